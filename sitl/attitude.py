@@ -1,0 +1,170 @@
+"""Attitude loops of all vehicles at once, at physics rate: the thesis' PIDs, and a PX4-like cascade.
+
+Both turn an attitude setpoint per vehicle into body torques (3, N) [N m]. They know no modes: a vehicle that is idle
+(disarmed, on the ground, clamped) gets zero torque and loses its memory, so that at release the loop sees the setpoint
+as a step from where the vehicle is.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+
+from sitl.vehicle import Array, Plant, Preset
+from swarmctl.core.frames import euler_from_quat
+
+_TURN_RAD = 2.0 * math.pi
+
+
+class AttitudeLoop(Protocol):
+    """What flies the attitude setpoints of a batch."""
+
+    def set_reference(self, vehicle: int, q_nb: Array) -> None:
+        """New setpoint of one vehicle, (4,) wxyz; it acts from the next step."""
+
+    def torque(self, plant: Plant, live: Array, out: Array) -> None:
+        """Torques (3, N) [N m] into `out`; `live` (N,) is 1.0 for vehicles in free flight and 0.0 for idle ones."""
+
+
+@dataclass(frozen=True, slots=True)
+class PidGains:
+    """Roll, pitch, yaw; error in rad, output N m."""
+
+    proportional: tuple[float, float, float]
+    integral: tuple[float, float, float]
+    derivative: tuple[float, float, float]
+
+
+THESIS_GAINS = {
+    "swarm": PidGains((0.05, 0.05, 0.005), (1e-4, 1e-4, 1e-4), (0.15, 0.15, 0.05)),  # section 4.3
+    "single": PidGains((0.15, 0.05, 0.005), (1e-4, 1e-4, 1e-4), (0.3, 0.25, 0.01)),  # chapter 3
+    "pid_step": PidGains((0.9, 0.6, 1.5), (0.01, 0.001, 0.001), (0.1, 0.1, 0.65)),  # chapter 2
+    "pid_trajectory": PidGains((0.2, 0.4, 0.01), (0.0, 1e-4, 0.0), (0.1, 0.1, 0.001)),
+}
+THESIS_SAMPLE_S = 0.02
+
+
+class ThesisAttitude:
+    """Three PIDs on Euler angles; the derivative is of the error, reference included.
+
+    The thesis samples at 0.02 s. At a faster physics rate the derivative is taken over a sliding 0.02 s window,
+    (e(t) - e(t - 0.02)) / 0.02, so that a reference step gives the same impulse; at dt = 0.02 s this is its discrete
+    PID.
+    """
+
+    def __init__(self, vehicles: int, dt_s: float, gains: PidGains = THESIS_GAINS["swarm"]) -> None:
+        self._window = max(1, round(THESIS_SAMPLE_S / dt_s))
+        self._kp = np.array(gains.proportional).reshape(3, 1)
+        self._ki = np.array(gains.integral).reshape(3, 1) * dt_s
+        self._kd = np.array(gains.derivative).reshape(3, 1) / (self._window * dt_s)
+        self._reference_rad = np.zeros((3, vehicles))
+        self._past = np.zeros((self._window, 3, vehicles))
+        self._head = 0
+        self._integral = np.zeros((3, vehicles))  # times kI already
+        self._error = np.zeros((3, vehicles))
+        self._term = np.zeros((3, vehicles))
+
+    def set_reference(self, vehicle: int, q_nb: Array) -> None:
+        self._reference_rad[:, vehicle] = euler_from_quat(q_nb)
+
+    def torque(self, plant: Plant, live: Array, out: Array) -> None:
+        error, term = self._error, self._term
+        np.subtract(self._reference_rad, plant.euler_rad, out=error)
+        np.multiply(error, 1.0 / _TURN_RAD, out=term)
+        np.rint(term, out=term)
+        term *= _TURN_RAD
+        error -= term  # nearest turn
+        error *= live
+        past = self._past[self._head]
+        np.subtract(error, past, out=term)
+        past[...] = error
+        self._head = (self._head + 1) % self._window
+        np.multiply(term, self._kd, out=out)
+        np.multiply(error, self._ki, out=term)
+        self._integral += term
+        self._integral *= live
+        out += self._integral
+        np.multiply(error, self._kp, out=term)
+        out += term
+        out *= live
+
+
+@dataclass(frozen=True, slots=True)
+class CascadeGains:
+    """Fitted to the measured response of PX4 1.18 SIH: dead time, t63 and t90 of roll and yaw steps."""
+
+    attitude_1_s: tuple[float, float, float] = (4.0, 4.0, 2.2)
+    rate_1_s: tuple[float, float, float] = (14.0, 14.0, 3.5)  # angular acceleration over rate error
+    rate_integral_1_s2: tuple[float, float, float] = (2.0, 2.0, 0.5)
+    rate_derivative: tuple[float, float, float] = (0.1, 0.1, 0.0)
+    rate_limit_rad_s: tuple[float, float, float] = (3.84, 3.84, 3.49)  # MC_ROLLRATE_MAX 220, MC_YAWRATE_MAX 200 deg/s
+    delay_s: float = 0.052  # setpoint to first reaction of the loop
+
+
+class CascadeAttitude:
+    """Quaternion P loop around a rate PID, behind a dead time: the x500's response with its motor lag."""
+
+    def __init__(self, preset: Preset, vehicles: int, dt_s: float, gains: CascadeGains | None = None) -> None:
+        gains = gains or CascadeGains()
+        inertia = np.array(preset.inertia_kg_m2).reshape(3, 1)
+        self._attitude = 2.0 * np.array(gains.attitude_1_s).reshape(3, 1)
+        self._limit = np.array(gains.rate_limit_rad_s).reshape(3, 1)
+        self._kp = inertia * np.array(gains.rate_1_s).reshape(3, 1)
+        self._ki = inertia * np.array(gains.rate_integral_1_s2).reshape(3, 1) * dt_s
+        self._kd = inertia * np.array(gains.rate_derivative).reshape(3, 1) / dt_s
+        self._reference = np.zeros((4, vehicles))
+        self._reference[0] = 1.0
+        self._line = np.repeat(self._reference[None], max(0, round(gains.delay_s / dt_s)) + 1, axis=0)
+        self._head = 0
+        # conj(q) * q_sp over the products q_i q_sp_j: vector part, then scalar part
+        self._error_rows = np.zeros((4, 16))
+        for row, terms in enumerate(
+            (
+                ((0, 1, 1), (1, 0, -1), (2, 3, -1), (3, 2, 1)),
+                ((0, 2, 1), (2, 0, -1), (3, 1, -1), (1, 3, 1)),
+                ((0, 3, 1), (3, 0, -1), (1, 2, -1), (2, 1, 1)),
+                ((0, 0, 1), (1, 1, 1), (2, 2, 1), (3, 3, 1)),
+            )
+        ):
+            for left, right, sign in terms:
+                self._error_rows[row, 4 * left + right] = sign
+        self._products = np.zeros((4, 4, vehicles))
+        self._error = np.zeros((4, vehicles))
+        self._integral = np.zeros((3, vehicles))
+        self._last_rate = np.zeros((3, vehicles))
+        self._term = np.zeros((3, vehicles))
+
+    def set_reference(self, vehicle: int, q_nb: Array) -> None:
+        self._reference[:, vehicle] = q_nb
+
+    def torque(self, plant: Plant, live: Array, out: Array) -> None:
+        self._line[self._head] = self._reference
+        self._head = (self._head + 1) % len(self._line)
+        np.multiply(plant.q_nb[:, None], self._line[self._head][None], out=self._products)
+        np.matmul(self._error_rows, self._products.reshape(16, -1), out=self._error)
+        rate_error, term, rate = self._error[:3], self._term, plant.rate_frd_rad_s
+        rate_error *= np.sign(self._error[3])
+        rate_error *= self._attitude
+        np.minimum(rate_error, self._limit, out=rate_error)
+        np.maximum(rate_error, -self._limit, out=rate_error)
+        rate_error -= rate
+        np.multiply(rate_error, self._ki, out=term)
+        self._integral += term
+        self._integral *= live
+        np.multiply(rate_error, self._kp, out=out)
+        out += self._integral
+        np.subtract(self._last_rate, rate, out=term)
+        self._last_rate[...] = rate
+        term *= self._kd
+        out += term
+        out *= live
+
+
+def attitude_loop(preset: Preset, vehicles: int, dt_s: float) -> AttitudeLoop:
+    """The loop that belongs to an airframe."""
+    if preset.name == "thesis":
+        return ThesisAttitude(vehicles, dt_s)
+    return CascadeAttitude(preset, vehicles, dt_s)

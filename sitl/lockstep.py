@@ -1,0 +1,195 @@
+"""A whole flight in one process on a simulated clock: the real `Agent`, real MAVLink bytes, faster than real time.
+
+Nothing here depends on wall time, so a seed gives the same states bit for bit, in whatever order agents are ticked.
+"""
+
+from __future__ import annotations
+
+import struct
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from sitl.world import SitlParams, SitlWorld
+from swarmctl.agent import Agent
+from swarmctl.assembly import make_agent
+from swarmctl.config import Config
+from swarmctl.core.clock import SimClock
+from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE, tick_row
+from swarmctl.core.types import TickRecord
+from swarmctl.links import topics
+from swarmctl.links.autopilot import PX4, Autopilot
+from swarmctl.links.commands import CodecCommands
+from swarmctl.links.mavlink import Codec
+from swarmctl.links.peers import LocalHub, agent_name
+from swarmctl.links.transport import pipe_pair
+
+_TAIL_S = 120.0  # flight allowed before and after the mission
+_TRUTH_EVERY_US = 20_000
+_OBSTACLES_EVERY_US = 1_000_000
+
+
+@dataclass
+class FlightLog:
+    """What one agent leaves behind; in memory, and in a run folder when there is one."""
+
+    directory: Path | None
+    agent: int
+    clock: SimClock
+    rows: list[NDArray[np.void]] = field(default_factory=list)
+    events: list[dict[str, Any]] = field(default_factory=list)
+    _tlog: BinaryIO | None = None
+
+    def __post_init__(self) -> None:
+        if self.directory is not None:
+            self._tlog = (self.directory / f"agent-{self.agent}.tlog").open("wb")
+
+    def tick(self, record: TickRecord) -> None:
+        self.rows.append(tick_row(record))
+
+    def event(self, name: str, t_us: int, utc_us: int, **fields: Any) -> None:
+        source = agent_name(self.agent)
+        self.events.append({"utc_us": utc_us, "t_us": t_us, "source": source, "event": name, **fields})
+
+    def frame(self, frame: bytes) -> None:
+        if self._tlog is not None:
+            self._tlog.write(struct.pack(">Q", self.clock.utc_us()) + frame)
+
+    @property
+    def ticks(self) -> NDArray[np.void]:
+        """All ticks, (T,) of `TICK_DTYPE`."""
+        return np.concatenate(self.rows) if self.rows else np.zeros(0, TICK_DTYPE)
+
+    def close(self) -> None:
+        """Write what a live agent would have written."""
+        if self.directory is None or self._tlog is None:
+            return
+        self._tlog.close()
+        (self.directory / f"agent-{self.agent}.ticks").write_bytes(self.ticks.tobytes())
+        lines = b"".join(msgspec.json.encode(event) + b"\n" for event in self.events)
+        (self.directory / f"agent-{self.agent}.events.jsonl").write_bytes(lines)
+
+
+class Lockstep:
+    """One flight, step by step.
+
+    Args:
+        config: the run.
+        directory: where agents' files go; None keeps everything in memory.
+        order: in which agents are ticked within a step; must not matter.
+    """
+
+    def __init__(self, config: Config, directory: Path | None = None, order: Sequence[int] | None = None) -> None:
+        agents = config.swarm.agents
+        self.config = config
+        self.clock = SimClock()
+        self._tick_us = round(1e6 / config.agent.rate_hz)
+        self._physics_us = round(1e6 / config.sitl.physics_hz)
+        if self._tick_us % self._physics_us:
+            raise ValueError(f"sitl.physics_hz: {config.sitl.physics_hz} must be a multiple of agent.rate_hz")
+        latency_us = round(config.sitl.link_latency_ms * 1000)
+        pairs = [pipe_pair(self.clock.now_us, latency_us) for _ in range(agents)]
+        self.world = SitlWorld(sitl_params(config), [vehicle for _, vehicle in pairs])
+        self.hub = LocalHub(self.clock.now_us, config.seed, round(config.bus.delay_ms * 1000), config.bus.loss_01)
+        self.logs = [FlightLog(directory, i, self.clock) for i in range(agents)]
+        self._operator = self.hub.attach(topics.OPERATOR)
+        self.agents: list[Agent | None] = [self._agent(i, pairs[i][0]) for i in range(agents)]
+        self._order = list(order) if order is not None else list(range(agents))
+        self._truth: list[NDArray[np.void]] = []
+        self._obstacles = obstacles_message(config)
+
+    def _agent(self, index: int, transport: Any) -> Agent:
+        log = self.logs[index]
+        bus = self.hub.attach(agent_name(index))
+
+        def slow_path(autopilot: Autopilot, codec: Codec) -> CodecCommands:
+            sysid = self.config.sysids()[index]
+            return CodecCommands(autopilot.send_frame, codec, sysid, PX4.external, PX4.hold)
+
+        boot_id = self.config.seed * 1000 + index
+        return make_agent(
+            self.config, index, boot_id, transport, bus, self.clock, log, log.frame, slow_path, time.perf_counter_ns
+        )
+
+    def step(self) -> None:
+        """One tick of every agent, then the physics up to the next."""
+        now_us = self.clock.now_us()
+        if now_us % _OBSTACLES_EVERY_US == 0:
+            self._operator.publish(topics.OBSTACLES, topics.encode_message(self._obstacles))
+        for i in self._order:
+            agent = self.agents[i]
+            if agent is not None:
+                agent.tick(now_us, 0)
+        for _ in range(self._tick_us // self._physics_us):
+            self.clock.advance(self._physics_us)
+            self.world.step(self.clock.now_us())
+        if self.clock.now_us() % _TRUTH_EVERY_US == 0:
+            self._truth.append(self.world.truth_rows())
+
+    def kill(self, index: int) -> None:
+        """An agent process dies: no more setpoints, gone from the bus."""
+        self.agents[index] = None
+        self.hub.detach(agent_name(index))
+
+    def command(self, verb: Any, agent: int = -1) -> None:
+        """What an operator's verb does."""
+        message = topics.CommandMessage(verb, agent, self.clock.utc_us())
+        self._operator.publish(topics.COMMAND, topics.encode_message(message))
+
+    @property
+    def finished(self) -> bool:
+        return all(agent is None or agent.finished for agent in self.agents)
+
+    @property
+    def truth(self) -> NDArray[np.void]:
+        """True states so far, (T * N,) of `TRUTH_DTYPE`."""
+        return np.concatenate(self._truth) if self._truth else np.zeros(0, TRUTH_DTYPE)
+
+    def problems(self) -> list[str]:
+        """Why the mission is not complete; empty when it is."""
+        found = []
+        for i, agent in enumerate(self.agents):
+            if agent is None:
+                found.append(f"agent {i} died")
+            elif not agent.finished or agent.outcome != "completed":
+                found.append(f"agent {i}: {agent.outcome if agent.finished else 'did not finish'}")
+        return found
+
+    def run(self, on_step: Callable[[Lockstep], None] | None = None) -> None:
+        """Fly until every agent has landed, or far longer than the mission should take."""
+        limit_us = round((self.config.mission.duration_s + _TAIL_S) * 1e6)
+        while not self.finished and self.clock.now_us() < limit_us:
+            self.step()
+            if on_step is not None:
+                on_step(self)
+
+
+def sitl_params(config: Config) -> SitlParams:
+    """The simulator of a configuration."""
+    spawn = np.array(config.starts_ned_m())
+    if config.sitl.start == "ground":
+        spawn[:, 2] = config.sitl.ground_z_m
+    return SitlParams(
+        vehicles=config.swarm.agents,
+        spawn_ned_m=spawn,
+        preset=config.sitl.preset,
+        origin_lat_deg=config.swarm.origin_lat_deg,
+        origin_lon_deg=config.swarm.origin_lon_deg,
+        origin_alt_m=config.swarm.origin_alt_m,
+        seed=config.seed,
+        physics_hz=config.sitl.physics_hz,
+        mass_scale=config.sitl.mass_scale,
+        start=config.sitl.start,
+    )
+
+
+def obstacles_message(config: Config) -> topics.ObstaclesMessage:
+    """The configured obstacles as agents hear of them."""
+    items = tuple(topics.ObstacleMessage(**o.model_dump()) for o in config.obstacles)
+    return topics.ObstaclesMessage(1, items)

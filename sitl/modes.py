@@ -1,0 +1,108 @@
+"""PX4's modes on the wire: custom_mode numbers, base_mode, MAV_STATE, and MAVLink results. Tables only."""
+
+from __future__ import annotations
+
+import enum
+
+from swarmctl.core.types import FlightMode
+
+
+def _main(number: int, sub: int = 0) -> int:
+    return number << 16 | sub << 24
+
+
+class Px4Mode(enum.IntEnum):
+    """custom_mode of HEARTBEAT: main << 16 | sub << 24."""
+
+    MANUAL = _main(1)
+    ALTCTL = _main(2)
+    POSCTL = _main(3)
+    AUTO_TAKEOFF = _main(4, 2)
+    AUTO_LOITER = _main(4, 3)
+    AUTO_MISSION = _main(4, 4)
+    AUTO_RTL = _main(4, 5)
+    AUTO_LAND = _main(4, 6)
+    ACRO = _main(5)
+    OFFBOARD = _main(6)
+    STABILIZED = _main(7)
+
+
+NEEDS_PILOT = {  # and the name PX4 refuses them by
+    Px4Mode.MANUAL: "Manual",
+    Px4Mode.ALTCTL: "Altitude",
+    Px4Mode.POSCTL: "Position",
+    Px4Mode.ACRO: "Acro",
+    Px4Mode.STABILIZED: "Stabilized",
+}
+NO_ARMING_IN = frozenset({Px4Mode.AUTO_RTL, Px4Mode.AUTO_LAND, Px4Mode.AUTO_MISSION, *NEEDS_PILOT})
+NOT_KEPT_AFTER_LANDING = frozenset({Px4Mode.AUTO_TAKEOFF, Px4Mode.AUTO_LAND, Px4Mode.AUTO_RTL})
+
+FLIGHT_MODES = {
+    Px4Mode.AUTO_TAKEOFF: FlightMode.TAKEOFF,
+    Px4Mode.AUTO_LOITER: FlightMode.HOLD,
+    Px4Mode.AUTO_MISSION: FlightMode.MISSION,
+    Px4Mode.AUTO_RTL: FlightMode.RTL,
+    Px4Mode.AUTO_LAND: FlightMode.LAND,
+    Px4Mode.OFFBOARD: FlightMode.EXTERNAL,
+}
+
+BASE_ARMED = 128
+BASE_AUTO = 29  # custom, auto, guided, stabilize
+BASE_MANUAL = 65  # custom, manual input
+BASE_STABILIZED = 81
+BASE_OFFBOARD = 17
+BASE_OFFBOARD_NO_STREAM_YET = 1
+
+
+def base_mode(mode: Px4Mode, *, armed: bool, streamed: bool) -> int:
+    """HEARTBEAT.base_mode; `streamed`: a setpoint stream has been seen since boot."""
+    if mode == Px4Mode.OFFBOARD:
+        flags = BASE_OFFBOARD if streamed or armed else BASE_OFFBOARD_NO_STREAM_YET
+    elif mode in (Px4Mode.MANUAL, Px4Mode.ACRO):
+        flags = BASE_MANUAL
+    elif mode in NEEDS_PILOT:
+        flags = BASE_STABILIZED
+    else:
+        flags = BASE_AUTO
+    return flags | (BASE_ARMED if armed else 0)
+
+
+class MavState(enum.IntEnum):
+    """MAV_STATE."""
+
+    UNINIT = 0
+    STANDBY = 3
+    ACTIVE = 4
+    CRITICAL = 5
+    TERMINATION = 8
+
+
+class Result(enum.IntEnum):
+    """MAV_RESULT."""
+
+    ACCEPTED = 0
+    TEMPORARILY_REJECTED = 1
+    DENIED = 2
+    UNSUPPORTED = 3
+    FAILED = 4
+
+
+class Severity(enum.IntEnum):
+    """MAV_SEVERITY."""
+
+    CRITICAL = 2
+    WARNING = 4
+    INFO = 6
+
+
+class OffboardLoss(enum.IntEnum):
+    """COM_OBL_RC_ACT; the first four need a pilot or mean Return, and end in RTL without one."""
+
+    POSITION = 0
+    ALTITUDE = 1
+    STABILIZED = 2
+    RETURN = 3
+    LAND = 4
+    HOLD = 5
+    TERMINATE = 6
+    DISARM = 7

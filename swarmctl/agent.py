@@ -1,0 +1,509 @@
+"""One agent: `tick(now)` listens, senses, thinks, judges, acts, shares and records. Nothing else happens anywhere.
+
+It has no thread, socket, sleep or simulation branch: transport, bus, slow path, clock and recorder are handed in.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from pydantic import Field
+
+from swarmctl.control.controller import ControllerParams, make_controller
+from swarmctl.control.disturbance import DisturbanceObserver, DisturbanceParams
+from swarmctl.control.failsafe import FailsafeParams, Judgement, judge
+from swarmctl.control.fallback import rest_plan
+from swarmctl.control.mission import MissionParams, MissionReference
+from swarmctl.control.model import Predictor, VehicleModelParams, acceleration
+from swarmctl.control.mpc import Start
+from swarmctl.control.separation import (
+    KeepOut,
+    SeparationParams,
+    align,
+    certify,
+    keep_out_of_obstacle,
+    keep_out_of_peer,
+    visible,
+)
+from swarmctl.control.sequence import Facts, PeerFacts, SequenceParams
+from swarmctl.control.sequence import Sequence as MissionSequence
+from swarmctl.control.setpoint import setpoint_of
+from swarmctl.core.clock import Clock
+from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned
+from swarmctl.core.params import Params
+from swarmctl.core.records import pack_tick
+from swarmctl.core.types import (
+    Array,
+    AttitudeSetpoint,
+    FlightMode,
+    Health,
+    Landed,
+    Mode,
+    Obstacle,
+    Phase,
+    Plan,
+    PlanStatus,
+    PredictedPath,
+    Reference,
+    TickRecord,
+    VehicleState,
+)
+from swarmctl.links import topics
+from swarmctl.links.autopilot import Autopilot
+from swarmctl.links.commands import CommandPort
+from swarmctl.links.peers import Bus, PeerPaths, agent_name
+
+_STATUS_US = 200_000
+_NOTHING_US = -1
+
+
+class AgentParams(Params):
+    """Everything of an agent that is neither controller nor vehicle."""
+
+    rate_hz: float = Field(50.0, ge=10, le=200)
+    connect_timeout_s: float = Field(15.0, gt=0, le=600)
+    sequence: SequenceParams = SequenceParams()
+    failsafe: FailsafeParams = FailsafeParams()
+    disturbance: DisturbanceParams = DisturbanceParams()
+    autopilot_params: dict[str, int | float] = Field({"COM_OBL_RC_ACT": 4})  # PX4: land when setpoints stop
+
+
+@dataclass(frozen=True, slots=True)
+class AgentSetup:
+    """What one agent is told before it starts."""
+
+    agent: int
+    boot_id: int
+    sysid: int
+    params: AgentParams
+    mission: MissionParams
+    starts_ned_m: Array  # (agents, 3)
+    controller: ControllerParams
+    separation: SeparationParams
+    vehicle_model: VehicleModelParams
+    obstacle_slots: int
+
+
+class TickSink(Protocol):
+    """Where records go; never blocks."""
+
+    def tick(self, record: TickRecord) -> None: ...
+
+    def event(self, name: str, t_us: int, utc_us: int, **fields: Any) -> None: ...
+
+
+class Agent:
+    """See the module. `stopwatch_ns` only measures the tick; it never influences it."""
+
+    def __init__(
+        self,
+        setup: AgentSetup,
+        autopilot: Autopilot,
+        commands: CommandPort,
+        bus: Bus,
+        clock: Clock,
+        sink: TickSink,
+        stopwatch_ns: Callable[[], int],
+    ) -> None:
+        self._setup, self._autopilot, self._commands = setup, autopilot, commands
+        self._bus, self._clock, self._sink, self._stopwatch_ns = bus, clock, sink, stopwatch_ns
+        agents = len(setup.starts_ned_m)
+        peers = [i for i in range(agents) if i != setup.agent]
+        slots = min(len(peers), setup.separation.max_neighbours) + setup.obstacle_slots
+        self._paths = PeerPaths(peers)
+        self._controller = make_controller(setup.controller, setup.separation, setup.agent, slots)
+        self._observer = DisturbanceObserver(setup.params.disturbance, setup.vehicle_model.hover_thrust_01)
+        self._predictor = Predictor(setup.vehicle_model)
+        reference = MissionReference(setup.mission, setup.starts_ned_m, setup.agent)
+        self._sequence = MissionSequence(
+            setup.params.sequence,
+            setup.params.autopilot_params,
+            len(peers),
+            setup.starts_ned_m[setup.agent],
+            setup.mission.duration_s,
+            reference,
+        )
+        self._peer_status: dict[int, topics.StatusMessage] = {}
+        self._obstacles: tuple[Obstacle, ...] = ()
+        self._obstacles_version = -1
+        self._judgement = Judgement(Mode.IDLE, "")
+        self._virtual = np.array([0.0, 0.0, GRAVITY_M_S2])
+        self._good: Plan | None = None
+        self._certified_us: int | None = None
+        self._hold_at: Array | None = None
+        self._seq = 0
+        self._status_us = 0
+        self._recent_ms: deque[float] = deque(maxlen=250)
+        self._failed_plans = 0
+        self._announced: tuple[Phase, Mode, FlightMode] | None = None
+        self._problem = ""
+        self._last_state_us = _NOTHING_US
+        self._thrust_01 = setup.vehicle_model.hover_thrust_01
+
+    @property
+    def finished(self) -> bool:
+        """Landed, disarmed, and so is every peer that is still there."""
+        if not self._sequence.finished:
+            return False
+        return all(p.phase is Phase.DONE or not p.alive for p in self._peer_facts().values())
+
+    @property
+    def outcome(self) -> str:
+        """ "completed", or why not."""
+        return self._sequence.outcome or "stopped before the mission began"
+
+    @property
+    def rejected(self) -> dict[str, int]:
+        """Bus messages refused so far, by reason."""
+        return dict(self._paths.rejected)
+
+    def ask(self, verb: str, now_us: int) -> None:
+        """An operator's wish: hold, resume, land, rtl."""
+        self._sequence.operator(verb, now_us, self._autopilot.poll(now_us))
+        self._note("operator", verb=verb)
+
+    def tick(self, now_us: int, late_ticks: int) -> TickRecord:
+        """One control step at monotonic time `now_us`; `late_ticks` so far is only recorded."""
+        began_ns = self._stopwatch_ns()
+        self._listen(now_us)
+        state = self._sense(now_us)
+        sensed_ns = self._stopwatch_ns()
+        start, plan, reference, keep_outs = self._think(now_us, state)
+        solved_ns = self._stopwatch_ns()
+        self._judge(now_us, state, plan, keep_outs)
+        flown = self._flown(now_us, state, start, plan)
+        setpoint = self._act(now_us, flown)
+        sent_ns = self._stopwatch_ns()
+        self._share(state, flown)
+        self._advance(now_us, state)
+        took = (sent_ns - began_ns, solved_ns - sensed_ns)
+        record = self._record(now_us, state, start, plan, flown, setpoint, reference, keep_outs, late_ticks, took)
+        self._report(now_us, record)
+        return record
+
+    # -- listen, sense ------------------------------------------------------------------------------------------------
+
+    def _listen(self, now_us: int) -> None:
+        utc_us = self._clock.utc_us()
+        for sender, payload in self._bus.receive(topics.PATH):
+            self._paths.offer(sender, payload, utc_us)
+        for sender, payload in self._bus.receive(topics.STATUS):
+            status = topics.decode_status(payload)
+            if status is not None and sender == agent_name(status.agent):
+                self._peer_status[status.agent] = status
+        for _, payload in self._bus.receive(topics.COMMAND):
+            command = topics.decode_command(payload)
+            if command is not None and command.agent in (-1, self._setup.agent):
+                self.ask(command.verb, now_us)
+        for _, payload in self._bus.receive(topics.OBSTACLES):
+            message = topics.decode_obstacles(payload)
+            if message is not None and message.version > self._obstacles_version:
+                self._obstacles_version = message.version
+                self._obstacles = tuple(_obstacle(o) for o in message.obstacles)
+
+    def _sense(self, now_us: int) -> VehicleState | None:
+        state = self._autopilot.poll(now_us)
+        self._commands.step(now_us)
+        for result in self._commands.results():
+            if not result.ok:
+                self._problem = f"{result.command.verb.value} refused: {result.text}"
+            self._note("command", verb=result.command.verb.value, ok=result.ok, text=result.text)
+        if state is None or state.t_us == self._last_state_us:
+            return state
+        self._last_state_us = state.t_us
+        if self._sequence.had_control:
+            self._observer.update(state, self._thrust_01)
+        elif self._autopilot.hover_thrust_01 is not None and state.mode is FlightMode.HOLD:
+            self._observer.learn_hover(self._autopilot.hover_thrust_01 * float(body_z_ned(state.q_nb)[2]))
+        return state
+
+    # -- think --------------------------------------------------------------------------------------------------------
+
+    def _think(
+        self, now_us: int, state: VehicleState | None
+    ) -> tuple[Start | None, Plan | None, Reference | None, list[KeepOut]]:
+        if state is None or not self._fresh(now_us, state):
+            return None, None, None, []
+        estimate = self._observer.estimate
+        act_us = now_us + self._predictor.delay_us
+        pos, vel = self._predictor.predict(state, act_us, estimate.disturbance_ned_m_s2)
+        if not self._sequence.had_control:
+            self._virtual = np.array([0.0, 0.0, GRAVITY_M_S2])
+            pos, vel = state.pos_ned_m, state.vel_ned_m_s
+        start = Start(act_us, pos, vel, float(body_z_ned(state.q_nb)[2]), self._virtual)
+        reference, now_ref = self._reference(now_us)
+        keep_outs = self._keep_outs(act_us, state)
+        if not Phase.GOTO_START <= self._sequence.phase <= Phase.GOTO_LAND:
+            return start, None, now_ref, keep_outs
+        steps, dt_us = self._controller.steps, self._controller.dt_us
+        guess = None
+        if self._good is not None and act_us - self._good.t0_us < steps * dt_us:
+            guess = self._shifted(self._good, act_us)
+        plan = self._controller.plan(start, reference, estimate.disturbance_ned_m_s2, keep_outs, guess)
+        return start, plan, now_ref, keep_outs
+
+    def _reference(self, now_us: int) -> tuple[Reference, Reference]:
+        """Over the horizon from when the setpoint acts, and now."""
+        dt_s = self._controller.dt_us * 1e-6
+        ahead_s = self._predictor.delay_us * 1e-6 + dt_s * np.arange(self._controller.longest + 1)
+        pos, vel = self._sequence.reference(self._clock.utc_us(), now_us, np.concatenate([[0.0], ahead_s]))
+        yaw_rad = self._setup.mission.yaw_rad
+        return Reference(pos[1:], vel[1:], yaw_rad), Reference(pos[:1], vel[:1], yaw_rad)
+
+    def _keep_outs(self, act_us: int, state: VehicleState) -> list[KeepOut]:
+        steps, dt_us, params = self._controller.steps, self._controller.dt_us, self._setup.separation
+        utc_us = self._utc(act_us)
+        found = [
+            keep_out_of_peer(path, utc_us, dt_us, steps, self._parked(path.agent), params)
+            for path in self._paths.latest()
+        ]
+        seen = visible(self._obstacles, state.pos_ned_m)[: self._setup.obstacle_slots]
+        return found + [keep_out_of_obstacle(o, dt_us, steps, params) for o in seen]
+
+    def _parked(self, agent: int) -> bool:
+        status = self._peer_status.get(agent)
+        return status is not None and status.phase == Phase.DONE
+
+    # -- judge, act ---------------------------------------------------------------------------------------------------
+
+    def _judge(self, now_us: int, state: VehicleState | None, plan: Plan | None, keep_outs: Sequence[KeepOut]) -> None:
+        if plan is None:
+            self._certified_us = now_us  # none was asked for
+        if plan is not None and plan.status is PlanStatus.OK:
+            self._good, self._certified_us = plan, now_us
+        elif plan is not None:
+            self._failed_plans += 1
+            self._problem = f"plan {plan.status.name.lower()}"
+            if self._good is not None and certify(self._shifted(self._good, plan.t0_us), keep_outs, 0) < 0.0:
+                self._good = None  # what is known now rules the old plan out as well
+        delay_us = self._predictor.delay_us
+        health = Health(
+            _NOTHING_US if state is None else max(0, now_us - state.t_us),
+            state is not None and state.armed,
+            FlightMode.UNKNOWN if state is None else state.mode,
+            Landed.UNKNOWN if state is None else state.landed,
+            state is not None and state.failsafe,
+            PlanStatus.NONE if plan is None else plan.status,
+            _NOTHING_US if self._good is None else now_us + delay_us - self._good.t0_us,
+            0 if self._certified_us is None else now_us - self._certified_us,
+            0.0 if state is None else math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s)),
+            self._sequence.phase,
+        )
+        self._judgement = judge(health, self._sequence.had_control, self._setup.params.failsafe)
+
+    def _flown(self, now_us: int, state: VehicleState | None, start: Start | None, plan: Plan | None) -> Plan | None:
+        """The plan whose first input is sent and whose path is shared; None when the autopilot flies."""
+        mode = self._judgement.mode
+        if mode is not Mode.HOLD:
+            self._hold_at = None
+        if start is None or state is None:
+            return None
+        if mode in (Mode.FOLLOW, Mode.STREAM):
+            return plan
+        if mode is Mode.REPLAY:
+            return self._good
+        if mode in (Mode.BRAKE, Mode.HOLD):
+            if mode is Mode.HOLD and self._hold_at is None:
+                self._hold_at = state.pos_ned_m
+            disturbance = self._observer.estimate.disturbance_ned_m_s2
+            return rest_plan(start, self._hold_at, disturbance, self._controller.dt_us, self._controller.steps)
+        return None
+
+    def _act(self, now_us: int, flown: Plan | None) -> AttitudeSetpoint | None:
+        if flown is None:
+            return None
+        act_us = now_us + self._predictor.delay_us
+        step = min(max(0, (act_us - flown.t0_us) // flown.dt_us), len(flown.virtual) - 1)
+        virtual = flown.virtual[step]
+        hover_01 = self._observer.estimate.hover_thrust_01
+        setpoint = setpoint_of(virtual, self._setup.mission.yaw_rad, hover_01, now_us, self._setup.vehicle_model)
+        refused = self._autopilot.send(setpoint, self._clock.now_us())
+        if refused:
+            self._problem = f"setpoint refused: {refused}"
+            self._note("setpoint_refused", reason=refused)
+            return None
+        self._virtual, self._thrust_01 = virtual, setpoint.thrust_01
+        self._predictor.sent(now_us, acceleration(virtual))
+        return setpoint
+
+    def _advance(self, now_us: int, state: VehicleState | None) -> None:
+        before = self._sequence.phase, self._sequence.had_control
+        facts = Facts(
+            now_us,
+            self._clock.utc_us(),
+            state,
+            self._autopilot.dialect is not None,
+            self._autopilot.armable,
+            self._commands.busy,
+            self._judgement.mode,
+            self._peer_facts(),
+        )
+        for command in self._sequence.step(facts):
+            self._commands.request(command)
+        if not before[1] and self._sequence.had_control:
+            self._predictor.clear()
+            self._observer.reset()
+            self._controller.reset()
+        now = (self._sequence.phase, self._judgement.mode, self._autopilot.mode)
+        if now != self._announced:
+            self._announced = now
+            names = {"phase": now[0].name, "mode": now[1].name, "flight_mode": now[2].name}
+            self._note("state", **names, reason=self._judgement.reason)
+
+    # -- share, record ------------------------------------------------------------------------------------------------
+
+    def _share(self, state: VehicleState | None, flown: Plan | None) -> None:
+        if state is not None:
+            path = self._path(flown) if flown is not None else self._coasting(state)
+            self._bus.publish(topics.PATH, topics.encode_path(path))
+
+    def _path(self, plan: Plan) -> PredictedPath:
+        return PredictedPath(
+            self._setup.agent,
+            self._setup.boot_id,
+            self._seq,
+            self._utc(plan.t0_us),
+            plan.dt_us,
+            0.0,
+            plan.pos_ned_m,
+        )
+
+    def _shifted(self, plan: Plan, t0_us: int) -> Array:
+        """Positions (N+1, 3) of a plan from `t0_us` on."""
+        steps, brake_m_s2 = self._controller.steps, self._setup.separation.brake_m_s2
+        return align(self._path(plan), self._utc(t0_us), self._controller.dt_us, steps, brake_m_s2)
+
+    def _coasting(self, state: VehicleState) -> PredictedPath:
+        """Somebody else flies: the own velocity, continued."""
+        t_s = np.arange(self._controller.steps + 1)[:, None] * (self._controller.dt_us * 1e-6)
+        pos = state.pos_ned_m + t_s * state.vel_ned_m_s
+        utc_us, dt_us = self._utc(state.t_us), self._controller.dt_us
+        return PredictedPath(self._setup.agent, self._setup.boot_id, self._seq, utc_us, dt_us, 0.0, pos)
+
+    def _record(
+        self,
+        now_us: int,
+        state: VehicleState | None,
+        start: Start | None,
+        plan: Plan | None,
+        flown: Plan | None,
+        setpoint: AttitudeSetpoint | None,
+        reference: Reference | None,
+        keep_outs: Sequence[KeepOut],
+        late_ticks: int,
+        took_ns: tuple[int, int],
+    ) -> TickRecord:
+        self._seq += 1
+        utc_us = self._clock.utc_us()
+        estimate = self._observer.estimate
+        here = _NAN3 if start is None else start.pos_ned_m
+        peers = [math.dist(here, k.pos_ned_m[0]) for k in keep_outs if k.tie >= 0]
+        obstacles = [math.dist(here, k.pos_ned_m[0]) for k in keep_outs if k.tie < 0]
+        sent_us = utc_us + self._predictor.delay_us  # a path begins when its sender's setpoint acts
+        ages_ms = [(sent_us - path.t0_utc_us) * 1e-3 for path in self._paths.latest()]
+        return TickRecord(
+            t_us=now_us,
+            utc_us=utc_us,
+            seq=self._seq,
+            mission_t_s=self._sequence.mission_t_s(utc_us),
+            phase=self._sequence.phase,
+            mode=self._judgement.mode,
+            flight_mode=self._autopilot.mode,
+            armed=self._autopilot.armed,
+            state_age_ms=math.nan if state is None else (now_us - state.t_us) * 1e-3,
+            pos_ned_m=_NAN3 if state is None else state.pos_ned_m,
+            vel_ned_m_s=_NAN3 if state is None else state.vel_ned_m_s,
+            q_nb=_NAN4 if state is None else state.q_nb,
+            ref_pos_ned_m=_NAN3 if reference is None else reference.pos_ned_m[0],
+            setpoint_q_nb=_NAN4 if setpoint is None else setpoint.q_nb,
+            setpoint_thrust_01=math.nan if setpoint is None else setpoint.thrust_01,
+            hover_thrust_01=estimate.hover_thrust_01,
+            disturbance_ned_m_s2=estimate.disturbance_ned_m_s2,
+            nearest_peer_m=min(peers, default=math.inf),
+            nearest_obstacle_m=min(obstacles, default=math.inf),
+            path_age_ms=max(ages_ms, default=math.nan),
+            peers=len(peers),
+            rejected=sum(self._paths.rejected.values()),
+            plan_status=PlanStatus.NONE if plan is None else plan.status,
+            slack_m=0.0 if plan is None else plan.slack_m,
+            residual_m=0.0 if plan is None else plan.residual_m,
+            iterations=0 if plan is None else plan.iterations,
+            solve_ms=took_ns[1] * 1e-6,
+            tick_ms=took_ns[0] * 1e-6,
+            late_ticks=late_ticks,
+            plan_pos_ned_m=_NO_PLAN if flown is None else flown.pos_ned_m,
+        )
+
+    def _report(self, now_us: int, record: TickRecord) -> None:
+        self._recent_ms.append(record.tick_ms)
+        self._sink.tick(record)
+        self._bus.publish(topics.TICK, pack_tick(record))
+        if now_us - self._status_us >= _STATUS_US:
+            self._status_us = now_us
+            self._bus.publish(topics.STATUS, topics.encode_message(self._status(record)))
+
+    def _status(self, record: TickRecord) -> topics.StatusMessage:
+        """What peers and people are told of this tick."""
+        error = record.pos_ned_m - record.ref_pos_ned_m
+        return topics.StatusMessage(
+            agent=self._setup.agent,
+            boot_id=self._setup.boot_id,
+            sysid=self._setup.sysid,
+            phase=int(record.phase),
+            mode=int(record.mode),
+            flight_mode=int(record.flight_mode),
+            armed=record.armed,
+            landed=int(self._autopilot.landed),
+            ready_utc_us=self._sequence.ready_utc_us,
+            outcome=self._sequence.outcome,
+            position_error_m=_finite(math.sqrt(float(error @ error))),
+            separation_m=_finite(record.nearest_peer_m),
+            tick_p99_ms=float(np.percentile(self._recent_ms, 99)),
+            ticks=record.seq,
+            late_ticks=record.late_ticks,
+            path_age_ms=_finite(record.path_age_ms),
+            solver_failed=self._failed_plans,
+            problem=self._problem,
+        )
+
+    def _peer_facts(self) -> dict[int, PeerFacts]:
+        alive = self._bus.alive()
+        return {
+            agent: PeerFacts(Phase(status.phase), status.ready_utc_us, agent_name(agent) in alive)
+            for agent, status in self._peer_status.items()
+        }
+
+    def _fresh(self, now_us: int, state: VehicleState) -> bool:
+        return now_us - state.t_us <= self._setup.params.failsafe.state_max_age_s * 1e6
+
+    def _utc(self, t_us: int) -> int:
+        """UTC of a monotonic time of this process."""
+        return self._clock.utc_us() + t_us - self._clock.now_us()
+
+    def _note(self, name: str, **fields: Any) -> None:
+        self._sink.event(name, self._clock.now_us(), self._clock.utc_us(), **fields)
+
+
+_NAN3 = np.full(3, math.nan)
+_NAN4 = np.full(4, math.nan)
+_NO_PLAN = np.empty((0, 3))
+
+
+def _finite(value: float) -> float:
+    """JSON has no infinity: -1 says there is none."""
+    return value if math.isfinite(value) else -1.0
+
+
+def _obstacle(message: topics.ObstacleMessage) -> Obstacle:
+    return Obstacle(
+        np.array(message.center_ned_m),
+        message.radius_m,
+        message.keep_out_m,
+        message.visibility_m,
+        np.array(message.vel_ned_m_s),
+    )

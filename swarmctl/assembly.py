@@ -1,0 +1,63 @@
+"""Builds one `Agent` from a whole configuration; real time and lockstep differ only in what they hand in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from swarmctl.agent import Agent, AgentSetup, TickSink
+from swarmctl.config import Config
+from swarmctl.core.clock import Clock
+from swarmctl.links.autopilot import Autopilot, GeoOrigin
+from swarmctl.links.commands import CommandPort
+from swarmctl.links.mavlink import Codec
+from swarmctl.links.peers import Bus
+from swarmctl.links.transport import Transport
+
+OWN_COMPID = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
+
+
+def make_agent(
+    config: Config,
+    agent: int,
+    boot_id: int,
+    transport: Transport,
+    bus: Bus,
+    clock: Clock,
+    sink: TickSink,
+    on_frame: Callable[[bytes], None],
+    slow_path: Callable[[Autopilot, Codec], CommandPort],
+    stopwatch_ns: Callable[[], int],
+) -> Agent:
+    """Wire an agent to its vehicle, its peers and its recorder.
+
+    Args:
+        config: the run.
+        agent: own index, from 0.
+        boot_id: differs between restarts of the same agent.
+        transport, bus, clock, sink: see `Agent`.
+        on_frame: told of every MAVLink frame in and out.
+        slow_path: makes the command executor for the vehicle.
+        stopwatch_ns: measures the tick.
+    """
+    sysid = config.sysids()[agent]
+    swarm = config.swarm
+    codec = Codec(sysid, OWN_COMPID)
+    origin = GeoOrigin(swarm.origin_lat_deg, swarm.origin_lon_deg, swarm.origin_alt_m)
+    autopilot = Autopilot(transport, codec, sysid, origin, on_frame)
+    commands = slow_path(autopilot, codec)
+    autopilot.attach(commands)
+    setup = AgentSetup(
+        agent,
+        boot_id,
+        sysid,
+        config.agent,
+        config.mission,
+        np.array(config.starts_ned_m()),
+        config.controller,
+        config.separation,
+        config.vehicle_model,
+        max(1, len(config.obstacles)),
+    )
+    return Agent(setup, autopilot, commands, bus, clock, sink, stopwatch_ns)

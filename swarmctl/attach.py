@@ -1,0 +1,276 @@
+"""How an operator's command finds a running launch and speaks to it over the bus.
+
+A launch leaves a note in its run folder and one in a private directory per user; both hold its process, so that a
+stale note is recognised. The verbs repeat what they say until they see an answer, because a fresh session may speak
+before its router has told it who listens.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import os
+import stat
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgspec
+import psutil
+
+from swarmctl.errors import ConfigError, StartError
+from swarmctl.links.bus import ZenohBus
+from swarmctl.links.peers import agent_name
+from swarmctl.links.topics import (
+    COMMAND,
+    OBSTACLES,
+    OPERATOR,
+    STATUS,
+    CommandMessage,
+    ObstacleMessage,
+    ObstaclesMessage,
+    StatusMessage,
+    decode_obstacles,
+    decode_status,
+    encode_message,
+)
+
+LAUNCH_FILE = "launch.json"
+MAX_OBSTACLE_M = 10_000.0
+_ANSWER_S = 5.0
+_REPEAT_S = 0.2
+_START_TOLERANCE_S = 1.0
+
+
+class RunningLaunch(msgspec.Struct, frozen=True):
+    """What an operator needs to join a launch."""
+
+    run: str
+    bus: str
+    pid: int
+    started_s: float  # of the process, UTC; a reused pid has another
+    agents: int
+    run_dir: str
+    view: str = ""  # address of the live view, "" without
+
+
+def announce(launch: RunningLaunch) -> None:
+    """Write the notes of a launch; the per-user one is a convenience and skipped where it would not be private."""
+    payload = msgspec.json.encode(launch)
+    _replace(Path(launch.run_dir) / LAUNCH_FILE, payload)
+    with contextlib.suppress(OSError):
+        _replace(_private_registry() / f"{launch.pid}.json", payload)
+
+
+def withdraw() -> None:
+    """Take this process's per-user note away."""
+    with contextlib.suppress(OSError):
+        (_registry() / f"{os.getpid()}.json").unlink(missing_ok=True)
+
+
+def process_start_s() -> tuple[float, int]:
+    """When this process began, UTC [s], and its id."""
+    return psutil.Process().create_time(), os.getpid()
+
+
+def find_launch(run_dir: Path | None) -> RunningLaunch:
+    """The launch of a run folder, or this user's newest that runs.
+
+    Raises:
+        StartError: there is none.
+    """
+    if run_dir is not None:
+        launch = _read(run_dir / LAUNCH_FILE)
+        if launch is None or not _runs(launch):
+            raise StartError(f"--run-dir {run_dir}: no launch runs there. See what does with: swarmctl status")
+        return launch
+    running: list[tuple[float, RunningLaunch]] = []
+    with contextlib.suppress(OSError):
+        for path in _registry().glob("*.json"):
+            launch = _read(path) if path.stat().st_uid == os.getuid() else None
+            if launch is not None and _runs(launch):
+                running.append((launch.started_s, launch))
+            else:
+                path.unlink(missing_ok=True)
+    if not running:
+        raise StartError("no launch runs. Start one with: swarmctl launch")
+    return max(running, key=lambda item: item[0])[1]
+
+
+@contextmanager
+def _joined(launch: RunningLaunch) -> Iterator[ZenohBus]:
+    senders = [agent_name(agent) for agent in range(launch.agents)]
+    bus = ZenohBus(launch.bus, launch.run, OPERATOR, {STATUS: senders, OBSTACLES: [OPERATOR]}, connect_timeout_ms=3000)
+    try:
+        yield bus
+    finally:
+        bus.close()
+
+
+def view_address(launch: RunningLaunch) -> str:
+    """Where the live view is served.
+
+    Raises:
+        StartError: this launch has none.
+    """
+    if not launch.view:
+        raise StartError(f"view: {launch.run} serves none; it was started with telemetry.enabled = false, or just now")
+    return launch.view
+
+
+def read_statuses(launch: RunningLaunch) -> dict[int, StatusMessage]:
+    """Newest status of every agent that says one in time."""
+    with _joined(launch) as bus:
+        return _statuses(bus, range(launch.agents), _ANSWER_S)
+
+
+def command(launch: RunningLaunch, verb: str, agent: int | None) -> dict[int, StatusMessage]:
+    """Ask one agent, or all, for a verb; returns what the asked ones say a second later.
+
+    Raises:
+        StartError: there is no such agent, or none of the asked ones is on the bus.
+    """
+    if agent is not None and not 0 <= agent < launch.agents:
+        raise StartError(f"--agent {agent}: this launch has agents 0 to {launch.agents - 1}")
+    asked = range(launch.agents) if agent is None else range(agent, agent + 1)
+    order = {"verb": verb, "agent": -1 if agent is None else agent, "utc_us": time.time_ns() // 1000}
+    message = msgspec.convert(order, CommandMessage)
+    with _joined(launch) as bus:
+        if not _statuses(bus, asked, _ANSWER_S):
+            raise StartError(f"{verb}: no agent asked is on the bus; see: swarmctl status")
+        for _ in range(5):
+            bus.publish(COMMAND, encode_message(message))
+            time.sleep(_REPEAT_S)
+        bus.receive(STATUS)
+        return _statuses(bus, asked, 1.0)
+
+
+def read_obstacles(launch: RunningLaunch) -> ObstaclesMessage:
+    """The list of obstacles the launch repeats.
+
+    Raises:
+        StartError: it says nothing in time.
+    """
+    with _joined(launch) as bus:
+        return _obstacles(bus, 0)
+
+
+def change_obstacles(
+    launch: RunningLaunch, change: Callable[[tuple[ObstacleMessage, ...]], tuple[ObstacleMessage, ...]]
+) -> ObstaclesMessage:
+    """Replace the list by `change(list)` and wait until the launch repeats the new one.
+
+    Raises:
+        StartError: the launch does not answer.
+    """
+    with _joined(launch) as bus:
+        old = _obstacles(bus, 0)
+        new = ObstaclesMessage(old.version + 1, change(old.obstacles))
+        return _obstacles(bus, new.version, encode_message(new))
+
+
+def obstacle(center: str, radius_m: float, keep_out_m: float, visibility_m: float, velocity: str) -> ObstacleMessage:
+    """An obstacle from what somebody typed; vectors as `north,east,down`, shared frame.
+
+    Raises:
+        ConfigError: a number is missing, not finite or out of range.
+    """
+    problems: list[str] = []
+    vectors = [_vector(key, text, problems) for key, text in (("--center", center), ("--velocity", velocity))]
+    lengths = {"--radius": radius_m, "--keep-out": keep_out_m, "--visibility": visibility_m}
+    for key, value_m in lengths.items():
+        if not 0.0 < value_m < MAX_OBSTACLE_M:
+            problems.append(f"{key} {value_m}: must be > 0 and < {MAX_OBSTACLE_M:.0f} m")
+    if problems:
+        raise ConfigError("obstacle", problems)
+    return ObstacleMessage(vectors[0], radius_m, keep_out_m, visibility_m, vectors[1])
+
+
+def without(known: tuple[ObstacleMessage, ...], number: int) -> tuple[ObstacleMessage, ...]:
+    """The list without one of its members.
+
+    Raises:
+        ConfigError: it has none of that number.
+    """
+    if not 0 <= number < len(known):
+        raise ConfigError("obstacle", [f"remove {number}: there are {len(known)}, counted from 0; see: obstacle list"])
+    return known[:number] + known[number + 1 :]
+
+
+def _vector(key: str, text: str, problems: list[str]) -> tuple[float, float, float]:
+    try:
+        north, east, down = (float(part) for part in text.split(","))
+    except ValueError:
+        problems.append(f"{key} {text!r}: write three numbers, north,east,down, for example 1.5,0,-2")
+        return (0.0, 0.0, 0.0)
+    if not all(math.isfinite(c) and abs(c) < MAX_OBSTACLE_M for c in (north, east, down)):
+        problems.append(f"{key} {text!r}: every number must be finite and within {MAX_OBSTACLE_M:.0f}")
+    return (north, east, down)
+
+
+def _obstacles(bus: ZenohBus, least_version: int, say: bytes | None = None) -> ObstaclesMessage:
+    deadline_s = time.monotonic() + _ANSWER_S
+    while time.monotonic() < deadline_s:
+        if say is not None:
+            bus.publish(OBSTACLES, say)
+        time.sleep(_REPEAT_S)
+        for _, payload in bus.receive(OBSTACLES):
+            message = decode_obstacles(payload)
+            if message is not None and message.version >= least_version:
+                return message
+    raise StartError(f"obstacle: the launch did not answer within {_ANSWER_S:.0f} s; see: swarmctl status")
+
+
+def _statuses(bus: ZenohBus, agents: range, timeout_s: float) -> dict[int, StatusMessage]:
+    """Newest status of each of `agents`, as soon as all have said one or when time is up."""
+    heard: dict[int, StatusMessage] = {}
+    deadline_s = time.monotonic() + timeout_s
+    while time.monotonic() < deadline_s:
+        for sender, payload in bus.receive(STATUS):
+            status = decode_status(payload)
+            if status is not None and status.agent in agents and sender == agent_name(status.agent):
+                heard[status.agent] = status
+        if len(heard) == len(agents):
+            break
+        time.sleep(0.02)
+    return dict(sorted(heard.items()))
+
+
+def _registry() -> Path:
+    return Path(tempfile.gettempdir()) / f"swarmctl-{os.getuid()}"
+
+
+def _private_registry() -> Path:
+    path = _registry()
+    path.mkdir(mode=0o700, exist_ok=True)
+    status = path.lstat()
+    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
+        raise OSError(f"{path} is not private")
+    return path
+
+
+def _read(path: Path) -> RunningLaunch | None:
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=RunningLaunch)
+    except (OSError, msgspec.DecodeError):
+        return None
+
+
+def _runs(launch: RunningLaunch) -> bool:
+    try:
+        return abs(psutil.Process(launch.pid).create_time() - launch.started_s) < _START_TOLERANCE_S
+    except (psutil.Error, ValueError):
+        return False
+
+
+def _replace(path: Path, payload: bytes) -> None:
+    part = path.with_name(f"{path.name}.part")
+    part.write_bytes(payload)
+    part.replace(path)
+
+
+def as_json(statuses: dict[int, StatusMessage]) -> str:
+    """Statuses for programs: a JSON list, one object per agent."""
+    return msgspec.json.format(msgspec.json.encode(list(statuses.values())), indent=2).decode()

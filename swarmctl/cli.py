@@ -1,0 +1,262 @@
+"""Verbs of the command line. No logic: each reads its arguments and calls the module that does the work.
+
+Everything heavy is imported inside the verb that needs it, so that `--help` is quick.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NoReturn
+
+import typer
+
+from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, SwarmError
+
+if TYPE_CHECKING:
+    from swarmctl.links.topics import ObstaclesMessage, StatusMessage
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Fly a swarm of quadrotors with one distributed-MPC agent beside every autopilot.",
+)
+obstacle_app = typer.Typer(no_args_is_help=True, help="Change the obstacles of a running launch.")
+app.add_typer(obstacle_app, name="obstacle")
+
+ConfigPath = Annotated[Path | None, typer.Argument(help="TOML file; without one the defaults, the thesis circle.")]
+Agents = Annotated[int | None, typer.Option("--agents", help="Number of agents, over swarm.agents.")]
+Duration = Annotated[float | None, typer.Option("--duration", help="Length of the mission [s].")]
+Seed = Annotated[int | None, typer.Option("--seed", help="Seed of everything random.")]
+Set = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override any key; may be repeated.")]
+NewRunDir = Annotated[Path | None, typer.Option("--run-dir", help="Folder to write; default runs/<UTC>-<name>.")]
+View = Annotated[bool | None, typer.Option("--view/--no-view", help="Open the viewer's window.")]
+RunningDir = Annotated[Path | None, typer.Option("--run-dir", help="Run folder of the launch; default the newest.")]
+OneAgent = Annotated[int | None, typer.Option("--agent", help="One agent; default all.")]
+Folder = Annotated[Path, typer.Argument(help="Run folder.")]
+
+
+def main() -> None:
+    """Run the command line; expected errors become words and an exit code, unexpected ones keep their traceback."""
+    code = _run_app()
+    try:
+        sys.stdout.flush()
+    except OSError:  # nobody reads any more; without this the interpreter would change the exit code
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    sys.exit(code)
+
+
+def _run_app() -> int:
+    try:
+        code = app(standalone_mode=False)
+    except SwarmError as error:
+        print(error, file=sys.stderr)
+        return error.exit_code
+    except (typer.Abort, KeyboardInterrupt):
+        return EXIT_INTERRUPTED
+    except Exception as error:
+        show = getattr(error, "show", None)  # click's usage errors, whichever click typer brings
+        if show is None or not hasattr(error, "exit_code"):
+            raise
+        show()
+        return EXIT_USAGE
+    return code if isinstance(code, int) else EXIT_OK
+
+
+@app.command()
+def launch(
+    config: ConfigPath = None,
+    agents: Agents = None,
+    duration: Duration = None,
+    run_dir: NewRunDir = None,
+    seed: Seed = None,
+    sets: Set = None,
+    view: View = None,
+) -> int:
+    """Bring up simulator, agents, bus and view, and fly. Ctrl-C lands, a second one ends everything at once."""
+    from swarmctl.config import load
+    from swarmctl.launch import LaunchOptions
+    from swarmctl.launch import launch as fly
+
+    options = LaunchOptions(run_dir, _has_display() if view is None else view)
+    return fly(load(config, _overrides(agents, duration, seed, sets)), options)
+
+
+@app.command()
+def simulate(
+    config: ConfigPath = None,
+    agents: Agents = None,
+    duration: Duration = None,
+    run_dir: NewRunDir = None,
+    seed: Seed = None,
+    sets: Set = None,
+    view: View = None,
+) -> NoReturn:
+    """Fly the same agents in one process on a simulated clock: deterministic, faster than real time."""
+    arguments = [] if config is None else [str(config)]
+    for name, value in (("--agents", agents), ("--duration", duration), ("--run-dir", run_dir), ("--seed", seed)):
+        arguments += [] if value is None else [f"{name}={value}"]
+    arguments += [f"--set={item}" for item in sets or ()]
+    arguments += [] if view is None else ["--view" if view else "--no-view"]
+    sys.stdout.flush()
+    os.execv(sys.executable, [sys.executable, "-m", "sitl.lockstep", *arguments])
+
+
+@app.command()
+def agent(
+    config: Annotated[Path, typer.Option("--config", help="Resolved TOML file.")],
+    number: Annotated[int, typer.Option("--id", help="Number of this agent, from 0.")],
+    run: Annotated[str, typer.Option("--run", help="Name of the run on the bus.")],
+    bus: Annotated[str, typer.Option("--bus", help="Endpoint of the router.")],
+    run_dir: Annotated[Path, typer.Option("--run-dir", help="Folder to record into.")],
+    fd: Annotated[int | None, typer.Option("--fd", help="Inherited, bound UDP socket of the vehicle.")] = None,
+) -> int:
+    """One agent beside one autopilot. `launch` starts them; on a companion computer start it yourself."""
+    from swarmctl.lifeline import PARENT_ENV, die_with_parent
+    from swarmctl.runner import run_agent
+
+    if PARENT_ENV in os.environ:
+        die_with_parent(signal.SIGTERM)
+    return run_agent(config, number, run, bus, run_dir, fd)
+
+
+@app.command()
+def status(
+    run_dir: RunningDir = None,
+    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+) -> int:
+    """Show every agent of a running launch."""
+    from swarmctl import attach
+
+    launch = attach.find_launch(run_dir)
+    statuses = attach.read_statuses(launch)
+    print(attach.as_json(statuses)) if as_json else _show(statuses, range(launch.agents))
+    return EXIT_OK
+
+
+@app.command()
+def hold(run_dir: RunningDir = None, agent: OneAgent = None) -> int:
+    """Brake and stay."""
+    return _command("hold", run_dir, agent)
+
+
+@app.command()
+def resume(run_dir: RunningDir = None, agent: OneAgent = None) -> int:
+    """Go on with the mission after hold."""
+    return _command("resume", run_dir, agent)
+
+
+@app.command()
+def land(run_dir: RunningDir = None, agent: OneAgent = None) -> int:
+    """Spread and land."""
+    return _command("land", run_dir, agent)
+
+
+@app.command()
+def rtl(run_dir: RunningDir = None, agent: OneAgent = None) -> int:
+    """Hand over to the autopilot's return to launch."""
+    return _command("rtl", run_dir, agent)
+
+
+@obstacle_app.command("list")
+def obstacle_list(run_dir: RunningDir = None) -> int:
+    """Show the obstacles agents know of."""
+    from swarmctl import attach
+
+    _show_obstacles(attach.read_obstacles(attach.find_launch(run_dir)))
+    return EXIT_OK
+
+
+@obstacle_app.command("add")
+def obstacle_add(
+    center: Annotated[str, typer.Option("--center", metavar="N,E,D", help="Centre, shared NED [m].")],
+    radius: Annotated[float, typer.Option("--radius", help="Physical radius [m].")] = 1.0,
+    keep_out: Annotated[float | None, typer.Option("--keep-out", help="From the centre [m]; radius + 0.75.")] = None,
+    visibility: Annotated[float, typer.Option("--visibility", help="Agents see it from closer than this [m].")] = 3.0,
+    velocity: Annotated[str, typer.Option("--velocity", metavar="N,E,D", help="[m/s].")] = "0,0,0",
+    run_dir: RunningDir = None,
+) -> int:
+    """Put a sphere into a running launch."""
+    from swarmctl import attach
+
+    obstacle = attach.obstacle(center, radius, radius + 0.75 if keep_out is None else keep_out, visibility, velocity)
+    launch = attach.find_launch(run_dir)
+    _show_obstacles(attach.change_obstacles(launch, lambda known: (*known, obstacle)))
+    return EXIT_OK
+
+
+@obstacle_app.command("remove")
+def obstacle_remove(
+    number: Annotated[int, typer.Argument(help="As `obstacle list` counts, from 0.")], run_dir: RunningDir = None
+) -> int:
+    """Take a sphere out of a running launch."""
+    from swarmctl import attach
+
+    launch = attach.find_launch(run_dir)
+    _show_obstacles(attach.change_obstacles(launch, lambda known: attach.without(known, number)))
+    return EXIT_OK
+
+
+@app.command()
+def view(run_dir: RunningDir = None) -> int:
+    """Open the live view of a running launch."""
+    from swarmctl import attach
+    from swarmctl.telemetry.recordings import open_viewer
+
+    open_viewer(attach.view_address(attach.find_launch(run_dir)))
+    return EXIT_OK
+
+
+@app.command()
+def replay(folder: Folder) -> int:
+    """Open the recording of a run."""
+    from swarmctl.telemetry.recordings import RECORDING, open_viewer
+
+    open_viewer(str(folder / RECORDING))
+    return EXIT_OK
+
+
+@app.command()
+def report(folder: Folder) -> int:
+    """Write the report of a run again, and finish a run that was cut off."""
+    from swarmctl.summary import rewrite_report
+
+    print(rewrite_report(folder))
+    return EXIT_OK
+
+
+def _command(verb: str, run_dir: Path | None, agent: int | None) -> int:
+    from swarmctl import attach
+
+    launch = attach.find_launch(run_dir)
+    _show(attach.command(launch, verb, agent), range(launch.agents) if agent is None else range(agent, agent + 1))
+    return EXIT_OK
+
+
+def _overrides(agents: int | None, duration: float | None, seed: int | None, sets: list[str] | None) -> list[str]:
+    """Options as `--set` items, the named ones last: they win."""
+    named = (("swarm.agents", agents), ("mission.duration_s", duration), ("seed", seed))
+    return [*(sets or ()), *(f"{key}={value}" for key, value in named if value is not None)]
+
+
+def _has_display() -> bool:
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def _show(statuses: dict[int, StatusMessage], agents: range) -> None:
+    from swarmctl.table import AgentView, print_statuses
+
+    print_statuses([AgentView(number, statuses.get(number)) for number in agents])
+
+
+def _show_obstacles(message: ObstaclesMessage) -> None:
+    print(f"version {message.version}, {len(message.obstacles)} obstacles, shared NED [m]")
+    for number, item in enumerate(message.obstacles):
+        center = ", ".join(f"{c:.2f}" for c in item.center_ned_m)
+        print(
+            f"{number}: centre {center}  radius {item.radius_m}  keep-out {item.keep_out_m}  seen {item.visibility_m}"
+        )

@@ -1,0 +1,404 @@
+"""One frozen tree for a whole run, read from TOML. Config is refused, not repaired: all problems at once.
+
+The parameter classes live beside the code they feed; this module composes them, checks what only the whole can tell,
+and writes the resolved copy. It does not open sockets or start anything.
+"""
+
+from __future__ import annotations
+
+import difflib
+import itertools
+import json
+import math
+import re
+import tomllib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, ValidationError
+
+from swarmctl.agent import AgentParams
+from swarmctl.control.controller import ControllerParams
+from swarmctl.control.mission import MissionParams
+from swarmctl.control.model import VehicleModelParams
+from swarmctl.control.separation import SeparationParams
+from swarmctl.core.params import Params, Vec3
+from swarmctl.errors import ConfigError
+from swarmctl.links.transport import Endpoint, parse_url
+from swarmctl.telemetry.referee import ObstacleRule, Rules
+
+MAX_AGENTS = 100
+_PAIRS_SHOWN = 3
+_BARE_KEY = re.compile(r"^[A-Za-z0-9_-]+$")
+
+
+class SwarmParams(Params):
+    """Who flies and in which frame."""
+
+    agents: int = Field(3, ge=1, le=MAX_AGENTS)
+    origin_lat_deg: float = Field(47.397742, ge=-90, le=90)  # shared origin of every position in this file
+    origin_lon_deg: float = Field(8.545594, ge=-180, le=180)
+    origin_alt_m: float = Field(489.4, ge=-500, le=9000)  # above mean sea level
+
+
+class StartParams(Params):
+    """Where each agent waits, at rest, until the mission begins; `positions_ned_m` wins over the line."""
+
+    positions_ned_m: tuple[Vec3, ...] = Field((), strict=False)
+    center_ned_m: Vec3 = (0.0, 0.0, 0.0)
+    direction_ned: Vec3 = (1.0, 0.0, 0.0)
+    spacing_m: float = Field(1.0, gt=0, le=100)
+
+
+class VehicleParams(Params):
+    """One autopilot."""
+
+    sysid: int = Field(ge=1, le=255)
+    url: str
+
+
+class SitlParams(Params):
+    """The built-in simulator that launch starts; switched off to fly vehicles somebody else runs."""
+
+    enabled: bool = True
+    preset: Literal["thesis", "x500"] = "thesis"
+    ground_z_m: float = Field(2.0, ge=-1000, le=1000)  # height of the ground below the shared origin, NED z
+    start: Literal["ground", "air"] = "ground"
+    mass_scale: float = Field(1.0, ge=0.3, le=1.9)  # true mass over the preset's, unknown to the bridge
+    link_latency_ms: float = Field(0.0, ge=0, le=1000)  # lockstep only
+    physics_hz: int = Field(250, ge=50, le=1000)
+
+
+class BusParams(Params):
+    """Zenoh, and the seeded faults of the lockstep bus."""
+
+    lease_ms: int = Field(1500, ge=500, le=10000)  # a silent link is declared dead after this
+    delay_ms: float = Field(0.0, ge=0, le=5000)  # lockstep only, on top of one tick
+    loss_01: float = Field(0.0, ge=0, le=1)  # lockstep only
+
+
+class TelemetryParams(Params):
+    """The one process that owns rerun."""
+
+    enabled: bool = True
+    port: int = Field(9876, ge=1, le=65535)  # loopback; the next free one is used when it is taken
+    rate_hz: float = Field(10.0, gt=0, le=50)
+
+
+class ObstacleParams(Params):
+    """A sphere that agents see only from closer than `visibility_m`."""
+
+    center_ned_m: Vec3
+    radius_m: float = Field(1.0, gt=0, le=1000)
+    keep_out_m: float = Field(1.75, gt=0, le=1000)  # constraint radius from the centre, thesis 1 + 2.5 x 0.3
+    visibility_m: float = Field(3.0, gt=0, le=10000)
+    vel_ned_m_s: Vec3 = (0.0, 0.0, 0.0)
+
+
+class LimitParams(Params):
+    """What the referee calls a violation."""
+
+    min_separation_m: float = Field(0.85, ge=0, le=100)
+    obstacle_margin_m: float = Field(0.05, ge=0, le=10)  # allowed intrusion into keep_out_m
+    late_ticks_01: float = Field(0.2, ge=0, le=1)  # a gross failure of timing; figures are in summary.json
+
+
+class Config(Params):
+    """A whole run."""
+
+    name: str = Field("swarm", pattern=r"^[A-Za-z0-9_-]{1,40}$")
+    seed: int = Field(1, ge=0, le=2**31 - 1)
+    swarm: SwarmParams = SwarmParams()
+    start: StartParams = StartParams()
+    mission: MissionParams = MissionParams()
+    controller: ControllerParams = ControllerParams()
+    separation: SeparationParams = SeparationParams()
+    vehicle_model: VehicleModelParams = VehicleModelParams()
+    agent: AgentParams = AgentParams()
+    vehicles: tuple[VehicleParams, ...] = Field((), strict=False)
+    sitl: SitlParams = SitlParams()
+    bus: BusParams = BusParams()
+    telemetry: TelemetryParams = TelemetryParams()
+    obstacles: tuple[ObstacleParams, ...] = Field((), strict=False)
+    limits: LimitParams = LimitParams()
+
+    def starts_ned_m(self) -> tuple[tuple[float, float, float], ...]:
+        """Start position of every agent, shared NED [m]."""
+        if self.start.positions_ned_m:
+            return self.start.positions_ned_m[: self.swarm.agents]
+        norm = math.sqrt(sum(c * c for c in self.start.direction_ned))
+        unit = tuple(c / norm for c in self.start.direction_ned)
+        offsets = [(i - (self.swarm.agents - 1) / 2) * self.start.spacing_m for i in range(self.swarm.agents)]
+        x, y, z = self.start.center_ned_m
+        return tuple((x + o * unit[0], y + o * unit[1], z + o * unit[2]) for o in offsets)
+
+    def sysids(self) -> tuple[int, ...]:
+        """MAVLink system id of every agent's vehicle."""
+        if self.vehicles:
+            return tuple(v.sysid for v in self.vehicles[: self.swarm.agents])
+        return tuple(i + 1 for i in range(self.swarm.agents))
+
+    def rules(self, mode: Literal["realtime", "lockstep"] = "realtime") -> Rules:
+        """What the referee judges this run by."""
+        return Rules(
+            agents=self.swarm.agents,
+            required_separation_m=self.limits.min_separation_m,
+            obstacles=tuple(ObstacleRule(o.center_ned_m, o.keep_out_m, o.vel_ned_m_s) for o in self.obstacles),
+            obstacle_margin_m=self.limits.obstacle_margin_m,
+            late_ticks_01=self.limits.late_ticks_01,
+            mode=mode,
+            duration_s=self.mission.duration_s,
+        )
+
+
+def load(path: Path | None, overrides: Sequence[str] = ()) -> Config:
+    """Read, override and check a configuration.
+
+    Args:
+        path: a TOML file; None for the defaults.
+        overrides: `key.sub=value` items, values in TOML syntax (bare words are strings); list items by index.
+
+    Raises:
+        ConfigError: every problem found, each with key, value, allowed range and fix.
+    """
+    source = str(path) if path else "defaults"
+    tree = _read(path)
+    problems = [p for item in overrides for p in _override(tree, item)]
+    if problems:
+        raise ConfigError(source, problems)
+    try:
+        config = Config.model_validate(tree)
+    except ValidationError as error:
+        raise ConfigError(source, [_explain(dict(e)) for e in error.errors()]) from error
+    problems = list(_whole(config))
+    if problems:
+        raise ConfigError(source, problems)
+    return config
+
+
+def dump(config: Config) -> str:
+    """The resolved configuration as TOML that `load` reads back to the same tree."""
+    lines: list[str] = []
+    _dump_table(config.model_dump(), "", lines)
+    return "\n".join(lines) + "\n"
+
+
+def _read(path: Path | None) -> dict[str, Any]:
+    if path is None:
+        return {}
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ConfigError(str(path), ["no such file. Give the path of a TOML file, for example configs/"]) from error
+    except (OSError, UnicodeDecodeError) as error:
+        raise ConfigError(str(path), [f"can't be read: {error}"]) from error
+    except (tomllib.TOMLDecodeError, RecursionError) as error:
+        raise ConfigError(str(path), [f"not TOML: {error}"]) from error
+
+
+def _override(tree: dict[str, Any], item: str) -> list[str]:
+    key, equals, text = item.partition("=")
+    parts = key.strip().split(".")
+    if not equals or not all(parts):
+        return [f"--set {item!r}: write it as key.sub=value"]
+    value = _value(text)
+    node: Any = tree
+    for part, following in itertools.pairwise(parts):
+        if isinstance(node, list):
+            if not part.isdigit() or int(part) >= len(node):
+                return [f"--set {key}: {part!r} is not an index of a list of {len(node)}"]
+            node = node[int(part)]
+        elif isinstance(node, dict):
+            node = node.setdefault(part, [] if following.isdigit() else {})
+        else:
+            return [f"--set {key}: {part!r} is inside a value, not a section"]
+    last = parts[-1]
+    if isinstance(node, dict):
+        node[last] = value
+    elif isinstance(node, list) and last.isdigit() and int(last) < len(node):
+        node[int(last)] = value
+    else:
+        return [f"--set {key}: no such place"]
+    return []
+
+
+def _value(text: str) -> Any:
+    """A TOML value; anything that is not exactly one is the text itself."""
+    try:
+        tree = tomllib.loads(f"v = {text}")
+    except (tomllib.TOMLDecodeError, RecursionError):
+        return text
+    return tree["v"] if tree.keys() == {"v"} else text
+
+
+def _explain(error: dict[str, Any]) -> str:
+    """One line with key, value, allowed range and fix."""
+    location = [str(part) for part in error["loc"]]
+    key = ".".join(location)
+    value = error.get("input")
+    if error["type"] == "extra_forbidden":
+        known = _keys_at(location[:-1])
+        close = difflib.get_close_matches(location[-1], known, 1)
+        hint = f"did you mean {close[0]!r}?" if close else f"known here: {', '.join(sorted(known))}"
+        return f"{key} = {value!r}: unknown key; {hint}"
+    if error["type"] == "missing":
+        return f"{key}: missing; add it"
+    if error["type"] == "finite_number":
+        return f"{key} = {value!r}: not a finite number; give a real one{_range_of(location)}"
+    return f"{key} = {value!r}: {error['msg'].lower()}{_range_of(location)}"
+
+
+def _field_at(location: Sequence[str]) -> Any:
+    model: Any = Config
+    field: Any = None
+    for part in location:
+        if part.isdigit():
+            continue
+        field = getattr(model, "model_fields", {}).get(part)
+        if field is None:
+            return None
+        model = _model_of(field.annotation)
+    return field
+
+
+def _model_of(annotation: Any) -> Any:
+    if isinstance(annotation, type) and issubclass(annotation, Params):
+        return annotation
+    for argument in getattr(annotation, "__args__", ()):
+        found = _model_of(argument)
+        if found is not None:
+            return found
+    return None
+
+
+def _keys_at(location: Sequence[str]) -> list[str]:
+    model = Config if not location else _model_of(getattr(_field_at(location), "annotation", None))
+    return list(getattr(model, "model_fields", {}))
+
+
+def _range_of(location: Sequence[str]) -> str:
+    field = _field_at(location)
+    bounds: dict[str, Any] = {}
+    for rule in getattr(field, "metadata", ()):
+        bounds.update({n: getattr(rule, n) for n in ("ge", "gt", "le", "lt") if getattr(rule, n, None) is not None})
+    signs = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
+    text = " and ".join(f"{signs[name]} {bound}" for name, bound in bounds.items())
+    return f"; allowed: {text}" if text else ""
+
+
+def _whole(config: Config) -> Iterator[str]:
+    """What no single key can tell."""
+    agents = config.swarm.agents
+    listed = len(config.start.positions_ned_m)
+    if listed and listed < agents:
+        yield f"start.positions_ned_m: {listed} positions for swarm.agents = {agents}; list one for each agent"
+    if not listed and not any(config.start.direction_ned):
+        yield "start.direction_ned = (0, 0, 0): give the line of start positions a direction"
+    elif not (listed and listed < agents):
+        yield from _starts_apart(config)
+    yield from _vehicle_problems(config)
+    yield from config.mission.problems(agents)
+    if config.separation.radius_m < config.limits.min_separation_m:
+        yield (
+            f"limits.min_separation_m = {config.limits.min_separation_m}: larger than separation.radius_m = "
+            f"{config.separation.radius_m}; agents would be judged by more than they keep. Lower it or raise the radius"
+        )
+
+
+def _starts_apart(config: Config) -> Iterator[str]:
+    starts = config.starts_ned_m()
+    pairs = ((math.dist(a, b), i, j) for (i, a), (j, b) in itertools.combinations(enumerate(starts), 2))
+    close = sorted(pair for pair in pairs if pair[0] < config.separation.radius_m)
+    for distance_m, i, j in close[:_PAIRS_SHOWN]:
+        yield (
+            f"start: agents {i} and {j} would wait {distance_m:.2f} m apart; separation.radius_m is "
+            f"{config.separation.radius_m}. Raise start.spacing_m or move them"
+        )
+    if len(close) > _PAIRS_SHOWN:
+        yield f"start: {len(close) - _PAIRS_SHOWN} more pairs of agents would wait too close together"
+    if config.sitl.enabled and config.sitl.start == "ground":
+        for i, start in enumerate(starts):
+            if start[2] > config.sitl.ground_z_m - 0.5:
+                yield (
+                    f"start: agent {i} waits at z = {start[2]} m, less than 0.5 m above the ground at "
+                    f"sitl.ground_z_m = {config.sitl.ground_z_m} (NED, down is positive)"
+                )
+
+
+def _vehicle_problems(config: Config) -> Iterator[str]:
+    agents = config.swarm.agents
+    if not config.vehicles:
+        if not config.sitl.enabled:
+            yield "vehicles: empty while sitl.enabled = false; list one [[vehicles]] with sysid and url for each agent"
+        return
+    if config.sitl.enabled:
+        yield (
+            "vehicles: listed while sitl.enabled = true; set sitl.enabled = false to fly them, "
+            "or remove them to fly the built-in simulator"
+        )
+    if len(config.vehicles) < agents:
+        yield f"vehicles: {len(config.vehicles)} listed for swarm.agents = {agents}; list one for each agent"
+    seen_sysids: dict[int, int] = {}
+    links: list[Endpoint | None] = []
+    for i, vehicle in enumerate(config.vehicles):
+        try:
+            link = parse_url(vehicle.url)
+        except ValueError as error:
+            yield f"vehicles.{i}.url = {error}"
+            link = None
+        rivals = [k for k, other in enumerate(links) if link and other and _same_place(link, other)]
+        links.append(link)
+        if rivals:
+            yield (
+                f"vehicles.{i}.url = {vehicle.url!r}: same port as vehicles.{rivals[0]}; "
+                "every vehicle needs a link of its own"
+            )
+        if vehicle.sysid in seen_sysids:
+            yield (
+                f"vehicles.{i}.sysid = {vehicle.sysid}: same as vehicles.{seen_sysids[vehicle.sysid]}; "
+                "give every autopilot its own MAV_SYS_ID"
+            )
+        seen_sysids.setdefault(vehicle.sysid, i)
+
+
+def _same_place(a: Endpoint, b: Endpoint) -> bool:
+    """Whether two links would meet: one serial device, one local port, or one remote address."""
+    if a.scheme != b.scheme:
+        return False
+    if a.scheme == "serial":
+        return a.where == b.where
+    if a.scheme == "udpin" and "0.0.0.0" in (a.where, b.where):
+        return a.number == b.number
+    return (a.where, a.number) == (b.where, b.number)
+
+
+def _dump_table(table: dict[str, Any], prefix: str, lines: list[str]) -> None:
+    nested: list[tuple[str, Any]] = []
+    for key, value in table.items():
+        if isinstance(value, dict) or (isinstance(value, (list, tuple)) and value and isinstance(value[0], dict)):
+            nested.append((key, value))
+        elif value is not None:
+            lines.append(f"{_key(key)} = {_toml(value)}")
+    for key, value in nested:
+        name = f"{prefix}{_key(key)}"
+        for item in [value] if isinstance(value, dict) else value:
+            header = f"[{name}]" if isinstance(value, dict) else f"[[{name}]]"
+            lines.extend(["", header])
+            _dump_table(item, f"{name}.", lines)
+
+
+def _key(key: str) -> str:
+    return key if _BARE_KEY.match(key) else _toml(key)
+
+
+def _toml(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, (int, float)):
+        return repr(value)
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(_toml(v) for v in value) + "]"
+    raise TypeError(f"no TOML for {type(value).__name__}")

@@ -1,0 +1,96 @@
+"""Offset-free flight: estimates of the hover thrust and of a constant disturbance acceleration.
+
+The observer compares measured velocity with the velocity that the *measured* attitude and the sent thrust explain, so
+attitude lag does not look like wind. What is left vertically is slowly moved into the hover thrust: a wrong mass or
+thrust scale then costs no altitude, and horizontal gains (thrust over mass) become right as well.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+
+from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned
+from swarmctl.core.params import Params
+from swarmctl.core.types import Array, VehicleState
+
+
+class DisturbanceParams(Params):
+    """Bandwidths of the estimators."""
+
+    enabled: bool = True
+    bandwidth_rad_s: float = Field(2.0, gt=0, le=50)
+    limit_m_s2: float = Field(4.0, gt=0, le=50)
+    hover_time_s: float = Field(2.0, gt=0, le=600)  # time constant of the hover-thrust estimate
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """What is known beyond the nominal model."""
+
+    disturbance_ned_m_s2: Array  # (3,)
+    hover_thrust_01: float
+
+
+class DisturbanceObserver:
+    """Second-order observer on velocity, per axis, and an integrating hover-thrust estimate.
+
+    v' = a_model + d + l1 (v - v_hat), d' = l2 (v - v_hat) with both poles at `bandwidth_rad_s`.
+    """
+
+    def __init__(self, params: DisturbanceParams, hover_thrust_01: float) -> None:
+        self._params = params
+        self._hover_01 = hover_thrust_01
+        self._hover_min, self._hover_max = 0.4 * hover_thrust_01, min(0.95, 2.2 * hover_thrust_01)
+        self._disturbance = np.zeros(3)
+        self._velocity: Array | None = None
+        self._t_us = 0
+
+    @property
+    def estimate(self) -> Estimate:
+        return Estimate(self._disturbance, self._hover_01)
+
+    def reset(self) -> None:
+        """Forget velocity and disturbance (not the hover thrust): the vehicle was flown by somebody else."""
+        self._velocity = None
+        self._disturbance = np.zeros(3)
+
+    def update(self, state: VehicleState, thrust_01: float) -> Estimate:
+        """Take in one new sample; `thrust_01` is what has acted since the last one."""
+        if not self._params.enabled:
+            return self.estimate
+        if self._velocity is None or not 0 < state.t_us - self._t_us < 200_000:
+            self._velocity, self._t_us = state.vel_ned_m_s, state.t_us
+            return self.estimate
+        dt_s = (state.t_us - self._t_us) * 1e-6
+        self._t_us = state.t_us
+        specific_m_s2 = thrust_01 * GRAVITY_M_S2 / self._hover_01
+        model = -specific_m_s2 * body_z_ned(state.q_nb)
+        model[2] += GRAVITY_M_S2
+        predicted = self._velocity + dt_s * (model + self._disturbance)
+        innovation = state.vel_ned_m_s - predicted
+        pole = self._params.bandwidth_rad_s
+        self._velocity = predicted + min(1.0, 2.0 * pole * dt_s) * innovation
+        disturbance = self._disturbance + dt_s * pole * pole * innovation
+        limit = self._params.limit_m_s2
+        self._disturbance = np.clip(disturbance, -limit, limit)
+        self._move_into_hover(dt_s, thrust_01)
+        return self.estimate
+
+    def learn_hover(self, thrust_01: float) -> None:
+        """Take over the vertical thrust the autopilot itself hovers with, before the bridge flies."""
+        if self._params.enabled:
+            self._hover_01 += 0.2 * (min(self._hover_max, max(self._hover_min, thrust_01)) - self._hover_01)
+
+    def _move_into_hover(self, dt_s: float, thrust_01: float) -> None:
+        """Explain the vertical remainder by hover thrust: thrust g / hover must grow by -d_z."""
+        share = dt_s / self._params.hover_time_s
+        down = float(self._disturbance[2])
+        specific = max(1.0, thrust_01 * GRAVITY_M_S2 / self._hover_01)
+        factor = 1.0 + share * down / specific
+        hover = min(self._hover_max, max(self._hover_min, self._hover_01 * factor))
+        moved = specific * (hover / self._hover_01 - 1.0)
+        self._hover_01 = hover
+        self._disturbance = self._disturbance - np.array([0.0, 0.0, moved])

@@ -1,0 +1,72 @@
+"""The thesis' position cascade (ch. 2): three PIDs from position errors to pitch, roll and thrust.
+
+The attitude PIDs below it belong to the autopilot. Derivative on measurement for steps (no derivative kick),
+derivative of the error for trajectories; integrals are clamped.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from swarmctl.control.mpc import Start
+from swarmctl.core.frames import GRAVITY_M_S2
+from swarmctl.core.params import Params, Vec3
+from swarmctl.core.types import Array, Plan, PlanStatus, Reference
+
+
+class PidParams(Params):
+    """Gains (kP, kI, kD) in the thesis' signs; the defaults are its trajectory set."""
+
+    derivative: Literal["error", "measurement"] = "error"
+    x: Vec3 = (-0.25, -0.001, -0.3)  # m -> rad of pitch
+    y: Vec3 = (0.05, 0.0, 0.45)  # m -> rad of roll
+    z: Vec3 = (-3.5, -0.001, -4.0)  # m -> m/s2 of thrust over mass
+    tilt_max_rad: float = Field(0.5, gt=0, lt=1.5)
+    thrust_max_m_s2: float = Field(20.0, gt=9.9, le=100)
+    integral_max: float = Field(5.0, ge=0, le=1e3)  # m s
+    dt_s: float = Field(0.02, gt=0.001, le=0.5)
+    path_steps: int = Field(40, ge=2, le=200)  # length of the shared path, at constant velocity
+
+
+class PidController:
+    """Keeps integrals and last errors between ticks."""
+
+    def __init__(self, params: PidParams) -> None:
+        self._params = params
+        self._gains = np.array([params.x, params.y, params.z])  # (3 axes, 3 gains)
+        self._integral = np.zeros(3)
+        self._last: Array | None = None
+
+    @property
+    def dt_us(self) -> int:
+        return round(self._params.dt_s * 1e6)
+
+    @property
+    def steps(self) -> int:
+        return self._params.path_steps
+
+    def reset(self) -> None:
+        """Forget the past: somebody else has flown."""
+        self._integral, self._last = np.zeros(3), None
+
+    def plan(self, start: Start, reference: Reference) -> Plan:
+        """Virtual controls of this tick; the path is the own velocity, continued."""
+        p = self._params
+        error = reference.pos_ned_m[0] - start.pos_ned_m
+        watched = error if p.derivative == "error" else -start.pos_ned_m
+        rate = np.zeros(3) if self._last is None else (watched - self._last) / p.dt_s
+        self._last = watched
+        self._integral = np.clip(self._integral + error * p.dt_s, -p.integral_max, p.integral_max)
+        out = self._gains[:, 0] * error + self._gains[:, 1] * self._integral + self._gains[:, 2] * rate
+        pitch, roll = (max(-p.tilt_max_rad, min(p.tilt_max_rad, float(a))) for a in out[:2])
+        thrust = min(p.thrust_max_m_s2, max(0.0, GRAVITY_M_S2 + float(out[2])))
+        virtual = np.array([math.sin(pitch) * math.cos(roll), -math.sin(roll), thrust])
+        t_s = np.arange(p.path_steps + 1)[:, None] * p.dt_s
+        pos = start.pos_ned_m + t_s * start.vel_ned_m_s
+        vel = np.tile(start.vel_ned_m_s, (p.path_steps + 1, 1))
+        held = np.tile(virtual, (p.path_steps, 1))
+        return Plan(PlanStatus.OK, start.t_us, self.dt_us, pos, vel, held, 0, 0, 0.0, 0.0, 0.0)

@@ -1,0 +1,118 @@
+"""The solver seam: minimise 1/2 x'Px + q'x subject to l <= Ax <= u, with a fixed sparsity pattern.
+
+OSQP is set up once and updated in place; every status is looked at. It is first order: callers judge a solution by
+residuals in their own units, not by its status alone. Wall-clock time must not influence the iterates, or runs would
+not repeat, hence the fixed `adaptive_rho_interval`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+import osqp
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy import sparse
+
+from swarmctl.core.params import Params
+from swarmctl.core.types import Array
+
+INFINITY = 1e20  # what OSQP takes for no bound
+_SOLVED = osqp.SolverStatus.OSQP_SOLVED
+_UNFINISHED = (osqp.SolverStatus.OSQP_SOLVED_INACCURATE, osqp.SolverStatus.OSQP_MAX_ITER_REACHED)
+
+
+class QpParams(Params):
+    """OSQP settings; tools measure them on recorded problems."""
+
+    eps: float = Field(2e-3, gt=0, le=0.1)  # absolute and relative; variables and rows are scaled to about 1
+    max_iterations: int = Field(1500, ge=10, le=100000)
+    polish: bool = True  # one more linear solve on the active set: exact for a correct guess
+    rho: float = Field(0.01, gt=0, le=1e6)
+    adaptive_rho_interval: int = Field(50, ge=1, le=10000)  # iterations, never seconds
+    check_every: int = Field(10, ge=1, le=1000)
+
+
+@dataclass(frozen=True, slots=True)
+class QpSolution:
+    """`x` is None when nothing came back; unless `exact` it is an unfinished iterate that the caller must judge."""
+
+    x: Array | None
+    exact: bool
+    status: str
+    iterations: int
+
+
+class QpSolver(Protocol):
+    """A solver of one problem family; called with all values, in the pattern it was built with."""
+
+    def solve(self, p_values: Array, q: Array, a_values: Array, lower: Array, upper: Array) -> QpSolution:
+        """Solve for new values, warm-started from the last solution. Never raises for an infeasible problem."""
+
+
+class OsqpSolver:
+    """OSQP behind the seam.
+
+    Args:
+        p_pattern: (n, n) boolean, upper triangle used.
+        a_pattern: (m, n) boolean.
+        params: settings.
+
+    `p_values` and `a_values` of `solve` are the entries of the patterns in column-major order; see `pattern_index`.
+    """
+
+    def __init__(self, p_pattern: NDArray[np.bool_], a_pattern: NDArray[np.bool_], params: QpParams) -> None:
+        self._p = sparse.csc_matrix(np.triu(p_pattern).astype(float))
+        self._a = sparse.csc_matrix(a_pattern.astype(float))
+        self._params = params
+        self._solver: osqp.OSQP | None = None
+
+    def solve(self, p_values: Array, q: Array, a_values: Array, lower: Array, upper: Array) -> QpSolution:
+        if self._solver is None:
+            return self._cold(p_values, q, a_values, lower, upper)
+        self._solver.update(Px=p_values, q=q, Ax=a_values, l=lower, u=upper)
+        solution = self._run()
+        # one "infeasible" from a warm start is not trusted (false ones are known): once more from scratch
+        return solution if solution.x is not None else self._cold(p_values, q, a_values, lower, upper)
+
+    def _cold(self, p_values: Array, q: Array, a_values: Array, lower: Array, upper: Array) -> QpSolution:
+        p, a, params = self._p.copy(), self._a.copy(), self._params
+        p.data, a.data = p_values.copy(), a_values.copy()
+        self._solver = osqp.OSQP()
+        self._solver.setup(
+            p,
+            q,
+            a,
+            lower,
+            upper,
+            verbose=False,
+            eps_abs=params.eps,
+            eps_rel=params.eps,
+            max_iter=params.max_iterations,
+            polishing=params.polish,
+            rho=params.rho,
+            adaptive_rho=True,
+            adaptive_rho_interval=params.adaptive_rho_interval,
+            check_termination=params.check_every,
+            scaling=0,
+            check_dualgap=False,  # with slack rows far from active it never closes; residuals are judged by the caller
+            warm_starting=True,
+        )
+        return self._run()
+
+    def _run(self) -> QpSolution:
+        assert self._solver is not None
+        result = self._solver.solve(raise_error=False)
+        status = result.info.status_val
+        usable = status in (_SOLVED, *_UNFINISHED) and bool(np.isfinite(result.x).all())
+        x = result.x if usable else None
+        return QpSolution(x, status == _SOLVED, str(result.info.status), int(result.info.iter))
+
+
+def pattern_index(pattern: NDArray[np.bool_], upper: bool = False) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Row and column of every stored value, column-major: what `solve` expects its values ordered by."""
+    kept = np.triu(pattern) if upper else pattern
+    columns, rows = np.nonzero(kept.T)
+    return rows, columns

@@ -1,0 +1,193 @@
+"""Keeping apart: peers' paths aligned in time, half-spaces for the MPC, and a certifier that is independent of the QP.
+
+Peers' predictions are time-stamped; each is interpolated at the own prediction times, continued beyond its end by
+braking to a stop, and given a margin that grows with age. A silent peer therefore turns into a keep-out where it was
+last expected to stop. Half-spaces are the thesis' distance constraints (4.1), (4.2) linearised at the own previous
+prediction.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+
+from swarmctl.control.condensed import HalfSpaces
+from swarmctl.core.params import Params
+from swarmctl.core.types import Array, Obstacle, PredictedPath
+
+_TINY_M = 1e-6
+
+
+class SeparationParams(Params):
+    """What distance is kept and how uncertainty is paid for."""
+
+    radius_m: float = Field(0.9, gt=0, le=100)  # centre to centre, thesis 3 x 0.3
+    certify_slack_m: float = Field(0.1, ge=0, le=10)  # a plan closer than radius minus this is never flown
+    age_accel_m_s2: float = Field(4.0, ge=0, le=50)  # margin a t^2 / 2 with the age of a path
+    age_margin_max_m: float = Field(1.0, ge=0, le=50)
+    brake_m_s2: float = Field(3.0, gt=0, le=50)  # how a peer is assumed to stop beyond its prediction
+    lost_after_s: float = Field(0.5, gt=0, le=60)  # from this age on a peer is kept clear of at every height
+    gate_m: float = Field(3.0, gt=0, le=1000)  # rows farther than this from being active are left out
+    stop_m_s2: float = Field(1.4, gt=0, le=50)  # braking that plans leave room for beyond their horizon
+    relax_01: float = Field(0.9, gt=0, le=1)  # share of the reachable displacement a row may ask for
+    bias_rad: float = Field(0.35, ge=0, le=1.2)  # right-hand rule: largest turn of head-on normals
+    stuck_m: float = Field(0.1, gt=0, le=10)  # a plan that moves less over its horizon gets nowhere
+    max_neighbours: int = Field(8, ge=1, le=99)  # nearest ones that get rows
+
+
+@dataclass(frozen=True, slots=True)
+class KeepOut:
+    """Something to stay clear of over the horizon, in the own prediction's time."""
+
+    pos_ned_m: Array  # (Hp+1, 3)
+    radius_m: float  # constraint distance between centres
+    certified_m: float  # a plan closer than this is refused
+    any_height: bool  # a vertical cylinder instead of a sphere
+    tie: int  # decides the side when centres coincide; the larger id goes first
+
+
+def align(path: PredictedPath, t0_utc_us: int, dt_us: int, steps: int, brake_m_s2: float) -> Array:
+    """Positions (steps+1, 3) of a peer at `t0_utc_us + k dt_us`: interpolated, then braking to a stop.
+
+    Times before the first point are extrapolated backwards along the first segment.
+    """
+    points = path.pos_ned_m
+    last = len(points) - 1
+    k = (t0_utc_us - path.t0_utc_us) / path.dt_us + np.arange(steps + 1) * (dt_us / path.dt_us)  # (steps+1,) in points
+    low = np.clip(np.floor(k).astype(int), 0, last - 1)
+    inside: Array = points[low] + (np.minimum(k, last) - low)[:, None] * (points[low + 1] - points[low])
+    beyond_s = (k - last) * (path.dt_us * 1e-6)
+    if beyond_s[-1] <= 0.0:
+        return inside
+    vel = (points[last] - points[last - 1]) / (path.dt_us * 1e-6)  # (3,)
+    speed = math.sqrt(float(vel @ vel))
+    if speed < _TINY_M:
+        return inside
+    t_s = np.clip(beyond_s, 0.0, speed / brake_m_s2)
+    travelled = speed * t_s - 0.5 * brake_m_s2 * t_s * t_s
+    inside += travelled[:, None] * (vel / speed)
+    return inside
+
+
+def keep_out_of_peer(
+    path: PredictedPath, t0_utc_us: int, dt_us: int, steps: int, parked: bool, params: SeparationParams
+) -> KeepOut:
+    """What to stay clear of because of one peer; `parked` peers have landed and do not grow with age."""
+    age_s = max(0.0, (t0_utc_us - path.t0_utc_us) * 1e-6)
+    margin_m = 0.0 if parked else min(0.5 * params.age_accel_m_s2 * age_s * age_s, params.age_margin_max_m)
+    radius_m = params.radius_m + path.radius_m + margin_m
+    return KeepOut(
+        align(path, t0_utc_us, dt_us, steps, params.brake_m_s2),
+        radius_m,
+        params.radius_m + path.radius_m - params.certify_slack_m,
+        age_s > params.lost_after_s and not parked,
+        path.agent,
+    )
+
+
+def keep_out_of_obstacle(obstacle: Obstacle, dt_us: int, steps: int, params: SeparationParams) -> KeepOut:
+    """What to stay clear of because of an obstacle seen now; moving ones are taken at constant velocity."""
+    t_s = np.arange(steps + 1) * (dt_us * 1e-6)
+    pos = obstacle.center_ned_m + t_s[:, None] * obstacle.vel_ned_m_s
+    return KeepOut(pos, obstacle.keep_out_m, obstacle.keep_out_m - params.certify_slack_m, False, -1)
+
+
+def visible(obstacles: Sequence[Obstacle], pos_ned_m: Array) -> list[Obstacle]:
+    """Obstacles whose centre is closer than their visibility distance now (4.2, as corrected)."""
+    return [o for o in obstacles if math.dist(o.center_ned_m, pos_ned_m) < o.visibility_m]
+
+
+def half_spaces_xy(
+    keep_outs: Sequence[KeepOut],
+    guess_ned_m: Array,
+    goal_xy_m: Array,
+    vel_xy_m_s: Array,
+    dt_s: float,
+    own_tie: int,
+    params: SeparationParams,
+) -> HalfSpaces | None:
+    """Linearised horizontal distance constraints for steps 1..Hp.
+
+    Args:
+        keep_outs: at most as many as the problem has slots.
+        guess_ned_m: (Hp+1, 3) own previous prediction at the same times, z from this tick's z-MPC.
+        goal_xy_m: (2,) where the reference ends: decides what head-on means.
+        vel_xy_m_s: (2,) own velocity at the first point.
+        dt_s: between points.
+        own_tie: own agent id.
+        params: bias and gate.
+
+    Height difference counts: a sphere of radius R leaves `sqrt(R^2 - dz^2)` to keep horizontally.
+    """
+    if not keep_outs:
+        return None
+    others = np.stack([k.pos_ned_m for k in keep_outs])[:, 1:]  # (slots, Hp, 3)
+    radius = np.array([k.radius_m for k in keep_outs])
+    flat = np.array([0.0 if k.any_height else 1.0 for k in keep_outs])
+    own = guess_ned_m[1:]
+    dz = (own[:, 2] - others[:, :, 2]) * flat[:, None]
+    needed = np.sqrt(np.maximum(radius[:, None] ** 2 - dz**2, 0.0))  # (slots, Hp)
+    apart = own[:, :2] - others[:, :, :2]  # (slots, Hp, 2)
+    distance = np.sqrt(np.einsum("skc,skc->sk", apart, apart))
+    side = np.array([[1.0 if own_tie > k.tie else -1.0, 0.0] for k in keep_outs])
+    close = distance < _TINY_M
+    normal = np.where(close[:, :, None], side[:, None, :], apart / np.maximum(distance, _TINY_M)[:, :, None])
+    moved = math.dist(guess_ned_m[-1, :2], guess_ned_m[0, :2])
+    stuck = min(1.0, max(0.0, 2.0 - moved / params.stuck_m))
+    urgency = np.array([1.0 if k.tie < 0 else stuck for k in keep_outs])
+    normal = _turned(normal, distance, needed, goal_xy_m - own[:, :2], params.bias_rad * urgency)
+    offset = np.einsum("skc,skc->sk", normal, others[:, :, :2]) + needed
+    idle = (needed <= 0.0) | (distance > needed + params.gate_m)
+    ends = (others[:, -1, :2] - others[:, -2, :2]) / dt_s  # (slots, 2) velocity of each at the end
+    closing = -np.einsum("sc,sc->s", normal[:, -1], vel_xy_m_s - ends)
+    stop_s = np.maximum(closing, 0.0) / (2.0 * params.stop_m_s2)
+    stop_offset = offset[:, -1] + stop_s * np.einsum("sc,sc->s", normal[:, -1], ends)
+    return HalfSpaces(normal, np.where(idle, -np.inf, offset), stop_s, np.where(idle[:, -1], -np.inf, stop_offset))
+
+
+def _turned(normal: Array, distance: Array, needed: Array, to_goal: Array, angle_rad: Array) -> Array:
+    """Turn normals that point straight against the way to the goal, so that head-on agents pass on one side.
+
+    Everybody turns the same way (clockwise seen from above, as NED yaw), which is a rule, not a draw. `angle_rad`
+    (slots,) is the largest turn: full for obstacles, for peers only when the own plan gets nowhere, because turned
+    normals would also keep a swarm that shares one goal from closing in evenly.
+    """
+    span = np.sqrt(np.einsum("kc,kc->k", to_goal, to_goal))  # (Hp,)
+    ahead = -np.einsum("skc,kc->sk", normal, to_goal) / np.maximum(span, _TINY_M)  # cosine: 1 is head-on
+    weight = np.clip((ahead - 0.7) / 0.3, 0.0, 1.0) * (span > 0.75 * needed) * (distance < 2.0 * needed + 0.5)
+    angle = angle_rad[:, None] * weight
+    c, s = np.cos(angle), np.sin(angle)
+    return np.stack([c * normal[:, :, 0] - s * normal[:, :, 1], s * normal[:, :, 0] + c * normal[:, :, 1]], axis=2)
+
+
+def certify(path_ned_m: Array, keep_outs: Sequence[KeepOut], from_step: int) -> float:
+    """Smallest margin [m] of a planned path against everything known, over true distances between samples too.
+
+    Args:
+        path_ned_m: (Hp+1, 3) own plan.
+        keep_outs: aligned with it.
+        from_step: steps before this one can't be changed by the plan any more.
+
+    Returns:
+        min over keep-outs of (distance - certified distance); where a keep-out is violated now already, a path that
+        does not come closer than now has margin 0. Infinite without keep-outs.
+    """
+    if not keep_outs:
+        return math.inf
+    others = np.stack([k.pos_ned_m for k in keep_outs])  # (m, Hp+1, 3)
+    apart = path_ned_m - others
+    apart[np.array([k.any_height for k in keep_outs]), :, 2] = 0.0
+    step = np.diff(apart, axis=1)
+    length2 = np.maximum(np.einsum("mkc,mkc->mk", step, step), 1e-18)
+    nearest = np.clip(-np.einsum("mkc,mkc->mk", apart[:, :-1], step) / length2, 0.0, 1.0)
+    closest = apart[:, :-1] + nearest[:, :, None] * step  # closest point of each relative segment to the origin
+    distance = np.sqrt(np.einsum("mkc,mkc->mk", closest, closest))  # (m, Hp)
+    now = np.sqrt(np.einsum("mc,mc->m", apart[:, 0], apart[:, 0]))
+    later = distance[:, from_step:].min(axis=1)
+    allowed = np.array([k.certified_m for k in keep_outs])
+    margin = np.where((now < allowed) & (later >= now - 0.02), 0.0, later - allowed)
+    return float(margin.min())

@@ -1,0 +1,304 @@
+"""The mission of one agent, phase by phase: what is asked of the autopilot and which reference is followed.
+
+Pure. Agents agree on the beginning without a leader: each says when it was ready, and all begin one second after the
+last one. What the operator asks (hold, resume, land, rtl) is applied here too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+
+from swarmctl.control.mission import Glide, MissionReference, brake_to_rest, glide_to
+from swarmctl.core.params import Params
+from swarmctl.core.types import Array, Command, FlightMode, Landed, Mode, Phase, VehicleState, Verb
+
+_ASK_EVERY_US = 1_000_000
+_BEGIN_AFTER_US = 1_000_000
+_ODOMETRY_ID, _ATTITUDE_TARGET_ID, _EXTENDED_ID, _ORIGIN_ID = 331, 83, 245, 49
+OPERATOR_STOP = "stopped by the operator"
+
+
+class SequenceParams(Params):
+    """Speeds of the way there and back, and patience."""
+
+    speed_m_s: float = Field(2.0, gt=0, le=20)
+    accel_m_s2: float = Field(1.2, gt=0, le=20)
+    state_rate_hz: float = Field(100.0, ge=20, le=250)
+    arrive_m: float = Field(0.15, gt=0, le=5)
+    arrive_m_s: float = Field(0.15, gt=0, le=5)
+    start_timeout_s: float = Field(90.0, gt=0, le=3600)  # from process start to TRACK
+    land_timeout_s: float = Field(20.0, gt=0, le=600)  # for reaching the landing place; then land where it is
+
+
+@dataclass(frozen=True, slots=True)
+class PeerFacts:
+    """What the sequence needs to know of a peer."""
+
+    phase: Phase
+    ready_utc_us: int
+    alive: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """This tick, as the sequence sees it."""
+
+    now_us: int
+    utc_us: int
+    state: VehicleState | None
+    heard: bool  # the vehicle's heartbeat is known
+    armable: bool
+    busy: bool  # a command is being executed
+    mode: Mode  # last judgement
+    peers: Mapping[int, PeerFacts]
+
+
+class Sequence:
+    """Phases of one agent.
+
+    Args:
+        params: speeds and patience.
+        setup: parameters the autopilot is given before flight, name -> value.
+        peers: how many others take part.
+        start_ned_m: (3,) own start, also the landing place.
+        duration_s: of the tracked mission.
+        reference: of the tracked mission.
+    """
+
+    def __init__(
+        self,
+        params: SequenceParams,
+        setup: Mapping[str, int | float],
+        peers: int,
+        start_ned_m: Array,
+        duration_s: float,
+        reference: MissionReference,
+    ) -> None:
+        self._params, self._setup, self._expected = params, dict(setup), peers
+        self._start_ned_m, self._duration_us, self._reference = start_ned_m, round(duration_s * 1e6), reference
+        self.phase = Phase.CONNECT
+        self.ready_utc_us = 0
+        self.begin_utc_us: int | None = None  # mission time 0
+        self.outcome = ""
+        self.had_control = False
+        self.held = False
+        self._glide: tuple[Glide, int] | None = None  # and when it began
+        self._entered_us = 0
+        self._born_us: int | None = None
+        self._asked_us = -_ASK_EVERY_US
+        self._configured = False
+        self._yielded = False
+        self._ground_z_m = 0.0
+        self._steps: dict[Phase, Callable[[Facts, VehicleState], list[Command]]] = {
+            Phase.STANDBY: self._standby,
+            Phase.ARM: self._arm,
+            Phase.TAKEOFF: self._takeoff,
+            Phase.GOTO_START: self._goto_start,
+            Phase.READY: self._ready,
+            Phase.TRACK: self._track,
+            Phase.GOTO_LAND: self._goto_land,
+            Phase.LAND: self._land,
+        }
+
+    @property
+    def finished(self) -> bool:
+        return self.phase is Phase.DONE
+
+    def step(self, facts: Facts) -> list[Command]:
+        """Advance by what is true now; returns what to ask of the autopilot."""
+        self._born_us = facts.now_us if self._born_us is None else self._born_us
+        state = facts.state
+        if state is None:
+            return self._connect(facts)
+        if self.phase is Phase.CONNECT:
+            self._enter(Phase.STANDBY, facts)
+        if facts.mode is Mode.YIELD and not self._yielded:
+            self._yielded, self.had_control = True, False
+            self.outcome = "pilot or autopilot took over"
+        if self._yielded:
+            if not state.armed and state.landed is Landed.ON_GROUND:
+                self._enter(Phase.DONE, facts)
+            return []
+        if facts.mode is Mode.LAND and self.phase < Phase.LAND:
+            self._give_up("no plan for too long", facts, state)
+        if state.mode is FlightMode.EXTERNAL and Phase.GOTO_START <= self.phase < Phase.LAND:
+            self._take_control(facts, state)
+        patience_us = self._params.start_timeout_s * 1e6
+        if self.phase < Phase.TRACK and facts.now_us - self._born_us > patience_us:
+            self._give_up(f"not tracking after {self._params.start_timeout_s:.0f} s ({self.phase.name})", facts, state)
+        handler = self._steps.get(self.phase)
+        return handler(facts, state) if handler else []
+
+    def reference(self, utc_us: int, now_us: int, offsets_s: Array) -> tuple[Array, Array]:
+        """Where to be, (K, 3) and (K, 3), at `offsets_s` (K,) from now."""
+        if self.phase is Phase.TRACK and not self.held and self.begin_utc_us is not None:
+            return self._reference.sample((utc_us - self.begin_utc_us) * 1e-6 + offsets_s)
+        if self._glide is not None:
+            glide, began_us = self._glide
+            return glide.sample((now_us - began_us) * 1e-6 + offsets_s)
+        return np.tile(self._start_ned_m, (len(offsets_s), 1)), np.zeros((len(offsets_s), 3))
+
+    def mission_t_s(self, utc_us: int) -> float:
+        """Mission time while tracking, else NaN."""
+        if self.phase is not Phase.TRACK or self.begin_utc_us is None:
+            return math.nan
+        return (utc_us - self.begin_utc_us) * 1e-6
+
+    def operator(self, verb: str, now_us: int, state: VehicleState | None) -> None:
+        """Apply hold, resume, land or rtl."""
+        if state is None or self.phase in (Phase.LAND, Phase.DONE):
+            return
+        if verb == "hold" and self.phase is Phase.TRACK:
+            self.held = True
+            self._glide = (brake_to_rest(state.pos_ned_m, state.vel_ned_m_s, self._params.accel_m_s2), now_us)
+        elif verb == "resume":
+            self.held = False
+            if self._yielded:
+                self._yielded, self.outcome = False, ""
+        elif verb in ("land", "rtl"):
+            self._stop(verb, now_us, state)
+
+    def _stop(self, verb: str, now_us: int, state: VehicleState) -> None:
+        self.outcome = self.outcome or OPERATOR_STOP
+        if self.phase < Phase.GOTO_START or self._yielded:
+            on_ground = state.landed is Landed.ON_GROUND
+            self.phase = Phase.DONE if on_ground and not state.armed else Phase.LAND
+        elif self.phase < Phase.GOTO_LAND:
+            self.phase = Phase.GOTO_LAND
+            accel = self._params.accel_m_s2
+            glide = brake_to_rest(state.pos_ned_m, state.vel_ned_m_s, accel) if verb == "land" else self._home(state)
+            self._glide = (glide, now_us)
+        self._entered_us = now_us
+
+    def _connect(self, facts: Facts) -> list[Command]:
+        if not facts.heard or not self._may_ask(facts):
+            return []
+        return [
+            Command(Verb.RATE, self._params.state_rate_hz, _ODOMETRY_ID),
+            Command(Verb.MESSAGE, number=_ORIGIN_ID),
+        ]
+
+    def _standby(self, facts: Facts, state: VehicleState) -> list[Command]:
+        if not self._configured:
+            self._configured = True
+            self._ground_z_m = float(state.pos_ned_m[2])
+            rates = [
+                Command(Verb.RATE, self._params.state_rate_hz, _ODOMETRY_ID),
+                Command(Verb.RATE, 5.0, _ATTITUDE_TARGET_ID),
+                Command(Verb.RATE, 10.0, _EXTENDED_ID),
+            ]
+            return rates + [
+                Command(Verb.PARAM_INT, number=v, name=k)
+                if isinstance(v, int)
+                else Command(Verb.PARAM_FLOAT, value=v, name=k)
+                for k, v in self._setup.items()
+            ]
+        known = sum(p.phase >= Phase.STANDBY and p.alive for p in facts.peers.values())
+        if facts.armable and not facts.busy and known == self._expected:
+            self._enter(Phase.ARM, facts)
+        return []
+
+    def _arm(self, facts: Facts, state: VehicleState) -> list[Command]:
+        if state.armed:
+            self._enter(Phase.GOTO_START if state.landed is Landed.IN_AIR else Phase.TAKEOFF, facts)
+            return []
+        return [Command(Verb.ARM)] if self._may_ask(facts) else []
+
+    def _takeoff(self, facts: Facts, state: VehicleState) -> list[Command]:
+        height_m = self._ground_z_m - float(self._start_ned_m[2])
+        climbed_m = self._ground_z_m - float(state.pos_ned_m[2])
+        settled = abs(float(state.vel_ned_m_s[2])) < 0.3 and abs(climbed_m - height_m) < 0.4
+        if state.mode is FlightMode.HOLD and state.landed is Landed.IN_AIR and settled:
+            self._enter(Phase.GOTO_START, facts)
+            return []
+        if state.mode is not FlightMode.TAKEOFF and state.landed is Landed.ON_GROUND and self._may_ask(facts):
+            return [Command(Verb.TAKEOFF, height_m)] if state.armed else [Command(Verb.ARM)]
+        return []
+
+    def _goto_start(self, facts: Facts, state: VehicleState) -> list[Command]:
+        if not self.had_control:
+            if self._glide is None:
+                self._glide = (Glide(state.pos_ned_m, np.zeros(3), state.pos_ned_m, 1.0), facts.now_us)
+            return [Command(Verb.EXTERNAL)] if self._may_ask(facts) else []
+        if self._arrived(state, self._start_ned_m):
+            self.ready_utc_us = facts.utc_us
+            self._enter(Phase.READY, facts)
+        return []
+
+    def _ready(self, facts: Facts, state: VehicleState) -> list[Command]:
+        if any(not p.alive for p in facts.peers.values()):
+            self.outcome = "a peer was lost before the mission began"
+            self._go_home(facts, state)
+            return []
+        ready = [p.ready_utc_us for p in facts.peers.values() if p.ready_utc_us > 0]
+        if len(ready) == self._expected:
+            self.begin_utc_us = max([self.ready_utc_us, *ready]) + _BEGIN_AFTER_US
+            if facts.utc_us >= self.begin_utc_us:
+                self._enter(Phase.TRACK, facts)
+        return []
+
+    def _track(self, facts: Facts, state: VehicleState) -> list[Command]:
+        assert self.begin_utc_us is not None
+        if not self.had_control:
+            return [Command(Verb.EXTERNAL)] if self._may_ask(facts) else []
+        if facts.utc_us - self.begin_utc_us >= self._duration_us and not self.held:
+            self.outcome = self.outcome or "completed"
+            self._go_home(facts, state)
+        return []
+
+    def _goto_land(self, facts: Facts, state: VehicleState) -> list[Command]:
+        target = self._glide[0].to_ned_m if self._glide else state.pos_ned_m
+        waited_us = facts.now_us - self._entered_us
+        if self._arrived(state, target) or waited_us > self._params.land_timeout_s * 1e6:
+            self._enter(Phase.LAND, facts)
+        return []
+
+    def _land(self, facts: Facts, state: VehicleState) -> list[Command]:
+        self.had_control = False
+        if state.landed is Landed.ON_GROUND and not state.armed:
+            self._enter(Phase.DONE, facts)
+            return []
+        if state.mode is FlightMode.LAND or not self._may_ask(facts):
+            return []
+        return [Command(Verb.DISARM if state.landed is Landed.ON_GROUND else Verb.LAND)]
+
+    def _arrived(self, state: VehicleState, target: Array) -> bool:
+        speed = math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s))
+        return math.dist(state.pos_ned_m, target) < self._params.arrive_m and speed < self._params.arrive_m_s
+
+    def _take_control(self, facts: Facts, state: VehicleState) -> None:
+        if self.had_control:
+            return
+        self.had_control = True
+        if self.phase is Phase.GOTO_START:
+            self._glide = (self._home(state), facts.now_us)
+
+    def _home(self, state: VehicleState) -> Glide:
+        p = self._params
+        return glide_to(state.pos_ned_m, state.vel_ned_m_s, self._start_ned_m, p.speed_m_s, p.accel_m_s2)
+
+    def _go_home(self, facts: Facts, state: VehicleState) -> None:
+        self._glide = (self._home(state), facts.now_us)
+        self.held = False
+        self._enter(Phase.GOTO_LAND, facts)
+
+    def _give_up(self, why: str, facts: Facts, state: VehicleState) -> None:
+        self.outcome = self.outcome or why
+        grounded = not state.armed and state.landed is Landed.ON_GROUND
+        self._enter(Phase.DONE if grounded else Phase.LAND, facts)
+
+    def _enter(self, phase: Phase, facts: Facts) -> None:
+        self.phase = phase
+        self._entered_us = facts.now_us
+        self._asked_us = facts.now_us - _ASK_EVERY_US
+
+    def _may_ask(self, facts: Facts) -> bool:
+        if facts.busy or facts.now_us - self._asked_us < _ASK_EVERY_US:
+            return False
+        self._asked_us = facts.now_us
+        return True

@@ -1,0 +1,32 @@
+"""Virtual controls -> attitude and normalised thrust."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from swarmctl.control.model import VehicleModelParams
+from swarmctl.core.frames import GRAVITY_M_S2, quat_from_body_z
+from swarmctl.core.types import Array, AttitudeSetpoint
+
+VALID_US = 100_000  # a setpoint that could not leave by then is stale
+
+
+def setpoint_of(
+    virtual: Array, yaw_rad: float, hover_thrust_01: float, now_us: int, params: VehicleModelParams
+) -> AttitudeSetpoint:
+    """Attitude and thrust of virtual controls (u_x, u_y, thrust over mass [m/s2]).
+
+    The body down axis is (u_x, u_y, sqrt(1 - u_x^2 - u_y^2)): thesis (3.26) and (3.33) without their singularity, tilt
+    limited by shortening (u_x, u_y). Thrust is linear in the autopilot's 0..1, `hover_thrust_01` carrying the weight.
+    """
+    ux, uy, specific = (float(c) for c in virtual)
+    tilt = math.hypot(ux, uy)
+    limit = math.sin(params.tilt_max_rad)
+    if tilt > limit:
+        ux, uy, tilt = ux * limit / tilt, uy * limit / tilt, limit
+    down = np.array([ux, uy, math.sqrt(max(0.0, 1.0 - tilt * tilt))])
+    thrust = hover_thrust_01 * specific / GRAVITY_M_S2
+    thrust = min(params.thrust_max_01, max(params.thrust_min_01, thrust)) if math.isfinite(thrust) else math.nan
+    return AttitudeSetpoint(quat_from_body_z(down, yaw_rad), thrust, now_us + VALID_US)

@@ -1,0 +1,68 @@
+"""Rotations between body FRD and world NED. Quaternions are (w, x, y, z) and rotate body vectors into NED.
+
+The only conversions in the project; MAVLink uses the same conventions, so its codec rotates nothing.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+GRAVITY_M_S2 = 9.81
+
+Array = NDArray[np.float64]
+
+
+def quat_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Array:
+    """Quaternion (4,) wxyz body->NED of ZYX Euler angles [rad]."""
+    cr, sr = math.cos(roll_rad / 2), math.sin(roll_rad / 2)
+    cp, sp = math.cos(pitch_rad / 2), math.sin(pitch_rad / 2)
+    cy, sy = math.cos(yaw_rad / 2), math.sin(yaw_rad / 2)
+    return np.array(
+        [
+            cr * cp * cy + sr * sp * sy,
+            sr * cp * cy - cr * sp * sy,
+            cr * sp * cy + sr * cp * sy,
+            cr * cp * sy - sr * sp * cy,
+        ]
+    )
+
+
+def euler_from_quat(q_nb: Array) -> tuple[float, float, float]:
+    """ZYX Euler angles (roll, pitch, yaw) [rad] of a unit quaternion (4,) wxyz."""
+    w, x, y, z = (float(c) for c in q_nb)
+    roll_rad = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    pitch_rad = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
+    yaw_rad = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+    return roll_rad, pitch_rad, yaw_rad
+
+
+def body_z_ned(q_nb: Array) -> Array:
+    """Body down axis in NED (3,): the thesis' (u_x, u_y, c_phi c_theta) of eqs. (3.16), (3.23)."""
+    w, x, y, z = (float(c) for c in q_nb)
+    return np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
+
+
+def quat_from_body_z(down_ned: Array, yaw_rad: float) -> Array:
+    """Quaternion (4,) wxyz whose body down axis is the unit vector `down_ned` (3,) and whose ZYX yaw is `yaw_rad`.
+
+    The exact inverse of thesis eqs. (3.16) and (3.23), that is (3.26) and the consistent form of (3.33),
+    `phi = -asin(u_y c_psi - u_x s_psi)`, without their singularity in the measured angles.
+    """
+    ux, uy, uz = (float(c) for c in down_ned)
+    s, c = math.sin(yaw_rad), math.cos(yaw_rad)
+    roll_rad = -math.asin(max(-1.0, min(1.0, uy * c - ux * s)))
+    pitch_rad = math.atan2(ux * c + uy * s, uz)
+    return quat_from_euler(roll_rad, pitch_rad, yaw_rad)
+
+
+def rotate_to_ned(q_nb: Array, vector_frd: Array) -> Array:
+    """Rotate a body FRD vector (3,) into NED (3,)."""
+    w, x, y, z = (float(c) for c in q_nb)
+    vx, vy, vz = (float(c) for c in vector_frd)
+    tx, ty, tz = 2 * (y * vz - z * vy), 2 * (z * vx - x * vz), 2 * (x * vy - y * vx)
+    return np.array(
+        [vx + w * tx + y * tz - z * ty, vy + w * ty + z * tx - x * tz, vz + w * tz + x * ty - y * tx],
+    )

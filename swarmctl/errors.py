@@ -1,0 +1,43 @@
+"""One exception tree; every branch is one exit code of the command line.
+
+Exceptions live at the borders (config, start-up, files). Inside a tick a failure is a value.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+EXIT_OK = 0
+EXIT_USAGE = 2
+EXIT_START = 3
+EXIT_MISSION = 4
+EXIT_INTERRUPTED = 130
+
+
+class SwarmError(Exception):
+    """Anything the command line reports in words instead of a traceback."""
+
+    exit_code = EXIT_MISSION
+
+
+class ConfigError(SwarmError):
+    """Bad usage or configuration; carries every problem found, not only the first."""
+
+    exit_code = EXIT_USAGE
+
+    def __init__(self, source: str, problems: Sequence[str]) -> None:
+        self.source = source
+        self.problems = tuple(problems)
+        super().__init__("\n".join(f"{source}: {problem}" for problem in self.problems))
+
+
+class StartError(SwarmError):
+    """A process, port, vehicle or link that was needed did not come up."""
+
+    exit_code = EXIT_START
+
+
+class MissionError(SwarmError):
+    """The flight began and did not end as asked, or a limit was violated."""
+
+    exit_code = EXIT_MISSION

@@ -1,0 +1,61 @@
+"""MAVLink 2 codec: bytes <-> dialect messages, one datagram at a time. No socket, no vehicle logic.
+
+`parse_buffer` is never used: as a stream parser it loses most good frames after two bytes of junk.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterator
+from typing import Any
+
+from pymavlink.dialects.v20 import common
+
+dialect = common
+
+MAVLINK2_MAGIC = 0xFD
+_HEADER = 10
+_CHECKSUM = 2
+_SIGNATURE = 13
+
+
+def frames(datagram: bytes) -> Iterator[bytes]:
+    """Split a datagram into frames; the rest is dropped at the first surprise."""
+    start = 0
+    while start + _HEADER + _CHECKSUM <= len(datagram) and datagram[start] == MAVLINK2_MAGIC:
+        signed = _SIGNATURE if datagram[start + 2] & 1 else 0
+        end = start + _HEADER + datagram[start + 1] + _CHECKSUM + signed
+        if end > len(datagram):
+            return
+        yield datagram[start:end]
+        start = end
+
+
+def message_id(frame: bytes) -> int:
+    """Message id of a frame that `frames` produced."""
+    return int.from_bytes(frame[7:10], "little")
+
+
+class Codec:
+    """Packs messages as one component and unpacks what it is given, counting what it refuses."""
+
+    def __init__(self, sysid: int, compid: int) -> None:
+        self._mav = dialect.MAVLink(None, srcSystem=sysid, srcComponent=compid)
+        self._mav.robust_parsing = False
+        self.sysid = sysid
+        self.compid = compid
+        self.refused: Counter[str] = Counter()
+
+    def encode(self, message: Any) -> bytes:
+        """Frame of a dialect message, with this component's ids and the next sequence number."""
+        frame: bytes = message.pack(self._mav)
+        self._mav.seq = (self._mav.seq + 1) % 256
+        return frame
+
+    def decode(self, frame: bytes) -> Any | None:
+        """Message of one frame, or None (counted) when it is not one of ours."""
+        try:
+            return self._mav.decode(bytearray(frame))
+        except (dialect.MAVError, IndexError, ValueError, KeyError) as error:
+            self.refused[type(error).__name__] += 1
+            return None

@@ -1,0 +1,234 @@
+"""What an agent knows of its peers, and the bus as one protocol. Pure: no zenoh, no clock, no thread.
+
+`PeerPaths` judges freshness by what the payload says, never by the bus. It keeps every peer's newest path whatever its
+age; what an old path means for separation is decided in `swarmctl.control`. `LocalHub` is the bus of lockstep.
+"""
+
+from __future__ import annotations
+
+import zlib
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import NamedTuple, Protocol
+
+import numpy as np
+
+from swarmctl.core.types import PredictedPath
+from swarmctl.links.topics import TOPICS, Topic, decode_path
+
+MAX_AGE_US = 2_000_000
+MAX_LEAD_US = 500_000
+_RETIRED_BOOTS = 64  # boot ids remembered per peer, so that a superseded one can't come back
+_LOSS = 1  # purpose of the random stream
+
+
+def agent_name(agent: int) -> str:
+    """Sender name of an agent on the bus."""
+    return f"agent-{agent}"
+
+
+class Bus(Protocol):
+    """Publish to everybody, receive without ever blocking."""
+
+    def publish(self, topic: Topic, payload: bytes) -> None:
+        """Send to all who listen to this sender; dropped, never queued for long."""
+
+    def receive(self, topic: Topic) -> list[tuple[str, bytes]]:
+        """(sender, payload) of everything kept since the last call, oldest first for each sender."""
+
+    def alive(self) -> frozenset[str]:
+        """Senders that are attached now, this one included. Advisory: it proves a process, not a control loop."""
+
+    def close(self) -> None:
+        """Leave the bus."""
+
+
+@dataclass(slots=True)
+class _Peer:
+    newest: PredictedPath
+    retired_boots: deque[int] = field(default_factory=lambda: deque(maxlen=_RETIRED_BOOTS))
+
+
+class PeerPaths:
+    """Newest good path of every peer; what is refused is counted by reason and leaves the known path untouched.
+
+    Args:
+        peers: agent numbers that are listened to, without the own one.
+        max_age_us: a path whose first point is older than this when it arrives is refused.
+        max_lead_us: a path whose first point is further in the future than this is refused.
+    """
+
+    def __init__(self, peers: Iterable[int], max_age_us: int = MAX_AGE_US, max_lead_us: int = MAX_LEAD_US) -> None:
+        self._expected = frozenset(peers)
+        self._max_age_us = max_age_us
+        self._max_lead_us = max_lead_us
+        self._peers: dict[int, _Peer] = {}
+        self.rejected: Counter[str] = Counter()
+
+    def offer(self, sender: str, payload: bytes, utc_us: int) -> None:
+        """Judge one message of the PATH topic.
+
+        Args:
+            sender: name of the key it arrived on, which the bus vouches for.
+            payload: bytes as received.
+            utc_us: now, disciplined UTC [us].
+        """
+        path = decode_path(payload)
+        if path is None:
+            self.rejected["malformed"] += 1
+            return
+        reason = self._refusal(sender, path, utc_us)
+        if reason:
+            self.rejected[reason] += 1
+            return
+        known = self._peers.get(path.agent)
+        if known is None:
+            self._peers[path.agent] = _Peer(path)
+            return
+        if known.newest.boot_id != path.boot_id:
+            known.retired_boots.append(known.newest.boot_id)
+        known.newest = path
+
+    def latest(self) -> tuple[PredictedPath, ...]:
+        """Newest path of every peer ever heard, whatever its age, by agent number."""
+        return tuple(self._peers[agent].newest for agent in sorted(self._peers))
+
+    def _refusal(self, sender: str, path: PredictedPath, utc_us: int) -> str:
+        if sender != agent_name(path.agent):
+            return "identity"
+        if path.agent not in self._expected:
+            return "unknown_peer"
+        if path.t0_utc_us - utc_us > self._max_lead_us:
+            return "future"
+        known = self._peers.get(path.agent)
+        if known is not None and _replayed(known, path):
+            return "replayed"
+        return "late" if utc_us - path.t0_utc_us > self._max_age_us else ""
+
+
+def _replayed(known: _Peer, path: PredictedPath) -> bool:
+    """Whether a path repeats or precedes what its peer has already said; a restart (new boot id) is not a replay."""
+    if path.boot_id == known.newest.boot_id:
+        return path.seq <= known.newest.seq
+    return path.boot_id in known.retired_boots or path.t0_utc_us < known.newest.t0_utc_us
+
+
+class _Message(NamedTuple):
+    visible_us: int
+    payload: bytes
+
+
+class LocalHub:
+    """A bus in memory, on a simulated clock, for agents that are ticked one after another.
+
+    What is published at `t` is visible to others from `t + max(1, delay_us)` on, so within one step nobody sees what
+    somebody else has just said, and the order in which agents are ticked does not matter.
+
+    Args:
+        now_us: the simulated clock.
+        seed: of the losses.
+        delay_us: travel time.
+        loss_01: probability that one receiver misses one message of an unreliable topic.
+    """
+
+    def __init__(self, now_us: Callable[[], int], seed: int = 0, delay_us: int = 0, loss_01: float = 0.0) -> None:
+        self._now_us = now_us
+        self._seed = seed
+        self._travel_us = max(1, delay_us)
+        self._loss_01 = loss_01
+        self._attached: dict[str, LocalBus] = {}
+        self._streams: dict[tuple[str, str], np.random.Generator] = {}
+
+    def attach(self, name: str, listen: Mapping[Topic, Sequence[str]] | None = None) -> LocalBus:
+        """Join as `name`.
+
+        Args:
+            name: sender name, free at the moment.
+            listen: senders heard per topic; None hears everybody but itself.
+        """
+        if name in self._attached:
+            raise ValueError(f"{name!r} is attached already")
+        bus = LocalBus(self, name, listen)
+        self._attached[name] = bus
+        return bus
+
+    def detach(self, name: str) -> None:
+        """Leave, or die: nothing more is sent or received; what is under way still arrives."""
+        self._attached.pop(name, None)
+
+    def alive(self) -> frozenset[str]:
+        return frozenset(self._attached)
+
+    def now_us(self) -> int:
+        return self._now_us()
+
+    def is_attached(self, bus: LocalBus) -> bool:
+        return self._attached.get(bus.name) is bus
+
+    def carry(self, sender: str, topic: Topic, payload: bytes) -> None:
+        """Put a message under way to every receiver that does not lose it."""
+        now_us = self._now_us()
+        message = _Message(now_us + self._travel_us, payload)
+        for bus in self._attached.values():
+            if bus.hears(topic, sender) and not self._is_lost(sender, bus.name, topic):
+                bus.accept(topic, sender, message, now_us)
+
+    def _is_lost(self, sender: str, receiver: str, topic: Topic) -> bool:
+        if topic.reliable or self._loss_01 <= 0.0:
+            return False
+        stream = self._streams.get((sender, receiver))
+        if stream is None:  # one stream per link: its draws depend on the sender's messages only
+            key = [self._seed, zlib.crc32(sender.encode()), zlib.crc32(receiver.encode()), _LOSS]
+            stream = self._streams[(sender, receiver)] = np.random.default_rng(key)
+        return bool(stream.random() < self._loss_01)
+
+
+class LocalBus:
+    """One participant of a `LocalHub`."""
+
+    def __init__(self, hub: LocalHub, name: str, listen: Mapping[Topic, Sequence[str]] | None) -> None:
+        self._hub = hub
+        self.name = name
+        self._listen = None if listen is None else {topic: frozenset(names) for topic, names in listen.items()}
+        self._inboxes: dict[Topic, dict[str, deque[_Message]]] = {topic: {} for topic in TOPICS}
+
+    def publish(self, topic: Topic, payload: bytes) -> None:
+        if self._hub.is_attached(self):
+            self._hub.carry(self.name, topic, payload)
+
+    def receive(self, topic: Topic) -> list[tuple[str, bytes]]:
+        if not self._hub.is_attached(self):
+            return []
+        now_us = self._hub.now_us()
+        arrived: list[tuple[int, str, bytes]] = []
+        for sender, inbox in self._inboxes.get(topic, {}).items():
+            _trim(inbox, topic.ring, now_us)
+            while inbox and inbox[0].visible_us <= now_us:
+                message = inbox.popleft()
+                arrived.append((message.visible_us, sender, message.payload))
+        arrived.sort(key=lambda item: item[:2])  # stable: a sender's own order stays
+        return [(sender, payload) for _, sender, payload in arrived]
+
+    def alive(self) -> frozenset[str]:
+        return self._hub.alive()
+
+    def close(self) -> None:
+        if self._hub.is_attached(self):
+            self._hub.detach(self.name)
+
+    def hears(self, topic: Topic, sender: str) -> bool:
+        if self._listen is None:
+            return sender != self.name
+        return sender in self._listen.get(topic, ())
+
+    def accept(self, topic: Topic, sender: str, message: _Message, now_us: int) -> None:
+        inbox = self._inboxes.setdefault(topic, {}).setdefault(sender, deque())
+        inbox.append(message)
+        _trim(inbox, topic.ring, now_us)
+
+
+def _trim(inbox: deque[_Message], ring: int, now_us: int) -> None:
+    """Keep the newest `ring` of the messages that have arrived; those under way do not push anything out yet."""
+    while len(inbox) > ring and inbox[ring].visible_us <= now_us:
+        inbox.popleft()

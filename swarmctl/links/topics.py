@@ -1,0 +1,155 @@
+"""What travels over the bus: one table of topics, and the layout of every message.
+
+Paths are a little-endian struct header and float32 points, ticks are `core.records` rows, the rest is msgspec JSON.
+Decoders bound-check and return None for anything that does not fit; they never raise.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass
+from typing import Literal, TypeVar
+
+import msgspec
+import numpy as np
+
+from swarmctl.core.types import PredictedPath
+
+
+@dataclass(frozen=True, slots=True)
+class Topic:
+    """One stream of an agent (or of the operator) on the bus."""
+
+    name: str
+    ring: int  # newest samples kept per sender
+    reliable: bool
+
+
+PATH = Topic("path", ring=1, reliable=False)
+STATUS = Topic("status", ring=1, reliable=False)
+TICK = Topic("tick", ring=256, reliable=False)
+COMMAND = Topic("command", ring=64, reliable=True)
+OBSTACLES = Topic("obstacles", ring=1, reliable=True)
+TOPICS = (PATH, STATUS, TICK, COMMAND, OBSTACLES)
+
+OPERATOR = "operator"  # the sender name of launch and of the operator verbs
+
+PATH_VERSION = 1
+MAX_POINTS = 250
+_PATH_HEADER = struct.Struct("<2sBBIIIqifBB2x")  # magic ver flags agent boot seq t0 dt radius n hdr_len
+_MAGIC = b"SP"
+_Message = TypeVar("_Message")
+
+
+def encode_path(path: PredictedPath) -> bytes:
+    """Bytes of a predicted path."""
+    points = np.ascontiguousarray(path.pos_ned_m, dtype="<f4")
+    header = _PATH_HEADER.pack(
+        _MAGIC,
+        PATH_VERSION,
+        0,
+        path.agent,
+        path.boot_id,
+        path.seq,
+        path.t0_utc_us,
+        path.dt_us,
+        path.radius_m,
+        len(points),
+        _PATH_HEADER.size,
+    )
+    return header + points.tobytes()
+
+
+def decode_path(payload: bytes) -> PredictedPath | None:
+    """Path of a payload; None unless magic, version, lengths and every number are good."""
+    if len(payload) < _PATH_HEADER.size:
+        return None
+    magic, version, _, agent, boot_id, seq, t0_utc_us, dt_us, radius_m, count, header_len = _PATH_HEADER.unpack_from(
+        payload
+    )
+    if magic != _MAGIC or version != PATH_VERSION or header_len < _PATH_HEADER.size:
+        return None
+    if not 2 <= count <= MAX_POINTS or dt_us <= 0 or len(payload) != header_len + 12 * count:
+        return None
+    points = np.frombuffer(payload, "<f4", 3 * count, header_len).reshape(count, 3).astype(np.float64)
+    if not (np.isfinite(points).all() and math.isfinite(radius_m) and radius_m >= 0.0):
+        return None
+    return PredictedPath(agent, boot_id, seq, t0_utc_us, dt_us, radius_m, points)
+
+
+class StatusMessage(msgspec.Struct, frozen=True):
+    """What an agent says of itself five times a second; peers read `phase` and `ready_utc_us`, people the rest."""
+
+    agent: int
+    boot_id: int
+    sysid: int
+    phase: int
+    mode: int
+    flight_mode: int
+    armed: bool
+    landed: int
+    ready_utc_us: int  # when it reached its start position, 0 before
+    outcome: str  # "" while flying, "completed", or why the mission failed
+    position_error_m: float
+    separation_m: float  # to the nearest peer now
+    tick_p99_ms: float
+    ticks: int
+    late_ticks: int
+    path_age_ms: float
+    solver_failed: int
+    problem: str  # newest thing an operator should know, "" when all is well
+
+
+class CommandMessage(msgspec.Struct, frozen=True):
+    """What an operator asks of one agent or of all (`agent` -1)."""
+
+    verb: Literal["hold", "resume", "land", "rtl"]
+    agent: int
+    utc_us: int
+
+
+class ObstacleMessage(msgspec.Struct, frozen=True):
+    """One spherical obstacle, shared NED [m]."""
+
+    center_ned_m: tuple[float, float, float]
+    radius_m: float
+    keep_out_m: float
+    visibility_m: float
+    vel_ned_m_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+class ObstaclesMessage(msgspec.Struct, frozen=True):
+    """The whole list of obstacles; a higher `version` replaces a lower one."""
+
+    version: int
+    obstacles: tuple[ObstacleMessage, ...]
+
+
+def encode_message(message: msgspec.Struct) -> bytes:
+    """Bytes of a control-plane message."""
+    return msgspec.json.encode(message)
+
+
+def decode_status(payload: bytes) -> StatusMessage | None:
+    return _decode(payload, _STATUS_DECODER)
+
+
+def decode_command(payload: bytes) -> CommandMessage | None:
+    return _decode(payload, _COMMAND_DECODER)
+
+
+def decode_obstacles(payload: bytes) -> ObstaclesMessage | None:
+    return _decode(payload, _OBSTACLES_DECODER)
+
+
+_STATUS_DECODER = msgspec.json.Decoder(StatusMessage)
+_COMMAND_DECODER = msgspec.json.Decoder(CommandMessage)
+_OBSTACLES_DECODER = msgspec.json.Decoder(ObstaclesMessage)
+
+
+def _decode(payload: bytes, decoder: msgspec.json.Decoder[_Message]) -> _Message | None:
+    try:
+        return decoder.decode(payload)
+    except msgspec.DecodeError:
+        return None

@@ -1,0 +1,234 @@
+"""Byte links to a vehicle: UDP, serial, and an in-memory pipe for lockstep. None of them ever blocks.
+
+A transport moves datagrams and stamps their arrival; it knows nothing of MAVLink except, on serial, where a frame ends.
+"""
+
+from __future__ import annotations
+
+import re
+import socket
+import struct
+import sys
+import time
+from collections import deque
+from collections.abc import Callable
+from typing import NamedTuple, Protocol
+
+from swarmctl.errors import StartError
+
+_MAX_DATAGRAM = 2048
+_SO_TIMESTAMPNS = 35  # Linux; socket.SO_TIMESTAMPNS is not exported before Python 3.13
+_TIMESPEC = struct.Struct("@qq")
+_URL = re.compile(r"^(?P<scheme>udpin|udpout|serial)://(?P<where>[^:]+):(?P<number>\d+)$")
+
+
+class Datagram(NamedTuple):
+    """Bytes and the monotonic time they arrived [us]."""
+
+    t_us: int
+    data: bytes
+
+
+class Transport(Protocol):
+    """One vehicle's byte link."""
+
+    def send(self, data: bytes) -> None:
+        """Hand over one frame; dropped, never queued, when the link can't take it."""
+
+    def receive(self, now_us: int) -> list[Datagram]:
+        """Everything that has arrived since the last call."""
+
+    def close(self) -> None:
+        """Release the port."""
+
+
+class Endpoint(NamedTuple):
+    """A parsed vehicle URL."""
+
+    scheme: str  # udpin | udpout | serial
+    where: str  # host, or device path
+    number: int  # port, or baud rate
+
+
+def parse_url(url: str) -> Endpoint:
+    """Split `udpin://host:port`, `udpout://host:port` or `serial:///dev/tty:baud`.
+
+    Raises:
+        ValueError: with the allowed forms, when the URL has none of them or the port is out of range.
+    """
+    match = _URL.match(url)
+    if match is None:
+        raise ValueError(f"{url!r}: use udpin://HOST:PORT, udpout://HOST:PORT or serial:///DEVICE:BAUD")
+    endpoint = Endpoint(match["scheme"], match["where"], int(match["number"]))
+    if endpoint.scheme != "serial" and not 1 <= endpoint.number <= 65535:
+        raise ValueError(f"{url!r}: port {endpoint.number} is outside 1..65535")
+    return endpoint
+
+
+def open_transport(url: str, inherited_fd: int | None = None) -> Transport:
+    """Open the link a URL names.
+
+    Args:
+        url: see `parse_url`.
+        inherited_fd: an already bound UDP socket from the launcher, which holds the port so that no other launch can
+            take it between the check and the flight.
+
+    Raises:
+        StartError: the port is taken or the device does not exist.
+    """
+    endpoint = parse_url(url)
+    if endpoint.scheme == "serial":
+        return SerialTransport(endpoint.where, endpoint.number)
+    if inherited_fd is not None:
+        return UdpTransport(socket.socket(fileno=inherited_fd))
+    if endpoint.scheme == "udpin":
+        return UdpTransport(bind_udp(endpoint.where, endpoint.number))
+    return UdpTransport(bind_udp("0.0.0.0", 0), remote=(endpoint.where, endpoint.number))
+
+
+def bind_udp(host: str, port: int) -> socket.socket:
+    """A bound UDP socket, without address reuse: a second binder must fail, not steal the traffic.
+
+    Raises:
+        StartError: the port is taken or the host is not ours.
+    """
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        sock.bind((host, port))
+    except (OSError, OverflowError) as error:
+        sock.close()
+        raise StartError(f"udp {host}:{port} can't be bound: {error}. Choose a free port or stop its owner") from error
+    return sock
+
+
+class UdpTransport:
+    """A UDP socket that answers the first sender it hears (PX4 latches its peer the same way).
+
+    With `remote` set it talks first. Arrival is stamped by the kernel, so a tick that drains the socket every 20 ms
+    still knows when each sample came.
+    """
+
+    def __init__(self, sock: socket.socket, remote: tuple[str, int] | None = None, latch: bool = True) -> None:
+        self._sock = sock
+        self._sock.setblocking(False)
+        self._remote = remote
+        self._latched = not latch
+        self._stamped = sys.platform == "linux"
+        if self._stamped:
+            self._sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+
+    @property
+    def fd(self) -> int:
+        """File descriptor, for a selector."""
+        return self._sock.fileno()
+
+    def send(self, data: bytes) -> None:
+        if self._remote is None:
+            return
+        try:
+            self._sock.sendto(data, self._remote)
+        except OSError:
+            return  # full buffer, or nobody listens: the autopilot's own failsafe judges silence
+
+    def receive(self, now_us: int) -> list[Datagram]:
+        arrived: list[Datagram] = []
+        while True:
+            try:
+                data, ancillary, _, sender = self._sock.recvmsg(_MAX_DATAGRAM, 64)
+            except BlockingIOError:
+                return arrived
+            except ConnectionRefusedError:
+                continue  # ICMP port unreachable surfaces here once
+            except OSError:
+                return arrived
+            if not self._latched:
+                self._remote, self._latched = sender, True
+            if sender == self._remote:
+                arrived.append(Datagram(self._arrival_us(ancillary, now_us), data))
+
+    def _arrival_us(self, ancillary: list[tuple[int, int, bytes]], now_us: int) -> int:
+        for level, kind, value in ancillary:
+            if level == socket.SOL_SOCKET and kind == _SO_TIMESTAMPNS:
+                seconds, nanoseconds = _TIMESPEC.unpack(value)
+                age_us: int = time.time_ns() // 1000 - (seconds * 1_000_000 + nanoseconds // 1000)
+                return now_us - max(0, age_us)
+        return now_us
+
+    def close(self) -> None:
+        self._sock.close()
+
+
+class SerialTransport:
+    """A serial port; frames are cut out of the byte stream and handed on one by one."""
+
+    def __init__(self, device: str, baud: int) -> None:
+        import serial  # only vehicles on a wire need it
+
+        try:
+            self._port = serial.Serial(device, baud, timeout=0, write_timeout=0)
+        except (serial.SerialException, ValueError) as error:
+            raise StartError(f"serial {device} at {baud} baud can't be opened: {error}") from error
+        self._buffer = bytearray()
+
+    def send(self, data: bytes) -> None:
+        try:
+            self._port.write(data)
+        except OSError:
+            return
+
+    def receive(self, now_us: int) -> list[Datagram]:
+        try:
+            self._buffer += self._port.read(_MAX_DATAGRAM)
+        except OSError:
+            return []
+        return [Datagram(now_us, frame) for frame in cut_frames(self._buffer)]
+
+    def close(self) -> None:
+        self._port.close()
+
+
+def cut_frames(buffer: bytearray) -> list[bytes]:
+    """Take every complete MAVLink 2 frame off the front of `buffer`; junk before a start byte is dropped."""
+    frames: list[bytes] = []
+    while True:
+        start = buffer.find(0xFD)
+        if start < 0:
+            buffer.clear()
+            return frames
+        del buffer[:start]
+        if len(buffer) < 3:
+            return frames
+        length = 12 + buffer[1] + (13 if buffer[2] & 1 else 0)
+        if len(buffer) < length:
+            return frames
+        frames.append(bytes(buffer[:length]))
+        del buffer[:length]
+
+
+class PipeTransport:
+    """One end of an in-memory link on a simulated clock; `latency_us` delays every datagram."""
+
+    def __init__(self, now_us: Callable[[], int], latency_us: int = 0) -> None:
+        self._now_us = now_us
+        self._latency_us = latency_us
+        self._inbox: deque[Datagram] = deque()
+        self.other: PipeTransport = self
+
+    def send(self, data: bytes) -> None:
+        self.other._inbox.append(Datagram(self._now_us() + self._latency_us, data))
+
+    def receive(self, now_us: int) -> list[Datagram]:
+        arrived: list[Datagram] = []
+        while self._inbox and self._inbox[0].t_us <= now_us:
+            arrived.append(self._inbox.popleft())
+        return arrived
+
+    def close(self) -> None:
+        self._inbox.clear()
+
+
+def pipe_pair(now_us: Callable[[], int], latency_us: int = 0) -> tuple[PipeTransport, PipeTransport]:
+    """Two connected ends."""
+    left, right = PipeTransport(now_us, latency_us), PipeTransport(now_us, latency_us)
+    left.other, right.other = right, left
+    return left, right

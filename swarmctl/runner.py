@@ -1,0 +1,184 @@
+"""The real-time loop around one agent: absolute deadlines, missed ticks skipped and counted, never caught up.
+
+Setpoints leave from the tick only. If this loop stalls they stop, and the autopilot's own failsafe acts.
+"""
+
+from __future__ import annotations
+
+import gc
+import signal
+import sys
+import time
+from pathlib import Path
+from types import FrameType
+
+from swarmctl.agent import Agent
+from swarmctl.assembly import make_agent
+from swarmctl.config import Config, load
+from swarmctl.control.sequence import OPERATOR_STOP
+from swarmctl.core.types import Mode
+from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, MissionError, StartError
+from swarmctl.links import topics
+from swarmctl.links.autopilot import PX4, Autopilot
+from swarmctl.links.bus import ZenohBus
+from swarmctl.links.commands import CommandPort
+from swarmctl.links.mavlink import Codec
+from swarmctl.links.mavsdk_commands import MavsdkCommands
+from swarmctl.links.peers import agent_name
+from swarmctl.links.transport import open_transport
+from swarmctl.telemetry.recorder import Recorder
+
+_LINGER_S = 1.0  # after the end, so that peers learn of it
+_VEHICLE_LOST_S = 15.0  # no state at all: nothing left to do here
+
+
+class WallClock:
+    """The host's clocks."""
+
+    def now_us(self) -> int:
+        return time.monotonic_ns() // 1000
+
+    def utc_us(self) -> int:
+        return time.time_ns() // 1000
+
+    def sleep_until(self, t_us: int) -> None:
+        """Return at monotonic `t_us` or, when it has passed, at once."""
+        left_us = t_us - self.now_us()
+        if left_us > 0:
+            time.sleep(left_us * 1e-6)
+
+
+class Pace:
+    """Deadlines of a periodic loop and the count of those that were missed.
+
+    A tick is late when its setpoint leaves after the next tick was due; a tick that is skipped counts as late.
+    """
+
+    def __init__(self, period_us: int, first_us: int) -> None:
+        self.period_us, self.due_us = period_us, first_us
+        self.late = 0
+
+    def done(self, sent_us: int, now_us: int) -> None:
+        """Account for the tick that was due, and set the next deadline."""
+        if sent_us > self.due_us + self.period_us:
+            self.late += 1
+        self.due_us += self.period_us
+        skipped = max(0, (now_us - self.due_us) // self.period_us)
+        self.late += skipped
+        self.due_us += skipped * self.period_us
+
+
+def run_agent(config_path: Path, agent: int, run: str, bus: str, run_dir: Path, fd: int | None) -> int:
+    """Fly one agent until its mission has ended; returns the exit code.
+
+    Args:
+        config_path: resolved configuration.
+        agent: own index, from 0.
+        run: name of the run on the bus.
+        bus: the router's endpoint.
+        run_dir: folder to record into.
+        fd: bound UDP socket inherited from the launcher.
+
+    Raises:
+        StartError: link, bus or vehicle is not there.
+        ConfigError: the configuration is not valid.
+    """
+    config = load(config_path)
+    if not 0 <= agent < config.swarm.agents:
+        raise StartError(f"--id {agent}: allowed: 0..{config.swarm.agents - 1} (swarm.agents)")
+    stop = _StopRequest()
+    clock = WallClock()
+    url = config.vehicles[agent].url if config.vehicles else ""
+    transport = open_transport(url or "udpin://127.0.0.1:14540", fd)
+    recorder = Recorder(run_dir, agent)
+    peers = [agent_name(i) for i in range(config.swarm.agents) if i != agent]
+    listen = {
+        topics.PATH: peers,
+        topics.STATUS: peers,
+        topics.COMMAND: [topics.OPERATOR],
+        topics.OBSTACLES: [topics.OPERATOR],
+    }
+    link = ZenohBus(bus, run, agent_name(agent), listen, config.bus.lease_ms)
+    slow: list[CommandPort] = []
+
+    def slow_path(autopilot: Autopilot, codec: Codec) -> CommandPort:
+        slow.append(MavsdkCommands(autopilot.send_frame, codec.sysid, PX4.external, PX4.hold))
+        return slow[0]
+
+    boot_id = (clock.utc_us() // 1000) & 0xFFFFFFFF
+    flown = make_agent(
+        config,
+        agent,
+        boot_id,
+        transport,
+        link,
+        clock,
+        recorder,
+        lambda frame: recorder.frame(clock.utc_us(), frame),
+        slow_path,
+        time.perf_counter_ns,
+    )
+    try:
+        return _loop(flown, config, clock, stop, url or f"inherited socket of sysid {config.sysids()[agent]}")
+    finally:
+        recorder.event("bus_summary", clock.now_us(), clock.utc_us(), rejected=flown.rejected, lost=recorder.lost)
+        slow[0].close()
+        link.close()
+        transport.close()
+        recorder.close()
+
+
+def _loop(agent: Agent, config: Config, clock: WallClock, stop: _StopRequest, vehicle: str) -> int:
+    gc.collect()
+    gc.freeze()  # start-up garbage is not looked at again during flight
+    pace = Pace(round(1e6 / config.agent.rate_hz), clock.now_us())
+    seen_us = clock.now_us()
+    ever_seen = False
+    finished_us: int | None = None
+    while True:
+        clock.sleep_until(pace.due_us)
+        now_us = clock.now_us()
+        if stop.take():
+            agent.ask("land", now_us)
+        record = agent.tick(now_us, pace.late)
+        pace.done(now_us + round(record.tick_ms * 1000), clock.now_us())
+        if record.mode is not Mode.BLIND:
+            seen_us, ever_seen = now_us, True
+        _give_up_on_silence(now_us - seen_us, ever_seen, config, vehicle)
+        if agent.finished:
+            finished_us = finished_us or now_us
+            if now_us - finished_us > _LINGER_S * 1e6:
+                return _exit_code(agent)
+
+
+def _give_up_on_silence(silent_us: int, ever_seen: bool, config: Config, vehicle: str) -> None:
+    if not ever_seen and silent_us > config.agent.connect_timeout_s * 1e6:
+        raise StartError(
+            f"vehicle at {vehicle}: no heartbeat and position within {config.agent.connect_timeout_s:.0f} s. "
+            "Is it running, sending to this port, and is its MAV_SYS_ID the configured sysid?"
+        )
+    if ever_seen and silent_us > _VEHICLE_LOST_S * 1e6:
+        raise MissionError(f"vehicle at {vehicle}: silent for {_VEHICLE_LOST_S:.0f} s, given up")
+
+
+def _exit_code(agent: Agent) -> int:
+    if agent.outcome == "completed":
+        return EXIT_OK
+    print(f"mission not completed: {agent.outcome}", file=sys.stderr)
+    return EXIT_INTERRUPTED if agent.outcome == OPERATOR_STOP else EXIT_MISSION
+
+
+class _StopRequest:
+    """SIGINT or SIGTERM: land. Taken once by the loop."""
+
+    def __init__(self) -> None:
+        self._asked = False
+        signal.signal(signal.SIGTERM, self._ask)
+        signal.signal(signal.SIGINT, self._ask)
+
+    def take(self) -> bool:
+        asked, self._asked = self._asked, False
+        return asked
+
+    def _ask(self, signum: int, frame: FrameType | None) -> None:
+        self._asked = True

@@ -1,0 +1,98 @@
+"""The end of a run: hand the folder to the referee and say the result in five lines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from swarmctl.config import Config, load
+from swarmctl.flight import Verdict
+
+if TYPE_CHECKING:
+    from swarmctl.telemetry.referee import Rules
+
+
+def sum_up(config: Config, directory: Path, verdict: Verdict, say: Callable[[str], None]) -> bool:
+    """Finish the run folder and say how it went; returns whether the referee found a limit broken.
+
+    A folder that can't be finished is a problem of the run, never a reason to lose its exit code.
+    """
+    from swarmctl.telemetry.recordings import optimize_recording  # heavy
+    from swarmctl.telemetry.run_folder import Outcome, finish_run
+
+    try:
+        rules = _rules(config, verdict)
+        summary = finish_run(directory, rules, Outcome(verdict.outcome, tuple(verdict.problems)))
+    except Exception as error:
+        verdict.problems.append(f"summary: {error}")
+        say(f"the run folder can't be finished: {error!r}. What was recorded is in {directory}")
+        return False
+    for line in summary_lines(summary, directory):
+        say(line)
+    optimize_recording(directory)
+    return bool(summary.get("violations"))
+
+
+def rewrite_report(directory: Path) -> Path:
+    """Write `report.html` of a run folder again; returns its path.
+
+    Raises:
+        ConfigError: it is no run folder.
+    """
+    from swarmctl.telemetry.run_folder import report_run  # heavy
+
+    return report_run(directory, load(directory / "config.toml").rules())
+
+
+def _rules(config: Config, verdict: Verdict) -> Rules:
+    """What the configuration asks for; obstacles as an operator left them."""
+    from swarmctl.telemetry.referee import ObstacleRule
+
+    rules = config.rules()
+    if verdict.obstacles is None:
+        return rules
+    changed = tuple(
+        ObstacleRule(item.center_ned_m, item.keep_out_m, item.vel_ned_m_s, since_us)
+        for item, since_us in verdict.obstacles.items()
+    )
+    return replace(rules, obstacles=changed)
+
+
+def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...]:
+    """Outcome, separation, timing, solver and bus, folder."""
+    violations = summary.get("violations") or []
+    separation, obstacles = _section(summary, "separation"), _section(summary, "obstacles")
+    timing, solver, comms = (_section(summary, name) for name in ("timing", "solver", "comms"))
+    tick, solve, age = _section(timing, "tick_ms"), _section(timing, "solve_ms"), _section(comms, "path_age_ms")
+    rejected = sum(_section(comms, "rejected").values())
+    outcome = f"{summary.get('outcome')}, index {_m(_section(summary, 'tracking').get('index_m'))}"
+    if violations:
+        outcome += f"; {len(violations)} violation{'s' if len(violations) > 1 else ''}: {violations[0]}"
+    clearance = obstacles.get("min_clearance_m")
+    return (
+        outcome,
+        f"separation {_m(separation.get('min_m'))} (required {_m(separation.get('required_m'))})"
+        + (
+            f", obstacles {_m(clearance)} (required {_m(obstacles.get('required_m'))})" if clearance is not None else ""
+        ),
+        f"ticks {timing.get('ticks')}, late {timing.get('late_ticks')}, "
+        f"tick p50/p99/max {_ms(tick)} ms, solve p50/p99/max {_ms(solve)} ms",
+        f"solver {solver.get('name')}, failed {solver.get('failed')}; "
+        f"path age p50/p99 {_ms(age, ('p50', 'p99'))} ms, {rejected} messages refused",
+        f"run folder {directory}",
+    )
+
+
+def _section(tree: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    value = tree.get(key)
+    return value if isinstance(value, Mapping) else {}
+
+
+def _m(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f} m"
+
+
+def _ms(values: Mapping[str, Any], keys: tuple[str, ...] = ("p50", "p99", "max")) -> str:
+    return "/".join("-" if values.get(key) is None else f"{values[key]:.1f}" for key in keys)

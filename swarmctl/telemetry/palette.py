@@ -1,0 +1,60 @@
+"""One colour per agent, the same in the live view, the recording and the report; readable on dark and on white."""
+
+from __future__ import annotations
+
+import colorsys
+
+_AGENTS = (
+    (59, 130, 246),  # blue
+    (245, 158, 11),  # amber
+    (16, 185, 129),  # emerald
+    (217, 70, 239),  # fuchsia
+    (6, 182, 212),  # cyan
+    (132, 204, 22),  # lime
+    (139, 92, 246),  # violet
+    (234, 88, 12),  # orange
+    (20, 184, 166),  # teal
+    (202, 138, 4),  # ochre
+)
+
+LIMIT_RGB = (239, 68, 68)  # limits, obstacles and violations; no agent has it
+REFERENCE_RGB = (148, 163, 184)
+SUM_RGB = (100, 116, 139)
+
+PHASE_RGB = {
+    "CONNECT": (71, 85, 105),
+    "STANDBY": (100, 116, 139),
+    "ARM": (202, 138, 4),
+    "TAKEOFF": (14, 165, 233),
+    "GOTO_START": (56, 189, 248),
+    "READY": (45, 212, 191),
+    "TRACK": (34, 160, 90),
+    "GOTO_LAND": (129, 140, 248),
+    "LAND": (99, 102, 241),
+    "DONE": (71, 85, 105),
+}
+
+MODE_RGB = {
+    "IDLE": (71, 85, 105),
+    "STREAM": (14, 165, 233),
+    "FOLLOW": (34, 160, 90),
+    "REPLAY": (234, 179, 8),
+    "BRAKE": (249, 115, 22),
+    "HOLD": (45, 212, 191),
+    "LAND": (99, 102, 241),
+    "YIELD": (168, 85, 247),
+    "BLIND": (220, 38, 38),
+}
+
+
+def agent_rgb(agent: int) -> tuple[int, int, int]:
+    """Colour of an agent, (r, g, b) in 0..255; beyond the table hues go round by the golden ratio."""
+    if agent < len(_AGENTS):
+        return _AGENTS[agent]
+    r, g, b = colorsys.hsv_to_rgb((0.61803398875 * agent) % 1.0, 0.65, 0.85)
+    return round(r * 255), round(g * 255), round(b * 255)
+
+
+def css(rgb: tuple[int, int, int]) -> str:
+    """Colour as `#rrggbb`."""
+    return f"#{rgb[0]:02x}{rgb[1]:02x}{rgb[2]:02x}"

@@ -1,0 +1,33 @@
+"""Values as JSON has them: no NaN, no infinity, no numpy. What can't be a number becomes null."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+
+
+def plain(value: Any) -> Any:
+    """The same value made of dict, list, str, int, float, bool and None; non-finite floats become None."""
+    if value is None or isinstance(value, (str, bool)):
+        return value
+    if isinstance(value, np.generic):
+        return plain(value.item())
+    if isinstance(value, int):
+        return int(value)  # also enums
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, dict):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [plain(item) for item in value]
+    return str(value)
+
+
+def to_json(value: Any, indent: int | None = None) -> str:
+    """JSON text of any value; never fails, never writes NaN."""
+    return json.dumps(plain(value), indent=indent, allow_nan=False, ensure_ascii=False)

@@ -1,0 +1,149 @@
+"""The agent's recorder: the tick hands over bytes and goes on; one thread of our own writes them.
+
+Never blocks and never raises into the tick. What doesn't fit the queue, or the disk refuses, is dropped and counted.
+Files only grow by whole rows, so a killed agent leaves readable files; at most `_FLUSH_S` of them is missing.
+"""
+
+from __future__ import annotations
+
+import bisect
+import contextlib
+import itertools
+import os
+import struct
+import threading
+import time
+from collections import deque
+from pathlib import Path
+from typing import Any
+
+from swarmctl.core.records import TICK_DTYPE, tick_row
+from swarmctl.core.types import TickRecord
+from swarmctl.telemetry.plain import to_json
+
+_FLUSH_S = 0.25
+_QUEUE = 16384  # items; about 20 s of ticks and frames, 4 MB
+_REOPEN_S = 1.0  # a file that can't be opened is tried again this often
+_TLOG_STAMP = struct.Struct(">Q")
+
+
+class Recorder:
+    """Ticks, MAVLink frames and events of one agent, in three files of a run folder.
+
+    `agent-<i>.ticks` holds raw `TICK_DTYPE` rows, `agent-<i>.tlog` frames behind their UTC [us] (the format of every
+    ground station), `agent-<i>.events.jsonl` one JSON object a line.
+    """
+
+    def __init__(self, directory: Path, agent: int) -> None:
+        self._source = f"agent-{agent}"
+        self._files = (
+            _RowFile(directory / f"{self._source}.ticks", TICK_DTYPE.itemsize),
+            _RowFile(directory / f"{self._source}.tlog"),
+            _RowFile(directory / f"{self._source}.events.jsonl"),
+        )
+        self._queue: deque[tuple[int, bytes]] = deque()
+        self._refused = 0  # written by the tick's thread
+        self._stop = threading.Event()
+        self._thread = threading.Thread(target=self._run, name=f"recorder-{agent}", daemon=True)
+        self._thread.start()
+
+    @property
+    def lost(self) -> int:
+        """Rows that will never be on disk, so far."""
+        return self._refused + sum(file.lost for file in self._files)
+
+    def tick(self, record: TickRecord) -> None:
+        """Keep one tick."""
+        self._put(0, tick_row(record).tobytes())
+
+    def frame(self, utc_us: int, frame: bytes) -> None:
+        """Keep one MAVLink frame, sent or received at `utc_us`."""
+        self._put(1, _TLOG_STAMP.pack(utc_us) + frame)
+
+    def event(self, name: str, t_us: int, utc_us: int, **fields: Any) -> None:
+        """Keep one event: something that happens now and then, with its figures."""
+        row = {"utc_us": utc_us, "t_us": t_us, "source": self._source, "event": name, **fields}
+        self._put(2, to_json(row).encode() + b"\n")
+
+    def close(self, timeout_s: float = 2.0) -> None:
+        """Write what is queued; a disk that hangs for `timeout_s` is left alone and its rows counted."""
+        self._stop.set()
+        self._thread.join(timeout_s)
+        if self._thread.is_alive():
+            self._refused += len(self._queue)
+
+    def _put(self, file: int, row: bytes) -> None:
+        if len(self._queue) >= _QUEUE or self._stop.is_set():
+            self._refused += 1
+            return
+        self._queue.append((file, row))
+
+    def _run(self) -> None:
+        while not self._stop.wait(_FLUSH_S):
+            self._drain()
+        self._drain()
+        for file in self._files:
+            file.close()
+
+    def _drain(self) -> None:
+        batches: tuple[list[bytes], ...] = ([], [], [])
+        for _ in range(len(self._queue)):
+            file, row = self._queue.popleft()
+            batches[file].append(row)
+        for file_, rows in zip(self._files, batches, strict=True):
+            if rows:
+                file_.append(rows)
+
+
+class _RowFile:
+    """A file that grows by whole rows or not at all, and counts the rows it could not take."""
+
+    def __init__(self, path: Path, row_bytes: int = 1) -> None:
+        self.lost = 0
+        self._path = path
+        self._row_bytes = row_bytes
+        self._fd = -1
+        self._good_size = 0
+        self._next_try_s = 0.0
+
+    def append(self, rows: list[bytes]) -> None:
+        if not self._open():
+            self.lost += len(rows)
+            return
+        data = memoryview(b"".join(rows))
+        done = 0
+        try:
+            while done < len(data):
+                done += os.write(self._fd, data[done:])
+            self._good_size += done
+        except OSError:
+            self._keep_whole(rows, done)
+
+    def _keep_whole(self, rows: list[bytes], done: int) -> None:
+        """After a write that stopped `done` bytes into `rows`: half a row would shift every later one."""
+        ends = list(itertools.accumulate(map(len, rows)))
+        kept = bisect.bisect_right(ends, done)
+        self.lost += len(rows) - kept
+        self._good_size += ends[kept - 1] if kept else 0
+        with contextlib.suppress(OSError):
+            os.ftruncate(self._fd, self._good_size)
+
+    def close(self) -> None:
+        if self._fd >= 0:
+            with contextlib.suppress(OSError):
+                os.close(self._fd)
+            self._fd = -1
+
+    def _open(self) -> bool:
+        now_s = time.monotonic()
+        if self._fd < 0 and now_s >= self._next_try_s:
+            self._next_try_s = now_s + _REOPEN_S
+            try:
+                self._fd = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC, 0o644)
+                size = os.fstat(self._fd).st_size
+                self._good_size = size - size % self._row_bytes
+                if self._good_size < size:
+                    os.ftruncate(self._fd, self._good_size)  # a killed predecessor's half row
+            except OSError:
+                self.close()
+        return self._fd >= 0

@@ -1,0 +1,149 @@
+"""Recordings as files and windows: pack one, draw one offline, open one in the native viewer."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import time
+import uuid
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarmctl.errors import StartError
+from swarmctl.telemetry.referee import RunData
+
+if TYPE_CHECKING:
+    from swarmctl.telemetry.layout import Stage  # rerun takes a second to import
+
+RECORDING = "telemetry.rrd"
+APPLICATION = "swarmctl"
+_LEAST_BYTES = 4096  # a packed recording without any entity is smaller: that was no recording
+_CHUNK = 50  # ticks of an agent sent at once: one second
+_OWN_PORT = ("--bind", "127.0.0.1", "--port", "auto")  # else it feeds our server's data back to our server
+_WINDOW_MEMORY = "2GB"  # the viewer's own default is 75 % of the machine
+
+
+def viewer_binary() -> Path:
+    """The native viewer; not the script of the same name, which passes on no signals."""
+    import rerun_cli
+
+    return Path(rerun_cli.__file__).parent / "rerun"
+
+
+def has_display() -> bool:
+    """Whether a window could be opened at all."""
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def open_viewer(target: str, log: Path | None = None) -> subprocess.Popen[bytes]:
+    """Open a live URL or a recording in the native viewer, which outlives this process.
+
+    Args:
+        target: `rerun+http://...` or the path of an `.rrd`.
+        log: file for what the viewer prints; None to drop it.
+
+    Raises:
+        StartError: no display, no such recording, or the viewer can't be started.
+    """
+    if not has_display():
+        raise StartError(
+            f"no display: neither DISPLAY nor WAYLAND_DISPLAY is set. On a machine with one: rerun --port auto {target}"
+        )
+    if "://" not in target and not Path(target).exists():
+        raise StartError(f"{target}: no such recording")
+    command = [str(viewer_binary()), target, "--memory-limit", _WINDOW_MEMORY, *_OWN_PORT]
+    try:
+        with (log or Path(os.devnull)).open("ab") as output:
+            return subprocess.Popen(
+                command, stdin=subprocess.DEVNULL, stdout=output, stderr=output, start_new_session=True
+            )
+    except OSError as error:
+        raise StartError(f"the viewer can't be started: {error}") from error
+
+
+def optimize_recording(directory: Path, timeout_s: float = 60.0) -> bool:
+    """Pack `telemetry.rrd` of a run folder, which also gives it the footer a live file lacks.
+
+    Returns: whether the file was replaced; on failure, or after `timeout_s`, the original stays.
+    """
+    source, packed = directory / RECORDING, directory / f"{RECORDING}.part"
+    if not source.exists():
+        return False
+    command = [str(viewer_binary()), "rrd", "optimize", str(source), "-o", str(packed)]
+    until_s = time.monotonic() + timeout_s
+    try:
+        for more in ((), ("--continue-on-error",)):  # the second for a file whose writer was killed
+            left_s = max(0.1, until_s - time.monotonic())
+            done = subprocess.run(
+                [*command, *more], stdin=subprocess.DEVNULL, capture_output=True, timeout=left_s, check=False
+            )
+            if done.returncode == 0 and packed.stat().st_size >= _LEAST_BYTES:
+                packed.replace(source)
+                return True
+        return False
+    except (OSError, subprocess.TimeoutExpired):
+        return False
+    finally:
+        packed.unlink(missing_ok=True)
+
+
+def simulated_recording(
+    directory: Path,
+    run: RunData,
+    agents: int,
+    separation_m: float,
+    limit_m: float,
+    obstacles: Sequence[dict[str, Any]] = (),
+) -> Path:
+    """Write `telemetry.rrd` of a finished run from its recorded ticks; predicted paths aren't in there.
+
+    Args:
+        directory: the run folder.
+        run: the recording.
+        agents: size of the swarm.
+        separation_m: distance that agents keep.
+        limit_m: distance below which the referee sees a violation.
+        obstacles: as in the configuration: center_ned_m, radius_m, keep_out_m, vel_ned_m_s.
+    """
+    import rerun as rr
+
+    from swarmctl.telemetry.obstacles import read_obstacles
+    from swarmctl.telemetry.scene import Scene
+
+    path = directory / RECORDING
+    rec = rr.RecordingStream(APPLICATION, recording_id=f"{directory.resolve().name}-{uuid.uuid4().hex[:8]}")
+    rec.set_log_time_enabled(False)
+    rec.set_sinks(rr.FileSink(path))
+    flown = {agent: rows for agent, rows in run.ticks.items() if agent < agents and len(rows)}
+    scene = Scene(rec, agents, separation_m, limit_m, _stage(flown))
+    scene.begin()
+    epoch_us = min((int(rows["utc_us"][0]) for rows in flown.values()), default=0)
+    drawn = read_obstacles(list(obstacles)) or []
+    scene.obstacles(drawn, 0, 0.0)
+    for first in range(0, max(map(len, flown.values()), default=0), _CHUNK):
+        for agent, rows in flown.items():
+            chunk = rows[first : first + _CHUNK]
+            scene.ticks(agent, chunk["utc_us"] - epoch_us, chunk, None)
+        if any(obstacle.moves for obstacle in drawn):
+            scene.obstacles(drawn, first * 20_000, first * 0.02)
+        scene.plots()
+    rec.flush(timeout_sec=30)
+    rec.disconnect()
+    return path
+
+
+def _stage(flown: Mapping[int, NDArray[np.void]]) -> Stage:
+    """The box that holds every flown position."""
+    from swarmctl.telemetry.layout import Stage
+
+    pos_ned_m = np.concatenate([rows["pos_ned_m"] for rows in flown.values()]) if flown else np.zeros((1, 3))
+    pos_ned_m = pos_ned_m[np.isfinite(pos_ned_m).all(axis=1)]
+    if not len(pos_ned_m):
+        return Stage()
+    low, high = pos_ned_m.min(axis=0), pos_ned_m.max(axis=0)
+    north_m, east_m, down_m = ((low + high) / 2).tolist()
+    return Stage((north_m, east_m, down_m), float((high - low).max() / 2) + 1.0)

@@ -1,0 +1,283 @@
+"""Judges a finished run from its recording: pure numpy, no files, no opinion of the agents themselves.
+
+Positions are the simulator's true ones where there are any, otherwise what the agents reported. The result is the
+content of `summary.json`; a figure that can't be known is None.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarmctl.core.types import Array, Mode, PlanStatus
+from swarmctl.telemetry.plain import plain
+from swarmctl.telemetry.tracks import Tracks, flight_rows, merge_tracks, mission_start_us, track_error, utc_offset_us
+
+_CONTROLLED = (Mode.FOLLOW, Mode.REPLAY, Mode.BRAKE)
+_SOLVER_FAILED = (PlanStatus.SOLVER_FAILED, PlanStatus.RESIDUAL)
+_LISTED = 10  # violations of one kind that are spelled out
+_DURATION_SLACK_S = 1.0  # of the mission that may be missing at its end before it counts as cut short
+
+
+class ObstacleRule(NamedTuple):
+    """A sphere to stay out of."""
+
+    center_ned_m: Sequence[float]  # (3,) when it begins to count
+    keep_out_m: float  # from the centre
+    vel_ned_m_s: Sequence[float] = (0.0, 0.0, 0.0)
+    since_utc_us: int | None = None  # when an operator set it; None: `center` holds at mission start, judged throughout
+
+
+@dataclass(frozen=True, slots=True)
+class Rules:
+    """What a run is judged by."""
+
+    agents: int
+    required_separation_m: float
+    obstacles: tuple[ObstacleRule, ...] = ()
+    obstacle_margin_m: float = 0.05  # allowed intrusion into keep_out_m
+    late_ticks_01: float = 0.2  # share of ticks that may be late
+    solver_name: str = "osqp"
+    mode: Literal["realtime", "lockstep"] = "realtime"
+    duration_s: float | None = None  # of mission time a completed run must have tracked
+
+
+@dataclass(frozen=True, slots=True)
+class RunData:
+    """The recording of a run."""
+
+    ticks: dict[int, NDArray[np.void]]  # per agent, TICK_DTYPE
+    truth: NDArray[np.void]  # TRUTH_DTYPE, empty without a simulator
+    events: list[dict[str, Any]]
+
+
+def judge(
+    run: RunData,
+    rules: Rules,
+    outcome: str,
+    problems: Sequence[str] = (),
+    speed_factor: float | None = None,
+    steady_after_s: float = 10.0,
+) -> dict[str, Any]:
+    """Figures and violations of a run.
+
+    Args:
+        run: the recording.
+        rules: limits.
+        outcome: "completed" | "failed" | "interrupted", as the launcher saw it.
+        problems: what went wrong in words, from the launcher; each one is a violation.
+        speed_factor: simulated seconds per wall second.
+        steady_after_s: mission time from which `steady_rmse_m` and `index_after_10s_m` are taken.
+    """
+    tracks = merge_tracks(run.ticks, run.truth, rules.agents)
+    clock = _MissionClock(run.ticks, tracks)
+    separation, apart = _judge_separation(tracks, rules, clock)
+    obstacles, clear = _judge_obstacles(tracks, rules, clock)
+    timing, punctual = _judge_timing(run.ticks, rules, speed_factor)
+    tracking, tracked_s = _judge_tracking(run, rules.agents, steady_after_s)
+    violations = [*problems, *apart, *clear, *punctual, *_not_a_number(run.truth)]
+    if outcome == "completed":
+        violations += _cut_short(tracked_s, rules)
+    summary = {
+        "outcome": "failed" if outcome == "completed" and violations else outcome,
+        "violations": violations,
+        "agents": rules.agents,
+        "duration_s": max(tracked_s.values(), default=0.0),
+        "mode": rules.mode,
+        "tracking": tracking,
+        "separation": separation,
+        "obstacles": obstacles,
+        "timing": timing,
+        "solver": _solver(run.ticks, rules.solver_name),
+        "comms": _comms(run),
+    }
+    result: dict[str, Any] = plain(summary)
+    return result
+
+
+class _MissionClock:
+    """Words for instants: mission time where there is a mission, otherwise time since the first arming."""
+
+    def __init__(self, ticks: Mapping[int, NDArray[np.void]], tracks: Tracks) -> None:
+        first_us = float(tracks.t_us[0]) if len(tracks.t_us) else 0.0
+        start_us = mission_start_us(ticks, tracks.time_field)
+        self.start_us = first_us if start_us is None else start_us
+        self.utc_offset_us = 0.0 if tracks.time_field == "utc_us" else utc_offset_us(ticks)
+
+    def at_s(self, t_us: float) -> float:
+        return (t_us - self.start_us) / 1e6
+
+
+def _judge_separation(tracks: Tracks, rules: Rules, clock: _MissionClock) -> tuple[dict[str, Any], list[str]]:
+    """Smallest distance of every pair at every common instant."""
+    found: dict[str, Any] = {
+        "min_m": None,
+        "required_m": rules.required_separation_m,
+        "min_pair": None,
+        "min_at_s": None,
+    }
+    violations = []
+    for i, j in itertools.combinations(range(rules.agents), 2):
+        distance_m = np.linalg.norm(tracks.pos_ned_m[:, i] - tracks.pos_ned_m[:, j], axis=1)
+        if not np.isfinite(distance_m).any():
+            violations.append(f"separation of agents {i} and {j} can't be judged: no common positions were recorded")
+            continue
+        nearest = int(np.nanargmin(distance_m))
+        least_m, at_s = float(distance_m[nearest]), clock.at_s(tracks.t_us[nearest])
+        if found["min_m"] is None or least_m < found["min_m"]:
+            found |= {"min_m": least_m, "min_pair": [i, j], "min_at_s": at_s}
+        if least_m < rules.required_separation_m:
+            violations.append(
+                f"separation {least_m:.3f} m below {rules.required_separation_m:g} m "
+                f"between agents {i} and {j} at {at_s:.1f} s"
+            )
+    return found, _shorten(violations)
+
+
+def _judge_obstacles(tracks: Tracks, rules: Rules, clock: _MissionClock) -> tuple[dict[str, float | None], list[str]]:
+    """Distance to the centre of the obstacle that was respected least, and what it had to be."""
+    worst: tuple[float, float] | None = None  # (distance, required) with the least room
+    violations = []
+    for number, rule in enumerate(rules.obstacles):
+        required_m = rule.keep_out_m - rules.obstacle_margin_m
+        since_us = clock.start_us if rule.since_utc_us is None else rule.since_utc_us - clock.utc_offset_us
+        elapsed_s = (tracks.t_us - since_us) / 1e6
+        center_ned_m = np.asarray(rule.center_ned_m) + elapsed_s[:, None] * np.asarray(rule.vel_ned_m_s)  # (T, 3)
+        counts = np.ones(len(elapsed_s), bool) if rule.since_utc_us is None else elapsed_s >= 0.0
+        for agent in range(rules.agents):
+            distance_m = np.linalg.norm(tracks.pos_ned_m[:, agent] - center_ned_m, axis=1)
+            distance_m[~counts] = np.nan
+            if not np.isfinite(distance_m).any():
+                continue
+            nearest = int(np.nanargmin(distance_m))
+            least_m = float(distance_m[nearest])
+            if worst is None or least_m - required_m < worst[0] - worst[1]:
+                worst = (least_m, required_m)
+            if least_m < required_m:
+                violations.append(
+                    f"obstacle clearance {least_m:.3f} m below {required_m:g} m "
+                    f"between agent {agent} and obstacle {number} at {clock.at_s(tracks.t_us[nearest]):.1f} s"
+                )
+    distance, required = worst or (None, None)
+    return {"min_clearance_m": distance, "required_m": required}, _shorten(violations)
+
+
+def _judge_timing(
+    ticks: Mapping[int, NDArray[np.void]], rules: Rules, speed_factor: float | None
+) -> tuple[dict[str, Any], list[str]]:
+    """Tick and solve times between arming and the end of landing."""
+    flights = [flight_rows(rows) for rows in ticks.values()]
+    total = sum(len(rows) for rows in flights)
+    late = sum(int(np.maximum(np.diff(rows["late_ticks"].astype(np.int64)), 0).sum()) for rows in flights)
+    timing = {
+        "ticks": total,
+        "late_ticks": late,
+        "tick_ms": _spread([rows["tick_ms"] for rows in flights]),
+        "solve_ms": _spread([rows["solve_ms"][rows["iterations"] > 0] for rows in flights]),
+        "speed_factor": speed_factor,
+    }
+    if total and late > rules.late_ticks_01 * total:
+        return timing, [f"late ticks {late / total:.1%} above {rules.late_ticks_01:.1%} ({late} of {total})"]
+    return timing, []
+
+
+def _judge_tracking(run: RunData, agents: int, steady_after_s: float) -> tuple[dict[str, Any], dict[int, float]]:
+    """Distance to the reference while tracking; also how long each agent tracked [s of mission time].
+
+    The index is thesis Table 19: the sum over agents of the distance to the shared reference, averaged over the
+    mission time that all agents have in common.
+    """
+    errors = {agent: track_error(rows, run.truth, agent) for agent, rows in run.ticks.items() if agent < agents}
+    errors = {agent: error for agent, error in errors.items() if len(error.mission_t_s)}
+    rows = []
+    for agent, error in errors.items():
+        steady = error.mission_t_s >= steady_after_s
+        rows.append(
+            {
+                "id": agent,
+                "mse_m2": np.mean(error.error_ned_m**2, axis=0),
+                "mean_distance_m": float(np.mean(error.distance_m)),
+                "rmse_m": float(np.sqrt(np.mean(error.distance_m**2))),
+                "steady_rmse_m": float(np.sqrt(np.mean(error.distance_m[steady] ** 2))) if steady.any() else None,
+            }
+        )
+    indices: tuple[float | None, float | None] = (None, None)
+    if len(errors) == agents:
+        first_s = max(error.mission_t_s[0] for error in errors.values())
+        last_s = min(error.mission_t_s[-1] for error in errors.values())
+        spans = [(first_s, last_s), (max(first_s, steady_after_s), last_s)]
+        indices = (_index_m(errors, *spans[0]), _index_m(errors, *spans[1]))
+    tracked_s = {agent: float(error.mission_t_s[-1]) for agent, error in errors.items()}
+    return {"index_m": indices[0], "index_after_10s_m": indices[1], "agents": rows}, tracked_s
+
+
+def _index_m(errors: Mapping[int, Any], first_s: float, last_s: float) -> float | None:
+    total_m = 0.0
+    for error in errors.values():
+        common = (error.mission_t_s >= first_s) & (error.mission_t_s <= last_s)
+        if not common.any():
+            return None
+        total_m += float(np.mean(error.distance_m[common]))
+    return total_m
+
+
+def _solver(ticks: Mapping[int, NDArray[np.void]], name: str) -> dict[str, Any]:
+    """Failures while the agent was in charge, and the largest residual of a plan that was good enough to fly."""
+    flights = [flight_rows(rows) for rows in ticks.values()]
+    charged = [rows[np.isin(rows["mode"], _CONTROLLED)] for rows in flights]
+    residuals = [
+        rows["residual_m"][(rows["iterations"] > 0) & (rows["plan_status"] == PlanStatus.OK)] for rows in flights
+    ]
+    return {
+        "name": name,
+        "failed": sum(int(np.isin(rows["plan_status"], _SOLVER_FAILED).sum()) for rows in charged),
+        "not_certified": sum(int((rows["plan_status"] == PlanStatus.NOT_CERTIFIED).sum()) for rows in charged),
+        "max_residual_m": _spread(residuals)["max"],
+    }
+
+
+def _comms(run: RunData) -> dict[str, Any]:
+    """Age of the oldest path in use, and what the agents' buses refused (their last `bus_summary` event)."""
+    ages = _spread([flight_rows(rows)["path_age_ms"] for rows in run.ticks.values()])
+    last = {event.get("source"): event for event in run.events if event.get("event") == "bus_summary"}
+    rejected: Counter[str] = Counter()
+    for event in last.values():
+        reasons = event.get("rejected")
+        if isinstance(reasons, dict):
+            rejected.update({str(reason): int(n) for reason, n in reasons.items() if isinstance(n, (int, float))})
+    return {"path_age_ms": {"p50": ages["p50"], "p99": ages["p99"]}, "rejected": dict(sorted(rejected.items()))}
+
+
+def _not_a_number(truth: NDArray[np.void]) -> Iterator[str]:
+    for vehicle in np.unique(truth["vehicle"][~np.isfinite(truth["pos_ned_m"]).all(axis=1)]):
+        yield f"true position of agent {vehicle} is not a number: the simulation diverged"
+
+
+def _cut_short(tracked_s: Mapping[int, float], rules: Rules) -> Iterator[str]:
+    if rules.duration_s is None:
+        return
+    for agent, seconds in tracked_s.items():
+        if seconds < rules.duration_s - _DURATION_SLACK_S:
+            yield f"mission time {seconds:.1f} s of agent {agent} below {rules.duration_s:g} s"
+
+
+def _spread(parts: Sequence[Array]) -> dict[str, float | None]:
+    """Median, 99th percentile and maximum of the finite values."""
+    values = np.concatenate([np.asarray(part, np.float64) for part in parts]) if parts else np.zeros(0)
+    values = values[np.isfinite(values)]
+    if not len(values):
+        return {"p50": None, "p99": None, "max": None}
+    p50, p99 = np.percentile(values, [50, 99])
+    return {"p50": float(p50), "p99": float(p99), "max": float(values.max())}
+
+
+def _shorten(violations: list[str]) -> list[str]:
+    if len(violations) <= _LISTED:
+        return violations
+    return [*violations[:_LISTED], f"and {len(violations) - _LISTED} more like the last"]

@@ -1,0 +1,65 @@
+"""Smallest distance of a live swarm: agents report at different instants, so reports are brought to one grid.
+
+An agent that falls silent stops counting after a second; it must not stop the others' figure.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarmctl.core.types import Array
+from swarmctl.telemetry.tracks import interpolate
+
+_GRID_US = 20_000
+_GAP_US = 500_000
+_SILENT_US = 1_000_000
+
+
+class SeparationFeed:
+    """Batches of positions in, smallest pairwise distance at 50 Hz out."""
+
+    def __init__(self, agents: int) -> None:
+        self._t_us: list[NDArray[np.int64]] = [np.zeros(0, np.int64) for _ in range(agents)]
+        self._pos_ned_m: list[Array] = [np.zeros((0, 3)) for _ in range(agents)]
+        self._next_us: int | None = None
+
+    def offer(self, agent: int, t_us: NDArray[np.int64], pos_ned_m: Array) -> None:
+        """Positions (T, 3) of one agent at `t_us` (T,), increasing."""
+        self._t_us[agent] = np.concatenate([self._t_us[agent], t_us])
+        self._pos_ned_m[agent] = np.vstack([self._pos_ned_m[agent], pos_ned_m])
+
+    def take(self) -> tuple[NDArray[np.int64], Array]:
+        """Instants (G,) and smallest distances (G,) since the last call, as far as every live agent has reported."""
+        ends_us = {agent: int(t_us[-1]) for agent, t_us in enumerate(self._t_us) if len(t_us)}
+        if not ends_us:
+            return np.zeros(0, np.int64), np.zeros(0)
+        live = [agent for agent, end_us in ends_us.items() if end_us >= max(ends_us.values()) - _SILENT_US]
+        until_us = min(ends_us[agent] for agent in live)
+        if self._next_us is None:
+            self._next_us = max(int(self._t_us[agent][0]) for agent in live)
+        grid_us = np.arange(self._next_us, until_us + 1, _GRID_US)
+        if len(live) < 2 or not len(grid_us):
+            return np.zeros(0, np.int64), np.zeros(0)
+        at = [interpolate(grid_us, self._t_us[agent], self._pos_ned_m[agent], _GAP_US) for agent in live]
+        least_m = _least_distance_m(np.stack(at, axis=1))
+        self._next_us = int(grid_us[-1]) + _GRID_US
+        self._forget(self._next_us - _GAP_US)
+        known = np.isfinite(least_m)
+        return grid_us[known], least_m[known]
+
+    def _forget(self, before_us: int) -> None:
+        for agent, t_us in enumerate(self._t_us):
+            first = int(np.searchsorted(t_us, before_us))
+            first = min(first, max(0, len(t_us) - 1))  # the newest one stays: it says who is live
+            self._t_us[agent], self._pos_ned_m[agent] = t_us[first:], self._pos_ned_m[agent][first:]
+
+
+def _least_distance_m(pos_ned_m: Array) -> Array:
+    """Smallest pairwise distance (G,) of positions (G, n, 3); NaN where no pair is known."""
+    least_m = np.full(len(pos_ned_m), np.inf)
+    for i in range(pos_ned_m.shape[1] - 1):
+        apart_m = np.linalg.norm(pos_ned_m[:, i + 1 :] - pos_ned_m[:, i : i + 1], axis=2)
+        least_m = np.fmin(least_m, np.fmin.reduce(apart_m, axis=1))
+    least_m[~np.isfinite(least_m)] = np.nan
+    return least_m

@@ -1,0 +1,127 @@
+"""Recorded rows as motion: where every vehicle was at common instants, and how far from its reference.
+
+Pure numpy; shared by the referee and the report so that they can't disagree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarmctl.core.types import Array, Phase
+
+_GRID_US = 20_000
+_GAP_US = 500_000  # reported positions further apart than this are not joined by a line
+
+
+@dataclass(frozen=True, slots=True)
+class Tracks:
+    """Positions of all agents at common instants, from the first arming to the end."""
+
+    t_us: Array  # (T,) in the clock `time_field` names
+    pos_ned_m: Array  # (T, agents, 3), NaN where unknown
+    time_field: str  # "t_us" for true positions, "utc_us" for reported ones: agents may be on several hosts
+
+
+@dataclass(frozen=True, slots=True)
+class TrackError:
+    """One agent against its reference, one row a tick of the mission."""
+
+    mission_t_s: Array  # (T,)
+    error_ned_m: Array  # (T, 3) position minus reference
+    distance_m: Array  # (T,)
+
+
+def flight_rows(rows: NDArray[np.void]) -> NDArray[np.void]:
+    """The ticks between arming and the end of landing."""
+    during: NDArray[np.void] = rows[(rows["phase"] >= Phase.ARM) & (rows["phase"] < Phase.DONE)]
+    return during
+
+
+def tracking_rows(rows: NDArray[np.void]) -> NDArray[np.void]:
+    """The ticks of the mission itself."""
+    during: NDArray[np.void] = rows[(rows["phase"] == Phase.TRACK) & np.isfinite(rows["mission_t_s"])]
+    return during
+
+
+def mission_start_us(ticks: Mapping[int, NDArray[np.void]], time_field: str) -> float | None:
+    """When mission time was zero, in the clock `time_field` names; None without a mission."""
+    for rows in ticks.values():
+        tracking = tracking_rows(rows)
+        if len(tracking):
+            return float(tracking[time_field][0]) - 1e6 * float(tracking["mission_t_s"][0])
+    return None
+
+
+def utc_offset_us(ticks: Mapping[int, NDArray[np.void]]) -> float:
+    """UTC minus monotonic time of this host [us], 0 when nothing was recorded."""
+    for rows in ticks.values():
+        if len(rows):
+            return float(np.median(rows["utc_us"] - rows["t_us"]))
+    return 0.0
+
+
+def merge_tracks(ticks: Mapping[int, NDArray[np.void]], truth: NDArray[np.void], agents: int) -> Tracks:
+    """Positions at common instants: every instant of the simulator, else reports interpolated to 50 Hz."""
+    return _true_tracks(truth, agents) if len(truth) else _reported_tracks(ticks, agents)
+
+
+def _true_tracks(truth: NDArray[np.void], agents: int) -> Tracks:
+    rows = truth[truth["vehicle"] < agents]
+    armed = rows["armed"] != 0
+    if not armed.any():
+        return Tracks(np.zeros(0), np.zeros((0, agents, 3)), "t_us")
+    rows = rows[rows["t_us"] >= rows["t_us"][armed].min()]
+    t_us, instant = np.unique(rows["t_us"], return_inverse=True)
+    pos_ned_m = np.full((len(t_us), agents, 3), np.nan)
+    pos_ned_m[instant, rows["vehicle"]] = rows["pos_ned_m"]
+    return Tracks(t_us.astype(np.float64), pos_ned_m, "t_us")
+
+
+def _reported_tracks(ticks: Mapping[int, NDArray[np.void]], agents: int) -> Tracks:
+    known = {agent: rows[np.isfinite(rows["pos_ned_m"]).all(axis=1)] for agent, rows in ticks.items() if agent < agents}
+    known = {agent: rows[np.argsort(rows["utc_us"], kind="stable")] for agent, rows in known.items() if len(rows)}
+    armed = [rows["utc_us"][rows["armed"] != 0] for rows in known.values()]
+    armed = [times for times in armed if len(times)]
+    if not armed:
+        return Tracks(np.zeros(0), np.zeros((0, agents, 3)), "utc_us")
+    last_us = max(int(rows["utc_us"][-1]) for rows in known.values())
+    t_us = np.arange(min(int(times[0]) for times in armed), last_us + 1, _GRID_US)
+    pos_ned_m = np.full((len(t_us), agents, 3), np.nan)
+    for agent, rows in known.items():
+        pos_ned_m[:, agent] = interpolate(t_us, rows["utc_us"], rows["pos_ned_m"], _GAP_US)
+    return Tracks(t_us.astype(np.float64), pos_ned_m, "utc_us")
+
+
+def interpolate(at_us: NDArray[np.int64], t_us: NDArray[np.int64], values: Array, gap_us: int) -> Array:
+    """Linear interpolation of rows (T, k), NaN outside the data and inside gaps longer than `gap_us`."""
+    if not len(t_us):
+        return np.full((len(at_us), values.shape[1]), np.nan)
+    base = t_us[0]  # microseconds of UTC would cost float64 its last digits
+    at, t = (at_us - base).astype(np.float64), (t_us - base).astype(np.float64)
+    result = np.column_stack([np.interp(at, t, values[:, k]) for k in range(values.shape[1])])
+    after = np.clip(np.searchsorted(t_us, at_us), 1, max(1, len(t_us) - 1))
+    if len(t_us) > 1:
+        result[(t_us[after] - t_us[after - 1]) > gap_us] = np.nan
+    result[(at_us < t_us[0]) | (at_us > t_us[-1])] = np.nan
+    return result
+
+
+def true_positions(rows: NDArray[np.void], truth: NDArray[np.void], agent: int) -> Array:
+    """Where the vehicle of `agent` was at each tick (T, 3): interpolated truth, or its report without a simulator."""
+    if not len(truth):
+        return np.array(rows["pos_ned_m"])
+    own = truth[truth["vehicle"] == agent]
+    return interpolate(rows["t_us"], own["t_us"], own["pos_ned_m"], _GAP_US)
+
+
+def track_error(rows: NDArray[np.void], truth: NDArray[np.void], agent: int) -> TrackError:
+    """Distance of one agent to its reference at each tick of the mission; ticks without both are left out."""
+    tracking = tracking_rows(rows)
+    error_ned_m = true_positions(tracking, truth, agent) - tracking["ref_pos_ned_m"]
+    known = np.isfinite(error_ned_m).all(axis=1)
+    error_ned_m = error_ned_m[known]
+    return TrackError(tracking["mission_t_s"][known], error_ned_m, np.linalg.norm(error_ned_m, axis=1))

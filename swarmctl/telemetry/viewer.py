@@ -1,0 +1,236 @@
+"""The one process that owns rerun: ticks from the bus in, live server and `telemetry.rrd` out.
+
+`python -m swarmctl.telemetry.viewer --run R --bus ENDPOINT --agents N --run-dir DIR`. It serves and never connects, so
+nothing it does can hold up an agent; frozen or killed, it costs pictures only. The launcher decides when it ends
+(SIGTERM); Ctrl-C is not its business.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import signal
+import socket
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from swarmctl.errors import EXIT_OK, EXIT_USAGE, StartError, SwarmError
+from swarmctl.lifeline import die_with_parent
+from swarmctl.telemetry.obstacles import MovingObstacle, read_obstacles
+from swarmctl.telemetry.recordings import APPLICATION, RECORDING, has_display, open_viewer
+
+URL_FILE = "viewer.url"
+_HOST = "127.0.0.1"
+_PORTS_TRIED = 50
+_SERVER_MEMORY = "512MiB"  # history for viewers that come late
+_EXIT_S = 4.0  # from SIGTERM to the end, whatever hangs
+_FLUSH_S = 2.0
+_PLOTS_S = 0.4  # curves are sent this often, poses at --rate-hz
+_REDRAW_S = 5.0  # obstacles at rest are sent again: a late viewer's history loses rare data first
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run until SIGTERM; returns the exit code."""
+    options = _parser().parse_args(arguments)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    stop = threading.Event()
+    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    if options.die_with_parent:
+        die_with_parent(signal.SIGTERM)
+    obstacles = read_obstacles(_listed(options.obstacles_json))
+    if obstacles is None:
+        print("viewer: --obstacles-json: give a JSON list of obstacles", file=sys.stderr)
+        return EXIT_USAGE
+    try:
+        return _run(options, obstacles, stop)
+    except SwarmError as error:
+        print(f"viewer: {error}", file=sys.stderr)
+        return error.exit_code
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="swarmctl.telemetry.viewer", description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("--run", required=True, help="name of the run on the bus")
+    parser.add_argument("--bus", required=True, help="Zenoh endpoint of the launcher's router")
+    parser.add_argument("--agents", type=int, required=True)
+    parser.add_argument("--run-dir", type=Path, required=True, help="folder for telemetry.rrd and viewer.url")
+    parser.add_argument("--port", type=int, default=9876, help="loopback; the next free one when it is taken")
+    parser.add_argument("--rate-hz", type=float, default=10.0, help="batches a second")
+    parser.add_argument("--separation", type=float, default=0.9, help="distance agents keep [m]")
+    parser.add_argument("--limit", type=float, help="distance that is a violation [m]; default: --separation")
+    parser.add_argument("--obstacles-json", default="[]")
+    parser.add_argument("--look-at", type=float, nargs=3, default=(0.0, 0.0, -2.0), help="middle of the scene, NED [m]")
+    parser.add_argument("--extent", type=float, default=6.0, help="from there to the edge of the scene [m]")
+    parser.add_argument("--view", action="store_true", help="open the native viewer when there is a display")
+    parser.add_argument("--die-with-parent", action="store_true")
+    return parser
+
+
+def _listed(text: str) -> object:
+    try:
+        return json.loads(text)
+    except json.JSONDecodeError:
+        return None
+
+
+def _run(options: argparse.Namespace, obstacles: list[MovingObstacle], stop: threading.Event) -> int:
+    from swarmctl.telemetry.feed import Feed, open_session
+    from swarmctl.telemetry.layout import Stage
+    from swarmctl.telemetry.scene import Scene
+
+    session = _interruptible(lambda: open_session(options.bus), stop)
+    if session is None:
+        return EXIT_OK
+    rec, url = _serve(options.run, options.run_dir, options.port)
+    limit_m = options.separation if options.limit is None else options.limit
+    north_m, east_m, down_m = options.look_at
+    scene = Scene(rec, options.agents, options.separation, limit_m, Stage((north_m, east_m, down_m), options.extent))
+    scene.begin()
+    feed = Feed(session, options.run, options.agents)
+    _announce(options, url)
+    Pump(feed, scene, obstacles).run(1.0 / options.rate_hz, stop)
+    _end(rec, session, f"telemetry lost={feed.lost} received={feed.received}")
+    return EXIT_OK
+
+
+class Pump:
+    """Moves what has arrived into the scene, at a fixed rate."""
+
+    def __init__(self, feed: Any, scene: Any, obstacles: list[MovingObstacle]) -> None:
+        self._feed = feed
+        self._scene = scene
+        self._obstacles = obstacles
+        self._newest_us = 0
+        self._set_us = 0  # when the obstacles were set
+        self._drawn_us: int | None = None
+
+    def run(self, period_s: float, stop: threading.Event) -> None:
+        """Until `stop`, and once more for what arrived meanwhile."""
+        next_s = time.monotonic()
+        next_plots_s = next_s
+        while not stop.is_set():
+            self.step()
+            if time.monotonic() >= next_plots_s:
+                self._scene.plots()
+                next_plots_s = time.monotonic() + _PLOTS_S - period_s / 2
+            next_s = max(next_s + period_s, time.monotonic())  # after a freeze: go on, don't catch up
+            stop.wait(next_s - time.monotonic())
+        self.step()
+        self._scene.plots()
+
+    def step(self) -> None:
+        for batch in self._feed.take():
+            self._scene.ticks(batch.agent, batch.t_us, batch.rows, batch.plan_ned_m)
+            self._newest_us = max(self._newest_us, int(batch.t_us[-1]))
+        newer = self._feed.take_obstacles()
+        if newer is not None:
+            self._obstacles, self._set_us, self._drawn_us = newer, self._newest_us, None
+            self._scene.log("operator", self._newest_us, "INFO", f"{len(newer)} obstacles")
+        self._draw_obstacles()
+
+    def _draw_obstacles(self) -> None:
+        since_s = None if self._drawn_us is None else (self._newest_us - self._drawn_us) / 1e6
+        due_s = 0.0 if any(obstacle.moves for obstacle in self._obstacles) else _REDRAW_S
+        if since_s is None or since_s > due_s:
+            self._scene.obstacles(self._obstacles, self._newest_us, (self._newest_us - self._set_us) / 1e6)
+            self._drawn_us = self._newest_us
+
+
+def _interruptible(connect: Callable[[], Any], stop: threading.Event) -> Any:
+    """Result of a blocking connect, or None when `stop` comes first: native code sees no signals."""
+    answer: list[Any] = []
+
+    def attempt() -> None:
+        try:
+            answer.append(connect())
+        except Exception as error:
+            answer.append(error)
+
+    thread = threading.Thread(target=attempt, daemon=True)
+    thread.start()
+    while thread.is_alive() and not stop.is_set():
+        thread.join(0.05)
+    if not answer:
+        return None
+    if isinstance(answer[0], Exception):
+        raise StartError(f"bus: {answer[0]}") from answer[0]
+    return answer[0]
+
+
+def _serve(run: str, directory: Path, port: int) -> tuple[Any, str]:
+    """A stream that serves on loopback and writes the recording, if the disk takes one; and its URL."""
+    import rerun as rr
+
+    rec = rr.RecordingStream(APPLICATION, recording_id=run, batcher_config=rr.ChunkBatcherConfig(flush_tick=0.25))
+    rec.set_log_time_enabled(False)
+    path = directory / RECORDING
+    for candidate in range(port, min(port + _PORTS_TRIED, 65536)):
+        if not _is_free(candidate):
+            continue
+        server = rr.GrpcServerSink(_HOST, candidate, server_memory_limit=_SERVER_MEMORY, newest_first=True)
+        try:
+            rec.set_sinks(server, rr.FileSink(str(path), write_footer=False))
+        except Exception as error:  # noqa: BLE001
+            print(f"viewer: no recording: {error}", file=sys.stderr, flush=True)
+            server = rr.GrpcServerSink(_HOST, candidate, server_memory_limit=_SERVER_MEMORY, newest_first=True)
+            rec.set_sinks(server)
+        if _is_ours(candidate):
+            return rec, f"rerun+http://{_HOST}:{candidate}/proxy"
+    raise StartError(f"no free port in {port}..{port + _PORTS_TRIED - 1} on {_HOST}. Set telemetry.port")
+
+
+def _is_free(port: int) -> bool:
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((_HOST, port))
+        except OSError:
+            return False
+    return True
+
+
+def _is_ours(port: int, timeout_s: float = 2.0) -> bool:
+    """Whether this process listens there: the server binds later, and a lost race is only logged."""
+    until_s = time.monotonic() + timeout_s
+    while time.monotonic() < until_s:
+        for connection in psutil.Process().net_connections("tcp4"):
+            if connection.status == psutil.CONN_LISTEN and connection.laddr.port == port:
+                return True
+        time.sleep(0.02)
+    return False
+
+
+def _announce(options: argparse.Namespace, url: str) -> None:
+    try:
+        (options.run_dir / URL_FILE).write_text(url + "\n", encoding="utf-8")
+        if options.view and has_display():
+            open_viewer(url, options.run_dir / "rerun.log")
+    except (OSError, SwarmError) as error:
+        print(f"viewer: {error}", file=sys.stderr)
+    print(f"viewer {url}", flush=True)
+
+
+def _end(rec: Any, session: Any, last_line: str) -> None:
+    """Bounded end: a frozen viewer makes flush and disconnect hang."""
+    watchdog = threading.Timer(_EXIT_S, os._exit, [EXIT_OK])
+    watchdog.daemon = True
+    watchdog.start()
+    print(last_line, flush=True)
+    try:
+        rec.flush(timeout_sec=_FLUSH_S)
+    except Exception as error:
+        print(f"viewer: flush: {error}", file=sys.stderr, flush=True)
+    rec.disconnect()
+    session.close()
+    watchdog.cancel()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,222 @@
+"""The Zenoh bus with real processes: isolation, bounded memory, liveliness, router restart, orphans."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from swarmctl.errors import StartError
+from swarmctl.links.bus import SCHEME, ZenohBus
+from swarmctl.links.topics import COMMAND, OPERATOR, PATH, STATUS, TICK
+
+pytestmark = pytest.mark.process
+
+WAIT_S = 20.0
+
+
+def until(condition: Callable[[], bool], timeout_s: float = WAIT_S) -> bool:
+    """Whether the condition came true in time."""
+    deadline_s = time.monotonic() + timeout_s
+    while time.monotonic() < deadline_s:
+        if condition():
+            return True
+        time.sleep(0.02)
+    return condition()
+
+
+def start_router(endpoint: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "swarmctl.links.bus", "--router", endpoint, "--die-with-parent"]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline().startswith("router ready")
+    return process
+
+
+def end(process: subprocess.Popen[str]) -> int:
+    process.terminate()
+    code = process.wait(WAIT_S)
+    if process.stdout is not None:
+        process.stdout.close()
+    return code
+
+
+@pytest.fixture
+def endpoint() -> Iterator[str]:
+    directory = tempfile.mkdtemp(prefix="swarm-test-")
+    endpoint = f"{SCHEME}{directory}/bus.sock"
+    router = start_router(endpoint)
+    yield endpoint
+    assert end(router) == 0
+    assert not Path(directory).exists(), "the router takes its socket and directory away"
+
+
+@pytest.fixture
+def join(endpoint: str) -> Iterator[Callable[..., ZenohBus]]:
+    opened: list[ZenohBus] = []
+
+    def opener(me: str, listen: dict[object, list[str]] | None = None, run: str = "run") -> ZenohBus:
+        opened.append(ZenohBus(endpoint, run, me, listen or {}))  # type: ignore[arg-type]
+        return opened[-1]
+
+    yield opener
+    for bus in opened:
+        bus.close()
+
+
+def test_newest_path_only_but_every_command_in_order(join: Callable[..., ZenohBus]) -> None:
+    agent = join("agent-0", {PATH: ["agent-1"], COMMAND: [OPERATOR], TICK: ["agent-1"]})
+    peer, operator = join("agent-1"), join(OPERATOR)
+    assert until(lambda: agent.alive() == {"agent-0", "agent-1", OPERATOR})
+    for i in range(400):
+        peer.publish(PATH, str(i).encode())
+        peer.publish(TICK, str(i).encode())
+    for i in range(20):
+        operator.publish(COMMAND, str(i).encode())
+    commands: list[tuple[str, bytes]] = []
+
+    def all_commands() -> bool:
+        commands.extend(agent.receive(COMMAND))
+        return len(commands) >= 20
+
+    assert until(all_commands)
+    assert commands == [(OPERATOR, str(i).encode()) for i in range(20)]
+    time.sleep(0.3)
+    assert agent.receive(PATH) == [("agent-1", b"399")]
+    assert agent.receive(PATH) == []
+    ticks = agent.receive(TICK)
+    assert len(ticks) <= TICK.ring
+    assert ticks[-1] == ("agent-1", b"399")
+
+
+def test_only_the_senders_and_the_run_asked_for_are_heard(join: Callable[..., ZenohBus]) -> None:
+    agent = join("agent-0", {PATH: ["agent-0", "agent-1"]})
+    stranger, foreign, peer = join("agent-2"), join("agent-1", run="other"), join("agent-1")
+    assert until(lambda: agent.alive() == {"agent-0", "agent-1", "agent-2"})
+    for _ in range(5):
+        stranger.publish(PATH, b"stranger")
+        foreign.publish(PATH, b"foreign")
+        agent.publish(PATH, b"echo")
+    peer.publish(PATH, b"peer")
+    heard: list[tuple[str, bytes]] = []
+
+    def anything() -> bool:
+        heard.extend(agent.receive(PATH))
+        return bool(heard)
+
+    assert until(anything)
+    time.sleep(0.2)
+    heard += agent.receive(PATH)
+    assert heard == [("agent-1", b"peer")]
+    assert agent.receive(STATUS) == []
+
+
+def test_a_killed_process_is_seen_at_once_and_a_frozen_one_within_its_lease(
+    endpoint: str, join: Callable[..., ZenohBus]
+) -> None:
+    script = (
+        "import sys, time; from swarmctl.links.bus import ZenohBus\n"
+        f"bus = ZenohBus({endpoint!r}, 'run', sys.argv[1], {{}}, lease_ms=1000)\ntime.sleep(60)"
+    )
+    watcher = join("agent-0")
+    killed, frozen = (subprocess.Popen([sys.executable, "-c", script, name]) for name in ("agent-1", "agent-2"))
+    try:
+        assert until(lambda: {"agent-1", "agent-2"} <= watcher.alive())
+        os.kill(frozen.pid, signal.SIGSTOP)
+        killed.kill()
+        assert until(lambda: "agent-1" not in watcher.alive(), 2.0)
+        assert until(lambda: "agent-2" not in watcher.alive(), 10.0)
+        os.kill(frozen.pid, signal.SIGCONT)
+        assert until(lambda: "agent-2" in watcher.alive(), 10.0)
+    finally:
+        for process in (killed, frozen):
+            process.kill()
+            process.wait(WAIT_S)
+
+
+def test_router_lost_and_back() -> None:
+    endpoint = f"{SCHEME}{tempfile.mkdtemp(prefix='swarm-test-')}/bus.sock"
+    router = start_router(endpoint)
+    a, b = ZenohBus(endpoint, "run", "agent-0", {PATH: ["agent-1"]}), ZenohBus(endpoint, "run", "agent-1", {})
+    try:
+        assert until(lambda: len(a.alive()) == 2)
+        router.kill()
+        router.wait(WAIT_S)
+        assert until(lambda: not a.alive())
+        for _ in range(100):
+            before_s = time.monotonic()
+            b.publish(PATH, b"lost")
+            assert time.monotonic() - before_s < 0.5, "publishing never waits for the bus"
+        assert router.stdout is not None
+        router.stdout.close()
+        router = start_router(endpoint)
+        assert until(lambda: len(a.alive()) == 2)
+
+        def heard() -> bool:
+            b.publish(PATH, b"again")
+            time.sleep(0.02)
+            return bool(a.receive(PATH))
+
+        assert until(heard)
+    finally:
+        started_s = time.monotonic()
+        a.close()
+        b.close()
+        end(router)
+    assert time.monotonic() - started_s < 10.0
+
+
+def test_a_closed_bus_is_silent_and_never_raises(join: Callable[..., ZenohBus]) -> None:
+    a, b = join("agent-0", {PATH: ["agent-1"]}), join("agent-1")
+    assert until(lambda: len(b.alive()) == 2)
+    a.close()
+    a.publish(PATH, b"x")
+    assert a.receive(PATH) == []
+    a.alive()
+    a.close()
+    assert until(lambda: b.alive() == {"agent-1"})
+
+
+def test_refusals_name_endpoint_and_fix(endpoint: str, tmp_path: Path) -> None:
+    with pytest.raises(StartError, match=r"absent.sock.*python -m swarmctl.links.bus --router"):
+        ZenohBus(f"{SCHEME}{tmp_path}/absent.sock", "run", "agent-0", {}, connect_timeout_ms=300)
+    tmp_path.chmod(0o755)
+    for bad, word in (
+        (endpoint, "another router"),
+        (f"{SCHEME}{tmp_path}/bus.sock", "0700"),
+        (f"{SCHEME}/tmp/{'x' * 200}/bus.sock", "longer"),
+        ("tcp/127.0.0.1:7447", SCHEME),
+    ):
+        command = [sys.executable, "-m", "swarmctl.links.bus", "--router", bad]
+        answer = subprocess.run(command, capture_output=True, text=True, timeout=WAIT_S, check=False)
+        assert answer.returncode == 3, answer
+        assert word in answer.stderr
+        assert bad in answer.stderr
+
+
+def test_router_ignores_ctrl_c_and_dies_with_a_killed_parent() -> None:
+    directory = Path(tempfile.mkdtemp(prefix="swarm-test-"))
+    endpoint = f"{SCHEME}{directory}/bus.sock"
+    script = (
+        "import subprocess, sys, time\n"
+        f"p = subprocess.Popen([sys.executable, '-m', 'swarmctl.links.bus', '--router', {endpoint!r}, "
+        "'--die-with-parent'], start_new_session=True)\nprint(p.pid, flush=True)\ntime.sleep(60)"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    pid = int(parent.stdout.readline())
+    assert until(lambda: (directory / "bus.sock").exists())
+    os.kill(pid, signal.SIGINT)
+    time.sleep(0.3)
+    assert (directory / "bus.sock").exists()
+    parent.kill()
+    parent.wait(WAIT_S)
+    parent.stdout.close()
+    assert until(lambda: not directory.exists()), "socket and directory are gone although nobody asked the router"

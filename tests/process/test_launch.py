@@ -1,0 +1,313 @@
+"""Real launches, as a user starts them: simulator, agents, bus and view in processes, with signals from outside."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+
+from swarmctl.core.records import TRUTH_DTYPE
+from swarmctl.core.types import Landed
+
+pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
+
+READY_S = 90.0
+END_S = 150.0
+SHORT = ("--agents", "2", "--duration", "6", "--set", "telemetry.enabled=false")
+
+
+class Launched:
+    """One `swarmctl launch`; its temporary files are in a folder of their own, so that leftovers show."""
+
+    def __init__(self, run_dir: Path, temp: Path, *arguments: str) -> None:
+        self.run_dir = run_dir
+        self.temp = temp
+        self.env = {**os.environ, "TMPDIR": str(temp)}
+        self.env.pop("DISPLAY", None)
+        self.out = run_dir.with_suffix(".out")
+        command = [sys.executable, "-m", "swarmctl", "launch", *arguments, "--run-dir", str(run_dir)]
+        with self.out.open("w") as out:
+            self.process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, env=self.env)
+
+    def text(self) -> str:
+        return self.out.read_text()
+
+    def events(self, name: str) -> list[dict[str, Any]]:
+        rows: list[dict[str, Any]] = []
+        for file in ("launch.events.jsonl", "events.jsonl"):
+            path = self.run_dir / file
+            if path.exists():
+                rows += [json.loads(line) for line in path.read_text().splitlines() if line.endswith("}")]
+        return [row for row in rows if row["source"] == "launch" and row["event"] == name]
+
+    def until_phase(self, phase: str, agents: int) -> None:
+        """Wait until so many agents have entered a phase."""
+        deadline_s = time.monotonic() + READY_S
+        while len({row["agent"] for row in self.events("phase") if row["phase"] == phase}) < agents:
+            assert self.process.poll() is None, self.text()
+            assert time.monotonic() < deadline_s, self.text()
+            time.sleep(0.1)
+
+    def end(self, timeout_s: float = END_S) -> int:
+        """Exit code; afterwards nothing may be left."""
+        code = self.process.wait(timeout_s)
+        assert self.leftovers() == []
+        return code
+
+    def relatives(self) -> list[psutil.Process]:
+        """Every process with this launch's folders on its command line, except the launcher."""
+        marks = (str(self.run_dir), str(self.temp))
+        found = []
+        for process in psutil.process_iter(["cmdline", "status"]):
+            line = " ".join(process.info["cmdline"] or ())
+            if process.pid != self.process.pid and any(mark in line for mark in marks):
+                found.append(process)
+        return found
+
+    def leftovers(self) -> list[str]:
+        files = [str(path) for path in self.temp.rglob("*") if path.is_socket() or path.name.startswith("swarm-")]
+        notes = [str(path) for path in self.temp.glob("swarmctl-*/*.json")]
+        return files + notes + [" ".join(p.cmdline()) for p in self.relatives() if p.is_running()]
+
+    def pid_of(self, *words: str) -> int:
+        (pid,) = [p.pid for p in self.relatives() if all(word in p.cmdline() for word in words)]
+        return pid
+
+    def verb(self, *arguments: str) -> subprocess.CompletedProcess[str]:
+        """An operator's command beside the launch."""
+        command = [sys.executable, "-m", "swarmctl", *arguments]
+        return subprocess.run(command, env=self.env, capture_output=True, text=True, timeout=60, check=False)
+
+    def summary(self) -> dict[str, Any]:
+        summary: dict[str, Any] = json.loads((self.run_dir / "summary.json").read_text())
+        return summary
+
+    def landed(self) -> dict[int, bool]:
+        """Whether each vehicle ended on the ground, in truth."""
+        data = (self.run_dir / "truth.bin").read_bytes()
+        truth = np.frombuffer(data, TRUTH_DTYPE, len(data) // TRUTH_DTYPE.itemsize)
+        return {
+            int(v): bool(truth["landed"][truth["vehicle"] == v][-1] == Landed.ON_GROUND)
+            for v in np.unique(truth["vehicle"])
+        }
+
+
+@pytest.fixture
+def start(tmp_path: Path) -> Iterator[Callable[..., Launched]]:
+    launches: list[Launched] = []
+
+    def starter(*arguments: str) -> Launched:
+        temp = Path(tempfile.mkdtemp(prefix="sw"))
+        launches.append(Launched(tmp_path / f"run{len(launches)}", temp, *arguments))
+        return launches[-1]
+
+    yield starter
+    for launched in launches:
+        for relative in launched.relatives():
+            with contextlib.suppress(psutil.Error):
+                relative.kill()
+        launched.process.kill()
+        launched.process.wait(20)
+        shutil.rmtree(launched.temp, ignore_errors=True)
+
+
+def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Callable[..., Launched]) -> None:
+    launched = start("--agents", "3", "--duration", "6", "--no-view")
+    launched.until_phase("TRACK", 3)
+    assert launched.verb("status").returncode == 0
+    assert launched.end() == 0, launched.text()
+    lines = launched.text().splitlines()
+    assert "3 agents" in lines[0]
+    assert "bus " in lines[1]
+    assert str(launched.run_dir) in lines[2]
+    assert any("agent-2  TRACK" in line for line in lines)
+    assert any(line.startswith("completed, index") for line in lines[-6:])
+    summary = launched.summary()
+    assert summary["outcome"] == "completed"
+    assert summary["violations"] == []
+    assert summary["agents"] == 3
+    assert summary["separation"]["min_m"] >= summary["separation"]["required_m"]
+    assert summary["tracking"]["index_m"] < 9.0, "three agents that stayed at the centre would have 15"
+    assert launched.landed() == {0: True, 1: True, 2: True}
+    for name in ("config.toml", "events.jsonl", "telemetry.rrd", "report.html", "truth.bin"):
+        assert (launched.run_dir / name).stat().st_size > 0, name
+    for i in range(3):
+        assert (launched.run_dir / f"agent-{i}.parquet").stat().st_size > 0
+        assert (launched.run_dir / f"agent-{i}.tlog").stat().st_size > 0
+    assert not list(launched.run_dir.glob("*.part"))
+
+
+def test_a_killed_agent_fails_the_launch_and_the_others_finish(start: Callable[..., Launched]) -> None:
+    launched = start("--agents", "3", "--duration", "8", "--set", "telemetry.enabled=false")
+    launched.until_phase("TRACK", 3)
+    os.kill(launched.pid_of("agent", "--id", "1"), signal.SIGKILL)
+    assert launched.end() == 4, launched.text()
+    assert "agent-1 was killed by SIGKILL" in launched.text()
+    assert {row["agent"]: row["exit_code"] for row in launched.events("agent_ended")} == {0: 0, 1: 137, 2: 0}
+    summary = launched.summary()
+    assert summary["outcome"] == "failed"
+    assert any("agent-1" in violation for violation in summary["violations"])
+    assert launched.landed()[0]
+    assert launched.landed()[2]
+
+
+def test_ctrl_c_lands_and_sums_up(start: Callable[..., Launched]) -> None:
+    launched = start("--agents", "2", "--duration", "60", "--set", "telemetry.enabled=false")
+    launched.until_phase("TRACK", 2)
+    launched.process.send_signal(signal.SIGINT)
+    assert launched.end() == 130, launched.text()
+    assert launched.landed() == {0: True, 1: True}
+    assert launched.summary()["outcome"] == "interrupted"
+    assert "interrupted, index" in launched.text()
+
+
+def test_a_second_ctrl_c_ends_everything_at_once(start: Callable[..., Launched]) -> None:
+    launched = start("--agents", "2", "--duration", "60", "--no-view")
+    launched.until_phase("TRACK", 2)
+    launched.process.send_signal(signal.SIGINT)
+    time.sleep(0.5)
+    launched.process.send_signal(signal.SIGINT)
+    assert launched.end(30.0) == 130, launched.text()
+    assert launched.summary()["outcome"] == "interrupted"
+
+
+@pytest.mark.parametrize("when_s", [0.0, 0.3, 1.0, 2.0])
+def test_ctrl_c_during_start_leaves_nothing(start: Callable[..., Launched], when_s: float) -> None:
+    launched = start(*SHORT)
+    while not (launched.run_dir / "config.toml").exists():
+        assert launched.process.poll() is None, launched.text()
+        time.sleep(0.01)
+    time.sleep(when_s)
+    launched.process.send_signal(signal.SIGINT)
+    assert launched.end() == 130, launched.text()
+
+
+def test_a_killed_launcher_leaves_nothing(start: Callable[..., Launched]) -> None:
+    launched = start("--agents", "2", "--duration", "60", "--no-view")
+    launched.until_phase("ARM", 2)
+    launched.process.kill()
+    launched.process.wait(20)
+    deadline_s = time.monotonic() + 30.0
+    while any(not path.endswith(".json") for path in launched.leftovers()) and time.monotonic() < deadline_s:
+        time.sleep(0.2)
+    assert all(path.endswith(".json") for path in launched.leftovers()), launched.leftovers()
+    assert launched.verb("status").returncode == 3, "the note it left is recognised as stale"
+    assert launched.leftovers() == []
+
+
+@pytest.mark.parametrize("name", ["swarmctl.links.bus", "sitl"])
+def test_without_router_or_simulator_the_launch_ends_as_failed(start: Callable[..., Launched], name: str) -> None:
+    launched = start("--agents", "2", "--duration", "60", "--set", "telemetry.enabled=false")
+    launched.until_phase("TRACK", 2)
+    os.kill(launched.pid_of(name), signal.SIGKILL)
+    assert launched.end() == 4, launched.text()
+    assert launched.summary()["outcome"] == "failed"
+    if name != "sitl":
+        assert launched.landed() == {0: True, 1: True}
+
+
+def test_the_flight_does_not_need_its_viewer(start: Callable[..., Launched]) -> None:
+    launched = start("--agents", "2", "--duration", "6", "--no-view")
+    launched.until_phase("TRACK", 2)
+    os.kill(launched.pid_of("swarmctl.telemetry.viewer"), signal.SIGKILL)
+    assert launched.end() == 0, launched.text()
+    assert launched.text().count("the flight goes on") == 1
+
+
+def test_two_launches_at_once(start: Callable[..., Launched]) -> None:
+    first, second = start(*SHORT), start(*SHORT)
+    assert first.end() == 0, first.text()
+    assert second.end() == 0, second.text()
+    (one,), (other,) = first.events("started"), second.events("started")
+    assert not set(one["ports"]) & set(other["ports"])
+    assert one["run"] != other["run"]
+
+
+def test_operator_verbs(start: Callable[..., Launched]) -> None:
+    launched = start("--agents", "2", "--duration", "120", "--set", "telemetry.enabled=false")
+    launched.until_phase("TRACK", 2)
+    statuses = json.loads(launched.verb("status", "--json").stdout)
+    assert [status["agent"] for status in statuses] == [0, 1]
+    held = launched.verb("hold", "--agent", "1")
+    assert held.returncode == 0, held.stderr
+    assert "agent-1" in held.stdout
+    assert "agent-0" not in held.stdout
+    added = launched.verb(
+        "obstacle", "add", "--center", "-40,2.5,-9", "--radius", "0.5", "--run-dir", str(launched.run_dir)
+    )
+    assert added.returncode == 0, added.stderr
+    assert "0: centre -40.00, 2.50, -9.00" in added.stdout
+    assert "1 obstacles" in launched.verb("obstacle", "list").stdout
+    assert "0 obstacles" in launched.verb("obstacle", "remove", "0").stdout
+    assert launched.verb("obstacle", "remove", "0").returncode == 2
+    assert launched.verb("land", "--agent", "7").returncode == 3
+    assert launched.verb("resume").returncode == 0
+    assert launched.verb("land").returncode == 0
+    assert launched.end() == 130, launched.text()
+    assert launched.landed() == {0: True, 1: True}
+
+
+def test_taken_ports_are_stepped_over(start: Callable[..., Launched]) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        try:
+            taken.bind(("127.0.0.1", 14541))
+        except OSError:
+            pytest.skip("somebody else flies on 14541, which is as good")
+        launched = start(*SHORT)
+        launched.until_phase("STANDBY", 2)
+        (started,) = launched.events("started")
+        assert 14541 not in started["ports"]
+        launched.process.send_signal(signal.SIGINT)
+        assert launched.end() == 130, launched.text()
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "words"),
+    [
+        (["--agents", "0"], 2, ["swarm.agents = 0", ">= 1"]),
+        (["--agents", "1000"], 2, ["swarm.agents = 1000", "<= 100"]),
+        (["--agents", "three"], 2, ["--agents"]),
+        (["--duration", "nan"], 2, ["mission.duration_s", "finite"]),
+        (["no/such/file.toml"], 2, ["no/such/file.toml", "no such file"]),
+        (["--set", "swarm.agnets=3"], 2, ["did you mean 'agents'"]),
+        (["--nonsense"], 2, ["--nonsense"]),
+    ],
+)
+def test_bad_usage_is_refused_before_anything_starts(
+    start: Callable[..., Launched], arguments: list[str], code: int, words: list[str]
+) -> None:
+    launched = start(*arguments)
+    assert launched.end(30.0) == code
+    assert "Traceback" not in launched.text()
+    for word in words:
+        assert word in launched.text()
+    assert not launched.run_dir.exists()
+
+
+def test_vehicle_links_that_can_not_work_are_all_named_at_once(start: Callable[..., Launched], tmp_path: Path) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        port = taken.getsockname()[1]
+        urls = [f"udpin://127.0.0.1:{port}", "serial:///dev/no-such-device:57600"]
+        vehicles = "".join(f'[[vehicles]]\nsysid = {i + 1}\nurl = "{url}"\n' for i, url in enumerate(urls))
+        path = tmp_path / "vehicles.toml"
+        path.write_text(f"[swarm]\nagents = 2\n[sitl]\nenabled = false\n{vehicles}")
+        launched = start(str(path))
+        assert launched.end(30.0) == 3
+    for word in ("vehicles.0.url", str(port), "vehicles.1.url", "/dev/no-such-device does not exist"):
+        assert word in launched.text()
+    assert not launched.run_dir.exists()

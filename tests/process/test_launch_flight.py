@@ -1,0 +1,267 @@
+"""How a launch is supervised, with processes that only sleep and end: who is blamed, who goes on, what comes out."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import pytest
+
+import swarmctl.flight
+from swarmctl.config import load
+from swarmctl.core.types import FlightMode, Landed, Mode, Phase
+from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START
+from swarmctl.flight import Base, EventLog, Flight, Verdict
+from swarmctl.links.peers import LocalHub, agent_name
+from swarmctl.links.topics import (
+    COMMAND,
+    OBSTACLES,
+    OPERATOR,
+    STATUS,
+    ObstacleMessage,
+    ObstaclesMessage,
+    StatusMessage,
+    decode_command,
+    decode_obstacles,
+    encode_message,
+)
+from swarmctl.processes import ROUTER, SITL, VIEWER, Child, Command, Site, kill_all
+from swarmctl.table import AgentView
+
+pytestmark = pytest.mark.process
+
+LANDS_ON_SIGTERM = "import signal, sys, time; signal.signal(signal.SIGTERM, lambda *_: sys.exit(130)); "
+FLIES_LONG = LANDS_ON_SIGTERM + "time.sleep(60)"
+
+
+def ends(code: int, after_s: float = 0.3) -> str:
+    return LANDS_ON_SIGTERM + f"time.sleep({after_s}); print('because'); sys.exit({code})"
+
+
+def status_of(agent: int, phase: Phase) -> bytes:
+    said = (Mode.FOLLOW, FlightMode.EXTERNAL, True, Landed.IN_AIR, 0, "", 0.1, 1.0, 2.0, 9, 0, 5.0, 0, "")
+    message = StatusMessage(agent, 1, agent + 1, phase, *said)
+    return encode_message(message)
+
+
+class Scene(Base):
+    """A base of scripted processes; it also is the display, which the flight calls once in every step."""
+
+    def __init__(self, directory: Path, agents: Sequence[str], others: dict[str, str] | None = None) -> None:
+        self.log = EventLog(directory / "launch.events.jsonl")
+        self.site = Site("run", "unixsock-stream//nowhere", directory)
+        scripts = {agent_name(i): script for i, script in enumerate(agents)} | (others or {ROUTER: FLIES_LONG})
+        self.children = {
+            name: Child(Command(name, (sys.executable, "-ESc", script)), directory) for name, script in scripts.items()
+        }
+        self.hub = LocalHub(lambda: time.monotonic_ns() // 1000)
+        self.bus = self.hub.attach(OPERATOR)
+        self.agents = [self.hub.attach(agent_name(i)) for i in range(len(agents))]
+        self.said: list[str] = []
+        self.interrupts = 0
+        self.silent: set[int] = set()
+        self.orders: list[str] = []
+        self.obeys = True
+        self.act: Callable[[], None] = lambda: None
+        self.began_s = time.monotonic()
+
+    def announce(self, view: str) -> None:
+        self.said.append(f"announced {view}")
+
+    def hear_operators(self) -> None:
+        """Listen to the own name, under which operators' commands speak too."""
+        self.hub.detach(OPERATOR)
+        senders = [agent_name(i) for i in range(len(self.agents))]
+        self.bus = self.hub.attach(OPERATOR, {OBSTACLES: [OPERATOR], STATUS: senders})
+
+    def say(self, text: str) -> None:
+        self.said.append(text)
+
+    def close(self) -> None:
+        return
+
+    def show(self, agents: Sequence[AgentView]) -> None:
+        for i, bus in enumerate(self.agents):
+            orders = [order for _, payload in bus.receive(COMMAND) if (order := decode_command(payload))]
+            self.orders += [order.verb for order in orders]
+            if orders and self.obeys and i not in self.silent:
+                self.children[agent_name(i)].signal(signal.SIGTERM)
+            if i not in self.silent and self.children[agent_name(i)].poll() is None:
+                bus.publish(STATUS, status_of(i, Phase.TRACK))
+        if time.monotonic() - self.began_s > 0.3:
+            act, self.act = self.act, lambda: None
+            act()
+
+    def fly(self) -> Verdict:
+        config = load(None, [f"swarm.agents={len(self.agents)}"])
+        try:
+            return Flight(config, self, self).fly(lambda: self.interrupts)
+        finally:
+            kill_all(list(self.children.values()))
+
+    def kill(self, name: str) -> None:
+        os.kill(self.children[name].pid, signal.SIGKILL)
+
+    def heard(self, *words: str) -> bool:
+        return any(all(word in line for word in words) for line in self.said)
+
+
+@pytest.fixture(autouse=True)
+def short_times(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(swarmctl.flight, "_SILENCE_S", 1.0)
+    monkeypatch.setattr(swarmctl.flight, "_AFTER_DEATH_S", 0.5)
+    monkeypatch.setattr(swarmctl.flight, "_LAND_OBEYED_S", 1.0)
+
+
+def test_all_agents_finish(tmp_path: Path) -> None:
+    verdict = Scene(tmp_path, [ends(0), ends(0, 0.6)]).fly()
+    assert (verdict.outcome, verdict.problems) == ("completed", [])
+    assert verdict.exit_code(violated=False) == EXIT_OK
+    assert verdict.exit_code(violated=True) == EXIT_MISSION
+
+
+def test_a_killed_agent_is_named_and_the_others_finish(tmp_path: Path) -> None:
+    scene = Scene(tmp_path, [FLIES_LONG, ends(0, 2.0), ends(0, 2.0)])
+    scene.act = lambda: scene.kill("agent-0")
+    verdict = scene.fly()
+    assert verdict.exit_code(violated=False) == EXIT_MISSION
+    assert verdict.outcome == "failed"
+    assert scene.heard("agent-0", "SIGKILL")
+    assert [scene.children[f"agent-{i}"].poll() for i in range(3)] == [137, 0, 0]
+    assert "land" not in scene.orders
+
+
+def test_a_frozen_agent_is_given_up_when_the_others_have_finished(tmp_path: Path) -> None:
+    scene = Scene(tmp_path, [FLIES_LONG, ends(0, 3.0)])
+
+    def freeze() -> None:
+        os.kill(scene.children["agent-0"].pid, signal.SIGSTOP)
+        scene.silent.add(0)
+
+    scene.act = freeze
+    verdict = scene.fly()
+    assert verdict.exit_code(violated=False) == EXIT_MISSION
+    assert scene.heard("agent-0", "silent")
+    assert scene.children["agent-1"].poll() == 0
+    assert scene.children["agent-0"].poll() == 137
+
+
+def test_one_failed_mission_fails_the_launch_and_says_why(tmp_path: Path) -> None:
+    scene = Scene(tmp_path, [ends(4, 1.0), ends(0, 1.5)])
+    verdict = scene.fly()
+    assert verdict.exit_code(violated=False) == EXIT_MISSION
+    assert scene.heard("agent-0", "because")
+    assert scene.children["agent-1"].poll() == 0
+
+
+def test_an_agent_that_can_not_start_lands_the_others(tmp_path: Path) -> None:
+    scene = Scene(tmp_path, [FLIES_LONG, ends(3)])
+    verdict = scene.fly()
+    assert verdict.exit_code(violated=False) == EXIT_START
+    assert scene.heard("agent-1", "could not start", "because")
+    assert scene.children["agent-0"].poll() == 130
+
+
+def test_an_agent_never_heard_that_crashes_did_not_start(tmp_path: Path) -> None:
+    scene = Scene(tmp_path, [ends(1)])
+    scene.silent.add(0)
+    assert scene.fly().exit_code(violated=False) == EXIT_START
+
+
+def test_first_interrupt_lands_everybody(tmp_path: Path) -> None:
+    scene = Scene(tmp_path, [FLIES_LONG, FLIES_LONG])
+    scene.act = lambda: setattr(scene, "interrupts", 1)
+    verdict = scene.fly()
+    assert (verdict.outcome, verdict.problems) == ("interrupted", [])
+    assert verdict.exit_code(violated=True) == EXIT_INTERRUPTED
+    assert "land" in scene.orders
+    assert [scene.children[f"agent-{i}"].poll() for i in range(2)] == [130, 130]
+
+
+def test_who_does_not_hear_the_order_is_told_by_signal(tmp_path: Path) -> None:
+    scene = Scene(tmp_path, [FLIES_LONG])
+    scene.obeys = False
+    scene.act = lambda: setattr(scene, "interrupts", 1)
+    verdict = scene.fly()
+    assert verdict.problems == []
+    assert scene.children["agent-0"].poll() == 130
+
+
+def test_second_interrupt_kills_at_once(tmp_path: Path) -> None:
+    scene = Scene(tmp_path, [FLIES_LONG, FLIES_LONG], {ROUTER: FLIES_LONG, SITL: FLIES_LONG})
+    scene.obeys = False
+
+    def twice() -> None:
+        scene.interrupts = 1
+        scene.act = lambda: setattr(scene, "interrupts", 2)
+
+    scene.act = twice
+    began_s = time.monotonic()
+    assert scene.fly().exit_code(violated=False) == EXIT_INTERRUPTED
+    assert time.monotonic() - began_s < 10.0
+    assert {child.poll() for child in scene.children.values()} == {137}
+
+
+@pytest.mark.parametrize("carrier", [ROUTER, SITL])
+def test_without_router_or_simulator_everybody_lands(tmp_path: Path, carrier: str) -> None:
+    scene = Scene(tmp_path, [FLIES_LONG, FLIES_LONG], {ROUTER: FLIES_LONG, SITL: FLIES_LONG})
+    scene.act = lambda: scene.kill(carrier)
+    verdict = scene.fly()
+    assert verdict.exit_code(violated=False) == EXIT_MISSION
+    assert len(verdict.problems) == 1
+    assert scene.heard(carrier, "SIGKILL")
+    assert [scene.children[f"agent-{i}"].poll() for i in range(2)] == [130, 130]
+
+
+def test_a_simulator_that_refuses_to_start_is_a_failed_start(tmp_path: Path) -> None:
+    scene = Scene(tmp_path, [FLIES_LONG], {ROUTER: FLIES_LONG, SITL: ends(2, 0.0)})
+    scene.silent.add(0)
+    assert scene.fly().exit_code(violated=False) == EXIT_START
+    assert scene.heard("sitl", "because")
+
+
+@pytest.mark.parametrize("signum", [signal.SIGKILL, signal.SIGSTOP])
+def test_without_its_viewer_the_flight_goes_on(tmp_path: Path, signum: signal.Signals) -> None:
+    viewer = "import time; print('viewer rerun+http://127.0.0.1:9876/proxy', flush=True); time.sleep(60)"
+    scene = Scene(tmp_path, [ends(0, 2.0)], {ROUTER: FLIES_LONG, VIEWER: viewer})
+    scene.act = lambda: os.kill(scene.children[VIEWER].pid, signum)
+    verdict = scene.fly()
+    assert verdict.exit_code(violated=False) == EXIT_OK
+    assert scene.heard("announced rerun+http://127.0.0.1:9876/proxy")
+    assert sum("the flight goes on" in line for line in scene.said) == 1
+
+
+def test_landed_by_an_operator_is_an_interrupted_flight(tmp_path: Path) -> None:
+    scene = Scene(tmp_path, [ends(130), ends(130)])
+    verdict = scene.fly()
+    assert (verdict.outcome, verdict.problems) == ("interrupted", [])
+    assert verdict.exit_code(violated=False) == EXIT_INTERRUPTED
+
+
+def test_obstacles_of_an_operator_are_adopted_and_repeated(tmp_path: Path) -> None:
+    scene = Scene(tmp_path, [ends(0, 2.0)])
+    ball = ObstacleMessage((1.0, 2.0, -3.0), 0.5, 1.0, 3.0)
+    repeated: list[int] = []
+
+    def set_ball() -> None:
+        scene.hub.carry(OPERATOR, OBSTACLES, encode_message(ObstaclesMessage(5, (ball,))))
+        scene.act = collect
+
+    def collect() -> None:
+        for _, payload in scene.agents[0].receive(OBSTACLES):
+            message = decode_obstacles(payload)
+            assert message is not None
+            repeated.append(message.version)
+        scene.act = collect
+
+    scene.act = set_ball
+    scene.hear_operators()
+    verdict = scene.fly()
+    assert repeated[-1] == 5
+    assert verdict.obstacles is not None
+    assert list(verdict.obstacles) == [ball]
+    assert all(since_us is not None for since_us in verdict.obstacles.values())

@@ -1,0 +1,312 @@
+"""The telemetry process against a real router: what it records, and that nothing it does reaches an agent."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import socket
+import struct
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+
+from swarmctl.core.records import TICK_DTYPE
+from swarmctl.core.types import Mode, Phase, PlanStatus
+from swarmctl.telemetry.recordings import optimize_recording, viewer_binary
+
+pytestmark = [pytest.mark.process, pytest.mark.timeout(120)]
+
+AGENTS = 3
+RUN = "test"
+OBSTACLE = {"center_ned_m": [2.0, 7.0, -1.5], "radius_m": 1.0, "keep_out_m": 1.75, "visibility_m": 3.0}
+
+
+def open_session(settings: dict[str, Any]) -> Any:
+    config = zenoh.Config()
+    for key, value in ({"scouting/multicast/enabled": False, "scouting/gossip/enabled": False} | settings).items():
+        config.insert_json5(key, json.dumps(value))
+    return zenoh.open(config)
+
+
+class Swarm:
+    """Publishes what three agents would: on a triangle of side 1 m, 0.577 m from the reference that moves north."""
+
+    def __init__(self, endpoint: str) -> None:
+        self.session = open_session({"mode": "client", "connect/endpoints": [endpoint]})
+        self.publishers = [
+            self.session.declare_publisher(
+                f"swarm/{RUN}/{agent}/tick",
+                congestion_control=zenoh.CongestionControl.DROP,
+                reliability=zenoh.Reliability.BEST_EFFORT,
+            )
+            for agent in range(AGENTS)
+        ]
+        self.seq = 0
+        self.slowest_put_s = 0.0
+
+    def fly(self, seconds: float) -> None:
+        next_s = time.monotonic()
+        for _ in range(round(seconds * 50)):
+            for agent in range(AGENTS):
+                payload = self.payload(agent)
+                began_s = time.monotonic()
+                self.publishers[agent].put(payload)
+                self.slowest_put_s = max(self.slowest_put_s, time.monotonic() - began_s)
+            self.seq += 1
+            next_s += 0.02
+            time.sleep(max(0.0, next_s - time.monotonic()))
+
+    def payload(self, agent: int) -> bytes:
+        row = np.zeros(1, TICK_DTYPE)
+        row["t_us"], row["utc_us"], row["seq"] = time.monotonic_ns() // 1000, time.time_ns() // 1000, self.seq
+        row["phase"], row["mode"], row["mission_t_s"] = Phase.TRACK, Mode.FOLLOW, self.seq * 0.02
+        if self.seq % 50 == 25:
+            row["mode"], row["plan_status"] = Mode.REPLAY, PlanStatus.SOLVER_FAILED
+        row["ref_pos_ned_m"] = (0.01 * self.seq, 0.0, -2.0)
+        around = 2 * np.pi * agent / AGENTS
+        row["pos_ned_m"] = row["ref_pos_ned_m"] + np.array([np.cos(around), np.sin(around), 0.0]) / np.sqrt(3)
+        row["q_nb"] = (np.cos(0.05), np.sin(0.05), 0.0, 0.0)  # roll 0.1 rad
+        row["setpoint_q_nb"] = (np.cos(0.1), np.sin(0.1), 0.0, 0.0)
+        row["setpoint_thrust_01"], row["hover_thrust_01"] = 0.6, 0.5
+        row["iterations"], row["solve_ms"], row["tick_ms"], row["late_ticks"] = 25, 2.5, 4.5, self.seq // 10
+        plan = (row["pos_ned_m"] + np.arange(26)[:, None] * (0.02, 0.0, 0.0)).astype("<f4")
+        payload: bytes = row.tobytes() + struct.pack("<H", len(plan)) + plan.tobytes()
+        return payload
+
+
+@pytest.fixture
+def endpoint() -> Iterator[str]:
+    with tempfile.TemporaryDirectory(prefix="bus-") as folder:  # a socket's path has to be short
+        address = f"unixsock-stream/{folder}/r.sock"
+        router = open_session({"mode": "router", "listen/endpoints": [address]})
+        yield address
+        router.close()
+
+
+@contextlib.contextmanager
+def viewer(endpoint: str, directory: Path, *more: str) -> Iterator[subprocess.Popen[str]]:
+    directory.mkdir(exist_ok=True)
+    command = [sys.executable, "-m", "swarmctl.telemetry.viewer", "--run", RUN, "--bus", endpoint]
+    command += ["--agents", str(AGENTS), "--run-dir", str(directory), "--obstacles-json", json.dumps([OBSTACLE]), *more]
+    with (directory / "viewer.log").open("wb") as log:
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True)
+    try:
+        yield process
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            process.send_signal(signal.SIGCONT)
+            process.kill()
+        process.wait(10)
+
+
+def ready(process: subprocess.Popen[str]) -> str:
+    assert process.stdout is not None
+    line = process.stdout.readline()
+    assert line.startswith("viewer rerun+http://127.0.0.1:"), line
+    return line.split()[1]
+
+
+def finish(process: subprocess.Popen[str], limit_s: float = 5.0) -> str:
+    began_s = time.monotonic()
+    process.send_signal(signal.SIGTERM)
+    output, _ = process.communicate(timeout=20)
+    assert time.monotonic() - began_s < limit_s
+    assert process.returncode == 0
+    return output.strip().splitlines()[-1]
+
+
+def values(directory: Path) -> dict[str, list[Any]]:
+    """Every non-static row of the recording, per entity: its components without the time columns."""
+    from rerun.chunk import RrdReader
+
+    found: dict[str, list[Any]] = {}
+    for chunk in RrdReader(str(directory / "telemetry.rrd")).stream():
+        batch = chunk.to_record_batch()
+        names = [name for name in batch.schema.names if ":" in name]
+        rows = found.setdefault(str(chunk.entity_path), [])
+        if not chunk.is_static:
+            rows += [{name: batch.column(name)[k].as_py() for name in names} for k in range(batch.num_rows)]
+    return found
+
+
+def scalars(rows: list[Any]) -> list[list[float]]:
+    return [row[name] for row in rows for name in row if name.endswith("Scalars:scalars")]
+
+
+def expected_entities() -> set[str]:
+    each = ["world/agent/{}", "world/agent/{}/body", "world/agent/{}/safety", "world/trail/{}", "world/plan/{}"]
+    each += ["plot/track_err/{}", "plot/solve_ms/{}", "plot/tick_ms/{}", "plot/late_ticks/{}"]
+    each += ["plot/att/{}/roll", "plot/att/{}/pitch", "plot/att/{}/thrust"]
+    each += ["state/{}/phase", "state/{}/mode", "events/agent-{}"]
+    shared = {"world", "world/reference", "world/reference_trail", "world/obstacles/body", "world/obstacles/keep_out"}
+    shared |= {"plot/separation/min", "plot/separation/limit"}
+    return {"/" + path for path in shared | {path.format(i) for path in each for i in range(AGENTS)}}
+
+
+def test_recording_holds_what_was_published(endpoint: str, tmp_path: Path) -> None:
+    with viewer(endpoint, tmp_path) as process:
+        url = ready(process)
+        assert (tmp_path / "viewer.url").read_text().strip() == url
+        swarm = Swarm(endpoint)
+        swarm.fly(2.0)
+        time.sleep(0.3)
+        assert finish(process) == "telemetry lost=0 received=300"
+        swarm.session.close()
+    found = values(tmp_path)
+    assert expected_entities() <= set(found)
+    for agent in range(AGENTS):
+        assert len(found[f"/world/agent/{agent}"]) == 100
+        assert np.allclose(scalars(found[f"/plot/track_err/{agent}"]), 1 / np.sqrt(3), atol=1e-6)
+        assert len(scalars(found[f"/plot/solve_ms/{agent}"])) == 100
+        roll = np.array(scalars(found[f"/plot/att/{agent}/roll"]))
+        assert np.allclose(np.radians(roll), [0.2, 0.1], atol=1e-6)  # setpoint first, then measured
+        assert 15 <= len(found[f"/world/plan/{agent}"]) <= 25
+        modes = [row[name] for row in found[f"/state/{agent}/mode"] for name in row if name.endswith("state")]
+        assert ["REPLAY"] in modes
+    least = np.array(scalars(found["/plot/separation/min"]))
+    assert len(least) > 90
+    assert np.allclose(least, 1.0, atol=0.02)  # agents publish one after another
+    texts = [row[name][0] for row in found["/events/agent-1"] for name in row if name.endswith("TextLog:text")]
+    assert "agent 1: mode REPLAY" in texts
+    assert "agent 1: plan refused: solver failed" in texts
+    before = (tmp_path / "telemetry.rrd").stat().st_size
+    assert optimize_recording(tmp_path)
+    assert (tmp_path / "telemetry.rrd").stat().st_size < before
+    assert len(values(tmp_path)["/world/agent/0"]) == 100
+
+
+def test_obstacles_of_the_operator_replace_the_first_ones(endpoint: str, tmp_path: Path) -> None:
+    with viewer(endpoint, tmp_path) as process:
+        ready(process)
+        swarm = Swarm(endpoint)
+        swarm.fly(0.3)
+        other = OBSTACLE | {"center_ned_m": [1.0, 1.0, -9.0]}
+        for version, listed in ((2, [other, OBSTACLE]), (1, []), (3, "nonsense")):
+            message = json.dumps({"version": version, "obstacles": listed})
+            swarm.session.put(f"swarm/{RUN}/operator/obstacles", message)
+            swarm.fly(0.3)
+        finish(process)
+        swarm.session.close()
+    centers = [
+        row[name] for row in values(tmp_path)["/world/obstacles/body"] for name in row if name.endswith("centers")
+    ]
+    assert centers == [[[2.0, 7.0, -1.5]], [[1.0, 1.0, -9.0], [2.0, 7.0, -1.5]]]
+
+
+def test_frozen_telemetry_costs_the_agents_nothing(endpoint: str, tmp_path: Path) -> None:
+    with viewer(endpoint, tmp_path) as process:
+        ready(process)
+        swarm = Swarm(endpoint)
+        swarm.fly(0.5)
+        process.send_signal(signal.SIGSTOP)
+        swarm.slowest_put_s = 0.0
+        began_s = time.monotonic()
+        swarm.fly(2.0)
+        assert time.monotonic() - began_s < 2.5
+        assert swarm.slowest_put_s < 0.2
+        process.send_signal(signal.SIGCONT)
+        swarm.fly(0.5)
+        time.sleep(0.3)
+        lost, received = (int(word.split("=")[1]) for word in finish(process).split()[1:])
+        assert lost + received == 450  # what the frozen process could not take is counted
+        assert received >= 150
+        swarm.session.close()
+
+
+def test_lost_samples_are_counted(endpoint: str, tmp_path: Path) -> None:
+    with viewer(endpoint, tmp_path) as process:
+        ready(process)
+        swarm = Swarm(endpoint)
+        swarm.fly(0.2)
+        swarm.seq += 7
+        swarm.fly(0.2)
+        swarm.publishers[0].put(b"garbage")
+        time.sleep(0.3)
+        assert finish(process) == "telemetry lost=21 received=60"
+        swarm.session.close()
+
+
+def test_comes_up_and_stops_without_agents(endpoint: str, tmp_path: Path) -> None:
+    with viewer(endpoint, tmp_path) as process:
+        ready(process)
+        process.send_signal(signal.SIGINT)
+        time.sleep(0.3)
+        assert process.poll() is None  # Ctrl-C is the launcher's business
+        assert finish(process) == "telemetry lost=0 received=0"
+
+
+def test_two_viewers_find_ports_of_their_own(endpoint: str, tmp_path: Path) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        port = str(taken.getsockname()[1])
+        with (
+            viewer(endpoint, tmp_path / "a", "--port", port) as a,
+            viewer(endpoint, tmp_path / "b", "--port", port) as b,
+        ):
+            urls = {ready(a), ready(b)}
+            assert len(urls) == 2
+            assert f"rerun+http://127.0.0.1:{port}/proxy" not in urls
+            finish(a)
+            finish(b)
+
+
+def test_stops_at_once_while_it_waits_for_a_router(tmp_path: Path) -> None:
+    with viewer(f"unixsock-stream/{tmp_path}/nobody.sock", tmp_path) as process:
+        time.sleep(2.0)
+        assert process.poll() is None
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(5) == 0
+
+
+def test_ends_with_its_parent(endpoint: str, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "swarmctl.telemetry.viewer", "--run", RUN, "--bus", endpoint, "--agents", "1"]
+    command += ["--run-dir", str(tmp_path), "--die-with-parent"]
+    code = f"import subprocess, time; print(subprocess.Popen({command!r}).pid, flush=True); time.sleep(60)"
+    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert parent.stdout is not None
+    pid = int(parent.stdout.readline())
+    ready(parent)
+    parent.kill()
+    parent.wait(10)
+    until_s = time.monotonic() + 8
+    while _alive(pid) and time.monotonic() < until_s:
+        time.sleep(0.1)
+    assert not _alive(pid)
+
+
+def _alive(pid: int) -> bool:
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
+
+
+def test_frozen_watcher_does_not_hold_up_the_end(endpoint: str, tmp_path: Path) -> None:
+    with viewer(endpoint, tmp_path) as process:
+        url = ready(process)
+        swarm = Swarm(endpoint)
+        saver = [str(viewer_binary()), "--connect", url, "--bind", "127.0.0.1", "--save", str(tmp_path / "copy.rrd")]
+        watcher = subprocess.Popen(saver, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, env=os.environ)
+        try:
+            swarm.fly(2.0)
+            assert watcher.poll() is None
+            watcher.send_signal(signal.SIGSTOP)
+            swarm.fly(1.0)
+            time.sleep(0.3)
+            assert finish(process) == "telemetry lost=0 received=450"
+        finally:
+            watcher.kill()
+            watcher.wait(10)
+            swarm.session.close()
+    assert len(values(tmp_path)["/world/agent/0"]) == 150

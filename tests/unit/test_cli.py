@@ -1,0 +1,169 @@
+"""The command line: quick help, exit codes, words instead of tracebacks, options that become overrides."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from swarmctl import attach, cli
+from swarmctl.errors import ConfigError, MissionError, StartError
+from swarmctl.links.topics import ObstacleMessage
+
+Run = Callable[..., int]
+HEAVY = ("numpy", "scipy", "osqp", "zenoh", "rerun", "pyarrow", "pydantic", "mavsdk", "pymavlink", "psutil", "msgspec")
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch) -> Run:
+    def runner(*arguments: str) -> int:
+        monkeypatch.setattr(sys, "argv", ["swarmctl", *arguments])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        assert isinstance(ended.value.code, int)
+        return ended.value.code
+
+    return runner
+
+
+@pytest.fixture
+def nobody(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(attach, "_registry", lambda: tmp_path / "registry")
+
+
+def test_help_is_quick_and_imports_nothing_heavy() -> None:
+    code = (
+        "import sys; sys.argv = ['swarmctl', '--help']\n"
+        "import atexit; from swarmctl import cli\n"
+        f"atexit.register(lambda: print('heavy:', [m for m in {HEAVY!r} if m in sys.modules]))\ncli.main()"
+    )
+    times_s = []
+    for _ in range(3):
+        began_s = time.monotonic()
+        answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+        times_s.append(time.monotonic() - began_s)
+        assert "heavy: []" in answer.stdout
+    assert min(times_s) < 0.4
+
+
+def test_every_verb_is_there_and_explains_itself(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    verbs = ["launch", "simulate", "agent", "status", "hold", "resume", "land", "rtl", "view", "replay", "report"]
+    for verb in [*verbs, "obstacle"]:
+        assert run(verb, "--help") == 0
+        assert f"{verb} " in capsys.readouterr().out
+    for verb in ("add", "remove", "list"):
+        assert run("obstacle", verb, "--help") == 0
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("lanch",), ("launch", "--agents", "x"), ("launch", "--nonsense"), ("agent",), ("launch", "a", "b"), ("replay",)],
+)
+def test_bad_usage_is_2(run: Run, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...]) -> None:
+    assert run(*arguments) == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("error", "code"), [(ConfigError("file", ["a", "b"]), 2), (StartError("no"), 3), (MissionError("hit"), 4)]
+)
+def test_expected_errors_are_words_and_their_exit_code(
+    run: Run, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, error: Exception, code: int
+) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(attach, "find_launch", fail)
+    assert run("status") == code
+    captured = capsys.readouterr()
+    assert captured.err == f"{error}\n"
+
+
+def test_unexpected_errors_keep_their_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError("bug")
+
+    monkeypatch.setattr(attach, "find_launch", fail)
+    monkeypatch.setattr(sys, "argv", ["swarmctl", "status"])
+    with pytest.raises(ZeroDivisionError, match="bug"):
+        cli.main()
+
+
+@pytest.mark.parametrize("verb", ["status", "hold", "resume", "land", "rtl", "view"])
+@pytest.mark.usefixtures("nobody")
+def test_without_a_launch_operator_verbs_are_3(run: Run, capsys: pytest.CaptureFixture[str], verb: str) -> None:
+    assert run(verb) == 3
+    assert "swarmctl launch" in capsys.readouterr().err
+
+
+def test_a_run_folder_without_a_launch_is_3(run: Run, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert run("land", "--run-dir", str(tmp_path)) == 3
+    assert str(tmp_path) in capsys.readouterr().err
+
+
+def test_options_override_sets_and_simulate_passes_everything_on(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert cli._overrides(4, 5.5, 6, ["swarm.agents=2", "a=b"]) == [
+        "swarm.agents=2",
+        "a=b",
+        "swarm.agents=4",
+        "mission.duration_s=5.5",
+        "seed=6",
+    ]
+    passed: list[tuple[str, list[str]]] = []
+    monkeypatch.setattr(os, "execv", lambda program, arguments: passed.append((program, arguments)))
+    assert run("simulate", "a.toml", "--agents", "4", "--seed", "6", "--set", "a=b", "--set", "c=d", "--no-view") == 0
+    module = [sys.executable, "-m", "sitl.lockstep"]
+    assert passed == [
+        (sys.executable, [*module, "a.toml", "--agents=4", "--seed=6", "--set=a=b", "--set=c=d", "--no-view"])
+    ]
+
+
+def test_a_reader_that_goes_away_does_not_change_the_exit_code() -> None:
+    code = (
+        "import sys; from swarmctl import cli, table\n"
+        "cli._run_app = lambda: table.PlainLines(sys.stdout).say('landed') or 4\ncli.main()"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    process.stdout.close()
+    assert process.wait(60) == 4
+
+
+def test_obstacles_are_read_strictly() -> None:
+    ball = attach.obstacle("1.5,0,-2", 0.5, 1.0, 3.0, "0,0,0.1")
+    assert ball == ObstacleMessage((1.5, 0.0, -2.0), 0.5, 1.0, 3.0, (0.0, 0.0, 0.1))
+    with pytest.raises(ConfigError) as caught:
+        attach.obstacle("1,2", -1.0, float("nan"), 3.0, "0,inf,0")
+    assert len(caught.value.problems) == 4
+    assert attach.without((ball, ball), 1) == (ball,)
+    with pytest.raises(ConfigError, match="there are 1"):
+        attach.without((ball,), 1)
+
+
+def test_the_registry_knows_live_launches_and_forgets_dead_ones(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    registry, folder = tmp_path / "registry", tmp_path / "run"
+    folder.mkdir()
+    monkeypatch.setattr(attach, "_registry", lambda: registry)
+    started_s, pid = attach.process_start_s()
+    launch = attach.RunningLaunch("run", "unixsock-stream//x", pid, started_s, 3, str(folder))
+    attach.announce(launch)
+    assert registry.stat().st_mode & 0o777 == 0o700
+    assert attach.find_launch(None) == launch
+    assert attach.find_launch(folder) == launch
+    attach.announce(attach.RunningLaunch("reused pid", "unixsock-stream//x", pid, started_s - 60, 3, str(folder)))
+    with pytest.raises(StartError):
+        attach.find_launch(folder)
+    with pytest.raises(StartError):
+        attach.find_launch(None)
+    assert list(registry.iterdir()) == []
+    registry.chmod(0o777)
+    attach.announce(launch)
+    assert list(registry.iterdir()) == [], "not private: nothing is written, the launch goes on"
+    attach.withdraw()

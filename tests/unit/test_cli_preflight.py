@@ -1,0 +1,180 @@
+"""What is refused before a launch, the ports it takes, and what it shows while it runs."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import io
+import socket
+from pathlib import Path
+
+import pytest
+
+from swarmctl import preflight
+from swarmctl.config import Config, load
+from swarmctl.core.types import FlightMode, Landed, Mode, Phase
+from swarmctl.errors import StartError
+from swarmctl.links.topics import StatusMessage
+from swarmctl.processes import Site, agent_commands, sitl_command, viewer_command
+from swarmctl.summary import summary_lines
+from swarmctl.table import AgentView, PlainLines, open_display, status_cells
+
+FIRST = 21540  # not PX4's own, so that the tests don't meet a flight
+
+
+def test_the_first_free_range_is_taken_as_a_whole() -> None:
+    held = preflight.claim_ports(3, FIRST)
+    ports = [sock.getsockname()[1] for sock in held]
+    others = preflight.claim_ports(3, FIRST)
+    other_ports = [sock.getsockname()[1] for sock in others]
+    assert ports == list(range(ports[0], ports[0] + 3))
+    assert other_ports == list(range(other_ports[0], other_ports[0] + 3))
+    assert not set(ports) & set(other_ports)
+    for sock in (*held, *others):
+        sock.close()
+
+
+def test_no_range_left() -> None:
+    with pytest.raises(StartError, match="no 100 free"):
+        preflight.claim_ports(100, 32700)
+
+
+def test_preflight_holds_the_ports_until_released() -> None:
+    ground = preflight.inspect(load(None, ["telemetry.enabled=false"]))
+    try:
+        assert len(ground.ports) == 3
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as rival, pytest.raises(OSError):
+            rival.bind(("127.0.0.1", ground.ports[0]))
+    finally:
+        ground.release()
+    assert ground.view_port == 0
+
+
+def test_a_taken_view_port_is_stepped_over() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen(1)
+        port = taken.getsockname()[1]
+        ground = preflight.inspect(load(None, [f"telemetry.port={port}"]))
+        ground.release()
+        assert port < ground.view_port < port + 50
+
+
+def test_every_problem_at_once_and_nothing_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    versions = {"osqp": "0.6.7", "rerun-sdk": None}
+
+    def version(name: str) -> str:
+        found = versions.get(name, "99.0")
+        if found is None:
+            raise importlib.metadata.PackageNotFoundError(name)
+        return found
+
+    monkeypatch.setattr(importlib.metadata, "version", version)
+    monkeypatch.setattr(preflight, "_free_view_port", lambda _: 0)
+    with pytest.raises(StartError) as caught:
+        preflight.inspect(load(None))
+    lines = str(caught.value).splitlines()
+    assert len(lines) == 3
+    assert "osqp = 0.6.7: too old; pip install 'osqp>=1.1'" in lines[0]
+    assert "rerun-sdk: not installed" in lines[1]
+    assert "telemetry.port = 9876" in lines[2]
+
+
+def vehicles(tmp_path: Path, url: str) -> Config:
+    path = tmp_path / "one.toml"
+    path.write_text(f'[swarm]\nagents=1\n[sitl]\nenabled=false\n[[vehicles]]\nsysid=1\nurl="{url}"\n')
+    return load(path, ["telemetry.enabled=false"])
+
+
+@pytest.mark.parametrize(
+    ("url", "word"),
+    [
+        ("serial:///dev/no-such:57600", "does not exist"),
+        ("udpin://192.0.2.1:14540", "can't be bound"),
+        ("udpout://no-such-host.invalid:14540", "check the host"),
+    ],
+)
+def test_vehicle_links_are_tried(tmp_path: Path, url: str, word: str) -> None:
+    with pytest.raises(StartError, match=word) as caught:
+        preflight.inspect(vehicles(tmp_path, url))
+    assert "vehicles.0.url" in str(caught.value)
+    assert url in str(caught.value)
+
+
+def test_a_good_vehicle_port_is_left_free(tmp_path: Path) -> None:
+    (held,) = preflight.claim_ports(1, FIRST)
+    port = held.getsockname()[1]
+    held.close()
+    ground = preflight.inspect(vehicles(tmp_path, f"udpin://127.0.0.1:{port}"))
+    assert ground.sockets == ()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as agent:
+        agent.bind(("127.0.0.1", port))
+
+
+def test_command_lines_say_what_the_configuration_says(tmp_path: Path) -> None:
+    config = load(None, ["swarm.agents=2", "start.spacing_m=1.5", "sitl.mass_scale=1.2", "seed=9"])
+    site = Site("run", "unixsock-stream//tmp/x/bus.sock", tmp_path)
+    sitl = sitl_command(config, site, (14540, 14541)).argv
+    assert "--spawn=-0.75,0.0,2.0;0.75,0.0,2.0" in sitl, "on the ground"
+    assert sitl[sitl.index("--remote-ports") + 1] == "14540,14541"
+    air = sitl_command(load(None, ["swarm.agents=1", "sitl.start='air'"]), site, (1,)).argv
+    assert "--spawn=0.0,0.0,0.0" in air
+    held = preflight.claim_ports(2, FIRST)
+    agents = agent_commands(config, site, held)
+    assert [command.name for command in agents] == ["agent-0", "agent-1"]
+    assert [command.fds for command in agents] == [(sock.fileno(),) for sock in held]
+    assert "--fd" not in agent_commands(config, site, ())[0].argv
+    for sock in held:
+        sock.close()
+    viewer = viewer_command(config, site, 9876, view=False).argv
+    assert "--view" not in viewer
+    assert viewer[viewer.index("--obstacles-json") + 1] == "[]"
+
+
+def status(phase: int = Phase.TRACK, separation_m: float = 1.25, problem: str = "") -> StatusMessage:
+    said = (Mode.FOLLOW, FlightMode.EXTERNAL, True, Landed.IN_AIR, 0, "", 0.1234, separation_m, 2.0, 100, 3, 20.0, 0)
+    return StatusMessage(0, 1, 1, phase, *said, problem)
+
+
+def test_plain_lines_speak_on_changes_only() -> None:
+    stream = io.StringIO()
+    display = open_display(stream)
+    assert isinstance(display, PlainLines)
+    view = AgentView(0)
+    display.show([view])
+    view.status = status(Phase.ARM)
+    display.show([view])
+    display.show([view])
+    view.status = status(Phase.TRACK, problem="wind")
+    display.show([view])
+    view.note = "dead"
+    display.show([view])
+    lines = stream.getvalue().splitlines()
+    assert len(lines) == 3
+    assert "agent-0  ARM" in lines[0]
+    assert "agent-0  TRACK  wind" in lines[1]
+    assert "agent-0  TRACK  dead" in lines[2]
+
+
+def test_a_lost_terminal_does_not_end_the_flight() -> None:
+    class Gone(io.StringIO):
+        def write(self, _: str) -> int:
+            raise BrokenPipeError
+
+    PlainLines(Gone()).say("x")
+
+
+def test_table_cells() -> None:
+    assert status_cells(AgentView(0, status())) == (
+        *("agent-0", "TRACK", "FOLLOW", "0.123", "1.25", "2.0", "3/100", "20"),
+        "",
+    )
+    assert status_cells(AgentView(0, status(99, -1.0)))[1:5] == ("99", "FOLLOW", "0.123", "-")
+    assert status_cells(AgentView(1))[-1] == "not heard yet"
+
+
+def test_a_summary_is_five_lines_even_when_almost_empty() -> None:
+    for summary in ({}, {"outcome": "failed", "violations": ["a", "b"], "timing": {"tick_ms": {"p50": None}}}):
+        lines = summary_lines(summary, Path("runs/x"))
+        assert len(lines) == 5
+        assert lines[-1] == "run folder runs/x"
+    assert "2 violations: a" in lines[0]

@@ -1,0 +1,220 @@
+"""What a configuration is refused for, in which words, and that what is accepted survives a round trip."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from swarmctl.config import Config, dump, load
+from swarmctl.errors import EXIT_USAGE, ConfigError
+
+CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.toml"))
+
+
+def refusals(path: Path | None, *overrides: str) -> tuple[str, ...]:
+    with pytest.raises(ConfigError) as caught:
+        load(path, overrides)
+    assert caught.value.exit_code == EXIT_USAGE
+    return caught.value.problems
+
+
+def file_with(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "swarm.toml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+def test_defaults_are_the_thesis_circle_with_three_agents() -> None:
+    config = load(None)
+    assert config.swarm.agents == 3
+    assert config.mission.kind == "circle"
+    assert config.sysids() == (1, 2, 3)
+    assert len(config.starts_ned_m()) == 3
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("swarm.agnets=3", ("swarm.agnets = 3", "unknown key", "'agents'")),
+        ("sitll.enabled=true", ("unknown key", "'sitl'")),
+        ("swarm.colour='red'", ("swarm.colour = 'red'", "known here", "agents")),
+        ("swarm.agents=0", ("swarm.agents = 0", ">= 1", "<= 100")),
+        ("swarm.agents=1000", ("swarm.agents = 1000", ">= 1", "<= 100")),
+        ("swarm.agents=-3", ("swarm.agents = -3",)),
+        ("swarm.agents=2.5", ("swarm.agents = 2.5", "integer")),
+        ("swarm.agents=many", ("swarm.agents = 'many'", "integer")),
+        ("swarm.agents=true", ("swarm.agents = True", "integer")),
+        ("mission.duration_s=nan", ("mission.duration_s = nan", "finite")),
+        ("mission.duration_s=inf", ("mission.duration_s = inf", "finite")),
+        ("mission.duration_s=-5", ("mission.duration_s = -5", "> 0")),
+        ("mission.duration_s='5'", ("mission.duration_s = '5'", "number")),
+        ("start.center_ned_m=[0.0, nan, 0.0]", ("start.center_ned_m.1 = nan", "finite")),
+        ("start.center_ned_m=[0.0, 1.0]", ("start.center_ned_m",)),
+        ("sitl.preset='mars'", ("sitl.preset = 'mars'", "thesis", "x500")),
+        ("telemetry.port=0", ("telemetry.port = 0", ">= 1", "<= 65535")),
+        ("name='../../etc'", ("name = '../../etc'",)),
+        ("name=", ("name = ''",)),
+        ("seed=-1", ("seed = -1", ">= 0")),
+        ("seed=1\nname='x'", ("seed", "integer")),
+        ("swarm=3", ("swarm = 3",)),
+        ("limits.min_separation_m=2.0", ("limits.min_separation_m = 2.0", "separation.radius_m")),
+        ("start.spacing_m=0.5", ("agents 0 and 1", "0.50 m apart", "start.spacing_m")),
+        ("start.direction_ned=[0.0, 0.0, 0.0]", ("start.direction_ned", "direction")),
+        ("start.positions_ned_m=[[0.0, 0.0, -1.0]]", ("start.positions_ned_m", "1 positions", "swarm.agents = 3")),
+        ("start.center_ned_m=[0.0, 0.0, 1.9]", ("agent 0", "ground", "sitl.ground_z_m")),
+        ("sitl.enabled=false", ("vehicles", "sitl.enabled = false", "[[vehicles]]")),
+        ("swarm.agents", ("write it as key.sub=value",)),
+        ("swarm..agents=3", ("write it as key.sub=value",)),
+        ("vehicles.0.url='x'", ("'0' is not an index",)),
+        ("seed.x=1", ("no such place",)),
+        ("seed.x.y=1", ("inside a value",)),
+    ],
+)
+def test_refused_in_one_line_with_key_value_and_what_is_allowed(
+    tmp_path: Path, override: str, words: tuple[str, ...]
+) -> None:
+    path = file_with(tmp_path, "seed = 1\n" if override.startswith("seed.") else "")
+    problems = refusals(path, override)
+    text = problems[0]
+    for word in words:
+        assert word in text, problems
+    assert "\n" not in text
+
+
+def test_a_refused_count_of_agents_is_said_once() -> None:
+    assert len(refusals(None, "swarm.agents=0")) == 1
+    assert len(refusals(None, "swarm.agents=1000")) == 1
+
+
+def test_all_problems_at_once(tmp_path: Path) -> None:
+    path = file_with(
+        tmp_path, "name = 'bad name'\n[swarm]\nagents = 0\n[sitl]\npresett = 'x500'\n[bus]\nloss_01 = 1.5\n"
+    )
+    problems = refusals(path)
+    assert len(problems) == 4
+    assert all(any(key in p for p in problems) for key in ("name", "swarm.agents", "sitl.presett", "bus.loss_01"))
+    with pytest.raises(ConfigError, match=r"swarm\.toml: swarm\.agents"):
+        load(path)
+
+
+def test_a_crowd_of_close_starts_is_summed_up() -> None:
+    problems = refusals(None, "swarm.agents=50", "start.spacing_m=0.01")
+    assert len(problems) == 4
+    assert "1222 more pairs" in problems[-1]
+
+
+VEHICLES = """
+[swarm]
+agents = 2
+[sitl]
+enabled = false
+[[vehicles]]
+sysid = {a}
+url = "{url_a}"
+[[vehicles]]
+sysid = {b}
+url = "{url_b}"
+"""
+
+
+def vehicles(tmp_path: Path, url_a: str, url_b: str, a: int = 1, b: int = 2) -> Path:
+    return file_with(tmp_path, VEHICLES.format(url_a=url_a, url_b=url_b, a=a, b=b))
+
+
+@pytest.mark.parametrize(
+    ("url_a", "url_b"),
+    [
+        ("udpin://127.0.0.1:14540", "udpin://127.0.0.1:14540"),
+        ("udpin://0.0.0.0:14540", "udpin://127.0.0.1:14540"),
+        ("udpout://10.0.0.2:14540", "udpout://10.0.0.2:14540"),
+        ("serial:///dev/ttyUSB0:57600", "serial:///dev/ttyUSB0:921600"),
+    ],
+)
+def test_two_agents_on_one_port(tmp_path: Path, url_a: str, url_b: str) -> None:
+    (problem,) = refusals(vehicles(tmp_path, url_a, url_b))
+    assert "vehicles.1.url" in problem
+    assert "vehicles.0" in problem
+
+
+@pytest.mark.parametrize(
+    ("url_a", "url_b"),
+    [
+        ("udpin://127.0.0.1:14540", "udpin://127.0.0.1:14541"),
+        ("udpin://127.0.0.1:14540", "udpin://127.0.0.2:14540"),
+        ("udpout://10.0.0.2:14540", "udpout://10.0.0.3:14540"),
+        ("udpout://10.0.0.2:14540", "udpin://127.0.0.1:14540"),
+        ("serial:///dev/ttyUSB0:57600", "serial:///dev/ttyUSB1:57600"),
+    ],
+)
+def test_links_of_their_own(tmp_path: Path, url_a: str, url_b: str) -> None:
+    assert load(vehicles(tmp_path, url_a, url_b, a=7, b=9)).sysids() == (7, 9)
+
+
+def test_duplicate_sysid_wrong_url_and_missing_vehicle_are_named(tmp_path: Path) -> None:
+    path = vehicles(tmp_path, "udpin://127.0.0.1:14540", "udp://:14541", a=3, b=3)
+    problems = refusals(path, "swarm.agents=3")
+    assert any("vehicles.1.sysid = 3" in p and "MAV_SYS_ID" in p for p in problems)
+    assert any("vehicles.1.url" in p and "udpin://HOST:PORT" in p for p in problems)
+    assert any("2 listed for swarm.agents = 3" in p for p in problems)
+    assert any("70000" in p for p in refusals(vehicles(tmp_path, "udpin://127.0.0.1:70000", "udpin://127.0.0.1:1")))
+
+
+def test_vehicles_beside_the_simulator_are_refused(tmp_path: Path) -> None:
+    path = vehicles(tmp_path, "udpin://127.0.0.1:14540", "udpin://127.0.0.1:14541")
+    (problem,) = refusals(path, "sitl.enabled=true")
+    assert "set sitl.enabled = false" in problem
+
+
+@pytest.mark.parametrize(
+    ("content", "word"),
+    [(b"[swarm\nagents = 3", "not TOML"), (b"\xff\xfe\x00", "can't be read"), (b"x = " + b"[" * 9000, "not TOML")],
+)
+def test_unreadable_content(tmp_path: Path, content: bytes, word: str) -> None:
+    path = tmp_path / "bad.toml"
+    path.write_bytes(content)
+    (problem,) = refusals(path)
+    assert word in problem
+
+
+def test_missing_file_and_folder(tmp_path: Path) -> None:
+    assert "no such file" in refusals(tmp_path / "absent.toml")[0]
+    assert "can't be read" in refusals(tmp_path)[0]
+
+
+def test_overrides_reach_sections_lists_and_new_sections(tmp_path: Path) -> None:
+    path = vehicles(tmp_path, "udpin://127.0.0.1:14540", "udpin://127.0.0.1:14541")
+    config = load(path, ["vehicles.1.sysid=42", "mission.circle.radius_m=2.5", "name=mine", "seed=7", "seed=8"])
+    assert config.sysids() == (1, 42)
+    assert config.mission.circle.radius_m == 2.5
+    assert (config.name, config.seed) == ("mine", 8)
+
+
+@pytest.mark.parametrize("path", [None, *CONFIGS], ids=lambda path: path.name if path else "defaults")
+def test_dump_reads_back_to_the_same_tree(tmp_path: Path, path: Path | None) -> None:
+    config = load(path)
+    assert load(file_with(tmp_path, dump(config))) == config
+
+
+def test_dump_keeps_lists_of_tables_and_odd_keys(tmp_path: Path) -> None:
+    text = (
+        '[agent.autopilot_params]\nCOM_OBL_RC_ACT = 4\n"odd key" = 1.5\n'
+        "[[obstacles]]\ncenter_ned_m = [1, 2, -3]\n[[obstacles]]\ncenter_ned_m = [1e-7, 2.5, -3]\nradius_m = 2\n"
+    )
+    config = load(file_with(tmp_path, text))
+    assert load(file_with(tmp_path, dump(config))) == config
+    assert [o.radius_m for o in config.obstacles] == [1.0, 2.0]
+
+
+@given(st.floats(min_value=1e-3, max_value=36000), st.integers(0, 2**31 - 1))
+def test_numbers_survive_exactly(duration_s: float, seed: int) -> None:
+    config = load(None, [f"mission.duration_s={duration_s}", f"seed={seed}"])
+    assert config.mission.duration_s == duration_s
+    assert f"seed = {seed}\n" in dump(config)
+
+
+def test_start_line_is_centred_and_spaced() -> None:
+    config: Config = load(None, ["swarm.agents=4", "start.spacing_m=2.0", "start.direction_ned=[0.0, 3.0, 0.0]"])
+    assert [s[1] for s in config.starts_ned_m()] == [-3.0, -1.0, 1.0, 3.0]

@@ -1,0 +1,191 @@
+"""The recorder never holds up a tick and never loses more than it says."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from swarmctl.core.records import TICK_DTYPE
+from swarmctl.core.types import FlightMode, Mode, Phase, PlanStatus, TickRecord
+from swarmctl.telemetry import recorder as recorder_module
+from swarmctl.telemetry.recorder import Recorder
+from swarmctl.telemetry.run_folder import load_run, read_rows
+
+
+def record(seq: int) -> TickRecord:
+    zero = np.zeros(3)
+    level = np.array([1.0, 0.0, 0.0, 0.0])
+    return TickRecord(
+        t_us=seq * 20_000,
+        utc_us=1_780_000_000_000_000 + seq * 20_000,
+        seq=seq,
+        mission_t_s=float("nan"),
+        phase=Phase.TRACK,
+        mode=Mode.FOLLOW,
+        flight_mode=FlightMode.EXTERNAL,
+        armed=True,
+        state_age_ms=4.0,
+        pos_ned_m=np.array([1.0, 2.0, 3.0]),
+        vel_ned_m_s=zero,
+        q_nb=level,
+        ref_pos_ned_m=zero,
+        setpoint_q_nb=level,
+        setpoint_thrust_01=0.5,
+        hover_thrust_01=0.5,
+        disturbance_ned_m_s2=zero,
+        nearest_peer_m=float("inf"),
+        nearest_obstacle_m=float("inf"),
+        path_age_ms=float("nan"),
+        peers=0,
+        rejected=0,
+        plan_status=PlanStatus.OK,
+        slack_m=0.0,
+        residual_m=0.0,
+        iterations=25,
+        solve_ms=1.0,
+        tick_ms=2.0,
+        late_ticks=0,
+        plan_pos_ned_m=np.zeros((26, 3)),
+    )
+
+
+def test_round_trip(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path, 2)
+    for seq in range(100):
+        recorder.tick(record(seq))
+    recorder.frame(1_780_000_000_000_000, b"\xfdframe")
+    recorder.event("plan_failed", 5, 6, status="max_iter", gap_m=float("nan"))
+    recorder.close(5.0)
+    assert recorder.lost == 0
+    rows = load_run(tmp_path).ticks[2]
+    assert rows["seq"].tolist() == list(range(100))
+    assert rows["pos_ned_m"][7].tolist() == [1.0, 2.0, 3.0]
+    stamp = (1_780_000_000_000_000).to_bytes(8, "big")
+    assert (tmp_path / "agent-2.tlog").read_bytes() == stamp + b"\xfdframe"
+    (event,) = [json.loads(line) for line in (tmp_path / "agent-2.events.jsonl").read_text().splitlines()]
+    assert event == {
+        "utc_us": 6,
+        "t_us": 5,
+        "source": "agent-2",
+        "event": "plan_failed",
+        "status": "max_iter",
+        "gap_m": None,
+    }
+
+
+def test_full_disk_is_counted_and_stays_the_recorders_problem(tmp_path: Path) -> None:
+    (tmp_path / "agent-0.ticks").symlink_to("/dev/full")
+    recorder = Recorder(tmp_path, 0)
+    for seq in range(10):
+        recorder.tick(record(seq))
+    recorder.event("still_here", 1, 2)
+    recorder.close(5.0)
+    assert recorder.lost == 10
+    assert "still_here" in (tmp_path / "agent-0.events.jsonl").read_text()
+
+
+def test_vanished_folder_is_counted(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "gone", 0)
+    recorder.tick(record(0))
+    recorder.close(5.0)
+    assert recorder.lost == 1
+
+
+def test_full_queue_drops_without_waiting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    os.mkfifo(tmp_path / "agent-0.ticks")  # opening it for writing blocks for ever: a disk that hangs
+    monkeypatch.setattr(recorder_module, "_QUEUE", 100)
+    recorder = Recorder(tmp_path, 0)
+    recorder.tick(record(0))
+    time.sleep(0.4)
+    began_s = time.monotonic()
+    for seq in range(500):
+        recorder.tick(record(seq))
+    recorder.close(0.1)
+    assert time.monotonic() - began_s < 1.0
+    assert recorder.lost >= 500
+
+
+def test_tick_costs_the_caller_little(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path, 0)
+    one = record(0)
+    costs_us = []
+    for _ in range(2000):
+        began_ns = time.perf_counter_ns()
+        recorder.tick(one)
+        costs_us.append((time.perf_counter_ns() - began_ns) / 1e3)
+    recorder.close(5.0)
+    assert np.median(costs_us) < 60.0, f"median {np.median(costs_us):.1f} us"
+
+
+_CHILD = """
+import sys, time, resource
+from pathlib import Path
+sys.path.insert(0, {folder!r})
+from test_telemetry_recorder import Recorder, record
+limit = {limit}
+if limit:
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+recorder = Recorder(Path({directory!r}), 0)
+for seq in range({count}):
+    recorder.tick(record(seq))
+    time.sleep({pause_s})
+recorder.close(5.0)
+print(recorder.lost, flush=True)
+"""
+
+
+def child(directory: Path, limit: int, count: int, pause_s: float) -> subprocess.Popen[str]:
+    code = _CHILD.format(
+        folder=str(Path(__file__).parent), directory=str(directory), limit=limit, count=count, pause_s=pause_s
+    )
+    return subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+
+
+def test_disk_that_fills_up_mid_row_leaves_whole_rows(tmp_path: Path) -> None:
+    process = child(tmp_path, limit=10 * TICK_DTYPE.itemsize + 50, count=60, pause_s=0.02)
+    output, _ = process.communicate(timeout=60)
+    rows = read_rows(tmp_path / "agent-0.ticks", TICK_DTYPE)
+    assert (tmp_path / "agent-0.ticks").stat().st_size % TICK_DTYPE.itemsize == 0
+    assert rows["seq"].tolist() == list(range(10))
+    assert int(output) == 50
+
+
+def test_killed_agent_leaves_all_but_the_last_moments(tmp_path: Path) -> None:
+    process = child(tmp_path, limit=0, count=10_000, pause_s=0.005)
+    path = tmp_path / "agent-0.ticks"
+    until_s = time.monotonic() + 30
+    while (not path.exists() or path.stat().st_size < 100 * TICK_DTYPE.itemsize) and time.monotonic() < until_s:
+        time.sleep(0.05)
+    process.send_signal(signal.SIGKILL)
+    process.wait(10)
+    rows = load_run(tmp_path).ticks[0]
+    assert len(rows) >= 100
+    assert rows["seq"].tolist() == list(range(len(rows)))
+
+
+def test_half_row_of_a_killed_agent_does_not_shift_its_successors(tmp_path: Path) -> None:
+    path = tmp_path / "agent-0.ticks"
+    recorder = Recorder(tmp_path, 0)
+    recorder.tick(record(0))
+    recorder.close(5.0)
+    with path.open("ab") as file:
+        file.write(b"\x01" * 57)
+    assert load_run(tmp_path).ticks[0]["seq"].tolist() == [0]
+    again = Recorder(tmp_path, 0)
+    again.tick(record(1))
+    again.close(5.0)
+    assert load_run(tmp_path).ticks[0]["seq"].tolist() == [0, 1]
+
+
+def test_an_agent_does_not_load_pyarrow_or_rerun() -> None:
+    code = "import sys, swarmctl.telemetry.recorder; print({'pyarrow', 'rerun', 'zenoh'} & set(sys.modules))"
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert output.stdout.strip() == "set()"

@@ -1,0 +1,186 @@
+"""Recordings drawn offline, the mesh, and the parts of the live view that can be judged without a bus."""
+
+from __future__ import annotations
+
+import json
+import struct
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from swarmctl.core.frames import euler_from_quat, quat_from_euler
+from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
+from swarmctl.core.types import Mode, Phase
+from swarmctl.errors import StartError
+from swarmctl.telemetry.attitude import roll_pitch_rad
+from swarmctl.telemetry.feed import AgentClock
+from swarmctl.telemetry.obstacles import read_obstacles
+from swarmctl.telemetry.palette import MODE_RGB, PHASE_RGB, agent_rgb
+from swarmctl.telemetry.quad_mesh import quad_glb
+from swarmctl.telemetry.recordings import open_viewer, optimize_recording, simulated_recording
+from swarmctl.telemetry.referee import RunData
+from swarmctl.telemetry.separation_feed import SeparationFeed
+
+NO_TRUTH = np.zeros(0, TRUTH_DTYPE)
+
+
+def flown(agent: int, count: int = 120) -> NDArray[np.void]:
+    rows = np.zeros(count, TICK_DTYPE)
+    rows["t_us"] = 20_000 * np.arange(count)
+    rows["utc_us"] = rows["t_us"] + 1_780_000_000_000_000
+    rows["seq"] = np.arange(count)
+    rows["phase"], rows["mode"], rows["iterations"], rows["solve_ms"] = Phase.TRACK, Mode.FOLLOW, 25, 1.5
+    rows["pos_ned_m"][:, 0] = float(agent)
+    rows["q_nb"][:, 0] = 1.0
+    rows["setpoint_q_nb"] = np.nan
+    return rows
+
+
+def test_offline_recording_holds_the_run_and_can_be_packed(tmp_path: Path) -> None:
+    from rerun.chunk import RrdReader
+
+    run = RunData({0: flown(0), 1: flown(1)}, NO_TRUTH, [])
+    obstacle = {"center_ned_m": (5.0, 0.0, 0.0), "radius_m": 1.0, "keep_out_m": 1.75, "vel_ned_m_s": (0.0, 0.0, 0.0)}
+    path = simulated_recording(tmp_path, run, 2, 0.9, 0.85, [obstacle])
+    assert optimize_recording(tmp_path)
+    rows: dict[str, int] = {}
+    distances: list[float] = []
+    for chunk in RrdReader(str(path)).stream():
+        batch: Any = chunk.to_record_batch()
+        rows[str(chunk.entity_path)] = rows.get(str(chunk.entity_path), 0) + batch.num_rows
+        if str(chunk.entity_path) == "/plot/separation/min" and not chunk.is_static:
+            distances += [value[0] for value in batch.column("Scalars:scalars").to_pylist()]
+    assert rows["/world/agent/0"] == rows["/world/agent/1"] == 120
+    assert "/world/obstacles/body" in rows
+    assert len(distances) == 120
+    assert set(distances) == {1.0}
+
+
+def test_recording_that_cannot_be_packed_stays(tmp_path: Path) -> None:
+    assert not optimize_recording(tmp_path)
+    (tmp_path / "telemetry.rrd").write_bytes(b"not a recording")
+    assert not optimize_recording(tmp_path)
+    assert (tmp_path / "telemetry.rrd").read_bytes() == b"not a recording"
+    assert [path.name for path in tmp_path.iterdir()] == ["telemetry.rrd"]
+
+
+def test_recording_of_a_killed_viewer_is_repaired(tmp_path: Path) -> None:
+    path = simulated_recording(tmp_path, RunData({0: flown(0)}, NO_TRUTH, []), 1, 0.9, 0.85)
+    path.write_bytes(path.read_bytes()[:-30_000])
+    assert optimize_recording(tmp_path)
+    assert path.stat().st_size > 20_000
+
+
+def test_opening_a_window_without_a_display_is_refused_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("DISPLAY", raising=False)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    with pytest.raises(StartError, match="no display"):
+        open_viewer("rerun+http://127.0.0.1:9876/proxy")
+
+
+def test_launcher_can_import_recordings_without_paying_for_rerun() -> None:
+    modules = "swarmctl.telemetry.recordings, swarmctl.telemetry.run_folder"
+    code = f"import sys, {modules}; print({{'pyarrow', 'rerun', 'zenoh'}} & set(sys.modules))"
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert output.stdout.strip() == "set()"
+
+
+def test_mesh_is_a_sound_glb_of_a_small_quadrotor() -> None:
+    glb = quad_glb(agent_rgb(0))
+    magic, version, length, json_length, kind = struct.unpack_from("<4sIIII", glb)
+    assert (magic, version, length, kind) == (b"glTF", 2, len(glb), 0x4E4F534A)
+    document = json.loads(glb[20 : 20 + json_length])
+    blob = glb[28 + json_length :]
+    assert len(blob) == document["buffers"][0]["byteLength"]
+    assert len(glb) < 60_000
+    corners = []
+    for primitive in document["meshes"][0]["primitives"]:
+        accessor = document["accessors"][primitive["attributes"]["POSITION"]]
+        offset = document["bufferViews"][accessor["bufferView"]]["byteOffset"]
+        corners.append(np.frombuffer(blob, "<f4", 3 * accessor["count"], offset).reshape(-1, 3))
+    size_m = np.ptp(np.concatenate(corners), axis=0)
+    assert 0.3 < size_m[0] < 0.5
+    assert size_m[2] < 0.1
+
+
+def test_least_distance_of_agents_that_report_at_different_instants() -> None:
+    feed = SeparationFeed(3)
+    t_us = 20_000 * np.arange(50)
+    feed.offer(0, t_us, np.zeros((50, 3)))
+    second_us = t_us + 13_000
+    feed.offer(1, second_us, np.column_stack([1.0 + second_us / 1e6, np.zeros(50), np.zeros(50)]))
+    grid_us, least_m = feed.take()
+    assert (grid_us[0], grid_us[-1]) == (13_000, 973_000)  # while both are known
+    assert np.allclose(least_m, 1.0 + grid_us / 1e6)
+    assert len(feed.take()[0]) == 0
+
+
+def test_silent_agent_does_not_stop_the_others() -> None:
+    feed = SeparationFeed(3)
+    t_us = 20_000 * np.arange(50)
+    for agent in range(3):
+        feed.offer(agent, t_us, np.full((50, 3), float(agent)))
+    feed.take()
+    last_us = 0
+    for _ in range(5):
+        t_us = t_us + 1_000_000
+        for agent in range(2):
+            feed.offer(agent, t_us, np.full((50, 3), float(agent)))
+        grid_us, _ = feed.take()
+        last_us = max([last_us, *grid_us.tolist()])
+    assert last_us == t_us[-1]
+
+
+def clock_rows(seqs: list[int], t_us: list[int], offset_us: int) -> NDArray[np.void]:
+    rows = np.zeros(len(seqs), TICK_DTYPE)
+    rows["seq"], rows["t_us"], rows["utc_us"] = seqs, t_us, np.array(t_us) + offset_us
+    return rows
+
+
+def test_clock_of_an_agent_ignores_utc_steps_counts_gaps_and_survives_a_restart() -> None:
+    clock = AgentClock()
+    t_us, newer = clock.place(clock_rows([0, 1, 4], [100, 200, 500], 1000), 1000)
+    assert t_us.tolist() == [100, 200, 500]
+    assert newer.all()
+    assert clock.lost == 2
+    t_us, newer = clock.place(clock_rows([5, 6], [600, 600], 999_999), 1000)  # UTC stepped; one sample came twice
+    assert t_us.tolist() == [600, 600]
+    assert newer.tolist() == [True, False]
+    t_us, newer = clock.place(clock_rows([0, 1], [10, 30], 2000), 1000)  # another process, later in UTC
+    assert t_us.tolist() == [1010, 1030]
+    assert newer.all()
+    assert clock.lost == 2
+
+
+@pytest.mark.parametrize(
+    "listed",
+    [
+        None,
+        "x",
+        [1],
+        [{}],
+        [{"center_ned_m": [1, 2], "radius_m": 1, "keep_out_m": 2}],
+        [{"center_ned_m": [1, 2, float("nan")], "radius_m": 1, "keep_out_m": 2}],
+    ],
+)
+def test_malformed_obstacles_are_refused(listed: object) -> None:
+    assert read_obstacles(listed) is None
+
+
+def test_roll_and_pitch_of_many_agree_with_those_of_one() -> None:
+    angles = np.random.default_rng(1).uniform(-1.0, 1.0, (20, 3))
+    q_nb = np.array([quat_from_euler(*row) for row in angles])
+    one_by_one = np.array([euler_from_quat(q)[:2] for q in q_nb])
+    assert np.allclose(roll_pitch_rad(q_nb), one_by_one)
+
+
+def test_every_state_and_agent_has_a_colour() -> None:
+    assert set(PHASE_RGB) == {phase.name for phase in Phase}
+    assert set(MODE_RGB) == {mode.name for mode in Mode}
+    colours = [agent_rgb(agent) for agent in range(30)]
+    assert len(set(colours)) == 30

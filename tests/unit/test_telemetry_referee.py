@@ -1,0 +1,252 @@
+"""The referee against runs small enough to judge by hand; every claim fails when its rule is off."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
+from swarmctl.core.types import Mode, Phase, PlanStatus
+from swarmctl.telemetry.plain import to_json
+from swarmctl.telemetry.referee import ObstacleRule, Rules, RunData, judge
+
+UTC0_US = 1_780_000_000_000_000
+START_US = 1_000_000  # monotonic time of mission start
+
+
+def ticks(seconds: float, pos_ned_m: Any, first_s: float = 0.0, rate_hz: int = 50) -> NDArray[np.void]:
+    """Ticks of an agent in the mission whose reference stays in the origin; `pos_ned_m` (3,) or (T, 3)."""
+    t_s = first_s + np.arange(round(seconds * rate_hz) + 1) / rate_hz
+    rows = np.zeros(len(t_s), TICK_DTYPE)
+    rows["t_us"] = START_US + np.round(t_s * 1e6).astype(np.int64)
+    rows["utc_us"] = rows["t_us"] + UTC0_US
+    rows["mission_t_s"] = t_s
+    rows["phase"], rows["mode"], rows["armed"] = Phase.TRACK, Mode.FOLLOW, 1
+    rows["pos_ned_m"] = pos_ned_m
+    rows["q_nb"][:, 0] = 1.0
+    rows["iterations"], rows["solve_ms"], rows["tick_ms"], rows["path_age_ms"] = 25, 2.0, 4.0, 30.0
+    return rows
+
+
+def truth(vehicle: int, t_s: Any, pos_ned_m: Any, armed: Any = 1) -> NDArray[np.void]:
+    """True states at mission times `t_s`."""
+    rows = np.zeros(len(t_s), TRUTH_DTYPE)
+    rows["t_us"] = START_US + np.round(np.asarray(t_s) * 1e6).astype(np.int64)
+    rows["vehicle"], rows["pos_ned_m"], rows["armed"] = vehicle, pos_ned_m, armed
+    return rows
+
+
+def run(by_agent: dict[int, NDArray[np.void]], *true: NDArray[np.void], events: Any = ()) -> RunData:
+    return RunData(by_agent, np.concatenate([np.zeros(0, TRUTH_DTYPE), *true]), list(events))
+
+
+APART = {0: ticks(20, (1.0, 0.0, 0.0)), 1: ticks(20, (0.0, 0.0, 2.0))}
+
+
+def test_index_is_the_sum_of_mean_distances() -> None:
+    tracking = judge(run(APART), Rules(2, 0.5), "completed")["tracking"]
+    assert tracking["index_m"] == pytest.approx(1.0 + 2.0)
+    assert tracking["agents"][0]["mse_m2"] == pytest.approx([1.0, 0.0, 0.0])
+    assert tracking["agents"][1]["mean_distance_m"] == pytest.approx(2.0)
+    assert tracking["agents"][1]["rmse_m"] == pytest.approx(2.0)
+    assert [row["id"] for row in tracking["agents"]] == [0, 1]
+
+
+def test_mean_and_rmse_of_a_changing_error() -> None:
+    pos = np.zeros((101, 3))
+    pos[:, 1] = np.where(np.arange(101) % 2 == 0, 3.0, 1.0)  # 51 times 3 m, 50 times 1 m
+    row = judge(run({0: ticks(2, pos)}), Rules(1, 0.5), "completed")["tracking"]["agents"][0]
+    assert row["mean_distance_m"] == pytest.approx((51 * 3 + 50) / 101)
+    assert row["mse_m2"][1] == pytest.approx((51 * 9 + 50) / 101)
+    assert row["rmse_m"] == pytest.approx(math.sqrt((51 * 9 + 50) / 101))
+
+
+def test_index_counts_only_the_time_all_agents_share() -> None:
+    late = ticks(20, (2.0, 0.0, 0.0))
+    late["pos_ned_m"][late["mission_t_s"] > 10.0] = (100.0, 0.0, 0.0)
+    both = {0: late, 1: ticks(10, (0.0, 1.0, 0.0))}
+    assert judge(run(both), Rules(2, 0.5), "failed")["tracking"]["index_m"] == pytest.approx(3.0)
+
+
+def test_index_is_unknown_when_an_agent_never_tracked() -> None:
+    assert judge(run({0: APART[0]}), Rules(2, 0.5), "failed")["tracking"]["index_m"] is None
+
+
+def test_steady_figures_leave_out_the_first_ten_seconds() -> None:
+    rows = ticks(20, (5.0, 0.0, 0.0))
+    rows["pos_ned_m"][rows["mission_t_s"] >= 10.0] = (0.1, 0.0, 0.0)
+    tracking = judge(run({0: rows}), Rules(1, 0.5), "completed")["tracking"]
+    assert tracking["agents"][0]["steady_rmse_m"] == pytest.approx(0.1)
+    assert tracking["index_after_10s_m"] == pytest.approx(0.1)
+    assert judge(run({0: ticks(5, (5.0, 0, 0))}), Rules(1, 0.5), "completed")["tracking"]["index_after_10s_m"] is None
+
+
+def test_truth_wins_over_reports_and_is_interpolated() -> None:
+    t_s = np.arange(0, 10.01, 0.1)
+    moving = np.column_stack([t_s, np.full_like(t_s, 0.25), 0 * t_s])  # 1 m/s north, 0.25 m east of the reference
+    rows = ticks(10, (9.0, 9.0, 9.0))
+    rows["ref_pos_ned_m"][:, 0] = rows["mission_t_s"]
+    row = judge(run({0: rows}, truth(0, t_s, moving)), Rules(1, 0.5), "completed")["tracking"]["agents"][0]
+    assert row["mse_m2"] == pytest.approx([0.0, 0.0625, 0.0], abs=1e-9)
+
+
+def closing(least_m: float) -> RunData:
+    """Two agents whose distance falls from 2 m to `least_m` at 5 s and grows again."""
+    t_s = np.arange(0, 10.001, 0.01)
+    gap = least_m + np.abs(t_s - 5.0) * (2.0 - least_m) / 5.0
+    other = np.column_stack([gap, 0 * gap, 0 * gap])
+    return run(APART, truth(0, t_s, (0.0, 0.0, 0.0)), truth(1, t_s, other))
+
+
+def test_separation_names_value_limit_pair_and_time() -> None:
+    summary = judge(closing(0.61), Rules(2, 0.85), "completed")
+    assert summary["separation"]["min_m"] == pytest.approx(0.61)
+    assert summary["separation"]["min_pair"] == [0, 1]
+    assert summary["separation"]["min_at_s"] == pytest.approx(5.0)
+    assert summary["violations"] == ["separation 0.610 m below 0.85 m between agents 0 and 1 at 5.0 s"]
+    assert summary["outcome"] == "failed"
+
+
+@pytest.mark.parametrize(("least_m", "limit_m", "outcome"), [(0.86, 0.85, "completed"), (0.84, 0.85, "failed")])
+def test_separation_decides_the_outcome(least_m: float, limit_m: float, outcome: str) -> None:
+    assert judge(closing(least_m), Rules(2, limit_m), "completed")["outcome"] == outcome
+
+
+def test_separation_counts_from_first_arming_to_the_very_end() -> None:
+    t_s = np.arange(0, 3.001, 0.1)
+    near = np.column_stack([np.where(t_s < 1.0, 0.1, 1.0), 0 * t_s, 0 * t_s])
+    armed = (t_s >= 0.999).astype(int)
+    touching_before = run({}, truth(0, t_s, (0, 0, 0), armed), truth(1, t_s, near, armed))
+    assert judge(touching_before, Rules(2, 0.5), "completed")["violations"] == []
+    disarmed_after = run({}, truth(0, t_s, (0, 0, 0), t_s < 0.05), truth(1, t_s, near[::-1], 0))
+    assert judge(disarmed_after, Rules(2, 0.5), "completed")["separation"]["min_m"] == pytest.approx(0.1)
+
+
+def test_reports_of_two_hosts_are_joined_by_utc() -> None:
+    first, second = ticks(10, (0.0, 0.0, 0.0)), ticks(10, (0.0, 0.0, 0.0))
+    second["t_us"] += 77_000_000  # another host's monotonic clock
+    second["utc_us"] += 7_000  # and ticks between the first one's
+    second["pos_ned_m"][:, 0] = 1.0 + 0.01 * second["mission_t_s"]
+    separation = judge(run({0: first, 1: second}), Rules(2, 0.5), "completed")["separation"]
+    assert separation["min_m"] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_positions_that_were_never_recorded_are_no_pass() -> None:
+    summary = judge(run({0: APART[0]}), Rules(2, 0.85), "completed")
+    assert summary["separation"]["min_m"] is None
+    assert summary["outcome"] == "failed"
+    assert "can't be judged" in summary["violations"][0]
+
+
+@pytest.mark.parametrize(("margin_m", "violated"), [(0.05, True), (0.3, False)])
+def test_obstacle_clearance_allows_its_margin_only(margin_m: float, violated: bool) -> None:
+    rules = Rules(1, 0.5, (ObstacleRule((1.5, 0.0, 0.0), 1.75),), margin_m)
+    summary = judge(run({0: ticks(5, (0.0, 0.0, 0.0))}), rules, "completed")
+    assert summary["obstacles"] == {"min_clearance_m": 1.5, "required_m": 1.75 - margin_m}
+    assert (summary["outcome"] == "failed") == violated
+    assert any("between agent 0 and obstacle 0" in text for text in summary["violations"]) == violated
+
+
+def test_moving_obstacle_is_met_where_it_is_at_the_time() -> None:
+    rules = Rules(1, 0.5, (ObstacleRule((10.0, 0.0, 0.0), 1.0, (-1.0, 0.0, 0.0)),))
+    assert judge(run({0: ticks(5, (0, 0, 0))}), rules, "completed")["obstacles"]["min_clearance_m"] == pytest.approx(
+        5.0
+    )
+    assert judge(run({0: ticks(9.5, (0, 0, 0))}), rules, "completed")["outcome"] == "failed"
+
+
+def test_obstacle_set_in_flight_counts_from_then_on() -> None:
+    rows = ticks(10, (0.0, 0.0, 0.0))
+    rows["pos_ned_m"][rows["mission_t_s"] >= 4.0] = (50.0, 0.0, 0.0)
+    since_us = UTC0_US + START_US + 5_000_000
+    rules = Rules(1, 0.5, (ObstacleRule((0.0, 0.0, 0.0), 1.0, (0.0, 0.0, 0.0), since_us),))
+    assert judge(run({0: rows}), rules, "completed")["outcome"] == "completed"
+    assert judge(run({0: rows}), Rules(1, 0.5, (ObstacleRule((0, 0, 0), 1.0),)), "completed")["outcome"] == "failed"
+
+
+def test_timing_counts_flight_ticks_and_late_ones() -> None:
+    rows = ticks(2, (0.0, 0.0, 0.0))  # 101 ticks
+    rows["phase"][:10] = Phase.STANDBY
+    rows["late_ticks"] = np.where(np.arange(101) < 50, 3, 33)  # 30 during the flight
+    rows["tick_ms"] = 4.0
+    rows["tick_ms"][60] = 9.0
+    rows["solve_ms"][70], rows["iterations"][70] = 99.0, 0  # nothing was solved in this tick
+    summary = judge(run({0: rows}), Rules(1, 0.5, late_ticks_01=0.2), "completed", speed_factor=8.0)
+    timing = summary["timing"]
+    assert (timing["ticks"], timing["late_ticks"], timing["speed_factor"]) == (91, 30, 8.0)
+    assert timing["tick_ms"] == {"p50": 4.0, "p99": pytest.approx(4.5), "max": 9.0}
+    assert timing["solve_ms"]["max"] == 2.0
+    assert summary["violations"] == ["late ticks 33.0% above 20.0% (30 of 91)"]
+    assert judge(run({0: rows}), Rules(1, 0.5, late_ticks_01=0.4), "completed")["violations"] == []
+
+
+def test_solver_failures_count_while_the_agent_is_in_charge() -> None:
+    rows = ticks(2, (0.0, 0.0, 0.0))
+    rows["plan_status"][:4] = [PlanStatus.SOLVER_FAILED, PlanStatus.RESIDUAL, PlanStatus.NOT_CERTIFIED, PlanStatus.NONE]
+    rows["plan_status"][10], rows["mode"][10] = PlanStatus.SOLVER_FAILED, Mode.YIELD
+    rows["residual_m"] = 1e-4
+    rows["residual_m"][0] = 7.0  # refused, never flown
+    solver = judge(run({0: rows}), Rules(1, 0.5, solver_name="daqp"), "completed")["solver"]
+    assert solver == {"name": "daqp", "failed": 2, "not_certified": 1, "max_residual_m": pytest.approx(1e-4)}
+
+
+def test_refused_messages_are_summed_over_each_agents_last_summary() -> None:
+    events = [
+        {"source": "agent-0", "event": "bus_summary", "rejected": {"stale": 1}},
+        {"source": "agent-0", "event": "bus_summary", "rejected": {"stale": 3, "identity": 1}},
+        {"source": "agent-1", "event": "bus_summary", "rejected": {"stale": 4}},
+        {"source": "agent-1", "event": "other", "rejected": {"stale": 100}},
+    ]
+    comms = judge(run(APART, events=events), Rules(2, 0.5), "completed")["comms"]
+    assert comms == {"path_age_ms": {"p50": 30.0, "p99": 30.0}, "rejected": {"identity": 1, "stale": 7}}
+
+
+@pytest.mark.parametrize(
+    ("outcome", "problems", "judged"),
+    [
+        ("completed", (), "completed"),
+        ("completed", ("agent 1 exited with code -9",), "failed"),
+        ("interrupted", (), "interrupted"),
+        ("failed", (), "failed"),
+    ],
+)
+def test_outcome(outcome: str, problems: tuple[str, ...], judged: str) -> None:
+    summary = judge(run(APART), Rules(2, 0.5), outcome, problems)
+    assert summary["outcome"] == judged
+    assert summary["violations"] == list(problems)
+
+
+def test_mission_cut_short_is_no_pass() -> None:
+    assert judge(run(APART), Rules(2, 0.5, duration_s=20.5), "completed")["outcome"] == "completed"
+    summary = judge(run(APART), Rules(2, 0.5, duration_s=38.0), "completed")
+    assert summary["violations"][0] == "mission time 20.0 s of agent 0 below 38 s"
+    assert judge(run(APART), Rules(2, 0.5, duration_s=38.0), "interrupted")["violations"] == []
+
+
+def test_diverged_truth_is_no_pass() -> None:
+    t_s = np.arange(0, 1, 0.1)
+    broken = np.where(t_s[:, None] > 0.5, np.nan, np.zeros((10, 3)))
+    summary = judge(run({}, truth(0, t_s, broken)), Rules(1, 0.5), "completed")
+    assert summary["outcome"] == "failed"
+    assert "not a number" in summary["violations"][0]
+
+
+@pytest.mark.parametrize("data", [run({}), run({0: ticks(0, (0, 0, 0))[:0]}), run(APART)], ids=["none", "empty", "run"])
+def test_summary_holds_no_nan_and_every_promised_key(data: RunData) -> None:
+    summary = judge(data, Rules(2, 0.85), "interrupted")
+
+    def refuse(constant: str) -> None:
+        raise AssertionError(constant)
+
+    again = json.loads(to_json(summary), parse_constant=refuse)
+    assert {"outcome", "violations", "agents", "duration_s", "mode"} <= set(again)
+    assert set(again["separation"]) >= {"min_m", "required_m"}
+    assert set(again["obstacles"]) == {"min_clearance_m", "required_m"}
+    assert set(again["timing"]) == {"ticks", "late_ticks", "tick_ms", "solve_ms", "speed_factor"}
+    assert set(again["solver"]) >= {"name", "failed", "max_residual_m"}
+    assert set(again["comms"]) == {"path_age_ms", "rejected"}

@@ -1,0 +1,207 @@
+"""A run folder is unique, survives crashes, and ends up complete."""
+
+from __future__ import annotations
+
+import json
+from concurrent.futures import ThreadPoolExecutor
+from html.parser import HTMLParser
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
+from swarmctl.core.types import Mode, Phase
+from swarmctl.errors import ConfigError, StartError
+from swarmctl.telemetry.charts import thin
+from swarmctl.telemetry.referee import ObstacleRule, Rules
+from swarmctl.telemetry.run_folder import (
+    Outcome,
+    create_run_folder,
+    finish_run,
+    load_run,
+    read_parquet,
+    report_run,
+    write_parquet,
+)
+
+UTC_US = 1_780_000_000_000_000
+
+
+def flight(agent: int, agents: int, seconds: float) -> tuple[NDArray[np.void], NDArray[np.void]]:
+    """Ticks and truth of one agent on a circle, take-off and landing included."""
+    t_s = np.arange(0, seconds, 0.02)
+    rows, true = np.zeros(len(t_s), TICK_DTYPE), np.zeros(len(t_s), TRUTH_DTYPE)
+    rows["t_us"] = true["t_us"] = 5_000_000 + (t_s * 1e6).astype(np.int64)
+    rows["utc_us"] = rows["t_us"] + UTC_US
+    rows["seq"] = np.arange(len(t_s))
+    rows["phase"] = np.select([t_s < 1, t_s < 3, t_s < seconds - 1], [Phase.STANDBY, Phase.TAKEOFF, Phase.TRACK], 8)
+    rows["mode"] = np.where(rows["phase"] == Phase.TRACK, Mode.FOLLOW, Mode.IDLE)
+    rows["mission_t_s"] = np.where(rows["phase"] == Phase.TRACK, t_s - 3, np.nan)
+    rows["armed"] = true["armed"] = t_s >= 1
+    angle = 0.5 * t_s
+    rows["ref_pos_ned_m"] = np.column_stack([5 * np.cos(angle), 5 * np.sin(angle), -1 - 0.1 * t_s])
+    around = 2 * np.pi * agent / agents
+    offset = 0.2 * agents * np.array([np.cos(around), np.sin(around), 0.0])
+    rows["pos_ned_m"] = true["pos_ned_m"] = rows["ref_pos_ned_m"] + offset
+    rows["q_nb"][:, 0] = true["q_nb"][:, 0] = 1.0
+    rows["setpoint_q_nb"] = np.where(rows["mode"][:, None] == Mode.IDLE, np.nan, rows["q_nb"])
+    noise = np.random.default_rng([1, agent]).gamma(2.0, 0.5, (2, len(t_s)))
+    rows["solve_ms"], rows["tick_ms"], rows["iterations"] = 1 + noise[0], 2 + noise[1], 25
+    rows["setpoint_thrust_01"], rows["hover_thrust_01"] = 0.5 + 0.02 * noise[0], 0.5
+    rows["path_age_ms"] = np.nan
+    true["vehicle"] = agent
+    return rows, true
+
+
+def write_run(directory: Path, agents: int, seconds: float) -> None:
+    """What processes leave behind, before the launcher finishes the run."""
+    true = []
+    for agent in range(agents):
+        rows, own = flight(agent, agents, seconds)
+        rows.tofile(directory / f"agent-{agent}.ticks")
+        true.append(own)
+        event = {"utc_us": UTC_US + agent, "t_us": agent, "source": f"agent-{agent}", "event": "phase", "to": "<b>"}
+        (directory / f"agent-{agent}.events.jsonl").write_text(json.dumps(event) + "\n")
+    np.concatenate(true).tofile(directory / "truth.bin")
+    (directory / "config.toml").write_text('name = "x<y"\n')
+
+
+RULES = Rules(3, 0.85, (ObstacleRule((20.0, 20.0, -2.0), 1.75),))
+
+
+def test_launches_in_the_same_second_get_folders_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    with ThreadPoolExecutor(8) as pool:
+        folders = list(pool.map(lambda _: create_run_folder(None, "circle", UTC_US), range(20)))
+    assert len(set(folders)) == 20
+    assert all(folder.is_dir() and not any(folder.iterdir()) for folder in folders)
+    assert Path("runs/20260528T202640Z-circle") in folders
+
+
+def test_given_folder_is_taken_as_it_is_but_never_twice(tmp_path: Path) -> None:
+    folder = create_run_folder(tmp_path / "a" / "b", "circle", UTC_US)
+    assert folder == tmp_path / "a" / "b"
+    (folder / "console.log").write_text("")
+    create_run_folder(folder, "circle", UTC_US)
+    (folder / "agent-0.ticks").write_bytes(b"")
+    with pytest.raises(ConfigError, match=r"holds a run already \(agent-0.ticks\)"):
+        create_run_folder(folder, "circle", UTC_US)
+
+
+def test_folder_that_cannot_be_made_is_a_start_error(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StartError, match="--run-dir"):
+        create_run_folder(tmp_path / "file" / "run", "circle", UTC_US)
+
+
+def test_parquet_gives_back_every_column(tmp_path: Path) -> None:
+    rows, _ = flight(1, 3, 6.0)
+    write_parquet(tmp_path / "agent-1.parquet", rows)
+    again = read_parquet(tmp_path / "agent-1.parquet")
+    for name in TICK_DTYPE.names or ():
+        np.testing.assert_array_equal(again[name], rows[name], err_msg=name)
+
+
+def test_half_rows_and_half_lines_are_ignored(tmp_path: Path) -> None:
+    write_run(tmp_path, 2, 5.0)
+    whole = load_run(tmp_path)
+    for name in ("agent-0.ticks", "truth.bin", "agent-1.events.jsonl"):
+        with (tmp_path / name).open("ab") as file:
+            file.write(b'{"utc_us": 1')
+    again = load_run(tmp_path)
+    assert len(again.ticks[0]) == len(whole.ticks[0])
+    assert len(again.truth) == len(whole.truth)
+    assert again.events == whole.events
+
+
+def test_missing_folder_is_refused_in_words(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no such run folder"):
+        load_run(tmp_path / "nowhere")
+
+
+def test_finished_run_is_complete_and_may_be_finished_again(tmp_path: Path) -> None:
+    write_run(tmp_path, 3, 20.0)
+    own = ({"utc_us": UTC_US - 1, "t_us": -1, "source": "launch", "event": "started"},)
+    summary = finish_run(tmp_path, RULES, Outcome("completed", events=own))
+    assert summary["outcome"] == "completed", summary["violations"]
+    assert summary["tracking"]["index_m"] == pytest.approx(3 * 0.6)
+    assert summary["separation"]["min_m"] == pytest.approx(0.6 * np.sqrt(3))
+    names = {path.name for path in tmp_path.iterdir()}
+    parquets = {f"agent-{agent}.parquet" for agent in range(3)}
+    assert names == parquets | {"truth.bin", "config.toml", "events.jsonl", "summary.json", "report.html"}
+    sources = [json.loads(line)["source"] for line in (tmp_path / "events.jsonl").read_text().splitlines()]
+    assert sources == ["launch", "agent-0", "agent-1", "agent-2"]
+    assert finish_run(tmp_path, RULES, Outcome("completed", events=own)) == summary
+    assert len((tmp_path / "events.jsonl").read_text().splitlines()) == 4
+    assert json.loads((tmp_path / "summary.json").read_text()) == summary
+
+
+def test_report_of_a_run_whose_launcher_died_says_so(tmp_path: Path) -> None:
+    write_run(tmp_path, 3, 6.0)
+    assert report_run(tmp_path, RULES).exists()
+    summary = json.loads((tmp_path / "summary.json").read_text())
+    assert summary["outcome"] == "failed"
+    assert summary["violations"] == ["the launcher did not finish this run"]
+
+
+class _Page(HTMLParser):
+    """Collects what a report must and must not have."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.open: list[str] = []
+        self.tags: list[str] = []
+        self.addresses: list[str] = []
+        self.text = ""
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.addresses += [value or "" for name, value in attrs if name in ("src", "href", "srcset", "data")]
+        if tag not in ("meta", "path", "rect", "circle", "i"):
+            self.open.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+
+    def handle_endtag(self, tag: str) -> None:
+        if tag not in ("i", "rect"):
+            assert self.open.pop() == tag
+
+    def handle_data(self, data: str) -> None:
+        self.text += data
+
+
+@pytest.mark.parametrize(("agents", "seconds"), [(3, 60.0), (12, 40.0), (1, 3.5)])
+def test_report_is_small_well_formed_and_self_contained(tmp_path: Path, agents: int, seconds: float) -> None:
+    write_run(tmp_path, agents, seconds)
+    rules = Rules(agents, 0.3, (ObstacleRule((20.0, 20.0, -2.0), 1.75),))
+    finish_run(tmp_path, rules, Outcome("completed", ("one <script>alert(1)</script> problem",)))
+    text = (tmp_path / "report.html").read_text()
+    page = _Page()
+    page.feed(text)
+    assert not page.open
+    assert len(text) < 1_000_000
+    assert page.addresses == []
+    assert "url(" not in text
+    assert "script" not in page.tags
+    assert "nan" not in text.lower().replace("covenant", "")
+    assert "one <script>alert(1)</script> problem" in page.text
+    assert 'name = "x<y"' in page.text
+    assert page.tags.count("svg") >= 10
+
+
+def test_report_of_an_empty_run(tmp_path: Path) -> None:
+    finish_run(tmp_path, RULES, Outcome("failed", ("no vehicle",)))
+    assert "no vehicle" in (tmp_path / "report.html").read_text()
+
+
+def test_thinning_keeps_peaks() -> None:
+    x = np.arange(10_000.0)
+    y = np.zeros(10_000)
+    y[1234], y[8765] = 50.0, -50.0
+    kept_x, kept_y = thin(x, y, 600)
+    assert len(kept_x) <= 600
+    assert (kept_y.max(), kept_y.min()) == (50.0, -50.0)
+    assert np.all(np.diff(kept_x) > 0)
