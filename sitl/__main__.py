@@ -111,7 +111,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the simulator; returns the process exit code."""
     options = _parser().parse_args(_joined(sys.argv[1:] if arguments is None else arguments))
     if options.die_with_parent:
-        from swarmctl.links.lifeline import die_with_parent
+        from swarmctl.lifeline import die_with_parent
 
         die_with_parent()
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: matrices here are far too small to share out

@@ -103,7 +103,7 @@ def simulate(
     arguments += [f"--set={item}" for item in sets or ()]
     arguments += [] if view is None else ["--view" if view else "--no-view"]
     sys.stdout.flush()
-    os.execv(sys.executable, [sys.executable, "-m", "sitl.lockstep", *arguments])
+    os.execv(sys.executable, [sys.executable, "-m", "sitl.simulate", *arguments])
 
 
 @app.command()

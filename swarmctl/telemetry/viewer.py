@@ -171,19 +171,26 @@ def _serve(run: str, directory: Path, port: int) -> tuple[Any, str]:
     rec = rr.RecordingStream(APPLICATION, recording_id=run, batcher_config=rr.ChunkBatcherConfig(flush_tick=0.25))
     rec.set_log_time_enabled(False)
     path = directory / RECORDING
+    writable = _takes_data(path)
     for candidate in range(port, min(port + _PORTS_TRIED, 65536)):
         if not _is_free(candidate):
             continue
         server = rr.GrpcServerSink(_HOST, candidate, server_memory_limit=_SERVER_MEMORY, newest_first=True)
-        try:
-            rec.set_sinks(server, rr.FileSink(str(path), write_footer=False))
-        except Exception as error:  # noqa: BLE001
-            print(f"viewer: no recording: {error}", file=sys.stderr, flush=True)
-            server = rr.GrpcServerSink(_HOST, candidate, server_memory_limit=_SERVER_MEMORY, newest_first=True)
-            rec.set_sinks(server)
+        rec.set_sinks(server, *([rr.FileSink(str(path), write_footer=False)] if writable else []))
         if _is_ours(candidate):
             return rec, f"rerun+http://{_HOST}:{candidate}/proxy"
     raise StartError(f"no free port in {port}..{port + _PORTS_TRIED - 1} on {_HOST}. Set telemetry.port")
+
+
+def _takes_data(path: Path) -> bool:
+    try:
+        with path.open("wb") as file:
+            file.write(bytes(4096))
+            file.flush()
+        return True
+    except OSError as error:
+        print(f"viewer: no recording, live view only: {error}", file=sys.stderr, flush=True)
+        return False
 
 
 def _is_free(port: int) -> bool:

@@ -245,6 +245,19 @@ def test_comes_up_and_stops_without_agents(endpoint: str, tmp_path: Path) -> Non
         assert finish(process) == "telemetry lost=0 received=0"
 
 
+def test_full_disk_leaves_the_live_view(endpoint: str, tmp_path: Path) -> None:
+    (tmp_path / "telemetry.rrd").symlink_to("/dev/full")
+    with viewer(endpoint, tmp_path) as process:
+        port = int(ready(process).rsplit(":", 1)[1].split("/")[0])
+        swarm = Swarm(endpoint)
+        swarm.fly(0.5)
+        socket.create_connection(("127.0.0.1", port), timeout=2).close()
+        time.sleep(0.3)
+        assert finish(process) == "telemetry lost=0 received=75"
+        swarm.session.close()
+    assert "live view only" in (tmp_path / "viewer.log").read_text()
+
+
 def test_two_viewers_find_ports_of_their_own(endpoint: str, tmp_path: Path) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))

@@ -1,0 +1,120 @@
+"""The `simulate` verb: a lockstep flight with the run folder, summary and exit code of a launch.
+
+`python -m sitl.simulate [CONFIG] [--agents N] [--duration S] [--run-dir DIR] [--seed K] [--set key=value] [--view]`
+"""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+import time
+from pathlib import Path
+from types import FrameType
+from typing import Any
+
+from rich.progress import Progress
+
+from sitl.lockstep import Lockstep
+from swarmctl.config import Config, dump, load
+from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, SwarmError
+from swarmctl.summary import summary_lines
+from swarmctl.telemetry.recordings import RECORDING, open_viewer, optimize_recording, simulated_recording
+from swarmctl.telemetry.run_folder import Outcome, create_run_folder, finish_run, load_run
+
+
+def simulate(config: Config, directory: Path) -> int:
+    """Fly `config` in lockstep into the run folder `directory`; returns the exit code."""
+    (directory / "config.toml").write_text(dump(config), encoding="utf-8")
+    flight = Lockstep(config, directory)
+    stop = _Interrupt()
+    began_s = time.perf_counter()
+    with Progress(transient=True, disable=not sys.stdout.isatty()) as bar:
+        total_s = config.mission.duration_s + 20.0  # there and back
+        task = bar.add_task(f"simulating {config.swarm.agents} agents", total=total_s)
+
+        def on_step(lockstep: Lockstep) -> None:
+            if stop.take():
+                lockstep.command("land")
+            bar.update(task, completed=min(total_s, lockstep.clock.now_us() * 1e-6))
+
+        flight.run(on_step)
+    wall_s = time.perf_counter() - began_s
+    problems = flight.problems()
+    outcome = "interrupted" if stop.count else "failed" if problems else "completed"
+    flight.truth.tofile(directory / "truth.bin")
+    for log in flight.logs:
+        log.close()
+    speed_factor = flight.clock.now_us() * 1e-6 / wall_s
+    shown = () if stop.count else tuple(problems)
+    rules = config.rules("lockstep")
+    summary = finish_run(directory, rules, Outcome(outcome, shown, speed_factor))
+    simulated_recording(
+        directory,
+        load_run(directory),
+        config.swarm.agents,
+        config.separation.radius_m,
+        config.limits.min_separation_m,
+        [obstacle.model_dump() for obstacle in config.obstacles],
+    )
+    optimize_recording(directory)
+    for line in summary_lines(summary, directory):
+        print(line)
+    print(f"{speed_factor:.1f} x real time")
+    if stop.count:
+        return EXIT_INTERRUPTED
+    return EXIT_OK if summary["outcome"] == "completed" else EXIT_MISSION
+
+
+class _Interrupt:
+    """First Ctrl-C lands, the second ends at once."""
+
+    def __init__(self) -> None:
+        self.count = 0
+        self._open = False
+        signal.signal(signal.SIGINT, self._ask)
+
+    def take(self) -> bool:
+        asked, self._open = self._open, False
+        return asked
+
+    def _ask(self, signum: int, frame: FrameType | None) -> None:
+        self.count += 1
+        self._open = True
+        if self.count > 1:
+            raise KeyboardInterrupt
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="swarmctl simulate", description=__doc__.splitlines()[0])
+    parser.add_argument("config", nargs="?", type=Path)
+    parser.add_argument("--agents", metavar="N", dest="swarm.agents")
+    parser.add_argument("--duration", metavar="S", dest="mission.duration_s")
+    parser.add_argument("--seed", metavar="K", dest="seed")
+    parser.add_argument("--set", metavar="KEY=VALUE", action="append", default=[], dest="sets")
+    parser.add_argument("--run-dir", metavar="DIR", type=Path, dest="run_dir")
+    parser.add_argument("--view", action=argparse.BooleanOptionalAction, default=False)
+    return parser
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the verb; returns the process exit code."""
+    options: dict[str, Any] = vars(_parser().parse_args(arguments))
+    overrides = list(options["sets"])
+    overrides += [f"{k}={options[k]}" for k in ("swarm.agents", "mission.duration_s", "seed") if options[k] is not None]
+    try:
+        config = load(options["config"], overrides)
+        directory = create_run_folder(options["run_dir"], config.name, time.time_ns() // 1000)
+        code = simulate(config, directory)
+        if options["view"]:
+            open_viewer(str(directory / RECORDING))
+        return code
+    except SwarmError as error:
+        print(error, file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
+
+
+if __name__ == "__main__":
+    sys.exit(main())
