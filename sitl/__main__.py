@@ -14,6 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
+from sitl.attitude import THESIS_GAINS
 from swarmctl.errors import EXIT_OK, EXIT_USAGE, SwarmError
 
 if TYPE_CHECKING:
@@ -80,6 +81,7 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add("--vehicles", type=_integer(1, 100), default=3, metavar="N")
     add("--preset", choices=("thesis", "x500"), default="thesis", help="airframe and attitude loop")
+    add("--attitude-gains", choices=tuple(THESIS_GAINS), default="swarm", help="attitude PIDs of the thesis airframe")
     add("--spawn", type=_spawns, metavar='"x,y,z;..."', help="NED metres; default: a line along x, 1 m apart")
     add("--origin", type=_origin, default=(47.397742, 8.545594, 489.4), metavar="LAT,LON,ALT", help="shared origin")
     add("--port", type=_integer(1, 65535), default=14540, help="first vehicle sends here until somebody talks to it")
@@ -133,6 +135,7 @@ def _params(options: argparse.Namespace) -> SitlParams:
         vehicles=options.vehicles,
         spawn_ned_m=spawns,
         preset=options.preset,
+        attitude_gains=options.attitude_gains,
         origin_lat_deg=lat_deg,
         origin_lon_deg=lon_deg,
         origin_alt_m=alt_m,

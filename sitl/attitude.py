@@ -163,8 +163,8 @@ class CascadeAttitude:
         out *= live
 
 
-def attitude_loop(preset: Preset, vehicles: int, dt_s: float) -> AttitudeLoop:
-    """The loop that belongs to an airframe."""
+def attitude_loop(preset: Preset, vehicles: int, dt_s: float, gains: str = "swarm") -> AttitudeLoop:
+    """The loop that belongs to an airframe; `gains` names one of `THESIS_GAINS` and matters to that airframe only."""
     if preset.name == "thesis":
-        return ThesisAttitude(vehicles, dt_s)
+        return ThesisAttitude(vehicles, dt_s, THESIS_GAINS[gains])
     return CascadeAttitude(preset, vehicles, dt_s)

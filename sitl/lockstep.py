@@ -179,6 +179,7 @@ def sitl_params(config: Config) -> SitlParams:
         vehicles=config.swarm.agents,
         spawn_ned_m=spawn,
         preset=config.sitl.preset,
+        attitude_gains=config.sitl.attitude_gains,
         origin_lat_deg=config.swarm.origin_lat_deg,
         origin_lon_deg=config.swarm.origin_lon_deg,
         origin_alt_m=config.swarm.origin_alt_m,

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.attitude import attitude_loop
+from sitl.attitude import THESIS_GAINS, attitude_loop
 from sitl.autopilot import IDLE, Autopilot
 from sitl.endpoint import Endpoint
 from sitl.navigator import Navigator
@@ -36,6 +36,7 @@ class SitlParams:
     vehicles: int
     spawn_ned_m: Array
     preset: str = "thesis"
+    attitude_gains: str = "swarm"  # of sitl.attitude.THESIS_GAINS
     origin_lat_deg: float = 47.397742
     origin_lon_deg: float = 8.545594
     origin_alt_m: float = 489.4
@@ -68,6 +69,8 @@ class SitlParams:
                 yield f"{key} = {value}: allowed: {low} to {high}"
         if self.preset not in PRESETS:
             yield f"preset = {self.preset!r}: allowed: {', '.join(PRESETS)}"
+        if self.attitude_gains not in THESIS_GAINS:
+            yield f"attitude_gains = {self.attitude_gains!r}: allowed: {', '.join(THESIS_GAINS)}"
         if self.start not in ("ground", "air"):
             yield f"start = {self.start!r}: allowed: ground, air"
         if self.spawn_ned_m.shape != (self.vehicles, 3):
@@ -104,7 +107,7 @@ class SitlWorld:
             mass_scale=params.mass_scale,
         )
         self.plant.held[:] = airborne
-        self.attitude = attitude_loop(preset, count, dt_s)
+        self.attitude = attitude_loop(preset, count, dt_s, params.attitude_gains)
         self.autopilots: list[Autopilot] = []
         self.endpoints: list[Endpoint] = []
         for i, transport in enumerate(transports):

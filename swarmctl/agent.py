@@ -6,10 +6,9 @@ It has no thread, socket, sleep or simulation branch: transport, bus, slow path,
 from __future__ import annotations
 
 import math
-from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from pydantic import Field
@@ -36,7 +35,6 @@ from swarmctl.control.setpoint import setpoint_of
 from swarmctl.core.clock import Clock
 from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned
 from swarmctl.core.params import Params
-from swarmctl.core.records import pack_tick
 from swarmctl.core.types import (
     Array,
     AttitudeSetpoint,
@@ -57,8 +55,8 @@ from swarmctl.links import topics
 from swarmctl.links.autopilot import Autopilot
 from swarmctl.links.commands import CommandPort
 from swarmctl.links.peers import Bus, PeerPaths, agent_name
+from swarmctl.reporter import Act, Reporter, Thought, TickSink, Took
 
-_STATUS_US = 200_000
 _NOTHING_US = -1
 
 
@@ -89,14 +87,6 @@ class AgentSetup:
     obstacle_slots: int
 
 
-class TickSink(Protocol):
-    """Where records go; never blocks."""
-
-    def tick(self, record: TickRecord) -> None: ...
-
-    def event(self, name: str, t_us: int, utc_us: int, **fields: Any) -> None: ...
-
-
 class Agent:
     """See the module. `stopwatch_ns` only measures the tick; it never influences it."""
 
@@ -117,6 +107,11 @@ class Agent:
         slots = min(len(peers), setup.separation.max_neighbours) + setup.obstacle_slots
         self._paths = PeerPaths(peers)
         self._controller = make_controller(setup.controller, setup.separation, setup.agent, slots)
+        self._transit = self._controller
+        if setup.controller.kind == "open_loop":  # can't go anywhere: something else flies to the start
+            self._transit = make_controller(
+                setup.controller.model_copy(update={"kind": "dmpc"}), setup.separation, setup.agent, slots
+            )
         self._observer = DisturbanceObserver(setup.params.disturbance, setup.vehicle_model.hover_thrust_01)
         self._predictor = Predictor(setup.vehicle_model)
         reference = MissionReference(setup.mission, setup.starts_ned_m, setup.agent)
@@ -136,10 +131,7 @@ class Agent:
         self._good: Plan | None = None
         self._certified_us: int | None = None
         self._hold_at: Array | None = None
-        self._seq = 0
-        self._status_us = 0
-        self._recent_ms: deque[float] = deque(maxlen=250)
-        self._failed_plans = 0
+        self._reporter = Reporter(setup.agent, setup.boot_id, setup.sysid, autopilot, self._paths, bus, clock, sink)
         self._announced: tuple[Phase, Mode, FlightMode] | None = None
         self._problem = ""
         self._last_state_us = _NOTHING_US
@@ -173,18 +165,25 @@ class Agent:
         self._listen(now_us)
         state = self._sense(now_us)
         sensed_ns = self._stopwatch_ns()
-        start, plan, reference, keep_outs = self._think(now_us, state)
+        thought = self._think(now_us, state)
         solved_ns = self._stopwatch_ns()
-        self._judge(now_us, state, plan, keep_outs)
-        flown = self._flown(now_us, state, start, plan)
+        self._judge(now_us, state, thought)
+        flown = self._flown(state, thought)
         setpoint = self._act(now_us, flown)
         sent_ns = self._stopwatch_ns()
         self._share(state, flown)
         self._advance(now_us, state)
-        took = (sent_ns - began_ns, solved_ns - sensed_ns)
-        record = self._record(now_us, state, start, plan, flown, setpoint, reference, keep_outs, late_ticks, took)
-        self._report(now_us, record)
-        return record
+        self._reporter.problem = self._problem
+        return self._reporter.report(
+            now_us,
+            state,
+            thought,
+            Act(self._judgement.mode, flown, setpoint),
+            self._sequence,
+            self._observer.estimate,
+            late_ticks,
+            Took((sent_ns - began_ns) * 1e-6, (solved_ns - sensed_ns) * 1e-6),
+        )
 
     # -- listen, sense ------------------------------------------------------------------------------------------------
 
@@ -224,11 +223,9 @@ class Agent:
 
     # -- think --------------------------------------------------------------------------------------------------------
 
-    def _think(
-        self, now_us: int, state: VehicleState | None
-    ) -> tuple[Start | None, Plan | None, Reference | None, list[KeepOut]]:
+    def _think(self, now_us: int, state: VehicleState | None) -> Thought:
         if state is None or not self._fresh(now_us, state):
-            return None, None, None, []
+            return Thought(None, None, None, [])
         estimate = self._observer.estimate
         act_us = now_us + self._predictor.delay_us
         pos, vel = self._predictor.predict(state, act_us, estimate.disturbance_ned_m_s2)
@@ -239,13 +236,14 @@ class Agent:
         reference, now_ref = self._reference(now_us)
         keep_outs = self._keep_outs(act_us, state)
         if not Phase.GOTO_START <= self._sequence.phase <= Phase.GOTO_LAND:
-            return start, None, now_ref, keep_outs
+            return Thought(start, None, now_ref, keep_outs)
         steps, dt_us = self._controller.steps, self._controller.dt_us
         guess = None
         if self._good is not None and act_us - self._good.t0_us < steps * dt_us:
             guess = self._shifted(self._good, act_us)
-        plan = self._controller.plan(start, reference, estimate.disturbance_ned_m_s2, keep_outs, guess)
-        return start, plan, now_ref, keep_outs
+        controller = self._controller if self._sequence.phase is Phase.TRACK else self._transit
+        plan = controller.plan(start, reference, estimate.disturbance_ned_m_s2, keep_outs, guess)
+        return Thought(start, plan, now_ref, keep_outs)
 
     def _reference(self, now_us: int) -> tuple[Reference, Reference]:
         """Over the horizon from when the setpoint acts, and now."""
@@ -271,15 +269,16 @@ class Agent:
 
     # -- judge, act ---------------------------------------------------------------------------------------------------
 
-    def _judge(self, now_us: int, state: VehicleState | None, plan: Plan | None, keep_outs: Sequence[KeepOut]) -> None:
+    def _judge(self, now_us: int, state: VehicleState | None, thought: Thought) -> None:
+        plan = thought.plan
         if plan is None:
             self._certified_us = now_us  # none was asked for
         if plan is not None and plan.status is PlanStatus.OK:
             self._good, self._certified_us = plan, now_us
         elif plan is not None:
-            self._failed_plans += 1
+            self._reporter.failed_plans += 1
             self._problem = f"plan {plan.status.name.lower()}"
-            if self._good is not None and certify(self._shifted(self._good, plan.t0_us), keep_outs, 0) < 0.0:
+            if self._good is not None and certify(self._shifted(self._good, plan.t0_us), thought.keep_outs, 0) < 0.0:
                 self._good = None  # what is known now rules the old plan out as well
         delay_us = self._predictor.delay_us
         health = Health(
@@ -296,22 +295,22 @@ class Agent:
         )
         self._judgement = judge(health, self._sequence.had_control, self._setup.params.failsafe)
 
-    def _flown(self, now_us: int, state: VehicleState | None, start: Start | None, plan: Plan | None) -> Plan | None:
+    def _flown(self, state: VehicleState | None, thought: Thought) -> Plan | None:
         """The plan whose first input is sent and whose path is shared; None when the autopilot flies."""
         mode = self._judgement.mode
         if mode is not Mode.HOLD:
             self._hold_at = None
-        if start is None or state is None:
+        if thought.start is None or state is None:
             return None
         if mode in (Mode.FOLLOW, Mode.STREAM):
-            return plan
+            return thought.plan
         if mode is Mode.REPLAY:
             return self._good
         if mode in (Mode.BRAKE, Mode.HOLD):
             if mode is Mode.HOLD and self._hold_at is None:
                 self._hold_at = state.pos_ned_m
             disturbance = self._observer.estimate.disturbance_ned_m_s2
-            return rest_plan(start, self._hold_at, disturbance, self._controller.dt_us, self._controller.steps)
+            return rest_plan(thought.start, self._hold_at, disturbance, self._controller.dt_us, self._controller.steps)
         return None
 
     def _act(self, now_us: int, flown: Plan | None) -> AttitudeSetpoint | None:
@@ -366,7 +365,7 @@ class Agent:
         return PredictedPath(
             self._setup.agent,
             self._setup.boot_id,
-            self._seq,
+            self._reporter.seq,
             self._utc(plan.t0_us),
             plan.dt_us,
             0.0,
@@ -383,93 +382,7 @@ class Agent:
         t_s = np.arange(self._controller.steps + 1)[:, None] * (self._controller.dt_us * 1e-6)
         pos = state.pos_ned_m + t_s * state.vel_ned_m_s
         utc_us, dt_us = self._utc(state.t_us), self._controller.dt_us
-        return PredictedPath(self._setup.agent, self._setup.boot_id, self._seq, utc_us, dt_us, 0.0, pos)
-
-    def _record(
-        self,
-        now_us: int,
-        state: VehicleState | None,
-        start: Start | None,
-        plan: Plan | None,
-        flown: Plan | None,
-        setpoint: AttitudeSetpoint | None,
-        reference: Reference | None,
-        keep_outs: Sequence[KeepOut],
-        late_ticks: int,
-        took_ns: tuple[int, int],
-    ) -> TickRecord:
-        self._seq += 1
-        utc_us = self._clock.utc_us()
-        estimate = self._observer.estimate
-        here = _NAN3 if start is None else start.pos_ned_m
-        peers = [math.dist(here, k.pos_ned_m[0]) for k in keep_outs if k.tie >= 0]
-        obstacles = [math.dist(here, k.pos_ned_m[0]) for k in keep_outs if k.tie < 0]
-        sent_us = utc_us + self._predictor.delay_us  # a path begins when its sender's setpoint acts
-        ages_ms = [(sent_us - path.t0_utc_us) * 1e-3 for path in self._paths.latest()]
-        return TickRecord(
-            t_us=now_us,
-            utc_us=utc_us,
-            seq=self._seq,
-            mission_t_s=self._sequence.mission_t_s(utc_us),
-            phase=self._sequence.phase,
-            mode=self._judgement.mode,
-            flight_mode=self._autopilot.mode,
-            armed=self._autopilot.armed,
-            state_age_ms=math.nan if state is None else (now_us - state.t_us) * 1e-3,
-            pos_ned_m=_NAN3 if state is None else state.pos_ned_m,
-            vel_ned_m_s=_NAN3 if state is None else state.vel_ned_m_s,
-            q_nb=_NAN4 if state is None else state.q_nb,
-            ref_pos_ned_m=_NAN3 if reference is None else reference.pos_ned_m[0],
-            setpoint_q_nb=_NAN4 if setpoint is None else setpoint.q_nb,
-            setpoint_thrust_01=math.nan if setpoint is None else setpoint.thrust_01,
-            hover_thrust_01=estimate.hover_thrust_01,
-            disturbance_ned_m_s2=estimate.disturbance_ned_m_s2,
-            nearest_peer_m=min(peers, default=math.inf),
-            nearest_obstacle_m=min(obstacles, default=math.inf),
-            path_age_ms=max(ages_ms, default=math.nan),
-            peers=len(peers),
-            rejected=sum(self._paths.rejected.values()),
-            plan_status=PlanStatus.NONE if plan is None else plan.status,
-            slack_m=0.0 if plan is None else plan.slack_m,
-            residual_m=0.0 if plan is None else plan.residual_m,
-            iterations=0 if plan is None else plan.iterations,
-            solve_ms=took_ns[1] * 1e-6,
-            tick_ms=took_ns[0] * 1e-6,
-            late_ticks=late_ticks,
-            plan_pos_ned_m=_NO_PLAN if flown is None else flown.pos_ned_m,
-        )
-
-    def _report(self, now_us: int, record: TickRecord) -> None:
-        self._recent_ms.append(record.tick_ms)
-        self._sink.tick(record)
-        self._bus.publish(topics.TICK, pack_tick(record))
-        if now_us - self._status_us >= _STATUS_US:
-            self._status_us = now_us
-            self._bus.publish(topics.STATUS, topics.encode_message(self._status(record)))
-
-    def _status(self, record: TickRecord) -> topics.StatusMessage:
-        """What peers and people are told of this tick."""
-        error = record.pos_ned_m - record.ref_pos_ned_m
-        return topics.StatusMessage(
-            agent=self._setup.agent,
-            boot_id=self._setup.boot_id,
-            sysid=self._setup.sysid,
-            phase=int(record.phase),
-            mode=int(record.mode),
-            flight_mode=int(record.flight_mode),
-            armed=record.armed,
-            landed=int(self._autopilot.landed),
-            ready_utc_us=self._sequence.ready_utc_us,
-            outcome=self._sequence.outcome,
-            position_error_m=_finite(math.sqrt(float(error @ error))),
-            separation_m=_finite(record.nearest_peer_m),
-            tick_p99_ms=float(np.percentile(self._recent_ms, 99)),
-            ticks=record.seq,
-            late_ticks=record.late_ticks,
-            path_age_ms=_finite(record.path_age_ms),
-            solver_failed=self._failed_plans,
-            problem=self._problem,
-        )
+        return PredictedPath(self._setup.agent, self._setup.boot_id, self._reporter.seq, utc_us, dt_us, 0.0, pos)
 
     def _peer_facts(self) -> dict[int, PeerFacts]:
         alive = self._bus.alive()
@@ -487,16 +400,6 @@ class Agent:
 
     def _note(self, name: str, **fields: Any) -> None:
         self._sink.event(name, self._clock.now_us(), self._clock.utc_us(), **fields)
-
-
-_NAN3 = np.full(3, math.nan)
-_NAN4 = np.full(4, math.nan)
-_NO_PLAN = np.empty((0, 3))
-
-
-def _finite(value: float) -> float:
-    """JSON has no infinity: -1 says there is none."""
-    return value if math.isfinite(value) else -1.0
 
 
 def _obstacle(message: topics.ObstacleMessage) -> Obstacle:

@@ -6,7 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from swarmctl.agent import Agent, AgentSetup, TickSink
+from swarmctl.agent import Agent, AgentSetup
 from swarmctl.config import Config
 from swarmctl.core.clock import Clock
 from swarmctl.links.autopilot import Autopilot, GeoOrigin
@@ -14,6 +14,7 @@ from swarmctl.links.commands import CommandPort
 from swarmctl.links.mavlink import Codec
 from swarmctl.links.peers import Bus
 from swarmctl.links.transport import Transport
+from swarmctl.reporter import TickSink
 
 OWN_COMPID = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
 

@@ -63,8 +63,9 @@ class SitlParams(Params):
 
     enabled: bool = True
     preset: Literal["thesis", "x500"] = "thesis"
+    attitude_gains: Literal["swarm", "single", "pid_step", "pid_trajectory"] = "swarm"  # of the thesis airframe
     ground_z_m: float = Field(2.0, ge=-1000, le=1000)  # height of the ground below the shared origin, NED z
-    start: Literal["ground", "air"] = "ground"
+    start: Literal["ground", "air"] = "ground"  # air: held at the start position, no ground anywhere (thesis)
     mass_scale: float = Field(1.0, ge=0.3, le=1.9)  # true mass over the preset's, unknown to the bridge
     link_latency_ms: float = Field(0.0, ge=0, le=1000)  # lockstep only
     physics_hz: int = Field(250, ge=50, le=1000)
@@ -82,7 +83,7 @@ class TelemetryParams(Params):
     """The one process that owns rerun."""
 
     enabled: bool = True
-    port: int = Field(9876, ge=1, le=65535)  # loopback; the next free one is used when it is taken
+    port: int = Field(9877, ge=1, le=65535)  # loopback, not rerun's own default; the next free one when it is taken
     rate_hz: float = Field(10.0, gt=0, le=50)
 
 

@@ -79,6 +79,7 @@ def sitl_command(config: Config, site: Site, ports: Sequence[int]) -> Command:
     if sitl.start == "ground":
         starts = tuple((x, y, sitl.ground_z_m) for x, y, _ in starts)
     argv = _python("-m", "sitl", "--vehicles", f"{swarm.agents}", "--preset", sitl.preset)
+    argv += ("--attitude-gains", sitl.attitude_gains)
     argv += ("--spawn=" + ";".join(",".join(repr(c) for c in start) for start in starts),)
     argv += (f"--origin={swarm.origin_lat_deg!r},{swarm.origin_lon_deg!r},{swarm.origin_alt_m!r}",)
     argv += ("--remote-ports", ",".join(str(port) for port in ports), "--seed", f"{config.seed}")

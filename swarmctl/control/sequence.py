@@ -1,6 +1,6 @@
 """The mission of one agent, phase by phase: what is asked of the autopilot and which reference is followed.
 
-Pure. Agents agree on the beginning without a leader: each says when it was ready, and all begin one second after the
+Pure. A vehicle that is found in the air is handed back holding in the air. Agents agree on the beginning without a leader: each says when it was ready, and all begin one second after the
 last one. What the operator asks (hold, resume, land, rtl) is applied here too.
 """
 
@@ -94,6 +94,7 @@ class Sequence:
         self._configured = False
         self._yielded = False
         self._ground_z_m = 0.0
+        self._airborne = False
         self._steps: dict[Phase, Callable[[Facts, VehicleState], list[Command]]] = {
             Phase.STANDBY: self._standby,
             Phase.ARM: self._arm,
@@ -187,6 +188,7 @@ class Sequence:
         if not self._configured:
             self._configured = True
             self._ground_z_m = float(state.pos_ned_m[2])
+            self._airborne = state.landed is Landed.IN_AIR
             rates = [
                 Command(Verb.RATE, self._params.state_rate_hz, _ODOMETRY_ID),
                 Command(Verb.RATE, 5.0, _ATTITUDE_TARGET_ID),
@@ -248,7 +250,10 @@ class Sequence:
             return [Command(Verb.EXTERNAL)] if self._may_ask(facts) else []
         if facts.utc_us - self.begin_utc_us >= self._duration_us and not self.held:
             self.outcome = self.outcome or "completed"
-            self._go_home(facts, state)
+            if self._airborne:
+                self._enter(Phase.LAND, facts)
+            else:
+                self._go_home(facts, state)
         return []
 
     def _goto_land(self, facts: Facts, state: VehicleState) -> list[Command]:
@@ -260,6 +265,10 @@ class Sequence:
 
     def _land(self, facts: Facts, state: VehicleState) -> list[Command]:
         self.had_control = False
+        if self._airborne:  # found in the air, handed back in the air
+            if state.mode is FlightMode.HOLD:
+                self._enter(Phase.DONE, facts)
+            return [Command(Verb.HOLD)] if self._may_ask(facts) else []
         if state.landed is Landed.ON_GROUND and not state.armed:
             self._enter(Phase.DONE, facts)
             return []

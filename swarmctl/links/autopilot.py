@@ -12,10 +12,11 @@ from typing import Any
 
 import numpy as np
 import pymap3d
+from pymavlink.dialects.v20 import common as dialect
 
 from swarmctl.core.types import Array, AttitudeSetpoint, FlightMode, Landed, VehicleState
 from swarmctl.links.commands import CommandPort
-from swarmctl.links.mavlink import Codec, dialect, frames
+from swarmctl.links.mavlink import Codec, frames
 from swarmctl.links.transport import Transport
 
 _ATTITUDE_ONLY = 7  # type_mask: body rates ignored; mask 0 would fly rates and attitude against each other

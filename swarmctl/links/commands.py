@@ -13,8 +13,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+from pymavlink.dialects.v20 import common as dialect
+
 from swarmctl.core.types import Command, Verb
-from swarmctl.links.mavlink import Codec, dialect
+from swarmctl.links.mavlink import Codec
 
 _RETRY_US = 500_000
 _TRIES = 4
