@@ -94,12 +94,13 @@ class Lockstep:
         if self._tick_us % self._physics_us:
             raise ValueError(f"sitl.physics_hz: {config.sitl.physics_hz} must be a multiple of agent.rate_hz")
         latency_us = round(config.sitl.link_latency_ms * 1000)
-        pairs = [pipe_pair(self.clock.now_us, latency_us) for _ in range(agents)]
-        self.world = SitlWorld(sitl_params(config), [vehicle for _, vehicle in pairs])
+        self.links = [pipe_pair(self.clock.now_us, latency_us) for _ in range(agents)]  # (agent's, vehicle's) ends
+        self.world = SitlWorld(sitl_params(config), [vehicle for _, vehicle in self.links])
         self.hub = LocalHub(self.clock.now_us, config.seed, round(config.bus.delay_ms * 1000), config.bus.loss_01)
         self.logs = [FlightLog(directory, i, self.clock) for i in range(agents)]
         self._operator = self.hub.attach(topics.OPERATOR)
-        self.agents: list[Agent | None] = [self._agent(i, pairs[i][0]) for i in range(agents)]
+        self.agents: list[Agent | None] = [self._agent(i, self.links[i][0]) for i in range(agents)]
+        self.frozen: set[int] = set()  # agents whose process is stopped: alive on the bus, but not ticking
         self._order = list(order) if order is not None else list(range(agents))
         self._truth: list[NDArray[np.void]] = []
         self._obstacles = obstacles_message(config)
@@ -124,7 +125,7 @@ class Lockstep:
             self._operator.publish(topics.OBSTACLES, topics.encode_message(self._obstacles))
         for i in self._order:
             agent = self.agents[i]
-            if agent is not None:
+            if agent is not None and i not in self.frozen:
                 agent.tick(now_us, 0)
         for _ in range(self._tick_us // self._physics_us):
             self.clock.advance(self._physics_us)

@@ -292,8 +292,10 @@ class Agent:
             0 if self._certified_us is None else now_us - self._certified_us,
             0.0 if state is None else math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s)),
             self._sequence.phase,
+            self._sequence.had_control,
+            self._sequence.yielded,
         )
-        self._judgement = judge(health, self._sequence.had_control, self._setup.params.failsafe)
+        self._judgement = judge(health, self._setup.params.failsafe)
 
     def _flown(self, state: VehicleState | None, thought: Thought) -> Plan | None:
         """The plan whose first input is sent and whose path is shared; None when the autopilot flies."""
@@ -340,6 +342,7 @@ class Agent:
             self._autopilot.armable,
             self._commands.busy,
             self._judgement.mode,
+            self._mute_peer() is not None,
             self._peer_facts(),
         )
         for command in self._sequence.step(facts):
@@ -390,6 +393,20 @@ class Agent:
             agent: PeerFacts(Phase(status.phase), status.ready_utc_us, agent_name(agent) in alive)
             for agent, status in self._peer_status.items()
         }
+
+    def _mute_peer(self) -> int | None:
+        """A peer in the air that is silent and not known to be gone: it may be flying on, or the bus is lost to us.
+
+        A peer whose liveliness token has gone while ours is there has died; its path has become a keep-out.
+        """
+        alive = self._bus.alive()
+        connected = agent_name(self._setup.agent) in alive
+        oldest_us = self._clock.utc_us() - round(self._setup.separation.lost_after_s * 1e6)
+        for path in self._paths.latest():
+            silent = path.t0_utc_us < oldest_us and not self._parked(path.agent)
+            if silent and (not connected or agent_name(path.agent) in alive):
+                return path.agent
+        return None
 
     def _fresh(self, now_us: int, state: VehicleState) -> bool:
         return now_us - state.t_us <= self._setup.params.failsafe.state_max_age_s * 1e6

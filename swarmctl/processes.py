@@ -19,9 +19,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import psutil
 
 from swarmctl.config import Config
+from swarmctl.control.mission import MissionReference
 from swarmctl.errors import StartError
 from swarmctl.lifeline import PARENT_ENV
 from swarmctl.links.peers import agent_name
@@ -92,11 +94,24 @@ def viewer_command(config: Config, site: Site, port: int, view: bool) -> Command
     """The process that owns rerun."""
     argv = _python("-m", "swarmctl.telemetry.viewer", "--run", site.run, "--bus", site.endpoint)
     argv += ("--agents", f"{config.swarm.agents}", "--run-dir", f"{site.directory}", "--port", f"{port}")
+    center, extent_m = _stage(config)
+    argv += ("--look-at", *(repr(c) for c in center), "--extent", f"{extent_m!r}")
     argv += ("--rate-hz", f"{config.telemetry.rate_hz!r}", "--separation", f"{config.separation.radius_m!r}")
     argv += ("--limit", f"{config.limits.min_separation_m!r}")
     obstacles = [obstacle.model_dump() for obstacle in config.obstacles]
     argv += ("--obstacles-json", json.dumps(obstacles), "--die-with-parent")
     return Command(VIEWER, argv + (("--view",) if view else ()))
+
+
+def _stage(config: Config) -> tuple[tuple[float, ...], float]:
+    """Middle (3,) and half size [m] of the box that holds every start and the whole reference, for the camera."""
+    starts = np.array(config.starts_ned_m())
+    times_s = np.linspace(0.0, config.mission.duration_s, 200)
+    flown = [MissionReference(config.mission, starts, agent).sample(times_s)[0] for agent in range(len(starts))]
+    points = np.concatenate([starts, *flown])
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle = 0.5 * (low + high)
+    return tuple(float(c) for c in middle), max(2.0, float(np.max(high - low)) / 2 + config.separation.radius_m)
 
 
 def _python(*arguments: str) -> tuple[str, ...]:

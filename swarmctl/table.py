@@ -13,6 +13,7 @@ from typing import Protocol, TextIO
 from rich.console import Console
 from rich.live import Live
 from rich.table import Table
+from rich.text import Text
 
 from swarmctl.core.types import Mode, Phase
 from swarmctl.links.peers import agent_name
@@ -121,7 +122,7 @@ def status_table(agents: Sequence[AgentView]) -> Table:
     """One row per agent."""
     table = Table(*_COLUMNS)
     for view in agents:
-        table.add_row(*status_cells(view))
+        table.add_row(*map(Text, status_cells(view)))  # not markup: agents may say "[...]"
     return table
 
 

@@ -34,55 +34,54 @@ class Judgement:
 _FLYING = (Phase.GOTO_START, Phase.READY, Phase.TRACK, Phase.GOTO_LAND)
 
 
-def judge(health: Health, had_control: bool, params: FailsafeParams) -> Judgement:
-    """Mode of this tick.
-
-    Args:
-        health: this tick's facts.
-        had_control: the autopilot has followed our setpoints in this flight and we have not given it back.
-        params: limits.
-    """
+def judge(health: Health, params: FailsafeParams) -> Judgement:
+    """Mode of this tick: that of the first row of the table that applies to `health`."""
     for applies, mode, reason in _TABLE:
-        if applies(health, had_control, params):
+        if applies(health, params):
             return Judgement(mode, reason)
     return Judgement(Mode.FOLLOW, "plan certified")
 
 
-def _blind(h: Health, _: bool, p: FailsafeParams) -> bool:
+def _blind(h: Health, p: FailsafeParams) -> bool:
     return h.state_age_us < 0 or h.state_age_us > p.state_max_age_s * 1e6
 
 
-def _not_ours(h: Health, _: bool, __: FailsafeParams) -> bool:
+def _not_ours(h: Health, _: FailsafeParams) -> bool:
     return h.phase not in _FLYING
 
 
-def _taken(h: Health, had_control: bool, _: FailsafeParams) -> bool:
-    return had_control and (h.mode is not FlightMode.EXTERNAL or not h.armed or h.autopilot_failsafe)
+def _yielded(h: Health, _: FailsafeParams) -> bool:
+    return h.yielded
 
 
-def _young(h: Health, _: bool, p: FailsafeParams) -> bool:
+def _taken(h: Health, _: FailsafeParams) -> bool:
+    return h.had_control and (h.mode is not FlightMode.EXTERNAL or not h.armed or h.autopilot_failsafe)
+
+
+def _young(h: Health, p: FailsafeParams) -> bool:
     return h.plan_status is not PlanStatus.OK and 0 <= h.last_good_plan_age_us <= p.replay_s * 1e6
 
 
-def _moving(h: Health, _: bool, p: FailsafeParams) -> bool:
+def _moving(h: Health, p: FailsafeParams) -> bool:
     return h.plan_status is not PlanStatus.OK and h.speed_m_s > p.rest_speed_m_s
 
 
-def _stuck(h: Health, _: bool, p: FailsafeParams) -> bool:
+def _stuck(h: Health, p: FailsafeParams) -> bool:
     return h.plan_status is not PlanStatus.OK and h.planless_us > (p.replay_s + p.hold_s) * 1e6
 
 
-def _planless(h: Health, _: bool, __: FailsafeParams) -> bool:
+def _planless(h: Health, _: FailsafeParams) -> bool:
     return h.plan_status is not PlanStatus.OK
 
 
-def _waiting(h: Health, had_control: bool, _: FailsafeParams) -> bool:
-    return not had_control
+def _waiting(h: Health, _: FailsafeParams) -> bool:
+    return not h.had_control
 
 
-_Row = tuple[Callable[[Health, bool, FailsafeParams], bool], Mode, str]
+_Row = tuple[Callable[[Health, FailsafeParams], bool], Mode, str]
 _TABLE: tuple[_Row, ...] = (
     (_blind, Mode.BLIND, "own state too old"),
+    (_yielded, Mode.YIELD, "pilot or autopilot flies until an operator resumes"),
     (_not_ours, Mode.IDLE, "autopilot flies"),
     (_taken, Mode.YIELD, "pilot or autopilot took over"),
     (_young, Mode.REPLAY, "no new plan: last certified one"),

@@ -20,6 +20,7 @@ from swarmctl.core.params import Params
 from swarmctl.core.types import Array
 
 INFINITY = 1e20  # what OSQP takes for no bound
+_RHO_AGAIN = 0.1  # solves most problems that crawl with the usual one, and is slower on the rest
 _SOLVED = osqp.SolverStatus.OSQP_SOLVED
 _UNFINISHED = (osqp.SolverStatus.OSQP_SOLVED_INACCURATE, osqp.SolverStatus.OSQP_MAX_ITER_REACHED)
 
@@ -27,8 +28,9 @@ _UNFINISHED = (osqp.SolverStatus.OSQP_SOLVED_INACCURATE, osqp.SolverStatus.OSQP_
 class QpParams(Params):
     """OSQP settings; tools measure them on recorded problems."""
 
-    eps: float = Field(2e-3, gt=0, le=0.1)  # absolute and relative; variables and rows are scaled to about 1
-    max_iterations: int = Field(1500, ge=10, le=100000)
+    eps: float = Field(3e-3, gt=0, le=0.1)  # absolute; variables and rows are scaled to about 1
+    eps_relative: float = Field(3e-4, ge=0, le=0.1)  # small: bounds far from active must not loosen the others
+    max_iterations: int = Field(2500, ge=10, le=100000)
     polish: bool = True  # one more linear solve on the active set: exact for a correct guess
     rho: float = Field(0.01, gt=0, le=1e6)
     adaptive_rho_interval: int = Field(50, ge=1, le=10000)  # iterations, never seconds
@@ -71,13 +73,16 @@ class OsqpSolver:
 
     def solve(self, p_values: Array, q: Array, a_values: Array, lower: Array, upper: Array) -> QpSolution:
         if self._solver is None:
-            return self._cold(p_values, q, a_values, lower, upper)
+            return self._cold(p_values, q, a_values, lower, upper, self._params.rho)
         self._solver.update(Px=p_values, q=q, Ax=a_values, l=lower, u=upper)
         solution = self._run()
-        # one "infeasible" from a warm start is not trusted (false ones are known): once more from scratch
-        return solution if solution.x is not None else self._cold(p_values, q, a_values, lower, upper)
+        if solution.exact:
+            return solution
+        # neither "infeasible" (false ones are known) nor a crawl from a warm start is trusted: once more from scratch
+        again = self._cold(p_values, q, a_values, lower, upper, _RHO_AGAIN)
+        return again if again.exact or solution.x is None else solution
 
-    def _cold(self, p_values: Array, q: Array, a_values: Array, lower: Array, upper: Array) -> QpSolution:
+    def _cold(self, p_values: Array, q: Array, a_values: Array, lower: Array, upper: Array, rho: float) -> QpSolution:
         p, a, params = self._p.copy(), self._a.copy(), self._params
         p.data, a.data = p_values.copy(), a_values.copy()
         self._solver = osqp.OSQP()
@@ -89,10 +94,10 @@ class OsqpSolver:
             upper,
             verbose=False,
             eps_abs=params.eps,
-            eps_rel=params.eps,
+            eps_rel=params.eps_relative,
             max_iter=params.max_iterations,
             polishing=params.polish,
-            rho=params.rho,
+            rho=rho,
             adaptive_rho=True,
             adaptive_rho_interval=params.adaptive_rho_interval,
             check_termination=params.check_every,

@@ -1,7 +1,8 @@
 """The mission of one agent, phase by phase: what is asked of the autopilot and which reference is followed.
 
-Pure. A vehicle that is found in the air is handed back holding in the air. Agents agree on the beginning without a leader: each says when it was ready, and all begin one second after the
-last one. What the operator asks (hold, resume, land, rtl) is applied here too.
+Pure. Agents agree on the beginning without a leader: each says when it was ready, and all begin one second after the
+last one. What the operator asks (hold, resume, land, rtl) is applied here too. A vehicle that was found in the air is
+handed back in the air, holding.
 """
 
 from __future__ import annotations
@@ -55,6 +56,7 @@ class Facts:
     armable: bool
     busy: bool  # a command is being executed
     mode: Mode  # last judgement
+    mute: bool  # a peer that may well be flying has not been heard for too long
     peers: Mapping[int, PeerFacts]
 
 
@@ -86,13 +88,14 @@ class Sequence:
         self.begin_utc_us: int | None = None  # mission time 0
         self.outcome = ""
         self.had_control = False
-        self.held = False
+        self.held = False  # by the operator
+        self.waiting = False  # for mute peers
         self._glide: tuple[Glide, int] | None = None  # and when it began
         self._entered_us = 0
         self._born_us: int | None = None
         self._asked_us = -_ASK_EVERY_US
         self._configured = False
-        self._yielded = False
+        self.yielded = False
         self._ground_z_m = 0.0
         self._airborne = False
         self._steps: dict[Phase, Callable[[Facts, VehicleState], list[Command]]] = {
@@ -118,15 +121,16 @@ class Sequence:
             return self._connect(facts)
         if self.phase is Phase.CONNECT:
             self._enter(Phase.STANDBY, facts)
-        if facts.mode is Mode.YIELD and not self._yielded:
-            self._yielded, self.had_control = True, False
+        if facts.mode is Mode.YIELD and not self.yielded:
+            self.yielded, self.had_control = True, False
             self.outcome = "pilot or autopilot took over"
-        if self._yielded:
+        if self.yielded:
             if not state.armed and state.landed is Landed.ON_GROUND:
                 self._enter(Phase.DONE, facts)
             return []
         if facts.mode is Mode.LAND and self.phase < Phase.LAND:
             self._give_up("no plan for too long", facts, state)
+        self._wait_for_mute_peers(facts, state)
         if state.mode is FlightMode.EXTERNAL and Phase.GOTO_START <= self.phase < Phase.LAND:
             self._take_control(facts, state)
         patience_us = self._params.start_timeout_s * 1e6
@@ -137,7 +141,7 @@ class Sequence:
 
     def reference(self, utc_us: int, now_us: int, offsets_s: Array) -> tuple[Array, Array]:
         """Where to be, (K, 3) and (K, 3), at `offsets_s` (K,) from now."""
-        if self.phase is Phase.TRACK and not self.held and self.begin_utc_us is not None:
+        if self.phase is Phase.TRACK and not (self.held or self.waiting) and self.begin_utc_us is not None:
             return self._reference.sample((utc_us - self.begin_utc_us) * 1e-6 + offsets_s)
         if self._glide is not None:
             glide, began_us = self._glide
@@ -156,25 +160,40 @@ class Sequence:
             return
         if verb == "hold" and self.phase is Phase.TRACK:
             self.held = True
-            self._glide = (brake_to_rest(state.pos_ned_m, state.vel_ned_m_s, self._params.accel_m_s2), now_us)
+            self._glide = (self._stop_glide(state), now_us)
         elif verb == "resume":
             self.held = False
-            if self._yielded:
-                self._yielded, self.outcome = False, ""
+            if self.yielded:
+                self.yielded, self.outcome = False, ""
         elif verb in ("land", "rtl"):
             self._stop(verb, now_us, state)
 
     def _stop(self, verb: str, now_us: int, state: VehicleState) -> None:
         self.outcome = self.outcome or OPERATOR_STOP
-        if self.phase < Phase.GOTO_START or self._yielded:
+        if self.phase < Phase.GOTO_START or self.yielded:
             on_ground = state.landed is Landed.ON_GROUND
             self.phase = Phase.DONE if on_ground and not state.armed else Phase.LAND
         elif self.phase < Phase.GOTO_LAND:
             self.phase = Phase.GOTO_LAND
-            accel = self._params.accel_m_s2
-            glide = brake_to_rest(state.pos_ned_m, state.vel_ned_m_s, accel) if verb == "land" else self._home(state)
+            glide = self._stop_glide(state) if verb == "land" else self._home(state)
             self._glide = (glide, now_us)
         self._entered_us = now_us
+
+    def _wait_for_mute_peers(self, facts: Facts, state: VehicleState) -> None:
+        """Everybody who loses the bus comes to rest: then what peers assume of each other (braking) holds."""
+        flying = self.had_control and Phase.GOTO_START <= self.phase <= Phase.GOTO_LAND
+        if facts.mute and flying and not self.waiting:
+            self.waiting = True
+            self._glide = (self._stop_glide(state), facts.now_us)
+        elif self.waiting and not facts.mute:
+            self.waiting = False
+            if self.phase in (Phase.GOTO_START, Phase.GOTO_LAND):
+                self._glide = (self._home(state), facts.now_us)
+            elif self.held:
+                self._glide = (self._stop_glide(state), facts.now_us)
+
+    def _stop_glide(self, state: VehicleState) -> Glide:
+        return brake_to_rest(state.pos_ned_m, state.vel_ned_m_s, self._params.accel_m_s2)
 
     def _connect(self, facts: Facts) -> list[Command]:
         if not facts.heard or not self._may_ask(facts):
@@ -227,7 +246,7 @@ class Sequence:
             if self._glide is None:
                 self._glide = (Glide(state.pos_ned_m, np.zeros(3), state.pos_ned_m, 1.0), facts.now_us)
             return [Command(Verb.EXTERNAL)] if self._may_ask(facts) else []
-        if self._arrived(state, self._start_ned_m):
+        if self._arrived(state, self._start_ned_m) and not self.waiting:
             self.ready_utc_us = facts.utc_us
             self._enter(Phase.READY, facts)
         return []
@@ -248,7 +267,7 @@ class Sequence:
         assert self.begin_utc_us is not None
         if not self.had_control:
             return [Command(Verb.EXTERNAL)] if self._may_ask(facts) else []
-        if facts.utc_us - self.begin_utc_us >= self._duration_us and not self.held:
+        if facts.utc_us - self.begin_utc_us >= self._duration_us and not (self.held or self.waiting):
             self.outcome = self.outcome or "completed"
             if self._airborne:
                 self._enter(Phase.LAND, facts)
@@ -259,7 +278,7 @@ class Sequence:
     def _goto_land(self, facts: Facts, state: VehicleState) -> list[Command]:
         target = self._glide[0].to_ned_m if self._glide else state.pos_ned_m
         waited_us = facts.now_us - self._entered_us
-        if self._arrived(state, target) or waited_us > self._params.land_timeout_s * 1e6:
+        if (self._arrived(state, target) and not self.waiting) or waited_us > self._params.land_timeout_s * 1e6:
             self._enter(Phase.LAND, facts)
         return []
 

@@ -207,6 +207,8 @@ class Health:
     planless_us: int  # since a plan was last certified
     speed_m_s: float
     phase: Phase
+    had_control: bool  # the autopilot has followed our setpoints and we have not given it back
+    yielded: bool  # somebody took over; stays until an operator resumes
 
 
 @dataclass(frozen=True, slots=True)

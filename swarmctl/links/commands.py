@@ -135,7 +135,8 @@ class CodecCommands:
             if asked is not None and asked.command == message.command:
                 self._finish(message.result == 0, f"result {message.result}")
         elif kind == "PARAM_VALUE" and current.name and message.param_id == current.name:
-            self._finish(message.param_value == self._wire_value(current) or current.verb is Verb.PARAM_INT, "set")
+            told, wanted = (struct.pack("<f", v) for v in (message.param_value, self._wire_value(current)))
+            self._finish(told == wanted, "set" if told == wanted else f"stays at {message.param_value}")
         elif kind == "PARAM_ERROR" and current.name and message.param_id == current.name:
             self._finish(False, f"parameter error {message.error}")
 

@@ -5,20 +5,16 @@ Rings drop the oldest sample when the viewer is slow, so neither the bus nor an 
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import zenoh
 from numpy.typing import NDArray
 
 from swarmctl.core.records import unpack_tick
 from swarmctl.core.types import Array
-from swarmctl.telemetry.obstacles import MovingObstacle, read_obstacles
-
-_RING = 256  # 5 s of ticks
-_CONNECT_MS = 10_000
+from swarmctl.links import topics
+from swarmctl.links.peers import Bus, agent_name
+from swarmctl.telemetry.obstacles import MovingObstacle
 
 
 class Batch(NamedTuple):
@@ -30,38 +26,12 @@ class Batch(NamedTuple):
     plan_ned_m: Array  # (M, 3) of the newest row, empty when it had none
 
 
-def open_session(endpoint: str) -> Any:
-    """A client session on the launcher's router; gives up after 10 s.
-
-    Raises:
-        zenoh.ZError: no router answers there.
-    """
-    settings = {
-        "mode": "client",
-        "connect/endpoints": [endpoint],
-        "connect/timeout_ms": _CONNECT_MS,
-        "connect/retry": {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 2},
-        "scouting/multicast/enabled": False,
-        "scouting/gossip/enabled": False,
-        "transport/link/tx/lease": 2000,
-        "transport/unicast/open_timeout": 2000,
-        "transport/link/rx/max_message_size": 1 << 20,
-    }
-    config = zenoh.Config()
-    for key, value in settings.items():
-        config.insert_json5(key, json.dumps(value))
-    return zenoh.open(config)
-
-
 class Feed:
-    """Subscriptions of one run."""
+    """What a run says; `bus` hears `listens_to(agents)`."""
 
-    def __init__(self, session: Any, run: str, agents: int) -> None:
-        def subscribe(sender: object, topic: str, ring: int) -> Any:
-            return session.declare_subscriber(f"swarm/{run}/{sender}/{topic}", zenoh.handlers.RingChannel(ring))
-
-        self._ticks = [subscribe(agent, "tick", _RING) for agent in range(agents)]
-        self._obstacles = subscribe("operator", "obstacles", 1)
+    def __init__(self, bus: Bus, agents: int) -> None:
+        self._bus = bus
+        self._numbers = {agent_name(agent): agent for agent in range(agents)}
         self._version = -1
         self._clocks = [AgentClock() for _ in range(agents)]
         self._epoch_us: int | None = None
@@ -75,47 +45,42 @@ class Feed:
 
     def take(self) -> list[Batch]:
         """Everything that has arrived since the last call."""
-        arrived = {}
-        for agent, subscriber in enumerate(self._ticks):
-            samples = self._drain(subscriber)
-            if samples:
-                arrived[agent] = samples
+        arrived: dict[int, list[tuple[NDArray[np.void], Array]]] = {}
+        for sender, payload in self._bus.receive(topics.TICK):
+            tick = unpack_tick(payload)
+            if tick is None:
+                self.malformed += 1
+            else:
+                self.received += 1
+                arrived.setdefault(self._numbers[sender], []).append(tick)
         if self._epoch_us is None and arrived:
             self._epoch_us = min(int(samples[0][0]["utc_us"][0]) for samples in arrived.values())
         return [batch for agent, samples in arrived.items() for batch in self._batch(agent, samples)]
 
     def take_obstacles(self) -> list[MovingObstacle] | None:
         """The operator's newest list of obstacles; None when there is no newer one."""
-        sample = self._obstacles.try_recv()
-        if sample is None:
-            return None
-        message = _json(sample.payload.to_bytes())
-        obstacles = read_obstacles(message.get("obstacles"))
-        version = message.get("version")
-        if obstacles is None or not isinstance(version, int) or version <= self._version:
-            self.malformed += obstacles is None
-            return None
-        self._version = version
-        return obstacles
-
-    def _drain(self, subscriber: Any) -> list[tuple[NDArray[np.void], Array]]:
-        samples = []
-        for _ in range(2 * _RING):
-            sample = subscriber.try_recv()
-            if sample is None:
-                break
-            tick = unpack_tick(sample.payload.to_bytes())
-            if tick is None:
+        newest: list[MovingObstacle] | None = None
+        for _, payload in self._bus.receive(topics.OBSTACLES):
+            message = topics.decode_obstacles(payload)
+            if message is None:
                 self.malformed += 1
-            else:
-                samples.append(tick)
-        self.received += len(samples)
-        return samples
+            elif message.version > self._version:
+                self._version = message.version
+                newest = [
+                    MovingObstacle(np.array(o.center_ned_m), o.radius_m, o.keep_out_m, np.array(o.vel_ned_m_s))
+                    for o in message.obstacles
+                ]
+        return newest
 
     def _batch(self, agent: int, samples: list[tuple[NDArray[np.void], Array]]) -> list[Batch]:
         rows = np.concatenate([row for row, _ in samples])
         t_us, kept = self._clocks[agent].place(rows, self._epoch_us or 0)
         return [Batch(agent, t_us[kept], rows[kept], samples[-1][1])] if kept.any() else []
+
+
+def listens_to(agents: int) -> dict[topics.Topic, list[str]]:
+    """Topics and senders a viewer of `agents` agents hears."""
+    return {topics.TICK: [agent_name(agent) for agent in range(agents)], topics.OBSTACLES: [topics.OPERATOR]}
 
 
 class AgentClock:
@@ -145,11 +110,3 @@ class AgentClock:
             newer[k] = t_us[k] > self._last_us
             self._last_us = max(self._last_us, int(t_us[k]))
         return t_us, newer
-
-
-def _json(payload: bytes) -> Mapping[str, Any]:
-    try:
-        message = json.loads(payload)
-    except (json.JSONDecodeError, UnicodeDecodeError):
-        return {}
-    return message if isinstance(message, dict) else {}

@@ -81,22 +81,23 @@ def _listed(text: str) -> object:
 
 
 def _run(options: argparse.Namespace, obstacles: list[MovingObstacle], stop: threading.Event) -> int:
-    from swarmctl.telemetry.feed import Feed, open_session
+    from swarmctl.links.bus import ZenohBus
+    from swarmctl.telemetry.feed import Feed, listens_to
     from swarmctl.telemetry.layout import Stage
     from swarmctl.telemetry.scene import Scene
 
-    session = _interruptible(lambda: open_session(options.bus), stop)
-    if session is None:
+    bus = _interruptible(lambda: ZenohBus(options.bus, options.run, "viewer", listens_to(options.agents)), stop)
+    if bus is None:
         return EXIT_OK
     rec, url = _serve(options.run, options.run_dir, options.port)
     limit_m = options.separation if options.limit is None else options.limit
     north_m, east_m, down_m = options.look_at
     scene = Scene(rec, options.agents, options.separation, limit_m, Stage((north_m, east_m, down_m), options.extent))
     scene.begin()
-    feed = Feed(session, options.run, options.agents)
+    feed = Feed(bus, options.agents)
     _announce(options, url)
     Pump(feed, scene, obstacles).run(1.0 / options.rate_hz, stop)
-    _end(rec, session, f"telemetry lost={feed.lost} received={feed.received}")
+    _end(rec, bus, f"telemetry lost={feed.lost} received={feed.received}")
     return EXIT_OK
 
 
@@ -224,7 +225,7 @@ def _announce(options: argparse.Namespace, url: str) -> None:
     print(f"viewer {url}", flush=True)
 
 
-def _end(rec: Any, session: Any, last_line: str) -> None:
+def _end(rec: Any, bus: Any, last_line: str) -> None:
     """Bounded end: a frozen viewer makes flush and disconnect hang."""
     watchdog = threading.Timer(_EXIT_S, os._exit, [EXIT_OK])
     watchdog.daemon = True
@@ -235,7 +236,7 @@ def _end(rec: Any, session: Any, last_line: str) -> None:
     except Exception as error:
         print(f"viewer: flush: {error}", file=sys.stderr, flush=True)
     rec.disconnect()
-    session.close()
+    bus.close()
     watchdog.cancel()
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import shutil
 import signal
 import socket
@@ -150,6 +151,9 @@ def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Callable[..., La
         assert (launched.run_dir / f"agent-{i}.parquet").stat().st_size > 0
         assert (launched.run_dir / f"agent-{i}.tlog").stat().st_size > 0
     assert not list(launched.run_dir.glob("*.part"))
+    received = re.search(r"received=(\d+)", (launched.run_dir / "viewer.log").read_text())
+    assert received
+    assert int(received[1]) > 300, "the viewer saw the ticks"
 
 
 def test_a_killed_agent_fails_the_launch_and_the_others_finish(start: Callable[..., Launched]) -> None:

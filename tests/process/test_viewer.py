@@ -45,7 +45,7 @@ class Swarm:
         self.session = open_session({"mode": "client", "connect/endpoints": [endpoint]})
         self.publishers = [
             self.session.declare_publisher(
-                f"swarm/{RUN}/{agent}/tick",
+                f"swarm/{RUN}/agent-{agent}/tick",
                 congestion_control=zenoh.CongestionControl.DROP,
                 reliability=zenoh.Reliability.BEST_EFFORT,
             )

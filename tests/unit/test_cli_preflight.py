@@ -8,6 +8,7 @@ import socket
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from swarmctl import preflight
 from swarmctl.config import Config, load
@@ -16,7 +17,7 @@ from swarmctl.errors import StartError
 from swarmctl.links.topics import StatusMessage
 from swarmctl.processes import Site, agent_commands, sitl_command, viewer_command
 from swarmctl.summary import summary_lines
-from swarmctl.table import AgentView, PlainLines, open_display, status_cells
+from swarmctl.table import AgentView, PlainLines, open_display, status_cells, status_table
 
 FIRST = 21540  # not PX4's own, so that the tests don't meet a flight
 
@@ -71,7 +72,7 @@ def test_every_problem_at_once_and_nothing_kept(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(importlib.metadata, "version", version)
     monkeypatch.setattr(preflight, "_free_view_port", lambda _: 0)
     with pytest.raises(StartError) as caught:
-        preflight.inspect(load(None))
+        preflight.inspect(load(None, ["telemetry.port=9876"]))
     lines = str(caught.value).splitlines()
     assert len(lines) == 3
     assert "osqp = 0.6.7: too old; pip install 'osqp>=1.1'" in lines[0]
@@ -170,6 +171,13 @@ def test_table_cells() -> None:
     )
     assert status_cells(AgentView(0, status(99, -1.0)))[1:5] == ("99", "FOLLOW", "0.123", "-")
     assert status_cells(AgentView(1))[-1] == "not heard yet"
+
+
+def test_what_an_agent_says_is_shown_as_it_is() -> None:
+    stream = io.StringIO()
+    view = AgentView(0, status(problem="refused [/bold] [red]"))
+    Console(file=stream, width=200).print(status_table([view]))
+    assert "refused [/bold] [red]" in stream.getvalue()
 
 
 def test_a_summary_is_five_lines_even_when_almost_empty() -> None:

@@ -1,0 +1,120 @@
+"""Flights in lockstep and what is measured on their true states."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from sitl.lockstep import Lockstep
+from swarmctl.config import Config, load
+from swarmctl.core.types import Mode, Phase
+
+ROOT = Path(__file__).parents[2]
+
+
+@dataclass
+class Flight:
+    """A finished flight."""
+
+    lockstep: Lockstep
+
+    @property
+    def config(self) -> Config:
+        return self.lockstep.config
+
+    @property
+    def problems(self) -> list[str]:
+        return self.lockstep.problems()
+
+    @property
+    def t_s(self) -> NDArray[np.float64]:
+        return np.asarray(self._truth["t_us"][:, 0] * 1e-6)
+
+    @property
+    def pos_ned_m(self) -> NDArray[np.float64]:
+        """(T, N, 3), true."""
+        return np.asarray(self._truth["pos_ned_m"])
+
+    @property
+    def _truth(self) -> Any:
+        return self.lockstep.truth.reshape(-1, self.config.swarm.agents)
+
+    def ticks(self, agent: int) -> Any:
+        return self.lockstep.logs[agent].ticks
+
+    def tracked(self, agent: int) -> tuple[Any, NDArray[np.float64]]:
+        """Ticks of the mission proper, and true position minus reference (K, 3) at each."""
+        ticks = self.ticks(agent)
+        ticks = ticks[np.isfinite(ticks["mission_t_s"])]
+        true = [np.interp(ticks["t_us"] * 1e-6, self.t_s, self.pos_ned_m[:, agent, c]) for c in range(3)]
+        return ticks, np.stack(true, axis=1) - ticks["ref_pos_ned_m"]
+
+    def index_m(self, after_s: float = 0.0) -> float:
+        """Sum over agents of the mean distance to the reference (thesis Table 19)."""
+        total = 0.0
+        for agent in range(self.config.swarm.agents):
+            ticks, error = self.tracked(agent)
+            total += float(np.linalg.norm(error[ticks["mission_t_s"] >= after_s], axis=1).mean())
+        return total
+
+    def separation_m(self, only: int | None = None) -> float:
+        """Smallest true distance of any two vehicles at any time, on the ground and in the air."""
+        pos = self.pos_ned_m
+        pairs = itertools.combinations(range(pos.shape[1]), 2)
+        chosen = [(i, j) for i, j in pairs if only is None or only in (i, j)]
+        return float(min(np.linalg.norm(pos[:, i] - pos[:, j], axis=1).min() for i, j in chosen))
+
+    def modes(self, agent: int, phase: Phase | None = None) -> set[Mode]:
+        ticks = self.ticks(agent)
+        rows = ticks if phase is None else ticks[ticks["phase"] == phase]
+        return {Mode(int(m)) for m in np.unique(rows["mode"])}
+
+    def event_names(self, agent: int) -> list[str]:
+        return [event["event"] for event in self.lockstep.logs[agent].events]
+
+
+Fly = Callable[..., Flight]
+
+
+def fly_now(
+    *overrides: str,
+    config: str | None = None,
+    order: list[int] | None = None,
+    at: dict[float, Callable[[Lockstep], None]] | None = None,
+) -> Flight:
+    """Fly a configuration; `at` maps mission times [s] to what happens then, once."""
+    path = ROOT / "configs" / config if config else None
+    lockstep = Lockstep(load(path, overrides), order=order)
+    due = sorted((at or {}).items())
+
+    def on_step(running: Lockstep) -> None:
+        while due and mission_t_s(running) >= due[0][0]:
+            due.pop(0)[1](running)
+
+    lockstep.run(on_step)
+    assert not due, f"the flight ended before {due[0][0]} s of mission time"
+    return Flight(lockstep)
+
+
+def mission_t_s(lockstep: Lockstep) -> float:
+    """Newest mission time of any agent that is tracking, else -1."""
+    times = [float(log.rows[-1]["mission_t_s"][0]) for log in lockstep.logs if log.rows]
+    return max((t for t in times if np.isfinite(t)), default=-1.0)
+
+
+@pytest.fixture
+def fly() -> Fly:
+    return fly_now
+
+
+@pytest.fixture(scope="session")
+def circle() -> Flight:
+    """The default mission, whole."""
+    return fly_now()

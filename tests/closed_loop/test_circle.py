@@ -1,0 +1,63 @@
+"""The default mission: three agents share a climbing circle (thesis 4.3)."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from swarmctl.core.types import Landed, Mode, Phase, PlanStatus
+from tests.closed_loop.conftest import Flight, Fly
+
+
+def test_whole_mission_is_flown_and_landed(circle: Flight) -> None:
+    assert circle.problems == []
+    last = circle.lockstep.truth[-3:]
+    assert (last["landed"] == Landed.ON_GROUND).all() and not last["armed"].any()
+    for agent in range(3):
+        phases = circle.ticks(agent)["phase"]
+        assert np.all(np.diff(phases.astype(int)) >= 0), "phases only move forward"
+        assert phases[-1] == Phase.DONE
+
+
+def test_true_separation_is_kept_throughout(circle: Flight) -> None:
+    assert circle.separation_m() >= 0.85
+
+
+def test_tracking_index(circle: Flight) -> None:
+    assert circle.index_m() <= 2.19, "thesis Table 19 at 3 x 0.3 m"
+    assert circle.index_m(after_s=10.0) <= 1.05 * np.sqrt(3) * 0.9, "within 5 % of the least possible"
+
+
+def test_no_plan_fails(circle: Flight) -> None:
+    for agent in range(3):
+        ticks, _ = circle.tracked(agent)
+        assert not np.isin(ticks["plan_status"], (PlanStatus.SOLVER_FAILED, PlanStatus.RESIDUAL)).any()
+        assert circle.modes(agent, Phase.TRACK) == {Mode.FOLLOW}
+
+
+def test_vehicles_come_down_a_metre_apart(circle: Flight) -> None:
+    down = circle.pos_ned_m[-1]
+    starts = np.array(circle.config.starts_ned_m())
+    assert np.linalg.norm((down - starts)[:, :2], axis=1).max() < 0.3
+
+
+def test_control_agents_that_ignore_each_other_collide(fly: Fly) -> None:
+    alone = fly("controller.kind='mpc'", "mission.duration_s=12")
+    assert alone.separation_m() < 0.3
+
+
+def test_a_wrong_mass_costs_no_altitude(fly: Fly) -> None:
+    heavy = fly("sitl.mass_scale=1.25", "swarm.agents=1", "mission.duration_s=15")
+    ticks, error = heavy.tracked(0)
+    assert np.abs(error[ticks["mission_t_s"] > 10, 2]).max() < 0.01
+
+
+def test_control_without_the_observer_a_wrong_mass_does(fly: Fly) -> None:
+    heavy = fly("sitl.mass_scale=1.25", "swarm.agents=1", "mission.duration_s=15", "agent.disturbance.enabled=false")
+    ticks, error = heavy.tracked(0)
+    assert np.abs(error[ticks["mission_t_s"] > 10, 2]).mean() > 0.05
+
+
+def test_without_peers_the_reference_is_met(fly: Fly) -> None:
+    lone = fly("swarm.agents=1", "mission.duration_s=15")
+    ticks, error = lone.tracked(0)
+    assert np.linalg.norm(error[ticks["mission_t_s"] > 10], axis=1).max() < 0.01

@@ -1,0 +1,28 @@
+"""Every file of configs/ is flown, shortened, or validated when it needs vehicles of its own."""
+
+from __future__ import annotations
+
+import pytest
+
+from swarmctl.config import load
+from tests.closed_loop.conftest import ROOT, Fly
+
+FILES = sorted(path.name for path in (ROOT / "configs").glob("*.toml"))
+
+
+def test_the_promised_files_are_there() -> None:
+    promised = {"swap8", "px4_udp", "px4_serial", "ardupilot_udp", "thesis_5_circle", "thesis_6_obstacle"}
+    assert promised <= {name.removesuffix(".toml") for name in FILES}
+    assert {name.split("_")[1] for name in FILES if name.startswith("thesis_")} == set("123456")
+
+
+@pytest.mark.parametrize("name", FILES)
+def test_every_config_flies_or_is_valid(fly: Fly, name: str) -> None:
+    config = load(ROOT / "configs" / name)
+    assert config.name == name.removesuffix(".toml")
+    if not config.sitl.enabled:
+        assert len(config.vehicles) >= config.swarm.agents
+        return
+    flight = fly("mission.duration_s=2", config=name)
+    assert flight.problems == []
+    assert config.swarm.agents == 1 or flight.separation_m() >= 0.85

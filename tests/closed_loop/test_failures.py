@@ -1,0 +1,169 @@
+"""Every row of the failure table that one process can show, each beside a flight with the protection switched off."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import common as dialect
+
+from sitl.lockstep import Lockstep
+from swarmctl.control import mpc
+from swarmctl.control.qp import QpSolution
+from swarmctl.core.types import FlightMode, Landed, Mode, Phase
+from swarmctl.links.mavlink import Codec
+from swarmctl.links.peers import PeerPaths
+from tests.closed_loop.conftest import Fly
+
+MISSION = "mission.duration_s=14"
+
+
+def landed_by_itself(flight_truth: np.ndarray, agent: int, agents: int = 3) -> bool:
+    rows = flight_truth.reshape(-1, agents)[:, agent]
+    return bool(rows["landed"][-1] == Landed.ON_GROUND and not rows["armed"][-1])
+
+
+@pytest.mark.parametrize(("victim", "at_s"), [(0, 5.0), (1, 8.0)])
+def test_a_dead_agent_lands_and_the_others_keep_clear(fly: Fly, victim: int, at_s: float) -> None:
+    flight = fly(MISSION, at={at_s: lambda running: running.kill(victim)})
+    assert landed_by_itself(flight.lockstep.truth, victim)
+    assert flight.separation_m() >= 0.85
+    assert flight.problems == [f"agent {victim} died"], "the others finish"
+
+
+def test_control_a_dead_agent_that_is_forgotten_is_hit(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
+    remember = PeerPaths.latest
+
+    def forget(self: PeerPaths):  # type: ignore[no-untyped-def]
+        paths = remember(self)
+        newest = max((path.t0_utc_us for path in paths), default=0)
+        return tuple(path for path in paths if newest - path.t0_utc_us < 200_000)
+
+    monkeypatch.setattr(PeerPaths, "latest", forget)
+    flight = fly("mission.duration_s=30", at={5.0: lambda running: running.kill(0)})
+    assert flight.separation_m(only=0) < 0.85
+
+
+def test_a_frozen_agent_is_landed_by_its_autopilot_and_never_retakes_control(fly: Fly) -> None:
+    flight = fly(
+        MISSION,
+        at={4.0: lambda running: running.frozen.add(1), 7.0: lambda running: running.frozen.discard(1)},
+    )
+    assert landed_by_itself(flight.lockstep.truth, 1)
+    assert flight.separation_m() >= 0.85
+    ticks = flight.ticks(1)
+    after = ticks[ticks["t_us"] > ticks["t_us"][np.argmax(np.diff(ticks["t_us"]))]]
+    assert Mode.YIELD in set(after["mode"])
+    first = int(np.argmax(after["mode"] == Mode.YIELD))
+    assert np.isnan(after["setpoint_thrust_01"][first:]).all(), "no setpoint after it has yielded"
+    assert flight.problems == ["agent 1: pilot or autopilot took over"]
+
+
+def take_over(running: Lockstep) -> None:
+    """A pilot's ground station switches vehicle 2 to HOLD."""
+    frame = Codec(255, 190).encode(dialect.MAVLink_command_long_message(3, 1, 176, 0, 1.0, 4.0, 3.0, 0, 0, 0, 0))
+    running.links[2][0].send(frame)
+
+
+def test_the_pilot_wins(fly: Fly) -> None:
+    flight = fly(MISSION, at={5.0: take_over, 6.5: lambda running: running.command("land")})
+    ticks = flight.ticks(2)
+    yielded = ticks["mode"] == Mode.YIELD
+    assert yielded.any()
+    first = int(np.argmax(yielded))
+    until_operator = ticks[first : first + 20]
+    assert (until_operator["flight_mode"] == FlightMode.HOLD).all()
+    assert np.isnan(ticks["setpoint_thrust_01"][first:]).all()
+    assert flight.separation_m() >= 0.85
+
+
+def test_no_state_no_setpoints(fly: Fly) -> None:
+    """The vehicle hears us, we don't hear it: setpoints stop within 200 ms + a tick, and it lands by itself."""
+
+    def deafen(running: Lockstep) -> None:
+        running.links[0][1].send = lambda data: None  # type: ignore[method-assign]
+
+    flight = fly(MISSION, "swarm.agents=1", "mission.duration_s=10", at={4.0: deafen})
+    ticks = flight.ticks(0)
+    blind = ticks[(ticks["mode"] == Mode.BLIND) & (ticks["phase"] >= Phase.TRACK)]
+    assert len(blind) and np.isnan(blind["setpoint_thrust_01"]).all()
+    assert blind["state_age_ms"].min() <= 221.0, "setpoints stop within 200 ms and a tick"
+    assert landed_by_itself(flight.lockstep.truth, 0, 1)
+
+
+def break_solver(running: Lockstep, agent: int, lasts_s: float) -> None:
+    """OSQP of one agent returns nothing for a while."""
+    until_s = running.clock.now_us() * 1e-6 + lasts_s
+    flown = running.agents[agent]
+    assert flown is not None
+    solver = flown._controller._mpc._xy._solver  # type: ignore[attr-defined]
+    solve = solver.solve
+
+    def fail(*values: object) -> QpSolution:
+        if running.clock.now_us() * 1e-6 < until_s:
+            return QpSolution(None, False, "broken", 0)
+        answer: QpSolution = solve(*values)
+        return answer
+
+    solver.solve = fail
+
+
+@pytest.mark.parametrize(
+    ("lasts_s", "reached"), [(0.3, Mode.REPLAY), (2.0, Mode.HOLD), (8.0, Mode.LAND)], ids=["replay", "hold", "land"]
+)
+def test_ladder_after_solver_failure(fly: Fly, lasts_s: float, reached: Mode) -> None:
+    flight = fly("mission.duration_s=14", at={5.0: lambda running: break_solver(running, 0, lasts_s)})
+    ladder = [Mode.REPLAY, Mode.BRAKE, Mode.HOLD, Mode.LAND]
+    seen = flight.modes(0)
+    assert [mode for mode in ladder if mode in seen] == ladder[: ladder.index(reached) + 1]
+    assert flight.separation_m() >= 0.85
+    assert all(landed_by_itself(flight.lockstep.truth, agent) for agent in range(3))
+    assert flight.problems == (["agent 0: no plan for too long"] if reached is Mode.LAND else [])
+
+
+def test_a_plan_that_would_come_too_close_is_not_flown(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The QP forgets its half-spaces; the certifier, which shares no code with it, is all that is left."""
+    monkeypatch.setattr(mpc, "half_spaces_xy", lambda *_: None)
+    flight = fly("mission.duration_s=8")
+    certified = flight.separation_m()
+    monkeypatch.setattr(mpc, "certify", lambda *_: 1.0)
+    uncertified = fly("mission.duration_s=8").separation_m()
+    assert uncertified < 0.3 < 0.6 < certified
+
+
+def test_ten_seconds_of_bus_silence(fly: Fly) -> None:
+    def silence(running: Lockstep) -> None:
+        running.hub.carry = lambda *_: None  # type: ignore[method-assign]
+
+    def speak(running: Lockstep) -> None:
+        del running.hub.carry
+
+    flight = fly("mission.duration_s=20", at={5.0: silence, 15.0: speak})
+    assert flight.separation_m() >= 0.80
+
+
+def test_late_and_lost_messages(fly: Fly) -> None:
+    flight = fly("bus.delay_ms=40", "bus.loss_01=0.2", MISSION)
+    assert flight.problems == []
+    assert flight.separation_m() >= 0.85
+
+
+def test_operator_holds_resumes_and_lands(fly: Fly) -> None:
+    speeds: dict[int, float] = {}
+
+    def speed(running: Lockstep) -> None:
+        speeds[len(speeds)] = float(np.linalg.norm(running.logs[0].rows[-1]["vel_ned_m_s"][0]))
+
+    flight = fly(
+        "mission.duration_s=14",
+        at={
+            4.0: lambda running: running.command("hold"),
+            8.0: speed,
+            8.1: lambda running: running.command("resume"),
+            12.0: speed,
+            12.1: lambda running: running.command("land"),
+        },
+    )
+    assert speeds[0] < 0.1 < 1.5 < speeds[1]
+    assert flight.separation_m() >= 0.85
+    assert flight.problems == [f"agent {i}: stopped by the operator" for i in range(3)]
+    assert all(landed_by_itself(flight.lockstep.truth, i) for i in range(3))

@@ -1,0 +1,40 @@
+"""An obstacle on the way that is seen only from close (thesis 4.4)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from tests.closed_loop.conftest import Flight, Fly, fly_now
+
+CONFIG = "thesis_6_obstacle.toml"
+
+
+@pytest.fixture(scope="module")
+def flight() -> Flight:
+    return fly_now(config=CONFIG)
+
+
+def clearance_m(flight: Flight) -> float:
+    center = np.array(flight.config.obstacles[0].center_ned_m)
+    return float(np.linalg.norm(flight.pos_ned_m - center, axis=2).min())
+
+
+def test_everybody_keeps_clear_of_it_and_of_each_other(flight: Flight) -> None:
+    assert flight.problems == []
+    assert clearance_m(flight) >= 1.70
+    assert flight.separation_m() >= 0.85
+
+
+def test_it_is_known_only_within_the_visibility_distance(flight: Flight) -> None:
+    for agent in range(3):
+        ticks = flight.ticks(agent)
+        seen = np.isfinite(ticks["nearest_obstacle_m"])
+        assert seen.any()
+        distance = np.linalg.norm(ticks["pos_ned_m"] - np.array(flight.config.obstacles[0].center_ned_m), axis=1)
+        assert distance[seen].max() < 3.0
+
+
+def test_control_unseen_it_is_hit(fly: Fly) -> None:
+    blind = fly("obstacles.0.visibility_m=0.1", config=CONFIG)
+    assert clearance_m(blind) < 1.0

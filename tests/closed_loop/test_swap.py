@@ -1,0 +1,16 @@
+"""Eight agents change places through one centre."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tests.closed_loop.conftest import Fly
+
+
+def test_eight_agents_swap_without_touching(fly: Fly) -> None:
+    flight = fly(config="swap8.toml")
+    assert flight.problems == []
+    assert flight.separation_m() >= 0.85
+    for agent in range(8):
+        _, error = flight.tracked(agent)
+        assert np.linalg.norm(error[-1]) < 0.1, "everybody arrives"

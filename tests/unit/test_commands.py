@@ -1,0 +1,216 @@
+"""The slow path through the codec: asked again until answered, one at a time, integers bytewise in the float."""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import common as dialect
+
+from swarmctl.core.types import Command, Verb
+from swarmctl.links.autopilot import ARDUCOPTER, PX4
+from swarmctl.links.commands import CodecCommands, CommandResult, long_command
+from swarmctl.links.mavlink import Codec
+
+SECOND = 1_000_000
+
+
+class Bench:
+    """`CodecCommands`, its clock, and what it sends."""
+
+    def __init__(self) -> None:
+        self.out: list[bytes] = []
+        self.port = CodecCommands(self.out.append, Codec(5, 191), 5, PX4.external, PX4.hold)
+        self.now_us = 0
+
+    def run(self, seconds: float) -> list[Any]:
+        """Everything but heartbeats sent within that time, ticked at 50 Hz."""
+        self.out.clear()
+        for _ in range(round(seconds * 50)):
+            self.port.step(self.now_us)
+            self.now_us += 20_000
+        decoded = [dialect.MAVLink(None).decode(bytearray(frame)) for frame in self.out]
+        return [m for m in decoded if m.get_type() != "HEARTBEAT"]
+
+    def hear(self, message: Any) -> list[CommandResult]:
+        codec = Codec(5, 1)
+        frame = codec.encode(message)
+        self.port.frame(frame, codec.decode(frame))
+        return self.port.results()
+
+
+def ack(command: int, result: int = 0) -> Any:
+    return dialect.MAVLink_command_ack_message(command, result)
+
+
+def param_value(name: str, value: float, kind: int = 9) -> Any:
+    return dialect.MAVLink_param_value_message(name.encode(), value, kind, 1, 0)
+
+
+def bytewise(number: int) -> float:
+    value: float = struct.unpack("<f", struct.pack("<i", number))[0]
+    return value
+
+
+@pytest.mark.parametrize(
+    ("command", "number", "params"),
+    [
+        (Command(Verb.ARM), 400, (1.0,)),
+        (Command(Verb.DISARM), 400, (0.0,)),
+        (Command(Verb.EXTERNAL), 176, (1.0, 6.0, 0.0)),
+        (Command(Verb.HOLD), 176, (1.0, 4.0, 3.0)),
+        (Command(Verb.RATE, 50.0, 331), 511, (331.0, 20_000.0)),
+        (Command(Verb.RATE, 0.0, 331), 511, (331.0, -1.0)),  # off
+        (Command(Verb.MESSAGE, number=49), 512, (49.0,)),
+    ],
+)
+def test_what_is_asked_of_px4(command: Command, number: int, params: tuple[float, ...]) -> None:
+    asked = long_command(command, PX4.external, PX4.hold)
+    assert asked is not None
+    assert (asked.command, asked.params) == (number, params)
+
+
+def test_modes_of_arducopter() -> None:
+    external = long_command(Command(Verb.EXTERNAL), ARDUCOPTER.external, ARDUCOPTER.hold)
+    hold = long_command(Command(Verb.HOLD), ARDUCOPTER.external, ARDUCOPTER.hold)
+    assert external is not None
+    assert hold is not None
+    assert (external.params[:2], hold.params[:2]) == ((1.0, 4.0), (1.0, 5.0))
+
+
+@pytest.mark.parametrize("verb", [Verb.TAKEOFF, Verb.LAND])
+def test_takeoff_and_land_happen_where_the_vehicle_is(verb: Verb) -> None:
+    asked = long_command(Command(verb, 3.0), PX4.external, PX4.hold)
+    assert asked is not None
+    assert asked.command == {Verb.TAKEOFF: 22, Verb.LAND: 21}[verb]
+    assert len(asked.params) == 7
+    assert all(math.isnan(p) for p in asked.params[4:])
+
+
+def test_arming_is_never_forced() -> None:
+    for verb in (Verb.ARM, Verb.DISARM):
+        asked = long_command(Command(verb), PX4.external, PX4.hold)
+        assert asked is not None
+        assert 21196.0 not in asked.params
+
+
+def test_asked_four_times_every_half_second_then_no_answer() -> None:
+    bench = Bench()
+    bench.port.request(Command(Verb.ARM))
+    assert bench.port.busy
+    sent = bench.run(0.5)
+    assert [(m.command, m.confirmation, m.target_system, m.target_component) for m in sent] == [(400, 0, 5, 1)]
+    assert [m.confirmation for m in bench.run(1.5)] == [1, 2, 3]
+    assert bench.port.busy
+    assert bench.run(0.5) == []
+    assert bench.port.results() == [CommandResult(Command(Verb.ARM), False, "no answer")]
+    assert not bench.port.busy
+    assert bench.port.results() == []
+
+
+def test_an_acknowledgement_ends_the_asking() -> None:
+    bench = Bench()
+    bench.port.request(Command(Verb.ARM))
+    bench.run(0.1)
+    assert bench.hear(ack(400)) == [CommandResult(Command(Verb.ARM), True, "result 0")]
+    assert bench.run(3.0) == []
+    assert not bench.port.busy
+
+
+@pytest.mark.parametrize("result", [1, 2, 3, 4])
+def test_a_refusal_is_a_result_with_its_code_and_is_not_asked_again(result: int) -> None:
+    bench = Bench()
+    bench.port.request(Command(Verb.ARM))
+    bench.run(0.1)
+    (answer,) = bench.hear(ack(400, result))
+    assert (answer.ok, answer.text) == (False, f"result {result}")
+    assert bench.run(3.0) == []
+
+
+def test_in_progress_is_not_an_answer_yet() -> None:
+    bench = Bench()
+    bench.port.request(Command(Verb.LAND))
+    bench.run(0.1)
+    assert bench.hear(ack(21, 5)) == []
+    assert bench.hear(ack(21, 0))[0].ok
+
+
+def test_the_answer_to_something_else_is_not_ours() -> None:
+    bench = Bench()
+    assert bench.hear(ack(400)) == []
+    bench.port.request(Command(Verb.EXTERNAL))
+    bench.run(0.1)
+    assert bench.hear(ack(400)) == []
+    assert bench.hear(param_value("MIS_TAKEOFF_ALT", 3.0)) == []
+    assert bench.port.busy
+
+
+def test_one_after_the_other() -> None:
+    bench = Bench()
+    bench.port.request(Command(Verb.ARM))
+    bench.port.request(Command(Verb.HOLD))
+    assert [m.command for m in bench.run(0.4)] == [400]
+    bench.hear(ack(400))
+    assert bench.port.busy
+    assert [m.command for m in bench.run(0.4)] == [176]
+
+
+def test_takeoff_height_goes_into_the_parameter_before_the_command() -> None:
+    bench = Bench()
+    bench.port.request(Command(Verb.TAKEOFF, 3.1))
+    (message,) = bench.run(0.2)
+    assert (message.get_type(), message.param_id, message.param_type) == ("PARAM_SET", "MIS_TAKEOFF_ALT", 9)
+    assert message.param_value == struct.unpack("<f", struct.pack("<f", 3.1))[0]
+    (answer,) = bench.hear(param_value("MIS_TAKEOFF_ALT", 3.1))
+    assert answer.ok
+    assert [m.command for m in bench.run(0.2)] == [22]
+
+
+@pytest.mark.parametrize("number", [4, 0, -1, 2**31 - 1, -(2**31)])
+def test_integer_parameters_travel_bytewise(number: int) -> None:
+    bench = Bench()
+    bench.port.request(Command(Verb.PARAM_INT, number=number, name="COM_OBL_RC_ACT"))
+    bench.run(0.02)
+    frame = bench.out[-1]
+    assert frame[7:10] == (23).to_bytes(3, "little")
+    payload = frame[10:-2].ljust(23, b"\x00")
+    assert payload[:4] == struct.pack("<i", number)
+    assert payload[4:6] == b"\x05\x01"
+    assert payload[6:22] == b"COM_OBL_RC_ACT\x00\x00"
+    assert payload[22] == 6  # MAV_PARAM_TYPE_INT32
+    (answer,) = bench.hear(param_value("COM_OBL_RC_ACT", bytewise(number), 6))
+    assert answer.ok
+
+
+def test_an_integer_that_the_vehicle_did_not_take_is_not_set() -> None:
+    bench = Bench()
+    bench.port.request(Command(Verb.PARAM_INT, number=4, name="COM_OBL_RC_ACT"))
+    bench.run(0.1)
+    assert not any(r.ok for r in bench.hear(param_value("COM_OBL_RC_ACT", bytewise(0), 6)))
+
+
+def test_a_float_that_the_vehicle_did_not_take_is_not_set() -> None:
+    bench = Bench()
+    bench.port.request(Command(Verb.PARAM_FLOAT, value=0.5, name="MPC_LAND_SPEED"))
+    bench.run(0.1)
+    assert not any(r.ok for r in bench.hear(param_value("MPC_LAND_SPEED", 0.7)))
+
+
+def test_a_parameter_that_does_not_exist_is_refused_at_once() -> None:
+    bench = Bench()
+    bench.port.request(Command(Verb.PARAM_FLOAT, value=0.5, name="NO_SUCH"))
+    bench.run(0.1)
+    (answer,) = bench.hear(dialect.MAVLink_param_error_message(5, 191, b"NO_SUCH", -1, 1))
+    assert (answer.ok, answer.text) == (False, "parameter error 1")
+
+
+def test_the_companion_beats_once_a_second_whatever_happens() -> None:
+    bench = Bench()
+    bench.port.request(Command(Verb.ARM))
+    bench.run(10.0)
+    beats = [f for f in bench.out if f[7:10] == b"\x00\x00\x00"]
+    assert len(beats) == 10
+    assert beats[0][5:7] == bytes([5, 191])
+    assert struct.unpack("<I5B", beats[0][10:-2]) == (0, 18, 8, 0, 4, 3)  # onboard controller, active

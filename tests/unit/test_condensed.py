@@ -1,0 +1,254 @@
+"""The condensed MPC against solutions it knows nothing of: least squares by simulation, and a dense QP by SLSQP."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy import optimize
+
+from swarmctl.control.condensed import AxesSolution, Axis, CondensedMpc, HalfSpaces, Horizon, Penalties
+from swarmctl.control.qp import QpParams
+from swarmctl.core.types import Array
+
+EXACT = QpParams(eps=1e-6, eps_relative=1e-6, max_iterations=20_000)
+AXIS = Axis(q_pos=1.5, q_vel=0.5, r=0.01, u_min=-0.2, u_max=0.2, du_max=0.05, terminal_pos=False, terminal_vel=False)
+HORIZON = Horizon(control=6, prediction=40, dt_s=0.02, euler=False)
+GAIN = -9.81
+
+
+def mpc(*axes: Axis, horizon: Horizon = HORIZON, slots: int = 0, relax_01: float = 1.0, qp: QpParams = EXACT) -> CondensedMpc:
+    return CondensedMpc(axes, horizon, slots, relax_01, Penalties(), qp)
+
+
+def simulate(
+    pos: float, vel: float, u: Array, gain: float, drift: float, dt_s: float, euler: bool
+) -> tuple[Array, Array]:
+    """Double integrator under held inputs, step by step; nothing of the code's matrices."""
+    positions, velocities = [], []
+    for value in u:
+        accel = gain * float(value) + drift
+        pos += dt_s * vel + (0.0 if euler else 0.5 * dt_s * dt_s * accel)
+        vel += dt_s * accel
+        positions.append(pos)
+        velocities.append(vel)
+    return np.array(positions), np.array(velocities)
+
+
+def held(moves: Array, u_prev: float, steps: int) -> Array:
+    """Inputs of increments: summed, and kept after the last."""
+    padded = np.concatenate([moves, np.zeros(steps - len(moves))])
+    return u_prev + np.cumsum(padded)
+
+
+def solve_one(
+    problem: CondensedMpc, pos: float, vel: float, u_prev: float, ref: float, drift: float = 0.0, gain: float = GAIN
+) -> AxesSolution:
+    steps = problem.horizon.prediction
+    one = np.ones((steps, 1))
+    return problem.solve(
+        np.array([pos]), np.array([vel]), np.array([u_prev]), np.array([gain]), np.array([drift]), ref * one, 0.0 * one
+    )
+
+
+@pytest.mark.parametrize("euler", [False, True])
+def test_prediction_is_the_motion_the_inputs_cause(euler: bool) -> None:
+    problem = mpc(AXIS, horizon=replace(HORIZON, euler=euler))
+    solution = solve_one(problem, 0.3, -0.4, 0.02, 1.0, drift=0.5)
+    pos, vel = simulate(0.3, -0.4, solution.u[:, 0], GAIN, 0.5, 0.02, euler)
+    np.testing.assert_allclose(solution.pos_m[:, 0], pos, atol=1e-12)
+    np.testing.assert_allclose(solution.vel_m_s[:, 0], vel, atol=1e-12)
+    assert (solution.u[6:, 0] == solution.u[5, 0]).all()  # nothing moves after the control horizon
+
+
+@pytest.mark.parametrize("euler", [False, True])
+def test_far_from_all_bounds_it_is_the_least_squares_solution(euler: bool) -> None:
+    wide = replace(AXIS, u_min=-10.0, u_max=10.0, du_max=5.0, r=0.3)
+    problem = mpc(wide, horizon=replace(HORIZON, euler=euler))
+    pos, vel, u_prev, ref, drift = 0.2, -0.1, 0.01, 0.35, 0.4
+
+    def residuals(moves: Array) -> Array:
+        p, v = simulate(pos, vel, held(moves, u_prev, 40), GAIN, drift, 0.02, euler)
+        return np.concatenate([math.sqrt(1.5) * (p - ref), math.sqrt(0.5) * v, math.sqrt(0.3) * moves])
+
+    base = residuals(np.zeros(6))
+    jacobian = np.stack([residuals(unit) - base for unit in np.eye(6)], axis=1)
+    best = np.linalg.lstsq(jacobian, -base, rcond=None)[0]
+    solution = solve_one(problem, pos, vel, u_prev, ref, drift)
+    np.testing.assert_allclose(solution.u[:, 0], held(best, u_prev, 40), atol=2e-5)
+    assert (solution.slack_m, solution.terminal_gap_m) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("ref", [100.0, -100.0])
+def test_bounds_on_increments_and_inputs_hold(ref: float) -> None:
+    solution = solve_one(mpc(AXIS, qp=QpParams()), 0.0, 0.0, 0.0, ref)
+    u = solution.u[:, 0]
+    assert np.abs(np.diff(u, prepend=0.0)).max() <= 0.05 + 1e-12
+    assert np.abs(u).max() <= 0.2 + 1e-3
+    # far away the quickest way is full increments to the bound: gain is negative, so north is u < 0
+    np.testing.assert_allclose(u[:4], -np.sign(ref) * np.array([0.05, 0.1, 0.15, 0.2]), atol=2e-3)
+
+
+def test_an_input_outside_its_bounds_comes_back_at_once() -> None:
+    solution = solve_one(mpc(AXIS), 0.0, 0.0, 0.9, 0.0)
+    assert np.abs(solution.u).max() <= 0.2 + 1e-6
+
+
+# -- against a dense solver -------------------------------------------------------------------------------------------
+
+
+def dense(
+    problem: CondensedMpc, pos: Array, vel: Array, u_prev: Array, ref: Array, spaces: HalfSpaces | None, rows: Array
+) -> tuple[Array, Array, Array]:
+    """Hard-constrained optimum by SLSQP on simulated motion: inputs, positions, velocities (Hp, 2)."""
+    horizon, axes = problem.horizon, problem.axes
+    hc, hp = horizon.control, horizon.prediction
+
+    def motion(moves: Array) -> tuple[Array, Array, Array]:
+        columns = []
+        for i, part in enumerate(moves.reshape(len(axes), hc)):
+            u = held(part, float(u_prev[i]), hp)
+            columns.append((u, *simulate(float(pos[i]), float(vel[i]), u, GAIN, 0.0, horizon.dt_s, horizon.euler)))
+        return tuple(np.stack(c, axis=1) for c in zip(*columns, strict=True))  # type: ignore[return-value]
+
+    def cost(moves: Array) -> float:
+        _, p, v = motion(moves)
+        total = 0.0
+        for i, axis in enumerate(axes):
+            total += axis.q_pos * float(np.sum((p[:, i] - ref[i]) ** 2)) + axis.q_vel * float(np.sum(v[:, i] ** 2))
+            total += axis.r * float(np.sum(moves.reshape(len(axes), hc)[i] ** 2))
+        return total
+
+    def inside(moves: Array) -> Array:
+        u, p, v = motion(moves)
+        parts = [(0.2 - u[:hc]).ravel(), (0.2 + u[:hc]).ravel()]
+        if spaces is not None:
+            for s in range(len(spaces.normal)):
+                gap = np.einsum("kc,kc->k", spaces.normal[s], p) - spaces.offset_m[s]
+                parts.append(gap[rows])
+                stopped = p[-1] + spaces.stop_s[s] * v[-1]
+                parts.append(np.array([spaces.normal[s, -1] @ stopped - spaces.stop_offset_m[s]]))
+        finite = np.concatenate(parts)
+        return finite[np.isfinite(finite)]
+
+    found = optimize.minimize(
+        cost,
+        np.zeros(len(axes) * hc),
+        method="SLSQP",
+        bounds=[(-a.du_max, a.du_max) for a in axes for _ in range(hc)],
+        constraints=[{"type": "ineq", "fun": inside}],
+        options={"maxiter": 300, "ftol": 1e-12},
+    )
+    assert found.success, found.message
+    return motion(found.x)
+
+
+def wall(normal: tuple[float, float], offset_m: float, steps: int, stop_s: float = 0.0) -> HalfSpaces:
+    unit = np.array(normal) / math.hypot(*normal)
+    return HalfSpaces(
+        np.tile(unit, (1, steps, 1)), np.full((1, steps), offset_m), np.array([stop_s]), np.array([offset_m])
+    )
+
+
+@pytest.mark.parametrize("euler", [False, True])
+@pytest.mark.parametrize(
+    ("normal", "offset_m", "stop_s"),
+    [
+        ((-1.0, 0.0), -0.08, 0.0),  # stay south of 0.08 m while the reference is 0.5 m north
+        ((-1.0, -1.0), -0.10, 0.0),  # oblique: slides along
+        ((-1.0, 0.0), -0.20, 0.3),  # the stopping row decides
+        ((0.0, 1.0), -5.0, 0.0),  # never active
+    ],
+)
+def test_half_spaces_against_a_dense_solver(
+    euler: bool, normal: tuple[float, float], offset_m: float, stop_s: float
+) -> None:
+    horizon = Horizon(control=5, prediction=25, dt_s=0.02, euler=euler)
+    problem = mpc(AXIS, replace(AXIS, q_pos=1.0), horizon=horizon, slots=2)
+    pos, vel, u_prev, ref = np.array([0.0, 0.0]), np.array([0.2, 0.1]), np.array([0.01, -0.02]), np.array([0.5, 0.3])
+    spaces = wall(normal, offset_m, 25, stop_s)
+    ours = problem.solve(
+        pos, vel, u_prev, np.full(2, GAIN), np.zeros(2), np.tile(ref, (25, 1)), np.zeros((25, 2)), spaces
+    )
+    u, p, v = dense(problem, pos, vel, u_prev, ref, spaces, problem._checked)
+    np.testing.assert_allclose(ours.pos_m, p, atol=5e-4)
+    np.testing.assert_allclose(ours.u, u, atol=3e-3)
+    assert ours.slack_m < 1e-3
+    assert ours.residual_m < 1e-3
+    unit = spaces.normal[0, 0]
+    assert ((ours.pos_m @ unit)[problem._checked] >= offset_m - 1e-3).all()
+    assert unit @ (ours.pos_m[-1] + stop_s * ours.vel_m_s[-1]) >= offset_m - 1e-3
+    free = problem.solve(pos, vel, u_prev, np.full(2, GAIN), np.zeros(2), np.tile(ref, (25, 1)), np.zeros((25, 2)))
+    active = np.abs(free.pos_m - ours.pos_m).max() > 0.01
+    assert active == (offset_m > -1.0)  # the constraint mattered, and left no trace in the next solve
+
+
+def test_rows_are_at_the_end_of_the_horizon_and_none_before_it_can_be_influenced() -> None:
+    problem = mpc(AXIS, AXIS, slots=1)
+    assert problem._checked[-1] == 39
+    assert problem._checked[0] >= 6
+    assert np.diff(problem._checked).max() * HORIZON.dt_s <= 0.081  # between samples the certificate looks
+
+
+def test_rows_that_cannot_be_met_give_slack_and_not_failure() -> None:
+    problem = mpc(AXIS, AXIS, slots=1, qp=QpParams())
+    still, origin = np.zeros((40, 2)), np.zeros(2)
+    spaces = wall((1.0, 0.0), 2.0, 40)  # 2 m north at once
+    solution = problem.solve(origin, origin, origin, np.full(2, GAIN), origin, still, still, spaces)
+    assert solution.solved
+    assert solution.slack_m > 1.0
+    assert solution.residual_m < 0.02
+    assert solution.u[5, 0] < -0.19  # with all it has to the north
+
+
+def test_relaxed_rows_ask_for_no_more_than_can_be_reached() -> None:
+    problem = mpc(AXIS, AXIS, slots=1, relax_01=0.9, qp=QpParams())
+    still, origin = np.zeros((40, 2)), np.zeros(2)
+    spaces = wall((1.0, 0.0), 2.0, 40)
+    solution = problem.solve(origin, origin, origin, np.full(2, GAIN), origin, still, still, spaces)
+    assert solution.slack_m < 0.02
+    reach, _ = simulate(0.0, 0.0, np.clip(-0.05 * np.arange(1, 41), -0.2, None), GAIN, 0.0, 0.02, False)
+    assert solution.pos_m[-1, 0] >= 0.9 * reach[-1] - 0.02
+    assert (solution.pos_m[problem._checked, 0] >= 0.9 * reach[problem._checked] - 0.02).all()
+
+
+# -- terminal conditions ----------------------------------------------------------------------------------------------
+
+
+def test_a_terminal_condition_that_can_be_met_is_met() -> None:
+    axis = replace(AXIS, q_pos=0.01, u_min=-1.0, u_max=1.0, du_max=0.3, terminal_pos=True, terminal_vel=True)
+    solution = solve_one(mpc(axis), 0.0, 0.0, 0.0, 0.4)
+    assert solution.pos_m[-1, 0] == pytest.approx(0.4, abs=2e-3)
+    assert solution.vel_m_s[-1, 0] == pytest.approx(0.0, abs=5e-3)
+    assert solution.terminal_gap_m < 2e-3
+    without = solve_one(mpc(replace(axis, terminal_pos=False, terminal_vel=False)), 0.0, 0.0, 0.0, 0.4)
+    assert abs(without.pos_m[-1, 0] - 0.4) > 0.02
+
+
+def test_one_that_cannot_be_met_is_softened_and_reported() -> None:
+    # the thesis' own example: half a metre in 0.4 s; full increments reach what is simulated here
+    horizon = Horizon(control=6, prediction=20, dt_s=0.02, euler=True)
+    solution = solve_one(mpc(replace(AXIS, terminal_pos=True), horizon=horizon), 0.0, 0.0, 0.0, 0.5)
+    best, _ = simulate(0.0, 0.0, np.clip(-0.05 * np.arange(1, 21), -0.2, None), GAIN, 0.0, 0.02, True)
+    assert solution.solved
+    assert solution.terminal_gap_m == pytest.approx(0.5 - best[-1], abs=2e-3)
+    np.testing.assert_allclose(solution.pos_m[:, 0], best, atol=2e-3)
+
+
+def test_nonsense_is_not_solved_and_does_not_poison_the_next_problem() -> None:
+    problem = mpc(AXIS)
+    expected = solve_one(mpc(AXIS), 0.0, 0.0, 0.0, 0.3)
+    assert not solve_one(problem, math.nan, 0.0, 0.0, 0.3).solved
+    after = solve_one(problem, 0.0, 0.0, 0.0, 0.3)
+    assert after.solved
+    np.testing.assert_allclose(after.u, expected.u, atol=1e-4)
+
+
+def test_the_same_problems_give_the_same_bits() -> None:
+    def series() -> Array:
+        problem = mpc(AXIS, qp=QpParams())
+        return np.stack([solve_one(problem, 0.1 * k, 0.2, 0.01, math.sin(k)).u for k in range(10)])
+
+    np.testing.assert_array_equal(series(), series())

@@ -1,0 +1,188 @@
+"""One step of the swarm MPC: signs by the thesis' equations, and every status of a plan by what brings it about."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from swarmctl.control.condensed import AxesSolution
+from swarmctl.control.controller import ControllerParams, make_controller
+from swarmctl.control.model import acceleration
+from swarmctl.control.mpc import RESIDUAL_LIMIT_M, MpcParams, Start, SwarmMpc
+from swarmctl.control.qp import QpParams
+from swarmctl.control.separation import KeepOut, SeparationParams, certify
+from swarmctl.core.types import Array, Plan, PlanStatus, Reference
+
+G = 9.81
+HERE = np.array([1.0, 2.0, -3.0])
+
+
+def start(pos: Array = HERE, vel: tuple[float, ...] = (0.0, 0.0, 0.0), virtual: tuple[float, ...] = (0.0, 0.0, G)) -> Start:
+    return Start(5_000_000, pos, np.array(vel), 1.0, np.array(virtual))
+
+
+def reference(offset: tuple[float, ...] = (0.0, 0.0, 0.0)) -> Reference:
+    return Reference(np.tile(HERE + offset, (101, 1)), np.zeros((101, 3)), 0.0)
+
+
+def plan_to(
+    offset: tuple[float, ...],
+    *keep_outs: KeepOut,
+    wind: tuple[float, ...] = (0.0, 0.0, 0.0),
+    begin: Start | None = None,
+    **params: Any,
+) -> Plan:
+    mpc = SwarmMpc(MpcParams(**params), SeparationParams(), 0, 2)
+    return mpc.plan(begin or start(), reference(offset), np.array(wind), keep_outs, None)
+
+
+def fixed(place: Array, allowed_m: float = 0.8, steps: int = 40) -> KeepOut:
+    return KeepOut(np.tile(place, (steps + 1, 1)), allowed_m + 0.1, allowed_m, False, 1)
+
+
+@pytest.mark.parametrize(("axis", "sign"), [(0, 1.0), (0, -1.0), (1, 1.0), (1, -1.0)])
+def test_a_reference_to_the_north_tilts_the_body_axis_south(axis: int, sign: float) -> None:
+    # (3.17) x'' = -(f/m) u_x and y'' = -(f/m) u_y: to accelerate north, u_x must be negative
+    offset = [0.0, 0.0, 0.0]
+    offset[axis] = sign
+    plan = plan_to((offset[0], offset[1], offset[2]))
+    assert plan.status is PlanStatus.OK
+    assert sign * plan.virtual[0, axis] < -0.02
+    assert sign * acceleration(plan.virtual[0])[axis] > 0.2
+    assert sign * (plan.pos_ned_m[-1, axis] - HERE[axis]) > 0.1
+    np.testing.assert_allclose(plan.virtual[:, 1 - axis], 0.0, atol=2e-3)
+
+
+@pytest.mark.parametrize("up_m", [0.5, -0.5])
+def test_a_reference_above_takes_more_thrust_than_the_weight(up_m: float) -> None:
+    plan = plan_to((0.0, 0.0, -up_m))
+    assert (plan.virtual[0, 2] - G) * up_m > 0.1
+    assert (plan.pos_ned_m[-1, 2] - HERE[2]) * -up_m > 0.1
+
+
+def test_at_its_reference_it_hovers() -> None:
+    plan = plan_to((0.0, 0.0, 0.0))
+    np.testing.assert_allclose(plan.virtual, np.tile([0.0, 0.0, G], (40, 1)), atol=5e-3)
+    np.testing.assert_allclose(plan.pos_ned_m, np.tile(HERE, (41, 1)), atol=2e-3)
+    assert (plan.t0_us, plan.dt_us, plan.status) == (5_000_000, 20_000, PlanStatus.OK)
+
+
+def test_a_tilted_vehicle_needs_more_thrust_to_hover() -> None:
+    # (3.11): z'' = g - (f/m) c with c frozen; held at c = 0.9 the equilibrium is g / 0.9
+    begin = Start(0, HERE, np.zeros(3), 0.9, np.array([0.0, 0.0, G / 0.9]))
+    plan = plan_to((0.0, 0.0, 0.0), begin=begin)
+    np.testing.assert_allclose(plan.virtual[:, 2], G / 0.9, atol=5e-3)
+
+
+def test_wind_is_leant_against() -> None:
+    plan = plan_to((0.0, 0.0, 0.0), wind=(1.0, -0.5, 0.4))
+    first_to_last = plan.virtual[-1]
+    assert first_to_last[0] > 0.02 > 0.0 > first_to_last[1]  # wind to the north: body axis north, thrust south
+    assert first_to_last[2] > G + 0.2
+
+
+def test_bounds_of_thrust_and_tilt_hold() -> None:
+    plan = plan_to((50.0, -50.0, -50.0))
+    assert np.abs(plan.virtual[:, :2]).max() <= 0.2 + 2e-3
+    assert np.abs(np.diff(plan.virtual[:, :2], axis=0, prepend=np.zeros((1, 2)))).max() <= 0.05 + 1e-9
+    assert plan.virtual[:, 2].max() <= 20.0 + 0.05
+    assert np.abs(np.diff(plan.virtual[:, 2], prepend=G)).max() <= 5.0 + 1e-9
+    falling = plan_to((0.0, 0.0, 50.0))
+    assert falling.virtual[:, 2].min() >= -0.05  # a rotor can't pull
+
+
+def test_the_planned_path_is_the_motion_of_its_own_virtual_controls() -> None:
+    plan = plan_to((0.5, -0.3, 0.0), begin=start(vel=(0.2, 0.1, 0.0)))
+    pos, vel = HERE.copy(), np.array([0.2, 0.1, 0.0])
+    for k in range(40):
+        accel = -plan.virtual[0, 2] * plan.virtual[k, :2]
+        pos[:2] += 0.02 * vel[:2] + 0.5 * 0.02**2 * accel
+        vel[:2] += 0.02 * accel
+        np.testing.assert_allclose(plan.pos_ned_m[k + 1, :2], pos[:2], atol=1e-9)
+
+
+def test_a_neighbour_in_the_way_is_kept_clear_of() -> None:
+    neighbour = fixed(HERE + [1.3, 0.0, 0.0])
+    free, kept = plan_to((1.3, 0.0, 0.0)), plan_to((1.3, 0.0, 0.0), neighbour)
+    assert free.status is kept.status is PlanStatus.OK
+    near = np.linalg.norm(kept.pos_ned_m - neighbour.pos_ned_m, axis=1).min()
+    assert near > 0.9 - 0.02
+    assert certify(free.pos_ned_m, [neighbour], 6) < certify(kept.pos_ned_m, [neighbour], 6)
+
+
+def test_a_plan_that_cannot_avoid_is_not_certified_and_says_how_much_it_lacks() -> None:
+    rushing = start(vel=(4.0, 0.0, 0.0))
+    plan = plan_to((5.0, 0.0, 0.0), fixed(HERE + [2.0, 0.0, 0.0]), begin=rushing)
+    assert plan.status is PlanStatus.NOT_CERTIFIED
+    assert certify(plan.pos_ned_m, [fixed(HERE + [2.0, 0.0, 0.0])], 6) < 0.0
+
+
+def test_a_keep_out_beyond_the_slots_is_still_judged() -> None:
+    behind = [fixed(HERE + [0.0, e, 0.0], 0.3) for e in (1.0, -1.0)]  # nearest two take both slots
+    wall = [fixed(HERE + [3.0 + 0.0, 0.0, 0.0], 0.8)]
+    plan = plan_to((5.0, 0.0, 0.0), *behind, *wall, begin=start(vel=(4.0, 0.0, 0.0)))
+    assert plan.status is PlanStatus.NOT_CERTIFIED
+
+
+def test_a_solver_that_breaks_down_is_a_status_and_not_an_exception() -> None:
+    for bad in (math.nan, math.inf):
+        plan = plan_to((1.0, 0.0, 0.0), begin=start(vel=(bad, 0.0, 0.0)))
+        assert plan.status is PlanStatus.SOLVER_FAILED
+    plan = plan_to((math.nan, 0.0, 0.0))
+    assert plan.status is PlanStatus.SOLVER_FAILED
+
+
+def solution(residual_m: float, solved: bool = True) -> AxesSolution:
+    two = np.zeros((40, 2))
+    return AxesSolution(solved, "", 1, two, np.tile(HERE[:2], (40, 1)), two, 0.0, residual_m, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("residual_m", "solved", "status"),
+    [
+        (RESIDUAL_LIMIT_M, True, PlanStatus.OK),
+        (1.01 * RESIDUAL_LIMIT_M, True, PlanStatus.RESIDUAL),
+        (math.inf, True, PlanStatus.RESIDUAL),
+        (0.0, False, PlanStatus.SOLVER_FAILED),
+    ],
+)
+def test_the_answer_of_the_solver_is_looked_at(
+    monkeypatch: pytest.MonkeyPatch, residual_m: float, solved: bool, status: PlanStatus
+) -> None:
+    mpc = SwarmMpc(MpcParams(), SeparationParams(), 0, 2)
+    monkeypatch.setattr(mpc._xy, "solve", lambda *_: solution(residual_m, solved))
+    assert mpc.plan(start(), reference(), np.zeros(3), [], None).status is status
+
+
+def test_a_solver_that_is_stopped_too_early_has_a_residual() -> None:
+    qp = QpParams(max_iterations=10, polish=False)
+    plan = plan_to((5.0, 0.5, 0.0), fixed(HERE + [1.0, 0.3, 0.0]), begin=start(vel=(1.5, 0.0, 0.0)), qp=qp)
+    assert plan.status in (PlanStatus.RESIDUAL, PlanStatus.SOLVER_FAILED, PlanStatus.NOT_CERTIFIED)
+    assert plan.residual_m > RESIDUAL_LIMIT_M
+
+
+@pytest.mark.parametrize("horizon_xy", [2, 6])
+def test_a_control_horizon_as_long_as_the_prediction_can_be_flown(horizon_xy: int) -> None:
+    neighbour = fixed(HERE + [3.0, 0.0, 0.0], steps=horizon_xy)
+    assert plan_to((0.1, 0.0, 0.0), neighbour, horizon_xy=horizon_xy).status is PlanStatus.OK
+
+
+def test_z_longer_or_shorter_than_xy_gives_a_plan_of_xy_length() -> None:
+    for horizon_z in (10, 60):
+        plan = plan_to((0.0, 0.0, -0.2), horizon_z=horizon_z)
+        assert plan.pos_ned_m.shape == (41, 3)
+        assert np.isfinite(plan.pos_ned_m).all()
+        assert plan.virtual.shape == (40, 3)
+
+
+def test_the_controller_without_neighbours_ignores_them_and_the_distributed_one_does_not() -> None:
+    neighbour = fixed(HERE + [0.5, 0.0, 0.0], 0.8)
+    alone = make_controller(ControllerParams(kind="mpc"), SeparationParams(), 0, 2)
+    together = make_controller(ControllerParams(kind="dmpc"), SeparationParams(), 0, 2)
+    free = alone.plan(start(), reference((0.5, 0.0, 0.0)), np.zeros(3), [neighbour], None)
+    kept = together.plan(start(), reference((0.5, 0.0, 0.0)), np.zeros(3), [neighbour], None)
+    assert free.virtual[5, 0] < -0.02  # towards the reference
+    assert kept.virtual[5, 0] > 0.02  # away from the neighbour that is too near

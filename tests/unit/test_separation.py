@@ -1,0 +1,247 @@
+"""Keeping apart: time alignment, growth with age, half-spaces and the certificate, by numbers worked out by hand."""
+
+from __future__ import annotations
+
+import math
+from itertools import product
+
+import numpy as np
+import pytest
+
+from swarmctl.control.separation import (
+    KeepOut,
+    SeparationParams,
+    align,
+    certify,
+    half_spaces_xy,
+    keep_out_of_obstacle,
+    keep_out_of_peer,
+    visible,
+)
+from swarmctl.core.types import Array, Obstacle, PredictedPath
+
+UTC_US = 1_700_000_000_000_000
+DT_US = 100_000
+STEPS = 10
+PARAMS = SeparationParams()  # radius 0.9, slack 0.1, 4 m/s2 of age, at most 1 m, brake 3 m/s2, lost after 0.5 s
+
+
+def peer(points: Array, dt_us: int = DT_US, radius_m: float = 0.0, agent: int = 1) -> PredictedPath:
+    return PredictedPath(agent, 1, 1, UTC_US, dt_us, radius_m, points)
+
+
+def straight(speed_m_s: float, points: int = 6, dt_us: int = DT_US) -> PredictedPath:
+    """Along north from the origin."""
+    north = np.arange(points) * speed_m_s * dt_us * 1e-6
+    return peer(np.stack([north, np.zeros(points), np.full(points, -2.0)], axis=1), dt_us)
+
+
+def test_alignment_interpolates_between_points() -> None:
+    curve = peer(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, -1.0], [3.0, 2.0, -1.0], [3.0, 6.0, -1.0]]))
+    aligned = align(curve, UTC_US + 25_000, 50_000, 3, 3.0)
+    np.testing.assert_allclose(aligned, [[0.25, 0.0, -0.25], [0.75, 0.0, -0.75], [1.5, 0.5, -1.0], [2.5, 1.5, -1.0]])
+
+
+def test_alignment_before_the_first_point_goes_back_along_the_first_segment() -> None:
+    aligned = align(straight(2.0), UTC_US - 150_000, DT_US, 2, 3.0)
+    np.testing.assert_allclose(aligned[:, 0], [-0.3, -0.1, 0.1], atol=1e-12)
+
+
+def test_beyond_its_end_a_peer_brakes_to_a_stop() -> None:
+    # 3 m/s at the end (x = 1.5 at 0.5 s), brake 3 m/s2: stops 1 s later 1.5 m on
+    aligned = align(straight(3.0), UTC_US + 500_000, 250_000, 6, 3.0)
+    # 3 t - 1.5 t^2 at 0, .25, .5, .75, 1 s: 0, .65625, 1.125, 1.40625, 1.5, then at rest
+    np.testing.assert_allclose(aligned[:, 0], [1.5, 2.15625, 2.625, 2.90625, 3.0, 3.0, 3.0], atol=1e-12)
+    np.testing.assert_allclose(aligned[:, 2], -2.0)
+
+
+def test_an_hour_old_path_is_a_place_and_not_a_projectile() -> None:
+    aligned = align(straight(3.0), UTC_US + 3_600_000_000, DT_US, 2, 3.0)
+    np.testing.assert_allclose(aligned[:, 0], 3.0)
+
+
+def test_a_peer_at_rest_stays() -> None:
+    aligned = align(straight(0.0), UTC_US + 10_000_000, DT_US, 2, 3.0)
+    np.testing.assert_allclose(aligned, np.tile([0.0, 0.0, -2.0], (3, 1)))
+
+
+@pytest.mark.parametrize(
+    ("age_s", "margin_m", "any_height"),
+    [(-0.1, 0.0, False), (0.0, 0.0, False), (0.1, 0.02, False), (0.5, 0.5, False), (0.6, 0.72, True), (9.0, 1.0, True)],
+)
+def test_keep_out_grows_with_age_to_its_cap_and_a_lost_peer_is_a_cylinder(
+    age_s: float, margin_m: float, any_height: bool
+) -> None:
+    at_us = UTC_US + round(age_s * 1e6)
+    path = peer(np.zeros((3, 3)), radius_m=0.25, agent=4)
+    keep_out = keep_out_of_peer(path, at_us, DT_US, STEPS, False, PARAMS)
+    assert keep_out.radius_m == pytest.approx(0.9 + 0.25 + margin_m)
+    assert keep_out.certified_m == pytest.approx(0.9 + 0.25 - 0.1)
+    assert (keep_out.any_height, keep_out.tie) == (any_height, 4)
+
+
+def test_a_peer_that_has_landed_is_kept_clear_of_but_does_not_grow() -> None:
+    keep_out = keep_out_of_peer(peer(np.zeros((3, 3))), UTC_US + 600_000_000, DT_US, STEPS, True, PARAMS)
+    assert keep_out.radius_m == pytest.approx(0.9)
+    assert not keep_out.any_height
+
+
+def test_a_moving_obstacle_is_taken_at_constant_velocity_and_seen_only_from_near() -> None:
+    obstacle = Obstacle(np.array([5.0, 0.0, -2.0]), 1.0, 1.75, 3.0, np.array([-1.0, 0.5, 0.0]))
+    keep_out = keep_out_of_obstacle(obstacle, 200_000, 2, PARAMS)
+    np.testing.assert_allclose(keep_out.pos_ned_m, [[5.0, 0.0, -2.0], [4.8, 0.1, -2.0], [4.6, 0.2, -2.0]])
+    assert (keep_out.radius_m, keep_out.certified_m) == (1.75, pytest.approx(1.65))
+    assert visible([obstacle], np.array([2.001, 0.0, -2.0])) == [obstacle]
+    assert visible([obstacle], np.array([2.0, 0.0, -2.0])) == []
+    assert visible([obstacle], np.array([5.0, 0.0, 1.0])) == []  # height counts
+
+
+# -- certificate ------------------------------------------------------------------------------------------------------
+
+
+def fixed(place: tuple[float, float, float], allowed_m: float, any_height: bool = False, steps: int = STEPS) -> KeepOut:
+    return KeepOut(np.tile(place, (steps + 1, 1)), allowed_m + 0.1, allowed_m, any_height, 1)
+
+
+def line(start: tuple[float, float, float], end: tuple[float, float, float], steps: int = STEPS) -> Array:
+    return np.linspace(start, end, steps + 1)
+
+
+def test_margin_is_true_distance_minus_what_is_allowed() -> None:
+    path = line((-5.0, 2.0, 0.0), (5.0, 2.0, 0.0))
+    assert certify(path, [fixed((0.0, 0.0, 0.0), 0.8)], 0) == pytest.approx(1.2)
+    assert certify(path, [fixed((0.0, 0.0, 0.0), 0.8), fixed((0.0, 1.5, 0.0), 0.8)], 0) == pytest.approx(-0.3)
+    assert certify(path, [], 0) == math.inf
+
+
+def test_a_path_that_jumps_over_an_obstacle_between_two_samples_is_caught() -> None:
+    path = line((-5.5, 0.0, 0.0), (4.5, 0.0, 0.0))  # samples 1 m apart, nearest ones 0.5 m from the centre
+    assert certify(path, [fixed((0.0, 0.0, 0.0), 0.4)], 0) == pytest.approx(-0.4)
+
+
+def test_two_that_swap_places_between_two_samples_are_caught() -> None:
+    other = KeepOut(line((10.0, 0.0, 0.0), (0.0, 0.0, 0.0), 5), 0.9, 0.8, False, 1)
+    own = line((0.0, 0.0, 0.0), (10.0, 0.0, 0.0), 5)  # at no sample nearer than 2 m
+    assert certify(own, [other], 0) == pytest.approx(-0.8)
+
+
+def test_height_separates_from_a_sphere_but_not_from_a_cylinder() -> None:
+    path = line((-5.0, 0.0, -3.0), (5.0, 0.0, -3.0))
+    assert certify(path, [fixed((0.0, 0.0, 0.0), 0.8)], 0) == pytest.approx(2.2)
+    assert certify(path, [fixed((0.0, 0.0, 0.0), 0.8, any_height=True)], 0) == pytest.approx(-0.8)
+
+
+def test_what_cannot_be_changed_any_more_is_not_judged() -> None:
+    path = line((0.85, 0.0, 0.0), (10.85, 0.0, 0.0))  # leaves; margin 0.05 in the first segment, 1.05 from the second
+    keep_out = [fixed((0.0, 0.0, 0.0), 0.8)]
+    assert certify(path, keep_out, 0) == pytest.approx(0.05)
+    assert certify(path, keep_out, 1) == pytest.approx(1.05)
+
+
+def test_where_it_is_too_close_now_a_way_out_is_allowed_and_a_way_in_is_not() -> None:
+    keep_out = [fixed((0.0, 0.0, 0.0), 0.8)]
+    assert certify(line((0.5, 0.0, 0.0), (3.0, 0.0, 0.0)), keep_out, 0) == 0.0
+    assert certify(line((0.5, 0.0, 0.0), (0.1, 0.0, 0.0)), keep_out, 0) == pytest.approx(-0.7)
+    # the excuse is for that keep-out only
+    assert certify(line((0.5, 0.0, 0.0), (3.0, 0.0, 0.0)), [*keep_out, fixed((3.0, 0.0, 0.0), 0.8)], 0) < 0.0
+
+
+def test_control_horizon_as_long_as_the_prediction_leaves_the_end_to_be_judged() -> None:
+    path = line((0.0, 0.0, 0.0), (5.0, 0.0, 0.0), 6)
+    assert certify(path, [fixed((5.0, 0.0, 0.0), 0.8, steps=6)], 6) < 0.0
+
+
+# -- half-spaces ------------------------------------------------------------------------------------------------------
+
+
+def spaces_of(guess: Array, *keep_outs: KeepOut, tie: int = 0, goal: tuple[float, float] = (0.0, 0.0), **changes: float):  # type: ignore[no-untyped-def]
+    params = PARAMS.model_copy(update=changes)
+    return half_spaces_xy(keep_outs, guess, np.array(goal), np.zeros(2), 0.1, tie, params)
+
+
+def still(place: tuple[float, float, float]) -> Array:
+    return np.tile(place, (STEPS + 1, 1))
+
+
+@pytest.mark.parametrize(("north", "east"), list(product((-2.0, 0.0, 2.0), (-1.5, 1.5))))
+def test_half_space_faces_from_the_other_to_us_and_stands_at_the_radius(north: float, east: float) -> None:
+    own = np.array([north, east])
+    spaces = spaces_of(still((north, east, 0.0)), fixed((0.0, 0.0, 0.0), 0.8), goal=(north, east))
+    normal, offset = spaces.normal[0, -1], spaces.offset_m[0, -1]
+    np.testing.assert_allclose(normal, own / np.linalg.norm(own), atol=1e-9)
+    assert offset == pytest.approx(0.9)
+    assert normal @ own > offset  # we are on the allowed side,
+    assert normal @ np.zeros(2) < offset  # the other is not
+
+
+def test_offset_moves_with_the_other() -> None:
+    spaces = spaces_of(still((10.0, 5.0, 0.0)), fixed((10.0, 3.0, 0.0), 0.8), goal=(10.0, 5.0))
+    assert spaces.offset_m[0, 0] == pytest.approx(3.0 + 0.9)  # along east
+
+
+@pytest.mark.parametrize(
+    ("height_m", "needed_m"), [(0.0, 0.9), (0.54, 0.72), (-0.72, 0.54), (0.9, -math.inf), (5.0, -math.inf)]
+)
+def test_height_difference_relieves_what_must_be_kept_horizontally(height_m: float, needed_m: float) -> None:
+    sphere = fixed((0.0, 0.0, 0.0), 0.8)
+    spaces = spaces_of(still((2.0, 0.0, height_m)), sphere, goal=(2.0, 0.0))
+    assert spaces.offset_m[0, 3] == pytest.approx(needed_m)
+    cylinder = fixed((0.0, 0.0, 0.0), 0.8, any_height=True)
+    assert spaces_of(still((2.0, 0.0, height_m)), cylinder, goal=(2.0, 0.0)).offset_m[0, 3] == pytest.approx(0.9)
+
+
+def test_far_ones_get_no_row() -> None:
+    assert np.isneginf(spaces_of(still((4.0, 0.0, 0.0)), fixed((0.0, 0.0, 0.0), 0.8)).offset_m).all()
+    assert np.isfinite(spaces_of(still((3.8, 0.0, 0.0)), fixed((0.0, 0.0, 0.0), 0.8)).offset_m).all()
+    assert spaces_of(still((4.0, 0.0, 0.0))) is None
+
+
+def test_two_at_the_same_place_take_opposite_sides_by_their_numbers() -> None:
+    place = (1.0, 2.0, -2.0)
+    other_of_0 = KeepOut(still(place), 0.9, 0.8, False, tie=1)
+    other_of_1 = KeepOut(still(place), 0.9, 0.8, False, tie=0)
+    first = spaces_of(still(place), other_of_0, tie=0, goal=(1.0, 2.0))
+    second = spaces_of(still(place), other_of_1, tie=1, goal=(1.0, 2.0))
+    assert np.isfinite(first.normal).all()
+    np.testing.assert_allclose(first.normal[0, 0], [-1.0, 0.0])
+    np.testing.assert_allclose(second.normal[0, 0], [1.0, 0.0])
+    # kept, both constraints put at least twice the radius between them
+    assert -first.offset_m[0, 0] + 1.0 + second.offset_m[0, 0] - 1.0 >= 1.8 - 1e-9
+
+
+def test_head_on_agents_that_get_nowhere_turn_to_opposite_sides_of_the_line() -> None:
+    north_bound, south_bound = still((0.0, 0.0, 0.0)), still((1.0, 0.0, 0.0))
+    a = spaces_of(north_bound, KeepOut(south_bound, 0.9, 0.8, False, 1), tie=0, goal=(5.0, 0.0))
+    b = spaces_of(south_bound, KeepOut(north_bound, 0.9, 0.8, False, 0), tie=1, goal=(-5.0, 0.0))
+    # turned by 0.35 rad: (-1, 0) -> (-cos, -sin), (1, 0) -> (cos, sin)
+    np.testing.assert_allclose(a.normal[0, 0], [-math.cos(0.35), -math.sin(0.35)], atol=1e-9)
+    np.testing.assert_allclose(b.normal[0, 0], [math.cos(0.35), math.sin(0.35)], atol=1e-9)
+    moving = np.linspace((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), STEPS + 1)  # gets somewhere: peers' normals stay
+    c = spaces_of(moving, KeepOut(still((2.0, 0.0, 0.0)), 0.9, 0.8, False, 1), goal=(5.0, 0.0))
+    np.testing.assert_allclose(c.normal[0, 0], [-1.0, 0.0], atol=1e-9)
+    obstacle = KeepOut(still((2.0, 0.0, 0.0)), 0.9, 0.8, False, -1)  # obstacles do not evade: always turned
+    assert abs(spaces_of(moving, obstacle, goal=(5.0, 0.0)).normal[0, 0, 1]) > 0.3
+
+
+def test_stopping_row_asks_for_the_braking_distance_and_not_when_opening() -> None:
+    guess = still((-3.0, 0.0, 0.0))
+    wall = [fixed((0.0, 0.0, 0.0), 0.8)]
+    params = PARAMS.model_copy(update={"bias_rad": 0.0})
+    closing = half_spaces_xy(wall, guess, np.array([5.0, 0.0]), np.array([2.8, 0.0]), 0.1, 0, params)
+    assert closing is not None
+    # v / (2 a): p + v * v / (2 a) is where braking with a = 1.4 from 2.8 m/s ends
+    assert closing.stop_s[0] == pytest.approx(2.8 / (2 * 1.4))
+    assert closing.stop_offset_m[0] == pytest.approx(0.9)
+    opening = half_spaces_xy(wall, guess, np.array([5.0, 0.0]), np.array([-2.8, 0.0]), 0.1, 0, params)
+    assert opening is not None
+    assert opening.stop_s[0] == 0.0
+
+
+def test_stopping_row_knows_that_the_other_moves_too() -> None:
+    other = KeepOut(line((0.0, 0.0, 0.0), (-1.0, 0.0, 0.0)), 0.9, 0.8, False, 1)  # 1 m/s south
+    params = PARAMS.model_copy(update={"bias_rad": 0.0})
+    spaces = half_spaces_xy([other], still((-3.0, 0.0, 0.0)), np.array([5.0, 0.0]), np.array([1.8, 0.0]), 0.1, 0, params)
+    assert spaces is not None
+    assert spaces.stop_s[0] == pytest.approx(2.8 / 2.8)  # closing speed 1.8 + 1.0
+    # normal is south (-1, 0): other at its end -1 - 1 s * 1 m/s = -2 -> offset 2 + 0.9
+    assert spaces.stop_offset_m[0] == pytest.approx(2.9)

@@ -1,0 +1,113 @@
+"""Virtual controls -> attitude and thrust, against attitudes worked out by hand."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from swarmctl.control.model import Predictor, VehicleModelParams, acceleration
+from swarmctl.control.setpoint import VALID_US, setpoint_of
+from swarmctl.core.frames import body_z_ned, euler_from_quat
+from swarmctl.core.types import FlightMode, Landed, VehicleState
+
+MODEL = VehicleModelParams()  # thrust 0.05..1, tilt 0.6 rad
+G = 9.81
+
+
+def test_level_at_hover_thrust() -> None:
+    setpoint = setpoint_of(np.array([0.0, 0.0, G]), 0.0, 0.42, 1_000, MODEL)
+    np.testing.assert_allclose(setpoint.q_nb, [1.0, 0.0, 0.0, 0.0])
+    assert setpoint.thrust_01 == pytest.approx(0.42)
+    assert setpoint.valid_until_us == 1_000 + VALID_US
+
+
+@pytest.mark.parametrize(
+    ("u_x", "u_y", "yaw_deg", "roll_deg", "pitch_deg"),
+    [
+        (-0.5, 0.0, 0.0, 0.0, -30.0),  # accelerate north, heading north: nose down
+        (0.5, 0.0, 0.0, 0.0, 30.0),
+        (0.0, -0.5, 0.0, 30.0, 0.0),  # accelerate east, heading north: right side down
+        (0.0, 0.5, 0.0, -30.0, 0.0),
+        (-0.5, 0.0, 90.0, -30.0, 0.0),  # accelerate north, heading east: left side down
+        (0.0, -0.5, 90.0, 0.0, -30.0),  # accelerate east, heading east: nose down
+        (-0.5, 0.0, 180.0, 0.0, 30.0),  # accelerate north, heading south: nose up
+    ],
+)
+def test_attitudes_by_hand(u_x: float, u_y: float, yaw_deg: float, roll_deg: float, pitch_deg: float) -> None:
+    q_nb = setpoint_of(np.array([u_x, u_y, G]), math.radians(yaw_deg), 0.5, 0, MODEL).q_nb
+    roll, pitch, yaw = (math.degrees(a) for a in euler_from_quat(q_nb))
+    assert (roll, pitch) == (pytest.approx(roll_deg, abs=1e-9), pytest.approx(pitch_deg, abs=1e-9))
+    assert math.cos(math.radians(yaw - yaw_deg)) == pytest.approx(1.0)
+
+
+@given(st.floats(-0.39, 0.39), st.floats(-0.39, 0.39), st.floats(-3.1, 3.1))
+def test_the_body_axis_of_the_attitude_is_what_was_asked(u_x: float, u_y: float, yaw: float) -> None:
+    q_nb = setpoint_of(np.array([u_x, u_y, G]), yaw, 0.5, 0, MODEL).q_nb
+    np.testing.assert_allclose(body_z_ned(q_nb), [u_x, u_y, math.sqrt(1 - u_x**2 - u_y**2)], atol=1e-9)
+    assert math.cos(euler_from_quat(q_nb)[2] - yaw) == pytest.approx(1.0)
+
+
+@given(st.floats(-5.0, 5.0), st.floats(-5.0, 5.0))
+def test_tilt_is_limited_by_shortening_and_never_by_turning(u_x: float, u_y: float) -> None:
+    down = body_z_ned(setpoint_of(np.array([u_x, u_y, G]), 0.3, 0.5, 0, MODEL).q_nb)
+    assert math.acos(min(1.0, down[2])) <= 0.6 + 1e-6
+    assert down[0] * u_y - down[1] * u_x == pytest.approx(0.0, abs=1e-6)
+    assert down[0] * u_x + down[1] * u_y >= -1e-9
+
+
+@pytest.mark.parametrize(
+    ("specific_m_s2", "hover_01", "thrust_01"),
+    [(G, 0.5, 0.5), (2 * G, 0.3, 0.6), (3 * G, 0.5, 1.0), (0.0, 0.5, 0.05), (-20.0, 0.5, 0.05), (G / 2, 0.6, 0.3)],
+)
+def test_thrust_is_linear_in_weights_and_bounded(specific_m_s2: float, hover_01: float, thrust_01: float) -> None:
+    setpoint = setpoint_of(np.array([0.0, 0.0, specific_m_s2]), 0.0, hover_01, 0, MODEL)
+    assert setpoint.thrust_01 == pytest.approx(thrust_01)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("entry", range(3))
+def test_nonsense_in_is_a_setpoint_that_is_refused(entry: int, bad: float) -> None:
+    virtual = np.array([0.1, -0.1, G])
+    virtual[entry] = bad
+    assert setpoint_of(virtual, 0.0, 0.5, 0, MODEL).problem(0)
+
+
+def test_acceleration_of_virtual_controls_by_hand() -> None:
+    np.testing.assert_allclose(acceleration(np.array([0.0, 0.0, G])), 0.0, atol=1e-12)
+    # 30 degrees nose down with the vertical part carrying the weight: g tan 30 to the north
+    virtual = np.array([-0.5, 0.0, G / math.cos(math.radians(30))])
+    np.testing.assert_allclose(acceleration(virtual), [G * math.tan(math.radians(30)), 0.0, 0.0], atol=1e-12)
+    np.testing.assert_allclose(acceleration(np.array([0.0, 0.0, 0.0])), [0.0, 0.0, G])
+
+
+def state(t_us: int, pos: tuple[float, ...], vel: tuple[float, ...]) -> VehicleState:
+    level = np.array([1.0, 0.0, 0.0, 0.0])
+    return VehicleState(
+        t_us, np.array(pos), np.array(vel), level, np.zeros(3), True, FlightMode.EXTERNAL, Landed.IN_AIR, False
+    )
+
+
+def test_prediction_applies_each_command_from_when_it_acts() -> None:
+    predictor = Predictor(VehicleModelParams(delay_s=0.1))
+    north, east = np.array([2.0, 0.0, 0.0]), np.array([0.0, 4.0, 0.0])
+    predictor.sent(0, north)  # acts from 0.1 s
+    predictor.sent(100_000, east)  # acts from 0.2 s
+    pos, vel = predictor.predict(state(150_000, (1.0, 0.0, 0.0), (1.0, 0.0, 0.0)), 300_000, np.zeros(3))
+    # 50 ms at 2 m/s2 north, then 100 ms at 4 m/s2 east
+    np.testing.assert_allclose(vel, [1.1, 0.4, 0.0])
+    np.testing.assert_allclose(pos, [1.0 + 0.05 + 0.0025 + 0.11, 0.02, 0.0])
+
+
+def test_prediction_adds_the_disturbance_to_commands_and_nothing_before_the_first() -> None:
+    predictor = Predictor(VehicleModelParams(delay_s=0.1))
+    wind = np.array([0.0, 1.0, 0.0])
+    hover = state(0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    np.testing.assert_allclose(predictor.predict(hover, 1_000_000, wind)[1], 0.0)  # whoever flies holds against it
+    predictor.sent(0, np.zeros(3))
+    np.testing.assert_allclose(predictor.predict(hover, 1_100_000, wind)[1], [0.0, 1.1, 0.0])
+    predictor.clear()
+    np.testing.assert_allclose(predictor.predict(hover, 1_000_000, wind)[1], 0.0)
