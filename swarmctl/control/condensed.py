@@ -51,9 +51,8 @@ class Penalties:
     cost along the constraint; so the slack's weight follows that slope.
     """
 
-    terminal: float = 200.0
-    slack_floor: float = 50.0  # per metre; on top of `slack_over` times the tracking cost's own slope
-    slack_over: float = 3.0
+    floor: float = 50.0  # per metre; on top of `over` times the tracking cost's own slope
+    over: float = 3.0
     slack_quadratic: float = 20000.0
 
 
@@ -206,8 +205,7 @@ class CondensedMpc:
         weights = self._penalties
         quadratic = [1e-3] * soft + [2 * weights.slack_quadratic * _SLACK_SCALE_M**2 * self._cost_scale] * self.slots
         self._p_dense[np.arange(moves, self._columns), np.arange(moves, self._columns)] = quadratic
-        self._q_soft = np.array([weights.terminal] * soft + [weights.slack_floor] * self.slots)
-        self._q_soft *= _SLACK_SCALE_M * self._cost_scale
+        self._q_soft = np.full(soft + self.slots, weights.floor * _SLACK_SCALE_M * self._cost_scale)
         assert len(self._q_soft) == self._columns - n * hc
 
     @staticmethod
@@ -261,7 +259,7 @@ class CondensedMpc:
             slope = axis.q_pos * (pos_error[:, i] @ self._phi_pos) + axis.q_vel * (vel_error[:, i] @ self._phi_vel)
             q[block] = (2.0 * gain * axis.du_max * self._cost_scale) * slope
         steepest = float(np.abs(q[: self._moves]).max()) * self._row_scale[-1]  # per metre of the last row
-        q[self._columns - self.slots :] += self._penalties.slack_over * steepest * _SLACK_SCALE_M
+        q[self._moves :] += self._penalties.over * steepest * _SLACK_SCALE_M
         return q
 
     def _fill_inputs(self, u_prev: Array) -> None:
@@ -341,7 +339,8 @@ class CondensedMpc:
         soft = len(self._terminals)
         flown = np.concatenate([np.clip(x[: self._moves], -1.0, 1.0), x[self._moves :]])
         slack = flown[self._moves + soft :] * _SLACK_SCALE_M
-        gap = flown[self._moves : self._moves + soft] * _SLACK_SCALE_M
+        terminal = slice(self._row_terminal, self._row_half, 2)  # their bounds are the error without any move
+        gap = np.abs(self._a_dense[terminal, : self._moves] @ flown[: self._moves] - self._lower[terminal])
         shortfall = self._lower[self._row_half :] - self._a_dense[self._row_half :] @ flown
         shortfall = shortfall / np.tile(self._row_scale, self.slots)
         excess = np.maximum(u - self._u_max, self._u_min - u) * np.abs(gain_m_s2) * self._drop[-1]

@@ -72,6 +72,8 @@ class OsqpSolver:
         self._solver: osqp.OSQP | None = None
 
     def solve(self, p_values: Array, q: Array, a_values: Array, lower: Array, upper: Array) -> QpSolution:
+        if not all(np.isfinite(values).all() for values in (p_values, q, a_values, lower, upper)):
+            return QpSolution(None, False, "not finite", 0)  # would poison the next warm start
         if self._solver is None:
             return self._cold(p_values, q, a_values, lower, upper, self._params.rho)
         self._solver.update(Px=p_values, q=q, Ax=a_values, l=lower, u=upper)
@@ -111,6 +113,8 @@ class OsqpSolver:
         assert self._solver is not None
         result = self._solver.solve(raise_error=False)
         status = result.info.status_val
+        if not np.isfinite(result.x).all():
+            self._solver = None  # start afresh next time
         usable = status in (_SOLVED, *_UNFINISHED) and bool(np.isfinite(result.x).all())
         x = result.x if usable else None
         return QpSolution(x, status == _SOLVED, str(result.info.status), int(result.info.iter))

@@ -187,7 +187,7 @@ def certify(path_ned_m: Array, keep_outs: Sequence[KeepOut], from_step: int) -> 
     closest = apart[:, :-1] + nearest[:, :, None] * step  # closest point of each relative segment to the origin
     distance = np.sqrt(np.einsum("mkc,mkc->mk", closest, closest))  # (m, Hp)
     now = np.sqrt(np.einsum("mc,mc->m", apart[:, 0], apart[:, 0]))
-    later = distance[:, from_step:].min(axis=1)
+    later = distance[:, min(from_step, distance.shape[1] - 1) :].min(axis=1)
     allowed = np.array([k.certified_m for k in keep_outs])
     margin = np.where((now < allowed) & (later >= now - 0.02), 0.0, later - allowed)
     return float(margin.min())

@@ -90,6 +90,7 @@ class Sequence:
         self.had_control = False
         self.held = False  # by the operator
         self.waiting = False  # for mute peers
+        self._bound_for = start_ned_m  # before it had to wait
         self._glide: tuple[Glide, int] | None = None  # and when it began
         self._entered_us = 0
         self._born_us: int | None = None
@@ -98,6 +99,8 @@ class Sequence:
         self.yielded = False
         self._ground_z_m = 0.0
         self._airborne = False
+        self._invited = False  # by an operator's resume, to take control from whoever has it
+        self._landing_seen = False
         self._steps: dict[Phase, Callable[[Facts, VehicleState], list[Command]]] = {
             Phase.STANDBY: self._standby,
             Phase.ARM: self._arm,
@@ -122,8 +125,7 @@ class Sequence:
         if self.phase is Phase.CONNECT:
             self._enter(Phase.STANDBY, facts)
         if facts.mode is Mode.YIELD and not self.yielded:
-            self.yielded, self.had_control = True, False
-            self.outcome = "pilot or autopilot took over"
+            self._yield()
         if self.yielded:
             if not state.armed and state.landed is Landed.ON_GROUND:
                 self._enter(Phase.DONE, facts)
@@ -164,9 +166,13 @@ class Sequence:
         elif verb == "resume":
             self.held = False
             if self.yielded:
-                self.yielded, self.outcome = False, ""
+                self.yielded, self.outcome, self._invited = False, "", True
         elif verb in ("land", "rtl"):
             self._stop(verb, now_us, state)
+
+    def _yield(self) -> None:
+        self.yielded, self.had_control, self._invited = True, False, False
+        self.outcome = "pilot or autopilot took over"
 
     def _stop(self, verb: str, now_us: int, state: VehicleState) -> None:
         self.outcome = self.outcome or OPERATOR_STOP
@@ -184,11 +190,12 @@ class Sequence:
         flying = self.had_control and Phase.GOTO_START <= self.phase <= Phase.GOTO_LAND
         if facts.mute and flying and not self.waiting:
             self.waiting = True
+            self._bound_for = self._glide[0].to_ned_m if self._glide else self._start_ned_m
             self._glide = (self._stop_glide(state), facts.now_us)
         elif self.waiting and not facts.mute:
             self.waiting = False
             if self.phase in (Phase.GOTO_START, Phase.GOTO_LAND):
-                self._glide = (self._home(state), facts.now_us)
+                self._glide = (self._way_to(self._bound_for, state), facts.now_us)
             elif self.held:
                 self._glide = (self._stop_glide(state), facts.now_us)
 
@@ -206,8 +213,6 @@ class Sequence:
     def _standby(self, facts: Facts, state: VehicleState) -> list[Command]:
         if not self._configured:
             self._configured = True
-            self._ground_z_m = float(state.pos_ned_m[2])
-            self._airborne = state.landed is Landed.IN_AIR
             rates = [
                 Command(Verb.RATE, self._params.state_rate_hz, _ODOMETRY_ID),
                 Command(Verb.RATE, 5.0, _ATTITUDE_TARGET_ID),
@@ -220,13 +225,16 @@ class Sequence:
                 for k, v in self._setup.items()
             ]
         known = sum(p.phase >= Phase.STANDBY and p.alive for p in facts.peers.values())
-        if facts.armable and not facts.busy and known == self._expected:
+        located = state.landed in (Landed.ON_GROUND, Landed.IN_AIR)
+        if located and facts.armable and not facts.busy and known == self._expected:
+            self._ground_z_m = float(state.pos_ned_m[2])
+            self._airborne = state.landed is Landed.IN_AIR
             self._enter(Phase.ARM, facts)
         return []
 
     def _arm(self, facts: Facts, state: VehicleState) -> list[Command]:
         if state.armed:
-            self._enter(Phase.GOTO_START if state.landed is Landed.IN_AIR else Phase.TAKEOFF, facts)
+            self._enter(Phase.GOTO_START if self._airborne else Phase.TAKEOFF, facts)
             return []
         return [Command(Verb.ARM)] if self._may_ask(facts) else []
 
@@ -237,19 +245,28 @@ class Sequence:
         if state.mode is FlightMode.HOLD and state.landed is Landed.IN_AIR and settled:
             self._enter(Phase.GOTO_START, facts)
             return []
+        if not state.armed:  # somebody, or the autopilot, thought better of it: never armed again
+            self._give_up("disarmed before take-off", facts, state)
+            return []
         if state.mode is not FlightMode.TAKEOFF and state.landed is Landed.ON_GROUND and self._may_ask(facts):
-            return [Command(Verb.TAKEOFF, height_m)] if state.armed else [Command(Verb.ARM)]
+            return [Command(Verb.TAKEOFF, height_m)]
         return []
 
     def _goto_start(self, facts: Facts, state: VehicleState) -> list[Command]:
         if not self.had_control:
             if self._glide is None:
                 self._glide = (Glide(state.pos_ned_m, np.zeros(3), state.pos_ned_m, 1.0), facts.now_us)
-            return [Command(Verb.EXTERNAL)] if self._may_ask(facts) else []
+            return self._ask_for_control(facts, state)
         if self._arrived(state, self._start_ned_m) and not self.waiting:
             self.ready_utc_us = facts.utc_us
             self._enter(Phase.READY, facts)
         return []
+
+    def _ask_for_control(self, facts: Facts, state: VehicleState) -> list[Command]:
+        """Control is taken from the autopilot's own hold; from anybody else only after an operator's `resume`."""
+        if state.mode not in (FlightMode.HOLD, FlightMode.TAKEOFF, FlightMode.EXTERNAL) and not self._invited:
+            return []
+        return [Command(Verb.EXTERNAL)] if self._may_ask(facts) else []
 
     def _ready(self, facts: Facts, state: VehicleState) -> list[Command]:
         if any(not p.alive for p in facts.peers.values()):
@@ -266,7 +283,7 @@ class Sequence:
     def _track(self, facts: Facts, state: VehicleState) -> list[Command]:
         assert self.begin_utc_us is not None
         if not self.had_control:
-            return [Command(Verb.EXTERNAL)] if self._may_ask(facts) else []
+            return self._ask_for_control(facts, state)
         if facts.utc_us - self.begin_utc_us >= self._duration_us and not (self.held or self.waiting):
             self.outcome = self.outcome or "completed"
             if self._airborne:
@@ -291,7 +308,13 @@ class Sequence:
         if state.landed is Landed.ON_GROUND and not state.armed:
             self._enter(Phase.DONE, facts)
             return []
-        if state.mode is FlightMode.LAND or not self._may_ask(facts):
+        if state.mode is FlightMode.LAND:
+            self._landing_seen = True
+            return []
+        if self._landing_seen and state.landed is not Landed.ON_GROUND:  # a pilot broke the landing off
+            self._yield()
+            return []
+        if not self._may_ask(facts):
             return []
         return [Command(Verb.DISARM if state.landed is Landed.ON_GROUND else Verb.LAND)]
 
@@ -307,8 +330,11 @@ class Sequence:
             self._glide = (self._home(state), facts.now_us)
 
     def _home(self, state: VehicleState) -> Glide:
+        return self._way_to(self._start_ned_m, state)
+
+    def _way_to(self, target_ned_m: Array, state: VehicleState) -> Glide:
         p = self._params
-        return glide_to(state.pos_ned_m, state.vel_ned_m_s, self._start_ned_m, p.speed_m_s, p.accel_m_s2)
+        return glide_to(state.pos_ned_m, state.vel_ned_m_s, target_ned_m, p.speed_m_s, p.accel_m_s2)
 
     def _go_home(self, facts: Facts, state: VehicleState) -> None:
         self._glide = (self._home(state), facts.now_us)

@@ -14,6 +14,7 @@ import numpy as np
 import pymap3d
 from pymavlink.dialects.v20 import common as dialect
 
+from swarmctl.core.frames import rotate_to_ned
 from swarmctl.core.types import Array, AttitudeSetpoint, FlightMode, Landed, VehicleState
 from swarmctl.links.commands import CommandPort
 from swarmctl.links.mavlink import Codec, frames
@@ -23,6 +24,8 @@ _ATTITUDE_ONLY = 7  # type_mask: body rates ignored; mask 0 would fly rates and 
 _ARMED_FLAG = 128
 _CRITICAL = 5
 _PREARM = 1 << 28
+_LOCAL_NED = dialect.MAV_FRAME_LOCAL_NED
+_BODY_FRD = (dialect.MAV_FRAME_BODY_NED, dialect.MAV_FRAME_BODY_FRD)  # of ODOMETRY's velocity
 _FAST = frozenset({dialect.MAVLINK_MSG_ID_ODOMETRY})  # not worth passing to the slow path
 
 
@@ -92,17 +95,20 @@ class VehicleClock:
         self._window_end_us = 0
         self._previous: int | None = None
         self._current: int | None = None
+        self._newest_us = 0
 
     def to_local(self, vehicle_us: int, arrived_us: int) -> int:
         """Our time of a vehicle stamp that arrived at `arrived_us`."""
         offset = arrived_us - vehicle_us
+        if vehicle_us < self._newest_us - 1_000_000:  # the vehicle rebooted: its clock began again
+            self._previous, self._current, self._window_end_us = None, None, arrived_us
+            self._newest_us = vehicle_us
+        self._newest_us = max(self._newest_us, vehicle_us)
         if arrived_us >= self._window_end_us:
             self._previous, self._current = self._current, None
             self._window_end_us = arrived_us + self.WINDOW_US
         self._current = offset if self._current is None else min(self._current, offset)
         best = self._current if self._previous is None else min(self._current, self._previous)
-        if offset - best > 1_000_000:  # the vehicle rebooted: its clock began again
-            self._previous, self._current, best = None, offset, offset
         return vehicle_us + best
 
 
@@ -217,15 +223,17 @@ class Autopilot:
         self.mode = self.dialect.modes.get(message.custom_mode, FlightMode.MANUAL)
 
     def _odometry(self, message: Any, arrived_us: int) -> None:
+        if message.frame_id != _LOCAL_NED or message.child_frame_id not in (_LOCAL_NED, *_BODY_FRD):
+            self._codec.refused["odometry frame"] += 1
+            return
         t_us = self._clock.to_local(message.time_usec, arrived_us)
         self._odometry_us = arrived_us
-        self._take(
-            t_us,
-            np.array([message.x, message.y, message.z]),
-            np.array([message.vx, message.vy, message.vz]),
-            np.array(message.q),
-            np.array([message.rollspeed, message.pitchspeed, message.yawspeed]),
-        )
+        q_nb = np.array(message.q)
+        vel = np.array([message.vx, message.vy, message.vz])
+        if message.child_frame_id in _BODY_FRD:
+            vel = rotate_to_ned(q_nb, vel)
+        rate = np.array([message.rollspeed, message.pitchspeed, message.yawspeed])
+        self._take(t_us, np.array([message.x, message.y, message.z]), vel, q_nb, rate)
 
     def _attitude_quaternion(self, message: Any, arrived_us: int) -> None:
         q_nb = np.array([message.q1, message.q2, message.q3, message.q4])

@@ -20,6 +20,7 @@ from swarmctl.links.mavlink import Codec
 
 _RETRY_US = 500_000
 _TRIES = 4
+_IN_PROGRESS = 5  # MAV_RESULT
 _HEARTBEAT_US = 1_000_000
 
 
@@ -132,7 +133,11 @@ class CodecCommands:
         kind = message.get_type()
         if kind == "COMMAND_ACK":
             asked = long_command(current, self._external, self._hold)
-            if asked is not None and asked.command == message.command:
+            if asked is None or asked.command != message.command:
+                return
+            if message.result == _IN_PROGRESS:
+                self._tries = 0
+            else:
                 self._finish(message.result == 0, f"result {message.result}")
         elif kind == "PARAM_VALUE" and current.name and message.param_id == current.name:
             told, wanted = (struct.pack("<f", v) for v in (message.param_value, self._wire_value(current)))

@@ -9,12 +9,12 @@ from __future__ import annotations
 import math
 import struct
 from dataclasses import dataclass
-from typing import Literal, TypeVar
+from typing import Annotated, Literal, TypeVar
 
 import msgspec
 import numpy as np
 
-from swarmctl.core.types import PredictedPath
+from swarmctl.core.types import FlightMode, Mode, Phase, PredictedPath
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +40,7 @@ MAX_POINTS = 250
 _PATH_HEADER = struct.Struct("<2sBBIIIqifBB2x")  # magic ver flags agent boot seq t0 dt radius n hdr_len
 _MAGIC = b"SP"
 _Message = TypeVar("_Message")
+Length = Annotated[float, msgspec.Meta(gt=0.0)]
 
 
 def encode_path(path: PredictedPath) -> bytes:
@@ -84,9 +85,9 @@ class StatusMessage(msgspec.Struct, frozen=True):
     agent: int
     boot_id: int
     sysid: int
-    phase: int
-    mode: int
-    flight_mode: int
+    phase: Annotated[int, msgspec.Meta(ge=0, le=int(max(Phase)))]
+    mode: Annotated[int, msgspec.Meta(ge=0, le=int(max(Mode)))]
+    flight_mode: Annotated[int, msgspec.Meta(ge=0, le=int(max(FlightMode)))]
     armed: bool
     landed: int
     ready_utc_us: int  # when it reached its start position, 0 before
@@ -113,9 +114,9 @@ class ObstacleMessage(msgspec.Struct, frozen=True):
     """One spherical obstacle, shared NED [m]."""
 
     center_ned_m: tuple[float, float, float]
-    radius_m: float
-    keep_out_m: float
-    visibility_m: float
+    radius_m: Length
+    keep_out_m: Length
+    visibility_m: Length
     vel_ned_m_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
 
 
@@ -151,5 +152,5 @@ _OBSTACLES_DECODER = msgspec.json.Decoder(ObstaclesMessage)
 def _decode(payload: bytes, decoder: msgspec.json.Decoder[_Message]) -> _Message | None:
     try:
         return decoder.decode(payload)
-    except msgspec.DecodeError:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return None

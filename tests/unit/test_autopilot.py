@@ -1,9 +1,10 @@
-"""One vehicle's link: which bytes are believed, in which frame and when they were true, and which setpoints may leave."""
+"""One vehicle's link: which bytes are believed, in which frame, when they were true, which setpoints may leave."""
 
 from __future__ import annotations
 
 import math
 import struct
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -63,9 +64,7 @@ def odometry(
     child: int = 1,
 ) -> Any:
     nothing = [math.nan] * 21
-    return dialect.MAVLink_odometry_message(
-        stamp_us, 1, child, *pos, list(q), *vel, *rate, nothing, nothing, 0, 2, 90
-    )
+    return dialect.MAVLink_odometry_message(stamp_us, 1, child, *pos, list(q), *vel, *rate, nothing, nothing, 0, 2, 90)
 
 
 def test_no_state_before_mode_origin_and_position_are_all_known() -> None:
@@ -122,7 +121,7 @@ def test_vehicle_time_is_mapped_by_the_smallest_delay_so_jitter_does_not_make_ol
     # sample 4 left at 40 ms and took 60 ms; by the best delay seen (4 ms) it is 56 ms old on arrival
     assert local[4] == 40_000 + 4_000
     assert local[5] == 50_000 + 4_000
-    assert all(b > a for a, b in zip(local[2:], local[3:], strict=False))
+    assert all(b > a for a, b in pairwise(local[2:]))
 
 
 def test_a_slow_drift_of_the_vehicle_clock_is_followed() -> None:

@@ -107,7 +107,7 @@ def test_reset_forgets_the_wind_and_keeps_the_weight() -> None:
     observer.reset()
     np.testing.assert_array_equal(observer.estimate.disturbance_ned_m_s2, 0.0)
     assert observer.estimate.hover_thrust_01 == pytest.approx(0.45, rel=0.01)
-    observer.update(sample(10**9, np.array([30.0, 0.0, 0.0])), 0.45)  # first sample after: nothing to compare with
+    observer.update(sample(20_020_000, np.array([30.0, 0.0, 0.0])), 0.45)  # first sample after: nothing to compare with
     np.testing.assert_array_equal(observer.estimate.disturbance_ned_m_s2, 0.0)
 
 

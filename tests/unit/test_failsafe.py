@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -21,18 +22,20 @@ GOOD = Health(
     planless_us=0,
     speed_m_s=1.0,
     phase=Phase.TRACK,
+    had_control=True,
+    yielded=False,
 )
 BAD_PLANS = [s for s in PlanStatus if s is not PlanStatus.OK]
 
 
-def mode_of(had_control: bool = True, **changes: object) -> Mode:
-    return judge(replace(GOOD, **changes), had_control, PARAMS).mode  # type: ignore[arg-type]
+def mode_of(**changes: Any) -> Mode:
+    return judge(replace(GOOD, **changes), PARAMS).mode
 
 
 def test_all_well_is_followed_and_before_the_autopilot_follows_it_is_streamed() -> None:
     assert mode_of() is Mode.FOLLOW
-    assert mode_of(False) is Mode.STREAM
-    assert mode_of(False, mode=FlightMode.HOLD) is Mode.STREAM
+    assert mode_of(had_control=False) is Mode.STREAM
+    assert mode_of(had_control=False, mode=FlightMode.HOLD) is Mode.STREAM
 
 
 @pytest.mark.parametrize(
@@ -54,24 +57,24 @@ def test_a_pilot_or_autopilot_that_leaves_offboard_is_yielded_to(mode: FlightMod
 
 
 @pytest.mark.parametrize("change", [{"armed": False}, {"autopilot_failsafe": True}])
-def test_disarming_and_the_autopilots_failsafe_are_yielded_to(change: dict[str, object]) -> None:
-    assert mode_of(**change) is Mode.YIELD  # type: ignore[arg-type]
-    assert mode_of(False, **change) is Mode.STREAM  # type: ignore[arg-type]
+def test_disarming_and_the_autopilots_failsafe_are_yielded_to(change: dict[str, Any]) -> None:
+    assert mode_of(**change) is Mode.YIELD
+    assert mode_of(had_control=False, **change) is Mode.STREAM
 
 
 @pytest.mark.parametrize("status", BAD_PLANS)
 def test_the_ladder_after_a_bad_plan(status: PlanStatus) -> None:
-    bad: dict[str, object] = {"plan_status": status}
-    assert mode_of(**bad, last_good_plan_age_us=0) is Mode.REPLAY  # type: ignore[arg-type]
-    assert mode_of(**bad, last_good_plan_age_us=400_000) is Mode.REPLAY  # type: ignore[arg-type]
-    assert mode_of(**bad, last_good_plan_age_us=400_001) is Mode.BRAKE  # type: ignore[arg-type]
-    assert mode_of(**bad, last_good_plan_age_us=-1) is Mode.BRAKE  # type: ignore[arg-type]
-    old: dict[str, object] = {**bad, "last_good_plan_age_us": 1_000_000}
-    assert mode_of(**old, speed_m_s=0.201) is Mode.BRAKE  # type: ignore[arg-type]
-    assert mode_of(**old, speed_m_s=0.2) is Mode.HOLD  # type: ignore[arg-type]
-    assert mode_of(**old, speed_m_s=0.0, planless_us=5_400_000) is Mode.HOLD  # type: ignore[arg-type]
-    assert mode_of(**old, speed_m_s=0.0, planless_us=5_400_001) is Mode.LAND  # type: ignore[arg-type]
-    assert mode_of(**old, speed_m_s=9.0, planless_us=5_400_001) is Mode.LAND  # type: ignore[arg-type]
+    bad: dict[str, Any] = {"plan_status": status}
+    assert mode_of(**bad, last_good_plan_age_us=0) is Mode.REPLAY
+    assert mode_of(**bad, last_good_plan_age_us=400_000) is Mode.REPLAY
+    assert mode_of(**bad, last_good_plan_age_us=400_001) is Mode.BRAKE
+    assert mode_of(**bad, last_good_plan_age_us=-1) is Mode.BRAKE
+    old: dict[str, Any] = {**bad, "last_good_plan_age_us": 1_000_000}
+    assert mode_of(**old, speed_m_s=0.201) is Mode.BRAKE
+    assert mode_of(**old, speed_m_s=0.2) is Mode.HOLD
+    assert mode_of(**old, speed_m_s=0.0, planless_us=5_400_000) is Mode.HOLD
+    assert mode_of(**old, speed_m_s=0.0, planless_us=5_400_001) is Mode.LAND
+    assert mode_of(**old, speed_m_s=9.0, planless_us=5_400_001) is Mode.LAND
 
 
 def test_a_plan_that_is_from_the_future_by_the_delay_is_still_young() -> None:
@@ -84,7 +87,7 @@ def test_a_bad_plan_is_never_flown_whoever_has_control(status: PlanStatus) -> No
         for age_us in (-1, 0, 10**9):
             for planless_us in (0, 10**9):
                 flown = mode_of(
-                    had_control, plan_status=status, last_good_plan_age_us=age_us, planless_us=planless_us
+                    had_control=had_control, plan_status=status, last_good_plan_age_us=age_us, planless_us=planless_us
                 )
                 assert flown not in (Mode.FOLLOW, Mode.STREAM)
 
@@ -96,6 +99,11 @@ def test_a_bad_plan_is_never_flown_whoever_has_control(status: PlanStatus) -> No
         ({"state_age_us": -1, "phase": Phase.STANDBY}, Mode.BLIND),
         ({"state_age_us": 300_000, "mode": FlightMode.MANUAL}, Mode.BLIND),
         ({"state_age_us": 300_000, "plan_status": PlanStatus.NONE}, Mode.BLIND),
+        # who has yielded stays so in every phase, but does not see without a state
+        ({"yielded": True, "had_control": False}, Mode.YIELD),
+        ({"yielded": True, "had_control": False, "phase": Phase.LAND}, Mode.YIELD),
+        ({"yielded": True, "had_control": False, "plan_status": PlanStatus.NONE, "planless_us": 10**9}, Mode.YIELD),
+        ({"yielded": True, "state_age_us": 300_000}, Mode.BLIND),
         # idle before yield: landing by the autopilot is not a take-over
         ({"phase": Phase.LAND, "mode": FlightMode.LAND}, Mode.IDLE),
         ({"phase": Phase.DONE, "armed": False}, Mode.IDLE),
@@ -107,17 +115,18 @@ def test_a_bad_plan_is_never_flown_whoever_has_control(status: PlanStatus) -> No
         ({"plan_status": PlanStatus.NONE, "last_good_plan_age_us": -1, "planless_us": 10**9}, Mode.LAND),
     ],
 )
-def test_order_of_precedence(changes: dict[str, object], mode: Mode) -> None:
-    assert mode_of(True, **changes) is mode  # type: ignore[arg-type]
+def test_order_of_precedence(changes: dict[str, Any], mode: Mode) -> None:
+    assert mode_of(**changes) is mode
 
 
 def test_every_judgement_says_why() -> None:
     reasons = {
-        judge(replace(GOOD, **change), True, PARAMS).reason  # type: ignore[arg-type]
+        judge(replace(GOOD, **change), PARAMS).reason
         for change in (
             {},
             {"state_age_us": -1},
             {"phase": Phase.ARM},
+            {"yielded": True},
             {"armed": False},
             {"plan_status": PlanStatus.NONE},
             {"plan_status": PlanStatus.NONE, "last_good_plan_age_us": -1},
@@ -125,5 +134,5 @@ def test_every_judgement_says_why() -> None:
             {"plan_status": PlanStatus.NONE, "last_good_plan_age_us": -1, "planless_us": 10**9},
         )
     }
-    assert len(reasons) == 8
+    assert len(reasons) == 9
     assert all(reasons)

@@ -18,11 +18,15 @@ STEPS = 250
 NO_WIND = np.zeros(3)
 
 
-def start(vel: tuple[float, ...], pos: tuple[float, ...] = (0.0, 0.0, -5.0), tilt: tuple[float, ...] = (0.0, 0.0)) -> Start:
+def start(
+    vel: tuple[float, ...], pos: tuple[float, ...] = (0.0, 0.0, -5.0), tilt: tuple[float, ...] = (0.0, 0.0)
+) -> Start:
     return Start(1_000_000, np.array(pos), np.array(vel), 1.0, np.array([*tilt, 9.81]))
 
 
-def brake(vel: tuple[float, ...], at: Array | None = None, wind: Array = NO_WIND, tilt: tuple[float, ...] = (0.0, 0.0)) -> Plan:
+def brake(
+    vel: tuple[float, ...], at: Array | None = None, wind: Array = NO_WIND, tilt: tuple[float, ...] = (0.0, 0.0)
+) -> Plan:
     return rest_plan(start(vel, tilt=tilt), at, wind, DT_US, STEPS)
 
 

@@ -131,6 +131,8 @@ def test_two_bytes_of_poison_cost_their_datagram_and_not_the_following_ones() ->
     received = [m for d in [b"\xfd\xff", *datagrams] for f in frames(d) if (m := codec.decode(f)) is not None]
     assert len(received) == 50
     assert list(frames(b"\xfd\xff" + datagrams[0])) == []
+    assert codec.decode(b"\xfd\xff") is None  # nor does the decoder keep anything for the next frame
+    assert all(codec.decode(datagram) is not None for datagram in datagrams)
 
 
 @pytest.mark.parametrize("cut", range(12 + 9))

@@ -97,9 +97,11 @@ def derivatives(glide: Glide) -> tuple[Array, Array, Array]:
     t_s = t_s[(np.abs(t_s) > 2 * h) & (np.abs(t_s - glide.travel_s) > 2 * h)]
     before, after = glide.sample(t_s - h), glide.sample(t_s + h)
     inside = t_s > 0.0
-    return glide.sample(t_s)[1][inside], ((after[0] - before[0]) / (2 * h))[inside], ((after[1] - before[1]) / (2 * h))[
-        inside
-    ]
+    return (
+        glide.sample(t_s)[1][inside],
+        ((after[0] - before[0]) / (2 * h))[inside],
+        ((after[1] - before[1]) / (2 * h))[inside],
+    )
 
 
 def test_a_glide_begins_as_it_is_and_ends_at_rest_on_its_target() -> None:

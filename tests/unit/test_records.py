@@ -73,7 +73,7 @@ def test_bytes_are_little_endian_packed_and_of_fixed_place() -> None:
     assert struct.unpack_from("<qqI", payload) == (9_000_000_000_001, 1_700_000_000_000_002, 4_000_000_003)
     assert payload[28:32] == bytes([6, 3, 7, 1])  # phase TRACK, mode REPLAY, EXTERNAL, armed
     assert struct.unpack_from("<3d", payload, 36) == (1.1, -2.2, -3.3)
-    # by hand: 20 header, 8 mission, 4 bytes, 4 age, 48 pos vel, 16 q, 24 ref, 16 q, 4 + 4, 12, 3 x 4, 2 + 4, 1, 8, 4, 8, 4
+    # 20 header, 8 mission, 4 bytes, 4 age, 48 pos vel, 16 q, 24 ref, 16 q, 8, 12, 12, 2 + 4, 1, 8, 4, 8, 4
     assert TICK_DTYPE.itemsize == 203
     assert payload[203:205] == b"\x04\x00"
     assert struct.unpack_from("<3f", payload, 205) == (-2.5, -1.5, -0.5)

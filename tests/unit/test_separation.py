@@ -8,6 +8,7 @@ from itertools import product
 import numpy as np
 import pytest
 
+from swarmctl.control.condensed import HalfSpaces
 from swarmctl.control.separation import (
     KeepOut,
     SeparationParams,
@@ -90,7 +91,7 @@ def test_a_moving_obstacle_is_taken_at_constant_velocity_and_seen_only_from_near
     obstacle = Obstacle(np.array([5.0, 0.0, -2.0]), 1.0, 1.75, 3.0, np.array([-1.0, 0.5, 0.0]))
     keep_out = keep_out_of_obstacle(obstacle, 200_000, 2, PARAMS)
     np.testing.assert_allclose(keep_out.pos_ned_m, [[5.0, 0.0, -2.0], [4.8, 0.1, -2.0], [4.6, 0.2, -2.0]])
-    assert (keep_out.radius_m, keep_out.certified_m) == (1.75, pytest.approx(1.65))
+    assert [keep_out.radius_m, keep_out.certified_m] == pytest.approx([1.75, 1.65])
     assert visible([obstacle], np.array([2.001, 0.0, -2.0])) == [obstacle]
     assert visible([obstacle], np.array([2.0, 0.0, -2.0])) == []
     assert visible([obstacle], np.array([5.0, 0.0, 1.0])) == []  # height counts
@@ -154,9 +155,11 @@ def test_control_horizon_as_long_as_the_prediction_leaves_the_end_to_be_judged()
 # -- half-spaces ------------------------------------------------------------------------------------------------------
 
 
-def spaces_of(guess: Array, *keep_outs: KeepOut, tie: int = 0, goal: tuple[float, float] = (0.0, 0.0), **changes: float):  # type: ignore[no-untyped-def]
-    params = PARAMS.model_copy(update=changes)
-    return half_spaces_xy(keep_outs, guess, np.array(goal), np.zeros(2), 0.1, tie, params)
+def spaces_of(guess: Array, *keep_outs: KeepOut, tie: int = 0, goal: tuple[float, float] = (0.0, 0.0)) -> HalfSpaces:
+    """Of an agent at rest."""
+    spaces = half_spaces_xy(keep_outs, guess, np.array(goal), np.zeros(2), 0.1, tie, PARAMS)
+    assert spaces is not None
+    return spaces
 
 
 def still(place: tuple[float, float, float]) -> Array:
@@ -193,7 +196,7 @@ def test_height_difference_relieves_what_must_be_kept_horizontally(height_m: flo
 def test_far_ones_get_no_row() -> None:
     assert np.isneginf(spaces_of(still((4.0, 0.0, 0.0)), fixed((0.0, 0.0, 0.0), 0.8)).offset_m).all()
     assert np.isfinite(spaces_of(still((3.8, 0.0, 0.0)), fixed((0.0, 0.0, 0.0), 0.8)).offset_m).all()
-    assert spaces_of(still((4.0, 0.0, 0.0))) is None
+    assert half_spaces_xy([], still((4.0, 0.0, 0.0)), np.zeros(2), np.zeros(2), 0.1, 0, PARAMS) is None
 
 
 def test_two_at_the_same_place_take_opposite_sides_by_their_numbers() -> None:
@@ -240,7 +243,9 @@ def test_stopping_row_asks_for_the_braking_distance_and_not_when_opening() -> No
 def test_stopping_row_knows_that_the_other_moves_too() -> None:
     other = KeepOut(line((0.0, 0.0, 0.0), (-1.0, 0.0, 0.0)), 0.9, 0.8, False, 1)  # 1 m/s south
     params = PARAMS.model_copy(update={"bias_rad": 0.0})
-    spaces = half_spaces_xy([other], still((-3.0, 0.0, 0.0)), np.array([5.0, 0.0]), np.array([1.8, 0.0]), 0.1, 0, params)
+    spaces = half_spaces_xy(
+        [other], still((-3.0, 0.0, 0.0)), np.array([5.0, 0.0]), np.array([1.8, 0.0]), 0.1, 0, params
+    )
     assert spaces is not None
     assert spaces.stop_s[0] == pytest.approx(2.8 / 2.8)  # closing speed 1.8 + 1.0
     # normal is south (-1, 0): other at its end -1 - 1 s * 1 m/s = -2 -> offset 2 + 0.9

@@ -40,7 +40,7 @@ def test_level_at_hover_thrust() -> None:
 def test_attitudes_by_hand(u_x: float, u_y: float, yaw_deg: float, roll_deg: float, pitch_deg: float) -> None:
     q_nb = setpoint_of(np.array([u_x, u_y, G]), math.radians(yaw_deg), 0.5, 0, MODEL).q_nb
     roll, pitch, yaw = (math.degrees(a) for a in euler_from_quat(q_nb))
-    assert (roll, pitch) == (pytest.approx(roll_deg, abs=1e-9), pytest.approx(pitch_deg, abs=1e-9))
+    assert [roll, pitch] == pytest.approx([roll_deg, pitch_deg], abs=1e-9)
     assert math.cos(math.radians(yaw - yaw_deg)) == pytest.approx(1.0)
 
 
@@ -100,6 +100,8 @@ def test_prediction_applies_each_command_from_when_it_acts() -> None:
     # 50 ms at 2 m/s2 north, then 100 ms at 4 m/s2 east
     np.testing.assert_allclose(vel, [1.1, 0.4, 0.0])
     np.testing.assert_allclose(pos, [1.0 + 0.05 + 0.0025 + 0.11, 0.02, 0.0])
+    before = predictor.predict(state(150_000, (1.0, 0.0, 0.0), (1.0, 0.0, 0.0)), 180_000, np.zeros(3))
+    np.testing.assert_allclose(before[1], [1.06, 0.0, 0.0])  # what acts later does not yet
 
 
 def test_prediction_adds_the_disturbance_to_commands_and_nothing_before_the_first() -> None:

@@ -1,0 +1,230 @@
+"""The phase machine once others decide: pilots, operators, lost plans, silence, found in the air."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from swarmctl.control.sequence import OPERATOR_STOP
+from swarmctl.core.types import FlightMode, Landed, Mode, Phase, Verb
+from tests.unit.sequenced_flight import IN_AIR, ON_GROUND, OURS, START, Flight, controlled, ready, verbs
+
+# -- yielding ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("phase", OURS)
+def test_after_a_pilot_took_over_nothing_is_ever_asked_again(phase: Phase) -> None:
+    flight = controlled(phase)
+    flight.judged, flight.flight_mode = Mode.YIELD, FlightMode.MANUAL
+    assert flight.run(0.1) == []
+    assert not flight.sequence.had_control
+    flight.judged = Mode.STREAM  # without control the judge has nothing to yield any more
+    assert flight.run(120.0) == []  # past every timeout
+    flight.flight_mode = FlightMode.EXTERNAL  # not even when the pilot tries our mode
+    assert flight.run(5.0) == []
+    assert not flight.sequence.had_control
+    flight.armed, flight.landed = False, ON_GROUND
+    assert flight.run(5.0) == []
+    assert (flight.phase, flight.sequence.outcome) == (Phase.DONE, "pilot or autopilot took over")
+
+
+def test_only_the_operator_resumes_and_then_offboard_is_asked_for() -> None:
+    flight = controlled(Phase.TRACK)
+    flight.judged, flight.flight_mode = Mode.YIELD, FlightMode.HOLD
+    flight.run(1.0)
+    flight.judged = Mode.STREAM
+    flight.ask("resume")
+    assert Verb.EXTERNAL in flight.run(1.5)
+    flight.flight_mode = FlightMode.EXTERNAL
+    flight.run(0.1)
+    assert flight.sequence.had_control
+
+
+@pytest.mark.parametrize("verb", ["hold", "land", "rtl"])
+def test_other_verbs_do_not_take_a_vehicle_from_its_pilot(verb: str) -> None:
+    flight = controlled(Phase.TRACK)
+    flight.judged, flight.flight_mode = Mode.YIELD, FlightMode.MANUAL
+    flight.run(0.5)
+    flight.judged = Mode.STREAM
+    flight.ask(verb)
+    assert flight.run(10.0) == []
+
+
+def test_a_pilot_who_takes_over_while_the_autopilot_lands_is_not_fought() -> None:
+    flight = controlled(Phase.GOTO_LAND)
+    flight.pos = START.copy()
+    flight.until(Phase.LAND)
+    flight._obey(flight.step())
+    assert flight.flight_mode is FlightMode.LAND
+    flight.landed, flight.armed = IN_AIR, True
+    flight.run(1.0)
+    flight.flight_mode = FlightMode.MANUAL
+    assert flight.run(10.0) == []
+
+
+# -- operator ---------------------------------------------------------------------------------------------------------
+
+
+def test_hold_stops_where_it_is_and_resume_goes_on_with_the_mission() -> None:
+    flight = controlled(Phase.TRACK)
+    flight.pos, flight.vel = np.array([4.0, 2.0, -2.0]), np.array([1.2, 0.0, 0.0])
+    flight.ask("hold")
+    pos, vel = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([0.0, 60.0]))
+    np.testing.assert_allclose(pos[0], [4.0, 2.0, -2.0])
+    np.testing.assert_allclose(vel, np.array([[1.2, 0.0, 0.0], [0.0, 0.0, 0.0]]))
+    assert pos[1, 0] == pytest.approx(4.0 + 1.2)  # v T / 2 with T = 2 v / a
+    flight.run(30.0)
+    assert flight.at == "TRACK"  # the mission does not end while held
+    flight.ask("resume")
+    flight.run(0.1)
+    assert (flight.phase, flight.sequence.outcome) == (Phase.GOTO_LAND, "completed")
+
+
+@pytest.mark.parametrize(
+    ("verb", "target"), [("land", np.array([4.0, 2.0, -2.0])), ("rtl", START)], ids=["land", "rtl"]
+)
+@pytest.mark.parametrize("phase", [Phase.GOTO_START, Phase.READY, Phase.TRACK])
+def test_land_is_here_and_rtl_is_at_the_start(phase: Phase, verb: str, target: np.ndarray) -> None:
+    flight = controlled(phase)
+    flight.pos = np.array([4.0, 2.0, -2.0])
+    flight.ask(verb)
+    assert (flight.phase, flight.sequence.outcome) == (Phase.GOTO_LAND, OPERATOR_STOP)
+    pos, _ = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([0.0, 60.0]))
+    np.testing.assert_allclose(pos, np.array([np.array([4.0, 2.0, -2.0]), target]), atol=1e-9)
+    flight.pos = target.copy()
+    assert Verb.LAND in flight.run(0.3)
+
+
+def test_stopping_on_the_ground_never_takes_off() -> None:
+    standing = Flight().until(Phase.STANDBY)
+    standing.ask("land")
+    assert standing.at == "DONE"
+    armed = Flight().until(Phase.TAKEOFF)
+    armed.ask("rtl")
+    assert armed.at == "LAND"
+    assert armed.run(0.5) == [Verb.DISARM]
+    armed.armed = False
+    armed.run(0.1)
+    assert armed.at == "DONE"
+
+
+def test_stopping_while_it_climbs_lands_it() -> None:
+    flight = Flight().until(Phase.TAKEOFF)
+    flight.landed, flight.flight_mode = IN_AIR, FlightMode.TAKEOFF
+    flight.ask("land")
+    assert flight.run(1.0) == [Verb.LAND]
+
+
+@pytest.mark.parametrize("verb", ["hold", "resume", "land", "rtl"])
+@pytest.mark.parametrize("phase", [Phase.LAND, Phase.DONE])
+def test_once_landing_verbs_change_nothing(phase: Phase, verb: str) -> None:
+    flight = controlled(Phase.GOTO_LAND)
+    flight.pos = START.copy()
+    flight.until(phase)
+    before = flight.phase, flight.sequence.outcome
+    flight.ask(verb)
+    assert (flight.phase, flight.sequence.outcome) == before
+
+
+# -- what takes too long ----------------------------------------------------------------------------------------------
+
+
+def test_a_start_that_takes_too_long_is_given_up_on_the_ground() -> None:
+    flight = Flight(start_timeout_s=20.0)
+    flight.armable = False
+    flight.run(19.9)
+    assert flight.at == "STANDBY"
+    flight.run(0.5)
+    assert flight.at == "DONE"
+    assert "20 s" in flight.sequence.outcome
+    assert "STANDBY" in flight.sequence.outcome
+
+
+def test_a_start_that_takes_too_long_in_the_air_lands() -> None:
+    flight = ready()
+    assert flight.run(120.0).count(Verb.LAND) > 0
+    assert flight.at == "LAND"
+    assert "READY" in flight.sequence.outcome
+
+
+def test_a_landing_place_that_cannot_be_reached_is_given_up() -> None:
+    flight = controlled(Phase.GOTO_LAND)
+    flight.run(19.0)
+    assert flight.at == "GOTO_LAND"
+    flight.run(2.0)
+    assert flight.at == "LAND"
+
+
+@pytest.mark.parametrize("phase", OURS)
+def test_no_plan_for_too_long_lands(phase: Phase) -> None:
+    flight = controlled(phase)
+    flight.judged = Mode.LAND
+    assert Verb.LAND in flight.run(0.3)
+    assert flight.at == "LAND"
+    assert flight.sequence.outcome
+
+
+# -- found in the air -------------------------------------------------------------------------------------------------
+
+
+def airborne(landed_at_first: Landed = IN_AIR) -> Flight:
+    flight = Flight()
+    flight.armed, flight.pos, flight.landed = True, START.copy(), landed_at_first
+    flight.run(0.2)
+    flight.landed = IN_AIR
+    return flight
+
+
+@pytest.mark.parametrize("landed_at_first", [IN_AIR, Landed.UNKNOWN], ids=["known", "not yet known"])
+def test_a_vehicle_found_in_the_air_is_handed_back_in_the_air(landed_at_first: Landed) -> None:
+    flight = airborne(landed_at_first)
+    asked: list[Verb] = []
+    phases: set[Phase] = set()
+    for _ in range(400):
+        commands = flight.step()
+        phases.add(flight.phase)
+        asked += verbs(commands)
+        flight._obey(commands)
+        if Verb.HOLD in verbs(commands):
+            flight.flight_mode = FlightMode.HOLD
+    assert not {Verb.ARM, Verb.TAKEOFF, Verb.LAND, Verb.DISARM} & set(asked)
+    assert asked[-1] is Verb.HOLD
+    assert Phase.GOTO_LAND not in phases  # where the mission ends, not where it began
+    assert (flight.phase, flight.sequence.outcome) == (Phase.DONE, "completed")
+    assert flight.armed
+
+
+# -- silence on the bus -----------------------------------------------------------------------------------------------
+
+
+def test_when_peers_fall_silent_it_comes_to_rest_and_goes_on_when_they_are_back() -> None:
+    flight = controlled(Phase.TRACK)
+    flight.pos, flight.vel, flight.mute = np.array([4.0, 2.0, -2.0]), np.array([1.2, 0.0, 0.0]), True
+    flight.run(0.1)
+    pos, vel = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([60.0]))
+    np.testing.assert_allclose(pos[0], [5.2, 2.0, -2.0])
+    assert not vel.any()
+    flight.run(60.0)
+    assert flight.at == "TRACK"
+    flight.mute = False
+    flight.run(0.1)
+    assert flight.at == "GOTO_LAND"  # its time was over meanwhile
+
+
+def test_who_is_told_to_land_here_does_not_fly_home_because_the_bus_was_silent_for_a_while() -> None:
+    flight = controlled(Phase.TRACK)
+    here = np.array([4.0, 2.0, -2.0])
+    flight.pos = here.copy()
+    flight.ask("land")
+    flight.mute = True
+    flight.run(1.0)
+    flight.mute = False
+    flight.run(0.1)
+    pos, _ = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([60.0]))
+    np.testing.assert_allclose(pos[0], here, atol=1e-9)
+
+
+def test_silence_does_not_keep_it_in_the_air_for_ever_once_it_goes_home() -> None:
+    flight = controlled(Phase.GOTO_LAND)
+    flight.mute, flight.pos = True, START.copy()
+    assert Verb.LAND in flight.run(25.0)
