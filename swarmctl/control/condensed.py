@@ -120,6 +120,8 @@ class CondensedMpc:
         self._build_response()
         self._build_layout()
         self._build_cost()
+        if slots == 0:  # small: tight tolerances cost less than polishing
+            qp = qp.model_copy(update={"polish": False, "eps": 0.01 * qp.eps, "eps_relative": 0.01 * qp.eps_relative})
         self._solver = OsqpSolver(self._p_pattern, self._a_pattern, qp)
 
     def _build_response(self) -> None:

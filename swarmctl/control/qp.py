@@ -20,7 +20,7 @@ from swarmctl.core.params import Params
 from swarmctl.core.types import Array
 
 INFINITY = 1e20  # what OSQP takes for no bound
-_RHO_AGAIN = 0.1  # solves most problems that crawl with the usual one, and is slower on the rest
+_RUIZ_AGAIN = 10  # scaling passes: solve the problems that crawl without, and are no gain on the rest
 _SOLVED = osqp.SolverStatus.OSQP_SOLVED
 _UNFINISHED = (osqp.SolverStatus.OSQP_SOLVED_INACCURATE, osqp.SolverStatus.OSQP_MAX_ITER_REACHED)
 
@@ -75,16 +75,16 @@ class OsqpSolver:
         if not all(np.isfinite(values).all() for values in (p_values, q, a_values, lower, upper)):
             return QpSolution(None, False, "not finite", 0)  # would poison the next warm start
         if self._solver is None:
-            return self._cold(p_values, q, a_values, lower, upper, self._params.rho)
+            return self._cold(p_values, q, a_values, lower, upper, 0)
         self._solver.update(Px=p_values, q=q, Ax=a_values, l=lower, u=upper)
         solution = self._run()
         if solution.exact:
             return solution
         # neither "infeasible" (false ones are known) nor a crawl from a warm start is trusted: once more from scratch
-        again = self._cold(p_values, q, a_values, lower, upper, _RHO_AGAIN)
+        again = self._cold(p_values, q, a_values, lower, upper, _RUIZ_AGAIN)
         return again if again.exact or solution.x is None else solution
 
-    def _cold(self, p_values: Array, q: Array, a_values: Array, lower: Array, upper: Array, rho: float) -> QpSolution:
+    def _cold(self, p_values: Array, q: Array, a_values: Array, lower: Array, upper: Array, scaling: int) -> QpSolution:
         p, a, params = self._p.copy(), self._a.copy(), self._params
         p.data, a.data = p_values.copy(), a_values.copy()
         self._solver = osqp.OSQP()
@@ -99,11 +99,11 @@ class OsqpSolver:
             eps_rel=params.eps_relative,
             max_iter=params.max_iterations,
             polishing=params.polish,
-            rho=rho,
+            rho=params.rho,
             adaptive_rho=True,
             adaptive_rho_interval=params.adaptive_rho_interval,
             check_termination=params.check_every,
-            scaling=0,
+            scaling=scaling,
             check_dualgap=False,  # with slack rows far from active it never closes; residuals are judged by the caller
             warm_starting=True,
         )

@@ -228,3 +228,28 @@ def test_silence_does_not_keep_it_in_the_air_for_ever_once_it_goes_home() -> Non
     flight = controlled(Phase.GOTO_LAND)
     flight.mute, flight.pos = True, START.copy()
     assert Verb.LAND in flight.run(25.0)
+
+
+def test_in_silence_nobody_declares_itself_ready_or_lands_among_the_others() -> None:
+    on_its_way = controlled(Phase.GOTO_START)
+    on_its_way.mute, on_its_way.pos = True, START.copy()
+    on_its_way.run(5.0)
+    assert on_its_way.at == "GOTO_START"
+    on_its_way.mute = False
+    on_its_way.run(0.2)
+    assert on_its_way.at == "READY"
+    home = controlled(Phase.GOTO_LAND)
+    home.mute, home.pos = True, START.copy()
+    home.run(0.1)  # braking ends where it is
+    home.run(5.0)
+    assert home.at == "GOTO_LAND"
+
+
+def test_taking_over_in_silence_it_stays_where_it_is() -> None:
+    flight = Flight().until(Phase.GOTO_START)
+    flight.mute, flight.pos = True, START + np.array([3.0, 0.0, 0.0])
+    flight.run(0.5)
+    flight.flight_mode = FlightMode.EXTERNAL
+    flight.run(0.2)
+    pos, _ = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([60.0]))
+    np.testing.assert_allclose(pos[0], START + np.array([3.0, 0.0, 0.0]), atol=1e-9)
