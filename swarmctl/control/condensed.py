@@ -75,8 +75,8 @@ class HalfSpaces:
 class AxesSolution:
     """Predicted motion of the axes; `solved` False leaves the arrays at the free response.
 
-    `residual_m` is the largest violation of a half-space or input bound, the latter as the displacement it causes.
-    An unfinished iterate comes as solved: its residual decides.
+    Increments and inputs are within their bounds exactly; `residual_m` is the largest violation of a half-space after
+    that. An unfinished iterate comes as solved: its residual decides.
     """
 
     solved: bool
@@ -334,18 +334,19 @@ class CondensedMpc:
         if x is None:
             held = np.tile(u_prev, (hp, 1))
             return AxesSolution(False, status, iterations, held, free_pos, free_vel, 0.0, np.inf, np.inf)
-        moves = np.clip(x[: self._moves], -1.0, 1.0).reshape(n, hc).T * self._du_max  # (Hc, axes)
+        wanted = np.clip(x[: self._moves], -1.0, 1.0).reshape(n, hc).T * self._du_max  # (Hc, axes)
+        inputs = np.clip(u_prev + np.cumsum(wanted, axis=0), self._u_min, self._u_max)
+        moves = np.diff(inputs, axis=0, prepend=u_prev[None])  # within both bounds, whatever the solver's tolerance
         u = u_prev + self._hold @ moves
         pos = free_pos + (self._phi_pos @ moves) * gain_m_s2
         vel = free_vel + (self._phi_vel @ moves) * gain_m_s2
         soft = len(self._terminals)
-        flown = np.concatenate([np.clip(x[: self._moves], -1.0, 1.0), x[self._moves :]])
+        flown = np.concatenate([(moves / self._du_max).T.ravel(), x[self._moves :]])
         slack = flown[self._moves + soft :] * _SLACK_SCALE_M
         terminal = slice(self._row_terminal, self._row_half, 2)  # their bounds are the error without any move
         gap = np.abs(self._a_dense[terminal, : self._moves] @ flown[: self._moves] - self._lower[terminal])
         shortfall = self._lower[self._row_half :] - self._a_dense[self._row_half :] @ flown
         shortfall = shortfall / np.tile(self._row_scale, self.slots)
-        excess = np.maximum(u - self._u_max, self._u_min - u) * np.abs(gain_m_s2) * self._drop[-1]
         return AxesSolution(
             True,
             status,
@@ -354,6 +355,6 @@ class CondensedMpc:
             pos,
             vel,
             float(slack.max(initial=0.0)),
-            float(max(shortfall.max(initial=0.0), excess.max())),
+            float(shortfall.max(initial=0.0)),
             float(gap.max(initial=0.0)),
         )

@@ -29,9 +29,9 @@ def rest_plan(start: Start, at_ned_m: Array | None, disturbance_ned_m_s2: Array,
             wanted = wanted + _STIFFNESS_1_S2 * (at_ned_m - pos[k])
         accel = np.clip(wanted, -_ACCEL_MAX_M_S2, _ACCEL_MAX_M_S2)
         lift = np.array([0.0, 0.0, GRAVITY_M_S2]) + disturbance_ned_m_s2 - accel  # thrust vector over mass, up is +
-        thrust = float(np.sqrt(lift @ lift))
         slew = _TILT_RATE_1_S * dt_s
-        u = np.clip(lift[:2] / thrust, tilt - slew, tilt + slew)
+        u = np.clip(lift[:2] / float(np.sqrt(lift @ lift)), tilt - slew, tilt + slew)
+        thrust = float(lift[2]) / float(np.sqrt(1.0 - u @ u))  # carries the weight at the tilt that is flown
         virtual[k], tilt = (u[0], u[1], thrust), u
         accel[:2] = disturbance_ned_m_s2[:2] - thrust * u
         pos[k + 1] = pos[k] + dt_s * vel[k] + 0.5 * dt_s * dt_s * accel

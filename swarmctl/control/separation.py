@@ -34,7 +34,7 @@ class SeparationParams(Params):
     gate_m: float = Field(3.0, gt=0, le=1000)  # rows farther than this from being active are left out
     stop_m_s2: float = Field(1.4, gt=0, le=50)  # braking that plans leave room for beyond their horizon
     relax_01: float = Field(0.9, gt=0, le=1)  # share of the reachable displacement a row may ask for
-    bias_rad: float = Field(0.35, ge=0, le=1.2)  # right-hand rule: largest turn of head-on normals
+    bias_rad: float = Field(0.35, ge=0, le=1.2)  # traffic rule: largest turn of head-on normals
     stuck_m: float = Field(0.1, gt=0, le=10)  # a plan that moves less over its horizon gets nowhere
     max_neighbours: int = Field(8, ge=1, le=99)  # nearest ones that get rows
 

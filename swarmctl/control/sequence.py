@@ -21,6 +21,7 @@ from swarmctl.core.types import Array, Command, FlightMode, Landed, Mode, Phase,
 _ASK_EVERY_US = 1_000_000
 _BEGIN_AFTER_US = 1_000_000
 _ODOMETRY_ID, _ATTITUDE_TARGET_ID, _EXTENDED_ID, _ORIGIN_ID = 331, 83, 245, 49
+_OURS = (FlightMode.HOLD, FlightMode.TAKEOFF, FlightMode.EXTERNAL)  # modes nobody but us has asked for
 OPERATOR_STOP = "stopped by the operator"
 
 
@@ -101,6 +102,7 @@ class Sequence:
         self._airborne = False
         self._invited = False  # by an operator's resume, to take control from whoever has it
         self._landing_seen = False
+        self._outcome_before = ""  # it yielded
         self._steps: dict[Phase, Callable[[Facts, VehicleState], list[Command]]] = {
             Phase.STANDBY: self._standby,
             Phase.ARM: self._arm,
@@ -166,23 +168,23 @@ class Sequence:
         elif verb == "resume":
             self.held = False
             if self.yielded:
-                self.yielded, self.outcome, self._invited = False, "", True
+                self.yielded, self.outcome, self._invited = False, self._outcome_before, True
         elif verb in ("land", "rtl"):
             self._stop(verb, now_us, state)
 
     def _yield(self) -> None:
         self.yielded, self.had_control, self._invited = True, False, False
+        self._outcome_before = self.outcome
         self.outcome = "pilot or autopilot took over"
 
     def _stop(self, verb: str, now_us: int, state: VehicleState) -> None:
         self.outcome = self.outcome or OPERATOR_STOP
         if self.phase < Phase.GOTO_START or self.yielded:
-            on_ground = state.landed is Landed.ON_GROUND
-            self.phase = Phase.DONE if on_ground and not state.armed else Phase.LAND
+            self.phase = Phase.LAND  # which is done at once on the ground, disarmed
         elif self.phase < Phase.GOTO_LAND:
             self.phase = Phase.GOTO_LAND
             glide = self._stop_glide(state) if verb == "land" else self._home(state)
-            self._glide = (glide, now_us)
+            self._glide, self._bound_for = (glide, now_us), glide.to_ned_m
         self._entered_us = now_us
 
     def _wait_for_mute_peers(self, facts: Facts, state: VehicleState) -> None:
@@ -264,7 +266,7 @@ class Sequence:
 
     def _ask_for_control(self, facts: Facts, state: VehicleState) -> list[Command]:
         """Control is taken from the autopilot's own hold; from anybody else only after an operator's `resume`."""
-        if state.mode not in (FlightMode.HOLD, FlightMode.TAKEOFF, FlightMode.EXTERNAL) and not self._invited:
+        if state.mode not in _OURS and not self._invited:
             return []
         return [Command(Verb.EXTERNAL)] if self._may_ask(facts) else []
 
@@ -302,16 +304,18 @@ class Sequence:
     def _land(self, facts: Facts, state: VehicleState) -> list[Command]:
         self.had_control = False
         if self._airborne:  # found in the air, handed back in the air
-            if state.mode is FlightMode.HOLD:
+            if state.mode is not FlightMode.EXTERNAL:
                 self._enter(Phase.DONE, facts)
+                return []
             return [Command(Verb.HOLD)] if self._may_ask(facts) else []
-        if state.landed is Landed.ON_GROUND and not state.armed:
+        if state.landed is Landed.ON_GROUND and not state.armed and not facts.busy:
             self._enter(Phase.DONE, facts)
             return []
         if state.mode is FlightMode.LAND:
             self._landing_seen = True
             return []
-        if self._landing_seen and state.landed is not Landed.ON_GROUND:  # a pilot broke the landing off
+        ours = state.mode in _OURS and not self._landing_seen  # else a pilot flies, or broke the landing off
+        if not ours and state.landed is not Landed.ON_GROUND:
             self._yield()
             return []
         if not self._may_ask(facts):
@@ -337,7 +341,7 @@ class Sequence:
         return glide_to(state.pos_ned_m, state.vel_ned_m_s, target_ned_m, p.speed_m_s, p.accel_m_s2)
 
     def _go_home(self, facts: Facts, state: VehicleState) -> None:
-        self._glide = (self._home(state), facts.now_us)
+        self._glide, self._bound_for = (self._home(state), facts.now_us), self._start_ned_m
         self.held = False
         self._enter(Phase.GOTO_LAND, facts)
 

@@ -53,7 +53,11 @@ class Codec:
     def decode(self, frame: bytes) -> Any | None:
         """Message of one frame, or None (counted) when it is not one of ours."""
         try:
-            return self._mav.decode(bytearray(frame))
+            message = self._mav.decode(bytearray(frame))
         except (dialect.MAVError, IndexError, ValueError, KeyError) as error:
             self.refused[type(error).__name__] += 1
             return None
+        if isinstance(message, dialect.MAVLink_unknown):  # its checksum can't be verified
+            self.refused["unknown message"] += 1
+            return None
+        return message

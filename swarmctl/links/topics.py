@@ -37,6 +37,7 @@ OPERATOR = "operator"  # the sender name of launch and of the operator verbs
 
 PATH_VERSION = 1
 MAX_POINTS = 250
+MAX_RADIUS_M = 10.0  # one peer must not ground all others
 _PATH_HEADER = struct.Struct("<2sBBIIIqifBB2x")  # magic ver flags agent boot seq t0 dt radius n hdr_len
 _MAGIC = b"SP"
 _Message = TypeVar("_Message")
@@ -74,7 +75,7 @@ def decode_path(payload: bytes) -> PredictedPath | None:
     if not 2 <= count <= MAX_POINTS or dt_us <= 0 or len(payload) != header_len + 12 * count:
         return None
     points = np.frombuffer(payload, "<f4", 3 * count, header_len).reshape(count, 3).astype(np.float64)
-    if not (np.isfinite(points).all() and math.isfinite(radius_m) and radius_m >= 0.0):
+    if not (np.isfinite(points).all() and math.isfinite(radius_m) and 0.0 <= radius_m <= MAX_RADIUS_M):
         return None
     return PredictedPath(agent, boot_id, seq, t0_utc_us, dt_us, radius_m, points)
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import optimize
 
 from swarmctl.control.condensed import AxesSolution, Axis, CondensedMpc, HalfSpaces, Horizon, Penalties
-from swarmctl.control.qp import QpParams
+from swarmctl.control.qp import OsqpSolver, QpParams, QpSolution
 from swarmctl.core.types import Array
 
 EXACT = QpParams(eps=1e-8, eps_relative=1e-8, max_iterations=20_000)
@@ -283,3 +283,17 @@ def test_the_same_problems_give_the_same_bits() -> None:
         return np.stack([solve_one(problem, 0.1 * k, 0.2, 0.01, math.sin(k)).u for k in range(10)])
 
     np.testing.assert_array_equal(series(), series())
+
+
+def test_a_failure_from_a_warm_start_is_tried_again_from_scratch(monkeypatch: pytest.MonkeyPatch) -> None:
+    one = np.ones((1, 1), bool)
+    solver = OsqpSolver(one, one, QpParams())
+    problem = (np.ones(1), -np.ones(1), np.ones(1), -np.ones(1), np.ones(1))  # minimum of x^2 / 2 - x is at 1
+    assert solver.solve(*problem).exact
+    genuine = solver._run
+    answers = [QpSolution(None, False, "primal infeasible", 10)]
+    monkeypatch.setattr(solver, "_run", lambda: answers.pop() if answers else genuine())
+    again = solver.solve(*problem)
+    assert again.exact
+    assert again.x is not None
+    assert again.x[0] == pytest.approx(1.0, abs=1e-2)

@@ -28,9 +28,10 @@ def test_after_a_pilot_took_over_nothing_is_ever_asked_again(phase: Phase) -> No
     assert (flight.phase, flight.sequence.outcome) == (Phase.DONE, "pilot or autopilot took over")
 
 
-def test_only_the_operator_resumes_and_then_offboard_is_asked_for() -> None:
+@pytest.mark.parametrize("flown", [FlightMode.HOLD, FlightMode.MANUAL], ids=["by the autopilot", "by the pilot"])
+def test_only_the_operator_resumes_and_then_offboard_is_asked_for(flown: FlightMode) -> None:
     flight = controlled(Phase.TRACK)
-    flight.judged, flight.flight_mode = Mode.YIELD, FlightMode.HOLD
+    flight.judged, flight.flight_mode = Mode.YIELD, flown
     flight.run(1.0)
     flight.judged = Mode.STREAM
     flight.ask("resume")
@@ -58,6 +59,19 @@ def test_a_pilot_who_takes_over_while_the_autopilot_lands_is_not_fought() -> Non
     assert flight.flight_mode is FlightMode.LAND
     flight.landed, flight.armed = IN_AIR, True
     flight.run(1.0)
+    flight.flight_mode = FlightMode.MANUAL
+    assert flight.run(10.0) == []
+
+
+@pytest.mark.parametrize("phase", [Phase.TAKEOFF, Phase.GOTO_START])
+def test_a_pilot_who_flies_before_the_mission_is_not_landed_by_its_time_out(phase: Phase) -> None:
+    flight = Flight().until(phase)
+    flight.flight_mode, flight.landed, flight.pos = FlightMode.MANUAL, IN_AIR, START.copy()
+    assert flight.run(120.0) == []
+
+
+def test_a_pilot_who_takes_over_while_it_is_handed_back_in_the_air_is_not_put_on_hold() -> None:
+    flight = airborne().until(Phase.LAND)
     flight.flight_mode = FlightMode.MANUAL
     assert flight.run(10.0) == []
 
@@ -98,6 +112,7 @@ def test_land_is_here_and_rtl_is_at_the_start(phase: Phase, verb: str, target: n
 def test_stopping_on_the_ground_never_takes_off() -> None:
     standing = Flight().until(Phase.STANDBY)
     standing.ask("land")
+    assert standing.run(0.1) == []
     assert standing.at == "DONE"
     armed = Flight().until(Phase.TAKEOFF)
     armed.ask("rtl")
@@ -218,6 +233,18 @@ def test_who_is_told_to_land_here_does_not_fly_home_because_the_bus_was_silent_f
     flight.ask("land")
     flight.mute = True
     flight.run(1.0)
+    flight.mute = False
+    flight.run(0.1)
+    pos, _ = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([60.0]))
+    np.testing.assert_allclose(pos[0], here, atol=1e-9)
+
+
+def test_who_is_told_in_silence_to_land_here_lands_here() -> None:
+    flight = controlled(Phase.TRACK)
+    here = np.array([4.0, 2.0, -2.0])
+    flight.pos, flight.mute = here.copy(), True
+    flight.run(1.0)
+    flight.ask("land")
     flight.mute = False
     flight.run(0.1)
     pos, _ = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([60.0]))

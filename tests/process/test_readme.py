@@ -1,0 +1,124 @@
+"""Every command README.md shows is run as it stands, shortened only by `--duration` and kept off the screen."""
+
+from __future__ import annotations
+
+import os
+import re
+import shlex
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.process
+
+ROOT = Path(__file__).parents[2]
+SHOWN = [line.strip() for line in (ROOT / "README.md").read_text().splitlines() if line.startswith("    ")]
+BIN = Path(sys.executable).parent
+WHILE_FLYING = ("status", "hold", "resume", "obstacle", "land")
+AFTERWARDS = ("report", "replay")
+
+
+def shown(pattern: str) -> list[str]:
+    return [line for line in SHOWN if re.search(pattern, line)]
+
+
+def run(line: str, *more: str, timeout_s: float = 170.0) -> subprocess.CompletedProcess[str]:
+    command, *arguments = shlex.split(line)
+    return subprocess.run(
+        [str(BIN / command), *arguments, *more],
+        cwd=ROOT,
+        env=environment(),
+        capture_output=True,
+        text=True,
+        timeout=timeout_s,
+        check=False,
+    )
+
+
+def environment() -> dict[str, str]:
+    return {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
+
+
+def test_nothing_is_shown_that_is_not_run() -> None:
+    run_here = shown(r"^swarmctl (launch|simulate) ") + shown(rf"^swarmctl ({'|'.join(WHILE_FLYING + AFTERWARDS)})\b")
+    run_here += shown(r"^python -m sitl ") + shown(r"^python3 -m venv ")
+    assert sorted(run_here) == sorted(SHOWN)
+
+
+def test_the_two_set_up_lines_install_what_they_use() -> None:
+    """Their flight and their tests are run by everything else here and by .ci/run; here: that the parts exist."""
+    fly, test = SHOWN[:2]
+    for line in (fly, test):
+        assert line.startswith("python3 -m venv .venv && .venv/bin/pip install -q -c constraints.txt ")
+    assert fly.endswith("&& .venv/bin/swarmctl launch --agents 3")
+    assert test.endswith("&& .venv/bin/python -m pytest -q -n 2 --dist worksteal")
+    assert "://" not in (ROOT / "constraints.txt").read_text()
+
+
+@pytest.mark.parametrize("line", shown(r"^swarmctl simulate "))
+def test_simulations(line: str, tmp_path: Path) -> None:
+    done = run(line, "--duration", "2", "--run-dir", str(tmp_path / "run"))
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "x real time" in done.stdout
+
+
+def test_a_launch_its_operator_and_what_is_left(tmp_path: Path) -> None:
+    (line,) = shown(r"^swarmctl launch --agents 3$")
+    directory = tmp_path / "run"
+    command, *arguments = shlex.split(line)
+    flying = subprocess.Popen(
+        [str(BIN / command), *arguments, "--no-view", "--duration", "60", "--run-dir", str(directory)],
+        cwd=ROOT,
+        env=environment() | {"TMPDIR": str(tmp_path)} if len(str(tmp_path)) < 40 else environment(),
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    try:
+        assert flying.stdout is not None
+        for said in flying.stdout:
+            if "TRACK" in said:
+                break
+        for verb in WHILE_FLYING:
+            (order,) = shown(rf"^swarmctl {verb}\b")
+            done = run(order, "--run-dir", str(directory))
+            assert done.returncode == 0, f"{order}: {done.stdout}{done.stderr}"
+            time.sleep(0.5)
+        rest = flying.stdout.read()
+        assert flying.wait(100) == 130, rest
+    finally:
+        flying.kill()
+    (report,) = shown(r"^swarmctl report ")
+    (directory / "report.html").unlink()
+    assert run(report.replace("runs/DIR", str(directory))).returncode == 0
+    assert (directory / "report.html").exists()
+    (replay,) = shown(r"^swarmctl replay ")
+    refused = run(replay.replace("runs/DIR", str(directory)))
+    assert refused.returncode == 3
+    assert "no display" in refused.stderr
+
+
+@pytest.mark.parametrize("line", shown(r"^swarmctl launch configs/thesis"))
+def test_launches_of_built_in_vehicles(line: str, tmp_path: Path) -> None:
+    done = run(line, "--no-view", "--duration", "1", "--run-dir", str(tmp_path / "run"))
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def test_vehicles_that_somebody_else_runs(tmp_path: Path) -> None:
+    (simulator,) = shown(r"^python -m sitl ")
+    (line,) = shown(r"^swarmctl launch configs/px4_udp")
+    command, *arguments = shlex.split(simulator)
+    vehicles = subprocess.Popen(
+        [str(BIN / command), *arguments], cwd=ROOT, stdout=subprocess.PIPE, text=True, start_new_session=True
+    )
+    try:
+        assert vehicles.stdout is not None
+        ports = [int(re.findall(r"1\d{4}", vehicles.stdout.readline())[-1]) for _ in range(3)]
+        urls = [f"--set=vehicles.{i}.url=udpin://127.0.0.1:{port}" for i, port in enumerate(ports)]
+        done = run(line, "--no-view", "--duration", "2", "--run-dir", str(tmp_path / "run"), *urls)
+        assert done.returncode == 0, done.stdout + done.stderr
+    finally:
+        vehicles.terminate()
+        vehicles.wait(10)

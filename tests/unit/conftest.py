@@ -1,0 +1,8 @@
+"""Property tests judge answers, not the speed of a shared machine."""
+
+from __future__ import annotations
+
+from hypothesis import settings
+
+settings.register_profile("unit", deadline=None)
+settings.load_profile("unit")
