@@ -10,7 +10,7 @@ from collections import Counter, deque
 from collections.abc import Callable
 from typing import Any
 
-from pymavlink.dialects.v20 import common as mav
+from pymavlink.dialects.v20 import development as mav
 
 from sitl.autopilot import FORCE, Autopilot
 from sitl.modes import Px4Mode, Result, Severity

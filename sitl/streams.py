@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from pymavlink.dialects.v20 import common as mav
+from pymavlink.dialects.v20 import development as mav
 
 from sitl.autopilot import Autopilot
 from sitl.sensors import Estimate, LocalOrigin
@@ -41,6 +41,10 @@ class Report:
 def heartbeat(r: Report) -> Any:
     pilot = r.autopilot
     return mav.MAVLink_heartbeat_message(2, 12, pilot.base_mode(), pilot.mode, pilot.system_status(r.estimate.t_us), 3)
+
+
+def current_mode(r: Report) -> Any:
+    return mav.MAVLink_current_mode_message(0, r.autopilot.mode, r.autopilot.intended)
 
 
 def sys_status(r: Report) -> Any:
@@ -200,6 +204,7 @@ STREAMS: dict[int, Stream] = {
     mav.MAVLINK_MSG_ID_ATTITUDE_TARGET: Stream(attitude_target, 10.0),
     mav.MAVLINK_MSG_ID_SERVO_OUTPUT_RAW: Stream(servo_output, 10.0),
     mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: Stream(extended_sys_state, 5.0),
+    mav.MAVLINK_MSG_ID_CURRENT_MODE: Stream(current_mode, 0.5),
     mav.MAVLINK_MSG_ID_BATTERY_STATUS: Stream(battery_status, 0.5),
     mav.MAVLINK_MSG_ID_ESTIMATOR_STATUS: Stream(estimator_status, 1.0),
     mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION: Stream(autopilot_version, 0.0),

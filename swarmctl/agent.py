@@ -156,7 +156,7 @@ class Agent:
 
     def ask(self, verb: str, now_us: int) -> None:
         """An operator's wish: hold, resume, land, rtl."""
-        self._sequence.operator(verb, now_us, self._autopilot.poll(now_us))
+        self._sequence.operator(verb, now_us, self._clock.utc_us(), self._autopilot.poll(now_us))
         self._note("operator", verb=verb)
 
     def tick(self, now_us: int, late_ticks: int) -> TickRecord:
@@ -257,7 +257,7 @@ class Agent:
         steps, dt_us, params = self._controller.steps, self._controller.dt_us, self._setup.separation
         utc_us = self._utc(act_us)
         found = [
-            keep_out_of_peer(path, utc_us, dt_us, steps, self._parked(path.agent), params)
+            keep_out_of_peer(path, utc_us, dt_us, steps, params, self._parked(path.agent), self._landing(path.agent))
             for path in self._paths.latest()
         ]
         seen = visible(self._obstacles, state.pos_ned_m)[: self._setup.obstacle_slots]
@@ -266,6 +266,11 @@ class Agent:
     def _parked(self, agent: int) -> bool:
         status = self._peer_status.get(agent)
         return status is not None and status.phase == Phase.DONE
+
+    def _landing(self, agent: int) -> bool:
+        status = self._peer_status.get(agent)
+        descending = status is not None and status.phase == Phase.LAND
+        return descending or self._sequence.phase is Phase.GOTO_LAND
 
     # -- judge, act ---------------------------------------------------------------------------------------------------
 
@@ -278,8 +283,8 @@ class Agent:
         elif plan is not None:
             self._reporter.failed_plans += 1
             self._problem = f"plan {plan.status.name.lower()}"
-            if self._good is not None and certify(self._shifted(self._good, plan.t0_us), thought.keep_outs, 0) < 0.0:
-                self._good = None  # what is known now rules the old plan out as well
+            if self._good is not None and not self._still_certified(self._good, plan.t0_us, thought.keep_outs):
+                self._good = None
         delay_us = self._predictor.delay_us
         health = Health(
             _NOTHING_US if state is None else max(0, now_us - state.t_us),
@@ -296,6 +301,18 @@ class Agent:
             self._sequence.yielded,
         )
         self._judgement = judge(health, self._setup.params.failsafe)
+
+    def _still_certified(self, good: Plan, t0_us: int, keep_outs: list[KeepOut]) -> bool:
+        """Whether an old plan is allowed by what is known now.
+
+        Of peers, who re-plan, only what is left to replay counts; towards an obstacle it must not lead at all.
+        """
+        path = self._shifted(good, t0_us)
+        left_us = round(self._setup.params.failsafe.replay_s * 1e6) - (t0_us - good.t0_us)
+        steps = max(1, left_us // self._controller.dt_us)
+        if certify(path, [k for k in keep_outs if k.tie < 0], 0) < 0.0:
+            return False
+        return certify(path, [k for k in keep_outs if k.tie >= 0], 0, steps) >= 0.0
 
     def _flown(self, state: VehicleState | None, thought: Thought) -> Plan | None:
         """The plan whose first input is sent and whose path is shared; None when the autopilot flies."""
@@ -381,10 +398,16 @@ class Agent:
         return align(self._path(plan), self._utc(t0_us), self._controller.dt_us, steps, brake_m_s2)
 
     def _coasting(self, state: VehicleState) -> PredictedPath:
-        """Somebody else flies: the own velocity, continued."""
-        t_s = np.arange(self._controller.steps + 1)[:, None] * (self._controller.dt_us * 1e-6)
-        pos = state.pos_ned_m + t_s * state.vel_ned_m_s
-        utc_us, dt_us = self._utc(state.t_us), self._controller.dt_us
+        """Somebody else flies: the own velocity, continued, or braked where the autopilot is about to stop."""
+        steps, dt_us = self._controller.steps, self._controller.dt_us
+        t_s = np.arange(steps + 1) * (dt_us * 1e-6)
+        if state.mode in (FlightMode.HOLD, FlightMode.LAND):
+            speed = math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s))
+            brake_m_s2 = self._setup.separation.brake_m_s2
+            t_s = np.minimum(t_s, speed / brake_m_s2)
+            t_s = t_s - 0.5 * brake_m_s2 * t_s * t_s / max(speed, 1e-6)  # of the present speed, for the same way
+        pos = state.pos_ned_m + t_s[:, None] * state.vel_ned_m_s
+        utc_us = self._utc(state.t_us)
         return PredictedPath(self._setup.agent, self._setup.boot_id, self._reporter.seq, utc_us, dt_us, 0.0, pos)
 
     def _peer_facts(self) -> dict[int, PeerFacts]:

@@ -32,7 +32,7 @@ class SeparationParams(Params):
     brake_m_s2: float = Field(3.0, gt=0, le=50)  # how a peer is assumed to stop beyond its prediction
     lost_after_s: float = Field(0.5, gt=0, le=60)  # from this age on a peer is kept clear of at every height
     gate_m: float = Field(3.0, gt=0, le=1000)  # rows farther than this from being active are left out
-    stop_m_s2: float = Field(1.4, gt=0, le=50)  # braking that plans leave room for beyond their horizon
+    stop_m_s2: float = Field(1.0, gt=0, le=50)  # braking that plans leave room for beyond their horizon
     relax_01: float = Field(0.9, gt=0, le=1)  # share of the reachable displacement a row may ask for
     bias_rad: float = Field(0.35, ge=0, le=1.2)  # traffic rule: largest turn of head-on normals
     stuck_m: float = Field(0.1, gt=0, le=10)  # a plan that moves less over its horizon gets nowhere
@@ -74,9 +74,23 @@ def align(path: PredictedPath, t0_utc_us: int, dt_us: int, steps: int, brake_m_s
 
 
 def keep_out_of_peer(
-    path: PredictedPath, t0_utc_us: int, dt_us: int, steps: int, parked: bool, params: SeparationParams
+    path: PredictedPath,
+    t0_utc_us: int,
+    dt_us: int,
+    steps: int,
+    params: SeparationParams,
+    parked: bool = False,
+    landing: bool = False,
 ) -> KeepOut:
-    """What to stay clear of because of one peer; `parked` peers have landed and do not grow with age."""
+    """What to stay clear of because of one peer.
+
+    Args:
+        path: the peer's newest.
+        t0_utc_us, dt_us, steps: the own prediction's times.
+        params: distance and margins.
+        parked: it has landed, so its path does not grow with age.
+        landing: it or we are about to descend, so it is kept clear of at every height.
+    """
     age_s = max(0.0, (t0_utc_us - path.t0_utc_us) * 1e-6)
     margin_m = 0.0 if parked else min(0.5 * params.age_accel_m_s2 * age_s * age_s, params.age_margin_max_m)
     radius_m = params.radius_m + path.radius_m + margin_m
@@ -84,7 +98,7 @@ def keep_out_of_peer(
         align(path, t0_utc_us, dt_us, steps, params.brake_m_s2),
         radius_m,
         params.radius_m + path.radius_m - params.certify_slack_m,
-        age_s > params.lost_after_s and not parked,
+        landing or (age_s > params.lost_after_s and not parked),
         path.agent,
     )
 
@@ -164,13 +178,14 @@ def _turned(normal: Array, distance: Array, needed: Array, to_goal: Array, angle
     return np.stack([c * normal[:, :, 0] - s * normal[:, :, 1], s * normal[:, :, 0] + c * normal[:, :, 1]], axis=2)
 
 
-def certify(path_ned_m: Array, keep_outs: Sequence[KeepOut], from_step: int) -> float:
+def certify(path_ned_m: Array, keep_outs: Sequence[KeepOut], from_step: int, to_step: int | None = None) -> float:
     """Smallest margin [m] of a planned path against everything known, over true distances between samples too.
 
     Args:
         path_ned_m: (Hp+1, 3) own plan.
         keep_outs: aligned with it.
         from_step: steps before this one can't be changed by the plan any more.
+        to_step: the last one that will be flown; None for the whole path.
 
     Returns:
         min over keep-outs of (distance - certified distance); where a keep-out is violated now already, a path that
@@ -187,7 +202,7 @@ def certify(path_ned_m: Array, keep_outs: Sequence[KeepOut], from_step: int) -> 
     closest = apart[:, :-1] + nearest[:, :, None] * step  # closest point of each relative segment to the origin
     distance = np.sqrt(np.einsum("mkc,mkc->mk", closest, closest))  # (m, Hp)
     now = np.sqrt(np.einsum("mc,mc->m", apart[:, 0], apart[:, 0]))
-    later = distance[:, min(from_step, distance.shape[1] - 1) :].min(axis=1)
+    later = distance[:, min(from_step, distance.shape[1] - 1) : to_step].min(axis=1)
     allowed = np.array([k.certified_m for k in keep_outs])
     margin = np.where((now < allowed) & (later >= now - 0.02), 0.0, later - allowed)
     return float(margin.min())

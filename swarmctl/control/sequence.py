@@ -19,8 +19,9 @@ from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Command, FlightMode, Landed, Mode, Phase, VehicleState, Verb
 
 _ASK_EVERY_US = 1_000_000
+_SETTLE_S = 2.0
 _BEGIN_AFTER_US = 1_000_000
-_ODOMETRY_ID, _ATTITUDE_TARGET_ID, _EXTENDED_ID, _ORIGIN_ID = 331, 83, 245, 49
+_ODOMETRY_ID, _ATTITUDE_TARGET_ID, _EXTENDED_ID, _CURRENT_MODE_ID, _ORIGIN_ID = 331, 83, 245, 436, 49
 _OURS = (FlightMode.HOLD, FlightMode.TAKEOFF, FlightMode.EXTERNAL)  # modes nobody but us has asked for
 OPERATOR_STOP = "stopped by the operator"
 
@@ -93,6 +94,7 @@ class Sequence:
         self.waiting = False  # for mute peers
         self._bound_for = start_ned_m  # before it had to wait
         self._glide: tuple[Glide, int] | None = None  # and when it began
+        self._rejoin: tuple[Glide, int] | None = None  # the same, of the offset to the mission's reference
         self._entered_us = 0
         self._born_us: int | None = None
         self._asked_us = -_ASK_EVERY_US
@@ -102,6 +104,7 @@ class Sequence:
         self._airborne = False
         self._invited = False  # by an operator's resume, to take control from whoever has it
         self._landing_seen = False
+        self._lands_here = False  # where it comes to rest, instead of on the start
         self._outcome_before = ""  # it yielded
         self._steps: dict[Phase, Callable[[Facts, VehicleState], list[Command]]] = {
             Phase.STANDBY: self._standby,
@@ -146,7 +149,12 @@ class Sequence:
     def reference(self, utc_us: int, now_us: int, offsets_s: Array) -> tuple[Array, Array]:
         """Where to be, (K, 3) and (K, 3), at `offsets_s` (K,) from now."""
         if self.phase is Phase.TRACK and not (self.held or self.waiting) and self.begin_utc_us is not None:
-            return self._reference.sample((utc_us - self.begin_utc_us) * 1e-6 + offsets_s)
+            pos, vel = self._reference.sample((utc_us - self.begin_utc_us) * 1e-6 + offsets_s)
+            if self._rejoin is not None:
+                glide, began_us = self._rejoin
+                offset, drift = glide.sample((now_us - began_us) * 1e-6 + offsets_s)
+                pos, vel = pos + offset, vel + drift
+            return pos, vel
         if self._glide is not None:
             glide, began_us = self._glide
             return glide.sample((now_us - began_us) * 1e-6 + offsets_s)
@@ -158,7 +166,7 @@ class Sequence:
             return math.nan
         return (utc_us - self.begin_utc_us) * 1e-6
 
-    def operator(self, verb: str, now_us: int, state: VehicleState | None) -> None:
+    def operator(self, verb: str, now_us: int, utc_us: int, state: VehicleState | None) -> None:
         """Apply hold, resume, land or rtl."""
         if state is None or self.phase in (Phase.LAND, Phase.DONE):
             return
@@ -166,6 +174,8 @@ class Sequence:
             self.held = True
             self._glide = (self._stop_glide(state), now_us)
         elif verb == "resume":
+            if self.held or self.yielded:
+                self._go_on(now_us, utc_us, state)
             self.held = False
             if self.yielded:
                 self.yielded, self.outcome, self._invited = False, self._outcome_before, True
@@ -183,7 +193,8 @@ class Sequence:
             self.phase = Phase.LAND  # which is done at once on the ground, disarmed
         elif self.phase < Phase.GOTO_LAND:
             self.phase = Phase.GOTO_LAND
-            glide = self._stop_glide(state) if verb == "land" else self._home(state)
+            self._lands_here = verb == "land"
+            glide = self._stop_glide(state) if self._lands_here else self._home(state)
             self._glide, self._bound_for = (glide, now_us), glide.to_ned_m
         self._entered_us = now_us
 
@@ -200,6 +211,16 @@ class Sequence:
                 self._glide = (self._way_to(self._bound_for, state), facts.now_us)
             elif self.held:
                 self._glide = (self._stop_glide(state), facts.now_us)
+            else:
+                self._go_on(facts.now_us, facts.utc_us, state)
+
+    def _go_on(self, now_us: int, utc_us: int, state: VehicleState) -> None:
+        """Close in smoothly on the mission's reference, which has moved on: a jump would have all race to one point."""
+        if self.phase is not Phase.TRACK or self.begin_utc_us is None:
+            return
+        pos, vel = self._reference.sample(np.array([(utc_us - self.begin_utc_us) * 1e-6]))
+        p, offset, drift = self._params, state.pos_ned_m - pos[0], state.vel_ned_m_s - vel[0]
+        self._rejoin = (glide_to(offset, drift, np.zeros(3), p.speed_m_s, p.accel_m_s2), now_us)
 
     def _stop_glide(self, state: VehicleState) -> Glide:
         return brake_to_rest(state.pos_ned_m, state.vel_ned_m_s, self._params.accel_m_s2)
@@ -219,6 +240,7 @@ class Sequence:
                 Command(Verb.RATE, self._params.state_rate_hz, _ODOMETRY_ID),
                 Command(Verb.RATE, 5.0, _ATTITUDE_TARGET_ID),
                 Command(Verb.RATE, 10.0, _EXTENDED_ID),
+                Command(Verb.RATE, 25.0, _CURRENT_MODE_ID),
             ]
             return rates + [
                 Command(Verb.PARAM_INT, number=v, name=k)
@@ -295,9 +317,8 @@ class Sequence:
         return []
 
     def _goto_land(self, facts: Facts, state: VehicleState) -> list[Command]:
-        target = self._glide[0].to_ned_m if self._glide else state.pos_ned_m
         waited_us = facts.now_us - self._entered_us
-        if (self._arrived(state, target) and not self.waiting) or waited_us > self._params.land_timeout_s * 1e6:
+        if (self._may_land(facts, state) and not self.waiting) or waited_us > self._params.land_timeout_s * 1e6:
             self._enter(Phase.LAND, facts)
         return []
 
@@ -325,6 +346,16 @@ class Sequence:
     def _arrived(self, state: VehicleState, target: Array) -> bool:
         speed = math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s))
         return math.dist(state.pos_ned_m, target) < self._params.arrive_m and speed < self._params.arrive_m_s
+
+    def _may_land(self, facts: Facts, state: VehicleState) -> bool:
+        """On the landing place; who lands where it is may have been pushed aside, and has to be at rest only."""
+        if self._glide is None:
+            return True
+        glide, began_us = self._glide
+        if not self._lands_here:
+            return self._arrived(state, glide.to_ned_m)
+        settled = facts.now_us - began_us > (glide.travel_s + _SETTLE_S) * 1e6
+        return settled and self._arrived(state, state.pos_ned_m)
 
     def _take_control(self, facts: Facts, state: VehicleState) -> None:
         if self.had_control:

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pymap3d
-from pymavlink.dialects.v20 import common as dialect
+from pymavlink.dialects.v20 import development as dialect
 
 from swarmctl.core.frames import rotate_to_ned
 from swarmctl.core.types import Array, AttitudeSetpoint, FlightMode, Landed, VehicleState
@@ -151,6 +151,7 @@ class Autopilot:
         self._boot_offset_us: int | None = None
         self._handlers: dict[str, Callable[[Any, int], None]] = {
             "HEARTBEAT": self._heartbeat,
+            "CURRENT_MODE": self._current_mode,
             "ODOMETRY": self._odometry,
             "ATTITUDE_QUATERNION": self._attitude_quaternion,
             "LOCAL_POSITION_NED": self._local_position,
@@ -221,6 +222,11 @@ class Autopilot:
         self.armed = bool(message.base_mode & _ARMED_FLAG)
         self.failsafe = message.system_status >= _CRITICAL
         self.mode = self.dialect.modes.get(message.custom_mode, FlightMode.MANUAL)
+
+    def _current_mode(self, message: Any, arrived_us: int) -> None:
+        """The same as in HEARTBEAT, but fast: a pilot's switch must not stay unseen for a second."""
+        if self.dialect is not None:
+            self.mode = self.dialect.modes.get(message.custom_mode, FlightMode.MANUAL)
 
     def _odometry(self, message: Any, arrived_us: int) -> None:
         if message.frame_id != _LOCAL_NED or message.child_frame_id not in (_LOCAL_NED, *_BODY_FRD):

@@ -13,7 +13,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
-from pymavlink.dialects.v20 import common as dialect
+from pymavlink.dialects.v20 import development as dialect
 
 from swarmctl.core.types import Command, Verb
 from swarmctl.links.mavlink import Codec

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pymavlink.dialects.v20 import common as mav
+from pymavlink.dialects.v20 import development as mav
 
 from swarmctl.core.records import TRUTH_DTYPE
 from swarmctl.links.mavlink import Codec, frames

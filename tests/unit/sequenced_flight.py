@@ -78,7 +78,7 @@ class Flight:
         self.peers[1] = PeerFacts(phase, ready_utc_us, alive)
 
     def ask(self, verb: str) -> None:
-        self.sequence.operator(verb, self.now_us, self.state)
+        self.sequence.operator(verb, self.now_us, self.utc_us, self.state)
 
     def until(self, phase: Phase) -> Flight:
         """Fly on, all going well, until a phase is reached."""

@@ -12,7 +12,7 @@ import pymap3d
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from pymavlink.dialects.v20 import common as dialect
+from pymavlink.dialects.v20 import development as dialect
 
 from swarmctl.core.clock import SimClock
 from swarmctl.core.types import AttitudeSetpoint, FlightMode, Landed

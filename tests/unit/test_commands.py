@@ -7,7 +7,7 @@ import struct
 from typing import Any
 
 import pytest
-from pymavlink.dialects.v20 import common as dialect
+from pymavlink.dialects.v20 import development as dialect
 
 from swarmctl.core.types import Command, Verb
 from swarmctl.links.autopilot import ARDUCOPTER, PX4

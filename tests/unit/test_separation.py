@@ -75,14 +75,14 @@ def test_keep_out_grows_with_age_to_its_cap_and_a_lost_peer_is_a_cylinder(
 ) -> None:
     at_us = UTC_US + round(age_s * 1e6)
     path = peer(np.zeros((3, 3)), radius_m=0.25, agent=4)
-    keep_out = keep_out_of_peer(path, at_us, DT_US, STEPS, False, PARAMS)
+    keep_out = keep_out_of_peer(path, at_us, DT_US, STEPS, PARAMS)
     assert keep_out.radius_m == pytest.approx(0.9 + 0.25 + margin_m)
     assert keep_out.certified_m == pytest.approx(0.9 + 0.25 - 0.1)
     assert (keep_out.any_height, keep_out.tie) == (any_height, 4)
 
 
 def test_a_peer_that_has_landed_is_kept_clear_of_but_does_not_grow() -> None:
-    keep_out = keep_out_of_peer(peer(np.zeros((3, 3))), UTC_US + 600_000_000, DT_US, STEPS, True, PARAMS)
+    keep_out = keep_out_of_peer(peer(np.zeros((3, 3))), UTC_US + 600_000_000, DT_US, STEPS, PARAMS, parked=True)
     assert keep_out.radius_m == pytest.approx(0.9)
     assert not keep_out.any_height
 

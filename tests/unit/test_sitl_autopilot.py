@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pymavlink.dialects.v20 import common as mav
+from pymavlink.dialects.v20 import development as mav
 
 from sitl.modes import MavState, OffboardLoss, Px4Mode, Result
 from sitl.world import SitlParams, SitlWorld

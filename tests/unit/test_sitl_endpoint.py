@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pymap3d
 import pytest
-from pymavlink.dialects.v20 import common as mav
+from pymavlink.dialects.v20 import development as mav
 
 from sitl.parameters import DEFAULTS, INT32, REAL32, Parameters, int_from_wire, int_to_wire
 from sitl.sensors import GeoPoint, local_origin
