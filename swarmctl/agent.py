@@ -283,7 +283,8 @@ class Agent:
         elif plan is not None:
             self._reporter.failed_plans += 1
             self._problem = f"plan {plan.status.name.lower()}"
-            if self._good is not None and not self._still_certified(self._good, plan.t0_us, thought.keep_outs):
+            assert thought.start is not None
+            if self._good is not None and not self._worth_replaying(self._good, thought.start, thought.keep_outs):
                 self._good = None
         delay_us = self._predictor.delay_us
         health = Health(
@@ -302,17 +303,14 @@ class Agent:
         )
         self._judgement = judge(health, self._setup.params.failsafe)
 
-    def _still_certified(self, good: Plan, t0_us: int, keep_outs: list[KeepOut]) -> bool:
-        """Whether an old plan is allowed by what is known now.
+    def _worth_replaying(self, good: Plan, start: Start, keep_outs: list[KeepOut]) -> bool:
+        """Whether an old plan is still certified by what is known now, or at least comes less close than braking."""
+        replayed = certify(self._shifted(good, start.t_us), keep_outs, 0)
+        return replayed >= 0.0 or replayed >= certify(self._rest(start).pos_ned_m, keep_outs, 0)
 
-        Of peers, who re-plan, only what is left to replay counts; towards an obstacle it must not lead at all.
-        """
-        path = self._shifted(good, t0_us)
-        left_us = round(self._setup.params.failsafe.replay_s * 1e6) - (t0_us - good.t0_us)
-        steps = max(1, left_us // self._controller.dt_us)
-        if certify(path, [k for k in keep_outs if k.tie < 0], 0) < 0.0:
-            return False
-        return certify(path, [k for k in keep_outs if k.tie >= 0], 0, steps) >= 0.0
+    def _rest(self, start: Start) -> Plan:
+        disturbance = self._observer.estimate.disturbance_ned_m_s2
+        return rest_plan(start, self._hold_at, disturbance, self._controller.dt_us, self._controller.steps)
 
     def _flown(self, state: VehicleState | None, thought: Thought) -> Plan | None:
         """The plan whose first input is sent and whose path is shared; None when the autopilot flies."""
@@ -328,8 +326,7 @@ class Agent:
         if mode in (Mode.BRAKE, Mode.HOLD):
             if mode is Mode.HOLD and self._hold_at is None:
                 self._hold_at = state.pos_ned_m
-            disturbance = self._observer.estimate.disturbance_ned_m_s2
-            return rest_plan(thought.start, self._hold_at, disturbance, self._controller.dt_us, self._controller.steps)
+            return self._rest(thought.start)
         return None
 
     def _act(self, now_us: int, flown: Plan | None) -> AttitudeSetpoint | None:

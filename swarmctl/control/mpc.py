@@ -22,7 +22,7 @@ from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Plan, PlanStatus, Reference
 
-RESIDUAL_LIMIT_M = 0.02  # a solution that misses a constraint by more is not a solution
+RESIDUAL_LIMIT_M = 0.05  # a solution that misses a constraint by more is none; the certificate judges the rest
 
 
 class AxisWeights(Params):

@@ -178,14 +178,13 @@ def _turned(normal: Array, distance: Array, needed: Array, to_goal: Array, angle
     return np.stack([c * normal[:, :, 0] - s * normal[:, :, 1], s * normal[:, :, 0] + c * normal[:, :, 1]], axis=2)
 
 
-def certify(path_ned_m: Array, keep_outs: Sequence[KeepOut], from_step: int, to_step: int | None = None) -> float:
+def certify(path_ned_m: Array, keep_outs: Sequence[KeepOut], from_step: int) -> float:
     """Smallest margin [m] of a planned path against everything known, over true distances between samples too.
 
     Args:
         path_ned_m: (Hp+1, 3) own plan.
         keep_outs: aligned with it.
         from_step: steps before this one can't be changed by the plan any more.
-        to_step: the last one that will be flown; None for the whole path.
 
     Returns:
         min over keep-outs of (distance - certified distance); where a keep-out is violated now already, a path that
@@ -202,7 +201,7 @@ def certify(path_ned_m: Array, keep_outs: Sequence[KeepOut], from_step: int, to_
     closest = apart[:, :-1] + nearest[:, :, None] * step  # closest point of each relative segment to the origin
     distance = np.sqrt(np.einsum("mkc,mkc->mk", closest, closest))  # (m, Hp)
     now = np.sqrt(np.einsum("mc,mc->m", apart[:, 0], apart[:, 0]))
-    later = distance[:, min(from_step, distance.shape[1] - 1) : to_step].min(axis=1)
+    later = distance[:, min(from_step, distance.shape[1] - 1) :].min(axis=1)
     allowed = np.array([k.certified_m for k in keep_outs])
     margin = np.where((now < allowed) & (later >= now - 0.02), 0.0, later - allowed)
     return float(margin.min())

@@ -118,13 +118,20 @@ def break_solver(running: Lockstep, agent: int, lasts_s: float) -> None:
     ("lasts_s", "reached"), [(0.3, Mode.REPLAY), (2.0, Mode.HOLD), (8.0, Mode.LAND)], ids=["replay", "hold", "land"]
 )
 def test_ladder_after_solver_failure(fly: Fly, lasts_s: float, reached: Mode) -> None:
-    flight = fly("mission.duration_s=18", at={9.0: lambda running: break_solver(running, 0, lasts_s)})
+    broken = {9.0: lambda running: break_solver(running, 0, lasts_s)}
+    flight = fly("mission.duration_s=18", "swarm.agents=1", at=broken)
     ladder = [Mode.REPLAY, Mode.BRAKE, Mode.HOLD, Mode.LAND]
     seen = flight.modes(0)
     assert [mode for mode in ladder if mode in seen] == ladder[: ladder.index(reached) + 1]
+    assert landed_by_itself(flight.lockstep.truth, 0, 1)
+    assert flight.problems == (["agent 0: no plan for too long"] if reached is Mode.LAND else [])
+
+
+@pytest.mark.parametrize("lasts_s", [0.3, 2.0, 8.0])
+def test_others_keep_clear_of_who_has_no_solver(fly: Fly, lasts_s: float) -> None:
+    flight = fly("mission.duration_s=14", at={6.0: lambda running: break_solver(running, 0, lasts_s)})
     assert flight.separation_m() >= 0.85
     assert all(landed_by_itself(flight.lockstep.truth, agent) for agent in range(3))
-    assert flight.problems == (["agent 0: no plan for too long"] if reached is Mode.LAND else [])
 
 
 def test_a_plan_that_would_come_too_close_is_not_flown(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:

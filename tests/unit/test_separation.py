@@ -24,7 +24,9 @@ from swarmctl.core.types import Array, Obstacle, PredictedPath
 UTC_US = 1_700_000_000_000_000
 DT_US = 100_000
 STEPS = 10
-PARAMS = SeparationParams()  # radius 0.9, slack 0.1, 4 m/s2 of age, at most 1 m, brake 3 m/s2, lost after 0.5 s
+PARAMS = SeparationParams(
+    stop_m_s2=1.4
+)  # radius 0.9, slack 0.1, 4 m/s2 of age, at most 1 m, brake 3 m/s2, lost after 0.5 s
 
 
 def peer(points: Array, dt_us: int = DT_US, radius_m: float = 0.0, agent: int = 1) -> PredictedPath:
