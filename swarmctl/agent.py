@@ -25,11 +25,8 @@ from swarmctl.control.separation import (
     SeparationParams,
     align,
     certify,
-    keep_out_of_obstacle,
-    keep_out_of_peer,
-    visible,
 )
-from swarmctl.control.sequence import Facts, PeerFacts, SequenceParams
+from swarmctl.control.sequence import Facts, SequenceParams
 from swarmctl.control.sequence import Sequence as MissionSequence
 from swarmctl.control.setpoint import setpoint_of
 from swarmctl.core.clock import Clock
@@ -42,7 +39,6 @@ from swarmctl.core.types import (
     Health,
     Landed,
     Mode,
-    Obstacle,
     Phase,
     Plan,
     PlanStatus,
@@ -54,8 +50,9 @@ from swarmctl.core.types import (
 from swarmctl.links import topics
 from swarmctl.links.autopilot import Autopilot
 from swarmctl.links.commands import CommandPort
-from swarmctl.links.peers import Bus, PeerPaths, agent_name
+from swarmctl.links.peers import Bus
 from swarmctl.reporter import Act, Reporter, Thought, TickSink, Took
+from swarmctl.surroundings import Surroundings
 
 _NOTHING_US = -1
 
@@ -105,7 +102,7 @@ class Agent:
         agents = len(setup.starts_ned_m)
         peers = [i for i in range(agents) if i != setup.agent]
         slots = min(len(peers), setup.separation.max_neighbours) + setup.obstacle_slots
-        self._paths = PeerPaths(peers)
+        self._surroundings = Surroundings(setup.agent, peers, setup.separation, setup.obstacle_slots, bus)
         self._controller = make_controller(setup.controller, setup.separation, setup.agent, slots)
         self._transit = self._controller
         if setup.controller.kind == "open_loop":  # can't go anywhere: something else flies to the start
@@ -123,15 +120,14 @@ class Agent:
             setup.mission.duration_s,
             reference,
         )
-        self._peer_status: dict[int, topics.StatusMessage] = {}
-        self._obstacles: tuple[Obstacle, ...] = ()
-        self._obstacles_version = -1
         self._judgement = Judgement(Mode.IDLE, "")
         self._virtual = np.array([0.0, 0.0, GRAVITY_M_S2])
         self._good: Plan | None = None
         self._certified_us: int | None = None
         self._hold_at: Array | None = None
-        self._reporter = Reporter(setup.agent, setup.boot_id, setup.sysid, autopilot, self._paths, bus, clock, sink)
+        self._reporter = Reporter(
+            setup.agent, setup.boot_id, setup.sysid, autopilot, self._surroundings.paths, bus, clock, sink
+        )
         self._announced: tuple[Phase, Mode, FlightMode] | None = None
         self._problem = ""
         self._last_state_us = _NOTHING_US
@@ -142,7 +138,7 @@ class Agent:
         """Landed, disarmed, and so is every peer that is still there."""
         if not self._sequence.finished:
             return False
-        return all(p.phase is Phase.DONE or not p.alive for p in self._peer_facts().values())
+        return all(p.phase is Phase.DONE or not p.alive for p in self._surroundings.peers().values())
 
     @property
     def outcome(self) -> str:
@@ -152,7 +148,7 @@ class Agent:
     @property
     def rejected(self) -> dict[str, int]:
         """Bus messages refused so far, by reason."""
-        return dict(self._paths.rejected)
+        return dict(self._surroundings.paths.rejected)
 
     def ask(self, verb: str, now_us: int) -> None:
         """An operator's wish: hold, resume, land, rtl."""
@@ -188,22 +184,8 @@ class Agent:
     # -- listen, sense ------------------------------------------------------------------------------------------------
 
     def _listen(self, now_us: int) -> None:
-        utc_us = self._clock.utc_us()
-        for sender, payload in self._bus.receive(topics.PATH):
-            self._paths.offer(sender, payload, utc_us)
-        for sender, payload in self._bus.receive(topics.STATUS):
-            status = topics.decode_status(payload)
-            if status is not None and sender == agent_name(status.agent):
-                self._peer_status[status.agent] = status
-        for _, payload in self._bus.receive(topics.COMMAND):
-            command = topics.decode_command(payload)
-            if command is not None and command.agent in (-1, self._setup.agent):
-                self.ask(command.verb, now_us)
-        for _, payload in self._bus.receive(topics.OBSTACLES):
-            message = topics.decode_obstacles(payload)
-            if message is not None and message.version > self._obstacles_version:
-                self._obstacles_version = message.version
-                self._obstacles = tuple(_obstacle(o) for o in message.obstacles)
+        for verb in self._surroundings.listen(self._clock.utc_us()):
+            self.ask(verb, now_us)
 
     def _sense(self, now_us: int) -> VehicleState | None:
         state = self._autopilot.poll(now_us)
@@ -234,10 +216,10 @@ class Agent:
             pos, vel = state.pos_ned_m, state.vel_ned_m_s
         start = Start(act_us, pos, vel, float(body_z_ned(state.q_nb)[2]), self._virtual)
         reference, now_ref = self._reference(now_us)
-        keep_outs = self._keep_outs(act_us, state)
+        steps, dt_us = self._controller.steps, self._controller.dt_us
+        keep_outs = self._surroundings.keep_outs(state.pos_ned_m, self._utc(act_us), dt_us, steps, self._sequence.phase)
         if not Phase.GOTO_START <= self._sequence.phase <= Phase.GOTO_LAND:
             return Thought(start, None, now_ref, keep_outs)
-        steps, dt_us = self._controller.steps, self._controller.dt_us
         guess = None
         if self._good is not None and act_us - self._good.t0_us < steps * dt_us:
             guess = self._shifted(self._good, act_us)
@@ -252,25 +234,6 @@ class Agent:
         pos, vel = self._sequence.reference(self._clock.utc_us(), now_us, np.concatenate([[0.0], ahead_s]))
         yaw_rad = self._setup.mission.yaw_rad
         return Reference(pos[1:], vel[1:], yaw_rad), Reference(pos[:1], vel[:1], yaw_rad)
-
-    def _keep_outs(self, act_us: int, state: VehicleState) -> list[KeepOut]:
-        steps, dt_us, params = self._controller.steps, self._controller.dt_us, self._setup.separation
-        utc_us = self._utc(act_us)
-        found = [
-            keep_out_of_peer(path, utc_us, dt_us, steps, params, self._parked(path.agent), self._landing(path.agent))
-            for path in self._paths.latest()
-        ]
-        seen = visible(self._obstacles, state.pos_ned_m)[: self._setup.obstacle_slots]
-        return found + [keep_out_of_obstacle(o, dt_us, steps, params) for o in seen]
-
-    def _parked(self, agent: int) -> bool:
-        status = self._peer_status.get(agent)
-        return status is not None and status.phase == Phase.DONE
-
-    def _landing(self, agent: int) -> bool:
-        status = self._peer_status.get(agent)
-        descending = status is not None and status.phase == Phase.LAND
-        return descending or self._sequence.phase is Phase.GOTO_LAND
 
     # -- judge, act ---------------------------------------------------------------------------------------------------
 
@@ -356,8 +319,8 @@ class Agent:
             self._autopilot.armable,
             self._commands.busy,
             self._judgement.mode,
-            self._mute_peer() is not None,
-            self._peer_facts(),
+            self._surroundings.somebody_is_mute(self._clock.utc_us()),
+            self._surroundings.peers(),
         )
         for command in self._sequence.step(facts):
             self._commands.request(command)
@@ -397,36 +360,16 @@ class Agent:
     def _coasting(self, state: VehicleState) -> PredictedPath:
         """Somebody else flies: the own velocity, continued, or braked where the autopilot is about to stop."""
         steps, dt_us = self._controller.steps, self._controller.dt_us
-        t_s = np.arange(steps + 1) * (dt_us * 1e-6)
+        act_us = self._clock.now_us() + self._predictor.delay_us
+        t_s = np.arange(steps + 1) * (dt_us * 1e-6) + (act_us - state.t_us) * 1e-6
         if state.mode in (FlightMode.HOLD, FlightMode.LAND):
             speed = math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s))
             brake_m_s2 = self._setup.separation.brake_m_s2
             t_s = np.minimum(t_s, speed / brake_m_s2)
             t_s = t_s - 0.5 * brake_m_s2 * t_s * t_s / max(speed, 1e-6)  # of the present speed, for the same way
         pos = state.pos_ned_m + t_s[:, None] * state.vel_ned_m_s
-        utc_us = self._utc(state.t_us)
-        return PredictedPath(self._setup.agent, self._setup.boot_id, self._reporter.seq, utc_us, dt_us, 0.0, pos)
-
-    def _peer_facts(self) -> dict[int, PeerFacts]:
-        alive = self._bus.alive()
-        return {
-            agent: PeerFacts(Phase(status.phase), status.ready_utc_us, agent_name(agent) in alive)
-            for agent, status in self._peer_status.items()
-        }
-
-    def _mute_peer(self) -> int | None:
-        """A peer in the air that is silent and not known to be gone: it may be flying on, or the bus is lost to us.
-
-        A peer whose liveliness token has gone while ours is there has died; its path has become a keep-out.
-        """
-        alive = self._bus.alive()
-        connected = agent_name(self._setup.agent) in alive
-        oldest_us = self._clock.utc_us() - round(self._setup.separation.lost_after_s * 1e6)
-        for path in self._paths.latest():
-            silent = path.t0_utc_us < oldest_us and not self._parked(path.agent)
-            if silent and (not connected or agent_name(path.agent) in alive):
-                return path.agent
-        return None
+        setup = self._setup
+        return PredictedPath(setup.agent, setup.boot_id, self._reporter.seq, self._utc(act_us), dt_us, 0.0, pos)
 
     def _fresh(self, now_us: int, state: VehicleState) -> bool:
         return now_us - state.t_us <= self._setup.params.failsafe.state_max_age_s * 1e6
@@ -437,13 +380,3 @@ class Agent:
 
     def _note(self, name: str, **fields: Any) -> None:
         self._sink.event(name, self._clock.now_us(), self._clock.utc_us(), **fields)
-
-
-def _obstacle(message: topics.ObstacleMessage) -> Obstacle:
-    return Obstacle(
-        np.array(message.center_ned_m),
-        message.radius_m,
-        message.keep_out_m,
-        message.visibility_m,
-        np.array(message.vel_ned_m_s),
-    )

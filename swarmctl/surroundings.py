@@ -1,0 +1,105 @@
+"""What an agent knows of its peers and of obstacles: hears the bus, answers what to keep clear of and who is there."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from swarmctl.control.separation import (
+    KeepOut,
+    SeparationParams,
+    keep_out_of_obstacle,
+    keep_out_of_peer,
+    visible,
+)
+from swarmctl.control.sequence import PeerFacts
+from swarmctl.core.types import Array, Obstacle, Phase
+from swarmctl.links import topics
+from swarmctl.links.peers import Bus, PeerPaths, agent_name
+
+
+class Surroundings:
+    """Peers' newest paths and statuses, and the obstacles the operator has told of.
+
+    Args:
+        agent: own index.
+        peers: indices of the others.
+        params: distances and ages.
+        obstacle_slots: how many obstacles the controller has room for.
+        bus: is drained by `listen`.
+    """
+
+    def __init__(self, agent: int, peers: list[int], params: SeparationParams, obstacle_slots: int, bus: Bus) -> None:
+        self._agent, self._params, self._obstacle_slots, self._bus = agent, params, obstacle_slots, bus
+        self.paths = PeerPaths(peers)
+        self._status: dict[int, topics.StatusMessage] = {}
+        self._obstacles: tuple[Obstacle, ...] = ()
+        self._obstacles_version = -1
+
+    def listen(self, utc_us: int) -> list[str]:
+        """Take in everything that has arrived; returns the operator's verbs for this agent."""
+        for sender, payload in self._bus.receive(topics.PATH):
+            self.paths.offer(sender, payload, utc_us)
+        for sender, payload in self._bus.receive(topics.STATUS):
+            status = topics.decode_status(payload)
+            if status is not None and sender == agent_name(status.agent):
+                self._status[status.agent] = status
+        for _, payload in self._bus.receive(topics.OBSTACLES):
+            message = topics.decode_obstacles(payload)
+            if message is not None and message.version > self._obstacles_version:
+                self._obstacles_version = message.version
+                self._obstacles = tuple(_obstacle(o) for o in message.obstacles)
+        commands = [topics.decode_command(payload) for _, payload in self._bus.receive(topics.COMMAND)]
+        return [c.verb for c in commands if c is not None and c.agent in (-1, self._agent)]
+
+    def keep_outs(self, pos_ned_m: Array, t0_utc_us: int, dt_us: int, steps: int, phase: Phase) -> list[KeepOut]:
+        """Everything to stay clear of over `steps` steps from `t0_utc_us`, seen from `pos_ned_m` (3,) in `phase`."""
+        found = [
+            keep_out_of_peer(
+                path,
+                t0_utc_us,
+                dt_us,
+                steps,
+                self._params,
+                parked=self._phase(path.agent) is Phase.DONE,
+                landing=phase is Phase.GOTO_LAND or self._phase(path.agent) is Phase.LAND,
+            )
+            for path in self.paths.latest()
+        ]
+        seen = visible(self._obstacles, pos_ned_m)[: self._obstacle_slots]
+        return found + [keep_out_of_obstacle(o, dt_us, steps, self._params) for o in seen]
+
+    def peers(self) -> dict[int, PeerFacts]:
+        """Who has been heard of, how far it is, and whether it is still on the bus."""
+        alive = self._bus.alive()
+        return {
+            agent: PeerFacts(Phase(status.phase), status.ready_utc_us, agent_name(agent) in alive)
+            for agent, status in self._status.items()
+        }
+
+    def somebody_is_mute(self, utc_us: int) -> bool:
+        """Whether a peer is silent and not known to be gone: it may be flying on, or the bus is lost to us.
+
+        A peer whose liveliness token has gone while ours is there has died; its path has become a keep-out.
+        """
+        alive = self._bus.alive()
+        connected = agent_name(self._agent) in alive
+        oldest_us = utc_us - round(self._params.lost_after_s * 1e6)
+        for path in self.paths.latest():
+            silent = path.t0_utc_us < oldest_us and self._phase(path.agent) is not Phase.DONE
+            if silent and (not connected or agent_name(path.agent) in alive):
+                return True
+        return False
+
+    def _phase(self, agent: int) -> Phase | None:
+        status = self._status.get(agent)
+        return None if status is None else Phase(status.phase)
+
+
+def _obstacle(message: topics.ObstacleMessage) -> Obstacle:
+    return Obstacle(
+        np.array(message.center_ned_m),
+        message.radius_m,
+        message.keep_out_m,
+        message.visibility_m,
+        np.array(message.vel_ned_m_s),
+    )
