@@ -186,7 +186,7 @@ class Flight:
                     "viewer_ended", f"view and recording stopped: viewer {child.how_it_ended()}; the flight goes on"
                 )
         elif "view address" not in self._reported:
-            line = child.line_with("viewer ")
+            line = child.line_with("viewer rerun+")
             if line and self._once("view address"):
                 address = line.removeprefix("viewer ")
                 self._say("viewer_ready", f"view {address}", url=address)

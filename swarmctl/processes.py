@@ -95,7 +95,7 @@ def viewer_command(config: Config, site: Site, port: int, view: bool) -> Command
     argv = _python("-m", "swarmctl.telemetry.viewer", "--run", site.run, "--bus", site.endpoint)
     argv += ("--agents", f"{config.swarm.agents}", "--run-dir", f"{site.directory}", "--port", f"{port}")
     center, extent_m = _stage(config)
-    argv += ("--look-at", *(repr(c) for c in center), "--extent", f"{extent_m!r}")
+    argv += ("--look-at", *(f"{c:.3f}" for c in center), "--extent", f"{extent_m:.3f}")
     argv += ("--rate-hz", f"{config.telemetry.rate_hz!r}", "--separation", f"{config.separation.radius_m!r}")
     argv += ("--limit", f"{config.limits.min_separation_m!r}")
     obstacles = [obstacle.model_dump() for obstacle in config.obstacles]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import io
+import re
 import socket
 from pathlib import Path
 
@@ -186,3 +187,12 @@ def test_a_summary_is_five_lines_even_when_almost_empty() -> None:
         assert len(lines) == 5
         assert lines[-1] == "run folder runs/x"
     assert "2 violations: a" in lines[0]
+
+
+def test_the_camera_is_given_numbers_argparse_does_not_take_for_options() -> None:
+    """`-5e-05` would be an option to argparse; the circle's middle is such a number."""
+    config = load(None)
+    argv = viewer_command(config, Site("run", "endpoint", Path("dir")), 9877, view=False).argv
+    at = argv.index("--look-at")
+    assert all(re.fullmatch(r"-?\d+\.\d+", number) for number in argv[at + 1 : at + 4])
+    assert float(argv[argv.index("--extent") + 1]) > 5.0
