@@ -14,18 +14,10 @@ import numpy as np
 import pymap3d
 
 from sitl.vehicle import Array, Plant
+from swarmctl.core.types import GeoOrigin
 
 _SEMI_MAJOR_M = 6378137.0
 _ECCENTRICITY2 = 6.69437999014e-3  # WGS-84
-
-
-@dataclass(frozen=True, slots=True)
-class GeoPoint:
-    """WGS-84; altitudes above mean sea level and above the ellipsoid are the same here."""
-
-    lat_deg: float
-    lon_deg: float
-    alt_m: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,7 +36,7 @@ class LocalOrigin:
         return self.lat_e7 + round(x_m / self.metres_per_e7_north), self.lon_e7 + round(y_m / self.metres_per_e7_east)
 
 
-def local_origin(spawn_ned_m: Array, shared: GeoPoint) -> LocalOrigin:
+def local_origin(spawn_ned_m: Array, shared: GeoOrigin) -> LocalOrigin:
     """The rounded local origin of a vehicle that spawns at `spawn_ned_m` (3,) in the shared frame."""
     lat, lon, alt = pymap3d.ned2geodetic(*(float(c) for c in spawn_ned_m), shared.lat_deg, shared.lon_deg, shared.alt_m)
     lat_e7, lon_e7, alt_mm = round(float(lat) * 1e7), round(float(lon) * 1e7), round(float(alt) * 1e3)

@@ -18,10 +18,11 @@ from sitl.autopilot import IDLE, Autopilot
 from sitl.endpoint import Endpoint
 from sitl.navigator import Navigator
 from sitl.parameters import Parameters
-from sitl.sensors import Estimate, GeoPoint, estimate_of, local_origin
+from sitl.sensors import Estimate, estimate_of, local_origin
 from sitl.streams import Report
 from sitl.vehicle import PRESETS, Array, Plant
 from swarmctl.core.records import TRUTH_DTYPE
+from swarmctl.core.types import GeoOrigin
 from swarmctl.errors import ConfigError
 from swarmctl.links.transport import Transport
 
@@ -95,7 +96,7 @@ class SitlWorld:
         self.params = params
         count, dt_s = params.vehicles, 1.0 / params.physics_hz
         preset = PRESETS[params.preset]
-        shared = GeoPoint(params.origin_lat_deg, params.origin_lon_deg, params.origin_alt_m)
+        shared = GeoOrigin(params.origin_lat_deg, params.origin_lon_deg, params.origin_alt_m)
         self.origins = [local_origin(spawn, shared) for spawn in params.spawn_ned_m]
         self._offset_ned_m = np.array([origin.offset_ned_m for origin in self.origins])  # (N, 3)
         airborne = params.start == "air"

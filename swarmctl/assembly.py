@@ -9,7 +9,8 @@ import numpy as np
 from swarmctl.agent import Agent, AgentSetup
 from swarmctl.config import Config
 from swarmctl.core.clock import Clock
-from swarmctl.links.autopilot import Autopilot, GeoOrigin
+from swarmctl.core.types import GeoOrigin
+from swarmctl.links.autopilot import Autopilot
 from swarmctl.links.commands import CommandPort
 from swarmctl.links.mavlink import Codec
 from swarmctl.links.peers import Bus

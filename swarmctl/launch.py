@@ -198,7 +198,7 @@ def _introduction(config: Config, site: Site, ground: Ground) -> tuple[str, ...]
     """Three lines that say what runs."""
     agents = config.swarm.agents
     if config.sitl.enabled:
-        vehicles = f"built-in SITL ({config.sitl.preset}) at udp {LOOPBACK}:{ground.ports[0]}-{ground.ports[-1]}"
+        vehicles = f"built-in SITL ({config.sitl.preset}) on {LOOPBACK}"
     else:
         vehicles = ", ".join(vehicle.url for vehicle in config.vehicles[:agents])
     view = f"view on port {ground.view_port}" if ground.view_port else "no view"

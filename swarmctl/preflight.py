@@ -20,8 +20,6 @@ from swarmctl.errors import StartError
 from swarmctl.links.transport import bind_udp, parse_url
 
 LOOPBACK = "127.0.0.1"
-FIRST_PORT = 14540  # PX4's first offboard port
-_LAST_PORT = 32767  # below the ephemeral range, which other programs draw from
 _VIEW_PORTS_TRIED = 50
 _NEEDED = {
     "numpy": (2, 2),
@@ -81,26 +79,16 @@ def inspect(config: Config) -> Ground:
     return ground
 
 
-def claim_ports(count: int, first: int = FIRST_PORT) -> tuple[socket.socket, ...]:
-    """Bind `count` consecutive loopback UDP ports: `first` and up, or the next such range that is free as a whole.
+def claim_ports(count: int) -> tuple[socket.socket, ...]:
+    """Bind `count` loopback UDP ports that nobody else knows of.
+
+    Not PX4's own 14540 and up: every other simulator on the machine sends there until it is answered, and an agent
+    would take the first one it hears for its vehicle.
 
     Raises:
-        StartError: there is no such range.
+        StartError: the machine has no port left.
     """
-    start = first
-    while start + count - 1 <= _LAST_PORT:
-        sockets: list[socket.socket] = []
-        for port in range(start, start + count):
-            try:
-                sockets.append(bind_udp(LOOPBACK, port))
-            except StartError:
-                break
-        if len(sockets) == count:
-            return tuple(sockets)
-        for sock in sockets:
-            sock.close()
-        start += count
-    raise StartError(f"vehicle ports: no {count} free in a row within {first}..{_LAST_PORT}; stop other simulators")
+    return tuple(bind_udp(LOOPBACK, 0) for _ in range(count))
 
 
 def _package_problems(config: Config) -> Iterator[str]:

@@ -104,6 +104,15 @@ class PlanStatus(enum.IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
+class GeoOrigin:
+    """WGS-84 origin of a local frame; heights above mean sea level and above the ellipsoid are taken as one."""
+
+    lat_deg: float
+    lon_deg: float
+    alt_m: float
+
+
+@dataclass(frozen=True, slots=True)
 class VehicleState:
     """Newest estimate of the own vehicle, in the shared frame."""
 

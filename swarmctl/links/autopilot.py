@@ -15,7 +15,7 @@ import pymap3d
 from pymavlink.dialects.v20 import development as dialect
 
 from swarmctl.core.frames import rotate_to_ned
-from swarmctl.core.types import Array, AttitudeSetpoint, FlightMode, Landed, VehicleState
+from swarmctl.core.types import Array, AttitudeSetpoint, FlightMode, GeoOrigin, Landed, VehicleState
 from swarmctl.links.commands import CommandPort
 from swarmctl.links.mavlink import Codec, frames
 from swarmctl.links.transport import Transport
@@ -27,15 +27,6 @@ _PREARM = 1 << 28
 _LOCAL_NED = dialect.MAV_FRAME_LOCAL_NED
 _BODY_FRD = (dialect.MAV_FRAME_BODY_NED, dialect.MAV_FRAME_BODY_FRD)  # of ODOMETRY's velocity
 _FAST = frozenset({dialect.MAVLINK_MSG_ID_ODOMETRY})  # not worth passing to the slow path
-
-
-@dataclass(frozen=True, slots=True)
-class GeoOrigin:
-    """WGS-84 origin of a local frame."""
-
-    lat_deg: float
-    lon_deg: float
-    alt_m: float
 
 
 @dataclass(frozen=True, slots=True)

@@ -219,7 +219,7 @@ def test_frozen_telemetry_costs_the_agents_nothing(endpoint: str, tmp_path: Path
         time.sleep(0.3)
         lost, received = (int(word.split("=")[1]) for word in finish(process).split()[1:])
         assert lost + received == 450  # what the frozen process could not take is counted
-        assert received >= 150
+        assert received >= 150 - 15, "all but what was under way when it froze"
         swarm.session.close()
 
 

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import development as dialect
 
 from swarmctl.core.clock import SimClock
-from swarmctl.core.types import AttitudeSetpoint, FlightMode, Landed
-from swarmctl.links.autopilot import Autopilot, GeoOrigin, VehicleClock
+from swarmctl.core.types import AttitudeSetpoint, FlightMode, GeoOrigin, Landed
+from swarmctl.links.autopilot import Autopilot, VehicleClock
 from swarmctl.links.mavlink import Codec
 from swarmctl.links.transport import PipeTransport, pipe_pair
 

@@ -12,15 +12,16 @@ import pytest
 from pymavlink.dialects.v20 import development as mav
 
 from sitl.parameters import DEFAULTS, INT32, REAL32, Parameters, int_from_wire, int_to_wire
-from sitl.sensors import GeoPoint, local_origin
+from sitl.sensors import local_origin
 from sitl.streams import STREAMS, Schedule
 from sitl.world import SitlParams, SitlWorld, line_of_spawns
 from swarmctl.core.clock import SimClock
+from swarmctl.core.types import GeoOrigin
 from swarmctl.errors import ConfigError
 from swarmctl.links.mavlink import Codec, frames
 from swarmctl.links.transport import pipe_pair
 
-ORIGIN = GeoPoint(47.397742, 8.545594, 489.4)
+ORIGIN = GeoOrigin(47.397742, 8.545594, 489.4)
 NAN = math.nan
 
 
@@ -309,8 +310,8 @@ def test_every_command_survives_extreme_parameters() -> None:
 @pytest.mark.parametrize(
     "spawn", [(0.0, 0.0, 0.0), (-1.0, 5.0, 2.0), (1500.0, -2500.0, -30.0), (0.003, -0.004, 0.0004)]
 )
-@pytest.mark.parametrize("origin", [ORIGIN, GeoPoint(-33.9, 151.2, 20.0), GeoPoint(64.1, -21.9, 0.0)])
-def test_origin_converts_back_to_the_true_position(spawn: tuple[float, float, float], origin: GeoPoint) -> None:
+@pytest.mark.parametrize("origin", [ORIGIN, GeoOrigin(-33.9, 151.2, 20.0), GeoOrigin(64.1, -21.9, 0.0)])
+def test_origin_converts_back_to_the_true_position(spawn: tuple[float, float, float], origin: GeoOrigin) -> None:
     """A client that puts the sent origin into the shared frame and adds the local position gets the truth."""
     place: dict[str, Any] = {
         "origin_lat_deg": origin.lat_deg,
