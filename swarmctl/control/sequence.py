@@ -318,7 +318,7 @@ class Sequence:
 
     def _goto_land(self, facts: Facts, state: VehicleState) -> list[Command]:
         waited_us = facts.now_us - self._entered_us
-        if (self._may_land(facts, state) and not self.waiting) or waited_us > self._params.land_timeout_s * 1e6:
+        if self._may_land(facts, state) or waited_us > self._params.land_timeout_s * 1e6:
             self._enter(Phase.LAND, facts)
         return []
 
@@ -353,7 +353,7 @@ class Sequence:
             return True
         glide, began_us = self._glide
         if not self._lands_here:
-            return self._arrived(state, glide.to_ned_m)
+            return self._arrived(state, glide.to_ned_m) and not self.waiting
         settled = facts.now_us - began_us > (glide.travel_s + _SETTLE_S) * 1e6
         return settled and self._arrived(state, state.pos_ned_m)
 
