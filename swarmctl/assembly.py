@@ -11,13 +11,11 @@ from swarmctl.config import Config
 from swarmctl.core.clock import Clock
 from swarmctl.core.types import GeoOrigin
 from swarmctl.links.autopilot import Autopilot
-from swarmctl.links.commands import CommandPort
+from swarmctl.links.commands import OWN_COMPID, CommandPort
 from swarmctl.links.mavlink import Codec
 from swarmctl.links.peers import Bus
 from swarmctl.links.transport import Transport
 from swarmctl.reporter import TickSink
-
-OWN_COMPID = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
 
 
 def make_agent(

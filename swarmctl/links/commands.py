@@ -18,6 +18,7 @@ from pymavlink.dialects.v20 import development as dialect
 from swarmctl.core.types import Command, Verb
 from swarmctl.links.mavlink import Codec
 
+OWN_COMPID = 191  # MAV_COMP_ID_ONBOARD_COMPUTER, beside the vehicle's own system id
 _RETRY_US = 500_000
 _TRIES = 4
 _IN_PROGRESS = 5  # MAV_RESULT

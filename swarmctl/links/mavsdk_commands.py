@@ -21,9 +21,7 @@ from mavsdk.plugins.mavlink_direct.mavlink_direct import MavlinkMessage
 from mavsdk.plugins.param import Param
 
 from swarmctl.core.types import Command, Verb
-from swarmctl.links.commands import CommandResult, long_command
-
-OWN_COMPID = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
+from swarmctl.links.commands import OWN_COMPID, CommandResult, long_command
 
 
 class MavsdkCommands:
