@@ -168,7 +168,9 @@ def _run(options: argparse.Namespace) -> int:
         raise ConfigError(
             "sitl", [f"port = {options.port}: allowed: up to {realtime.MAX_PORT - count - shift + 1} here"]
         )
-    world = SitlWorld(params, [UdpTransport(s, (realtime.HOST, r)) for s, r in zip(sockets, remotes, strict=True)])
+    latch = not options.remote_ports  # given peers are the only ones: a stray datagram must not take a vehicle over
+    pairs = zip(sockets, remotes, strict=True)
+    world = SitlWorld(params, [UdpTransport(s, (realtime.HOST, r), latch=latch) for s, r in pairs])
     if shift:
         print(f"sitl: ports {options.local_port}.. are taken; shifted by {shift}")
     for i, (sock, remote) in enumerate(zip(sockets, remotes, strict=True)):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import re
 import signal
@@ -131,3 +132,28 @@ def running(pid: int) -> bool:
         return Path(f"/proc/{pid}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
     except (FileNotFoundError, ProcessLookupError):
         return False
+
+
+@pytest.mark.parametrize("given", [True, False], ids=["given peer", "control: latched peer"])
+def test_a_stray_datagram_does_not_take_over_a_vehicle_whose_peer_is_given(given: bool) -> None:
+    """Somebody who still talks to the port of an earlier simulator must not be taken for the agent."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as agent:
+        agent.bind(("127.0.0.1", 0))
+        port = agent.getsockname()[1]
+        process, ((local, _),) = start(
+            "--vehicles", "1", *(["--remote-ports", str(port)] if given else ["--port", str(port)])
+        )
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stray:
+            stray.sendto(b"\xfd", ("127.0.0.1", local))
+            time.sleep(0.5)
+            agent.setblocking(False)
+            with contextlib.suppress(BlockingIOError):
+                while agent.recv(2048):
+                    pass
+            agent.settimeout(3.0)
+            if given:
+                assert agent.recv(2048)
+            else:
+                with pytest.raises(TimeoutError):
+                    agent.recv(2048)
+        stop(process)

@@ -34,7 +34,9 @@ from swarmctl.table import AgentView
 
 pytestmark = pytest.mark.process
 
-LANDS_ON_SIGTERM = "import signal, sys, time; signal.signal(signal.SIGTERM, lambda *_: sys.exit(130)); "
+LANDS_ON_SIGTERM = (
+    "import signal, sys, time; signal.signal(signal.SIGTERM, lambda *_: sys.exit(130)); print('up', flush=True); "
+)
 FLIES_LONG = LANDS_ON_SIGTERM + "time.sleep(60)"
 
 
@@ -58,6 +60,10 @@ class Scene(Base):
         self.children = {
             name: Child(Command(name, (sys.executable, "-ESc", script)), directory) for name, script in scripts.items()
         }
+        deadline_s = time.monotonic() + 30.0
+        for name, child in self.children.items():  # what is sent a signal has to be there to take it
+            while "'up'" in scripts[name] and not child.line_with("up") and time.monotonic() < deadline_s:
+                time.sleep(0.01)
         self.hub = LocalHub(lambda: time.monotonic_ns() // 1000)
         self.bus = self.hub.attach(OPERATOR)
         self.agents = [self.hub.attach(agent_name(i)) for i in range(len(agents))]
