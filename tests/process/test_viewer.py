@@ -212,8 +212,8 @@ def test_frozen_telemetry_costs_the_agents_nothing(endpoint: str, tmp_path: Path
         swarm.slowest_put_s = 0.0
         began_s = time.monotonic()
         swarm.fly(2.0)
-        assert time.monotonic() - began_s < 2.5
-        assert swarm.slowest_put_s < 0.2
+        assert time.monotonic() - began_s < 3.0
+        assert swarm.slowest_put_s < 0.5
         process.send_signal(signal.SIGCONT)
         swarm.fly(0.5)
         time.sleep(0.3)
