@@ -34,6 +34,8 @@ class SequenceParams(Params):
     state_rate_hz: float = Field(100.0, ge=20, le=250)
     arrive_m: float = Field(0.15, gt=0, le=5)
     arrive_m_s: float = Field(0.15, gt=0, le=5)
+    land_m: float = Field(0.06, gt=0, le=5)  # what is missed here, and drifted, is missing between landing places
+    land_m_s: float = Field(0.06, gt=0, le=5)
     start_timeout_s: float = Field(90.0, gt=0, le=3600)  # from process start to TRACK
     land_timeout_s: float = Field(20.0, gt=0, le=600)  # for reaching the landing place; then land where it is
 
@@ -281,7 +283,8 @@ class Sequence:
             if self._glide is None:
                 self._glide = (Glide(state.pos_ned_m, np.zeros(3), state.pos_ned_m, 1.0), facts.now_us)
             return self._ask_for_control(facts, state)
-        if self._arrived(state, self._start_ned_m) and not self.waiting:
+        p = self._params
+        if self._at(state, self._start_ned_m, p.arrive_m, p.arrive_m_s) and not self.waiting:
             self.ready_utc_us = facts.utc_us
             self._enter(Phase.READY, facts)
         return []
@@ -343,9 +346,10 @@ class Sequence:
             return []
         return [Command(Verb.DISARM if state.landed is Landed.ON_GROUND else Verb.LAND)]
 
-    def _arrived(self, state: VehicleState, target: Array) -> bool:
+    @staticmethod
+    def _at(state: VehicleState, target: Array, within_m: float, slower_m_s: float) -> bool:
         speed = math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s))
-        return math.dist(state.pos_ned_m, target) < self._params.arrive_m and speed < self._params.arrive_m_s
+        return math.dist(state.pos_ned_m, target) < within_m and speed < slower_m_s
 
     def _may_land(self, facts: Facts, state: VehicleState) -> bool:
         """On the landing place; who lands where it is may have been pushed aside, and has to be at rest only."""
@@ -353,9 +357,9 @@ class Sequence:
             return True
         glide, began_us = self._glide
         if not self._lands_here:
-            return self._arrived(state, glide.to_ned_m) and not self.waiting
+            return self._at(state, glide.to_ned_m, self._params.land_m, self._params.land_m_s) and not self.waiting
         settled = facts.now_us - began_us > (glide.travel_s + _SETTLE_S) * 1e6
-        return settled and self._arrived(state, state.pos_ned_m)
+        return settled and self._at(state, state.pos_ned_m, math.inf, self._params.arrive_m_s)
 
     def _take_control(self, facts: Facts, state: VehicleState) -> None:
         if self.had_control:
