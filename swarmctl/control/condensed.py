@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from swarmctl.control.qp import INFINITY, OsqpSolver, QpParams, pattern_index
+from swarmctl.control.qp import INFINITY, OsqpSolver, QpParams, QpSolver, pattern_index
 from swarmctl.core.types import Array
 
 _SLACK_SCALE_M = 0.1  # slack variables are in units of this, so that they are about 1 like all others
@@ -122,7 +122,7 @@ class CondensedMpc:
         self._build_cost()
         if slots == 0:  # small: tight tolerances cost less than polishing
             qp = qp.model_copy(update={"polish": False, "eps": 0.01 * qp.eps, "eps_relative": 0.01 * qp.eps_relative})
-        self._solver = OsqpSolver(self._p_pattern, self._a_pattern, qp)
+        self._solver: QpSolver = OsqpSolver(self._p_pattern, self._a_pattern, qp)
 
     def _build_response(self) -> None:
         """Positions and velocities at steps 1..Hp of a unit increment at each step j < Hc, per unit gain."""

@@ -15,8 +15,6 @@ from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array, VehicleState
 
-DOWN = np.array([0.0, 0.0, 1.0])
-
 
 class VehicleModelParams(Params):
     """Bounds and lags of the airframe, not of the controller."""

@@ -17,4 +17,3 @@ class Params(BaseModel):
 
 
 Vec3 = Annotated[tuple[float, float, float], Field(strict=False)]  # TOML arrays are lists
-Pair = Annotated[tuple[float, float], Field(strict=False)]

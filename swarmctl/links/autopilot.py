@@ -139,7 +139,6 @@ class Autopilot:
         self._sample: tuple[int, Array, Array, Array, Array] | None = None
         self._attitude: tuple[int, Array, Array] | None = None
         self._odometry_us = 0
-        self._boot_offset_us: int | None = None
         self._handlers: dict[str, Callable[[Any, int], None]] = {
             "HEARTBEAT": self._heartbeat,
             "CURRENT_MODE": self._current_mode,
