@@ -231,7 +231,7 @@ class Plant:
         self._forcing_rows[_RATE], self._forcing_rows[9] = wrench_rows[1:], wrench_rows[0]
         self._weights = np.array([2.0, 3.0, 4.0]) * (dt_s / 9.0)
         self._allocate_buffers(count)
-        self._refresh()
+        self.refresh()
 
     def _allocate_buffers(self, count: int) -> None:
         self._args = np.zeros((12, count))
@@ -294,7 +294,7 @@ class Plant:
         if held is not None:
             self.state[:, self.held] = held
         self._touch_ground()
-        self._refresh()
+        self.refresh()
 
     def _add_wind(self, wind_ned_m_s: Array) -> None:
         drag = np.array(self.preset.drag_n_s_m)
@@ -332,7 +332,7 @@ class Plant:
         np.multiply(self._polynomial[10:].reshape(3, 3, -1), state[_VEL], out=self._lever)
         np.add.reduce(self._lever, axis=1, out=out[_POS])
 
-    def _refresh(self) -> None:
+    def refresh(self) -> None:
         """Rotation, NED velocity and Euler angles of the current state."""
         quat = self.state[_QUAT]
         np.multiply(quat[:, None], quat[None], out=self._quat_products)
@@ -352,7 +352,7 @@ class Plant:
         np.greater_equal(self.state[12], self.ground_z_m, out=self.contact)
         if not self.contact.any():
             return
-        self._refresh()
+        self.refresh()
         lift_n = self.rotor_force_n.sum(axis=0) * self.rotation[8]
         for i in np.flatnonzero(self.contact):
             self._rest_on_ground(int(i), float(lift_n[i]), float(self.ground_z_m[i]))

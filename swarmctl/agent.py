@@ -19,13 +19,9 @@ from swarmctl.control.failsafe import FailsafeParams, Judgement, judge
 from swarmctl.control.fallback import rest_plan
 from swarmctl.control.mission import MissionParams, MissionReference
 from swarmctl.control.model import Predictor, VehicleModelParams, acceleration
-from swarmctl.control.mpc import Start
-from swarmctl.control.separation import (
-    KeepOut,
-    SeparationParams,
-    align,
-    certify,
-)
+from swarmctl.control.problem import Problem, Start
+from swarmctl.control.replay import Replay
+from swarmctl.control.separation import SeparationParams
 from swarmctl.control.sequence import Facts, SequenceParams
 from swarmctl.control.sequence import Sequence as MissionSequence
 from swarmctl.control.setpoint import setpoint_of
@@ -33,6 +29,7 @@ from swarmctl.core.clock import Clock
 from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned
 from swarmctl.core.params import Params
 from swarmctl.core.types import (
+    NO_TIMES,
     Array,
     AttitudeSetpoint,
     FlightMode,
@@ -103,11 +100,11 @@ class Agent:
         peers = [i for i in range(agents) if i != setup.agent]
         slots = min(len(peers), setup.separation.max_neighbours) + setup.obstacle_slots
         self._surroundings = Surroundings(setup.agent, peers, setup.separation, setup.obstacle_slots, bus)
-        self._controller = make_controller(setup.controller, setup.separation, setup.agent, slots)
+        self._controller = make_controller(setup.controller, setup.separation, setup.agent, slots, stopwatch_ns)
         self._transit = self._controller
         if setup.controller.kind == "open_loop":  # can't go anywhere: something else flies to the start
             self._transit = make_controller(
-                setup.controller.model_copy(update={"kind": "dmpc"}), setup.separation, setup.agent, slots
+                setup.controller.model_copy(update={"kind": "dmpc"}), setup.separation, setup.agent, slots, stopwatch_ns
             )
         self._observer = DisturbanceObserver(setup.params.disturbance, setup.vehicle_model.hover_thrust_01)
         self._predictor = Predictor(setup.vehicle_model)
@@ -122,12 +119,14 @@ class Agent:
         )
         self._judgement = Judgement(Mode.IDLE, "")
         self._virtual = np.array([0.0, 0.0, GRAVITY_M_S2])
-        self._good: Plan | None = None
+        brake_m_s2 = setup.separation.brake_m_s2
+        self._replay = Replay(setup.agent, self._controller.dt_us, self._controller.steps, brake_m_s2)
         self._certified_us: int | None = None
         self._hold_at: Array | None = None
         self._reporter = Reporter(
             setup.agent, setup.boot_id, setup.sysid, autopilot, self._surroundings.paths, bus, clock, sink
         )
+        self.took = Took(0.0, 0.0, 0.0, 0.0, 0.0)  # of the last tick
         self._announced: tuple[Phase, Mode, FlightMode] | None = None
         self._problem = ""
         self._last_state_us = _NOTHING_US
@@ -160,13 +159,22 @@ class Agent:
         began_ns = self._stopwatch_ns()
         self._listen(now_us)
         state = self._sense(now_us)
+        self._sequence.begin_if_due(now_us, self._clock.utc_us())
         sensed_ns = self._stopwatch_ns()
         thought = self._think(now_us, state)
-        solved_ns = self._stopwatch_ns()
+        thought_ns = self._stopwatch_ns()
         self._judge(now_us, state, thought)
         flown = self._flown(state, thought)
         setpoint = self._act(now_us, flown)
         sent_ns = self._stopwatch_ns()
+        times = NO_TIMES if thought.plan is None else thought.plan.times
+        self.took = Took(
+            (sensed_ns - began_ns) * 1e-6,
+            (thought_ns - sensed_ns) * 1e-6 - (times.solve_us + times.certify_us) * 1e-3,
+            times.solve_us * 1e-3,
+            times.certify_us * 1e-3,
+            (sent_ns - thought_ns) * 1e-6,
+        )
         self._share(state, flown)
         self._advance(now_us, state)
         self._reporter.problem = self._problem
@@ -178,7 +186,7 @@ class Agent:
             self._sequence,
             self._observer.estimate,
             late_ticks,
-            Took((sent_ns - began_ns) * 1e-6, (solved_ns - sensed_ns) * 1e-6),
+            self.took,
         )
 
     # -- listen, sense ------------------------------------------------------------------------------------------------
@@ -220,11 +228,9 @@ class Agent:
         keep_outs = self._surroundings.keep_outs(state.pos_ned_m, self._utc(act_us), dt_us, steps, self._sequence.phase)
         if not Phase.GOTO_START <= self._sequence.phase <= Phase.GOTO_LAND:
             return Thought(start, None, now_ref, keep_outs)
-        guess = None
-        if self._good is not None and act_us - self._good.t0_us < steps * dt_us:
-            guess = self._shifted(self._good, act_us)
+        guess = self._replay.guess_ned_m(act_us)
         controller = self._controller if self._sequence.phase is Phase.TRACK else self._transit
-        plan = controller.plan(start, reference, estimate.disturbance_ned_m_s2, keep_outs, guess)
+        plan = controller.plan(Problem(start, reference, estimate.disturbance_ned_m_s2, tuple(keep_outs), guess))
         return Thought(start, plan, now_ref, keep_outs)
 
     def _reference(self, now_us: int) -> tuple[Reference, Reference]:
@@ -241,14 +247,15 @@ class Agent:
         plan = thought.plan
         if plan is None:
             self._certified_us = now_us  # none was asked for
+        if plan is not None:
+            assert thought.start is not None
+            self._replay.take(plan, thought.start, thought.keep_outs, self._rest(thought.start))
         if plan is not None and plan.status is PlanStatus.OK:
-            self._good, self._certified_us = plan, now_us
+            self._certified_us = now_us
         elif plan is not None:
             self._reporter.failed_plans += 1
             self._problem = f"plan {plan.status.name.lower()}"
-            assert thought.start is not None
-            if self._good is not None and not self._worth_replaying(self._good, thought.start, thought.keep_outs):
-                self._good = None
+        good = self._replay.plan
         delay_us = self._predictor.delay_us
         health = Health(
             _NOTHING_US if state is None else max(0, now_us - state.t_us),
@@ -257,7 +264,7 @@ class Agent:
             Landed.UNKNOWN if state is None else state.landed,
             state is not None and state.failsafe,
             PlanStatus.NONE if plan is None else plan.status,
-            _NOTHING_US if self._good is None else now_us + delay_us - self._good.t0_us,
+            _NOTHING_US if good is None else now_us + delay_us - good.t0_us,
             0 if self._certified_us is None else now_us - self._certified_us,
             0.0 if state is None else math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s)),
             self._sequence.phase,
@@ -265,11 +272,6 @@ class Agent:
             self._sequence.yielded,
         )
         self._judgement = judge(health, self._setup.params.failsafe)
-
-    def _worth_replaying(self, good: Plan, start: Start, keep_outs: list[KeepOut]) -> bool:
-        """Whether an old plan is still certified by what is known now, or at least comes less close than braking."""
-        replayed = certify(self._shifted(good, start.t_us), keep_outs, 0)
-        return replayed >= 0.0 or replayed >= certify(self._rest(start).pos_ned_m, keep_outs, 0)
 
     def _rest(self, start: Start) -> Plan:
         disturbance = self._observer.estimate.disturbance_ned_m_s2
@@ -285,7 +287,7 @@ class Agent:
         if mode in (Mode.FOLLOW, Mode.STREAM):
             return thought.plan
         if mode is Mode.REPLAY:
-            return self._good
+            return self._replay.plan
         if mode in (Mode.BRAKE, Mode.HOLD):
             if mode is Mode.HOLD and self._hold_at is None:
                 self._hold_at = state.pos_ned_m
@@ -351,11 +353,6 @@ class Agent:
             0.0,
             plan.pos_ned_m,
         )
-
-    def _shifted(self, plan: Plan, t0_us: int) -> Array:
-        """Positions (N+1, 3) of a plan from `t0_us` on."""
-        steps, brake_m_s2 = self._controller.steps, self._setup.separation.brake_m_s2
-        return align(self._path(plan), self._utc(t0_us), self._controller.dt_us, steps, brake_m_s2)
 
     def _coasting(self, state: VehicleState) -> PredictedPath:
         """Somebody else flies: the own velocity, continued, or braked where the autopilot is about to stop."""

@@ -1,93 +1,26 @@
 """Condensed linear MPC over input increments for one, two or three double-integrator axes (thesis 3.9-3.31).
 
-Every axis obeys `p'' = gain u + drift`. The decision variables are the increments of `u` over the control horizon Hc,
-scaled by their bound to [-1, 1]; after Hc the input stays. Rows: increment bounds, input bounds, softened terminal
+Every axis obeys `p'' = gain(k) u + drift`. The decision variables are the increments of `u` over the control horizon
+Hc, scaled to about [-1, 1]; after Hc the input stays. Rows: increment bounds, input bounds, softened terminal
 conditions, and half-spaces `n . p_k >= b_k` with one slack a slot. Nothing here knows which axis is which.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import numpy as np
+from numpy.typing import NDArray
 
-from swarmctl.control.qp import INFINITY, OsqpSolver, QpParams, QpSolver, pattern_index
+from swarmctl.control.axes import AxesSolution, Axis, HalfSpaces, Horizon, Penalties
+from swarmctl.control.qp import INFINITY, QpParams, make_solver, pattern_index
+from swarmctl.control.terminal import TerminalRegion, terminal_region
 from swarmctl.core.types import Array
 
 _SLACK_SCALE_M = 0.1  # slack variables are in units of this, so that they are about 1 like all others
+_SLACK_USED_M = 1e-3
+_REACHED_01 = 0.998  # of what bounded increments can reach is asked for in place of an end farther away
 _ROW_STRIDE = 4  # neighbouring rows are nearly parallel, which slows a first-order solver down
-_NOMINAL_GAIN_M_S2 = 9.81  # only scales the cost
-
-
-@dataclass(frozen=True, slots=True)
-class Axis:
-    """Weights and bounds of one axis (thesis Tables 9, 10, 17, 21)."""
-
-    q_pos: float
-    q_vel: float
-    r: float
-    u_min: float
-    u_max: float
-    du_max: float
-    terminal_pos: bool
-    terminal_vel: bool
-
-
-@dataclass(frozen=True, slots=True)
-class Horizon:
-    """Lengths and sample time of the prediction."""
-
-    control: int
-    prediction: int
-    dt_s: float
-    euler: bool  # forward Euler as in the thesis (3.6), otherwise exact for a held input
-
-
-@dataclass(frozen=True, slots=True)
-class Penalties:
-    """Exact (linear) and quadratic weights of what is softened.
-
-    A linear penalty is exact when it exceeds the multiplier of the hard constraint, that is the slope of the tracking
-    cost along the constraint; so the slack's weight follows that slope.
-    """
-
-    floor: float = 50.0  # per metre; on top of `over` times the tracking cost's own slope
-    over: float = 3.0
-    slack_quadratic: float = 20000.0
-
-
-@dataclass(frozen=True, slots=True)
-class HalfSpaces:
-    """`normal[s, k] . p_k >= offset[s, k]` for slots s and steps k = 1..Hp; offset -inf switches a row off.
-
-    Only every fourth step from the end of the control horizon on becomes a row: earlier ones can't be influenced, and
-    between rows 0.08 s apart the certificate looks at true distances anyway. One more row a slot looks beyond
-    the horizon: `normal[s, -1] . (p_Hp + stop_s[s] v_Hp) >= stop_offset_m[s]`, so that there is room left to stop.
-    """
-
-    normal: Array  # (slots, Hp, axes)
-    offset_m: Array  # (slots, Hp)
-    stop_s: Array  # (slots,)
-    stop_offset_m: Array  # (slots,)
-
-
-@dataclass(frozen=True, slots=True)
-class AxesSolution:
-    """Predicted motion of the axes; `solved` False leaves the arrays at the free response.
-
-    Increments and inputs are within their bounds exactly; `residual_m` is the largest violation of a half-space after
-    that. An unfinished iterate comes as solved: its residual decides.
-    """
-
-    solved: bool
-    status: str
-    iterations: int
-    u: Array  # (Hp, axes), held over each step
-    pos_m: Array  # (Hp, axes), steps 1..Hp
-    vel_m_s: Array  # (Hp, axes)
-    slack_m: float
-    residual_m: float
-    terminal_gap_m: float
 
 
 class CondensedMpc:
@@ -101,6 +34,7 @@ class CondensedMpc:
             inside the dead time can't be infeasible and push agents away (`1` asks for all).
         penalties: weights of what is softened.
         qp: solver settings.
+        stopwatch_ns: measures the solver, and has no influence.
     """
 
     def __init__(
@@ -111,9 +45,10 @@ class CondensedMpc:
         relax_01: float,
         penalties: Penalties,
         qp: QpParams,
+        stopwatch_ns: Callable[[], int],
     ) -> None:
         self.axes, self.horizon, self.slots, self._relax_01 = axes, horizon, slots, relax_01
-        self._penalties = penalties
+        self._penalties, self._stopwatch_ns = penalties, stopwatch_ns
         self._u_min = np.array([a.u_min for a in axes])
         self._u_max = np.array([a.u_max for a in axes])
         self._du_max = np.array([a.du_max for a in axes])
@@ -122,30 +57,40 @@ class CondensedMpc:
         self._build_cost()
         if slots == 0:  # small: tight tolerances cost less than polishing
             qp = qp.model_copy(update={"polish": False, "eps": 0.01 * qp.eps, "eps_relative": 0.01 * qp.eps_relative})
-        self._solver: QpSolver = OsqpSolver(self._p_pattern, self._a_pattern, qp)
+        self._solver = make_solver(self._p_pattern, self._a_pattern, qp)
+        self._soft_solver = make_solver(self._p_pattern, self._a_pattern, qp) if self._terminals else self._solver
 
     def _build_response(self) -> None:
-        """Positions and velocities at steps 1..Hp of a unit increment at each step j < Hc, per unit gain."""
+        """Positions and velocities at steps 1..Hp of a unit acceleration held over each step; what is constant."""
         hp, hc, dt_s = self.horizon.prediction, self.horizon.control, self.horizon.dt_s
         steps = np.arange(1, hp + 1)
-        held = np.maximum(steps[:, None] - np.arange(hc)[None, :], 0)  # (Hp, Hc) steps an increment has acted
-        own = held - 1 if self.horizon.euler else held
-        self._phi_pos = 0.5 * dt_s**2 * held * np.maximum(own, 0)  # (Hp, Hc)
-        self._phi_vel = dt_s * held
+        since = steps[:, None] - steps[None, :]  # (Hp, Hp) steps after the one an acceleration has acted in
+        acted = since >= 0
+        self._pos_of_accel = dt_s**2 * np.where(acted, since + (0.0 if self.horizon.euler else 0.5), 0.0)
+        self._vel_of_accel = dt_s * acted
+        self._hold = (np.minimum.outer(np.arange(hp), np.arange(hc)) == np.arange(hc)).astype(float)  # (Hp, Hc)
         self._t_s = dt_s * steps  # (Hp,)
-        self._drop = 0.5 * dt_s**2 * steps * (steps - 1 if self.horizon.euler else steps)  # position of unit accel.
         self._checked = np.arange(hp - 1, min(hc, hp - 1) - 1, -_ROW_STRIDE)[
             ::-1
         ]  # 0-based steps that get half-space rows
-        response = self._phi_pos[self._checked].max(axis=1) * max(a.du_max for a in self.axes) * _NOMINAL_GAIN_M_S2
+        step_m_s2 = max(a.du_max * a.gain_m_s2 for a in self.axes)
+        response = (self._pos_of_accel @ self._hold)[self._checked].max(axis=1) * step_m_s2
         response = np.append(response, response[-1])  # and the stopping row
         self._row_scale = 1.0 / np.maximum(response, 0.01)  # rows of about unit size suit a first-order solver
-        self._hold = (np.minimum.outer(np.arange(hp), np.arange(hc)) == np.arange(hc)).astype(float)  # (Hp, Hc)
 
     def _build_layout(self) -> None:
         n, hc, checks = len(self.axes), self.horizon.control, len(self._row_scale)
-        self._terminals = [(i, "pos") for i, a in enumerate(self.axes) if a.terminal_pos]
-        self._terminals += [(i, "vel") for i, a in enumerate(self.axes) if a.terminal_vel]
+        ends = [a.terminal for a in self.axes]
+        self._terminals = [(i, "pos") for i, end in enumerate(ends) if end in ("position", "position_velocity")]
+        self._terminals += [(i, "vel") for i, end in enumerate(ends) if end == "position_velocity"]
+        self._ends = np.arange(len(self._terminals))
+        self._end_velocities = np.array([j for j, (_, what) in enumerate(self._terminals) if what == "vel"], dtype=int)
+        self._end_wanted = np.zeros(len(self._terminals))
+        self._terminals_of = {
+            i: np.array([j for j, (k, _) in enumerate(self._terminals) if k == i])
+            for i in sorted({i for i, _ in self._terminals})
+        }
+        self._regions = {i: self._region(a) for i, a in enumerate(self.axes) if a.terminal == "region"}
         moves, soft = n * hc, len(self._terminals)
         self._moves, self._columns = moves, moves + soft + self.slots
         self._row_input = moves
@@ -179,17 +124,27 @@ class CondensedMpc:
         self._lower = np.full(rows, -INFINITY)
         self._upper = np.full(rows, INFINITY)
 
+    def _region(self, axis: Axis) -> TerminalRegion:
+        gain = axis.gain_m_s2
+        room = min(axis.u_max - axis.u_rest, axis.u_rest - axis.u_min)
+        return terminal_region(
+            axis.q_pos, axis.q_vel, axis.r / gain**2, gain * room, gain * axis.du_max, self.horizon.dt_s
+        )
+
     def _build_cost(self) -> None:
         n, hc = len(self.axes), self.horizon.control
-        self._hessian: list[Array] = []
-        for axis in self.axes:
-            gram = axis.q_pos * self._phi_pos.T @ self._phi_pos + axis.q_vel * self._phi_vel.T @ self._phi_vel
-            self._hessian.append(2.0 * axis.du_max**2 * gram)
-        largest = max(float(np.max(np.diag(h))) for h in self._hessian) * _NOMINAL_GAIN_M_S2**2
+        phi_pos, phi_vel = self._pos_of_accel @ self._hold, self._vel_of_accel @ self._hold  # (Hp, Hc)
+        largest = 0.0
+        for i, axis in enumerate(self.axes):
+            gram = axis.q_pos * phi_pos.T @ phi_pos + axis.q_vel * phi_vel.T @ phi_vel
+            if i in self._regions:
+                end = np.stack([phi_pos[-1], phi_vel[-1], self._hold[-1]])  # (3, Hc)
+                gram += end.T @ self._regions[i].beyond @ end
+            largest = max(largest, 2.0 * (axis.du_max * axis.gain_m_s2) ** 2 * float(np.max(np.diag(gram))))
         self._cost_scale = 1.0 / max(largest, 1e-12)
         for i, axis in enumerate(self.axes):
             block = slice(self._moves + i * hc, self._moves + (i + 1) * hc)
-            self._a_dense[block, i * hc : (i + 1) * hc] = np.tri(hc) * axis.du_max / self._input_scale(axis)
+            self._a_dense[block, i * hc : (i + 1) * hc] = np.tri(hc) * axis.du_max / axis.u_scale
             self._lower[i * hc : (i + 1) * hc] = -1.0
             self._upper[i * hc : (i + 1) * hc] = 1.0
         moves, soft = self._moves, len(self._terminals)
@@ -210,10 +165,6 @@ class CondensedMpc:
         self._q_soft = np.full(soft + self.slots, weights.floor * _SLACK_SCALE_M * self._cost_scale)
         assert len(self._q_soft) == self._columns - n * hc
 
-    @staticmethod
-    def _input_scale(axis: Axis) -> float:
-        return max(abs(axis.u_min), abs(axis.u_max))
-
     def solve(
         self,
         pos_m: Array,
@@ -230,60 +181,146 @@ class CondensedMpc:
         Args:
             pos_m, vel_m_s: (axes,) state the prediction starts from.
             u_prev: (axes,) input now held.
-            gain_m_s2: (axes,) acceleration of a unit input, sign included.
+            gain_m_s2: (Hp, axes) acceleration of a unit input over each step, sign included.
             drift_m_s2: (axes,) acceleration without input.
             ref_pos_m, ref_vel_m_s: (Hp, axes) at steps 1..Hp.
             half_spaces: at most `slots` families; None for none.
         """
         u_prev = np.clip(u_prev, self._u_min, self._u_max)
-        accel = gain_m_s2 * u_prev + drift_m_s2  # (axes,)
-        free_pos = pos_m + self._t_s[:, None] * vel_m_s + self._drop[:, None] * accel  # (Hp, axes)
-        free_vel = vel_m_s + self._t_s[:, None] * accel
-        q = self._fill_cost(gain_m_s2, free_pos - ref_pos_m, free_vel - ref_vel_m_s)
+        accel = gain_m_s2 * u_prev + drift_m_s2  # (Hp, axes)
+        free_pos = pos_m + self._t_s[:, None] * vel_m_s + self._pos_of_accel @ accel  # (Hp, axes)
+        free_vel = vel_m_s + self._vel_of_accel @ accel
+        driven = gain_m_s2.T[:, :, None] * self._hold  # (axes, Hp, Hc)
+        phi_pos, phi_vel = self._pos_of_accel @ driven, self._vel_of_accel @ driven
+        pos_error, vel_error = free_pos - ref_pos_m, free_vel - ref_vel_m_s
+        ref_accel = (ref_vel_m_s[-1] - ref_vel_m_s[-2]) / self.horizon.dt_s if len(ref_vel_m_s) > 1 else 0.0 * u_prev
+        ends = np.stack([pos_error[-1], vel_error[-1], accel[-1] - ref_accel])  # (3, axes) without any move
+        q = self._fill_cost(gain_m_s2, phi_pos, phi_vel, pos_error, vel_error, ends)
         self._fill_inputs(u_prev)
-        self._fill_terminals(gain_m_s2, (free_pos - ref_pos_m)[-1], (free_vel - ref_vel_m_s)[-1])
-        self._fill_half_spaces(gain_m_s2, u_prev, free_pos, free_vel, half_spaces)
-        solution = self._solver.solve(
-            self._p_dense[self._p_index], q, self._a_dense[self._a_index], self._lower, self._upper
+        self._fill_terminals(q, phi_pos[:, -1], phi_vel[:, -1], u_prev, pos_error[-1], vel_error[-1])
+        self._fill_half_spaces(phi_pos, phi_vel, u_prev, free_pos, free_vel, half_spaces)
+        p_values, a_values = self._p_dense[self._p_index], self._a_dense[self._a_index]
+        began_ns = self._stopwatch_ns()
+        solution = self._solver.solve(p_values, q, a_values, self._lower, self._upper)
+        for softened in (self._end_velocities, self._ends):  # not feasible: exact penalties instead of equalities
+            if len(softened) and not solution.exact:
+                self._soften(softened)
+                solution = self._soft_solver.solve(p_values, q, a_values, self._lower, self._upper)
+        if len(self._ends) and self.slots and self._distance_slack_m(solution.x) > _SLACK_USED_M:
+            self._soften(self._ends)  # distances come first: let go of the end
+            q[self._moves + self._ends] = 0.0
+            solution = self._soft_solver.solve(p_values, q, a_values, self._lower, self._upper)
+        solve_us = (self._stopwatch_ns() - began_ns) * 1e-3
+        inputs = self._inputs(solution.x, u_prev)
+        moves = np.diff(inputs, axis=0, prepend=u_prev[None])  # within both bounds, whatever the solver's tolerance
+        slack_m, residual_m, gap_m = self._shortfalls(solution.x, moves)
+        pos = free_pos + np.einsum("akc,ca->ka", phi_pos, moves)
+        vel = free_vel + np.einsum("akc,ca->ka", phi_vel, moves)
+        for i, region in self._regions.items():
+            end = np.array([(pos - ref_pos_m)[-1, i], (vel - ref_vel_m_s)[-1, i], ends[2, i]])
+            end[2] += gain_m_s2[-1, i] * float(self._hold[-1] @ moves[:, i])
+            gap_m = max(gap_m, region.outside_m(end))
+        return AxesSolution(
+            solution.x is not None,
+            solution.status,
+            solution.iterations,
+            u_prev + self._hold @ moves,
+            pos,
+            vel,
+            slack_m,
+            residual_m,
+            gap_m,
+            solve_us,
         )
-        return self._unpack(solution.x, solution.status, solution.iterations, u_prev, gain_m_s2, free_pos, free_vel)
 
-    def _fill_cost(self, gain_m_s2: Array, pos_error: Array, vel_error: Array) -> Array:
+    def motion(self, pos_m: Array, vel_m_s: Array, accel_m_s2: Array) -> tuple[Array, Array]:
+        """Positions and velocities (Hp, axes) under accelerations (Hp, axes) held over each step."""
+        pos = pos_m + self._t_s[:, None] * vel_m_s + self._pos_of_accel @ accel_m_s2
+        return pos, vel_m_s + self._vel_of_accel @ accel_m_s2
+
+    def _fill_cost(
+        self, gain_m_s2: Array, phi_pos: Array, phi_vel: Array, pos_error: Array, vel_error: Array, ends: Array
+    ) -> Array:
         hc = self.horizon.control
         q = np.empty(self._columns)
         q[self._moves :] = self._q_soft
         for i, axis in enumerate(self.axes):
             block = slice(i * hc, (i + 1) * hc)
-            gain = float(gain_m_s2[i])
-            hessian = gain * gain * self._hessian[i]
-            hessian[np.arange(hc), np.arange(hc)] += 2.0 * axis.r * axis.du_max**2
-            self._p_dense[block, block] = hessian * self._cost_scale
-            slope = axis.q_pos * (pos_error[:, i] @ self._phi_pos) + axis.q_vel * (vel_error[:, i] @ self._phi_vel)
-            q[block] = (2.0 * gain * axis.du_max * self._cost_scale) * slope
+            hessian = axis.q_pos * (phi_pos[i].T @ phi_pos[i]) + axis.q_vel * (phi_vel[i].T @ phi_vel[i])
+            slope = axis.q_pos * (pos_error[:, i] @ phi_pos[i]) + axis.q_vel * (vel_error[:, i] @ phi_vel[i])
+            if i in self._regions:
+                end = np.stack([phi_pos[i, -1], phi_vel[i, -1], gain_m_s2[-1, i] * self._hold[-1]])  # (3, Hc)
+                pull = end.T @ self._regions[i].beyond
+                hessian += pull @ end
+                slope += pull @ ends[:, i]
+            hessian[np.arange(hc), np.arange(hc)] += axis.r
+            self._p_dense[block, block] = (2.0 * axis.du_max**2 * self._cost_scale) * hessian
+            q[block] = (2.0 * axis.du_max * self._cost_scale) * slope
         steepest = float(np.abs(q[: self._moves]).max()) * self._row_scale[-1]  # per metre of the last row
-        q[self._moves :] += self._penalties.over * steepest * _SLACK_SCALE_M
+        q[self._moves + len(self._terminals) :] += self._penalties.over * steepest * _SLACK_SCALE_M
         return q
 
     def _fill_inputs(self, u_prev: Array) -> None:
         hc = self.horizon.control
         for i, axis in enumerate(self.axes):
             block = slice(self._row_input + i * hc, self._row_input + (i + 1) * hc)
-            scale = self._input_scale(axis)
+            scale = axis.u_scale
             self._lower[block] = (axis.u_min - u_prev[i]) / scale
             self._upper[block] = (axis.u_max - u_prev[i]) / scale
 
-    def _fill_terminals(self, gain_m_s2: Array, pos_error: Array, vel_error: Array) -> None:
-        hc = self.horizon.control
+    def _fill_terminals(
+        self, q: Array, end_pos: Array, end_vel: Array, u_prev: Array, pos_error: Array, vel_error: Array
+    ) -> None:
+        """Equalities `gap = 0`, slacks fixed; and weights of the slacks that make them exact, should it be needed.
+
+        No end is asked for that the bounded increments can't reach: towards a far one they go as far as they can. The
+        multipliers that balance the cost's slope g along the rows R, (R R')^-1 R g, are the scale of the weights.
+        """
+        hc, out_of_reach = self.horizon.control, set[int]()
         for j, (i, what) in enumerate(self._terminals):
-            response = self._phi_pos[-1] if what == "pos" else self._phi_vel[-1]
-            error = pos_error[i] if what == "pos" else vel_error[i]
+            response = end_pos[i] if what == "pos" else end_vel[i]
             row = self._row_terminal + 2 * j
-            self._a_dense[row : row + 2, i * hc : (i + 1) * hc] = gain_m_s2[i] * self.axes[i].du_max * response
-            self._lower[row] = -error  # gap + slack >= 0
-            self._upper[row + 1] = -error  # gap - slack <= 0
+            self._a_dense[row : row + 2, i * hc : (i + 1) * hc] = self.axes[i].du_max * response
+            self._end_wanted[j] = -(pos_error if what == "pos" else vel_error)[i]
+            asked = self._end_wanted[j]
+            least, most = sorted(float(response @ moves) for moves in self._extremes(i, u_prev))
+            self._lower[row : row + 2], self._upper[row : row + 2] = -INFINITY, INFINITY
+            if i in out_of_reach:
+                continue  # on the way there its velocity does not matter
+            if not least <= asked <= most:
+                out_of_reach.add(i)
+                asked = _REACHED_01 * (most if asked > most else least)
+            self._lower[row : row + 2] = self._upper[row : row + 2] = asked
+        self._upper[self._row_soft + self._ends] = 0.0
+        for i, own in self._terminals_of.items():
+            rows = self._a_dense[self._row_terminal + 2 * own, i * hc : (i + 1) * hc]  # (own, Hc)
+            multiplier = np.abs(np.linalg.lstsq(rows.T, q[i * hc : (i + 1) * hc], rcond=1e-9)[0])
+            q[self._moves + own] += self._penalties.over_terminal * multiplier * _SLACK_SCALE_M
+
+    def _extremes(self, i: int, u_prev: Array) -> tuple[Array, Array]:
+        """Increments (Hc,) of axis `i` that raise and that lower its input as fast as the bounds allow."""
+        axis, ramp = self.axes[i], np.arange(1, self.horizon.control + 1)
+        rise = np.minimum(u_prev[i] + axis.du_max * ramp, axis.u_max)
+        fall = np.maximum(u_prev[i] - axis.du_max * ramp, axis.u_min)
+        return np.diff(rise, prepend=u_prev[i]), np.diff(fall, prepend=u_prev[i])
+
+    def _distance_slack_m(self, x: Array | None) -> float:
+        return 0.0 if x is None else float(x[self._moves + len(self._terminals) :].max()) * _SLACK_SCALE_M
+
+    def _soften(self, which: NDArray[np.intp]) -> None:
+        """Rows `gap + slack >= 0` and `gap - slack <= 0` with free slacks, for these terminal conditions."""
+        rows = self._row_terminal + 2 * which
+        self._upper[rows], self._lower[rows + 1] = INFINITY, -INFINITY
+        self._upper[self._row_soft + which] = INFINITY
 
     def _fill_half_spaces(
-        self, gain_m_s2: Array, u_prev: Array, free_pos: Array, free_vel: Array, spaces: HalfSpaces | None
+        self,
+        phi_pos: Array,
+        phi_vel: Array,
+        u_prev: Array,
+        free_pos: Array,
+        free_vel: Array,
+        spaces: HalfSpaces | None,
     ) -> None:
         hc, checks = self.horizon.control, len(self._row_scale)
         self._lower[self._row_half :] = -INFINITY
@@ -292,69 +329,41 @@ class CondensedMpc:
         used = len(spaces.normal)
         normal = np.concatenate([spaces.normal[:, self._checked], spaces.normal[:, -1:]], axis=1)
         offset = np.concatenate([spaces.offset_m[:, self._checked], spaces.stop_offset_m[:, None]], axis=1)
-        response = np.empty((used, checks, hc))  # metres of each row per unit gain and increment
-        response[:, :-1] = self._phi_pos[self._checked]
-        response[:, -1] = self._phi_pos[-1] + spaces.stop_s[:, None] * self._phi_vel[-1]
         free = np.empty((used, checks, len(self.axes)))
         free[:, :-1] = free_pos[self._checked]
         free[:, -1] = free_pos[-1] + spaces.stop_s[:, None] * free_vel[-1]
-        push = normal * gain_m_s2
-        scaled = push * self._row_scale[None, :, None]
         rows = slice(self._row_half, self._row_half + used * checks)
         block = self._a_dense[rows].reshape(used, checks, self._columns)
+        reach = np.zeros((used, checks))  # largest value of each row that the bounded increments allow
         for i, axis in enumerate(self.axes):
-            block[:, :, i * hc : (i + 1) * hc] = scaled[:, :, i, None] * (axis.du_max * response)
+            push = np.empty((used, checks, hc))  # metres of each row per unit increment
+            push[:, :-1] = phi_pos[i, self._checked]
+            push[:, -1] = phi_pos[i, -1] + spaces.stop_s[:, None] * phi_vel[i, -1]
+            push *= normal[:, :, i, None]
+            block[:, :, i * hc : (i + 1) * hc] = (axis.du_max * self._row_scale)[None, :, None] * push
+            rise, fall = self._extremes(i, u_prev)
+            reach += np.maximum(push @ rise, push @ fall)
         wanted = offset - np.einsum("ska,ska->sk", normal, free)
-        lower = np.minimum(wanted, self._relax_01 * self._reach(push, response, u_prev)) * self._row_scale
+        lower = np.minimum(wanted, self._relax_01 * reach) * self._row_scale
         self._lower[rows] = np.where(np.isfinite(offset), lower, -INFINITY).ravel()
 
-    def _reach(self, push: Array, response: Array, u_prev: Array) -> Array:
-        """Largest value of each row (used, checks) that the bounded increments allow."""
-        total = np.zeros(push.shape[:2])
-        ramp = np.arange(1, self.horizon.control + 1)
-        for i, axis in enumerate(self.axes):
-            up = np.minimum(u_prev[i] + axis.du_max * ramp, axis.u_max)
-            down = np.maximum(u_prev[i] - axis.du_max * ramp, axis.u_min)
-            rise = response @ np.diff(up, prepend=u_prev[i])  # (used, checks)
-            fall = response @ np.diff(down, prepend=u_prev[i])
-            total += np.maximum(push[:, :, i] * rise, push[:, :, i] * fall)
-        return total
-
-    def _unpack(
-        self,
-        x: Array | None,
-        status: str,
-        iterations: int,
-        u_prev: Array,
-        gain_m_s2: Array,
-        free_pos: Array,
-        free_vel: Array,
-    ) -> AxesSolution:
-        hp, hc, n = self.horizon.prediction, self.horizon.control, len(self.axes)
+    def _inputs(self, x: Array | None, u_prev: Array) -> Array:
+        """Inputs (Hc, axes) of a solution, clipped to all bounds; without one, held."""
+        hc, n = self.horizon.control, len(self.axes)
         if x is None:
-            held = np.tile(u_prev, (hp, 1))
-            return AxesSolution(False, status, iterations, held, free_pos, free_vel, 0.0, np.inf, np.inf)
-        wanted = np.clip(x[: self._moves], -1.0, 1.0).reshape(n, hc).T * self._du_max  # (Hc, axes)
-        inputs = np.clip(u_prev + np.cumsum(wanted, axis=0), self._u_min, self._u_max)
-        moves = np.diff(inputs, axis=0, prepend=u_prev[None])  # within both bounds, whatever the solver's tolerance
-        u = u_prev + self._hold @ moves
-        pos = free_pos + (self._phi_pos @ moves) * gain_m_s2
-        vel = free_vel + (self._phi_vel @ moves) * gain_m_s2
+            return np.tile(u_prev, (hc, 1))
+        wanted = np.clip(x[: self._moves].reshape(n, hc).T * self._du_max, -self._du_max, self._du_max)
+        return np.asarray(np.clip(u_prev + np.cumsum(wanted, axis=0), self._u_min, self._u_max))
+
+    def _shortfalls(self, x: Array | None, moves: Array) -> tuple[float, float, float]:
+        """Largest slack used, violation of a half-space and gap of a terminal row [m] for the moves as clipped."""
+        if x is None:
+            return 0.0, np.inf, np.inf
         soft = len(self._terminals)
         flown = np.concatenate([(moves / self._du_max).T.ravel(), x[self._moves :]])
         slack = flown[self._moves + soft :] * _SLACK_SCALE_M
-        terminal = slice(self._row_terminal, self._row_half, 2)  # their bounds are the error without any move
-        gap = np.abs(self._a_dense[terminal, : self._moves] @ flown[: self._moves] - self._lower[terminal])
+        rows = self._a_dense[self._row_terminal : self._row_half : 2, : self._moves]
+        gap = np.abs(rows @ flown[: self._moves] - self._end_wanted)
         shortfall = self._lower[self._row_half :] - self._a_dense[self._row_half :] @ flown
         shortfall = shortfall / np.tile(self._row_scale, self.slots)
-        return AxesSolution(
-            True,
-            status,
-            iterations,
-            u,
-            pos,
-            vel,
-            float(slack.max(initial=0.0)),
-            float(shortfall.max(initial=0.0)),
-            float(gap.max(initial=0.0)),
-        )
+        return float(slack.max(initial=0.0)), float(shortfall.max(initial=0.0)), float(gap.max(initial=0.0))

@@ -2,23 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Literal, Protocol
 
 import numpy as np
 
-from swarmctl.control.mpc import MpcParams, Start, SwarmMpc
+from swarmctl.control.joint_mpc import JointMpc
+from swarmctl.control.mpc import MpcParams, SwarmMpc
 from swarmctl.control.pid import PidController, PidParams
-from swarmctl.control.separation import KeepOut, SeparationParams
+from swarmctl.control.problem import Problem
+from swarmctl.control.separation import SeparationParams
 from swarmctl.core.params import Params
-from swarmctl.core.types import Array, Plan, PlanStatus, Reference
+from swarmctl.core.types import NO_TIMES, Plan, PlanStatus
 
 
 class ControllerParams(Params):
     """Which controller flies, and the parameters of each."""
 
-    kind: Literal["dmpc", "mpc", "pid", "open_loop"] = "dmpc"
-    mpc: MpcParams = MpcParams()  # dmpc, and mpc: the same without anything to keep clear of
+    kind: Literal["dmpc", "dmpc3", "mpc", "pid", "open_loop"] = "dmpc"
+    mpc: MpcParams = MpcParams()  # of dmpc, dmpc3 (all axes in one problem) and mpc (nothing to keep clear of)
     pid: PidParams = PidParams()
 
 
@@ -37,37 +40,22 @@ class Controller(Protocol):
     def longest(self) -> int:
         """Steps of reference needed."""
 
-    def plan(
-        self,
-        start: Start,
-        reference: Reference,
-        disturbance_ned_m_s2: Array,
-        keep_outs: Sequence[KeepOut],
-        guess_ned_m: Array | None,
-    ) -> Plan:
-        """See `SwarmMpc.plan`."""
+    def plan(self, problem: Problem) -> Plan:
+        """What to fly from `problem.start` on. Never raises for a problem without a solution."""
 
     def reset(self) -> None:
         """Forget the past: somebody else has flown."""
 
 
 class _Mpc:
-    """`SwarmMpc` keeps nothing between ticks but its warm start."""
+    """Both kinds of MPC keep nothing between ticks but their warm start."""
 
-    def __init__(self, mpc: SwarmMpc, alone: bool) -> None:
+    def __init__(self, mpc: SwarmMpc | JointMpc, alone: bool) -> None:
         self._mpc, self._alone = mpc, alone
         self.dt_us, self.steps, self.longest = mpc.dt_us, mpc.steps, mpc.longest
 
-    def plan(
-        self,
-        start: Start,
-        reference: Reference,
-        disturbance_ned_m_s2: Array,
-        keep_outs: Sequence[KeepOut],
-        guess_ned_m: Array | None,
-    ) -> Plan:
-        known = () if self._alone else keep_outs
-        return self._mpc.plan(start, reference, disturbance_ned_m_s2, known, guess_ned_m)
+    def plan(self, problem: Problem) -> Plan:
+        return self._mpc.plan(replace(problem, keep_outs=()) if self._alone else problem)
 
     def reset(self) -> None:
         return
@@ -78,15 +66,8 @@ class _Pid:
         self._pid = PidController(params)
         self.dt_us, self.steps, self.longest = self._pid.dt_us, self._pid.steps, self._pid.steps
 
-    def plan(
-        self,
-        start: Start,
-        reference: Reference,
-        disturbance_ned_m_s2: Array,
-        keep_outs: Sequence[KeepOut],
-        guess_ned_m: Array | None,
-    ) -> Plan:
-        return self._pid.plan(start, reference)
+    def plan(self, problem: Problem) -> Plan:
+        return self._pid.plan(problem)
 
     def reset(self) -> None:
         self._pid.reset()
@@ -99,29 +80,27 @@ class _OpenLoop:
         self.dt_us, self.steps = round(params.dt_s * 1e6), params.horizon_xy
         self.longest = self.steps
 
-    def plan(
-        self,
-        start: Start,
-        reference: Reference,
-        disturbance_ned_m_s2: Array,
-        keep_outs: Sequence[KeepOut],
-        guess_ned_m: Array | None,
-    ) -> Plan:
+    def plan(self, problem: Problem) -> Plan:
+        start = problem.start
         t_s = np.arange(self.steps + 1)[:, None] * (self.dt_us * 1e-6)
         pos = start.pos_ned_m + t_s * start.vel_ned_m_s
         vel = np.tile(start.vel_ned_m_s, (self.steps + 1, 1))
         nothing = np.zeros((self.steps, 3))
-        return Plan(PlanStatus.OK, start.t_us, self.dt_us, pos, vel, nothing, 0, 0, 0.0, 0.0, 0.0)
+        return Plan(PlanStatus.OK, start.t_us, self.dt_us, pos, vel, nothing, NO_TIMES, 0, 0.0, 0.0, 0.0)
 
     def reset(self) -> None:
         return
 
 
-def make_controller(params: ControllerParams, separation: SeparationParams, agent: int, slots: int) -> Controller:
+def make_controller(
+    params: ControllerParams, separation: SeparationParams, agent: int, slots: int, stopwatch_ns: Callable[[], int]
+) -> Controller:
     """The controller a config asks for; `slots` is how many keep-outs it can hold at once."""
     if params.kind == "pid":
         return _Pid(params.pid)
     if params.kind == "open_loop":
         return _OpenLoop(params.mpc)
+    if params.kind == "dmpc3":
+        return _Mpc(JointMpc(params.mpc, separation, agent, slots, stopwatch_ns), False)
     alone = params.kind == "mpc"
-    return _Mpc(SwarmMpc(params.mpc, separation, agent, 0 if alone else slots), alone)
+    return _Mpc(SwarmMpc(params.mpc, separation, agent, 0 if alone else slots, stopwatch_ns), alone)

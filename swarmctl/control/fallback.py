@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from swarmctl.control.mpc import Start
+from swarmctl.control.problem import Start
 from swarmctl.core.frames import GRAVITY_M_S2
-from swarmctl.core.types import Array, Plan, PlanStatus
+from swarmctl.core.types import NO_TIMES, Array, Plan, PlanStatus
 
 _DAMPING_1_S = 4.0
 _STIFFNESS_1_S2 = 4.0
@@ -36,4 +36,4 @@ def rest_plan(start: Start, at_ned_m: Array | None, disturbance_ned_m_s2: Array,
         accel[:2] = disturbance_ned_m_s2[:2] - thrust * u
         pos[k + 1] = pos[k] + dt_s * vel[k] + 0.5 * dt_s * dt_s * accel
         vel[k + 1] = vel[k] + dt_s * accel
-    return Plan(PlanStatus.NONE, start.t_us, dt_us, pos, vel, virtual, 0, 0, 0.0, 0.0, 0.0)
+    return Plan(PlanStatus.NONE, start.t_us, dt_us, pos, vel, virtual, NO_TIMES, 0, 0.0, 0.0, 0.0)

@@ -8,19 +8,20 @@ drift of each axis.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
-from swarmctl.control.condensed import AxesSolution, Axis, CondensedMpc, Horizon, Penalties
+from swarmctl.control.axes import AxesSolution, Axis, Horizon, Penalties, Terminal
+from swarmctl.control.condensed import CondensedMpc
+from swarmctl.control.problem import Problem, Start
 from swarmctl.control.qp import QpParams
-from swarmctl.control.separation import KeepOut, SeparationParams, certify, half_spaces_xy
+from swarmctl.control.separation import KeepOut, SeparationParams, certify, half_spaces
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.params import Params
-from swarmctl.core.types import Array, Plan, PlanStatus, Reference
+from swarmctl.core.types import Array, Plan, PlanStatus, PlanTimes
 
 RESIDUAL_LIMIT_M = 0.05  # a solution that misses a constraint by more is none; the certificate judges the rest
 
@@ -28,7 +29,7 @@ RESIDUAL_LIMIT_M = 0.05  # a solution that misses a constraint by more is none; 
 class AxisWeights(Params):
     """Quadratic weights of one axis."""
 
-    q_pos: float = Field(ge=0, le=1e4)
+    q_pos: float = Field(gt=0, le=1e4)
     q_vel: float = Field(ge=0, le=1e4)
     r: float = Field(gt=0, le=1e4)
 
@@ -38,9 +39,12 @@ class MpcParams(Params):
 
     dt_s: float = Field(0.02, gt=0.001, le=0.5)
     discretisation: Literal["zoh", "euler"] = "zoh"  # euler is the thesis' (3.6)
+    thrust_ahead: Literal["held", "planned"] = (
+        "planned"  # x-y predicted with f_t of now (thesis) or of the whole z plan
+    )
     control_z: int = Field(3, ge=1, le=50)
     horizon_z: int = Field(40, ge=2, le=200)
-    control_xy: int = Field(6, ge=1, le=50)
+    control_xy: int = Field(6, ge=1, le=50)  # and of dmpc3, for all three axes
     horizon_xy: int = Field(40, ge=2, le=200)
     z: AxisWeights = AxisWeights(q_pos=2.0, q_vel=0.05, r=0.01)
     x: AxisWeights = AxisWeights(q_pos=1.5, q_vel=0.5, r=0.01)
@@ -50,101 +54,75 @@ class MpcParams(Params):
     dthrust_max_m_s2: float = Field(5.0, gt=0, le=100)  # per step
     u_max: float = Field(0.2, gt=0, lt=1)  # sine of the tilt, each axis
     du_max: float = Field(0.05, gt=0, lt=1)  # per step
-    terminal_z: Literal["none", "position", "position_velocity"] = "position_velocity"
-    terminal_xy: Literal["none", "position"] = "none"
+    terminal_z: Terminal = "position_velocity"  # softened equality, or a region (see control.terminal)
+    terminal_xy: Terminal = "none"
     qp: QpParams = QpParams()
 
+    def vertical(self) -> Axis:
+        """z: the input is thrust over mass."""
+        w = self.z
+        least, most, step = self.thrust_min_m_s2, self.thrust_max_m_s2, self.dthrust_max_m_s2
+        return Axis(w.q_pos, w.q_vel, w.r, least, most, step, GRAVITY_M_S2, 1.0, self.terminal_z)
 
-@dataclass(frozen=True, slots=True)
-class Start:
-    """Where a plan begins: the predicted own state when its first setpoint acts."""
+    def horizontal(self) -> tuple[Axis, Axis]:
+        """x and y: the inputs are u_x and u_y."""
+        return self._lateral(self.x), self._lateral(self.y)
 
-    t_us: int
-    pos_ned_m: Array  # (3,)
-    vel_ned_m_s: Array  # (3,)
-    cos_tilt: float  # cos(phi) cos(theta) now
-    virtual: Array  # (3,) u_x, u_y, thrust over mass now held
+    def _lateral(self, w: AxisWeights) -> Axis:
+        u, du = self.u_max, self.du_max
+        return Axis(w.q_pos, w.q_vel, w.r, -u, u, du, 0.0, GRAVITY_M_S2, self.terminal_xy)
+
+    def horizon(self, control: int, prediction: int) -> Horizon:
+        return Horizon(control, prediction, self.dt_s, self.discretisation == "euler")
 
 
 class SwarmMpc:
     """z-MPC, then x-y MPC with half-spaces, then a certificate over true distances."""
 
-    def __init__(self, params: MpcParams, separation: SeparationParams, own_tie: int, slots: int) -> None:
+    def __init__(
+        self,
+        params: MpcParams,
+        separation: SeparationParams,
+        own_tie: int,
+        slots: int,
+        stopwatch_ns: Callable[[], int],
+    ) -> None:
         self._params, self._separation, self._tie, self._slots = params, separation, own_tie, slots
-        self._dt_us = round(params.dt_s * 1e6)
-        euler = params.discretisation == "euler"
-        z_terminal = params.terminal_z
+        self._stopwatch_ns = stopwatch_ns
+        self.dt_us = round(params.dt_s * 1e6)
+        self.steps = params.horizon_xy
+        self.longest = max(params.horizon_xy, params.horizon_z)  # reference steps needed
         self._z = CondensedMpc(
-            (
-                Axis(
-                    params.z.q_pos,
-                    params.z.q_vel,
-                    params.z.r,
-                    params.thrust_min_m_s2,
-                    params.thrust_max_m_s2,
-                    params.dthrust_max_m_s2,
-                    z_terminal != "none",
-                    z_terminal == "position_velocity",
-                ),
-            ),
-            Horizon(params.control_z, params.horizon_z, params.dt_s, euler),
+            (params.vertical(),),
+            params.horizon(params.control_z, params.horizon_z),
             0,
             1.0,
             Penalties(),
             params.qp,
+            stopwatch_ns,
         )
         self._xy = CondensedMpc(
-            tuple(
-                Axis(w.q_pos, w.q_vel, w.r, -params.u_max, params.u_max, params.du_max, terminal, False)
-                for w in (params.x, params.y)
-                for terminal in (params.terminal_xy == "position",)
-            ),
-            Horizon(params.control_xy, params.horizon_xy, params.dt_s, euler),
+            params.horizontal(),
+            params.horizon(params.control_xy, params.horizon_xy),
             slots,
             separation.relax_01,
             Penalties(),
             params.qp,
+            stopwatch_ns,
         )
 
-    @property
-    def steps(self) -> int:
-        """Prediction steps of a plan."""
-        return self._params.horizon_xy
-
-    @property
-    def longest(self) -> int:
-        """Reference steps needed."""
-        return max(self._params.horizon_xy, self._params.horizon_z)
-
-    @property
-    def dt_us(self) -> int:
-        return self._dt_us
-
-    def plan(
-        self,
-        start: Start,
-        reference: Reference,
-        disturbance_ned_m_s2: Array,
-        keep_outs: Sequence[KeepOut],
-        guess_ned_m: Array | None,
-    ) -> Plan:
-        """One step of distributed MPC. Never raises for an infeasible problem; the status says what may be flown.
-
-        Args:
-            start: predicted own state.
-            reference: at least `longest` + 1 points from `start.t_us` on.
-            disturbance_ned_m_s2: (3,) taken as constant.
-            keep_outs: peers and obstacles, aligned with the plan's times.
-            guess_ned_m: (steps+1, 3) own previous prediction at the new times; None for constant velocity.
-        """
-        up = self._solve_z(start, reference, float(disturbance_ned_m_s2[2]))
-        thrust = float(up.u[0, 0])
-        guess = self._guess(start, up.pos_m[:, 0], guess_ned_m)
-        nearest = sorted(keep_outs, key=lambda k: float(np.min(np.sum((guess - k.pos_ned_m) ** 2, axis=1))))
-        spaces = half_spaces_xy(
-            nearest[: self._slots],
+    def plan(self, problem: Problem) -> Plan:
+        """One step of distributed MPC. Never raises for an infeasible problem; the status says what may be flown."""
+        began_ns = self._stopwatch_ns()
+        start, steps = problem.start, self.steps
+        up = self._solve_z(problem)
+        count = min(steps, len(up.pos_m))
+        guess = first_guess(problem, self._params.dt_s, steps)
+        guess[1 : count + 1, 2] = up.pos_m[:count, 0]
+        spaces = half_spaces(
+            nearest(problem.keep_outs, guess, self._slots),
             guess,
-            reference.pos_ned_m[self.steps, :2],
+            problem.reference.pos_ned_m[steps, :2],
             start.vel_ned_m_s[:2],
             self._params.dt_s,
             self._tie,
@@ -154,68 +132,104 @@ class SwarmMpc:
             start.pos_ned_m[:2],
             start.vel_ned_m_s[:2],
             start.virtual[:2],
-            np.array([-thrust, -thrust]),
-            disturbance_ned_m_s2[:2],
-            reference.pos_ned_m[1 : self.steps + 1, :2],
-            reference.vel_ned_m_s[1 : self.steps + 1, :2],
+            np.repeat(-self._thrust_ahead(up)[:, None], 2, axis=1),
+            problem.disturbance_ned_m_s2[:2],
+            problem.reference.pos_ned_m[1 : steps + 1, :2],
+            problem.reference.vel_ned_m_s[1 : steps + 1, :2],
             spaces,
         )
-        return self._assemble(start, up, across, keep_outs)
+        pos, vel = np.empty((steps, 3)), np.zeros((steps, 3))
+        virtual = np.empty((steps, 3))
+        pos[:, :2], vel[:, :2], virtual[:, :2] = across.pos_m, across.vel_m_s, across.u
+        pos[:count, 2:], vel[:count, 2:], virtual[:count, 2:] = up.pos_m[:count], up.vel_m_s[:count], up.u[:count]
+        pos[count:, 2], virtual[count:, 2] = up.pos_m[-1, 0], up.u[-1, 0]
+        return judged(
+            problem, pos, vel, virtual, (up, across), self._params.control_xy, self.dt_us, began_ns, self._stopwatch_ns
+        )
 
-    def _solve_z(self, start: Start, reference: Reference, disturbance_m_s2: float) -> AxesSolution:
-        steps = self._params.horizon_z
+    def _solve_z(self, problem: Problem) -> AxesSolution:
+        steps, start, reference = self._params.horizon_z, problem.start, problem.reference
         return self._z.solve(
             start.pos_ned_m[2:],
             start.vel_ned_m_s[2:],
             start.virtual[2:],
-            np.array([-start.cos_tilt]),
-            np.array([GRAVITY_M_S2 + disturbance_m_s2]),
+            np.full((steps, 1), -start.cos_tilt),
+            GRAVITY_M_S2 + problem.disturbance_ned_m_s2[2:],
             reference.pos_ned_m[1 : steps + 1, 2:],
             reference.vel_ned_m_s[1 : steps + 1, 2:],
         )
 
-    def _guess(self, start: Start, z_m: Array, previous_ned_m: Array | None) -> Array:
-        steps = self.steps
-        if previous_ned_m is None:
-            t_s = np.arange(steps + 1)[:, None] * self._params.dt_s
-            guess = start.pos_ned_m + t_s * start.vel_ned_m_s
-        else:
-            guess = previous_ned_m.copy()
-        count = min(steps, len(z_m))
-        guess[1 : count + 1, 2] = z_m[:count]
-        return guess
+    def _thrust_ahead(self, up: AxesSolution) -> Array:
+        """Thrust over mass (steps,) that x-y is predicted with."""
+        if self._params.thrust_ahead == "held":
+            return np.full(self.steps, up.u[0, 0])
+        return np.asarray(up.u[np.minimum(np.arange(self.steps), len(up.u) - 1), 0])
 
-    def _assemble(self, start: Start, up: AxesSolution, across: AxesSolution, keep_outs: Sequence[KeepOut]) -> Plan:
-        steps = self.steps
-        pos, vel = np.empty((steps + 1, 3)), np.empty((steps + 1, 3))
-        virtual = np.empty((steps, 3))
-        pos[0], vel[0] = start.pos_ned_m, start.vel_ned_m_s
-        pos[1:, :2], vel[1:, :2], virtual[:, :2] = across.pos_m, across.vel_m_s, across.u
-        count = min(steps, len(up.pos_m))
-        pos[1 : count + 1, 2], vel[1 : count + 1, 2], virtual[:count, 2] = (
-            up.pos_m[:count, 0],
-            up.vel_m_s[:count, 0],
-            up.u[:count, 0],
-        )
-        pos[count + 1 :, 2], vel[count + 1 :, 2], virtual[count:, 2] = up.pos_m[-1, 0], 0.0, up.u[-1, 0]
-        residual_m = max(up.residual_m, across.residual_m)
-        status = PlanStatus.OK
-        if not (up.solved and across.solved):
-            status = PlanStatus.SOLVER_FAILED
-        elif residual_m > RESIDUAL_LIMIT_M:
-            status = PlanStatus.RESIDUAL
-        elif certify(pos, keep_outs, self._params.control_xy) < 0.0:
-            status = PlanStatus.NOT_CERTIFIED
-        return Plan(
-            status,
-            start.t_us,
-            self._dt_us,
-            pos,
-            vel,
-            virtual,
-            0,
-            up.iterations + across.iterations,
-            across.slack_m,
-            residual_m,
-            max(up.terminal_gap_m, across.terminal_gap_m),
-        )
+
+def first_guess(problem: Problem, dt_s: float, steps: int) -> Array:
+    """Positions (steps+1, 3) to linearise around: the own previous prediction, or constant velocity."""
+    if problem.guess_ned_m is not None:
+        return problem.guess_ned_m.copy()
+    start, t_s = problem.start, np.arange(steps + 1)[:, None] * dt_s
+    return np.asarray(start.pos_ned_m + t_s * start.vel_ned_m_s)
+
+
+def nearest(keep_outs: Sequence[KeepOut], guess_ned_m: Array, slots: int) -> list[KeepOut]:
+    """The `slots` keep-outs that the guess comes closest to."""
+
+    def gap_m(k: KeepOut) -> float:
+        apart = (guess_ned_m - k.pos_ned_m)[:, : 2 if k.any_height else 3]
+        return float(np.sqrt(np.min(np.sum(apart**2, axis=1)))) - k.radius_m
+
+    return sorted(keep_outs, key=gap_m)[:slots]
+
+
+def judged(
+    problem: Problem,
+    pos_ned_m: Array,
+    vel_ned_m_s: Array,
+    virtual: Array,
+    solutions: Sequence[AxesSolution],
+    from_step: int,
+    dt_us: int,
+    began_ns: int,
+    stopwatch_ns: Callable[[], int],
+) -> Plan:
+    """A plan with what may be done with it: solved, within the residual limit, certified.
+
+    Args:
+        problem: what was asked.
+        pos_ned_m, vel_ned_m_s: (steps, 3) at steps 1..Hp.
+        virtual: (steps, 3).
+        solutions: of all problems solved for it.
+        from_step: steps before this one are not certified: they can't be changed any more.
+        dt_us: step.
+        began_ns: on the stopwatch.
+        stopwatch_ns: see `CondensedMpc`.
+    """
+    start: Start = problem.start
+    pos = np.concatenate([start.pos_ned_m[None], pos_ned_m])
+    residual_m = max(s.residual_m for s in solutions)
+    solved_ns = stopwatch_ns()
+    status = PlanStatus.OK
+    if not all(s.solved for s in solutions):
+        status = PlanStatus.SOLVER_FAILED
+    elif residual_m > RESIDUAL_LIMIT_M:
+        status = PlanStatus.RESIDUAL
+    elif certify(pos, problem.keep_outs, from_step) < 0.0:
+        status = PlanStatus.NOT_CERTIFIED
+    solve_us = sum(s.solve_us for s in solutions)
+    certify_us = (stopwatch_ns() - solved_ns) * 1e-3
+    return Plan(
+        status,
+        start.t_us,
+        dt_us,
+        pos,
+        np.concatenate([start.vel_ned_m_s[None], vel_ned_m_s]),
+        virtual,
+        PlanTimes((solved_ns - began_ns) * 1e-3 - solve_us, solve_us, certify_us),
+        sum(s.iterations for s in solutions),
+        max(s.slack_m for s in solutions),
+        residual_m,
+        max(s.terminal_gap_m for s in solutions),
+    )

@@ -1,7 +1,8 @@
 """The thesis' position cascade (ch. 2): three PIDs from position errors to pitch, roll and thrust.
 
 The attitude PIDs below it belong to the autopilot. Derivative on measurement for steps (no derivative kick),
-derivative of the error for trajectories; integrals are clamped.
+derivative of the error for trajectories. Integrals are clamped, and wait while their own output is at its limit
+(anti-windup by conditional integration). The reference's acceleration can be fed forward.
 """
 
 from __future__ import annotations
@@ -12,10 +13,10 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from swarmctl.control.mpc import Start
+from swarmctl.control.problem import Problem
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.params import Params, Vec3
-from swarmctl.core.types import Array, Plan, PlanStatus, Reference
+from swarmctl.core.types import NO_TIMES, Array, Plan, PlanStatus, Reference
 
 
 class PidParams(Params):
@@ -25,6 +26,7 @@ class PidParams(Params):
     x: Vec3 = (-0.25, -0.001, -0.3)  # m -> rad of pitch
     y: Vec3 = (0.05, 0.0, 0.45)  # m -> rad of roll
     z: Vec3 = (-3.5, -0.001, -4.0)  # m -> m/s2 of thrust over mass
+    accel_feed_forward: float = Field(0.0, ge=0, le=1.5)  # share of the reference's acceleration; thesis 0
     tilt_max_rad: float = Field(0.5, gt=0, lt=1.5)
     thrust_max_m_s2: float = Field(20.0, gt=9.9, le=100)
     integral_max: float = Field(5.0, ge=0, le=1e3)  # m s
@@ -38,6 +40,8 @@ class PidController:
     def __init__(self, params: PidParams) -> None:
         self._params = params
         self._gains = np.array([params.x, params.y, params.z])  # (3 axes, 3 gains)
+        self._least = np.array([-params.tilt_max_rad, -params.tilt_max_rad, -GRAVITY_M_S2])
+        self._most = np.array([params.tilt_max_rad, params.tilt_max_rad, params.thrust_max_m_s2 - GRAVITY_M_S2])
         self._integral = np.zeros(3)
         self._last: Array | None = None
 
@@ -53,20 +57,29 @@ class PidController:
         """Forget the past: somebody else has flown."""
         self._integral, self._last = np.zeros(3), None
 
-    def plan(self, start: Start, reference: Reference) -> Plan:
+    def plan(self, problem: Problem) -> Plan:
         """Virtual controls of this tick; the path is the own velocity, continued."""
-        p = self._params
-        error = reference.pos_ned_m[0] - start.pos_ned_m
+        p, start = self._params, problem.start
+        error = problem.reference.pos_ned_m[0] - start.pos_ned_m
         watched = error if p.derivative == "error" else -start.pos_ned_m
         rate = np.zeros(3) if self._last is None else (watched - self._last) / p.dt_s
         self._last = watched
-        self._integral = np.clip(self._integral + error * p.dt_s, -p.integral_max, p.integral_max)
-        out = self._gains[:, 0] * error + self._gains[:, 1] * self._integral + self._gains[:, 2] * rate
-        pitch, roll = (max(-p.tilt_max_rad, min(p.tilt_max_rad, float(a))) for a in out[:2])
-        thrust = min(p.thrust_max_m_s2, max(0.0, GRAVITY_M_S2 + float(out[2])))
+        integral = np.clip(self._integral + error * p.dt_s, -p.integral_max, p.integral_max)
+        gains = self._gains
+        wanted = gains[:, 0] * error + gains[:, 1] * integral + gains[:, 2] * rate + self._ahead(problem.reference)
+        out = np.clip(wanted, self._least, self._most)
+        winding = (wanted != out) & (np.sign(gains[:, 1] * error) == np.sign(wanted))
+        self._integral = np.where(winding, self._integral, integral)
+        pitch, roll, thrust = float(out[0]), float(out[1]), GRAVITY_M_S2 + float(out[2])
         virtual = np.array([math.sin(pitch) * math.cos(roll), -math.sin(roll), thrust])
         t_s = np.arange(p.path_steps + 1)[:, None] * p.dt_s
         pos = start.pos_ned_m + t_s * start.vel_ned_m_s
         vel = np.tile(start.vel_ned_m_s, (p.path_steps + 1, 1))
         held = np.tile(virtual, (p.path_steps, 1))
-        return Plan(PlanStatus.OK, start.t_us, self.dt_us, pos, vel, held, 0, 0, 0.0, 0.0, 0.0)
+        return Plan(PlanStatus.OK, start.t_us, self.dt_us, pos, vel, held, NO_TIMES, 0, 0.0, 0.0, 0.0)
+
+    def _ahead(self, reference: Reference) -> Array:
+        """Pitch, roll and thrust over mass (3,) that the reference's acceleration takes (linearised at hover)."""
+        accel = (reference.vel_ned_m_s[1] - reference.vel_ned_m_s[0]) / self._params.dt_s
+        north, east, down = (self._params.accel_feed_forward * float(a) for a in accel)
+        return np.array([-north / GRAVITY_M_S2, east / GRAVITY_M_S2, -down])

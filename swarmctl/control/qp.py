@@ -2,18 +2,20 @@
 
 OSQP is set up once and updated in place; every status is looked at. It is first order: callers judge a solution by
 residuals in their own units, not by its status alone. Wall-clock time must not influence the iterates, or runs would
-not repeat, hence the fixed `adaptive_rho_interval`.
+not repeat, hence the fixed `adaptive_rho_interval`. DAQP, an exact active-set solver, is an optional extra.
 """
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 import osqp
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, field_validator
+from pydantic_core import PydanticCustomError
 from scipy import sparse
 
 from swarmctl.core.params import Params
@@ -26,8 +28,9 @@ _UNFINISHED = (osqp.SolverStatus.OSQP_SOLVED_INACCURATE, osqp.SolverStatus.OSQP_
 
 
 class QpParams(Params):
-    """OSQP settings; tools measure them on recorded problems."""
+    """Which solver, and its settings: all are OSQP's, DAQP is exact and takes `max_iterations` only."""
 
+    solver: Literal["osqp", "daqp"] = "osqp"  # daqp: quicker on small swarms, needs the extra swarmctl[daqp]
     eps: float = Field(3e-3, gt=0, le=0.1)  # absolute; variables and rows are scaled to about 1
     eps_relative: float = Field(3e-4, ge=0, le=0.1)  # small: bounds far from active must not loosen the others
     max_iterations: int = Field(2500, ge=10, le=100000)
@@ -35,6 +38,16 @@ class QpParams(Params):
     rho: float = Field(0.01, gt=0, le=1e6)
     adaptive_rho_interval: int = Field(50, ge=1, le=10000)  # iterations, never seconds
     check_every: int = Field(10, ge=1, le=1000)
+
+    @field_validator("solver")
+    @classmethod
+    def _installed(cls, solver: str) -> str:
+        """Refuse here what could otherwise only fail when the first agent starts."""
+        if solver == "daqp" and not _daqp_is_usable():
+            raise PydanticCustomError(
+                "missing_package", "daqp is not installed; pip install 'swarmctl[daqp]', or use solver = 'osqp'"
+            )
+        return solver
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +58,9 @@ class QpSolution:
     exact: bool
     status: str
     iterations: int
+
+
+NOT_FINITE = QpSolution(None, False, "not finite", 0)  # such values would poison the next warm start
 
 
 class QpSolver(Protocol):
@@ -72,8 +88,8 @@ class OsqpSolver:
         self._solver: osqp.OSQP | None = None
 
     def solve(self, p_values: Array, q: Array, a_values: Array, lower: Array, upper: Array) -> QpSolution:
-        if not all(np.isfinite(values).all() for values in (p_values, q, a_values, lower, upper)):
-            return QpSolution(None, False, "not finite", 0)  # would poison the next warm start
+        if not is_finite(p_values, q, a_values, lower, upper):
+            return NOT_FINITE
         if self._solver is None:
             return self._cold(p_values, q, a_values, lower, upper, 0)
         self._solver.update(Px=p_values, q=q, Ax=a_values, l=lower, u=upper)
@@ -125,3 +141,24 @@ def pattern_index(pattern: NDArray[np.bool_], upper: bool = False) -> tuple[NDAr
     kept = np.triu(pattern) if upper else pattern
     columns, rows = np.nonzero(kept.T)
     return rows, columns
+
+
+def is_finite(*values: Array) -> bool:
+    """Whether every number of every array is one; missing bounds are `INFINITY`, which is."""
+    return all(bool(np.isfinite(array).all()) for array in values)
+
+
+def make_solver(p_pattern: NDArray[np.bool_], a_pattern: NDArray[np.bool_], params: QpParams) -> QpSolver:
+    """The solver a configuration asks for."""
+    if params.solver == "daqp":
+        from swarmctl.control.qp_daqp import DaqpSolver  # an extra: only who asks for it needs it
+
+        return DaqpSolver(p_pattern, a_pattern, params)
+    return OsqpSolver(p_pattern, a_pattern, params)
+
+
+def _daqp_is_usable() -> bool:
+    try:
+        return hasattr(importlib.import_module("daqp"), "Model")
+    except ImportError:
+        return False

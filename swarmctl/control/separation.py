@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import Field
 
-from swarmctl.control.condensed import HalfSpaces
+from swarmctl.control.axes import HalfSpaces
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Obstacle, PredictedPath
 
@@ -115,49 +115,55 @@ def visible(obstacles: Sequence[Obstacle], pos_ned_m: Array) -> list[Obstacle]:
     return [o for o in obstacles if math.dist(o.center_ned_m, pos_ned_m) < o.visibility_m]
 
 
-def half_spaces_xy(
+def half_spaces(
     keep_outs: Sequence[KeepOut],
     guess_ned_m: Array,
-    goal_xy_m: Array,
-    vel_xy_m_s: Array,
+    goal_m: Array,
+    vel_m_s: Array,
     dt_s: float,
     own_tie: int,
     params: SeparationParams,
 ) -> HalfSpaces | None:
-    """Linearised horizontal distance constraints for steps 1..Hp.
+    """Linearised distance constraints for steps 1..Hp, in the plane or in space.
 
     Args:
         keep_outs: at most as many as the problem has slots.
-        guess_ned_m: (Hp+1, 3) own previous prediction at the same times, z from this tick's z-MPC.
-        goal_xy_m: (2,) where the reference ends: decides what head-on means.
-        vel_xy_m_s: (2,) own velocity at the first point.
+        guess_ned_m: (Hp+1, 3) own previous prediction at the same times.
+        goal_m: (2,) or (3,) where the reference ends: decides what head-on means, and how many axes there are.
+        vel_m_s: (2,) or (3,) own velocity at the first point.
         dt_s: between points.
         own_tie: own agent id.
         params: bias and gate.
 
-    Height difference counts: a sphere of radius R leaves `sqrt(R^2 - dz^2)` to keep horizontally.
+    In the plane height difference counts: a sphere of radius R leaves `sqrt(R^2 - dz^2)` to keep horizontally. A
+    keep-out at any height is a vertical cylinder, in the plane and in space.
     """
     if not keep_outs:
         return None
+    axes = len(goal_m)
     others = np.stack([k.pos_ned_m for k in keep_outs])[:, 1:]  # (slots, Hp, 3)
     radius = np.array([k.radius_m for k in keep_outs])
-    flat = np.array([0.0 if k.any_height else 1.0 for k in keep_outs])
-    own = guess_ned_m[1:]
-    dz = (own[:, 2] - others[:, :, 2]) * flat[:, None]
-    needed = np.sqrt(np.maximum(radius[:, None] ** 2 - dz**2, 0.0))  # (slots, Hp)
-    apart = own[:, :2] - others[:, :, :2]  # (slots, Hp, 2)
+    apart = guess_ned_m[1:] - others  # (slots, Hp, 3)
+    apart[np.array([k.any_height for k in keep_outs]), :, 2] = 0.0
+    below_m = apart[:, :, 2] if axes == 2 else np.zeros(apart.shape[:2])
+    needed = np.sqrt(np.maximum(radius[:, None] ** 2 - below_m**2, 0.0))  # (slots, Hp)
+    apart, others = apart[:, :, :axes], others[:, :, :axes]
     distance = np.sqrt(np.einsum("skc,skc->sk", apart, apart))
-    side = np.array([[1.0 if own_tie > k.tie else -1.0, 0.0] for k in keep_outs])
-    close = distance < _TINY_M
-    normal = np.where(close[:, :, None], side[:, None, :], apart / np.maximum(distance, _TINY_M)[:, :, None])
-    moved = math.dist(guess_ned_m[-1, :2], guess_ned_m[0, :2])
+    side = np.zeros((len(keep_outs), 1, axes))
+    side[:, 0, 0] = [1.0 if own_tie > k.tie else -1.0 for k in keep_outs]
+    normal = np.where(distance[:, :, None] < _TINY_M, side, apart / np.maximum(distance, _TINY_M)[:, :, None])
+    moved = math.dist(guess_ned_m[-1, :axes], guess_ned_m[0, :axes])
     stuck = min(1.0, max(0.0, 2.0 - moved / params.stuck_m))
-    urgency = np.array([1.0 if k.tie < 0 else stuck for k in keep_outs])
-    normal = _turned(normal, distance, needed, goal_xy_m - own[:, :2], params.bias_rad * urgency)
-    offset = np.einsum("skc,skc->sk", normal, others[:, :, :2]) + needed
+    to_goal = goal_m - guess_ned_m[1:, :axes]  # (Hp, axes)
+    across = to_goal[:, 0] * normal[:, :, 1] - to_goal[:, 1] * normal[:, :, 0]  # > 0: passing it on the right
+    turn = [np.where(a > 0.0, -1.0, 1.0) if k.tie < 0 else stuck for k, a in zip(keep_outs, across, strict=True)]
+    normal = _turned(
+        normal, distance, needed, to_goal, params.bias_rad * np.stack(np.broadcast_arrays(*turn, across[0])[:-1])
+    )
+    offset = np.einsum("skc,skc->sk", normal, others) + needed
     idle = (needed <= 0.0) | (distance > needed + params.gate_m)
-    ends = (others[:, -1, :2] - others[:, -2, :2]) / dt_s  # (slots, 2) velocity of each at the end
-    closing = -np.einsum("sc,sc->s", normal[:, -1], vel_xy_m_s - ends)
+    ends = (others[:, -1] - others[:, -2]) / dt_s  # (slots, axes) velocity of each at the end
+    closing = -np.einsum("sc,sc->s", normal[:, -1], vel_m_s - ends)
     stop_s = np.maximum(closing, 0.0) / (2.0 * params.stop_m_s2)
     stop_offset = offset[:, -1] + stop_s * np.einsum("sc,sc->s", normal[:, -1], ends)
     return HalfSpaces(normal, np.where(idle, -np.inf, offset), stop_s, np.where(idle[:, -1], -np.inf, stop_offset))
@@ -166,16 +172,20 @@ def half_spaces_xy(
 def _turned(normal: Array, distance: Array, needed: Array, to_goal: Array, angle_rad: Array) -> Array:
     """Turn normals that point straight against the way to the goal, so that head-on agents pass on one side.
 
-    Everybody turns the same way (clockwise seen from above, as NED yaw), which is a rule, not a draw. `angle_rad`
-    (slots,) is the largest turn: full for obstacles, for peers only when the own plan gets nowhere, because turned
-    normals would also keep a swarm that shares one goal from closing in evenly.
+    Among peers everybody turns the same way (clockwise seen from above, as NED yaw), which is a rule, not a draw;
+    obstacles are passed on the side one is on. `angle_rad` (slots, Hp) is the largest turn: full for obstacles, for
+    peers only when the own plan gets nowhere, because turned normals would also keep a swarm that shares one goal from
+    closing in evenly.
     """
     span = np.sqrt(np.einsum("kc,kc->k", to_goal, to_goal))  # (Hp,)
     ahead = -np.einsum("skc,kc->sk", normal, to_goal) / np.maximum(span, _TINY_M)  # cosine: 1 is head-on
     weight = np.clip((ahead - 0.7) / 0.3, 0.0, 1.0) * (span > 0.75 * needed) * (distance < 2.0 * needed + 0.5)
-    angle = angle_rad[:, None] * weight
+    angle = angle_rad * weight
     c, s = np.cos(angle), np.sin(angle)
-    return np.stack([c * normal[:, :, 0] - s * normal[:, :, 1], s * normal[:, :, 0] + c * normal[:, :, 1]], axis=2)
+    turned = normal.copy()
+    turned[:, :, 0] = c * normal[:, :, 0] - s * normal[:, :, 1]
+    turned[:, :, 1] = s * normal[:, :, 0] + c * normal[:, :, 1]
+    return turned
 
 
 def certify(path_ned_m: Array, keep_outs: Sequence[KeepOut], from_step: int) -> float:

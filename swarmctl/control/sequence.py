@@ -162,6 +162,12 @@ class Sequence:
             return glide.sample((now_us - began_us) * 1e-6 + offsets_s)
         return np.tile(self._start_ned_m, (len(offsets_s), 1)), np.zeros((len(offsets_s), 3))
 
+    def begin_if_due(self, now_us: int, utc_us: int) -> None:
+        """Enter the mission on time: before a tick thinks, so that its first plan is the mission's already."""
+        if self.phase is Phase.READY and self.begin_utc_us is not None and utc_us >= self.begin_utc_us:
+            self.phase = Phase.TRACK
+            self._entered_us, self._asked_us = now_us, now_us - _ASK_EVERY_US
+
     def mission_t_s(self, utc_us: int) -> float:
         """Mission time while tracking, else NaN."""
         if self.phase is not Phase.TRACK or self.begin_utc_us is None:
@@ -303,8 +309,6 @@ class Sequence:
         ready = [p.ready_utc_us for p in facts.peers.values() if p.ready_utc_us > 0]
         if len(ready) == self._expected:
             self.begin_utc_us = max([self.ready_utc_us, *ready]) + _BEGIN_AFTER_US
-            if facts.utc_us >= self.begin_utc_us:
-                self._enter(Phase.TRACK, facts)
         return []
 
     def _track(self, facts: Facts, state: VehicleState) -> list[Command]:

@@ -161,6 +161,18 @@ class Reference:
 
 
 @dataclass(frozen=True, slots=True)
+class PlanTimes:
+    """Where the time of planning went; measured, and of no influence."""
+
+    setup_us: float  # half-spaces and matrices
+    solve_us: float  # inside the QP solver
+    certify_us: float
+
+
+NO_TIMES = PlanTimes(0.0, 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
 class Plan:
     """Answer of one MPC step: predicted motion and the virtual controls that produce it."""
 
@@ -170,7 +182,7 @@ class Plan:
     pos_ned_m: Array  # (N+1, 3)
     vel_ned_m_s: Array  # (N+1, 3)
     virtual: Array  # (N, 3): virtual controls u_x, u_y [-] and thrust over mass [m/s2], held over each step
-    solve_us: int
+    times: PlanTimes
     iterations: int
     slack_m: float  # largest separation slack used
     residual_m: float  # largest primal residual, in metres of position

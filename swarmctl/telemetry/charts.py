@@ -1,4 +1,4 @@
-"""Inline SVG, written by hand: time charts, a top view and bars. No script, no font, no request.
+"""Inline SVG, written by hand: time charts, a top view, an oblique view and bars. No script, no font, no request.
 
 Every function returns text. Lines are thinned to a number of points that keeps their extremes.
 """
@@ -6,10 +6,11 @@ Every function returns text. Lines are thinned to a number of points that keeps 
 from __future__ import annotations
 
 import html
+import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,7 @@ from swarmctl.telemetry.palette import LIMIT_RGB, css
 
 WIDTH = 640
 _LEFT, _RIGHT, _TOP, _BOTTOM = 52, 12, 8, 24
+_LOOK_RAD, _DOWN_RAD = math.radians(35), math.radians(24)  # the oblique view looks this far east of north, and down
 
 
 @dataclass(frozen=True, slots=True)
@@ -27,6 +29,19 @@ class Line:
 
     x: Array  # (T,)
     y: Array  # (T,)
+    color: str
+    label: str = ""
+    dash: str = ""
+    width: float = 1.4
+    opacity: float = 1.0
+    marks: bool = False  # a dot on every point
+
+
+@dataclass(frozen=True, slots=True)
+class SpaceLine:
+    """One path in space; NaN breaks it."""
+
+    pos_ned_m: Array  # (T, 3)
     color: str
     label: str = ""
     dash: str = ""
@@ -48,6 +63,24 @@ class Span(NamedTuple):
     end: float
     name: str
     color: str
+
+
+class Window(NamedTuple):
+    """A part of a time chart: what an obstacle takes up of one axis while the reference leads through it."""
+
+    start: float
+    end: float
+    low: float
+    high: float
+    style: Literal["obstacle", "keepout"]
+
+
+class Ball(NamedTuple):
+    """A sphere in the oblique view, in metres."""
+
+    center_ned_m: tuple[float, float, float]
+    radius_m: float
+    style: Literal["obstacle", "keepout"]
 
 
 class Circle(NamedTuple):
@@ -83,6 +116,7 @@ def time_chart(
     height: int = 170,
     from_zero: bool = False,
     ceiling: float | None = None,
+    windows: Sequence[Window] = (),
 ) -> str:
     """A figure with one chart over time.
 
@@ -96,26 +130,21 @@ def time_chart(
         height: of the plot [px].
         from_zero: the value axis begins at 0.
         ceiling: largest value shown; higher ones leave the plot.
+        windows: shaded parts, cut where they leave the plot.
     """
     low, high = _value_range([line.y for line in lines], [limit.value for limit in limits], from_zero, ceiling)
     x = _Axis(*_widened(*x_range), _LEFT, WIDTH - _RIGHT)
     y = _Axis(low, high, height - _BOTTOM, _TOP)
-    parts = []
+    behind = ""
     if band is not None:
         left, right = x.px(np.clip(np.array(band), x.low, x.high))
-        parts.append(
-            f'<rect class="band" x="{left:.1f}" y="{_TOP}" width="{right - left:.1f}" height="{y.first - _TOP}"/>'
-        )
-    parts += [_grid(x, y), *(_limit(limit, x, y) for limit in limits)]
-    parts += [_polyline(line, x, y, thin(line.x, line.y, points)) for line in lines]
+        behind = f'<rect class="band" x="{left:.1f}" y="{_TOP}" width="{right - left:.1f}" height="{y.first - _TOP}"/>'
+    inside = [_window(window, x, y) for window in windows] + [_limit(limit, x, y) for limit in limits]
+    inside += [_polyline(line, x, y, thin(line.x, line.y, points)) for line in lines]
     clip = (
         f'<svg x="0" y="{_TOP}" width="{WIDTH}" height="{y.first - _TOP}" viewBox="0 {_TOP} {WIDTH} {y.first - _TOP}">'
     )
-    body = (
-        "".join(parts[:2]) + clip + "".join(parts[2:]) + "</svg>"
-        if band
-        else parts[0] + clip + "".join(parts[1:]) + "</svg>"
-    )
+    body = f"{behind}{_grid(x, y)}{clip}{''.join(inside)}</svg>"
     return _figure(title, lines, f'<svg viewBox="0 0 {WIDTH} {height}" role="img">{body}</svg>')
 
 
@@ -143,6 +172,95 @@ def top_view(title: str, lines: Sequence[Line], circles: Sequence[Circle], point
             cx, cy = float(x.px(line.x[-1])), float(y.px(line.y[-1]))
             parts.append(f'<circle cx="{cx:.1f}" cy="{cy:.1f}" r="4" fill="{line.color}"/>')
     return _figure(title, lines, f'<svg viewBox="0 0 {WIDTH} {height:.0f}" role="img">{"".join(parts)}</svg>')
+
+
+def space_view(title: str, lines: Sequence[SpaceLine], balls: Sequence[Ball] = (), points: int = 600) -> str:
+    """A figure seen from the south-west and from above; up is up, north to the left, east to the right.
+
+    Scales are equal, so that a ball is round. Without balls, paths far taller or flatter than wide are drawn with
+    another scale for heights, which is said.
+    """
+    spread = [line.pos_ned_m for line in lines]
+    spread += [np.array([ball.center_ned_m]) + side * ball.radius_m for ball in balls for side in (-1, 1)]
+    view = _Oblique([_value_range([pos[:, k] for pos in spread]) for k in range(3)], may_stretch=not balls)
+    drawn, nearer = [], []
+    for line in lines:
+        kept = np.unique(np.linspace(0, len(line.pos_ned_m) - 1, min(points, len(line.pos_ned_m))).astype(int))
+        pos_ned_m = line.pos_ned_m[kept]  # (K, 3)
+        px, py = view.px(pos_ned_m)
+        drawn.append(_stroke(line, px, py))
+        if balls:
+            covered = np.all([view.depth_m(pos_ned_m) > view.depth_m(np.array(b.center_ned_m)) for b in balls], axis=0)
+            nearer.append(_stroke(line, np.where(covered, np.nan, px), py))
+        known = np.flatnonzero(np.isfinite(px) & np.isfinite(py))
+        if line.label and not line.dash and len(known):
+            nearer.append(f'<circle cx="{px[known[-1]]:.1f}" cy="{py[known[-1]]:.1f}" r="4" fill="{line.color}"/>')
+    for ball in balls:
+        cx, cy = view.px(np.array(ball.center_ned_m))
+        drawn.append(f'<circle class="{ball.style}" cx="{cx:.1f}" cy="{cy:.1f}" r="{ball.radius_m * view.scale:.1f}"/>')
+    body = "".join([view.frame(), *drawn, *nearer])
+    return _figure(title, lines, f'<svg viewBox="0 0 {WIDTH} {view.height:.0f}" role="img">{body}</svg>')
+
+
+class _Oblique:
+    """Parallel projection of a NED box onto the drawing."""
+
+    def __init__(self, ranges_ned_m: Sequence[tuple[float, float]], may_stretch: bool) -> None:
+        self._low, self._high = np.array(ranges_ned_m).T
+        wide_m, tall_m = max(self._high[:2] - self._low[:2]), self._high[2] - self._low[2]
+        fitting = min(max(1.0, 0.3 * wide_m / tall_m), 1.3 * wide_m / tall_m)
+        self._heights = float(f"{fitting:.2g}") if may_stretch else 1.0
+        corners = np.array(list(itertools.product(*zip(self._low, self._high, strict=True))))
+        right_m, up_m = self._plane_m(corners)
+        self.scale = float(min((WIDTH - 130) / np.ptp(right_m), 330 / np.ptp(up_m)))  # pixels per metre
+        self._left_px = WIDTH / 2 - self.scale * float(right_m.min() + right_m.max()) / 2
+        self._top_px = _TOP + self.scale * float(up_m.max())
+        self.height = _TOP + float(np.ptp(up_m)) * self.scale + 34
+
+    def px(self, pos_ned_m: Array) -> tuple[Array, Array]:
+        """Pixels (...,) right and down of positions (..., 3)."""
+        right_m, up_m = self._plane_m(pos_ned_m)
+        return self._left_px + right_m * self.scale, self._top_px - up_m * self.scale
+
+    def _plane_m(self, pos_ned_m: Array) -> tuple[Array, Array]:
+        """Right and up (...,) in the plane of the drawing [m]."""
+        n, e, down = pos_ned_m[..., 0], pos_ned_m[..., 1], pos_ned_m[..., 2] * self._heights
+        right_m = e * math.cos(_LOOK_RAD) - n * math.sin(_LOOK_RAD)
+        ahead_m = n * math.cos(_LOOK_RAD) + e * math.sin(_LOOK_RAD)
+        return right_m, ahead_m * math.sin(_DOWN_RAD) - down * math.cos(_DOWN_RAD)
+
+    def depth_m(self, pos_ned_m: Array) -> Array:
+        """How far behind the origin positions (..., 3) are, seen from the camera [m]."""
+        ahead_m = pos_ned_m[..., 0] * math.cos(_LOOK_RAD) + pos_ned_m[..., 1] * math.sin(_LOOK_RAD)
+        return np.asarray(ahead_m * math.cos(_DOWN_RAD) + pos_ned_m[..., 2] * math.sin(_DOWN_RAD))
+
+    def frame(self) -> str:
+        """Floor, the two walls behind, ticks and names of the axes."""
+        (n0, e0, top), (n1, e1, floor) = self._low, self._high
+        parts = []
+        for n in _nice(n0, n1, 4):
+            parts += [self._wire((n, e0, floor), (n, e1, floor), (n, e1, top)), self._tick((n, e0, floor), n, "end")]
+        for e in _nice(e0, e1, 4):
+            parts += [self._wire((n0, e, floor), (n1, e, floor), (n1, e, top)), self._tick((n0, e, floor), e, "start")]
+        for z in _nice(top, floor, 5):
+            parts += [self._wire((n1, e0, z), (n1, e1, z), (n0, e1, z)), self._tick((n1, e0, z), z, "end", 3.5)]
+        parts.append(self._wire((n1, e0, top), (n1, e0, floor), (n0, e0, floor), (n0, e1, floor), style="axis"))
+        parts.append(self._text(((n0 + n1) / 2, e0, floor), "x north [m]", "end", -26, 26))
+        parts.append(self._text((n0, (e0 + e1) / 2, floor), "y east [m]", "start", 26, 26))
+        scaled = "" if self._heights == 1.0 else f", scale x {self._heights:g}"
+        parts.append(self._text((n1, e0, top), f"z down [m]{scaled}", "end", 10, -8))
+        return "".join(parts)
+
+    def _wire(self, *corners_ned_m: tuple[float, float, float], style: str = "grid") -> str:
+        px, py = self.px(np.array(corners_ned_m))
+        return f'<path class="{style}" d="M{"L".join(f"{a:.1f} {b:.1f}" for a, b in zip(px, py, strict=True))}"/>'
+
+    def _tick(self, at_ned_m: tuple[float, float, float], value: float, anchor: str, below: float = 13) -> str:
+        return self._text(at_ned_m, f"{value:g}", anchor, -5 if anchor == "end" else 5, below)
+
+    def _text(self, at_ned_m: tuple[float, float, float], text: str, anchor: str, right: float, below: float) -> str:
+        px, py = self.px(np.array(at_ned_m))
+        return f'<text class="tick" x="{px + right:.1f}" y="{py + below:.1f}" text-anchor="{anchor}">{text}</text>'
 
 
 def state_bars(title: str, rows: Sequence[tuple[str, Sequence[Span]]], x_range: tuple[float, float]) -> str:
@@ -187,12 +305,23 @@ def thin(x: Array, y: Array, points: int) -> tuple[Array, Array]:
 
 def _polyline(line: Line, x: _Axis, y: _Axis, curve: tuple[Array, Array]) -> str:
     px, py = x.px(curve[0]), np.clip(y.px(curve[1]), -1e4, 1e4)
-    finite = np.isfinite(px) & np.isfinite(py)
+    dots = ""
+    if line.marks:
+        shown = np.isfinite(px) & np.isfinite(py)
+        dots = "".join(
+            f'<circle cx="{a:.1f}" cy="{b:.1f}" r="3.5" fill="{line.color}"/>'
+            for a, b in zip(px[shown], py[shown], strict=True)
+        )
+    return _stroke(line, px, py) + dots
+
+
+def _stroke(line: Line | SpaceLine, px: Array, py: Array) -> str:
+    """One path through points (T,) given in pixels; NaN breaks it."""
     path = "".join(
         "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(px[part], py[part], strict=True))
-        for part in _stretches(finite)
+        for part in _stretches(np.isfinite(px) & np.isfinite(py))
     )
-    if not path:
+    if not path or line.width <= 0:
         return ""
     dash = f' stroke-dasharray="{line.dash}"' if line.dash else ""
     opacity = f' opacity="{line.opacity:g}"' if line.opacity < 1 else ""
@@ -208,7 +337,7 @@ def _stretches(finite: NDArray[np.bool_]) -> list[NDArray[np.intp]]:
 
 def _grid(x: _Axis, y: _Axis) -> str:
     parts = []
-    for value in _nice(y.low, y.high, 4):
+    for value in _nice(y.low, y.high, 5):
         py = float(y.px(np.array(value)))
         parts.append(f'<path class="grid" d="M{x.first} {py:.1f}H{x.last}"/>')
         parts.append(f'<text class="tick" x="{x.first - 6}" y="{py + 3.5:.1f}" text-anchor="end">{value:g}</text>')
@@ -223,6 +352,13 @@ def _ticks_below(x: _Axis, y: _Axis) -> str:
     return "".join(parts)
 
 
+def _window(window: Window, x: _Axis, y: _Axis) -> str:
+    left, right = x.px(np.clip(np.array([window.start, window.end]), x.low, x.high))
+    bottom, top = y.px(np.clip(np.array([window.low, window.high]), y.low, y.high))
+    size = f'width="{right - left:.1f}" height="{bottom - top:.1f}"'
+    return f'<rect class="{window.style}" x="{left:.1f}" y="{top:.1f}" {size}/>'
+
+
 def _limit(limit: Limit, x: _Axis, y: _Axis) -> str:
     py = float(y.px(np.array(limit.value)))
     color = css(LIMIT_RGB)
@@ -233,7 +369,7 @@ def _limit(limit: Limit, x: _Axis, y: _Axis) -> str:
     )
 
 
-def _figure(title: str, lines: Sequence[Line], drawing: str) -> str:
+def _figure(title: str, lines: Sequence[Line | SpaceLine], drawing: str) -> str:
     legend = "".join(_key(line.label, line.color, line.dash) for line in lines if line.label)
     return f"<figure><figcaption>{html.escape(title)}</figcaption>{drawing}<div class=legend>{legend}</div></figure>"
 

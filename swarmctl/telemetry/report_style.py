@@ -31,6 +31,7 @@ path { fill: none }
 .tick { font-size: 11px; fill: #64748b }
 .band { fill: #f0fdf4 }
 .obstacle { fill: #fee2e2; stroke: #ef4444 }
+.keepout { fill: #fee2e2; fill-opacity: .45; stroke: #ef4444; stroke-dasharray: 4 3 }
 .legend { display: flex; flex-wrap: wrap; gap: 2px 14px; font-size: 12px; color: #475569; margin-top: 2px }
 .legend i { display: inline-block; width: 18px; margin-right: 5px; vertical-align: 4px }
 table { border-collapse: collapse; width: 100%; font-variant-numeric: tabular-nums }
@@ -52,5 +53,20 @@ pre {
   white-space: pre-wrap; overflow-wrap: anywhere;
 }
 summary { cursor: pointer; font-weight: 600 }
+nav { display: flex; flex-wrap: wrap; gap: 4px 14px; margin: 0 0 14px }
+a { color: #2563eb; text-decoration: none }
+.tiles { display: grid; grid-template-columns: repeat(auto-fit, minmax(150px, 1fr)); gap: 12px; margin-bottom: 12px }
+.tiles b { display: block; font-size: 24px; line-height: 1.2; font-variant-numeric: tabular-nums }
+.tiles span { color: #64748b; font-size: 12px }
+th.group { padding-top: 16px; font-size: 13px; color: #1e293b }
+td.note { min-width: 220px; max-width: 420px; color: #475569; font-size: 13px }
+.panels { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 480px), 1fr)); gap: 4px 12px }
+.panels figure { border: 0; padding: 0 }
+.panels figcaption { font-weight: 400; color: #475569; margin: 0 }
+.cards + .cards { margin-top: 12px }
+.cards.halves { grid-template-columns: repeat(auto-fill, minmax(min(100%, 520px), 1fr)) }
+.cards.small .tick { font-size: 13px }
+.prose p { max-width: 900px; margin: 6px 0 }
+.prose li { max-width: 880px }
 .dot { display: inline-block; width: 10px; height: 10px; border-radius: 50%; margin-right: 7px }
 """

@@ -136,7 +136,7 @@ def test_others_keep_clear_of_who_has_no_solver(fly: Fly, lasts_s: float) -> Non
 
 def test_a_plan_that_would_come_too_close_is_not_flown(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
     """The QP forgets its half-spaces; the certifier, which shares no code with it, is all that is left."""
-    monkeypatch.setattr(mpc, "half_spaces_xy", lambda *_: None)
+    monkeypatch.setattr(mpc, "half_spaces", lambda *_: None)
     flight = fly("mission.duration_s=8")
     certified = flight.separation_m()
     monkeypatch.setattr(mpc, "certify", lambda *_: 1.0)

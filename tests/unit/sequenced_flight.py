@@ -67,6 +67,7 @@ class Flight:
             mute=self.mute,
             peers=self.peers,
         )
+        self.sequence.begin_if_due(facts.now_us, facts.utc_us)  # as the agent does, before it thinks
         asked = self.sequence.step(facts)
         self.now_us += 100_000
         return asked

@@ -9,7 +9,7 @@ import pytest
 
 from swarmctl.control.fallback import rest_plan
 from swarmctl.control.model import acceleration
-from swarmctl.control.mpc import Start
+from swarmctl.control.problem import Start
 from swarmctl.core.types import Array, Plan, PlanStatus
 
 DT_US = 20_000

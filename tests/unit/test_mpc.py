@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from swarmctl.control.condensed import AxesSolution
+from swarmctl.control.axes import AxesSolution
 from swarmctl.control.controller import ControllerParams, make_controller
 from swarmctl.control.model import acceleration
-from swarmctl.control.mpc import RESIDUAL_LIMIT_M, MpcParams, Start, SwarmMpc
+from swarmctl.control.mpc import RESIDUAL_LIMIT_M, MpcParams, SwarmMpc, nearest
+from swarmctl.control.problem import Problem, Start
 from swarmctl.control.qp import QpParams
 from swarmctl.control.separation import KeepOut, SeparationParams, certify
 from swarmctl.core.types import Array, Plan, PlanStatus, Reference
@@ -30,6 +31,15 @@ def reference(offset: tuple[float, ...] = (0.0, 0.0, 0.0)) -> Reference:
     return Reference(np.tile(HERE + offset, (101, 1)), np.zeros((101, 3)), 0.0)
 
 
+def problem(
+    offset: tuple[float, ...] = (0.0, 0.0, 0.0),
+    *keep_outs: KeepOut,
+    wind: tuple[float, ...] = (0.0, 0.0, 0.0),
+    begin: Start | None = None,
+) -> Problem:
+    return Problem(begin or start(), reference(offset), np.array(wind), keep_outs, None)
+
+
 def plan_to(
     offset: tuple[float, ...],
     *keep_outs: KeepOut,
@@ -37,8 +47,8 @@ def plan_to(
     begin: Start | None = None,
     **params: Any,
 ) -> Plan:
-    mpc = SwarmMpc(MpcParams(**params), SeparationParams(), 0, 2)
-    return mpc.plan(begin or start(), reference(offset), np.array(wind), keep_outs, None)
+    mpc = SwarmMpc(MpcParams(**params), SeparationParams(), 0, 2, lambda: 0)
+    return mpc.plan(problem(offset, *keep_outs, wind=wind, begin=begin))
 
 
 def fixed(place: Array, allowed_m: float = 0.8, steps: int = 40) -> KeepOut:
@@ -103,14 +113,28 @@ def test_a_far_reference_is_planned_for_within_the_bounds_of_thrust(down_m: floa
     assert (plan.virtual[0, 2] - G) * down_m < 0.0
 
 
-def test_the_planned_path_is_the_motion_of_its_own_virtual_controls() -> None:
-    plan = plan_to((0.5, -0.3, 0.0), begin=start(vel=(0.2, 0.1, 0.0)))
-    pos, vel = HERE.copy(), np.array([0.2, 0.1, 0.0])
+@pytest.mark.parametrize("cos_tilt", [1.0, 0.9])
+@pytest.mark.parametrize("ahead", ["planned", "held"])
+def test_the_planned_path_is_the_motion_of_its_own_virtual_controls(ahead: str, cos_tilt: float) -> None:
+    wind, vel = np.array([0.3, -0.2, 0.1]), np.array([0.2, 0.1, 0.3])
+    begin = Start(0, HERE, vel, cos_tilt, np.array([0.05, 0.0, 8.0]))
+    plan = plan_to((0.5, -0.3, -0.4), begin=begin, wind=tuple(wind), thrust_ahead=ahead)
+    assert np.ptp(plan.virtual[:, 2]) > 1.0  # the thrust is not constant, so it matters which one x-y is predicted with
+    pos = HERE.copy()
     for k in range(40):
-        accel = -plan.virtual[0, 2] * plan.virtual[k, :2]
-        pos[:2] += 0.02 * vel[:2] + 0.5 * 0.02**2 * accel
-        vel[:2] += 0.02 * accel
-        np.testing.assert_allclose(plan.pos_ned_m[k + 1, :2], pos[:2], atol=1e-9)
+        thrust = plan.virtual[k if ahead == "planned" else 0, 2]  # held: the thesis' f_t of now
+        across, up = -thrust * plan.virtual[k, :2], G - cos_tilt * plan.virtual[k, 2]
+        accel = np.array([*across, up]) + wind
+        pos, vel = pos + 0.02 * vel + 0.5 * 0.02**2 * accel, vel + 0.02 * accel
+        np.testing.assert_allclose(plan.pos_ned_m[k + 1], pos, atol=1e-9)
+        np.testing.assert_allclose(plan.vel_ned_m_s[k + 1], vel, atol=1e-9)
+
+
+def test_only_a_thrust_that_changes_makes_held_and_planned_differ() -> None:
+    level = [plan_to((0.5, 0.0, 0.0), thrust_ahead=ahead) for ahead in ("planned", "held")]
+    np.testing.assert_allclose(level[0].pos_ned_m, level[1].pos_ned_m, atol=1e-3)
+    climbing = [plan_to((2.0, 0.0, -0.5), thrust_ahead=ahead) for ahead in ("planned", "held")]
+    assert np.abs(climbing[0].pos_ned_m - climbing[1].pos_ned_m).max() > 0.02
 
 
 def test_a_neighbour_in_the_way_is_kept_clear_of() -> None:
@@ -130,7 +154,7 @@ def test_a_plan_that_cannot_avoid_is_not_certified_and_says_how_much_it_lacks() 
 
 
 def test_a_keep_out_beyond_the_slots_is_still_judged() -> None:
-    near = [fixed(HERE + np.array([0.0, e, 0.0]), 0.3) for e in (0.5, -0.5)]  # nearest two take both slots
+    near = [fixed(HERE + np.array([0.0, e, 0.0]), 0.8) for e in (0.5, -0.5)]  # nearest two take both slots
     wall = [fixed(HERE + np.array([3.0, 0.6, 0.0]), 0.8)]
     plan = plan_to((5.0, 0.0, 0.0), *near, *wall, begin=start(vel=(4.0, 0.0, 0.0)))
     assert plan.status is PlanStatus.NOT_CERTIFIED
@@ -146,7 +170,7 @@ def test_a_solver_that_breaks_down_is_a_status_and_not_an_exception() -> None:
 
 def solution(residual_m: float, solved: bool = True) -> AxesSolution:
     two = np.zeros((40, 2))
-    return AxesSolution(solved, "", 1, two, np.tile(HERE[:2], (40, 1)), two, 0.0, residual_m, 0.0)
+    return AxesSolution(solved, "", 1, two, np.tile(HERE[:2], (40, 1)), two, 0.0, residual_m, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(
@@ -161,9 +185,9 @@ def solution(residual_m: float, solved: bool = True) -> AxesSolution:
 def test_the_answer_of_the_solver_is_looked_at(
     monkeypatch: pytest.MonkeyPatch, residual_m: float, solved: bool, status: PlanStatus
 ) -> None:
-    mpc = SwarmMpc(MpcParams(), SeparationParams(), 0, 2)
+    mpc = SwarmMpc(MpcParams(), SeparationParams(), 0, 2, lambda: 0)
     monkeypatch.setattr(mpc._xy, "solve", lambda *_: solution(residual_m, solved))
-    assert mpc.plan(start(), reference(), np.zeros(3), [], None).status is status
+    assert mpc.plan(problem()).status is status
 
 
 def test_a_solver_that_is_stopped_too_early_has_a_residual() -> None:
@@ -189,10 +213,63 @@ def test_z_longer_or_shorter_than_xy_gives_a_plan_of_xy_length() -> None:
 
 def test_the_controller_without_neighbours_ignores_them_and_the_distributed_one_does_not() -> None:
     neighbour = fixed(HERE + np.array([0.5, 0.0, 0.0]), 0.8)
-    alone = make_controller(ControllerParams(kind="mpc"), SeparationParams(), 0, 2)
-    together = make_controller(ControllerParams(kind="dmpc"), SeparationParams(), 0, 2)
-    free = alone.plan(start(), reference((0.5, 0.0, 0.0)), np.zeros(3), [neighbour], None)
-    kept = together.plan(start(), reference((0.5, 0.0, 0.0)), np.zeros(3), [neighbour], None)
+    alone = make_controller(ControllerParams(kind="mpc"), SeparationParams(), 0, 2, lambda: 0)
+    together = make_controller(ControllerParams(kind="dmpc"), SeparationParams(), 0, 2, lambda: 0)
+    free, kept = (c.plan(problem((0.5, 0.0, 0.0), neighbour)) for c in (alone, together))
     assert free.status is PlanStatus.OK
     assert free.virtual[5, 0] < -0.02  # towards the reference
     assert kept.virtual[5, 0] > 0.02  # away from the neighbour that is too near
+
+
+def test_times_are_measured_with_the_stopwatch_and_add_up() -> None:
+    now_ns = iter(range(0, 10**9, 1000))  # every reading is 1 us after the last
+    mpc = SwarmMpc(MpcParams(), SeparationParams(), 0, 2, lambda: next(now_ns))
+    neighbour = fixed(HERE + np.array([1.3, 0.0, 0.0]))
+    times = mpc.plan(problem((0.1, 0.0, 0.0), neighbour)).times
+    # read at the start, round both solves, after them, and after the certificate: six intervals
+    assert (times.setup_us, times.solve_us, times.certify_us) == (3.0, 2.0, 1.0)
+
+
+@pytest.mark.parametrize("horizon_z", [3, 40])
+def test_one_move_for_two_conditions_at_the_end_is_planned_and_not_an_exception(horizon_z: int) -> None:
+    plan = plan_to((0.0, 0.0, -0.1), control_z=1, horizon_z=horizon_z)
+    assert plan.status is PlanStatus.OK
+    assert plan.terminal_gap_m > 0.0
+
+
+@pytest.mark.parametrize("terminal", ["position", "position_velocity"])
+@pytest.mark.parametrize("ahead", ["planned", "held"])
+def test_falling_without_thrust_is_planned_and_not_an_exception(ahead: str, terminal: str) -> None:
+    falling = start(virtual=(0.0, 0.0, 0.0))  # no thrust now, none wanted: tilting moves nothing
+    plan = plan_to((0.0, 0.0, 100.0), begin=falling, terminal_xy=terminal, thrust_ahead=ahead)
+    assert plan.virtual[0, 2] == pytest.approx(0.0, abs=0.1)
+    assert plan.status is PlanStatus.OK
+
+
+def test_on_its_side_a_vehicle_gets_a_plan_and_not_an_exception() -> None:
+    plan = plan_to((0.0, 0.0, -0.1), begin=Start(0, HERE, np.zeros(3), 0.0, np.array([0.0, 0.0, G])))
+    assert np.isfinite(plan.pos_ned_m).all()
+
+
+def wide(place: Array, radius_m: float, any_height: bool = False) -> KeepOut:
+    return KeepOut(np.tile(place, (41, 1)), radius_m, radius_m - 0.1, any_height, 1)
+
+
+@pytest.mark.parametrize(
+    "pressing",
+    [wide(HERE + np.array([4.2, 0.0, 0.0]), 4.0), wide(HERE + np.array([1.0, 0.0, 9.0]), 0.9, any_height=True)],
+    ids=["large", "at any height"],
+)
+def test_slots_go_to_those_whose_surface_is_nearest(pressing: KeepOut) -> None:
+    harmless = wide(HERE + np.array([0.0, 2.0, 0.0]), 0.9)
+    guess = np.tile(HERE, (41, 1))
+    assert nearest([harmless, pressing], guess, 1)[0] is pressing
+
+
+@pytest.mark.parametrize("terminal", ["position", "position_velocity"])
+def test_keeping_clear_comes_before_ending_at_the_reference(terminal: str) -> None:
+    # the reference has moved into a neighbour's place; the end can be met in time, by flying into it
+    neighbour = fixed(HERE + np.array([0.9, 0.0, 0.0]))
+    plan = plan_to((0.03, 0.0, 0.0), neighbour, terminal_xy=terminal, terminal_z="none")
+    assert plan.slack_m < 0.01
+    assert np.linalg.norm(plan.pos_ned_m - neighbour.pos_ned_m, axis=1).min() > 0.9 - 0.01

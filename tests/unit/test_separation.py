@@ -8,13 +8,13 @@ from itertools import product
 import numpy as np
 import pytest
 
-from swarmctl.control.condensed import HalfSpaces
+from swarmctl.control.axes import HalfSpaces
 from swarmctl.control.separation import (
     KeepOut,
     SeparationParams,
     align,
     certify,
-    half_spaces_xy,
+    half_spaces,
     keep_out_of_obstacle,
     keep_out_of_peer,
     visible,
@@ -159,7 +159,7 @@ def test_control_horizon_as_long_as_the_prediction_leaves_the_end_to_be_judged()
 
 def spaces_of(guess: Array, *keep_outs: KeepOut, tie: int = 0, goal: tuple[float, float] = (0.0, 0.0)) -> HalfSpaces:
     """Of an agent at rest."""
-    spaces = half_spaces_xy(keep_outs, guess, np.array(goal), np.zeros(2), 0.1, tie, PARAMS)
+    spaces = half_spaces(keep_outs, guess, np.array(goal), np.zeros(2), 0.1, tie, PARAMS)
     assert spaces is not None
     return spaces
 
@@ -198,7 +198,7 @@ def test_height_difference_relieves_what_must_be_kept_horizontally(height_m: flo
 def test_far_ones_get_no_row() -> None:
     assert np.isneginf(spaces_of(still((4.0, 0.0, 0.0)), fixed((0.0, 0.0, 0.0), 0.8)).offset_m).all()
     assert np.isfinite(spaces_of(still((3.8, 0.0, 0.0)), fixed((0.0, 0.0, 0.0), 0.8)).offset_m).all()
-    assert half_spaces_xy([], still((4.0, 0.0, 0.0)), np.zeros(2), np.zeros(2), 0.1, 0, PARAMS) is None
+    assert half_spaces([], still((4.0, 0.0, 0.0)), np.zeros(2), np.zeros(2), 0.1, 0, PARAMS) is None
 
 
 def test_two_at_the_same_place_take_opposite_sides_by_their_numbers() -> None:
@@ -228,16 +228,28 @@ def test_head_on_agents_that_get_nowhere_turn_to_opposite_sides_of_the_line() ->
     assert abs(spaces_of(moving, obstacle, goal=(5.0, 0.0)).normal[0, 0, 1]) > 0.3
 
 
+@pytest.mark.parametrize("axes", [2, 3])
+@pytest.mark.parametrize("east_m", [0.05, -0.05])
+def test_obstacles_are_passed_on_the_side_one_is_on(east_m: float, axes: int) -> None:
+    moving = np.linspace((0.0, east_m, 0.0), (1.0, east_m, 0.0), STEPS + 1)
+    obstacle = KeepOut(still((2.0, 0.0, 0.0)), 0.9, 0.8, False, -1)
+    spaces = half_spaces([obstacle], moving, np.array([5.0, 0.0, 0.0][:axes]), np.zeros(axes), 0.1, 0, PARAMS)
+    assert spaces is not None
+    normal = spaces.normal[0]
+    assert (np.sign(normal[:, 1]) == np.sign(east_m)).all()
+    assert (np.abs(normal[:, 1]) > 0.2).all()  # more than the 0.05 / 2 without the turn
+
+
 def test_stopping_row_asks_for_the_braking_distance_and_not_when_opening() -> None:
     guess = still((-3.0, 0.0, 0.0))
     wall = [fixed((0.0, 0.0, 0.0), 0.8)]
     params = PARAMS.model_copy(update={"bias_rad": 0.0})
-    closing = half_spaces_xy(wall, guess, np.array([5.0, 0.0]), np.array([2.8, 0.0]), 0.1, 0, params)
+    closing = half_spaces(wall, guess, np.array([5.0, 0.0]), np.array([2.8, 0.0]), 0.1, 0, params)
     assert closing is not None
     # v / (2 a): p + v * v / (2 a) is where braking with a = 1.4 from 2.8 m/s ends
     assert closing.stop_s[0] == pytest.approx(2.8 / (2 * 1.4))
     assert closing.stop_offset_m[0] == pytest.approx(0.9)
-    opening = half_spaces_xy(wall, guess, np.array([5.0, 0.0]), np.array([-2.8, 0.0]), 0.1, 0, params)
+    opening = half_spaces(wall, guess, np.array([5.0, 0.0]), np.array([-2.8, 0.0]), 0.1, 0, params)
     assert opening is not None
     assert opening.stop_s[0] == 0.0
 
@@ -245,10 +257,108 @@ def test_stopping_row_asks_for_the_braking_distance_and_not_when_opening() -> No
 def test_stopping_row_knows_that_the_other_moves_too() -> None:
     other = KeepOut(line((0.0, 0.0, 0.0), (-1.0, 0.0, 0.0)), 0.9, 0.8, False, 1)  # 1 m/s south
     params = PARAMS.model_copy(update={"bias_rad": 0.0})
-    spaces = half_spaces_xy(
-        [other], still((-3.0, 0.0, 0.0)), np.array([5.0, 0.0]), np.array([1.8, 0.0]), 0.1, 0, params
-    )
+    spaces = half_spaces([other], still((-3.0, 0.0, 0.0)), np.array([5.0, 0.0]), np.array([1.8, 0.0]), 0.1, 0, params)
     assert spaces is not None
     assert spaces.stop_s[0] == pytest.approx(2.8 / 2.8)  # closing speed 1.8 + 1.0
     # normal is south (-1, 0): other at its end -1 - 1 s * 1 m/s = -2 -> offset 2 + 0.9
     assert spaces.stop_offset_m[0] == pytest.approx(2.9)
+
+
+# -- half-spaces in space ---------------------------------------------------------------------------------------------
+
+
+def in_space(
+    guess: Array, *keep_outs: KeepOut, tie: int = 0, goal: tuple[float, float, float] = (0.0, 0.0, 0.0)
+) -> HalfSpaces:
+    """Of an agent at rest."""
+    spaces = half_spaces(keep_outs, guess, np.array(goal), np.zeros(3), 0.1, tie, PARAMS)
+    assert spaces is not None
+    return spaces
+
+
+@pytest.mark.parametrize("axes", [2, 3])
+@pytest.mark.parametrize("seed", range(20))
+def test_whoever_is_in_a_half_space_is_at_least_the_radius_away(seed: int, axes: int) -> None:
+    rng = np.random.default_rng([seed, 0, 11])
+    guess = np.cumsum(rng.normal(0.0, 0.2, (STEPS + 1, 3)), axis=0)
+    goal = rng.normal(0.0, 4.0, 3)
+    keep_outs = [
+        KeepOut(
+            rng.normal(0.0, 1.0, 3) + np.cumsum(rng.normal(0.0, 0.1, (STEPS + 1, 3)), axis=0),
+            float(rng.uniform(0.3, 2.0)),
+            0.1,
+            bool(k % 2),
+            int(rng.integers(-1, 3)),  # obstacles and peers of both ranks
+        )
+        for k in range(6)
+    ]
+    spaces = half_spaces(keep_outs, guess, goal[:axes], rng.normal(0.0, 1.0, axes), 0.1, 1, PARAMS)
+    assert spaces is not None
+    assert spaces.normal.shape == (6, STEPS, axes)
+    np.testing.assert_allclose(np.linalg.norm(spaces.normal, axis=2), 1.0, atol=1e-12)
+    assert np.isfinite(spaces.offset_m).any()
+    for s, keep_out in enumerate(keep_outs):
+        if keep_out.any_height and axes == 3:
+            np.testing.assert_array_equal(spaces.normal[s, :, 2], 0.0)
+        for k in np.flatnonzero(np.isfinite(spaces.offset_m[s])):
+            points = keep_out.pos_ned_m[k + 1] + rng.uniform(-4.0, 4.0, (300, 3))
+            if axes == 2:
+                points[:, 2] = guess[k + 1, 2]  # the plane it is told for
+            # onto the face of the half-space where they are nearest, and a random way in
+            normal = spaces.normal[s, k]
+            shift = spaces.offset_m[s, k] - points[:, :axes] @ normal + np.abs(rng.normal(0.0, 0.05, 300))
+            points[:, :axes] += shift[:, None] * normal
+            apart = points - keep_out.pos_ned_m[k + 1]
+            if keep_out.any_height:
+                apart[:, 2] = 0.0
+            assert np.linalg.norm(apart, axis=1).min() >= keep_out.radius_m - 1e-9
+
+
+def test_in_space_who_is_above_is_kept_above() -> None:
+    spaces = in_space(still((0.0, 0.0, -2.0)), fixed((0.0, 0.0, -1.0), 0.8), goal=(0.0, 0.0, -2.0))
+    np.testing.assert_allclose(spaces.normal[0], np.tile([0.0, 0.0, -1.0], (STEPS, 1)))
+    np.testing.assert_allclose(spaces.offset_m[0], 1.0 + 0.9)  # -z >= 1.9: at most 1.9 m below the origin's height
+    oblique = in_space(still((1.2, 0.0, -1.6)), fixed((0.0, 0.0, 0.0), 0.8), goal=(1.2, 0.0, -1.6))
+    np.testing.assert_allclose(oblique.normal[0, 0], [0.6, 0.0, -0.8])
+    assert oblique.offset_m[0, 0] == pytest.approx(0.9)  # all of it: height is no relief but a direction
+
+
+def test_in_space_a_cylinder_is_kept_clear_of_sideways_only() -> None:
+    cylinder = fixed((0.0, 0.0, 0.0), 0.8, any_height=True)
+    spaces = in_space(still((1.2, 0.0, -1.6)), cylinder, goal=(1.2, 0.0, -1.6))
+    np.testing.assert_allclose(spaces.normal[0], np.tile([1.0, 0.0, 0.0], (STEPS, 1)))
+    np.testing.assert_allclose(spaces.offset_m[0], 0.9)
+
+
+@pytest.mark.parametrize("any_height", [False, True])
+@pytest.mark.parametrize("above_m", [0.0, 5.0])
+def test_in_space_coincident_centres_have_a_side(above_m: float, any_height: bool) -> None:
+    place = (1.0, 2.0, -2.0)
+    over = still((1.0, 2.0, -2.0 - (above_m if any_height else 0.0)))  # straight above a cylinder is inside it too
+    for tie, north in ((0, -1.0), (1, 1.0)):
+        other = KeepOut(still(place), 0.9, 0.8, any_height, tie=1 - tie)
+        spaces = in_space(over, other, tie=tie, goal=(1.0, 2.0, -2.0))
+        np.testing.assert_allclose(spaces.normal[0], np.tile([north, 0.0, 0.0], (STEPS, 1)))
+        np.testing.assert_allclose(spaces.offset_m[0], north * 1.0 + 0.9)
+        assert np.isfinite(spaces.stop_offset_m).all()
+        assert np.isfinite(spaces.stop_s).all()
+
+
+def test_in_space_the_stopping_row_knows_vertical_speed() -> None:
+    sinking = half_spaces(
+        [fixed((0.0, 0.0, 0.0), 0.8)], still((0.0, 0.0, -3.0)), np.zeros(3), np.array([0.0, 0.0, 2.8]), 0.1, 0, PARAMS
+    )
+    assert sinking is not None
+    assert sinking.stop_s[0] == pytest.approx(2.8 / (2 * 1.4))
+    assert sinking.stop_offset_m[0] == pytest.approx(0.9)
+    rising_other = KeepOut(line((0.0, 0.0, 0.0), (0.0, 0.0, -1.0)), 0.9, 0.8, False, 1)  # 1 m/s up
+    spaces = in_space(still((0.0, 0.0, -3.0)), rising_other)
+    assert spaces.stop_s[0] == pytest.approx(1.0 / 2.8)
+    assert spaces.stop_offset_m[0] == pytest.approx(1.0 + 0.9 + 1.0 / 2.8)  # -z: where it is then, and the radius
+
+
+def test_in_space_who_climbs_gets_somewhere() -> None:
+    peer_ahead = KeepOut(np.linspace((1.5, 0.0, -0.2), (1.5, 0.0, -2.2), STEPS + 1), 0.9, 0.8, False, 1)
+    climbing = np.linspace((0.0, 0.0, 0.0), (0.05, 0.0, -2.0), STEPS + 1)  # 2 m, of which 5 cm are not up
+    turned = in_space(climbing, peer_ahead, goal=(9.0, 0.0, -2.0)).normal[0, :, 1]
+    np.testing.assert_allclose(turned, 0.0, atol=1e-9)

@@ -1,0 +1,255 @@
+"""Problems of a real flight, solved again: x-y QP by OSQP and DAQP, and with true distances by SLSQP, in one run.
+
+The flight is the thesis' circle with an obstacle on the way: agents and their MAVLink bytes in lockstep. Problems are
+recorded where an agent sees both neighbours and the obstacle.
+
+What is compared with what: of the QP the call of the solver from Python is timed, updating its matrices included,
+working them out not (that is a tick's `setup`). Of the nonlinear problem the call of SciPy is timed, callbacks
+included, working out its constants not. Both are warm-started from their own last answer. SLSQP runs twice: with
+analytic gradients, the best that can be done for it, and with finite differences, fmincon's way unless told better.
+All of them are timed on the processor: on a busy machine a wall clock would charge the slower one with the time slices
+of others, which the quicker one slips through between. The whole ticks of the flight are wall-clock time.
+"""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+
+from sitl.experiments.slsqp import DenseQp, NonlinearAnswer, NonlinearXy, XyState
+from sitl.lockstep import Lockstep
+from swarmctl.config import Config, load
+from swarmctl.control.axes import AxesSolution, HalfSpaces
+from swarmctl.control.condensed import _SLACK_SCALE_M
+from swarmctl.control.controller import Controller
+from swarmctl.control.mpc import MpcParams, SwarmMpc
+from swarmctl.control.problem import Problem
+from swarmctl.control.qp import QpParams, QpSolution, QpSolver, pattern_index
+from swarmctl.control.separation import SeparationParams
+from swarmctl.core.types import Array, Plan
+
+_OBSTACLE = "obstacles=[{center_ned_m=[-5.0,-1.5,-1.8],radius_m=1.0,keep_out_m=1.75,visibility_m=3.0}]"
+_MISSION = "mission.duration_s=9.0"  # the obstacle is passed at about 7 s
+_WARM_UP = 20  # problems that are solved and not counted
+_SLOTS = 3  # two neighbours, one obstacle
+
+
+def circle_with_obstacle() -> Config:
+    """The thesis' circle (its section 4.3) with an obstacle like that of its section 4.4 on the way."""
+    return load(None, [_MISSION, _OBSTACLE, "sitl.start='air'"])
+
+
+@dataclass(frozen=True, slots=True)
+class Captured:
+    """What agents were asked in flight, one after the other, and how long their whole ticks took then."""
+
+    config: Config
+    problems: tuple[Problem, ...]
+    tick_ms: Array  # (len(problems),)
+
+
+class Recording:
+    """A controller that remembers what it is asked."""
+
+    def __init__(self, controller: Controller) -> None:
+        self._controller = controller
+        self.problems: list[Problem] = []
+
+    @property
+    def dt_us(self) -> int:
+        return self._controller.dt_us
+
+    @property
+    def steps(self) -> int:
+        return self._controller.steps
+
+    @property
+    def longest(self) -> int:
+        return self._controller.longest
+
+    def plan(self, problem: Problem) -> Plan:
+        self.problems.append(problem)
+        return self._controller.plan(problem)
+
+    def reset(self) -> None:
+        self._controller.reset()
+
+
+def capture(config: Config, keep_outs: int = _SLOTS, most: int = 240) -> Captured:
+    """Fly `config` in lockstep; keep at most `most` tracking problems with exactly `keep_outs` things to avoid.
+
+    They are consecutive, agent after agent.
+    """
+    flight = Lockstep(config)
+    agents = [agent for agent in flight.agents if agent is not None]
+    recordings = []
+    for agent in agents:
+        recordings.append(Recording(agent._controller))
+        agent._controller = recordings[-1]  # `_transit` stays: only tracking is recorded
+    found: list[list[tuple[Problem, float]]] = [[] for _ in agents]
+
+    def on_step(_: Lockstep) -> None:
+        for agent, recording, kept in zip(agents, recordings, found, strict=True):
+            kept += [(p, agent.took.tick_ms) for p in recording.problems if len(p.keep_outs) == keep_outs]
+            recording.problems.clear()
+
+    with settled_garbage():
+        flight.run(on_step)
+    together = [item for kept in found for item in kept][:most]
+    return Captured(config, tuple(p for p, _ in together), np.array([ms for _, ms in together]))
+
+
+@contextmanager
+def settled_garbage() -> Iterator[None]:
+    """As the real-time loop does it: start-up garbage is not looked at again while something is measured."""
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
+
+
+class TappedMpc(SwarmMpc):
+    """The controller of a flight with its x-y problem in sight: what it was asked last, and how long that took."""
+
+    def __init__(self, params: MpcParams, separation: SeparationParams, slots: int = _SLOTS) -> None:
+        super().__init__(params, separation, 0, slots, time.thread_time_ns)
+        self._genuine = self._xy.solve
+        self._xy.solve = self._watched  # type: ignore[method-assign]
+        self.values = self._xy._solver = _Tap(self._xy._solver)
+        self.solve_ms = 0.0
+        self._state: XyState | None = None
+
+    def _watched(
+        self,
+        pos_m: Array,
+        vel_m_s: Array,
+        u_prev: Array,
+        gain_m_s2: Array,
+        drift_m_s2: Array,
+        ref_pos_m: Array,
+        ref_vel_m_s: Array,
+        half_spaces: HalfSpaces | None = None,
+    ) -> AxesSolution:
+        self._state = XyState(pos_m, vel_m_s, u_prev, gain_m_s2, drift_m_s2)
+        answer = self._genuine(pos_m, vel_m_s, u_prev, gain_m_s2, drift_m_s2, ref_pos_m, ref_vel_m_s, half_spaces)
+        self.solve_ms = answer.solve_us * 1e-3
+        return answer
+
+    def qp(self) -> DenseQp:
+        """The x-y QP of the last plan."""
+        xy = self._xy
+        p_values, q, a_values, lower, upper = self.values.asked
+        hessian, rows = np.zeros(xy._p_pattern.shape), np.zeros(xy._a_pattern.shape)
+        i, j = pattern_index(xy._p_pattern, upper=True)
+        hessian[i, j] = hessian[j, i] = p_values
+        rows[pattern_index(xy._a_pattern)] = a_values
+        return DenseQp(hessian, q, rows, lower.copy(), upper.copy(), len(rows) - xy._row_half, xy.slots, _SLACK_SCALE_M)
+
+    def nonlinear(self, problem: Problem, plan: Plan) -> NonlinearXy:
+        """The x-y problem of the last plan with true distances instead of half-spaces; same z, same thrust."""
+        assert self._state is not None
+        xy = self._xy
+        return NonlinearXy(self.qp(), xy.axes, xy.horizon, self._state, problem.keep_outs, plan.pos_ned_m[1:, 2])
+
+
+class _Tap:
+    """A solver that remembers what it was last asked, which the caller may overwrite, and its answer."""
+
+    def __init__(self, solver: QpSolver) -> None:
+        self._solver = solver
+        self.asked: tuple[Array, ...] = ()
+        self.solution = QpSolution(None, False, "not asked", 0)
+
+    def solve(self, p_values: Array, q: Array, a_values: Array, lower: Array, upper: Array) -> QpSolution:
+        self.solution = self._solver.solve(p_values, q, a_values, lower, upper)
+        self.asked = (p_values, q, a_values, lower, upper)
+        return self.solution
+
+
+@dataclass(frozen=True, slots=True)
+class Times:
+    """Percentiles of a duration [ms]."""
+
+    p50_ms: float
+    p99_ms: float
+
+
+def times_of(took_ms: Sequence[float] | Array) -> Times:
+    """p50 and p99 of at least one duration [ms]."""
+    p50_ms, p99_ms = np.percentile(np.asarray(took_ms), (50, 99))
+    return Times(float(p50_ms), float(p99_ms))
+
+
+@dataclass(frozen=True, slots=True)
+class XyTimes:
+    """The x-y problem with two neighbours and an obstacle: how long it takes each solver, on the processor."""
+
+    problems: int
+    tick: Times  # whole ticks in which they were asked, in flight, by the wall clock
+    qp: dict[str, Times]  # by solver: the QP
+    slsqp: Times | None  # true distances, analytic gradients; None when not asked for
+    slsqp_differences: Times | None  # the same without gradients given
+    slsqp_solved_01: float  # share of problems it says it has solved
+
+    def speed_up(self, solver: str, differences: bool = False) -> float:
+        """How many times longer SLSQP takes (p50); NaN when it was not measured."""
+        baseline = self.slsqp_differences if differences else self.slsqp
+        return float("nan") if baseline is None else baseline.p50_ms / self.qp[solver].p50_ms
+
+
+def measure_xy(
+    captured: Captured,
+    solvers: Sequence[str] = ("osqp", "daqp"),
+    slsqp: bool = True,
+    on_problem: Callable[[], None] = lambda: None,
+) -> XyTimes:
+    """Solve every captured problem with every solver in turn, so that a busy machine slows all of them down alike."""
+    mpcs = {name: tapped(captured.config, name) for name in solvers}
+    qp_ms: dict[str, list[float]] = {name: [] for name in solvers}
+    baselines = (_Baseline(True), _Baseline(False)) if slsqp else ()
+    with settled_garbage():
+        for problem in captured.problems:
+            for name, mpc in mpcs.items():
+                plan = mpc.plan(problem)
+                qp_ms[name].append(mpc.solve_ms)
+            for baseline in baselines:
+                baseline.solve(mpc.nonlinear(problem, plan))
+            on_problem()
+    counted = {name: times_of(took[_WARM_UP:]) for name, took in qp_ms.items()}
+    count, tick = len(captured.problems), times_of(captured.tick_ms)
+    if not slsqp:
+        return XyTimes(count, tick, counted, None, None, float("nan"))
+    analytic, differences = (times_of(b.took_ms[_WARM_UP:]) for b in baselines)
+    solved_01 = float(np.mean([answer.solved for b in baselines for answer in b.answers]))
+    return XyTimes(count, tick, counted, analytic, differences, solved_01)
+
+
+def tapped(config: Config, solver: str) -> TappedMpc:
+    """The controller of `config` with another QP solver."""
+    params = config.controller.mpc
+    qp = QpParams.model_validate({**params.qp.model_dump(), "solver": solver})
+    return TappedMpc(params.model_copy(update={"qp": qp}), config.separation)
+
+
+class _Baseline:
+    """SLSQP from its own last answer, shifted by one step."""
+
+    def __init__(self, gradients: bool) -> None:
+        self._gradients = gradients
+        self.took_ms: list[float] = []
+        self.answers: list[NonlinearAnswer] = []
+
+    def solve(self, problem: NonlinearXy) -> None:
+        last = self.answers[-1].x if self.answers else np.zeros(len(problem.qp.slope))
+        guess = problem.shifted(last)
+        began_ns = time.thread_time_ns()
+        answer = problem.solve(guess, self._gradients)
+        self.took_ms.append((time.thread_time_ns() - began_ns) * 1e-6)
+        self.answers.append(answer)

@@ -1,0 +1,63 @@
+"""What a reproduced experiment leaves behind: the flight as arrays, and the rows it is judged by."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Path = Literal["plant", "full"]  # controllers on the plant itself; agents over MAVLink
+
+
+@dataclass(frozen=True, slots=True)
+class Sphere:
+    """An obstacle that agents see only from close by."""
+
+    center_ned_m: tuple[float, float, float]
+    radius_m: float
+    keep_out_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class Trace:
+    """One flight from mission start to mission end, true states at every tick of 0.02 s.
+
+    The setpoint at index k is the one computed from the state at index k. NaN where nothing was recorded: torques exist
+    on the plant path only.
+    """
+
+    name: str  # of the flight, unique: "circle 0.90 dmpc"
+    path: Path
+    t_s: Array  # (T,)
+    pos_ned_m: Array  # (T, N, 3)
+    vel_ned_m_s: Array  # (T, N, 3)
+    euler_rad: Array  # (T, N, 3) roll, pitch, yaw
+    ref_pos_ned_m: Array  # (T, N, 3)
+    euler_ref_rad: Array  # (T, N, 3) attitude setpoint
+    thrust_n: Array  # (T, N)
+    torque_n_m: Array  # (T, N, 3)
+    failed: int  # plans that could not be flown
+    terminal_missed: int  # plans whose softened terminal condition was not met
+    obstacles: tuple[Sphere, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One line of `reproduce.json`; lower is better in every row."""
+
+    name: str
+    published: float | None
+    ours: float
+    limit: float | None  # what must be reached
+    path: Path
+    unit: str
+    note: str = ""
+    least: float | None = None  # the least possible, where it is known
+
+    @property
+    def met(self) -> bool | None:
+        """Whether the limit is kept; None without one."""
+        return None if self.limit is None else self.ours <= self.limit

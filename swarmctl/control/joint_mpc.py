@@ -1,0 +1,94 @@
+"""One MPC for the three axes (thesis 5.2: "mitigate the perceived bias towards the z axis"): keeping clear in space.
+
+The same axes, weights and bounds as `swarmctl.control.mpc`, but z, x and y are one problem, so that an agent may pass
+above or below what it must keep clear of. The products f u_x and f u_y are linearised by solving twice, the second
+time with the thrust f that the first has planned; the path that is certified and shared is the motion under the
+products themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from swarmctl.control.axes import AxesSolution, HalfSpaces, Penalties
+from swarmctl.control.condensed import CondensedMpc
+from swarmctl.control.mpc import MpcParams, first_guess, judged, nearest
+from swarmctl.control.problem import Problem
+from swarmctl.control.separation import SeparationParams, half_spaces
+from swarmctl.core.frames import GRAVITY_M_S2
+from swarmctl.core.types import Array, Plan
+
+_TIGHTER_01 = 0.1  # of the solver's tolerance: z, whose increments are ten times larger, sets the scale of the cost
+_THRUST_LEAST_M_S2 = 1.0  # without thrust tilting would have no effect at all
+
+
+class JointMpc:
+    """x, y and z together with half-spaces, then a certificate over true distances."""
+
+    def __init__(
+        self,
+        params: MpcParams,
+        separation: SeparationParams,
+        own_tie: int,
+        slots: int,
+        stopwatch_ns: Callable[[], int],
+    ) -> None:
+        self._params, self._separation, self._tie, self._slots = params, separation, own_tie, slots
+        self._stopwatch_ns = stopwatch_ns
+        self.dt_us = round(params.dt_s * 1e6)
+        self.steps = self.longest = params.horizon_xy
+        eps, eps_relative = _TIGHTER_01 * params.qp.eps, _TIGHTER_01 * params.qp.eps_relative
+        self._mpc = CondensedMpc(
+            (*params.horizontal(), params.vertical()),
+            params.horizon(params.control_xy, params.horizon_xy),
+            slots,
+            separation.relax_01,
+            Penalties(),
+            params.qp.model_copy(update={"eps": eps, "eps_relative": eps_relative}),
+            stopwatch_ns,
+        )
+
+    def plan(self, problem: Problem) -> Plan:
+        """One step of distributed MPC. Never raises for an infeasible problem; the status says what may be flown."""
+        began_ns = self._stopwatch_ns()
+        start, steps = problem.start, self.steps
+        guess = first_guess(problem, self._params.dt_s, steps)
+        spaces = half_spaces(
+            nearest(problem.keep_outs, guess, self._slots),
+            guess,
+            problem.reference.pos_ned_m[steps],
+            start.vel_ned_m_s,
+            self._params.dt_s,
+            self._tie,
+            self._separation,
+        )
+        held = max(_THRUST_LEAST_M_S2, float(start.virtual[2]))
+        first = self._solve(problem, np.full(steps, held), spaces)
+        found = self._solve(problem, first.u[:, 2], spaces)
+        found = replace(found, solve_us=first.solve_us + found.solve_us, iterations=first.iterations + found.iterations)
+        thrust = found.u[:, 2:]
+        along = np.column_stack([found.u[:, :2], np.full(steps, start.cos_tilt)])  # (steps, 3)
+        pos, vel = self._mpc.motion(start.pos_ned_m, start.vel_ned_m_s, self._drift(problem) - thrust * along)
+        return judged(
+            problem, pos, vel, found.u, (found,), self._params.control_xy, self.dt_us, began_ns, self._stopwatch_ns
+        )
+
+    def _solve(self, problem: Problem, thrust_m_s2: Array, spaces: HalfSpaces | None) -> AxesSolution:
+        steps, start, reference = self.steps, problem.start, problem.reference
+        return self._mpc.solve(
+            start.pos_ned_m,
+            start.vel_ned_m_s,
+            start.virtual,
+            np.column_stack([-thrust_m_s2, -thrust_m_s2, np.full(steps, -start.cos_tilt)]),
+            self._drift(problem),
+            reference.pos_ned_m[1 : steps + 1],
+            reference.vel_ned_m_s[1 : steps + 1],
+            spaces,
+        )
+
+    @staticmethod
+    def _drift(problem: Problem) -> Array:
+        return np.asarray(problem.disturbance_ned_m_s2 + np.array([0.0, 0.0, GRAVITY_M_S2]))

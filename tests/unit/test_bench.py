@@ -1,0 +1,200 @@
+"""The bench measures what it says: a real agent in a plausible crowd, and one problem for all solvers."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import optimize
+
+from sitl.experiments import bench, formation
+from sitl.experiments.captured import Captured, capture, circle_with_obstacle, measure_xy, tapped
+from sitl.experiments.formation import Formation, Neighbours, formation_config, places_m
+from sitl.experiments.slsqp import NonlinearXy
+from swarmctl.core.types import Array
+from swarmctl.errors import EXIT_OK, ConfigError, MissionError
+
+KEYS = {"name", "solver", "neighbours", "p50_ms", "p99_ms"}
+SPEED_M_S = formation.RADIUS_M * formation.OMEGA_RAD_S
+
+
+@pytest.fixture
+def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without waiting until the agent has caught up, and with few problems."""
+    monkeypatch.setattr(bench, "_WARM_UP_S", 0.1)
+    monkeypatch.setattr(bench, "capture", lambda config: capture(config, most=22))
+
+
+@pytest.fixture(scope="module")
+def captured() -> Captured:
+    return capture(circle_with_obstacle())
+
+
+@pytest.mark.usefixtures("quick")
+def test_the_verb_writes_a_list_of_rows_of_five_keys(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert bench.main(["--neighbours", "0,2", "--ticks", "5", "--out", str(tmp_path / "new")]) == EXIT_OK
+    rows = json.loads((tmp_path / "new" / "bench.json").read_text())
+    assert isinstance(rows, list) and all(set(row) == KEYS for row in rows)
+    assert len({(r["name"], r["solver"], r["neighbours"]) for r in rows}) == len(rows)
+    assert all(0.0 <= r["p50_ms"] <= r["p99_ms"] < 1e4 for r in rows)
+    ticks = {(r["name"], r["solver"], r["neighbours"]) for r in rows if "x-y" not in r["name"]}
+    plain = {(n, s, k) for n in bench.PARTS for s in bench.SOLVERS for k in (0, 2)}
+    assert ticks == plain | {(f"{n}, 1 obstacle", s, 2) for n in bench.PARTS for s in bench.SOLVERS}
+    assert {r["solver"] for r in rows if "nonlinear" in r["name"]} == {"slsqp"}
+    assert "one tick" in capsys.readouterr().out
+
+
+@pytest.mark.usefixtures("quick")
+def test_parts_of_a_tick_add_up_to_it() -> None:
+    parts = bench.measure_ticks(2, ["osqp"], 10)["osqp"]
+    assert parts.shape == (10, len(bench.PARTS))
+    assert (parts > 0.0).all()
+    np.testing.assert_allclose(parts[:, :-1].sum(axis=1), parts[:, -1], atol=1e-6)
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_tick_without_a_plan_is_no_figure(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Formation, "planned", property(lambda self: False))
+    with pytest.raises(MissionError, match="daqp with 1 neighbours: a tick without a plan"):
+        bench.measure_ticks(1, ["daqp"], 3)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [["--neighbours", "2,x"], ["--neighbours", "-1"], ["--neighbours", "100"], ["--ticks", "0"], ["--solver", "qp"]],
+)
+def test_bad_usage_is_refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit) as caught:
+        bench.main(arguments)
+    assert caught.value.code == 2
+    assert arguments[0] in capsys.readouterr().err
+
+
+def test_a_folder_that_cannot_be_made_is_an_error_in_words(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(ConfigError, match="--out"):
+        bench.write([], tmp_path / "file")
+
+
+def test_a_busy_machine_is_said() -> None:
+    assert bench.busy_note(0.1, 2) == ""
+    assert "load 2.3 on 2 processors" in bench.busy_note(2.3, 2)
+
+
+@pytest.mark.parametrize("count", [2, 3, 9, 31])
+def test_places_are_as_close_as_vehicles_may_be_and_no_closer(count: int) -> None:
+    places = places_m(count)
+    apart = np.linalg.norm(places[:, None] - places[None], axis=2)[~np.eye(count, dtype=bool)]
+    assert apart.min() == pytest.approx(formation.SPACING_M)
+    np.testing.assert_allclose(places.mean(axis=0), 0.0, atol=1e-9)
+    assert places[0, 1] == places[:, 1].min()
+    assert np.linalg.norm(places, axis=1).max() < 0.8 * np.sqrt(count) * formation.SPACING_M, "a crowd, not a line"
+
+
+def test_neighbours_move_as_vehicles_could() -> None:
+    t_s = np.arange(0.0, 20.0, 0.02)
+    paths = Neighbours(places_m(31)[1:], 1).positions_ned_m(t_s)
+    assert paths.shape == (30, len(t_s), 3)
+    speed = np.linalg.norm(np.diff(paths, axis=1), axis=2) / 0.02
+    accel = np.linalg.norm(np.diff(paths, n=2, axis=1), axis=2) / 0.02**2
+    assert speed.min() > 0.3 * SPEED_M_S and speed.max() < 1.8 * SPEED_M_S
+    assert accel.max() < 3.0  # what the bounded tilt allows on each axis and both together
+    apart = np.linalg.norm(paths[:, None] - paths[None], axis=3)[~np.eye(30, dtype=bool)]
+    assert apart.min() > 0.85
+
+
+@pytest.mark.parametrize(("neighbours", "pillar"), [(2, False), (2, True), (30, False)])
+def test_the_agent_flies_pressed_against_its_neighbours(neighbours: int, pillar: bool) -> None:
+    flown = Formation(formation_config("daqp", neighbours, pillar))
+    while flown.mission_t_s < 4.5:
+        flown.step()
+    for _ in range(40):
+        flown.step()
+        assert flown.planned
+        assert flown.record.peers == neighbours
+        assert 0.88 < flown.record.nearest_peer_m < 0.95, "at the distance that is kept: active constraints"
+        if pillar:
+            assert 5.15 < flown.record.nearest_obstacle_m < 5.3
+    assert float(np.linalg.norm(flown.record.vel_ned_m_s)) == pytest.approx(SPEED_M_S, rel=0.6)
+
+
+def test_captured_problems_have_two_neighbours_and_an_obstacle(captured: Captured) -> None:
+    assert len(captured.problems) == len(captured.tick_ms) == 240
+    for problem in captured.problems:
+        assert [k.tie for k in problem.keep_outs].count(-1) == 1
+        assert len(problem.keep_outs) == 3
+    assert (captured.tick_ms > 0.0).all()
+
+
+def nonlinear_series(captured: Captured, every: int) -> list[tuple[NonlinearXy, Array, Array]]:
+    """The nonlinear problem, the exact answer of its QP and the x-y plan (Hp, 2) made of that."""
+    mpc, series = tapped(captured.config, "daqp"), []
+    for problem in captured.problems[::every]:
+        plan = mpc.plan(problem)
+        x = mpc.values.solution.x
+        assert x is not None
+        series.append((mpc.nonlinear(problem, plan), x, plan.pos_ned_m[1:, :2]))
+    return series
+
+
+def test_the_nonlinear_problem_moves_as_the_controller_predicts(captured: Captured) -> None:
+    for nonlinear, x, planned in nonlinear_series(captured, 20):
+        np.testing.assert_allclose(nonlinear.positions_m(x), planned, atol=1e-6)
+
+
+def test_the_gradients_given_to_slsqp_are_right(captured: Captured) -> None:
+    rng = np.random.default_rng(3)
+    for nonlinear, x, _ in nonlinear_series(captured, 40):
+        at = x + 0.1 * rng.normal(size=len(x))
+        differences = optimize.approx_fprime(at, nonlinear._margins, 1e-7)
+        np.testing.assert_allclose(nonlinear._gradients(at), differences, atol=1e-5)
+        slope = optimize.approx_fprime(at, nonlinear.qp.cost, 1e-7)
+        np.testing.assert_allclose(nonlinear._cost_and_gradient(at)[1], slope, rtol=1e-3, atol=1e-2)
+
+
+def test_slsqp_keeps_the_true_distances(captured: Captured) -> None:
+    for nonlinear, _, _ in nonlinear_series(captured, 12):
+        answer = nonlinear.solve(np.zeros(len(nonlinear.qp.slope)))
+        assert answer.solved
+        assert nonlinear.shortfall_m(answer.x) < 1e-6
+        assert (np.abs(answer.x[: nonlinear._moves]) < 1.0 + 1e-9).all()
+
+
+def test_slsqp_costs_no_more_than_a_qp_answer_that_keeps_them_too(captured: Captured) -> None:
+    dearer = []
+    for nonlinear, x, _ in nonlinear_series(captured, 3):
+        if nonlinear.shortfall_m(x) < 1e-9:  # not so where half-spaces look at some steps only
+            dearer.append(nonlinear.solve(x).cost - nonlinear.qp.cost(x))
+    assert len(dearer) >= 20
+    assert max(dearer) < 1e-3
+    assert np.median(dearer) > -1.0, "and not much less: half-spaces cost little"
+
+
+def test_finite_differences_give_the_same_answer_as_gradients(captured: Captured) -> None:
+    for nonlinear, x, _ in nonlinear_series(captured, 60):
+        with_gradients, without = nonlinear.solve(x), nonlinear.solve(x, gradients=False)
+        assert without.cost == pytest.approx(with_gradients.cost, abs=1e-3)
+
+
+def test_both_qp_solvers_agree_on_captured_problems(captured: Captured) -> None:
+    exact, first_order = tapped(captured.config, "daqp"), tapped(captured.config, "osqp")
+    apart_m = []
+    for problem in captured.problems:
+        one, other = exact.plan(problem), first_order.plan(problem)
+        apart_m.append(np.abs(one.pos_ned_m - other.pos_ned_m).max())
+        assert exact.values.solution.exact
+    assert np.median(apart_m) < 0.003  # over the whole horizon
+    assert np.quantile(apart_m, 0.95) < 0.02
+
+
+def test_the_qp_is_much_faster_than_the_nonlinear_problem(captured: Captured) -> None:
+    few = Captured(captured.config, captured.problems[:40], captured.tick_ms[:40])
+    times = measure_xy(few)
+    assert times.problems == 40
+    assert times.slsqp_solved_01 > 0.9
+    assert times.speed_up("osqp") > 2.0  # measured 7
+    assert times.speed_up("daqp") > 10.0  # measured 40
+    assert times.speed_up("daqp", differences=True) > 10.0
+    assert np.isnan(measure_xy(few, ["osqp"], slsqp=False).speed_up("osqp"))
