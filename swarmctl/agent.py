@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -249,7 +250,7 @@ class Agent:
             self._certified_us = now_us  # none was asked for
         if plan is not None:
             assert thought.start is not None
-            self._replay.take(plan, thought.start, thought.keep_outs, self._rest(thought.start))
+            self._replay.take(plan, thought.start, thought.keep_outs, partial(self._rest, thought.start))
         if plan is not None and plan.status is PlanStatus.OK:
             self._certified_us = now_us
         elif plan is not None:

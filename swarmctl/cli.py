@@ -102,8 +102,7 @@ def simulate(
         arguments += [] if value is None else [f"{name}={value}"]
     arguments += [f"--set={item}" for item in sets or ()]
     arguments += [] if view is None else ["--view" if view else "--no-view"]
-    sys.stdout.flush()
-    os.execv(sys.executable, [sys.executable, "-m", "sitl.simulate", *arguments])
+    _become("sitl.simulate", arguments)
 
 
 @app.command()
@@ -227,6 +226,44 @@ def report(folder: Folder) -> int:
 
     print(rewrite_report(folder))
     return EXIT_OK
+
+
+@app.command()
+def reproduce(
+    only: Annotated[list[str] | None, typer.Option("--only", metavar="FLIGHT", help="One experiment; repeat.")] = None,
+    plant: Annotated[bool, typer.Option("--plant", help="Only on the plant itself, as the thesis did.")] = False,
+    full: Annotated[bool, typer.Option("--full", help="Only over MAVLink, through the whole bridge.")] = False,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder to write; default runs/<UTC>-reproduce.")] = None,
+    jobs: Annotated[int | None, typer.Option("--jobs", metavar="N", help="Processes; default one a processor.")] = None,
+) -> NoReturn:
+    """Fly the thesis' six experiments again and write them beside what it published."""
+    arguments = [f"--only={name}" for name in only or ()]
+    arguments += [flag for flag, given in (("--plant", plant), ("--full", full)) if given]
+    arguments += [] if out is None else [f"--out={out}"]
+    arguments += [] if jobs is None else [f"--jobs={jobs}"]
+    _become("sitl.experiments.reproduce", arguments)
+
+
+@app.command()
+def bench(
+    out: Annotated[Path | None, typer.Option("--out", help="Folder of bench.json; default here.")] = None,
+    neighbours: Annotated[str | None, typer.Option("--neighbours", metavar="N,N,..", help="How many, 0 to 30.")] = None,
+    solver: Annotated[list[str] | None, typer.Option("--solver", help="osqp or daqp; repeat.")] = None,
+    ticks: Annotated[int | None, typer.Option("--ticks", metavar="N", help="Measured ticks a case.")] = None,
+    slsqp: Annotated[bool | None, typer.Option("--slsqp/--no-slsqp", help="Measure the nonlinear baseline.")] = None,
+) -> NoReturn:
+    """Measure one agent's tick, part by part, for 0 to 30 neighbours and every solver."""
+    arguments = [f"--solver={name}" for name in solver or ()]
+    for name, value in (("--out", out), ("--neighbours", neighbours), ("--ticks", ticks)):
+        arguments += [] if value is None else [f"{name}={value}"]
+    arguments += [] if slsqp is None else ["--slsqp" if slsqp else "--no-slsqp"]
+    _become("sitl.experiments.bench", arguments)
+
+
+def _become(module: str, arguments: list[str]) -> NoReturn:
+    """Replace this process: the bridge never imports the simulator."""
+    sys.stdout.flush()
+    os.execv(sys.executable, [sys.executable, "-m", module, *arguments])
 
 
 def _command(verb: str, run_dir: Path | None, agent: int | None) -> int:

@@ -1,4 +1,4 @@
-"""Problems of a real flight, solved again: x-y QP by OSQP and DAQP, and with true distances by SLSQP, in one run.
+"""Problems of a real flight, solved again: the x-y QP by OSQP and DAQP, the thesis' own problem by SLSQP, in one run.
 
 The flight is the thesis' circle with an obstacle on the way: agents and their MAVLink bytes in lockstep. Problems are
 recorded where an agent sees both neighbours and the obstacle.
@@ -6,9 +6,11 @@ recorded where an agent sees both neighbours and the obstacle.
 What is compared with what: of the QP the call of the solver from Python is timed, updating its matrices included,
 working them out not (that is a tick's `setup`). Of the nonlinear problem the call of SciPy is timed, callbacks
 included, working out its constants not. Both are warm-started from their own last answer. SLSQP runs twice: with
-analytic gradients, the best that can be done for it, and with finite differences, fmincon's way unless told better.
-All of them are timed on the processor: on a busy machine a wall clock would charge the slower one with the time slices
-of others, which the quicker one slips through between. The whole ticks of the flight are wall-clock time.
+finite differences, fmincon's way and the stand-in for it, and with analytic gradients. Its constraints are hard, those
+of the QP give way by slacks: about a third of these problems ask for a distance that is lost already, and what has no
+solution is left out of the ratio. All are timed on the processor: on a busy machine a wall clock would charge the
+slower one with the time slices of others, which the quicker one slips through between. The whole ticks of the flight
+are wall-clock time.
 """
 
 from __future__ import annotations
@@ -20,19 +22,20 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from sitl.experiments.slsqp import DenseQp, NonlinearAnswer, NonlinearXy, XyState
+from sitl.experiments.slsqp import KEPT_M, NonlinearAnswer, NonlinearXy, XyAsked
 from sitl.lockstep import Lockstep
 from swarmctl.config import Config, load
 from swarmctl.control.axes import AxesSolution, HalfSpaces
-from swarmctl.control.condensed import _SLACK_SCALE_M
 from swarmctl.control.controller import Controller
 from swarmctl.control.mpc import MpcParams, SwarmMpc
 from swarmctl.control.problem import Problem
-from swarmctl.control.qp import QpParams, QpSolution, QpSolver, pattern_index
+from swarmctl.control.qp import QpParams
 from swarmctl.control.separation import SeparationParams
 from swarmctl.core.types import Array, Plan
 
+Mask = NDArray[np.bool_]
 _OBSTACLE = "obstacles=[{center_ned_m=[-5.0,-1.5,-1.8],radius_m=1.0,keep_out_m=1.75,visibility_m=3.0}]"
 _MISSION = "mission.duration_s=9.0"  # the obstacle is passed at about 7 s
 _WARM_UP = 20  # problems that are solved and not counted
@@ -122,9 +125,8 @@ class TappedMpc(SwarmMpc):
         super().__init__(params, separation, 0, slots, time.thread_time_ns)
         self._genuine = self._xy.solve
         self._xy.solve = self._watched  # type: ignore[method-assign]
-        self.values = self._xy._solver = _Tap(self._xy._solver)
         self.solve_ms = 0.0
-        self._state: XyState | None = None
+        self._asked: XyAsked | None = None
 
     def _watched(
         self,
@@ -137,40 +139,16 @@ class TappedMpc(SwarmMpc):
         ref_vel_m_s: Array,
         half_spaces: HalfSpaces | None = None,
     ) -> AxesSolution:
-        self._state = XyState(pos_m, vel_m_s, u_prev, gain_m_s2, drift_m_s2)
+        self._asked = XyAsked(pos_m, vel_m_s, u_prev, gain_m_s2, drift_m_s2, ref_pos_m, ref_vel_m_s)
         answer = self._genuine(pos_m, vel_m_s, u_prev, gain_m_s2, drift_m_s2, ref_pos_m, ref_vel_m_s, half_spaces)
         self.solve_ms = answer.solve_us * 1e-3
         return answer
 
-    def qp(self) -> DenseQp:
-        """The x-y QP of the last plan."""
-        xy = self._xy
-        p_values, q, a_values, lower, upper = self.values.asked
-        hessian, rows = np.zeros(xy._p_pattern.shape), np.zeros(xy._a_pattern.shape)
-        i, j = pattern_index(xy._p_pattern, upper=True)
-        hessian[i, j] = hessian[j, i] = p_values
-        rows[pattern_index(xy._a_pattern)] = a_values
-        return DenseQp(hessian, q, rows, lower.copy(), upper.copy(), len(rows) - xy._row_half, xy.slots, _SLACK_SCALE_M)
-
     def nonlinear(self, problem: Problem, plan: Plan) -> NonlinearXy:
-        """The x-y problem of the last plan with true distances instead of half-spaces; same z, same thrust."""
-        assert self._state is not None
+        """The x-y problem of the last plan as the thesis poses it; same z, same thrust."""
+        assert self._asked is not None
         xy = self._xy
-        return NonlinearXy(self.qp(), xy.axes, xy.horizon, self._state, problem.keep_outs, plan.pos_ned_m[1:, 2])
-
-
-class _Tap:
-    """A solver that remembers what it was last asked, which the caller may overwrite, and its answer."""
-
-    def __init__(self, solver: QpSolver) -> None:
-        self._solver = solver
-        self.asked: tuple[Array, ...] = ()
-        self.solution = QpSolution(None, False, "not asked", 0)
-
-    def solve(self, p_values: Array, q: Array, a_values: Array, lower: Array, upper: Array) -> QpSolution:
-        self.solution = self._solver.solve(p_values, q, a_values, lower, upper)
-        self.asked = (p_values, q, a_values, lower, upper)
-        return self.solution
+        return NonlinearXy(xy.axes, xy.horizon, self._asked, problem.keep_outs, plan.pos_ned_m[1:, 2])
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,20 +166,61 @@ def times_of(took_ms: Sequence[float] | Array) -> Times:
 
 
 @dataclass(frozen=True, slots=True)
+class Baseline:
+    """SLSQP on the counted problems, as the thesis poses them."""
+
+    took_ms: Array  # (problems,)
+    solved: Mask  # (problems,) by its own account
+    at_limit: Mask  # (problems,) of iterations
+    kept: Mask  # (problems,) whether its answer keeps every true distance
+
+    @property
+    def times(self) -> Times:
+        """Of all problems, those without a solution included."""
+        return times_of(self.took_ms)
+
+    @property
+    def solved_01(self) -> float:
+        return float(self.solved.mean())
+
+    @property
+    def at_limit_01(self) -> float:
+        return float(self.at_limit.mean())
+
+    @property
+    def infeasible_01(self) -> float:
+        """Share for which it says that it found nothing to satisfy the constraints."""
+        return float((~self.solved & ~self.at_limit).mean())
+
+    @property
+    def kept_01(self) -> float:
+        return float(self.kept.mean())
+
+
+@dataclass(frozen=True, slots=True)
 class XyTimes:
     """The x-y problem with two neighbours and an obstacle: how long it takes each solver, on the processor."""
 
-    problems: int
     tick: Times  # whole ticks in which they were asked, in flight, by the wall clock
-    qp: dict[str, Times]  # by solver: the QP
-    slsqp: Times | None  # true distances, analytic gradients; None when not asked for
-    slsqp_differences: Times | None  # the same without gradients given
-    slsqp_solved_01: float  # share of problems it says it has solved
+    qp_ms: dict[str, Array]  # by solver: the QP, (problems,)
+    fmincon: Baseline | None  # stand-in for it: finite differences; None when not asked for
+    gradients: Baseline | None  # the same with analytic gradients, the best that can be done for it
 
-    def speed_up(self, solver: str, differences: bool = False) -> float:
-        """How many times longer SLSQP takes (p50); NaN when it was not measured."""
-        baseline = self.slsqp_differences if differences else self.slsqp
-        return float("nan") if baseline is None else baseline.p50_ms / self.qp[solver].p50_ms
+    @property
+    def problems(self) -> int:
+        """How many were counted."""
+        return len(next(iter(self.qp_ms.values())))
+
+    def qp(self, solver: str) -> Times:
+        return times_of(self.qp_ms[solver])
+
+    def speed_up(self, solver: str = "osqp", gradients: bool = False) -> float:
+        """How many times longer SLSQP takes (p50), on the problems that it has solved; NaN when not measured."""
+        baseline = self.gradients if gradients else self.fmincon
+        if baseline is None or not baseline.solved.any():
+            return float("nan")
+        solved = baseline.solved
+        return float(np.median(baseline.took_ms[solved]) / np.median(self.qp_ms[solver][solved]))
 
 
 def measure_xy(
@@ -210,10 +229,13 @@ def measure_xy(
     slsqp: bool = True,
     on_problem: Callable[[], None] = lambda: None,
 ) -> XyTimes:
-    """Solve every captured problem with every solver in turn, so that a busy machine slows all of them down alike."""
+    """Solve every captured problem with every solver in turn, so that a busy machine slows all of them down alike.
+
+    The first 20 are solved and not counted.
+    """
     mpcs = {name: tapped(captured.config, name) for name in solvers}
     qp_ms: dict[str, list[float]] = {name: [] for name in solvers}
-    baselines = (_Baseline(True), _Baseline(False)) if slsqp else ()
+    baselines = (_Running(False), _Running(True)) if slsqp else ()
     with settled_garbage():
         for problem in captured.problems:
             for name, mpc in mpcs.items():
@@ -222,13 +244,9 @@ def measure_xy(
             for baseline in baselines:
                 baseline.solve(mpc.nonlinear(problem, plan))
             on_problem()
-    counted = {name: times_of(took[_WARM_UP:]) for name, took in qp_ms.items()}
-    count, tick = len(captured.problems), times_of(captured.tick_ms)
-    if not slsqp:
-        return XyTimes(count, tick, counted, None, None, float("nan"))
-    analytic, differences = (times_of(b.took_ms[_WARM_UP:]) for b in baselines)
-    solved_01 = float(np.mean([answer.solved for b in baselines for answer in b.answers]))
-    return XyTimes(count, tick, counted, analytic, differences, solved_01)
+    counted = {name: np.array(took[_WARM_UP:]) for name, took in qp_ms.items()}
+    found = [b.counted() for b in baselines] if slsqp else [None, None]
+    return XyTimes(times_of(captured.tick_ms), counted, *found)
 
 
 def tapped(config: Config, solver: str) -> TappedMpc:
@@ -238,18 +256,26 @@ def tapped(config: Config, solver: str) -> TappedMpc:
     return TappedMpc(params.model_copy(update={"qp": qp}), config.separation)
 
 
-class _Baseline:
+class _Running:
     """SLSQP from its own last answer, shifted by one step."""
 
     def __init__(self, gradients: bool) -> None:
         self._gradients = gradients
-        self.took_ms: list[float] = []
-        self.answers: list[NonlinearAnswer] = []
+        self._took_ms: list[float] = []
+        self._answers: list[NonlinearAnswer] = []
 
     def solve(self, problem: NonlinearXy) -> None:
-        last = self.answers[-1].x if self.answers else np.zeros(len(problem.qp.slope))
-        guess = problem.shifted(last)
+        guess = problem.shifted(self._answers[-1].moves) if self._answers else None
         began_ns = time.thread_time_ns()
         answer = problem.solve(guess, self._gradients)
-        self.took_ms.append((time.thread_time_ns() - began_ns) * 1e-6)
-        self.answers.append(answer)
+        self._took_ms.append((time.thread_time_ns() - began_ns) * 1e-6)
+        self._answers.append(answer)
+
+    def counted(self) -> Baseline:
+        answers = self._answers[_WARM_UP:]
+        return Baseline(
+            np.array(self._took_ms[_WARM_UP:]),
+            np.array([a.solved for a in answers]),
+            np.array([a.at_limit for a in answers]),
+            np.array([a.shortfall_m < KEPT_M for a in answers]),
+        )

@@ -9,6 +9,7 @@ the last certified plan.
 from __future__ import annotations
 
 import time
+from functools import partial
 
 import numpy as np
 
@@ -72,6 +73,13 @@ class Pilot:
         """Where to be now, (3,)."""
         return np.asarray(self._reference.sample(np.array([t_us * 1e-6]))[0][0])
 
+    def prime(self, state: VehicleState) -> None:
+        """One plan to stay, as an agent that waits for the mission makes: errors then begin from zero."""
+        start = Start(state.t_us, state.pos_ned_m, state.vel_ned_m_s, 1.0, self._virtual)
+        points = self._controller.longest + 1
+        stay = Reference(np.tile(state.pos_ned_m, (points, 1)), np.zeros((points, 3)), self._config.mission.yaw_rad)
+        self._controller.plan(Problem(start, stay, np.zeros(3), (), None))
+
     def step(self, state: VehicleState, peers: list[PredictedPath]) -> AttitudeSetpoint:
         """The setpoint of this step; `path` is what peers may know of it."""
         now_us, estimate = state.t_us, self._observer.estimate
@@ -120,13 +128,13 @@ class Pilot:
 
     def _flown(self, plan: Plan, start: Start, keep_outs: tuple[KeepOut, ...]) -> Plan:
         disturbance = self._observer.estimate.disturbance_ned_m_s2
-        rest = rest_plan(start, None, disturbance, self._dt_us, self._steps)
+        rest = partial(rest_plan, start, None, disturbance, self._dt_us, self._steps)
         self._replay.take(plan, start, keep_outs, rest)
         if plan.status is PlanStatus.OK:
             return plan
         self.failed += 1
         good = self._replay.plan
-        return rest if good is None or start.t_us - good.t0_us > _REPLAY_US else good
+        return rest() if good is None or start.t_us - good.t0_us > _REPLAY_US else good
 
     def _path(self, plan: Plan) -> PredictedPath:
         return PredictedPath(self._agent, 1, 1, plan.t0_us, plan.dt_us, 0.0, plan.pos_ned_m)
@@ -151,6 +159,8 @@ def fly_on_plant(name: str, config: Config, *, matched_velocity: bool = False) -
     log = {key: np.zeros((steps, agents, 3)) for key in ("pos", "vel", "euler", "ref", "euler_ref", "torque")}
     thrust_n = np.zeros((steps, agents))
     wrench = np.zeros((4, agents))
+    for i, pilot in enumerate(pilots):
+        pilot.prime(_state(plant, i, 0))
     for k in range(steps):
         states = [_state(plant, i, k * STEP_US) for i in range(agents)]
         if k:

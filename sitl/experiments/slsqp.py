@@ -1,11 +1,14 @@
-"""The x-y problem as the thesis poses it, with true distances, for SciPy's SLSQP: the stand-in for MATLAB's fmincon.
+"""The x-y problem exactly as the thesis poses it, for SciPy's SLSQP: the stand-in for MATLAB's fmincon.
 
-Decision variables, cost and linear rows are those of the linearised QP, taken from the QP itself: scaled increments
-over Hc and a slack for each neighbour or obstacle, `1/2 x'Px + q'x`, bounds on increments and inputs. What differs is
-what is kept clear of: `|p_i(k) - p_j(k)| + slack >= r` at every step k = 1..Hp (4.1), (4.2), in three dimensions with z
-as the z problem has planned it, instead of half-spaces at some steps. Everything constant is worked out beforehand, so
-that only the solver and its callbacks are timed. The slack keeps it feasible, as in the QP: hard distances have no
-solution once delay has cost a millimetre.
+Decision variables are the increments of u_x and u_y over Hc, in their own unit (3.25), (3.32). The cost is (3.27) and
+(3.34), `e'Q1 e + de'Q2 de + du'R du` over Hp. Increments and inputs are bounded (3.28), (3.29), and the distances
+`|p_i(k) - p_j(k)| >= r` hold at every step k = 1..Hp, in three dimensions with z as the z problem has planned it (4.1),
+(4.2). All of it is hard, as there: no slack, no step left out. Some problems of a flight have no solution then.
+
+Nothing is held back from the solver. Errors of all steps are one matrix product, everything constant is worked out
+beforehand, so that only SciPy and its callbacks are timed, and the bounds on inputs come with their gradient, as
+fmincon takes linear constraints. What is differentiated numerically unless told better is what fmincon differentiates:
+the cost and the distances.
 """
 
 from __future__ import annotations
@@ -17,163 +20,172 @@ import numpy as np
 from scipy import optimize
 
 from swarmctl.control.axes import Axis, Horizon
-from swarmctl.control.qp import INFINITY
 from swarmctl.control.separation import KeepOut
 from swarmctl.core.types import Array
 
-FTOL = 1e-6  # of a cost whose Hessian has a diagonal of about 1
-MAX_ITERATIONS = 100
+FTOL = 1e-6  # fmincon's tolerances; of the thesis' own cost
+MAX_ITERATIONS = 400  # fmincon's own limit
+KEPT_M = 1e-6  # fmincon's tolerance of a constraint
+_SOLVED, _LIMIT = 0, 9  # SLSQP's exit modes
 _LEAST_M = 1e-9
 
 
 @dataclass(frozen=True, slots=True)
-class DenseQp:
-    """`1/2 x'Px + q'x` subject to `lower <= Ax <= upper`; columns are increments, then slacks.
-
-    The last rows are half-spaces, as many for each slot, and the last columns the slots' slacks.
-    """
-
-    hessian: Array  # (n, n)
-    slope: Array  # (n,)
-    rows: Array  # (m, n)
-    lower: Array  # (m,)
-    upper: Array  # (m,)
-    half_spaces: int  # rows of `rows`
-    slots: int
-    slack_m: float  # of one unit of a slot's slack variable
-
-    def cost(self, x: Array) -> float:
-        return float(0.5 * x @ self.hessian @ x + self.slope @ x)
-
-
-@dataclass(frozen=True, slots=True)
-class XyState:
-    """What the x-y prediction starts from."""
+class XyAsked:
+    """One tick's x-y problem: where the prediction starts from and where it is to go."""
 
     pos_m: Array  # (2,)
     vel_m_s: Array  # (2,)
     u_prev: Array  # (2,)
     gain_m_s2: Array  # (Hp, 2) acceleration of a unit input over each step
     drift_m_s2: Array  # (2,)
+    ref_pos_m: Array  # (Hp, 2)
+    ref_vel_m_s: Array  # (Hp, 2)
 
 
 @dataclass(frozen=True, slots=True)
 class NonlinearAnswer:
-    """What SLSQP returned; `x` as in the QP."""
+    """What SLSQP returned. Not solved and not at its limit: it found nothing that satisfies the constraints."""
 
-    x: Array
+    moves: Array  # (2 Hc,) increments of u_x, then of u_y
     cost: float
     solved: bool
+    at_limit: bool
     iterations: int
+    shortfall_m: float  # largest violation of a distance
 
 
 class NonlinearXy:
     """One tick's x-y problem with true distances.
 
     Args:
-        qp: the linearised problem of the same tick.
-        axes, horizon: what it is about.
-        state: where it starts.
-        keep_outs: neighbours and obstacles, at most as many as the QP has slots.
+        axes: weights and bounds; their terminal conditions are left out, the thesis' swarm has none in x-y.
+        horizon: lengths and sample time.
+        asked: the tick's problem.
+        keep_outs: neighbours and obstacles.
         z_ned_m: (Hp,) planned height at steps 1..Hp.
     """
 
     def __init__(
-        self,
-        qp: DenseQp,
-        axes: Sequence[Axis],
-        horizon: Horizon,
-        state: XyState,
-        keep_outs: Sequence[KeepOut],
-        z_ned_m: Array,
+        self, axes: Sequence[Axis], horizon: Horizon, asked: XyAsked, keep_outs: Sequence[KeepOut], z_ned_m: Array
     ) -> None:
-        if len(keep_outs) > qp.slots:
-            raise ValueError(f"keep_outs: {len(keep_outs)}, the QP has {qp.slots} slots")
-        self.qp = qp
         hp, self._hc, dt_s = horizon.prediction, horizon.control, horizon.dt_s
-        self._moves, self._slacks = len(axes) * self._hc, len(qp.slope) - qp.slots
+        count = len(axes)
+        u_min, u_max = np.array([a.u_min for a in axes]), np.array([a.u_max for a in axes])
+        du_max = np.repeat([a.du_max for a in axes], self._hc)
+        self._u_prev = np.clip(asked.u_prev, u_min, u_max)
         steps = np.arange(1, hp + 1)
         since = steps[:, None] - steps  # (Hp, Hp) steps after the one an acceleration has acted in
         half = 0.0 if horizon.euler else 0.5
-        integral = dt_s**2 * np.where(since >= 0, since + half, 0.0)  # position of an acceleration in each step
+        to_pos, to_vel = dt_s**2 * np.where(since >= 0, since + half, 0.0), dt_s * (since >= 0)
         held = (np.minimum(steps[:, None] - 1, self._hc - 1) >= np.arange(self._hc)).astype(float)  # (Hp, Hc)
-        accel = state.gain_m_s2 * np.clip(state.u_prev, [a.u_min for a in axes], [a.u_max for a in axes])
-        self._free_m = state.pos_m + (dt_s * steps)[:, None] * state.vel_m_s + integral @ (accel + state.drift_m_s2)
-        self._push = np.stack(  # (2, Hp, Hc) metres of a whole increment
-            [integral @ (state.gain_m_s2[:, i, None] * held) * axis.du_max for i, axis in enumerate(axes)]
+        accel = asked.gain_m_s2 * self._u_prev + asked.drift_m_s2  # (Hp, 2)
+        self._free_m = (asked.pos_m + (dt_s * steps)[:, None] * asked.vel_m_s + to_pos @ accel).T.ravel()  # (2 Hp,)
+        free_vel = (asked.vel_m_s + to_vel @ accel).T.ravel()
+        driven = [asked.gain_m_s2[:, i, None] * held for i in range(count)]
+        self._push = _blocks([to_pos @ d for d in driven])  # (2 Hp, 2 Hc) metres of a unit increment
+        push_vel = _blocks([to_vel @ d for d in driven])
+        weight_pos, weight_vel, weight_moves = (
+            np.sqrt(np.repeat([getattr(a, name) for a in axes], length))
+            for name, length in (("q_pos", hp), ("q_vel", hp), ("r", self._hc))
         )
-        others = np.array([k.pos_ned_m[1 : hp + 1] for k in keep_outs]).reshape(-1, hp, 3)
-        self._others_m = others[:, :, :2]  # (slots, Hp, 2)
+        self._effect = np.concatenate(  # (4 Hp + 2 Hc, 2 Hc) weighted errors of a unit increment
+            [weight_pos[:, None] * self._push, weight_vel[:, None] * push_vel, np.diag(weight_moves)]
+        )
+        self._at_rest = np.concatenate(  # (4 Hp + 2 Hc,) weighted errors without any
+            [
+                weight_pos * (self._free_m - asked.ref_pos_m.T.ravel()),
+                weight_vel * (free_vel - asked.ref_vel_m_s.T.ravel()),
+                np.zeros(count * self._hc),
+            ]
+        )
+        sums = _blocks([np.tri(self._hc)] * count)
+        self._sums = np.concatenate([sums, -sums])
+        self._room = np.concatenate(
+            [np.repeat(self._u_prev - u_min, self._hc), np.repeat(u_max - self._u_prev, self._hc)]
+        )
+        self._bounds = optimize.Bounds(-du_max, du_max)
+        others = np.array([k.pos_ned_m[1 : hp + 1].T for k in keep_outs]).reshape(-1, 3, hp)
+        self._others_m = others[:, :2]  # (K, 2, Hp)
         flat = np.array([0.0 if k.any_height else 1.0 for k in keep_outs])
-        self._dz2 = ((z_ned_m - others[:, :, 2]) * flat[:, None]) ** 2  # (slots, Hp)
+        self._dz2 = ((z_ned_m - others[:, 2]) * flat[:, None]) ** 2  # (K, Hp)
         self._radius_m = np.array([k.radius_m for k in keep_outs])[:, None]
-        self._build_rows(len(keep_outs), hp)
 
-    def _build_rows(self, used: int, hp: int) -> None:
-        qp = self.qp
-        kept = slice(self._moves, len(qp.rows) - qp.half_spaces)  # the first ones are the increments' own bounds
-        rows, lower, upper = qp.rows[kept], qp.lower[kept], qp.upper[kept]
-        below, above = lower > -INFINITY, upper < INFINITY
-        self._linear = np.concatenate([rows[below], -rows[above]])
-        self._linear_least = np.concatenate([lower[below], -upper[above]])
-        self._gradient = np.zeros((len(self._linear) + used * hp, len(qp.slope)))
-        self._gradient[: len(self._linear)] = self._linear
-        slots = self._gradient[len(self._linear) :].reshape(used, hp, -1)
-        for s in range(used):
-            slots[s, :, self._slacks + s] = qp.slack_m
-        self._bounds = [(-1.0, 1.0)] * self._moves + [(0.0, None)] * (len(qp.slope) - self._moves)
-
-    def positions_m(self, x: Array) -> Array:
+    def positions_m(self, moves: Array) -> Array:
         """(Hp, 2) at steps 1..Hp."""
-        moved = np.einsum("ahj,aj->ha", self._push, x[: self._moves].reshape(len(self._push), self._hc))
-        return np.asarray(self._free_m + moved)
+        return np.asarray((self._free_m + self._push @ moves).reshape(2, -1).T)
 
-    def shortfall_m(self, x: Array) -> float:
-        """Largest violation of a softened distance."""
-        return float(np.max(-self._distances(x)[1], initial=0.0))
+    def shortfall_m(self, moves: Array) -> float:
+        """Largest violation of a distance."""
+        return float(np.max(-self.margins_m(moves), initial=0.0))
 
-    def shifted(self, x: Array) -> Array:
+    def moves_of(self, u: Array) -> Array:
+        """The increments (2 Hc,) that make inputs (>= Hc, 2) of the ones held now."""
+        return np.asarray(np.diff(u[: self._hc], axis=0, prepend=self._u_prev[None]).T.ravel())
+
+    def inputs(self, moves: Array) -> Array:
+        """Inputs (Hc, 2) that the increments make of the ones held now."""
+        return np.asarray(self._u_prev + np.cumsum(moves.reshape(2, self._hc).T, axis=0))
+
+    def shifted(self, moves: Array) -> Array:
         """The last answer one step on: every increment a step earlier, none at the end."""
-        guess = x.copy()
-        moves = guess[: self._moves].reshape(-1, self._hc)
-        moves[:, :-1] = moves[:, 1:]
-        moves[:, -1] = 0.0
-        return guess
+        guess = np.zeros((2, self._hc))
+        guess[:, :-1] = moves.reshape(2, self._hc)[:, 1:]
+        return guess.ravel()
 
-    def solve(self, guess: Array, gradients: bool = True) -> NonlinearAnswer:
-        """SLSQP from `guess` (n,), with analytic gradients or with finite differences."""
-        constraints = {"type": "ineq", "fun": self._margins}
+    def solve(self, guess: Array | None = None, gradients: bool = False) -> NonlinearAnswer:
+        """SLSQP from `guess` (2 Hc,), or from no move; with analytic gradients, or with finite differences."""
+        distances = {"type": "ineq", "fun": self.margins_m}
         if gradients:
-            constraints["jac"] = self._gradients
+            distances["jac"] = self.margin_gradients
+        inputs = {"type": "ineq", "fun": self._input_margins, "jac": lambda moves: self._sums}
         result = optimize.minimize(
-            self._cost_and_gradient if gradients else self.qp.cost,
-            guess,
+            self.cost_and_gradient if gradients else self.cost,
+            np.zeros(2 * self._hc) if guess is None else guess,
             jac=gradients,
             method="SLSQP",
             bounds=self._bounds,
-            constraints=constraints,
+            constraints=[inputs, distances],
             options={"ftol": FTOL, "maxiter": MAX_ITERATIONS},
         )
-        return NonlinearAnswer(np.asarray(result.x), float(result.fun), bool(result.success), int(result.nit))
+        moves, mode = np.asarray(result.x), int(result.status)
+        return NonlinearAnswer(
+            moves, float(result.fun), mode == _SOLVED, mode == _LIMIT, int(result.nit), self.shortfall_m(moves)
+        )
 
-    def _distances(self, x: Array) -> tuple[Array, Array, Array]:
-        """Horizontal difference (slots, Hp, 2), margin and distance (slots, Hp) to everything to keep clear of."""
-        apart = self.positions_m(x) - self._others_m
-        distance = np.sqrt(np.einsum("skc,skc->sk", apart, apart) + self._dz2)
-        slack = x[self._slacks : self._slacks + len(self._radius_m), None] * self.qp.slack_m
-        return apart, distance + slack - self._radius_m, distance
+    def cost(self, moves: Array) -> float:
+        """(3.27) and (3.34)."""
+        errors = self._at_rest + self._effect @ moves
+        return float(errors @ errors)
 
-    def _cost_and_gradient(self, x: Array) -> tuple[float, Array]:
-        pull = self.qp.hessian @ x
-        return float(0.5 * x @ pull + self.qp.slope @ x), pull + self.qp.slope
+    def cost_and_gradient(self, moves: Array) -> tuple[float, Array]:
+        errors = self._at_rest + self._effect @ moves
+        return float(errors @ errors), 2.0 * (errors @ self._effect)
 
-    def _margins(self, x: Array) -> Array:
-        return np.concatenate([self._linear @ x - self._linear_least, self._distances(x)[1].ravel()])
+    def margins_m(self, moves: Array) -> Array:
+        """What is left of every distance at every step, (K Hp,)."""
+        return np.asarray((self._distances(moves)[1] - self._radius_m).ravel())
 
-    def _gradients(self, x: Array) -> Array:
-        apart, _, distance = self._distances(x)
-        normal = apart / np.maximum(distance, _LEAST_M)[:, :, None]  # (slots, Hp, 2)
-        slots = self._gradient[len(self._linear) :].reshape(*distance.shape, -1)
-        for a, push in enumerate(self._push):
-            slots[:, :, a * self._hc : (a + 1) * self._hc] = normal[:, :, a, None] * push
-        return self._gradient
+    def margin_gradients(self, moves: Array) -> Array:
+        """(K Hp, 2 Hc)."""
+        apart, distance = self._distances(moves)
+        normal = apart / np.maximum(distance, _LEAST_M)[:, None]  # (K, 2, Hp)
+        push = self._push.reshape(2, -1, 2 * self._hc)
+        return np.asarray((normal[:, 0, :, None] * push[0] + normal[:, 1, :, None] * push[1]).reshape(-1, 2 * self._hc))
+
+    def _distances(self, moves: Array) -> tuple[Array, Array]:
+        """Horizontal difference (K, 2, Hp) and distance (K, Hp) to everything to keep clear of."""
+        apart = (self._free_m + self._push @ moves).reshape(2, -1) - self._others_m
+        return apart, np.sqrt(np.einsum("sck,sck->sk", apart, apart) + self._dz2)
+
+    def _input_margins(self, moves: Array) -> Array:
+        return np.asarray(self._room + self._sums @ moves)
+
+
+def _blocks(of_axes: Sequence[Array]) -> Array:
+    """Matrices of the axes on the diagonal of a large one: axes do not act on each other."""
+    rows, columns = of_axes[0].shape
+    whole = np.zeros((len(of_axes) * rows, len(of_axes) * columns))
+    for i, block in enumerate(of_axes):
+        whole[i * rows : (i + 1) * rows, i * columns : (i + 1) * columns] = block
+    return whole

@@ -197,17 +197,17 @@ class CondensedMpc:
         ends = np.stack([pos_error[-1], vel_error[-1], accel[-1] - ref_accel])  # (3, axes) without any move
         q = self._fill_cost(gain_m_s2, phi_pos, phi_vel, pos_error, vel_error, ends)
         self._fill_inputs(u_prev)
-        self._fill_terminals(q, phi_pos[:, -1], phi_vel[:, -1], u_prev, pos_error[-1], vel_error[-1])
+        self._fill_terminals(phi_pos[:, -1], phi_vel[:, -1], u_prev, pos_error[-1], vel_error[-1])
         self._fill_half_spaces(phi_pos, phi_vel, u_prev, free_pos, free_vel, half_spaces)
         p_values, a_values = self._p_dense[self._p_index], self._a_dense[self._a_index]
         began_ns = self._stopwatch_ns()
         solution = self._solver.solve(p_values, q, a_values, self._lower, self._upper)
         for softened in (self._end_velocities, self._ends):  # not feasible: exact penalties instead of equalities
             if len(softened) and not solution.exact:
-                self._soften(softened)
+                self._soften(q, softened)
                 solution = self._soft_solver.solve(p_values, q, a_values, self._lower, self._upper)
         if len(self._ends) and self.slots and self._distance_slack_m(solution.x) > _SLACK_USED_M:
-            self._soften(self._ends)  # distances come first: let go of the end
+            self._soften(q, self._ends)  # distances come first: let go of the end
             q[self._moves + self._ends] = 0.0
             solution = self._soft_solver.solve(p_values, q, a_values, self._lower, self._upper)
         solve_us = (self._stopwatch_ns() - began_ns) * 1e-3
@@ -269,12 +269,11 @@ class CondensedMpc:
             self._upper[block] = (axis.u_max - u_prev[i]) / scale
 
     def _fill_terminals(
-        self, q: Array, end_pos: Array, end_vel: Array, u_prev: Array, pos_error: Array, vel_error: Array
+        self, end_pos: Array, end_vel: Array, u_prev: Array, pos_error: Array, vel_error: Array
     ) -> None:
-        """Equalities `gap = 0`, slacks fixed; and weights of the slacks that make them exact, should it be needed.
+        """Equalities `gap = 0`, slacks fixed.
 
-        No end is asked for that the bounded increments can't reach: towards a far one they go as far as they can. The
-        multipliers that balance the cost's slope g along the rows R, (R R')^-1 R g, are the scale of the weights.
+        No end is asked for that the bounded increments can't reach: towards a far one they go as far as they can.
         """
         hc, out_of_reach = self.horizon.control, set[int]()
         for j, (i, what) in enumerate(self._terminals):
@@ -292,23 +291,29 @@ class CondensedMpc:
                 asked = _REACHED_01 * (most if asked > most else least)
             self._lower[row : row + 2] = self._upper[row : row + 2] = asked
         self._upper[self._row_soft + self._ends] = 0.0
-        for i, own in self._terminals_of.items():
-            rows = self._a_dense[self._row_terminal + 2 * own, i * hc : (i + 1) * hc]  # (own, Hc)
-            multiplier = np.abs(np.linalg.lstsq(rows.T, q[i * hc : (i + 1) * hc], rcond=1e-9)[0])
-            q[self._moves + own] += self._penalties.over_terminal * multiplier * _SLACK_SCALE_M
 
     def _extremes(self, i: int, u_prev: Array) -> tuple[Array, Array]:
         """Increments (Hc,) of axis `i` that raise and that lower its input as fast as the bounds allow."""
         axis, ramp = self.axes[i], np.arange(1, self.horizon.control + 1)
         rise = np.minimum(u_prev[i] + axis.du_max * ramp, axis.u_max)
         fall = np.maximum(u_prev[i] - axis.du_max * ramp, axis.u_min)
-        return np.diff(rise, prepend=u_prev[i]), np.diff(fall, prepend=u_prev[i])
+        before = np.full(1, u_prev[i])
+        return rise - np.concatenate([before, rise[:-1]]), fall - np.concatenate([before, fall[:-1]])
 
     def _distance_slack_m(self, x: Array | None) -> float:
         return 0.0 if x is None else float(x[self._moves + len(self._terminals) :].max()) * _SLACK_SCALE_M
 
-    def _soften(self, which: NDArray[np.intp]) -> None:
-        """Rows `gap + slack >= 0` and `gap - slack <= 0` with free slacks, for these terminal conditions."""
+    def _soften(self, q: Array, which: NDArray[np.intp]) -> None:
+        """Rows `gap + slack >= 0` and `gap - slack <= 0` with free slacks, for these terminal conditions.
+
+        The multipliers that balance the cost's slope g along the rows R, (R R')^-1 R g, are the scale of the weights
+        that make them exact.
+        """
+        hc = self.horizon.control
+        for i, own in self._terminals_of.items():
+            block = self._a_dense[self._row_terminal + 2 * own, i * hc : (i + 1) * hc]  # (own, Hc)
+            multiplier = np.abs(np.linalg.lstsq(block.T, q[i * hc : (i + 1) * hc], rcond=1e-9)[0])
+            q[self._moves + own] = self._q_soft[own] + self._penalties.over_terminal * multiplier * _SLACK_SCALE_M
         rows = self._row_terminal + 2 * which
         self._upper[rows], self._lower[rows + 1] = INFINITY, -INFINITY
         self._upper[self._row_soft + which] = INFINITY

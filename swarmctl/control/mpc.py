@@ -101,14 +101,17 @@ class SwarmMpc:
             params.qp,
             stopwatch_ns,
         )
-        self._xy = CondensedMpc(
-            params.horizontal(),
-            params.horizon(params.control_xy, params.horizon_xy),
-            slots,
-            separation.relax_01,
-            Penalties(),
-            params.qp,
-            stopwatch_ns,
+        self._xy, self._xy_alone = (  # without anything to keep clear of the problem is small and solved exactly
+            CondensedMpc(
+                params.horizontal(),
+                params.horizon(params.control_xy, params.horizon_xy),
+                room,
+                separation.relax_01,
+                Penalties(),
+                params.qp,
+                stopwatch_ns,
+            )
+            for room in (slots, 0)
         )
 
     def plan(self, problem: Problem) -> Plan:
@@ -128,7 +131,7 @@ class SwarmMpc:
             self._tie,
             self._separation,
         )
-        across = self._xy.solve(
+        across = (self._xy_alone if spaces is None else self._xy).solve(
             start.pos_ned_m[:2],
             start.vel_ned_m_s[:2],
             start.virtual[:2],

@@ -24,7 +24,10 @@ from swarmctl.core.types import Array
 INFINITY = 1e20  # what OSQP takes for no bound
 _RUIZ_AGAIN = 10  # scaling passes: solve the problems that crawl without, and are no gain on the rest
 _SOLVED = osqp.SolverStatus.OSQP_SOLVED
-_UNFINISHED = (osqp.SolverStatus.OSQP_SOLVED_INACCURATE, osqp.SolverStatus.OSQP_MAX_ITER_REACHED)
+_USABLE = frozenset(  # the last two are unfinished iterates
+    int(status)
+    for status in (_SOLVED, osqp.SolverStatus.OSQP_SOLVED_INACCURATE, osqp.SolverStatus.OSQP_MAX_ITER_REACHED)
+)
 
 
 class QpParams(Params):
@@ -128,12 +131,12 @@ class OsqpSolver:
     def _run(self) -> QpSolution:
         assert self._solver is not None
         result = self._solver.solve(raise_error=False)
-        status = result.info.status_val
-        if not np.isfinite(result.x).all():
+        x, status = result.x, result.info.status_val
+        finite = bool(np.isfinite(x).all())
+        if not finite:
             self._solver = None  # start afresh next time
-        usable = status in (_SOLVED, *_UNFINISHED) and bool(np.isfinite(result.x).all())
-        x = result.x if usable else None
-        return QpSolution(x, status == _SOLVED, str(result.info.status), int(result.info.iter))
+        usable = finite and status in _USABLE
+        return QpSolution(x if usable else None, status == _SOLVED, str(result.info.status), int(result.info.iter))
 
 
 def pattern_index(pattern: NDArray[np.bool_], upper: bool = False) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -144,8 +147,8 @@ def pattern_index(pattern: NDArray[np.bool_], upper: bool = False) -> tuple[NDAr
 
 
 def is_finite(*values: Array) -> bool:
-    """Whether every number of every array is one; missing bounds are `INFINITY`, which is."""
-    return all(bool(np.isfinite(array).all()) for array in values)
+    """Whether every number of every vector is one; missing bounds are `INFINITY`, which is."""
+    return bool(np.isfinite(np.concatenate(values)).all())  # at once: a third of the time of one after the other
 
 
 def make_solver(p_pattern: NDArray[np.bool_], a_pattern: NDArray[np.bool_], params: QpParams) -> QpSolver:

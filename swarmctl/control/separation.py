@@ -155,11 +155,11 @@ def half_spaces(
     moved = math.dist(guess_ned_m[-1, :axes], guess_ned_m[0, :axes])
     stuck = min(1.0, max(0.0, 2.0 - moved / params.stuck_m))
     to_goal = goal_m - guess_ned_m[1:, :axes]  # (Hp, axes)
-    across = to_goal[:, 0] * normal[:, :, 1] - to_goal[:, 1] * normal[:, :, 0]  # > 0: passing it on the right
-    turn = [np.where(a > 0.0, -1.0, 1.0) if k.tie < 0 else stuck for k, a in zip(keep_outs, across, strict=True)]
-    normal = _turned(
-        normal, distance, needed, to_goal, params.bias_rad * np.stack(np.broadcast_arrays(*turn, across[0])[:-1])
-    )
+    across = to_goal[:, 0] * normal[:, :, 1] - to_goal[:, 1] * normal[:, :, 0]  # (slots, Hp) > 0: it is on the left
+    turn = np.full(distance.shape, stuck)
+    is_obstacle = np.array([k.tie < 0 for k in keep_outs])
+    turn[is_obstacle] = np.where(across[is_obstacle] > 0.0, -1.0, 1.0)
+    normal = _turned(normal, distance, needed, to_goal, params.bias_rad * turn)
     offset = np.einsum("skc,skc->sk", normal, others) + needed
     idle = (needed <= 0.0) | (distance > needed + params.gate_m)
     ends = (others[:, -1] - others[:, -2]) / dt_s  # (slots, axes) velocity of each at the end

@@ -177,7 +177,7 @@ def test_operator_holds_resumes_and_lands(fly: Fly) -> None:
             14.1: lambda running: running.command("land"),
         },
     )
-    assert speeds[0] < 0.3 < 1.5 < speeds[1]
+    assert speeds[0] < 0.3 < 1.2 < speeds[1]
     assert flight.separation_m() >= 0.85
     assert flight.problems == [f"agent {i}: stopped by the operator" for i in range(3)]
     assert all(landed_by_itself(flight.lockstep.truth, i) for i in range(3))

