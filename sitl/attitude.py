@@ -36,19 +36,20 @@ class PidGains:
     proportional: tuple[float, float, float]
     integral: tuple[float, float, float]
     derivative: tuple[float, float, float]
+    on_measurement: bool = False  # the derivative, so that a step of the reference does not kick
 
 
 THESIS_GAINS = {
     "swarm": PidGains((0.05, 0.05, 0.005), (1e-4, 1e-4, 1e-4), (0.15, 0.15, 0.05)),  # section 4.3
     "single": PidGains((0.15, 0.05, 0.005), (1e-4, 1e-4, 1e-4), (0.3, 0.25, 0.01)),  # chapter 3
-    "pid_step": PidGains((0.9, 0.6, 1.5), (0.01, 0.001, 0.001), (0.1, 0.1, 0.65)),  # chapter 2
+    "pid_step": PidGains((0.9, 0.6, 1.5), (0.01, 0.001, 0.001), (0.1, 0.1, 0.65), on_measurement=True),  # chapter 2
     "pid_trajectory": PidGains((0.2, 0.4, 0.01), (0.0, 1e-4, 0.0), (0.1, 0.1, 0.001)),
 }
 THESIS_SAMPLE_S = 0.02
 
 
 class ThesisAttitude:
-    """Three PIDs on Euler angles; the derivative is of the error, reference included.
+    """Three PIDs on Euler angles; the derivative is of the error, reference included, or of the measurement (steps).
 
     The thesis samples at 0.02 s. At a faster physics rate the derivative is taken over a sliding 0.02 s window,
     (e(t) - e(t - 0.02)) / 0.02, so that a reference step gives the same impulse; at dt = 0.02 s this is its discrete
@@ -60,6 +61,7 @@ class ThesisAttitude:
         self._kp = np.array(gains.proportional).reshape(3, 1)
         self._ki = np.array(gains.integral).reshape(3, 1) * dt_s
         self._kd = np.array(gains.derivative).reshape(3, 1) / (self._window * dt_s)
+        self._on_measurement = gains.on_measurement
         self._reference_rad = np.zeros((3, vehicles))
         self._past = np.zeros((self._window, 3, vehicles))
         self._head = 0
@@ -79,8 +81,11 @@ class ThesisAttitude:
         error -= term  # nearest turn
         error *= live
         past = self._past[self._head]
-        np.subtract(error, past, out=term)
-        past[...] = error
+        watched = np.remainder(-plant.euler_rad, _TURN_RAD) * live if self._on_measurement else error
+        np.subtract(watched, past, out=term)
+        if self._on_measurement:
+            term -= np.rint(term / _TURN_RAD) * _TURN_RAD  # nearest turn
+        past[...] = watched
         self._head = (self._head + 1) % self._window
         np.multiply(term, self._kd, out=out)
         np.multiply(error, self._ki, out=term)

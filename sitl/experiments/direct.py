@@ -74,11 +74,13 @@ class Pilot:
         return np.asarray(self._reference.sample(np.array([t_us * 1e-6]))[0][0])
 
     def prime(self, state: VehicleState) -> None:
-        """One plan to stay, as an agent that waits for the mission makes: errors then begin from zero."""
-        start = Start(state.t_us, state.pos_ned_m, state.vel_ned_m_s, 1.0, self._virtual)
-        points = self._controller.longest + 1
-        stay = Reference(np.tile(state.pos_ned_m, (points, 1)), np.zeros((points, 3)), self._config.mission.yaw_rad)
-        self._controller.plan(Problem(start, stay, np.zeros(3), (), None))
+        """Plan to stay and share it, as an agent that waits for the mission does: errors then begin from zero."""
+        act_us = state.t_us + self._predictor.delay_us
+        start = Start(act_us - self._dt_us, state.pos_ned_m, state.vel_ned_m_s, 1.0, self._virtual)
+        points, yaw_rad = self._controller.longest + 1, self._config.mission.yaw_rad
+        stay = Reference(np.tile(state.pos_ned_m, (points, 1)), np.zeros((points, 3)), yaw_rad)
+        plan = self._controller.plan(Problem(start, stay, np.zeros(3), (), None))
+        self.path = self._path(self._flown(plan, start, ()))
 
     def step(self, state: VehicleState, peers: list[PredictedPath]) -> AttitudeSetpoint:
         """The setpoint of this step; `path` is what peers may know of it."""

@@ -44,7 +44,7 @@ def environment() -> dict[str, str]:
 
 def test_nothing_is_shown_that_is_not_run() -> None:
     run_here = shown(r"^swarmctl (launch|simulate) ") + shown(rf"^swarmctl ({'|'.join(WHILE_FLYING + AFTERWARDS)})\b")
-    run_here += shown(r"^python -m sitl ") + shown(r"^python3 -m venv ")
+    run_here += shown(r"^python -m sitl ") + shown(r"^python3 -m venv ") + shown(r"^swarmctl (reproduce|bench) ")
     assert sorted(run_here) == sorted(SHOWN)
 
 
@@ -63,6 +63,13 @@ def test_simulations(line: str, tmp_path: Path) -> None:
     done = run(line, "--duration", "2", "--run-dir", str(tmp_path / "run"))
     assert done.returncode == 0, done.stdout + done.stderr
     assert "x real time" in done.stdout
+
+
+@pytest.mark.parametrize("line", shown(r"^swarmctl (reproduce|bench) "))
+def test_experiments_and_timing(line: str, tmp_path: Path) -> None:
+    done = run(line, "--out", str(tmp_path / "out"))
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert any((tmp_path / "out" / name).exists() for name in ("reproduce.json", "bench.json"))
 
 
 def test_a_launch_its_operator_and_what_is_left(tmp_path: Path) -> None:

@@ -1,0 +1,76 @@
+"""`reproduce` and `bench` as an operator runs them: exit codes, and what is left in the folder."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from sitl.experiments.figures import FLIGHTS
+
+pytestmark = pytest.mark.process
+
+SWARMCTL = Path(sys.executable).parent / "swarmctl"
+
+
+def run(directory: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    """Away from the checkout: what comes with swarmctl is found from anywhere."""
+    return subprocess.run(
+        [str(SWARMCTL), *arguments],
+        cwd=directory,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+
+
+def test_one_flight_is_reproduced(tmp_path: Path) -> None:
+    out = tmp_path / "new" / "folder"
+    done = run(tmp_path, "reproduce", "--only", "pid_fast", "--plant", "--out", str(out), "--jobs", "1")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert sorted(path.name for path in out.iterdir()) == ["report.html", "reproduce.json"]
+    assert [path.name for path in tmp_path.iterdir()] == ["new"]
+    (rows,) = json.loads((out / "reproduce.json").read_text(encoding="utf-8")).values()
+    for row in rows:
+        assert row.keys() >= {"name", "published", "ours", "limit", "path", "unit", "note"}
+        assert row["name"].startswith("PID fast, Table 6, ")
+        assert row["path"] == "plant"
+        assert isinstance(row["ours"], float)
+    assert rows[0]["published"] == 0.0741
+    assert rows[0]["limit"] == pytest.approx(1.2 * 0.0741)
+    page = (out / "report.html").read_text(encoding="utf-8")
+    assert "Figure 45: " in page
+    assert "Figure 11: " not in page
+    assert str(out / "report.html") in done.stdout
+    assert "0 limits missed" in done.stdout
+
+
+def test_an_unknown_flight_is_2_with_those_that_are_known(tmp_path: Path) -> None:
+    done = run(tmp_path, "reproduce", "--only", "nonsense")
+    assert done.returncode == 2
+    assert "'nonsense' is no experiment" in done.stderr
+    assert all(name in done.stderr for name in (*FLIGHTS, "timing"))
+    assert "Traceback" not in done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_bench_leaves_a_list_of_rows(tmp_path: Path) -> None:
+    out = tmp_path / "new"
+    done = run(tmp_path, "bench", "--neighbours", "0,2", "--ticks", "30", "--no-slsqp", "--out", str(out))
+    assert done.returncode == 0, done.stdout + done.stderr
+    rows = json.loads((out / "bench.json").read_text(encoding="utf-8"))
+    assert isinstance(rows, list)
+    for row in rows:
+        assert row.keys() == {"name", "solver", "neighbours", "p50_ms", "p99_ms"}
+        assert 0.0 <= row["p50_ms"] <= row["p99_ms"]
+    names = ("sense", "setup", "solve", "certify", "send", "tick")
+    found = {(row["name"], row["solver"], row["neighbours"]) for row in rows}
+    assert found >= {(name, solver, count) for name in names for solver in ("osqp", "daqp") for count in (0, 2)}
+    assert len(found) == len(rows)
+    assert not any(row["solver"] == "slsqp" for row in rows)
