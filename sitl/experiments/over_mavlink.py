@@ -56,7 +56,7 @@ def fly_over_mavlink(name: str, config: Config) -> Trace:
         of_ticks("setpoint_thrust_01") * PRESETS[config.sitl.preset].thrust_max_n,
         np.full((steps, agents, 3), np.nan),
         sum(int((rows["plan_status"] != PlanStatus.OK).sum()) for rows in ticks),
-        0,
+        None,
         tuple(Sphere(o.center_ned_m, o.radius_m, o.keep_out_m) for o in config.obstacles),
     )
 

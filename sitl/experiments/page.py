@@ -212,11 +212,15 @@ def _number(value: float | None) -> str:
     return f"{value:.4g}" if math.isfinite(value) else _NOT_A_NUMBER
 
 
+def _count(value: int | None) -> str:
+    return "-" if value is None else str(value)
+
+
 def _flights_table(flown: Mapping[Flight, Sequence[Trace]]) -> str:
     rows = "".join(
         f"<tr><td>{FLIGHTS[key]}</td><td>{html.escape(trace.name)}</td><td>{trace.path}</td>"
         f"<td class=n>{trace.pos_ned_m.shape[1]}</td><td class=n>{trace.t_s[-1] if len(trace.t_s) else 0:.1f}</td>"
-        f"<td class=n>{trace.failed}</td><td class=n>{trace.terminal_missed}</td></tr>"
+        f"<td class=n>{trace.failed}</td><td class=n>{_count(trace.terminal_missed)}</td></tr>"
         for key, traces in flown.items()
         for trace in traces
     )

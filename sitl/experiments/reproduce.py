@@ -10,10 +10,10 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import os
+import signal
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from pathlib import Path
 
 from rich.console import Console
@@ -33,7 +33,8 @@ from sitl.experiments.thesis import FULL_JOBS, PLANT_JOBS, Job
 from sitl.experiments.timing import timing_rows
 from sitl.experiments.trace import Row, Trace
 from swarmctl.config import load
-from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, ConfigError, SwarmError
+from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, ConfigError, StartError, SwarmError
+from swarmctl.lifeline import die_with_parent
 from swarmctl.shipped import shipped_config
 from swarmctl.telemetry.run_folder import create_run_folder
 
@@ -41,39 +42,42 @@ TIMING = "timing"  # what `--only` calls the rows that are no flight's
 
 
 def fly(job: Job) -> Trace:
-    """One flight; runs in a process of its own."""
+    """One flight."""
     config = load(shipped_config(job.config), job.overrides)
     if job.path == "plant":
         return fly_on_plant(job.name, config, matched_velocity=job.matched_velocity)
     return fly_over_mavlink(job.name, config)
 
 
+def fly_job(job: Job) -> tuple[Job, list[Trace], str]:
+    """What a worker does: the traces of a job (see `thesis.is_flown_again`), or why there is none."""
+    try:
+        traces = [fly(job)]
+        if thesis.is_flown_again(job):
+            traces.append(fly(thesis.wider(job, traces[0])))
+    except Exception as error:  # one flight's failure must not cost the others
+        return job, [], f"{type(error).__name__}: {error}"
+    return job, traces, ""
+
+
 def fly_all(jobs: Sequence[Job], processes: int, bar: Progress) -> tuple[dict[str, Trace], dict[str, str]]:
-    """Traces by job name, and what went wrong by job name. Swarm circles are flown again at their true distance."""
+    """Traces by name, and what went wrong by job name. Leaving early, by Ctrl-C too, ends the workers."""
     flown: dict[str, Trace] = {}
     failed: dict[str, str] = {}
-    again = [job for job in jobs if _flown_again(job)]
-    task = bar.add_task("flying", total=len(jobs) + len(again))
-    with ProcessPoolExecutor(processes, mp_context=multiprocessing.get_context("spawn")) as pool:
-        longest_first = sorted(jobs, key=lambda job: job.flight != "circle")
-        running: dict[Future[Trace], Job] = {pool.submit(fly, job): job for job in longest_first}
-        while running:
-            for future in wait(running, return_when=FIRST_COMPLETED).done:
-                job = running.pop(future)
-                bar.update(task, advance=1, description=job.name)
-                try:
-                    flown[job.name] = future.result()
-                except Exception as error:  # one flight's failure must not cost the others
-                    failed[job.name] = f"{type(error).__name__}: {error}"
-                    continue
-                if _flown_again(job):
-                    wider = thesis.wider(job, flown[job.name])
-                    running[pool.submit(fly, wider)] = wider
+    task = bar.add_task("flying", total=len(jobs))
+    longest_first = sorted(jobs, key=lambda job: job.flight != "circle")
+    with multiprocessing.get_context("spawn").Pool(processes, _prepare_worker) as pool:
+        for job, traces, why in pool.imap_unordered(fly_job, longest_first):
+            bar.update(task, advance=1, description=job.name)
+            flown.update({trace.name: trace for trace in traces})
+            if why:
+                failed[job.name] = why
     return flown, failed
 
 
-def _flown_again(job: Job) -> bool:
-    return job.path == "plant" and job.flight == "circle" and job.config == "thesis_5_circle" and "true" not in job.name
+def _prepare_worker() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
+    die_with_parent(signal.SIGKILL)
 
 
 def chosen(only: Sequence[str], plant: bool, full: bool) -> list[Job]:
@@ -147,6 +151,13 @@ def reproduce(only: Sequence[str], plant: bool, full: bool, directory: Path, pro
     return EXIT_MISSION if failed else EXIT_OK
 
 
+def _make(directory: Path) -> None:
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StartError(f"{directory} can't be made: {error}. Choose another with --out") from error
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="swarmctl reproduce", description=__doc__.splitlines()[0])
     parser.add_argument("--only", action="append", default=[], metavar="FLIGHT")
@@ -164,7 +175,8 @@ def main(arguments: list[str] | None = None) -> int:
         if options.jobs < 1:
             raise ConfigError("--jobs", [f"{options.jobs}: at least 1 process flies"])
         chosen(options.only, options.plant, options.full)
-        directory = create_run_folder(options.out, "reproduce", time.time_ns() // 1000)
+        directory = options.out or create_run_folder(None, "reproduce", time.time_ns() // 1000)
+        _make(directory)
         return reproduce(options.only, options.plant, options.full, directory, options.jobs)
     except SwarmError as error:
         print(error, file=sys.stderr)

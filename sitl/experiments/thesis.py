@@ -101,6 +101,11 @@ FULL_JOBS: tuple[Job, ...] = tuple(
 )
 
 
+def is_flown_again(job: Job) -> bool:
+    """Whether a second flight is asked for, at equal true distance: the thesis' own controller on its own path."""
+    return job.path == "plant" and job.config == "thesis_5_circle"
+
+
 def wider(job: Job, trace: Trace) -> Job:
     """The same swarm flight with the constraint radius widened by what its true distances fell short of it."""
     radius_m = _radius_m(job.name)
@@ -257,10 +262,13 @@ def _true_distance_rows(flown: Flown) -> Iterator[Row]:
 
 def _dmpc3_rows(flown: Flown) -> Iterator[Row]:
     """`dmpc3` over `dmpc` on every row they share: 1 and below is not worse."""
-    pairs = [
+    pairs: list[tuple[str, str, str, Callable[[Trace], float]]] = [
         (f"circle, {factor:g} x 0.3 m, index", radius_name("dmpc", factor), radius_name("dmpc3", factor), score.index_m)
         for factor in RADII
     ]
+    settled = _settled_over_least(RADII[0] * SAFE_RADIUS_M)
+    widest = radius_name("dmpc", RADII[0]), radius_name("dmpc3", RADII[0])
+    pairs.append((f"circle, {RADII[0]:g} x 0.3 m, index after 10 s", *widest, settled))
     pairs.append(("obstacle, index", "obstacle improved", "obstacle dmpc3", score.index_m))
     for name, one, other, figure in pairs:
         if one in flown and other in flown:

@@ -40,7 +40,7 @@ class Trace:
     thrust_n: Array  # (T, N)
     torque_n_m: Array  # (T, N, 3)
     failed: int  # plans that could not be flown
-    terminal_missed: int  # plans whose softened terminal condition was not met
+    terminal_missed: int | None  # plans whose terminal condition was not met; None where it was not recorded
     obstacles: tuple[Sphere, ...] = ()
 
 
