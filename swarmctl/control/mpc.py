@@ -39,9 +39,7 @@ class MpcParams(Params):
 
     dt_s: float = Field(0.02, gt=0.001, le=0.5)
     discretisation: Literal["zoh", "euler"] = "zoh"  # euler is the thesis' (3.6)
-    thrust_ahead: Literal["held", "planned"] = (
-        "planned"  # x-y predicted with f_t of now (thesis) or of the whole z plan
-    )
+    thrust_ahead: Literal["held", "planned"] = "held"  # x-y predicted with f_t of now (thesis) or of the z plan
     control_z: int = Field(3, ge=1, le=50)
     horizon_z: int = Field(40, ge=2, le=200)
     control_xy: int = Field(6, ge=1, le=50)  # and of dmpc3, for all three axes

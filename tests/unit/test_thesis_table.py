@@ -81,6 +81,7 @@ OBSTACLE: list[Wanted] = [
 ]
 BETTER: list[Wanted] = [
     *((f"circle, {radius} x 0.3 m, index, dmpc3 over dmpc", None, 1.0) for radius in RADII),
+    ("circle, 3 x 0.3 m, index after 10 s, dmpc3 over dmpc", None, 1.0),
     ("obstacle, index, dmpc3 over dmpc", None, 1.0),
 ]
 FULL: list[Wanted] = [
