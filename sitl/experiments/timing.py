@@ -24,12 +24,13 @@ def timing_rows(bar: Progress) -> list[Row]:
     assert fmincon is not None
     ms = "ms"
     kept = f"{fmincon.solved_01:.0%} of {found.problems} problems have a solution to it; the ratio is of those"
+    slower = f"{kept}; OSQP is first order and takes some 140 iterations, DAQP's active set a few"
     return [
         Row(f"{_PROBLEM}, OSQP, median", None, osqp.p50_ms, 0.5, "plant", ms),
         Row(f"{_PROBLEM}, OSQP, 99th percentile", None, osqp.p99_ms, 1.5, "plant", ms),
         Row(f"{_PROBLEM}, DAQP, median", None, daqp.p50_ms, None, "plant", ms),
         Row(f"{_PROBLEM}, SLSQP in place of fmincon, median", None, fmincon.times.p50_ms, None, "plant", ms, kept),
-        Row(f"{_PROBLEM}, OSQP over SLSQP", None, 1.0 / found.speed_up(), 1.0 / _FASTER, "plant", "1", kept),
+        Row(f"{_PROBLEM}, OSQP over SLSQP", None, 1.0 / found.speed_up(), 1.0 / _FASTER, "plant", "1", slower),
         Row(f"{_PROBLEM}, DAQP over SLSQP", None, 1.0 / found.speed_up("daqp"), 1.0 / _FASTER, "plant", "1", kept),
         Row("whole tick, 2 neighbours and 1 obstacle, median", None, found.tick.p50_ms, 1.5, "full", ms),
     ]

@@ -34,9 +34,14 @@ from swarmctl.table import AgentView
 
 pytestmark = pytest.mark.process
 
-LANDS_ON_SIGTERM = (
-    "import signal, sys, time; signal.signal(signal.SIGTERM, lambda *_: sys.exit(130)); print('up', flush=True); "
-)
+LANDS_ON_SIGTERM = """
+import signal, sys, time
+def land(*_):
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # a second one would kill an interpreter that is on its way out
+    sys.exit(130)
+signal.signal(signal.SIGTERM, land)
+print('up', flush=True)
+"""
 FLIES_LONG = LANDS_ON_SIGTERM + "time.sleep(60)"
 
 
