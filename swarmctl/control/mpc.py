@@ -35,7 +35,7 @@ class AxisWeights(Params):
 
 
 class MpcParams(Params):
-    """Horizons, weights and bounds; the defaults are the thesis' swarm flight (its section 4.3)."""
+    """Horizons, weights and bounds; the defaults are the thesis' swarm flight (its section 4.3) but for z's end."""
 
     dt_s: float = Field(0.02, gt=0.001, le=0.5)
     discretisation: Literal["zoh", "euler"] = "zoh"  # euler is the thesis' (3.6)
@@ -52,7 +52,7 @@ class MpcParams(Params):
     dthrust_max_m_s2: float = Field(5.0, gt=0, le=100)  # per step
     u_max: float = Field(0.2, gt=0, lt=1)  # sine of the tilt, each axis
     du_max: float = Field(0.05, gt=0, lt=1)  # per step
-    terminal_z: Terminal = "position_velocity"  # softened equality, or a region (see control.terminal)
+    terminal_z: Terminal = "region"  # thesis: an equality, which limit-cycles once a link delays it by half a tick
     terminal_xy: Terminal = "none"
     qp: QpParams = QpParams()
 

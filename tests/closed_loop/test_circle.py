@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from swarmctl.core.types import Landed, Mode, Phase, PlanStatus
 from tests.closed_loop.conftest import Flight, Fly
@@ -55,6 +56,18 @@ def test_control_without_the_observer_a_wrong_mass_does(fly: Fly) -> None:
     heavy = fly("sitl.mass_scale=1.25", "swarm.agents=1", "mission.duration_s=15", "agent.disturbance.enabled=false")
     ticks, error = heavy.tracked(0)
     assert np.abs(error[ticks["mission_t_s"] > 10, 2]).mean() > 0.05
+
+
+@pytest.mark.parametrize(("terminal", "calm"), [("region", True), ("position_velocity", False)])
+def test_thrust_stays_calm_with_half_a_tick_of_latency_but_not_under_the_equality(
+    fly: Fly, terminal: str, calm: bool
+) -> None:
+    late = ("sitl.link_latency_ms=10", f"controller.mpc.terminal_z={terminal}", "swarm.agents=2")
+    flight = fly("mission.duration_s=12", *late)
+    for agent in range(2):
+        ticks = flight.ticks(agent)
+        spread_01 = float(ticks["setpoint_thrust_01"][ticks["mission_t_s"] > 8.0].std())
+        assert spread_01 < 0.02 if calm else spread_01 > 0.1
 
 
 def test_without_peers_the_reference_is_met(fly: Fly) -> None:

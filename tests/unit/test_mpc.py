@@ -232,7 +232,7 @@ def test_times_are_measured_with_the_stopwatch_and_add_up() -> None:
 
 @pytest.mark.parametrize("horizon_z", [3, 40])
 def test_one_move_for_two_conditions_at_the_end_is_planned_and_not_an_exception(horizon_z: int) -> None:
-    plan = plan_to((0.0, 0.0, -0.1), control_z=1, horizon_z=horizon_z)
+    plan = plan_to((0.0, 0.0, -0.1), control_z=1, horizon_z=horizon_z, terminal_z="position_velocity")
     assert plan.status is PlanStatus.OK
     assert plan.terminal_gap_m > 0.0
 
