@@ -44,7 +44,7 @@ class MpcParams(Params):
     horizon_z: int = Field(40, ge=2, le=200)
     control_xy: int = Field(6, ge=1, le=50)  # and of dmpc3, for all three axes
     horizon_xy: int = Field(40, ge=2, le=200)
-    z: AxisWeights = AxisWeights(q_pos=2.0, q_vel=0.05, r=0.01)
+    z: AxisWeights = AxisWeights(q_pos=2.0, q_vel=0.05, r=1.0)  # thesis r 0.01: starves x-y of thrust in fast climbs
     x: AxisWeights = AxisWeights(q_pos=1.5, q_vel=0.5, r=0.01)
     y: AxisWeights = AxisWeights(q_pos=1.5, q_vel=0.5, r=0.01)
     thrust_min_m_s2: float = Field(0.0, ge=-20, le=9)  # thesis -20 (a rotor can't pull)

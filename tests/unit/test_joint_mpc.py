@@ -44,6 +44,7 @@ def problem(
 
 
 def joint(slots: int = 4, separation: SeparationParams | None = None, **params: Any) -> JointMpc:
+    params.setdefault("z", {"q_pos": 2.0, "q_vel": 0.05, "r": 0.01})  # as configs/improved_5_circle_dmpc3.toml
     return JointMpc(MpcParams(**params), separation or SeparationParams(), 0, slots, lambda: 0)
 
 

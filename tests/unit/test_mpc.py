@@ -133,7 +133,8 @@ def test_the_planned_path_is_the_motion_of_its_own_virtual_controls(ahead: str, 
 def test_only_a_thrust_that_changes_makes_held_and_planned_differ() -> None:
     level = [plan_to((0.5, 0.0, 0.0), thrust_ahead=ahead) for ahead in ("planned", "held")]
     np.testing.assert_allclose(level[0].pos_ned_m, level[1].pos_ned_m, atol=1e-3)
-    climbing = [plan_to((2.0, 0.0, -0.5), thrust_ahead=ahead) for ahead in ("planned", "held")]
+    brisk = {"q_pos": 2.0, "q_vel": 0.05, "r": 0.01}
+    climbing = [plan_to((2.0, 0.0, -0.5), thrust_ahead=ahead, z=brisk) for ahead in ("planned", "held")]
     assert np.abs(climbing[0].pos_ned_m - climbing[1].pos_ned_m).max() > 0.02
 
 
