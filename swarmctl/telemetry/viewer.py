@@ -22,7 +22,7 @@ from typing import Any
 import psutil
 
 from swarmctl.errors import EXIT_OK, EXIT_USAGE, StartError, SwarmError
-from swarmctl.lifeline import die_with_parent
+from swarmctl.lifeline import StopRequest, die_with_parent
 from swarmctl.telemetry.obstacles import MovingObstacle, read_obstacles
 from swarmctl.telemetry.recordings import APPLICATION, RECORDING, has_display, open_viewer
 
@@ -40,8 +40,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run until SIGTERM; returns the exit code."""
     options = _parser().parse_args(arguments)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    stop = threading.Event()
-    signal.signal(signal.SIGTERM, lambda *_: stop.set())
+    stop = StopRequest(signal.SIGTERM)
     if options.die_with_parent:
         die_with_parent(signal.SIGTERM)
     obstacles = read_obstacles(_listed(options.obstacles_json))
@@ -80,7 +79,7 @@ def _listed(text: str) -> object:
         return None
 
 
-def _run(options: argparse.Namespace, obstacles: list[MovingObstacle], stop: threading.Event) -> int:
+def _run(options: argparse.Namespace, obstacles: list[MovingObstacle], stop: StopRequest) -> int:
     from swarmctl.links.bus import ZenohBus
     from swarmctl.telemetry.feed import Feed, listens_to
     from swarmctl.telemetry.layout import Stage
@@ -112,7 +111,7 @@ class Pump:
         self._set_us = 0  # when the obstacles were set
         self._drawn_us: int | None = None
 
-    def run(self, period_s: float, stop: threading.Event) -> None:
+    def run(self, period_s: float, stop: StopRequest) -> None:
         """Until `stop`, and once more for what arrived meanwhile."""
         next_s = time.monotonic()
         next_plots_s = next_s
@@ -144,7 +143,7 @@ class Pump:
             self._drawn_us = self._newest_us
 
 
-def _interruptible(connect: Callable[[], Any], stop: threading.Event) -> Any:
+def _interruptible(connect: Callable[[], Any], stop: StopRequest) -> Any:
     """Result of a blocking connect, or None when `stop` comes first: native code sees no signals."""
     answer: list[Any] = []
 

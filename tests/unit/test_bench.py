@@ -191,14 +191,17 @@ def test_slsqp_costs_no_more_than_a_qp_answer_that_keeps_them_too(captured: Capt
     assert compared >= 20
 
 
-def test_finite_differences_give_the_same_answer_as_gradients(captured: Captured) -> None:
-    compared = 0
+def test_an_optimum_found_with_gradients_is_one_for_finite_differences_too(captured: Captured) -> None:
+    """Started at it: from anywhere else the two may end in different valleys, for the problem is not convex."""
+    dearer = []
     for nonlinear, moves, _ in nonlinear_series(captured, 20):
-        without, with_gradients = nonlinear.solve(moves), nonlinear.solve(moves, gradients=True)
-        if without.solved and with_gradients.solved:
-            assert without.cost == pytest.approx(with_gradients.cost, rel=1e-4)
-            compared += 1
-    assert compared >= 5
+        found = nonlinear.solve(moves, gradients=True)
+        again = nonlinear.solve(found.moves)
+        if found.solved and again.solved:
+            dearer.append(again.cost / found.cost - 1.0)
+    assert len(dearer) >= 5
+    assert max(dearer) < 1e-4
+    assert abs(float(np.median(dearer))) < 1e-6
 
 
 def test_an_answer_is_shifted_by_one_step(captured: Captured) -> None:
