@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 
-
 from swarmctl.lifeline import StopRequest
 
 # A signal at a random moment of `wait`, over and over. An Event hangs here within some dozen rounds.
