@@ -13,19 +13,39 @@ from typing import Protocol
 
 import numpy as np
 
-from sitl.vehicle import Array, Plant, Preset
+from sitl.airframes import Preset
+from sitl.rates import RateLoop
+from sitl.vehicle import Array
 from swarmctl.core.frames import euler_from_quat
 
 _TURN_RAD = 2.0 * math.pi
 
 
+class Sensed(Protocol):
+    """Attitude and rates of a batch, true (`Plant`) or as the autopilots believe (`Estimator`)."""
+
+    @property
+    def q_nb(self) -> Array:
+        """(4, N) wxyz."""
+
+    @property
+    def euler_rad(self) -> Array:
+        """(3, N) roll, pitch, yaw."""
+
+    @property
+    def rate_frd_rad_s(self) -> Array:
+        """(3, N)."""
+
+
 class AttitudeLoop(Protocol):
     """What flies the attitude setpoints of a batch."""
+
+    rates: RateLoop
 
     def set_reference(self, vehicle: int, q_nb: Array) -> None:
         """New setpoint of one vehicle, (4,) wxyz; it acts from the next step."""
 
-    def torque(self, plant: Plant, live: Array, out: Array) -> None:
+    def torque(self, sensed: Sensed, live: Array, out: Array) -> None:
         """Torques (3, N) [N m] into `out`; `live` (N,) is 1.0 for vehicles in free flight and 0.0 for idle ones."""
 
 
@@ -63,6 +83,8 @@ class ThesisAttitude:
         self._kd = np.array(gains.derivative).reshape(3, 1) / (self._window * dt_s)
         self._on_measurement = gains.on_measurement
         self._reference_rad = np.zeros((3, vehicles))
+        self._rate_gain = np.array(gains.derivative).reshape(3, 1)
+        self.rates = RateLoop(self._rate_gain, vehicles, dt_s)
         self._past = np.zeros((self._window, 3, vehicles))
         self._head = 0
         self._integral = np.zeros((3, vehicles))  # times kI already
@@ -72,16 +94,16 @@ class ThesisAttitude:
     def set_reference(self, vehicle: int, q_nb: Array) -> None:
         self._reference_rad[:, vehicle] = euler_from_quat(q_nb)
 
-    def torque(self, plant: Plant, live: Array, out: Array) -> None:
+    def torque(self, sensed: Sensed, live: Array, out: Array) -> None:
         error, term = self._error, self._term
-        np.subtract(self._reference_rad, plant.euler_rad, out=error)
+        np.subtract(self._reference_rad, sensed.euler_rad, out=error)
         np.multiply(error, 1.0 / _TURN_RAD, out=term)
         np.rint(term, out=term)
         term *= _TURN_RAD
         error -= term  # nearest turn
         error *= live
         past = self._past[self._head]
-        watched = np.remainder(-plant.euler_rad, _TURN_RAD) * live if self._on_measurement else error
+        watched = np.remainder(-sensed.euler_rad, _TURN_RAD) * live if self._on_measurement else error
         np.subtract(watched, past, out=term)
         if self._on_measurement:
             term -= np.rint(term / _TURN_RAD) * _TURN_RAD  # nearest turn
@@ -94,31 +116,63 @@ class ThesisAttitude:
         out += self._integral
         np.multiply(error, self._kp, out=term)
         out += term
+        if self.rates.feeding:
+            out += self._rate_gain * self.rates.feed_rad_s
         out *= live
+        self.rates.overrule(sensed.rate_frd_rad_s, live, out)
 
 
 @dataclass(frozen=True, slots=True)
 class CascadeGains:
-    """Fitted to the measured response of PX4 1.18 SIH: dead time, t63 and t90 of roll and yaw steps."""
+    """Of one airframe's loops; roll, pitch, yaw."""
 
-    attitude_1_s: tuple[float, float, float] = (4.0, 4.0, 2.2)
-    rate_1_s: tuple[float, float, float] = (14.0, 14.0, 3.5)  # angular acceleration over rate error
-    rate_integral_1_s2: tuple[float, float, float] = (2.0, 2.0, 0.5)
-    rate_derivative: tuple[float, float, float] = (0.1, 0.1, 0.0)
-    rate_limit_rad_s: tuple[float, float, float] = (3.84, 3.84, 3.49)  # MC_ROLLRATE_MAX 220, MC_YAWRATE_MAX 200 deg/s
-    delay_s: float = 0.052  # setpoint to first reaction of the loop
+    attitude_1_s: tuple[float, float, float]
+    rate_1_s: tuple[float, float, float]  # angular acceleration over rate error
+    rate_integral_1_s2: tuple[float, float, float]
+    rate_derivative: tuple[float, float, float]
+    rate_limit_rad_s: tuple[float, float, float]
+    delay_s: float  # setpoint to first reaction of the loop
+
+
+CASCADE_GAINS = {
+    "x500": CascadeGains(  # fitted to PX4 1.18 SIH: t10, t50, t63, t90, overshoot of roll, pitch and yaw steps
+        attitude_1_s=(4.02, 4.02, 3.0),
+        rate_1_s=(13.4, 13.4, 2.95),
+        rate_integral_1_s2=(0.41, 0.41, 0.1),
+        rate_derivative=(0.40, 0.40, 0.5),
+        rate_limit_rad_s=(3.84, 3.84, 3.49),  # MC_ROLLRATE_MAX 220, MC_YAWRATE_MAX 200 deg/s
+        delay_s=0.036,
+    ),
+    "crazyflie": CascadeGains(  # as fast as its rotors' lag allows without overshoot; no published step response
+        attitude_1_s=(7.0, 7.0, 4.0),
+        rate_1_s=(20.0, 20.0, 8.0),
+        rate_integral_1_s2=(2.0, 2.0, 0.5),
+        rate_derivative=(0.1, 0.1, 0.0),
+        rate_limit_rad_s=(5.0, 5.0, 3.5),
+        delay_s=0.008,  # radio to stabiliser
+    ),
+    "arducopter": CascadeGains(  # fitted to ArduCopter 4.6.3: t10, t50, t63, t90 of a roll step; yaw not measured
+        attitude_1_s=(5.3, 5.3, 4.0),
+        rate_1_s=(28.0, 28.0, 8.0),
+        rate_integral_1_s2=(0.4, 0.4, 0.1),
+        rate_derivative=(0.3, 0.3, 0.1),
+        rate_limit_rad_s=(6.0, 6.0, 3.0),
+        delay_s=0.028,
+    ),
+}
 
 
 class CascadeAttitude:
     """Quaternion P loop around a rate PID, behind a dead time: the x500's response with its motor lag."""
 
     def __init__(self, preset: Preset, vehicles: int, dt_s: float, gains: CascadeGains | None = None) -> None:
-        gains = gains or CascadeGains()
+        gains = gains or CASCADE_GAINS[preset.name]
         inertia = np.array(preset.inertia_kg_m2).reshape(3, 1)
         self._attitude = 2.0 * np.array(gains.attitude_1_s).reshape(3, 1)
         self._limit = np.array(gains.rate_limit_rad_s).reshape(3, 1)
         self._kp = inertia * np.array(gains.rate_1_s).reshape(3, 1)
         self._ki = inertia * np.array(gains.rate_integral_1_s2).reshape(3, 1) * dt_s
+        self.rates = RateLoop(self._kp, vehicles, dt_s)
         self._kd = inertia * np.array(gains.rate_derivative).reshape(3, 1) / dt_s
         self._reference = np.zeros((4, vehicles))
         self._reference[0] = 1.0
@@ -145,16 +199,18 @@ class CascadeAttitude:
     def set_reference(self, vehicle: int, q_nb: Array) -> None:
         self._reference[:, vehicle] = q_nb
 
-    def torque(self, plant: Plant, live: Array, out: Array) -> None:
+    def torque(self, sensed: Sensed, live: Array, out: Array) -> None:
         self._line[self._head] = self._reference
         self._head = (self._head + 1) % len(self._line)
-        np.multiply(plant.q_nb[:, None], self._line[self._head][None], out=self._products)
+        np.multiply(sensed.q_nb[:, None], self._line[self._head][None], out=self._products)
         np.matmul(self._error_rows, self._products.reshape(16, -1), out=self._error)
-        rate_error, term, rate = self._error[:3], self._term, plant.rate_frd_rad_s
+        rate_error, term, rate = self._error[:3], self._term, sensed.rate_frd_rad_s
         rate_error *= np.sign(self._error[3])
         rate_error *= self._attitude
         np.minimum(rate_error, self._limit, out=rate_error)
         np.maximum(rate_error, -self._limit, out=rate_error)
+        if self.rates.feeding:
+            rate_error += self.rates.feed_rad_s
         rate_error -= rate
         np.multiply(rate_error, self._ki, out=term)
         self._integral += term
@@ -166,6 +222,7 @@ class CascadeAttitude:
         term *= self._kd
         out += term
         out *= live
+        self.rates.overrule(rate, live, out)
 
 
 def attitude_loop(preset: Preset, vehicles: int, dt_s: float, gains: str = "swarm") -> AttitudeLoop:

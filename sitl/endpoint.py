@@ -1,33 +1,44 @@
-"""MAVLink face of one vehicle: frames in, commands and setpoints out, reports back. PX4's manners on its offboard link.
+"""MAVLink face of one vehicle on one link: frames in, setpoints and commands on, reports out. PX4's manners.
 
-It decides who is addressed, which command means what, and what is sent when; what happens then is the `Autopilot`'s.
+It decides who is addressed and what is sent when. What commands mean is `commands`', parameters and missions have
+modules of their own, and what happens then is the `Autopilot`'s.
 """
 
 from __future__ import annotations
 
-import math
+import struct
 from collections import Counter, deque
 from collections.abc import Callable
 from typing import Any
 
 from pymavlink.dialects.v20 import development as mav
 
-from sitl.autopilot import FORCE, Autopilot
-from sitl.modes import Px4Mode, Result, Severity
-from sitl.parameters import UnknownParameterError, WireValue, WrongTypeError
-from sitl.streams import STREAMS, Report, Schedule
-from swarmctl.links.mavlink import Codec, frames
+from sitl.autopilot import Autopilot
+from sitl.commands import Commands, Params
+from sitl.mission_link import MissionLink
+from sitl.modes import MODE_NAMES, STANDARD_MODES, Result, Severity
+from sitl.parameter_link import ParameterLink
+from sitl.schedule import OFFBOARD_HZ, Schedule
+from sitl.streams import LinkCounts, Report
+from sitl.streams_health import STREAMS
+from sitl.wire import KINDS, FrameWriter, Kind, frames
+from swarmctl.links.mavlink import Codec
 from swarmctl.links.transport import Transport
 
 COMPONENT = 1
 TYPE_GCS = 6
-CUSTOM_MODE_FLAG = 1
-PARAMS_PER_STEP = 4
 TEXT_CHARS = 50
 TEXT_MAX_AGE_US = 5_000_000
 TEXT_EVERY_US = 50_000
-PARAM_ERROR_UNKNOWN, PARAM_ERROR_TYPE = 1, 7
-Params = tuple[float, float, float, float, float, float, float]
+BOOT_COMMAND = 211  # PX4 acknowledges it unasked when it has started
+_ACK = KINDS[mav.MAVLINK_MSG_ID_COMMAND_ACK]
+_TEXT = KINDS[mav.MAVLINK_MSG_ID_STATUSTEXT]
+_TIMESYNC = KINDS[mav.MAVLINK_MSG_ID_TIMESYNC]
+_PING = KINDS[mav.MAVLINK_MSG_ID_PING]
+_INTERVAL = KINDS[mav.MAVLINK_MSG_ID_MESSAGE_INTERVAL]
+_AVAILABLE = KINDS[mav.MAVLINK_MSG_ID_AVAILABLE_MODES]
+_ORIGIN = mav.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
+_UNKNOWN_PLACE = 2**31 - 1  # of COMMAND_INT
 
 
 class Endpoint:
@@ -39,226 +50,245 @@ class Endpoint:
         autopilot: what obeys.
         report: makes a `Report` of this instant; called only when something is sent.
         step_us: physics step, the fastest message interval.
+        default_hz: what the link sends unasked.
     """
 
     def __init__(
-        self, sysid: int, transport: Transport, autopilot: Autopilot, report: Callable[[], Report], step_us: int
+        self,
+        sysid: int,
+        transport: Transport,
+        autopilot: Autopilot,
+        report: Callable[[], Report],
+        step_us: int,
+        default_hz: dict[int, float] | None = None,
     ) -> None:
         self.sysid = sysid
         self.transport = transport
         self.ignored: Counter[str] = Counter()
+        self.sender = (0, 0)  # of the message being handled
         self._autopilot = autopilot
         self._report = report
+        self._step_us = step_us
+        self._default_hz = OFFBOARD_HZ if default_hz is None else default_hz
         self._codec = Codec(sysid, COMPONENT)
-        self._schedule = Schedule(step_us)
-        self._contacted = self._gcs_heard = self._origin_sent = False
-        self._params: deque[int] = deque()
+        self._writer = FrameWriter(sysid, COMPONENT)
+        self._others: list[Endpoint] = []  # links of the same vehicle
+        self._handlers = self._handler_table()
+        self._begin()
+
+    def _begin(self) -> None:
+        """As after boot."""
+        self._schedule = Schedule(self._step_us, self._default_hz, self._autopilot.boot.quiet_us)
+        self._counts = LinkCounts()
+        self._gcs_heard = self._greeted = False
+        self._origin_sent: object = None
+        self._seen: set[tuple[int, int]] = set()
         self._texts: deque[tuple[int, Severity, str]] = deque()
-        self._text_id = 0
-        self._text_due_us = 0
-        self._now_us = 0
-        self._sender = (0, 0)
-        self._handlers: dict[int, Callable[[Any], None]] = {
+        self._text_id = self._text_due_us = self._now_us = 0
+        self._commands = Commands(self._autopilot, self)
+        self._parameters = ParameterLink(self._autopilot.parameters, self, self._tell_parameter)
+        self._missions = MissionLink(self._autopilot.store, self)
+
+    def join(self, other: Endpoint) -> None:
+        """Both are links of one vehicle."""
+        self._others.append(other)
+        other._others.append(self)
+
+    def reboot(self, now_us: int) -> None:
+        """The autopilot goes down and starts again, on all its links; `now_us` is on the simulation's clock."""
+        self._autopilot.reboot(now_us)
+        for endpoint in (self, *self._others):
+            endpoint._begin()
+
+    def receive(self, now_us: int, transport_now_us: int) -> None:
+        """Handle everything that has arrived; `now_us` is on the simulation's clock."""
+        arrived = self.transport.receive(transport_now_us)
+        if not arrived:
+            return
+        self._now_us = self._autopilot.boot.since_us(now_us)
+        if self._now_us < self._autopilot.boot.quiet_us:
+            return  # it is starting: nobody listens
+        for datagram in arrived:
+            self._counts.received_bytes += len(datagram.data)
+            for frame in frames(datagram.data):
+                self._on_frame(frame)
+
+    def send_due(self, now_us: int) -> None:
+        """Send what the schedule, running transfers, or pending texts ask for; `now_us` as in `receive`."""
+        pilot = self._autopilot
+        self._now_us = pilot.boot.since_us(now_us)
+        if self._now_us < pilot.boot.quiet_us:
+            return
+        if pilot.reboot_at_us is not None and self._now_us >= pilot.reboot_at_us:
+            self.reboot(now_us)
+            return
+        if not self._greeted:
+            self._greeted = True
+            self.send(_ACK, BOOT_COMMAND, Result.ACCEPTED, 0, 0, 0, 1)
+        due = self._schedule.take_due(self._now_us)
+        if pilot.ready(self._now_us) and self._origin_sent is not pilot.boot.origin:
+            self._origin_sent = pilot.boot.origin
+            due.append(_ORIGIN)
+        if due:
+            self._send_streams(due)
+        self._parameters.send_due(self._now_us)
+        self._missions.send_due(self._now_us)
+        self._send_reached()
+        if self._texts or pilot.texts:
+            self._send_texts()
+
+    # --- receiving ---
+
+    def _handler_table(self) -> dict[int, Callable[[Any], None]]:
+        return {
             mav.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET: self._on_attitude_target,
-            mav.MAVLINK_MSG_ID_HEARTBEAT: self._on_heartbeat,
             mav.MAVLINK_MSG_ID_COMMAND_LONG: self._on_command_long,
             mav.MAVLINK_MSG_ID_COMMAND_INT: self._on_command_int,
             mav.MAVLINK_MSG_ID_SET_MODE: self._on_set_mode,
             mav.MAVLINK_MSG_ID_TIMESYNC: self._on_timesync,
             mav.MAVLINK_MSG_ID_PING: self._on_ping,
-            mav.MAVLINK_MSG_ID_PARAM_REQUEST_LIST: self._on_param_list,
-            mav.MAVLINK_MSG_ID_PARAM_REQUEST_READ: self._on_param_read,
-            mav.MAVLINK_MSG_ID_PARAM_SET: self._on_param_set,
+            mav.MAVLINK_MSG_ID_PARAM_REQUEST_LIST: lambda m: self._parameters.list(self._now_us),
+            mav.MAVLINK_MSG_ID_PARAM_REQUEST_READ: lambda m: self._parameters.read(m),
+            mav.MAVLINK_MSG_ID_PARAM_SET: lambda m: self._parameters.write(m),
+            mav.MAVLINK_MSG_ID_MISSION_COUNT: lambda m: self._missions.count(m, self._now_us),
+            mav.MAVLINK_MSG_ID_MISSION_ITEM_INT: lambda m: self._missions.item(m, self._now_us),
+            mav.MAVLINK_MSG_ID_MISSION_ITEM: lambda m: self._missions.item(m, self._now_us),
+            mav.MAVLINK_MSG_ID_MISSION_REQUEST_LIST: lambda m: self._missions.list(m),
+            mav.MAVLINK_MSG_ID_MISSION_REQUEST_INT: lambda m: self._missions.request(m),
+            mav.MAVLINK_MSG_ID_MISSION_REQUEST: lambda m: self._missions.request(m),
+            mav.MAVLINK_MSG_ID_MISSION_CLEAR_ALL: lambda m: self._missions.clear(m),
+            mav.MAVLINK_MSG_ID_MISSION_SET_CURRENT: lambda m: self._missions.set_current(m),
         }
-        self._commands: dict[int, Callable[[Params], Result | None]] = {
-            mav.MAV_CMD_COMPONENT_ARM_DISARM: self._arm_disarm,
-            mav.MAV_CMD_DO_SET_MODE: self._set_mode,
-            mav.MAV_CMD_NAV_TAKEOFF: self._takeoff,
-            mav.MAV_CMD_NAV_LAND: lambda _: self._autopilot.set_mode(Px4Mode.AUTO_LAND, self._now_us),
-            mav.MAV_CMD_NAV_RETURN_TO_LAUNCH: lambda _: self._autopilot.set_mode(Px4Mode.AUTO_RTL, self._now_us),
-            mav.MAV_CMD_DO_FLIGHTTERMINATION: self._terminate,
-            mav.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_interval,
-            mav.MAV_CMD_REQUEST_MESSAGE: self._request_message,
-        }
-
-    def receive(self, now_us: int, transport_now_us: int) -> None:
-        """Handle everything that has arrived; `now_us` is time since boot."""
-        self._now_us = now_us
-        for datagram in self.transport.receive(transport_now_us):
-            for frame in frames(datagram.data):
-                self._on_frame(frame)
-
-    def send_due(self, now_us: int) -> None:
-        """Send what the schedule, a parameter list, or pending texts ask for."""
-        self._now_us = now_us
-        due = self._schedule.take_due(now_us)
-        ready = self._autopilot.ready(now_us)
-        if ready and not self._origin_sent:
-            self._origin_sent = True
-            due.append(mav.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
-        if due:
-            report = self._report()
-            for message in due:
-                stream = STREAMS[message]
-                if ready or not stream.needs_position:
-                    self._send(stream.build(report))
-        if self._params:
-            for _ in range(min(PARAMS_PER_STEP, len(self._params))):
-                self._send_param(self._autopilot.parameters.by_index(self._params.popleft()))
-        if self._texts or self._autopilot.texts:
-            self._send_texts()
-
-    # --- receiving ---
 
     def _on_frame(self, frame: bytes) -> None:
         message = self._codec.decode(frame)
         if message is None:
             self.ignored["not_decoded"] += 1
+            self._counts.not_decoded += 1
+            return
+        self._counts.received += 1
+        self.sender = message.get_srcSystem(), message.get_srcComponent()
+        if message.get_msgId() == mav.MAVLINK_MSG_ID_HEARTBEAT:
+            self._on_heartbeat(message, frame)
             return
         handler = self._handlers.get(message.get_msgId())
         if handler is None:
             return
-        target = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
-        if target[0] not in (0, self.sysid) or target[1] not in (0, COMPONENT):
-            if handler != self._on_ping:
+        if message.get_msgId() != mav.MAVLINK_MSG_ID_PING:
+            system, component = getattr(message, "target_system", 0), getattr(message, "target_component", 0)
+            if system not in (0, self.sysid) or component not in (0, COMPONENT):
                 self.ignored["not_addressed"] += 1
-            return
-        self._sender = message.get_srcSystem(), message.get_srcComponent()
+                return
+        self._seen.add(self.sender)
         handler(message)
-        if not self._contacted:
-            self._contacted = True
-            self._send_stream(mav.MAVLINK_MSG_ID_HEARTBEAT)
 
-    def _on_heartbeat(self, message: Any) -> None:
-        self._gcs_heard = self._gcs_heard or message.type == TYPE_GCS
+    def _on_heartbeat(self, message: Any, frame: bytes) -> None:
+        if self.sender == (self.sysid, COMPONENT):
+            return  # our own, echoed
+        self._seen.add(self.sender)
+        if message.type == TYPE_GCS:
+            self._gcs_heard = True
+            self._autopilot.watch.on_gcs_heartbeat(self._now_us)
+        for other in self._others:
+            other.transport.send(frame)
 
-    def _on_attitude_target(self, message: Any) -> None:
-        self._autopilot.on_setpoint(message.type_mask, message.q, message.thrust, self._now_us)
+    def _on_attitude_target(self, m: Any) -> None:
+        rates = m.body_roll_rate, m.body_pitch_rate, m.body_yaw_rate
+        self._autopilot.on_setpoint(m.type_mask, m.q, rates, m.thrust, self._now_us)
 
     def _on_timesync(self, message: Any) -> None:
         if message.tc1 == 0:
-            self._send(mav.MAVLink_timesync_message(self._now_us * 1000, message.ts1))
+            self.send(_TIMESYNC, self._now_us * 1000, message.ts1)
 
     def _on_ping(self, message: Any) -> None:
-        if message.target_system == 0:
-            self._send(mav.MAVLink_ping_message(message.time_usec, message.seq, *self._sender))
+        if message.target_system == 0 and message.target_component == 0:
+            self.send(_PING, message.time_usec, message.seq, *self.sender)
 
     # --- commands ---
 
     def _on_command_long(self, m: Any) -> None:
         params = (m.param1, m.param2, m.param3, m.param4, m.param5, m.param6, m.param7)
-        self._acknowledge(m.command, self._run(m.command, params))
+        self._acknowledge(m.command, self._commands.run(m.command, params, self._now_us))
 
     def _on_command_int(self, m: Any) -> None:
-        params = (m.param1, m.param2, m.param3, m.param4, m.x / 1e7, m.y / 1e7, m.z)
-        self._acknowledge(m.command, self._run(m.command, params))
+        known = not (m.x == _UNKNOWN_PLACE and m.y == _UNKNOWN_PLACE)
+        place = (m.x / 1e7, m.y / 1e7) if known else (float("nan"), float("nan"))
+        params: Params = (m.param1, m.param2, m.param3, m.param4, *place, m.z)
+        self._acknowledge(m.command, self._commands.run(m.command, params, self._now_us))
 
     def _on_set_mode(self, m: Any) -> None:
-        main, sub = m.custom_mode >> 16 & 0xFF, m.custom_mode >> 24 & 0xFF
-        params = (float(m.base_mode), float(main), float(sub), 0.0, 0.0, 0.0, 0.0)
-        self._acknowledge(mav.MAV_CMD_DO_SET_MODE, self._run(mav.MAV_CMD_DO_SET_MODE, params))
-
-    def _run(self, command: int, params: Params) -> Result | None:
-        action = self._commands.get(command)
-        if action is None:
-            return Result.UNSUPPORTED
-        if self._autopilot.terminated and command not in (
-            mav.MAV_CMD_SET_MESSAGE_INTERVAL,
-            mav.MAV_CMD_REQUEST_MESSAGE,
-        ):
-            return Result.TEMPORARILY_REJECTED
-        return action(params)
+        result = self._commands.set_mode(m.base_mode, m.custom_mode, self._now_us)
+        self._acknowledge(mav.MAV_CMD_DO_SET_MODE, result)
 
     def _acknowledge(self, command: int, result: Result | None) -> None:
-        if result is not None:
-            self._send(mav.MAVLink_command_ack_message(command, result, 0, 0, *self._sender))
+        """To the sender, on every link it has been heard on."""
+        if result is None:
+            return
+        for link in (self, *(o for o in self._others if self.sender in o._seen)):
+            link.send(_ACK, command, result, 0, 0, *self.sender)
 
-    def _arm_disarm(self, params: Params) -> Result | None:
-        if params[0] == 1.0:
-            return self._autopilot.arm(self._now_us)
-        if params[0] == 0.0:
-            return self._autopilot.disarm(force=params[1] == FORCE)
-        self._autopilot.texts.append((Severity.CRITICAL, f"Unsupported ARM_DISARM param: {params[0]:.3f}"))
-        return None
-
-    def _set_mode(self, params: Params) -> Result:
-        base, main, sub = (_whole(p) for p in params[:3])
-        if base is None or main is None or not base & CUSTOM_MODE_FLAG:
-            return Result.TEMPORARILY_REJECTED
-        try:
-            mode = Px4Mode(main << 16 | (sub or 0) << 24 if main == 4 else main << 16)
-        except ValueError:
-            return Result.TEMPORARILY_REJECTED
-        return self._autopilot.set_mode(mode, self._now_us)
-
-    def _takeoff(self, params: Params) -> Result:
-        alt_amsl_m = params[6] if math.isfinite(params[6]) else None
-        return self._autopilot.set_mode(Px4Mode.AUTO_TAKEOFF, self._now_us, alt_amsl_m)
-
-    def _terminate(self, params: Params) -> Result:
-        return self._autopilot.terminate() if params[0] > 0.5 else Result.ACCEPTED
-
-    def _set_interval(self, params: Params) -> Result:
-        message, interval_us = _whole(params[0]), _whole(params[1])
-        if message not in STREAMS or message is None or interval_us is None:
-            return Result.FAILED
+    def set_interval(self, message: int, interval_us: int) -> bool:
+        """SET_MESSAGE_INTERVAL; False: no such message."""
+        if message not in STREAMS:
+            return False
         self._schedule.set_interval(message, interval_us, self._now_us)
-        return Result.ACCEPTED
+        return True
 
-    def _request_message(self, params: Params) -> Result:
-        message = _whole(params[0])
-        if message is None:
-            return Result.DENIED
+    def request(self, message: int, argument: float) -> None:
+        """REQUEST_MESSAGE; what does not exist is not sent."""
         if message in STREAMS:
-            self._send_stream(message)
-        return Result.ACCEPTED  # PX4 accepts ids it never sends, too
+            self._send_streams([message])
+        elif message == mav.MAVLINK_MSG_ID_MESSAGE_INTERVAL and 0 <= argument <= 0xFFFF:
+            wanted = int(argument)
+            self.send(_INTERVAL, self._schedule.interval_us(wanted) if wanted in STREAMS else 0, wanted)
+        elif message == mav.MAVLINK_MSG_ID_AVAILABLE_MODES:
+            self._send_available_modes(argument)
 
-    # --- parameters ---
-
-    def _on_param_list(self, _: Any) -> None:
-        self._params = deque(range(len(self._autopilot.parameters)))
-
-    def _on_param_read(self, message: Any) -> None:
-        table = self._autopilot.parameters
-        try:
-            found = table.by_index(message.param_index) if message.param_index >= 0 else table.by_name(message.param_id)
-        except UnknownParameterError:
-            self._send_param_error(message.param_id, PARAM_ERROR_UNKNOWN)
-        else:
-            self._send_param(found)
-
-    def _on_param_set(self, message: Any) -> None:
-        try:
-            stored = self._autopilot.parameters.set_from_wire(message.param_id, message.param_value, message.param_type)
-        except UnknownParameterError:
-            self._send_param_error(message.param_id, PARAM_ERROR_UNKNOWN)
-        except WrongTypeError:
-            self._send_param_error(message.param_id, PARAM_ERROR_TYPE)
-        else:
-            self._send_param(stored)
-
-    def _send_param(self, p: WireValue) -> None:
-        count = len(self._autopilot.parameters)
-        self._send(mav.MAVLink_param_value_message(p.name.encode(), p.value, p.kind, count, p.index))
-
-    def _send_param_error(self, name: str, error: int) -> None:
-        raw = name.encode("ascii", "replace")[:16]
-        self._send(mav.MAVLink_param_error_message(*self._sender, raw, -1, error))
+    def _send_available_modes(self, argument: float) -> None:
+        """All modes, or the one with that index, from 1 on."""
+        for index, (mode, name) in enumerate(MODE_NAMES.items(), 1):
+            if argument in (0.0, float(index)):
+                standard = STANDARD_MODES.get(mode, 0)
+                self.send(_AVAILABLE, mode, 0, len(MODE_NAMES), index, standard, name.encode())
 
     # --- sending ---
 
-    def _send(self, message: Any) -> None:
-        self.transport.send(self._codec.encode(message))
+    def send(self, kind: Kind, *fields: Any) -> None:
+        """One message from its fields in wire order."""
+        try:
+            frame = self._writer.frame(kind, fields)
+        except struct.error:
+            self.ignored[f"not_sent {kind.name}"] += 1  # a number no field holds: never stop the flight for it
+            return
+        self._counts.sent += 1
+        self._counts.sent_bytes += len(frame)
+        self.transport.send(frame)
 
-    def _send_stream(self, message: int) -> None:
-        stream = STREAMS[message]
-        if self._autopilot.ready(self._now_us) or not stream.needs_position:
-            self._send(stream.build(self._report()))
+    def _send_streams(self, messages: list[int]) -> None:
+        report = self._report()
+        report.counts = self._counts
+        placed = self._autopilot.has_position and self._autopilot.ready(self._now_us)
+        for message in messages:
+            stream = STREAMS[message]
+            if placed or not stream.needs_position:
+                self.send(KINDS[message], *stream.build(report))
+
+    def _send_reached(self) -> None:
+        reached = self._autopilot.flight.reached
+        for seq in reached:
+            for link in (self, *self._others):
+                link._missions.reached(seq)
+        reached.clear()
+
+    def _tell_parameter(self, value: Any) -> None:
+        for other in self._others:
+            other._parameters.send(value)
 
     def _send_texts(self) -> None:
         """PX4 tells only links with a ground station (HEARTBEAT type 6), at most 20/s, nothing older than 5 s."""
         for severity, text in self._autopilot.texts:
-            self._texts.append((self._now_us, severity, text))
+            for link in (self, *self._others):
+                link._texts.append((self._now_us, severity, text))
         self._autopilot.texts.clear()
         while self._texts and self._now_us - self._texts[0][0] > TEXT_MAX_AGE_US:
             self._texts.popleft()
@@ -270,9 +300,4 @@ class Endpoint:
         raw = text.encode("ascii", "replace")
         chunks = [raw[i : i + TEXT_CHARS] for i in range(0, len(raw), TEXT_CHARS)]
         for number, chunk in enumerate(chunks):
-            self._send(mav.MAVLink_statustext_message(severity, chunk, self._text_id if len(chunks) > 1 else 0, number))
-
-
-def _whole(value: float) -> int | None:
-    """Integer of a command parameter; None for NaN and infinities."""
-    return int(value) if math.isfinite(value) else None
+            self.send(_TEXT, severity, chunk, self._text_id, number)

@@ -24,7 +24,7 @@ from swarmctl.core.clock import SimClock
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE, tick_row
 from swarmctl.core.types import TickRecord
 from swarmctl.links import topics
-from swarmctl.links.autopilot import PX4, Autopilot
+from swarmctl.links.autopilot import Autopilot
 from swarmctl.links.commands import CodecCommands
 from swarmctl.links.mavlink import Codec
 from swarmctl.links.peers import LocalHub, agent_name
@@ -72,8 +72,7 @@ class FlightLog:
             return
         self._tlog.close()
         (self.directory / f"agent-{self.agent}.ticks").write_bytes(self.ticks.tobytes())
-        lines = b"".join(msgspec.json.encode(event) + b"\n" for event in self.events)
-        (self.directory / f"agent-{self.agent}.events.jsonl").write_bytes(lines)
+        write_events(self.directory / f"agent-{self.agent}.events.jsonl", self.events)
 
 
 class Lockstep:
@@ -98,6 +97,8 @@ class Lockstep:
         self.world = SitlWorld(sitl_params(config), [vehicle for _, vehicle in self.links])
         self.hub = LocalHub(self.clock.now_us, config.seed, round(config.bus.delay_ms * 1000), config.bus.loss_01)
         self.logs = [FlightLog(directory, i, self.clock) for i in range(agents)]
+        self.fault_events: list[dict[str, Any]] = []
+        self.world.faults.on_event = self._on_fault
         self._operator = self.hub.attach(topics.OPERATOR)
         self.agents: list[Agent | None] = [self._agent(i, self.links[i][0]) for i in range(agents)]
         self.frozen: set[int] = set()  # agents whose process is stopped: alive on the bus, but not ticking
@@ -105,13 +106,17 @@ class Lockstep:
         self._truth: list[NDArray[np.void]] = []
         self._obstacles = obstacles_message(config)
 
+    def _on_fault(self, name: str, t_us: int, fields: dict[str, Any]) -> None:
+        stamp = {"utc_us": self.clock.utc_us(), "t_us": self.clock.now_us(), "source": "sitl", "event": name}
+        self.fault_events.append({**stamp, "since_boot_us": t_us, **fields})
+
     def _agent(self, index: int, transport: Any) -> Agent:
         log = self.logs[index]
         bus = self.hub.attach(agent_name(index))
 
         def slow_path(autopilot: Autopilot, codec: Codec) -> CodecCommands:
             sysid = self.config.sysids()[index]
-            return CodecCommands(autopilot.send_frame, codec, sysid, PX4.external, PX4.hold)
+            return CodecCommands(autopilot.send_frame, codec, sysid, lambda: autopilot.dialect)
 
         boot_id = self.config.seed * 1000 + index
         return make_agent(
@@ -171,6 +176,11 @@ class Lockstep:
                 on_step(self)
 
 
+def write_events(path: Path, events: Sequence[dict[str, Any]]) -> None:
+    """One JSON object a line, as live processes log them."""
+    path.write_bytes(b"".join(msgspec.json.encode(event) + b"\n" for event in events))
+
+
 def sitl_params(config: Config) -> SitlParams:
     """The simulator of a configuration."""
     spawn = np.array(config.starts_ned_m())
@@ -188,6 +198,10 @@ def sitl_params(config: Config) -> SitlParams:
         physics_hz=config.sitl.physics_hz,
         mass_scale=config.sitl.mass_scale,
         start=config.sitl.start,
+        estimator=config.sitl.estimator,
+        autopilot_kind=config.sitl.autopilot_kind,
+        reject_bad_setpoints=config.sitl.reject_bad_setpoints,
+        realism=config.sitl.realism(),
     )
 
 

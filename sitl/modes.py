@@ -27,15 +27,23 @@ class Px4Mode(enum.IntEnum):
     STABILIZED = _main(7)
 
 
-NEEDS_PILOT = {  # and the name PX4 refuses them by
+MODE_NAMES = {  # as PX4 refuses them
     Px4Mode.MANUAL: "Manual",
     Px4Mode.ALTCTL: "Altitude",
     Px4Mode.POSCTL: "Position",
     Px4Mode.ACRO: "Acro",
     Px4Mode.STABILIZED: "Stabilized",
+    Px4Mode.OFFBOARD: "Offboard",
+    Px4Mode.AUTO_TAKEOFF: "Takeoff",
+    Px4Mode.AUTO_LOITER: "Hold",
+    Px4Mode.AUTO_MISSION: "Mission",
+    Px4Mode.AUTO_RTL: "Return",
+    Px4Mode.AUTO_LAND: "Land",
 }
-NO_ARMING_IN = frozenset({Px4Mode.AUTO_RTL, Px4Mode.AUTO_LAND, Px4Mode.AUTO_MISSION, *NEEDS_PILOT})
+NEEDS_PILOT = frozenset({Px4Mode.MANUAL, Px4Mode.ALTCTL, Px4Mode.POSCTL, Px4Mode.ACRO, Px4Mode.STABILIZED})
+NO_ARMING_IN = frozenset({Px4Mode.AUTO_RTL, Px4Mode.AUTO_LAND, *NEEDS_PILOT})
 NOT_KEPT_AFTER_LANDING = frozenset({Px4Mode.AUTO_TAKEOFF, Px4Mode.AUTO_LAND, Px4Mode.AUTO_RTL})
+FLIES_BLIND = frozenset({Px4Mode.OFFBOARD, Px4Mode.AUTO_LAND})  # without a position; LAND then only descends
 
 FLIGHT_MODES = {
     Px4Mode.AUTO_TAKEOFF: FlightMode.TAKEOFF,
@@ -44,6 +52,14 @@ FLIGHT_MODES = {
     Px4Mode.AUTO_RTL: FlightMode.RTL,
     Px4Mode.AUTO_LAND: FlightMode.LAND,
     Px4Mode.OFFBOARD: FlightMode.EXTERNAL,
+}
+STANDARD_MODES = {  # MAV_STANDARD_MODE of CURRENT_MODE
+    Px4Mode.POSCTL: 1,
+    Px4Mode.ALTCTL: 4,
+    Px4Mode.AUTO_RTL: 5,
+    Px4Mode.AUTO_MISSION: 6,
+    Px4Mode.AUTO_LAND: 7,
+    Px4Mode.AUTO_TAKEOFF: 8,
 }
 
 BASE_ARMED = 128
@@ -90,9 +106,20 @@ class Result(enum.IntEnum):
 class Severity(enum.IntEnum):
     """MAV_SEVERITY."""
 
+    EMERGENCY = 0
     CRITICAL = 2
     WARNING = 4
     INFO = 6
+
+
+class MissionState(enum.IntEnum):
+    """MISSION_STATE of MISSION_CURRENT."""
+
+    NO_MISSION = 1
+    NOT_STARTED = 2
+    ACTIVE = 3
+    PAUSED = 4
+    COMPLETE = 5
 
 
 class OffboardLoss(enum.IntEnum):

@@ -1,11 +1,14 @@
 """Flies a `SitlWorld` against the wall clock: absolute deadlines, bounded catch-up, a truth file, a clean end.
 
 Short of CPU it first catches up step by step; after a stall longer than `STALL_US` the missed steps are given up, so
-that vehicles stand still for that time while their clocks go on, and clients keep a constant clock offset.
+that vehicles stand still for that time while their clocks go on, and clients keep a constant clock offset. Simulated
+time may run faster than the wall clock, and with a gate it waits for its clients instead of leaving them behind.
 """
 
 from __future__ import annotations
 
+import contextlib
+import json
 import signal
 import socket
 import time
@@ -13,8 +16,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
-from typing import BinaryIO
+from typing import Any, BinaryIO
 
+from sitl.control import ControlSocket
 from sitl.world import SitlWorld
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.links.transport import bind_udp
@@ -24,6 +28,10 @@ STALL_US = 200_000
 TRUTH_US = 20_000
 FLUSH_US = 500_000
 MAX_PORT = 65535
+CONTROL_US = 100_000
+GATE_US = 20_000
+GATE_PATIENCE_US = 1_000_000
+_GATE_POLL_S = 1e-4
 
 
 @dataclass
@@ -89,27 +97,96 @@ def monotonic_us() -> int:
     return time.monotonic_ns() // 1000
 
 
-def fly(world: SitlWorld, stop: StopRequest, truth: TruthFile | None) -> Tally:
-    """Step the world at its physics rate until `stop`."""
+class EventFile:
+    """Faults as they begin and end, one JSON object a line; a full disk loses events, never the flight."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def write(self, name: str, since_boot_us: int, fields: dict[str, Any]) -> None:
+        """Append one."""
+        stamp = {"utc_us": time.time_ns() // 1000, "t_us": monotonic_us(), "source": "sitl", "event": name}
+        with contextlib.suppress(OSError), self._path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps({**stamp, "since_boot_us": since_boot_us, **fields}) + "\n")
+
+
+class Gate:
+    """Holds the physics every `GATE_US` until each vehicle in OFFBOARD has got a new setpoint.
+
+    A vehicle whose client says nothing for a second of wall time is not waited for until the client speaks again, so
+    that the autopilot can notice the loss.
+    """
+
+    def __init__(self, world: SitlWorld) -> None:
+        self._world = world
+        self._seen = world.setpoint_counts()
+        self._given_up: set[int] = set()
+
+    def wait(self, stop: StopRequest, now_us: int) -> None:
+        """Return when all have spoken."""
+        deadline_us = monotonic_us() + GATE_PATIENCE_US
+        while not stop.wanted:
+            counts = self._world.setpoint_counts()
+            fresh = {i for i, count in enumerate(counts) if count > self._seen[i]}
+            self._given_up -= fresh
+            missing = self._world.offboard_vehicles() - fresh - self._given_up
+            if missing and monotonic_us() >= deadline_us:
+                self._given_up |= missing
+                missing = set()
+            if not missing:
+                self._seen = counts
+                return
+            time.sleep(_GATE_POLL_S)
+            self._world.receive(now_us)
+
+
+def fly(
+    world: SitlWorld,
+    stop: StopRequest,
+    truth: TruthFile | None,
+    *,
+    speed: float = 1.0,
+    control: ControlSocket | None = None,
+    gate: Gate | None = None,
+) -> Tally:
+    """Step the world at its physics rate until `stop`.
+
+    Args:
+        world: what to step.
+        stop: ends the flight.
+        truth: where true states go.
+        speed: simulated over wall time; with a gate, at most.
+        control: asked for faults ten times a second.
+        gate: makes the physics wait for its clients; time spent so is given up, on both clocks.
+    """
     tally = Tally()
     period_us = 1e6 / world.params.physics_hz
-    start_us, count = monotonic_us(), 0
+    gate_every, control_every = round(GATE_US / period_us), max(1, round(CONTROL_US * speed / period_us))
+    start_us = sim_start_us = monotonic_us()
+    count = 0
     while not stop.wanted:
-        due_us = start_us + round(count * period_us)
-        behind_us = monotonic_us() - due_us
+        sim_us = sim_start_us + round(count * period_us)
+        behind_us = monotonic_us() - (start_us + round(count * period_us / speed))
         if behind_us < 0:
             time.sleep(-behind_us * 1e-6)
             continue
         if behind_us > STALL_US:
             tally.stalls += 1
-            tally.lost_us += behind_us
+            tally.lost_us += round(behind_us * speed)
             start_us += behind_us
-            due_us += behind_us
-        elif behind_us > period_us:
+            sim_start_us += round(behind_us * speed)
+            sim_us += round(behind_us * speed)
+        elif behind_us * speed > period_us:
             tally.late += 1
-        world.step(due_us)
+        if gate is not None and count % gate_every == 0:
+            waited_us = -monotonic_us()
+            gate.wait(stop, sim_us)
+            start_us += waited_us + monotonic_us()
+        if control is not None and count % control_every == 0:
+            control.poll(world)
+        world.step(sim_us)
         if truth is not None:
-            truth.record(world, due_us)
+            truth.record(world, sim_us)
         count += 1
     tally.steps = count
     return tally

@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pymap3d
 
-from sitl.vehicle import Array, Plant
+from sitl.vehicle import Array
 from swarmctl.core.types import GeoOrigin
 
 _SEMI_MAJOR_M = 6378137.0
@@ -57,6 +58,17 @@ def local_origin(spawn_ned_m: Array, shared: GeoOrigin) -> LocalOrigin:
     )
 
 
+class Power(NamedTuple):
+    """What the autopilot's power module measures."""
+
+    charge_01: float
+    volts: float
+    amperes: float  # negative: not measured
+
+
+FULL = Power(1.0, 16.2, -1.0)  # as PX4's SIH reports its simulated pack
+
+
 @dataclass(frozen=True, slots=True)
 class Estimate:
     """State of one vehicle as its autopilot knows it, local NED."""
@@ -69,22 +81,10 @@ class Estimate:
     rate_frd_rad_s: tuple[float, float, float]
     down_axis_ned: tuple[float, float, float]  # body down axis
     on_ground: bool
+    pos_accuracy_m: tuple[float, float] = (0.01, 0.01)  # 1 sigma as the autopilot knows it: horizontal, vertical
+    gps_ok: bool = True
+    battery: Power = FULL
 
     @property
     def yaw_rad(self) -> float:
         return self.euler_rad[2]
-
-
-def estimate_of(plant: Plant, vehicle: int, t_us: int) -> Estimate:
-    """Exact state of one vehicle; noise and bias belong here when they come."""
-    column = plant.state[:, vehicle].tolist()
-    return Estimate(
-        t_us,
-        tuple(column[10:13]),
-        tuple(plant.vel_ned_m_s[:, vehicle].tolist()),
-        tuple(column[0:4]),
-        tuple(plant.euler_rad[:, vehicle].tolist()),
-        tuple(column[4:7]),
-        tuple(plant.rotation[2::3, vehicle].tolist()),
-        bool(plant.contact[vehicle]),
-    )

@@ -15,7 +15,7 @@ from typing import Any
 
 from rich.progress import Progress
 
-from sitl.lockstep import Lockstep
+from sitl.lockstep import Lockstep, write_events
 from swarmctl.config import Config, dump, load
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, SwarmError
 from swarmctl.summary import summary_lines
@@ -45,6 +45,8 @@ def simulate(config: Config, directory: Path) -> int:
     flight.truth.tofile(directory / "truth.bin")
     for log in flight.logs:
         log.close()
+    if flight.fault_events:
+        write_events(directory / "sitl.events.jsonl", flight.fault_events)
     speed_factor = flight.clock.now_us() * 1e-6 / wall_s
     shown = () if stop.count else tuple(problems)
     rules = config.rules("lockstep")

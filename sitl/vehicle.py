@@ -11,11 +11,11 @@ Arrays are (rows, N), one column a vehicle. This module knows no controller, no 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sitl.airframes import Preset
 from swarmctl.core.frames import GRAVITY_M_S2
 
 Array = NDArray[np.float64]
@@ -24,60 +24,6 @@ Mask = NDArray[np.bool_]
 RATE_LIMIT_RAD_S = 60.0  # a tumbling vehicle stays finite under an explicit integrator; no controlled flight comes near
 GROUND_FRICTION = 0.8  # of the weight; a vehicle that touches down at 1 m/s slides 6 cm
 
-
-@dataclass(frozen=True, slots=True)
-class Preset:
-    """Airframe numbers, nominal mass."""
-
-    name: str
-    mass_kg: float
-    inertia_kg_m2: tuple[float, float, float]
-    arm_m: float
-    rotor_force_max_n: float  # each of four
-    yaw_per_force_m: float  # d / b of the thesis: yaw torque of a rotor over its force
-    thrust_coeff_n_s2: float  # b: rotor force over W^2
-    rotor_inertia_kg_m2: float  # Jr
-    drag_rotation_1_s: tuple[float, float, float]  # kp, kq, kr
-    drag_n_s_m: tuple[float, float, float]  # ku, kv, kw times the nominal mass, body axes
-    drag_scales_with_mass: bool  # thesis: an acceleration whatever the mass; SIH: a force
-    motor_tau_s: float  # 0: rotors follow at once
-
-    @property
-    def thrust_max_n(self) -> float:
-        """Collective thrust of setpoint 1.0."""
-        return 4.0 * self.rotor_force_max_n
-
-
-PRESETS = {
-    "thesis": Preset(
-        name="thesis",  # thesis Table 1
-        mass_kg=1.0,
-        inertia_kg_m2=(8e-3, 8e-3, 14.2e-3),
-        arm_m=0.24,
-        rotor_force_max_n=5.0,  # its 20 N bound, shared out
-        yaw_per_force_m=1.1e-6 / 54.2e-6,
-        thrust_coeff_n_s2=54.2e-6,
-        rotor_inertia_kg_m2=1.08e-6,
-        drag_rotation_1_s=(0.03, 0.03, 0.01),
-        drag_n_s_m=(0.048, 0.11, 0.046),
-        drag_scales_with_mass=True,
-        motor_tau_s=0.0,
-    ),
-    "x500": Preset(
-        name="x500",  # PX4 1.18 SIH defaults
-        mass_kg=1.0,
-        inertia_kg_m2=(0.025, 0.025, 0.03),
-        arm_m=0.2,
-        rotor_force_max_n=5.0,
-        yaw_per_force_m=0.02,
-        thrust_coeff_n_s2=54.2e-6,
-        rotor_inertia_kg_m2=0.0,
-        drag_rotation_1_s=(0.0, 0.0, 0.0),
-        drag_n_s_m=(1.0, 1.0, 1.0),
-        drag_scales_with_mass=False,
-        motor_tau_s=0.05,
-    ),
-}
 
 # Rows of the polynomial's argument: constant, rotor speed sum, quaternion, body rates, body velocity.
 _ARGUMENTS = ("1", "wr", "qw", "qx", "qy", "qz", "p", "q", "r", "u", "v", "w")
@@ -189,6 +135,8 @@ class Plant:
         euler_rad: (3, N) roll, pitch, yaw, of the current state.
         contact: (N,) resting on or sliding over the ground.
         rotor_force_n: (4, N) after motor lag.
+        rotor_share_01: (4, N) of its force that each rotor still gives, or None for all: battery, failures.
+        mass_ratio: (N,) mass over the mass at the start, or None.
     """
 
     def __init__(
@@ -199,6 +147,8 @@ class Plant:
         *,
         ground: bool = True,
         mass_scale: float = 1.0,
+        thrust_curve_01: float = 0.0,
+        ground_effect: bool = False,
     ) -> None:
         """Vehicles at rest, level, nose north.
 
@@ -208,6 +158,8 @@ class Plant:
             dt_s: step.
             ground: False for no ground at all.
             mass_scale: true mass over the preset's.
+            thrust_curve_01: k of a rotor's force (1 - k) u + k u^2 over its limit, at command u; PX4's THR_MDL_FAC.
+            ground_effect: rotors push harder close to the ground.
         """
         count = len(pos_ned_m)
         self.preset = preset
@@ -221,6 +173,10 @@ class Plant:
         self.held: Mask = np.zeros(count, dtype=bool)  # clamped at the spawn pose
         self.mixer = Mixer(preset, count)
         self.rotor_force_n = np.zeros((4, count))
+        self.rotor_share_01: Array | None = None
+        self.mass_ratio: Array | None = None
+        self._curve_01 = thrust_curve_01
+        self._ground_effect = ground_effect and ground
         self._wind_ned_m_s: Array | None = None
         self._lag = 1.0 - math.exp(-dt_s / preset.motor_tau_s) if preset.motor_tau_s > 0 else 1.0
         self._rows = _quadratic_rows(preset, self.mass_kg)
@@ -268,7 +224,16 @@ class Plant:
     @property
     def hover_thrust_01(self) -> float:
         """Thrust setpoint that carries the true mass."""
-        return self.mass_kg * GRAVITY_M_S2 / self.preset.thrust_max_n
+        force_01, k = self.mass_kg * GRAVITY_M_S2 / self.preset.thrust_max_n, self._curve_01
+        if not k:
+            return force_01
+        return (math.sqrt((1.0 - k) ** 2 + 4.0 * k * force_01) - (1.0 - k)) / (2.0 * k)
+
+    @property
+    def height_m(self) -> Array:
+        """(N,) above the ground; above z = 0 where there is none."""
+        height_m: Array = (self.ground_z_m if self.ground_z_m is not None else 0.0) - self.state[12]
+        return height_m
 
     def set_wind(self, wind_ned_m_s: Array | None) -> None:
         """Air velocity (3, N) NED that drag acts against; None for still air. Frozen in the body over one step."""
@@ -276,17 +241,21 @@ class Plant:
 
     def step(self, rotor_cmd_n: Array) -> None:
         """Advance by `dt_s` under commanded rotor forces (4, N) [N], already within the rotors' limits."""
+        rotor_cmd_n = self._achievable(rotor_cmd_n)
         if self._lag < 1.0:
             np.subtract(rotor_cmd_n, self.rotor_force_n, out=self._spins)
             self._spins *= self._lag
             self.rotor_force_n += self._spins
         else:
             self.rotor_force_n[...] = rotor_cmd_n
-        np.matmul(self._forcing_rows, self.rotor_force_n, out=self._forcing)
+        lift_n = self.rotor_force_n * self._near_ground() if self._ground_effect else self.rotor_force_n
+        np.matmul(self._forcing_rows, lift_n, out=self._forcing)
         if self.preset.rotor_inertia_kg_m2:
             np.multiply(self.rotor_force_n, 1.0 / self.preset.thrust_coeff_n_s2, out=self._spins)
             np.sqrt(self._spins, out=self._spins)
             np.matmul(-_YAW_SIGN, self._spins, out=self._args[1])  # w_r = W1 - W2 + W3 - W4
+        if self.mass_ratio is not None:
+            self._reweigh(self.mass_ratio)
         if self._wind_ned_m_s is not None:
             self._add_wind(self._wind_ned_m_s)
         held = self.state[:, self.held].copy() if self.held.any() else None
@@ -296,11 +265,42 @@ class Plant:
         self._touch_ground()
         self.refresh()
 
+    def _achievable(self, rotor_cmd_n: Array) -> Array:
+        """Force that the commanded ones become; thrust curve first, then what battery and rotor can give."""
+        if self._curve_01:
+            command = rotor_cmd_n / self.preset.rotor_force_max_n
+            rotor_cmd_n = rotor_cmd_n * (1.0 - self._curve_01 + self._curve_01 * command)
+        return rotor_cmd_n if self.rotor_share_01 is None else rotor_cmd_n * self.rotor_share_01
+
+    def _near_ground(self) -> Array:
+        """(N,) thrust over that of the same rotor far up: I. C. Cheeseman and W. E. Bennett, ARC R&M 3021, 1955.
+
+        One rotor's formula, 1 / (1 - (R / 4 z)^2); the rotor is taken to stand one radius above the skids.
+        """
+        radius_m = self.preset.rotor_radius_m
+        share = 0.25 * radius_m / (np.maximum(self.height_m, 0.0) + radius_m)
+        gain: Array = 1.0 / (1.0 - share * share)
+        return gain
+
+    def _reweigh(self, mass_ratio: Array) -> None:
+        """Thrust and drag forces act on another mass; the inertia stays (the load is at the centre)."""
+        lighter = 1.0 / mass_ratio
+        self._forcing[9] *= lighter
+        if not self.preset.drag_scales_with_mass:
+            self._forcing[_VEL] += self._drag_1_s() * (1.0 - lighter) * self.state[_VEL]
+
+    def _drag_1_s(self) -> Array:
+        """(3, 1) of the mass at the start."""
+        mass_kg = self.preset.mass_kg if self.preset.drag_scales_with_mass else self.mass_kg
+        rate: Array = np.array(self.preset.drag_n_s_m)[:, None] / mass_kg
+        return rate
+
     def _add_wind(self, wind_ned_m_s: Array) -> None:
-        drag = np.array(self.preset.drag_n_s_m)
-        drag /= self.preset.mass_kg if self.preset.drag_scales_with_mass else self.mass_kg
+        drag = self._drag_1_s()
+        if self.mass_ratio is not None and not self.preset.drag_scales_with_mass:
+            drag = drag / self.mass_ratio
         np.multiply(self.rotation.reshape(3, 3, -1), wind_ned_m_s[:, None], out=self._lever)
-        self._forcing[_VEL] += drag[:, None] * self._lever.sum(axis=0)
+        self._forcing[_VEL] += drag * self._lever.sum(axis=0)
 
     def _integrate(self) -> None:
         state, stage, slopes, h = self.state, self._stage, self._slopes, self.dt_s
@@ -362,9 +362,10 @@ class Plant:
         state = self.state
         yaw = math.atan2(self.rotation[3, i], self.rotation[0, i])
         north, east, down = (float(v) for v in self.vel_ned_m_s[:, i])
-        load_n = max(0.0, self.mass_kg * GRAVITY_M_S2 - lift_n)
+        mass_kg = self.mass_kg * (float(self.mass_ratio[i]) if self.mass_ratio is not None else 1.0)
+        load_n = max(0.0, mass_kg * GRAVITY_M_S2 - lift_n)
         speed = math.hypot(north, east)
-        slowed = max(0.0, speed - GROUND_FRICTION * load_n / self.mass_kg * self.dt_s)
+        slowed = max(0.0, speed - GROUND_FRICTION * load_n / mass_kg * self.dt_s)
         ratio = slowed / speed if speed > 0 else 0.0
         north, east, down = north * ratio, east * ratio, min(down, 0.0)
         c, s = math.cos(yaw), math.sin(yaw)

@@ -7,27 +7,55 @@ the same bytes give the same flight. Setpoints that have arrived by then act in 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, field
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from sitl.airframes import PRESETS
 from sitl.attitude import THESIS_GAINS, attitude_loop
-from sitl.autopilot import IDLE, Autopilot
+from sitl.autopilot import Autopilot
+from sitl.commander import Commander, Face
 from sitl.endpoint import Endpoint
-from sitl.navigator import Navigator
+from sitl.estimator import ESTIMATORS, Estimator
+from sitl.faults import Faults
+from sitl.imu import Imu
+from sitl.lossy import LossyLink
+from sitl.navigator import IDLE, Navigator
 from sitl.parameters import Parameters
-from sitl.sensors import Estimate, estimate_of, local_origin
+from sitl.physics import Physics, outfitted
+from sitl.schedule import GCS_HZ
+from sitl.sensors import FULL, local_origin
 from sitl.streams import Report
-from sitl.vehicle import PRESETS, Array, Plant
+from sitl.vehicle import Array, Plant
 from swarmctl.core.records import TRUTH_DTYPE
-from swarmctl.core.types import GeoOrigin
+from swarmctl.core.simulated import FaultParams, RealismParams
+from swarmctl.core.types import FlightMode, GeoOrigin
 from swarmctl.errors import ConfigError
 from swarmctl.links.transport import Transport
 
 AUTOPILOT_HZ = 50
+_SCALED_TIMEOUTS = ("COM_OF_LOSS_T", "COM_DL_LOSS_T", "COM_RC_LOSS_T")
+_LINK_PURPOSE, _GCS_LINK_PURPOSE = 3, 4  # of the random streams, beside run seed and vehicle
 MAX_VEHICLES = 100
+
+
+@runtime_checkable
+class Metered(Protocol):
+    """An autopilot that reports its battery."""
+
+    battery_01: float
+    battery_v: float
+    battery_a: float
+
+
+@runtime_checkable
+class Rebooting(Protocol):
+    """A MAVLink face whose autopilot can start again."""
+
+    def reboot(self, now_us: int) -> None:
+        """As after power-up; `now_us` is on the clock of the simulation."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,6 +75,10 @@ class SitlParams:
     start: Literal["ground", "air"] = "ground"
     ekf_ready_s: float = 1.0  # PX4 takes 4 s
     sysid_base: int = 1
+    estimator: str = "exact"  # of sitl.estimator.ESTIMATORS
+    autopilot_kind: Literal["px4", "arducopter"] = "px4"
+    realism: RealismParams = field(default_factory=RealismParams)
+    reject_bad_setpoints: bool = True  # False: NaN and zero quaternions do what they do to PX4 1.18
 
     def __post_init__(self) -> None:
         problems = list(self._problems())
@@ -72,6 +104,11 @@ class SitlParams:
             yield f"preset = {self.preset!r}: allowed: {', '.join(PRESETS)}"
         if self.attitude_gains not in THESIS_GAINS:
             yield f"attitude_gains = {self.attitude_gains!r}: allowed: {', '.join(THESIS_GAINS)}"
+        if self.estimator not in ESTIMATORS:
+            yield f"estimator = {self.estimator!r}: allowed: {', '.join(ESTIMATORS)}"
+        if self.autopilot_kind not in ("px4", "arducopter"):
+            yield f"autopilot_kind = {self.autopilot_kind!r}: allowed: px4, arducopter"
+        yield from self.realism.fault_problems(self.vehicles)
         if self.start not in ("ground", "air"):
             yield f"start = {self.start!r}: allowed: ground, air"
         if self.spawn_ned_m.shape != (self.vehicles, 3):
@@ -88,14 +125,19 @@ def line_of_spawns(vehicles: int) -> Array:
 
 
 class SitlWorld:
-    """The simulation; `transports` are the vehicle ends of the links, in vehicle order."""
+    """The simulation; `transports` are the vehicle ends of the links, in vehicle order.
 
-    def __init__(self, params: SitlParams, transports: Sequence[Transport]) -> None:
-        if len(transports) != params.vehicles:
-            raise ValueError(f"transports: {len(transports)} for {params.vehicles} vehicles")
+    `gcs_transports` are those of a second link each, to a ground station, as PX4 has one.
+    """
+
+    def __init__(
+        self, params: SitlParams, transports: Sequence[Transport], gcs_transports: Sequence[Transport] = ()
+    ) -> None:
+        if len(transports) != params.vehicles or len(gcs_transports) not in (0, params.vehicles):
+            raise ValueError(f"transports: {len(transports)} and {len(gcs_transports)} for {params.vehicles} vehicles")
         self.params = params
         count, dt_s = params.vehicles, 1.0 / params.physics_hz
-        preset = PRESETS[params.preset]
+        preset = outfitted(PRESETS[params.preset], params.realism)
         shared = GeoOrigin(params.origin_lat_deg, params.origin_lon_deg, params.origin_alt_m)
         self.origins = [local_origin(spawn, shared) for spawn in params.spawn_ned_m]
         self._offset_ned_m = np.array([origin.offset_ned_m for origin in self.origins])  # (N, 3)
@@ -106,20 +148,30 @@ class SitlWorld:
             dt_s,
             ground=not airborne,
             mass_scale=params.mass_scale,
+            thrust_curve_01=params.realism.thrust_curve_01,
+            ground_effect=params.realism.ground_effect,
         )
         self.plant.held[:] = airborne
+        self.estimator = Estimator(ESTIMATORS[params.estimator], self.plant, params.seed)
         self.attitude = attitude_loop(preset, count, dt_s, params.attitude_gains)
-        self.autopilots: list[Autopilot] = []
-        self.endpoints: list[Endpoint] = []
-        for i, transport in enumerate(transports):
-            table = Parameters(params.sysid_base + i)
-            navigator = Navigator(table, self.plant.hover_thrust_01)
-            pilot = Autopilot(table, navigator, ekf_ready_us=round(params.ekf_ready_s * 1e6), airborne=airborne)
-            pilot.origin_alt_m = self.origins[i].alt_mm / 1e3
+        self._autopilot_every = max(1, round(params.physics_hz / AUTOPILOT_HZ))
+        self.physics = Physics(
+            self.plant, self.attitude, self.estimator, params.realism, params.seed, self._autopilot_every
+        )
+        self.autopilots: list[Commander] = []
+        self.endpoints: list[Face] = []
+        self._links = [LossyLink(link, (params.seed, i, _LINK_PURPOSE)) for i, link in enumerate(transports)]
+        self.gcs_endpoints: list[Face] = []
+        self._gcs_links = [
+            LossyLink(link, (params.seed, i, _GCS_LINK_PURPOSE)) for i, link in enumerate(gcs_transports)
+        ]
+        self.imu = Imu(self.plant, self._autopilot_every * dt_s)
+        build = self._arducopter if params.autopilot_kind == "arducopter" else self._px4
+        for i, transport in enumerate(self._links):
+            pilot, endpoint = build(i, transport)
             self.autopilots.append(pilot)
-            self.endpoints.append(
-                Endpoint(params.sysid_base + i, transport, pilot, self._reporter(i), round(dt_s * 1e6))
-            )
+            self.endpoints.append(endpoint)
+        self._metered = [pilot if isinstance(pilot, Metered) else None for pilot in self.autopilots]
         self._wrench = np.zeros((4, count))
         self._live = np.zeros(count)
         self._powered = np.zeros(count, dtype=bool)
@@ -127,27 +179,82 @@ class SitlWorld:
         self._boot_us: int | None = None
         self._now_us = 0
         self._steps = 0
-        self._autopilot_every = max(1, round(params.physics_hz / AUTOPILOT_HZ))
+        problems = [problem for fault in params.realism.faults for problem in self.can(fault)]
+        if problems:
+            raise ConfigError("sitl", problems)
+        self.faults = Faults(self, params.realism.faults, count)
 
     def step(self, now_us: int) -> None:
         """One physics step that ends at `now_us` (monotonic); then everything due is sent, stamped with it."""
         if self._boot_us is None:
             self._boot_us = now_us - round(1e6 / self.params.physics_hz)
         since_boot_us = now_us - self._boot_us
-        for endpoint in self.endpoints:
-            endpoint.receive(since_boot_us, now_us)
+        self.faults.step(since_boot_us)
+        self.receive(now_us)
         if self._steps % self._autopilot_every == 0:
+            self.imu.sample()
             for i, pilot in enumerate(self.autopilots):
-                pilot.tick(
-                    estimate_of(self.plant, i, since_boot_us), since_boot_us, self._autopilot_every * self.plant.dt_s
-                )
+                estimate = self.estimator.of(i, since_boot_us)
+                metered = self._metered[i]
+                if metered is not None and estimate.battery is not FULL:
+                    metered.battery_01, metered.battery_v, metered.battery_a = estimate.battery
+                pilot.tick(estimate, since_boot_us, self._autopilot_every * self.plant.dt_s)
         self._steps += 1
         self._take_outputs()
-        self.attitude.torque(self.plant, self._live, self._wrench[1:])
-        self.plant.step(self.plant.mixer.allocate(self._wrench))
+        self.physics.step(since_boot_us * 1e-6, self._wrench, self._live)
         self._now_us = now_us
         for endpoint in self.endpoints:
             endpoint.send_due(since_boot_us)
+        for endpoint in self.gcs_endpoints:
+            endpoint.send_due(since_boot_us)
+
+    def receive(self, now_us: int) -> None:
+        """Handle everything that has arrived, without a step."""
+        since_boot_us = now_us - (now_us if self._boot_us is None else self._boot_us)
+        for endpoint in self.endpoints:
+            endpoint.receive(since_boot_us, now_us)
+        for endpoint in self.gcs_endpoints:
+            endpoint.receive(since_boot_us, now_us)
+
+    def offboard_vehicles(self) -> set[int]:
+        """Vehicles that a client flies now."""
+        return {i for i, p in enumerate(self.autopilots) if p.armed and p.flight_mode() == FlightMode.EXTERNAL}
+
+    def setpoint_counts(self) -> list[int]:
+        """SET_ATTITUDE_TARGET frames that have reached each vehicle; counted from the first call on."""
+        return [sum(link.setpoints() for link in self.links_of(i)) for i in range(self.params.vehicles)]
+
+    def scale_timeouts(self, speed: float) -> None:
+        """Keep timeouts as they are on the wall clock, as PX4 does when it starts a fast simulation."""
+        for pilot in self.autopilots:
+            for name in _SCALED_TIMEOUTS if self.params.autopilot_kind == "px4" else ():
+                pilot.parameters.assign(name, speed * pilot.parameters.real(name))
+
+    @property
+    def boot_us(self) -> int:
+        """When its clock read 0, on the clock it is stepped by; 0 before the first step."""
+        return self._boot_us or 0
+
+    @property
+    def since_boot_us(self) -> int:
+        """Simulated time of the newest step; what faults and stamps count in."""
+        return 0 if self._boot_us is None else self._now_us - self._boot_us
+
+    def links_of(self, vehicle: int) -> Sequence[LossyLink]:
+        """Every link of a vehicle, for faults."""
+        return self._links[vehicle : vehicle + 1] + self._gcs_links[vehicle : vehicle + 1]
+
+    def reboot(self, vehicle: int, now_us: int) -> None:
+        """Start an autopilot again; its vehicle goes on as physics has it."""
+        face = self.endpoints[vehicle]
+        if isinstance(face, Rebooting):
+            face.reboot(now_us)
+
+    def can(self, fault: FaultParams) -> Iterator[str]:
+        """What is wrong with asking for a fault here; all problems."""
+        yield from fault.problems(self.params.vehicles)
+        if fault.kind == "reboot" and not isinstance(self.endpoints[0], Rebooting):
+            yield f"kind = reboot: {self.params.autopilot_kind} vehicles can't; choose another"
 
     def truth_rows(self) -> NDArray[np.void]:
         """True states (N,) of `TRUTH_DTYPE`, shared frame."""
@@ -164,8 +271,7 @@ class SitlWorld:
 
     def set_wind(self, wind_ned_m_s: Sequence[float]) -> None:
         """Steady wind (3,) NED [m/s] on every vehicle."""
-        wind = np.array(wind_ned_m_s, dtype=np.float64).reshape(3, 1)
-        self.plant.set_wind(np.repeat(wind, self.params.vehicles, axis=1) if wind.any() else None)
+        self.physics.air.mean_ned_m_s = np.array(wind_ned_m_s, dtype=np.float64).reshape(3, 1)
 
     def _take_outputs(self) -> None:
         """Hand changed setpoints to the attitude loops; open clamps; note who flies."""
@@ -175,19 +281,63 @@ class SitlWorld:
             if output is not self._flown[i]:
                 self._flown[i] = output
                 self.attitude.set_reference(i, output.q_nb)
-                self._wrench[0, i] = output.thrust_01 * thrust_max_n
-                self._powered[i] = output is not IDLE
+                self.attitude.rates.set(i, output.rate_frd_rad_s, output.feed_frd_rad_s)
+                self._wrench[0, i] = 0.0 if output.stopped else output.thrust_01 * thrust_max_n
+                self._powered[i] = not (output.stopped or output.loose)
             if pilot.released and self.plant.held[i]:
                 self.plant.held[i] = False
         np.logical_and(self._powered, ~self.plant.contact, out=self._live, casting="unsafe")
         self._live *= ~self.plant.held
 
-    def _reporter(self, vehicle: int) -> Callable[[], Report]:
-        plant, pilot, origin = self.plant, self.autopilots[vehicle], self.origins[vehicle]
+    def _px4(self, vehicle: int, link: Transport) -> tuple[Commander, Face]:
+        params, table = self.params, Parameters(self.params.sysid_base + vehicle)
+        navigator = Navigator(table, self.plant.hover_thrust_01)
+        airborne = params.start == "air"
+        pilot = Autopilot(
+            table,
+            navigator,
+            ekf_ready_us=round(params.ekf_ready_s * 1e6),
+            airborne=airborne,
+            reject_bad_setpoints=params.reject_bad_setpoints,
+        )
+        pilot.start_at(self.origins[vehicle])
+        sysid, step_us = params.sysid_base + vehicle, round(self.plant.dt_s * 1e6)
+        report = self._reporter(vehicle, pilot)
+        endpoint = Endpoint(sysid, link, pilot, report, step_us)
+        if self._gcs_links:
+            ground = Endpoint(sysid, self._gcs_links[vehicle], pilot, report, step_us, GCS_HZ)
+            self.gcs_endpoints.append(ground)
+            endpoint.join(ground)
+        return pilot, endpoint
+
+    def _arducopter(self, vehicle: int, link: Transport) -> tuple[Commander, Face]:
+        from sitl.arducopter_endpoint import Start, arducopter_vehicle  # with a second dialect module: 20 MB
+
+        params = self.params
+        start = Start(
+            self.origins[vehicle],
+            lambda: self.estimator.of(vehicle, self._now_us - (self._boot_us or 0)),
+            round(params.ekf_ready_s * 1e6),
+            params.start == "air",
+        )
+        links = [link, *self._gcs_links[vehicle : vehicle + 1]]
+        pilot, faces = arducopter_vehicle(params.sysid_base + vehicle, links, self.plant, vehicle, start)
+        self.gcs_endpoints.extend(faces[1:])
+        return pilot, faces[0]
+
+    def _reporter(self, vehicle: int, pilot: Autopilot) -> Callable[[], Report]:
+        plant, origin = self.plant, self.origins[vehicle]
         rotor_scale = 1.0 / plant.preset.rotor_force_max_n
+        cached: list[Report] = []  # of the newest step, for the other link
 
         def report() -> Report:
-            estimate: Estimate = estimate_of(plant, vehicle, self._now_us - (self._boot_us or 0))
-            return Report(estimate, pilot, origin, tuple((plant.rotor_force_n[:, vehicle] * rotor_scale).tolist()))
+            now_us = self._now_us - (self._boot_us or 0)
+            if cached and cached[0].simulation_us == now_us:
+                return cached[0]
+            estimate = pilot.boot.local(self.estimator.of(vehicle, now_us))
+            rotors = tuple((plant.rotor_force_n[:, vehicle] * rotor_scale).tolist())
+            made = Report(estimate, pilot, pilot.boot.origin or origin, rotors, self.imu.of(vehicle), now_us)
+            cached[:] = [made]
+            return made
 
         return report

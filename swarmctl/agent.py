@@ -16,16 +16,18 @@ from pydantic import Field
 
 from swarmctl.control.controller import ControllerParams, make_controller
 from swarmctl.control.disturbance import DisturbanceObserver, DisturbanceParams
+from swarmctl.control.facts import Facts
 from swarmctl.control.failsafe import FailsafeParams, Judgement, judge
 from swarmctl.control.fallback import rest_plan
 from swarmctl.control.mission import MissionParams, MissionReference
-from swarmctl.control.model import Predictor, VehicleModelParams, acceleration
+from swarmctl.control.model import Predictor, VehicleModelParams
 from swarmctl.control.problem import Problem, Start
 from swarmctl.control.replay import Replay
-from swarmctl.control.separation import SeparationParams
-from swarmctl.control.sequence import Facts, SequenceParams
+from swarmctl.control.separation import SeparationParams, radius_problem
 from swarmctl.control.sequence import Sequence as MissionSequence
+from swarmctl.control.sequence import SequenceParams
 from swarmctl.control.setpoint import setpoint_of
+from swarmctl.control.state_filter import StateFilter, StateFilterParams
 from swarmctl.core.clock import Clock
 from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned
 from swarmctl.core.params import Params
@@ -49,10 +51,12 @@ from swarmctl.links import topics
 from swarmctl.links.autopilot import Autopilot
 from swarmctl.links.commands import CommandPort
 from swarmctl.links.peers import Bus
+from swarmctl.links.upkeep import Upkeep
 from swarmctl.reporter import Act, Reporter, Thought, TickSink, Took
 from swarmctl.surroundings import Surroundings
 
 _NOTHING_US = -1
+_AUTOPILOT_HOVERS = (FlightMode.HOLD, FlightMode.EXTERNAL)  # in the latter while it takes off by itself
 
 
 class AgentParams(Params):
@@ -63,7 +67,14 @@ class AgentParams(Params):
     sequence: SequenceParams = SequenceParams()
     failsafe: FailsafeParams = FailsafeParams()
     disturbance: DisturbanceParams = DisturbanceParams()
+    state_filter: StateFilterParams = StateFilterParams()
     autopilot_params: dict[str, int | float] = Field({"COM_OBL_RC_ACT": 4})  # PX4: land when setpoints stop
+
+
+def _estimator(params: AgentParams, model: VehicleModelParams) -> DisturbanceObserver | StateFilter:
+    if params.state_filter.enabled:
+        return StateFilter(params.state_filter, params.disturbance, model)
+    return DisturbanceObserver(params.disturbance, model.hover_thrust_01)
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,20 +111,29 @@ class Agent:
         agents = len(setup.starts_ned_m)
         peers = [i for i in range(agents) if i != setup.agent]
         slots = min(len(peers), setup.separation.max_neighbours) + setup.obstacle_slots
+        self._upkeep = Upkeep(autopilot, commands, setup.params.autopilot_params, setup.params.sequence.state_rate_hz)
         self._surroundings = Surroundings(setup.agent, peers, setup.separation, setup.obstacle_slots, bus)
-        self._controller = make_controller(setup.controller, setup.separation, setup.agent, slots, stopwatch_ns)
+        self._controller = make_controller(
+            setup.controller, setup.vehicle_model, setup.separation, setup.agent, slots, stopwatch_ns
+        )
         self._transit = self._controller
         if setup.controller.kind == "open_loop":  # can't go anywhere: something else flies to the start
             self._transit = make_controller(
-                setup.controller.model_copy(update={"kind": "dmpc"}), setup.separation, setup.agent, slots, stopwatch_ns
+                setup.controller.model_copy(update={"kind": "dmpc"}),
+                setup.vehicle_model,
+                setup.separation,
+                setup.agent,
+                slots,
+                stopwatch_ns,
             )
-        self._observer = DisturbanceObserver(setup.params.disturbance, setup.vehicle_model.hover_thrust_01)
+        self._observer = _estimator(setup.params, setup.vehicle_model)
         self._predictor = Predictor(setup.vehicle_model)
         reference = MissionReference(setup.mission, setup.starts_ned_m, setup.agent)
         self._sequence = MissionSequence(
             setup.params.sequence,
-            setup.params.autopilot_params,
+            setup.agent,
             len(peers),
+            setup.separation.radius_m,
             setup.starts_ned_m[setup.agent],
             setup.mission.duration_s,
             reference,
@@ -200,15 +220,18 @@ class Agent:
         state = self._autopilot.poll(now_us)
         self._commands.step(now_us)
         for result in self._commands.results():
+            self._upkeep.took(result)
+            asked = f"{result.command.verb.value} {result.command.name}".rstrip()
             if not result.ok:
-                self._problem = f"{result.command.verb.value} refused: {result.text}"
-            self._note("command", verb=result.command.verb.value, ok=result.ok, text=result.text)
+                self._problem = f"{asked} refused: {result.text}"
+            self._note("command", verb=asked, ok=result.ok, text=result.text)
         if state is None or state.t_us == self._last_state_us:
             return state
         self._last_state_us = state.t_us
+        self._observer.update(state, self._thrust_01 if self._sequence.had_control else None)
         if self._sequence.had_control:
-            self._observer.update(state, self._thrust_01)
-        elif self._autopilot.hover_thrust_01 is not None and state.mode is FlightMode.HOLD:
+            return state
+        if self._autopilot.hover_thrust_01 is not None and state.mode in _AUTOPILOT_HOVERS:
             self._observer.learn_hover(self._autopilot.hover_thrust_01 * float(body_z_ned(state.q_nb)[2]))
         return state
 
@@ -219,11 +242,14 @@ class Agent:
             return Thought(None, None, None, [])
         estimate = self._observer.estimate
         act_us = now_us + self._predictor.delay_us
-        pos, vel = self._predictor.predict(state, act_us, estimate.disturbance_ned_m_s2)
-        if not self._sequence.had_control:
+        if self._sequence.had_control:
+            start = self._predictor.start(
+                self._observer.state(state), act_us, estimate.disturbance_ned_m_s2, self._virtual
+            )
+        else:
             self._virtual = np.array([0.0, 0.0, GRAVITY_M_S2])
-            pos, vel = state.pos_ned_m, state.vel_ned_m_s
-        start = Start(act_us, pos, vel, float(body_z_ned(state.q_nb)[2]), self._virtual)
+            upright = float(body_z_ned(state.q_nb)[2])
+            start = Start(act_us, state.pos_ned_m, state.vel_ned_m_s, upright, self._virtual)
         reference, now_ref = self._reference(now_us)
         steps, dt_us = self._controller.steps, self._controller.dt_us
         keep_outs = self._surroundings.keep_outs(state.pos_ned_m, self._utc(act_us), dt_us, steps, self._sequence.phase)
@@ -276,7 +302,8 @@ class Agent:
 
     def _rest(self, start: Start) -> Plan:
         disturbance = self._observer.estimate.disturbance_ned_m_s2
-        return rest_plan(start, self._hold_at, disturbance, self._controller.dt_us, self._controller.steps)
+        lag = self._setup.vehicle_model.lag()
+        return rest_plan(start, self._hold_at, disturbance, lag, self._controller.dt_us, self._controller.steps)
 
     def _flown(self, state: VehicleState | None, thought: Thought) -> Plan | None:
         """The plan whose first input is sent and whose path is shared; None when the autopilot flies."""
@@ -309,24 +336,30 @@ class Agent:
             self._note("setpoint_refused", reason=refused)
             return None
         self._virtual, self._thrust_01 = virtual, setpoint.thrust_01
-        self._predictor.sent(now_us, acceleration(virtual))
+        self._predictor.sent(now_us, virtual)
         return setpoint
 
     def _advance(self, now_us: int, state: VehicleState | None) -> None:
         before = self._sequence.phase, self._sequence.had_control
+        utc_us, dialect = self._clock.utc_us(), self._autopilot.dialect
         facts = Facts(
             now_us,
-            self._clock.utc_us(),
+            utc_us,
             state,
-            self._autopilot.dialect is not None,
+            self._upkeep.ready,
             self._autopilot.armable,
             self._commands.busy,
             self._judgement.mode,
-            self._surroundings.somebody_is_mute(self._clock.utc_us()),
+            self._surroundings.somebody_is_mute(utc_us),
             self._surroundings.peers(),
+            others_ned_m=self._surroundings.others_ned_m(utc_us),
+            arm_in=None if dialect is None else dialect.arm_in,
+            boots=self._autopilot.clock.boots,
+            refusal=self._refusal(),
         )
         for command in self._sequence.step(facts):
             self._commands.request(command)
+        self._upkeep.step(now_us)
         if not before[1] and self._sequence.had_control:
             self._predictor.clear()
             self._observer.reset()
@@ -336,6 +369,13 @@ class Agent:
             self._announced = now
             names = {"phase": now[0].name, "mode": now[1].name, "flight_mode": now[2].name}
             self._note("state", **names, reason=self._judgement.reason)
+
+    def _refusal(self) -> str:
+        """Why nothing may be armed, or ""."""
+        alone = len(self._setup.starts_ned_m) == 1
+        accuracy_m = self._autopilot.pos_accuracy_m or 0.0  # not told: body and tracking are left to judge by
+        radius = "" if alone else radius_problem(self._setup.separation, accuracy_m)
+        return "; ".join(filter(None, (self._upkeep.refusal, radius)))
 
     # -- share, record ------------------------------------------------------------------------------------------------
 

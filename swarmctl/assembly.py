@@ -57,7 +57,7 @@ def make_agent(
         np.array(config.starts_ned_m()),
         config.controller,
         config.separation,
-        config.vehicle_model,
+        config.model_of(agent),
         max(1, len(config.obstacles)),
     )
     return Agent(setup, autopilot, commands, bus, clock, sink, stopwatch_ns)

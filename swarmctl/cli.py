@@ -106,6 +106,25 @@ def simulate(
 
 
 @app.command()
+def check(
+    config: ConfigPath = None,
+    agents: Agents = None,
+    sets: Set = None,
+    apply: Annotated[
+        bool, typer.Option("--apply", help="Set wanted parameters, on disarmed vehicles; else nothing is changed.")
+    ] = False,
+    seconds: Annotated[float, typer.Option("--seconds", min=1.0, max=600.0, help="Listen to each vehicle [s].")] = 3.0,
+    json: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write everything found, too.")] = None,
+) -> int:
+    """Ask every vehicle and say what to fix. Exit 0: nothing; 3: one is not reached; 4: something."""
+    from swarmctl.check import CheckOptions
+    from swarmctl.check import check as ask
+    from swarmctl.config import load
+
+    return ask(load(config, _overrides(agents, None, None, sets)), CheckOptions(apply, seconds, json))
+
+
+@app.command()
 def agent(
     config: Annotated[Path, typer.Option("--config", help="Resolved TOML file.")],
     number: Annotated[int, typer.Option("--id", help="Number of this agent, from 0.")],
@@ -159,6 +178,28 @@ def land(run_dir: RunningDir = None, agent: OneAgent = None) -> int:
 def rtl(run_dir: RunningDir = None, agent: OneAgent = None) -> int:
     """Hand over to the autopilot's return to launch."""
     return _command("rtl", run_dir, agent)
+
+
+@app.command()
+def fault(
+    kind: Annotated[str, typer.Argument(help="gps_loss, motor, link_loss, gust, ...; a wrong one lists them all.")],
+    vehicle: Annotated[int, typer.Option("--vehicle", help="Which, from 0; -1 for all.")] = -1,
+    value: Annotated[float | None, typer.Option("--value", help="Of the kind: fraction, metres, ms, ...")] = None,
+    for_s: Annotated[float, typer.Option("--for", help="How long [s]; 0 to the end.")] = 0.0,
+    rotor: Annotated[int, typer.Option("--rotor", help="Of a motor fault, 0 to 3.")] = 0,
+    direction: Annotated[str, typer.Option("--direction", help="Of a link: both, to_vehicle, from_vehicle.")] = "both",
+    towards: Annotated[float, typer.Option("--towards", help="Of a gust or jump, degrees from north.")] = 0.0,
+    run_dir: RunningDir = None,
+) -> int:
+    """Let something go wrong in the simulator of a running launch; refused where real vehicles fly."""
+    from swarmctl import attach
+    from swarmctl.fault import inject, parse_fault
+
+    launch = attach.find_launch(run_dir)
+    wanted = {"kind": kind, "vehicle": vehicle, "value": value, "for_s": for_s, "rotor": rotor}
+    asked = parse_fault({**wanted, "direction": direction, "towards_deg": towards}, launch.agents)
+    print(inject(launch, asked))
+    return EXIT_OK
 
 
 @obstacle_app.command("list")

@@ -22,8 +22,9 @@ from swarmctl.agent import AgentParams
 from swarmctl.control.controller import ControllerParams
 from swarmctl.control.mission import MissionParams
 from swarmctl.control.model import VehicleModelParams
-from swarmctl.control.separation import SeparationParams
+from swarmctl.control.separation import SeparationParams, radius_problem
 from swarmctl.core.params import Params, Vec3
+from swarmctl.core.simulated import RealismParams
 from swarmctl.errors import ConfigError
 from swarmctl.links.transport import Endpoint, parse_url
 from swarmctl.telemetry.referee import ObstacleRule, Rules
@@ -56,19 +57,29 @@ class VehicleParams(Params):
 
     sysid: int = Field(ge=1, le=255)
     url: str
+    model: VehicleModelParams | None = None  # where it differs from the others; whole, instead of vehicle_model
 
 
-class SitlParams(Params):
+class SitlParams(RealismParams):
     """The built-in simulator that launch starts; switched off to fly vehicles somebody else runs."""
 
     enabled: bool = True
-    preset: Literal["thesis", "x500"] = "thesis"
+    preset: Literal["thesis", "x500", "crazyflie", "arducopter"] = "thesis"
     attitude_gains: Literal["swarm", "single", "pid_step", "pid_trajectory"] = "swarm"  # of the thesis airframe
     ground_z_m: float = Field(2.0, ge=-1000, le=1000)  # height of the ground below the shared origin, NED z
     start: Literal["ground", "air"] = "ground"  # air: held at the start position, no ground anywhere (thesis)
     mass_scale: float = Field(1.0, ge=0.3, le=1.9)  # true mass over the preset's, unknown to the bridge
+    estimator: Literal["exact", "gps", "external"] = "exact"  # what the autopilots' estimates are off by
+    autopilot_kind: Literal["px4", "arducopter"] = "px4"  # whose face the simulator shows
     link_latency_ms: float = Field(0.0, ge=0, le=1000)  # lockstep only
     physics_hz: int = Field(250, ge=50, le=1000)
+    gcs_port: int = Field(0, ge=0, le=65535)  # every vehicle has a second link to a ground station there; 0: none
+    reject_bad_setpoints: bool = True  # false: NaN and zero quaternions do what they do to PX4 1.18
+    speed: float = Field(1.0, gt=0, le=100)  # simulated over wall time; agents can't follow any but 1
+
+    def realism(self) -> RealismParams:
+        """What the simulator's physics is given beside its airframe."""
+        return RealismParams(**{key: getattr(self, key) for key in RealismParams.model_fields})
 
 
 class BusParams(Params):
@@ -139,6 +150,11 @@ class Config(Params):
         if self.vehicles:
             return tuple(v.sysid for v in self.vehicles[: self.swarm.agents])
         return tuple(i + 1 for i in range(self.swarm.agents))
+
+    def model_of(self, agent: int) -> VehicleModelParams:
+        """What is believed of one agent's vehicle."""
+        own = self.vehicles[agent].model if self.vehicles else None
+        return own or self.vehicle_model
 
     def rules(self, mode: Literal["realtime", "lockstep"] = "realtime") -> Rules:
         """What the referee judges this run by."""
@@ -299,7 +315,15 @@ def _whole(config: Config) -> Iterator[str]:
     elif not (listed and listed < agents):
         yield from _starts_apart(config)
     yield from _vehicle_problems(config)
+    if config.sitl.speed != 1.0:
+        yield (
+            f"sitl.speed = {config.sitl.speed}: agents fly on wall time and can't follow; leave it at 1. Faster than "
+            "real time: swarmctl simulate, or python -m sitl --speed with clients of your own"
+        )
+    yield from (f"sitl.{problem}" for problem in config.sitl.fault_problems(agents))
     yield from config.mission.problems(agents)
+    if agents > 1 and (problem := radius_problem(config.separation, 0.0)):
+        yield problem
     if config.separation.radius_m < config.limits.min_separation_m:
         yield (
             f"limits.min_separation_m = {config.limits.min_separation_m}: larger than separation.radius_m = "
@@ -380,7 +404,7 @@ def _dump_table(table: dict[str, Any], prefix: str, lines: list[str]) -> None:
         if isinstance(value, dict) or (isinstance(value, (list, tuple)) and value and isinstance(value[0], dict)):
             nested.append((key, value))
         elif value is not None:
-            lines.append(f"{_key(key)} = {_toml(value)}")
+            lines.append(f"{_key(key)} = {toml_value(value)}")
     for key, value in nested:
         name = f"{prefix}{_key(key)}"
         for item in [value] if isinstance(value, dict) else value:
@@ -390,10 +414,11 @@ def _dump_table(table: dict[str, Any], prefix: str, lines: list[str]) -> None:
 
 
 def _key(key: str) -> str:
-    return key if _BARE_KEY.match(key) else _toml(key)
+    return key if _BARE_KEY.match(key) else toml_value(key)
 
 
-def _toml(value: Any) -> str:
+def toml_value(value: Any) -> str:
+    """A value as TOML, on one line; what is None inside a table is left out."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, (int, float)):
@@ -401,5 +426,7 @@ def _toml(value: Any) -> str:
     if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(_toml(v) for v in value) + "]"
+        return "[" + ", ".join(toml_value(v) for v in value) + "]"
+    if isinstance(value, dict):
+        return "{" + ", ".join(f"{_key(k)} = {toml_value(v)}" for k, v in value.items() if v is not None) + "}"
     raise TypeError(f"no TOML for {type(value).__name__}")

@@ -22,10 +22,12 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from swarmctl.config import Config
+from swarmctl.config import Config, SitlParams, toml_value
 from swarmctl.control.mission import MissionReference
+from swarmctl.core.simulated import RealismParams
 from swarmctl.errors import StartError
 from swarmctl.lifeline import PARENT_ENV
+from swarmctl.links.bus import socket_file
 from swarmctl.links.peers import agent_name
 
 ROUTER = "router"
@@ -81,13 +83,30 @@ def sitl_command(config: Config, site: Site, ports: Sequence[int]) -> Command:
     if sitl.start == "ground":
         starts = tuple((x, y, sitl.ground_z_m) for x, y, _ in starts)
     argv = _python("-m", "sitl", "--vehicles", f"{swarm.agents}", "--preset", sitl.preset)
-    argv += ("--attitude-gains", sitl.attitude_gains)
+    argv += ("--attitude-gains", sitl.attitude_gains, "--estimator", sitl.estimator)
+    argv += ("--autopilot", sitl.autopilot_kind)
+    argv += ("--gcs-port", f"{sitl.gcs_port}") if sitl.gcs_port else ()
+    argv += () if sitl.reject_bad_setpoints else ("--accept-bad-setpoints",)
     argv += ("--spawn=" + ";".join(",".join(repr(c) for c in start) for start in starts),)
     argv += (f"--origin={swarm.origin_lat_deg!r},{swarm.origin_lon_deg!r},{swarm.origin_alt_m!r}",)
     argv += ("--remote-ports", ",".join(str(port) for port in ports), "--seed", f"{config.seed}")
     argv += ("--physics-hz", f"{sitl.physics_hz}", "--mass-scale", f"{sitl.mass_scale!r}", "--start", sitl.start)
+    argv += _realism(sitl)
+    argv += ("--control", f"{control_socket(site.endpoint)}", "--events", f"{site.directory / 'sitl.events.jsonl'}")
     argv += ("--truth", f"{site.directory / 'truth.bin'}", "--die-with-parent")
     return Command(SITL, argv)
+
+
+def _realism(sitl: SitlParams) -> tuple[str, ...]:
+    """What differs from a plain flight, as the simulator's own `--set` items."""
+    defaults = RealismParams().model_dump()
+    wanted = sitl.realism().model_dump()
+    return tuple(f"--set={key}={toml_value(wanted[key])}" for key in wanted if wanted[key] != defaults[key])
+
+
+def control_socket(endpoint: str) -> Path:
+    """Where the simulator of a launch listens for faults: beside the bus."""
+    return socket_file(endpoint).with_name("sitl.sock")
 
 
 def viewer_command(config: Config, site: Site, port: int, view: bool) -> Command:

@@ -19,7 +19,7 @@ from swarmctl.control.sequence import OPERATOR_STOP
 from swarmctl.core.types import Mode
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, MissionError, StartError
 from swarmctl.links import topics
-from swarmctl.links.autopilot import PX4, Autopilot
+from swarmctl.links.autopilot import Autopilot
 from swarmctl.links.bus import ZenohBus
 from swarmctl.links.commands import CommandPort
 from swarmctl.links.mavlink import Codec
@@ -102,7 +102,7 @@ def run_agent(config_path: Path, agent: int, run: str, bus: str, run_dir: Path, 
     slow: list[CommandPort] = []
 
     def slow_path(autopilot: Autopilot, codec: Codec) -> CommandPort:
-        slow.append(MavsdkCommands(autopilot.send_frame, codec.sysid, PX4.external, PX4.hold))
+        slow.append(MavsdkCommands(autopilot.send_frame, codec.sysid, lambda: autopilot.dialect))
         return slow[0]
 
     boot_id = (clock.utc_us() // 1000) & 0xFFFFFFFF

@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from swarmctl.control.facts import PeerFacts
 from swarmctl.control.separation import (
     KeepOut,
     SeparationParams,
+    align,
     keep_out_of_obstacle,
     keep_out_of_peer,
     visible,
 )
-from swarmctl.control.sequence import PeerFacts
 from swarmctl.core.types import Array, Obstacle, Phase
 from swarmctl.links import topics
 from swarmctl.links.peers import Bus, PeerPaths, agent_name
@@ -75,6 +76,11 @@ class Surroundings:
             agent: PeerFacts(Phase(status.phase), status.ready_utc_us, agent_name(agent) in alive)
             for agent, status in self._status.items()
         }
+
+    def others_ned_m(self, utc_us: int) -> tuple[Array, ...]:
+        """Where each peer is now (3,), by its newest path."""
+        paths = self.paths.latest()
+        return tuple(align(path, utc_us, path.dt_us, 0, self._params.brake_m_s2)[0] for path in paths)
 
     def somebody_is_mute(self, utc_us: int) -> bool:
         """Whether a peer is silent and not known to be gone: it may be flying on, or the bus is lost to us.

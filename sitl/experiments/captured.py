@@ -24,11 +24,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.experiments.slsqp import KEPT_M, NonlinearAnswer, NonlinearXy, XyAsked
+from sitl.experiments.slsqp import KEPT_M, NonlinearAnswer, NonlinearXy
 from sitl.lockstep import Lockstep
 from swarmctl.config import Config, load
-from swarmctl.control.axes import AxesSolution, HalfSpaces
+from swarmctl.control.axes import AxesProblem, AxesSolution, HalfSpaces
 from swarmctl.control.controller import Controller
+from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc import MpcParams, SwarmMpc
 from swarmctl.control.problem import Problem
 from swarmctl.control.qp import QpParams
@@ -121,26 +122,18 @@ def settled_garbage() -> Iterator[None]:
 class TappedMpc(SwarmMpc):
     """The controller of a flight with its x-y problem in sight: what it was asked last, and how long that took."""
 
-    def __init__(self, params: MpcParams, separation: SeparationParams, slots: int = _SLOTS) -> None:
-        super().__init__(params, separation, 0, slots, time.thread_time_ns)
+    def __init__(
+        self, params: MpcParams, vehicle: VehicleModelParams, separation: SeparationParams, slots: int = _SLOTS
+    ) -> None:
+        super().__init__(params, vehicle, separation, 0, slots, time.thread_time_ns)
         self._genuine = self._xy.solve
         self._xy.solve = self._watched  # type: ignore[method-assign]
         self.solve_ms = 0.0
-        self._asked: XyAsked | None = None
+        self._asked: AxesProblem | None = None
 
-    def _watched(
-        self,
-        pos_m: Array,
-        vel_m_s: Array,
-        u_prev: Array,
-        gain_m_s2: Array,
-        drift_m_s2: Array,
-        ref_pos_m: Array,
-        ref_vel_m_s: Array,
-        half_spaces: HalfSpaces | None = None,
-    ) -> AxesSolution:
-        self._asked = XyAsked(pos_m, vel_m_s, u_prev, gain_m_s2, drift_m_s2, ref_pos_m, ref_vel_m_s)
-        answer = self._genuine(pos_m, vel_m_s, u_prev, gain_m_s2, drift_m_s2, ref_pos_m, ref_vel_m_s, half_spaces)
+    def _watched(self, asked: AxesProblem, half_spaces: HalfSpaces | None = None) -> AxesSolution:
+        self._asked = asked
+        answer = self._genuine(asked, half_spaces)
         self.solve_ms = answer.solve_us * 1e-3
         return answer
 
@@ -253,7 +246,7 @@ def tapped(config: Config, solver: str) -> TappedMpc:
     """The controller of `config` with another QP solver."""
     params = config.controller.mpc
     qp = QpParams.model_validate({**params.qp.model_dump(), "solver": solver})
-    return TappedMpc(params.model_copy(update={"qp": qp}), config.separation)
+    return TappedMpc(params.model_copy(update={"qp": qp}), config.vehicle_model, config.separation)
 
 
 class _Running:

@@ -13,20 +13,21 @@ from functools import partial
 
 import numpy as np
 
+from sitl.airframes import PRESETS
 from sitl.attitude import THESIS_GAINS, THESIS_SAMPLE_S, ThesisAttitude
 from sitl.experiments.trace import Array, Sphere, Trace
-from sitl.vehicle import PRESETS, Plant
+from sitl.vehicle import Plant
 from swarmctl.config import Config
 from swarmctl.control.controller import make_controller
 from swarmctl.control.disturbance import DisturbanceObserver
 from swarmctl.control.fallback import rest_plan
 from swarmctl.control.mission import MissionReference
-from swarmctl.control.model import Predictor, acceleration
+from swarmctl.control.model import Predictor
 from swarmctl.control.problem import Problem, Start
 from swarmctl.control.replay import Replay
 from swarmctl.control.separation import KeepOut, keep_out_of_obstacle, keep_out_of_peer, visible
 from swarmctl.control.setpoint import setpoint_of
-from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned, euler_from_quat
+from swarmctl.core.frames import GRAVITY_M_S2, euler_from_quat
 from swarmctl.core.types import (
     AttitudeSetpoint,
     FlightMode,
@@ -40,7 +41,6 @@ from swarmctl.core.types import (
 )
 
 STEP_US = round(THESIS_SAMPLE_S * 1e6)
-_REPLAY_US = 400_000  # as the agent's failsafe
 _TERMINAL_MET_M = 0.01
 
 
@@ -50,7 +50,9 @@ class Pilot:
     def __init__(self, config: Config, agent: int) -> None:
         self._config, self._agent = config, agent
         slots = min(config.swarm.agents - 1, config.separation.max_neighbours) + len(config.obstacles)
-        self._controller = make_controller(config.controller, config.separation, agent, slots, time.perf_counter_ns)
+        self._controller = make_controller(
+            config.controller, config.vehicle_model, config.separation, agent, slots, time.perf_counter_ns
+        )
         self._dt_us, self._steps = self._controller.dt_us, self._controller.steps
         self._predictor = Predictor(config.vehicle_model)
         hover_01 = PRESETS["thesis"].mass_kg * GRAVITY_M_S2 / PRESETS["thesis"].thrust_max_n
@@ -60,6 +62,7 @@ class Pilot:
         self._thrust_01 = hover_01
         brake_m_s2 = config.separation.brake_m_s2
         self._replay = Replay(agent, self._dt_us, self._steps, brake_m_s2)
+        self._replay_us = round(config.agent.failsafe.replay_s * 1e6)
         self._obstacles = tuple(
             Obstacle(np.array(o.center_ned_m), o.radius_m, o.keep_out_m, o.visibility_m, np.array(o.vel_ned_m_s))
             for o in config.obstacles
@@ -67,7 +70,6 @@ class Pilot:
         self.path: PredictedPath | None = None
         self.failed = 0
         self.terminal_missed = 0
-        self.solve_ms: list[float] = []
 
     def reference_ned_m(self, t_us: int) -> Array:
         """Where to be now, (3,)."""
@@ -86,8 +88,7 @@ class Pilot:
         """The setpoint of this step; `path` is what peers may know of it."""
         now_us, estimate = state.t_us, self._observer.estimate
         act_us = now_us + self._predictor.delay_us
-        pos, vel = self._predictor.predict(state, act_us, estimate.disturbance_ned_m_s2)
-        start = Start(act_us, pos, vel, float(body_z_ned(state.q_nb)[2]), self._virtual)
+        start = self._predictor.start(state, act_us, estimate.disturbance_ned_m_s2, self._virtual)
         keep_outs = self._keep_outs(state.pos_ned_m, act_us, peers)
         plan = self._controller.plan(
             Problem(
@@ -98,12 +99,11 @@ class Pilot:
                 self._replay.guess_ned_m(act_us),
             )
         )
-        self.solve_ms.append(plan.times.solve_us * 1e-3)
         self.terminal_missed += plan.terminal_gap_m > _TERMINAL_MET_M
         flown = self._flown(plan, start, keep_outs)
         self.path = self._path(flown)
         self._virtual = flown.virtual[min((act_us - flown.t0_us) // self._dt_us, len(flown.virtual) - 1)]
-        self._predictor.sent(now_us, acceleration(self._virtual))
+        self._predictor.sent(now_us, self._virtual)
         setpoint = setpoint_of(
             self._virtual,
             self._config.mission.yaw_rad,
@@ -130,13 +130,13 @@ class Pilot:
 
     def _flown(self, plan: Plan, start: Start, keep_outs: tuple[KeepOut, ...]) -> Plan:
         disturbance = self._observer.estimate.disturbance_ned_m_s2
-        rest = partial(rest_plan, start, None, disturbance, self._dt_us, self._steps)
+        rest = partial(rest_plan, start, None, disturbance, None, self._dt_us, self._steps)
         self._replay.take(plan, start, keep_outs, rest)
         if plan.status is PlanStatus.OK:
             return plan
         self.failed += 1
         good = self._replay.plan
-        return rest() if good is None or start.t_us - good.t0_us > _REPLAY_US else good
+        return rest() if good is None or start.t_us - good.t0_us > self._replay_us else good
 
     def _path(self, plan: Plan) -> PredictedPath:
         return PredictedPath(self._agent, 1, 1, plan.t0_us, plan.dt_us, 0.0, plan.pos_ned_m)

@@ -21,7 +21,7 @@ from swarmctl.config import Config, load
 from swarmctl.core.clock import SimClock
 from swarmctl.core.types import Array, Phase, PlanStatus, PredictedPath, TickRecord
 from swarmctl.links import topics
-from swarmctl.links.autopilot import PX4, Autopilot
+from swarmctl.links.autopilot import Autopilot
 from swarmctl.links.commands import CodecCommands
 from swarmctl.links.mavlink import Codec
 from swarmctl.links.peers import LocalHub, agent_name
@@ -147,7 +147,7 @@ class Formation:
 
     @staticmethod
     def _slow_path(autopilot: Autopilot, codec: Codec) -> CodecCommands:
-        return CodecCommands(autopilot.send_frame, codec, 1, PX4.external, PX4.hold)
+        return CodecCommands(autopilot.send_frame, codec, 1, lambda: autopilot.dialect)
 
     @property
     def mission_t_s(self) -> float:

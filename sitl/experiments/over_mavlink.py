@@ -9,10 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from sitl.airframes import PRESETS
 from sitl.attitude import THESIS_SAMPLE_S
 from sitl.experiments.trace import Array, Sphere, Trace
 from sitl.lockstep import Lockstep
-from sitl.vehicle import PRESETS
 from swarmctl.config import Config
 from swarmctl.core.frames import euler_from_quat
 from swarmctl.core.types import PlanStatus

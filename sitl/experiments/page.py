@@ -39,7 +39,7 @@ _READING = (
     "asks of itself; least is what no controller can go below: three agents that keep r from each other around one "
     "shared point are at best an equilateral triangle, a sum of sqrt(3) r.",
     "Path plant: every controller acts on the plant itself once in 0.02 s, as in the thesis. Path full: agents fly "
-    "simulated autopilots over MAVLink, with their delays and without torques, which a MAVLink vehicle does not tell.",
+    "simulated autopilots over an ideal MAVLink link, without torques, which a MAVLink vehicle does not tell.",
     "Figures carry the numbers of the thesis. Time is in seconds from mission start, NED: z is negative upwards. The "
     "dashed dark line is the reference, or for angles the setpoint of the attitude controllers. Red boxes in figures "
     "90 to 92 are the extent of the obstacle (solid) and of its keep-out (dashed) on that axis, while the reference "

@@ -99,7 +99,7 @@ def by_flight(jobs: Sequence[Job], flown: dict[str, Trace]) -> dict[str, list[Tr
     """Traces for the page: of a swarm one of each path and kind, of single vehicles all."""
     found: dict[str, list[Trace]] = {}
     for job in jobs:
-        other_radius = job.flight == "circle" and not job.name.split(",")[0].endswith(" 3 x 0.3 m")
+        other_radius = job.radius_m is not None and job.radius_m != thesis.RADII[0] * thesis.SAFE_RADIUS_M
         if job.name in flown and not other_radius:
             found.setdefault(job.flight, []).append(flown[job.name])
     return found

@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy import optimize
 
-from swarmctl.control.axes import Axis, Horizon
+from swarmctl.control.axes import AxesProblem, Axis, Horizon
 from swarmctl.control.separation import KeepOut
 from swarmctl.core.types import Array
 
@@ -28,19 +28,6 @@ MAX_ITERATIONS = 400  # fmincon's own limit
 KEPT_M = 1e-6  # fmincon's tolerance of a constraint
 _SOLVED, _LIMIT = 0, 9  # SLSQP's exit modes
 _LEAST_M = 1e-9
-
-
-@dataclass(frozen=True, slots=True)
-class XyAsked:
-    """One tick's x-y problem: where the prediction starts from and where it is to go."""
-
-    pos_m: Array  # (2,)
-    vel_m_s: Array  # (2,)
-    u_prev: Array  # (2,)
-    gain_m_s2: Array  # (Hp, 2) acceleration of a unit input over each step
-    drift_m_s2: Array  # (2,)
-    ref_pos_m: Array  # (Hp, 2)
-    ref_vel_m_s: Array  # (Hp, 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,22 +54,18 @@ class NonlinearXy:
     """
 
     def __init__(
-        self, axes: Sequence[Axis], horizon: Horizon, asked: XyAsked, keep_outs: Sequence[KeepOut], z_ned_m: Array
+        self, axes: Sequence[Axis], horizon: Horizon, asked: AxesProblem, keep_outs: Sequence[KeepOut], z_ned_m: Array
     ) -> None:
-        hp, self._hc, dt_s = horizon.prediction, horizon.control, horizon.dt_s
+        hp, self._hc = horizon.prediction, horizon.control
         count = len(axes)
         u_min, u_max = np.array([a.u_min for a in axes]), np.array([a.u_max for a in axes])
         du_max = np.repeat([a.du_max for a in axes], self._hc)
         self._u_prev = np.clip(asked.u_prev, u_min, u_max)
-        steps = np.arange(1, hp + 1)
-        since = steps[:, None] - steps  # (Hp, Hp) steps after the one an acceleration has acted in
-        half = 0.0 if horizon.euler else 0.5
-        to_pos, to_vel = dt_s**2 * np.where(since >= 0, since + half, 0.0), dt_s * (since >= 0)
-        held = (np.minimum(steps[:, None] - 1, self._hc - 1) >= np.arange(self._hc)).astype(float)  # (Hp, Hc)
+        (to_pos, to_vel), (glide_s, kept) = horizon.of_acceleration(), horizon.of_velocity_s()
         accel = asked.gain_m_s2 * self._u_prev + asked.drift_m_s2  # (Hp, 2)
-        self._free_m = (asked.pos_m + (dt_s * steps)[:, None] * asked.vel_m_s + to_pos @ accel).T.ravel()  # (2 Hp,)
-        free_vel = (asked.vel_m_s + to_vel @ accel).T.ravel()
-        driven = [asked.gain_m_s2[:, i, None] * held for i in range(count)]
+        self._free_m = (asked.pos_m + glide_s[:, None] * asked.vel_m_s + to_pos @ accel).T.ravel()  # (2 Hp,)
+        free_vel = (kept[:, None] * asked.vel_m_s + to_vel @ accel).T.ravel()
+        driven = [asked.gain_m_s2[:, i, None] * horizon.held() for i in range(count)]
         self._push = _blocks([to_pos @ d for d in driven])  # (2 Hp, 2 Hc) metres of a unit increment
         push_vel = _blocks([to_vel @ d for d in driven])
         weight_pos, weight_vel, weight_moves = (

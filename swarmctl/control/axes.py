@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
+import numpy as np
+
+from swarmctl.control.lag import Lag
 from swarmctl.core.types import Array
 
 Terminal = Literal["none", "position", "position_velocity", "region"]
@@ -23,6 +27,7 @@ class Axis:
     u_rest: float  # input that holds still
     gain_m_s2: float  # nominal acceleration of a unit input; scales cost and terminal region
     terminal: Terminal
+    lag: Lag | None = None  # how the input is realised; None at once
 
     @property
     def u_scale(self) -> float:
@@ -32,12 +37,44 @@ class Axis:
 
 @dataclass(frozen=True, slots=True)
 class Horizon:
-    """Lengths and sample time of the prediction."""
+    """Lengths and sample time of the prediction, and the motion of a point under drag over it: p'' = a - drag p'."""
 
     control: int
     prediction: int
     dt_s: float
     euler: bool  # forward Euler as in the thesis (3.6), otherwise exact for a held input
+    drag_1_s: float = 0.0
+
+    def t_s(self) -> Array:
+        """(Hp,) times of steps 1..Hp."""
+        return np.asarray(self.dt_s * np.arange(1, self.prediction + 1), np.float64)
+
+    def held(self) -> Array:
+        """(Hp, Hc) inputs over each step of a unit increment at each control step."""
+        steps, moves = np.arange(self.prediction), np.arange(self.control)
+        return np.asarray(np.minimum.outer(steps, moves) == moves, np.float64)
+
+    def of_velocity_s(self) -> tuple[Array, Array]:
+        """(Hp,), (Hp,) displacement [s] and velocity [1] at steps 1..Hp of a unit velocity at the start."""
+        t_s, drag = self.t_s(), self.drag_1_s
+        if drag == 0.0:
+            return t_s, np.ones(self.prediction)
+        left = np.exp(-drag * t_s)
+        return (1.0 - left) / drag, left
+
+    def of_acceleration(self) -> tuple[Array, Array]:
+        """(Hp, Hp), (Hp, Hp) displacement [s2] and velocity [s] at steps 1..Hp of unit accelerations over each step."""
+        dt_s, drag = self.dt_s, self.drag_1_s
+        steps = np.arange(1, self.prediction + 1)
+        since = steps[:, None] - steps[None, :]  # steps after the one an acceleration has acted in
+        acted = since >= 0
+        if drag == 0.0:
+            own = 0.0 if self.euler else 0.5
+            return dt_s**2 * np.where(acted, since + own, 0.0), np.where(acted, dt_s, 0.0)
+        gained = -math.expm1(-drag * dt_s) / drag  # velocity at the end of its own step
+        left = np.exp(-drag * dt_s * np.maximum(since, 0))
+        own = 0.0 if self.euler else (dt_s - gained) / drag
+        return np.where(acted, own + gained * (1.0 - left) / drag, 0.0), np.where(acted, gained * left, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,15 +95,30 @@ class Penalties:
 class HalfSpaces:
     """`normal[s, k] . p_k >= offset[s, k]` for slots s and steps k = 1..Hp; offset -inf switches a row off.
 
-    Only every fourth step from the end of the control horizon on becomes a row: earlier ones can't be influenced, and
-    between rows 0.08 s apart the certificate looks at true distances anyway. One more row a slot looks beyond
-    the horizon: `normal[s, -1] . (p_Hp + stop_s[s] v_Hp) >= stop_offset_m[s]`, so that there is room left to stop.
+    Only steps 0.08 s apart become rows, from the first on that moves can change: between them the certificate looks at
+    true distances anyway. One more row a slot looks beyond the horizon, so that there is room left to stop:
+    `normal[s, -1] . (p_Hp + stop_s[s] v_Hp) >= stop_offset_m[s]`.
     """
 
     normal: Array  # (slots, Hp, axes)
     offset_m: Array  # (slots, Hp)
     stop_s: Array  # (slots,)
     stop_offset_m: Array  # (slots,)
+
+
+@dataclass(frozen=True, slots=True)
+class AxesProblem:
+    """One receding-horizon step: where the prediction starts from and where it is to go."""
+
+    pos_m: Array  # (axes,)
+    vel_m_s: Array  # (axes,)
+    u_prev: Array  # (axes,) input now held
+    gain_m_s2: Array  # (Hp, axes) acceleration of a unit input over each step, sign included
+    drift_m_s2: Array  # (axes,) acceleration without input
+    ref_pos_m: Array  # (Hp, axes) at steps 1..Hp
+    ref_vel_m_s: Array  # (Hp, axes)
+    realised: Array | None = None  # (axes,) what of the input acts at the start; None as held. For axes with a lag
+    realised_1_s: Array | None = None  # (axes,) its rate; None at rest
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,26 +1,30 @@
-"""Condensed linear MPC over input increments for one, two or three double-integrator axes (thesis 3.9-3.31).
+"""Condensed linear MPC over input increments for one, two or three axes (thesis 3.9-3.31).
 
-Every axis obeys `p'' = gain(k) u + drift`. The decision variables are the increments of `u` over the control horizon
-Hc, scaled to about [-1, 1]; after Hc the input stays. Rows: increment bounds, input bounds, softened terminal
-conditions, and half-spaces `n . p_k >= b_k` with one slack a slot. Nothing here knows which axis is which.
+Every axis obeys `p'' = gain(k) a + drift - drag p'`, where `a` is the input u or, with a lag, what follows it. The
+decision variables are the increments of `u` over the control horizon Hc, scaled to about [-1, 1]; after Hc the input
+stays. Rows: increment bounds, input bounds, softened terminal conditions, and half-spaces `n . p_k >= b_k` with one
+slack a slot. Nothing here knows which axis is which.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
-from swarmctl.control.axes import AxesSolution, Axis, HalfSpaces, Horizon, Penalties
+from swarmctl.control.axes import AxesProblem, AxesSolution, Axis, HalfSpaces, Horizon, Penalties
+from swarmctl.control.lag import lag_response
 from swarmctl.control.qp import INFINITY, QpParams, make_solver, pattern_index
 from swarmctl.control.terminal import TerminalRegion, terminal_region
 from swarmctl.core.types import Array
 
 _SLACK_SCALE_M = 0.1  # slack variables are in units of this, so that they are about 1 like all others
 _SLACK_USED_M = 1e-3
+_MOVES_S = 0.12  # what is flown in this time after the dead time is decided already
 _REACHED_01 = 0.998  # of what bounded increments can reach is asked for in place of an end farther away
-_ROW_STRIDE = 4  # neighbouring rows are nearly parallel, which slows a first-order solver down
+_ROW_EVERY_S = 0.08  # neighbouring rows are nearly parallel, which slows a first-order solver down
 
 
 class CondensedMpc:
@@ -62,19 +66,16 @@ class CondensedMpc:
 
     def _build_response(self) -> None:
         """Positions and velocities at steps 1..Hp of a unit acceleration held over each step; what is constant."""
-        hp, hc, dt_s = self.horizon.prediction, self.horizon.control, self.horizon.dt_s
-        steps = np.arange(1, hp + 1)
-        since = steps[:, None] - steps[None, :]  # (Hp, Hp) steps after the one an acceleration has acted in
-        acted = since >= 0
-        self._pos_of_accel = dt_s**2 * np.where(acted, since + (0.0 if self.horizon.euler else 0.5), 0.0)
-        self._vel_of_accel = dt_s * acted
-        self._hold = (np.minimum.outer(np.arange(hp), np.arange(hc)) == np.arange(hc)).astype(float)  # (Hp, Hc)
-        self._t_s = dt_s * steps  # (Hp,)
-        self._checked = np.arange(hp - 1, min(hc, hp - 1) - 1, -_ROW_STRIDE)[
-            ::-1
-        ]  # 0-based steps that get half-space rows
+        hp = self.horizon.prediction
+        self._pos_of_accel, self._vel_of_accel = self.horizon.of_acceleration()
+        self._pos_of_vel, self._vel_of_vel = self.horizon.of_velocity_s()
+        self._hold = self.horizon.held()
+        self._lags = [lag_response(a.lag, self.horizon.dt_s, hp) for a in self.axes]
+        self._acted = np.stack([response.of_command @ self._hold for response in self._lags])  # (axes, Hp, Hc)
+        first, stride = self.first_row(), max(1, round(_ROW_EVERY_S / self.horizon.dt_s))
+        self._checked = np.arange(hp - 1, first - 1, -stride)[::-1]  # 0-based steps that get half-space rows
         step_m_s2 = max(a.du_max * a.gain_m_s2 for a in self.axes)
-        response = (self._pos_of_accel @ self._hold)[self._checked].max(axis=1) * step_m_s2
+        response = (self._pos_of_accel @ self._acted[0])[self._checked].max(axis=1) * step_m_s2
         response = np.append(response, response[-1])  # and the stopping row
         self._row_scale = 1.0 / np.maximum(response, 0.01)  # rows of about unit size suit a first-order solver
 
@@ -133,12 +134,12 @@ class CondensedMpc:
 
     def _build_cost(self) -> None:
         n, hc = len(self.axes), self.horizon.control
-        phi_pos, phi_vel = self._pos_of_accel @ self._hold, self._vel_of_accel @ self._hold  # (Hp, Hc)
         largest = 0.0
         for i, axis in enumerate(self.axes):
+            phi_pos, phi_vel = self._pos_of_accel @ self._acted[i], self._vel_of_accel @ self._acted[i]  # (Hp, Hc)
             gram = axis.q_pos * phi_pos.T @ phi_pos + axis.q_vel * phi_vel.T @ phi_vel
             if i in self._regions:
-                end = np.stack([phi_pos[-1], phi_vel[-1], self._hold[-1]])  # (3, Hc)
+                end = np.stack([phi_pos[-1], phi_vel[-1], self._acted[i, -1]])  # (3, Hc)
                 gram += end.T @ self._regions[i].beyond @ end
             largest = max(largest, 2.0 * (axis.du_max * axis.gain_m_s2) ** 2 * float(np.max(np.diag(gram))))
         self._cost_scale = 1.0 / max(largest, 1e-12)
@@ -165,36 +166,19 @@ class CondensedMpc:
         self._q_soft = np.full(soft + self.slots, weights.floor * _SLACK_SCALE_M * self._cost_scale)
         assert len(self._q_soft) == self._columns - n * hc
 
-    def solve(
-        self,
-        pos_m: Array,
-        vel_m_s: Array,
-        u_prev: Array,
-        gain_m_s2: Array,
-        drift_m_s2: Array,
-        ref_pos_m: Array,
-        ref_vel_m_s: Array,
-        half_spaces: HalfSpaces | None = None,
-    ) -> AxesSolution:
-        """One receding-horizon step.
-
-        Args:
-            pos_m, vel_m_s: (axes,) state the prediction starts from.
-            u_prev: (axes,) input now held.
-            gain_m_s2: (Hp, axes) acceleration of a unit input over each step, sign included.
-            drift_m_s2: (axes,) acceleration without input.
-            ref_pos_m, ref_vel_m_s: (Hp, axes) at steps 1..Hp.
-            half_spaces: at most `slots` families; None for none.
-        """
-        u_prev = np.clip(u_prev, self._u_min, self._u_max)
-        accel = gain_m_s2 * u_prev + drift_m_s2  # (Hp, axes)
-        free_pos = pos_m + self._t_s[:, None] * vel_m_s + self._pos_of_accel @ accel  # (Hp, axes)
-        free_vel = vel_m_s + self._vel_of_accel @ accel
-        driven = gain_m_s2.T[:, :, None] * self._hold  # (axes, Hp, Hc)
+    def solve(self, asked: AxesProblem, half_spaces: HalfSpaces | None = None) -> AxesSolution:
+        """One receding-horizon step, with at most `slots` families of half-spaces; None for none."""
+        gain_m_s2, ref_pos_m, ref_vel_m_s = asked.gain_m_s2, asked.ref_pos_m, asked.ref_vel_m_s
+        u_prev = np.clip(asked.u_prev, self._u_min, self._u_max)
+        held = np.broadcast_to(u_prev, gain_m_s2.shape)
+        accel = gain_m_s2 * self.realised(held, asked.realised, asked.realised_1_s) + asked.drift_m_s2  # (Hp, axes)
+        free_pos, free_vel = self.motion(asked.pos_m, asked.vel_m_s, accel)
+        driven = gain_m_s2.T[:, :, None] * self._acted  # (axes, Hp, Hc)
         phi_pos, phi_vel = self._pos_of_accel @ driven, self._vel_of_accel @ driven
         pos_error, vel_error = free_pos - ref_pos_m, free_vel - ref_vel_m_s
         ref_accel = (ref_vel_m_s[-1] - ref_vel_m_s[-2]) / self.horizon.dt_s if len(ref_vel_m_s) > 1 else 0.0 * u_prev
-        ends = np.stack([pos_error[-1], vel_error[-1], accel[-1] - ref_accel])  # (3, axes) without any move
+        surplus = accel[-1] - self.horizon.drag_1_s * ref_vel_m_s[-1] - ref_accel
+        ends = np.stack([pos_error[-1], vel_error[-1], surplus])  # (3, axes) without any move
         q = self._fill_cost(gain_m_s2, phi_pos, phi_vel, pos_error, vel_error, ends)
         self._fill_inputs(u_prev)
         self._fill_terminals(phi_pos[:, -1], phi_vel[:, -1], u_prev, pos_error[-1], vel_error[-1])
@@ -218,7 +202,7 @@ class CondensedMpc:
         vel = free_vel + np.einsum("akc,ca->ka", phi_vel, moves)
         for i, region in self._regions.items():
             end = np.array([(pos - ref_pos_m)[-1, i], (vel - ref_vel_m_s)[-1, i], ends[2, i]])
-            end[2] += gain_m_s2[-1, i] * float(self._hold[-1] @ moves[:, i])
+            end[2] += gain_m_s2[-1, i] * float(self._acted[i, -1] @ moves[:, i])
             gap_m = max(gap_m, region.outside_m(end))
         return AxesSolution(
             solution.x is not None,
@@ -233,10 +217,29 @@ class CondensedMpc:
             solve_us,
         )
 
+    def first_row(self) -> int:
+        """0-based step from which on the moves can change a position by enough to matter."""
+        slowest_s = max((a.lag.ramp_delay_s for a in self.axes if a.lag is not None), default=0.0)
+        steps = math.ceil((_MOVES_S + slowest_s) / self.horizon.dt_s - 1e-9)
+        return min(steps, self.horizon.prediction - 1)
+
+    def realised(self, u: Array, at_start: Array | None, rate_1_s: Array | None) -> Array:
+        """Mean realised inputs (Hp, axes) over each step of commanded ones (Hp, axes).
+
+        `at_start` (axes,) acts already, None as commanded first, and changes by `rate_1_s` (axes,), None not at all.
+        """
+        acts = np.empty(u.shape)
+        for i, lag in enumerate(self._lags):
+            begins = u[0, i] if at_start is None else at_start[i]
+            acts[:, i] = lag.of_command @ u[:, i] + begins * lag.of_tilt
+            if rate_1_s is not None:
+                acts[:, i] += rate_1_s[i] * lag.of_rate_s
+        return acts
+
     def motion(self, pos_m: Array, vel_m_s: Array, accel_m_s2: Array) -> tuple[Array, Array]:
         """Positions and velocities (Hp, axes) under accelerations (Hp, axes) held over each step."""
-        pos = pos_m + self._t_s[:, None] * vel_m_s + self._pos_of_accel @ accel_m_s2
-        return pos, vel_m_s + self._vel_of_accel @ accel_m_s2
+        pos = pos_m + self._pos_of_vel[:, None] * vel_m_s + self._pos_of_accel @ accel_m_s2
+        return pos, self._vel_of_vel[:, None] * vel_m_s + self._vel_of_accel @ accel_m_s2
 
     def _fill_cost(
         self, gain_m_s2: Array, phi_pos: Array, phi_vel: Array, pos_error: Array, vel_error: Array, ends: Array
@@ -249,7 +252,7 @@ class CondensedMpc:
             hessian = axis.q_pos * (phi_pos[i].T @ phi_pos[i]) + axis.q_vel * (phi_vel[i].T @ phi_vel[i])
             slope = axis.q_pos * (pos_error[:, i] @ phi_pos[i]) + axis.q_vel * (vel_error[:, i] @ phi_vel[i])
             if i in self._regions:
-                end = np.stack([phi_pos[i, -1], phi_vel[i, -1], gain_m_s2[-1, i] * self._hold[-1]])  # (3, Hc)
+                end = np.stack([phi_pos[i, -1], phi_vel[i, -1], gain_m_s2[-1, i] * self._acted[i, -1]])  # (3, Hc)
                 pull = end.T @ self._regions[i].beyond
                 hessian += pull @ end
                 slope += pull @ ends[:, i]

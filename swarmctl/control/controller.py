@@ -9,6 +9,7 @@ from typing import Literal, Protocol
 import numpy as np
 
 from swarmctl.control.joint_mpc import JointMpc
+from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc import MpcParams, SwarmMpc
 from swarmctl.control.pid import PidController, PidParams
 from swarmctl.control.problem import Problem
@@ -93,7 +94,12 @@ class _OpenLoop:
 
 
 def make_controller(
-    params: ControllerParams, separation: SeparationParams, agent: int, slots: int, stopwatch_ns: Callable[[], int]
+    params: ControllerParams,
+    vehicle: VehicleModelParams,
+    separation: SeparationParams,
+    agent: int,
+    slots: int,
+    stopwatch_ns: Callable[[], int],
 ) -> Controller:
     """The controller a config asks for; `slots` is how many keep-outs it can hold at once."""
     if params.kind == "pid":
@@ -101,6 +107,6 @@ def make_controller(
     if params.kind == "open_loop":
         return _OpenLoop(params.mpc)
     if params.kind == "dmpc3":
-        return _Mpc(JointMpc(params.mpc, separation, agent, slots, stopwatch_ns), False)
+        return _Mpc(JointMpc(params.mpc, vehicle, separation, agent, slots, stopwatch_ns), False)
     alone = params.kind == "mpc"
-    return _Mpc(SwarmMpc(params.mpc, separation, agent, 0 if alone else slots, stopwatch_ns), alone)
+    return _Mpc(SwarmMpc(params.mpc, vehicle, separation, agent, 0 if alone else slots, stopwatch_ns), alone)

@@ -34,6 +34,32 @@ class Estimate:
     hover_thrust_01: float
 
 
+class HoverThrust:
+    """Estimate of the thrust setpoint that carries the weight; a wrong mass or battery then costs no altitude."""
+
+    def __init__(self, hover_thrust_01: float, time_s: float) -> None:
+        self.value_01, self._time_s = hover_thrust_01, time_s
+        self._least, self._most = 0.4 * hover_thrust_01, min(0.95, 2.2 * hover_thrust_01)
+
+    def learn(self, thrust_01: float) -> None:
+        """Take over the vertical thrust the autopilot itself hovers with, before the bridge flies."""
+        self.value_01 += 0.2 * (min(self._most, max(self._least, thrust_01)) - self.value_01)
+
+    def explain(self, down_m_s2: float, thrust_01: float, dt_s: float) -> float:
+        """Move a share of a vertical remainder into the hover thrust: thrust g / hover must grow by `-down_m_s2`.
+
+        Returns:
+            what has moved [m/s2]; to be taken off the remainder.
+        """
+        share = dt_s / self._time_s
+        specific = max(1.0, thrust_01 * GRAVITY_M_S2 / self.value_01)
+        factor = 1.0 + share * down_m_s2 / specific
+        hover = min(self._most, max(self._least, self.value_01 * factor))
+        moved = specific * (hover / self.value_01 - 1.0)
+        self.value_01 = hover
+        return moved
+
+
 class DisturbanceObserver:
     """Second-order observer on velocity, per axis, and an integrating hover-thrust estimate.
 
@@ -42,31 +68,30 @@ class DisturbanceObserver:
 
     def __init__(self, params: DisturbanceParams, hover_thrust_01: float) -> None:
         self._params = params
-        self._hover_01 = hover_thrust_01
-        self._hover_min, self._hover_max = 0.4 * hover_thrust_01, min(0.95, 2.2 * hover_thrust_01)
+        self._hover = HoverThrust(hover_thrust_01, params.hover_time_s)
         self._disturbance = np.zeros(3)
         self._velocity: Array | None = None
         self._t_us = 0
 
     @property
     def estimate(self) -> Estimate:
-        return Estimate(self._disturbance, self._hover_01)
+        return Estimate(self._disturbance, self._hover.value_01)
 
     def reset(self) -> None:
         """Forget velocity and disturbance (not the hover thrust): the vehicle was flown by somebody else."""
         self._velocity = None
         self._disturbance = np.zeros(3)
 
-    def update(self, state: VehicleState, thrust_01: float) -> Estimate:
-        """Take in one new sample; `thrust_01` is what has acted since the last one."""
-        if not self._params.enabled:
+    def update(self, state: VehicleState, thrust_01: float | None) -> Estimate:
+        """Take in one new sample; `thrust_01` is what has acted since the last one, None when nobody knows."""
+        if not self._params.enabled or thrust_01 is None:
             return self.estimate
         if self._velocity is None or not 0 < state.t_us - self._t_us < 200_000:
             self._velocity, self._t_us = state.vel_ned_m_s, state.t_us
             return self.estimate
         dt_s = (state.t_us - self._t_us) * 1e-6
         self._t_us = state.t_us
-        specific_m_s2 = thrust_01 * GRAVITY_M_S2 / self._hover_01
+        specific_m_s2 = thrust_01 * GRAVITY_M_S2 / self._hover.value_01
         model = -specific_m_s2 * body_z_ned(state.q_nb)
         model[2] += GRAVITY_M_S2
         predicted = self._velocity + dt_s * (model + self._disturbance)
@@ -76,21 +101,15 @@ class DisturbanceObserver:
         disturbance = self._disturbance + dt_s * pole * pole * innovation
         limit = self._params.limit_m_s2
         self._disturbance = np.clip(disturbance, -limit, limit)
-        self._move_into_hover(dt_s, thrust_01)
+        moved = self._hover.explain(float(self._disturbance[2]), thrust_01, dt_s)
+        self._disturbance = self._disturbance - np.array([0.0, 0.0, moved])
         return self.estimate
 
     def learn_hover(self, thrust_01: float) -> None:
-        """Take over the vertical thrust the autopilot itself hovers with, before the bridge flies."""
+        """See `HoverThrust.learn`."""
         if self._params.enabled:
-            self._hover_01 += 0.2 * (min(self._hover_max, max(self._hover_min, thrust_01)) - self._hover_01)
+            self._hover.learn(thrust_01)
 
-    def _move_into_hover(self, dt_s: float, thrust_01: float) -> None:
-        """Explain the vertical remainder by hover thrust: thrust g / hover must grow by -d_z."""
-        share = dt_s / self._params.hover_time_s
-        down = float(self._disturbance[2])
-        specific = max(1.0, thrust_01 * GRAVITY_M_S2 / self._hover_01)
-        factor = 1.0 + share * down / specific
-        hover = min(self._hover_max, max(self._hover_min, self._hover_01 * factor))
-        moved = specific * (hover / self._hover_01 - 1.0)
-        self._hover_01 = hover
-        self._disturbance = self._disturbance - np.array([0.0, 0.0, moved])
+    def state(self, reported: VehicleState) -> VehicleState:
+        """The state to plan from: as reported."""
+        return reported

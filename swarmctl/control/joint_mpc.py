@@ -13,11 +13,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from swarmctl.control.axes import AxesSolution, HalfSpaces, Penalties
+from swarmctl.control.axes import AxesProblem, AxesSolution, HalfSpaces, Penalties
 from swarmctl.control.condensed import CondensedMpc
-from swarmctl.control.mpc import MpcParams, first_guess, judged, nearest
+from swarmctl.control.model import VehicleModelParams
+from swarmctl.control.mpc import MpcParams, first_guess, judged, near_half_spaces
 from swarmctl.control.problem import Problem
-from swarmctl.control.separation import SeparationParams, half_spaces
+from swarmctl.control.separation import SeparationParams
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.types import Array, Plan
 
@@ -31,6 +32,7 @@ class JointMpc:
     def __init__(
         self,
         params: MpcParams,
+        vehicle: VehicleModelParams,
         separation: SeparationParams,
         own_tie: int,
         slots: int,
@@ -42,8 +44,8 @@ class JointMpc:
         self.steps = self.longest = params.horizon_xy
         eps, eps_relative = _TIGHTER_01 * params.qp.eps, _TIGHTER_01 * params.qp.eps_relative
         self._mpc = CondensedMpc(
-            (*params.horizontal(), params.vertical()),
-            params.horizon(params.control_xy, params.horizon_xy),
+            (*params.horizontal(vehicle), params.vertical()),
+            params.horizon(params.control_xy, params.horizon_xy, vehicle),
             slots,
             separation.relax_01,
             Penalties(),
@@ -56,29 +58,23 @@ class JointMpc:
         began_ns = self._stopwatch_ns()
         start, steps = problem.start, self.steps
         guess = first_guess(problem, self._params.dt_s, steps)
-        spaces = half_spaces(
-            nearest(problem.keep_outs, guess, self._slots),
-            guess,
-            problem.reference.pos_ned_m[steps],
-            start.vel_ned_m_s,
-            self._params.dt_s,
-            self._tie,
-            self._separation,
-        )
+        spaces = near_half_spaces(problem, guess, 3, self._slots, self._params.dt_s, self._tie, self._separation)
         held = max(_THRUST_LEAST_M_S2, float(start.virtual[2]))
         first = self._solve(problem, np.full(steps, held), spaces)
         found = self._solve(problem, first.u[:, 2], spaces)
         found = replace(found, solve_us=first.solve_us + found.solve_us, iterations=first.iterations + found.iterations)
         thrust = found.u[:, 2:]
-        along = np.column_stack([found.u[:, :2], np.full(steps, start.cos_tilt)])  # (steps, 3)
+        tilt, rate = self._acting(problem)
+        acting = self._mpc.realised(found.u, tilt, rate)
+        along = np.column_stack([acting[:, :2], np.full(steps, start.cos_tilt)])  # (steps, 3)
         pos, vel = self._mpc.motion(start.pos_ned_m, start.vel_ned_m_s, self._drift(problem) - thrust * along)
         return judged(
-            problem, pos, vel, found.u, (found,), self._params.control_xy, self.dt_us, began_ns, self._stopwatch_ns
+            problem, pos, vel, found.u, (found,), self._mpc.first_row(), self.dt_us, began_ns, self._stopwatch_ns
         )
 
     def _solve(self, problem: Problem, thrust_m_s2: Array, spaces: HalfSpaces | None) -> AxesSolution:
         steps, start, reference = self.steps, problem.start, problem.reference
-        return self._mpc.solve(
+        asked = AxesProblem(
             start.pos_ned_m,
             start.vel_ned_m_s,
             start.virtual,
@@ -86,8 +82,15 @@ class JointMpc:
             self._drift(problem),
             reference.pos_ned_m[1 : steps + 1],
             reference.vel_ned_m_s[1 : steps + 1],
-            spaces,
+            *self._acting(problem),
         )
+        return self._mpc.solve(asked, spaces)
+
+    @staticmethod
+    def _acting(problem: Problem) -> tuple[Array, Array]:
+        """What of the three inputs acts at the start, and its rate."""
+        start = problem.start
+        return np.append(start.tilt, start.virtual[2]), np.append(start.tilt_rate_1_s, 0.0)
 
     @staticmethod
     def _drift(problem: Problem) -> Array:

@@ -14,9 +14,10 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from swarmctl.control.axes import AxesSolution, Axis, Horizon, Penalties, Terminal
+from swarmctl.control.axes import AxesProblem, AxesSolution, Axis, HalfSpaces, Horizon, Penalties, Terminal
 from swarmctl.control.condensed import CondensedMpc
-from swarmctl.control.problem import Problem, Start
+from swarmctl.control.model import VehicleModelParams
+from swarmctl.control.problem import Problem
 from swarmctl.control.qp import QpParams
 from swarmctl.control.separation import KeepOut, SeparationParams, certify, half_spaces
 from swarmctl.core.frames import GRAVITY_M_S2
@@ -35,7 +36,7 @@ class AxisWeights(Params):
 
 
 class MpcParams(Params):
-    """Horizons, weights and bounds; the defaults are the thesis' swarm flight (its section 4.3) but for z's end."""
+    """Horizons, weights and bounds; the defaults are the thesis' swarm flight (its section 4.3) but for z's end and r."""
 
     dt_s: float = Field(0.02, gt=0.001, le=0.5)
     discretisation: Literal["zoh", "euler"] = "zoh"  # euler is the thesis' (3.6)
@@ -57,21 +58,21 @@ class MpcParams(Params):
     qp: QpParams = QpParams()
 
     def vertical(self) -> Axis:
-        """z: the input is thrust over mass."""
+        """z: the input is thrust over mass, which follows at once."""
         w = self.z
         least, most, step = self.thrust_min_m_s2, self.thrust_max_m_s2, self.dthrust_max_m_s2
         return Axis(w.q_pos, w.q_vel, w.r, least, most, step, GRAVITY_M_S2, 1.0, self.terminal_z)
 
-    def horizontal(self) -> tuple[Axis, Axis]:
-        """x and y: the inputs are u_x and u_y."""
-        return self._lateral(self.x), self._lateral(self.y)
+    def horizontal(self, vehicle: VehicleModelParams) -> tuple[Axis, Axis]:
+        """x and y: the inputs are u_x and u_y, which the attitude follows."""
+        return self._lateral(self.x, vehicle), self._lateral(self.y, vehicle)
 
-    def _lateral(self, w: AxisWeights) -> Axis:
-        u, du = self.u_max, self.du_max
-        return Axis(w.q_pos, w.q_vel, w.r, -u, u, du, 0.0, GRAVITY_M_S2, self.terminal_xy)
+    def _lateral(self, w: AxisWeights, vehicle: VehicleModelParams) -> Axis:
+        u, du = min(self.u_max, vehicle.u_max()), self.du_max
+        return Axis(w.q_pos, w.q_vel, w.r, -u, u, du, 0.0, GRAVITY_M_S2, self.terminal_xy, vehicle.lag())
 
-    def horizon(self, control: int, prediction: int) -> Horizon:
-        return Horizon(control, prediction, self.dt_s, self.discretisation == "euler")
+    def horizon(self, control: int, prediction: int, vehicle: VehicleModelParams) -> Horizon:
+        return Horizon(control, prediction, self.dt_s, self.discretisation == "euler", vehicle.drag_1_s)
 
 
 class SwarmMpc:
@@ -80,6 +81,7 @@ class SwarmMpc:
     def __init__(
         self,
         params: MpcParams,
+        vehicle: VehicleModelParams,
         separation: SeparationParams,
         own_tie: int,
         slots: int,
@@ -92,7 +94,7 @@ class SwarmMpc:
         self.longest = max(params.horizon_xy, params.horizon_z)  # reference steps needed
         self._z = CondensedMpc(
             (params.vertical(),),
-            params.horizon(params.control_z, params.horizon_z),
+            params.horizon(params.control_z, params.horizon_z, vehicle),
             0,
             1.0,
             Penalties(),
@@ -101,8 +103,8 @@ class SwarmMpc:
         )
         self._xy, self._xy_alone = (  # without anything to keep clear of the problem is small and solved exactly
             CondensedMpc(
-                params.horizontal(),
-                params.horizon(params.control_xy, params.horizon_xy),
+                params.horizontal(vehicle),
+                params.horizon(params.control_xy, params.horizon_xy, vehicle),
                 room,
                 separation.relax_01,
                 Penalties(),
@@ -120,16 +122,8 @@ class SwarmMpc:
         count = min(steps, len(up.pos_m))
         guess = first_guess(problem, self._params.dt_s, steps)
         guess[1 : count + 1, 2] = up.pos_m[:count, 0]
-        spaces = half_spaces(
-            nearest(problem.keep_outs, guess, self._slots),
-            guess,
-            problem.reference.pos_ned_m[steps, :2],
-            start.vel_ned_m_s[:2],
-            self._params.dt_s,
-            self._tie,
-            self._separation,
-        )
-        across = (self._xy_alone if spaces is None else self._xy).solve(
+        spaces = near_half_spaces(problem, guess, 2, self._slots, self._params.dt_s, self._tie, self._separation)
+        asked = AxesProblem(
             start.pos_ned_m[:2],
             start.vel_ned_m_s[:2],
             start.virtual[:2],
@@ -137,20 +131,22 @@ class SwarmMpc:
             problem.disturbance_ned_m_s2[:2],
             problem.reference.pos_ned_m[1 : steps + 1, :2],
             problem.reference.vel_ned_m_s[1 : steps + 1, :2],
-            spaces,
+            start.tilt,
+            start.tilt_rate_1_s,
         )
+        across = (self._xy_alone if spaces is None else self._xy).solve(asked, spaces)
         pos, vel = np.empty((steps, 3)), np.zeros((steps, 3))
         virtual = np.empty((steps, 3))
         pos[:, :2], vel[:, :2], virtual[:, :2] = across.pos_m, across.vel_m_s, across.u
         pos[:count, 2:], vel[:count, 2:], virtual[:count, 2:] = up.pos_m[:count], up.vel_m_s[:count], up.u[:count]
         pos[count:, 2], virtual[count:, 2] = up.pos_m[-1, 0], up.u[-1, 0]
         return judged(
-            problem, pos, vel, virtual, (up, across), self._params.control_xy, self.dt_us, began_ns, self._stopwatch_ns
+            problem, pos, vel, virtual, (up, across), self._xy.first_row(), self.dt_us, began_ns, self._stopwatch_ns
         )
 
     def _solve_z(self, problem: Problem) -> AxesSolution:
         steps, start, reference = self._params.horizon_z, problem.start, problem.reference
-        return self._z.solve(
+        asked = AxesProblem(
             start.pos_ned_m[2:],
             start.vel_ned_m_s[2:],
             start.virtual[2:],
@@ -159,6 +155,7 @@ class SwarmMpc:
             reference.pos_ned_m[1 : steps + 1, 2:],
             reference.vel_ned_m_s[1 : steps + 1, 2:],
         )
+        return self._z.solve(asked)
 
     def _thrust_ahead(self, up: AxesSolution) -> Array:
         """Thrust over mass (steps,) that x-y is predicted with."""
@@ -185,6 +182,15 @@ def nearest(keep_outs: Sequence[KeepOut], guess_ned_m: Array, slots: int) -> lis
     return sorted(keep_outs, key=gap_m)[:slots]
 
 
+def near_half_spaces(
+    problem: Problem, guess_ned_m: Array, axes: int, slots: int, dt_s: float, own_tie: int, params: SeparationParams
+) -> HalfSpaces | None:
+    """Distances to what comes nearest, linearised around the guess (steps+1, 3), in the first `axes` axes."""
+    steps, near = len(guess_ned_m) - 1, nearest(problem.keep_outs, guess_ned_m, slots)
+    goal, vel = problem.reference.pos_ned_m[steps, :axes], problem.start.vel_ned_m_s[:axes]
+    return half_spaces(near, guess_ned_m, goal, vel, dt_s, own_tie, params)
+
+
 def judged(
     problem: Problem,
     pos_ned_m: Array,
@@ -208,7 +214,7 @@ def judged(
         began_ns: on the stopwatch.
         stopwatch_ns: see `CondensedMpc`.
     """
-    start: Start = problem.start
+    start = problem.start
     pos = np.concatenate([start.pos_ned_m[None], pos_ned_m])
     residual_m = max(s.residual_m for s in solutions)
     solved_ns = stopwatch_ns()

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+import numpy as np
 
 from swarmctl.control.separation import KeepOut
 from swarmctl.core.types import Array, Reference
@@ -17,6 +19,8 @@ class Start:
     vel_ned_m_s: Array  # (3,)
     cos_tilt: float  # cos(phi) cos(theta) now
     virtual: Array  # (3,) u_x, u_y, thrust over mass now held
+    tilt: Array = field(default_factory=lambda: np.zeros(2))  # (2,) u_x, u_y realised, of a vehicle with a lag
+    tilt_rate_1_s: Array = field(default_factory=lambda: np.zeros(2))  # (2,)
 
 
 @dataclass(frozen=True, slots=True)

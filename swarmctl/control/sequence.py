@@ -3,27 +3,36 @@
 Pure. Agents agree on the beginning without a leader: each says when it was ready, and all begin one second after the
 last one. What the operator asks (hold, resume, land, rtl) is applied here too. A vehicle that was found in the air is
 handed back in the air, holding.
+
+Autopilots know nothing of each other: before one takes over, the agent comes to rest and makes room under its own plan.
+Only without a plan does the autopilot land from where it is.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable
 
 import numpy as np
 from pydantic import Field
 
+from swarmctl.control.facts import Facts
 from swarmctl.control.mission import Glide, MissionReference, brake_to_rest, glide_to
+from swarmctl.control.spread import nearest_in_plane_m, room_for
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Command, FlightMode, Landed, Mode, Phase, VehicleState, Verb
 
 _ASK_EVERY_US = 1_000_000
+_SPIN_UP_US = 3_000_000  # asked again meanwhile, ArduCopter refuses
 _SETTLE_S = 2.0
 _BEGIN_AFTER_US = 1_000_000
-_ODOMETRY_ID, _ATTITUDE_TARGET_ID, _EXTENDED_ID, _CURRENT_MODE_ID, _ORIGIN_ID = 331, 83, 245, 436, 49
+_HOVER_US = 1_000_000  # of the autopilot's own hover, to learn its thrust where no HOLD separates it from our flight
+_ROOM_M = 0.1  # gone farther than has to be, so that it is reached
+_PLANNED = (Mode.FOLLOW, Mode.REPLAY)
 _OURS = (FlightMode.HOLD, FlightMode.TAKEOFF, FlightMode.EXTERNAL)  # modes nobody but us has asked for
 OPERATOR_STOP = "stopped by the operator"
+TAKEN_OVER = "pilot or autopilot took over"
+REBOOTED = "the autopilot rebooted"
 
 
 class SequenceParams(Params):
@@ -38,30 +47,7 @@ class SequenceParams(Params):
     land_m_s: float = Field(0.06, gt=0, le=5)
     start_timeout_s: float = Field(90.0, gt=0, le=3600)  # from process start to TRACK
     land_timeout_s: float = Field(20.0, gt=0, le=600)  # for reaching the landing place; then land where it is
-
-
-@dataclass(frozen=True, slots=True)
-class PeerFacts:
-    """What the sequence needs to know of a peer."""
-
-    phase: Phase
-    ready_utc_us: int
-    alive: bool
-
-
-@dataclass(frozen=True, slots=True)
-class Facts:
-    """This tick, as the sequence sees it."""
-
-    now_us: int
-    utc_us: int
-    state: VehicleState | None
-    heard: bool  # the vehicle's heartbeat is known
-    armable: bool
-    busy: bool  # a command is being executed
-    mode: Mode  # last judgement
-    mute: bool  # a peer that may well be flying has not been heard for too long
-    peers: Mapping[int, PeerFacts]
+    apart_m: float = Field(0.2, ge=0, le=20)  # beyond separation.radius_m, between who lands where it is and others
 
 
 class Sequence:
@@ -69,8 +55,9 @@ class Sequence:
 
     Args:
         params: speeds and patience.
-        setup: parameters the autopilot is given before flight, name -> value.
+        agent: own index.
         peers: how many others take part.
+        radius_m: distance that agents keep.
         start_ned_m: (3,) own start, also the landing place.
         duration_s: of the tracked mission.
         reference: of the tracked mission.
@@ -79,13 +66,15 @@ class Sequence:
     def __init__(
         self,
         params: SequenceParams,
-        setup: Mapping[str, int | float],
+        agent: int,
         peers: int,
+        radius_m: float,
         start_ned_m: Array,
         duration_s: float,
         reference: MissionReference,
     ) -> None:
-        self._params, self._setup, self._expected = params, dict(setup), peers
+        self._params, self._agent, self._expected = params, agent, peers
+        self._apart_m = radius_m + params.apart_m
         self._start_ned_m, self._duration_us, self._reference = start_ned_m, round(duration_s * 1e6), reference
         self.phase = Phase.CONNECT
         self.ready_utc_us = 0
@@ -100,9 +89,10 @@ class Sequence:
         self._entered_us = 0
         self._born_us: int | None = None
         self._asked_us = -_ASK_EVERY_US
-        self._configured = False
+        self._boots = 0
         self.yielded = False
         self._ground_z_m = 0.0
+        self._hovering_us: int | None = None
         self._airborne = False
         self._invited = False  # by an operator's resume, to take control from whoever has it
         self._landing_seen = False
@@ -127,12 +117,17 @@ class Sequence:
         """Advance by what is true now; returns what to ask of the autopilot."""
         self._born_us = facts.now_us if self._born_us is None else self._born_us
         state = facts.state
+        if facts.boots != self._boots:
+            self._boots = facts.boots
+            if Phase.ARM <= self.phase < Phase.DONE and not self.yielded:
+                self._yield(REBOOTED)
         if state is None:
-            return self._connect(facts)
-        if self.phase is Phase.CONNECT:
+            return []
+        if self.phase is Phase.CONNECT and facts.prepared:  # not before: peers arm when everybody stands by
             self._enter(Phase.STANDBY, facts)
+            return self._refuse(facts.refusal, facts) if facts.refusal else []
         if facts.mode is Mode.YIELD and not self.yielded:
-            self._yield()
+            self._yield(TAKEN_OVER)
         if self.yielded:
             if not state.armed and state.landed is Landed.ON_GROUND:
                 self._enter(Phase.DONE, facts)
@@ -190,10 +185,10 @@ class Sequence:
         elif verb in ("land", "rtl"):
             self._stop(verb, now_us, state)
 
-    def _yield(self) -> None:
+    def _yield(self, why: str) -> None:
         self.yielded, self.had_control, self._invited = True, False, False
         self._outcome_before = self.outcome
-        self.outcome = "pilot or autopilot took over"
+        self.outcome = why
 
     def _stop(self, verb: str, now_us: int, state: VehicleState) -> None:
         self.outcome = self.outcome or OPERATOR_STOP
@@ -233,29 +228,13 @@ class Sequence:
     def _stop_glide(self, state: VehicleState) -> Glide:
         return brake_to_rest(state.pos_ned_m, state.vel_ned_m_s, self._params.accel_m_s2)
 
-    def _connect(self, facts: Facts) -> list[Command]:
-        if not facts.heard or not self._may_ask(facts):
-            return []
-        return [
-            Command(Verb.RATE, self._params.state_rate_hz, _ODOMETRY_ID),
-            Command(Verb.MESSAGE, number=_ORIGIN_ID),
-        ]
-
     def _standby(self, facts: Facts, state: VehicleState) -> list[Command]:
-        if not self._configured:
-            self._configured = True
-            rates = [
-                Command(Verb.RATE, self._params.state_rate_hz, _ODOMETRY_ID),
-                Command(Verb.RATE, 5.0, _ATTITUDE_TARGET_ID),
-                Command(Verb.RATE, 10.0, _EXTENDED_ID),
-                Command(Verb.RATE, 25.0, _CURRENT_MODE_ID),
-            ]
-            return rates + [
-                Command(Verb.PARAM_INT, number=v, name=k)
-                if isinstance(v, int)
-                else Command(Verb.PARAM_FLOAT, value=v, name=k)
-                for k, v in self._setup.items()
-            ]
+        if not facts.prepared:  # any more: it has rebooted
+            return []
+        if facts.refusal:
+            return self._refuse(facts.refusal, facts)
+        if any(p.phase is Phase.DONE and p.alive for p in facts.peers.values()):
+            return self._refuse("a peer gave up before take-off", facts)
         known = sum(p.phase >= Phase.STANDBY and p.alive for p in facts.peers.values())
         located = state.landed in (Landed.ON_GROUND, Landed.IN_AIR)
         if located and facts.armable and not facts.busy and known == self._expected:
@@ -264,23 +243,44 @@ class Sequence:
             self._enter(Phase.ARM, facts)
         return []
 
+    def _refuse(self, why: str, facts: Facts) -> list[Command]:
+        """Nothing has been armed yet, and nothing will be."""
+        self.outcome = self.outcome or why
+        self._enter(Phase.DONE, facts)
+        return []
+
     def _arm(self, facts: Facts, state: VehicleState) -> list[Command]:
+        if state.armed and self._airborne and not self._invited and _is_theirs(state):
+            self._yield(TAKEN_OVER)  # before anything is streamed: one setpoint would take it
+            return []
         if state.armed:
             self._enter(Phase.GOTO_START if self._airborne else Phase.TAKEOFF, facts)
             return []
-        return [Command(Verb.ARM)] if self._may_ask(facts) else []
+        if facts.refusal:
+            return self._refuse(facts.refusal, facts)
+        if not self._may_ask(facts):
+            return []
+        in_mode = facts.arm_in in (None, state.mode)
+        return [Command(Verb.ARM if in_mode else Verb.EXTERNAL)]
 
     def _takeoff(self, facts: Facts, state: VehicleState) -> list[Command]:
         height_m = self._ground_z_m - float(self._start_ned_m[2])
         climbed_m = self._ground_z_m - float(state.pos_ned_m[2])
         settled = abs(float(state.vel_ned_m_s[2])) < 0.3 and abs(climbed_m - height_m) < 0.4
-        if state.mode is FlightMode.HOLD and state.landed is Landed.IN_AIR and settled:
+        hovers = state.mode in (FlightMode.HOLD, facts.arm_in) and state.landed is Landed.IN_AIR and settled
+        self._hovering_us = (self._hovering_us or facts.now_us) if hovers else None
+        learned = facts.arm_in is None or facts.now_us - (self._hovering_us or facts.now_us) >= _HOVER_US
+        if hovers and learned:
             self._enter(Phase.GOTO_START, facts)
             return []
         if not state.armed:  # somebody, or the autopilot, thought better of it: never armed again
             self._give_up("disarmed before take-off", facts, state)
             return []
-        if state.mode is not FlightMode.TAKEOFF and state.landed is Landed.ON_GROUND and self._may_ask(facts):
+        if (
+            state.mode is not FlightMode.TAKEOFF
+            and state.landed is Landed.ON_GROUND
+            and self._may_ask(facts, _SPIN_UP_US)
+        ):
             return [Command(Verb.TAKEOFF, height_m)]
         return []
 
@@ -296,8 +296,12 @@ class Sequence:
         return []
 
     def _ask_for_control(self, facts: Facts, state: VehicleState) -> list[Command]:
-        """Control is taken from the autopilot's own hold; from anybody else only after an operator's `resume`."""
-        if state.mode not in _OURS and not self._invited:
+        """Control is taken from the autopilot's own hold; from anybody else only after an operator's `resume`.
+
+        Not even setpoints may flow meanwhile: PX4 returns to OFFBOARD by itself when they resume after a failsafe.
+        """
+        if not self._invited and _is_theirs(state):
+            self._yield(TAKEN_OVER)
             return []
         return [Command(Verb.EXTERNAL)] if self._may_ask(facts) else []
 
@@ -317,16 +321,24 @@ class Sequence:
             return self._ask_for_control(facts, state)
         if facts.utc_us - self.begin_utc_us >= self._duration_us and not (self.held or self.waiting):
             self.outcome = self.outcome or "completed"
-            if self._airborne:
+            if self._airborne and not facts.peers:
                 self._enter(Phase.LAND, facts)
+            elif self._airborne:
+                self._stop_here(facts, state)
             else:
                 self._go_home(facts, state)
         return []
 
     def _goto_land(self, facts: Facts, state: VehicleState) -> list[Command]:
         waited_us = facts.now_us - self._entered_us
-        if self._may_land(facts, state) or waited_us > self._params.land_timeout_s * 1e6:
+        if self._may_land(facts, state):
             self._enter(Phase.LAND, facts)
+        elif waited_us > self._params.land_timeout_s * 1e6:
+            at_rest = self._at(state, state.pos_ned_m, math.inf, self._params.arrive_m_s)
+            if self._lands_here or (at_rest and self._has_room(facts, state)) or facts.mode not in _PLANNED:
+                self._enter(Phase.LAND, facts)
+            else:
+                self._stop_here(facts, state)
         return []
 
     def _land(self, facts: Facts, state: VehicleState) -> list[Command]:
@@ -344,7 +356,7 @@ class Sequence:
             return []
         ours = state.mode in _OURS and not self._landing_seen  # else a pilot flies, or broke the landing off
         if not ours and state.landed is not Landed.ON_GROUND:
-            self._yield()
+            self._yield(TAKEN_OVER)
             return []
         if not self._may_ask(facts):
             return []
@@ -356,14 +368,23 @@ class Sequence:
         return math.dist(state.pos_ned_m, target) < within_m and speed < slower_m_s
 
     def _may_land(self, facts: Facts, state: VehicleState) -> bool:
-        """On the landing place; who lands where it is may have been pushed aside, and has to be at rest only."""
+        """On the landing place; who lands where it is must be at rest, pushed aside as it may be, and to have room."""
         if self._glide is None:
             return True
         glide, began_us = self._glide
         if not self._lands_here:
             return self._at(state, glide.to_ned_m, self._params.land_m, self._params.land_m_s) and not self.waiting
-        settled = facts.now_us - began_us > (glide.travel_s + _SETTLE_S) * 1e6
-        return settled and self._at(state, state.pos_ned_m, math.inf, self._params.arrive_m_s)
+        if facts.now_us - began_us <= (glide.travel_s + _SETTLE_S) * 1e6:
+            return False
+        if self._has_room(facts, state):
+            return self._at(state, state.pos_ned_m, math.inf, self._params.arrive_m_s)
+        room = room_for(state.pos_ned_m, facts.others_ned_m, self._apart_m + _ROOM_M, self._agent)
+        self._glide = (self._way_to(room, state), facts.now_us)
+        return False
+
+    def _has_room(self, facts: Facts, state: VehicleState) -> bool:
+        """Whether an autopilot may take over among the others; without control nothing can be done about it."""
+        return not self.had_control or nearest_in_plane_m(state.pos_ned_m, facts.others_ned_m) >= self._apart_m
 
     def _take_control(self, facts: Facts, state: VehicleState) -> None:
         if self.had_control:
@@ -386,16 +407,31 @@ class Sequence:
 
     def _give_up(self, why: str, facts: Facts, state: VehicleState) -> None:
         self.outcome = self.outcome or why
+        if self.had_control and facts.mode in _PLANNED:
+            self._stop_here(facts, state)
+            return
         grounded = not state.armed and state.landed is Landed.ON_GROUND
         self._enter(Phase.DONE if grounded else Phase.LAND, facts)
+
+    def _stop_here(self, facts: Facts, state: VehicleState) -> None:
+        """Brake and make room under the own plan, then hand over where that ends."""
+        glide = self._stop_glide(state)
+        self._glide, self._bound_for = (glide, facts.now_us), glide.to_ned_m
+        self._lands_here, self.held = True, False
+        self._enter(Phase.GOTO_LAND, facts)
 
     def _enter(self, phase: Phase, facts: Facts) -> None:
         self.phase = phase
         self._entered_us = facts.now_us
-        self._asked_us = facts.now_us - _ASK_EVERY_US
+        self._asked_us = facts.now_us - _SPIN_UP_US
 
-    def _may_ask(self, facts: Facts) -> bool:
-        if facts.busy or facts.now_us - self._asked_us < _ASK_EVERY_US:
+    def _may_ask(self, facts: Facts, every_us: int = _ASK_EVERY_US) -> bool:
+        if facts.busy or facts.now_us - self._asked_us < every_us:
             return False
         self._asked_us = facts.now_us
         return True
+
+
+def _is_theirs(state: VehicleState) -> bool:
+    """Whether a pilot, an operator or a failsafe has the vehicle."""
+    return state.mode not in _OURS or state.failsafe

@@ -42,7 +42,7 @@ class Landed(enum.IntEnum):
 class Phase(enum.IntEnum):
     """Where an agent is in its mission; moves forward only."""
 
-    CONNECT = 0  # no vehicle state yet
+    CONNECT = 0  # no vehicle state yet, or its link is not set up
     STANDBY = 1  # vehicle seen, waiting for health and for every peer
     ARM = 2
     TAKEOFF = 3
@@ -81,6 +81,7 @@ class Verb(enum.Enum):
     MESSAGE = "message"  # number: message id to be sent once
     PARAM_INT = "param_int"  # name, number
     PARAM_FLOAT = "param_float"  # name, value
+    PARAM_GET = "param_get"  # name
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,106 +1,50 @@
 """One vehicle as the tick sees it: MAVLink in, `VehicleState` in the shared frame out; setpoints in, bytes out.
 
-Newest sample wins. Times of the vehicle's clock are mapped to ours by the smallest transport delay seen lately. The
-vehicle's local origin is converted to the shared one here and nowhere else.
+Newest sample wins. `VehicleClock` says when it was true, `LocalFrame` where; which messages mean what, the dialect that
+the HEARTBEAT names. There is no state while any of it is in doubt, the mode included.
 """
 
 from __future__ import annotations
 
+from collections import Counter, deque
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-import pymap3d
-from pymavlink.dialects.v20 import development as dialect
+from pymavlink.dialects.v20 import development as mavlink
 
 from swarmctl.core.frames import rotate_to_ned
 from swarmctl.core.types import Array, AttitudeSetpoint, FlightMode, GeoOrigin, Landed, VehicleState
 from swarmctl.links.commands import CommandPort
+from swarmctl.links.dialects import DIALECTS, Dialect
+from swarmctl.links.local_frame import LocalFrame
 from swarmctl.links.mavlink import Codec, frames
 from swarmctl.links.transport import Transport
+from swarmctl.links.vehicle_clock import VehicleClock
 
 _ATTITUDE_ONLY = 7  # type_mask: body rates ignored; mask 0 would fly rates and attitude against each other
 _ARMED_FLAG = 128
 _CRITICAL = 5
 _PREARM = 1 << 28
-_LOCAL_NED = dialect.MAV_FRAME_LOCAL_NED
-_BODY_FRD = (dialect.MAV_FRAME_BODY_NED, dialect.MAV_FRAME_BODY_FRD)  # of ODOMETRY's velocity
-_FAST = frozenset({dialect.MAVLINK_MSG_ID_ODOMETRY})  # not worth passing to the slow path
+_LOCAL_NED = mavlink.MAV_FRAME_LOCAL_NED
+_BODY_FRD = (mavlink.MAV_FRAME_BODY_NED, mavlink.MAV_FRAME_BODY_FRD)  # of ODOMETRY's velocity
+_FAST = frozenset({mavlink.MAVLINK_MSG_ID_ODOMETRY})  # not worth passing to the slow path
+_GAP_US = 300_000  # after a silence this long, ours or the link's, the mode has to be told again
+_TOLD_LATELY_US = 100_000  # a mode this young at the end of our own silence was not held up in a full buffer
+_SYNC_EVERY_US = 200_000
+_OWN_FLIGHT_US = 1_000_000  # without setpoints for so long the autopilot flies by itself, whatever its mode
+_HOVER_M_S = 0.2
 
 
-@dataclass(frozen=True, slots=True)
-class Dialect:
-    """What differs between autopilots."""
+class _Sample(NamedTuple):
+    """Newest state in the vehicle's own clock and frame."""
 
-    name: str
-    external: tuple[float, float]  # DO_SET_MODE main, sub
-    hold: tuple[float, float]
-    modes: dict[int, FlightMode]  # custom_mode -> mode
-
-
-def _px4(main: int, sub: int = 0) -> int:
-    return main << 16 | sub << 24
-
-
-PX4 = Dialect(
-    "PX4",
-    (6.0, 0.0),
-    (4.0, 3.0),
-    {
-        _px4(1): FlightMode.MANUAL,
-        _px4(2): FlightMode.MANUAL,
-        _px4(3): FlightMode.MANUAL,
-        _px4(7): FlightMode.MANUAL,
-        _px4(4, 2): FlightMode.TAKEOFF,
-        _px4(4, 3): FlightMode.HOLD,
-        _px4(4, 4): FlightMode.MISSION,
-        _px4(4, 5): FlightMode.RTL,
-        _px4(4, 6): FlightMode.LAND,
-        _px4(6): FlightMode.EXTERNAL,
-    },
-)
-ARDUCOPTER = Dialect(
-    "ArduCopter",
-    (4.0, 0.0),
-    (5.0, 0.0),
-    {
-        0: FlightMode.MANUAL,
-        2: FlightMode.MANUAL,
-        3: FlightMode.MISSION,
-        4: FlightMode.EXTERNAL,
-        5: FlightMode.HOLD,
-        6: FlightMode.RTL,
-        9: FlightMode.LAND,
-    },
-)
-DIALECTS = {12: PX4, 3: ARDUCOPTER}  # HEARTBEAT.autopilot
-
-
-class VehicleClock:
-    """Vehicle time -> our monotonic time: offset is the smallest (arrival - stamp) of the last two windows."""
-
-    WINDOW_US = 2_000_000
-
-    def __init__(self) -> None:
-        self._window_end_us = 0
-        self._previous: int | None = None
-        self._current: int | None = None
-        self._newest_us = 0
-
-    def to_local(self, vehicle_us: int, arrived_us: int) -> int:
-        """Our time of a vehicle stamp that arrived at `arrived_us`."""
-        offset = arrived_us - vehicle_us
-        if vehicle_us < self._newest_us - 1_000_000:  # the vehicle rebooted: its clock began again
-            self._previous, self._current, self._window_end_us = None, None, arrived_us
-            self._newest_us = vehicle_us
-        self._newest_us = max(self._newest_us, vehicle_us)
-        if arrived_us >= self._window_end_us:
-            self._previous, self._current = self._current, None
-            self._window_end_us = arrived_us + self.WINDOW_US
-        self._current = offset if self._current is None else min(self._current, offset)
-        best = self._current if self._previous is None else min(self._current, self._previous)
-        return vehicle_us + best
+    vehicle_us: int
+    t_us: int  # our monotonic time
+    pos_ned_m: Array  # (3,)
+    vel_ned_m_s: Array  # (3,)
+    q_nb: Array  # (4,)
+    rate_frd_rad_s: Array  # (3,)
 
 
 class Autopilot:
@@ -112,7 +56,25 @@ class Autopilot:
         sysid: the vehicle's system id; everything else is ignored.
         shared: origin of the swarm's frame.
         on_frame: told of every frame in and out (recording).
+
+    Attributes:
+        clock: the vehicle's clock; `clock.boots` counts its reboots.
+        frame: the vehicle's local frame.
+        params: parameters the vehicle has told of.
+        hover_thrust_01: what the autopilot flies with while it hovers by itself; before that, what its parameter says.
+        pos_accuracy_m: horizontal 1-sigma accuracy it claims; None while untold.
+        samples: states received; the difference of two readings is the rate.
+        heard_us: arrival of the last frame, our time.
+        invalid: polls without a state although there was a sample, by reason.
     """
+
+    params: dict[str, float]
+    hover_thrust_01: float | None
+    pos_accuracy_m: float | None
+    _sample: _Sample | None
+    _placed: tuple[_Sample, Array] | None  # the sample, and its position in the shared frame
+    _attitude: tuple[int, Array, Array] | None  # arrival, attitude, rates
+    _reset_counter: int | None
 
     def __init__(
         self,
@@ -122,35 +84,56 @@ class Autopilot:
         shared: GeoOrigin,
         on_frame: Callable[[bytes], None],
     ) -> None:
-        self._transport, self._codec, self._sysid, self._shared = transport, codec, sysid, shared
+        self._transport, self._codec, self._sysid = transport, codec, sysid
         self._on_frame = on_frame
-        self._clock = VehicleClock()
+        self.clock = VehicleClock()
+        self.frame = LocalFrame(shared)
         self._slow: CommandPort | None = None
         self.dialect: Dialect | None = None
-        self.offset_ned_m: Array | None = None  # (3,) local origin in the shared frame
         self.armed = False
         self.mode = FlightMode.UNKNOWN
-        self.landed = Landed.UNKNOWN
-        self.armable = False
         self.failsafe = False
-        self.hover_thrust_01: float | None = None  # what the autopilot flies with while it hovers by itself
         self.texts: list[str] = []
         self.refused_setpoints = 0
-        self._sample: tuple[int, Array, Array, Array, Array] | None = None
-        self._attitude: tuple[int, Array, Array] | None = None
-        self._odometry_us = 0
+        self.samples = 0
+        self.heard_us: int | None = None
+        self.invalid: Counter[str] = Counter()
+        self._mode_us = 0  # arrival of the message that told the mode
+        self._doubt_us: int | None = None  # the mode has to be told after this
+        self._polled_us: int | None = None
+        self._setpoint_us: int | None = None
+        self._sync_us = 0
+        self._syncs: deque[int] = deque(maxlen=16)  # our times in open TIMESYNC questions [ns]
+        self._boots = 0
+        self._counter_resets = 0
+        self._forget()
         self._handlers: dict[str, Callable[[Any, int], None]] = {
             "HEARTBEAT": self._heartbeat,
             "CURRENT_MODE": self._current_mode,
             "ODOMETRY": self._odometry,
             "ATTITUDE_QUATERNION": self._attitude_quaternion,
             "LOCAL_POSITION_NED": self._local_position,
+            "GLOBAL_POSITION_INT": self._global_position,
+            "GPS_GLOBAL_ORIGIN": self._origin,
             "SYS_STATUS": self._sys_status,
             "EXTENDED_SYS_STATE": self._extended,
-            "GPS_GLOBAL_ORIGIN": self._origin,
+            "ESTIMATOR_STATUS": self._estimator,
+            "GPS_RAW_INT": self._gps,
             "ATTITUDE_TARGET": self._attitude_target,
+            "PARAM_VALUE": self._param_value,
+            "TIMESYNC": self._timesync,
             "STATUSTEXT": self._statustext,
         }
+
+    @property
+    def offset_ned_m(self) -> Array | None:
+        """Local origin (3,) in the shared frame."""
+        return self.frame.offset_ned_m
+
+    @property
+    def resets(self) -> int:
+        """How often the estimate has jumped in the shared frame: what was filtered before does not continue."""
+        return self._counter_resets + self.frame.jumps
 
     def attach(self, slow: CommandPort) -> None:
         """Pass everything but the fast state messages on to the slow path."""
@@ -162,16 +145,21 @@ class Autopilot:
         self._transport.send(frame)
 
     def poll(self, now_us: int) -> VehicleState | None:
-        """Drain the link; the newest state, or None before the first complete one."""
+        """Drain the link; the newest state, or None before the first complete one and while it is in doubt."""
+        if self._polled_us is not None and now_us - self._polled_us > _GAP_US:
+            self._doubt_us = now_us - _TOLD_LATELY_US  # we slept: what was buffered may end long ago
+        self._polled_us = now_us
         for datagram in self._transport.receive(now_us):
             for frame in frames(datagram.data):
                 self._frame(frame, datagram.t_us)
-        if self._sample is None or self.offset_ned_m is None or self.mode is FlightMode.UNKNOWN:
+        self._ask_the_time(now_us)
+        if self._sample is None or self.mode is FlightMode.UNKNOWN:
             return None
-        t_us, pos, vel, q_nb, rate = self._sample
-        return VehicleState(
-            t_us, pos + self.offset_ned_m, vel, q_nb, rate, self.armed, self.mode, self.landed, self.failsafe
-        )
+        if self._doubt_us is not None and self._mode_us < self._doubt_us:
+            self.invalid["mode not told since a silence"] += 1
+            return None
+        self._doubt_us = None
+        return self._state(self._sample)
 
     def send(self, setpoint: AttitudeSetpoint, now_us: int) -> str:
         """Send one setpoint; returns why it was refused, or "".
@@ -183,14 +171,17 @@ class Autopilot:
             self.refused_setpoints += 1
             return refused
         q = [float(c) for c in setpoint.q_nb]
-        message = dialect.MAVLink_set_attitude_target_message(
+        message = mavlink.MAVLink_set_attitude_target_message(
             (now_us // 1000) & 0xFFFFFFFF, self._sysid, 1, _ATTITUDE_ONLY, q, 0.0, 0.0, 0.0, setpoint.thrust_01
         )
+        self._setpoint_us = now_us
         self.send_frame(self._codec.encode(message))
         return ""
 
     def close(self) -> None:
         self._transport.close()
+
+    # -- frames -------------------------------------------------------------------------------------------------------
 
     def _frame(self, frame: bytes, arrived_us: int) -> None:
         if frame[5] != self._sysid or frame[6] != 1:
@@ -199,6 +190,9 @@ class Autopilot:
         if message is None:
             return
         self._on_frame(frame)
+        if self.heard_us is not None and arrived_us - self.heard_us > _GAP_US:
+            self._doubt_us = arrived_us  # the link was silent: what was said meanwhile is lost
+        self.heard_us = arrived_us
         handler = self._handlers.get(message.get_type())
         if handler is not None:
             handler(message, arrived_us)
@@ -206,30 +200,45 @@ class Autopilot:
             self._slow.frame(frame, message)
 
     def _heartbeat(self, message: Any, arrived_us: int) -> None:
-        self.dialect = DIALECTS.get(message.autopilot)
-        if self.dialect is None:
+        dialect = DIALECTS.get(message.autopilot)
+        if dialect is None:
             return
+        self.dialect = dialect
         self.armed = bool(message.base_mode & _ARMED_FLAG)
         self.failsafe = message.system_status >= _CRITICAL
-        self.mode = self.dialect.modes.get(message.custom_mode, FlightMode.MANUAL)
+        self.mode, self._mode_us = dialect.mode(message.custom_mode), arrived_us
 
     def _current_mode(self, message: Any, arrived_us: int) -> None:
         """The same as in HEARTBEAT, but fast: a pilot's switch must not stay unseen for a second."""
         if self.dialect is not None:
-            self.mode = self.dialect.modes.get(message.custom_mode, FlightMode.MANUAL)
+            self.mode, self._mode_us = self.dialect.mode(message.custom_mode), arrived_us
+
+    def _sys_status(self, message: Any, arrived_us: int) -> None:
+        self.armable = bool(message.onboard_control_sensors_health & _PREARM)
+
+    def _extended(self, message: Any, arrived_us: int) -> None:
+        self.landed = Landed(message.landed_state) if message.landed_state <= Landed.LANDING else Landed.UNKNOWN
+
+    def _statustext(self, message: Any, arrived_us: int) -> None:
+        text = message.text.rstrip("\t\x00") if isinstance(message.text, str) else str(message.text)
+        self.texts = [*self.texts[-19:], text]
+
+    # -- state --------------------------------------------------------------------------------------------------------
 
     def _odometry(self, message: Any, arrived_us: int) -> None:
         if message.frame_id != _LOCAL_NED or message.child_frame_id not in (_LOCAL_NED, *_BODY_FRD):
             self._codec.refused["odometry frame"] += 1
             return
-        t_us = self._clock.to_local(message.time_usec, arrived_us)
         self._odometry_us = arrived_us
         q_nb = np.array(message.q)
         vel = np.array([message.vx, message.vy, message.vz])
         if message.child_frame_id in _BODY_FRD:
             vel = rotate_to_ned(q_nb, vel)
         rate = np.array([message.rollspeed, message.pitchspeed, message.yawspeed])
-        self._take(t_us, np.array([message.x, message.y, message.z]), vel, q_nb, rate)
+        pos = np.array([message.x, message.y, message.z])
+        if self._take(message.time_usec, arrived_us, pos, vel, q_nb, rate):
+            self._counter_resets += self._reset_counter not in (None, message.reset_counter)
+            self._reset_counter = message.reset_counter
 
     def _attitude_quaternion(self, message: Any, arrived_us: int) -> None:
         q_nb = np.array([message.q1, message.q2, message.q3, message.q4])
@@ -240,39 +249,98 @@ class Autopilot:
         """Fallback for autopilots without ODOMETRY: position with the newest attitude."""
         if self._attitude is None or (arrived_us - self._odometry_us < 500_000 and self._odometry_us):
             return
-        t_us = self._clock.to_local(message.time_boot_ms * 1000, arrived_us)
         pos, vel = np.array([message.x, message.y, message.z]), np.array([message.vx, message.vy, message.vz])
-        self._take(t_us, pos, vel, self._attitude[1], self._attitude[2])
+        self._take(message.time_boot_ms * 1000, arrived_us, pos, vel, self._attitude[1], self._attitude[2])
 
-    def _take(self, t_us: int, pos: Array, vel: Array, q_nb: Array, rate: Array) -> None:
+    def _take(self, vehicle_us: int, arrived_us: int, pos: Array, vel: Array, q_nb: Array, rate: Array) -> bool:
+        """Keep a sample if it is good and the newest."""
         norm = float(np.sqrt(q_nb @ q_nb))
         if not (np.isfinite(pos).all() and np.isfinite(vel).all() and np.isfinite(rate).all() and 0.9 < norm < 1.1):
             self._codec.refused["state not finite"] += 1
-            return
-        if self._sample is None or t_us >= self._sample[0] or self._sample[0] - t_us > 1_000_000:
-            self._sample = (t_us, pos, vel, q_nb / norm, rate)
+            return False
+        t_us = self.clock.to_local(vehicle_us, arrived_us)
+        if self.clock.boots != self._boots:
+            self._boots = self.clock.boots
+            self._forget()
+            self._odometry_us = arrived_us
+        self.samples += 1
+        if self._sample is not None and vehicle_us < self._sample.vehicle_us:
+            return False
+        self._sample = _Sample(vehicle_us, t_us, pos, vel, q_nb / norm, rate)
+        return True
 
-    def _sys_status(self, message: Any, arrived_us: int) -> None:
-        self.armable = bool(message.onboard_control_sensors_health & _PREARM)
+    def _state(self, sample: _Sample) -> VehicleState | None:
+        if self._placed is None or self._placed[0] is not sample:
+            placed = self.frame.place(sample.vehicle_us, sample.pos_ned_m, sample.vel_ned_m_s, self.armed)
+            self._placed = None if placed is None else (sample, placed)
+        if self._placed is None:
+            return None
+        pos, vel, q_nb, rate = self._placed[1], sample.vel_ned_m_s, sample.q_nb, sample.rate_frd_rad_s
+        return VehicleState(sample.t_us, pos, vel, q_nb, rate, self.armed, self.mode, self.landed, self.failsafe)
 
-    def _extended(self, message: Any, arrived_us: int) -> None:
-        self.landed = Landed(message.landed_state) if message.landed_state <= Landed.LANDING else Landed.UNKNOWN
+    def _forget(self) -> None:
+        """The vehicle has rebooted, or was never heard: nothing it said holds."""
+        self._sample = self._placed = self._attitude = self._reset_counter = None
+        self._odometry_us = 0
+        self.landed = Landed.UNKNOWN
+        self.armable = False
+        self.params = {}
+        self.hover_thrust_01 = self.pos_accuracy_m = None
+        self.frame.forget()
+
+    # -- frame, clock, accuracy, parameters ---------------------------------------------------------------------------
 
     def _origin(self, message: Any, arrived_us: int) -> None:
-        north, east, down = pymap3d.geodetic2ned(
-            message.latitude * 1e-7,
-            message.longitude * 1e-7,
-            message.altitude * 1e-3,
-            self._shared.lat_deg,
-            self._shared.lon_deg,
-            self._shared.alt_m,
-        )
-        self.offset_ned_m = np.array([north, east, down], dtype=float)
+        self.frame.told(_geodetic(message.latitude, message.longitude, message.altitude))
+
+    def _global_position(self, message: Any, arrived_us: int) -> None:
+        if self._sample is not None:
+            place = _geodetic(message.lat, message.lon, message.alt)
+            self.frame.seen(place, message.time_boot_ms * 1000, self._sample[0], *self._sample[2:4])
+
+    def _ask_the_time(self, now_us: int) -> None:
+        if self.dialect is not None and now_us - self._sync_us >= _SYNC_EVERY_US:
+            self._sync_us = now_us
+            self._syncs.append(now_us * 1000)
+            self.send_frame(self._codec.encode(mavlink.MAVLink_timesync_message(0, now_us * 1000)))
+
+    def _timesync(self, message: Any, arrived_us: int) -> None:
+        if message.tc1 > 0 and message.ts1 in self._syncs:
+            self._syncs.remove(message.ts1)
+            self.clock.round_trip(message.ts1 // 1000, message.tc1 // 1000, arrived_us)
+
+    def _estimator(self, message: Any, arrived_us: int) -> None:
+        self._accuracy("ESTIMATOR_STATUS", message.pos_horiz_accuracy)
+
+    def _gps(self, message: Any, arrived_us: int) -> None:
+        self._accuracy("GPS_RAW_INT", message.h_acc * 1e-3)
+
+    def _accuracy(self, source: str, sigma_m: float) -> None:
+        """0 means untold in both messages."""
+        if self.dialect is not None and self.dialect.horizontal_accuracy == source and 0.0 < sigma_m < np.inf:
+            self.pos_accuracy_m = float(sigma_m)
+
+    def _param_value(self, message: Any, arrived_us: int) -> None:
+        if self.dialect is None:
+            return
+        value = self.dialect.from_wire(message.param_value, message.param_type)
+        if not np.isfinite(value):
+            return
+        self.params[message.param_id] = value
+        if message.param_id == self.dialect.hover_parameter and self.hover_thrust_01 is None and 0.05 < value < 0.95:
+            self.hover_thrust_01 = value
 
     def _attitude_target(self, message: Any, arrived_us: int) -> None:
-        if self.mode is FlightMode.HOLD and self.landed is Landed.IN_AIR and 0.05 < message.thrust < 1.0:
+        """Thrust of a hover that is the autopilot's own: in HOLD, or where take-off and our control share one mode."""
+        if self.landed is Landed.IN_AIR and 0.05 < message.thrust < 1.0 and self._hovers_by_itself(arrived_us):
             self.hover_thrust_01 = float(message.thrust)
 
-    def _statustext(self, message: Any, arrived_us: int) -> None:
-        text = message.text.rstrip("\t\x00") if isinstance(message.text, str) else str(message.text)
-        self.texts = [*self.texts[-19:], text]
+    def _hovers_by_itself(self, now_us: int) -> bool:
+        if self.mode is not FlightMode.EXTERNAL or self._sample is None:
+            return self.mode is FlightMode.HOLD
+        own = self._setpoint_us is None or now_us - self._setpoint_us > _OWN_FLIGHT_US
+        return own and abs(float(self._sample.vel_ned_m_s[2])) < _HOVER_M_S
+
+
+def _geodetic(lat_e7: int, lon_e7: int, alt_mm: int) -> GeoOrigin:
+    return GeoOrigin(lat_e7 * 1e-7, lon_e7 * 1e-7, alt_mm * 1e-3)

@@ -1,10 +1,12 @@
-"""Byte links to a vehicle: UDP, serial, and an in-memory pipe for lockstep. None of them ever blocks.
+"""Byte links to a vehicle: UDP, TCP, serial, and an in-memory pipe for lockstep. None of them ever blocks.
 
-A transport moves datagrams and stamps their arrival; it knows nothing of MAVLink except, on serial, where a frame ends.
+A transport moves datagrams and stamps their arrival; it knows nothing of MAVLink except, in a byte stream, where a
+frame ends. Streams that break are opened again for as long as it takes: whether a vehicle is lost is judged elsewhere.
 """
 
 from __future__ import annotations
 
+import contextlib
 import re
 import socket
 import struct
@@ -12,14 +14,17 @@ import sys
 import time
 from collections import deque
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 from swarmctl.errors import StartError
 
 _MAX_DATAGRAM = 2048
+_CHUNK = 65536
 _SO_TIMESTAMPNS = 35  # Linux; socket.SO_TIMESTAMPNS is not exported before Python 3.13
 _TIMESPEC = struct.Struct("@qq")
-_URL = re.compile(r"^(?P<scheme>udpin|udpout|serial)://(?P<where>[^:]+):(?P<number>\d+)$")
+_URL = re.compile(r"^(?P<scheme>udpin|udpout|tcp|serial)://(?P<where>[^:]+):(?P<number>\d+)$")
+_REOPEN_US = 1_000_000
+_DEAD_US = 5_000_000  # every autopilot beats once a second
 
 
 class Datagram(NamedTuple):
@@ -45,20 +50,22 @@ class Transport(Protocol):
 class Endpoint(NamedTuple):
     """A parsed vehicle URL."""
 
-    scheme: str  # udpin | udpout | serial
+    scheme: str  # udpin | udpout | tcp | serial
     where: str  # host, or device path
     number: int  # port, or baud rate
 
 
 def parse_url(url: str) -> Endpoint:
-    """Split `udpin://host:port`, `udpout://host:port` or `serial:///dev/tty:baud`.
+    """Split `udpin://host:port`, `udpout://host:port`, `tcp://host:port` or `serial:///dev/tty:baud`.
 
     Raises:
         ValueError: with the allowed forms, when the URL has none of them or the port is out of range.
     """
     match = _URL.match(url)
     if match is None:
-        raise ValueError(f"{url!r}: use udpin://HOST:PORT, udpout://HOST:PORT or serial:///DEVICE:BAUD")
+        raise ValueError(
+            f"{url!r}: use udpin://HOST:PORT, udpout://HOST:PORT, tcp://HOST:PORT or serial:///DEVICE:BAUD"
+        )
     endpoint = Endpoint(match["scheme"], match["where"], int(match["number"]))
     if endpoint.scheme != "serial" and not 1 <= endpoint.number <= 65535:
         raise ValueError(f"{url!r}: port {endpoint.number} is outside 1..65535")
@@ -74,7 +81,7 @@ def open_transport(url: str, inherited_fd: int | None = None) -> Transport:
             take it between the check and the flight.
 
     Raises:
-        StartError: the port is taken or the device does not exist.
+        StartError: the port is taken, the host has no address, or the device does not exist.
     """
     endpoint = parse_url(url)
     if endpoint.scheme == "serial":
@@ -83,7 +90,20 @@ def open_transport(url: str, inherited_fd: int | None = None) -> Transport:
         return UdpTransport(socket.socket(fileno=inherited_fd))
     if endpoint.scheme == "udpin":
         return UdpTransport(bind_udp(endpoint.where, endpoint.number))
-    return UdpTransport(bind_udp("0.0.0.0", 0), remote=(endpoint.where, endpoint.number))
+    there = resolve(endpoint.where), endpoint.number
+    return TcpTransport(there) if endpoint.scheme == "tcp" else UdpTransport(bind_udp("0.0.0.0", 0), remote=there)
+
+
+def resolve(host: str) -> str:
+    """IPv4 address of a host, once: a name server in the tick would stop it.
+
+    Raises:
+        StartError: it has none.
+    """
+    try:
+        return socket.gethostbyname(host)
+    except (OSError, UnicodeError) as error:
+        raise StartError(f"{host} has no IPv4 address: {error}; check the host") from error
 
 
 def bind_udp(host: str, port: int) -> socket.socket:
@@ -158,33 +178,122 @@ class UdpTransport:
         self._sock.close()
 
 
+class TcpTransport:
+    """A TCP client (ArduPilot listens on 5760); frames are cut out of the byte stream.
+
+    It connects while the tick runs, and again a second after the other end has gone. What does not fit into the
+    socket's buffer is dropped by whole frames.
+    """
+
+    def __init__(self, remote: tuple[str, int]) -> None:
+        self._remote = remote
+        self._sock: socket.socket | None = None
+        self._open_us: int | None = None  # when the last attempt began
+        self._heard_us = 0
+        self._buffer = bytearray()
+        self._rest = b""  # of a frame that left in part
+
+    def send(self, data: bytes) -> None:
+        if self._sock is None:
+            return
+        try:
+            if self._rest:
+                self._rest = self._rest[self._sock.send(self._rest) :]
+            if not self._rest:
+                self._rest = data[self._sock.send(data) :]
+        except (BlockingIOError, InterruptedError):
+            return
+        except OSError:
+            self._lose()
+
+    def receive(self, now_us: int) -> list[Datagram]:
+        if self._sock is not None and now_us - self._heard_us > _DEAD_US:
+            self._lose()  # an end that vanished without a word would be waited for for a quarter of an hour
+        if self._sock is None and (self._open_us is None or now_us - self._open_us >= _REOPEN_US):
+            self._open(now_us)
+        try:
+            while self._sock is not None:
+                data = self._sock.recv(_CHUNK)
+                if not data:
+                    self._lose()
+                self._buffer += data
+                self._heard_us = now_us
+        except (BlockingIOError, InterruptedError):
+            pass  # all of it, or still connecting
+        except OSError:
+            self._lose()
+        return [Datagram(now_us, frame) for frame in cut_frames(self._buffer)]
+
+    def close(self) -> None:
+        self._lose()
+
+    def _open(self, now_us: int) -> None:
+        self._open_us = self._heard_us = now_us
+        self._sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        self._sock.setblocking(False)
+        self._sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        with contextlib.suppress(BlockingIOError, OSError):  # recv says whether it has worked
+            self._sock.connect(self._remote)
+
+    def _lose(self) -> None:
+        if self._sock is not None:
+            self._sock.close()
+        self._sock, self._rest = None, b""
+        self._buffer.clear()
+
+
 class SerialTransport:
-    """A serial port; frames are cut out of the byte stream and handed on one by one."""
+    """A serial port; frames are cut out of the byte stream and handed on one by one. Unplugged, it is opened again."""
 
     def __init__(self, device: str, baud: int) -> None:
         import serial  # only vehicles on a wire need it
 
+        def open_port() -> Any:
+            return serial.Serial(device, baud, timeout=0, write_timeout=0)
+
+        self._open_port: Callable[[], Any] = open_port
         try:
-            self._port = serial.Serial(device, baud, timeout=0, write_timeout=0)
-        except (serial.SerialException, ValueError) as error:
+            self._port: Any = open_port()
+        except (OSError, ValueError) as error:  # SerialException is an OSError
             raise StartError(f"serial {device} at {baud} baud can't be opened: {error}") from error
+        self._lost_us: int | None = None
+        self._lost = False
         self._buffer = bytearray()
 
     def send(self, data: bytes) -> None:
+        if self._port is None:
+            return
         try:
             self._port.write(data)
         except OSError:
-            return
+            self._lost = True
 
     def receive(self, now_us: int) -> list[Datagram]:
+        self._reopen(now_us)
+        if self._port is None:
+            return []
         try:
-            self._buffer += self._port.read(_MAX_DATAGRAM)
+            self._buffer += self._port.read(_CHUNK)
         except OSError:
+            self._lost = True
             return []
         return [Datagram(now_us, frame) for frame in cut_frames(self._buffer)]
 
     def close(self) -> None:
-        self._port.close()
+        if self._port is not None:
+            self._port.close()
+
+    def _reopen(self, now_us: int) -> None:
+        if self._lost and self._port is not None:
+            with contextlib.suppress(OSError):
+                self._port.close()
+            self._port, self._lost_us = None, now_us
+            self._buffer.clear()
+        if self._port is None and self._lost_us is not None and now_us - self._lost_us >= _REOPEN_US:
+            self._lost_us = now_us
+            with contextlib.suppress(OSError):
+                self._port = self._open_port()
+                self._lost = False
 
 
 def cut_frames(buffer: bytearray) -> list[bytes]:

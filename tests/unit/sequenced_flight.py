@@ -6,14 +6,16 @@ from typing import Any
 
 import numpy as np
 
+from swarmctl.control.facts import Facts, PeerFacts
 from swarmctl.control.mission import MissionParams, MissionReference
-from swarmctl.control.sequence import Facts, PeerFacts, Sequence, SequenceParams
+from swarmctl.control.sequence import Sequence, SequenceParams
 from swarmctl.core.types import Command, FlightMode, Landed, Mode, Phase, VehicleState, Verb
 
 UTC0_US = 1_700_000_000_000_000
 START = np.array([1.0, 0.0, -3.0])
 SECOND = 1_000_000
 DURATION_S = 10.0
+RADIUS_M = 0.9
 ON_GROUND, IN_AIR = Landed.ON_GROUND, Landed.IN_AIR
 
 
@@ -22,13 +24,17 @@ class Flight:
 
     def __init__(self, peers: int = 1, **params: Any) -> None:
         mission = MissionReference(MissionParams(kind="line"), START[None, :], 0)
-        setup: dict[str, int | float] = {"COM_OBL_RC_ACT": 4, "MPC_LAND_SPEED": 0.5}
-        self.sequence = Sequence(SequenceParams(**params), setup, peers, START, DURATION_S, mission)
+        self.sequence = Sequence(SequenceParams(**params), 0, peers, RADIUS_M, START, DURATION_S, mission)
         self.now_us = 0
         self.pos, self.vel = np.array([1.0, 0.0, 0.0]), np.zeros(3)
         self.armed, self.flight_mode, self.landed = False, FlightMode.HOLD, ON_GROUND
         self.judged = Mode.IDLE
-        self.heard = self.armable = True
+        self.prepared = self.armable = True
+        self.failsafe = False
+        self.others: tuple[np.ndarray, ...] = ()
+        self.arm_in: FlightMode | None = None
+        self.boots = 0
+        self.refusal = ""
         self.busy = self.mute = False
         self.seen = True
         self.peers = {k + 1: PeerFacts(Phase.STANDBY, 0, True) for k in range(peers)}
@@ -52,7 +58,7 @@ class Flight:
             return None
         q_nb = np.array([1.0, 0.0, 0.0, 0.0])
         return VehicleState(
-            self.now_us, self.pos, self.vel, q_nb, np.zeros(3), self.armed, self.flight_mode, self.landed, False
+            self.now_us, self.pos, self.vel, q_nb, np.zeros(3), self.armed, self.flight_mode, self.landed, self.failsafe
         )
 
     def step(self) -> list[Command]:
@@ -60,12 +66,16 @@ class Flight:
             now_us=self.now_us,
             utc_us=self.utc_us,
             state=self.state,
-            heard=self.heard,
+            prepared=self.prepared,
             armable=self.armable,
             busy=self.busy,
             mode=self.judged,
             mute=self.mute,
             peers=self.peers,
+            others_ned_m=self.others,
+            arm_in=self.arm_in,
+            boots=self.boots,
+            refusal=self.refusal,
         )
         self.sequence.begin_if_due(facts.now_us, facts.utc_us)  # as the agent does, before it thinks
         asked = self.sequence.step(facts)

@@ -16,9 +16,10 @@ from pymavlink.dialects.v20 import development as dialect
 
 from swarmctl.core.clock import SimClock
 from swarmctl.core.types import AttitudeSetpoint, FlightMode, GeoOrigin, Landed
-from swarmctl.links.autopilot import Autopilot, VehicleClock
+from swarmctl.links.autopilot import Autopilot
 from swarmctl.links.mavlink import Codec
 from swarmctl.links.transport import PipeTransport, pipe_pair
+from swarmctl.links.vehicle_clock import VehicleClock
 
 SHARED = GeoOrigin(47.397742, 8.545594, 489.4)
 LEVEL = (1.0, 0.0, 0.0, 0.0)
@@ -140,6 +141,10 @@ def test_after_a_reboot_of_the_vehicle_its_new_clock_is_taken_and_its_samples_to
     bench.poll()
     bench.clock.advance(3_000_000)
     bench.say(odometry(10_000, pos=(0.5, 0.0, 0.0)))
+    bench.heartbeat()
+    assert bench.poll() is None, "its local origin is another one now"
+    assert bench.pilot.clock.boots == 1
+    bench.origin(SHARED.lat_deg, SHARED.lon_deg, SHARED.alt_m)
     state = bench.poll()
     assert state.pos_ned_m[0] == pytest.approx(0.5, abs=0.01)
     assert abs(state.t_us - bench.clock.now_us()) < 20_000
@@ -214,6 +219,7 @@ def test_velocity_that_came_in_body_axes_is_not_taken_for_ned() -> None:
 def test_position_without_odometry_uses_the_newest_attitude_and_odometry_wins() -> None:
     bench = Bench().ready()
     bench.clock.advance(1_000_000)
+    bench.heartbeat(base=0)  # after a silence the mode has to be told again; disarmed, positions may jump
     local = dialect.MAVLink_local_position_ned_message(1000, 4.0, 5.0, -6.0, 0.5, -0.5, 0.25)
     bench.say(local)
     assert bench.poll() is None  # no attitude yet
@@ -367,3 +373,115 @@ def test_limits_of_thrust_and_time_are_inclusive(thrust_01: float) -> None:
     bench = Bench()
     assert bench.pilot.send(setpoint(thrust_01=thrust_01, valid_until_us=100), 100) == ""
     assert len(sent(bench.vehicle)) == 1
+
+
+# -- what is in doubt -------------------------------------------------------------------------------------------------
+
+
+def flying(bench: Bench, seconds: float, mode_hz: float = 25.0) -> Any:
+    """The vehicle speaks for a while, polled at 50 Hz; the last state."""
+    state = None
+    for k in range(round(seconds * 50)):
+        bench.clock.advance(20_000)
+        bench.say(odometry(bench.clock.now_us()))
+        if mode_hz and k % round(50 / mode_hz) == 0:
+            bench.heartbeat()
+        state = bench.poll()
+    return state
+
+
+def test_after_the_link_was_silent_there_is_no_state_until_the_mode_is_told_again() -> None:
+    bench = Bench().ready()
+    assert flying(bench, 1.0) is not None
+    bench.clock.advance(400_000)  # a failsafe may have acted: PX4 retakes OFFBOARD from a single setpoint
+    assert flying(bench, 0.2, mode_hz=0.0) is None
+    assert bench.pilot.invalid["mode not told since a silence"] == 10
+    assert flying(bench, 0.1) is not None
+    bench.clock.advance(200_000)
+    assert flying(bench, 0.1, mode_hz=0.0) is not None, "shorter than any loss time-out"
+
+
+def test_a_poll_after_a_sleep_does_not_believe_a_mode_from_a_buffer_that_filled_up() -> None:
+    bench = Bench().ready()
+    flying(bench, 1.0)
+    for _ in range(10):  # 0.4 s into the buffer, the rest of a second is dropped
+        bench.clock.advance(40_000)
+        bench.say(odometry(bench.clock.now_us()))
+        bench.heartbeat()
+    bench.clock.advance(600_000)
+    assert bench.poll() is None
+    assert flying(bench, 0.1, mode_hz=0.0) is None
+    assert flying(bench, 0.1) is not None
+
+
+def test_a_poll_after_a_sleep_believes_a_mode_that_is_young() -> None:
+    bench = Bench().ready()
+    flying(bench, 1.0)
+    for _ in range(20):
+        bench.clock.advance(40_000)
+        bench.say(odometry(bench.clock.now_us()))
+        bench.heartbeat()
+    assert bench.poll() is not None
+
+
+def test_estimator_resets_are_counted() -> None:
+    bench = Bench().ready()
+    for counter, resets in ((3, 0), (3, 0), (4, 1), (4, 1), (6, 2)):
+        bench.clock.advance(20_000)
+        message = odometry(bench.clock.now_us())
+        message.reset_counter = counter
+        bench.say(message)
+        bench.poll()
+        assert bench.pilot.resets == resets
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "message", "sigma_m"),
+    [
+        (12, dialect.MAVLink_estimator_status_message(0, 0, 0, 0, 0, 0, 0, 0, 0.35, 0.5), 0.35),
+        (12, dialect.MAVLink_estimator_status_message(0, 0, 0, 0, 0, 0, 0, 0, 0.0, 0.5), None),
+        (12, dialect.MAVLink_gps_raw_int_message(0, 3, 0, 0, 0, 0, 0, 0, 0, 9, 0, 900), None),
+        (3, dialect.MAVLink_gps_raw_int_message(0, 3, 0, 0, 0, 0, 0, 0, 0, 9, 0, 900), 0.9),
+        (3, dialect.MAVLink_gps_raw_int_message(0, 3, 0, 0, 0, 0, 0, 0, 0, 9, 0, 0), None),
+    ],
+)
+def test_the_accuracy_an_autopilot_claims(autopilot: int, message: Any, sigma_m: float | None) -> None:
+    bench = Bench()
+    bench.heartbeat(autopilot=autopilot)
+    bench.say(message)
+    bench.poll()
+    assert bench.pilot.pos_accuracy_m == (None if sigma_m is None else pytest.approx(sigma_m))
+
+
+def test_hover_thrust_is_the_parameters_until_the_vehicle_hovers_by_itself() -> None:
+    bench = Bench()
+    bench.heartbeat(4, autopilot=3)
+    bench.say(dialect.MAVLink_param_value_message(b"MOT_THST_HOVER", 0.39, 9, 1, 0))
+    bench.say(dialect.MAVLink_extended_sys_state_message(0, 2))
+    bench.poll()
+    assert bench.pilot.hover_thrust_01 == pytest.approx(0.39)
+    bench.say(odometry(20_000))
+    target = dialect.MAVLink_attitude_target_message(0, 0, list(LEVEL), 0.0, 0.0, 0.0, 0.36)
+    bench.say(target)  # GUIDED, and nobody has sent a setpoint: its own take-off
+    bench.poll()
+    assert bench.pilot.hover_thrust_01 == pytest.approx(0.36)
+    bench.pilot.send(setpoint(thrust_01=0.8), bench.clock.now_us())
+    bench.say(dialect.MAVLink_attitude_target_message(0, 0, list(LEVEL), 0.0, 0.0, 0.0, 0.8))
+    bench.poll()
+    assert bench.pilot.hover_thrust_01 == pytest.approx(0.36), "an echo of ours says nothing"
+
+
+def test_an_answered_timesync_is_ours_and_tells_the_round_trip() -> None:
+    bench = Bench().ready()
+    flying(bench, 0.3)
+    asked = [f for d in bench.vehicle.receive(10**15) for f in [d.data] if f[7:10] == (111).to_bytes(3, "little")]
+    assert asked
+    question = dialect.MAVLink(None).decode(bytearray(asked[-1]))
+    assert question.tc1 == 0
+    bench.clock.advance(6_000)
+    bench.say(dialect.MAVLink_timesync_message(bench.clock.now_us() * 1000, 12345))  # somebody else's answer
+    bench.poll()
+    assert bench.pilot.clock.round_trip_us is None
+    bench.say(dialect.MAVLink_timesync_message(bench.clock.now_us() * 1000, question.ts1))
+    bench.poll()
+    assert bench.pilot.clock.round_trip_us == bench.clock.now_us() - question.ts1 // 1000

@@ -53,7 +53,20 @@ def test_help_is_quick_and_imports_nothing_heavy() -> None:
 
 
 def test_every_verb_is_there_and_explains_itself(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
-    verbs = ["launch", "simulate", "agent", "status", "hold", "resume", "land", "rtl", "view", "replay", "report"]
+    verbs = [
+        "launch",
+        "simulate",
+        "check",
+        "agent",
+        "status",
+        "hold",
+        "resume",
+        "land",
+        "rtl",
+        "view",
+        "replay",
+        "report",
+    ]
     for verb in [*verbs, "obstacle"]:
         assert run(verb, "--help") == 0
         assert f"{verb} " in capsys.readouterr().out

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 import struct
 from typing import Any
@@ -10,8 +11,8 @@ import pytest
 from pymavlink.dialects.v20 import development as dialect
 
 from swarmctl.core.types import Command, Verb
-from swarmctl.links.autopilot import ARDUCOPTER, PX4
-from swarmctl.links.commands import CodecCommands, CommandResult, long_command
+from swarmctl.links.commands import CodecCommands, CommandResult
+from swarmctl.links.dialects import ARDUCOPTER, PX4, Dialect
 from swarmctl.links.mavlink import Codec
 
 SECOND = 1_000_000
@@ -20,9 +21,10 @@ SECOND = 1_000_000
 class Bench:
     """`CodecCommands`, its clock, and what it sends."""
 
-    def __init__(self) -> None:
+    def __init__(self, dialect: Dialect | None = PX4) -> None:
         self.out: list[bytes] = []
-        self.port = CodecCommands(self.out.append, Codec(5, 191), 5, PX4.external, PX4.hold)
+        self.dialect = dialect
+        self.port = CodecCommands(self.out.append, Codec(5, 191), 5, lambda: self.dialect)
         self.now_us = 0
 
     def run(self, seconds: float) -> list[Any]:
@@ -67,22 +69,31 @@ def bytewise(number: int) -> float:
     ],
 )
 def test_what_is_asked_of_px4(command: Command, number: int, params: tuple[float, ...]) -> None:
-    asked = long_command(command, PX4.external, PX4.hold)
+    asked = PX4.long_command(command)
     assert asked is not None
     assert (asked.command, asked.params) == (number, params)
 
 
-def test_modes_of_arducopter() -> None:
-    external = long_command(Command(Verb.EXTERNAL), ARDUCOPTER.external, ARDUCOPTER.hold)
-    hold = long_command(Command(Verb.HOLD), ARDUCOPTER.external, ARDUCOPTER.hold)
-    assert external is not None
-    assert hold is not None
-    assert (external.params[:2], hold.params[:2]) == ((1.0, 4.0), (1.0, 5.0))
+@pytest.mark.parametrize(
+    ("command", "number", "params"),
+    [
+        (Command(Verb.EXTERNAL), 176, (1.0, 4.0, 0.0)),  # GUIDED
+        (Command(Verb.HOLD), 176, (1.0, 5.0, 0.0)),  # LOITER
+        (Command(Verb.LAND), 176, (1.0, 9.0)),
+        (Command(Verb.TAKEOFF, 2.5), 22, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2.5)),
+        (Command(Verb.ARM), 400, (1.0,)),
+        (Command(Verb.RATE, 50.0, 32), 511, (32.0, 20_000.0)),
+    ],
+)
+def test_what_is_asked_of_arducopter(command: Command, number: int, params: tuple[float, ...]) -> None:
+    asked = ARDUCOPTER.long_command(command)
+    assert asked is not None
+    assert (asked.command, asked.params) == (number, params)
 
 
 @pytest.mark.parametrize("verb", [Verb.TAKEOFF, Verb.LAND])
 def test_takeoff_and_land_happen_where_the_vehicle_is(verb: Verb) -> None:
-    asked = long_command(Command(verb, 3.0), PX4.external, PX4.hold)
+    asked = PX4.long_command(Command(verb, 3.0))
     assert asked is not None
     assert asked.command == {Verb.TAKEOFF: 22, Verb.LAND: 21}[verb]
     assert len(asked.params) == 7
@@ -90,8 +101,8 @@ def test_takeoff_and_land_happen_where_the_vehicle_is(verb: Verb) -> None:
 
 
 def test_arming_is_never_forced() -> None:
-    for verb in (Verb.ARM, Verb.DISARM):
-        asked = long_command(Command(verb), PX4.external, PX4.hold)
+    for verb, spoken in itertools.product((Verb.ARM, Verb.DISARM), (PX4, ARDUCOPTER)):
+        asked = spoken.long_command(Command(verb))
         assert asked is not None
         assert 21196.0 not in asked.params
 
@@ -166,6 +177,53 @@ def test_takeoff_height_goes_into_the_parameter_before_the_command() -> None:
     (answer,) = bench.hear(param_value("MIS_TAKEOFF_ALT", 3.1))
     assert answer.ok
     assert [m.command for m in bench.run(0.2)] == [22]
+
+
+def test_takeoff_is_not_asked_for_when_its_height_was_not_taken() -> None:
+    bench = Bench()
+    bench.port.request(Command(Verb.TAKEOFF, 3.1))
+    bench.run(0.1)
+    results = bench.hear(param_value("MIS_TAKEOFF_ALT", 2.5))
+    assert [(r.command.verb, r.ok) for r in results] == [(Verb.PARAM_FLOAT, False), (Verb.TAKEOFF, False)]
+    assert bench.run(3.0) == []
+
+
+def test_arducopter_takes_off_with_the_height_in_the_command() -> None:
+    bench = Bench(ARDUCOPTER)
+    bench.port.request(Command(Verb.TAKEOFF, 3.0))
+    (message,) = bench.run(0.2)
+    assert (message.command, message.param7) == (22, 3.0)
+
+
+def test_nothing_is_asked_in_the_wrong_language() -> None:
+    bench = Bench(None)
+    bench.port.request(Command(Verb.EXTERNAL))
+    assert bench.run(5.0) == []
+    assert bench.port.busy
+    bench.dialect = ARDUCOPTER
+    (message,) = bench.run(0.2)
+    assert (message.command, message.param2) == (176, 4.0)
+
+
+def test_integers_travel_as_floats_to_arducopter_and_are_read_so() -> None:
+    bench = Bench(ARDUCOPTER)
+    bench.port.request(Command(Verb.PARAM_INT, number=8, name="GUID_OPTIONS"))
+    (message,) = bench.run(0.1)
+    assert (message.param_id, message.param_value) == ("GUID_OPTIONS", 8.0)
+    assert bench.hear(param_value("GUID_OPTIONS", 8.0, 6))[0].ok
+    assert ARDUCOPTER.from_wire(8.0, 6) == 8.0
+    assert PX4.from_wire(bytewise(8), 6) == 8.0
+    assert PX4.from_wire(0.625, 9) == 0.625
+
+
+def test_a_parameter_is_read_by_its_name() -> None:
+    bench = Bench()
+    bench.port.request(Command(Verb.PARAM_GET, name="MPC_THR_HOVER"))
+    (message,) = bench.run(0.1)
+    kind = message.get_type(), message.param_id, message.param_index, message.target_system
+    assert kind == ("PARAM_REQUEST_READ", "MPC_THR_HOVER", -1, 5)
+    (answer,) = bench.hear(param_value("MPC_THR_HOVER", 0.5))
+    assert (answer.ok, answer.text) == (True, "0.5")
 
 
 @pytest.mark.parametrize("number", [4, 0, -1, 2**31 - 1, -(2**31)])

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy import optimize
 
-from swarmctl.control.axes import AxesSolution, Axis, HalfSpaces, Horizon, Penalties
+from swarmctl.control.axes import AxesProblem, AxesSolution, Axis, HalfSpaces, Horizon, Penalties
 from swarmctl.control.condensed import CondensedMpc
 from swarmctl.control.qp import OsqpSolver, QpParams, QpSolution
 from swarmctl.core.types import Array
@@ -71,7 +71,7 @@ def solve_one(
     one = np.ones((steps, 1))
     gains = np.array(np.broadcast_to(gain, steps))[:, None]
     here, now, held_u, pushed = (np.array([x]) for x in (pos, vel, u_prev, drift))
-    return problem.solve(here, now, held_u, gains, pushed, ref * one, ref_vel * one)
+    return problem.solve(AxesProblem(here, now, held_u, gains, pushed, ref * one, ref_vel * one))
 
 
 @pytest.mark.parametrize("euler", [False, True])
@@ -93,7 +93,7 @@ def test_prediction_follows_a_gain_that_is_another_at_every_step_and_axis(euler:
     gains = np.stack([VARYING, np.linspace(-3.0, -20.0, 40)], axis=1)
     pos, vel, u_prev, drift = np.array([0.3, -1.0]), np.array([-0.4, 0.2]), np.array([0.02, -0.15]), [0.5, -0.2]
     reference = np.tile([1.0, 0.5], (40, 1))
-    solution = problem.solve(pos, vel, u_prev, gains, np.array(drift), reference, 0.0 * reference)
+    solution = problem.solve(AxesProblem(pos, vel, u_prev, gains, np.array(drift), reference, 0.0 * reference))
     assert np.abs(np.diff(solution.u, axis=0)).max() > 0.01  # it does something
     for i in range(2):
         p, v = simulate(pos[i], vel[i], solution.u[:, i], gains[:, i], drift[i], 0.02, euler)
@@ -226,7 +226,7 @@ def test_half_spaces_against_a_dense_solver(
     pos, vel, u_prev, ref = np.array([0.0, 0.0]), np.array([0.2, 0.1]), np.array([0.01, -0.02]), np.array([0.5, 0.3])
     spaces = wall(normal, offset_m, 25, stop_s)
     tick = (pos, vel, u_prev, np.stack([gain, gain], axis=1), np.zeros(2), np.tile(ref, (25, 1)), np.zeros((25, 2)))
-    ours = problem.solve(*tick, spaces)
+    ours = problem.solve(AxesProblem(*tick), spaces)
     u, p, _ = dense(problem, pos, vel, u_prev, gain, ref, spaces, problem._checked)
     np.testing.assert_allclose(ours.pos_m, p, atol=5e-4)
     np.testing.assert_allclose(ours.u, u, atol=3e-3)
@@ -235,7 +235,7 @@ def test_half_spaces_against_a_dense_solver(
     unit = spaces.normal[0, 0]
     assert ((ours.pos_m @ unit)[problem._checked] >= offset_m - 1e-3).all()
     assert unit @ (ours.pos_m[-1] + stop_s * ours.vel_m_s[-1]) >= offset_m - 1e-3
-    free = problem.solve(*tick)
+    free = problem.solve(AxesProblem(*tick))
     active = bool(np.abs(free.pos_m - ours.pos_m).max() > 0.005)
     assert active == (offset_m > -1.0)  # the constraint mattered, and left no trace in the next solve
 
@@ -252,7 +252,7 @@ def test_rows_that_cannot_be_met_give_slack_and_not_failure() -> None:
     still, origin = np.zeros((40, 2)), np.zeros(2)
     north, south = wall((1.0, 0.0), 0.1, 40), wall((-1.0, 0.0), 0.1, 40)  # north of 0.1 m and south of -0.1 m
     both = HalfSpaces(*(np.concatenate([getattr(w, name) for w in (north, south)]) for name in FIELDS))
-    solution = problem.solve(origin, origin, origin, same_gain(40, 2), origin, still, still, both)
+    solution = problem.solve(AxesProblem(origin, origin, origin, same_gain(40, 2), origin, still, still), both)
     assert solution.solved
     assert solution.slack_m == pytest.approx(0.1, abs=0.02)  # each gives way by half of what is asked
     assert solution.residual_m < 0.02
@@ -264,7 +264,9 @@ def test_no_reference_is_worth_any_slack_where_the_rows_can_be_met(ref_m: float)
     problem = mpc(AXIS, AXIS, slots=1, qp=QpParams())
     origin, reference = np.zeros(2), np.tile([ref_m, 0.0], (40, 1))
     spaces = wall((-1.0, 0.0), -0.1, 40)  # stay south of 0.1 m
-    solution = problem.solve(origin, origin, origin, same_gain(40, 2), origin, reference, 0.0 * reference, spaces)
+    solution = problem.solve(
+        AxesProblem(origin, origin, origin, same_gain(40, 2), origin, reference, 0.0 * reference), spaces
+    )
     assert solution.slack_m < 0.005
     assert solution.pos_m[-1, 0] < 0.1 + 0.02
 
@@ -273,7 +275,7 @@ def test_relaxed_rows_ask_for_no_more_than_can_be_reached() -> None:
     problem = mpc(AXIS, AXIS, slots=1, relax_01=0.9, qp=QpParams())
     still, origin = np.zeros((40, 2)), np.zeros(2)
     spaces = wall((1.0, 0.0), 2.0, 40)
-    solution = problem.solve(origin, origin, origin, same_gain(40, 2), origin, still, still, spaces)
+    solution = problem.solve(AxesProblem(origin, origin, origin, same_gain(40, 2), origin, still, still), spaces)
     assert solution.slack_m < 0.02
     reach, _ = simulate(0.0, 0.0, np.clip(-0.05 * np.arange(1, 41), -0.2, None), GAIN, 0.0, 0.02, False)
     assert solution.pos_m[-1, 0] >= 0.9 * reach[-1] - 0.02

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from swarmctl.control.controller import Controller, ControllerParams, make_controller
+from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc import MpcParams
 from swarmctl.control.pid import PidParams
 from swarmctl.control.problem import Problem, Start
@@ -25,7 +26,9 @@ PLANNING: list[Kind] = ["dmpc", "dmpc3", "mpc"]
 
 
 def make(kind: Kind, slots: int = 2, **params: Any) -> Controller:
-    return make_controller(ControllerParams(kind=kind, **params), SeparationParams(), 0, slots, time.perf_counter_ns)
+    return make_controller(
+        ControllerParams(kind=kind, **params), VehicleModelParams(), SeparationParams(), 0, slots, time.perf_counter_ns
+    )
 
 
 def hover(controller: Controller, offset: tuple[float, ...] = (0.0, 0.0, 0.0), *keep_outs: KeepOut) -> Problem:

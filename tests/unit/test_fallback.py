@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from swarmctl.control.fallback import rest_plan
+from swarmctl.control.lag import Lag
 from swarmctl.control.model import acceleration
 from swarmctl.control.problem import Start
 from swarmctl.core.types import Array, Plan, PlanStatus
@@ -27,7 +28,7 @@ def start(
 def brake(
     vel: tuple[float, ...], at: Array | None = None, wind: Array = NO_WIND, tilt: tuple[float, ...] = (0.0, 0.0)
 ) -> Plan:
-    return rest_plan(start(vel, tilt=tilt), at, wind, DT_US, STEPS)
+    return rest_plan(start(vel, tilt=tilt), at, wind, None, DT_US, STEPS)
 
 
 @pytest.mark.parametrize("speed_m_s", [0.5, 1.0, 2.5, 5.0])
@@ -97,3 +98,54 @@ def test_at_rest_on_its_place_nothing_moves() -> None:
     np.testing.assert_allclose(plan.pos_ned_m, np.tile([0.0, 0.0, -5.0], (STEPS + 1, 1)))
     np.testing.assert_allclose(plan.virtual, np.tile([0.0, 0.0, 9.81], (STEPS, 1)))
     assert (plan.t0_us, plan.dt_us) == (1_000_000, DT_US)
+
+
+# -- a vehicle whose attitude lags ------------------------------------------------------------------------------------
+
+LAG = Lag(9.5, 1.0)  # of the measured autopilot
+SLOW = Lag(4.0, 0.8)
+
+
+def flown(
+    believed: Lag | None, true: Lag, vel: tuple[float, ...], at: Array | None, seconds: float
+) -> tuple[Array, Array]:
+    """Positions and velocities (T, 3) of a vehicle with a lag that flies the first command of a new plan each tick."""
+    pos, v, tilt, rate, commanded = np.zeros(3), np.array(vel), np.zeros(2), np.zeros(2), np.zeros(2)
+    path, speeds = [], []
+    for _ in range(round(seconds / DT_S)):
+        begin = Start(0, pos, v, 1.0, np.array([*commanded, 9.81]), tilt, rate)
+        virtual = rest_plan(begin, at, NO_WIND, believed, DT_US, 2).virtual[0]
+        ends = [true.advance(float(tilt[i]), float(rate[i]), float(virtual[i]), DT_S) for i in (0, 1)]
+        tilt, rate = np.array([e[0] for e in ends]), np.array([e[1] for e in ends])
+        accel = acceleration(np.array([ends[0][2] / DT_S, ends[1][2] / DT_S, virtual[2]]))
+        pos, v, commanded = pos + DT_S * v + 0.5 * DT_S**2 * accel, v + DT_S * accel, virtual[:2]
+        path.append(pos)
+        speeds.append(v)
+    return np.array(path), np.array(speeds)
+
+
+@pytest.mark.parametrize("lag", [LAG, SLOW])
+def test_a_lagging_vehicle_comes_to_rest_and_does_not_swing(lag: Lag) -> None:
+    _, speeds = flown(lag, lag, (3.0, 0.0, 0.0), None, 8.0)
+    assert np.abs(speeds[-50:]).max() < 0.02
+    assert speeds[:, 0].min() > -0.3
+    held, _ = flown(lag, lag, (2.0, 0.0, 0.0), np.zeros(3), 14.0)
+    assert np.abs(held[-50:, :2]).max() < 0.05
+
+
+def test_the_damping_for_a_vehicle_without_lag_would_swing_a_slow_one() -> None:
+    """The control of the test above."""
+    _, speeds = flown(None, SLOW, (3.0, 0.0, 0.0), None, 8.0)
+    assert speeds[:, 0].min() < -0.5
+
+
+def test_the_path_it_shares_is_the_one_a_lagging_vehicle_flies() -> None:
+    begin = Start(0, np.zeros(3), np.array([2.0, -1.0, 0.0]), 1.0, np.array([0.1, 0.0, 9.81]), np.array([0.1, 0.0]))
+    plan = rest_plan(begin, None, NO_WIND, LAG, DT_US, STEPS)
+    pos, vel, tilt, rate = np.zeros(3), np.array([2.0, -1.0, 0.0]), np.array([0.1, 0.0]), np.zeros(2)
+    for k, virtual in enumerate(plan.virtual):
+        ends = [LAG.advance(float(tilt[i]), float(rate[i]), float(virtual[i]), DT_S) for i in (0, 1)]
+        tilt, rate = np.array([e[0] for e in ends]), np.array([e[1] for e in ends])
+        accel = acceleration(np.array([ends[0][2] / DT_S, ends[1][2] / DT_S, virtual[2]]))
+        pos, vel = pos + DT_S * vel + 0.5 * DT_S**2 * accel, vel + DT_S * accel
+        np.testing.assert_allclose(plan.pos_ned_m[k + 1, :2], pos[:2], atol=0.02)

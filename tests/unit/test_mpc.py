@@ -10,7 +10,7 @@ import pytest
 
 from swarmctl.control.axes import AxesSolution
 from swarmctl.control.controller import ControllerParams, make_controller
-from swarmctl.control.model import acceleration
+from swarmctl.control.model import VehicleModelParams, acceleration
 from swarmctl.control.mpc import RESIDUAL_LIMIT_M, MpcParams, SwarmMpc, nearest
 from swarmctl.control.problem import Problem, Start
 from swarmctl.control.qp import QpParams
@@ -47,7 +47,7 @@ def plan_to(
     begin: Start | None = None,
     **params: Any,
 ) -> Plan:
-    mpc = SwarmMpc(MpcParams(**params), SeparationParams(), 0, 2, lambda: 0)
+    mpc = SwarmMpc(MpcParams(**params), VehicleModelParams(), SeparationParams(), 0, 2, lambda: 0)
     return mpc.plan(problem(offset, *keep_outs, wind=wind, begin=begin))
 
 
@@ -186,7 +186,7 @@ def solution(residual_m: float, solved: bool = True) -> AxesSolution:
 def test_the_answer_of_the_solver_is_looked_at(
     monkeypatch: pytest.MonkeyPatch, residual_m: float, solved: bool, status: PlanStatus
 ) -> None:
-    mpc = SwarmMpc(MpcParams(), SeparationParams(), 0, 2, lambda: 0)
+    mpc = SwarmMpc(MpcParams(), VehicleModelParams(), SeparationParams(), 0, 2, lambda: 0)
     monkeypatch.setattr(mpc._xy_alone, "solve", lambda *_: solution(residual_m, solved))
     assert mpc.plan(problem()).status is status
 
@@ -214,8 +214,8 @@ def test_z_longer_or_shorter_than_xy_gives_a_plan_of_xy_length() -> None:
 
 def test_the_controller_without_neighbours_ignores_them_and_the_distributed_one_does_not() -> None:
     neighbour = fixed(HERE + np.array([0.5, 0.0, 0.0]), 0.8)
-    alone = make_controller(ControllerParams(kind="mpc"), SeparationParams(), 0, 2, lambda: 0)
-    together = make_controller(ControllerParams(kind="dmpc"), SeparationParams(), 0, 2, lambda: 0)
+    alone = make_controller(ControllerParams(kind="mpc"), VehicleModelParams(), SeparationParams(), 0, 2, lambda: 0)
+    together = make_controller(ControllerParams(kind="dmpc"), VehicleModelParams(), SeparationParams(), 0, 2, lambda: 0)
     free, kept = (c.plan(problem((0.5, 0.0, 0.0), neighbour)) for c in (alone, together))
     assert free.status is PlanStatus.OK
     assert free.virtual[5, 0] < -0.02  # towards the reference
@@ -224,7 +224,7 @@ def test_the_controller_without_neighbours_ignores_them_and_the_distributed_one_
 
 def test_times_are_measured_with_the_stopwatch_and_add_up() -> None:
     now_ns = iter(range(0, 10**9, 1000))  # every reading is 1 us after the last
-    mpc = SwarmMpc(MpcParams(), SeparationParams(), 0, 2, lambda: next(now_ns))
+    mpc = SwarmMpc(MpcParams(), VehicleModelParams(), SeparationParams(), 0, 2, lambda: next(now_ns))
     neighbour = fixed(HERE + np.array([1.3, 0.0, 0.0]))
     times = mpc.plan(problem((0.1, 0.0, 0.0), neighbour)).times
     # read at the start, round both solves, after them, and after the certificate: six intervals

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from itertools import product
+from typing import Any
 
 import numpy as np
 import pytest
@@ -17,6 +18,8 @@ from swarmctl.control.separation import (
     half_spaces,
     keep_out_of_obstacle,
     keep_out_of_peer,
+    radius_problem,
+    required_radius_m,
     visible,
 )
 from swarmctl.core.types import Array, Obstacle, PredictedPath
@@ -362,3 +365,35 @@ def test_in_space_who_climbs_gets_somewhere() -> None:
     climbing = np.linspace((0.0, 0.0, 0.0), (0.05, 0.0, -2.0), STEPS + 1)  # 2 m, of which 5 cm are not up
     turned = in_space(climbing, peer_ahead, goal=(9.0, 0.0, -2.0)).normal[0, :, 1]
     np.testing.assert_allclose(turned, 0.0, atol=1e-9)
+
+
+# -- how large the radius has to be -----------------------------------------------------------------------------------
+
+
+def test_the_radius_covers_bodies_tracking_and_two_wrong_positions() -> None:
+    params = SeparationParams(radius_m=0.9, body_m=0.48, tracking_m=0.05)
+    assert required_radius_m(params, 0.0) == pytest.approx(0.53)
+    assert 1.2 < required_radius_m(params, 0.28) < 1.5  # of an autopilot on plain GPS, as flights of them suggest
+    rng, accuracy_m = np.random.default_rng(2), 0.28
+    errors = rng.normal(scale=accuracy_m / math.sqrt(2.0), size=(100_000, 2, 2))
+    apart = required_radius_m(params, accuracy_m) - 0.05 - np.linalg.norm(errors[:, 0] - errors[:, 1], axis=1)
+    assert (apart < params.body_m).mean() < 0.03
+
+
+@pytest.mark.parametrize(
+    ("told", "accuracy_m", "refused"),
+    [({}, 0.0, False), ({}, 0.28, True), ({"radius_m": 1.4}, 0.28, False), ({"allow_small_radius": True}, 0.28, False)],
+)
+def test_a_radius_that_is_too_small_is_refused_unless_told_so(
+    told: dict[str, Any], accuracy_m: float, refused: bool
+) -> None:
+    problem = radius_problem(SeparationParams(**told), accuracy_m)
+    assert bool(problem) is refused
+    if refused:
+        assert all(part in problem for part in ("separation.radius_m = 0.9", "1.27 m", "allow_small_radius"))
+
+
+def test_plans_keep_what_tracking_will_miss_and_the_certificate_asks_for_the_radius() -> None:
+    keep_out = keep_out_of_peer(peer(np.zeros((3, 3))), UTC_US, DT_US, 2, SeparationParams(tracking_m=0.07))
+    assert keep_out.radius_m == pytest.approx(0.97)
+    assert keep_out.certified_m == pytest.approx(0.8)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from swarmctl.core.types import Command, FlightMode, Phase, Verb
-from tests.unit.sequenced_flight import IN_AIR, SECOND, START, UTC0_US, Flight, ready, verbs
+from tests.unit.sequenced_flight import IN_AIR, SECOND, START, UTC0_US, Flight, ready
 
 # -- the way there ----------------------------------------------------------------------------------------------------
 
@@ -27,20 +27,57 @@ def test_a_whole_flight_asks_for_each_thing_once_and_in_order() -> None:
     assert (flight.sequence.finished, flight.sequence.outcome) == (True, "completed")
 
 
-def test_without_a_vehicle_nothing_but_its_state_is_asked_for_and_only_once_a_second() -> None:
+def test_without_a_vehicle_or_before_its_link_is_set_up_nothing_is_asked_for() -> None:
     flight = Flight()
-    flight.seen = flight.heard = False
+    flight.seen = flight.prepared = False
     assert flight.run(3.0) == []
-    flight.heard = True
-    assert flight.run(3.0) == [Verb.RATE, Verb.MESSAGE] * 3
     assert flight.at == "CONNECT"
+    flight.seen = True
+    assert flight.run(3.0) == []
+    assert flight.at == "CONNECT", "peers would arm if it stood by, and it may have to refuse"
+    flight.prepared = True
+    assert Verb.ARM in flight.run(0.3)
 
 
-def test_parameters_are_set_before_anything_else_with_their_types() -> None:
-    commands = Flight().step()
-    assert Command(Verb.PARAM_INT, number=4, name="COM_OBL_RC_ACT") in commands
-    assert Command(Verb.PARAM_FLOAT, value=0.5, name="MPC_LAND_SPEED") in commands
-    assert Verb.ARM not in verbs(commands)
+@pytest.mark.parametrize("phase", [Phase.CONNECT, Phase.STANDBY, Phase.ARM])
+def test_what_refuses_to_arm_ends_the_mission_with_its_reason(phase: Phase) -> None:
+    flight = Flight()
+    flight.prepared, flight.armable = phase is not Phase.CONNECT, phase is Phase.ARM
+    flight.run(0.3)
+    assert flight.phase is phase
+    flight.prepared, flight.refusal = True, "COM_OBL_RC_ACT can't be read"
+    assert flight.run(5.0) == []
+    assert (flight.at, flight.sequence.outcome) == ("DONE", "COM_OBL_RC_ACT can't be read")
+    flight.refusal = ""
+    assert flight.run(5.0) == []
+
+
+def test_when_a_peer_gives_up_on_the_ground_nobody_else_takes_off() -> None:
+    flight = Flight()
+    flight.peer(Phase.DONE)
+    assert flight.run(5.0) == []
+    assert (flight.at, flight.sequence.outcome) == ("DONE", "a peer gave up before take-off")
+
+
+def test_arducopter_is_guided_before_it_is_armed_and_takes_off_in_that_mode() -> None:
+    flight = Flight()
+    flight.arm_in, flight.flight_mode = FlightMode.EXTERNAL, FlightMode.MANUAL
+    flight.until(Phase.ARM)
+    assert flight.run(1.0) == [Verb.EXTERNAL]
+    flight.flight_mode = FlightMode.MANUAL  # STABILIZE again while it boots
+    assert flight.run(1.0) == [Verb.EXTERNAL]
+    flight.flight_mode = FlightMode.EXTERNAL
+    assert flight.run(1.0) == [Verb.ARM]
+    flight.armed = True
+    assert flight.run(0.3) == [Verb.TAKEOFF]
+    flight.landed, flight.vel = IN_AIR, np.array([0.0, 0.0, -1.0])
+    assert flight.run(1.0) == []
+    assert (flight.at, flight.sequence.had_control) == ("TAKEOFF", False), "it climbs by itself"
+    flight.pos, flight.vel = START.copy(), np.zeros(3)
+    flight.run(0.8)
+    assert not flight.sequence.had_control, "its hover thrust is being learned"
+    flight.run(0.5)
+    assert flight.sequence.had_control
 
 
 @pytest.mark.parametrize("missing", ["armable", "answers", "peer", "peer alive", "peer vehicle"])

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from swarmctl.control.sequence import OPERATOR_STOP
+from swarmctl.control.sequence import OPERATOR_STOP, REBOOTED
+from swarmctl.control.spread import nearest_in_plane_m, room_for
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase, Verb
 from tests.unit.sequenced_flight import IN_AIR, ON_GROUND, OURS, START, Flight, controlled, ready, verbs
 
@@ -206,7 +207,8 @@ def test_a_vehicle_found_in_the_air_is_handed_back_in_the_air(landed_at_first: L
             flight.flight_mode = FlightMode.HOLD
     assert not {Verb.ARM, Verb.TAKEOFF, Verb.LAND, Verb.DISARM} & set(asked)
     assert asked[-1] is Verb.HOLD
-    assert Phase.GOTO_LAND not in phases  # where the mission ends, not where it began
+    pos, _ = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([60.0]))
+    np.testing.assert_allclose(pos[0], flight.pos, atol=1e-9)  # where the mission ends, not where it began
     assert (flight.phase, flight.sequence.outcome) == (Phase.DONE, "completed")
     assert flight.armed
 
@@ -282,3 +284,122 @@ def test_taking_over_in_silence_it_stays_where_it_is() -> None:
     flight.run(0.2)
     pos, _ = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([60.0]))
     np.testing.assert_allclose(pos[0], START + np.array([3.0, 0.0, 0.0]), atol=1e-9)
+
+
+# -- rebooted ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("phase", [Phase.ARM, Phase.TAKEOFF, *OURS])
+def test_after_a_reboot_of_its_autopilot_it_asks_for_nothing_any_more(phase: Phase) -> None:
+    flight = controlled(phase) if phase in OURS else Flight().until(phase)
+    flight.boots, flight.seen = 1, False  # no position yet
+    flight.run(0.2)
+    assert flight.sequence.outcome == REBOOTED
+    flight.seen, flight.armed, flight.flight_mode = True, False, FlightMode.HOLD
+    flight.landed = IN_AIR
+    assert flight.run(5.0) == []
+    flight.landed = ON_GROUND
+    assert flight.run(5.0) == []
+    assert (flight.at, flight.sequence.outcome) == ("DONE", REBOOTED)
+
+
+def test_a_reboot_before_anything_was_armed_costs_nothing() -> None:
+    flight = Flight()
+    flight.armable = False
+    flight.run(0.3)
+    flight.boots, flight.prepared, flight.armable = 1, False, True
+    assert flight.run(2.0) == [], "its parameters are not set again yet"
+    flight.prepared = True
+    assert Verb.ARM in flight.run(0.5)
+
+
+# -- before control ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("mode", "failsafe"),
+    [(FlightMode.RTL, True), (FlightMode.LAND, True), (FlightMode.HOLD, True), (FlightMode.MANUAL, False)],
+)
+def test_a_vehicle_found_in_a_failsafe_or_with_a_pilot_is_not_even_streamed_to(
+    mode: FlightMode, failsafe: bool
+) -> None:
+    flight = airborne()
+    flight.flight_mode, flight.failsafe = mode, failsafe
+    assert flight.run(5.0) == []
+    assert flight.phase < Phase.GOTO_START, "in which setpoints flow"
+    assert flight.sequence.yielded
+    flight.ask("resume")
+    assert Verb.EXTERNAL in flight.run(1.0)
+
+
+# -- brake and make room before an autopilot takes over ---------------------------------------------------------------
+
+CLOSE = START + np.array([0.6, 0.0, 0.0])
+
+
+def test_who_lands_where_it_is_goes_where_there_is_room_first() -> None:
+    flight = controlled(Phase.TRACK)
+    flight.pos, flight.others = START.copy(), (CLOSE,)
+    flight.judged = Mode.FOLLOW
+    flight.ask("land")
+    assert Verb.LAND not in flight.run(6.0)
+    pos, _ = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([60.0]))
+    assert np.linalg.norm((pos[0] - CLOSE)[:2]) == pytest.approx(0.9 + 0.2 + 0.1)
+    assert pos[0][2] == START[2]
+    flight.pos = pos[0]
+    assert Verb.LAND in flight.run(6.0)
+
+
+def test_below_is_no_room_and_those_above_each_other_part_in_different_directions() -> None:
+    low, high = START.copy(), START - np.array([0.0, 0.0, 3.0])
+    assert nearest_in_plane_m(low, [high]) == 0.0
+    apart = [room_for(low, [high], 1.2, own) - room_for(high, [low], 1.2, own + 1) for own in range(4)]
+    assert min(np.linalg.norm(gap[:2]) for gap in apart) > 1.2
+    crowd = [np.array([0.3 * k, 0.1 * k * k, -2.0]) for k in range(4)]
+    place = room_for(np.array([0.2, 0.2, -2.0]), crowd, 1.2, 5)
+    assert nearest_in_plane_m(place, crowd) > 1.1
+    np.testing.assert_array_equal(room_for(low, [], 1.2, 0), low)
+
+
+def test_without_room_for_too_long_it_lands_all_the_same() -> None:
+    flight = controlled(Phase.TRACK)
+    flight.pos, flight.others = START.copy(), (CLOSE,)
+    flight.ask("land")
+    assert Verb.LAND not in flight.run(19.0)
+    assert Verb.LAND in flight.run(3.0)
+
+
+def test_a_start_given_up_at_speed_brakes_before_the_autopilot_lands_it() -> None:
+    flight = controlled(Phase.GOTO_START)
+    flight.judged, flight.vel = Mode.FOLLOW, np.array([2.0, 0.0, 0.0])
+    while flight.phase is Phase.GOTO_START:
+        flight.step()
+    assert flight.at == "GOTO_LAND"
+    _, vel = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([0.0, 60.0]))
+    np.testing.assert_allclose(vel[1], 0.0)
+    assert "not tracking" in flight.sequence.outcome
+
+
+def test_only_without_a_plan_it_is_landed_at_once() -> None:
+    flight = controlled(Phase.TRACK)
+    flight.others, flight.judged = (CLOSE,), Mode.LAND
+    assert Verb.LAND in flight.run(0.3)
+
+
+def test_a_landing_place_not_reached_in_time_is_left_at_rest_and_with_room() -> None:
+    flight = controlled(Phase.GOTO_LAND)
+    flight.judged, flight.vel = Mode.FOLLOW, np.array([1.0, 0.0, 0.0])
+    assert Verb.LAND not in flight.run(21.0)
+    assert flight.at == "GOTO_LAND"
+    flight.vel = np.zeros(3)
+    assert Verb.LAND in flight.run(5.0)
+
+
+def test_handed_back_in_the_air_among_others_it_holds_only_at_rest_and_alone_at_once() -> None:
+    for others in (1, 0):
+        flight = Flight(others)
+        flight.armed, flight.pos, flight.landed = True, START.copy(), IN_AIR
+        flight.until(Phase.TRACK)
+        flight.judged, flight.vel = Mode.FOLLOW, np.array([2.0, 0.0, 0.0])
+        asked = flight.run(11.0)
+        assert (Verb.HOLD in asked) is (others == 0)

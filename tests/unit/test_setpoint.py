@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarmctl.control.model import Predictor, VehicleModelParams, acceleration
+from swarmctl.control.model import Predictor, VehicleModelParams, acceleration, tilt_rate
 from swarmctl.control.setpoint import VALID_US, setpoint_of
-from swarmctl.core.frames import body_z_ned, euler_from_quat
-from swarmctl.core.types import FlightMode, Landed, VehicleState
+from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned, euler_from_quat, quat_from_body_z
+from swarmctl.core.types import Array, FlightMode, Landed, VehicleState
 
 MODEL = VehicleModelParams()  # thrust 0.05..1, tilt 0.6 rad
 G = 9.81
@@ -84,6 +85,16 @@ def test_acceleration_of_virtual_controls_by_hand() -> None:
     np.testing.assert_allclose(acceleration(np.array([0.0, 0.0, 0.0])), [0.0, 0.0, G])
 
 
+HOVER = np.array([0.0, 0.0, GRAVITY_M_S2])
+
+
+def level_and(north_m_s2: float, east_m_s2: float) -> Array:
+    """Virtual controls that accelerate like this without climbing."""
+    lift = np.array([-north_m_s2, -east_m_s2, GRAVITY_M_S2])
+    size = float(np.linalg.norm(lift))
+    return np.array([lift[0] / size, lift[1] / size, size])
+
+
 def state(t_us: int, pos: tuple[float, ...], vel: tuple[float, ...]) -> VehicleState:
     level = np.array([1.0, 0.0, 0.0, 0.0])
     return VehicleState(
@@ -91,25 +102,89 @@ def state(t_us: int, pos: tuple[float, ...], vel: tuple[float, ...]) -> VehicleS
     )
 
 
+def predicted(predictor: Predictor, now: VehicleState, until_us: int, wind: Array) -> tuple[Array, Array]:
+    start = predictor.start(now, until_us, wind, HOVER)
+    assert start.t_us == until_us
+    return start.pos_ned_m, start.vel_ned_m_s
+
+
 def test_prediction_applies_each_command_from_when_it_acts() -> None:
     predictor = Predictor(VehicleModelParams(delay_s=0.1))
-    north, east = np.array([2.0, 0.0, 0.0]), np.array([0.0, 4.0, 0.0])
+    north, east = level_and(2.0, 0.0), level_and(0.0, 4.0)
     predictor.sent(0, north)  # acts from 0.1 s
     predictor.sent(100_000, east)  # acts from 0.2 s
-    pos, vel = predictor.predict(state(150_000, (1.0, 0.0, 0.0), (1.0, 0.0, 0.0)), 300_000, np.zeros(3))
+    pos, vel = predicted(predictor, state(150_000, (1.0, 0.0, 0.0), (1.0, 0.0, 0.0)), 300_000, np.zeros(3))
     # 50 ms at 2 m/s2 north, then 100 ms at 4 m/s2 east
-    np.testing.assert_allclose(vel, [1.1, 0.4, 0.0])
-    np.testing.assert_allclose(pos, [1.0 + 0.05 + 0.0025 + 0.11, 0.02, 0.0])
-    before = predictor.predict(state(150_000, (1.0, 0.0, 0.0), (1.0, 0.0, 0.0)), 180_000, np.zeros(3))
-    np.testing.assert_allclose(before[1], [1.06, 0.0, 0.0])  # what acts later does not yet
+    np.testing.assert_allclose(vel, [1.1, 0.4, 0.0], atol=1e-12)
+    np.testing.assert_allclose(pos, [1.0 + 0.05 + 0.0025 + 0.11, 0.02, 0.0], atol=1e-12)
+    before = predicted(predictor, state(150_000, (1.0, 0.0, 0.0), (1.0, 0.0, 0.0)), 180_000, np.zeros(3))
+    np.testing.assert_allclose(before[1], [1.06, 0.0, 0.0], atol=1e-12)  # what acts later does not yet
 
 
 def test_prediction_adds_the_disturbance_to_commands_and_nothing_before_the_first() -> None:
     predictor = Predictor(VehicleModelParams(delay_s=0.1))
     wind = np.array([0.0, 1.0, 0.0])
     hover = state(0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    np.testing.assert_allclose(predictor.predict(hover, 1_000_000, wind)[1], 0.0)  # whoever flies holds against it
-    predictor.sent(0, np.zeros(3))
-    np.testing.assert_allclose(predictor.predict(hover, 1_100_000, wind)[1], [0.0, 1.1, 0.0])
+    np.testing.assert_allclose(predicted(predictor, hover, 1_000_000, wind)[1], 0.0)  # whoever flies holds against it
+    predictor.sent(0, HOVER)
+    np.testing.assert_allclose(predicted(predictor, hover, 1_100_000, wind)[1], [0.0, 1.1, 0.0], atol=1e-12)
     predictor.clear()
-    np.testing.assert_allclose(predictor.predict(hover, 1_000_000, wind)[1], 0.0)
+    np.testing.assert_allclose(predicted(predictor, hover, 1_000_000, wind)[1], 0.0)
+
+
+# -- with an attitude that lags behind --------------------------------------------------------------------------------
+
+LAGGING = VehicleModelParams(delay_s=0.08, attitude_rad_s=9.5, drag_1_s=1.0)
+
+
+def tilted(t_us: int, u_x: float, rate_1_s: float) -> VehicleState:
+    """At rest, leaning so that the down axis has a north part `u_x`, which changes by `rate_1_s`."""
+    q_nb = quat_from_body_z(np.array([u_x, 0.0, math.sqrt(1.0 - u_x * u_x)]), 0.0)
+    pitch_rate = rate_1_s / math.sqrt(1.0 - u_x * u_x)
+    return replace(
+        state(t_us, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)), q_nb=q_nb, rate_frd_rad_s=np.array([0, pitch_rate, 0])
+    )
+
+
+def test_rate_of_the_tilt_is_that_of_the_body() -> None:
+    now = tilted(0, 0.3, 0.8)
+    np.testing.assert_allclose(tilt_rate(now), [0.8, 0.0], atol=1e-12)
+    turned = replace(now, q_nb=quat_from_body_z(body_z_ned(now.q_nb), 1.1), rate_frd_rad_s=np.array([0.4, -0.2, 5.0]))
+    h, (p, q, r) = 1e-6, turned.rate_frd_rad_s
+    step = np.array([1.0, 0.5 * h * p, 0.5 * h * q, 0.5 * h * r])
+    after = body_z_ned(product(turned.q_nb, step))
+    np.testing.assert_allclose(tilt_rate(turned), (after - body_z_ned(turned.q_nb))[:2] / h, atol=1e-4)
+
+
+def product(a: Array, b: Array) -> Array:
+    """Hamilton product of two quaternions wxyz."""
+    w, v = a[0] * b[0] - a[1:] @ b[1:], a[0] * b[1:] + b[0] * a[1:] + np.cross(a[1:], b[1:])
+    return np.array([w, *v])
+
+
+def test_a_lagging_vehicle_is_predicted_from_its_measured_tilt() -> None:
+    predictor, lag = Predictor(LAGGING), LAGGING.lag()
+    assert lag is not None
+    command = np.array([0.2, 0.0, GRAVITY_M_S2 / math.sqrt(1 - 0.04)])
+    predictor.sent(-200_000, command)
+    start = predictor.start(tilted(0, 0.05, 0.5), 80_000, np.zeros(3), command)
+    tilt, rate, _ = lag.advance(0.05, 0.5, 0.2, 0.08)
+    assert start.tilt[0] == pytest.approx(tilt, abs=1e-9)
+    assert start.tilt_rate_1_s[0] == pytest.approx(rate, abs=1e-9)
+    assert start.cos_tilt == pytest.approx(math.sqrt(1.0 - tilt * tilt))
+    vel = 0.0
+    for k in range(800):
+        leaning, _, _ = lag.advance(0.05, 0.5, 0.2, k * 1e-4)
+        vel += 1e-4 * (-float(command[2]) * leaning - 1.0 * vel)
+    assert start.vel_ned_m_s[0] == pytest.approx(vel, abs=2e-3)
+
+
+def test_without_the_lag_in_the_model_the_same_vehicle_is_predicted_elsewhere() -> None:
+    """The control of the test above."""
+    command = np.array([0.2, 0.0, GRAVITY_M_S2])
+    believed = []
+    for params in (LAGGING, LAGGING.model_copy(update={"attitude_rad_s": 0.0})):
+        predictor = Predictor(params)
+        predictor.sent(-200_000, command)
+        believed.append(predictor.start(tilted(0, 0.0, 0.0), 80_000, np.zeros(3), command).vel_ned_m_s[0])
+    assert abs(believed[1]) > 4.0 * abs(believed[0])

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from sitl.airframes import PRESETS
 from sitl.attitude import THESIS_GAINS, AttitudeLoop, CascadeAttitude, ThesisAttitude, attitude_loop
-from sitl.vehicle import PRESETS, Plant
+from sitl.vehicle import Plant
 from swarmctl.core.frames import quat_from_euler
 
 Array = NDArray[np.float64]
@@ -34,7 +35,7 @@ def step_response(preset: str, axis: int, angle_deg: float, dt_s: float = 0.004,
 
 def fly(plant: Plant, loop: AttitudeLoop) -> None:
     wrench = np.zeros((4, 1))
-    wrench[0] = 9.81
+    wrench[0] = plant.mass_kg * 9.81
     loop.torque(plant, LIVE, wrench[1:])
     plant.step(plant.mixer.allocate(wrench))
 
@@ -91,23 +92,77 @@ def test_thesis_attitude_is_fast(axis: int, dt_s: float) -> None:
 @pytest.mark.parametrize("axis", [0, 1])
 @pytest.mark.parametrize("angle_deg", [10.0, -10.0, 30.0])
 def test_x500_roll_and_pitch_answer_like_px4(axis: int, angle_deg: float) -> None:
-    """Bounds around PX4's measured t10 0.13-0.14, t50 0.26-0.28, t63 0.30-0.32, t90 0.46-0.51 s, max 3 %."""
+    """PX4's measured t10 0.13-0.14, t50 0.26-0.28, t63 0.30-0.32, t90 0.46-0.51 s, max 10.1-10.3; one sample of slack.
+
+    What its 30 deg step does not show here: a steady 29.2, 2.7 % short.
+    """
     samples = step_response("x500", axis, angle_deg)
-    assert 0.05 < reached_s(samples, 0.01) < 0.12  # dead time
-    assert 0.11 < reached_s(samples, 0.10) < 0.17
-    assert 0.24 < reached_s(samples, 0.50) < 0.30
-    assert 0.28 < reached_s(samples, 0.63) < 0.34
-    assert 0.42 < reached_s(samples, 0.90) < 0.55
-    assert samples.max() < 1.03
+    assert 0.065 < reached_s(samples, 0.01) < 0.085  # first motion ~70 ms
+    assert 0.126 < reached_s(samples, 0.10) < 0.144
+    assert 0.256 < reached_s(samples, 0.50) < 0.284
+    assert 0.296 < reached_s(samples, 0.63) <= 0.324
+    assert 0.456 < reached_s(samples, 0.90) < 0.514
+    assert 1.01 < samples.max() < 1.03
     assert samples[-1] == pytest.approx(1.0, abs=0.01)
 
 
+def test_x500_roll_fits_the_published_model() -> None:
+    """Dead time 80-85 ms and second order, w 9.0-10.5 rad/s, zeta 0.95-1.05, fitted PX4 to 1.2-1.7 % rms."""
+    samples = step_response("x500", 0, 10.0)
+    best = min(
+        float(np.sqrt(np.mean((samples - second_order(len(samples), dead_s, omega, zeta)) ** 2)))
+        for dead_s in (0.080, 0.085)
+        for omega in np.arange(9.0, 10.6, 0.25)
+        for zeta in (0.8, 0.85, 0.9, 0.95, 1.0)
+    )
+    assert best < 0.02
+    slow = second_order(len(samples), 0.082, 7.0, 1.0)
+    assert float(np.sqrt(np.mean((samples - slow) ** 2))) > 0.03
+
+
+def second_order(steps: int, dead_s: float, omega: float, zeta: float, dt_s: float = 0.004) -> Array:
+    """Step response of the model, by small explicit steps."""
+    value, rate, out = 0.0, 0.0, np.zeros(steps)
+    for k in range(steps * 4):
+        if (k + 1) * dt_s / 4 > dead_s:
+            rate += (omega**2 * (1.0 - value) - 2 * zeta * omega * rate) * dt_s / 4
+            value += rate * dt_s / 4
+        out[k // 4] = value
+    return out
+
+
+@pytest.mark.parametrize(
+    ("thrust_01", "measured_m_s2"), [(0.388, 1.44), (0.488, -0.09), (0.588, -1.20), (0.688, -2.49)]
+)
+def test_x500_climbs_on_thrust_steps_like_px4(thrust_01: float, measured_m_s2: float) -> None:
+    """NED z acceleration 0.25-0.7 s after a step from hover, px4 SIH: 1 kg, drag 1 N/(m/s), lag 0.05 s."""
+    plant = Plant(PRESETS["x500"], np.zeros((1, 3)), 0.004, ground=False)
+    plant.rotor_force_n[:] = 9.81 / 4
+    speeds = []
+    for _ in range(175):
+        plant.step(np.full((4, 1), thrust_01 * 5.0))
+        speeds.append(float(plant.vel_ned_m_s[2, 0]))
+    mean_m_s2 = (speeds[-1] - speeds[61]) / ((174 - 61) * 0.004)
+    assert mean_m_s2 == pytest.approx(measured_m_s2, abs=0.2)
+
+
 def test_x500_yaw_answers_like_px4() -> None:
+    """PX4: t10 0.26-0.32, t50 0.55-0.58, t63 0.62-0.66, t90 0.78-0.81 s, max 25.5-25.8, 22.4 at ~2 s; t90 is late."""
     samples = step_response("x500", 2, 20.0)
-    assert 0.5 < reached_s(samples, 0.50) < 0.62
-    assert 0.56 < reached_s(samples, 0.63) < 0.72
-    assert 0.7 < reached_s(samples, 0.90) < 0.95
-    assert samples.max() < 1.3
+    assert 0.256 < reached_s(samples, 0.10) < 0.324
+    assert 0.546 < reached_s(samples, 0.50) < 0.584
+    assert 0.616 < reached_s(samples, 0.63) < 0.664
+    assert 0.78 < reached_s(samples, 0.90) < 0.84
+    assert 1.27 < samples.max() < 1.30
+    assert 1.08 < samples[-1] < 1.14
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_crazyflie_is_twice_as_quick(axis: int) -> None:
+    samples = step_response("crazyflie", axis, 10.0)
+    assert 0.1 < reached_s(samples, 0.63) < 0.2
+    assert samples.max() < 1.03
+    assert samples[-1] == pytest.approx(1.0, abs=0.01)
 
 
 @pytest.mark.parametrize("loop", [ThesisAttitude(1, 0.004), CascadeAttitude(PRESETS["x500"], 1, 0.004)])

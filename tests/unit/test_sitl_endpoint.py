@@ -12,8 +12,9 @@ import pytest
 from pymavlink.dialects.v20 import development as mav
 
 from sitl.parameters import DEFAULTS, INT32, REAL32, Parameters, int_from_wire, int_to_wire
+from sitl.schedule import OFFBOARD_HZ, Schedule
 from sitl.sensors import local_origin
-from sitl.streams import STREAMS, Schedule
+from sitl.streams_health import STREAMS
 from sitl.world import SitlParams, SitlWorld, line_of_spawns
 from swarmctl.core.clock import SimClock
 from swarmctl.core.types import GeoOrigin
@@ -48,7 +49,7 @@ class Client:
             for datagram in link.receive(self.clock.now_us()):
                 if i == vehicle:
                     got += [self.codec.decode(f) for f in frames(datagram.data)]
-        return got
+        return [m for m in got if m is not None]  # what the dialect module lacks is test_sitl_wire's
 
     def ask(self, message: Any, vehicle: int = 0) -> list[Any]:
         self.links[vehicle].send(self.codec.encode(message))
@@ -87,7 +88,7 @@ def test_acks_go_to_the_sender() -> None:
     assert (ack.result, ack.target_system, ack.target_component) == (3, 1, 191)
 
 
-@pytest.mark.parametrize("command", [410, 520, 178, 246, 31010])
+@pytest.mark.parametrize("command", [410, 520, 34, 31010])
 def test_unknown_commands_are_unsupported(command: int) -> None:
     assert result(Client().command(command, NAN, NAN, NAN, NAN, NAN, NAN, NAN)) == 3
 
@@ -100,10 +101,11 @@ def test_command_int_and_set_mode_are_understood() -> None:
     assert (ack.command, ack.result) == (176, 0)
 
 
-def test_a_first_contact_is_answered_with_a_heartbeat_at_once() -> None:
+def test_heartbeats_keep_their_tick_whoever_talks() -> None:
     client = Client()
     got = client.ask(mav.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
-    (beat,) = of("HEARTBEAT", got)
+    assert not of("HEARTBEAT", got)
+    (beat,) = of("HEARTBEAT", client.run(1.0))
     assert (beat.type, beat.autopilot, beat.base_mode, beat.custom_mode, beat.system_status) == (
         2,
         12,
@@ -118,9 +120,9 @@ def test_a_first_contact_is_answered_with_a_heartbeat_at_once() -> None:
 
 def test_default_rates_are_those_of_the_offboard_link() -> None:
     got = Client().run(4.0)
-    for message, stream in STREAMS.items():
+    for message in STREAMS.keys() & mav.mavlink_map.keys():
         name = mav.mavlink_map[message].msgname
-        assert len(of(name, got)) == pytest.approx(4.0 * stream.rate_hz, abs=1.01), name
+        assert len(of(name, got)) == pytest.approx(4.0 * OFFBOARD_HZ.get(message, 0.0), abs=1.01), name
 
 
 @pytest.mark.parametrize(("interval_us", "per_second"), [(10000, 100), (20000, 50), (-1, 0), (0, 30), (1, 250)])
@@ -143,7 +145,7 @@ def test_odometry_samples_lie_on_the_agents_grid() -> None:
 
 def test_a_late_schedule_sends_once_and_keeps_its_grid() -> None:
     schedule = Schedule(4000)
-    for message in STREAMS:
+    for message in OFFBOARD_HZ:
         schedule.set_interval(message, -1, 0)
     schedule.set_interval(331, 10000, 0)
     assert schedule.take_due(0) == [331]
@@ -213,7 +215,11 @@ def test_texts_go_to_ground_stations_only() -> None:
     station.ask(mav.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3))
     got = station.command(400, 5) + station.command(400, 1) + station.run(0.5)
     texts = [m.text for m in of("STATUSTEXT", got)]
-    assert texts == ["Unsupported ARM_DISARM param: 5.000", "Armed by external command\t"]
+    assert texts == [
+        "Unsupported ARM_DISARM param: 5.000\t",
+        "Armed by external command\t",
+        "[logger] ./log/2026-01-01/00_00_00.ulg\t",
+    ]
 
 
 def test_old_texts_are_dropped() -> None:
@@ -238,6 +244,7 @@ def test_parameter_list_is_complete() -> None:
     client.ask(mav.MAVLink_param_request_list_message(1, 1))
     values = of("PARAM_VALUE", client.run(0.5))
     assert {m.param_index for m in values} | {0, 1, 2, 3} == set(range(len(DEFAULTS)))
+    assert {m.param_count for m in values} == {len(DEFAULTS)}
     sysid = next(m for m in values if m.param_id == "MAV_SYS_ID")
     assert (int_from_wire(sysid.param_value), sysid.param_type) == (1, INT32)
 

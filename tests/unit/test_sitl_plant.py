@@ -9,7 +9,8 @@ import pytest
 from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 
-from sitl.vehicle import PRESETS, RATE_LIMIT_RAD_S, Plant
+from sitl.airframes import PRESETS
+from sitl.vehicle import RATE_LIMIT_RAD_S, Plant
 from swarmctl.core.frames import quat_from_euler
 
 Array = NDArray[np.float64]

@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 import pytest
 
-from swarmctl.control.axes import AxesSolution, Axis, Horizon, Penalties
+from swarmctl.control.axes import AxesProblem, AxesSolution, Axis, Horizon, Penalties
 from swarmctl.control.condensed import CondensedMpc
 from swarmctl.control.qp import QpParams
 from swarmctl.control.terminal import TerminalRegion, terminal_region, transition
@@ -175,7 +175,9 @@ def solve(problem: CondensedMpc, pos: float, vel: float, u: float) -> AxesSoluti
     axis, steps = problem.axes[0], problem.horizon.prediction
     gain, still = -axis.gain_m_s2, np.zeros((steps, 1))
     drift = np.array([-gain * axis.u_rest])
-    return problem.solve(np.array([pos]), np.array([vel]), np.array([u]), still + gain, drift, still, still)
+    return problem.solve(
+        AxesProblem(np.array([pos]), np.array([vel]), np.array([u]), still + gain, drift, still, still)
+    )
 
 
 def first_increment(problem: CondensedMpc, error: Array) -> float:
@@ -282,7 +284,7 @@ def test_from_where_a_plan_ends_inside_the_regulator_keeps_the_bounds_of_the_inp
     rest, still, ended_inside = 9.81 + wind_m_s2, np.zeros((2, 1)), 0
     for error in boundary(region, 400, 5) * 0.97:
         u = np.array([np.clip(rest - error[2], 0.0, 20.0)])
-        plan = problem.solve(error[:1], error[1:2], u, still - 1.0, np.array([rest]), still, still)
+        plan = problem.solve(AxesProblem(error[:1], error[1:2], u, still - 1.0, np.array([rest]), still, still))
         if plan.terminal_gap_m > 0.0:
             continue
         ended_inside += 1

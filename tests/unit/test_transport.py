@@ -16,6 +16,7 @@ from swarmctl.errors import StartError
 from swarmctl.links.transport import (
     Endpoint,
     SerialTransport,
+    TcpTransport,
     UdpTransport,
     bind_udp,
     cut_frames,
@@ -23,6 +24,8 @@ from swarmctl.links.transport import (
     parse_url,
     pipe_pair,
 )
+
+SECOND = 1_000_000
 
 
 def frame(payload: bytes, signed: bool = False) -> bytes:
@@ -37,6 +40,7 @@ def frame(payload: bytes, signed: bool = False) -> bytes:
         ("udpin://0.0.0.0:14540", Endpoint("udpin", "0.0.0.0", 14540)),
         ("udpout://px4.local:1", Endpoint("udpout", "px4.local", 1)),
         ("udpin://127.0.0.1:65535", Endpoint("udpin", "127.0.0.1", 65535)),
+        ("tcp://127.0.0.1:5760", Endpoint("tcp", "127.0.0.1", 5760)),
         ("serial:///dev/ttyACM0:57600", Endpoint("serial", "/dev/ttyACM0", 57600)),
         ("serial:///dev/ttyS1:921600", Endpoint("serial", "/dev/ttyS1", 921600)),
     ],
@@ -51,7 +55,8 @@ def test_urls(url: str, endpoint: Endpoint) -> None:
         "",
         "14540",
         "udp://127.0.0.1:14540",
-        "tcp://127.0.0.1:5760",
+        "tcp://127.0.0.1",
+        "tcpout://127.0.0.1:5760",
         "udpin://127.0.0.1",
         "udpin://:14540",
         "udpin://127.0.0.1:0",
@@ -234,6 +239,174 @@ def test_serial_hands_on_whole_frames() -> None:
 def test_a_missing_serial_device_is_a_start_error_with_its_name() -> None:
     with pytest.raises(StartError, match="/dev/no-such-port at 57600"):
         open_transport("serial:///dev/no-such-port:57600")
+
+
+def test_a_serial_port_that_is_unplugged_is_opened_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    name = os.ttyname(slave)
+    link = SerialTransport(name, 57600)
+    good = frame(b"abc")
+    port = link._port
+
+    def unplugged(size: int) -> bytes:
+        raise OSError("device disconnected")
+
+    monkeypatch.setattr(port, "read", unplugged)
+    assert link.receive(SECOND) == []
+    link.send(good)  # into nothing
+    assert link.receive(SECOND + 1) == []
+    assert link.receive(2 * SECOND) == []
+    assert link._port is None
+    assert link.receive(2 * SECOND + 1) == []
+    assert link._port is not None, "opened again a second later"
+    os.write(master, good)
+    time.sleep(0.02)
+    assert [d.data for d in link.receive(3 * SECOND)] == [good]
+    link.close()
+    os.close(master)
+    os.close(slave)
+
+
+def test_a_host_without_an_address_is_a_start_error() -> None:
+    for url in ("tcp://no-such-host.invalid:5760", "udpout://no-such-host.invalid:14540"):
+        with pytest.raises(StartError, match=r"no-such-host\.invalid has no IPv4 address"):
+            open_transport(url)
+
+
+def test_names_are_resolved_once_so_that_the_answer_is_known_for_the_peers() -> None:
+    vehicle = client()
+    link = open_transport(f"udpout://localhost:{vehicle.getsockname()[1]}")
+    assert isinstance(link, UdpTransport)
+    link.send(b"hello")
+    _, sender = vehicle.recvfrom(100)
+    vehicle.sendto(b"state", ("127.0.0.1", sender[1]))
+    assert wait_for(link, 1) == [b"state"]
+    vehicle.close()
+    link.close()
+
+
+# -- TCP --------------------------------------------------------------------------------------------------------------
+
+
+class Server:
+    """A listening autopilot; `link` has its connection in the first tick that finds it."""
+
+    def __init__(self, port: int = 0) -> None:
+        self.listener = socket.socket()
+        self.listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        self.listener.bind(("127.0.0.1", port))
+        self.listener.listen(1)
+        self.listener.settimeout(2.0)
+        self.port = int(self.listener.getsockname()[1])
+        self.peer: socket.socket | None = None
+
+    def accept(self) -> socket.socket:
+        self.peer, _ = self.listener.accept()
+        self.peer.settimeout(2.0)
+        return self.peer
+
+    def close(self) -> None:
+        if self.peer is not None:
+            self.peer.close()
+        self.listener.close()
+
+
+def drain(link: TcpTransport, now_us: int, count: int) -> list[bytes]:
+    got: list[bytes] = []
+    deadline = time.monotonic() + 2.0
+    while len(got) < count and time.monotonic() < deadline:
+        got += [d.data for d in link.receive(now_us)]
+    return got
+
+
+def tcp_link(port: int) -> TcpTransport:
+    link = open_transport(f"tcp://localhost:{port}")
+    assert isinstance(link, TcpTransport)
+    return link
+
+
+def test_tcp_carries_whole_frames_both_ways() -> None:
+    server = Server()
+    link = tcp_link(server.port)
+    assert link.receive(0) == []
+    peer = server.accept()
+    good = frame(b"abc")
+    peer.sendall(b"banner\r\n" + good + good[:7])
+    assert drain(link, 5, 1) == [good]
+    peer.sendall(good[7:])
+    assert drain(link, 6, 1) == [good]
+    link.send(good)
+    assert peer.recv(100) == good
+    link.close()
+    server.close()
+
+
+def test_tcp_comes_back_a_second_after_the_other_end_has_gone() -> None:
+    server = Server()
+    link = tcp_link(server.port)
+    link.receive(0)
+    peer = server.accept()
+    peer.sendall(frame(b"abc")[:6])
+    time.sleep(0.02)
+    link.receive(1)
+    server.close()
+    time.sleep(0.02)
+    assert link.receive(2) == []
+    link.send(b"into nothing")
+    again = Server(server.port)
+    assert link.receive(SECOND - 1) == []
+    link.receive(SECOND)
+    again.accept().sendall(frame(b"xyz"))
+    assert drain(link, SECOND + 1, 1) == [frame(b"xyz")], "half a frame of the old connection is forgotten"
+    link.close()
+    again.close()
+
+
+def test_tcp_that_nobody_listens_to_is_tried_again_and_never_blocks() -> None:
+    server = Server()
+    server.close()
+    link = tcp_link(server.port)
+    began = time.monotonic()
+    for k in range(100):
+        assert link.receive(k * 20_000) == []
+        link.send(frame(b"abc"))
+    assert time.monotonic() - began < 0.5
+    late = Server(server.port)
+    link.receive(10 * SECOND)
+    silent = late.accept()
+    assert link.receive(15 * SECOND + 1) == [], "connected but silent for too long: connected again"
+    assert silent.recv(1) == b""
+    late.accept().sendall(frame(b"abc"))
+    assert drain(link, 10 * SECOND + 1, 1) == [frame(b"abc")]
+    link.close()
+    late.close()
+
+
+def test_tcp_into_a_full_buffer_drops_whole_frames() -> None:
+    server = Server()
+    link = tcp_link(server.port)
+    link.receive(0)
+    peer = server.accept()
+    sent = [frame(bytes([k % 256]) * 200) for k in range(40_000)]
+    for data in sent:
+        link.send(data)
+    peer.setblocking(False)
+    buffer, got = bytearray(), []
+    for _ in range(1000):
+        try:
+            buffer += peer.recv(1 << 20)
+        except BlockingIOError:
+            link.send(frame(b"last"))
+            time.sleep(0.001)
+        got += cut_frames(buffer)
+        if got and got[-1] == frame(b"last"):
+            break
+    assert got[-1] == frame(b"last")
+    assert 10 < len(got) < len(sent), "some were dropped"
+    assert set(got) <= {*sent, frame(b"last")}, "none was torn"
+    link.close()
+    server.close()
 
 
 def test_pipe_delays_by_its_latency_in_both_directions() -> None:

@@ -1,0 +1,105 @@
+"""ArduCopter's modes and boot on the wire: custom_mode numbers, MAV_STATE, refusals. Tables only."""
+
+from __future__ import annotations
+
+import enum
+from dataclasses import dataclass
+
+from swarmctl.core.types import FlightMode
+
+
+class CopterMode(enum.IntEnum):
+    """custom_mode of HEARTBEAT, those that are flown here."""
+
+    STABILIZE = 0
+    ALT_HOLD = 2
+    GUIDED = 4
+    LOITER = 5
+    RTL = 6
+    LAND = 9
+    BRAKE = 17
+
+
+NOT_FLOWN_HERE = {  # modes ArduCopter 4.6 has and this simulator does not enter
+    1: "ACRO",
+    3: "AUTO",
+    7: "CIRCLE",
+    11: "DRIFT",
+    13: "SPORT",
+    14: "FLIP",
+    15: "AUTOTUNE",
+    16: "POSHOLD",
+    18: "THROW",
+    19: "AVOID_ADSB",
+    20: "GUIDED_NOGPS",
+    21: "SMART_RTL",
+    22: "FLOWHOLD",
+    23: "FOLLOW",
+    24: "ZIGZAG",
+    25: "SYSTEMID",
+    26: "AUTOROTATE",
+    27: "AUTO_RTL",
+    28: "TURTLE",
+}
+NEEDS_POSITION = frozenset(
+    {CopterMode.GUIDED, CopterMode.LOITER, CopterMode.RTL, CopterMode.BRAKE}
+)  # to be entered while armed; LAND comes down without one
+NO_ARMING_IN = frozenset({CopterMode.RTL, CopterMode.LAND, CopterMode.BRAKE})
+ENDS_ON_GROUND = frozenset({CopterMode.RTL, CopterMode.LAND})  # disarm by themselves after touchdown
+WITHOUT_POSITION_CONTROL = frozenset({CopterMode.STABILIZE, CopterMode.ALT_HOLD})
+
+FLIGHT_MODES = {
+    CopterMode.GUIDED: FlightMode.EXTERNAL,
+    CopterMode.LOITER: FlightMode.HOLD,
+    CopterMode.BRAKE: FlightMode.HOLD,
+    CopterMode.RTL: FlightMode.RTL,
+    CopterMode.LAND: FlightMode.LAND,
+}
+
+BASE_ARMED = 128
+BASE_ALWAYS = 81  # custom, manual input, stabilize
+BASE_POSITION_CONTROL = 8
+
+
+class CopterState(enum.IntEnum):
+    """MAV_STATE, as ArduCopter uses it: standby means on the ground, armed or not."""
+
+    BOOT = 1
+    STANDBY = 3
+    ACTIVE = 4
+    CRITICAL = 5
+
+
+@dataclass(frozen=True, slots=True)
+class BootTimes:
+    """When things happen after start [us]; in the measured order and proportions, with wiped parameters."""
+
+    heartbeat_us: int
+    initialised_us: int  # the mode is STABILIZE again
+    origin_us: int
+    armable_us: int
+
+    @classmethod
+    def armable_after(cls, armable_us: int) -> BootTimes:
+        """The measured boot (1.05, 2.45, 20.0, 23.7 s), scaled to be armable at `armable_us`."""
+        return cls(*(round(armable_us * at_s / 23.7) for at_s in (1.05, 2.45, 20.0, 23.7)))
+
+
+_CONSISTENT_AFTER = 0.5  # of the boot time: not measured, only that these texts come first
+_NOT_READY = (
+    "Arm: Accels inconsistent",
+    "Arm: Gyros inconsistent",
+)
+
+
+def arming_refusals(boot: BootTimes, now_us: int) -> tuple[str, ...]:
+    """Why arming is refused so long after start; empty once it is not."""
+    if now_us < boot.initialised_us:
+        return ("Arm: System not initialised",)
+    if now_us < boot.armable_us * _CONSISTENT_AFTER:
+        return (*_NOT_READY, "Arm: EKF attitude is bad")
+    if now_us < boot.origin_us:
+        return ("Arm: EKF attitude is bad",)
+    if now_us < boot.armable_us:
+        return ("Arm: AHRS: not using configured AHRS type",)
+    return ()

@@ -1,0 +1,185 @@
+"""Faults: what each kind does to a world, when it begins and when it ends.
+
+A fault of the same kind on the same vehicle (and rotor) replaces the one before. Everything here is on simulated time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, Protocol
+
+import numpy as np
+
+from sitl.estimator import Estimator
+from sitl.lossy import LossyLink, Way
+from sitl.physics import Physics
+from sitl.vehicle import Array
+from sitl.wind import Gust
+from swarmctl.core.simulated import EVERY_VEHICLE, FaultParams
+
+Undo = Callable[[], None]
+_NEVER_US = 1 << 62
+
+
+class Afflicted(Protocol):
+    """What faults act on."""
+
+    @property
+    def physics(self) -> Physics:
+        """Plant, air, battery."""
+
+    @property
+    def estimator(self) -> Estimator:
+        """What the vehicles believe."""
+
+    def links_of(self, vehicle: int) -> Sequence[LossyLink]:
+        """Every link of a vehicle."""
+
+    def reboot(self, vehicle: int, now_us: int) -> None:
+        """Start its autopilot again."""
+
+
+def _gps_loss(world: Afflicted, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
+    world.estimator.lose_gps(vehicle)
+    return lambda: world.estimator.find_gps(vehicle)
+
+
+def _estimator_jump(world: Afflicted, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
+    by_ned_m = fault.amount * _towards(fault)
+    world.estimator.jump(vehicle, by_ned_m)
+    return lambda: world.estimator.jump(vehicle, -by_ned_m)
+
+
+def _estimator_freeze(world: Afflicted, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
+    world.estimator.freeze(vehicle, now_us)
+    return lambda: world.estimator.thaw(vehicle)
+
+
+def _motor(world: Afflicted, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
+    world.physics.set_rotor_health(vehicle, fault.rotor, fault.amount)
+    return lambda: world.physics.set_rotor_health(vehicle, fault.rotor, 1.0)
+
+
+def _mass(world: Afflicted, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
+    world.physics.set_mass(vehicle, fault.amount)
+    return lambda: world.physics.set_mass(vehicle, 1.0)
+
+
+def _gust(world: Afflicted, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
+    on = np.zeros(world.physics.plant.state.shape[1])
+    on[vehicle] = 1.0
+    gust = Gust(fault.amount * _towards(fault).reshape(3, 1), now_us * 1e-6, fault.for_s, on)
+    world.physics.air.gusts.append(gust)
+    return lambda: None  # it blows itself out
+
+
+def _battery(world: Afflicted, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
+    world.physics.drain(vehicle, fault.amount)
+    return lambda: None
+
+
+def _reboot(world: Afflicted, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
+    world.reboot(vehicle, now_us)
+    return lambda: None
+
+
+def _link(trouble: str) -> Callable[[Afflicted, int, FaultParams, int], Undo]:
+    def begin(world: Afflicted, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
+        ways = list(_ways(world.links_of(vehicle), fault.direction))
+
+        def put(amount: float) -> None:
+            for way in ways:
+                way.trouble(trouble, amount)
+
+        put(fault.amount)
+        return lambda: put(0.0)
+
+    return begin
+
+
+_BEGIN: dict[str, Callable[[Afflicted, int, FaultParams, int], Undo]] = {
+    "gps_loss": _gps_loss,
+    "estimator_jump": _estimator_jump,
+    "estimator_freeze": _estimator_freeze,
+    "motor": _motor,
+    "link_loss": _link("loss_01"),
+    "link_delay": _link("delay_ms"),
+    "link_duplicate": _link("duplicate_01"),
+    "link_reorder": _link("reorder_01"),
+    "link_corrupt": _link("corrupt_01"),
+    "gust": _gust,
+    "battery": _battery,
+    "mass": _mass,
+    "reboot": _reboot,
+}
+_ADD_UP = frozenset({"estimator_jump", "gust"})
+
+
+class Faults:
+    """Begins and ends the faults of one world.
+
+    Attributes:
+        on_event: told of every beginning and end: name, time since boot [us], fields.
+    """
+
+    def __init__(self, world: Afflicted, scheduled: Iterable[FaultParams], vehicles: int) -> None:
+        self.on_event: Callable[[str, int, dict[str, Any]], None] = lambda name, t_us, fields: None
+        self._world = world
+        self._vehicles = vehicles
+        self._waiting = sorted(scheduled, key=lambda fault: fault.at_s)
+        self._running: dict[tuple[Any, ...], tuple[int, FaultParams, int, Undo]] = {}
+        self._next_us = self._earliest_us()
+
+    def step(self, now_us: int) -> None:
+        """Begin and end what is due; `now_us` since boot."""
+        if now_us < self._next_us:
+            return
+        for key, (end_us, fault, vehicle, undo) in list(self._running.items()):
+            if now_us >= end_us:
+                del self._running[key]
+                undo()
+                self._tell("fault_ended", now_us, fault, vehicle)
+        while self._waiting and self._waiting[0].at_s * 1e6 <= now_us:
+            self._begin(self._waiting.pop(0), now_us)
+        self._next_us = self._earliest_us()
+
+    def begin(self, fault: FaultParams, now_us: int) -> None:
+        """Let a fault happen now, whatever its `at_s`."""
+        self._begin(fault, now_us)
+        self._next_us = self._earliest_us()
+
+    def _begin(self, fault: FaultParams, now_us: int) -> None:
+        for vehicle in range(self._vehicles) if fault.vehicle == EVERY_VEHICLE else (fault.vehicle,):
+            key: tuple[Any, ...] = (fault.kind, vehicle, fault.rotor, fault.direction)
+            if fault.kind in _ADD_UP:
+                key = (*key, now_us, len(self._running))
+            before = self._running.pop(key, None)
+            if before is not None:
+                before[3]()
+            undo = _BEGIN[fault.kind](self._world, vehicle, fault, now_us)
+            if fault.for_s:
+                self._running[key] = (now_us + round(fault.for_s * 1e6), fault, vehicle, undo)
+            self._tell("fault_began", now_us, fault, vehicle)
+
+    def _earliest_us(self) -> int:
+        ends = [end_us for end_us, *_ in self._running.values()]
+        starts = [round(self._waiting[0].at_s * 1e6)] if self._waiting else []
+        return min(ends + starts, default=_NEVER_US)
+
+    def _tell(self, name: str, now_us: int, fault: FaultParams, vehicle: int) -> None:
+        fields = {"kind": fault.kind, "vehicle": vehicle, "value": fault.amount, "for_s": fault.for_s}
+        self.on_event(name, now_us, fields)
+
+
+def _towards(fault: FaultParams) -> Array:
+    azimuth_rad = math.radians(fault.towards_deg)
+    return np.array([math.cos(azimuth_rad), math.sin(azimuth_rad), 0.0])
+
+
+def _ways(links: Sequence[LossyLink], direction: str) -> Iterable[Way]:
+    for link in links:
+        if direction in ("both", "to_vehicle"):
+            yield link.to_vehicle
+        if direction in ("both", "from_vehicle"):
+            yield link.from_vehicle

@@ -1,0 +1,192 @@
+"""PX4 and ArduCopter: everything in which they differ, as one table each. Which one it is, the HEARTBEAT says.
+
+Figures and rules are measured or read in their sources; commands are MAVLink's COMMAND_LONG unless they are parameters.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from swarmctl.core.types import Command, FlightMode, Verb
+
+_INT32, _REAL32 = 6, 9  # MAV_PARAM_TYPE
+_CUSTOM_MODE = 1.0  # DO_SET_MODE p1: MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+_LAST_INTEGER_TYPE = 8
+_ARM, _TAKEOFF, _LAND, _SET_MODE, _INTERVAL, _REQUEST = 400, 22, 21, 176, 511, 512
+_NAN = math.nan
+
+SYS_STATUS, GPS_RAW_INT, ATTITUDE_QUATERNION, LOCAL_POSITION_NED, GLOBAL_POSITION_INT = 1, 24, 31, 32, 33
+GPS_GLOBAL_ORIGIN, ATTITUDE_TARGET, ESTIMATOR_STATUS, EXTENDED_SYS_STATE, ODOMETRY, CURRENT_MODE = (
+    49,
+    83,
+    230,
+    245,
+    331,
+    436,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class LongCommand:
+    """A COMMAND_LONG: id and its first parameters; the others are 0."""
+
+    command: int
+    params: tuple[float, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """A parameter without whose right value nothing is armed."""
+
+    name: str
+    holds: Callable[[float], bool]
+    otherwise: str  # what a wrong value does, and the fix
+
+    def problem(self, value: float | None) -> str:
+        """Why not to fly with this value (None: it could not be read), or ""."""
+        if value is None:
+            return f"{self.name} can't be read, and it decides what happens when setpoints stop or what they mean"
+        return "" if self.holds(value) else f"{self.name} = {value:g}: {self.otherwise}"
+
+
+@dataclass(frozen=True, slots=True)
+class Dialect:
+    """What differs between autopilots."""
+
+    name: str
+    modes: Mapping[int, FlightMode]  # HEARTBEAT.custom_mode -> mode; what is not here, a pilot flies
+    external: tuple[float, ...]  # DO_SET_MODE p2, p3 of the mode that follows setpoints
+    hold: tuple[float, ...]
+    land: LongCommand
+    takeoff_parameter: str  # the height of a take-off; "": it travels in NAV_TAKEOFF's p7
+    arm_in: FlightMode | None  # mode to be in before arming and taking off; None: any that can be armed
+    integers_bytewise: bool  # an int32's bits in the float of PARAM_*, or its value
+    state: tuple[int, ...]  # messages that carry the state, at the state's rate
+    rates_hz: Mapping[int, float]  # the others that must flow
+    rules: tuple[Rule, ...]
+    hover_parameter: str
+    thrust_parameters: tuple[str, ...]  # read and recorded: they say what thrust means
+    horizontal_accuracy: str  # message that tells it
+
+    def mode(self, custom_mode: int) -> FlightMode:
+        """Mode of a HEARTBEAT or CURRENT_MODE."""
+        return self.modes.get(custom_mode, FlightMode.MANUAL)
+
+    def to_read(self) -> tuple[str, ...]:
+        """Parameters to be known before flight."""
+        return tuple(dict.fromkeys([*(r.name for r in self.rules), self.hover_parameter, *self.thrust_parameters]))
+
+    def steps(self, command: Command) -> tuple[Command, ...]:
+        """What one request is made of."""
+        if command.verb is Verb.TAKEOFF and self.takeoff_parameter:
+            return Command(Verb.PARAM_FLOAT, value=command.value, name=self.takeoff_parameter), command
+        return (command,)
+
+    def long_command(self, command: Command) -> LongCommand | None:
+        """COMMAND_LONG of a command, or None when it is about a parameter."""
+        interval_us = 1e6 / command.value if command.value > 0 else -1.0
+        height = (_NAN,) * 7 if self.takeoff_parameter else (0.0,) * 6 + (command.value,)
+        table: dict[Verb, LongCommand] = {
+            Verb.ARM: LongCommand(_ARM, (1.0,)),
+            Verb.DISARM: LongCommand(_ARM, (0.0,)),
+            Verb.TAKEOFF: LongCommand(_TAKEOFF, height),
+            Verb.EXTERNAL: LongCommand(_SET_MODE, (_CUSTOM_MODE, *self.external)),
+            Verb.HOLD: LongCommand(_SET_MODE, (_CUSTOM_MODE, *self.hold)),
+            Verb.LAND: self.land,
+            Verb.RATE: LongCommand(_INTERVAL, (float(command.number), interval_us)),
+            Verb.MESSAGE: LongCommand(_REQUEST, (float(command.number),)),
+        }
+        return table.get(command.verb)
+
+    def to_wire(self, command: Command) -> tuple[float, int]:
+        """Value and MAV_PARAM_TYPE that PARAM_SET carries for PARAM_INT and PARAM_FLOAT."""
+        if command.verb is not Verb.PARAM_INT:
+            return float(struct.unpack("<f", struct.pack("<f", command.value))[0]), _REAL32
+        if self.integers_bytewise:
+            return float(struct.unpack("<f", struct.pack("<i", command.number))[0]), _INT32
+        return float(struct.unpack("<f", struct.pack("<f", command.number))[0]), _INT32
+
+    def from_wire(self, value: float, kind: int) -> float:
+        """Number that a PARAM_VALUE carries."""
+        if self.integers_bytewise and kind <= _LAST_INTEGER_TYPE:
+            return float(struct.unpack("<i", struct.pack("<f", value))[0])
+        return value
+
+
+def _px4(main: int, sub: int = 0) -> int:
+    return main << 16 | sub << 24
+
+
+PX4 = Dialect(
+    name="PX4",
+    modes={
+        _px4(4, 2): FlightMode.TAKEOFF,
+        _px4(4, 3): FlightMode.HOLD,
+        _px4(4, 4): FlightMode.MISSION,
+        _px4(4, 5): FlightMode.RTL,
+        _px4(4, 6): FlightMode.LAND,
+        _px4(6): FlightMode.EXTERNAL,
+    },
+    external=(6.0, 0.0),
+    hold=(4.0, 3.0),
+    land=LongCommand(_LAND, (_NAN,) * 7),
+    takeoff_parameter="MIS_TAKEOFF_ALT",
+    arm_in=None,
+    integers_bytewise=True,
+    state=(ODOMETRY,),
+    rates_hz={ATTITUDE_TARGET: 5.0, EXTENDED_SYS_STATE: 10.0, CURRENT_MODE: 25.0, ESTIMATOR_STATUS: 1.0},
+    rules=(
+        Rule(
+            "COM_OBL_RC_ACT",
+            lambda v: 0 <= v <= 5,
+            "motors would stop in the air when setpoints do; set agent.autopilot_params.COM_OBL_RC_ACT = 4 (land)",
+        ),
+    ),
+    hover_parameter="MPC_THR_HOVER",
+    thrust_parameters=("THR_MDL_FAC", "MPC_THR_MIN", "MPC_THR_MAX"),
+    horizontal_accuracy="ESTIMATOR_STATUS",
+)
+ARDUCOPTER = Dialect(
+    name="ArduCopter",
+    modes={
+        3: FlightMode.MISSION,
+        4: FlightMode.EXTERNAL,
+        5: FlightMode.HOLD,
+        6: FlightMode.RTL,
+        9: FlightMode.LAND,
+        21: FlightMode.RTL,  # SMART_RTL
+    },
+    external=(4.0, 0.0),
+    hold=(5.0, 0.0),
+    land=LongCommand(_SET_MODE, (_CUSTOM_MODE, 9.0)),
+    takeoff_parameter="",
+    arm_in=FlightMode.EXTERNAL,
+    integers_bytewise=False,
+    state=(LOCAL_POSITION_NED, ATTITUDE_QUATERNION),
+    rates_hz={
+        SYS_STATUS: 5.0,
+        EXTENDED_SYS_STATE: 10.0,
+        ATTITUDE_TARGET: 5.0,
+        GPS_RAW_INT: 1.0,
+        GLOBAL_POSITION_INT: 2.0,
+    },
+    rules=(
+        Rule(
+            "GUID_OPTIONS",
+            lambda v: bool(int(v) & 8),
+            "thrust would be flown as a climb rate; set agent.autopilot_params.GUID_OPTIONS = 8 (bit 3)",
+        ),
+        Rule(
+            "GUID_TIMEOUT",
+            lambda v: 0.0 < v <= 5.0,
+            "so long the last attitude is flown when setpoints stop; set agent.autopilot_params.GUID_TIMEOUT = 1.0",
+        ),
+    ),
+    hover_parameter="MOT_THST_HOVER",
+    thrust_parameters=("MOT_THST_EXPO", "MOT_SPIN_ARM", "MOT_SPIN_MIN", "MOT_SPIN_MAX"),
+    horizontal_accuracy="GPS_RAW_INT",  # its EKF's own figures are test ratios, not metres
+)
+DIALECTS: Mapping[int, Dialect] = {12: PX4, 3: ARDUCOPTER}  # by HEARTBEAT.autopilot

@@ -1,0 +1,132 @@
+"""What a link needs before flight and keeps needing: messages at their rates, the origin, parameters set and read back.
+
+All of it is asked again when the autopilot has rebooted, rates also when they have been lost. One command at a time,
+and only when nobody else is asking: a request to land never waits for more than one answer.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Mapping
+
+from swarmctl.core.types import Command, Verb
+from swarmctl.links.autopilot import Autopilot
+from swarmctl.links.commands import CommandPort, CommandResult
+from swarmctl.links.dialects import GPS_GLOBAL_ORIGIN, Dialect
+
+_ORIGIN_EVERY_US = 1_000_000
+_ORIGIN_SOON_US = 200_000  # positions do not fit: there is no state until it is told
+_WATCH_US = 2_000_000
+_WATCH_MAX_US = 30_000_000  # a link that can't carry the rate is not asked for ever more often
+_SILENT_US = 1_200_000  # not even a heartbeat: there is nobody to ask
+_ENOUGH_01 = 0.5
+
+
+class Upkeep:
+    """Sets up one autopilot and watches that it stays so.
+
+    Args:
+        autopilot: what is told of it.
+        commands: how it is asked.
+        setup: parameters it is given, name -> value.
+        state_rate_hz: of the messages that carry the state.
+
+    Attributes:
+        ready: everything has been asked and answered, since the last reboot.
+    """
+
+    def __init__(
+        self, autopilot: Autopilot, commands: CommandPort, setup: Mapping[str, int | float], state_rate_hz: float
+    ) -> None:
+        self._autopilot, self._commands = autopilot, commands
+        self._setup, self._rate_hz = dict(setup), state_rate_hz
+        self._boots = -1
+        self._dialect: Dialect | None = None
+        self._todo: deque[Command] = deque()
+        self._open: Command | None = None
+        self._failed: dict[str, str] = {}  # parameter -> what the autopilot said
+        self._origin_us = 0
+        self._watched_us = 0
+        self._watch_us = _WATCH_US
+        self._samples = 0
+        self.ready = False
+
+    @property
+    def refusal(self) -> str:
+        """Why nothing may be armed, or ""; not known before `ready`."""
+        if not self.ready or self._dialect is None:
+            return ""
+        found = []
+        for rule in self._dialect.rules:
+            if rule.name in self._failed and rule.name in self._setup:
+                found.append(f"{rule.name} could not be set to {self._setup[rule.name]}: {self._failed[rule.name]}")
+            else:
+                found.append(rule.problem(self._autopilot.params.get(rule.name)))
+        return "; ".join(problem for problem in found if problem)
+
+    def took(self, result: CommandResult) -> None:
+        """An answer of the command port, whoever asked."""
+        if result.command != self._open:
+            return
+        self._open = None
+        if not result.ok and result.command.name:
+            self._failed[result.command.name] = result.text
+        self.ready = self.ready or not self._todo
+
+    def step(self, now_us: int) -> None:
+        """Ask for what is missing. Called last in a tick, so that everybody else asks first."""
+        self._notice_reboot(now_us)
+        if self._dialect is None or self._commands.busy:
+            return
+        self._open = None
+        if self.ready:
+            self._watch(now_us)
+        command = self._todo.popleft() if self._todo else self._origin(now_us)
+        if command is not None:
+            self._open = command
+            self._commands.request(command)
+
+    def _notice_reboot(self, now_us: int) -> None:
+        autopilot = self._autopilot
+        if autopilot.dialect is None or (autopilot.clock.boots == self._boots and autopilot.dialect is self._dialect):
+            return
+        self._boots, self._dialect, self.ready = autopilot.clock.boots, autopilot.dialect, False
+        self._failed.clear()
+        self._watched_us, self._samples = now_us, autopilot.samples
+        origin = [Command(Verb.MESSAGE, number=GPS_GLOBAL_ORIGIN)]
+        reads = [Command(Verb.PARAM_GET, name=n) for n in self._dialect.to_read() if n not in self._setup]
+        self._todo = deque(self._rates(self._dialect) + origin + [self._setting(n) for n in self._setup] + reads)
+
+    def _rates(self, dialect: Dialect) -> list[Command]:
+        state = [Command(Verb.RATE, self._rate_hz, number) for number in dialect.state]
+        return state + [Command(Verb.RATE, rate_hz, number) for number, rate_hz in dialect.rates_hz.items()]
+
+    def _setting(self, name: str) -> Command:
+        value = self._setup[name]
+        if isinstance(value, int):
+            return Command(Verb.PARAM_INT, number=value, name=name)
+        return Command(Verb.PARAM_FLOAT, value=value, name=name)
+
+    def _origin(self, now_us: int) -> Command | None:
+        frame = self._autopilot.frame
+        every_us = _ORIGIN_EVERY_US if frame.offset_ned_m is None else _ORIGIN_SOON_US
+        if not frame.wants_origin or now_us - self._origin_us < every_us:
+            return None
+        self._origin_us = now_us
+        return Command(Verb.MESSAGE, number=GPS_GLOBAL_ORIGIN)
+
+    def _watch(self, now_us: int) -> None:
+        """A vehicle that talks but tells its state at less than half the rate has lost what it was asked."""
+        waited_us = now_us - self._watched_us
+        if waited_us < self._watch_us:
+            return
+        samples, heard_us = self._autopilot.samples - self._samples, self._autopilot.heard_us
+        self._watched_us, self._samples = now_us, self._autopilot.samples
+        enough = samples >= _ENOUGH_01 * self._rate_hz * waited_us * 1e-6
+        silent = heard_us is None or now_us - heard_us > _SILENT_US
+        if enough or silent:
+            self._watch_us = _WATCH_US
+            return
+        self._watch_us = min(_WATCH_MAX_US, 2 * self._watch_us)
+        assert self._dialect is not None
+        self._todo.extend(self._rates(self._dialect))

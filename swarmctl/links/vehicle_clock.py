@@ -1,0 +1,152 @@
+"""The vehicle's clock against ours: offset and rate, from arrivals that are never early and round trips as bounds.
+
+A stamp that arrives at y was true at most at y: the line under all points (stamp, arrival), touching the earliest ones,
+is the clock seen through the shortest delay. An answered TIMESYNC says that it can't have been before the question, and
+how long the shortest way is. Autopilots' time runs up to some percent off ours, and in simulators it also stands still.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from itertools import pairwise
+
+_BUCKET_US = 250_000  # of vehicle time; the earliest arrival of each is kept
+_BUCKETS = 32
+_RATE_AFTER_US = 1_000_000  # points must span this before a rate is believed
+_KNEE_01 = 0.6  # the part of the line under this share of the window is continued to now
+_REBOOT_US = 1_000_000  # a stamp this far back: the clock began again
+_LEAP_US = 1_000_000  # an arrival this much too early: the clock was set forward
+_BOUND_SLACK_US = 1_000
+_MOVED_US = 5_000  # a line that misses more is of before the clock stood still; less, the bound itself corrects
+_UNKNOWN_RATE_US = 200_000  # the same while no rate is known
+_LOOP_US = 4_000  # of a round trip, what an autopilot's own loop may take to answer
+_TRIP_WINDOW_US = 5_000_000
+
+Point = tuple[float, float]  # stamp, arrival - stamp [us]
+
+
+class VehicleClock:
+    """Maps vehicle stamps to our monotonic time.
+
+    Args:
+        rate_limit: largest difference of the clocks' rates that is believed; 0 follows the offset only.
+
+    Attributes:
+        boots: how often the vehicle's clock has begun again.
+        rate: by how much our clock runs faster than the vehicle's.
+    """
+
+    def __init__(self, rate_limit: float = 0.2) -> None:
+        self._limit = rate_limit
+        self.boots = 0
+        self.rate = 0.0
+        self._offset_us = 0.0  # at stamp 0, along the line
+        self._points: deque[Point] = deque(maxlen=_BUCKETS)
+        self._floor: Point | None = None  # stamp of the newest answered TIMESYNC, and what the line is at least there
+        self._newest_us: int | None = None
+        self._trips: tuple[int | None, int | None] = (None, None)  # shortest of the last window and of this one
+        self._trips_end_us = 0
+
+    @property
+    def offset_us(self) -> float | None:
+        """Our time minus the vehicle's, at its newest stamp; None before the first."""
+        if self._newest_us is None:
+            return None
+        return self._line(self._newest_us) - self._way_us
+
+    @property
+    def round_trip_us(self) -> int | None:
+        """Shortest answered TIMESYNC lately; None when none was answered."""
+        known = [trip for trip in self._trips if trip is not None]
+        return min(known) if known else None
+
+    def to_local(self, vehicle_us: int, arrived_us: int) -> int:
+        """Our time of a vehicle stamp that arrived at `arrived_us`."""
+        late_us = arrived_us - vehicle_us
+        if self._newest_us is None or vehicle_us < self._newest_us - _REBOOT_US:
+            self.boots += self._newest_us is not None
+            self._begin_again(vehicle_us, late_us)
+        residual_us = late_us - self._line(vehicle_us)
+        if residual_us < -_LEAP_US:
+            self._begin_again(vehicle_us, late_us)
+        assert self._newest_us is not None
+        rolled = self._keep(float(vehicle_us), float(late_us))
+        self._newest_us = max(self._newest_us, vehicle_us)
+        if rolled or residual_us < 0.0:
+            self._fit()
+        return vehicle_us + round(self._line(vehicle_us) - self._way_us)
+
+    def round_trip(self, asked_us: int, vehicle_us: int, arrived_us: int) -> None:
+        """An answered TIMESYNC: the vehicle's clock read `vehicle_us` between `asked_us` and `arrived_us` of ours."""
+        if self._newest_us is None or abs(vehicle_us - self._newest_us) > _REBOOT_US or arrived_us < asked_us:
+            return  # another time base than the stamps of the state
+        if arrived_us >= self._trips_end_us:
+            self._trips, self._trips_end_us = (self._trips[1], None), arrived_us + _TRIP_WINDOW_US
+        trip = arrived_us - asked_us
+        self._trips = self._trips[0], trip if self._trips[1] is None else min(trip, self._trips[1])
+        least_us = float(asked_us - vehicle_us - _BOUND_SLACK_US)
+        if least_us > self._offset_us + self.rate * vehicle_us:
+            self._fit()
+        missing_us = least_us - (self._offset_us + self.rate * vehicle_us)
+        self._floor = (float(vehicle_us), least_us)
+        if missing_us > (_MOVED_US if self._spans() else _UNKNOWN_RATE_US):
+            fresh = [(x, y) for x, y in self._points if y + self.rate * (vehicle_us - x) >= least_us]
+            self._points.clear()  # the others are of before the vehicle's clock stood still
+            self._points.extend(fresh or [(float(vehicle_us), float(arrived_us - vehicle_us))])
+            self._fit()
+
+    @property
+    def _way_us(self) -> float:
+        """Shortest one-way delay, which the line does not know: half of what is left of a round trip."""
+        trip = self.round_trip_us
+        return 0.0 if trip is None else 0.5 * max(0, trip - _LOOP_US)
+
+    def _line(self, vehicle_us: float) -> float:
+        """Our time minus the vehicle's at a stamp, as seen through the shortest delay."""
+        line = self._offset_us + self.rate * vehicle_us
+        if self._floor is None:
+            return line
+        stamp_us, least_us = self._floor
+        return max(line, least_us + self.rate * (vehicle_us - stamp_us))
+
+    def _spans(self) -> bool:
+        return len(self._points) > 1 and self._points[-1][0] - self._points[0][0] >= _RATE_AFTER_US
+
+    def _begin_again(self, vehicle_us: int, late_us: int) -> None:
+        self._points.clear()
+        self._floor = None
+        self._newest_us, self.rate, self._offset_us = vehicle_us, 0.0, float(late_us)
+
+    def _keep(self, x: float, y: float) -> bool:
+        """Take a point into its bucket if it is the earliest there; whether that began a new bucket."""
+        if self._points and x // _BUCKET_US <= self._points[-1][0] // _BUCKET_US:
+            last_x, last_y = self._points[-1]
+            if y - self.rate * x < last_y - self.rate * last_x:
+                self._points[-1] = (x, y)
+            return False
+        self._points.append((x, y))
+        return True
+
+    def _fit(self) -> None:
+        if self._spans():
+            first, last = self._points[0][0], self._points[-1][0]
+            rate = _slope_under(self._points, first + _KNEE_01 * (last - first))
+            self.rate = max(-self._limit, min(self._limit, rate))
+        self._offset_us = min(y - self.rate * x for x, y in self._points)
+
+
+def _slope_under(points: deque[Point], at: float) -> float:
+    """Slope of the lower convex hull of points (ascending x) at `at`."""
+    hull: list[Point] = []
+    for x, y in points:
+        while len(hull) > 1 and _turns_down(hull[-2], hull[-1], (x, y)):
+            hull.pop()
+        hull.append((x, y))
+    for left, right in pairwise(hull):
+        if right[0] >= at:
+            return (right[1] - left[1]) / (right[0] - left[0])
+    return 0.0
+
+
+def _turns_down(a: Point, b: Point, c: Point) -> bool:
+    return (b[0] - a[0]) * (c[1] - a[1]) <= (b[1] - a[1]) * (c[0] - a[0])

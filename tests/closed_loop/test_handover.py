@@ -1,0 +1,220 @@
+"""Between agent, autopilot and pilot: who flies, how it is handed over, and that nobody takes it back unasked.
+
+Each protection beside the same flight without it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import development as mavlink
+
+from sitl.lockstep import Lockstep
+from swarmctl.agent import Agent
+from swarmctl.config import load
+from swarmctl.control import sequence
+from swarmctl.control.sequence import REBOOTED, TAKEN_OVER, Sequence
+from swarmctl.core.types import FlightMode, Phase, VehicleState
+from swarmctl.links import autopilot
+from swarmctl.links.mavlink import Codec, frames, message_id
+from swarmctl.links.transport import PipeTransport
+from tests.closed_loop.conftest import Fly, mission_t_s
+
+SETPOINT = 82  # SET_ATTITUDE_TARGET
+SLEEP_S = 1.62  # wakes in a tick in which the state is told but not the mode
+
+# four cross one point at close quarters and at speed, all told to land there
+CROSSING = (
+    "swarm.agents=4",
+    "start.positions_ned_m=[[3.0,0.0,0.0],[-3.0,0.1,0.0],[0.1,3.0,0.0],[0.0,-3.0,0.0]]",
+    "mission.kind=swap",
+    "mission.swap.travel_s=2.5",
+    "mission.duration_s=12",
+)
+LAND_NOW: dict[float, Callable[[Lockstep], None]] = {1.7: lambda running: running.command("land")}
+
+
+def test_who_is_told_to_land_at_speed_among_others_brakes_and_makes_room_first(fly: Fly) -> None:
+    flight = fly(*CROSSING, at=LAND_NOW)
+    assert flight.separation_m() >= 0.85
+    final = flight.pos_ned_m[-1]
+    apart = min(np.linalg.norm(final[i] - final[j]) for i in range(4) for j in range(i))
+    assert apart >= 1.0, "on the ground: radius 0.9 and 0.2 to spare, less what the autopilot drifts while it lands"
+    for agent in range(4):
+        ticks = flight.ticks(agent)
+        handed = ticks[int(np.argmax(ticks["phase"] == Phase.LAND))]
+        assert np.linalg.norm(handed["vel_ned_m_s"]) < 0.2
+
+
+def test_control_an_autopilot_that_lands_at_speed_among_others_comes_too_close(
+    fly: Fly, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def land_at_once(self: Sequence, verb: str, now_us: int, state: VehicleState) -> None:
+        self.outcome, self.phase, self._entered_us = "stopped", Phase.LAND, now_us
+
+    monkeypatch.setattr(Sequence, "_stop", land_at_once)
+    assert fly(*CROSSING, at=LAND_NOW).separation_m() < 0.75
+
+
+# -- PX4 returns to OFFBOARD by itself when setpoints resume ----------------------------------------------------------
+
+ALONE = ("swarm.agents=1", "mission.duration_s=8")
+
+
+class Watched:
+    """One agent and its vehicle; notes when setpoints leave and when the vehicle is in OFFBOARD, armed."""
+
+    def __init__(self, *overrides: str) -> None:
+        self.run = Lockstep(load(None, (*ALONE, *overrides)))
+        self.setpoints_us: list[int] = []
+        self.offboard_us: list[int] = []
+        self._listen()
+
+    @property
+    def now_us(self) -> int:
+        return self.run.clock.now_us()
+
+    @property
+    def agent(self) -> Agent:
+        agent = self.run.agents[0]
+        assert agent is not None
+        return agent
+
+    def step_for(self, seconds: float) -> None:
+        for _ in range(round(seconds * 50)):
+            self.run.step()
+            truth = self.run.world.truth_rows()[0]
+            if truth["armed"] and truth["flight_mode"] == FlightMode.EXTERNAL:
+                self.offboard_us.append(self.now_us)
+
+    def until_mission(self, t_s: float) -> Watched:
+        while mission_t_s(self.run) < t_s:
+            self.step_for(0.02)
+            assert self.now_us < 60_000_000
+        return self
+
+    def restart_agent(self) -> None:
+        """A new process beside the same vehicle."""
+        self.run.agents[0] = self.run._agent(0, self.run.links[0][0])
+
+    def _listen(self) -> None:
+        link = self.run.links[0][0]
+
+        def send(data: bytes) -> None:
+            self.setpoints_us += [self.now_us for frame in frames(data) if message_id(frame) == SETPOINT]
+            PipeTransport.send(link, data)
+
+        link.send = send  # type: ignore[method-assign]
+
+
+def asleep_past_the_loss() -> Watched:
+    """The agent's process stands still; its socket keeps half a second and drops the rest, as UDP's does."""
+    flight = Watched().until_mission(2.0)
+    ours, vehicles = flight.run.links[0]
+    flight.run.frozen.add(0)
+
+    def send(data: bytes) -> None:
+        if 0 not in flight.run.frozen or len(ours._inbox) < 150:
+            PipeTransport.send(vehicles, data)
+
+    vehicles.send = send  # type: ignore[method-assign]
+    flight.step_for(SLEEP_S)
+    flight.setpoints_us.clear()
+    flight.offboard_us.clear()
+    flight.run.frozen.discard(0)
+    flight.step_for(3.0)
+    return flight
+
+
+def test_an_agent_that_slept_past_the_loss_takes_nothing_back() -> None:
+    flight = asleep_past_the_loss()
+    assert flight.setpoints_us == flight.offboard_us == []
+    assert flight.agent.outcome == TAKEN_OVER
+
+
+def test_control_without_doubting_the_mode_it_returns_to_offboard(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(autopilot, "_GAP_US", 10**12)
+    flight = asleep_past_the_loss()
+    assert flight.setpoints_us
+    assert flight.offboard_us
+
+
+def restarted_while_the_autopilot_flies_home(switched_off: Callable[[], None] = lambda: None) -> Watched:
+    """With PX4's own choice of what to do when setpoints stop."""
+    flight = Watched("agent.autopilot_params.COM_OBL_RC_ACT=3").until_mission(3.0)
+    switched_off()
+    flight.run.kill(0)
+    flight.step_for(1.5)
+    assert flight.run.world.truth_rows()[0]["flight_mode"] == FlightMode.RTL
+    flight.offboard_us.clear()
+    flight.setpoints_us.clear()
+    flight.restart_agent()
+    flight.step_for(2.0)
+    return flight
+
+
+def test_a_restarted_agent_leaves_a_vehicle_to_the_failsafe_that_has_it() -> None:
+    flight = restarted_while_the_autopilot_flies_home()
+    assert flight.setpoints_us == flight.offboard_us == []
+    flight.run.command("resume")  # an operator means it
+    flight.step_for(1.0)
+    assert flight.setpoints_us
+    assert flight.offboard_us
+
+
+def test_control_streaming_to_a_vehicle_that_is_not_ours_takes_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    def switch_off() -> None:
+        monkeypatch.setattr(sequence, "_is_theirs", lambda state: False)
+        monkeypatch.setattr(Sequence, "_ask_for_control", lambda *_: [])  # streaming is enough
+
+    flight = restarted_while_the_autopilot_flies_home(switch_off)
+    assert flight.setpoints_us
+    assert flight.offboard_us
+
+
+def test_after_a_reboot_in_flight_nothing_is_armed_again_and_the_outcome_says_why() -> None:
+    flight = Watched().until_mission(2.0)
+    asked_before = len(flight.run.logs[0].events)
+    flight.setpoints_us.clear()
+    flight.run.world.reboot(0, flight.now_us)
+    flight.step_for(12.0)
+    since = flight.run.logs[0].events[asked_before:]
+    verbs = [event["verb"] for event in since if event["event"] == "command"]
+    assert not {"arm", "external", "takeoff"} & set(verbs)
+    assert {"rate", "param_int COM_OBL_RC_ACT", "message"} <= set(verbs), "the link is set up again"
+    assert (flight.agent.finished, flight.agent.outcome) == (True, REBOOTED)
+
+
+# -- ArduCopter -------------------------------------------------------------------------------------------------------
+
+COPTER = ("sitl.autopilot_kind=arducopter", "agent.autopilot_params={GUID_OPTIONS=8}")
+
+
+def test_arducopter_is_flown_in_its_own_dialect_until_a_pilot_chooses_another_mode() -> None:
+    flight = Watched(*COPTER).until_mission(4.0)
+    ticks = flight.run.logs[0].ticks
+    ready = ticks[ticks["phase"] == Phase.READY]
+    assert np.abs(ready["pos_ned_m"][:, 2]).max() < 0.2, "the hover thrust was learned before: no sag"
+    assert ready["hover_thrust_01"][0] == pytest.approx(0.49, abs=0.02), "of the plant; its parameter says 0.39"
+    loiter = mavlink.MAVLink_command_long_message(1, 1, 176, 0, 1.0, 5.0, 0, 0, 0, 0, 0)
+    PipeTransport.send(flight.run.links[0][0], Codec(255, 190).encode(loiter))
+    flight.step_for(0.5)
+    flight.setpoints_us.clear()
+    flight.step_for(4.0)
+    assert flight.setpoints_us == []
+    assert flight.agent.outcome == TAKEN_OVER
+    flight.run.command("resume")
+    flight.step_for(1.5)
+    assert flight.setpoints_us
+    flight.step_for(25.0)
+    assert (flight.agent.finished, flight.agent.outcome) == (True, "completed")
+
+
+def test_an_arducopter_whose_thrust_would_be_a_climb_rate_is_not_armed() -> None:
+    flight = Watched(COPTER[0], "agent.autopilot_params={}")
+    flight.step_for(3.0)
+    assert flight.agent.finished
+    assert "set agent.autopilot_params.GUID_OPTIONS = 8" in flight.agent.outcome
+    assert not flight.run.world.truth_rows()[0]["armed"]

@@ -1,0 +1,136 @@
+"""Who is at the other end of a dialogue: a simulated vehicle in this process, or any autopilot by URL.
+
+Both give transports and let time pass; nothing else differs for whoever talks to them.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+import numpy as np
+
+from sitl.world import SitlParams, SitlWorld
+from swarmctl.core.clock import SimClock
+from swarmctl.links.transport import Datagram, Transport, open_transport, pipe_pair
+from tests.conformance.vocabulary import GCS_LINK, OFFBOARD_LINK
+
+EKF_READY_S = 4.0  # as measured on PX4
+STEP_US = 4000
+Tamper = Callable[[bytes], list[bytes]]
+
+
+class Partner(Protocol):
+    """One vehicle and the links to it."""
+
+    links: dict[str, Transport]
+    slack_s: float  # added to every limit: what the wall clock and a loaded machine may cost
+    simulated: bool
+
+    def now_s(self) -> float:
+        """Time the vehicle's promises are measured in."""
+
+    def advance(self) -> None:
+        """Let a few milliseconds pass."""
+
+    def restart(self, booting: bool) -> None:
+        """A vehicle that has just started; `booting`: with the time its estimator really takes."""
+
+    def can_restart(self) -> bool: ...
+
+    def close(self) -> None: ...
+
+
+class TamperedLink:
+    """A link whose incoming frames pass through somebody else's hands."""
+
+    def __init__(self, inner: Transport, tamper: Tamper) -> None:
+        self._inner = inner
+        self._tamper = tamper
+
+    def send(self, data: bytes) -> None:
+        self._inner.send(data)
+
+    def receive(self, now_us: int) -> list[Datagram]:
+        return [Datagram(d.t_us, frame) for d in self._inner.receive(now_us) for frame in self._tamper(d.data)]
+
+    def close(self) -> None:
+        self._inner.close()
+
+
+class InProcess:
+    """`SitlWorld` with one vehicle like the sheet's, on a simulated clock and in-memory links."""
+
+    slack_s = 0.0
+    simulated = True
+
+    def __init__(self) -> None:
+        self.restart(booting=True)
+
+    def restart(self, booting: bool) -> None:
+        self._clock = SimClock()
+        pairs = {name: pipe_pair(self._clock.now_us) for name in (OFFBOARD_LINK, GCS_LINK)}
+        self.links: dict[str, Transport] = {name: ours for name, (_, ours) in pairs.items()}
+        ready_s = EKF_READY_S if booting else 0.1
+        params = SitlParams(
+            1, np.zeros((1, 3)), preset="x500", ekf_ready_s=ready_s, reject_bad_setpoints=False
+        )  # the sheet's PX4 validates nothing
+        self.world = SitlWorld(params, [pairs[OFFBOARD_LINK][0]], [pairs[GCS_LINK][0]])
+
+    def can_restart(self) -> bool:
+        return True
+
+    def now_s(self) -> float:
+        return self._clock.now_us() * 1e-6
+
+    def advance(self) -> None:
+        self._clock.advance(STEP_US)
+        self.world.step(self._clock.now_us())
+
+    def close(self) -> None:
+        for link in self.links.values():
+            link.close()
+
+
+class ByUrl:
+    """Any autopilot on the URLs of its links; `restart_command` is a shell line that starts it afresh."""
+
+    slack_s = 0.15
+    simulated = False
+    PAUSE_S = 0.002
+
+    def __init__(self, url: str, gcs_url: str = "", restart_command: str = "") -> None:
+        urls = {OFFBOARD_LINK: url} | ({GCS_LINK: gcs_url} if gcs_url else {})
+        self.links: dict[str, Transport] = {name: open_transport(u) for name, u in urls.items()}
+        self._restart_command = restart_command
+        self._process: subprocess.Popen[bytes] | None = None
+        if restart_command:
+            self.restart(booting=True)
+
+    def can_restart(self) -> bool:
+        return bool(self._restart_command)
+
+    def restart(self, booting: bool) -> None:
+        self._stop()
+        for link in self.links.values():
+            link.receive(0)  # what the last one still said
+        self._process = subprocess.Popen(["sh", "-c", f"exec {self._restart_command}"], stdout=subprocess.DEVNULL)
+
+    def now_s(self) -> float:
+        return time.monotonic()
+
+    def advance(self) -> None:
+        time.sleep(self.PAUSE_S)
+
+    def _stop(self) -> None:
+        if self._process is not None:
+            self._process.terminate()
+            self._process.wait(timeout=10.0)
+            self._process = None
+
+    def close(self) -> None:
+        self._stop()
+        for link in self.links.values():
+            link.close()

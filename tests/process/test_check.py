@@ -1,0 +1,269 @@
+"""`swarmctl check` against real simulator processes over UDP: what it finds, what it sets, what it leaves alone."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+from pymavlink.dialects.v20 import development as mavlink
+
+from swarmctl.check import CheckOptions, check
+from swarmctl.config import load
+from swarmctl.errors import StartError
+from swarmctl.links.mavlink import Codec, frames
+
+pytestmark = pytest.mark.process
+
+ROOT = Path(__file__).resolve().parents[2]
+ENV = {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+QUICK_S = 1.0
+
+
+def free_ports(count: int) -> list[int]:
+    """Free a moment ago; nothing else on this machine asks for them by number."""
+    sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
+    for sock in sockets:
+        sock.bind(("127.0.0.1", 0))
+    ports = [int(sock.getsockname()[1]) for sock in sockets]
+    for sock in sockets:
+        sock.close()
+    return ports
+
+
+class Simulator:
+    """`python -m sitl`, and where its vehicles send to."""
+
+    def __init__(self, vehicles: int, autopilot: str = "px4") -> None:
+        self.ports = free_ports(vehicles)
+        arguments = ["--vehicles", f"{vehicles}", "--remote-ports", ",".join(map(str, self.ports))]
+        arguments += [
+            "--ekf-ready",
+            "0.2",
+            "--local-port",
+            f"{free_ports(1)[0]}",
+            "--die-with-parent",
+            "--autopilot",
+            autopilot,
+        ]
+        self.process = subprocess.Popen(
+            [sys.executable, "-m", "sitl", *arguments], cwd=ROOT, env=ENV, stdout=subprocess.PIPE, text=True
+        )
+
+    def wait_until_up(self) -> None:
+        assert self.process.stdout is not None
+        for _ in self.ports:
+            assert "sysid=" in self.process.stdout.readline()
+
+    def stop(self) -> None:
+        self.process.terminate()
+        try:
+            self.process.communicate(timeout=10)
+        finally:
+            self.process.kill()
+
+
+@pytest.fixture(scope="module")
+def simulators() -> Iterator[tuple[Simulator, Simulator]]:
+    """One of two vehicles, and one of one vehicle that has the first one's system id."""
+    begun = Simulator(2), Simulator(1)
+    try:
+        for simulator in begun:
+            simulator.wait_until_up()
+        yield begun
+    finally:
+        for simulator in begun:
+            simulator.stop()
+
+
+@pytest.fixture
+def copter() -> Iterator[Simulator]:
+    simulator = Simulator(1, "arducopter")
+    try:
+        simulator.wait_until_up()
+        yield simulator
+    finally:
+        simulator.stop()
+
+
+Simulators = tuple[Simulator, Simulator]
+Check = Callable[..., tuple[int, dict[str, Any], str]]
+
+
+@pytest.fixture
+def run_check(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Check:
+    """Check vehicles (system id, port) as configured; exit code, JSON and what was printed."""
+
+    def run(*vehicles: tuple[int, int], apply: bool = False, more: str = "") -> tuple[int, dict[str, Any], str]:
+        text = f"[swarm]\nagents={len(vehicles)}\n[start]\ncenter_ned_m=[0.0,0.0,-2.0]\n[sitl]\nenabled=false\n"
+        text += "".join(f'[[vehicles]]\nsysid={sysid}\nurl="udpin://127.0.0.1:{port}"\n' for sysid, port in vehicles)
+        path = tmp_path / "check.toml"
+        path.write_text(text + more)
+        code = check(load(path), CheckOptions(apply, QUICK_S, tmp_path / "check.json", connect_s=1.5))
+        return code, json.loads((tmp_path / "check.json").read_text()), capsys.readouterr().out
+
+    return run
+
+
+def verdict(found: dict[str, Any], topic: str, agent: int = 0) -> str:
+    [line] = [line for line in found["findings"] if line["topic"] == topic and line["agent"] == agent]
+    return str(line["verdict"])
+
+
+class Pilot:
+    """Somebody else on the vehicle's link, before or after a check."""
+
+    def __init__(self, port: int) -> None:
+        self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._sock.bind(("127.0.0.1", port))
+        self._sock.settimeout(2.0)
+        self._codec = Codec(1, 190)
+        _, self._vehicle = self._sock.recvfrom(2048)
+
+    def __enter__(self) -> Pilot:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._sock.close()
+
+    def ask(self, message: Any, answer: str) -> Any:
+        """Send until a message of the kind `answer` comes."""
+        deadline_s = time.monotonic() + 3.0
+        while time.monotonic() < deadline_s:
+            self._sock.sendto(self._codec.encode(message), self._vehicle)
+            tried_s = time.monotonic() + 0.3
+            while time.monotonic() < tried_s:
+                for frame in frames(self._sock.recv(2048)):
+                    heard = self._codec.decode(frame)
+                    if heard is not None and heard.get_type() == answer:
+                        return heard
+        raise AssertionError(f"no {answer}")
+
+    def arm(self, armed: bool) -> int:
+        params = (1.0 if armed else 0.0, *[0.0] * 6)
+        return int(self.ask(mavlink.MAVLink_command_long_message(1, 1, 400, 0, *params), "COMMAND_ACK").result)
+
+    def parameter(self, name: str) -> bytes:
+        asked = mavlink.MAVLink_param_request_read_message(1, 1, name.encode(), -1)
+        return bytes(self.ask(asked, "PARAM_VALUE").get_msgbuf())
+
+    def armed(self) -> bool:
+        beat = self.ask(mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3), "HEARTBEAT")
+        return bool(beat.base_mode & 128)
+
+
+def test_a_wrong_parameter_is_found_applied_and_then_nothing_is_left(simulators: Simulators, run_check: Check) -> None:
+    vehicles = list(enumerate(simulators[0].ports, 1))
+    code, found, printed = run_check(*vehicles)
+    assert code == 4
+    assert verdict(found, "COM_OBL_RC_ACT") == verdict(found, "COM_OBL_RC_ACT", 1) == "FIX"
+    assert "fix  agent-0, agent-1 COM_OBL_RC_ACT: 0" in printed
+    facts = found["vehicles"][0]
+    assert (facts["autopilot"], facts["sysid"], facts["mode"], facts["landed"]) == ("PX4", 1, "HOLD", "ON_GROUND")
+    assert facts["link"]["round_trip"]["answers"] > 10
+    assert facts["link"]["lost_01"] < 0.01
+    assert facts["origin_told"] and facts["pos_ned_m"] is not None
+    assert found["changes"] == []
+
+    code, found, printed = run_check(*vehicles, apply=True)
+    assert code == 0
+    assert [(c["name"], c["before"], c["after"], c["done"]) for c in found["changes"]] == [
+        ("COM_OBL_RC_ACT", 0, 4, True)
+    ] * 2
+    assert "agent-1 COM_OBL_RC_ACT: 0 -> 4" in printed
+
+    code, found, printed = run_check(*vehicles)  # by another process of the same vehicles: it has stayed
+    assert code == 0
+    assert {line["verdict"] for line in found["findings"]} <= {"OK", "NOTE"}
+    assert "2 of 2 vehicles reached, nothing to fix" in printed
+
+
+def test_an_arducopter_is_asked_and_set_in_its_own_encoding(copter: Simulator, run_check: Check) -> None:
+    wanted = "[agent.autopilot_params]\nGUID_OPTIONS=8\n"
+    code, found, _ = run_check((1, copter.ports[0]), apply=True, more=wanted)
+    assert code == 0
+    assert found["vehicles"][0]["autopilot"] == "ArduCopter"
+    assert ("GUID_OPTIONS", 0, 8, True) in [(c["name"], c["before"], c["after"], c["done"]) for c in found["changes"]]
+    assert all(c["done"] for c in found["changes"])
+    assert verdict(found, "origin") == verdict(found, "sensors") == "OK"
+
+
+def test_a_missing_vehicle_and_one_with_anothers_id(simulators: Simulators, run_check: Check) -> None:
+    pair, single = simulators
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        vehicles = (
+            (1, pair.ports[0]),
+            (2, single.ports[0]),
+            (3, free_ports(1)[0]),
+            (4, int(taken.getsockname()[1])),
+        )
+        code, found, printed = run_check(*vehicles, apply=True)
+    assert code == 3
+    assert [bool(v["unreachable"]) for v in found["vehicles"]] == [False, False, True, True]
+    assert "can't be bound" in found["vehicles"][3]["unreachable"]
+    assert verdict(found, "system id") == "OK"
+    assert verdict(found, "system id", 1) == verdict(found, "system ids", -1) == "FIX"
+    assert "2 of 4 vehicles reached" in printed
+    assert [c["done"] for c in found["changes"] if c["agent"] == 1] == [False]  # not the vehicle that was meant
+    assert "it is vehicle 1, not 2" in printed
+
+
+def test_an_armed_vehicle_is_reported_and_left_alone(simulators: Simulators, run_check: Check) -> None:
+    port = simulators[1].ports[0]
+    with Pilot(port) as pilot:
+        before = pilot.parameter("COM_OBL_RC_ACT")
+        assert pilot.arm(True) == 0
+    code, found, printed = run_check((1, port), apply=True)
+    assert code == 4
+    assert found["vehicles"][0]["armed"] is True
+    assert verdict(found, "state") == "NOTE"
+    assert [(c["done"], c["refused"]) for c in found["changes"]] == [(False, "it is armed")]
+    assert "not changed to 4 (it is armed)" in printed
+    with Pilot(port) as pilot:
+        assert pilot.armed()
+        assert pilot.parameter("COM_OBL_RC_ACT")[10:-2] == before[10:-2]
+        assert pilot.arm(False) == 0
+
+
+def test_without_a_configuration_the_built_in_simulator_is_checked_and_ended(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "swarmctl", "check", "--agents", "2", f"--seconds={QUICK_S}"]
+    command += ["--json", str(tmp_path / "check.json")]
+    env = {**ENV, "TMPDIR": str(tmp_path)}
+    done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "2 of 2 vehicles reached, nothing to fix" in done.stdout
+    assert [path.name for path in tmp_path.iterdir()] == ["check.json"]
+    assert left_of(tmp_path) == []
+
+    begun = subprocess.Popen([*command, "--seconds=60"], cwd=tmp_path, env=env, stdout=subprocess.DEVNULL)
+    deadline_s = time.monotonic() + 20.0
+    while not left_of(tmp_path, "sitl") and time.monotonic() < deadline_s:
+        time.sleep(0.05)
+    begun.send_signal(signal.SIGTERM)
+    assert begun.wait(timeout=10) == 130
+    assert [path.name for path in tmp_path.iterdir()] == ["check.json"]
+    assert left_of(tmp_path) == []
+
+
+def left_of(folder: Path, name: str = "") -> list[str]:
+    """Command lines of processes that were told of a folder."""
+    lines = [" ".join(p.info["cmdline"] or ()) for p in psutil.process_iter(["cmdline"])]
+    return [line for line in lines if str(folder) in line and name in line]
+
+
+def test_a_json_file_that_can_not_be_written_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "one.toml"
+    url = f"udpin://127.0.0.1:{free_ports(1)[0]}"
+    path.write_text(f'[swarm]\nagents=1\n[sitl]\nenabled=false\n[[vehicles]]\nsysid=1\nurl="{url}"\n')
+    with pytest.raises(StartError, match="can't be written"):
+        check(load(path), CheckOptions(json=tmp_path / "nowhere" / "check.json", connect_s=0.1))
