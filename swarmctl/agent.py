@@ -111,7 +111,9 @@ class Agent:
         agents = len(setup.starts_ned_m)
         peers = [i for i in range(agents) if i != setup.agent]
         slots = min(len(peers), setup.separation.max_neighbours) + setup.obstacle_slots
-        self._upkeep = Upkeep(autopilot, commands, setup.params.autopilot_params, setup.params.sequence.state_rate_hz)
+        self._upkeep = Upkeep(
+            autopilot, commands, setup.params.autopilot_params, setup.sysid, setup.params.sequence.state_rate_hz
+        )
         self._surroundings = Surroundings(setup.agent, peers, setup.separation, setup.obstacle_slots, bus)
         self._controller = make_controller(
             setup.controller, setup.vehicle_model, setup.separation, setup.agent, slots, stopwatch_ns

@@ -22,6 +22,7 @@ _OFFBOARD_EXCEPTED = 4  # COM_RCL_EXCEPT bit 2
 _STICKS_NOT_BY_RADIO = (1, 4)  # COM_RC_IN_MODE: joystick only, disabled
 _HOVER_APART_01 = 0.1
 _GUIDED_SILENCE_S = 1.0
+_LAND_WITHOUT_STATION = 5  # FS_GCS_ENABLE
 _WEIGHT_WANTED, _WEIGHT_TABLE = 60, 50
 
 
@@ -150,11 +151,9 @@ def _guided_timeout(value: float, facts: VehicleFacts, config: Config) -> Opinio
 
 
 def _ground_station_failsafe(value: float, facts: VehicleFacts, config: Config) -> Opinion:
-    if value == 0:
-        return _ok("0, or a ground station")
-    station = facts.number("SYSID_MYGCS")
-    who = "a ground station" if station is None else f"a ground station of system id {station:g}"
-    return Opinion(Verdict.NOTE, "0, or a ground station", f"GUIDED ends when {who} is not heard; keep it connected")
+    if value == _LAND_WITHOUT_STATION:
+        return _ok("5, land")
+    return Opinion(Verdict.FIX, "5, land", "without its agent it would drift on for ever", _LAND_WITHOUT_STATION)
 
 
 def _throttle_failsafe(value: float, facts: VehicleFacts, config: Config) -> Opinion:
@@ -200,7 +199,7 @@ ROWS: dict[str, tuple[Row, ...]] = {
     "ArduCopter": (
         Row("GUID_OPTIONS", "what thrust means", _guided_options),
         Row("GUID_TIMEOUT", "how long the last attitude is flown when setpoints stop", _guided_timeout),
-        Row("FS_GCS_ENABLE", "whether a lost ground station ends GUIDED", _ground_station_failsafe),
+        Row("FS_GCS_ENABLE", "what happens when the agent's heartbeats stop", _ground_station_failsafe),
         Row("FS_THR_ENABLE", "whether a lost radio ends GUIDED", _throttle_failsafe),
         Row("FS_EKF_ACTION", "what happens when the estimator diverges", _ekf_failsafe),
         Row("ARMING_CHECK", "what is checked before arming", _arming_check),
@@ -209,7 +208,7 @@ ROWS: dict[str, tuple[Row, ...]] = {
         Row("SYSID_THISMAV", "who it is after the next boot", _own_sysid),
     ),
 }
-_ALSO_READ = {"PX4": ("NAV_RCL_ACT",), "ArduCopter": ("SYSID_MYGCS",)}  # what rows refer to
+_ALSO_READ = {"PX4": ("NAV_RCL_ACT",), "ArduCopter": ()}  # what rows refer to
 
 
 def names_to_read(dialect: Dialect, config: Config) -> tuple[str, ...]:

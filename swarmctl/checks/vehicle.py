@@ -117,9 +117,6 @@ def _link(facts: VehicleFacts, config: Config) -> Finding:
     if link.senders > 1:
         told = f"{link.senders} senders"
         return line(FIX, told, "an agent takes the first one it hears for its vehicle; let only the vehicle send", 89)
-    if facts.autopilot == "PX4" and facts.url.startswith("udpout"):
-        advice = f"{_LATCH}: restart it before a launch, or use udpin"
-        return line(NOTE, found, advice)
     return line(OK, found)
 
 

@@ -36,7 +36,7 @@ class AxisWeights(Params):
 
 
 class MpcParams(Params):
-    """Horizons, weights and bounds; the defaults are the thesis' swarm flight (its section 4.3) but for z's end and r."""
+    """Horizons, weights and bounds; defaults are the thesis' swarm flight (its section 4.3) but for z's end and r."""
 
     dt_s: float = Field(0.02, gt=0.001, le=0.5)
     discretisation: Literal["zoh", "euler"] = "zoh"  # euler is the thesis' (3.6)

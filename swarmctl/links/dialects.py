@@ -70,6 +70,7 @@ class Dialect:
     hover_parameter: str
     thrust_parameters: tuple[str, ...]  # read and recorded: they say what thrust means
     horizontal_accuracy: str  # message that tells it
+    heeds_parameter: str = ""  # whose heartbeats its link-loss failsafe counts; "": anybody's
 
     def mode(self, custom_mode: int) -> FlightMode:
         """Mode of a HEARTBEAT or CURRENT_MODE."""
@@ -184,9 +185,25 @@ ARDUCOPTER = Dialect(
             lambda v: 0.0 < v <= 5.0,
             "so long the last attitude is flown when setpoints stop; set agent.autopilot_params.GUID_TIMEOUT = 1.0",
         ),
+        Rule(
+            "FS_GCS_ENABLE",
+            lambda v: v == 5,
+            "without its agent it would drift on for ever; set agent.autopilot_params.FS_GCS_ENABLE = 5 (land)",
+        ),
+        Rule(
+            "FS_GCS_TIMEOUT",
+            lambda v: 0.0 < v <= 5.0,
+            "so long it drifts before it lands without its agent; set agent.autopilot_params.FS_GCS_TIMEOUT = 2.0",
+        ),
+        Rule(
+            "ATC_ANGLE_BOOST",
+            lambda v: v == 0,
+            "thrust is planned for the tilt already; set agent.autopilot_params.ATC_ANGLE_BOOST = 0",
+        ),
     ),
     hover_parameter="MOT_THST_HOVER",
     thrust_parameters=("MOT_THST_EXPO", "MOT_SPIN_ARM", "MOT_SPIN_MIN", "MOT_SPIN_MAX"),
     horizontal_accuracy="GPS_RAW_INT",  # its EKF's own figures are test ratios, not metres
+    heeds_parameter="SYSID_MYGCS",
 )
 DIALECTS: Mapping[int, Dialect] = {12: PX4, 3: ARDUCOPTER}  # by HEARTBEAT.autopilot

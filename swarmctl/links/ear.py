@@ -11,7 +11,7 @@ import socket
 import time
 from typing import NamedTuple, Protocol
 
-from swarmctl.links.transport import Transport, bind_udp, open_transport, parse_url, resolve
+from swarmctl.links.transport import Transport, bind_towards, bind_udp, open_transport, parse_url, resolve
 
 Address = tuple[str, int]
 NOWHERE: Address = ("", 0)
@@ -58,7 +58,8 @@ def open_ear(url: str) -> tuple[Ear, Address]:
     if endpoint.scheme == "udpin":
         return UdpEar(bind_udp(endpoint.where, endpoint.number)), NOWHERE
     if endpoint.scheme == "udpout":
-        return UdpEar(bind_udp("0.0.0.0", 0)), (resolve(endpoint.where), endpoint.number)
+        there = resolve(endpoint.where), endpoint.number
+        return UdpEar(bind_towards(there)), there
     there = endpoint.where, endpoint.number
     return WireEar(open_transport(url), there), there
 

@@ -12,6 +12,7 @@ import socket
 import struct
 import sys
 import time
+import zlib
 from collections import deque
 from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
@@ -23,6 +24,8 @@ _CHUNK = 65536
 _SO_TIMESTAMPNS = 35  # Linux; socket.SO_TIMESTAMPNS is not exported before Python 3.13
 _TIMESPEC = struct.Struct("@qq")
 _URL = re.compile(r"^(?P<scheme>udpin|udpout|tcp|serial)://(?P<where>[^:]+):(?P<number>\d+)$")
+_LOCAL_PORTS = (20000, 32700)  # towards vehicles that are spoken to first; below the ones systems hand out
+_NEIGHBOURS = 16
 _REOPEN_US = 1_000_000
 _DEAD_US = 5_000_000  # every autopilot beats once a second
 
@@ -91,7 +94,7 @@ def open_transport(url: str, inherited_fd: int | None = None) -> Transport:
     if endpoint.scheme == "udpin":
         return UdpTransport(bind_udp(endpoint.where, endpoint.number))
     there = resolve(endpoint.where), endpoint.number
-    return TcpTransport(there) if endpoint.scheme == "tcp" else UdpTransport(bind_udp("0.0.0.0", 0), remote=there)
+    return TcpTransport(there) if endpoint.scheme == "tcp" else UdpTransport(bind_towards(there), remote=there)
 
 
 def resolve(host: str) -> str:
@@ -119,6 +122,19 @@ def bind_udp(host: str, port: int) -> socket.socket:
         sock.close()
         raise StartError(f"udp {host}:{port} can't be bound: {error}. Choose a free port or stop its owner") from error
     return sock
+
+
+def bind_towards(remote: tuple[str, int]) -> socket.socket:
+    """A UDP socket on a local port that is the same at every start: PX4 talks to the first port that ever spoke to it.
+
+    Raises:
+        StartError: the port and its neighbours are taken.
+    """
+    first = _LOCAL_PORTS[0] + zlib.crc32(f"{remote[0]}:{remote[1]}".encode()) % (_LOCAL_PORTS[1] - _LOCAL_PORTS[0])
+    for port in range(first, first + _NEIGHBOURS):  # another vehicle's may be the same
+        with contextlib.suppress(StartError):
+            return bind_udp("0.0.0.0", port)
+    raise StartError(f"udp ports {first} to {port} are taken. Stop what talks to {remote[0]}:{remote[1]} already")
 
 
 class UdpTransport:

@@ -29,6 +29,7 @@ class Upkeep:
         autopilot: what is told of it.
         commands: how it is asked.
         setup: parameters it is given, name -> value.
+        sysid: the agent's own system id, which heartbeats carry.
         state_rate_hz: of the messages that carry the state.
 
     Attributes:
@@ -36,10 +37,16 @@ class Upkeep:
     """
 
     def __init__(
-        self, autopilot: Autopilot, commands: CommandPort, setup: Mapping[str, int | float], state_rate_hz: float
+        self,
+        autopilot: Autopilot,
+        commands: CommandPort,
+        setup: Mapping[str, int | float],
+        sysid: int,
+        state_rate_hz: float,
     ) -> None:
         self._autopilot, self._commands = autopilot, commands
-        self._setup, self._rate_hz = dict(setup), state_rate_hz
+        self._given, self._setup, self._rate_hz = dict(setup), dict(setup), state_rate_hz
+        self._sysid = sysid
         self._boots = -1
         self._dialect: Dialect | None = None
         self._todo: deque[Command] = deque()
@@ -56,7 +63,8 @@ class Upkeep:
         """Why nothing may be armed, or ""; not known before `ready`."""
         if not self.ready or self._dialect is None:
             return ""
-        found = []
+        heeds = self._dialect.heeds_parameter
+        found = [f"{heeds} could not be set to {self._sysid}: {self._failed[heeds]}"] if heeds in self._failed else []
         for rule in self._dialect.rules:
             if rule.name in self._failed and rule.name in self._setup:
                 found.append(f"{rule.name} could not be set to {self._setup[rule.name]}: {self._failed[rule.name]}")
@@ -92,6 +100,9 @@ class Upkeep:
             return
         self._boots, self._dialect, self.ready = autopilot.clock.boots, autopilot.dialect, False
         self._failed.clear()
+        self._setup = dict(self._given)
+        if self._dialect.heeds_parameter:
+            self._setup[self._dialect.heeds_parameter] = self._sysid
         self._watched_us, self._samples = now_us, autopilot.samples
         origin = [Command(Verb.MESSAGE, number=GPS_GLOBAL_ORIGIN)]
         reads = [Command(Verb.PARAM_GET, name=n) for n in self._dialect.to_read() if n not in self._setup]

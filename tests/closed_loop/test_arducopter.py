@@ -56,3 +56,21 @@ def test_control_without_the_option_nothing_is_armed() -> None:
     (agent,) = flight.lockstep.agents
     assert agent is not None and "GUID_OPTIONS" in agent.outcome
     assert not flight.lockstep.truth["armed"].any()
+
+
+# -- an agent that dies -----------------------------------------------------------------------------------------------
+
+
+def test_the_vehicle_of_a_dead_agent_lands_and_the_other_keeps_clear() -> None:
+    died = {4.0: lambda running: running.kill(0)}
+    flight = fly_now("swarm.agents=2", "mission.duration_s=10", config=CONFIG, at=died)
+    assert pilots(flight.lockstep)[0].flight_mode() is FlightMode.LAND
+    assert flight.lockstep.truth[-2]["landed"] == Landed.ON_GROUND
+    assert flight.separation_m() >= 0.85
+
+
+def test_control_without_its_failsafe_it_would_never_be_armed() -> None:
+    flight = fly_now("swarm.agents=1", "agent.autopilot_params.FS_GCS_ENABLE=0", config=CONFIG)
+    (agent,) = flight.lockstep.agents
+    assert agent is not None and "FS_GCS_ENABLE" in agent.outcome
+    assert not flight.lockstep.truth["armed"].any()

@@ -106,7 +106,10 @@ def test_with_nothing_near_it_plans_what_the_two_problems_of_the_thesis_do(
     terminal: Terminal, goal: tuple[float, float, float]
 ) -> None:
     same = MpcParams(control_z=6, horizon_z=40, terminal_z=terminal, qp=DAQP)  # as x-y, which dmpc3 takes for all
-    both = [kind(same, VehicleModelParams(), SeparationParams(), 0, 4, lambda: 0).plan(problem(goal)) for kind in (JointMpc, SwarmMpc)]
+    both = [
+        kind(same, VehicleModelParams(), SeparationParams(), 0, 4, lambda: 0).plan(problem(goal))
+        for kind in (JointMpc, SwarmMpc)
+    ]
     assert both[0].status is both[1].status is PlanStatus.OK
     np.testing.assert_allclose(both[0].virtual, both[1].virtual, atol=1e-5)
     np.testing.assert_allclose(both[0].pos_ned_m, both[1].pos_ned_m, atol=1e-6)

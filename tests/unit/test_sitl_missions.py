@@ -226,12 +226,13 @@ def test_return_climbs_to_its_parameter(return_alt_m: float, highest_m: float) -
     bench.world.plant.state[10, 0] += 25.0  # carried away, beyond the cone
     bench.run(0.02)
     assert bench.mode(4, 5) == Result.ACCEPTED
+    bench.run(0.1)
+    assert any(t.startswith("RTL: start return at") for t in bench.texts())
     highest = 0.0
     for _ in range(200):
         bench.run(0.1)
         highest = max(highest, bench.height_m)
     assert highest == pytest.approx(highest_m, abs=0.6)
-    assert any(t.startswith("RTL: start return at") for t in bench.texts())
 
 
 # --- failsafes ---

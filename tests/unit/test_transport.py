@@ -145,6 +145,19 @@ def test_udpout_talks_first_and_hears_the_answer() -> None:
     link.close()
 
 
+def test_who_speaks_first_does_so_from_the_same_port_at_every_start() -> None:
+    ports = []
+    for _ in range(2):
+        link = open_transport("udpout://127.0.0.1:14581")
+        assert isinstance(link, UdpTransport)
+        ports.append(socket.socket(fileno=os.dup(link.fd)).getsockname()[1])
+        link.close()
+    assert ports[0] == ports[1]
+    both = [open_transport("udpout://127.0.0.1:14581") for _ in range(2)]
+    for link in both:
+        link.close()
+
+
 def test_arrival_is_stamped_by_the_kernel_and_not_by_the_tick_that_drains(bound: socket.socket) -> None:
     link = UdpTransport(bound)
     vehicle = client()

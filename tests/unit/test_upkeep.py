@@ -22,13 +22,16 @@ PX4, ARDUCOPTER = 12, 3
 LEVEL = [1.0, 0.0, 0.0, 0.0]
 
 
+COPTER_WITHOUT_AGENT = {"FS_GCS_ENABLE": 5, "FS_GCS_TIMEOUT": 2.0, "ATC_ANGLE_BOOST": 0, "SYSID_MYGCS": 255}
+
+
 class Vehicle:
     """A made-up autopilot at the far end: answers commands and parameters, streams what it was asked to."""
 
     def __init__(self, autopilot: int = PX4, **params: float) -> None:
         defaults = {
             PX4: {"COM_OBL_RC_ACT": 4, "MPC_THR_HOVER": 0.45, "THR_MDL_FAC": 0.0, "MPC_THR_MIN": 0.1, "MPC_THR_MAX": 1},
-            ARDUCOPTER: {"GUID_OPTIONS": 8, "GUID_TIMEOUT": 3.0, "MOT_THST_HOVER": 0.35},
+            ARDUCOPTER: {"GUID_OPTIONS": 8, "GUID_TIMEOUT": 3.0, "MOT_THST_HOVER": 0.35, **COPTER_WITHOUT_AGENT},
         }
         self.autopilot, self.params = autopilot, {**defaults[autopilot], **params}
         self.clock = SimClock()
@@ -41,7 +44,7 @@ class Vehicle:
         self.port = CodecCommands(self.pilot.send_frame, Codec(1, 191), 1, lambda: self.pilot.dialect)
         self.pilot.attach(self.port)
         self.setup: dict[str, int | float] = {}
-        self.upkeep = Upkeep(self.pilot, self.port, self.setup, 50.0)
+        self.upkeep = Upkeep(self.pilot, self.port, self.setup, 1, 50.0)
 
     def boot(self) -> None:
         self.booted_us = self.clock.now_us()
@@ -49,7 +52,7 @@ class Vehicle:
         self.asked: list[tuple[int, float]] = []
 
     def set_up(self, **setup: int | float) -> Vehicle:
-        self.upkeep = Upkeep(self.pilot, self.port, setup, 50.0)
+        self.upkeep = Upkeep(self.pilot, self.port, setup, 1, 50.0)
         return self
 
     @property
@@ -137,11 +140,12 @@ def test_px4_is_set_up_in_two_seconds_and_left_alone_then() -> None:
 
 
 def test_arducopter_is_asked_for_every_message_the_bridge_needs() -> None:
-    vehicle = Vehicle(ARDUCOPTER, GUID_OPTIONS=0).set_up(GUID_OPTIONS=8).run(12.0)  # unknown ones are met by silence
+    vehicle = Vehicle(ARDUCOPTER, GUID_OPTIONS=0).set_up(GUID_OPTIONS=8).run(30.0)  # unknown ones are met by silence
     assert vehicle.upkeep.ready
     assert vehicle.upkeep.refusal == ""
     assert rates(vehicle) == {1, 24, 31, 32, 33, 83, 245}
     assert vehicle.pilot.params["GUID_OPTIONS"] == 8.0
+    assert vehicle.params["SYSID_MYGCS"] == 1, "its link-loss failsafe heeds the agent's heartbeats"
     assert vehicle.pilot.hover_thrust_01 == pytest.approx(0.35)
     assert vehicle.pilot.poll(vehicle.clock.now_us()) is not None
 
@@ -155,8 +159,11 @@ def test_arducopter_is_asked_for_every_message_the_bridge_needs() -> None:
             r"GUID_OPTIONS = 0: .*set agent\.autopilot_params\.GUID_OPTIONS = 8",
         ),
         (Vehicle(ARDUCOPTER, GUID_TIMEOUT=60.0).set_up(), "GUID_TIMEOUT = 60"),
+        (Vehicle(ARDUCOPTER, FS_GCS_ENABLE=0).set_up(), "FS_GCS_ENABLE = 0: .*drift"),
+        (Vehicle(ARDUCOPTER, FS_GCS_TIMEOUT=30.0).set_up(), "FS_GCS_TIMEOUT = 30"),
+        (Vehicle(ARDUCOPTER, ATC_ANGLE_BOOST=1).set_up(), "ATC_ANGLE_BOOST = 1"),
     ],
-    ids=["motors stop", "climb rate", "flies on"],
+    ids=["motors stop", "climb rate", "flies on", "drifts on", "drifts long", "boost"],
 )
 def test_what_a_parameter_would_do_in_flight_is_refused_before_it(vehicle: Vehicle, why: str) -> None:
     vehicle.run(12.0)
