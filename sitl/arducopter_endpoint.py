@@ -67,6 +67,7 @@ class ArduCopterEndpoint:
         self._report = report
         self._codec = Codec(sysid, COMPONENT)
         self._step_us = step_us
+        self._waited_us = 0  # since the datagram in hand arrived
         self._texts = pilot.outbox()
         self._params_per_step = max(1, round(PARAMS_PER_S * step_us * 1e-6))
         self._sender = (0, 0)
@@ -128,6 +129,7 @@ class ArduCopterEndpoint:
         """Handle everything that has arrived; `now_us` is the simulation's time, everywhere else it is since boot."""
         self._at(now_us)
         for datagram in self.transport.receive(transport_now_us):
+            self._waited_us = max(0, min(self._step_us, transport_now_us - datagram.t_us))
             for frame in frames(datagram.data):
                 self._on_frame(frame)
 
@@ -188,7 +190,7 @@ class ArduCopterEndpoint:
 
     def _on_timesync(self, message: Any) -> None:
         if message.tc1 == 0:
-            self._send(mav.MAVLink_timesync_message(self._now_us * 1000, message.ts1))
+            self._send(mav.MAVLink_timesync_message((self._now_us - self._waited_us) * 1000, message.ts1))
 
     def _on_data_stream(self, m: Any) -> None:
         rate_hz = m.req_message_rate if m.start_stop else 0

@@ -69,6 +69,7 @@ class Endpoint:
         self._autopilot = autopilot
         self._report = report
         self._step_us = step_us
+        self._waited_us = 0  # since the datagram in hand arrived
         self._default_hz = OFFBOARD_HZ if default_hz is None else default_hz
         self._codec = Codec(sysid, COMPONENT)
         self._writer = FrameWriter(sysid, COMPONENT)
@@ -109,6 +110,7 @@ class Endpoint:
         if self._now_us < self._autopilot.boot.quiet_us:
             return  # it is starting: nobody listens
         for datagram in arrived:
+            self._waited_us = max(0, min(self._step_us, transport_now_us - datagram.t_us))
             self._counts.received_bytes += len(datagram.data)
             for frame in frames(datagram.data):
                 self._on_frame(frame)
@@ -198,7 +200,7 @@ class Endpoint:
 
     def _on_timesync(self, message: Any) -> None:
         if message.tc1 == 0:
-            self.send(_TIMESYNC, self._now_us * 1000, message.ts1)
+            self.send(_TIMESYNC, (self._now_us - self._waited_us) * 1000, message.ts1)  # when it arrived
 
     def _on_ping(self, message: Any) -> None:
         if message.target_system == 0 and message.target_component == 0:

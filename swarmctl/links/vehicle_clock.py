@@ -19,8 +19,8 @@ _LEAP_US = 1_000_000  # an arrival this much too early: the clock was set forwar
 _BOUND_SLACK_US = 1_000
 _MOVED_US = 5_000  # a line that misses more is of before the clock stood still; less, the bound itself corrects
 _UNKNOWN_RATE_US = 200_000  # the same while no rate is known
-_LOOP_US = 4_000  # of a round trip, what an autopilot's own loop may take to answer
-_TRIP_WINDOW_US = 5_000_000
+_LOOP_US = 4_000  # of what is left between the bounds, what an autopilot's own loop may take to answer
+_QUESTIONS = 32  # remembered
 
 Point = tuple[float, float]  # stamp, arrival - stamp [us]
 
@@ -33,19 +33,19 @@ class VehicleClock:
 
     Attributes:
         boots: how often the vehicle's clock has begun again.
+        answered: how many round trips have been taken in.
         rate: by how much our clock runs faster than the vehicle's.
     """
 
     def __init__(self, rate_limit: float = 0.2) -> None:
         self._limit = rate_limit
-        self.boots = 0
+        self.boots = self.answered = 0
         self.rate = 0.0
         self._offset_us = 0.0  # at stamp 0, along the line
         self._points: deque[Point] = deque(maxlen=_BUCKETS)
         self._floor: Point | None = None  # stamp of the newest answered TIMESYNC, and what the line is at least there
         self._newest_us: int | None = None
-        self._trips: tuple[int | None, int | None] = (None, None)  # shortest of the last window and of this one
-        self._trips_end_us = 0
+        self._asked: deque[Point] = deque(maxlen=_QUESTIONS)  # stamp of an answer, question - stamp
 
     @property
     def offset_us(self) -> float | None:
@@ -53,12 +53,6 @@ class VehicleClock:
         if self._newest_us is None:
             return None
         return self._line(self._newest_us) - self._way_us
-
-    @property
-    def round_trip_us(self) -> int | None:
-        """Shortest answered TIMESYNC lately; None when none was answered."""
-        known = [trip for trip in self._trips if trip is not None]
-        return min(known) if known else None
 
     def to_local(self, vehicle_us: int, arrived_us: int) -> int:
         """Our time of a vehicle stamp that arrived at `arrived_us`."""
@@ -80,10 +74,7 @@ class VehicleClock:
         """An answered TIMESYNC: the vehicle's clock read `vehicle_us` between `asked_us` and `arrived_us` of ours."""
         if self._newest_us is None or abs(vehicle_us - self._newest_us) > _REBOOT_US or arrived_us < asked_us:
             return  # another time base than the stamps of the state
-        if arrived_us >= self._trips_end_us:
-            self._trips, self._trips_end_us = (self._trips[1], None), arrived_us + _TRIP_WINDOW_US
-        trip = arrived_us - asked_us
-        self._trips = self._trips[0], trip if self._trips[1] is None else min(trip, self._trips[1])
+        self.answered += 1
         least_us = float(asked_us - vehicle_us - _BOUND_SLACK_US)
         if least_us > self._offset_us + self.rate * vehicle_us:
             self._fit()
@@ -94,12 +85,18 @@ class VehicleClock:
             self._points.clear()  # the others are of before the vehicle's clock stood still
             self._points.extend(fresh or [(float(vehicle_us), float(arrived_us - vehicle_us))])
             self._fit()
+        self._asked.append((float(vehicle_us), float(asked_us - vehicle_us)))
 
     @property
     def _way_us(self) -> float:
-        """Shortest one-way delay, which the line does not know: half of what is left of a round trip."""
-        trip = self.round_trip_us
-        return 0.0 if trip is None else 0.5 * max(0, trip - _LOOP_US)
+        """Shortest one-way delay, which the line does not know: half of what the bounds leave between them.
+
+        That is the shortest way here, and the shortest way there of the questions remembered.
+        """
+        if not self._asked or not self._spans():  # until the rate is known the line may be far too low
+            return 0.0
+        left_us = min(self._offset_us + self.rate * x - y for x, y in self._asked)
+        return 0.5 * max(0.0, left_us - _LOOP_US)
 
     def _line(self, vehicle_us: float) -> float:
         """Our time minus the vehicle's at a stamp, as seen through the shortest delay."""
@@ -114,6 +111,7 @@ class VehicleClock:
 
     def _begin_again(self, vehicle_us: int, late_us: int) -> None:
         self._points.clear()
+        self._asked.clear()
         self._floor = None
         self._newest_us, self.rate, self._offset_us = vehicle_us, 0.0, float(late_us)
 

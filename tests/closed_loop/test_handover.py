@@ -189,7 +189,10 @@ def test_after_a_reboot_in_flight_nothing_is_armed_again_and_the_outcome_says_wh
 
 # -- ArduCopter -------------------------------------------------------------------------------------------------------
 
-COPTER = ("sitl.autopilot_kind=arducopter", "agent.autopilot_params={GUID_OPTIONS=8}")
+COPTER = (
+    "sitl.autopilot_kind=arducopter",
+    "agent.autopilot_params={GUID_OPTIONS=8, FS_GCS_ENABLE=5, FS_GCS_TIMEOUT=2.0, ATC_ANGLE_BOOST=0}",
+)
 
 
 def test_arducopter_is_flown_in_its_own_dialect_until_a_pilot_chooses_another_mode() -> None:

@@ -88,7 +88,7 @@ def test_over_an_ideal_link_the_bridge_flies_what_the_plant_path_flies() -> None
 def test_control_over_a_slow_link_it_does_not() -> None:
     plant, late = (
         on_plant("thesis_4_mpc_fast", SHORT),
-        over_mavlink("thesis_4_mpc_fast", SHORT, "sitl.link_latency_ms=20"),
+        over_mavlink("thesis_4_mpc_fast", SHORT, "sitl.link_latency_ms=60"),
     )
     assert score.mean_distance_m(late) > 1.2 * score.mean_distance_m(plant)
 

@@ -116,6 +116,10 @@ class Dialogue:
         """Where texts are told: the link that hears a ground station."""
         return v.GCS_LINK if v.GCS_LINK in self.partner.links else v.OFFBOARD_LINK
 
+    @property
+    def streaming(self) -> bool:
+        return self._stream is not None
+
     def own_ids(self, link: str) -> tuple[int, int]:
         return (self.sysid or 1, ONBOARD_COMPONENT) if link == v.OFFBOARD_LINK else (GCS_SYSID, GCS_COMPONENT)
 

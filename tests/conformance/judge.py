@@ -197,6 +197,8 @@ class Judge:
             passed.clear()
             for arrived in self._seen(step.name, v.OFFBOARD_LINK):
                 value = getattr(arrived.message, step.field)
+                if not passed and value != step.values[0]:
+                    continue  # still where it was before
                 if not passed or passed[-1] != value:
                     passed.append(value)
             return len(passed) >= len(step.values)

@@ -24,6 +24,7 @@ FIRST_TEXT_S = 1.5  # PX4 tells a new ground station nothing before 1.4 s
 NO_AUTO_DISARM = {"COM_DISARM_PRFLT": -1.0}
 CLIMB_01, CLIMB_S, CALM_S = 0.7, 1.0, 0.8  # drag brings the climb to rest at about 4 m
 CALM_M_S = 0.3
+STREAM_GONE_S = 1.2  # COM_OF_LOSS_T, and when that is looked at
 IN_AIR, LOW_M, HIGH_M = 2, 2.5, 15.0
 ARMED_FLAG, PREARM_BIT = 128, 0x10000000
 
@@ -95,7 +96,9 @@ class Player:
 
     def _come_to_rest(self, *, stay_up: bool) -> None:
         """By commands only: on the ground, or in LOITER where the next row flies and nothing speaks against it."""
-        self.dialogue.stop()
+        if self.dialogue.streaming:
+            self.dialogue.stop()
+            self.dialogue.run(STREAM_GONE_S)
         self.dialogue.muted.clear()
         self.dialogue.set_mark()
         self._judge.judge(v.sees("HEARTBEAT", 2.0))
@@ -107,9 +110,8 @@ class Player:
         self._original.clear()
 
     def _land_and_disarm(self) -> None:
-        if self._say(v.disarm()):
-            return
-        self._say(v.go(4, 6))
+        if not self._say(v.disarm()):
+            self._say(v.go(4, 6))
         self._wait(lambda: not self._armed(), 60.0, "not landed and disarmed")
 
     def _say(self, command: v.Command) -> bool:

@@ -263,7 +263,7 @@ class At:
 
 @dataclass(frozen=True, slots=True)
 class Passes:
-    """A field takes these values one after the other."""
+    """A field takes these values one after the other, from when it first has the first of them."""
 
     name: str
     field: str

@@ -188,7 +188,7 @@ def test_a_wrong_parameter_is_found_applied_and_then_nothing_is_left(simulators:
 
 
 def test_an_arducopter_is_asked_and_set_in_its_own_encoding(copter: Simulator, run_check: Check) -> None:
-    wanted = "[agent.autopilot_params]\nGUID_OPTIONS=8\n"
+    wanted = "[agent.autopilot_params]\nGUID_OPTIONS=8\nFS_GCS_ENABLE=5\nFS_GCS_TIMEOUT=2.0\nATC_ANGLE_BOOST=0\n"
     code, found, _ = run_check((1, copter.ports[0]), apply=True, more=wanted)
     assert code == 0
     assert found["vehicles"][0]["autopilot"] == "ArduCopter"

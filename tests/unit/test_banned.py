@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[2]
 SOURCES = [path for package in ("swarmctl", "sitl") for path in (ROOT / package).rglob("*.py")]
 
 BANNED = {
-    r"plugins\.offboard|import Offboard|Offboard\(": "MAVSDK's Offboard plugin re-sends the last setpoint for ever",
+    r"plugins\.offboard|import Offboard\b|\bOffboard\(": "MAVSDK's Offboard plugin re-sends the last setpoint for ever",
     r"\.arm_force\(": "sends a forced disarm in MAVSDK 4.1.0",
     r"\.parse_buffer\(": "loses good frames after two bytes of junk",
     r"FifoChannel|zenoh\.handlers\.Callback": "a slow reader would freeze the whole Zenoh session",
