@@ -17,7 +17,7 @@ pytestmark = pytest.mark.process
 ROOT = Path(__file__).parents[2]
 SHOWN = [line.strip() for line in (ROOT / "README.md").read_text().splitlines() if line.startswith("    ")]
 BIN = Path(sys.executable).parent
-WHILE_FLYING = ("status", "hold", "resume", "obstacle", "land")
+WHILE_FLYING = ("status", "hold", "resume", "obstacle", "fault", "land")
 AFTERWARDS = ("report", "replay")
 
 
@@ -44,7 +44,7 @@ def environment() -> dict[str, str]:
 
 def test_nothing_is_shown_that_is_not_run() -> None:
     run_here = shown(r"^swarmctl (launch|simulate) ") + shown(rf"^swarmctl ({'|'.join(WHILE_FLYING + AFTERWARDS)})\b")
-    run_here += shown(r"^python -m sitl ") + shown(r"^python3 -m venv ") + shown(r"^swarmctl (reproduce|bench) ")
+    run_here += shown(r"^python -m sitl ") + shown(r"^python3 -m venv ") + shown(r"^swarmctl (reproduce|bench|check) ")
     assert sorted(run_here) == sorted(SHOWN)
 
 
@@ -126,6 +126,11 @@ def test_vehicles_that_somebody_else_runs(tmp_path: Path) -> None:
         while len(ports) < 3:
             ports += map(int, re.findall(r"remote=(\d+)", vehicles.stdout.readline()))
         urls = [f"--set=vehicles.{i}.url=udpin://127.0.0.1:{port}" for i, port in enumerate(ports)]
+        (check,) = shown(r"^swarmctl check ")
+        asked = run(check, "--apply", *urls)
+        assert asked.returncode == 4, "the simulator's vehicles stand 1 m apart, the configuration keeps 1.5 m"
+        assert "stand closer than they may fly" in asked.stdout
+        assert "COM_OBL_RC_ACT: 0 -> 4" in asked.stdout
         done = run(line, "--no-view", "--duration", "2", "--run-dir", str(tmp_path / "run"), *urls)
         assert done.returncode == 0, done.stdout + done.stderr
     finally:
