@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +25,7 @@ class Flight:
     """A finished flight."""
 
     lockstep: Lockstep
+    _ticks: dict[int, Any] = field(default_factory=dict)
 
     @property
     def config(self) -> Config:
@@ -42,12 +44,14 @@ class Flight:
         """(T, N, 3), true."""
         return np.asarray(self._truth["pos_ned_m"])
 
-    @property
+    @cached_property
     def _truth(self) -> Any:
         return self.lockstep.truth.reshape(-1, self.config.swarm.agents)
 
     def ticks(self, agent: int) -> Any:
-        return self.lockstep.logs[agent].ticks
+        if agent not in self._ticks:
+            self._ticks[agent] = self.lockstep.logs[agent].ticks
+        return self._ticks[agent]
 
     def tracked(self, agent: int) -> tuple[Any, NDArray[np.float64]]:
         """Ticks of the mission proper, and true position minus reference (K, 3) at each."""
@@ -88,8 +92,12 @@ def fly_now(
     config: str | None = None,
     order: list[int] | None = None,
     at: dict[float, Callable[[Lockstep], None]] | None = None,
+    until: Callable[[Lockstep], bool] | None = None,
 ) -> Flight:
-    """Fly a configuration; `at` maps mission times [s] to what happens then, once."""
+    """Fly a configuration to its end, or `until` nothing more is asked of it.
+
+    `at` maps mission times [s] to what happens then, once.
+    """
     path = ROOT / "configs" / config if config else None
     lockstep = Lockstep(load(path, overrides), order=order)
     due = sorted((at or {}).items())
@@ -98,7 +106,13 @@ def fly_now(
         while due and mission_t_s(running) >= due[0][0]:
             due.pop(0)[1](running)
 
-    lockstep.run(on_step)
+    if until is None:
+        lockstep.run(on_step)
+    else:
+        while not until(lockstep):
+            assert not lockstep.finished, "the flight ended before what it was flown for"
+            lockstep.step()
+            on_step(lockstep)
     assert not due, f"the flight ended before {due[0][0]} s of mission time"
     return Flight(lockstep)
 

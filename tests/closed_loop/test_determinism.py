@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-from tests.closed_loop.conftest import Fly
+import pytest
 
-SHORT = ("mission.duration_s=4", "bus.loss_01=0.2", "bus.delay_ms=30")
+from tests.closed_loop.conftest import Flight, Fly, fly_now
+
+SHORT = ("mission.duration_s=3", "bus.loss_01=0.2", "bus.delay_ms=30")
 
 
-def test_same_seed_same_bytes_in_any_order(fly: Fly) -> None:
-    first, again = fly(*SHORT, "seed=7"), fly(*SHORT, "seed=7", order=[2, 0, 1])
+@pytest.fixture(scope="module")
+def first() -> Flight:
+    return fly_now(*SHORT, "seed=7")
+
+
+def test_same_seed_same_bytes_in_any_order(first: Flight, fly: Fly) -> None:
+    again = fly(*SHORT, "seed=7", order=[2, 0, 1])
     assert first.lockstep.truth.tobytes() == again.lockstep.truth.tobytes()
 
 
-def test_control_another_seed_loses_other_messages(fly: Fly) -> None:
-    first, other = fly(*SHORT, "seed=7"), fly(*SHORT, "seed=8")
+def test_control_another_seed_loses_other_messages(first: Flight, fly: Fly) -> None:
+    other = fly(*SHORT, "seed=8")
     assert first.lockstep.truth.tobytes() != other.lockstep.truth.tobytes()

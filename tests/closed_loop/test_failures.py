@@ -73,8 +73,14 @@ def take_over(running: Lockstep) -> None:
     running.links[2][0].send(frame)
 
 
+def others_have_landed(running: Lockstep) -> bool:
+    """Vehicle 2 stays with its pilot for ever."""
+    return all(len(log.rows) and log.rows[-1]["phase"][0] == Phase.DONE for log in running.logs[:2])
+
+
 def test_the_pilot_wins(fly: Fly) -> None:
-    flight = fly(MISSION, at={8.0: take_over, 9.5: lambda running: running.command("land")})
+    landing = {8.0: take_over, 9.5: lambda running: running.command("land")}
+    flight = fly(MISSION, at=landing, until=others_have_landed)
     ticks = flight.ticks(2)
     yielded = ticks["mode"] == Mode.YIELD
     assert yielded.any()
@@ -127,9 +133,13 @@ def test_ladder_after_solver_failure(fly: Fly, lasts_s: float, reached: Mode) ->
     assert flight.problems == (["agent 0: no plan for too long"] if reached is Mode.LAND else [])
 
 
-@pytest.mark.parametrize("lasts_s", [0.3, 2.0, 8.0])
-def test_others_keep_clear_of_who_has_no_solver(fly: Fly, lasts_s: float) -> None:
-    flight = fly("mission.duration_s=14", at={6.0: lambda running: break_solver(running, 0, lasts_s)})
+def test_others_keep_clear_of_who_has_no_solver(fly: Fly) -> None:
+    """It replays, then comes to a hold and returns, and in the end lands."""
+    broken = {
+        at_s: partial(break_solver, agent=0, lasts_s=lasts_s) for at_s, lasts_s in ((6.0, 0.3), (8.0, 2.0), (14.0, 8.0))
+    }
+    flight = fly("mission.duration_s=20", at=broken)
+    assert {Mode.REPLAY, Mode.BRAKE, Mode.HOLD, Mode.LAND} <= flight.modes(0)
     assert flight.separation_m() >= 0.85
     assert all(landed_by_itself(flight.lockstep.truth, agent) for agent in range(3))
 
@@ -140,7 +150,7 @@ def test_a_plan_that_would_come_too_close_is_not_flown(fly: Fly, monkeypatch: py
     flight = fly("mission.duration_s=8")
     certified = flight.separation_m()
     monkeypatch.setattr(mpc, "certify", lambda *_: 1.0)
-    uncertified = fly("mission.duration_s=8").separation_m()
+    uncertified = fly("mission.duration_s=5").separation_m()
     assert uncertified < 0.3 < 0.6 < certified
 
 

@@ -119,7 +119,7 @@ def test_three_vehicles_keep_apart_and_close_to_the_reference() -> None:
 
 
 def test_three_vehicles_without_lag_and_dead_time_in_the_prediction_do_not() -> None:
-    _, _, true_m = together(fly(*SWARM, *PLAIN, "vehicle_model.delay_s=0"))
+    _, _, true_m = together(fly(*SWARM, *PLAIN, "vehicle_model.delay_s=0", "mission.duration_s=11"))
     assert true_m < 0.6
 
 

@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -235,24 +236,31 @@ def test_an_armed_vehicle_is_reported_and_left_alone(simulators: Simulators, run
         assert pilot.arm(False) == 0
 
 
-def test_without_a_configuration_the_built_in_simulator_is_checked_and_ended(tmp_path: Path) -> None:
+@pytest.fixture
+def short_path() -> Iterator[Path]:
+    """A folder in which a socket's path is short enough, whatever the test is called."""
+    with tempfile.TemporaryDirectory(prefix="sw") as folder:
+        yield Path(folder)
+
+
+def test_without_a_configuration_the_built_in_simulator_is_checked_and_ended(short_path: Path) -> None:
     command = [sys.executable, "-m", "swarmctl", "check", "--agents", "2", f"--seconds={QUICK_S}"]
-    command += ["--json", str(tmp_path / "check.json")]
-    env = {**ENV, "TMPDIR": str(tmp_path)}
-    done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=60)
+    command += ["--json", str(short_path / "check.json")]
+    env = {**ENV, "TMPDIR": str(short_path)}
+    done = subprocess.run(command, cwd=short_path, env=env, capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stdout + done.stderr
     assert "2 of 2 vehicles reached, nothing to fix" in done.stdout
-    assert [path.name for path in tmp_path.iterdir()] == ["check.json"]
-    assert left_of(tmp_path) == []
+    assert [path.name for path in short_path.iterdir()] == ["check.json"]
+    assert left_of(short_path) == []
 
-    begun = subprocess.Popen([*command, "--seconds=60"], cwd=tmp_path, env=env, stdout=subprocess.DEVNULL)
+    begun = subprocess.Popen([*command, "--seconds=60"], cwd=short_path, env=env, stdout=subprocess.DEVNULL)
     deadline_s = time.monotonic() + 20.0
-    while not left_of(tmp_path, "sitl") and time.monotonic() < deadline_s:
+    while not left_of(short_path, "sitl") and time.monotonic() < deadline_s:
         time.sleep(0.05)
     begun.send_signal(signal.SIGTERM)
     assert begun.wait(timeout=10) == 130
-    assert [path.name for path in tmp_path.iterdir()] == ["check.json"]
-    assert left_of(tmp_path) == []
+    assert [path.name for path in short_path.iterdir()] == ["check.json"]
+    assert left_of(short_path) == []
 
 
 def left_of(folder: Path, name: str = "") -> list[str]:

@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import re
+import shlex
 import shutil
 import signal
 import socket
@@ -17,18 +18,20 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import psutil
 import pytest
 
-from swarmctl.core.records import TRUTH_DTYPE
-from swarmctl.core.types import Landed, Phase
+from swarmctl.core.types import Phase
+from tests.process.test_readme import ROOT, landed, shown
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
 
 READY_S = 90.0
 END_S = 150.0
-SHORT = ("--agents", "2", "--duration", "6", "--set", "telemetry.enabled=false")
+TWO = ("--agents", "2", "--set", "telemetry.enabled=false")
+STAY = ("--set", "mission.kind=swap", "--set", "mission.swap.travel_s=600", "--set", "start.spacing_m=2")
+NEAR = (*STAY, "--set", "sitl.ground_z_m=1")  # nowhere to go, nobody in the way, and soon down
+AIR = (*STAY, "--set", "sitl.start=air")  # neither taken off nor landed, where that is not asked
 
 
 class Launched:
@@ -42,7 +45,7 @@ class Launched:
         self.out = run_dir.with_suffix(".out")
         command = [sys.executable, "-m", "swarmctl", "launch", *arguments, "--run-dir", str(run_dir)]
         with self.out.open("w") as out:
-            self.process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, env=self.env)
+            self.process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, env=self.env, cwd=ROOT)
 
     def text(self) -> str:
         return self.out.read_text()
@@ -100,12 +103,7 @@ class Launched:
 
     def landed(self) -> dict[int, bool]:
         """Whether each vehicle ended on the ground, in truth."""
-        data = (self.run_dir / "truth.bin").read_bytes()
-        truth = np.frombuffer(data, TRUTH_DTYPE, len(data) // TRUTH_DTYPE.itemsize)
-        return {
-            int(v): bool(truth["landed"][truth["vehicle"] == v][-1] == Landed.ON_GROUND)
-            for v in np.unique(truth["vehicle"])
-        }
+        return landed(self.run_dir)
 
 
 @pytest.fixture
@@ -128,7 +126,8 @@ def start(tmp_path: Path) -> Iterator[Callable[..., Launched]]:
 
 
 def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Callable[..., Launched]) -> None:
-    launched = start("--agents", "3", "--duration", "6", "--no-view")
+    (line,) = shown(r"^swarmctl launch configs/thesis")
+    launched = start(*shlex.split(line)[2:], "--duration", "4", "--no-view")
     launched.until_phase("TRACK", 3)
     assert launched.verb("status").returncode == 0
     assert launched.end() == 0, launched.text()
@@ -143,7 +142,7 @@ def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Callable[..., La
     assert summary["violations"] == []
     assert summary["agents"] == 3
     assert summary["separation"]["min_m"] >= summary["separation"]["required_m"]
-    assert summary["tracking"]["index_m"] < 9.0, "three agents that stayed at the centre would have 15"
+    assert summary["tracking"]["index_m"] < 6.0, "three agents that stayed at the start would have 10"
     assert launched.landed() == {0: True, 1: True, 2: True}
     for name in ("config.toml", "events.jsonl", "telemetry.rrd", "report.html", "truth.bin"):
         assert (launched.run_dir / name).stat().st_size > 0, name
@@ -157,7 +156,7 @@ def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Callable[..., La
 
 
 def test_a_killed_agent_fails_the_launch_and_the_others_finish(start: Callable[..., Launched]) -> None:
-    launched = start("--agents", "3", "--duration", "8", "--set", "telemetry.enabled=false")
+    launched = start("--agents", "3", "--duration", "4", *NEAR, "--set", "telemetry.enabled=false")
     launched.until_phase("TRACK", 3)
     os.kill(launched.pid_of("agent", "--id", "1"), signal.SIGKILL)
     assert launched.end() == 4, launched.text()
@@ -171,7 +170,7 @@ def test_a_killed_agent_fails_the_launch_and_the_others_finish(start: Callable[.
 
 
 def test_ctrl_c_lands_and_sums_up(start: Callable[..., Launched]) -> None:
-    launched = start("--agents", "2", "--duration", "60", "--set", "telemetry.enabled=false")
+    launched = start(*TWO, *NEAR, "--duration", "60")
     launched.until_phase("TRACK", 2)
     launched.process.send_signal(signal.SIGINT)
     assert launched.end() == 130, launched.text()
@@ -181,7 +180,7 @@ def test_ctrl_c_lands_and_sums_up(start: Callable[..., Launched]) -> None:
 
 
 def test_a_second_ctrl_c_ends_everything_at_once(start: Callable[..., Launched]) -> None:
-    launched = start("--agents", "2", "--duration", "60", "--no-view")
+    launched = start("--agents", "2", *AIR, "--duration", "60", "--no-view")
     launched.until_phase("TRACK", 2)
     launched.process.send_signal(signal.SIGINT)
     time.sleep(0.5)
@@ -192,7 +191,7 @@ def test_a_second_ctrl_c_ends_everything_at_once(start: Callable[..., Launched])
 
 @pytest.mark.parametrize("when_s", [0.0, 0.3, 1.0, 2.0])
 def test_ctrl_c_during_start_leaves_nothing(start: Callable[..., Launched], when_s: float) -> None:
-    launched = start(*SHORT)
+    launched = start(*TWO, "--duration", "6")
     while not (launched.run_dir / "config.toml").exists():
         assert launched.process.poll() is None, launched.text()
         time.sleep(0.01)
@@ -202,7 +201,7 @@ def test_ctrl_c_during_start_leaves_nothing(start: Callable[..., Launched], when
 
 
 def test_a_killed_launcher_leaves_nothing(start: Callable[..., Launched]) -> None:
-    launched = start("--agents", "2", "--duration", "60", "--no-view")
+    launched = start("--agents", "2", *AIR, "--duration", "60", "--no-view")
     launched.until_phase("TRACK", 2)
     launched.process.kill()
     launched.process.wait(20)
@@ -214,9 +213,11 @@ def test_a_killed_launcher_leaves_nothing(start: Callable[..., Launched]) -> Non
     assert launched.leftovers() == []
 
 
-@pytest.mark.parametrize("name", ["swarmctl.links.bus", "sitl"])
-def test_without_router_or_simulator_the_launch_ends_as_failed(start: Callable[..., Launched], name: str) -> None:
-    launched = start("--agents", "2", "--duration", "60", "--set", "telemetry.enabled=false")
+@pytest.mark.parametrize(("name", "where"), [("swarmctl.links.bus", NEAR), ("sitl", AIR)], ids=["bus", "sitl"])
+def test_without_router_or_simulator_the_launch_ends_as_failed(
+    start: Callable[..., Launched], name: str, where: tuple[str, ...]
+) -> None:
+    launched = start(*TWO, *where, "--duration", "60")
     launched.until_phase("TRACK", 2)
     os.kill(launched.pid_of(name), signal.SIGKILL)
     assert launched.end() == 4, launched.text()
@@ -226,24 +227,30 @@ def test_without_router_or_simulator_the_launch_ends_as_failed(start: Callable[.
 
 
 def test_the_flight_does_not_need_its_viewer(start: Callable[..., Launched]) -> None:
-    launched = start("--agents", "2", "--duration", "6", "--no-view")
+    launched = start("--agents", "2", *AIR, "--duration", "3", "--no-view")
     launched.until_phase("TRACK", 2)
     os.kill(launched.pid_of("swarmctl.telemetry.viewer"), signal.SIGKILL)
     assert launched.end() == 0, launched.text()
     assert launched.text().count("the flight goes on") == 1
 
 
-def test_two_launches_at_once(start: Callable[..., Launched]) -> None:
-    first, second = start(*SHORT), start(*SHORT)
-    assert first.end() == 0, first.text()
-    assert second.end() == 0, second.text()
+def test_two_launches_at_once_beside_another_simulator(start: Callable[..., Launched]) -> None:
+    """Every PX4-like simulator sends to 14540 and up until somebody answers: neither takes its vehicles for its own."""
+    others = subprocess.Popen([sys.executable, "-m", "sitl", "--vehicles", "3"], stdout=subprocess.DEVNULL)
+    try:
+        first, second = (start(*TWO, *AIR, "--duration", "2") for _ in range(2))
+        assert first.end() == 0, first.text()
+        assert second.end() == 0, second.text()
+    finally:
+        others.terminate()
+        others.wait(10)
     (one,), (other,) = first.events("started"), second.events("started")
     assert not set(one["ports"]) & set(other["ports"])
     assert one["run"] != other["run"]
 
 
 def test_operator_verbs(start: Callable[..., Launched]) -> None:
-    launched = start("--agents", "2", "--duration", "120", "--set", "telemetry.enabled=false")
+    launched = start(*TWO, *AIR, "--duration", "120")
     launched.until_phase("TRACK", 2)
     statuses = json.loads(launched.verb("status", "--json").stdout)
     assert [status["agent"] for status in statuses] == [0, 1]
@@ -263,18 +270,6 @@ def test_operator_verbs(start: Callable[..., Launched]) -> None:
     assert launched.verb("resume").returncode == 0
     assert launched.verb("land").returncode == 0
     assert launched.end() == 130, launched.text()
-    assert launched.landed() == {0: True, 1: True}
-
-
-def test_other_simulators_on_px4s_ports_are_not_taken_for_ours(start: Callable[..., Launched]) -> None:
-    """Every PX4-like simulator sends to 14540 and up until somebody answers."""
-    others = subprocess.Popen([sys.executable, "-m", "sitl", "--vehicles", "3"], stdout=subprocess.DEVNULL)
-    try:
-        launched = start(*SHORT)
-        assert launched.end() == 0, launched.text()
-    finally:
-        others.terminate()
-        others.wait(10)
 
 
 @pytest.mark.parametrize(

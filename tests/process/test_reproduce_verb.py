@@ -1,4 +1,4 @@
-"""`reproduce` and `bench` as an operator runs them: exit codes, and what is left in the folder."""
+"""`reproduce` as an operator runs it: exit codes, and what is left in the folder."""
 
 from __future__ import annotations
 
@@ -58,19 +58,3 @@ def test_an_unknown_flight_is_2_with_those_that_are_known(tmp_path: Path) -> Non
     assert all(name in done.stderr for name in (*FLIGHTS, "timing"))
     assert "Traceback" not in done.stderr
     assert list(tmp_path.iterdir()) == []
-
-
-def test_bench_leaves_a_list_of_rows(tmp_path: Path) -> None:
-    out = tmp_path / "new"
-    done = run(tmp_path, "bench", "--neighbours", "0,2", "--ticks", "30", "--no-slsqp", "--out", str(out))
-    assert done.returncode == 0, done.stdout + done.stderr
-    rows = json.loads((out / "bench.json").read_text(encoding="utf-8"))
-    assert isinstance(rows, list)
-    for row in rows:
-        assert row.keys() == {"name", "solver", "neighbours", "p50_ms", "p99_ms"}
-        assert 0.0 <= row["p50_ms"] <= row["p99_ms"]
-    names = ("sense", "setup", "solve", "certify", "send", "tick")
-    found = {(row["name"], row["solver"], row["neighbours"]) for row in rows}
-    assert found >= {(name, solver, count) for name in names for solver in ("osqp", "daqp") for count in (0, 2)}
-    assert len(found) == len(rows)
-    assert not any(row["solver"] == "slsqp" for row in rows)

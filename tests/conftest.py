@@ -1,0 +1,24 @@
+"""The order of the tests: the longest first, so that no worker idles at the end."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+TESTS = Path(__file__).parent
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Two workers begin with the first item and with the middle one.
+
+    One flies in real time, which leaves its processor half idle, while the other computes; short tests follow both.
+    """
+    groups: dict[str, list[pytest.Item]] = {"process": [], "closed_loop": [], "": []}
+    for item in items:
+        folder = item.path.relative_to(TESTS).parts[0]
+        groups[folder if folder in groups else ""].append(item)
+    flown, computed, short = groups.values()
+    before = max(0, (len(items) + 1) // 2 - len(flown))
+    items[:] = flown + short[:before] + computed + short[before:]
