@@ -23,9 +23,9 @@ def free_port() -> int:
 
 
 @contextmanager
-def simulator(preset: str = "x500", speed: float = SPEED) -> Iterator[int]:
-    """Yields the port it sends to, and checks its clean end."""
-    port = free_port()
+def simulator(preset: str = "x500", speed: float = SPEED, port: int | None = None) -> Iterator[int]:
+    """Yields the port it sends to, free if none is given, and checks its clean end."""
+    port = free_port() if port is None else port
     process = subprocess.Popen(
         [
             *(sys.executable, "-m", "sitl", "--vehicles", "1", "--preset", preset, "--speed", str(speed)),

@@ -199,7 +199,7 @@ class LibMav:
         empty = {n: "" if n in texts else [0] * length if length else 0 for n, length in lengths.items()}
         return message.set_from_dict(empty | fields)
 
-    def connect(self, timeout_s: float = 3.0) -> None:
+    def connect(self, timeout_s: float = 10.0) -> None:
         """Wait for a heartbeat."""
         self.connection = self._runtime.await_connection(round(timeout_s * 1e3))
         self.connection.add_message_callback(self._keep)
@@ -223,6 +223,8 @@ class LibMav:
         return int(ack["result"])
 
     def close(self) -> None:
+        """When nobody sends any more: it waits, with the interpreter locked, for a thread that delivers messages."""
+        time.sleep(0.2)
         self._runtime.stop()
         self._interface.close()
 
@@ -303,7 +305,8 @@ def test_libmav_reads_every_message_as_we_do() -> None:
 
 @pytest.mark.process
 def test_libmav_flies() -> None:
-    with simulator() as port, lib_mav(port) as client:
+    port = free_port()
+    with lib_mav(port) as client, simulator(port=port):  # who sends ends first
         client.connect()
         wait_for(lambda: any(number == mav.MAVLINK_MSG_ID_ODOMETRY for number, _ in client.decoded), 3.0, "a position")
         asked = client.build("PARAM_REQUEST_READ", target_system=1, target_component=1, param_id="MAV_SYS_ID")
