@@ -243,7 +243,7 @@ def _run(options: argparse.Namespace) -> int:
         print(gcs_place)
     sys.stdout.flush()
     complaint = ""
-    control = ControlSocket(options.control) if options.control else None
+    control = ControlSocket(options.control, options.die_with_parent) if options.control else None
     try:
         gc.freeze()  # what has been built stays: nothing for the collector to walk through in flight
         gate = realtime.Gate(world) if options.lockstep else None

@@ -17,6 +17,7 @@ from pydantic import ValidationError
 from sitl.world import SitlWorld
 from swarmctl.core.simulated import FaultParams
 from swarmctl.errors import ConfigError
+from swarmctl.lifeline import remove_socket
 
 _LARGEST = 8192
 
@@ -24,12 +25,16 @@ _LARGEST = 8192
 class ControlSocket:
     """Bound where the launcher said; gone with `close`.
 
+    Args:
+        of_launch: the folder is a launch's own; whoever ends last, the router or this, takes it away.
+
     Raises:
         ConfigError: the path is taken or can't be made.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, of_launch: bool = False) -> None:
         self._path = path
+        self._of_launch = of_launch
         self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
         try:
             before = os.umask(0o177)
@@ -58,7 +63,10 @@ class ControlSocket:
 
     def close(self) -> None:
         self._socket.close()
-        self._path.unlink(missing_ok=True)
+        if self._of_launch:
+            remove_socket(self._path)
+        else:
+            self._path.unlink(missing_ok=True)
 
 
 def handle(request: bytes, world: SitlWorld) -> dict[str, Any]:

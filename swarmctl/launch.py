@@ -19,7 +19,8 @@ from swarmctl.attach import RunningLaunch, announce, process_start_s, withdraw
 from swarmctl.config import Config, dump
 from swarmctl.errors import StartError
 from swarmctl.flight import Base, EventLog, Flight
-from swarmctl.links.bus import SCHEME, ZenohBus, remove_socket, socket_file
+from swarmctl.lifeline import remove_socket
+from swarmctl.links.bus import SCHEME, ZenohBus, socket_file
 from swarmctl.links.peers import agent_name
 from swarmctl.links.topics import OBSTACLES, OPERATOR, STATUS
 from swarmctl.preflight import LOOPBACK, Ground, inspect

@@ -1,12 +1,14 @@
-"""How a child process ends: with the launcher that started it (Linux only), or when it is asked to."""
+"""How a child process ends: with the launcher that started it (Linux only), or when it is asked to, leaving nothing."""
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import os
 import select
 import signal
 import sys
+from pathlib import Path
 from types import FrameType
 
 _PR_SET_PDEATHSIG = 1
@@ -24,6 +26,14 @@ def die_with_parent(signum: int = signal.SIGTERM) -> None:
     ctypes.CDLL(None, use_errno=True).prctl(_PR_SET_PDEATHSIG, signum, 0, 0, 0)
     if os.getppid() != parent:
         os.kill(os.getpid(), signum)
+
+
+def remove_socket(path: Path) -> None:
+    """Delete a Unix socket, its lock, and their directory if that leaves it empty: who ends last takes it away."""
+    for name in (path, path.with_name(path.name + ".lock")):
+        name.unlink(missing_ok=True)
+    with contextlib.suppress(OSError):
+        path.parent.rmdir()
 
 
 class StopRequest:

@@ -22,7 +22,7 @@ from typing import Any
 import zenoh
 
 from swarmctl.errors import StartError, SwarmError
-from swarmctl.lifeline import die_with_parent
+from swarmctl.lifeline import die_with_parent, remove_socket
 from swarmctl.links.topics import TOPICS, Topic
 
 SCHEME = "unixsock-stream/"
@@ -150,14 +150,6 @@ def socket_file(endpoint: str) -> Path:
             f"bus endpoint {endpoint!r}: path longer than {_MAX_SOCKET_PATH} bytes; set TMPDIR to a shorter directory"
         )
     return Path(path)
-
-
-def remove_socket(path: Path) -> None:
-    """Delete a router's socket, its lock, and their directory if that leaves it empty."""
-    for name in (path, path.with_name(path.name + ".lock")):
-        name.unlink(missing_ok=True)
-    with contextlib.suppress(OSError):
-        path.parent.rmdir()
 
 
 def _private_socket(endpoint: str) -> Path:

@@ -20,6 +20,7 @@ from swarmctl.attach import RunningLaunch
 from swarmctl.core.simulated import FAULTS, FaultParams
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.fault import inject, parse_fault
+from swarmctl.lifeline import remove_socket
 from swarmctl.links.mavlink import message_id
 from swarmctl.links.transport import Datagram
 from tests.unit.flown_world import FlownWorld
@@ -332,3 +333,16 @@ def test_a_taken_control_path_is_refused(tmp_path: Path) -> None:
         sock.bind(str(path))
         with pytest.raises(ConfigError, match="control = "):
             ControlSocket(path)
+
+
+@pytest.mark.parametrize("of_launch", [True, False])
+def test_the_last_to_end_takes_a_launch_folder_away_and_no_other(tmp_path: Path, of_launch: bool) -> None:
+    """A router that ends before the simulator finds the folder in use; a folder of the user's stays."""
+    folder = tmp_path / "swarm-1"
+    folder.mkdir()
+    (folder / "bus.sock").touch()
+    control = ControlSocket(folder / "sitl.sock", of_launch)
+    remove_socket(folder / "bus.sock")
+    assert folder.exists()
+    control.close()
+    assert folder.exists() is not of_launch
