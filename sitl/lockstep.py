@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import struct
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -82,9 +82,16 @@ class Lockstep:
         config: the run.
         directory: where agents' files go; None keeps everything in memory.
         order: in which agents are ticked within a step; must not matter.
+        own: configurations of agents that fly by another one than the run's.
     """
 
-    def __init__(self, config: Config, directory: Path | None = None, order: Sequence[int] | None = None) -> None:
+    def __init__(
+        self,
+        config: Config,
+        directory: Path | None = None,
+        order: Sequence[int] | None = None,
+        own: Mapping[int, Config] | None = None,
+    ) -> None:
         agents = config.swarm.agents
         self.config = config
         self.clock = SimClock()
@@ -100,6 +107,7 @@ class Lockstep:
         self.fault_events: list[dict[str, Any]] = []
         self.world.faults.on_event = self._on_fault
         self._operator = self.hub.attach(topics.OPERATOR)
+        self._own = dict(own or {})
         self.agents: list[Agent | None] = [self._agent(i, self.links[i][0]) for i in range(agents)]
         self.frozen: set[int] = set()  # agents whose process is stopped: alive on the bus, but not ticking
         self._order = list(order) if order is not None else list(range(agents))
@@ -119,8 +127,9 @@ class Lockstep:
             return CodecCommands(autopilot.send_frame, codec, sysid, lambda: autopilot.dialect)
 
         boot_id = self.config.seed * 1000 + index
+        config = self._own.get(index, self.config)
         return make_agent(
-            self.config, index, boot_id, transport, bus, self.clock, log, log.frame, slow_path, time.perf_counter_ns
+            config, index, boot_id, transport, bus, self.clock, log, log.frame, slow_path, time.perf_counter_ns
         )
 
     def step(self) -> None:
@@ -147,6 +156,11 @@ class Lockstep:
         """What an operator's verb does."""
         message = topics.CommandMessage(verb, agent, self.clock.utc_us())
         self._operator.publish(topics.COMMAND, topics.encode_message(message))
+
+    def set_obstacles(self, obstacles: Sequence[topics.ObstacleMessage]) -> None:
+        """What an operator's verb does: the whole list, which replaces the one before."""
+        self._obstacles = topics.ObstaclesMessage(self._obstacles.version + 1, tuple(obstacles))
+        self._operator.publish(topics.OBSTACLES, topics.encode_message(self._obstacles))
 
     @property
     def finished(self) -> bool:

@@ -14,7 +14,10 @@ from typing import Any
 import numpy as np
 from pydantic import Field
 
+from swarmctl.control.barrier import BarrierParams
+from swarmctl.control.commit import CommitParams
 from swarmctl.control.controller import ControllerParams, make_controller
+from swarmctl.control.detour import Deadlock, Detour, DetourParams, Sampled
 from swarmctl.control.disturbance import DisturbanceObserver, DisturbanceParams
 from swarmctl.control.facts import Facts
 from swarmctl.control.failsafe import FailsafeParams, Judgement, judge
@@ -23,11 +26,12 @@ from swarmctl.control.mission import MissionParams, MissionReference
 from swarmctl.control.model import Predictor, VehicleModelParams
 from swarmctl.control.problem import Problem, Start
 from swarmctl.control.replay import Replay
-from swarmctl.control.separation import SeparationParams, radius_problem
+from swarmctl.control.separation import KeepOut, SeparationParams, radius_problem
 from swarmctl.control.sequence import Sequence as MissionSequence
 from swarmctl.control.sequence import SequenceParams
 from swarmctl.control.setpoint import setpoint_of
 from swarmctl.control.state_filter import StateFilter, StateFilterParams
+from swarmctl.coordination import Coordination
 from swarmctl.core.clock import Clock
 from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned
 from swarmctl.core.params import Params
@@ -47,6 +51,7 @@ from swarmctl.core.types import (
     TickRecord,
     VehicleState,
 )
+from swarmctl.last_layer import LastLayer
 from swarmctl.links import topics
 from swarmctl.links.autopilot import Autopilot
 from swarmctl.links.commands import CommandPort
@@ -56,6 +61,8 @@ from swarmctl.reporter import Act, Reporter, Thought, TickSink, Took
 from swarmctl.surroundings import Surroundings
 
 _NOTHING_US = -1
+_FLIES = (Mode.FOLLOW, Mode.REPLAY, Mode.BRAKE, Mode.HOLD)
+_DEVIATES = (Mode.BRAKE, Mode.HOLD, Mode.LAND, Mode.YIELD, Mode.BLIND)  # from what it has promised
 _AUTOPILOT_HOVERS = (FlightMode.HOLD, FlightMode.EXTERNAL)  # in the latter while it takes off by itself
 
 
@@ -68,6 +75,9 @@ class AgentParams(Params):
     failsafe: FailsafeParams = FailsafeParams()
     disturbance: DisturbanceParams = DisturbanceParams()
     state_filter: StateFilterParams = StateFilterParams()
+    barrier: BarrierParams = BarrierParams()
+    commit: CommitParams = CommitParams()
+    detour: DetourParams = DetourParams()
     autopilot_params: dict[str, int | float] = Field({"COM_OBL_RC_ACT": 4})  # PX4: land when setpoints stop
 
 
@@ -114,7 +124,21 @@ class Agent:
         self._upkeep = Upkeep(
             autopilot, commands, setup.params.autopilot_params, setup.sysid, setup.params.sequence.state_rate_hz
         )
-        self._surroundings = Surroundings(setup.agent, peers, setup.separation, setup.obstacle_slots, bus)
+        self._surroundings = Surroundings(setup.agent, peers, setup.separation, bus)
+        self._coordination: Coordination | None = None
+        if setup.separation.mode == "guaranteed":
+            self._coordination = Coordination(
+                setup.agent,
+                setup.boot_id,
+                peers,
+                setup.params.commit,
+                setup.controller.mpc,
+                setup.separation,
+                slots,
+                self._surroundings,
+                bus,
+                stopwatch_ns,
+            )
         self._controller = make_controller(
             setup.controller, setup.vehicle_model, setup.separation, setup.agent, slots, stopwatch_ns
         )
@@ -130,7 +154,18 @@ class Agent:
             )
         self._observer = _estimator(setup.params, setup.vehicle_model)
         self._predictor = Predictor(setup.vehicle_model)
-        reference = MissionReference(setup.mission, setup.starts_ned_m, setup.agent)
+        self._last_layer = LastLayer(
+            setup.params.barrier,
+            setup.vehicle_model,
+            1.0 / setup.params.rate_hz,
+            self._surroundings,
+            setup.separation.downwash,
+            self._note,
+        )
+        apart_m = setup.separation.radius_m + setup.separation.tracking_m
+        reference = MissionReference(setup.mission, setup.starts_ned_m, setup.agent, apart_m)
+        self._detour = Detour(setup.params.detour, setup.agent, setup.separation.radius_m)
+        self._deadlock: Deadlock | None = None  # the one that was last noted
         self._sequence = MissionSequence(
             setup.params.sequence,
             setup.agent,
@@ -188,7 +223,7 @@ class Agent:
         thought_ns = self._stopwatch_ns()
         self._judge(now_us, state, thought)
         flown = self._flown(state, thought)
-        setpoint = self._act(now_us, flown)
+        setpoint = self._act(now_us, flown, thought.start)
         sent_ns = self._stopwatch_ns()
         times = NO_TIMES if thought.plan is None else thought.plan.times
         self.took = Took(
@@ -205,7 +240,7 @@ class Agent:
             now_us,
             state,
             thought,
-            Act(self._judgement.mode, flown, setpoint),
+            Act(self._judgement.mode, flown, setpoint, self._last_layer.acts),
             self._sequence,
             self._observer.estimate,
             late_ticks,
@@ -217,6 +252,8 @@ class Agent:
     def _listen(self, now_us: int) -> None:
         for verb in self._surroundings.listen(self._clock.utc_us()):
             self.ask(verb, now_us)
+        if self._coordination is not None:
+            self._coordination.listen()
 
     def _sense(self, now_us: int) -> VehicleState | None:
         state = self._autopilot.poll(now_us)
@@ -252,15 +289,34 @@ class Agent:
             self._virtual = np.array([0.0, 0.0, GRAVITY_M_S2])
             upright = float(body_z_ned(state.q_nb)[2])
             start = Start(act_us, state.pos_ned_m, state.vel_ned_m_s, upright, self._virtual)
-        reference, now_ref = self._reference(now_us)
         steps, dt_us = self._controller.steps, self._controller.dt_us
         keep_outs = self._surroundings.keep_outs(state.pos_ned_m, self._utc(act_us), dt_us, steps, self._sequence.phase)
-        if not Phase.GOTO_START <= self._sequence.phase <= Phase.GOTO_LAND:
+        flies = Phase.GOTO_START <= self._sequence.phase <= Phase.GOTO_LAND
+        self._look_for_deadlock(now_us, state, keep_outs, flies)
+        reference, now_ref = self._reference(now_us)
+        promised = self._coordinated(now_us, state, flies)
+        if not flies:
             return Thought(start, None, now_ref, keep_outs)
+        if promised is not None:
+            reference = promised
         guess = self._replay.guess_ned_m(act_us)
         controller = self._controller if self._sequence.phase is Phase.TRACK else self._transit
-        plan = controller.plan(Problem(start, reference, estimate.disturbance_ned_m_s2, tuple(keep_outs), guess))
+        kept = tuple(keep_outs) if promised is None else ()  # what it has promised keeps clear already
+        plan = controller.plan(Problem(start, reference, estimate.disturbance_ned_m_s2, kept, guess))
         return Thought(start, plan, now_ref, keep_outs)
+
+    def _coordinated(self, now_us: int, state: VehicleState, flies: bool) -> Reference | None:
+        """What has been promised, over the horizon from when the setpoint acts; None when nothing is."""
+        if self._coordination is None:
+            return None
+        utc_us = self._clock.utc_us()
+        if not (flies and self._sequence.had_control) or self._judgement.mode in _DEVIATES:
+            self._coordination.idle(utc_us, state)
+            return None
+        self._coordination.step(utc_us, state, self._sequence.phase, self._wanted(now_us))
+        act_us = utc_us + self._predictor.delay_us
+        pos, vel = self._coordination.follow(act_us + np.arange(self._controller.longest + 1) * self._controller.dt_us)
+        return Reference(pos, vel, self._setup.mission.yaw_rad)
 
     def _reference(self, now_us: int) -> tuple[Reference, Reference]:
         """Over the horizon from when the setpoint acts, and now."""
@@ -268,7 +324,29 @@ class Agent:
         ahead_s = self._predictor.delay_us * 1e-6 + dt_s * np.arange(self._controller.longest + 1)
         pos, vel = self._sequence.reference(self._clock.utc_us(), now_us, np.concatenate([[0.0], ahead_s]))
         yaw_rad = self._setup.mission.yaw_rad
-        return Reference(pos[1:], vel[1:], yaw_rad), Reference(pos[:1], vel[:1], yaw_rad)
+        now_ref = Reference(pos[:1], vel[:1], yaw_rad)
+        if self._detour.active:
+            return Reference(*self._detour.sample(ahead_s), yaw_rad), now_ref
+        return Reference(pos[1:], vel[1:], yaw_rad), now_ref
+
+    def _wanted(self, now_us: int) -> Sampled:
+        """Where to be at offsets from now: on the reference, or on a way round what blocks it."""
+        if self._detour.active:
+            return self._detour.sample
+        return partial(self._sequence.reference, self._clock.utc_us(), now_us)
+
+    def _look_for_deadlock(self, now_us: int, state: VehicleState, keep_outs: list[KeepOut], flies: bool) -> None:
+        if flies and self._sequence.had_control:
+            reference = partial(self._sequence.reference, self._clock.utc_us(), now_us)
+            self._detour.step(now_us, state.pos_ned_m, reference, keep_outs, self._surroundings.landmarks)
+        else:
+            self._detour.reset()
+        told, self._deadlock = self._deadlock, self._detour.deadlock
+        if told is None and self._deadlock is not None:
+            self._problem = f"deadlocked by {self._deadlock.names}"
+            self._note("deadlock", begins=True, by=self._deadlock.by)
+        elif told is not None and self._deadlock is None:
+            self._note("deadlock", begins=False, lasted_s=(now_us - told.since_us) * 1e-6)
 
     # -- judge, act ---------------------------------------------------------------------------------------------------
 
@@ -324,14 +402,16 @@ class Agent:
             return self._rest(thought.start)
         return None
 
-    def _act(self, now_us: int, flown: Plan | None) -> AttitudeSetpoint | None:
-        if flown is None:
+    def _act(self, now_us: int, flown: Plan | None, start: Start | None) -> AttitudeSetpoint | None:
+        if flown is None or start is None:
+            self._last_layer.rest(now_us)
             return None
         act_us = now_us + self._predictor.delay_us
         step = min(max(0, (act_us - flown.t0_us) // flown.dt_us), len(flown.virtual) - 1)
-        virtual = flown.virtual[step]
-        hover_01 = self._observer.estimate.hover_thrust_01
-        setpoint = setpoint_of(virtual, self._setup.mission.yaw_rad, hover_01, now_us, self._setup.vehicle_model)
+        estimate, flies = self._observer.estimate, self._judgement.mode in _FLIES
+        virtual = self._last_layer.keep_apart(now_us, self._utc(act_us), flown.virtual[step], start, estimate, flies)
+        yaw_rad, hover_01 = self._setup.mission.yaw_rad, estimate.hover_thrust_01
+        setpoint = setpoint_of(virtual, yaw_rad, hover_01, now_us, self._setup.vehicle_model)
         refused = self._autopilot.send(setpoint, self._clock.now_us())
         if refused:
             self._problem = f"setpoint refused: {refused}"
@@ -352,7 +432,7 @@ class Agent:
             self._autopilot.armable,
             self._commands.busy,
             self._judgement.mode,
-            self._surroundings.somebody_is_mute(utc_us),
+            self._coordination is None and self._surroundings.somebody_is_mute(utc_us),
             self._surroundings.peers(),
             others_ned_m=self._surroundings.others_ned_m(utc_us),
             arm_in=None if dialect is None else dialect.arm_in,
@@ -385,6 +465,8 @@ class Agent:
         if state is not None:
             path = self._path(flown) if flown is not None else self._coasting(state)
             self._bus.publish(topics.PATH, topics.encode_path(path))
+        if self._coordination is not None:
+            self._coordination.say()
 
     def _path(self, plan: Plan) -> PredictedPath:
         return PredictedPath(

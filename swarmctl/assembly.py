@@ -58,6 +58,6 @@ def make_agent(
         config.controller,
         config.separation,
         config.model_of(agent),
-        max(1, len(config.obstacles)),
+        min(max(1, len(config.obstacles)), config.separation.max_obstacles),
     )
     return Agent(setup, autopilot, commands, bus, clock, sink, stopwatch_ns)

@@ -171,7 +171,9 @@ def change_obstacles(
         return _obstacles(bus, new.version, encode_message(new))
 
 
-def obstacle(center: str, radius_m: float, keep_out_m: float, visibility_m: float, velocity: str) -> ObstacleMessage:
+def obstacle(
+    center: str, radius_m: float, keep_out_m: float, visibility_m: float, velocity: str, column: bool = False
+) -> ObstacleMessage:
     """An obstacle from what somebody typed; vectors as `north,east,down`, shared frame.
 
     Raises:
@@ -185,7 +187,7 @@ def obstacle(center: str, radius_m: float, keep_out_m: float, visibility_m: floa
             problems.append(f"{key} {value_m}: must be > 0 and < {MAX_OBSTACLE_M:.0f} m")
     if problems:
         raise ConfigError("obstacle", problems)
-    return ObstacleMessage(vectors[0], radius_m, keep_out_m, visibility_m, vectors[1])
+    return ObstacleMessage(vectors[0], radius_m, keep_out_m, visibility_m, vectors[1], column)
 
 
 def without(known: tuple[ObstacleMessage, ...], number: int) -> tuple[ObstacleMessage, ...]:

@@ -218,12 +218,14 @@ def obstacle_add(
     keep_out: Annotated[float | None, typer.Option("--keep-out", help="From the centre [m]; radius + 0.75.")] = None,
     visibility: Annotated[float, typer.Option("--visibility", help="Agents see it from closer than this [m].")] = 3.0,
     velocity: Annotated[str, typer.Option("--velocity", metavar="N,E,D", help="[m/s].")] = "0,0,0",
+    column: Annotated[bool, typer.Option("--column", help="An upright column of any height, not a sphere.")] = False,
     run_dir: RunningDir = None,
 ) -> int:
-    """Put a sphere into a running launch."""
+    """Put a sphere or a column into a running launch."""
     from swarmctl import attach
 
-    obstacle = attach.obstacle(center, radius, radius + 0.75 if keep_out is None else keep_out, visibility, velocity)
+    keep_out_m = radius + 0.75 if keep_out is None else keep_out
+    obstacle = attach.obstacle(center, radius, keep_out_m, visibility, velocity, column)
     launch = attach.find_launch(run_dir)
     _show_obstacles(attach.change_obstacles(launch, lambda known: (*known, obstacle)))
     return EXIT_OK
@@ -233,7 +235,7 @@ def obstacle_add(
 def obstacle_remove(
     number: Annotated[int, typer.Argument(help="As `obstacle list` counts, from 0.")], run_dir: RunningDir = None
 ) -> int:
-    """Take a sphere out of a running launch."""
+    """Take an obstacle out of a running launch."""
     from swarmctl import attach
 
     launch = attach.find_launch(run_dir)
@@ -336,5 +338,6 @@ def _show_obstacles(message: ObstaclesMessage) -> None:
     for number, item in enumerate(message.obstacles):
         center = ", ".join(f"{c:.2f}" for c in item.center_ned_m)
         print(
-            f"{number}: centre {center}  radius {item.radius_m}  keep-out {item.keep_out_m}  seen {item.visibility_m}"
+            f"{number}: {'column' if item.column else 'centre'} {center}  radius {item.radius_m}  "
+            f"keep-out {item.keep_out_m}  seen {item.visibility_m}"
         )

@@ -99,9 +99,10 @@ class TelemetryParams(Params):
 
 
 class ObstacleParams(Params):
-    """A sphere that agents see only from closer than `visibility_m`."""
+    """A sphere, or an upright column of any height, that agents see only from closer than `visibility_m`."""
 
     center_ned_m: Vec3
+    column: bool = False
     radius_m: float = Field(1.0, gt=0, le=1000)
     keep_out_m: float = Field(1.75, gt=0, le=1000)  # constraint radius from the centre, thesis 1 + 2.5 x 0.3
     visibility_m: float = Field(3.0, gt=0, le=10000)
@@ -161,11 +162,14 @@ class Config(Params):
         return Rules(
             agents=self.swarm.agents,
             required_separation_m=self.limits.min_separation_m,
-            obstacles=tuple(ObstacleRule(o.center_ned_m, o.keep_out_m, o.vel_ned_m_s) for o in self.obstacles),
+            obstacles=tuple(
+                ObstacleRule(o.center_ned_m, o.keep_out_m, o.vel_ned_m_s, column=o.column) for o in self.obstacles
+            ),
             obstacle_margin_m=self.limits.obstacle_margin_m,
             late_ticks_01=self.limits.late_ticks_01,
             mode=mode,
             duration_s=self.mission.duration_s,
+            downwash=self.separation.downwash,
         )
 
 

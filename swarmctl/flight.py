@@ -325,7 +325,7 @@ def _first_obstacles(config: Config) -> ObstaclesMessage:
     return ObstaclesMessage(
         1,
         tuple(
-            ObstacleMessage(o.center_ned_m, o.radius_m, o.keep_out_m, o.visibility_m, o.vel_ned_m_s)
+            ObstacleMessage(o.center_ned_m, o.radius_m, o.keep_out_m, o.visibility_m, o.vel_ned_m_s, o.column)
             for o in config.obstacles
         ),
     )

@@ -60,6 +60,7 @@ class Act:
     mode: Mode
     flown: Plan | None
     setpoint: AttitudeSetpoint | None
+    barrier_acted: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -175,6 +176,7 @@ class Reporter:
             tick_ms=took.tick_ms,
             late_ticks=late_ticks,
             plan_pos_ned_m=_NO_PLAN if act.flown is None else act.flown.pos_ned_m,
+            barrier_acted=act.barrier_acted,
         )
 
     def _surroundings(self, thought: Thought, utc_us: int) -> tuple[list[float], list[float], float]:
@@ -186,7 +188,7 @@ class Reporter:
             return [], [], math.nan
         here, act_utc_us = thought.start.pos_ned_m, utc_us + thought.start.t_us - self._clock.now_us()
         peers = [math.dist(here, k.pos_ned_m[0]) for k in thought.keep_outs if k.tie >= 0]
-        obstacles = [math.dist(here, k.pos_ned_m[0]) for k in thought.keep_outs if k.tie < 0]
+        obstacles = [k.distance_m(here) for k in thought.keep_outs if k.tie < 0]
         ages_ms = [(act_utc_us - path.t0_utc_us) * 1e-3 for path in self._paths.latest()]
         return peers, obstacles, max(ages_ms, default=math.nan)
 

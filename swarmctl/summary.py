@@ -54,7 +54,7 @@ def _rules(config: Config, verdict: Verdict) -> Rules:
     if verdict.obstacles is None:
         return rules
     changed = tuple(
-        ObstacleRule(item.center_ned_m, item.keep_out_m, item.vel_ned_m_s, since_us)
+        ObstacleRule(item.center_ned_m, item.keep_out_m, item.vel_ned_m_s, since_us, item.column)
         for item, since_us in verdict.obstacles.items()
     )
     return replace(rules, obstacles=changed)
@@ -80,9 +80,14 @@ def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...
         f"ticks {timing.get('ticks')}, late {timing.get('late_ticks')}, "
         f"tick p50/p99/max {_ms(tick)} ms, solve p50/p99/max {_ms(solve)} ms",
         f"solver {solver.get('name')}, failed {solver.get('failed')}; "
-        f"path age p50/p99 {_ms(age, ('p50', 'p99'))} ms, {rejected} messages refused",
+        f"path age p50/p99 {_ms(age, ('p50', 'p99'))} ms, {rejected} messages refused" + _deadlocks(summary),
         f"run folder {directory}",
     )
+
+
+def _deadlocks(summary: Mapping[str, Any]) -> str:
+    found = _section(summary, "deadlocks")
+    return f"; {found['count']} deadlocks, {found['unresolved']} unresolved" if found.get("count") else ""
 
 
 def _section(tree: Mapping[str, Any], key: str) -> Mapping[str, Any]:

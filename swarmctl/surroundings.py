@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Set
+
 import numpy as np
 
+from swarmctl.control.barrier import Body, body_of_obstacle, body_of_peer
 from swarmctl.control.facts import PeerFacts
 from swarmctl.control.separation import (
     KeepOut,
@@ -13,9 +16,11 @@ from swarmctl.control.separation import (
     keep_out_of_peer,
     visible,
 )
-from swarmctl.core.types import Array, Obstacle, Phase
+from swarmctl.core.types import Array, Mode, Obstacle, Phase
 from swarmctl.links import topics
 from swarmctl.links.peers import Bus, PeerPaths, agent_name
+
+_FLOWN_BY_AGENT = frozenset((Mode.FOLLOW, Mode.REPLAY, Mode.BRAKE, Mode.HOLD))
 
 
 class Surroundings:
@@ -25,16 +30,16 @@ class Surroundings:
         agent: own index.
         peers: indices of the others.
         params: distances and ages.
-        obstacle_slots: how many obstacles the controller has room for.
         bus: is drained by `listen`.
     """
 
-    def __init__(self, agent: int, peers: list[int], params: SeparationParams, obstacle_slots: int, bus: Bus) -> None:
-        self._agent, self._params, self._obstacle_slots, self._bus = agent, params, obstacle_slots, bus
+    def __init__(self, agent: int, peers: list[int], params: SeparationParams, bus: Bus) -> None:
+        self._agent, self._params, self._bus = agent, params, bus
         self.paths = PeerPaths(peers)
         self._status: dict[int, topics.StatusMessage] = {}
         self._obstacles: tuple[Obstacle, ...] = ()
         self._obstacles_version = -1
+        self._seen: dict[int, Obstacle] = {}  # that have been visible, by identity
 
     def listen(self, utc_us: int) -> list[str]:
         """Take in everything that has arrived; returns the operator's verbs for this agent."""
@@ -48,12 +53,23 @@ class Surroundings:
             message = topics.decode_obstacles(payload)
             if message is not None and message.version > self._obstacles_version:
                 self._obstacles_version = message.version
-                self._obstacles = tuple(_obstacle(o) for o in message.obstacles)
+                self._obstacles, self._seen = tuple(_obstacle(o) for o in message.obstacles), {}
         commands = [topics.decode_command(payload) for _, payload in self._bus.receive(topics.COMMAND)]
         return [c.verb for c in commands if c is not None and c.agent in (-1, self._agent)]
 
-    def keep_outs(self, pos_ned_m: Array, t0_utc_us: int, dt_us: int, steps: int, phase: Phase) -> list[KeepOut]:
-        """Everything to stay clear of over `steps` steps from `t0_utc_us`, seen from `pos_ned_m` (3,) in `phase`."""
+    def keep_outs(
+        self,
+        pos_ned_m: Array,
+        t0_utc_us: int,
+        dt_us: int,
+        steps: int,
+        phase: Phase,
+        without: Set[int] = frozenset(),
+    ) -> list[KeepOut]:
+        """Everything to stay clear of over `steps` steps from `t0_utc_us`, seen from `pos_ned_m` (3,) in `phase`.
+
+        Peers in `without` are left out: what they will do is known better.
+        """
         found = [
             keep_out_of_peer(
                 path,
@@ -65,9 +81,30 @@ class Surroundings:
                 landing=phase is Phase.GOTO_LAND or self._phase(path.agent) is Phase.LAND,
             )
             for path in self.paths.latest()
+            if path.agent not in without
         ]
-        seen = visible(self._obstacles, pos_ned_m)[: self._obstacle_slots]
+        seen = visible(self._obstacles, pos_ned_m)
+        self._seen.update((id(o), o) for o in seen)
         return found + [keep_out_of_obstacle(o, dt_us, steps, self._params) for o in seen]
+
+    def landmarks(self) -> list[Obstacle]:
+        """Obstacles at rest that have been visible so far."""
+        return [o for o in self._seen.values() if not o.vel_ned_m_s.any()]
+
+    def bodies(self, pos_ned_m: Array, act_utc_us: int, ahead_s: float, margin_m: float) -> list[Body]:
+        """What not to touch, `ahead_s` after `act_utc_us`: peers heard of and obstacles seen from `pos_ned_m` (3,)."""
+        p, fresh_us = self._params, act_utc_us - round(self._params.lost_after_s * 1e6)
+        found = []
+        for path in self.paths.latest():
+            status = self._status.get(path.agent)
+            filters = status is not None and status.mode in _FLOWN_BY_AGENT and path.t0_utc_us >= fresh_us
+            growth_m_s2 = 0.0 if self._phase(path.agent) is Phase.DONE else p.age_accel_m_s2
+            apart_m = p.body_m + margin_m
+            found.append(
+                body_of_peer(path, act_utc_us, ahead_s, apart_m, growth_m_s2, p.age_margin_max_m, filters)
+            )
+        apart_m = 0.5 * p.body_m + margin_m
+        return found + [body_of_obstacle(o, ahead_s, apart_m) for o in visible(self._obstacles, pos_ned_m)]
 
     def peers(self) -> dict[int, PeerFacts]:
         """Who has been heard of, how far it is, and whether it is still on the bus."""
@@ -108,4 +145,5 @@ def _obstacle(message: topics.ObstacleMessage) -> Obstacle:
         message.keep_out_m,
         message.visibility_m,
         np.array(message.vel_ned_m_s),
+        message.column,
     )

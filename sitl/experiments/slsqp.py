@@ -90,7 +90,7 @@ class NonlinearXy:
         self._bounds = optimize.Bounds(-du_max, du_max)
         others = np.array([k.pos_ned_m[1 : hp + 1].T for k in keep_outs]).reshape(-1, 3, hp)
         self._others_m = others[:, :2]  # (K, 2, Hp)
-        flat = np.array([0.0 if k.any_height else 1.0 for k in keep_outs])
+        flat = np.array([k.vertical_01 for k in keep_outs])
         self._dz2 = ((z_ned_m - others[:, 2]) * flat[:, None]) ** 2  # (K, Hp)
         self._radius_m = np.array([k.radius_m for k in keep_outs])[:, None]
 

@@ -22,7 +22,7 @@ class DisturbanceParams(Params):
 
     enabled: bool = True
     bandwidth_rad_s: float = Field(2.0, gt=0, le=50)
-    limit_m_s2: float = Field(4.0, gt=0, le=50)
+    limit_m_s2: float = Field(15.0, gt=0, le=50)  # 8 m/s of wind and a gust on 1 1/s of drag are 12
     hover_time_s: float = Field(2.0, gt=0, le=600)  # time constant of the hover-thrust estimate
 
 

@@ -1,4 +1,4 @@
-"""References: where to be at a given mission time. All agents of a mission share one reference unless it is a swap.
+"""References: where to be at a given mission time. All agents share one reference unless each has a way of its own.
 
 Pure functions of time; the flight before and after (to the start, to the landing place) is a `Glide`.
 """
@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
 
+from swarmctl.control.standoff import places_ned_m
 from swarmctl.core.params import Params, Vec3
 from swarmctl.core.types import Array
 
@@ -47,16 +48,26 @@ class SwapParams(Params):
     travel_s: float = Field(8.0, gt=0, le=600)
 
 
+class GotoParams(Params):
+    """Every agent flies smoothly from its start to its goal and stays there; who shares one stays round it."""
+
+    goals_ned_m: tuple[Vec3, ...] = Field((), strict=False)  # one an agent, or a single one for all
+    speed_m_s: float = Field(2.0, gt=0, le=20)  # peaks, about
+    accel_m_s2: float = Field(1.2, gt=0, le=20)
+    standoff: bool = True  # goals too close to each other become an arrangement round them
+
+
 class MissionParams(Params):
     """What is flown between start and landing."""
 
-    kind: Literal["hover", "circle", "line", "steps", "swap"] = "circle"
+    kind: Literal["hover", "circle", "line", "steps", "swap", "goto"] = "circle"
     duration_s: float = Field(37.7, gt=0, le=36000)
     yaw_rad: float = Field(0.0, ge=-3.1416, le=3.1416)
     circle: CircleParams = CircleParams()
     line: LineParams = LineParams()
     steps: StepsParams = StepsParams()
     swap: SwapParams = SwapParams()
+    goto: GotoParams = GotoParams()
 
     def problems(self, agents: int) -> Iterator[str]:
         """What no single key can tell."""
@@ -65,6 +76,9 @@ class MissionParams(Params):
             yield f"mission.steps.rows: times {times} must be given, in increasing order"
         if self.kind == "swap" and agents < 2:
             yield f"mission.kind = 'swap' with swarm.agents = {agents}: a swap needs at least 2"
+        goals = len(self.goto.goals_ned_m)
+        if self.kind == "goto" and goals not in (1, agents):
+            yield f"mission.goto.goals_ned_m: {goals} goals for swarm.agents = {agents}; list one each, or one for all"
 
 
 class MissionReference:
@@ -74,12 +88,15 @@ class MissionReference:
         params: what is flown.
         starts_ned_m: (agents, 3) start positions.
         agent: own index.
+        apart_m: distance that agents keep, for a mission that sends several to one point.
     """
 
-    def __init__(self, params: MissionParams, starts_ned_m: Array, agent: int) -> None:
+    def __init__(self, params: MissionParams, starts_ned_m: Array, agent: int, apart_m: float = 0.0) -> None:
         self._params = params
         self._start = starts_ned_m[agent]
         self._opposite = 2.0 * starts_ned_m.mean(axis=0) - self._start
+        if params.kind == "goto":
+            self._way = _ways(params.goto, starts_ned_m, apart_m)[agent]
 
     def sample(self, t_s: Array) -> tuple[Array, Array]:
         """Positions and velocities, (K, 3) each, at mission times `t_s` (K,); before 0 the value at 0, at rest."""
@@ -89,6 +106,7 @@ class MissionReference:
             "line": self._line,
             "steps": self._steps,
             "swap": self._swap,
+            "goto": self._goto,
         }
         pos, vel = shapes[self._params.kind](np.maximum(t_s, 0.0))
         vel[t_s < 0.0] = 0.0
@@ -117,6 +135,29 @@ class MissionReference:
     def _swap(self, t_s: Array) -> tuple[Array, Array]:
         glide = Glide(self._start, np.zeros(3), self._opposite, self._params.swap.travel_s)
         return glide.sample(t_s)
+
+    def _goto(self, t_s: Array) -> tuple[Array, Array]:
+        return self._way.sample(t_s)
+
+
+def _ways(params: GotoParams, starts_ned_m: Array, apart_m: float) -> list[Glide]:
+    """Of every agent; those who share a goal get there at the same time."""
+    agents = len(starts_ned_m)
+    goals = np.array(params.goals_ned_m) if params.goals_ned_m else starts_ned_m
+    if len(goals) == 1:
+        goals = np.tile(goals, (agents, 1))
+    groups = [[i] for i in range(agents)]
+    if params.standoff:
+        goals, groups = places_ned_m(starts_ned_m, goals, apart_m)
+    ways = [
+        glide_to(start, np.zeros(3), goal, params.speed_m_s, params.accel_m_s2)
+        for start, goal in zip(starts_ned_m, goals, strict=True)
+    ]
+    for group in groups:
+        slowest_s = max(ways[i].travel_s for i in group)
+        for i in group:
+            ways[i] = replace(ways[i], travel_s=slowest_s)
+    return ways
 
 
 @dataclass(frozen=True, slots=True)

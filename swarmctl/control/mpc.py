@@ -176,7 +176,7 @@ def nearest(keep_outs: Sequence[KeepOut], guess_ned_m: Array, slots: int) -> lis
     """The `slots` keep-outs that the guess comes closest to."""
 
     def gap_m(k: KeepOut) -> float:
-        apart = (guess_ned_m - k.pos_ned_m)[:, : 2 if k.any_height else 3]
+        apart = (guess_ned_m - k.pos_ned_m) * (1.0, 1.0, k.vertical_01)
         return float(np.sqrt(np.min(np.sum(apart**2, axis=1)))) - k.radius_m
 
     return sorted(keep_outs, key=gap_m)[:slots]

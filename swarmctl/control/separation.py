@@ -11,6 +11,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
@@ -25,9 +26,11 @@ _TINY_M = 1e-6
 class SeparationParams(Params):
     """What distance is kept and how uncertainty is paid for."""
 
+    mode: Literal["best_effort", "guaranteed"] = "best_effort"  # guaranteed: only what all have acknowledged is flown
     radius_m: float = Field(0.9, gt=0, le=100)  # centre to centre, thesis 3 x 0.3
     body_m: float = Field(0.48, gt=0, le=100)  # centres of two vehicles that touch; thesis: twice its arm of 0.24 m
     tracking_m: float = Field(0.0, ge=0, le=10)  # what is flown closer than planned: plans keep this much more
+    downwash: float = Field(1.0, ge=1, le=10)  # among peers heights count this many times less: 2 for x500-size rotors
     allow_small_radius: bool = False  # fly although radius_m is below what body, tracking and estimator need
     certify_slack_m: float = Field(0.1, ge=0, le=10)  # a plan closer than radius minus this is never flown
     age_accel_m_s2: float = Field(4.0, ge=0, le=50)  # margin a t^2 / 2 with the age of a path
@@ -40,6 +43,7 @@ class SeparationParams(Params):
     bias_rad: float = Field(0.35, ge=0, le=1.2)  # traffic rule: largest turn of head-on normals
     stuck_m: float = Field(0.1, gt=0, le=10)  # a plan that moves less over its horizon gets nowhere
     max_neighbours: int = Field(8, ge=1, le=99)  # nearest ones that get rows
+    max_obstacles: int = Field(6, ge=1, le=50)  # likewise; all visible ones are certified against
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,6 +55,17 @@ class KeepOut:
     certified_m: float  # a plan closer than this is refused
     any_height: bool  # a vertical cylinder instead of a sphere
     tie: int  # decides the side when centres coincide; the larger id goes first
+    downwash: float = 1.0  # an ellipsoid this many times as high as it is wide, instead of a sphere
+
+    @property
+    def vertical_01(self) -> float:
+        """What a vertical distance counts."""
+        return 0.0 if self.any_height else 1.0 / self.downwash
+
+    def distance_m(self, pos_ned_m: Array) -> float:
+        """Of a position (3,) from where it is now; in the plane when it is kept clear of at any height."""
+        axes = 2 if self.any_height else 3
+        return math.dist(self.pos_ned_m[0, :axes], pos_ned_m[:axes])
 
 
 def required_radius_m(params: SeparationParams, accuracy_m: float) -> float:
@@ -124,6 +139,7 @@ def keep_out_of_peer(
         params.radius_m + path.radius_m - params.certify_slack_m,
         landing or (age_s > params.lost_after_s and not parked),
         path.agent,
+        params.downwash,
     )
 
 
@@ -131,12 +147,12 @@ def keep_out_of_obstacle(obstacle: Obstacle, dt_us: int, steps: int, params: Sep
     """What to stay clear of because of an obstacle seen now; moving ones are taken at constant velocity."""
     t_s = np.arange(steps + 1) * (dt_us * 1e-6)
     pos = obstacle.center_ned_m + t_s[:, None] * obstacle.vel_ned_m_s
-    return KeepOut(pos, obstacle.keep_out_m, obstacle.keep_out_m - params.certify_slack_m, False, -1)
+    return KeepOut(pos, obstacle.keep_out_m, obstacle.keep_out_m - params.certify_slack_m, obstacle.column, -1)
 
 
 def visible(obstacles: Sequence[Obstacle], pos_ned_m: Array) -> list[Obstacle]:
     """Obstacles whose centre is closer than their visibility distance now (4.2, as corrected)."""
-    return [o for o in obstacles if math.dist(o.center_ned_m, pos_ned_m) < o.visibility_m]
+    return [o for o in obstacles if o.distance_m(pos_ned_m) < o.visibility_m]
 
 
 def half_spaces(
@@ -160,7 +176,8 @@ def half_spaces(
         params: bias and gate.
 
     In the plane height difference counts: a sphere of radius R leaves `sqrt(R^2 - dz^2)` to keep horizontally. A
-    keep-out at any height is a vertical cylinder, in the plane and in space.
+    keep-out at any height is a vertical cylinder, in the plane and in space, and one with downwash an ellipsoid: a
+    sphere in space with heights scaled.
     """
     if not keep_outs:
         return None
@@ -168,7 +185,8 @@ def half_spaces(
     others = np.stack([k.pos_ned_m for k in keep_outs])[:, 1:]  # (slots, Hp, 3)
     radius = np.array([k.radius_m for k in keep_outs])
     apart = guess_ned_m[1:] - others  # (slots, Hp, 3)
-    apart[np.array([k.any_height for k in keep_outs]), :, 2] = 0.0
+    vertical_01 = np.array([k.vertical_01 for k in keep_outs])[:, None]
+    apart[:, :, 2] *= vertical_01
     below_m = apart[:, :, 2] if axes == 2 else np.zeros(apart.shape[:2])
     needed = np.sqrt(np.maximum(radius[:, None] ** 2 - below_m**2, 0.0))  # (slots, Hp)
     apart, others = apart[:, :, :axes], others[:, :, :axes]
@@ -184,11 +202,15 @@ def half_spaces(
     is_obstacle = np.array([k.tie < 0 for k in keep_outs])
     turn[is_obstacle] = np.where(across[is_obstacle] > 0.0, -1.0, 1.0)
     normal = _turned(normal, distance, needed, to_goal, params.bias_rad * turn)
+    if axes == 3:
+        normal[:, :, 2] *= vertical_01  # in heights as they are
     offset = np.einsum("skc,skc->sk", normal, others) + needed
     idle = (needed <= 0.0) | (distance > needed + params.gate_m)
     ends = (others[:, -1] - others[:, -2]) / dt_s  # (slots, axes) velocity of each at the end
     closing = -np.einsum("sc,sc->s", normal[:, -1], vel_m_s - ends)
     stop_s = np.maximum(closing, 0.0) / (2.0 * params.stop_m_s2)
+    squeezed = np.array([k.downwash > 1.0 and not k.any_height for k in keep_outs])
+    stop_s[squeezed] /= np.maximum(np.linalg.norm(normal[squeezed, -1], axis=1), _TINY_M)  # so is what braking gains
     stop_offset = offset[:, -1] + stop_s * np.einsum("sc,sc->s", normal[:, -1], ends)
     return HalfSpaces(normal, np.where(idle, -np.inf, offset), stop_s, np.where(idle[:, -1], -np.inf, stop_offset))
 
@@ -228,7 +250,7 @@ def certify(path_ned_m: Array, keep_outs: Sequence[KeepOut], from_step: int) -> 
         return math.inf
     others = np.stack([k.pos_ned_m for k in keep_outs])  # (m, Hp+1, 3)
     apart = path_ned_m - others
-    apart[np.array([k.any_height for k in keep_outs]), :, 2] = 0.0
+    apart[:, :, 2] *= np.array([k.vertical_01 for k in keep_outs])[:, None]
     step = np.diff(apart, axis=1)
     length2 = np.maximum(np.einsum("mkc,mkc->mk", step, step), 1e-18)
     nearest = np.clip(-np.einsum("mkc,mkc->mk", apart[:, :-1], step) / length2, 0.0, 1.0)

@@ -143,13 +143,19 @@ class PredictedPath:
 
 @dataclass(frozen=True, slots=True)
 class Obstacle:
-    """A sphere to keep out of, visible only from closer than `visibility_m`."""
+    """A sphere or an upright column to keep out of, visible only from closer than `visibility_m`."""
 
     center_ned_m: Array  # (3,)
     radius_m: float  # physical radius
     keep_out_m: float  # constraint radius, measured from the centre
     visibility_m: float
     vel_ned_m_s: Array  # (3,)
+    column: bool = False  # of any height, round its centre
+
+    def distance_m(self, pos_ned_m: Array) -> float:
+        """From its centre, of a column from its axis."""
+        axes = 2 if self.column else 3
+        return math.dist(self.center_ned_m[:axes], pos_ned_m[:axes])
 
 
 @dataclass(frozen=True, slots=True)
@@ -267,3 +273,4 @@ class TickRecord:
     tick_ms: float  # listen to send
     late_ticks: int  # so far, skipped ones included
     plan_pos_ned_m: Array  # (N+1, 3), empty when there is no plan
+    barrier_acted: bool = False  # the last layer has changed what was flown

@@ -19,6 +19,7 @@ from swarmctl.links.topics import TOPICS, Topic, decode_path
 
 MAX_AGE_US = 2_000_000
 MAX_LEAD_US = 500_000
+LEASE_US = 1_500_000  # after which a silent link of the bus in memory is taken for dead, as bus.lease_ms
 _RETIRED_BOOTS = 64  # boot ids remembered per peer, so that a superseded one can't come back
 _LOSS = 1  # purpose of the random stream
 
@@ -139,6 +140,18 @@ class LocalHub:
         self._loss_01 = loss_01
         self._attached: dict[str, LocalBus] = {}
         self._streams: dict[tuple[str, str], np.random.Generator] = {}
+        self._mute_since_us: int | None = None
+        self._held: list[tuple[str, Topic, bytes]] = []  # reliable messages said while it is mute
+
+    def mute(self) -> None:
+        """The bus falls apart: nobody hears anybody. Reliable messages wait, the others are lost."""
+        self._mute_since_us = self._now_us()
+
+    def unmute(self) -> None:
+        """It is whole again; what has waited is under way from now on."""
+        held, self._held, self._mute_since_us = self._held, [], None
+        for sender, topic, payload in held:
+            self.carry(sender, topic, payload)
 
     def attach(self, name: str, listen: Mapping[Topic, Sequence[str]] | None = None) -> LocalBus:
         """Join as `name`.
@@ -158,7 +171,9 @@ class LocalHub:
         self._attached.pop(name, None)
 
     def alive(self) -> frozenset[str]:
-        return frozenset(self._attached)
+        """Everybody; nobody, not even oneself, after `LEASE_US` of a mute bus."""
+        lost = self._mute_since_us is not None and self._now_us() - self._mute_since_us >= LEASE_US
+        return frozenset() if lost else frozenset(self._attached)
 
     def now_us(self) -> int:
         return self._now_us()
@@ -168,6 +183,10 @@ class LocalHub:
 
     def carry(self, sender: str, topic: Topic, payload: bytes) -> None:
         """Put a message under way to every receiver that does not lose it."""
+        if self._mute_since_us is not None:
+            if topic.reliable:
+                self._held.append((sender, topic, payload))
+            return
         now_us = self._now_us()
         message = _Message(now_us + self._travel_us, payload)
         for bus in self._attached.values():

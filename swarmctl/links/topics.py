@@ -31,7 +31,8 @@ STATUS = Topic("status", ring=1, reliable=False)
 TICK = Topic("tick", ring=256, reliable=False)
 COMMAND = Topic("command", ring=64, reliable=True)
 OBSTACLES = Topic("obstacles", ring=1, reliable=True)
-TOPICS = (PATH, STATUS, TICK, COMMAND, OBSTACLES)
+INTENT = Topic("intent", ring=1, reliable=False)  # the newest says all: a lost one is made good by the next
+TOPICS = (PATH, STATUS, TICK, COMMAND, OBSTACLES, INTENT)
 
 OPERATOR = "operator"  # the sender name of launch and of the operator verbs
 
@@ -112,13 +113,14 @@ class CommandMessage(msgspec.Struct, frozen=True):
 
 
 class ObstacleMessage(msgspec.Struct, frozen=True):
-    """One spherical obstacle, shared NED [m]."""
+    """One obstacle, a sphere or a column of any height, shared NED [m]."""
 
     center_ned_m: tuple[float, float, float]
     radius_m: Length
     keep_out_m: Length
     visibility_m: Length
     vel_ned_m_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    column: bool = False
 
 
 class ObstaclesMessage(msgspec.Struct, frozen=True):

@@ -67,7 +67,9 @@ class Feed:
             elif message.version > self._version:
                 self._version = message.version
                 newest = [
-                    MovingObstacle(np.array(o.center_ned_m), o.radius_m, o.keep_out_m, np.array(o.vel_ned_m_s))
+                    MovingObstacle(
+                        np.array(o.center_ned_m), o.radius_m, o.keep_out_m, np.array(o.vel_ned_m_s), o.column
+                    )
                     for o in message.obstacles
                 ]
         return newest

@@ -12,12 +12,13 @@ from swarmctl.core.types import Array
 
 
 class MovingObstacle(NamedTuple):
-    """A sphere that keeps its velocity."""
+    """A sphere, or a column of any height, that keeps its velocity."""
 
     center_ned_m: Array  # (3,) when it was set
     radius_m: float
     keep_out_m: float
     vel_ned_m_s: Array  # (3,)
+    column: bool = False
 
     def center_after(self, elapsed_s: float) -> Array:
         """Centre (3,) NED [m], `elapsed_s` after it was set."""
@@ -44,4 +45,4 @@ def _obstacle(item: Mapping[str, Any]) -> MovingObstacle:
     radius_m, keep_out_m = float(item["radius_m"]), float(item["keep_out_m"])
     if not all(map(math.isfinite, (*center_ned_m, *vel_ned_m_s, radius_m, keep_out_m))):
         raise ValueError("not finite")
-    return MovingObstacle(center_ned_m, radius_m, keep_out_m, vel_ned_m_s)
+    return MovingObstacle(center_ned_m, radius_m, keep_out_m, vel_ned_m_s, bool(item.get("column", False)))

@@ -26,12 +26,13 @@ _DURATION_SLACK_S = 1.0  # of the mission that may be missing at its end before 
 
 
 class ObstacleRule(NamedTuple):
-    """A sphere to stay out of."""
+    """A sphere, or a column of any height, to stay out of."""
 
     center_ned_m: Sequence[float]  # (3,) when it begins to count
     keep_out_m: float  # from the centre
     vel_ned_m_s: Sequence[float] = (0.0, 0.0, 0.0)
     since_utc_us: int | None = None  # when an operator set it; None: `center` holds at mission start, judged throughout
+    column: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +47,7 @@ class Rules:
     solver_name: str = "osqp"
     mode: Literal["realtime", "lockstep"] = "realtime"
     duration_s: float | None = None  # of mission time a completed run must have tracked
+    downwash: float = 1.0  # heights count this many times less in `scaled_min_m`, which is reported, not judged
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,6 +98,7 @@ def judge(
         "timing": timing,
         "solver": _solver(run.ticks, rules.solver_name),
         "comms": _comms(run),
+        "deadlocks": _deadlocks(run.events),
     }
     result: dict[str, Any] = plain(summary)
     return result
@@ -115,16 +118,19 @@ class _MissionClock:
 
 
 def _judge_separation(tracks: Tracks, rules: Rules, clock: _MissionClock) -> tuple[dict[str, Any], list[str]]:
-    """Smallest distance of every pair at every common instant."""
+    """Smallest distance of every pair at every common instant; also with heights scaled by the downwash."""
     found: dict[str, Any] = {
         "min_m": None,
         "required_m": rules.required_separation_m,
         "min_pair": None,
         "min_at_s": None,
+        "scaled_min_m": None,
     }
+    scale = np.array([1.0, 1.0, 1.0 / rules.downwash])
     violations = []
     for i, j in itertools.combinations(range(rules.agents), 2):
-        distance_m = np.linalg.norm(tracks.pos_ned_m[:, i] - tracks.pos_ned_m[:, j], axis=1)
+        apart_m = tracks.pos_ned_m[:, i] - tracks.pos_ned_m[:, j]
+        distance_m = np.linalg.norm(apart_m, axis=1)
         if not np.isfinite(distance_m).any():
             violations.append(f"separation of agents {i} and {j} can't be judged: no common positions were recorded")
             continue
@@ -132,6 +138,8 @@ def _judge_separation(tracks: Tracks, rules: Rules, clock: _MissionClock) -> tup
         least_m, at_s = float(distance_m[nearest]), clock.at_s(tracks.t_us[nearest])
         if found["min_m"] is None or least_m < found["min_m"]:
             found |= {"min_m": least_m, "min_pair": [i, j], "min_at_s": at_s}
+        scaled_m = float(np.nanmin(np.linalg.norm(apart_m * scale, axis=1)))
+        found["scaled_min_m"] = min(scaled_m, scaled_m if found["scaled_min_m"] is None else found["scaled_min_m"])
         if least_m < rules.required_separation_m:
             violations.append(
                 f"separation {least_m:.3f} m below {rules.required_separation_m:g} m "
@@ -141,7 +149,7 @@ def _judge_separation(tracks: Tracks, rules: Rules, clock: _MissionClock) -> tup
 
 
 def _judge_obstacles(tracks: Tracks, rules: Rules, clock: _MissionClock) -> tuple[dict[str, float | None], list[str]]:
-    """Distance to the centre of the obstacle that was respected least, and what it had to be."""
+    """Distance to the centre (of a column, the axis) of the obstacle respected least, and what it had to be."""
     worst: tuple[float, float] | None = None  # (distance, required) with the least room
     violations = []
     for number, rule in enumerate(rules.obstacles):
@@ -151,7 +159,8 @@ def _judge_obstacles(tracks: Tracks, rules: Rules, clock: _MissionClock) -> tupl
         center_ned_m = np.asarray(rule.center_ned_m) + elapsed_s[:, None] * np.asarray(rule.vel_ned_m_s)  # (T, 3)
         counts = np.ones(len(elapsed_s), bool) if rule.since_utc_us is None else elapsed_s >= 0.0
         for agent in range(rules.agents):
-            distance_m = np.linalg.norm(tracks.pos_ned_m[:, agent] - center_ned_m, axis=1)
+            apart_m = tracks.pos_ned_m[:, agent] - center_ned_m
+            distance_m = np.linalg.norm(apart_m[:, : 2 if rule.column else 3], axis=1)
             distance_m[~counts] = np.nan
             if not np.isfinite(distance_m).any():
                 continue
@@ -239,6 +248,7 @@ def _solver(ticks: Mapping[int, NDArray[np.void]], name: str) -> dict[str, Any]:
         "failed": sum(int(np.isin(rows["plan_status"], _SOLVER_FAILED).sum()) for rows in charged),
         "not_certified": sum(int((rows["plan_status"] == PlanStatus.NOT_CERTIFIED).sum()) for rows in charged),
         "max_residual_m": _spread(residuals)["max"],
+        "barrier_ticks": sum(int(rows["barrier_acted"].sum()) for rows in flights),
     }
 
 
@@ -252,6 +262,14 @@ def _comms(run: RunData) -> dict[str, Any]:
         if isinstance(reasons, dict):
             rejected.update({str(reason): int(n) for reason, n in reasons.items() if isinstance(n, (int, float))})
     return {"path_age_ms": {"p50": ages["p50"], "p99": ages["p99"]}, "rejected": dict(sorted(rejected.items()))}
+
+
+def _deadlocks(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """How often agents noticed that they got nowhere, and for how long at most."""
+    noticed = [event for event in events if event.get("event") == "deadlock"]
+    lasted_s = [float(event["lasted_s"]) for event in noticed if isinstance(event.get("lasted_s"), (int, float))]
+    begun = sum(event.get("begins") is True for event in noticed)
+    return {"count": begun, "longest_s": max(lasted_s, default=None), "unresolved": begun - len(lasted_s)}
 
 
 def _not_a_number(truth: NDArray[np.void]) -> Iterator[str]:

@@ -22,6 +22,7 @@ from swarmctl.telemetry.separation_feed import SeparationFeed
 
 _STAGE = Stage()
 _REPEAT_US = 2_000_000  # states are sent again this often: a late viewer's buffer loses rare data first
+_COLUMN_HALF_M = 30.0  # drawn of a column to either side of its centre
 _PROBLEMS = {
     PlanStatus.SOLVER_FAILED: "solver failed",
     PlanStatus.RESIDUAL: "residual too large",
@@ -107,7 +108,10 @@ class Scene:
         ):
             spheres = rr.Ellipsoids3D(
                 centers=[o.center_after(elapsed_s) for o in obstacles],
-                half_sizes=[[radius_m] * 3 for radius_m in radii_m],
+                half_sizes=[
+                    [radius_m, radius_m, _COLUMN_HALF_M if o.column else radius_m]
+                    for o, radius_m in zip(obstacles, radii_m, strict=True)
+                ],
                 colors=[(*LIMIT_RGB, alpha)] * len(obstacles),
                 line_radii=[0.004],
                 fill_mode=mode,

@@ -24,6 +24,7 @@ def test_everybody_keeps_clear_of_it_and_of_each_other(flight: Flight) -> None:
     assert flight.problems == []
     assert clearance_m(flight) >= 1.70
     assert flight.separation_m() >= 0.85
+    assert not any(flight.ticks(i)["barrier_acted"].any() for i in range(3)), "the last layer is not needed for it"
 
 
 def test_it_is_known_only_within_the_visibility_distance(flight: Flight) -> None:

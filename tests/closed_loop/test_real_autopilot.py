@@ -68,7 +68,7 @@ def test_a_lone_vehicle_tracks_the_circle(
         (PLAIN, 0.2),
         (("vehicle_model.delay_s=0",), 0.042),
         (("vehicle_model.attitude_rad_s=0",), 0.08),
-        (("vehicle_model.drag_1_s=0",), 0.2),
+        (("vehicle_model.drag_1_s=0",), 0.1),
         (("agent.state_filter.bias_m_s=0",), 0.06),
     ],
     ids=["plain", "dead time", "lag", "drag", "velocity bias"],

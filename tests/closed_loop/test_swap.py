@@ -14,3 +14,4 @@ def test_eight_agents_swap_without_touching(fly: Fly) -> None:
     for agent in range(8):
         _, error = flight.tracked(agent)
         assert np.linalg.norm(error[-1]) < 0.1, "everybody arrives"
+        assert not flight.ticks(agent)["barrier_acted"].any(), "the last layer is not what keeps them apart"

@@ -151,6 +151,7 @@ def test_a_reader_that_goes_away_does_not_change_the_exit_code() -> None:
 def test_obstacles_are_read_strictly() -> None:
     ball = attach.obstacle("1.5,0,-2", 0.5, 1.0, 3.0, "0,0,0.1")
     assert ball == ObstacleMessage((1.5, 0.0, -2.0), 0.5, 1.0, 3.0, (0.0, 0.0, 0.1))
+    assert attach.obstacle("1.5,0,-2", 0.5, 1.0, 3.0, "0,0,0.1", column=True).column
     with pytest.raises(ConfigError) as caught:
         attach.obstacle("1,2", -1.0, float("nan"), 3.0, "0,inf,0")
     assert len(caught.value.problems) == 4

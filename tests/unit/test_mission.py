@@ -8,10 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from swarmctl.control.mission import Glide, MissionParams, MissionReference, brake_to_rest, glide_to
+from swarmctl.control.mission import Glide, GotoParams, MissionParams, MissionReference, brake_to_rest, glide_to
 from swarmctl.core.types import Array
 
 STARTS = np.array([[-1.0, 0.0, -1.0], [0.0, 0.0, -1.0], [1.0, 3.0, -4.0]])
+
+GOTO = {"goals_ned_m": [[6.0, -4.0, -2.0]]}
 
 
 def sample(t_s: list[float], agent: int = 0, **params: Any) -> tuple[Array, Array]:
@@ -63,19 +65,38 @@ def test_a_swap_ends_opposite_through_the_middle_of_the_swarm() -> None:
         np.testing.assert_allclose(vel[1], 1.875 * (pos[2] - pos[0]) / 8.0, atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["hover", "circle", "line", "steps", "swap"])
+def test_everybody_goes_to_its_own_goal_or_all_to_one_and_stays() -> None:
+    goals = [[5.0, 0.0, -1.0], [0.0, 6.0, -2.0], [1.0, 3.0, -4.0]]
+    for agent in range(3):
+        pos, vel = sample([0.0, 60.0, 90.0], agent, kind="goto", goto={"goals_ned_m": goals})
+        np.testing.assert_allclose(pos, [STARTS[agent], goals[agent], goals[agent]], atol=1e-12)
+        assert not vel.any()
+        np.testing.assert_allclose(
+            sample([60.0], agent, kind="goto", goto={"goals_ned_m": goals[:1]})[0], goals[:1], atol=1e-12
+        )
+
+
+def test_the_way_to_a_goal_keeps_to_speed_and_acceleration() -> None:
+    t_s = np.arange(0.0, 20.0, 0.01)
+    goto = {"goals_ned_m": [[9.0, 8.0, -1.0]], "speed_m_s": 1.5, "accel_m_s2": 1.0}
+    _, vel = sample(t_s.tolist(), kind="goto", goto=goto)
+    assert np.linalg.norm(vel, axis=1).max() == pytest.approx(1.5, rel=1e-3)  # as fast as asked, not faster
+    assert np.linalg.norm(np.diff(vel, axis=0), axis=1).max() / 0.01 <= 1.0
+
+
+@pytest.mark.parametrize("kind", ["hover", "circle", "line", "steps", "swap", "goto"])
 def test_before_its_time_a_mission_waits_at_rest_where_it_begins(kind: str) -> None:
-    pos, vel = sample([-100.0, -1e-6, 0.0], kind=kind)
+    pos, vel = sample([-100.0, -1e-6, 0.0], kind=kind, goto=GOTO)
     np.testing.assert_array_equal(pos[:2], [pos[2]] * 2)
     assert not vel[:2].any()
 
 
-@pytest.mark.parametrize("kind", ["circle", "line", "swap"])
+@pytest.mark.parametrize("kind", ["circle", "line", "swap", "goto"])
 def test_velocity_is_the_derivative_of_position(kind: str) -> None:
     t_s = np.linspace(0.1, 12.0, 200)
     h = 1e-5
-    forward, back = sample((t_s + h).tolist(), kind=kind)[0], sample((t_s - h).tolist(), kind=kind)[0]
-    np.testing.assert_allclose(sample(t_s.tolist(), kind=kind)[1], (forward - back) / (2 * h), atol=1e-6)
+    forward, back = (sample((t_s + sign * h).tolist(), kind=kind, goto=GOTO)[0] for sign in (1.0, -1.0))
+    np.testing.assert_allclose(sample(t_s.tolist(), kind=kind, goto=GOTO)[1], (forward - back) / (2 * h), atol=1e-6)
 
 
 def test_missions_that_make_no_sense_are_refused() -> None:
@@ -83,6 +104,9 @@ def test_missions_that_make_no_sense_are_refused() -> None:
     backwards = MissionParams.model_validate({"kind": "steps", "steps": {"rows": [[5.0, 0, 0, 0], [1.0, 0, 0, 0]]}})
     assert "increasing" in next(iter(backwards.problems(3)))
     assert "at least 2" in next(iter(MissionParams(kind="swap").problems(1)))
+    for goals, refused in ((0, True), (1, False), (2, True), (3, False)):
+        goto = GotoParams(goals_ned_m=((0.0, 0.0, -2.0),) * goals)
+        assert [f"{goals} goals" in p for p in MissionParams(kind="goto", goto=goto).problems(3)] == [True] * refused
 
 
 # -- glides -----------------------------------------------------------------------------------------------------------

@@ -49,6 +49,7 @@ def record(plan: np.ndarray = PLAN) -> TickRecord:
         solve_ms=1.25,
         tick_ms=2.75,
         late_ticks=65_537,
+        barrier_acted=True,
         plan_pos_ned_m=plan,
     )
 
@@ -73,11 +74,11 @@ def test_bytes_are_little_endian_packed_and_of_fixed_place() -> None:
     assert struct.unpack_from("<qqI", payload) == (9_000_000_000_001, 1_700_000_000_000_002, 4_000_000_003)
     assert payload[28:32] == bytes([6, 3, 7, 1])  # phase TRACK, mode REPLAY, EXTERNAL, armed
     assert struct.unpack_from("<3d", payload, 36) == (1.1, -2.2, -3.3)
-    # 20 header, 8 mission, 4 bytes, 4 age, 48 pos vel, 16 q, 24 ref, 16 q, 8, 12, 12, 2 + 4, 1, 8, 4, 8, 4
-    assert TICK_DTYPE.itemsize == 203
-    assert payload[203:205] == b"\x04\x00"
-    assert struct.unpack_from("<3f", payload, 205) == (-2.5, -1.5, -0.5)
-    assert len(payload) == 203 + 2 + 4 * 12
+    # 20 header, 8 mission, 4 bytes, 4 age, 48 pos vel, 16 q, 24 ref, 16 q, 8, 12, 12, 2 + 4, 1, 8, 4, 8, 4, 1
+    assert TICK_DTYPE.itemsize == 204
+    assert payload[204:206] == b"\x04\x00"
+    assert struct.unpack_from("<3f", payload, 206) == (-2.5, -1.5, -0.5)
+    assert len(payload) == 204 + 2 + 4 * 12
     assert TRUTH_DTYPE.itemsize == 8 + 2 + 24 + 24 + 16 + 3
 
 
@@ -97,7 +98,7 @@ def test_every_truncation_and_every_extra_byte_is_refused() -> None:
 @pytest.mark.parametrize("points", [0, 3, 5, 65_535])
 def test_a_count_that_does_not_fit_its_points_is_refused(points: int) -> None:
     payload = bytearray(pack_tick(record()))
-    payload[203:205] = struct.pack("<H", points)
+    payload[204:206] = struct.pack("<H", points)
     assert unpack_tick(bytes(payload)) is None
 
 

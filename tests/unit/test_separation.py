@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import product
 from typing import Any
 
@@ -120,6 +121,18 @@ def test_margin_is_true_distance_minus_what_is_allowed() -> None:
     assert certify(path, [], 0) == math.inf
 
 
+def test_a_column_is_seen_and_kept_clear_of_at_every_height() -> None:
+    column = Obstacle(np.array([5.0, 0.0, -2.0]), 1.0, 1.75, 3.0, np.zeros(3), column=True)
+    assert visible([column], np.array([2.001, 0.0, 30.0])) == [column]
+    keep_out = keep_out_of_obstacle(column, DT_US, STEPS, PARAMS)
+    assert keep_out.any_height
+    assert keep_out.distance_m(np.array([2.0, 0.0, 30.0])) == pytest.approx(3.0)
+    high_above = np.linspace([3.0, 0.0, -20.0], [4.0, 0.0, -20.0], STEPS + 1)
+    assert certify(high_above, [keep_out], 0) == pytest.approx(1.0 - 1.65)
+    sphere = keep_out_of_obstacle(replace(column, column=False), DT_US, STEPS, PARAMS)
+    assert certify(high_above, [sphere], 0) > 10.0
+
+
 def test_a_path_that_jumps_over_an_obstacle_between_two_samples_is_caught() -> None:
     path = line((-5.5, 0.0, 0.0), (4.5, 0.0, 0.0))  # samples 1 m apart, nearest ones 0.5 m from the centre
     assert certify(path, [fixed((0.0, 0.0, 0.0), 0.4)], 0) == pytest.approx(-0.4)
@@ -196,6 +209,48 @@ def test_height_difference_relieves_what_must_be_kept_horizontally(height_m: flo
     assert spaces.offset_m[0, 3] == pytest.approx(needed_m)
     cylinder = fixed((0.0, 0.0, 0.0), 0.8, any_height=True)
     assert spaces_of(still((2.0, 0.0, height_m)), cylinder, goal=(2.0, 0.0)).offset_m[0, 3] == pytest.approx(0.9)
+
+
+def squeezed(place: tuple[float, float, float]) -> KeepOut:
+    """With a downwash of 2, allowed 0.8 m."""
+    return replace(fixed(place, 0.8), downwash=2.0)
+
+
+@pytest.mark.parametrize(("height_m", "needed_m"), [(0.0, 0.9), (1.0, math.sqrt(0.81 - 0.25)), (1.8, 0.0)])
+def test_downwash_reaches_higher_than_wide(height_m: float, needed_m: float) -> None:
+    """In the plane, in space and in the certificate alike."""
+    spaces = spaces_of(still((2.0, 0.0, height_m)), squeezed((0.0, 0.0, 0.0)), goal=(2.0, 0.0))
+    if needed_m:
+        assert spaces.offset_m[0, 3] == pytest.approx(needed_m)
+    else:
+        assert np.isneginf(spaces.offset_m).all()
+    for angle in (0.3, 1.0, 1.4):  # rows touch the ellipsoid (x/0.9)^2 + (z/1.8)^2 = 1 from outside
+        where = (1.2 * math.cos(angle), 0.0, -2.4 * math.sin(angle))
+        rows = in_space(still(where), squeezed((0.0, 0.0, 0.0)), goal=where)
+        normal, offset = rows.normal[0, 5], rows.offset_m[0, 5]
+        touches = np.array([0.9 * math.cos(angle), 0.0, -1.8 * math.sin(angle)])
+        assert normal @ touches == pytest.approx(offset)
+        round_it = np.linspace(0.0, 2.0 * math.pi, 50)
+        skin = np.stack([0.9 * np.cos(round_it), 0 * round_it, 1.8 * np.sin(round_it)], axis=1)
+        assert (skin @ normal).max() <= offset + 1e-6
+    assert certify(still((0.0, 0.0, -1.7)), [squeezed((0.0, 0.0, 0.0))], 0) == pytest.approx(0.05)
+    assert certify(still((0.9, 0.0, 0.0)), [squeezed((0.0, 0.0, 0.0))], 0) == pytest.approx(0.1)
+
+
+def test_downwash_is_of_peers_not_of_obstacles() -> None:
+    params = SeparationParams(downwash=2.0)
+    path = PredictedPath(1, 1, 1, 0, DT_US, 0.0, still((0.0, 0.0, 0.0)))
+    assert keep_out_of_peer(path, 0, DT_US, STEPS, params).downwash == 2.0
+    ball = Obstacle(np.zeros(3), 1.0, 1.75, 3.0, np.zeros(3))
+    assert keep_out_of_obstacle(ball, DT_US, STEPS, params).downwash == 1.0
+
+
+def test_downwash_takes_as_long_to_stop_from_above() -> None:
+    sinking = [np.zeros(3), np.array([0.0, 0.0, 2.8]), 0.1, 0, PARAMS]
+    for keep_out in (fixed((0.0, 0.0, 0.0), 0.8), squeezed((0.0, 0.0, 0.0))):
+        spaces = half_spaces([keep_out], still((0.0, 0.0, -3.0)), *sinking)
+        assert spaces is not None
+        assert spaces.stop_s[0] == pytest.approx(2.8 / (2 * 1.4))
 
 
 def test_far_ones_get_no_row() -> None:

@@ -112,6 +112,16 @@ def test_separation_names_value_limit_pair_and_time() -> None:
     assert summary["outcome"] == "failed"
 
 
+def test_separation_with_heights_scaled_is_told_beside_the_true_one() -> None:
+    t_s = np.arange(0, 5.001, 0.01)
+    low, high = truth(0, t_s, (0.0, 0.0, 0.0)), truth(1, t_s, (0.3, 0.0, -1.6))
+    found = judge(run(APART, low, high), Rules(2, 0.85, downwash=2.0), "completed")["separation"]
+    assert found["min_m"] == pytest.approx(math.hypot(0.3, 1.6))
+    assert found["scaled_min_m"] == pytest.approx(math.hypot(0.3, 0.8))
+    same = judge(run(APART, low, high), Rules(2, 0.85), "completed")["separation"]
+    assert same["scaled_min_m"] == pytest.approx(same["min_m"])
+
+
 @pytest.mark.parametrize(("least_m", "limit_m", "outcome"), [(0.86, 0.85, "completed"), (0.84, 0.85, "failed")])
 def test_separation_decides_the_outcome(least_m: float, limit_m: float, outcome: str) -> None:
     assert judge(closing(least_m), Rules(2, limit_m), "completed")["outcome"] == outcome
@@ -150,6 +160,14 @@ def test_obstacle_clearance_allows_its_margin_only(margin_m: float, violated: bo
     assert summary["obstacles"] == {"min_clearance_m": 1.5, "required_m": 1.75 - margin_m}
     assert (summary["outcome"] == "failed") == violated
     assert any("between agent 0 and obstacle 0" in text for text in summary["violations"]) == violated
+
+
+@pytest.mark.parametrize(("column", "clearance_m"), [(True, 1.5), (False, 2.5)])
+def test_height_does_not_count_beside_a_column(column: bool, clearance_m: float) -> None:
+    rules = Rules(1, 0.5, (ObstacleRule((1.5, 0.0, 2.0), 1.75, column=column),))
+    summary = judge(run({0: ticks(5, (0.0, 0.0, 0.0))}), rules, "completed")
+    assert summary["obstacles"]["min_clearance_m"] == pytest.approx(clearance_m)
+    assert (summary["outcome"] == "failed") == column
 
 
 def test_moving_obstacle_is_met_where_it_is_at_the_time() -> None:
@@ -191,8 +209,15 @@ def test_solver_failures_count_while_the_agent_is_in_charge() -> None:
     rows["plan_status"][10], rows["mode"][10] = PlanStatus.SOLVER_FAILED, Mode.YIELD
     rows["residual_m"] = 1e-4
     rows["residual_m"][0] = 7.0  # refused, never flown
+    rows["barrier_acted"][5:8] = 1
     solver = judge(run({0: rows}), Rules(1, 0.5, solver_name="daqp"), "completed")["solver"]
-    assert solver == {"name": "daqp", "failed": 2, "not_certified": 1, "max_residual_m": pytest.approx(1e-4)}
+    assert solver == {
+        "name": "daqp",
+        "failed": 2,
+        "not_certified": 1,
+        "max_residual_m": pytest.approx(1e-4),
+        "barrier_ticks": 3,
+    }
 
 
 def test_refused_messages_are_summed_over_each_agents_last_summary() -> None:
@@ -219,6 +244,14 @@ def test_outcome(outcome: str, problems: tuple[str, ...], judged: str) -> None:
     summary = judge(run(APART), Rules(2, 0.5), outcome, problems)
     assert summary["outcome"] == judged
     assert summary["violations"] == list(problems)
+
+
+def test_deadlocks_are_counted() -> None:
+    noted = [{"begins": True, "by": [1]}, {"begins": False, "lasted_s": 2.5}, {"begins": True, "by": [-1]}]
+    events = [{"event": "deadlock", "source": "agent-0"} | fields for fields in noted]
+    summary = judge(run(APART, events=[{"event": "state"}, *events]), Rules(2, 0.5), "completed")
+    assert summary["deadlocks"] == {"count": 2, "longest_s": 2.5, "unresolved": 1}
+    assert judge(run(APART), Rules(2, 0.5), "completed")["deadlocks"]["count"] == 0
 
 
 def test_mission_cut_short_is_no_pass() -> None:

@@ -1,0 +1,42 @@
+"""What a cell switches: protections and estimator noise, each as settings of the run's configuration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """An estimator of `sitl.estimator`, and what flying on it takes."""
+
+    accuracy_m: float  # rms per horizontal axis; radii grow to what it needs
+    arrive_m: float  # added to a scenario's own: nobody can tell better where he is
+    settings: tuple[str, ...] = ()
+
+
+_WANDERING = (
+    "agent.state_filter.enabled=true",  # the reported velocity is biased against the reported position
+    "agent.sequence.arrive_m=0.5",
+    "agent.sequence.arrive_m_s=0.4",
+)
+
+PROTECTIONS: dict[str, tuple[str, ...]] = {
+    "guaranteed": ("separation.mode=guaranteed",),
+    "default": (),
+    "off": ("controller.kind=mpc", "agent.barrier.enabled=false"),  # the same plans, of somebody who sees nobody
+}
+
+UNCOOPERATIVE = (*PROTECTIONS["off"], "separation.mode=best_effort")  # promises nothing either
+
+NOISES: dict[str, Noise] = {
+    "exact": Noise(0.0, 0.0),
+    "external": Noise(0.04, 0.15, ("sitl.estimator=external", *_WANDERING)),
+    "gps": Noise(0.25, 0.85, ("sitl.estimator=gps", *_WANDERING)),
+}
+
+
+def wind_settings(wind_m_s: float) -> tuple[str, ...]:
+    """Steady wind that blows east, and Dryden turbulence of the same wind at 6 m."""
+    if not wind_m_s:
+        return ()
+    return (f"sitl.wind.mean_ned_m_s=[0.0, {wind_m_s}, 0.0]", f"sitl.wind.turbulence_m_s={wind_m_s}")

@@ -1,0 +1,283 @@
+"""Guaranteed separation: nothing is flown that has not been promised, and nothing is promised that somebody contradicts.
+
+Every agent follows a *committed* trajectory, which ends at rest. To fly on it makes a *proposal*, which leaves the
+committed trajectory a little later, keeps its distance to everything it knows its peers have committed to or propose,
+and ends at rest again. It commits to the proposal only when every living peer has acknowledged it. All agents say all
+of this in one message a tick, the newest of which is all that counts: committed, proposal, acknowledgements.
+
+Rules, in this order in every tick:
+
+1. Take in the newest message of every peer.
+2. Withdraw the own proposal if it comes too close to what a peer has committed to, or to a peer's proposal that is
+   *earlier* (by time of proposal, then agent number; both are in the messages, so both sides order them alike).
+3. Commit if all living peers have acknowledged it; withdraw it once the moment has passed where it leaves the old one.
+4. Without a proposal make one, clear of everything known, both of what peers have committed to and of what they propose.
+5. Say what is committed, proposed, and which proposal of each peer has been taken in.
+
+*No two agents are ever committed to trajectories that come closer than the certified distance.* Let A commit to a and,
+not earlier, B to b. A has heard a message of B that acknowledges a. If b was proposed before B sent it, the message
+carries b, as proposal or as committed: were b earlier, A would have withdrawn a (rule 2); were it later, B, which knew a
+when it sent that message, would have withdrawn b. If b was proposed after it, B knew a and kept clear of it (rule 4), for
+B forgets a only when A says it has withdrawn it. So a and b do not conflict. Nothing is assumed of delay, loss, order or
+duplication: without messages no acknowledgement comes, and everybody comes to rest where the committed trajectory ends.
+It replaces the waiting time of two-step commit (RMADER, Kondo et al. 2023), whose guarantee ends where a message is late.
+
+What it rests on, and how that is watched in flight:
+
+- Agents mean the same time: a clock offset of e seconds costs v e metres. `separation.tracking_m` covers it; offsets of
+  vehicles' clocks are measured, hosts are to be synchronised.
+- They fly what they follow: the distance from the committed trajectory is `tracking_error_m`, an event when it exceeds
+  the allowance.
+- Everybody takes part. Who does not (a pilot flies, an agent has died) is a keep-out of the best-effort kind.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence, Set
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+
+from swarmctl.control.model import VehicleModelParams
+from swarmctl.control.mpc import MpcParams, SwarmMpc
+from swarmctl.control.problem import Problem, Start
+from swarmctl.control.separation import KeepOut, SeparationParams, align, certify
+from swarmctl.core.frames import GRAVITY_M_S2
+from swarmctl.core.intent import Intent, Proposal
+from swarmctl.core.params import Params
+from swarmctl.core.trajectory import Trajectory, ending_at_rest, joined, resting, stopping
+from swarmctl.core.types import Array, Plan, PlanStatus, Reference
+
+_LATENCIES = 50  # remembered
+_PERCENTILE = 90.0
+_LEAD_OVER = 1.2  # times that percentile of the time acknowledgements take
+_BRAKED_FROM_01 = (1.0, 0.75, 0.5, 0.3, 0.15)  # of the plan
+_RESTS_M_S = 0.05
+_TICK_S = 0.04  # sending and hearing, at least
+
+
+class CommitParams(Params):
+    """Planning in the space of trajectories; of `separation.mode = "guaranteed"`."""
+
+    dt_s: float = Field(0.1, ge=0.02, le=0.5)
+    horizon: int = Field(20, ge=5, le=60)  # steps, before the braking that every plan ends in
+    moves: int = Field(8, ge=2, le=40)
+    brake_m_s2: float = Field(1.5, gt=0, le=10)  # of that braking
+    share_01: float = Field(0.8, gt=0, le=1)  # of the controller's tilt that plans may use; the rest is for tracking
+    lead_min_s: float = Field(0.06, ge=0.02, le=2)  # from proposing to flying it
+    lead_max_s: float = Field(1.5, ge=0.1, le=5)
+
+
+@dataclass(slots=True)
+class CommitCounts:
+    """Since the start."""
+
+    proposed: int = 0
+    committed: int = 0
+    withdrawn: int = 0
+    expired: int = 0
+    unplanned: int = 0
+    stopped: int = 0  # at once, because of somebody who takes no part
+
+
+class Commitments:
+    """The five rules for one agent.
+
+    Args:
+        agent: own number.
+        params: planning.
+        mpc: the controller's bounds and weights.
+        separation: distances.
+        slots: how many neighbours and obstacles get rows.
+        stopwatch_ns: see `CondensedMpc`.
+    """
+
+    def __init__(
+        self,
+        agent: int,
+        params: CommitParams,
+        mpc: MpcParams,
+        separation: SeparationParams,
+        slots: int,
+        stopwatch_ns: Callable[[], int],
+    ) -> None:
+        self._agent, self._params, self._separation = agent, params, separation
+        self._dt_us = round(params.dt_s * 1e6)
+        self._planner = SwarmMpc(
+            _planning(mpc, params), VehicleModelParams(delay_s=0.0), separation, agent, slots, stopwatch_ns
+        )
+        self._latencies_s: deque[float] = deque(maxlen=_LATENCIES)
+        self._lead_s = params.lead_min_s
+        self._number = 0
+        self.committed: Trajectory | None = None
+        self.proposal: Proposal | None = None
+        self.counts = CommitCounts()
+
+    def begin(self, pos_ned_m: Array, vel_ned_m_s: Array, utc_us: int) -> None:
+        """Control has been taken: come to rest from here."""
+        self.committed = stopping(pos_ned_m, vel_ned_m_s, utc_us, self._dt_us, self._params.brake_m_s2)
+        self.proposal = None
+
+    def end(self, pos_ned_m: Array, utc_us: int) -> None:
+        """Somebody else flies."""
+        self.committed, self.proposal = resting(pos_ned_m, utc_us, self._dt_us), None
+
+    def hear(self, utc_us: int, peers: Mapping[int, Intent], living: Set[int]) -> None:
+        """Rules 2 and 3.
+
+        Args:
+            utc_us: now.
+            peers: newest message of each.
+            living: peers whose acknowledgement counts.
+        """
+        mine = self.proposal
+        if mine is None:
+            return
+        known = [intent.committed for intent in peers.values() if intent.promised]
+        known += [i.proposal.trajectory for i in peers.values() if i.proposal and i.proposal.order < mine.order]
+        if self._conflicts(mine.trajectory, utc_us, known):
+            self.proposal = None
+            self.counts.withdrawn += 1
+        elif all(agent in peers and peers[agent].heard.get(self._agent, -1) >= mine.number for agent in living):
+            self.committed, self.proposal = mine.trajectory, None
+            self.counts.committed += 1
+            self._latencies_s.append((utc_us - mine.made_utc_us) * 1e-6)
+            self._set_lead(_LEAD_OVER * float(np.percentile(self._latencies_s, _PERCENTILE)) + _TICK_S)
+        elif utc_us > mine.made_utc_us + round(self._lead_s * 1e6):
+            self.proposal = None
+            self.counts.expired += 1
+            self._set_lead(2.0 * self._lead_s)
+
+    def avoid(self, utc_us: int, others: Sequence[KeepOut]) -> None:
+        """Come to rest at once where that keeps clearer of those who take no part; `others` from now on."""
+        if self.committed is None or not others:
+            return
+        steps = len(others[0].pos_ned_m) - 1
+        times = utc_us + np.arange(steps + 1) * self._dt_us
+        pos, vel = self.committed.sample(times)
+        margin_m = certify(pos, others, 0)
+        if margin_m >= 0.0 or float(vel[0] @ vel[0]) < _RESTS_M_S**2:
+            return
+        stop = stopping(pos[0], vel[0], utc_us, self._dt_us, self._params.brake_m_s2)
+        if certify(stop.sample(times)[0], others, 0) > margin_m:
+            self.committed, self.proposal = stop, None
+            self.counts.stopped += 1
+
+    def propose(
+        self,
+        utc_us: int,
+        reference: Callable[[Array], tuple[Array, Array]],
+        peers: Mapping[int, Intent],
+        others: Sequence[KeepOut],
+    ) -> None:
+        """Rule 4. `reference` gives positions and velocities at offsets [s] from now; `others` as from `keep_outs`."""
+        if self.proposal is not None or self.committed is None:
+            return
+        branch_us = utc_us + self.lead_us
+        plan = self._planned(branch_us, utc_us, reference, peers, others)
+        trajectory = None if plan is None else self._clear(plan, branch_us, utc_us, peers, others)
+        if trajectory is None:
+            self.counts.unplanned += 1
+            return
+        self._number = max(self._number + 1, utc_us // 1000 & 0xFFFFFFFF)  # also above those before a restart
+        self.proposal = Proposal(self._number, utc_us, self._agent, trajectory)
+        self.counts.proposed += 1
+
+    @property
+    def lead_us(self) -> int:
+        """From proposing to flying it [us]."""
+        return round(self._lead_s * 1e6)
+
+    @property
+    def steps(self) -> int:
+        """Of `keep_outs` that `propose` needs, from `lead_us` ahead on."""
+        return self._planner.steps
+
+    @property
+    def dt_us(self) -> int:
+        return self._dt_us
+
+    def _planned(
+        self,
+        branch_us: int,
+        utc_us: int,
+        reference: Callable[[Array], tuple[Array, Array]],
+        peers: Mapping[int, Intent],
+        others: Sequence[KeepOut],
+    ) -> Plan | None:
+        assert self.committed is not None
+        steps, dt_us = self._planner.steps, self._dt_us
+        times = branch_us + np.arange(steps + 1) * dt_us
+        pos, vel = self.committed.sample(times)
+        accel = self.committed.acceleration(branch_us)
+        lift = np.array([0.0, 0.0, GRAVITY_M_S2]) - accel
+        size = float(np.sqrt(lift @ lift))
+        start = Start(branch_us, pos[0], vel[0], 1.0, np.array([lift[0] / size, lift[1] / size, size]))
+        wanted = Reference(*reference((times - utc_us) * 1e-6), 0.0)
+        keep_outs = [self._keep_out(t, i.agent, branch_us, steps) for i in peers.values() for t in _intended(i)]
+        plan = self._planner.plan(Problem(start, wanted, np.zeros(3), (*keep_outs, *others), pos))
+        return None if plan.status is PlanStatus.SOLVER_FAILED else plan
+
+    def _clear(
+        self, plan: Plan, branch_us: int, utc_us: int, peers: Mapping[int, Intent], others: Sequence[KeepOut]
+    ) -> Trajectory | None:
+        """The plan, braked from as late as it then stays clear of everything known; None when it never does."""
+        assert self.committed is not None
+        known = [trajectory for intent in peers.values() for trajectory in _intended(intent)]
+        steps, dt_us, brake_m_s2 = self._planner.steps, self._dt_us, self._params.brake_m_s2
+        ahead = branch_us + np.arange(steps + 1) * dt_us
+        for share in _BRAKED_FROM_01:
+            last = max(1, round(share * steps))
+            braked = ending_at_rest(
+                branch_us, dt_us, plan.pos_ned_m[: last + 1], plan.vel_ned_m_s[: last + 1], brake_m_s2
+            )
+            whole = joined(self.committed, braked, utc_us)
+            if certify(whole.sample(ahead)[0], others, 0) >= 0.0 and not self._conflicts(whole, utc_us, known):
+                return whole
+        return None
+
+    def _conflicts(self, trajectory: Trajectory, utc_us: int, known: Sequence[Trajectory]) -> bool:
+        """Whether it comes too close to any of these from now until all are at rest."""
+        if not known:
+            return False
+        end_us = max(trajectory.end_utc_us, *(other.end_utc_us for other in known))
+        steps = max(1, -(-(end_us - utc_us) // self._dt_us))
+        own = trajectory.sample(utc_us + np.arange(steps + 1) * self._dt_us)[0]
+        return certify(own, [self._keep_out(other, 0, utc_us, steps) for other in known], 0) < 0.0
+
+    def _keep_out(self, trajectory: Trajectory, agent: int, t0_utc_us: int, steps: int) -> KeepOut:
+        p = self._separation
+        points = align(trajectory.path(agent, 0, 0), t0_utc_us, self._dt_us, steps, p.brake_m_s2)
+        return KeepOut(points, p.radius_m + p.tracking_m, p.radius_m - p.certify_slack_m, False, agent, p.downwash)
+
+    def _set_lead(self, lead_s: float) -> None:
+        self._lead_s = min(self._params.lead_max_s, max(self._params.lead_min_s, lead_s))
+
+
+def _intended(intent: Intent) -> tuple[Trajectory, ...]:
+    committed = (intent.committed,) if intent.promised else ()
+    return committed if intent.proposal is None else (*committed, intent.proposal.trajectory)
+
+
+def _planning(mpc: MpcParams, params: CommitParams) -> MpcParams:
+    """The controller's weights and bounds on the planner's grid."""
+    return mpc.model_copy(
+        update={
+            "dt_s": params.dt_s,
+            "discretisation": "zoh",
+            "thrust_ahead": "held",
+            "control_z": params.moves,
+            "horizon_z": params.horizon,
+            "control_xy": params.moves,
+            "horizon_xy": params.horizon,
+            "u_max": params.share_01 * mpc.u_max,
+            "thrust_min_m_s2": max(mpc.thrust_min_m_s2, 0.7 * GRAVITY_M_S2),
+            "thrust_max_m_s2": min(mpc.thrust_max_m_s2, 1.3 * GRAVITY_M_S2),
+            "terminal_z": "none",
+            "terminal_xy": "none",
+        }
+    )
+
+

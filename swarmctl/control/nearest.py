@@ -1,0 +1,91 @@
+"""The point of a polyhedron that is nearest to a given one: exact, for few dimensions and rows, in plain Python.
+
+Rows are taken one after the other. A row that the nearest point so far violates is active at the next one (strict
+convexity), so that the search goes on in the row's plane, one dimension lower, with the rows before it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import TypeAlias
+
+Vector: TypeAlias = tuple[float, ...]
+Row: TypeAlias = tuple[Vector, float]  # normal (n,) and offset of `normal . x >= offset`
+
+_PARALLEL = 1e-9
+_EPS = 1e-9
+
+
+def nearest_point(wanted: Vector, rows: Sequence[Row]) -> Vector | None:
+    """Nearest to `wanted` (n,) of all x with `normal . x >= offset` for every row; None when there is none."""
+    found = wanted
+    for i, (normal, offset) in enumerate(rows):
+        length = math.sqrt(sum(c * c for c in normal))
+        short = offset - sum(map(_times, normal, found))
+        if short <= _EPS * max(1.0, length):
+            continue
+        if length < _PARALLEL:
+            return None
+        unit = tuple(c / length for c in normal)
+        within = _nearest_on(wanted, unit, offset / length, rows[:i])
+        if within is None:
+            return None
+        found = within
+    return found
+
+
+def nearest_or_least_violating(wanted: Vector, soft: Sequence[Row], hard: Sequence[Row], weight: float) -> Vector:
+    """Nearest of all that keep every row; where there is none, keep `hard` and violate `soft` as little as possible.
+
+    Args:
+        wanted: (n,).
+        soft, hard: rows; there must be a point that keeps the hard ones.
+        weight: of the squared largest violation of a unit soft row against the squared way from `wanted`.
+    """
+    found = nearest_point(wanted, [*hard, *soft])
+    if found is not None:
+        return found
+    share = 1.0 / math.sqrt(weight)  # one more coordinate, what all soft rows may lack, measured in the same metric
+    lifted = [((*normal, 0.0), offset) for normal, offset in hard]
+    lifted.append(((0.0,) * len(wanted) + (1.0,), 0.0))
+    lifted += [((*normal, share), offset) for normal, offset in soft]
+    found = nearest_point((*wanted, 0.0), lifted)
+    return wanted if found is None else found[:-1]
+
+
+def _nearest_on(wanted: Vector, unit: Vector, offset: float, rows: Sequence[Row]) -> Vector | None:
+    """As `nearest_point`, on the plane `unit . x = offset`."""
+    lift = offset - sum(map(_times, unit, wanted))
+    foot = tuple(w + lift * u for w, u in zip(wanted, unit, strict=True))
+    if len(wanted) == 1:
+        kept = all(o - n[0] * foot[0] <= _EPS * max(1.0, abs(n[0])) for n, o in rows)
+        return foot if kept else None
+    mirror, scale = _mirror(unit)
+    flat: list[Row] = []
+    for normal, row_offset in rows:
+        along = scale * sum(map(_times, mirror, normal))
+        inside = tuple(n - along * m for n, m in zip(normal[1:], mirror[1:], strict=True))
+        left = row_offset - sum(map(_times, normal, foot))
+        size = math.sqrt(sum(c * c for c in inside))
+        if size < _PARALLEL:
+            if left > _EPS:
+                return None
+            continue
+        flat.append((inside, left))
+    found = nearest_point((0.0,) * (len(wanted) - 1), flat)
+    if found is None:
+        return None
+    along = scale * sum(map(_times, mirror[1:], found))
+    return tuple(f + x - along * m for f, x, m in zip(foot, (0.0, *found), mirror, strict=True))
+
+
+def _mirror(unit: Vector) -> tuple[Vector, float]:
+    """Householder reflection x - scale (m . x) m that takes `unit` to the first axis."""
+    first = unit[0] + math.copysign(1.0, unit[0])
+    mirror = (first, *unit[1:])
+    return mirror, 2.0 / sum(c * c for c in mirror)
+
+
+def _times(a: float, b: float) -> float:
+    return a * b

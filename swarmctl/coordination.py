@@ -1,0 +1,112 @@
+"""An agent's part in guaranteed separation: hears intents, runs `control.commit`, and says its own intent."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from swarmctl.control.commit import CommitCounts, Commitments, CommitParams
+from swarmctl.control.mpc import MpcParams
+from swarmctl.control.separation import KeepOut, SeparationParams
+from swarmctl.core.intent import Intent
+from swarmctl.core.types import Array, Phase, VehicleState
+from swarmctl.links import topics
+from swarmctl.links.intents import PeerIntents, encode_intent
+from swarmctl.links.peers import Bus, agent_name
+from swarmctl.surroundings import Surroundings
+
+Sampled = Callable[[Array], tuple[Array, Array]]  # offsets [s] from now -> positions, velocities
+
+
+class Coordination:
+    """See the module.
+
+    Args:
+        agent, boot_id: who speaks.
+        peers: the others.
+        params, mpc, separation, slots, stopwatch_ns: see `Commitments`.
+        surroundings: who else is there.
+        bus: is drained by `listen`.
+    """
+
+    def __init__(
+        self,
+        agent: int,
+        boot_id: int,
+        peers: list[int],
+        params: CommitParams,
+        mpc: MpcParams,
+        separation: SeparationParams,
+        slots: int,
+        surroundings: Surroundings,
+        bus: Bus,
+        stopwatch_ns: Callable[[], int],
+    ) -> None:
+        self._agent, self._boot_id, self._bus, self._surroundings = agent, boot_id, bus, surroundings
+        self._commitments = Commitments(agent, params, mpc, separation, slots, stopwatch_ns)
+        self._intents, self._peers = PeerIntents(peers), frozenset(peers)
+        self._seq = 0
+        self._promised = False
+        self.tracking_error_m = 0.0  # from what it follows
+
+    @property
+    def counts(self) -> CommitCounts:
+        return self._commitments.counts
+
+    @property
+    def rejected(self) -> dict[str, int]:
+        """Messages refused so far, by reason."""
+        return dict(self._intents.rejected)
+
+    def listen(self) -> None:
+        """Rule 1."""
+        for sender, payload in self._bus.receive(topics.INTENT):
+            self._intents.offer(sender, payload)
+
+    def step(self, utc_us: int, state: VehicleState, phase: Phase, reference: Sampled) -> None:
+        """Rules 2 to 4, while this agent flies."""
+        commitments = self._commitments
+        if not self._promised:
+            self._promised = True
+            commitments.begin(state.pos_ned_m, state.vel_ned_m_s, utc_us)
+        alive = self._bus.alive()
+        living = {agent for agent in self._peers if agent_name(agent) in alive}
+        known = {agent: intent for agent, intent in self._intents.newest.items() if agent in living}
+        commitments.hear(utc_us, known, living)
+        taking_part = {agent for agent, intent in known.items() if intent.promised}
+        commitments.avoid(utc_us, self._others(utc_us, state, phase, taking_part))
+        ahead = self._others(utc_us + commitments.lead_us, state, phase, taking_part)
+        commitments.propose(utc_us, reference, known, ahead)
+        self.tracking_error_m = float(np.linalg.norm(state.pos_ned_m - self.follow(np.array([utc_us]))[0][0]))
+
+    def idle(self, utc_us: int, state: VehicleState) -> None:
+        """Somebody else flies: nothing is promised, what others propose is acknowledged all the same."""
+        self._promised = False
+        self._commitments.end(state.pos_ned_m, utc_us)
+
+    def follow(self, t_utc_us: Array) -> tuple[Array, Array]:
+        """Committed positions and velocities (M, 3) at times (M,)."""
+        assert self._commitments.committed is not None
+        return self._commitments.committed.sample(t_utc_us)
+
+    def say(self) -> None:
+        """Rule 5."""
+        if self._commitments.committed is None:
+            return
+        self._seq += 1
+        intent = Intent(
+            self._agent,
+            self._boot_id,
+            self._seq,
+            self._promised,
+            self._commitments.committed,
+            self._commitments.proposal,
+            self._intents.heard(),
+        )
+        self._bus.publish(topics.INTENT, encode_intent(intent))
+
+    def _others(self, t0_utc_us: int, state: VehicleState, phase: Phase, taking_part: set[int]) -> list[KeepOut]:
+        """Who takes no part, and obstacles, on the planner's grid from a time on."""
+        steps, dt_us = self._commitments.steps, self._commitments.dt_us
+        return self._surroundings.keep_outs(state.pos_ned_m, t0_utc_us, dt_us, steps, phase, taking_part)

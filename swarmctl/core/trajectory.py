@@ -1,0 +1,92 @@
+"""A timed motion that ends at rest: what an agent has promised to follow, or proposes to."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from swarmctl.core.types import Array, PredictedPath
+
+_STOPPED_M_S = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """Positions and velocities at equal steps from `t0_utc_us` on; before it as at its beginning, after it at rest."""
+
+    t0_utc_us: int
+    dt_us: int
+    pos_ned_m: Array  # (K+1, 3)
+    vel_ned_m_s: Array  # (K+1, 3); the last is zero
+
+    @property
+    def end_utc_us(self) -> int:
+        """From here on it rests."""
+        return self.t0_utc_us + (len(self.pos_ned_m) - 1) * self.dt_us
+
+    def sample(self, t_utc_us: Array) -> tuple[Array, Array]:
+        """Positions and velocities (M, 3), (M, 3) at times (M,): cubic between the points."""
+        last, dt_s = len(self.pos_ned_m) - 1, self.dt_us * 1e-6
+        k = np.clip((np.asarray(t_utc_us, np.float64) - self.t0_utc_us) / self.dt_us, 0.0, last)
+        low = np.minimum(k.astype(int), last - 1)
+        s = (k - low)[:, None]
+        p0, p1 = self.pos_ned_m[low], self.pos_ned_m[low + 1]
+        v0, v1 = self.vel_ned_m_s[low] * dt_s, self.vel_ned_m_s[low + 1] * dt_s
+        ends, rise = 2.0 * (p0 - p1) + v0 + v1, 3.0 * (p1 - p0) - 2.0 * v0 - v1
+        pos = ((ends * s + rise) * s + v0) * s + p0
+        vel = ((3.0 * ends * s + 2.0 * rise) * s + v0) / dt_s
+        inside = ((t_utc_us >= self.t0_utc_us) & (t_utc_us <= self.end_utc_us))[:, None]
+        return pos, np.where(inside, vel, 0.0)
+
+    def acceleration(self, t_utc_us: float) -> Array:
+        """(3,) at a time, from the velocities around it."""
+        half_us = 0.5 * self.dt_us
+        vel = self.sample(np.array([t_utc_us - half_us, t_utc_us + half_us]))[1]
+        return np.asarray((vel[1] - vel[0]) / (self.dt_us * 1e-6))
+
+    def path(self, agent: int, boot_id: int, seq: int) -> PredictedPath:
+        """As peers look at it."""
+        return PredictedPath(agent, boot_id, seq, self.t0_utc_us, self.dt_us, 0.0, self.pos_ned_m)
+
+
+def resting(pos_ned_m: Array, t_utc_us: int, dt_us: int) -> Trajectory:
+    """Stay here."""
+    return Trajectory(t_utc_us, dt_us, np.tile(pos_ned_m, (2, 1)), np.zeros((2, 3)))
+
+
+def stopping(pos_ned_m: Array, vel_ned_m_s: Array, t_utc_us: int, dt_us: int, brake_m_s2: float) -> Trajectory:
+    """Come to rest straight ahead at constant deceleration."""
+    return ending_at_rest(t_utc_us, dt_us, pos_ned_m[None], vel_ned_m_s[None], brake_m_s2)
+
+
+def ending_at_rest(
+    t0_utc_us: int, dt_us: int, pos_ned_m: Array, vel_ned_m_s: Array, brake_m_s2: float
+) -> Trajectory:
+    """A plan (K+1, 3), continued by braking from its last velocity."""
+    pos, vel = _brake(pos_ned_m[-1], vel_ned_m_s[-1], dt_us * 1e-6, brake_m_s2)
+    return Trajectory(t0_utc_us, dt_us, np.vstack([pos_ned_m, pos]), np.vstack([vel_ned_m_s, vel]))
+
+
+def joined(first: Trajectory, then: Trajectory, from_utc_us: int) -> Trajectory:
+    """The first from a time on, up to where the second begins, on the second's grid; they meet there."""
+    missing = max(0, math.ceil((then.t0_utc_us - from_utc_us) / then.dt_us))
+    if missing == 0:
+        return then
+    times = then.t0_utc_us - np.arange(missing, 0, -1) * then.dt_us
+    pos, vel = first.sample(times)
+    return Trajectory(
+        int(times[0]), then.dt_us, np.vstack([pos, then.pos_ned_m]), np.vstack([vel, then.vel_ned_m_s])
+    )
+
+
+def _brake(pos_ned_m: Array, vel_ned_m_s: Array, dt_s: float, brake_m_s2: float) -> tuple[Array, Array]:
+    """Points after the given one, (L, 3) and (L, 3), at least one; the last two at rest in the same place."""
+    speed = math.sqrt(float(vel_ned_m_s @ vel_ned_m_s))
+    if speed < _STOPPED_M_S:
+        return pos_ned_m[None].copy(), np.zeros((1, 3))
+    stop_s = speed / brake_m_s2
+    t_s = np.minimum(dt_s * np.arange(1, math.ceil(stop_s / dt_s) + 2), stop_s)[:, None]
+    unit = vel_ned_m_s / speed
+    return pos_ned_m + (speed * t_s - 0.5 * brake_m_s2 * t_s * t_s) * unit, (speed - brake_m_s2 * t_s) * unit

@@ -1,0 +1,77 @@
+"""The last layer alone: half-spaces and certifier switched off, agents that fly through each other."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from sitl.lockstep import Lockstep
+from swarmctl.config import load
+from tests.closed_loop.conftest import ROOT, Flight, Fly
+
+BLIND = ("mission.kind=swap", "sitl.start=air", "controller.kind=mpc", "mission.duration_s=7")
+OFF = "agent.barrier.enabled=false"
+BODY_M, X500_BODY_M = 0.48, 0.65
+RADIUS_M, TRAVEL_S = 2.6, 6.5  # peaks at 1.5 m/s, so they close in at 3 m/s
+
+
+def ring(count: int) -> tuple[str, ...]:
+    """`count` agents on a circle, each with the opposite place as its goal."""
+    angles = [2.0 * math.pi * i / count for i in range(count)]
+    places = [[round(RADIUS_M * math.cos(a), 3), round(RADIUS_M * math.sin(a), 3), -3.0] for a in angles]
+    return (f"swarm.agents={count}", f"start.positions_ned_m={places}", f"mission.swap.travel_s={TRAVEL_S}", *BLIND)
+
+
+def through_each_other(*overrides: str, config: str | None = None) -> Flight:
+    """Until they have touched, or long enough to have gone through."""
+    flight = Lockstep(load(ROOT / "configs" / config if config else None, overrides))
+    while flight.clock.now_us() < 60e6:
+        flight.step()
+        if flight.clock.now_us() % 100_000 == 0 and Flight(flight).separation_m() < 0.3:
+            break
+        if all(len(log.rows) and log.rows[-1]["mission_t_s"][0] > TRAVEL_S for log in flight.logs):
+            break
+    return Flight(flight)
+
+
+def barrier_ticks(flight: Flight) -> list[int]:
+    return [int(flight.ticks(i)["barrier_acted"].sum()) for i in range(flight.config.swarm.agents)]
+
+
+@pytest.mark.parametrize("count", [2, 6])
+def test_they_do_not_touch(count: int) -> None:
+    flight = through_each_other(*ring(count))
+    assert flight.separation_m() >= BODY_M
+    assert min(barrier_ticks(flight)) > 10
+    begun = [event for event in flight.lockstep.logs[0].events if event["event"] == "barrier"]
+    assert begun[0]["acts"]
+
+
+@pytest.mark.parametrize("count", [2, 6])
+def test_control_without_it_they_touch(count: int) -> None:
+    flight = through_each_other(*ring(count), OFF)
+    assert flight.separation_m() < BODY_M
+    assert not any(barrier_ticks(flight))
+
+
+def test_with_the_dead_time_and_lag_of_a_real_autopilot_they_do_not_touch() -> None:
+    flight = through_each_other(*ring(2), "sitl.estimator=exact", config="x500_circle.toml")
+    assert flight.separation_m() >= X500_BODY_M
+    assert min(barrier_ticks(flight)) > 10
+
+
+def test_control_of_a_lag_that_it_is_not_told_of_they_touch() -> None:
+    plain = ("vehicle_model.attitude_rad_s=0", "vehicle_model.delay_s=0", "vehicle_model.drag_1_s=0")
+    flight = through_each_other(*ring(2), "sitl.estimator=exact", *plain, config="x500_circle.toml")
+    assert flight.separation_m() < X500_BODY_M
+
+
+def test_it_leaves_an_ordinary_flight_alone_bit_by_bit(fly: Fly, circle: Flight) -> None:
+    assert not any(barrier_ticks(circle))
+    short = ("sitl.start=air", "mission.duration_s=2")
+    with_it, without = fly(*short), fly(*short, OFF)
+    assert with_it.lockstep.truth.tobytes() == without.lockstep.truth.tobytes()
+    for i in range(3):
+        np.testing.assert_array_equal(with_it.ticks(i)["setpoint_q_nb"], without.ticks(i)["setpoint_q_nb"])

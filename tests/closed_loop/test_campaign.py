@@ -1,0 +1,117 @@
+"""A small campaign: protections and their control, the same seed twice, going on after it was killed, the report."""
+
+from __future__ import annotations
+
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import psutil
+import pyarrow.parquet as pq
+import pytest
+from scipy.stats import binomtest
+
+from sitl.campaign.command import main
+from sitl.campaign.flight import Flight, fly
+from sitl.campaign.page import REPORT
+from sitl.campaign.quick import QUICK
+from sitl.campaign.scenarios import layout_of
+from sitl.campaign.store import ROWS
+from sitl.campaign.trials import Cell, Row, Trial, trial_of
+from swarmctl.core.types import Phase
+
+ROOT = Path(__file__).parents[2]
+TOUCH_M = {"swap": 0.48, "random": 0.15}
+
+
+def rows_in(directory: Path) -> list[Row]:
+    rows: list[Row] = pq.read_table(directory / ROWS).to_pylist()
+    return rows
+
+
+@pytest.fixture(scope="module")
+def quick(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("campaign")
+    assert main(["--quick", "--jobs", "1", "--out", str(out)]) == 0
+    return out
+
+
+def test_agents_that_see_each_other_do_not_collide(quick: Path) -> None:
+    rows = [row for row in rows_in(quick) if row["protections"] == "default"]
+    assert {row["outcome"] for row in rows} == {"arrived"}
+    assert all(row["min_separation_m"] > TOUCH_M[row["scenario"]] for row in rows)
+    (alone,) = [row["unconstrained_time_s"] for row in rows if row["scenario"] == "random"]
+    assert 2.0 < alone < 8.0
+
+
+def test_control_agents_that_see_nobody_do(quick: Path) -> None:
+    rows = [row for row in rows_in(quick) if row["protections"] == "off"]
+    assert rows and all(row["collided"] and not row["arrived"] for row in rows)
+    assert all(row["min_separation_m"] < TOUCH_M[row["scenario"]] for row in rows)
+
+
+def test_the_same_seed_gives_the_same_row_and_another_one_does_not(quick: Path) -> None:
+    flown = next(row for row in rows_in(quick) if row["protections"] == "off" and row["seed"] == 1)
+    trial = trial_of(flown)
+    again, other = fly(trial), fly(Trial(trial.cell, 3))
+    measured = [name for name in flown if name not in ("cpu_s", "seed")]
+    assert [again[name] for name in measured] == [flown[name] for name in measured]
+    assert other["min_separation_m"] != flown["min_separation_m"]
+
+
+def test_a_finished_campaign_flies_nothing(quick: Path) -> None:
+    before = rows_in(quick)
+    assert main(["--quick", "--jobs", "1", "--out", str(quick)]) == 0
+    assert rows_in(quick) == before
+    assert {trial_of(row) for row in before} == set(QUICK)
+
+
+def test_the_report_has_every_cell_with_its_exact_interval(quick: Path) -> None:
+    page = (quick / REPORT).read_text(encoding="utf-8")
+    off = [row for row in rows_in(quick) if row["protections"] == "off"]
+    hits = sum(row["collided"] for row in off)
+    exact = binomtest(hits, len(off)).proportion_ci(0.95, method="exact")
+    share = f"{hits}/{len(off)} {100 * hits / len(off):.1f} % [{100 * exact.low:.1f}, {100 * exact.high:.1f}]"
+    assert share in page
+    assert len(re.findall(r"<td>(?:default|off)</td>", page)) == len({trial.cell for trial in QUICK})
+    assert "--scenario swap --agents 3 --delay 100 --loss 0.1" in page, "what flies a failed run again"
+
+
+def test_incidents_happen_in_flight() -> None:
+    """Two agents; the bus falls apart for 2 s: paths age, both come through."""
+    trial = Trial(Cell("partition", 2, 0.0, 0.0, "exact", 0.0, "default"), 1)
+    flight = Flight(trial, layout_of("partition", 1, 2))
+    flight.run()
+    assert flight.row(None)["outcome"] == "arrived"
+    for log in flight.lockstep.logs:
+        ages_ms = log.ticks["path_age_ms"][log.ticks["phase"] == Phase.TRACK]
+        assert 1950.0 < ages_ms.max() < 2200.0
+        assert ages_ms[-1] < 150.0
+
+
+@pytest.mark.process
+def test_a_killed_campaign_goes_on_where_it_was(tmp_path: Path) -> None:
+    asked = ["--scenario", "swap", "--agents", "2", "--protections", "off", "--jobs", "2", "--out", str(tmp_path)]
+    command = [sys.executable, str(ROOT / "tools" / "campaign.py"), *asked, "--trials", "50"]
+    campaign = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL)
+    children: list[psutil.Process] = []
+    try:
+        deadline_s = time.monotonic() + 100.0
+        while not (tmp_path / ROWS).exists() and time.monotonic() < deadline_s:
+            time.sleep(0.1)
+        children = psutil.Process(campaign.pid).children(recursive=True)
+    finally:
+        campaign.send_signal(signal.SIGKILL)
+        campaign.wait()
+    _, alive = psutil.wait_procs(children, timeout=10.0)
+    assert children and alive == [], "nobody flies on for nobody"
+    before = rows_in(tmp_path)
+    assert 1 <= len(before) < 50
+    highest = max(row["seed"] for row in before)
+    assert main([*asked, "--jobs", "1", "--mix", "--trials", str(highest + 1)]) == 0
+    after = rows_in(tmp_path)
+    assert after[: len(before)] == before, "processor times included: not flown again"
+    assert sorted(row["seed"] for row in after) == list(range(1, highest + 2))

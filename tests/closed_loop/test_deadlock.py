@@ -1,0 +1,122 @@
+"""Nobody gets stuck for good: exact symmetry, one goal for all, a corridor too narrow to pass each other."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sitl.campaign.layouts import least_sum_m, ring
+from sitl.lockstep import Lockstep
+from swarmctl.config import load
+from swarmctl.core.types import Array
+
+SMALL = (  # bodies of 15 cm that keep 30 cm
+    "sitl.preset=crazyflie",
+    "sitl.physics_hz=100",
+    "vehicle_model={delay_s=0.04,attitude_rad_s=20.0,drag_1_s=0.25,hover_thrust_01=0.43}",
+    "separation={radius_m=0.3,body_m=0.15}",
+    "limits.min_separation_m=0.15",
+)
+
+
+class Flown:
+    """The mission of a flight from and to the air, without what comes before and after."""
+
+    def __init__(self, starts: Array, goals: Array, seconds: float, *sets: str) -> None:
+        config = load(
+            None,
+            [
+                "sitl.start=air",
+                f"swarm.agents={len(starts)}",
+                f"start.positions_ned_m={json.dumps(starts.tolist())}",
+                "mission.kind=goto",
+                f"mission.goto.goals_ned_m={json.dumps(goals.tolist())}",
+                f"mission.duration_s={seconds + 1.0}",
+                *sets,
+            ],
+        )
+        lockstep = Lockstep(config)
+        logs, path = lockstep.logs, []
+        while not logs[0].rows or not logs[0].rows[-1]["mission_t_s"][0] >= seconds:
+            lockstep.step()
+            if len(logs[0].rows) > 1 and np.isfinite(logs[0].rows[-1]["mission_t_s"][0]):
+                path.append(lockstep.world.truth_rows()["pos_ned_m"])
+        self.pos_ned_m = np.array(path)  # (T, N, 3)
+        self.distance_m = np.linalg.norm(self.pos_ned_m[-1] - goals, axis=1)
+        self.noted: list[dict[str, Any]] = [e for log in logs for e in log.events if e["event"] == "deadlock"]
+
+    @property
+    def separation_m(self) -> float:
+        pairs = itertools.combinations(range(self.pos_ned_m.shape[1]), 2)
+        return float(min(np.linalg.norm(self.pos_ned_m[:, i] - self.pos_ned_m[:, j], axis=1).min() for i, j in pairs))
+
+    @property
+    def moved_m(self) -> float:
+        """Farthest way of any agent from where it ends, in the last second."""
+        return float(np.linalg.norm(self.pos_ned_m[-50:] - self.pos_ned_m[-1], axis=2).max())
+
+
+def corridor() -> str:
+    """Two walls that leave 0.12 m to fly in, 2.4 m long, and walls at both ends that one can fly round."""
+    half_m = 0.06 + 0.375
+    posts = [(x, side * half_m) for x in np.arange(-1.2, 1.3, 0.3) for side in (-1, 1)]
+    posts += [(x, side * (half_m + 0.3 * k)) for x in (-1.2, 1.2) for side in (-1, 1) for k in range(1, 5)]
+    size = "column=true,radius_m=0.15,keep_out_m=0.375,visibility_m=2.0"
+    return "obstacles=[" + ",".join(f"{{center_ned_m=[{x:.2f},{y:.3f},0.0],{size}}}" for x, y in posts) + "]"
+
+
+ENDS = np.array([[-2.2, 0.0, -1.0], [2.2, 0.0, -1.0]])
+
+
+@pytest.fixture(scope="module")
+def met() -> Flown:
+    """Two come from opposite ends of the corridor."""
+    return Flown(ENDS, -ENDS, 17.0, corridor(), *SMALL, "mission.goto.speed_m_s=1.0")
+
+
+def test_two_that_meet_in_a_corridor_get_by(met: Flown) -> None:
+    assert met.distance_m.max() < 0.05
+    assert met.separation_m > 0.25
+
+
+def test_it_is_noticed_and_told(met: Flown) -> None:
+    begun = [e for e in met.noted if e["begins"]]
+    assert any(set(e["by"]) & {0, 1} for e in begun)
+    assert all(e["lasted_s"] >= 1.5 for e in met.noted if not e["begins"])
+    assert len(begun) == len(met.noted) / 2, "every deadlock has ended"
+
+
+def test_control_without_the_rule_they_stay_stuck() -> None:
+    flown = Flown(ENDS, -ENDS, 11.0, corridor(), *SMALL, "mission.goto.speed_m_s=1.0", "agent.detour.enabled=false")
+    assert flown.distance_m.min() > 1.5
+    assert flown.moved_m < 0.1
+    assert any(e["begins"] for e in flown.noted), "it is noticed all the same"
+    assert not any(not e["begins"] for e in flown.noted)
+
+
+TRIANGLE = ring(3, 3.0, 0.0)
+
+
+def test_three_sent_to_one_point_come_to_rest_round_it() -> None:
+    flown = Flown(TRIANGLE, np.zeros((1, 3)), 7.0)
+    assert flown.distance_m.sum() < 1.1 * least_sum_m(3, 0.9)
+    assert flown.moved_m < 0.02
+    assert flown.separation_m > 0.85
+
+
+def test_control_without_places_of_their_own_they_push() -> None:
+    flown = Flown(TRIANGLE, np.zeros((1, 3)), 7.0, "mission.goto.standoff=false")
+    assert flown.distance_m.sum() > 1.15 * least_sum_m(3, 0.9)
+
+
+def test_an_exactly_symmetric_swap_never_stops() -> None:
+    starts = ring(4, 2.5, math.pi / 4)
+    flown = Flown(starts, -starts, 9.0)
+    assert flown.noted == []
+    assert flown.distance_m.max() < 0.1
+    assert flown.separation_m > 0.85

@@ -1,0 +1,91 @@
+"""Wind, a heavier vehicle, a sagging battery and a wrong thrust curve at once cost a lone vehicle next to nothing."""
+
+from __future__ import annotations
+
+import functools
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from sitl.lockstep import Lockstep
+from swarmctl.config import load
+from swarmctl.core.types import Phase
+from tests.closed_loop.conftest import ROOT
+
+STEADY_FROM_S = 6.0
+ALONE = (
+    "swarm.agents=1",
+    "sitl.start=air",
+    "sitl.estimator=exact",
+    "start.center_ned_m=[5, 0, -3]",
+    "mission.circle.climb_ned_m_s=0",
+    "mission.duration_s=16",
+    "agent.sequence.arrive_m=1",
+)
+HEAVY = ("sitl.mass_scale=1.2", "sitl.battery.capacity_mah=5000", "sitl.battery.charge_01=0.9")
+WIND = ("sitl.wind.mean_ned_m_s=[8,0,0]",)
+GUSTS = ("sitl.wind.gust_ned_m_s=[2,1,0]", "sitl.wind.gust_at_s=12", "sitl.wind.gust_for_s=2")
+EDDIES = ("sitl.wind.turbulence_m_s=3",)
+CURVE = ("sitl.thrust_curve_01=0.3",)
+BLIND = ("agent.disturbance.limit_m_s2=0.01",)
+
+
+class Errors(NamedTuple):
+    """Of the true position against the reference once steady [m]."""
+
+    rmse_m: float
+    mean_down_m: float
+    largest_down_m: float
+
+
+@functools.cache
+def errors(*overrides: str) -> Errors:
+    flight = Lockstep(load(ROOT / "configs" / "x500_circle.toml", (*ALONE, *overrides)))
+    log = flight.logs[0]
+    while flight.clock.now_us() < 40e6 and not (log.rows and log.rows[-1]["phase"][0] > Phase.TRACK):
+        flight.step()
+    ticks, truth = log.ticks, flight.truth
+    ticks = ticks[ticks["mission_t_s"] >= STEADY_FROM_S]
+    assert len(ticks) > 400
+    true = [np.interp(ticks["t_us"], truth["t_us"], truth["pos_ned_m"][:, axis]) for axis in range(3)]
+    error = np.stack(true, axis=1) - ticks["ref_pos_ned_m"]
+    down = error[:, 2]
+    return Errors(float(np.sqrt((error**2).sum(axis=1).mean())), float(down.mean()), float(np.abs(down).max()))
+
+
+def test_wind_gusts_mass_and_battery_leave_centimetres() -> None:
+    found = errors(*WIND, *HEAVY, *GUSTS)
+    assert found.rmse_m <= 0.045
+    assert abs(found.mean_down_m) <= 0.005
+    assert found.largest_down_m <= 0.02
+
+
+def test_turbulence_on_top_leaves_centimetres() -> None:
+    assert errors(*WIND, *HEAVY, *GUSTS, *EDDIES).rmse_m <= 0.05
+
+
+def test_at_rest_nothing_is_left() -> None:
+    hover = ("mission.kind=hover", "mission.duration_s=15")
+    found = errors(*hover, *WIND, *HEAVY, *CURVE)
+    assert found.rmse_m <= 0.005
+    assert found.largest_down_m <= 0.005
+
+
+@pytest.mark.parametrize(
+    ("without", "at_least_m"),
+    [
+        (BLIND, 1.0),
+        (("agent.disturbance.limit_m_s2=4",), 0.4),  # 8 m/s are 8 m/s2 at 1 1/s of drag
+        (("agent.state_filter.enabled=false",), 0.2),  # the plain observer takes drag for wind that turns
+        (("controller.mpc.u_max=0.45", "vehicle_model.tilt_max_rad=0.47"), 1.0),
+    ],
+    ids=["no estimate", "4 m/s2 at most", "no filter", "no room to lean"],
+)
+def test_control_without_its_parts_it_does_not(without: tuple[str, ...], at_least_m: float) -> None:
+    assert errors(*WIND, *HEAVY, *GUSTS, *without).rmse_m > at_least_m
+
+
+def test_control_a_disturbance_that_walks_slower_lags_behind() -> None:
+    slow = errors(*WIND, *HEAVY, *GUSTS, "agent.state_filter.disturbance_m_s2=0.2")
+    assert slow.rmse_m > 0.05

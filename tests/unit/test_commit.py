@@ -1,0 +1,167 @@
+"""Promises are kept apart whatever happens to the messages; controls break the rules one by one."""
+
+from __future__ import annotations
+
+import itertools
+import random
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from swarmctl.control.commit import Commitments, CommitParams
+from swarmctl.control.mission import glide_to
+from swarmctl.control.mpc import MpcParams
+from swarmctl.control.separation import SeparationParams
+from swarmctl.core.intent import Intent
+from swarmctl.core.types import Array
+
+UTC_US = 1_700_000_000_000_000
+TICK_US = 40_000
+SEPARATION = SeparationParams(radius_m=0.9)
+CERTIFIED_M = SEPARATION.radius_m - SEPARATION.certify_slack_m
+
+
+@dataclass
+class Network:
+    """Messages with seeded delays and losses; nobody hears anything in the dark."""
+
+    delay_us: tuple[int, int] = (0, 0)
+    loss_01: float = 0.0
+    dark_us: tuple[int, int] = (0, 0)
+    seed: int = 3
+    _under_way: list[tuple[int, int, Intent]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._random = random.Random(self.seed)
+
+    def send(self, now_us: int, receiver: int, intent: Intent) -> None:
+        if self._random.random() >= self.loss_01 and not self.dark_us[0] <= now_us - UTC_US < self.dark_us[1]:
+            self._under_way.append((now_us + 1 + self._random.randint(*self.delay_us), receiver, intent))
+
+    def arrived(self, now_us: int, receiver: int) -> list[Intent]:
+        mine = [m for m in self._under_way if m[1] == receiver and m[0] <= now_us]
+        self._under_way = [m for m in self._under_way if not (m[1] == receiver and m[0] <= now_us)]
+        return [intent for _, _, intent in sorted(mine, key=lambda m: m[0])]
+
+
+class Crowd:
+    """Agents that follow their promises exactly, from a ring through its middle to the other side."""
+
+    def __init__(self, count: int, network: Network) -> None:
+        angle = 2.0 * np.pi * np.arange(count) / count
+        self.starts = np.stack([3.0 * np.cos(angle), 3.0 * np.sin(angle), np.full(count, -2.0)], axis=1)
+        self.agents = [
+            Commitments(i, CommitParams(), MpcParams(u_max=0.25), SEPARATION, count, lambda: 0) for i in range(count)
+        ]
+        self.known: list[dict[int, Intent]] = [{} for _ in range(count)]
+        self.network, self.now_us, self.seq = network, UTC_US, 0
+        for agent, start in zip(self.agents, self.starts, strict=True):
+            agent.begin(start, np.zeros(3), UTC_US)
+
+    def heard(self, agent: int) -> Mapping[int, int]:
+        return {a: i.proposal.number for a, i in self.known[agent].items() if i.proposal is not None}
+
+    def step(self) -> None:
+        self.now_us += TICK_US
+        self.seq += 1
+        ids = range(len(self.agents))
+        for i in ids:
+            for intent in self.network.arrived(self.now_us, i):
+                if intent.agent not in self.known[i] or intent.seq > self.known[i][intent.agent].seq:
+                    self.known[i][intent.agent] = intent
+        for i, agent in enumerate(self.agents):
+            agent.hear(self.now_us, self.known[i], set(ids) - {i})
+            agent.propose(self.now_us, lambda offsets_s, i=i: self.wanted(i, offsets_s), self.known[i], ())
+        for i, agent in enumerate(self.agents):
+            assert agent.committed is not None
+            said = Intent(i, 1, self.seq, True, agent.committed, agent.proposal, self.heard(i))
+            for j in ids:
+                if j != i:
+                    self.network.send(self.now_us, j, said)
+
+    def wanted(self, agent: int, offsets_s: Array) -> tuple[Array, Array]:
+        goal = self.starts[agent] * np.array([-1.0, -1.0, 1.0])
+        t_s = (self.now_us - UTC_US) * 1e-6 + offsets_s
+        return glide_to(self.starts[agent], np.zeros(3), goal, 1.5, 1.0).sample(t_s)
+
+    def promised_m(self) -> float:
+        """Smallest distance, from now to their ends, of any two trajectories that are followed now."""
+        followed = [agent.committed for agent in self.agents if agent.committed is not None]
+        end_us = max(self.now_us, *(trajectory.end_utc_us for trajectory in followed))
+        times = np.arange(self.now_us, end_us + 50_001, 50_000)
+        paths = [trajectory.sample(times)[0] for trajectory in followed]
+        return min(float(np.linalg.norm(a - b, axis=1).min()) for a, b in itertools.combinations(paths, 2))
+
+    def run(self, seconds: float) -> float:
+        """Smallest promised distance ever."""
+        least = np.inf
+        for _ in range(round(seconds * 1e6 / TICK_US)):
+            self.step()
+            least = min(least, self.promised_m())
+        return float(least)
+
+    @property
+    def committed(self) -> int:
+        return sum(agent.counts.committed for agent in self.agents)
+
+
+NETWORKS = {
+    "ideal": Network(),
+    "300 ms": Network((300_000, 300_000)),
+    "0 to 400 ms, out of order, 30 % lost": Network((0, 400_000), 0.3),
+    "2 s of silence": Network((20_000, 60_000), 0.1, (1_500_000, 3_500_000)),
+}
+
+
+@pytest.mark.parametrize("network", NETWORKS.values(), ids=NETWORKS.keys())
+def test_promises_never_come_closer_than_certified(network: Network) -> None:
+    crowd = Crowd(4, network)
+    assert crowd.run(6.0) >= CERTIFIED_M - 1e-3
+    assert crowd.committed >= 8, "they do move"
+
+
+class Careless(Crowd):
+    """Commits without waiting for anybody."""
+
+    def step(self) -> None:
+        super().step()
+        for i, agent in enumerate(self.agents):
+            if agent.proposal is not None:
+                everybody = {j: intent for j, intent in self.known[i].items()}
+                agent.hear(self.now_us, everybody, set())
+
+
+def test_control_promises_that_wait_for_nobody_contradict_each_other() -> None:
+    assert Careless(4, Network((300_000, 300_000))).run(6.0) < CERTIFIED_M - 0.1
+
+
+def test_in_silence_everybody_comes_to_rest_and_stays_apart() -> None:
+    crowd = Crowd(4, Network((20_000, 20_000), dark_us=(1_500_000, 10**9)))
+    crowd.run(1.6)
+    committed = crowd.committed
+    crowd.run(3.0)
+    assert crowd.committed - committed <= 4, "what was acknowledged before may still be flown"
+    for agent in crowd.agents:
+        assert agent.committed is not None
+        assert agent.committed.end_utc_us < crowd.now_us
+
+
+def test_of_two_proposals_in_conflict_the_earlier_one_is_flown() -> None:
+    crowd = Crowd(2, Network((100_000, 100_000)))
+    crowd.run(6.0)
+    assert all(agent.counts.committed > 3 for agent in crowd.agents)
+    assert sum(agent.counts.withdrawn for agent in crowd.agents) >= 0
+
+
+def test_a_slow_network_lengthens_the_lead_and_a_fast_one_shortens_it_again() -> None:
+    crowd = Crowd(2, Network((250_000, 250_000)))
+    before_us = crowd.agents[0].lead_us
+    crowd.run(4.0)
+    slow_us = crowd.agents[0].lead_us
+    crowd.network.delay_us = (0, 0)
+    crowd.run(8.0)
+    assert before_us < 0.3 * slow_us
+    assert slow_us > 450_000
+    assert crowd.agents[0].lead_us < 0.5 * slow_us

@@ -1,0 +1,97 @@
+"""Intents over the wire: what is said is what is heard, and nothing else is taken in."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from swarmctl.core.intent import Intent, Proposal
+from swarmctl.core.trajectory import Trajectory, ending_at_rest, joined, resting, stopping
+from swarmctl.links.intents import PeerIntents, decode_intent, encode_intent
+from swarmctl.links.peers import agent_name
+
+UTC_US = 1_700_000_000_000_000
+
+
+def trajectory(shift_m: float = 0.0) -> Trajectory:
+    return stopping(np.array([shift_m, 1.0, -2.0]), np.array([1.5, -0.5, 0.25]), UTC_US, 100_000, 1.5)
+
+
+def intent(seq: int = 1, agent: int = 2, boot_id: int = 9, propose: bool = True) -> Intent:
+    proposal = Proposal(77, UTC_US + 5, agent, trajectory(0.5)) if propose else None
+    return Intent(agent, boot_id, seq, True, trajectory(), proposal, {0: 5, 1: 4_000_000_000})
+
+
+@pytest.mark.parametrize("propose", [True, False])
+def test_what_is_said_is_heard(propose: bool) -> None:
+    said = intent(propose=propose)
+    heard = decode_intent(encode_intent(said))
+    assert heard is not None
+    assert (heard.agent, heard.boot_id, heard.seq, heard.promised, heard.heard) == (2, 9, 1, True, said.heard)
+    np.testing.assert_allclose(heard.committed.pos_ned_m, said.committed.pos_ned_m, atol=1e-6)
+    assert heard.committed.t0_utc_us == UTC_US
+    assert (heard.proposal is not None) is propose
+    if heard.proposal is not None:
+        assert heard.proposal.order == (UTC_US + 5, 2)
+        np.testing.assert_allclose(heard.proposal.trajectory.vel_ned_m_s, trajectory(0.5).vel_ned_m_s, atol=1e-6)
+
+
+def test_truncated_lengthened_and_mutilated_ones_are_none() -> None:
+    good = encode_intent(intent())
+    rng = np.random.default_rng(1)
+    assert all(decode_intent(good[:n]) is None for n in range(len(good)))
+    assert decode_intent(good + b"\0") is None
+    for _ in range(2000):
+        bad = bytearray(good)
+        bad[rng.integers(len(bad))] = rng.integers(256)
+        found = decode_intent(bytes(bad))
+        if found is not None:
+            assert np.isfinite(found.committed.pos_ned_m).all()
+
+
+def test_only_newer_ones_of_expected_peers_are_taken_in() -> None:
+    peers = PeerIntents([0, 2])
+    for sender, said in (
+        (agent_name(2), intent(seq=3)),
+        (agent_name(2), intent(seq=3)),  # replayed
+        (agent_name(2), intent(seq=2)),
+        (agent_name(2), intent(seq=9, boot_id=8)),  # of before its restart
+        (agent_name(0), intent(seq=4)),  # somebody else's name
+        (agent_name(1), intent(seq=4, agent=1)),  # not expected
+    ):
+        peers.offer(sender, encode_intent(said))
+    peers.offer(agent_name(2), b"nonsense")
+    assert set(peers.newest) == {2} and peers.newest[2].seq == 3
+    assert peers.rejected == {"replayed": 3, "identity": 1, "unknown_peer": 1, "malformed": 1}
+    assert peers.heard() == {2: 77}
+    peers.offer(agent_name(2), encode_intent(intent(seq=1, boot_id=10, propose=False)))
+    assert peers.newest[2].boot_id == 10
+    assert peers.heard() == {}
+
+
+def test_a_trajectory_rests_before_and_after_itself_and_is_smooth_between() -> None:
+    path = trajectory()
+    times = np.arange(UTC_US - 200_000, path.end_utc_us + 300_000, 1_000)
+    pos, vel = path.sample(times)
+    np.testing.assert_array_equal(pos[-1], path.pos_ned_m[-1])
+    assert not vel[-1].any() and not vel[0].any()
+    inside = (times > UTC_US) & (times < path.end_utc_us)
+    np.testing.assert_allclose((np.gradient(pos, 1e-3, axis=0) - vel)[inside][2:-2], 0.0, atol=5e-3)
+    np.testing.assert_allclose(
+        path.acceleration(UTC_US + 300_000), -1.5 * vel[400] / np.linalg.norm(vel[400]), atol=0.02
+    )
+
+
+def test_a_proposal_leaves_what_is_committed_and_ends_at_rest() -> None:
+    first = trajectory()
+    branch_us = UTC_US + 237_000
+    pos, vel = first.sample(branch_us + np.arange(5) * 100_000)
+    then = ending_at_rest(branch_us, 100_000, pos + np.linspace(0, 0.3, 5)[:, None], vel, 1.5)
+    whole = joined(first, then, UTC_US + 120_000)
+    early = np.arange(UTC_US + 120_000, branch_us, 5_000)
+    np.testing.assert_allclose(whole.sample(early)[0], first.sample(early)[0], atol=1e-3)
+    assert not whole.vel_ned_m_s[-1].any()
+    np.testing.assert_array_equal(whole.pos_ned_m[-1], whole.pos_ned_m[-2])  # nobody sees it move on
+    assert joined(resting(pos[0], UTC_US, 100_000), replace(then), branch_us).t0_utc_us == branch_us
