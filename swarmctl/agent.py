@@ -161,6 +161,7 @@ class Agent:
             self._surroundings,
             setup.separation.downwash,
             self._note,
+            stopwatch_ns,
         )
         apart_m = setup.separation.radius_m + setup.separation.tracking_m
         reference = MissionReference(setup.mission, setup.starts_ned_m, setup.agent, apart_m)
@@ -184,7 +185,7 @@ class Agent:
         self._reporter = Reporter(
             setup.agent, setup.boot_id, setup.sysid, autopilot, self._surroundings.paths, bus, clock, sink
         )
-        self.took = Took(0.0, 0.0, 0.0, 0.0, 0.0)  # of the last tick
+        self.took = Took(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # of the last tick
         self._announced: tuple[Phase, Mode, FlightMode] | None = None
         self._problem = ""
         self._last_state_us = _NOTHING_US
@@ -228,10 +229,12 @@ class Agent:
         times = NO_TIMES if thought.plan is None else thought.plan.times
         self.took = Took(
             (sensed_ns - began_ns) * 1e-6,
-            (thought_ns - sensed_ns) * 1e-6 - (times.solve_us + times.certify_us) * 1e-3,
+            (thought_ns - sensed_ns) * 1e-6 - (times.spaces_us + times.solve_us + times.certify_us) * 1e-3,
+            times.spaces_us * 1e-3,
             times.solve_us * 1e-3,
             times.certify_us * 1e-3,
-            (sent_ns - thought_ns) * 1e-6,
+            self._last_layer.took_ms,
+            (sent_ns - thought_ns) * 1e-6 - self._last_layer.took_ms,
         )
         self._share(state, flown)
         self._advance(now_us, state)
@@ -321,7 +324,7 @@ class Agent:
     def _reference(self, now_us: int) -> tuple[Reference, Reference]:
         """Over the horizon from when the setpoint acts, and now."""
         dt_s = self._controller.dt_us * 1e-6
-        ahead_s = self._predictor.delay_us * 1e-6 + dt_s * np.arange(self._controller.longest + 1)
+        ahead_s = self._predictor.delay_us * 1e-6 + dt_s * np.arange(self._controller.longest + 1, dtype=np.float64)
         pos, vel = self._sequence.reference(self._clock.utc_us(), now_us, np.concatenate([[0.0], ahead_s]))
         yaw_rad = self._setup.mission.yaw_rad
         now_ref = Reference(pos[:1], vel[:1], yaw_rad)

@@ -23,6 +23,7 @@ class LastLayer:
         surroundings: who and what there is.
         downwash: see `SeparationParams`.
         note: is told `acts=True` when it begins and `acts=False, ticks=...` when it has done.
+        stopwatch_ns: measures it, and has no influence.
     """
 
     def __init__(
@@ -33,17 +34,19 @@ class LastLayer:
         surroundings: Surroundings,
         downwash: float,
         note: Callable[..., None],
+        stopwatch_ns: Callable[[], int],
     ) -> None:
         self._params, self._surroundings, self._note = params, surroundings, note
         self._barrier = Barrier(params, vehicle, dt_s, downwash)
+        self._stopwatch_ns = stopwatch_ns
         self._ticks, self._last_us = 0, 0
-        self.acts = False  # in the newest tick
+        self.acts, self.took_ms = False, 0.0  # in the newest tick
 
     def keep_apart(
         self, now_us: int, act_utc_us: int, virtual: Array, start: Start, estimate: Estimate, flies: bool
     ) -> Array:
         """Virtual controls (3,) to fly from `act_utc_us` on in place of `virtual`; the same unless `flies`."""
-        changed = None
+        began_ns, changed = self._stopwatch_ns(), None
         if self._params.enabled and flies:
             changed = self._barrier.filtered(
                 virtual,
@@ -53,11 +56,13 @@ class LastLayer:
                 self._surroundings.bodies(start.pos_ned_m, act_utc_us, self._barrier.ahead_s, self._params.margin_m),
             )
         self._count(now_us, changed is not None)
+        self.took_ms = (self._stopwatch_ns() - began_ns) * 1e-6
         return virtual if changed is None else changed
 
     def rest(self, now_us: int) -> None:
         """Nothing is flown."""
         self._count(now_us, False)
+        self.took_ms = 0.0
 
     def _count(self, now_us: int, acts: bool) -> None:
         self.acts = acts

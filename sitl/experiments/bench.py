@@ -41,7 +41,7 @@ from swarmctl.core.types import Array
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, ConfigError, MissionError, SwarmError
 from swarmctl.reporter import Took
 
-PARTS = ("sense", "setup", "solve", "certify", "send", "tick")
+PARTS = ("sense", "setup", "spaces", "solve", "certify", "barrier", "send", "tick")
 SOLVERS = ("osqp", "daqp")
 NEIGHBOURS = (0, 1, 2, 4, 8, 16, 30)
 MAX_NEIGHBOURS = 99
@@ -70,7 +70,7 @@ def measure_ticks(
     pillar: bool = False,
     on_tick: Callable[[], None] = lambda: None,
 ) -> dict[str, Array]:
-    """Parts of `ticks` ticks, (ticks, 6) [ms] in the order of `PARTS`, by solver.
+    """Parts of `ticks` ticks, (ticks, 8) [ms] in the order of `PARTS`, by solver.
 
     Raises:
         MissionError: an agent did not get under way, or had no plan at a counted tick: a failing tick is no figure.
@@ -98,8 +98,9 @@ def _get_under_way(solver: str, formation: Formation) -> None:
     raise MissionError(f"bench: the agent with {solver} did not begin within {_READY_WITHIN_TICKS} ticks")
 
 
-def _parts(took: Took) -> tuple[float, ...]:
-    return took.sense_ms, took.setup_ms, took.solve_ms, took.certify_ms, took.send_ms, took.tick_ms
+def _parts(t: Took) -> tuple[float, ...]:
+    layers = t.spaces_ms, t.solve_ms, t.certify_ms, t.barrier_ms
+    return t.sense_ms, t.setup_ms, *layers, t.send_ms, t.tick_ms
 
 
 def tick_rows(took: dict[str, Array], neighbours: int, suffix: str = "") -> list[BenchRow]:

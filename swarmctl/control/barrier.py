@@ -5,8 +5,8 @@ command acts, it changes the command as little as possible such that bodies can 
 every pair with distance r, r' its rate and D the distance of touching bodies plus a margin, the approach may be no
 faster than
 
-    v(d) = k d            for d = r - D below a / k^2,
-           sqrt(2 a (d - a / 2 k^2))      beyond,
+    v(d) = k d                          for d = r + react r' - D below a / k^2,
+           sqrt(2 a (d - a / 2 k^2))    beyond,
 
 which leaves room to stop at D with the braking `a` of both; h = r' + v(d) >= 0 is made a barrier by h' >= -gain h.
 That is a half-plane of accelerations for each pair, and both of a pair take half of it (U. Borrmann, L. Wang, A. Ames,

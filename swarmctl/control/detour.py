@@ -32,7 +32,8 @@ _REPLAN_US = 500_000
 _BETTER_01 = 0.85  # a new way is taken when it is this much shorter
 _NEAR_RADII = 5.0  # of the distance that agents keep: peers beyond are not gone round
 _STANDS_M = 0.15  # a peer that means to move less over its plan stands
-_MARGIN_M = 0.03  # corners are passed farther away than has to be kept
+_MARGIN_M = 0.02  # corners are passed farther away than has to be kept
+_SQUEEZE = 3.0  # how much less a gap that may be none is worth after every deadlock
 _ACCEL_M_S2 = 0.8  # at the end of a way
 
 
@@ -186,7 +187,7 @@ class Detour:
     def _plan(self, anew: bool, keep_outs: Sequence[KeepOut], obstacles: Sequence[Obstacle]) -> None:
         discs = self._discs(keep_outs, obstacles)
         start, goal = self._here[:2], self._wanted[:2]
-        way = short_way(start, goal, discs, self._radius_m / 3.0)
+        way = short_way(start, goal, discs, self._radius_m / 3.0, squeeze=_SQUEEZE**self._rung)
         if not anew and self._way is not None and math.dist(self._way.corners[-1], goal) < self._params.behind_m:
             rest = self._way.rest(start)
             if rest.is_clear(discs) and way.length_m > _BETTER_01 * rest.length_m:

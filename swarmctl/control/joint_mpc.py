@@ -58,7 +58,9 @@ class JointMpc:
         began_ns = self._stopwatch_ns()
         start, steps = problem.start, self.steps
         guess = first_guess(problem, self._params.dt_s, steps)
+        guessed_ns = self._stopwatch_ns()
         spaces = near_half_spaces(problem, guess, 3, self._slots, self._params.dt_s, self._tie, self._separation)
+        spaces_us = (self._stopwatch_ns() - guessed_ns) * 1e-3
         held = max(_THRUST_LEAST_M_S2, float(start.virtual[2]))
         first = self._solve(problem, np.full(steps, held), spaces)
         found = self._solve(problem, first.u[:, 2], spaces)
@@ -68,9 +70,8 @@ class JointMpc:
         acting = self._mpc.realised(found.u, tilt, rate)
         along = np.column_stack([acting[:, :2], np.full(steps, start.cos_tilt)])  # (steps, 3)
         pos, vel = self._mpc.motion(start.pos_ned_m, start.vel_ned_m_s, self._drift(problem) - thrust * along)
-        return judged(
-            problem, pos, vel, found.u, (found,), self._mpc.first_row(), self.dt_us, began_ns, self._stopwatch_ns
-        )
+        first, stopwatch_ns = self._mpc.first_row(), self._stopwatch_ns
+        return judged(problem, pos, vel, found.u, (found,), first, self.dt_us, began_ns, spaces_us, stopwatch_ns)
 
     def _solve(self, problem: Problem, thrust_m_s2: Array, spaces: HalfSpaces | None) -> AxesSolution:
         steps, start, reference = self.steps, problem.start, problem.reference

@@ -122,7 +122,9 @@ class SwarmMpc:
         count = min(steps, len(up.pos_m))
         guess = first_guess(problem, self._params.dt_s, steps)
         guess[1 : count + 1, 2] = up.pos_m[:count, 0]
+        guessed_ns = self._stopwatch_ns()
         spaces = near_half_spaces(problem, guess, 2, self._slots, self._params.dt_s, self._tie, self._separation)
+        spaces_us = (self._stopwatch_ns() - guessed_ns) * 1e-3
         asked = AxesProblem(
             start.pos_ned_m[:2],
             start.vel_ned_m_s[:2],
@@ -140,9 +142,8 @@ class SwarmMpc:
         pos[:, :2], vel[:, :2], virtual[:, :2] = across.pos_m, across.vel_m_s, across.u
         pos[:count, 2:], vel[:count, 2:], virtual[:count, 2:] = up.pos_m[:count], up.vel_m_s[:count], up.u[:count]
         pos[count:, 2], virtual[count:, 2] = up.pos_m[-1, 0], up.u[-1, 0]
-        return judged(
-            problem, pos, vel, virtual, (up, across), self._xy.first_row(), self.dt_us, began_ns, self._stopwatch_ns
-        )
+        first, stopwatch_ns = self._xy.first_row(), self._stopwatch_ns
+        return judged(problem, pos, vel, virtual, (up, across), first, self.dt_us, began_ns, spaces_us, stopwatch_ns)
 
     def _solve_z(self, problem: Problem) -> AxesSolution:
         steps, start, reference = self._params.horizon_z, problem.start, problem.reference
@@ -200,6 +201,7 @@ def judged(
     from_step: int,
     dt_us: int,
     began_ns: int,
+    spaces_us: float,
     stopwatch_ns: Callable[[], int],
 ) -> Plan:
     """A plan with what may be done with it: solved, within the residual limit, certified.
@@ -212,6 +214,7 @@ def judged(
         from_step: steps before this one are not certified: they can't be changed any more.
         dt_us: step.
         began_ns: on the stopwatch.
+        spaces_us: what half-spaces took since.
         stopwatch_ns: see `CondensedMpc`.
     """
     start = problem.start
@@ -234,7 +237,7 @@ def judged(
         pos,
         np.concatenate([start.vel_ned_m_s[None], vel_ned_m_s]),
         virtual,
-        PlanTimes((solved_ns - began_ns) * 1e-3 - solve_us, solve_us, certify_us),
+        PlanTimes((solved_ns - began_ns) * 1e-3 - solve_us - spaces_us, solve_us, certify_us, spaces_us),
         sum(s.iterations for s in solutions),
         max(s.slack_m for s in solutions),
         residual_m,

@@ -19,6 +19,7 @@ ROOM = 1.05  # places are this much farther apart than agents keep: nobody pushe
 _CENTRES = 13  # tried along each edge of a lattice triangle
 _TURNS = 72
 _ROUNDS = 30
+_FAIR = 1e-4  # of equal sums the one with the least unequal distances
 _TINY_M = 1e-6  # computers that round differently must still choose alike
 
 
@@ -56,7 +57,7 @@ def arrangement(count: int) -> Array:
             continue
         u, v = i / (_CENTRES - 1), j / (_CENTRES - 1)
         points = _round_median(lattice, np.array([u + 0.5 * v, math.sqrt(0.75) * v]), count)
-        total = float(np.sqrt((points**2).sum(axis=1)).sum())
+        total = float(np.linalg.norm(points, axis=1).sum()) + _FAIR * float((points**2).sum())
         if total < least - _TINY_M:
             best, least = points, total
     return best

@@ -1,8 +1,8 @@
 """The shortest way in the plane round discs: a grid, Dijkstra from the goal, and a string pulled tight.
 
 Only asked by who stands still before something (`swarmctl.control.detour`): the MPC looks 0.8 s ahead and has no way of
-knowing on which side a wall ends. Takes 2 to 6 ms. Cells inside a disc are passable at a price, so that there is always
-an answer, also from where one should not be and through gaps that the grid is too coarse for.
+knowing on which side a wall ends. Cells inside a disc are passable at a price, so that there is always an answer, also
+from where one should not be and through gaps that the grid is too coarse for.
 """
 
 from __future__ import annotations
@@ -17,7 +17,8 @@ from scipy.sparse.csgraph import dijkstra
 from swarmctl.core.types import Array
 
 _CELLS = 60  # along the longer side
-_PRICE_EDGE, _PRICE_INSIDE = 30.0, 1000.0  # of a metre less than a cell inside a disc, and farther inside
+_EDGE_CELLS = 0.7  # a point so far inside a disc may have a free one in its cell
+_PRICE_INSIDE = 1000.0  # of a metre farther inside
 _NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))
 
 
@@ -60,13 +61,14 @@ class Way:
         return all(clear(a, b, discs) for a, b in itertools.pairwise(self.corners))
 
 
-def short_way(start: Array, goal: Array, discs: Array, cell_m: float) -> Way:
+def short_way(start: Array, goal: Array, discs: Array, cell_m: float, squeeze: float = 3.0) -> Way:
     """A short way from `start` (2,) to `goal` (2,) outside `discs` (M, 3): centre and radius.
 
     Args:
         start, goal: its first and last point.
         discs: what to go round.
         cell_m: of the grid; larger where the ground is large.
+        squeeze: price of a metre through what may be a gap or may be none.
     """
     if clear(start, goal, discs):
         return Way(np.stack([start, goal]))
@@ -74,8 +76,8 @@ def short_way(start: Array, goal: Array, discs: Array, cell_m: float) -> Way:
     price = np.ones(len(points))
     for x, y, radius in discs:
         distance = np.hypot(points[:, 0] - x, points[:, 1] - y)
-        price[distance < radius] = np.maximum(price[distance < radius], _PRICE_EDGE)
-        price[distance < radius - step_m] = _PRICE_INSIDE
+        price[distance < radius] = np.maximum(price[distance < radius], squeeze)
+        price[distance < radius - _EDGE_CELLS * step_m] = _PRICE_INSIDE
     first = int(np.argmin(((points - start) ** 2).sum(axis=1)))
     last = int(np.argmin(((points - goal) ** 2).sum(axis=1)))
     _, before = dijkstra(_edges(price, shape, step_m), directed=False, indices=last, return_predecessors=True)

@@ -227,8 +227,8 @@ def test_times_are_measured_with_the_stopwatch_and_add_up() -> None:
     mpc = SwarmMpc(MpcParams(), VehicleModelParams(), SeparationParams(), 0, 2, lambda: next(now_ns))
     neighbour = fixed(HERE + np.array([1.3, 0.0, 0.0]))
     times = mpc.plan(problem((0.1, 0.0, 0.0), neighbour)).times
-    # read at the start, round both solves, after them, and after the certificate: six intervals
-    assert (times.setup_us, times.solve_us, times.certify_us) == (3.0, 2.0, 1.0)
+    # read at the start, round both solves and the half-spaces, after them, and after the certificate: eight intervals
+    assert (times.setup_us, times.spaces_us, times.solve_us, times.certify_us) == (4.0, 1.0, 2.0, 1.0)
 
 
 @pytest.mark.parametrize("horizon_z", [3, 40])

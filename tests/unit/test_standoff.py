@@ -27,6 +27,10 @@ def test_the_arrangement_is_the_least_that_a_search_over_all_finds(count: int) -
     assert np.linalg.norm(points, axis=1).sum() <= least_sum_m(count, 1.0) + 1e-3
 
 
+def test_two_keep_the_same_distance_to_their_goal() -> None:
+    np.testing.assert_allclose(np.linalg.norm(arrangement(2), axis=1), 0.5)  # one on it would be as good a sum
+
+
 def test_three_round_one_point_form_a_triangle_at_its_height() -> None:
     starts = np.array([[4.0, 0.0, -1.0], [-2.0, 3.4, -1.0], [-2.0, -3.4, -2.0]])
     goals = np.tile([1.0, 1.0, -3.0], (3, 1))
@@ -47,7 +51,7 @@ def test_goals_far_enough_apart_stay_as_they_are() -> None:
 
 
 def test_who_would_be_pushed_by_an_arrangement_joins_it() -> None:
-    goals = np.array([[5.0, 0.0, 0.0], [5.0, 0.0, 0.0], [6.2, 0.0, 0.0], [9.0, 0.0, 0.0]])
+    goals = np.array([[5.0, 0.0, 0.0], [5.0, 0.0, 0.0], [5.9, 0.0, 0.0], [9.0, 0.0, 0.0]])
     starts = np.arange(4)[:, None] * np.array([2.0, 0.0, 0.0])  # they come along the line of the goals
     places, groups = places_ned_m(starts, goals, APART_M)
     assert groups == [[0, 1, 2], [3]]

@@ -247,8 +247,8 @@ def test_outcome(outcome: str, problems: tuple[str, ...], judged: str) -> None:
 
 
 def test_deadlocks_are_counted() -> None:
-    noted = [{"begins": True, "by": [1]}, {"begins": False, "lasted_s": 2.5}, {"begins": True, "by": [-1]}]
-    events = [{"event": "deadlock", "source": "agent-0"} | fields for fields in noted]
+    noted = [("begins", True), ("lasted_s", 2.5), ("begins", True)]
+    events = [{"event": "deadlock", "source": "agent-0", name: value} for name, value in noted]
     summary = judge(run(APART, events=[{"event": "state"}, *events]), Rules(2, 0.5), "completed")
     assert summary["deadlocks"] == {"count": 2, "longest_s": 2.5, "unresolved": 1}
     assert judge(run(APART), Rules(2, 0.5), "completed")["deadlocks"]["count"] == 0

@@ -51,6 +51,14 @@ def test_through_the_gap_and_not_round_the_wall() -> None:
     )
 
 
+def test_what_may_be_no_gap_is_worth_less_and_less() -> None:
+    """The middle of this one is 2 cm inside the discs of both sides, as far as a free one can be from a grid point."""
+    discs = np.vstack([wall(-2.48, -0.38), wall(0.38, 2.4)])
+    through, round_it = (short_way(START, GOAL, discs, 0.1, squeeze) for squeeze in (3.0, 27.0))
+    assert np.abs(through.corners[:, 1]).max() < 0.2
+    assert np.abs(round_it.corners[:, 1]).max() > 2.4
+
+
 def test_there_is_a_way_even_where_all_is_closed_or_where_one_should_not_be() -> None:
     ring = 1.0 * np.stack([np.cos(a := np.arange(0.0, 6.2, 0.2)), np.sin(a), np.full(len(a), 0.3)], axis=1)
     assert short_way(np.zeros(2), GOAL, ring, 0.1).length_m < 4.0
