@@ -10,6 +10,7 @@ from swarmctl.control.commit import CommitCounts, Commitments, CommitParams
 from swarmctl.control.mpc import MpcParams
 from swarmctl.control.separation import KeepOut, SeparationParams
 from swarmctl.core.intent import Intent
+from swarmctl.core.trajectory import Times
 from swarmctl.core.types import Array, Phase, VehicleState
 from swarmctl.links import topics
 from swarmctl.links.intents import PeerIntents, encode_intent
@@ -70,11 +71,9 @@ class Coordination:
         if not self._promised:
             self._promised = True
             commitments.begin(state.pos_ned_m, state.vel_ned_m_s, utc_us)
-        alive = self._bus.alive()
-        living = {agent for agent in self._peers if agent_name(agent) in alive}
-        known = {agent: intent for agent, intent in self._intents.newest.items() if agent in living}
+        known, living = self._intents.newest, self._living()
         commitments.hear(utc_us, known, living)
-        taking_part = {agent for agent, intent in known.items() if intent.promised}
+        taking_part = {agent for agent in living if agent in known and known[agent].promised}
         commitments.avoid(utc_us, self._others(utc_us, state, phase, taking_part))
         ahead = self._others(utc_us + commitments.lead_us, state, phase, taking_part)
         commitments.propose(utc_us, reference, known, ahead)
@@ -85,7 +84,7 @@ class Coordination:
         self._promised = False
         self._commitments.end(state.pos_ned_m, utc_us)
 
-    def follow(self, t_utc_us: Array) -> tuple[Array, Array]:
+    def follow(self, t_utc_us: Times) -> tuple[Array, Array]:
         """Committed positions and velocities (M, 3) at times (M,)."""
         assert self._commitments.committed is not None
         return self._commitments.committed.sample(t_utc_us)
@@ -105,6 +104,13 @@ class Coordination:
             self._intents.heard(),
         )
         self._bus.publish(topics.INTENT, encode_intent(intent))
+
+    def _living(self) -> frozenset[int]:
+        """Peers whose acknowledgement counts: off the bus all of them, for then nobody is known to be dead."""
+        alive = self._bus.alive()
+        if agent_name(self._agent) not in alive:
+            return self._peers
+        return frozenset(agent for agent in self._peers if agent_name(agent) in alive)
 
     def _others(self, t0_utc_us: int, state: VehicleState, phase: Phase, taking_part: set[int]) -> list[KeepOut]:
         """Who takes no part, and obstacles, on the planner's grid from a time on."""

@@ -1,4 +1,4 @@
-"""Guaranteed separation: nothing is flown that has not been promised, and nothing is promised that somebody contradicts.
+"""Guaranteed separation: nothing is flown that has not been promised, nothing promised that somebody contradicts.
 
 Every agent follows a *committed* trajectory, which ends at rest. To fly on it makes a *proposal*, which leaves the
 committed trajectory a little later, keeps its distance to everything it knows its peers have committed to or propose,
@@ -11,24 +11,27 @@ Rules, in this order in every tick:
 2. Withdraw the own proposal if it comes too close to what a peer has committed to, or to a peer's proposal that is
    *earlier* (by time of proposal, then agent number; both are in the messages, so both sides order them alike).
 3. Commit if all living peers have acknowledged it; withdraw it once the moment has passed where it leaves the old one.
-4. Without a proposal make one, clear of everything known, both of what peers have committed to and of what they propose.
+4. Without a proposal make one, clear of everything known, both of what peers have committed to and of what they
+   propose.
 5. Say what is committed, proposed, and which proposal of each peer has been taken in.
 
-*No two agents are ever committed to trajectories that come closer than the certified distance.* Let A commit to a and,
-not earlier, B to b. A has heard a message of B that acknowledges a. If b was proposed before B sent it, the message
-carries b, as proposal or as committed: were b earlier, A would have withdrawn a (rule 2); were it later, B, which knew a
-when it sent that message, would have withdrawn b. If b was proposed after it, B knew a and kept clear of it (rule 4), for
-B forgets a only when A says it has withdrawn it. So a and b do not conflict. Nothing is assumed of delay, loss, order or
-duplication: without messages no acknowledgement comes, and everybody comes to rest where the committed trajectory ends.
-It replaces the waiting time of two-step commit (RMADER, Kondo et al. 2023), whose guarantee ends where a message is late.
+*No two agents are ever committed to trajectories that come closer than the certified distance.* Let A commit to a
+and, not earlier, B to b. A has heard a message of B that acknowledges a. If b was proposed before B sent it, the
+message carries b, as proposal or as committed: were b earlier, A would have withdrawn a (rule 2); were it later, B,
+which knew a when it sent that message, would have withdrawn b. If b was proposed after it, B knew a and kept clear of
+it (rule 4), for B forgets a only when A says it has withdrawn it. So a and b do not conflict. Nothing is assumed of
+delay, loss, order or duplication: without messages no acknowledgement comes, and everybody comes to rest where the
+committed trajectory ends. It replaces the waiting time of two-step commit (RMADER, Kondo et al. 2023), whose
+guarantee ends where a message is late.
 
 What it rests on, and how that is watched in flight:
 
-- Agents mean the same time: a clock offset of e seconds costs v e metres. `separation.tracking_m` covers it; offsets of
-  vehicles' clocks are measured, hosts are to be synchronised.
-- They fly what they follow: the distance from the committed trajectory is `tracking_error_m`, an event when it exceeds
-  the allowance.
-- Everybody takes part. Who does not (a pilot flies, an agent has died) is a keep-out of the best-effort kind.
+- Agents mean the same time: a clock offset of e seconds costs v e metres. `separation.tracking_m` covers it; offsets
+  of vehicles' clocks are measured, hosts are to be synchronised.
+- They fly what they follow: the distance from the committed trajectory is `tracking_error_m`, an event when it
+  exceeds the allowance.
+- Everybody takes part. Who does not (a pilot flies, an agent has died) is a keep-out of the best-effort kind, and a
+  peer is dead only when its liveliness token is gone while the own one is there: who is off the bus commits nothing.
 """
 
 from __future__ import annotations
@@ -129,7 +132,7 @@ class Commitments:
 
         Args:
             utc_us: now.
-            peers: newest message of each.
+            peers: newest message of each, also of those who have died: they may have flown on for a while.
             living: peers whose acknowledgement counts.
         """
         mine = self.proposal
@@ -209,13 +212,13 @@ class Commitments:
     ) -> Plan | None:
         assert self.committed is not None
         steps, dt_us = self._planner.steps, self._dt_us
-        times = branch_us + np.arange(steps + 1) * dt_us
-        pos, vel = self.committed.sample(times)
+        ahead_us = np.arange(steps + 1, dtype=np.float64) * dt_us
+        pos, vel = self.committed.sample(branch_us + ahead_us)
         accel = self.committed.acceleration(branch_us)
         lift = np.array([0.0, 0.0, GRAVITY_M_S2]) - accel
         size = float(np.sqrt(lift @ lift))
         start = Start(branch_us, pos[0], vel[0], 1.0, np.array([lift[0] / size, lift[1] / size, size]))
-        wanted = Reference(*reference((times - utc_us) * 1e-6), 0.0)
+        wanted = Reference(*reference(1e-6 * (ahead_us + self.lead_us)), 0.0)
         keep_outs = [self._keep_out(t, i.agent, branch_us, steps) for i in peers.values() for t in _intended(i)]
         plan = self._planner.plan(Problem(start, wanted, np.zeros(3), (*keep_outs, *others), pos))
         return None if plan.status is PlanStatus.SOLVER_FAILED else plan
@@ -279,5 +282,3 @@ def _planning(mpc: MpcParams, params: CommitParams) -> MpcParams:
             "terminal_xy": "none",
         }
     )
-
-

@@ -70,8 +70,8 @@ class JointMpc:
         acting = self._mpc.realised(found.u, tilt, rate)
         along = np.column_stack([acting[:, :2], np.full(steps, start.cos_tilt)])  # (steps, 3)
         pos, vel = self._mpc.motion(start.pos_ned_m, start.vel_ned_m_s, self._drift(problem) - thrust * along)
-        first, stopwatch_ns = self._mpc.first_row(), self._stopwatch_ns
-        return judged(problem, pos, vel, found.u, (found,), first, self.dt_us, began_ns, spaces_us, stopwatch_ns)
+        first_row, stopwatch_ns = self._mpc.first_row(), self._stopwatch_ns
+        return judged(problem, pos, vel, found.u, (found,), first_row, self.dt_us, began_ns, spaces_us, stopwatch_ns)
 
     def _solve(self, problem: Problem, thrust_m_s2: Array, spaces: HalfSpaces | None) -> AxesSolution:
         steps, start, reference = self.steps, problem.start, problem.reference

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from swarmctl.core.types import Array, PredictedPath
 
+Times = NDArray[Any]  # [us] of UTC, whole or not
 _STOPPED_M_S = 1e-3
 
 
@@ -26,7 +29,7 @@ class Trajectory:
         """From here on it rests."""
         return self.t0_utc_us + (len(self.pos_ned_m) - 1) * self.dt_us
 
-    def sample(self, t_utc_us: Array) -> tuple[Array, Array]:
+    def sample(self, t_utc_us: Times) -> tuple[Array, Array]:
         """Positions and velocities (M, 3), (M, 3) at times (M,): cubic between the points."""
         last, dt_s = len(self.pos_ned_m) - 1, self.dt_us * 1e-6
         k = np.clip((np.asarray(t_utc_us, np.float64) - self.t0_utc_us) / self.dt_us, 0.0, last)
@@ -61,9 +64,7 @@ def stopping(pos_ned_m: Array, vel_ned_m_s: Array, t_utc_us: int, dt_us: int, br
     return ending_at_rest(t_utc_us, dt_us, pos_ned_m[None], vel_ned_m_s[None], brake_m_s2)
 
 
-def ending_at_rest(
-    t0_utc_us: int, dt_us: int, pos_ned_m: Array, vel_ned_m_s: Array, brake_m_s2: float
-) -> Trajectory:
+def ending_at_rest(t0_utc_us: int, dt_us: int, pos_ned_m: Array, vel_ned_m_s: Array, brake_m_s2: float) -> Trajectory:
     """A plan (K+1, 3), continued by braking from its last velocity."""
     pos, vel = _brake(pos_ned_m[-1], vel_ned_m_s[-1], dt_us * 1e-6, brake_m_s2)
     return Trajectory(t0_utc_us, dt_us, np.vstack([pos_ned_m, pos]), np.vstack([vel_ned_m_s, vel]))
@@ -76,9 +77,7 @@ def joined(first: Trajectory, then: Trajectory, from_utc_us: int) -> Trajectory:
         return then
     times = then.t0_utc_us - np.arange(missing, 0, -1) * then.dt_us
     pos, vel = first.sample(times)
-    return Trajectory(
-        int(times[0]), then.dt_us, np.vstack([pos, then.pos_ned_m]), np.vstack([vel, then.vel_ned_m_s])
-    )
+    return Trajectory(int(times[0]), then.dt_us, np.vstack([pos, then.pos_ned_m]), np.vstack([vel, then.vel_ned_m_s]))
 
 
 def _brake(pos_ned_m: Array, vel_ned_m_s: Array, dt_s: float, brake_m_s2: float) -> tuple[Array, Array]:

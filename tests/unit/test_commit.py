@@ -6,6 +6,7 @@ import itertools
 import random
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 import pytest
@@ -73,7 +74,7 @@ class Crowd:
                     self.known[i][intent.agent] = intent
         for i, agent in enumerate(self.agents):
             agent.hear(self.now_us, self.known[i], set(ids) - {i})
-            agent.propose(self.now_us, lambda offsets_s, i=i: self.wanted(i, offsets_s), self.known[i], ())
+            agent.propose(self.now_us, partial(self.wanted, i), self.known[i], ())
         for i, agent in enumerate(self.agents):
             assert agent.committed is not None
             said = Intent(i, 1, self.seq, True, agent.committed, agent.proposal, self.heard(i))
@@ -129,7 +130,7 @@ class Careless(Crowd):
         super().step()
         for i, agent in enumerate(self.agents):
             if agent.proposal is not None:
-                everybody = {j: intent for j, intent in self.known[i].items()}
+                everybody = dict(self.known[i])
                 agent.hear(self.now_us, everybody, set())
 
 

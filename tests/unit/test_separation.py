@@ -246,9 +246,10 @@ def test_downwash_is_of_peers_not_of_obstacles() -> None:
 
 
 def test_downwash_takes_as_long_to_stop_from_above() -> None:
-    sinking = [np.zeros(3), np.array([0.0, 0.0, 2.8]), 0.1, 0, PARAMS]
     for keep_out in (fixed((0.0, 0.0, 0.0), 0.8), squeezed((0.0, 0.0, 0.0))):
-        spaces = half_spaces([keep_out], still((0.0, 0.0, -3.0)), *sinking)
+        spaces = half_spaces(
+            [keep_out], still((0.0, 0.0, -3.0)), np.zeros(3), np.array([0.0, 0.0, 2.8]), 0.1, 0, PARAMS
+        )
         assert spaces is not None
         assert spaces.stop_s[0] == pytest.approx(2.8 / (2 * 1.4))
 
