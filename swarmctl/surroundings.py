@@ -11,7 +11,7 @@ from swarmctl.control.facts import PeerFacts
 from swarmctl.control.separation import (
     KeepOut,
     SeparationParams,
-    align,
+    aligned,
     keep_out_of_obstacle,
     keep_out_of_peer,
     visible,
@@ -70,6 +70,8 @@ class Surroundings:
 
         Peers in `without` are left out: what they will do is known better.
         """
+        paths = [path for path in self.paths.latest() if path.agent not in without]
+        places = aligned(paths, t0_utc_us, dt_us, steps, self._params.brake_m_s2) if paths else ()
         found = [
             keep_out_of_peer(
                 path,
@@ -79,9 +81,9 @@ class Surroundings:
                 self._params,
                 parked=self._phase(path.agent) is Phase.DONE,
                 landing=phase is Phase.GOTO_LAND or self._phase(path.agent) is Phase.LAND,
+                points=points,
             )
-            for path in self.paths.latest()
-            if path.agent not in without
+            for path, points in zip(paths, places, strict=True)
         ]
         seen = visible(self._obstacles, pos_ned_m)
         self._seen.update((id(o), o) for o in seen)
@@ -115,7 +117,7 @@ class Surroundings:
     def others_ned_m(self, utc_us: int) -> tuple[Array, ...]:
         """Where each peer is now (3,), by its newest path."""
         paths = self.paths.latest()
-        return tuple(align(path, utc_us, path.dt_us, 0, self._params.brake_m_s2)[0] for path in paths)
+        return tuple(aligned(paths, utc_us, 1, 0, self._params.brake_m_s2)[:, 0]) if paths else ()
 
     def somebody_is_mute(self, utc_us: int) -> bool:
         """Whether a peer is silent and not known to be gone: it may be flying on, or the bus is lost to us.

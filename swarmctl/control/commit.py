@@ -46,11 +46,11 @@ from pydantic import Field
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc import MpcParams, SwarmMpc
 from swarmctl.control.problem import Problem, Start
-from swarmctl.control.separation import KeepOut, SeparationParams, align, certify
+from swarmctl.control.separation import KeepOut, SeparationParams, certify
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.intent import Intent, Proposal
 from swarmctl.core.params import Params
-from swarmctl.core.trajectory import Trajectory, ending_at_rest, joined, resting, stopping
+from swarmctl.core.trajectory import Trajectory, ending_at_rest, joined, places, resting, stopping
 from swarmctl.core.types import Array, Plan, PlanStatus, Reference
 
 _LATENCIES = 50  # remembered
@@ -114,6 +114,7 @@ class Commitments:
         self._latencies_s: deque[float] = deque(maxlen=_LATENCIES)
         self._lead_s = params.lead_min_s
         self._number = 0
+        self._cleared: dict[int, Trajectory] = {}  # by identity: what the own proposal is known to be clear of
         self.committed: Trajectory | None = None
         self.proposal: Proposal | None = None
         self.counts = CommitCounts()
@@ -140,10 +141,13 @@ class Commitments:
             return
         known = [intent.committed for intent in peers.values() if intent.promised]
         known += [i.proposal.trajectory for i in peers.values() if i.proposal and i.proposal.order < mine.order]
-        if self._conflicts(mine.trajectory, utc_us, known):
+        new = [trajectory for trajectory in known if id(trajectory) not in self._cleared]
+        if self._conflicts(mine.trajectory, utc_us, new):
             self.proposal = None
             self.counts.withdrawn += 1
-        elif all(agent in peers and peers[agent].heard.get(self._agent, -1) >= mine.number for agent in living):
+            return
+        self._cleared.update((id(trajectory), trajectory) for trajectory in new)
+        if all(agent in peers and peers[agent].heard.get(self._agent, -1) >= mine.number for agent in living):
             self.committed, self.proposal = mine.trajectory, None
             self.counts.committed += 1
             self._latencies_s.append((utc_us - mine.made_utc_us) * 1e-6)
@@ -186,6 +190,7 @@ class Commitments:
             return
         self._number = max(self._number + 1, utc_us // 1000 & 0xFFFFFFFF)  # also above those before a restart
         self.proposal = Proposal(self._number, utc_us, self._agent, trajectory)
+        self._cleared = {id(known): known for intent in peers.values() for known in _intended(intent)}
         self.counts.proposed += 1
 
     @property
@@ -219,7 +224,8 @@ class Commitments:
         size = float(np.sqrt(lift @ lift))
         start = Start(branch_us, pos[0], vel[0], 1.0, np.array([lift[0] / size, lift[1] / size, size]))
         wanted = Reference(*reference(1e-6 * (ahead_us + self.lead_us)), 0.0)
-        keep_outs = [self._keep_out(t, i.agent, branch_us, steps) for i in peers.values() for t in _intended(i)]
+        known = [(t, intent.agent) for intent in peers.values() for t in _intended(intent)]
+        keep_outs = self._keep_outs([t for t, _ in known], [agent for _, agent in known], branch_us, steps)
         plan = self._planner.plan(Problem(start, wanted, np.zeros(3), (*keep_outs, *others), pos))
         return None if plan.status is PlanStatus.SOLVER_FAILED else plan
 
@@ -248,12 +254,20 @@ class Commitments:
         end_us = max(trajectory.end_utc_us, *(other.end_utc_us for other in known))
         steps = max(1, -(-(end_us - utc_us) // self._dt_us))
         own = trajectory.sample(utc_us + np.arange(steps + 1) * self._dt_us)[0]
-        return certify(own, [self._keep_out(other, 0, utc_us, steps) for other in known], 0) < 0.0
+        return certify(own, self._keep_outs(known, [0] * len(known), utc_us, steps), 0) < 0.0
 
-    def _keep_out(self, trajectory: Trajectory, agent: int, t0_utc_us: int, steps: int) -> KeepOut:
+    def _keep_outs(
+        self, trajectories: Sequence[Trajectory], agents: Sequence[int], t0_utc_us: int, steps: int
+    ) -> list[KeepOut]:
+        if not trajectories:
+            return []
         p = self._separation
-        points = align(trajectory.path(agent, 0, 0), t0_utc_us, self._dt_us, steps, p.brake_m_s2)
-        return KeepOut(points, p.radius_m + p.tracking_m, p.radius_m - p.certify_slack_m, False, agent, p.downwash)
+        radius_m, certified_m = p.radius_m + p.tracking_m, p.radius_m - p.certify_slack_m
+        where = places(trajectories, t0_utc_us + np.arange(steps + 1) * self._dt_us)
+        return [
+            KeepOut(points, radius_m, certified_m, False, agent, p.downwash)
+            for points, agent in zip(where, agents, strict=True)
+        ]
 
     def _set_lead(self, lead_s: float) -> None:
         self._lead_s = min(self._params.lead_max_s, max(self._params.lead_min_s, lead_s))

@@ -169,7 +169,7 @@ class CondensedMpc:
     def solve(self, asked: AxesProblem, half_spaces: HalfSpaces | None = None) -> AxesSolution:
         """One receding-horizon step, with at most `slots` families of half-spaces; None for none."""
         gain_m_s2, ref_pos_m, ref_vel_m_s = asked.gain_m_s2, asked.ref_pos_m, asked.ref_vel_m_s
-        u_prev = np.clip(asked.u_prev, self._u_min, self._u_max)
+        u_prev = np.minimum(np.maximum(asked.u_prev, self._u_min), self._u_max)
         held = np.broadcast_to(u_prev, gain_m_s2.shape)
         accel = gain_m_s2 * self.realised(held, asked.realised, asked.realised_1_s) + asked.drift_m_s2  # (Hp, axes)
         free_pos, free_vel = self.motion(asked.pos_m, asked.vel_m_s, accel)
@@ -360,8 +360,9 @@ class CondensedMpc:
         hc, n = self.horizon.control, len(self.axes)
         if x is None:
             return np.tile(u_prev, (hc, 1))
-        wanted = np.clip(x[: self._moves].reshape(n, hc).T * self._du_max, -self._du_max, self._du_max)
-        return np.asarray(np.clip(u_prev + np.cumsum(wanted, axis=0), self._u_min, self._u_max))
+        wanted = x[: self._moves].reshape(n, hc).T * self._du_max
+        wanted = np.minimum(np.maximum(wanted, -self._du_max), self._du_max)
+        return np.asarray(np.minimum(np.maximum(u_prev + np.cumsum(wanted, axis=0), self._u_min), self._u_max))
 
     def _shortfalls(self, x: Array | None, moves: Array) -> tuple[float, float, float]:
         """Largest slack used, violation of a half-space and gap of a terminal row [m] for the moves as clipped."""

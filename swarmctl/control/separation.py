@@ -90,26 +90,41 @@ def radius_problem(params: SeparationParams, accuracy_m: float) -> str:
 
 
 def align(path: PredictedPath, t0_utc_us: int, dt_us: int, steps: int, brake_m_s2: float) -> Array:
-    """Positions (steps+1, 3) of a peer at `t0_utc_us + k dt_us`: interpolated, then braking to a stop.
+    """Positions (steps+1, 3) of a peer at `t0_utc_us + k dt_us`; see `aligned`."""
+    return np.asarray(aligned([path], t0_utc_us, dt_us, steps, brake_m_s2)[0])
+
+
+def aligned(paths: Sequence[PredictedPath], t0_utc_us: int, dt_us: int, steps: int, brake_m_s2: float) -> Array:
+    """Positions (N, steps+1, 3) of peers at `t0_utc_us + k dt_us`: interpolated, then braking to a stop.
 
     Times before the first point are extrapolated backwards along the first segment.
     """
-    points = path.pos_ned_m
-    last = len(points) - 1
-    k = (t0_utc_us - path.t0_utc_us) / path.dt_us + np.arange(steps + 1) * (dt_us / path.dt_us)  # (steps+1,) in points
-    low = np.clip(np.floor(k).astype(int), 0, last - 1)
-    inside: Array = points[low] + (np.minimum(k, last) - low)[:, None] * (points[low + 1] - points[low])
-    beyond_s = (k - last) * (path.dt_us * 1e-6)
-    if beyond_s[-1] <= 0.0:
-        return inside
-    vel = (points[last] - points[last - 1]) / (path.dt_us * 1e-6)  # (3,)
+    counts = np.array([len(path.pos_ned_m) for path in paths])[:, None]
+    firsts = np.cumsum(counts)[:, None] - counts  # (N, 1) in all points
+    points = np.concatenate([path.pos_ned_m for path in paths])
+    since = np.array([(t0_utc_us - path.t0_utc_us) / path.dt_us for path in paths])[:, None]
+    pace = np.array([dt_us / path.dt_us for path in paths])[:, None]
+    last = counts - 1
+    k = since + np.arange(steps + 1) * pace  # (N, steps+1) in points
+    low = np.minimum(np.maximum(np.floor(k).astype(int), 0), last - 1)
+    begins = points[firsts + low]
+    found: Array = begins + (np.minimum(k, last) - low)[:, :, None] * (points[firsts + low + 1] - begins)
+    beyond = k - last
+    for i, path in enumerate(paths):
+        if beyond[i, -1] > 0.0:
+            _brake(found[i], path, beyond[i] * (path.dt_us * 1e-6), brake_m_s2)
+    return found
+
+
+def _brake(found_ned_m: Array, path: PredictedPath, beyond_s: Array, brake_m_s2: float) -> None:
+    """Move positions (steps+1, 3) on by what it takes to stop beyond the path's end."""
+    vel = (path.pos_ned_m[-1] - path.pos_ned_m[-2]) / (path.dt_us * 1e-6)  # (3,)
     speed = math.sqrt(float(vel @ vel))
     if speed < _TINY_M:
-        return inside
-    t_s = np.clip(beyond_s, 0.0, speed / brake_m_s2)
+        return
+    t_s = np.minimum(np.maximum(beyond_s, 0.0), speed / brake_m_s2)
     travelled = speed * t_s - 0.5 * brake_m_s2 * t_s * t_s
-    inside += travelled[:, None] * (vel / speed)
-    return inside
+    found_ned_m += travelled[:, None] * (vel / speed)
 
 
 def keep_out_of_peer(
@@ -120,6 +135,7 @@ def keep_out_of_peer(
     params: SeparationParams,
     parked: bool = False,
     landing: bool = False,
+    points: Array | None = None,
 ) -> KeepOut:
     """What to stay clear of because of one peer.
 
@@ -129,12 +145,13 @@ def keep_out_of_peer(
         params: distance and margins.
         parked: it has landed, so its path does not grow with age.
         landing: it or we are about to descend, so it is kept clear of at every height.
+        points: as from `align`, if that has been done.
     """
     age_s = max(0.0, (t0_utc_us - path.t0_utc_us) * 1e-6)
     margin_m = 0.0 if parked else min(0.5 * params.age_accel_m_s2 * age_s * age_s, params.age_margin_max_m)
     radius_m = params.radius_m + params.tracking_m + path.radius_m + margin_m
     return KeepOut(
-        align(path, t0_utc_us, dt_us, steps, params.brake_m_s2),
+        align(path, t0_utc_us, dt_us, steps, params.brake_m_s2) if points is None else points,
         radius_m,
         params.radius_m + path.radius_m - params.certify_slack_m,
         landing or (age_s > params.lost_after_s and not parked),

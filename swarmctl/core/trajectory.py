@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from swarmctl.core.types import Array, PredictedPath
+from swarmctl.core.types import Array
 
 Times = NDArray[Any]  # [us] of UTC, whole or not
 _STOPPED_M_S = 1e-3
@@ -49,9 +50,18 @@ class Trajectory:
         vel = self.sample(np.array([t_utc_us - half_us, t_utc_us + half_us]))[1]
         return np.asarray((vel[1] - vel[0]) / (self.dt_us * 1e-6))
 
-    def path(self, agent: int, boot_id: int, seq: int) -> PredictedPath:
-        """As peers look at it."""
-        return PredictedPath(agent, boot_id, seq, self.t0_utc_us, self.dt_us, 0.0, self.pos_ned_m)
+
+def places(trajectories: Sequence[Trajectory], t_utc_us: Times) -> Array:
+    """Positions (N, M, 3) of several at times (M,), straight between their points."""
+    lasts = np.array([len(t.pos_ned_m) - 1 for t in trajectories])
+    firsts = np.cumsum(lasts + 1) - lasts - 1  # (N,) in all points
+    points = np.concatenate([t.pos_ned_m for t in trajectories])
+    begins = np.array([t.t0_utc_us for t in trajectories], np.float64)[:, None]
+    steps = np.array([t.dt_us for t in trajectories], np.float64)[:, None]
+    k = np.minimum(np.maximum((t_utc_us - begins) / steps, 0.0), lasts[:, None])
+    low = np.minimum(k.astype(np.int64), lasts[:, None] - 1)
+    part, low = (k - low)[:, :, None], low + firsts[:, None]
+    return np.asarray(points[low] + part * (points[low + 1] - points[low]))
 
 
 def resting(pos_ned_m: Array, t_utc_us: int, dt_us: int) -> Trajectory:

@@ -27,6 +27,8 @@ _PROPOSAL = struct.Struct("<Iq")  # number, time it was made
 _TRAJECTORY = struct.Struct("<qiH2x")
 _HEARD = struct.Struct("<II")
 
+Memory = dict[bytes, Trajectory]  # trajectories by their bytes
+
 
 def encode_intent(intent: Intent) -> bytes:
     """Bytes of one message."""
@@ -49,21 +51,28 @@ def encode_intent(intent: Intent) -> bytes:
     return b"".join(parts)
 
 
-def decode_intent(payload: bytes) -> Intent | None:
-    """The message; None unless magic, version, lengths and every number are good."""
+def decode_intent(payload: bytes, memory: Memory | None = None) -> Intent | None:
+    """The message; None unless magic, version, lengths and every number are good.
+
+    `memory` holds the trajectories of the message before: one that is said again is the same object again.
+    """
     try:
         magic, version, flags, agent, boot_id, seq, count = _HEADER.unpack_from(payload)
         if magic != _MAGIC or version != INTENT_VERSION or flags > 3 or count > MAX_ACKNOWLEDGED:
             return None
-        committed, at = _decode_trajectory(payload, _HEADER.size)
+        known, said = memory or {}, Memory()
+        committed, at = _decode_trajectory(payload, _HEADER.size, known, said)
         proposal = None
         if flags & _PROPOSES:
             number, made_utc_us = _PROPOSAL.unpack_from(payload, at)
-            trajectory, at = _decode_trajectory(payload, at + _PROPOSAL.size)
+            trajectory, at = _decode_trajectory(payload, at + _PROPOSAL.size, known, said)
             proposal = Proposal(number, made_utc_us, agent, trajectory)
         if len(payload) != at + count * _HEARD.size:
             return None
         heard = dict(_HEARD.iter_unpack(payload[at:]))
+        if memory is not None:
+            memory.clear()
+            memory.update(said)
         return Intent(agent, boot_id, seq, bool(flags & _PROMISED), committed, proposal, heard)
     except (struct.error, ValueError):
         return None
@@ -74,20 +83,26 @@ def _encode_trajectory(trajectory: Trajectory) -> bytes:
     return _TRAJECTORY.pack(trajectory.t0_utc_us, trajectory.dt_us, len(points)) + points.tobytes()
 
 
-def _decode_trajectory(payload: bytes, at: int) -> tuple[Trajectory, int]:
+def _decode_trajectory(payload: bytes, at: int, known: Memory, said: Memory) -> tuple[Trajectory, int]:
     """The trajectory that begins there, and where it ends.
 
     Raises:
         ValueError, struct.error: it is none.
     """
     t0_utc_us, dt_us, count = _TRAJECTORY.unpack_from(payload, at)
+    end = at + _TRAJECTORY.size + 24 * count
+    body = payload[at:end]
+    if body in known:
+        said[body] = known[body]
+        return said[body], end
     at += _TRAJECTORY.size
     if not 2 <= count <= MAX_POINTS or dt_us <= 0 or len(payload) < at + 24 * count:
         raise ValueError("no trajectory")
     points: Array = np.frombuffer(payload, "<f4", 6 * count, at).reshape(count, 6).astype(np.float64)
     if not np.isfinite(points).all():
         raise ValueError("not finite")
-    return Trajectory(t0_utc_us, dt_us, points[:, :3], points[:, 3:]), at + 24 * count
+    said[body] = Trajectory(t0_utc_us, dt_us, points[:, :3].copy(), points[:, 3:].copy())
+    return said[body], end
 
 
 class PeerIntents:
@@ -99,12 +114,13 @@ class PeerIntents:
 
     def __init__(self, peers: Iterable[int]) -> None:
         self._expected = frozenset(peers)
+        self._memory = {agent_name(agent): Memory() for agent in self._expected}
         self.newest: dict[int, Intent] = {}
         self.rejected: Counter[str] = Counter()
 
     def offer(self, sender: str, payload: bytes) -> None:
         """Judge one message; `sender` is the name the bus vouches for."""
-        intent = decode_intent(payload)
+        intent = decode_intent(payload, self._memory.get(sender))
         if intent is None:
             self.rejected["malformed"] += 1
         elif sender != agent_name(intent.agent):
