@@ -69,6 +69,7 @@ class CommitParams(Params):
     moves: int = Field(8, ge=2, le=40)
     brake_m_s2: float = Field(1.5, gt=0, le=10)  # of that braking
     share_01: float = Field(0.8, gt=0, le=1)  # of the controller's tilt that plans may use; the rest is for tracking
+    period_s: float = Field(0.1, ge=0, le=2)  # between two plans, at least
     lead_min_s: float = Field(0.06, ge=0.02, le=2)  # from proposing to flying it
     lead_max_s: float = Field(1.5, ge=0.1, le=5)
 
@@ -113,7 +114,7 @@ class Commitments:
         )
         self._latencies_s: deque[float] = deque(maxlen=_LATENCIES)
         self._lead_s = params.lead_min_s
-        self._number = 0
+        self._number, self._next_us = 0, 0
         self._cleared: dict[int, Trajectory] = {}  # by identity: what the own proposal is known to be clear of
         self.committed: Trajectory | None = None
         self.proposal: Proposal | None = None
@@ -180,8 +181,9 @@ class Commitments:
         others: Sequence[KeepOut],
     ) -> None:
         """Rule 4. `reference` gives positions and velocities at offsets [s] from now; `others` as from `keep_outs`."""
-        if self.proposal is not None or self.committed is None:
+        if self.proposal is not None or self.committed is None or utc_us < self._next_us:
             return
+        self._next_us = utc_us + round(self._params.period_s * 1e6)
         branch_us = utc_us + self.lead_us
         plan = self._planned(branch_us, utc_us, reference, peers, others)
         trajectory = None if plan is None else self._clear(plan, branch_us, utc_us, peers, others)
