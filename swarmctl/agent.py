@@ -6,35 +6,29 @@ It has no thread, socket, sleep or simulation branch: transport, bus, slow path,
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import numpy as np
-from pydantic import Field
 
-from swarmctl.control.barrier import BarrierParams
-from swarmctl.control.commit import CommitParams
-from swarmctl.control.controller import ControllerParams, make_controller
-from swarmctl.control.detour import Deadlock, Detour, DetourParams, Sampled
-from swarmctl.control.disturbance import DisturbanceObserver, DisturbanceParams
+from swarmctl.agent_setup import AgentSetup, make_estimator
+from swarmctl.control.controller import make_controller
+from swarmctl.control.detour import Deadlock, Detour, Sampled
 from swarmctl.control.facts import Facts
-from swarmctl.control.failsafe import FailsafeParams, Judgement, judge
+from swarmctl.control.failsafe import Judgement, judge
 from swarmctl.control.fallback import rest_plan
-from swarmctl.control.mission import MissionParams, MissionReference
-from swarmctl.control.model import Predictor, VehicleModelParams
+from swarmctl.control.mission import MissionReference
+from swarmctl.control.model import Predictor
 from swarmctl.control.problem import Problem, Start
 from swarmctl.control.replay import Replay
-from swarmctl.control.separation import KeepOut, SeparationParams, radius_problem
+from swarmctl.control.separation import KeepOut, radius_problem
 from swarmctl.control.sequence import Sequence as MissionSequence
-from swarmctl.control.sequence import SequenceParams
 from swarmctl.control.setpoint import setpoint_of
-from swarmctl.control.state_filter import StateFilter, StateFilterParams
 from swarmctl.coordination import Coordination
 from swarmctl.core.clock import Clock
 from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned
-from swarmctl.core.params import Params
 from swarmctl.core.types import (
     NO_TIMES,
     Array,
@@ -64,43 +58,6 @@ _NOTHING_US = -1
 _FLIES = (Mode.FOLLOW, Mode.REPLAY, Mode.BRAKE, Mode.HOLD)
 _DEVIATES = (Mode.BRAKE, Mode.HOLD, Mode.LAND, Mode.YIELD, Mode.BLIND)  # from what it has promised
 _AUTOPILOT_HOVERS = (FlightMode.HOLD, FlightMode.EXTERNAL)  # in the latter while it takes off by itself
-
-
-class AgentParams(Params):
-    """Everything of an agent that is neither controller nor vehicle."""
-
-    rate_hz: float = Field(50.0, ge=10, le=200)
-    connect_timeout_s: float = Field(15.0, gt=0, le=600)
-    sequence: SequenceParams = SequenceParams()
-    failsafe: FailsafeParams = FailsafeParams()
-    disturbance: DisturbanceParams = DisturbanceParams()
-    state_filter: StateFilterParams = StateFilterParams()
-    barrier: BarrierParams = BarrierParams()
-    commit: CommitParams = CommitParams()
-    detour: DetourParams = DetourParams()
-    autopilot_params: dict[str, int | float] = Field({"COM_OBL_RC_ACT": 4})  # PX4: land when setpoints stop
-
-
-def _estimator(params: AgentParams, model: VehicleModelParams) -> DisturbanceObserver | StateFilter:
-    if params.state_filter.enabled:
-        return StateFilter(params.state_filter, params.disturbance, model)
-    return DisturbanceObserver(params.disturbance, model.hover_thrust_01)
-
-
-@dataclass(frozen=True, slots=True)
-class AgentSetup:
-    """What one agent is told before it starts."""
-
-    agent: int
-    boot_id: int
-    sysid: int
-    params: AgentParams
-    mission: MissionParams
-    starts_ned_m: Array  # (agents, 3)
-    controller: ControllerParams
-    separation: SeparationParams
-    vehicle_model: VehicleModelParams
-    obstacle_slots: int
 
 
 class Agent:
@@ -137,6 +94,7 @@ class Agent:
                 slots,
                 self._surroundings,
                 bus,
+                self._note,
                 stopwatch_ns,
             )
         self._controller = make_controller(
@@ -152,7 +110,7 @@ class Agent:
                 slots,
                 stopwatch_ns,
             )
-        self._observer = _estimator(setup.params, setup.vehicle_model)
+        self._observer = make_estimator(setup.params, setup.vehicle_model)
         self._predictor = Predictor(setup.vehicle_model)
         self._last_layer = LastLayer(
             setup.params.barrier,
@@ -206,7 +164,16 @@ class Agent:
     @property
     def rejected(self) -> dict[str, int]:
         """Bus messages refused so far, by reason."""
-        return dict(self._surroundings.paths.rejected)
+        found = Counter(self._surroundings.paths.rejected)
+        if self._coordination is not None:
+            found.update(self._coordination.rejected)
+        return dict(found)
+
+    @property
+    def commits_refused(self) -> int | None:
+        """Proposals that were not flown after peers had been heard; None unless separation is guaranteed."""
+        counts = None if self._coordination is None else self._coordination.counts
+        return None if counts is None else counts.withdrawn + counts.expired
 
     def ask(self, verb: str, now_us: int) -> None:
         """An operator's wish: hold, resume, land, rtl."""

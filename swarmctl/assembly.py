@@ -6,7 +6,8 @@ from collections.abc import Callable
 
 import numpy as np
 
-from swarmctl.agent import Agent, AgentSetup
+from swarmctl.agent import Agent
+from swarmctl.agent_setup import AgentSetup
 from swarmctl.config import Config
 from swarmctl.core.clock import Clock
 from swarmctl.core.types import GeoOrigin

@@ -18,7 +18,7 @@ from typing import Any, Literal
 
 from pydantic import Field, ValidationError
 
-from swarmctl.agent import AgentParams
+from swarmctl.agent_setup import AgentParams
 from swarmctl.control.controller import ControllerParams
 from swarmctl.control.mission import MissionParams
 from swarmctl.control.model import VehicleModelParams

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import asdict
 
 import numpy as np
 
-from swarmctl.control.commit import CommitCounts, Commitments, CommitParams
+from swarmctl.control.commit import CommitCounts, Commitments, CommitParams, promised_m
 from swarmctl.control.mpc import MpcParams
 from swarmctl.control.separation import KeepOut, SeparationParams
 from swarmctl.core.intent import Intent
@@ -29,6 +30,8 @@ class Coordination:
         params, mpc, separation, slots, stopwatch_ns: see `Commitments`.
         surroundings: who else is there.
         bus: is drained by `listen`.
+        note: is told `off_promise` when what is flown leaves what is promised by more than half of what is promised
+            beyond touching bodies, and when it is back; and `promises` with all counts when somebody else takes over.
     """
 
     def __init__(
@@ -42,14 +45,16 @@ class Coordination:
         slots: int,
         surroundings: Surroundings,
         bus: Bus,
+        note: Callable[..., None],
         stopwatch_ns: Callable[[], int],
     ) -> None:
         self._agent, self._boot_id, self._bus, self._surroundings = agent, boot_id, bus, surroundings
         self._commitments = Commitments(agent, params, mpc, separation, slots, stopwatch_ns)
         self._intents, self._peers = PeerIntents(peers), frozenset(peers)
-        self._seq = 0
+        self._note, self._seq = note, 0
         self._promised = False
-        self.tracking_error_m = 0.0  # from what it follows
+        self._allowed_m = separation.tracking_m + 0.5 * (promised_m(separation) - separation.body_m)
+        self._is_off, self._worst_m = False, 0.0
 
     @property
     def counts(self) -> CommitCounts:
@@ -77,11 +82,13 @@ class Coordination:
         commitments.avoid(utc_us, self._others(utc_us, state, phase, taking_part))
         ahead = self._others(utc_us + commitments.lead_us, state, phase, taking_part)
         commitments.propose(utc_us, reference, known, ahead)
-        self.tracking_error_m = float(np.linalg.norm(state.pos_ned_m - self.follow(np.array([utc_us]))[0][0]))
+        self._watch(float(np.linalg.norm(state.pos_ned_m - self.follow(np.array([utc_us]))[0][0])))
 
     def idle(self, utc_us: int, state: VehicleState) -> None:
         """Somebody else flies: nothing is promised, what others propose is acknowledged all the same."""
-        self._promised = False
+        if self._promised:
+            self._promised = False
+            self._note("promises", **asdict(self.counts), worst_tracking_m=self._worst_m)
         self._commitments.end(state.pos_ned_m, utc_us)
 
     def follow(self, t_utc_us: Times) -> tuple[Array, Array]:
@@ -104,6 +111,12 @@ class Coordination:
             self._intents.heard(),
         )
         self._bus.publish(topics.INTENT, encode_intent(intent))
+
+    def _watch(self, error_m: float) -> None:
+        self._worst_m = max(self._worst_m, error_m)
+        if (error_m > self._allowed_m) != self._is_off:
+            self._is_off = not self._is_off
+            self._note("off_promise", begins=self._is_off, error_m=error_m, allowed_m=self._allowed_m)
 
     def _living(self) -> frozenset[int]:
         """Peers whose acknowledgement counts: off the bus all of them, for then nobody is known to be dead."""

@@ -28,8 +28,8 @@ What it rests on, and how that is watched in flight:
 
 - Agents mean the same time: a clock offset of e seconds costs v e metres. `separation.tracking_m` covers it; offsets
   of vehicles' clocks are measured, hosts are to be synchronised.
-- They fly what they follow: the distance from the committed trajectory is `tracking_error_m`, an event when it
-  exceeds the allowance.
+- They fly what they follow: half of what is promised beyond touching bodies may be missed by each. An event
+  `off_promise` says who misses more, and `promises` at the end the worst of the flight.
 - Everybody takes part. Who does not (a pilot flies, an agent has died) is a keep-out of the best-effort kind, and a
   peer is dead only when its liveliness token is gone while the own one is there: who is off the bus commits nothing.
 """
@@ -264,7 +264,7 @@ class Commitments:
         if not trajectories:
             return []
         p = self._separation
-        radius_m, certified_m = p.radius_m + p.tracking_m, p.radius_m - p.certify_slack_m
+        radius_m, certified_m = p.radius_m + p.tracking_m, promised_m(p)
         where = places(trajectories, t0_utc_us + np.arange(steps + 1) * self._dt_us)
         return [
             KeepOut(points, radius_m, certified_m, False, agent, p.downwash)
@@ -273,6 +273,11 @@ class Commitments:
 
     def _set_lead(self, lead_s: float) -> None:
         self._lead_s = min(self._params.lead_max_s, max(self._params.lead_min_s, lead_s))
+
+
+def promised_m(params: SeparationParams) -> float:
+    """Distance that no two committed trajectories come closer than."""
+    return params.radius_m - params.certify_slack_m
 
 
 def _intended(intent: Intent) -> tuple[Trajectory, ...]:

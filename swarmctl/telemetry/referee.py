@@ -99,6 +99,7 @@ def judge(
         "solver": _solver(run.ticks, rules.solver_name),
         "comms": _comms(run),
         "deadlocks": _deadlocks(run.events),
+        "promises": _promises(run.events),
     }
     result: dict[str, Any] = plain(summary)
     return result
@@ -270,6 +271,20 @@ def _deadlocks(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     lasted_s = [float(event["lasted_s"]) for event in noticed if isinstance(event.get("lasted_s"), (int, float))]
     begun = sum(event.get("begins") is True for event in noticed)
     return {"count": begun, "longest_s": max(lasted_s, default=None), "unresolved": begun - len(lasted_s)}
+
+
+def _promises(events: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+    """Sums over agents of what they counted by their last `promises` event; None where nothing was guaranteed."""
+    last = {event.get("source"): event for event in events if event.get("event") == "promises"}
+    if not last:
+        return None
+    names = ("proposed", "committed", "withdrawn", "expired", "unplanned", "stopped")
+    worst_m = max(float(event["worst_tracking_m"]) for event in last.values())
+    off = sum(event.get("event") == "off_promise" and event.get("begins") is True for event in events)
+    return {name: sum(int(event[name]) for event in last.values()) for name in names} | {
+        "worst_tracking_m": worst_m,
+        "off_promise": off,
+    }
 
 
 def _not_a_number(truth: NDArray[np.void]) -> Iterator[str]:

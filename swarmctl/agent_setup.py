@@ -1,0 +1,59 @@
+"""What one agent is told before it starts: its parameters, its place in the swarm, its vehicle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pydantic import Field
+
+from swarmctl.control.barrier import BarrierParams
+from swarmctl.control.commit import CommitParams
+from swarmctl.control.controller import ControllerParams
+from swarmctl.control.detour import DetourParams
+from swarmctl.control.disturbance import DisturbanceObserver, DisturbanceParams
+from swarmctl.control.failsafe import FailsafeParams
+from swarmctl.control.mission import MissionParams
+from swarmctl.control.model import VehicleModelParams
+from swarmctl.control.separation import SeparationParams
+from swarmctl.control.sequence import SequenceParams
+from swarmctl.control.state_filter import StateFilter, StateFilterParams
+from swarmctl.core.params import Params
+from swarmctl.core.types import Array
+
+
+class AgentParams(Params):
+    """Everything of an agent that is neither controller nor vehicle."""
+
+    rate_hz: float = Field(50.0, ge=10, le=200)
+    connect_timeout_s: float = Field(15.0, gt=0, le=600)
+    sequence: SequenceParams = SequenceParams()
+    failsafe: FailsafeParams = FailsafeParams()
+    disturbance: DisturbanceParams = DisturbanceParams()
+    state_filter: StateFilterParams = StateFilterParams()
+    barrier: BarrierParams = BarrierParams()
+    commit: CommitParams = CommitParams()
+    detour: DetourParams = DetourParams()
+    autopilot_params: dict[str, int | float] = Field({"COM_OBL_RC_ACT": 4})  # PX4: land when setpoints stop
+
+
+@dataclass(frozen=True, slots=True)
+class AgentSetup:
+    """What one agent is told before it starts."""
+
+    agent: int
+    boot_id: int
+    sysid: int
+    params: AgentParams
+    mission: MissionParams
+    starts_ned_m: Array  # (agents, 3)
+    controller: ControllerParams
+    separation: SeparationParams
+    vehicle_model: VehicleModelParams
+    obstacle_slots: int
+
+
+def make_estimator(params: AgentParams, model: VehicleModelParams) -> DisturbanceObserver | StateFilter:
+    """Of state and disturbance, as configured."""
+    if params.state_filter.enabled:
+        return StateFilter(params.state_filter, params.disturbance, model)
+    return DisturbanceObserver(params.disturbance, model.hover_thrust_01)
