@@ -141,9 +141,18 @@ class Agent:
         self._certified_us: int | None = None
         self._hold_at: Array | None = None
         self._reporter = Reporter(
-            setup.agent, setup.boot_id, setup.sysid, autopilot, self._surroundings.paths, bus, clock, sink
+            setup.agent,
+            setup.boot_id,
+            setup.sysid,
+            self._coordination is not None,
+            autopilot,
+            self._surroundings.paths,
+            bus,
+            clock,
+            sink,
         )
-        self.took = Took(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # of the last tick
+        self.took = Took(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # of the last tick
+        self._promise_ns = 0  # of the last tick
         self._announced: tuple[Phase, Mode, FlightMode] | None = None
         self._problem = ""
         self._last_state_us = _NOTHING_US
@@ -196,7 +205,9 @@ class Agent:
         times = NO_TIMES if thought.plan is None else thought.plan.times
         self.took = Took(
             (sensed_ns - began_ns) * 1e-6,
-            (thought_ns - sensed_ns) * 1e-6 - (times.spaces_us + times.solve_us + times.certify_us) * 1e-3,
+            (thought_ns - sensed_ns - self._promise_ns) * 1e-6
+            - (times.spaces_us + times.solve_us + times.certify_us) * 1e-3,
+            self._promise_ns * 1e-6,
             times.spaces_us * 1e-3,
             times.solve_us * 1e-3,
             times.certify_us * 1e-3,
@@ -279,11 +290,13 @@ class Agent:
         """What has been promised, over the horizon from when the setpoint acts; None when nothing is."""
         if self._coordination is None:
             return None
-        utc_us = self._clock.utc_us()
+        utc_us, began_ns = self._clock.utc_us(), self._stopwatch_ns()
+        self._promise_ns = 0
         if not (flies and self._sequence.had_control) or self._judgement.mode in _DEVIATES:
             self._coordination.idle(utc_us, state)
             return None
         self._coordination.step(utc_us, state, self._sequence.phase, self._wanted(now_us))
+        self._promise_ns = self._stopwatch_ns() - began_ns
         act_us = utc_us + self._predictor.delay_us
         pos, vel = self._coordination.follow(act_us + np.arange(self._controller.longest + 1) * self._controller.dt_us)
         return Reference(pos, vel, self._setup.mission.yaw_rad)

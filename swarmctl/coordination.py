@@ -7,7 +7,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from swarmctl.control.commit import CommitCounts, Commitments, CommitParams, promised_m
+from swarmctl.control.commit import CommitCounts, Commitments, CommitParams, intended, promised_m
 from swarmctl.control.mpc import MpcParams
 from swarmctl.control.separation import KeepOut, SeparationParams
 from swarmctl.core.intent import Intent
@@ -79,6 +79,7 @@ class Coordination:
         known, living = self._intents.newest, self._living()
         commitments.hear(utc_us, known, living)
         taking_part = {agent for agent in living if agent in known and known[agent].promised}
+        self._surroundings.promised = {agent: intended(known[agent]) for agent in taking_part}
         commitments.avoid(utc_us, self._others(utc_us, state, phase, taking_part))
         ahead = self._others(utc_us + commitments.lead_us, state, phase, taking_part)
         commitments.propose(utc_us, reference, known, ahead)
@@ -88,6 +89,7 @@ class Coordination:
         """Somebody else flies: nothing is promised, what others propose is acknowledged all the same."""
         if self._promised:
             self._promised = False
+            self._surroundings.promised = {}
             self._note("promises", **asdict(self.counts), worst_tracking_m=self._worst_m)
         self._commitments.end(state.pos_ned_m, utc_us)
 
@@ -119,11 +121,12 @@ class Coordination:
             self._note("off_promise", begins=self._is_off, error_m=error_m, allowed_m=self._allowed_m)
 
     def _living(self) -> frozenset[int]:
-        """Peers whose acknowledgement counts: off the bus all of them, for then nobody is known to be dead."""
+        """Peers that promise and whose acknowledgement counts: off the bus nobody is known to be dead."""
         alive = self._bus.alive()
+        promising = frozenset(agent for agent in self._peers if self._surroundings.promises(agent))
         if agent_name(self._agent) not in alive:
-            return self._peers
-        return frozenset(agent for agent in self._peers if agent_name(agent) in alive)
+            return promising
+        return frozenset(agent for agent in promising if agent_name(agent) in alive)
 
     def _others(self, t0_utc_us: int, state: VehicleState, phase: Phase, taking_part: set[int]) -> list[KeepOut]:
         """Who takes no part, and obstacles, on the planner's grid from a time on."""

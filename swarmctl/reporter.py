@@ -69,6 +69,7 @@ class Took:
 
     sense_ms: float  # listen included
     setup_ms: float  # prediction, reference, keep-outs, matrices
+    promise_ms: float  # hearing, judging and planning promises; 0 in best effort
     spaces_ms: float  # half-spaces
     solve_ms: float  # inside the QP solver
     certify_ms: float
@@ -79,7 +80,7 @@ class Took:
     def tick_ms(self) -> float:
         """Listen to send."""
         planned_ms = self.setup_ms + self.spaces_ms + self.solve_ms + self.certify_ms
-        return self.sense_ms + planned_ms + self.barrier_ms + self.send_ms
+        return self.sense_ms + self.promise_ms + planned_ms + self.barrier_ms + self.send_ms
 
 
 class Reporter:
@@ -87,6 +88,7 @@ class Reporter:
 
     Args:
         agent, boot_id, sysid: who reports.
+        promises: it flies only what it has promised.
         autopilot: the vehicle, for what it says of itself.
         paths: what is known of peers.
         bus, clock, sink: where it goes.
@@ -97,13 +99,14 @@ class Reporter:
         agent: int,
         boot_id: int,
         sysid: int,
+        promises: bool,
         autopilot: Autopilot,
         paths: PeerPaths,
         bus: Bus,
         clock: Clock,
         sink: TickSink,
     ) -> None:
-        self._agent, self._boot_id, self._sysid = agent, boot_id, sysid
+        self._agent, self._boot_id, self._sysid, self._promises = agent, boot_id, sysid, promises
         self._autopilot, self._paths = autopilot, paths
         self._bus, self._clock, self._sink = bus, clock, sink
         self._recent_ms: deque[float] = deque(maxlen=_RECENT_TICKS)
@@ -216,6 +219,7 @@ class Reporter:
             path_age_ms=_finite(record.path_age_ms),
             solver_failed=self.failed_plans,
             problem=self.problem,
+            promises=self._promises,
         )
 
 

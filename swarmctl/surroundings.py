@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Set
+from collections.abc import Mapping, Sequence, Set
 
 import numpy as np
 
@@ -16,6 +16,7 @@ from swarmctl.control.separation import (
     keep_out_of_peer,
     visible,
 )
+from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.types import Array, Mode, Obstacle, Phase
 from swarmctl.links import topics
 from swarmctl.links.peers import Bus, PeerPaths, agent_name
@@ -40,6 +41,7 @@ class Surroundings:
         self._obstacles: tuple[Obstacle, ...] = ()
         self._obstacles_version = -1
         self._seen: dict[int, Obstacle] = {}  # that have been visible, by identity
+        self.promised: Mapping[int, Sequence[Trajectory]] = {}  # what peers may follow, of those who promise
 
     def listen(self, utc_us: int) -> list[str]:
         """Take in everything that has arrived; returns the operator's verbs for this agent."""
@@ -94,10 +96,21 @@ class Surroundings:
         return [o for o in self._seen.values() if not o.vel_ned_m_s.any()]
 
     def bodies(self, pos_ned_m: Array, act_utc_us: int, ahead_s: float, margin_m: float) -> list[Body]:
-        """What not to touch, `ahead_s` after `act_utc_us`: peers heard of and obstacles seen from `pos_ned_m` (3,)."""
+        """What not to touch, `ahead_s` after `act_utc_us`: peers heard of and obstacles seen from `pos_ned_m` (3,).
+
+        Who promises is where it has promised to be, however old the message.
+        """
         p, fresh_us = self._params, act_utc_us - round(self._params.lost_after_s * 1e6)
-        found = []
+        found: list[Body] = []
+        for agent, trajectories in self.promised.items():
+            status = self._status.get(agent)
+            share_01 = 0.5 if status is not None and status.mode in _FLOWN_BY_AGENT else 1.0
+            felt_us = np.array([act_utc_us + ahead_s * 1e6])
+            for pos, vel in (trajectory.sample(felt_us) for trajectory in trajectories):
+                found.append(Body(tuple(pos[0].tolist()), tuple(vel[0].tolist()), p.body_m + margin_m, share_01))
         for path in self.paths.latest():
+            if path.agent in self.promised:
+                continue
             status = self._status.get(path.agent)
             filters = status is not None and status.mode in _FLOWN_BY_AGENT and path.t0_utc_us >= fresh_us
             growth_m_s2 = 0.0 if self._phase(path.agent) is Phase.DONE else p.age_accel_m_s2
@@ -105,6 +118,11 @@ class Surroundings:
             found.append(body_of_peer(path, act_utc_us, ahead_s, apart_m, growth_m_s2, p.age_margin_max_m, filters))
         apart_m = 0.5 * p.body_m + margin_m
         return found + [body_of_obstacle(o, ahead_s, apart_m) for o in visible(self._obstacles, pos_ned_m)]
+
+    def promises(self, agent: int) -> bool:
+        """Whether a peer flies by promises, as far as it is known."""
+        status = self._status.get(agent)
+        return status is None or status.promises
 
     def peers(self) -> dict[int, PeerFacts]:
         """Who has been heard of, how far it is, and whether it is still on the bus."""

@@ -7,6 +7,7 @@ from sitl.campaign.trials import Cell, Trial
 _CELLS: tuple[tuple[Cell, int], ...] = (
     (Cell("swap", 3, 100.0, 0.1, "exact", 0.0, "default"), 1),
     (Cell("swap", 3, 100.0, 0.1, "exact", 0.0, "off"), 2),
+    (Cell("swap", 3, 300.0, 0.3, "exact", 0.0, "guaranteed"), 1),
     (Cell("random", 4, 0.0, 0.0, "exact", 0.0, "default"), 1),
 )
 

@@ -15,6 +15,7 @@ import sitl.experiments.one_thread  # noqa: F401
 # isort: split
 import argparse
 import json
+import math
 import os
 import sys
 from collections.abc import Callable, Sequence
@@ -37,11 +38,13 @@ from sitl.experiments.captured import (
     times_of,
 )
 from sitl.experiments.formation import Formation, formation_config
-from swarmctl.core.types import Array
+from sitl.lockstep import Lockstep
+from swarmctl.config import Config, load
+from swarmctl.core.types import Array, Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, ConfigError, MissionError, SwarmError
 from swarmctl.reporter import Took
 
-PARTS = ("sense", "setup", "spaces", "solve", "certify", "barrier", "send", "tick")
+PARTS = ("sense", "setup", "promise", "spaces", "solve", "certify", "barrier", "send", "tick")
 SOLVERS = ("osqp", "daqp")
 NEIGHBOURS = (0, 1, 2, 4, 8, 16, 30)
 MAX_NEIGHBOURS = 99
@@ -49,6 +52,10 @@ _BESIDE_PILLAR = 2  # neighbours of the scenario with an obstacle
 _WARM_UP_S = 5.0  # of the mission: catching up with the circle
 _READY_WITHIN_TICKS = 1500
 _OBSTACLE = ", 1 obstacle"
+_PROMISES = ", guaranteed"
+_PROMISING = 9  # neighbours of the scenario with promises
+_SWAP_ROOM_M = 0.63  # half of what neighbours on its circle are apart
+_ENDLESS_S = 3600.0
 _BUSY_LOAD = 0.7  # one-minute load average
 
 
@@ -70,7 +77,7 @@ def measure_ticks(
     pillar: bool = False,
     on_tick: Callable[[], None] = lambda: None,
 ) -> dict[str, Array]:
-    """Parts of `ticks` ticks, (ticks, 8) [ms] in the order of `PARTS`, by solver.
+    """Parts of `ticks` ticks, (ticks, 9) [ms] in the order of `PARTS`, by solver.
 
     Raises:
         MissionError: an agent did not get under way, or had no plan at a counted tick: a failing tick is no figure.
@@ -90,6 +97,47 @@ def measure_ticks(
     return {solver: np.array(rows) for solver, rows in took.items()}
 
 
+def measure_promises(
+    neighbours: int, solvers: Sequence[str], ticks: int, on_tick: Callable[[], None] = lambda: None
+) -> dict[str, Array]:
+    """The same of `neighbours + 1` agents that fly a swap by promises: ticks of all of them in turn, (ticks, 9) [ms].
+
+    Paths alone, as in `measure_ticks`, promise nothing: everybody is a whole agent here.
+    """
+    crowds = {solver: Lockstep(_swap_config(solver, neighbours + 1)) for solver in solvers}
+    took: dict[str, list[tuple[float, ...]]] = {solver: [] for solver in solvers}
+    for crowd in crowds.values():
+        while crowd.logs[0].rows == [] or int(crowd.logs[0].rows[-1]["phase"][0]) != Phase.TRACK:
+            crowd.step()
+    with settled_garbage():
+        for _ in range(0, ticks, neighbours + 1):
+            for solver, crowd in crowds.items():
+                crowd.step()
+                took[solver] += [_parts(agent.took) for agent in crowd.agents if agent is not None]
+            for _ in range(neighbours + 1):
+                on_tick()
+    return {solver: np.array(rows[:ticks]) for solver, rows in took.items()}
+
+
+def _swap_config(solver: str, agents: int) -> Config:
+    radius_m = max(4.0, _SWAP_ROOM_M / math.sin(math.pi / agents))
+    angles = 2.0 * math.pi * np.arange(agents) / agents
+    starts = [[round(radius_m * math.cos(a), 3), round(radius_m * math.sin(a), 3), 0.0] for a in angles]
+    return load(
+        None,
+        [
+            f"swarm.agents={agents}",
+            f"start.positions_ned_m={starts}",
+            "mission.kind='swap'",
+            f"mission.duration_s={_ENDLESS_S}",
+            f"separation.max_neighbours={max(1, agents - 1)}",
+            "separation.mode='guaranteed'",
+            f"controller.mpc.qp.solver='{solver}'",
+            "sitl.start='air'",
+        ],
+    )
+
+
 def _get_under_way(solver: str, formation: Formation) -> None:
     for _ in range(_READY_WITHIN_TICKS):
         formation.step()
@@ -99,7 +147,7 @@ def _get_under_way(solver: str, formation: Formation) -> None:
 
 
 def _parts(t: Took) -> tuple[float, ...]:
-    layers = t.spaces_ms, t.solve_ms, t.certify_ms, t.barrier_ms
+    layers = t.promise_ms, t.spaces_ms, t.solve_ms, t.certify_ms, t.barrier_ms
     return t.sense_ms, t.setup_ms, *layers, t.send_ms, t.tick_ms
 
 
@@ -130,8 +178,9 @@ def bench(
 ) -> list[BenchRow]:
     """Measure everything; shows progress on a terminal."""
     rows: list[BenchRow] = []
+    promising = min(_PROMISING, max(1, *neighbours, 0))
     with Progress(transient=True, console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task("ticks", total=ticks * (len(neighbours) + 1))
+        task = bar.add_task("ticks", total=ticks * (len(neighbours) + 2))
 
         def on_tick() -> None:
             bar.advance(task)
@@ -139,6 +188,8 @@ def bench(
         for count in neighbours:
             bar.update(task, description=f"{count} neighbours")
             rows += tick_rows(measure_ticks(count, solvers, ticks, on_tick=on_tick), count)
+        bar.update(task, description=f"{promising} neighbours that promise")
+        rows += tick_rows(measure_promises(promising, solvers, ticks, on_tick), promising, _PROMISES)
         bar.update(task, description=f"{_BESIDE_PILLAR} neighbours, 1 obstacle")
         beside = measure_ticks(_BESIDE_PILLAR, solvers, ticks, pillar=True, on_tick=on_tick)
         rows += tick_rows(beside, _BESIDE_PILLAR, _OBSTACLE)
@@ -160,7 +211,7 @@ def show(rows: Sequence[BenchRow], console: Console) -> None:
     """The rows as two tables and the ratios."""
     neighbours = Column("neighbours", min_width=10)
     table = Table("solver", neighbours, *PARTS, title="one tick: p50 (p99) [ms]", box=SIMPLE)
-    for suffix in ("", _OBSTACLE):
+    for suffix in ("", _PROMISES, _OBSTACLE):
         keys = dict.fromkeys((r.neighbours, r.solver) for r in rows if r.name == "tick" + suffix)
         for count, solver in keys:
             found = {r.name: r for r in rows if (r.neighbours, r.solver) == (count, solver)}

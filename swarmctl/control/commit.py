@@ -192,7 +192,7 @@ class Commitments:
             return
         self._number = max(self._number + 1, utc_us // 1000 & 0xFFFFFFFF)  # also above those before a restart
         self.proposal = Proposal(self._number, utc_us, self._agent, trajectory)
-        self._cleared = {id(known): known for intent in peers.values() for known in _intended(intent)}
+        self._cleared = {id(known): known for intent in peers.values() for known in intended(intent)}
         self.counts.proposed += 1
 
     @property
@@ -226,7 +226,7 @@ class Commitments:
         size = float(np.sqrt(lift @ lift))
         start = Start(branch_us, pos[0], vel[0], 1.0, np.array([lift[0] / size, lift[1] / size, size]))
         wanted = Reference(*reference(1e-6 * (ahead_us + self.lead_us)), 0.0)
-        known = [(t, intent.agent) for intent in peers.values() for t in _intended(intent)]
+        known = [(t, intent.agent) for intent in peers.values() for t in intended(intent)]
         keep_outs = self._keep_outs([t for t, _ in known], [agent for _, agent in known], branch_us, steps)
         plan = self._planner.plan(Problem(start, wanted, np.zeros(3), (*keep_outs, *others), pos))
         return None if plan.status is PlanStatus.SOLVER_FAILED else plan
@@ -236,7 +236,7 @@ class Commitments:
     ) -> Trajectory | None:
         """The plan, braked from as late as it then stays clear of everything known; None when it never does."""
         assert self.committed is not None
-        known = [trajectory for intent in peers.values() for trajectory in _intended(intent)]
+        known = [trajectory for intent in peers.values() for trajectory in intended(intent)]
         steps, dt_us, brake_m_s2 = self._planner.steps, self._dt_us, self._params.brake_m_s2
         ahead = branch_us + np.arange(steps + 1) * dt_us
         for share in _BRAKED_FROM_01:
@@ -280,7 +280,8 @@ def promised_m(params: SeparationParams) -> float:
     return params.radius_m - params.certify_slack_m
 
 
-def _intended(intent: Intent) -> tuple[Trajectory, ...]:
+def intended(intent: Intent) -> tuple[Trajectory, ...]:
+    """What an agent may follow from now on."""
     committed = (intent.committed,) if intent.promised else ()
     return committed if intent.proposal is None else (*committed, intent.proposal.trajectory)
 

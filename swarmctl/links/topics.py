@@ -102,6 +102,7 @@ class StatusMessage(msgspec.Struct, frozen=True):
     path_age_ms: float
     solver_failed: int
     problem: str  # newest thing an operator should know, "" when all is well
+    promises: bool = False  # it flies only what it has promised, see `control.commit`
 
 
 class CommandMessage(msgspec.Struct, frozen=True):

@@ -40,7 +40,8 @@ def quick(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_agents_that_see_each_other_do_not_collide(quick: Path) -> None:
-    rows = [row for row in rows_in(quick) if row["protections"] == "default"]
+    rows = [row for row in rows_in(quick) if row["protections"] != "off"]
+    assert {row["protections"] for row in rows} == {"default", "guaranteed"}
     assert {row["outcome"] for row in rows} == {"arrived"}
     assert all(row["min_separation_m"] > TOUCH_M[row["scenario"]] for row in rows)
     (alone,) = [row["unconstrained_time_s"] for row in rows if row["scenario"] == "random"]
@@ -76,7 +77,7 @@ def test_the_report_has_every_cell_with_its_exact_interval(quick: Path) -> None:
     exact = binomtest(hits, len(off)).proportion_ci(0.95, method="exact")
     share = f"{hits}/{len(off)} {100 * hits / len(off):.1f} % [{100 * exact.low:.1f}, {100 * exact.high:.1f}]"
     assert share in page
-    assert len(re.findall(r"<td>(?:default|off)</td>", page)) == len({trial.cell for trial in QUICK})
+    assert len(re.findall(r"<td>(?:default|off|guaranteed)</td>", page)) == len({trial.cell for trial in QUICK})
     assert "--scenario swap --agents 3 --delay 100 --loss 0.1" in page, "what flies a failed run again"
 
 

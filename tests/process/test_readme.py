@@ -26,6 +26,7 @@ SHOWN = [line.strip() for line in (ROOT / "README.md").read_text().splitlines() 
 BIN = Path(sys.executable).parent
 WHILE_FLYING = ("status", "hold", "resume", "obstacle", "fault", "land")
 AFTERWARDS = ("report", "replay")
+CAMPAIGN = r"^python tools/campaign\.py "
 
 
 def shown(pattern: str) -> list[str]:
@@ -61,7 +62,12 @@ def landed(directory: Path) -> dict[int, bool]:
 
 def test_nothing_is_shown_that_is_not_run() -> None:
     run_here = shown(r"^swarmctl (launch|simulate) ") + shown(rf"^swarmctl ({'|'.join(WHILE_FLYING + AFTERWARDS)})\b")
-    run_here += shown(r"^python -m sitl ") + shown(r"^python3 -m venv ") + shown(r"^swarmctl (reproduce|bench|check) ")
+    run_here += (
+        shown(r"^python -m sitl ")
+        + shown(r"^python3 -m venv ")
+        + shown(r"^swarmctl (reproduce|bench|check) ")
+        + shown(CAMPAIGN)
+    )
     assert sorted(run_here) == sorted(SHOWN)
 
 
@@ -98,11 +104,18 @@ def test_timing(line: str, tmp_path: Path) -> None:
     for row in rows:
         assert row.keys() == {"name", "solver", "neighbours", "p50_ms", "p99_ms"}
         assert 0.0 <= row["p50_ms"] <= row["p99_ms"]
-    names = ("sense", "setup", "solve", "certify", "send", "tick")
+    names = ("sense", "setup", "spaces", "solve", "certify", "barrier", "send", "tick")
     found = {(row["name"], row["solver"], row["neighbours"]) for row in rows}
     assert found >= {(name, solver, count) for name in names for solver in ("osqp", "daqp") for count in (0, 2)}
     assert len(found) == len(rows)
     assert {row["solver"] for row in rows if "nonlinear" in row["name"]} == {"slsqp"}
+
+
+@pytest.mark.parametrize("line", shown(CAMPAIGN))
+def test_campaigns(line: str, tmp_path: Path) -> None:
+    done = run(line, "--out", str(tmp_path / "out"))
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert {path.name for path in (tmp_path / "out").iterdir()} == {"rows.parquet", "report.html"}
 
 
 def test_a_launch_its_operator_and_what_is_left(tmp_path: Path) -> None:

@@ -42,16 +42,21 @@ def test_the_verb_writes_a_list_of_rows_of_five_keys(tmp_path: Path, capsys: pyt
     assert all(0.0 <= r["p50_ms"] <= r["p99_ms"] < 1e4 for r in rows)
     ticks = {(r["name"], r["solver"], r["neighbours"]) for r in rows if "x-y" not in r["name"]}
     plain = {(n, s, k) for n in bench.PARTS for s in bench.SOLVERS for k in (0, 2)}
-    assert ticks == plain | {(f"{n}, 1 obstacle", s, 2) for n in bench.PARTS for s in bench.SOLVERS}
+    promised = {(f"{n}, guaranteed", s, 2) for n in bench.PARTS for s in bench.SOLVERS}
+    assert ticks == plain | promised | {(f"{n}, 1 obstacle", s, 2) for n in bench.PARTS for s in bench.SOLVERS}
     assert {r["solver"] for r in rows} == set(bench.SOLVERS), "no nonlinear baseline that was not asked for"
     assert "one tick" in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures("quick")
-def test_parts_of_a_tick_add_up_to_it() -> None:
-    parts = bench.measure_ticks(2, ["osqp"], 10)["osqp"]
+@pytest.mark.parametrize("guaranteed", [False, True])
+def test_parts_of_a_tick_add_up_to_it(guaranteed: bool) -> None:
+    measure = bench.measure_promises if guaranteed else bench.measure_ticks
+    parts = measure(2, ["osqp"], 10)["osqp"]
     assert parts.shape == (10, len(bench.PARTS))
-    assert (parts > 0.0).all()
+    promise = bench.PARTS.index("promise")
+    assert (np.delete(parts, promise, axis=1) > 0.0).all()
+    assert (parts[:, promise] > 0.0).all() == guaranteed
     np.testing.assert_allclose(parts[:, :-1].sum(axis=1), parts[:, -1], atol=1e-6)
 
 

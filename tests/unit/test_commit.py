@@ -142,7 +142,7 @@ def test_in_silence_everybody_comes_to_rest_and_stays_apart() -> None:
     crowd = Crowd(4, Network((20_000, 20_000), dark_us=(1_500_000, 10**9)))
     crowd.run(1.6)
     committed = crowd.committed
-    crowd.run(3.0)
+    crowd.run(4.0)  # 2 s of plan and the braking after it
     assert crowd.committed - committed <= 4, "what was acknowledged before may still be flown"
     for agent in crowd.agents:
         assert agent.committed is not None
