@@ -295,7 +295,7 @@ class Agent:
         if not (flies and self._sequence.had_control) or self._judgement.mode in _DEVIATES:
             self._coordination.idle(utc_us, state)
             return None
-        self._coordination.step(utc_us, state, self._sequence.phase, self._wanted(now_us))
+        self._coordination.step(utc_us, state, self._sequence.phase, self._wanted(now_us), self._detour.active)
         self._promise_ns = self._stopwatch_ns() - began_ns
         act_us = utc_us + self._predictor.delay_us
         pos, vel = self._coordination.follow(act_us + np.arange(self._controller.longest + 1) * self._controller.dt_us)

@@ -70,8 +70,8 @@ class Coordination:
         for sender, payload in self._bus.receive(topics.INTENT):
             self._intents.offer(sender, payload)
 
-    def step(self, utc_us: int, state: VehicleState, phase: Phase, reference: Sampled) -> None:
-        """Rules 2 to 4, while this agent flies."""
+    def step(self, utc_us: int, state: VehicleState, phase: Phase, reference: Sampled, is_way: bool) -> None:
+        """Rules 2 to 4, while this agent flies; `is_way` as in `Commitments.propose`."""
         commitments = self._commitments
         if not self._promised:
             self._promised = True
@@ -82,7 +82,7 @@ class Coordination:
         self._surroundings.promised = {agent: intended(known[agent]) for agent in taking_part}
         commitments.avoid(utc_us, self._others(utc_us, state, phase, taking_part))
         ahead = self._others(utc_us + commitments.lead_us, state, phase, taking_part)
-        commitments.propose(utc_us, reference, known, ahead)
+        commitments.propose(utc_us, reference, known, ahead, is_way)
         self._watch(float(np.linalg.norm(state.pos_ned_m - self.follow(np.array([utc_us]))[0][0])))
 
     def idle(self, utc_us: int, state: VehicleState) -> None:

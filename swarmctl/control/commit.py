@@ -58,6 +58,8 @@ _PERCENTILE = 90.0
 _LEAD_OVER = 1.2  # times that percentile of the time acknowledgements take
 _BRAKED_FROM_01 = (1.0, 0.75, 0.5, 0.3, 0.15)  # of the plan
 _RESTS_M_S = 0.05
+_LATER_S = 0.2  # after the lead: the last moment to brake without asking
+_SLACK_01 = 1.0 / 3.0  # of what is kept beyond touching bodies plans may use up at most
 _TICK_S = 0.04  # sending and hearing, at least
 
 
@@ -159,7 +161,12 @@ class Commitments:
             self._set_lead(2.0 * self._lead_s)
 
     def avoid(self, utc_us: int, others: Sequence[KeepOut]) -> None:
-        """Come to rest at once where that keeps clearer of those who take no part; `others` from now on."""
+        """Come to rest without asking where waiting for acknowledgements would be too late for those who take no part.
+
+        Args:
+            utc_us: now.
+            others: those, and obstacles, from now on.
+        """
         if self.committed is None or not others:
             return
         steps = len(others[0].pos_ned_m) - 1
@@ -168,10 +175,20 @@ class Commitments:
         margin_m = certify(pos, others, 0)
         if margin_m >= 0.0 or float(vel[0] @ vel[0]) < _RESTS_M_S**2:
             return
-        stop = stopping(pos[0], vel[0], utc_us, self._dt_us, self._params.brake_m_s2)
+        later_us = utc_us + self.lead_us + round(_LATER_S * 1e6)
+        if certify(self._stopped(later_us, utc_us).sample(times)[0], others, 0) >= 0.0:
+            return
+        stop = self._stopped(utc_us, utc_us)
         if certify(stop.sample(times)[0], others, 0) > margin_m:
             self.committed, self.proposal = stop, None
             self.counts.stopped += 1
+
+    def _stopped(self, brake_us: int, utc_us: int) -> Trajectory:
+        """What is committed, braked from a time on, straight ahead."""
+        assert self.committed is not None
+        pos, vel = self.committed.sample(np.array([brake_us]))
+        stop = stopping(pos[0], vel[0], brake_us, self._dt_us, self._params.brake_m_s2)
+        return joined(self.committed, stop, utc_us)
 
     def propose(
         self,
@@ -179,13 +196,22 @@ class Commitments:
         reference: Callable[[Array], tuple[Array, Array]],
         peers: Mapping[int, Intent],
         others: Sequence[KeepOut],
+        is_way: bool = False,
     ) -> None:
-        """Rule 4. `reference` gives positions and velocities at offsets [s] from now; `others` as from `keep_outs`."""
+        """Rule 4.
+
+        Args:
+            utc_us: now.
+            reference: gives positions and velocities at offsets [s] from now.
+            peers: as of `hear`.
+            others: as from `keep_outs`, from `lead_us` ahead on.
+            is_way: the reference begins here and is clear of obstacles: look for plans near it, not near the last one.
+        """
         if self.proposal is not None or self.committed is None or utc_us < self._next_us:
             return
         self._next_us = utc_us + round(self._params.period_s * 1e6)
         branch_us = utc_us + self.lead_us
-        plan = self._planned(branch_us, utc_us, reference, peers, others)
+        plan = self._planned(branch_us, reference, peers, others, is_way)
         trajectory = None if plan is None else self._clear(plan, branch_us, utc_us, peers, others)
         if trajectory is None:
             self.counts.unplanned += 1
@@ -212,10 +238,10 @@ class Commitments:
     def _planned(
         self,
         branch_us: int,
-        utc_us: int,
         reference: Callable[[Array], tuple[Array, Array]],
         peers: Mapping[int, Intent],
         others: Sequence[KeepOut],
+        is_way: bool,
     ) -> Plan | None:
         assert self.committed is not None
         steps, dt_us = self._planner.steps, self._dt_us
@@ -226,9 +252,10 @@ class Commitments:
         size = float(np.sqrt(lift @ lift))
         start = Start(branch_us, pos[0], vel[0], 1.0, np.array([lift[0] / size, lift[1] / size, size]))
         wanted = Reference(*reference(1e-6 * (ahead_us + self.lead_us)), 0.0)
+        guess = wanted.pos_ned_m + (pos[0] - wanted.pos_ned_m[0]) if is_way else pos
         known = [(t, intent.agent) for intent in peers.values() for t in intended(intent)]
         keep_outs = self._keep_outs([t for t, _ in known], [agent for _, agent in known], branch_us, steps)
-        plan = self._planner.plan(Problem(start, wanted, np.zeros(3), (*keep_outs, *others), pos))
+        plan = self._planner.plan(Problem(start, wanted, np.zeros(3), (*keep_outs, *others), guess))
         return None if plan.status is PlanStatus.SOLVER_FAILED else plan
 
     def _clear(
@@ -277,7 +304,8 @@ class Commitments:
 
 def promised_m(params: SeparationParams) -> float:
     """Distance that no two committed trajectories come closer than."""
-    return params.radius_m - params.certify_slack_m
+    slack_m = min(params.certify_slack_m, _SLACK_01 * max(0.0, params.radius_m - params.body_m))
+    return params.radius_m - slack_m
 
 
 def intended(intent: Intent) -> tuple[Trajectory, ...]:
