@@ -105,9 +105,8 @@ class Surroundings:
         for agent, trajectories in self.promised.items():
             status = self._status.get(agent)
             share_01 = 0.5 if status is not None and status.mode in _FLOWN_BY_AGENT else 1.0
-            felt_us = np.array([act_utc_us + ahead_s * 1e6])
-            for pos, vel in (trajectory.sample(felt_us) for trajectory in trajectories):
-                found.append(Body(tuple(pos[0].tolist()), tuple(vel[0].tolist()), p.body_m + margin_m, share_01))
+            for pos, vel in (trajectory.at(act_utc_us + ahead_s * 1e6) for trajectory in trajectories):
+                found.append(Body(pos, vel, p.body_m + margin_m, share_01))
         for path in self.paths.latest():
             if path.agent in self.promised:
                 continue

@@ -44,6 +44,21 @@ class Trajectory:
         inside = ((t_utc_us >= self.t0_utc_us) & (t_utc_us <= self.end_utc_us))[:, None]
         return pos, np.where(inside, vel, 0.0)
 
+    def at(self, t_utc_us: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Position and velocity at one time, as `sample` has them, without its arrays."""
+        last, dt_s = len(self.pos_ned_m) - 1, self.dt_us * 1e-6
+        k = (t_utc_us - self.t0_utc_us) / self.dt_us
+        if not 0.0 <= k < last:
+            return tuple(self.pos_ned_m[0 if k < 0.0 else last].tolist()), (0.0, 0.0, 0.0)
+        low = int(k)
+        s, pos, vel = k - low, [], []
+        ends = self.pos_ned_m[low : low + 2].tolist(), self.vel_ned_m_s[low : low + 2].tolist()
+        for p0, p1, v0, v1 in zip(*ends[0], *ends[1], strict=True):
+            a, b = 2.0 * (p0 - p1) + dt_s * (v0 + v1), 3.0 * (p1 - p0) - dt_s * (2.0 * v0 + v1)
+            pos.append(((a * s + b) * s + dt_s * v0) * s + p0)
+            vel.append((3.0 * a * s + 2.0 * b) * s / dt_s + v0)
+        return tuple(pos), tuple(vel)
+
     def acceleration(self, t_utc_us: float) -> Array:
         """(3,) at a time, from the velocities around it."""
         half_us = 0.5 * self.dt_us

@@ -95,3 +95,24 @@ def test_a_proposal_leaves_what_is_committed_and_ends_at_rest() -> None:
     assert not whole.vel_ned_m_s[-1].any()
     np.testing.assert_array_equal(whole.pos_ned_m[-1], whole.pos_ned_m[-2])  # nobody sees it move on
     assert joined(resting(pos[0], UTC_US, 100_000), replace(then), branch_us).t0_utc_us == branch_us
+
+
+def test_one_time_at_a_time_is_the_same() -> None:
+    path = trajectory()
+    for t_us in np.arange(UTC_US - 200_000, path.end_utc_us + 300_000, 7_001):
+        pos, vel = path.sample(np.array([t_us]))
+        np.testing.assert_allclose(path.at(float(t_us))[0], pos[0], atol=1e-9)
+        np.testing.assert_allclose(path.at(float(t_us))[1], vel[0], atol=1e-6)
+
+
+def test_what_is_said_again_is_the_same_object_again() -> None:
+    peers = PeerIntents([2])
+    peers.offer(agent_name(2), encode_intent(intent(seq=1)))
+    before = peers.newest[2]
+    peers.offer(agent_name(2), encode_intent(intent(seq=2)))
+    after = peers.newest[2]
+    assert after.seq == 2 and after.committed is before.committed
+    assert before.proposal is not None and after.proposal is not None
+    assert after.proposal.trajectory is before.proposal.trajectory
+    peers.offer(agent_name(2), encode_intent(replace(intent(seq=3), committed=trajectory(1.0))))
+    assert peers.newest[2].committed is not before.committed
