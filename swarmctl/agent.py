@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from swarmctl.agent_setup import AgentSetup, make_estimator
+from swarmctl.control.commit import following
 from swarmctl.control.controller import make_controller
 from swarmctl.control.detour import Deadlock, Detour, Sampled
 from swarmctl.control.facts import Facts
@@ -83,7 +84,10 @@ class Agent:
         )
         self._surroundings = Surroundings(setup.agent, peers, setup.separation, bus)
         self._coordination: Coordination | None = None
+        controller = setup.controller
         if setup.separation.mode == "guaranteed":
+            flying = following(controller.mpc, setup.params.commit)
+            controller = controller.model_copy(update={"mpc": flying})
             self._coordination = Coordination(
                 setup.agent,
                 setup.boot_id,
@@ -98,12 +102,12 @@ class Agent:
                 stopwatch_ns,
             )
         self._controller = make_controller(
-            setup.controller, setup.vehicle_model, setup.separation, setup.agent, slots, stopwatch_ns
+            controller, setup.vehicle_model, setup.separation, setup.agent, slots, stopwatch_ns
         )
         self._transit = self._controller
-        if setup.controller.kind == "open_loop":  # can't go anywhere: something else flies to the start
+        if controller.kind == "open_loop":  # can't go anywhere: something else flies to the start
             self._transit = make_controller(
-                setup.controller.model_copy(update={"kind": "dmpc"}),
+                controller.model_copy(update={"kind": "dmpc"}),
                 setup.vehicle_model,
                 setup.separation,
                 setup.agent,

@@ -95,6 +95,7 @@ def run_agent(config_path: Path, agent: int, run: str, bus: str, run_dir: Path, 
     listen = {
         topics.PATH: peers,
         topics.STATUS: peers,
+        topics.INTENT: peers,
         topics.COMMAND: [topics.OPERATOR],
         topics.OBSTACLES: [topics.OPERATOR],
     }

@@ -44,7 +44,7 @@ import numpy as np
 from pydantic import Field
 
 from swarmctl.control.model import VehicleModelParams
-from swarmctl.control.mpc import MpcParams, SwarmMpc
+from swarmctl.control.mpc import AxisWeights, MpcParams, SwarmMpc
 from swarmctl.control.problem import Problem, Start
 from swarmctl.control.separation import KeepOut, SeparationParams, certify
 from swarmctl.core.frames import GRAVITY_M_S2
@@ -74,6 +74,7 @@ class CommitParams(Params):
     period_s: float = Field(0.1, ge=0, le=2)  # between two plans, at least
     lead_min_s: float = Field(0.06, ge=0.02, le=2)  # from proposing to flying it
     lead_max_s: float = Field(1.5, ge=0.1, le=5)
+    follow_z: AxisWeights = AxisWeights(q_pos=20.0, q_vel=0.5, r=0.05)  # of flying what is promised: to the centimetre
 
 
 @dataclass(slots=True)
@@ -300,6 +301,11 @@ class Commitments:
 
     def _set_lead(self, lead_s: float) -> None:
         self._lead_s = min(self._params.lead_max_s, max(self._params.lead_min_s, lead_s))
+
+
+def following(mpc: MpcParams, params: CommitParams) -> MpcParams:
+    """The controller that flies what is promised: a stiffer z, where wishes may be met softly and promises may not."""
+    return mpc.model_copy(update={"z": params.follow_z})
 
 
 def promised_m(params: SeparationParams) -> float:

@@ -96,7 +96,7 @@ def _run(options: argparse.Namespace, obstacles: list[MovingObstacle], stop: Sto
     feed = Feed(bus, options.agents)
     _announce(options, url)
     Pump(feed, scene, obstacles).run(1.0 / options.rate_hz, stop)
-    _end(rec, bus, f"telemetry lost={feed.lost} received={feed.received}")
+    _end(rec, bus, f"telemetry lost={feed.lost} received={feed.received} malformed={feed.malformed}")
     return EXIT_OK
 
 

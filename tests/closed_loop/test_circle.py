@@ -42,7 +42,7 @@ def test_vehicles_come_down_a_metre_apart(circle: Flight) -> None:
 
 
 def test_control_agents_that_ignore_each_other_collide(fly: Fly) -> None:
-    alone = fly("controller.kind='mpc'", "mission.duration_s=5")
+    alone = fly("controller.kind='mpc'", "agent.barrier.enabled=false", "mission.duration_s=5")
     assert alone.separation_m() < 0.3
 
 

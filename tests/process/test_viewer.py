@@ -160,7 +160,7 @@ def test_recording_holds_what_was_published(endpoint: str, tmp_path: Path) -> No
         swarm = Swarm(endpoint)
         swarm.fly(2.0)
         time.sleep(0.3)
-        assert finish(process) == "telemetry lost=0 received=300"
+        assert finish(process) == "telemetry lost=0 received=300 malformed=0"
         swarm.session.close()
     found = values(tmp_path)
     assert expected_entities() <= set(found)
@@ -232,7 +232,7 @@ def test_lost_samples_are_counted(endpoint: str, tmp_path: Path) -> None:
         swarm.fly(0.2)
         swarm.publishers[0].put(b"garbage")
         time.sleep(0.3)
-        assert finish(process) == "telemetry lost=21 received=60"
+        assert finish(process) == "telemetry lost=21 received=60 malformed=0"
         swarm.session.close()
 
 
@@ -242,7 +242,7 @@ def test_comes_up_and_stops_without_agents(endpoint: str, tmp_path: Path) -> Non
         process.send_signal(signal.SIGINT)
         time.sleep(0.3)
         assert process.poll() is None  # Ctrl-C is the launcher's business
-        assert finish(process) == "telemetry lost=0 received=0"
+        assert finish(process) == "telemetry lost=0 received=0 malformed=0"
 
 
 def test_full_disk_leaves_the_live_view(endpoint: str, tmp_path: Path) -> None:
@@ -253,7 +253,7 @@ def test_full_disk_leaves_the_live_view(endpoint: str, tmp_path: Path) -> None:
         swarm.fly(0.5)
         socket.create_connection(("127.0.0.1", port), timeout=2).close()
         time.sleep(0.3)
-        assert finish(process) == "telemetry lost=0 received=75"
+        assert finish(process) == "telemetry lost=0 received=75 malformed=0"
         swarm.session.close()
     assert "live view only" in (tmp_path / "viewer.log").read_text()
 
@@ -317,7 +317,7 @@ def test_frozen_watcher_does_not_hold_up_the_end(endpoint: str, tmp_path: Path) 
             watcher.send_signal(signal.SIGSTOP)
             swarm.fly(1.0)
             time.sleep(0.3)
-            assert finish(process) == "telemetry lost=0 received=450"
+            assert finish(process) == "telemetry lost=0 received=450 malformed=0"
         finally:
             watcher.kill()
             watcher.wait(10)
