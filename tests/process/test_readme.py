@@ -77,7 +77,7 @@ def test_the_two_set_up_lines_install_what_they_use() -> None:
     for line in (fly, test):
         assert line.startswith("python3 -m venv .venv && .venv/bin/pip install -q -c constraints.txt ")
     assert fly.endswith("&& .venv/bin/swarmctl launch --agents 3")
-    assert test.endswith("&& .venv/bin/python -m pytest -q -n 2 --dist worksteal")
+    assert test.endswith("&& .venv/bin/python -m pytest -q -n 3 --dist worksteal")
     assert "://" not in (ROOT / "constraints.txt").read_text()
 
 

@@ -217,7 +217,7 @@ def test_frozen_telemetry_costs_the_agents_nothing(endpoint: str, tmp_path: Path
         process.send_signal(signal.SIGCONT)
         swarm.fly(0.5)
         time.sleep(0.3)
-        lost, received = (int(word.split("=")[1]) for word in finish(process).split()[1:])
+        lost, received, _ = (int(word.split("=")[1]) for word in finish(process).split()[1:])
         assert lost + received == 450  # what the frozen process could not take is counted
         assert received >= 150 - 15, "all but what was under way when it froze"
         swarm.session.close()
@@ -232,7 +232,7 @@ def test_lost_samples_are_counted(endpoint: str, tmp_path: Path) -> None:
         swarm.fly(0.2)
         swarm.publishers[0].put(b"garbage")
         time.sleep(0.3)
-        assert finish(process) == "telemetry lost=21 received=60 malformed=0"
+        assert finish(process) == "telemetry lost=21 received=60 malformed=1"
         swarm.session.close()
 
 
