@@ -27,6 +27,6 @@ def test_every_config_flies_or_is_valid(fly: Fly, name: str) -> None:
     if test := FLOWN_ELSEWHERE.get(config.name):
         assert name in (ROOT / "tests" / "closed_loop" / f"test_{test}.py").read_text(encoding="utf-8")
         return
-    flight = fly("mission.duration_s=2", config=name)
+    flight = fly("mission.duration_s=2", "sitl.start=air", config=name)
     assert flight.problems == []
     assert config.swarm.agents == 1 or flight.separation_m() >= 0.85

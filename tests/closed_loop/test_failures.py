@@ -18,6 +18,7 @@ from swarmctl.links.peers import PeerPaths
 from tests.closed_loop.conftest import Fly
 
 MISSION = "mission.duration_s=14"
+AIR = "sitl.start=air"
 
 
 def landed_by_itself(flight_truth: np.ndarray, agent: int, agents: int = 3) -> bool:
@@ -147,10 +148,10 @@ def test_others_keep_clear_of_who_has_no_solver(fly: Fly) -> None:
 def test_a_plan_that_would_come_too_close_is_not_flown(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
     """The QP forgets its half-spaces and the last layer is off: what is left is the certifier, code of its own."""
     monkeypatch.setattr(mpc, "half_spaces", lambda *_: None)
-    flight = fly("mission.duration_s=8", "agent.barrier.enabled=false")
+    flight = fly("mission.duration_s=8", AIR, "agent.barrier.enabled=false")
     certified = flight.separation_m()
     monkeypatch.setattr(mpc, "certify", lambda *_: 1.0)
-    uncertified = fly("mission.duration_s=5", "agent.barrier.enabled=false").separation_m()
+    uncertified = fly("mission.duration_s=5", AIR, "agent.barrier.enabled=false").separation_m()
     assert uncertified < 0.3 < 0.6 < certified
 
 
@@ -161,7 +162,7 @@ def test_ten_seconds_of_bus_silence(fly: Fly) -> None:
     def speak(running: Lockstep) -> None:
         del running.hub.carry
 
-    flight = fly("mission.duration_s=20", at={5.0: silence, 15.0: speak})
+    flight = fly("mission.duration_s=20", AIR, at={5.0: silence, 15.0: speak})
     assert flight.separation_m() >= 0.80
 
 

@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sitl.experiments.bench import PARTS, SOLVERS
 from swarmctl.core.records import TRUTH_DTYPE
 from swarmctl.core.types import Landed
 
@@ -26,7 +27,7 @@ SHOWN = [line.strip() for line in (ROOT / "README.md").read_text().splitlines() 
 BIN = Path(sys.executable).parent
 WHILE_FLYING = ("status", "hold", "resume", "obstacle", "fault", "land")
 AFTERWARDS = ("report", "replay")
-CAMPAIGN = r"^python tools/campaign\.py "
+CAMPAIGN = r"^python tools/campaign\.py "  # is run by tests/closed_loop/test_campaign.py
 
 
 def shown(pattern: str) -> list[str]:
@@ -104,18 +105,14 @@ def test_timing(line: str, tmp_path: Path) -> None:
     for row in rows:
         assert row.keys() == {"name", "solver", "neighbours", "p50_ms", "p99_ms"}
         assert 0.0 <= row["p50_ms"] <= row["p99_ms"]
-    names = ("sense", "setup", "spaces", "solve", "certify", "barrier", "send", "tick")
     found = {(row["name"], row["solver"], row["neighbours"]) for row in rows}
-    assert found >= {(name, solver, count) for name in names for solver in ("osqp", "daqp") for count in (0, 2)}
     assert len(found) == len(rows)
+    expected = {(part, solver, count) for part in PARTS for solver in SOLVERS for count in (0, 2)}
+    scenarios = (", guaranteed", ", 1 obstacle")
+    expected |= {(part + scenario, solver, 2) for part in PARTS for solver in SOLVERS for scenario in scenarios}
+    assert {key for key in found if "x-y" not in key[0]} == expected
+    assert "one tick" in done.stdout
     assert {row["solver"] for row in rows if "nonlinear" in row["name"]} == {"slsqp"}
-
-
-@pytest.mark.parametrize("line", shown(CAMPAIGN))
-def test_campaigns(line: str, tmp_path: Path) -> None:
-    done = run(line, "--out", str(tmp_path / "out"))
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert {path.name for path in (tmp_path / "out").iterdir()} == {"rows.parquet", "report.html"}
 
 
 def test_a_launch_its_operator_and_what_is_left(tmp_path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,9 +14,8 @@ from sitl.experiments.captured import Captured, capture, circle_with_obstacle, m
 from sitl.experiments.formation import Formation, Neighbours, formation_config, places_m
 from sitl.experiments.slsqp import KEPT_M, NonlinearXy
 from swarmctl.core.types import Array, PlanStatus
-from swarmctl.errors import EXIT_OK, ConfigError, MissionError
+from swarmctl.errors import ConfigError, MissionError
 
-KEYS = {"name", "solver", "neighbours", "p50_ms", "p99_ms"}
 SPEED_M_S = formation.RADIUS_M * formation.OMEGA_RAD_S
 
 
@@ -31,21 +29,6 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture(scope="module")
 def captured() -> Captured:
     return capture(circle_with_obstacle())
-
-
-@pytest.mark.usefixtures("quick")
-def test_the_verb_writes_a_list_of_rows_of_five_keys(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert bench.main(["--neighbours", "0,2", "--ticks", "5", "--no-slsqp", "--out", str(tmp_path / "new")]) == EXIT_OK
-    rows = json.loads((tmp_path / "new" / "bench.json").read_text())
-    assert isinstance(rows, list) and all(set(row) == KEYS for row in rows)
-    assert len({(r["name"], r["solver"], r["neighbours"]) for r in rows}) == len(rows)
-    assert all(0.0 <= r["p50_ms"] <= r["p99_ms"] < 1e4 for r in rows)
-    ticks = {(r["name"], r["solver"], r["neighbours"]) for r in rows if "x-y" not in r["name"]}
-    plain = {(n, s, k) for n in bench.PARTS for s in bench.SOLVERS for k in (0, 2)}
-    promised = {(f"{n}, guaranteed", s, 2) for n in bench.PARTS for s in bench.SOLVERS}
-    assert ticks == plain | promised | {(f"{n}, 1 obstacle", s, 2) for n in bench.PARTS for s in bench.SOLVERS}
-    assert {r["solver"] for r in rows} == set(bench.SOLVERS), "no nonlinear baseline that was not asked for"
-    assert "one tick" in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures("quick")
