@@ -238,7 +238,7 @@ class Agent:
         for verb in self._surroundings.listen(self._clock.utc_us()):
             self.ask(verb, now_us)
         if self._coordination is not None:
-            self._coordination.listen()
+            self._coordination.listen(self._clock.utc_us())
 
     def _sense(self, now_us: int) -> VehicleState | None:
         state = self._autopilot.poll(now_us)
@@ -263,6 +263,8 @@ class Agent:
 
     def _think(self, now_us: int, state: VehicleState | None) -> Thought:
         if state is None or not self._fresh(now_us, state):
+            if self._coordination is not None:  # the autopilot flies it, blindly or by its failsafe
+                self._coordination.idle(self._clock.utc_us(), state)
             return Thought(None, None, None, [])
         estimate = self._observer.estimate
         act_us = now_us + self._predictor.delay_us

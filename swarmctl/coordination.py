@@ -7,7 +7,7 @@ from dataclasses import asdict
 
 import numpy as np
 
-from swarmctl.control.commit import CommitCounts, Commitments, CommitParams, intended, promised_m
+from swarmctl.control.commit import CommitCounts, Commitments, CommitParams, promised_m
 from swarmctl.control.mpc import MpcParams
 from swarmctl.control.separation import KeepOut, SeparationParams
 from swarmctl.core.intent import Intent
@@ -18,6 +18,8 @@ from swarmctl.links.intents import PeerIntents, encode_intent
 from swarmctl.links.peers import Bus, agent_name
 from swarmctl.surroundings import Surroundings
 
+_DEAD_US = 100_000  # of a token's absence
+_SETTLED_US = 2_000_000  # of our own presence, after which absences count
 Sampled = Callable[[Array], tuple[Array, Array]]  # offsets [s] from now -> positions, velocities
 
 
@@ -30,8 +32,9 @@ class Coordination:
         params, mpc, separation, slots, stopwatch_ns: see `Commitments`.
         surroundings: who else is there.
         bus: is drained by `listen`.
-        note: is told `off_promise` when what is flown leaves what is promised by more than half of what is promised
-            beyond touching bodies, and when it is back; and `promises` with all counts when somebody else takes over.
+        note: is told `broken_promise` when a peer's promise contradicts ours; `off_promise` when what is flown leaves
+            what is promised by more than half of what is promised beyond touching bodies, and when it is back; and
+            `promises` with all counts when somebody else takes over.
     """
 
     def __init__(
@@ -55,6 +58,9 @@ class Coordination:
         self._promised = False
         self._allowed_m = separation.tracking_m + 0.5 * (promised_m(separation) - separation.body_m)
         self._is_off, self._worst_m = False, 0.0
+        self._absent_since_us: dict[int, int] = {}
+        self._on_bus_since_us: int | None = None
+        self._broken: set[int] = set()
 
     @property
     def counts(self) -> CommitCounts:
@@ -65,10 +71,10 @@ class Coordination:
         """Messages refused so far, by reason."""
         return dict(self._intents.rejected)
 
-    def listen(self) -> None:
+    def listen(self, utc_us: int) -> None:
         """Rule 1."""
         for sender, payload in self._bus.receive(topics.INTENT):
-            self._intents.offer(sender, payload)
+            self._intents.offer(sender, payload, utc_us)
 
     def step(self, utc_us: int, state: VehicleState, phase: Phase, reference: Sampled, is_way: bool) -> None:
         """Rules 2 to 4, while this agent flies; `is_way` as in `Commitments.propose`."""
@@ -76,22 +82,28 @@ class Coordination:
         if not self._promised:
             self._promised = True
             commitments.begin(state.pos_ned_m, state.vel_ned_m_s, utc_us)
-        known, living = self._intents.newest, self._living()
+        known, living = self._intents.newest, self._living(utc_us)
         commitments.hear(utc_us, known, living)
-        taking_part = {agent for agent in living if agent in known and known[agent].promised}
-        self._surroundings.promised = {agent: intended(known[agent]) for agent in taking_part}
+        broken = commitments.broken(utc_us, known)
+        if broken != self._broken:
+            self._broken = broken
+            self._note("broken_promise", by=sorted(broken))
+        astray = self._surroundings.astray(known, utc_us, self._allowed_m)
+        gone = self._absent_since_us.keys()  # perhaps dead: no longer trusted, still asked
+        taking_part = {a for a in living - gone - broken - astray if a in known and known[a].promised}
+        self._surroundings.promised = {agent: known[agent].followed for agent in taking_part}
         commitments.avoid(utc_us, self._others(utc_us, state, phase, taking_part))
         ahead = self._others(utc_us + commitments.lead_us, state, phase, taking_part)
         commitments.propose(utc_us, reference, known, ahead, is_way)
         self._watch(float(np.linalg.norm(state.pos_ned_m - self.follow(np.array([utc_us]))[0][0])))
 
-    def idle(self, utc_us: int, state: VehicleState) -> None:
-        """Somebody else flies: nothing is promised, what others propose is acknowledged all the same."""
+    def idle(self, utc_us: int, state: VehicleState | None) -> None:
+        """Somebody else flies, or nobody knows: nothing is promised, but peers are still acknowledged."""
         if self._promised:
             self._promised = False
             self._surroundings.promised = {}
             self._note("promises", **asdict(self.counts), worst_tracking_m=self._worst_m)
-        self._commitments.end(state.pos_ned_m, utc_us)
+        self._commitments.end(None if state is None else state.pos_ned_m, utc_us)
 
     def follow(self, t_utc_us: Times) -> tuple[Array, Array]:
         """Committed positions and velocities (M, 3) at times (M,)."""
@@ -120,13 +132,25 @@ class Coordination:
             self._is_off = not self._is_off
             self._note("off_promise", begins=self._is_off, error_m=error_m, allowed_m=self._allowed_m)
 
-    def _living(self) -> frozenset[int]:
-        """Peers that promise and whose acknowledgement counts: off the bus nobody is known to be dead."""
+    def _living(self, utc_us: int) -> frozenset[int]:
+        """Peers that promise and whose acknowledgement counts.
+
+        A peer is dead when it has been off the bus for some ticks while we have been on it for seconds: tokens vanish
+        and come back one by one when a router is lost, and two that took each other for dead would both promise.
+        """
         alive = self._bus.alive()
         promising = frozenset(agent for agent in self._peers if self._surroundings.promises(agent))
         if agent_name(self._agent) not in alive:
+            self._on_bus_since_us = None
+            self._absent_since_us.clear()
             return promising
-        return frozenset(agent for agent in promising if agent_name(agent) in alive)
+        if self._on_bus_since_us is None:
+            self._on_bus_since_us = utc_us
+        absent = {agent for agent in self._peers if agent_name(agent) not in alive}
+        self._absent_since_us = {agent: self._absent_since_us.get(agent, utc_us) for agent in absent}
+        if utc_us - self._on_bus_since_us < _SETTLED_US:
+            return promising
+        return promising - {a for a, since_us in self._absent_since_us.items() if utc_us - since_us >= _DEAD_US}
 
     def _others(self, t0_utc_us: int, state: VehicleState, phase: Phase, taking_part: set[int]) -> list[KeepOut]:
         """Who takes no part, and obstacles, on the planner's grid from a time on."""

@@ -28,18 +28,28 @@ from swarmctl.links.peers import agent_name
 from swarmctl.links.transport import open_transport
 from swarmctl.telemetry.recorder import Recorder
 
+_SLEW_01 = 0.01  # of elapsed time, by which UTC may be corrected
 _LINGER_S = 1.0  # after the end, so that peers learn of it
 _VEHICLE_LOST_S = 15.0  # no state at all: nothing left to do here
 
 
 class WallClock:
-    """The host's clocks."""
+    """The host's clocks. A step of UTC is followed slowly: in flight, time neither jumps nor runs backwards."""
+
+    def __init__(self) -> None:
+        self._read_ns = time.monotonic_ns()
+        self._offset_ns = time.time_ns() - self._read_ns
 
     def now_us(self) -> int:
         return time.monotonic_ns() // 1000
 
     def utc_us(self) -> int:
-        return time.time_ns() // 1000
+        now_ns = time.monotonic_ns()
+        most_ns = int((now_ns - self._read_ns) * _SLEW_01)
+        off_ns = time.time_ns() - now_ns - self._offset_ns
+        self._offset_ns += min(most_ns, max(-most_ns, off_ns))
+        self._read_ns = now_ns
+        return (now_ns + self._offset_ns) // 1000
 
     def sleep_until(self, t_us: int) -> None:
         """Return at monotonic `t_us` or, when it has passed, at once."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence, Set
 
 import numpy as np
@@ -16,11 +17,13 @@ from swarmctl.control.separation import (
     keep_out_of_peer,
     visible,
 )
+from swarmctl.core.intent import Intent
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.types import Array, Mode, Obstacle, Phase
 from swarmctl.links import topics
 from swarmctl.links.peers import Bus, PeerPaths, agent_name
 
+_NEW_US = 300_000  # a path that may be compared with promises
 _FLOWN_BY_AGENT = frozenset((Mode.FOLLOW, Mode.REPLAY, Mode.BRAKE, Mode.HOLD))
 
 
@@ -90,6 +93,18 @@ class Surroundings:
         seen = visible(self._obstacles, pos_ned_m)
         self._seen.update((id(o), o) for o in seen)
         return found + [keep_out_of_obstacle(o, dt_us, steps, self._params) for o in seen]
+
+    def astray(self, intents: Mapping[int, Intent], utc_us: int, allowed_m: float) -> set[int]:
+        """Peers whose path of just now is farther than allowed from everything that they have promised to follow."""
+        found = set()
+        for path in self.paths.latest():
+            intent, at_us = intents.get(path.agent), path.t0_utc_us
+            if intent is None or not intent.promised or at_us < utc_us - _NEW_US:
+                continue
+            here = path.pos_ned_m[0].tolist()
+            if all(math.dist(here, trajectory.at(at_us)[0]) > allowed_m for trajectory in intent.followed):
+                found.add(path.agent)
+        return found
 
     def landmarks(self) -> list[Obstacle]:
         """Obstacles at rest that have been visible so far."""

@@ -30,15 +30,19 @@ What it rests on, and how that is watched in flight:
   of vehicles' clocks are measured, hosts are to be synchronised.
 - They fly what they follow: half of what is promised beyond touching bodies may be missed by each. An event
   `off_promise` says who misses more, and `promises` at the end the worst of the flight.
+- Promises are kept. A promise is changed without being asked for only where a vehicle begins to promise at speed, and
+  by `avoid`, before something that takes no part. Whoever finds a peer's promise in contradiction to the own one
+  (`broken`), or a peer beside its promise, keeps clear of it as of one that takes no part.
 - Everybody takes part. Who does not (a pilot flies, an agent has died) is a keep-out of the best-effort kind, and a
   peer is dead only when its liveliness token is gone while the own one is there: who is off the bus commits nothing.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence, Set
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from pydantic import Field
@@ -58,7 +62,10 @@ _PERCENTILE = 90.0
 _LEAD_OVER = 1.2  # times that percentile of the time acknowledgements take
 _BRAKED_FROM_01 = (1.0, 0.75, 0.5, 0.3, 0.15)  # of the plan
 _RESTS_M_S = 0.05
+_TAIL_S = 2.0  # of braking, judged against who takes no part
 _LATER_S = 0.2  # after the lead: the last moment to brake without asking
+_CLOSER_M = 0.001  # than now, of promises that are too close already
+_SPARE_M = 0.01  # proposals keep more than promises need: between points they are judged by straight lines
 _SLACK_01 = 1.0 / 3.0  # of what is kept beyond touching bodies plans may use up at most
 _TICK_S = 0.04  # sending and hearing, at least
 
@@ -66,10 +73,10 @@ _TICK_S = 0.04  # sending and hearing, at least
 class CommitParams(Params):
     """Planning in the space of trajectories; of `separation.mode = "guaranteed"`."""
 
-    dt_s: float = Field(0.1, ge=0.02, le=0.5)
+    dt_s: float = Field(0.1, ge=0.05, le=0.5)
     horizon: int = Field(20, ge=5, le=60)  # steps, before the braking that every plan ends in
     moves: int = Field(8, ge=2, le=40)
-    brake_m_s2: float = Field(1.5, gt=0, le=10)  # of that braking
+    brake_m_s2: float = Field(1.5, ge=0.5, le=10)  # of that braking
     share_01: float = Field(0.8, gt=0, le=1)  # of the controller's tilt that plans may use; the rest is for tracking
     period_s: float = Field(0.1, ge=0, le=2)  # between two plans, at least
     lead_min_s: float = Field(0.06, ge=0.02, le=2)  # from proposing to flying it
@@ -119,6 +126,8 @@ class Commitments:
         self._lead_s = params.lead_min_s
         self._number, self._next_us = 0, 0
         self._cleared: dict[int, Trajectory] = {}  # by identity: what the own proposal is known to be clear of
+        self._compatible: dict[int, Trajectory] = {}  # likewise, of what is committed
+        self._compatible_with: Trajectory | None = None
         self.committed: Trajectory | None = None
         self.proposal: Proposal | None = None
         self.counts = CommitCounts()
@@ -128,9 +137,11 @@ class Commitments:
         self.committed = stopping(pos_ned_m, vel_ned_m_s, utc_us, self._dt_us, self._params.brake_m_s2)
         self.proposal = None
 
-    def end(self, pos_ned_m: Array, utc_us: int) -> None:
-        """Somebody else flies."""
-        self.committed, self.proposal = resting(pos_ned_m, utc_us, self._dt_us), None
+    def end(self, pos_ned_m: Array | None, utc_us: int) -> None:
+        """Somebody else flies, from (3,) if it is known where."""
+        self.proposal = None
+        if pos_ned_m is not None:
+            self.committed = resting(pos_ned_m, utc_us, self._dt_us)
 
     def hear(self, utc_us: int, peers: Mapping[int, Intent], living: Set[int]) -> None:
         """Rules 2 and 3.
@@ -143,6 +154,11 @@ class Commitments:
         mine = self.proposal
         if mine is None:
             return
+        if utc_us > mine.made_utc_us + self.lead_us:
+            self.proposal = None
+            self.counts.expired += 1
+            self._set_lead(2.0 * self._lead_s)
+            return
         known = [intent.committed for intent in peers.values() if intent.promised]
         known += [i.proposal.trajectory for i in peers.values() if i.proposal and i.proposal.order < mine.order]
         new = [trajectory for trajectory in known if id(trajectory) not in self._cleared]
@@ -151,15 +167,25 @@ class Commitments:
             self.counts.withdrawn += 1
             return
         self._cleared.update((id(trajectory), trajectory) for trajectory in new)
-        if all(agent in peers and peers[agent].heard.get(self._agent, -1) >= mine.number for agent in living):
+        if all(agent in peers and peers[agent].heard.get(self._agent) == mine.number for agent in living):
             self.committed, self.proposal = mine.trajectory, None
             self.counts.committed += 1
             self._latencies_s.append((utc_us - mine.made_utc_us) * 1e-6)
             self._set_lead(_LEAD_OVER * float(np.percentile(self._latencies_s, _PERCENTILE)) + _TICK_S)
-        elif utc_us > mine.made_utc_us + round(self._lead_s * 1e6):
-            self.proposal = None
-            self.counts.expired += 1
-            self._set_lead(2.0 * self._lead_s)
+
+    def broken(self, utc_us: int, peers: Mapping[int, Intent]) -> set[int]:
+        """Peers whose promise contradicts the own one: somebody had to change his without being asked for it."""
+        if self.committed is None:
+            return set()
+        promises = {agent: intent.committed for agent, intent in peers.items() if intent.promised}
+        if self._compatible_with is not self.committed:
+            self._compatible, self._compatible_with = {}, self.committed
+        new = [t for t in promises.values() if id(t) not in self._compatible]
+        if new and not self._conflicts(self.committed, utc_us, new):
+            self._compatible.update((id(t), t) for t in new)
+            new = []
+        unsure = {id(t) for t in new}
+        return {a for a, t in promises.items() if id(t) in unsure and self._conflicts(self.committed, utc_us, [t])}
 
     def avoid(self, utc_us: int, others: Sequence[KeepOut]) -> None:
         """Come to rest without asking where waiting for acknowledgements would be too late for those who take no part.
@@ -217,9 +243,9 @@ class Commitments:
         if trajectory is None:
             self.counts.unplanned += 1
             return
-        self._number = max(self._number + 1, utc_us // 1000 & 0xFFFFFFFF)  # also above those before a restart
+        self._number = max(self._number + 1, utc_us)  # none of before a restart
         self.proposal = Proposal(self._number, utc_us, self._agent, trajectory)
-        self._cleared = {id(known): known for intent in peers.values() for known in intended(intent)}
+        self._cleared = {id(known): known for intent in peers.values() for known in intent.followed}
         self.counts.proposed += 1
 
     @property
@@ -229,8 +255,8 @@ class Commitments:
 
     @property
     def steps(self) -> int:
-        """Of `keep_outs` that `propose` needs, from `lead_us` ahead on."""
-        return self._planner.steps
+        """Of `keep_outs` that `avoid` and `propose` need: the plan and its braking."""
+        return self._planner.steps + math.ceil(_TAIL_S / self._params.dt_s)
 
     @property
     def dt_us(self) -> int:
@@ -254,9 +280,10 @@ class Commitments:
         start = Start(branch_us, pos[0], vel[0], 1.0, np.array([lift[0] / size, lift[1] / size, size]))
         wanted = Reference(*reference(1e-6 * (ahead_us + self.lead_us)), 0.0)
         guess = wanted.pos_ned_m + (pos[0] - wanted.pos_ned_m[0]) if is_way else pos
-        known = [(t, intent.agent) for intent in peers.values() for t in intended(intent)]
+        known = [(t, intent.agent) for intent in peers.values() for t in intent.followed]
         keep_outs = self._keep_outs([t for t, _ in known], [agent for _, agent in known], branch_us, steps)
-        plan = self._planner.plan(Problem(start, wanted, np.zeros(3), (*keep_outs, *others), guess))
+        kept = (*keep_outs, *(_begun(other, steps) for other in others))
+        plan = self._planner.plan(Problem(start, wanted, np.zeros(3), kept, guess))
         return None if plan.status is PlanStatus.SOLVER_FAILED else plan
 
     def _clear(
@@ -264,35 +291,45 @@ class Commitments:
     ) -> Trajectory | None:
         """The plan, braked from as late as it then stays clear of everything known; None when it never does."""
         assert self.committed is not None
-        known = [trajectory for intent in peers.values() for trajectory in intended(intent)]
+        known = [trajectory for intent in peers.values() for trajectory in intent.followed]
         steps, dt_us, brake_m_s2 = self._planner.steps, self._dt_us, self._params.brake_m_s2
-        ahead = branch_us + np.arange(steps + 1) * dt_us
+        ahead = branch_us + np.arange(self.steps + 1) * dt_us
         for share in _BRAKED_FROM_01:
             last = max(1, round(share * steps))
             braked = ending_at_rest(
                 branch_us, dt_us, plan.pos_ned_m[: last + 1], plan.vel_ned_m_s[: last + 1], brake_m_s2
             )
             whole = joined(self.committed, braked, utc_us)
-            if certify(whole.sample(ahead)[0], others, 0) >= 0.0 and not self._conflicts(whole, utc_us, known):
+            if certify(whole.sample(ahead)[0], others, 0) >= 0.0 and not self._conflicts(
+                whole, utc_us, known, _SPARE_M
+            ):
                 return whole
         return None
 
-    def _conflicts(self, trajectory: Trajectory, utc_us: int, known: Sequence[Trajectory]) -> bool:
+    def _conflicts(
+        self, trajectory: Trajectory, utc_us: int, known: Sequence[Trajectory], spare_m: float = 0.0
+    ) -> bool:
         """Whether it comes too close to any of these from now until all are at rest."""
         if not known:
             return False
         end_us = max(trajectory.end_utc_us, *(other.end_utc_us for other in known))
         steps = max(1, -(-(end_us - utc_us) // self._dt_us))
         own = trajectory.sample(utc_us + np.arange(steps + 1) * self._dt_us)[0]
-        return certify(own, self._keep_outs(known, [0] * len(known), utc_us, steps), 0) < 0.0
+        kept = self._keep_outs(known, [0] * len(known), utc_us, steps, spare_m)
+        return not certify(own, kept, 0, _CLOSER_M) >= 0.0
 
     def _keep_outs(
-        self, trajectories: Sequence[Trajectory], agents: Sequence[int], t0_utc_us: int, steps: int
+        self,
+        trajectories: Sequence[Trajectory],
+        agents: Sequence[int],
+        t0_utc_us: int,
+        steps: int,
+        spare_m: float = 0.0,
     ) -> list[KeepOut]:
         if not trajectories:
             return []
         p = self._separation
-        radius_m, certified_m = p.radius_m + p.tracking_m, promised_m(p)
+        radius_m, certified_m = p.radius_m + p.tracking_m, promised_m(p) + spare_m
         where = places(trajectories, t0_utc_us + np.arange(steps + 1) * self._dt_us)
         return [
             KeepOut(points, radius_m, certified_m, False, agent, p.downwash)
@@ -314,10 +351,9 @@ def promised_m(params: SeparationParams) -> float:
     return params.radius_m - slack_m
 
 
-def intended(intent: Intent) -> tuple[Trajectory, ...]:
-    """What an agent may follow from now on."""
-    committed = (intent.committed,) if intent.promised else ()
-    return committed if intent.proposal is None else (*committed, intent.proposal.trajectory)
+def _begun(keep_out: KeepOut, steps: int) -> KeepOut:
+    """Its first steps."""
+    return replace(keep_out, pos_ned_m=keep_out.pos_ned_m[: steps + 1])
 
 
 def _planning(mpc: MpcParams, params: CommitParams) -> MpcParams:

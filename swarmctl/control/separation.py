@@ -21,6 +21,7 @@ from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Obstacle, PredictedPath
 
 _TINY_M = 1e-6
+_CLOSER_M = 0.02  # than now, where it is too close already
 
 
 class SeparationParams(Params):
@@ -251,13 +252,14 @@ def _turned(normal: Array, distance: Array, needed: Array, to_goal: Array, angle
     return turned
 
 
-def certify(path_ned_m: Array, keep_outs: Sequence[KeepOut], from_step: int) -> float:
+def certify(path_ned_m: Array, keep_outs: Sequence[KeepOut], from_step: int, closer_m: float = _CLOSER_M) -> float:
     """Smallest margin [m] of a planned path against everything known, over true distances between samples too.
 
     Args:
         path_ned_m: (Hp+1, 3) own plan.
         keep_outs: aligned with it.
         from_step: steps before this one can't be changed by the plan any more.
+        closer_m: where a keep-out is violated now already, a path may come this much closer.
 
     Returns:
         min over keep-outs of (distance - certified distance); where a keep-out is violated now already, a path that
@@ -276,5 +278,5 @@ def certify(path_ned_m: Array, keep_outs: Sequence[KeepOut], from_step: int) -> 
     now = np.sqrt(np.einsum("mc,mc->m", apart[:, 0], apart[:, 0]))
     later = distance[:, min(from_step, distance.shape[1] - 1) :].min(axis=1)
     allowed = np.array([k.certified_m for k in keep_outs])
-    margin = np.where((now < allowed) & (later >= now - 0.02), 0.0, later - allowed)
+    margin = np.where((now < allowed) & (later >= now - closer_m), 0.0, later - allowed)
     return float(margin.min())

@@ -12,7 +12,7 @@ from swarmctl.core.trajectory import Trajectory
 class Proposal:
     """What an agent would like to follow."""
 
-    number: int  # counts up
+    number: int  # counts up, 64 bit: never used again, not after a restart either
     made_utc_us: int
     agent: int
     trajectory: Trajectory
@@ -33,4 +33,14 @@ class Intent:
     promised: bool  # it follows what it has committed to; otherwise somebody else flies it
     committed: Trajectory
     proposal: Proposal | None
-    heard: Mapping[int, int]  # newest proposal number taken in of each peer
+    heard: Mapping[int, int]  # number of the proposal in the newest message taken in of each peer
+
+    @property
+    def trajectories(self) -> tuple[Trajectory, ...]:
+        """All that it speaks of."""
+        return (self.committed,) if self.proposal is None else (self.committed, self.proposal.trajectory)
+
+    @property
+    def followed(self) -> tuple[Trajectory, ...]:
+        """What the agent may follow from now on."""
+        return self.trajectories if self.promised else self.trajectories[1:]

@@ -18,14 +18,17 @@ from swarmctl.core.types import Array
 from swarmctl.links.peers import agent_name
 
 INTENT_VERSION = 1
-MAX_POINTS = 400
+MAX_POINTS = 2000
+MAX_STEP_US = 500_000
+RESTART_US = 5_000_000  # of silence, after which an earlier boot id is a restart under another clock
+MAX_LEAD_US = 10_000_000  # what begins later is of another clock
 MAX_ACKNOWLEDGED = 256
 _MAGIC = b"SI"
 _HEADER = struct.Struct("<2sBBIIIH2x")  # magic version flags agent boot seq acknowledgements
 _PROPOSES, _PROMISED = 1, 2
-_PROPOSAL = struct.Struct("<Iq")  # number, time it was made
+_PROPOSAL = struct.Struct("<Qq")  # number, time it was made
 _TRAJECTORY = struct.Struct("<qiH2x")
-_HEARD = struct.Struct("<II")
+_HEARD = struct.Struct("<IQ")
 
 Memory = dict[bytes, Trajectory]  # trajectories by their bytes
 
@@ -96,7 +99,7 @@ def _decode_trajectory(payload: bytes, at: int, known: Memory, said: Memory) -> 
         said[body] = known[body]
         return said[body], end
     at += _TRAJECTORY.size
-    if not 2 <= count <= MAX_POINTS or dt_us <= 0 or len(payload) < at + 24 * count:
+    if not 2 <= count <= MAX_POINTS or not 0 < dt_us <= MAX_STEP_US or len(payload) < at + 24 * count:
         raise ValueError("no trajectory")
     points: Array = np.frombuffer(payload, "<f4", 6 * count, at).reshape(count, 6).astype(np.float64)
     if not np.isfinite(points).all():
@@ -115,11 +118,12 @@ class PeerIntents:
     def __init__(self, peers: Iterable[int]) -> None:
         self._expected = frozenset(peers)
         self._memory = {agent_name(agent): Memory() for agent in self._expected}
+        self._heard_us: dict[int, int] = {}  # when the newest came
         self.newest: dict[int, Intent] = {}
         self.rejected: Counter[str] = Counter()
 
-    def offer(self, sender: str, payload: bytes) -> None:
-        """Judge one message; `sender` is the name the bus vouches for."""
+    def offer(self, sender: str, payload: bytes, utc_us: int) -> None:
+        """Judge one message; `sender` is the name the bus vouches for, `utc_us` now."""
         intent = decode_intent(payload, self._memory.get(sender))
         if intent is None:
             self.rejected["malformed"] += 1
@@ -127,17 +131,20 @@ class PeerIntents:
             self.rejected["identity"] += 1
         elif intent.agent not in self._expected:
             self.rejected["unknown_peer"] += 1
-        elif not self._is_newer(intent):
+        elif not self._is_newer(intent, utc_us):
             self.rejected["replayed"] += 1
+        elif any(trajectory.t0_utc_us > utc_us + MAX_LEAD_US for trajectory in intent.trajectories):
+            self.rejected["future"] += 1
         else:
-            self.newest[intent.agent] = intent
+            self.newest[intent.agent], self._heard_us[intent.agent] = intent, utc_us
 
     def heard(self) -> dict[int, int]:
         """Number of the proposal that each peer is known to make now."""
         return {agent: i.proposal.number for agent, i in self.newest.items() if i.proposal is not None}
 
-    def _is_newer(self, intent: Intent) -> bool:
+    def _is_newer(self, intent: Intent, utc_us: int) -> bool:
         known = self.newest.get(intent.agent)
-        if known is None or intent.boot_id > known.boot_id:  # boot ids are start times
-            return True
-        return intent.boot_id == known.boot_id and intent.seq > known.seq
+        if known is None or intent.boot_id == known.boot_id:
+            return known is None or intent.seq > known.seq
+        silent_us = utc_us - self._heard_us[intent.agent]
+        return intent.boot_id > known.boot_id or silent_us > RESTART_US  # boot ids are start times, but clocks err

@@ -62,7 +62,7 @@ def test_who_is_off_the_bus_promises_nothing() -> None:
 
 
 def test_control_who_takes_silence_for_death_promises_against_the_living(monkeypatch: pytest.MonkeyPatch) -> None:
-    def only_seen(self: Coordination) -> Set[int]:
+    def only_seen(self: Coordination, utc_us: int) -> Set[int]:
         return frozenset(agent for agent in self._peers if agent_name(agent) in self._bus.alive())
 
     monkeypatch.setattr(Coordination, "_living", only_seen)

@@ -14,8 +14,9 @@ import pytest
 from swarmctl.control.commit import Commitments, CommitParams
 from swarmctl.control.mission import glide_to
 from swarmctl.control.mpc import MpcParams
-from swarmctl.control.separation import SeparationParams
-from swarmctl.core.intent import Intent
+from swarmctl.control.separation import KeepOut, SeparationParams
+from swarmctl.core.intent import Intent, Proposal
+from swarmctl.core.trajectory import Trajectory, ending_at_rest, resting
 from swarmctl.core.types import Array
 
 UTC_US = 1_700_000_000_000_000
@@ -153,7 +154,88 @@ def test_of_two_proposals_in_conflict_the_earlier_one_is_flown() -> None:
     crowd = Crowd(2, Network((100_000, 100_000)))
     crowd.run(6.0)
     assert all(agent.counts.committed > 3 for agent in crowd.agents)
-    assert sum(agent.counts.withdrawn for agent in crowd.agents) >= 0
+    assert sum(agent.counts.withdrawn for agent in crowd.agents) > 0
+
+
+def meeting() -> tuple[Commitments, Commitments]:
+    """Two that fly one behind the other at 1.5 m/s, 1 m apart, each on what it has committed to."""
+    pair = []
+    for i, x_m in enumerate((0.0, -1.0)):
+        agent = Commitments(i, CommitParams(), MpcParams(u_max=0.25), SEPARATION, 2, lambda: 0)
+        points = np.array([[x_m + 0.15 * k, 0.0, -2.0] for k in range(21)])
+        agent.committed = ending_at_rest(UTC_US, 100_000, points, np.tile([1.5, 0.0, 0.0], (21, 1)), 1.5)
+        pair.append(agent)
+    return pair[0], pair[1]
+
+
+def said_by(agent: Commitments, number: int) -> dict[int, Intent]:
+    assert agent.committed is not None
+    return {number: Intent(number, 1, 1, True, agent.committed, agent.proposal, {})}
+
+
+def wall(x_m: float, agent: Commitments) -> KeepOut:
+    return KeepOut(np.tile([x_m, 0.0, -2.0], (agent.steps + 1, 1)), 0.9, 0.8, False, -1)
+
+
+def test_a_promise_that_was_changed_without_asking_is_found_by_whom_it_contradicts() -> None:
+    first, second = meeting()
+    assert second.broken(UTC_US, said_by(first, 0)) == set()
+    first.avoid(UTC_US, [wall(1.6, first)])
+    assert first.counts.stopped == 1, "before a wall there is no time to ask"
+    assert second.broken(UTC_US, said_by(first, 0)) == {0}
+    assert second.broken(UTC_US, said_by(first, 0)) == {0}, "as long as it does"
+
+
+def test_a_wall_that_leaves_time_to_ask_stops_nobody() -> None:
+    first, _ = meeting()
+    first.avoid(UTC_US, [wall(2.6, first)])
+    assert first.counts.stopped == 0
+
+
+def at_goal(offsets_s: Array) -> tuple[Array, Array]:
+    return np.tile([1.0, 0.0, -2.0], (len(offsets_s), 1)), np.zeros((len(offsets_s), 3))
+
+
+def proposing() -> tuple[Commitments, Proposal]:
+    agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), SEPARATION, 2, lambda: 0)
+    agent.begin(np.array([0.0, 0.0, -2.0]), np.zeros(3), UTC_US)
+    agent.propose(UTC_US, at_goal, {}, ())
+    assert agent.proposal is not None
+    return agent, agent.proposal
+
+
+def acknowledging(number: int) -> dict[int, Intent]:
+    return {1: Intent(1, 1, 1, True, resting(np.array([9.0, 0.0, 0.0]), UTC_US, 100_000), None, {0: number})}
+
+
+@pytest.mark.parametrize(("off", "commits"), [(0, 1), (1, 0), (-1, 0)])
+def test_only_the_very_proposal_is_acknowledged(off: int, commits: int) -> None:
+    agent, proposal = proposing()
+    agent.hear(UTC_US + 20_000, acknowledging(proposal.number + off), {1})
+    assert agent.counts.committed == commits
+
+
+def test_an_acknowledgement_after_the_moment_to_leave_is_too_late() -> None:
+    agent, proposal = proposing()
+    agent.hear(UTC_US + agent.lead_us + 1, acknowledging(proposal.number), {1})
+    assert (agent.counts.committed, agent.counts.expired, agent.proposal) == (0, 1, None)
+
+
+def test_promises_that_are_too_close_already_do_not_creep_closer() -> None:
+    """Each ends 5 mm nearer than it begins, which the leniency that plans have would let pass, again and again."""
+    agent, _ = proposing()
+    other = resting(np.zeros(3), UTC_US, 100_000)
+    for k in range(10):
+        x_m = CERTIFIED_M - 0.01 - 0.005 * k
+        nearer = np.array([[x_m, 0.0, 0.0], [x_m - 0.005, 0.0, 0.0]])
+        assert agent._conflicts(Trajectory(UTC_US, 100_000, nearer, np.zeros((2, 3))), UTC_US, [other])
+        assert not agent._conflicts(Trajectory(UTC_US, 100_000, nearer[::-1], np.zeros((2, 3))), UTC_US, [other])
+
+
+def test_what_is_not_a_number_conflicts() -> None:
+    agent, _ = proposing()
+    bad = Trajectory(UTC_US, 100_000, np.full((2, 3), np.nan), np.zeros((2, 3)))
+    assert agent._conflicts(bad, UTC_US, [resting(np.zeros(3), UTC_US, 100_000)])
 
 
 def test_a_slow_network_lengthens_the_lead_and_a_fast_one_shortens_it_again() -> None:

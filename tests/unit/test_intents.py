@@ -21,7 +21,7 @@ def trajectory(shift_m: float = 0.0) -> Trajectory:
 
 def intent(seq: int = 1, agent: int = 2, boot_id: int = 9, propose: bool = True) -> Intent:
     proposal = Proposal(77, UTC_US + 5, agent, trajectory(0.5)) if propose else None
-    return Intent(agent, boot_id, seq, True, trajectory(), proposal, {0: 5, 1: 4_000_000_000})
+    return Intent(agent, boot_id, seq, True, trajectory(), proposal, {0: 5, 1: UTC_US})
 
 
 @pytest.mark.parametrize("propose", [True, False])
@@ -61,14 +61,31 @@ def test_only_newer_ones_of_expected_peers_are_taken_in() -> None:
         (agent_name(0), intent(seq=4)),  # somebody else's name
         (agent_name(1), intent(seq=4, agent=1)),  # not expected
     ):
-        peers.offer(sender, encode_intent(said))
-    peers.offer(agent_name(2), b"nonsense")
+        peers.offer(sender, encode_intent(said), UTC_US)
+    peers.offer(agent_name(2), b"nonsense", UTC_US)
     assert set(peers.newest) == {2} and peers.newest[2].seq == 3
     assert peers.rejected == {"replayed": 3, "identity": 1, "unknown_peer": 1, "malformed": 1}
     assert peers.heard() == {2: 77}
-    peers.offer(agent_name(2), encode_intent(intent(seq=1, boot_id=10, propose=False)))
+    peers.offer(agent_name(2), encode_intent(intent(seq=1, boot_id=10, propose=False)), UTC_US)
     assert peers.newest[2].boot_id == 10
     assert peers.heard() == {}
+
+
+def test_a_restart_under_an_earlier_clock_is_heard_once_the_old_one_is_silent() -> None:
+    peers = PeerIntents([2])
+    peers.offer(agent_name(2), encode_intent(intent(seq=5, boot_id=9)), UTC_US)
+    peers.offer(agent_name(2), encode_intent(intent(seq=1, boot_id=3)), UTC_US + 4_900_000)
+    assert peers.newest[2].boot_id == 9
+    peers.offer(agent_name(2), encode_intent(intent(seq=2, boot_id=3)), UTC_US + 5_100_000)
+    assert peers.newest[2].boot_id == 3
+
+
+def test_what_begins_in_the_future_is_of_another_clock() -> None:
+    peers = PeerIntents([2])
+    peers.offer(agent_name(2), encode_intent(intent()), UTC_US - 11_000_000)
+    assert peers.rejected == {"future": 1} and peers.newest == {}
+    peers.offer(agent_name(2), encode_intent(intent()), UTC_US - 9_000_000)
+    assert peers.newest[2].seq == 1
 
 
 def test_a_trajectory_rests_before_and_after_itself_and_is_smooth_between() -> None:
@@ -107,12 +124,12 @@ def test_one_time_at_a_time_is_the_same() -> None:
 
 def test_what_is_said_again_is_the_same_object_again() -> None:
     peers = PeerIntents([2])
-    peers.offer(agent_name(2), encode_intent(intent(seq=1)))
+    peers.offer(agent_name(2), encode_intent(intent(seq=1)), UTC_US)
     before = peers.newest[2]
-    peers.offer(agent_name(2), encode_intent(intent(seq=2)))
+    peers.offer(agent_name(2), encode_intent(intent(seq=2)), UTC_US)
     after = peers.newest[2]
     assert after.seq == 2 and after.committed is before.committed
     assert before.proposal is not None and after.proposal is not None
     assert after.proposal.trajectory is before.proposal.trajectory
-    peers.offer(agent_name(2), encode_intent(replace(intent(seq=3), committed=trajectory(1.0))))
+    peers.offer(agent_name(2), encode_intent(replace(intent(seq=3), committed=trajectory(1.0))), UTC_US)
     assert peers.newest[2].committed is not before.committed

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
 import pytest
@@ -77,3 +78,20 @@ def test_an_agent_number_outside_the_swarm_is_refused_before_anything_is_opened(
     path.write_text("[swarm]\nagents = 2\n", encoding="utf-8")
     with pytest.raises(StartError, match=r"--id 2.*0\.\.1"):
         run_agent(path, 2, "run", "tcp/127.0.0.1:1", tmp_path, None)
+
+
+def test_a_step_of_the_hosts_utc_is_followed_slowly(monkeypatch: pytest.MonkeyPatch) -> None:
+    elapsed_ns, stepped_ns = 0, 0
+    monkeypatch.setattr(time, "monotonic_ns", lambda: 5_000_000_000 + elapsed_ns)
+    monkeypatch.setattr(time, "time_ns", lambda: 1_700_000_000_000_000_000 + elapsed_ns + stepped_ns)
+    clock = WallClock()
+    began_us = before_us = clock.utc_us()
+    stepped_ns = -500_000_000
+    for _ in range(100):
+        elapsed_ns += 20_000_000
+        now_us = clock.utc_us()
+        assert 19_800 <= now_us - before_us <= 20_200, "neither back nor on"
+        before_us = now_us
+    assert began_us + 2_000_000 - before_us == pytest.approx(20_000, abs=10), "1 % of the time that has passed"
+    elapsed_ns += 100_000_000_000
+    assert clock.utc_us() == (time.time_ns()) // 1000
