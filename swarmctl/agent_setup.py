@@ -33,7 +33,9 @@ class AgentParams(Params):
     barrier: BarrierParams = BarrierParams()
     commit: CommitParams = CommitParams()
     detour: DetourParams = DetourParams()
-    autopilot_params: dict[str, int | float] = Field({"COM_OBL_RC_ACT": 4})  # PX4: land when setpoints stop
+    autopilot_params: dict[str, int | float] = Field(  # PX4: land when setpoints stop, before it has flown far blindly
+        {"COM_OBL_RC_ACT": 4, "COM_OF_LOSS_T": 0.5}
+    )
 
 
 @dataclass(frozen=True, slots=True)

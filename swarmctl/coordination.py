@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 
@@ -57,6 +57,9 @@ class Coordination:
         self._note, self._seq = note, 0
         self._promised = False
         self._allowed_m = separation.tracking_m + 0.5 * (promised_m(separation) - separation.body_m)
+        self._spent_m = (
+            separation.tracking_m + separation.certify_slack_m
+        )  # of what plans keep, before they are refused
         self._is_off, self._worst_m = False, 0.0
         self._absent_since_us: dict[int, int] = {}
         self._on_bus_since_us: int | None = None
@@ -92,7 +95,8 @@ class Coordination:
         gone = self._absent_since_us.keys()  # perhaps dead: no longer trusted, still asked
         taking_part = {a for a in living - gone - broken - astray if a in known and known[a].promised}
         self._surroundings.promised = {agent: known[agent].followed for agent in taking_part}
-        commitments.avoid(utc_us, self._others(utc_us, state, phase, taking_part))
+        partners = {agent: known[agent] for agent in taking_part}
+        commitments.avoid(utc_us, reference, partners, self._others(utc_us, state, phase, taking_part), is_way)
         ahead = self._others(utc_us + commitments.lead_us, state, phase, taking_part)
         commitments.propose(utc_us, reference, known, ahead, is_way)
         self._watch(float(np.linalg.norm(state.pos_ned_m - self.follow(np.array([utc_us]))[0][0])))
@@ -153,6 +157,10 @@ class Coordination:
         return promising - {a for a, since_us in self._absent_since_us.items() if utc_us - since_us >= _DEAD_US}
 
     def _others(self, t0_utc_us: int, state: VehicleState, phase: Phase, taking_part: set[int]) -> list[KeepOut]:
-        """Who takes no part, and obstacles, on the planner's grid from a time on."""
+        """Who takes no part, and obstacles, on the planner's grid from a time on.
+
+        Nobody can tell what the silent do: they are kept clear of with all of the margin that grows with age.
+        """
         steps, dt_us = self._commitments.steps, self._commitments.dt_us
-        return self._surroundings.keep_outs(state.pos_ned_m, t0_utc_us, dt_us, steps, phase, taking_part)
+        found = self._surroundings.keep_outs(state.pos_ned_m, t0_utc_us, dt_us, steps, phase, taking_part)
+        return [replace(k, certified_m=max(k.certified_m, k.radius_m - self._spent_m)) for k in found]

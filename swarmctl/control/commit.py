@@ -41,7 +41,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -61,7 +61,7 @@ _LATENCIES = 50  # remembered
 _PERCENTILE = 90.0
 _LEAD_OVER = 1.2  # times that percentile of the time acknowledgements take
 _BRAKED_FROM_01 = (1.0, 0.75, 0.5, 0.3, 0.15)  # of the plan
-_RESTS_M_S = 0.05
+_WORTH_M = 0.02  # by which a way out has to be better than what has been promised
 _TAIL_S = 2.0  # of braking, judged against who takes no part
 _LATER_S = 0.2  # after the lead: the last moment to brake without asking
 _CLOSER_M = 0.001  # than now, of promises that are too close already
@@ -93,7 +93,7 @@ class CommitCounts:
     withdrawn: int = 0
     expired: int = 0
     unplanned: int = 0
-    stopped: int = 0  # at once, because of somebody who takes no part
+    evaded: int = 0  # changed at once, because of somebody who takes no part
 
 
 class Commitments:
@@ -187,28 +187,56 @@ class Commitments:
         unsure = {id(t) for t in new}
         return {a for a, t in promises.items() if id(t) in unsure and self._conflicts(self.committed, utc_us, [t])}
 
-    def avoid(self, utc_us: int, others: Sequence[KeepOut]) -> None:
-        """Come to rest without asking where waiting for acknowledgements would be too late for those who take no part.
+    def avoid(
+        self,
+        utc_us: int,
+        reference: Callable[[Array], tuple[Array, Array]],
+        peers: Mapping[int, Intent],
+        others: Sequence[KeepOut],
+        is_way: bool = False,
+    ) -> None:
+        """Change the own promise without asking, where waiting would be too late for those who take no part.
 
         Args:
             utc_us: now.
-            others: those, and obstacles, from now on.
+            reference, is_way: as of `propose`.
+            peers: of those who take part.
+            others: those who do not, and obstacles, from now on.
         """
         if self.committed is None or not others:
             return
-        steps = len(others[0].pos_ned_m) - 1
-        times = utc_us + np.arange(steps + 1) * self._dt_us
-        pos, vel = self.committed.sample(times)
-        margin_m = certify(pos, others, 0)
-        if margin_m >= 0.0 or float(vel[0] @ vel[0]) < _RESTS_M_S**2:
+        times = utc_us + np.arange(len(others[0].pos_ned_m)) * self._dt_us
+        if certify(self.committed.sample(times)[0], others, 0) >= 0.0:
             return
         later_us = utc_us + self.lead_us + round(_LATER_S * 1e6)
         if certify(self._stopped(later_us, utc_us).sample(times)[0], others, 0) >= 0.0:
             return
-        stop = self._stopped(utc_us, utc_us)
-        if certify(stop.sample(times)[0], others, 0) > margin_m:
-            self.committed, self.proposal = stop, None
-            self.counts.stopped += 1
+        known = [trajectory for intent in peers.values() for trajectory in intent.followed]
+
+        def margin_m(trajectory: Trajectory) -> float:
+            return min(certify(trajectory.sample(times)[0], others, 0), self._margin_m(trajectory, utc_us, known))
+
+        best, best_m = self.committed, margin_m(self.committed) + _WORTH_M
+        for candidate in self._ways_out(utc_us, reference, peers, others, is_way):
+            if (found_m := margin_m(candidate)) > best_m:
+                best, best_m = candidate, found_m
+        if best is not self.committed:
+            self.committed, self.proposal = best, None
+            self.counts.evaded += 1
+
+    def _ways_out(
+        self,
+        utc_us: int,
+        reference: Callable[[Array], tuple[Array, Array]],
+        peers: Mapping[int, Intent],
+        others: Sequence[KeepOut],
+        is_way: bool,
+    ) -> Iterator[Trajectory]:
+        """From now on: round everybody, and straight to a stop."""
+        plan = self._planned(utc_us, utc_us, reference, peers, others, is_way)
+        if plan is not None:
+            yield ending_at_rest(utc_us, self._dt_us, plan.pos_ned_m, plan.vel_ned_m_s, self._params.brake_m_s2)
+        yield self._stopped(utc_us, utc_us)
 
     def _stopped(self, brake_us: int, utc_us: int) -> Trajectory:
         """What is committed, braked from a time on, straight ahead."""
@@ -238,7 +266,7 @@ class Commitments:
             return
         self._next_us = utc_us + round(self._params.period_s * 1e6)
         branch_us = utc_us + self.lead_us
-        plan = self._planned(branch_us, reference, peers, others, is_way)
+        plan = self._planned(branch_us, utc_us, reference, peers, others, is_way)
         trajectory = None if plan is None else self._clear(plan, branch_us, utc_us, peers, others)
         if trajectory is None:
             self.counts.unplanned += 1
@@ -265,6 +293,7 @@ class Commitments:
     def _planned(
         self,
         branch_us: int,
+        utc_us: int,
         reference: Callable[[Array], tuple[Array, Array]],
         peers: Mapping[int, Intent],
         others: Sequence[KeepOut],
@@ -278,7 +307,7 @@ class Commitments:
         lift = np.array([0.0, 0.0, GRAVITY_M_S2]) - accel
         size = float(np.sqrt(lift @ lift))
         start = Start(branch_us, pos[0], vel[0], 1.0, np.array([lift[0] / size, lift[1] / size, size]))
-        wanted = Reference(*reference(1e-6 * (ahead_us + self.lead_us)), 0.0)
+        wanted = Reference(*reference(1e-6 * (ahead_us + (branch_us - utc_us))), 0.0)
         guess = wanted.pos_ned_m + (pos[0] - wanted.pos_ned_m[0]) if is_way else pos
         known = [(t, intent.agent) for intent in peers.values() for t in intent.followed]
         keep_outs = self._keep_outs([t for t, _ in known], [agent for _, agent in known], branch_us, steps)
@@ -310,13 +339,18 @@ class Commitments:
         self, trajectory: Trajectory, utc_us: int, known: Sequence[Trajectory], spare_m: float = 0.0
     ) -> bool:
         """Whether it comes too close to any of these from now until all are at rest."""
+        return not self._margin_m(trajectory, utc_us, known, spare_m) >= 0.0
+
+    def _margin_m(
+        self, trajectory: Trajectory, utc_us: int, known: Sequence[Trajectory], spare_m: float = 0.0
+    ) -> float:
         if not known:
-            return False
+            return math.inf
         end_us = max(trajectory.end_utc_us, *(other.end_utc_us for other in known))
         steps = max(1, -(-(end_us - utc_us) // self._dt_us))
         own = trajectory.sample(utc_us + np.arange(steps + 1) * self._dt_us)[0]
         kept = self._keep_outs(known, [0] * len(known), utc_us, steps, spare_m)
-        return not certify(own, kept, 0, _CLOSER_M) >= 0.0
+        return certify(own, kept, 0, _CLOSER_M)
 
     def _keep_outs(
         self,

@@ -278,7 +278,7 @@ def _promises(events: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     last = {event.get("source"): event for event in events if event.get("event") == "promises"}
     if not last:
         return None
-    names = ("proposed", "committed", "withdrawn", "expired", "unplanned", "stopped")
+    names = ("proposed", "committed", "withdrawn", "expired", "unplanned", "evaded")
     worst_m = max(float(event["worst_tracking_m"]) for event in last.values())
     off = sum(event.get("event") == "off_promise" and event.get("begins") is True for event in events)
     return {name: sum(int(event[name]) for event in last.values()) for name in names} | {

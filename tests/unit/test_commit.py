@@ -157,6 +157,10 @@ def test_of_two_proposals_in_conflict_the_earlier_one_is_flown() -> None:
     assert sum(agent.counts.withdrawn for agent in crowd.agents) > 0
 
 
+def at_goal(offsets_s: Array) -> tuple[Array, Array]:
+    return np.tile([1.0, 0.0, -2.0], (len(offsets_s), 1)), np.zeros((len(offsets_s), 3))
+
+
 def meeting() -> tuple[Commitments, Commitments]:
     """Two that fly one behind the other at 1.5 m/s, 1 m apart, each on what it has committed to."""
     pair = []
@@ -180,20 +184,16 @@ def wall(x_m: float, agent: Commitments) -> KeepOut:
 def test_a_promise_that_was_changed_without_asking_is_found_by_whom_it_contradicts() -> None:
     first, second = meeting()
     assert second.broken(UTC_US, said_by(first, 0)) == set()
-    first.avoid(UTC_US, [wall(1.6, first)])
-    assert first.counts.stopped == 1, "before a wall there is no time to ask"
+    first.avoid(UTC_US, at_goal, {}, [wall(1.6, first)])
+    assert first.counts.evaded == 1, "before a wall there is no time to ask"
     assert second.broken(UTC_US, said_by(first, 0)) == {0}
     assert second.broken(UTC_US, said_by(first, 0)) == {0}, "as long as it does"
 
 
 def test_a_wall_that_leaves_time_to_ask_stops_nobody() -> None:
     first, _ = meeting()
-    first.avoid(UTC_US, [wall(2.6, first)])
-    assert first.counts.stopped == 0
-
-
-def at_goal(offsets_s: Array) -> tuple[Array, Array]:
-    return np.tile([1.0, 0.0, -2.0], (len(offsets_s), 1)), np.zeros((len(offsets_s), 3))
+    first.avoid(UTC_US, at_goal, {}, [wall(2.6, first)])
+    assert first.counts.evaded == 0
 
 
 def proposing() -> tuple[Commitments, Proposal]:
