@@ -221,5 +221,4 @@ def sitl_params(config: Config) -> SitlParams:
 
 def obstacles_message(config: Config) -> topics.ObstaclesMessage:
     """The configured obstacles as agents hear of them."""
-    items = tuple(topics.ObstacleMessage(**o.model_dump()) for o in config.obstacles)
-    return topics.ObstaclesMessage(1, items)
+    return topics.first_obstacles(o.model_dump() for o in config.obstacles)

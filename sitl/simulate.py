@@ -9,6 +9,7 @@ import argparse
 import signal
 import sys
 import time
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -17,7 +18,7 @@ from rich.progress import Progress
 
 from sitl.lockstep import Lockstep, write_events
 from swarmctl.config import Config, dump, load
-from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, SwarmError
+from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, exit_code_of
 from swarmctl.summary import summary_lines
 from swarmctl.telemetry.recordings import RECORDING, open_viewer, optimize_recording, simulated_recording
 from swarmctl.telemetry.run_folder import Outcome, create_run_folder, finish_run, load_run
@@ -102,20 +103,18 @@ def _parser() -> argparse.ArgumentParser:
 def main(arguments: list[str] | None = None) -> int:
     """Run the verb; returns the process exit code."""
     options: dict[str, Any] = vars(_parser().parse_args(arguments))
+    return exit_code_of(partial(_run, options))
+
+
+def _run(options: dict[str, Any]) -> int:
     overrides = list(options["sets"])
     overrides += [f"{k}={options[k]}" for k in ("swarm.agents", "mission.duration_s", "seed") if options[k] is not None]
-    try:
-        config = load(options["config"], overrides)
-        directory = create_run_folder(options["run_dir"], config.name, time.time_ns() // 1000)
-        code = simulate(config, directory)
-        if options["view"]:
-            open_viewer(str(directory / RECORDING))
-        return code
-    except SwarmError as error:
-        print(error, file=sys.stderr)
-        return error.exit_code
-    except KeyboardInterrupt:
-        return EXIT_INTERRUPTED
+    config = load(options["config"], overrides)
+    directory = create_run_folder(options["run_dir"], config.name, time.time_ns() // 1000)
+    code = simulate(config, directory)
+    if options["view"]:
+        open_viewer(str(directory / RECORDING))
+    return code
 
 
 if __name__ == "__main__":

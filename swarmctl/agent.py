@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from swarmctl.agent_setup import AgentSetup, make_estimator
-from swarmctl.control.commit import following
+from swarmctl.control.commit import Wish, following
 from swarmctl.control.controller import make_controller
-from swarmctl.control.detour import Deadlock, Detour, Sampled
+from swarmctl.control.detour import Deadlock, Detour
 from swarmctl.control.facts import Facts
 from swarmctl.control.failsafe import Judgement, judge
 from swarmctl.control.fallback import rest_plan
@@ -43,6 +43,7 @@ from swarmctl.core.types import (
     PlanStatus,
     PredictedPath,
     Reference,
+    Sampled,
     TickRecord,
     VehicleState,
 )
@@ -53,10 +54,9 @@ from swarmctl.links.commands import CommandPort
 from swarmctl.links.peers import Bus
 from swarmctl.links.upkeep import Upkeep
 from swarmctl.reporter import Act, Reporter, Thought, TickSink, Took
-from swarmctl.surroundings import Surroundings
+from swarmctl.surroundings import FLOWN_BY_AGENT, Surroundings
 
 _NOTHING_US = -1
-_FLIES = (Mode.FOLLOW, Mode.REPLAY, Mode.BRAKE, Mode.HOLD)
 _DEVIATES = (Mode.BRAKE, Mode.HOLD, Mode.LAND, Mode.YIELD, Mode.BLIND)  # from what it has promised
 _AUTOPILOT_HOVERS = (FlightMode.HOLD, FlightMode.EXTERNAL)  # in the latter while it takes off by itself
 
@@ -125,8 +125,7 @@ class Agent:
             self._note,
             stopwatch_ns,
         )
-        apart_m = setup.separation.radius_m + setup.separation.tracking_m
-        reference = MissionReference(setup.mission, setup.starts_ned_m, setup.agent, apart_m)
+        reference = MissionReference(setup.mission, setup.starts_ned_m, setup.agent, setup.separation.planned_m)
         self._detour = Detour(setup.params.detour, setup.agent, setup.separation.radius_m)
         self._deadlock: Deadlock | None = None  # the one that was last noted
         self._sequence = MissionSequence(
@@ -262,6 +261,7 @@ class Agent:
     # -- think --------------------------------------------------------------------------------------------------------
 
     def _think(self, now_us: int, state: VehicleState | None) -> Thought:
+        self._promise_ns = 0
         if state is None or not self._fresh(now_us, state):
             if self._coordination is not None:  # the autopilot flies it, blindly or by its failsafe
                 self._coordination.idle(self._clock.utc_us(), state)
@@ -297,11 +297,10 @@ class Agent:
         if self._coordination is None:
             return None
         utc_us, began_ns = self._clock.utc_us(), self._stopwatch_ns()
-        self._promise_ns = 0
         if not (flies and self._sequence.had_control) or self._judgement.mode in _DEVIATES:
             self._coordination.idle(utc_us, state)
             return None
-        self._coordination.step(utc_us, state, self._sequence.phase, self._wanted(now_us), self._detour.active)
+        self._coordination.step(utc_us, state, self._sequence.phase, self._wish(now_us))
         self._promise_ns = self._stopwatch_ns() - began_ns
         act_us = utc_us + self._predictor.delay_us
         pos, vel = self._coordination.follow(act_us + np.arange(self._controller.longest + 1) * self._controller.dt_us)
@@ -318,15 +317,18 @@ class Agent:
             return Reference(*self._detour.sample(ahead_s), yaw_rad), now_ref
         return Reference(pos[1:], vel[1:], yaw_rad), now_ref
 
-    def _wanted(self, now_us: int) -> Sampled:
-        """Where to be at offsets from now: on the reference, or on a way round what blocks it."""
+    def _wish(self, now_us: int) -> Wish:
+        """To be on the reference, or on a way round what blocks it."""
         if self._detour.active:
-            return self._detour.sample
+            return Wish(self._detour.sample, is_way=True)
+        return Wish(self._mission_reference(now_us))
+
+    def _mission_reference(self, now_us: int) -> Sampled:
         return partial(self._sequence.reference, self._clock.utc_us(), now_us)
 
     def _look_for_deadlock(self, now_us: int, state: VehicleState, keep_outs: list[KeepOut], flies: bool) -> None:
         if flies and self._sequence.had_control:
-            reference = partial(self._sequence.reference, self._clock.utc_us(), now_us)
+            reference = self._mission_reference(now_us)
             self._detour.step(now_us, state.pos_ned_m, reference, keep_outs, self._surroundings.landmarks)
         else:
             self._detour.reset()
@@ -397,7 +399,7 @@ class Agent:
             return None
         act_us = now_us + self._predictor.delay_us
         step = min(max(0, (act_us - flown.t0_us) // flown.dt_us), len(flown.virtual) - 1)
-        estimate, flies = self._observer.estimate, self._judgement.mode in _FLIES
+        estimate, flies = self._observer.estimate, self._judgement.mode in FLOWN_BY_AGENT
         virtual = self._last_layer.keep_apart(now_us, self._utc(act_us), flown.virtual[step], start, estimate, flies)
         yaw_rad, hover_01 = self._setup.mission.yaw_rad, estimate.hover_thrust_01
         setpoint = setpoint_of(virtual, yaw_rad, hover_01, now_us, self._setup.vehicle_model)

@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 
 import numpy as np
 
-from swarmctl.control.commit import CommitCounts, Commitments, CommitParams, promised_m
+from swarmctl.control.commit import CommitCounts, Commitments, CommitParams, Wish, promised_m
 from swarmctl.control.mpc import MpcParams
 from swarmctl.control.separation import KeepOut, SeparationParams
 from swarmctl.core.intent import Intent
@@ -20,7 +20,6 @@ from swarmctl.surroundings import Surroundings
 
 _DEAD_US = 100_000  # of a token's absence
 _SETTLED_US = 2_000_000  # of our own presence, after which absences count
-Sampled = Callable[[Array], tuple[Array, Array]]  # offsets [s] from now -> positions, velocities
 
 
 class Coordination:
@@ -57,9 +56,7 @@ class Coordination:
         self._note, self._seq = note, 0
         self._promised = False
         self._allowed_m = separation.tracking_m + 0.5 * (promised_m(separation) - separation.body_m)
-        self._spent_m = (
-            separation.tracking_m + separation.certify_slack_m
-        )  # of what plans keep, before they are refused
+        self._spent_m = separation.tracking_m + separation.certify_slack_m  # of what plans keep, until refused
         self._is_off, self._worst_m = False, 0.0
         self._absent_since_us: dict[int, int] = {}
         self._on_bus_since_us: int | None = None
@@ -79,8 +76,8 @@ class Coordination:
         for sender, payload in self._bus.receive(topics.INTENT):
             self._intents.offer(sender, payload, utc_us)
 
-    def step(self, utc_us: int, state: VehicleState, phase: Phase, reference: Sampled, is_way: bool) -> None:
-        """Rules 2 to 4, while this agent flies; `is_way` as in `Commitments.propose`."""
+    def step(self, utc_us: int, state: VehicleState, phase: Phase, wish: Wish) -> None:
+        """Rules 2 to 4, while this agent flies and would like to follow a wish."""
         commitments = self._commitments
         if not self._promised:
             self._promised = True
@@ -96,9 +93,10 @@ class Coordination:
         taking_part = {a for a in living - gone - broken - astray if a in known and known[a].promised}
         self._surroundings.promised = {agent: known[agent].followed for agent in taking_part}
         partners = {agent: known[agent] for agent in taking_part}
-        commitments.avoid(utc_us, reference, partners, self._others(utc_us, state, phase, taking_part), is_way)
-        ahead = self._others(utc_us + commitments.lead_us, state, phase, taking_part)
-        commitments.propose(utc_us, reference, known, ahead, is_way)
+        commitments.avoid(utc_us, wish, partners, self._others(utc_us, state, phase, taking_part))
+        if commitments.is_due(utc_us):
+            ahead = self._others(utc_us + commitments.lead_us, state, phase, taking_part)
+            commitments.propose(utc_us, wish, known, ahead)
         self._watch(float(np.linalg.norm(state.pos_ned_m - self.follow(np.array([utc_us]))[0][0])))
 
     def idle(self, utc_us: int, state: VehicleState | None) -> None:

@@ -5,7 +5,8 @@ Exceptions live at the borders (config, start-up, files). Inside a tick a failur
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Sequence
 
 EXIT_OK = 0
 EXIT_USAGE = 2
@@ -41,3 +42,16 @@ class MissionError(SwarmError):
     """The flight began and did not end as asked, or a limit was violated."""
 
     exit_code = EXIT_MISSION
+
+
+def exit_code_of(run: Callable[[], int], when_interrupted: str = "") -> int:
+    """What `run` returns; of an error, in words on standard error, and of Ctrl-C the exit code that says so."""
+    try:
+        return run()
+    except SwarmError as error:
+        print(error, file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        if when_interrupted:
+            print(when_interrupted, file=sys.stderr)
+        return EXIT_INTERRUPTED

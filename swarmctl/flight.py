@@ -29,6 +29,7 @@ from swarmctl.links.topics import (
     decode_obstacles,
     decode_status,
     encode_message,
+    first_obstacles,
 )
 from swarmctl.processes import ROUTER, SITL, VIEWER, Child, Site, kill_all
 from swarmctl.table import AgentView, Display, name_of
@@ -108,7 +109,8 @@ class Flight:
         self._display = display
         self._verdict = Verdict()
         self._views = [AgentView(agent) for agent in range(config.swarm.agents)]
-        self._obstacles = _first_obstacles(config)
+        self._configured = first_obstacles(o.model_dump() for o in config.obstacles)
+        self._obstacles = self._configured
         self._obstacles_said_s = 0.0
         self._started_s = time.monotonic()
         self._reported: set[str] = set()
@@ -162,7 +164,7 @@ class Flight:
         """An operator has changed the list: repeat the new one, and judge what is new in it from now on."""
         self._obstacles, self._obstacles_said_s = message, 0.0
         now_us = time.time_ns() // 1000
-        known = self._verdict.obstacles or dict.fromkeys(_first_obstacles(self._config).obstacles)
+        known = self._verdict.obstacles or dict.fromkeys(self._configured.obstacles)
         self._verdict.obstacles = {item: known.get(item, now_us) for item in message.obstacles}
         self._say("obstacles", f"{len(message.obstacles)} obstacles, set by an operator", version=message.version)
 
@@ -318,14 +320,3 @@ class Flight:
 
     def _running(self) -> list[AgentView]:
         return [view for view in self._views if self._base.children[agent_name(view.agent)].poll() is None]
-
-
-def _first_obstacles(config: Config) -> ObstaclesMessage:
-    """Version 1 of the list: what the configuration says."""
-    return ObstaclesMessage(
-        1,
-        tuple(
-            ObstacleMessage(o.center_ned_m, o.radius_m, o.keep_out_m, o.visibility_m, o.vel_ned_m_s, o.column)
-            for o in config.obstacles
-        ),
-    )

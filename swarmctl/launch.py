@@ -19,7 +19,6 @@ from swarmctl.attach import RunningLaunch, announce, process_start_s, withdraw
 from swarmctl.config import Config, dump
 from swarmctl.errors import StartError
 from swarmctl.flight import Base, EventLog, Flight
-from swarmctl.lifeline import remove_socket
 from swarmctl.links.bus import SCHEME, ZenohBus, socket_file
 from swarmctl.links.peers import agent_name
 from swarmctl.links.topics import OBSTACLES, OPERATOR, STATUS
@@ -162,7 +161,6 @@ class Bringup(Base):
             self.bus.close()
         end_all(router, _ROUTER_STOP_S)
         self._ground.release()
-        remove_socket(socket_file(self.site.endpoint))
         shutil.rmtree(self._socket_dir, ignore_errors=True)
         withdraw()
         self.log.write("stopped", exit_codes={name: child.poll() for name, child in self.children.items()})

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence, Set
 
-import numpy as np
-
 from swarmctl.control.barrier import Body, body_of_obstacle, body_of_peer
 from swarmctl.control.facts import PeerFacts
 from swarmctl.control.separation import (
@@ -24,7 +22,7 @@ from swarmctl.links import topics
 from swarmctl.links.peers import Bus, PeerPaths, agent_name
 
 _NEW_US = 300_000  # a path that may be compared with promises
-_FLOWN_BY_AGENT = frozenset((Mode.FOLLOW, Mode.REPLAY, Mode.BRAKE, Mode.HOLD))
+FLOWN_BY_AGENT = frozenset((Mode.FOLLOW, Mode.REPLAY, Mode.BRAKE, Mode.HOLD))
 
 
 class Surroundings:
@@ -58,7 +56,7 @@ class Surroundings:
             message = topics.decode_obstacles(payload)
             if message is not None and message.version > self._obstacles_version:
                 self._obstacles_version = message.version
-                self._obstacles, self._seen = tuple(_obstacle(o) for o in message.obstacles), {}
+                self._obstacles, self._seen = tuple(o.obstacle() for o in message.obstacles), {}
         commands = [topics.decode_command(payload) for _, payload in self._bus.receive(topics.COMMAND)]
         return [c.verb for c in commands if c is not None and c.agent in (-1, self._agent)]
 
@@ -118,15 +116,13 @@ class Surroundings:
         p, fresh_us = self._params, act_utc_us - round(self._params.lost_after_s * 1e6)
         found: list[Body] = []
         for agent, trajectories in self.promised.items():
-            status = self._status.get(agent)
-            share_01 = 0.5 if status is not None and status.mode in _FLOWN_BY_AGENT else 1.0
+            share_01 = 0.5 if self._flies_itself(agent) else 1.0
             for pos, vel in (trajectory.at(act_utc_us + ahead_s * 1e6) for trajectory in trajectories):
                 found.append(Body(pos, vel, p.body_m + margin_m, share_01))
         for path in self.paths.latest():
             if path.agent in self.promised:
                 continue
-            status = self._status.get(path.agent)
-            filters = status is not None and status.mode in _FLOWN_BY_AGENT and path.t0_utc_us >= fresh_us
+            filters = self._flies_itself(path.agent) and path.t0_utc_us >= fresh_us
             growth_m_s2 = 0.0 if self._phase(path.agent) is Phase.DONE else p.age_accel_m_s2
             apart_m = p.body_m + margin_m
             found.append(body_of_peer(path, act_utc_us, ahead_s, apart_m, growth_m_s2, p.age_margin_max_m, filters))
@@ -165,17 +161,11 @@ class Surroundings:
                 return True
         return False
 
+    def _flies_itself(self, agent: int) -> bool:
+        """Whether its agent flies it, and so filters as we do."""
+        status = self._status.get(agent)
+        return status is not None and status.mode in FLOWN_BY_AGENT
+
     def _phase(self, agent: int) -> Phase | None:
         status = self._status.get(agent)
         return None if status is None else Phase(status.phase)
-
-
-def _obstacle(message: topics.ObstacleMessage) -> Obstacle:
-    return Obstacle(
-        np.array(message.center_ned_m),
-        message.radius_m,
-        message.keep_out_m,
-        message.visibility_m,
-        np.array(message.vel_ned_m_s),
-        message.column,
-    )

@@ -16,6 +16,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -33,7 +34,7 @@ from sitl.campaign.store import Store
 from sitl.campaign.summary import summaries
 from sitl.campaign.switches import NOISES, PROTECTIONS
 from sitl.campaign.trials import Cell, Row, Trial, cells, trial_of
-from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, ConfigError, SwarmError
+from swarmctl.errors import EXIT_MISSION, EXIT_OK, ConfigError, exit_code_of
 
 MAX_AGENTS = 100
 _SAY_EVERY_S = 30.0  # where there is no terminal to draw a bar on
@@ -43,14 +44,7 @@ _Value = TypeVar("_Value")
 def main(arguments: list[str] | None = None) -> int:
     """Fly what is asked for and not there yet; 4 when a trial could not be flown at all."""
     options = _parser().parse_args(arguments)
-    try:
-        return _run(options)
-    except SwarmError as error:
-        print(error, file=sys.stderr)
-        return error.exit_code
-    except KeyboardInterrupt:
-        print(f"interrupted; the same call goes on from {options.out}", file=sys.stderr)
-        return EXIT_INTERRUPTED
+    return exit_code_of(partial(_run, options), f"interrupted; the same call goes on from {options.out}")
 
 
 def _run(options: argparse.Namespace) -> int:

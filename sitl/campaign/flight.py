@@ -202,9 +202,10 @@ class Flight:
         return tuple(found)
 
     def _commits_refused(self) -> int | None:
-        """Counted by agents that coordinate; None when none does."""
-        counts = [getattr(agent, "commits_refused", None) for agent in self._agents]
-        return sum(count for count in counts if count is not None) if any(c is not None for c in counts) else None
+        """Counted by agents that promise; None when none does."""
+        counts = [agent.commits_refused for agent in self._agents if agent is not None]
+        promising = [count for count in counts if count is not None]
+        return sum(promising) if promising else None
 
 
 def _alone_s(trial: Trial, layout: Layout) -> float | None:

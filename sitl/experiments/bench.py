@@ -15,11 +15,11 @@ import sitl.experiments.one_thread  # noqa: F401
 # isort: split
 import argparse
 import json
-import math
 import os
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, astuple, dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +28,9 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Column, Table
 
+from sitl.campaign.flight import config_of
+from sitl.campaign.scenarios import layout_of
+from sitl.campaign.trials import Cell
 from sitl.experiments.captured import (
     Times,
     XyTimes,
@@ -39,9 +42,9 @@ from sitl.experiments.captured import (
 )
 from sitl.experiments.formation import Formation, formation_config
 from sitl.lockstep import Lockstep
-from swarmctl.config import Config, load
+from swarmctl.config import Config
 from swarmctl.core.types import Array, Phase
-from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, ConfigError, MissionError, SwarmError
+from swarmctl.errors import EXIT_OK, ConfigError, MissionError, exit_code_of
 from swarmctl.reporter import Took
 
 PARTS = ("sense", "setup", "promise", "spaces", "solve", "certify", "barrier", "send", "tick")
@@ -54,7 +57,6 @@ _READY_WITHIN_TICKS = 1500
 _OBSTACLE = ", 1 obstacle"
 _PROMISES = ", guaranteed"
 _PROMISING = 9  # neighbours of the scenario with promises
-_SWAP_ROOM_M = 0.63  # half of what neighbours on its circle are apart
 _ENDLESS_S = 3600.0
 _BUSY_LOAD = 0.7  # one-minute load average
 
@@ -84,7 +86,7 @@ def measure_ticks(
     """
     formations = {solver: Formation(formation_config(solver, neighbours, pillar)) for solver in solvers}
     for solver, formation in formations.items():
-        _get_under_way(solver, formation)
+        _get_under_way(solver, formation.step, partial(_is_warm, formation))
     took: dict[str, list[tuple[float, ...]]] = {solver: [] for solver in solvers}
     with settled_garbage():
         for _ in range(ticks):
@@ -106,9 +108,8 @@ def measure_promises(
     """
     crowds = {solver: Lockstep(_swap_config(solver, neighbours + 1)) for solver in solvers}
     took: dict[str, list[tuple[float, ...]]] = {solver: [] for solver in solvers}
-    for crowd in crowds.values():
-        while crowd.logs[0].rows == [] or int(crowd.logs[0].rows[-1]["phase"][0]) != Phase.TRACK:
-            crowd.step()
+    for solver, crowd in crowds.items():
+        _get_under_way(solver, crowd.step, partial(_tracks, crowd))
     with settled_garbage():
         for _ in range(0, ticks, neighbours + 1):
             for solver, crowd in crowds.items():
@@ -120,35 +121,29 @@ def measure_promises(
 
 
 def _swap_config(solver: str, agents: int) -> Config:
-    radius_m = max(4.0, _SWAP_ROOM_M / math.sin(math.pi / agents))
-    angles = 2.0 * math.pi * np.arange(agents) / agents
-    starts = [[round(radius_m * math.cos(a), 3), round(radius_m * math.sin(a), 3), 0.0] for a in angles]
-    return load(
-        None,
-        [
-            f"swarm.agents={agents}",
-            f"start.positions_ned_m={starts}",
-            "mission.kind='swap'",
-            f"mission.duration_s={_ENDLESS_S}",
-            f"separation.max_neighbours={max(1, agents - 1)}",
-            "separation.mode='guaranteed'",
-            f"controller.mpc.qp.solver='{solver}'",
-            "sitl.start='air'",
-        ],
-    )
+    cell = Cell("symmetric", agents, 0.0, 0.0, "exact", 0.0, "guaranteed")
+    extra = (f"controller.mpc.qp.solver='{solver}'", f"mission.duration_s={_ENDLESS_S}")
+    return config_of(cell, 1, layout_of(cell.scenario, 1, agents), agents, extra)
 
 
-def _get_under_way(solver: str, formation: Formation) -> None:
+def _tracks(crowd: Lockstep) -> bool:
+    return int(crowd.logs[0].rows[-1]["phase"][0]) == Phase.TRACK
+
+
+def _is_warm(formation: Formation) -> bool:
+    return formation.mission_t_s >= _WARM_UP_S
+
+
+def _get_under_way(solver: str, step: Callable[[], None], ready: Callable[[], bool]) -> None:
     for _ in range(_READY_WITHIN_TICKS):
-        formation.step()
-        if formation.mission_t_s >= _WARM_UP_S:
+        step()
+        if ready():
             return
     raise MissionError(f"bench: the agent with {solver} did not begin within {_READY_WITHIN_TICKS} ticks")
 
 
-def _parts(t: Took) -> tuple[float, ...]:
-    layers = t.promise_ms, t.spaces_ms, t.solve_ms, t.certify_ms, t.barrier_ms
-    return t.sense_ms, t.setup_ms, *layers, t.send_ms, t.tick_ms
+def _parts(took: Took) -> tuple[float, ...]:
+    return (*astuple(took), took.tick_ms)
 
 
 def tick_rows(took: dict[str, Array], neighbours: int, suffix: str = "") -> list[BenchRow]:
@@ -271,21 +266,18 @@ def _parser() -> argparse.ArgumentParser:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the verb; returns the process exit code."""
-    options = _parser().parse_args(arguments)
+    return exit_code_of(partial(_run, _parser().parse_args(arguments)))
+
+
+def _run(options: argparse.Namespace) -> int:
     console = Console()
     note = busy_note(os.getloadavg()[0], os.cpu_count() or 1)
     solvers = list(dict.fromkeys(options.solver or SOLVERS))
-    try:
-        rows = bench(options.neighbours, solvers, options.ticks, options.slsqp, console)
-        show(rows, console)
-        if note:
-            console.print(note)
-        console.print(str(write(rows, options.out)))
-    except SwarmError as error:
-        print(error, file=sys.stderr)
-        return error.exit_code
-    except KeyboardInterrupt:
-        return EXIT_INTERRUPTED
+    rows = bench(options.neighbours, solvers, options.ticks, options.slsqp, console)
+    show(rows, console)
+    if note:
+        console.print(note)
+    console.print(str(write(rows, options.out)))
     return EXIT_OK
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from sitl.airframes import PRESETS
 from sitl.attitude import THESIS_GAINS, THESIS_SAMPLE_S, ThesisAttitude
 from sitl.experiments.trace import Array, Sphere, Trace
+from sitl.lockstep import obstacles_message
 from sitl.vehicle import Plant
 from swarmctl.config import Config
 from swarmctl.control.controller import make_controller
@@ -32,7 +33,6 @@ from swarmctl.core.types import (
     AttitudeSetpoint,
     FlightMode,
     Landed,
-    Obstacle,
     Plan,
     PlanStatus,
     PredictedPath,
@@ -57,19 +57,14 @@ class Pilot:
         self._predictor = Predictor(config.vehicle_model)
         hover_01 = PRESETS["thesis"].mass_kg * GRAVITY_M_S2 / PRESETS["thesis"].thrust_max_n
         self._observer = DisturbanceObserver(config.agent.disturbance, hover_01)
-        starts, apart_m = np.array(config.starts_ned_m()), config.separation.radius_m
-        self._reference = MissionReference(config.mission, starts, agent, apart_m)
+        starts = np.array(config.starts_ned_m())
+        self._reference = MissionReference(config.mission, starts, agent, config.separation.planned_m)
         self._virtual = np.array([0.0, 0.0, GRAVITY_M_S2])
         self._thrust_01 = hover_01
         brake_m_s2 = config.separation.brake_m_s2
         self._replay = Replay(agent, self._dt_us, self._steps, brake_m_s2)
         self._replay_us = round(config.agent.failsafe.replay_s * 1e6)
-        self._obstacles = tuple(
-            Obstacle(
-                np.array(o.center_ned_m), o.radius_m, o.keep_out_m, o.visibility_m, np.array(o.vel_ned_m_s), o.column
-            )
-            for o in config.obstacles
-        )
+        self._obstacles = tuple(o.obstacle() for o in obstacles_message(config).obstacles)
         self.path: PredictedPath | None = None
         self.failed = 0
         self.terminal_missed = 0

@@ -14,6 +14,7 @@ import signal
 import sys
 import time
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -33,7 +34,7 @@ from sitl.experiments.thesis import FULL_JOBS, PLANT_JOBS, Job
 from sitl.experiments.timing import timing_rows
 from sitl.experiments.trace import Row, Trace
 from swarmctl.config import load
-from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, ConfigError, StartError, SwarmError
+from swarmctl.errors import EXIT_MISSION, EXIT_OK, ConfigError, StartError, exit_code_of
 from swarmctl.lifeline import die_with_parent
 from swarmctl.shipped import shipped_config
 from swarmctl.telemetry.run_folder import create_run_folder
@@ -170,19 +171,16 @@ def _parser() -> argparse.ArgumentParser:
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the verb; returns the process exit code."""
-    options = _parser().parse_args(arguments)
-    try:
-        if options.jobs < 1:
-            raise ConfigError("--jobs", [f"{options.jobs}: at least 1 process flies"])
-        chosen(options.only, options.plant, options.full)
-        directory = options.out or create_run_folder(None, "reproduce", time.time_ns() // 1000)
-        _make(directory)
-        return reproduce(options.only, options.plant, options.full, directory, options.jobs)
-    except SwarmError as error:
-        print(error, file=sys.stderr)
-        return error.exit_code
-    except KeyboardInterrupt:
-        return EXIT_INTERRUPTED
+    return exit_code_of(partial(_run, _parser().parse_args(arguments)))
+
+
+def _run(options: argparse.Namespace) -> int:
+    if options.jobs < 1:
+        raise ConfigError("--jobs", [f"{options.jobs}: at least 1 process flies"])
+    chosen(options.only, options.plant, options.full)
+    directory = options.out or create_run_folder(None, "reproduce", time.time_ns() // 1000)
+    _make(directory)
+    return reproduce(options.only, options.plant, options.full, directory, options.jobs)
 
 
 if __name__ == "__main__":

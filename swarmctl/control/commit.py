@@ -55,7 +55,7 @@ from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.intent import Intent, Proposal
 from swarmctl.core.params import Params
 from swarmctl.core.trajectory import Trajectory, ending_at_rest, joined, places, resting, stopping
-from swarmctl.core.types import Array, Plan, PlanStatus, Reference
+from swarmctl.core.types import Array, Plan, PlanStatus, Reference, Sampled
 
 _LATENCIES = 50  # remembered
 _PERCENTILE = 90.0
@@ -82,6 +82,14 @@ class CommitParams(Params):
     lead_min_s: float = Field(0.06, ge=0.02, le=2)  # from proposing to flying it
     lead_max_s: float = Field(1.5, ge=0.1, le=5)
     follow_z: AxisWeights = AxisWeights(q_pos=20.0, q_vel=0.5, r=0.05)  # of flying what is promised: to the centimetre
+
+
+@dataclass(frozen=True, slots=True)
+class Wish:
+    """What an agent would follow if it were alone."""
+
+    reference: Sampled
+    is_way: bool = False  # it begins here and is clear of obstacles: look for plans near it, not near the last one
 
 
 @dataclass(slots=True)
@@ -190,16 +198,15 @@ class Commitments:
     def avoid(
         self,
         utc_us: int,
-        reference: Callable[[Array], tuple[Array, Array]],
+        wish: Wish,
         peers: Mapping[int, Intent],
         others: Sequence[KeepOut],
-        is_way: bool = False,
     ) -> None:
         """Change the own promise without asking, where waiting would be too late for those who take no part.
 
         Args:
             utc_us: now.
-            reference, is_way: as of `propose`.
+            wish: what it would like.
             peers: of those who take part.
             others: those who do not, and obstacles, from now on.
         """
@@ -211,13 +218,13 @@ class Commitments:
         later_us = utc_us + self.lead_us + round(_LATER_S * 1e6)
         if certify(self._stopped(later_us, utc_us).sample(times)[0], others, 0) >= 0.0:
             return
-        known = [trajectory for intent in peers.values() for trajectory in intent.followed]
+        known = _followed(peers)
 
         def margin_m(trajectory: Trajectory) -> float:
             return min(certify(trajectory.sample(times)[0], others, 0), self._margin_m(trajectory, utc_us, known))
 
         best, best_m = self.committed, margin_m(self.committed) + _WORTH_M
-        for candidate in self._ways_out(utc_us, reference, peers, others, is_way):
+        for candidate in self._ways_out(utc_us, wish, peers, others):
             if (found_m := margin_m(candidate)) > best_m:
                 best, best_m = candidate, found_m
         if best is not self.committed:
@@ -227,13 +234,12 @@ class Commitments:
     def _ways_out(
         self,
         utc_us: int,
-        reference: Callable[[Array], tuple[Array, Array]],
+        wish: Wish,
         peers: Mapping[int, Intent],
         others: Sequence[KeepOut],
-        is_way: bool,
     ) -> Iterator[Trajectory]:
         """From now on: round everybody, and straight to a stop."""
-        plan = self._planned(utc_us, utc_us, reference, peers, others, is_way)
+        plan = self._planned(utc_us, utc_us, wish, peers, others)
         if plan is not None:
             yield ending_at_rest(utc_us, self._dt_us, plan.pos_ned_m, plan.vel_ned_m_s, self._params.brake_m_s2)
         yield self._stopped(utc_us, utc_us)
@@ -245,35 +251,35 @@ class Commitments:
         stop = stopping(pos[0], vel[0], brake_us, self._dt_us, self._params.brake_m_s2)
         return joined(self.committed, stop, utc_us)
 
+    def is_due(self, utc_us: int) -> bool:
+        """Whether there is no proposal and it is time for one."""
+        return self.proposal is None and self.committed is not None and utc_us >= self._next_us
+
     def propose(
         self,
         utc_us: int,
-        reference: Callable[[Array], tuple[Array, Array]],
+        wish: Wish,
         peers: Mapping[int, Intent],
         others: Sequence[KeepOut],
-        is_way: bool = False,
     ) -> None:
-        """Rule 4.
+        """Rule 4, when it `is_due`.
 
         Args:
             utc_us: now.
-            reference: gives positions and velocities at offsets [s] from now.
+            wish: what it would like.
             peers: as of `hear`.
             others: as from `keep_outs`, from `lead_us` ahead on.
-            is_way: the reference begins here and is clear of obstacles: look for plans near it, not near the last one.
         """
-        if self.proposal is not None or self.committed is None or utc_us < self._next_us:
-            return
         self._next_us = utc_us + round(self._params.period_s * 1e6)
         branch_us = utc_us + self.lead_us
-        plan = self._planned(branch_us, utc_us, reference, peers, others, is_way)
+        plan = self._planned(branch_us, utc_us, wish, peers, others)
         trajectory = None if plan is None else self._clear(plan, branch_us, utc_us, peers, others)
         if trajectory is None:
             self.counts.unplanned += 1
             return
         self._number = max(self._number + 1, utc_us)  # none of before a restart
         self.proposal = Proposal(self._number, utc_us, self._agent, trajectory)
-        self._cleared = {id(known): known for intent in peers.values() for known in intent.followed}
+        self._cleared = {id(known): known for known in _followed(peers)}
         self.counts.proposed += 1
 
     @property
@@ -294,10 +300,9 @@ class Commitments:
         self,
         branch_us: int,
         utc_us: int,
-        reference: Callable[[Array], tuple[Array, Array]],
+        wish: Wish,
         peers: Mapping[int, Intent],
         others: Sequence[KeepOut],
-        is_way: bool,
     ) -> Plan | None:
         assert self.committed is not None
         steps, dt_us = self._planner.steps, self._dt_us
@@ -307,8 +312,8 @@ class Commitments:
         lift = np.array([0.0, 0.0, GRAVITY_M_S2]) - accel
         size = float(np.sqrt(lift @ lift))
         start = Start(branch_us, pos[0], vel[0], 1.0, np.array([lift[0] / size, lift[1] / size, size]))
-        wanted = Reference(*reference(1e-6 * (ahead_us + (branch_us - utc_us))), 0.0)
-        guess = wanted.pos_ned_m + (pos[0] - wanted.pos_ned_m[0]) if is_way else pos
+        wanted = Reference(*wish.reference(1e-6 * (ahead_us + (branch_us - utc_us))), 0.0)
+        guess = wanted.pos_ned_m + (pos[0] - wanted.pos_ned_m[0]) if wish.is_way else pos
         known = [(t, intent.agent) for intent in peers.values() for t in intent.followed]
         keep_outs = self._keep_outs([t for t, _ in known], [agent for _, agent in known], branch_us, steps)
         kept = (*keep_outs, *(_begun(other, steps) for other in others))
@@ -320,7 +325,7 @@ class Commitments:
     ) -> Trajectory | None:
         """The plan, braked from as late as it then stays clear of everything known; None when it never does."""
         assert self.committed is not None
-        known = [trajectory for intent in peers.values() for trajectory in intent.followed]
+        known = _followed(peers)
         steps, dt_us, brake_m_s2 = self._planner.steps, self._dt_us, self._params.brake_m_s2
         ahead = branch_us + np.arange(self.steps + 1) * dt_us
         for share in _BRAKED_FROM_01:
@@ -363,10 +368,10 @@ class Commitments:
         if not trajectories:
             return []
         p = self._separation
-        radius_m, certified_m = p.radius_m + p.tracking_m, promised_m(p) + spare_m
+        certified_m = promised_m(p) + spare_m
         where = places(trajectories, t0_utc_us + np.arange(steps + 1) * self._dt_us)
         return [
-            KeepOut(points, radius_m, certified_m, False, agent, p.downwash)
+            KeepOut(points, p.planned_m, certified_m, False, agent, p.downwash)
             for points, agent in zip(where, agents, strict=True)
         ]
 
@@ -383,6 +388,11 @@ def promised_m(params: SeparationParams) -> float:
     """Distance that no two committed trajectories come closer than."""
     slack_m = min(params.certify_slack_m, _SLACK_01 * max(0.0, params.radius_m - params.body_m))
     return params.radius_m - slack_m
+
+
+def _followed(peers: Mapping[int, Intent]) -> list[Trajectory]:
+    """All that peers may follow from now on."""
+    return [trajectory for intent in peers.values() for trajectory in intent.followed]
 
 
 def _begun(keep_out: KeepOut, steps: int) -> KeepOut:

@@ -24,9 +24,7 @@ from pydantic import Field
 from swarmctl.control.separation import KeepOut
 from swarmctl.control.waypoints import Way, short_way
 from swarmctl.core.params import Params
-from swarmctl.core.types import Array, Obstacle
-
-Sampled = Callable[[Array], tuple[Array, Array]]  # offsets [s] from now -> positions, velocities
+from swarmctl.core.types import Array, Obstacle, Sampled
 
 _REPLAN_US = 500_000
 _BETTER_01 = 0.85  # a new way is taken when it is this much shorter

@@ -18,6 +18,7 @@ from pydantic import Field
 
 from swarmctl.control.axes import HalfSpaces
 from swarmctl.core.params import Params
+from swarmctl.core.trajectory import between
 from swarmctl.core.types import Array, Obstacle, PredictedPath
 
 _TINY_M = 1e-6
@@ -45,6 +46,11 @@ class SeparationParams(Params):
     stuck_m: float = Field(0.1, gt=0, le=10)  # a plan that moves less over its horizon gets nowhere
     max_neighbours: int = Field(8, ge=1, le=99)  # nearest ones that get rows
     max_obstacles: int = Field(6, ge=1, le=50)  # likewise; all visible ones are certified against
+
+    @property
+    def planned_m(self) -> float:
+        """What plans keep."""
+        return self.radius_m + self.tracking_m
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,17 +106,12 @@ def aligned(paths: Sequence[PredictedPath], t0_utc_us: int, dt_us: int, steps: i
 
     Times before the first point are extrapolated backwards along the first segment.
     """
-    counts = np.array([len(path.pos_ned_m) for path in paths])[:, None]
-    firsts = np.cumsum(counts)[:, None] - counts  # (N, 1) in all points
-    points = np.concatenate([path.pos_ned_m for path in paths])
+    lasts = np.array([len(path.pos_ned_m) - 1 for path in paths])[:, None]
     since = np.array([(t0_utc_us - path.t0_utc_us) / path.dt_us for path in paths])[:, None]
     pace = np.array([dt_us / path.dt_us for path in paths])[:, None]
-    last = counts - 1
     k = since + np.arange(steps + 1) * pace  # (N, steps+1) in points
-    low = np.minimum(np.maximum(np.floor(k).astype(int), 0), last - 1)
-    begins = points[firsts + low]
-    found: Array = begins + (np.minimum(k, last) - low)[:, :, None] * (points[firsts + low + 1] - begins)
-    beyond = k - last
+    found = between([path.pos_ned_m for path in paths], k)
+    beyond = k - lasts
     for i, path in enumerate(paths):
         if beyond[i, -1] > 0.0:
             _brake(found[i], path, beyond[i] * (path.dt_us * 1e-6), brake_m_s2)
@@ -150,7 +151,7 @@ def keep_out_of_peer(
     """
     age_s = max(0.0, (t0_utc_us - path.t0_utc_us) * 1e-6)
     margin_m = 0.0 if parked else min(0.5 * params.age_accel_m_s2 * age_s * age_s, params.age_margin_max_m)
-    radius_m = params.radius_m + params.tracking_m + path.radius_m + margin_m
+    radius_m = params.planned_m + path.radius_m + margin_m
     return KeepOut(
         align(path, t0_utc_us, dt_us, steps, params.brake_m_s2) if points is None else points,
         radius_m,

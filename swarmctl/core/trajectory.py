@@ -68,15 +68,22 @@ class Trajectory:
 
 def places(trajectories: Sequence[Trajectory], t_utc_us: Times) -> Array:
     """Positions (N, M, 3) of several at times (M,), straight between their points."""
-    lasts = np.array([len(t.pos_ned_m) - 1 for t in trajectories])
-    firsts = np.cumsum(lasts + 1) - lasts - 1  # (N,) in all points
-    points = np.concatenate([t.pos_ned_m for t in trajectories])
     begins = np.array([t.t0_utc_us for t in trajectories], np.float64)[:, None]
     steps = np.array([t.dt_us for t in trajectories], np.float64)[:, None]
-    k = np.minimum(np.maximum((t_utc_us - begins) / steps, 0.0), lasts[:, None])
-    low = np.minimum(k.astype(np.int64), lasts[:, None] - 1)
-    part, low = (k - low)[:, :, None], low + firsts[:, None]
-    return np.asarray(points[low] + part * (points[low + 1] - points[low]))
+    return between([t.pos_ned_m for t in trajectories], np.maximum((t_utc_us - begins) / steps, 0.0))
+
+
+def between(polylines: Sequence[Array], k: Array) -> Array:
+    """Positions (N, M, 3) at indices (N, M) into N polylines, straight between their points.
+
+    Before the first point the first segment goes on backwards; after the last point is the last point.
+    """
+    lasts = np.array([len(points) - 1 for points in polylines])[:, None]
+    firsts = np.cumsum(lasts + 1)[:, None] - lasts - 1  # (N, 1) in all points
+    points = np.concatenate(polylines)
+    low = np.minimum(np.maximum(np.floor(k).astype(np.int64), 0), lasts - 1)
+    begins = points[firsts + low]
+    return np.asarray(begins + (np.minimum(k, lasts) - low)[:, :, None] * (points[firsts + low + 1] - begins))
 
 
 def resting(pos_ned_m: Array, t_utc_us: int, dt_us: int) -> Trajectory:

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 import enum
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+Sampled = Callable[[Array], tuple[Array, Array]]  # offsets [s] from now (K,) -> positions, velocities (K, 3)
 
 
 class FlightMode(enum.IntEnum):

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import msgspec
 import numpy as np
 
-from swarmctl.core.types import FlightMode, Mode, Phase, PredictedPath
+from swarmctl.core.types import FlightMode, Mode, Obstacle, Phase, PredictedPath
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,12 +124,22 @@ class ObstacleMessage(msgspec.Struct, frozen=True):
     vel_ned_m_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
     column: bool = False
 
+    def obstacle(self) -> Obstacle:
+        """As plans see it."""
+        center, vel = np.array(self.center_ned_m), np.array(self.vel_ned_m_s)
+        return Obstacle(center, self.radius_m, self.keep_out_m, self.visibility_m, vel, self.column)
+
 
 class ObstaclesMessage(msgspec.Struct, frozen=True):
     """The whole list of obstacles; a higher `version` replaces a lower one."""
 
     version: int
     obstacles: tuple[ObstacleMessage, ...]
+
+
+def first_obstacles(items: Iterable[Mapping[str, Any]]) -> ObstaclesMessage:
+    """Version 1 of the list: items as configured."""
+    return ObstaclesMessage(1, tuple(ObstacleMessage(**item) for item in items))
 
 
 def encode_message(message: msgspec.Struct) -> bytes:

@@ -134,6 +134,25 @@ def test_ladder_after_solver_failure(fly: Fly, lasts_s: float, reached: Mode) ->
     assert flight.problems == (["agent 0: no plan for too long"] if reached is Mode.LAND else [])
 
 
+@pytest.mark.parametrize(("loss_s", "blind_s"), [(None, 0.5), (1.0, 1.0)], ids=["set by agents", "control"])
+def test_the_vehicle_of_a_dead_agent_flies_on_blindly_for_half_a_second(
+    fly: Fly, loss_s: float | None, blind_s: float
+) -> None:
+    """PX4 holds the last attitude for COM_OF_LOSS_T, which is a second of its own accord."""
+    own = f"agent.autopilot_params={{COM_OBL_RC_ACT=4,COM_OF_LOSS_T={loss_s}}}"
+    died: list[float] = []
+
+    def kill(running: Lockstep) -> None:
+        died.append(running.clock.now_us() * 1e-6)
+        running.kill(0)
+
+    def taken_over(running: Lockstep) -> bool:
+        return bool(died) and running.world.autopilots[0].flight_mode() != FlightMode.EXTERNAL
+
+    flight = fly("swarm.agents=2", AIR, *([own] if loss_s else []), at={2.0: kill}, until=taken_over)
+    assert flight.lockstep.clock.now_us() * 1e-6 - died[0] == pytest.approx(blind_s, abs=0.12)
+
+
 def test_others_keep_clear_of_who_has_no_solver(fly: Fly) -> None:
     """It replays, then comes to a hold and returns, and in the end lands."""
     broken = {

@@ -9,7 +9,10 @@ import pytest
 from sitl.campaign.flight import Flight
 from sitl.campaign.scenarios import layout_of
 from sitl.campaign.trials import Cell, Trial
+from sitl.lockstep import Lockstep
+from swarmctl.config import load
 from swarmctl.coordination import Coordination
+from swarmctl.core.types import Phase
 from swarmctl.links.peers import agent_name
 
 PROMISED_M = 0.8
@@ -79,3 +82,29 @@ def test_who_flies_beside_what_it_promised_says_so(body_m: float, told: bool) ->
     if told:
         assert off[0]["begins"] is True
         assert float(str(off[0]["error_m"])) > float(str(off[0]["allowed_m"])) == pytest.approx(0.1 / 3)
+
+
+@pytest.mark.parametrize(("weights", "follows"), [("", True), ("{q_pos=2.0,q_vel=0.05,r=1.0}", False)])
+def test_what_is_promised_is_flown_in_height_too(weights: str, follows: bool) -> None:
+    """Into a climbing circle from rest; control: the thesis' soft z, which is good enough for wishes."""
+    sets = ["swarm.agents=1", "sitl.start=air", "separation.mode=guaranteed", "mission.duration_s=2.5"]
+    sets += [f"agent.commit.follow_z={weights}"] * bool(weights)
+    flight = Lockstep(load(None, sets))
+    flight.run()
+    (told,) = [event for event in flight.logs[0].events if event["event"] == "promises"]
+    assert (told["worst_tracking_m"] < 0.1) is follows
+    assert (told["worst_tracking_m"] > 0.2) is not follows
+
+
+def test_a_blind_tick_makes_no_promises_and_takes_no_time_for_them() -> None:
+    flight = Lockstep(load(None, ["swarm.agents=1", "sitl.start=air", "separation.mode=guaranteed"]))
+    while not flight.logs[0].rows or flight.logs[0].rows[-1]["phase"][0] != Phase.TRACK:
+        flight.step()
+    (agent,) = flight.agents
+    assert agent is not None
+    assert agent.took.promise_ms > 0.0
+    flight.links[0][1].send = lambda data: None  # type: ignore[method-assign]
+    for _ in range(15):
+        flight.step()
+    assert agent.took.promise_ms == 0.0
+    assert agent.took.setup_ms >= 0.0

@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 import pytest
 
-from swarmctl.control.commit import Commitments, CommitParams
+from swarmctl.control.commit import Commitments, CommitParams, Wish
 from swarmctl.control.mission import glide_to
 from swarmctl.control.mpc import MpcParams
 from swarmctl.control.separation import KeepOut, SeparationParams
@@ -75,7 +75,8 @@ class Crowd:
                     self.known[i][intent.agent] = intent
         for i, agent in enumerate(self.agents):
             agent.hear(self.now_us, self.known[i], set(ids) - {i})
-            agent.propose(self.now_us, partial(self.wanted, i), self.known[i], ())
+            if agent.is_due(self.now_us):
+                agent.propose(self.now_us, Wish(partial(self.wanted, i)), self.known[i], ())
         for i, agent in enumerate(self.agents):
             assert agent.committed is not None
             said = Intent(i, 1, self.seq, True, agent.committed, agent.proposal, self.heard(i))
@@ -184,7 +185,7 @@ def wall(x_m: float, agent: Commitments) -> KeepOut:
 def test_a_promise_that_was_changed_without_asking_is_found_by_whom_it_contradicts() -> None:
     first, second = meeting()
     assert second.broken(UTC_US, said_by(first, 0)) == set()
-    first.avoid(UTC_US, at_goal, {}, [wall(1.6, first)])
+    first.avoid(UTC_US, Wish(at_goal), {}, [wall(1.6, first)])
     assert first.counts.evaded == 1, "before a wall there is no time to ask"
     assert second.broken(UTC_US, said_by(first, 0)) == {0}
     assert second.broken(UTC_US, said_by(first, 0)) == {0}, "as long as it does"
@@ -192,14 +193,48 @@ def test_a_promise_that_was_changed_without_asking_is_found_by_whom_it_contradic
 
 def test_a_wall_that_leaves_time_to_ask_stops_nobody() -> None:
     first, _ = meeting()
-    first.avoid(UTC_US, at_goal, {}, [wall(2.6, first)])
+    first.avoid(UTC_US, Wish(at_goal), {}, [wall(2.6, first)])
     assert first.counts.evaded == 0
+
+
+def test_who_rests_makes_way_for_what_comes_at_it() -> None:
+    """To stop would change nothing: it rests already."""
+    agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), SEPARATION, 2, lambda: 0)
+    agent.begin(np.array([0.0, 0.0, -2.0]), np.zeros(3), UTC_US)
+    times_s = 0.1 * np.arange(agent.steps + 1)
+    coming = np.stack([2.5 - 1.0 * times_s, 0.3 + 0.0 * times_s, -2.0 + 0.0 * times_s], axis=1)
+    agent.avoid(UTC_US, Wish(at_goal), {}, [KeepOut(coming, 0.9, 0.8, False, 1)])
+    assert agent.counts.evaded == 1
+    assert agent.committed is not None
+    apart = agent.committed.sample(UTC_US + times_s * 1e6)[0] - coming
+    assert np.linalg.norm(apart, axis=1).min() > 0.5, "it would have been 0.3 m"
+
+
+@pytest.mark.parametrize(("is_way", "gets_on"), [(True, True), (False, False)])
+def test_along_a_way_round_plans_look_near_the_way(is_way: bool, gets_on: bool) -> None:
+    """The last plan leads north before a wall, the way south through its gap: from one to the other no row leads."""
+    small = SeparationParams(radius_m=0.3, body_m=0.15)
+    agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), small, 5, lambda: 0)
+    to_north = glide_to(np.array([0.0, 0.0, -2.0]), np.zeros(3), np.array([0.1, 0.9, -2.0]), 1.0, 1.0)
+    agent.committed = ending_at_rest(UTC_US, 100_000, *to_north.sample(np.arange(0.0, 2.1, 0.1)), 1.5)
+    posts = [np.array([0.8, y_m, -2.0]) for y_m in (0.3, 0.6, 0.9, 1.2)]
+    wall = [KeepOut(np.tile(post, (agent.steps + 1, 1)), 0.375, 0.275, True, -1) for post in posts]
+    corners = np.array([[0.0, 0.0], [0.8, -0.4], [3.0, -0.4]])
+    reached_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+
+    def way(offsets_s: Array) -> tuple[Array, Array]:
+        x, y = (np.interp(offsets_s, reached_m, corners[:, i]) for i in (0, 1))  # at 1 m/s
+        return np.stack([x, y, 0.0 * x - 2.0], axis=1), np.zeros((len(offsets_s), 3))
+
+    agent.propose(UTC_US, Wish(way, is_way), {}, wall)
+    assert agent.proposal is not None
+    assert bool(agent.proposal.trajectory.pos_ned_m[-1, 0] > 1.0) is gets_on, "behind the wall"
 
 
 def proposing() -> tuple[Commitments, Proposal]:
     agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), SEPARATION, 2, lambda: 0)
     agent.begin(np.array([0.0, 0.0, -2.0]), np.zeros(3), UTC_US)
-    agent.propose(UTC_US, at_goal, {}, ())
+    agent.propose(UTC_US, Wish(at_goal), {}, ())
     assert agent.proposal is not None
     return agent, agent.proposal
 

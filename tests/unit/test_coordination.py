@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from swarmctl.control.commit import CommitParams
+from swarmctl.control.commit import CommitParams, Wish
 from swarmctl.control.mpc import MpcParams
 from swarmctl.control.separation import SeparationParams
 from swarmctl.coordination import Coordination
@@ -52,25 +52,21 @@ class Bench:
         )
         self.seq = 0
 
-    def fly(self, seconds: float, pos: Array = HERE, each: Callable[[], None] = lambda: None) -> None:
+    @property
+    def state(self) -> VehicleState:
+        """Hovers here."""
+        north = np.array([1.0, 0.0, 0.0, 0.0])
+        still, now_us = np.zeros(3), self.clock.now_us()
+        return VehicleState(now_us, HERE, still, north, still, True, FlightMode.EXTERNAL, Landed.IN_AIR, False)
+
+    def fly(self, seconds: float, each: Callable[[], None] = lambda: None) -> None:
         for _ in range(round(seconds / 0.02)):
             self.clock.advance(20_000)
             each()
             utc_us = self.clock.utc_us()
             self.surroundings.listen(utc_us)
             self.coordination.listen(utc_us)
-            state = VehicleState(
-                self.clock.now_us(),
-                pos,
-                np.zeros(3),
-                np.array([1.0, 0.0, 0.0, 0.0]),
-                np.zeros(3),
-                True,
-                FlightMode.EXTERNAL,
-                Landed.IN_AIR,
-                False,
-            )
-            self.coordination.step(utc_us, state, Phase.TRACK, self.wanted, False)
+            self.coordination.step(utc_us, self.state, Phase.TRACK, Wish(self.wanted))
             self.coordination.say()
 
     def wanted(self, offsets_s: Array) -> tuple[Array, Array]:
@@ -142,6 +138,26 @@ def test_who_is_beside_its_promise_is_where_it_is(bench: Bench) -> None:
     assert bench.surroundings.promised == {}
     (body,) = bench.surroundings.bodies(HERE, bench.clock.utc_us(), 0.0, 0.0)
     assert body.pos_ned_m == pytest.approx(tuple(aside))
+
+
+def test_who_promises_is_not_kept_clear_of_more_because_its_message_is_old(bench: Bench) -> None:
+    bench.fly(0.5, each=bench.speak)
+    bench.fly(1.0)
+    utc_us, apart_m = bench.clock.utc_us(), SeparationParams().body_m
+    assert {body.apart_m for body in bench.surroundings.bodies(HERE, utc_us, 0.0, 0.0)} == {apart_m}
+    bench.surroundings.promised = {}
+    (control,) = bench.surroundings.bodies(HERE, utc_us, 0.0, 0.0)
+    assert control.apart_m > apart_m + 0.9, "a path as old may have been left by a metre"
+
+
+def test_who_is_silent_is_certified_against_with_all_of_its_margin(bench: Bench) -> None:
+    bench.fly(0.5, each=bench.speak)
+    bench.fly(1.0)
+    utc_us, params = bench.clock.utc_us(), SeparationParams()
+    (kept,) = bench.coordination._others(utc_us, bench.state, Phase.TRACK, set())
+    (control,) = bench.surroundings.keep_outs(HERE, utc_us, 100_000, 5, Phase.TRACK)
+    assert control.certified_m == params.radius_m - params.certify_slack_m, "which would not grow with age"
+    assert kept.certified_m > params.planned_m + 0.5
 
 
 def test_who_does_not_know_where_it_is_promises_nothing(bench: Bench) -> None:
