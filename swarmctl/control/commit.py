@@ -31,8 +31,8 @@ What it rests on, and how that is watched in flight:
 - They fly what they follow: half of what is promised beyond touching bodies may be missed by each. An event
   `off_promise` says who misses more, and `promises` at the end the worst of the flight.
 - Promises are kept. A promise is changed without being asked for only where a vehicle begins to promise at speed, and
-  by `avoid`, before something that takes no part. Whoever finds a peer's promise in contradiction to the own one
-  (`broken`), or a peer beside its promise, keeps clear of it as of one that takes no part.
+  by `avoid`, before something that takes no part: round it, to a stop, or above it. Whoever finds a peer's promise in
+  contradiction to the own one (`broken`), or a peer beside its promise, keeps clear of it as of one that takes no part.
 - Everybody takes part. Who does not (a pilot flies, an agent has died) is a keep-out of the best-effort kind, and a
   peer is dead only when its liveliness token is gone while the own one is there: who is off the bus commits nothing.
 """
@@ -47,6 +47,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pydantic import Field
 
+from swarmctl.control.mission import brake_to_rest, glide_to
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc import AxisWeights, MpcParams, SwarmMpc
 from swarmctl.control.problem import Problem, Start
@@ -62,6 +63,7 @@ _PERCENTILE = 90.0
 _LEAD_OVER = 1.2  # times that percentile of the time acknowledgements take
 _BRAKED_FROM_01 = (1.0, 0.75, 0.5, 0.3, 0.15)  # of the plan
 _WORTH_M = 0.02  # by which a way out has to be better than what has been promised
+_RISE_M_S, _RISE_M_S2 = 2.0, 2.0
 _TAIL_S = 2.0  # of braking, judged against who takes no part
 _LATER_S = 0.2  # after the lead: the last moment to brake without asking
 _CLOSER_M = 0.001  # than now, of promises that are too close already
@@ -81,6 +83,8 @@ class CommitParams(Params):
     period_s: float = Field(0.1, ge=0, le=2)  # between two plans, at least
     lead_min_s: float = Field(0.06, ge=0.02, le=2)  # from proposing to flying it
     lead_max_s: float = Field(1.5, ge=0.1, le=5)
+    bias_rad: float = Field(1.0, ge=0, le=1.2)  # as in `separation`, stronger and sooner: who has promised to stop
+    stuck_m: float = Field(1.0, gt=0, le=10)  # before a peer that has promised the same gives way only when asked
     follow_z: AxisWeights = AxisWeights(q_pos=20.0, q_vel=0.5, r=0.05)  # of flying what is promised: to the centimetre
 
 
@@ -127,8 +131,9 @@ class Commitments:
     ) -> None:
         self._agent, self._params, self._separation = agent, params, separation
         self._dt_us = round(params.dt_s * 1e6)
+        keeping_right = separation.model_copy(update={"bias_rad": params.bias_rad, "stuck_m": params.stuck_m})
         self._planner = SwarmMpc(
-            _planning(mpc, params), VehicleModelParams(delay_s=0.0), separation, agent, slots, stopwatch_ns
+            _planning(mpc, params), VehicleModelParams(delay_s=0.0), keeping_right, agent, slots, stopwatch_ns
         )
         self._latencies_s: deque[float] = deque(maxlen=_LATENCIES)
         self._lead_s = params.lead_min_s
@@ -238,11 +243,14 @@ class Commitments:
         peers: Mapping[int, Intent],
         others: Sequence[KeepOut],
     ) -> Iterator[Trajectory]:
-        """From now on: round everybody, and straight to a stop."""
+        """From now on: round everybody, straight to a stop, and over who can be flown over."""
         plan = self._planned(utc_us, utc_us, wish, peers, others)
         if plan is not None:
             yield ending_at_rest(utc_us, self._dt_us, plan.pos_ned_m, plan.vel_ned_m_s, self._params.brake_m_s2)
         yield self._stopped(utc_us, utc_us)
+        heights_m = [k.radius_m for k in others if not k.any_height]
+        if heights_m:
+            yield self._risen(utc_us, max(heights_m) + _SPARE_M)
 
     def _stopped(self, brake_us: int, utc_us: int) -> Trajectory:
         """What is committed, braked from a time on, straight ahead."""
@@ -250,6 +258,15 @@ class Commitments:
         pos, vel = self.committed.sample(np.array([brake_us]))
         stop = stopping(pos[0], vel[0], brake_us, self._dt_us, self._params.brake_m_s2)
         return joined(self.committed, stop, utc_us)
+
+    def _risen(self, utc_us: int, height_m: float) -> Trajectory:
+        """What is committed, left upwards."""
+        assert self.committed is not None
+        pos, vel = (found[0] for found in self.committed.sample(np.array([utc_us])))
+        above = brake_to_rest(pos, vel, self._params.brake_m_s2).to_ned_m - [0.0, 0.0, height_m]
+        glide = glide_to(pos, vel, above, _RISE_M_S, _RISE_M_S2)
+        ahead_s = self._params.dt_s * np.arange(math.ceil(glide.travel_s / self._params.dt_s) + 1, dtype=np.float64)
+        return ending_at_rest(utc_us, self._dt_us, *glide.sample(ahead_s), self._params.brake_m_s2)
 
     def is_due(self, utc_us: int) -> bool:
         """Whether there is no proposal and it is time for one."""

@@ -42,7 +42,8 @@ class SeparationParams(Params):
     gate_m: float = Field(3.0, gt=0, le=1000)  # rows farther than this from being active are left out
     stop_m_s2: float = Field(1.0, gt=0, le=50)  # braking that plans leave room for beyond their horizon
     relax_01: float = Field(0.9, gt=0, le=1)  # share of the reachable displacement a row may ask for
-    bias_rad: float = Field(0.35, ge=0, le=1.2)  # traffic rule: largest turn of head-on normals
+    bias_rad: float = Field(0.35, ge=0, le=1.2)  # traffic rule: largest turn of head-on normals among peers
+    bias_obstacle_rad: float = Field(0.35, ge=0, le=1.2)  # likewise, before obstacles
     stuck_m: float = Field(0.1, gt=0, le=10)  # a plan that moves less over its horizon gets nowhere
     max_neighbours: int = Field(8, ge=1, le=99)  # nearest ones that get rows
     max_obstacles: int = Field(6, ge=1, le=50)  # likewise; all visible ones are certified against
@@ -217,10 +218,10 @@ def half_spaces(
     stuck = min(1.0, max(0.0, 2.0 - moved / params.stuck_m))
     to_goal = goal_m - guess_ned_m[1:, :axes]  # (Hp, axes)
     across = to_goal[:, 0] * normal[:, :, 1] - to_goal[:, 1] * normal[:, :, 0]  # (slots, Hp) > 0: it is on the left
-    turn = np.full(distance.shape, stuck)
+    turn_rad = np.full(distance.shape, params.bias_rad * stuck)
     is_obstacle = np.array([k.tie < 0 for k in keep_outs])
-    turn[is_obstacle] = np.where(across[is_obstacle] > 0.0, -1.0, 1.0)
-    normal = _turned(normal, distance, needed, to_goal, params.bias_rad * turn)
+    turn_rad[is_obstacle] = params.bias_obstacle_rad * np.where(across[is_obstacle] > 0.0, -1.0, 1.0)
+    normal = _turned(normal, distance, needed, to_goal, turn_rad)
     if axes == 3:
         normal[:, :, 2] *= vertical_01  # in heights as they are
     offset = np.einsum("skc,skc->sk", normal, others) + needed

@@ -37,6 +37,18 @@ def test_late_and_lost_messages_cost_time_and_no_distance() -> None:
     assert events(flight, "off_promise") == []
 
 
+@pytest.mark.parametrize(
+    ("traffic_rule", "within_s"),
+    [("", 11.0), ("agent.commit.bias_rad=0.35 agent.commit.stuck_m=0.1", 14.0)],
+    ids=["keeping right early", "control: only who stands turns"],
+)
+def test_who_meets_keeps_right_before_all_stand(traffic_rule: str, within_s: float) -> None:
+    """Late plans that end in stops lock in the middle of a swap, and to get out of that takes as long again."""
+    row = flown(Cell("swap", 6, 100.0, 0.0, "exact", 0.0, "guaranteed", traffic_rule)).row(None)
+    assert row["min_separation_m"] >= PROMISED_M - 0.03
+    assert (row["flight_time_s"] < within_s) is (traffic_rule == "")
+
+
 def test_control_agents_that_see_nobody_touch() -> None:
     assert flown(Cell("swap", 4, 300.0, 0.3, "exact", 0.0, "off")).row(None)["min_separation_m"] < TOUCH_M
 

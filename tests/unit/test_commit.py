@@ -210,6 +210,26 @@ def test_who_rests_makes_way_for_what_comes_at_it() -> None:
     assert np.linalg.norm(apart, axis=1).min() > 0.5, "it would have been 0.3 m"
 
 
+@pytest.mark.parametrize(("column", "passes_m"), [(False, 0.9), (True, 0.1)], ids=["ball", "control: column"])
+def test_who_is_hemmed_in_makes_way_upwards(column: bool, passes_m: float) -> None:
+    """Peers rest on the three sides that are left; what comes runs over whoever cannot rise."""
+    agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), SEPARATION, 5, lambda: 0)
+    agent.begin(np.array([0.0, 0.0, -2.0]), np.zeros(3), UTC_US)
+    sides = [[0.0, 0.9, -2.0], [0.0, -0.9, -2.0], [-0.9, 0.0, -2.0]]
+    peers = {
+        i: Intent(i, 1, 1, True, resting(np.array(side), UTC_US, 100_000), None, {})
+        for i, side in enumerate(sides, start=1)
+    }
+    times_s = 0.1 * np.arange(agent.steps + 1)
+    coming = np.stack([3.5 - 1.0 * times_s, 0.0 * times_s, -2.0 + 0.0 * times_s], axis=1)
+    agent.avoid(UTC_US, Wish(at_goal), peers, [KeepOut(coming, 1.0, 0.9, column, -1)])
+    assert agent.committed is not None
+    pos = agent.committed.sample(UTC_US + times_s * 1e6)[0]
+    apart = np.linalg.norm((pos - coming)[:, : 2 if column else 3], axis=1)
+    assert (apart.min() >= passes_m) is not column
+    assert np.linalg.norm(pos[:, None] - np.array(sides), axis=2).min() >= CERTIFIED_M
+
+
 @pytest.mark.parametrize(("is_way", "gets_on"), [(True, True), (False, False)])
 def test_along_a_way_round_plans_look_near_the_way(is_way: bool, gets_on: bool) -> None:
     """The last plan leads north before a wall, the way south through its gap: from one to the other no row leads."""

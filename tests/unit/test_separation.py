@@ -302,7 +302,7 @@ def test_obstacles_are_passed_on_the_side_one_is_on(east_m: float, axes: int) ->
 def test_stopping_row_asks_for_the_braking_distance_and_not_when_opening() -> None:
     guess = still((-3.0, 0.0, 0.0))
     wall = [fixed((0.0, 0.0, 0.0), 0.8)]
-    params = PARAMS.model_copy(update={"bias_rad": 0.0})
+    params = PARAMS.model_copy(update={"bias_rad": 0.0, "bias_obstacle_rad": 0.0})
     closing = half_spaces(wall, guess, np.array([5.0, 0.0]), np.array([2.8, 0.0]), 0.1, 0, params)
     assert closing is not None
     # v / (2 a): p + v * v / (2 a) is where braking with a = 1.4 from 2.8 m/s ends
@@ -315,7 +315,7 @@ def test_stopping_row_asks_for_the_braking_distance_and_not_when_opening() -> No
 
 def test_stopping_row_knows_that_the_other_moves_too() -> None:
     other = KeepOut(line((0.0, 0.0, 0.0), (-1.0, 0.0, 0.0)), 0.9, 0.8, False, 1)  # 1 m/s south
-    params = PARAMS.model_copy(update={"bias_rad": 0.0})
+    params = PARAMS.model_copy(update={"bias_rad": 0.0, "bias_obstacle_rad": 0.0})
     spaces = half_spaces([other], still((-3.0, 0.0, 0.0)), np.array([5.0, 0.0]), np.array([1.8, 0.0]), 0.1, 0, params)
     assert spaces is not None
     assert spaces.stop_s[0] == pytest.approx(2.8 / 2.8)  # closing speed 1.8 + 1.0
