@@ -31,7 +31,8 @@ END_S = 150.0
 TWO = ("--agents", "2", "--set", "telemetry.enabled=false")
 STAY = ("--set", "mission.kind=swap", "--set", "mission.swap.travel_s=600", "--set", "start.spacing_m=2")
 NEAR = (*STAY, "--set", "sitl.ground_z_m=1")  # nowhere to go, nobody in the way, and soon down
-AIR = (*STAY, "--set", "sitl.start=air")  # neither taken off nor landed, where that is not asked
+PATIENT = "agent.autopilot_params={COM_OBL_RC_ACT=4,COM_OF_LOSS_T=3}"  # where there is no ground no failsafe ever lands
+AIR = (*STAY, "--set", "sitl.start=air", "--set", PATIENT)  # neither taken off nor landed, where that is not asked
 
 
 class Launched:
@@ -86,10 +87,10 @@ class Launched:
     def leftovers(self) -> list[str]:
         files = [str(path) for path in self.temp.rglob("*") if path.is_socket() or path.name.startswith("swarm-")]
         notes = [str(path) for path in self.temp.glob("swarmctl-*/*.json")]
-        return files + notes + [" ".join(p.cmdline()) for p in self.relatives() if p.is_running()]
+        return files + notes + [" ".join(process.info["cmdline"]) for process in self.relatives()]
 
     def pid_of(self, *words: str) -> int:
-        (pid,) = [p.pid for p in self.relatives() if all(word in p.cmdline() for word in words)]
+        (pid,) = [p.pid for p in self.relatives() if all(word in p.info["cmdline"] for word in words)]
         return pid
 
     def verb(self, *arguments: str) -> subprocess.CompletedProcess[str]:
