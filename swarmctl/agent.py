@@ -329,7 +329,8 @@ class Agent:
     def _look_for_deadlock(self, now_us: int, state: VehicleState, keep_outs: list[KeepOut], flies: bool) -> None:
         if flies and self._sequence.had_control:
             reference = self._mission_reference(now_us)
-            self._detour.step(now_us, state.pos_ned_m, reference, keep_outs, self._surroundings.landmarks)
+            known = [*keep_outs, *(self._coordination.left_behind if self._coordination else ())]
+            self._detour.step(now_us, state.pos_ned_m, reference, known, self._surroundings.landmarks)
         else:
             self._detour.reset()
         told, self._deadlock = self._deadlock, self._detour.deadlock

@@ -61,6 +61,8 @@ class Coordination:
         self._absent_since_us: dict[int, int] = {}
         self._on_bus_since_us: int | None = None
         self._broken: set[int] = set()
+        self._separation = separation
+        self.left_behind: list[KeepOut] = []  # where the gone have promised to end: perhaps they do
 
     @property
     def counts(self) -> CommitCounts:
@@ -90,6 +92,7 @@ class Coordination:
             self._note("broken_promise", by=sorted(broken))
         astray = self._surroundings.astray(known, utc_us, self._allowed_m)
         gone = self._absent_since_us.keys()  # perhaps dead: no longer trusted, still asked
+        self.left_behind = [k for a in known.keys() - living if known[a].promised for k in self._ends(known[a])]
         taking_part = {a for a in living - gone - broken - astray if a in known and known[a].promised}
         self._surroundings.promised = {agent: known[agent].followed for agent in taking_part}
         partners = {agent: known[agent] for agent in taking_part}
@@ -103,7 +106,7 @@ class Coordination:
         """Somebody else flies, or nobody knows: nothing is promised, but peers are still acknowledged."""
         if self._promised:
             self._promised = False
-            self._surroundings.promised = {}
+            self._surroundings.promised, self.left_behind = {}, []
             self._note("promises", **asdict(self.counts), worst_tracking_m=self._worst_m)
         self._commitments.end(None if state is None else state.pos_ned_m, utc_us)
 
@@ -153,6 +156,11 @@ class Coordination:
         if utc_us - self._on_bus_since_us < _SETTLED_US:
             return promising
         return promising - {a for a, since_us in self._absent_since_us.items() if utc_us - since_us >= _DEAD_US}
+
+    def _ends(self, intent: Intent) -> list[KeepOut]:
+        p = self._separation
+        ends = [np.tile(trajectory.pos_ned_m[-1], (2, 1)) for trajectory in intent.followed]
+        return [KeepOut(end, p.planned_m, promised_m(p), False, intent.agent, p.downwash) for end in ends]
 
     def _others(self, t0_utc_us: int, state: VehicleState, phase: Phase, taking_part: set[int]) -> list[KeepOut]:
         """Who takes no part, and obstacles, on the planner's grid from a time on.

@@ -124,8 +124,8 @@ class Surroundings:
                 continue
             filters = self._flies_itself(path.agent) and path.t0_utc_us >= fresh_us
             growth_m_s2 = 0.0 if self._phase(path.agent) is Phase.DONE else p.age_accel_m_s2
-            apart_m = p.body_m + margin_m
-            found.append(body_of_peer(path, act_utc_us, ahead_s, apart_m, growth_m_s2, p.age_margin_max_m, filters))
+            grows = (p.body_m + margin_m, growth_m_s2, p.age_margin_max_m)
+            found.append(body_of_peer(path, act_utc_us, ahead_s, *grows, filters, p.brake_m_s2))
         apart_m = 0.5 * p.body_m + margin_m
         return found + [body_of_obstacle(o, ahead_s, apart_m) for o in visible(self._obstacles, pos_ned_m)]
 

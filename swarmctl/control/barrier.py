@@ -76,17 +76,20 @@ def body_of_peer(
     growth_m_s2: float,
     growth_max_m: float,
     filters: bool,
+    brake_m_s2: float,
 ) -> Body:
     """A peer on its newest path.
 
     Args:
-        path: positions; beyond its end it is taken to rest there.
+        path: positions; beyond its end it is taken to brake.
         act_utc_us: when the own command arrives at the vehicle.
         ahead_s: after that, when it is felt.
         apart_m: centres of two vehicles that touch, and the margin.
         growth_m_s2: what it may have accelerated beside its path since.
         growth_max_m: limit of that.
         filters: it does its half.
+        brake_m_s2: how it is taken to stop, the same as plans take it: from a place where this layer alone sees
+            somebody no plan would look for a way round him.
     """
     age_s = max(0.0, (act_utc_us - path.t0_utc_us) * 1e-6)
     points, dt_s = path.pos_ned_m, path.dt_us * 1e-6
@@ -95,14 +98,23 @@ def body_of_peer(
     grown_m = apart_m + path.radius_m + min(0.5 * growth_m_s2 * age_s * age_s, growth_max_m)
     share_01 = 0.5 if filters else 1.0
     if at >= last:
-        x, y, z = points[last].tolist()
-        return Body((x, y, z), (0.0, 0.0, 0.0), grown_m, share_01)
+        a, b = points[last - 1].tolist(), points[last].tolist()
+        pos, vel = _braked(b, tuple((q - p) / dt_s for p, q in zip(a, b, strict=True)), (at - last) * dt_s, brake_m_s2)
+        return Body(pos, vel, grown_m, share_01)
     low = max(0, int(at))
     a, b = points[low].tolist(), points[low + 1].tolist()
     part = at - low
     pos = tuple(p + part * (q - p) for p, q in zip(a, b, strict=True))
     vel = tuple((q - p) / dt_s for p, q in zip(a, b, strict=True))
     return Body(pos, vel, grown_m, share_01)
+
+
+def _braked(pos: Vector, vel: Vector, t_s: float, brake_m_s2: float) -> tuple[Vector, Vector]:
+    speed = math.sqrt(_dot(vel, vel))
+    lasts_s = min(t_s, speed / brake_m_s2)
+    moved = lasts_s * (1.0 - 0.5 * brake_m_s2 * lasts_s / max(speed, _TINY))  # seconds at the first speed
+    left_01 = max(0.0, 1.0 - brake_m_s2 * lasts_s / max(speed, _TINY))
+    return tuple(p + moved * v for p, v in zip(pos, vel, strict=True)), tuple(left_01 * v for v in vel)
 
 
 def body_of_obstacle(obstacle: Obstacle, ahead_s: float, apart_m: float) -> Body:

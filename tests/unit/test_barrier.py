@@ -11,6 +11,7 @@ import pytest
 from swarmctl.control.barrier import Barrier, BarrierParams, Body, body_of_obstacle, body_of_peer
 from swarmctl.control.model import VehicleModelParams, acceleration
 from swarmctl.control.problem import Start
+from swarmctl.control.separation import align
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.types import Array, Obstacle, PredictedPath
 
@@ -184,7 +185,7 @@ def path(t0_us: int, vel: tuple[float, float, float] = (1.0, 0.0, 0.0), points: 
 
 
 def body(known: PredictedPath, act_us: int, ahead_s: float = 0.0, filters: bool = True) -> Body:
-    return body_of_peer(known, act_us, ahead_s, APART_M, 4.0, 1.0, filters)
+    return body_of_peer(known, act_us, ahead_s, APART_M, 4.0, 1.0, filters, 2.0)
 
 
 def test_a_peer_is_where_its_path_says_when_the_command_is_felt() -> None:
@@ -199,8 +200,17 @@ def test_who_has_not_been_heard_may_be_farther_from_its_path_every_moment() -> N
     reach = [body(path(0), age_us).apart_m for age_us in (0, 100_000, 300_000, 600_000, 5_000_000)]
     assert reach == sorted(reach)
     assert reach[-1] == pytest.approx(APART_M + 1.0)
-    assert body(path(0), 5_000_000).vel_ned_m_s == (0.0, 0.0, 0.0)
-    assert body(path(0), 5_000_000).pos_ned_m == pytest.approx((0.8, 0.0, 0.0))
+
+
+@pytest.mark.parametrize("age_us", [100_000, 790_000, 900_000, 1_050_000, 5_000_000])
+@pytest.mark.parametrize("vel", [(1.0, 0.0, 0.0), (0.6, -1.2, 0.1), (0.0, 0.0, 0.0)], ids=str)
+def test_the_silent_are_where_plans_take_them_to_be(vel: tuple[float, float, float], age_us: int) -> None:
+    """Or an agent stands before somebody whom no plan sees there, and nothing looks for a way round."""
+    known = path(0, vel)
+    found = body(known, age_us)
+    assert found.pos_ned_m == pytest.approx(align(known, age_us, 20_000, 1, 2.0)[0])
+    before, after = (np.array(body(known, age_us + by_us).pos_ned_m) for by_us in (-100, 100))
+    assert found.vel_ned_m_s == pytest.approx((after - before) / 2e-4, abs=1e-3)
 
 
 def test_an_obstacle_moves_on() -> None:

@@ -118,6 +118,19 @@ def test_a_peer_is_dead_only_after_it_has_been_gone_for_some_ticks(bench: Bench)
     assert bench.committed > before
 
 
+def test_where_the_gone_have_promised_to_end_is_in_the_way(bench: Bench) -> None:
+    """No promise leads there any more, so whoever does not get past has to look for a way round it."""
+    bench.fly(2.5, each=bench.speak)
+    assert bench.coordination.left_behind == []
+    bench.alive.discard(PEER)
+    bench.fly(0.3)
+    (left,) = bench.coordination.left_behind
+    assert left.tie == 1
+    assert left.pos_ned_m[0] == pytest.approx(PLACE)
+    bench.coordination.idle(bench.clock.utc_us(), None)
+    assert bench.coordination.left_behind == []
+
+
 def test_who_comes_back_to_the_bus_takes_nobody_for_dead_at_first(bench: Bench) -> None:
     bench.fly(2.5, each=bench.speak)
     before = bench.committed
