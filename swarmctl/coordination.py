@@ -53,15 +53,13 @@ class Coordination:
         self._agent, self._boot_id, self._bus, self._surroundings = agent, boot_id, bus, surroundings
         self._commitments = Commitments(agent, params, mpc, separation, slots, stopwatch_ns)
         self._intents, self._peers = PeerIntents(peers), frozenset(peers)
-        self._note, self._seq = note, 0
+        self._note, self._seq, self._separation = note, 0, separation
         self._promised = False
         self._allowed_m = separation.tracking_m + 0.5 * (promised_m(separation) - separation.body_m)
-        self._spent_m = separation.tracking_m + separation.certify_slack_m  # of what plans keep, until refused
         self._is_off, self._worst_m = False, 0.0
         self._absent_since_us: dict[int, int] = {}
         self._on_bus_since_us: int | None = None
         self._broken: set[int] = set()
-        self._separation = separation
         self.left_behind: list[KeepOut] = []  # where the gone have promised to end: perhaps they do
 
     @property
@@ -169,4 +167,5 @@ class Coordination:
         """
         steps, dt_us = self._commitments.steps, self._commitments.dt_us
         found = self._surroundings.keep_outs(state.pos_ned_m, t0_utc_us, dt_us, steps, phase, taking_part)
-        return [replace(k, certified_m=max(k.certified_m, k.radius_m - self._spent_m)) for k in found]
+        spent_m = self._separation.tracking_m + self._separation.certify_slack_m  # of what plans keep, until refused
+        return [replace(k, certified_m=max(k.certified_m, k.radius_m - spent_m)) for k in found]

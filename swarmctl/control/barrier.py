@@ -88,8 +88,7 @@ def body_of_peer(
         growth_m_s2: what it may have accelerated beside its path since.
         growth_max_m: limit of that.
         filters: it does its half.
-        brake_m_s2: how it is taken to stop, the same as plans take it: from a place where this layer alone sees
-            somebody no plan would look for a way round him.
+        brake_m_s2: how it is taken to stop, as plans take it: whom this layer alone sees nothing plans a way round.
     """
     age_s = max(0.0, (act_utc_us - path.t0_utc_us) * 1e-6)
     points, dt_s = path.pos_ned_m, path.dt_us * 1e-6
@@ -110,11 +109,10 @@ def body_of_peer(
 
 
 def _braked(pos: Vector, vel: Vector, t_s: float, brake_m_s2: float) -> tuple[Vector, Vector]:
-    speed = math.sqrt(_dot(vel, vel))
-    lasts_s = min(t_s, speed / brake_m_s2)
-    moved = lasts_s * (1.0 - 0.5 * brake_m_s2 * lasts_s / max(speed, _TINY))  # seconds at the first speed
-    left_01 = max(0.0, 1.0 - brake_m_s2 * lasts_s / max(speed, _TINY))
-    return tuple(p + moved * v for p, v in zip(pos, vel, strict=True)), tuple(left_01 * v for v in vel)
+    stop_s = math.sqrt(_dot(vel, vel)) / brake_m_s2
+    done_01 = t_s / stop_s if t_s < stop_s else 1.0
+    moved_s = stop_s * done_01 * (1.0 - 0.5 * done_01)  # at the first speed
+    return tuple(p + moved_s * v for p, v in zip(pos, vel, strict=True)), tuple((1.0 - done_01) * v for v in vel)
 
 
 def body_of_obstacle(obstacle: Obstacle, ahead_s: float, apart_m: float) -> Body:

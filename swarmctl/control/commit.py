@@ -83,8 +83,8 @@ class CommitParams(Params):
     period_s: float = Field(0.1, ge=0, le=2)  # between two plans, at least
     lead_min_s: float = Field(0.06, ge=0.02, le=2)  # from proposing to flying it
     lead_max_s: float = Field(1.5, ge=0.1, le=5)
-    bias_rad: float = Field(1.0, ge=0, le=1.2)  # as in `separation`, stronger and sooner: who has promised to stop
-    stuck_m: float = Field(1.0, gt=0, le=10)  # before a peer that has promised the same gives way only when asked
+    bias_rad: float = Field(1.0, ge=0, le=1.2)  # as in `separation`, in its place: plans that end in stops lock sooner
+    stuck_m: float = Field(1.0, gt=0, le=10)  # likewise: who meets turns while it still moves
     follow_z: AxisWeights = AxisWeights(q_pos=20.0, q_vel=0.5, r=0.05)  # of flying what is promised: to the centimetre
 
 

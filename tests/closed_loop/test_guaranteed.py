@@ -38,15 +38,20 @@ def test_late_and_lost_messages_cost_time_and_no_distance() -> None:
 
 
 @pytest.mark.parametrize(
-    ("traffic_rule", "within_s"),
-    [("", 11.0), ("agent.commit.bias_rad=0.35 agent.commit.stuck_m=0.1", 14.0)],
+    ("traffic_rule", "within_s", "least_m"),
+    [("", 11.0, PROMISED_M), ("agent.commit.bias_rad=0.35 agent.commit.stuck_m=0.1", 14.0, PROMISED_M - 0.03)],
     ids=["keeping right early", "control: only who stands turns"],
 )
-def test_who_meets_keeps_right_before_all_stand(traffic_rule: str, within_s: float) -> None:
+def test_who_meets_keeps_right_before_all_stand(traffic_rule: str, within_s: float, least_m: float) -> None:
     """Late plans that end in stops lock in the middle of a swap, and to get out of that takes as long again."""
     row = flown(Cell("swap", 6, 100.0, 0.0, "exact", 0.0, "guaranteed", traffic_rule)).row(None)
-    assert row["min_separation_m"] >= PROMISED_M - 0.03
+    assert row["min_separation_m"] >= least_m
     assert (row["flight_time_s"] < within_s) is (traffic_rule == "")
+
+
+def test_where_a_dead_peer_has_promised_to_end_is_gone_round() -> None:
+    """Unseen by the look-out for deadlocks, somebody stands for good between that and the last path of the dead."""
+    assert flown(Cell("death", 6, 100.0, 0.0, "exact", 0.0, "guaranteed"), 3).row(None)["outcome"] == "arrived"
 
 
 def test_control_agents_that_see_nobody_touch() -> None:
