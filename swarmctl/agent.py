@@ -13,21 +13,23 @@ from typing import Any
 
 import numpy as np
 
-from swarmctl.agent_setup import AgentSetup, make_estimator
-from swarmctl.control.commit import Wish, following
-from swarmctl.control.controller import make_controller
-from swarmctl.control.detour import Deadlock, Detour
+from swarmctl.agent_parts import (
+    make_controllers,
+    make_coordination,
+    make_estimator,
+    make_last_layer,
+    make_sequence,
+)
+from swarmctl.agent_setup import AgentSetup
+from swarmctl.control.coasting import coasting
 from swarmctl.control.facts import Facts
 from swarmctl.control.failsafe import Judgement, judge
 from swarmctl.control.fallback import rest_plan
-from swarmctl.control.mission import MissionReference
 from swarmctl.control.model import Predictor
 from swarmctl.control.problem import Problem, Start
 from swarmctl.control.replay import Replay
 from swarmctl.control.separation import KeepOut, radius_problem
-from swarmctl.control.sequence import Sequence as MissionSequence
 from swarmctl.control.setpoint import setpoint_of
-from swarmctl.coordination import Coordination
 from swarmctl.core.clock import Clock
 from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned
 from swarmctl.core.types import (
@@ -43,11 +45,9 @@ from swarmctl.core.types import (
     PlanStatus,
     PredictedPath,
     Reference,
-    Sampled,
     TickRecord,
     VehicleState,
 )
-from swarmctl.last_layer import LastLayer
 from swarmctl.links import topics
 from swarmctl.links.autopilot import Autopilot
 from swarmctl.links.commands import CommandPort
@@ -55,6 +55,7 @@ from swarmctl.links.peers import Bus
 from swarmctl.links.upkeep import Upkeep
 from swarmctl.reporter import Act, Reporter, Thought, TickSink, Took
 from swarmctl.surroundings import FLOWN_BY_AGENT, Surroundings
+from swarmctl.wayfinder import Wayfinder
 
 _NOTHING_US = -1
 _DEVIATES = (Mode.BRAKE, Mode.HOLD, Mode.LAND, Mode.YIELD, Mode.BLIND)  # from what it has promised
@@ -76,78 +77,27 @@ class Agent:
     ) -> None:
         self._setup, self._autopilot, self._commands = setup, autopilot, commands
         self._bus, self._clock, self._sink, self._stopwatch_ns = bus, clock, sink, stopwatch_ns
-        agents = len(setup.starts_ned_m)
-        peers = [i for i in range(agents) if i != setup.agent]
-        slots = min(len(peers), setup.separation.max_neighbours) + setup.obstacle_slots
         self._upkeep = Upkeep(
             autopilot, commands, setup.params.autopilot_params, setup.sysid, setup.params.sequence.state_rate_hz
         )
-        self._surroundings = Surroundings(setup.agent, peers, setup.separation, bus)
-        self._coordination: Coordination | None = None
-        controller = setup.controller
-        if setup.separation.mode == "guaranteed":
-            flying = following(controller.mpc, setup.params.commit)
-            controller = controller.model_copy(update={"mpc": flying})
-            self._coordination = Coordination(
-                setup.agent,
-                setup.boot_id,
-                peers,
-                setup.params.commit,
-                setup.controller.mpc,
-                setup.separation,
-                slots,
-                self._surroundings,
-                bus,
-                self._note,
-                stopwatch_ns,
-            )
-        self._controller = make_controller(
-            controller, setup.vehicle_model, setup.separation, setup.agent, slots, stopwatch_ns
-        )
-        self._transit = self._controller
-        if controller.kind == "open_loop":  # can't go anywhere: something else flies to the start
-            self._transit = make_controller(
-                controller.model_copy(update={"kind": "dmpc"}),
-                setup.vehicle_model,
-                setup.separation,
-                setup.agent,
-                slots,
-                stopwatch_ns,
-            )
-        self._observer = make_estimator(setup.params, setup.vehicle_model)
+        self._surroundings = Surroundings(setup.agent, setup.peers, setup.separation, bus)
+        self._coordination = make_coordination(setup, self._surroundings, bus, self._note, stopwatch_ns)
+        self._controller, self._transit = make_controllers(setup, stopwatch_ns)
+        self._observer = make_estimator(setup)
         self._predictor = Predictor(setup.vehicle_model)
-        self._last_layer = LastLayer(
-            setup.params.barrier,
-            setup.vehicle_model,
-            1.0 / setup.params.rate_hz,
-            self._surroundings,
-            setup.separation.downwash,
-            self._note,
-            stopwatch_ns,
-        )
-        reference = MissionReference(setup.mission, setup.starts_ned_m, setup.agent, setup.separation.planned_m)
-        self._detour = Detour(setup.params.detour, setup.agent, setup.separation.radius_m)
-        self._deadlock: Deadlock | None = None  # the one that was last noted
-        self._sequence = MissionSequence(
-            setup.params.sequence,
-            setup.agent,
-            len(peers),
-            setup.separation.radius_m,
-            setup.starts_ned_m[setup.agent],
-            setup.mission.duration_s,
-            reference,
-        )
+        self._last_layer = make_last_layer(setup, self._surroundings, self._note, stopwatch_ns)
+        self._sequence = make_sequence(setup)
+        self._wayfinder = Wayfinder(setup, self._sequence, self._note)
         self._judgement = Judgement(Mode.IDLE, "")
         self._virtual = np.array([0.0, 0.0, GRAVITY_M_S2])
-        brake_m_s2 = setup.separation.brake_m_s2
-        self._replay = Replay(setup.agent, self._controller.dt_us, self._controller.steps, brake_m_s2)
+        self._replay = Replay(setup.agent, self._controller.dt_us, self._controller.steps, setup.separation.brake_m_s2)
         self._certified_us: int | None = None
         self._hold_at: Array | None = None
         self._reporter = Reporter(
             setup.agent,
             setup.boot_id,
             setup.sysid,
-            self._coordination is not None,
+            setup.promises,
             autopilot,
             self._surroundings.paths,
             bus,
@@ -280,7 +230,9 @@ class Agent:
         keep_outs = self._surroundings.keep_outs(state.pos_ned_m, self._utc(act_us), dt_us, steps, self._sequence.phase)
         flies = Phase.GOTO_START <= self._sequence.phase <= Phase.GOTO_LAND
         self._look_for_deadlock(now_us, state, keep_outs, flies)
-        reference, now_ref = self._reference(now_us)
+        grid = np.arange(self._controller.longest + 1, dtype=np.float64)
+        ahead_s = self._predictor.delay_us * 1e-6 + dt_us * 1e-6 * grid
+        reference, now_ref = self._wayfinder.reference(now_us, self._clock.utc_us(), ahead_s)
         promised = self._coordinated(now_us, state, flies)
         if not flies:
             return Thought(start, None, now_ref, keep_outs)
@@ -300,45 +252,21 @@ class Agent:
         if not (flies and self._sequence.had_control) or self._judgement.mode in _DEVIATES:
             self._coordination.idle(utc_us, state)
             return None
-        self._coordination.step(utc_us, state, self._sequence.phase, self._wish(now_us))
+        self._coordination.step(utc_us, state, self._sequence.phase, self._wayfinder.wish(now_us, utc_us))
         self._promise_ns = self._stopwatch_ns() - began_ns
         act_us = utc_us + self._predictor.delay_us
         pos, vel = self._coordination.follow(act_us + np.arange(self._controller.longest + 1) * self._controller.dt_us)
         return Reference(pos, vel, self._setup.mission.yaw_rad)
 
-    def _reference(self, now_us: int) -> tuple[Reference, Reference]:
-        """Over the horizon from when the setpoint acts, and now."""
-        dt_s = self._controller.dt_us * 1e-6
-        ahead_s = self._predictor.delay_us * 1e-6 + dt_s * np.arange(self._controller.longest + 1, dtype=np.float64)
-        pos, vel = self._sequence.reference(self._clock.utc_us(), now_us, np.concatenate([[0.0], ahead_s]))
-        yaw_rad = self._setup.mission.yaw_rad
-        now_ref = Reference(pos[:1], vel[:1], yaw_rad)
-        if self._detour.active:
-            return Reference(*self._detour.sample(ahead_s), yaw_rad), now_ref
-        return Reference(pos[1:], vel[1:], yaw_rad), now_ref
-
-    def _wish(self, now_us: int) -> Wish:
-        """To be on the reference, or on a way round what blocks it."""
-        if self._detour.active:
-            return Wish(self._detour.sample, is_way=True)
-        return Wish(self._mission_reference(now_us))
-
-    def _mission_reference(self, now_us: int) -> Sampled:
-        return partial(self._sequence.reference, self._clock.utc_us(), now_us)
-
     def _look_for_deadlock(self, now_us: int, state: VehicleState, keep_outs: list[KeepOut], flies: bool) -> None:
-        if flies and self._sequence.had_control:
-            reference = self._mission_reference(now_us)
-            known = [*keep_outs, *(self._coordination.left_behind if self._coordination else ())]
-            self._detour.step(now_us, state.pos_ned_m, reference, known, self._surroundings.landmarks)
-        else:
-            self._detour.reset()
-        told, self._deadlock = self._deadlock, self._detour.deadlock
-        if told is None and self._deadlock is not None:
-            self._problem = f"deadlocked by {self._deadlock.names}"
-            self._note("deadlock", begins=True, by=self._deadlock.by)
-        elif told is not None and self._deadlock is None:
-            self._note("deadlock", begins=False, lasted_s=(now_us - told.since_us) * 1e-6)
+        if not (flies and self._sequence.had_control):
+            self._wayfinder.rest(now_us)
+            return
+        known = [*keep_outs, *(self._coordination.left_behind if self._coordination else ())]
+        landmarks = self._surroundings.landmarks
+        deadlock = self._wayfinder.look(now_us, self._clock.utc_us(), state.pos_ned_m, known, landmarks)
+        if deadlock is not None:
+            self._problem = f"deadlocked by {deadlock.names}"
 
     # -- judge, act ---------------------------------------------------------------------------------------------------
 
@@ -455,35 +383,20 @@ class Agent:
 
     def _share(self, state: VehicleState | None, flown: Plan | None) -> None:
         if state is not None:
-            path = self._path(flown) if flown is not None else self._coasting(state)
-            self._bus.publish(topics.PATH, topics.encode_path(path))
+            self._bus.publish(topics.PATH, topics.encode_path(self._path(state, flown)))
         if self._coordination is not None:
             self._coordination.say()
 
-    def _path(self, plan: Plan) -> PredictedPath:
-        return PredictedPath(
-            self._setup.agent,
-            self._setup.boot_id,
-            self._reporter.seq,
-            self._utc(plan.t0_us),
-            plan.dt_us,
-            0.0,
-            plan.pos_ned_m,
-        )
-
-    def _coasting(self, state: VehicleState) -> PredictedPath:
-        """Somebody else flies: the own velocity, continued, or braked where the autopilot is about to stop."""
-        steps, dt_us = self._controller.steps, self._controller.dt_us
-        act_us = self._clock.now_us() + self._predictor.delay_us
-        t_s = np.arange(steps + 1) * (dt_us * 1e-6) + (act_us - state.t_us) * 1e-6
-        if state.mode in (FlightMode.HOLD, FlightMode.LAND):
-            speed = math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s))
-            brake_m_s2 = self._setup.separation.brake_m_s2
-            t_s = np.minimum(t_s, speed / brake_m_s2)
-            t_s = t_s - 0.5 * brake_m_s2 * t_s * t_s / max(speed, 1e-6)  # of the present speed, for the same way
-        pos = state.pos_ned_m + t_s[:, None] * state.vel_ned_m_s
-        setup = self._setup
-        return PredictedPath(setup.agent, setup.boot_id, self._reporter.seq, self._utc(act_us), dt_us, 0.0, pos)
+    def _path(self, state: VehicleState, flown: Plan | None) -> PredictedPath:
+        setup, seq = self._setup, self._reporter.seq
+        if flown is not None:
+            t0_us, dt_us, pos = self._utc(flown.t0_us), flown.dt_us, flown.pos_ned_m
+            return PredictedPath(setup.agent, setup.boot_id, seq, t0_us, dt_us, 0.0, pos)
+        act_us, dt_us = self._clock.now_us() + self._predictor.delay_us, self._controller.dt_us
+        grid = np.arange(self._controller.steps + 1, dtype=np.float64)
+        ahead_s = grid * (dt_us * 1e-6) + (act_us - state.t_us) * 1e-6
+        pos = coasting(state, ahead_s, setup.separation.brake_m_s2)
+        return PredictedPath(setup.agent, setup.boot_id, seq, self._utc(act_us), dt_us, 0.0, pos)
 
     def _fresh(self, now_us: int, state: VehicleState) -> bool:
         return now_us - state.t_us <= self._setup.params.failsafe.state_max_age_s * 1e6

@@ -7,16 +7,16 @@ from dataclasses import dataclass
 from pydantic import Field
 
 from swarmctl.control.barrier import BarrierParams
-from swarmctl.control.commit import CommitParams
 from swarmctl.control.controller import ControllerParams
 from swarmctl.control.detour import DetourParams
-from swarmctl.control.disturbance import DisturbanceObserver, DisturbanceParams
+from swarmctl.control.disturbance import DisturbanceParams
 from swarmctl.control.failsafe import FailsafeParams
 from swarmctl.control.mission import MissionParams
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.separation import SeparationParams
 from swarmctl.control.sequence import SequenceParams
-from swarmctl.control.state_filter import StateFilter, StateFilterParams
+from swarmctl.control.state_filter import StateFilterParams
+from swarmctl.control.trajectory_planner import CommitParams
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array
 
@@ -53,9 +53,17 @@ class AgentSetup:
     vehicle_model: VehicleModelParams
     obstacle_slots: int
 
+    @property
+    def peers(self) -> list[int]:
+        """Indices of the others."""
+        return [i for i in range(len(self.starts_ned_m)) if i != self.agent]
 
-def make_estimator(params: AgentParams, model: VehicleModelParams) -> DisturbanceObserver | StateFilter:
-    """Of state and disturbance, as configured."""
-    if params.state_filter.enabled:
-        return StateFilter(params.state_filter, params.disturbance, model)
-    return DisturbanceObserver(params.disturbance, model.hover_thrust_01)
+    @property
+    def slots(self) -> int:
+        """How many neighbours and obstacles get rows in a problem."""
+        return min(len(self.peers), self.separation.max_neighbours) + self.obstacle_slots
+
+    @property
+    def promises(self) -> bool:
+        """Whether only what has been promised is flown."""
+        return self.separation.mode == "guaranteed"

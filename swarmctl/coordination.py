@@ -7,9 +7,10 @@ from dataclasses import asdict, replace
 
 import numpy as np
 
-from swarmctl.control.commit import CommitCounts, Commitments, CommitParams, Wish, promised_m
+from swarmctl.control.commit import CommitCounts, Commitments
 from swarmctl.control.mpc import MpcParams
 from swarmctl.control.separation import KeepOut, SeparationParams
+from swarmctl.control.trajectory_planner import CommitParams, Situation, Wish, promised_m
 from swarmctl.core.intent import Intent
 from swarmctl.core.trajectory import Times
 from swarmctl.core.types import Array, Phase, VehicleState
@@ -94,10 +95,12 @@ class Coordination:
         taking_part = {a for a in living - gone - broken - astray if a in known and known[a].promised}
         self._surroundings.promised = {agent: known[agent].followed for agent in taking_part}
         partners = {agent: known[agent] for agent in taking_part}
-        commitments.avoid(utc_us, wish, partners, self._others(utc_us, state, phase, taking_part))
+        others = self._others(utc_us, state, phase, taking_part)
+        commitments.avoid(Situation(utc_us, utc_us, wish, partners, others))
         if commitments.is_due(utc_us):
-            ahead = self._others(utc_us + commitments.lead_us, state, phase, taking_part)
-            commitments.propose(utc_us, wish, known, ahead)
+            begin_us = utc_us + commitments.lead_us
+            others = self._others(begin_us, state, phase, taking_part)
+            commitments.propose(Situation(utc_us, begin_us, wish, known, others))
         self._watch(float(np.linalg.norm(state.pos_ned_m - self.follow(np.array([utc_us]))[0][0])))
 
     def idle(self, utc_us: int, state: VehicleState | None) -> None:

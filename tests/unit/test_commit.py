@@ -11,10 +11,11 @@ from functools import partial
 import numpy as np
 import pytest
 
-from swarmctl.control.commit import Commitments, CommitParams, Wish
+from swarmctl.control.commit import Commitments
 from swarmctl.control.mission import glide_to
 from swarmctl.control.mpc import MpcParams
 from swarmctl.control.separation import KeepOut, SeparationParams
+from swarmctl.control.trajectory_planner import CommitParams, Situation, Wish
 from swarmctl.core.intent import Intent, Proposal
 from swarmctl.core.trajectory import Trajectory, ending_at_rest, resting
 from swarmctl.core.types import Array
@@ -76,7 +77,9 @@ class Crowd:
         for i, agent in enumerate(self.agents):
             agent.hear(self.now_us, self.known[i], set(ids) - {i})
             if agent.is_due(self.now_us):
-                agent.propose(self.now_us, Wish(partial(self.wanted, i)), self.known[i], ())
+                begin_us = self.now_us + agent.lead_us
+                wish = Wish(partial(self.wanted, i))
+                agent.propose(Situation(self.now_us, begin_us, wish, self.known[i], ()))
         for i, agent in enumerate(self.agents):
             assert agent.committed is not None
             said = Intent(i, 1, self.seq, True, agent.committed, agent.proposal, self.heard(i))
@@ -185,7 +188,7 @@ def wall(x_m: float, agent: Commitments) -> KeepOut:
 def test_a_promise_that_was_changed_without_asking_is_found_by_whom_it_contradicts() -> None:
     first, second = meeting()
     assert second.broken(UTC_US, said_by(first, 0)) == set()
-    first.avoid(UTC_US, Wish(at_goal), {}, [wall(1.6, first)])
+    first.avoid(Situation(UTC_US, UTC_US, Wish(at_goal), {}, [wall(1.6, first)]))
     assert first.counts.evaded == 1, "before a wall there is no time to ask"
     assert second.broken(UTC_US, said_by(first, 0)) == {0}
     assert second.broken(UTC_US, said_by(first, 0)) == {0}, "as long as it does"
@@ -193,7 +196,7 @@ def test_a_promise_that_was_changed_without_asking_is_found_by_whom_it_contradic
 
 def test_a_wall_that_leaves_time_to_ask_stops_nobody() -> None:
     first, _ = meeting()
-    first.avoid(UTC_US, Wish(at_goal), {}, [wall(2.6, first)])
+    first.avoid(Situation(UTC_US, UTC_US, Wish(at_goal), {}, [wall(2.6, first)]))
     assert first.counts.evaded == 0
 
 
@@ -203,7 +206,7 @@ def test_who_rests_makes_way_for_what_comes_at_it() -> None:
     agent.begin(np.array([0.0, 0.0, -2.0]), np.zeros(3), UTC_US)
     times_s = 0.1 * np.arange(agent.steps + 1)
     coming = np.stack([2.5 - 1.0 * times_s, 0.3 + 0.0 * times_s, -2.0 + 0.0 * times_s], axis=1)
-    agent.avoid(UTC_US, Wish(at_goal), {}, [KeepOut(coming, 0.9, 0.8, False, 1)])
+    agent.avoid(Situation(UTC_US, UTC_US, Wish(at_goal), {}, [KeepOut(coming, 0.9, 0.8, False, 1)]))
     assert agent.counts.evaded == 1
     assert agent.committed is not None
     apart = agent.committed.sample(UTC_US + times_s * 1e6)[0] - coming
@@ -222,7 +225,7 @@ def test_who_is_hemmed_in_makes_way_upwards(column: bool, passes_m: float) -> No
     }
     times_s = 0.1 * np.arange(agent.steps + 1)
     coming = np.stack([3.5 - 1.0 * times_s, 0.0 * times_s, -2.0 + 0.0 * times_s], axis=1)
-    agent.avoid(UTC_US, Wish(at_goal), peers, [KeepOut(coming, 1.0, 0.9, column, -1)])
+    agent.avoid(Situation(UTC_US, UTC_US, Wish(at_goal), peers, [KeepOut(coming, 1.0, 0.9, column, -1)]))
     assert agent.committed is not None
     pos = agent.committed.sample(UTC_US + times_s * 1e6)[0]
     apart = np.linalg.norm((pos - coming)[:, : 2 if column else 3], axis=1)
@@ -246,7 +249,7 @@ def test_along_a_way_round_plans_look_near_the_way(is_way: bool, gets_on: bool) 
         x, y = (np.interp(offsets_s, reached_m, corners[:, i]) for i in (0, 1))  # at 1 m/s
         return np.stack([x, y, 0.0 * x - 2.0], axis=1), np.zeros((len(offsets_s), 3))
 
-    agent.propose(UTC_US, Wish(way, is_way), {}, wall)
+    agent.propose(Situation(UTC_US, UTC_US + agent.lead_us, Wish(way, is_way), {}, wall))
     assert agent.proposal is not None
     assert bool(agent.proposal.trajectory.pos_ned_m[-1, 0] > 1.0) is gets_on, "behind the wall"
 
@@ -254,7 +257,7 @@ def test_along_a_way_round_plans_look_near_the_way(is_way: bool, gets_on: bool) 
 def proposing() -> tuple[Commitments, Proposal]:
     agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), SEPARATION, 2, lambda: 0)
     agent.begin(np.array([0.0, 0.0, -2.0]), np.zeros(3), UTC_US)
-    agent.propose(UTC_US, Wish(at_goal), {}, ())
+    agent.propose(Situation(UTC_US, UTC_US + agent.lead_us, Wish(at_goal), {}, ()))
     assert agent.proposal is not None
     return agent, agent.proposal
 
@@ -283,14 +286,16 @@ def test_promises_that_are_too_close_already_do_not_creep_closer() -> None:
     for k in range(10):
         x_m = CERTIFIED_M - 0.01 - 0.005 * k
         nearer = np.array([[x_m, 0.0, 0.0], [x_m - 0.005, 0.0, 0.0]])
-        assert agent._conflicts(Trajectory(UTC_US, 100_000, nearer, np.zeros((2, 3))), UTC_US, [other])
-        assert not agent._conflicts(Trajectory(UTC_US, 100_000, nearer[::-1], np.zeros((2, 3))), UTC_US, [other])
+        assert agent._planner.conflicts(Trajectory(UTC_US, 100_000, nearer, np.zeros((2, 3))), UTC_US, [other])
+        assert not agent._planner.conflicts(
+            Trajectory(UTC_US, 100_000, nearer[::-1], np.zeros((2, 3))), UTC_US, [other]
+        )
 
 
 def test_what_is_not_a_number_conflicts() -> None:
     agent, _ = proposing()
     bad = Trajectory(UTC_US, 100_000, np.full((2, 3), np.nan), np.zeros((2, 3)))
-    assert agent._conflicts(bad, UTC_US, [resting(np.zeros(3), UTC_US, 100_000)])
+    assert agent._planner.conflicts(bad, UTC_US, [resting(np.zeros(3), UTC_US, 100_000)])
 
 
 def test_a_slow_network_lengthens_the_lead_and_a_fast_one_shortens_it_again() -> None:

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from swarmctl.control.commit import CommitParams, Wish
 from swarmctl.control.mpc import MpcParams
 from swarmctl.control.separation import SeparationParams
+from swarmctl.control.trajectory_planner import CommitParams, Wish
 from swarmctl.coordination import Coordination
 from swarmctl.core.clock import SimClock
 from swarmctl.core.intent import Intent
