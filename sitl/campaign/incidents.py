@@ -59,8 +59,9 @@ class Partition:
 class Appearance:
     """An obstacle appears in front of a vehicle, and everybody is told at once, as by `swarmctl obstacle`.
 
-    Not before there is room to avoid it: `ahead_m` along the victim's velocity, and nobody else inside `clear_m`. A
-    moving one begins `ahead_m` to the victim's side, heads for where the victim will be and is gone after its way.
+    Not before there is room to avoid it: `ahead_m` along the victim's velocity, and nobody else inside `clear_m`; and
+    not where one that stays would keep somebody from arriving. A moving one begins `ahead_m` to the victim's side,
+    heads for where the victim will be and is gone after its way.
 
     Args:
         victim: agent.
@@ -70,6 +71,7 @@ class Appearance:
         radius_m, keep_out_m: of the obstacle.
         speed_m_s: 0: it stays.
         side: -1 or 1, where a moving one comes from.
+        goals_ned_m: (N, 3), which stay free.
     """
 
     def __init__(
@@ -82,7 +84,9 @@ class Appearance:
         keep_out_m: float,
         speed_m_s: float,
         side: int,
+        goals_ned_m: Array,
     ) -> None:
+        self._goals_ned_m = goals_ned_m
         self._victim, self._at_s, self._ahead_m, self._clear_m = victim, at_s, ahead_m, clear_m
         self._radius_m, self._keep_out_m, self._speed_m_s, self._side = radius_m, keep_out_m, speed_m_s, side
         self._from: tuple[float, Array, Array] | None = None  # when, where (3,), velocity (3,)
@@ -125,6 +129,9 @@ class Appearance:
             across = self._side * np.array([-ahead[1], ahead[0], 0.0])
             met = pos_ned_m[self._victim] + min(meets_s * speed, _MET_M) * ahead
             where, vel = met + self._ahead_m * across, -self._speed_m_s * across
+        to_goals_m = np.linalg.norm(self._goals_ned_m - where, axis=1).min()
+        if not self._speed_m_s and to_goals_m < self._keep_out_m + _ARRIVING_M:
+            return
         if np.linalg.norm(pos_ned_m - where, axis=1).min() >= self._clear_m:
             self._from = (t_s, where, vel)
 
@@ -132,3 +139,4 @@ class Appearance:
 _SEEN_M = 100.0
 _FLYING_M_S = 0.5
 _MET_M = 3.0
+_ARRIVING_M = 0.3  # beyond what is kept from an obstacle, where one arrives

@@ -150,18 +150,22 @@ def _with(layout: Layout, incident: Incident, **changes: object) -> Layout:
 
 
 def _sudden(rng: np.random.Generator, agents: int, speed_m_s: float) -> Layout:
-    ahead_m = 3.5 if speed_m_s else 2.5
+    victim, at_s = int(rng.integers(agents)), float(rng.uniform(*_SWAP_S))
+    side = int(rng.choice((-1, 1)))
+    swap = _swap(rng, agents)
+    assert swap.goals_ned_m is not None
     appears = Appearance(
-        victim=int(rng.integers(agents)),
-        at_s=float(rng.uniform(*_SWAP_S)),
-        ahead_m=ahead_m,
+        victim=victim,
+        at_s=at_s,
+        ahead_m=3.5 if speed_m_s else 2.5,
         clear_m=2.2,
         radius_m=0.5,
         keep_out_m=1.0,
         speed_m_s=speed_m_s,
-        side=int(rng.choice((-1, 1))),
+        side=side,
+        goals_ned_m=swap.goals_ned_m,
     )
-    return _with(_swap(rng, agents), appears)
+    return _with(swap, appears)
 
 
 def _sudden_static(rng: np.random.Generator, agents: int) -> Layout:

@@ -12,6 +12,7 @@ from scipy.stats import binomtest
 from sitl.campaign.command import main
 from sitl.campaign.crew import on_cluster, on_this_machine
 from sitl.campaign.flight import config_of
+from sitl.campaign.incidents import Appearance
 from sitl.campaign.intervals import clopper_pearson
 from sitl.campaign.layouts import least_sum_m
 from sitl.campaign.scenarios import SCENARIOS, layout_of
@@ -19,6 +20,8 @@ from sitl.campaign.store import Store
 from sitl.campaign.switches import NOISES, PROTECTIONS
 from sitl.campaign.trials import SCHEMA, Cell, Row, Trial, cells
 from sitl.campaign.umpire import Solid, Umpire
+from sitl.lockstep import Lockstep
+from swarmctl.config import load
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.links import topics
 from swarmctl.links.peers import LEASE_US, LocalHub, agent_name
@@ -79,6 +82,21 @@ def test_who_stands_still_is_told_from_who_creeps() -> None:
     for tick in range(200):
         judge.see(0.02 * tick, np.array([[1.0, 0.0, 0.0], [0.05 * 0.02 * tick, 3.0, 0.0]]), REST)
     assert judge.standing().tolist() == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("goal_m", "speed_m_s", "appears"),
+    [(4.0, 0.0, True), (3.0, 0.0, False), (3.0, 0.5, True)],
+    ids=["clear", "on it", "passes"],
+)
+def test_what_stays_never_appears_where_somebody_is_to_arrive(goal_m: float, speed_m_s: float, appears: bool) -> None:
+    """2.5 m before a vehicle that flies north; one metre is kept from it."""
+    goals = np.array([[goal_m, 0.0, 0.0]])
+    appearance = Appearance(0, 1.0, 2.5, 2.2, 0.5, 1.0, speed_m_s, 1, goals)
+    lockstep = Lockstep(load(None, ["swarm.agents=1"]))
+    for t_s in (0.9, 1.1):
+        appearance.step(lockstep, t_s, np.zeros((1, 3)), np.array([[2.0, 0.0, 0.0]]))
+        assert bool(appearance.solids(t_s)) is (appears and t_s > 1.0)
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)
