@@ -26,6 +26,7 @@ from swarmctl.core.types import Array, Plan, PlanStatus, Reference, Sampled
 _BRAKED_FROM_01 = (1.0, 0.75, 0.5, 0.3, 0.15)  # of the plan
 _WORTH_M = 0.02  # by which a way out has to be better than what has been promised
 _RISE_M_S, _RISE_M_S2 = 2.0, 2.0
+_GATHER_M_S2 = 0.8  # of who sets out on a way
 _TAIL_S = 2.0  # of braking, judged against who takes no part
 _CLOSER_M = 0.001  # than now, of promises that are too close already
 _SPARE_M = 0.01  # proposals keep more than promises need: between points they are judged by straight lines
@@ -111,8 +112,12 @@ class TrajectoryPlanner:
 
     def proposal(self, committed: Trajectory, now: Situation) -> Trajectory | None:
         """What leaves the committed one where plans begin, clear of everything known; None when nothing does."""
-        plan = self._planned(committed, now)
-        return None if plan is None else self._clear(committed, plan, now)
+        found = self._clear(committed, self._planned(committed, now), now)
+        if found is None and now.wish.is_way:
+            speed_m_s = float(np.linalg.norm(committed.sample(np.array([now.begin_us]))[1]))
+            slower = replace(now, wish=_gathering_speed(now.wish, speed_m_s))
+            found = self._clear(committed, self._planned(committed, slower), slower)
+        return found
 
     def way_out(self, committed: Trajectory, now: Situation) -> Trajectory | None:
         """What keeps clearer of everything known than the committed one; None when nothing does.
@@ -179,8 +184,10 @@ class TrajectoryPlanner:
         plan = self._mpc.plan(Problem(start, wanted, np.zeros(3), kept, guess))
         return None if plan.status is PlanStatus.SOLVER_FAILED else plan
 
-    def _clear(self, committed: Trajectory, plan: Plan, now: Situation) -> Trajectory | None:
+    def _clear(self, committed: Trajectory, plan: Plan | None, now: Situation) -> Trajectory | None:
         """The plan, braked from as late as it then stays clear of everything known; None when it never does."""
+        if plan is None:
+            return None
         known = now.followed
         for share in _BRAKED_FROM_01:
             end = max(1, round(share * self._mpc.steps)) + 1
@@ -235,6 +242,28 @@ def promised_m(params: SeparationParams) -> float:
     """Distance that no two committed trajectories come closer than."""
     slack_m = min(params.certify_slack_m, _SLACK_01 * max(0.0, params.radius_m - params.body_m))
     return params.radius_m - slack_m
+
+
+def _gathering_speed(way: Wish, speed_m_s: float) -> Wish:
+    """The same way, begun at an own speed.
+
+    Rows keep plans outside obstacles where the way says they will be by then: of a way that begins faster than one is,
+    the rows are those of the next corner, and plans cut this one.
+    """
+    way_m_s = float(np.linalg.norm(way.reference(np.zeros(1))[1]))
+    if way_m_s <= speed_m_s:
+        return way
+    rate_1_s = _GATHER_M_S2 / way_m_s
+    slow_01 = speed_m_s / way_m_s
+    late_s = (1.0 - slow_01) / rate_1_s  # until the way's own speed is reached
+
+    def reference(offsets_s: Array) -> tuple[Array, Array]:
+        begun_s = np.minimum(offsets_s, late_s)
+        at_s = (slow_01 + 0.5 * rate_1_s * begun_s) * begun_s + (offsets_s - begun_s)
+        pos, vel = way.reference(at_s)
+        return pos, vel * (slow_01 + rate_1_s * begun_s)[:, None]
+
+    return Wish(reference, is_way=True)
 
 
 def _begun(keep_out: KeepOut, steps: int) -> KeepOut:

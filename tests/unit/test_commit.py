@@ -11,6 +11,7 @@ from functools import partial
 import numpy as np
 import pytest
 
+from swarmctl.control import trajectory_planner
 from swarmctl.control.commit import Commitments
 from swarmctl.control.mission import glide_to
 from swarmctl.control.mpc import MpcParams
@@ -18,7 +19,7 @@ from swarmctl.control.separation import KeepOut, SeparationParams
 from swarmctl.control.trajectory_planner import CommitParams, Situation, Wish
 from swarmctl.core.intent import Intent, Proposal
 from swarmctl.core.trajectory import Trajectory, ending_at_rest, resting
-from swarmctl.core.types import Array
+from swarmctl.core.types import Array, Sampled
 
 UTC_US = 1_700_000_000_000_000
 TICK_US = 40_000
@@ -233,6 +234,19 @@ def test_who_is_hemmed_in_makes_way_upwards(column: bool, passes_m: float) -> No
     assert np.linalg.norm(pos[:, None] - np.array(sides), axis=2).min() >= CERTIFIED_M
 
 
+def along(corners: Array) -> Sampled:
+    """A way through (K, 2) at 1 m/s."""
+    reached_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+
+    def sample(offsets_s: Array) -> tuple[Array, Array]:
+        x, y = (np.interp(offsets_s, reached_m, corners[:, i]) for i in (0, 1))
+        leg = np.clip(np.searchsorted(reached_m, offsets_s, side="right") - 1, 0, len(corners) - 2)
+        unit = np.diff(corners, axis=0)[leg] / np.diff(reached_m)[leg, None]
+        return np.stack([x, y, 0.0 * x - 2.0], axis=1), np.column_stack([unit, 0.0 * x])
+
+    return sample
+
+
 @pytest.mark.parametrize(("is_way", "gets_on"), [(True, True), (False, False)])
 def test_along_a_way_round_plans_look_near_the_way(is_way: bool, gets_on: bool) -> None:
     """The last plan leads north before a wall, the way south through its gap: from one to the other no row leads."""
@@ -242,16 +256,28 @@ def test_along_a_way_round_plans_look_near_the_way(is_way: bool, gets_on: bool) 
     agent.committed = ending_at_rest(UTC_US, 100_000, *to_north.sample(np.arange(0.0, 2.1, 0.1)), 1.5)
     posts = [np.array([0.8, y_m, -2.0]) for y_m in (0.3, 0.6, 0.9, 1.2)]
     wall = [KeepOut(np.tile(post, (agent.steps + 1, 1)), 0.375, 0.275, True, -1) for post in posts]
-    corners = np.array([[0.0, 0.0], [0.8, -0.4], [3.0, -0.4]])
-    reached_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
-
-    def way(offsets_s: Array) -> tuple[Array, Array]:
-        x, y = (np.interp(offsets_s, reached_m, corners[:, i]) for i in (0, 1))  # at 1 m/s
-        return np.stack([x, y, 0.0 * x - 2.0], axis=1), np.zeros((len(offsets_s), 3))
-
+    way = along(np.array([[0.0, 0.0], [0.8, -0.4], [3.0, -0.4]]))
     agent.propose(Situation(UTC_US, UTC_US + agent.lead_us, Wish(way, is_way), {}, wall))
     assert agent.proposal is not None
     assert bool(agent.proposal.trajectory.pos_ned_m[-1, 0] > 1.0) is gets_on, "behind the wall"
+
+
+@pytest.mark.parametrize("gathers", [True, False], ids=["", "control: at the way's speed at once"])
+def test_who_rests_at_a_corner_sets_out_at_its_own_speed(gathers: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A way at 1 m/s is round the corner before the agent is: rows of what comes next let its plan cut this one."""
+    if not gathers:
+        monkeypatch.setattr(trajectory_planner, "_gathering_speed", lambda wish, speed_m_s: wish)
+    small = SeparationParams(radius_m=0.3, body_m=0.15)
+    agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), small, 3, lambda: 0)
+    here = np.array([2.716, 2.764, -2.0])
+    agent.begin(here, np.zeros(3), UTC_US)
+    posts = [np.array([3.0, y_m, -2.0]) for y_m in (2.802, 2.502, 2.202)]
+    wall = [KeepOut(np.tile(post, (agent.steps + 1, 1)), 0.375, 0.275, True, -1) for post in posts]
+    way = along(np.array([here[:2], [2.77, 3.14], [3.21, 3.25], [4.19, 3.06]]))
+    agent.propose(Situation(UTC_US, UTC_US + agent.lead_us, Wish(way, is_way=True), {}, wall))
+    assert (agent.proposal is not None) is gathers
+    if agent.proposal is not None:
+        assert agent.proposal.trajectory.pos_ned_m[-1, 0] > 3.4, "behind the wall"
 
 
 def proposing() -> tuple[Commitments, Proposal]:
