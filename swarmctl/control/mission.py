@@ -17,6 +17,7 @@ from swarmctl.control.standoff import places_ned_m
 from swarmctl.core.params import Params, Vec3
 from swarmctl.core.types import Array
 
+OUTWARD_S_M = 0.5  # how much later places of one goal are reached that are farther from it
 Waypoint = Annotated[tuple[float, float, float, float], Field(strict=False)]
 
 
@@ -141,7 +142,10 @@ class MissionReference:
 
 
 def _ways(params: GotoParams, starts_ned_m: Array, apart_m: float) -> list[Glide]:
-    """Of every agent; those who share a goal get there at the same time."""
+    """Of every agent; those who share a goal get there at the same time, farther out a little later.
+
+    A ring that closes before somebody is inside it opens only after much pushing.
+    """
     agents = len(starts_ned_m)
     goals = np.array(params.goals_ned_m) if params.goals_ned_m else starts_ned_m
     if len(goals) == 1:
@@ -155,8 +159,9 @@ def _ways(params: GotoParams, starts_ned_m: Array, apart_m: float) -> list[Glide
     ]
     for group in groups:
         slowest_s = max(ways[i].travel_s for i in group)
-        for i in group:
-            ways[i] = replace(ways[i], travel_s=slowest_s)
+        from_center_m = np.linalg.norm(goals[group] - goals[group].mean(axis=0), axis=1)
+        for i, outward_m in zip(group, from_center_m - from_center_m.min(), strict=True):
+            ways[i] = replace(ways[i], travel_s=slowest_s + OUTWARD_S_M * outward_m)
     return ways
 
 

@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 
 from sitl.campaign.layouts import least_sum_m, ring
+from sitl.campaign.scenarios import layout_of
 from sitl.lockstep import Lockstep
 from swarmctl.config import load
+from swarmctl.control import mission
 from swarmctl.core.types import Array
 
 SMALL = (  # bodies of 15 cm that keep 30 cm
@@ -117,6 +119,20 @@ def test_three_sent_to_one_point_come_to_rest_round_it() -> None:
 def test_control_without_places_of_their_own_they_push() -> None:
     flown = Flown(TRIANGLE, np.zeros((1, 3)), 7.0, "mission.goto.standoff=false")
     assert flown.distance_m.sum() > 1.15 * least_sum_m(3, 0.9)
+
+
+@pytest.mark.parametrize(
+    ("outward_s_m", "settled"), [(mission.OUTWARD_S_M, True), (0.0, False)], ids=["", "control: all at the same time"]
+)
+def test_ten_sent_to_one_point_get_inside_before_the_ring_closes(
+    outward_s_m: float, settled: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(mission, "OUTWARD_S_M", outward_s_m)
+    starts = layout_of("same_goal", 8, 10).starts_ned_m
+    flown = Flown(starts, np.zeros((1, 3)), 6.5, "sitl.physics_hz=100")
+    assert (flown.moved_m < 0.02) is settled
+    assert (float(flown.distance_m.sum()) < 1.1 * least_sum_m(10, 0.9)) is settled
+    assert flown.separation_m > 0.85
 
 
 def test_an_exactly_symmetric_swap_never_stops() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sitl.campaign.layouts import least_sum_m
-from swarmctl.control.mission import GotoParams, MissionParams, MissionReference
+from swarmctl.control.mission import OUTWARD_S_M, GotoParams, MissionParams, MissionReference
 from swarmctl.control.standoff import ROOM, arrangement, places_ned_m
 from swarmctl.core.types import Array
 
@@ -72,15 +72,29 @@ def test_ways_flown_together_never_come_much_closer_than_their_ends(count: int) 
     assert least_m >= ROOM * APART_M / math.sqrt(2.0) - 1e-6  # where no two gain by exchanging their places
 
 
-def test_everybody_works_out_the_same_and_arrives_at_the_same_time() -> None:
+def rest_s(references: list[MissionReference]) -> list[float]:
+    """When each comes to rest."""
+    times = np.arange(0.0, 20.0, 0.01)
+    return [float(times[np.linalg.norm(r.sample(times)[1], axis=1).nonzero()[0][-1]]) for r in references]
+
+
+def test_inner_places_are_reached_first() -> None:
+    starts = 5.0 * np.stack([np.cos(np.arange(7.0)), np.sin(np.arange(7.0)), 0.0 * np.arange(7.0)], axis=1)
+    mission = MissionParams(kind="goto", goto=GotoParams(goals_ned_m=((0.0, 0.0, 0.0),)))
+    flown = [MissionReference(mission, starts, agent, APART_M) for agent in range(7)]
+    ends_m = [float(np.linalg.norm(r.sample(np.array([60.0]))[0][0])) for r in flown]
+    first, *others = [t_s for _, t_s in sorted(zip(ends_m, rest_s(flown), strict=True))]
+    assert min(others) - first == pytest.approx(OUTWARD_S_M * ROOM * APART_M, abs=0.05)
+    assert max(others) - min(others) < 0.05
+
+
+def test_everybody_works_out_the_same_and_arrives_as_others_do() -> None:
     starts = np.array([[4.0, 0.0, -1.0], [-1.0, 1.7, -1.0], [-2.0, -3.4, -2.0]])
     mission = MissionParams(kind="goto", goto=GotoParams(goals_ned_m=((0.0, 0.0, -1.0),)))
     flown = [MissionReference(mission, starts, agent, APART_M) for agent in range(3)]
     ends = np.array([reference.sample(np.array([60.0]))[0][0] for reference in flown])
     np.testing.assert_allclose(ends, places_ned_m(starts, np.tile([0.0, 0.0, -1.0], (3, 1)), APART_M)[0])
-    times = np.arange(0.0, 20.0, 0.01)
-    rest_s = [times[np.linalg.norm(r.sample(times)[1], axis=1).nonzero()[0][-1]] for r in flown]
-    assert max(rest_s) - min(rest_s) < 0.05
+    assert max(rest_s(flown)) - min(rest_s(flown)) < 0.05, "three places are equally far"
     alone = mission.model_copy(update={"goto": mission.goto.model_copy(update={"standoff": False})})
     np.testing.assert_array_equal(
         MissionReference(alone, starts, 1, APART_M).sample(np.array([60.0]))[0][0], [0, 0, -1]
