@@ -17,7 +17,7 @@ from swarmctl.assembly import make_agent
 from swarmctl.config import Config, load
 from swarmctl.control.sequence import OPERATOR_STOP
 from swarmctl.core.types import Mode
-from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, MissionError, StartError
+from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, MissionError, StartError
 from swarmctl.links import topics
 from swarmctl.links.autopilot import Autopilot
 from swarmctl.links.bus import ZenohBus
@@ -176,16 +176,18 @@ def _exit_code(agent: Agent) -> int:
     if agent.outcome == "completed":
         return EXIT_OK
     print(f"mission not completed: {agent.outcome}", file=sys.stderr)
-    return EXIT_INTERRUPTED if agent.outcome == OPERATOR_STOP else EXIT_MISSION
+    if agent.outcome == OPERATOR_STOP:
+        return EXIT_INTERRUPTED
+    return EXIT_MISSION if agent.has_armed else EXIT_START
 
 
 class _StopRequest:
-    """SIGINT or SIGTERM: land. Taken once by the loop."""
+    """SIGINT, SIGTERM or SIGHUP (its terminal has gone): land. Taken once by the loop; the agent keeps it."""
 
     def __init__(self) -> None:
         self._asked = False
-        signal.signal(signal.SIGTERM, self._ask)
-        signal.signal(signal.SIGINT, self._ask)
+        for signum in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            signal.signal(signum, self._ask)
 
     def take(self) -> bool:
         asked, self._asked = self._asked, False
