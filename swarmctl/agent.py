@@ -119,11 +119,16 @@ class Agent:
         self._thrust_01 = setup.vehicle_model.hover_thrust_01
 
     @property
-    def finished(self) -> bool:
-        """Landed, disarmed, its parameters as they were, and so is every peer that is still there."""
-        if self._done_us is None or not (self._upkeep.restored or self._waited_us(self._done_us) > _RESTORE_US):
+    def done(self) -> bool:
+        """Landed, disarmed, and its parameters as they were."""
+        if self._done_us is None:
             return False
-        return all(p.phase is Phase.DONE or not p.alive for p in self._surroundings.peers().values())
+        return self._upkeep.restored or self._waited_us(self._done_us) > _RESTORE_US
+
+    @property
+    def finished(self) -> bool:
+        """Done, and so is every peer that is still there."""
+        return self.done and all(p.phase is Phase.DONE or not p.alive for p in self._surroundings.peers().values())
 
     @property
     def outcome(self) -> str:
