@@ -28,6 +28,7 @@ from swarmctl.control.facts import Facts
 from swarmctl.control.failsafe import Judgement, judge
 from swarmctl.control.fallback import rest_plan
 from swarmctl.control.model import Predictor
+from swarmctl.control.overload import Level, Overload
 from swarmctl.control.problem import Problem, Start
 from swarmctl.control.replay import Replay
 from swarmctl.control.separation import KeepOut, radius_problem
@@ -114,6 +115,7 @@ class Agent:
         self._alerts = Alerts()
         self._accuracy = AccuracyMonitor()
         self._standby_us = 0
+        self._overload = Overload(setup.params.overload, round(1e6 / setup.params.rate_hz))
         self._done_us: int | None = None
         self._last_state_us = _NOTHING_US
         self._thrust_01 = setup.vehicle_model.hover_thrust_01
@@ -160,8 +162,9 @@ class Agent:
         self._note("operator", verb=verb)
 
     def tick(self, now_us: int, late_ticks: int) -> TickRecord:
-        """One control step at monotonic time `now_us`; `late_ticks` so far is only recorded."""
+        """One control step at monotonic time `now_us`, with the deadlines missed so far."""
         began_ns = self._stopwatch_ns()
+        self._watch_deadlines(now_us, late_ticks)
         self._listen(now_us)
         state = self._sense(now_us)
         self._sequence.begin_if_due(now_us, self._clock.utc_us())
@@ -197,6 +200,15 @@ class Agent:
             late_ticks,
             self.took,
         )
+
+    def _watch_deadlines(self, now_us: int, late_ticks: int) -> None:
+        before = self._overload.level
+        self._overload.update(now_us, late_ticks)
+        level = self._overload.level
+        if level is not Level.NONE:
+            self._alerts.put("overload", self._overload.text(), now_us)
+        if level is not before:
+            self._note("overload", level=level.name, missed_01=round(self._overload.missed_01, 3))
 
     # -- listen, sense ------------------------------------------------------------------------------------------------
 
@@ -378,6 +390,7 @@ class Agent:
             boots=self._autopilot.clock.boots,
             refusal=self._upkeep.refusal,
             unsettled=self._unsettled(now_us),
+            overload=self._overload.level,
             armed_told_us=self._autopilot.armed_told_us,
         )
         for command in self._sequence.step(facts):
