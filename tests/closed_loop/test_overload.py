@@ -31,7 +31,7 @@ def swapped(*more: str, until_s: float, at: dict[float, Callable[[Lockstep], Non
 def test_who_misses_nine_deadlines_of_ten_comes_to_rest_far_from_the_others_and_lands() -> None:
     flight = swapped(until_s=30.0, at={0.5: one_tick_of(10)})
     assert flight.separation_m() > 1.5
-    assert {p.split(": ")[1] for p in flight.problems} == {"overload"}
+    assert {agent.outcome.split(":")[0] for agent in flight.lockstep.agents if agent} == {"overload"}
     levels = [e["level"] for e in flight.lockstep.logs[0].events if e["event"] == "overload"]
     assert levels == ["WIDEN", "HOLD", "LAND"]
 
