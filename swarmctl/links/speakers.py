@@ -142,7 +142,8 @@ class Speaker:
         same_boot = said.boot_id == believed.boot_id
         if same_boot and said.seq in self._contents:
             return REPLAYED if self._contents[said.seq] == zlib.crc32(said.payload) else SEQUENCE
-        if said.said_utc_us <= believed.said_utc_us and (not same_boot or said.seq <= believed.seq):
+        repeats = same_boot and said.seq <= believed.seq and said.said_utc_us <= believed.said_utc_us
+        if repeats or (not same_boot and said.said_utc_us <= believed.began_utc_us):  # or is of a former life
             return REPLAYED
         claim = self._claim(said, utc_us)
         if not self._is_confirmed(claim, believed, utc_us):
