@@ -134,7 +134,7 @@ class Config(Params):
     sitl: SitlParams = SitlParams()
     bus: BusParams = BusParams()
     telemetry: TelemetryParams = TelemetryParams()
-    obstacles: tuple[ObstacleParams, ...] = Field((), max_length=MAX_OBSTACLES, strict=False)
+    obstacles: tuple[ObstacleParams, ...] = Field((), strict=False)
     limits: LimitParams = LimitParams()
 
     def starts_ned_m(self) -> tuple[tuple[float, float, float], ...]:
@@ -320,7 +320,7 @@ def _whole(config: Config) -> Iterator[str]:
     elif not (listed and listed < agents):
         yield from _starts_apart(config)
     yield from _vehicle_problems(config)
-    yield from _far_obstacles(config)
+    yield from _obstacle_problems(config)
     if config.sitl.speed != 1.0:
         yield (
             f"sitl.speed = {config.sitl.speed}: agents fly on wall time and can't follow; leave it at 1. Faster than "
@@ -337,8 +337,11 @@ def _whole(config: Config) -> Iterator[str]:
         )
 
 
-def _far_obstacles(config: Config) -> Iterator[str]:
-    """Of those that agents would refuse to hear of."""
+def _obstacle_problems(config: Config) -> Iterator[str]:
+    """What agents would refuse to hear of."""
+    if len(config.obstacles) > MAX_OBSTACLES:
+        yield f"obstacles: {len(config.obstacles)} are listed, agents keep {MAX_OBSTACLES} at most"
+        return
     for number, obstacle in enumerate(config.obstacles):
         for key, vector in (("center_ned_m", obstacle.center_ned_m), ("vel_ned_m_s", obstacle.vel_ned_m_s)):
             if max(map(abs, vector)) > MAX_OBSTACLE_M:
