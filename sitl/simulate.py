@@ -44,7 +44,9 @@ def simulate(config: Config, directory: Path) -> int:
     problems = flight.problems()
     outcome = "interrupted" if stop.count else "failed" if problems else "completed"
     flight.truth.tofile(directory / "truth.bin")
-    for log in flight.logs:
+    for log, agent in zip(flight.logs, flight.agents, strict=True):
+        if agent is not None:
+            log.event("bus_summary", flight.clock.now_us(), flight.clock.utc_us(), rejected=agent.rejected, lost=0)
         log.close()
     if flight.fault_events:
         write_events(directory / "sitl.events.jsonl", flight.fault_events)

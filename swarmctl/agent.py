@@ -6,7 +6,6 @@ It has no thread, socket, sleep or simulation branch: transport, bus, slow path,
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -85,7 +84,9 @@ class Agent:
         self._upkeep = Upkeep(
             autopilot, commands, setup.params.autopilot_params, setup.sysid, setup.params.sequence.state_rate_hz
         )
-        self._surroundings = Surroundings(setup.agent, setup.peers, setup.separation, bus)
+        self._surroundings = Surroundings(
+            setup.agent, setup.peers, setup.separation, bus, setup.params.rate_hz, self._note
+        )
         self._coordination = make_coordination(setup, self._surroundings, bus, self._note, stopwatch_ns)
         self._controller, self._transit = make_controllers(setup, stopwatch_ns)
         self._observer = make_estimator(setup)
@@ -145,10 +146,7 @@ class Agent:
     @property
     def rejected(self) -> dict[str, int]:
         """Bus messages refused so far, by reason."""
-        found = Counter(self._surroundings.paths.rejected)
-        if self._coordination is not None:
-            found.update(self._coordination.rejected)
-        return dict(found)
+        return dict(self._surroundings.refusals.by_reason)
 
     @property
     def commits_refused(self) -> int | None:
@@ -189,6 +187,9 @@ class Agent:
         )
         self._share(state, flown)
         self._advance(now_us, state)
+        refusals = self._surroundings.refusals.alert(self._clock.utc_us())
+        if refusals:
+            self._alerts.put("bus", refusals, now_us)
         self._reporter.problem = self._alerts.text(now_us)
         return self._reporter.report(
             now_us,
@@ -439,7 +440,7 @@ class Agent:
         if state is not None:
             self._bus.publish(topics.PATH, topics.encode_path(self._path(state, flown)))
         if self._coordination is not None:
-            self._coordination.say()
+            self._coordination.say(self._clock.utc_us())
 
     def _path(self, state: VehicleState, flown: Plan | None) -> PredictedPath:
         setup, seq = self._setup, self._reporter.seq

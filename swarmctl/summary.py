@@ -80,9 +80,16 @@ def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...
         f"ticks {timing.get('ticks')}, late {timing.get('late_ticks')}, "
         f"tick p50/p99/max {_ms(tick)} ms, solve p50/p99/max {_ms(solve)} ms",
         f"solver {solver.get('name')}, failed {solver.get('failed')}; "
-        f"path age p50/p99 {_ms(age, ('p50', 'p99'))} ms, {rejected} messages refused" + _deadlocks(summary),
+        f"path age p50/p99 {_ms(age, ('p50', 'p99'))} ms, {rejected} messages refused"
+        + _unheard(comms)
+        + _deadlocks(summary),
         f"run folder {directory}",
     )
+
+
+def _unheard(comms: Mapping[str, Any]) -> str:
+    found = _section(comms, "unheard")
+    return f"; agent-{found['agent']} unheard for {found['longest_s']:.1f} s" if found.get("count") else ""
 
 
 def _deadlocks(summary: Mapping[str, Any]) -> str:
