@@ -265,6 +265,7 @@ def _udp_links(options: argparse.Namespace) -> tuple[list[Transport], list[str]]
     from sitl import realtime
     from sitl.ports import OpenPort
     from swarmctl.errors import ConfigError
+    from swarmctl.links.latch import nobody
     from swarmctl.links.transport import UdpTransport
 
     count = options.vehicles
@@ -279,7 +280,7 @@ def _udp_links(options: argparse.Namespace) -> tuple[list[Transport], list[str]]
     places = [f"local={s.getsockname()[1]} remote={r}" for s, r in zip(sockets, remotes, strict=True)]
     pairs = zip(sockets, remotes, strict=True)
     if options.remote_ports:  # given peers are the only ones: a stray datagram must not take a vehicle over
-        return [UdpTransport(s, (realtime.HOST, r), latch=False) for s, r in pairs], places
+        return [UdpTransport(s, (realtime.HOST, r), nobody) for s, r in pairs], places
     return [OpenPort(s, (realtime.HOST, r)) for s, r in pairs], places
 
 

@@ -22,7 +22,7 @@ from swarmctl.links import topics
 from swarmctl.links.autopilot import Autopilot
 from swarmctl.links.bus import ZenohBus
 from swarmctl.links.commands import CommandPort
-from swarmctl.links.mavlink import Codec
+from swarmctl.links.mavlink import Codec, heartbeat_of
 from swarmctl.links.mavsdk_commands import MavsdkCommands
 from swarmctl.links.peers import agent_name
 from swarmctl.links.transport import open_transport
@@ -99,7 +99,7 @@ def run_agent(config_path: Path, agent: int, run: str, bus: str, run_dir: Path, 
     stop = _StopRequest()
     clock = WallClock()
     url = config.vehicles[agent].url if config.vehicles else ""
-    transport = open_transport(url or "udpin://127.0.0.1:14540", fd)
+    transport = open_transport(url or "udpin://127.0.0.1:14540", fd, heartbeat_of(config.sysids()[agent]))
     recorder = Recorder(run_dir, agent)
     peers = [agent_name(i) for i in range(config.swarm.agents) if i != agent]
     listen = {
@@ -166,7 +166,8 @@ def _give_up_on_silence(silent_us: int, ever_seen: bool, config: Config, vehicle
     if not ever_seen and silent_us > config.agent.connect_timeout_s * 1e6:
         raise StartError(
             f"vehicle at {vehicle}: no heartbeat and position within {config.agent.connect_timeout_s:.0f} s. "
-            "Is it running, sending to this port, and is its MAV_SYS_ID the configured sysid?"
+            "Is it running, sending to this port, and is its MAV_SYS_ID the configured sysid? PX4 answers only the first "
+            "program that has ever spoken to it: end the other one, or restart PX4"
         )
     if ever_seen and silent_us > _VEHICLE_LOST_S * 1e6:
         raise MissionError(f"vehicle at {vehicle}: silent for {_VEHICLE_LOST_S:.0f} s, given up")
