@@ -166,8 +166,8 @@ def _give_up_on_silence(silent_us: int, ever_seen: bool, config: Config, vehicle
     if not ever_seen and silent_us > config.agent.connect_timeout_s * 1e6:
         raise StartError(
             f"vehicle at {vehicle}: no heartbeat and position within {config.agent.connect_timeout_s:.0f} s. "
-            "Is it running, sending to this port, and is its MAV_SYS_ID the configured sysid? PX4 answers only the first "
-            "program that has ever spoken to it: end the other one, or restart PX4"
+            "Is it running, sending to this port, and is its MAV_SYS_ID the configured sysid? "
+            "PX4 answers only the first program that has ever spoken to it: end that one, or restart PX4"
         )
     if ever_seen and silent_us > _VEHICLE_LOST_S * 1e6:
         raise MissionError(f"vehicle at {vehicle}: silent for {_VEHICLE_LOST_S:.0f} s, given up")

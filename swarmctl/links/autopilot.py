@@ -28,6 +28,7 @@ _CRITICAL = 5
 _PREARM = 1 << 28
 _LOCAL_NED = mavlink.MAV_FRAME_LOCAL_NED
 _BODY_FRD = (mavlink.MAV_FRAME_BODY_NED, mavlink.MAV_FRAME_BODY_FRD)  # of ODOMETRY's velocity
+_STATE = frozenset({"ODOMETRY", "LOCAL_POSITION_NED"})  # whose stamps are the state's
 _FAST = frozenset({mavlink.MAVLINK_MSG_ID_ODOMETRY})  # not worth passing to the slow path
 _GAP_US = 300_000  # after a silence this long, ours or the link's, the mode has to be told again
 _TOLD_LATELY_US = 100_000  # a mode this young at the end of our own silence was not held up in a full buffer
@@ -104,7 +105,7 @@ class Autopilot:
         self._setpoint_us: int | None = None
         self._sync_us = 0
         self._syncs: deque[int] = deque(maxlen=16)  # our times in open TIMESYNC questions [ns]
-        self._boots = 0
+        self._boots = self._restarts = 0  # of the clock, as far as they have been heeded
         self._counter_resets = 0
         self._forget()
         self._handlers: dict[str, Callable[[Any, int], None]] = {
@@ -193,7 +194,10 @@ class Autopilot:
         if self.heard_us is not None and arrived_us - self.heard_us > _GAP_US:
             self._doubt_us = arrived_us  # the link was silent: what was said meanwhile is lost
         self.heard_us = arrived_us
-        handler = self._handlers.get(message.get_type())
+        kind = message.get_type()
+        if kind not in _STATE and (boot_ms := getattr(message, "time_boot_ms", None)) is not None:
+            self.clock.witness(kind, boot_ms * 1000, arrived_us)
+        handler = self._handlers.get(kind)
         if handler is not None:
             handler(message, arrived_us)
         if self._slow is not None and message.get_msgId() not in _FAST:
@@ -259,6 +263,11 @@ class Autopilot:
             self._codec.refused["state not finite"] += 1
             return False
         t_us = self.clock.to_local(vehicle_us, arrived_us)
+        if t_us is None:
+            self._codec.refused["stamp not believed"] += 1
+            return False
+        if self.clock.restarts != self._restarts:
+            self._restarts, self._sample = self.clock.restarts, None
         if self.clock.boots != self._boots:
             self._boots = self.clock.boots
             self._forget()

@@ -118,7 +118,9 @@ def test_newest_sample_of_a_drained_link_wins_whatever_the_order_of_arrival() ->
 def test_vehicle_time_is_mapped_by_the_smallest_delay_so_jitter_does_not_make_old_samples_young() -> None:
     clock = VehicleClock()
     delays_us = [9_000, 30_000, 4_000, 12_000, 60_000, 5_000]
-    local = [clock.to_local(5_000_000 + 10_000 * i, 10_000 * i + d) for i, d in enumerate(delays_us)]
+    found = [clock.to_local(5_000_000 + 10_000 * i, 10_000 * i + d) for i, d in enumerate(delays_us)]
+    local = [t_us for t_us in found if t_us is not None]
+    assert len(local) == len(found)
     # sample 4 left at 40 ms and took 60 ms; by the best delay seen (4 ms) it is 56 ms old on arrival
     assert local[4] == 40_000 + 4_000
     assert local[5] == 50_000 + 4_000
@@ -130,24 +132,50 @@ def test_a_slow_drift_of_the_vehicle_clock_is_followed() -> None:
     error_us = 0
     for i in range(1000):  # 10 s at 100 Hz, vehicle clock 1000 ppm slow, delay 5 ms
         true_us = i * 10_000
-        error_us = clock.to_local(round(true_us * 0.999), true_us + 5_000) - true_us
+        local_us = clock.to_local(round(true_us * 0.999), true_us + 5_000)
+        assert local_us is not None
+        error_us = local_us - true_us
     assert -1_000 < error_us <= 5_000  # two windows of 2 s: at most 4 ms behind
+
+
+def stamped(bench: Bench, seconds: float, booted_us: int = 0, north_m: float = 0.0) -> Any:
+    """The vehicle speaks for a while, state and attitude at 50 Hz, its clock begun at `booted_us`; the last state."""
+    state = None
+    for _ in range(round(seconds * 50)):
+        bench.clock.advance(20_000)
+        stamp_us = bench.clock.now_us() - booted_us
+        bench.say(odometry(stamp_us, pos=(north_m, 0.0, 0.0)))
+        bench.say(dialect.MAVLink_attitude_quaternion_message(stamp_us // 1000, *LEVEL, 0.0, 0.0, 0.0))
+        bench.heartbeat()
+        state = bench.poll()
+    return state
 
 
 def test_after_a_reboot_of_the_vehicle_its_new_clock_is_taken_and_its_samples_too() -> None:
     bench = Bench().ready()
-    bench.clock.advance(60_000_000)
-    bench.say(odometry(60_000_000, pos=(5.0, 0.0, 0.0)))
-    bench.poll()
+    stamped(bench, 60.0, north_m=5.0)
     bench.clock.advance(3_000_000)
-    bench.say(odometry(10_000, pos=(0.5, 0.0, 0.0)))
-    bench.heartbeat()
-    assert bench.poll() is None, "its local origin is another one now"
+    booted_us = bench.clock.now_us()
+    assert stamped(bench, 0.5, booted_us, 0.5) is None, "its local origin is another one now"
     assert bench.pilot.clock.boots == 1
     bench.origin(SHARED.lat_deg, SHARED.lon_deg, SHARED.alt_m)
-    state = bench.poll()
+    state = stamped(bench, 0.02, booted_us, 0.5)
     assert state.pos_ned_m[0] == pytest.approx(0.5, abs=0.01)
     assert abs(state.t_us - bench.clock.now_us()) < 20_000
+    stamped(bench, 5.0, booted_us, 0.5)
+    assert bench.pilot.clock.boots == 1
+
+
+@pytest.mark.parametrize("off_us", [-30_000_000, 900_000, 10**12])
+def test_one_state_of_another_time_neither_reboots_the_vehicle_nor_freezes_what_is_known_of_it(off_us: int) -> None:
+    bench = Bench().ready()
+    stamped(bench, 31.0)
+    bench.say(odometry(bench.clock.now_us() + off_us, pos=(9.0, 0.0, 0.0)))
+    assert bench.poll().pos_ned_m[0] == pytest.approx(0.0, abs=0.01)
+    state = stamped(bench, 0.02, north_m=0.1)
+    assert state.pos_ned_m[0] == pytest.approx(0.1, abs=0.01)
+    assert abs(state.t_us - bench.clock.now_us()) < 1_000
+    assert (bench.pilot.clock.boots, bench.own_codec.refused["stamp not believed"]) == (0, 1)
 
 
 def test_a_link_that_falls_a_second_and_a_half_behind_does_not_make_old_samples_young() -> None:
@@ -155,7 +183,9 @@ def test_a_link_that_falls_a_second_and_a_half_behind_does_not_make_old_samples_
     for i in range(100):
         clock.to_local(i * 10_000, i * 10_000 + 5_000)
     arrived_us = 1_000_000 + 1_500_000
-    assert arrived_us - clock.to_local(1_000_000, arrived_us) > 1_400_000  # older than any failsafe allows
+    local_us = clock.to_local(1_000_000, arrived_us)
+    assert local_us is not None
+    assert arrived_us - local_us > 1_400_000  # older than any failsafe allows
 
 
 @pytest.mark.parametrize(("sysid", "compid"), [(2, 1), (1, 2), (255, 190), (1, 191)])

@@ -1,4 +1,4 @@
-"""Whose a UDP port is: the vehicle's, from its first heartbeat on, wherever it moves to, and however others flood it."""
+"""Whose a UDP port is: the vehicle's from its first heartbeat on, wherever it moves to, however others flood it."""
 
 from __future__ import annotations
 
@@ -254,7 +254,7 @@ def test_one_poll_takes_in_so_much_and_no_more(port: socket.socket) -> None:
     assert heard(link, 1) == [b"first"]
     for _ in range(200):
         vehicle.sendto(bytes(1500), port.getsockname())
-    sizes = []
+    sizes: list[int] = []
     while not sizes or sizes[-1]:
         sizes.append(sum(len(d.data) for d in link.receive(now())))
     assert max(sizes) <= 131_072 + 1500
