@@ -106,6 +106,7 @@ class Agent:
         )
         self.took = Took(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # of the last tick
         self._promise_ns = 0  # of the last tick
+        self._gaps = 0  # of setpoints, as far as they have been told
         self._announced: tuple[Phase, Mode, FlightMode] | None = None
         self._problem = ""
         self._last_state_us = _NOTHING_US
@@ -337,6 +338,10 @@ class Agent:
             self._problem = f"setpoint refused: {refused}"
             self._note("setpoint_refused", reason=refused)
             return None
+        if self._autopilot.gaps != self._gaps:
+            self._gaps, gap_s = self._autopilot.gaps, self._autopilot.gap_s
+            self._problem = f"setpoints had stopped for {gap_s:.2f} s: the autopilot's failsafe may have acted"
+            self._note("setpoint_gap", seconds=gap_s)
         self._virtual, self._thrust_01 = virtual, setpoint.thrust_01
         self._predictor.sent(now_us, virtual)
         return setpoint

@@ -23,7 +23,7 @@ from swarmctl.links.vehicle_clock import VehicleClock
 
 SHARED = GeoOrigin(47.397742, 8.545594, 489.4)
 LEVEL = (1.0, 0.0, 0.0, 0.0)
-PX4_OFFBOARD, PX4_HOLD = 6 << 16, 4 << 16 | 3 << 24
+PX4_OFFBOARD, PX4_HOLD, PX4_LAND = 6 << 16, 4 << 16 | 3 << 24, 4 << 16 | 6 << 24
 
 
 class Bench:
@@ -452,6 +452,81 @@ def test_a_poll_after_a_sleep_believes_a_mode_that_is_young() -> None:
         bench.say(odometry(bench.clock.now_us()))
         bench.heartbeat()
     assert bench.poll() is not None
+
+
+def requests(bench: Bench) -> int:
+    """How often the vehicle has been asked for its HEARTBEAT since the last call."""
+    found = [dialect.MAVLink(None).decode(bytearray(data)) for data in sent(bench.vehicle)]
+    return sum(m.get_type() == "COMMAND_LONG" and (m.command, m.param1) == (512, 0.0) for m in found)
+
+
+@pytest.mark.parametrize("slept", [True, False], ids=["we slept", "the link was silent"])
+def test_after_a_silence_the_vehicle_is_asked_and_its_answer_is_enough(slept: bool) -> None:
+    bench = Bench().ready()
+    flying(bench, 1.0)
+    requests(bench)
+    for _ in range(16):  # CURRENT_MODE would come within half a second, HEARTBEAT within one
+        bench.clock.advance(20_000)
+        if slept:
+            bench.say(odometry(bench.clock.now_us()))
+        else:
+            bench.poll()
+    if not slept:
+        bench.say(odometry(bench.clock.now_us()))
+    assert bench.poll() is None
+    assert requests(bench) == 1
+    bench.heartbeat()
+    assert flying(bench, 0.02, mode_hz=0.0) is not None
+    assert requests(bench) == 0
+
+
+def test_a_vehicle_that_does_not_answer_is_asked_again_but_not_every_tick() -> None:
+    bench = Bench().ready()
+    flying(bench, 1.0)
+    requests(bench)
+    bench.clock.advance(400_000)
+    assert flying(bench, 0.6, mode_hz=0.0) is None
+    assert 8 <= requests(bench) <= 10
+
+
+@pytest.mark.parametrize(("custom_mode", "mode"), [(PX4_LAND, FlightMode.LAND), (1 << 16, FlightMode.MANUAL)])
+def test_a_mode_that_came_and_went_between_two_polls_is_shown_once(custom_mode: int, mode: FlightMode) -> None:
+    bench = Bench().ready()
+    flying(bench, 1.0)
+    for custom in (custom_mode, PX4_OFFBOARD):
+        bench.say(dialect.MAVLink_current_mode_message(0, custom, 0))
+    assert bench.poll().mode is mode
+    assert bench.poll().mode is mode, "the same tick"
+    assert flying(bench, 0.02, mode_hz=0.0).mode is FlightMode.EXTERNAL
+    assert bench.pilot.watch.departures == 1
+
+
+def test_a_failsafe_that_came_and_went_between_two_polls_is_shown_once() -> None:
+    bench = Bench().ready()
+    flying(bench, 1.0)
+    bench.heartbeat(status=5)
+    bench.heartbeat(status=4)
+    assert bench.poll().failsafe
+    assert not flying(bench, 0.02, mode_hz=0.0).failsafe
+
+
+def test_setpoints_that_resume_after_the_failsafe_may_have_acted_are_told() -> None:
+    bench = Bench().ready()
+    bench.say(dialect.MAVLink_param_value_message(b"COM_OF_LOSS_T", 0.5, 9, 1, 0))
+
+    def stream_after(seconds: float) -> tuple[int, float]:
+        bench.clock.advance(round(seconds * 1e6))
+        bench.heartbeat()
+        bench.poll()
+        bench.pilot.send(setpoint(valid_until_us=bench.clock.now_us() + 100_000), bench.clock.now_us())
+        return bench.pilot.gaps, round(bench.pilot.gap_s, 2)
+
+    assert stream_after(5.0) == (0, 0.0)
+    assert stream_after(0.45) == (0, 0.0)
+    assert stream_after(0.62) == (1, 0.62)
+    bench.heartbeat(PX4_LAND)
+    bench.poll()
+    assert stream_after(10.0) == (1, 0.62), "it had left, and been seen to"
 
 
 def test_estimator_resets_are_counted() -> None:
