@@ -106,7 +106,7 @@ class Agent:
         )
         self.took = Took(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # of the last tick
         self._promise_ns = 0  # of the last tick
-        self._gaps = 0  # of setpoints, as far as they have been told
+        self._gaps = self._jumps = 0  # of setpoints and of the estimate, as far as they have been told
         self._announced: tuple[Phase, Mode, FlightMode] | None = None
         self._problem = ""
         self._last_state_us = _NOTHING_US
@@ -199,6 +199,11 @@ class Agent:
             if not result.ok:
                 self._problem = f"{asked} refused: {result.text}"
             self._note("command", verb=asked, ok=result.ok, text=result.text)
+        frame = self._autopilot.frame
+        if frame.jumps != self._jumps:
+            self._jumps = frame.jumps
+            self._problem = f"estimate jumped by {frame.jump_m:.1f} m: peers keep that much more away"
+            self._note("estimate_jumped", metres=frame.jump_m)
         if state is None or state.t_us == self._last_state_us:
             return state
         self._last_state_us = state.t_us
@@ -393,15 +398,15 @@ class Agent:
             self._coordination.say()
 
     def _path(self, state: VehicleState, flown: Plan | None) -> PredictedPath:
-        setup, seq = self._setup, self._reporter.seq
+        setup, seq, margin_m = self._setup, self._reporter.seq, self._autopilot.frame.margin_m
         if flown is not None:
             t0_us, dt_us, pos = self._utc(flown.t0_us), flown.dt_us, flown.pos_ned_m
-            return PredictedPath(setup.agent, setup.boot_id, seq, t0_us, dt_us, 0.0, pos)
+            return PredictedPath(setup.agent, setup.boot_id, seq, t0_us, dt_us, margin_m, pos)
         act_us, dt_us = self._clock.now_us() + self._predictor.delay_us, self._controller.dt_us
         grid = np.arange(self._controller.steps + 1, dtype=np.float64)
         ahead_s = grid * (dt_us * 1e-6) + (act_us - state.t_us) * 1e-6
         pos = coasting(state, ahead_s, setup.separation.brake_m_s2)
-        return PredictedPath(setup.agent, setup.boot_id, seq, self._utc(act_us), dt_us, 0.0, pos)
+        return PredictedPath(setup.agent, setup.boot_id, seq, self._utc(act_us), dt_us, margin_m, pos)
 
     def _fresh(self, now_us: int, state: VehicleState) -> bool:
         return now_us - state.t_us <= self._setup.params.failsafe.state_max_age_s * 1e6

@@ -78,6 +78,7 @@ class Autopilot:
     _placed: tuple[_Sample, Array] | None  # the sample, and its position in the shared frame
     _attitude: tuple[int, Array, Array] | None  # arrival, attitude, rates
     _reset_counter: int | None
+    _was_reset: bool  # the estimator has said so, since the newest placed sample
 
     def __init__(
         self,
@@ -106,7 +107,6 @@ class Autopilot:
         self._sync_us = 0
         self._syncs: deque[int] = deque(maxlen=16)  # our times in open TIMESYNC questions [ns]
         self._boots = self._restarts = 0  # of the clock, as far as they have been heeded
-        self._counter_resets = 0
         self._forget()
         self._handlers: dict[str, Callable[[Any, int], None]] = {
             "HEARTBEAT": self._heartbeat,
@@ -140,11 +140,6 @@ class Autopilot:
     def offset_ned_m(self) -> Array | None:
         """Local origin (3,) in the shared frame."""
         return self.frame.offset_ned_m
-
-    @property
-    def resets(self) -> int:
-        """How often the estimate has jumped in the shared frame: what was filtered before does not continue."""
-        return self._counter_resets + self.frame.jumps
 
     def attach(self, slow: CommandPort) -> None:
         """Pass everything but the fast state messages on to the slow path."""
@@ -265,7 +260,7 @@ class Autopilot:
         rate = np.array([message.rollspeed, message.pitchspeed, message.yawspeed])
         pos = np.array([message.x, message.y, message.z])
         if self._take(message.time_usec, arrived_us, pos, vel, q_nb, rate):
-            self._counter_resets += self._reset_counter not in (None, message.reset_counter)
+            self._was_reset |= self._reset_counter not in (None, message.reset_counter)
             self._reset_counter = message.reset_counter
 
     def _attitude_quaternion(self, message: Any, arrived_us: int) -> None:
@@ -304,7 +299,8 @@ class Autopilot:
 
     def _state(self, sample: _Sample, now_us: int) -> VehicleState | None:
         if self._placed is None or self._placed[0] is not sample:
-            placed = self.frame.place(sample.vehicle_us, sample.pos_ned_m, sample.vel_ned_m_s, self.armed)
+            told, self._was_reset = self._was_reset, False
+            placed = self.frame.place(sample.vehicle_us, sample.pos_ned_m, sample.vel_ned_m_s, self.armed, told)
             self._placed = None if placed is None else (sample, placed)
         if self._placed is None:
             return None
@@ -315,6 +311,7 @@ class Autopilot:
     def _forget(self) -> None:
         """The vehicle has rebooted, or was never heard: nothing it said holds."""
         self._sample = self._placed = self._attitude = self._reset_counter = None
+        self._was_reset = False
         self._odometry_us = 0
         self.landed = Landed.UNKNOWN
         self.armable = False

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import development as dialect
 
+from sitl.endpoint import Endpoint
 from sitl.lockstep import Lockstep
 from swarmctl.core.types import FlightMode, Mode, Phase
 from swarmctl.links.autopilot import Autopilot
@@ -17,7 +18,9 @@ AT_S = 4.03
 
 def freeze(running: Lockstep) -> None:
     """Its modes are told by HEARTBEAT alone, once a second: between two of them, unless it is asked."""
-    running.world.endpoints[0].set_interval(dialect.MAVLINK_MSG_ID_CURRENT_MODE, -1)  # type: ignore[union-attr]
+    endpoint = running.world.endpoints[0]
+    assert isinstance(endpoint, Endpoint)
+    endpoint.set_interval(dialect.MAVLINK_MSG_ID_CURRENT_MODE, -1)
     running.frozen.add(0)
 
 

@@ -529,15 +529,28 @@ def test_setpoints_that_resume_after_the_failsafe_may_have_acted_are_told() -> N
     assert stream_after(10.0) == (1, 0.62), "it had left, and been seen to"
 
 
-def test_estimator_resets_are_counted() -> None:
+@pytest.mark.parametrize(("counted", "north_m"), [(True, 1.0), (True, 0.1), (False, 1.0)])
+def test_an_estimate_that_jumps_does_not_move_the_vehicle_and_peers_are_given_a_margin(
+    counted: bool, north_m: float
+) -> None:
+    """A step of 0.1 m is one only by the estimator's own word."""
     bench = Bench().ready()
-    for counter, resets in ((3, 0), (3, 0), (4, 1), (4, 1), (6, 2)):
-        bench.clock.advance(20_000)
-        message = odometry(bench.clock.now_us())
-        message.reset_counter = counter
-        bench.say(message)
-        bench.poll()
-        assert bench.pilot.resets == resets
+    flying(bench, 1.0)
+    jumped = odometry(bench.clock.now_us() + 20_000, pos=(north_m, 0.0, 0.0))
+    jumped.reset_counter = int(counted)
+    bench.clock.advance(20_000)
+    bench.say(jumped)
+    bench.origin(SHARED.lat_deg, SHARED.lon_deg, SHARED.alt_m)
+    assert bench.poll().pos_ned_m[0] == pytest.approx(0.0, abs=0.01)
+    bench.clock.advance(20_000)
+    again = odometry(bench.clock.now_us(), pos=(north_m, 0.0, 0.0))
+    again.reset_counter = int(counted)
+    bench.say(again)
+    bench.origin(SHARED.lat_deg, SHARED.lon_deg, SHARED.alt_m)
+    assert bench.poll().pos_ned_m[0] == pytest.approx(0.0, abs=0.01)
+    assert bench.pilot.frame.jumps == 1
+    assert bench.pilot.frame.jump_m == pytest.approx(north_m, abs=0.02)
+    assert 0.0 < bench.pilot.frame.margin_m <= north_m
 
 
 @pytest.mark.parametrize(
