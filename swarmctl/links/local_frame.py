@@ -6,8 +6,9 @@ what is right or to what is wrong: then its position has moved, but the vehicle 
 
 A position that no flight can explain is therefore bridged: what it is off by is taken from it, so that the vehicle
 stays where it was and nobody flies across the difference. A newly told origin explains it and ends the bridge. Else
-the vehicle may be at either place: `margin_m` is what has to be kept clear of around it, until the new positions have
-been steady for a while and the bridge has been drawn in slowly.
+the vehicle may be at either place: `margin_m` is what has to be kept clear of around it. A short bridge is drawn in
+slowly once positions have been steady for a while. A long one stays until the estimate jumps back or the vehicle has
+landed: nobody can tell which place is right, and only to go on as before puts nobody in danger who was not before.
 """
 
 from __future__ import annotations
@@ -30,6 +31,7 @@ _FORGET_S = 1.0  # a position this old predicts nothing
 _ASKED_US = 500_000  # for the origin, after which it is taken not to have moved
 _STEADY_US = 3_000_000  # of positions after a jump, before they are believed
 _DRAW_IN_M_S = 0.3  # how fast a bridge shortens: what a vehicle is moved by it
+_SHORT_M = 1.0  # a margin that peers can give and fly on; drawn in, 5 m ended in a collision in truth
 _WIDEN_M_S = 2.0  # how fast the margin grows: others can make room so fast
 _NARROW_M_S = 0.5
 _NEAR_US = 100_000  # a geodetic and a local position of one moment
@@ -141,27 +143,21 @@ class LocalFrame:
                 return
         if missed_m < leeway_m:
             return
+        self.bridge_ned_m, self._jumped_us = missing_ned_m, t_us
         self.jump_m = math.sqrt(float(missing_ned_m @ missing_ned_m))
-        self._jumped_us = t_us
-        if self.jump_m < step_m:  # it has jumped back
-            self.bridge_ned_m, self._unexplained = _NOTHING, False
-            return
-        self.bridge_ned_m = missing_ned_m
-        self._unexplained = not reset
+        self._unexplained = not reset and self.jump_m >= step_m  # else it has jumped back
         self.jumps += reset
 
     def _draw_in(self, t_us: int, since_s: float) -> None:
-        """Widen or narrow the margin, and shorten the bridge once positions have been steady."""
+        """Widen or narrow the margin, and shorten a short bridge once positions have been steady."""
         left_m = math.sqrt(float(self.bridge_ned_m @ self.bridge_ned_m))
-        if left_m == 0.0:
-            self.margin_m = max(0.0, self.margin_m - _NARROW_M_S * since_s)
-            return
         if self._unexplained and t_us - self._jumped_us > _ASKED_US:  # nobody tells of an origin that has moved
             self._unexplained = False
             self.jumps += 1
-        if not self._unexplained:
-            self.margin_m = min(self.jump_m, MAX_RADIUS_M, self.margin_m + _WIDEN_M_S * since_s)
-        if t_us - self._jumped_us > _STEADY_US:
+        wanted_m = min(self.jump_m, MAX_RADIUS_M) if left_m and not self._unexplained else 0.0
+        widest_m, least_m = self.margin_m + _WIDEN_M_S * since_s, self.margin_m - _NARROW_M_S * since_s
+        self.margin_m = max(min(wanted_m, widest_m), least_m)
+        if left_m and self.jump_m <= _SHORT_M and t_us - self._jumped_us > _STEADY_US:
             self.bridge_ned_m = self.bridge_ned_m * max(0.0, 1.0 - _DRAW_IN_M_S * since_s / left_m)
 
     def _take_origin(self) -> None:

@@ -109,23 +109,34 @@ def steps_m(placed: list[Array | None]) -> list[float]:
 
 
 @pytest.mark.parametrize("answered", [True, False], ids=["origin told again", "origin never told again"])
-def test_an_estimate_that_jumps_moves_nobody_at_once_and_is_drawn_in_slowly(answered: bool) -> None:
+def test_a_long_jump_of_the_estimate_moves_nobody_and_is_kept_clear_of(answered: bool) -> None:
     vehicle = flying()
     before = vehicle.fly(0.02)
     placed = before + jumped(vehicle).fly(0.02)
     if answered:
         vehicle.say()
-    placed += vehicle.fly(2.9)
-    assert vehicle.error_m(placed) == pytest.approx(5.0, abs=0.02), "3 s of steady positions come first"
-    assert vehicle.frame.jumps == 1
-    assert vehicle.frame.margin_m == pytest.approx(5.0 if answered else 2.0 * 2.4, abs=0.1)
+    placed += vehicle.fly(2.0)
+    assert vehicle.frame.margin_m == pytest.approx(2.0 * (2.0 if answered else 1.5), abs=0.1)
+    placed += vehicle.fly(30.0)
+    assert vehicle.error_m(placed) == pytest.approx(5.0, abs=0.02)
+    assert max(steps_m(placed)) < 1e-6
+    assert (vehicle.frame.jumps, vehicle.frame.margin_m) == (1, vehicle.frame.jump_m)
     assert vehicle.frame.jump_m == pytest.approx(5.0, abs=0.02)
-    placed += vehicle.fly(10.0)
-    assert vehicle.frame.margin_m == pytest.approx(5.0, abs=0.02), "as long as it may be at either place"
-    placed += vehicle.fly(8.0)
+    vehicle.armed = False
+    assert vehicle.error_m(vehicle.fly(0.1)) < 0.02, "on the ground everything is believed"
+    assert vehicle.frame.margin_m == 0.0
+
+
+def test_a_short_jump_of_the_estimate_is_drawn_in_slowly_once_positions_are_steady() -> None:
+    vehicle = flying()
+    placed = vehicle.fly(0.02) + jumped(vehicle, 0.16 * UP).fly(2.9)
+    assert vehicle.error_m(placed) == pytest.approx(0.8, abs=0.02)
+    placed += vehicle.fly(2.0)
+    assert vehicle.frame.margin_m == pytest.approx(0.8, abs=0.02), "as long as it may be at either place"
+    placed += vehicle.fly(1.0)
     assert vehicle.error_m(placed) < 0.02
     assert max(steps_m(placed)) <= 0.3 * STEP_US * 1e-6 + 1e-6
-    vehicle.fly(11.0)
+    vehicle.fly(2.0)
     assert vehicle.frame.margin_m == 0.0
 
 
@@ -141,14 +152,14 @@ def test_the_margin_grows_no_faster_than_others_can_make_room() -> None:
     assert margins_m[-1] == pytest.approx(2.0, abs=0.1)
 
 
-@pytest.mark.parametrize("after_s", [1.0, 8.0], ids=["before it is drawn in", "meanwhile"])
-def test_an_estimate_that_jumps_back_leaves_the_vehicle_where_it_is(after_s: float) -> None:
-    vehicle = jumped(flying())
+@pytest.mark.parametrize(("by_01", "after_s"), [(1.0, 8.0), (0.16, 4.0)], ids=["long", "short and being drawn in"])
+def test_an_estimate_that_jumps_back_leaves_the_vehicle_where_it_is(by_01: float, after_s: float) -> None:
+    vehicle = jumped(flying(), by_01 * UP)
     placed = vehicle.fly(after_s)
-    vehicle.say()
-    placed += jumped(vehicle, -UP).fly(20.0)
+    placed += jumped(vehicle, -by_01 * UP).fly(20.0)
     assert max(steps_m(placed)) <= 0.3 * STEP_US * 1e-6 + 1e-6
     assert vehicle.error_m(placed) < 0.02
+    assert vehicle.frame.margin_m == 0.0
 
 
 def test_a_step_that_the_estimator_tells_of_is_bridged_however_small() -> None:
