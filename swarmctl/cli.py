@@ -132,6 +132,9 @@ def agent(
     bus: Annotated[str, typer.Option("--bus", help="Endpoint of the router.")],
     run_dir: Annotated[Path, typer.Option("--run-dir", help="Folder to record into.")],
     fd: Annotated[int | None, typer.Option("--fd", help="Inherited, bound UDP socket of the vehicle.")] = None,
+    vehicle_port: Annotated[
+        int | None, typer.Option("--vehicle-port", help="Loopback port at the other end of that socket.")
+    ] = None,
 ) -> int:
     """One agent beside one autopilot. `launch` starts them; on a companion computer start it yourself."""
     from swarmctl.lifeline import PARENT_ENV, die_with_parent
@@ -139,7 +142,7 @@ def agent(
 
     if PARENT_ENV in os.environ:
         die_with_parent(signal.SIGTERM)
-    return run_agent(config, number, run, bus, run_dir, fd)
+    return run_agent(config, number, run, bus, run_dir, fd, vehicle_port)
 
 
 @app.command()

@@ -141,8 +141,8 @@ class Bringup(Base):
         if ground.view_port:
             self._spawn(viewer_command(config, site, ground.view_port, self._options.view))
         if config.sitl.enabled:
-            self._spawn(sitl_command(config, site, ground.ports))
-        for command in agent_commands(config, site, ground.sockets):
+            self._spawn(sitl_command(config, site, ground.ports, ground.vehicle_sockets))
+        for command in agent_commands(config, site, ground.sockets, ground.vehicle_sockets):
             self._spawn(command)
         ground.release()
         self.announce("")

@@ -28,6 +28,7 @@ from swarmctl.links.peers import agent_name
 from swarmctl.links.transport import open_transport
 from swarmctl.telemetry.recorder import Recorder
 
+_LOOPBACK = "127.0.0.1"
 _SLEW_01 = 0.01  # of elapsed time, by which UTC may be corrected
 _LINGER_S = 1.0  # after the end, so that peers learn of it
 _VEHICLE_LOST_S = 15.0  # no state at all: nothing left to do here
@@ -78,7 +79,9 @@ class Pace:
         self.due_us += skipped * self.period_us
 
 
-def run_agent(config_path: Path, agent: int, run: str, bus: str, run_dir: Path, fd: int | None) -> int:
+def run_agent(
+    config_path: Path, agent: int, run: str, bus: str, run_dir: Path, fd: int | None, vehicle_port: int | None = None
+) -> int:
     """Fly one agent until its mission has ended; returns the exit code.
 
     Args:
@@ -88,6 +91,7 @@ def run_agent(config_path: Path, agent: int, run: str, bus: str, run_dir: Path, 
         bus: the router's endpoint.
         run_dir: folder to record into.
         fd: bound UDP socket inherited from the launcher.
+        vehicle_port: loopback port at its other end; None where that is not known.
 
     Raises:
         StartError: link, bus or vehicle is not there.
@@ -99,7 +103,9 @@ def run_agent(config_path: Path, agent: int, run: str, bus: str, run_dir: Path, 
     stop = _StopRequest()
     clock = WallClock()
     url = config.vehicles[agent].url if config.vehicles else ""
-    transport = open_transport(url or "udpin://127.0.0.1:14540", fd, heartbeat_of(config.sysids()[agent]))
+    is_vehicle = heartbeat_of(config.sysids()[agent])
+    remote = None if vehicle_port is None else (_LOOPBACK, vehicle_port)
+    transport = open_transport(url or f"udpin://{_LOOPBACK}:14540", fd, is_vehicle, remote)
     recorder = Recorder(run_dir, agent)
     peers = [agent_name(i) for i in range(config.swarm.agents) if i != agent]
     listen = {
