@@ -112,6 +112,7 @@ class Agent:
         )
         self.took = Took(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # of the last tick
         self._promise_ns = 0  # of the last tick
+        self._gaps = self._jumps = 0  # of setpoints and of the estimate, as far as they have been told
         self._announced: tuple[Phase, Mode, FlightMode] | None = None
         self._alerts = Alerts()
         self._accuracy = AccuracyMonitor()
@@ -230,6 +231,12 @@ class Agent:
             else:
                 self._alerts.put(asked, f"{asked} refused: {result.text}", now_us)
             self._note("command", verb=asked, ok=result.ok, text=result.text)
+        frame = self._autopilot.frame
+        if frame.jumps != self._jumps:
+            self._jumps = frame.jumps
+            text = f"estimate jumped by {frame.jump_m:.1f} m: peers keep that much more away"
+            self._alerts.put("jump", text, now_us)
+            self._note("estimate_jumped", metres=frame.jump_m)
         if state is None or state.t_us == self._last_state_us:
             return state
         self._last_state_us = state.t_us
@@ -369,6 +376,11 @@ class Agent:
             self._alerts.put("setpoint", f"setpoint refused: {refused}", now_us)
             self._note("setpoint_refused", reason=refused)
             return None
+        if self._autopilot.gaps != self._gaps:
+            self._gaps, gap_s = self._autopilot.gaps, self._autopilot.gap_s
+            text = f"setpoints had stopped for {gap_s:.2f} s: the autopilot's failsafe may have acted"
+            self._alerts.put("gap", text, now_us)
+            self._note("setpoint_gap", seconds=gap_s)
         self._virtual, self._thrust_01 = virtual, setpoint.thrust_01
         self._predictor.sent(now_us, virtual)
         return setpoint
@@ -444,14 +456,15 @@ class Agent:
 
     def _path(self, state: VehicleState, flown: Plan | None) -> PredictedPath:
         setup, seq = self._setup, self._reporter.seq
+        margin_m = min(topics.MAX_RADIUS_M, self._autopilot.frame.margin_m + self._overload.margin_m)
         if flown is not None:
             t0_us, dt_us, pos = self._utc(flown.t0_us), flown.dt_us, flown.pos_ned_m
-            return PredictedPath(setup.agent, setup.boot_id, seq, t0_us, dt_us, 0.0, pos)
+            return PredictedPath(setup.agent, setup.boot_id, seq, t0_us, dt_us, margin_m, pos)
         act_us, dt_us = self._clock.now_us() + self._predictor.delay_us, self._controller.dt_us
         grid = np.arange(self._controller.steps + 1, dtype=np.float64)
         ahead_s = grid * (dt_us * 1e-6) + (act_us - state.t_us) * 1e-6
         pos = coasting(state, ahead_s, setup.separation.brake_m_s2)
-        return PredictedPath(setup.agent, setup.boot_id, seq, self._utc(act_us), dt_us, 0.0, pos)
+        return PredictedPath(setup.agent, setup.boot_id, seq, self._utc(act_us), dt_us, margin_m, pos)
 
     def _fresh(self, now_us: int, state: VehicleState) -> bool:
         return now_us - state.t_us <= self._setup.params.failsafe.state_max_age_s * 1e6

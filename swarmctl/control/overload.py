@@ -18,10 +18,10 @@ class OverloadParams(Params):
     """Shares of missed deadlines, each over `window_s`."""
 
     window_s: float = Field(2.0, gt=0, le=60)
-    widen_01: float = Field(0.05, gt=0, le=1)  # from here on distances grow
-    margin_max_m: float = Field(0.3, ge=0, le=10)  # by so much where the agent comes to rest
+    widen_01: float = Field(0.15, gt=0, le=1)  # from here on distances grow
+    margin_max_m: float = Field(0.2, ge=0, le=10)  # by so much where the agent comes to rest
     hold_01: float = Field(0.4, gt=0, le=1)  # from here on it comes to rest
-    clear_01: float = Field(0.15, ge=0, le=1)  # below, it goes on
+    clear_01: float = Field(0.2, ge=0, le=1)  # below, it goes on
     land_after_s: float = Field(10.0, gt=0, le=600)  # of holding for this reason
 
 

@@ -31,7 +31,7 @@ def ran(pattern: list[tuple[float, float]]) -> Overload:
         ([(0.2, 5)], Level.WIDEN),
         ([(0.5, 5)], Level.HOLD),
         ([(0.5, 15)], Level.LAND),
-        ([(0.5, 5), (0.2, 3)], Level.HOLD),
+        ([(0.5, 5), (0.3, 3)], Level.HOLD),
         ([(0.5, 5), (0.0, 3)], Level.NONE),
         ([(0.0, 5), (1.0, 0.5), (0.0, 0.1)], Level.WIDEN),
         ([(0.0, 5), (1.0, 1.0), (0.0, 0.1)], Level.HOLD),
@@ -43,10 +43,10 @@ def test_levels(pattern: list[tuple[float, float]], level: Level) -> None:
 
 
 def test_margin_grows_with_the_share_and_is_bounded() -> None:
-    margins = [ran([(share, 5)]).margin_m for share in (0.0, 0.1, 0.25, 0.6)]
+    margins = [ran([(share, 5)]).margin_m for share in (0.0, 0.2, 0.3, 0.6)]
     assert margins[0] == 0.0
     assert margins == sorted(margins)
-    assert 0.02 < margins[1] < margins[2] < margins[3] == pytest.approx(0.3)
+    assert 0.02 < margins[1] < margins[2] < margins[3] == pytest.approx(0.2)
 
 
 def test_the_cause_is_named() -> None:
