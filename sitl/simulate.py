@@ -19,14 +19,16 @@ from rich.progress import Progress
 from sitl.lockstep import Lockstep, write_events
 from swarmctl.config import Config, dump, load
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, exit_code_of
-from swarmctl.summary import summary_lines
+from swarmctl.files import replace_text
+from swarmctl.summary import summary_lines, unwritten_line, violation_lines
 from swarmctl.telemetry.recordings import RECORDING, open_viewer, optimize_recording, simulated_recording
-from swarmctl.telemetry.run_folder import Outcome, create_run_folder, finish_run, load_run
+from swarmctl.telemetry.run_files import load_run
+from swarmctl.telemetry.run_folder import Outcome, create_run_folder, finish_run
 
 
 def simulate(config: Config, directory: Path) -> int:
     """Fly `config` in lockstep into the run folder `directory`; returns the exit code."""
-    (directory / "config.toml").write_text(dump(config), encoding="utf-8")
+    replace_text(directory / "config.toml", dump(config))
     flight = Lockstep(config, directory)
     stop = _Interrupt()
     began_s = time.perf_counter()
@@ -51,7 +53,7 @@ def simulate(config: Config, directory: Path) -> int:
     speed_factor = flight.clock.now_us() * 1e-6 / wall_s
     shown = () if stop.count else tuple(problems)
     rules = config.rules("lockstep")
-    summary = finish_run(directory, rules, Outcome(outcome, shown, speed_factor))
+    summary, unwritten = finish_run(directory, rules, Outcome(outcome, shown, speed_factor))
     simulated_recording(
         directory,
         load_run(directory),
@@ -61,12 +63,14 @@ def simulate(config: Config, directory: Path) -> int:
         [obstacle.model_dump() for obstacle in config.obstacles],
     )
     optimize_recording(directory)
-    for line in summary_lines(summary, directory):
+    for line in (*violation_lines(summary), *summary_lines(summary, directory)):
         print(line)
     print(f"{speed_factor:.1f} x real time")
+    if unwritten:
+        print(unwritten_line(directory, unwritten))
     if stop.count:
         return EXIT_INTERRUPTED
-    return EXIT_OK if summary["outcome"] == "completed" else EXIT_MISSION
+    return EXIT_OK if summary["outcome"] == "completed" and not unwritten else EXIT_MISSION
 
 
 class _Interrupt:

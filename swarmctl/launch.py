@@ -18,6 +18,7 @@ from typing import Any
 from swarmctl.attach import RunningLaunch, announce, process_start_s, withdraw
 from swarmctl.config import Config, dump
 from swarmctl.errors import StartError
+from swarmctl.files import replace_text
 from swarmctl.flight import Base, EventLog, Flight
 from swarmctl.links.bus import SCHEME, ZenohBus, socket_file
 from swarmctl.links.peers import agent_name
@@ -107,7 +108,7 @@ def _run_folder(config: Config, options: LaunchOptions) -> Path:
 
     directory = create_run_folder(options.run_dir, config.name, time.time_ns() // 1000).resolve()
     try:
-        (directory / "config.toml").write_text(dump(config), encoding="utf-8")
+        replace_text(directory / "config.toml", dump(config))
     except OSError as error:
         raise StartError(f"{directory}: can't be written: {error}. Choose another with --run-dir") from error
     return directory

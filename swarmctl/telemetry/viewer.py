@@ -22,6 +22,7 @@ from typing import Any
 import psutil
 
 from swarmctl.errors import EXIT_OK, EXIT_USAGE, StartError, SwarmError
+from swarmctl.files import replace_text
 from swarmctl.lifeline import StopRequest, die_with_parent
 from swarmctl.telemetry.obstacles import MovingObstacle, read_obstacles
 from swarmctl.telemetry.recordings import APPLICATION, RECORDING, has_display, open_viewer
@@ -216,7 +217,7 @@ def _is_ours(port: int, timeout_s: float = 2.0) -> bool:
 
 def _announce(options: argparse.Namespace, url: str) -> None:
     try:
-        (options.run_dir / URL_FILE).write_text(url + "\n", encoding="utf-8")
+        replace_text(options.run_dir / URL_FILE, url + "\n")
         if options.view and has_display():
             open_viewer(url, options.run_dir / "rerun.log")
     except (OSError, SwarmError) as error:

@@ -17,7 +17,7 @@ from swarmctl.core.types import FlightMode, Landed, Mode, Phase
 from swarmctl.errors import StartError
 from swarmctl.links.topics import StatusMessage
 from swarmctl.processes import Site, agent_commands, sitl_command, viewer_command
-from swarmctl.summary import summary_lines
+from swarmctl.summary import summary_lines, violation_lines
 from swarmctl.table import AgentView, PlainLines, open_display, status_cells, status_table
 
 
@@ -176,7 +176,14 @@ def test_a_summary_is_five_lines_even_when_almost_empty() -> None:
         lines = summary_lines(summary, Path("runs/x"))
         assert len(lines) == 5
         assert lines[-1] == "run folder runs/x"
-    assert "2 violations: a" in lines[0]
+    assert "2 violations" in lines[0]
+
+
+def test_every_violation_is_said() -> None:
+    assert violation_lines({"violations": ["a", "b\x1b[2J"]}) == ("violation: a", r"violation: b\x1b[2J")
+    alone = {"outcome": "failed", "violations": ["a"]}
+    assert violation_lines(alone) == ()
+    assert summary_lines(alone, Path("runs/x"))[0].endswith("1 violation: a")
 
 
 def test_the_camera_is_given_numbers_argparse_does_not_take_for_options() -> None:

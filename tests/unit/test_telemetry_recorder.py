@@ -17,7 +17,7 @@ from swarmctl.core.records import TICK_DTYPE
 from swarmctl.core.types import FlightMode, Mode, Phase, PlanStatus, TickRecord
 from swarmctl.telemetry import recorder as recorder_module
 from swarmctl.telemetry.recorder import Recorder
-from swarmctl.telemetry.run_folder import load_run, read_rows
+from swarmctl.telemetry.run_files import load_run, read_rows
 
 
 def record(seq: int) -> TickRecord:
