@@ -8,6 +8,7 @@ before its router has told it who listens.
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 import os
 import stat
@@ -275,4 +276,4 @@ def _replace(path: Path, payload: bytes) -> None:
 
 def as_json(statuses: dict[int, StatusMessage]) -> str:
     """Statuses for programs: a JSON list, one object per agent."""
-    return msgspec.json.format(msgspec.json.encode(list(statuses.values())), indent=2).decode()
+    return json.dumps(msgspec.to_builtins(list(statuses.values())), indent=2)  # ASCII: agents may say anything

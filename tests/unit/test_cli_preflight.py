@@ -11,14 +11,22 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from swarmctl import preflight
+from swarmctl import attach, preflight
 from swarmctl.config import Config, load
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase
 from swarmctl.errors import StartError
 from swarmctl.links.topics import StatusMessage
 from swarmctl.processes import Site, agent_commands, sitl_command, viewer_command
 from swarmctl.summary import summary_lines, violation_lines
-from swarmctl.table import AgentView, PlainLines, open_display, status_cells, status_table
+from swarmctl.table import (
+    AgentView,
+    LiveTable,
+    PlainLines,
+    open_display,
+    print_statuses,
+    status_cells,
+    status_table,
+)
 
 
 def test_vehicle_ports_are_held_and_are_not_those_every_simulator_sends_to() -> None:
@@ -169,6 +177,23 @@ def test_what_an_agent_says_is_shown_as_it_is() -> None:
     view = AgentView(0, status(problem="refused [/bold] [red]"))
     Console(file=stream, width=200).print(status_table([view]))
     assert "refused [/bold] [red]" in stream.getvalue()
+
+
+def test_what_an_agent_says_steers_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    """ESC, the 8-bit CSI and direction marks, as a status, as the launcher's line and as JSON."""
+    hostile = "\x1b]0;owned\x07\x9b2J\u202e\r\nDONE"
+    stream = io.StringIO()
+    lines = PlainLines(stream)
+    lines.say(hostile)
+    lines.show([AgentView(0, status(problem=hostile))])
+    Console(file=stream, width=200).print(status_table([AgentView(0, status(problem=hostile), note="")]))
+    LiveTable(Console(file=stream, force_terminal=False)).say(hostile)
+    print_statuses([AgentView(0, status(problem=hostile))])
+    print(attach.as_json({0: status(problem=hostile)}))
+    shown = stream.getvalue() + capsys.readouterr().out
+    assert "DONE" in shown
+    assert all(c.isprintable() or c in "\n\t" for c in shown)
+    assert not any(line.lstrip(" ,│").startswith("DONE") for line in shown.splitlines())
 
 
 def test_a_summary_is_five_lines_even_when_almost_empty() -> None:
