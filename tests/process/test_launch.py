@@ -41,7 +41,7 @@ class Launched:
     def __init__(self, run_dir: Path, temp: Path, *arguments: str) -> None:
         self.run_dir = run_dir
         self.temp = temp
-        self.env = {**os.environ, "TMPDIR": str(temp)}
+        self.env = {**os.environ, "TMPDIR": str(temp), "XDG_RUNTIME_DIR": ""}
         self.env.pop("DISPLAY", None)
         self.out = run_dir.with_suffix(".out")
         command = [sys.executable, "-m", "swarmctl", "launch", *arguments, "--run-dir", str(run_dir)]

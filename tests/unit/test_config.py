@@ -192,7 +192,11 @@ def test_vehicles_beside_the_simulator_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("content", "word"),
-    [(b"[swarm\nagents = 3", "not TOML"), (b"\xff\xfe\x00", "can't be read"), (b"x = " + b"[" * 9000, "nested too deeply")],
+    [
+        (b"[swarm\nagents = 3", "not TOML"),
+        (b"\xff\xfe\x00", "can't be read"),
+        (b"x = " + b"[" * 9000, "nested too deeply"),
+    ],
 )
 def test_unreadable_content(tmp_path: Path, content: bytes, word: str) -> None:
     path = tmp_path / "bad.toml"
@@ -222,7 +226,7 @@ def test_dump_reads_back_to_the_same_tree(tmp_path: Path, path: Path | None) -> 
 
 def test_dump_keeps_lists_of_tables_and_parameters(tmp_path: Path) -> None:
     text = (
-        '[agent.autopilot_params]\nCOM_OBL_RC_ACT = 4\nCOM_OF_LOSS_T = 1.5\n'
+        "[agent.autopilot_params]\nCOM_OBL_RC_ACT = 4\nCOM_OF_LOSS_T = 1.5\n"
         "[[obstacles]]\ncenter_ned_m = [1, 2, -3]\n[[obstacles]]\ncenter_ned_m = [1e-7, 2.5, -3]\nradius_m = 2\n"
     )
     config = load(file_with(tmp_path, text))
