@@ -1,9 +1,9 @@
 """How an operator's command finds a running launch and speaks to it over the bus.
 
-A launch leaves a note in its run folder and in each registry: private directories of the user, one in the user's
-runtime directory and one beside other temporary files, so that a verb from another session, without the former, finds
-it as well. Every note holds the launch's process, so that a stale one is recognised; directories that are not private
-or of somebody else are ignored, whatever their name. The verbs repeat what they say until they see an answer, because a fresh session may speak
+A launch leaves a note in its run folder and one in each registry: private directories of the user, in the user's
+runtime directory and beside other temporary files, so that a verb from a session without the former finds it as well.
+Every note holds the launch's process, so that a stale one is recognised; what is not private or of somebody else is
+ignored, whatever its name. The verbs repeat what they say until they see an answer, because a fresh session may speak
 before its router has told it who listens.
 """
 

@@ -328,7 +328,7 @@ def test_a_clock_one_percent_slow_is_no_finding(config: Config) -> None:
     assert line_of(findings([slow], config), "clock").verdict is OK
 
 
-@pytest.mark.parametrize("url", URLS + ("udpout://10.0.0.5:14580",))
+@pytest.mark.parametrize("url", (*URLS, "udpout://10.0.0.5:14580"))
 def test_silence_over_udp_names_the_first_sender_and_the_cure(config: Config, url: str) -> None:
     advice = line_of(findings([unreached(0, url, 1, "nothing is heard")], config), "link").advice
     assert "spoke to it first" in advice

@@ -12,9 +12,12 @@ import pytest
 from rich.console import Console
 
 from swarmctl import attach, preflight
-from swarmctl.config import Config, load
+from swarmctl.config import Config, dump, load
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase
-from swarmctl.errors import StartError
+from swarmctl.errors import ConfigError, StartError, SwarmError
+from swarmctl.fault import inject, parse_fault
+from swarmctl.flight import why_it_failed
+from swarmctl.links.bus import SCHEME
 from swarmctl.links.topics import StatusMessage
 from swarmctl.processes import Site, agent_commands, sitl_command, viewer_command
 from swarmctl.summary import summary_lines, violation_lines
@@ -194,6 +197,35 @@ def test_what_an_agent_says_steers_no_terminal(capsys: pytest.CaptureFixture[str
     assert "DONE" in shown
     assert all(c.isprintable() or c in "\n\t" for c in shown)
     assert not any(line.lstrip(" ,│").startswith("DONE") for line in shown.splitlines())
+
+
+@pytest.mark.parametrize(
+    ("outcome", "last_line", "words"),
+    [
+        ("not tracking after 90 s", "mission not completed: not tracking after 90 s", "not tracking after 90 s"),
+        ("completed", "vehicle at udpin: silent for 15 s, given up", "vehicle at udpin: silent for 15 s, given up"),
+        ("", "vehicle silent", "vehicle silent"),
+        ("completed", "", "no reason given"),
+    ],
+)
+def test_an_agent_never_failed_with_completed_for_a_reason(outcome: str, last_line: str, words: str) -> None:
+    assert why_it_failed(outcome, last_line) == words
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "words"),
+    [
+        ((), StartError, "not up yet, or has ended"),
+        (("sitl.enabled=false", "vehicles=[{sysid=1, url='udpin://127.0.0.1:14540'}]"), ConfigError, "no simulator"),
+    ],
+)
+def test_a_fault_without_a_simulator_says_which_kind_of_without(
+    tmp_path: Path, settings: tuple[str, ...], error: type[SwarmError], words: str
+) -> None:
+    (tmp_path / "config.toml").write_text(dump(load(None, ["swarm.agents=1", *settings])))
+    launch = attach.RunningLaunch("run", f"{SCHEME}{tmp_path}/bus.sock", 1, 0.0, 1, str(tmp_path))
+    with pytest.raises(error, match=words):
+        inject(launch, parse_fault({"kind": "gps_loss"}, 1))
 
 
 def test_a_summary_is_five_lines_even_when_almost_empty() -> None:
