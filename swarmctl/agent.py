@@ -21,6 +21,8 @@ from swarmctl.agent_parts import (
     make_sequence,
 )
 from swarmctl.agent_setup import AgentSetup
+from swarmctl.alerts import Alerts
+from swarmctl.control.accuracy import AccuracyMonitor
 from swarmctl.control.coasting import coasting
 from swarmctl.control.facts import Facts
 from swarmctl.control.failsafe import Judgement, judge
@@ -59,6 +61,8 @@ from swarmctl.wayfinder import Wayfinder
 
 _NOTHING_US = -1
 _DEVIATES = (Mode.BRAKE, Mode.HOLD, Mode.LAND, Mode.YIELD, Mode.BLIND)  # from what it has promised
+_WAITS_LONG_US = 3_000_000  # for take-off, before it says for what
+_RESTORE_US = 5_000_000  # for parameters to be set back before the process ends
 _AUTOPILOT_HOVERS = (FlightMode.HOLD, FlightMode.EXTERNAL)  # in the latter while it takes off by itself
 
 
@@ -107,21 +111,34 @@ class Agent:
         self.took = Took(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # of the last tick
         self._promise_ns = 0  # of the last tick
         self._announced: tuple[Phase, Mode, FlightMode] | None = None
-        self._problem = ""
+        self._alerts = Alerts()
+        self._accuracy = AccuracyMonitor()
+        self._standby_us = 0
+        self._done_us: int | None = None
         self._last_state_us = _NOTHING_US
         self._thrust_01 = setup.vehicle_model.hover_thrust_01
 
     @property
-    def finished(self) -> bool:
-        """Landed, disarmed, and so is every peer that is still there."""
-        if not self._sequence.finished:
+    def done(self) -> bool:
+        """Landed, disarmed, and its parameters as they were."""
+        if self._done_us is None:
             return False
-        return all(p.phase is Phase.DONE or not p.alive for p in self._surroundings.peers().values())
+        return self._upkeep.restored or self._waited_us(self._done_us) > _RESTORE_US
+
+    @property
+    def finished(self) -> bool:
+        """Done, and so is every peer that is still there."""
+        return self.done and all(p.phase is Phase.DONE or not p.alive for p in self._surroundings.peers().values())
 
     @property
     def outcome(self) -> str:
         """ "completed", or why not."""
         return self._sequence.outcome or "stopped before the mission began"
+
+    @property
+    def has_armed(self) -> bool:
+        """Whether the autopilot has been asked to arm: before that a mission that ends could not start."""
+        return self._sequence.arming.requested
 
     @property
     def rejected(self) -> dict[str, int]:
@@ -169,7 +186,7 @@ class Agent:
         )
         self._share(state, flown)
         self._advance(now_us, state)
-        self._reporter.problem = self._problem
+        self._reporter.problem = self._alerts.text(now_us)
         return self._reporter.report(
             now_us,
             state,
@@ -195,8 +212,10 @@ class Agent:
         for result in self._commands.results():
             self._upkeep.took(result)
             asked = f"{result.command.verb.value} {result.command.name}".rstrip()
-            if not result.ok:
-                self._problem = f"{asked} refused: {result.text}"
+            if result.ok:
+                self._alerts.clear(asked)
+            else:
+                self._alerts.put(asked, f"{asked} refused: {result.text}", now_us)
             self._note("command", verb=asked, ok=result.ok, text=result.text)
         if state is None or state.t_us == self._last_state_us:
             return state
@@ -266,7 +285,7 @@ class Agent:
         landmarks = self._surroundings.landmarks
         deadlock = self._wayfinder.look(now_us, self._clock.utc_us(), state.pos_ned_m, known, landmarks)
         if deadlock is not None:
-            self._problem = f"deadlocked by {deadlock.names}"
+            self._alerts.put("deadlock", f"deadlocked by {deadlock.names}", now_us)
 
     # -- judge, act ---------------------------------------------------------------------------------------------------
 
@@ -281,7 +300,7 @@ class Agent:
             self._certified_us = now_us
         elif plan is not None:
             self._reporter.failed_plans += 1
-            self._problem = f"plan {plan.status.name.lower()}"
+            self._alerts.put("plan", f"plan {plan.status.name.lower()}", now_us)
         good = self._replay.plan
         delay_us = self._predictor.delay_us
         health = Health(
@@ -334,7 +353,7 @@ class Agent:
         setpoint = setpoint_of(virtual, yaw_rad, hover_01, now_us, self._setup.vehicle_model)
         refused = self._autopilot.send(setpoint, self._clock.now_us())
         if refused:
-            self._problem = f"setpoint refused: {refused}"
+            self._alerts.put("setpoint", f"setpoint refused: {refused}", now_us)
             self._note("setpoint_refused", reason=refused)
             return None
         self._virtual, self._thrust_01 = virtual, setpoint.thrust_01
@@ -357,10 +376,13 @@ class Agent:
             others_ned_m=self._surroundings.others_ned_m(utc_us),
             arm_in=None if dialect is None else dialect.arm_in,
             boots=self._autopilot.clock.boots,
-            refusal=self._refusal(),
+            refusal=self._upkeep.refusal,
+            unsettled=self._unsettled(now_us),
+            armed_told_us=self._autopilot.armed_told_us,
         )
         for command in self._sequence.step(facts):
             self._commands.request(command)
+        self._finish(now_us)
         self._upkeep.step(now_us)
         if not before[1] and self._sequence.had_control:
             self._predictor.clear()
@@ -372,12 +394,31 @@ class Agent:
             names = {"phase": now[0].name, "mode": now[1].name, "flight_mode": now[2].name}
             self._note("state", **names, reason=self._judgement.reason)
 
-    def _refusal(self) -> str:
-        """Why nothing may be armed, or ""."""
-        alone = len(self._setup.starts_ned_m) == 1
-        accuracy_m = self._autopilot.pos_accuracy_m or 0.0  # not told: body and tracking are left to judge by
-        radius = "" if alone else radius_problem(self._setup.separation, accuracy_m)
-        return "; ".join(filter(None, (self._upkeep.refusal, radius)))
+    def _finish(self, now_us: int) -> None:
+        """At the end of the mission: give the autopilot its parameters back. Before it: say what is waited for."""
+        phase, waits_for = self._sequence.phase, self._sequence.waits_for
+        if phase is Phase.STANDBY and waits_for and self._waited_us(self._standby_us) > _WAITS_LONG_US:
+            self._alerts.put("start", f"waits for {waits_for}", now_us)
+        if phase is not Phase.STANDBY:
+            self._standby_us = now_us
+        if not self._sequence.finished:
+            return
+        if self._done_us is None:
+            self._done_us = now_us
+            self._upkeep.restore()
+        if self._upkeep.left_changed and self._waited_us(self._done_us) > _RESTORE_US and not self._upkeep.restored:
+            self._alerts.put("restore", f"parameters left changed: {self._upkeep.left_changed}", now_us)
+
+    def _waited_us(self, since_us: int) -> int:
+        return self._clock.now_us() - since_us
+
+    def _unsettled(self, now_us: int) -> str:
+        """Why nothing may be armed yet: the estimator settles, or is too inaccurate for the distances asked for."""
+        if len(self._setup.starts_ned_m) == 1 or self._sequence.phase > Phase.STANDBY:
+            return ""
+        self._accuracy.update(now_us, self._autopilot.pos_accuracy_m)
+        accuracy_m = self._accuracy.worst_m or 0.0  # not told: body and tracking are left to judge by
+        return self._accuracy.unsettled(now_us) or radius_problem(self._setup.separation, accuracy_m)
 
     # -- share, record ------------------------------------------------------------------------------------------------
 

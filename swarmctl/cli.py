@@ -133,6 +133,7 @@ def agent(
     bus: Annotated[str, typer.Option("--bus", help="Endpoint of the router.")],
     run_dir: Annotated[Path, typer.Option("--run-dir", help="Folder to record into.")],
     fd: Annotated[int | None, typer.Option("--fd", help="Inherited, bound UDP socket of the vehicle.")] = None,
+    only_land: Annotated[bool, typer.Option("--only-land", help="Land and disarm the vehicle, then end.")] = False,
 ) -> int:
     """One agent beside one autopilot. `launch` starts them; on a companion computer start it yourself."""
     from swarmctl.lifeline import PARENT_ENV, die_with_parent
@@ -140,7 +141,7 @@ def agent(
 
     if PARENT_ENV in os.environ:
         die_with_parent(signal.SIGTERM)
-    return run_agent(config, number, run, bus, run_dir, fd)
+    return run_agent(config, number, run, bus, run_dir, fd, only_land)
 
 
 @app.command()

@@ -10,7 +10,7 @@ import shutil
 import signal
 import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -20,7 +20,7 @@ from swarmctl.config import Config, dump
 from swarmctl.errors import StartError
 from swarmctl.files import replace_text
 from swarmctl.flight import Base, EventLog, Flight
-from swarmctl.links.bus import SCHEME, ZenohBus, socket_file
+from swarmctl.links.bus import NO_BUS, SCHEME, ZenohBus, socket_file
 from swarmctl.links.peers import agent_name
 from swarmctl.links.topics import OBSTACLES, OPERATOR, STATUS
 from swarmctl.preflight import LOOPBACK, Ground, inspect
@@ -145,7 +145,6 @@ class Bringup(Base):
             self._spawn(sitl_command(config, site, ground.ports))
         for command in agent_commands(config, site, ground.sockets):
             self._spawn(command)
-        ground.release()
         self.announce("")
         for line in _introduction(config, site, ground):
             self._display.say(line)
@@ -165,6 +164,16 @@ class Bringup(Base):
         shutil.rmtree(self._socket_dir, ignore_errors=True)
         withdraw()
         self.log.write("stopped", exit_codes={name: child.poll() for name, child in self.children.items()})
+
+    def recover(self, agent: int) -> Child:
+        """Start an agent on the vehicle of one that ended; it records beside, and flies without a router if it must."""
+        router = self.children[ROUTER]
+        endpoint = self.site.endpoint if router.poll() is None else NO_BUS
+        directory = self.site.directory / "recovery"
+        directory.mkdir(exist_ok=True)
+        site = Site(self.site.run, endpoint, directory)
+        command = agent_commands(self._config, site, self._ground.sockets, self.site.directory / "config.toml")[agent]
+        return Child(replace(command, argv=(*command.argv, "--only-land")), directory)
 
     def announce(self, view: str) -> None:
         """Let operators' commands find this launch."""

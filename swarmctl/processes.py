@@ -65,11 +65,17 @@ def router_command(endpoint: str) -> Command:
     return Command(ROUTER, _python("-m", "swarmctl.links.bus", "--router", endpoint, "--die-with-parent"))
 
 
-def agent_commands(config: Config, site: Site, sockets: Sequence[socket.socket]) -> tuple[Command, ...]:
-    """One agent for each vehicle; `sockets` are the bound vehicle ports they inherit, or none."""
+def agent_commands(
+    config: Config, site: Site, sockets: Sequence[socket.socket], config_path: Path | None = None
+) -> tuple[Command, ...]:
+    """One agent for each vehicle; `sockets` are the bound vehicle ports they inherit, or none.
+
+    `config_path` is where the resolved configuration is, when it is not in the site's folder.
+    """
     commands = []
     for agent in range(config.swarm.agents):
-        argv = _python("-m", "swarmctl", "agent", "--config", f"{site.directory / 'config.toml'}", "--id", f"{agent}")
+        argv = _python("-m", "swarmctl", "agent", "--config", f"{config_path or site.directory / 'config.toml'}")
+        argv += ("--id", f"{agent}")
         argv += ("--run", site.run, "--bus", site.endpoint, "--run-dir", f"{site.directory}")
         fds = (sockets[agent].fileno(),) if sockets else ()
         commands.append(Command(agent_name(agent), argv + (("--fd", f"{fds[0]}") if fds else ()), fds))

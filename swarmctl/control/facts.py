@@ -34,3 +34,5 @@ class Facts:
     arm_in: FlightMode | None = None  # flight mode to be in before arming; None: the one it is in
     boots: int = 0  # reboots of the autopilot so far
     refusal: str = ""  # why nothing may be armed
+    unsettled: str = ""  # why nothing may be armed yet; it may pass
+    armed_told_us: int = -1  # arrival of the HEARTBEAT that told `state.armed`

@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import development as mavlink
 from swarmctl.core.frames import rotate_to_ned
 from swarmctl.core.types import Array, AttitudeSetpoint, FlightMode, GeoOrigin, Landed, VehicleState
 from swarmctl.links.commands import CommandPort
-from swarmctl.links.dialects import DIALECTS, Dialect
+from swarmctl.links.dialects import DIALECTS, LAST_INTEGER_TYPE, Dialect
 from swarmctl.links.local_frame import LocalFrame
 from swarmctl.links.mavlink import Codec, frames
 from swarmctl.links.transport import Transport
@@ -61,6 +61,8 @@ class Autopilot:
         clock: the vehicle's clock; `clock.boots` counts its reboots.
         frame: the vehicle's local frame.
         params: parameters the vehicle has told of.
+        whole_params: names of those that it keeps as integers.
+        armed_told_us: arrival of the HEARTBEAT that told `armed`, our time; -1 before the first.
         hover_thrust_01: what the autopilot flies with while it hovers by itself; before that, what its parameter says.
         pos_accuracy_m: horizontal 1-sigma accuracy it claims; None while untold.
         samples: states received; the difference of two readings is the rate.
@@ -69,6 +71,7 @@ class Autopilot:
     """
 
     params: dict[str, float]
+    whole_params: set[str]
     hover_thrust_01: float | None
     pos_accuracy_m: float | None
     _sample: _Sample | None
@@ -91,6 +94,7 @@ class Autopilot:
         self._slow: CommandPort | None = None
         self.dialect: Dialect | None = None
         self.armed = False
+        self.armed_told_us = -1
         self.mode = FlightMode.UNKNOWN
         self.failsafe = False
         self.texts: list[str] = []
@@ -204,7 +208,7 @@ class Autopilot:
         if dialect is None:
             return
         self.dialect = dialect
-        self.armed = bool(message.base_mode & _ARMED_FLAG)
+        self.armed, self.armed_told_us = bool(message.base_mode & _ARMED_FLAG), arrived_us
         self.failsafe = message.system_status >= _CRITICAL
         self.mode, self._mode_us = dialect.mode(message.custom_mode), arrived_us
 
@@ -284,7 +288,7 @@ class Autopilot:
         self._odometry_us = 0
         self.landed = Landed.UNKNOWN
         self.armable = False
-        self.params = {}
+        self.params, self.whole_params = {}, set()
         self.hover_thrust_01 = self.pos_accuracy_m = None
         self.frame.forget()
 
@@ -327,6 +331,8 @@ class Autopilot:
         if not np.isfinite(value):
             return
         self.params[message.param_id] = value
+        if message.param_type <= LAST_INTEGER_TYPE:
+            self.whole_params.add(message.param_id)
         if message.param_id == self.dialect.hover_parameter and self.hover_thrust_01 is None and 0.05 < value < 0.95:
             self.hover_thrust_01 = value
 

@@ -26,6 +26,7 @@ from swarmctl.lifeline import die_with_parent, remove_socket
 from swarmctl.links.topics import TOPICS, Topic
 
 SCHEME = "unixsock-stream/"
+NO_BUS = "none"  # endpoint of an agent that flies by itself
 CONNECT_TIMEOUT_MS = 10_000
 CLOSE_DEADLINE_S = 2.0
 _MAX_MESSAGE_BYTES = 1 << 20

@@ -14,7 +14,7 @@ from swarmctl.core.types import Command, FlightMode, Verb
 
 _INT32, _REAL32 = 6, 9  # MAV_PARAM_TYPE
 _CUSTOM_MODE = 1.0  # DO_SET_MODE p1: MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
-_LAST_INTEGER_TYPE = 8
+LAST_INTEGER_TYPE = 8  # MAV_PARAM_TYPE_INT64; what follows is a float
 _ARM, _TAKEOFF, _LAND, _SET_MODE, _INTERVAL, _REQUEST = 400, 22, 21, 176, 511, 512
 _NAN = math.nan
 
@@ -112,7 +112,7 @@ class Dialect:
 
     def from_wire(self, value: float, kind: int) -> float:
         """Number that a PARAM_VALUE carries."""
-        if self.integers_bytewise and kind <= _LAST_INTEGER_TYPE:
+        if self.integers_bytewise and kind <= LAST_INTEGER_TYPE:
             return float(struct.unpack("<i", struct.pack("<f", value))[0])
         return value
 
@@ -144,6 +144,17 @@ PX4 = Dialect(
             "COM_OBL_RC_ACT",
             lambda v: 0 <= v <= 5,
             "motors would stop in the air when setpoints do; set agent.autopilot_params.COM_OBL_RC_ACT = 4 (land)",
+        ),
+        Rule(
+            "NAV_DLL_ACT",
+            lambda v: v in (2, 3),
+            "a vehicle whose agent dies before OFFBOARD would hover for ever; "
+            "set agent.autopilot_params.NAV_DLL_ACT = 3 (land)",
+        ),
+        Rule(
+            "COM_DL_LOSS_T",
+            lambda v: 0 < v <= 30,
+            "so long a vehicle whose agent died before OFFBOARD hovers; set agent.autopilot_params.COM_DL_LOSS_T = 5",
         ),
     ),
     hover_parameter="MPC_THR_HOVER",

@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import swarmctl.flight
+import swarmctl.recovery
 from swarmctl.config import load
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START
@@ -72,16 +73,24 @@ class Scene(Base):
         self.hub = LocalHub(lambda: time.monotonic_ns() // 1000)
         self.bus = self.hub.attach(OPERATOR)
         self.agents = [self.hub.attach(agent_name(i)) for i in range(len(agents))]
+        self.directory = directory
+        self.lands = ends(130, 0.5)  # what recovers a vehicle
+        self.recovered: list[int] = []
         self.said: list[str] = []
         self.interrupts = 0
         self.silent: set[int] = set()
         self.orders: list[str] = []
         self.obeys = True
+        self.phase = Phase.TRACK
         self.act: Callable[[], None] = lambda: None
         self.began_s = time.monotonic()
 
     def announce(self, view: str) -> None:
         self.said.append(f"announced {view}")
+
+    def recover(self, agent: int) -> Child:
+        self.recovered.append(agent)
+        return Child(Command(agent_name(agent), (sys.executable, "-ESc", self.lands)), self.directory)
 
     def hear_operators(self) -> None:
         """Listen to the own name, under which operators' commands speak too."""
@@ -102,7 +111,7 @@ class Scene(Base):
             if orders and self.obeys and i not in self.silent:
                 self.children[agent_name(i)].signal(signal.SIGTERM)
             if i not in self.silent and self.children[agent_name(i)].poll() is None:
-                bus.publish(STATUS, status_of(i, Phase.TRACK))
+                bus.publish(STATUS, status_of(i, self.phase))
         if time.monotonic() - self.began_s > 0.3:
             act, self.act = self.act, lambda: None
             act()
@@ -142,8 +151,58 @@ def test_a_killed_agent_is_named_and_the_others_finish(tmp_path: Path) -> None:
     assert verdict.exit_code(violated=False) == EXIT_MISSION
     assert verdict.outcome == "failed"
     assert scene.heard("agent-0", "SIGKILL")
-    assert [scene.children[f"agent-{i}"].poll() for i in range(3)] == [137, 0, 0]
+    assert scene.recovered == [0]
+    assert scene.heard("the vehicle of agent-0", "disarmed")
+    assert verdict.left == ()
+    assert [scene.children[f"agent-{i}"].poll() for i in range(3)] == [130, 0, 0]
     assert "land" not in scene.orders
+
+
+def test_a_vehicle_that_can_not_be_recovered_is_named(tmp_path: Path) -> None:
+    scene = Scene(tmp_path, [FLIES_LONG, ends(0, 2.0)])
+    scene.lands = ends(3, 0.3)
+    scene.act = lambda: scene.kill("agent-0")
+    verdict = scene.fly()
+    assert scene.recovered == [0]
+    assert len(verdict.left) == 1
+    assert scene.heard("vehicle 1", "may be armed", "TRACK", "by hand")
+    assert verdict.exit_code(violated=False) == EXIT_MISSION
+
+
+def test_an_interrupted_launch_that_leaves_a_vehicle_is_a_failed_one(tmp_path: Path) -> None:
+    scene = Scene(tmp_path, [FLIES_LONG, FLIES_LONG])
+    scene.lands = ends(3, 0.3)
+
+    def interrupt_and_kill() -> None:
+        scene.interrupts = 1
+        scene.kill("agent-1")
+
+    scene.act = interrupt_and_kill
+    verdict = scene.fly()
+    assert verdict.interrupted
+    assert len(verdict.left) == 1
+    assert verdict.exit_code(violated=False) == EXIT_MISSION
+
+
+def test_a_recovery_that_takes_too_long_is_ended_and_the_vehicle_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(swarmctl.recovery, "RECOVERY_S", 1.0)
+    scene = Scene(tmp_path, [FLIES_LONG, ends(0, 1.0)])
+    scene.lands = FLIES_LONG
+    scene.act = lambda: scene.kill("agent-0")
+    began_s = time.monotonic()
+    verdict = scene.fly()
+    assert time.monotonic() - began_s < 20.0
+    assert len(verdict.left) == 1
+
+
+def test_an_agent_that_ends_before_anything_was_armed_could_not_start(tmp_path: Path) -> None:
+    scene = Scene(tmp_path, [ends(3, 1.0), FLIES_LONG])
+    scene.phase = Phase.STANDBY
+    verdict = scene.fly()
+    assert scene.recovered == []
+    assert verdict.exit_code(violated=False) == EXIT_START
 
 
 def test_a_frozen_agent_is_given_up_when_the_others_have_finished(tmp_path: Path) -> None:
@@ -158,7 +217,8 @@ def test_a_frozen_agent_is_given_up_when_the_others_have_finished(tmp_path: Path
     assert verdict.exit_code(violated=False) == EXIT_MISSION
     assert scene.heard("agent-0", "silent")
     assert scene.children["agent-1"].poll() == 0
-    assert scene.children["agent-0"].poll() == 137
+    assert scene.recovered == [0], "what is frozen is killed, and its vehicle landed"
+    assert scene.children["agent-0"].poll() == 130
 
 
 def test_one_failed_mission_fails_the_launch_and_says_why(tmp_path: Path) -> None:
@@ -171,6 +231,7 @@ def test_one_failed_mission_fails_the_launch_and_says_why(tmp_path: Path) -> Non
 
 def test_an_agent_that_can_not_start_lands_the_others(tmp_path: Path) -> None:
     scene = Scene(tmp_path, [FLIES_LONG, ends(3)])
+    scene.phase = Phase.STANDBY
     verdict = scene.fly()
     assert verdict.exit_code(violated=False) == EXIT_START
     assert scene.heard("agent-1", "could not start", "because")
