@@ -14,7 +14,7 @@ from swarmctl.core.records import TICK_DTYPE
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import replace_text
 from swarmctl.telemetry.plain import to_json
-from swarmctl.telemetry.referee import Rules, judge
+from swarmctl.telemetry.referee import Rules, RunData, judge
 from swarmctl.telemetry.report import REPORT, write_report
 from swarmctl.telemetry.run_files import (
     AGENT_FILE,
@@ -93,15 +93,21 @@ class Finished(NamedTuple):
     unwritten: tuple[str, ...]  # "summary.json: No space left on device", ...
 
 
-def finish_run(directory: Path, rules: Rules, outcome: Outcome) -> Finished:
+def finish_run(directory: Path, rules: Rules, outcome: Outcome, recorded: RunData | None = None) -> Finished:
     """Close a run folder: judgement, one event file, Parquet, report. May be repeated.
 
     A disk that is full costs files, never the judgement: the run is judged first, from what is there.
 
+    Args:
+        directory: the run folder.
+        rules: limits.
+        outcome: how the run ended.
+        recorded: what was flown, from who still has it in memory; None: what the folder holds.
+
     Raises:
         ConfigError: something in the folder can't be read.
     """
-    run = load_run(directory)
+    run = load_run(directory) if recorded is None else recorded
     run.events[:] = _merged(run.events, outcome.events)
     summary = judge(run, rules, outcome.outcome, outcome.problems, outcome.speed_factor)
     writers: dict[str, Callable[[], object]] = {

@@ -2,7 +2,7 @@
 
 `python -m swarmctl.telemetry.viewer --run R --bus ENDPOINT --agents N --run-dir DIR`. It serves and never connects, so
 nothing it does can hold up an agent; frozen or killed, it costs pictures only. The launcher decides when it ends
-(SIGTERM); Ctrl-C is not its business.
+(SIGTERM, or SIGHUP where somebody started it by hand); Ctrl-C is not its business.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run until SIGTERM; returns the exit code."""
     options = _parser().parse_args(arguments)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    stop = StopRequest(signal.SIGTERM)
+    stop = StopRequest(signal.SIGTERM, signal.SIGHUP)
     if options.die_with_parent:
         die_with_parent(signal.SIGTERM)
     obstacles = read_obstacles(_listed(options.obstacles_json))

@@ -195,6 +195,24 @@ def test_a_second_ctrl_c_ends_everything_at_once(start: Callable[..., Launched])
     assert launched.summary()["outcome"] == "interrupted"
 
 
+def test_a_closed_terminal_lands_and_keeps_the_verdict(start: Callable[..., Launched]) -> None:
+    """The kernel and the shell both send SIGHUP: that is one request, and after the flight none at all."""
+    launched = start(*TWO, *NEAR, "--duration", "60")
+    launched.until_phase("TRACK", 2)
+    for _ in range(3):
+        launched.process.send_signal(signal.SIGHUP)
+        time.sleep(0.1)
+    deadline_s = time.monotonic() + END_S
+    while launched.process.poll() is None and time.monotonic() < deadline_s:
+        if launched.events("stopped"):  # everybody has landed, the run is being judged
+            launched.process.send_signal(signal.SIGHUP)
+        time.sleep(0.05)
+    assert launched.end() == 130, launched.text()
+    assert launched.landed() == {0: True, 1: True}
+    assert launched.summary()["outcome"] == "interrupted"
+    assert "killed" not in launched.text()
+
+
 @pytest.mark.parametrize("when_s", [0.0, 0.3, 1.0, 2.0])
 def test_ctrl_c_during_start_leaves_nothing(start: Callable[..., Launched], when_s: float) -> None:
     launched = start(*TWO, "--duration", "6")
