@@ -193,7 +193,7 @@ def _simulator(config: Config) -> Iterator[_Field]:
 
 @contextlib.contextmanager
 def _interruptible() -> Iterator[None]:
-    """SIGTERM and SIGHUP as Ctrl-C, once: what was started here is ended, and that is not interrupted again."""
+    """SIGTERM and SIGHUP as Ctrl-C, once: from then on they are ignored, so that what was started here is ended."""
     signums = (signal.SIGTERM, signal.SIGHUP)
 
     def interrupt(signum: int, frame: FrameType | None) -> None:
@@ -206,4 +206,5 @@ def _interruptible() -> Iterator[None]:
         yield
     finally:
         for each, handler in zip(signums, before, strict=True):
-            signal.signal(each, handler)
+            if signal.getsignal(each) is interrupt:
+                signal.signal(each, handler)
