@@ -8,6 +8,7 @@ from __future__ import annotations
 import struct
 import time
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -29,6 +30,8 @@ from swarmctl.links.commands import CodecCommands
 from swarmctl.links.mavlink import Codec
 from swarmctl.links.peers import LocalHub, agent_name
 from swarmctl.links.transport import pipe_pair
+from swarmctl.telemetry.plain import plain
+from swarmctl.telemetry.referee import RunData
 
 _TAIL_S = 120.0  # flight allowed before and after the mission
 _TRUTH_EVERY_US = 20_000
@@ -59,7 +62,8 @@ class FlightLog:
 
     def frame(self, frame: bytes) -> None:
         if self._tlog is not None:
-            self._tlog.write(struct.pack(">Q", self.clock.utc_us()) + frame)
+            with suppress(OSError):  # a full disk loses frames, never the flight
+                self._tlog.write(struct.pack(">Q", self.clock.utc_us()) + frame)
 
     @property
     def ticks(self) -> NDArray[np.void]:
@@ -67,10 +71,15 @@ class FlightLog:
         return np.concatenate(self.rows) if self.rows else np.zeros(0, TICK_DTYPE)
 
     def close(self) -> None:
-        """Write what a live agent would have written."""
+        """Write what a live agent would have written.
+
+        Raises:
+            OSError: the disk refuses.
+        """
         if self.directory is None or self._tlog is None:
             return
-        self._tlog.close()
+        with suppress(OSError):
+            self._tlog.close()
         (self.directory / f"agent-{self.agent}.ticks").write_bytes(self.ticks.tobytes())
         write_events(self.directory / f"agent-{self.agent}.events.jsonl", self.events)
 
@@ -178,6 +187,11 @@ class Lockstep:
     def truth(self) -> NDArray[np.void]:
         """True states so far, (T * N,) of `TRUTH_DTYPE`."""
         return np.concatenate(self._truth) if self._truth else np.zeros(0, TRUTH_DTYPE)
+
+    def recorded(self) -> RunData:
+        """What a run folder would hold of the flight so far."""
+        events = [event for log in self.logs for event in log.events] + self.fault_events
+        return RunData({log.agent: log.ticks for log in self.logs}, self.truth, [plain(event) for event in events])
 
     def problems(self) -> list[str]:
         """Why the mission is not complete; empty when it is."""

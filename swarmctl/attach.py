@@ -1,13 +1,16 @@
 """How an operator's command finds a running launch and speaks to it over the bus.
 
-A launch leaves a note in its run folder and one in a private directory per user; both hold its process, so that a
-stale note is recognised. The verbs repeat what they say until they see an answer, because a fresh session may speak
+A launch leaves a note in its run folder and one in each registry: private directories of the user, in the user's
+runtime directory and beside other temporary files, so that a verb from a session without the former finds it as well.
+Every note holds the launch's process, so that a stale one is recognised; what is not private or of somebody else is
+ignored, whatever its name. The verbs repeat what they say until they see an answer, because a fresh session may speak
 before its router has told it who listens.
 """
 
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 import os
 import stat
@@ -21,6 +24,7 @@ import msgspec
 import psutil
 
 from swarmctl.errors import ConfigError, StartError
+from swarmctl.files import read_file, replace_bytes
 from swarmctl.links.bus import ZenohBus
 from swarmctl.links.orders import EVERYBODY, Verb, orders
 from swarmctl.links.peers import agent_name
@@ -43,6 +47,7 @@ LAUNCH_FILE = "launch.json"
 _ANSWER_S = 5.0
 _REPEAT_S = 0.2
 _START_TOLERANCE_S = 1.0
+_MOST_BYTES = 65_536  # of a note
 
 
 class RunningLaunch(msgspec.Struct, frozen=True):
@@ -58,17 +63,20 @@ class RunningLaunch(msgspec.Struct, frozen=True):
 
 
 def announce(launch: RunningLaunch) -> None:
-    """Write the notes of a launch; the per-user one is a convenience and skipped where it would not be private."""
+    """Write the notes of a launch; without the one in its run folder it can't be spoken to, the others are extra."""
     payload = msgspec.json.encode(launch)
-    _replace(Path(launch.run_dir) / LAUNCH_FILE, payload)
-    with contextlib.suppress(OSError):
-        _replace(_private_registry() / f"{launch.pid}.json", payload)
+    replace_bytes(Path(launch.run_dir) / LAUNCH_FILE, payload)
+    for registry in (_runtime_registry(), _temporary_registry()):
+        if registry is not None:
+            with contextlib.suppress(OSError):
+                replace_bytes(registry / f"{launch.pid}.json", payload)
 
 
 def withdraw() -> None:
-    """Take this process's per-user note away."""
-    with contextlib.suppress(OSError):
-        (_registry() / f"{os.getpid()}.json").unlink(missing_ok=True)
+    """Take this process's notes out of the registries."""
+    for registry in _registries():
+        with contextlib.suppress(OSError):
+            (registry / f"{os.getpid()}.json").unlink(missing_ok=True)
 
 
 def process_start_s() -> tuple[float, int]:
@@ -88,12 +96,12 @@ def find_launch(run_dir: Path | None) -> RunningLaunch:
             raise StartError(f"--run-dir {run_dir}: no launch runs there. See what does with: swarmctl status")
         return launch
     running: list[tuple[float, RunningLaunch]] = []
-    with contextlib.suppress(OSError):
-        for path in _registry().glob("*.json"):
-            launch = _read(path) if path.stat().st_uid == os.getuid() else None
-            if launch is not None and _runs(launch):
-                running.append((launch.started_s, launch))
-            else:
+    for path in (path for registry in _registries() for path in registry.glob("*.json")):
+        launch = _read(path)
+        if launch is not None and _runs(launch):
+            running.append((launch.started_s, launch))
+        else:
+            with contextlib.suppress(OSError):
                 path.unlink(missing_ok=True)
     if not running:
         raise StartError("no launch runs. Start one with: swarmctl launch")
@@ -254,22 +262,58 @@ def _statuses(
     return dict(sorted(heard.items()))
 
 
-def _registry() -> Path:
-    return Path(tempfile.gettempdir()) / f"swarmctl-{os.getuid()}"
+def _registries() -> list[Path]:
+    """Private directories of this user that may hold notes."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    places = [Path(runtime) / "swarmctl"] if runtime and _is_private(Path(runtime)) else []
+    places += sorted(_temporary_folder().glob(f"{_temporary_name()}*"))
+    return [place for place in places if _is_private(place)]
 
 
-def _private_registry() -> Path:
-    path = _registry()
-    path.mkdir(mode=0o700, exist_ok=True)
-    status = path.lstat()
-    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
-        raise OSError(f"{path} is not private")
-    return path
+def _runtime_registry() -> Path | None:
+    """The user's own runtime directory is nobody else's to squat on; None where there is none."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    if not runtime or not _is_private(Path(runtime)):
+        return None
+    registry = Path(runtime) / "swarmctl"
+    with contextlib.suppress(OSError):
+        registry.mkdir(mode=0o700, exist_ok=True)
+    return registry if _is_private(registry) else None
+
+
+def _temporary_registry() -> Path | None:
+    """Where anybody may take the plain name first, one with a name nobody can foresee serves as well."""
+    plain = _temporary_folder() / _temporary_name()
+    with contextlib.suppress(OSError):
+        plain.mkdir(mode=0o700, exist_ok=True)
+    for place in (plain, *sorted(plain.parent.glob(f"{plain.name}-*"))):
+        if _is_private(place):
+            return place
+    with contextlib.suppress(OSError):
+        return Path(tempfile.mkdtemp(prefix=f"{plain.name}-", dir=plain.parent))
+    return None
+
+
+def _temporary_folder() -> Path:
+    return Path(tempfile.gettempdir())
+
+
+def _temporary_name() -> str:
+    return f"swarmctl-{os.getuid()}"
+
+
+def _is_private(place: Path) -> bool:
+    """Whether it is a directory, no link, of this user, and closed to everybody else."""
+    try:
+        status = place.lstat()
+    except OSError:
+        return False
+    return stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o077
 
 
 def _read(path: Path) -> RunningLaunch | None:
     try:
-        return msgspec.json.decode(path.read_bytes(), type=RunningLaunch)
+        return msgspec.json.decode(read_file(path, _MOST_BYTES), type=RunningLaunch)
     except (OSError, msgspec.DecodeError):
         return None
 
@@ -281,12 +325,6 @@ def _runs(launch: RunningLaunch) -> bool:
         return False
 
 
-def _replace(path: Path, payload: bytes) -> None:
-    part = path.with_name(f"{path.name}.part")
-    part.write_bytes(payload)
-    part.replace(path)
-
-
 def as_json(statuses: dict[int, StatusMessage]) -> str:
     """Statuses for programs: a JSON list, one object per agent."""
-    return msgspec.json.format(msgspec.json.encode(list(statuses.values())), indent=2).decode()
+    return json.dumps(msgspec.to_builtins(list(statuses.values())), indent=2)  # ASCII: agents may say anything

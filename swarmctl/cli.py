@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
+from swarmctl.core.text import printable_lines
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, SwarmError
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ def _run_app() -> int:
     try:
         code = app(standalone_mode=False)
     except SwarmError as error:
-        print(error, file=sys.stderr)
+        print(printable_lines(str(error)), file=sys.stderr)
         return error.exit_code
     except (typer.Abort, KeyboardInterrupt):
         return EXIT_INTERRUPTED

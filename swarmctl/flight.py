@@ -106,6 +106,11 @@ class Verdict:
         return EXIT_MISSION if self.problems or violated else EXIT_OK
 
 
+def why_it_failed(outcome: str, last_line: str) -> str:
+    """Why an agent ended with a failure: what its mission came to, or what went wrong after a complete one."""
+    return (outcome if outcome != "completed" else "") or last_line or "no reason given"
+
+
 class Flight:
     """Watches one launch until every agent has ended, or has been given up."""
 
@@ -324,7 +329,7 @@ class Flight:
             self._refuse(f"{child.name} could not start: {child.last_line()}")
         elif code == EXIT_MISSION:
             outcome = view.status.outcome if view.status else ""
-            self._fail("agent_failed", f"{child.name} failed: {outcome or child.last_line() or 'no reason given'}")
+            self._fail("agent_failed", f"{child.name} failed: {why_it_failed(outcome, child.last_line())}")
         elif view.status is None:
             self._refuse(f"{child.name} could not start: it {child.how_it_ended()}")
         else:

@@ -102,8 +102,7 @@ def _radio_source(value: float, facts: VehicleFacts, config: Config) -> Opinion:
 
 
 def _thrust_model(value: float, facts: VehicleFacts, config: Config) -> Opinion:
-    simulated = config.sitl.enabled or facts.version is None or facts.version.uid == "0"
-    if value == 0 and not simulated:
+    if value == 0 and facts.version is not None and facts.version.has_usb:  # no simulator has
         return Opinion(
             Verdict.NOTE, "0.2 to 0.5", "thrust is taken as linear, real propellers are not: calibrate it to hover well"
         )
