@@ -33,7 +33,6 @@ from swarmctl.links.peers import agent_name
 ROUTER = "router"
 SITL = "sitl"
 VIEWER = "viewer"
-_ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS", "RAYON_NUM_THREADS")
 _TAIL_BYTES = 4096
 
 
@@ -255,6 +254,5 @@ def kill_all(children: Sequence[Child]) -> None:
 
 
 def _environment(base: Mapping[str, str]) -> dict[str, str]:
-    """One thread per process for linear algebra: N agents share the cores, and small problems only lose by more."""
-    fixed = dict.fromkeys(_ONE_THREAD, "1")
-    return {**base, **fixed, "PYTHONUNBUFFERED": "1", PARENT_ENV: str(os.getpid())}
+    """One thread for what rerun shares out, as `kernels` has for linear algebra: N agents share the cores."""
+    return {**base, "RAYON_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1", PARENT_ENV: str(os.getpid())}
