@@ -7,6 +7,7 @@ mode into one `Command`, from the offboard stream (`setpoints`) or from the AUTO
 from __future__ import annotations
 
 import datetime
+import math
 from collections import Counter, deque
 from collections.abc import Sequence
 
@@ -40,6 +41,7 @@ CHECK_US = 100_000  # grid on which PX4 looks for reasons to act
 RESUME_US = 20_000  # from a resumed stream to OFFBOARD, before the next tick
 DEAD_RECKONING_US = 5_000_000  # EKF2_NOAID_TOUT: so long a position without GPS is believed
 REBOOT_AFTER_US = 400_000  # the acknowledgement gets out first
+STATUS_EVERY_US = 500_000  # and at once when anything in it changes
 EPOCH_UTC_US = 1_767_225_600_000_000  # 2026-01-01, of flights that have no wall clock
 _HEALTH_TEXT = "Arming denied: Resolve system health failures first\t"
 _LOSS_MODES = {OffboardLoss.LAND: Px4Mode.AUTO_LAND, OffboardLoss.HOLD: Px4Mode.AUTO_LOITER}
@@ -133,6 +135,10 @@ class Autopilot:
         """The estimator has settled."""
         return now_us >= self._ekf_ready_us
 
+    def settled_share(self, now_us: int) -> float:
+        """Time since boot over the time the estimator takes until it can be armed."""
+        return now_us / self._ekf_ready_us if self._ekf_ready_us else math.inf
+
     def stream_alive(self, now_us: int) -> bool:
         """A usable setpoint is younger than COM_OF_LOSS_T."""
         return self.stream.age_us(now_us) <= self.parameters.real("COM_OF_LOSS_T") * 1e6
@@ -154,6 +160,11 @@ class Autopilot:
         if self.armed:
             return MavState.CRITICAL if self.failsafe else MavState.ACTIVE
         return MavState.STANDBY if self.armable(now_us) else MavState.UNINIT
+
+    def status(self, now_us: int) -> tuple[object, ...]:
+        """What PX4 publishes of itself, and so may tell: another value each time it is published."""
+        flags = self.armed, self.failsafe, self.system_status(now_us)
+        return now_us // STATUS_EVERY_US, self.mode, self.intended, *flags
 
     def flight_mode(self) -> FlightMode:
         return FLIGHT_MODES.get(self.mode, FlightMode.MANUAL)

@@ -37,6 +37,7 @@ _TIMESYNC = KINDS[mav.MAVLINK_MSG_ID_TIMESYNC]
 _PING = KINDS[mav.MAVLINK_MSG_ID_PING]
 _INTERVAL = KINDS[mav.MAVLINK_MSG_ID_MESSAGE_INTERVAL]
 _AVAILABLE = KINDS[mav.MAVLINK_MSG_ID_AVAILABLE_MODES]
+_CURRENT_MODE = mav.MAVLINK_MSG_ID_CURRENT_MODE
 _ORIGIN = mav.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
 _UNKNOWN_PLACE = 2**31 - 1  # of COMMAND_INT
 
@@ -83,6 +84,7 @@ class Endpoint:
         self._counts = LinkCounts()
         self._gcs_heard = self._greeted = False
         self._origin_sent: object = None
+        self._status_sent: tuple[object, ...] = ()
         self._seen: set[tuple[int, int]] = set()
         self._texts: deque[tuple[int, Severity, str]] = deque()
         self._text_id = self._text_due_us = self._now_us = 0
@@ -271,9 +273,16 @@ class Endpoint:
         report.counts = self._counts
         placed = self._autopilot.has_position and self._autopilot.ready(self._now_us)
         for message in messages:
+            if message == _CURRENT_MODE and not self._status_is_new():
+                continue
             stream = STREAMS[message]
             if placed or not stream.needs_position:
                 self.send(KINDS[message], *stream.build(report))
+
+    def _status_is_new(self) -> bool:
+        """PX4 tells its mode when it has published it, twice a second and on change, however often it is asked to."""
+        before, self._status_sent = self._status_sent, self._autopilot.status(self._now_us)
+        return before != self._status_sent
 
     def _send_reached(self) -> None:
         reached = self._autopilot.flight.reached

@@ -265,7 +265,7 @@ FENCE_ROWS = (
             Stream(setpoint(0.6)),
             Wait(3.0),
             Stream(setpoint(HOVER_01)),
-            always("CURRENT_MODE", 1.5, 100, custom_mode=M_OFFBOARD),
+            always("CURRENT_MODE", 1.5, 2, custom_mode=M_OFFBOARD),
             Moves("height_m", Between(9.0, 30.0), 1.5),
         ),
         {"GF_ACTION": 1, "GF_MAX_VER_DIST": 9.0},
@@ -311,7 +311,7 @@ BATTERY_ROWS = (
         (
             SetParam("BAT_LOW_THR", 3.0),
             SetParam("BAT_CRIT_THR", 2.0),
-            always("CURRENT_MODE", 7.0, 500, custom_mode=M_LOITER),
+            always("CURRENT_MODE", 7.0, 13, custom_mode=M_LOITER),
         ),
         {"COM_LOW_BAT_ACT": 0},
     ),

@@ -330,8 +330,8 @@ def heartbeat(within_s: float = 1.2, **fields: Any) -> Sees:
     return Sees("HEARTBEAT", fields, within_s)
 
 
-def mode(value: int, intended: int | None = None, within_s: float = 0.15) -> Sees:
-    """The mode as CURRENT_MODE shows it, at 100 Hz."""
+def mode(value: int, intended: int | None = None, within_s: float = 0.6) -> Sees:
+    """The mode as CURRENT_MODE shows it: twice a second, and at once on a change."""
     return Sees("CURRENT_MODE", {"custom_mode": value, "intended_custom_mode": intended or value}, within_s)
 
 
