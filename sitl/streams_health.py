@@ -10,8 +10,8 @@ from sitl.schedule import CURRENT_EVENT_SEQUENCE, ESC_INFO, ESC_STATUS, LINK_NOD
 from sitl.settling import claimed
 from sitl.streams import FLIGHT_STREAMS, NAN, Fields, LinkCounts, Report, Stream, home_z_m, int32, ms
 
-_SENSORS_PRESENT = 0x0200C02F
-_SENSORS_ENABLED = 0x0201C02F
+_SENSORS_PRESENT = 0x0300C02F
+_SENSORS_ENABLED = 0x0301C02F
 _SENSORS_HEALTHY = 0x0320C83F
 _SENSOR_GPS = 0x20
 _SENSOR_BATTERY = 0x02000000

@@ -37,6 +37,7 @@ def custom_mode(main: int, sub: int = 0) -> int:
 
 
 M_MANUAL, M_ALTCTL, M_POSCTL, M_ACRO, M_OFFBOARD, M_STAB = (custom_mode(n) for n in (1, 2, 3, 5, 6, 7))
+M_TERMINATION = custom_mode(10)
 M_TAKEOFF, M_LOITER, M_MISSION, M_RTL, M_LAND = (custom_mode(4, n) for n in (2, 3, 4, 5, 6))
 
 
@@ -349,6 +350,7 @@ class Row:
         never_streamed: needs a vehicle that has had no setpoint since its start.
         needs_gcs: needs the second link.
         not_by_url: why it can't be played against a vehicle given by URL; empty when it can.
+        real_px4: why a real one may answer otherwise, where that is no fault of the row; empty where it must not.
     """
 
     name: str
@@ -360,6 +362,7 @@ class Row:
     never_streamed: bool = False
     needs_gcs: bool = False
     not_by_url: str = ""
+    real_px4: str = ""
 
     @property
     def needs_reboot(self) -> bool:

@@ -118,13 +118,20 @@ def test_transfers_that_can_not_be() -> None:
     for message, result in (
         (mav.MAVLink_mission_count_message(1, 1, 60000, MISSION), 4),
         (mav.MAVLink_mission_count_message(1, 1, 1, 77), 3),
-        (mav.MAVLink_mission_request_int_message(1, 1, 5, MISSION), 13),
         (item(bench, 0, 16), 1),  # nobody asked for it
     ):
         bench.forget()
         bench.send(message)
         bench.run(0.01)
         assert [m.type for m in bench.said(ACK)] == [result]
+
+
+def test_an_item_that_is_not_there_is_not_answered() -> None:
+    bench = Bench()
+    bench.forget()
+    bench.send(mav.MAVLink_mission_request_int_message(1, 1, 5, MISSION))
+    bench.run(0.3)
+    assert not bench.said(ACK)
 
 
 def test_an_upload_asks_again_and_gives_up() -> None:
