@@ -112,7 +112,7 @@ class Player:
     def _land_and_disarm(self) -> None:
         if not self._say(v.disarm()):
             self._say(v.go(4, 6))
-        self._wait(lambda: not self._armed(), 60.0, "not landed and disarmed")
+        self._wait(lambda: not self._armed(), 120.0, "not landed and disarmed")
 
     def _say(self, command: v.Command) -> bool:
         """A command whose refusal is no deviation; whether it was accepted."""

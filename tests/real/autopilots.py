@@ -59,7 +59,18 @@ class Kind:
     def binary(self) -> Path | None:
         """The build to test with, if there is one."""
         given = os.environ.get(self.variable, "")
-        return Path(given).resolve() if given else None
+        return Path(given).expanduser().absolute() if given else None
+
+    def place(self, index: int, count: int, folder: Path, parameters: Mapping[str, float] | None = None) -> Start:
+        """Where the vehicle of that index stands among so many."""
+        lat_deg = self.origin.lat_deg + math.degrees(north_m(index, count) / EARTH_RADIUS_M)
+        return Start(index, folder, lat_deg, self.origin.lon_deg, self.origin.alt_m, parameters or {})
+
+    def shell_line(self, start: Start) -> list[str]:
+        """What starts it, from any folder and any environment."""
+        assert self.binary is not None
+        told = [f"{name}={value}" for name, value in self.environment(start).items()]
+        return ["env", "-C", str(start.folder), *told, *self.command(self.binary, start)]
 
 
 def _px4_command(binary: Path, start: Start) -> list[str]:
@@ -107,6 +118,11 @@ PX4 = Kind(
 ARDUCOPTER = Kind("SWARMCTL_ARDUCOPTER", GeoOrigin(-35.363262, 149.165237, 584.0), (14550,), 10, _arducopter_command)
 
 
+def north_m(index: int, count: int) -> float:
+    """Where a vehicle stands."""
+    return (index - (count - 1) / 2) * SPACING_M
+
+
 class Fleet:
     """N vehicles that stand `SPACING_M` apart along north; each writes to a folder of its own."""
 
@@ -118,31 +134,21 @@ class Fleet:
         directory: Path,
         parameters: Mapping[str, float] | None = None,
     ) -> None:
-        assert kind.binary is not None
         self.kind, self.count, self.network = kind, count, network
-        self._binary = kind.binary
         self._directory = directory
-        self._parameters = parameters or {}
+        self._parameters = parameters
         self._running: dict[int, subprocess.Popen[bytes]] = {}
         for index in range(count):
             self.start(index)
-
-    def north_m(self, index: int) -> float:
-        """Where a vehicle stands."""
-        return (index - (self.count - 1) / 2) * SPACING_M
 
     def start(self, index: int) -> None:
         """Power up; what it has stored stays as it was."""
         folder = self._directory / str(index)
         folder.mkdir(parents=True, exist_ok=True)
-        origin = self.kind.origin
-        lat_deg = origin.lat_deg + math.degrees(self.north_m(index) / EARTH_RADIUS_M)
-        start = Start(index, folder, lat_deg, origin.lon_deg, origin.alt_m, self._parameters)
+        start = self.kind.place(index, self.count, folder, self._parameters)
         with (folder / "out.log").open("ab") as out:
             self._running[index] = subprocess.Popen(
-                [*self.network.prefix, *self.kind.command(self._binary, start)],
-                cwd=folder,
-                env={**os.environ, **self.kind.environment(start)},
+                [*self.network.prefix, *self.kind.shell_line(start)],
                 stdin=subprocess.DEVNULL,
                 stdout=out,
                 stderr=subprocess.STDOUT,

@@ -193,7 +193,7 @@ def test_the_current_item_can_be_chosen_in_flight() -> None:
 
 
 def test_no_mission_no_mission_mode() -> None:
-    bench = taken_off()
+    bench = taken_off().as_ground_station()
     assert bench.mode(4, 4) == Result.TEMPORARILY_REJECTED
     assert "Switching to Mission is currently not available\t" in bench.texts()
     assert bench.command(300, 0, 0) == Result.DENIED
@@ -338,7 +338,7 @@ def test_a_lost_ground_station_acts_as_told(action: int, mode: Px4Mode) -> None:
 
 
 def test_without_a_position_auto_descends_and_offboard_goes_on() -> None:
-    bench = taken_off("x500")
+    bench = taken_off("x500").as_ground_station()
     bench.pilot.position_ok = False
     bench.run(1.0)
     assert (bench.pilot.mode, bench.pilot.failsafe) == (LAND, True)
