@@ -239,6 +239,7 @@ def sitl_params(config: Config) -> SitlParams:
         physics_hz=config.sitl.physics_hz,
         mass_scale=config.sitl.mass_scale,
         start=config.sitl.start,
+        ekf_ready_s=config.sitl.ekf_ready_s,
         estimator=config.sitl.estimator,
         autopilot_kind=config.sitl.autopilot_kind,
         reject_bad_setpoints=config.sitl.reject_bad_setpoints,

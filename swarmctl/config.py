@@ -71,6 +71,7 @@ class SitlParams(RealismParams):
     attitude_gains: Literal["swarm", "single", "pid_step", "pid_trajectory"] = "swarm"  # of the thesis airframe
     ground_z_m: float = Field(2.0, ge=-1000, le=1000)  # height of the ground below the shared origin, NED z
     start: Literal["ground", "air"] = "ground"  # air: held at the start position, no ground anywhere (thesis)
+    ekf_ready_s: float = Field(1.0, ge=0, le=60)  # from its start until it can be armed; PX4 takes 4
     mass_scale: float = Field(1.0, ge=0.3, le=1.9)  # true mass over the preset's, unknown to the bridge
     estimator: Literal["exact", "gps", "external"] = "exact"  # what the autopilots' estimates are off by
     autopilot_kind: Literal["px4", "arducopter"] = "px4"  # whose face the simulator shows

@@ -96,7 +96,7 @@ def sitl_command(config: Config, site: Site, ports: Sequence[int], sockets: Sequ
         starts = tuple((x, y, sitl.ground_z_m) for x, y, _ in starts)
     argv = _python("-m", "sitl", "--vehicles", f"{swarm.agents}", "--preset", sitl.preset)
     argv += ("--attitude-gains", sitl.attitude_gains, "--estimator", sitl.estimator)
-    argv += ("--autopilot", sitl.autopilot_kind)
+    argv += ("--autopilot", sitl.autopilot_kind, "--ekf-ready", f"{sitl.ekf_ready_s!r}")
     argv += ("--gcs-port", f"{sitl.gcs_port}") if sitl.gcs_port else ()
     argv += () if sitl.reject_bad_setpoints else ("--accept-bad-setpoints",)
     argv += ("--spawn=" + ";".join(",".join(repr(c) for c in start) for start in starts),)
