@@ -119,6 +119,9 @@ class Lockstep:
         self._own = dict(own or {})
         self.agents: list[Agent | None] = [self._agent(i, self.links[i][0]) for i in range(agents)]
         self.frozen: set[int] = set()  # agents whose process is stopped: alive on the bus, but not ticking
+        self.starved: dict[int, int] = {}  # agent -> of how many ticks its processor lets it do one
+        self._missed = [0] * agents
+        self._steps = 0
         self._order = list(order) if order is not None else list(range(agents))
         self._truth: list[NDArray[np.void]] = []
         self._obstacles = obstacles_message(config)
@@ -148,8 +151,13 @@ class Lockstep:
             self._operator.publish(topics.OBSTACLES, topics.encode_message(self._obstacles))
         for i in self._order:
             agent = self.agents[i]
-            if agent is not None and i not in self.frozen:
-                agent.tick(now_us, 0)
+            if agent is None or i in self.frozen:
+                continue
+            if self._steps % self.starved.get(i, 1):
+                self._missed[i] += 1
+                continue
+            agent.tick(now_us, self._missed[i])
+        self._steps += 1
         for _ in range(self._tick_us // self._physics_us):
             self.clock.advance(self._physics_us)
             self.world.step(self.clock.now_us())

@@ -6,7 +6,6 @@ It has no thread, socket, sleep or simulation branch: transport, bus, slow path,
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -28,6 +27,7 @@ from swarmctl.control.facts import Facts
 from swarmctl.control.failsafe import Judgement, judge
 from swarmctl.control.fallback import rest_plan
 from swarmctl.control.model import Predictor
+from swarmctl.control.overload import Level, Overload
 from swarmctl.control.problem import Problem, Start
 from swarmctl.control.replay import Replay
 from swarmctl.control.separation import KeepOut, radius_problem
@@ -84,7 +84,9 @@ class Agent:
         self._upkeep = Upkeep(
             autopilot, commands, setup.params.autopilot_params, setup.sysid, setup.params.sequence.state_rate_hz
         )
-        self._surroundings = Surroundings(setup.agent, setup.peers, setup.separation, bus)
+        self._surroundings = Surroundings(
+            setup.agent, setup.peers, setup.separation, bus, setup.params.rate_hz, self._note
+        )
         self._coordination = make_coordination(setup, self._surroundings, bus, self._note, stopwatch_ns)
         self._controller, self._transit = make_controllers(setup, stopwatch_ns)
         self._observer = make_estimator(setup)
@@ -110,10 +112,12 @@ class Agent:
         )
         self.took = Took(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # of the last tick
         self._promise_ns = 0  # of the last tick
+        self._gaps = self._jumps = 0  # of setpoints and of the estimate, as far as they have been told
         self._announced: tuple[Phase, Mode, FlightMode] | None = None
         self._alerts = Alerts()
         self._accuracy = AccuracyMonitor()
         self._standby_us = 0
+        self._overload = Overload(setup.params.overload, round(1e6 / setup.params.rate_hz))
         self._done_us: int | None = None
         self._last_state_us = _NOTHING_US
         self._thrust_01 = setup.vehicle_model.hover_thrust_01
@@ -143,10 +147,7 @@ class Agent:
     @property
     def rejected(self) -> dict[str, int]:
         """Bus messages refused so far, by reason."""
-        found = Counter(self._surroundings.paths.rejected)
-        if self._coordination is not None:
-            found.update(self._coordination.rejected)
-        return dict(found)
+        return dict(self._surroundings.refusals.by_reason)
 
     @property
     def commits_refused(self) -> int | None:
@@ -160,8 +161,9 @@ class Agent:
         self._note("operator", verb=verb)
 
     def tick(self, now_us: int, late_ticks: int) -> TickRecord:
-        """One control step at monotonic time `now_us`; `late_ticks` so far is only recorded."""
+        """One control step at monotonic time `now_us`, with the deadlines missed so far."""
         began_ns = self._stopwatch_ns()
+        self._watch_deadlines(now_us, late_ticks)
         self._listen(now_us)
         state = self._sense(now_us)
         self._sequence.begin_if_due(now_us, self._clock.utc_us())
@@ -186,6 +188,9 @@ class Agent:
         )
         self._share(state, flown)
         self._advance(now_us, state)
+        refusals = self._surroundings.refusals.alert(self._clock.utc_us())
+        if refusals:
+            self._alerts.put("bus", refusals, now_us)
         self._reporter.problem = self._alerts.text(now_us)
         return self._reporter.report(
             now_us,
@@ -197,6 +202,15 @@ class Agent:
             late_ticks,
             self.took,
         )
+
+    def _watch_deadlines(self, now_us: int, late_ticks: int) -> None:
+        before = self._overload.level
+        self._overload.update(now_us, late_ticks)
+        level = self._overload.level
+        if level is not Level.NONE:
+            self._alerts.put("overload", self._overload.text(), now_us)
+        if level is not before:
+            self._note("overload", level=level.name, missed_01=round(self._overload.missed_01, 3))
 
     # -- listen, sense ------------------------------------------------------------------------------------------------
 
@@ -217,6 +231,12 @@ class Agent:
             else:
                 self._alerts.put(asked, f"{asked} refused: {result.text}", now_us)
             self._note("command", verb=asked, ok=result.ok, text=result.text)
+        frame = self._autopilot.frame
+        if frame.jumps != self._jumps:
+            self._jumps = frame.jumps
+            text = f"estimate jumped by {frame.jump_m:.1f} m: peers keep that much more away"
+            self._alerts.put("jump", text, now_us)
+            self._note("estimate_jumped", metres=frame.jump_m)
         if state is None or state.t_us == self._last_state_us:
             return state
         self._last_state_us = state.t_us
@@ -356,6 +376,11 @@ class Agent:
             self._alerts.put("setpoint", f"setpoint refused: {refused}", now_us)
             self._note("setpoint_refused", reason=refused)
             return None
+        if self._autopilot.gaps != self._gaps:
+            self._gaps, gap_s = self._autopilot.gaps, self._autopilot.gap_s
+            text = f"setpoints had stopped for {gap_s:.2f} s: the autopilot's failsafe may have acted"
+            self._alerts.put("gap", text, now_us)
+            self._note("setpoint_gap", seconds=gap_s)
         self._virtual, self._thrust_01 = virtual, setpoint.thrust_01
         self._predictor.sent(now_us, virtual)
         return setpoint
@@ -378,6 +403,7 @@ class Agent:
             boots=self._autopilot.clock.boots,
             refusal=self._upkeep.refusal,
             unsettled=self._unsettled(now_us),
+            overload=self._overload.level,
             armed_told_us=self._autopilot.armed_told_us,
         )
         for command in self._sequence.step(facts):
@@ -426,18 +452,19 @@ class Agent:
         if state is not None:
             self._bus.publish(topics.PATH, topics.encode_path(self._path(state, flown)))
         if self._coordination is not None:
-            self._coordination.say()
+            self._coordination.say(self._clock.utc_us())
 
     def _path(self, state: VehicleState, flown: Plan | None) -> PredictedPath:
         setup, seq = self._setup, self._reporter.seq
+        margin_m = min(topics.MAX_RADIUS_M, self._autopilot.frame.margin_m + self._overload.margin_m)
         if flown is not None:
             t0_us, dt_us, pos = self._utc(flown.t0_us), flown.dt_us, flown.pos_ned_m
-            return PredictedPath(setup.agent, setup.boot_id, seq, t0_us, dt_us, 0.0, pos)
+            return PredictedPath(setup.agent, setup.boot_id, seq, t0_us, dt_us, margin_m, pos)
         act_us, dt_us = self._clock.now_us() + self._predictor.delay_us, self._controller.dt_us
         grid = np.arange(self._controller.steps + 1, dtype=np.float64)
         ahead_s = grid * (dt_us * 1e-6) + (act_us - state.t_us) * 1e-6
         pos = coasting(state, ahead_s, setup.separation.brake_m_s2)
-        return PredictedPath(setup.agent, setup.boot_id, seq, self._utc(act_us), dt_us, 0.0, pos)
+        return PredictedPath(setup.agent, setup.boot_id, seq, self._utc(act_us), dt_us, margin_m, pos)
 
     def _fresh(self, now_us: int, state: VehicleState) -> bool:
         return now_us - state.t_us <= self._setup.params.failsafe.state_max_age_s * 1e6

@@ -13,6 +13,7 @@ from swarmctl.control.disturbance import DisturbanceParams
 from swarmctl.control.failsafe import FailsafeParams
 from swarmctl.control.mission import MissionParams
 from swarmctl.control.model import VehicleModelParams
+from swarmctl.control.overload import OverloadParams
 from swarmctl.control.separation import SeparationParams
 from swarmctl.control.sequence import SequenceParams
 from swarmctl.control.state_filter import StateFilterParams
@@ -28,6 +29,7 @@ class AgentParams(Params):
     connect_timeout_s: float = Field(15.0, gt=0, le=600)
     sequence: SequenceParams = SequenceParams()
     failsafe: FailsafeParams = FailsafeParams()
+    overload: OverloadParams = OverloadParams()
     disturbance: DisturbanceParams = DisturbanceParams()
     state_filter: StateFilterParams = StateFilterParams()
     barrier: BarrierParams = BarrierParams()

@@ -26,13 +26,15 @@ import psutil
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import read_file, replace_bytes
 from swarmctl.links.bus import ZenohBus
+from swarmctl.links.orders import EVERYBODY, Verb, orders
 from swarmctl.links.peers import agent_name
 from swarmctl.links.topics import (
     COMMAND,
+    MAX_OBSTACLE_M,
+    MAX_OBSTACLES,
     OBSTACLES,
     OPERATOR,
     STATUS,
-    CommandMessage,
     ObstacleMessage,
     ObstaclesMessage,
     StatusMessage,
@@ -42,7 +44,6 @@ from swarmctl.links.topics import (
 )
 
 LAUNCH_FILE = "launch.json"
-MAX_OBSTACLE_M = 10_000.0
 _ANSWER_S = 5.0
 _REPEAT_S = 0.2
 _START_TOLERANCE_S = 1.0
@@ -62,13 +63,13 @@ class RunningLaunch(msgspec.Struct, frozen=True):
 
 
 def announce(launch: RunningLaunch) -> None:
-    """Write the notes of a launch; without the one in its run folder it can't be spoken to, the others are extra."""
+    """Write the notes of a launch; a disk that takes none costs the operator's verbs, never the flight."""
     payload = msgspec.json.encode(launch)
-    replace_bytes(Path(launch.run_dir) / LAUNCH_FILE, payload)
-    for registry in (_runtime_registry(), _temporary_registry()):
-        if registry is not None:
-            with contextlib.suppress(OSError):
-                replace_bytes(registry / f"{launch.pid}.json", payload)
+    notes = [Path(launch.run_dir) / LAUNCH_FILE]
+    notes += [place / f"{launch.pid}.json" for place in (_runtime_registry(), _temporary_registry()) if place]
+    for note in notes:
+        with contextlib.suppress(OSError):
+            replace_bytes(note, payload)
 
 
 def withdraw() -> None:
@@ -143,13 +144,16 @@ def command(launch: RunningLaunch, verb: str, agent: int | None) -> dict[int, St
     if agent is not None and not 0 <= agent < launch.agents:
         raise StartError(f"--agent {agent}: this launch has agents 0 to {launch.agents - 1}")
     asked = range(launch.agents) if agent is None else range(agent, agent + 1)
-    order = {"verb": verb, "agent": -1 if agent is None else agent, "utc_us": time.time_ns() // 1000}
-    message = msgspec.convert(order, CommandMessage)
     with _joined(launch) as bus:
-        if not _statuses(bus, asked, _ANSWER_S):
+        ahead_us: dict[int, int] = {}
+        if not _statuses(bus, asked, _ANSWER_S, ahead_us):
             raise StartError(f"{verb}: no agent asked is on the bus; see: swarmctl status")
+        now_us = time.time_ns() // 1000
+        clocks_us = [now_us + us for us in ahead_us.values()]
+        said = orders(msgspec.convert(verb, Verb), EVERYBODY if agent is None else agent, now_us, clocks_us)
         for _ in range(5):
-            bus.publish(COMMAND, encode_message(message))
+            for order in said:
+                bus.publish(COMMAND, order)
             time.sleep(_REPEAT_S)
         bus.receive(STATUS)
         return _statuses(bus, asked, 1.0)
@@ -175,7 +179,10 @@ def change_obstacles(
     """
     with _joined(launch) as bus:
         old = _obstacles(bus, 0)
-        new = ObstaclesMessage(old.version + 1, change(old.obstacles))
+        changed = change(old.obstacles)
+        if len(changed) > MAX_OBSTACLES:
+            raise ConfigError("obstacle", [f"add: there are {len(old.obstacles)}, agents keep {MAX_OBSTACLES} at most"])
+        new = ObstaclesMessage(old.version + 1, changed)
         return _obstacles(bus, new.version, encode_message(new))
 
 
@@ -233,8 +240,13 @@ def _obstacles(bus: ZenohBus, least_version: int, say: bytes | None = None) -> O
     raise StartError(f"obstacle: the launch did not answer within {_ANSWER_S:.0f} s; see: swarmctl status")
 
 
-def _statuses(bus: ZenohBus, agents: range, timeout_s: float) -> dict[int, StatusMessage]:
-    """Newest status of each of `agents`, as soon as all have said one or when time is up."""
+def _statuses(
+    bus: ZenohBus, agents: range, timeout_s: float, ahead_us: dict[int, int] | None = None
+) -> dict[int, StatusMessage]:
+    """Newest status of each of `agents`, as soon as all have said one or when time is up.
+
+    `ahead_us` is told by how much the clock of each is ahead of ours.
+    """
     heard: dict[int, StatusMessage] = {}
     deadline_s = time.monotonic() + timeout_s
     while time.monotonic() < deadline_s:
@@ -242,6 +254,8 @@ def _statuses(bus: ZenohBus, agents: range, timeout_s: float) -> dict[int, Statu
             status = decode_status(payload)
             if status is not None and status.agent in agents and sender == agent_name(status.agent):
                 heard[status.agent] = status
+                if ahead_us is not None:
+                    ahead_us[status.agent] = status.utc_us - time.time_ns() // 1000
         if len(heard) == len(agents):
             break
         time.sleep(0.02)

@@ -27,6 +27,7 @@ from swarmctl.core.simulated import RealismParams
 from swarmctl.core.text import printable
 from swarmctl.errors import ConfigError
 from swarmctl.links.parameter_kinds import parameter_problems
+from swarmctl.links.topics import MAX_OBSTACLE_M, MAX_OBSTACLES
 from swarmctl.links.transport import Endpoint, parse_url
 from swarmctl.telemetry.referee import ObstacleRule, Rules
 
@@ -291,6 +292,7 @@ def _whole(config: Config) -> Iterator[str]:
         yield from _starts_apart(config)
     yield from _vehicle_problems(config)
     yield from parameter_problems(config.agent.autopilot_params)
+    yield from _obstacle_problems(config)
     if config.sitl.speed != 1.0:
         yield (
             f"sitl.speed = {config.sitl.speed}: agents fly on wall time and can't follow; leave it at 1. Faster than "
@@ -305,6 +307,17 @@ def _whole(config: Config) -> Iterator[str]:
             f"limits.min_separation_m = {config.limits.min_separation_m}: larger than separation.radius_m = "
             f"{config.separation.radius_m}; agents would be judged by more than they keep. Lower it or raise the radius"
         )
+
+
+def _obstacle_problems(config: Config) -> Iterator[str]:
+    """What agents would refuse to hear of."""
+    if len(config.obstacles) > MAX_OBSTACLES:
+        yield f"obstacles: {len(config.obstacles)} are listed, agents keep {MAX_OBSTACLES} at most"
+        return
+    for number, obstacle in enumerate(config.obstacles):
+        for key, vector in (("center_ned_m", obstacle.center_ned_m), ("vel_ned_m_s", obstacle.vel_ned_m_s)):
+            if max(map(abs, vector)) > MAX_OBSTACLE_M:
+                yield f"obstacles.{number}.{key} = {vector}: every number must be within {MAX_OBSTACLE_M:g}"
 
 
 def _starts_apart(config: Config) -> Iterator[str]:

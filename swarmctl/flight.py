@@ -18,12 +18,12 @@ from typing import Any
 from swarmctl.config import Config
 from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START
+from swarmctl.links.orders import EVERYBODY, orders
 from swarmctl.links.peers import Bus, agent_name
 from swarmctl.links.topics import (
     COMMAND,
     OBSTACLES,
     STATUS,
-    CommandMessage,
     ObstacleMessage,
     ObstaclesMessage,
     decode_obstacles,
@@ -131,8 +131,7 @@ class Flight:
         self._carrier_lost = False  # router or simulator is gone
         self._vehicles_lost = False  # the simulator is gone, and its vehicles with it
         self._recovery = Recovery(base.recover, config.sysids())
-        self._land_order: bytes | None = None
-        self._land_ordered_s = 0.0
+        self._land_ordered_s: float | None = None
         self._land_said_s = 0.0
         self._land_until_s = 0.0
 
@@ -184,7 +183,7 @@ class Flight:
             self._verdict.has_armed |= Phase.ARM <= status.phase < Phase.DONE
         for _, payload in self._bus.receive(OBSTACLES):
             message = decode_obstacles(payload)
-            if message is not None and message.version > self._obstacles.version:
+            if message is not None and message.replaces(self._obstacles.version):
                 self._adopt(message)
 
     def _adopt(self, message: ObstaclesMessage) -> None:
@@ -245,7 +244,7 @@ class Flight:
         self._base.children[agent_name(view.agent)] = child
         view.note, view.heard_s = "recovering", time.monotonic()
         self._say("recovering", f"landing the vehicle of {agent_name(view.agent)}, which may be armed or in the air")
-        if self._land_order is not None:
+        if self._land_ordered_s is not None:
             self._land_until_s = max(self._land_until_s, time.monotonic() + RECOVERY_S)
 
     def _judge_silence(self, view: AgentView, child: Child, now_s: float) -> None:
@@ -280,26 +279,30 @@ class Flight:
         if now_s - self._obstacles_said_s >= _OBSTACLES_REPEAT_S:
             self._obstacles_said_s = now_s
             self._bus.publish(OBSTACLES, encode_message(self._obstacles))
-        if self._land_order is not None and now_s - self._land_said_s >= _LAND_REPEAT_S:
+        if self._land_ordered_s is not None and now_s - self._land_said_s >= _LAND_REPEAT_S:
             self._land_said_s = now_s
-            self._repeat_land_order(self._land_order, now_s)
+            self._repeat_land_order(now_s, now_s - self._land_ordered_s)
 
-    def _repeat_land_order(self, order: bytes, now_s: float) -> None:
-        """Over the bus until everybody shows that it lands, after a while also by signal."""
+    def _repeat_land_order(self, now_s: float, since_s: float) -> None:
+        """Over the bus until everybody shows that it lands, stamped anew each time, after a while also by signal."""
         running = (view for view in self._running() if not self._recovery.is_on(view.agent))
         deaf = [view for view in running if view.status is None or view.status.phase < Phase.GOTO_LAND]
         if deaf:
-            self._bus.publish(COMMAND, order)
+            clocks_us = [
+                view.status.utc_us + round((now_s - view.heard_s) * 1e6) for view in deaf if view.status is not None
+            ]
+            for order in orders("land", EVERYBODY, time.time_ns() // 1000, clocks_us):
+                self._bus.publish(COMMAND, order)
         for view in deaf:
             child = self._base.children[agent_name(view.agent)]
-            if now_s - self._land_ordered_s > _LAND_OBEYED_S and self._once(f"{child.name} told by signal"):
+            if since_s > _LAND_OBEYED_S and self._once(f"{child.name} told by signal"):
                 child.signal(signal.SIGTERM)
 
     def _is_over(self) -> bool:
         """Whether nobody is left to wait for. Silent agents are given up when nobody else flies."""
         now_s = time.monotonic()
         running = self._running()
-        if self._land_order is not None and now_s > self._land_until_s:
+        if self._land_ordered_s is not None and now_s > self._land_until_s:
             for view in running:
                 if not self._recovery.is_on(view.agent):
                     self._fail("not_landed", f"{agent_name(view.agent)} did not end in time and was killed")
@@ -310,7 +313,7 @@ class Flight:
                 c.ended_s for c in self._base.children.values() if c.ended_s is not None and c.poll() not in (0, 130)
             ]
             return self._carrier_lost or not deaths_s or now_s - max(deaths_s) > _AFTER_DEATH_S
-        if self._land_order is None and all(view.note == "silent" for view in running):
+        if self._land_ordered_s is None and all(view.note == "silent" for view in running):
             bus_is_suspect = len(running) == len(self._views) and len(running) > 1
             self._land(_LAND_S if bus_is_suspect else _AFTER_DEATH_S)
         return False
@@ -321,7 +324,7 @@ class Flight:
         if code == EXIT_OK or self._carrier_lost or self._recovery.is_on(view.agent):
             return
         if code == EXIT_INTERRUPTED:
-            self._verdict.interrupted = self._verdict.interrupted or self._land_order is None  # an operator's `land`
+            self._verdict.interrupted |= self._land_ordered_s is None  # an operator's `land`
         elif code == EXIT_START:
             self._refuse(f"{child.name} could not start: {child.last_line()}")
         elif code == EXIT_MISSION:
@@ -336,8 +339,7 @@ class Flight:
     def _land(self, timeout_s: float) -> None:
         """Ask all to land, over the bus; by signal where the bus can't reach."""
         now_s = time.monotonic()
-        if self._land_order is None:
-            self._land_order = encode_message(CommandMessage("land", -1, time.time_ns() // 1000))
+        if self._land_ordered_s is None:
             self._land_ordered_s, self._land_until_s = now_s, now_s + timeout_s
             self._base.log.write("land")
         self._land_until_s = min(self._land_until_s, now_s + timeout_s)

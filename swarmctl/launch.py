@@ -148,8 +148,8 @@ class Bringup(Base):
         if ground.view_port:
             self._spawn(viewer_command(config, site, ground.view_port, self._options.view))
         if config.sitl.enabled:
-            self._spawn(sitl_command(config, site, ground.ports))
-        for command in agent_commands(config, site, ground.sockets):
+            self._spawn(sitl_command(config, site, ground.ports, ground.vehicle_sockets))
+        for command in agent_commands(config, site, ground.sockets, ground.vehicle_sockets):
             self._spawn(command)
         self.announce("")
         for line in _introduction(config, site, ground):
@@ -178,7 +178,8 @@ class Bringup(Base):
         directory = self.site.directory / "recovery"
         directory.mkdir(exist_ok=True)
         site = Site(self.site.run, endpoint, directory)
-        command = agent_commands(self._config, site, self._ground.sockets, self.site.directory / "config.toml")[agent]
+        ends = self._ground.sockets, self._ground.vehicle_sockets
+        command = agent_commands(self._config, site, *ends, self.site.directory / "config.toml")[agent]
         return Child(replace(command, argv=(*command.argv, "--only-land")), directory)
 
     def announce(self, view: str) -> None:

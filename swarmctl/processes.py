@@ -66,11 +66,16 @@ def router_command(endpoint: str) -> Command:
 
 
 def agent_commands(
-    config: Config, site: Site, sockets: Sequence[socket.socket], config_path: Path | None = None
+    config: Config,
+    site: Site,
+    sockets: Sequence[socket.socket],
+    vehicles: Sequence[socket.socket] = (),
+    config_path: Path | None = None,
 ) -> tuple[Command, ...]:
-    """One agent for each vehicle; `sockets` are the bound vehicle ports they inherit, or none.
+    """One agent for each vehicle; `sockets` are the ends of their links that they inherit, or none.
 
-    `config_path` is where the resolved configuration is, when it is not in the site's folder.
+    `vehicles` are the simulator's ends of them, whose ports the agents are told. `config_path` is where the resolved
+    configuration is, when it is not in the site's folder.
     """
     commands = []
     for agent in range(config.swarm.agents):
@@ -78,12 +83,14 @@ def agent_commands(
         argv += ("--id", f"{agent}")
         argv += ("--run", site.run, "--bus", site.endpoint, "--run-dir", f"{site.directory}")
         fds = (sockets[agent].fileno(),) if sockets else ()
-        commands.append(Command(agent_name(agent), argv + (("--fd", f"{fds[0]}") if fds else ()), fds))
+        argv += ("--fd", f"{fds[0]}") if fds else ()
+        argv += ("--vehicle-port", f"{vehicles[agent].getsockname()[1]}") if vehicles else ()
+        commands.append(Command(agent_name(agent), argv, fds))
     return tuple(commands)
 
 
-def sitl_command(config: Config, site: Site, ports: Sequence[int]) -> Command:
-    """The built-in simulator, which sends to `ports` on loopback and chooses its own."""
+def sitl_command(config: Config, site: Site, ports: Sequence[int], sockets: Sequence[socket.socket] = ()) -> Command:
+    """The built-in simulator, which sends to `ports` on loopback from `sockets`, or chooses its own."""
     sitl, swarm = config.sitl, config.swarm
     starts = config.starts_ned_m()
     if sitl.start == "ground":
@@ -96,11 +103,13 @@ def sitl_command(config: Config, site: Site, ports: Sequence[int]) -> Command:
     argv += ("--spawn=" + ";".join(",".join(repr(c) for c in start) for start in starts),)
     argv += (f"--origin={swarm.origin_lat_deg!r},{swarm.origin_lon_deg!r},{swarm.origin_alt_m!r}",)
     argv += ("--remote-ports", ",".join(str(port) for port in ports), "--seed", f"{config.seed}")
+    fds = tuple(sock.fileno() for sock in sockets)
+    argv += ("--local-fds", ",".join(map(str, fds))) if fds else ()
     argv += ("--physics-hz", f"{sitl.physics_hz}", "--mass-scale", f"{sitl.mass_scale!r}", "--start", sitl.start)
     argv += _realism(sitl)
     argv += ("--control", f"{control_socket(site.endpoint)}", "--events", f"{site.directory / 'sitl.events.jsonl'}")
     argv += ("--truth", f"{site.directory / 'truth.bin'}", "--die-with-parent")
-    return Command(SITL, argv)
+    return Command(SITL, argv, fds)
 
 
 def _realism(sitl: SitlParams) -> tuple[str, ...]:

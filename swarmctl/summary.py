@@ -102,7 +102,9 @@ def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...
         f"ticks {_count(timing, 'ticks')}, late {_count(timing, 'late_ticks')}, "
         f"tick p50/p99/max {_ms(tick)} ms, solve p50/p99/max {_ms(solve)} ms",
         f"solver {_count(solver, 'name')}, failed {_count(solver, 'failed')}; "
-        f"path age p50/p99 {_ms(age, ('p50', 'p99'))} ms, {rejected} messages refused" + _deadlocks(summary),
+        f"path age p50/p99 {_ms(age, ('p50', 'p99'))} ms, {rejected} messages refused"
+        + _unheard(comms)
+        + _deadlocks(summary),
         f"run folder {directory}",
     )
 
@@ -111,6 +113,11 @@ def violation_lines(summary: Mapping[str, Any]) -> tuple[str, ...]:
     """One line for each violation, where the first line of the summary does not hold the only one."""
     violations = summary.get("violations") or []
     return tuple(f"violation: {printable(violation)}" for violation in violations) if len(violations) > 1 else ()
+
+
+def _unheard(comms: Mapping[str, Any]) -> str:
+    found = _section(comms, "unheard")
+    return f"; agent-{found['agent']} unheard for {found['longest_s']:.1f} s" if found.get("count") else ""
 
 
 def _deadlocks(summary: Mapping[str, Any]) -> str:

@@ -19,6 +19,7 @@ from pydantic import Field
 from swarmctl.control.arming import ArmingEvidence
 from swarmctl.control.facts import Facts
 from swarmctl.control.mission import Glide, MissionReference, brake_to_rest, glide_to
+from swarmctl.control.overload import Level
 from swarmctl.control.spread import nearest_in_plane_m, room_for
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Command, FlightMode, Landed, Mode, Phase, VehicleState, Verb
@@ -34,6 +35,7 @@ _OURS = (FlightMode.HOLD, FlightMode.TAKEOFF, FlightMode.EXTERNAL)  # modes nobo
 OPERATOR_STOP = "stopped by the operator"
 TAKEN_OVER = "pilot or autopilot took over"
 REBOOTED = "the autopilot rebooted"
+OVERLOADED = "overload: deadlines were missed for too long"
 
 
 class SequenceParams(Params):
@@ -86,7 +88,7 @@ class Sequence:
         self._stop_verb = ""  # land or rtl, from when it is asked for until it is under way
         self.had_control = False
         self.held = False  # by the operator
-        self.waiting = False  # for mute peers
+        self.waiting = False  # for mute peers, or for its processor
         self._bound_for = start_ned_m  # before it had to wait
         self._glide: tuple[Glide, int] | None = None  # and when it began
         self._rejoin: tuple[Glide, int] | None = None  # the same, of the offset to the mission's reference
@@ -140,7 +142,9 @@ class Sequence:
             return []
         if facts.mode is Mode.LAND and self.phase < Phase.LAND:
             self._give_up("no plan for too long", facts, state)
-        self._wait_for_mute_peers(facts, state)
+        if facts.overload is Level.LAND and self.phase < Phase.GOTO_LAND:
+            self._give_up(OVERLOADED, facts, state)
+        self._wait_for_better(facts, state)
         if state.mode is FlightMode.EXTERNAL and Phase.GOTO_START <= self.phase < Phase.LAND:
             self._take_control(facts, state)
         patience_us = self._params.start_timeout_s * 1e6
@@ -219,14 +223,15 @@ class Sequence:
         """Whether the vehicle is on the ground and known to be disarmed."""
         return state.landed is Landed.ON_GROUND and self.arming.is_disarmed(facts, state)
 
-    def _wait_for_mute_peers(self, facts: Facts, state: VehicleState) -> None:
-        """Everybody who loses the bus comes to rest: then what peers assume of each other (braking) holds."""
+    def _wait_for_better(self, facts: Facts, state: VehicleState) -> None:
+        """Who loses the bus comes to rest: then what peers assume (braking) holds. So does who misses its deadlines."""
         flying = self.had_control and Phase.GOTO_START <= self.phase <= Phase.GOTO_LAND
-        if facts.mute and flying and not self.waiting:
+        must_wait = facts.mute or facts.overload >= Level.HOLD
+        if must_wait and flying and not self.waiting:
             self.waiting = True
             self._bound_for = self._glide[0].to_ned_m if self._glide else self._start_ned_m
             self._glide = (self._stop_glide(state), facts.now_us)
-        elif self.waiting and not facts.mute:
+        elif self.waiting and not must_wait:
             self.waiting = False
             if self.phase in (Phase.GOTO_START, Phase.GOTO_LAND):
                 self._glide = (self._way_to(self._bound_for, state), facts.now_us)

@@ -70,6 +70,7 @@ class Dialect:
     hover_parameter: str
     thrust_parameters: tuple[str, ...]  # read and recorded: they say what thrust means
     horizontal_accuracy: str  # message that tells it
+    loss_parameter: str  # how long it waits for setpoints [s]
     heeds_parameter: str = ""  # whose heartbeats its link-loss failsafe counts; "": anybody's
 
     def mode(self, custom_mode: int) -> FlightMode:
@@ -138,7 +139,12 @@ PX4 = Dialect(
     arm_in=None,
     integers_bytewise=True,
     state=(ODOMETRY,),
-    rates_hz={ATTITUDE_TARGET: 5.0, EXTENDED_SYS_STATE: 10.0, CURRENT_MODE: 25.0, ESTIMATOR_STATUS: 1.0},
+    rates_hz={
+        ATTITUDE_TARGET: 5.0,
+        EXTENDED_SYS_STATE: 10.0,
+        CURRENT_MODE: 50.0,  # how often it looks whether the mode has changed; it is sent at 2 Hz and on change
+        ESTIMATOR_STATUS: 1.0,
+    },
     rules=(
         Rule(
             "COM_OBL_RC_ACT",
@@ -160,6 +166,7 @@ PX4 = Dialect(
     hover_parameter="MPC_THR_HOVER",
     thrust_parameters=("THR_MDL_FAC", "MPC_THR_MIN", "MPC_THR_MAX"),
     horizontal_accuracy="ESTIMATOR_STATUS",
+    loss_parameter="COM_OF_LOSS_T",
 )
 ARDUCOPTER = Dialect(
     name="ArduCopter",
@@ -215,6 +222,7 @@ ARDUCOPTER = Dialect(
     hover_parameter="MOT_THST_HOVER",
     thrust_parameters=("MOT_THST_EXPO", "MOT_SPIN_ARM", "MOT_SPIN_MIN", "MOT_SPIN_MAX"),
     horizontal_accuracy="GPS_RAW_INT",  # its EKF's own figures are test ratios, not metres
+    loss_parameter="GUID_TIMEOUT",
     heeds_parameter="SYSID_MYGCS",
 )
 DIALECTS: Mapping[int, Dialect] = {12: PX4, 3: ARDUCOPTER}  # by HEARTBEAT.autopilot

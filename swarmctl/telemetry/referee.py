@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl.core.types import Array, Mode, PlanStatus
+from swarmctl.telemetry.hearing import refused_peers, unheard
 from swarmctl.telemetry.plain import finite, plain
 from swarmctl.telemetry.tracks import (
     Tracks,
@@ -92,7 +93,8 @@ def judge(
     timing, punctual = _judge_timing(run.ticks, rules, speed_factor)
     tracking, tracked_s = _judge_tracking(run, rules.agents, steady_after_s)
     unseen = [] if len(run.truth) else list(_unseen(run.ticks, rules.agents, clock))
-    violations = [*problems, *apart, *clear, *unseen, *punctual, *_not_a_number(run.truth)]
+    refused = _shorten(list(refused_peers(run.events)))
+    violations = [*problems, *apart, *clear, *unseen, *punctual, *refused, *_not_a_number(run.truth)]
     if outcome == "completed":
         violations += _cut_short(tracked_s, rules)
     summary = {
@@ -279,7 +281,7 @@ def _solver(ticks: Mapping[int, NDArray[np.void]], name: str) -> dict[str, Any]:
 
 
 def _comms(run: RunData) -> dict[str, Any]:
-    """Age of the oldest path in use, and what the agents' buses refused (their last `bus_summary` event)."""
+    """Age of the oldest path in use, what the agents' buses refused (their last `bus_summary`), who went unheard."""
     ages = _spread([flight_rows(rows)["path_age_ms"] for rows in run.ticks.values()])
     last = {event.get("source"): event for event in run.events if event.get("event") == "bus_summary"}
     rejected: Counter[str] = Counter()
@@ -287,7 +289,11 @@ def _comms(run: RunData) -> dict[str, Any]:
         reasons = event.get("rejected")
         if isinstance(reasons, dict):
             rejected.update({str(reason): int(n) for reason, n in reasons.items() if finite(n) is not None})
-    return {"path_age_ms": {"p50": ages["p50"], "p99": ages["p99"]}, "rejected": dict(sorted(rejected.items()))}
+    return {
+        "path_age_ms": {"p50": ages["p50"], "p99": ages["p99"]},
+        "rejected": dict(sorted(rejected.items())),
+        "unheard": unheard(run.events),
+    }
 
 
 def _deadlocks(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -293,6 +293,9 @@ def _summary_rows(summary: Mapping[str, Any], rules: Rules | None) -> Iterator[s
     yield _row("age of peers' paths, median / p99", f"{ages} ms")
     refused = ", ".join(f"{reason} {count}" for reason, count in comms["rejected"].items()) or "none"
     yield _row("bus messages refused", refused)
+    if (unheard := comms.get("unheard") or {}).get("count"):
+        lasted = _figure(unheard["longest_s"], "s", 1)
+        yield _row("peers there but unheard, the longest", f"{unheard['count']}, agent-{unheard['agent']} {lasted}")
     if timing["speed_factor"] is not None:
         yield _row("speed", f"{timing['speed_factor']:.1f} x real time")
 

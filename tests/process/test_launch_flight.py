@@ -50,9 +50,9 @@ def ends(code: int, after_s: float = 0.3) -> str:
     return LANDS_ON_SIGTERM + f"time.sleep({after_s}); print('because'); sys.exit({code})"
 
 
-def status_of(agent: int, phase: Phase) -> bytes:
-    said = (Mode.FOLLOW, FlightMode.EXTERNAL, True, Landed.IN_AIR, 0, "", 0.1, 1.0, 2.0, 9, 0, 5.0, 0, "")
-    message = StatusMessage(agent, 1, agent + 1, phase, *said)
+def status_of(agent: int, phase: Phase, utc_us: int) -> bytes:
+    said = (Mode.FOLLOW, FlightMode.EXTERNAL, True, Landed.IN_AIR, 0, "", 0.1, 1.0, 2.0, 9, 0, 5.0, 0, "", False)
+    message = StatusMessage(agent, 1, agent + 1, phase, *said, utc_us)
     return encode_message(message)
 
 
@@ -80,6 +80,8 @@ class Scene(Base):
         self.interrupts = 0
         self.silent: set[int] = set()
         self.orders: list[str] = []
+        self.stamped_us: list[tuple[int, int]] = []  # of each order, by how much it was stamped before we heard it
+        self.behind_us = 0  # by how much the agents' clock is behind ours
         self.obeys = True
         self.phase = Phase.TRACK
         self.act: Callable[[], None] = lambda: None
@@ -108,10 +110,12 @@ class Scene(Base):
         for i, bus in enumerate(self.agents):
             orders = [order for _, payload in bus.receive(COMMAND) if (order := decode_command(payload))]
             self.orders += [order.verb for order in orders]
+            now_us = time.time_ns() // 1000
+            self.stamped_us += [(order.utc_us, now_us - order.utc_us) for order in orders]
             if orders and self.obeys and i not in self.silent:
                 self.children[agent_name(i)].signal(signal.SIGTERM)
             if i not in self.silent and self.children[agent_name(i)].poll() is None:
-                bus.publish(STATUS, status_of(i, self.phase))
+                bus.publish(STATUS, status_of(i, self.phase, now_us - self.behind_us))
         if time.monotonic() - self.began_s > 0.3:
             act, self.act = self.act, lambda: None
             act()
@@ -261,6 +265,18 @@ def test_who_does_not_hear_the_order_is_told_by_signal(tmp_path: Path) -> None:
     verdict = scene.fly()
     assert verdict.problems == []
     assert scene.children["agent-0"].poll() == 130
+    stamps_us = sorted({stamp_us for stamp_us, _ in scene.stamped_us})
+    assert len(stamps_us) >= 2, "stamped anew every time: it would not be valid for long"
+    assert all(age_us < 400_000 for _, age_us in scene.stamped_us)
+
+
+def test_agents_whose_clock_is_an_hour_behind_are_ordered_to_land_by_their_own(tmp_path: Path) -> None:
+    scene = Scene(tmp_path, [FLIES_LONG, FLIES_LONG])
+    scene.obeys, scene.behind_us = False, 3_600_000_000
+    scene.act = lambda: setattr(scene, "interrupts", 1)
+    scene.fly()
+    ages_us = {round(age_us, -6) for _, age_us in scene.stamped_us}
+    assert ages_us == {0, 3_600_000_000}
 
 
 def test_second_interrupt_kills_at_once(tmp_path: Path) -> None:

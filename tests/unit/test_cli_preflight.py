@@ -47,6 +47,7 @@ def test_preflight_holds_the_ports_until_released() -> None:
         assert len(ground.ports) == 3
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as rival, pytest.raises(OSError):
             rival.bind(("127.0.0.1", ground.ports[0]))
+        assert len({sock.getsockname()[1] for sock in (*ground.sockets, *ground.vehicle_sockets)}) == 6
     finally:
         ground.release()
     assert ground.view_port == 0
@@ -125,8 +126,14 @@ def test_command_lines_say_what_the_configuration_says(tmp_path: Path) -> None:
     agents = agent_commands(config, site, held)
     assert [command.name for command in agents] == ["agent-0", "agent-1"]
     assert [command.fds for command in agents] == [(sock.fileno(),) for sock in held]
-    assert "--fd" not in agent_commands(config, site, ())[0].argv
-    for sock in held:
+    assert not {"--fd", "--vehicle-port"} & set(agent_commands(config, site, ())[0].argv)
+    theirs = preflight.claim_ports(2)
+    told = [command.argv[-2:] for command in agent_commands(config, site, held, theirs)]
+    assert told == [("--vehicle-port", f"{sock.getsockname()[1]}") for sock in theirs]
+    inherits = sitl_command(config, site, (1, 2), theirs)
+    assert inherits.fds == tuple(sock.fileno() for sock in theirs)
+    assert inherits.argv[inherits.argv.index("--local-fds") + 1] == ",".join(map(str, inherits.fds))
+    for sock in (*held, *theirs):
         sock.close()
     viewer = viewer_command(config, site, 9876, view=False).argv
     assert "--view" not in viewer

@@ -13,6 +13,7 @@ from sitl.parameters import DEFAULTS as PX4_DEFAULTS
 from swarmctl.config import Config, dump, load
 from swarmctl.errors import EXIT_USAGE, ConfigError
 from swarmctl.links.parameter_kinds import KINDS
+from swarmctl.links.topics import MAX_OBSTACLES
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.toml"))
 
@@ -291,3 +292,19 @@ def test_numbers_survive_exactly(duration_s: float, seed: int) -> None:
 def test_start_line_is_centred_and_spaced() -> None:
     config: Config = load(None, ["swarm.agents=4", "start.spacing_m=2.0", "start.direction_ned=[0.0, 3.0, 0.0]"])
     assert [s[1] for s in config.starts_ned_m()] == [-3.0, -1.0, 1.0, 3.0]
+
+
+def test_more_obstacles_or_farther_ones_than_agents_take_in_are_refused(tmp_path: Path) -> None:
+    ball = "[[obstacles]]\ncenter_ned_m = [1, 2, -3]\n"
+    path = tmp_path / "run.toml"
+    path.write_text(ball * MAX_OBSTACLES)
+    assert len(load(path).obstacles) == MAX_OBSTACLES
+    for text, problem in (
+        (ball * (MAX_OBSTACLES + 1), f"obstacles: 65 are listed, agents keep {MAX_OBSTACLES} at most"),
+        (ball * 20_000, f"obstacles: 20000 are listed, agents keep {MAX_OBSTACLES} at most"),
+        (ball.replace("-3", "-30000.0"), r"obstacles.0.center_ned_m .* within 10000"),
+        (ball + "vel_ned_m_s = [0.0, 1e5, 0.0]\n", r"obstacles.0.vel_ned_m_s .* within 10000"),
+    ):
+        path.write_text(text)
+        with pytest.raises(ConfigError, match=problem):
+            load(path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from swarmctl.control.sequence import OPERATOR_STOP
@@ -100,7 +101,7 @@ def test_a_stop_while_the_state_is_lost_in_flight_begins_when_it_is_back() -> No
 
 def test_land_on_the_way_home_lands_here_and_repeating_it_does_not_begin_again() -> None:
     flight = Flight().until(Phase.TRACK)
-    flight.pos = START + [4.0, 0.0, 0.0]
+    flight.pos = START + np.array([4.0, 0.0, 0.0])
     flight.ask("rtl")
     flight.run(0.5)
     target = flight.sequence._bound_for.copy()

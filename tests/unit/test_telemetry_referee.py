@@ -274,7 +274,49 @@ def test_refused_messages_are_summed_over_each_agents_last_summary() -> None:
         {"source": "agent-1", "event": "other", "rejected": {"stale": 100}},
     ]
     comms = judge(run(APART, events=events), Rules(2, 0.5), "completed")["comms"]
-    assert comms == {"path_age_ms": {"p50": 30.0, "p99": 30.0}, "rejected": {"identity": 1, "stale": 7}}
+    assert comms["path_age_ms"] == {"p50": 30.0, "p99": 30.0}
+    assert comms["rejected"] == {"identity": 1, "stale": 7}
+
+
+def refused(by: int, reason: str, count: int, sender: str = "agent-1", topic: str = "path") -> dict[str, Any]:
+    return {
+        "source": f"agent-{by}",
+        "event": "refused",
+        "sender": sender,
+        "topic": topic,
+        "reason": reason,
+        "count": count,
+    }
+
+
+def test_messages_refused_in_a_peers_name_are_a_violation_and_what_a_network_does_is_not() -> None:
+    network = [refused(0, "late", 4000), refused(0, "replayed", 900), refused(0, "unconfirmed", 70)]
+    clumsy = [refused(0, "malformed", 50), refused(0, "stale_order", 3, "operator", "command")]
+    summary = judge(run(APART, events=network + clumsy), Rules(2, 0.5), "completed")
+    assert (summary["outcome"], summary["violations"]) == ("completed", [])
+    forged = [
+        refused(0, "boot", 1),
+        refused(2, "boot", 3),
+        refused(0, "boot", 2),
+        refused(0, "sequence", 1, topic="status"),
+    ]
+    summary = judge(run(APART, events=network + clumsy + forged), Rules(2, 0.5), "completed")
+    assert summary["outcome"] == "failed"
+    assert summary["violations"] == [
+        "messages in the name of agent-1 were refused (path boot 5, status sequence 1) by agent-0, agent-2"
+    ]
+
+
+def test_who_went_unheard_longest_is_named() -> None:
+    def row(by: int, agent: int, at_s: float, **fields: Any) -> dict[str, Any]:
+        return {"source": f"agent-{by}", "event": "unheard", "agent": agent, "utc_us": round(at_s * 1e6), **fields}
+
+    ended = [row(0, 1, 10.0, begins=True), row(0, 1, 12.0, begins=False, lasted_s=2.5)]
+    comms = judge(run(APART, events=ended), Rules(2, 0.5), "completed")["comms"]
+    assert comms["unheard"] == {"count": 1, "longest_s": 2.5, "agent": 1, "by": "agent-0"}
+    lasting = [row(1, 0, 11.0, begins=True), {"event": "state", "utc_us": 52_000_000}]
+    comms = judge(run(APART, events=ended + lasting), Rules(2, 0.5), "completed")["comms"]
+    assert comms["unheard"] == {"count": 2, "longest_s": 41.0, "agent": 0, "by": "agent-1"}
 
 
 @pytest.mark.parametrize(
@@ -328,4 +370,4 @@ def test_summary_holds_no_nan_and_every_promised_key(data: RunData) -> None:
     assert set(again["obstacles"]) == {"min_clearance_m", "required_m"}
     assert set(again["timing"]) == {"ticks", "due_ticks", "late_ticks", "tick_ms", "solve_ms", "speed_factor"}
     assert set(again["solver"]) >= {"name", "failed", "max_residual_m"}
-    assert set(again["comms"]) == {"path_age_ms", "rejected"}
+    assert set(again["comms"]) == {"path_age_ms", "rejected", "unheard"}

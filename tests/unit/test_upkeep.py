@@ -110,6 +110,8 @@ class Vehicle:
             self._tell(message.param_id)
         elif kind == "PARAM_REQUEST_READ" and message.param_id in self.params:
             self._tell(message.param_id)
+        elif kind == "TIMESYNC" and message.tc1 == 0:
+            self.say(mavlink.MAVLink_timesync_message(self.stamp_us * 1000, message.ts1))
 
     def _from_wire(self, name: str, value: float) -> float:
         if self.autopilot == PX4 and isinstance(self.params[name], int):
@@ -237,7 +239,10 @@ def test_after_a_reboot_everything_is_asked_for_again() -> None:
     vehicle.boot()
     vehicle.params["COM_OBL_RC_ACT"] = 0
     vehicle.rates_hz = {331: 30.0}  # PX4 streams by itself; its clock begins again
-    vehicle.run(0.1)
+    rebooted_us = vehicle.clock.now_us()
+    while vehicle.pilot.clock.boots == 0:
+        vehicle.run(0.02)
+    assert vehicle.clock.now_us() - rebooted_us <= 600_000
     assert not vehicle.upkeep.ready
     assert vehicle.pilot.clock.boots == 1
     assert (vehicle.pilot.landed, vehicle.pilot.offset_ned_m) == (Landed.UNKNOWN, None)
