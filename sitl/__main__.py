@@ -12,7 +12,6 @@ import argparse
 import gc
 import json
 import math
-import os
 import socket
 import sys
 from collections.abc import Callable
@@ -156,7 +155,6 @@ def main(arguments: list[str] | None = None) -> int:
         from swarmctl.lifeline import die_with_parent
 
         die_with_parent()
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: matrices here are far too small to share out
     try:
         return _run(options)
     except SwarmError as error:

@@ -92,6 +92,9 @@ class AutoFlight:
         self._takeoff_z_m = self._return_z_m = self._climb_xy_m = self._goal_ned_m = self._inside_us = None
         self._climbed = False
         self._navigator.engage(estimate, fresh=fresh)
+        if mode == Px4Mode.AUTO_TAKEOFF and self.takeoff_alt_amsl_m is None:
+            height_m = self._parameters.real("MIS_TAKEOFF_ALT")
+            self._say(Severity.INFO, f"Using default takeoff altitude: {height_m:.1f} m\t")
         if mode == Px4Mode.AUTO_MISSION and self.mission_finished:
             self._store.current, self.mission_finished = 0, False
         self._seen_changes = self._store.changes

@@ -7,6 +7,7 @@ mode into one `Command`, from the offboard stream (`setpoints`) or from the AUTO
 from __future__ import annotations
 
 import datetime
+import math
 from collections import Counter, deque
 from collections.abc import Sequence
 
@@ -40,6 +41,8 @@ CHECK_US = 100_000  # grid on which PX4 looks for reasons to act
 RESUME_US = 20_000  # from a resumed stream to OFFBOARD, before the next tick
 DEAD_RECKONING_US = 5_000_000  # EKF2_NOAID_TOUT: so long a position without GPS is believed
 REBOOT_AFTER_US = 400_000  # the acknowledgement gets out first
+REFUSED_EVERY_US = 1_000_000  # a refused mode is not explained more often
+STATUS_EVERY_US = 500_000  # and at once when anything in it changes
 EPOCH_UTC_US = 1_767_225_600_000_000  # 2026-01-01, of flights that have no wall clock
 _HEALTH_TEXT = "Arming denied: Resolve system health failures first\t"
 _LOSS_MODES = {OffboardLoss.LAND: Px4Mode.AUTO_LAND, OffboardLoss.HOLD: Px4Mode.AUTO_LOITER}
@@ -105,6 +108,7 @@ class Autopilot:
         self.watch.reset()
         self._estimate: Estimate | None = None
         self._cause: Cause | None = None
+        self._refused_us = -REFUSED_EVERY_US
         self._armed_us = self._next_check_us = self._aided_us = self._unaided_us = 0
         self._resume_us: int | None = None
         self._delayed: tuple[int, Action] | None = None  # when to do what, after a while in Hold
@@ -133,6 +137,10 @@ class Autopilot:
         """The estimator has settled."""
         return now_us >= self._ekf_ready_us
 
+    def settled_share(self, now_us: int) -> float:
+        """Time since boot over the time the estimator takes until it can be armed."""
+        return now_us / self._ekf_ready_us if self._ekf_ready_us else math.inf
+
     def stream_alive(self, now_us: int) -> bool:
         """A usable setpoint is younger than COM_OF_LOSS_T."""
         return self.stream.age_us(now_us) <= self.parameters.real("COM_OF_LOSS_T") * 1e6
@@ -154,6 +162,11 @@ class Autopilot:
         if self.armed:
             return MavState.CRITICAL if self.failsafe else MavState.ACTIVE
         return MavState.STANDBY if self.armable(now_us) else MavState.UNINIT
+
+    def status(self, now_us: int) -> tuple[object, ...]:
+        """What PX4 publishes of itself, and so may tell: another value each time it is published."""
+        flags = self.armed, self.failsafe, self.system_status(now_us)
+        return now_us // STATUS_EVERY_US, self.mode, self.intended, *flags
 
     def flight_mode(self) -> FlightMode:
         return FLIGHT_MODES.get(self.mode, FlightMode.MANUAL)
@@ -247,21 +260,25 @@ class Autopilot:
             self.mode = self.intended = self._resting_mode
         self.say(Severity.INFO, text)
 
-    def set_mode(self, mode: Px4Mode, now_us: int, takeoff_alt_amsl_m: float | None = None) -> Result:
-        """A commanded mode change; cancels a running failsafe. No takeoff height given: MIS_TAKEOFF_ALT."""
+    def set_mode(
+        self, mode: Px4Mode, now_us: int, takeoff_alt_amsl_m: float | None = None, *, tell: bool = True
+    ) -> Result:
+        """A commanded mode change; cancels a running failsafe.
+
+        No takeoff height given: MIS_TAKEOFF_ALT. `tell`: say why it is refused.
+        """
         if self.terminated:
             return Result.TEMPORARILY_REJECTED
         if self.armed and not self._can_enter(mode, now_us):
-            self.say(Severity.CRITICAL, f"Switching to {MODE_NAMES[mode]} is currently not available\t")
+            if tell and now_us - self._refused_us > REFUSED_EVERY_US:
+                self._refused_us = now_us
+                self.say(Severity.CRITICAL, f"Switching to {MODE_NAMES[mode]} is currently not available\t")
             return Result.TEMPORARILY_REJECTED
         self.intended = mode
         if mode not in NOT_KEPT_AFTER_LANDING:
             self._resting_mode = mode
         if mode == Px4Mode.AUTO_TAKEOFF:
             self.flight.takeoff_alt_amsl_m = takeoff_alt_amsl_m
-            if takeoff_alt_amsl_m is None:
-                height = self.parameters.real("MIS_TAKEOFF_ALT")
-                self.say(Severity.INFO, f"Using default takeoff altitude: {height:.1f} m\t")
         if mode == Px4Mode.AUTO_LAND and self.armed:
             self.say(Severity.INFO, "Landing at current position\t")
         self._clear_failsafe()
@@ -277,9 +294,15 @@ class Autopilot:
 
     def terminate(self) -> Result:
         """MAV_CMD_DO_FLIGHTTERMINATION: motors off until reboot."""
+        if not self.armed:
+            return Result.DENIED
+        self.mode = Px4Mode.TERMINATION
+        self._stop_for_good()
+        return Result.ACCEPTED
+
+    def _stop_for_good(self) -> None:
         self.terminated = True
         self.output = IDLE
-        return Result.ACCEPTED
 
     def request_reboot(self, now_us: int) -> Result:
         """MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN p1=1; the world does it."""
@@ -387,7 +410,7 @@ class Autopilot:
         self.say(Severity.CRITICAL, "Failsafe activated\t")
         if action == Action.TERMINATE:
             self.failsafe = True
-            self.terminate()
+            self._stop_for_good()
         else:
             self._disarm("Disarmed by failsafe\t", keep_mode=True)
 

@@ -17,6 +17,7 @@ CUSTOM_MODE_FLAG = 1
 CHANGE_MODE_FLAG = 1  # of DO_REPOSITION
 Params = tuple[float, float, float, float, float, float, float]
 _MAIN_AUTO, _SUB_MISSION = 4, 4
+_TOLD_WHY = 190  # the component of a ground station: nobody else is told why a mode is refused
 _AFTER_TERMINATION = frozenset(
     {
         mav.MAV_CMD_SET_MESSAGE_INTERVAL,
@@ -30,11 +31,13 @@ _AFTER_TERMINATION = frozenset(
 class Messages(Protocol):
     """What a link can do about messages."""
 
+    sender: tuple[int, int]  # system and component of the command being handled
+
     def set_interval(self, message: int, interval_us: int) -> bool:
         """False: no such message."""
 
-    def request(self, message: int, argument: float) -> None:
-        """Send it once, if it exists."""
+    def request(self, message: int, argument: float) -> bool:
+        """Send it once; False: there is no such message, or nothing to tell in it."""
 
 
 class Commands:
@@ -82,7 +85,7 @@ class Commands:
     # --- flight ---
 
     def _enter(self, mode: Px4Mode) -> Result:
-        return self._autopilot.set_mode(mode, self._now_us)
+        return self._autopilot.set_mode(mode, self._now_us, tell=self._messages.sender[1] == _TOLD_WHY)
 
     def _arm_disarm(self, params: Params) -> Result | None:
         if params[0] == 1.0:
@@ -95,18 +98,22 @@ class Commands:
     def _set_mode(self, params: Params) -> Result:
         base, main, sub = (_whole(p) for p in params[:3])
         if base is None or main is None or not base & CUSTOM_MODE_FLAG:
-            return Result.TEMPORARILY_REJECTED
+            return self._unsupported("base")
         if main == _MAIN_AUTO:
             main |= (sub or _SUB_MISSION) << 8
-        try:
-            mode = Px4Mode(main << 16)
-        except ValueError:
-            return Result.TEMPORARILY_REJECTED
-        return self._enter(mode)
+        mode = main << 16
+        if mode not in MODE_NAMES:
+            return self._unsupported("auto" if main & 0xFF == _MAIN_AUTO else "main")
+        return self._enter(Px4Mode(mode))
+
+    def _unsupported(self, what: str) -> Result:
+        self._autopilot.say(Severity.CRITICAL, f"Unsupported {what} mode\t")
+        return Result.TEMPORARILY_REJECTED
 
     def _takeoff(self, params: Params) -> Result:
         alt_amsl_m = params[6] if math.isfinite(params[6]) else None
-        return self._autopilot.set_mode(Px4Mode.AUTO_TAKEOFF, self._now_us, alt_amsl_m)
+        tell = self._messages.sender[1] == _TOLD_WHY
+        return self._autopilot.set_mode(Px4Mode.AUTO_TAKEOFF, self._now_us, alt_amsl_m, tell=tell)
 
     def _start_mission(self, params: Params) -> Result:
         pilot, first = self._autopilot, _whole(params[0])
@@ -184,8 +191,7 @@ class Commands:
         message = _whole(params[0])
         if message is None:
             return Result.DENIED
-        self._messages.request(message, params[1])
-        return Result.ACCEPTED  # PX4 accepts ids it never sends, too
+        return Result.ACCEPTED if self._messages.request(message, params[1]) else Result.DENIED
 
 
 def _whole(value: float) -> int | None:

@@ -30,6 +30,7 @@ TYPE_GCS = 6
 TEXT_CHARS = 50
 TEXT_MAX_AGE_US = 5_000_000
 TEXT_EVERY_US = 50_000
+GCS_GONE_US = 2_500_000  # without its heartbeat
 BOOT_COMMAND = 211  # PX4 acknowledges it unasked when it has started
 _ACK = KINDS[mav.MAVLINK_MSG_ID_COMMAND_ACK]
 _TEXT = KINDS[mav.MAVLINK_MSG_ID_STATUSTEXT]
@@ -37,6 +38,7 @@ _TIMESYNC = KINDS[mav.MAVLINK_MSG_ID_TIMESYNC]
 _PING = KINDS[mav.MAVLINK_MSG_ID_PING]
 _INTERVAL = KINDS[mav.MAVLINK_MSG_ID_MESSAGE_INTERVAL]
 _AVAILABLE = KINDS[mav.MAVLINK_MSG_ID_AVAILABLE_MODES]
+_CURRENT_MODE = mav.MAVLINK_MSG_ID_CURRENT_MODE
 _ORIGIN = mav.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
 _UNKNOWN_PLACE = 2**31 - 1  # of COMMAND_INT
 
@@ -81,8 +83,10 @@ class Endpoint:
         """As after boot."""
         self._schedule = Schedule(self._step_us, self._default_hz, self._autopilot.boot.quiet_us)
         self._counts = LinkCounts()
-        self._gcs_heard = self._greeted = False
+        self._greeted = False
+        self._gcs_us: int | None = None  # when a ground station was last heard
         self._origin_sent: object = None
+        self._status_sent: tuple[object, ...] = ()
         self._seen: set[tuple[int, int]] = set()
         self._texts: deque[tuple[int, Severity, str]] = deque()
         self._text_id = self._text_due_us = self._now_us = 0
@@ -114,6 +118,7 @@ class Endpoint:
             self._counts.received_bytes += len(datagram.data)
             for frame in frames(datagram.data):
                 self._on_frame(frame)
+        self._autopilot.stream.flown()
 
     def send_due(self, now_us: int) -> None:
         """Send what the schedule, running transfers, or pending texts ask for; `now_us` as in `receive`."""
@@ -189,7 +194,7 @@ class Endpoint:
             return  # our own, echoed
         self._seen.add(self.sender)
         if message.type == TYPE_GCS:
-            self._gcs_heard = True
+            self._gcs_us = self._now_us
             self._autopilot.watch.on_gcs_heartbeat(self._now_us)
         for other in self._others:
             other.transport.send(frame)
@@ -236,15 +241,18 @@ class Endpoint:
         self._schedule.set_interval(message, interval_us, self._now_us)
         return True
 
-    def request(self, message: int, argument: float) -> None:
-        """REQUEST_MESSAGE; what does not exist is not sent."""
+    def request(self, message: int, argument: float) -> bool:
+        """REQUEST_MESSAGE; False when nothing was sent."""
         if message in STREAMS:
-            self._send_streams([message])
-        elif message == mav.MAVLINK_MSG_ID_MESSAGE_INTERVAL and 0 <= argument <= 0xFFFF:
+            return self._send_streams([message]) == 1
+        if message == mav.MAVLINK_MSG_ID_MESSAGE_INTERVAL and 0 <= argument <= 0xFFFF:
             wanted = int(argument)
             self.send(_INTERVAL, self._schedule.interval_us(wanted) if wanted in STREAMS else 0, wanted)
         elif message == mav.MAVLINK_MSG_ID_AVAILABLE_MODES:
             self._send_available_modes(argument)
+        else:
+            return False
+        return True
 
     def _send_available_modes(self, argument: float) -> None:
         """All modes, or the one with that index, from 1 on."""
@@ -266,14 +274,25 @@ class Endpoint:
         self._counts.sent_bytes += len(frame)
         self.transport.send(frame)
 
-    def _send_streams(self, messages: list[int]) -> None:
+    def _send_streams(self, messages: list[int]) -> int:
+        """How many of them there was something to tell in."""
         report = self._report()
         report.counts = self._counts
         placed = self._autopilot.has_position and self._autopilot.ready(self._now_us)
+        told = 0
         for message in messages:
+            if message == _CURRENT_MODE and not self._status_is_new():
+                continue
             stream = STREAMS[message]
             if placed or not stream.needs_position:
                 self.send(KINDS[message], *stream.build(report))
+                told += 1
+        return told
+
+    def _status_is_new(self) -> bool:
+        """PX4 tells its mode when it has published it, twice a second and on change, however often it is asked to."""
+        before, self._status_sent = self._status_sent, self._autopilot.status(self._now_us)
+        return before != self._status_sent
 
     def _send_reached(self) -> None:
         reached = self._autopilot.flight.reached
@@ -287,14 +306,15 @@ class Endpoint:
             other._parameters.send(value)
 
     def _send_texts(self) -> None:
-        """PX4 tells only links with a ground station (HEARTBEAT type 6), at most 20/s, nothing older than 5 s."""
+        """PX4 tells only links with a ground station (HEARTBEAT type 6) now, at most 20/s, nothing older than 5 s."""
         for severity, text in self._autopilot.texts:
             for link in (self, *self._others):
                 link._texts.append((self._now_us, severity, text))
         self._autopilot.texts.clear()
         while self._texts and self._now_us - self._texts[0][0] > TEXT_MAX_AGE_US:
             self._texts.popleft()
-        if not (self._texts and self._gcs_heard and self._now_us >= self._text_due_us):
+        told = self._gcs_us is not None and self._now_us - self._gcs_us <= GCS_GONE_US
+        if not (self._texts and told and self._now_us >= self._text_due_us):
             return
         _, severity, text = self._texts.popleft()
         self._text_due_us = self._now_us + TEXT_EVERY_US

@@ -1,12 +1,14 @@
 """A whole flight in one process on a simulated clock: the real `Agent`, real MAVLink bytes, faster than real time.
 
-Nothing here depends on wall time, so a seed gives the same states bit for bit, in whatever order agents are ticked.
+Nothing here depends on wall time, and `swarmctl.kernels` keeps the processor out of it, so a seed gives the same states
+bit for bit, in whatever order agents are ticked.
 """
 
 from __future__ import annotations
 
 import struct
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -24,6 +26,7 @@ from swarmctl.config import Config
 from swarmctl.core.clock import SimClock
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE, tick_row
 from swarmctl.core.types import TickRecord
+from swarmctl.kernels import why_not_repeatable
 from swarmctl.links import topics
 from swarmctl.links.autopilot import Autopilot
 from swarmctl.links.commands import CodecCommands
@@ -101,6 +104,8 @@ class Lockstep:
         order: Sequence[int] | None = None,
         own: Mapping[int, Config] | None = None,
     ) -> None:
+        if reason := why_not_repeatable():
+            warnings.warn(f"this flight may differ from the same one elsewhere: {reason}", stacklevel=2)
         agents = config.swarm.agents
         self.config = config
         self.clock = SimClock()
@@ -234,6 +239,7 @@ def sitl_params(config: Config) -> SitlParams:
         physics_hz=config.sitl.physics_hz,
         mass_scale=config.sitl.mass_scale,
         start=config.sitl.start,
+        ekf_ready_s=config.sitl.ekf_ready_s,
         estimator=config.sitl.estimator,
         autopilot_kind=config.sitl.autopilot_kind,
         reject_bad_setpoints=config.sitl.reject_bad_setpoints,

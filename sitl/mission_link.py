@@ -111,8 +111,7 @@ class MissionLink:
         """MISSION_REQUEST_INT, or the older MISSION_REQUEST, which gets a MISSION_ITEM."""
         items = self._store.items.get(m.mission_type, ())
         if m.seq >= len(items):
-            self._acknowledge(MissionResult.INVALID_SEQUENCE, m.mission_type)
-            return
+            return  # PX4 answers nothing
         item = items[m.seq]
         current = int(m.mission_type == MISSION and m.seq == self._store.current)
         tail = m.seq, item.command, *self._link.sender

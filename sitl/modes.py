@@ -25,6 +25,7 @@ class Px4Mode(enum.IntEnum):
     ACRO = _main(5)
     OFFBOARD = _main(6)
     STABILIZED = _main(7)
+    TERMINATION = _main(10)
 
 
 MODE_NAMES = {  # as PX4 refuses them

@@ -43,7 +43,7 @@ class OffboardStream:
     def reset(self) -> None:
         """As after boot."""
         self.command = IDLE
-        self.seen = self.poisoned = False
+        self.seen = self.poisoned = self._bad = False
         self.echo: tuple[Sequence[float], float, Triple] = (_LEVEL, 0.0, _NO_RATES)
         self._last_us: int | None = None
 
@@ -90,11 +90,17 @@ class OffboardStream:
             self.echo = _LEVEL, abs(thrust_01), asked
             return
         size = math.sqrt(sum(c * c for c in q_nb))
-        self.poisoned = self.poisoned or not (math.isfinite(size) and size > 0.0)
-        q_unit = IDLE.q_nb if self.poisoned else np.array(q_nb, dtype=np.float64) / size
+        self._bad = not (math.isfinite(size) and size > 0.0)
+        loose = self.poisoned or self._bad
+        q_unit = IDLE.q_nb if loose else np.array(q_nb, dtype=np.float64) / size
         feed = _feed(type_mask, rates)
-        self.command = Command(q_unit, thrust, feed_frd_rad_s=feed, stopped=stopped, loose=self.poisoned)
+        self.command = Command(q_unit, thrust, feed_frd_rad_s=feed, stopped=stopped, loose=loose)
         self.echo = q_nb, abs(thrust_01), _NO_RATES
+
+    def flown(self) -> None:
+        """The attitude controller takes the newest setpoint; what came just before that one never reaches it."""
+        self.poisoned = self.poisoned or self._bad
+        self._bad = False
 
     def spoiled(self, command: Command) -> Command:
         """A command of any mode as a poisoned attitude controller flies it: thrust, but no torque."""

@@ -18,6 +18,7 @@ from sitl.navigator import IDLE
 from sitl.sensors import Estimate, LocalOrigin
 
 FRAME_LOCAL_NED = 1
+PROTOCOL_VERSION = 300
 REST_FORCE_M_S2 = (0.0, 0.0, -9.81)
 Fields = tuple[Any, ...]
 NAN = math.nan
@@ -215,11 +216,16 @@ def time_estimates(r: Report) -> Fields:
 
 
 def autopilot_version(r: Report) -> Fields:
-    version, none = 0x01120000, (0,) * 8
-    uid = r.autopilot.parameters.integer("MAV_SYS_ID")
+    version, none = 0x01120080, (0,) * 8  # 1.18.0 beta
+    uid = r.autopilot.parameters.integer("MAV_SYS_ID") - 1  # in simulation it is the instance's number
     return 59647, uid, version, version, 0, 1, 0, 0, *_HASH, *_HASH, *none, *(0,) * 18
 
 
+def protocol_version(_: Report) -> Fields:
+    return 200, 100, 203, *(0,) * 8, *_LIBRARY_HASH
+
+
+_LIBRARY_HASH = tuple(bytes.fromhex("447729498e1fcbf9"))
 _HASH = tuple(reversed(bytes.fromhex("83c4f4e580000000")))  # of the release that was measured
 
 
@@ -269,4 +275,5 @@ FLIGHT_STREAMS: dict[int, Stream] = {
     mav.MAVLINK_MSG_ID_MISSION_CURRENT: Stream(mission_current),
     380: Stream(time_estimates),
     mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION: Stream(autopilot_version),
+    PROTOCOL_VERSION: Stream(protocol_version),
 }

@@ -7,16 +7,16 @@ import math
 from pymavlink.dialects.v20 import development as mav
 
 from sitl.schedule import CURRENT_EVENT_SEQUENCE, ESC_INFO, ESC_STATUS, LINK_NODE_STATUS, SENSOR_FUSION
+from sitl.settling import claimed
 from sitl.streams import FLIGHT_STREAMS, NAN, Fields, LinkCounts, Report, Stream, home_z_m, int32, ms
 
-_SENSORS_PRESENT = 0x0200C02F
-_SENSORS_ENABLED = 0x0201C02F
+_SENSORS_PRESENT = 0x0300C02F
+_SENSORS_ENABLED = 0x0301C02F
 _SENSORS_HEALTHY = 0x0320C83F
 _SENSOR_GPS = 0x20
 _SENSOR_BATTERY = 0x02000000
 _PREARM_CHECK = 0x10000000
 _CELLS = 4
-_EVERYTHING_ESTIMATED = 1023
 _POSITION_ESTIMATED = 0x0008 | 0x0010 | 0x0100 | 0x0200  # horizontal relative, absolute, and both predicted
 _EARTH_FIELD_NED_GAUSS = (0.214, 0.011, 0.430)  # central Europe
 _SEA_LEVEL_HPA, _SEA_LEVEL_K, _LAPSE_K_M, _EXPONENT = 1013.25, 288.15, 0.0065, 5.25588
@@ -126,9 +126,12 @@ def vibration(r: Report) -> Fields:
 
 
 def estimator_status(r: Report) -> Fields:
-    e = r.estimate
-    flags = _EVERYTHING_ESTIMATED if r.autopilot.has_position else _EVERYTHING_ESTIMATED & ~_POSITION_ESTIMATED
-    return e.t_us, 0.02, 0.02, 0.02, 0.01, 0.0, NAN, *e.pos_accuracy_m, flags
+    e, pilot = r.estimate, r.autopilot
+    horizontal_m, vertical_m = e.pos_accuracy_m
+    horizontal_m, flags = claimed(horizontal_m, pilot.settled_share(e.t_us))
+    if not pilot.has_position:
+        flags &= ~_POSITION_ESTIMATED
+    return e.t_us, 0.02, 0.02, 0.02, 0.01, 0.0, NAN, horizontal_m, vertical_m, flags
 
 
 def sensor_fusion(r: Report) -> Fields:

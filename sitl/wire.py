@@ -1,6 +1,6 @@
 """MAVLink frames of the simulator: packed straight from tuples, and cut out of what arrives.
 
-A dialect object costs 5-40 us to pack, a tuple about 2: one core has to carry 25,000 messages a second. PX4 sends seven
+A dialect object costs 5-40 us to pack, a tuple about 2: one core has to carry 25,000 messages a second. PX4 sends eight
 messages the dialect module lacks; they are defined here. `tests/unit/test_sitl_wire.py` checks all against pymavlink.
 """
 
@@ -68,6 +68,18 @@ LACKING: dict[int, tuple[str, str, int, tuple[str, ...]]] = {
         "<Q4i4f4fB",
         10,
         ("uint64_t time_usec", "int32_t rpm 4", "float voltage 4", "float current 4", "uint8_t index"),
+    ),
+    300: (
+        "PROTOCOL_VERSION",
+        "<HHH8B8B",
+        217,
+        (
+            "uint16_t version",
+            "uint16_t min_version",
+            "uint16_t max_version",
+            "uint8_t spec_version_hash 8",
+            "uint8_t library_version_hash 8",
+        ),
     ),
     380: (
         "TIME_ESTIMATE_TO_TARGET",

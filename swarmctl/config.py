@@ -25,7 +25,7 @@ from swarmctl.core.params import Params, Vec3
 from swarmctl.core.simulated import RealismParams
 from swarmctl.core.text import printable
 from swarmctl.errors import ConfigError
-from swarmctl.links.parameter_kinds import parameter_problems
+from swarmctl.links.parameter_names import parameter_problems
 from swarmctl.links.topics import MAX_OBSTACLE_M, MAX_OBSTACLES
 from swarmctl.links.transport import Endpoint, parse_url
 from swarmctl.telemetry.referee import ObstacleRule, Rules
@@ -71,6 +71,7 @@ class SitlParams(RealismParams):
     attitude_gains: Literal["swarm", "single", "pid_step", "pid_trajectory"] = "swarm"  # of the thesis airframe
     ground_z_m: float = Field(2.0, ge=-1000, le=1000)  # height of the ground below the shared origin, NED z
     start: Literal["ground", "air"] = "ground"  # air: held at the start position, no ground anywhere (thesis)
+    ekf_ready_s: float = Field(1.0, ge=0, le=60)  # from its start until it can be armed; PX4 takes 4
     mass_scale: float = Field(1.0, ge=0.3, le=1.9)  # true mass over the preset's, unknown to the bridge
     estimator: Literal["exact", "gps", "external"] = "exact"  # what the autopilots' estimates are off by
     autopilot_kind: Literal["px4", "arducopter"] = "px4"  # whose face the simulator shows
@@ -289,8 +290,8 @@ def _whole(config: Config) -> Iterator[str]:
     elif not (listed and listed < agents):
         yield from _starts_apart(config)
     yield from _vehicle_problems(config)
-    yield from parameter_problems(config.agent.autopilot_params)
     yield from _obstacle_problems(config)
+    yield from parameter_problems(config.agent.autopilot_params)
     if config.sitl.speed != 1.0:
         yield (
             f"sitl.speed = {config.sitl.speed}: agents fly on wall time and can't follow; leave it at 1. Faster than "

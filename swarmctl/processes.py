@@ -34,7 +34,6 @@ from swarmctl.toml_text import toml_value
 ROUTER = "router"
 SITL = "sitl"
 VIEWER = "viewer"
-_ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS", "RAYON_NUM_THREADS")
 _TAIL_BYTES = 4096
 
 
@@ -98,7 +97,7 @@ def sitl_command(config: Config, site: Site, ports: Sequence[int], sockets: Sequ
         starts = tuple((x, y, sitl.ground_z_m) for x, y, _ in starts)
     argv = _python("-m", "sitl", "--vehicles", f"{swarm.agents}", "--preset", sitl.preset)
     argv += ("--attitude-gains", sitl.attitude_gains, "--estimator", sitl.estimator)
-    argv += ("--autopilot", sitl.autopilot_kind)
+    argv += ("--autopilot", sitl.autopilot_kind, "--ekf-ready", f"{sitl.ekf_ready_s!r}")
     argv += ("--gcs-port", f"{sitl.gcs_port}") if sitl.gcs_port else ()
     argv += () if sitl.reject_bad_setpoints else ("--accept-bad-setpoints",)
     argv += ("--spawn=" + ";".join(",".join(repr(c) for c in start) for start in starts),)
@@ -256,6 +255,5 @@ def kill_all(children: Sequence[Child]) -> None:
 
 
 def _environment(base: Mapping[str, str]) -> dict[str, str]:
-    """One thread per process for linear algebra: N agents share the cores, and small problems only lose by more."""
-    fixed = dict.fromkeys(_ONE_THREAD, "1")
-    return {**base, **fixed, "PYTHONUNBUFFERED": "1", PARENT_ENV: str(os.getpid())}
+    """One thread for what rerun shares out, as `kernels` has for linear algebra: N agents share the cores."""
+    return {**base, "RAYON_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1", PARENT_ENV: str(os.getpid())}

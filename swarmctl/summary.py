@@ -109,15 +109,15 @@ def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...
     )
 
 
+def _unheard(comms: Mapping[str, Any]) -> str:
+    found = _section(comms, "unheard")
+    return f"; agent-{found['agent']} unheard for {found['longest_s']:.1f} s" if found.get("count") else ""
+
+
 def violation_lines(summary: Mapping[str, Any]) -> tuple[str, ...]:
     """One line for each violation, where the first line of the summary does not hold the only one."""
     violations = summary.get("violations") or []
     return tuple(f"violation: {printable(violation)}" for violation in violations) if len(violations) > 1 else ()
-
-
-def _unheard(comms: Mapping[str, Any]) -> str:
-    found = _section(comms, "unheard")
-    return f"; agent-{found['agent']} unheard for {found['longest_s']:.1f} s" if found.get("count") else ""
 
 
 def _deadlocks(summary: Mapping[str, Any]) -> str:

@@ -10,9 +10,6 @@ flight. Writes `bench.json`, a list of rows of five keys.
 
 from __future__ import annotations
 
-import sitl.experiments.one_thread  # noqa: F401
-
-# isort: split
 import argparse
 import json
 import os

@@ -128,7 +128,8 @@ class Judge:
             nonlocal looked
             news = self._seen(step.name, step.link, forwarded=step.forwarded)
             new, looked = news[looked:], len(news)
-            return any(a.t_s >= after_s - 1e-9 and (not step.fields or matches(a.message, step.fields)) for a in new)
+            late = [a for a in new if not step.not_before_s or a.t_s >= after_s - 1e-9]
+            return any(not step.fields or matches(a.message, step.fields) for a in late)
 
         if not self._d.run_until(met, step.within_s):
             instead = self._instead(self._seen(step.name, step.link), step.fields)

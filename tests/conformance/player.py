@@ -25,7 +25,7 @@ NO_AUTO_DISARM = {"COM_DISARM_PRFLT": -1.0}
 CLIMB_01, CLIMB_S, CALM_S = 0.7, 1.0, 0.8  # drag brings the climb to rest at about 4 m
 CALM_M_S = 0.3
 STREAM_GONE_S = 1.2  # COM_OF_LOSS_T, and when that is looked at
-IN_AIR, LOW_M, HIGH_M = 2, 2.5, 15.0
+IN_AIR, LOW_M, HIGH_M = 2, 2.5, 8.0
 ARMED_FLAG, PREARM_BIT = 128, 0x10000000
 
 
@@ -112,7 +112,7 @@ class Player:
     def _land_and_disarm(self) -> None:
         if not self._say(v.disarm()):
             self._say(v.go(4, 6))
-        self._wait(lambda: not self._armed(), 60.0, "not landed and disarmed")
+        self._wait(lambda: not self._armed(), 120.0, "not landed and disarmed")
 
     def _say(self, command: v.Command) -> bool:
         """A command whose refusal is no deviation; whether it was accepted."""
@@ -171,7 +171,7 @@ class Player:
             self.dialogue.stop()
         self.dialogue.set_mark()
         calm = near(0.0, CALM_M_S)
-        self._judge.judge(v.sees("LOCAL_POSITION_NED", 10.0, vx=calm, vy=calm, vz=calm))
+        self._judge.judge(v.sees("LOCAL_POSITION_NED", 20.0, vx=calm, vy=calm, vz=calm))
         if start is v.State.OFFBOARD:
             self._judge.judge(v.Stream(v.setpoint(v.HOVER_01)))
             self._judge.judge(v.go(6))

@@ -8,6 +8,7 @@ from tests.conformance.vocabulary import (
     ARM_DISARM,
     CRITICAL,
     FORCE,
+    GCS_LINK,
     INFO,
     LAND,
     M_LAND,
@@ -18,6 +19,7 @@ from tests.conformance.vocabulary import (
     NAN,
     NO_ACK,
     RTL,
+    SET_MODE,
     TAKEOFF,
     TEMPORARILY_REJECTED,
     UNSUPPORTED,
@@ -49,9 +51,13 @@ from tests.conformance.vocabulary import (
 STATE, ARMING, REFUSALS = "2 state", "3", "5"
 ALL_NAN = (NAN,) * 7
 DENIED_HEALTH = Says("Arming denied: Resolve system health failures first\t", CRITICAL)
-NO_HEADING = Says("Preflight Fail: no heading reference", CRITICAL, 0.8)
 PREARM = 0x10000000
 EXTENDED = "EXTENDED_SYS_STATE"
+
+
+def refused_mode(main: int, sub: int = 0) -> Command:
+    """DO_SET_MODE from the ground station: only to its component is told why it is refused."""
+    return Command(SET_MODE, (1, main, sub), TEMPORARILY_REJECTED, link=GCS_LINK)
 
 
 def unavailable(name: str) -> Says:
@@ -60,10 +66,10 @@ def unavailable(name: str) -> Says:
 
 ARMING_ROWS = (
     Row(
-        "arming is refused before the estimator is ready, with two texts",
+        "arming is refused before the estimator is ready, with a text",
         REFUSALS,
         State.BOOTING,
-        (At(2.9), arm(TEMPORARILY_REJECTED), DENIED_HEALTH, NO_HEADING),
+        (At(2.9), arm(TEMPORARILY_REJECTED), DENIED_HEALTH),
     ),
     Row(
         "arming is refused 3.5 s after start and accepted at 4.2 s",
@@ -85,8 +91,8 @@ ARMING_ROWS = (
         State.ARMABLE,
         (
             Command(TAKEOFF, ALL_NAN),
-            Says("Using default takeoff altitude: 2.5 m\t", INFO),
             arm(),
+            Says("Using default takeoff altitude: 2.5 m\t", INFO),
             Turns(3, 1.3, 2.7, EXTENDED, "landed_state"),
             Says("Takeoff detected\t", INFO, 3.5),
             Turns(M_LOITER, 6.3, 9.3),
@@ -117,7 +123,7 @@ ARMING_ROWS = (
             Passes(EXTENDED, "landed_state", (1, 3, 2), 12.0),
             Command(LAND),
             Says("Landing at current position\t", INFO),
-            Says("Landing detected\t", INFO, 10.0),
+            Says("Landing detected\t", INFO, 15.0),
             Passes(EXTENDED, "landed_state", (4, 1), 10.0),
             Mark(),
             Says("Disarmed by landing\t", INFO, 3.6),
@@ -241,22 +247,29 @@ REFUSAL_ROWS = (
             f"{name} is refused armed",
             REFUSALS,
             State.LOITER,
-            (Wait(1.2), go(main, sub, ack=TEMPORARILY_REJECTED), unavailable(name), mode(M_LOITER)),
+            (Wait(1.2), refused_mode(main, sub), unavailable(name), mode(M_LOITER)),
+            needs_gcs=True,
         )
         for name, main, sub in (("Offboard", 6, 0), ("Position", 3, 0), ("Acro", 5, 0), ("Mission", 4, 4))
     ),
     Row("POSCTL is accepted disarmed without radio", REFUSALS, State.ARMABLE, (go(3, ack=ACCEPTED), mode(M_POSCTL))),
     Row(
-        "main mode 99 is refused without a text",
+        "why a mode is refused is not told to an onboard computer",
         REFUSALS,
-        State.ARMABLE,
-        (go(99, ack=TEMPORARILY_REJECTED), SaysNothing(), mode(M_LOITER)),
+        State.LOITER,
+        (Wait(1.2), go(6, ack=TEMPORARILY_REJECTED), SaysNothing(), mode(M_LOITER)),
     ),
     Row(
-        "a mode without the custom flag is refused without a text",
+        "main mode 99 is refused",
         REFUSALS,
         State.ARMABLE,
-        (go(4, 5, ack=TEMPORARILY_REJECTED, flag=0), SaysNothing(), mode(M_LOITER)),
+        (go(99, ack=TEMPORARILY_REJECTED), Says("Unsupported main mode\t", CRITICAL), mode(M_LOITER)),
+    ),
+    Row(
+        "a mode without the custom flag is refused",
+        REFUSALS,
+        State.ARMABLE,
+        (go(4, 5, ack=TEMPORARILY_REJECTED, flag=0), Says("Unsupported base mode\t", CRITICAL), mode(M_LOITER)),
     ),
     *(
         Row(

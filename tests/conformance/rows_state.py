@@ -4,19 +4,20 @@ from __future__ import annotations
 
 from tests.conformance.fields import Between, Bits, NotANumber
 from tests.conformance.vocabulary import (
+    DENIED,
     M_LAND,
     M_LOITER,
     M_OFFBOARD,
     M_POSCTL,
     M_RTL,
     M_TAKEOFF,
+    M_TERMINATION,
     NAN,
     TAKEOFF,
     TERMINATE,
     Command,
     First,
     Mark,
-    Passes,
     Row,
     State,
     Stop,
@@ -26,6 +27,7 @@ from tests.conformance.vocabulary import (
     always,
     go,
     heartbeat,
+    never,
     sees,
     setpoint,
 )
@@ -96,11 +98,17 @@ STATE_ROWS = (
         (go(3), heartbeat(base_mode=81, custom_mode=M_POSCTL, system_status=0)),
     ),
     Row(
-        "flight termination: status 8, the mode stays",
+        "flight termination: status 8 and a mode of its own",
         STATE,
         State.ARMED,
-        (Command(TERMINATE, (1.0,)), heartbeat(custom_mode=M_LOITER, system_status=8)),
+        (Command(TERMINATE, (1.0,)), heartbeat(custom_mode=M_TERMINATION, system_status=8)),
         spoils=True,
+    ),
+    Row(
+        "flight termination is denied disarmed",
+        STATE,
+        State.ARMABLE,
+        (Command(TERMINATE, (1.0,), DENIED), heartbeat(base_mode=29, custom_mode=M_LOITER, system_status=3)),
     ),
     Row(
         "CURRENT_MODE shows a change within 30 ms, HEARTBEAT within 1 s",
@@ -115,12 +123,12 @@ STATE_ROWS = (
         (
             sees(
                 "SYS_STATUS",
-                onboard_control_sensors_present=0x0200C02F,
-                onboard_control_sensors_enabled=0x0201C02F,
+                onboard_control_sensors_present=Bits(0x0200C02F, ~0x0300C02F),  # and while it logs, the logger
+                onboard_control_sensors_enabled=Bits(0x0201C02F, ~0x0301C02F),
                 onboard_control_sensors_health=0x1320C83F,
                 voltage_battery=16200,
                 current_battery=-1,
-                battery_remaining=100,
+                battery_remaining=Between(50, 100),
             ),
         ),
     ),
@@ -168,7 +176,12 @@ STATE_ROWS = (
         "OFFBOARD goes from ground to air within 0.1 s of lift-off thrust, by way of nothing",
         STATE,
         State.GROUND_OFFBOARD,
-        (Stream(setpoint(0.7)), Passes(EXTENDED, "landed_state", (1, 2), 0.12), Stream(setpoint(0.0))),
+        (
+            Stream(setpoint(0.7)),
+            Turns(2, 0.0, 0.12, EXTENDED, "landed_state"),
+            never(EXTENDED, 0.3, landed_state=3),
+            Stream(setpoint(0.0)),
+        ),
     ),
 )
 

@@ -37,6 +37,7 @@ def custom_mode(main: int, sub: int = 0) -> int:
 
 
 M_MANUAL, M_ALTCTL, M_POSCTL, M_ACRO, M_OFFBOARD, M_STAB = (custom_mode(n) for n in (1, 2, 3, 5, 6, 7))
+M_TERMINATION = custom_mode(10)
 M_TAKEOFF, M_LOITER, M_MISSION, M_RTL, M_LAND = (custom_mode(4, n) for n in (2, 3, 4, 5, 6))
 
 
@@ -330,8 +331,8 @@ def heartbeat(within_s: float = 1.2, **fields: Any) -> Sees:
     return Sees("HEARTBEAT", fields, within_s)
 
 
-def mode(value: int, intended: int | None = None, within_s: float = 0.15) -> Sees:
-    """The mode as CURRENT_MODE shows it, at 100 Hz."""
+def mode(value: int, intended: int | None = None, within_s: float = 0.6) -> Sees:
+    """The mode as CURRENT_MODE shows it: twice a second, and at once on a change."""
     return Sees("CURRENT_MODE", {"custom_mode": value, "intended_custom_mode": intended or value}, within_s)
 
 
@@ -349,6 +350,7 @@ class Row:
         never_streamed: needs a vehicle that has had no setpoint since its start.
         needs_gcs: needs the second link.
         not_by_url: why it can't be played against a vehicle given by URL; empty when it can.
+        real_px4: why a real one may answer otherwise, where that is no fault of the row; empty where it must not.
     """
 
     name: str
@@ -360,6 +362,7 @@ class Row:
     never_streamed: bool = False
     needs_gcs: bool = False
     not_by_url: str = ""
+    real_px4: str = ""
 
     @property
     def needs_reboot(self) -> bool:

@@ -26,7 +26,7 @@ from swarmctl.links.mavlink import Codec, frames
 pytestmark = pytest.mark.process
 
 ROOT = Path(__file__).resolve().parents[2]
-ENV = {**os.environ, "PYTHONPATH": str(ROOT), "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
+ENV = {**os.environ, "PYTHONPATH": str(ROOT)}
 QUICK_S = 1.0
 
 

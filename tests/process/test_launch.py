@@ -38,13 +38,15 @@ AIR = (*STAY, "--set", "sitl.start=air", "--set", PATIENT)  # neither taken off 
 class Launched:
     """One `swarmctl launch`; its temporary files are in a folder of their own, so that leftovers show."""
 
+    prefix: tuple[str, ...] = ()  # of the command line
+
     def __init__(self, run_dir: Path, temp: Path, *arguments: str) -> None:
         self.run_dir = run_dir
         self.temp = temp
         self.env = {**os.environ, "TMPDIR": str(temp), "XDG_RUNTIME_DIR": ""}
         self.env.pop("DISPLAY", None)
         self.out = run_dir.with_suffix(".out")
-        command = [sys.executable, "-m", "swarmctl", "launch", *arguments, "--run-dir", str(run_dir)]
+        command = [*self.prefix, sys.executable, "-m", "swarmctl", "launch", *arguments, "--run-dir", str(run_dir)]
         with self.out.open("w") as out:
             self.process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, env=self.env, cwd=ROOT)
 

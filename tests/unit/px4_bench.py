@@ -20,6 +20,7 @@ from swarmctl.links.transport import pipe_pair
 NAN = math.nan
 LEVEL = [1.0, 0.0, 0.0, 0.0]
 HOVER = 9.81 / 20.0
+GROUND_STATION = 190
 SPAWN_NED_M = (1.0, 2.0, 0.5)
 COARSE: dict[str, Any] = {"physics_hz": 100}  # long flights, where only the autopilot's rate matters
 
@@ -117,6 +118,11 @@ class Bench:
 
     def mode(self, main: int, sub: int = 0) -> int | None:
         return self.command(176, 1, main, sub)
+
+    def as_ground_station(self) -> Bench:
+        """From now on this end speaks as a ground station, which is told why a mode is refused."""
+        self.codec = Codec(1, GROUND_STATION)
+        return self
 
     def texts(self) -> list[str]:
         return [text for _, text in self.pilot.texts] + [t for _, _, t in self.endpoint._texts]

@@ -9,10 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sitl.parameters import DEFAULTS as PX4_DEFAULTS
 from swarmctl.config import Config, dump, load
 from swarmctl.errors import EXIT_USAGE, ConfigError
-from swarmctl.links.parameter_kinds import KINDS
 from swarmctl.links.topics import MAX_OBSTACLES
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.toml"))
@@ -76,8 +74,6 @@ def test_defaults_are_the_thesis_circle_with_three_agents() -> None:
         ("seed.x=1", ("no such place",)),
         ("agents=5", ("agents = 5", "unknown key", "'swarm.agents'")),
         ("swarm.preset='x500'", ("unknown key", "'sitl.preset'")),
-        ("agent.autopilot_params.COM_OF_LOSS_T=10", ("COM_OF_LOSS_T = 10", "float", "write 10.0")),
-        ("agent.autopilot_params.COM_OBL_RC_ACT=4.0", ("COM_OBL_RC_ACT = 4.0", "integer", "write 4")),
         ("agent.autopilot_params.COM_OBL_RC_ACT=4294967296", ("COM_OBL_RC_ACT = 4294967296", "2147483647")),
         ("agent.autopilot_params.MPC_THR_HOVER=1e39", ("MPC_THR_HOVER = 1e+39", "3.40282e+38")),
         (f"agent.autopilot_params.{'X' * 17}=1", ("no MAVLink parameter name", "1 to 16 letters")),
@@ -275,11 +271,6 @@ def test_what_is_no_file_is_refused_at_once(tmp_path: Path) -> None:
     good = file_with(tmp_path, "seed = 3")
     (tmp_path / "mine").symlink_to(good)
     assert load(tmp_path / "mine").seed == 3
-
-
-def test_kinds_of_parameters_are_those_of_the_simulator() -> None:
-    for name, kind in KINDS.items():
-        assert type(PX4_DEFAULTS[name]) is kind, name
 
 
 @given(st.floats(min_value=1e-3, max_value=36000), st.integers(0, 2**31 - 1))

@@ -86,7 +86,7 @@ def test_preflight_disarm(limit_s: float) -> None:
 
 
 def test_offboard_armed_needs_a_stream() -> None:
-    bench = Bench()
+    bench = Bench().as_ground_station()
     bench.arm()
     assert bench.mode(6) == Result.TEMPORARILY_REJECTED
     assert any("Offboard is currently not available" in t for t in bench.texts())

@@ -187,7 +187,7 @@ def test_health_shows_when_arming_would_be_accepted() -> None:
     assert not first.onboard_control_sensors_health & 0x10000000
     ready = of("SYS_STATUS", client.run(1.5))[-1]
     assert ready.onboard_control_sensors_health == 0x1320C83F
-    assert ready.onboard_control_sensors_present == 0x0200C02F
+    assert ready.onboard_control_sensors_present == 0x0300C02F
 
 
 @pytest.mark.parametrize(("message", "name"), [(148, "AUTOPILOT_VERSION"), (242, "HOME_POSITION")])

@@ -172,10 +172,16 @@ def test_the_local_frame_begins_where_it_boots() -> None:
     assert bench.said(mav.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)[-1].latitude == after.lat_e7
 
 
-@pytest.mark.parametrize(("reject_bad", "poisoned"), [(True, False), (False, True)])
-def test_one_bad_quaternion_poisons_until_reboot_unless_refused(reject_bad: bool, poisoned: bool) -> None:
+@pytest.mark.parametrize(
+    ("reject_bad", "alone_s", "poisoned"), [(True, 0.02, False), (False, 0.02, True), (False, 0.0, False)]
+)
+def test_one_bad_quaternion_poisons_until_reboot_unless_refused_or_followed_at_once(
+    reject_bad: bool, alone_s: float, poisoned: bool
+) -> None:
     bench = Bench("x500", **COARSE, reject_bad_setpoints=reject_bad).in_offboard(height_m=3.0)
     bench.setpoint(q=[0.0] * 4)
+    if alone_s:
+        bench.run(alone_s)
     bench.run(0.1, 50)
     bench.mode(4, 3)
     wind = 3.0

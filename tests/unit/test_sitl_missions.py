@@ -118,13 +118,20 @@ def test_transfers_that_can_not_be() -> None:
     for message, result in (
         (mav.MAVLink_mission_count_message(1, 1, 60000, MISSION), 4),
         (mav.MAVLink_mission_count_message(1, 1, 1, 77), 3),
-        (mav.MAVLink_mission_request_int_message(1, 1, 5, MISSION), 13),
         (item(bench, 0, 16), 1),  # nobody asked for it
     ):
         bench.forget()
         bench.send(message)
         bench.run(0.01)
         assert [m.type for m in bench.said(ACK)] == [result]
+
+
+def test_an_item_that_is_not_there_is_not_answered() -> None:
+    bench = Bench()
+    bench.forget()
+    bench.send(mav.MAVLink_mission_request_int_message(1, 1, 5, MISSION))
+    bench.run(0.3)
+    assert not bench.said(ACK)
 
 
 def test_an_upload_asks_again_and_gives_up() -> None:
@@ -186,7 +193,7 @@ def test_the_current_item_can_be_chosen_in_flight() -> None:
 
 
 def test_no_mission_no_mission_mode() -> None:
-    bench = taken_off()
+    bench = taken_off().as_ground_station()
     assert bench.mode(4, 4) == Result.TEMPORARILY_REJECTED
     assert "Switching to Mission is currently not available\t" in bench.texts()
     assert bench.command(300, 0, 0) == Result.DENIED
@@ -331,7 +338,7 @@ def test_a_lost_ground_station_acts_as_told(action: int, mode: Px4Mode) -> None:
 
 
 def test_without_a_position_auto_descends_and_offboard_goes_on() -> None:
-    bench = taken_off("x500")
+    bench = taken_off("x500").as_ground_station()
     bench.pilot.position_ok = False
     bench.run(1.0)
     assert (bench.pilot.mode, bench.pilot.failsafe) == (LAND, True)

@@ -1,0 +1,170 @@
+"""Real autopilots in their own simulators: N processes of somebody's build, on their usual ports.
+
+A build is found by an environment variable; `docs/real_autopilots.md` says how.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import subprocess
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from swarmctl.core.types import GeoOrigin
+from swarmctl.lifeline import die_with_parent
+from tests.real.network import Network
+
+SPACING_M = 2.0  # apart along north, about the origin
+EARTH_RADIUS_M = 6_371_000.0
+STOP_S = 5.0
+PARAMETER_FILES = ("copter.parm", "../../../Tools/autotest/default_params/copter.parm")  # beside it; of a source tree
+
+
+@dataclass(frozen=True, slots=True)
+class Start:
+    """Where one vehicle is to be started."""
+
+    index: int
+    folder: Path
+    lat_deg: float
+    lon_deg: float
+    alt_m: float
+    parameters: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Kind:
+    """One autopilot: where its vehicles are by default, its ports, and how one is started.
+
+    Attributes:
+        variable: environment variable with the path of its binary.
+        origin: middle of the vehicles.
+        ports: UDP ports of instance 0 that somebody listens on; the others follow.
+        spread: instance i has port + spread * i.
+        command: binary and start to command line.
+        environment: what it is told by environment variables.
+    """
+
+    variable: str
+    origin: GeoOrigin
+    ports: tuple[int, ...]
+    spread: int
+    command: Callable[[Path, Start], list[str]]
+    environment: Callable[[Start], dict[str, str]] = field(default=lambda start: {})
+
+    @property
+    def binary(self) -> Path | None:
+        """The build to test with, if there is one."""
+        given = os.environ.get(self.variable, "")
+        return Path(given).expanduser().absolute() if given else None
+
+    def place(self, index: int, count: int, folder: Path, parameters: Mapping[str, float] | None = None) -> Start:
+        """Where the vehicle of that index stands among so many."""
+        lat_deg = self.origin.lat_deg + math.degrees(north_m(index, count) / EARTH_RADIUS_M)
+        return Start(index, folder, lat_deg, self.origin.lon_deg, self.origin.alt_m, parameters or {})
+
+    def shell_line(self, start: Start) -> list[str]:
+        """What starts it, from any folder and any environment."""
+        assert self.binary is not None
+        told = [f"{name}={value}" for name, value in self.environment(start).items()]
+        return ["env", "-C", str(start.folder), *told, *self.command(self.binary, start)]
+
+
+def _px4_command(binary: Path, start: Start) -> list[str]:
+    return [str(binary), "-i", str(start.index), "-d", str(binary.parent.parent / "etc")]
+
+
+def _px4_environment(start: Start) -> dict[str, str]:
+    home = {"LAT": f"{start.lat_deg:.9f}", "LON": f"{start.lon_deg:.9f}", "ALT": f"{start.alt_m}"}
+    return {
+        "PX4_SYS_AUTOSTART": "10040",
+        "PX4_SIM_MODEL": "sihsim_quadx",
+        **{f"PX4_HOME_{name}": value for name, value in home.items()},
+        **{f"PX4_PARAM_{name}": f"{value:g}" for name, value in start.parameters.items()},
+    }
+
+
+def _arducopter_command(binary: Path, start: Start) -> list[str]:
+    own = start.folder / "own.parm"
+    sysid = start.index + 1
+    lines = {"SYSID_THISMAV": sysid, **start.parameters}
+    own.write_text("".join(f"{name} {value:g}\n" for name, value in lines.items()))
+    return [
+        *(str(binary), "-S", f"-I{start.index}", "--model", "quad", "--speedup", "1", "--sysid", str(sysid)),
+        *("--home", f"{start.lat_deg:.9f},{start.lon_deg:.9f},{start.alt_m:g},0"),
+        *("--defaults", f"{_parameter_file(binary)},{own}"),
+        *("--serial0", f"udpclient:127.0.0.1:{14550 + 10 * start.index}"),
+    ]
+
+
+def _parameter_file(binary: Path) -> Path:
+    for name in PARAMETER_FILES:
+        if (binary.parent / name).is_file():
+            return (binary.parent / name).resolve()
+    raise FileNotFoundError(f"{binary}: none of {', '.join(PARAMETER_FILES)} from its folder")
+
+
+PX4 = Kind(
+    "SWARMCTL_PX4",
+    GeoOrigin(47.397742, 8.545594, 489.4),
+    (14540, 14580, 18570, 14280, 13030, 19450, 19410),
+    1,
+    _px4_command,
+    _px4_environment,
+)
+ARDUCOPTER = Kind("SWARMCTL_ARDUCOPTER", GeoOrigin(-35.363262, 149.165237, 584.0), (14550,), 10, _arducopter_command)
+
+
+def north_m(index: int, count: int) -> float:
+    """Where a vehicle stands."""
+    return (index - (count - 1) / 2) * SPACING_M
+
+
+class Fleet:
+    """N vehicles that stand `SPACING_M` apart along north; each writes to a folder of its own."""
+
+    def __init__(
+        self,
+        kind: Kind,
+        count: int,
+        network: Network,
+        directory: Path,
+        parameters: Mapping[str, float] | None = None,
+    ) -> None:
+        self.kind, self.count, self.network = kind, count, network
+        self._directory = directory
+        self._parameters = parameters
+        self._running: dict[int, subprocess.Popen[bytes]] = {}
+        for index in range(count):
+            self.start(index)
+
+    def start(self, index: int) -> None:
+        """Power up; what it has stored stays as it was."""
+        folder = self._directory / str(index)
+        folder.mkdir(parents=True, exist_ok=True)
+        start = self.kind.place(index, self.count, folder, self._parameters)
+        with (folder / "out.log").open("ab") as out:
+            self._running[index] = subprocess.Popen(
+                [*self.network.prefix, *self.kind.shell_line(start)],
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=subprocess.STDOUT,
+                preexec_fn=lambda: die_with_parent(signal.SIGKILL),
+            )
+
+    def stop(self, index: int) -> None:
+        """Cut its power."""
+        process = self._running.pop(index)
+        process.kill()
+        process.wait(STOP_S)
+
+    def reboot(self, index: int) -> None:
+        self.stop(index)
+        self.start(index)
+
+    def close(self) -> None:
+        for index in list(self._running):
+            self.stop(index)

@@ -1,0 +1,91 @@
+"""Real autopilots to fly against: `SWARMCTL_PX4`, `SWARMCTL_ARDUCOPTER`; see docs/real_autopilots.md."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import psutil
+import pytest
+
+from tests.process.test_launch import Launched
+from tests.real.autopilots import Fleet, Kind
+from tests.real.network import Network, own_network
+from tests.real.witness import Truth, Witness
+
+
+class Inside(Launched):
+    """A launch in a network."""
+
+    def __init__(self, network: Network, run_dir: Path, temp: Path, *arguments: str) -> None:
+        self.prefix = network.prefix
+        super().__init__(run_dir, temp, *arguments, "--no-view", "--set", "telemetry.enabled=false")
+
+
+class Field:
+    """Where vehicles stand, with somebody who watches them; launches fly them one after the other."""
+
+    def __init__(self, fleet: Fleet, witness: Witness, directory: Path) -> None:
+        self.fleet, self.witness = fleet, witness
+        self._directory = directory
+        self._launches: list[Launched] = []
+
+    def launch(self, *arguments: str) -> Launched:
+        temp = Path(tempfile.mkdtemp(prefix="sw"))
+        run_dir = self._directory / f"run{len(self._launches)}"
+        self._launches.append(Inside(self.fleet.network, run_dir, temp, *arguments))
+        return self._launches[-1]
+
+    def close(self) -> None:
+        for launched in self._launches:
+            for relative in launched.relatives():
+                with contextlib.suppress(psutil.Error):
+                    relative.kill()
+            launched.process.kill()
+            launched.process.wait(20)
+            shutil.rmtree(launched.temp, ignore_errors=True)
+        self.witness.close()
+        self.fleet.close()
+
+
+Fielder = Callable[..., Field]
+
+
+@pytest.fixture
+def network() -> Iterator[Network]:
+    with own_network() as network:
+        yield network
+
+
+@pytest.fixture
+def field(network: Network, tmp_path: Path) -> Iterator[Fielder]:
+    """Powers up N vehicles of a kind; skips where no build of it is named."""
+    fields: list[Field] = []
+
+    def power_up(
+        kind: Kind,
+        count: int,
+        parameters: dict[str, float] | None = None,
+        on_truth: Callable[[Witness, int, Truth], None] | None = None,
+    ) -> Field:
+        require(kind, network, count)
+        fleet = Fleet(kind, count, network, tmp_path / "vehicles", parameters)
+        fields.append(Field(fleet, Witness(fleet, on_truth), tmp_path))
+        return fields[-1]
+
+    yield power_up
+    for each in fields:
+        each.close()
+
+
+def require(kind: Kind, network: Network, count: int) -> None:
+    """Skip where there is nothing to fly; fail where what is named is not there."""
+    if kind.binary is None:
+        pytest.skip(f"{kind.variable} names no build")
+    assert kind.binary.is_file(), f"{kind.variable}: {kind.binary} is no file"
+    taken = network.taken(port + kind.spread * i for port in kind.ports for i in range(count))
+    if taken:
+        pytest.skip(f"ports {taken} are taken; run as root for a network of its own")

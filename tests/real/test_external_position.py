@@ -1,0 +1,41 @@
+"""Position fed from outside, as motion capture does: from the simulator's truth, into the autopilot's filter."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from pymavlink.dialects.v20 import development as mav
+
+from tests.real.autopilots import PX4
+from tests.real.conftest import Fielder
+from tests.real.test_flights import PX4_CONFIG, flown
+from tests.real.witness import Truth, Witness
+
+pytestmark = [pytest.mark.process, pytest.mark.timeout(900)]
+
+FED = {"EKF2_EV_CTRL": 3, "EKF2_GPS_CTRL": 0, "EKF2_HGT_REF": 3}  # horizontal and vertical position; height from it
+ORIGIN_EVERY = 25  # samples
+NO_COVARIANCE = [math.nan] * 21
+
+
+def feed(witness: Witness, index: int, truth: Truth) -> None:
+    """One sample of the truth, and now and then where the frame is."""
+    if len(witness.vehicles[index].t_s) % ORIGIN_EVERY == 1:
+        origin = PX4.origin
+        place = round(origin.lat_deg * 1e7), round(origin.lon_deg * 1e7), round(origin.alt_m * 1e3)
+        witness.say(index, mav.MAVLink_set_gps_global_origin_message(index + 1, *place))
+    velocity, rates = truth.vel_ned_m_s, (math.nan,) * 3
+    frame = mav.MAV_FRAME_LOCAL_NED
+    fields = (0, frame, frame, *truth.pos_ned_m, list(truth.q_nb), *velocity, *rates, NO_COVARIANCE, NO_COVARIANCE)
+    witness.say(index, mav.MAVLink_odometry_message(*fields, 0, mav.MAV_ESTIMATOR_TYPE_MOCAP))
+
+
+@pytest.mark.parametrize("time_number", [1, 2])
+def test_three_px4_with_external_position_fly_close_together(field: Fielder, time_number: int) -> None:
+    here = field(PX4, 3, FED, feed)
+    summary = flown(here, PX4_CONFIG, "--set", "separation.radius_m=0.9").summary()
+    assert summary["violations"] == []
+    assert summary["tracking"]["index_after_10s_m"] <= 1.75
+    assert summary["separation"]["min_m"] >= 0.87
+    assert here.witness.min_separation_m() >= 0.79

@@ -1,0 +1,90 @@
+"""Whole missions on real autopilots, launched as a user launches them, judged by what really happened."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+
+from swarmctl.core.types import Phase
+from tests.process.test_launch import Launched
+from tests.real.autopilots import ARDUCOPTER, PX4
+from tests.real.conftest import Field, Fielder
+from tests.real.witness import Seen
+
+pytestmark = [pytest.mark.process, pytest.mark.timeout(900)]
+
+PX4_CONFIG, ARDUPILOT_CONFIG = "configs/px4_udp.toml", "configs/ardupilot_udp.toml"
+LONE_PX4 = ("--set", "swarm.agents=1", "--set", 'vehicles=[{sysid=1, url="udpin://127.0.0.1:14540"}]')
+END_S = 240.0
+BODIES_M = 0.65  # tip to tip
+GROUND_S = 40.0  # from the end of a launch until the last vehicle has disarmed itself
+THREE_ARDUCOPTERS = str(Path(__file__).with_name("three_arducopters.toml"))
+
+
+def flown(field: Field, *arguments: str) -> Launched:
+    """A launch that completes, and vehicles that are on the ground and disarmed after it."""
+    launched = field.launch(*arguments)
+    assert launched.end(END_S) == 0, launched.text()
+    field.witness.wait(field.witness.all_rest, GROUND_S, "all vehicles landed and disarmed")
+    assert all(field.witness.highest_m(i) > 1.0 for i in range(field.fleet.count)), "they flew"
+    return launched
+
+
+def true_rmse_m(launched: Launched, seen: Seen, agent: int = 0) -> float:
+    """Of the true position against the reference, from 10 s of the mission on."""
+    table = pq.read_table(Path(launched.run_dir) / f"agent-{agent}.parquet")
+    rows = {name: table.column(name).to_numpy() for name in ("t_us", "phase", "mission_t_s")}
+    wanted = np.stack([table.column(f"ref_pos_ned_m_{axis}").to_numpy() for axis in "xyz"], axis=1)
+    late = (rows["phase"] == Phase.TRACK) & (rows["mission_t_s"] >= 10.0)
+    assert late.sum() > 450
+    error = seen.at(rows["t_us"][late] * 1e-6) - wanted[late]
+    return float(np.sqrt(np.mean(np.sum(error**2, axis=1))))
+
+
+def test_a_lone_px4_tracks_its_circle(field: Fielder) -> None:
+    here = field(PX4, 1)
+    launched = flown(here, PX4_CONFIG, *LONE_PX4)
+    assert launched.summary()["tracking"]["agents"][0]["steady_rmse_m"] < 0.08
+    assert true_rmse_m(launched, here.witness.vehicles[0]) < 0.8  # its estimate is 0.3 to 0.6 m off
+
+
+@pytest.mark.parametrize("after_boot_s", [0, 2, 5, 20])
+def test_three_px4_fly_twice_as_they_are_however_early_they_are_launched(field: Fielder, after_boot_s: float) -> None:
+    here = field(PX4, 3)
+    time.sleep(after_boot_s)
+    for _ in range(2):
+        launched = flown(here, PX4_CONFIG, "--duration", "12")
+        assert launched.summary()["violations"] == []
+    assert here.witness.min_separation_m() > BODIES_M
+
+
+def test_three_px4_fly_the_shipped_mission(field: Fielder) -> None:
+    here = field(PX4, 3)
+    launched = flown(here, PX4_CONFIG)
+    assert launched.summary()["violations"] == []
+    assert here.witness.min_separation_m() > BODIES_M
+
+
+def test_a_lone_arducopter_hovers_as_shipped(field: Fielder) -> None:
+    here = field(ARDUCOPTER, 1)
+    launched = flown(here, ARDUPILOT_CONFIG)
+    assert launched.summary()["tracking"]["agents"][0]["steady_rmse_m"] < 0.1
+    assert true_rmse_m(launched, here.witness.vehicles[0]) < 0.3
+
+
+def test_three_arducopters_fly_a_circle_close_together(field: Fielder) -> None:
+    here = field(ARDUCOPTER, 3)
+    summary = flown(here, THREE_ARDUCOPTERS).summary()
+    assert summary["violations"] == []
+    assert summary["tracking"]["index_after_10s_m"] < 1.75
+    assert here.witness.min_separation_m() > 0.8
+
+
+def test_a_second_launch_flies_the_same_arducopters(field: Fielder) -> None:
+    here = field(ARDUCOPTER, 1)
+    for _ in range(2):
+        flown(here, ARDUPILOT_CONFIG, "--duration", "8")

@@ -1,0 +1,113 @@
+"""What goes wrong around a flight of real autopilots: an agent dies, a pilot takes over, an autopilot starts again."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+
+import pyarrow.parquet as pq
+import pytest
+from pymavlink.dialects.v20 import development as mav
+
+from swarmctl.core.types import Phase
+from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION
+from tests.process.test_launch import Launched
+from tests.real.autopilots import PX4
+from tests.real.conftest import Field, Fielder
+from tests.real.test_flights import BODIES_M, END_S, GROUND_S, PX4_CONFIG
+
+pytestmark = [pytest.mark.process, pytest.mark.timeout(900)]
+
+LOITER, OFFBOARD = 0x03040000, 0x00060000
+PHASES = ("CONNECT", "STANDBY", "ARM", "TAKEOFF", "GOTO_START", "READY", "TRACK", "GOTO_LAND", "LAND")
+STOPPED_S = 60.0  # within which nothing is armed any more, or it is named
+
+
+def tracked_s(launched: Launched, agent: int) -> float:
+    """How far an agent got in its mission."""
+    table = pq.read_table(launched.run_dir / f"agent-{agent}.parquet", columns=["phase", "mission_t_s"])
+    times_s = table.column("mission_t_s").to_numpy()[table.column("phase").to_numpy() == Phase.TRACK]
+    return float(times_s.max(initial=0.0))
+
+
+def mode_of(here: Field, index: int) -> int:
+    return here.witness.vehicles[index].beats[-1][2]
+
+
+def test_a_killed_agent_ends_with_its_vehicle_on_the_ground_and_the_others_finish(field: Fielder) -> None:
+    here = field(PX4, 3)
+    launched = here.launch(PX4_CONFIG, "--duration", "30")
+    launched.until_phase("TRACK", 3)
+    time.sleep(5.0)
+    os.kill(launched.pid_of("agent", "--id", "1"), signal.SIGKILL)
+    here.witness.wait(lambda: not here.witness.vehicles[1].armed, 30.0, "landed by its own failsafe and disarmed")
+    assert here.witness.vehicles[1].height_m() < 0.3
+    assert launched.end(END_S) == EXIT_MISSION, launched.text()
+    here.witness.wait(here.witness.all_rest, GROUND_S, "all vehicles landed and disarmed")
+    assert min(tracked_s(launched, 0), tracked_s(launched, 2)) == pytest.approx(30.0, abs=0.5)
+    assert here.witness.min_separation_m() > BODIES_M
+
+
+def test_a_pilot_has_the_vehicle_until_resume(field: Fielder) -> None:
+    here = field(PX4, 3)
+    launched = here.launch(PX4_CONFIG)
+    launched.until_phase("TRACK", 3)
+    time.sleep(5.0)
+    here.witness.command(1, mav.MAV_CMD_DO_SET_MODE, 1, 4, 3)
+    here.witness.wait(lambda: mode_of(here, 1) == LOITER, 2.5, "in LOITER")
+    until_s = time.monotonic() + 5.0
+    while time.monotonic() < until_s:
+        assert mode_of(here, 1) == LOITER, "the pilot has it"
+        time.sleep(0.1)
+    assert launched.verb("resume").returncode == 0
+    here.witness.wait(lambda: mode_of(here, 1) == OFFBOARD, 15.0, "in OFFBOARD again")
+    assert launched.end(END_S) == 0, launched.text()
+    here.witness.wait(here.witness.all_rest, GROUND_S, "all vehicles landed and disarmed")
+    assert here.witness.min_separation_m() > BODIES_M
+
+
+def test_an_autopilot_that_starts_again_before_arming_is_waited_for(field: Fielder) -> None:
+    here = field(PX4, 3)
+    here.witness.wait(lambda: all(v.beats for v in here.witness.vehicles), 20.0, "heartbeats")
+    launched = here.launch(PX4_CONFIG, "--duration", "12")
+    launched.until_phase("CONNECT", 3)
+    time.sleep(1.0)
+    assert not any(vehicle.was_armed for vehicle in here.witness.vehicles)
+    here.fleet.reboot(1)
+    assert launched.end(END_S) == 0, launched.text()
+    here.witness.wait(here.witness.all_rest, GROUND_S, "all vehicles landed and disarmed")
+    assert all(here.witness.highest_m(i) > 1.0 for i in range(3)), "they flew"
+
+
+@pytest.mark.parametrize("phase", PHASES)
+@pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP], ids=lambda how: how.name)
+def test_a_stopped_launch_leaves_nothing_armed(field: Fielder, how: signal.Signals, phase: str) -> None:
+    here = field(PX4, 3)
+    launched = here.launch(PX4_CONFIG, "--duration", "8")
+    launched.until_phase(phase, 1)
+    launched.process.send_signal(how)
+    code = launched.end(END_S)
+    if code != EXIT_MISSION:
+        assert code == EXIT_INTERRUPTED, launched.text()
+        here.witness.wait(here.witness.all_rest, STOPPED_S, "nothing armed any more")
+        return
+    time.sleep(STOPPED_S)
+    armed = [i for i, vehicle in enumerate(here.witness.vehicles) if vehicle.armed]
+    assert all(f"agent {i}" in launched.text() for i in armed), f"{armed} armed and not named: {launched.text()}"
+
+
+@pytest.mark.parametrize("phase", PHASES)
+def test_a_killed_agent_leaves_nothing_armed(field: Fielder, phase: str) -> None:
+    here = field(PX4, 1)
+    launched = here.launch(
+        PX4_CONFIG,
+        *("--set", "swarm.agents=1", "--set", 'vehicles=[{sysid=1, url="udpin://127.0.0.1:14540"}]', "--duration", "8"),
+    )
+    launched.until_phase(phase, 1)
+    os.kill(launched.pid_of("agent", "--id", "0"), signal.SIGKILL)
+    assert launched.end(END_S) == EXIT_MISSION, launched.text()
+    until_s = time.monotonic() + STOPPED_S
+    while time.monotonic() < until_s and here.witness.vehicles[0].armed:
+        time.sleep(0.2)
+    assert not here.witness.vehicles[0].armed or "armed" in launched.text(), launched.text()
