@@ -33,11 +33,12 @@ def test_everybody_keeps_clear_of_it_and_of_each_other(fly: Fly, seed: int) -> N
         assert past.modes(agent, Phase.TRACK) == {Mode.FOLLOW}
 
 
-def test_with_published_weights_nobody_touches_it_and_everybody_comes_home(flight: Flight) -> None:
-    """Without a weight on velocity they overshoot and meet fast behind it: 1.64 m in the worst of six starts."""
+def test_with_published_weights_everybody_keeps_clear_from_the_published_start_and_comes_home(flight: Flight) -> None:
+    """Without a weight on velocity they overshoot: from starts a millimetre off the worst of six is 1.64 m."""
     assert flight.problems == []
-    assert clearance_m(flight) >= 1.5
+    assert clearance_m(flight) >= 1.70
     assert flight.separation_m() >= 0.85
+    assert not any(flight.ticks(i)["barrier_acted"].any() for i in range(3)), "the last layer is not needed for it"
 
 
 def test_it_is_known_only_within_the_visibility_distance(flight: Flight) -> None:
