@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import time
 from pathlib import Path
 
@@ -9,7 +11,7 @@ import pytest
 
 from swarmctl.config import load
 from swarmctl.errors import MissionError, StartError
-from swarmctl.runner import Pace, WallClock, _give_up_on_silence
+from swarmctl.runner import Pace, WallClock, _give_up_on_silence, _StopRequest
 
 MS = 1_000
 
@@ -69,6 +71,21 @@ def test_a_vehicle_that_was_never_there_is_a_start_error_and_a_lost_one_a_missio
     _give_up_on_silence(15_000_000, True, config, "udpin://x")
     with pytest.raises(MissionError, match="udpin://x"):
         _give_up_on_silence(15_000_001, True, config, "udpin://x")
+
+
+@pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_a_signal_is_a_stop_request_that_is_taken_once(signum: signal.Signals) -> None:
+    before = {s: signal.getsignal(s) for s in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)}
+    try:
+        stop = _StopRequest(asked=False)
+        assert not stop.take()
+        os.kill(os.getpid(), signum)
+        assert stop.take()
+        assert not stop.take()
+        assert _StopRequest(asked=True).take(), "an agent that only lands has been asked from the beginning"
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 def test_an_agent_number_outside_the_swarm_is_refused_before_anything_is_opened(tmp_path: Path) -> None:

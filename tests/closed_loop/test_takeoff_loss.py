@@ -1,0 +1,47 @@
+"""An agent that dies before OFFBOARD leaves no vehicle hovering: PX4's data-link failsafe lands it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+
+from sitl.lockstep import Lockstep
+from swarmctl.config import load
+from swarmctl.core.types import FlightMode, Phase
+from swarmctl.links import autopilot
+from swarmctl.links.dialects import DIALECTS, PX4
+
+PHASES = [Phase.ARM, Phase.TAKEOFF]
+
+
+def died_in(phase: Phase) -> Lockstep:
+    """Forty seconds after the only agent of a vehicle died, a while into a phase."""
+    flight = Lockstep(load(None, ["swarm.agents=1", "mission.duration_s=5"]))
+    entered_us: int | None = None
+    while entered_us is None or flight.clock.now_us() < entered_us + (2_000_000 if phase is Phase.TAKEOFF else 60_000):
+        flight.step()
+        rows = flight.logs[0].rows
+        if entered_us is None and rows and rows[-1]["phase"][0] == phase:
+            entered_us = flight.clock.now_us()
+    flight.kill(0)
+    until_us = flight.clock.now_us() + 40_000_000
+    while flight.clock.now_us() < until_us:
+        flight.step()
+    return flight
+
+
+@pytest.mark.parametrize("phase", PHASES)
+def test_a_vehicle_whose_agent_dies_before_offboard_is_disarmed_within_forty_seconds(phase: Phase) -> None:
+    flight = died_in(phase)
+    assert flight.truth["armed"].any() or phase is Phase.ARM
+    assert not flight.truth["armed"][-1]
+
+
+def test_negative_control_without_the_data_link_failsafe_it_hovers_armed(monkeypatch: pytest.MonkeyPatch) -> None:
+    unprotected = replace(PX4, given={}, rules=())
+    monkeypatch.setattr(autopilot, "DIALECTS", {**DIALECTS, 12: unprotected})
+    flight = died_in(Phase.TAKEOFF)
+    assert flight.truth["armed"][-1]
+    assert flight.truth["pos_ned_m"][-1][2] < flight.truth["pos_ned_m"][0][2] - 2.0
+    assert flight.truth["flight_mode"][-1] == FlightMode.HOLD
