@@ -171,8 +171,9 @@ def _fly(cell: Cell, path: Path, folder: Path, witness: Witness) -> tuple[bool, 
         took_s, left = time.monotonic() - stopped_s, sorted(i for i, armed in witness.armed.items() if armed)
         said = log.read_text(errors="replace")
         named = launch.poll() == 4 and all(f"vehicle {i} " in said for i in left)
+        heeded = launch.poll() != 0 or cell.phase in ("GOTO_LAND", "LAND")  # it did not fly on to the end
         flown = f"armed before: {sorted(witness.ever)}"
-        return not left or named, f"exit {launch.poll()}, {took_s:.1f} s, left armed: {left}, {flown}"
+        return heeded and (not left or named), f"exit {launch.poll()}, {took_s:.1f} s, left armed: {left}, {flown}"
     finally:
         if launch.poll() is None:
             os.killpg(launch.pid, signal.SIGKILL)
@@ -219,6 +220,8 @@ def main() -> int:
     parser.add_argument("--config", type=Path, metavar="FILE", help="vehicles that run already")
     parser.add_argument("--witness-port", type=int, default=0, help="their second link's port here")
     options = parser.parse_args()
+    for signum in (signal.SIGINT, signal.SIGHUP):
+        signal.signal(signum, signal.SIG_DFL)  # in the background a shell has them ignored, and a launch inherits that
     failed = 0
     for cell in options.cells:
         holds, what = fly(cell, options.config, options.witness_port)

@@ -43,5 +43,5 @@ def test_negative_control_without_the_data_link_failsafe_it_hovers_armed(monkeyp
     monkeypatch.setattr(autopilot, "DIALECTS", {**DIALECTS, 12: unprotected})
     flight = died_in(Phase.TAKEOFF)
     assert flight.truth["armed"][-1]
-    assert flight.truth["pos_ned_m"][-1][2] < flight.truth["pos_ned_m"][0][2] - 2.0
+    assert flight.truth["pos_ned_m"][-1][2] < flight.truth["pos_ned_m"][0][2] - 1.5
     assert flight.truth["flight_mode"][-1] == FlightMode.HOLD
