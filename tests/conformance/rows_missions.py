@@ -40,7 +40,7 @@ from tests.conformance.vocabulary import (
 
 TRANSFER, RUN, FENCE, BATTERY = "missions", "mission run", "geofence", "battery"
 WAYPOINT, TAKEOFF, LAND, RTL, REPOSITION = 16, 22, 21, 20, 192
-FRAME_RELATIVE_INT = 6
+FRAME_MISSION, FRAME_RELATIVE_INT = 2, 6
 NORTH_8_M = 8 * 90  # 1e-7 deg: 0.0111 m each
 ACCEPTED_MISSION, NO_SPACE = 0, 4
 FENCE_KIND, INCLUSION = 1, 5001
@@ -56,6 +56,7 @@ class Item:
     up_m: float = 5.0
     param1: float = 0.0
     kind: int = 0
+    frame: int = FRAME_RELATIVE_INT
 
 
 UP_OVER_AND_LAND = (
@@ -74,7 +75,7 @@ def item(seq: int, what: Item) -> Send:
     return addressed(
         "MISSION_ITEM_INT",
         seq=seq,
-        frame=FRAME_RELATIVE_INT,
+        frame=what.frame,
         command=what.command,
         current=int(seq == 0),
         autocontinue=1,
@@ -212,7 +213,7 @@ RUN_ROWS = (
         RUN,
         State.LOITER,
         (
-            *upload((*AROUND, Item(RTL, 0, 0, 0.0))),
+            *upload((*AROUND, Item(RTL, 0, 0, 0.0, frame=FRAME_MISSION))),
             go(4, 4),
             mode(M_MISSION),
             sees("MISSION_ITEM_REACHED", 20.0, seq=0),
@@ -263,7 +264,7 @@ FENCE_ROWS = (
         State.OFFBOARD,
         (
             Stream(setpoint(0.6)),
-            Wait(3.0),
+            Wait(4.0),
             Stream(setpoint(HOVER_01)),
             always("CURRENT_MODE", 1.5, 2, custom_mode=M_OFFBOARD),
             Moves("height_m", Between(9.0, 30.0), 1.5),
