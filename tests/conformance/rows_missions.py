@@ -214,6 +214,7 @@ RUN_ROWS = (
         State.LOITER,
         (
             *upload((*AROUND, Item(RTL, 0, 0, 0.0, frame=FRAME_MISSION))),
+            Wait(1.0),  # it is examined
             go(4, 4),
             mode(M_MISSION),
             sees("MISSION_ITEM_REACHED", 20.0, seq=0),

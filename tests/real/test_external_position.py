@@ -15,17 +15,19 @@ from tests.real.witness import Truth, Witness
 pytestmark = [pytest.mark.process, pytest.mark.timeout(900)]
 
 FED = {"EKF2_EV_CTRL": 3, "EKF2_GPS_CTRL": 0, "EKF2_HGT_REF": 3}  # horizontal and vertical position; height from it
-ORIGIN_EVERY, ORIGIN_UNTIL = 25, 300  # samples: told until it must have been heard, before anything is armed
+ORIGIN_EVERY, ORIGIN_UNTIL = 25, 150  # samples: an origin that is told later moves the height that is fed
 NO_COVARIANCE = [math.nan] * 21
 
 
 def feed(witness: Witness, index: int, truth: Truth) -> None:
-    """One sample of the truth, and now and then where the frame is."""
+    """First where the frame is, then one sample of the truth after the other."""
     samples = len(witness.vehicles[index].t_s)
-    if samples < ORIGIN_UNTIL and samples % ORIGIN_EVERY == 1:
-        origin = PX4.origin
-        place = round(origin.lat_deg * 1e7), round(origin.lon_deg * 1e7), round(origin.alt_m * 1e3)
-        witness.say(index, mav.MAVLink_set_gps_global_origin_message(index + 1, *place))
+    if samples < ORIGIN_UNTIL:
+        if samples % ORIGIN_EVERY == 0:
+            origin = PX4.origin
+            place = round(origin.lat_deg * 1e7), round(origin.lon_deg * 1e7), round(origin.alt_m * 1e3)
+            witness.say(index, mav.MAVLink_set_gps_global_origin_message(index + 1, *place))
+        return
     velocity, rates = truth.vel_ned_m_s, (math.nan,) * 3
     frame = mav.MAV_FRAME_LOCAL_NED
     fields = (0, frame, frame, *truth.pos_ned_m, list(truth.q_nb), *velocity, *rates, NO_COVARIANCE, NO_COVARIANCE)

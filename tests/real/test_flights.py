@@ -20,7 +20,7 @@ pytestmark = [pytest.mark.process, pytest.mark.timeout(900)]
 PX4_CONFIG, ARDUPILOT_CONFIG = "configs/px4_udp.toml", "configs/ardupilot_udp.toml"
 LONE_PX4 = ("--set", "swarm.agents=1", "--set", 'vehicles=[{sysid=1, url="udpin://127.0.0.1:14540"}]')
 END_S = 240.0
-ARMABLE_S = 120.0
+PLACED_S = 120.0
 BODIES_M = 0.65  # tip to tip
 GROUND_S = 40.0  # from the end of a launch until the last vehicle has disarmed itself
 THREE_ARDUCOPTERS = str(Path(__file__).with_name("three_arducopters.toml"))
@@ -71,9 +71,9 @@ def test_three_px4_fly_the_shipped_mission(field: Fielder) -> None:
 
 
 def booted(field: Fielder, count: int) -> Field:
-    """ArduCopters that can be armed: it takes their filter up to a minute to use GPS."""
+    """ArduCopters that know where they are: it takes their filters up to a minute to use GPS."""
     here = field(ARDUCOPTER, count)
-    here.witness.wait(here.witness.all_armable, ARMABLE_S, "armable")
+    here.witness.wait(here.witness.all_placed, PLACED_S, "a position")
     return here
 
 

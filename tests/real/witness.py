@@ -25,7 +25,6 @@ from swarmctl.links.transport import cut_frames
 from tests.real.autopilots import ARDUCOPTER, Fleet
 
 ARMED_FLAG = 128
-PREARM = 0x10000000
 TRUTH_MESSAGES = {mav.MAVLINK_MSG_ID_HIL_STATE_QUATERNION, mav.MAVLINK_MSG_ID_SIM_STATE}
 HOST = "127.0.0.1"
 MAX_DATAGRAM = 4096
@@ -35,7 +34,7 @@ ASK_EVERY_S = 2.0
 # ArduCopter sends nothing unasked [us].
 ASKED_US = {
     mav.MAVLINK_MSG_ID_SIM_STATE: 40_000,
-    mav.MAVLINK_MSG_ID_SYS_STATUS: 1_000_000,
+    mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 1_000_000,
 }
 GRID_S = 0.04
 
@@ -56,7 +55,7 @@ class Seen:
     t_s: list[float] = field(default_factory=list)
     pos_ned_m: list[tuple[float, float, float]] = field(default_factory=list)  # about the origin
     beats: list[tuple[float, bool, int]] = field(default_factory=list)  # time, armed, custom_mode
-    armable: bool = False  # by its own word, in its present mode
+    placed: bool = False  # its filter has a position
 
     @property
     def armed(self) -> bool:
@@ -183,8 +182,8 @@ class Witness:
             assert time.monotonic() < deadline_s, f"not within {limit_s:g} s: {what}"
             time.sleep(0.05)
 
-    def all_armable(self) -> bool:
-        return all(vehicle.armable for vehicle in self.vehicles)
+    def all_placed(self) -> bool:
+        return all(vehicle.placed for vehicle in self.vehicles)
 
     def all_rest(self) -> bool:
         """Every vehicle is disarmed, and where it is on the ground."""
@@ -220,10 +219,8 @@ class Witness:
             message = self._codec.decode(frame)
             if message is not None:
                 seen.beats.append((t_s, bool(message.base_mode & ARMED_FLAG), message.custom_mode))
-        elif number == mav.MAVLINK_MSG_ID_SYS_STATUS:
-            message = self._codec.decode(frame)
-            if message is not None:
-                seen.armable = bool(message.onboard_control_sensors_health & PREARM)
+        elif number == mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
+            seen.placed = True
         elif number in TRUTH_MESSAGES:
             message = self._codec.decode(frame)
             if message is not None:
