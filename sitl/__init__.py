@@ -1,0 +1,1 @@
+from swarmctl import kernels  # noqa: F401  (before numpy)

@@ -12,7 +12,7 @@ import argparse
 import gc
 import json
 import math
-import os
+import socket
 import sys
 from collections.abc import Callable
 from dataclasses import asdict
@@ -111,6 +111,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--origin", type=_origin, default=(47.397742, 8.545594, 489.4), metavar="LAT,LON,ALT", help="shared origin")
     add("--port", type=_integer(1, 65535), default=14540, help="first vehicle sends here until somebody talks to it")
     add("--local-port", type=_integer(1, 65535), default=14580, help="first vehicle listens here")
+    add("--local-fds", type=_ports, metavar="FD,...", help="inherited, bound UDP sockets instead, one for each vehicle")
     add("--gcs-port", type=_integer(0, 65535), default=0, help="second link of every vehicle to here; 0: none")
     add("--accept-bad-setpoints", action="store_true", help="NaN and zero quaternions do what they do to PX4 1.18")
     add("--remote-ports", type=_ports, default=[], metavar="P0,P1,..", help="fixed destinations instead of --port")
@@ -154,7 +155,6 @@ def main(arguments: list[str] | None = None) -> int:
         from swarmctl.lifeline import die_with_parent
 
         die_with_parent()
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before numpy: matrices here are far too small to share out
     try:
         return _run(options)
     except SwarmError as error:
@@ -265,10 +265,17 @@ def _udp_links(options: argparse.Namespace) -> tuple[list[Transport], list[str]]
     from sitl import realtime
     from sitl.ports import OpenPort
     from swarmctl.errors import ConfigError
+    from swarmctl.links.latch import nobody
     from swarmctl.links.transport import UdpTransport
 
     count = options.vehicles
-    sockets, shift = realtime.bind_range(options.local_port, count)
+    if options.local_fds and len(options.local_fds) != count:
+        given = ",".join(str(fd) for fd in options.local_fds)
+        raise ConfigError("sitl", [f"local-fds = {given}: allowed: one socket for each of {count} vehicles"])
+    if options.local_fds:
+        sockets, shift = [socket.socket(fileno=fd) for fd in options.local_fds], 0
+    else:
+        sockets, shift = realtime.bind_range(options.local_port, count)
     remotes = realtime.remote_ports(options.port, shift, count, options.remote_ports)
     if max(remotes) > realtime.MAX_PORT:
         raise ConfigError(
@@ -279,7 +286,7 @@ def _udp_links(options: argparse.Namespace) -> tuple[list[Transport], list[str]]
     places = [f"local={s.getsockname()[1]} remote={r}" for s, r in zip(sockets, remotes, strict=True)]
     pairs = zip(sockets, remotes, strict=True)
     if options.remote_ports:  # given peers are the only ones: a stray datagram must not take a vehicle over
-        return [UdpTransport(s, (realtime.HOST, r), latch=False) for s, r in pairs], places
+        return [UdpTransport(s, (realtime.HOST, r), nobody) for s, r in pairs], places
     return [OpenPort(s, (realtime.HOST, r)) for s, r in pairs], places
 
 

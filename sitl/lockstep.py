@@ -1,13 +1,16 @@
 """A whole flight in one process on a simulated clock: the real `Agent`, real MAVLink bytes, faster than real time.
 
-Nothing here depends on wall time, so a seed gives the same states bit for bit, in whatever order agents are ticked.
+Nothing here depends on wall time, and `swarmctl.kernels` keeps the processor out of it, so a seed gives the same states
+bit for bit, in whatever order agents are ticked.
 """
 
 from __future__ import annotations
 
 import struct
 import time
+import warnings
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -23,12 +26,15 @@ from swarmctl.config import Config
 from swarmctl.core.clock import SimClock
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE, tick_row
 from swarmctl.core.types import TickRecord
+from swarmctl.kernels import why_not_repeatable
 from swarmctl.links import topics
 from swarmctl.links.autopilot import Autopilot
 from swarmctl.links.commands import CodecCommands
 from swarmctl.links.mavlink import Codec
 from swarmctl.links.peers import LocalHub, agent_name
 from swarmctl.links.transport import pipe_pair
+from swarmctl.telemetry.plain import plain
+from swarmctl.telemetry.referee import RunData
 
 _TAIL_S = 120.0  # flight allowed before and after the mission
 _TRUTH_EVERY_US = 20_000
@@ -59,7 +65,8 @@ class FlightLog:
 
     def frame(self, frame: bytes) -> None:
         if self._tlog is not None:
-            self._tlog.write(struct.pack(">Q", self.clock.utc_us()) + frame)
+            with suppress(OSError):  # a full disk loses frames, never the flight
+                self._tlog.write(struct.pack(">Q", self.clock.utc_us()) + frame)
 
     @property
     def ticks(self) -> NDArray[np.void]:
@@ -67,10 +74,15 @@ class FlightLog:
         return np.concatenate(self.rows) if self.rows else np.zeros(0, TICK_DTYPE)
 
     def close(self) -> None:
-        """Write what a live agent would have written."""
+        """Write what a live agent would have written.
+
+        Raises:
+            OSError: the disk refuses.
+        """
         if self.directory is None or self._tlog is None:
             return
-        self._tlog.close()
+        with suppress(OSError):
+            self._tlog.close()
         (self.directory / f"agent-{self.agent}.ticks").write_bytes(self.ticks.tobytes())
         write_events(self.directory / f"agent-{self.agent}.events.jsonl", self.events)
 
@@ -92,6 +104,8 @@ class Lockstep:
         order: Sequence[int] | None = None,
         own: Mapping[int, Config] | None = None,
     ) -> None:
+        if reason := why_not_repeatable():
+            warnings.warn(f"this flight may differ from the same one elsewhere: {reason}", stacklevel=2)
         agents = config.swarm.agents
         self.config = config
         self.clock = SimClock()
@@ -110,6 +124,9 @@ class Lockstep:
         self._own = dict(own or {})
         self.agents: list[Agent | None] = [self._agent(i, self.links[i][0]) for i in range(agents)]
         self.frozen: set[int] = set()  # agents whose process is stopped: alive on the bus, but not ticking
+        self.starved: dict[int, int] = {}  # agent -> of how many ticks its processor lets it do one
+        self._missed = [0] * agents
+        self._steps = 0
         self._order = list(order) if order is not None else list(range(agents))
         self._truth: list[NDArray[np.void]] = []
         self._obstacles = obstacles_message(config)
@@ -139,8 +156,13 @@ class Lockstep:
             self._operator.publish(topics.OBSTACLES, topics.encode_message(self._obstacles))
         for i in self._order:
             agent = self.agents[i]
-            if agent is not None and i not in self.frozen:
-                agent.tick(now_us, 0)
+            if agent is None or i in self.frozen:
+                continue
+            if self._steps % self.starved.get(i, 1):
+                self._missed[i] += 1
+                continue
+            agent.tick(now_us, self._missed[i])
+        self._steps += 1
         for _ in range(self._tick_us // self._physics_us):
             self.clock.advance(self._physics_us)
             self.world.step(self.clock.now_us())
@@ -170,6 +192,11 @@ class Lockstep:
     def truth(self) -> NDArray[np.void]:
         """True states so far, (T * N,) of `TRUTH_DTYPE`."""
         return np.concatenate(self._truth) if self._truth else np.zeros(0, TRUTH_DTYPE)
+
+    def recorded(self) -> RunData:
+        """What a run folder would hold of the flight so far."""
+        events = [event for log in self.logs for event in log.events] + self.fault_events
+        return RunData({log.agent: log.ticks for log in self.logs}, self.truth, [plain(event) for event in events])
 
     def problems(self) -> list[str]:
         """Why the mission is not complete; empty when it is."""

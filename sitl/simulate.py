@@ -9,6 +9,8 @@ import argparse
 import signal
 import sys
 import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -19,39 +21,85 @@ from rich.progress import Progress
 from sitl.lockstep import Lockstep, write_events
 from swarmctl.config import Config, dump, load
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, exit_code_of
-from swarmctl.summary import summary_lines
+from swarmctl.files import replace_bytes, replace_text
+from swarmctl.summary import summary_lines, unwritten_line, violation_lines
+from swarmctl.table import PlainLines
 from swarmctl.telemetry.recordings import RECORDING, open_viewer, optimize_recording, simulated_recording
-from swarmctl.telemetry.run_folder import Outcome, create_run_folder, finish_run, load_run
+from swarmctl.telemetry.run_files import load_run
+from swarmctl.telemetry.run_folder import Outcome, create_run_folder, finish_run
 
 
 def simulate(config: Config, directory: Path) -> int:
     """Fly `config` in lockstep into the run folder `directory`; returns the exit code."""
-    (directory / "config.toml").write_text(dump(config), encoding="utf-8")
+    replace_text(directory / "config.toml", dump(config))
     flight = Lockstep(config, directory)
     stop = _Interrupt()
     began_s = time.perf_counter()
-    with Progress(transient=True, disable=not sys.stdout.isatty()) as bar:
-        total_s = config.mission.duration_s + 20.0  # there and back
-        task = bar.add_task(f"simulating {config.swarm.agents} agents", total=total_s)
+    with _progress(config) as advance:
 
         def on_step(lockstep: Lockstep) -> None:
             if stop.take():
                 lockstep.command("land")
-            bar.update(task, completed=min(total_s, lockstep.clock.now_us() * 1e-6))
+            advance(lockstep.clock.now_us() * 1e-6)
 
         flight.run(on_step)
     wall_s = time.perf_counter() - began_s
     problems = flight.problems()
     outcome = "interrupted" if stop.count else "failed" if problems else "completed"
-    flight.truth.tofile(directory / "truth.bin")
-    for log in flight.logs:
-        log.close()
-    if flight.fault_events:
-        write_events(directory / "sitl.events.jsonl", flight.fault_events)
+    for log, agent in zip(flight.logs, flight.agents, strict=True):
+        if agent is not None:
+            log.event("bus_summary", flight.clock.now_us(), flight.clock.utc_us(), rejected=agent.rejected, lost=0)
     speed_factor = flight.clock.now_us() * 1e-6 / wall_s
     shown = () if stop.count else tuple(problems)
-    rules = config.rules("lockstep")
-    summary = finish_run(directory, rules, Outcome(outcome, shown, speed_factor))
+    unwritten = _write_rows(flight, directory)
+    finished = finish_run(directory, config.rules("lockstep"), Outcome(outcome, shown, speed_factor), flight.recorded())
+    summary, unwritten = finished.summary, (*unwritten, *finished.unwritten)
+    if not unwritten:
+        _write_recording(config, directory)
+    say = PlainLines(sys.stdout).say  # to a terminal that may have been closed
+    for line in (*violation_lines(summary), *summary_lines(summary, directory)):
+        say(line)
+    say(f"{speed_factor:.1f} x real time")
+    if unwritten:
+        say(unwritten_line(directory, unwritten))
+    if stop.count:
+        return EXIT_INTERRUPTED
+    return EXIT_OK if summary["outcome"] == "completed" and not unwritten else EXIT_MISSION
+
+
+@contextmanager
+def _progress(config: Config) -> Iterator[Callable[[float], None]]:
+    """A bar on a terminal; takes the simulated time [s]. A terminal that is gone is no reason to stop flying."""
+    total_s = config.mission.duration_s + 20.0  # there and back
+    bar = Progress(transient=True, disable=not sys.stdout.isatty())
+    task = bar.add_task(f"simulating {config.swarm.agents} agents", total=total_s)
+    with suppress(OSError):
+        bar.start()
+    try:
+        yield lambda now_s: bar.update(task, completed=min(total_s, now_s))
+    finally:
+        with suppress(OSError):
+            bar.stop()
+
+
+def _write_rows(flight: Lockstep, directory: Path) -> tuple[str, ...]:
+    """What live processes would have left behind; returns what the disk did not take."""
+    writers: dict[str, Callable[[], object]] = {
+        "truth.bin": lambda: replace_bytes(directory / "truth.bin", flight.truth.tobytes()),
+        **{f"agent-{log.agent}.ticks": log.close for log in flight.logs},
+    }
+    if flight.fault_events:
+        writers["sitl.events.jsonl"] = lambda: write_events(directory / "sitl.events.jsonl", flight.fault_events)
+    unwritten = []
+    for name, write in writers.items():
+        try:
+            write()
+        except OSError as error:
+            unwritten.append(f"{name}: {error.strerror or error}")
+    return tuple(unwritten)
+
+
+def _write_recording(config: Config, directory: Path) -> None:
     simulated_recording(
         directory,
         load_run(directory),
@@ -61,27 +109,25 @@ def simulate(config: Config, directory: Path) -> int:
         [obstacle.model_dump() for obstacle in config.obstacles],
     )
     optimize_recording(directory)
-    for line in summary_lines(summary, directory):
-        print(line)
-    print(f"{speed_factor:.1f} x real time")
-    if stop.count:
-        return EXIT_INTERRUPTED
-    return EXIT_OK if summary["outcome"] == "completed" else EXIT_MISSION
 
 
 class _Interrupt:
-    """First Ctrl-C lands, the second ends at once."""
+    """First Ctrl-C lands, the second ends at once; a closed terminal is the first only, however often it says so."""
 
     def __init__(self) -> None:
         self.count = 0
         self._open = False
-        signal.signal(signal.SIGINT, self._ask)
+        for signum in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(signum) != signal.SIG_IGN:
+                signal.signal(signum, self._ask)
 
     def take(self) -> bool:
         asked, self._open = self._open, False
         return asked
 
     def _ask(self, signum: int, frame: FrameType | None) -> None:
+        if signum == signal.SIGHUP and self.count:
+            return
         self.count += 1
         self._open = True
         if self.count > 1:

@@ -6,7 +6,6 @@ It has no thread, socket, sleep or simulation branch: transport, bus, slow path,
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -21,11 +20,14 @@ from swarmctl.agent_parts import (
     make_sequence,
 )
 from swarmctl.agent_setup import AgentSetup
+from swarmctl.alerts import Alerts
+from swarmctl.control.accuracy import AccuracyMonitor
 from swarmctl.control.coasting import coasting
 from swarmctl.control.facts import Facts
 from swarmctl.control.failsafe import Judgement, judge
 from swarmctl.control.fallback import rest_plan
 from swarmctl.control.model import Predictor
+from swarmctl.control.overload import Level, Overload
 from swarmctl.control.problem import Problem, Start
 from swarmctl.control.replay import Replay
 from swarmctl.control.separation import KeepOut, radius_problem
@@ -59,6 +61,8 @@ from swarmctl.wayfinder import Wayfinder
 
 _NOTHING_US = -1
 _DEVIATES = (Mode.BRAKE, Mode.HOLD, Mode.LAND, Mode.YIELD, Mode.BLIND)  # from what it has promised
+_WAITS_LONG_US = 3_000_000  # for take-off, before it says for what
+_RESTORE_US = 5_000_000  # for parameters to be set back before the process ends
 _AUTOPILOT_HOVERS = (FlightMode.HOLD, FlightMode.EXTERNAL)  # in the latter while it takes off by itself
 
 
@@ -80,7 +84,9 @@ class Agent:
         self._upkeep = Upkeep(
             autopilot, commands, setup.params.autopilot_params, setup.sysid, setup.params.sequence.state_rate_hz
         )
-        self._surroundings = Surroundings(setup.agent, setup.peers, setup.separation, bus)
+        self._surroundings = Surroundings(
+            setup.agent, setup.peers, setup.separation, bus, setup.params.rate_hz, self._note
+        )
         self._coordination = make_coordination(setup, self._surroundings, bus, self._note, stopwatch_ns)
         self._controller, self._transit = make_controllers(setup, stopwatch_ns)
         self._observer = make_estimator(setup)
@@ -106,17 +112,27 @@ class Agent:
         )
         self.took = Took(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # of the last tick
         self._promise_ns = 0  # of the last tick
+        self._gaps = self._jumps = 0  # of setpoints and of the estimate, as far as they have been told
         self._announced: tuple[Phase, Mode, FlightMode] | None = None
-        self._problem = ""
+        self._alerts = Alerts()
+        self._accuracy = AccuracyMonitor()
+        self._standby_us = 0
+        self._overload = Overload(setup.params.overload, round(1e6 / setup.params.rate_hz))
+        self._done_us: int | None = None
         self._last_state_us = _NOTHING_US
         self._thrust_01 = setup.vehicle_model.hover_thrust_01
 
     @property
-    def finished(self) -> bool:
-        """Landed, disarmed, and so is every peer that is still there."""
-        if not self._sequence.finished:
+    def done(self) -> bool:
+        """Landed, disarmed, and its parameters as they were."""
+        if self._done_us is None:
             return False
-        return all(p.phase is Phase.DONE or not p.alive for p in self._surroundings.peers().values())
+        return self._upkeep.restored or self._waited_us(self._done_us) > _RESTORE_US
+
+    @property
+    def finished(self) -> bool:
+        """Done, and so is every peer that is still there."""
+        return self.done and all(p.phase is Phase.DONE or not p.alive for p in self._surroundings.peers().values())
 
     @property
     def outcome(self) -> str:
@@ -124,12 +140,14 @@ class Agent:
         return self._sequence.outcome or "stopped before the mission began"
 
     @property
+    def has_armed(self) -> bool:
+        """Whether the autopilot has been asked to arm: before that a mission that ends could not start."""
+        return self._sequence.arming.requested
+
+    @property
     def rejected(self) -> dict[str, int]:
         """Bus messages refused so far, by reason."""
-        found = Counter(self._surroundings.paths.rejected)
-        if self._coordination is not None:
-            found.update(self._coordination.rejected)
-        return dict(found)
+        return dict(self._surroundings.refusals.by_reason)
 
     @property
     def commits_refused(self) -> int | None:
@@ -143,8 +161,9 @@ class Agent:
         self._note("operator", verb=verb)
 
     def tick(self, now_us: int, late_ticks: int) -> TickRecord:
-        """One control step at monotonic time `now_us`; `late_ticks` so far is only recorded."""
+        """One control step at monotonic time `now_us`, with the deadlines missed so far."""
         began_ns = self._stopwatch_ns()
+        self._watch_deadlines(now_us, late_ticks)
         self._listen(now_us)
         state = self._sense(now_us)
         self._sequence.begin_if_due(now_us, self._clock.utc_us())
@@ -169,7 +188,10 @@ class Agent:
         )
         self._share(state, flown)
         self._advance(now_us, state)
-        self._reporter.problem = self._problem
+        refusals = self._surroundings.refusals.alert(self._clock.utc_us())
+        if refusals:
+            self._alerts.put("bus", refusals, now_us)
+        self._reporter.problem = self._alerts.text(now_us)
         return self._reporter.report(
             now_us,
             state,
@@ -180,6 +202,15 @@ class Agent:
             late_ticks,
             self.took,
         )
+
+    def _watch_deadlines(self, now_us: int, late_ticks: int) -> None:
+        before = self._overload.level
+        self._overload.update(now_us, late_ticks)
+        level = self._overload.level
+        if level is not Level.NONE:
+            self._alerts.put("overload", self._overload.text(), now_us)
+        if level is not before:
+            self._note("overload", level=level.name, missed_01=round(self._overload.missed_01, 3))
 
     # -- listen, sense ------------------------------------------------------------------------------------------------
 
@@ -195,9 +226,17 @@ class Agent:
         for result in self._commands.results():
             self._upkeep.took(result)
             asked = f"{result.command.verb.value} {result.command.name}".rstrip()
-            if not result.ok:
-                self._problem = f"{asked} refused: {result.text}"
+            if result.ok:
+                self._alerts.clear(asked)
+            else:
+                self._alerts.put(asked, f"{asked} refused: {result.text}", now_us)
             self._note("command", verb=asked, ok=result.ok, text=result.text)
+        frame = self._autopilot.frame
+        if frame.jumps != self._jumps:
+            self._jumps = frame.jumps
+            text = f"estimate jumped by {frame.jump_m:.1f} m: peers keep that much more away"
+            self._alerts.put("jump", text, now_us)
+            self._note("estimate_jumped", metres=frame.jump_m)
         if state is None or state.t_us == self._last_state_us:
             return state
         self._last_state_us = state.t_us
@@ -266,7 +305,7 @@ class Agent:
         landmarks = self._surroundings.landmarks
         deadlock = self._wayfinder.look(now_us, self._clock.utc_us(), state.pos_ned_m, known, landmarks)
         if deadlock is not None:
-            self._problem = f"deadlocked by {deadlock.names}"
+            self._alerts.put("deadlock", f"deadlocked by {deadlock.names}", now_us)
 
     # -- judge, act ---------------------------------------------------------------------------------------------------
 
@@ -281,7 +320,7 @@ class Agent:
             self._certified_us = now_us
         elif plan is not None:
             self._reporter.failed_plans += 1
-            self._problem = f"plan {plan.status.name.lower()}"
+            self._alerts.put("plan", f"plan {plan.status.name.lower()}", now_us)
         good = self._replay.plan
         delay_us = self._predictor.delay_us
         health = Health(
@@ -334,9 +373,14 @@ class Agent:
         setpoint = setpoint_of(virtual, yaw_rad, hover_01, now_us, self._setup.vehicle_model)
         refused = self._autopilot.send(setpoint, self._clock.now_us())
         if refused:
-            self._problem = f"setpoint refused: {refused}"
+            self._alerts.put("setpoint", f"setpoint refused: {refused}", now_us)
             self._note("setpoint_refused", reason=refused)
             return None
+        if self._autopilot.gaps != self._gaps:
+            self._gaps, gap_s = self._autopilot.gaps, self._autopilot.gap_s
+            text = f"setpoints had stopped for {gap_s:.2f} s: the autopilot's failsafe may have acted"
+            self._alerts.put("gap", text, now_us)
+            self._note("setpoint_gap", seconds=gap_s)
         self._virtual, self._thrust_01 = virtual, setpoint.thrust_01
         self._predictor.sent(now_us, virtual)
         return setpoint
@@ -357,10 +401,14 @@ class Agent:
             others_ned_m=self._surroundings.others_ned_m(utc_us),
             arm_in=None if dialect is None else dialect.arm_in,
             boots=self._autopilot.clock.boots,
-            refusal=self._refusal(),
+            refusal=self._upkeep.refusal,
+            unsettled=self._unsettled(now_us),
+            overload=self._overload.level,
+            armed_told_us=self._autopilot.armed_told_us,
         )
         for command in self._sequence.step(facts):
             self._commands.request(command)
+        self._finish(now_us)
         self._upkeep.step(now_us)
         if not before[1] and self._sequence.had_control:
             self._predictor.clear()
@@ -372,12 +420,31 @@ class Agent:
             names = {"phase": now[0].name, "mode": now[1].name, "flight_mode": now[2].name}
             self._note("state", **names, reason=self._judgement.reason)
 
-    def _refusal(self) -> str:
-        """Why nothing may be armed, or ""."""
-        alone = len(self._setup.starts_ned_m) == 1
-        accuracy_m = self._autopilot.pos_accuracy_m or 0.0  # not told: body and tracking are left to judge by
-        radius = "" if alone else radius_problem(self._setup.separation, accuracy_m)
-        return "; ".join(filter(None, (self._upkeep.refusal, radius)))
+    def _finish(self, now_us: int) -> None:
+        """At the end of the mission: give the autopilot its parameters back. Before it: say what is waited for."""
+        phase, waits_for = self._sequence.phase, self._sequence.waits_for
+        if phase is Phase.STANDBY and waits_for and self._waited_us(self._standby_us) > _WAITS_LONG_US:
+            self._alerts.put("start", f"waits for {waits_for}", now_us)
+        if phase is not Phase.STANDBY:
+            self._standby_us = now_us
+        if not self._sequence.finished:
+            return
+        if self._done_us is None:
+            self._done_us = now_us
+            self._upkeep.restore()
+        if self._upkeep.left_changed and self._waited_us(self._done_us) > _RESTORE_US and not self._upkeep.restored:
+            self._alerts.put("restore", f"parameters left changed: {self._upkeep.left_changed}", now_us)
+
+    def _waited_us(self, since_us: int) -> int:
+        return self._clock.now_us() - since_us
+
+    def _unsettled(self, now_us: int) -> str:
+        """Why nothing may be armed yet: the estimator settles, or is too inaccurate for the distances asked for."""
+        if len(self._setup.starts_ned_m) == 1 or self._sequence.phase > Phase.STANDBY:
+            return ""
+        self._accuracy.update(now_us, self._autopilot.pos_accuracy_m)
+        accuracy_m = self._accuracy.worst_m or 0.0  # not told: body and tracking are left to judge by
+        return self._accuracy.unsettled(now_us) or radius_problem(self._setup.separation, accuracy_m)
 
     # -- share, record ------------------------------------------------------------------------------------------------
 
@@ -385,18 +452,19 @@ class Agent:
         if state is not None:
             self._bus.publish(topics.PATH, topics.encode_path(self._path(state, flown)))
         if self._coordination is not None:
-            self._coordination.say()
+            self._coordination.say(self._clock.utc_us())
 
     def _path(self, state: VehicleState, flown: Plan | None) -> PredictedPath:
         setup, seq = self._setup, self._reporter.seq
+        margin_m = min(topics.MAX_RADIUS_M, self._autopilot.frame.margin_m + self._overload.margin_m)
         if flown is not None:
             t0_us, dt_us, pos = self._utc(flown.t0_us), flown.dt_us, flown.pos_ned_m
-            return PredictedPath(setup.agent, setup.boot_id, seq, t0_us, dt_us, 0.0, pos)
+            return PredictedPath(setup.agent, setup.boot_id, seq, t0_us, dt_us, margin_m, pos)
         act_us, dt_us = self._clock.now_us() + self._predictor.delay_us, self._controller.dt_us
         grid = np.arange(self._controller.steps + 1, dtype=np.float64)
         ahead_s = grid * (dt_us * 1e-6) + (act_us - state.t_us) * 1e-6
         pos = coasting(state, ahead_s, setup.separation.brake_m_s2)
-        return PredictedPath(setup.agent, setup.boot_id, seq, self._utc(act_us), dt_us, 0.0, pos)
+        return PredictedPath(setup.agent, setup.boot_id, seq, self._utc(act_us), dt_us, margin_m, pos)
 
     def _fresh(self, now_us: int, state: VehicleState) -> bool:
         return now_us - state.t_us <= self._setup.params.failsafe.state_max_age_s * 1e6

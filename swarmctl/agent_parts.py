@@ -49,6 +49,7 @@ def make_coordination(
         bus,
         note,
         stopwatch_ns,
+        setup.params.rate_hz,
     )
 
 

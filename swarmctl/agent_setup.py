@@ -13,6 +13,7 @@ from swarmctl.control.disturbance import DisturbanceParams
 from swarmctl.control.failsafe import FailsafeParams
 from swarmctl.control.mission import MissionParams
 from swarmctl.control.model import VehicleModelParams
+from swarmctl.control.overload import OverloadParams
 from swarmctl.control.separation import SeparationParams
 from swarmctl.control.sequence import SequenceParams
 from swarmctl.control.state_filter import StateFilterParams
@@ -28,13 +29,14 @@ class AgentParams(Params):
     connect_timeout_s: float = Field(15.0, gt=0, le=600)
     sequence: SequenceParams = SequenceParams()
     failsafe: FailsafeParams = FailsafeParams()
+    overload: OverloadParams = OverloadParams()
     disturbance: DisturbanceParams = DisturbanceParams()
     state_filter: StateFilterParams = StateFilterParams()
     barrier: BarrierParams = BarrierParams()
     commit: CommitParams = CommitParams()
     detour: DetourParams = DetourParams()
-    autopilot_params: dict[str, int | float] = Field(  # PX4: land when setpoints stop, before it has flown far blindly
-        {"COM_OBL_RC_ACT": 4, "COM_OF_LOSS_T": 0.5}
+    autopilot_params: dict[str, int | float] = Field(  # PX4: land when setpoints stop, or heartbeats before OFFBOARD
+        {"COM_OBL_RC_ACT": 4, "COM_OF_LOSS_T": 0.5, "NAV_DLL_ACT": 3, "COM_DL_LOSS_T": 5}
     )
 
 

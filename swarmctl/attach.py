@@ -1,13 +1,16 @@
 """How an operator's command finds a running launch and speaks to it over the bus.
 
-A launch leaves a note in its run folder and one in a private directory per user; both hold its process, so that a
-stale note is recognised. The verbs repeat what they say until they see an answer, because a fresh session may speak
+A launch leaves a note in its run folder and one in each registry: private directories of the user, in the user's
+runtime directory and beside other temporary files, so that a verb from a session without the former finds it as well.
+Every note holds the launch's process, so that a stale one is recognised; what is not private or of somebody else is
+ignored, whatever its name. The verbs repeat what they say until they see an answer, because a fresh session may speak
 before its router has told it who listens.
 """
 
 from __future__ import annotations
 
 import contextlib
+import json
 import math
 import os
 import stat
@@ -21,14 +24,17 @@ import msgspec
 import psutil
 
 from swarmctl.errors import ConfigError, StartError
+from swarmctl.files import read_file, replace_bytes
 from swarmctl.links.bus import ZenohBus
+from swarmctl.links.orders import EVERYBODY, Verb, orders
 from swarmctl.links.peers import agent_name
 from swarmctl.links.topics import (
     COMMAND,
+    MAX_OBSTACLE_M,
+    MAX_OBSTACLES,
     OBSTACLES,
     OPERATOR,
     STATUS,
-    CommandMessage,
     ObstacleMessage,
     ObstaclesMessage,
     StatusMessage,
@@ -38,10 +44,10 @@ from swarmctl.links.topics import (
 )
 
 LAUNCH_FILE = "launch.json"
-MAX_OBSTACLE_M = 10_000.0
 _ANSWER_S = 5.0
 _REPEAT_S = 0.2
 _START_TOLERANCE_S = 1.0
+_MOST_BYTES = 65_536  # of a note
 
 
 class RunningLaunch(msgspec.Struct, frozen=True):
@@ -57,17 +63,20 @@ class RunningLaunch(msgspec.Struct, frozen=True):
 
 
 def announce(launch: RunningLaunch) -> None:
-    """Write the notes of a launch; the per-user one is a convenience and skipped where it would not be private."""
+    """Write the notes of a launch; without the one in its run folder it can't be spoken to, the others are extra."""
     payload = msgspec.json.encode(launch)
-    _replace(Path(launch.run_dir) / LAUNCH_FILE, payload)
-    with contextlib.suppress(OSError):
-        _replace(_private_registry() / f"{launch.pid}.json", payload)
+    replace_bytes(Path(launch.run_dir) / LAUNCH_FILE, payload)
+    for registry in (_runtime_registry(), _temporary_registry()):
+        if registry is not None:
+            with contextlib.suppress(OSError):
+                replace_bytes(registry / f"{launch.pid}.json", payload)
 
 
 def withdraw() -> None:
-    """Take this process's per-user note away."""
-    with contextlib.suppress(OSError):
-        (_registry() / f"{os.getpid()}.json").unlink(missing_ok=True)
+    """Take this process's notes out of the registries."""
+    for registry in _registries():
+        with contextlib.suppress(OSError):
+            (registry / f"{os.getpid()}.json").unlink(missing_ok=True)
 
 
 def process_start_s() -> tuple[float, int]:
@@ -87,12 +96,12 @@ def find_launch(run_dir: Path | None) -> RunningLaunch:
             raise StartError(f"--run-dir {run_dir}: no launch runs there. See what does with: swarmctl status")
         return launch
     running: list[tuple[float, RunningLaunch]] = []
-    with contextlib.suppress(OSError):
-        for path in _registry().glob("*.json"):
-            launch = _read(path) if path.stat().st_uid == os.getuid() else None
-            if launch is not None and _runs(launch):
-                running.append((launch.started_s, launch))
-            else:
+    for path in (path for registry in _registries() for path in registry.glob("*.json")):
+        launch = _read(path)
+        if launch is not None and _runs(launch):
+            running.append((launch.started_s, launch))
+        else:
+            with contextlib.suppress(OSError):
                 path.unlink(missing_ok=True)
     if not running:
         raise StartError("no launch runs. Start one with: swarmctl launch")
@@ -135,13 +144,16 @@ def command(launch: RunningLaunch, verb: str, agent: int | None) -> dict[int, St
     if agent is not None and not 0 <= agent < launch.agents:
         raise StartError(f"--agent {agent}: this launch has agents 0 to {launch.agents - 1}")
     asked = range(launch.agents) if agent is None else range(agent, agent + 1)
-    order = {"verb": verb, "agent": -1 if agent is None else agent, "utc_us": time.time_ns() // 1000}
-    message = msgspec.convert(order, CommandMessage)
     with _joined(launch) as bus:
-        if not _statuses(bus, asked, _ANSWER_S):
+        ahead_us: dict[int, int] = {}
+        if not _statuses(bus, asked, _ANSWER_S, ahead_us):
             raise StartError(f"{verb}: no agent asked is on the bus; see: swarmctl status")
+        now_us = time.time_ns() // 1000
+        clocks_us = [now_us + us for us in ahead_us.values()]
+        said = orders(msgspec.convert(verb, Verb), EVERYBODY if agent is None else agent, now_us, clocks_us)
         for _ in range(5):
-            bus.publish(COMMAND, encode_message(message))
+            for order in said:
+                bus.publish(COMMAND, order)
             time.sleep(_REPEAT_S)
         bus.receive(STATUS)
         return _statuses(bus, asked, 1.0)
@@ -167,7 +179,10 @@ def change_obstacles(
     """
     with _joined(launch) as bus:
         old = _obstacles(bus, 0)
-        new = ObstaclesMessage(old.version + 1, change(old.obstacles))
+        changed = change(old.obstacles)
+        if len(changed) > MAX_OBSTACLES:
+            raise ConfigError("obstacle", [f"add: there are {len(old.obstacles)}, agents keep {MAX_OBSTACLES} at most"])
+        new = ObstaclesMessage(old.version + 1, changed)
         return _obstacles(bus, new.version, encode_message(new))
 
 
@@ -225,8 +240,13 @@ def _obstacles(bus: ZenohBus, least_version: int, say: bytes | None = None) -> O
     raise StartError(f"obstacle: the launch did not answer within {_ANSWER_S:.0f} s; see: swarmctl status")
 
 
-def _statuses(bus: ZenohBus, agents: range, timeout_s: float) -> dict[int, StatusMessage]:
-    """Newest status of each of `agents`, as soon as all have said one or when time is up."""
+def _statuses(
+    bus: ZenohBus, agents: range, timeout_s: float, ahead_us: dict[int, int] | None = None
+) -> dict[int, StatusMessage]:
+    """Newest status of each of `agents`, as soon as all have said one or when time is up.
+
+    `ahead_us` is told by how much the clock of each is ahead of ours.
+    """
     heard: dict[int, StatusMessage] = {}
     deadline_s = time.monotonic() + timeout_s
     while time.monotonic() < deadline_s:
@@ -234,28 +254,66 @@ def _statuses(bus: ZenohBus, agents: range, timeout_s: float) -> dict[int, Statu
             status = decode_status(payload)
             if status is not None and status.agent in agents and sender == agent_name(status.agent):
                 heard[status.agent] = status
+                if ahead_us is not None:
+                    ahead_us[status.agent] = status.utc_us - time.time_ns() // 1000
         if len(heard) == len(agents):
             break
         time.sleep(0.02)
     return dict(sorted(heard.items()))
 
 
-def _registry() -> Path:
-    return Path(tempfile.gettempdir()) / f"swarmctl-{os.getuid()}"
+def _registries() -> list[Path]:
+    """Private directories of this user that may hold notes."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    places = [Path(runtime) / "swarmctl"] if runtime and _is_private(Path(runtime)) else []
+    places += sorted(_temporary_folder().glob(f"{_temporary_name()}*"))
+    return [place for place in places if _is_private(place)]
 
 
-def _private_registry() -> Path:
-    path = _registry()
-    path.mkdir(mode=0o700, exist_ok=True)
-    status = path.lstat()
-    if not stat.S_ISDIR(status.st_mode) or status.st_uid != os.getuid() or status.st_mode & 0o077:
-        raise OSError(f"{path} is not private")
-    return path
+def _runtime_registry() -> Path | None:
+    """The user's own runtime directory is nobody else's to squat on; None where there is none."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    if not runtime or not _is_private(Path(runtime)):
+        return None
+    registry = Path(runtime) / "swarmctl"
+    with contextlib.suppress(OSError):
+        registry.mkdir(mode=0o700, exist_ok=True)
+    return registry if _is_private(registry) else None
+
+
+def _temporary_registry() -> Path | None:
+    """Where anybody may take the plain name first, one with a name nobody can foresee serves as well."""
+    plain = _temporary_folder() / _temporary_name()
+    with contextlib.suppress(OSError):
+        plain.mkdir(mode=0o700, exist_ok=True)
+    for place in (plain, *sorted(plain.parent.glob(f"{plain.name}-*"))):
+        if _is_private(place):
+            return place
+    with contextlib.suppress(OSError):
+        return Path(tempfile.mkdtemp(prefix=f"{plain.name}-", dir=plain.parent))
+    return None
+
+
+def _temporary_folder() -> Path:
+    return Path(tempfile.gettempdir())
+
+
+def _temporary_name() -> str:
+    return f"swarmctl-{os.getuid()}"
+
+
+def _is_private(place: Path) -> bool:
+    """Whether it is a directory, no link, of this user, and closed to everybody else."""
+    try:
+        status = place.lstat()
+    except OSError:
+        return False
+    return stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o077
 
 
 def _read(path: Path) -> RunningLaunch | None:
     try:
-        return msgspec.json.decode(path.read_bytes(), type=RunningLaunch)
+        return msgspec.json.decode(read_file(path, _MOST_BYTES), type=RunningLaunch)
     except (OSError, msgspec.DecodeError):
         return None
 
@@ -267,12 +325,6 @@ def _runs(launch: RunningLaunch) -> bool:
         return False
 
 
-def _replace(path: Path, payload: bytes) -> None:
-    part = path.with_name(f"{path.name}.part")
-    part.write_bytes(payload)
-    part.replace(path)
-
-
 def as_json(statuses: dict[int, StatusMessage]) -> str:
     """Statuses for programs: a JSON list, one object per agent."""
-    return msgspec.json.format(msgspec.json.encode(list(statuses.values())), indent=2).decode()
+    return json.dumps(msgspec.to_builtins(list(statuses.values())), indent=2)  # ASCII: agents may say anything

@@ -193,13 +193,18 @@ def _simulator(config: Config) -> Iterator[_Field]:
 
 @contextlib.contextmanager
 def _interruptible() -> Iterator[None]:
-    """SIGTERM as Ctrl-C: what was started here is ended."""
+    """SIGTERM and SIGHUP as Ctrl-C, once: from then on they are ignored, so that what was started here is ended."""
+    signums = (signal.SIGTERM, signal.SIGHUP)
 
     def interrupt(signum: int, frame: FrameType | None) -> None:
+        for each in signums:
+            signal.signal(each, signal.SIG_IGN)
         raise KeyboardInterrupt
 
-    before = signal.signal(signal.SIGTERM, interrupt)
+    before = [signal.signal(each, interrupt) for each in signums]
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for each, handler in zip(signums, before, strict=True):
+            if signal.getsignal(each) is interrupt:
+                signal.signal(each, handler)

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
+from swarmctl.core.text import printable_lines
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, SwarmError
 
 if TYPE_CHECKING:
@@ -54,7 +55,7 @@ def _run_app() -> int:
     try:
         code = app(standalone_mode=False)
     except SwarmError as error:
-        print(error, file=sys.stderr)
+        print(printable_lines(str(error)), file=sys.stderr)
         return error.exit_code
     except (typer.Abort, KeyboardInterrupt):
         return EXIT_INTERRUPTED
@@ -132,14 +133,29 @@ def agent(
     bus: Annotated[str, typer.Option("--bus", help="Endpoint of the router.")],
     run_dir: Annotated[Path, typer.Option("--run-dir", help="Folder to record into.")],
     fd: Annotated[int | None, typer.Option("--fd", help="Inherited, bound UDP socket of the vehicle.")] = None,
+    vehicle_port: Annotated[
+        int | None, typer.Option("--vehicle-port", help="Loopback port at the other end of that socket.")
+    ] = None,
+    only_land: Annotated[bool, typer.Option("--only-land", help="Land and disarm the vehicle, then end.")] = False,
 ) -> int:
     """One agent beside one autopilot. `launch` starts them; on a companion computer start it yourself."""
     from swarmctl.lifeline import PARENT_ENV, die_with_parent
-    from swarmctl.runner import run_agent
+    from swarmctl.runner import AgentProcess, run_agent
 
     if PARENT_ENV in os.environ:
         die_with_parent(signal.SIGTERM)
-    return run_agent(config, number, run, bus, run_dir, fd)
+    return run_agent(
+        AgentProcess(
+            config_path=config,
+            agent=number,
+            run=run,
+            bus=bus,
+            run_dir=run_dir,
+            fd=fd,
+            vehicle_port=vehicle_port,
+            only_land=only_land,
+        )
+    )
 
 
 @app.command()

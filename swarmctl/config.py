@@ -10,8 +10,6 @@ import difflib
 import itertools
 import json
 import math
-import re
-import tomllib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
@@ -19,19 +17,24 @@ from typing import Any, Literal
 from pydantic import Field, ValidationError
 
 from swarmctl.agent_setup import AgentParams
+from swarmctl.config_source import override, read_tree, shown
 from swarmctl.control.controller import ControllerParams
 from swarmctl.control.mission import MissionParams
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.separation import SeparationParams, radius_problem
 from swarmctl.core.params import Params, Vec3
 from swarmctl.core.simulated import RealismParams
+from swarmctl.core.text import printable
 from swarmctl.errors import ConfigError
+from swarmctl.links.parameter_names import parameter_problems
+from swarmctl.links.topics import MAX_OBSTACLE_M, MAX_OBSTACLES
 from swarmctl.links.transport import Endpoint, parse_url
 from swarmctl.telemetry.referee import ObstacleRule, Rules
 
 MAX_AGENTS = 100
 _PAIRS_SHOWN = 3
-_BARE_KEY = re.compile(r"^[A-Za-z0-9_-]+$")
+_PLACES_SHOWN = 3
+_PROBLEMS_SHOWN = 30
 
 
 class SwarmParams(Params):
@@ -185,14 +188,16 @@ def load(path: Path | None, overrides: Sequence[str] = ()) -> Config:
         ConfigError: every problem found, each with key, value, allowed range and fix.
     """
     source = str(path) if path else "defaults"
-    tree = _read(path)
-    problems = [p for item in overrides for p in _override(tree, item)]
+    tree = read_tree(path)
+    problems = [p for item in overrides for p in override(tree, item)]
     if problems:
         raise ConfigError(source, problems)
     try:
         config = Config.model_validate(tree)
     except ValidationError as error:
-        raise ConfigError(source, [_explain(dict(e)) for e in error.errors()]) from error
+        problems = [_explain(dict(e)) for e in error.errors(include_url=False)[:_PROBLEMS_SHOWN]]
+        hidden = error.error_count() - len(problems)
+        raise ConfigError(source, [*problems, *([f"and {hidden} more problems"] if hidden else [])]) from error
     problems = list(_whole(config))
     if problems:
         raise ConfigError(source, problems)
@@ -206,69 +211,36 @@ def dump(config: Config) -> str:
     return "\n".join(lines) + "\n"
 
 
-def _read(path: Path | None) -> dict[str, Any]:
-    if path is None:
-        return {}
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise ConfigError(str(path), ["no such file. Give the path of a TOML file, for example configs/"]) from error
-    except (OSError, UnicodeDecodeError) as error:
-        raise ConfigError(str(path), [f"can't be read: {error}"]) from error
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise ConfigError(str(path), [f"not TOML: {error}"]) from error
-
-
-def _override(tree: dict[str, Any], item: str) -> list[str]:
-    key, equals, text = item.partition("=")
-    parts = key.strip().split(".")
-    if not equals or not all(parts):
-        return [f"--set {item!r}: write it as key.sub=value"]
-    value = _value(text)
-    node: Any = tree
-    for part, following in itertools.pairwise(parts):
-        if isinstance(node, list):
-            if not part.isdigit() or int(part) >= len(node):
-                return [f"--set {key}: {part!r} is not an index of a list of {len(node)}"]
-            node = node[int(part)]
-        elif isinstance(node, dict):
-            node = node.setdefault(part, [] if following.isdigit() else {})
-        else:
-            return [f"--set {key}: {part!r} is inside a value, not a section"]
-    last = parts[-1]
-    if isinstance(node, dict):
-        node[last] = value
-    elif isinstance(node, list) and last.isdigit() and int(last) < len(node):
-        node[int(last)] = value
-    else:
-        return [f"--set {key}: no such place"]
-    return []
-
-
-def _value(text: str) -> Any:
-    """A TOML value; anything that is not exactly one is the text itself."""
-    try:
-        tree = tomllib.loads(f"v = {text}")
-    except (tomllib.TOMLDecodeError, RecursionError):
-        return text
-    return tree["v"] if tree.keys() == {"v"} else text
-
-
 def _explain(error: dict[str, Any]) -> str:
     """One line with key, value, allowed range and fix."""
     location = [str(part) for part in error["loc"]]
-    key = ".".join(location)
-    value = error.get("input")
+    key = printable(".".join(location), 100)
+    value = shown(error.get("input"))
     if error["type"] == "extra_forbidden":
-        known = _keys_at(location[:-1])
-        close = difflib.get_close_matches(location[-1], known, 1)
-        hint = f"did you mean {close[0]!r}?" if close else f"known here: {', '.join(sorted(known))}"
-        return f"{key} = {value!r}: unknown key; {hint}"
+        return f"{key} = {value}: unknown key; {_hint(location)}"
     if error["type"] == "missing":
         return f"{key}: missing; add it"
     if error["type"] == "finite_number":
-        return f"{key} = {value!r}: not a finite number; give a real one{_range_of(location)}"
-    return f"{key} = {value!r}: {error['msg'].lower()}{_range_of(location)}"
+        return f"{key} = {value}: not a finite number; give a real one{_range_of(location)}"
+    return f"{key} = {value}: {error['msg'].lower()}{_range_of(location)}"
+
+
+def _hint(location: Sequence[str]) -> str:
+    """What somebody who wrote an unknown key may have meant: the same word elsewhere, or a like one here."""
+    elsewhere = [key for key in _all_keys(Config, "") if key.rpartition(".")[2] == location[-1]]
+    if elsewhere:
+        return f"did you mean {' or '.join(map(repr, elsewhere[:_PLACES_SHOWN]))}?"
+    known = _keys_at(location[:-1])
+    close = difflib.get_close_matches(location[-1], known, 1)
+    return f"did you mean {close[0]!r}?" if close else f"known here: {', '.join(sorted(known))}"
+
+
+def _all_keys(model: Any, prefix: str) -> Iterator[str]:
+    for name, field in model.model_fields.items():
+        yield f"{prefix}{name}"
+        inner = _model_of(field.annotation)
+        if inner is not None:
+            yield from _all_keys(inner, f"{prefix}{name}.")
 
 
 def _field_at(location: Sequence[str]) -> Any:
@@ -320,6 +292,8 @@ def _whole(config: Config) -> Iterator[str]:
     elif not (listed and listed < agents):
         yield from _starts_apart(config)
     yield from _vehicle_problems(config)
+    yield from _obstacle_problems(config)
+    yield from parameter_problems(config.agent.autopilot_params)
     if config.sitl.speed != 1.0:
         yield (
             f"sitl.speed = {config.sitl.speed}: agents fly on wall time and can't follow; leave it at 1. Faster than "
@@ -334,6 +308,17 @@ def _whole(config: Config) -> Iterator[str]:
             f"limits.min_separation_m = {config.limits.min_separation_m}: larger than separation.radius_m = "
             f"{config.separation.radius_m}; agents would be judged by more than they keep. Lower it or raise the radius"
         )
+
+
+def _obstacle_problems(config: Config) -> Iterator[str]:
+    """What agents would refuse to hear of."""
+    if len(config.obstacles) > MAX_OBSTACLES:
+        yield f"obstacles: {len(config.obstacles)} are listed, agents keep {MAX_OBSTACLES} at most"
+        return
+    for number, obstacle in enumerate(config.obstacles):
+        for key, vector in (("center_ned_m", obstacle.center_ned_m), ("vel_ned_m_s", obstacle.vel_ned_m_s)):
+            if max(map(abs, vector)) > MAX_OBSTACLE_M:
+                yield f"obstacles.{number}.{key} = {vector}: every number must be within {MAX_OBSTACLE_M:g}"
 
 
 def _starts_apart(config: Config) -> Iterator[str]:
@@ -409,17 +394,13 @@ def _dump_table(table: dict[str, Any], prefix: str, lines: list[str]) -> None:
         if isinstance(value, dict) or (isinstance(value, (list, tuple)) and value and isinstance(value[0], dict)):
             nested.append((key, value))
         elif value is not None:
-            lines.append(f"{_key(key)} = {toml_value(value)}")
+            lines.append(f"{key} = {toml_value(value)}")
     for key, value in nested:
-        name = f"{prefix}{_key(key)}"
+        name = f"{prefix}{key}"
         for item in [value] if isinstance(value, dict) else value:
             header = f"[{name}]" if isinstance(value, dict) else f"[[{name}]]"
             lines.extend(["", header])
             _dump_table(item, f"{name}.", lines)
-
-
-def _key(key: str) -> str:
-    return key if _BARE_KEY.match(key) else toml_value(key)
 
 
 def toml_value(value: Any) -> str:
@@ -433,5 +414,5 @@ def toml_value(value: Any) -> str:
     if isinstance(value, (list, tuple)):
         return "[" + ", ".join(toml_value(v) for v in value) + "]"
     if isinstance(value, dict):
-        return "{" + ", ".join(f"{_key(k)} = {toml_value(v)}" for k, v in value.items() if v is not None) + "}"
+        return "{" + ", ".join(f"{k} = {toml_value(v)}" for k, v in value.items() if v is not None) + "}"
     raise TypeError(f"no TOML for {type(value).__name__}")

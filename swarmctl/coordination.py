@@ -32,6 +32,7 @@ class Coordination:
         params, mpc, separation, slots, stopwatch_ns: see `Commitments`.
         surroundings: who else is there.
         bus: is drained by `listen`.
+        rate_hz: of every agent's ticks.
         note: is told `broken_promise` when a peer's promise contradicts ours; `off_promise` when what is flown leaves
             what is promised by more than half of what is promised beyond touching bodies, and when it is back; and
             `promises` with all counts when somebody else takes over.
@@ -50,10 +51,12 @@ class Coordination:
         bus: Bus,
         note: Callable[..., None],
         stopwatch_ns: Callable[[], int],
+        rate_hz: float,
     ) -> None:
         self._agent, self._boot_id, self._bus, self._surroundings = agent, boot_id, bus, surroundings
         self._commitments = Commitments(agent, params, mpc, separation, slots, stopwatch_ns)
-        self._intents, self._peers = PeerIntents(peers), frozenset(peers)
+        refusals, attendance = surroundings.refusals, surroundings.attendance
+        self._intents, self._peers = PeerIntents(peers, rate_hz, refusals, attendance), frozenset(peers)
         self._note, self._seq, self._separation = note, 0, separation
         self._promised = False
         self._allowed_m = separation.tracking_m + 0.5 * (promised_m(separation) - separation.body_m)
@@ -66,11 +69,6 @@ class Coordination:
     @property
     def counts(self) -> CommitCounts:
         return self._commitments.counts
-
-    @property
-    def rejected(self) -> dict[str, int]:
-        """Messages refused so far, by reason."""
-        return dict(self._intents.rejected)
 
     def listen(self, utc_us: int) -> None:
         """Rule 1."""
@@ -116,7 +114,7 @@ class Coordination:
         assert self._commitments.committed is not None
         return self._commitments.committed.sample(t_utc_us)
 
-    def say(self) -> None:
+    def say(self, utc_us: int) -> None:
         """Rule 5."""
         if self._commitments.committed is None:
             return
@@ -125,6 +123,7 @@ class Coordination:
             self._agent,
             self._boot_id,
             self._seq,
+            utc_us,
             self._promised,
             self._commitments.committed,
             self._commitments.proposal,

@@ -8,11 +8,14 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Sequence
 
+from swarmctl.core.text import printable, printable_lines
+
 EXIT_OK = 0
 EXIT_USAGE = 2
 EXIT_START = 3
 EXIT_MISSION = 4
 EXIT_INTERRUPTED = 130
+_MOST_SHOWN = 2000  # characters of one problem
 
 
 class SwarmError(Exception):
@@ -29,7 +32,7 @@ class ConfigError(SwarmError):
     def __init__(self, source: str, problems: Sequence[str]) -> None:
         self.source = source
         self.problems = tuple(problems)
-        super().__init__("\n".join(f"{source}: {problem}" for problem in self.problems))
+        super().__init__("\n".join(printable(f"{source}: {problem}", _MOST_SHOWN) for problem in self.problems))
 
 
 class StartError(SwarmError):
@@ -49,7 +52,7 @@ def exit_code_of(run: Callable[[], int], when_interrupted: str = "") -> int:
     try:
         return run()
     except SwarmError as error:
-        print(error, file=sys.stderr)
+        print(printable_lines(str(error)), file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
         if when_interrupted:

@@ -17,6 +17,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from swarmctl.attach import RunningLaunch
+from swarmctl.config import load
 from swarmctl.core.simulated import FAULTS, FaultParams
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.processes import control_socket
@@ -49,10 +50,12 @@ def inject(launch: RunningLaunch, fault: FaultParams) -> str:
 
     Raises:
         ConfigError: the launch flies vehicles that are not simulated by it, or the simulator refuses.
-        StartError: the simulator does not answer.
+        StartError: the simulator does not answer, or has ended with the flight.
     """
     path = control_socket(launch.bus)
     if not path.exists():
+        if load(Path(launch.run_dir) / "config.toml").sitl.enabled:
+            raise StartError(f"fault: the simulator of {launch.run} is not up yet, or has ended; see: swarmctl status")
         why = "this launch started no simulator; faults are for simulated vehicles, never for real ones"
         raise ConfigError("fault", [f"{launch.run}: {why}"])
     answer = _ask(path, {"fault": fault.model_dump()})

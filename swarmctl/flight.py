@@ -18,12 +18,12 @@ from typing import Any
 from swarmctl.config import Config
 from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START
+from swarmctl.links.orders import EVERYBODY, orders
 from swarmctl.links.peers import Bus, agent_name
 from swarmctl.links.topics import (
     COMMAND,
     OBSTACLES,
     STATUS,
-    CommandMessage,
     ObstacleMessage,
     ObstaclesMessage,
     decode_obstacles,
@@ -32,6 +32,7 @@ from swarmctl.links.topics import (
     first_obstacles,
 )
 from swarmctl.processes import ROUTER, SITL, VIEWER, Child, Site, kill_all
+from swarmctl.recovery import RECOVERY_S, Recovery
 from swarmctl.table import AgentView, Display, name_of
 
 _STEP_S = 0.05
@@ -71,6 +72,10 @@ class Base:
         """Publish the address of the live view to operators' commands."""
         raise NotImplementedError
 
+    def recover(self, agent: int) -> Child:
+        """Start an agent on the vehicle of one that ended; it only lands that vehicle."""
+        raise NotImplementedError
+
 
 @dataclass(slots=True)
 class Verdict:
@@ -78,6 +83,8 @@ class Verdict:
 
     problems: list[str] = field(default_factory=list)
     could_not_start: bool = False
+    has_armed: bool = False  # somebody has asked a vehicle to arm
+    left: tuple[str, ...] = ()  # vehicles that may still be armed or in the air, in words
     interrupted: bool = False
     obstacles: dict[ObstacleMessage, int | None] | None = None  # since when [us UTC]; None: as configured
 
@@ -90,11 +97,18 @@ class Verdict:
 
     def exit_code(self, violated: bool) -> int:
         """Of the whole launch; `violated`: the referee found a limit broken."""
+        if self.left:
+            return EXIT_MISSION
         if self.interrupted:
             return EXIT_INTERRUPTED
-        if self.could_not_start:
+        if self.could_not_start and not self.has_armed:
             return EXIT_START
         return EXIT_MISSION if self.problems or violated else EXIT_OK
+
+
+def why_it_failed(outcome: str, last_line: str) -> str:
+    """Why an agent ended with a failure: what its mission came to, or what went wrong after a complete one."""
+    return (outcome if outcome != "completed" else "") or last_line or "no reason given"
 
 
 class Flight:
@@ -115,8 +129,9 @@ class Flight:
         self._started_s = time.monotonic()
         self._reported: set[str] = set()
         self._carrier_lost = False  # router or simulator is gone
-        self._land_order: bytes | None = None
-        self._land_ordered_s = 0.0
+        self._vehicles_lost = False  # the simulator is gone, and its vehicles with it
+        self._recovery = Recovery(base.recover, config.sysids())
+        self._land_ordered_s: float | None = None
         self._land_said_s = 0.0
         self._land_until_s = 0.0
 
@@ -139,11 +154,21 @@ class Flight:
             self._speak()
             self._display.show(self._views)
             if self._is_over():
-                return self._verdict
+                return self._name_the_left()
             time.sleep(_STEP_S)
         self._verdict.interrupted = True
         self._fail("killed", "interrupted twice: every process was killed, vehicles were left to their autopilots")
+        running = self._running()
         kill_all(list(self._base.children.values()))
+        if not self._config.sitl.enabled:
+            self._recovery.give_up(running)
+        return self._name_the_left()
+
+    def _name_the_left(self) -> Verdict:
+        """Say of every vehicle that is not known to be down that it is not."""
+        self._verdict.left = () if self._vehicles_lost else tuple(self._recovery.left(self._views))
+        for words in self._verdict.left:
+            self._fail("vehicle_left", words)
         return self._verdict
 
     def _hear(self) -> None:
@@ -155,9 +180,10 @@ class Flight:
             if view.status is None or view.status.phase != status.phase:
                 self._base.log.write("phase", agent=status.agent, phase=name_of(Phase, status.phase))
             view.status, view.heard_s = status, time.monotonic()
+            self._verdict.has_armed |= Phase.ARM <= status.phase < Phase.DONE
         for _, payload in self._bus.receive(OBSTACLES):
             message = decode_obstacles(payload)
-            if message is not None and message.version > self._obstacles.version:
+            if message is not None and message.replaces(self._obstacles.version):
                 self._adopt(message)
 
     def _adopt(self, message: ObstaclesMessage) -> None:
@@ -174,6 +200,7 @@ class Flight:
             child = self._base.children.get(name)
             if child is not None and child.poll() is not None and self._once(name):
                 self._carrier_lost = True
+                self._vehicles_lost |= name == SITL
                 self._verdict.could_not_start |= not any(view.status for view in self._views)
                 self._fail(f"{name}_ended", f"{name} {child.how_it_ended()}; landing. See {child.log}")
                 self._land(land_s)
@@ -203,14 +230,31 @@ class Flight:
             code = child.poll()
             if code is None:
                 self._judge_silence(view, child, now_s)
-            elif self._once(child.name):
+            elif self._once(f"{child.name} {child.pid} ended"):
                 self._note_end(view, child, code)
+                self._recover(view, code)
+
+    def _recover(self, view: AgentView, code: int) -> None:
+        """Have a vehicle that is not known to be down landed by another process on its link."""
+        if self._recovery.is_on(view.agent) and code == EXIT_INTERRUPTED:
+            self._say("recovered", f"the vehicle of {agent_name(view.agent)} is on the ground and disarmed")
+        child = None if self._vehicles_lost else self._recovery.begin(view, code)
+        if child is None:
+            return
+        self._base.children[agent_name(view.agent)] = child
+        view.note, view.heard_s = "recovering", time.monotonic()
+        self._say("recovering", f"landing the vehicle of {agent_name(view.agent)}, which may be armed or in the air")
+        if self._land_ordered_s is not None:
+            self._land_until_s = max(self._land_until_s, time.monotonic() + RECOVERY_S)
 
     def _judge_silence(self, view: AgentView, child: Child, now_s: float) -> None:
         waited_s = now_s - self._started_s
         if view.status is None:
             if waited_s > _HEARD_S and self._once(f"{child.name} unheard"):
                 self._refuse(f"{child.name} is not on the bus after {_HEARD_S:.0f} s; see {child.log}")
+        elif self._recovery.is_on(view.agent):
+            if self._recovery.is_overdue(view.agent):
+                child.kill_all()
         elif now_s - view.heard_s > _SILENCE_S:
             view.note = "silent"
             if self._once(f"{child.name} silent"):
@@ -235,34 +279,41 @@ class Flight:
         if now_s - self._obstacles_said_s >= _OBSTACLES_REPEAT_S:
             self._obstacles_said_s = now_s
             self._bus.publish(OBSTACLES, encode_message(self._obstacles))
-        if self._land_order is not None and now_s - self._land_said_s >= _LAND_REPEAT_S:
+        if self._land_ordered_s is not None and now_s - self._land_said_s >= _LAND_REPEAT_S:
             self._land_said_s = now_s
-            self._repeat_land_order(self._land_order, now_s)
+            self._repeat_land_order(now_s, now_s - self._land_ordered_s)
 
-    def _repeat_land_order(self, order: bytes, now_s: float) -> None:
-        """Over the bus until everybody shows that it lands, after a while also by signal."""
-        deaf = [view for view in self._running() if view.status is None or view.status.phase < Phase.GOTO_LAND]
+    def _repeat_land_order(self, now_s: float, since_s: float) -> None:
+        """Over the bus until everybody shows that it lands, stamped anew each time, after a while also by signal."""
+        running = (view for view in self._running() if not self._recovery.is_on(view.agent))
+        deaf = [view for view in running if view.status is None or view.status.phase < Phase.GOTO_LAND]
         if deaf:
-            self._bus.publish(COMMAND, order)
+            clocks_us = [
+                view.status.utc_us + round((now_s - view.heard_s) * 1e6) for view in deaf if view.status is not None
+            ]
+            for order in orders("land", EVERYBODY, time.time_ns() // 1000, clocks_us):
+                self._bus.publish(COMMAND, order)
         for view in deaf:
             child = self._base.children[agent_name(view.agent)]
-            if now_s - self._land_ordered_s > _LAND_OBEYED_S and self._once(f"{child.name} told by signal"):
+            if since_s > _LAND_OBEYED_S and self._once(f"{child.name} told by signal"):
                 child.signal(signal.SIGTERM)
 
     def _is_over(self) -> bool:
         """Whether nobody is left to wait for. Silent agents are given up when nobody else flies."""
         now_s = time.monotonic()
         running = self._running()
-        if self._land_order is not None and now_s > self._land_until_s:
+        if self._land_ordered_s is not None and now_s > self._land_until_s:
             for view in running:
-                self._fail("not_landed", f"{agent_name(view.agent)} did not end in time and was killed")
-            return True
+                if not self._recovery.is_on(view.agent):
+                    self._fail("not_landed", f"{agent_name(view.agent)} did not end in time and was killed")
+                kill_all([self._base.children[agent_name(view.agent)]])
+            return not running
         if not running:
             deaths_s = [
                 c.ended_s for c in self._base.children.values() if c.ended_s is not None and c.poll() not in (0, 130)
             ]
             return self._carrier_lost or not deaths_s or now_s - max(deaths_s) > _AFTER_DEATH_S
-        if self._land_order is None and all(view.note == "silent" for view in running):
+        if self._land_ordered_s is None and all(view.note == "silent" for view in running):
             bus_is_suspect = len(running) == len(self._views) and len(running) > 1
             self._land(_LAND_S if bus_is_suspect else _AFTER_DEATH_S)
         return False
@@ -270,32 +321,31 @@ class Flight:
     def _note_end(self, view: AgentView, child: Child, code: int) -> None:
         view.note = "done" if code == EXIT_OK else f"exit {code}"
         self._base.log.write("agent_ended", agent=view.agent, exit_code=code)
-        if code == EXIT_OK or self._carrier_lost:
+        if code == EXIT_OK or self._carrier_lost or self._recovery.is_on(view.agent):
             return
         if code == EXIT_INTERRUPTED:
-            self._verdict.interrupted = self._verdict.interrupted or self._land_order is None  # an operator's `land`
+            self._verdict.interrupted |= self._land_ordered_s is None  # an operator's `land`
         elif code == EXIT_START:
             self._refuse(f"{child.name} could not start: {child.last_line()}")
         elif code == EXIT_MISSION:
             outcome = view.status.outcome if view.status else ""
-            self._fail("agent_failed", f"{child.name} failed: {outcome or child.last_line() or 'no reason given'}")
+            self._fail("agent_failed", f"{child.name} failed: {why_it_failed(outcome, child.last_line())}")
         elif view.status is None:
             self._refuse(f"{child.name} could not start: it {child.how_it_ended()}")
         else:
             view.note = "dead"
-            self._fail(
-                "agent_died", f"{child.name} {child.how_it_ended()}; its autopilot is on its own, the others fly on"
-            )
+            self._fail("agent_died", f"{child.name} {child.how_it_ended()}; the others fly on")
 
     def _land(self, timeout_s: float) -> None:
         """Ask all to land, over the bus; by signal where the bus can't reach."""
         now_s = time.monotonic()
-        if self._land_order is None:
-            self._land_order = encode_message(CommandMessage("land", -1, time.time_ns() // 1000))
+        if self._land_ordered_s is None:
             self._land_ordered_s, self._land_until_s = now_s, now_s + timeout_s
             self._base.log.write("land")
         self._land_until_s = min(self._land_until_s, now_s + timeout_s)
         for view in self._running():
+            if self._recovery.is_on(view.agent):
+                continue
             if self._carrier_lost or view.status is None or view.note == "silent":
                 self._base.children[agent_name(view.agent)].signal(signal.SIGTERM)
 

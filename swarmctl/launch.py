@@ -10,7 +10,7 @@ import shutil
 import signal
 import tempfile
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -18,8 +18,9 @@ from typing import Any
 from swarmctl.attach import RunningLaunch, announce, process_start_s, withdraw
 from swarmctl.config import Config, dump
 from swarmctl.errors import StartError
+from swarmctl.files import replace_text
 from swarmctl.flight import Base, EventLog, Flight
-from swarmctl.links.bus import SCHEME, ZenohBus, socket_file
+from swarmctl.links.bus import NO_BUS, SCHEME, ZenohBus, socket_file
 from swarmctl.links.peers import agent_name
 from swarmctl.links.topics import OBSTACLES, OPERATOR, STATUS
 from swarmctl.preflight import LOOPBACK, Ground, inspect
@@ -54,7 +55,12 @@ class LaunchOptions:
 
 
 class Interrupts:
-    """Counts SIGINT, SIGTERM and SIGHUP instead of raising."""
+    """Counts SIGINT and SIGTERM instead of raising, and as the first of them SIGHUP.
+
+    A terminal that is closed sends SIGHUP more than once, the kernel to its foreground and the shell to its jobs: that
+    is nobody who asks again, and no reason to kill what is landing. Under `nohup` it is not heard at all, and never
+    after the flight: it would cost the verdict.
+    """
 
     _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -63,15 +69,16 @@ class Interrupts:
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> Interrupts:
-        self._before = {signum: signal.signal(signum, self._note) for signum in self._SIGNALS}
+        heard = [signum for signum in self._SIGNALS if signal.getsignal(signum) != signal.SIG_IGN]
+        self._before = {signum: signal.signal(signum, self._note) for signum in heard}
         return self
 
     def __exit__(self, *_: object) -> None:
         for signum, handler in self._before.items():
-            signal.signal(signum, handler)
+            signal.signal(signum, signal.SIG_IGN if signum == signal.SIGHUP else handler)
 
     def _note(self, signum: int, frame: FrameType | None) -> None:
-        self.count += 1
+        self.count = max(self.count, 1) if signum == signal.SIGHUP else self.count + 1
 
 
 def launch(config: Config, options: LaunchOptions) -> int:
@@ -107,7 +114,7 @@ def _run_folder(config: Config, options: LaunchOptions) -> Path:
 
     directory = create_run_folder(options.run_dir, config.name, time.time_ns() // 1000).resolve()
     try:
-        (directory / "config.toml").write_text(dump(config), encoding="utf-8")
+        replace_text(directory / "config.toml", dump(config))
     except OSError as error:
         raise StartError(f"{directory}: can't be written: {error}. Choose another with --run-dir") from error
     return directory
@@ -141,10 +148,9 @@ class Bringup(Base):
         if ground.view_port:
             self._spawn(viewer_command(config, site, ground.view_port, self._options.view))
         if config.sitl.enabled:
-            self._spawn(sitl_command(config, site, ground.ports))
-        for command in agent_commands(config, site, ground.sockets):
+            self._spawn(sitl_command(config, site, ground.ports, ground.vehicle_sockets))
+        for command in agent_commands(config, site, ground.sockets, ground.vehicle_sockets):
             self._spawn(command)
-        ground.release()
         self.announce("")
         for line in _introduction(config, site, ground):
             self._display.say(line)
@@ -164,6 +170,17 @@ class Bringup(Base):
         shutil.rmtree(self._socket_dir, ignore_errors=True)
         withdraw()
         self.log.write("stopped", exit_codes={name: child.poll() for name, child in self.children.items()})
+
+    def recover(self, agent: int) -> Child:
+        """Start an agent on the vehicle of one that ended; it records beside, and flies without a router if it must."""
+        router = self.children[ROUTER]
+        endpoint = self.site.endpoint if router.poll() is None else NO_BUS
+        directory = self.site.directory / "recovery"
+        directory.mkdir(exist_ok=True)
+        site = Site(self.site.run, endpoint, directory)
+        ends = self._ground.sockets, self._ground.vehicle_sockets
+        command = agent_commands(self._config, site, *ends, self.site.directory / "config.toml")[agent]
+        return Child(replace(command, argv=(*command.argv, "--only-land")), directory)
 
     def announce(self, view: str) -> None:
         """Let operators' commands find this launch."""

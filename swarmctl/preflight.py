@@ -41,10 +41,11 @@ class Ground:
     sockets: tuple[socket.socket, ...]  # one bound socket per agent with the built-in simulator, else none
     ports: tuple[int, ...]  # theirs
     view_port: int  # 0 when telemetry is off
+    vehicle_sockets: tuple[socket.socket, ...] = ()  # the simulator's ends of the same links
 
     def release(self) -> None:
         """Close this process's copies; agents keep theirs."""
-        for sock in self.sockets:
+        for sock in (*self.sockets, *self.vehicle_sockets):
             sock.close()
 
 
@@ -56,11 +57,12 @@ def inspect(config: Config) -> Ground:
     """
     problems = list(_package_problems(config))
     sockets: tuple[socket.socket, ...] = ()
+    count = config.swarm.agents
     if config.sitl.enabled:
         if importlib.util.find_spec("sitl") is None:
             problems.append("sitl.enabled = true: package 'sitl' is not installed; install the whole distribution")
         try:
-            sockets = claim_ports(config.swarm.agents)
+            sockets = claim_ports(2 * count)  # both ends: an agent then knows where its vehicle is
         except StartError as error:
             problems.append(str(error))
     else:
@@ -71,8 +73,8 @@ def inspect(config: Config) -> Ground:
             f"telemetry.port = {config.telemetry.port}: it and the {_VIEW_PORTS_TRIED - 1} after it are taken; "
             "choose another or set telemetry.enabled = false"
         )
-    ports = tuple(sock.getsockname()[1] for sock in sockets)
-    ground = Ground(sockets, ports, view_port)
+    ports = tuple(sock.getsockname()[1] for sock in sockets[:count])
+    ground = Ground(sockets[:count], ports, view_port, sockets[count:])
     if problems:
         ground.release()
         raise StartError("\n".join(problems))

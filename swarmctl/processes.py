@@ -33,7 +33,6 @@ from swarmctl.links.peers import agent_name
 ROUTER = "router"
 SITL = "sitl"
 VIEWER = "viewer"
-_ONE_THREAD = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS", "NUMEXPR_NUM_THREADS", "RAYON_NUM_THREADS")
 _TAIL_BYTES = 4096
 
 
@@ -65,19 +64,32 @@ def router_command(endpoint: str) -> Command:
     return Command(ROUTER, _python("-m", "swarmctl.links.bus", "--router", endpoint, "--die-with-parent"))
 
 
-def agent_commands(config: Config, site: Site, sockets: Sequence[socket.socket]) -> tuple[Command, ...]:
-    """One agent for each vehicle; `sockets` are the bound vehicle ports they inherit, or none."""
+def agent_commands(
+    config: Config,
+    site: Site,
+    sockets: Sequence[socket.socket],
+    vehicles: Sequence[socket.socket] = (),
+    config_path: Path | None = None,
+) -> tuple[Command, ...]:
+    """One agent for each vehicle; `sockets` are the ends of their links that they inherit, or none.
+
+    `vehicles` are the simulator's ends of them, whose ports the agents are told. `config_path` is where the resolved
+    configuration is, when it is not in the site's folder.
+    """
     commands = []
     for agent in range(config.swarm.agents):
-        argv = _python("-m", "swarmctl", "agent", "--config", f"{site.directory / 'config.toml'}", "--id", f"{agent}")
+        argv = _python("-m", "swarmctl", "agent", "--config", f"{config_path or site.directory / 'config.toml'}")
+        argv += ("--id", f"{agent}")
         argv += ("--run", site.run, "--bus", site.endpoint, "--run-dir", f"{site.directory}")
         fds = (sockets[agent].fileno(),) if sockets else ()
-        commands.append(Command(agent_name(agent), argv + (("--fd", f"{fds[0]}") if fds else ()), fds))
+        argv += ("--fd", f"{fds[0]}") if fds else ()
+        argv += ("--vehicle-port", f"{vehicles[agent].getsockname()[1]}") if vehicles else ()
+        commands.append(Command(agent_name(agent), argv, fds))
     return tuple(commands)
 
 
-def sitl_command(config: Config, site: Site, ports: Sequence[int]) -> Command:
-    """The built-in simulator, which sends to `ports` on loopback and chooses its own."""
+def sitl_command(config: Config, site: Site, ports: Sequence[int], sockets: Sequence[socket.socket] = ()) -> Command:
+    """The built-in simulator, which sends to `ports` on loopback from `sockets`, or chooses its own."""
     sitl, swarm = config.sitl, config.swarm
     starts = config.starts_ned_m()
     if sitl.start == "ground":
@@ -90,11 +102,13 @@ def sitl_command(config: Config, site: Site, ports: Sequence[int]) -> Command:
     argv += ("--spawn=" + ";".join(",".join(repr(c) for c in start) for start in starts),)
     argv += (f"--origin={swarm.origin_lat_deg!r},{swarm.origin_lon_deg!r},{swarm.origin_alt_m!r}",)
     argv += ("--remote-ports", ",".join(str(port) for port in ports), "--seed", f"{config.seed}")
+    fds = tuple(sock.fileno() for sock in sockets)
+    argv += ("--local-fds", ",".join(map(str, fds))) if fds else ()
     argv += ("--physics-hz", f"{sitl.physics_hz}", "--mass-scale", f"{sitl.mass_scale!r}", "--start", sitl.start)
     argv += _realism(sitl)
     argv += ("--control", f"{control_socket(site.endpoint)}", "--events", f"{site.directory / 'sitl.events.jsonl'}")
     argv += ("--truth", f"{site.directory / 'truth.bin'}", "--die-with-parent")
-    return Command(SITL, argv)
+    return Command(SITL, argv, fds)
 
 
 def _realism(sitl: SitlParams) -> tuple[str, ...]:
@@ -240,6 +254,5 @@ def kill_all(children: Sequence[Child]) -> None:
 
 
 def _environment(base: Mapping[str, str]) -> dict[str, str]:
-    """One thread per process for linear algebra: N agents share the cores, and small problems only lose by more."""
-    fixed = dict.fromkeys(_ONE_THREAD, "1")
-    return {**base, **fixed, "PYTHONUNBUFFERED": "1", PARENT_ENV: str(os.getpid())}
+    """One thread for what rerun shares out, as `kernels` has for linear algebra: N agents share the cores."""
+    return {**base, "RAYON_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1", PARENT_ENV: str(os.getpid())}

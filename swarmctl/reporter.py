@@ -173,7 +173,7 @@ class Reporter:
             nearest_obstacle_m=min(obstacles, default=math.inf),
             path_age_ms=age_ms,
             peers=len(peers),
-            rejected=sum(self._paths.rejected.values()),
+            rejected=self._paths.refusals.total,
             plan_status=PlanStatus.NONE if plan is None else plan.status,
             slack_m=0.0 if plan is None else plan.slack_m,
             residual_m=0.0 if plan is None else plan.residual_m,
@@ -220,6 +220,7 @@ class Reporter:
             solver_failed=self.failed_plans,
             problem=self.problem,
             promises=self._promises,
+            utc_us=record.utc_us,
         )
 
 

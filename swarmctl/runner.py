@@ -9,6 +9,7 @@ import gc
 import signal
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
 from types import FrameType
 
@@ -17,17 +18,18 @@ from swarmctl.assembly import make_agent
 from swarmctl.config import Config, load
 from swarmctl.control.sequence import OPERATOR_STOP
 from swarmctl.core.types import Mode
-from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, MissionError, StartError
+from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, MissionError, StartError
 from swarmctl.links import topics
 from swarmctl.links.autopilot import Autopilot
-from swarmctl.links.bus import ZenohBus
+from swarmctl.links.bus import NO_BUS, ZenohBus
 from swarmctl.links.commands import CommandPort
-from swarmctl.links.mavlink import Codec
+from swarmctl.links.mavlink import Codec, heartbeat_of
 from swarmctl.links.mavsdk_commands import MavsdkCommands
-from swarmctl.links.peers import agent_name
+from swarmctl.links.peers import Bus, LocalHub, agent_name
 from swarmctl.links.transport import open_transport
 from swarmctl.telemetry.recorder import Recorder
 
+_LOOPBACK = "127.0.0.1"
 _SLEW_01 = 0.01  # of elapsed time, by which UTC may be corrected
 _LINGER_S = 1.0  # after the end, so that peers learn of it
 _VEHICLE_LOST_S = 15.0  # no state at all: nothing left to do here
@@ -78,38 +80,39 @@ class Pace:
         self.due_us += skipped * self.period_us
 
 
-def run_agent(config_path: Path, agent: int, run: str, bus: str, run_dir: Path, fd: int | None) -> int:
-    """Fly one agent until its mission has ended; returns the exit code.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AgentProcess:
+    """What one agent process is told on its command line."""
 
-    Args:
-        config_path: resolved configuration.
-        agent: own index, from 0.
-        run: name of the run on the bus.
-        bus: the router's endpoint.
-        run_dir: folder to record into.
-        fd: bound UDP socket inherited from the launcher.
+    config_path: Path  # resolved configuration
+    agent: int  # own index, from 0
+    run: str  # name of the run on the bus
+    bus: str  # the router's endpoint; `NO_BUS`: it flies by itself
+    run_dir: Path  # folder to record into
+    fd: int | None = None  # bound UDP socket inherited from the launcher
+    vehicle_port: int | None = None  # loopback port at its other end; None where that is not known
+    only_land: bool = False  # whatever the vehicle does, it is landed and disarmed, and that is all
+
+
+def run_agent(process: AgentProcess) -> int:
+    """Fly one agent until its mission has ended; returns the exit code.
 
     Raises:
         StartError: link, bus or vehicle is not there.
         ConfigError: the configuration is not valid.
     """
-    config = load(config_path)
+    agent = process.agent
+    config = load(process.config_path)
     if not 0 <= agent < config.swarm.agents:
         raise StartError(f"--id {agent}: allowed: 0..{config.swarm.agents - 1} (swarm.agents)")
-    stop = _StopRequest()
+    stop = _StopRequest(asked=process.only_land)
     clock = WallClock()
     url = config.vehicles[agent].url if config.vehicles else ""
-    transport = open_transport(url or "udpin://127.0.0.1:14540", fd)
-    recorder = Recorder(run_dir, agent)
-    peers = [agent_name(i) for i in range(config.swarm.agents) if i != agent]
-    listen = {
-        topics.PATH: peers,
-        topics.STATUS: peers,
-        topics.INTENT: peers,
-        topics.COMMAND: [topics.OPERATOR],
-        topics.OBSTACLES: [topics.OPERATOR],
-    }
-    link = ZenohBus(bus, run, agent_name(agent), listen, config.bus.lease_ms)
+    is_vehicle = heartbeat_of(config.sysids()[agent])
+    remote = None if process.vehicle_port is None else (_LOOPBACK, process.vehicle_port)
+    transport = open_transport(url or f"udpin://{_LOOPBACK}:14540", process.fd, is_vehicle, remote)
+    recorder = Recorder(process.run_dir, agent)
+    link = _join(process, config, clock)
     slow: list[CommandPort] = []
 
     def slow_path(autopilot: Autopilot, codec: Codec) -> CommandPort:
@@ -130,7 +133,8 @@ def run_agent(config_path: Path, agent: int, run: str, bus: str, run_dir: Path, 
         time.perf_counter_ns,
     )
     try:
-        return _loop(flown, config, clock, stop, url or f"inherited socket of sysid {config.sysids()[agent]}")
+        vehicle = url or f"inherited socket of sysid {config.sysids()[agent]}"
+        return _loop(flown, config, clock, stop, vehicle, process.only_land)
     finally:
         recorder.event("bus_summary", clock.now_us(), clock.utc_us(), rejected=flown.rejected, lost=recorder.lost)
         slow[0].close()
@@ -139,7 +143,23 @@ def run_agent(config_path: Path, agent: int, run: str, bus: str, run_dir: Path, 
         recorder.close()
 
 
-def _loop(agent: Agent, config: Config, clock: WallClock, stop: _StopRequest, vehicle: str) -> int:
+def _join(process: AgentProcess, config: Config, clock: WallClock) -> Bus:
+    """Return the bus of the run; one with nobody else on it where there is no router."""
+    me = agent_name(process.agent)
+    if process.bus == NO_BUS:
+        return LocalHub(clock.now_us).attach(me)
+    peers = [agent_name(i) for i in range(config.swarm.agents) if i != process.agent]
+    listen = {
+        topics.PATH: peers,
+        topics.STATUS: peers,
+        topics.INTENT: peers,
+        topics.COMMAND: [topics.OPERATOR],
+        topics.OBSTACLES: [topics.OPERATOR],
+    }
+    return ZenohBus(process.bus, process.run, me, listen, config.bus.lease_ms)
+
+
+def _loop(agent: Agent, config: Config, clock: WallClock, stop: _StopRequest, vehicle: str, only_land: bool) -> int:
     gc.collect()
     gc.freeze()  # start-up garbage is not looked at again during flight
     pace = Pace(round(1e6 / config.agent.rate_hz), clock.now_us())
@@ -156,7 +176,7 @@ def _loop(agent: Agent, config: Config, clock: WallClock, stop: _StopRequest, ve
         if record.mode is not Mode.BLIND:
             seen_us, ever_seen = now_us, True
         _give_up_on_silence(now_us - seen_us, ever_seen, config, vehicle)
-        if agent.finished:
+        if agent.done if only_land else agent.finished:
             finished_us = finished_us or now_us
             if now_us - finished_us > _LINGER_S * 1e6:
                 return _exit_code(agent)
@@ -166,7 +186,8 @@ def _give_up_on_silence(silent_us: int, ever_seen: bool, config: Config, vehicle
     if not ever_seen and silent_us > config.agent.connect_timeout_s * 1e6:
         raise StartError(
             f"vehicle at {vehicle}: no heartbeat and position within {config.agent.connect_timeout_s:.0f} s. "
-            "Is it running, sending to this port, and is its MAV_SYS_ID the configured sysid?"
+            "Is it running, sending to this port, and is its MAV_SYS_ID the configured sysid? "
+            "PX4 answers only the first program that has ever spoken to it: end that one, or restart PX4"
         )
     if ever_seen and silent_us > _VEHICLE_LOST_S * 1e6:
         raise MissionError(f"vehicle at {vehicle}: silent for {_VEHICLE_LOST_S:.0f} s, given up")
@@ -176,16 +197,18 @@ def _exit_code(agent: Agent) -> int:
     if agent.outcome == "completed":
         return EXIT_OK
     print(f"mission not completed: {agent.outcome}", file=sys.stderr)
-    return EXIT_INTERRUPTED if agent.outcome == OPERATOR_STOP else EXIT_MISSION
+    if agent.outcome == OPERATOR_STOP:
+        return EXIT_INTERRUPTED
+    return EXIT_MISSION if agent.has_armed else EXIT_START
 
 
 class _StopRequest:
-    """SIGINT or SIGTERM: land. Taken once by the loop."""
+    """SIGINT, SIGTERM or SIGHUP (its terminal has gone): land. Taken once by the loop; the agent keeps it."""
 
-    def __init__(self) -> None:
-        self._asked = False
-        signal.signal(signal.SIGTERM, self._ask)
-        signal.signal(signal.SIGINT, self._ask)
+    def __init__(self, asked: bool) -> None:
+        self._asked = asked
+        for signum in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            signal.signal(signum, self._ask)
 
     def take(self) -> bool:
         asked, self._asked = self._asked, False

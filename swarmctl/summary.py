@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from swarmctl.config import Config, load
+from swarmctl.core.text import printable
+from swarmctl.errors import ConfigError
 from swarmctl.flight import Verdict
 
 if TYPE_CHECKING:
@@ -17,22 +19,36 @@ if TYPE_CHECKING:
 def sum_up(config: Config, directory: Path, verdict: Verdict, say: Callable[[str], None]) -> bool:
     """Finish the run folder and say how it went; returns whether the referee found a limit broken.
 
-    A folder that can't be finished is a problem of the run, never a reason to lose its exit code.
+    A folder that can't be read or written is a problem of the run, never a reason to lose the verdict.
     """
     from swarmctl.telemetry.recordings import optimize_recording  # heavy
     from swarmctl.telemetry.run_folder import Outcome, finish_run
 
     try:
         rules = _rules(config, verdict)
-        summary = finish_run(directory, rules, Outcome(verdict.outcome, tuple(verdict.problems)))
+        summary, unwritten = finish_run(directory, rules, Outcome(verdict.outcome, tuple(verdict.problems)))
     except Exception as error:
+        known = {"outcome": verdict.outcome, "violations": list(verdict.problems)}
+        for line in (*violation_lines(known), *summary_lines(known, directory)):
+            say(line)
         verdict.problems.append(f"summary: {error}")
-        say(f"the run folder can't be finished: {error!r}. What was recorded is in {directory}")
+        say(f"the run can't be judged: {error!r}. What was recorded is in {directory}")
         return False
-    for line in summary_lines(summary, directory):
+    for line in (*violation_lines(summary), *summary_lines(summary, directory)):
         say(line)
+    if unwritten:
+        verdict.problems.append(f"run folder: {'; '.join(unwritten)}")
+        say(unwritten_line(directory, unwritten))
     optimize_recording(directory)
     return bool(summary.get("violations"))
+
+
+def unwritten_line(directory: Path, unwritten: Sequence[str]) -> str:
+    """What to say of files that the disk did not take."""
+    return (
+        f"not everything could be written to {directory}: {'; '.join(unwritten)}. "
+        f"Make room, then: swarmctl report {directory}"
+    )
 
 
 def rewrite_report(directory: Path) -> Path:
@@ -41,9 +57,13 @@ def rewrite_report(directory: Path) -> Path:
     Raises:
         ConfigError: it is no run folder.
     """
-    from swarmctl.telemetry.run_folder import report_run  # heavy
+    from swarmctl.telemetry.run_files import CONFIG, read_text, refuse_no_folder  # heavy
+    from swarmctl.telemetry.run_folder import report_run
 
-    return report_run(directory, load(directory / "config.toml").rules())
+    refuse_no_folder(directory)
+    if not read_text(directory / CONFIG):
+        raise ConfigError(str(directory), [f"is no run folder: it holds no {CONFIG}"])
+    return report_run(directory, load(directory / CONFIG).rules())
 
 
 def _rules(config: Config, verdict: Verdict) -> Rules:
@@ -68,8 +88,10 @@ def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...
     tick, solve, age = _section(timing, "tick_ms"), _section(timing, "solve_ms"), _section(comms, "path_age_ms")
     rejected = sum(_section(comms, "rejected").values())
     outcome = f"{summary.get('outcome')}, index {_m(_section(summary, 'tracking').get('index_m'))}"
-    if violations:
-        outcome += f"; {len(violations)} violation{'s' if len(violations) > 1 else ''}: {violations[0]}"
+    if len(violations) == 1:
+        outcome += f"; 1 violation: {printable(violations[0])}"
+    elif violations:
+        outcome += f"; {len(violations)} violations, each with a line above"
     clearance = obstacles.get("min_clearance_m")
     return (
         outcome,
@@ -77,12 +99,25 @@ def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...
         + (
             f", obstacles {_m(clearance)} (required {_m(obstacles.get('required_m'))})" if clearance is not None else ""
         ),
-        f"ticks {timing.get('ticks')}, late {timing.get('late_ticks')}, "
+        f"ticks {_count(timing, 'ticks')}, late {_count(timing, 'late_ticks')}, "
         f"tick p50/p99/max {_ms(tick)} ms, solve p50/p99/max {_ms(solve)} ms",
-        f"solver {solver.get('name')}, failed {solver.get('failed')}; "
-        f"path age p50/p99 {_ms(age, ('p50', 'p99'))} ms, {rejected} messages refused" + _deadlocks(summary),
+        f"solver {_count(solver, 'name')}, failed {_count(solver, 'failed')}; "
+        f"path age p50/p99 {_ms(age, ('p50', 'p99'))} ms, {rejected} messages refused"
+        + _unheard(comms)
+        + _deadlocks(summary),
         f"run folder {directory}",
     )
+
+
+def _unheard(comms: Mapping[str, Any]) -> str:
+    found = _section(comms, "unheard")
+    return f"; agent-{found['agent']} unheard for {found['longest_s']:.1f} s" if found.get("count") else ""
+
+
+def violation_lines(summary: Mapping[str, Any]) -> tuple[str, ...]:
+    """One line for each violation, where the first line of the summary does not hold the only one."""
+    violations = summary.get("violations") or []
+    return tuple(f"violation: {printable(violation)}" for violation in violations) if len(violations) > 1 else ()
 
 
 def _deadlocks(summary: Mapping[str, Any]) -> str:
@@ -93,6 +128,10 @@ def _deadlocks(summary: Mapping[str, Any]) -> str:
 def _section(tree: Mapping[str, Any], key: str) -> Mapping[str, Any]:
     value = tree.get(key)
     return value if isinstance(value, Mapping) else {}
+
+
+def _count(tree: Mapping[str, Any], key: str) -> str:
+    return str(tree.get(key, "-"))
 
 
 def _m(value: float | None) -> str:

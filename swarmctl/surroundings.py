@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence, Set
 
 from swarmctl.control.barrier import Body, body_of_obstacle, body_of_peer
 from swarmctl.control.facts import PeerFacts
@@ -19,9 +19,13 @@ from swarmctl.core.intent import Intent
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.types import Array, Mode, Obstacle, Phase
 from swarmctl.links import topics
+from swarmctl.links.orders import Orders
 from swarmctl.links.peers import Bus, PeerPaths, agent_name
+from swarmctl.links.refusals import FUTURE, IDENTITY, MALFORMED, SEQUENCE, UNKNOWN_PEER, Refusals
+from swarmctl.links.speakers import Attendance, Said, Speaker
 
 _NEW_US = 300_000  # a path that may be compared with promises
+_READY_LEAD_US = 1_000_000  # of another clock than ours
 FLOWN_BY_AGENT = frozenset((Mode.FOLLOW, Mode.REPLAY, Mode.BRAKE, Mode.HOLD))
 
 
@@ -33,32 +37,90 @@ class Surroundings:
         peers: indices of the others.
         params: distances and ages.
         bus: is drained by `listen`.
+        rate_hz: of every agent's ticks.
+        note: is told `refused` (see `Refusals`); `unheard` when a peer that is on the bus has said no path that is
+            believed for `lost_after_s`, and when that ends, with how long it lasted.
     """
 
-    def __init__(self, agent: int, peers: list[int], params: SeparationParams, bus: Bus) -> None:
-        self._agent, self._params, self._bus = agent, params, bus
-        self.paths = PeerPaths(peers)
+    def __init__(
+        self,
+        agent: int,
+        peers: list[int],
+        params: SeparationParams,
+        bus: Bus,
+        rate_hz: float,
+        note: Callable[..., None],
+    ) -> None:
+        self._agent, self._params, self._bus, self._note = agent, params, bus, note
+        self.refusals, self.attendance = Refusals(note), Attendance(bus)
+        shared = rate_hz, self.refusals, self.attendance
+        self.paths = PeerPaths(peers, *shared)
+        self._speakers = {peer: Speaker(agent_name(peer), topics.STATUS.name, *shared) for peer in peers}
+        self._orders = Orders(agent, self.refusals)
+        self._unheard_since_us: dict[int, int] = {}
         self._status: dict[int, topics.StatusMessage] = {}
         self._obstacles: tuple[Obstacle, ...] = ()
-        self._obstacles_version = -1
+        self._obstacles_version: int | None = None
         self._seen: dict[int, Obstacle] = {}  # that have been visible, by identity
         self.promised: Mapping[int, Sequence[Trajectory]] = {}  # what peers may follow, of those who promise
 
     def listen(self, utc_us: int) -> list[str]:
         """Take in everything that has arrived; returns the operator's verbs for this agent."""
+        self.attendance.look(utc_us)
         for sender, payload in self._bus.receive(topics.PATH):
             self.paths.offer(sender, payload, utc_us)
         for sender, payload in self._bus.receive(topics.STATUS):
-            status = topics.decode_status(payload)
-            if status is not None and sender == agent_name(status.agent):
-                self._status[status.agent] = status
-        for _, payload in self._bus.receive(topics.OBSTACLES):
-            message = topics.decode_obstacles(payload)
-            if message is not None and message.version > self._obstacles_version:
-                self._obstacles_version = message.version
-                self._obstacles, self._seen = tuple(o.obstacle() for o in message.obstacles), {}
-        commands = [topics.decode_command(payload) for _, payload in self._bus.receive(topics.COMMAND)]
-        return [c.verb for c in commands if c is not None and c.agent in (-1, self._agent)]
+            self._take_status(sender, payload, utc_us)
+        for sender, payload in self._bus.receive(topics.OBSTACLES):
+            self._take_obstacles(sender, payload, utc_us)
+        verbs = [self._orders.take(*received, utc_us) for received in self._bus.receive(topics.COMMAND)]
+        self.refusals.tell(utc_us)
+        self._watch_unheard(utc_us)
+        return [verb for verb in verbs if verb is not None]
+
+    def _take_status(self, sender: str, payload: bytes, utc_us: int) -> None:
+        status = topics.decode_status(payload)
+        reason = ""
+        if status is None:
+            reason = MALFORMED
+        elif sender != agent_name(status.agent):
+            reason = IDENTITY
+        elif status.agent not in self._speakers:
+            reason = UNKNOWN_PEER
+        elif status.ready_utc_us > utc_us + _READY_LEAD_US:
+            reason = FUTURE
+        if reason or status is None:
+            self.refusals.add(sender, topics.STATUS.name, reason, utc_us)
+        elif self._speakers[status.agent].believes(Said(status.boot_id, status.ticks, utc_us, payload), utc_us):
+            self._status[status.agent] = status
+
+    def _take_obstacles(self, sender: str, payload: bytes, utc_us: int) -> None:
+        message, known = topics.decode_obstacles(payload), self._obstacles_version
+        if message is None:
+            self.refusals.add(sender, topics.OBSTACLES.name, MALFORMED, utc_us)
+        elif message.replaces(known):
+            self._obstacles_version = message.version
+            self._obstacles, self._seen = tuple(o.obstacle() for o in message.obstacles), {}
+        elif known is not None and message.version > known:
+            self.refusals.add(sender, topics.OBSTACLES.name, SEQUENCE, utc_us)
+
+    def _watch_unheard(self, utc_us: int) -> None:
+        """Tell of peers that are there, but of which no path is believed."""
+        oldest_us = utc_us - round(self._params.lost_after_s * 1e6)
+        unheard = {
+            path.agent: path.t0_utc_us
+            for path in self.paths.latest()
+            if path.t0_utc_us < oldest_us and self._is_there(path.agent) and self._phase(path.agent) is not Phase.DONE
+        }
+        for agent in unheard.keys() - self._unheard_since_us.keys():
+            self._unheard_since_us[agent] = unheard[agent]
+            self._note("unheard", agent=agent, begins=True)
+        for agent in self._unheard_since_us.keys() - unheard.keys():
+            lasted_s = (utc_us - self._unheard_since_us.pop(agent)) * 1e-6
+            self._note("unheard", agent=agent, begins=False, lasted_s=lasted_s)
+
+    def _is_there(self, agent: int) -> bool:
+        return self.attendance.since_us(agent_name(agent)) is not None
 
     def keep_outs(
         self,

@@ -15,11 +15,13 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from swarmctl.core.text import printable
 from swarmctl.core.types import Mode, Phase
 from swarmctl.links.peers import agent_name
 from swarmctl.links.topics import StatusMessage
 
 REFRESH_HZ = 4.0
+_LINE = 2000  # characters of a line that stays
 _COLUMNS = ("agent", "phase", "mode", "error m", "separation m", "tick p99 ms", "late", "path age ms", "problem")
 
 
@@ -62,7 +64,7 @@ class LiveTable:
 
     def say(self, text: str) -> None:
         with contextlib.suppress(OSError):
-            self._console.print(text, markup=False, soft_wrap=True)
+            self._console.print(printable(text, _LINE), markup=False, soft_wrap=True)
 
     def show(self, agents: Sequence[AgentView]) -> None:
         now_s = time.monotonic()
@@ -92,7 +94,7 @@ class PlainLines:
 
     def say(self, text: str) -> None:
         with contextlib.suppress(OSError):  # the reader of the pipe is gone; the flight goes on
-            print(text, file=self._stream, flush=True)
+            print(printable(text, _LINE), file=self._stream, flush=True)
 
     def show(self, agents: Sequence[AgentView]) -> None:
         for view in agents:
@@ -130,7 +132,7 @@ def status_cells(view: AgentView) -> tuple[str, ...]:
     """Cells of one agent, in the order of the columns."""
     status = view.status
     if status is None:
-        return (agent_name(view.agent), *[""] * (len(_COLUMNS) - 2), view.note or "not heard yet")
+        return (agent_name(view.agent), *[""] * (len(_COLUMNS) - 2), printable(view.note) or "not heard yet")
     return (
         agent_name(view.agent),
         name_of(Phase, status.phase),
@@ -140,7 +142,7 @@ def status_cells(view: AgentView) -> tuple[str, ...]:
         _number(status.tick_p99_ms, 1),
         f"{status.late_ticks}/{status.ticks}",
         _number(status.path_age_ms, 0),
-        view.note or status.problem,
+        printable(view.note or status.problem),
     )
 
 

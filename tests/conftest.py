@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+import swarmctl  # noqa: F401  (before anything loads numpy)
+
 TESTS = Path(__file__).parent
 
 

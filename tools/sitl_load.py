@@ -150,12 +150,10 @@ def measure(vehicles: int, seconds: float, core: int, arguments: Sequence[str]) 
         stats = Path(folder) / "stats.json"
         command = [sys.executable, "-m", "sitl", "--vehicles", f"{vehicles}", "--local-port", f"{LOCAL_PORT}"]
         command += ["--preset", "x500", "--stats", f"{stats}", *arguments]
-        environment = {**os.environ, "OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1"}
         process = subprocess.Popen(
             command,
             stdout=subprocess.PIPE,
             text=True,
-            env=environment,
             preexec_fn=lambda: os.sched_setaffinity(0, {core}),
         )
         clients = [Client(i, port) for i, port in enumerate(_ports(process, vehicles))]

@@ -5,7 +5,6 @@ Every process has one thread: a flight is one, and numpy's own would only get in
 
 from __future__ import annotations
 
-import os
 import signal
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -17,7 +16,6 @@ from sitl.campaign.trials import Row, Trial
 from swarmctl.errors import StartError
 from swarmctl.lifeline import die_with_parent
 
-_THREADS = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 Fly = Callable[[Trial], Row]
 
 
@@ -39,7 +37,6 @@ def on_this_machine(
     if jobs == 1:
         yield from ((trial, _flown(fly, trial)) for trial in trials)
         return
-    os.environ.update(dict.fromkeys(_THREADS, "1"))  # read by the libraries of the children when they load
     pool = ProcessPoolExecutor(jobs, get_context("spawn"), _begin)
     try:
         todo = iter(trials)

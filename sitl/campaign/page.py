@@ -10,7 +10,7 @@ from pathlib import Path
 from sitl.campaign.scenarios import SCENARIOS
 from sitl.campaign.summary import CellSummary, Share, summaries
 from sitl.campaign.trials import Row, trial_of
-from swarmctl.telemetry.atomic import write_text
+from swarmctl.files import replace_text
 from swarmctl.telemetry.report_style import STYLE
 
 REPORT = "report.html"
@@ -47,7 +47,7 @@ def write_page(directory: Path, rows: Sequence[Row], runs_per_hour: float | None
     body = "".join(parts)
     page = f"<head>{head}<style>{STYLE}{_BAR_STYLE}</style></head><body><main>{body}</main></body>"
     path = directory / REPORT
-    write_text(path, f"<!doctype html><html lang=en>{page}</html>\n")
+    replace_text(path, f"<!doctype html><html lang=en>{page}</html>\n")
     return path
 
 

@@ -12,9 +12,11 @@ import pyarrow.parquet as pq
 
 from sitl.campaign.trials import SCHEMA, Row, Trial, trial_of
 from swarmctl.errors import ConfigError
+from swarmctl.files import read_file, replaced
 
 ROWS = "rows.parquet"
 _SAVE_EVERY_S = 1.0
+_MOST_BYTES = 2**31
 
 
 class Store:
@@ -71,16 +73,15 @@ class Store:
         self._saved_s = time.monotonic()
         if len(self.rows) == self._saved_rows:
             return
-        part = self._path.with_name(ROWS + ".part")
-        pq.write_table(pa.Table.from_pylist(self.rows, SCHEMA), part)
-        part.replace(self._path)
+        with replaced(self._path) as file:
+            pq.write_table(pa.Table.from_pylist(self.rows, SCHEMA), file)
         self._saved_rows = len(self.rows)
 
 
 def _read(path: Path) -> list[Row]:
     try:
-        table = pq.read_table(path)
-    except (OSError, pa.ArrowInvalid) as error:
+        table = pq.read_table(pa.BufferReader(read_file(path, _MOST_BYTES)))
+    except (OSError, pa.ArrowException) as error:
         raise ConfigError(str(path), [f"can't be read ({error}); give another --out"]) from error
     if table.schema.names != SCHEMA.names:
         raise ConfigError(str(path), ["has other columns than these sources write; give another --out"])

@@ -10,9 +10,6 @@ flight. Writes `bench.json`, a list of rows of five keys.
 
 from __future__ import annotations
 
-import sitl.experiments.one_thread  # noqa: F401
-
-# isort: split
 import argparse
 import json
 import os
@@ -45,6 +42,7 @@ from sitl.lockstep import Lockstep
 from swarmctl.config import Config
 from swarmctl.core.types import Array, Phase
 from swarmctl.errors import EXIT_OK, ConfigError, MissionError, exit_code_of
+from swarmctl.files import replace_text
 from swarmctl.reporter import Took
 
 PARTS = ("sense", "setup", "promise", "spaces", "solve", "certify", "barrier", "send", "tick")
@@ -232,7 +230,7 @@ def write(rows: Sequence[BenchRow], directory: Path) -> Path:
     try:
         directory.mkdir(parents=True, exist_ok=True)
         path = directory / "bench.json"
-        path.write_text(json.dumps([asdict(row) for row in rows], indent=1) + "\n", encoding="utf-8")
+        replace_text(path, json.dumps([asdict(row) for row in rows], indent=1) + "\n")
     except OSError as error:
         raise ConfigError("--out", [f"{directory}: can't be written: {error.strerror}"]) from error
     return path

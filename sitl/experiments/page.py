@@ -24,7 +24,7 @@ from sitl.experiments.figures import (
     separation_chart,
 )
 from sitl.experiments.trace import Row, Trace
-from swarmctl.telemetry.atomic import write_text
+from swarmctl.files import replace_text
 from swarmctl.telemetry.report_style import STYLE
 
 REPORT = "report.html"
@@ -101,7 +101,7 @@ def write_page(
     head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>reproduce</title>'
     page_html = f"<head>{head}<style>{STYLE}</style></head><body><main>{body}</main></body>"
     path = directory / REPORT
-    write_text(path, f"<!doctype html><html lang=en>{page_html}</html>\n")
+    replace_text(path, f"<!doctype html><html lang=en>{page_html}</html>\n")
     return path
 
 
@@ -112,7 +112,7 @@ def write_json(directory: Path, rows: Sequence[Row]) -> Path:
         OSError: the disk refuses; an earlier file is untouched.
     """
     path = directory / ROWS
-    write_text(path, json.dumps({"rows": [_json_row(row) for row in rows]}, indent=1, allow_nan=False) + "\n")
+    replace_text(path, json.dumps({"rows": [_json_row(row) for row in rows]}, indent=1, allow_nan=False) + "\n")
     return path
 
 

@@ -21,11 +21,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from sitl.experiments import (
-    one_thread,  # noqa: F401  (before numpy, in every process)
-    score,
-    thesis,
-)
+from sitl.experiments import score, thesis
 from sitl.experiments.direct import fly_on_plant
 from sitl.experiments.figures import FLIGHTS, Extra, IndexPoint
 from sitl.experiments.over_mavlink import fly_over_mavlink

@@ -101,17 +101,8 @@ def _radio_source(value: float, facts: VehicleFacts, config: Config) -> Opinion:
     return _ok("as the pilot flies; 4 without any")
 
 
-def _ground_station_loss(value: float, facts: VehicleFacts, config: Config) -> Opinion:
-    if value == 0:
-        return _ok("0, or a ground station")
-    return Opinion(
-        Verdict.NOTE, "0, or a ground station", "offboard ends when no ground station is heard; keep one connected"
-    )
-
-
 def _thrust_model(value: float, facts: VehicleFacts, config: Config) -> Opinion:
-    simulated = config.sitl.enabled or facts.version is None or facts.version.uid == "0"
-    if value == 0 and not simulated:
+    if value == 0 and facts.version is not None and facts.version.has_usb:  # no simulator has
         return Opinion(
             Verdict.NOTE, "0.2 to 0.5", "thrust is taken as linear, real propellers are not: calibrate it to hover well"
         )
@@ -191,7 +182,6 @@ ROWS: dict[str, tuple[Row, ...]] = {
         Row("MAV_FWDEXTSP", "whether setpoints are flown", _forward_setpoints),
         Row("COM_RCL_EXCEPT", "whether a lost radio ends offboard", _radio_exception),
         Row("COM_RC_IN_MODE", "where sticks come from", _radio_source),
-        Row("NAV_DLL_ACT", "whether a lost ground station ends offboard", _ground_station_loss),
         Row("MPC_THR_HOVER", "what hovers", _hover),
         Row("THR_MDL_FAC", "how thrust becomes motor speed", _thrust_model),
         Row("MAV_SYS_ID", "who it is after the next boot", _own_sysid),

@@ -71,7 +71,7 @@ def _duplicates(vehicles: Sequence[VehicleFacts], config: Config) -> list[Findin
         if a.sysid == b.sysid:
             advice = f"agents {a.agent} and {b.agent} would command the same id: give each autopilot its own"
             lines.append(Finding(SWARM, "system ids", FIX, f"{a.sysid} twice", "all different", advice, 96))
-        elif a.version and b.version and a.version.uid == b.version.uid and a.version.uid != "0":
+        elif a.version and b.version and a.version.uid == b.version.uid and a.version.has_usb:
             advice = f"agents {a.agent} and {b.agent} are connected to the same board"
             lines.append(Finding(SWARM, "system ids", FIX, f"uid {a.version.uid} twice", "all different", advice, 96))
     return lines

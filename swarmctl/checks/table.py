@@ -15,9 +15,11 @@ from rich.text import Text
 
 from swarmctl.checks.change import Change
 from swarmctl.checks.finding import SWARM, Finding, Verdict, worst_first
+from swarmctl.core.text import printable
 from swarmctl.links.link_facts import VehicleFacts
 from swarmctl.links.peers import agent_name
 
+_LINE = 2000  # characters of one thing to fix
 _COLUMNS = ("vehicle", "what", "found", "wanted", "verdict")
 _STYLES = {Verdict.OK: "green", Verdict.NOTE: "yellow", Verdict.FIX: "bold red"}
 
@@ -32,7 +34,7 @@ def print_check(vehicles: Sequence[VehicleFacts], lines: Sequence[Finding], chan
         for line in lines:
             print("\t".join(_cells(line)))
     for text in _after_table(vehicles, lines, changes):
-        console.print(text, markup=False, soft_wrap=True)
+        console.print(printable(text, _LINE), markup=False, soft_wrap=True)
 
 
 def as_json(vehicles: Sequence[VehicleFacts], lines: Sequence[Finding], changes: Sequence[Change], code: int) -> str:
@@ -60,7 +62,8 @@ def _drawn(lines: Sequence[Finding]) -> Table:
 
 
 def _cells(line: Finding) -> tuple[str, ...]:
-    return _who(line.agent), line.topic, line.found, line.wanted, line.verdict.name.lower()
+    words = (line.topic, line.found, line.wanted, line.verdict.name.lower())
+    return _who(line.agent), *(printable(word) for word in words)
 
 
 def _who(agent: int) -> str:

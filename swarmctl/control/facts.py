@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
+from swarmctl.control.overload import Level
 from swarmctl.core.types import Array, FlightMode, Mode, Phase, VehicleState
 
 
@@ -34,3 +35,6 @@ class Facts:
     arm_in: FlightMode | None = None  # flight mode to be in before arming; None: the one it is in
     boots: int = 0  # reboots of the autopilot so far
     refusal: str = ""  # why nothing may be armed
+    unsettled: str = ""  # why nothing may be armed yet; it may pass
+    overload: Level = Level.NONE  # what missed deadlines ask for
+    armed_told_us: int = -1  # arrival of the HEARTBEAT that told `state.armed`

@@ -16,14 +16,16 @@ from collections.abc import Callable
 import numpy as np
 from pydantic import Field
 
+from swarmctl.control.arming import ArmingEvidence
 from swarmctl.control.facts import Facts
 from swarmctl.control.mission import Glide, MissionReference, brake_to_rest, glide_to
+from swarmctl.control.overload import Level
 from swarmctl.control.spread import nearest_in_plane_m, room_for
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Command, FlightMode, Landed, Mode, Phase, VehicleState, Verb
 
 _ASK_EVERY_US = 1_000_000
-_SPIN_UP_US = 3_000_000  # asked again meanwhile, ArduCopter refuses
+_SPIN_UP_US = 6_000_000  # ArduCopter's rotors spin up for over 3 s, and it refuses to be asked again meanwhile
 _SETTLE_S = 2.0
 _BEGIN_AFTER_US = 1_000_000
 _HOVER_US = 1_000_000  # of the autopilot's own hover, to learn its thrust where no HOLD separates it from our flight
@@ -33,6 +35,7 @@ _OURS = (FlightMode.HOLD, FlightMode.TAKEOFF, FlightMode.EXTERNAL)  # modes nobo
 OPERATOR_STOP = "stopped by the operator"
 TAKEN_OVER = "pilot or autopilot took over"
 REBOOTED = "the autopilot rebooted"
+OVERLOADED = "overload: deadlines were missed for too long"
 
 
 class SequenceParams(Params):
@@ -80,9 +83,12 @@ class Sequence:
         self.ready_utc_us = 0
         self.begin_utc_us: int | None = None  # mission time 0
         self.outcome = ""
+        self.waits_for = ""  # what keeps it on the ground
+        self.arming = ArmingEvidence()
+        self._stop_verb = ""  # land or rtl, from when it is asked for until it is under way
         self.had_control = False
         self.held = False  # by the operator
-        self.waiting = False  # for mute peers
+        self.waiting = False  # for mute peers, or for its processor
         self._bound_for = start_ned_m  # before it had to wait
         self._glide: tuple[Glide, int] | None = None  # and when it began
         self._rejoin: tuple[Glide, int] | None = None  # the same, of the offset to the mission's reference
@@ -116,6 +122,7 @@ class Sequence:
     def step(self, facts: Facts) -> list[Command]:
         """Advance by what is true now; returns what to ask of the autopilot."""
         self._born_us = facts.now_us if self._born_us is None else self._born_us
+        self.arming.update(facts)
         state = facts.state
         if facts.boots != self._boots:
             self._boots = facts.boots
@@ -123,23 +130,27 @@ class Sequence:
                 self._yield(REBOOTED)
         if state is None:
             return []
+        self._apply_stop(facts.now_us, state)
         if self.phase is Phase.CONNECT and facts.prepared:  # not before: peers arm when everybody stands by
-            self._enter(Phase.STANDBY, facts)
+            self._enter(Phase.STANDBY, facts.now_us)
             return self._refuse(facts.refusal, facts) if facts.refusal else []
         if facts.mode is Mode.YIELD and not self.yielded:
             self._yield(TAKEN_OVER)
         if self.yielded:
-            if not state.armed and state.landed is Landed.ON_GROUND:
-                self._enter(Phase.DONE, facts)
+            if self._is_down(facts, state):
+                self._enter(Phase.DONE, facts.now_us)
             return []
         if facts.mode is Mode.LAND and self.phase < Phase.LAND:
             self._give_up("no plan for too long", facts, state)
-        self._wait_for_mute_peers(facts, state)
+        if facts.overload is Level.LAND and self.phase < Phase.GOTO_LAND:
+            self._give_up(OVERLOADED, facts, state)
+        self._wait_for_better(facts, state)
         if state.mode is FlightMode.EXTERNAL and Phase.GOTO_START <= self.phase < Phase.LAND:
             self._take_control(facts, state)
         patience_us = self._params.start_timeout_s * 1e6
         if self.phase < Phase.TRACK and facts.now_us - self._born_us > patience_us:
-            self._give_up(f"not tracking after {self._params.start_timeout_s:.0f} s ({self.phase.name})", facts, state)
+            cause = f"not tracking after {self._params.start_timeout_s:.0f} s ({self.phase.name})"
+            self._give_up(f"{cause}: {self.waits_for}" if self.waits_for else cause, facts, state)
         handler = self._steps.get(self.phase)
         return handler(facts, state) if handler else []
 
@@ -170,9 +181,15 @@ class Sequence:
         return (utc_us - self.begin_utc_us) * 1e-6
 
     def operator(self, verb: str, now_us: int, utc_us: int, state: VehicleState | None) -> None:
-        """Apply hold, resume, land or rtl."""
+        """Apply hold, resume, land or rtl.
+
+        A stop (land, rtl) is kept until there is a vehicle state to begin it with: it is lost in no phase.
+        """
+        if verb in ("land", "rtl"):
+            self._stop_verb = verb
         if state is None or self.phase in (Phase.LAND, Phase.DONE):
             return
+        self._apply_stop(now_us, state)
         if verb == "hold" and self.phase is Phase.TRACK:
             self.held = True
             self._glide = (self._stop_glide(state), now_us)
@@ -182,33 +199,39 @@ class Sequence:
             self.held = False
             if self.yielded:
                 self.yielded, self.outcome, self._invited = False, self._outcome_before, True
-        elif verb in ("land", "rtl"):
-            self._stop(verb, now_us, state)
 
     def _yield(self, why: str) -> None:
         self.yielded, self.had_control, self._invited = True, False, False
         self._outcome_before = self.outcome
         self.outcome = why
 
-    def _stop(self, verb: str, now_us: int, state: VehicleState) -> None:
+    def _apply_stop(self, now_us: int, state: VehicleState) -> None:
+        """Begin the stop that has been asked for, if it is not under way."""
+        verb, self._stop_verb = self._stop_verb, ""
+        if not verb or self.phase >= Phase.LAND:
+            return
         self.outcome = self.outcome or OPERATOR_STOP
         if self.phase < Phase.GOTO_START or self.yielded:
-            self.phase = Phase.LAND  # which is done at once on the ground, disarmed
-        elif self.phase < Phase.GOTO_LAND:
-            self.phase = Phase.GOTO_LAND
-            self._lands_here = verb == "land"
-            glide = self._stop_glide(state) if self._lands_here else self._home(state)
-            self._glide, self._bound_for = (glide, now_us), glide.to_ned_m
-        self._entered_us = now_us
+            self._enter(Phase.LAND, now_us)  # which is done at once where the vehicle is known to be disarmed
+        elif self.phase < Phase.GOTO_LAND and verb == "rtl":
+            self._lands_here = False
+            self._go_home(now_us, state)
+        elif verb == "land" and not self._lands_here:
+            self._stop_here(now_us, state)
 
-    def _wait_for_mute_peers(self, facts: Facts, state: VehicleState) -> None:
-        """Everybody who loses the bus comes to rest: then what peers assume of each other (braking) holds."""
+    def _is_down(self, facts: Facts, state: VehicleState) -> bool:
+        """Whether the vehicle is on the ground and known to be disarmed."""
+        return state.landed is Landed.ON_GROUND and self.arming.is_disarmed(facts, state)
+
+    def _wait_for_better(self, facts: Facts, state: VehicleState) -> None:
+        """Who loses the bus comes to rest: then what peers assume (braking) holds. So does who misses its deadlines."""
         flying = self.had_control and Phase.GOTO_START <= self.phase <= Phase.GOTO_LAND
-        if facts.mute and flying and not self.waiting:
+        must_wait = facts.mute or facts.overload >= Level.HOLD
+        if must_wait and flying and not self.waiting:
             self.waiting = True
             self._bound_for = self._glide[0].to_ned_m if self._glide else self._start_ned_m
             self._glide = (self._stop_glide(state), facts.now_us)
-        elif self.waiting and not facts.mute:
+        elif self.waiting and not must_wait:
             self.waiting = False
             if self.phase in (Phase.GOTO_START, Phase.GOTO_LAND):
                 self._glide = (self._way_to(self._bound_for, state), facts.now_us)
@@ -230,23 +253,40 @@ class Sequence:
 
     def _standby(self, facts: Facts, state: VehicleState) -> list[Command]:
         if not facts.prepared:  # any more: it has rebooted
+            self.waits_for = "the link to be set up again after a reboot of the autopilot"
             return []
         if facts.refusal:
             return self._refuse(facts.refusal, facts)
         if any(p.phase is Phase.DONE and p.alive for p in facts.peers.values()):
             return self._refuse("a peer gave up before take-off", facts)
-        known = sum(p.phase >= Phase.STANDBY and p.alive for p in facts.peers.values())
-        located = state.landed in (Landed.ON_GROUND, Landed.IN_AIR)
-        if located and facts.armable and not facts.busy and known == self._expected:
+        self.waits_for = self._missing(facts, state)
+        if not self.waits_for:
             self._ground_z_m = float(state.pos_ned_m[2])
             self._airborne = state.landed is Landed.IN_AIR
-            self._enter(Phase.ARM, facts)
+            self._enter(Phase.ARM, facts.now_us)
+            return []
+        stays = state.mode is FlightMode.EXTERNAL and facts.arm_in is None and not facts.armable
+        if stays and not state.armed and self._may_ask(facts):
+            return [Command(Verb.HOLD)]  # PX4 stays in OFFBOARD after a landing, where it can't be armed
         return []
 
+    def _missing(self, facts: Facts, state: VehicleState) -> str:
+        """What has to be true before arming and is not, or ""."""
+        if state.landed not in (Landed.ON_GROUND, Landed.IN_AIR):
+            return "the autopilot to tell whether it has landed"
+        if not facts.armable:
+            return f"the autopilot to be ready to arm (it is in {state.mode.name})"
+        if facts.unsettled:
+            return facts.unsettled
+        absent = self._expected - sum(p.phase >= Phase.STANDBY and p.alive for p in facts.peers.values())
+        if absent:
+            return f"{absent} of {self._expected} peers to stand by"
+        return "the autopilot's answers" if facts.busy else ""
+
     def _refuse(self, why: str, facts: Facts) -> list[Command]:
-        """Nothing has been armed yet, and nothing will be."""
+        """Give up before take-off: nothing more will be armed, and what has been armed is disarmed."""
         self.outcome = self.outcome or why
-        self._enter(Phase.DONE, facts)
+        self._enter(Phase.LAND if self.arming.requested else Phase.DONE, facts.now_us)
         return []
 
     def _arm(self, facts: Facts, state: VehicleState) -> list[Command]:
@@ -254,14 +294,16 @@ class Sequence:
             self._yield(TAKEN_OVER)  # before anything is streamed: one setpoint would take it
             return []
         if state.armed:
-            self._enter(Phase.GOTO_START if self._airborne else Phase.TAKEOFF, facts)
+            self._enter(Phase.GOTO_START if self._airborne else Phase.TAKEOFF, facts.now_us)
             return []
         if facts.refusal:
             return self._refuse(facts.refusal, facts)
         if not self._may_ask(facts):
             return []
-        in_mode = facts.arm_in in (None, state.mode)
-        return [Command(Verb.ARM if in_mode else Verb.EXTERNAL)]
+        if facts.arm_in not in (None, state.mode):
+            return [Command(Verb.EXTERNAL)]
+        self.arming.request()
+        return [Command(Verb.ARM)]
 
     def _takeoff(self, facts: Facts, state: VehicleState) -> list[Command]:
         height_m = self._ground_z_m - float(self._start_ned_m[2])
@@ -271,7 +313,7 @@ class Sequence:
         self._hovering_us = (self._hovering_us or facts.now_us) if hovers else None
         learned = facts.arm_in is None or facts.now_us - (self._hovering_us or facts.now_us) >= _HOVER_US
         if hovers and learned:
-            self._enter(Phase.GOTO_START, facts)
+            self._enter(Phase.GOTO_START, facts.now_us)
             return []
         if not state.armed:  # somebody, or the autopilot, thought better of it: never armed again
             self._give_up("disarmed before take-off", facts, state)
@@ -292,7 +334,7 @@ class Sequence:
         p = self._params
         if self._at(state, self._start_ned_m, p.arrive_m, p.arrive_m_s) and not self.waiting:
             self.ready_utc_us = facts.utc_us
-            self._enter(Phase.READY, facts)
+            self._enter(Phase.READY, facts.now_us)
         return []
 
     def _ask_for_control(self, facts: Facts, state: VehicleState) -> list[Command]:
@@ -306,9 +348,9 @@ class Sequence:
         return [Command(Verb.EXTERNAL)] if self._may_ask(facts) else []
 
     def _ready(self, facts: Facts, state: VehicleState) -> list[Command]:
-        if any(not p.alive for p in facts.peers.values()):
-            self.outcome = "a peer was lost before the mission began"
-            self._go_home(facts, state)
+        if any(not p.alive or p.phase >= Phase.GOTO_LAND for p in facts.peers.values()):
+            self.outcome = "a peer gave up or was lost before the mission began"
+            self._go_home(facts.now_us, state)
             return []
         ready = [p.ready_utc_us for p in facts.peers.values() if p.ready_utc_us > 0]
         if len(ready) == self._expected:
@@ -322,34 +364,34 @@ class Sequence:
         if facts.utc_us - self.begin_utc_us >= self._duration_us and not (self.held or self.waiting):
             self.outcome = self.outcome or "completed"
             if self._airborne and not facts.peers:
-                self._enter(Phase.LAND, facts)
+                self._enter(Phase.LAND, facts.now_us)
             elif self._airborne:
-                self._stop_here(facts, state)
+                self._stop_here(facts.now_us, state)
             else:
-                self._go_home(facts, state)
+                self._go_home(facts.now_us, state)
         return []
 
     def _goto_land(self, facts: Facts, state: VehicleState) -> list[Command]:
         waited_us = facts.now_us - self._entered_us
         if self._may_land(facts, state):
-            self._enter(Phase.LAND, facts)
+            self._enter(Phase.LAND, facts.now_us)
         elif waited_us > self._params.land_timeout_s * 1e6:
             at_rest = self._at(state, state.pos_ned_m, math.inf, self._params.arrive_m_s)
             if self._lands_here or (at_rest and self._has_room(facts, state)) or facts.mode not in _PLANNED:
-                self._enter(Phase.LAND, facts)
+                self._enter(Phase.LAND, facts.now_us)
             else:
-                self._stop_here(facts, state)
+                self._stop_here(facts.now_us, state)
         return []
 
     def _land(self, facts: Facts, state: VehicleState) -> list[Command]:
         self.had_control = False
         if self._airborne:  # found in the air, handed back in the air
             if state.mode is not FlightMode.EXTERNAL:
-                self._enter(Phase.DONE, facts)
+                self._enter(Phase.DONE, facts.now_us)
                 return []
             return [Command(Verb.HOLD)] if self._may_ask(facts) else []
-        if state.landed is Landed.ON_GROUND and not state.armed and not facts.busy:
-            self._enter(Phase.DONE, facts)
+        if self._is_down(facts, state):
+            self._enter(Phase.DONE, facts.now_us)
             return []
         if state.mode is FlightMode.LAND:
             self._landing_seen = True
@@ -400,30 +442,29 @@ class Sequence:
         p = self._params
         return glide_to(state.pos_ned_m, state.vel_ned_m_s, target_ned_m, p.speed_m_s, p.accel_m_s2)
 
-    def _go_home(self, facts: Facts, state: VehicleState) -> None:
-        self._glide, self._bound_for = (self._home(state), facts.now_us), self._start_ned_m
+    def _go_home(self, now_us: int, state: VehicleState) -> None:
+        self._glide, self._bound_for = (self._home(state), now_us), self._start_ned_m
         self.held = False
-        self._enter(Phase.GOTO_LAND, facts)
+        self._enter(Phase.GOTO_LAND, now_us)
 
     def _give_up(self, why: str, facts: Facts, state: VehicleState) -> None:
         self.outcome = self.outcome or why
         if self.had_control and facts.mode in _PLANNED:
-            self._stop_here(facts, state)
+            self._stop_here(facts.now_us, state)
             return
-        grounded = not state.armed and state.landed is Landed.ON_GROUND
-        self._enter(Phase.DONE if grounded else Phase.LAND, facts)
+        self._enter(Phase.DONE if self._is_down(facts, state) else Phase.LAND, facts.now_us)
 
-    def _stop_here(self, facts: Facts, state: VehicleState) -> None:
+    def _stop_here(self, now_us: int, state: VehicleState) -> None:
         """Brake and make room under the own plan, then hand over where that ends."""
         glide = self._stop_glide(state)
-        self._glide, self._bound_for = (glide, facts.now_us), glide.to_ned_m
+        self._glide, self._bound_for = (glide, now_us), glide.to_ned_m
         self._lands_here, self.held = True, False
-        self._enter(Phase.GOTO_LAND, facts)
+        self._enter(Phase.GOTO_LAND, now_us)
 
-    def _enter(self, phase: Phase, facts: Facts) -> None:
+    def _enter(self, phase: Phase, now_us: int) -> None:
         self.phase = phase
-        self._entered_us = facts.now_us
-        self._asked_us = facts.now_us - _SPIN_UP_US
+        self._entered_us = now_us
+        self._asked_us = now_us - _SPIN_UP_US
 
     def _may_ask(self, facts: Facts, every_us: int = _ASK_EVERY_US) -> bool:
         if facts.busy or facts.now_us - self._asked_us < every_us:

@@ -30,6 +30,7 @@ class Intent:
     agent: int
     boot_id: int
     seq: int
+    said_utc_us: int
     promised: bool  # it follows what it has committed to; otherwise somebody else flies it
     committed: Trajectory
     proposal: Proposal | None

@@ -1,7 +1,7 @@
 """One vehicle as the tick sees it: MAVLink in, `VehicleState` in the shared frame out; setpoints in, bytes out.
 
 Newest sample wins. `VehicleClock` says when it was true, `LocalFrame` where; which messages mean what, the dialect that
-the HEARTBEAT names. There is no state while any of it is in doubt, the mode included.
+the HEARTBEAT names. There is no state, and so nothing is sent, while any of it is in doubt, the mode included.
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ from pymavlink.dialects.v20 import development as mavlink
 from swarmctl.core.frames import rotate_to_ned
 from swarmctl.core.types import Array, AttitudeSetpoint, FlightMode, GeoOrigin, Landed, VehicleState
 from swarmctl.links.commands import CommandPort
-from swarmctl.links.dialects import DIALECTS, Dialect
+from swarmctl.links.dialects import DIALECTS, LAST_INTEGER_TYPE, Dialect
 from swarmctl.links.local_frame import LocalFrame
 from swarmctl.links.mavlink import Codec, frames
+from swarmctl.links.mode_watch import ModeWatch
 from swarmctl.links.transport import Transport
 from swarmctl.links.vehicle_clock import VehicleClock
 
@@ -28,9 +29,8 @@ _CRITICAL = 5
 _PREARM = 1 << 28
 _LOCAL_NED = mavlink.MAV_FRAME_LOCAL_NED
 _BODY_FRD = (mavlink.MAV_FRAME_BODY_NED, mavlink.MAV_FRAME_BODY_FRD)  # of ODOMETRY's velocity
+_STATE = frozenset({"ODOMETRY", "LOCAL_POSITION_NED"})  # whose stamps are the state's
 _FAST = frozenset({mavlink.MAVLINK_MSG_ID_ODOMETRY})  # not worth passing to the slow path
-_GAP_US = 300_000  # after a silence this long, ours or the link's, the mode has to be told again
-_TOLD_LATELY_US = 100_000  # a mode this young at the end of our own silence was not held up in a full buffer
 _SYNC_EVERY_US = 200_000
 _OWN_FLIGHT_US = 1_000_000  # without setpoints for so long the autopilot flies by itself, whatever its mode
 _HOVER_M_S = 0.2
@@ -61,20 +61,27 @@ class Autopilot:
         clock: the vehicle's clock; `clock.boots` counts its reboots.
         frame: the vehicle's local frame.
         params: parameters the vehicle has told of.
+        whole_params: names of those that it keeps as integers.
+        armed_told_us: arrival of the HEARTBEAT that told `armed`, our time; -1 before the first.
         hover_thrust_01: what the autopilot flies with while it hovers by itself; before that, what its parameter says.
         pos_accuracy_m: horizontal 1-sigma accuracy it claims; None while untold.
         samples: states received; the difference of two readings is the rate.
         heard_us: arrival of the last frame, our time.
         invalid: polls without a state although there was a sample, by reason.
+        watch: the vehicle's flight mode and failsafe, and whether they are in doubt.
+        gaps: how often setpoints were resumed, in that mode, after so long that its failsafe may have acted unseen.
+        gap_s: the last of them.
     """
 
     params: dict[str, float]
+    whole_params: set[str]
     hover_thrust_01: float | None
     pos_accuracy_m: float | None
     _sample: _Sample | None
     _placed: tuple[_Sample, Array] | None  # the sample, and its position in the shared frame
     _attitude: tuple[int, Array, Array] | None  # arrival, attitude, rates
     _reset_counter: int | None
+    _was_reset: bool  # the estimator has said so, since the newest placed sample
 
     def __init__(
         self,
@@ -88,24 +95,22 @@ class Autopilot:
         self._on_frame = on_frame
         self.clock = VehicleClock()
         self.frame = LocalFrame(shared)
+        self.watch = ModeWatch()
         self._slow: CommandPort | None = None
         self.dialect: Dialect | None = None
         self.armed = False
-        self.mode = FlightMode.UNKNOWN
-        self.failsafe = False
+        self.armed_told_us = -1
         self.texts: list[str] = []
         self.refused_setpoints = 0
         self.samples = 0
         self.heard_us: int | None = None
         self.invalid: Counter[str] = Counter()
-        self._mode_us = 0  # arrival of the message that told the mode
-        self._doubt_us: int | None = None  # the mode has to be told after this
-        self._polled_us: int | None = None
+        self.gaps, self.gap_s = 0, 0.0
+        self._departures = 0  # up to the newest setpoint
         self._setpoint_us: int | None = None
         self._sync_us = 0
         self._syncs: deque[int] = deque(maxlen=16)  # our times in open TIMESYNC questions [ns]
-        self._boots = 0
-        self._counter_resets = 0
+        self._boots = self._restarts = 0  # of the clock, as far as they have been heeded
         self._forget()
         self._handlers: dict[str, Callable[[Any, int], None]] = {
             "HEARTBEAT": self._heartbeat,
@@ -126,14 +131,19 @@ class Autopilot:
         }
 
     @property
+    def mode(self) -> FlightMode:
+        """As told last."""
+        return self.watch.mode
+
+    @property
+    def failsafe(self) -> bool:
+        """Whether the autopilot's failsafe acts, as told last."""
+        return self.watch.failsafe
+
+    @property
     def offset_ned_m(self) -> Array | None:
         """Local origin (3,) in the shared frame."""
         return self.frame.offset_ned_m
-
-    @property
-    def resets(self) -> int:
-        """How often the estimate has jumped in the shared frame: what was filtered before does not continue."""
-        return self._counter_resets + self.frame.jumps
 
     def attach(self, slow: CommandPort) -> None:
         """Pass everything but the fast state messages on to the slow path."""
@@ -146,20 +156,19 @@ class Autopilot:
 
     def poll(self, now_us: int) -> VehicleState | None:
         """Drain the link; the newest state, or None before the first complete one and while it is in doubt."""
-        if self._polled_us is not None and now_us - self._polled_us > _GAP_US:
-            self._doubt_us = now_us - _TOLD_LATELY_US  # we slept: what was buffered may end long ago
-        self._polled_us = now_us
+        self.watch.poll(now_us)
         for datagram in self._transport.receive(now_us):
             for frame in frames(datagram.data):
                 self._frame(frame, datagram.t_us)
         self._ask_the_time(now_us)
         if self._sample is None or self.mode is FlightMode.UNKNOWN:
             return None
-        if self._doubt_us is not None and self._mode_us < self._doubt_us:
+        if self.watch.in_doubt:
             self.invalid["mode not told since a silence"] += 1
+            if self.watch.asks(now_us):
+                self._ask_for(mavlink.MAVLINK_MSG_ID_HEARTBEAT)
             return None
-        self._doubt_us = None
-        return self._state(self._sample)
+        return self._state(self._sample, now_us)
 
     def send(self, setpoint: AttitudeSetpoint, now_us: int) -> str:
         """Send one setpoint; returns why it was refused, or "".
@@ -174,12 +183,23 @@ class Autopilot:
         message = mavlink.MAVLink_set_attitude_target_message(
             (now_us // 1000) & 0xFFFFFFFF, self._sysid, 1, _ATTITUDE_ONLY, q, 0.0, 0.0, 0.0, setpoint.thrust_01
         )
-        self._setpoint_us = now_us
+        self._measure_gap(now_us)
         self.send_frame(self._codec.encode(message))
         return ""
 
     def close(self) -> None:
         self._transport.close()
+
+    def _measure_gap(self, now_us: int) -> None:
+        """How long setpoints had stopped, if that was longer than the autopilot waits for them.
+
+        PX4 returns to OFFBOARD by itself when they resume, sooner than CURRENT_MODE may tell that it was away.
+        """
+        last_us, stayed = self._setpoint_us, self._departures == self.watch.departures
+        self._setpoint_us, self._departures = now_us, self.watch.departures
+        loss_s = None if self.dialect is None else self.params.get(self.dialect.loss_parameter)
+        if last_us is not None and stayed and loss_s is not None and now_us - last_us > loss_s * 1e6:
+            self.gaps, self.gap_s = self.gaps + 1, (now_us - last_us) * 1e-6
 
     # -- frames -------------------------------------------------------------------------------------------------------
 
@@ -190,10 +210,12 @@ class Autopilot:
         if message is None:
             return
         self._on_frame(frame)
-        if self.heard_us is not None and arrived_us - self.heard_us > _GAP_US:
-            self._doubt_us = arrived_us  # the link was silent: what was said meanwhile is lost
+        self.watch.heard(arrived_us)
         self.heard_us = arrived_us
-        handler = self._handlers.get(message.get_type())
+        kind = message.get_type()
+        if kind not in _STATE and (boot_ms := getattr(message, "time_boot_ms", None)) is not None:
+            self.clock.witness(kind, boot_ms * 1000, arrived_us)
+        handler = self._handlers.get(kind)
         if handler is not None:
             handler(message, arrived_us)
         if self._slow is not None and message.get_msgId() not in _FAST:
@@ -204,14 +226,19 @@ class Autopilot:
         if dialect is None:
             return
         self.dialect = dialect
-        self.armed = bool(message.base_mode & _ARMED_FLAG)
-        self.failsafe = message.system_status >= _CRITICAL
-        self.mode, self._mode_us = dialect.mode(message.custom_mode), arrived_us
+        self.armed, self.armed_told_us = bool(message.base_mode & _ARMED_FLAG), arrived_us
+        self.watch.alarm(message.system_status >= _CRITICAL)
+        self.watch.told(dialect.mode(message.custom_mode), arrived_us)
 
     def _current_mode(self, message: Any, arrived_us: int) -> None:
-        """The same as in HEARTBEAT, but fast: a pilot's switch must not stay unseen for a second."""
+        """The same as in HEARTBEAT, but on change: a pilot's switch must not stay unseen for a second."""
         if self.dialect is not None:
-            self.mode, self._mode_us = self.dialect.mode(message.custom_mode), arrived_us
+            self.watch.told(self.dialect.mode(message.custom_mode), arrived_us)
+
+    def _ask_for(self, message_id: int) -> None:
+        asked = (float(message_id), *(0.0,) * 6)
+        request = mavlink.MAVLink_command_long_message(self._sysid, 1, mavlink.MAV_CMD_REQUEST_MESSAGE, 0, *asked)
+        self.send_frame(self._codec.encode(request))
 
     def _sys_status(self, message: Any, arrived_us: int) -> None:
         self.armable = bool(message.onboard_control_sensors_health & _PREARM)
@@ -237,7 +264,7 @@ class Autopilot:
         rate = np.array([message.rollspeed, message.pitchspeed, message.yawspeed])
         pos = np.array([message.x, message.y, message.z])
         if self._take(message.time_usec, arrived_us, pos, vel, q_nb, rate):
-            self._counter_resets += self._reset_counter not in (None, message.reset_counter)
+            self._was_reset |= self._reset_counter not in (None, message.reset_counter)
             self._reset_counter = message.reset_counter
 
     def _attitude_quaternion(self, message: Any, arrived_us: int) -> None:
@@ -259,6 +286,11 @@ class Autopilot:
             self._codec.refused["state not finite"] += 1
             return False
         t_us = self.clock.to_local(vehicle_us, arrived_us)
+        if t_us is None:
+            self._codec.refused["stamp not believed"] += 1
+            return False
+        if self.clock.restarts != self._restarts:
+            self._restarts, self._sample = self.clock.restarts, None
         if self.clock.boots != self._boots:
             self._boots = self.clock.boots
             self._forget()
@@ -269,22 +301,25 @@ class Autopilot:
         self._sample = _Sample(vehicle_us, t_us, pos, vel, q_nb / norm, rate)
         return True
 
-    def _state(self, sample: _Sample) -> VehicleState | None:
+    def _state(self, sample: _Sample, now_us: int) -> VehicleState | None:
         if self._placed is None or self._placed[0] is not sample:
-            placed = self.frame.place(sample.vehicle_us, sample.pos_ned_m, sample.vel_ned_m_s, self.armed)
+            told, self._was_reset = self._was_reset, False
+            placed = self.frame.place(sample.vehicle_us, sample.pos_ned_m, sample.vel_ned_m_s, self.armed, told)
             self._placed = None if placed is None else (sample, placed)
         if self._placed is None:
             return None
         pos, vel, q_nb, rate = self._placed[1], sample.vel_ned_m_s, sample.q_nb, sample.rate_frd_rad_s
-        return VehicleState(sample.t_us, pos, vel, q_nb, rate, self.armed, self.mode, self.landed, self.failsafe)
+        mode, failsafe = self.watch.show(now_us)
+        return VehicleState(sample.t_us, pos, vel, q_nb, rate, self.armed, mode, self.landed, failsafe)
 
     def _forget(self) -> None:
         """The vehicle has rebooted, or was never heard: nothing it said holds."""
         self._sample = self._placed = self._attitude = self._reset_counter = None
+        self._was_reset = False
         self._odometry_us = 0
         self.landed = Landed.UNKNOWN
         self.armable = False
-        self.params = {}
+        self.params, self.whole_params = {}, set()
         self.hover_thrust_01 = self.pos_accuracy_m = None
         self.frame.forget()
 
@@ -327,6 +362,8 @@ class Autopilot:
         if not np.isfinite(value):
             return
         self.params[message.param_id] = value
+        if message.param_type <= LAST_INTEGER_TYPE:
+            self.whole_params.add(message.param_id)
         if message.param_id == self.dialect.hover_parameter and self.hover_thrust_01 is None and 0.05 < value < 0.95:
             self.hover_thrust_01 = value
 

@@ -15,6 +15,7 @@ import json
 import signal
 import sys
 import threading
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -23,9 +24,10 @@ import zenoh
 
 from swarmctl.errors import StartError, SwarmError
 from swarmctl.lifeline import die_with_parent, remove_socket
-from swarmctl.links.topics import TOPICS, Topic
+from swarmctl.links.topics import TOO_LONG, TOPICS, Topic
 
 SCHEME = "unixsock-stream/"
+NO_BUS = "none"  # endpoint of an agent that flies by itself
 CONNECT_TIMEOUT_MS = 10_000
 CLOSE_DEADLINE_S = 2.0
 _MAX_MESSAGE_BYTES = 1 << 20
@@ -74,6 +76,7 @@ class ZenohBus:
             for topic, senders in listen.items()
         }
         self._alive: set[str] = set()
+        self._arrivals: Counter[str] = Counter()
         self._lives = self._session.liveliness().declare_subscriber(
             f"{prefix}/*/alive", zenoh.handlers.RingChannel(_ALIVE_RING), history=True
         )
@@ -85,25 +88,35 @@ class ZenohBus:
             self._publishers[topic].put(payload)
 
     def receive(self, topic: Topic) -> list[tuple[str, bytes]]:
-        """Everything in the rings of a topic, oldest first for each sender."""
+        """Everything in the rings of a topic, oldest first for each sender; at most one ring of each."""
         arrived: list[tuple[str, bytes]] = []
         for sender, subscriber in self._subscribers.get(topic, ()):
-            arrived.extend((sender, sample.payload.to_bytes()) for sample in _drain(subscriber, topic.ring))
+            payloads = (sample.payload for sample in _drain(subscriber, topic.ring))
+            arrived += [(sender, p.to_bytes() if len(p) <= topic.max_bytes else TOO_LONG) for p in payloads]
         return arrived
 
     def alive(self) -> frozenset[str]:
         """Senders whose liveliness token is present; empty, even of this one, while the router is gone."""
-        for sample in _drain(self._lives, _ALIVE_RING):
-            sender = str(sample.key_expr).split("/")[2]
-            if sample.kind == zenoh.SampleKind.PUT:
-                self._alive.add(sender)
-            else:
-                self._alive.discard(sender)
+        self._watch_tokens()
         return frozenset(self._alive)
+
+    def arrivals(self) -> Mapping[str, int]:
+        """How often each token has come; one that left and came back between two looks has come twice."""
+        self._watch_tokens()
+        return self._arrivals
 
     def close(self) -> None:
         """Leave the bus; gives up after `CLOSE_DEADLINE_S`, since a link that lost its other end can hold it up."""
         _close_within(self._session, CLOSE_DEADLINE_S)
+
+    def _watch_tokens(self) -> None:
+        for sample in _drain(self._lives, _ALIVE_RING):
+            sender = str(sample.key_expr).split("/")[2]
+            if sample.kind != zenoh.SampleKind.PUT:
+                self._alive.discard(sender)
+            elif sender not in self._alive:  # a second process of that name has not come anew
+                self._alive.add(sender)
+                self._arrivals[sender] += 1
 
     def _publisher(self, key: str, topic: Topic) -> Any:
         reliability = zenoh.Reliability.RELIABLE if topic.reliable else zenoh.Reliability.BEST_EFFORT

@@ -23,6 +23,7 @@ _RETRY_US = 500_000
 _TRIES = 4
 _IN_PROGRESS = 5  # MAV_RESULT
 _HEARTBEAT_US = 1_000_000
+_GROUND_STATION, _NO_AUTOPILOT, _ACTIVE = 6, 8, 4  # MAV_TYPE_GCS: what PX4 counts for its data-link failsafe
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,14 +59,16 @@ class CommandPort(Protocol):
 
 
 class CodecCommands:
-    """Commands through the codec, re-sent until acknowledged; also sends the companion's heartbeat.
+    """Commands through the codec, re-sent until acknowledged; also sends the agent's heartbeat.
+
+    It is a ground station's: only those count for PX4's data-link failsafe, which lands a vehicle whose agent dies
+    before OFFBOARD, and only to them PX4 sends its texts.
 
     Args:
         send: hands a frame to the vehicle.
         codec: own identity.
         target: the vehicle's system id.
         dialect: the autopilot's, or None while nobody knows; commands wait for it.
-        beats: whether to send the companion's heartbeat.
     """
 
     def __init__(
@@ -74,10 +77,9 @@ class CodecCommands:
         codec: Codec,
         target: int,
         dialect: Callable[[], Dialect | None],
-        beats: bool = True,
     ) -> None:
         self._send, self._codec, self._target = send, codec, target
-        self._dialect, self._beats = dialect, beats
+        self._dialect = dialect
         self._asked: deque[Command] = deque()
         self._steps: deque[Command] = deque()  # of the one being executed
         self._spoken: Dialect | None = None  # in which it is being asked
@@ -116,9 +118,9 @@ class CodecCommands:
             self._finish(False, f"parameter error {message.error}")
 
     def step(self, now_us: int) -> None:
-        if self._beats and now_us >= self._heartbeat_us:
+        if now_us >= self._heartbeat_us:
             self._heartbeat_us = now_us + _HEARTBEAT_US
-            beat = mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)  # onboard controller, active
+            beat = mavlink.MAVLink_heartbeat_message(_GROUND_STATION, _NO_AUTOPILOT, 0, 0, _ACTIVE, 3)
             self._send(self._codec.encode(beat))
         if not self._steps:
             self._spoken = self._dialect()

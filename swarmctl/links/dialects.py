@@ -14,7 +14,7 @@ from swarmctl.core.types import Command, FlightMode, Verb
 
 _INT32, _REAL32 = 6, 9  # MAV_PARAM_TYPE
 _CUSTOM_MODE = 1.0  # DO_SET_MODE p1: MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
-_LAST_INTEGER_TYPE = 8
+LAST_INTEGER_TYPE = 8  # MAV_PARAM_TYPE_INT64; what follows is a float
 _ARM, _TAKEOFF, _LAND, _SET_MODE, _INTERVAL, _REQUEST = 400, 22, 21, 176, 511, 512
 _NAN = math.nan
 
@@ -70,6 +70,7 @@ class Dialect:
     hover_parameter: str
     thrust_parameters: tuple[str, ...]  # read and recorded: they say what thrust means
     horizontal_accuracy: str  # message that tells it
+    loss_parameter: str  # how long it waits for setpoints [s]
     heeds_parameter: str = ""  # whose heartbeats its link-loss failsafe counts; "": anybody's
 
     def mode(self, custom_mode: int) -> FlightMode:
@@ -112,7 +113,7 @@ class Dialect:
 
     def from_wire(self, value: float, kind: int) -> float:
         """Number that a PARAM_VALUE carries."""
-        if self.integers_bytewise and kind <= _LAST_INTEGER_TYPE:
+        if self.integers_bytewise and kind <= LAST_INTEGER_TYPE:
             return float(struct.unpack("<i", struct.pack("<f", value))[0])
         return value
 
@@ -138,17 +139,34 @@ PX4 = Dialect(
     arm_in=None,
     integers_bytewise=True,
     state=(ODOMETRY,),
-    rates_hz={ATTITUDE_TARGET: 5.0, EXTENDED_SYS_STATE: 10.0, CURRENT_MODE: 25.0, ESTIMATOR_STATUS: 1.0},
+    rates_hz={
+        ATTITUDE_TARGET: 5.0,
+        EXTENDED_SYS_STATE: 10.0,
+        CURRENT_MODE: 50.0,  # how often it looks whether the mode has changed; it is sent at 2 Hz and on change
+        ESTIMATOR_STATUS: 1.0,
+    },
     rules=(
         Rule(
             "COM_OBL_RC_ACT",
             lambda v: 0 <= v <= 5,
             "motors would stop in the air when setpoints do; set agent.autopilot_params.COM_OBL_RC_ACT = 4 (land)",
         ),
+        Rule(
+            "NAV_DLL_ACT",
+            lambda v: v in (2, 3),
+            "a vehicle whose agent dies before OFFBOARD would hover for ever; "
+            "set agent.autopilot_params.NAV_DLL_ACT = 3 (land)",
+        ),
+        Rule(
+            "COM_DL_LOSS_T",
+            lambda v: 0 < v <= 30,
+            "so long a vehicle whose agent died before OFFBOARD hovers; set agent.autopilot_params.COM_DL_LOSS_T = 5",
+        ),
     ),
     hover_parameter="MPC_THR_HOVER",
     thrust_parameters=("THR_MDL_FAC", "MPC_THR_MIN", "MPC_THR_MAX"),
     horizontal_accuracy="ESTIMATOR_STATUS",
+    loss_parameter="COM_OF_LOSS_T",
 )
 ARDUCOPTER = Dialect(
     name="ArduCopter",
@@ -204,6 +222,7 @@ ARDUCOPTER = Dialect(
     hover_parameter="MOT_THST_HOVER",
     thrust_parameters=("MOT_THST_EXPO", "MOT_SPIN_ARM", "MOT_SPIN_MIN", "MOT_SPIN_MAX"),
     horizontal_accuracy="GPS_RAW_INT",  # its EKF's own figures are test ratios, not metres
+    loss_parameter="GUID_TIMEOUT",
     heeds_parameter="SYSID_MYGCS",
 )
 DIALECTS: Mapping[int, Dialect] = {12: PX4, 3: ARDUCOPTER}  # by HEARTBEAT.autopilot

@@ -1,6 +1,6 @@
 """A vehicle link that hears everybody, for checks: who else sends here, and in which protocol, is part of the answer.
 
-The flying link (`transport`) obeys the first sender and drops the rest; this one tells them apart. It answers only the
+The flying link (`transport`) obeys its vehicle and drops the rest; this one tells them apart. It answers only the
 address it is told to.
 """
 

@@ -7,7 +7,6 @@ trajectory is t0, step, count, then positions and velocities as float32.
 from __future__ import annotations
 
 import struct
-from collections import Counter
 from collections.abc import Iterable
 
 import numpy as np
@@ -15,16 +14,18 @@ import numpy as np
 from swarmctl.core.intent import Intent, Proposal
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.types import Array
-from swarmctl.links.peers import agent_name
+from swarmctl.links.peers import MAX_LEAD_US, agent_name
+from swarmctl.links.refusals import FUTURE, IDENTITY, MALFORMED, UNKNOWN_PEER, Refusals
+from swarmctl.links.speakers import Attendance, Said, Speaker
+from swarmctl.links.topics import INTENT
 
-INTENT_VERSION = 1
+INTENT_VERSION = 2
 MAX_POINTS = 2000
 MAX_STEP_US = 500_000
-RESTART_US = 5_000_000  # of silence, after which an earlier boot id is a restart under another clock
-MAX_LEAD_US = 10_000_000  # what begins later is of another clock
+MAX_BEGIN_US = 10_000_000  # from now: what begins later is of another clock
 MAX_ACKNOWLEDGED = 256
 _MAGIC = b"SI"
-_HEADER = struct.Struct("<2sBBIIIH2x")  # magic version flags agent boot seq acknowledgements
+_HEADER = struct.Struct("<2sBBIIIqH2x")  # magic version flags agent boot seq said acknowledgements
 _PROPOSES, _PROMISED = 1, 2
 _PROPOSAL = struct.Struct("<Qq")  # number, time it was made
 _TRAJECTORY = struct.Struct("<qiH2x")
@@ -43,6 +44,7 @@ def encode_intent(intent: Intent) -> bytes:
             intent.agent,
             intent.boot_id,
             intent.seq,
+            intent.said_utc_us,
             len(intent.heard),
         ),
         _encode_trajectory(intent.committed),
@@ -60,7 +62,7 @@ def decode_intent(payload: bytes, memory: Memory | None = None) -> Intent | None
     `memory` holds the trajectories of the message before: one that is said again is the same object again.
     """
     try:
-        magic, version, flags, agent, boot_id, seq, count = _HEADER.unpack_from(payload)
+        magic, version, flags, agent, boot_id, seq, said_utc_us, count = _HEADER.unpack_from(payload)
         if magic != _MAGIC or version != INTENT_VERSION or flags > 3 or count > MAX_ACKNOWLEDGED:
             return None
         known, said = memory or {}, Memory()
@@ -76,7 +78,7 @@ def decode_intent(payload: bytes, memory: Memory | None = None) -> Intent | None
         if memory is not None:
             memory.clear()
             memory.update(said)
-        return Intent(agent, boot_id, seq, bool(flags & _PROMISED), committed, proposal, heard)
+        return Intent(agent, boot_id, seq, said_utc_us, bool(flags & _PROMISED), committed, proposal, heard)
     except (struct.error, ValueError):
         return None
 
@@ -113,38 +115,35 @@ class PeerIntents:
 
     Args:
         peers: agent numbers that are listened to, without the own one.
+        rate_hz, refusals, attendance: see `Speaker`.
     """
 
-    def __init__(self, peers: Iterable[int]) -> None:
-        self._expected = frozenset(peers)
-        self._memory = {agent_name(agent): Memory() for agent in self._expected}
-        self._heard_us: dict[int, int] = {}  # when the newest came
+    def __init__(self, peers: Iterable[int], rate_hz: float, refusals: Refusals, attendance: Attendance) -> None:
+        names = {agent: agent_name(agent) for agent in peers}
+        self._speakers = {a: Speaker(name, INTENT.name, rate_hz, refusals, attendance) for a, name in names.items()}
+        self._refusals = refusals
+        self._memory: dict[str, Memory] = {}
         self.newest: dict[int, Intent] = {}
-        self.rejected: Counter[str] = Counter()
 
     def offer(self, sender: str, payload: bytes, utc_us: int) -> None:
         """Judge one message; `sender` is the name the bus vouches for, `utc_us` now."""
-        intent = decode_intent(payload, self._memory.get(sender))
-        if intent is None:
-            self.rejected["malformed"] += 1
-        elif sender != agent_name(intent.agent):
-            self.rejected["identity"] += 1
-        elif intent.agent not in self._expected:
-            self.rejected["unknown_peer"] += 1
-        elif not self._is_newer(intent, utc_us):
-            self.rejected["replayed"] += 1
-        elif any(trajectory.t0_utc_us > utc_us + MAX_LEAD_US for trajectory in intent.trajectories):
-            self.rejected["future"] += 1
-        else:
-            self.newest[intent.agent], self._heard_us[intent.agent] = intent, utc_us
+        memory = dict(self._memory.get(sender, {}))
+        intent = decode_intent(payload, memory)
+        if intent is None or (reason := self._refusal(sender, intent, utc_us)):
+            self._refusals.add(sender, INTENT.name, MALFORMED if intent is None else reason, utc_us)
+            return
+        said = Said(intent.boot_id, intent.seq, min(intent.said_utc_us, utc_us + MAX_LEAD_US), payload)
+        if self._speakers[intent.agent].believes(said, utc_us):
+            self.newest[intent.agent], self._memory[sender] = intent, memory
 
     def heard(self) -> dict[int, int]:
         """Number of the proposal that each peer is known to make now."""
         return {agent: i.proposal.number for agent, i in self.newest.items() if i.proposal is not None}
 
-    def _is_newer(self, intent: Intent, utc_us: int) -> bool:
-        known = self.newest.get(intent.agent)
-        if known is None or intent.boot_id == known.boot_id:
-            return known is None or intent.seq > known.seq
-        silent_us = utc_us - self._heard_us[intent.agent]
-        return intent.boot_id > known.boot_id or silent_us > RESTART_US  # boot ids are start times, but clocks err
+    def _refusal(self, sender: str, intent: Intent, utc_us: int) -> str:
+        if sender != agent_name(intent.agent):
+            return IDENTITY
+        if intent.agent not in self._speakers:
+            return UNKNOWN_PEER
+        begins_us = max(trajectory.t0_utc_us for trajectory in intent.trajectories)
+        return FUTURE if begins_us > utc_us + MAX_BEGIN_US else ""

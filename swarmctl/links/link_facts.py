@@ -67,8 +67,14 @@ class Version:
     stage: str  # dev, alpha, beta, rc, release
     git: str
     board: int
-    uid: str  # uid2, hexadecimal; "0" for simulators
+    uid: str  # uid2, hexadecimal; of PX4's simulator the number of its instance, so it tells nothing of what it is
     bytewise: bool | None  # which parameter encoding it announces
+    vendor: int = 0  # of its USB port; 0 where there is none: simulators, and boards that run Linux
+
+    @property
+    def has_usb(self) -> bool:
+        """Whether this is a board of its own, for sure; False says nothing."""
+        return self.vendor != 0
 
 
 @dataclass(frozen=True, slots=True)

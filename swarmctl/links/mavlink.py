@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from pymavlink.dialects.v20 import development as dialect
@@ -15,6 +15,7 @@ MAVLINK2_MAGIC = 0xFD
 _HEADER = 10
 _CHECKSUM = 2
 _SIGNATURE = 13
+_AUTOPILOT_COMPID = 1
 
 
 def frames(datagram: bytes) -> Iterator[bytes]:
@@ -32,6 +33,25 @@ def frames(datagram: bytes) -> Iterator[bytes]:
 def message_id(frame: bytes) -> int:
     """Message id of a frame that `frames` produced."""
     return int.from_bytes(frame[7:10], "little")
+
+
+def heartbeat_of(sysid: int) -> Callable[[bytes], bool]:
+    """A test of datagrams: whether one holds a good HEARTBEAT of the autopilot with this system id.
+
+    Ground stations and companions beat too, some with a vehicle's system id; what they name is no autopilot.
+    """
+    codec = Codec(sysid, _AUTOPILOT_COMPID)
+
+    def beats(datagram: bytes) -> bool:
+        for frame in frames(datagram):
+            if message_id(frame) != dialect.MAVLINK_MSG_ID_HEARTBEAT or frame[5:7] != bytes([sysid, _AUTOPILOT_COMPID]):
+                continue
+            message = codec.decode(frame)
+            if message is not None and message.autopilot != dialect.MAV_AUTOPILOT_INVALID:
+                return True
+        return False
+
+    return beats
 
 
 class Codec:

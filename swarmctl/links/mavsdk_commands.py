@@ -1,6 +1,7 @@
 """The slow path on a real link: MAVSDK over `raw://`, fed by the agent's own socket.
 
-MAVSDK keeps the heartbeat, retries and acknowledgements of commands; what a command is made of, the dialect says.
+MAVSDK keeps retries and acknowledgements of commands; what a command is made of, the dialect says. Heartbeats leave
+from the tick: a thread that sent them beside a tick that hangs would hide its death from the autopilot.
 Parameters go through our own codec, because MAVSDK only says that it was not refused, not what is stored now.
 
 Its Offboard plugin is never created: it re-sends the last setpoint from a C++ thread for ever, which defeats the
@@ -42,10 +43,10 @@ class MavsdkCommands:
 
     def __init__(self, send: Callable[[bytes], None], target: int, dialect: Callable[[], Dialect | None]) -> None:
         self._target, self._dialect = target, dialect
-        self._sdk = Mavsdk(Configuration.create_manual(target, OWN_COMPID, True))
+        self._sdk = Mavsdk(Configuration.create_manual(target, OWN_COMPID, False))
         self._sdk.add_any_connection("raw://")
         self._raw = self._sdk.subscribe_raw_bytes_to_be_sent(send)
-        self._parameters = CodecCommands(send, Codec(target, OWN_COMPID), target, dialect, beats=False)
+        self._parameters = CodecCommands(send, Codec(target, OWN_COMPID), target, dialect)
         self._wanted: deque[Command] = deque()
         self._steps: deque[Command] = deque()  # of the one being executed
         self._open = False  # the first step has been handed to MAVSDK or the codec

@@ -1,7 +1,8 @@
 """What an agent knows of its peers, and the bus as one protocol. Pure: no zenoh, no clock, no thread.
 
-`PeerPaths` judges freshness by what the payload says, never by the bus. It keeps every peer's newest path whatever its
-age; what an old path means for separation is decided in `swarmctl.control`. `LocalHub` is the bus of lockstep.
+`PeerPaths` judges freshness by what the payload says, never by the bus, and identity by `links.speakers`. It keeps
+every peer's newest path whatever its age; what an old path means for separation is decided in `swarmctl.control`.
+`LocalHub` is the bus of lockstep.
 """
 
 from __future__ import annotations
@@ -9,18 +10,18 @@ from __future__ import annotations
 import zlib
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 
 import numpy as np
 
 from swarmctl.core.types import PredictedPath
-from swarmctl.links.topics import TOPICS, Topic, decode_path
+from swarmctl.links.refusals import FUTURE, IDENTITY, LATE, MALFORMED, UNKNOWN_PEER, Refusals
+from swarmctl.links.speakers import Attendance, Said, Speaker
+from swarmctl.links.topics import PATH, TOO_LONG, TOPICS, Topic, decode_path
 
 MAX_AGE_US = 2_000_000
 MAX_LEAD_US = 500_000
 LEASE_US = 1_500_000  # after which a silent link of the bus in memory is taken for dead, as bus.lease_ms
-_RETIRED_BOOTS = 64  # boot ids remembered per peer, so that a superseded one can't come back
 _LOSS = 1  # purpose of the random stream
 
 
@@ -36,19 +37,19 @@ class Bus(Protocol):
         """Send to all who listen to this sender; dropped, never queued for long."""
 
     def receive(self, topic: Topic) -> list[tuple[str, bytes]]:
-        """(sender, payload) of everything kept since the last call, oldest first for each sender."""
+        """(sender, payload) of what is kept since the last call, oldest first for each sender.
+
+        At most a ring of each sender, and `TOO_LONG` instead of every message that is longer than its topic allows.
+        """
 
     def alive(self) -> frozenset[str]:
         """Senders that are attached now, this one included. Advisory: it proves a process, not a control loop."""
 
+    def arrivals(self) -> Mapping[str, int]:
+        """How often each sender has been seen to come, so that one that left and came back at once is noticed."""
+
     def close(self) -> None:
         """Leave the bus."""
-
-
-@dataclass(slots=True)
-class _Peer:
-    newest: PredictedPath
-    retired_boots: deque[int] = field(default_factory=lambda: deque(maxlen=_RETIRED_BOOTS))
 
 
 class PeerPaths:
@@ -56,16 +57,26 @@ class PeerPaths:
 
     Args:
         peers: agent numbers that are listened to, without the own one.
+        rate_hz, refusals, attendance: see `Speaker`.
         max_age_us: a path whose first point is older than this when it arrives is refused.
         max_lead_us: a path whose first point is further in the future than this is refused.
     """
 
-    def __init__(self, peers: Iterable[int], max_age_us: int = MAX_AGE_US, max_lead_us: int = MAX_LEAD_US) -> None:
-        self._expected = frozenset(peers)
+    def __init__(
+        self,
+        peers: Iterable[int],
+        rate_hz: float,
+        refusals: Refusals,
+        attendance: Attendance,
+        max_age_us: int = MAX_AGE_US,
+        max_lead_us: int = MAX_LEAD_US,
+    ) -> None:
+        names = {agent: agent_name(agent) for agent in peers}
+        self._speakers = {a: Speaker(name, PATH.name, rate_hz, refusals, attendance) for a, name in names.items()}
         self._max_age_us = max_age_us
         self._max_lead_us = max_lead_us
-        self._peers: dict[int, _Peer] = {}
-        self.rejected: Counter[str] = Counter()
+        self._newest: dict[int, PredictedPath] = {}
+        self.refusals = refusals
 
     def offer(self, sender: str, payload: bytes, utc_us: int) -> None:
         """Judge one message of the PATH topic.
@@ -76,43 +87,24 @@ class PeerPaths:
             utc_us: now, disciplined UTC [us].
         """
         path = decode_path(payload)
-        if path is None:
-            self.rejected["malformed"] += 1
+        if path is None or (reason := self._refusal(sender, path, utc_us)):
+            self.refusals.add(sender, PATH.name, MALFORMED if path is None else reason, utc_us)
             return
-        reason = self._refusal(sender, path, utc_us)
-        if reason:
-            self.rejected[reason] += 1
-            return
-        known = self._peers.get(path.agent)
-        if known is None:
-            self._peers[path.agent] = _Peer(path)
-            return
-        if known.newest.boot_id != path.boot_id:
-            known.retired_boots.append(known.newest.boot_id)
-        known.newest = path
+        if self._speakers[path.agent].believes(Said(path.boot_id, path.seq, path.t0_utc_us, payload), utc_us):
+            self._newest[path.agent] = path
 
     def latest(self) -> tuple[PredictedPath, ...]:
         """Newest path of every peer ever heard, whatever its age, by agent number."""
-        return tuple(self._peers[agent].newest for agent in sorted(self._peers))
+        return tuple(self._newest[agent] for agent in sorted(self._newest))
 
     def _refusal(self, sender: str, path: PredictedPath, utc_us: int) -> str:
         if sender != agent_name(path.agent):
-            return "identity"
-        if path.agent not in self._expected:
-            return "unknown_peer"
+            return IDENTITY
+        if path.agent not in self._speakers:
+            return UNKNOWN_PEER
         if path.t0_utc_us - utc_us > self._max_lead_us:
-            return "future"
-        known = self._peers.get(path.agent)
-        if known is not None and _replayed(known, path):
-            return "replayed"
-        return "late" if utc_us - path.t0_utc_us > self._max_age_us else ""
-
-
-def _replayed(known: _Peer, path: PredictedPath) -> bool:
-    """Whether a path repeats or precedes what its peer has already said; a restart (new boot id) is not a replay."""
-    if path.boot_id == known.newest.boot_id:
-        return path.seq <= known.newest.seq
-    return path.boot_id in known.retired_boots or path.t0_utc_us < known.newest.t0_utc_us
+            return FUTURE
+        return LATE if utc_us - path.t0_utc_us > self._max_age_us else ""
 
 
 class _Message(NamedTuple):
@@ -139,6 +131,9 @@ class LocalHub:
         self._travel_us = max(1, delay_us)
         self._loss_01 = loss_01
         self._attached: dict[str, LocalBus] = {}
+        self._alive: frozenset[str] = frozenset()  # as the router last told
+        self._arrivals: Counter[str] = Counter()
+        self._came: set[str] = set()  # while it was mute
         self._streams: dict[tuple[str, str], np.random.Generator] = {}
         self._mute_since_us: int | None = None
         self._held: list[tuple[str, Topic, bytes]] = []  # reliable messages said while it is mute
@@ -146,10 +141,14 @@ class LocalHub:
     def mute(self) -> None:
         """The bus falls apart: nobody hears anybody. Reliable messages wait, the others are lost."""
         self._mute_since_us = self._now_us()
+        self._came = set()
 
     def unmute(self) -> None:
         """It is whole again; what has waited is under way from now on."""
+        came = set(self._attached) if self._has_lost_tokens() else self._came & self._attached.keys()
         held, self._held, self._mute_since_us = self._held, [], None
+        self._arrivals.update(came)
+        self._alive = frozenset(self._attached)
         for sender, topic, payload in held:
             self.carry(sender, topic, payload)
 
@@ -164,16 +163,31 @@ class LocalHub:
             raise ValueError(f"{name!r} is attached already")
         bus = LocalBus(self, name, listen)
         self._attached[name] = bus
+        self._tell(came=name)
         return bus
 
     def detach(self, name: str) -> None:
         """Leave, or die: nothing more is sent or received; what is under way still arrives."""
         self._attached.pop(name, None)
+        self._tell()
 
     def alive(self) -> frozenset[str]:
-        """Everybody; nobody, not even oneself, after `LEASE_US` of a mute bus."""
-        lost = self._mute_since_us is not None and self._now_us() - self._mute_since_us >= LEASE_US
-        return frozenset() if lost else frozenset(self._attached)
+        """Everybody; as it was when the bus became mute, and nobody, not even oneself, after `LEASE_US` of that."""
+        return frozenset() if self._has_lost_tokens() else self._alive
+
+    def arrivals(self) -> Mapping[str, int]:
+        """How often each has come; once more for everybody after a mute bus had lost them."""
+        return self._arrivals
+
+    def _has_lost_tokens(self) -> bool:
+        return self._mute_since_us is not None and self._now_us() - self._mute_since_us >= LEASE_US
+
+    def _tell(self, came: str = "") -> None:
+        if self._mute_since_us is not None:
+            self._came |= {came} - {""}
+            return
+        self._alive = frozenset(self._attached)
+        self._arrivals.update([came] if came else [])
 
     def now_us(self) -> int:
         return self._now_us()
@@ -225,12 +239,16 @@ class LocalBus:
             _trim(inbox, topic.ring, now_us)
             while inbox and inbox[0].visible_us <= now_us:
                 message = inbox.popleft()
-                arrived.append((message.visible_us, sender, message.payload))
+                payload = message.payload if len(message.payload) <= topic.max_bytes else TOO_LONG
+                arrived.append((message.visible_us, sender, payload))
         arrived.sort(key=lambda item: item[:2])  # stable: a sender's own order stays
         return [(sender, payload) for _, sender, payload in arrived]
 
     def alive(self) -> frozenset[str]:
         return self._hub.alive()
+
+    def arrivals(self) -> Mapping[str, int]:
+        return self._hub.arrivals()
 
     def close(self) -> None:
         if self._hub.is_attached(self):

@@ -115,6 +115,7 @@ def _version(message: Any | None) -> Version | None:
         message.board_version,
         uid,
         True if capabilities & _BYTEWISE else False if capabilities & _C_CAST else None,
+        message.vendor_id,
     )
 
 

@@ -1,7 +1,8 @@
 """What travels over the bus: one table of topics, and the layout of every message.
 
 Paths are a little-endian struct header and float32 points, ticks are `core.records` rows, the rest is msgspec JSON.
-Decoders bound-check and return None for anything that does not fit; they never raise.
+A bus hands out nothing longer than its topic allows. Decoders bound-check and return None for anything that does not
+fit; they never raise.
 """
 
 from __future__ import annotations
@@ -23,17 +24,20 @@ class Topic:
     """One stream of an agent (or of the operator) on the bus."""
 
     name: str
-    ring: int  # newest samples kept per sender
+    ring: int  # newest samples kept per sender; more than one, so that a forged one does not push out the true one
+    max_bytes: int  # longer ones are handed out as `TOO_LONG`
     reliable: bool
 
 
-PATH = Topic("path", ring=1, reliable=False)
-STATUS = Topic("status", ring=1, reliable=False)
-TICK = Topic("tick", ring=256, reliable=False)
-COMMAND = Topic("command", ring=64, reliable=True)
-OBSTACLES = Topic("obstacles", ring=1, reliable=True)
-INTENT = Topic("intent", ring=1, reliable=False)  # the newest says all: a lost one is made good by the next
+PATH = Topic("path", ring=4, max_bytes=4096, reliable=False)
+STATUS = Topic("status", ring=4, max_bytes=16_384, reliable=False)
+TICK = Topic("tick", ring=256, max_bytes=4096, reliable=False)
+COMMAND = Topic("command", ring=64, max_bytes=1024, reliable=True)
+OBSTACLES = Topic("obstacles", ring=4, max_bytes=65_536, reliable=True)
+INTENT = Topic("intent", ring=4, max_bytes=131_072, reliable=False)  # the newest says all, a lost one is made good
 TOPICS = (PATH, STATUS, TICK, COMMAND, OBSTACLES, INTENT)
+
+TOO_LONG = b""  # instead of a message that nobody will look into; no decoder takes it
 
 OPERATOR = "operator"  # the sender name of launch and of the operator verbs
 
@@ -43,7 +47,13 @@ MAX_RADIUS_M = 10.0  # one peer must not ground all others
 _PATH_HEADER = struct.Struct("<2sBBIIIqifBB2x")  # magic ver flags agent boot seq t0 dt radius n hdr_len
 _MAGIC = b"SP"
 _Message = TypeVar("_Message")
-Length = Annotated[float, msgspec.Meta(gt=0.0)]
+
+MAX_OBSTACLES = 64  # measured: 20 us each in every tick that sees it, of 20 ms; 6000 took 130 ms
+MAX_OBSTACLE_M = 10_000.0  # of every length and coordinate
+MAX_VERSION_STEP = 64  # changes of the list that may be missed; a version out of reach would shut out all later ones
+Length = Annotated[float, msgspec.Meta(gt=0.0, le=MAX_OBSTACLE_M)]
+Coordinate = Annotated[float, msgspec.Meta(ge=-MAX_OBSTACLE_M, le=MAX_OBSTACLE_M)]
+Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
 
 
 def encode_path(path: PredictedPath) -> bytes:
@@ -85,25 +95,26 @@ def decode_path(payload: bytes) -> PredictedPath | None:
 class StatusMessage(msgspec.Struct, frozen=True):
     """What an agent says of itself five times a second; peers read `phase` and `ready_utc_us`, people the rest."""
 
-    agent: int
-    boot_id: int
+    agent: Count
+    boot_id: Count
     sysid: int
     phase: Annotated[int, msgspec.Meta(ge=0, le=int(max(Phase)))]
     mode: Annotated[int, msgspec.Meta(ge=0, le=int(max(Mode)))]
     flight_mode: Annotated[int, msgspec.Meta(ge=0, le=int(max(FlightMode)))]
     armed: bool
     landed: int
-    ready_utc_us: int  # when it reached its start position, 0 before
+    ready_utc_us: Count  # when it reached its start position, 0 before
     outcome: str  # "" while flying, "completed", or why the mission failed
     position_error_m: float
     separation_m: float  # to the nearest peer now
     tick_p99_ms: float
-    ticks: int
+    ticks: Count
     late_ticks: int
     path_age_ms: float
     solver_failed: int
     problem: str  # newest thing an operator should know, "" when all is well
     promises: bool = False  # it flies only what it has promised, see `control.commit`
+    utc_us: Count = 0  # when it was said, by the agent's clock
 
 
 class CommandMessage(msgspec.Struct, frozen=True):
@@ -111,17 +122,17 @@ class CommandMessage(msgspec.Struct, frozen=True):
 
     verb: Literal["hold", "resume", "land", "rtl"]
     agent: int
-    utc_us: int
+    utc_us: Count  # when it was asked for, by the clock of those asked
 
 
 class ObstacleMessage(msgspec.Struct, frozen=True):
     """One obstacle, a sphere or a column of any height, shared NED [m]."""
 
-    center_ned_m: tuple[float, float, float]
+    center_ned_m: tuple[Coordinate, Coordinate, Coordinate]
     radius_m: Length
     keep_out_m: Length
     visibility_m: Length
-    vel_ned_m_s: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    vel_ned_m_s: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
     column: bool = False
 
     def obstacle(self) -> Obstacle:
@@ -133,8 +144,12 @@ class ObstacleMessage(msgspec.Struct, frozen=True):
 class ObstaclesMessage(msgspec.Struct, frozen=True):
     """The whole list of obstacles; a higher `version` replaces a lower one."""
 
-    version: int
-    obstacles: tuple[ObstacleMessage, ...]
+    version: Count
+    obstacles: Annotated[tuple[ObstacleMessage, ...], msgspec.Meta(max_length=MAX_OBSTACLES)]
+
+    def replaces(self, version: int | None) -> bool:
+        """Whether it is newer than the known version (None: none is known), and may be the next or one soon after."""
+        return version is None or 0 < self.version - version <= MAX_VERSION_STEP
 
 
 def first_obstacles(items: Iterable[Mapping[str, Any]]) -> ObstaclesMessage:

@@ -18,9 +18,12 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 from swarmctl.errors import StartError
+from swarmctl.links.latch import Address, IsVehicle, Latch, admit_only, anybody
 
 _MAX_DATAGRAM = 2048
 _CHUNK = 65536
+_DATAGRAMS_A_POLL, _BYTES_A_POLL = 600, 131_072  # what one tick can take in; the rest waits for the next
+_BUFFER_BYTES = 1 << 20  # as much as the system allows: what a vehicle says while its agent sleeps is not lost
 _SO_TIMESTAMPNS = 35  # Linux; socket.SO_TIMESTAMPNS is not exported before Python 3.13
 _TIMESPEC = struct.Struct("@qq")
 _URL = re.compile(r"^(?P<scheme>udpin|udpout|tcp|serial)://(?P<where>[^:]+):(?P<number>\d+)$")
@@ -75,13 +78,17 @@ def parse_url(url: str) -> Endpoint:
     return endpoint
 
 
-def open_transport(url: str, inherited_fd: int | None = None) -> Transport:
+def open_transport(
+    url: str, inherited_fd: int | None = None, is_vehicle: IsVehicle = anybody, remote: Address | None = None
+) -> Transport:
     """Open the link a URL names.
 
     Args:
         url: see `parse_url`.
         inherited_fd: an already bound UDP socket from the launcher, which holds the port so that no other launch can
             take it between the check and the flight.
+        is_vehicle: whether a datagram shows that its sender is the vehicle; UDP belongs to the first who sends one.
+        remote: where the other end of an inherited socket is known to be.
 
     Raises:
         StartError: the port is taken, the host has no address, or the device does not exist.
@@ -90,11 +97,11 @@ def open_transport(url: str, inherited_fd: int | None = None) -> Transport:
     if endpoint.scheme == "serial":
         return SerialTransport(endpoint.where, endpoint.number)
     if inherited_fd is not None:
-        return UdpTransport(socket.socket(fileno=inherited_fd))
+        return UdpTransport(socket.socket(fileno=inherited_fd), remote, is_vehicle)
     if endpoint.scheme == "udpin":
-        return UdpTransport(bind_udp(endpoint.where, endpoint.number))
+        return UdpTransport(bind_udp(endpoint.where, endpoint.number), None, is_vehicle)
     there = resolve(endpoint.where), endpoint.number
-    return TcpTransport(there) if endpoint.scheme == "tcp" else UdpTransport(bind_towards(there), remote=there)
+    return TcpTransport(there) if endpoint.scheme == "tcp" else UdpTransport(bind_towards(there), there, is_vehicle)
 
 
 def resolve(host: str) -> str:
@@ -130,25 +137,37 @@ def bind_towards(remote: tuple[str, int]) -> socket.socket:
     Raises:
         StartError: the port and its neighbours are taken.
     """
+    host = _own_address(remote)
     first = _LOCAL_PORTS[0] + zlib.crc32(f"{remote[0]}:{remote[1]}".encode()) % (_LOCAL_PORTS[1] - _LOCAL_PORTS[0])
     for port in range(first, first + _NEIGHBOURS):  # another vehicle's may be the same
         with contextlib.suppress(StartError):
-            return bind_udp("0.0.0.0", port)
+            return bind_udp(host, port)
     raise StartError(f"udp ports {first} to {port} are taken. Stop what talks to {remote[0]}:{remote[1]} already")
 
 
+def _own_address(remote: tuple[str, int]) -> str:
+    """Address of the interface that leads to `remote`; every interface while no way leads there yet."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(remote)  # sends nothing
+        except OSError:
+            return "0.0.0.0"
+        return str(probe.getsockname()[0])
+
+
 class UdpTransport:
-    """A UDP socket that answers the first sender it hears (PX4 latches its peer the same way).
+    """A UDP socket that hears and answers one sender: the vehicle, see `Latch`.
 
     With `remote` set it talks first. Arrival is stamped by the kernel, so a tick that drains the socket every 20 ms
-    still knows when each sample came.
+    still knows when each sample came. One call takes in so much and no more, whoever floods the port.
     """
 
-    def __init__(self, sock: socket.socket, remote: tuple[str, int] | None = None, latch: bool = True) -> None:
+    def __init__(self, sock: socket.socket, remote: Address | None = None, is_vehicle: IsVehicle = anybody) -> None:
         self._sock = sock
         self._sock.setblocking(False)
-        self._remote = remote
-        self._latched = not latch
+        self._sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+        self.latch = Latch(is_vehicle, remote)
+        self._admitted: Address | None = None  # by the kernel; None: everybody
         self._stamped = sys.platform == "linux"
         if self._stamped:
             self._sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
@@ -159,28 +178,38 @@ class UdpTransport:
         return self._sock.fileno()
 
     def send(self, data: bytes) -> None:
-        if self._remote is None:
+        if self.latch.remote is None:
             return
         try:
-            self._sock.sendto(data, self._remote)
+            self._sock.sendto(data, self.latch.remote)
         except OSError:
             return  # full buffer, or nobody listens: the autopilot's own failsafe judges silence
 
     def receive(self, now_us: int) -> list[Datagram]:
+        latch = self.latch
+        latch.poll(now_us)
+        self._admit(latch.only)
         arrived: list[Datagram] = []
-        while True:
+        left = _BYTES_A_POLL
+        for _ in range(_DATAGRAMS_A_POLL):
             try:
                 data, ancillary, _, sender = self._sock.recvmsg(_MAX_DATAGRAM, 64)
-            except BlockingIOError:
-                return arrived
             except ConnectionRefusedError:
                 continue  # ICMP port unreachable surfaces here once
             except OSError:
-                return arrived
-            if not self._latched:
-                self._remote, self._latched = sender, True
-            if sender == self._remote:
+                break  # all of it
+            if latch.admits(sender, data):
                 arrived.append(Datagram(self._arrival_us(ancillary, now_us), data))
+                left -= len(data)
+            if left < 0:
+                break
+        self._admit(latch.only)
+        return arrived
+
+    def _admit(self, sender: Address | None) -> None:
+        if sender != self._admitted:
+            self._admitted = sender
+            admit_only(self._sock, sender)
 
     def _arrival_us(self, ancillary: list[tuple[int, int, bytes]], now_us: int) -> int:
         for level, kind, value in ancillary:

@@ -1,11 +1,13 @@
 """What a link needs before flight and keeps needing: messages at their rates, the origin, parameters set and read back.
 
 All of it is asked again when the autopilot has rebooted, rates also when they have been lost. One command at a time,
-and only when nobody else is asking: a request to land never waits for more than one answer.
+and only when nobody else is asking: a request to land never waits for more than one answer. Parameters are set for the
+flight alone: afterwards they are what they were before, because with them a vehicle counts on an agent beside it.
 """
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Mapping
 
@@ -34,6 +36,7 @@ class Upkeep:
 
     Attributes:
         ready: everything has been asked and answered, since the last reboot.
+        restored: every parameter that was changed has been set back, or could not be.
     """
 
     def __init__(
@@ -50,13 +53,16 @@ class Upkeep:
         self._boots = -1
         self._dialect: Dialect | None = None
         self._todo: deque[Command] = deque()
+        self._compared = False  # what was read with what is wanted
+        self._before: dict[str, float] = {}  # parameter -> value that the vehicle came with
+        self._restoring = False
         self._open: Command | None = None
         self._failed: dict[str, str] = {}  # parameter -> what the autopilot said
         self._origin_us = 0
         self._watched_us = 0
         self._watch_us = _WATCH_US
         self._samples = 0
-        self.ready = False
+        self.ready = self.restored = False
 
     @property
     def refusal(self) -> str:
@@ -65,21 +71,34 @@ class Upkeep:
             return ""
         heeds = self._dialect.heeds_parameter
         found = [f"{heeds} could not be set to {self._sysid}: {self._failed[heeds]}"] if heeds in self._failed else []
-        for rule in self._dialect.rules:
-            if rule.name in self._failed and rule.name in self._setup:
-                found.append(f"{rule.name} could not be set to {self._setup[rule.name]}: {self._failed[rule.name]}")
-            else:
-                found.append(rule.problem(self._autopilot.params.get(rule.name)))
-        return "; ".join(problem for problem in found if problem)
+        told, known = self._autopilot.params, self._autopilot.params.keys()
+        failed = self._setup.keys() & self._failed.keys() & known - {heeds}
+        found += [f"{name} could not be set to {self._setup[name]}: {self._failed[name]}" for name in failed]
+        found += [rule.problem(told.get(rule.name)) for rule in self._dialect.rules if rule.name not in self._failed]
+        found += [rule.problem(None) for rule in self._dialect.rules if rule.name in self._failed.keys() - known]
+        return "; ".join(sorted(problem for problem in found if problem))
+
+    @property
+    def left_changed(self) -> dict[str, float]:
+        """Parameters that could not be set back, with the values that the vehicle came with."""
+        return dict(self._before)
+
+    def restore(self) -> None:
+        """Begin to set every changed parameter back; the vehicle is disarmed or has been handed back."""
+        names = [name for name in reversed(self._before) if name in self._autopilot.params]
+        self._todo = deque(self._setting(name, self._before[name]) for name in names)
+        self._restoring = True
 
     def took(self, result: CommandResult) -> None:
         """An answer of the command port, whoever asked."""
         if result.command != self._open:
             return
         self._open = None
-        if not result.ok and result.command.name:
-            self._failed[result.command.name] = result.text
-        self.ready = self.ready or not self._todo
+        name = result.command.name
+        if name and self._restoring:
+            self._before.pop(name if result.ok else "", None)
+        elif name and not result.ok:
+            self._failed[name] = result.text
 
     def step(self, now_us: int) -> None:
         """Ask for what is missing. Called last in a tick, so that everybody else asks first."""
@@ -87,8 +106,12 @@ class Upkeep:
         if self._dialect is None or self._commands.busy:
             return
         self._open = None
-        if self.ready:
+        if self._restoring:
+            self.restored = not self._todo
+        elif self.ready:
             self._watch(now_us)
+        elif not self._todo:
+            self._compare()
         command = self._todo.popleft() if self._todo else self._origin(now_us)
         if command is not None:
             self._open = command
@@ -99,24 +122,36 @@ class Upkeep:
         if autopilot.dialect is None or (autopilot.clock.boots == self._boots and autopilot.dialect is self._dialect):
             return
         self._boots, self._dialect, self.ready = autopilot.clock.boots, autopilot.dialect, False
+        self._compared = False
         self._failed.clear()
         self._setup = dict(self._given)
         if self._dialect.heeds_parameter:
             self._setup[self._dialect.heeds_parameter] = self._sysid
         self._watched_us, self._samples = now_us, autopilot.samples
         origin = [Command(Verb.MESSAGE, number=GPS_GLOBAL_ORIGIN)]
-        reads = [Command(Verb.PARAM_GET, name=n) for n in self._dialect.to_read() if n not in self._setup]
-        self._todo = deque(self._rates(self._dialect) + origin + [self._setting(n) for n in self._setup] + reads)
+        reads = [Command(Verb.PARAM_GET, name=n) for n in dict.fromkeys((*self._setup, *self._dialect.to_read()))]
+        self._todo = deque(self._rates(self._dialect) + origin + reads)
+
+    def _compare(self) -> None:
+        """Ask for what was read to be what is wanted; nothing left to ask for: the link is set up."""
+        if self._compared:
+            self.ready = True
+            return
+        self._compared, told = True, self._autopilot.params
+        for name, value in self._setup.items():
+            if name in told and not math.isclose(told[name], value, rel_tol=1e-6, abs_tol=1e-9):
+                self._before.setdefault(name, told[name])
+                self._todo.append(self._setting(name, value))
 
     def _rates(self, dialect: Dialect) -> list[Command]:
         state = [Command(Verb.RATE, self._rate_hz, number) for number in dialect.state]
         return state + [Command(Verb.RATE, rate_hz, number) for number, rate_hz in dialect.rates_hz.items()]
 
-    def _setting(self, name: str) -> Command:
-        value = self._setup[name]
-        if isinstance(value, int):
-            return Command(Verb.PARAM_INT, number=value, name=name)
-        return Command(Verb.PARAM_FLOAT, value=value, name=name)
+    def _setting(self, name: str, value: float) -> Command:
+        """Request for a value in the type that the vehicle keeps it in, whatever the configuration wrote."""
+        if name in self._autopilot.whole_params and float(value).is_integer():
+            return Command(Verb.PARAM_INT, number=int(value), name=name)
+        return Command(Verb.PARAM_FLOAT, value=float(value), name=name)
 
     def _origin(self, now_us: int) -> Command | None:
         frame = self._autopilot.frame

@@ -20,12 +20,19 @@ from swarmctl.telemetry.palette import LIMIT_RGB, css
 
 WIDTH = 640
 _LEFT, _RIGHT, _TOP, _BOTTOM = 52, 12, 8, 24
+_FAR = 1e9  # no unit of ours gets there; a damaged recording does, and would press all else flat
 _LOOK_RAD, _DOWN_RAD = math.radians(35), math.radians(24)  # the oblique view looks this far east of north, and down
+
+
+def _near(values: Array) -> Array:
+    """What can be drawn; NaN for the rest."""
+    values = np.asarray(values, np.float64)
+    return np.where(np.abs(values) < _FAR, values, np.nan)
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One curve; NaN breaks it."""
+    """One curve; NaN, and what is too far off to draw, breaks it."""
 
     x: Array  # (T,)
     y: Array  # (T,)
@@ -35,6 +42,10 @@ class Line:
     width: float = 1.4
     opacity: float = 1.0
     marks: bool = False  # a dot on every point
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "x", _near(self.x))
+        object.__setattr__(self, "y", _near(self.y))
 
 
 @dataclass(frozen=True, slots=True)

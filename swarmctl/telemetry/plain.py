@@ -28,6 +28,17 @@ def plain(value: Any) -> Any:
     return str(value)
 
 
+def finite(value: Any) -> float | None:
+    """A number as float; None for what is not one, not finite, or too large."""
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        return None
+    try:
+        number = float(value)
+    except OverflowError:
+        return None
+    return number if math.isfinite(number) else None
+
+
 def to_json(value: Any, indent: int | None = None) -> str:
     """JSON text of any value; never fails, never writes NaN."""
     return json.dumps(plain(value), indent=indent, allow_nan=False, ensure_ascii=False)

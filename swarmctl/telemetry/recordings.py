@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl.errors import StartError
+from swarmctl.files import replaced_by_program
 from swarmctl.telemetry.referee import RunData
 
 if TYPE_CHECKING:
@@ -53,7 +54,7 @@ def open_viewer(target: str, log: Path | None = None) -> subprocess.Popen[bytes]
         raise StartError(
             f"no display: neither DISPLAY nor WAYLAND_DISPLAY is set. On a machine with one: rerun --port auto {target}"
         )
-    if "://" not in target and not Path(target).exists():
+    if "://" not in target and not Path(target).is_file():
         raise StartError(f"{target}: no such recording")
     command = [str(viewer_binary()), target, "--memory-limit", _WINDOW_MEMORY, *_OWN_PORT]
     try:
@@ -70,25 +71,29 @@ def optimize_recording(directory: Path, timeout_s: float = 60.0) -> bool:
 
     Returns: whether the file was replaced; on failure, or after `timeout_s`, the original stays.
     """
-    source, packed = directory / RECORDING, directory / f"{RECORDING}.part"
-    if not source.exists():
+    source = directory / RECORDING
+    if source.is_symlink() or not source.is_file():
         return False
-    command = [str(viewer_binary()), "rrd", "optimize", str(source), "-o", str(packed)]
-    until_s = time.monotonic() + timeout_s
     try:
-        for more in ((), ("--continue-on-error",)):  # the second for a file whose writer was killed
-            left_s = max(0.1, until_s - time.monotonic())
-            done = subprocess.run(
-                [*command, *more], stdin=subprocess.DEVNULL, capture_output=True, timeout=left_s, check=False
-            )
-            if done.returncode == 0 and packed.stat().st_size >= _LEAST_BYTES:
-                packed.replace(source)
-                return True
-        return False
+        with replaced_by_program(source) as packed:
+            return _packed(source, packed, timeout_s)
     except (OSError, subprocess.TimeoutExpired):
         return False
-    finally:
+
+
+def _packed(source: Path, packed: Path, timeout_s: float) -> bool:
+    """Have `packed` written from `source`; it is there afterwards only if it is good."""
+    command = [str(viewer_binary()), "rrd", "optimize", str(source), "-o", str(packed)]
+    until_s = time.monotonic() + timeout_s
+    for more in ((), ("--continue-on-error",)):  # the second for a file whose writer was killed
+        left_s = max(0.1, until_s - time.monotonic())
+        done = subprocess.run(
+            [*command, *more], stdin=subprocess.DEVNULL, capture_output=True, timeout=left_s, check=False
+        )
+        if done.returncode == 0 and packed.stat().st_size >= _LEAST_BYTES:
+            return True
         packed.unlink(missing_ok=True)
+    return False
 
 
 def simulated_recording(

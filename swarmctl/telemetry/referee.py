@@ -16,8 +16,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl.core.types import Array, Mode, PlanStatus
-from swarmctl.telemetry.plain import plain
-from swarmctl.telemetry.tracks import Tracks, flight_rows, merge_tracks, mission_start_us, track_error, utc_offset_us
+from swarmctl.telemetry.hearing import refused_peers, unheard
+from swarmctl.telemetry.plain import finite, plain
+from swarmctl.telemetry.tracks import (
+    Tracks,
+    flight_rows,
+    merge_tracks,
+    mission_start_us,
+    track_error,
+    unseen_spans,
+    utc_offset_us,
+)
 
 _CONTROLLED = (Mode.FOLLOW, Mode.REPLAY, Mode.BRAKE)
 _SOLVER_FAILED = (PlanStatus.SOLVER_FAILED, PlanStatus.RESIDUAL)
@@ -43,7 +52,7 @@ class Rules:
     required_separation_m: float
     obstacles: tuple[ObstacleRule, ...] = ()
     obstacle_margin_m: float = 0.05  # allowed intrusion into keep_out_m
-    late_ticks_01: float = 0.2  # share of ticks that may be late
+    late_ticks_01: float = 0.2  # share of the ticks that were due, flown or skipped, that may be late
     solver_name: str = "osqp"
     mode: Literal["realtime", "lockstep"] = "realtime"
     duration_s: float | None = None  # of mission time a completed run must have tracked
@@ -83,7 +92,9 @@ def judge(
     obstacles, clear = _judge_obstacles(tracks, rules, clock)
     timing, punctual = _judge_timing(run.ticks, rules, speed_factor)
     tracking, tracked_s = _judge_tracking(run, rules.agents, steady_after_s)
-    violations = [*problems, *apart, *clear, *punctual, *_not_a_number(run.truth)]
+    unseen = [] if len(run.truth) else list(_unseen(run.ticks, rules.agents, clock))
+    refused = _shorten(list(refused_peers(run.events)))
+    violations = [*problems, *apart, *clear, *unseen, *punctual, *refused, *_not_a_number(run.truth)]
     if outcome == "completed":
         violations += _cut_short(tracked_s, rules)
     summary = {
@@ -149,6 +160,18 @@ def _judge_separation(tracks: Tracks, rules: Rules, clock: _MissionClock) -> tup
     return found, _shorten(violations)
 
 
+def _unseen(ticks: Mapping[int, NDArray[np.void]], agents: int, clock: _MissionClock) -> Iterator[str]:
+    """Flight of which nothing is known: without true positions nobody can say how close it came."""
+    for agent, rows in ticks.items():
+        spans = unseen_spans(flight_rows(rows), "utc_us") if agent < agents else []
+        if spans:
+            seconds, begins_s = sum(end - begin for begin, end in spans) / 1e6, clock.at_s(spans[0][0])
+            yield (
+                f"agent {agent} did not know where its armed vehicle was for {seconds:.1f} s, "
+                f"from {begins_s:.1f} s on: its separation can't be judged"
+            )
+
+
 def _judge_obstacles(tracks: Tracks, rules: Rules, clock: _MissionClock) -> tuple[dict[str, float | None], list[str]]:
     """Distance to the centre (of a column, the axis) of the obstacle respected least, and what it had to be."""
     worst: tuple[float, float] | None = None  # (distance, required) with the least room
@@ -184,16 +207,20 @@ def _judge_timing(
     """Tick and solve times between arming and the end of landing."""
     flights = [flight_rows(rows) for rows in ticks.values()]
     total = sum(len(rows) for rows in flights)
-    late = sum(int(np.maximum(np.diff(rows["late_ticks"].astype(np.int64)), 0).sum()) for rows in flights)
+    steps = [np.maximum(np.diff(rows["late_ticks"].astype(np.int64)), 0) for rows in flights]
+    late = sum(int(step.sum()) for step in steps)
+    # of what is late between two ticks, one at most was flown; the others were skipped, and were due all the same
+    due = total + sum(int(np.maximum(step - 1, 0).sum()) for step in steps)
     timing = {
         "ticks": total,
+        "due_ticks": due,
         "late_ticks": late,
         "tick_ms": _spread([rows["tick_ms"] for rows in flights]),
         "solve_ms": _spread([rows["solve_ms"][rows["iterations"] > 0] for rows in flights]),
         "speed_factor": speed_factor,
     }
-    if total and late > rules.late_ticks_01 * total:
-        return timing, [f"late ticks {late / total:.1%} above {rules.late_ticks_01:.1%} ({late} of {total})"]
+    if due and late > rules.late_ticks_01 * due:
+        return timing, [f"late ticks {late / due:.1%} above {rules.late_ticks_01:.1%} ({late} of {due} due)"]
     return timing, []
 
 
@@ -254,21 +281,25 @@ def _solver(ticks: Mapping[int, NDArray[np.void]], name: str) -> dict[str, Any]:
 
 
 def _comms(run: RunData) -> dict[str, Any]:
-    """Age of the oldest path in use, and what the agents' buses refused (their last `bus_summary` event)."""
+    """Age of the oldest path in use, what the agents' buses refused (their last `bus_summary`), who went unheard."""
     ages = _spread([flight_rows(rows)["path_age_ms"] for rows in run.ticks.values()])
     last = {event.get("source"): event for event in run.events if event.get("event") == "bus_summary"}
     rejected: Counter[str] = Counter()
     for event in last.values():
         reasons = event.get("rejected")
         if isinstance(reasons, dict):
-            rejected.update({str(reason): int(n) for reason, n in reasons.items() if isinstance(n, (int, float))})
-    return {"path_age_ms": {"p50": ages["p50"], "p99": ages["p99"]}, "rejected": dict(sorted(rejected.items()))}
+            rejected.update({str(reason): int(n) for reason, n in reasons.items() if finite(n) is not None})
+    return {
+        "path_age_ms": {"p50": ages["p50"], "p99": ages["p99"]},
+        "rejected": dict(sorted(rejected.items())),
+        "unheard": unheard(run.events),
+    }
 
 
 def _deadlocks(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """How often agents noticed that they got nowhere, and for how long at most."""
     noticed = [event for event in events if event.get("event") == "deadlock"]
-    lasted_s = [float(event["lasted_s"]) for event in noticed if isinstance(event.get("lasted_s"), (int, float))]
+    lasted_s = [seconds for event in noticed if (seconds := finite(event.get("lasted_s"))) is not None]
     begun = sum(event.get("begins") is True for event in noticed)
     return {"count": begun, "longest_s": max(lasted_s, default=None), "unresolved": begun - len(lasted_s)}
 
@@ -279,9 +310,9 @@ def _promises(events: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     if not last:
         return None
     names = ("proposed", "committed", "withdrawn", "expired", "unplanned", "evaded")
-    worst_m = max(float(event["worst_tracking_m"]) for event in last.values())
+    worst_m = max(finite(event.get("worst_tracking_m")) or 0.0 for event in last.values())
     off = sum(event.get("event") == "off_promise" and event.get("begins") is True for event in events)
-    return {name: sum(int(event[name]) for event in last.values()) for name in names} | {
+    return {name: sum(int(finite(event.get(name)) or 0) for event in last.values()) for name in names} | {
         "worst_tracking_m": worst_m,
         "off_promise": off,
     }

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl.core.types import Array, Mode, Phase
-from swarmctl.telemetry.atomic import write_text
+from swarmctl.files import replace_text
 from swarmctl.telemetry.attitude import roll_pitch_rad
 from swarmctl.telemetry.charts import Circle, Limit, Line, Span, state_bars, time_chart, top_view
 from swarmctl.telemetry.palette import MODE_RGB, PHASE_RGB, REFERENCE_RGB, SUM_RGB, agent_rgb, css
@@ -75,7 +75,7 @@ def write_report(
     head = f'<meta charset="utf-8"><meta name="viewport" content="width=device-width"><title>{title}</title>'
     path = directory / REPORT
     page_html = f"<head>{head}<style>{STYLE}</style></head><body><main>{body}</main></body>"
-    write_text(path, f"<!doctype html><html lang=en>{page_html}</html>\n")
+    replace_text(path, f"<!doctype html><html lang=en>{page_html}</html>\n")
     return path
 
 
@@ -96,7 +96,7 @@ class _Page:
         self._range = (min(e[0] for e in ends), max(e[1] for e in ends)) if ends else (0.0, 1.0)
         missions = [self._seconds(rows[[0, -1]]) for rows in map(tracking_rows, run.ticks.values()) if len(rows)]
         self._band = (min(m[0] for m in missions), max(m[1] for m in missions)) if missions else None
-        self._agents = sorted(run.ticks)
+        self._agents = sorted(agent for agent in run.ticks if agent < agents)
         lines = 11 * len(self._agents) + 6 * min(_DETAILED_AGENTS, len(self._agents)) + 8
         self._points = int(np.clip(_ALL_POINTS // lines, 40, 600))
 
@@ -271,10 +271,11 @@ def _summary_rows(summary: Mapping[str, Any], rules: Rules | None) -> Iterator[s
     yield _least("smallest separation", separation["min_m"], separation["required_m"])
     if obstacles["min_clearance_m"] is not None:
         yield _least("nearest to an obstacle's centre", obstacles["min_clearance_m"], obstacles["required_m"])
-    share = timing["late_ticks"] / timing["ticks"] if timing["ticks"] else None
+    due = timing.get("due_ticks") or timing["ticks"]
+    share = timing["late_ticks"] / due if due else None
     most = rules.late_ticks_01 if rules else None
     good = None if share is None or most is None else share <= most
-    late = f"{timing['late_ticks']} of {timing['ticks']}"
+    late = f"{timing['late_ticks']} of {due}"
     yield _row("late ticks", late, "" if most is None else f"{most:.0%}", good)
     yield _row("tracking index, sum of mean distances", _figure(summary["tracking"]["index_m"], "m", 3))
     yield _row("the same after 10 s", _figure(summary["tracking"]["index_after_10s_m"], "m", 3))
@@ -292,6 +293,9 @@ def _summary_rows(summary: Mapping[str, Any], rules: Rules | None) -> Iterator[s
     yield _row("age of peers' paths, median / p99", f"{ages} ms")
     refused = ", ".join(f"{reason} {count}" for reason, count in comms["rejected"].items()) or "none"
     yield _row("bus messages refused", refused)
+    if (unheard := comms.get("unheard") or {}).get("count"):
+        lasted = _figure(unheard["longest_s"], "s", 1)
+        yield _row("peers there but unheard, the longest", f"{unheard['count']}, agent-{unheard['agent']} {lasted}")
     if timing["speed_factor"] is not None:
         yield _row("speed", f"{timing['speed_factor']:.1f} x real time")
 

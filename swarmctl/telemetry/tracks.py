@@ -15,6 +15,8 @@ from swarmctl.core.types import Array, Phase
 
 _GRID_US = 20_000
 _GAP_US = 500_000  # reported positions further apart than this are not joined by a line
+_STALE_MS = _GAP_US / 1e3  # an agent that hears nothing goes on recording where it saw its vehicle last
+LONGEST_US = 48 * 3_600_000_000  # of a run; clocks further apart have no instants in common
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +45,7 @@ def flight_rows(rows: NDArray[np.void]) -> NDArray[np.void]:
 
 def tracking_rows(rows: NDArray[np.void]) -> NDArray[np.void]:
     """The ticks of the mission itself."""
-    during: NDArray[np.void] = rows[(rows["phase"] == Phase.TRACK) & np.isfinite(rows["mission_t_s"])]
+    during: NDArray[np.void] = rows[(rows["phase"] == Phase.TRACK) & (np.abs(rows["mission_t_s"]) < LONGEST_US / 1e6)]
     return during
 
 
@@ -65,7 +67,11 @@ def utc_offset_us(ticks: Mapping[int, NDArray[np.void]]) -> float:
 
 
 def merge_tracks(ticks: Mapping[int, NDArray[np.void]], truth: NDArray[np.void], agents: int) -> Tracks:
-    """Positions at common instants: every instant of the simulator, else reports interpolated to 50 Hz."""
+    """Positions at common instants: every instant of the simulator, else reports interpolated to 50 Hz.
+
+    A report counts at the instant its state is of, not at the tick that repeats it: a vehicle that is no longer heard
+    has no position, however often its last one was recorded.
+    """
     return _true_tracks(truth, agents) if len(truth) else _reported_tracks(ticks, agents)
 
 
@@ -82,18 +88,41 @@ def _true_tracks(truth: NDArray[np.void], agents: int) -> Tracks:
 
 
 def _reported_tracks(ticks: Mapping[int, NDArray[np.void]], agents: int) -> Tracks:
-    known = {agent: rows[np.isfinite(rows["pos_ned_m"]).all(axis=1)] for agent, rows in ticks.items() if agent < agents}
-    known = {agent: rows[np.argsort(rows["utc_us"], kind="stable")] for agent, rows in known.items() if len(rows)}
-    armed = [rows["utc_us"][rows["armed"] != 0] for rows in known.values()]
-    armed = [times for times in armed if len(times)]
-    if not armed:
-        return Tracks(np.zeros(0), np.zeros((0, agents, 3)), "utc_us")
-    last_us = max(int(rows["utc_us"][-1]) for rows in known.values())
-    t_us = np.arange(min(int(times[0]) for times in armed), last_us + 1, _GRID_US)
+    known = {agent: rows[_located(rows)] for agent, rows in ticks.items() if agent < agents}
+    armed_us = [int(rows["utc_us"][rows["armed"] != 0].min()) for rows in known.values() if rows["armed"].any()]
+    nothing = Tracks(np.zeros(0), np.zeros((0, agents, 3)), "utc_us")
+    if not armed_us:
+        return nothing
+    first_us, last_us = min(armed_us), max(int(rows["utc_us"].max()) for rows in known.values() if len(rows))
+    if last_us - first_us > LONGEST_US:
+        return nothing
+    t_us = np.arange(first_us, last_us + 1, _GRID_US)
     pos_ned_m = np.full((len(t_us), agents, 3), np.nan)
     for agent, rows in known.items():
-        pos_ned_m[:, agent] = interpolate(t_us, rows["utc_us"], rows["pos_ned_m"], _GAP_US)
+        of_us, newest = np.unique(_state_utc_us(rows), return_index=True)
+        pos_ned_m[:, agent] = interpolate(t_us, of_us, rows["pos_ned_m"][newest], _GAP_US)
     return Tracks(t_us.astype(np.float64), pos_ned_m, "utc_us")
+
+
+def _located(rows: NDArray[np.void]) -> NDArray[np.bool_]:
+    """Ticks that knew where their vehicle was, at some time."""
+    located: NDArray[np.bool_] = np.isfinite(rows["pos_ned_m"]).all(axis=1) & np.isfinite(rows["state_age_ms"])
+    return located
+
+
+def _state_utc_us(rows: NDArray[np.void]) -> NDArray[np.int64]:
+    """When the recorded states were true (T,), of ticks with a state."""
+    age_us = np.clip(rows["state_age_ms"].astype(np.float64) * 1e3, 0.0, LONGEST_US)
+    when_us: NDArray[np.int64] = rows["utc_us"] - np.round(age_us).astype(np.int64)
+    return when_us
+
+
+def unseen_spans(rows: NDArray[np.void], time_field: str) -> list[tuple[float, float]]:
+    """Beginning and end of every time in which an armed vehicle was not heard for too long to know where it was."""
+    unseen = (rows["armed"] != 0) & ~(_located(rows) & (rows["state_age_ms"] <= _STALE_MS))
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], unseen, [False]])))
+    t_us = rows[time_field].astype(np.float64)
+    return [(float(t_us[first]), float(t_us[end - 1])) for first, end in edges.reshape(-1, 2)]
 
 
 def interpolate(at_us: NDArray[np.int64], t_us: NDArray[np.int64], values: Array, gap_us: int) -> Array:
@@ -111,9 +140,10 @@ def interpolate(at_us: NDArray[np.int64], t_us: NDArray[np.int64], values: Array
 
 
 def true_positions(rows: NDArray[np.void], truth: NDArray[np.void], agent: int) -> Array:
-    """Where the vehicle of `agent` was at each tick (T, 3): interpolated truth, or its report without a simulator."""
+    """Where the vehicle of `agent` was at each tick (T, 3), NaN where unknown: interpolated truth, else its report."""
     if not len(truth):
-        return np.array(rows["pos_ned_m"])
+        heard = _located(rows) & (rows["state_age_ms"] <= _STALE_MS)
+        return np.where(heard[:, None], rows["pos_ned_m"], np.nan)
     own = truth[truth["vehicle"] == agent]
     return interpolate(rows["t_us"], own["t_us"], own["pos_ned_m"], _GAP_US)
 

@@ -2,7 +2,7 @@
 
 `python -m swarmctl.telemetry.viewer --run R --bus ENDPOINT --agents N --run-dir DIR`. It serves and never connects, so
 nothing it does can hold up an agent; frozen or killed, it costs pictures only. The launcher decides when it ends
-(SIGTERM); Ctrl-C is not its business.
+(SIGTERM, or SIGHUP where somebody started it by hand); Ctrl-C is not its business.
 """
 
 from __future__ import annotations
@@ -22,6 +22,7 @@ from typing import Any
 import psutil
 
 from swarmctl.errors import EXIT_OK, EXIT_USAGE, StartError, SwarmError
+from swarmctl.files import replace_text
 from swarmctl.lifeline import StopRequest, die_with_parent
 from swarmctl.telemetry.obstacles import MovingObstacle, read_obstacles
 from swarmctl.telemetry.recordings import APPLICATION, RECORDING, has_display, open_viewer
@@ -40,7 +41,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run until SIGTERM; returns the exit code."""
     options = _parser().parse_args(arguments)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    stop = StopRequest(signal.SIGTERM)
+    stop = StopRequest(signal.SIGTERM, signal.SIGHUP)
     if options.die_with_parent:
         die_with_parent(signal.SIGTERM)
     obstacles = read_obstacles(_listed(options.obstacles_json))
@@ -216,7 +217,7 @@ def _is_ours(port: int, timeout_s: float = 2.0) -> bool:
 
 def _announce(options: argparse.Namespace, url: str) -> None:
     try:
-        (options.run_dir / URL_FILE).write_text(url + "\n", encoding="utf-8")
+        replace_text(options.run_dir / URL_FILE, url + "\n")
         if options.view and has_display():
             open_viewer(url, options.run_dir / "rerun.log")
     except (OSError, SwarmError) as error:

@@ -15,7 +15,7 @@ import pytest
 
 from swarmctl.errors import StartError
 from swarmctl.links.bus import SCHEME, ZenohBus
-from swarmctl.links.topics import COMMAND, OPERATOR, PATH, STATUS, TICK
+from swarmctl.links.topics import COMMAND, OPERATOR, PATH, STATUS, TICK, TOO_LONG
 
 pytestmark = pytest.mark.process
 
@@ -89,7 +89,7 @@ def test_newest_path_only_but_every_command_in_order(join: Callable[..., ZenohBu
     assert until(all_commands)
     assert commands == [(OPERATOR, str(i).encode()) for i in range(20)]
     time.sleep(0.3)
-    assert agent.receive(PATH) == [("agent-1", b"399")]
+    assert agent.receive(PATH) == [("agent-1", str(i).encode()) for i in range(400 - PATH.ring, 400)]
     assert agent.receive(PATH) == []
     ticks = agent.receive(TICK)
     assert len(ticks) <= TICK.ring
@@ -171,6 +171,67 @@ def test_router_lost_and_back() -> None:
         b.close()
         end(router)
     assert time.monotonic() - started_s < 10.0
+
+
+def test_a_flood_holds_up_no_tick(endpoint: str, join: Callable[..., ZenohBus]) -> None:
+    """What comes while a ring is drained waits for the next tick."""
+    script = (
+        "from swarmctl.links.bus import ZenohBus\nfrom swarmctl.links.topics import PATH\n"
+        f"bus = ZenohBus({endpoint!r}, 'run', 'agent-1', {{}})\nwhile True: bus.publish(PATH, b'x' * 100)"
+    )
+    agent = join("agent-0", {PATH: ["agent-1"]})
+    flooding = subprocess.Popen([sys.executable, "-c", script])
+    try:
+        assert until(lambda: bool(agent.receive(PATH)))
+        drained: list[int] = []
+        deadline_s = time.monotonic() + 3.0
+        while time.monotonic() < deadline_s:
+            drained += [len(agent.receive(PATH)) for _ in range(10_000)]
+    finally:
+        flooding.kill()
+        flooding.wait(WAIT_S)
+    assert sum(drained) > 100
+    assert max(drained) <= PATH.ring
+
+
+def test_nothing_longer_than_its_topic_allows_is_handed_out(join: Callable[..., ZenohBus]) -> None:
+    agent, peer = join("agent-0", {PATH: ["agent-1"]}), join("agent-1")
+    assert until(lambda: len(agent.alive()) == 2)
+    heard: list[tuple[str, bytes]] = []
+    for size in (PATH.max_bytes, PATH.max_bytes + 1, 900_000, 2_000_000, 7):  # the bus itself drops the fourth
+        peer.publish(PATH, bytes(size))
+
+    def all_heard() -> bool:
+        heard.extend(agent.receive(PATH))
+        return len(heard) >= 4
+
+    assert until(all_heard)
+    assert [payload for _, payload in heard] == [bytes(PATH.max_bytes), TOO_LONG, TOO_LONG, bytes(7)]
+
+
+def test_a_token_has_come_once_however_many_processes_hold_it(join: Callable[..., ZenohBus]) -> None:
+    watcher, first = join("agent-0"), join("agent-1")
+    assert until(lambda: dict(watcher.arrivals()) == {"agent-0": 1, "agent-1": 1})
+    second = join("agent-1")
+    time.sleep(0.3)
+    first.close()
+    time.sleep(0.3)
+    assert "agent-1" in watcher.alive()
+    assert dict(watcher.arrivals()) == {"agent-0": 1, "agent-1": 1}
+    second.close()
+    assert until(lambda: "agent-1" not in watcher.alive())
+    join("agent-1")
+    assert until(lambda: dict(watcher.arrivals()) == {"agent-0": 1, "agent-1": 2})
+
+
+def test_one_that_left_and_came_back_between_two_looks_has_come_twice(join: Callable[..., ZenohBus]) -> None:
+    watcher, first = join("agent-0"), join("agent-1")
+    assert until(lambda: "agent-1" in watcher.alive())
+    first.close()
+    join("agent-1")
+    time.sleep(0.5)
+    assert "agent-1" in watcher.alive()
+    assert watcher.arrivals()["agent-1"] == 2
 
 
 def test_a_closed_bus_is_silent_and_never_raises(join: Callable[..., ZenohBus]) -> None:

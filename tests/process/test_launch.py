@@ -43,7 +43,7 @@ class Launched:
     def __init__(self, run_dir: Path, temp: Path, *arguments: str) -> None:
         self.run_dir = run_dir
         self.temp = temp
-        self.env = {**os.environ, "TMPDIR": str(temp)}
+        self.env = {**os.environ, "TMPDIR": str(temp), "XDG_RUNTIME_DIR": ""}
         self.env.pop("DISPLAY", None)
         self.out = run_dir.with_suffix(".out")
         command = [*self.prefix, sys.executable, "-m", "swarmctl", "launch", *arguments, "--run-dir", str(run_dir)]
@@ -195,6 +195,24 @@ def test_a_second_ctrl_c_ends_everything_at_once(start: Callable[..., Launched])
     launched.process.send_signal(signal.SIGINT)
     assert launched.end(30.0) == 130, launched.text()
     assert launched.summary()["outcome"] == "interrupted"
+
+
+def test_a_closed_terminal_lands_and_keeps_the_verdict(start: Callable[..., Launched]) -> None:
+    """The kernel and the shell both send SIGHUP: that is one request, and after the flight none at all."""
+    launched = start(*TWO, *NEAR, "--duration", "60")
+    launched.until_phase("TRACK", 2)
+    for _ in range(3):
+        launched.process.send_signal(signal.SIGHUP)
+        time.sleep(0.1)
+    deadline_s = time.monotonic() + END_S
+    while launched.process.poll() is None and time.monotonic() < deadline_s:
+        if launched.events("stopped"):  # everybody has landed, the run is being judged
+            launched.process.send_signal(signal.SIGHUP)
+        time.sleep(0.05)
+    assert launched.end() == 130, launched.text()
+    assert launched.landed() == {0: True, 1: True}
+    assert launched.summary()["outcome"] == "interrupted"
+    assert "killed" not in launched.text()
 
 
 @pytest.mark.parametrize("when_s", [0.0, 0.3, 1.0, 2.0])

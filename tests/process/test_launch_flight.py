@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import swarmctl.flight
+import swarmctl.recovery
 from swarmctl.config import load
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START
@@ -49,9 +50,9 @@ def ends(code: int, after_s: float = 0.3) -> str:
     return LANDS_ON_SIGTERM + f"time.sleep({after_s}); print('because'); sys.exit({code})"
 
 
-def status_of(agent: int, phase: Phase) -> bytes:
-    said = (Mode.FOLLOW, FlightMode.EXTERNAL, True, Landed.IN_AIR, 0, "", 0.1, 1.0, 2.0, 9, 0, 5.0, 0, "")
-    message = StatusMessage(agent, 1, agent + 1, phase, *said)
+def status_of(agent: int, phase: Phase, utc_us: int) -> bytes:
+    said = (Mode.FOLLOW, FlightMode.EXTERNAL, True, Landed.IN_AIR, 0, "", 0.1, 1.0, 2.0, 9, 0, 5.0, 0, "", False)
+    message = StatusMessage(agent, 1, agent + 1, phase, *said, utc_us)
     return encode_message(message)
 
 
@@ -72,16 +73,26 @@ class Scene(Base):
         self.hub = LocalHub(lambda: time.monotonic_ns() // 1000)
         self.bus = self.hub.attach(OPERATOR)
         self.agents = [self.hub.attach(agent_name(i)) for i in range(len(agents))]
+        self.directory = directory
+        self.lands = ends(130, 0.5)  # what recovers a vehicle
+        self.recovered: list[int] = []
         self.said: list[str] = []
         self.interrupts = 0
         self.silent: set[int] = set()
         self.orders: list[str] = []
+        self.stamped_us: list[tuple[int, int]] = []  # of each order, by how much it was stamped before we heard it
+        self.behind_us = 0  # by how much the agents' clock is behind ours
         self.obeys = True
+        self.phase = Phase.TRACK
         self.act: Callable[[], None] = lambda: None
         self.began_s = time.monotonic()
 
     def announce(self, view: str) -> None:
         self.said.append(f"announced {view}")
+
+    def recover(self, agent: int) -> Child:
+        self.recovered.append(agent)
+        return Child(Command(agent_name(agent), (sys.executable, "-ESc", self.lands)), self.directory)
 
     def hear_operators(self) -> None:
         """Listen to the own name, under which operators' commands speak too."""
@@ -99,10 +110,12 @@ class Scene(Base):
         for i, bus in enumerate(self.agents):
             orders = [order for _, payload in bus.receive(COMMAND) if (order := decode_command(payload))]
             self.orders += [order.verb for order in orders]
+            now_us = time.time_ns() // 1000
+            self.stamped_us += [(order.utc_us, now_us - order.utc_us) for order in orders]
             if orders and self.obeys and i not in self.silent:
                 self.children[agent_name(i)].signal(signal.SIGTERM)
             if i not in self.silent and self.children[agent_name(i)].poll() is None:
-                bus.publish(STATUS, status_of(i, Phase.TRACK))
+                bus.publish(STATUS, status_of(i, self.phase, now_us - self.behind_us))
         if time.monotonic() - self.began_s > 0.3:
             act, self.act = self.act, lambda: None
             act()
@@ -142,8 +155,58 @@ def test_a_killed_agent_is_named_and_the_others_finish(tmp_path: Path) -> None:
     assert verdict.exit_code(violated=False) == EXIT_MISSION
     assert verdict.outcome == "failed"
     assert scene.heard("agent-0", "SIGKILL")
-    assert [scene.children[f"agent-{i}"].poll() for i in range(3)] == [137, 0, 0]
+    assert scene.recovered == [0]
+    assert scene.heard("the vehicle of agent-0", "disarmed")
+    assert verdict.left == ()
+    assert [scene.children[f"agent-{i}"].poll() for i in range(3)] == [130, 0, 0]
     assert "land" not in scene.orders
+
+
+def test_a_vehicle_that_can_not_be_recovered_is_named(tmp_path: Path) -> None:
+    scene = Scene(tmp_path, [FLIES_LONG, ends(0, 2.0)])
+    scene.lands = ends(3, 0.3)
+    scene.act = lambda: scene.kill("agent-0")
+    verdict = scene.fly()
+    assert scene.recovered == [0]
+    assert len(verdict.left) == 1
+    assert scene.heard("vehicle 1", "may be armed", "TRACK", "by hand")
+    assert verdict.exit_code(violated=False) == EXIT_MISSION
+
+
+def test_an_interrupted_launch_that_leaves_a_vehicle_is_a_failed_one(tmp_path: Path) -> None:
+    scene = Scene(tmp_path, [FLIES_LONG, FLIES_LONG])
+    scene.lands = ends(3, 0.3)
+
+    def interrupt_and_kill() -> None:
+        scene.interrupts = 1
+        scene.kill("agent-1")
+
+    scene.act = interrupt_and_kill
+    verdict = scene.fly()
+    assert verdict.interrupted
+    assert len(verdict.left) == 1
+    assert verdict.exit_code(violated=False) == EXIT_MISSION
+
+
+def test_a_recovery_that_takes_too_long_is_ended_and_the_vehicle_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(swarmctl.recovery, "RECOVERY_S", 1.0)
+    scene = Scene(tmp_path, [FLIES_LONG, ends(0, 1.0)])
+    scene.lands = FLIES_LONG
+    scene.act = lambda: scene.kill("agent-0")
+    began_s = time.monotonic()
+    verdict = scene.fly()
+    assert time.monotonic() - began_s < 20.0
+    assert len(verdict.left) == 1
+
+
+def test_an_agent_that_ends_before_anything_was_armed_could_not_start(tmp_path: Path) -> None:
+    scene = Scene(tmp_path, [ends(3, 1.0), FLIES_LONG])
+    scene.phase = Phase.STANDBY
+    verdict = scene.fly()
+    assert scene.recovered == []
+    assert verdict.exit_code(violated=False) == EXIT_START
 
 
 def test_a_frozen_agent_is_given_up_when_the_others_have_finished(tmp_path: Path) -> None:
@@ -158,7 +221,8 @@ def test_a_frozen_agent_is_given_up_when_the_others_have_finished(tmp_path: Path
     assert verdict.exit_code(violated=False) == EXIT_MISSION
     assert scene.heard("agent-0", "silent")
     assert scene.children["agent-1"].poll() == 0
-    assert scene.children["agent-0"].poll() == 137
+    assert scene.recovered == [0], "what is frozen is killed, and its vehicle landed"
+    assert scene.children["agent-0"].poll() == 130
 
 
 def test_one_failed_mission_fails_the_launch_and_says_why(tmp_path: Path) -> None:
@@ -171,6 +235,7 @@ def test_one_failed_mission_fails_the_launch_and_says_why(tmp_path: Path) -> Non
 
 def test_an_agent_that_can_not_start_lands_the_others(tmp_path: Path) -> None:
     scene = Scene(tmp_path, [FLIES_LONG, ends(3)])
+    scene.phase = Phase.STANDBY
     verdict = scene.fly()
     assert verdict.exit_code(violated=False) == EXIT_START
     assert scene.heard("agent-1", "could not start", "because")
@@ -200,6 +265,18 @@ def test_who_does_not_hear_the_order_is_told_by_signal(tmp_path: Path) -> None:
     verdict = scene.fly()
     assert verdict.problems == []
     assert scene.children["agent-0"].poll() == 130
+    stamps_us = sorted({stamp_us for stamp_us, _ in scene.stamped_us})
+    assert len(stamps_us) >= 2, "stamped anew every time: it would not be valid for long"
+    assert all(age_us < 400_000 for _, age_us in scene.stamped_us)
+
+
+def test_agents_whose_clock_is_an_hour_behind_are_ordered_to_land_by_their_own(tmp_path: Path) -> None:
+    scene = Scene(tmp_path, [FLIES_LONG, FLIES_LONG])
+    scene.obeys, scene.behind_us = False, 3_600_000_000
+    scene.act = lambda: setattr(scene, "interrupts", 1)
+    scene.fly()
+    ages_us = {round(age_us, -6) for _, age_us in scene.stamped_us}
+    assert ages_us == {0, 3_600_000_000}
 
 
 def test_second_interrupt_kills_at_once(tmp_path: Path) -> None:

@@ -34,7 +34,8 @@ class Flight:
         self.others: tuple[np.ndarray, ...] = ()
         self.arm_in: FlightMode | None = None
         self.boots = 0
-        self.refusal = ""
+        self.refusal = self.unsettled = ""
+        self.beat_us: int | None = None  # the HEARTBEAT that told `armed`; None: one comes with every step
         self.busy = self.mute = False
         self.seen = True
         self.peers = {k + 1: PeerFacts(Phase.STANDBY, 0, True) for k in range(peers)}
@@ -76,6 +77,8 @@ class Flight:
             arm_in=self.arm_in,
             boots=self.boots,
             refusal=self.refusal,
+            unsettled=self.unsettled,
+            armed_told_us=self.now_us if self.beat_us is None else self.beat_us,
         )
         self.sequence.begin_if_due(facts.now_us, facts.utc_us)  # as the agent does, before it thinks
         asked = self.sequence.step(facts)

@@ -23,7 +23,7 @@ from swarmctl.links.vehicle_clock import VehicleClock
 
 SHARED = GeoOrigin(47.397742, 8.545594, 489.4)
 LEVEL = (1.0, 0.0, 0.0, 0.0)
-PX4_OFFBOARD, PX4_HOLD = 6 << 16, 4 << 16 | 3 << 24
+PX4_OFFBOARD, PX4_HOLD, PX4_LAND = 6 << 16, 4 << 16 | 3 << 24, 4 << 16 | 6 << 24
 
 
 class Bench:
@@ -118,7 +118,9 @@ def test_newest_sample_of_a_drained_link_wins_whatever_the_order_of_arrival() ->
 def test_vehicle_time_is_mapped_by_the_smallest_delay_so_jitter_does_not_make_old_samples_young() -> None:
     clock = VehicleClock()
     delays_us = [9_000, 30_000, 4_000, 12_000, 60_000, 5_000]
-    local = [clock.to_local(5_000_000 + 10_000 * i, 10_000 * i + d) for i, d in enumerate(delays_us)]
+    found = [clock.to_local(5_000_000 + 10_000 * i, 10_000 * i + d) for i, d in enumerate(delays_us)]
+    local = [t_us for t_us in found if t_us is not None]
+    assert len(local) == len(found)
     # sample 4 left at 40 ms and took 60 ms; by the best delay seen (4 ms) it is 56 ms old on arrival
     assert local[4] == 40_000 + 4_000
     assert local[5] == 50_000 + 4_000
@@ -130,24 +132,50 @@ def test_a_slow_drift_of_the_vehicle_clock_is_followed() -> None:
     error_us = 0
     for i in range(1000):  # 10 s at 100 Hz, vehicle clock 1000 ppm slow, delay 5 ms
         true_us = i * 10_000
-        error_us = clock.to_local(round(true_us * 0.999), true_us + 5_000) - true_us
+        local_us = clock.to_local(round(true_us * 0.999), true_us + 5_000)
+        assert local_us is not None
+        error_us = local_us - true_us
     assert -1_000 < error_us <= 5_000  # two windows of 2 s: at most 4 ms behind
+
+
+def stamped(bench: Bench, seconds: float, booted_us: int = 0, north_m: float = 0.0) -> Any:
+    """The vehicle speaks for a while, state and attitude at 50 Hz, its clock begun at `booted_us`; the last state."""
+    state = None
+    for _ in range(round(seconds * 50)):
+        bench.clock.advance(20_000)
+        stamp_us = bench.clock.now_us() - booted_us
+        bench.say(odometry(stamp_us, pos=(north_m, 0.0, 0.0)))
+        bench.say(dialect.MAVLink_attitude_quaternion_message(stamp_us // 1000, *LEVEL, 0.0, 0.0, 0.0))
+        bench.heartbeat()
+        state = bench.poll()
+    return state
 
 
 def test_after_a_reboot_of_the_vehicle_its_new_clock_is_taken_and_its_samples_too() -> None:
     bench = Bench().ready()
-    bench.clock.advance(60_000_000)
-    bench.say(odometry(60_000_000, pos=(5.0, 0.0, 0.0)))
-    bench.poll()
+    stamped(bench, 60.0, north_m=5.0)
     bench.clock.advance(3_000_000)
-    bench.say(odometry(10_000, pos=(0.5, 0.0, 0.0)))
-    bench.heartbeat()
-    assert bench.poll() is None, "its local origin is another one now"
+    booted_us = bench.clock.now_us()
+    assert stamped(bench, 0.5, booted_us, 0.5) is None, "its local origin is another one now"
     assert bench.pilot.clock.boots == 1
     bench.origin(SHARED.lat_deg, SHARED.lon_deg, SHARED.alt_m)
-    state = bench.poll()
+    state = stamped(bench, 0.02, booted_us, 0.5)
     assert state.pos_ned_m[0] == pytest.approx(0.5, abs=0.01)
     assert abs(state.t_us - bench.clock.now_us()) < 20_000
+    stamped(bench, 5.0, booted_us, 0.5)
+    assert bench.pilot.clock.boots == 1
+
+
+@pytest.mark.parametrize("off_us", [-30_000_000, 900_000, 10**12])
+def test_one_state_of_another_time_neither_reboots_the_vehicle_nor_freezes_what_is_known_of_it(off_us: int) -> None:
+    bench = Bench().ready()
+    stamped(bench, 31.0)
+    bench.say(odometry(bench.clock.now_us() + off_us, pos=(9.0, 0.0, 0.0)))
+    assert bench.poll().pos_ned_m[0] == pytest.approx(0.0, abs=0.01)
+    state = stamped(bench, 0.02, north_m=0.1)
+    assert state.pos_ned_m[0] == pytest.approx(0.1, abs=0.01)
+    assert abs(state.t_us - bench.clock.now_us()) < 1_000
+    assert (bench.pilot.clock.boots, bench.own_codec.refused["stamp not believed"]) == (0, 1)
 
 
 def test_a_link_that_falls_a_second_and_a_half_behind_does_not_make_old_samples_young() -> None:
@@ -155,7 +183,9 @@ def test_a_link_that_falls_a_second_and_a_half_behind_does_not_make_old_samples_
     for i in range(100):
         clock.to_local(i * 10_000, i * 10_000 + 5_000)
     arrived_us = 1_000_000 + 1_500_000
-    assert arrived_us - clock.to_local(1_000_000, arrived_us) > 1_400_000  # older than any failsafe allows
+    local_us = clock.to_local(1_000_000, arrived_us)
+    assert local_us is not None
+    assert arrived_us - local_us > 1_400_000  # older than any failsafe allows
 
 
 @pytest.mark.parametrize(("sysid", "compid"), [(2, 1), (1, 2), (255, 190), (1, 191)])
@@ -424,15 +454,103 @@ def test_a_poll_after_a_sleep_believes_a_mode_that_is_young() -> None:
     assert bench.poll() is not None
 
 
-def test_estimator_resets_are_counted() -> None:
+def requests(bench: Bench) -> int:
+    """How often the vehicle has been asked for its HEARTBEAT since the last call."""
+    found = [dialect.MAVLink(None).decode(bytearray(data)) for data in sent(bench.vehicle)]
+    return sum(m.get_type() == "COMMAND_LONG" and (m.command, m.param1) == (512, 0.0) for m in found)
+
+
+@pytest.mark.parametrize("slept", [True, False], ids=["we slept", "the link was silent"])
+def test_after_a_silence_the_vehicle_is_asked_and_its_answer_is_enough(slept: bool) -> None:
     bench = Bench().ready()
-    for counter, resets in ((3, 0), (3, 0), (4, 1), (4, 1), (6, 2)):
+    flying(bench, 1.0)
+    requests(bench)
+    for _ in range(16):  # CURRENT_MODE would come within half a second, HEARTBEAT within one
         bench.clock.advance(20_000)
-        message = odometry(bench.clock.now_us())
-        message.reset_counter = counter
-        bench.say(message)
+        if slept:
+            bench.say(odometry(bench.clock.now_us()))
+        else:
+            bench.poll()
+    if not slept:
+        bench.say(odometry(bench.clock.now_us()))
+    assert bench.poll() is None
+    assert requests(bench) == 1
+    bench.heartbeat()
+    assert flying(bench, 0.02, mode_hz=0.0) is not None
+    assert requests(bench) == 0
+
+
+def test_a_vehicle_that_does_not_answer_is_asked_again_but_not_every_tick() -> None:
+    bench = Bench().ready()
+    flying(bench, 1.0)
+    requests(bench)
+    bench.clock.advance(400_000)
+    assert flying(bench, 0.6, mode_hz=0.0) is None
+    assert 8 <= requests(bench) <= 10
+
+
+@pytest.mark.parametrize(("custom_mode", "mode"), [(PX4_LAND, FlightMode.LAND), (1 << 16, FlightMode.MANUAL)])
+def test_a_mode_that_came_and_went_between_two_polls_is_shown_once(custom_mode: int, mode: FlightMode) -> None:
+    bench = Bench().ready()
+    flying(bench, 1.0)
+    for custom in (custom_mode, PX4_OFFBOARD):
+        bench.say(dialect.MAVLink_current_mode_message(0, custom, 0))
+    assert bench.poll().mode is mode
+    assert bench.poll().mode is mode, "the same tick"
+    assert flying(bench, 0.02, mode_hz=0.0).mode is FlightMode.EXTERNAL
+    assert bench.pilot.watch.departures == 1
+
+
+def test_a_failsafe_that_came_and_went_between_two_polls_is_shown_once() -> None:
+    bench = Bench().ready()
+    flying(bench, 1.0)
+    bench.heartbeat(status=5)
+    bench.heartbeat(status=4)
+    assert bench.poll().failsafe
+    assert not flying(bench, 0.02, mode_hz=0.0).failsafe
+
+
+def test_setpoints_that_resume_after_the_failsafe_may_have_acted_are_told() -> None:
+    bench = Bench().ready()
+    bench.say(dialect.MAVLink_param_value_message(b"COM_OF_LOSS_T", 0.5, 9, 1, 0))
+
+    def stream_after(seconds: float) -> tuple[int, float]:
+        bench.clock.advance(round(seconds * 1e6))
+        bench.heartbeat()
         bench.poll()
-        assert bench.pilot.resets == resets
+        bench.pilot.send(setpoint(valid_until_us=bench.clock.now_us() + 100_000), bench.clock.now_us())
+        return bench.pilot.gaps, round(bench.pilot.gap_s, 2)
+
+    assert stream_after(5.0) == (0, 0.0)
+    assert stream_after(0.45) == (0, 0.0)
+    assert stream_after(0.62) == (1, 0.62)
+    bench.heartbeat(PX4_LAND)
+    bench.poll()
+    assert stream_after(10.0) == (1, 0.62), "it had left, and been seen to"
+
+
+@pytest.mark.parametrize(("counted", "north_m"), [(True, 1.0), (True, 0.1), (False, 1.0)])
+def test_an_estimate_that_jumps_does_not_move_the_vehicle_and_peers_are_given_a_margin(
+    counted: bool, north_m: float
+) -> None:
+    """A step of 0.1 m is one only by the estimator's own word."""
+    bench = Bench().ready()
+    flying(bench, 1.0)
+    jumped = odometry(bench.clock.now_us() + 20_000, pos=(north_m, 0.0, 0.0))
+    jumped.reset_counter = int(counted)
+    bench.clock.advance(20_000)
+    bench.say(jumped)
+    bench.origin(SHARED.lat_deg, SHARED.lon_deg, SHARED.alt_m)
+    assert bench.poll().pos_ned_m[0] == pytest.approx(0.0, abs=0.01)
+    bench.clock.advance(20_000)
+    again = odometry(bench.clock.now_us(), pos=(north_m, 0.0, 0.0))
+    again.reset_counter = int(counted)
+    bench.say(again)
+    bench.origin(SHARED.lat_deg, SHARED.lon_deg, SHARED.alt_m)
+    assert bench.poll().pos_ned_m[0] == pytest.approx(0.0, abs=0.01)
+    assert bench.pilot.frame.jumps == 1
+    assert bench.pilot.frame.jump_m == pytest.approx(north_m, abs=0.02)
+    assert 0.0 < bench.pilot.frame.margin_m <= north_m
 
 
 @pytest.mark.parametrize(

@@ -42,7 +42,8 @@ PX4_VALUES: dict[str, float | int] = {
     "COM_RCL_EXCEPT": 0,
     "COM_RC_IN_MODE": 1,
     "NAV_RCL_ACT": 2,
-    "NAV_DLL_ACT": 0,
+    "NAV_DLL_ACT": 3,
+    "COM_DL_LOSS_T": 5,
     "MPC_THR_HOVER": 0.5,
     "THR_MDL_FAC": 0.0,
     "MAV_SYS_ID": 1,
@@ -189,8 +190,8 @@ PX4_CASES: list[tuple[str, dict[str, Any], Verdict, str]] = [
     ("round trip", {"link_round_trip": None}, NOTE, "neither"),
     ("round trip", {"link_round_trip": RoundTrip(90.0, 120.0, 60, "PING")}, NOTE, "0.045 s"),
     ("round trip", {"link_round_trip": RoundTrip(90.0, 900.0, 60, "PING")}, FIX, "state_max_age_s"),
-    ("clock", {"link_time": VehicleTime(0.0, -10000.0, 100.0)}, NOTE, "short of CPU"),
-    ("clock", {"link_time": VehicleTime(0.0, 50000.0, 100.0)}, FIX, "short of CPU"),
+    ("clock", {"link_time": VehicleTime(0.0, -30000.0, 100.0)}, NOTE, "short of CPU"),
+    ("clock", {"link_time": VehicleTime(0.0, 60000.0, 100.0)}, FIX, "short of CPU"),
     ("start", {"pos_ned_m": (0.0, 0.0, -1.8)}, FIX, "origin_alt_m"),
     ("start", {"pos_ned_m": (500.0, 0.0, 0.0)}, FIX, "start_timeout_s"),
     ("start", {"pos_ned_m": (50.0, 0.0, 0.0)}, NOTE, "far"),
@@ -201,10 +202,11 @@ PX4_CASES: list[tuple[str, dict[str, Any], Verdict, str]] = [
     ("COM_OBL_RC_ACT", {"parameters": parameters(PX4_VALUES, COM_OBL_RC_ACT=None)}, FIX, "no such parameter"),
     ("MAV_FWDEXTSP", {"parameters": parameters(PX4_VALUES, MAV_FWDEXTSP=0)}, FIX, "not flown"),
     ("COM_RCL_EXCEPT", {"parameters": parameters(PX4_VALUES, COM_RC_IN_MODE=0)}, FIX, "NAV_RCL_ACT = 2"),
-    ("NAV_DLL_ACT", {"parameters": parameters(PX4_VALUES, NAV_DLL_ACT=3)}, NOTE, "keep one connected"),
+    ("NAV_DLL_ACT", {"parameters": parameters(PX4_VALUES, NAV_DLL_ACT=0)}, FIX, "hover for ever"),
+    ("COM_DL_LOSS_T", {"parameters": parameters(PX4_VALUES, COM_DL_LOSS_T=60)}, FIX, "hovers"),
     ("MPC_THR_HOVER", {"parameters": parameters(PX4_VALUES, MPC_THR_HOVER=0.3)}, NOTE, "hover_thrust_01 = 0.3"),
     ("MAV_SYS_ID", {"parameters": parameters(PX4_VALUES, MAV_SYS_ID=9)}, FIX, "reboot"),
-    ("THR_MDL_FAC", {"version": Version((1, 18, 0), "release", "", 50, "3a91", True)}, NOTE, "calibrate"),
+    ("THR_MDL_FAC", {"version": Version((1, 18, 0), "release", "", 50, "3a91", True, 0x3185)}, NOTE, "calibrate"),
 ]
 COPTER_CASES: list[tuple[str, dict[str, Any], Verdict, str]] = [
     ("GUID_OPTIONS", {"parameters": parameters(COPTER_VALUES, GUID_OPTIONS=0)}, FIX, "climb rate"),
@@ -309,10 +311,32 @@ def test_a_parameter_meant_for_another_kind_of_autopilot_is_only_told(config: Co
 
 
 def test_one_board_under_two_urls_is_told_and_two_simulators_are_not_one_board(config: Config) -> None:
-    same = Version((1, 18, 0), "release", "", 50, "3a91", True)
+    same = Version((1, 18, 0), "release", "", 50, "3a91", True, 0x3185)
     lines = findings([changed(HEALTHY, version=same), changed(SECOND_OK, version=same)], config)
     assert "same board" in line_of(lines, "system ids", SWARM).advice
     assert not [line for line in findings([HEALTHY, SECOND_OK], config) if line.topic == "system ids"]
+
+
+@pytest.mark.parametrize("uid", ["0", "01", "02"])
+def test_a_simulator_is_not_told_to_calibrate_whatever_its_uid(config: Config, uid: str) -> None:
+    """PX4's simulator has its instance for a uid, and two hosts may fly the same instance."""
+    simulated = Version((1, 18, 0), "beta", "83c4f4e5", 1, uid, True)
+    lines = findings([changed(HEALTHY, version=simulated), changed(SECOND_OK, version=simulated)], config)
+    assert worst_first(lines) == []
+
+
+def test_a_clock_one_percent_slow_is_no_finding(config: Config) -> None:
+    slow = changed(HEALTHY, link_time=VehicleTime(0.0, -11_000.0, 100.0))
+    assert line_of(findings([slow], config), "clock").verdict is OK
+
+
+@pytest.mark.parametrize("url", (*URLS, "udpout://10.0.0.5:14580"))
+def test_silence_over_udp_names_the_first_sender_and_the_cure(config: Config, url: str) -> None:
+    advice = line_of(findings([unreached(0, url, 1, "nothing is heard")], config), "link").advice
+    assert "spoke to it first" in advice
+    assert "restart PX4" in advice
+    serial = line_of(findings([unreached(0, "serial:///dev/ttyACM0:921600", 1, "nothing")], config), "link")
+    assert "spoke to it first" not in serial.advice
 
 
 def test_the_spread_of_origins_is_shown_and_harmless(config: Config) -> None:
@@ -342,10 +366,11 @@ def test_a_fix_comes_before_any_note(config: Config) -> None:
 
 
 def test_apply_sets_what_is_wrong_and_nothing_else(config: Config) -> None:
-    wrong = parameters(PX4_VALUES, COM_OBL_RC_ACT=0, COM_OF_LOSS_T=9.0, MAV_FWDEXTSP=0, NAV_DLL_ACT=3, MAV_SYS_ID=9)
+    wrong = parameters(PX4_VALUES, COM_OBL_RC_ACT=0, COM_OF_LOSS_T=9.0, MAV_FWDEXTSP=0, NAV_DLL_ACT=0, MAV_SYS_ID=9)
     assert changes(changed(HEALTHY, parameters=wrong), config) == {
         "COM_OBL_RC_ACT": 4,
         "COM_OF_LOSS_T": 0.5,
+        "NAV_DLL_ACT": 3,
         "MAV_FWDEXTSP": 1,
     }
     assert changes(HEALTHY, config) == {}
@@ -400,3 +425,13 @@ def test_the_json_is_json_and_the_table_one_line_a_row(
     assert sum(line.startswith("agent-0\t") for line in printed) == len(lines)
     assert "agent-0 COM_OBL_RC_ACT: 0 -> 4" in printed
     assert printed[-1] == "1 of 1 vehicles reached, nothing to fix, 0 to know"
+
+
+def test_what_a_vehicle_says_steers_no_terminal(config: Config, capsys: pytest.CaptureFixture[str]) -> None:
+    hostile = "\x1b]0;owned\x07\x9b2J\u202e\r\nDONE"
+    facts = changed(HEALTHY, version=Version((1, 18, 0), "beta", hostile, 1, hostile, True))
+    print_check([facts], [*findings([facts], config), Finding(0, "x", FIX, hostile, hostile, hostile)], [])
+    shown = capsys.readouterr().out
+    assert "DONE" in shown
+    assert all(c.isprintable() or c in "\n\t" for c in shown)
+    assert not any(line.startswith("DONE") for line in shown.splitlines())

@@ -6,9 +6,11 @@ import os
 import resource
 import subprocess
 import sys
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from swarmctl import attach, cli
@@ -33,7 +35,8 @@ def run(monkeypatch: pytest.MonkeyPatch) -> Run:
 
 @pytest.fixture
 def nobody(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(attach, "_registry", lambda: tmp_path / "registry")
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
 
 
 def test_help_is_quick_and_imports_nothing_heavy() -> None:
@@ -163,9 +166,10 @@ def test_obstacles_are_read_strictly() -> None:
 def test_the_registry_knows_live_launches_and_forgets_dead_ones(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    registry, folder = tmp_path / "registry", tmp_path / "run"
+    registry, folder = tmp_path / f"swarmctl-{os.getuid()}", tmp_path / "run"
     folder.mkdir()
-    monkeypatch.setattr(attach, "_registry", lambda: registry)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     started_s, pid = attach.process_start_s()
     launch = attach.RunningLaunch("run", "unixsock-stream//x", pid, started_s, 3, str(folder))
     attach.announce(launch)
@@ -178,7 +182,67 @@ def test_the_registry_knows_live_launches_and_forgets_dead_ones(
     with pytest.raises(StartError):
         attach.find_launch(None)
     assert list(registry.iterdir()) == []
-    registry.chmod(0o777)
+
+
+def squat_open(place: Path) -> None:
+    place.mkdir()
+    place.chmod(0o777)
+
+
+def squat_of_another(place: Path) -> None:
+    place.mkdir(mode=0o700)
+    os.chown(place, 12345, 12345)
+
+
+def squat_file(place: Path) -> None:
+    place.write_text("")
+
+
+def squat_link(place: Path) -> None:
+    (place.parent / "elsewhere").mkdir(mode=0o700)
+    place.symlink_to(place.parent / "elsewhere")
+
+
+@pytest.mark.parametrize("squat", [squat_open, squat_of_another, squat_file, squat_link])
+@pytest.mark.parametrize("at_launch", [True, False], ids=["runtime directory at launch", "none at launch"])
+@pytest.mark.parametrize("at_verb", [True, False], ids=["runtime directory at the verb", "none at the verb"])
+def test_a_launch_and_its_verbs_find_each_other_whoever_takes_the_name_first(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, squat: Callable[[Path], None], at_launch: bool, at_verb: bool
+) -> None:
+    temporary, runtime, folder = tmp_path / "tmp", tmp_path / "runtime", tmp_path / "run"
+    for place in (temporary, runtime, folder):
+        place.mkdir(mode=0o700)
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    if squat is squat_of_another and os.getuid() != 0:
+        pytest.skip("only root can give a directory away")
+    squat(temporary / f"swarmctl-{os.getuid()}")
+    started_s, pid = attach.process_start_s()
+    launch = attach.RunningLaunch("run", "unixsock-stream//x", pid, started_s, 3, str(folder))
+    forged = attach.RunningLaunch("forged", "unixsock-stream//evil", pid, started_s + 0.5, 3, str(folder))
+    if squat is not squat_file:
+        (temporary / f"swarmctl-{os.getuid()}" / "1.json").write_bytes(msgspec.json.encode(forged))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime) if at_launch else "")
     attach.announce(launch)
-    assert list(registry.iterdir()) == [], "not private: nothing is written, the launch goes on"
+    attach.announce(launch)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime) if at_verb else "")
+    assert attach.find_launch(None) == launch
     attach.withdraw()
+    if at_launch == at_verb:
+        with pytest.raises(StartError):
+            attach.find_launch(None)
+    assert len(list(temporary.glob("swarmctl-*"))) == 2, "one more, not one each time"
+
+
+def test_a_runtime_directory_of_somebody_else_is_not_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """As after `su` or `sudo -E`."""
+    temporary, runtime, folder = tmp_path / "tmp", tmp_path / "runtime", tmp_path / "run"
+    for place in (temporary, runtime, folder):
+        place.mkdir(mode=0o700)
+    runtime.chmod(0o755)
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
+    started_s, pid = attach.process_start_s()
+    launch = attach.RunningLaunch("run", "unixsock-stream//x", pid, started_s, 3, str(folder))
+    attach.announce(launch)
+    assert list(runtime.iterdir()) == []
+    assert attach.find_launch(None) == launch

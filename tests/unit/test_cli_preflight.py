@@ -11,14 +11,25 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from swarmctl import preflight
-from swarmctl.config import Config, load
+from swarmctl import attach, preflight
+from swarmctl.config import Config, dump, load
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase
-from swarmctl.errors import StartError
+from swarmctl.errors import ConfigError, StartError, SwarmError
+from swarmctl.fault import inject, parse_fault
+from swarmctl.flight import why_it_failed
+from swarmctl.links.bus import SCHEME
 from swarmctl.links.topics import StatusMessage
 from swarmctl.processes import Site, agent_commands, sitl_command, viewer_command
-from swarmctl.summary import summary_lines
-from swarmctl.table import AgentView, PlainLines, open_display, status_cells, status_table
+from swarmctl.summary import summary_lines, violation_lines
+from swarmctl.table import (
+    AgentView,
+    LiveTable,
+    PlainLines,
+    open_display,
+    print_statuses,
+    status_cells,
+    status_table,
+)
 
 
 def test_vehicle_ports_are_held_and_are_not_those_every_simulator_sends_to() -> None:
@@ -36,6 +47,7 @@ def test_preflight_holds_the_ports_until_released() -> None:
         assert len(ground.ports) == 3
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as rival, pytest.raises(OSError):
             rival.bind(("127.0.0.1", ground.ports[0]))
+        assert len({sock.getsockname()[1] for sock in (*ground.sockets, *ground.vehicle_sockets)}) == 6
     finally:
         ground.release()
     assert ground.view_port == 0
@@ -114,8 +126,14 @@ def test_command_lines_say_what_the_configuration_says(tmp_path: Path) -> None:
     agents = agent_commands(config, site, held)
     assert [command.name for command in agents] == ["agent-0", "agent-1"]
     assert [command.fds for command in agents] == [(sock.fileno(),) for sock in held]
-    assert "--fd" not in agent_commands(config, site, ())[0].argv
-    for sock in held:
+    assert not {"--fd", "--vehicle-port"} & set(agent_commands(config, site, ())[0].argv)
+    theirs = preflight.claim_ports(2)
+    told = [command.argv[-2:] for command in agent_commands(config, site, held, theirs)]
+    assert told == [("--vehicle-port", f"{sock.getsockname()[1]}") for sock in theirs]
+    inherits = sitl_command(config, site, (1, 2), theirs)
+    assert inherits.fds == tuple(sock.fileno() for sock in theirs)
+    assert inherits.argv[inherits.argv.index("--local-fds") + 1] == ",".join(map(str, inherits.fds))
+    for sock in (*held, *theirs):
         sock.close()
     viewer = viewer_command(config, site, 9876, view=False).argv
     assert "--view" not in viewer
@@ -171,12 +189,65 @@ def test_what_an_agent_says_is_shown_as_it_is() -> None:
     assert "refused [/bold] [red]" in stream.getvalue()
 
 
+def test_what_an_agent_says_steers_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    """ESC, the 8-bit CSI and direction marks, as a status, as the launcher's line and as JSON."""
+    hostile = "\x1b]0;owned\x07\x9b2J\u202e\r\nDONE"
+    stream = io.StringIO()
+    lines = PlainLines(stream)
+    lines.say(hostile)
+    lines.show([AgentView(0, status(problem=hostile))])
+    Console(file=stream, width=200).print(status_table([AgentView(0, status(problem=hostile), note="")]))
+    LiveTable(Console(file=stream, force_terminal=False)).say(hostile)
+    print_statuses([AgentView(0, status(problem=hostile))])
+    print(attach.as_json({0: status(problem=hostile)}))
+    shown = stream.getvalue() + capsys.readouterr().out
+    assert "DONE" in shown
+    assert all(c.isprintable() or c in "\n\t" for c in shown)
+    assert not any(line.lstrip(" ,│").startswith("DONE") for line in shown.splitlines())
+
+
+@pytest.mark.parametrize(
+    ("outcome", "last_line", "words"),
+    [
+        ("not tracking after 90 s", "mission not completed: not tracking after 90 s", "not tracking after 90 s"),
+        ("completed", "vehicle at udpin: silent for 15 s, given up", "vehicle at udpin: silent for 15 s, given up"),
+        ("", "vehicle silent", "vehicle silent"),
+        ("completed", "", "no reason given"),
+    ],
+)
+def test_an_agent_never_failed_with_completed_for_a_reason(outcome: str, last_line: str, words: str) -> None:
+    assert why_it_failed(outcome, last_line) == words
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "words"),
+    [
+        ((), StartError, "not up yet, or has ended"),
+        (("sitl.enabled=false", "vehicles=[{sysid=1, url='udpin://127.0.0.1:14540'}]"), ConfigError, "no simulator"),
+    ],
+)
+def test_a_fault_without_a_simulator_says_which_kind_of_without(
+    tmp_path: Path, settings: tuple[str, ...], error: type[SwarmError], words: str
+) -> None:
+    (tmp_path / "config.toml").write_text(dump(load(None, ["swarm.agents=1", *settings])))
+    launch = attach.RunningLaunch("run", f"{SCHEME}{tmp_path}/bus.sock", 1, 0.0, 1, str(tmp_path))
+    with pytest.raises(error, match=words):
+        inject(launch, parse_fault({"kind": "gps_loss"}, 1))
+
+
 def test_a_summary_is_five_lines_even_when_almost_empty() -> None:
     for summary in ({}, {"outcome": "failed", "violations": ["a", "b"], "timing": {"tick_ms": {"p50": None}}}):
         lines = summary_lines(summary, Path("runs/x"))
         assert len(lines) == 5
         assert lines[-1] == "run folder runs/x"
-    assert "2 violations: a" in lines[0]
+    assert "2 violations" in lines[0]
+
+
+def test_every_violation_is_said() -> None:
+    assert violation_lines({"violations": ["a", "b\x1b[2J"]}) == ("violation: a", r"violation: b\x1b[2J")
+    alone = {"outcome": "failed", "violations": ["a"]}
+    assert violation_lines(alone) == ()
+    assert summary_lines(alone, Path("runs/x"))[0].endswith("1 violation: a")
 
 
 def test_the_camera_is_given_numbers_argparse_does_not_take_for_options() -> None:

@@ -264,11 +264,11 @@ def test_a_parameter_that_does_not_exist_is_refused_at_once() -> None:
     assert (answer.ok, answer.text) == (False, "parameter error 1")
 
 
-def test_the_companion_beats_once_a_second_whatever_happens() -> None:
+def test_a_ground_station_beats_once_a_second_whatever_happens() -> None:
     bench = Bench()
     bench.port.request(Command(Verb.ARM))
     bench.run(10.0)
     beats = [f for f in bench.out if f[7:10] == b"\x00\x00\x00"]
     assert len(beats) == 10
     assert beats[0][5:7] == bytes([5, 191])
-    assert struct.unpack("<I5B", beats[0][10:-2]) == (0, 18, 8, 0, 4, 3)  # onboard controller, active
+    assert struct.unpack("<I5B", beats[0][10:-2]) == (0, 6, 8, 0, 4, 3)  # ground station, active

@@ -83,7 +83,7 @@ class Crowd:
                 agent.propose(Situation(self.now_us, begin_us, wish, self.known[i], ()))
         for i, agent in enumerate(self.agents):
             assert agent.committed is not None
-            said = Intent(i, 1, self.seq, True, agent.committed, agent.proposal, self.heard(i))
+            said = Intent(i, 1, self.seq, self.now_us, True, agent.committed, agent.proposal, self.heard(i))
             for j in ids:
                 if j != i:
                     self.network.send(self.now_us, j, said)
@@ -179,7 +179,7 @@ def meeting() -> tuple[Commitments, Commitments]:
 
 def said_by(agent: Commitments, number: int) -> dict[int, Intent]:
     assert agent.committed is not None
-    return {number: Intent(number, 1, 1, True, agent.committed, agent.proposal, {})}
+    return {number: Intent(number, 1, 1, UTC_US, True, agent.committed, agent.proposal, {})}
 
 
 def wall(x_m: float, agent: Commitments) -> KeepOut:
@@ -221,7 +221,7 @@ def test_who_is_hemmed_in_makes_way_upwards(column: bool, passes_m: float) -> No
     agent.begin(np.array([0.0, 0.0, -2.0]), np.zeros(3), UTC_US)
     sides = [[0.0, 0.9, -2.0], [0.0, -0.9, -2.0], [-0.9, 0.0, -2.0]]
     peers = {
-        i: Intent(i, 1, 1, True, resting(np.array(side), UTC_US, 100_000), None, {})
+        i: Intent(i, 1, 1, UTC_US, True, resting(np.array(side), UTC_US, 100_000), None, {})
         for i, side in enumerate(sides, start=1)
     }
     times_s = 0.1 * np.arange(agent.steps + 1)
@@ -289,7 +289,7 @@ def proposing() -> tuple[Commitments, Proposal]:
 
 
 def acknowledging(number: int) -> dict[int, Intent]:
-    return {1: Intent(1, 1, 1, True, resting(np.array([9.0, 0.0, 0.0]), UTC_US, 100_000), None, {0: number})}
+    return {1: Intent(1, 1, 1, UTC_US, True, resting(np.array([9.0, 0.0, 0.0]), UTC_US, 100_000), None, {0: number})}
 
 
 @pytest.mark.parametrize(("off", "commits"), [(0, 1), (1, 0), (-1, 0)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import pytest
@@ -10,6 +11,7 @@ from hypothesis import strategies as st
 
 from swarmctl.config import Config, dump, load
 from swarmctl.errors import EXIT_USAGE, ConfigError
+from swarmctl.links.topics import MAX_OBSTACLES
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.toml"))
 
@@ -70,6 +72,23 @@ def test_defaults_are_the_thesis_circle_with_three_agents() -> None:
         ("swarm..agents=3", ("write it as key.sub=value",)),
         ("vehicles.0.url='x'", ("'0' is not an index",)),
         ("seed.x=1", ("no such place",)),
+        ("agents=5", ("agents = 5", "unknown key", "'swarm.agents'")),
+        ("swarm.preset='x500'", ("unknown key", "'sitl.preset'")),
+        ("agent.autopilot_params.COM_OBL_RC_ACT=4294967296", ("COM_OBL_RC_ACT = 4294967296", "2147483647")),
+        ("agent.autopilot_params.MPC_THR_HOVER=1e39", ("MPC_THR_HOVER = 1e+39", "3.40282e+38")),
+        (f"agent.autopilot_params.{'X' * 17}=1", ("no MAVLink parameter name", "1 to 16 letters")),
+        (f"agent.autopilot_params.{'X' * 5000}=1", ("no MAVLink parameter name", "XXX ... XXX")),
+        ("agent.autopilot_params.MÄH=1", ("no MAVLink parameter name",)),
+        (f"seed=1{'0' * 5000}", ("seed", "too many digits", "64 bits")),
+        (f"seed=0x{'f' * 50_000}", ("seed", "200000 bits", "64 bits")),
+        (f"start.center_ned_m=[0.0, 0x{'f' * 50_000}, 0.0]", ("start.center_ned_m.1", "64 bits")),
+        (f"{'a.' * 5000}a=1", ("5001 sections inside each other", "allowed: 12")),
+        (f"seed={'[' * 100_000}", ("seed", "nested too deeply")),
+        (f"swarm={'[' * 100}{']' * 100}", ("swarm.0", "nested too deeply")),
+        (f"vehicles.1{'0' * 5000}.url='x'", ("is not an index of a list of 0",)),
+        ("vehicles.²=1", ("vehicles",)),
+        ("\x1b[2J=1", (r"\x1b[2J = 1", "unknown key")),
+        ("seed='\x1b[2J\\u202e'", (r"\x1b",)),
         ("seed.x.y=1", ("inside a value",)),
     ],
 )
@@ -170,7 +189,11 @@ def test_vehicles_beside_the_simulator_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("content", "word"),
-    [(b"[swarm\nagents = 3", "not TOML"), (b"\xff\xfe\x00", "can't be read"), (b"x = " + b"[" * 9000, "not TOML")],
+    [
+        (b"[swarm\nagents = 3", "not TOML"),
+        (b"\xff\xfe\x00", "can't be read"),
+        (b"x = " + b"[" * 9000, "nested too deeply"),
+    ],
 )
 def test_unreadable_content(tmp_path: Path, content: bytes, word: str) -> None:
     path = tmp_path / "bad.toml"
@@ -198,14 +221,56 @@ def test_dump_reads_back_to_the_same_tree(tmp_path: Path, path: Path | None) -> 
     assert load(file_with(tmp_path, dump(config))) == config
 
 
-def test_dump_keeps_lists_of_tables_and_odd_keys(tmp_path: Path) -> None:
+def test_dump_keeps_lists_of_tables_and_parameters(tmp_path: Path) -> None:
     text = (
-        '[agent.autopilot_params]\nCOM_OBL_RC_ACT = 4\n"odd key" = 1.5\n'
+        "[agent.autopilot_params]\nCOM_OBL_RC_ACT = 4\nCOM_OF_LOSS_T = 1.5\n"
         "[[obstacles]]\ncenter_ned_m = [1, 2, -3]\n[[obstacles]]\ncenter_ned_m = [1e-7, 2.5, -3]\nradius_m = 2\n"
     )
     config = load(file_with(tmp_path, text))
     assert load(file_with(tmp_path, dump(config))) == config
     assert [o.radius_m for o in config.obstacles] == [1.0, 2.0]
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        f"seed = 1{'0' * 5000}",
+        f"seed = 0x{'f' * 50_000}",
+        f"[{'a.' * 5000}a]",
+        f"{'a.' * 5000}a = 1",
+        f"seed = {'[' * 100}{']' * 100}",
+        '"\\u001b[2J" = 1',
+        f"name = '{'x' * 100_000}'",
+    ],
+    ids=["digits", "hexadecimal", "deep table", "deep key", "deep list", "escape", "long"],
+)
+def test_a_hostile_file_is_refused_in_one_short_printable_line(tmp_path: Path, text: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load(file_with(tmp_path, text))
+    assert len(str(caught.value).splitlines()) == 1
+    assert len(str(caught.value)) < 1000
+    assert str(caught.value).isprintable()
+
+
+def test_many_problems_are_not_all_told(tmp_path: Path) -> None:
+    problems = refusals(file_with(tmp_path, "".join(f"key{i} = 1\n" for i in range(10_000))))
+    assert len(problems) == 31
+    assert problems[-1] == "and 9970 more problems"
+
+
+@pytest.mark.timeout(20)
+def test_what_is_no_file_is_refused_at_once(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "link").symlink_to("/dev/zero")
+    with (tmp_path / "huge").open("wb") as file:
+        file.truncate(2**40)
+    words = {"pipe": "not a regular file", "link": "not a regular file", "huge": "larger than"}
+    for name, word in words.items():
+        (problem,) = refusals(tmp_path / name)
+        assert word in problem
+    good = file_with(tmp_path, "seed = 3")
+    (tmp_path / "mine").symlink_to(good)
+    assert load(tmp_path / "mine").seed == 3
 
 
 @given(st.floats(min_value=1e-3, max_value=36000), st.integers(0, 2**31 - 1))
@@ -218,3 +283,19 @@ def test_numbers_survive_exactly(duration_s: float, seed: int) -> None:
 def test_start_line_is_centred_and_spaced() -> None:
     config: Config = load(None, ["swarm.agents=4", "start.spacing_m=2.0", "start.direction_ned=[0.0, 3.0, 0.0]"])
     assert [s[1] for s in config.starts_ned_m()] == [-3.0, -1.0, 1.0, 3.0]
+
+
+def test_more_obstacles_or_farther_ones_than_agents_take_in_are_refused(tmp_path: Path) -> None:
+    ball = "[[obstacles]]\ncenter_ned_m = [1, 2, -3]\n"
+    path = tmp_path / "run.toml"
+    path.write_text(ball * MAX_OBSTACLES)
+    assert len(load(path).obstacles) == MAX_OBSTACLES
+    for text, problem in (
+        (ball * (MAX_OBSTACLES + 1), f"obstacles: 65 are listed, agents keep {MAX_OBSTACLES} at most"),
+        (ball * 20_000, f"obstacles: 20000 are listed, agents keep {MAX_OBSTACLES} at most"),
+        (ball.replace("-3", "-30000.0"), r"obstacles.0.center_ned_m .* within 10000"),
+        (ball + "vel_ned_m_s = [0.0, 1e5, 0.0]\n", r"obstacles.0.vel_ned_m_s .* within 10000"),
+    ):
+        path.write_text(text)
+        with pytest.raises(ConfigError, match=problem):
+            load(path)

@@ -22,6 +22,7 @@ from swarmctl.links.peers import LocalBus, LocalHub, agent_name
 from swarmctl.surroundings import Surroundings
 
 PEER = agent_name(1)
+RATE_HZ = 50.0
 HERE = np.array([0.0, 0.0, -2.0])
 PLACE = np.array([3.0, 0.0, -2.0])  # of the peer
 
@@ -36,7 +37,7 @@ class Bench:
         self.peer: LocalBus = hub.attach(PEER)
         self.alive = {agent_name(0), PEER}
         separation = SeparationParams()
-        self.surroundings = Surroundings(0, [1], separation, self.bus)
+        self.surroundings = Surroundings(0, [1], separation, self.bus, RATE_HZ, lambda *_, **__: None)
         self.coordination = Coordination(
             0,
             1,
@@ -49,6 +50,7 @@ class Bench:
             self.bus,
             lambda name, **fields: self.told.append((name, fields)),
             lambda: 0,
+            RATE_HZ,
         )
         self.seq = 0
 
@@ -67,7 +69,7 @@ class Bench:
             self.surroundings.listen(utc_us)
             self.coordination.listen(utc_us)
             self.coordination.step(utc_us, self.state, Phase.TRACK, Wish(self.wanted))
-            self.coordination.say()
+            self.coordination.say(utc_us)
 
     def wanted(self, offsets_s: Array) -> tuple[Array, Array]:
         return np.tile(HERE, (len(offsets_s), 1)), np.zeros((len(offsets_s), 3))
@@ -84,7 +86,7 @@ class Bench:
         path = PredictedPath(1, 1, self.seq, utc_us, 20_000, 0.0, np.tile(path_at, (41, 1)))
         self.peer.publish(topics.PATH, topics.encode_path(path))
         if not silent:
-            said = Intent(1, 1, self.seq, True, resting(PLACE, utc_us, 100_000), None, heard)
+            said = Intent(1, 1, self.seq, utc_us, True, resting(PLACE, utc_us, 100_000), None, heard)
             self.peer.publish(topics.INTENT, encode_intent(said))
 
     @property
@@ -176,7 +178,7 @@ def test_who_is_silent_is_certified_against_with_all_of_its_margin(bench: Bench)
 def test_who_does_not_know_where_it_is_promises_nothing(bench: Bench) -> None:
     bench.fly(1.0, each=bench.speak)
     bench.coordination.idle(bench.clock.utc_us(), None)
-    bench.coordination.say()
+    bench.coordination.say(bench.clock.utc_us())
     bench.clock.advance(20_000)
     *_, (_, payload) = bench.peer.receive(topics.INTENT)
     intent = decode_intent(payload)

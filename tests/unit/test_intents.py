@@ -7,10 +7,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from swarmctl.core.clock import SimClock
 from swarmctl.core.intent import Intent, Proposal
 from swarmctl.core.trajectory import Trajectory, ending_at_rest, joined, resting, stopping
 from swarmctl.links.intents import PeerIntents, decode_intent, encode_intent
-from swarmctl.links.peers import agent_name
+from swarmctl.links.peers import LocalHub, agent_name
+from swarmctl.links.refusals import Refusals
+from swarmctl.links.speakers import Attendance
 
 UTC_US = 1_700_000_000_000_000
 
@@ -21,7 +24,8 @@ def trajectory(shift_m: float = 0.0) -> Trajectory:
 
 def intent(seq: int = 1, agent: int = 2, boot_id: int = 9, propose: bool = True) -> Intent:
     proposal = Proposal(77, UTC_US + 5, agent, trajectory(0.5)) if propose else None
-    return Intent(agent, boot_id, seq, True, trajectory(), proposal, {0: 5, 1: UTC_US})
+    said_utc_us = UTC_US + 20_000 * seq
+    return Intent(agent, boot_id, seq, said_utc_us, True, trajectory(), proposal, {0: 5, 1: UTC_US})
 
 
 @pytest.mark.parametrize("propose", [True, False])
@@ -30,6 +34,7 @@ def test_what_is_said_is_heard(propose: bool) -> None:
     heard = decode_intent(encode_intent(said))
     assert heard is not None
     assert (heard.agent, heard.boot_id, heard.seq, heard.promised, heard.heard) == (2, 9, 1, True, said.heard)
+    assert heard.said_utc_us == UTC_US + 20_000
     np.testing.assert_allclose(heard.committed.pos_ned_m, said.committed.pos_ned_m, atol=1e-6)
     assert heard.committed.t0_utc_us == UTC_US
     assert (heard.proposal is not None) is propose
@@ -51,41 +56,65 @@ def test_truncated_lengthened_and_mutilated_ones_are_none() -> None:
             assert np.isfinite(found.committed.pos_ned_m).all()
 
 
+class Store:
+    """Intents of agents 0 and 2 as agent 1 takes them in, at 50 Hz, one message a tick."""
+
+    def __init__(self) -> None:
+        self.clock = SimClock()
+        self.hub = LocalHub(self.clock.now_us)
+        self.peer = self.hub.attach(agent_name(2))
+        self.attendance = Attendance(self.hub.attach(agent_name(1)))
+        self.refusals = Refusals(lambda *_, **__: None)
+        self.intents = PeerIntents([0, 2], 50.0, self.refusals, self.attendance)
+        self.utc_us = UTC_US
+
+    def offer(self, *said: Intent, sender: str = agent_name(2)) -> None:
+        for each in said:
+            self.utc_us += 20_000
+            self.attendance.look(self.utc_us)
+            self.intents.offer(sender, encode_intent(each), self.utc_us)
+
+
 def test_only_newer_ones_of_expected_peers_are_taken_in() -> None:
-    peers = PeerIntents([0, 2])
-    for sender, said in (
-        (agent_name(2), intent(seq=3)),
-        (agent_name(2), intent(seq=3)),  # replayed
-        (agent_name(2), intent(seq=2)),
-        (agent_name(2), intent(seq=9, boot_id=8)),  # of before its restart
-        (agent_name(0), intent(seq=4)),  # somebody else's name
-        (agent_name(1), intent(seq=4, agent=1)),  # not expected
-    ):
-        peers.offer(sender, encode_intent(said), UTC_US)
-    peers.offer(agent_name(2), b"nonsense", UTC_US)
-    assert set(peers.newest) == {2} and peers.newest[2].seq == 3
-    assert peers.rejected == {"replayed": 3, "identity": 1, "unknown_peer": 1, "malformed": 1}
-    assert peers.heard() == {2: 77}
-    peers.offer(agent_name(2), encode_intent(intent(seq=1, boot_id=10, propose=False)), UTC_US)
-    assert peers.newest[2].boot_id == 10
-    assert peers.heard() == {}
+    store = Store()
+    store.offer(intent(seq=3), intent(seq=3), intent(seq=2))
+    store.offer(intent(seq=4), sender=agent_name(0))
+    store.offer(intent(seq=4, agent=1), sender=agent_name(1))
+    store.intents.offer(agent_name(2), b"nonsense", UTC_US)
+    assert set(store.intents.newest) == {2} and store.intents.newest[2].seq == 3
+    assert store.refusals.by_reason == {"replayed": 2, "identity": 1, "unknown_peer": 1, "malformed": 1}
+    assert store.intents.heard() == {2: 77}
 
 
-def test_a_restart_under_an_earlier_clock_is_heard_once_the_old_one_is_silent() -> None:
-    peers = PeerIntents([2])
-    peers.offer(agent_name(2), encode_intent(intent(seq=5, boot_id=9)), UTC_US)
-    peers.offer(agent_name(2), encode_intent(intent(seq=1, boot_id=3)), UTC_US + 4_900_000)
-    assert peers.newest[2].boot_id == 9
-    peers.offer(agent_name(2), encode_intent(intent(seq=2, boot_id=3)), UTC_US + 5_100_000)
-    assert peers.newest[2].boot_id == 3
+def test_one_forged_intent_does_not_silence_its_peer() -> None:
+    store = Store()
+    store.offer(intent(seq=3), intent(seq=4, boot_id=10), intent(seq=2**32 - 1), intent(seq=4))
+    assert (store.intents.newest[2].boot_id, store.intents.newest[2].seq) == (9, 4)
+    assert store.refusals.by_reason == {"unconfirmed": 2}
+    store.offer(*(intent(seq=seq) for seq in range(5, 12)))
+    assert store.intents.newest[2].seq == 11
+    assert store.refusals.by_reason["boot"] == 1
+
+
+def test_a_restart_is_heard_with_its_third_intent_and_has_proposed_nothing_yet() -> None:
+    store = Store()
+    store.offer(intent(seq=3))
+    store.peer.close()
+    store.attendance.look(store.utc_us)
+    store.peer = store.hub.attach(agent_name(2))
+    store.offer(
+        *(replace(intent(seq=seq, boot_id=3, propose=False), said_utc_us=UTC_US + seq * 50_000) for seq in (4, 5, 6))
+    )
+    assert store.intents.newest[2].boot_id == 3
+    assert store.intents.heard() == {}
 
 
 def test_what_begins_in_the_future_is_of_another_clock() -> None:
-    peers = PeerIntents([2])
-    peers.offer(agent_name(2), encode_intent(intent()), UTC_US - 11_000_000)
-    assert peers.rejected == {"future": 1} and peers.newest == {}
-    peers.offer(agent_name(2), encode_intent(intent()), UTC_US - 9_000_000)
-    assert peers.newest[2].seq == 1
+    store = Store()
+    store.intents.offer(agent_name(2), encode_intent(intent()), UTC_US - 11_000_000)
+    assert store.refusals.by_reason == {"future": 1} and store.intents.newest == {}
+    store.intents.offer(agent_name(2), encode_intent(intent()), UTC_US - 9_000_000)
+    assert store.intents.newest[2].seq == 1
 
 
 def test_a_trajectory_rests_before_and_after_itself_and_is_smooth_between() -> None:
@@ -123,13 +152,13 @@ def test_one_time_at_a_time_is_the_same() -> None:
 
 
 def test_what_is_said_again_is_the_same_object_again() -> None:
-    peers = PeerIntents([2])
-    peers.offer(agent_name(2), encode_intent(intent(seq=1)), UTC_US)
-    before = peers.newest[2]
-    peers.offer(agent_name(2), encode_intent(intent(seq=2)), UTC_US)
-    after = peers.newest[2]
+    store = Store()
+    store.offer(intent(seq=1))
+    before = store.intents.newest[2]
+    store.offer(replace(intent(seq=9, boot_id=4), committed=trajectory(2.0)), intent(seq=2))  # a forger between them
+    after = store.intents.newest[2]
     assert after.seq == 2 and after.committed is before.committed
     assert before.proposal is not None and after.proposal is not None
     assert after.proposal.trajectory is before.proposal.trajectory
-    peers.offer(agent_name(2), encode_intent(replace(intent(seq=3), committed=trajectory(1.0))), UTC_US)
-    assert peers.newest[2].committed is not before.committed
+    store.offer(replace(intent(seq=3), committed=trajectory(1.0)))
+    assert store.intents.newest[2].committed is not before.committed

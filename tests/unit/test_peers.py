@@ -7,8 +7,10 @@ import pytest
 
 from swarmctl.core.clock import SimClock
 from swarmctl.core.types import PredictedPath
-from swarmctl.links.peers import LocalBus, LocalHub, PeerPaths, agent_name
-from swarmctl.links.topics import COMMAND, PATH, TICK, encode_path
+from swarmctl.links.peers import LEASE_US, LocalBus, LocalHub, PeerPaths, agent_name
+from swarmctl.links.refusals import Refusals
+from swarmctl.links.speakers import Attendance
+from swarmctl.links.topics import COMMAND, PATH, TICK, TOO_LONG, encode_path
 
 NOW_US = 1_700_000_000_000_000
 
@@ -17,26 +19,45 @@ def payload(agent: int = 1, boot_id: int = 7, seq: int = 1, t0_utc_us: int = NOW
     return encode_path(PredictedPath(agent, boot_id, seq, t0_utc_us, 100_000, 0.0, np.zeros((5, 3))))
 
 
-def store_with(*messages: bytes) -> PeerPaths:
-    store = PeerPaths([1, 2])
+class Store:
+    """Paths of agents 1 and 2 as agent 0 takes them in."""
+
+    def __init__(self) -> None:
+        self.hub = LocalHub(lambda: 0)
+        self.attendance = Attendance(self.hub.attach("agent-0"))
+        self.refusals = Refusals(lambda *_, **__: None)
+        self.paths = PeerPaths([1, 2], 50.0, self.refusals, self.attendance)
+
+    def offer(self, message: bytes, sender: str = "agent-1", utc_us: int = NOW_US) -> None:
+        self.attendance.look(utc_us)
+        self.paths.offer(sender, message, utc_us)
+
+    @property
+    def kept(self) -> list[tuple[int, int, int]]:
+        """(agent, boot id, sequence number) of each."""
+        return [(path.agent, path.boot_id, path.seq) for path in self.paths.latest()]
+
+
+def store_with(*messages: bytes) -> Store:
+    store = Store()
     for message in messages:
-        store.offer("agent-1", message, NOW_US)
+        store.offer(message)
     return store
 
 
 def test_newest_path_of_every_peer_is_kept_by_agent_number() -> None:
-    store = PeerPaths([1, 2])
-    store.offer("agent-2", payload(agent=2, seq=4), NOW_US)
-    store.offer("agent-1", payload(agent=1, seq=1), NOW_US)
-    store.offer("agent-1", payload(agent=1, seq=2), NOW_US)
-    assert [(p.agent, p.seq) for p in store.latest()] == [(1, 2), (2, 4)]
-    assert not store.rejected
+    store = Store()
+    store.offer(payload(agent=2, seq=4), "agent-2")
+    store.offer(payload(agent=1, seq=1))
+    store.offer(payload(agent=1, seq=2))
+    assert store.kept == [(1, 7, 2), (2, 7, 4)]
+    assert not store.refusals.total
 
 
 def test_a_silent_peer_is_never_forgotten() -> None:
     store = store_with(payload())
-    store.offer("agent-2", payload(agent=2, t0_utc_us=NOW_US + 3600_000_000), NOW_US + 3600_000_000)
-    assert [p.agent for p in store.latest()] == [1, 2]
+    store.offer(payload(agent=2, t0_utc_us=NOW_US + 3600_000_000), "agent-2", NOW_US + 3600_000_000)
+    assert [agent for agent, *_ in store.kept] == [1, 2]
 
 
 @pytest.mark.parametrize(
@@ -50,46 +71,35 @@ def test_a_silent_peer_is_never_forgotten() -> None:
         ("agent-9", payload(agent=9), "unknown_peer"),
         ("agent-1", payload(seq=5), "replayed"),
         ("agent-1", payload(seq=4), "replayed"),
+        ("agent-1", payload(seq=5, t0_utc_us=NOW_US + 1), "sequence"),
         ("agent-1", payload(seq=9, t0_utc_us=NOW_US + 500_001), "future"),
         ("agent-1", payload(seq=9, t0_utc_us=NOW_US - 2_000_001), "late"),
+        ("agent-1", payload(seq=2**32 - 1, t0_utc_us=NOW_US + 1), "unconfirmed"),
+        ("agent-1", payload(boot_id=8, t0_utc_us=NOW_US + 1), "unconfirmed"),
+        ("agent-1", payload(boot_id=8, seq=99, t0_utc_us=NOW_US - 1000), "replayed"),
     ],
 )
 def test_refused_with_a_counted_reason_and_the_known_path_stays(sender: str, message: bytes, reason: str) -> None:
     store = store_with(payload(seq=5))
-    store.offer(sender, message, NOW_US)
-    assert dict(store.rejected) == {reason: 1}
-    assert [p.seq for p in store.latest()] == [5]
+    store.offer(message, sender)
+    assert store.refusals.by_reason == {reason: 1}
+    assert store.kept == [(1, 7, 5)]
 
 
 @pytest.mark.parametrize("t0_utc_us", [NOW_US + 500_000, NOW_US - 2_000_000])
 def test_limits_of_age_are_inclusive(t0_utc_us: int) -> None:
-    assert len(store_with(payload(t0_utc_us=t0_utc_us)).latest()) == 1
-
-
-def test_a_restarted_peer_is_believed_and_its_former_life_is_not() -> None:
-    store = store_with(payload(boot_id=7, seq=500), payload(boot_id=3, seq=1, t0_utc_us=NOW_US + 1000))
-    assert [(p.boot_id, p.seq) for p in store.latest()] == [(3, 1)]
-    store.offer("agent-1", payload(boot_id=7, seq=501, t0_utc_us=NOW_US + 2000), NOW_US)
-    assert store.rejected["replayed"] == 1
-    store.offer("agent-1", payload(boot_id=3, seq=2, t0_utc_us=NOW_US + 3000), NOW_US)
-    assert [(p.boot_id, p.seq) for p in store.latest()] == [(3, 2)]
-
-
-def test_a_delayed_message_of_an_unseen_former_life_is_a_replay() -> None:
-    store = store_with(payload(boot_id=3), payload(boot_id=7, seq=99, t0_utc_us=NOW_US - 1000))
-    assert [p.boot_id for p in store.latest()] == [3]
-    assert store.rejected["replayed"] == 1
+    assert len(store_with(payload(t0_utc_us=t0_utc_us)).kept) == 1
 
 
 def test_random_bytes_never_raise() -> None:
     rng = np.random.default_rng(4)
-    store = PeerPaths([1])
+    store = Store()
     for _ in range(2000):
         good = bytearray(payload())
         good[int(rng.integers(len(good)))] = int(rng.integers(256))
-        store.offer("agent-1", bytes(good), NOW_US)
-        store.offer("agent-1", rng.bytes(int(rng.integers(0, 200))), NOW_US)
-    assert store.rejected["malformed"] >= 2000
+        store.offer(bytes(good))
+        store.offer(rng.bytes(int(rng.integers(0, 200))))
+    assert store.refusals.by_reason["malformed"] >= 2000
 
 
 def hub_of(names: list[str], delay_us: int = 0, loss_01: float = 0.0) -> tuple[SimClock, LocalHub, list[LocalBus]]:
@@ -133,6 +143,10 @@ def test_ring_keeps_the_newest_per_sender_and_only_of_what_has_arrived() -> None
     assert len(ticks) == TICK.ring
     assert ticks[-1] == ("agent-0", b"299")
     assert c.receive(PATH) == [("agent-0", b"2"), ("agent-1", b"3")]
+    for i in range(9):
+        a.publish(PATH, str(i).encode())
+    clock.advance(10)
+    assert [message for _, message in c.receive(PATH)] == [b"5", b"6", b"7", b"8"]
 
 
 def test_listening_can_be_limited_to_neighbours() -> None:
@@ -201,3 +215,38 @@ def test_loss_has_the_asked_rate_is_independent_per_receiver_and_spares_reliable
     clock.advance(1)
     assert b.receive(COMMAND) == [("operator", b"land")]
     assert b.receive(PATH) == []
+
+
+def test_what_is_longer_than_its_topic_allows_is_not_handed_out() -> None:
+    clock, _, (a, b) = hub_of(["agent-0", "agent-1"])
+    a.publish(PATH, bytes(PATH.max_bytes))
+    a.publish(PATH, bytes(PATH.max_bytes + 1))
+    clock.advance(1)
+    assert b.receive(PATH) == [("agent-0", bytes(PATH.max_bytes)), ("agent-0", TOO_LONG)]
+
+
+def test_who_leaves_and_comes_back_at_once_has_come_twice() -> None:
+    _, hub, (a, b) = hub_of(["agent-0", "agent-1"])
+    assert dict(b.arrivals()) == {"agent-0": 1, "agent-1": 1}
+    a.close()
+    assert b.alive() == {"agent-1"}
+    hub.attach("agent-0")
+    assert dict(b.arrivals()) == {"agent-0": 2, "agent-1": 1}
+    assert b.alive() == {"agent-0", "agent-1"}
+
+
+@pytest.mark.parametrize(
+    ("mute_us", "more"), [(LEASE_US - 1, {"agent-0": 1}), (LEASE_US, {"agent-0": 1, "agent-1": 1})]
+)
+def test_a_mute_bus_tells_of_comings_and_goings_when_it_is_whole_again(mute_us: int, more: dict[str, int]) -> None:
+    clock, hub, (a, b) = hub_of(["agent-0", "agent-1"])
+    before = dict(b.arrivals())
+    hub.mute()
+    a.close()
+    assert b.alive() == {"agent-0", "agent-1"}, "nobody can tell us"
+    hub.attach("agent-0")
+    clock.advance(mute_us)
+    assert dict(b.arrivals()) == before
+    hub.unmute()
+    assert dict(b.arrivals()) == {name: count + more.get(name, 0) for name, count in before.items()}
+    assert b.alive() == {"agent-0", "agent-1"}

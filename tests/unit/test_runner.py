@@ -72,12 +72,12 @@ def test_a_vehicle_that_was_never_there_is_a_start_error_and_a_lost_one_a_missio
 
 
 def test_an_agent_number_outside_the_swarm_is_refused_before_anything_is_opened(tmp_path: Path) -> None:
-    from swarmctl.runner import run_agent
+    from swarmctl.runner import AgentProcess, run_agent
 
     path = tmp_path / "config.toml"
     path.write_text("[swarm]\nagents = 2\n", encoding="utf-8")
     with pytest.raises(StartError, match=r"--id 2.*0\.\.1"):
-        run_agent(path, 2, "run", "tcp/127.0.0.1:1", tmp_path, None)
+        run_agent(AgentProcess(config_path=path, agent=2, run="run", bus="tcp/127.0.0.1:1", run_dir=tmp_path))
 
 
 def test_a_step_of_the_hosts_utc_is_followed_slowly(monkeypatch: pytest.MonkeyPatch) -> None:

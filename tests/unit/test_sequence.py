@@ -196,7 +196,7 @@ def test_a_peer_lost_before_the_beginning_sends_everybody_home() -> None:
     flight.peer(Phase.READY, 0, alive=False)
     flight.run(0.1)
     assert flight.at == "GOTO_LAND"
-    assert "peer was lost" in flight.sequence.outcome
+    assert "was lost before the mission began" in flight.sequence.outcome
 
 
 def test_the_reference_runs_on_the_common_clock_and_only_while_tracking() -> None:

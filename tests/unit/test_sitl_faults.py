@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import shutil
 import socket
 import threading
 import time
@@ -275,10 +276,11 @@ def test_wrong_faults_are_refused_with_all_problems(wanted: dict[str, Any], comp
 
 
 def launch_at(folder: Path) -> RunningLaunch:
-    return RunningLaunch("circle-1", f"unixsock-stream/{folder}/bus.sock", 1, 0.0, 3, "")
+    return RunningLaunch("circle-1", f"unixsock-stream/{folder}/bus.sock", 1, 0.0, 3, f"{folder}")
 
 
 def test_a_run_with_real_vehicles_takes_no_faults(tmp_path: Path) -> None:
+    shutil.copy(Path(__file__).parents[2] / "configs" / "px4_udp.toml", tmp_path / "config.toml")
     with pytest.raises(ConfigError, match="never for real ones") as refused:
         inject(launch_at(tmp_path), FaultParams(kind="gps_loss"))
     assert refused.value.exit_code == 2

@@ -17,7 +17,7 @@ from swarmctl.core.records import TICK_DTYPE
 from swarmctl.core.types import FlightMode, Mode, Phase, PlanStatus, TickRecord
 from swarmctl.telemetry import recorder as recorder_module
 from swarmctl.telemetry.recorder import Recorder
-from swarmctl.telemetry.run_folder import load_run, read_rows
+from swarmctl.telemetry.run_files import load_run, read_rows
 
 
 def record(seq: int) -> TickRecord:
@@ -104,10 +104,13 @@ def test_full_queue_drops_without_waiting(tmp_path: Path, monkeypatch: pytest.Mo
     monkeypatch.setattr(recorder_module, "_QUEUE", 100)
     recorder = Recorder(tmp_path, 0)
     recorder.tick(record(0))
-    time.sleep(0.4)
+    until_s = time.monotonic() + 10.0
+    while recorder._queue and time.monotonic() < until_s:  # from then on the thread hangs with the first row
+        time.sleep(0.01)
     began_s = time.monotonic()
     for seq in range(500):
         recorder.tick(record(seq))
+    assert recorder.lost == 400, "a hundred fit, and no more is kept in memory"
     recorder.close(0.1)
     assert time.monotonic() - began_s < 1.0
     assert recorder.lost >= 500

@@ -190,7 +190,7 @@ def test_obstacle_set_in_flight_counts_from_then_on() -> None:
 def test_timing_counts_flight_ticks_and_late_ones() -> None:
     rows = ticks(2, (0.0, 0.0, 0.0))  # 101 ticks
     rows["phase"][:10] = Phase.STANDBY
-    rows["late_ticks"] = np.where(np.arange(101) < 50, 3, 33)  # 30 during the flight
+    rows["late_ticks"] = 3 + np.clip(np.arange(101) - 40, 0, 30)  # 30 during the flight, one after the other
     rows["tick_ms"] = 4.0
     rows["tick_ms"][60] = 9.0
     rows["solve_ms"][70], rows["iterations"][70] = 99.0, 0  # nothing was solved in this tick
@@ -199,8 +199,54 @@ def test_timing_counts_flight_ticks_and_late_ones() -> None:
     assert (timing["ticks"], timing["late_ticks"], timing["speed_factor"]) == (91, 30, 8.0)
     assert timing["tick_ms"] == {"p50": 4.0, "p99": pytest.approx(4.5), "max": 9.0}
     assert timing["solve_ms"]["max"] == 2.0
-    assert summary["violations"] == ["late ticks 33.0% above 20.0% (30 of 91)"]
+    assert summary["violations"] == ["late ticks 33.0% above 20.0% (30 of 91 due)"]
     assert judge(run({0: rows}), Rules(1, 0.5, late_ticks_01=0.4), "completed")["violations"] == []
+
+
+def test_ticks_that_were_skipped_were_due() -> None:
+    rows = ticks(2, (0.0, 0.0, 0.0))  # 101 ticks
+    rows["late_ticks"] = 3 * np.arange(101)  # each of them late, and two skipped before it
+    summary = judge(run({0: rows}), Rules(1, 0.5, late_ticks_01=0.2), "completed")
+    assert (summary["timing"]["ticks"], summary["timing"]["due_ticks"]) == (101, 301)
+    assert summary["violations"] == ["late ticks 99.7% above 20.0% (300 of 301 due)"]
+
+
+def vanishing(heard: bool) -> RunData:
+    """Agent 1 flies past where agent 0's vehicle was at 5 s. Unless heard, that one's last state is repeated since."""
+    passing, seen = ticks(20, (0.0, 0.0, 0.0)), ticks(20, (0.0, 0.0, 0.0))
+    t_s = passing["mission_t_s"]
+    seen["pos_ned_m"][:, 0] = np.minimum(t_s, 20.0 if heard else 5.0)  # 1 m/s north
+    seen["state_age_ms"] = 0.0 if heard else np.maximum(0.0, t_s - 5.0) * 1e3
+    passing["pos_ned_m"] = np.column_stack([np.full_like(t_s, 5.0), 10.4 - t_s, 0 * t_s])  # 0.4 m beside it at 10 s
+    passing["pos_ned_m"][:, 1] = np.maximum(passing["pos_ned_m"][:, 1], 0.4)
+    return run({0: seen, 1: passing})
+
+
+def test_a_vehicle_that_vanished_is_named_and_not_judged_by_where_it_was_seen_last() -> None:
+    summary = judge(vanishing(heard=False), Rules(2, 0.85), "failed")
+    assert summary["separation"]["min_m"] == pytest.approx(5.4)  # at 5 s, the last that is known
+    assert summary["violations"] == [
+        "agent 0 did not know where its armed vehicle was for 14.5 s, from 5.5 s on: its separation can't be judged"
+    ]
+    assert judge(vanishing(heard=True), Rules(2, 0.85), "failed")["separation"]["min_m"] == pytest.approx(
+        3.83, abs=0.02
+    )
+
+
+def test_a_reported_state_counts_when_it_was_true_not_when_it_was_recorded() -> None:
+    delayed, still = ticks(10, (0.0, 0.0, 0.0)), ticks(10, (10.0, 0.0, 0.0))
+    delayed["state_age_ms"] = 200.0
+    delayed["pos_ned_m"][:, 0] = delayed["mission_t_s"] - 0.2  # 1 m/s north, told 200 ms later
+    pair = judge(run({0: delayed, 1: still}), Rules(2, 0.1), "failed")["separation"]
+    assert pair["min_m"] == pytest.approx(0.2, abs=0.03)
+    assert pair["min_at_s"] == pytest.approx(9.8, abs=0.03)
+
+
+def test_clocks_of_different_years_have_no_common_instants() -> None:
+    other = ticks(10, (5.0, 0.0, 0.0))
+    other["utc_us"] -= UTC0_US
+    summary = judge(run({0: ticks(10, (0.0, 0.0, 0.0)), 1: other}), Rules(2, 0.5), "completed")
+    assert "can't be judged" in summary["violations"][0]
 
 
 def test_solver_failures_count_while_the_agent_is_in_charge() -> None:
@@ -228,7 +274,49 @@ def test_refused_messages_are_summed_over_each_agents_last_summary() -> None:
         {"source": "agent-1", "event": "other", "rejected": {"stale": 100}},
     ]
     comms = judge(run(APART, events=events), Rules(2, 0.5), "completed")["comms"]
-    assert comms == {"path_age_ms": {"p50": 30.0, "p99": 30.0}, "rejected": {"identity": 1, "stale": 7}}
+    assert comms["path_age_ms"] == {"p50": 30.0, "p99": 30.0}
+    assert comms["rejected"] == {"identity": 1, "stale": 7}
+
+
+def refused(by: int, reason: str, count: int, sender: str = "agent-1", topic: str = "path") -> dict[str, Any]:
+    return {
+        "source": f"agent-{by}",
+        "event": "refused",
+        "sender": sender,
+        "topic": topic,
+        "reason": reason,
+        "count": count,
+    }
+
+
+def test_messages_refused_in_a_peers_name_are_a_violation_and_what_a_network_does_is_not() -> None:
+    network = [refused(0, "late", 4000), refused(0, "replayed", 900), refused(0, "unconfirmed", 70)]
+    clumsy = [refused(0, "malformed", 50), refused(0, "stale_order", 3, "operator", "command")]
+    summary = judge(run(APART, events=network + clumsy), Rules(2, 0.5), "completed")
+    assert (summary["outcome"], summary["violations"]) == ("completed", [])
+    forged = [
+        refused(0, "boot", 1),
+        refused(2, "boot", 3),
+        refused(0, "boot", 2),
+        refused(0, "sequence", 1, topic="status"),
+    ]
+    summary = judge(run(APART, events=network + clumsy + forged), Rules(2, 0.5), "completed")
+    assert summary["outcome"] == "failed"
+    assert summary["violations"] == [
+        "messages in the name of agent-1 were refused (path boot 5, status sequence 1) by agent-0, agent-2"
+    ]
+
+
+def test_who_went_unheard_longest_is_named() -> None:
+    def row(by: int, agent: int, at_s: float, **fields: Any) -> dict[str, Any]:
+        return {"source": f"agent-{by}", "event": "unheard", "agent": agent, "utc_us": round(at_s * 1e6), **fields}
+
+    ended = [row(0, 1, 10.0, begins=True), row(0, 1, 12.0, begins=False, lasted_s=2.5)]
+    comms = judge(run(APART, events=ended), Rules(2, 0.5), "completed")["comms"]
+    assert comms["unheard"] == {"count": 1, "longest_s": 2.5, "agent": 1, "by": "agent-0"}
+    lasting = [row(1, 0, 11.0, begins=True), {"event": "state", "utc_us": 52_000_000}]
+    comms = judge(run(APART, events=ended + lasting), Rules(2, 0.5), "completed")["comms"]
+    assert comms["unheard"] == {"count": 2, "longest_s": 41.0, "agent": 0, "by": "agent-1"}
 
 
 @pytest.mark.parametrize(
@@ -280,6 +368,6 @@ def test_summary_holds_no_nan_and_every_promised_key(data: RunData) -> None:
     assert {"outcome", "violations", "agents", "duration_s", "mode"} <= set(again)
     assert set(again["separation"]) >= {"min_m", "required_m"}
     assert set(again["obstacles"]) == {"min_clearance_m", "required_m"}
-    assert set(again["timing"]) == {"ticks", "late_ticks", "tick_ms", "solve_ms", "speed_factor"}
+    assert set(again["timing"]) == {"ticks", "due_ticks", "late_ticks", "tick_ms", "solve_ms", "speed_factor"}
     assert set(again["solver"]) >= {"name", "failed", "max_residual_m"}
-    assert set(again["comms"]) == {"path_age_ms", "rejected"}
+    assert set(again["comms"]) == {"path_age_ms", "rejected", "unheard"}

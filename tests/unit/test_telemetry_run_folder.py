@@ -16,15 +16,8 @@ from swarmctl.core.types import Mode, Phase
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.telemetry.charts import thin
 from swarmctl.telemetry.referee import ObstacleRule, Rules
-from swarmctl.telemetry.run_folder import (
-    Outcome,
-    create_run_folder,
-    finish_run,
-    load_run,
-    read_parquet,
-    report_run,
-    write_parquet,
-)
+from swarmctl.telemetry.run_files import load_run, read_parquet, write_parquet
+from swarmctl.telemetry.run_folder import Outcome, create_run_folder, finish_run, report_run
 
 UTC_US = 1_780_000_000_000_000
 
@@ -124,7 +117,8 @@ def test_missing_folder_is_refused_in_words(tmp_path: Path) -> None:
 def test_finished_run_is_complete_and_may_be_finished_again(tmp_path: Path) -> None:
     write_run(tmp_path, 3, 20.0)
     own = ({"utc_us": UTC_US - 1, "t_us": -1, "source": "launch", "event": "started"},)
-    summary = finish_run(tmp_path, RULES, Outcome("completed", events=own))
+    summary, unwritten = finish_run(tmp_path, RULES, Outcome("completed", events=own))
+    assert unwritten == ()
     assert summary["outcome"] == "completed", summary["violations"]
     assert summary["tracking"]["index_m"] == pytest.approx(3 * 0.6)
     assert summary["separation"]["min_m"] == pytest.approx(0.6 * np.sqrt(3))
@@ -133,7 +127,7 @@ def test_finished_run_is_complete_and_may_be_finished_again(tmp_path: Path) -> N
     assert names == parquets | {"truth.bin", "config.toml", "events.jsonl", "summary.json", "report.html"}
     sources = [json.loads(line)["source"] for line in (tmp_path / "events.jsonl").read_text().splitlines()]
     assert sources == ["launch", "agent-0", "agent-1", "agent-2"]
-    assert finish_run(tmp_path, RULES, Outcome("completed", events=own)) == summary
+    assert finish_run(tmp_path, RULES, Outcome("completed", events=own)) == (summary, ())
     assert len((tmp_path / "events.jsonl").read_text().splitlines()) == 4
     assert json.loads((tmp_path / "summary.json").read_text()) == summary
 

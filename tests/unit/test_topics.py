@@ -11,8 +11,12 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from swarmctl.core.intent import Intent, Proposal
+from swarmctl.core.records import TICK_DTYPE
+from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.types import PredictedPath
 from swarmctl.links import topics
+from swarmctl.links.intents import MAX_ACKNOWLEDGED, MAX_POINTS, encode_intent
 from swarmctl.links.topics import decode_command, decode_obstacles, decode_path, decode_status, encode_message
 
 POINTS = np.array([[1.5, -2.25, -3.0], [1.625, -2.0, -3.5], [1.75, -1.75, -4.0]])
@@ -220,8 +224,41 @@ def test_numbers_beyond_a_double_are_refused() -> None:
     assert decode_obstacles(obstacles().replace(b"1.75", b"NaN")) is None
 
 
-def test_every_topic_has_its_own_name_and_only_newest_paths_matter() -> None:
+def test_every_topic_has_its_own_name_and_few_old_paths_are_kept() -> None:
     assert len({topic.name for topic in topics.TOPICS}) == len(topics.TOPICS)
-    assert topics.PATH.ring == topics.STATUS.ring == topics.OBSTACLES.ring == 1
+    assert max(topics.PATH.ring, topics.STATUS.ring, topics.OBSTACLES.ring, topics.INTENT.ring) <= 4
     assert topics.COMMAND.reliable
     assert topics.OBSTACLES.reliable
+
+
+def test_lists_and_numbers_from_outside_are_bounded() -> None:
+    ball = topics.ObstacleMessage((9.5, 5.5, -2.3), 1.0, 1.75, 3.0)
+    most = topics.ObstaclesMessage(1, (ball,) * topics.MAX_OBSTACLES)
+    assert decode_obstacles(encode_message(most)) == most
+    assert len(encode_message(most)) <= topics.OBSTACLES.max_bytes
+    assert decode_obstacles(encode_message(topics.ObstaclesMessage(1, (ball,) * (topics.MAX_OBSTACLES + 1)))) is None
+    for fields in ({"center_ned_m": [0, 0, 1e5]}, {"vel_ned_m_s": [-1e5, 0, 0]}, {"keep_out_m": 1e5}):
+        assert decode_obstacles(obstacles(**fields)) is None
+    for name in ("agent", "boot_id", "ticks", "ready_utc_us", "utc_us"):
+        for value in (-1, 10**30):
+            assert (
+                decode_status(
+                    msgspec.json.encode(msgspec.to_builtins(STATUS)).replace(
+                        f'"{name}":{getattr(STATUS, name)}'.encode(), f'"{name}":{value}'.encode()
+                    )
+                )
+                is None
+            )
+
+
+def test_the_longest_good_message_of_every_topic_fits() -> None:
+    path = PredictedPath(0, 0, 0, 0, 1, 0.0, np.zeros((topics.MAX_POINTS, 3)))
+    assert len(topics.encode_path(path)) <= topics.PATH.max_bytes
+    trajectory = Trajectory(0, 1, np.zeros((MAX_POINTS, 3)), np.zeros((MAX_POINTS, 3)))
+    heard = dict.fromkeys(range(MAX_ACKNOWLEDGED), 2**60)
+    intent = Intent(0, 0, 0, 0, True, trajectory, Proposal(1, 0, 0, trajectory), heard)
+    assert len(encode_intent(intent)) <= topics.INTENT.max_bytes
+    assert TICK_DTYPE.itemsize + 12 * topics.MAX_POINTS <= topics.TICK.max_bytes
+    status = msgspec.structs.replace(STATUS, outcome="x" * 4000, problem="\u20ac" * 4000)
+    assert len(encode_message(status)) <= topics.STATUS.max_bytes
+    assert len(encode_message(topics.CommandMessage("resume", -1, 2**62))) <= topics.COMMAND.max_bytes

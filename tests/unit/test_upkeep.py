@@ -22,6 +22,7 @@ PX4, ARDUCOPTER = 12, 3
 LEVEL = [1.0, 0.0, 0.0, 0.0]
 
 
+PX4_WITHOUT_AGENT = {"COM_OBL_RC_ACT": 4, "NAV_DLL_ACT": 3, "COM_DL_LOSS_T": 5}
 COPTER_WITHOUT_AGENT = {"FS_GCS_ENABLE": 5, "FS_GCS_TIMEOUT": 2.0, "ATC_ANGLE_BOOST": 0, "SYSID_MYGCS": 255}
 
 
@@ -30,7 +31,7 @@ class Vehicle:
 
     def __init__(self, autopilot: int = PX4, **params: float) -> None:
         defaults = {
-            PX4: {"COM_OBL_RC_ACT": 4, "MPC_THR_HOVER": 0.45, "THR_MDL_FAC": 0.0, "MPC_THR_MIN": 0.1, "MPC_THR_MAX": 1},
+            PX4: {**PX4_WITHOUT_AGENT, "MPC_THR_HOVER": 0.45, "THR_MDL_FAC": 0.0, "MPC_THR_MIN": 0.1, "MPC_THR_MAX": 1},
             ARDUCOPTER: {"GUID_OPTIONS": 8, "GUID_TIMEOUT": 3.0, "MOT_THST_HOVER": 0.35, **COPTER_WITHOUT_AGENT},
         }
         self.autopilot, self.params = autopilot, {**defaults[autopilot], **params}
@@ -109,6 +110,8 @@ class Vehicle:
             self._tell(message.param_id)
         elif kind == "PARAM_REQUEST_READ" and message.param_id in self.params:
             self._tell(message.param_id)
+        elif kind == "TIMESYNC" and message.tc1 == 0:
+            self.say(mavlink.MAVLink_timesync_message(self.stamp_us * 1000, message.ts1))
 
     def _from_wire(self, name: str, value: float) -> float:
         if self.autopilot == PX4 and isinstance(self.params[name], int):
@@ -184,12 +187,62 @@ def test_an_offboard_loss_action_that_could_not_be_set_or_read_is_refused() -> N
     assert (harmless.upkeep.ready, harmless.upkeep.refusal) == (True, ""), "only what matters refuses"
 
 
+def test_a_whole_number_in_the_configuration_is_set_in_the_type_that_the_vehicle_keeps() -> None:
+    vehicle = Vehicle(COM_OF_LOSS_T=1.0, COM_OBL_RC_ACT=0).set_up(COM_OF_LOSS_T=10, COM_OBL_RC_ACT=4.0).run(4.0)
+    assert (vehicle.upkeep.ready, vehicle.upkeep.refusal) == (True, "")
+    assert (vehicle.params["COM_OF_LOSS_T"], vehicle.params["COM_OBL_RC_ACT"]) == (10.0, 4)
+
+
+def test_nothing_is_armed_when_a_parameter_that_is_there_could_not_be_set() -> None:
+    vehicle = Vehicle(MPC_LAND_SPEED=0.7)
+    vehicle.read_only = True
+    vehicle.set_up(MPC_LAND_SPEED=0.5).run(4.0)
+    assert vehicle.upkeep.refusal == "MPC_LAND_SPEED could not be set to 0.5: stays at 0.7"
+
+
+def test_px4_that_would_hover_for_ever_without_its_agent_is_refused() -> None:
+    assert "hover for ever" in Vehicle(NAV_DLL_ACT=0).set_up().run(4.0).upkeep.refusal
+    assert "COM_DL_LOSS_T = 60" in Vehicle(COM_DL_LOSS_T=60).set_up().run(4.0).upkeep.refusal
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "wanted", "came_with"),
+    [
+        (PX4, {"NAV_DLL_ACT": 3, "COM_OBL_RC_ACT": 4}, {"NAV_DLL_ACT": 0, "COM_OBL_RC_ACT": 4}),
+        (ARDUCOPTER, {"FS_GCS_ENABLE": 5}, {"FS_GCS_ENABLE": 0, "SYSID_MYGCS": 255}),
+    ],
+    ids=["PX4", "ArduCopter"],
+)
+def test_after_the_flight_parameters_are_what_they_were(
+    autopilot: int, wanted: dict[str, int], came_with: dict[str, int]
+) -> None:
+    vehicle = Vehicle(autopilot, **came_with).set_up(**wanted).run(30.0)
+    assert wanted.items() <= vehicle.params.items()
+    assert not vehicle.upkeep.restored
+    vehicle.upkeep.restore()
+    vehicle.run(3.0)
+    assert vehicle.upkeep.restored
+    assert came_with.items() <= vehicle.params.items()
+    assert vehicle.upkeep.left_changed == {}
+
+
+def test_a_parameter_that_could_not_be_set_back_is_named_with_its_value() -> None:
+    vehicle = Vehicle(NAV_DLL_ACT=0).set_up(NAV_DLL_ACT=3).run(4.0)
+    vehicle.read_only = True
+    vehicle.upkeep.restore()
+    vehicle.run(3.0)
+    assert (vehicle.upkeep.restored, vehicle.upkeep.left_changed) == (True, {"NAV_DLL_ACT": 0})
+
+
 def test_after_a_reboot_everything_is_asked_for_again() -> None:
     vehicle = Vehicle(COM_OBL_RC_ACT=0).set_up(COM_OBL_RC_ACT=4).run(3.0)
     vehicle.boot()
     vehicle.params["COM_OBL_RC_ACT"] = 0
     vehicle.rates_hz = {331: 30.0}  # PX4 streams by itself; its clock begins again
-    vehicle.run(0.1)
+    rebooted_us = vehicle.clock.now_us()
+    while vehicle.pilot.clock.boots == 0:
+        vehicle.run(0.02)
+    assert vehicle.clock.now_us() - rebooted_us <= 600_000
     assert not vehicle.upkeep.ready
     assert vehicle.pilot.clock.boots == 1
     assert (vehicle.pilot.landed, vehicle.pilot.offset_ned_m) == (Landed.UNKNOWN, None)

@@ -18,6 +18,7 @@ class Link:
 
     def __init__(self, clock: VehicleClock, rate: float, base_us: float = 300.0, asked: bool = True) -> None:
         self.clock, self.rate, self.base_us, self.asked = clock, rate, base_us, asked
+        self.witnessed, self.unknown = False, 0  # samples without a time
         self.now_us, self.vehicle_us = 0.0, float(BOOTED_US)
         self._random = random.Random(7)
 
@@ -35,8 +36,12 @@ class Link:
                 continue
             self.vehicle_us += TICK_US * self.rate
             arrived_us = round(self.now_us + self.delay_us())
-            error_us = self.clock.to_local(round(self.vehicle_us), arrived_us) - self.now_us
-            worst = max(worst, abs(error_us)) if self.now_us > SETTLED_US else worst
+            if self.witnessed:
+                self.clock.witness("ATTITUDE", round(self.vehicle_us), arrived_us)
+            found_us = self.clock.to_local(round(self.vehicle_us), arrived_us)
+            self.unknown += found_us is None
+            if found_us is not None and self.now_us > SETTLED_US:
+                worst = max(worst, abs(found_us - self.now_us))
             if self.asked and k % 20 == 0:
                 up_us, down_us = self.delay_us(), self.delay_us()
                 stamp_us = self.vehicle_us + up_us * self.rate
@@ -94,15 +99,62 @@ def test_congestion_for_two_seconds_makes_no_old_sample_young() -> None:
     assert link.run(2.0) < 3_000
 
 
-def test_a_reboot_and_a_clock_set_forward_begin_again() -> None:
+@pytest.mark.parametrize("witness", ["TIMESYNC", "ATTITUDE"])
+def test_a_reboot_that_another_message_bears_out_is_one_and_takes_half_a_second(witness: str) -> None:
+    link = Link(VehicleClock(), 0.99, asked=witness == "TIMESYNC")
+    link.witnessed = witness == "ATTITUDE"
+    link.run(10.0)
+    assert (link.unknown, link.clock.refused) == (0, 0)
+    link.vehicle_us = 1_300_000.0
+    assert link.run(5.0) < 12_000  # for a second it has no rate again
+    assert (link.clock.boots, link.clock.restarts) == (1, 1)
+    assert 10 <= link.unknown <= 50
+
+
+def test_a_state_that_goes_back_alone_is_no_reboot_until_nothing_else_has_come_for_three_seconds() -> None:
+    link = Link(VehicleClock(), 1.0, asked=False)
+    link.run(10.0)
+    link.vehicle_us = 1_300_000.0
+    link.run(2.9)
+    assert (link.clock.boots, link.unknown) == (0, 290)
+    link.run(0.2)
+    assert link.clock.boots == 1
+
+
+@pytest.mark.parametrize("off_us", [-60_000_000, -1_500_000, 100_000, 900_000, 5_000_000, 10**15])
+@pytest.mark.parametrize("every", [None, 2, 9])
+def test_stamps_in_past_or_future_among_good_ones_change_nothing(off_us: int, every: int | None) -> None:
+    """One of them, every other one, and every ninth; and forged boot times beside them."""
+    clean, link = Link(VehicleClock(), 0.99), Link(VehicleClock(), 0.99)
+    for each in (clean, link):
+        each.run(10.0)
+    for k in range(300):
+        if (k == 20) if every is None else k % every == 0:
+            stamp_us = round(link.vehicle_us) + off_us
+            assert link.clock.to_local(stamp_us, round(link.now_us)) is None
+            link.clock.witness("SYSTEM_TIME", stamp_us, round(link.now_us))
+        assert link.run(0.01) == clean.run(0.01)
+    assert (link.clock.boots, link.clock.restarts, link.unknown) == (0, 0, 0)
+    assert link.clock.refused > 0
+
+
+def test_a_wrong_first_stamp_is_corrected_without_a_reboot() -> None:
+    for off_us in (10**15, -BOOTED_US):
+        link = Link(VehicleClock(), 1.0)
+        link.clock.to_local(BOOTED_US + off_us, 0)
+        link.run(5.0)
+        assert link.run(5.0) < 8_000
+        assert (link.clock.boots, link.clock.restarts) == (0, 1)
+        assert link.unknown <= 11
+
+
+def test_a_clock_set_forward_begins_again_and_is_no_reboot() -> None:
     link = Link(VehicleClock(), 1.0)
     link.run(10.0)
-    link.vehicle_us = 100_000.0
-    assert link.run(5.0) < 8_000
-    assert link.clock.boots == 1
     link.vehicle_us += 1e15
     assert link.run(5.0) < 8_000
-    assert link.clock.boots == 1
+    assert (link.clock.boots, link.clock.restarts) == (0, 1)
+    assert link.unknown <= 11
 
 
 def test_round_trips_of_another_time_base_are_ignored() -> None:

@@ -1,0 +1,205 @@
+"""The files of a run folder, as arrays and rows; a folder may come from somebody else, so nothing in it is believed.
+
+Formats: `agent-<i>.ticks` and `truth.bin` are raw rows of `core.records`; `agent-<i>.parquet` is the same table with
+vectors expanded to one column per component. Half rows at the end, of a killed process, are ignored. Whatever is no
+regular file of bounded size, or does not hold what its name says, is refused in words.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
+from swarmctl.errors import ConfigError
+from swarmctl.files import read_file, replaced
+from swarmctl.telemetry.referee import RunData
+from swarmctl.telemetry.summary_file import decode_summary
+from swarmctl.telemetry.tracks import LONGEST_US
+
+EVENTS = "events.jsonl"
+SUMMARY = "summary.json"
+TRUTH = "truth.bin"
+CONFIG = "config.toml"
+RECORDING = "telemetry.rrd"
+AGENT_FILE = re.compile(r"^agent-(\d{1,3})\.(ticks|parquet)$")
+
+_MOST_ROWS_BYTES = 2**31  # a day of one agent; more would not fit a laptop's memory either
+_MOST_EVENTS_BYTES = 2**28
+_MOST_TEXT_BYTES = 2**24
+_MOST_ROWS = _MOST_ROWS_BYTES // TICK_DTYPE.itemsize
+_DEEPEST_EVENT = 8  # ours nest twice
+_INT64 = range(-(2**63), 2**63)
+_AXES = {3: ("x", "y", "z"), 4: ("w", "x", "y", "z")}
+
+
+def load_run(directory: Path) -> RunData:
+    """Everything recorded in a run folder, whether finished or not.
+
+    Raises:
+        ConfigError: there is no such folder, or something in it is not what its name says.
+    """
+    refuse_no_folder(directory)
+    ticks: dict[int, NDArray[np.void]] = {}
+    for path in sorted(directory.iterdir(), key=lambda path: path.suffix):  # raw rows win over their Parquet
+        match = AGENT_FILE.match(path.name)
+        if match:
+            rows = read_rows(path, TICK_DTYPE) if match[2] == "ticks" else read_parquet(path)
+            ticks[int(match[1])] = _in_time(path, rows, ("t_us", "utc_us"))
+    truth = directory / TRUTH
+    return RunData(
+        ticks=dict(sorted(ticks.items())),
+        truth=_in_time(truth, read_rows(truth, TRUTH_DTYPE), ("t_us",)),
+        events=read_events(directory),
+    )
+
+
+def refuse_no_folder(directory: Path) -> None:
+    """Say so when there is no run folder at all.
+
+    Raises:
+        ConfigError: there is no such folder.
+    """
+    if not directory.is_dir():
+        raise ConfigError(str(directory), ["no such run folder. Give one that launch or simulate wrote"])
+
+
+def read_rows(path: Path, dtype: np.dtype[np.void]) -> NDArray[np.void]:
+    """Whole rows of a raw file; empty when there is none."""
+    data = _content(path, _MOST_ROWS_BYTES)
+    return np.frombuffer(data, dtype, len(data) // dtype.itemsize)
+
+
+def read_text(path: Path) -> str:
+    """Text of a file of the folder; empty when there is none."""
+    return _content(path, _MOST_TEXT_BYTES).decode("utf-8", errors="replace")
+
+
+def read_summary(directory: Path) -> dict[str, Any] | None:
+    """The summary of a finished run, None when there is none."""
+    path = directory / SUMMARY
+    content = _content(path, _MOST_TEXT_BYTES)
+    if not content and not path.exists():
+        return None
+    try:
+        return decode_summary(content)
+    except ValueError as error:
+        raise _damaged(path, f"is no summary: {error}. Remove it, and the run is judged again") from error
+
+
+def read_events(directory: Path) -> list[dict[str, Any]]:
+    """Events of every source in a run folder, sorted by UTC, each once; lines that aren't one of ours are skipped."""
+    lines: dict[bytes, None] = {}
+    for path in sorted(directory.glob(f"*{EVENTS}")):
+        lines.update(dict.fromkeys(_content(path, _MOST_EVENTS_BYTES).splitlines()))
+    rows = (_event(line) for line in lines)
+    return sorted((row for row in rows if row is not None), key=utc_us_of)
+
+
+def utc_us_of(row: Mapping[str, Any]) -> int:
+    """When an event was, 0 when it does not say."""
+    utc_us = row.get("utc_us")
+    return utc_us if isinstance(utc_us, int) else 0
+
+
+def _event(line: bytes) -> dict[str, Any] | None:
+    try:
+        row = json.loads(line.decode("utf-8", errors="replace"))
+    except (ValueError, RecursionError):
+        return None
+    return row if isinstance(row, dict) and _is_sane(row) else None
+
+
+def _is_sane(row: dict[str, Any]) -> bool:
+    """Whether no value is nested deeper, and no integer larger, than what reads it can bear."""
+    level: list[Any] = [row]
+    for _ in range(_DEEPEST_EVENT):
+        if any(isinstance(value, int) and value not in _INT64 for value in level):
+            return False
+        lists = [value for value in level if isinstance(value, list)]
+        lists += [list(value.values()) for value in level if isinstance(value, dict)]
+        level = [item for values in lists for item in values]
+        if not level:
+            return True
+    return False
+
+
+def _content(path: Path, most_bytes: int) -> bytes:
+    try:
+        return read_file(path, most_bytes)
+    except FileNotFoundError:
+        return b""
+    except OSError as error:
+        raise _damaged(path, f"can't be read: {error.strerror}") from error
+
+
+def _in_time(path: Path, rows: NDArray[np.void], clocks: tuple[str, ...]) -> NDArray[np.void]:
+    """`rows`, when they are of one run by all its clocks."""
+    for clock in clocks:
+        if len(rows) and int(rows[clock].max()) - int(rows[clock].min()) > LONGEST_US:
+            raise _damaged(path, f"damaged: {clock} spans more than {LONGEST_US / 3.6e9:.0f} hours")
+    return rows
+
+
+def _damaged(path: Path, problem: str) -> ConfigError:
+    return ConfigError(str(path), [problem])
+
+
+def write_parquet(path: Path, rows: NDArray[np.void]) -> None:
+    """Structured rows as Parquet; `pos_ned_m` becomes `pos_ned_m_x`, `_y`, `_z`, quaternions `_w` to `_z`."""
+    import pyarrow as pa  # an agent process must not pay for it
+    import pyarrow.parquet as pq
+
+    columns: dict[str, Any] = {}
+    for name in rows.dtype.names or ():
+        shape = rows.dtype[name].shape
+        if shape:
+            for k, axis in enumerate(_AXES[shape[0]]):
+                columns[f"{name}_{axis}"] = pa.array(np.ascontiguousarray(rows[name][:, k]))
+        else:
+            columns[name] = pa.array(np.ascontiguousarray(rows[name]))
+    with replaced(path) as file:
+        pq.write_table(pa.table(columns), file, compression="zstd")
+
+
+def read_parquet(path: Path) -> NDArray[np.void]:
+    """Inverse of `write_parquet` for ticks; columns this version doesn't know are ignored, missing ones are zero.
+
+    Raises:
+        ConfigError: it is no Parquet, is too long, or a column is no number.
+    """
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    try:
+        file = pq.ParquetFile(pa.BufferReader(_content(path, _MOST_ROWS_BYTES)))
+        if file.metadata.num_rows > _MOST_ROWS:
+            raise _damaged(path, f"has {file.metadata.num_rows} rows, more than a day of one agent")
+        return _tick_rows(file)
+    except (OSError, ValueError, pa.ArrowException) as error:  # of a damaged one, each of them
+        raise _damaged(path, f"is no recording of ticks: {error}. Remove it to see the others") from error
+
+
+def _tick_rows(file: Any) -> NDArray[np.void]:
+    known = set(file.schema_arrow.names)
+    columns = {name: columns for name, columns in _columns().items() if known.issuperset(columns)}
+    table = file.read(columns=[column for of_field in columns.values() for column in of_field])
+    rows = np.zeros(table.num_rows, TICK_DTYPE)
+    for name, of_field in columns.items():
+        values = [table.column(column).to_numpy() for column in of_field]
+        if any(value.dtype.kind not in "iufb" for value in values):
+            raise ValueError(f"column {name} holds no numbers")
+        rows[name] = values[0] if len(values) == 1 else np.column_stack(values)
+    return rows
+
+
+def _columns() -> dict[str, list[str]]:
+    """Columns of every field of a tick."""
+    shapes = {name: TICK_DTYPE[name].shape for name in TICK_DTYPE.names or ()}
+    return {name: [f"{name}_{axis}" for axis in _AXES[s[0]]] if s else [name] for name, s in shapes.items()}

@@ -1,0 +1,99 @@
+"""`summary.json` read back: what the report needs of it, checked before it is believed."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, Literal
+
+import msgspec
+
+Outcome = Literal["completed", "failed", "interrupted"]
+_Figure = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]  # what can be printed and drawn
+_Count = Annotated[int, msgspec.Meta(ge=0, lt=2**53)]
+
+
+class _Spread(msgspec.Struct):
+    p50: _Figure | None = None
+    p99: _Figure | None = None
+    max: _Figure | None = None
+
+
+class _Tracked(msgspec.Struct):
+    id: Annotated[int, msgspec.Meta(ge=0, lt=1000)]
+    mse_m2: list[_Figure | None]
+    mean_distance_m: _Figure | None = None
+    rmse_m: _Figure | None = None
+    steady_rmse_m: _Figure | None = None
+
+
+class _Tracking(msgspec.Struct):
+    agents: list[_Tracked]
+    index_m: _Figure | None = None
+    index_after_10s_m: _Figure | None = None
+
+
+class _Separation(msgspec.Struct):
+    required_m: _Figure
+    min_m: _Figure | None = None
+
+
+class _Obstacles(msgspec.Struct):
+    min_clearance_m: _Figure | None = None
+    required_m: _Figure | None = None
+
+
+class _Timing(msgspec.Struct):
+    ticks: _Count
+    late_ticks: _Count
+    tick_ms: _Spread
+    solve_ms: _Spread
+    speed_factor: _Figure | None = None
+    due_ticks: _Count = 0  # missing in older folders
+
+
+class _Solver(msgspec.Struct):
+    name: str
+    failed: _Count
+    not_certified: _Count
+    max_residual_m: _Figure | None = None
+    barrier_ticks: _Count = 0
+
+
+class _Comms(msgspec.Struct):
+    path_age_ms: _Spread
+    rejected: dict[str, _Count]
+
+
+class _Deadlocks(msgspec.Struct):
+    count: _Count = 0
+    longest_s: _Figure | None = None
+    unresolved: _Count = 0
+
+
+class _Summary(msgspec.Struct):
+    outcome: Outcome
+    violations: list[str]
+    agents: _Count
+    mode: str
+    separation: _Separation
+    obstacles: _Obstacles
+    timing: _Timing
+    tracking: _Tracking
+    solver: _Solver
+    comms: _Comms
+    duration_s: _Figure | None = None
+    deadlocks: _Deadlocks = msgspec.field(default_factory=_Deadlocks)  # missing in older folders
+
+
+def decode_summary(content: bytes) -> dict[str, Any]:
+    """What the report needs of a summary; the rest is dropped.
+
+    Raises:
+        ValueError: it is not JSON, or a key is missing or of another type; the text says which.
+    """
+    try:
+        summary: dict[str, Any] = msgspec.to_builtins(msgspec.json.decode(content, type=_Summary))
+    except msgspec.MsgspecError as error:
+        raise ValueError(str(error)) from error
+    except RecursionError as error:
+        raise ValueError("nested too deeply") from error
+    return summary

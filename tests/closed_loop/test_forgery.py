@@ -1,0 +1,201 @@
+"""A stranger on the bus writes under a peer's name. Nobody is silenced, nobody comes closer, and the run says so."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from sitl.lockstep import Lockstep
+from swarmctl.core.types import Mode, Phase, PredictedPath
+from swarmctl.links import topics
+from swarmctl.links.intents import decode_intent, encode_intent
+from swarmctl.links.orders import Verb
+from swarmctl.links.peers import agent_name
+from swarmctl.links.speakers import Said, Speaker, _Stream
+from swarmctl.telemetry.referee import RunData, judge
+from tests.closed_loop.conftest import Flight, Fly, fly_now, mission_t_s
+
+AGENTS, VICTIM, STRANGER = 4, 1, 999
+LAST = 2**32 - 1
+CROSSED_S = 5.0  # they meet after three
+FORGED_S = 2.0
+GUARANTEED = "separation.mode=guaranteed"
+SWAP = (
+    f"swarm.agents={AGENTS}",
+    "start.positions_ned_m=[[3,0,0],[0,3,0],[-3,0,0],[0,-3,0]]",
+    "mission.swap.travel_s=6",
+    "mission.duration_s=12",
+    "sitl.start=air",
+)
+
+
+def crossed(running: Lockstep) -> bool:
+    return mission_t_s(running) >= CROSSED_S
+
+
+def swap(fly: Fly, *overrides: str, at: dict[float, Callable[[Lockstep], None]] | None = None) -> Flight:
+    return fly(*SWAP, *overrides, config="swap8.toml", at=at, until=crossed)
+
+
+def summary(flight: Flight) -> dict[str, Any]:
+    """As the run folder would say, had all gone well from there."""
+    logs = flight.lockstep.logs
+    events = [event for log in logs for event in log.events]
+    data = RunData({log.agent: log.ticks for log in logs}, flight.lockstep.truth, events)
+    return judge(data, replace(flight.config.rules("lockstep"), duration_s=None), "completed")
+
+
+def say(running: Lockstep, topic: topics.Topic, payload: bytes, name: int = VICTIM) -> None:
+    running.hub.carry(agent_name(name), topic, payload)
+
+
+def forge_paths(running: Lockstep) -> None:
+    """By everybody's name one of another life and one of the highest number: far away, at rest."""
+    at_us = running.clock.utc_us() + 40_000
+    for agent in range(AGENTS):
+        away = np.tile([60.0, 20.0 * agent, -2.0], (26, 1))
+        for boot, seq in ((STRANGER, 1), (running.config.seed * 1000 + agent, LAST)):
+            path = PredictedPath(agent, boot, seq, at_us, 100_000, 0.0, away)
+            say(running, topics.PATH, topics.encode_path(path), agent)
+
+
+def overhear(heard: list[bytes], topic: topics.Topic) -> Callable[[Lockstep], None]:
+    """Keep what the victim says on a topic."""
+
+    def tap(running: Lockstep) -> None:
+        carry = running.hub.carry
+
+        def listen(sender: str, of: topics.Topic, payload: bytes) -> None:
+            if sender == agent_name(VICTIM) and of is topic:
+                heard.append(payload)
+            carry(sender, of, payload)
+
+        running.hub.carry = listen  # type: ignore[method-assign, assignment]
+
+    return tap
+
+
+@pytest.fixture(scope="module")
+def twin() -> Flight:
+    """The same flight, untouched."""
+    return swap(fly_now)
+
+
+def test_forged_paths_change_nothing_and_are_told(fly: Fly, twin: Flight) -> None:
+    flight = swap(fly, at={FORGED_S: forge_paths})
+    assert twin.separation_m() >= 0.85
+    np.testing.assert_array_equal(flight.pos_ned_m, twin.pos_ned_m)
+    found = summary(flight)
+    assert found["outcome"] == "failed"
+    assert sorted(found["violations"]) == [
+        f"messages in the name of agent-{i} were refused (path boot 3, path sequence 3) by "
+        + ", ".join(f"agent-{j}" for j in range(AGENTS) if j != i)
+        for i in range(AGENTS)
+    ]
+    assert found["comms"]["unheard"]["count"] == 0
+    assert summary(twin)["violations"] == []
+
+
+def newest_wins(self: Speaker, said: Said, utc_us: int) -> str:
+    """What was believed before there were claims."""
+    known, stream = self._believed, _Stream(said.boot_id, said.seq, said.said_utc_us, utc_us, utc_us)
+    if known is not None and (said.boot_id, said.seq) < (known.boot_id, known.seq):
+        return "replayed"
+    self._believed = stream
+    return ""
+
+
+def test_control_where_the_newest_is_believed_they_meet(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Speaker, "_refusal", newest_wins)
+    flight = swap(fly, at={FORGED_S: forge_paths})
+    assert flight.separation_m() < 0.1
+    found = summary(flight)["comms"]["unheard"]
+    assert found["longest_s"] > 1.0, "who was silenced is named"
+
+
+def test_a_forged_status_lands_parks_and_delays_nobody(fly: Fly, twin: Flight) -> None:
+    heard: list[bytes] = []
+
+    def forge(running: Lockstep) -> None:
+        status = topics.decode_status(heard[-1])
+        assert status is not None
+        done = msgspec.structs.replace(status, phase=int(Phase.DONE), mode=int(Mode.IDLE), ready_utc_us=0)
+        for lie in (
+            msgspec.structs.replace(done, boot_id=STRANGER),
+            msgspec.structs.replace(done, ticks=2**40),
+            msgspec.structs.replace(status, ready_utc_us=2**60, ticks=status.ticks + 1),
+        ):
+            say(running, topics.STATUS, topics.encode_message(lie))
+
+    flight = swap(fly, at={0.0: overhear(heard, topics.STATUS), FORGED_S: forge})
+    np.testing.assert_array_equal(flight.pos_ned_m, twin.pos_ned_m)
+    (violation,) = summary(flight)["violations"]
+    assert "(status boot 3, status sequence 3)" in violation
+    rejected = [agent.rejected for agent in flight.lockstep.agents if agent is not None]
+    assert [of.get("future", 0) for of in rejected] == [1, 0, 1, 1]
+
+
+def forge_intents(heard: list[bytes], running: Lockstep) -> None:
+    """Of another life, and of the highest number: one that promises to be elsewhere."""
+    intent = decode_intent(heard[-1])
+    assert intent is not None
+    away = replace(intent.committed, pos_ned_m=intent.committed.pos_ned_m + np.array([60.0, 0.0, 0.0]))
+    for boot_id, seq in ((STRANGER, 1), (intent.boot_id, LAST)):
+        lie = replace(intent, boot_id=boot_id, seq=seq, committed=away, proposal=None)
+        say(running, topics.INTENT, encode_intent(lie))
+
+
+def test_forged_intents_break_no_promise(fly: Fly) -> None:
+    heard: list[bytes] = []
+    forge = partial(forge_intents, heard)
+    untouched = swap(fly, GUARANTEED)
+    flight = swap(fly, GUARANTEED, at={0.0: overhear(heard, topics.INTENT), FORGED_S: forge})
+    np.testing.assert_array_equal(flight.pos_ned_m, untouched.pos_ned_m)
+    (violation,) = summary(flight)["violations"]
+    assert "(intent boot 3, intent sequence 3)" in violation
+
+
+def test_who_forges_all_the_time_is_told_and_nobody_comes_closer(fly: Fly, twin: Flight) -> None:
+    flight = swap(fly, at={0.5 + 0.02 * i: forge_paths for i in range(200)})
+    np.testing.assert_array_equal(flight.pos_ned_m, twin.pos_ned_m)
+    assert len(summary(flight)["violations"]) == AGENTS
+
+
+def test_late_and_lost_messages_accuse_nobody(fly: Fly) -> None:
+    flight = swap(fly, "bus.delay_ms=300", "bus.loss_01=0.2")
+    assert not [violation for violation in summary(flight)["violations"] if "refused" in violation]
+
+
+def test_orders_of_another_day_are_not_obeyed_and_the_last_one_counts(fly: Fly) -> None:
+    """A `land` of 1970, one of in an hour, and a `hold` that comes again after it was lifted."""
+    speeds_m_s: list[float] = []
+
+    def order(running: Lockstep, verb: Verb, at_us: int) -> None:
+        message = topics.CommandMessage(verb, -1, at_us)
+        running.hub.carry(topics.OPERATOR, topics.COMMAND, topics.encode_message(message))
+
+    def orders(running: Lockstep) -> None:
+        now_us = running.clock.utc_us()
+        order(running, "land", 0)
+        order(running, "hold", now_us - 200_000)
+        order(running, "resume", now_us - 100_000)
+        order(running, "hold", now_us - 200_000)
+        order(running, "land", now_us + 3_600_000_000)
+
+    def look(running: Lockstep) -> None:
+        agent = running.agents[0]
+        assert agent is not None
+        assert agent.rejected == {"stale_order": 1, "future_order": 1, "superseded_order": 1}
+        assert agent._reporter.problem == "command of operator refused: future_order"
+        speeds_m_s.append(float(np.linalg.norm(running.logs[0].rows[-1]["vel_ned_m_s"][0])))
+
+    flight = swap(fly, at={1.0: orders, 2.5: look})
+    assert speeds_m_s[0] > 0.3
+    assert flight.modes(0, Phase.TRACK) == {Mode.FOLLOW}
+    assert not (flight.ticks(0)["phase"] > Phase.TRACK).any()

@@ -1,0 +1,74 @@
+"""An agent that was stopped for a moment: it rejoins before the autopilot's failsafe acts, or learns that it has."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import development as dialect
+
+from sitl.endpoint import Endpoint
+from sitl.lockstep import Lockstep
+from swarmctl.core.types import FlightMode, Mode, Phase
+from swarmctl.links.autopilot import Autopilot
+from tests.closed_loop.conftest import Flight, Fly
+
+ALONE = ("swarm.agents=1", "sitl.start=air", "mission.duration_s=8")
+AT_S = 4.03
+
+
+def freeze(running: Lockstep) -> None:
+    """Its modes are told by HEARTBEAT alone, once a second: between two of them, unless it is asked."""
+    endpoint = running.world.endpoints[0]
+    assert isinstance(endpoint, Endpoint)
+    endpoint.set_interval(dialect.MAVLINK_MSG_ID_CURRENT_MODE, -1)
+    running.frozen.add(0)
+
+
+def gaps(flight: Flight) -> list[float]:
+    """Times between setpoints while tracking [s], the longest first."""
+    ticks = flight.ticks(0)
+    ticks = ticks[(ticks["phase"] == Phase.TRACK) & np.isfinite(ticks["setpoint_thrust_01"])]
+    return sorted((np.diff(ticks["t_us"]) * 1e-6).tolist(), reverse=True)
+
+
+def fly_stopped_for(fly: Fly, seconds: float) -> Flight:
+    """Until three seconds after the agent was stopped."""
+    stopped_us: list[int] = []
+
+    def stop(running: Lockstep) -> None:
+        freeze(running)
+        stopped_us.append(running.clock.now_us())
+
+    def over(running: Lockstep) -> bool:
+        since_s = (running.clock.now_us() - stopped_us[0]) * 1e-6 if stopped_us else 0.0
+        if since_s >= seconds:
+            running.frozen.discard(0)
+        return since_s > 3.0
+
+    return fly(*ALONE, at={AT_S: stop}, until=over)
+
+
+def has_yielded(flight: Flight) -> bool:
+    return Mode.YIELD in flight.modes(0)
+
+
+def test_an_agent_that_was_stopped_for_a_third_of_a_second_flies_on_before_a_failsafe_acts(fly: Fly) -> None:
+    flight = fly_stopped_for(fly, 0.32)
+    assert 0.32 <= gaps(flight)[0] < 0.40
+    assert gaps(flight)[1] < 0.05
+    ticks = flight.ticks(0)
+    assert set(ticks["flight_mode"][ticks["phase"] == Phase.TRACK].tolist()) == {FlightMode.EXTERNAL}
+    assert not has_yielded(flight)
+    assert "setpoint_gap" not in flight.event_names(0)
+
+
+def test_control_who_waits_to_be_told_the_mode_loses_the_vehicle(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Autopilot, "_ask_for", lambda *_: None)
+    flight = fly_stopped_for(fly, 0.32)
+    assert has_yielded(flight)
+
+
+def test_an_agent_that_was_stopped_for_longer_yields_to_the_failsafe_that_acted(fly: Fly) -> None:
+    flight = fly_stopped_for(fly, 0.8)
+    assert has_yielded(flight)
+    assert np.isnan(flight.ticks(0)["setpoint_thrust_01"][-100:]).all()

@@ -1,0 +1,50 @@
+"""An estimate that jumps in flight: the vehicle has not moved, nobody flies across the difference, and peers know."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sitl.lockstep import Lockstep
+from swarmctl.links.local_frame import LocalFrame
+from tests.closed_loop.conftest import Flight, Fly
+
+JUMP_M = 5.0
+AT_S = 4.0  # of the mission
+WATCHED_S = 5.0
+
+
+def fly_with_a_jump(fly: Fly) -> tuple[Flight, float]:
+    """Vehicle 0 takes itself for 5 m farther from vehicle 1 than it is, and so would fly through it to come back."""
+    jumped_us: list[int] = []
+
+    def jump(running: Lockstep) -> None:
+        pos = running.world.plant.pos_ned_m[:2] + np.array(running.config.starts_ned_m())[:, :2].T
+        away = pos[:, 0] - pos[:, 1]
+        running.world.estimator.jump(0, np.array([*(JUMP_M * away / np.linalg.norm(away)), 0.0]))
+        jumped_us.append(running.clock.now_us())
+
+    def over(running: Lockstep) -> bool:
+        return bool(jumped_us) and running.clock.now_us() - jumped_us[0] > WATCHED_S * 1e6
+
+    flight = fly("sitl.start=air", "mission.duration_s=20", at={AT_S: jump}, until=over)
+    return flight, jumped_us[0] * 1e-6
+
+
+def test_a_jump_of_the_estimate_brings_nobody_closer_and_is_told(fly: Fly) -> None:
+    flight, jumped_s = fly_with_a_jump(fly)
+    assert flight.separation_m() >= 0.85
+    assert flight.event_names(0).count("estimate_jumped") == 1
+    after = flight.t_s > jumped_s
+    step_m_s = np.linalg.norm(np.diff(flight.pos_ned_m[after, 0], axis=0), axis=1) / np.diff(flight.t_s[after])
+    assert step_m_s.max() < 3.5, "it flies its mission, at 2.5 m/s, and does not race back"
+    others = flight.pos_ned_m[after][:, 1:] - flight.pos_ned_m[after][:, :1]
+    apart_m = np.linalg.norm(others, axis=2)  # (T, 2)
+    assert apart_m[-1].min() > 1.3, "its peers make room for where else it may be"
+
+
+def test_control_a_jump_that_is_believed_at_once_ends_in_a_collision(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(LocalFrame, "_fit", lambda *_: None)
+    flight, _ = fly_with_a_jump(fly)
+    assert flight.separation_m() < flight.config.separation.body_m
+    assert "estimate_jumped" not in flight.event_names(0)

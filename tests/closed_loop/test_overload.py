@@ -1,0 +1,51 @@
+"""Agents whose processor is too slow: they come to rest far from each other, name it, and land if it lasts."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from sitl.lockstep import Lockstep
+from tests.closed_loop.conftest import Flight, fly_now
+
+SWAP = ("swarm.agents=4", "start={positions_ned_m=[[4,0,0],[0,4,0],[-4,0,0],[0,-4,0]]}", "sitl.start=air")
+UNPROTECTED = ("agent.overload.widen_01=1", "agent.overload.hold_01=1", "agent.overload.clear_01=1")
+BODY_M = 0.48  # touching, with the default airframe
+
+
+def one_tick_of(count: int) -> Callable[[Lockstep], None]:
+    """What makes every agent do one tick of `count` from now on."""
+
+    def begin(lockstep: Lockstep) -> None:
+        lockstep.starved = dict.fromkeys(range(4), count)
+
+    return begin
+
+
+def swapped(*more: str, until_s: float, at: dict[float, Callable[[Lockstep], None]]) -> Flight:
+    def over(lockstep: Lockstep) -> bool:
+        return lockstep.finished or lockstep.clock.now_us() > until_s * 1e6
+
+    return fly_now(*SWAP, *more, config="swap8.toml", at=at, until=over)
+
+
+def test_who_misses_nine_deadlines_of_ten_comes_to_rest_far_from_the_others_and_lands() -> None:
+    flight = swapped(until_s=30.0, at={0.5: one_tick_of(10)})
+    assert flight.separation_m() > 1.5
+    assert {agent.outcome.split(":")[0] for agent in flight.lockstep.agents if agent} == {"overload"}
+    levels = [e["level"] for e in flight.lockstep.logs[0].events if e["event"] == "overload"]
+    assert levels == ["WIDEN", "HOLD", "LAND"]
+
+
+def test_negative_control_without_the_reaction_bodies_touch() -> None:
+    flight = swapped(*UNPROTECTED, until_s=20.0, at={0.5: one_tick_of(10)})
+    assert flight.separation_m() < BODY_M
+
+
+def test_an_overload_that_passes_delays_the_mission_and_no_more() -> None:
+    flight = swapped(until_s=24.0, at={0.5: one_tick_of(10), 4.5: one_tick_of(1)})
+    assert flight.separation_m() > 0.85
+    levels = [e["level"] for e in flight.lockstep.logs[0].events if e["event"] == "overload"]
+    assert levels[:2] == ["WIDEN", "HOLD"]
+    assert levels[-1] == "NONE"
+    goals = -flight.pos_ned_m[0, :, :2]
+    assert abs(flight.pos_ned_m[-1, :, :2] - goals).max() < 0.3, "they have arrived at the opposite side all the same"

@@ -1,0 +1,77 @@
+"""What is read is a file of bounded size, and what is written never goes through somebody else's link."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from swarmctl.files import read_file, replace_bytes, replace_text, replaced, replaced_by_program
+
+
+def test_a_file_is_read_whole(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    path.write_bytes(b"12345")
+    assert read_file(path, 5) == b"12345"
+    with pytest.raises(FileNotFoundError):
+        read_file(tmp_path / "b", 5)
+
+
+def test_a_file_larger_than_asked_for_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "a"
+    with path.open("wb") as file:
+        file.truncate(2**40)  # sparse: reading it would need 1 TB
+    with pytest.raises(OSError, match="is larger than 1 MB"):
+        read_file(path, 10**6)
+
+
+@pytest.mark.timeout(10)
+def test_a_pipe_and_a_device_are_refused_at_once(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", Path("/dev/zero"), tmp_path):
+        with pytest.raises(OSError, match="is not a regular file"):
+            read_file(path, 10**6, follow=True)
+
+
+def test_a_link_is_followed_only_when_asked_to(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"secret")
+    (tmp_path / "link").symlink_to("a")
+    assert read_file(tmp_path / "link", 100, follow=True) == b"secret"
+    with pytest.raises(OSError, match="is a symbolic link"):
+        read_file(tmp_path / "link", 100)
+
+
+def test_a_link_in_place_of_the_file_is_replaced_and_its_target_kept(tmp_path: Path) -> None:
+    precious = tmp_path / "precious"
+    precious.write_text("mine")
+    path = tmp_path / "out" / "report.html"
+    path.parent.mkdir()
+    for name in ("report.html", "report.html.part", ".report.html.part"):  # also where a neighbour might be expected
+        (path.parent / name).symlink_to(precious)
+    replace_text(path, "page")
+    assert precious.read_text() == "mine"
+    assert path.read_text() == "page"
+    assert not path.is_symlink()
+    with replaced_by_program(path) as part:
+        part.write_text("packed")
+    assert path.read_text() == "packed"
+    assert precious.read_text() == "mine"
+
+
+def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    path = tmp_path / "summary.json"
+    replace_bytes(path, b"old")
+    with pytest.raises(ZeroDivisionError), replaced(path) as file:
+        file.write(b"half")
+        raise ZeroDivisionError
+    with pytest.raises(ZeroDivisionError), replaced_by_program(path) as part:
+        part.write_bytes(b"half")
+        raise ZeroDivisionError
+    assert path.read_bytes() == b"old"
+    assert [p.name for p in tmp_path.iterdir()] == ["summary.json"]
+
+
+def test_text_that_is_no_unicode_is_written_all_the_same(tmp_path: Path) -> None:
+    replace_text(tmp_path / "a", "lone \ud800 surrogate")
+    assert (tmp_path / "a").read_text() == "lone ? surrogate"

@@ -1,0 +1,45 @@
+"""`simulate` says its verdict whatever becomes of the disk and of the terminal."""
+
+from __future__ import annotations
+
+import json
+import os
+import pty
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+SHORT = ("--agents", "1", "--duration", "2", "--set", "telemetry.enabled=false", "--set", "sitl.start=air")
+
+
+def test_a_full_disk_costs_the_files_and_not_the_verdict(tmp_path: Path) -> None:
+    code = "import resource, sys; from sitl.simulate import main\n"
+    code += "resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))\nsys.exit(main(sys.argv[1:]))"
+    command = [sys.executable, "-c", code, *SHORT, "--run-dir", str(tmp_path / "run")]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    lines = done.stdout.splitlines()
+    assert done.returncode == 4, done.stderr
+    assert lines[0].startswith("completed, index")
+    assert lines[1].startswith("separation - (required")
+    assert "agent-0.ticks: File too large" in lines[-1]
+
+
+def test_a_closed_terminal_lands_and_keeps_the_verdict(tmp_path: Path) -> None:
+    """The kernel and the shell both say so: the second SIGHUP is not somebody who asks again."""
+    folder = tmp_path / "run"
+    master, terminal = pty.openpty()
+    command = [sys.executable, "-m", "sitl.simulate", *SHORT[:2], "--duration", "600", "--run-dir", str(folder)]
+    process = subprocess.Popen(command, stdin=terminal, stdout=terminal, stderr=terminal, start_new_session=True)
+    os.close(terminal)
+    until_s = time.monotonic() + 60.0
+    while not (folder / "agent-0.tlog").exists() and time.monotonic() < until_s:
+        time.sleep(0.05)
+    time.sleep(1.0)
+    os.close(master)
+    for _ in range(2):
+        process.send_signal(signal.SIGHUP)
+        time.sleep(0.1)
+    assert process.wait(120) == 130
+    assert json.loads((folder / "summary.json").read_text())["outcome"] == "interrupted"
