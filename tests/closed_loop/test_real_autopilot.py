@@ -128,7 +128,7 @@ def test_three_vehicles_without_lag_and_dead_time_in_the_prediction_do_not() -> 
 
 def outcome(*overrides: str) -> tuple[str, bool]:
     """Why an agent ended, and whether anything was ever armed."""
-    flight = Lockstep(load(CONFIG, (*overrides, "mission.duration_s=1")))
+    flight = Lockstep(load(CONFIG, (*overrides, "mission.duration_s=1", "agent.sequence.start_timeout_s=11")))
     while not flight.finished and flight.clock.now_us() < 12e6:
         flight.step()
     assert flight.agents[0] is not None
