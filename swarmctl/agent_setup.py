@@ -35,8 +35,8 @@ class AgentParams(Params):
     barrier: BarrierParams = BarrierParams()
     commit: CommitParams = CommitParams()
     detour: DetourParams = DetourParams()
-    autopilot_params: dict[str, int | float] = Field(  # PX4: land when setpoints stop, or heartbeats before OFFBOARD
-        {"COM_OBL_RC_ACT": 4, "COM_OF_LOSS_T": 0.5, "NAV_DLL_ACT": 3, "COM_DL_LOSS_T": 5}
+    autopilot_params: dict[str, int | float] = Field(  # PX4: land when setpoints stop, before it has flown far blindly
+        {"COM_OBL_RC_ACT": 4, "COM_OF_LOSS_T": 0.5}
     )
 
 

@@ -63,13 +63,13 @@ class RunningLaunch(msgspec.Struct, frozen=True):
 
 
 def announce(launch: RunningLaunch) -> None:
-    """Write the notes of a launch; without the one in its run folder it can't be spoken to, the others are extra."""
+    """Write the notes of a launch; a disk that takes none costs the operator's verbs, never the flight."""
     payload = msgspec.json.encode(launch)
-    replace_bytes(Path(launch.run_dir) / LAUNCH_FILE, payload)
-    for registry in (_runtime_registry(), _temporary_registry()):
-        if registry is not None:
-            with contextlib.suppress(OSError):
-                replace_bytes(registry / f"{launch.pid}.json", payload)
+    notes = [Path(launch.run_dir) / LAUNCH_FILE]
+    notes += [place / f"{launch.pid}.json" for place in (_runtime_registry(), _temporary_registry()) if place]
+    for note in notes:
+        with contextlib.suppress(OSError):
+            replace_bytes(note, payload)
 
 
 def withdraw() -> None:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import difflib
 import itertools
-import json
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -30,6 +29,7 @@ from swarmctl.links.parameter_names import parameter_problems
 from swarmctl.links.topics import MAX_OBSTACLE_M, MAX_OBSTACLES
 from swarmctl.links.transport import Endpoint, parse_url
 from swarmctl.telemetry.referee import ObstacleRule, Rules
+from swarmctl.toml_text import toml_text
 
 MAX_AGENTS = 100
 _PAIRS_SHOWN = 3
@@ -206,9 +206,7 @@ def load(path: Path | None, overrides: Sequence[str] = ()) -> Config:
 
 def dump(config: Config) -> str:
     """The resolved configuration as TOML that `load` reads back to the same tree."""
-    lines: list[str] = []
-    _dump_table(config.model_dump(), "", lines)
-    return "\n".join(lines) + "\n"
+    return toml_text(config.model_dump())
 
 
 def _explain(error: dict[str, Any]) -> str:
@@ -386,33 +384,3 @@ def _same_place(a: Endpoint, b: Endpoint) -> bool:
     if a.scheme == "udpin" and "0.0.0.0" in (a.where, b.where):
         return a.number == b.number
     return (a.where, a.number) == (b.where, b.number)
-
-
-def _dump_table(table: dict[str, Any], prefix: str, lines: list[str]) -> None:
-    nested: list[tuple[str, Any]] = []
-    for key, value in table.items():
-        if isinstance(value, dict) or (isinstance(value, (list, tuple)) and value and isinstance(value[0], dict)):
-            nested.append((key, value))
-        elif value is not None:
-            lines.append(f"{key} = {toml_value(value)}")
-    for key, value in nested:
-        name = f"{prefix}{key}"
-        for item in [value] if isinstance(value, dict) else value:
-            header = f"[{name}]" if isinstance(value, dict) else f"[[{name}]]"
-            lines.extend(["", header])
-            _dump_table(item, f"{name}.", lines)
-
-
-def toml_value(value: Any) -> str:
-    """A value as TOML, on one line; what is None inside a table is left out."""
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, (int, float)):
-        return repr(value)
-    if isinstance(value, str):
-        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
-    if isinstance(value, (list, tuple)):
-        return "[" + ", ".join(toml_value(v) for v in value) + "]"
-    if isinstance(value, dict):
-        return "{" + ", ".join(f"{k} = {toml_value(v)}" for k, v in value.items() if v is not None) + "}"
-    raise TypeError(f"no TOML for {type(value).__name__}")

@@ -22,13 +22,14 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from swarmctl.config import Config, SitlParams, toml_value
+from swarmctl.config import Config, SitlParams
 from swarmctl.control.mission import MissionReference
 from swarmctl.core.simulated import RealismParams
 from swarmctl.errors import StartError
 from swarmctl.lifeline import PARENT_ENV
 from swarmctl.links.bus import socket_file
 from swarmctl.links.peers import agent_name
+from swarmctl.toml_text import toml_value
 
 ROUTER = "router"
 SITL = "sitl"

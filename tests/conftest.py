@@ -11,6 +11,10 @@ import swarmctl  # noqa: F401  (before anything loads numpy)
 TESTS = Path(__file__).parent
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption("--nudged", metavar="SEED", default="0", help="fly tests/closed_loop from starts a millimetre off")
+
+
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Two workers begin with the first item and with the middle one.

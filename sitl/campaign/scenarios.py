@@ -16,8 +16,8 @@ import numpy as np
 
 from sitl.campaign.incidents import Appearance, Death, Incident, Partition
 from sitl.campaign.layouts import far_goals, forest, ring, scattered, walls
-from swarmctl.config import toml_value
 from swarmctl.core.types import Array
+from swarmctl.toml_text import toml_value
 
 
 @dataclass(frozen=True, slots=True)

@@ -251,6 +251,8 @@ def _opinion(name: str, facts: VehicleFacts, config: Config, rule: Rule | None, 
     value = facts.number(name)
     if name in config.agent.autopilot_params:
         return _as_configured(name, facts, config, rule, row)
+    if value is not None and name in DIALECTS[facts.autopilot_number].given:
+        return _ok("set by the agent for its flight")
     if value is None:
         if rule is not None:
             return Opinion(Verdict.FIX, "readable", rule.problem(None))

@@ -67,6 +67,7 @@ class Dialect:
     state: tuple[int, ...]  # messages that carry the state, at the state's rate
     rates_hz: Mapping[int, float]  # the others that must flow
     rules: tuple[Rule, ...]
+    given: Mapping[str, int | float]  # parameters that every flight sets unless it is configured otherwise
     hover_parameter: str
     thrust_parameters: tuple[str, ...]  # read and recorded: they say what thrust means
     horizontal_accuracy: str  # message that tells it
@@ -163,6 +164,7 @@ PX4 = Dialect(
             "so long a vehicle whose agent died before OFFBOARD hovers; set agent.autopilot_params.COM_DL_LOSS_T = 5",
         ),
     ),
+    given={"NAV_DLL_ACT": 3, "COM_DL_LOSS_T": 5},  # land when the agent's heartbeats stop before OFFBOARD
     hover_parameter="MPC_THR_HOVER",
     thrust_parameters=("THR_MDL_FAC", "MPC_THR_MIN", "MPC_THR_MAX"),
     horizontal_accuracy="ESTIMATOR_STATUS",
@@ -219,6 +221,7 @@ ARDUCOPTER = Dialect(
             "thrust is planned for the tilt already; set agent.autopilot_params.ATC_ANGLE_BOOST = 0",
         ),
     ),
+    given={},
     hover_parameter="MOT_THST_HOVER",
     thrust_parameters=("MOT_THST_EXPO", "MOT_SPIN_ARM", "MOT_SPIN_MIN", "MOT_SPIN_MAX"),
     horizontal_accuracy="GPS_RAW_INT",  # its EKF's own figures are test ratios, not metres

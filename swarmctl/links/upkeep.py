@@ -54,7 +54,7 @@ class Upkeep:
         self._dialect: Dialect | None = None
         self._todo: deque[Command] = deque()
         self._compared = False  # what was read with what is wanted
-        self._before: dict[str, float] = {}  # parameter -> value that the vehicle came with
+        self._before: dict[str, Command] = {}  # parameter -> what sets it to the value that the vehicle came with
         self._restoring = False
         self._open: Command | None = None
         self._failed: dict[str, str] = {}  # parameter -> what the autopilot said
@@ -81,12 +81,11 @@ class Upkeep:
     @property
     def left_changed(self) -> dict[str, float]:
         """Parameters that could not be set back, with the values that the vehicle came with."""
-        return dict(self._before)
+        return {name: set_back.value or float(set_back.number) for name, set_back in self._before.items()}
 
     def restore(self) -> None:
         """Begin to set every changed parameter back; the vehicle is disarmed or has been handed back."""
-        names = [name for name in reversed(self._before) if name in self._autopilot.params]
-        self._todo = deque(self._setting(name, self._before[name]) for name in names)
+        self._todo = deque(reversed(self._before.values()))
         self._restoring = True
 
     def took(self, result: CommandResult) -> None:
@@ -124,7 +123,7 @@ class Upkeep:
         self._boots, self._dialect, self.ready = autopilot.clock.boots, autopilot.dialect, False
         self._compared = False
         self._failed.clear()
-        self._setup = dict(self._given)
+        self._setup = {**self._dialect.given, **self._given}
         if self._dialect.heeds_parameter:
             self._setup[self._dialect.heeds_parameter] = self._sysid
         self._watched_us, self._samples = now_us, autopilot.samples
@@ -140,7 +139,7 @@ class Upkeep:
         self._compared, told = True, self._autopilot.params
         for name, value in self._setup.items():
             if name in told and not math.isclose(told[name], value, rel_tol=1e-6, abs_tol=1e-9):
-                self._before.setdefault(name, told[name])
+                self._before.setdefault(name, self._setting(name, told[name]))
                 self._todo.append(self._setting(name, value))
 
     def _rates(self, dialect: Dialect) -> list[Command]:

@@ -6,6 +6,8 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
+from swarmctl.telemetry.plain import finite
+
 _ALLOWED = {  # of one topic of one peer, by one agent; other reasons are what a network or a restart does by itself
     "boot": 0,
     "sequence": 0,
@@ -44,11 +46,15 @@ def unheard(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         source, agent = str(event.get("source")), event["agent"]
         if event.get("begins"):
             count += 1
-            since_us[source, agent] = int(event.get("utc_us", 0))
+            since_us[source, agent] = _utc_us(event)
         elif since_us.pop((source, agent), None) is not None:
-            worst = max(worst, (float(event.get("lasted_s", 0.0)), agent, source), key=lambda item: item[0])
-    last_us = max((int(event.get("utc_us", 0)) for event in events), default=0)
+            worst = max(worst, (finite(event.get("lasted_s")) or 0.0, agent, source), key=lambda item: item[0])
+    last_us = max(map(_utc_us, events), default=0)
     for (source, agent), began_us in since_us.items():  # to the end
         worst = max(worst, ((last_us - began_us) * 1e-6, agent, source), key=lambda item: item[0])
     longest_s, agent_, by = worst
     return {"count": count, "longest_s": longest_s if count else None, "agent": agent_, "by": by}
+
+
+def _utc_us(event: Mapping[str, Any]) -> int:
+    return int(finite(event.get("utc_us")) or 0)

@@ -7,7 +7,12 @@ import pytest
 from swarmctl.config import load
 from tests.closed_loop.conftest import ROOT, Fly
 
-FLOWN_ELSEWHERE = {"swap8": "swap", "thesis_6_obstacle": "obstacle", "ardupilot_sitl": "arducopter"}  # and for longer
+FLOWN_ELSEWHERE = {  # and for longer
+    "swap8": "swap",
+    "thesis_6_obstacle": "obstacle",
+    "improved_6_obstacle": "obstacle",
+    "ardupilot_sitl": "arducopter",
+}
 FILES = sorted(path.name for path in (ROOT / "configs").glob("*.toml"))
 
 

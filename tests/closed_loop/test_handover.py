@@ -17,7 +17,7 @@ from swarmctl.config import load
 from swarmctl.control import sequence
 from swarmctl.control.sequence import REBOOTED, TAKEN_OVER, Sequence
 from swarmctl.core.types import FlightMode, Phase, VehicleState
-from swarmctl.links import autopilot
+from swarmctl.links import mode_watch
 from swarmctl.links.mavlink import Codec, frames, message_id
 from swarmctl.links.transport import PipeTransport
 from tests.closed_loop.conftest import Fly, mission_t_s
@@ -51,10 +51,11 @@ def test_who_is_told_to_land_at_speed_among_others_brakes_and_makes_room_first(f
 def test_control_an_autopilot_that_lands_at_speed_among_others_comes_too_close(
     fly: Fly, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def land_at_once(self: Sequence, verb: str, now_us: int, state: VehicleState) -> None:
-        self.outcome, self.phase, self._entered_us = "stopped", Phase.LAND, now_us
+    def land_at_once(self: Sequence, now_us: int, state: VehicleState) -> None:
+        if self._stop_verb:
+            self.outcome, self.phase, self._entered_us = "stopped", Phase.LAND, now_us
 
-    monkeypatch.setattr(Sequence, "_stop", land_at_once)
+    monkeypatch.setattr(Sequence, "_apply_stop", land_at_once)
     assert fly(*CROSSING, at=LAND_NOW).separation_m() < 0.75
 
 
@@ -135,7 +136,7 @@ def test_an_agent_that_slept_past_the_loss_takes_nothing_back() -> None:
 
 
 def test_control_without_doubting_the_mode_it_returns_to_offboard(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(autopilot, "_GAP_US", 10**12)
+    monkeypatch.setattr(mode_watch, "_GAP_US", 10**12)
     flight = asleep_past_the_loss()
     assert flight.setpoints_us
     assert flight.offboard_us
@@ -183,7 +184,7 @@ def test_after_a_reboot_in_flight_nothing_is_armed_again_and_the_outcome_says_wh
     since = flight.run.logs[0].events[asked_before:]
     verbs = [event["verb"] for event in since if event["event"] == "command"]
     assert not {"arm", "external", "takeoff"} & set(verbs)
-    assert {"rate", "param_int COM_OBL_RC_ACT", "message"} <= set(verbs), "the link is set up again"
+    assert {"rate", "param_int COM_OBL_RC_ACT", "message"} <= set(verbs), "set up again, or set back"
     assert (flight.agent.finished, flight.agent.outcome) == (True, REBOOTED)
 
 

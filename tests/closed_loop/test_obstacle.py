@@ -5,14 +5,16 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from tests.closed_loop.conftest import Flight, Fly, fly_now
+from swarmctl.core.types import Mode, Phase
+from tests.closed_loop.conftest import Flight, Fly, fly_now, mission_is_over
 
-CONFIG = "thesis_6_obstacle.toml"
+CONFIG, PUBLISHED = "improved_6_obstacle.toml", "thesis_6_obstacle.toml"
 
 
 @pytest.fixture(scope="module")
 def flight() -> Flight:
-    return fly_now(config=CONFIG)
+    """From the ground and home again, past the obstacle twice."""
+    return fly_now(config=PUBLISHED)
 
 
 def clearance_m(flight: Flight) -> float:
@@ -20,7 +22,19 @@ def clearance_m(flight: Flight) -> float:
     return float(np.linalg.norm(flight.pos_ned_m - center, axis=2).min())
 
 
-def test_everybody_keeps_clear_of_it_and_of_each_other(flight: Flight) -> None:
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_everybody_keeps_clear_of_it_and_of_each_other(fly: Fly, seed: int) -> None:
+    """Worst of starts 1 to 3, a millimetre off: 1.763 m and 0.908 m."""
+    past = fly("sitl.start=air", config=CONFIG, until=mission_is_over, seed=seed)
+    assert clearance_m(past) >= 1.75
+    assert past.separation_m() >= 0.89
+    for agent in range(3):
+        assert not past.ticks(agent)["barrier_acted"].any(), "the last layer is not needed for it"
+        assert past.modes(agent, Phase.TRACK) == {Mode.FOLLOW}
+
+
+def test_with_published_weights_everybody_keeps_clear_from_the_published_start_and_comes_home(flight: Flight) -> None:
+    """Without a weight on velocity they overshoot: from starts a millimetre off the worst of six is 1.64 m."""
     assert flight.problems == []
     assert clearance_m(flight) >= 1.70
     assert flight.separation_m() >= 0.85
@@ -37,5 +51,5 @@ def test_it_is_known_only_within_the_visibility_distance(flight: Flight) -> None
 
 
 def test_control_unseen_it_is_hit(fly: Fly) -> None:
-    blind = fly("obstacles.0.visibility_m=0.1", "mission.duration_s=6", config=CONFIG)  # hit after 4.4 s
+    blind = fly("obstacles.0.visibility_m=0.1", "mission.duration_s=6", config=PUBLISHED)  # hit after 4.4 s
     assert clearance_m(blind) < 1.0

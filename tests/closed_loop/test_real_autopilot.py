@@ -128,8 +128,8 @@ def test_three_vehicles_without_lag_and_dead_time_in_the_prediction_do_not() -> 
 
 def outcome(*overrides: str) -> tuple[str, bool]:
     """Why an agent ended, and whether anything was ever armed."""
-    flight = Lockstep(load(CONFIG, (*overrides, "mission.duration_s=1", "agent.sequence.start_timeout_s=11")))
-    while not flight.finished and flight.clock.now_us() < 12e6:
+    flight = Lockstep(load(CONFIG, (*overrides, "mission.duration_s=1", "agent.sequence.start_timeout_s=25")))
+    while not flight.finished and flight.clock.now_us() < 30e6:
         flight.step()
     assert flight.agents[0] is not None
     return flight.agents[0].outcome, bool(flight.truth["armed"].any())

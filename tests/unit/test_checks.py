@@ -42,8 +42,8 @@ PX4_VALUES: dict[str, float | int] = {
     "COM_RCL_EXCEPT": 0,
     "COM_RC_IN_MODE": 1,
     "NAV_RCL_ACT": 2,
-    "NAV_DLL_ACT": 3,
-    "COM_DL_LOSS_T": 5,
+    "NAV_DLL_ACT": 0,
+    "COM_DL_LOSS_T": 10,
     "MPC_THR_HOVER": 0.5,
     "THR_MDL_FAC": 0.0,
     "MAV_SYS_ID": 1,
@@ -202,8 +202,7 @@ PX4_CASES: list[tuple[str, dict[str, Any], Verdict, str]] = [
     ("COM_OBL_RC_ACT", {"parameters": parameters(PX4_VALUES, COM_OBL_RC_ACT=None)}, FIX, "no such parameter"),
     ("MAV_FWDEXTSP", {"parameters": parameters(PX4_VALUES, MAV_FWDEXTSP=0)}, FIX, "not flown"),
     ("COM_RCL_EXCEPT", {"parameters": parameters(PX4_VALUES, COM_RC_IN_MODE=0)}, FIX, "NAV_RCL_ACT = 2"),
-    ("NAV_DLL_ACT", {"parameters": parameters(PX4_VALUES, NAV_DLL_ACT=0)}, FIX, "hover for ever"),
-    ("COM_DL_LOSS_T", {"parameters": parameters(PX4_VALUES, COM_DL_LOSS_T=60)}, FIX, "hovers"),
+    ("NAV_DLL_ACT", {"parameters": parameters(PX4_VALUES, NAV_DLL_ACT=None)}, FIX, "can't be read"),
     ("MPC_THR_HOVER", {"parameters": parameters(PX4_VALUES, MPC_THR_HOVER=0.3)}, NOTE, "hover_thrust_01 = 0.3"),
     ("MAV_SYS_ID", {"parameters": parameters(PX4_VALUES, MAV_SYS_ID=9)}, FIX, "reboot"),
     ("THR_MDL_FAC", {"version": Version((1, 18, 0), "release", "", 50, "3a91", True, 0x3185)}, NOTE, "calibrate"),
@@ -370,7 +369,6 @@ def test_apply_sets_what_is_wrong_and_nothing_else(config: Config) -> None:
     assert changes(changed(HEALTHY, parameters=wrong), config) == {
         "COM_OBL_RC_ACT": 4,
         "COM_OF_LOSS_T": 0.5,
-        "NAV_DLL_ACT": 3,
         "MAV_FWDEXTSP": 1,
     }
     assert changes(HEALTHY, config) == {}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.metadata
 import io
 import re
+import signal
 import socket
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from swarmctl.core.types import FlightMode, Landed, Mode, Phase
 from swarmctl.errors import ConfigError, StartError, SwarmError
 from swarmctl.fault import inject, parse_fault
 from swarmctl.flight import why_it_failed
+from swarmctl.launch import Interrupts
 from swarmctl.links.bus import SCHEME
 from swarmctl.links.topics import StatusMessage
 from swarmctl.processes import Site, agent_commands, sitl_command, viewer_command
@@ -241,6 +243,22 @@ def test_a_summary_is_five_lines_even_when_almost_empty() -> None:
         assert len(lines) == 5
         assert lines[-1] == "run folder runs/x"
     assert "2 violations" in lines[0]
+
+
+def test_a_hangup_is_one_request_and_none_under_nohup() -> None:
+    """SIGHUP comes from the kernel and again from the shell; a second Ctrl-C is still a second one."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    try:
+        with Interrupts() as interrupts:
+            for signum, count in ((signal.SIGHUP, 1), (signal.SIGHUP, 1), (signal.SIGINT, 2), (signal.SIGHUP, 2)):
+                signal.raise_signal(signum)
+                assert interrupts.count == count
+        signal.raise_signal(signal.SIGHUP)  # while the run is judged
+        with Interrupts() as interrupts:  # from here on ignored, as nohup begins
+            signal.raise_signal(signal.SIGHUP)
+            assert interrupts.count == 0
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_every_violation_is_said() -> None:

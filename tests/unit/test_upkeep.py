@@ -201,8 +201,13 @@ def test_nothing_is_armed_when_a_parameter_that_is_there_could_not_be_set() -> N
 
 
 def test_px4_that_would_hover_for_ever_without_its_agent_is_refused() -> None:
-    assert "hover for ever" in Vehicle(NAV_DLL_ACT=0).set_up().run(4.0).upkeep.refusal
-    assert "COM_DL_LOSS_T = 60" in Vehicle(COM_DL_LOSS_T=60).set_up().run(4.0).upkeep.refusal
+    assert "hover for ever" in Vehicle().set_up(NAV_DLL_ACT=0).run(4.0).upkeep.refusal
+    assert "COM_DL_LOSS_T = 60" in Vehicle().set_up(COM_DL_LOSS_T=60).run(4.0).upkeep.refusal
+    stubborn = Vehicle(NAV_DLL_ACT=0)
+    stubborn.read_only = True
+    assert "NAV_DLL_ACT could not be set to 3" in stubborn.set_up().run(4.0).upkeep.refusal
+    vehicle = Vehicle(NAV_DLL_ACT=0, COM_DL_LOSS_T=60).set_up().run(4.0)
+    assert (vehicle.params["NAV_DLL_ACT"], vehicle.params["COM_DL_LOSS_T"], vehicle.upkeep.refusal) == (3, 5, "")
 
 
 @pytest.mark.parametrize(
