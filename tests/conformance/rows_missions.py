@@ -92,7 +92,7 @@ def upload(items: tuple[Item, ...], kind: int = 0) -> tuple[Step, ...]:
     """Announced, asked for one by one, acknowledged."""
     steps: list[Step] = [addressed("MISSION_COUNT", count=len(items), mission_type=kind)]
     for seq, what in enumerate(items):
-        steps += [sees("MISSION_REQUEST_INT", seq=seq, mission_type=kind), item(seq, what)]
+        steps += [sees("MISSION_REQUEST_INT", 1.5, seq=seq, mission_type=kind), item(seq, what)]
     return *steps, sees("MISSION_ACK", type=ACCEPTED_MISSION, mission_type=kind)
 
 
