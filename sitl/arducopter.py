@@ -252,7 +252,8 @@ class ArduCopter:
         if not z_m < estimate.pos_ned_m[2]:  # not up, or not a number
             return Result.FAILED
         self._takeoff_z_m, self._takeoff_reached = z_m, False
-        self._enter_guided(Guided.TAKEOFF)
+        if self.guided is not Guided.TAKEOFF:  # asked again while motors spin up, it goes on
+            self._enter_guided(Guided.TAKEOFF)
         return Result.ACCEPTED
 
     def gcs_heard(self, now_us: int) -> None:
@@ -300,7 +301,8 @@ class ArduCopter:
             self._disarm()
             return
         if self._ground.landed and not self._lifts_off(now_us):
-            self.output, self.throttle_in_01 = IDLE, 0.0
+            self.throttle_in_01 = self._ground.takeoff_throttle_01(now_us) if self._takes_off() else 0.0
+            self.output = Command(IDLE.q_nb, self.throttle_in_01) if self.throttle_in_01 else IDLE
             return
         self._put_out(*self._fliers[self.mode](estimate, dt_s))
 
@@ -333,7 +335,7 @@ class ArduCopter:
         )
         if not asked:
             self._ground.stay()
-        if not asked or not self._ground.lifts_off(now_us):
+        if not asked or not self._ground.lifts_off(now_us, slowly=self.guided is Guided.TAKEOFF):
             return False
         self._engage()
         return True

@@ -8,6 +8,8 @@ from sitl.sensors import Estimate
 LANDED_AFTER_US = 1_000_000  # continuous ground contact at low throttle
 LANDED_THROTTLE = 0.5  # of hover
 ARMING_DELAY_US = 2_000_000  # before motors spin up
+TAKEOFF_SLEW_1_S = 0.5  # throttle of NAV_TAKEOFF once they have: TKOFF_SLEW_TIME of 2 s
+LIFTS_AT = 0.95  # of hover
 
 
 class Ground:
@@ -25,6 +27,7 @@ class Ground:
     def __init__(self, parameters: CopterParameters, hover_01: float, everywhere_air: bool) -> None:
         self._parameters = parameters
         self._low_01 = LANDED_THROTTLE * hover_01
+        self._lifting_01 = LIFTS_AT * hover_01
         self._everywhere_air = everywhere_air
         self.landed = not everywhere_air
         self._contact_us: int | None = None
@@ -56,12 +59,24 @@ class Ground:
         elif not self.landed and now_us - self._contact_us >= LANDED_AFTER_US:
             self.landed, self._quiet_us, self._rising_us = True, now_us, None
 
-    def lifts_off(self, now_us: int) -> bool:
-        """A take-off is asked for: whether the motors have spun up for it. True once, then `landed` is over."""
+    def takeoff_throttle_01(self, now_us: int) -> float:
+        """Of a NAV_TAKEOFF that is still on the ground: 0 while motors spin up, then rising."""
+        if self._rising_us is None:
+            return 0.0
+        since_s = (now_us - self._rising_us) * 1e-6 - self._parameters.real("MOT_SPOOL_TIME")
+        return max(0.0, since_s * TAKEOFF_SLEW_1_S)
+
+    def lifts_off(self, now_us: int, *, slowly: bool) -> bool:
+        """A take-off is asked for: whether the motors have spun up for it. True once, then `landed` is over.
+
+        `slowly`: NAV_TAKEOFF raises the throttle first; a setpoint is flown as it is.
+        """
         self._quiet_us = now_us
         if self._rising_us is None:
             self._rising_us = max(now_us, self._armed_us + ARMING_DELAY_US)
         if now_us - self._rising_us < self._parameters.real("MOT_SPOOL_TIME") * 1e6:
+            return False
+        if slowly and self.takeoff_throttle_01(now_us) < self._lifting_01:
             return False
         self.landed, self._contact_us, self._rising_us = False, None, None
         return True

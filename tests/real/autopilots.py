@@ -46,6 +46,7 @@ class Kind:
         spread: instance i has port + spread * i.
         command: binary and start to command line.
         environment: what it is told by environment variables.
+        lock_name: of a file in /tmp by which it runs once on a machine, whatever the network; {} is the instance.
     """
 
     variable: str
@@ -54,12 +55,16 @@ class Kind:
     spread: int
     command: Callable[[Path, Start], list[str]]
     environment: Callable[[Start], dict[str, str]] = field(default=lambda start: {})
+    lock_name: str = ""
 
     @property
     def binary(self) -> Path | None:
         """The build to test with, if there is one."""
         given = os.environ.get(self.variable, "")
         return Path(given).expanduser().absolute() if given else None
+
+    def locks(self, count: int) -> list[Path]:
+        return [Path("/tmp") / self.lock_name.format(i) for i in range(count)] if self.lock_name else []
 
     def place(self, index: int, count: int, folder: Path, parameters: Mapping[str, float] | None = None) -> Start:
         """Where the vehicle of that index stands among so many."""
@@ -114,6 +119,7 @@ PX4 = Kind(
     1,
     _px4_command,
     _px4_environment,
+    "px4_lock-{}",
 )
 ARDUCOPTER = Kind("SWARMCTL_ARDUCOPTER", GeoOrigin(-35.363262, 149.165237, 584.0), (14550,), 10, _arducopter_command)
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import fcntl
 import shutil
 import tempfile
 from collections.abc import Callable, Iterator
@@ -89,3 +90,18 @@ def require(kind: Kind, network: Network, count: int) -> None:
     taken = network.taken(port + kind.spread * i for port in kind.ports for i in range(count))
     if taken:
         pytest.skip(f"ports {taken} are taken; run as root for a network of its own")
+    running = [lock for lock in kind.locks(count) if held(lock)]
+    if running:
+        pytest.skip(f"somebody else's autopilot runs and holds {', '.join(map(str, running))}")
+
+
+def held(lock: Path) -> bool:
+    """Whether a process has locked that file."""
+    if not lock.exists():
+        return False
+    with lock.open("r+b") as file:
+        try:
+            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            return True
+    return False

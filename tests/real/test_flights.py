@@ -20,6 +20,7 @@ pytestmark = [pytest.mark.process, pytest.mark.timeout(900)]
 PX4_CONFIG, ARDUPILOT_CONFIG = "configs/px4_udp.toml", "configs/ardupilot_udp.toml"
 LONE_PX4 = ("--set", "swarm.agents=1", "--set", 'vehicles=[{sysid=1, url="udpin://127.0.0.1:14540"}]')
 END_S = 240.0
+PLACED_S = 120.0
 BODIES_M = 0.65  # tip to tip
 GROUND_S = 40.0  # from the end of a launch until the last vehicle has disarmed itself
 THREE_ARDUCOPTERS = str(Path(__file__).with_name("three_arducopters.toml"))
@@ -69,15 +70,22 @@ def test_three_px4_fly_the_shipped_mission(field: Fielder) -> None:
     assert here.witness.min_separation_m() > BODIES_M
 
 
+def booted(field: Fielder, count: int) -> Field:
+    """ArduCopters that know where they are: it takes their filters up to a minute to use GPS."""
+    here = field(ARDUCOPTER, count)
+    here.witness.wait(here.witness.all_placed, PLACED_S, "a position")
+    return here
+
+
 def test_a_lone_arducopter_hovers_as_shipped(field: Fielder) -> None:
-    here = field(ARDUCOPTER, 1)
+    here = booted(field, 1)
     launched = flown(here, ARDUPILOT_CONFIG)
     assert launched.summary()["tracking"]["agents"][0]["steady_rmse_m"] < 0.1
     assert true_rmse_m(launched, here.witness.vehicles[0]) < 0.3
 
 
 def test_three_arducopters_fly_a_circle_close_together(field: Fielder) -> None:
-    here = field(ARDUCOPTER, 3)
+    here = booted(field, 3)
     summary = flown(here, THREE_ARDUCOPTERS).summary()
     assert summary["violations"] == []
     assert summary["tracking"]["index_after_10s_m"] < 1.75
@@ -85,6 +93,6 @@ def test_three_arducopters_fly_a_circle_close_together(field: Fielder) -> None:
 
 
 def test_a_second_launch_flies_the_same_arducopters(field: Fielder) -> None:
-    here = field(ARDUCOPTER, 1)
+    here = booted(field, 1)
     for _ in range(2):
         flown(here, ARDUPILOT_CONFIG, "--duration", "8")

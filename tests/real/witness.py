@@ -7,6 +7,7 @@ ArduCopter has a second serial port on TCP. It is also the ground station by whi
 from __future__ import annotations
 
 import contextlib
+import itertools
 import socket
 import threading
 import time
@@ -30,7 +31,11 @@ MAX_DATAGRAM = 4096
 CONNECT_S = 0.2
 PAUSE_S = 0.004
 ASK_EVERY_S = 2.0
-TRUTH_EVERY_US = 40_000
+# ArduCopter sends nothing unasked [us].
+ASKED_US = {
+    mav.MAVLINK_MSG_ID_SIM_STATE: 40_000,
+    mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 1_000_000,
+}
 GRID_S = 0.04
 
 
@@ -50,6 +55,7 @@ class Seen:
     t_s: list[float] = field(default_factory=list)
     pos_ned_m: list[tuple[float, float, float]] = field(default_factory=list)  # about the origin
     beats: list[tuple[float, bool, int]] = field(default_factory=list)  # time, armed, custom_mode
+    placed: bool = False  # its filter has a position
 
     @property
     def armed(self) -> bool:
@@ -176,6 +182,9 @@ class Witness:
             assert time.monotonic() < deadline_s, f"not within {limit_s:g} s: {what}"
             time.sleep(0.05)
 
+    def all_placed(self) -> bool:
+        return all(vehicle.placed for vehicle in self.vehicles)
+
     def all_rest(self) -> bool:
         """Every vehicle is disarmed, and where it is on the ground."""
         return all(vehicle.pos_ned_m and not vehicle.armed and vehicle.height_m() < 0.3 for vehicle in self.vehicles)
@@ -194,8 +203,8 @@ class Witness:
             now_s = time.monotonic()
             if self._fleet.kind is ARDUCOPTER and now_s - asked_s > ASK_EVERY_S:
                 asked_s = now_s
-                for index in range(self._fleet.count):  # it tells its simulator's state only when asked
-                    self.command(index, mav.MAV_CMD_SET_MESSAGE_INTERVAL, mav.MAVLINK_MSG_ID_SIM_STATE, TRUTH_EVERY_US)
+                for index, (number, every_us) in itertools.product(range(self._fleet.count), ASKED_US.items()):
+                    self.command(index, mav.MAV_CMD_SET_MESSAGE_INTERVAL, number, every_us)
             for link in self._links:
                 for frame in link.frames():
                     self._note(frame, now_s)
@@ -210,6 +219,8 @@ class Witness:
             message = self._codec.decode(frame)
             if message is not None:
                 seen.beats.append((t_s, bool(message.base_mode & ARMED_FLAG), message.custom_mode))
+        elif number == mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED:
+            seen.placed = True
         elif number in TRUTH_MESSAGES:
             message = self._codec.decode(frame)
             if message is not None:
