@@ -99,7 +99,7 @@ def vehicles(config: Path | None, folder: Path, witness_port: int) -> Iterator[P
     path = folder / "stops.toml"
     path.write_text("\n".join(lines) + "\n", encoding="utf-8")
     argv = [sys.executable, "-m", "sitl", "--vehicles", f"{AGENTS}", "--gcs-port", f"{witness_port}"]
-    argv += ["--remote-ports", ",".join(map(str, ports)), "--local-port", f"{free_ports(1)[0]}"]
+    argv += ["--remote-ports", ",".join(map(str, ports)), "--local-port", f"{free_ports(1)[0]}", "--die-with-parent"]
     simulator = subprocess.Popen(argv, stdout=subprocess.DEVNULL, stderr=subprocess.STDOUT)
     try:
         yield path
