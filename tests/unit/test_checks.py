@@ -14,7 +14,7 @@ import pytest
 from swarmctl.checks.change import Change
 from swarmctl.checks.finding import SWARM, Finding, Verdict, worst_first
 from swarmctl.checks.parameters import RC_RECEIVER, ROWS, changes, names_to_read, unchangeable
-from swarmctl.checks.swarm import exit_code, findings
+from swarmctl.checks.swarm import exit_code, findings, standing
 from swarmctl.checks.table import as_json, print_check
 from swarmctl.config import Config, load
 from swarmctl.core.types import FlightMode, Landed
@@ -400,3 +400,18 @@ def test_the_json_is_json_and_the_table_one_line_a_row(
     assert sum(line.startswith("agent-0\t") for line in printed) == len(lines)
     assert "agent-0 COM_OBL_RC_ACT: 0 -> 4" in printed
     assert printed[-1] == "1 of 1 vehicles reached, nothing to fix, 0 to know"
+
+
+@pytest.mark.parametrize(
+    ("facts", "found"),
+    [
+        (HEALTHY, []),
+        (dataclasses.replace(HEALTHY, armed=True), ["armed"]),
+        (dataclasses.replace(HEALTHY, landed=Landed.IN_AIR), ["in_air"]),
+        (unreached(0, URLS[0], 1, "no heartbeat"), ["unknown"]),
+    ],
+)
+def test_who_does_not_stand_disarmed_may_not_be_flown(facts: VehicleFacts, found: list[str]) -> None:
+    lines = standing([facts])
+    assert [line.found for line in lines] == found
+    assert exit_code([facts], lines) == (0 if not found else 3 if facts.unreachable else 4)
