@@ -32,6 +32,7 @@ _LEAST_S = 10.0
 _LEAST_TILT = 0.03  # rms; of less the estimator's own errors are a large part
 _BLOCK_S = 2.0  # residuals farther apart are taken to be independent
 _WINDOW_S = 1.5
+_THRUST_DELAYS_S = np.arange(0.0, 0.21, 0.01)
 _CONFIDENCE = 0.95
 _ITERATIONS = 30
 _FIRST = (0.06, 10.0, 1.0)  # delay, natural frequency, damping
@@ -115,8 +116,7 @@ def identify(flight: Flown) -> Identified | str:
     if isinstance(attitude, str):
         return attitude
     delay, natural, damping = attitude
-    thrust_01, pos, down = _on_grid(flight, delay.value)
-    inverse_hover = _fit_vertical(thrust_01, pos, down)
+    inverse_hover, thrust_01, pos, down = _fit_vertical(flight)
     hover = Figure(*(1.0 / k for k in (inverse_hover.value, inverse_hover.high, inverse_hover.low)))
     drag = _fit_drag(thrust_01, pos, down, inverse_hover.value)
     found = Identified(delay, natural, damping, drag, hover)
@@ -193,10 +193,20 @@ def _on_grid(flight: Flown, delay_s: float) -> tuple[Array, Array, Array]:
     return flight.sent_thrust_01[np.maximum(held, 0)], pos, down
 
 
-def _fit_vertical(thrust_01: Array, pos: Array, down: Array) -> Figure:
-    """1 / hover thrust; vertical drag is fitted beside it and forgotten."""
-    accel, drag, force, blocks = _windows(-GRAVITY_M_S2 * thrust_01 * down[:, 2], pos[:, 2])
-    return _regress(np.column_stack([force, drag])[:, None, :], (accel - GRAVITY_M_S2)[:, None], blocks)
+def _fit_vertical(flight: Flown) -> tuple[Figure, Array, Array, Array]:
+    """1 / hover thrust, with what `_on_grid` gives; vertical drag is fitted beside it and forgotten.
+
+    Thrust has a dead time of its own, motors included: the one that leaves least unexplained.
+    """
+    tried = []
+    for delay_s in _THRUST_DELAYS_S:
+        thrust_01, pos, down = _on_grid(flight, float(delay_s))
+        accel, drag, force, blocks = _windows(-GRAVITY_M_S2 * thrust_01 * down[:, 2], pos[:, 2])
+        rows, left = np.column_stack([force, drag]), accel - GRAVITY_M_S2
+        missed = left - rows @ np.linalg.lstsq(rows, left, rcond=None)[0]
+        tried.append((float(missed @ missed), len(tried), rows, left, blocks, (thrust_01, pos, down)))
+    _, _, rows, left, blocks, motion = min(tried, key=lambda one: one[:2])
+    return _regress(rows[:, None, :], left[:, None], blocks), *motion
 
 
 def _fit_drag(thrust_01: Array, pos: Array, down: Array, inverse_hover: float) -> Figure:
