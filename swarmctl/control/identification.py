@@ -198,15 +198,17 @@ def _fit_vertical(flight: Flown) -> tuple[Figure, Array, Array, Array]:
 
     Thrust has a dead time of its own, motors included: the one that leaves least unexplained.
     """
-    tried = []
-    for delay_s in _THRUST_DELAYS_S:
-        thrust_01, pos, down = _on_grid(flight, float(delay_s))
-        accel, drag, force, blocks = _windows(-GRAVITY_M_S2 * thrust_01 * down[:, 2], pos[:, 2])
-        rows, left = np.column_stack([force, drag]), accel - GRAVITY_M_S2
-        missed = left - rows @ np.linalg.lstsq(rows, left, rcond=None)[0]
-        tried.append((float(missed @ missed), len(tried), rows, left, blocks, (thrust_01, pos, down)))
-    _, _, rows, left, blocks, motion = min(tried, key=lambda one: one[:2])
-    return _regress(rows[:, None, :], left[:, None], blocks), *motion
+    motions = [_on_grid(flight, float(delay_s)) for delay_s in _THRUST_DELAYS_S]
+    fits = [_vertical_rows(*motion) for motion in motions]
+    missed = [left - rows @ np.linalg.lstsq(rows, left, rcond=None)[0] for rows, left, _ in fits]
+    best = int(np.argmin([m @ m for m in missed]))
+    rows, left, blocks = fits[best]
+    return _regress(rows[:, None, :], left[:, None], blocks), *motions[best]
+
+
+def _vertical_rows(thrust_01: Array, pos: Array, down: Array) -> tuple[Array, Array, NDArray[np.int64]]:
+    accel, drag, force, blocks = _windows(-GRAVITY_M_S2 * thrust_01 * down[:, 2], pos[:, 2])
+    return np.column_stack([force, drag]), accel - GRAVITY_M_S2, blocks
 
 
 def _fit_drag(thrust_01: Array, pos: Array, down: Array, inverse_hover: float) -> Figure:

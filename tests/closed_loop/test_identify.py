@@ -47,16 +47,14 @@ def found(seed: int) -> Identified:
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_drag_and_hover_thrust_are_found_whatever_the_estimators_errors(seed: int) -> None:
-    assert found(seed).drag_1_s.value == pytest.approx(DRAG_1_S, rel=0.05)
-    assert found(seed).hover_thrust_01.value == pytest.approx(HOVER_01, rel=0.005)
+    assert found(seed).drag_1_s.value == pytest.approx(DRAG_1_S, rel=0.02)
+    assert found(seed).hover_thrust_01.value == pytest.approx(HOVER_01, rel=0.003)
 
 
-def test_their_intervals_hold_the_truth_and_are_narrow() -> None:
-    drag, hover = [found(seed).drag_1_s for seed in SEEDS], [found(seed).hover_thrust_01 for seed in SEEDS]
+def test_the_interval_of_drag_holds_the_truth_and_is_narrow() -> None:
+    drag = [found(seed).drag_1_s for seed in SEEDS]
     assert sum(f.low <= DRAG_1_S <= f.high for f in drag) >= len(SEEDS) - 1
-    assert sum(f.low <= HOVER_01 <= f.high for f in hover) >= len(SEEDS) - 1
-    assert max(f.high - f.low for f in drag) < 0.15
-    assert max(f.high - f.low for f in hover) < 0.01
+    assert max(f.high - f.low for f in drag) < 0.05
 
 
 def circle_rmse_m(*overrides: str) -> float:
