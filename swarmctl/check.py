@@ -18,7 +18,7 @@ from types import FrameType
 
 from swarmctl.checks.change import Change
 from swarmctl.checks.parameters import Number, changes, names_to_read, unchangeable
-from swarmctl.checks.swarm import exit_code, findings
+from swarmctl.checks.swarm import exit_code, findings, standing
 from swarmctl.checks.table import as_json, print_check
 from swarmctl.config import Config
 from swarmctl.core.types import GeoOrigin
@@ -48,6 +48,7 @@ class CheckOptions:
     seconds: float = 3.0  # to listen to every vehicle, after its first heartbeat
     json: Path | None = None
     connect_s: float = _CONNECT_S
+    to_fly: bool = False  # who is armed already is not for us to fly
 
 
 def check(config: Config, options: CheckOptions) -> int:
@@ -59,6 +60,8 @@ def check(config: Config, options: CheckOptions) -> int:
     with _interruptible(), _field(config, options) as field:
         vehicles, changed = _ask(config, options, field)
     lines = findings(vehicles, config) + [change.finding() for change in changed if not change.done]
+    if options.to_fly:
+        lines += standing(vehicles)
     code = exit_code(vehicles, lines)
     print_check(vehicles, lines, changed)
     if options.json is not None:

@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 import typer
 
 from swarmctl.core.text import printable_lines
-from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, SwarmError
+from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, ConfigError, SwarmError
 
 if TYPE_CHECKING:
     from swarmctl.links.topics import ObstaclesMessage, StatusMessage
@@ -116,13 +116,26 @@ def check(
     ] = False,
     seconds: Annotated[float, typer.Option("--seconds", min=1.0, max=600.0, help="Listen to each vehicle [s].")] = 3.0,
     json: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write everything found, too.")] = None,
+    identify: Annotated[
+        bool, typer.Option("--identify", help="Then FLY: steps about the start; identify delay, lag, drag, thrust.")
+    ] = False,
+    write: Annotated[
+        Path | None, typer.Option("--write", metavar="FILE", help="With --identify: the vehicle model as TOML.")
+    ] = None,
 ) -> int:
     """Ask every vehicle and say what to fix. Exit 0: nothing; 3: one is not reached; 4: something."""
     from swarmctl.check import CheckOptions
     from swarmctl.check import check as ask
     from swarmctl.config import load
 
-    return ask(load(config, _overrides(agents, None, None, sets)), CheckOptions(apply, seconds, json))
+    if write is not None and not identify:
+        raise ConfigError("--write", ["there is nothing to write without --identify"])
+    asked, options = load(config, _overrides(agents, None, None, sets)), CheckOptions(apply, seconds, json)
+    if not identify:
+        return ask(asked, options)
+    from swarmctl.identify import IdentifyOptions, check_and_identify
+
+    return check_and_identify(asked, IdentifyOptions(options, write))
 
 
 @app.command()

@@ -250,7 +250,7 @@ def _opinions(facts: VehicleFacts, config: Config) -> dict[str, Opinion]:
 def _opinion(name: str, facts: VehicleFacts, config: Config, rule: Rule | None, row: Row | None) -> Opinion:
     value = facts.number(name)
     if name in config.agent.autopilot_params:
-        return _as_configured(name, facts, config, rule, row)
+        return _as_configured(name, facts, config, rule)
     if value is not None and name in DIALECTS[facts.autopilot_number].given:
         return _ok("set by the agent for its flight")
     if value is None:
@@ -264,7 +264,7 @@ def _opinion(name: str, facts: VehicleFacts, config: Config, rule: Rule | None, 
     return replace(judged, verdict=Verdict.FIX, advice=broken) if broken else judged
 
 
-def _as_configured(name: str, facts: VehicleFacts, config: Config, rule: Rule | None, row: Row | None) -> Opinion:
+def _as_configured(name: str, facts: VehicleFacts, config: Config, rule: Rule | None) -> Opinion:
     value, want = facts.number(name), config.agent.autopilot_params[name]
     wanted = f"{want:g} (agent.autopilot_params)"
     broken = "" if rule is None else rule.problem(want)
@@ -275,10 +275,7 @@ def _as_configured(name: str, facts: VehicleFacts, config: Config, rule: Rule | 
         return Opinion(Verdict.NOTE if rule is None else Verdict.FIX, wanted, advice)
     if math.isclose(value, want, rel_tol=1e-6, abs_tol=1e-9):
         return _ok(wanted)
-    if config.sitl.enabled:
-        return Opinion(Verdict.NOTE, wanted, "this simulator starts anew each time, and the agent sets it", want)
-    judged = None if row is None else row.judge(value, facts, config).advice
-    return Opinion(Verdict.FIX, wanted, f"{judged or 'agents count on it'}; --apply sets {want:g}", want)
+    return Opinion(Verdict.NOTE, wanted, f"the agent sets it for its flight; --apply sets {want:g} for good", want)
 
 
 def _finding(facts: VehicleFacts, name: str, opinion: Opinion) -> Finding:

@@ -34,6 +34,16 @@ def exit_code(vehicles: Sequence[VehicleFacts], lines: Sequence[Finding]) -> int
     return EXIT_MISSION if any(line.verdict is FIX for line in lines) else EXIT_OK
 
 
+def standing(vehicles: Sequence[VehicleFacts]) -> list[Finding]:
+    """Who may not be flown from here on: armed, in the air, or never told where."""
+    advice = "somebody else flies it, or has left it armed: land and disarm it first"
+    return [
+        Finding(facts.agent, "to fly", FIX, "armed" if facts.armed else facts.landed.name.lower(), "on ground", advice)
+        for facts in vehicles
+        if facts.armed or facts.landed is not Landed.ON_GROUND
+    ]
+
+
 def _own(facts: VehicleFacts, config: Config) -> list[Finding]:
     return [*_start(facts, config), *parameter_findings(facts, config)]
 

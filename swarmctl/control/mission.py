@@ -17,6 +17,9 @@ from swarmctl.control.standoff import places_ned_m
 from swarmctl.core.params import Params, Vec3
 from swarmctl.core.types import Array
 
+_TO_AND_FRO = np.array(
+    [(1, 0, 0), (0, 0, 0), (-1, 0, 0), (0, 0, 0), (0, 1, 0), (0, 0, 0), (0, -1, 0), (0, 0, 0), (0, 0, -1), (0, 0, 0)]
+)
 OUTWARD_S_M = 0.5  # how much later places of one goal are reached that are farther from it
 Waypoint = Annotated[tuple[float, float, float, float], Field(strict=False)]
 
@@ -58,10 +61,31 @@ class GotoParams(Params):
     standoff: bool = True  # goals too close to each other become an arrangement round them
 
 
+class IdentifyParams(Params):
+    """Steps about the own start, to and fro along each axis: what `swarmctl check --identify` flies."""
+
+    step_m: float = Field(2.0, gt=0.1, le=20)  # north, south, east, west
+    climb_m: float = Field(0.5, ge=0, le=20)
+    hold_s: float = Field(2.5, ge=0.5, le=30)  # before the next step
+    repeats: int = Field(2, ge=1, le=20)
+    distance_max_m: float = Field(5.0, gt=0.1, le=100)  # farther from the start, or faster, it stops and lands
+    speed_max_m_s: float = Field(5.0, gt=0.1, le=30)
+
+    @property
+    def duration_s(self) -> float:
+        """Of all steps, and a hover behind them."""
+        return self.hold_s * (self.repeats * len(_TO_AND_FRO) + 1)
+
+    def rows(self) -> Array:
+        """Steps (R, 4): from when, and where relative to the start."""
+        places = np.tile(_TO_AND_FRO, (self.repeats, 1)) * (self.step_m, self.step_m, self.climb_m)
+        return np.column_stack([self.hold_s * np.arange(1, len(places) + 1), places])
+
+
 class MissionParams(Params):
     """What is flown between start and landing."""
 
-    kind: Literal["hover", "circle", "line", "steps", "swap", "goto"] = "circle"
+    kind: Literal["hover", "circle", "line", "steps", "swap", "goto", "identify"] = "circle"
     duration_s: float = Field(37.7, gt=0, le=36000)
     yaw_rad: float = Field(0.0, ge=-3.1416, le=3.1416)
     circle: CircleParams = CircleParams()
@@ -69,6 +93,7 @@ class MissionParams(Params):
     steps: StepsParams = StepsParams()
     swap: SwapParams = SwapParams()
     goto: GotoParams = GotoParams()
+    identify: IdentifyParams = IdentifyParams()
 
     def problems(self, agents: int) -> Iterator[str]:
         """What no single key can tell."""
@@ -77,6 +102,12 @@ class MissionParams(Params):
             yield f"mission.steps.rows: times {times} must be given, in increasing order"
         if self.kind == "swap" and agents < 2:
             yield f"mission.kind = 'swap' with swarm.agents = {agents}: a swap needs at least 2"
+        own = self.identify
+        if self.kind == "identify" and own.distance_max_m < 1.5 * own.step_m:
+            yield (
+                f"mission.identify.distance_max_m = {own.distance_max_m}: less than 1.5 times step_m = {own.step_m}; "
+                "an overshoot would end the flight. Raise it or lower step_m"
+            )
         goals = len(self.goto.goals_ned_m)
         if self.kind == "goto" and goals not in (1, agents):
             yield f"mission.goto.goals_ned_m: {goals} goals for swarm.agents = {agents}; list one each, or one for all"
@@ -108,6 +139,7 @@ class MissionReference:
             "steps": self._steps,
             "swap": self._swap,
             "goto": self._goto,
+            "identify": self._identify,
         }
         pos, vel = shapes[self._params.kind](np.maximum(t_s, 0.0))
         vel[t_s < 0.0] = 0.0
@@ -129,9 +161,7 @@ class MissionReference:
         return np.array(self._params.line.origin_ned_m) + t_s[:, None] * velocity, np.tile(velocity, (len(t_s), 1))
 
     def _steps(self, t_s: Array) -> tuple[Array, Array]:
-        rows = np.array(self._params.steps.rows)  # (rows, 4)
-        index = np.maximum(np.searchsorted(rows[:, 0], t_s + 1e-9, side="right") - 1, 0)
-        return rows[index, 1:], np.zeros((len(t_s), 3))
+        return _held(np.array(self._params.steps.rows), t_s), np.zeros((len(t_s), 3))
 
     def _swap(self, t_s: Array) -> tuple[Array, Array]:
         glide = Glide(self._start, np.zeros(3), self._opposite, self._params.swap.travel_s)
@@ -139,6 +169,28 @@ class MissionReference:
 
     def _goto(self, t_s: Array) -> tuple[Array, Array]:
         return self._way.sample(t_s)
+
+    def _identify(self, t_s: Array) -> tuple[Array, Array]:
+        rows = np.concatenate([np.zeros((1, 4)), self._params.identify.rows()])
+        return self._start + _held(rows, t_s), np.zeros((len(t_s), 3))
+
+    def excess(self, pos_ned_m: Array, vel_ned_m_s: Array) -> str:
+        """Why an identification flight must end, or "": its vehicle is flown by figures that may be wrong."""
+        if self._params.kind != "identify":
+            return ""
+        p, away_m, speed_m_s = self._params.identify, math.dist(pos_ned_m, self._start), math.hypot(*vel_ned_m_s)
+        if away_m > p.distance_max_m:
+            return f"{away_m:.1f} m from its start; mission.identify.distance_max_m is {p.distance_max_m:g}"
+        if speed_m_s > p.speed_max_m_s:
+            return f"{speed_m_s:.1f} m/s fast; mission.identify.speed_max_m_s is {p.speed_max_m_s:g}"
+        return ""
+
+
+def _held(rows: Array, t_s: Array) -> Array:
+    """Positions (K, 3) at times (K,) of steps (R, 4)."""
+    index = np.maximum(np.searchsorted(rows[:, 0], t_s + 1e-9, side="right") - 1, 0)
+    held: Array = rows[index, 1:]
+    return held
 
 
 def _ways(params: GotoParams, starts_ned_m: Array, apart_m: float) -> list[Glide]:

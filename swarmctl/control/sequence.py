@@ -361,6 +361,9 @@ class Sequence:
         assert self.begin_utc_us is not None
         if not self.had_control:
             return self._ask_for_control(facts, state)
+        if excess := self._reference.excess(state.pos_ned_m, state.vel_ned_m_s):
+            self._give_up(excess, facts, state)
+            return []
         if facts.utc_us - self.begin_utc_us >= self._duration_us and not (self.held or self.waiting):
             self.outcome = self.outcome or "completed"
             if self._airborne and not facts.peers:

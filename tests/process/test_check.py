@@ -104,12 +104,14 @@ Check = Callable[..., tuple[int, dict[str, Any], str]]
 def run_check(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Check:
     """Check vehicles (system id, port) as configured; exit code, JSON and what was printed."""
 
-    def run(*vehicles: tuple[int, int], apply: bool = False, more: str = "") -> tuple[int, dict[str, Any], str]:
+    def run(
+        *vehicles: tuple[int, int], apply: bool = False, more: str = "", to_fly: bool = False
+    ) -> tuple[int, dict[str, Any], str]:
         text = f"[swarm]\nagents={len(vehicles)}\n[start]\ncenter_ned_m=[0.0,0.0,-2.0]\n[sitl]\nenabled=false\n"
         text += "".join(f'[[vehicles]]\nsysid={sysid}\nurl="udpin://127.0.0.1:{port}"\n' for sysid, port in vehicles)
         path = tmp_path / "check.toml"
         path.write_text(text + more)
-        code = check(load(path), CheckOptions(apply, QUICK_S, tmp_path / "check.json", connect_s=1.5))
+        code = check(load(path), CheckOptions(apply, QUICK_S, tmp_path / "check.json", 1.5, to_fly))
         return code, json.loads((tmp_path / "check.json").read_text()), capsys.readouterr().out
 
     return run
@@ -165,9 +167,9 @@ class Pilot:
 def test_a_wrong_parameter_is_found_applied_and_then_nothing_is_left(simulators: Simulators, run_check: Check) -> None:
     vehicles = list(enumerate(simulators[0].ports, 1))
     code, found, printed = run_check(*vehicles)
-    assert code == 4
-    assert verdict(found, "COM_OBL_RC_ACT") == verdict(found, "COM_OBL_RC_ACT", 1) == "FIX"
-    assert "fix  agent-0, agent-1 COM_OBL_RC_ACT: 0" in printed
+    assert code == 0
+    assert verdict(found, "COM_OBL_RC_ACT") == verdict(found, "COM_OBL_RC_ACT", 1) == "NOTE"
+    assert "note agent-0, agent-1 COM_OBL_RC_ACT: 0" in printed, "agents set it for their flight"
     facts = found["vehicles"][0]
     assert (facts["autopilot"], facts["sysid"], facts["mode"], facts["landed"]) == ("PX4", 1, "HOLD", "ON_GROUND")
     assert facts["link"]["round_trip"]["answers"] > 10
@@ -229,6 +231,9 @@ def test_an_armed_vehicle_is_reported_and_left_alone(simulators: Simulators, run
     assert verdict(found, "state") == "NOTE"
     assert {(c["done"], c["refused"]) for c in found["changes"]} == {(False, "it is armed")}
     assert "not changed to 4 (it is armed)" in printed
+    assert not any(line["topic"] == "to fly" for line in found["findings"])
+    _, found, _ = run_check((1, port), to_fly=True)
+    assert verdict(found, "to fly") == "FIX"
     with Pilot(port) as pilot:
         assert pilot.armed()
         assert pilot.parameter("COM_OBL_RC_ACT")[10:-2] == before[10:-2]

@@ -14,7 +14,7 @@ import pytest
 from swarmctl.checks.change import Change
 from swarmctl.checks.finding import SWARM, Finding, Verdict, worst_first
 from swarmctl.checks.parameters import RC_RECEIVER, ROWS, changes, names_to_read, unchangeable
-from swarmctl.checks.swarm import exit_code, findings
+from swarmctl.checks.swarm import exit_code, findings, standing
 from swarmctl.checks.table import as_json, print_check
 from swarmctl.config import Config, load
 from swarmctl.core.types import FlightMode, Landed
@@ -198,7 +198,7 @@ PX4_CASES: list[tuple[str, dict[str, Any], Verdict, str]] = [
     ("COM_OF_LOSS_T", {"parameters": parameters(PX4_VALUES, COM_OF_LOSS_T=3.0)}, FIX, "set 1.0"),
     ("COM_OF_LOSS_T", {"parameters": parameters(PX4_VALUES, COM_OF_LOSS_T=0.05)}, FIX, "set 0.5"),
     ("COM_OF_LOSS_T", {"parameters": parameters(PX4_VALUES, COM_OF_LOSS_T=None)}, NOTE, "not judged"),
-    ("COM_OBL_RC_ACT", {"parameters": parameters(PX4_VALUES, COM_OBL_RC_ACT=0)}, FIX, "returns"),
+    ("COM_OBL_RC_ACT", {"parameters": parameters(PX4_VALUES, COM_OBL_RC_ACT=0)}, NOTE, "the agent sets it"),
     ("COM_OBL_RC_ACT", {"parameters": parameters(PX4_VALUES, COM_OBL_RC_ACT=None)}, FIX, "no such parameter"),
     ("MAV_FWDEXTSP", {"parameters": parameters(PX4_VALUES, MAV_FWDEXTSP=0)}, FIX, "not flown"),
     ("COM_RCL_EXCEPT", {"parameters": parameters(PX4_VALUES, COM_RC_IN_MODE=0)}, FIX, "NAV_RCL_ACT = 2"),
@@ -360,7 +360,7 @@ def test_a_vehicle_that_is_not_reached_is_the_worst_and_the_exit_code(config: Co
 
 
 def test_a_fix_comes_before_any_note(config: Config) -> None:
-    ill = changed(HEALTHY, armed=True, link_lost_01=0.02, parameters=parameters(PX4_VALUES, COM_OF_LOSS_T=3.0))
+    ill = changed(HEALTHY, armed=True, link_lost_01=0.02, parameters=parameters(PX4_VALUES, MAV_FWDEXTSP=0))
     assert [line.verdict for line in worst_first(findings([ill], config))] == [FIX, NOTE, NOTE]
 
 
@@ -433,3 +433,18 @@ def test_what_a_vehicle_says_steers_no_terminal(config: Config, capsys: pytest.C
     assert "DONE" in shown
     assert all(c.isprintable() or c in "\n\t" for c in shown)
     assert not any(line.startswith("DONE") for line in shown.splitlines())
+
+
+@pytest.mark.parametrize(
+    ("facts", "found"),
+    [
+        (HEALTHY, []),
+        (dataclasses.replace(HEALTHY, armed=True), ["armed"]),
+        (dataclasses.replace(HEALTHY, landed=Landed.IN_AIR), ["in_air"]),
+        (unreached(0, URLS[0], 1, "no heartbeat"), ["unknown"]),
+    ],
+)
+def test_who_does_not_stand_disarmed_may_not_be_flown(facts: VehicleFacts, found: list[str]) -> None:
+    lines = standing([facts])
+    assert [line.found for line in lines] == found
+    assert exit_code([facts], lines) == (0 if not found else 3 if facts.unreachable else 4)

@@ -1,0 +1,304 @@
+"""What a recorded flight says of its vehicle: dead time, attitude lag, drag and hover thrust, with intervals.
+
+Attitude: the tilt that follows the setpoints sent, by dead time and `swarmctl.control.lag`, is fitted to the tilt
+measured, both axes with one set of parameters. Translation: the equation of motion is integrated against smooth
+windows, so that positions need not be differentiated and the reported velocity, which is biased, is not used:
+
+    p'' = -k g u d + drag (wind - v) + g   gives   int w'' p = -k int w g u d + drag (wind int w + int w' p) + g int w
+
+with thrust setpoint u, measured body down axis d and k = 1 / hover thrust. The vertical axis gives k, the horizontal
+ones drag and the mean wind. Residuals are correlated in time: intervals come from their sums over blocks (a sandwich
+estimator) and Student's t, and hold for what the model describes, not for what it leaves out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarmctl.control.lag import Lag
+from swarmctl.control.model import VehicleModelParams
+from swarmctl.core.frames import GRAVITY_M_S2
+from swarmctl.core.types import Array, Phase
+
+_GRID_S = 0.004
+_SETTLE_S = 1.0  # at the beginning, while the fitted lag forgets where it began
+_GAP_S = 0.1  # without a setpoint for longer, somebody else flew
+_LEAST_S = 10.0
+_LEAST_TILT = 0.03  # rms; of less the estimator's own errors are a large part
+_BLOCK_S = 2.0  # residuals farther apart are taken to be independent
+_WINDOW_S = 1.5
+_THRUST_DELAYS_S = np.arange(0.0, 0.21, 0.01)
+_CONFIDENCE = 0.95
+_ITERATIONS = 30
+_FIRST = (0.06, 10.0, 1.0)  # delay, natural frequency, damping
+_LEAST = (0.0, 1.0, 0.3)
+_MOST = (0.5, 60.0, 3.0)
+_MISFIT_01 = 0.3  # of the tilt's own rms: an attitude that follows otherwise is not described by these figures
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """An estimate and its 95 % interval."""
+
+    value: float
+    low: float
+    high: float
+
+    def __str__(self) -> str:
+        return f"{self.value:.4g} ({self.low:.4g} to {self.high:.4g})"
+
+
+@dataclass(frozen=True, slots=True)
+class Identified:
+    """One vehicle, as its flight showed it."""
+
+    delay_s: Figure
+    attitude_rad_s: Figure
+    attitude_damping: Figure
+    drag_1_s: Figure
+    hover_thrust_01: Figure
+
+    def model(self, before: VehicleModelParams) -> VehicleModelParams:
+        """The vehicle's parameters with these figures; bounds stay as configured."""
+        figures = {name: float(f"{getattr(self, name).value:.3g}") for name in self.__slots__}
+        return VehicleModelParams.model_validate({**before.model_dump(), **figures})
+
+
+@dataclass(frozen=True, slots=True)
+class Flown:
+    """What was sent and what was measured, each at its own times [s] from a common zero."""
+
+    sent_s: Array  # (T,)
+    sent_down: Array  # (T, 2) horizontal part of the body's down axis asked for
+    sent_thrust_01: Array  # (T,)
+    seen_s: Array  # (S,)
+    seen_down: Array  # (S, 3) body down axis, NED
+    seen_pos_ned_m: Array  # (S, 3)
+
+
+def flown(ticks: NDArray[np.void]) -> Flown | str:
+    """The longest part of a flight (`TICK_DTYPE`) that setpoints flew without a gap; or why there is none."""
+    ours = (ticks["phase"] >= Phase.GOTO_START) & (ticks["phase"] <= Phase.GOTO_LAND)
+    ours &= np.isfinite(ticks["setpoint_thrust_01"]) & np.isfinite(ticks["state_age_ms"])
+    rows = ticks[ours]
+    if not len(rows):
+        return "no setpoints were flown"
+    t_s = (rows["t_us"] - rows["t_us"][0]) * 1e-6
+    starts = np.concatenate([[0], np.flatnonzero(np.diff(t_s) > _GAP_S) + 1, [len(rows)]])
+    longest = int(np.argmax(t_s[starts[1:] - 1] - t_s[starts[:-1]]))
+    part = slice(starts[longest], starts[longest + 1])
+    rows, t_s = rows[part], t_s[part] - t_s[part][0]
+    if t_s[-1] < _LEAST_S:
+        return f"setpoints were flown for {t_s[-1]:.1f} s at a stretch; {_LEAST_S:.0f} s are needed"
+    seen_s = t_s - rows["state_age_ms"].astype(np.float64) * 1e-3
+    new = np.diff(seen_s, prepend=-math.inf) > 1e-3
+    sent_down = _down(rows["setpoint_q_nb"].astype(np.float64))[:, :2]
+    if float(np.sqrt(np.mean(np.var(sent_down, axis=0)))) < _LEAST_TILT:
+        return "it hardly tilted: nothing can be told from this flight"
+    return Flown(
+        t_s,
+        sent_down,
+        rows["setpoint_thrust_01"].astype(np.float64),
+        seen_s[new],
+        _down(rows["q_nb"][new].astype(np.float64)),
+        np.array(rows["pos_ned_m"][new]),
+    )
+
+
+def identify(flight: Flown) -> Identified | str:
+    """Fit everything; or why it can't be."""
+    attitude = _fit_attitude(flight)
+    if isinstance(attitude, str):
+        return attitude
+    delay, natural, damping = attitude
+    inverse_hover, thrust_01, pos, down = _fit_vertical(flight)
+    hover = Figure(*(1.0 / k for k in (inverse_hover.value, inverse_hover.high, inverse_hover.low)))
+    drag = _fit_drag(thrust_01, pos, down, inverse_hover.value)
+    found = Identified(delay, natural, damping, drag, hover)
+    if not all(math.isfinite(f.low) and math.isfinite(f.high) for f in (*attitude, drag, hover)):
+        return "the flight is too short for intervals"
+    if not 0.05 < hover.value < 0.95:
+        return f"a hover thrust of {hover.value:.2f} of full can't be: is the thrust setpoint a thrust?"
+    return found
+
+
+# -- attitude ---------------------------------------------------------------------------------------------------------
+
+
+def _fit_attitude(flight: Flown) -> tuple[Figure, Figure, Figure] | str:
+    """Dead time, natural frequency and damping; a constant offset of each axis takes up what levels are off."""
+    used = flight.seen_s > _SETTLE_S
+    at_s, measured = flight.seen_s[used], flight.seen_down[used, :2]
+
+    def residuals(parameters: Array) -> Array:
+        delay_s, natural_rad_s, damping = (float(p) for p in parameters[:3])
+        followed = _followed(flight, delay_s, natural_rad_s, damping, at_s)
+        return np.asarray(followed + parameters[3:] - measured)  # (S, 2)
+
+    least, most = np.array([*_LEAST, -1.0, -1.0]), np.array([*_MOST, 1.0, 1.0])
+    best = _least_squares(residuals, np.array([*_FIRST, 0.0, 0.0]), least, most)
+    misfit = float(np.sqrt(np.mean(residuals(best) ** 2)))
+    if misfit > _MISFIT_01 * float(np.sqrt(np.mean(np.var(measured, axis=0)))):
+        return f"its attitude does not follow setpoints as a second-order lag: off by {misfit:.3f} rad rms"
+    blocks = (at_s / _BLOCK_S).astype(int)
+    wide = _half_widths(_jacobian(residuals, best), residuals(best), blocks)
+    values = zip(best[:3], wide[:3], _LEAST, strict=True)
+    delay, natural, damping = (Figure(float(b), float(max(b - w, lo)), float(b + w)) for b, w, lo in values)
+    return delay, natural, damping
+
+
+def _followed(flight: Flown, delay_s: float, natural_rad_s: float, damping: float, at_s: Array) -> Array:
+    """Tilt (S, 2) at times `at_s` (S,) of a vehicle with these parameters."""
+    from scipy.signal import lfilter  # heavy, and not needed to fly
+
+    grid_s = np.arange(flight.sent_s[0], flight.sent_s[-1] + _GRID_S, _GRID_S)
+    command = _held_mean(flight.sent_s, flight.sent_down, grid_s - delay_s)
+    lag = Lag(natural_rad_s, damping)
+    (a, b, _), (c, d, _), (e, f, _) = (
+        lag.advance(*start, _GRID_S) for start in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
+    )
+    denominator = [1.0, -(a + d), a * d - b * c]  # of x' = [[a, c], [b, d]] x + [e, f] u, tilt the first of x
+    numerator = [0.0, e, c * f - d * e]
+    tilt = command[0] + lfilter(numerator, denominator, command - command[0], axis=0)
+    return np.column_stack([np.interp(at_s, grid_s, tilt[:, i]) for i in range(2)])
+
+
+def _held_mean(sent_s: Array, sent: Array, from_s: Array) -> Array:
+    """Mean (G, k), over one grid step from `from_s` (G,) on, of commands (T, k) that are held until the next."""
+    ends_s = np.append(sent_s, sent_s[-1] + 10.0)
+    area = np.concatenate([np.zeros((1, sent.shape[1])), np.cumsum(sent * np.diff(ends_s)[:, None], axis=0)])
+    before = np.minimum(from_s - sent_s[0], 0.0)[:, None] * sent[0]
+    until = np.minimum(from_s + _GRID_S - sent_s[0], 0.0)[:, None] * sent[0]
+
+    def integral(at_s: Array) -> Array:
+        return np.column_stack([np.interp(at_s, ends_s, area[:, i]) for i in range(sent.shape[1])])
+
+    return np.asarray((integral(from_s + _GRID_S) + until - integral(from_s) - before) / _GRID_S)
+
+
+# -- translation ------------------------------------------------------------------------------------------------------
+
+
+def _on_grid(flight: Flown, delay_s: float) -> tuple[Array, Array, Array]:
+    """Thrust (G,) that acts, position (G, 3) and body down axis (G, 3) at common times."""
+    grid_s = np.arange(flight.seen_s[0] + _SETTLE_S, flight.seen_s[-1], _GRID_S)
+    pos = np.column_stack([np.interp(grid_s, flight.seen_s, flight.seen_pos_ned_m[:, i]) for i in range(3)])
+    down = np.column_stack([np.interp(grid_s, flight.seen_s, flight.seen_down[:, i]) for i in range(3)])
+    held = np.searchsorted(flight.sent_s, grid_s - delay_s, side="right") - 1
+    return flight.sent_thrust_01[np.maximum(held, 0)], pos, down
+
+
+def _fit_vertical(flight: Flown) -> tuple[Figure, Array, Array, Array]:
+    """1 / hover thrust, with what `_on_grid` gives; vertical drag is fitted beside it and forgotten.
+
+    Thrust has a dead time of its own, motors included: the one that leaves least unexplained.
+    """
+    motions = [_on_grid(flight, float(delay_s)) for delay_s in _THRUST_DELAYS_S]
+    fits = [_vertical_rows(*motion) for motion in motions]
+    missed = [left - rows @ np.linalg.lstsq(rows, left, rcond=None)[0] for rows, left, _ in fits]
+    best = int(np.argmin([m @ m for m in missed]))
+    rows, left, blocks = fits[best]
+    return _regress(rows[:, None, :], left[:, None], blocks), *motions[best]
+
+
+def _vertical_rows(thrust_01: Array, pos: Array, down: Array) -> tuple[Array, Array, NDArray[np.int64]]:
+    accel, drag, force, blocks = _windows(-GRAVITY_M_S2 * thrust_01 * down[:, 2], pos[:, 2])
+    return np.column_stack([force, drag]), accel - GRAVITY_M_S2, blocks
+
+
+def _fit_drag(thrust_01: Array, pos: Array, down: Array, inverse_hover: float) -> Figure:
+    """Horizontal drag over mass, both axes together; a constant of each is drag times the wind."""
+    rows, left = [], []
+    for i in range(2):
+        accel, drag, force, blocks = _windows(-GRAVITY_M_S2 * thrust_01 * down[:, i], pos[:, i])
+        wind = np.zeros((len(accel), 2))
+        wind[:, i] = 1.0
+        rows.append(np.column_stack([drag, wind]))
+        left.append(accel - inverse_hover * force)
+    return _regress(np.stack(rows, axis=1), np.column_stack(left), blocks)
+
+
+def _windows(force: Array, pos: Array) -> tuple[Array, Array, Array, NDArray[np.int64]]:
+    """Integrals over overlapping windows of unit area: acceleration, minus velocity, force, and each one's block."""
+    count = round(_WINDOW_S / _GRID_S)
+    s = (np.arange(count) + 0.5) / count
+    weight = s**4 * (1.0 - s) ** 4
+    slope = 4.0 * s**3 * (1.0 - s) ** 3 * (1.0 - 2.0 * s) / _WINDOW_S
+    curve = (12.0 * s**2 * (1.0 - s) ** 2 * (1.0 - 2.0 * s) ** 2 - 8.0 * s**3 * (1.0 - s) ** 3) / _WINDOW_S**2
+    area = float(np.sum(weight))
+    first = np.arange(0, len(pos) - count, count // 6)
+    over = first[:, None] + np.arange(count)
+    near = pos[over] - pos[first][:, None]  # the integrals of slope and curve alone are zero: only rounding
+    blocks = (first * _GRID_S / _BLOCK_S).astype(np.int64)
+    return near @ curve / area, near @ slope / area, force[over] @ weight / area, blocks
+
+
+# -- least squares ----------------------------------------------------------------------------------------------------
+
+
+def _regress(rows: Array, left: Array, blocks: NDArray[np.int64]) -> Figure:
+    """The first coefficient of linear least squares; rows (W, axes, p), left sides (W, axes)."""
+    flat = rows.reshape(-1, rows.shape[2])
+    best = np.linalg.lstsq(flat, left.reshape(-1), rcond=None)[0]
+    wide = _half_widths(rows, rows @ best - left, blocks)
+    return Figure(float(best[0]), float(best[0] - wide[0]), float(best[0] + wide[0]))
+
+
+def _half_widths(jacobian: Array, residuals: Array, blocks: NDArray[np.int64]) -> Array:
+    """Half widths (p,) of the intervals: jacobian (S, axes, p), residuals (S, axes), each sample's block (S,)."""
+    from scipy.special import stdtrit  # heavy, and not needed to fly
+
+    scores = np.einsum("sap,sa->sp", jacobian, residuals)
+    names = np.unique(blocks)
+    count, unknowns = len(names), jacobian.shape[2]
+    if count <= unknowns:
+        return np.full(unknowns, math.inf)
+    sums = np.stack([scores[blocks == name].sum(axis=0) for name in names])
+    flat = jacobian.reshape(-1, unknowns)
+    bread = np.linalg.pinv(flat.T @ flat)
+    covariance = bread @ (sums.T @ sums) @ bread * count / (count - unknowns)
+    factor = stdtrit(count - unknowns, 0.5 + 0.5 * _CONFIDENCE)
+    return np.asarray(factor * np.sqrt(np.diag(covariance)))
+
+
+def _least_squares(residuals: Callable[[Array], Array], first: Array, least: Array, most: Array) -> Array:
+    """Levenberg-Marquardt within bounds, which end a component's step."""
+    best, damping = first, 1e-3
+    cost = float(np.sum(residuals(best) ** 2))
+    for _ in range(_ITERATIONS):
+        jacobian = _jacobian(residuals, best).reshape(-1, len(best))
+        slope, curve = jacobian.T @ residuals(best).reshape(-1), jacobian.T @ jacobian
+        step = np.linalg.solve(curve + damping * np.diag(np.diag(curve) + 1e-12), -slope)
+        tried = np.clip(best + step, least, most)
+        tried_cost = float(np.sum(residuals(tried) ** 2))
+        if tried_cost >= cost:
+            damping *= 10.0
+            if damping > 1e6:
+                break
+            continue
+        done = cost - tried_cost < 1e-9 * cost
+        best, cost, damping = tried, tried_cost, 0.3 * damping
+        if done:
+            break
+    return best
+
+
+def _jacobian(residuals: Callable[[Array], Array], at: Array) -> Array:
+    """Central differences (S, axes, p)."""
+    columns = []
+    for i, value in enumerate(at):
+        step = np.zeros(len(at))
+        step[i] = 1e-4 * max(abs(float(value)), 0.05)
+        columns.append((residuals(at + step) - residuals(at - step)) / (2.0 * step[i]))
+    return np.stack(columns, axis=2)
+
+
+def _down(q_nb: Array) -> Array:
+    """Body down axes (T, 3), NED, of attitudes (T, 4)."""
+    w, x, y, z = q_nb.T
+    return np.column_stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])

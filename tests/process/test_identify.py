@@ -1,0 +1,95 @@
+"""`swarmctl check --identify` as a program, on the built-in simulator in real time: what it flies and writes."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from swarmctl.config import load
+from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
+from swarmctl.core.types import Landed, Phase
+
+pytestmark = pytest.mark.process
+
+ROOT = Path(__file__).resolve().parents[2]
+CONFIG = ROOT / "configs" / "x500_circle.toml"
+SHORT = (
+    "swarm.agents=1",
+    "start.center_ned_m=[0.0, 0.0, -2.0]",
+    "mission.identify.repeats=1",
+    "mission.identify.hold_s=1.5",
+)
+
+
+def begin(directory: Path, *arguments: str) -> subprocess.Popen[str]:
+    sets = [item for pair in SHORT for item in ("--set", pair)]
+    return subprocess.Popen(
+        [sys.executable, "-m", "swarmctl", "check", str(CONFIG), "--identify", *sets, *arguments],
+        cwd=directory,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def landed(directory: Path) -> bool:
+    [run] = (directory / "runs").iterdir()
+    data = (run / "truth.bin").read_bytes()
+    last = np.frombuffer(data, TRUTH_DTYPE, len(data) // TRUTH_DTYPE.itemsize)[-1]
+    return bool(last["landed"] == Landed.ON_GROUND and not last["armed"])
+
+
+def tracking(directory: Path) -> bool:
+    rows = [path.read_bytes() for path in directory.glob("runs/*/agent-0.ticks")]
+    size = TICK_DTYPE.itemsize
+    return any(np.frombuffer(d, TICK_DTYPE, len(d) // size)["phase"].max(initial=0) == Phase.TRACK for d in rows)
+
+
+def test_what_was_flown_becomes_a_table_for_the_configuration(tmp_path: Path) -> None:
+    table = tmp_path / "x500.toml"
+    flight = begin(tmp_path, "--apply", "--write", str(table))
+    said, _ = flight.communicate(timeout=170)
+    assert flight.returncode == 0, said
+    assert landed(tmp_path)
+    model = load(table).vehicle_model
+    assert model.drag_1_s == pytest.approx(1.0, abs=0.2)
+    assert model.hover_thrust_01 == pytest.approx(9.81 / 20.0, rel=0.02)
+    assert model.tilt_max_rad == load(CONFIG).vehicle_model.tilt_max_rad
+    assert "agent-0\tdelay_s\t" in said
+    assert table.read_text() in said
+
+
+def test_ctrl_c_lands_and_nothing_is_written(tmp_path: Path) -> None:
+    table = tmp_path / "x500.toml"
+    flight = begin(tmp_path, "--apply", "--write", str(table))
+    try:
+        deadline_s = time.monotonic() + 90.0
+        while not tracking(tmp_path):
+            assert flight.poll() is None, flight.communicate()[0]
+            assert time.monotonic() < deadline_s
+            time.sleep(0.2)
+        flight.send_signal(signal.SIGINT)
+        said, _ = flight.communicate(timeout=80)
+    finally:
+        flight.kill()
+    assert flight.returncode == 130, said
+    assert landed(tmp_path)
+    assert not table.exists()
+
+
+def test_nothing_is_flown_when_the_file_to_write_is_there_already(tmp_path: Path) -> None:
+    (tmp_path / "here.toml").write_text("mine")
+    flight = begin(tmp_path, "--write", "here.toml")
+    printed, _ = flight.communicate(timeout=90)
+    assert flight.returncode == 3, printed
+    assert "exists already" in printed
+    assert not (tmp_path / "runs").exists()
+    assert (tmp_path / "here.toml").read_text() == "mine"
