@@ -69,7 +69,8 @@ class Interrupts:
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> Interrupts:
-        heard = [signum for signum in self._SIGNALS if signal.getsignal(signum) != signal.SIG_IGN]
+        ignored = (signal.SIGHUP,) if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN else ()
+        heard = [signum for signum in self._SIGNALS if signum not in ignored]  # a stop is heeded in the background too
         self._before = {signum: signal.signal(signum, self._note) for signum in heard}
         return self
 

@@ -15,8 +15,8 @@ from sitl.lockstep import Lockstep
 from swarmctl.config import load
 
 CONFIGS = Path(__file__).parents[1] / "configs"
-DIES_AT_US = 4_000_000  # under way on the circle
-UNTIL_US = 8_000_000  # every mission has begun by 5 s
+DIES_AT_US = 9_000_000  # under way on the circle
+UNTIL_US = 13_000_000  # every mission has begun by 10 s
 
 
 @dataclass(frozen=True, slots=True)

@@ -166,7 +166,10 @@ def test_a_killed_agent_fails_the_launch_and_the_others_finish(start: Callable[.
     os.kill(launched.pid_of("agent", "--id", "1"), signal.SIGKILL)
     assert launched.end() == 4, launched.text()
     assert "agent-1 was killed by SIGKILL" in launched.text()
-    assert {row["agent"]: row["exit_code"] for row in launched.events("agent_ended")} == {0: 0, 1: 137, 2: 0}
+    ended = [(row["agent"], row["exit_code"]) for row in launched.events("agent_ended")]
+    assert {(0, 0), (1, 137), (2, 0)} <= set(ended)
+    assert (1, 130) in ended, "its vehicle was landed by another agent"
+    assert "the vehicle of agent-1 is on the ground and disarmed" in launched.text()
     summary = launched.summary()
     assert summary["outcome"] == "failed"
     assert any("agent-1" in violation for violation in summary["violations"])
