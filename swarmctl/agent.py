@@ -127,7 +127,7 @@ class Agent:
         """Landed, disarmed, and its parameters as they were."""
         if self._done_us is None:
             return False
-        return self._upkeep.restored or self._waited_us(self._done_us) > _RESTORE_US
+        return self._upkeep.restored or self._clock.now_us() - self._done_us > _RESTORE_US
 
     @property
     def finished(self) -> bool:
@@ -408,7 +408,8 @@ class Agent:
         )
         for command in self._sequence.step(facts):
             self._commands.request(command)
-        self._finish(now_us)
+        self._tell_what_is_waited_for(now_us)
+        self._give_parameters_back(now_us)
         self._upkeep.step(now_us)
         if not before[1] and self._sequence.had_control:
             self._predictor.clear()
@@ -420,23 +421,23 @@ class Agent:
             names = {"phase": now[0].name, "mode": now[1].name, "flight_mode": now[2].name}
             self._note("state", **names, reason=self._judgement.reason)
 
-    def _finish(self, now_us: int) -> None:
-        """At the end of the mission: give the autopilot its parameters back. Before it: say what is waited for."""
-        phase, waits_for = self._sequence.phase, self._sequence.waits_for
-        if phase is Phase.STANDBY and waits_for and self._waited_us(self._standby_us) > _WAITS_LONG_US:
-            self._alerts.put("start", f"waits for {waits_for}", now_us)
-        if phase is not Phase.STANDBY:
+    def _tell_what_is_waited_for(self, now_us: int) -> None:
+        waits_for = self._sequence.waits_for
+        if self._sequence.phase is not Phase.STANDBY:
             self._standby_us = now_us
+        elif waits_for and now_us - self._standby_us > _WAITS_LONG_US:
+            self._alerts.put("start", f"waits for {waits_for}", now_us)
+
+    def _give_parameters_back(self, now_us: int) -> None:
+        """Once the mission has ended: set the autopilot's parameters back, and say which of them could not be."""
         if not self._sequence.finished:
             return
         if self._done_us is None:
             self._done_us = now_us
             self._upkeep.restore()
-        if self._upkeep.left_changed and self._waited_us(self._done_us) > _RESTORE_US and not self._upkeep.restored:
-            self._alerts.put("restore", f"parameters left changed: {self._upkeep.left_changed}", now_us)
-
-    def _waited_us(self, since_us: int) -> int:
-        return self._clock.now_us() - since_us
+        left = self._upkeep.left_changed
+        if left and self.done and self._alerts.put("restore", f"parameters left changed, they were: {left}", now_us):
+            self._note("parameters_left_changed", were=left)
 
     def _unsettled(self, now_us: int) -> str:
         """Why nothing may be armed yet: the estimator settles, or is too inaccurate for the distances asked for."""
