@@ -21,7 +21,7 @@ from rich.progress import Progress
 from sitl.lockstep import Lockstep, write_events
 from swarmctl.config import Config, dump, load
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, exit_code_of
-from swarmctl.files import replace_bytes, replace_text
+from swarmctl.files import replace_bytes, replace_text, write_each
 from swarmctl.summary import summary_lines, unwritten_line, violation_lines
 from swarmctl.table import PlainLines
 from swarmctl.telemetry.recordings import RECORDING, open_viewer, optimize_recording, simulated_recording
@@ -90,13 +90,7 @@ def _write_rows(flight: Lockstep, directory: Path) -> tuple[str, ...]:
     }
     if flight.fault_events:
         writers["sitl.events.jsonl"] = lambda: write_events(directory / "sitl.events.jsonl", flight.fault_events)
-    unwritten = []
-    for name, write in writers.items():
-        try:
-            write()
-        except OSError as error:
-            unwritten.append(f"{name}: {error.strerror or error}")
-    return tuple(unwritten)
+    return write_each(writers)
 
 
 def _write_recording(config: Config, directory: Path) -> None:

@@ -12,7 +12,7 @@ import os
 import secrets
 import stat
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
@@ -101,3 +101,14 @@ def replaced_by_program(path: Path) -> Iterator[Path]:
         yield part
         with contextlib.suppress(FileNotFoundError):
             part.replace(path)
+
+
+def write_each(writers: Mapping[str, Callable[[], object]]) -> tuple[str, ...]:
+    """Call every writer, whatever becomes of the others; returns what the disk did not take, by name, in words."""
+    unwritten = []
+    for name, write in writers.items():
+        try:
+            write()
+        except OSError as error:
+            unwritten.append(f"{name}: {error.strerror or error}")
+    return tuple(unwritten)

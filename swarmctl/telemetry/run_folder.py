@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 from swarmctl.core.records import TICK_DTYPE
 from swarmctl.errors import ConfigError, StartError
-from swarmctl.files import replace_text
+from swarmctl.files import replace_text, write_each
 from swarmctl.telemetry.plain import to_json
 from swarmctl.telemetry.referee import Rules, RunData, judge
 from swarmctl.telemetry.report import REPORT, write_report
@@ -116,13 +116,7 @@ def finish_run(directory: Path, rules: Rules, outcome: Outcome, recorded: RunDat
         **{path.name: partial(_pack_ticks, path) for path in sorted(directory.glob("agent-*.ticks"))},
         REPORT: lambda: write_report(directory, run, summary, read_text(directory / CONFIG), rules),
     }
-    unwritten = []
-    for name, write in writers.items():
-        try:
-            write()
-        except OSError as error:
-            unwritten.append(f"{name}: {error.strerror or error}")
-    return Finished(summary, tuple(unwritten))
+    return Finished(summary, write_each(writers))
 
 
 def report_run(directory: Path, rules: Rules) -> Path:
