@@ -10,13 +10,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
 from swarmctl.control.axes import AxesProblem, AxesSolution, HalfSpaces, Penalties
 from swarmctl.control.condensed import CondensedMpc
 from swarmctl.control.model import VehicleModelParams
-from swarmctl.control.mpc import MpcParams, first_guess, judged, near_half_spaces
+from swarmctl.control.mpc import MpcParams, first_guess, judged, near_half_spaces, planned
 from swarmctl.control.problem import Problem
 from swarmctl.control.separation import SeparationParams
 from swarmctl.core.frames import GRAVITY_M_S2
@@ -56,11 +57,12 @@ class JointMpc:
     def plan(self, problem: Problem) -> Plan:
         """One step of distributed MPC. Never raises for an infeasible problem; the status says what may be flown."""
         began_ns = self._stopwatch_ns()
+        guess = first_guess(problem, self._params.dt_s, self.steps)
+        near = partial(near_half_spaces, problem, guess, 3, self._slots, self._params.dt_s, self._tie)
+        return planned(near, partial(self._plan, problem, began_ns), self._separation, self._stopwatch_ns)
+
+    def _plan(self, problem: Problem, began_ns: int, spaces: HalfSpaces | None, spaces_us: float) -> Plan:
         start, steps = problem.start, self.steps
-        guess = first_guess(problem, self._params.dt_s, steps)
-        guessed_ns = self._stopwatch_ns()
-        spaces = near_half_spaces(problem, guess, 3, self._slots, self._params.dt_s, self._tie, self._separation)
-        spaces_us = (self._stopwatch_ns() - guessed_ns) * 1e-3
         held = max(_THRUST_LEAST_M_S2, float(start.virtual[2]))
         first = self._solve(problem, np.full(steps, held), spaces)
         found = self._solve(problem, first.u[:, 2], spaces)

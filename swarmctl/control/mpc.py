@@ -8,7 +8,9 @@ drift of each axis.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -117,14 +119,17 @@ class SwarmMpc:
     def plan(self, problem: Problem) -> Plan:
         """One step of distributed MPC. Never raises for an infeasible problem; the status says what may be flown."""
         began_ns = self._stopwatch_ns()
-        start, steps = problem.start, self.steps
         up = self._solve_z(problem)
-        count = min(steps, len(up.pos_m))
-        guess = first_guess(problem, self._params.dt_s, steps)
+        guess = first_guess(problem, self._params.dt_s, self.steps)
+        count = min(self.steps, len(up.pos_m))
         guess[1 : count + 1, 2] = up.pos_m[:count, 0]
-        guessed_ns = self._stopwatch_ns()
-        spaces = near_half_spaces(problem, guess, 2, self._slots, self._params.dt_s, self._tie, self._separation)
-        spaces_us = (self._stopwatch_ns() - guessed_ns) * 1e-3
+        near = partial(near_half_spaces, problem, guess, 2, self._slots, self._params.dt_s, self._tie)
+        return planned(near, partial(self._plan, problem, up, began_ns), self._separation, self._stopwatch_ns)
+
+    def _plan(
+        self, problem: Problem, up: AxesSolution, began_ns: int, spaces: HalfSpaces | None, spaces_us: float
+    ) -> Plan:
+        start, steps, count = problem.start, self.steps, min(self.steps, len(up.pos_m))
         asked = AxesProblem(
             start.pos_ned_m[:2],
             start.vel_ned_m_s[:2],
@@ -190,6 +195,35 @@ def near_half_spaces(
     steps, near = len(guess_ned_m) - 1, nearest(problem.keep_outs, guess_ned_m, slots)
     goal, vel = problem.reference.pos_ned_m[steps, :axes], problem.start.vel_ned_m_s[:axes]
     return half_spaces(near, guess_ned_m, goal, vel, dt_s, own_tie, params)
+
+
+def planned(
+    spaces_of: Callable[[SeparationParams], HalfSpaces | None],
+    plan: Callable[[HalfSpaces | None, float], Plan],
+    separation: SeparationParams,
+    stopwatch_ns: Callable[[], int],
+) -> Plan:
+    """The plan within the half-spaces near its guess or, if that is not certified, within those far from it as well.
+
+    A plan leaves a guess that stands still far behind, and half-spaces that are far from the guess are left out: it
+    then runs into peers that are out there by the time it arrives, and so does every next one from the same guess.
+
+    Args:
+        spaces_of: half-spaces by parameters.
+        plan: makes a plan within half-spaces, given the time [us] that they took.
+        separation: parameters; those of the second plan leave nothing out.
+        stopwatch_ns: see `CondensedMpc`.
+    """
+    began_ns = stopwatch_ns()
+    near = spaces_of(separation)
+    found = plan(near, (stopwatch_ns() - began_ns) * 1e-3)
+    if near is None or found.status is not PlanStatus.NOT_CERTIFIED:
+        return found
+    began_ns = stopwatch_ns()
+    every = spaces_of(separation.model_copy(update={"gate_m": math.inf}))
+    if every is None or np.array_equal(every.offset_m, near.offset_m):
+        return found
+    return plan(every, (stopwatch_ns() - began_ns) * 1e-3)
 
 
 def judged(

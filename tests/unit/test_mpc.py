@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 import pytest
@@ -274,3 +274,25 @@ def test_keeping_clear_comes_before_ending_at_the_reference(terminal: str) -> No
     plan = plan_to((0.03, 0.0, 0.0), neighbour, terminal_xy=terminal, terminal_z="none")
     assert plan.slack_m < 0.01
     assert np.linalg.norm(plan.pos_ned_m - neighbour.pos_ned_m, axis=1).min() > 0.9 - 0.01
+
+
+@pytest.mark.parametrize("kind", ["dmpc", "dmpc3"])
+def test_from_rest_peers_that_it_would_meet_far_away_are_kept_clear_of(kind: Literal["dmpc", "dmpc3"]) -> None:
+    """Two peers and the reference go round a circle; the guess stands still, farther than the gate from all of them.
+
+    Of three PX4 one that had stopped found no plan for 5 s, until it gave up.
+    """
+
+    def on_circle(begins_ned_m: tuple[float, float, float], steps: int) -> Array:
+        turned = 0.5 * 0.05 * np.arange(steps + 1)  # 0.5 rad/s
+        c, s, (n, e, d) = np.cos(turned), np.sin(turned), begins_ned_m
+        return np.stack([c * n - s * e, s * n + c * e, np.full(steps + 1, d)], axis=1)
+
+    peers = [on_circle(begins, 40) for begins in ((-0.75, 4.91, -3.3), (0.92, 4.89, -3.3))]
+    ahead = on_circle((-0.1, 5.0, -3.4), 100)
+    along = Reference(ahead, np.gradient(ahead, 0.05, axis=0), 0.0)
+    params = ControllerParams(kind=kind, mpc=MpcParams(dt_s=0.05, control_xy=20, u_max=0.75))
+    mpc = make_controller(params, VehicleModelParams(), SeparationParams(radius_m=1.6), 1, 2, lambda: 0)
+    keep_outs = tuple(KeepOut(path, 1.6, 1.55, False, tie) for path, tie in zip(peers, (0, 2), strict=True))
+    at_rest = start(np.array([0.45, -0.13, -2.5]))
+    assert mpc.plan(Problem(at_rest, along, np.zeros(3), keep_outs, None)).status is PlanStatus.OK
