@@ -18,15 +18,9 @@ LAST_INTEGER_TYPE = 8  # MAV_PARAM_TYPE_INT64; what follows is a float
 _ARM, _TAKEOFF, _LAND, _SET_MODE, _INTERVAL, _REQUEST = 400, 22, 21, 176, 511, 512
 _NAN = math.nan
 
-SYS_STATUS, GPS_RAW_INT, ATTITUDE_QUATERNION, LOCAL_POSITION_NED, GLOBAL_POSITION_INT = 1, 24, 31, 32, 33
-GPS_GLOBAL_ORIGIN, ATTITUDE_TARGET, ESTIMATOR_STATUS, EXTENDED_SYS_STATE, ODOMETRY, CURRENT_MODE = (
-    49,
-    83,
-    230,
-    245,
-    331,
-    436,
-)
+SYS_STATUS, GPS_RAW_INT, ATTITUDE, ATTITUDE_QUATERNION, LOCAL_POSITION_NED, GLOBAL_POSITION_INT = 1, 24, 30, 31, 32, 33
+GPS_GLOBAL_ORIGIN, ATTITUDE_TARGET, HIGHRES_IMU = 49, 83, 105
+ESTIMATOR_STATUS, EXTENDED_SYS_STATE, ODOMETRY, CURRENT_MODE = 230, 245, 331, 436
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,6 +139,10 @@ PX4 = Dialect(
         EXTENDED_SYS_STATE: 10.0,
         CURRENT_MODE: 50.0,  # how often it looks whether the mode has changed; it is sent at 2 Hz and on change
         ESTIMATOR_STATUS: 1.0,
+        ATTITUDE: 2.0,  # these four come at 50 to 100 Hz otherwise: half of all that is to be decoded, for nobody
+        ATTITUDE_QUATERNION: 2.0,
+        HIGHRES_IMU: 2.0,
+        GLOBAL_POSITION_INT: 2.0,
     },
     rules=(
         Rule(

@@ -133,7 +133,7 @@ def test_px4_is_set_up_in_two_seconds_and_left_alone_then() -> None:
     vehicle = Vehicle(COM_OBL_RC_ACT=0).set_up(COM_OBL_RC_ACT=4).run(2.0)
     assert vehicle.upkeep.ready
     assert vehicle.upkeep.refusal == ""
-    assert rates(vehicle) == {331, 83, 245, 436, 230}
+    assert rates(vehicle) == {331, 83, 245, 436, 230, 30, 31, 33, 105}
     assert vehicle.params["COM_OBL_RC_ACT"] == vehicle.pilot.params["COM_OBL_RC_ACT"] == 4
     assert vehicle.pilot.hover_thrust_01 == pytest.approx(0.45)
     assert vehicle.pilot.offset_ned_m is not None
@@ -253,7 +253,7 @@ def test_after_a_reboot_everything_is_asked_for_again() -> None:
     assert (vehicle.pilot.landed, vehicle.pilot.offset_ned_m) == (Landed.UNKNOWN, None)
     vehicle.run(3.0)
     assert vehicle.upkeep.ready
-    assert rates(vehicle) == {331, 83, 245, 436, 230}
+    assert rates(vehicle) == {331, 83, 245, 436, 230, 30, 31, 33, 105}
     assert vehicle.params["COM_OBL_RC_ACT"] == 4
     assert vehicle.pilot.mode is FlightMode.HOLD
 
@@ -261,7 +261,7 @@ def test_after_a_reboot_everything_is_asked_for_again() -> None:
 def test_rates_that_were_lost_are_asked_for_again_but_a_silent_vehicle_is_not_shouted_at() -> None:
     vehicle = Vehicle().set_up().run(5.0)
     vehicle.talks = False
-    vehicle.run(14.0)  # what was asked at the very beginning of the silence is asked four times
+    vehicle.run(24.0)  # what was asked at the very beginning of the silence is asked four times
     vehicle.asked.clear()
     vehicle.run(10.0)
     assert vehicle.asked == []
