@@ -22,6 +22,7 @@ from pymavlink.dialects.v20 import development as mav
 from swarmctl.core.types import GeoOrigin
 from swarmctl.links.mavlink import Codec, frames, message_id
 from swarmctl.links.transport import cut_frames
+from tests.real import priority
 from tests.real.autopilots import ARDUCOPTER, Fleet
 
 ARMED_FLAG = 128
@@ -72,7 +73,8 @@ class Seen:
     def at(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
         """(T, 3) positions at these times."""
         samples = np.array(self.pos_ned_m)
-        return np.stack([np.interp(t_s, self.t_s, samples[:, axis]) for axis in range(3)], axis=1)
+        times_s = self.t_s[: len(samples)]  # it is still being added to
+        return np.stack([np.interp(t_s, times_s, samples[:, axis]) for axis in range(3)], axis=1)
 
 
 class UdpLink:
@@ -198,6 +200,7 @@ class Witness:
         return [UdpLink(14550, 18570), *(UdpLink(19410 + i, 19450) for i in each)]
 
     def _listen(self) -> None:
+        priority.raise_thread(priority.FEED)
         asked_s = 0.0
         while not self._ending.is_set():
             now_s = time.monotonic()
