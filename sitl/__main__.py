@@ -19,14 +19,14 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, NoReturn
 
-from sitl.attitude import THESIS_GAINS
+from sitl.plant.attitude import THESIS_GAINS
 from swarmctl.errors import EXIT_OK, EXIT_USAGE, SwarmError
 
 if TYPE_CHECKING:
     from sitl.realtime import Tally
     from sitl.world import SitlParams, SitlWorld
     from swarmctl.core.simulated import RealismParams
-    from swarmctl.links.transport import Transport
+    from swarmctl.mavlink.transport import Transport
 
 
 _SET_HELP = "wind, battery, rotors, faults as under [sitl] of a configuration, such as wind.turbulence_m_s=5"
@@ -152,7 +152,7 @@ def main(arguments: list[str] | None = None) -> int:
     """Run the simulator; returns the process exit code."""
     options = _parser().parse_args(_joined(sys.argv[1:] if arguments is None else arguments))
     if options.die_with_parent:
-        from swarmctl.lifeline import die_with_parent
+        from swarmctl.process_lifetime import die_with_parent
 
         die_with_parent()
     try:
@@ -217,7 +217,7 @@ def _section(item: str) -> str:
 
 def _run(options: argparse.Namespace) -> int:
     from sitl import realtime
-    from sitl.control import ControlSocket
+    from sitl.fault_socket import ControlSocket
     from sitl.world import SitlWorld
     from swarmctl.errors import ConfigError
 
@@ -263,10 +263,10 @@ def _run(options: argparse.Namespace) -> int:
 def _udp_links(options: argparse.Namespace) -> tuple[list[Transport], list[str]]:
     """Links of all vehicles, and where each is."""
     from sitl import realtime
-    from sitl.ports import OpenPort
+    from sitl.net.ports import OpenPort
     from swarmctl.errors import ConfigError
-    from swarmctl.links.latch import nobody
-    from swarmctl.links.transport import UdpTransport
+    from swarmctl.mavlink.latch import nobody
+    from swarmctl.mavlink.transport import UdpTransport
 
     count = options.vehicles
     if options.local_fds and len(options.local_fds) != count:
@@ -293,7 +293,7 @@ def _udp_links(options: argparse.Namespace) -> tuple[list[Transport], list[str]]
 def _gcs_links(options: argparse.Namespace) -> tuple[list[Transport], str]:
     """A ground station's links, and where they are; none when there is no port for it."""
     from sitl import realtime
-    from sitl.ports import OpenPort
+    from sitl.net.ports import OpenPort
     from swarmctl.errors import ConfigError
 
     if not options.gcs_port:
@@ -307,8 +307,8 @@ def _gcs_links(options: argparse.Namespace) -> tuple[list[Transport], str]:
 
 
 def _tcp_links(options: argparse.Namespace) -> tuple[list[Transport], list[str]]:
+    from sitl.net.tcp import serve_tcp
     from sitl.realtime import HOST
-    from sitl.tcp import serve_tcp
 
     servers = serve_tcp(HOST, options.tcp_port, options.vehicles)
     return list(servers), [f"tcp={server.port}" for server in servers]

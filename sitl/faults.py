@@ -11,11 +11,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from sitl.estimator import Estimator
-from sitl.lossy import LossyLink, Way
-from sitl.physics import Physics
-from sitl.vehicle import Array
-from sitl.wind import Gust
+from sitl.net.lossy import LossyLink, Way
+from sitl.plant.estimator import Estimator
+from sitl.plant.physics import Physics
+from sitl.plant.vehicle import Array
+from sitl.plant.wind import Gust
 from swarmctl.core.simulated import EVERY_VEHICLE, FaultParams
 
 Undo = Callable[[], None]

@@ -20,19 +20,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sitl.world import SitlParams, SitlWorld
-from swarmctl.agent import Agent
-from swarmctl.assembly import make_agent
+from swarmctl.agent.agent import Agent
+from swarmctl.agent.assembly import make_agent
+from swarmctl.bus import topics
+from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.config import Config
 from swarmctl.core.clock import SimClock
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE, tick_row
 from swarmctl.core.types import TickRecord
 from swarmctl.kernels import why_not_repeatable
-from swarmctl.links import topics
-from swarmctl.links.autopilot import Autopilot
-from swarmctl.links.commands import CodecCommands
-from swarmctl.links.mavlink import Codec
-from swarmctl.links.peers import LocalHub, agent_name
-from swarmctl.links.transport import pipe_pair
+from swarmctl.mavlink.autopilot import Autopilot
+from swarmctl.mavlink.codec import Codec
+from swarmctl.mavlink.commands import CodecCommands
+from swarmctl.mavlink.transport import pipe_pair
 from swarmctl.telemetry.plain import plain
 from swarmctl.telemetry.referee import RunData
 

@@ -18,10 +18,10 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, BinaryIO
 
-from sitl.control import ControlSocket
+from sitl.fault_socket import ControlSocket
 from sitl.world import SitlWorld
 from swarmctl.errors import ConfigError, StartError
-from swarmctl.links.transport import bind_udp
+from swarmctl.mavlink.transport import bind_udp
 
 HOST = "127.0.0.1"
 STALL_US = 200_000

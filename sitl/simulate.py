@@ -22,8 +22,8 @@ from sitl.lockstep import Lockstep, write_events
 from swarmctl.config import Config, dump, load
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, exit_code_of
 from swarmctl.files import replace_bytes, replace_text, write_each
-from swarmctl.summary import summary_lines, unwritten_line, violation_lines
-from swarmctl.table import PlainLines
+from swarmctl.ops.status_table import PlainLines
+from swarmctl.ops.summary import summary_lines, unwritten_line, violation_lines
 from swarmctl.telemetry.recordings import RECORDING, open_viewer, optimize_recording, simulated_recording
 from swarmctl.telemetry.run_files import load_run
 from swarmctl.telemetry.run_folder import Outcome, create_run_folder, finish_run

@@ -13,27 +13,27 @@ from typing import Literal, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.airframes import PRESETS
-from sitl.attitude import THESIS_GAINS, attitude_loop
-from sitl.autopilot import Autopilot
-from sitl.commander import Commander, Face
-from sitl.endpoint import Endpoint
-from sitl.estimator import ESTIMATORS, Estimator
 from sitl.faults import Faults
-from sitl.imu import Imu
-from sitl.lossy import LossyLink
-from sitl.navigator import IDLE, Navigator
-from sitl.parameters import Parameters
-from sitl.physics import Physics, outfitted
-from sitl.schedule import GCS_HZ
-from sitl.sensors import FULL, local_origin
-from sitl.streams import Report
-from sitl.vehicle import Array, Plant
+from sitl.net.lossy import LossyLink
+from sitl.plant.airframes import PRESETS
+from sitl.plant.attitude import THESIS_GAINS, attitude_loop
+from sitl.plant.estimator import ESTIMATORS, Estimator
+from sitl.plant.imu import Imu
+from sitl.plant.physics import Physics, outfitted
+from sitl.plant.sensors import FULL, local_origin
+from sitl.plant.vehicle import Array, Plant
+from sitl.px4.autopilot import Autopilot
+from sitl.px4.link.endpoint import Endpoint
+from sitl.px4.link.schedule import GCS_HZ
+from sitl.px4.link.streams import Report
+from sitl.px4.navigator import IDLE, Navigator
+from sitl.px4.parameters import Parameters
+from sitl.vehicle_parts import Commander, Face
 from swarmctl.core.records import TRUTH_DTYPE
 from swarmctl.core.simulated import FaultParams, RealismParams
 from swarmctl.core.types import FlightMode, GeoOrigin
 from swarmctl.errors import ConfigError
-from swarmctl.links.transport import Transport
+from swarmctl.mavlink.transport import Transport
 
 AUTOPILOT_HZ = 50
 _SCALED_TIMEOUTS = ("COM_OF_LOSS_T", "COM_DL_LOSS_T", "COM_RC_LOSS_T")
@@ -65,7 +65,7 @@ class SitlParams:
     vehicles: int
     spawn_ned_m: Array
     preset: str = "thesis"
-    attitude_gains: str = "swarm"  # of sitl.attitude.THESIS_GAINS
+    attitude_gains: str = "swarm"  # of sitl.plant.attitude.THESIS_GAINS
     origin_lat_deg: float = 47.397742
     origin_lon_deg: float = 8.545594
     origin_alt_m: float = 489.4
@@ -311,7 +311,7 @@ class SitlWorld:
         return pilot, endpoint
 
     def _arducopter(self, vehicle: int, link: Transport) -> tuple[Commander, Face]:
-        from sitl.arducopter_endpoint import Start, arducopter_vehicle  # with a second dialect module: 20 MB
+        from sitl.arducopter.endpoint import Start, arducopter_vehicle  # with a second dialect module: 20 MB
 
         params = self.params
         start = Start(

@@ -1,5 +1,5 @@
 """`python -m swarmctl`, which the launcher itself uses to start agents."""
 
-from swarmctl.cli import main
+from swarmctl.ops.cli import main
 
 main()

@@ -15,19 +15,19 @@ from typing import Any, Literal
 
 from pydantic import Field, ValidationError
 
-from swarmctl.agent_setup import AgentParams
+from swarmctl.agent.setup import AgentParams
+from swarmctl.bus.topics import MAX_OBSTACLE_M, MAX_OBSTACLES
 from swarmctl.config_source import override, read_tree, shown
+from swarmctl.control.collision.separation import SeparationParams, radius_problem
 from swarmctl.control.controller import ControllerParams
-from swarmctl.control.mission import MissionParams
 from swarmctl.control.model import VehicleModelParams
-from swarmctl.control.separation import SeparationParams, radius_problem
+from swarmctl.control.reference.mission import MissionParams
 from swarmctl.core.params import Params, Vec3
 from swarmctl.core.simulated import RealismParams
 from swarmctl.core.text import printable
 from swarmctl.errors import ConfigError
-from swarmctl.links.parameter_names import parameter_problems
-from swarmctl.links.topics import MAX_OBSTACLE_M, MAX_OBSTACLES
-from swarmctl.links.transport import Endpoint, parse_url
+from swarmctl.mavlink.parameter_names import parameter_problems
+from swarmctl.mavlink.transport import Endpoint, parse_url
 from swarmctl.telemetry.referee import ObstacleRule, Rules
 from swarmctl.toml_text import toml_text
 

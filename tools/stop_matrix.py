@@ -27,8 +27,8 @@ from pathlib import Path
 
 import psutil
 
-from swarmctl.links.mavlink import Codec, frames
-from swarmctl.preflight import claim_ports
+from swarmctl.mavlink.codec import Codec, frames
+from swarmctl.ops.preflight import claim_ports
 
 PHASES = ("CONNECT", "STANDBY", "ARM", "TAKEOFF", "GOTO_START", "READY", "TRACK", "HOLD", "GOTO_LAND", "LAND")
 STOPS = ("sigint", "sigterm", "sighup", "land", "kill-agent", "kill-router", "kill-launcher")

@@ -8,12 +8,12 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from swarmctl.control.joint_mpc import JointMpc
+from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.model import VehicleModelParams
-from swarmctl.control.mpc import MpcParams, SwarmMpc
+from swarmctl.control.mpc.joint_mpc import JointMpc
+from swarmctl.control.mpc.problem import Problem
+from swarmctl.control.mpc.swarm_mpc import MpcParams, SwarmMpc
 from swarmctl.control.pid import PidController, PidParams
-from swarmctl.control.problem import Problem
-from swarmctl.control.separation import SeparationParams
 from swarmctl.core.params import Params
 from swarmctl.core.types import NO_TIMES, Plan, PlanStatus
 

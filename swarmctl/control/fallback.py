@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from swarmctl.control.lag import Lag
-from swarmctl.control.problem import Start
+from swarmctl.control.mpc.problem import Start
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.types import NO_TIMES, Array, Plan, PlanStatus
 

@@ -1,7 +1,7 @@
 """What the controller believes of its vehicle: delay, lag, drag, bounds, and where it will be when a setpoint acts.
 
 The model knows no mass: thrust enters as acceleration (thrust over mass), and the estimator in
-`swarmctl.control.disturbance` finds the hover thrust that converts it to the autopilot's 0..1.
+`swarmctl.control.estimation.disturbance` finds the hover thrust that converts it to the autopilot's 0..1.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field
 
 from swarmctl.control.lag import Lag
-from swarmctl.control.problem import Start
+from swarmctl.control.mpc.problem import Start
 from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned, rotate_to_ned
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array, VehicleState

@@ -1,7 +1,7 @@
 """The two clocks of a process, as one protocol that is passed in.
 
 Monotonic microseconds (`now_us`) are for deadlines and ages inside this process; disciplined UTC microseconds
-(`utc_us`) are for everything that leaves it. The wall-clock implementation lives in `swarmctl.runner`.
+(`utc_us`) are for everything that leaves it. The wall-clock implementation lives in `swarmctl.agent.runner`.
 """
 
 from __future__ import annotations

@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
+MAX_RADIUS_M = 10.0  # of what a path claims round itself: one peer must not ground all others
 Sampled = Callable[[Array], tuple[Array, Array]]  # offsets [s] from now (K,) -> positions, velocities (K, 3)
 
 

@@ -10,10 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from swarmctl.bus import topics
+from swarmctl.bus.peers import Bus, agent_name
 from swarmctl.core.records import unpack_tick
 from swarmctl.core.types import Array
-from swarmctl.links import topics
-from swarmctl.links.peers import Bus, agent_name
 from swarmctl.telemetry.obstacles import MovingObstacle
 
 

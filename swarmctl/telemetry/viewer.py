@@ -23,7 +23,7 @@ import psutil
 
 from swarmctl.errors import EXIT_OK, EXIT_USAGE, StartError, SwarmError
 from swarmctl.files import replace_text
-from swarmctl.lifeline import StopRequest, die_with_parent
+from swarmctl.process_lifetime import StopRequest, die_with_parent
 from swarmctl.telemetry.obstacles import MovingObstacle, read_obstacles
 from swarmctl.telemetry.recordings import APPLICATION, RECORDING, has_display, open_viewer
 
@@ -81,7 +81,7 @@ def _listed(text: str) -> object:
 
 
 def _run(options: argparse.Namespace, obstacles: list[MovingObstacle], stop: StopRequest) -> int:
-    from swarmctl.links.bus import ZenohBus
+    from swarmctl.bus.zenoh_bus import ZenohBus
     from swarmctl.telemetry.feed import Feed, listens_to
     from swarmctl.telemetry.layout import Stage
     from swarmctl.telemetry.scene import Scene

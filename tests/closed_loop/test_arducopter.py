@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from sitl.arducopter import ArduCopter
+from sitl.arducopter.autopilot import ArduCopter
 from sitl.lockstep import Lockstep
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase
 from tests.closed_loop.conftest import Flight, fly_now

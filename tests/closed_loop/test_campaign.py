@@ -15,13 +15,13 @@ import pyarrow.parquet as pq
 import pytest
 from scipy.stats import binomtest
 
-from sitl.campaign.command import main
-from sitl.campaign.flight import Flight, fly
-from sitl.campaign.page import REPORT
-from sitl.campaign.quick import QUICK
-from sitl.campaign.scenarios import layout_of
-from sitl.campaign.store import ROWS
-from sitl.campaign.trials import Cell, Row, Trial, trial_of
+from sitl.studies.campaign.command import main
+from sitl.studies.campaign.flight import Flight, fly
+from sitl.studies.campaign.page import REPORT
+from sitl.studies.campaign.quick import QUICK
+from sitl.studies.campaign.scenarios import layout_of
+from sitl.studies.campaign.store import ROWS
+from sitl.studies.campaign.trials import Cell, Row, Trial, trial_of
 from swarmctl.core.types import Phase
 
 ROOT = Path(__file__).parents[2]

@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sitl.campaign.layouts import least_sum_m, ring
-from sitl.campaign.scenarios import layout_of
 from sitl.lockstep import Lockstep
+from sitl.studies.campaign.layouts import least_sum_m, ring
+from sitl.studies.campaign.scenarios import layout_of
 from swarmctl.config import load
-from swarmctl.control import mission
+from swarmctl.control.reference import mission
 from swarmctl.core.types import Array
 from tests.closed_loop.conftest import nudged
 

@@ -10,11 +10,11 @@ import pytest
 from pymavlink.dialects.v20 import development as dialect
 
 from sitl.lockstep import Lockstep
-from swarmctl.control import mpc
-from swarmctl.control.qp import QpSolution
+from swarmctl.bus.peers import PeerPaths
+from swarmctl.control.mpc import swarm_mpc as mpc
+from swarmctl.control.mpc.qp import QpSolution
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase, PredictedPath
-from swarmctl.links.mavlink import Codec
-from swarmctl.links.peers import PeerPaths
+from swarmctl.mavlink.codec import Codec
 from tests.closed_loop.conftest import Fly
 
 MISSION = "mission.duration_s=14"

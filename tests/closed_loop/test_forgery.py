@@ -12,12 +12,12 @@ import numpy as np
 import pytest
 
 from sitl.lockstep import Lockstep
+from swarmctl.bus import topics
+from swarmctl.bus.orders import Verb
+from swarmctl.bus.peers import agent_name
+from swarmctl.bus.senders import Said, Speaker, _Stream
+from swarmctl.bus.trajectory_messages import decode_intent, encode_intent
 from swarmctl.core.types import Mode, Phase, PredictedPath
-from swarmctl.links import topics
-from swarmctl.links.intents import decode_intent, encode_intent
-from swarmctl.links.orders import Verb
-from swarmctl.links.peers import agent_name
-from swarmctl.links.speakers import Said, Speaker, _Stream
 from swarmctl.telemetry.referee import RunData, judge
 from tests.closed_loop.conftest import Flight, Fly, fly_now, mission_t_s
 

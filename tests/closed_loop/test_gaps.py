@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import development as dialect
 
-from sitl.endpoint import Endpoint
 from sitl.lockstep import Lockstep
+from sitl.px4.link.endpoint import Endpoint
 from swarmctl.core.types import FlightMode, Mode, Phase
-from swarmctl.links.autopilot import Autopilot
+from swarmctl.mavlink.autopilot import Autopilot
 from tests.closed_loop.conftest import Flight, Fly
 
 ALONE = ("swarm.agents=1", "sitl.start=air", "mission.duration_s=8")

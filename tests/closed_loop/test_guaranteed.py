@@ -6,14 +6,14 @@ from collections.abc import Set
 
 import pytest
 
-from sitl.campaign.flight import Flight
-from sitl.campaign.scenarios import layout_of
-from sitl.campaign.trials import Cell, Trial
 from sitl.lockstep import Lockstep
+from sitl.studies.campaign.flight import Flight
+from sitl.studies.campaign.scenarios import layout_of
+from sitl.studies.campaign.trials import Cell, Trial
+from swarmctl.agent.coordination import Coordination
+from swarmctl.bus.peers import agent_name
 from swarmctl.config import load
-from swarmctl.coordination import Coordination
 from swarmctl.core.types import Phase
-from swarmctl.links.peers import agent_name
 
 PROMISED_M = 0.8
 TOUCH_M = 0.48

@@ -12,14 +12,14 @@ import pytest
 from pymavlink.dialects.v20 import development as mavlink
 
 from sitl.lockstep import Lockstep
-from swarmctl.agent import Agent
+from swarmctl.agent.agent import Agent
 from swarmctl.config import load
-from swarmctl.control import sequence
-from swarmctl.control.sequence import REBOOTED, TAKEN_OVER, Sequence
+from swarmctl.control.phases import sequence
+from swarmctl.control.phases.sequence import REBOOTED, TAKEN_OVER, Sequence
 from swarmctl.core.types import FlightMode, Phase, VehicleState
-from swarmctl.links import mode_watch
-from swarmctl.links.mavlink import Codec, frames, message_id
-from swarmctl.links.transport import PipeTransport
+from swarmctl.mavlink import mode_watch
+from swarmctl.mavlink.codec import Codec, frames, message_id
+from swarmctl.mavlink.transport import PipeTransport
 from tests.closed_loop.conftest import Fly, mission_t_s
 
 SETPOINT = 82  # SET_ATTITUDE_TARGET

@@ -14,7 +14,7 @@ import pytest
 
 from sitl.lockstep import Lockstep
 from swarmctl.config import load
-from swarmctl.control.identification import Flown, Identified, flown, identify
+from swarmctl.control.estimation.identification import Flown, Identified, flown, identify
 from swarmctl.core.types import Landed, Phase
 
 CONFIG = Path(__file__).parents[2] / "configs" / "x500_circle.toml"

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sitl.lockstep import Lockstep
-from swarmctl.links.local_frame import LocalFrame
+from swarmctl.mavlink.local_frame import LocalFrame
 from tests.closed_loop.conftest import Flight, Fly
 
 JUMP_M = 5.0

@@ -7,12 +7,13 @@ from functools import cache
 import numpy as np
 import pytest
 
-from sitl.experiments import score, thesis
-from sitl.experiments.direct import fly_on_plant
-from sitl.experiments.over_mavlink import fly_over_mavlink
-from sitl.experiments.trace import Trace
+from sitl.studies.thesis import experiments as thesis
+from sitl.studies.thesis import score
+from sitl.studies.thesis.mavlink_flight import fly_over_mavlink
+from sitl.studies.thesis.model_flight import fly_on_plant
+from sitl.studies.thesis.trace import Trace
+from swarmctl.built_in_configs import shipped_config
 from swarmctl.config import load
-from swarmctl.shipped import shipped_config
 
 PUBLISHED_PID_FAST_M, RETUNED_M = 0.0741, 0.0400  # thesis Table 6; limit of the retuned gains
 PUBLISHED_MPC_FAST_M, IMPROVED_M = 0.0145, 0.0130  # thesis Table 12; limit of the improved preset

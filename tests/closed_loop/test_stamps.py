@@ -9,9 +9,9 @@ import pytest
 from pymavlink.dialects.v20 import development as dialect
 
 from sitl.lockstep import Lockstep
-from swarmctl.control.sequence import REBOOTED
-from swarmctl.links.mavlink import Codec
-from swarmctl.links.vehicle_clock import VehicleClock
+from swarmctl.control.phases.sequence import REBOOTED
+from swarmctl.mavlink.codec import Codec
+from swarmctl.mavlink.vehicle_clock import VehicleClock
 from tests.closed_loop.conftest import Flight, Fly
 
 OFFS_US = (-30_000_000, -1_500_000, 200_000, 900_000, 10**12)

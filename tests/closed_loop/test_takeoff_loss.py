@@ -9,8 +9,8 @@ import pytest
 from sitl.lockstep import Lockstep
 from swarmctl.config import load
 from swarmctl.core.types import FlightMode, Phase
-from swarmctl.links import autopilot
-from swarmctl.links.dialects import DIALECTS, PX4
+from swarmctl.mavlink import autopilot
+from swarmctl.mavlink.dialects import DIALECTS, PX4
 
 PHASES = [Phase.ARM, Phase.TAKEOFF]
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from sitl.world import SitlParams, SitlWorld
 from swarmctl.core.clock import SimClock
-from swarmctl.links.transport import Datagram, Transport, open_transport, pipe_pair
+from swarmctl.mavlink.transport import Datagram, Transport, open_transport, pipe_pair
 from tests.conformance.vocabulary import GCS_LINK, OFFBOARD_LINK
 
 EKF_READY_S = 4.0  # as measured on PX4

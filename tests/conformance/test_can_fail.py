@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from swarmctl.links.mavlink import Codec
+from swarmctl.mavlink.codec import Codec
 from tests.conformance import vocabulary as v
 from tests.conformance.dialogue import Deviation, Dialogue
 from tests.conformance.judge import command_message

@@ -17,7 +17,7 @@ import pytest
 from pymavlink.dialects.v20 import development as mav
 
 from swarmctl.core.records import TRUTH_DTYPE
-from swarmctl.links.mavlink import Codec, frames
+from swarmctl.mavlink.codec import Codec, frames
 
 pytestmark = pytest.mark.process
 

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import pytest
 
+from swarmctl.bus.topics import COMMAND, OPERATOR, PATH, STATUS, TICK, TOO_LONG
+from swarmctl.bus.zenoh_bus import SCHEME, ZenohBus
 from swarmctl.errors import StartError
-from swarmctl.links.bus import SCHEME, ZenohBus
-from swarmctl.links.topics import COMMAND, OPERATOR, PATH, STATUS, TICK, TOO_LONG
 
 pytestmark = pytest.mark.process
 
@@ -33,7 +33,7 @@ def until(condition: Callable[[], bool], timeout_s: float = WAIT_S) -> bool:
 
 
 def start_router(endpoint: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "swarmctl.links.bus", "--router", endpoint, "--die-with-parent"]
+    command = [sys.executable, "-m", "swarmctl.bus.zenoh_bus", "--router", endpoint, "--die-with-parent"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     assert process.stdout.readline().startswith("router ready")
@@ -122,7 +122,7 @@ def test_a_killed_process_is_seen_at_once_and_a_frozen_one_within_its_lease(
     endpoint: str, join: Callable[..., ZenohBus]
 ) -> None:
     script = (
-        "import sys, time; from swarmctl.links.bus import ZenohBus\n"
+        "import sys, time; from swarmctl.bus.zenoh_bus import ZenohBus\n"
         f"bus = ZenohBus({endpoint!r}, 'run', sys.argv[1], {{}}, lease_ms=1000)\ntime.sleep(60)"
     )
     watcher = join("agent-0")
@@ -176,7 +176,7 @@ def test_router_lost_and_back() -> None:
 def test_a_flood_holds_up_no_tick(endpoint: str, join: Callable[..., ZenohBus]) -> None:
     """What comes while a ring is drained waits for the next tick."""
     script = (
-        "from swarmctl.links.bus import ZenohBus\nfrom swarmctl.links.topics import PATH\n"
+        "from swarmctl.bus.zenoh_bus import ZenohBus\nfrom swarmctl.bus.topics import PATH\n"
         f"bus = ZenohBus({endpoint!r}, 'run', 'agent-1', {{}})\nwhile True: bus.publish(PATH, b'x' * 100)"
     )
     agent = join("agent-0", {PATH: ["agent-1"]})
@@ -246,7 +246,7 @@ def test_a_closed_bus_is_silent_and_never_raises(join: Callable[..., ZenohBus]) 
 
 
 def test_refusals_name_endpoint_and_fix(endpoint: str, tmp_path: Path) -> None:
-    with pytest.raises(StartError, match=r"absent.sock.*python -m swarmctl.links.bus --router"):
+    with pytest.raises(StartError, match=r"absent.sock.*python -m swarmctl.bus.zenoh_bus --router"):
         ZenohBus(f"{SCHEME}{tmp_path}/absent.sock", "run", "agent-0", {}, connect_timeout_ms=300)
     tmp_path.chmod(0o755)
     for bad, word in (
@@ -255,7 +255,7 @@ def test_refusals_name_endpoint_and_fix(endpoint: str, tmp_path: Path) -> None:
         (f"{SCHEME}/tmp/{'x' * 200}/bus.sock", "longer"),
         ("tcp/127.0.0.1:7447", SCHEME),
     ):
-        command = [sys.executable, "-m", "swarmctl.links.bus", "--router", bad]
+        command = [sys.executable, "-m", "swarmctl.bus.zenoh_bus", "--router", bad]
         answer = subprocess.run(command, capture_output=True, text=True, timeout=WAIT_S, check=False)
         assert answer.returncode == 3, answer
         assert word in answer.stderr
@@ -267,7 +267,7 @@ def test_router_ignores_ctrl_c_and_dies_with_a_killed_parent() -> None:
     endpoint = f"{SCHEME}{directory}/bus.sock"
     script = (
         "import subprocess, sys, time\n"
-        f"p = subprocess.Popen([sys.executable, '-m', 'swarmctl.links.bus', '--router', {endpoint!r}, "
+        f"p = subprocess.Popen([sys.executable, '-m', 'swarmctl.bus.zenoh_bus', '--router', {endpoint!r}, "
         "'--die-with-parent'], start_new_session=True)\nprint(p.pid, flush=True)\ntime.sleep(60)"
     )
     parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)

@@ -18,10 +18,10 @@ import psutil
 import pytest
 from pymavlink.dialects.v20 import development as mavlink
 
-from swarmctl.check import CheckOptions, check
 from swarmctl.config import load
 from swarmctl.errors import StartError
-from swarmctl.links.mavlink import Codec, frames
+from swarmctl.mavlink.codec import Codec, frames
+from swarmctl.ops.vehicle_check import CheckOptions, check
 
 pytestmark = pytest.mark.process
 

@@ -242,7 +242,7 @@ def test_a_killed_launcher_leaves_nothing(start: Callable[..., Launched]) -> Non
     assert launched.leftovers() == []
 
 
-@pytest.mark.parametrize(("name", "where"), [("swarmctl.links.bus", NEAR), ("sitl", AIR)], ids=["bus", "sitl"])
+@pytest.mark.parametrize(("name", "where"), [("swarmctl.bus.zenoh_bus", NEAR), ("sitl", AIR)], ids=["bus", "sitl"])
 def test_without_router_or_simulator_the_launch_ends_as_failed(
     start: Callable[..., Launched], name: str, where: tuple[str, ...]
 ) -> None:

@@ -11,14 +11,10 @@ from pathlib import Path
 
 import pytest
 
-import swarmctl.flight
-import swarmctl.recovery
-from swarmctl.config import load
-from swarmctl.core.types import FlightMode, Landed, Mode, Phase
-from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START
-from swarmctl.flight import Base, EventLog, Flight, Verdict
-from swarmctl.links.peers import LocalHub, agent_name
-from swarmctl.links.topics import (
+import swarmctl.ops.recovery
+import swarmctl.ops.supervisor
+from swarmctl.bus.peers import LocalHub, agent_name
+from swarmctl.bus.topics import (
     COMMAND,
     OBSTACLES,
     OPERATOR,
@@ -30,8 +26,12 @@ from swarmctl.links.topics import (
     decode_obstacles,
     encode_message,
 )
-from swarmctl.processes import ROUTER, SITL, VIEWER, Child, Command, Site, kill_all
-from swarmctl.table import AgentView
+from swarmctl.config import load
+from swarmctl.core.types import FlightMode, Landed, Mode, Phase
+from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START
+from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, Command, Site, kill_all
+from swarmctl.ops.status_table import AgentView
+from swarmctl.ops.supervisor import Base, EventLog, Flight, Verdict
 
 pytestmark = pytest.mark.process
 
@@ -136,9 +136,9 @@ class Scene(Base):
 
 @pytest.fixture(autouse=True)
 def short_times(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(swarmctl.flight, "_SILENCE_S", 1.0)
-    monkeypatch.setattr(swarmctl.flight, "_AFTER_DEATH_S", 0.5)
-    monkeypatch.setattr(swarmctl.flight, "_LAND_OBEYED_S", 1.0)
+    monkeypatch.setattr(swarmctl.ops.supervisor, "_SILENCE_S", 1.0)
+    monkeypatch.setattr(swarmctl.ops.supervisor, "_AFTER_DEATH_S", 0.5)
+    monkeypatch.setattr(swarmctl.ops.supervisor, "_LAND_OBEYED_S", 1.0)
 
 
 def test_all_agents_finish(tmp_path: Path) -> None:
@@ -191,7 +191,7 @@ def test_an_interrupted_launch_that_leaves_a_vehicle_is_a_failed_one(tmp_path: P
 def test_a_recovery_that_takes_too_long_is_ended_and_the_vehicle_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(swarmctl.recovery, "RECOVERY_S", 1.0)
+    monkeypatch.setattr(swarmctl.ops.recovery, "RECOVERY_S", 1.0)
     scene = Scene(tmp_path, [FLIES_LONG, ends(0, 1.0)])
     scene.lands = FLIES_LONG
     scene.act = lambda: scene.kill("agent-0")

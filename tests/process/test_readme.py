@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sitl.experiments.bench import PARTS, SOLVERS
+from sitl.studies.bench.bench import PARTS, SOLVERS
 from swarmctl.core.records import TRUTH_DTYPE
 from swarmctl.core.types import Landed
 

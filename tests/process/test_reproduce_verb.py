@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from sitl.experiments.figures import FLIGHTS
+from sitl.studies.thesis.figures import FLIGHTS
 
 pytestmark = pytest.mark.process
 

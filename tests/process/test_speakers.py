@@ -11,12 +11,12 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
+from swarmctl.bus.peers import PeerPaths, agent_name
+from swarmctl.bus.refusals import Refusals
+from swarmctl.bus.senders import SILENCE_US, Attendance
+from swarmctl.bus.topics import PATH, encode_path
+from swarmctl.bus.zenoh_bus import ZenohBus
 from swarmctl.core.types import PredictedPath
-from swarmctl.links.bus import ZenohBus
-from swarmctl.links.peers import PeerPaths, agent_name
-from swarmctl.links.refusals import Refusals
-from swarmctl.links.speakers import SILENCE_US, Attendance
-from swarmctl.links.topics import PATH, encode_path
 from tests.process.test_bus import WAIT_S, end, endpoint, join, start_router  # noqa: F401  (fixtures)
 
 pytestmark = pytest.mark.process
@@ -27,8 +27,8 @@ PEER = """
 import sys, time
 import numpy as np
 from swarmctl.core.types import PredictedPath
-from swarmctl.links.bus import ZenohBus
-from swarmctl.links.topics import PATH, encode_path
+from swarmctl.bus.zenoh_bus import ZenohBus
+from swarmctl.bus.topics import PATH, encode_path
 bus = ZenohBus(sys.argv[1], "run", "agent-1", {}, lease_ms=1000)
 seq = 0
 while True:

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from swarmctl.core.types import GeoOrigin
-from swarmctl.lifeline import die_with_parent
+from swarmctl.process_lifetime import die_with_parent
 from tests.real.network import Network
 
 SPACING_M = 2.0  # apart along north, about the origin

@@ -9,9 +9,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from swarmctl.bus.topics import MAX_OBSTACLES
 from swarmctl.config import Config, dump, load
 from swarmctl.errors import EXIT_USAGE, ConfigError
-from swarmctl.links.topics import MAX_OBSTACLES
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.toml"))
 

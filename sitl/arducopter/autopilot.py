@@ -1,0 +1,405 @@
+"""ArduCopter 4.6's commander for one vehicle: modes, arming, GUIDED attitude setpoints, landing, GCS failsafe.
+
+Scalar code at autopilot rate. It speaks in results and texts, not in MAVLink messages (`arducopter_endpoint` does).
+
+Nobody holds the radio: its sticks are centred while the vehicle flies (STABILIZE hovers on hover thrust, LOITER and
+ALT_HOLD keep the height) and its throttle is down on the ground. Unlike ArduCopter, body rates that are not finite are
+refused; everything else about setpoints is as measured, GUID_OPTIONS and type masks included.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+
+from sitl.arducopter.ground import Ground
+from sitl.arducopter.guided import LEVEL, SOME_RATES, Guided, Setpoints, Target
+from sitl.arducopter.modes import (
+    BASE_ALWAYS,
+    BASE_ARMED,
+    BASE_POSITION_CONTROL,
+    ENDS_ON_GROUND,
+    FLIGHT_MODES,
+    NEEDS_POSITION,
+    NO_ARMING_IN,
+    NOT_FLOWN_HERE,
+    WITHOUT_POSITION_CONTROL,
+    BootTimes,
+    CopterMode,
+    CopterState,
+    arming_refusals,
+)
+from sitl.arducopter.navigator import CopterNavigator
+from sitl.arducopter.parameters import CopterParameters
+from sitl.arducopter.return_home import Stage, WayHome
+from sitl.plant.sensors import Estimate, LocalOrigin
+from sitl.plant.vehicle import Array
+from sitl.px4.boot import Boot
+from sitl.px4.modes import Result, Severity
+from sitl.px4.navigator import IDLE, Command
+from swarmctl.core.frames import euler_from_quat, quat_from_euler
+from swarmctl.core.types import FlightMode, Landed
+
+FORCE_ARM, FORCE_DISARM = 2989.0, 21196.0  # p2 of ARM/DISARM
+REACHED_M = 0.1
+
+
+class ArduCopter:
+    """Commander of one vehicle.
+
+    Attributes:
+        clock: its own time and local frame.
+        boot: when what works, on that clock.
+        armed: motors may turn.
+        mode: what flies.
+        guided: what GUIDED does.
+        home_ned_m: local position of the last arming, or of the EKF origin before.
+        home_set: how often home has been set.
+        output: attitude and thrust to fly.
+        target_q_nb, throttle_in_01: the attitude controller's input, before angle boost (ATTITUDE_TARGET).
+        released: an air start's clamp has been opened.
+        has_origin: the EKF has its origin, and so a position.
+        failsafe: the ground station is lost.
+        refused: setpoints not used, by reason.
+    """
+
+    def __init__(
+        self,
+        parameters: CopterParameters,
+        navigator: CopterNavigator,
+        origin: LocalOrigin,
+        *,
+        ekf_ready_us: int,
+        airborne: bool,
+    ) -> None:
+        self.parameters = parameters
+        self.clock = Boot()
+        self.clock.origin = origin
+        self.boot = BootTimes.armable_after(ekf_ready_us)
+        self.released = not airborne
+        self.refused: Counter[str] = Counter()
+        self._outboxes: list[deque[tuple[Severity, str]]] = []
+        self._navigator = navigator
+        self._airborne = airborne
+        self._fliers: dict[CopterMode, Callable[[Estimate, float], tuple[Array, float]]] = {
+            CopterMode.STABILIZE: self._stabilize,
+            CopterMode.ALT_HOLD: self._alt_hold,
+            CopterMode.GUIDED: self._fly_guided,
+            CopterMode.LOITER: self._loiter,
+            CopterMode.BRAKE: self._loiter,
+            CopterMode.RTL: self._return,
+            CopterMode.LAND: self._land,
+        }
+        self._power_up()
+
+    def _power_up(self) -> None:
+        self.armed = False
+        self.mode = CopterMode.STABILIZE
+        self.guided = Guided.STOP
+        self.home_ned_m: tuple[float, float, float] | None = None
+        self.home_set = 0
+        self.output = IDLE
+        self.target_q_nb, self.throttle_in_01 = LEVEL, 0.0
+        self._ground = Ground(self.parameters, self._navigator.hover_01, self._airborne)
+        self._setpoints = Setpoints(self.parameters)
+        self._way_home = WayHome(self.parameters, self._navigator)
+        self._takeoff_z_m = 0.0
+        self._takeoff_reached = False
+        self._estimate: Estimate | None = None
+        self._now_us = 0
+        self._initialised = self.has_origin = False
+        self._gcs_us: int | None = None
+        self.failsafe = False
+
+    def reboot(self, now_us: int) -> None:
+        """Start again at `now_us` of the simulation; parameters are kept, the local frame begins where it is."""
+        self.clock.again(now_us, self._estimate)
+        self._power_up()
+
+    # --- what others ask ---
+
+    def outbox(self) -> deque[tuple[Severity, str]]:
+        """A new queue that every text is put into: one for each link."""
+        box: deque[tuple[Severity, str]] = deque(maxlen=64)
+        self._outboxes.append(box)
+        return box
+
+    def prearm_passed(self, now_us: int) -> bool:
+        """PREARM_CHECK of SYS_STATUS; whatever the mode."""
+        return self.armed or now_us >= self.boot.armable_us
+
+    @property
+    def landed(self) -> Landed:
+        if self._ground.landed:
+            return Landed.ON_GROUND
+        if self.armed and self._lands():
+            return Landed.LANDING
+        if self.armed and self._takes_off():
+            return Landed.TAKEOFF
+        return Landed.IN_AIR
+
+    def base_mode(self) -> int:
+        """HEARTBEAT.base_mode: bit 8 while the horizontal position controller is at work."""
+        angle = self.mode == CopterMode.GUIDED and self.guided is Guided.ANGLE
+        positions = self.mode not in WITHOUT_POSITION_CONTROL and not angle
+        return BASE_ALWAYS | (BASE_POSITION_CONTROL if positions else 0) | (BASE_ARMED if self.armed else 0)
+
+    def system_status(self) -> CopterState:
+        if not self._initialised:
+            return CopterState.BOOT
+        if self.failsafe:
+            return CopterState.CRITICAL
+        return CopterState.STANDBY if self._ground.landed else CopterState.ACTIVE
+
+    def flight_mode(self) -> FlightMode:
+        return FLIGHT_MODES.get(self.mode, FlightMode.MANUAL)
+
+    def say(self, severity: Severity, text: str) -> None:
+        """A STATUSTEXT on every link."""
+        for box in self._outboxes:
+            box.append((severity, text))
+
+    # --- setpoints ---
+
+    def on_setpoint(
+        self, type_mask: int, q_nb: Sequence[float], rates: Sequence[float], thrust: float, now_us: int
+    ) -> bool:
+        """SET_ATTITUDE_TARGET, see `Setpoints.take`; True when it will be flown."""
+        if self.mode != CopterMode.GUIDED:
+            return self._refuse("not_guided")
+        refusal = self._setpoints.take(type_mask, q_nb, rates, thrust, self.target_q_nb, now_us)
+        if refusal:
+            if refusal == SOME_RATES and self.guided is not Guided.STOP:
+                self._enter_guided(Guided.STOP)
+            return self._refuse(refusal)
+        if self.guided is not Guided.ANGLE:
+            self._enter_guided(Guided.ANGLE)
+        if not self.armed:
+            return True
+        self.released = True
+        if not self._ground.landed:  # acts at once: the real one's loop runs at 400 Hz
+            target = self._setpoints.target
+            self._put_out(target.q_nb, self.throttle_in_01 if target.thrust_01 is None else target.thrust_01)
+        return True
+
+    def _refuse(self, reason: str) -> bool:
+        self.refused[reason] += 1
+        return False
+
+    # --- commands ---
+
+    def arm(self, now_us: int, *, force: bool = False) -> Result:
+        """MAV_CMD_COMPONENT_ARM_DISARM p1=1."""
+        if self.armed:
+            return Result.ACCEPTED
+        reasons = arming_refusals(self.boot, now_us)
+        if force and now_us >= self.boot.initialised_us:
+            reasons = ()
+        if self.mode in NO_ARMING_IN:
+            reasons = (*reasons, f"Arm: {self.mode.name} mode not armable")
+        for reason in reasons:
+            self.say(Severity.CRITICAL, reason)
+        if reasons or self._estimate is None:
+            return Result.FAILED
+        self.armed = True
+        self._ground.armed_at(now_us)
+        self._set_home(self._estimate)
+        self.say(Severity.INFO, "Arming motors")
+        self._engage()
+        return Result.ACCEPTED
+
+    def disarm(self, *, force: bool = False) -> Result:
+        """MAV_CMD_COMPONENT_ARM_DISARM p1=0; in the air only with `force`."""
+        if not self.armed:
+            return Result.ACCEPTED
+        if not self._ground.landed and self.released and not force:
+            return Result.FAILED
+        self._disarm()
+        return Result.ACCEPTED
+
+    def _disarm(self) -> None:
+        self.armed = self.failsafe = False
+        self.output, self.throttle_in_01 = IDLE, 0.0
+        self.say(Severity.INFO, "Disarming motors")
+
+    def set_mode(self, number: int) -> Result:
+        """A commanded mode; while disarmed any mode can be set."""
+        if number not in set(CopterMode):
+            known = NOT_FLOWN_HERE.get(number)
+            text = f"Mode change to {known} failed: init failed" if known else f"No such mode {number}"
+            self.say(Severity.WARNING, text)
+            return Result.FAILED
+        mode = CopterMode(number)
+        if self.armed and mode in NEEDS_POSITION and not self.has_origin:
+            self.say(Severity.WARNING, f"Mode change to {mode.name} failed: requires position")
+            return Result.FAILED
+        if mode != self.mode:
+            self._enter(mode)
+        return Result.ACCEPTED
+
+    def take_off(self, height_m: float) -> Result:
+        """MAV_CMD_NAV_TAKEOFF: `height_m` above home. In GUIDED, armed, on the ground."""
+        estimate, home = self._estimate, self.home_ned_m
+        if (
+            not self.armed
+            or not self._ground.landed
+            or self.mode != CopterMode.GUIDED
+            or estimate is None
+            or home is None
+        ):
+            return Result.FAILED
+        z_m = home[2] - height_m
+        if not z_m < estimate.pos_ned_m[2]:  # not up, or not a number
+            return Result.FAILED
+        self._takeoff_z_m, self._takeoff_reached = z_m, False
+        if self.guided is not Guided.TAKEOFF:  # asked again while motors spin up, it goes on
+            self._enter_guided(Guided.TAKEOFF)
+        return Result.ACCEPTED
+
+    def gcs_heard(self, now_us: int) -> None:
+        """HEARTBEAT from SYSID_MYGCS."""
+        self._gcs_us = now_us
+        if self.failsafe:
+            self.failsafe = False
+            self.say(Severity.WARNING, "GCS Failsafe Cleared")
+
+    def _enter(self, mode: CopterMode) -> None:
+        self.mode = mode
+        self.guided = Guided.STOP
+        self._ground.stay()
+        if self._estimate is not None and self.home_ned_m is not None:
+            self._way_home.begin(self._estimate, self.home_ned_m)
+        self._engage()
+
+    def _enter_guided(self, what: Guided) -> None:
+        self.guided = what
+        self._ground.stay()
+        self._engage()
+
+    def _engage(self) -> None:
+        if self._estimate is not None:
+            self._navigator.engage(self._estimate)
+
+    # --- every tick ---
+
+    def tick(self, estimate: Estimate, now_us: int, dt_s: float) -> None:
+        """Boot, detect landing and lost ground stations, disarm when due, and fly the mode.
+
+        `estimate` and `now_us` are the simulation's; everywhere else time is since boot.
+        """
+        now_us = self.clock.since_us(now_us)
+        if now_us < 0:
+            return
+        estimate = self.clock.local(estimate)
+        self._estimate, self._now_us = estimate, now_us
+        self._boot_on(estimate, now_us)
+        self._ground.watch(estimate, self.throttle_in_01, self.armed, now_us)
+        self._watch_gcs(now_us)
+        if not self.armed:
+            return
+        if self._ground.disarms(self.mode in ENDS_ON_GROUND, now_us):
+            self._disarm()
+            return
+        if self._ground.landed and not self._lifts_off(now_us):
+            self.throttle_in_01 = self._ground.takeoff_throttle_01(now_us) if self._takes_off() else 0.0
+            self.output = Command(IDLE.q_nb, self.throttle_in_01) if self.throttle_in_01 else IDLE
+            return
+        self._put_out(*self._fliers[self.mode](estimate, dt_s))
+
+    def _boot_on(self, estimate: Estimate, now_us: int) -> None:
+        if not self._initialised and now_us >= self.boot.initialised_us:
+            self._initialised = True
+            self._enter(CopterMode.STABILIZE)
+        if not self.has_origin and now_us >= self.boot.origin_us:
+            self.has_origin = True
+            self.say(Severity.INFO, "EKF3 IMU0 origin set")
+            self._set_home(estimate)
+
+    def _set_home(self, estimate: Estimate) -> None:
+        self.home_ned_m = estimate.pos_ned_m
+        self.home_set += 1
+
+    def _watch_gcs(self, now_us: int) -> None:
+        action = self.parameters.integer("FS_GCS_ENABLE")
+        if not action or not self.armed or self.failsafe or self._gcs_us is None or self._ground.landed:
+            return
+        if now_us - self._gcs_us > self.parameters.real("FS_GCS_TIMEOUT") * 1e6:
+            self.failsafe = True
+            self.say(Severity.WARNING, "GCS Failsafe")
+            self._enter(CopterMode.LAND if action in (4, 5, 7) else CopterMode.RTL)
+
+    def _lifts_off(self, now_us: int) -> bool:
+        """On the ground: whether what is asked takes off, and the motors have spun up for it."""
+        asked = self.mode == CopterMode.GUIDED and (
+            self.guided is Guided.TAKEOFF or (self.guided is Guided.ANGLE and self._target().rises)
+        )
+        if not asked:
+            self._ground.stay()
+        if not asked or not self._ground.lifts_off(now_us, slowly=self.guided is Guided.TAKEOFF):
+            return False
+        self._engage()
+        return True
+
+    def _put_out(self, q_nb: Array, throttle_01: float) -> None:
+        """Hand an attitude and a throttle to the attitude controller, which boosts it by the tilt asked for."""
+        self.target_q_nb, self.throttle_in_01 = q_nb, throttle_01
+        boost = 1.0
+        if self.parameters.integer("ATC_ANGLE_BOOST"):
+            boost = 1.0 / max(0.1, 1.0 - 2.0 * float(q_nb[1] ** 2 + q_nb[2] ** 2))
+        self.output = Command(q_nb, max(0.0, min(1.0, throttle_01 * boost)))
+
+    # --- modes: attitude and throttle of this tick ---
+
+    def _level(self) -> Array:
+        _, _, yaw_rad = euler_from_quat(self.target_q_nb)
+        return quat_from_euler(0.0, 0.0, yaw_rad)
+
+    def _stabilize(self, estimate: Estimate, dt_s: float) -> tuple[Array, float]:
+        return self._level(), self._navigator.hover_01
+
+    def _alt_hold(self, estimate: Estimate, dt_s: float) -> tuple[Array, float]:
+        return self._level(), self._navigator.hold_height(estimate, dt_s)
+
+    def _loiter(self, estimate: Estimate, dt_s: float) -> tuple[Array, float]:
+        return self._navigator.hold(estimate, dt_s), self._navigator.hold_height(estimate, dt_s)
+
+    def _land(self, estimate: Estimate, dt_s: float) -> tuple[Array, float]:
+        speed_m_s = self.parameters.metres("LAND_SPEED")
+        ground_z_m = self.home_ned_m[2] if self.home_ned_m is not None else estimate.pos_ned_m[2]
+        if ground_z_m - estimate.pos_ned_m[2] > self.parameters.metres("LAND_ALT_LOW"):
+            speed_m_s = self.parameters.metres("LAND_SPEED_HIGH") or self.parameters.metres("WPNAV_SPEED_DN")
+        return self._navigator.hold(estimate, dt_s), self._navigator.climb(estimate, -speed_m_s, dt_s)
+
+    def _fly_guided(self, estimate: Estimate, dt_s: float) -> tuple[Array, float]:
+        if self.guided is Guided.ANGLE:
+            return self._fly_angle(estimate, dt_s)
+        if self.guided is Guided.STOP:
+            return self._loiter(estimate, dt_s)
+        self._takeoff_reached |= estimate.pos_ned_m[2] <= self._takeoff_z_m + REACHED_M
+        throttle = self._navigator.to_height(estimate, self._takeoff_z_m, dt_s)
+        return self._navigator.hold(estimate, dt_s), throttle
+
+    def _fly_angle(self, estimate: Estimate, dt_s: float) -> tuple[Array, float]:
+        target = self._setpoints.target = self._target().turned(dt_s)
+        if target.thrust_01 is not None:
+            return target.q_nb, target.thrust_01
+        return target.q_nb, self._navigator.climb(estimate, target.climb_m_s, dt_s)
+
+    def _target(self) -> Target:
+        """The newest setpoint; when it is too old: level, climb rate 0, whatever thrust meant."""
+        if self._setpoints.stale(self._now_us):
+            if self._setpoints.target.thrust_01 is not None and self._estimate is not None:
+                self._navigator.engage(self._estimate)
+            self._setpoints.target = Target(self._level())
+        return self._setpoints.target
+
+    def _return(self, estimate: Estimate, dt_s: float) -> tuple[Array, float]:
+        if self._way_home.stage is Stage.LAND:
+            return self._land(estimate, dt_s)
+        return self._way_home.fly(estimate, self.home_ned_m or estimate.pos_ned_m, self._now_us, dt_s)
+
+    def _lands(self) -> bool:
+        return self.mode == CopterMode.LAND or (self.mode == CopterMode.RTL and self._way_home.stage is Stage.LAND)
+
+    def _takes_off(self) -> bool:
+        return self.mode == CopterMode.GUIDED and self.guided is Guided.TAKEOFF and not self._takeoff_reached

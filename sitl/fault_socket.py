@@ -1,0 +1,96 @@
+"""A running simulator's ear for faults: JSON requests on a Unix datagram socket, each answered to its sender.
+
+`{"fault": {"kind": "motor", "vehicle": 0, "value": 0.5, "for_s": 2}}` is answered by `{"ok": true, "since_boot_s": 12}`
+or by `{"ok": false, "problems": ["value = 7: allowed for motor: 0 to 1 (...)"]}`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from sitl.world import SitlWorld
+from swarmctl.core.simulated import FaultParams
+from swarmctl.errors import ConfigError
+from swarmctl.process_lifetime import remove_socket
+
+_LARGEST = 8192
+
+
+class ControlSocket:
+    """Bound where the launcher said; gone with `close`.
+
+    Args:
+        of_launch: the folder is a launch's own; whoever ends last, the router or this, takes it away.
+
+    Raises:
+        ConfigError: the path is taken or can't be made.
+    """
+
+    def __init__(self, path: Path, of_launch: bool = False) -> None:
+        self._path = path
+        self._of_launch = of_launch
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        try:
+            before = os.umask(0o177)
+            try:
+                self._socket.bind(str(path))
+            finally:
+                os.umask(before)
+        except OSError as error:
+            self._socket.close()
+            fix = "a path of at most 100 bytes, not taken, in a folder that exists"
+            raise ConfigError("sitl", [f"control = {path}: {error}; allowed: {fix}"]) from error
+        self._socket.setblocking(False)
+
+    def poll(self, world: SitlWorld) -> None:
+        """Answer what has arrived."""
+        while True:
+            try:
+                request, sender = self._socket.recvfrom(_LARGEST)
+            except OSError:
+                return
+            answer = json.dumps(handle(request, world)).encode()
+            try:
+                self._socket.sendto(answer, sender)
+            except (OSError, TypeError):
+                continue  # it has no address, or did not wait
+
+    def close(self) -> None:
+        self._socket.close()
+        if self._of_launch:
+            remove_socket(self._path)
+        else:
+            self._path.unlink(missing_ok=True)
+
+
+def handle(request: bytes, world: SitlWorld) -> dict[str, Any]:
+    """Do what a request asks, or say everything that is wrong with it."""
+    try:
+        asked = json.loads(request)
+        wanted = asked["fault"]
+    except (ValueError, TypeError, KeyError, RecursionError):
+        return _refused(['not a request: send {"fault": {"kind": ...}} as JSON'])
+    try:
+        fault = FaultParams.model_validate(wanted)
+    except ValidationError as error:
+        return _refused([_explain(dict(e)) for e in error.errors()])
+    problems = list(world.can(fault))
+    if problems:
+        return _refused(problems)
+    world.faults.begin(fault, world.since_boot_us)
+    return {"ok": True, "since_boot_s": world.since_boot_us * 1e-6}
+
+
+def _refused(problems: list[str]) -> dict[str, Any]:
+    return {"ok": False, "problems": problems}
+
+
+def _explain(error: dict[str, Any]) -> str:
+    key = ".".join(str(part) for part in error["loc"]) or "fault"
+    return f"{key} = {error.get('input')!r}: {error['msg'].lower()}"

@@ -1,0 +1,146 @@
+"""A link that loses, delays, doubles, reorders and corrupts datagrams, seeded, each direction by itself.
+
+Without a fault it hands everything through untouched. What is late is released when the simulator next steps.
+"""
+
+from __future__ import annotations
+
+import heapq
+from dataclasses import dataclass
+
+import numpy as np
+
+from swarmctl.mavlink.codec import frames, message_id
+from swarmctl.mavlink.transport import Datagram, Transport
+
+_OVERTAKEN_US = 100_000  # a datagram waits this long for one to overtake it
+_SET_ATTITUDE_TARGET = 82
+_NOTHING = (0.0,) * 5
+
+
+@dataclass
+class Troubles:
+    """Of one direction; probabilities are per datagram."""
+
+    loss_01: float = 0.0
+    delay_ms: float = 0.0
+    duplicate_01: float = 0.0
+    reorder_01: float = 0.0
+    corrupt_01: float = 0.0
+
+    def any(self) -> bool:
+        """Whether there is one."""
+        return (self.loss_01, self.delay_ms, self.duplicate_01, self.reorder_01, self.corrupt_01) != _NOTHING
+
+
+class Way:
+    """One direction of a link.
+
+    Attributes:
+        clear: datagrams pass untouched and none is waiting; kept up to date, because every datagram asks.
+    """
+
+    def __init__(self, rng: np.random.Generator) -> None:
+        self.clear = True
+        self.troubles = Troubles()
+        self._rng = rng
+        self._queue: list[tuple[int, int, bytes]] = []  # due, number, datagram
+        self._overtaken: tuple[int, bytes] | None = None  # patience ends, datagram
+        self._number = 0
+
+    def trouble(self, name: str, amount: float) -> None:
+        """Set one of the troubles; 0 takes it away."""
+        setattr(self.troubles, name, amount)
+        self._look()
+
+    def offer(self, now_us: int, data: bytes) -> None:
+        """One datagram enters."""
+        troubles, rng = self.troubles, self._rng
+        if self._happens(troubles.loss_01):
+            return
+        if self._happens(troubles.corrupt_01) and data:
+            spoilt = bytearray(data)
+            spoilt[int(rng.integers(len(data)))] ^= 1 << int(rng.integers(8))
+            data = bytes(spoilt)
+        if self._overtaken is None and self._happens(troubles.reorder_01):
+            self._overtaken = now_us + _OVERTAKEN_US, data
+            return
+        due_us = now_us + round(troubles.delay_ms * 1e3)
+        for _ in range(2 if self._happens(troubles.duplicate_01) else 1):
+            self._push(due_us, data)
+        if self._overtaken is not None:
+            self._push(due_us, self._overtaken[1])
+            self._overtaken = None
+
+    def take(self, now_us: int) -> list[Datagram]:
+        """Everything that comes out by now, stamped with its own time."""
+        if self._overtaken is not None and now_us >= self._overtaken[0]:
+            self._push(*self._overtaken)
+            self._overtaken = None
+        out = []
+        while self._queue and self._queue[0][0] <= now_us:
+            due_us, _, data = heapq.heappop(self._queue)
+            out.append(Datagram(due_us, data))
+        self._look()
+        return out
+
+    def _look(self) -> None:
+        self.clear = not (self._queue or self._overtaken or self.troubles.any())
+
+    def _push(self, due_us: int, data: bytes) -> None:
+        self._number += 1
+        heapq.heappush(self._queue, (due_us, self._number, data))
+
+    def _happens(self, probability_01: float) -> bool:
+        """A draw only where it matters, so that one fault does not change what another does."""
+        return probability_01 > 0.0 and float(self._rng.random()) < probability_01
+
+
+class LossyLink:
+    """A transport around another one.
+
+    Attributes:
+        to_vehicle, from_vehicle: its two directions.
+    """
+
+    def __init__(self, inner: Transport, seed: tuple[int, ...]) -> None:
+        self._inner = inner
+        self._now_us = 0
+        self._setpoints: int | None = None
+        self.to_vehicle, self.from_vehicle = (Way(np.random.default_rng([*seed, way])) for way in (0, 1))
+
+    def send(self, data: bytes) -> None:
+        way = self.from_vehicle
+        if way.clear:
+            self._inner.send(data)
+            return
+        way.offer(self._now_us, data)
+        self._release()
+
+    def receive(self, now_us: int) -> list[Datagram]:
+        self._now_us = now_us
+        if not self.from_vehicle.clear:
+            self._release()
+        arrived = self._inner.receive(now_us)
+        way = self.to_vehicle
+        if not way.clear:
+            for datagram in arrived:
+                way.offer(datagram.t_us, datagram.data)
+            arrived = way.take(now_us)
+        if self._setpoints is not None:
+            self._setpoints += sum(
+                message_id(frame) == _SET_ATTITUDE_TARGET for datagram in arrived for frame in frames(datagram.data)
+            )
+        return arrived
+
+    def setpoints(self) -> int:
+        """SET_ATTITUDE_TARGET frames that have come out since the first call."""
+        self._setpoints = self._setpoints or 0
+        return self._setpoints
+
+    def close(self) -> None:
+        self._inner.close()
+
+    def _release(self) -> None:
+        for datagram in self.from_vehicle.take(self._now_us):
+            self._inner.send(datagram.data)

@@ -1,0 +1,50 @@
+"""A vehicle's UDP port as PX4 has one: it listens to everybody, and talks to whoever was first."""
+
+from __future__ import annotations
+
+import socket
+
+from swarmctl.mavlink.transport import Datagram
+
+_MAX_DATAGRAM = 2048
+
+
+class OpenPort:
+    """Sends to `remote` until the first datagram arrives, from then on to its sender for good.
+
+    Datagrams of all senders are handed on: PX4 obeys them too, and answers the first.
+    """
+
+    def __init__(self, sock: socket.socket, remote: tuple[str, int]) -> None:
+        self._sock = sock
+        self._sock.setblocking(False)
+        self._remote = remote
+        self._latched = False
+
+    @property
+    def fd(self) -> int:
+        """File descriptor, for a selector."""
+        return self._sock.fileno()
+
+    def send(self, data: bytes) -> None:
+        """Hand over one frame; dropped when the socket can't take it."""
+        try:
+            self._sock.sendto(data, self._remote)
+        except OSError:
+            return
+
+    def receive(self, now_us: int) -> list[Datagram]:
+        """Everything that has arrived since the last call."""
+        arrived: list[Datagram] = []
+        while True:
+            try:
+                data, sender = self._sock.recvfrom(_MAX_DATAGRAM)
+            except OSError:
+                return arrived
+            if not self._latched:
+                self._remote, self._latched = sender, True
+            arrived.append(Datagram(now_us, data))
+
+    def close(self) -> None:
+        """Release the port."""
+        self._sock.close()

@@ -1,0 +1,272 @@
+"""What is wrong with each autopilot's estimate of itself: seeded error models, one independent error a vehicle.
+
+The autopilot's own navigator and its attitude loop fly on the same wrong estimate that its client is told. With the
+model `exact` there is no error and nothing is drawn. Stamps say when an estimate was published; how old the sample
+behind it is (`latency_s`) is told to nobody, as on a real autopilot.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from sitl.plant.attitude import Sensed
+from sitl.plant.sensors import FULL, Estimate, Power
+from sitl.plant.vehicle import Array, Plant
+
+_BLOCK = 50  # steps of random numbers drawn at a time
+_DRAWS = 17  # a step and vehicle: wander of position 3, velocity 3, tilt 2; white noise on each 3, 3, 3
+_PURPOSE = 1  # of the random stream, beside run seed and vehicle
+_LOST_M_S2 = 0.05  # acceleration that 0.3 deg of tilt error leaks into a position that nothing corrects
+EXACT_ACCURACY_M = (0.01, 0.01)
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorModel:
+    """Slow errors: root mean square and correlation time, NED per axis.
+
+    They are white noise behind two equal low-passes: a filter that integrates inertial data, as an autopilot's does,
+    is wrong smoothly, so that its position can still be differentiated.
+    """
+
+    position_m: tuple[float, float, float]
+    position_tau_s: float
+    velocity_m_s: tuple[float, float, float]  # reported velocity against the derivative of the reported position
+    velocity_tau_s: float
+    tilt_rad: float  # roll and pitch each
+    tilt_tau_s: float
+    noise_position_m: float  # white, per axis and physics step
+    noise_velocity_m_s: float
+    noise_attitude_rad: float
+    latency_s: tuple[float, float]  # age of a sample when published; every vehicle has its own between these
+
+    @property
+    def accuracy_m(self) -> tuple[float, float]:
+        """1 sigma, horizontal (both axes together, as PX4 reports it) and vertical."""
+        north, east, down = (math.hypot(rms_m, self.noise_position_m) for rms_m in self.position_m)
+        return math.hypot(north, east), down
+
+
+_PERFECT = ErrorModel((0.0,) * 3, 1.0, (0.0,) * 3, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0, (0.0, 0.0))  # to carry faults
+
+ESTIMATORS: dict[str, ErrorModel | None] = {
+    "exact": None,
+    "gps": ErrorModel(  # PX4 1.18 with its default GPS: position 0.3-0.6 m off in space, velocity 0.1-0.3 m/s
+        position_m=(0.2, 0.2, 0.25),
+        position_tau_s=25.0,
+        velocity_m_s=(0.15, 0.15, 0.15),
+        velocity_tau_s=4.0,
+        tilt_rad=math.radians(0.3),
+        tilt_tau_s=20.0,
+        noise_position_m=0.005,
+        noise_velocity_m_s=0.02,
+        noise_attitude_rad=math.radians(0.1),
+        latency_s=(0.010, 0.020),
+    ),
+    "external": ErrorModel(  # position fed from outside into the same filter: 4 cm off in space, velocity 0.05-0.1 m/s
+        position_m=(0.023, 0.023, 0.023),
+        position_tau_s=25.0,
+        velocity_m_s=(0.055, 0.055, 0.055),
+        velocity_tau_s=4.0,
+        tilt_rad=math.radians(0.3),
+        tilt_tau_s=20.0,
+        noise_position_m=0.005,
+        noise_velocity_m_s=0.02,
+        noise_attitude_rad=math.radians(0.1),
+        latency_s=(0.010, 0.020),
+    ),
+}
+
+
+class Estimator:
+    """Estimates of all vehicles. `advance` after every physics step; `of` whenever somebody asks.
+
+    Attributes:
+        q_nb: (4, N) attitude as the attitude loop knows it: without latency and white noise.
+        euler_rad: (3, N) the same as roll, pitch, yaw.
+        rate_frd_rad_s: (3, N).
+        power: what each vehicle's power module measures.
+    """
+
+    def __init__(self, model: ErrorModel | None, plant: Plant, seed: int) -> None:
+        self._model = model
+        self._plant = plant
+        self._seed = seed
+        self._accuracy_m = model.accuracy_m if model else EXACT_ACCURACY_M
+        self._stale = True
+        count = plant.state.shape[1]
+        self.power: list[Power] = [FULL] * count
+        self._jump_ned_m = np.zeros((3, count))
+        self._lost_s = np.zeros(count)  # since GPS was lost; 0: it is there
+        self._lost = np.zeros(count)
+        self._drift_axis = np.zeros((3, count))
+        self._frozen: dict[int, Estimate] = {}
+        self._rows: list[Any] = []  # (19,) of each vehicle: see `_believed`
+        self._on_ground: list[bool] = []
+        if model is not None:
+            self._start(model, plant, seed)
+
+    def _start(self, model: ErrorModel, plant: Plant, seed: int) -> None:
+        count, dt_s = plant.state.shape[1], plant.dt_s
+        self._rngs = [np.random.default_rng([seed, i, _PURPOSE]) for i in range(count)]
+        taus_s = np.repeat([model.position_tau_s, model.velocity_tau_s, model.tilt_tau_s], (3, 3, 2))
+        rms = np.array([*model.position_m, *model.velocity_m_s, model.tilt_rad, model.tilt_rad])
+        self._keep = np.exp(-2.0 * dt_s / taus_s)[:, None]  # of each low-pass, with half the correlation time
+        rough_rms = math.sqrt(2.0) * rms  # of the first stage: the second halves its variance
+        self._drive = (rough_rms * np.sqrt(1.0 - np.exp(-4.0 * dt_s / taus_s)))[:, None]
+        self._white_rms = np.repeat(
+            [model.noise_position_m, model.noise_velocity_m_s, model.noise_attitude_rad], (3, 3, 3)
+        )[:, None]
+        first = np.stack([rng.standard_normal((2, 8)) for rng in self._rngs], axis=2)  # (2, 8, N)
+        self._wander = first[0] * rms[:, None]
+        self._rough = self._wander + first[1] * rms[:, None]  # variance and correlation of the two at rest
+        low_s, high_s = model.latency_s
+        lags = [round(rng.uniform(low_s, high_s) / dt_s) for rng in self._rngs]
+        self._lag_steps = np.array(lags)
+        self._history = np.repeat(self._sample()[None], max(lags) + 1, axis=0)  # (steps, 13, N), ring
+        self._head = 0
+        self._columns = np.arange(count)
+        self._block = np.zeros((0, _DRAWS, count))
+        self._drawn = 0
+        self._white = np.zeros((9, count))
+        self._tilt_quat()
+
+    def advance(self) -> None:
+        """The physics has made a step."""
+        self._stale = True
+        if self._model is None:
+            return
+        if self._drawn == len(self._block):
+            self._block = np.stack([rng.standard_normal((_BLOCK, _DRAWS)) for rng in self._rngs], axis=2)
+            self._drawn = 0
+        draws = self._block[self._drawn]
+        self._drawn += 1
+        self._lost_s += self._lost * self._plant.dt_s
+        self._rough *= self._keep
+        self._rough += self._drive * draws[:8]
+        self._wander += (1.0 - self._keep) * (self._rough - self._wander)
+        np.multiply(draws[8:], self._white_rms, out=self._white)
+        self._head = (self._head + 1) % len(self._history)
+        self._history[self._head] = self._sample()
+        self._tilt_quat()
+
+    def of(self, vehicle: int, t_us: int) -> Estimate:
+        """What a vehicle believes; `t_us` is its stamp, since boot."""
+        frozen = self._frozen.get(vehicle)
+        if frozen is not None:
+            return replace(frozen, t_us=t_us, on_ground=bool(self._plant.contact[vehicle]), battery=self.power[vehicle])
+        if self._stale:
+            self._publish()
+        row = self._rows[vehicle]
+        lost_s = float(self._lost_s[vehicle])
+        accuracy_m = self._accuracy_m
+        if lost_s:
+            accuracy_m = math.hypot(accuracy_m[0], 0.5 * _LOST_M_S2 * lost_s * lost_s), accuracy_m[1]
+        return Estimate(
+            t_us,
+            row[0:3],
+            row[3:6],
+            row[9:13],
+            row[13:16],
+            row[6:9],
+            row[16:19],
+            self._on_ground[vehicle],
+            accuracy_m,
+            not self._lost[vehicle],
+            self.power[vehicle],
+        )
+
+    # --- faults ---
+
+    @property
+    def sensed(self) -> Sensed:
+        """What the attitude loop flies on."""
+        return self._plant if self._model is None else self
+
+    def jump(self, vehicle: int, by_ned_m: Array) -> None:
+        """Move the reported position by (3,); the negative takes it back."""
+        self._wake()
+        self._jump_ned_m[:, vehicle] += by_ned_m
+        self._stale = True
+
+    def freeze(self, vehicle: int, t_us: int) -> None:
+        """Go on reporting what is believed now."""
+        self._frozen[vehicle] = self.of(vehicle, t_us)
+
+    def thaw(self, vehicle: int) -> None:
+        """Report what is believed again."""
+        self._frozen.pop(vehicle, None)
+
+    def lose_gps(self, vehicle: int) -> None:
+        """From now on position is dead-reckoned: its error accelerates, horizontally; height has a barometer."""
+        self._wake()
+        heading = np.random.default_rng([self._seed, vehicle, _PURPOSE, 1]).uniform(0.0, 2.0 * math.pi)
+        self._drift_axis[:, vehicle] = math.cos(heading), math.sin(heading), 0.0
+        self._lost[vehicle], self._lost_s[vehicle] = 1.0, 0.0
+
+    def find_gps(self, vehicle: int) -> None:
+        """GPS is back: the estimate jumps to where it says."""
+        self._lost[vehicle] = self._lost_s[vehicle] = 0.0
+
+    def _wake(self) -> None:
+        if self._model is None:
+            self._model = _PERFECT
+            self._start(_PERFECT, self._plant, self._seed)
+
+    def _sample(self) -> Array:
+        """(13, N) position, NED velocity, rates and attitude of this instant."""
+        plant = self._plant
+        return np.concatenate([plant.pos_ned_m, plant.vel_ned_m_s, plant.rate_frd_rad_s, plant.q_nb])
+
+    def _tilt_quat(self) -> None:
+        """What the attitude loop flies on."""
+        self.q_nb = _turned(self._plant.q_nb, self._wander[6], self._wander[7], 0.0)
+        self.euler_rad, _ = _euler_and_down(self.q_nb)
+        self.rate_frd_rad_s = self._plant.rate_frd_rad_s
+
+    def _publish(self) -> None:
+        """Rows of numbers for all vehicles at once: one conversion a step instead of six a message."""
+        self._stale = False
+        self._on_ground = self._plant.contact.tolist()
+        if self._model is None:
+            plant = self._plant
+            believed = np.concatenate([self._sample(), plant.euler_rad, plant.rotation[2::3]])
+        else:
+            believed = self._believed()
+        self._rows = list(zip(*believed.tolist(), strict=True))
+
+    def _believed(self) -> Array:
+        """(19, N) position, velocity, rates, attitude, Euler angles and down axis, each vehicle's own age."""
+        rows = (self._head - self._lag_steps) % len(self._history)
+        seen = self._history[rows, :, self._columns].T  # (13, N), each vehicle's own age
+        reported = seen[:9].copy()
+        reported[:6] += self._wander[:6] + self._white[:6]
+        reported[:3] += self._jump_ned_m + self._drift_axis * (0.5 * _LOST_M_S2 * self._lost_s**2)
+        reported[3:6] += self._drift_axis * (_LOST_M_S2 * self._lost_s)
+        noise = self._white[6:]
+        q_nb = _turned(seen[9:], self._wander[6] + noise[0], self._wander[7] + noise[1], noise[2])
+        return np.concatenate([reported, q_nb, *_euler_and_down(q_nb)])
+
+
+def _turned(q_nb: Array, roll_rad: Array, pitch_rad: Array, yaw_rad: Array | float) -> Array:
+    """Attitudes (4, N) with small errors about the body axes; unit length."""
+    w, x, y, z = q_nb
+    a, b, c = 0.5 * roll_rad, 0.5 * pitch_rad, 0.5 * yaw_rad
+    turned = np.stack(
+        [w - x * a - y * b - z * c, x + w * a + y * c - z * b, y + w * b + z * a - x * c, z + w * c + x * b - y * a]
+    )
+    unit: Array = turned / np.sqrt(np.sum(turned * turned, axis=0))
+    return unit
+
+
+def _euler_and_down(q_nb: Array) -> tuple[Array, Array]:
+    """Roll, pitch, yaw (3, N) and the body's down axis in NED (3, N)."""
+    w, x, y, z = q_nb
+    down = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z])
+    roll = np.arctan2(2 * (y * z + w * x), down[2])
+    pitch = np.arcsin(np.clip(2 * (w * y - x * z), -1.0, 1.0))
+    yaw = np.arctan2(2 * (x * y + w * z), w * w + x * x - y * y - z * z)
+    return np.stack([roll, pitch, yaw]), down

@@ -1,0 +1,375 @@
+"""N quadrotors as one batched plant: rigid body of thesis (1.18), rotors with real limits, ground contact.
+
+The attitude is integrated as a quaternion, so that (1.18)'s singularity at theta = 90 deg does not exist; away from it
+the equations are the same. Errata built in: v' has `+ g sin(phi) cos(theta)`, kp..kr damp rotation and ku..kw damp
+translation (Table 1 describes them the other way round). Rotor forces are in [0, rotor_force_max_n]: the thesis'
+negative thrust does not exist.
+
+Arrays are (rows, N), one column a vehicle. This module knows no controller, no MAVLink and no clock.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sitl.plant.airframes import Preset
+from swarmctl.core.frames import GRAVITY_M_S2
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+RATE_LIMIT_RAD_S = 60.0  # a tumbling vehicle stays finite under an explicit integrator; no controlled flight comes near
+GROUND_FRICTION = 0.8  # of the weight; a vehicle that touches down at 1 m/s slides 6 cm
+
+
+# Rows of the polynomial's argument: constant, rotor speed sum, quaternion, body rates, body velocity.
+_ARGUMENTS = ("1", "wr", "qw", "qx", "qy", "qz", "p", "q", "r", "u", "v", "w")
+_QUAT, _RATE, _VEL, _POS = slice(0, 4), slice(4, 7), slice(7, 10), slice(10, 13)
+_YAW_SIGN = np.array([-1.0, 1.0, -1.0, 1.0])
+
+# Body->NED rotation matrix, row-major, as quadratic forms of the quaternion.
+_ROTATION: tuple[tuple[tuple[str, str, float], ...], ...] = (
+    (("qw", "qw", 1), ("qx", "qx", 1), ("qy", "qy", -1), ("qz", "qz", -1)),
+    (("qx", "qy", 2), ("qw", "qz", -2)),
+    (("qx", "qz", 2), ("qw", "qy", 2)),
+    (("qx", "qy", 2), ("qw", "qz", 2)),
+    (("qw", "qw", 1), ("qx", "qx", -1), ("qy", "qy", 1), ("qz", "qz", -1)),
+    (("qy", "qz", 2), ("qw", "qx", -2)),
+    (("qx", "qz", 2), ("qw", "qy", -2)),
+    (("qy", "qz", 2), ("qw", "qx", 2)),
+    (("qw", "qw", 1), ("qx", "qx", -1), ("qy", "qy", -1), ("qz", "qz", 1)),
+)
+
+
+def _quadratic_rows(preset: Preset, mass_kg: float) -> Array:
+    """(19, 144): state derivative (quaternion, rates, velocity) and rotation matrix over products of `_ARGUMENTS`."""
+    ix, iy, iz = preset.inertia_kg_m2
+    kp, kq, kr = preset.drag_rotation_1_s
+    ku, kv, kw = (k / (preset.mass_kg if preset.drag_scales_with_mass else mass_kg) for k in preset.drag_n_s_m)
+    jr, g = preset.rotor_inertia_kg_m2, GRAVITY_M_S2
+    rows: list[tuple[tuple[str, str, float], ...]] = [
+        (("qx", "p", -0.5), ("qy", "q", -0.5), ("qz", "r", -0.5)),
+        (("qw", "p", 0.5), ("qy", "r", 0.5), ("qz", "q", -0.5)),
+        (("qw", "q", 0.5), ("qz", "p", 0.5), ("qx", "r", -0.5)),
+        (("qw", "r", 0.5), ("qx", "q", 0.5), ("qy", "p", -0.5)),
+        (("r", "q", (iy - iz) / ix), ("1", "p", -kp), ("wr", "p", -jr)),
+        (("p", "r", (iz - ix) / iy), ("1", "q", -kq), ("wr", "q", jr)),
+        (("p", "q", (ix - iy) / iz), ("1", "r", -kr)),
+        (("r", "v", 1.0), ("q", "w", -1.0), ("1", "u", -ku), *((a, b, c * g) for a, b, c in _ROTATION[6])),
+        (("p", "w", 1.0), ("r", "u", -1.0), ("1", "v", -kv), *((a, b, c * g) for a, b, c in _ROTATION[7])),
+        (("q", "u", 1.0), ("p", "v", -1.0), ("1", "w", -kw), *((a, b, c * g) for a, b, c in _ROTATION[8])),
+        *_ROTATION,
+    ]
+    table = np.zeros((len(rows), len(_ARGUMENTS), len(_ARGUMENTS)))
+    for row, terms in enumerate(rows):
+        for left, right, coefficient in terms:
+            table[row, _ARGUMENTS.index(left), _ARGUMENTS.index(right)] += coefficient
+    return table.reshape(len(rows), -1)
+
+
+def _attitude_rows() -> Array:
+    """(13, 16): the rotation matrix, then (r21, r10, r22, r00), the arguments of roll's and yaw's arctangents."""
+    names = ("qw", "qx", "qy", "qz")
+    table = np.zeros((13, 4, 4))
+    for row, source in enumerate((*range(9), 7, 3, 8, 0)):
+        for left, right, coefficient in _ROTATION[source]:
+            table[row, names.index(left), names.index(right)] += coefficient
+    return table.reshape(13, 16)
+
+
+class Mixer:
+    """Wrench -> rotor forces and back: the A matrix of thesis (1.13)-(1.16), plus configuration.
+
+    Every rotor stays within [0, rotor_force_max_n]. Roll, pitch and thrust are clipped rotor by rotor; yaw gets what
+    room is left, because its lever is 12 times shorter and a yaw step would otherwise cost all attitude control.
+    """
+
+    def __init__(self, preset: Preset, vehicles: int) -> None:
+        arm_m, yaw_m, self._max_n = preset.arm_m, preset.yaw_per_force_m, preset.rotor_force_max_n
+        half = 0.5 / arm_m
+        self._from_wrench = np.array([[0.25, 0, -half], [0.25, -half, 0], [0.25, 0, half], [0.25, half, 0]])
+        self._yaw_scale = 0.25 / yaw_m
+        self.wrench_of_forces = np.array(  # (4, 4): f_t, tau_x, tau_y, tau_z of the four rotor forces
+            [[1, 1, 1, 1], [0, -arm_m, 0, arm_m], [-arm_m, 0, arm_m, 0], yaw_m * _YAW_SIGN]
+        )
+        eye = np.eye(4)
+        self._room_rows = np.vstack([eye[0], eye[2], -eye[1], -eye[3], eye[1], eye[3], -eye[0], -eye[2]])
+        self._room_offset = np.array([0, 0, 1, 1, 0, 0, 1, 1]).reshape(8, 1) * self._max_n
+        self._forces = np.zeros((4, vehicles))
+        self._room = np.zeros((8, vehicles))
+        self._yaw = np.zeros(vehicles)
+        self._least = np.zeros((2, vehicles))
+        self._share = np.zeros((4, vehicles))
+
+    def allocate(self, wrench: Array) -> Array:
+        """Rotor forces (4, N) [N] for a wrench (4, N) of f_t [N], tau_x, tau_y, tau_z [N m]; the buffer is reused."""
+        forces, room, yaw, least = self._forces, self._room, self._yaw, self._least
+        np.matmul(self._from_wrench, wrench[:3], out=forces)
+        np.maximum(forces, 0.0, out=forces)
+        np.minimum(forces, self._max_n, out=forces)
+        np.matmul(self._room_rows, forces, out=room)
+        room += self._room_offset
+        np.minimum.reduce(room.reshape(2, 4, -1), axis=1, out=least)
+        np.multiply(wrench[3], self._yaw_scale, out=yaw)
+        np.minimum(yaw, least[0], out=yaw)
+        np.negative(least[1], out=least[1])
+        np.maximum(yaw, least[1], out=yaw)
+        np.multiply(_YAW_SIGN[:, None], yaw, out=self._share)
+        forces += self._share
+        return forces
+
+
+class Plant:
+    """State and one fixed step (Bogacki-Shampine third order, ode3) of all vehicles at once.
+
+    The right-hand side of (1.18) with a quaternion is quadratic in (quaternion, rates, velocity): one outer product and
+    one constant matrix evaluate it for all vehicles.
+
+    Attributes:
+        state: (13, N) quaternion body->NED, rates FRD [rad/s], velocity FRD [m/s], position NED [m].
+        rotation: (9, N) row-major body->NED, of the current state.
+        vel_ned_m_s: (3, N), of the current state.
+        euler_rad: (3, N) roll, pitch, yaw, of the current state.
+        contact: (N,) resting on or sliding over the ground.
+        rotor_force_n: (4, N) after motor lag.
+        rotor_share_01: (4, N) of its force that each rotor still gives, or None for all: battery, failures.
+        mass_ratio: (N,) mass over the mass at the start, or None.
+    """
+
+    def __init__(
+        self,
+        preset: Preset,
+        pos_ned_m: Array,
+        dt_s: float,
+        *,
+        ground: bool = True,
+        mass_scale: float = 1.0,
+        thrust_curve_01: float = 0.0,
+        ground_effect: bool = False,
+    ) -> None:
+        """Vehicles at rest, level, nose north.
+
+        Args:
+            preset: airframe.
+            pos_ned_m: (N, 3) spawn positions; each vehicle's ground is the plane at its own z.
+            dt_s: step.
+            ground: False for no ground at all.
+            mass_scale: true mass over the preset's.
+            thrust_curve_01: k of a rotor's force (1 - k) u + k u^2 over its limit, at command u; PX4's THR_MDL_FAC.
+            ground_effect: rotors push harder close to the ground.
+        """
+        count = len(pos_ned_m)
+        self.preset = preset
+        self.dt_s = dt_s
+        self.mass_kg = preset.mass_kg * mass_scale
+        self.state = np.zeros((13, count))
+        self.state[0] = 1.0
+        self.state[_POS] = np.asarray(pos_ned_m, dtype=np.float64).T
+        self.ground_z_m: Array | None = self.state[12].copy() if ground else None
+        self.contact: Mask = np.full(count, ground)
+        self.held: Mask = np.zeros(count, dtype=bool)  # clamped at the spawn pose
+        self.mixer = Mixer(preset, count)
+        self.rotor_force_n = np.zeros((4, count))
+        self.rotor_share_01: Array | None = None
+        self.mass_ratio: Array | None = None
+        self._curve_01 = thrust_curve_01
+        self._ground_effect = ground_effect and ground
+        self._wind_ned_m_s: Array | None = None
+        self._lag = 1.0 - math.exp(-dt_s / preset.motor_tau_s) if preset.motor_tau_s > 0 else 1.0
+        self._rows = _quadratic_rows(preset, self.mass_kg)
+        self._attitude_rows = _attitude_rows()
+        scale = 1.0 / np.array([-self.mass_kg, *preset.inertia_kg_m2])
+        wrench_rows = self.mixer.wrench_of_forces * scale[:, None]
+        self._forcing_rows = np.zeros((10, 4))
+        self._forcing_rows[_RATE], self._forcing_rows[9] = wrench_rows[1:], wrench_rows[0]
+        self._weights = np.array([2.0, 3.0, 4.0]) * (dt_s / 9.0)
+        self._allocate_buffers(count)
+        self.refresh()
+
+    def _allocate_buffers(self, count: int) -> None:
+        self._args = np.zeros((12, count))
+        self._args[0] = 1.0
+        self._products = np.zeros((12, 12, count))
+        self._polynomial = np.zeros((19, count))
+        self._forcing = np.zeros((10, count))
+        self._slopes = np.zeros((3, 13, count))
+        self._stage = np.zeros((13, count))
+        self._sum = np.zeros(13 * count)
+        self._lever = np.zeros((3, 3, count))
+        self._norm = np.zeros(count)
+        self._square = np.zeros((4, count))
+        self._quat_products = np.zeros((4, 4, count))
+        self._attitude = np.zeros((13, count))
+        self._spins = np.zeros((4, count))
+        self.rotation = self._attitude[:9]
+        self.vel_ned_m_s = np.zeros((3, count))
+        self.euler_rad = np.zeros((3, count))
+        self._roll_yaw = self.euler_rad[::2]
+
+    @property
+    def q_nb(self) -> Array:
+        return self.state[_QUAT]
+
+    @property
+    def rate_frd_rad_s(self) -> Array:
+        return self.state[_RATE]
+
+    @property
+    def pos_ned_m(self) -> Array:
+        return self.state[_POS]
+
+    @property
+    def hover_thrust_01(self) -> float:
+        """Thrust setpoint that carries the true mass."""
+        force_01, k = self.mass_kg * GRAVITY_M_S2 / self.preset.thrust_max_n, self._curve_01
+        if not k:
+            return force_01
+        return (math.sqrt((1.0 - k) ** 2 + 4.0 * k * force_01) - (1.0 - k)) / (2.0 * k)
+
+    @property
+    def height_m(self) -> Array:
+        """(N,) above the ground; above z = 0 where there is none."""
+        height_m: Array = (self.ground_z_m if self.ground_z_m is not None else 0.0) - self.state[12]
+        return height_m
+
+    def set_wind(self, wind_ned_m_s: Array | None) -> None:
+        """Air velocity (3, N) NED that drag acts against; None for still air. Frozen in the body over one step."""
+        self._wind_ned_m_s = None if wind_ned_m_s is None else np.array(wind_ned_m_s, dtype=np.float64)
+
+    def step(self, rotor_cmd_n: Array) -> None:
+        """Advance by `dt_s` under commanded rotor forces (4, N) [N], already within the rotors' limits."""
+        rotor_cmd_n = self._achievable(rotor_cmd_n)
+        if self._lag < 1.0:
+            np.subtract(rotor_cmd_n, self.rotor_force_n, out=self._spins)
+            self._spins *= self._lag
+            self.rotor_force_n += self._spins
+        else:
+            self.rotor_force_n[...] = rotor_cmd_n
+        lift_n = self.rotor_force_n * self._near_ground() if self._ground_effect else self.rotor_force_n
+        np.matmul(self._forcing_rows, lift_n, out=self._forcing)
+        if self.preset.rotor_inertia_kg_m2:
+            np.multiply(self.rotor_force_n, 1.0 / self.preset.thrust_coeff_n_s2, out=self._spins)
+            np.sqrt(self._spins, out=self._spins)
+            np.matmul(-_YAW_SIGN, self._spins, out=self._args[1])  # w_r = W1 - W2 + W3 - W4
+        if self.mass_ratio is not None:
+            self._reweigh(self.mass_ratio)
+        if self._wind_ned_m_s is not None:
+            self._add_wind(self._wind_ned_m_s)
+        held = self.state[:, self.held].copy() if self.held.any() else None
+        self._integrate()
+        if held is not None:
+            self.state[:, self.held] = held
+        self._touch_ground()
+        self.refresh()
+
+    def _achievable(self, rotor_cmd_n: Array) -> Array:
+        """Force that the commanded ones become; thrust curve first, then what battery and rotor can give."""
+        if self._curve_01:
+            command = rotor_cmd_n / self.preset.rotor_force_max_n
+            rotor_cmd_n = rotor_cmd_n * (1.0 - self._curve_01 + self._curve_01 * command)
+        return rotor_cmd_n if self.rotor_share_01 is None else rotor_cmd_n * self.rotor_share_01
+
+    def _near_ground(self) -> Array:
+        """(N,) thrust over that of the same rotor far up: I. C. Cheeseman and W. E. Bennett, ARC R&M 3021, 1955.
+
+        One rotor's formula, 1 / (1 - (R / 4 z)^2); the rotor is taken to stand one radius above the skids.
+        """
+        radius_m = self.preset.rotor_radius_m
+        share = 0.25 * radius_m / (np.maximum(self.height_m, 0.0) + radius_m)
+        gain: Array = 1.0 / (1.0 - share * share)
+        return gain
+
+    def _reweigh(self, mass_ratio: Array) -> None:
+        """Thrust and drag forces act on another mass; the inertia stays (the load is at the centre)."""
+        lighter = 1.0 / mass_ratio
+        self._forcing[9] *= lighter
+        if not self.preset.drag_scales_with_mass:
+            self._forcing[_VEL] += self._drag_1_s() * (1.0 - lighter) * self.state[_VEL]
+
+    def _drag_1_s(self) -> Array:
+        """(3, 1) of the mass at the start."""
+        mass_kg = self.preset.mass_kg if self.preset.drag_scales_with_mass else self.mass_kg
+        rate: Array = np.array(self.preset.drag_n_s_m)[:, None] / mass_kg
+        return rate
+
+    def _add_wind(self, wind_ned_m_s: Array) -> None:
+        drag = self._drag_1_s()
+        if self.mass_ratio is not None and not self.preset.drag_scales_with_mass:
+            drag = drag / self.mass_ratio
+        np.multiply(self.rotation.reshape(3, 3, -1), wind_ned_m_s[:, None], out=self._lever)
+        self._forcing[_VEL] += drag * self._lever.sum(axis=0)
+
+    def _integrate(self) -> None:
+        state, stage, slopes, h = self.state, self._stage, self._slopes, self.dt_s
+        self._slope(state, slopes[0])
+        np.multiply(slopes[0], 0.5 * h, out=stage)
+        stage += state
+        self._slope(stage, slopes[1])
+        np.multiply(slopes[1], 0.75 * h, out=stage)
+        stage += state
+        self._slope(stage, slopes[2])
+        np.matmul(self._weights, slopes.reshape(3, -1), out=self._sum)
+        state += self._sum.reshape(13, -1)
+        rates = state[_RATE]
+        np.minimum(rates, RATE_LIMIT_RAD_S, out=rates)
+        np.maximum(rates, -RATE_LIMIT_RAD_S, out=rates)
+        quat = state[_QUAT]
+        np.multiply(quat, quat, out=self._square)
+        np.add.reduce(self._square, axis=0, out=self._norm)
+        np.sqrt(self._norm, out=self._norm)
+        quat /= self._norm
+
+    def _slope(self, state: Array, out: Array) -> None:
+        """Right-hand side of (1.18) at `state` (13, N) into `out` (13, N)."""
+        args = self._args
+        args[2:] = state[:10]
+        np.multiply(args[:, None], args[None], out=self._products)
+        np.matmul(self._rows, self._products.reshape(144, -1), out=self._polynomial)
+        np.add(self._polynomial[:10], self._forcing, out=out[:10])
+        np.multiply(self._polynomial[10:].reshape(3, 3, -1), state[_VEL], out=self._lever)
+        np.add.reduce(self._lever, axis=1, out=out[_POS])
+
+    def refresh(self) -> None:
+        """Rotation, NED velocity and Euler angles of the current state."""
+        quat = self.state[_QUAT]
+        np.multiply(quat[:, None], quat[None], out=self._quat_products)
+        np.matmul(self._attitude_rows, self._quat_products.reshape(16, -1), out=self._attitude)
+        np.multiply(self.rotation.reshape(3, 3, -1), self.state[_VEL], out=self._lever)
+        np.add.reduce(self._lever, axis=1, out=self.vel_ned_m_s)
+        np.arctan2(self._attitude[9:11], self._attitude[11:13], out=self._roll_yaw)
+        pitch = self.euler_rad[1]
+        np.maximum(self._attitude[6], -1.0, out=pitch)
+        np.minimum(pitch, 1.0, out=pitch)
+        np.arcsin(pitch, out=pitch)
+        np.negative(pitch, out=pitch)
+
+    def _touch_ground(self) -> None:
+        if self.ground_z_m is None:
+            return
+        np.greater_equal(self.state[12], self.ground_z_m, out=self.contact)
+        if not self.contact.any():
+            return
+        self.refresh()
+        lift_n = self.rotor_force_n.sum(axis=0) * self.rotation[8]
+        for i in np.flatnonzero(self.contact):
+            self._rest_on_ground(int(i), float(lift_n[i]), float(self.ground_z_m[i]))
+
+    def _rest_on_ground(self, i: int, lift_n: float, ground_z_m: float) -> None:
+        """No penetration, upright on the skids, Coulomb friction; a vehicle with more lift than weight may leave."""
+        state = self.state
+        yaw = math.atan2(self.rotation[3, i], self.rotation[0, i])
+        north, east, down = (float(v) for v in self.vel_ned_m_s[:, i])
+        mass_kg = self.mass_kg * (float(self.mass_ratio[i]) if self.mass_ratio is not None else 1.0)
+        load_n = max(0.0, mass_kg * GRAVITY_M_S2 - lift_n)
+        speed = math.hypot(north, east)
+        slowed = max(0.0, speed - GROUND_FRICTION * load_n / mass_kg * self.dt_s)
+        ratio = slowed / speed if speed > 0 else 0.0
+        north, east, down = north * ratio, east * ratio, min(down, 0.0)
+        c, s = math.cos(yaw), math.sin(yaw)
+        state[_QUAT, i] = math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)
+        state[_RATE, i] = 0.0
+        state[_VEL, i] = c * north + s * east, c * east - s * north, down
+        state[12, i] = ground_z_m

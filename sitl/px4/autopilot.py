@@ -1,0 +1,444 @@
+"""PX4's commander for one vehicle: modes, arming, offboard entry and loss, failsafes, landing detection.
+
+Scalar code at autopilot rate. It speaks in results and texts, not in MAVLink messages (`endpoint` does), and turns the
+mode into one `Command`, from the offboard stream (`setpoints`) or from the AUTO modes (`auto_flight`).
+"""
+
+from __future__ import annotations
+
+import datetime
+import math
+from collections import Counter, deque
+from collections.abc import Sequence
+
+from sitl.plant.sensors import Estimate, LocalOrigin
+from sitl.px4.auto_flight import AutoFlight, Phase
+from sitl.px4.boot import Boot
+from sitl.px4.failsafe import Action, Cause, Watch
+from sitl.px4.geofence import Geofence
+from sitl.px4.landing import LandDetector
+from sitl.px4.link.setpoints import OffboardStream
+from sitl.px4.missions import Store
+from sitl.px4.modes import (
+    FLIES_BLIND,
+    FLIGHT_MODES,
+    MODE_NAMES,
+    NEEDS_PILOT,
+    NO_ARMING_IN,
+    NOT_KEPT_AFTER_LANDING,
+    MavState,
+    OffboardLoss,
+    Px4Mode,
+    Result,
+    Severity,
+    base_mode,
+)
+from sitl.px4.navigator import IDLE, Command, Navigator, Triple
+from sitl.px4.parameters import Parameters
+from swarmctl.core.types import FlightMode, Landed
+
+CHECK_US = 100_000  # grid on which PX4 looks for reasons to act
+RESUME_US = 20_000  # from a resumed stream to OFFBOARD, before the next tick
+DEAD_RECKONING_US = 5_000_000  # EKF2_NOAID_TOUT: so long a position without GPS is believed
+REBOOT_AFTER_US = 400_000  # the acknowledgement gets out first
+REFUSED_EVERY_US = 1_000_000  # a refused mode is not explained more often
+STATUS_EVERY_US = 500_000  # and at once when anything in it changes
+EPOCH_UTC_US = 1_767_225_600_000_000  # 2026-01-01, of flights that have no wall clock
+_HEALTH_TEXT = "Arming denied: Resolve system health failures first\t"
+_LOSS_MODES = {OffboardLoss.LAND: Px4Mode.AUTO_LAND, OffboardLoss.HOLD: Px4Mode.AUTO_LOITER}
+_ACTION_MODES = {Action.HOLD: Px4Mode.AUTO_LOITER, Action.RETURN: Px4Mode.AUTO_RTL, Action.LAND: Px4Mode.AUTO_LAND}
+
+
+class Autopilot:
+    """Commander of one vehicle. `now_us` is time since its boot, except in `tick` and `reboot`.
+
+    Attributes:
+        armed: motors may turn.
+        mode: what flies now.
+        intended: what was commanded; differs from `mode` only in a failsafe.
+        failsafe: the autopilot acts on its own.
+        terminated: motors off until reboot.
+        home_ned_m: local position of the last arming.
+        output: what to fly.
+        released: an air start's clamp has been opened.
+        texts: (severity, text) not yet sent.
+        reboot_at_us: when it will go down; None: it stays up.
+        position_ok: input; there is a horizontal position.
+        battery_01, battery_v, battery_a: input; charge, voltage, current (-1: not measured).
+        boot_utc_us: UTC of its boot.
+    """
+
+    def __init__(
+        self,
+        parameters: Parameters,
+        navigator: Navigator,
+        *,
+        ekf_ready_us: int,
+        airborne: bool,
+        reject_bad_setpoints: bool = True,
+    ) -> None:
+        self.parameters = parameters
+        self.texts: deque[tuple[Severity, str]] = deque(maxlen=64)
+        self.store = Store()
+        self.stream = OffboardStream(reject_bad=reject_bad_setpoints)
+        self.flight = AutoFlight(parameters, navigator, self.store, self.say)
+        self.watch = Watch(parameters, self.say)
+        self._land_detector = LandDetector(parameters, self.say, airborne=airborne)
+        self.released = not airborne
+        self.position_ok = True
+        self.boot = Boot(ekf_ready_us)
+        self.battery_01, self.battery_v, self.battery_a = 1.0, 16.2, -1.0
+        self.boot_utc_us = EPOCH_UTC_US
+        self._fence = Geofence(parameters, self.store)
+        self._navigator = navigator
+        self._ekf_ready_us = ekf_ready_us
+        self._begin()
+
+    def _begin(self) -> None:
+        """Begin anew; parameters and uploads stay."""
+        self.armed = self.failsafe = self.terminated = False
+        self.mode = self.intended = self._resting_mode = Px4Mode.AUTO_LOITER
+        self._land_detector.reset()
+        self.home_ned_m: tuple[float, float, float] | None = None
+        self.output = IDLE
+        self.reboot_at_us: int | None = None
+        self.texts.clear()
+        self.stream.reset()
+        self.flight.reset()
+        self.watch.reset()
+        self._estimate: Estimate | None = None
+        self._cause: Cause | None = None
+        self._refused_us = -REFUSED_EVERY_US
+        self._armed_us = self._next_check_us = self._aided_us = self._unaided_us = 0
+        self._resume_us: int | None = None
+        self._delayed: tuple[int, Action] | None = None  # when to do what, after a while in Hold
+
+    def reboot(self, now_us: int) -> None:
+        """Go down now and start again; `now_us` is on the clock of the simulation."""
+        before_us = self.boot.at_us
+        self.boot.again(now_us, self._estimate)
+        self.boot_utc_us += self.boot.at_us - before_us
+        if self.boot.origin is not None:
+            self.start_at(self.boot.origin)
+        self._begin()
+
+    def start_at(self, origin: LocalOrigin) -> None:
+        """Set the origin of the local frame."""
+        self.boot.origin = self.flight.origin = origin
+        self.flight.origin_alt_m = origin.alt_mm / 1e3
+
+    # --- what others ask ---
+
+    def say(self, severity: Severity, text: str) -> None:
+        """Queue a STATUSTEXT."""
+        self.texts.append((severity, text))
+
+    def ready(self, now_us: int) -> bool:
+        """The estimator has settled."""
+        return now_us >= self._ekf_ready_us
+
+    def settled_share(self, now_us: int) -> float:
+        """Time since boot over the time the estimator takes until it can be armed."""
+        return now_us / self._ekf_ready_us if self._ekf_ready_us else math.inf
+
+    def stream_alive(self, now_us: int) -> bool:
+        """A usable setpoint is younger than COM_OF_LOSS_T."""
+        return self.stream.age_us(now_us) <= self.parameters.real("COM_OF_LOSS_T") * 1e6
+
+    def armable(self, now_us: int) -> bool:
+        """PREARM_CHECK: arming would be accepted in the present mode."""
+        if not self.ready(now_us) or self.terminated or self.intended in NO_ARMING_IN:
+            return False
+        if self.watch.fence_broken or self.watch.battery_warning >= 2:
+            return False
+        return self._can_enter(self.intended, now_us)
+
+    def base_mode(self) -> int:
+        return base_mode(self.mode, armed=self.armed, streamed=self.stream.seen)
+
+    def system_status(self, now_us: int) -> MavState:
+        if self.terminated:
+            return MavState.TERMINATION
+        if self.armed:
+            return MavState.CRITICAL if self.failsafe else MavState.ACTIVE
+        return MavState.STANDBY if self.armable(now_us) else MavState.UNINIT
+
+    def status(self, now_us: int) -> tuple[object, ...]:
+        """What PX4 publishes of itself, and so may tell: another value each time it is published."""
+        flags = self.armed, self.failsafe, self.system_status(now_us)
+        return now_us // STATUS_EVERY_US, self.mode, self.intended, *flags
+
+    def flight_mode(self) -> FlightMode:
+        return FLIGHT_MODES.get(self.mode, FlightMode.MANUAL)
+
+    @property
+    def has_position(self) -> bool:
+        """A horizontal position, measured or dead-reckoned for a short while."""
+        return self.position_ok and self._unaided_us <= DEAD_RECKONING_US
+
+    @property
+    def position_ned_m(self) -> Triple | None:
+        """Where it believes to be; None without a position."""
+        return self._estimate.pos_ned_m if self._estimate is not None and self.has_position else None
+
+    @property
+    def refused(self) -> Counter[str]:
+        """Setpoints not used, by reason."""
+        return self.stream.refused
+
+    @property
+    def landed(self) -> Landed:
+        """MAV_LANDED_STATE."""
+        return self._land_detector.landed
+
+    @property
+    def motors_on(self) -> bool:
+        return self.armed and not self.terminated and not self.output.stopped
+
+    @property
+    def battery_warning(self) -> int:
+        """0 none, 1 low, 2 critical, 3 emergency."""
+        return self.watch.battery_warning
+
+    # --- the offboard stream ---
+
+    def on_setpoint(self, type_mask: int, q_nb: Sequence[float], rates: Triple, thrust_01: float, now_us: int) -> bool:
+        """SET_ATTITUDE_TARGET addressed to this vehicle; True when it counts as a stream."""
+        flying = self.mode == Px4Mode.OFFBOARD
+        if not self.stream.take(type_mask, q_nb, rates, thrust_01, now_us, flying=flying):
+            return False
+        if flying and self.armed and not self.terminated:
+            self.released, self.output = True, self.stream.command
+        elif self.failsafe and self._cause == Cause.OFFBOARD and self._resume_us is None:
+            self._resume_us = now_us
+        return True
+
+    # --- commands ---
+
+    def arm(self, now_us: int) -> Result:
+        """MAV_CMD_COMPONENT_ARM_DISARM p1=1."""
+        if self.armed:
+            return Result.ACCEPTED
+        if not self.armable(now_us):
+            self.say(Severity.CRITICAL, _HEALTH_TEXT)
+            if not self.ready(now_us):
+                self.say(Severity.CRITICAL, "Preflight Fail: no heading reference")
+            if self.terminated:
+                self.say(Severity.CRITICAL, "Preflight Fail: Flight termination active")
+            return Result.TEMPORARILY_REJECTED
+        self.armed, self._armed_us = True, now_us
+        self._land_detector.arm(now_us)
+        self._clear_failsafe()
+        self.mode = self.intended
+        if self._estimate is not None:
+            if self.has_position:
+                self.home_ned_m = self._estimate.pos_ned_m
+            self.flight.engage(self.mode, self._estimate, fresh=True)
+        self.say(Severity.INFO, "Armed by external command\t")
+        began = datetime.datetime.fromtimestamp((self.boot_utc_us + now_us) // 1_000_000, datetime.UTC)
+        self.say(Severity.INFO, f"[logger] ./log/{began:%Y-%m-%d/%H_%M_%S}.ulg\t")
+        if self.mode == Px4Mode.OFFBOARD and self.stream.command is not IDLE:
+            self.released, self.output = True, self.stream.command
+        return Result.ACCEPTED
+
+    def disarm(self, force: bool) -> Result:
+        """MAV_CMD_COMPONENT_ARM_DISARM p1=0; in the air only with `force`."""
+        if not self.armed:
+            return Result.ACCEPTED
+        if self.landed != Landed.ON_GROUND and self.released and not force:
+            self.say(Severity.CRITICAL, "Disarming denied: not landed\t")
+            return Result.TEMPORARILY_REJECTED
+        self._disarm("Disarmed by external command\t")
+        return Result.ACCEPTED
+
+    def _disarm(self, text: str, *, keep_mode: bool = False) -> None:
+        self.armed = False
+        self._clear_failsafe()
+        self.watch.forget()
+        self.output = self.stream.command = IDLE
+        if not keep_mode:
+            self.mode = self.intended = self._resting_mode
+        self.say(Severity.INFO, text)
+
+    def set_mode(
+        self, mode: Px4Mode, now_us: int, takeoff_alt_amsl_m: float | None = None, *, tell: bool = True
+    ) -> Result:
+        """A commanded mode change; cancels a running failsafe.
+
+        No takeoff height given: MIS_TAKEOFF_ALT. `tell`: say why it is refused.
+        """
+        if self.terminated:
+            return Result.TEMPORARILY_REJECTED
+        if self.armed and not self._can_enter(mode, now_us):
+            if tell and now_us - self._refused_us > REFUSED_EVERY_US:
+                self._refused_us = now_us
+                self.say(Severity.CRITICAL, f"Switching to {MODE_NAMES[mode]} is currently not available\t")
+            return Result.TEMPORARILY_REJECTED
+        self.intended = mode
+        if mode not in NOT_KEPT_AFTER_LANDING:
+            self._resting_mode = mode
+        if mode == Px4Mode.AUTO_TAKEOFF:
+            self.flight.takeoff_alt_amsl_m = takeoff_alt_amsl_m
+        if mode == Px4Mode.AUTO_LAND and self.armed:
+            self.say(Severity.INFO, "Landing at current position\t")
+        self._clear_failsafe()
+        self._enter(mode)
+        return Result.ACCEPTED
+
+    def _can_enter(self, mode: Px4Mode, now_us: int) -> bool:
+        if mode == Px4Mode.OFFBOARD:
+            return self.stream_alive(now_us)
+        if mode == Px4Mode.AUTO_MISSION and not self.store.mission:
+            return False
+        return mode not in NEEDS_PILOT and (self.has_position or mode in FLIES_BLIND)
+
+    def terminate(self) -> Result:
+        """MAV_CMD_DO_FLIGHTTERMINATION: motors off until reboot."""
+        if not self.armed:
+            return Result.DENIED
+        self.mode = Px4Mode.TERMINATION
+        self._stop_for_good()
+        return Result.ACCEPTED
+
+    def _stop_for_good(self) -> None:
+        self.terminated = True
+        self.output = IDLE
+
+    def request_reboot(self, now_us: int) -> Result:
+        """MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN p1=1; the world does it."""
+        if self.armed:
+            return Result.DENIED
+        self.reboot_at_us = now_us + REBOOT_AFTER_US
+        return Result.ACCEPTED
+
+    def reposition(self, goal_ned_m: Triple, yaw_rad: float) -> None:
+        """Where LOITER is to hold (MAV_CMD_DO_REPOSITION)."""
+        if self.armed and self.mode == Px4Mode.AUTO_LOITER and self.landed != Landed.ON_GROUND:
+            self.flight.reposition(goal_ned_m, yaw_rad)
+
+    def _enter(self, mode: Px4Mode) -> None:
+        fresh = self.mode == Px4Mode.OFFBOARD
+        self.mode = mode
+        self.stream.command = IDLE  # OFFBOARD waits for the next setpoint; until then the last output stays
+        if self.armed and mode != Px4Mode.OFFBOARD and self._estimate is not None:
+            self.flight.engage(mode, self._estimate, fresh=fresh)
+
+    # --- every tick ---
+
+    def tick(self, estimate: Estimate, now_us: int, dt_s: float) -> None:
+        """Detect landing, judge stream and failsafes, disarm when due, and fly AUTO modes.
+
+        `now_us` and the estimate are the simulation's: this autopilot may have booted later, and elsewhere.
+        """
+        now_us = self.boot.since_us(now_us)
+        if now_us < 0:
+            return
+        estimate = self._estimate = self.boot.local(estimate)
+        self._aided_us = now_us if estimate.gps_ok else self._aided_us
+        self._unaided_us = now_us - self._aided_us
+        if self.home_ned_m is None and self.has_position and self.ready(now_us):
+            self.home_ned_m = estimate.pos_ned_m
+        self._land_detector.update(estimate.on_ground, self._airborne_state(), now_us)
+        if now_us >= self._next_check_us:
+            self._next_check_us = now_us - now_us % CHECK_US + CHECK_US
+            self._check(estimate, now_us)
+        if not self.armed or self.terminated:
+            return
+        if self._resume_us is not None and now_us - self._resume_us >= RESUME_US:
+            self._resume(now_us)
+        text = self._land_detector.disarm_text(now_us)
+        if text:
+            self._disarm(text)
+        if self.armed and self.mode != Px4Mode.OFFBOARD:
+            self.output = self.stream.spoiled(self._fly_auto(estimate, now_us, dt_s))
+
+    def _fly_auto(self, estimate: Estimate, now_us: int, dt_s: float) -> Command:
+        if not self.has_position and not estimate.on_ground:
+            return self._navigator.descend_blind(estimate, dt_s)
+        command = self.flight.fly(self.mode, estimate, self.home_ned_m, self._armed_us, now_us, dt_s)
+        if self.flight.done:
+            self.flight.done = False
+            self.mode = self.intended = self._resting_mode = Px4Mode.AUTO_LOITER
+        return command
+
+    # --- failsafes ---
+
+    def _check(self, estimate: Estimate, now_us: int) -> None:
+        """What PX4 looks at ten times a second."""
+        origin = self.flight.origin
+        breaches = self._fence.breaches(estimate.pos_ned_m, self.home_ned_m, origin) if origin else []
+        cause, action = self.watch.check(breaches, self.battery_01, now_us, armed=self.armed)
+        if not self.armed or self.terminated:
+            return
+        if self.mode == Px4Mode.OFFBOARD and not self.stream_alive(now_us):
+            self._lose_stream()
+        elif not self.has_position and self.mode not in FLIES_BLIND:
+            self._fail(Cause.POSITION, Px4Mode.AUTO_LAND)
+        elif self.has_position and self._cause == Cause.POSITION:
+            self._clear_failsafe()
+            self._enter(self.intended)
+        if action > Action.WARN:
+            self._act(cause, action, now_us)
+        elif self._delayed is not None and now_us >= self._delayed[0] and self._cause is not None:
+            self._do(self._cause, self._delayed[1])
+
+    def _lose_stream(self) -> None:
+        action = self.parameters.integer("COM_OBL_RC_ACT")
+        self._cause = Cause.OFFBOARD
+        if action == OffboardLoss.TERMINATE:
+            self._do(Cause.OFFBOARD, Action.TERMINATE)
+        elif action == OffboardLoss.DISARM:
+            self._do(Cause.OFFBOARD, Action.DISARM)
+        else:
+            known = OffboardLoss(action) if 0 <= action <= OffboardLoss.DISARM else OffboardLoss.RETURN
+            self._fail(Cause.OFFBOARD, _LOSS_MODES.get(known, Px4Mode.AUTO_RTL))
+
+    def _act(self, cause: Cause, action: Action, now_us: int) -> None:
+        """Carry out a failsafe's action; Return and Land give a pilot time in Hold first."""
+        wait_s = self.parameters.real("COM_FAIL_ACT_T")
+        if action in (Action.RETURN, Action.LAND) and wait_s > 0:
+            self._fail(cause, Px4Mode.AUTO_LOITER)
+            self._delayed = now_us + round(wait_s * 1e6), action
+        else:
+            self._do(cause, action)
+
+    def _do(self, cause: Cause, action: Action) -> None:
+        self._delayed = None
+        if action in _ACTION_MODES:
+            self._fail(cause, _ACTION_MODES[action])
+            return
+        self.say(Severity.CRITICAL, "Failsafe activated\t")
+        if action == Action.TERMINATE:
+            self.failsafe = True
+            self._stop_for_good()
+        else:
+            self._disarm("Disarmed by failsafe\t", keep_mode=True)
+
+    def _fail(self, cause: Cause, mode: Px4Mode) -> None:
+        """Fly `mode` until a mode is commanded, or the cause is gone where PX4 goes back by itself."""
+        self._delayed = self._resume_us = None
+        if not self.failsafe or cause != self._cause:
+            self.say(Severity.CRITICAL, "Failsafe activated\t")
+        self.failsafe, self._cause = True, cause
+        mode = mode if self.has_position or mode in FLIES_BLIND else Px4Mode.AUTO_LAND
+        if mode != self.mode:
+            self._enter(mode)
+
+    def _clear_failsafe(self) -> None:
+        self.failsafe = False
+        self._cause = self._delayed = self._resume_us = None
+
+    def _resume(self, now_us: int) -> None:
+        """The stream is back after a loss: OFFBOARD again, unless it has gone once more."""
+        self._resume_us = None
+        if self.stream_alive(now_us) and self.intended == Px4Mode.OFFBOARD:
+            self._clear_failsafe()
+            self._enter(Px4Mode.OFFBOARD)
+
+    def _airborne_state(self) -> Landed:
+        if not self.armed or self.mode == Px4Mode.OFFBOARD:
+            return Landed.IN_AIR
+        if self.flight.phase == Phase.TAKEOFF:
+            return Landed.TAKEOFF
+        landing = self.mode == Px4Mode.AUTO_LAND or self.flight.phase == Phase.LANDING
+        return Landed.LANDING if landing else Landed.IN_AIR

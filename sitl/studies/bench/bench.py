@@ -1,0 +1,283 @@
+"""The `bench` verb: how long an agent's tick takes, split into its parts, for growing swarms and for both QP solvers.
+
+`python -m sitl.studies.bench.bench [--out DIR] [--neighbours 0,1,2] [--solver osqp] [--ticks N] [--no-slsqp]`
+
+One real agent among neighbours that are paths on the bus (see `formation`), no process, no socket: what is measured is
+the work of a tick. Solvers take turns tick by tick, so that their ratios are fair on a busy machine. Ticks are timed by
+the wall clock, as in flight, x-y problems alone on the processor (see `captured`). Garbage collection is on, as in
+flight. Writes `bench.json`, a list of rows of five keys.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, astuple, dataclass
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from rich.box import SIMPLE
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Column, Table
+
+from sitl.lockstep import Lockstep
+from sitl.studies.bench.captured import (
+    Times,
+    XyTimes,
+    capture,
+    circle_with_obstacle,
+    measure_xy,
+    settled_garbage,
+    times_of,
+)
+from sitl.studies.bench.formation import Formation, formation_config
+from sitl.studies.campaign.flight import config_of
+from sitl.studies.campaign.scenarios import layout_of
+from sitl.studies.campaign.trials import Cell
+from swarmctl.agent.telemetry_publisher import Took
+from swarmctl.config import Config
+from swarmctl.core.types import Array, Phase
+from swarmctl.errors import EXIT_OK, ConfigError, MissionError, exit_code_of
+from swarmctl.files import replace_text
+
+PARTS = ("sense", "setup", "promise", "spaces", "solve", "certify", "barrier", "send", "tick")
+SOLVERS = ("osqp", "daqp")
+NEIGHBOURS = (0, 1, 2, 4, 8, 16, 30)
+MAX_NEIGHBOURS = 99
+_BESIDE_PILLAR = 2  # neighbours of the scenario with an obstacle
+_WARM_UP_S = 5.0  # of the mission: catching up with the circle
+_READY_WITHIN_TICKS = 1500
+_OBSTACLE = ", 1 obstacle"
+_PROMISES = ", guaranteed"
+_PROMISING = 9  # neighbours of the scenario with promises
+_ENDLESS_S = 3600.0
+_BUSY_LOAD = 0.7  # one-minute load average
+
+
+@dataclass(frozen=True, slots=True)
+class BenchRow:
+    """One line of `bench.json`."""
+
+    name: str
+    solver: str
+    neighbours: int
+    p50_ms: float
+    p99_ms: float
+
+
+def measure_ticks(
+    neighbours: int,
+    solvers: Sequence[str],
+    ticks: int,
+    pillar: bool = False,
+    on_tick: Callable[[], None] = lambda: None,
+) -> dict[str, Array]:
+    """Parts of `ticks` ticks, (ticks, 9) [ms] in the order of `PARTS`, by solver.
+
+    Raises:
+        MissionError: an agent did not get under way, or had no plan at a counted tick: a failing tick is no figure.
+    """
+    formations = {solver: Formation(formation_config(solver, neighbours, pillar)) for solver in solvers}
+    for solver, formation in formations.items():
+        _get_under_way(solver, formation.step, partial(_is_warm, formation))
+    took: dict[str, list[tuple[float, ...]]] = {solver: [] for solver in solvers}
+    with settled_garbage():
+        for _ in range(ticks):
+            for solver, formation in formations.items():
+                formation.step()
+                if not formation.planned:
+                    raise MissionError(f"bench: {solver} with {neighbours} neighbours: a tick without a plan")
+                took[solver].append(_parts(formation.took))
+            on_tick()
+    return {solver: np.array(rows) for solver, rows in took.items()}
+
+
+def measure_promises(
+    neighbours: int, solvers: Sequence[str], ticks: int, on_tick: Callable[[], None] = lambda: None
+) -> dict[str, Array]:
+    """The same of `neighbours + 1` agents that fly a swap by promises: ticks of all of them in turn, (ticks, 9) [ms].
+
+    Paths alone, as in `measure_ticks`, promise nothing: everybody is a whole agent here.
+    """
+    crowds = {solver: Lockstep(_swap_config(solver, neighbours + 1)) for solver in solvers}
+    took: dict[str, list[tuple[float, ...]]] = {solver: [] for solver in solvers}
+    for solver, crowd in crowds.items():
+        _get_under_way(solver, crowd.step, partial(_tracks, crowd))
+    with settled_garbage():
+        for _ in range(0, ticks, neighbours + 1):
+            for solver, crowd in crowds.items():
+                crowd.step()
+                took[solver] += [_parts(agent.took) for agent in crowd.agents if agent is not None]
+            for _ in range(neighbours + 1):
+                on_tick()
+    return {solver: np.array(rows[:ticks]) for solver, rows in took.items()}
+
+
+def _swap_config(solver: str, agents: int) -> Config:
+    cell = Cell("symmetric", agents, 0.0, 0.0, "exact", 0.0, "guaranteed")
+    extra = (f"controller.mpc.qp.solver='{solver}'", f"mission.duration_s={_ENDLESS_S}")
+    return config_of(cell, 1, layout_of(cell.scenario, 1, agents), agents, extra)
+
+
+def _tracks(crowd: Lockstep) -> bool:
+    return int(crowd.logs[0].rows[-1]["phase"][0]) == Phase.TRACK
+
+
+def _is_warm(formation: Formation) -> bool:
+    return formation.mission_t_s >= _WARM_UP_S
+
+
+def _get_under_way(solver: str, step: Callable[[], None], ready: Callable[[], bool]) -> None:
+    for _ in range(_READY_WITHIN_TICKS):
+        step()
+        if ready():
+            return
+    raise MissionError(f"bench: the agent with {solver} did not begin within {_READY_WITHIN_TICKS} ticks")
+
+
+def _parts(took: Took) -> tuple[float, ...]:
+    return (*astuple(took), took.tick_ms)
+
+
+def tick_rows(took: dict[str, Array], neighbours: int, suffix: str = "") -> list[BenchRow]:
+    """Rows of one scenario."""
+    rows = []
+    for solver, parts in took.items():
+        for name, column in zip(PARTS, parts.T, strict=True):
+            rows.append(_row(name + suffix, solver, neighbours, times_of(column)))
+    return rows
+
+
+def xy_rows(times: XyTimes) -> list[BenchRow]:
+    """Rows of the x-y problem alone: QP, and true distances as in the thesis."""
+    rows = [_row("solve x-y" + _OBSTACLE, solver, 2, times.qp(solver)) for solver in times.qp_ms]
+    if times.fmincon is not None and times.gradients is not None:
+        rows.append(_row("solve x-y, nonlinear" + _OBSTACLE, "slsqp", 2, times.fmincon.times))
+        rows.append(_row("solve x-y, nonlinear, gradients" + _OBSTACLE, "slsqp", 2, times.gradients.times))
+    return rows
+
+
+def _row(name: str, solver: str, neighbours: int, times: Times) -> BenchRow:
+    return BenchRow(name, solver, neighbours, round(times.p50_ms, 4), round(times.p99_ms, 4))
+
+
+def bench(
+    neighbours: Sequence[int], solvers: Sequence[str], ticks: int, slsqp: bool, console: Console
+) -> list[BenchRow]:
+    """Measure everything; shows progress on a terminal."""
+    rows: list[BenchRow] = []
+    promising = min(_PROMISING, max(1, *neighbours, 0))
+    with Progress(transient=True, console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task("ticks", total=ticks * (len(neighbours) + 2))
+
+        def on_tick() -> None:
+            bar.advance(task)
+
+        for count in neighbours:
+            bar.update(task, description=f"{count} neighbours")
+            rows += tick_rows(measure_ticks(count, solvers, ticks, on_tick=on_tick), count)
+        bar.update(task, description=f"{promising} neighbours that promise")
+        rows += tick_rows(measure_promises(promising, solvers, ticks, on_tick), promising, _PROMISES)
+        bar.update(task, description=f"{_BESIDE_PILLAR} neighbours, 1 obstacle")
+        beside = measure_ticks(_BESIDE_PILLAR, solvers, ticks, pillar=True, on_tick=on_tick)
+        rows += tick_rows(beside, _BESIDE_PILLAR, _OBSTACLE)
+        bar.update(task, description="x-y problems of a flight")
+        captured = capture(circle_with_obstacle())
+        problem_task = bar.add_task("x-y problems", total=len(captured.problems))
+        rows += xy_rows(measure_xy(captured, solvers, slsqp, lambda: bar.advance(problem_task)))
+    return rows
+
+
+def busy_note(load: float, processors: int) -> str:
+    """What to say of the machine before anything is measured; "" when it is quiet."""
+    if load < _BUSY_LOAD:
+        return ""
+    return f"load {load:.1f} on {processors} processors before the start: p99 of ticks includes other processes' work"
+
+
+def show(rows: Sequence[BenchRow], console: Console) -> None:
+    """The rows as two tables and the ratios."""
+    neighbours = Column("neighbours", min_width=10)
+    table = Table("solver", neighbours, *PARTS, title="one tick: p50 (p99) [ms]", box=SIMPLE)
+    for suffix in ("", _PROMISES, _OBSTACLE):
+        keys = dict.fromkeys((r.neighbours, r.solver) for r in rows if r.name == "tick" + suffix)
+        for count, solver in keys:
+            found = {r.name: r for r in rows if (r.neighbours, r.solver) == (count, solver)}
+            cells = [f"{r.p50_ms:.2f} ({r.p99_ms:.2f})" for r in (found[name + suffix] for name in PARTS)]
+            table.add_row(solver, f"{count}{suffix}", *cells)
+    console.print(table)
+    alone = [r for r in rows if r.name.startswith("solve x-y")]
+    title = "x-y problems of a flight, 2 neighbours + 1 obstacle [ms]"
+    table = Table("problem", "solver", "p50", "p99", title=title, box=SIMPLE)
+    for r in alone:
+        table.add_row(r.name.removesuffix(_OBSTACLE), r.solver, f"{r.p50_ms:.3f}", f"{r.p99_ms:.3f}")
+    console.print(table)
+    for nonlinear in (r for r in alone if r.solver == "slsqp"):
+        for r in (r for r in alone if r.solver != "slsqp"):
+            name = nonlinear.name.removesuffix(_OBSTACLE)
+            console.print(
+                f"{r.solver}: {nonlinear.p50_ms / r.p50_ms:.0f} times as fast as slsqp, {name} (p50 of all problems)"
+            )
+
+
+def write(rows: Sequence[BenchRow], directory: Path) -> Path:
+    """`bench.json` in `directory`, which is made if need be."""
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+        path = directory / "bench.json"
+        replace_text(path, json.dumps([asdict(row) for row in rows], indent=1) + "\n")
+    except OSError as error:
+        raise ConfigError("--out", [f"{directory}: can't be written: {error.strerror}"]) from error
+    return path
+
+
+def _counts(text: str) -> list[int]:
+    try:
+        counts = [int(part) for part in text.split(",")]
+    except ValueError:
+        counts = [-1]
+    if not all(0 <= count <= MAX_NEIGHBOURS for count in counts):
+        raise argparse.ArgumentTypeError(f"{text!r}: give numbers from 0 to {MAX_NEIGHBOURS}, such as 0,2,8")
+    return list(dict.fromkeys(counts))
+
+
+def _ticks(text: str) -> int:
+    if not text.isdigit() or not 1 <= int(text) <= 100_000:
+        raise argparse.ArgumentTypeError(f"{text!r}: allowed: 1 to 100000")
+    return int(text)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="swarmctl bench", description=__doc__.splitlines()[0])
+    parser.add_argument("--out", metavar="DIR", type=Path, default=Path(), help="where bench.json goes")
+    parser.add_argument("--neighbours", metavar="K,K", type=_counts, default=list(NEIGHBOURS))
+    parser.add_argument("--solver", action="append", choices=SOLVERS, help="may be given twice; default: both")
+    parser.add_argument("--ticks", metavar="N", type=_ticks, default=300, help="measured for each solver and scenario")
+    parser.add_argument("--slsqp", action=argparse.BooleanOptionalAction, default=True, help="the nonlinear baseline")
+    return parser
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the verb; returns the process exit code."""
+    return exit_code_of(partial(_run, _parser().parse_args(arguments)))
+
+
+def _run(options: argparse.Namespace) -> int:
+    console = Console()
+    note = busy_note(os.getloadavg()[0], os.cpu_count() or 1)
+    solvers = list(dict.fromkeys(options.solver or SOLVERS))
+    rows = bench(options.neighbours, solvers, options.ticks, options.slsqp, console)
+    show(rows, console)
+    if note:
+        console.print(note)
+    console.print(str(write(rows, options.out)))
+    return EXIT_OK
+
+
+if __name__ == "__main__":
+    sys.exit(main())

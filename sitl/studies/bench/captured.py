@@ -1,0 +1,274 @@
+"""Problems of a real flight, solved again: the x-y QP by OSQP and DAQP, the thesis' own problem by SLSQP, in one run.
+
+The flight is the thesis' circle with an obstacle on the way: agents and their MAVLink bytes in lockstep. Problems are
+recorded where an agent sees both neighbours and the obstacle.
+
+What is compared with what: of the QP the call of the solver from Python is timed, updating its matrices included,
+working them out not (that is a tick's `setup`). Of the nonlinear problem the call of SciPy is timed, callbacks
+included, working out its constants not. Both are warm-started from their own last answer. SLSQP runs twice: with
+finite differences, fmincon's way and the stand-in for it, and with analytic gradients. Its constraints are hard, those
+of the QP give way by slacks: about a third of these problems ask for a distance that is lost already, and what has no
+solution is left out of the ratio. All are timed on the processor: on a busy machine a wall clock would charge the
+slower one with the time slices of others, which the quicker one slips through between. The whole ticks of the flight
+are wall-clock time.
+"""
+
+from __future__ import annotations
+
+import gc
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sitl.lockstep import Lockstep
+from sitl.studies.bench.slsqp import KEPT_M, NonlinearAnswer, NonlinearXy
+from swarmctl.config import Config, load
+from swarmctl.control.collision.separation import SeparationParams
+from swarmctl.control.controller import Controller
+from swarmctl.control.model import VehicleModelParams
+from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, HalfSpaces
+from swarmctl.control.mpc.problem import Problem
+from swarmctl.control.mpc.qp import QpParams
+from swarmctl.control.mpc.swarm_mpc import MpcParams, SwarmMpc
+from swarmctl.core.types import Array, Plan
+
+Mask = NDArray[np.bool_]
+_OBSTACLE = "obstacles=[{center_ned_m=[-5.0,-1.5,-1.8],radius_m=1.0,keep_out_m=1.75,visibility_m=3.0}]"
+_MISSION = "mission.duration_s=9.0"  # the obstacle is passed at about 7 s
+_WARM_UP = 20  # problems that are solved and not counted
+_SLOTS = 3  # two neighbours, one obstacle
+
+
+def circle_with_obstacle() -> Config:
+    """The thesis' circle (its section 4.3) with an obstacle like that of its section 4.4 on the way."""
+    return load(None, [_MISSION, _OBSTACLE, "sitl.start='air'"])
+
+
+@dataclass(frozen=True, slots=True)
+class Captured:
+    """What agents were asked in flight, one after the other, and how long their whole ticks took then."""
+
+    config: Config
+    problems: tuple[Problem, ...]
+    tick_ms: Array  # (len(problems),)
+
+
+class Recording:
+    """A controller that remembers what it is asked."""
+
+    def __init__(self, controller: Controller) -> None:
+        self._controller = controller
+        self.problems: list[Problem] = []
+
+    @property
+    def dt_us(self) -> int:
+        return self._controller.dt_us
+
+    @property
+    def steps(self) -> int:
+        return self._controller.steps
+
+    @property
+    def longest(self) -> int:
+        return self._controller.longest
+
+    def plan(self, problem: Problem) -> Plan:
+        self.problems.append(problem)
+        return self._controller.plan(problem)
+
+    def reset(self) -> None:
+        self._controller.reset()
+
+
+def capture(config: Config, keep_outs: int = _SLOTS, most: int = 240) -> Captured:
+    """Fly `config` in lockstep; keep at most `most` tracking problems with exactly `keep_outs` things to avoid.
+
+    They are consecutive, agent after agent.
+    """
+    flight = Lockstep(config)
+    agents = [agent for agent in flight.agents if agent is not None]
+    recordings = []
+    for agent in agents:
+        recordings.append(Recording(agent._controller))
+        agent._controller = recordings[-1]  # `_transit` stays: only tracking is recorded
+    found: list[list[tuple[Problem, float]]] = [[] for _ in agents]
+
+    def on_step(_: Lockstep) -> None:
+        for agent, recording, kept in zip(agents, recordings, found, strict=True):
+            kept += [(p, agent.took.tick_ms) for p in recording.problems if len(p.keep_outs) == keep_outs]
+            recording.problems.clear()
+
+    with settled_garbage():
+        flight.run(on_step)
+    together = [item for kept in found for item in kept][:most]
+    return Captured(config, tuple(p for p, _ in together), np.array([ms for _, ms in together]))
+
+
+@contextmanager
+def settled_garbage() -> Iterator[None]:
+    """As the real-time loop does it: start-up garbage is not looked at again while something is measured."""
+    gc.collect()
+    gc.freeze()
+    try:
+        yield
+    finally:
+        gc.unfreeze()
+
+
+class TappedMpc(SwarmMpc):
+    """The controller of a flight with its x-y problem in sight: what it was asked last, and how long that took."""
+
+    def __init__(
+        self, params: MpcParams, vehicle: VehicleModelParams, separation: SeparationParams, slots: int = _SLOTS
+    ) -> None:
+        super().__init__(params, vehicle, separation, 0, slots, time.thread_time_ns)
+        self._genuine = self._xy.solve
+        self._xy.solve = self._watched  # type: ignore[method-assign]
+        self.solve_ms = 0.0
+        self._asked: AxesProblem | None = None
+
+    def _watched(self, asked: AxesProblem, half_spaces: HalfSpaces | None = None) -> AxesSolution:
+        self._asked = asked
+        answer = self._genuine(asked, half_spaces)
+        self.solve_ms = answer.solve_us * 1e-3
+        return answer
+
+    def nonlinear(self, problem: Problem, plan: Plan) -> NonlinearXy:
+        """The x-y problem of the last plan as the thesis poses it; same z, same thrust."""
+        assert self._asked is not None
+        xy = self._xy
+        return NonlinearXy(xy.axes, xy.horizon, self._asked, problem.keep_outs, plan.pos_ned_m[1:, 2])
+
+
+@dataclass(frozen=True, slots=True)
+class Times:
+    """Percentiles of a duration [ms]."""
+
+    p50_ms: float
+    p99_ms: float
+
+
+def times_of(took_ms: Sequence[float] | Array) -> Times:
+    """p50 and p99 of at least one duration [ms]."""
+    p50_ms, p99_ms = np.percentile(np.asarray(took_ms), (50, 99))
+    return Times(float(p50_ms), float(p99_ms))
+
+
+@dataclass(frozen=True, slots=True)
+class Baseline:
+    """SLSQP on the counted problems, as the thesis poses them."""
+
+    took_ms: Array  # (problems,)
+    solved: Mask  # (problems,) by its own account
+    at_limit: Mask  # (problems,) of iterations
+    kept: Mask  # (problems,) whether its answer keeps every true distance
+
+    @property
+    def times(self) -> Times:
+        """Of all problems, those without a solution included."""
+        return times_of(self.took_ms)
+
+    @property
+    def solved_01(self) -> float:
+        return float(self.solved.mean())
+
+    @property
+    def at_limit_01(self) -> float:
+        return float(self.at_limit.mean())
+
+    @property
+    def infeasible_01(self) -> float:
+        """Share for which it says that it found nothing to satisfy the constraints."""
+        return float((~self.solved & ~self.at_limit).mean())
+
+    @property
+    def kept_01(self) -> float:
+        return float(self.kept.mean())
+
+
+@dataclass(frozen=True, slots=True)
+class XyTimes:
+    """The x-y problem with two neighbours and an obstacle: how long it takes each solver, on the processor."""
+
+    tick: Times  # whole ticks in which they were asked, in flight, by the wall clock
+    qp_ms: dict[str, Array]  # by solver: the QP, (problems,)
+    fmincon: Baseline | None  # stand-in for it: finite differences; None when not asked for
+    gradients: Baseline | None  # the same with analytic gradients, the best that can be done for it
+
+    @property
+    def problems(self) -> int:
+        """How many were counted."""
+        return len(next(iter(self.qp_ms.values())))
+
+    def qp(self, solver: str) -> Times:
+        return times_of(self.qp_ms[solver])
+
+    def speed_up(self, solver: str = "osqp", gradients: bool = False) -> float:
+        """How many times longer SLSQP takes (p50), on the problems that it has solved; NaN when not measured."""
+        baseline = self.gradients if gradients else self.fmincon
+        if baseline is None or not baseline.solved.any():
+            return float("nan")
+        solved = baseline.solved
+        return float(np.median(baseline.took_ms[solved]) / np.median(self.qp_ms[solver][solved]))
+
+
+def measure_xy(
+    captured: Captured,
+    solvers: Sequence[str] = ("osqp", "daqp"),
+    slsqp: bool = True,
+    on_problem: Callable[[], None] = lambda: None,
+) -> XyTimes:
+    """Solve every captured problem with every solver in turn, so that a busy machine slows all of them down alike.
+
+    The first 20 are solved and not counted.
+    """
+    mpcs = {name: tapped(captured.config, name) for name in solvers}
+    qp_ms: dict[str, list[float]] = {name: [] for name in solvers}
+    baselines = (_Running(False), _Running(True)) if slsqp else ()
+    with settled_garbage():
+        for problem in captured.problems:
+            for name, mpc in mpcs.items():
+                plan = mpc.plan(problem)
+                qp_ms[name].append(mpc.solve_ms)
+            for baseline in baselines:
+                baseline.solve(mpc.nonlinear(problem, plan))
+            on_problem()
+    counted = {name: np.array(took[_WARM_UP:]) for name, took in qp_ms.items()}
+    found = [b.counted() for b in baselines] if slsqp else [None, None]
+    return XyTimes(times_of(captured.tick_ms), counted, *found)
+
+
+def tapped(config: Config, solver: str) -> TappedMpc:
+    """The controller of `config` with another QP solver."""
+    params = config.controller.mpc
+    qp = QpParams.model_validate({**params.qp.model_dump(), "solver": solver})
+    return TappedMpc(params.model_copy(update={"qp": qp}), config.vehicle_model, config.separation)
+
+
+class _Running:
+    """SLSQP from its own last answer, shifted by one step."""
+
+    def __init__(self, gradients: bool) -> None:
+        self._gradients = gradients
+        self._took_ms: list[float] = []
+        self._answers: list[NonlinearAnswer] = []
+
+    def solve(self, problem: NonlinearXy) -> None:
+        guess = problem.shifted(self._answers[-1].moves) if self._answers else None
+        began_ns = time.thread_time_ns()
+        answer = problem.solve(guess, self._gradients)
+        self._took_ms.append((time.thread_time_ns() - began_ns) * 1e-6)
+        self._answers.append(answer)
+
+    def counted(self) -> Baseline:
+        answers = self._answers[_WARM_UP:]
+        return Baseline(
+            np.array(self._took_ms[_WARM_UP:]),
+            np.array([a.solved for a in answers]),
+            np.array([a.at_limit for a in answers]),
+            np.array([a.shortfall_m < KEPT_M for a in answers]),
+        )

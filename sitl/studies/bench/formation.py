@@ -1,0 +1,219 @@
+"""One real agent, with its vehicle and MAVLink bytes, among neighbours that are only paths on the bus.
+
+Neighbours keep their places in a formation that moves and turns with the circle all share, and sway a little. Each
+publishes an ordinary predicted path every tick, as an agent would. The rearmost place is left to the agent, which is
+drawn to the middle like everybody else and so presses against those before it. Nothing of it needs wall time.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from sitl.lockstep import obstacles_message, sitl_params
+from sitl.world import SitlWorld
+from swarmctl.agent.assembly import make_agent
+from swarmctl.agent.telemetry_publisher import Took
+from swarmctl.bus import topics
+from swarmctl.bus.peers import LocalHub, agent_name
+from swarmctl.config import Config, load
+from swarmctl.core.clock import SimClock
+from swarmctl.core.types import Array, Phase, PlanStatus, PredictedPath, TickRecord
+from swarmctl.mavlink.autopilot import Autopilot
+from swarmctl.mavlink.codec import Codec
+from swarmctl.mavlink.commands import CodecCommands
+from swarmctl.mavlink.transport import pipe_pair
+
+SPACING_M = 1.0  # of places; what is kept is 0.9 m
+RADIUS_M, OMEGA_RAD_S, HEIGHT_M = 5.0, 0.5, 1.0  # of the circle, thesis 4.3 without the climb
+_PILLAR_KEEP_OUT_M = 5.2  # an obstacle that fills the circle and a little more: always in sight, always in the way
+_SWAY_M = 0.03
+_SWAY_HZ = (0.2, 0.5)
+_SWAY = 1  # purpose of the random stream
+_STATUS_EVERY_US = 200_000
+_OBSTACLES_EVERY_US = 1_000_000
+_ENDLESS_S = 3600.0
+
+
+def places_m(count: int) -> Array:
+    """`count` places (count, 2) of a triangular lattice round its own middle: outward and along the circle.
+
+    The rearmost comes first.
+    """
+    reach = range(-8, 9)
+    lattice = [(SPACING_M * 0.5 * math.sqrt(3.0) * i, SPACING_M * (j + 0.5 * (i % 2))) for i in reach for j in reach]
+    near = np.array(sorted(lattice, key=lambda p: (round(math.hypot(*p), 6), p))[:count])
+    near = near - near.mean(axis=0)
+    return np.asarray(near[np.argsort(near[:, 1], kind="stable")])
+
+
+def column_m(count: int) -> Array:
+    """`count` places (count, 2) one behind the other along the rim of the pillar, the rearmost first."""
+    along = SPACING_M * (np.arange(count) - 0.5 * (count - 1))
+    return np.stack([np.full(count, _PILLAR_KEEP_OUT_M + 0.05 - RADIUS_M), along], axis=1)
+
+
+class Neighbours:
+    """Where the others are at mission time t: `places` (K, 2) about the reference, turned with it, swaying."""
+
+    def __init__(self, places: Array, seed: int) -> None:
+        rng = np.random.default_rng([seed, len(places), _SWAY])
+        self._places_m = places
+        self._rate_rad_s = 2.0 * math.pi * rng.uniform(*_SWAY_HZ, size=(len(places), 2))
+        self._phase_rad = rng.uniform(0.0, 2.0 * math.pi, size=(len(places), 2))
+
+    def positions_ned_m(self, t_s: Array) -> Array:
+        """(K, T, 3) at mission times `t_s` (T,); at rest and without sway before 0."""
+        t_s = np.maximum(t_s, 0.0)
+        sway = _SWAY_M * np.sin(self._rate_rad_s[:, None] * t_s[:, None] + self._phase_rad[:, None])
+        sway -= _SWAY_M * np.sin(self._phase_rad)[:, None]
+        return turned_ned_m(self._places_m[:, None] + sway, t_s)
+
+
+def turned_ned_m(places: Array, t_s: Array) -> Array:
+    """Places (K, T, 2) outward and along the circle, at the reference's place at `t_s` (T,), as (K, T, 3) NED."""
+    angle = OMEGA_RAD_S * t_s
+    out, along = np.stack([np.cos(angle), np.sin(angle)], 1), np.stack([-np.sin(angle), np.cos(angle)], 1)  # (T, 2)
+    flat = (RADIUS_M + places[:, :, :1]) * out + places[:, :, 1:] * along
+    return np.concatenate([flat, np.full((*flat.shape[:2], 1), -HEIGHT_M)], axis=2)
+
+
+def formation_config(solver: str, neighbours: int, pillar: bool) -> Config:
+    """The thesis' circle for one agent and `neighbours` others, every one of which gets rows in the problem."""
+    places = column_m(neighbours + 1) if pillar else places_m(neighbours + 1)
+    starts = turned_ned_m(places[:, None], np.zeros(1))[:, 0]
+    overrides = [
+        f"swarm.agents={neighbours + 1}",
+        f"start.positions_ned_m={starts.tolist()}",
+        f"mission.duration_s={_ENDLESS_S}",
+        f"mission.circle={{center_ned_m=[0.0,0.0,{-HEIGHT_M}],climb_ned_m_s=0.0}}",
+        f"separation.max_neighbours={max(1, neighbours)}",
+        f"controller.mpc.qp.solver='{solver}'",
+        "sitl.start='air'",
+    ]
+    if pillar:
+        keep_out = f"radius_m={_PILLAR_KEEP_OUT_M - 0.5},keep_out_m={_PILLAR_KEEP_OUT_M}"
+        overrides.append(f"obstacles=[{{center_ned_m=[0.0,0.0,{-HEIGHT_M}],{keep_out},visibility_m=100.0}}]")
+    return load(None, overrides)
+
+
+class _Newest:
+    """A recorder that keeps only the newest tick."""
+
+    def __init__(self) -> None:
+        self.record: TickRecord | None = None
+
+    def tick(self, record: TickRecord) -> None:
+        self.record = record
+
+    def event(self, name: str, t_us: int, utc_us: int, **fields: Any) -> None:
+        return
+
+
+class Formation:
+    """The agent (number 0), its vehicle and its neighbours, step by step."""
+
+    def __init__(self, config: Config) -> None:
+        self.clock = SimClock()
+        self._config, self._sink = config, _Newest()
+        self._tick_us = round(1e6 / config.agent.rate_hz)
+        self._physics_us = round(1e6 / config.sitl.physics_hz)
+        near, far = pipe_pair(self.clock.now_us, 0)
+        params = sitl_params(config)
+        self._world = SitlWorld(replace(params, vehicles=1, spawn_ned_m=params.spawn_ned_m[:1]), [far])
+        hub = LocalHub(self.clock.now_us, config.seed)
+        count = config.swarm.agents - 1
+        places = column_m(count + 1) if config.obstacles else places_m(count + 1)
+        self.neighbours = Neighbours(places[1:], config.seed)
+        self._buses = [hub.attach(agent_name(i + 1), {}) for i in range(count)]
+        self._operator = hub.attach(topics.OPERATOR, {})
+        self._seq = 0
+        self.agent = make_agent(
+            config,
+            0,
+            1,
+            near,
+            hub.attach(agent_name(0)),
+            self.clock,
+            self._sink,
+            lambda frame: None,
+            self._slow_path,
+            time.perf_counter_ns,
+        )
+
+    @staticmethod
+    def _slow_path(autopilot: Autopilot, codec: Codec) -> CodecCommands:
+        return CodecCommands(autopilot.send_frame, codec, 1, lambda: autopilot.dialect)
+
+    @property
+    def mission_t_s(self) -> float:
+        """Of the newest tick; -1 before the mission."""
+        record = self._sink.record
+        return -1.0 if record is None or not math.isfinite(record.mission_t_s) else record.mission_t_s
+
+    @property
+    def took(self) -> Took:
+        """Parts of the newest tick."""
+        return self.agent.took
+
+    @property
+    def record(self) -> TickRecord:
+        """The newest tick."""
+        assert self._sink.record is not None
+        return self._sink.record
+
+    @property
+    def planned(self) -> bool:
+        """Whether the newest tick had a plan that may be flown."""
+        return self.record.plan_status is PlanStatus.OK
+
+    def step(self) -> None:
+        """Neighbours speak, the agent ticks, physics moves on to the next tick."""
+        self._speak()
+        self.agent.tick(self.clock.now_us(), 0)
+        for _ in range(self._tick_us // self._physics_us):
+            self.clock.advance(self._physics_us)
+            self._world.step(self.clock.now_us())
+
+    def _speak(self) -> None:
+        now_us, utc_us = self.clock.now_us(), self.clock.utc_us()
+        delay_us, dt_us = round(self._config.vehicle_model.delay_s * 1e6), round(self._config.controller.mpc.dt_s * 1e6)
+        steps = self._config.controller.mpc.horizon_xy
+        began_s = self.mission_t_s + self._tick_us * 1e-6 if self.mission_t_s >= 0.0 else -1.0
+        ahead_s = 1e-6 * np.arange(delay_us, delay_us + (steps + 1) * dt_us, dt_us, dtype=np.float64)
+        paths = self.neighbours.positions_ned_m(ahead_s + began_s if began_s >= 0.0 else 0.0 * ahead_s)
+        self._seq += 1
+        for i, (bus, path) in enumerate(zip(self._buses, paths, strict=True)):
+            message = PredictedPath(i + 1, 1, self._seq, utc_us + delay_us, dt_us, 0.0, path)
+            bus.publish(topics.PATH, topics.encode_path(message))
+            if now_us % _STATUS_EVERY_US == 0:
+                bus.publish(topics.STATUS, topics.encode_message(self._status(i + 1, began_s >= 0.0)))
+        if now_us % _OBSTACLES_EVERY_US == 0:
+            self._operator.publish(topics.OBSTACLES, topics.encode_message(obstacles_message(self._config)))
+
+    def _status(self, agent: int, tracking: bool) -> topics.StatusMessage:
+        phase = Phase.TRACK if tracking else Phase.READY
+        return topics.StatusMessage(
+            agent=agent,
+            boot_id=1,
+            sysid=agent + 1,
+            phase=int(phase),
+            mode=2,
+            flight_mode=7,
+            armed=True,
+            landed=2,
+            ready_utc_us=1,
+            outcome="",
+            position_error_m=0.0,
+            separation_m=0.0,
+            tick_p99_ms=0.0,
+            ticks=0,
+            late_ticks=0,
+            path_age_ms=0.0,
+            solver_failed=0,
+            problem="",
+        )

@@ -1,0 +1,197 @@
+"""Seeded Monte Carlo in lockstep: scenario x agents x delay x loss x noise x wind x protections, judged on true states.
+
+Every combination is a cell, flown with the same seeds. Rows go to `OUT/rows.parquet` as they come in; the same call
+again flies only what is missing there. `OUT/report.html` has every cell with exact binomial intervals.
+
+    python tools/campaign.py --quick
+    python tools/campaign.py --scenario swap --agents 6,10 --delay 0,50,100 --loss 0,0.1 --trials 100 --out runs/swap
+    python tools/campaign.py --scenario random --protections default,off --dask scheduler.local:8786
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+from sitl.studies.campaign.factors import NOISES, PROTECTIONS
+from sitl.studies.campaign.flight import config_of
+from sitl.studies.campaign.page import share_text, write_page
+from sitl.studies.campaign.quick import QUICK
+from sitl.studies.campaign.scenarios import SCENARIOS, layout_of
+from sitl.studies.campaign.source import code_id
+from sitl.studies.campaign.store import Store
+from sitl.studies.campaign.summary import summaries
+from sitl.studies.campaign.trials import Cell, Row, Trial, cells, trial_of
+from sitl.studies.campaign.worker_pool import on_cluster, on_this_machine
+from swarmctl.errors import EXIT_MISSION, EXIT_OK, ConfigError, exit_code_of
+
+MAX_AGENTS = 100
+_SAY_EVERY_S = 30.0  # where there is no terminal to draw a bar on
+_Value = TypeVar("_Value")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Fly what is asked for and not there yet; 4 when a trial could not be flown at all."""
+    options = _parser().parse_args(arguments)
+    return exit_code_of(partial(_run, options), f"interrupted; the same call goes on from {options.out}")
+
+
+def _run(options: argparse.Namespace) -> int:
+    trials = _trials(options)
+    began_s, errors = time.monotonic(), []
+    with Store(options.out, code_id(), options.mix) as store:
+        missing = store.missing(trials)
+        print(f"{len(trials)} runs, {len(trials) - len(missing)} of them there already; {options.out}", flush=True)
+        jobs = min(options.jobs, max(1, len(missing)))
+        flown = on_cluster(missing, options.dask) if options.dask else on_this_machine(missing, jobs)
+        count = 0
+        with closing(flown):
+            for trial, result in _shown(flown, len(missing)):
+                if isinstance(result, str):
+                    errors.append(f"{trial}: {result}")
+                    continue
+                count += 1
+                store.add(result)
+    hours = (time.monotonic() - began_s) / 3600.0
+    report = write_page(options.out, store.rows, count / hours if count else None)
+    asked = set(trials)
+    _print_table([row for row in store.rows if trial_of(row) in asked])
+    print(f"{count} runs in {hours * 60:.1f} min, {count / hours if count else 0.0:.0f} an hour; {report}")
+    for error in errors:
+        print(error, file=sys.stderr)
+    return EXIT_MISSION if errors else EXIT_OK
+
+
+def _trials(options: argparse.Namespace) -> list[Trial]:
+    """What is asked for.
+
+    Raises:
+        ConfigError: every cell that can't be flown, and why.
+    """
+    if options.quick:
+        return list(QUICK)
+    found: list[Cell] = []
+    for name in options.scenario:
+        agents = options.agents or SCENARIOS[name].agents
+        axes = (options.delay, options.loss, options.noise, options.wind, options.protections)
+        found += cells([name], agents, *axes, sets=" ".join(options.sets))
+    problems: dict[str, None] = {}
+    for cell in found:
+        problems.update(dict.fromkeys(_problems(cell, options.first_seed)))
+    if problems:
+        raise ConfigError("campaign", list(problems))
+    seeds = range(options.first_seed, options.first_seed + options.trials)
+    return [Trial(cell, seed) for seed in seeds for cell in found]  # all cells grow together
+
+
+def _problems(cell: Cell, seed: int) -> Iterator[str]:
+    least = SCENARIOS[cell.scenario].needs
+    if cell.agents < least:
+        yield f"--agents {cell.agents}: {cell.scenario} needs at least {least}"
+        return
+    try:
+        config_of(cell, seed, layout_of(cell.scenario, seed, cell.agents), cell.agents)
+    except ConfigError as error:
+        yield from error.problems
+    except ValueError as error:
+        yield f"--scenario {cell.scenario} --agents {cell.agents}: {error}"
+
+
+def _shown(flown: Iterator[tuple[Trial, Any]], total: int) -> Iterator[tuple[Trial, Any]]:
+    """The same, with a bar on a terminal and a line now and then elsewhere."""
+    collided = done = 0
+    began_s = said_s = time.monotonic()
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, transient=True, disable=not sys.stdout.isatty()) as bar:
+        task = bar.add_task("flying", total=total)
+        for trial, result in flown:
+            yield trial, result
+            done += 1
+            collided += not isinstance(result, str) and result["collided"]
+            now_s = time.monotonic()
+            hourly = 3600.0 * done / max(now_s - began_s, 1e-3)
+            bar.update(task, advance=1, description=f"{collided} collided, {hourly:.0f} runs/h")
+            if bar.disable and now_s - said_s >= _SAY_EVERY_S:
+                said_s = now_s
+                print(f"{done}/{total} flown, {collided} collided, {hourly:.0f} runs/h", flush=True)
+
+
+def _print_table(rows: list[Row]) -> None:
+    table = Table(box=None, pad_edge=False)
+    for name in ("cell", "collided", "arrived", "deadlocked", "separation", "time"):
+        table.add_column(name)
+    for s in summaries(rows):
+        c = s.cell
+        name = f"{c.scenario} {c.agents}, {c.delay_ms:g} ms, {100 * c.loss:g} %"
+        extras = [c.noise if c.noise != "exact" else "", f"wind {c.wind_m_s:g}" if c.wind_m_s else "", c.sets]
+        table.add_row(
+            ", ".join([name, *filter(None, extras), c.protections]),
+            share_text(s.collided),
+            share_text(s.arrived),
+            str(s.deadlocked.hits),
+            "" if s.min_separation_m is None else f"{s.min_separation_m:.2f} m",
+            "" if s.time_median_s is None else f"{s.time_median_s:.1f} s",
+        )
+    Console(width=None if sys.stdout.isatty() else 160, highlight=False).print(table)
+
+
+def _parser() -> argparse.ArgumentParser:
+    scenarios = "\n".join(f"  {name:15}{s.title}; agents {s.agents}" for name, s in SCENARIOS.items())
+    parser = argparse.ArgumentParser(
+        prog="campaign",
+        description=(__doc__ or "").rstrip(),
+        epilog=f"scenarios:\n{scenarios}\n\nLists are separated by commas.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    add = parser.add_argument
+    add("--scenario", metavar="NAME,..", type=_names(SCENARIOS), default=["swap"], help="or all")
+    add("--agents", metavar="N,..", type=_numbers(int, 1, MAX_AGENTS), help="left out: as listed below")
+    add("--delay", metavar="MS,..", type=_numbers(float, 0, 5000), default=[0.0], help="of every message on the bus")
+    add("--loss", metavar="P,..", type=_numbers(float, 0, 1), default=[0.0], help="0..1, of unreliable messages")
+    add("--noise", metavar="NAME,..", type=_names(NOISES), default=["exact"], help=", ".join(NOISES))
+    add("--wind", metavar="M/S,..", type=_numbers(float, 0, 40), default=[0.0], help="mean, with turbulence of as much")
+    add("--protections", metavar="NAME,..", type=_names(PROTECTIONS), default=["default"], help=", ".join(PROTECTIONS))
+    add("--set", metavar="KEY=VALUE", dest="sets", action="append", default=[], help="of the configuration, any number")
+    add("--trials", metavar="N", type=int, default=20, help="seeds of every cell, default %(default)s")
+    add("--first-seed", metavar="K", type=int, default=1)
+    add("--out", metavar="DIR", type=Path, default=Path("runs/campaign"), help="default %(default)s")
+    add("--jobs", metavar="N", type=int, default=os.cpu_count() or 1, help="processes, default %(default)s")
+    add("--dask", metavar="HOST:PORT", help="fly on the workers of this scheduler instead")
+    add("--mix", action="store_true", help="go on in a folder whose rows were flown by other sources")
+    add("--quick", action="store_true", help="the subset that is tested with every change; leaves the axes above out")
+    return parser
+
+
+def _names(known: dict[str, Any]) -> Callable[[str], list[str]]:
+    def parse(text: str) -> list[str]:
+        asked = list(known) if text == "all" else text.split(",")
+        unknown = [name for name in asked if name not in known]
+        if unknown:
+            raise argparse.ArgumentTypeError(f"{', '.join(unknown)}: allowed: {', '.join(known)}")
+        return asked
+
+    return parse
+
+
+def _numbers(kind: Callable[[str], _Value], low: float, high: float) -> Callable[[str], list[_Value]]:
+    def parse(text: str) -> list[_Value]:
+        try:
+            values = [kind(part) for part in text.split(",")]
+        except ValueError as error:
+            raise argparse.ArgumentTypeError(f"{text!r}: numbers, separated by commas") from error
+        if not all(low <= value <= high for value in values):  # type: ignore[operator]
+            raise argparse.ArgumentTypeError(f"{text}: allowed: {low:g} to {high:g}")
+        return values
+
+    return parse

@@ -1,0 +1,142 @@
+"""What happens in the middle of a flight: an agent dies, the bus falls apart, an obstacle appears."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+
+from sitl.lockstep import Lockstep
+from sitl.studies.campaign.collision_monitor import Solid
+from swarmctl.bus import topics
+from swarmctl.core.types import Array
+
+_TOLD_EVERY_S = 0.1  # of a moving obstacle: messages have no time, so it has to be followed
+
+
+class Incident(Protocol):
+    """One per flight: it may remember."""
+
+    def step(self, lockstep: Lockstep, t_s: float, pos_ned_m: Array, vel_ned_m_s: Array) -> None:
+        """Called every tick with the mission time and the true states (N, 3); does something when it is due."""
+
+    def solids(self, t_s: float) -> Sequence[Solid]:
+        """What is in the way now beside the configured obstacles."""
+
+
+class Death:
+    """One agent's process dies; its vehicle is left to its autopilot."""
+
+    def __init__(self, agent: int, at_s: float) -> None:
+        self._agent, self._at_s, self._done = agent, at_s, False
+
+    def step(self, lockstep: Lockstep, t_s: float, pos_ned_m: Array, vel_ned_m_s: Array) -> None:
+        if t_s >= self._at_s and not self._done:
+            self._done = True
+            lockstep.kill(self._agent)
+
+    def solids(self, t_s: float) -> Sequence[Solid]:
+        return ()
+
+
+class Partition:
+    """Nobody hears anybody for a while."""
+
+    def __init__(self, at_s: float, for_s: float) -> None:
+        self._due = [(at_s, True), (at_s + for_s, False)]
+
+    def step(self, lockstep: Lockstep, t_s: float, pos_ned_m: Array, vel_ned_m_s: Array) -> None:
+        if self._due and t_s >= self._due[0][0]:
+            _, falls = self._due.pop(0)
+            (lockstep.hub.mute if falls else lockstep.hub.unmute)()
+
+    def solids(self, t_s: float) -> Sequence[Solid]:
+        return ()
+
+
+class Appearance:
+    """An obstacle appears in front of a vehicle, and everybody is told at once, as by `swarmctl obstacle`.
+
+    Not before there is room to avoid it: `ahead_m` along the victim's velocity, and nobody else inside `clear_m`; and
+    not where one that stays would keep somebody from arriving. A moving one begins `ahead_m` to the victim's side,
+    heads for where the victim will be and is gone after its way.
+
+    Args:
+        victim: agent.
+        at_s: earliest mission time.
+        ahead_m: from the victim.
+        clear_m: from everybody.
+        radius_m, keep_out_m: of the obstacle.
+        speed_m_s: 0: it stays.
+        side: -1 or 1, where a moving one comes from.
+        goals_ned_m: (N, 3), which stay free.
+    """
+
+    def __init__(
+        self,
+        victim: int,
+        at_s: float,
+        ahead_m: float,
+        clear_m: float,
+        radius_m: float,
+        keep_out_m: float,
+        speed_m_s: float,
+        side: int,
+        goals_ned_m: Array,
+    ) -> None:
+        self._goals_ned_m = goals_ned_m
+        self._victim, self._at_s, self._ahead_m, self._clear_m = victim, at_s, ahead_m, clear_m
+        self._radius_m, self._keep_out_m, self._speed_m_s, self._side = radius_m, keep_out_m, speed_m_s, side
+        self._from: tuple[float, Array, Array] | None = None  # when, where (3,), velocity (3,)
+        self._told_s = -math.inf
+        self._gone = False
+
+    def step(self, lockstep: Lockstep, t_s: float, pos_ned_m: Array, vel_ned_m_s: Array) -> None:
+        if self._from is None and t_s >= self._at_s and not self._gone:
+            self._appear(t_s, pos_ned_m, vel_ned_m_s)
+        if self._from is None:
+            return
+        since_s, _, vel = self._from
+        if self._speed_m_s and (t_s - since_s) * self._speed_m_s > 2.0 * self._ahead_m:
+            self._from, self._gone = None, True
+            lockstep.set_obstacles(())
+        elif t_s - self._told_s >= (_TOLD_EVERY_S if self._speed_m_s else math.inf):
+            self._told_s = t_s
+            center, to = self._center(t_s).tolist(), vel.tolist()
+            lockstep.set_obstacles(
+                [topics.ObstacleMessage(tuple(center), self._radius_m, self._keep_out_m, _SEEN_M, tuple(to))]
+            )
+
+    def solids(self, t_s: float) -> Sequence[Solid]:
+        return () if self._from is None else (Solid(self._center(t_s), self._radius_m, False),)
+
+    def _center(self, t_s: float) -> Array:
+        assert self._from is not None
+        since_s, where, vel = self._from
+        return where + (t_s - since_s) * vel
+
+    def _appear(self, t_s: float, pos_ned_m: Array, vel_ned_m_s: Array) -> None:
+        speed = float(np.linalg.norm(vel_ned_m_s[self._victim]))
+        if speed < _FLYING_M_S:
+            return
+        ahead = vel_ned_m_s[self._victim] / speed
+        if not self._speed_m_s:
+            where, vel = pos_ned_m[self._victim] + self._ahead_m * ahead, np.zeros(3)
+        else:
+            meets_s = self._ahead_m / self._speed_m_s
+            across = self._side * np.array([-ahead[1], ahead[0], 0.0])
+            met = pos_ned_m[self._victim] + min(meets_s * speed, _MET_M) * ahead
+            where, vel = met + self._ahead_m * across, -self._speed_m_s * across
+        to_goals_m = np.linalg.norm(self._goals_ned_m - where, axis=1).min()
+        if not self._speed_m_s and to_goals_m < self._keep_out_m + _ARRIVING_M:
+            return
+        if np.linalg.norm(pos_ned_m - where, axis=1).min() >= self._clear_m:
+            self._from = (t_s, where, vel)
+
+
+_SEEN_M = 100.0
+_FLYING_M_S = 0.5
+_MET_M = 3.0
+_ARRIVING_M = 0.3  # beyond what is kept from an obstacle, where one arrives

@@ -1,0 +1,230 @@
+"""What is flown: one table of scenarios, each a function of seed and agents.
+
+Two sizes of vehicle. `THESIS`: its airframe, bodies of 0.48 m that keep 0.9 m, as everywhere else here. `SMALL`: a
+Crazyflie (0.14 m from tip to tip, counted as 0.15 m) that keeps 0.3 m, the figures of the public baselines for boxes,
+forests and mazes (online_dmpc: minimum distance 0.3 m, 1 m/s2, a box of 3 x 3 x 2 m; judged at 0.15 m).
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sitl.studies.campaign.events import Appearance, Death, Incident, Partition
+from sitl.studies.campaign.layouts import far_goals, forest, ring, scattered, walls
+from swarmctl.core.types import Array
+from swarmctl.toml_text import toml_value
+
+
+@dataclass(frozen=True, slots=True)
+class Size:
+    """A vehicle and what it keeps."""
+
+    radius_m: float
+    body_m: float
+    settings: tuple[str, ...]
+
+
+THESIS = Size(0.9, 0.48, ("sitl.preset=thesis",))
+SMALL = Size(
+    0.3,
+    0.15,
+    (
+        "sitl.preset=crazyflie",
+        "limits.min_separation_m=0.15",
+        "vehicle_model={delay_s=0.04,attitude_rad_s=20.0,drag_1_s=0.25,hover_thrust_01=0.43}",
+    ),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Layout:
+    """One drawn instance of a scenario."""
+
+    size: Size
+    starts_ned_m: Array  # (N, 3)
+    settings: tuple[str, ...]
+    limit_s: float  # of mission time
+    goals_ned_m: Array | None = None  # (N, 3); None: the mission is flown to its end
+    arrive_m: float = 0.15
+    settles: bool = False  # one goal for all: arrived when everybody has come to rest
+    incidents: tuple[Incident, ...] = ()
+    uncooperative: frozenset[int] = frozenset()  # avoid nobody
+    lost: frozenset[int] = frozenset()  # not expected to arrive
+
+
+@dataclass(frozen=True, slots=True)
+class Scenario:
+    """A row of the table."""
+
+    title: str
+    draw: Callable[[np.random.Generator, int], Layout]
+    agents: tuple[int, ...]  # flown unless others are asked for
+    alone: bool = False  # also fly the longest way alone, for comparison
+    needs: int = 1  # fewest agents that make sense
+
+
+_JITTER_M = 0.05
+_SPEED_M_S, _ACCEL_M_S2 = 2.0, 1.2
+_SMALL_M_S, _SMALL_M_S2 = 1.0, 1.0
+_COLUMN_M = 0.3  # radius of a tree
+_POST_RADIUS_M = 0.15
+_HULL_MARGIN_M = 0.15  # planned between a small vehicle's hull and a surface; plans are certified to 0.1 m less
+_SWAP_S = (1.5, 3.5)  # mission time while everybody is under way to the middle
+
+
+def _go(goals: Array, speed_m_s: float = _SPEED_M_S, accel_m_s2: float = _ACCEL_M_S2) -> tuple[str, ...]:
+    return (
+        "mission.kind=goto",
+        f"mission.goto={{goals_ned_m={toml_value(goals.tolist())},speed_m_s={speed_m_s},accel_m_s2={accel_m_s2}}}",
+    )
+
+
+def _columns(axes: Array, radius_m: float, size: Size) -> str:
+    keep_out_m = radius_m + 0.5 * size.body_m + _HULL_MARGIN_M
+    entry = f"column=true,radius_m={radius_m},keep_out_m={keep_out_m:.3f},visibility_m=2.0"
+    items = ",".join(f"{{center_ned_m={toml_value(axis)},{entry}}}" for axis in axes.tolist())
+    return f"obstacles=[{items}]"
+
+
+def _circle(rng: np.random.Generator, agents: int) -> Layout:
+    line = np.zeros((agents, 3))
+    line[:, 0] = np.arange(agents) - (agents - 1) / 2
+    line[:, :2] += rng.uniform(-_JITTER_M, _JITTER_M, (agents, 2))
+    return Layout(THESIS, line, ("mission.kind=circle",), limit_s=25.0)
+
+
+def _swap(rng: np.random.Generator, agents: int, jitter_m: float = _JITTER_M) -> Layout:
+    radius_m = max(4.0, 0.7 * THESIS.radius_m / math.sin(math.pi / agents))
+    exact = ring(agents, radius_m, float(rng.uniform(0.0, 2.0 * math.pi)))
+    starts = exact.copy()
+    starts[:, :2] += rng.uniform(-jitter_m, jitter_m, (agents, 2))
+    goals = -starts
+    return Layout(THESIS, starts, _go(goals), limit_s=40.0, goals_ned_m=goals)
+
+
+def _symmetric(rng: np.random.Generator, agents: int) -> Layout:
+    return _swap(rng, agents, jitter_m=0.0)
+
+
+def _random(rng: np.random.Generator, agents: int) -> Layout:
+    low, high = np.array([-1.5, -1.5, -2.2]), np.array([1.5, 1.5, -0.2])
+    starts = scattered(rng, agents, low, high, 0.5)
+    goals = far_goals(rng, starts, low, high, 0.5, 1.0)
+    return Layout(SMALL, starts, _go(goals, _SMALL_M_S, _SMALL_M_S2), 30.0, goals, arrive_m=0.1)
+
+
+def _same_goal(rng: np.random.Generator, agents: int) -> Layout:
+    starts = ring(agents, max(4.0, 0.7 * THESIS.radius_m / math.sin(math.pi / max(agents, 2))), 0.0)
+    starts[:, :2] += rng.uniform(-0.2, 0.2, (agents, 2))
+    goal = np.zeros((1, 3))
+    return Layout(THESIS, starts, _go(goal), 30.0, np.repeat(goal, agents, axis=0), settles=True)
+
+
+def _forest(rng: np.random.Generator, agents: int) -> Layout:
+    axes = forest(rng, 20, 4.0, 1.1)  # the tightest gap: 0.5 m between surfaces
+    starts = ring(agents, 5.0, float(rng.uniform(0.0, 2.0 * math.pi)))
+    starts[:, 2] = -1.0
+    goals = starts * [-1.0, -1.0, 1.0]
+    settings = (*_go(goals, _SMALL_M_S, _SMALL_M_S2), _columns(axes, _COLUMN_M, SMALL))
+    return Layout(SMALL, starts, settings, 60.0, goals, arrive_m=0.1)
+
+
+def _maze(rng: np.random.Generator, agents: int) -> Layout:
+    posts = walls(rng, np.array([-3.0, -1.0, 1.0, 3.0]), 4.0, (0.6, 1.2), 1.2)
+    width = np.linspace(-3.0, 3.0, agents)
+    starts = np.stack([np.full(agents, -4.5), rng.permutation(width), np.full(agents, -1.0)], axis=1)
+    goals = np.stack([np.full(agents, 4.5), rng.permutation(width), np.full(agents, -1.0)], axis=1)
+    other_way = np.arange(agents) % 2 == 1
+    starts[other_way], goals[other_way] = goals[other_way].copy(), starts[other_way].copy()
+    settings = (*_go(goals, _SMALL_M_S, _SMALL_M_S2), _columns(posts, _POST_RADIUS_M, SMALL))
+    return Layout(SMALL, starts, settings, 60.0, goals, arrive_m=0.1)
+
+
+def _with(layout: Layout, incident: Incident, **changes: object) -> Layout:
+    return replace(layout, incidents=(incident,), **changes)  # type: ignore[arg-type]
+
+
+def _sudden(rng: np.random.Generator, agents: int, speed_m_s: float) -> Layout:
+    victim, at_s = int(rng.integers(agents)), float(rng.uniform(*_SWAP_S))
+    side = int(rng.choice((-1, 1)))
+    swap = _swap(rng, agents)
+    assert swap.goals_ned_m is not None
+    appears = Appearance(
+        victim=victim,
+        at_s=at_s,
+        ahead_m=3.5 if speed_m_s else 2.5,
+        clear_m=2.2,
+        radius_m=0.5,
+        keep_out_m=1.0,
+        speed_m_s=speed_m_s,
+        side=side,
+        goals_ned_m=swap.goals_ned_m,
+    )
+    return _with(swap, appears)
+
+
+def _sudden_static(rng: np.random.Generator, agents: int) -> Layout:
+    return _sudden(rng, agents, 0.0)
+
+
+def _sudden_moving(rng: np.random.Generator, agents: int) -> Layout:
+    return _sudden(rng, agents, float(rng.uniform(0.5, 1.0)))
+
+
+def _uncooperative(rng: np.random.Generator, agents: int) -> Layout:
+    return replace(_swap(rng, agents), uncooperative=frozenset({int(rng.integers(agents))}))
+
+
+def _death(rng: np.random.Generator, agents: int) -> Layout:
+    victim = int(rng.integers(agents))
+    return _with(_swap(rng, agents), Death(victim, float(rng.uniform(*_SWAP_S))), lost=frozenset({victim}))
+
+
+def _partition(rng: np.random.Generator, agents: int) -> Layout:
+    return _with(_swap(rng, agents), Partition(float(rng.uniform(*_SWAP_S)), 2.0))
+
+
+SCENARIOS: dict[str, Scenario] = {
+    "circle": Scenario("the thesis' climbing circle, one reference for all", _circle, (3,)),
+    "swap": Scenario("everybody to the opposite side of a circle, starts 5 cm off", _swap, (6, 10), needs=2),
+    "symmetric": Scenario("the same from a perfect polygon", _symmetric, (6, 10), needs=2),
+    "random": Scenario("random transitions in 3 x 3 x 2 m, small vehicles", _random, (4, 10, 20), alone=True),
+    "same_goal": Scenario("everybody to one point", _same_goal, (3, 6, 10)),
+    "forest": Scenario("swap through 20 columns, small vehicles", _forest, (10,), needs=2),
+    "maze": Scenario("both ways through four rows of walls, small vehicles", _maze, (10,)),
+    "sudden_static": Scenario("an obstacle appears in the middle of a swap", _sudden_static, (6,), needs=2),
+    "sudden_moving": Scenario("one crosses the swap at 0.5 to 1 m/s", _sudden_moving, (6,), needs=2),
+    "uncooperative": Scenario("one of a swap avoids nobody", _uncooperative, (6,), needs=2),
+    "death": Scenario("one agent of a swap dies on the way", _death, (6,), needs=2),
+    "partition": Scenario("nobody hears anybody for 2 s of a swap", _partition, (6, 10), needs=2),
+}
+
+
+def layout_of(scenario: str, seed: int, agents: int) -> Layout:
+    """The instance that a seed draws; the same for every other condition of a cell."""
+    rng = np.random.default_rng([seed, agents, zlib.crc32(scenario.encode()), _LAYOUT])
+    return SCENARIOS[scenario].draw(rng, agents)
+
+
+def settings_of(layout: Layout, agents: int) -> Sequence[str]:
+    """The layout as settings of a run's configuration."""
+    size = layout.size
+    return (
+        *size.settings,
+        f"swarm.agents={agents}",
+        f"start.positions_ned_m={toml_value(layout.starts_ned_m.tolist())}",
+        f"separation.radius_m={size.radius_m}",
+        f"separation.body_m={size.body_m}",
+        f"separation.max_neighbours={min(max(agents - 1, 1), _NEIGHBOURS)}",
+        f"mission.duration_s={layout.limit_s}",
+        *layout.settings,
+    )
+
+
+_LAYOUT = 5  # purpose of the random stream
+_NEIGHBOURS = 9

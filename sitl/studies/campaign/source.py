@@ -1,0 +1,22 @@
+"""Which code flew a trial: a digest of the sources that can change its result."""
+
+from __future__ import annotations
+
+import hashlib
+from functools import cache
+from pathlib import Path
+
+_PACKAGES = ("sitl", "swarmctl")
+_PAGES = {"page.py", "store.py", "crew.py", "intervals.py", "summary.py", "command.py"}  # of this package: no flight
+
+
+@cache
+def code_id() -> str:
+    """12 hexadecimal digits of SHA-256 over every module of the simulator and the bridge."""
+    root = Path(__file__).parents[3]
+    digest = hashlib.sha256()
+    for path in sorted(path for package in _PACKAGES for path in (root / package).rglob("*.py")):
+        if path.parent.name == "campaign" and path.name in _PAGES:
+            continue
+        digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:12]

@@ -1,0 +1,89 @@
+"""The folder of a campaign: `rows.parquet` with one row per finished run, replaced in one step as rows come in."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable
+from pathlib import Path
+from types import TracebackType
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from sitl.studies.campaign.trials import SCHEMA, Row, Trial, trial_of
+from swarmctl.errors import ConfigError
+from swarmctl.files import read_file, replaced
+
+ROWS = "rows.parquet"
+_SAVE_EVERY_S = 1.0
+_MOST_BYTES = 2**31
+
+
+class Store:
+    """Rows of one campaign; a context that saves what is left when it ends.
+
+    Args:
+        directory: made when it is missing.
+        code: of the sources that fly now.
+        mix: accept rows flown by other sources.
+
+    Raises:
+        ConfigError: the folder holds something else, or rows of other sources.
+    """
+
+    def __init__(self, directory: Path, code: str, mix: bool = False) -> None:
+        self._path = directory / ROWS
+        self.rows: list[Row] = []
+        directory.mkdir(parents=True, exist_ok=True)
+        if self._path.exists():
+            self.rows = _read(self._path)
+        others = sorted({row["code"] for row in self.rows} - {code})
+        if others and not mix:
+            raise ConfigError(
+                str(self._path),
+                [
+                    f"flown by other sources ({', '.join(others)}; these are {code}): give a new --out, "
+                    "or --mix to go on with both"
+                ],
+            )
+        self._finished = {trial_of(row) for row in self.rows}
+        self._saved_s, self._saved_rows = time.monotonic(), len(self.rows)
+
+    def __enter__(self) -> Store:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.save()
+
+    def missing(self, trials: Iterable[Trial]) -> list[Trial]:
+        """Those not flown yet, in order, each once."""
+        return [trial for trial in dict.fromkeys(trials) if trial not in self._finished]
+
+    def add(self, row: Row) -> None:
+        """Take a finished row; it is on disk within a second, or with the next one."""
+        self.rows.append(row)
+        self._finished.add(trial_of(row))
+        if time.monotonic() - self._saved_s >= _SAVE_EVERY_S:
+            self.save()
+
+    def save(self) -> None:
+        """Write all rows, if there are new ones."""
+        self._saved_s = time.monotonic()
+        if len(self.rows) == self._saved_rows:
+            return
+        with replaced(self._path) as file:
+            pq.write_table(pa.Table.from_pylist(self.rows, SCHEMA), file)
+        self._saved_rows = len(self.rows)
+
+
+def _read(path: Path) -> list[Row]:
+    try:
+        table = pq.read_table(pa.BufferReader(read_file(path, _MOST_BYTES)))
+    except (OSError, pa.ArrowException) as error:
+        raise ConfigError(str(path), [f"can't be read ({error}); give another --out"]) from error
+    if table.schema.names != SCHEMA.names:
+        raise ConfigError(str(path), ["has other columns than these sources write; give another --out"])
+    rows: list[Row] = table.to_pylist()
+    return rows

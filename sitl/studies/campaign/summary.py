@@ -1,0 +1,90 @@
+"""What the rows of each cell come to: counts with exact intervals, times and distances. No formatting."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from statistics import fmean, median
+
+from sitl.studies.campaign.intervals import Interval, clopper_pearson
+from sitl.studies.campaign.trials import Cell, Row, cell_of
+
+
+@dataclass(frozen=True, slots=True)
+class Share:
+    """How often something happened."""
+
+    hits: int
+    trials: int
+
+    @property
+    def share(self) -> float:
+        """0..1."""
+        return self.hits / self.trials if self.trials else 0.0
+
+    @property
+    def interval(self) -> Interval:
+        """95 %, exact."""
+        return clopper_pearson(self.hits, self.trials)
+
+
+@dataclass(frozen=True, slots=True)
+class CellSummary:
+    """One line of the report; None where nothing was measured."""
+
+    cell: Cell
+    collided: Share
+    arrived: Share
+    deadlocked: Share
+    min_separation_m: float | None  # of all runs
+    min_clearance_m: float | None
+    time_median_s: float | None  # of the runs that arrived
+    time_max_s: float | None
+    over_alone: float | None  # median of flight time over the unconstrained one
+    over_least: float | None  # largest sum of distances over the least
+    plans_failed: float  # mean per run
+    commits_refused: float
+    barrier_acted: float
+    cpu_s: float
+
+
+def summaries(rows: Sequence[Row]) -> list[CellSummary]:
+    """One of every cell, in the cells' order."""
+    grouped: dict[Cell, list[Row]] = {}
+    for row in rows:
+        grouped.setdefault(cell_of(row), []).append(row)
+    return [_summary(cell, grouped[cell]) for cell in sorted(grouped)]
+
+
+def _summary(cell: Cell, rows: Sequence[Row]) -> CellSummary:
+    times = [row["flight_time_s"] for row in rows if row["flight_time_s"] is not None]
+    ratios = _ratios(rows, "flight_time_s", "unconstrained_time_s")
+    sums = _ratios([row for row in rows if row["arrived"]], "goal_sum_m", "least_sum_m")
+    return CellSummary(
+        cell,
+        _count(rows, "collided"),
+        _count(rows, "arrived"),
+        _count(rows, "deadlocked"),
+        _least(rows, "min_separation_m"),
+        _least(rows, "min_clearance_m"),
+        median(times) if times else None,
+        max(times, default=None),
+        median(ratios) if ratios else None,
+        max(sums, default=None),
+        fmean(row["plans_failed"] for row in rows),
+        fmean(row["commits_refused"] or 0 for row in rows),
+        fmean(row["barrier_acted"] for row in rows),
+        fmean(row["cpu_s"] for row in rows),
+    )
+
+
+def _count(rows: Sequence[Row], name: str) -> Share:
+    return Share(sum(bool(row[name]) for row in rows), len(rows))
+
+
+def _least(rows: Sequence[Row], name: str) -> float | None:
+    return min((row[name] for row in rows if row[name] is not None), default=None)
+
+
+def _ratios(rows: Sequence[Row], above: str, below: str) -> list[float]:
+    return [row[above] / row[below] for row in rows if row[above] is not None and row[below]]

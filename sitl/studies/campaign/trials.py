@@ -1,0 +1,95 @@
+"""What a campaign is made of: cells, trials and the table row that a flown trial becomes. Data only."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import pyarrow as pa
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Cell:
+    """One combination of conditions, flown with many seeds."""
+
+    scenario: str  # of sitl.studies.campaign.scenarios.SCENARIOS
+    agents: int
+    delay_ms: float  # of every message on the bus, on top of one tick
+    loss: float  # 0..1, probability that one receiver misses one message of an unreliable topic
+    noise: str  # of sitl.studies.campaign.factors.NOISES
+    wind_m_s: float  # steady, from the west, with Dryden turbulence of as much
+    protections: str  # of sitl.studies.campaign.factors.PROTECTIONS
+    sets: str = ""  # further key=value settings, separated by spaces
+
+
+@dataclass(frozen=True, slots=True, order=True)
+class Trial:
+    """One flight."""
+
+    cell: Cell
+    seed: int
+
+
+CELL_FIELDS = ("scenario", "agents", "delay_ms", "loss", "noise", "wind_m_s", "protections", "sets")
+
+# One row per run. Lengths and times are null where there is nothing to measure.
+SCHEMA = pa.schema(
+    [
+        pa.field("scenario", pa.string()),
+        pa.field("agents", pa.int32()),
+        pa.field("delay_ms", pa.float64()),
+        pa.field("loss", pa.float64()),
+        pa.field("seed", pa.int64()),
+        pa.field("protections", pa.string()),
+        pa.field("collided", pa.bool_()),  # in truth: two bodies touched, or one and an obstacle
+        pa.field("min_separation_m", pa.float64()),  # smallest true distance of two centres at any time
+        pa.field("arrived", pa.bool_()),  # everybody who should, for good, and nobody collided
+        pa.field("flight_time_s", pa.float64()),  # from the mission's begin to the last arrival
+        pa.field("noise", pa.string()),
+        pa.field("wind_m_s", pa.float64()),
+        pa.field("sets", pa.string()),
+        pa.field("deadlocked", pa.bool_()),  # time ran out, and somebody who has not arrived stands still
+        pa.field("outcome", pa.string()),  # arrived, collided, deadlocked, late, or what went wrong
+        pa.field("min_clearance_m", pa.float64()),  # smallest true distance of a body's hull to an obstacle's surface
+        pa.field("arrived_agents", pa.int32()),
+        pa.field("unconstrained_time_s", pa.float64()),  # of the longest way, flown alone
+        pa.field("goal_sum_m", pa.float64()),  # sum of all distances to the goals at the end
+        pa.field("least_sum_m", pa.float64()),  # the least that sum can be (same goal)
+        pa.field("plans_failed", pa.int64()),  # ticks of all agents without a certified plan
+        pa.field("commits_refused", pa.int64()),  # plans of all agents not flown after others were heard
+        pa.field("barrier_acted", pa.int64()),  # ticks of all agents in which the last layer changed the input
+        pa.field("simulated_s", pa.float64()),
+        pa.field("cpu_s", pa.float64()),  # processor time, the only column that is not a function of the trial
+        pa.field("code", pa.string()),  # of the sources that flew it
+    ]
+)
+
+Row = dict[str, Any]
+
+
+def cells(
+    scenarios: Sequence[str],
+    agents: Sequence[int],
+    delays_ms: Sequence[float],
+    losses: Sequence[float],
+    noises: Sequence[str],
+    winds_m_s: Sequence[float],
+    protections: Sequence[str],
+    sets: str = "",
+) -> Iterator[Cell]:
+    """Every combination, in order."""
+    axes = (scenarios, agents, delays_ms, losses, noises, winds_m_s, protections)
+    for scenario, count, delay_ms, loss, noise, wind_m_s, protection in itertools.product(*axes):
+        yield Cell(scenario, count, delay_ms, loss, noise, wind_m_s, protection, sets)
+
+
+def cell_of(row: Row) -> Cell:
+    """The cell that a row belongs to."""
+    return Cell(**{name: row[name] for name in CELL_FIELDS})
+
+
+def trial_of(row: Row) -> Trial:
+    """The trial that a row is the result of."""
+    return Trial(cell_of(row), row["seed"])

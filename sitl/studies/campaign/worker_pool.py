@@ -1,0 +1,104 @@
+"""Who flies the trials: processes on this machine, or the workers of a Dask cluster. Rows come back as they finish.
+
+Every process has one thread: a flight is one, and numpy's own would only get in each other's way.
+"""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Generator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+from typing import Any
+
+from sitl.studies.campaign.trials import Row, Trial
+from swarmctl.errors import StartError
+from swarmctl.process_lifetime import die_with_parent
+
+Fly = Callable[[Trial], Row]
+
+
+def fly_trial(trial: Trial) -> Row:
+    """`sitl.studies.campaign.flight.fly`, imported where it runs."""
+    from sitl.studies.campaign.flight import fly
+
+    return fly(trial)
+
+
+def on_this_machine(
+    trials: Sequence[Trial], jobs: int, fly: Fly = fly_trial
+) -> Generator[tuple[Trial, Row | str], None, None]:
+    """Fly in `jobs` processes; yields each trial with its row, or with what went wrong in words.
+
+    Raises:
+        StartError: a process ended by itself, for want of memory or by a signal.
+    """
+    if jobs == 1:
+        yield from ((trial, _flown(fly, trial)) for trial in trials)
+        return
+    pool = ProcessPoolExecutor(jobs, get_context("spawn"), _begin)
+    try:
+        todo = iter(trials)
+        flying: dict[Future[Row | str], Trial] = {}
+        while True:
+            for trial in todo:
+                flying[pool.submit(_flown, fly, trial)] = trial
+                if len(flying) >= 2 * jobs:
+                    break
+            if not flying:
+                return
+            done, _ = wait(flying, return_when=FIRST_COMPLETED)
+            for future in done:
+                yield flying.pop(future), _result(future)
+    finally:
+        processes = list((pool._processes or {}).values())
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in processes:  # a flight under way is not waited for: it is flown again
+            process.terminate()
+
+
+def on_cluster(
+    trials: Sequence[Trial], address: str, fly: Fly = fly_trial
+) -> Generator[tuple[Trial, Row | str], None, None]:
+    """Fly on the workers of the Dask scheduler at `HOST:PORT`.
+
+    They need this package in the same version, and a thread each: `dask worker HOST:PORT --nthreads 1 --nworkers auto`.
+
+    Raises:
+        StartError: no client library, or no scheduler answers.
+    """
+    try:
+        from distributed import Client, as_completed
+    except ImportError as error:
+        raise StartError("--dask: needs dask.distributed; pip install 'swarmctl[campaign]'") from error
+    url = address if "://" in address else f"tcp://{address}"
+    try:
+        client = Client(url, timeout="10s")
+    except (OSError, TimeoutError) as error:
+        raise StartError(f"--dask {address}: no scheduler answers ({error}); start one with: dask scheduler") from error
+    with client:
+        futures: dict[Any, Trial] = {client.submit(_flown, fly, trial, pure=False): trial for trial in trials}
+        for future in as_completed(futures):
+            yield futures[future], _result(future)
+
+
+def _begin() -> None:
+    """Of a child process: Ctrl-C is the parent's to judge, and its end is ours."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    die_with_parent(signal.SIGKILL)
+
+
+def _flown(fly: Fly, trial: Trial) -> Row | str:
+    try:
+        return fly(trial)
+    except Exception as error:  # one broken trial must not end the campaign
+        return f"{type(error).__name__}: {error}"
+
+
+def _result(future: Any) -> Row | str:
+    try:
+        result: Row | str = future.result()
+    except BrokenProcessPool as error:
+        raise StartError("a process of the campaign ended by itself (out of memory?); rows so far are kept") from error
+    return result

@@ -1,0 +1,368 @@
+"""Every figure of the thesis that shows a result, as a table, and how each is drawn from flights.
+
+A flight is given as several traces: the first is the published preset, further ones are alternatives (another preset,
+the path over MAVLink) and are drawn beside it. Swarm figures show the agents of the first trace only.
+"""
+
+from __future__ import annotations
+
+import html
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from sitl.studies.thesis.trace import Array, Trace
+from swarmctl.telemetry.charts import Ball, Circle, Limit, Line, SpaceLine, Window, space_view, time_chart, top_view
+from swarmctl.telemetry.palette import LIMIT_RGB, SUM_RGB, agent_rgb, css
+
+Flight = Literal[
+    "open_loop", "pid_step", "pid_steps", "pid_slow", "pid_fast", "mpc_slow", "mpc_fast", "circle", "obstacle"
+]
+Drawn = Literal["states", "x", "y", "z", "roll", "pitch", "yaw", "thrust", "torque_x", "torque_y", "torque_z", "space"]
+
+FLIGHTS: dict[Flight, str] = {
+    "open_loop": "Open loop, zero input",
+    "pid_step": "PID, one step",
+    "pid_steps": "PID, consecutive steps",
+    "pid_slow": "PID, slow trajectory",
+    "pid_fast": "PID, fast trajectory",
+    "mpc_slow": "MPC, slow trajectory",
+    "mpc_fast": "MPC, fast trajectory",
+    "circle": "Swarm on a climbing circle",
+    "obstacle": "Swarm and a suddenly seen obstacle",
+}
+SWARMS: tuple[Flight, ...] = ("circle", "obstacle")
+
+_QUANTITIES: dict[Drawn, str] = {
+    "x": "position x [m]",
+    "y": "position y [m]",
+    "z": "position z [m]",
+    "roll": "roll phi [rad]",
+    "pitch": "pitch theta [rad]",
+    "yaw": "yaw psi [rad]",
+    "thrust": "thrust f_t [N]",
+    "torque_x": "torque tau_x [N m]",
+    "torque_y": "torque tau_y [N m]",
+    "torque_z": "torque tau_z [N m]",
+    "space": "path in space [m]",
+    "states": "all twelve states",
+}
+_AXES: tuple[Drawn, ...] = ("x", "y", "z")
+_ANGLES: tuple[Drawn, ...] = ("roll", "pitch", "yaw")
+_TORQUES: tuple[Drawn, ...] = ("torque_x", "torque_y", "torque_z")
+_REFERENCE = "#334155"
+_PUBLISHED = "#b45309"
+
+
+@dataclass(frozen=True, slots=True)
+class Figure:
+    """One figure of the thesis."""
+
+    number: int
+    caption: str
+    flight: Flight
+    drawn: Drawn
+
+    @property
+    def title(self) -> str:
+        return f"Figure {self.number}: {self.caption}"
+
+
+@dataclass(frozen=True, slots=True)
+class IndexPoint:
+    """One constraint radius of Table 19."""
+
+    radius_m: float
+    ours_m: float | None  # tracking index: sum over agents of the mean distance to the shared reference
+    published_m: float | None = None
+    series: str = "ours"  # points of one series are joined
+
+
+@dataclass(frozen=True, slots=True)
+class Extra:
+    """What the page shows that is in no trace.
+
+    Attributes:
+        separation_m: constraint radius by trace name or, for all traces of a flight, by flight.
+        index: tracking index over constraint radius.
+        notes: paragraphs for the top of the page.
+    """
+
+    separation_m: Mapping[str, float] = field(default_factory=dict)
+    index: Sequence[IndexPoint] = ()
+    notes: Sequence[str] = ()
+
+
+def _run_of(first: int, flight: Flight, drawn: Sequence[Drawn], by: str) -> tuple[Figure, ...]:
+    return tuple(Figure(first + k, f"{_QUANTITIES[what]}, {by}", flight, what) for k, what in enumerate(drawn))
+
+
+_TEN: tuple[Drawn, ...] = (*_AXES, *_ANGLES, "thrust", *_TORQUES)
+_ELEVEN: tuple[Drawn, ...] = (*_TEN, "space")
+
+FIGURES: tuple[Figure, ...] = (
+    *_run_of(5, "open_loop", ("states",), "zero input from rest"),
+    *_run_of(11, "pid_step", _TEN, "one step, PID"),
+    *_run_of(21, "pid_steps", ("space", *_TEN), "consecutive steps, PID"),
+    *_run_of(34, "pid_slow", _ELEVEN, "slow trajectory, PID"),
+    *_run_of(45, "pid_fast", _ELEVEN, "fast trajectory, PID"),
+    *_run_of(61, "mpc_slow", _ELEVEN, "slow trajectory, MPC"),
+    *_run_of(72, "mpc_fast", _ELEVEN, "fast trajectory, MPC"),
+    *_run_of(85, "circle", (*_AXES, "space"), "swarm, distributed MPC"),
+    *_run_of(90, "obstacle", (*_AXES, "space"), "swarm and obstacle, distributed MPC"),
+)
+
+
+def draw(figure: Figure, traces: Sequence[Trace], points: int = 300) -> str:
+    """One figure of the thesis as HTML.
+
+    Args:
+        figure: which.
+        traces: of its flight, the published preset first; at least one.
+        points: kept per line.
+    """
+    if figure.drawn == "states":
+        return _states(figure, traces, points)
+    if figure.drawn == "space":
+        return _space(figure, traces, points)
+    lines = _swarm_lines(figure, traces[0]) if figure.flight in SWARMS else _single_lines(figure, traces)
+    windows = _windows(traces[0], _AXES.index(figure.drawn)) if figure.drawn in _AXES else []
+    title = figure.title if lines else f"{figure.title} (not recorded)"
+    return time_chart(title, lines, _seconds(traces), points=points, windows=windows, height=200)
+
+
+def body_rates_rad_s(trace: Trace, agent: int = 0) -> Array:
+    """Body FRD rates p, q, r (T, 3) [rad/s] by central differences of the recorded angles; a trace has no rates."""
+    euler_rad = trace.euler_rad[:, agent]
+    if len(euler_rad) < 2:
+        return np.full_like(euler_rad, np.nan)
+    roll, pitch = euler_rad[:, 0], euler_rad[:, 1]
+    droll, dpitch, dyaw = np.gradient(np.unwrap(euler_rad, axis=0), trace.t_s, axis=0).T
+    return np.column_stack(
+        [
+            droll - dyaw * np.sin(pitch),
+            dpitch * np.cos(roll) + dyaw * np.cos(pitch) * np.sin(roll),
+            -dpitch * np.sin(roll) + dyaw * np.cos(pitch) * np.cos(roll),
+        ]
+    )
+
+
+def body_velocity_m_s(trace: Trace, agent: int = 0) -> Array:
+    """Body FRD velocity u, v, w (T, 3) [m/s]: the NED velocity turned by the ZYX angles."""
+    sr, sp, sy = np.sin(trace.euler_rad[:, agent]).T
+    cr, cp, cy = np.cos(trace.euler_rad[:, agent]).T
+    to_body = np.array(
+        [
+            [cp * cy, cp * sy, -sp],
+            [sr * sp * cy - cr * sy, sr * sp * sy + cr * cy, sr * cp],
+            [cr * sp * cy + sr * sy, cr * sp * sy - sr * cy, cr * cp],
+        ]
+    )  # (3, 3, T)
+    return np.asarray(np.einsum("ijt,tj->ti", to_body, trace.vel_ned_m_s[:, agent]))
+
+
+def nearest_pair_m(trace: Trace) -> Array:
+    """Smallest distance between two agents at every tick (T,) [m], NaN where unknown or alone."""
+    pos = trace.pos_ned_m  # (T, N, 3)
+    first, second = np.triu_indices(pos.shape[1], k=1)
+    if not len(first):
+        return np.full(len(pos), np.nan)
+    return np.asarray(np.fmin.reduce(np.linalg.norm(pos[:, first] - pos[:, second], axis=2), axis=1))
+
+
+def separation_chart(flight: Flight, traces: Sequence[Trace], separation_m: Mapping[str, float], points: int) -> str:
+    """Smallest distance of two agents over time, with the constraint radius of every trace."""
+    colors = [css(agent_rgb(k)) for k in range(len(traces))]
+    lines = [Line(t.t_s, nearest_pair_m(t), c, t.name) for t, c in zip(traces, colors, strict=True)]
+    radii = {separation_m.get(trace.name, separation_m.get(flight)) for trace in traces}
+    limits = [Limit(r, f"constraint radius {r:g} m") for r in sorted(r for r in radii if r is not None)]
+    title = "Smallest distance between two agents [m]"
+    return time_chart(title, lines, _seconds(traces), limits=limits, points=points, from_zero=True, height=300)
+
+
+def error_chart(flight: Flight, traces: Sequence[Trace], separation_m: Mapping[str, float], points: int) -> str:
+    """Distance to the reference over time, summed over agents; its mean is the published index."""
+    lines = []
+    for k, trace in enumerate(traces):
+        sum_m = np.linalg.norm(trace.pos_ned_m - trace.ref_pos_ned_m, axis=2).sum(axis=1)
+        lines.append(Line(trace.t_s, sum_m, css(agent_rgb(k)), f"{trace.name}, mean {_mean(sum_m)} m"))
+    radius_m = separation_m.get(traces[0].name, separation_m.get(flight))
+    limits = []
+    if radius_m is not None and traces[0].pos_ned_m.shape[1] == 3:
+        limits = [Limit(math.sqrt(3) * radius_m, "least possible for three agents")]
+    title = "Distances to the shared reference, sum [m]" if flight in SWARMS else "Distance to the reference [m]"
+    return time_chart(title, lines, _seconds(traces), limits=limits, points=points, from_zero=True, height=300)
+
+
+def obstacle_chart(traces: Sequence[Trace], points: int) -> str:
+    """Distance to the centre of the first obstacle: all agents of the first trace, the nearest of the others."""
+    sphere = traces[0].obstacles[0]
+    center_ned_m = np.array(sphere.center_ned_m)
+    lines = []
+    for k, trace in enumerate(traces):
+        away_m = np.linalg.norm(trace.pos_ned_m - center_ned_m, axis=2)  # (T, N)
+        if k == 0:
+            lines += [Line(trace.t_s, away_m[:, i], css(agent_rgb(i)), f"agent {i}") for i in range(away_m.shape[1])]
+        else:
+            color = css(agent_rgb(traces[0].pos_ned_m.shape[1] + k - 1))
+            lines.append(Line(trace.t_s, np.fmin.reduce(away_m, axis=1), color, f"nearest, {trace.name}"))
+    limits = [Limit(sphere.keep_out_m, f"constraint radius {sphere.keep_out_m:g} m")]
+    title = "Distance to the centre of the obstacle [m]"
+    return time_chart(title, lines, _seconds(traces), limits=limits, points=points, from_zero=True, height=300)
+
+
+def above_chart(trace: Trace, points: int) -> str:
+    """Agents, reference and obstacles from above; circles are the keep-out and the obstacle."""
+    lines = [
+        Line(trace.pos_ned_m[:, i, 1], trace.pos_ned_m[:, i, 0], css(agent_rgb(i)), f"agent {i}")
+        for i in range(trace.pos_ned_m.shape[1])
+    ]
+    ref = trace.ref_pos_ned_m[:, 0]
+    lines.append(Line(ref[:, 1], ref[:, 0], _REFERENCE, "reference", "4 3", 1.1))
+    circles = [
+        Circle(sphere.center_ned_m[1], sphere.center_ned_m[0], radius_m)
+        for sphere in trace.obstacles
+        for radius_m in (sphere.keep_out_m, sphere.radius_m)
+    ]
+    return top_view("From above: north up, east right [m]", lines, circles, points)
+
+
+def index_chart(index: Sequence[IndexPoint]) -> str:
+    """Tracking index over constraint radius: Table 19, ours, and the least that three agents can reach."""
+    radii = np.array(sorted({point.radius_m for point in index}))
+    published = sorted({(p.radius_m, p.published_m) for p in index if p.published_m is not None})
+    lines = []
+    for k, name in enumerate(dict.fromkeys(point.series for point in index)):
+        ours = sorted((p.radius_m, p.ours_m) for p in index if p.series == name and p.ours_m is not None)
+        lines.append(_marked(ours, css(agent_rgb(k)), name))
+    lines.append(_marked(published, _PUBLISHED, "published, Table 19"))
+    lines.append(Line(radii, math.sqrt(3) * radii, css(LIMIT_RGB), "least possible, sqrt(3) r", "5 4", 1.2))
+    shown = (float(radii[0]) - 0.03, float(radii[-1]) + 0.03)
+    title = "Tracking index [m] over constraint radius [m], three periods of the circle"
+    return time_chart(title, lines, shown, from_zero=True, height=240)
+
+
+def _marked(pairs: Sequence[tuple[float, float]], color: str, label: str) -> Line:
+    values = np.array(pairs, np.float64).reshape(-1, 2)
+    return Line(values[:, 0], values[:, 1], color, label, marks=True)
+
+
+def _mean(values: Array) -> str:
+    return f"{np.nanmean(values):.3g}" if np.isfinite(values).any() else "-"
+
+
+def _seconds(traces: Sequence[Trace]) -> tuple[float, float]:
+    ends = [float(trace.t_s[k]) for trace in traces if len(trace.t_s) for k in (0, -1)]
+    return (min(ends), max(ends)) if ends else (0.0, 1.0)
+
+
+def _single_lines(figure: Figure, traces: Sequence[Trace]) -> list[Line]:
+    """The response of every trace, and what the first one was asked for."""
+    lines = []
+    for k, trace in enumerate(traces):
+        values = _response(trace, figure.drawn, 0)
+        if np.isfinite(values).any():
+            label = trace.name if len(traces) > 1 else "response"
+            lines.append(Line(trace.t_s, values, css(agent_rgb(k)), label, width=1.4 if k else 1.9))
+    asked = _asked(traces[0], figure.drawn)
+    if asked is not None and np.isfinite(asked).any():
+        word = "reference" if figure.drawn in _AXES else "setpoint"
+        own = f" of {traces[0].name}" if word == "setpoint" and len(traces) > 1 else ""
+        lines.append(Line(traces[0].t_s, asked, _REFERENCE, word + own, "4 3", 1.1))
+    return lines
+
+
+def _swarm_lines(figure: Figure, trace: Trace) -> list[Line]:
+    agents = range(trace.pos_ned_m.shape[1])
+    lines = [Line(trace.t_s, _response(trace, figure.drawn, i), css(agent_rgb(i)), f"agent {i}") for i in agents]
+    asked = _asked(trace, figure.drawn)
+    return lines if asked is None else [*lines, Line(trace.t_s, asked, _REFERENCE, "reference", "4 3", 1.1)]
+
+
+def _response(trace: Trace, drawn: Drawn, agent: int) -> Array:
+    """What is drawn of one agent (T,)."""
+    if drawn in _AXES:
+        return trace.pos_ned_m[:, agent, _AXES.index(drawn)]
+    if drawn in _ANGLES:
+        return trace.euler_rad[:, agent, _ANGLES.index(drawn)]
+    if drawn == "thrust":
+        return trace.thrust_n[:, agent]
+    return trace.torque_n_m[:, agent, _TORQUES.index(drawn)]
+
+
+def _asked(trace: Trace, drawn: Drawn) -> Array | None:
+    """Reference or attitude setpoint of the first agent (T,); None where the thesis has none."""
+    if drawn in _AXES:
+        return trace.ref_pos_ned_m[:, 0, _AXES.index(drawn)]
+    if drawn in _ANGLES:
+        return trace.euler_ref_rad[:, 0, _ANGLES.index(drawn)]
+    return None
+
+
+def _windows(trace: Trace, axis: int) -> list[Window]:
+    """What every obstacle takes up of one axis while the reference is inside it."""
+    found = []
+    for sphere in trace.obstacles:
+        away_m = np.linalg.norm(trace.ref_pos_ned_m[:, 0] - np.array(sphere.center_ned_m), axis=1)
+        center = sphere.center_ned_m[axis]
+        sizes: tuple[tuple[float, Literal["keepout", "obstacle"]], ...] = (
+            (sphere.keep_out_m, "keepout"),
+            (sphere.radius_m, "obstacle"),
+        )
+        for radius_m, style in sizes:
+            inside_s = trace.t_s[away_m < radius_m]
+            if len(inside_s):
+                start_s, end_s = float(inside_s[0]), float(inside_s[-1])
+                found.append(Window(start_s, end_s, center - radius_m, center + radius_m, style))
+    return found
+
+
+def _space(figure: Figure, traces: Sequence[Trace], points: int) -> str:
+    first = traces[0]
+    if figure.flight in SWARMS:
+        shown = [(f"agent {i}", first.pos_ned_m[:, i]) for i in range(first.pos_ned_m.shape[1])]
+    else:
+        shown = [(trace.name if len(traces) > 1 else "response", trace.pos_ned_m[:, 0]) for trace in traces]
+    lines = [SpaceLine(pos_ned_m, css(agent_rgb(k)), name, width=1.6) for k, (name, pos_ned_m) in enumerate(shown)]
+    lines.append(SpaceLine(first.ref_pos_ned_m[:, 0], _REFERENCE, "reference", "4 3", 1.1))
+    balls = []
+    for sphere in first.obstacles:
+        balls.append(Ball(sphere.center_ned_m, sphere.radius_m, "obstacle"))
+        balls.append(Ball(sphere.center_ned_m, sphere.keep_out_m, "keepout"))
+    return space_view(figure.title, lines, balls, points)
+
+
+def _states(figure: Figure, traces: Sequence[Trace], points: int) -> str:
+    """Four panels of three states; further traces are dashed."""
+    panels: tuple[tuple[str, str], ...] = (
+        ("angles [rad]", "phi theta psi"),
+        ("body rates [rad/s]", "p q r"),
+        ("body velocity [m/s]", "u v w"),
+        ("position NED [m]", "x y z"),
+    )
+    states = [
+        (t.euler_rad[:, 0], body_rates_rad_s(t), body_velocity_m_s(t), t.pos_ned_m[:, 0]) for t in traces
+    ]  # each (T, 3)
+    drawings = []
+    for panel, (title, names) in enumerate(panels):
+        lines = [
+            Line(
+                trace.t_s,
+                states[n][panel][:, k],
+                css(agent_rgb(k)),
+                "" if n else name,
+                "4 3" if n else "",
+                1.6 - 0.2 * k,
+            )
+            for n, trace in enumerate(traces)
+            for k, name in enumerate(names.split())
+        ]
+        drawings.append(time_chart(title, lines, _seconds(traces), points=points, height=130))
+    rest = f"; dashed: {html.escape(', '.join(t.name for t in traces[1:]))}" if len(traces) > 1 else ""
+    color = css(SUM_RGB)
+    note = f'<div class=legend style="color:{color}">the thesis says: only z and w move{rest}</div>'
+    inner = "".join(drawings)
+    return f"<figure><figcaption>{figure.title}</figcaption><div class=panels>{inner}</div>{note}</figure>"

@@ -1,0 +1,67 @@
+"""The same flights through the whole bridge: agents, MAVLink frames, commands and the simulator's own loops.
+
+Ideal link: no latency, no loss. The simulator's physics runs at the thesis' 50 Hz, so that what is left of a difference
+to the plant path is the bridge itself: frames in single precision, the sequence from arming to tracking, and its
+estimate of the hover thrust.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sitl.lockstep import Lockstep
+from sitl.plant.airframes import PRESETS
+from sitl.plant.attitude import THESIS_SAMPLE_S
+from sitl.studies.thesis.trace import Array, Sphere, Trace
+from swarmctl.config import Config
+from swarmctl.core.frames import euler_from_quat
+from swarmctl.core.types import PlanStatus
+
+PHYSICS_HZ = round(1.0 / THESIS_SAMPLE_S)
+
+
+def fly_over_mavlink(name: str, config: Config) -> Trace:
+    """Fly a configuration's mission in lockstep; the trace is of the mission proper, from true states.
+
+    Raises:
+        RuntimeError: the mission did not complete.
+    """
+    sitl = config.sitl.model_copy(update={"physics_hz": PHYSICS_HZ, "start": "air"})
+    lockstep = Lockstep(config.model_copy(update={"sitl": sitl}))
+    lockstep.run()
+    problems = lockstep.problems()
+    if problems:
+        raise RuntimeError(f"{name}: {'; '.join(problems)}")
+    agents = config.swarm.agents
+    ticks = [log.ticks[np.isfinite(log.ticks["mission_t_s"])] for log in lockstep.logs]
+    steps = min(len(rows) for rows in ticks)
+    truth = lockstep.truth.reshape(-1, agents)
+    at = np.searchsorted(truth["t_us"][:, 0], ticks[0]["t_us"][:steps])  # true states at the ticks
+    if (truth["t_us"][at, 0] != ticks[0]["t_us"][:steps]).any():
+        raise RuntimeError(f"{name}: ticks and true states are not of the same times")
+    true = truth[at]
+
+    def of_ticks(field: str) -> Array:
+        return np.stack([rows[field][:steps] for rows in ticks], axis=1).astype(np.float64)
+
+    return Trace(
+        name,
+        "full",
+        np.asarray(ticks[0]["mission_t_s"][:steps], np.float64),
+        true["pos_ned_m"],
+        true["vel_ned_m_s"],
+        _euler(true["q_nb"]),
+        of_ticks("ref_pos_ned_m"),
+        _euler(of_ticks("setpoint_q_nb")),
+        of_ticks("setpoint_thrust_01") * PRESETS[config.sitl.preset].thrust_max_n,
+        np.full((steps, agents, 3), np.nan),
+        sum(int((rows["plan_status"] != PlanStatus.OK).sum()) for rows in ticks),
+        None,
+        tuple(Sphere(o.center_ned_m, o.radius_m, o.keep_out_m) for o in config.obstacles),
+    )
+
+
+def _euler(q_nb: Array) -> Array:
+    """Roll, pitch, yaw (T, N, 3) of quaternions (T, N, 4)."""
+    flat = [euler_from_quat(np.asarray(q, np.float64)) for q in q_nb.reshape(-1, 4)]
+    return np.array(flat).reshape(*q_nb.shape[:2], 3)

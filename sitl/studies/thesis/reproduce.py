@@ -1,0 +1,184 @@
+"""The `reproduce` verb: fly all six experiments of the thesis again and write what came out beside what was published.
+
+`python -m sitl.studies.thesis.reproduce [--only FLIGHT]... [--plant] [--full] [--out DIR] [--jobs N]`
+
+Flights are independent and shared out over processes; timing is measured afterwards, alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import os
+import signal
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from functools import partial
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import Progress
+from rich.table import Table
+
+from sitl.studies.bench.timing import timing_rows
+from sitl.studies.thesis import experiments as thesis
+from sitl.studies.thesis import score
+from sitl.studies.thesis.experiments import FULL_JOBS, PLANT_JOBS, Job
+from sitl.studies.thesis.figures import FLIGHTS, Extra, IndexPoint
+from sitl.studies.thesis.mavlink_flight import fly_over_mavlink
+from sitl.studies.thesis.model_flight import fly_on_plant
+from sitl.studies.thesis.page import write_json, write_page
+from sitl.studies.thesis.trace import Row, Trace
+from swarmctl.built_in_configs import shipped_config
+from swarmctl.config import load
+from swarmctl.errors import EXIT_MISSION, EXIT_OK, ConfigError, StartError, exit_code_of
+from swarmctl.process_lifetime import die_with_parent
+from swarmctl.telemetry.run_folder import create_run_folder
+
+TIMING = "timing"  # what `--only` calls the rows that are no flight's
+
+
+def fly(job: Job) -> Trace:
+    """One flight."""
+    config = load(shipped_config(job.config), job.overrides)
+    if job.path == "plant":
+        return fly_on_plant(job.name, config, matched_velocity=job.matched_velocity)
+    return fly_over_mavlink(job.name, config)
+
+
+def fly_job(job: Job) -> tuple[Job, list[Trace], str]:
+    """What a worker does: the traces of a job (see `thesis.is_flown_again`), or why there is none."""
+    try:
+        traces = [fly(job)]
+        if thesis.is_flown_again(job):
+            traces.append(fly(thesis.wider(job, traces[0])))
+    except Exception as error:  # one flight's failure must not cost the others
+        return job, [], f"{type(error).__name__}: {error}"
+    return job, traces, ""
+
+
+def fly_all(jobs: Sequence[Job], processes: int, bar: Progress) -> tuple[dict[str, Trace], dict[str, str]]:
+    """Traces by name, and what went wrong by job name. Leaving early, by Ctrl-C too, ends the workers."""
+    flown: dict[str, Trace] = {}
+    failed: dict[str, str] = {}
+    task = bar.add_task("flying", total=len(jobs))
+    longest_first = sorted(jobs, key=lambda job: job.flight != "circle")
+    with multiprocessing.get_context("spawn").Pool(processes, _prepare_worker) as pool:
+        for job, traces, why in pool.imap_unordered(fly_job, longest_first):
+            bar.update(task, advance=1, description=job.name)
+            flown.update({trace.name: trace for trace in traces})
+            if why:
+                failed[job.name] = why
+    return flown, failed
+
+
+def _prepare_worker() -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
+    die_with_parent(signal.SIGKILL)
+
+
+def chosen(only: Sequence[str], plant: bool, full: bool) -> list[Job]:
+    """The jobs asked for; neither path named means both.
+
+    Raises:
+        ConfigError: a flight is not known.
+    """
+    unknown = [name for name in only if name not in (*FLIGHTS, TIMING)]
+    if unknown:
+        known = ", ".join([*FLIGHTS, TIMING])
+        raise ConfigError("--only", [f"{name!r} is no experiment; known are {known}" for name in unknown])
+    both = plant == full
+    paths = {"plant": plant or both, "full": full or both}
+    return [job for job in (*PLANT_JOBS, *FULL_JOBS) if paths[job.path] and (not only or job.flight in only)]
+
+
+def by_flight(jobs: Sequence[Job], flown: dict[str, Trace]) -> dict[str, list[Trace]]:
+    """Traces for the page: of a swarm one of each path and kind, of single vehicles all."""
+    found: dict[str, list[Trace]] = {}
+    for job in jobs:
+        other_radius = job.radius_m is not None and job.radius_m != thesis.RADII[0] * thesis.SAFE_RADIUS_M
+        if job.name in flown and not other_radius:
+            found.setdefault(job.flight, []).append(flown[job.name])
+    return found
+
+
+def index_points(flown: dict[str, Trace]) -> Iterator[IndexPoint]:
+    """Points of the index over the constraint radius (Table 19)."""
+    for kind in ("dmpc", "dmpc3"):
+        for factor in thesis.RADII:
+            trace = flown.get(thesis.radius_name(kind, factor))
+            if trace is not None:
+                radius_m = factor * thesis.SAFE_RADIUS_M
+                yield IndexPoint(radius_m, score.index_m(trace), thesis.TABLE_19_M.get(factor), kind)
+
+
+def show(rows: Sequence[Row], console: Console) -> None:
+    """The rows as a table."""
+    table = Table(show_edge=False)
+    table.add_column("row")
+    for name in ("published", "ours", "limit", "least"):
+        table.add_column(name, justify="right")
+    table.add_column("")
+    for row in rows:
+        cells = ["" if value is None else f"{value:.4g}" for value in (row.published, row.ours, row.limit, row.least)]
+        verdict = {None: "", True: "[green]met", False: "[red]missed"}[row.met]
+        table.add_row(row.name, *cells, verdict)
+    console.print(table)
+
+
+def reproduce(only: Sequence[str], plant: bool, full: bool, directory: Path, processes: int) -> int:
+    """Fly, judge, write; returns the exit code."""
+    console, began_s = Console(), time.perf_counter()
+    jobs = chosen(only, plant, full)
+    with Progress(console=console, transient=True, disable=not sys.stdout.isatty()) as bar:
+        flown, failed = fly_all(jobs, processes, bar)
+        rows = thesis.rows(flown)
+        if not only or TIMING in only:
+            rows += timing_rows(bar)
+    notes = [f"{name} did not complete: {why}" for name, why in failed.items()]
+    radius_m = 3.0 * thesis.SAFE_RADIUS_M
+    extra = Extra({"circle": radius_m, "obstacle": radius_m}, tuple(index_points(flown)), tuple(notes))
+    write_json(directory, rows)
+    page = write_page(directory, rows, by_flight(jobs, flown), extra)
+    show(rows, console)
+    for note in notes:
+        print(note, file=sys.stderr)
+    missed = sum(row.met is False for row in rows)
+    print(f"{len(rows)} rows, {missed} limits missed, {time.perf_counter() - began_s:.0f} s; {page}")
+    return EXIT_MISSION if failed else EXIT_OK
+
+
+def _make(directory: Path) -> None:
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StartError(f"{directory} can't be made: {error}. Choose another with --out") from error
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="swarmctl reproduce", description=__doc__.splitlines()[0])
+    parser.add_argument("--only", action="append", default=[], metavar="FLIGHT")
+    parser.add_argument("--plant", action="store_true")
+    parser.add_argument("--full", action="store_true")
+    parser.add_argument("--out", type=Path, metavar="DIR")
+    parser.add_argument("--jobs", type=int, metavar="N", default=min(8, len(os.sched_getaffinity(0))))
+    return parser
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the verb; returns the process exit code."""
+    return exit_code_of(partial(_run, _parser().parse_args(arguments)))
+
+
+def _run(options: argparse.Namespace) -> int:
+    if options.jobs < 1:
+        raise ConfigError("--jobs", [f"{options.jobs}: at least 1 process flies"])
+    chosen(options.only, options.plant, options.full)
+    directory = options.out or create_run_folder(None, "reproduce", time.time_ns() // 1000)
+    _make(directory)
+    return reproduce(options.only, options.plant, options.full, directory, options.jobs)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

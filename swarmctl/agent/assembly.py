@@ -1,0 +1,64 @@
+"""Builds one `Agent` from a whole configuration; real time and lockstep differ only in what they hand in."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from swarmctl.agent.agent import Agent
+from swarmctl.agent.setup import AgentSetup
+from swarmctl.agent.telemetry_publisher import TickSink
+from swarmctl.bus.peers import Bus
+from swarmctl.config import Config
+from swarmctl.core.clock import Clock
+from swarmctl.core.types import GeoOrigin
+from swarmctl.mavlink.autopilot import Autopilot
+from swarmctl.mavlink.codec import Codec
+from swarmctl.mavlink.commands import OWN_COMPID, CommandPort
+from swarmctl.mavlink.transport import Transport
+
+
+def make_agent(
+    config: Config,
+    agent: int,
+    boot_id: int,
+    transport: Transport,
+    bus: Bus,
+    clock: Clock,
+    sink: TickSink,
+    on_frame: Callable[[bytes], None],
+    slow_path: Callable[[Autopilot, Codec], CommandPort],
+    stopwatch_ns: Callable[[], int],
+) -> Agent:
+    """Wire an agent to its vehicle, its peers and its recorder.
+
+    Args:
+        config: the run.
+        agent: own index, from 0.
+        boot_id: differs between restarts of the same agent.
+        transport, bus, clock, sink: see `Agent`.
+        on_frame: told of every MAVLink frame in and out.
+        slow_path: makes the command executor for the vehicle.
+        stopwatch_ns: measures the tick.
+    """
+    sysid = config.sysids()[agent]
+    swarm = config.swarm
+    codec = Codec(sysid, OWN_COMPID)
+    origin = GeoOrigin(swarm.origin_lat_deg, swarm.origin_lon_deg, swarm.origin_alt_m)
+    autopilot = Autopilot(transport, codec, sysid, origin, on_frame)
+    commands = slow_path(autopilot, codec)
+    autopilot.attach(commands)
+    setup = AgentSetup(
+        agent,
+        boot_id,
+        sysid,
+        config.agent,
+        config.mission,
+        np.array(config.starts_ned_m()),
+        config.controller,
+        config.separation,
+        config.model_of(agent),
+        min(max(1, len(config.obstacles)), config.separation.max_obstacles),
+    )
+    return Agent(setup, autopilot, commands, bus, clock, sink, stopwatch_ns)

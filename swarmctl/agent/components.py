@@ -1,0 +1,82 @@
+"""What an agent is made of, put together from what it is told."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from swarmctl.agent.coordination import Coordination
+from swarmctl.agent.safety_filter import LastLayer
+from swarmctl.agent.setup import AgentSetup
+from swarmctl.agent.world_model import Surroundings
+from swarmctl.bus.peers import Bus
+from swarmctl.control.commit.trajectory_planner import following
+from swarmctl.control.controller import Controller, make_controller
+from swarmctl.control.estimation.disturbance import DisturbanceObserver
+from swarmctl.control.estimation.state_filter import StateFilter
+from swarmctl.control.phases.sequence import Sequence
+from swarmctl.control.reference.mission import MissionReference
+
+Note = Callable[..., None]
+Stopwatch = Callable[[], int]  # [ns]
+
+
+def make_controllers(setup: AgentSetup, stopwatch_ns: Stopwatch) -> tuple[Controller, Controller]:
+    """Of the mission, and of the ways there and back."""
+    params, rest = setup.controller, (setup.vehicle_model, setup.separation, setup.agent, setup.slots, stopwatch_ns)
+    if setup.promises:
+        params = params.model_copy(update={"mpc": following(params.mpc, setup.params.commit)})
+    mission = make_controller(params, *rest)
+    if params.kind != "open_loop":
+        return mission, mission
+    return mission, make_controller(params.model_copy(update={"kind": "dmpc"}), *rest)  # the other can't go anywhere
+
+
+def make_coordination(
+    setup: AgentSetup, surroundings: Surroundings, bus: Bus, note: Note, stopwatch_ns: Stopwatch
+) -> Coordination | None:
+    """None unless separation is guaranteed."""
+    if not setup.promises:
+        return None
+    return Coordination(
+        setup.agent,
+        setup.boot_id,
+        setup.peers,
+        setup.params.commit,
+        setup.controller.mpc,
+        setup.separation,
+        setup.slots,
+        surroundings,
+        bus,
+        note,
+        stopwatch_ns,
+        setup.params.rate_hz,
+    )
+
+
+def make_estimator(setup: AgentSetup) -> DisturbanceObserver | StateFilter:
+    """Of state and disturbance, as configured."""
+    params, model = setup.params, setup.vehicle_model
+    if params.state_filter.enabled:
+        return StateFilter(params.state_filter, params.disturbance, model)
+    return DisturbanceObserver(params.disturbance, model.hover_thrust_01)
+
+
+def make_last_layer(setup: AgentSetup, surroundings: Surroundings, note: Note, stopwatch_ns: Stopwatch) -> LastLayer:
+    """Of the bodies around it."""
+    dt_s = 1.0 / setup.params.rate_hz
+    downwash = setup.separation.downwash
+    return LastLayer(setup.params.barrier, setup.vehicle_model, dt_s, surroundings, downwash, note, stopwatch_ns)
+
+
+def make_sequence(setup: AgentSetup) -> Sequence:
+    """Of its mission."""
+    reference = MissionReference(setup.mission, setup.starts_ned_m, setup.agent, setup.separation.planned_m)
+    return Sequence(
+        setup.params.sequence,
+        setup.agent,
+        len(setup.peers),
+        setup.separation.radius_m,
+        setup.starts_ned_m[setup.agent],
+        setup.mission.duration_s,
+        reference,
+    )

@@ -1,0 +1,218 @@
+"""The real-time loop around one agent: absolute deadlines, missed ticks skipped and counted, never caught up.
+
+Setpoints leave from the tick only. If this loop stalls they stop, and the autopilot's own failsafe acts.
+"""
+
+from __future__ import annotations
+
+import gc
+import signal
+import sys
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from types import FrameType
+
+from swarmctl.agent.agent import Agent
+from swarmctl.agent.assembly import make_agent
+from swarmctl.bus import topics
+from swarmctl.bus.peers import Bus, LocalHub, agent_name
+from swarmctl.bus.zenoh_bus import NO_BUS, ZenohBus
+from swarmctl.config import Config, load
+from swarmctl.control.phases.sequence import OPERATOR_STOP
+from swarmctl.core.types import Mode
+from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, MissionError, StartError
+from swarmctl.mavlink.autopilot import Autopilot
+from swarmctl.mavlink.codec import Codec, heartbeat_of
+from swarmctl.mavlink.commands import CommandPort
+from swarmctl.mavlink.mavsdk_commands import MavsdkCommands
+from swarmctl.mavlink.transport import open_transport
+from swarmctl.telemetry.recorder import Recorder
+
+_LOOPBACK = "127.0.0.1"
+_SLEW_01 = 0.01  # of elapsed time, by which UTC may be corrected
+_LINGER_S = 1.0  # after the end, so that peers learn of it
+_VEHICLE_LOST_S = 15.0  # no state at all: nothing left to do here
+
+
+class WallClock:
+    """The host's clocks. A step of UTC is followed slowly: in flight, time neither jumps nor runs backwards."""
+
+    def __init__(self) -> None:
+        self._read_ns = time.monotonic_ns()
+        self._offset_ns = time.time_ns() - self._read_ns
+
+    def now_us(self) -> int:
+        return time.monotonic_ns() // 1000
+
+    def utc_us(self) -> int:
+        now_ns = time.monotonic_ns()
+        most_ns = int((now_ns - self._read_ns) * _SLEW_01)
+        off_ns = time.time_ns() - now_ns - self._offset_ns
+        self._offset_ns += min(most_ns, max(-most_ns, off_ns))
+        self._read_ns = now_ns
+        return (now_ns + self._offset_ns) // 1000
+
+    def sleep_until(self, t_us: int) -> None:
+        """Return at monotonic `t_us` or, when it has passed, at once."""
+        left_us = t_us - self.now_us()
+        if left_us > 0:
+            time.sleep(left_us * 1e-6)
+
+
+class Pace:
+    """Deadlines of a periodic loop and the count of those that were missed.
+
+    A tick is late when its setpoint leaves after the next tick was due; a tick that is skipped counts as late.
+    """
+
+    def __init__(self, period_us: int, first_us: int) -> None:
+        self.period_us, self.due_us = period_us, first_us
+        self.late = 0
+
+    def done(self, sent_us: int, now_us: int) -> None:
+        """Account for the tick that was due, and set the next deadline."""
+        if sent_us > self.due_us + self.period_us:
+            self.late += 1
+        self.due_us += self.period_us
+        skipped = max(0, (now_us - self.due_us) // self.period_us)
+        self.late += skipped
+        self.due_us += skipped * self.period_us
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AgentProcess:
+    """What one agent process is told on its command line."""
+
+    config_path: Path  # resolved configuration
+    agent: int  # own index, from 0
+    run: str  # name of the run on the bus
+    bus: str  # the router's endpoint; `NO_BUS`: it flies by itself
+    run_dir: Path  # folder to record into
+    fd: int | None = None  # bound UDP socket inherited from the launcher
+    vehicle_port: int | None = None  # loopback port at its other end; None where that is not known
+    only_land: bool = False  # whatever the vehicle does, it is landed and disarmed, and that is all
+
+
+def run_agent(process: AgentProcess) -> int:
+    """Fly one agent until its mission has ended; returns the exit code.
+
+    Raises:
+        StartError: link, bus or vehicle is not there.
+        ConfigError: the configuration is not valid.
+    """
+    agent = process.agent
+    config = load(process.config_path)
+    if not 0 <= agent < config.swarm.agents:
+        raise StartError(f"--id {agent}: allowed: 0..{config.swarm.agents - 1} (swarm.agents)")
+    stop = _StopRequest(asked=process.only_land)
+    clock = WallClock()
+    url = config.vehicles[agent].url if config.vehicles else ""
+    is_vehicle = heartbeat_of(config.sysids()[agent])
+    remote = None if process.vehicle_port is None else (_LOOPBACK, process.vehicle_port)
+    transport = open_transport(url or f"udpin://{_LOOPBACK}:14540", process.fd, is_vehicle, remote)
+    recorder = Recorder(process.run_dir, agent)
+    link = _join(process, config, clock)
+    slow: list[CommandPort] = []
+
+    def slow_path(autopilot: Autopilot, codec: Codec) -> CommandPort:
+        slow.append(MavsdkCommands(autopilot.send_frame, codec.sysid, lambda: autopilot.dialect))
+        return slow[0]
+
+    boot_id = (clock.utc_us() // 1000) & 0xFFFFFFFF
+    flown = make_agent(
+        config,
+        agent,
+        boot_id,
+        transport,
+        link,
+        clock,
+        recorder,
+        lambda frame: recorder.frame(clock.utc_us(), frame),
+        slow_path,
+        time.perf_counter_ns,
+    )
+    try:
+        vehicle = url or f"inherited socket of sysid {config.sysids()[agent]}"
+        return _loop(flown, config, clock, stop, vehicle, process.only_land)
+    finally:
+        recorder.event("bus_summary", clock.now_us(), clock.utc_us(), rejected=flown.rejected, lost=recorder.lost)
+        slow[0].close()
+        link.close()
+        transport.close()
+        recorder.close()
+
+
+def _join(process: AgentProcess, config: Config, clock: WallClock) -> Bus:
+    """Return the bus of the run; one with nobody else on it where there is no router."""
+    me = agent_name(process.agent)
+    if process.bus == NO_BUS:
+        return LocalHub(clock.now_us).attach(me)
+    peers = [agent_name(i) for i in range(config.swarm.agents) if i != process.agent]
+    listen = {
+        topics.PATH: peers,
+        topics.STATUS: peers,
+        topics.INTENT: peers,
+        topics.COMMAND: [topics.OPERATOR],
+        topics.OBSTACLES: [topics.OPERATOR],
+    }
+    return ZenohBus(process.bus, process.run, me, listen, config.bus.lease_ms)
+
+
+def _loop(agent: Agent, config: Config, clock: WallClock, stop: _StopRequest, vehicle: str, only_land: bool) -> int:
+    gc.collect()
+    gc.freeze()  # start-up garbage is not looked at again during flight
+    pace = Pace(round(1e6 / config.agent.rate_hz), clock.now_us())
+    seen_us = clock.now_us()
+    ever_seen = False
+    finished_us: int | None = None
+    while True:
+        clock.sleep_until(pace.due_us)
+        now_us = clock.now_us()
+        if stop.take():
+            agent.ask("land", now_us)
+        record = agent.tick(now_us, pace.late)
+        pace.done(now_us + round(record.tick_ms * 1000), clock.now_us())
+        if record.mode is not Mode.BLIND:
+            seen_us, ever_seen = now_us, True
+        _give_up_on_silence(now_us - seen_us, ever_seen, config, vehicle)
+        if agent.done if only_land else agent.finished:
+            finished_us = finished_us or now_us
+            if now_us - finished_us > _LINGER_S * 1e6:
+                return _exit_code(agent)
+
+
+def _give_up_on_silence(silent_us: int, ever_seen: bool, config: Config, vehicle: str) -> None:
+    if not ever_seen and silent_us > config.agent.connect_timeout_s * 1e6:
+        raise StartError(
+            f"vehicle at {vehicle}: no heartbeat and position within {config.agent.connect_timeout_s:.0f} s. "
+            "Is it running, sending to this port, and is its MAV_SYS_ID the configured sysid? "
+            "PX4 answers only the first program that has ever spoken to it: end that one, or restart PX4"
+        )
+    if ever_seen and silent_us > _VEHICLE_LOST_S * 1e6:
+        raise MissionError(f"vehicle at {vehicle}: silent for {_VEHICLE_LOST_S:.0f} s, given up")
+
+
+def _exit_code(agent: Agent) -> int:
+    if agent.outcome == "completed":
+        return EXIT_OK
+    print(f"mission not completed: {agent.outcome}", file=sys.stderr)
+    if agent.outcome == OPERATOR_STOP:
+        return EXIT_INTERRUPTED
+    return EXIT_MISSION if agent.has_armed else EXIT_START
+
+
+class _StopRequest:
+    """SIGINT, SIGTERM or SIGHUP (its terminal has gone): land. Taken once by the loop; the agent keeps it."""
+
+    def __init__(self, asked: bool) -> None:
+        self._asked = asked
+        for signum in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
+            signal.signal(signum, self._ask)
+
+    def take(self) -> bool:
+        asked, self._asked = self._asked, False
+        return asked
+
+    def _ask(self, signum: int, frame: FrameType | None) -> None:
+        self._asked = True

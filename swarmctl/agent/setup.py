@@ -1,0 +1,71 @@
+"""What one agent is told before it starts: its parameters, its place in the swarm, its vehicle."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pydantic import Field
+
+from swarmctl.control.collision.barrier import BarrierParams
+from swarmctl.control.collision.separation import SeparationParams
+from swarmctl.control.commit.trajectory_planner import CommitParams
+from swarmctl.control.controller import ControllerParams
+from swarmctl.control.estimation.disturbance import DisturbanceParams
+from swarmctl.control.estimation.state_filter import StateFilterParams
+from swarmctl.control.model import VehicleModelParams
+from swarmctl.control.phases.failsafe import FailsafeParams
+from swarmctl.control.phases.overload import OverloadParams
+from swarmctl.control.phases.sequence import SequenceParams
+from swarmctl.control.reference.deadlock import DetourParams
+from swarmctl.control.reference.mission import MissionParams
+from swarmctl.core.params import Params
+from swarmctl.core.types import Array
+
+
+class AgentParams(Params):
+    """Everything of an agent that is neither controller nor vehicle."""
+
+    rate_hz: float = Field(50.0, ge=10, le=200)
+    connect_timeout_s: float = Field(15.0, gt=0, le=600)
+    sequence: SequenceParams = SequenceParams()
+    failsafe: FailsafeParams = FailsafeParams()
+    overload: OverloadParams = OverloadParams()
+    disturbance: DisturbanceParams = DisturbanceParams()
+    state_filter: StateFilterParams = StateFilterParams()
+    barrier: BarrierParams = BarrierParams()
+    commit: CommitParams = CommitParams()
+    detour: DetourParams = DetourParams()
+    autopilot_params: dict[str, int | float] = Field(  # PX4: land when setpoints stop, before it has flown far blindly
+        {"COM_OBL_RC_ACT": 4, "COM_OF_LOSS_T": 0.5}
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class AgentSetup:
+    """What one agent is told before it starts."""
+
+    agent: int
+    boot_id: int
+    sysid: int
+    params: AgentParams
+    mission: MissionParams
+    starts_ned_m: Array  # (agents, 3)
+    controller: ControllerParams
+    separation: SeparationParams
+    vehicle_model: VehicleModelParams
+    obstacle_slots: int
+
+    @property
+    def peers(self) -> list[int]:
+        """Indices of the others."""
+        return [i for i in range(len(self.starts_ned_m)) if i != self.agent]
+
+    @property
+    def slots(self) -> int:
+        """How many neighbours and obstacles get rows in a problem."""
+        return min(len(self.peers), self.separation.max_neighbours) + self.obstacle_slots
+
+    @property
+    def promises(self) -> bool:
+        """Whether only what has been promised is flown."""
+        return self.separation.mode == "guaranteed"

@@ -1,0 +1,229 @@
+"""What one tick leaves behind: its record for the recorder and the viewer, and a status for peers and people."""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+
+from swarmctl.bus import topics
+from swarmctl.bus.peers import Bus, PeerPaths
+from swarmctl.control.collision.separation import KeepOut
+from swarmctl.control.estimation.disturbance import Estimate
+from swarmctl.control.mpc.problem import Start
+from swarmctl.control.phases.sequence import Sequence
+from swarmctl.core.clock import Clock
+from swarmctl.core.records import pack_tick
+from swarmctl.core.types import (
+    AttitudeSetpoint,
+    Mode,
+    Plan,
+    PlanStatus,
+    Reference,
+    TickRecord,
+    VehicleState,
+)
+from swarmctl.mavlink.autopilot import Autopilot
+
+_STATUS_EVERY_US = 200_000
+_RECENT_TICKS = 250
+_NAN3 = np.full(3, math.nan)
+_NAN4 = np.full(4, math.nan)
+_NO_PLAN = np.empty((0, 3))
+
+
+class TickSink(Protocol):
+    """Where records go; never blocks."""
+
+    def tick(self, record: TickRecord) -> None: ...
+
+    def event(self, name: str, t_us: int, utc_us: int, **fields: Any) -> None: ...
+
+
+@dataclass(frozen=True, slots=True)
+class Thought:
+    """What a tick has worked out; all but `keep_outs` None while the own state is too old."""
+
+    start: Start | None
+    plan: Plan | None  # None as well while the autopilot flies
+    reference: Reference | None  # now, one point
+    keep_outs: list[KeepOut]
+
+
+@dataclass(frozen=True, slots=True)
+class Act:
+    """What a tick has done."""
+
+    mode: Mode
+    flown: Plan | None
+    setpoint: AttitudeSetpoint | None
+    barrier_acted: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Took:
+    """How long the parts of a tick took [ms]."""
+
+    sense_ms: float  # listen included
+    setup_ms: float  # prediction, reference, keep-outs, matrices
+    promise_ms: float  # hearing, judging and planning promises; 0 in best effort
+    spaces_ms: float  # half-spaces
+    solve_ms: float  # inside the QP solver
+    certify_ms: float
+    barrier_ms: float  # the last layer
+    send_ms: float  # judging included
+
+    @property
+    def tick_ms(self) -> float:
+        """Listen to send."""
+        planned_ms = self.setup_ms + self.spaces_ms + self.solve_ms + self.certify_ms
+        return self.sense_ms + self.promise_ms + planned_ms + self.barrier_ms + self.send_ms
+
+
+class Reporter:
+    """Counts ticks, writes their records and says the agent's status five times a second.
+
+    Args:
+        agent, boot_id, sysid: who reports.
+        promises: it flies only what it has promised.
+        autopilot: the vehicle, for what it says of itself.
+        paths: what is known of peers.
+        bus, clock, sink: where it goes.
+    """
+
+    def __init__(
+        self,
+        agent: int,
+        boot_id: int,
+        sysid: int,
+        promises: bool,
+        autopilot: Autopilot,
+        paths: PeerPaths,
+        bus: Bus,
+        clock: Clock,
+        sink: TickSink,
+    ) -> None:
+        self._agent, self._boot_id, self._sysid, self._promises = agent, boot_id, sysid, promises
+        self._autopilot, self._paths = autopilot, paths
+        self._bus, self._clock, self._sink = bus, clock, sink
+        self._recent_ms: deque[float] = deque(maxlen=_RECENT_TICKS)
+        self._status_us = -_STATUS_EVERY_US
+        self.seq = 0
+        self.failed_plans = 0
+        self.problem = ""
+
+    def report(
+        self,
+        now_us: int,
+        state: VehicleState | None,
+        thought: Thought,
+        act: Act,
+        sequence: Sequence,
+        estimate: Estimate,
+        late_ticks: int,
+        took: Took,
+    ) -> TickRecord:
+        """Record and publish one tick; the setpoint has left already."""
+        self.seq += 1
+        record = self._record(now_us, state, thought, act, sequence, estimate, late_ticks, took)
+        self._recent_ms.append(took.tick_ms)
+        self._sink.tick(record)
+        self._bus.publish(topics.TICK, pack_tick(record))
+        if now_us - self._status_us >= _STATUS_EVERY_US:
+            self._status_us = now_us
+            self._bus.publish(topics.STATUS, topics.encode_message(self._status(record, sequence)))
+        return record
+
+    def _record(
+        self,
+        now_us: int,
+        state: VehicleState | None,
+        thought: Thought,
+        act: Act,
+        sequence: Sequence,
+        estimate: Estimate,
+        late_ticks: int,
+        took: Took,
+    ) -> TickRecord:
+        utc_us = self._clock.utc_us()
+        plan, setpoint = thought.plan, act.setpoint
+        peers, obstacles, age_ms = self._surroundings(thought, utc_us)
+        return TickRecord(
+            t_us=now_us,
+            utc_us=utc_us,
+            seq=self.seq,
+            mission_t_s=sequence.mission_t_s(utc_us),
+            phase=sequence.phase,
+            mode=act.mode,
+            flight_mode=self._autopilot.mode,
+            armed=self._autopilot.armed,
+            state_age_ms=math.nan if state is None else (now_us - state.t_us) * 1e-3,
+            pos_ned_m=_NAN3 if state is None else state.pos_ned_m,
+            vel_ned_m_s=_NAN3 if state is None else state.vel_ned_m_s,
+            q_nb=_NAN4 if state is None else state.q_nb,
+            ref_pos_ned_m=_NAN3 if thought.reference is None else thought.reference.pos_ned_m[0],
+            setpoint_q_nb=_NAN4 if setpoint is None else setpoint.q_nb,
+            setpoint_thrust_01=math.nan if setpoint is None else setpoint.thrust_01,
+            hover_thrust_01=estimate.hover_thrust_01,
+            disturbance_ned_m_s2=estimate.disturbance_ned_m_s2,
+            nearest_peer_m=min(peers, default=math.inf),
+            nearest_obstacle_m=min(obstacles, default=math.inf),
+            path_age_ms=age_ms,
+            peers=len(peers),
+            rejected=self._paths.refusals.total,
+            plan_status=PlanStatus.NONE if plan is None else plan.status,
+            slack_m=0.0 if plan is None else plan.slack_m,
+            residual_m=0.0 if plan is None else plan.residual_m,
+            iterations=0 if plan is None else plan.iterations,
+            solve_ms=took.solve_ms,
+            tick_ms=took.tick_ms,
+            late_ticks=late_ticks,
+            plan_pos_ned_m=_NO_PLAN if act.flown is None else act.flown.pos_ned_m,
+            barrier_acted=act.barrier_acted,
+        )
+
+    def _surroundings(self, thought: Thought, utc_us: int) -> tuple[list[float], list[float], float]:
+        """Distances to peers and to visible obstacles [m] when the setpoint acts; age of the oldest newest path [ms].
+
+        A path begins when its sender's setpoint acts, so its age counts from there to when ours does.
+        """
+        if thought.start is None:
+            return [], [], math.nan
+        here, act_utc_us = thought.start.pos_ned_m, utc_us + thought.start.t_us - self._clock.now_us()
+        peers = [math.dist(here, k.pos_ned_m[0]) for k in thought.keep_outs if k.tie >= 0]
+        obstacles = [k.distance_m(here) for k in thought.keep_outs if k.tie < 0]
+        ages_ms = [(act_utc_us - path.t0_utc_us) * 1e-3 for path in self._paths.latest()]
+        return peers, obstacles, max(ages_ms, default=math.nan)
+
+    def _status(self, record: TickRecord, sequence: Sequence) -> topics.StatusMessage:
+        error = record.pos_ned_m - record.ref_pos_ned_m
+        return topics.StatusMessage(
+            agent=self._agent,
+            boot_id=self._boot_id,
+            sysid=self._sysid,
+            phase=int(record.phase),
+            mode=int(record.mode),
+            flight_mode=int(record.flight_mode),
+            armed=record.armed,
+            landed=int(self._autopilot.landed),
+            ready_utc_us=sequence.ready_utc_us,
+            outcome=sequence.outcome,
+            position_error_m=_finite(math.sqrt(float(error @ error))),
+            separation_m=_finite(record.nearest_peer_m),
+            tick_p99_ms=float(np.percentile(self._recent_ms, 99)),
+            ticks=record.seq,
+            late_ticks=record.late_ticks,
+            path_age_ms=_finite(record.path_age_ms),
+            solver_failed=self.failed_plans,
+            problem=self.problem,
+            promises=self._promises,
+            utc_us=record.utc_us,
+        )
+
+
+def _finite(value: float) -> float:
+    """JSON has no infinity: -1 says there is none."""
+    return value if math.isfinite(value) else -1.0

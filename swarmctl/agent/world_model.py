@@ -1,0 +1,233 @@
+"""What an agent knows of its peers and of obstacles: hears the bus, answers what to keep clear of and who is there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence, Set
+
+from swarmctl.bus import topics
+from swarmctl.bus.orders import Orders
+from swarmctl.bus.peers import Bus, PeerPaths, agent_name
+from swarmctl.bus.refusals import FUTURE, IDENTITY, MALFORMED, SEQUENCE, UNKNOWN_PEER, Refusals
+from swarmctl.bus.senders import Attendance, Said, Speaker
+from swarmctl.control.collision.barrier import Body, body_of_obstacle, body_of_peer
+from swarmctl.control.collision.separation import (
+    KeepOut,
+    SeparationParams,
+    aligned,
+    keep_out_of_obstacle,
+    keep_out_of_peer,
+    visible,
+)
+from swarmctl.control.phases.inputs import PeerFacts
+from swarmctl.core.trajectory import Trajectory
+from swarmctl.core.trajectory_message import Intent
+from swarmctl.core.types import Array, Mode, Obstacle, Phase
+
+_NEW_US = 300_000  # a path that may be compared with promises
+_READY_LEAD_US = 1_000_000  # of another clock than ours
+FLOWN_BY_AGENT = frozenset((Mode.FOLLOW, Mode.REPLAY, Mode.BRAKE, Mode.HOLD))
+
+
+class Surroundings:
+    """Peers' newest paths and statuses, and the obstacles the operator has told of.
+
+    Args:
+        agent: own index.
+        peers: indices of the others.
+        params: distances and ages.
+        bus: is drained by `listen`.
+        rate_hz: of every agent's ticks.
+        note: is told `refused` (see `Refusals`); `unheard` when a peer that is on the bus has said no path that is
+            believed for `lost_after_s`, and when that ends, with how long it lasted.
+    """
+
+    def __init__(
+        self,
+        agent: int,
+        peers: list[int],
+        params: SeparationParams,
+        bus: Bus,
+        rate_hz: float,
+        note: Callable[..., None],
+    ) -> None:
+        self._agent, self._params, self._bus, self._note = agent, params, bus, note
+        self.refusals, self.attendance = Refusals(note), Attendance(bus)
+        shared = rate_hz, self.refusals, self.attendance
+        self.paths = PeerPaths(peers, *shared)
+        self._speakers = {peer: Speaker(agent_name(peer), topics.STATUS.name, *shared) for peer in peers}
+        self._orders = Orders(agent, self.refusals)
+        self._unheard_since_us: dict[int, int] = {}
+        self._status: dict[int, topics.StatusMessage] = {}
+        self._obstacles: tuple[Obstacle, ...] = ()
+        self._obstacles_version: int | None = None
+        self._seen: dict[int, Obstacle] = {}  # that have been visible, by identity
+        self.promised: Mapping[int, Sequence[Trajectory]] = {}  # what peers may follow, of those who promise
+
+    def listen(self, utc_us: int) -> list[str]:
+        """Take in everything that has arrived; returns the operator's verbs for this agent."""
+        self.attendance.look(utc_us)
+        for sender, payload in self._bus.receive(topics.PATH):
+            self.paths.offer(sender, payload, utc_us)
+        for sender, payload in self._bus.receive(topics.STATUS):
+            self._take_status(sender, payload, utc_us)
+        for sender, payload in self._bus.receive(topics.OBSTACLES):
+            self._take_obstacles(sender, payload, utc_us)
+        verbs = [self._orders.take(*received, utc_us) for received in self._bus.receive(topics.COMMAND)]
+        self.refusals.tell(utc_us)
+        self._watch_unheard(utc_us)
+        return [verb for verb in verbs if verb is not None]
+
+    def _take_status(self, sender: str, payload: bytes, utc_us: int) -> None:
+        status = topics.decode_status(payload)
+        reason = ""
+        if status is None:
+            reason = MALFORMED
+        elif sender != agent_name(status.agent):
+            reason = IDENTITY
+        elif status.agent not in self._speakers:
+            reason = UNKNOWN_PEER
+        elif status.ready_utc_us > utc_us + _READY_LEAD_US:
+            reason = FUTURE
+        if reason or status is None:
+            self.refusals.add(sender, topics.STATUS.name, reason, utc_us)
+        elif self._speakers[status.agent].believes(Said(status.boot_id, status.ticks, utc_us, payload), utc_us):
+            self._status[status.agent] = status
+
+    def _take_obstacles(self, sender: str, payload: bytes, utc_us: int) -> None:
+        message, known = topics.decode_obstacles(payload), self._obstacles_version
+        if message is None:
+            self.refusals.add(sender, topics.OBSTACLES.name, MALFORMED, utc_us)
+        elif message.replaces(known):
+            self._obstacles_version = message.version
+            self._obstacles, self._seen = tuple(o.obstacle() for o in message.obstacles), {}
+        elif known is not None and message.version > known:
+            self.refusals.add(sender, topics.OBSTACLES.name, SEQUENCE, utc_us)
+
+    def _watch_unheard(self, utc_us: int) -> None:
+        """Tell of peers that are there, but of which no path is believed."""
+        oldest_us = utc_us - round(self._params.lost_after_s * 1e6)
+        unheard = {
+            path.agent: path.t0_utc_us
+            for path in self.paths.latest()
+            if path.t0_utc_us < oldest_us and self._is_there(path.agent) and self._phase(path.agent) is not Phase.DONE
+        }
+        for agent in unheard.keys() - self._unheard_since_us.keys():
+            self._unheard_since_us[agent] = unheard[agent]
+            self._note("unheard", agent=agent, begins=True)
+        for agent in self._unheard_since_us.keys() - unheard.keys():
+            lasted_s = (utc_us - self._unheard_since_us.pop(agent)) * 1e-6
+            self._note("unheard", agent=agent, begins=False, lasted_s=lasted_s)
+
+    def _is_there(self, agent: int) -> bool:
+        return self.attendance.since_us(agent_name(agent)) is not None
+
+    def keep_outs(
+        self,
+        pos_ned_m: Array,
+        t0_utc_us: int,
+        dt_us: int,
+        steps: int,
+        phase: Phase,
+        without: Set[int] = frozenset(),
+    ) -> list[KeepOut]:
+        """Everything to stay clear of over `steps` steps from `t0_utc_us`, seen from `pos_ned_m` (3,) in `phase`.
+
+        Peers in `without` are left out: what they will do is known better.
+        """
+        paths = [path for path in self.paths.latest() if path.agent not in without]
+        places = aligned(paths, t0_utc_us, dt_us, steps, self._params.brake_m_s2) if paths else ()
+        found = [
+            keep_out_of_peer(
+                path,
+                t0_utc_us,
+                dt_us,
+                steps,
+                self._params,
+                parked=self._phase(path.agent) is Phase.DONE,
+                landing=phase is Phase.GOTO_LAND or self._phase(path.agent) is Phase.LAND,
+                points=points,
+            )
+            for path, points in zip(paths, places, strict=True)
+        ]
+        seen = visible(self._obstacles, pos_ned_m)
+        self._seen.update((id(o), o) for o in seen)
+        return found + [keep_out_of_obstacle(o, dt_us, steps, self._params) for o in seen]
+
+    def astray(self, intents: Mapping[int, Intent], utc_us: int, allowed_m: float) -> set[int]:
+        """Peers whose path of just now is farther than allowed from everything that they have promised to follow."""
+        found = set()
+        for path in self.paths.latest():
+            intent, at_us = intents.get(path.agent), path.t0_utc_us
+            if intent is None or not intent.promised or at_us < utc_us - _NEW_US:
+                continue
+            here = path.pos_ned_m[0].tolist()
+            if all(math.dist(here, trajectory.at(at_us)[0]) > allowed_m for trajectory in intent.followed):
+                found.add(path.agent)
+        return found
+
+    def landmarks(self) -> list[Obstacle]:
+        """Obstacles at rest that have been visible so far."""
+        return [o for o in self._seen.values() if not o.vel_ned_m_s.any()]
+
+    def bodies(self, pos_ned_m: Array, act_utc_us: int, ahead_s: float, margin_m: float) -> list[Body]:
+        """What not to touch, `ahead_s` after `act_utc_us`: peers heard of and obstacles seen from `pos_ned_m` (3,).
+
+        Who promises is where it has promised to be, however old the message.
+        """
+        p, fresh_us = self._params, act_utc_us - round(self._params.lost_after_s * 1e6)
+        found: list[Body] = []
+        for agent, trajectories in self.promised.items():
+            share_01 = 0.5 if self._flies_itself(agent) else 1.0
+            for pos, vel in (trajectory.at(act_utc_us + ahead_s * 1e6) for trajectory in trajectories):
+                found.append(Body(pos, vel, p.body_m + margin_m, share_01))
+        for path in self.paths.latest():
+            if path.agent in self.promised:
+                continue
+            filters = self._flies_itself(path.agent) and path.t0_utc_us >= fresh_us
+            growth_m_s2 = 0.0 if self._phase(path.agent) is Phase.DONE else p.age_accel_m_s2
+            grows = (p.body_m + margin_m, growth_m_s2, p.age_margin_max_m)
+            found.append(body_of_peer(path, act_utc_us, ahead_s, *grows, filters, p.brake_m_s2))
+        apart_m = 0.5 * p.body_m + margin_m
+        return found + [body_of_obstacle(o, ahead_s, apart_m) for o in visible(self._obstacles, pos_ned_m)]
+
+    def promises(self, agent: int) -> bool:
+        """Whether a peer flies by promises, as far as it is known."""
+        status = self._status.get(agent)
+        return status is None or status.promises
+
+    def peers(self) -> dict[int, PeerFacts]:
+        """Who has been heard of, how far it is, and whether it is still on the bus."""
+        alive = self._bus.alive()
+        return {
+            agent: PeerFacts(Phase(status.phase), status.ready_utc_us, agent_name(agent) in alive)
+            for agent, status in self._status.items()
+        }
+
+    def others_ned_m(self, utc_us: int) -> tuple[Array, ...]:
+        """Where each peer is now (3,), by its newest path."""
+        paths = self.paths.latest()
+        return tuple(aligned(paths, utc_us, 1, 0, self._params.brake_m_s2)[:, 0]) if paths else ()
+
+    def somebody_is_mute(self, utc_us: int) -> bool:
+        """Whether a peer is silent and not known to be gone: it may be flying on, or the bus is lost to us.
+
+        A peer whose liveliness token has gone while ours is there has died; its path has become a keep-out.
+        """
+        alive = self._bus.alive()
+        connected = agent_name(self._agent) in alive
+        oldest_us = utc_us - round(self._params.lost_after_s * 1e6)
+        for path in self.paths.latest():
+            silent = path.t0_utc_us < oldest_us and self._phase(path.agent) is not Phase.DONE
+            if silent and (not connected or agent_name(path.agent) in alive):
+                return True
+        return False
+
+    def _flies_itself(self, agent: int) -> bool:
+        """Whether its agent flies it, and so filters as we do."""
+        status = self._status.get(agent)
+        return status is not None and status.mode in FLOWN_BY_AGENT
+
+    def _phase(self, agent: int) -> Phase | None:
+        status = self._status.get(agent)
+        return None if status is None else Phase(status.phase)

@@ -1,0 +1,75 @@
+"""Operators' orders: how long one is valid, which of several is obeyed, and whose clock it is stamped by. Pure."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Literal
+
+from swarmctl.bus.refusals import FUTURE_ORDER, MALFORMED, REPLAYED, STALE_ORDER, SUPERSEDED_ORDER, Refusals
+from swarmctl.bus.topics import COMMAND, CommandMessage, decode_command, encode_message
+
+VALID_US = 2_000_000  # after its stamp
+MAX_LEAD_US = 500_000  # a stamp further in the future is of another clock
+_SAME_CLOCK_US = 500_000
+EVERYBODY = -1
+
+Verb = Literal["hold", "resume", "land", "rtl"]
+
+
+class Orders:
+    """Takes what operators ask of one agent, each order once, however often it is repeated.
+
+    An order counts for `VALID_US`: an old one says what somebody wanted of another flight. Of two the one that was
+    asked for later counts, in whatever order they come, so a repeated `hold` does not undo a `resume`. Only `land` is
+    obeyed whatever came before it: a stamp a little in the future must not be able to hold it up.
+
+    Args:
+        agent: own index.
+        refusals: is told what is not obeyed.
+    """
+
+    def __init__(self, agent: int, refusals: Refusals) -> None:
+        self._agent, self._refusals = agent, refusals
+        self._newest: CommandMessage | None = None  # that was obeyed
+
+    def take(self, sender: str, payload: bytes, utc_us: int) -> Verb | None:
+        """The verb, if it is for this agent and to be obeyed now."""
+        order = decode_command(payload)
+        if order is not None and order.agent not in (EVERYBODY, self._agent):
+            return None
+        reason = MALFORMED if order is None else self._refusal(order, utc_us)
+        if reason or order is None:
+            self._refusals.add(sender, COMMAND.name, reason, utc_us)
+            return None
+        if self._newest is None or order.utc_us > self._newest.utc_us:
+            self._newest = order
+        return order.verb
+
+    def _refusal(self, order: CommandMessage, utc_us: int) -> str:
+        if utc_us - order.utc_us > VALID_US:
+            return STALE_ORDER
+        if order.utc_us - utc_us > MAX_LEAD_US:
+            return FUTURE_ORDER
+        if self._newest is None or order.utc_us > self._newest.utc_us:
+            return ""
+        if order == self._newest:
+            return REPLAYED
+        return "" if order.verb == "land" else SUPERSEDED_ORDER
+
+
+def orders(verb: Verb, agent: int, utc_us: int, clocks_us: Iterable[int]) -> list[bytes]:
+    """Messages that ask for a verb now: one by the own clock, and one by every clock that differs from it.
+
+    Agents follow a step of UTC slowly, so in flight their clock and the operator's may be far apart. One by the own
+    clock is always there: who forges a status must not be able to make an order invalid.
+
+    Args:
+        agent: who is asked, or `EVERYBODY`.
+        utc_us: own clock.
+        clocks_us: what the clocks of those asked say now, by their statuses.
+    """
+    stamps_us = [utc_us]
+    for clock_us in sorted(clocks_us):
+        if all(abs(clock_us - known_us) > _SAME_CLOCK_US for known_us in stamps_us):
+            stamps_us.append(clock_us)
+    return [encode_message(CommandMessage(verb, agent, stamp_us)) for stamp_us in stamps_us]

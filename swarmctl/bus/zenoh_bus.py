@@ -1,0 +1,242 @@
+"""The Zenoh bus: a client for agents and operators, and the router process they meet at.
+
+One Unix socket in a private directory, no port, no discovery. Samples wait in one ring per topic and sender and are
+drained by the tick: no callback, no FIFO, nothing that could block reception. Freshness is judged by
+`swarmctl.bus.peers` from the payload; nothing here looks into one.
+
+`python -m swarmctl.bus.zenoh_bus --router unixsock-stream/DIR/bus.sock` is the router.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import signal
+import sys
+import threading
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import zenoh
+
+from swarmctl.bus.topics import TOO_LONG, TOPICS, Topic
+from swarmctl.errors import StartError, SwarmError
+from swarmctl.process_lifetime import die_with_parent, remove_socket
+
+SCHEME = "unixsock-stream/"
+NO_BUS = "none"  # endpoint of an agent that flies by itself
+CONNECT_TIMEOUT_MS = 10_000
+CLOSE_DEADLINE_S = 2.0
+_MAX_MESSAGE_BYTES = 1 << 20
+_ALIVE_RING = 1024
+_OPEN_TIMEOUT_MS = 2000
+_MAX_SOCKET_PATH = 100  # sun_path is 108 bytes
+
+_COMMON: dict[str, Any] = {
+    "scouting/multicast/enabled": False,
+    "scouting/gossip/enabled": False,
+    "transport/unicast/open_timeout": _OPEN_TIMEOUT_MS,
+    "transport/link/rx/max_message_size": _MAX_MESSAGE_BYTES,
+    "transport/shared_memory/enabled": False,
+}
+
+
+class ZenohBus:
+    """A client session that implements `swarmctl.bus.peers.Bus`.
+
+    Args:
+        endpoint: the router's, for example `unixsock-stream//tmp/swarm-x/bus.sock`.
+        run: name of the run; other runs are never heard.
+        me: own sender name.
+        listen: senders to hear, per topic.
+        lease_ms: others declare this session dead after so much silence of its link.
+        connect_timeout_ms: how long to wait for the router.
+
+    Raises:
+        StartError: the router does not answer in time.
+    """
+
+    def __init__(
+        self,
+        endpoint: str,
+        run: str,
+        me: str,
+        listen: Mapping[Topic, Sequence[str]],
+        lease_ms: int = 1500,
+        connect_timeout_ms: int = CONNECT_TIMEOUT_MS,
+    ) -> None:
+        self._session = _open_client(endpoint, lease_ms, connect_timeout_ms)
+        prefix = f"swarm/{run}"
+        self._publishers = {topic: self._publisher(f"{prefix}/{me}/{topic.name}", topic) for topic in TOPICS}
+        self._subscribers = {
+            topic: [(sender, self._subscriber(f"{prefix}/{sender}/{topic.name}", topic)) for sender in senders]
+            for topic, senders in listen.items()
+        }
+        self._alive: set[str] = set()
+        self._arrivals: Counter[str] = Counter()
+        self._lives = self._session.liveliness().declare_subscriber(
+            f"{prefix}/*/alive", zenoh.handlers.RingChannel(_ALIVE_RING), history=True
+        )
+        self._token = self._session.liveliness().declare_token(f"{prefix}/{me}/alive")
+
+    def publish(self, topic: Topic, payload: bytes) -> None:
+        """Hand over to the session; dropped when its queue is full or the bus is gone."""
+        with contextlib.suppress(zenoh.ZError):
+            self._publishers[topic].put(payload)
+
+    def receive(self, topic: Topic) -> list[tuple[str, bytes]]:
+        """Everything in the rings of a topic, oldest first for each sender; at most one ring of each."""
+        arrived: list[tuple[str, bytes]] = []
+        for sender, subscriber in self._subscribers.get(topic, ()):
+            payloads = (sample.payload for sample in _drain(subscriber, topic.ring))
+            arrived += [(sender, p.to_bytes() if len(p) <= topic.max_bytes else TOO_LONG) for p in payloads]
+        return arrived
+
+    def alive(self) -> frozenset[str]:
+        """Senders whose liveliness token is present; empty, even of this one, while the router is gone."""
+        self._watch_tokens()
+        return frozenset(self._alive)
+
+    def arrivals(self) -> Mapping[str, int]:
+        """How often each token has come; one that left and came back between two looks has come twice."""
+        self._watch_tokens()
+        return self._arrivals
+
+    def close(self) -> None:
+        """Leave the bus; gives up after `CLOSE_DEADLINE_S`, since a link that lost its other end can hold it up."""
+        _close_within(self._session, CLOSE_DEADLINE_S)
+
+    def _watch_tokens(self) -> None:
+        for sample in _drain(self._lives, _ALIVE_RING):
+            sender = str(sample.key_expr).split("/")[2]
+            if sample.kind != zenoh.SampleKind.PUT:
+                self._alive.discard(sender)
+            elif sender not in self._alive:  # a second process of that name has not come anew
+                self._alive.add(sender)
+                self._arrivals[sender] += 1
+
+    def _publisher(self, key: str, topic: Topic) -> Any:
+        reliability = zenoh.Reliability.RELIABLE if topic.reliable else zenoh.Reliability.BEST_EFFORT
+        return self._session.declare_publisher(
+            key, congestion_control=zenoh.CongestionControl.DROP, reliability=reliability
+        )
+
+    def _subscriber(self, key: str, topic: Topic) -> Any:
+        return self._session.declare_subscriber(
+            key, zenoh.handlers.RingChannel(topic.ring), allowed_origin=zenoh.Locality.REMOTE
+        )
+
+
+def run_router(endpoint: str) -> None:
+    """Route until SIGTERM, which the caller has blocked, then take the socket and its directory away.
+
+    Raises:
+        StartError: the endpoint is not a Unix socket in a private directory, or another router holds it.
+    """
+    socket_path = _private_socket(endpoint)
+    zenoh.init_log_from_env_or("error")
+    settings = _COMMON | {"mode": "router", "listen/endpoints": [endpoint], "scouting/delay": 0}
+    try:
+        session = _open(settings)
+    except zenoh.ZError as error:
+        raise StartError(f"bus endpoint {endpoint!r}: can't be opened: {error}. Is another router using it?") from error
+    print(f"router ready {endpoint}", flush=True)
+    signal.sigwait({signal.SIGTERM})
+    _close_within(session, CLOSE_DEADLINE_S)
+    remove_socket(socket_path)
+
+
+def socket_file(endpoint: str) -> Path:
+    """Path of a Unix socket endpoint.
+
+    Raises:
+        StartError: it is of another kind, or too long for the kernel.
+    """
+    path = endpoint.removeprefix(SCHEME)
+    if path == endpoint or not path.startswith("/"):
+        raise StartError(f"bus endpoint {endpoint!r}: use {SCHEME}/ABSOLUTE/PATH")
+    if len(path.encode()) > _MAX_SOCKET_PATH:
+        raise StartError(
+            f"bus endpoint {endpoint!r}: path longer than {_MAX_SOCKET_PATH} bytes; set TMPDIR to a shorter directory"
+        )
+    return Path(path)
+
+
+def _private_socket(endpoint: str) -> Path:
+    path = socket_file(endpoint)
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if path.parent.stat().st_mode & 0o077:
+        raise StartError(
+            f"bus endpoint {endpoint!r}: {path.parent} is open to other users, who could fly the swarm; "
+            "use a directory of mode 0700"
+        )
+    return path
+
+
+def _open_client(endpoint: str, lease_ms: int, timeout_ms: int) -> Any:
+    settings = _COMMON | {
+        "mode": "client",
+        "connect/endpoints": [endpoint],
+        "connect/timeout_ms": timeout_ms,
+        "connect/exit_on_failure": True,
+        "connect/retry": {"period_init_ms": 50, "period_max_ms": 500, "period_increase_factor": 2},
+        "transport/link/tx/lease": lease_ms,
+    }
+    try:
+        return _open(settings)
+    except zenoh.ZError as error:
+        raise StartError(
+            f"bus endpoint {endpoint!r}: no router answers within {timeout_ms / 1000:.1f} s. "
+            f"Start one with: python -m swarmctl.bus.zenoh_bus --router {endpoint}"
+        ) from error
+
+
+def _open(settings: Mapping[str, Any]) -> Any:
+    config = zenoh.Config()
+    for key, value in settings.items():
+        config.insert_json5(key, json.dumps(value))
+    return zenoh.open(config)
+
+
+def _drain(subscriber: Any, limit: int) -> list[Any]:
+    """At most `limit` samples, so that a flood can't hold the caller."""
+    samples: list[Any] = []
+    with contextlib.suppress(zenoh.ZError):  # the session is closed
+        while len(samples) < limit and (sample := subscriber.try_recv()) is not None:
+            samples.append(sample)
+    return samples
+
+
+def _close_within(session: Any, deadline_s: float) -> None:
+    def close() -> None:
+        with contextlib.suppress(zenoh.ZError):
+            session.close()
+
+    closer = threading.Thread(target=close, name="bus-close", daemon=True)
+    closer.start()
+    closer.join(deadline_s)
+
+
+def main() -> int:
+    """Entry of the router process."""
+    parser = argparse.ArgumentParser(prog="python -m swarmctl.bus.zenoh_bus", description="Router of one swarm's bus.")
+    parser.add_argument("--router", required=True, metavar="ENDPOINT", help=f"{SCHEME}/DIR/bus.sock")
+    parser.add_argument("--die-with-parent", action="store_true", help="end when the parent process ends")
+    arguments = parser.parse_args()
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})  # for sigwait; zenoh's threads inherit the mask
+    if arguments.die_with_parent:
+        die_with_parent(signal.SIGTERM)
+    try:
+        run_router(arguments.router)
+    except SwarmError as error:
+        print(error, file=sys.stderr)
+        return error.exit_code
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

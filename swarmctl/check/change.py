@@ -1,0 +1,40 @@
+"""What `--apply` was to set, and what came of it."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from swarmctl.check.finding import Finding, Verdict
+from swarmctl.check.parameters import Number
+
+
+@dataclass(frozen=True, slots=True)
+class Change:
+    """One parameter."""
+
+    agent: int
+    name: str
+    before: Number
+    wanted: Number
+    after: Number | None  # as read back
+    refused: str  # why it was not tried, or ""
+
+    @property
+    def done(self) -> bool:
+        return self.after is not None and math.isclose(self.after, self.wanted, rel_tol=1e-6, abs_tol=1e-9)
+
+    def in_words(self) -> str:
+        """Before and after."""
+        if self.done:
+            return f"{self.name}: {self.before:g} -> {self.after:g}"
+        return f"{self.name}: {self.before:g}, not changed to {self.wanted:g} ({self._why()})"
+
+    def finding(self) -> Finding:
+        """Of a change that was not done."""
+        found = "not told" if self.after is None else f"{self.after:g}"
+        advice = f"--apply did not set it: {self._why()}"
+        return Finding(self.agent, f"apply {self.name}", Verdict.FIX, found, f"{self.wanted:g}", advice, 98)
+
+    def _why(self) -> str:
+        return self.refused or "the autopilot kept its own value"

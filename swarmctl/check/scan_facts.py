@@ -1,0 +1,185 @@
+"""From a probe's messages to `VehicleFacts`: units, bits and frames. No judgement."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import pymap3d
+
+from swarmctl.check.link_facts import (
+    Estimator,
+    Gps,
+    LinkFacts,
+    Ned,
+    Sensors,
+    VehicleFacts,
+    Version,
+)
+from swarmctl.check.link_statistics import FrameTally, round_trip, vehicle_time
+from swarmctl.check.scanner import ARMED_FLAG, Probe
+from swarmctl.core.types import FlightMode, GeoOrigin, Landed
+from swarmctl.mavlink.dialects import DIALECTS
+
+_BYTEWISE, _C_CAST = 1 << 4, 1 << 17  # MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_*
+_ENOUGH_ANSWERS = 3
+_STAGES = ((255, "release"), (192, "rc"), (128, "beta"), (64, "alpha"), (0, "dev"))  # FIRMWARE_VERSION_TYPE
+_UNKNOWN_8, _UNKNOWN_16 = 255, 65535
+
+
+def unreached(agent: int, url: str, wanted_sysid: int, why: str) -> VehicleFacts:
+    """A link that could not even be opened."""
+    link = LinkFacts(0.0, {}, 0.0, 0.0, 0.0, 0, 0, (), 0, None, None)
+    return VehicleFacts(agent, url, wanted_sysid, why, link)
+
+
+def facts_of(probe: Probe, agent: int, url: str, wanted_sysid: int, shared: GeoOrigin, now_us: int) -> VehicleFacts:
+    """Everything a probe has heard until `now_us`.
+
+    Args:
+        probe: of this vehicle.
+        agent, url, wanted_sysid: what the configuration says.
+        shared: origin of the swarm's frame.
+        now_us: monotonic.
+    """
+    link = _link(probe, probe.listened_s(now_us))
+    beat = probe.message("HEARTBEAT")
+    if beat is None:
+        return VehicleFacts(agent, url, wanted_sysid, _silence(probe), link)
+    dialect = DIALECTS.get(beat.autopilot)
+    pos, origin, told = _place(probe, shared)
+    return VehicleFacts(
+        agent=agent,
+        url=url,
+        wanted_sysid=wanted_sysid,
+        unreachable="",
+        link=link,
+        sysid=probe.sysid,
+        autopilot="" if dialect is None else dialect.name,
+        autopilot_number=beat.autopilot,
+        version=_version(probe.message("AUTOPILOT_VERSION")),
+        mode=FlightMode.UNKNOWN if dialect is None else dialect.mode(beat.custom_mode),
+        custom_mode=beat.custom_mode,
+        armed=bool(beat.base_mode & ARMED_FLAG),
+        landed=_landed(probe.message("EXTENDED_SYS_STATE")),
+        system_status=beat.system_status,
+        sensors=_sensors(probe.message("SYS_STATUS")),
+        estimator=_estimator(probe.message("ESTIMATOR_STATUS")),
+        gps=_gps(probe.message("GPS_RAW_INT")),
+        pos_ned_m=pos,
+        origin_ned_m=origin,
+        origin_told=told,
+        parameters={} if probe.parameters is None else probe.parameters.facts(),
+    )
+
+
+def _silence(probe: Probe) -> str:
+    if not probe.senders:
+        return "nothing is heard"
+    return "frames are heard, but no autopilot's heartbeat"
+
+
+def _link(probe: Probe, listened_s: float) -> LinkFacts:
+    tally = probe.tallies.get(probe.sysid, FrameTally())
+    by = "TIMESYNC" if len(probe.answers["TIMESYNC"]) >= _ENOUGH_ANSWERS else "PING"
+    span_s = max(listened_s, 1e-6)
+    return LinkFacts(
+        listened_s=listened_s,
+        rates_hz=tally.rates_hz(listened_s),
+        frames_s=tally.frames / span_s,
+        bytes_s=tally.bytes / span_s,
+        lost_01=tally.lost_01,
+        mavlink1=probe.mavlink1,
+        mavlink2=probe.mavlink2,
+        autopilots=probe.autopilots(),
+        senders=len(probe.senders),
+        round_trip=round_trip(probe.answers[by], by),
+        time=vehicle_time(probe.answers["TIMESYNC"]),
+    )
+
+
+def _version(message: Any | None) -> Version | None:
+    if message is None:
+        return None
+    flight = message.flight_sw_version
+    stage = next(name for least, name in _STAGES if flight & 0xFF >= least)
+    git = bytes(message.flight_custom_version)
+    text = git.rstrip(b"\0")
+    readable = text.decode("ascii") if text and all(chr(c) in "0123456789abcdef" for c in text) else git[::-1].hex()
+    uid = bytes(message.uid2).rstrip(b"\0").hex() or "0"
+    capabilities = message.capabilities
+    return Version(
+        (flight >> 24 & 0xFF, flight >> 16 & 0xFF, flight >> 8 & 0xFF),
+        stage,
+        readable.strip("0") and readable,
+        message.board_version,
+        uid,
+        True if capabilities & _BYTEWISE else False if capabilities & _C_CAST else None,
+        message.vendor_id,
+    )
+
+
+def _landed(message: Any | None) -> Landed:
+    if message is None or message.landed_state > Landed.LANDING:
+        return Landed.UNKNOWN
+    return Landed(message.landed_state)
+
+
+def _sensors(message: Any | None) -> Sensors | None:
+    if message is None:
+        return None
+    return Sensors(
+        message.onboard_control_sensors_present,
+        message.onboard_control_sensors_enabled,
+        message.onboard_control_sensors_health,
+        None if message.voltage_battery in (0, _UNKNOWN_16) else message.voltage_battery * 1e-3,
+        None if message.battery_remaining < 0 else message.battery_remaining * 1e-2,
+    )
+
+
+def _estimator(message: Any | None) -> Estimator | None:
+    if message is None:
+        return None
+    return Estimator(message.flags, _told(message.pos_horiz_accuracy), _told(message.pos_vert_accuracy))
+
+
+def _told(value: float) -> float | None:
+    """An accuracy; zero, negative or not finite is none."""
+    return float(value) if math.isfinite(value) and value > 0 else None
+
+
+def _gps(message: Any | None) -> Gps | None:
+    if message is None:
+        return None
+    satellites = None if message.satellites_visible == _UNKNOWN_8 else message.satellites_visible
+    return Gps(message.fix_type, satellites, message.h_acc * 1e-3 if message.h_acc else None)
+
+
+def _place(probe: Probe, shared: GeoOrigin) -> tuple[Ned | None, Ned | None, bool]:
+    """Position and local origin in the shared frame, and whether the vehicle told its origin itself."""
+    local = probe.message("LOCAL_POSITION_NED") or probe.message("ODOMETRY")
+    world = probe.message("GLOBAL_POSITION_INT")
+    zero = probe.message("GPS_GLOBAL_ORIGIN")
+    here = None if local is None else _ned(local.x, local.y, local.z)
+    if zero is not None:
+        origin = _in_shared(zero.latitude, zero.longitude, zero.altitude, shared)
+        return None if here is None else _sum(origin, here), origin, True
+    if world is None or (world.lat == 0 and world.lon == 0):
+        return None, None, False
+    pos = _in_shared(world.lat, world.lon, world.alt, shared)
+    return pos, None if here is None else _sum(pos, here, -1.0), False
+
+
+def _in_shared(lat_e7: int, lon_e7: int, alt_mm: int, shared: GeoOrigin) -> Ned:
+    north, east, down = pymap3d.geodetic2ned(
+        lat_e7 * 1e-7, lon_e7 * 1e-7, alt_mm * 1e-3, shared.lat_deg, shared.lon_deg, shared.alt_m
+    )
+    return float(north), float(east), float(down)
+
+
+def _ned(x: float, y: float, z: float) -> Ned | None:
+    return (x, y, z) if all(math.isfinite(c) for c in (x, y, z)) else None
+
+
+def _sum(a: Ned, b: Ned, scale: float = 1.0) -> Ned:
+    return a[0] + scale * b[0], a[1] + scale * b[1], a[2] + scale * b[2]

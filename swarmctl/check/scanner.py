@@ -1,0 +1,288 @@
+"""Questions to one vehicle, and what it says: nothing is armed, no mode, rate or parameter is changed by asking.
+
+A probe sends its heartbeat, TIMESYNC, PING, requests for single messages and parameter reads. `set_parameters` is the
+one thing that changes a vehicle; it stops by itself when the vehicle is, or becomes, armed.
+"""
+
+from __future__ import annotations
+
+import math
+import selectors
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any, NamedTuple
+
+from pymavlink.dialects.v20 import development as mavlink
+
+from swarmctl.check.link_statistics import Answer, FrameTally
+from swarmctl.check.listener import NOWHERE, Address, Ear, Heard, monotonic_us
+from swarmctl.check.parameter_reader import ParameterReader
+from swarmctl.mavlink.codec import Codec
+from swarmctl.mavlink.dialects import DIALECTS, Dialect
+
+PROBE_COMPID = 192  # MAV_COMP_ID_ONBOARD_COMPUTER2: sequence numbers apart from those of an agent that may be flying
+AUTOPILOT_COMPID = 1
+ARMED_FLAG = 128
+_NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: a companion, a ground station
+_HEARTBEAT_US, _TIMESYNC_US, _PING_US, _REQUEST_US = 1_000_000, 50_000, 200_000, 500_000
+_REQUESTS = 4  # without an answer
+_STALE_US = 1_000_000
+_PREARM = 1 << 28  # MAV_SYS_STATUS_PREARM_CHECK
+_FRESH_US = 2_500_000  # a heartbeat older than this says nothing about armed
+_POLL_S = 0.005
+_ONCE = (mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
+ASKED = (  # for, one by one, when they do not come by themselves
+    *_ONCE,
+    mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE,
+    mavlink.MAVLINK_MSG_ID_SYS_STATUS,
+    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
+    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
+    mavlink.MAVLINK_MSG_ID_GPS_RAW_INT,
+    mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS,
+)
+
+
+class Newest(NamedTuple):
+    """A message and when it arrived."""
+
+    t_us: int
+    message: Any
+
+
+class Probe:
+    """One vehicle.
+
+    Args:
+        ear: its link, owned by the probe.
+        there: where to speak before anybody was heard.
+        wanted_sysid: the vehicle the configuration names; another one is taken when it is not heard.
+        names_of: parameters to read of an autopilot of this dialect.
+        seconds: how long to listen after its first heartbeat.
+        patience_s: how much longer to wait for a vehicle that is not ready to arm yet.
+    """
+
+    def __init__(
+        self,
+        ear: Ear,
+        there: Address,
+        wanted_sysid: int,
+        names_of: Callable[[Dialect], Sequence[str]],
+        seconds: float,
+        patience_s: float = 0.0,
+    ) -> None:
+        self.ear = ear
+        self.sysid = 0  # of the vehicle that is asked; 0 before its first heartbeat
+        self.began_us: int | None = None
+        self.mavlink1 = self.mavlink2 = 0
+        self.senders: set[Address] = set()
+        self.newest: dict[tuple[int, str], Newest] = {}
+        self.tallies: dict[int, FrameTally] = {}
+        self.answers: dict[str, list[Answer]] = {"TIMESYNC": [], "PING": []}
+        self.parameters: ParameterReader | None = None
+        self._there, self._wanted, self._names_of, self._seconds = there, wanted_sysid, names_of, seconds
+        self._patience_s = patience_s
+        self._codec = Codec(wanted_sysid, PROBE_COMPID)
+        self._due_us: dict[str, int] = {}
+        self._asked: dict[int, int] = {}
+        self._timesyncs: dict[int, int] = {}  # ts1 [ns] -> sent [us]
+        self._pings: dict[int, int] = {}  # seq -> sent [us]
+
+    # --- what is known ---
+
+    @property
+    def heard(self) -> bool:
+        """Whether an autopilot's heartbeat came."""
+        return self.began_us is not None
+
+    def listened_s(self, now_us: int) -> float:
+        return 0.0 if self.began_us is None else (now_us - self.began_us) * 1e-6
+
+    def finished(self, now_us: int) -> bool:
+        """Listened for long enough, and every parameter is read or given up."""
+        least_s = self._seconds if self._ready() else self._seconds + self._patience_s
+        if not self.heard or self.listened_s(now_us) < least_s:
+            return False
+        return self.parameters is None or self.parameters.settled
+
+    def message(self, name: str) -> Any | None:
+        """Newest message of a kind from the vehicle."""
+        found = self.newest.get((self.sysid, name))
+        return None if found is None else found.message
+
+    def autopilots(self) -> tuple[int, ...]:
+        """System ids that autopilots on this link have."""
+        return tuple(sorted(sysid for sysid, name in self.newest if name == "HEARTBEAT"))
+
+    def _ready(self) -> bool:
+        beat, health = self.message("HEARTBEAT"), self.message("SYS_STATUS")
+        if beat is not None and beat.base_mode & ARMED_FLAG:
+            return True
+        return health is not None and bool(health.onboard_control_sensors_health & _PREARM)
+
+    def may_change(self, now_us: int) -> bool:
+        """Whether the vehicle has said just now that it is disarmed."""
+        beat = self.newest.get((self.sysid, "HEARTBEAT"))
+        if beat is None or now_us - beat.t_us > _FRESH_US or self.sysid != self._wanted:
+            return False
+        return not beat.message.base_mode & ARMED_FLAG
+
+    # --- asking ---
+
+    def step(self, now_us: int) -> None:
+        """Take in what has arrived, and ask what is due."""
+        for heard in self.ear.receive():
+            self._take(heard)
+        if self._there == NOWHERE:
+            return
+        if self._due("heartbeat", now_us, _HEARTBEAT_US):
+            self._send(mavlink.MAVLink_heartbeat_message(18, _NO_AUTOPILOT, 0, 0, 4, 3))
+        if not self.heard:
+            return
+        if self._due("timesync", now_us, _TIMESYNC_US):
+            self._timesyncs[now_us * 1000] = monotonic_us()
+            self._send(mavlink.MAVLink_timesync_message(0, now_us * 1000))
+        if self._due("ping", now_us, _PING_US):
+            seq = len(self._pings) + 1
+            self._pings[seq] = monotonic_us()
+            self._send(mavlink.MAVLink_ping_message(now_us, seq, 0, 0))
+        if self._due("requests", now_us, _REQUEST_US):
+            self._request_missing(now_us)
+        if self.parameters is not None:
+            for message in self.parameters.step(now_us, self.may_change(now_us)):
+                self._send(message)
+
+    def set_parameters(self, values: Mapping[str, float | int]) -> None:
+        """Set these, one after the other, and read each back; only while the vehicle says that it is disarmed."""
+        assert self.parameters is not None
+        self.parameters.set_all(values)
+
+    def _request_missing(self, now_us: int) -> None:
+        for number in ASKED:
+            known = self.newest.get((self.sysid, mavlink.mavlink_map[number].msgname))
+            if known is not None and (number in _ONCE or now_us - known.t_us < _STALE_US):
+                self._asked.pop(number, None)
+                continue
+            if self._asked.get(number, 0) >= _REQUESTS:
+                continue
+            self._asked[number] = self._asked.get(number, 0) + 1
+            params = (float(number), *[0.0] * 6)
+            self._send(
+                mavlink.MAVLink_command_long_message(
+                    self.sysid, AUTOPILOT_COMPID, mavlink.MAV_CMD_REQUEST_MESSAGE, 0, *params
+                )
+            )
+
+    def _due(self, what: str, now_us: int, every_us: int) -> bool:
+        if now_us < self._due_us.get(what, 0):
+            return False
+        self._due_us[what] = now_us + every_us
+        return True
+
+    def _send(self, message: Any) -> None:
+        self.ear.send(self._codec.encode(message), self._there)
+
+    # --- listening ---
+
+    def _take(self, heard: Heard) -> None:
+        for frame in frames_of_any_version(heard.data):
+            if frame[0] == mavlink.PROTOCOL_MARKER_V1:
+                sysid, compid, seq = frame[3], frame[4], frame[2]
+            else:
+                sysid, compid, seq = frame[5], frame[6], frame[4]
+            if compid != AUTOPILOT_COMPID:
+                continue
+            message = self._codec.decode(frame)
+            if message is None and frame[0] == mavlink.PROTOCOL_MARKER_V1:
+                continue
+            self._count(frame, heard.sender)
+            tally = self.tallies.setdefault(sysid, FrameTally())
+            tally.frame(seq, len(frame))
+            if message is not None:
+                tally.message(message.get_type(), heard.t_us)
+                self._message(sysid, message, heard)
+
+    def _count(self, frame: bytes, sender: Address) -> None:
+        self.senders.add(sender)
+        if frame[0] == mavlink.PROTOCOL_MARKER_V1:
+            self.mavlink1 += 1
+        else:
+            self.mavlink2 += 1
+
+    def _message(self, sysid: int, message: Any, heard: Heard) -> None:
+        name = message.get_type()
+        if name == "HEARTBEAT":
+            if message.autopilot == _NO_AUTOPILOT:
+                return
+            self._choose(sysid, message.autopilot, heard)
+        self.newest[sysid, name] = Newest(heard.t_us, message)
+        if sysid != self.sysid:
+            return
+        if name == "TIMESYNC":
+            self._timesync(message, heard.t_us)
+        elif name == "PING":
+            sent_us = self._pings.get(message.seq) if message.target_component == PROBE_COMPID else None
+            if sent_us is not None:
+                self.answers["PING"].append(Answer(sent_us, heard.t_us, math.nan))
+        elif self.parameters is not None:
+            self.parameters.hear(message)
+
+    def _choose(self, sysid: int, autopilot: int, heard: Heard) -> None:
+        """The first autopilot, until the one the configuration names is heard."""
+        if self.sysid in (sysid, self._wanted):
+            return
+        if self.sysid and sysid != self._wanted:
+            return
+        self.sysid = sysid
+        self.began_us = heard.t_us if self.began_us is None else self.began_us
+        self._there = heard.sender
+        self._asked.clear()
+        self.answers = {"TIMESYNC": [], "PING": []}
+        self.parameters = None
+        dialect = DIALECTS.get(autopilot)
+        if dialect is not None:
+            self.parameters = ParameterReader(sysid, AUTOPILOT_COMPID, self._names_of(dialect), dialect)
+
+    def _timesync(self, message: Any, t_us: int) -> None:
+        sent_us = self._timesyncs.pop(message.ts1, None) if message.tc1 else None
+        if sent_us is not None:
+            self.answers["TIMESYNC"].append(Answer(sent_us, t_us, message.tc1 * 1e-3))
+
+
+def frames_of_any_version(datagram: bytes) -> Iterator[bytes]:
+    """Split a datagram into MAVLink 1 and 2 frames; the rest is dropped at the first surprise."""
+    start = 0
+    while start + 8 <= len(datagram):
+        if datagram[start] == mavlink.PROTOCOL_MARKER_V1:
+            end = start + 8 + datagram[start + 1]
+        elif datagram[start] == mavlink.PROTOCOL_MARKER_V2 and start + 12 <= len(datagram):
+            end = start + 12 + datagram[start + 1] + (13 if datagram[start + 2] & 1 else 0)
+        else:
+            return
+        if end > len(datagram):
+            return
+        yield datagram[start:end]
+        start = end
+
+
+def survey(probes: Sequence[Probe], connect_s: float, longest_s: float, ended: Callable[[], bool]) -> None:
+    """Ask all vehicles at once until each has finished, was not heard for `connect_s`, or `ended`."""
+    began_us = monotonic_us()
+    with selectors.DefaultSelector() as selector:
+        blind = False
+        for probe in probes:
+            fd = probe.ear.fd()
+            blind = blind or fd is None
+            if fd is not None:
+                selector.register(fd, selectors.EVENT_READ)
+        while not ended():
+            now_us = monotonic_us()
+            waited_s = (now_us - began_us) * 1e-6
+            open_probes = [p for p in probes if not (p.finished(now_us) or (not p.heard and waited_s > connect_s))]
+            if not open_probes or waited_s > longest_s:
+                return
+            for probe in probes:
+                probe.step(now_us)
+            if blind or not selector.get_map():
+                time.sleep(_POLL_S)
+            else:
+                selector.select(_POLL_S)

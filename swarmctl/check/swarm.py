@@ -1,0 +1,167 @@
+"""All vehicles together: ids, places against the start, and the whole judgement in one call. Pure."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections.abc import Callable, Sequence
+
+from swarmctl.check.finding import SWARM, Finding, Verdict
+from swarmctl.check.link_facts import Ned, VehicleFacts
+from swarmctl.check.parameters import parameter_findings
+from swarmctl.check.vehicle import vehicle_findings
+from swarmctl.config import Config
+from swarmctl.control.collision.separation import required_radius_m
+from swarmctl.core.types import Landed
+from swarmctl.errors import EXIT_MISSION, EXIT_OK, EXIT_START
+
+OK, NOTE, FIX = Verdict.OK, Verdict.NOTE, Verdict.FIX
+_FAR_M = 30.0  # from the start, horizontally: worth a look
+_CLIMB_LEAST_M = 0.5
+_SWAPPED_BY_M = 0.5  # what changing places would save, at least
+
+
+def findings(vehicles: Sequence[VehicleFacts], config: Config) -> list[Finding]:
+    """Every line of the check: each vehicle's, in order, then those about all of them."""
+    lines = [line for facts in vehicles for line in (*vehicle_findings(facts, config), *_own(facts, config))]
+    return lines + [line for judge in _SWARM_ROWS for line in judge(vehicles, config)]
+
+
+def exit_code(vehicles: Sequence[VehicleFacts], lines: Sequence[Finding]) -> int:
+    """0 nothing to fix; 3 a vehicle was not reached; 4 something to fix."""
+    if any(not facts.reached for facts in vehicles):
+        return EXIT_START
+    return EXIT_MISSION if any(line.verdict is FIX for line in lines) else EXIT_OK
+
+
+def standing(vehicles: Sequence[VehicleFacts]) -> list[Finding]:
+    """Who may not be flown from here on: armed, in the air, or never told where."""
+    advice = "somebody else flies it, or has left it armed: land and disarm it first"
+    return [
+        Finding(facts.agent, "to fly", FIX, "armed" if facts.armed else facts.landed.name.lower(), "on ground", advice)
+        for facts in vehicles
+        if facts.armed or facts.landed is not Landed.ON_GROUND
+    ]
+
+
+def _own(facts: VehicleFacts, config: Config) -> list[Finding]:
+    return [*_start(facts, config), *parameter_findings(facts, config)]
+
+
+def _start(facts: VehicleFacts, config: Config) -> list[Finding]:
+    """Where it stands against where it will wait."""
+    pos = facts.pos_ned_m
+    if pos is None:
+        return []
+    start = config.starts_ned_m()[facts.agent]
+    away_m, climb_m = math.dist(pos[:2], start[:2]), pos[2] - start[2]
+
+    def line(verdict: Verdict, advice: str = "", weight: int = 0) -> list[Finding]:
+        found = f"{away_m:.2f} m beside it, {climb_m:+.2f} m below"
+        return [Finding(facts.agent, "start", verdict, found, _place(start), advice, weight)]
+
+    if facts.landed is Landed.ON_GROUND and climb_m < _CLIMB_LEAST_M:
+        advice = (
+            f"its start is less than {_CLIMB_LEAST_M} m above the ground it stands on: raise the start (NED, down is "
+            "positive) or correct swarm.origin_alt_m"
+        )
+        return line(FIX, advice, 77)
+    sequence = config.agent.sequence
+    if away_m / sequence.speed_m_s > sequence.start_timeout_s:
+        advice = f"it can't get there within agent.sequence.start_timeout_s = {sequence.start_timeout_s:g}: move it"
+        return line(FIX, advice, 76)
+    if away_m > _FAR_M:
+        return line(NOTE, "far from its start; is the way there free?", 6)
+    return line(OK)
+
+
+def _duplicates(vehicles: Sequence[VehicleFacts], config: Config) -> list[Finding]:
+    lines = []
+    for a, b in itertools.combinations([v for v in vehicles if v.reached], 2):
+        if a.sysid == b.sysid:
+            advice = f"agents {a.agent} and {b.agent} would command the same id: give each autopilot its own"
+            lines.append(Finding(SWARM, "system ids", FIX, f"{a.sysid} twice", "all different", advice, 96))
+        elif a.version and b.version and a.version.uid == b.version.uid and a.version.has_usb:
+            advice = f"agents {a.agent} and {b.agent} are connected to the same board"
+            lines.append(Finding(SWARM, "system ids", FIX, f"uid {a.version.uid} twice", "all different", advice, 96))
+    return lines
+
+
+def _origins(vehicles: Sequence[VehicleFacts], config: Config) -> list[Finding]:
+    """Each vehicle has its own local frame; agents convert, so the spread itself is harmless."""
+    known = [v.origin_ned_m for v in vehicles if v.origin_ned_m is not None]
+    if len(known) < 2:
+        return []
+    spread_m = max(math.dist(a, b) for a, b in itertools.combinations(known, 2))
+    return [Finding(SWARM, "origins", OK, f"up to {spread_m:.2f} m apart", "any; agents convert")]
+
+
+def _apart(vehicles: Sequence[VehicleFacts], config: Config) -> list[Finding]:
+    """Horizontally: the autopilots climb on the spot, before the agents keep them apart."""
+    placed = [(v.agent, v.pos_ned_m) for v in vehicles if v.pos_ned_m is not None]
+    if len(placed) < 2:
+        return []
+    radius_m = config.separation.radius_m
+    pairs = [(math.dist(p[:2], q[:2]), i, j) for (i, p), (j, q) in itertools.combinations(placed, 2)]
+    close = sorted(pair for pair in pairs if pair[0] < radius_m)
+    wanted = f"separation.radius_m = {radius_m:g}"
+    if not close:
+        return [Finding(SWARM, "distances", OK, f"least {min(pairs)[0]:.2f} m", wanted)]
+    return [
+        Finding(
+            SWARM,
+            "distances",
+            FIX,
+            f"agents {i} and {j}: {away_m:.2f} m",
+            wanted,
+            f"vehicles of agents {i} and {j} stand closer than they may fly; move them apart",
+            80,
+        )
+        for away_m, i, j in close
+    ]
+
+
+def _radius(vehicles: Sequence[VehicleFacts], config: Config) -> list[Finding]:
+    """The distance kept, against what bodies, tracking and the least accurate estimator need."""
+    told = [v.pos_accuracy_m for v in vehicles if v.pos_accuracy_m is not None]
+    if len(vehicles) < 2 or not told:
+        return []
+    separation = config.separation
+    least_m = math.ceil(required_radius_m(separation, max(told)) * 100) / 100
+    found = f"separation.radius_m = {separation.radius_m:g}"
+    wanted = (
+        f"{least_m:.2f} m: body {separation.body_m:g}, tracking {separation.tracking_m:g}, estimator {max(told):.2f}"
+    )
+    if separation.radius_m >= least_m:
+        return [Finding(SWARM, "radius", OK, found, wanted)]
+    advice = f"bodies may touch where estimates say they are apart: set separation.radius_m = {least_m:.2f}"
+    if separation.allow_small_radius:
+        return [Finding(SWARM, "radius", NOTE, found, wanted, advice, 9)]
+    return [Finding(SWARM, "radius", FIX, found, wanted, f"{advice}; agents refuse to arm", 79)]
+
+
+def _swapped(vehicles: Sequence[VehicleFacts], config: Config) -> list[Finding]:
+    """Pairs whose ways to the start would be shorter if they changed places."""
+    starts = config.starts_ned_m()
+    placed = [(v.agent, v.pos_ned_m) for v in vehicles if v.pos_ned_m is not None]
+    lines = []
+    for (i, p), (j, q) in itertools.combinations(placed, 2):
+        straight_m = math.dist(p[:2], starts[i][:2]) + math.dist(q[:2], starts[j][:2])
+        crossed_m = math.dist(p[:2], starts[j][:2]) + math.dist(q[:2], starts[i][:2])
+        if crossed_m + _SWAPPED_BY_M < straight_m:
+            advice = f"vehicles of agents {i} and {j} stand nearer to each other's start: change their order, or place"
+            lines.append(Finding(SWARM, "order", NOTE, f"agents {i} and {j}", "each nearest its own start", advice, 6))
+    return lines
+
+
+def _place(pos_ned_m: Ned) -> str:
+    return "(" + ", ".join(f"{c:.1f}" for c in pos_ned_m) + ")"
+
+
+_SWARM_ROWS: tuple[Callable[[Sequence[VehicleFacts], Config], list[Finding]], ...] = (
+    _duplicates,
+    _origins,
+    _apart,
+    _radius,
+    _swapped,
+)

@@ -1,0 +1,98 @@
+"""What a check shows: one table, a block for each vehicle; what to fix, the worst first; and the same as JSON."""
+
+from __future__ import annotations
+
+import dataclasses
+import enum
+import json
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from swarmctl.bus.peers import agent_name
+from swarmctl.check.change import Change
+from swarmctl.check.finding import SWARM, Finding, Verdict, worst_first
+from swarmctl.check.link_facts import VehicleFacts
+from swarmctl.core.text import printable
+
+_LINE = 2000  # characters of one thing to fix
+_COLUMNS = ("vehicle", "what", "found", "wanted", "verdict")
+_STYLES = {Verdict.OK: "green", Verdict.NOTE: "yellow", Verdict.FIX: "bold red"}
+
+
+def print_check(vehicles: Sequence[VehicleFacts], lines: Sequence[Finding], changes: Sequence[Change]) -> None:
+    """On standard output: a drawn table on a terminal, tab-separated lines anywhere else."""
+    console = Console(highlight=False)
+    if console.is_terminal:
+        console.print(_drawn(lines))
+    else:
+        print("\t".join(_COLUMNS))
+        for line in lines:
+            print("\t".join(_cells(line)))
+    for text in _after_table(vehicles, lines, changes):
+        console.print(printable(text, _LINE), markup=False, soft_wrap=True)
+
+
+def as_json(vehicles: Sequence[VehicleFacts], lines: Sequence[Finding], changes: Sequence[Change], code: int) -> str:
+    """Everything a program may want, findings in the order of the table."""
+    tree = {
+        "exit_code": code,
+        "vehicles": [_plain(dataclasses.asdict(v)) for v in vehicles],
+        "findings": [_plain(dataclasses.asdict(line)) for line in lines],
+        "changes": [_plain({**dataclasses.asdict(c), "done": c.done}) for c in changes],
+    }
+    return json.dumps(tree, indent=1, allow_nan=False) + "\n"
+
+
+def _drawn(lines: Sequence[Finding]) -> Table:
+    table = Table(*_COLUMNS)
+    before = None
+    for line in lines:
+        if before is not None and line.agent != before:
+            table.add_section()
+        first, *middle, verdict = _cells(line)
+        name = Text(first if line.agent != before else "")  # not markup: vehicles may say "[...]"
+        table.add_row(name, *map(Text, middle), Text(verdict, style=_STYLES[line.verdict]))
+        before = line.agent
+    return table
+
+
+def _cells(line: Finding) -> tuple[str, ...]:
+    words = (line.topic, line.found, line.wanted, line.verdict.name.lower())
+    return _who(line.agent), *(printable(word) for word in words)
+
+
+def _who(agent: int) -> str:
+    return "swarm" if agent == SWARM else agent_name(agent)
+
+
+def _after_table(vehicles: Sequence[VehicleFacts], lines: Sequence[Finding], changes: Sequence[Change]) -> list[str]:
+    texts = [f"{agent_name(change.agent)} {change.in_words()}" for change in changes]
+    found = worst_first(lines)
+    alike: dict[tuple[Verdict, str], list[str]] = {}  # one text for all it is true of
+    for line in found:
+        said = f"{line.topic}: {line.found}. {line.advice}"
+        alike.setdefault((line.verdict, said), []).append(_who(line.agent))
+    texts += [f"{verdict.name.lower():4} {', '.join(who)} {said}" for (verdict, said), who in alike.items()]
+    to_fix = sum(line.verdict is Verdict.FIX for line in found)
+    reached = sum(v.reached for v in vehicles)
+    rest = f"{to_fix} to fix" if to_fix else "nothing to fix"
+    texts.append(f"{reached} of {len(vehicles)} vehicles reached, {rest}, {len(found) - to_fix} to know")
+    return texts
+
+
+def _plain(value: Any) -> Any:
+    """For JSON: enums by name, no infinities."""
+    if isinstance(value, enum.Enum):
+        return value.name
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    if isinstance(value, Mapping):
+        return {str(key): _plain(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return value

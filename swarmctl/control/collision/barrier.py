@@ -1,0 +1,280 @@
+"""The last layer: a control-barrier filter on the acceleration that is about to be commanded.
+
+It knows nothing of horizons, rows or certificates, and shares no code with them: from where everybody will be when the
+command acts, it changes the command as little as possible such that bodies can still be kept apart by braking. For
+every pair with distance r, r' its rate and D the distance of touching bodies plus a margin, the approach may be no
+faster than
+
+    v(d) = k d                          for d = r + react r' - D below a / k^2,
+           sqrt(2 a (d - a / 2 k^2))    beyond,
+
+which leaves room to stop at D with the braking `a` of both; h = r' + v(d) >= 0 is made a barrier by h' >= -gain h.
+That is a half-plane of accelerations for each pair, and both of a pair take half of it (U. Borrmann, L. Wang, A. Ames,
+M. Egerstedt 2015; L. Wang, A. Ames, M. Egerstedt 2017). What does not filter itself, an obstacle, a silent peer or one
+that its autopilot flies, is left all of it. Of accelerations that keep every half-plane and the airframe's bounds the
+nearest to the wanted one is flown; where there is none, the one that lacks least.
+
+What is guaranteed: bodies that are apart stay apart, as long as every one of a pair brakes with `brake_m_s2`, positions
+and velocities are within `margin_m` together with what the prediction over dead time and lag is off by, and h >= 0 to
+begin with. Several neighbours at once may ask for more than the airframe has; then the largest lack is least.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from pydantic import Field
+
+from swarmctl.control.collision.projection import Row, Vector, nearest_or_least_violating
+from swarmctl.control.lag import Lag
+from swarmctl.control.model import VehicleModelParams
+from swarmctl.control.mpc.problem import Start
+from swarmctl.core.frames import GRAVITY_M_S2
+from swarmctl.core.params import Params
+from swarmctl.core.types import Array, Obstacle, PredictedPath
+
+_TINY = 1e-6
+_LACK_WEIGHT = 100.0  # more would trade all of the thrust for a trace of distance
+_LAG_STEP_S = 1e-3
+_LIFT_M_S2 = 2.5  # thrust may be changed by: without lift there is no braking either
+_FARTHEST_M_S2 = 40.0  # a row that is kept by any acceleration
+
+
+class BarrierParams(Params):
+    """When the last layer acts, and how hard."""
+
+    enabled: bool = True
+    margin_m: float = Field(0.05, ge=0, le=10)  # beyond touching bodies
+    brake_m_s2: float = Field(4.0, gt=0, le=20)  # of one vehicle, level; more is left for the rest
+    near_1_s: float = Field(6.0, gt=0, le=50)  # k: approach allowed per metre left, close by
+    gain_1_s: float = Field(6.0, gt=0, le=50)  # how fast the allowed approach may be neared
+    react_s: float = Field(0.045, ge=0, le=1)  # of approaching on while the airframe turns to brake
+    escape_m_s: float = Field(0.5, ge=0, le=10)  # parting asked for when closer than allowed
+    slew_1_s: float = Field(2.5, gt=0, le=50)  # of (u_x, u_y): a faster turn would saturate rotors and be lost
+
+
+@dataclass(frozen=True, slots=True)
+class Body:
+    """Something not to touch, when the command acts."""
+
+    pos_ned_m: Vector  # (3,)
+    vel_ned_m_s: Vector  # (3,)
+    apart_m: float  # of centres
+    share_01: float  # of keeping apart that is ours
+    column: bool = False  # of any height
+    solid: bool = False  # without downwash
+
+
+def body_of_peer(
+    path: PredictedPath,
+    act_utc_us: int,
+    ahead_s: float,
+    apart_m: float,
+    growth_m_s2: float,
+    growth_max_m: float,
+    filters: bool,
+    brake_m_s2: float,
+) -> Body:
+    """A peer on its newest path.
+
+    Args:
+        path: positions; beyond its end it is taken to brake.
+        act_utc_us: when the own command arrives at the vehicle.
+        ahead_s: after that, when it is felt.
+        apart_m: centres of two vehicles that touch, and the margin.
+        growth_m_s2: what it may have accelerated beside its path since.
+        growth_max_m: limit of that.
+        filters: it does its half.
+        brake_m_s2: how it is taken to stop, as plans take it: whom this layer alone sees nothing plans a way round.
+    """
+    age_s = max(0.0, (act_utc_us - path.t0_utc_us) * 1e-6)
+    points, dt_s = path.pos_ned_m, path.dt_us * 1e-6
+    at = ((act_utc_us - path.t0_utc_us) * 1e-6 + ahead_s) / dt_s
+    last = len(points) - 1
+    grown_m = apart_m + path.radius_m + min(0.5 * growth_m_s2 * age_s * age_s, growth_max_m)
+    share_01 = 0.5 if filters else 1.0
+    if at >= last:
+        a, b = points[last - 1].tolist(), points[last].tolist()
+        pos, vel = _braked(b, tuple((q - p) / dt_s for p, q in zip(a, b, strict=True)), (at - last) * dt_s, brake_m_s2)
+        return Body(pos, vel, grown_m, share_01)
+    low = max(0, int(at))
+    a, b = points[low].tolist(), points[low + 1].tolist()
+    part = at - low
+    pos = tuple(p + part * (q - p) for p, q in zip(a, b, strict=True))
+    vel = tuple((q - p) / dt_s for p, q in zip(a, b, strict=True))
+    return Body(pos, vel, grown_m, share_01)
+
+
+def _braked(pos: Vector, vel: Vector, t_s: float, brake_m_s2: float) -> tuple[Vector, Vector]:
+    stop_s = math.sqrt(_dot(vel, vel)) / brake_m_s2
+    done_01 = t_s / stop_s if t_s < stop_s else 1.0
+    moved_s = stop_s * done_01 * (1.0 - 0.5 * done_01)  # at the first speed
+    return tuple(p + moved_s * v for p, v in zip(pos, vel, strict=True)), tuple((1.0 - done_01) * v for v in vel)
+
+
+def body_of_obstacle(obstacle: Obstacle, ahead_s: float, apart_m: float) -> Body:
+    """An obstacle `ahead_s` from now, at constant velocity; `apart_m` from its surface to the own centre."""
+    vel = obstacle.vel_ned_m_s.tolist()
+    pos = tuple(p + ahead_s * v for p, v in zip(obstacle.center_ned_m.tolist(), vel, strict=True))
+    return Body(pos, tuple(vel), obstacle.radius_m + apart_m, 1.0, obstacle.column, True)
+
+
+class Barrier:
+    """The filter of one vehicle.
+
+    Args:
+        params: when and how hard.
+        vehicle: bounds, lag and drag.
+        dt_s: between two commands.
+        downwash: vertical distances count this many times less.
+    """
+
+    def __init__(self, params: BarrierParams, vehicle: VehicleModelParams, dt_s: float, downwash: float = 1.0) -> None:
+        self._params, self._vehicle, self._down_01 = params, vehicle, 1.0 / downwash
+        self._slew = params.slew_1_s * dt_s
+        lag = vehicle.lag()
+        self.ahead_s = 0.0 if lag is None else lag.ramp_delay_s  # from acting to being felt
+        self._responses = _responses(lag, vehicle.drag_1_s, self.ahead_s)
+
+    def filtered(
+        self, virtual: Array, start: Start, disturbance_ned_m_s2: Array, hover_thrust_01: float, bodies: Sequence[Body]
+    ) -> Array | None:
+        """The virtual controls (3,) to fly in place of `virtual`; None when those will do.
+
+        Args:
+            virtual: u_x, u_y, thrust over mass, wanted.
+            start: own state when they act.
+            disturbance_ned_m_s2: (3,).
+            hover_thrust_01: scales the bounds of thrust.
+            bodies: when they are felt.
+        """
+        if not bodies or not np.isfinite(virtual).all():
+            return None
+        pos, vel = self._felt(start, disturbance_ned_m_s2)
+        ux, uy, thrust = virtual.tolist()
+        upright = math.sqrt(max(0.0, 1.0 - ux * ux - uy * uy))
+        wanted = (thrust * ux, thrust * uy, thrust * upright)  # thrust vector over mass, up is +
+        dx, dy, dz = disturbance_ned_m_s2.tolist()
+        drag = self._vehicle.drag_1_s
+        rest = (dx - drag * vel[0], dy - drag * vel[1], GRAVITY_M_S2 + dz - drag * vel[2])  # acceleration without it
+        rows = [row for body in bodies if (row := self._row(body, pos, vel, rest)) is not None]
+        if all(_dot(normal, wanted) >= offset for normal, offset in rows):
+            return None
+        rows.sort(key=lambda row: _dot(row[0], wanted) - row[1])  # what is lacking most, first: fewer are active after
+        turns = [self._turn(u, held) for u, held in zip((ux, uy), start.virtual.tolist(), strict=False)]
+        bounds = self._bounds(wanted, thrust, turns, hover_thrust_01)
+        lift = nearest_or_least_violating(wanted, rows, bounds, _LACK_WEIGHT)
+        size = math.sqrt(_dot(lift, lift))
+        if size < _TINY:
+            return None
+        flown = [min(most, max(least, f / size)) for f, (least, most) in zip(lift, turns, strict=False)]
+        return np.array([*flown, size])
+
+    def _felt(self, start: Start, disturbance_ned_m_s2: Array) -> tuple[Vector, Vector]:
+        """Own position and velocity when a command of now is felt, under what is commanded already."""
+        pos, vel = start.pos_ned_m.tolist(), start.vel_ned_m_s.tolist()
+        if not self.ahead_s:
+            return tuple(pos), tuple(vel)
+        r, held, d = self._responses, start.virtual.tolist(), disturbance_ned_m_s2.tolist()
+        pushed = [[0.0, 0.0], [0.0, 0.0], [0.0, 0.0]]
+        for i in (0, 1):
+            tilt, rate = float(start.tilt[i]), float(start.tilt_rate_1_s[i])
+            for k in (0, 1):
+                acts = tilt * r.of_tilt[k] + rate * r.of_rate[k] + held[i] * r.of_command[k]
+                pushed[i][k] = d[i] * r.of_accel[k] - held[2] * acts
+        down_m_s2 = GRAVITY_M_S2 + d[2] - held[2] * start.cos_tilt
+        pushed[2] = [down_m_s2 * r.of_accel[0], down_m_s2 * r.of_accel[1]]
+        return (
+            tuple(p + r.of_velocity[0] * v + x[0] for p, v, x in zip(pos, vel, pushed, strict=True)),
+            tuple(r.of_velocity[1] * v + x[1] for v, x in zip(vel, pushed, strict=True)),
+        )
+
+    def _row(self, body: Body, pos: Vector, vel: Vector, rest: Vector) -> Row | None:
+        """`normal . thrust vector >= offset` of one body; None when it is too far to matter."""
+        p, (bx, by, bz), (bu, bv, bw) = self._params, body.pos_ned_m, body.vel_ned_m_s
+        down_01 = 0.0 if body.column else 1.0 if body.solid else self._down_01
+        x, y, z = pos[0] - bx, pos[1] - by, down_01 * (pos[2] - bz)
+        u, v, w = vel[0] - bu, vel[1] - bv, down_01 * (vel[2] - bw)
+        speed2 = u * u + v * v + w * w
+        distance = math.sqrt(x * x + y * y + z * z)
+        if distance > _TINY:
+            nx, ny, nz = x / distance, y / distance, z / distance
+        else:  # one inside the other: back to where each came from
+            size = math.sqrt(speed2) + _TINY
+            nx, ny, nz = -u / size, -v / size, -w / size
+        rate = nx * u + ny * v + nz * w
+        react_s = p.react_s if rate < 0.0 else 0.0
+        left, brake = distance + react_s * rate - body.apart_m, p.brake_m_s2 / body.share_01
+        bend = brake / p.near_1_s**2
+        if left > bend:
+            allowed = math.sqrt(2.0 * brake * (left - 0.5 * bend))
+            slope = brake / allowed
+        else:
+            allowed, slope = p.near_1_s * left, p.near_1_s
+            if allowed < -p.escape_m_s:
+                allowed, slope = -p.escape_m_s, 0.0
+        turning = (speed2 - rate * rate) / max(distance, 0.5 * body.apart_m)  # r'' of passing by
+        need = -(slope * rate + p.gain_1_s * (rate + allowed)) / (1.0 + slope * react_s) - turning  # least r''
+        if need < -_FARTHEST_M_S2:
+            return None
+        nz *= down_01
+        return (-nx, -ny, -nz), body.share_01 * need - (nx * rest[0] + ny * rest[1] + nz * rest[2])
+
+    def _turn(self, wanted: float, held: float) -> tuple[float, float]:
+        """Least and largest u of an axis from what is held now, the wanted one always among them."""
+        most = self._vehicle.u_max()
+        return min(wanted, max(-most, held - self._slew)), max(wanted, min(most, held + self._slew))
+
+    def _bounds(
+        self, wanted: Vector, thrust_m_s2: float, turns: Sequence[tuple[float, float]], hover_thrust_01: float
+    ) -> list[Row]:
+        """Rows of what the airframe can do."""
+        model, full = self._vehicle, GRAVITY_M_S2 / hover_thrust_01
+        least = max(wanted[2] - _LIFT_M_S2, min(wanted[2], model.thrust_min_01 * full))
+        most = min(wanted[2] + _LIFT_M_S2, max(wanted[2], model.thrust_max_01 * full))
+        spans = [*((thrust_m_s2 * low, thrust_m_s2 * high) for low, high in turns), (least, most)]
+        rows: list[Row] = []
+        for i, (low, high) in enumerate(spans):
+            axis = tuple(1.0 if k == i else 0.0 for k in range(3))
+            rows.append((axis, low))
+            rows.append((tuple(-c for c in axis), -high))
+        return rows
+
+
+@dataclass(frozen=True, slots=True)
+class _Responses:
+    """Displacement and velocity over a fixed time of unit starts and of a unit acceleration."""
+
+    of_velocity: tuple[float, float]
+    of_accel: tuple[float, float]
+    of_tilt: tuple[float, float]  # of tilt at the start alone, thrust over mass 1
+    of_rate: tuple[float, float]
+    of_command: tuple[float, float]
+
+
+def _responses(lag: Lag | None, drag_1_s: float, for_s: float) -> _Responses:
+    starts = ((0, 0, 0, 1, 0), (0, 0, 0, 0, 1), (1, 0, 0, 0, 0), (0, 1, 0, 0, 0), (0, 0, 1, 0, 0))
+    return _Responses(*(_moved(lag, drag_1_s, for_s, *map(float, s)) for s in starts))
+
+
+def _moved(
+    lag: Lag | None, drag_1_s: float, for_s: float, tilt: float, rate: float, command: float, vel: float, accel: float
+) -> tuple[float, float]:
+    pos = 0.0
+    if lag is None:
+        return pos, vel
+    steps = max(1, round(for_s / _LAG_STEP_S))
+    dt_s = for_s / steps
+    for _ in range(steps):
+        tilt, rate, integral = lag.advance(tilt, rate, command, dt_s)
+        gained = vel + integral + dt_s * (accel - drag_1_s * vel)
+        pos += 0.5 * dt_s * (vel + gained)
+        vel = gained
+    return pos, vel
+
+
+def _dot(a: Vector, b: Vector) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

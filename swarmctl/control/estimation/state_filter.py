@@ -1,0 +1,160 @@
+"""Kalman filter on what an autopilot reports: position, velocity, bias of the reported velocity, and disturbance.
+
+An EKF that fuses GPS reports a velocity that is biased against its own position by 0.1 to 0.3 m/s, wandering over
+seconds; a controller that believes it circles beside its reference. Per axis, with the model's acceleration `a` of the
+measured attitude and the thrust that acts,
+
+    p' = v,   v' = a + d - drag v + w_a,   b' = -b / T_b + w_b,   d' = w_d,      measured: p + n_p,  v + b + n_v.
+
+The axes share one covariance, because their noises are equal and samples come for all at once. While somebody else
+flies, the acceleration is unknown: it is then noise, and d is left alone.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import replace
+
+import numpy as np
+from pydantic import Field
+
+from swarmctl.control.estimation.disturbance import DisturbanceParams, Estimate, HoverThrust
+from swarmctl.control.model import VehicleModelParams
+from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned
+from swarmctl.core.params import Params
+from swarmctl.core.types import VehicleState
+
+_POS, _VEL, _BIAS, _DIST = range(4)
+_STALE_US = 200_000
+_UNKNOWN_M_S2 = 3.0  # acceleration while somebody else flies
+_FIRST_M_S2 = 1.0  # disturbance at take-over, one sigma
+
+
+class StateFilterParams(Params):
+    """One sigma of what is wrong with an autopilot's estimate; off for exact states."""
+
+    enabled: bool = False
+    pos_m: float = Field(0.02, gt=0, le=10)  # noise of a reported position
+    vel_m_s: float = Field(0.05, gt=0, le=10)  # noise of a reported velocity
+    bias_m_s: float = Field(0.2, ge=0, le=10)  # wandering bias of it
+    bias_time_s: float = Field(4.0, gt=0, le=600)  # correlation time of that bias
+    accel_m_s2: float = Field(0.5, gt=0, le=20)  # what the model misses, white, over one second
+    disturbance_m_s2: float = Field(0.5, gt=0, le=20)  # growth of the disturbance over one second
+    jump_m: float = Field(1.0, gt=0, le=100)  # a reported position farther off begins anew: the estimator was reset
+
+
+class StateFilter:
+    """See the module.
+
+    Args:
+        params: noises.
+        disturbance: limits and the hover thrust's time constant, shared with the observer.
+        model: drag, dead time, first hover thrust.
+    """
+
+    def __init__(self, params: StateFilterParams, disturbance: DisturbanceParams, model: VehicleModelParams) -> None:
+        self._params, self._limit_m_s2 = params, disturbance.limit_m_s2
+        self._drag_1_s, self._delay_us = model.drag_1_s, round(model.delay_s * 1e6)
+        self._hover = HoverThrust(model.hover_thrust_01, disturbance.hover_time_s)
+        self._thrusts: deque[tuple[int, float]] = deque(maxlen=256)  # time it was sent, thrust 0..1
+        self._mean = np.zeros((4, 3))
+        self._covariance = np.zeros((4, 4))
+        self._t_us: int | None = None
+
+    @property
+    def estimate(self) -> Estimate:
+        return Estimate(self._mean[_DIST].copy(), self._hover.value_01)
+
+    def reset(self) -> None:
+        """Begin to estimate the disturbance: from now on it is known what acts."""
+        self._mean[_DIST] = 0.0
+        self._covariance[_DIST] = self._covariance[:, _DIST] = 0.0
+        self._covariance[_DIST, _DIST] = _FIRST_M_S2**2
+        self._thrusts.clear()
+
+    def learn_hover(self, thrust_01: float) -> None:
+        """See `HoverThrust.learn`."""
+        self._hover.learn(thrust_01)
+
+    def update(self, state: VehicleState, thrust_01: float | None) -> Estimate:
+        """Take in one new sample; `thrust_01` is what is being sent, None while somebody else flies."""
+        if thrust_01 is not None:
+            self._thrusts.append((state.t_us, thrust_01))
+        if self._t_us is None or not 0 < state.t_us - self._t_us < _STALE_US or self._jumped(state):
+            self._begin(state)
+            return self.estimate
+        dt_s = (state.t_us - self._t_us) * 1e-6
+        self._t_us = state.t_us
+        acted_01 = None if thrust_01 is None else self._acting(state.t_us, thrust_01)
+        self._predict(state, acted_01, dt_s)
+        self._correct(state)
+        if acted_01 is not None:
+            self._mean[_DIST, 2] -= self._hover.explain(float(self._mean[_DIST, 2]), acted_01, dt_s)
+            np.clip(self._mean[_DIST], -self._limit_m_s2, self._limit_m_s2, out=self._mean[_DIST])
+        return self.estimate
+
+    def state(self, reported: VehicleState) -> VehicleState:
+        """The state to plan from: filtered position and velocity, as old as the sample."""
+        if self._t_us != reported.t_us:
+            return reported
+        return replace(reported, pos_ned_m=self._mean[_POS].copy(), vel_ned_m_s=self._mean[_VEL].copy())
+
+    def _begin(self, state: VehicleState) -> None:
+        p = self._params
+        self._t_us = state.t_us
+        disturbance, spread = self._mean[_DIST].copy(), self._covariance[_DIST, _DIST]
+        self._mean = np.stack([state.pos_ned_m, state.vel_ned_m_s, np.zeros(3), disturbance])
+        velocity = p.vel_m_s**2 + p.bias_m_s**2
+        self._covariance = np.diag([p.pos_m**2, velocity, p.bias_m_s**2, spread])
+        self._covariance[_VEL, _BIAS] = self._covariance[_BIAS, _VEL] = -(p.bias_m_s**2)
+
+    def _jumped(self, state: VehicleState) -> bool:
+        off = state.pos_ned_m - self._mean[_POS]
+        return float(off @ off) > self._params.jump_m**2
+
+    def _acting(self, t_us: int, newest_01: float) -> float:
+        """Thrust that has passed the dead time at `t_us`."""
+        acting_01 = newest_01 if not self._thrusts else self._thrusts[0][1]
+        while self._thrusts and self._thrusts[0][0] + self._delay_us <= t_us:
+            acting_01 = self._thrusts[0][1]
+            if len(self._thrusts) == 1 or self._thrusts[1][0] + self._delay_us > t_us:
+                break
+            self._thrusts.popleft()
+        return acting_01
+
+    def _predict(self, state: VehicleState, thrust_01: float | None, dt_s: float) -> None:
+        p, noise_m_s2 = self._params, self._params.accel_m_s2
+        model, drag_1_s, walk = np.zeros(3), self._drag_1_s, p.disturbance_m_s2
+        if thrust_01 is None:
+            noise_m_s2, drag_1_s, walk = _UNKNOWN_M_S2, 0.0, 0.0
+        else:
+            model = -(thrust_01 * GRAVITY_M_S2 / self._hover.value_01) * body_z_ned(state.q_nb)
+            model[2] += GRAVITY_M_S2
+        kept = max(0.0, 1.0 - dt_s / p.bias_time_s)
+        push = 0.0 if thrust_01 is None else dt_s
+        f = np.eye(4)
+        f[_POS, _VEL] = dt_s
+        f[_VEL, _VEL], f[_VEL, _DIST] = 1.0 - drag_1_s * dt_s, push
+        f[_BIAS, _BIAS] = kept
+        mean = f @ self._mean
+        accel = model - drag_1_s * self._mean[_VEL] + (push / dt_s) * self._mean[_DIST]
+        mean[_POS] += 0.5 * dt_s * dt_s * accel
+        mean[_VEL] += dt_s * model
+        self._mean = mean
+        q = np.diag([0.0, noise_m_s2**2 * dt_s, (1.0 - kept * kept) * p.bias_m_s**2, walk**2 * dt_s])
+        q[_POS, _POS] = (0.5 * dt_s) ** 2 * q[_VEL, _VEL]
+        self._covariance = f @ self._covariance @ f.T + q
+
+    def _correct(self, state: VehicleState) -> None:
+        p = self._params
+        innovation = np.stack(
+            [state.pos_ned_m - self._mean[_POS], state.vel_ned_m_s - self._mean[_VEL] - self._mean[_BIAS]]
+        )
+        seen = np.stack([self._covariance[_POS], self._covariance[_VEL] + self._covariance[_BIAS]])  # (2, 4) H P
+        spread = np.stack([seen[:, _POS], seen[:, _VEL] + seen[:, _BIAS]], axis=1)
+        spread[0, 0] += p.pos_m**2
+        spread[1, 1] += p.vel_m_s**2
+        gain = np.linalg.solve(spread, seen).T  # (4, 2)
+        self._mean = self._mean + gain @ innovation
+        self._covariance = self._covariance - gain @ seen
+        self._covariance = 0.5 * (self._covariance + self._covariance.T)

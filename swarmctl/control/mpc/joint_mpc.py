@@ -1,0 +1,100 @@
+"""One MPC for the three axes (thesis 5.2: "mitigate the perceived bias towards the z axis"): keeping clear in space.
+
+The same axes, weights and bounds as `swarmctl.control.mpc.swarm_mpc`, but z, x and y are one problem, so that an agent
+may pass above or below what it must keep clear of. The products f u_x and f u_y are linearised by solving twice, the
+second time with the thrust f that the first has planned; the path that is certified and shared is the motion under the
+products themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+
+from swarmctl.control.collision.separation import SeparationParams
+from swarmctl.control.model import VehicleModelParams
+from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, HalfSpaces, Penalties
+from swarmctl.control.mpc.condensed import CondensedMpc
+from swarmctl.control.mpc.problem import Problem
+from swarmctl.control.mpc.swarm_mpc import MpcParams, first_guess, judged, near_half_spaces, planned
+from swarmctl.core.frames import GRAVITY_M_S2
+from swarmctl.core.types import Array, Plan
+
+_TIGHTER_01 = 0.1  # of the solver's tolerance: z, whose increments are ten times larger, sets the scale of the cost
+_THRUST_LEAST_M_S2 = 1.0  # without thrust tilting would have no effect at all
+
+
+class JointMpc:
+    """x, y and z together with half-spaces, then a certificate over true distances."""
+
+    def __init__(
+        self,
+        params: MpcParams,
+        vehicle: VehicleModelParams,
+        separation: SeparationParams,
+        own_tie: int,
+        slots: int,
+        stopwatch_ns: Callable[[], int],
+    ) -> None:
+        self._params, self._separation, self._tie, self._slots = params, separation, own_tie, slots
+        self._stopwatch_ns = stopwatch_ns
+        self.dt_us = round(params.dt_s * 1e6)
+        self.steps = self.longest = params.horizon_xy
+        eps, eps_relative = _TIGHTER_01 * params.qp.eps, _TIGHTER_01 * params.qp.eps_relative
+        self._mpc = CondensedMpc(
+            (*params.horizontal(vehicle), params.vertical()),
+            params.horizon(params.control_xy, params.horizon_xy, vehicle),
+            slots,
+            separation.relax_01,
+            Penalties(),
+            params.qp.model_copy(update={"eps": eps, "eps_relative": eps_relative}),
+            stopwatch_ns,
+        )
+
+    def plan(self, problem: Problem) -> Plan:
+        """One step of distributed MPC. Never raises for an infeasible problem; the status says what may be flown."""
+        began_ns = self._stopwatch_ns()
+        guess = first_guess(problem, self._params.dt_s, self.steps)
+        near = partial(near_half_spaces, problem, guess, 3, self._slots, self._params.dt_s, self._tie)
+        return planned(near, partial(self._plan, problem, began_ns), self._separation, self._stopwatch_ns)
+
+    def _plan(self, problem: Problem, began_ns: int, spaces: HalfSpaces | None, spaces_us: float) -> Plan:
+        start, steps = problem.start, self.steps
+        held = max(_THRUST_LEAST_M_S2, float(start.virtual[2]))
+        first = self._solve(problem, np.full(steps, held), spaces)
+        found = self._solve(problem, first.u[:, 2], spaces)
+        found = replace(found, solve_us=first.solve_us + found.solve_us, iterations=first.iterations + found.iterations)
+        thrust = found.u[:, 2:]
+        tilt, rate = self._acting(problem)
+        acting = self._mpc.realised(found.u, tilt, rate)
+        along = np.column_stack([acting[:, :2], np.full(steps, start.cos_tilt)])  # (steps, 3)
+        pos, vel = self._mpc.motion(start.pos_ned_m, start.vel_ned_m_s, self._drift(problem) - thrust * along)
+        first_row, stopwatch_ns = self._mpc.first_row(), self._stopwatch_ns
+        return judged(problem, pos, vel, found.u, (found,), first_row, self.dt_us, began_ns, spaces_us, stopwatch_ns)
+
+    def _solve(self, problem: Problem, thrust_m_s2: Array, spaces: HalfSpaces | None) -> AxesSolution:
+        steps, start, reference = self.steps, problem.start, problem.reference
+        asked = AxesProblem(
+            start.pos_ned_m,
+            start.vel_ned_m_s,
+            start.virtual,
+            np.column_stack([-thrust_m_s2, -thrust_m_s2, np.full(steps, -start.cos_tilt)]),
+            self._drift(problem),
+            reference.pos_ned_m[1 : steps + 1],
+            reference.vel_ned_m_s[1 : steps + 1],
+            *self._acting(problem),
+        )
+        return self._mpc.solve(asked, spaces)
+
+    @staticmethod
+    def _acting(problem: Problem) -> tuple[Array, Array]:
+        """What of the three inputs acts at the start, and its rate."""
+        start = problem.start
+        return np.append(start.tilt, start.virtual[2]), np.append(start.tilt_rate_1_s, 0.0)
+
+    @staticmethod
+    def _drift(problem: Problem) -> Array:
+        return np.asarray(problem.disturbance_ned_m_s2 + np.array([0.0, 0.0, GRAVITY_M_S2]))

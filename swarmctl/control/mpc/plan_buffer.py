@@ -1,0 +1,43 @@
+"""The newest certified plan: what the next one is linearised around, and what is flown when the next one fails."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+from swarmctl.control.collision.separation import KeepOut, align, certify
+from swarmctl.control.mpc.problem import Start
+from swarmctl.core.types import Array, Plan, PlanStatus, PredictedPath
+
+
+class Replay:
+    """Keeps a plan as long as it is worth flying.
+
+    Args:
+        agent: own id.
+        dt_us, steps: of the controller's plans.
+        brake_m_s2: how a plan is continued beyond its end.
+    """
+
+    def __init__(self, agent: int, dt_us: int, steps: int, brake_m_s2: float) -> None:
+        self._agent, self._dt_us, self._steps, self._brake_m_s2 = agent, dt_us, steps, brake_m_s2
+        self.plan: Plan | None = None
+
+    def take(self, plan: Plan, start: Start, keep_outs: Sequence[KeepOut], rest: Callable[[], Plan]) -> None:
+        """Keep a good plan; after a bad one drop the last good one if braking (`rest`) comes less close than it."""
+        if plan.status is PlanStatus.OK:
+            self.plan = plan
+        elif self.plan is not None:
+            replayed_m = certify(self.positions_ned_m(self.plan, start.t_us), keep_outs, 0)
+            if replayed_m < 0.0 and replayed_m < certify(rest().pos_ned_m, keep_outs, 0):
+                self.plan = None
+
+    def guess_ned_m(self, t0_us: int) -> Array | None:
+        """Positions (steps+1, 3) of the plan from `t0_us` on; None when there is none or it has run out."""
+        if self.plan is None or t0_us - self.plan.t0_us >= self._steps * self._dt_us:
+            return None
+        return self.positions_ned_m(self.plan, t0_us)
+
+    def positions_ned_m(self, plan: Plan, t0_us: int) -> Array:
+        """Positions (steps+1, 3) of any plan from `t0_us` on."""
+        path = PredictedPath(self._agent, 0, 0, plan.t0_us, plan.dt_us, 0.0, plan.pos_ned_m)
+        return align(path, t0_us, self._dt_us, self._steps, self._brake_m_s2)

@@ -1,0 +1,279 @@
+"""The thesis' MPC for one vehicle of a swarm: z first, then x-y together with what must be kept clear of (ch. 3, 4).
+
+z'' = g - (f/m) c, with c = cos(phi) cos(theta) frozen at the current attitude (3.11); x'' = -(f/m) u_x and
+y'' = -(f/m) u_y with the thrust that the z problem has just chosen (3.18), (3.24). Thrust over mass is the z input, so
+the thesis' newtons for its 1 kg are our m/s2. z knows nothing of collisions. The disturbance estimate is a constant
+drift of each axis.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Literal
+
+import numpy as np
+from pydantic import Field
+
+from swarmctl.control.collision.separation import KeepOut, SeparationParams, certify, half_spaces
+from swarmctl.control.model import VehicleModelParams
+from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, Axis, HalfSpaces, Horizon, Penalties, Terminal
+from swarmctl.control.mpc.condensed import CondensedMpc
+from swarmctl.control.mpc.problem import Problem
+from swarmctl.control.mpc.qp import QpParams
+from swarmctl.core.frames import GRAVITY_M_S2
+from swarmctl.core.params import Params
+from swarmctl.core.types import Array, Plan, PlanStatus, PlanTimes
+
+RESIDUAL_LIMIT_M = 0.05  # a solution that misses a constraint by more is none; the certificate judges the rest
+
+
+class AxisWeights(Params):
+    """Quadratic weights of one axis."""
+
+    q_pos: float = Field(gt=0, le=1e4)
+    q_vel: float = Field(ge=0, le=1e4)
+    r: float = Field(gt=0, le=1e4)
+
+
+class MpcParams(Params):
+    """Horizons, weights and bounds; defaults are the thesis' swarm flight (its section 4.3) but for z's end and r."""
+
+    dt_s: float = Field(0.02, gt=0.001, le=0.5)
+    discretisation: Literal["zoh", "euler"] = "zoh"  # euler is the thesis' (3.6)
+    thrust_ahead: Literal["held", "planned"] = "held"  # x-y predicted with f_t of now (thesis) or of the z plan
+    control_z: int = Field(3, ge=1, le=50)
+    horizon_z: int = Field(40, ge=2, le=200)
+    control_xy: int = Field(6, ge=1, le=50)  # and of dmpc3, for all three axes
+    horizon_xy: int = Field(40, ge=2, le=200)
+    z: AxisWeights = AxisWeights(q_pos=2.0, q_vel=0.05, r=1.0)  # thesis r 0.01: starves x-y of thrust in fast climbs
+    x: AxisWeights = AxisWeights(q_pos=1.5, q_vel=0.5, r=0.01)
+    y: AxisWeights = AxisWeights(q_pos=1.5, q_vel=0.5, r=0.01)
+    thrust_min_m_s2: float = Field(0.0, ge=-20, le=9)  # thesis -20 (a rotor can't pull)
+    thrust_max_m_s2: float = Field(20.0, gt=9.9, le=100)
+    dthrust_max_m_s2: float = Field(5.0, gt=0, le=100)  # per step
+    u_max: float = Field(0.2, gt=0, lt=1)  # sine of the tilt, each axis
+    du_max: float = Field(0.05, gt=0, lt=1)  # per step
+    terminal_z: Terminal = "region"  # thesis: an equality, which limit-cycles once a link delays it by half a tick
+    terminal_xy: Terminal = "none"
+    qp: QpParams = QpParams()
+
+    def vertical(self) -> Axis:
+        """z: the input is thrust over mass, which follows at once."""
+        w = self.z
+        least, most, step = self.thrust_min_m_s2, self.thrust_max_m_s2, self.dthrust_max_m_s2
+        return Axis(w.q_pos, w.q_vel, w.r, least, most, step, GRAVITY_M_S2, 1.0, self.terminal_z)
+
+    def horizontal(self, vehicle: VehicleModelParams) -> tuple[Axis, Axis]:
+        """x and y: the inputs are u_x and u_y, which the attitude follows."""
+        return self._lateral(self.x, vehicle), self._lateral(self.y, vehicle)
+
+    def _lateral(self, w: AxisWeights, vehicle: VehicleModelParams) -> Axis:
+        u, du = min(self.u_max, vehicle.u_max()), self.du_max
+        return Axis(w.q_pos, w.q_vel, w.r, -u, u, du, 0.0, GRAVITY_M_S2, self.terminal_xy, vehicle.lag())
+
+    def horizon(self, control: int, prediction: int, vehicle: VehicleModelParams) -> Horizon:
+        return Horizon(control, prediction, self.dt_s, self.discretisation == "euler", vehicle.drag_1_s)
+
+
+class SwarmMpc:
+    """z-MPC, then x-y MPC with half-spaces, then a certificate over true distances."""
+
+    def __init__(
+        self,
+        params: MpcParams,
+        vehicle: VehicleModelParams,
+        separation: SeparationParams,
+        own_tie: int,
+        slots: int,
+        stopwatch_ns: Callable[[], int],
+    ) -> None:
+        self._params, self._separation, self._tie, self._slots = params, separation, own_tie, slots
+        self._stopwatch_ns = stopwatch_ns
+        self.dt_us = round(params.dt_s * 1e6)
+        self.steps = params.horizon_xy
+        self.longest = max(params.horizon_xy, params.horizon_z)  # reference steps needed
+        self._z = CondensedMpc(
+            (params.vertical(),),
+            params.horizon(params.control_z, params.horizon_z, vehicle),
+            0,
+            1.0,
+            Penalties(),
+            params.qp,
+            stopwatch_ns,
+        )
+        self._xy, self._xy_alone = (  # without anything to keep clear of the problem is small and solved exactly
+            CondensedMpc(
+                params.horizontal(vehicle),
+                params.horizon(params.control_xy, params.horizon_xy, vehicle),
+                room,
+                separation.relax_01,
+                Penalties(),
+                params.qp,
+                stopwatch_ns,
+            )
+            for room in (slots, 0)
+        )
+
+    def plan(self, problem: Problem) -> Plan:
+        """One step of distributed MPC. Never raises for an infeasible problem; the status says what may be flown."""
+        began_ns = self._stopwatch_ns()
+        up = self._solve_z(problem)
+        guess = first_guess(problem, self._params.dt_s, self.steps)
+        count = min(self.steps, len(up.pos_m))
+        guess[1 : count + 1, 2] = up.pos_m[:count, 0]
+        near = partial(near_half_spaces, problem, guess, 2, self._slots, self._params.dt_s, self._tie)
+        return planned(near, partial(self._plan, problem, up, began_ns), self._separation, self._stopwatch_ns)
+
+    def _plan(
+        self, problem: Problem, up: AxesSolution, began_ns: int, spaces: HalfSpaces | None, spaces_us: float
+    ) -> Plan:
+        start, steps, count = problem.start, self.steps, min(self.steps, len(up.pos_m))
+        asked = AxesProblem(
+            start.pos_ned_m[:2],
+            start.vel_ned_m_s[:2],
+            start.virtual[:2],
+            np.repeat(-self._thrust_ahead(up)[:, None], 2, axis=1),
+            problem.disturbance_ned_m_s2[:2],
+            problem.reference.pos_ned_m[1 : steps + 1, :2],
+            problem.reference.vel_ned_m_s[1 : steps + 1, :2],
+            start.tilt,
+            start.tilt_rate_1_s,
+        )
+        across = (self._xy_alone if spaces is None else self._xy).solve(asked, spaces)
+        pos, vel = np.empty((steps, 3)), np.zeros((steps, 3))
+        virtual = np.empty((steps, 3))
+        pos[:, :2], vel[:, :2], virtual[:, :2] = across.pos_m, across.vel_m_s, across.u
+        pos[:count, 2:], vel[:count, 2:], virtual[:count, 2:] = up.pos_m[:count], up.vel_m_s[:count], up.u[:count]
+        pos[count:, 2], virtual[count:, 2] = up.pos_m[-1, 0], up.u[-1, 0]
+        first, stopwatch_ns = self._xy.first_row(), self._stopwatch_ns
+        return judged(problem, pos, vel, virtual, (up, across), first, self.dt_us, began_ns, spaces_us, stopwatch_ns)
+
+    def _solve_z(self, problem: Problem) -> AxesSolution:
+        steps, start, reference = self._params.horizon_z, problem.start, problem.reference
+        asked = AxesProblem(
+            start.pos_ned_m[2:],
+            start.vel_ned_m_s[2:],
+            start.virtual[2:],
+            np.full((steps, 1), -start.cos_tilt),
+            GRAVITY_M_S2 + problem.disturbance_ned_m_s2[2:],
+            reference.pos_ned_m[1 : steps + 1, 2:],
+            reference.vel_ned_m_s[1 : steps + 1, 2:],
+        )
+        return self._z.solve(asked)
+
+    def _thrust_ahead(self, up: AxesSolution) -> Array:
+        """Thrust over mass (steps,) that x-y is predicted with."""
+        if self._params.thrust_ahead == "held":
+            return np.full(self.steps, up.u[0, 0])
+        return np.asarray(up.u[np.minimum(np.arange(self.steps), len(up.u) - 1), 0])
+
+
+def first_guess(problem: Problem, dt_s: float, steps: int) -> Array:
+    """Positions (steps+1, 3) to linearise around: the own previous prediction, or constant velocity."""
+    if problem.guess_ned_m is not None:
+        return problem.guess_ned_m.copy()
+    start, t_s = problem.start, np.arange(steps + 1)[:, None] * dt_s
+    return np.asarray(start.pos_ned_m + t_s * start.vel_ned_m_s)
+
+
+def nearest(keep_outs: Sequence[KeepOut], guess_ned_m: Array, slots: int) -> list[KeepOut]:
+    """The `slots` keep-outs that the guess comes closest to."""
+
+    def gap_m(k: KeepOut) -> float:
+        apart = (guess_ned_m - k.pos_ned_m) * (1.0, 1.0, k.vertical_01)
+        return float(np.sqrt(np.min(np.sum(apart**2, axis=1)))) - k.radius_m
+
+    return sorted(keep_outs, key=gap_m)[:slots]
+
+
+def near_half_spaces(
+    problem: Problem, guess_ned_m: Array, axes: int, slots: int, dt_s: float, own_tie: int, params: SeparationParams
+) -> HalfSpaces | None:
+    """Distances to what comes nearest, linearised around the guess (steps+1, 3), in the first `axes` axes."""
+    steps, near = len(guess_ned_m) - 1, nearest(problem.keep_outs, guess_ned_m, slots)
+    goal, vel = problem.reference.pos_ned_m[steps, :axes], problem.start.vel_ned_m_s[:axes]
+    return half_spaces(near, guess_ned_m, goal, vel, dt_s, own_tie, params)
+
+
+def planned(
+    spaces_of: Callable[[SeparationParams], HalfSpaces | None],
+    plan: Callable[[HalfSpaces | None, float], Plan],
+    separation: SeparationParams,
+    stopwatch_ns: Callable[[], int],
+) -> Plan:
+    """The plan within the half-spaces near its guess or, if that is not certified, within those far from it as well.
+
+    A plan leaves a guess that stands still far behind, and half-spaces that are far from the guess are left out: it
+    then runs into peers that are out there by the time it arrives, and so does every next one from the same guess.
+
+    Args:
+        spaces_of: half-spaces by parameters.
+        plan: makes a plan within half-spaces, given the time [us] that they took.
+        separation: parameters; those of the second plan leave nothing out.
+        stopwatch_ns: see `CondensedMpc`.
+    """
+    began_ns = stopwatch_ns()
+    near = spaces_of(separation)
+    found = plan(near, (stopwatch_ns() - began_ns) * 1e-3)
+    if near is None or found.status is not PlanStatus.NOT_CERTIFIED:
+        return found
+    began_ns = stopwatch_ns()
+    every = spaces_of(separation.model_copy(update={"gate_m": math.inf}))
+    if every is None or np.array_equal(every.offset_m, near.offset_m):
+        return found
+    return plan(every, (stopwatch_ns() - began_ns) * 1e-3)
+
+
+def judged(
+    problem: Problem,
+    pos_ned_m: Array,
+    vel_ned_m_s: Array,
+    virtual: Array,
+    solutions: Sequence[AxesSolution],
+    from_step: int,
+    dt_us: int,
+    began_ns: int,
+    spaces_us: float,
+    stopwatch_ns: Callable[[], int],
+) -> Plan:
+    """A plan with what may be done with it: solved, within the residual limit, certified.
+
+    Args:
+        problem: what was asked.
+        pos_ned_m, vel_ned_m_s: (steps, 3) at steps 1..Hp.
+        virtual: (steps, 3).
+        solutions: of all problems solved for it.
+        from_step: steps before this one are not certified: they can't be changed any more.
+        dt_us: step.
+        began_ns: on the stopwatch.
+        spaces_us: what half-spaces took since.
+        stopwatch_ns: see `CondensedMpc`.
+    """
+    start = problem.start
+    pos = np.concatenate([start.pos_ned_m[None], pos_ned_m])
+    residual_m = max(s.residual_m for s in solutions)
+    solved_ns = stopwatch_ns()
+    status = PlanStatus.OK
+    if not all(s.solved for s in solutions):
+        status = PlanStatus.SOLVER_FAILED
+    elif residual_m > RESIDUAL_LIMIT_M:
+        status = PlanStatus.RESIDUAL
+    elif certify(pos, problem.keep_outs, from_step) < 0.0:
+        status = PlanStatus.NOT_CERTIFIED
+    solve_us = sum(s.solve_us for s in solutions)
+    certify_us = (stopwatch_ns() - solved_ns) * 1e-3
+    return Plan(
+        status,
+        start.t_us,
+        dt_us,
+        pos,
+        np.concatenate([start.vel_ned_m_s[None], vel_ned_m_s]),
+        virtual,
+        PlanTimes((solved_ns - began_ns) * 1e-3 - solve_us - spaces_us, solve_us, certify_us, spaces_us),
+        sum(s.iterations for s in solutions),
+        max(s.slack_m for s in solutions),
+        residual_m,
+        max(s.terminal_gap_m for s in solutions),
+    )

@@ -1,0 +1,481 @@
+"""The mission of one agent, phase by phase: what is asked of the autopilot and which reference is followed.
+
+Pure. Agents agree on the beginning without a leader: each says when it was ready, and all begin one second after the
+last one. What the operator asks (hold, resume, land, rtl) is applied here too. A vehicle that was found in the air is
+handed back in the air, holding.
+
+Autopilots know nothing of each other: before one takes over, the agent comes to rest and makes room under its own plan.
+Only without a plan does the autopilot land from where it is.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import numpy as np
+from pydantic import Field
+
+from swarmctl.control.phases.arming import ArmingEvidence
+from swarmctl.control.phases.inputs import Facts
+from swarmctl.control.phases.overload import Level
+from swarmctl.control.reference.landing_places import nearest_in_plane_m, room_for
+from swarmctl.control.reference.mission import Glide, MissionReference, brake_to_rest, glide_to
+from swarmctl.core.params import Params
+from swarmctl.core.types import Array, Command, FlightMode, Landed, Mode, Phase, VehicleState, Verb
+
+_ASK_EVERY_US = 1_000_000
+_SPIN_UP_US = 6_000_000  # ArduCopter's rotors spin up for over 3 s, and it refuses to be asked again meanwhile
+_SETTLE_S = 2.0
+_BEGIN_AFTER_US = 1_000_000
+_HOVER_US = 1_000_000  # of the autopilot's own hover, to learn its thrust where no HOLD separates it from our flight
+_ROOM_M = 0.1  # gone farther than has to be, so that it is reached
+_PLANNED = (Mode.FOLLOW, Mode.REPLAY)
+_OURS = (FlightMode.HOLD, FlightMode.TAKEOFF, FlightMode.EXTERNAL)  # modes nobody but us has asked for
+OPERATOR_STOP = "stopped by the operator"
+TAKEN_OVER = "pilot or autopilot took over"
+REBOOTED = "the autopilot rebooted"
+OVERLOADED = "overload: deadlines were missed for too long"
+
+
+class SequenceParams(Params):
+    """Speeds of the way there and back, and patience."""
+
+    speed_m_s: float = Field(2.0, gt=0, le=20)
+    accel_m_s2: float = Field(1.2, gt=0, le=20)
+    state_rate_hz: float = Field(100.0, ge=20, le=250)
+    arrive_m: float = Field(0.15, gt=0, le=5)
+    arrive_m_s: float = Field(0.15, gt=0, le=5)
+    land_m: float = Field(0.06, gt=0, le=5)  # what is missed here, and drifted, is missing between landing places
+    land_m_s: float = Field(0.06, gt=0, le=5)
+    start_timeout_s: float = Field(90.0, gt=0, le=3600)  # from process start to TRACK
+    land_timeout_s: float = Field(20.0, gt=0, le=600)  # for reaching the landing place; then land where it is
+    apart_m: float = Field(0.2, ge=0, le=20)  # beyond separation.radius_m, between who lands where it is and others
+
+
+class Sequence:
+    """Phases of one agent.
+
+    Args:
+        params: speeds and patience.
+        agent: own index.
+        peers: how many others take part.
+        radius_m: distance that agents keep.
+        start_ned_m: (3,) own start, also the landing place.
+        duration_s: of the tracked mission.
+        reference: of the tracked mission.
+    """
+
+    def __init__(
+        self,
+        params: SequenceParams,
+        agent: int,
+        peers: int,
+        radius_m: float,
+        start_ned_m: Array,
+        duration_s: float,
+        reference: MissionReference,
+    ) -> None:
+        self._params, self._agent, self._expected = params, agent, peers
+        self._apart_m = radius_m + params.apart_m
+        self._start_ned_m, self._duration_us, self._reference = start_ned_m, round(duration_s * 1e6), reference
+        self.phase = Phase.CONNECT
+        self.ready_utc_us = 0
+        self.begin_utc_us: int | None = None  # mission time 0
+        self.outcome = ""
+        self.waits_for = ""  # what keeps it on the ground
+        self.arming = ArmingEvidence()
+        self._stop_verb = ""  # land or rtl, from when it is asked for until it is under way
+        self.had_control = False
+        self.held = False  # by the operator
+        self.waiting = False  # for mute peers, or for its processor
+        self._bound_for = start_ned_m  # before it had to wait
+        self._glide: tuple[Glide, int] | None = None  # and when it began
+        self._rejoin: tuple[Glide, int] | None = None  # the same, of the offset to the mission's reference
+        self._entered_us = 0
+        self._born_us: int | None = None
+        self._asked_us = -_ASK_EVERY_US
+        self._boots = 0
+        self.yielded = False
+        self._ground_z_m = 0.0
+        self._hovering_us: int | None = None
+        self._airborne = False
+        self._invited = False  # by an operator's resume, to take control from whoever has it
+        self._landing_seen = False
+        self._lands_here = False  # where it comes to rest, instead of on the start
+        self._outcome_before = ""  # it yielded
+        self._steps: dict[Phase, Callable[[Facts, VehicleState], list[Command]]] = {
+            Phase.STANDBY: self._standby,
+            Phase.ARM: self._arm,
+            Phase.TAKEOFF: self._takeoff,
+            Phase.GOTO_START: self._goto_start,
+            Phase.READY: self._ready,
+            Phase.TRACK: self._track,
+            Phase.GOTO_LAND: self._goto_land,
+            Phase.LAND: self._land,
+        }
+
+    @property
+    def finished(self) -> bool:
+        return self.phase is Phase.DONE
+
+    def step(self, facts: Facts) -> list[Command]:
+        """Advance by what is true now; returns what to ask of the autopilot."""
+        self._born_us = facts.now_us if self._born_us is None else self._born_us
+        self.arming.update(facts)
+        state = facts.state
+        if facts.boots != self._boots:
+            self._boots = facts.boots
+            if Phase.ARM <= self.phase < Phase.DONE and not self.yielded:
+                self._yield(REBOOTED)
+        if state is None:
+            return []
+        self._apply_stop(facts.now_us, state)
+        if self.phase is Phase.CONNECT and facts.prepared:  # not before: peers arm when everybody stands by
+            self._enter(Phase.STANDBY, facts.now_us)
+            return self._refuse(facts.refusal, facts) if facts.refusal else []
+        if facts.mode is Mode.YIELD and not self.yielded:
+            self._yield(TAKEN_OVER)
+        if self.yielded:
+            if self._is_down(facts, state):
+                self._enter(Phase.DONE, facts.now_us)
+            return []
+        if facts.mode is Mode.LAND and self.phase < Phase.LAND:
+            self._give_up("no plan for too long", facts, state)
+        if facts.overload is Level.LAND and self.phase < Phase.GOTO_LAND:
+            self._give_up(OVERLOADED, facts, state)
+        self._wait_for_better(facts, state)
+        if state.mode is FlightMode.EXTERNAL and Phase.GOTO_START <= self.phase < Phase.LAND:
+            self._take_control(facts, state)
+        patience_us = self._params.start_timeout_s * 1e6
+        if self.phase < Phase.TRACK and facts.now_us - self._born_us > patience_us:
+            cause = f"not tracking after {self._params.start_timeout_s:.0f} s ({self.phase.name})"
+            self._give_up(f"{cause}: {self.waits_for}" if self.waits_for else cause, facts, state)
+        handler = self._steps.get(self.phase)
+        return handler(facts, state) if handler else []
+
+    def reference(self, utc_us: int, now_us: int, offsets_s: Array) -> tuple[Array, Array]:
+        """Where to be, (K, 3) and (K, 3), at `offsets_s` (K,) from now."""
+        if self.phase is Phase.TRACK and not (self.held or self.waiting) and self.begin_utc_us is not None:
+            pos, vel = self._reference.sample((utc_us - self.begin_utc_us) * 1e-6 + offsets_s)
+            if self._rejoin is not None:
+                glide, began_us = self._rejoin
+                offset, drift = glide.sample((now_us - began_us) * 1e-6 + offsets_s)
+                pos, vel = pos + offset, vel + drift
+            return pos, vel
+        if self._glide is not None:
+            glide, began_us = self._glide
+            return glide.sample((now_us - began_us) * 1e-6 + offsets_s)
+        return np.tile(self._start_ned_m, (len(offsets_s), 1)), np.zeros((len(offsets_s), 3))
+
+    def begin_if_due(self, now_us: int, utc_us: int) -> None:
+        """Enter the mission on time: before a tick thinks, so that its first plan is the mission's already."""
+        if self.phase is Phase.READY and self.begin_utc_us is not None and utc_us >= self.begin_utc_us:
+            self.phase = Phase.TRACK
+            self._entered_us, self._asked_us = now_us, now_us - _ASK_EVERY_US
+
+    def mission_t_s(self, utc_us: int) -> float:
+        """Mission time while tracking, else NaN."""
+        if self.phase is not Phase.TRACK or self.begin_utc_us is None:
+            return math.nan
+        return (utc_us - self.begin_utc_us) * 1e-6
+
+    def operator(self, verb: str, now_us: int, utc_us: int, state: VehicleState | None) -> None:
+        """Apply hold, resume, land or rtl.
+
+        A stop (land, rtl) is kept until there is a vehicle state to begin it with: it is lost in no phase.
+        """
+        if verb in ("land", "rtl"):
+            self._stop_verb = verb
+        if state is None or self.phase in (Phase.LAND, Phase.DONE):
+            return
+        self._apply_stop(now_us, state)
+        if verb == "hold" and self.phase is Phase.TRACK:
+            self.held = True
+            self._glide = (self._stop_glide(state), now_us)
+        elif verb == "resume":
+            if self.held or self.yielded:
+                self._go_on(now_us, utc_us, state)
+            self.held = False
+            if self.yielded:
+                self.yielded, self.outcome, self._invited = False, self._outcome_before, True
+
+    def _yield(self, why: str) -> None:
+        self.yielded, self.had_control, self._invited = True, False, False
+        self._outcome_before = self.outcome
+        self.outcome = why
+
+    def _apply_stop(self, now_us: int, state: VehicleState) -> None:
+        """Begin the stop that has been asked for, if it is not under way."""
+        verb, self._stop_verb = self._stop_verb, ""
+        if not verb or self.phase >= Phase.LAND:
+            return
+        self.outcome = self.outcome or OPERATOR_STOP
+        if self.phase < Phase.GOTO_START or self.yielded:
+            self._enter(Phase.LAND, now_us)  # which is done at once where the vehicle is known to be disarmed
+        elif self.phase < Phase.GOTO_LAND and verb == "rtl":
+            self._lands_here = False
+            self._go_home(now_us, state)
+        elif verb == "land" and not self._lands_here:
+            self._stop_here(now_us, state)
+
+    def _is_down(self, facts: Facts, state: VehicleState) -> bool:
+        """Whether the vehicle is on the ground and known to be disarmed."""
+        return state.landed is Landed.ON_GROUND and self.arming.is_disarmed(facts, state)
+
+    def _wait_for_better(self, facts: Facts, state: VehicleState) -> None:
+        """Who loses the bus comes to rest: then what peers assume (braking) holds. So does who misses its deadlines."""
+        flying = self.had_control and Phase.GOTO_START <= self.phase <= Phase.GOTO_LAND
+        must_wait = facts.mute or facts.overload >= Level.HOLD
+        if must_wait and flying and not self.waiting:
+            self.waiting = True
+            self._bound_for = self._glide[0].to_ned_m if self._glide else self._start_ned_m
+            self._glide = (self._stop_glide(state), facts.now_us)
+        elif self.waiting and not must_wait:
+            self.waiting = False
+            if self.phase in (Phase.GOTO_START, Phase.GOTO_LAND):
+                self._glide = (self._way_to(self._bound_for, state), facts.now_us)
+            elif self.held:
+                self._glide = (self._stop_glide(state), facts.now_us)
+            else:
+                self._go_on(facts.now_us, facts.utc_us, state)
+
+    def _go_on(self, now_us: int, utc_us: int, state: VehicleState) -> None:
+        """Close in smoothly on the mission's reference, which has moved on: a jump would have all race to one point."""
+        if self.phase is not Phase.TRACK or self.begin_utc_us is None:
+            return
+        pos, vel = self._reference.sample(np.array([(utc_us - self.begin_utc_us) * 1e-6]))
+        p, offset, drift = self._params, state.pos_ned_m - pos[0], state.vel_ned_m_s - vel[0]
+        self._rejoin = (glide_to(offset, drift, np.zeros(3), p.speed_m_s, p.accel_m_s2), now_us)
+
+    def _stop_glide(self, state: VehicleState) -> Glide:
+        return brake_to_rest(state.pos_ned_m, state.vel_ned_m_s, self._params.accel_m_s2)
+
+    def _standby(self, facts: Facts, state: VehicleState) -> list[Command]:
+        if not facts.prepared:  # any more: it has rebooted
+            self.waits_for = "the link to be set up again after a reboot of the autopilot"
+            return []
+        if facts.refusal:
+            return self._refuse(facts.refusal, facts)
+        if any(p.phase is Phase.DONE and p.alive for p in facts.peers.values()):
+            return self._refuse("a peer gave up before take-off", facts)
+        self.waits_for = self._missing(facts, state)
+        if not self.waits_for:
+            self._ground_z_m = float(state.pos_ned_m[2])
+            self._airborne = state.landed is Landed.IN_AIR
+            self._enter(Phase.ARM, facts.now_us)
+            return []
+        stays = state.mode is FlightMode.EXTERNAL and facts.arm_in is None and not facts.armable
+        if stays and not state.armed and self._may_ask(facts):
+            return [Command(Verb.HOLD)]  # PX4 stays in OFFBOARD after a landing, where it can't be armed
+        return []
+
+    def _missing(self, facts: Facts, state: VehicleState) -> str:
+        """What has to be true before arming and is not, or ""."""
+        if state.landed not in (Landed.ON_GROUND, Landed.IN_AIR):
+            return "the autopilot to tell whether it has landed"
+        if not facts.armable:
+            return f"the autopilot to be ready to arm (it is in {state.mode.name})"
+        if facts.unsettled:
+            return facts.unsettled
+        absent = self._expected - sum(p.phase >= Phase.STANDBY and p.alive for p in facts.peers.values())
+        if absent:
+            return f"{absent} of {self._expected} peers to stand by"
+        return "the autopilot's answers" if facts.busy else ""
+
+    def _refuse(self, why: str, facts: Facts) -> list[Command]:
+        """Give up before take-off: nothing more will be armed, and what has been armed is disarmed."""
+        self.outcome = self.outcome or why
+        self._enter(Phase.LAND if self.arming.requested else Phase.DONE, facts.now_us)
+        return []
+
+    def _arm(self, facts: Facts, state: VehicleState) -> list[Command]:
+        if state.armed and self._airborne and not self._invited and _is_theirs(state):
+            self._yield(TAKEN_OVER)  # before anything is streamed: one setpoint would take it
+            return []
+        if state.armed:
+            self._enter(Phase.GOTO_START if self._airborne else Phase.TAKEOFF, facts.now_us)
+            return []
+        if facts.refusal:
+            return self._refuse(facts.refusal, facts)
+        if not self._may_ask(facts):
+            return []
+        if facts.arm_in not in (None, state.mode):
+            return [Command(Verb.EXTERNAL)]
+        self.arming.request()
+        return [Command(Verb.ARM)]
+
+    def _takeoff(self, facts: Facts, state: VehicleState) -> list[Command]:
+        height_m = self._ground_z_m - float(self._start_ned_m[2])
+        climbed_m = self._ground_z_m - float(state.pos_ned_m[2])
+        settled = abs(float(state.vel_ned_m_s[2])) < 0.3 and abs(climbed_m - height_m) < 0.4
+        hovers = state.mode in (FlightMode.HOLD, facts.arm_in) and state.landed is Landed.IN_AIR and settled
+        self._hovering_us = (self._hovering_us or facts.now_us) if hovers else None
+        learned = facts.arm_in is None or facts.now_us - (self._hovering_us or facts.now_us) >= _HOVER_US
+        if hovers and learned:
+            self._enter(Phase.GOTO_START, facts.now_us)
+            return []
+        if not state.armed:  # somebody, or the autopilot, thought better of it: never armed again
+            self._give_up("disarmed before take-off", facts, state)
+            return []
+        if (
+            state.mode is not FlightMode.TAKEOFF
+            and state.landed is Landed.ON_GROUND
+            and self._may_ask(facts, _SPIN_UP_US)
+        ):
+            return [Command(Verb.TAKEOFF, height_m)]
+        return []
+
+    def _goto_start(self, facts: Facts, state: VehicleState) -> list[Command]:
+        if not self.had_control:
+            if self._glide is None:
+                self._glide = (Glide(state.pos_ned_m, np.zeros(3), state.pos_ned_m, 1.0), facts.now_us)
+            return self._ask_for_control(facts, state)
+        p = self._params
+        if self._at(state, self._start_ned_m, p.arrive_m, p.arrive_m_s) and not self.waiting:
+            self.ready_utc_us = facts.utc_us
+            self._enter(Phase.READY, facts.now_us)
+        return []
+
+    def _ask_for_control(self, facts: Facts, state: VehicleState) -> list[Command]:
+        """Control is taken from the autopilot's own hold; from anybody else only after an operator's `resume`.
+
+        Not even setpoints may flow meanwhile: PX4 returns to OFFBOARD by itself when they resume after a failsafe.
+        """
+        if not self._invited and _is_theirs(state):
+            self._yield(TAKEN_OVER)
+            return []
+        return [Command(Verb.EXTERNAL)] if self._may_ask(facts) else []
+
+    def _ready(self, facts: Facts, state: VehicleState) -> list[Command]:
+        if any(not p.alive or p.phase >= Phase.GOTO_LAND for p in facts.peers.values()):
+            self.outcome = "a peer gave up or was lost before the mission began"
+            self._go_home(facts.now_us, state)
+            return []
+        ready = [p.ready_utc_us for p in facts.peers.values() if p.ready_utc_us > 0]
+        if len(ready) == self._expected:
+            self.begin_utc_us = max([self.ready_utc_us, *ready]) + _BEGIN_AFTER_US
+        return []
+
+    def _track(self, facts: Facts, state: VehicleState) -> list[Command]:
+        assert self.begin_utc_us is not None
+        if not self.had_control:
+            return self._ask_for_control(facts, state)
+        if excess := self._reference.excess(state.pos_ned_m, state.vel_ned_m_s):
+            self._give_up(excess, facts, state)
+            return []
+        if facts.utc_us - self.begin_utc_us >= self._duration_us and not (self.held or self.waiting):
+            self.outcome = self.outcome or "completed"
+            if self._airborne and not facts.peers:
+                self._enter(Phase.LAND, facts.now_us)
+            elif self._airborne:
+                self._stop_here(facts.now_us, state)
+            else:
+                self._go_home(facts.now_us, state)
+        return []
+
+    def _goto_land(self, facts: Facts, state: VehicleState) -> list[Command]:
+        waited_us = facts.now_us - self._entered_us
+        if self._may_land(facts, state):
+            self._enter(Phase.LAND, facts.now_us)
+        elif waited_us > self._params.land_timeout_s * 1e6:
+            at_rest = self._at(state, state.pos_ned_m, math.inf, self._params.arrive_m_s)
+            if self._lands_here or (at_rest and self._has_room(facts, state)) or facts.mode not in _PLANNED:
+                self._enter(Phase.LAND, facts.now_us)
+            else:
+                self._stop_here(facts.now_us, state)
+        return []
+
+    def _land(self, facts: Facts, state: VehicleState) -> list[Command]:
+        self.had_control = False
+        if self._airborne:  # found in the air, handed back in the air
+            if state.mode is not FlightMode.EXTERNAL:
+                self._enter(Phase.DONE, facts.now_us)
+                return []
+            return [Command(Verb.HOLD)] if self._may_ask(facts) else []
+        if self._is_down(facts, state):
+            self._enter(Phase.DONE, facts.now_us)
+            return []
+        if state.mode is FlightMode.LAND:
+            self._landing_seen = True
+            return []
+        ours = state.mode in _OURS and not self._landing_seen  # else a pilot flies, or broke the landing off
+        if not ours and state.landed is not Landed.ON_GROUND:
+            self._yield(TAKEN_OVER)
+            return []
+        if not self._may_ask(facts):
+            return []
+        return [Command(Verb.DISARM if state.landed is Landed.ON_GROUND else Verb.LAND)]
+
+    @staticmethod
+    def _at(state: VehicleState, target: Array, within_m: float, slower_m_s: float) -> bool:
+        speed = math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s))
+        return math.dist(state.pos_ned_m, target) < within_m and speed < slower_m_s
+
+    def _may_land(self, facts: Facts, state: VehicleState) -> bool:
+        """On the landing place; who lands where it is must be at rest, pushed aside as it may be, and to have room."""
+        if self._glide is None:
+            return True
+        glide, began_us = self._glide
+        if not self._lands_here:
+            return self._at(state, glide.to_ned_m, self._params.land_m, self._params.land_m_s) and not self.waiting
+        if facts.now_us - began_us <= (glide.travel_s + _SETTLE_S) * 1e6:
+            return False
+        if self._has_room(facts, state):
+            return self._at(state, state.pos_ned_m, math.inf, self._params.arrive_m_s)
+        room = room_for(state.pos_ned_m, facts.others_ned_m, self._apart_m + _ROOM_M, self._agent)
+        self._glide = (self._way_to(room, state), facts.now_us)
+        return False
+
+    def _has_room(self, facts: Facts, state: VehicleState) -> bool:
+        """Whether an autopilot may take over among the others; without control nothing can be done about it."""
+        return not self.had_control or nearest_in_plane_m(state.pos_ned_m, facts.others_ned_m) >= self._apart_m
+
+    def _take_control(self, facts: Facts, state: VehicleState) -> None:
+        if self.had_control:
+            return
+        self.had_control = True
+        if self.phase is Phase.GOTO_START:
+            self._glide = (self._home(state), facts.now_us)
+
+    def _home(self, state: VehicleState) -> Glide:
+        return self._way_to(self._start_ned_m, state)
+
+    def _way_to(self, target_ned_m: Array, state: VehicleState) -> Glide:
+        p = self._params
+        return glide_to(state.pos_ned_m, state.vel_ned_m_s, target_ned_m, p.speed_m_s, p.accel_m_s2)
+
+    def _go_home(self, now_us: int, state: VehicleState) -> None:
+        self._glide, self._bound_for = (self._home(state), now_us), self._start_ned_m
+        self.held = False
+        self._enter(Phase.GOTO_LAND, now_us)
+
+    def _give_up(self, why: str, facts: Facts, state: VehicleState) -> None:
+        self.outcome = self.outcome or why
+        if self.had_control and facts.mode in _PLANNED:
+            self._stop_here(facts.now_us, state)
+            return
+        self._enter(Phase.DONE if self._is_down(facts, state) else Phase.LAND, facts.now_us)
+
+    def _stop_here(self, now_us: int, state: VehicleState) -> None:
+        """Brake and make room under the own plan, then hand over where that ends."""
+        glide = self._stop_glide(state)
+        self._glide, self._bound_for = (glide, now_us), glide.to_ned_m
+        self._lands_here, self.held = True, False
+        self._enter(Phase.GOTO_LAND, now_us)
+
+    def _enter(self, phase: Phase, now_us: int) -> None:
+        self.phase = phase
+        self._entered_us = now_us
+        self._asked_us = now_us - _SPIN_UP_US
+
+    def _may_ask(self, facts: Facts, every_us: int = _ASK_EVERY_US) -> bool:
+        if facts.busy or facts.now_us - self._asked_us < every_us:
+            return False
+        self._asked_us = facts.now_us
+        return True
+
+
+def _is_theirs(state: VehicleState) -> bool:
+    """Whether a pilot, an operator or a failsafe has the vehicle."""
+    return state.mode not in _OURS or state.failsafe

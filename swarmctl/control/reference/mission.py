@@ -1,0 +1,257 @@
+"""References: where to be at a given mission time. All agents share one reference unless each has a way of its own.
+
+Pure functions of time; the flight before and after (to the start, to the landing place) is a `Glide`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import Field
+
+from swarmctl.control.reference.goal_assignment import places_ned_m
+from swarmctl.core.params import Params, Vec3
+from swarmctl.core.types import Array
+
+_TO_AND_FRO = np.array(
+    [(1, 0, 0), (0, 0, 0), (-1, 0, 0), (0, 0, 0), (0, 1, 0), (0, 0, 0), (0, -1, 0), (0, 0, 0), (0, 0, -1), (0, 0, 0)]
+)
+OUTWARD_S_M = 0.5  # how much later places of one goal are reached that are farther from it
+Waypoint = Annotated[tuple[float, float, float, float], Field(strict=False)]
+
+
+class CircleParams(Params):
+    """Climbing circle: `center + (r cos wt, r sin wt, climb t)` (thesis 4.3 and, with r 0.5, its tracking sets)."""
+
+    center_ned_m: Vec3 = (0.0, 0.0, -1.0)
+    radius_m: float = Field(5.0, ge=0, le=1000)
+    omega_rad_s: float = Field(0.5, ge=-10, le=10)
+    climb_ned_m_s: float = Field(-0.1, ge=-20, le=20)  # negative is up
+
+
+class LineParams(Params):
+    """Straight line at constant velocity (thesis 4.4)."""
+
+    origin_ned_m: Vec3 = (2.0, 2.0, -2.0)
+    velocity_ned_m_s: Vec3 = (1.5, 0.7, -0.1)
+
+
+class StepsParams(Params):
+    """Piecewise constant positions: rows of `[from_s, x, y, z]` in order of time (thesis 2.4)."""
+
+    rows: tuple[Waypoint, ...] = Field(((0.0, 1.0, 1.0, -1.0),), strict=False)
+
+
+class SwapParams(Params):
+    """Every agent flies to the point opposite its start, smoothly, in `travel_s`."""
+
+    travel_s: float = Field(8.0, gt=0, le=600)
+
+
+class GotoParams(Params):
+    """Every agent flies smoothly from its start to its goal and stays there; who shares one stays round it."""
+
+    goals_ned_m: tuple[Vec3, ...] = Field((), strict=False)  # one an agent, or a single one for all
+    speed_m_s: float = Field(2.0, gt=0, le=20)  # peaks, about
+    accel_m_s2: float = Field(1.2, gt=0, le=20)
+    standoff: bool = True  # goals too close to each other become an arrangement round them
+
+
+class IdentifyParams(Params):
+    """Steps about the own start, to and fro along each axis: what `swarmctl check --identify` flies."""
+
+    step_m: float = Field(2.0, gt=0.1, le=20)  # north, south, east, west
+    climb_m: float = Field(0.5, ge=0, le=20)
+    hold_s: float = Field(2.5, ge=0.5, le=30)  # before the next step
+    repeats: int = Field(2, ge=1, le=20)
+    distance_max_m: float = Field(5.0, gt=0.1, le=100)  # farther from the start, or faster, it stops and lands
+    speed_max_m_s: float = Field(5.0, gt=0.1, le=30)
+
+    @property
+    def duration_s(self) -> float:
+        """Of all steps, and a hover behind them."""
+        return self.hold_s * (self.repeats * len(_TO_AND_FRO) + 1)
+
+    def rows(self) -> Array:
+        """Steps (R, 4): from when, and where relative to the start."""
+        places = np.tile(_TO_AND_FRO, (self.repeats, 1)) * (self.step_m, self.step_m, self.climb_m)
+        return np.column_stack([self.hold_s * np.arange(1, len(places) + 1), places])
+
+
+class MissionParams(Params):
+    """What is flown between start and landing."""
+
+    kind: Literal["hover", "circle", "line", "steps", "swap", "goto", "identify"] = "circle"
+    duration_s: float = Field(37.7, gt=0, le=36000)
+    yaw_rad: float = Field(0.0, ge=-3.1416, le=3.1416)
+    circle: CircleParams = CircleParams()
+    line: LineParams = LineParams()
+    steps: StepsParams = StepsParams()
+    swap: SwapParams = SwapParams()
+    goto: GotoParams = GotoParams()
+    identify: IdentifyParams = IdentifyParams()
+
+    def problems(self, agents: int) -> Iterator[str]:
+        """What no single key can tell."""
+        times = [row[0] for row in self.steps.rows]
+        if self.kind == "steps" and (not times or times != sorted(times)):
+            yield f"mission.steps.rows: times {times} must be given, in increasing order"
+        if self.kind == "swap" and agents < 2:
+            yield f"mission.kind = 'swap' with swarm.agents = {agents}: a swap needs at least 2"
+        own = self.identify
+        if self.kind == "identify" and own.distance_max_m < 1.5 * own.step_m:
+            yield (
+                f"mission.identify.distance_max_m = {own.distance_max_m}: less than 1.5 times step_m = {own.step_m}; "
+                "an overshoot would end the flight. Raise it or lower step_m"
+            )
+        goals = len(self.goto.goals_ned_m)
+        if self.kind == "goto" and goals not in (1, agents):
+            yield f"mission.goto.goals_ned_m: {goals} goals for swarm.agents = {agents}; list one each, or one for all"
+
+
+class MissionReference:
+    """The reference of one agent.
+
+    Args:
+        params: what is flown.
+        starts_ned_m: (agents, 3) start positions.
+        agent: own index.
+        apart_m: distance that agents keep, for a mission that sends several to one point.
+    """
+
+    def __init__(self, params: MissionParams, starts_ned_m: Array, agent: int, apart_m: float = 0.0) -> None:
+        self._params = params
+        self._start = starts_ned_m[agent]
+        self._opposite = 2.0 * starts_ned_m.mean(axis=0) - self._start
+        if params.kind == "goto":
+            self._way = _ways(params.goto, starts_ned_m, apart_m)[agent]
+
+    def sample(self, t_s: Array) -> tuple[Array, Array]:
+        """Positions and velocities, (K, 3) each, at mission times `t_s` (K,); before 0 the value at 0, at rest."""
+        shapes = {
+            "hover": self._hover,
+            "circle": self._circle,
+            "line": self._line,
+            "steps": self._steps,
+            "swap": self._swap,
+            "goto": self._goto,
+            "identify": self._identify,
+        }
+        pos, vel = shapes[self._params.kind](np.maximum(t_s, 0.0))
+        vel[t_s < 0.0] = 0.0
+        return pos, vel
+
+    def _hover(self, t_s: Array) -> tuple[Array, Array]:
+        return np.tile(self._start, (len(t_s), 1)), np.zeros((len(t_s), 3))
+
+    def _circle(self, t_s: Array) -> tuple[Array, Array]:
+        c = self._params.circle
+        angle = c.omega_rad_s * t_s
+        cos, sin = np.cos(angle), np.sin(angle)
+        pos = np.stack([c.radius_m * cos, c.radius_m * sin, c.climb_ned_m_s * t_s], axis=1) + np.array(c.center_ned_m)
+        speed = c.radius_m * c.omega_rad_s
+        return pos, np.stack([-speed * sin, speed * cos, np.full(len(t_s), c.climb_ned_m_s)], axis=1)
+
+    def _line(self, t_s: Array) -> tuple[Array, Array]:
+        velocity = np.array(self._params.line.velocity_ned_m_s)
+        return np.array(self._params.line.origin_ned_m) + t_s[:, None] * velocity, np.tile(velocity, (len(t_s), 1))
+
+    def _steps(self, t_s: Array) -> tuple[Array, Array]:
+        return _held(np.array(self._params.steps.rows), t_s), np.zeros((len(t_s), 3))
+
+    def _swap(self, t_s: Array) -> tuple[Array, Array]:
+        glide = Glide(self._start, np.zeros(3), self._opposite, self._params.swap.travel_s)
+        return glide.sample(t_s)
+
+    def _goto(self, t_s: Array) -> tuple[Array, Array]:
+        return self._way.sample(t_s)
+
+    def _identify(self, t_s: Array) -> tuple[Array, Array]:
+        rows = np.concatenate([np.zeros((1, 4)), self._params.identify.rows()])
+        return self._start + _held(rows, t_s), np.zeros((len(t_s), 3))
+
+    def excess(self, pos_ned_m: Array, vel_ned_m_s: Array) -> str:
+        """Why an identification flight must end, or "": its vehicle is flown by figures that may be wrong."""
+        if self._params.kind != "identify":
+            return ""
+        p, away_m, speed_m_s = self._params.identify, math.dist(pos_ned_m, self._start), math.hypot(*vel_ned_m_s)
+        if away_m > p.distance_max_m:
+            return f"{away_m:.1f} m from its start; mission.identify.distance_max_m is {p.distance_max_m:g}"
+        if speed_m_s > p.speed_max_m_s:
+            return f"{speed_m_s:.1f} m/s fast; mission.identify.speed_max_m_s is {p.speed_max_m_s:g}"
+        return ""
+
+
+def _held(rows: Array, t_s: Array) -> Array:
+    """Positions (K, 3) at times (K,) of steps (R, 4)."""
+    index = np.maximum(np.searchsorted(rows[:, 0], t_s + 1e-9, side="right") - 1, 0)
+    held: Array = rows[index, 1:]
+    return held
+
+
+def _ways(params: GotoParams, starts_ned_m: Array, apart_m: float) -> list[Glide]:
+    """Of every agent; those who share a goal get there at the same time, farther out a little later.
+
+    A ring that closes before somebody is inside it opens only after much pushing.
+    """
+    agents = len(starts_ned_m)
+    goals = np.array(params.goals_ned_m) if params.goals_ned_m else starts_ned_m
+    if len(goals) == 1:
+        goals = np.tile(goals, (agents, 1))
+    groups = [[i] for i in range(agents)]
+    if params.standoff:
+        goals, groups = places_ned_m(starts_ned_m, goals, apart_m)
+    ways = [
+        glide_to(start, np.zeros(3), goal, params.speed_m_s, params.accel_m_s2)
+        for start, goal in zip(starts_ned_m, goals, strict=True)
+    ]
+    for group in groups:
+        slowest_s = max(ways[i].travel_s for i in group)
+        from_center_m = np.linalg.norm(goals[group] - goals[group].mean(axis=0), axis=1)
+        for i, outward_m in zip(group, from_center_m - from_center_m.min(), strict=True):
+            ways[i] = replace(ways[i], travel_s=slowest_s + OUTWARD_S_M * outward_m)
+    return ways
+
+
+@dataclass(frozen=True, slots=True)
+class Glide:
+    """Quintic from a position and velocity to rest at a target: continuous in acceleration."""
+
+    from_ned_m: Array  # (3,)
+    vel_ned_m_s: Array  # (3,)
+    to_ned_m: Array  # (3,)
+    travel_s: float
+
+    def sample(self, t_s: Array) -> tuple[Array, Array]:
+        """Positions and velocities, (K, 3) each, at times `t_s` (K,) since it began."""
+        s = np.clip(t_s / self.travel_s, 0.0, 1.0)[:, None]
+        delta, carry = self.to_ned_m - self.from_ned_m, self.vel_ned_m_s * self.travel_s
+        blend = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+        coast = s - 6.0 * s**3 + 8.0 * s**4 - 3.0 * s**5
+        pos = self.from_ned_m + blend * delta + coast * carry
+        slope = 30.0 * s**2 * (1.0 - s) ** 2
+        coast_slope = 1.0 - 18.0 * s**2 + 32.0 * s**3 - 15.0 * s**4
+        vel = (slope * delta + coast_slope * carry) / self.travel_s
+        return pos, vel
+
+
+def glide_to(pos: Array, vel: Array, target: Array, speed_m_s: float, accel_m_s2: float) -> Glide:
+    """The quickest `Glide` whose peak speed and acceleration stay near the given ones.
+
+    A quintic from rest peaks at 1.875 of its mean speed and at 5.77 distance / T^2.
+    """
+    distance = math.dist(pos, target)
+    initial = math.sqrt(float(vel @ vel))
+    travel_s = max(1.875 * distance / speed_m_s, math.sqrt(5.77 * distance / accel_m_s2), 3.0 * initial / accel_m_s2)
+    return Glide(pos, vel, target, max(travel_s, 0.5))
+
+
+def brake_to_rest(pos: Array, vel: Array, accel_m_s2: float) -> Glide:
+    """A `Glide` that stops about as soon as `accel_m_s2` allows, straight ahead."""
+    speed = math.sqrt(float(vel @ vel))
+    travel_s = max(0.5, 2.0 * speed / accel_m_s2)
+    return Glide(pos, vel, pos + 0.5 * travel_s * vel, travel_s)

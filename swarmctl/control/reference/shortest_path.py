@@ -1,0 +1,135 @@
+"""The shortest way in the plane round discs: a grid, Dijkstra from the goal, and a string pulled tight.
+
+Only asked by who stands still before something (`swarmctl.control.reference.deadlock`): the MPC looks 0.8 s ahead and
+has no way of knowing on which side a wall ends. Cells inside a disc are passable at a price, so that there is always an
+answer, also from where one should not be and through gaps that the grid is too coarse for.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import dijkstra
+
+from swarmctl.core.types import Array
+
+_CELLS = 60  # along the longer side
+_EDGE_CELLS = 0.7  # a point so far inside a disc may have a free one in its cell
+_PRICE_INSIDE = 1000.0  # of a metre farther inside
+_NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))
+
+
+class Way:
+    """A polyline in the plane, measured along itself.
+
+    Args:
+        corners: (K, 2), at least 2.
+    """
+
+    def __init__(self, corners: Array) -> None:
+        self.corners = corners
+        self._legs = np.diff(corners, axis=0)
+        self._lengths_m = np.maximum(np.linalg.norm(self._legs, axis=1), 1e-9)
+        self._reached_m = np.concatenate([[0.0], np.cumsum(self._lengths_m)])
+        self.length_m = float(self._reached_m[-1])
+
+    def nearest_m(self, here: Array) -> float:
+        """How far along it the point nearest to `here` (2,) is; the farthest of several."""
+        share = np.clip(((here - self.corners[:-1]) * self._legs).sum(axis=1) / self._lengths_m**2, 0.0, 1.0)
+        distance = np.linalg.norm(self.corners[:-1] + share[:, None] * self._legs - here, axis=1)
+        leg = len(distance) - 1 - int(np.argmin(distance[::-1]))
+        return float(self._reached_m[leg] + share[leg] * self._lengths_m[leg])
+
+    def rest(self, here: Array) -> Way:
+        """From `here` (2,) on to its end."""
+        ahead = self._reached_m[1:] > self.nearest_m(here)
+        ahead[-1] = True
+        return Way(np.vstack([here, self.corners[1:][ahead]]))
+
+    def sample(self, along_m: Array) -> tuple[Array, Array]:
+        """Points and directions, (K, 2) each, at distances (K,) along it; beyond its end that, without direction."""
+        leg = np.clip(np.searchsorted(self._reached_m, along_m, side="right") - 1, 0, len(self._legs) - 1)
+        unit = self._legs[leg] / self._lengths_m[leg, None]
+        here_m = np.minimum(along_m, self.length_m) - self._reached_m[leg]
+        return self.corners[leg] + here_m[:, None] * unit, np.where((along_m < self.length_m)[:, None], unit, 0.0)
+
+    def is_clear(self, discs: Array) -> bool:
+        """Whether all of it stays outside `discs` (M, 3)."""
+        return all(clear(a, b, discs) for a, b in itertools.pairwise(self.corners))
+
+
+def short_way(start: Array, goal: Array, discs: Array, cell_m: float, squeeze: float = 3.0) -> Way:
+    """A short way from `start` (2,) to `goal` (2,) outside `discs` (M, 3): centre and radius.
+
+    Args:
+        start, goal: its first and last point.
+        discs: what to go round.
+        cell_m: of the grid; larger where the ground is large.
+        squeeze: price of a metre through what may be a gap or may be none.
+    """
+    if clear(start, goal, discs):
+        return Way(np.stack([start, goal]))
+    points, shape, step_m = _grid(start, goal, discs, cell_m)
+    price = np.ones(len(points))
+    for x, y, radius in discs:
+        distance = np.hypot(points[:, 0] - x, points[:, 1] - y)
+        price[distance < radius] = np.maximum(price[distance < radius], squeeze)
+        price[distance < radius - _EDGE_CELLS * step_m] = _PRICE_INSIDE
+    first = int(np.argmin(((points - start) ** 2).sum(axis=1)))
+    last = int(np.argmin(((points - goal) ** 2).sum(axis=1)))
+    _, before = dijkstra(_edges(price, shape, step_m), directed=False, indices=last, return_predecessors=True)
+    cells = [first]
+    while cells[-1] != last and before[cells[-1]] >= 0:
+        cells.append(int(before[cells[-1]]))
+    return _tightened(np.vstack([start, points[cells[1:-1]], goal]), discs)
+
+
+def clear(a: Array, b: Array, discs: Array) -> bool:
+    """Whether the segment from `a` (2,) to `b` (2,) stays outside all discs; one it begins in may be left."""
+    if not len(discs):
+        return True
+    way = b - a
+    length2 = max(float(way @ way), 1e-12)
+    from_a = discs[:, :2] - a
+    along = np.clip(from_a @ way / length2, 0.0, 1.0)
+    nearest = np.linalg.norm(from_a - along[:, None] * way, axis=1)
+    leaves = (np.linalg.norm(from_a, axis=1) < discs[:, 2]) & (along <= 0.0)
+    return bool(((nearest >= discs[:, 2]) | leaves).all())
+
+
+def _grid(start: Array, goal: Array, discs: Array, cell_m: float) -> tuple[Array, tuple[int, int], float]:
+    """Points (rows * columns, 2) round everything, with room to pass outside."""
+    largest_m = float(discs[:, 2].max())
+    corners = np.vstack([start, goal, discs[:, :2] - discs[:, 2:], discs[:, :2] + discs[:, 2:]])
+    low, high = corners.min(axis=0) - largest_m, corners.max(axis=0) + largest_m
+    step_m = max(cell_m, float((high - low).max()) / _CELLS)
+    shape = (math.ceil((high[0] - low[0]) / step_m) + 1, math.ceil((high[1] - low[1]) / step_m) + 1)
+    rows, columns = np.meshgrid(np.arange(shape[0]), np.arange(shape[1]), indexing="ij")
+    return low + step_m * np.stack([rows.ravel(), columns.ravel()], axis=1), shape, step_m
+
+
+def _edges(price: Array, shape: tuple[int, int], step_m: float) -> csr_array:
+    """Each cell with its eight neighbours; every edge once."""
+    index = np.arange(len(price)).reshape(shape)
+    starts, ends, lengths = [], [], []
+    for down, right in _NEIGHBOURS:
+        a = index[: shape[0] - down, max(0, -right) : shape[1] - max(0, right)].ravel()
+        b = index[down:, max(0, right) : shape[1] + min(0, right)].ravel()
+        starts.append(a)
+        ends.append(b)
+        lengths.append(step_m * math.hypot(down, right) * np.maximum(price[a], price[b]))
+    where = (np.concatenate(starts), np.concatenate(ends))
+    return csr_array((np.concatenate(lengths), where), shape=(len(price), len(price)))
+
+
+def _tightened(points: Array, discs: Array) -> Way:
+    """Through as few of `points` (K, 2) as straight lines allow."""
+    kept = [0]
+    while kept[-1] < len(points) - 1:
+        here = kept[-1]
+        straight = [k for k in range(here + 2, len(points)) if clear(points[here], points[k], discs)]
+        kept.append(straight[-1] if straight else here + 1)
+    return Way(points[kept])

@@ -1,0 +1,383 @@
+"""One vehicle as the tick sees it: MAVLink in, `VehicleState` in the shared frame out; setpoints in, bytes out.
+
+Newest sample wins. `VehicleClock` says when it was true, `LocalFrame` where; which messages mean what, the dialect that
+the HEARTBEAT names. There is no state, and so nothing is sent, while any of it is in doubt, the mode included.
+"""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+from pymavlink.dialects.v20 import development as mavlink
+
+from swarmctl.core.frames import rotate_to_ned
+from swarmctl.core.types import Array, AttitudeSetpoint, FlightMode, GeoOrigin, Landed, VehicleState
+from swarmctl.mavlink.codec import Codec, frames
+from swarmctl.mavlink.commands import CommandPort
+from swarmctl.mavlink.dialects import DIALECTS, LAST_INTEGER_TYPE, Dialect
+from swarmctl.mavlink.local_frame import LocalFrame
+from swarmctl.mavlink.mode_watch import ModeWatch
+from swarmctl.mavlink.transport import Transport
+from swarmctl.mavlink.vehicle_clock import VehicleClock
+
+_ATTITUDE_ONLY = 7  # type_mask: body rates ignored; mask 0 would fly rates and attitude against each other
+_ARMED_FLAG = 128
+_CRITICAL = 5
+_PREARM = 1 << 28
+_LOCAL_NED = mavlink.MAV_FRAME_LOCAL_NED
+_BODY_FRD = (mavlink.MAV_FRAME_BODY_NED, mavlink.MAV_FRAME_BODY_FRD)  # of ODOMETRY's velocity
+_STATE = frozenset({"ODOMETRY", "LOCAL_POSITION_NED"})  # whose stamps are the state's
+_FAST = frozenset({mavlink.MAVLINK_MSG_ID_ODOMETRY})  # not worth passing to the slow path
+_SYNC_EVERY_US = 200_000
+_OWN_FLIGHT_US = 1_000_000  # without setpoints for so long the autopilot flies by itself, whatever its mode
+_HOVER_M_S = 0.2
+
+
+class _Sample(NamedTuple):
+    """Newest state in the vehicle's own clock and frame."""
+
+    vehicle_us: int
+    t_us: int  # our monotonic time
+    pos_ned_m: Array  # (3,)
+    vel_ned_m_s: Array  # (3,)
+    q_nb: Array  # (4,)
+    rate_frd_rad_s: Array  # (3,)
+
+
+class Autopilot:
+    """The link to one vehicle.
+
+    Args:
+        transport: bytes.
+        codec: own identity.
+        sysid: the vehicle's system id; everything else is ignored.
+        shared: origin of the swarm's frame.
+        on_frame: told of every frame in and out (recording).
+
+    Attributes:
+        clock: the vehicle's clock; `clock.boots` counts its reboots.
+        frame: the vehicle's local frame.
+        params: parameters the vehicle has told of.
+        whole_params: names of those that it keeps as integers.
+        armed_told_us: arrival of the HEARTBEAT that told `armed`, our time; -1 before the first.
+        hover_thrust_01: what the autopilot flies with while it hovers by itself; before that, what its parameter says.
+        pos_accuracy_m: horizontal 1-sigma accuracy it claims; None while untold.
+        samples: states received; the difference of two readings is the rate.
+        heard_us: arrival of the last frame, our time.
+        invalid: polls without a state although there was a sample, by reason.
+        watch: the vehicle's flight mode and failsafe, and whether they are in doubt.
+        gaps: how often setpoints were resumed, in that mode, after so long that its failsafe may have acted unseen.
+        gap_s: the last of them.
+    """
+
+    params: dict[str, float]
+    whole_params: set[str]
+    hover_thrust_01: float | None
+    pos_accuracy_m: float | None
+    _sample: _Sample | None
+    _placed: tuple[_Sample, Array] | None  # the sample, and its position in the shared frame
+    _attitude: tuple[int, Array, Array] | None  # arrival, attitude, rates
+    _reset_counter: int | None
+    _was_reset: bool  # the estimator has said so, since the newest placed sample
+
+    def __init__(
+        self,
+        transport: Transport,
+        codec: Codec,
+        sysid: int,
+        shared: GeoOrigin,
+        on_frame: Callable[[bytes], None],
+    ) -> None:
+        self._transport, self._codec, self._sysid = transport, codec, sysid
+        self._on_frame = on_frame
+        self.clock = VehicleClock()
+        self.frame = LocalFrame(shared)
+        self.watch = ModeWatch()
+        self._slow: CommandPort | None = None
+        self.dialect: Dialect | None = None
+        self.armed = False
+        self.armed_told_us = -1
+        self.texts: list[str] = []
+        self.refused_setpoints = 0
+        self.samples = 0
+        self.heard_us: int | None = None
+        self.invalid: Counter[str] = Counter()
+        self.gaps, self.gap_s = 0, 0.0
+        self._departures = 0  # up to the newest setpoint
+        self._setpoint_us: int | None = None
+        self._sync_us = 0
+        self._syncs: deque[int] = deque(maxlen=16)  # our times in open TIMESYNC questions [ns]
+        self._boots = self._restarts = 0  # of the clock, as far as they have been heeded
+        self._forget()
+        self._handlers: dict[str, Callable[[Any, int], None]] = {
+            "HEARTBEAT": self._heartbeat,
+            "CURRENT_MODE": self._current_mode,
+            "ODOMETRY": self._odometry,
+            "ATTITUDE_QUATERNION": self._attitude_quaternion,
+            "LOCAL_POSITION_NED": self._local_position,
+            "GLOBAL_POSITION_INT": self._global_position,
+            "GPS_GLOBAL_ORIGIN": self._origin,
+            "SYS_STATUS": self._sys_status,
+            "EXTENDED_SYS_STATE": self._extended,
+            "ESTIMATOR_STATUS": self._estimator,
+            "GPS_RAW_INT": self._gps,
+            "ATTITUDE_TARGET": self._attitude_target,
+            "PARAM_VALUE": self._param_value,
+            "TIMESYNC": self._timesync,
+            "STATUSTEXT": self._statustext,
+        }
+
+    @property
+    def mode(self) -> FlightMode:
+        """As told last."""
+        return self.watch.mode
+
+    @property
+    def failsafe(self) -> bool:
+        """Whether the autopilot's failsafe acts, as told last."""
+        return self.watch.failsafe
+
+    @property
+    def offset_ned_m(self) -> Array | None:
+        """Local origin (3,) in the shared frame."""
+        return self.frame.offset_ned_m
+
+    def attach(self, slow: CommandPort) -> None:
+        """Pass everything but the fast state messages on to the slow path."""
+        self._slow = slow
+
+    def send_frame(self, frame: bytes) -> None:
+        """For the slow path: its bytes leave by the same link."""
+        self._on_frame(frame)
+        self._transport.send(frame)
+
+    def poll(self, now_us: int) -> VehicleState | None:
+        """Drain the link; the newest state, or None before the first complete one and while it is in doubt."""
+        self.watch.poll(now_us)
+        for datagram in self._transport.receive(now_us):
+            for frame in frames(datagram.data):
+                self._frame(frame, datagram.t_us)
+        self._ask_the_time(now_us)
+        if self._sample is None or self.mode is FlightMode.UNKNOWN:
+            return None
+        if self.watch.in_doubt:
+            self.invalid["mode not told since a silence"] += 1
+            if self.watch.asks(now_us):
+                self._ask_for(mavlink.MAVLINK_MSG_ID_HEARTBEAT)
+            return None
+        return self._state(self._sample, now_us)
+
+    def send(self, setpoint: AttitudeSetpoint, now_us: int) -> str:
+        """Send one setpoint; returns why it was refused, or "".
+
+        Nothing else in the project sends setpoints.
+        """
+        refused = setpoint.problem(now_us)
+        if refused:
+            self.refused_setpoints += 1
+            return refused
+        q = [float(c) for c in setpoint.q_nb]
+        message = mavlink.MAVLink_set_attitude_target_message(
+            (now_us // 1000) & 0xFFFFFFFF, self._sysid, 1, _ATTITUDE_ONLY, q, 0.0, 0.0, 0.0, setpoint.thrust_01
+        )
+        self._measure_gap(now_us)
+        self.send_frame(self._codec.encode(message))
+        return ""
+
+    def close(self) -> None:
+        self._transport.close()
+
+    def _measure_gap(self, now_us: int) -> None:
+        """How long setpoints had stopped, if that was longer than the autopilot waits for them.
+
+        PX4 returns to OFFBOARD by itself when they resume, sooner than CURRENT_MODE may tell that it was away.
+        """
+        last_us, stayed = self._setpoint_us, self._departures == self.watch.departures
+        self._setpoint_us, self._departures = now_us, self.watch.departures
+        loss_s = None if self.dialect is None else self.params.get(self.dialect.loss_parameter)
+        if last_us is not None and stayed and loss_s is not None and now_us - last_us > loss_s * 1e6:
+            self.gaps, self.gap_s = self.gaps + 1, (now_us - last_us) * 1e-6
+
+    # -- frames -------------------------------------------------------------------------------------------------------
+
+    def _frame(self, frame: bytes, arrived_us: int) -> None:
+        if frame[5] != self._sysid or frame[6] != 1:
+            return
+        message = self._codec.decode(frame)
+        if message is None:
+            return
+        self._on_frame(frame)
+        self.watch.heard(arrived_us)
+        self.heard_us = arrived_us
+        kind = message.get_type()
+        if kind not in _STATE and (boot_ms := getattr(message, "time_boot_ms", None)) is not None:
+            self.clock.witness(kind, boot_ms * 1000, arrived_us)
+        handler = self._handlers.get(kind)
+        if handler is not None:
+            handler(message, arrived_us)
+        if self._slow is not None and message.get_msgId() not in _FAST:
+            self._slow.frame(frame, message)
+
+    def _heartbeat(self, message: Any, arrived_us: int) -> None:
+        dialect = DIALECTS.get(message.autopilot)
+        if dialect is None:
+            return
+        self.dialect = dialect
+        self.armed, self.armed_told_us = bool(message.base_mode & _ARMED_FLAG), arrived_us
+        self.watch.alarm(message.system_status >= _CRITICAL)
+        self.watch.told(dialect.mode(message.custom_mode), arrived_us)
+
+    def _current_mode(self, message: Any, arrived_us: int) -> None:
+        """The same as in HEARTBEAT, but on change: a pilot's switch must not stay unseen for a second."""
+        if self.dialect is not None:
+            self.watch.told(self.dialect.mode(message.custom_mode), arrived_us)
+
+    def _ask_for(self, message_id: int) -> None:
+        asked = (float(message_id), *(0.0,) * 6)
+        request = mavlink.MAVLink_command_long_message(self._sysid, 1, mavlink.MAV_CMD_REQUEST_MESSAGE, 0, *asked)
+        self.send_frame(self._codec.encode(request))
+
+    def _sys_status(self, message: Any, arrived_us: int) -> None:
+        self.armable = bool(message.onboard_control_sensors_health & _PREARM)
+
+    def _extended(self, message: Any, arrived_us: int) -> None:
+        self.landed = Landed(message.landed_state) if message.landed_state <= Landed.LANDING else Landed.UNKNOWN
+
+    def _statustext(self, message: Any, arrived_us: int) -> None:
+        text = message.text.rstrip("\t\x00") if isinstance(message.text, str) else str(message.text)
+        self.texts = [*self.texts[-19:], text]
+
+    # -- state --------------------------------------------------------------------------------------------------------
+
+    def _odometry(self, message: Any, arrived_us: int) -> None:
+        if message.frame_id != _LOCAL_NED or message.child_frame_id not in (_LOCAL_NED, *_BODY_FRD):
+            self._codec.refused["odometry frame"] += 1
+            return
+        self._odometry_us = arrived_us
+        q_nb = np.array(message.q)
+        vel = np.array([message.vx, message.vy, message.vz])
+        if message.child_frame_id in _BODY_FRD:
+            vel = rotate_to_ned(q_nb, vel)
+        rate = np.array([message.rollspeed, message.pitchspeed, message.yawspeed])
+        pos = np.array([message.x, message.y, message.z])
+        if self._take(message.time_usec, arrived_us, pos, vel, q_nb, rate):
+            self._was_reset |= self._reset_counter not in (None, message.reset_counter)
+            self._reset_counter = message.reset_counter
+
+    def _attitude_quaternion(self, message: Any, arrived_us: int) -> None:
+        q_nb = np.array([message.q1, message.q2, message.q3, message.q4])
+        rate = np.array([message.rollspeed, message.pitchspeed, message.yawspeed])
+        self._attitude = (arrived_us, q_nb, rate)
+
+    def _local_position(self, message: Any, arrived_us: int) -> None:
+        """Fallback for autopilots without ODOMETRY: position with the newest attitude."""
+        if self._attitude is None or (arrived_us - self._odometry_us < 500_000 and self._odometry_us):
+            return
+        pos, vel = np.array([message.x, message.y, message.z]), np.array([message.vx, message.vy, message.vz])
+        self._take(message.time_boot_ms * 1000, arrived_us, pos, vel, self._attitude[1], self._attitude[2])
+
+    def _take(self, vehicle_us: int, arrived_us: int, pos: Array, vel: Array, q_nb: Array, rate: Array) -> bool:
+        """Keep a sample if it is good and the newest."""
+        norm = float(np.sqrt(q_nb @ q_nb))
+        if not (np.isfinite(pos).all() and np.isfinite(vel).all() and np.isfinite(rate).all() and 0.9 < norm < 1.1):
+            self._codec.refused["state not finite"] += 1
+            return False
+        t_us = self.clock.to_local(vehicle_us, arrived_us)
+        if t_us is None:
+            self._codec.refused["stamp not believed"] += 1
+            return False
+        if self.clock.restarts != self._restarts:
+            self._restarts, self._sample = self.clock.restarts, None
+        if self.clock.boots != self._boots:
+            self._boots = self.clock.boots
+            self._forget()
+            self._odometry_us = arrived_us
+        self.samples += 1
+        if self._sample is not None and vehicle_us < self._sample.vehicle_us:
+            return False
+        self._sample = _Sample(vehicle_us, t_us, pos, vel, q_nb / norm, rate)
+        return True
+
+    def _state(self, sample: _Sample, now_us: int) -> VehicleState | None:
+        if self._placed is None or self._placed[0] is not sample:
+            told, self._was_reset = self._was_reset, False
+            placed = self.frame.place(sample.vehicle_us, sample.pos_ned_m, sample.vel_ned_m_s, self.armed, told)
+            self._placed = None if placed is None else (sample, placed)
+        if self._placed is None:
+            return None
+        pos, vel, q_nb, rate = self._placed[1], sample.vel_ned_m_s, sample.q_nb, sample.rate_frd_rad_s
+        mode, failsafe = self.watch.show(now_us)
+        return VehicleState(sample.t_us, pos, vel, q_nb, rate, self.armed, mode, self.landed, failsafe)
+
+    def _forget(self) -> None:
+        """The vehicle has rebooted, or was never heard: nothing it said holds."""
+        self._sample = self._placed = self._attitude = self._reset_counter = None
+        self._was_reset = False
+        self._odometry_us = 0
+        self.landed = Landed.UNKNOWN
+        self.armable = False
+        self.params, self.whole_params = {}, set()
+        self.hover_thrust_01 = self.pos_accuracy_m = None
+        self.frame.forget()
+
+    # -- frame, clock, accuracy, parameters ---------------------------------------------------------------------------
+
+    def _origin(self, message: Any, arrived_us: int) -> None:
+        self.frame.told(_geodetic(message.latitude, message.longitude, message.altitude))
+
+    def _global_position(self, message: Any, arrived_us: int) -> None:
+        if self._sample is not None:
+            place = _geodetic(message.lat, message.lon, message.alt)
+            self.frame.seen(place, message.time_boot_ms * 1000, self._sample[0], *self._sample[2:4])
+
+    def _ask_the_time(self, now_us: int) -> None:
+        if self.dialect is not None and now_us - self._sync_us >= _SYNC_EVERY_US:
+            self._sync_us = now_us
+            self._syncs.append(now_us * 1000)
+            self.send_frame(self._codec.encode(mavlink.MAVLink_timesync_message(0, now_us * 1000)))
+
+    def _timesync(self, message: Any, arrived_us: int) -> None:
+        if message.tc1 > 0 and message.ts1 in self._syncs:
+            self._syncs.remove(message.ts1)
+            self.clock.round_trip(message.ts1 // 1000, message.tc1 // 1000, arrived_us)
+
+    def _estimator(self, message: Any, arrived_us: int) -> None:
+        self._accuracy("ESTIMATOR_STATUS", message.pos_horiz_accuracy)
+
+    def _gps(self, message: Any, arrived_us: int) -> None:
+        self._accuracy("GPS_RAW_INT", message.h_acc * 1e-3)
+
+    def _accuracy(self, source: str, sigma_m: float) -> None:
+        """0 means untold in both messages."""
+        if self.dialect is not None and self.dialect.horizontal_accuracy == source and 0.0 < sigma_m < np.inf:
+            self.pos_accuracy_m = float(sigma_m)
+
+    def _param_value(self, message: Any, arrived_us: int) -> None:
+        if self.dialect is None:
+            return
+        value = self.dialect.from_wire(message.param_value, message.param_type)
+        if not np.isfinite(value):
+            return
+        self.params[message.param_id] = value
+        if message.param_type <= LAST_INTEGER_TYPE:
+            self.whole_params.add(message.param_id)
+        if message.param_id == self.dialect.hover_parameter and self.hover_thrust_01 is None and 0.05 < value < 0.95:
+            self.hover_thrust_01 = value
+
+    def _attitude_target(self, message: Any, arrived_us: int) -> None:
+        """Thrust of a hover that is the autopilot's own: in HOLD, or where take-off and our control share one mode."""
+        if self.landed is Landed.IN_AIR and 0.05 < message.thrust < 1.0 and self._hovers_by_itself(arrived_us):
+            self.hover_thrust_01 = float(message.thrust)
+
+    def _hovers_by_itself(self, now_us: int) -> bool:
+        if self.mode is not FlightMode.EXTERNAL or self._sample is None:
+            return self.mode is FlightMode.HOLD
+        own = self._setpoint_us is None or now_us - self._setpoint_us > _OWN_FLIGHT_US
+        return own and abs(float(self._sample.vel_ned_m_s[2])) < _HOVER_M_S
+
+
+def _geodetic(lat_e7: int, lon_e7: int, alt_mm: int) -> GeoOrigin:
+    return GeoOrigin(lat_e7 * 1e-7, lon_e7 * 1e-7, alt_mm * 1e-3)

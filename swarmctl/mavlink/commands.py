@@ -1,0 +1,170 @@
+"""The slow path: arming, modes, parameters and rates, as commands that are requested and answered later.
+
+One table of MAVLink commands serves both executors: `CodecCommands` here (lockstep; also plain links without MAVSDK)
+and `MavsdkCommands`, which runs MAVSDK over the same socket. The tick never waits for either.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+from pymavlink.dialects.v20 import development as mavlink
+
+from swarmctl.core.types import Command, Verb
+from swarmctl.mavlink.codec import Codec
+from swarmctl.mavlink.dialects import Dialect
+
+OWN_COMPID = 191  # MAV_COMP_ID_ONBOARD_COMPUTER, beside the vehicle's own system id
+_RETRY_US = 500_000
+_TRIES = 4
+_IN_PROGRESS = 5  # MAV_RESULT
+_HEARTBEAT_US = 1_000_000
+_GROUND_STATION, _NO_AUTOPILOT, _ACTIVE = 6, 8, 4  # MAV_TYPE_GCS: what PX4 counts for its data-link failsafe
+
+
+@dataclass(frozen=True, slots=True)
+class CommandResult:
+    """One answer; `text` says what the autopilot said."""
+
+    command: Command
+    ok: bool
+    text: str
+
+
+class CommandPort(Protocol):
+    """Executes commands one after the other, in the background of the tick."""
+
+    @property
+    def busy(self) -> bool:
+        """Whether something is asked and not answered yet."""
+
+    def request(self, command: Command) -> None:
+        """Queue a command."""
+
+    def results(self) -> list[CommandResult]:
+        """Answers since the last call."""
+
+    def frame(self, frame: bytes, message: Any) -> None:
+        """Everything the vehicle says, except the fast state messages."""
+
+    def step(self, now_us: int) -> None:
+        """Called once a tick."""
+
+    def close(self) -> None:
+        """Release everything."""
+
+
+class CodecCommands:
+    """Commands through the codec, re-sent until acknowledged; also sends the agent's heartbeat.
+
+    It is a ground station's: only those count for PX4's data-link failsafe, which lands a vehicle whose agent dies
+    before OFFBOARD, and only to them PX4 sends its texts.
+
+    Args:
+        send: hands a frame to the vehicle.
+        codec: own identity.
+        target: the vehicle's system id.
+        dialect: the autopilot's, or None while nobody knows; commands wait for it.
+    """
+
+    def __init__(
+        self,
+        send: Callable[[bytes], None],
+        codec: Codec,
+        target: int,
+        dialect: Callable[[], Dialect | None],
+    ) -> None:
+        self._send, self._codec, self._target = send, codec, target
+        self._dialect = dialect
+        self._asked: deque[Command] = deque()
+        self._steps: deque[Command] = deque()  # of the one being executed
+        self._spoken: Dialect | None = None  # in which it is being asked
+        self._tries = 0
+        self._next_us = 0
+        self._heartbeat_us = 0
+        self._results: list[CommandResult] = []
+
+    @property
+    def busy(self) -> bool:
+        return bool(self._steps or self._asked)
+
+    def request(self, command: Command) -> None:
+        self._asked.append(command)
+
+    def results(self) -> list[CommandResult]:
+        done, self._results = self._results, []
+        return done
+
+    def frame(self, frame: bytes, message: Any) -> None:
+        if not self._steps or self._spoken is None:
+            return
+        current = self._steps[0]
+        kind = message.get_type()
+        if kind == "COMMAND_ACK":
+            asked = self._spoken.long_command(current)
+            if asked is None or asked.command != message.command:
+                return
+            if message.result == _IN_PROGRESS:
+                self._tries = 0
+            else:
+                self._finish(message.result == 0, f"result {message.result}")
+        elif kind == "PARAM_VALUE" and current.name and message.param_id == current.name:
+            self._compare(current, self._spoken, message)
+        elif kind == "PARAM_ERROR" and current.name and message.param_id == current.name:
+            self._finish(False, f"parameter error {message.error}")
+
+    def step(self, now_us: int) -> None:
+        if now_us >= self._heartbeat_us:
+            self._heartbeat_us = now_us + _HEARTBEAT_US
+            beat = mavlink.MAVLink_heartbeat_message(_GROUND_STATION, _NO_AUTOPILOT, 0, 0, _ACTIVE, 3)
+            self._send(self._codec.encode(beat))
+        if not self._steps:
+            self._spoken = self._dialect()
+            if not self._asked or self._spoken is None:
+                return
+            self._steps.extend(self._spoken.steps(self._asked.popleft()))
+            self._tries, self._next_us = 0, now_us
+        if now_us >= self._next_us:
+            if self._tries == _TRIES:
+                self._finish(False, "no answer")
+                return
+            self._next_us = now_us + _RETRY_US
+            self._tries += 1
+            assert self._spoken is not None
+            self._send(self._codec.encode(self._message(self._steps[0], self._spoken)))
+
+    def close(self) -> None:
+        self._asked.clear()
+        self._steps.clear()
+
+    def _compare(self, current: Command, dialect: Dialect, message: Any) -> None:
+        told = dialect.from_wire(message.param_value, message.param_type)
+        if current.verb is Verb.PARAM_GET:
+            self._finish(True, f"{told:g}")
+            return
+        bits, wanted = (struct.pack("<f", v) for v in (message.param_value, dialect.to_wire(current)[0]))
+        self._finish(bits == wanted, "set" if bits == wanted else f"stays at {told:g}")
+
+    def _finish(self, ok: bool, text: str) -> None:
+        """Of the current step: the next one follows at once, but not after a failure."""
+        current = self._steps.popleft()
+        self._results.append(CommandResult(current, ok, text))
+        self._tries, self._next_us = 0, 0
+        if not ok:
+            why = f"{current.name or current.verb.value}: {text}"
+            self._results.extend(CommandResult(step, False, why) for step in self._steps)
+            self._steps.clear()
+
+    def _message(self, command: Command, dialect: Dialect) -> Any:
+        if command.verb is Verb.PARAM_GET:
+            return mavlink.MAVLink_param_request_read_message(self._target, 1, command.name.encode(), -1)
+        asked = dialect.long_command(command)
+        if asked is None:
+            value, kind = dialect.to_wire(command)
+            return mavlink.MAVLink_param_set_message(self._target, 1, command.name.encode(), value, kind)
+        padded = (*asked.params, *(0.0,) * (7 - len(asked.params)))
+        return mavlink.MAVLink_command_long_message(self._target, 1, asked.command, self._tries - 1, *padded)

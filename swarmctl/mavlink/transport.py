@@ -1,0 +1,388 @@
+"""Byte links to a vehicle: UDP, TCP, serial, and an in-memory pipe for lockstep. None of them ever blocks.
+
+A transport moves datagrams and stamps their arrival; it knows nothing of MAVLink except, in a byte stream, where a
+frame ends. Streams that break are opened again for as long as it takes: whether a vehicle is lost is judged elsewhere.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import socket
+import struct
+import sys
+import time
+import zlib
+from collections import deque
+from collections.abc import Callable
+from typing import Any, NamedTuple, Protocol
+
+from swarmctl.errors import StartError
+from swarmctl.mavlink.latch import Address, IsVehicle, Latch, admit_only, anybody
+
+_MAX_DATAGRAM = 2048
+_CHUNK = 65536
+_DATAGRAMS_A_POLL, _BYTES_A_POLL = 600, 131_072  # what one tick can take in; the rest waits for the next
+_BUFFER_BYTES = 1 << 20  # as much as the system allows: what a vehicle says while its agent sleeps is not lost
+_SO_TIMESTAMPNS = 35  # Linux; socket.SO_TIMESTAMPNS is not exported before Python 3.13
+_TIMESPEC = struct.Struct("@qq")
+_URL = re.compile(r"^(?P<scheme>udpin|udpout|tcp|serial)://(?P<where>[^:]+):(?P<number>\d+)$")
+_LOCAL_PORTS = (20000, 32700)  # towards vehicles that are spoken to first; below the ones systems hand out
+_NEIGHBOURS = 16
+_REOPEN_US = 1_000_000
+_DEAD_US = 5_000_000  # every autopilot beats once a second
+
+
+class Datagram(NamedTuple):
+    """Bytes and the monotonic time they arrived [us]."""
+
+    t_us: int
+    data: bytes
+
+
+class Transport(Protocol):
+    """One vehicle's byte link."""
+
+    def send(self, data: bytes) -> None:
+        """Hand over one frame; dropped, never queued, when the link can't take it."""
+
+    def receive(self, now_us: int) -> list[Datagram]:
+        """Everything that has arrived since the last call."""
+
+    def close(self) -> None:
+        """Release the port."""
+
+
+class Endpoint(NamedTuple):
+    """A parsed vehicle URL."""
+
+    scheme: str  # udpin | udpout | tcp | serial
+    where: str  # host, or device path
+    number: int  # port, or baud rate
+
+
+def parse_url(url: str) -> Endpoint:
+    """Split `udpin://host:port`, `udpout://host:port`, `tcp://host:port` or `serial:///dev/tty:baud`.
+
+    Raises:
+        ValueError: with the allowed forms, when the URL has none of them or the port is out of range.
+    """
+    match = _URL.match(url)
+    if match is None:
+        raise ValueError(
+            f"{url!r}: use udpin://HOST:PORT, udpout://HOST:PORT, tcp://HOST:PORT or serial:///DEVICE:BAUD"
+        )
+    endpoint = Endpoint(match["scheme"], match["where"], int(match["number"]))
+    if endpoint.scheme != "serial" and not 1 <= endpoint.number <= 65535:
+        raise ValueError(f"{url!r}: port {endpoint.number} is outside 1..65535")
+    return endpoint
+
+
+def open_transport(
+    url: str, inherited_fd: int | None = None, is_vehicle: IsVehicle = anybody, remote: Address | None = None
+) -> Transport:
+    """Open the link a URL names.
+
+    Args:
+        url: see `parse_url`.
+        inherited_fd: an already bound UDP socket from the launcher, which holds the port so that no other launch can
+            take it between the check and the flight.
+        is_vehicle: whether a datagram shows that its sender is the vehicle; UDP belongs to the first who sends one.
+        remote: where the other end of an inherited socket is known to be.
+
+    Raises:
+        StartError: the port is taken, the host has no address, or the device does not exist.
+    """
+    endpoint = parse_url(url)
+    if endpoint.scheme == "serial":
+        return SerialTransport(endpoint.where, endpoint.number)
+    if inherited_fd is not None:
+        return UdpTransport(socket.socket(fileno=inherited_fd), remote, is_vehicle)
+    if endpoint.scheme == "udpin":
+        return UdpTransport(bind_udp(endpoint.where, endpoint.number), None, is_vehicle)
+    there = resolve(endpoint.where), endpoint.number
+    return TcpTransport(there) if endpoint.scheme == "tcp" else UdpTransport(bind_towards(there), there, is_vehicle)
+
+
+def resolve(host: str) -> str:
+    """IPv4 address of a host, once: a name server in the tick would stop it.
+
+    Raises:
+        StartError: it has none.
+    """
+    try:
+        return socket.gethostbyname(host)
+    except (OSError, UnicodeError) as error:
+        raise StartError(f"{host} has no IPv4 address: {error}; check the host") from error
+
+
+def bind_udp(host: str, port: int) -> socket.socket:
+    """A bound UDP socket, without address reuse: a second binder must fail, not steal the traffic.
+
+    Raises:
+        StartError: the port is taken or the host is not ours.
+    """
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    try:
+        sock.bind((host, port))
+    except (OSError, OverflowError) as error:
+        sock.close()
+        raise StartError(f"udp {host}:{port} can't be bound: {error}. Choose a free port or stop its owner") from error
+    return sock
+
+
+def bind_towards(remote: tuple[str, int]) -> socket.socket:
+    """A UDP socket on a local port that is the same at every start: PX4 talks to the first port that ever spoke to it.
+
+    Raises:
+        StartError: the port and its neighbours are taken.
+    """
+    host = _own_address(remote)
+    first = _LOCAL_PORTS[0] + zlib.crc32(f"{remote[0]}:{remote[1]}".encode()) % (_LOCAL_PORTS[1] - _LOCAL_PORTS[0])
+    for port in range(first, first + _NEIGHBOURS):  # another vehicle's may be the same
+        with contextlib.suppress(StartError):
+            return bind_udp(host, port)
+    raise StartError(f"udp ports {first} to {port} are taken. Stop what talks to {remote[0]}:{remote[1]} already")
+
+
+def _own_address(remote: tuple[str, int]) -> str:
+    """Address of the interface that leads to `remote`; every interface while no way leads there yet."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.connect(remote)  # sends nothing
+        except OSError:
+            return "0.0.0.0"
+        return str(probe.getsockname()[0])
+
+
+class UdpTransport:
+    """A UDP socket that hears and answers one sender: the vehicle, see `Latch`.
+
+    With `remote` set it talks first. Arrival is stamped by the kernel, so a tick that drains the socket every 20 ms
+    still knows when each sample came. One call takes in so much and no more, whoever floods the port.
+    """
+
+    def __init__(self, sock: socket.socket, remote: Address | None = None, is_vehicle: IsVehicle = anybody) -> None:
+        self._sock = sock
+        self._sock.setblocking(False)
+        self._sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+        self.latch = Latch(is_vehicle, remote)
+        self._admitted: Address | None = None  # by the kernel; None: everybody
+        self._stamped = sys.platform == "linux"
+        if self._stamped:
+            self._sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+
+    @property
+    def fd(self) -> int:
+        """File descriptor, for a selector."""
+        return self._sock.fileno()
+
+    def send(self, data: bytes) -> None:
+        if self.latch.remote is None:
+            return
+        try:
+            self._sock.sendto(data, self.latch.remote)
+        except OSError:
+            return  # full buffer, or nobody listens: the autopilot's own failsafe judges silence
+
+    def receive(self, now_us: int) -> list[Datagram]:
+        latch = self.latch
+        latch.poll(now_us)
+        self._admit(latch.only)
+        arrived: list[Datagram] = []
+        left = _BYTES_A_POLL
+        for _ in range(_DATAGRAMS_A_POLL):
+            try:
+                data, ancillary, _, sender = self._sock.recvmsg(_MAX_DATAGRAM, 64)
+            except ConnectionRefusedError:
+                continue  # ICMP port unreachable surfaces here once
+            except OSError:
+                break  # all of it
+            if latch.admits(sender, data):
+                arrived.append(Datagram(self._arrival_us(ancillary, now_us), data))
+                left -= len(data)
+            if left < 0:
+                break
+        self._admit(latch.only)
+        return arrived
+
+    def _admit(self, sender: Address | None) -> None:
+        if sender != self._admitted:
+            self._admitted = sender
+            admit_only(self._sock, sender)
+
+    def _arrival_us(self, ancillary: list[tuple[int, int, bytes]], now_us: int) -> int:
+        for level, kind, value in ancillary:
+            if level == socket.SOL_SOCKET and kind == _SO_TIMESTAMPNS:
+                seconds, nanoseconds = _TIMESPEC.unpack(value)
+                age_us: int = time.time_ns() // 1000 - (seconds * 1_000_000 + nanoseconds // 1000)
+                return now_us - max(0, age_us)
+        return now_us
+
+    def close(self) -> None:
+        self._sock.close()
+
+
+class TcpTransport:
+    """A TCP client (ArduPilot listens on 5760); frames are cut out of the byte stream.
+
+    It connects while the tick runs, and again a second after the other end has gone. What does not fit into the
+    socket's buffer is dropped by whole frames.
+    """
+
+    def __init__(self, remote: tuple[str, int]) -> None:
+        self._remote = remote
+        self._sock: socket.socket | None = None
+        self._open_us: int | None = None  # when the last attempt began
+        self._heard_us = 0
+        self._buffer = bytearray()
+        self._rest = b""  # of a frame that left in part
+
+    def send(self, data: bytes) -> None:
+        if self._sock is None:
+            return
+        try:
+            if self._rest:
+                self._rest = self._rest[self._sock.send(self._rest) :]
+            if not self._rest:
+                self._rest = data[self._sock.send(data) :]
+        except (BlockingIOError, InterruptedError):
+            return
+        except OSError:
+            self._lose()
+
+    def receive(self, now_us: int) -> list[Datagram]:
+        if self._sock is not None and now_us - self._heard_us > _DEAD_US:
+            self._lose()  # an end that vanished without a word would be waited for for a quarter of an hour
+        if self._sock is None and (self._open_us is None or now_us - self._open_us >= _REOPEN_US):
+            self._open(now_us)
+        try:
+            while self._sock is not None:
+                data = self._sock.recv(_CHUNK)
+                if not data:
+                    self._lose()
+                self._buffer += data
+                self._heard_us = now_us
+        except (BlockingIOError, InterruptedError):
+            pass  # all of it, or still connecting
+        except OSError:
+            self._lose()
+        return [Datagram(now_us, frame) for frame in cut_frames(self._buffer)]
+
+    def close(self) -> None:
+        self._lose()
+
+    def _open(self, now_us: int) -> None:
+        self._open_us = self._heard_us = now_us
+        self._sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
+        self._sock.setblocking(False)
+        self._sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        with contextlib.suppress(BlockingIOError, OSError):  # recv says whether it has worked
+            self._sock.connect(self._remote)
+
+    def _lose(self) -> None:
+        if self._sock is not None:
+            self._sock.close()
+        self._sock, self._rest = None, b""
+        self._buffer.clear()
+
+
+class SerialTransport:
+    """A serial port; frames are cut out of the byte stream and handed on one by one. Unplugged, it is opened again."""
+
+    def __init__(self, device: str, baud: int) -> None:
+        import serial  # only vehicles on a wire need it
+
+        def open_port() -> Any:
+            return serial.Serial(device, baud, timeout=0, write_timeout=0)
+
+        self._open_port: Callable[[], Any] = open_port
+        try:
+            self._port: Any = open_port()
+        except (OSError, ValueError) as error:  # SerialException is an OSError
+            raise StartError(f"serial {device} at {baud} baud can't be opened: {error}") from error
+        self._lost_us: int | None = None
+        self._lost = False
+        self._buffer = bytearray()
+
+    def send(self, data: bytes) -> None:
+        if self._port is None:
+            return
+        try:
+            self._port.write(data)
+        except OSError:
+            self._lost = True
+
+    def receive(self, now_us: int) -> list[Datagram]:
+        self._reopen(now_us)
+        if self._port is None:
+            return []
+        try:
+            self._buffer += self._port.read(_CHUNK)
+        except OSError:
+            self._lost = True
+            return []
+        return [Datagram(now_us, frame) for frame in cut_frames(self._buffer)]
+
+    def close(self) -> None:
+        if self._port is not None:
+            self._port.close()
+
+    def _reopen(self, now_us: int) -> None:
+        if self._lost and self._port is not None:
+            with contextlib.suppress(OSError):
+                self._port.close()
+            self._port, self._lost_us = None, now_us
+            self._buffer.clear()
+        if self._port is None and self._lost_us is not None and now_us - self._lost_us >= _REOPEN_US:
+            self._lost_us = now_us
+            with contextlib.suppress(OSError):
+                self._port = self._open_port()
+                self._lost = False
+
+
+def cut_frames(buffer: bytearray) -> list[bytes]:
+    """Take every complete MAVLink 2 frame off the front of `buffer`; junk before a start byte is dropped."""
+    frames: list[bytes] = []
+    while True:
+        start = buffer.find(0xFD)
+        if start < 0:
+            buffer.clear()
+            return frames
+        del buffer[:start]
+        if len(buffer) < 3:
+            return frames
+        length = 12 + buffer[1] + (13 if buffer[2] & 1 else 0)
+        if len(buffer) < length:
+            return frames
+        frames.append(bytes(buffer[:length]))
+        del buffer[:length]
+
+
+class PipeTransport:
+    """One end of an in-memory link on a simulated clock; `latency_us` delays every datagram."""
+
+    def __init__(self, now_us: Callable[[], int], latency_us: int = 0) -> None:
+        self._now_us = now_us
+        self._latency_us = latency_us
+        self._inbox: deque[Datagram] = deque()
+        self.other: PipeTransport = self
+
+    def send(self, data: bytes) -> None:
+        self.other._inbox.append(Datagram(self._now_us() + self._latency_us, data))
+
+    def receive(self, now_us: int) -> list[Datagram]:
+        arrived: list[Datagram] = []
+        while self._inbox and self._inbox[0].t_us <= now_us:
+            arrived.append(self._inbox.popleft())
+        return arrived
+
+    def close(self) -> None:
+        self._inbox.clear()
+
+
+def pipe_pair(now_us: Callable[[], int], latency_us: int = 0) -> tuple[PipeTransport, PipeTransport]:
+    """Two connected ends."""
+    left, right = PipeTransport(now_us, latency_us), PipeTransport(now_us, latency_us)
+    left.other, right.other = right, left
+    return left, right

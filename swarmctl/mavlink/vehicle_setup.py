@@ -1,0 +1,177 @@
+"""What a link needs before flight and keeps needing: messages at their rates, the origin, parameters set and read back.
+
+All of it is asked again when the autopilot has rebooted, rates also when they have been lost. One command at a time,
+and only when nobody else is asking: a request to land never waits for more than one answer. Parameters are set for the
+flight alone: afterwards they are what they were before, because with them a vehicle counts on an agent beside it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Mapping
+
+from swarmctl.core.types import Command, Verb
+from swarmctl.mavlink.autopilot import Autopilot
+from swarmctl.mavlink.commands import CommandPort, CommandResult
+from swarmctl.mavlink.dialects import GPS_GLOBAL_ORIGIN, Dialect
+
+_ORIGIN_EVERY_US = 1_000_000
+_ORIGIN_SOON_US = 200_000  # positions do not fit: there is no state until it is told
+_WATCH_US = 2_000_000
+_WATCH_MAX_US = 30_000_000  # a link that can't carry the rate is not asked for ever more often
+_SILENT_US = 1_200_000  # not even a heartbeat: there is nobody to ask
+_ENOUGH_01 = 0.5
+
+
+class Upkeep:
+    """Sets up one autopilot and watches that it stays so.
+
+    Args:
+        autopilot: what is told of it.
+        commands: how it is asked.
+        setup: parameters it is given, name -> value.
+        sysid: the agent's own system id, which heartbeats carry.
+        state_rate_hz: of the messages that carry the state.
+
+    Attributes:
+        ready: everything has been asked and answered, since the last reboot.
+        restored: every parameter that was changed has been set back, or could not be.
+    """
+
+    def __init__(
+        self,
+        autopilot: Autopilot,
+        commands: CommandPort,
+        setup: Mapping[str, int | float],
+        sysid: int,
+        state_rate_hz: float,
+    ) -> None:
+        self._autopilot, self._commands = autopilot, commands
+        self._given, self._setup, self._rate_hz = dict(setup), dict(setup), state_rate_hz
+        self._sysid = sysid
+        self._boots = -1
+        self._dialect: Dialect | None = None
+        self._todo: deque[Command] = deque()
+        self._compared = False  # what was read with what is wanted
+        self._before: dict[str, Command] = {}  # parameter -> what sets it to the value that the vehicle came with
+        self._restoring = False
+        self._open: Command | None = None
+        self._failed: dict[str, str] = {}  # parameter -> what the autopilot said
+        self._origin_us = 0
+        self._watched_us = 0
+        self._watch_us = _WATCH_US
+        self._samples = 0
+        self.ready = self.restored = False
+
+    @property
+    def refusal(self) -> str:
+        """Why nothing may be armed, or ""; not known before `ready`."""
+        if not self.ready or self._dialect is None:
+            return ""
+        heeds = self._dialect.heeds_parameter
+        found = [f"{heeds} could not be set to {self._sysid}: {self._failed[heeds]}"] if heeds in self._failed else []
+        told, known = self._autopilot.params, self._autopilot.params.keys()
+        failed = self._setup.keys() & self._failed.keys() & known - {heeds}
+        found += [f"{name} could not be set to {self._setup[name]}: {self._failed[name]}" for name in failed]
+        found += [rule.problem(told.get(rule.name)) for rule in self._dialect.rules if rule.name not in self._failed]
+        found += [rule.problem(None) for rule in self._dialect.rules if rule.name in self._failed.keys() - known]
+        return "; ".join(sorted(problem for problem in found if problem))
+
+    @property
+    def left_changed(self) -> dict[str, float]:
+        """Parameters that could not be set back, with the values that the vehicle came with."""
+        return {name: set_back.value or float(set_back.number) for name, set_back in self._before.items()}
+
+    def restore(self) -> None:
+        """Begin to set every changed parameter back; the vehicle is disarmed or has been handed back."""
+        self._todo = deque(reversed(self._before.values()))
+        self._restoring = True
+
+    def took(self, result: CommandResult) -> None:
+        """An answer of the command port, whoever asked."""
+        if result.command != self._open:
+            return
+        self._open = None
+        name = result.command.name
+        if name and self._restoring:
+            self._before.pop(name if result.ok else "", None)
+        elif name and not result.ok:
+            self._failed[name] = result.text
+
+    def step(self, now_us: int) -> None:
+        """Ask for what is missing. Called last in a tick, so that everybody else asks first."""
+        self._notice_reboot(now_us)
+        if self._dialect is None or self._commands.busy:
+            return
+        self._open = None
+        if self._restoring:
+            self.restored = not self._todo
+        elif self.ready:
+            self._watch(now_us)
+        elif not self._todo:
+            self._compare()
+        command = self._todo.popleft() if self._todo else self._origin(now_us)
+        if command is not None:
+            self._open = command
+            self._commands.request(command)
+
+    def _notice_reboot(self, now_us: int) -> None:
+        autopilot = self._autopilot
+        if autopilot.dialect is None or (autopilot.clock.boots == self._boots and autopilot.dialect is self._dialect):
+            return
+        self._boots, self._dialect, self.ready = autopilot.clock.boots, autopilot.dialect, False
+        self._compared = False
+        self._failed.clear()
+        self._setup = {**self._dialect.given, **self._given}
+        if self._dialect.heeds_parameter:
+            self._setup[self._dialect.heeds_parameter] = self._sysid
+        self._watched_us, self._samples = now_us, autopilot.samples
+        origin = [Command(Verb.MESSAGE, number=GPS_GLOBAL_ORIGIN)]
+        reads = [Command(Verb.PARAM_GET, name=n) for n in dict.fromkeys((*self._setup, *self._dialect.to_read()))]
+        self._todo = deque(self._rates(self._dialect) + origin + reads)
+
+    def _compare(self) -> None:
+        """Ask for what was read to be what is wanted; nothing left to ask for: the link is set up."""
+        if self._compared:
+            self.ready = True
+            return
+        self._compared, told = True, self._autopilot.params
+        for name, value in self._setup.items():
+            if name in told and not math.isclose(told[name], value, rel_tol=1e-6, abs_tol=1e-9):
+                self._before.setdefault(name, self._setting(name, told[name]))
+                self._todo.append(self._setting(name, value))
+
+    def _rates(self, dialect: Dialect) -> list[Command]:
+        state = [Command(Verb.RATE, self._rate_hz, number) for number in dialect.state]
+        return state + [Command(Verb.RATE, rate_hz, number) for number, rate_hz in dialect.rates_hz.items()]
+
+    def _setting(self, name: str, value: float) -> Command:
+        """Request for a value in the type that the vehicle keeps it in, whatever the configuration wrote."""
+        if name in self._autopilot.whole_params and float(value).is_integer():
+            return Command(Verb.PARAM_INT, number=int(value), name=name)
+        return Command(Verb.PARAM_FLOAT, value=float(value), name=name)
+
+    def _origin(self, now_us: int) -> Command | None:
+        frame = self._autopilot.frame
+        every_us = _ORIGIN_EVERY_US if frame.offset_ned_m is None else _ORIGIN_SOON_US
+        if not frame.wants_origin or now_us - self._origin_us < every_us:
+            return None
+        self._origin_us = now_us
+        return Command(Verb.MESSAGE, number=GPS_GLOBAL_ORIGIN)
+
+    def _watch(self, now_us: int) -> None:
+        """A vehicle that talks but tells its state at less than half the rate has lost what it was asked."""
+        waited_us = now_us - self._watched_us
+        if waited_us < self._watch_us:
+            return
+        samples, heard_us = self._autopilot.samples - self._samples, self._autopilot.heard_us
+        self._watched_us, self._samples = now_us, self._autopilot.samples
+        enough = samples >= _ENOUGH_01 * self._rate_hz * waited_us * 1e-6
+        silent = heard_us is None or now_us - heard_us > _SILENT_US
+        if enough or silent:
+            self._watch_us = _WATCH_US
+            return
+        self._watch_us = min(_WATCH_MAX_US, 2 * self._watch_us)
+        assert self._dialect is not None
+        self._todo.extend(self._rates(self._dialect))

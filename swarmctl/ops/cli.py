@@ -1,0 +1,372 @@
+"""Verbs of the command line. No logic: each reads its arguments and calls the module that does the work.
+
+Everything heavy is imported inside the verb that needs it, so that `--help` is quick.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, NoReturn
+
+import typer
+
+from swarmctl.core.text import printable_lines
+from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, ConfigError, SwarmError
+
+if TYPE_CHECKING:
+    from swarmctl.bus.topics import ObstaclesMessage, StatusMessage
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Fly a swarm of quadrotors with one distributed-MPC agent beside every autopilot.",
+)
+obstacle_app = typer.Typer(no_args_is_help=True, help="Change the obstacles of a running launch.")
+app.add_typer(obstacle_app, name="obstacle")
+
+ConfigPath = Annotated[Path | None, typer.Argument(help="TOML file; without one the defaults, the thesis circle.")]
+Agents = Annotated[int | None, typer.Option("--agents", help="Number of agents, over swarm.agents.")]
+Duration = Annotated[float | None, typer.Option("--duration", help="Length of the mission [s].")]
+Seed = Annotated[int | None, typer.Option("--seed", help="Seed of everything random.")]
+Set = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override any key; may be repeated.")]
+NewRunDir = Annotated[Path | None, typer.Option("--run-dir", help="Folder to write; default runs/<UTC>-<name>.")]
+View = Annotated[bool | None, typer.Option("--view/--no-view", help="Open the viewer's window.")]
+RunningDir = Annotated[Path | None, typer.Option("--run-dir", help="Run folder of the launch; default the newest.")]
+OneAgent = Annotated[int | None, typer.Option("--agent", help="One agent; default all.")]
+Folder = Annotated[Path, typer.Argument(help="Run folder.")]
+
+
+def main() -> None:
+    """Run the command line; expected errors become words and an exit code, unexpected ones keep their traceback."""
+    code = _run_app()
+    try:
+        sys.stdout.flush()
+    except OSError:  # nobody reads any more; without this the interpreter would change the exit code
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    sys.exit(code)
+
+
+def _run_app() -> int:
+    try:
+        code = app(standalone_mode=False)
+    except SwarmError as error:
+        print(printable_lines(str(error)), file=sys.stderr)
+        return error.exit_code
+    except (typer.Abort, KeyboardInterrupt):
+        return EXIT_INTERRUPTED
+    except Exception as error:
+        show = getattr(error, "show", None)  # click's usage errors, whichever click typer brings
+        if show is None or not hasattr(error, "exit_code"):
+            raise
+        show()
+        return EXIT_USAGE
+    return code if isinstance(code, int) else EXIT_OK
+
+
+@app.command()
+def launch(
+    config: ConfigPath = None,
+    agents: Agents = None,
+    duration: Duration = None,
+    run_dir: NewRunDir = None,
+    seed: Seed = None,
+    sets: Set = None,
+    view: View = None,
+) -> int:
+    """Bring up simulator, agents, bus and view, and fly. Ctrl-C lands, a second one ends everything at once."""
+    from swarmctl.config import load
+    from swarmctl.ops.launch import LaunchOptions
+    from swarmctl.ops.launch import launch as fly
+
+    options = LaunchOptions(run_dir, _has_display() if view is None else view)
+    return fly(load(config, _overrides(agents, duration, seed, sets)), options)
+
+
+@app.command()
+def simulate(
+    config: ConfigPath = None,
+    agents: Agents = None,
+    duration: Duration = None,
+    run_dir: NewRunDir = None,
+    seed: Seed = None,
+    sets: Set = None,
+    view: View = None,
+) -> NoReturn:
+    """Fly the same agents in one process on a simulated clock: deterministic, faster than real time."""
+    arguments = [] if config is None else [str(config)]
+    for name, value in (("--agents", agents), ("--duration", duration), ("--run-dir", run_dir), ("--seed", seed)):
+        arguments += [] if value is None else [f"{name}={value}"]
+    arguments += [f"--set={item}" for item in sets or ()]
+    arguments += [] if view is None else ["--view" if view else "--no-view"]
+    _become("sitl.simulate", arguments)
+
+
+@app.command()
+def check(
+    config: ConfigPath = None,
+    agents: Agents = None,
+    sets: Set = None,
+    apply: Annotated[
+        bool, typer.Option("--apply", help="Set wanted parameters, on disarmed vehicles; else nothing is changed.")
+    ] = False,
+    seconds: Annotated[float, typer.Option("--seconds", min=1.0, max=600.0, help="Listen to each vehicle [s].")] = 3.0,
+    json: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write everything found, too.")] = None,
+    identify: Annotated[
+        bool, typer.Option("--identify", help="Then FLY: steps about the start; identify delay, lag, drag, thrust.")
+    ] = False,
+    write: Annotated[
+        Path | None, typer.Option("--write", metavar="FILE", help="With --identify: the vehicle model as TOML.")
+    ] = None,
+) -> int:
+    """Ask every vehicle and say what to fix. Exit 0: nothing; 3: one is not reached; 4: something."""
+    from swarmctl.config import load
+    from swarmctl.ops.vehicle_check import CheckOptions
+    from swarmctl.ops.vehicle_check import check as ask
+
+    if write is not None and not identify:
+        raise ConfigError("--write", ["there is nothing to write without --identify"])
+    asked, options = load(config, _overrides(agents, None, None, sets)), CheckOptions(apply, seconds, json)
+    if not identify:
+        return ask(asked, options)
+    from swarmctl.ops.identify import IdentifyOptions, check_and_identify
+
+    return check_and_identify(asked, IdentifyOptions(options, write))
+
+
+@app.command()
+def agent(
+    config: Annotated[Path, typer.Option("--config", help="Resolved TOML file.")],
+    number: Annotated[int, typer.Option("--id", help="Number of this agent, from 0.")],
+    run: Annotated[str, typer.Option("--run", help="Name of the run on the bus.")],
+    bus: Annotated[str, typer.Option("--bus", help="Endpoint of the router.")],
+    run_dir: Annotated[Path, typer.Option("--run-dir", help="Folder to record into.")],
+    fd: Annotated[int | None, typer.Option("--fd", help="Inherited, bound UDP socket of the vehicle.")] = None,
+    vehicle_port: Annotated[
+        int | None, typer.Option("--vehicle-port", help="Loopback port at the other end of that socket.")
+    ] = None,
+    only_land: Annotated[bool, typer.Option("--only-land", help="Land and disarm the vehicle, then end.")] = False,
+) -> int:
+    """One agent beside one autopilot. `launch` starts them; on a companion computer start it yourself."""
+    from swarmctl.agent.runner import AgentProcess, run_agent
+    from swarmctl.process_lifetime import PARENT_ENV, die_with_parent
+
+    if PARENT_ENV in os.environ:
+        die_with_parent(signal.SIGTERM)
+    return run_agent(
+        AgentProcess(
+            config_path=config,
+            agent=number,
+            run=run,
+            bus=bus,
+            run_dir=run_dir,
+            fd=fd,
+            vehicle_port=vehicle_port,
+            only_land=only_land,
+        )
+    )
+
+
+@app.command()
+def status(
+    run_dir: RunningDir = None,
+    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+) -> int:
+    """Show every agent of a running launch."""
+    from swarmctl.ops import operator as attach
+
+    launch = attach.find_launch(run_dir)
+    statuses = attach.read_statuses(launch)
+    print(attach.as_json(statuses)) if as_json else _show(statuses, range(launch.agents))
+    return EXIT_OK
+
+
+@app.command()
+def hold(run_dir: RunningDir = None, agent: OneAgent = None) -> int:
+    """Brake and stay."""
+    return _command("hold", run_dir, agent)
+
+
+@app.command()
+def resume(run_dir: RunningDir = None, agent: OneAgent = None) -> int:
+    """Go on with the mission after hold."""
+    return _command("resume", run_dir, agent)
+
+
+@app.command()
+def land(run_dir: RunningDir = None, agent: OneAgent = None) -> int:
+    """Spread and land."""
+    return _command("land", run_dir, agent)
+
+
+@app.command()
+def rtl(run_dir: RunningDir = None, agent: OneAgent = None) -> int:
+    """Hand over to the autopilot's return to launch."""
+    return _command("rtl", run_dir, agent)
+
+
+@app.command()
+def fault(
+    kind: Annotated[str, typer.Argument(help="gps_loss, motor, link_loss, gust, ...; a wrong one lists them all.")],
+    vehicle: Annotated[int, typer.Option("--vehicle", help="Which, from 0; -1 for all.")] = -1,
+    value: Annotated[float | None, typer.Option("--value", help="Of the kind: fraction, metres, ms, ...")] = None,
+    for_s: Annotated[float, typer.Option("--for", help="How long [s]; 0 to the end.")] = 0.0,
+    rotor: Annotated[int, typer.Option("--rotor", help="Of a motor fault, 0 to 3.")] = 0,
+    direction: Annotated[str, typer.Option("--direction", help="Of a link: both, to_vehicle, from_vehicle.")] = "both",
+    towards: Annotated[float, typer.Option("--towards", help="Of a gust or jump, degrees from north.")] = 0.0,
+    run_dir: RunningDir = None,
+) -> int:
+    """Let something go wrong in the simulator of a running launch; refused where real vehicles fly."""
+    from swarmctl.ops import operator as attach
+    from swarmctl.ops.fault import inject, parse_fault
+
+    launch = attach.find_launch(run_dir)
+    wanted = {"kind": kind, "vehicle": vehicle, "value": value, "for_s": for_s, "rotor": rotor}
+    asked = parse_fault({**wanted, "direction": direction, "towards_deg": towards}, launch.agents)
+    print(inject(launch, asked))
+    return EXIT_OK
+
+
+@obstacle_app.command("list")
+def obstacle_list(run_dir: RunningDir = None) -> int:
+    """Show the obstacles agents know of."""
+    from swarmctl.ops import operator as attach
+
+    _show_obstacles(attach.read_obstacles(attach.find_launch(run_dir)))
+    return EXIT_OK
+
+
+@obstacle_app.command("add")
+def obstacle_add(
+    center: Annotated[str, typer.Option("--center", metavar="N,E,D", help="Centre, shared NED [m].")],
+    radius: Annotated[float, typer.Option("--radius", help="Physical radius [m].")] = 1.0,
+    keep_out: Annotated[float | None, typer.Option("--keep-out", help="From the centre [m]; radius + 0.75.")] = None,
+    visibility: Annotated[float, typer.Option("--visibility", help="Agents see it from closer than this [m].")] = 3.0,
+    velocity: Annotated[str, typer.Option("--velocity", metavar="N,E,D", help="[m/s].")] = "0,0,0",
+    column: Annotated[bool, typer.Option("--column", help="An upright column of any height, not a sphere.")] = False,
+    run_dir: RunningDir = None,
+) -> int:
+    """Put a sphere or a column into a running launch."""
+    from swarmctl.ops import operator as attach
+
+    keep_out_m = radius + 0.75 if keep_out is None else keep_out
+    obstacle = attach.obstacle(center, radius, keep_out_m, visibility, velocity, column)
+    launch = attach.find_launch(run_dir)
+    _show_obstacles(attach.change_obstacles(launch, lambda known: (*known, obstacle)))
+    return EXIT_OK
+
+
+@obstacle_app.command("remove")
+def obstacle_remove(
+    number: Annotated[int, typer.Argument(help="As `obstacle list` counts, from 0.")], run_dir: RunningDir = None
+) -> int:
+    """Take an obstacle out of a running launch."""
+    from swarmctl.ops import operator as attach
+
+    launch = attach.find_launch(run_dir)
+    _show_obstacles(attach.change_obstacles(launch, lambda known: attach.without(known, number)))
+    return EXIT_OK
+
+
+@app.command()
+def view(run_dir: RunningDir = None) -> int:
+    """Open the live view of a running launch."""
+    from swarmctl.ops import operator as attach
+    from swarmctl.telemetry.recordings import open_viewer
+
+    open_viewer(attach.view_address(attach.find_launch(run_dir)))
+    return EXIT_OK
+
+
+@app.command()
+def replay(folder: Folder) -> int:
+    """Open the recording of a run."""
+    from swarmctl.telemetry.recordings import RECORDING, open_viewer
+
+    open_viewer(str(folder / RECORDING))
+    return EXIT_OK
+
+
+@app.command()
+def report(folder: Folder) -> int:
+    """Write the report of a run again, and finish a run that was cut off."""
+    from swarmctl.ops.summary import rewrite_report
+
+    print(rewrite_report(folder))
+    return EXIT_OK
+
+
+@app.command()
+def reproduce(
+    only: Annotated[list[str] | None, typer.Option("--only", metavar="FLIGHT", help="One experiment; repeat.")] = None,
+    plant: Annotated[bool, typer.Option("--plant", help="Only on the plant itself, as the thesis did.")] = False,
+    full: Annotated[bool, typer.Option("--full", help="Only over MAVLink, through the whole bridge.")] = False,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder to write; default runs/<UTC>-reproduce.")] = None,
+    jobs: Annotated[int | None, typer.Option("--jobs", metavar="N", help="Processes; default one a processor.")] = None,
+) -> NoReturn:
+    """Fly the thesis' six experiments again and write them beside what it published."""
+    arguments = [f"--only={name}" for name in only or ()]
+    arguments += [flag for flag, given in (("--plant", plant), ("--full", full)) if given]
+    arguments += [] if out is None else [f"--out={out}"]
+    arguments += [] if jobs is None else [f"--jobs={jobs}"]
+    _become("sitl.studies.thesis.reproduce", arguments)
+
+
+@app.command()
+def bench(
+    out: Annotated[Path | None, typer.Option("--out", help="Folder of bench.json; default here.")] = None,
+    neighbours: Annotated[str | None, typer.Option("--neighbours", metavar="N,N,..", help="How many, 0 to 30.")] = None,
+    solver: Annotated[list[str] | None, typer.Option("--solver", help="osqp or daqp; repeat.")] = None,
+    ticks: Annotated[int | None, typer.Option("--ticks", metavar="N", help="Measured ticks a case.")] = None,
+    slsqp: Annotated[bool | None, typer.Option("--slsqp/--no-slsqp", help="Measure the nonlinear baseline.")] = None,
+) -> NoReturn:
+    """Measure one agent's tick, part by part, for 0 to 30 neighbours and every solver."""
+    arguments = [f"--solver={name}" for name in solver or ()]
+    for name, value in (("--out", out), ("--neighbours", neighbours), ("--ticks", ticks)):
+        arguments += [] if value is None else [f"{name}={value}"]
+    arguments += [] if slsqp is None else ["--slsqp" if slsqp else "--no-slsqp"]
+    _become("sitl.studies.bench.bench", arguments)
+
+
+def _become(module: str, arguments: list[str]) -> NoReturn:
+    """Replace this process: the bridge never imports the simulator."""
+    sys.stdout.flush()
+    os.execv(sys.executable, [sys.executable, "-m", module, *arguments])
+
+
+def _command(verb: str, run_dir: Path | None, agent: int | None) -> int:
+    from swarmctl.ops import operator as attach
+
+    launch = attach.find_launch(run_dir)
+    _show(attach.command(launch, verb, agent), range(launch.agents) if agent is None else range(agent, agent + 1))
+    return EXIT_OK
+
+
+def _overrides(agents: int | None, duration: float | None, seed: int | None, sets: list[str] | None) -> list[str]:
+    """Options as `--set` items, the named ones last: they win."""
+    named = (("swarm.agents", agents), ("mission.duration_s", duration), ("seed", seed))
+    return [*(sets or ()), *(f"{key}={value}" for key, value in named if value is not None)]
+
+
+def _has_display() -> bool:
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+def _show(statuses: dict[int, StatusMessage], agents: range) -> None:
+    from swarmctl.ops.status_table import AgentView, print_statuses
+
+    print_statuses([AgentView(number, statuses.get(number)) for number in agents])
+
+
+def _show_obstacles(message: ObstaclesMessage) -> None:
+    print(f"version {message.version}, {len(message.obstacles)} obstacles, shared NED [m]")
+    for number, item in enumerate(message.obstacles):
+        center = ", ".join(f"{c:.2f}" for c in item.center_ned_m)
+        print(
+            f"{number}: {'column' if item.column else 'centre'} {center}  radius {item.radius_m}  "
+            f"keep-out {item.keep_out_m}  seen {item.visibility_m}"
+        )

@@ -1,0 +1,106 @@
+"""`swarmctl fault`: let something go wrong in a running simulator, and say what it answered.
+
+Only the simulator that the launch started can take faults: a run that flies vehicles of its own has no control socket,
+and is refused.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import socket
+import tempfile
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from swarmctl.config import load
+from swarmctl.core.simulated import FAULTS, FaultParams
+from swarmctl.errors import ConfigError, StartError
+from swarmctl.ops.operator import RunningLaunch
+from swarmctl.ops.processes import control_socket
+
+_ANSWER_S = 3.0
+_LARGEST = 8192
+_OPTIONS = {"for_s": "--for", "towards_deg": "--towards", "kind": "KIND"}
+
+
+def parse_fault(wanted: Mapping[str, Any], vehicles: int) -> FaultParams:
+    """A fault from what somebody typed; what is None was not given.
+
+    Raises:
+        ConfigError: with every problem: kind, vehicle, value, times.
+    """
+    given = {key: value for key, value in wanted.items() if value is not None}
+    try:
+        fault = FaultParams.model_validate(given)
+    except ValidationError as error:
+        problems = [_explain(dict(e)) for e in error.errors()]
+        raise ConfigError("fault", [*problems, *_missed(given, vehicles, problems)]) from error
+    problems = [_as_option(problem) for problem in fault.problems(vehicles)]
+    if problems:
+        raise ConfigError("fault", problems)
+    return fault
+
+
+def inject(launch: RunningLaunch, fault: FaultParams) -> str:
+    """Send a fault to the simulator of a launch; returns what it says.
+
+    Raises:
+        ConfigError: the launch flies vehicles that are not simulated by it, or the simulator refuses.
+        StartError: the simulator does not answer, or has ended with the flight.
+    """
+    path = control_socket(launch.bus)
+    if not path.exists():
+        if load(Path(launch.run_dir) / "config.toml").sitl.enabled:
+            raise StartError(f"fault: the simulator of {launch.run} is not up yet, or has ended; see: swarmctl status")
+        why = "this launch started no simulator; faults are for simulated vehicles, never for real ones"
+        raise ConfigError("fault", [f"{launch.run}: {why}"])
+    answer = _ask(path, {"fault": fault.model_dump()})
+    if not answer.get("ok"):
+        raise ConfigError("fault", [str(problem) for problem in answer.get("problems", ["refused"])])
+    who = "every vehicle" if fault.vehicle < 0 else f"vehicle {fault.vehicle}"
+    length = f" for {fault.for_s:g} s" if fault.for_s else ""
+    return f"{fault.kind} on {who}{length}, {answer['since_boot_s']:.1f} s after the simulator's start"
+
+
+def _ask(path: Path, request: dict[str, Any]) -> dict[str, Any]:
+    """One request, one answer, over a socket of our own in a private folder."""
+    with (
+        tempfile.TemporaryDirectory(prefix="swarm-") as folder,
+        socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock,
+    ):
+        sock.bind(f"{folder}/{os.getpid()}.sock")
+        sock.settimeout(_ANSWER_S)
+        try:
+            sock.sendto(json.dumps(request).encode(), str(path))
+            answer = json.loads(sock.recv(_LARGEST))
+        except (OSError, ValueError) as error:
+            raise StartError(f"fault: the simulator does not answer ({error}); see: swarmctl status") from error
+    return answer if isinstance(answer, dict) else {}
+
+
+def _explain(error: dict[str, Any]) -> str:
+    key = ".".join(str(part) for part in error["loc"])
+    if key == "kind":
+        return f"KIND {error.get('input')!r}: allowed: {', '.join(FAULTS)}"
+    return _as_option(f"{key} = {error.get('input')!r}: {error['msg'].lower()}")
+
+
+def _missed(given: dict[str, Any], vehicles: int, found: list[str]) -> Iterator[str]:
+    """What the first check could not get to: the vehicle of a fault whose kind is unknown, the value of a known one."""
+    vehicle = given.get("vehicle", -1)
+    if not any("--vehicle" in problem for problem in found) and vehicle >= vehicles:
+        yield f"--vehicle = {vehicle}: allowed: 0 to {vehicles - 1}, or -1 for all"
+    rule = FAULTS.get(str(given.get("kind")))
+    value = given.get("value")
+    if rule and value is not None and not rule.low <= value <= rule.high:
+        yield f"--value = {value}: allowed for {given['kind']}: {rule.low:g} to {rule.high:g} ({rule.meaning})"
+
+
+def _as_option(problem: str) -> str:
+    """`for_s = 0: ...` as the command line calls it."""
+    key = problem.split(" ", 1)[0].split(":", 1)[0]
+    return problem.replace(key, _OPTIONS.get(key, f"--{key}"), 1)

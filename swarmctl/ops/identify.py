@@ -1,0 +1,148 @@
+"""`swarmctl check --identify`: fly every vehicle through small steps and write down what it is.
+
+It flies, so it begins with the check itself and goes no further while anything is to fix. The flight is a launch like
+any other, its mission `identify`; the same figures can be had of any run folder whose flight moved enough.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from swarmctl.bus.peers import agent_name
+from swarmctl.config import Config
+from swarmctl.control.estimation.identification import Figure, Identified, flown, identify
+from swarmctl.control.model import VehicleModelParams
+from swarmctl.errors import EXIT_MISSION, EXIT_OK, StartError
+from swarmctl.ops.launch import LaunchOptions, launch
+from swarmctl.ops.vehicle_check import CheckOptions, check
+from swarmctl.toml_text import toml_value
+
+_UNITS = {
+    "delay_s": "s",
+    "attitude_rad_s": "rad/s",
+    "attitude_damping": "",
+    "drag_1_s": "1/s",
+    "hover_thrust_01": "of full",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class IdentifyOptions:
+    """What is not part of the configuration."""
+
+    check: CheckOptions
+    write: Path | None = None  # the table, as a file of its own
+    run_dir: Path | None = None
+
+
+def check_and_identify(config: Config, options: IdentifyOptions) -> int:
+    """Check all vehicles, fly them, and print what was identified; returns the exit code.
+
+    Raises:
+        StartError: the vehicles or the simulator do not come up, or the table can't be written.
+        ConfigError: the configuration can't be flown.
+    """
+    if options.write is not None and options.write.exists():
+        raise StartError(f"{options.write}: exists already. Choose a new file with --write")
+    code = check(config, replace(options.check, to_fly=True))
+    if code != EXIT_OK:
+        print("not flown: something is to fix first")
+        return code
+    steps = config.mission.identify
+    print(
+        f"flying now: up to the start, then {steps.duration_s:.0f} s of steps of {steps.step_m:g} m about it, and back "
+        "down. Ctrl-C lands"
+    )
+    directory = _run_folder(options.run_dir)
+    code = launch(identification(config), LaunchOptions(directory))
+    if code != EXIT_OK:
+        print("not identified: the flight did not go as asked")
+        return code
+    found = identified(directory, config.swarm.agents)
+    models = {agent: result for agent, result in found.items() if isinstance(result, Identified)}
+    for line in lines(found):
+        print(line)
+    text = table(config, models, time.strftime("%Y-%m-%d", time.gmtime()))
+    print(f"\n{text}", end="")
+    if options.write is not None:
+        _write(options.write, text)
+    return EXIT_OK if len(models) == config.swarm.agents else EXIT_MISSION
+
+
+def identification(config: Config) -> Config:
+    """The flight that is identified from."""
+    mission = config.mission.model_copy(
+        update={"kind": "identify", "duration_s": config.mission.identify.duration_s, "yaw_rad": 0.0}
+    )
+    telemetry = config.telemetry.model_copy(update={"enabled": False})
+    return Config.model_validate(
+        {**config.model_dump(), "mission": mission.model_dump(), "telemetry": telemetry.model_dump()}
+    )
+
+
+def identified(directory: Path, agents: int) -> dict[int, Identified | str]:
+    """Of every agent of a run folder: its vehicle, or why nothing can be told."""
+    from swarmctl.telemetry.run_files import load_run  # heavy
+
+    run = load_run(directory)
+    found: dict[int, Identified | str] = {}
+    for agent in range(agents):
+        flight = flown(run.ticks[agent]) if agent in run.ticks else "nothing was recorded"
+        found[agent] = flight if isinstance(flight, str) else identify(flight)
+    return found
+
+
+def lines(found: Mapping[int, Identified | str]) -> list[str]:
+    """For people: a line for each figure, tabs between."""
+    shown = ["vehicle\twhat\testimate\t95 % interval\tunit"]
+    for agent, result in found.items():
+        if isinstance(result, str):
+            shown.append(f"{agent_name(agent)}\tnot identified: {result}")
+            continue
+        for name, unit in _UNITS.items():
+            figure: Figure = getattr(result, name)
+            shown.append(
+                f"{agent_name(agent)}\t{name}\t{figure.value:.4g}\t{figure.low:.4g} to {figure.high:.4g}\t{unit}"
+            )
+    return shown
+
+
+def table(config: Config, models: Mapping[int, Identified], date: str) -> str:
+    """TOML for the configuration: a model for each listed vehicle; for the built-in simulator one, of its first."""
+    text = [f"# swarmctl check --identify, {date}; behind each figure its 95 % interval"]
+    for agent, found in models.items():
+        if config.vehicles:
+            vehicle = config.vehicles[agent]
+            text += ["[[vehicles]]", f"sysid = {vehicle.sysid}", f"url = {toml_value(vehicle.url)}", ""]
+        text += [f"[{'vehicles.model' if config.vehicles else 'vehicle_model'}]"]
+        text += _model_lines(found, config.model_of(agent))
+        if not config.vehicles:
+            break
+        text.append("")
+    return "\n".join(text).rstrip("\n") + "\n"
+
+
+def _model_lines(found: Identified, before: VehicleModelParams) -> Sequence[str]:
+    shown = []
+    for name, value in found.model(before).model_dump().items():
+        figure = getattr(found, name, None)
+        interval = "" if figure is None else f"  # {figure.low:.3g} to {figure.high:.3g}"
+        shown.append(f"{name} = {toml_value(value)}{interval}")
+    return shown
+
+
+def _run_folder(run_dir: Path | None) -> Path:
+    from swarmctl.telemetry.run_folder import create_run_folder  # heavy
+
+    return create_run_folder(run_dir, "identify", time.time_ns() // 1000)
+
+
+def _write(path: Path, text: str) -> None:
+    try:
+        with path.open("x", encoding="utf-8") as file:
+            file.write(text)
+    except OSError as error:
+        raise StartError(f"{path}: can't be written: {error}. Choose another with --write") from error

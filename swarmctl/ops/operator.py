@@ -1,0 +1,330 @@
+"""How an operator's command finds a running launch and speaks to it over the bus.
+
+A launch leaves a note in its run folder and one in each registry: private directories of the user, in the user's
+runtime directory and beside other temporary files, so that a verb from a session without the former finds it as well.
+Every note holds the launch's process, so that a stale one is recognised; what is not private or of somebody else is
+ignored, whatever its name. The verbs repeat what they say until they see an answer, because a fresh session may speak
+before its router has told it who listens.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import stat
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import msgspec
+import psutil
+
+from swarmctl.bus.orders import EVERYBODY, Verb, orders
+from swarmctl.bus.peers import agent_name
+from swarmctl.bus.topics import (
+    COMMAND,
+    MAX_OBSTACLE_M,
+    MAX_OBSTACLES,
+    OBSTACLES,
+    OPERATOR,
+    STATUS,
+    ObstacleMessage,
+    ObstaclesMessage,
+    StatusMessage,
+    decode_obstacles,
+    decode_status,
+    encode_message,
+)
+from swarmctl.bus.zenoh_bus import ZenohBus
+from swarmctl.errors import ConfigError, StartError
+from swarmctl.files import read_file, replace_bytes
+
+LAUNCH_FILE = "launch.json"
+_ANSWER_S = 5.0
+_REPEAT_S = 0.2
+_START_TOLERANCE_S = 1.0
+_MOST_BYTES = 65_536  # of a note
+
+
+class RunningLaunch(msgspec.Struct, frozen=True):
+    """What an operator needs to join a launch."""
+
+    run: str
+    bus: str
+    pid: int
+    started_s: float  # of the process, UTC; a reused pid has another
+    agents: int
+    run_dir: str
+    view: str = ""  # address of the live view, "" without
+
+
+def announce(launch: RunningLaunch) -> None:
+    """Write the notes of a launch; a disk that takes none costs the operator's verbs, never the flight."""
+    payload = msgspec.json.encode(launch)
+    notes = [Path(launch.run_dir) / LAUNCH_FILE]
+    notes += [place / f"{launch.pid}.json" for place in (_runtime_registry(), _temporary_registry()) if place]
+    for note in notes:
+        with contextlib.suppress(OSError):
+            replace_bytes(note, payload)
+
+
+def withdraw() -> None:
+    """Take this process's notes out of the registries."""
+    for registry in _registries():
+        with contextlib.suppress(OSError):
+            (registry / f"{os.getpid()}.json").unlink(missing_ok=True)
+
+
+def process_start_s() -> tuple[float, int]:
+    """When this process began, UTC [s], and its id."""
+    return psutil.Process().create_time(), os.getpid()
+
+
+def find_launch(run_dir: Path | None) -> RunningLaunch:
+    """The launch of a run folder, or this user's newest that runs.
+
+    Raises:
+        StartError: there is none.
+    """
+    if run_dir is not None:
+        launch = _read(run_dir / LAUNCH_FILE)
+        if launch is None or not _runs(launch):
+            raise StartError(f"--run-dir {run_dir}: no launch runs there. See what does with: swarmctl status")
+        return launch
+    running: list[tuple[float, RunningLaunch]] = []
+    for path in (path for registry in _registries() for path in registry.glob("*.json")):
+        launch = _read(path)
+        if launch is not None and _runs(launch):
+            running.append((launch.started_s, launch))
+        else:
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
+    if not running:
+        raise StartError("no launch runs. Start one with: swarmctl launch")
+    return max(running, key=lambda item: item[0])[1]
+
+
+@contextmanager
+def _joined(launch: RunningLaunch) -> Iterator[ZenohBus]:
+    senders = [agent_name(agent) for agent in range(launch.agents)]
+    bus = ZenohBus(launch.bus, launch.run, OPERATOR, {STATUS: senders, OBSTACLES: [OPERATOR]}, connect_timeout_ms=3000)
+    try:
+        yield bus
+    finally:
+        bus.close()
+
+
+def view_address(launch: RunningLaunch) -> str:
+    """Where the live view is served.
+
+    Raises:
+        StartError: this launch has none.
+    """
+    if not launch.view:
+        raise StartError(f"view: {launch.run} serves none; it was started with telemetry.enabled = false, or just now")
+    return launch.view
+
+
+def read_statuses(launch: RunningLaunch) -> dict[int, StatusMessage]:
+    """Newest status of every agent that says one in time."""
+    with _joined(launch) as bus:
+        return _statuses(bus, range(launch.agents), _ANSWER_S)
+
+
+def command(launch: RunningLaunch, verb: str, agent: int | None) -> dict[int, StatusMessage]:
+    """Ask one agent, or all, for a verb; returns what the asked ones say a second later.
+
+    Raises:
+        StartError: there is no such agent, or none of the asked ones is on the bus.
+    """
+    if agent is not None and not 0 <= agent < launch.agents:
+        raise StartError(f"--agent {agent}: this launch has agents 0 to {launch.agents - 1}")
+    asked = range(launch.agents) if agent is None else range(agent, agent + 1)
+    with _joined(launch) as bus:
+        ahead_us: dict[int, int] = {}
+        if not _statuses(bus, asked, _ANSWER_S, ahead_us):
+            raise StartError(f"{verb}: no agent asked is on the bus; see: swarmctl status")
+        now_us = time.time_ns() // 1000
+        clocks_us = [now_us + us for us in ahead_us.values()]
+        said = orders(msgspec.convert(verb, Verb), EVERYBODY if agent is None else agent, now_us, clocks_us)
+        for _ in range(5):
+            for order in said:
+                bus.publish(COMMAND, order)
+            time.sleep(_REPEAT_S)
+        bus.receive(STATUS)
+        return _statuses(bus, asked, 1.0)
+
+
+def read_obstacles(launch: RunningLaunch) -> ObstaclesMessage:
+    """The list of obstacles the launch repeats.
+
+    Raises:
+        StartError: it says nothing in time.
+    """
+    with _joined(launch) as bus:
+        return _obstacles(bus, 0)
+
+
+def change_obstacles(
+    launch: RunningLaunch, change: Callable[[tuple[ObstacleMessage, ...]], tuple[ObstacleMessage, ...]]
+) -> ObstaclesMessage:
+    """Replace the list by `change(list)` and wait until the launch repeats the new one.
+
+    Raises:
+        StartError: the launch does not answer.
+    """
+    with _joined(launch) as bus:
+        old = _obstacles(bus, 0)
+        changed = change(old.obstacles)
+        if len(changed) > MAX_OBSTACLES:
+            raise ConfigError("obstacle", [f"add: there are {len(old.obstacles)}, agents keep {MAX_OBSTACLES} at most"])
+        new = ObstaclesMessage(old.version + 1, changed)
+        return _obstacles(bus, new.version, encode_message(new))
+
+
+def obstacle(
+    center: str, radius_m: float, keep_out_m: float, visibility_m: float, velocity: str, column: bool = False
+) -> ObstacleMessage:
+    """An obstacle from what somebody typed; vectors as `north,east,down`, shared frame.
+
+    Raises:
+        ConfigError: a number is missing, not finite or out of range.
+    """
+    problems: list[str] = []
+    vectors = [_vector(key, text, problems) for key, text in (("--center", center), ("--velocity", velocity))]
+    lengths = {"--radius": radius_m, "--keep-out": keep_out_m, "--visibility": visibility_m}
+    for key, value_m in lengths.items():
+        if not 0.0 < value_m < MAX_OBSTACLE_M:
+            problems.append(f"{key} {value_m}: must be > 0 and < {MAX_OBSTACLE_M:.0f} m")
+    if problems:
+        raise ConfigError("obstacle", problems)
+    return ObstacleMessage(vectors[0], radius_m, keep_out_m, visibility_m, vectors[1], column)
+
+
+def without(known: tuple[ObstacleMessage, ...], number: int) -> tuple[ObstacleMessage, ...]:
+    """The list without one of its members.
+
+    Raises:
+        ConfigError: it has none of that number.
+    """
+    if not 0 <= number < len(known):
+        raise ConfigError("obstacle", [f"remove {number}: there are {len(known)}, counted from 0; see: obstacle list"])
+    return known[:number] + known[number + 1 :]
+
+
+def _vector(key: str, text: str, problems: list[str]) -> tuple[float, float, float]:
+    try:
+        north, east, down = (float(part) for part in text.split(","))
+    except ValueError:
+        problems.append(f"{key} {text!r}: write three numbers, north,east,down, for example 1.5,0,-2")
+        return (0.0, 0.0, 0.0)
+    if not all(math.isfinite(c) and abs(c) < MAX_OBSTACLE_M for c in (north, east, down)):
+        problems.append(f"{key} {text!r}: every number must be finite and within {MAX_OBSTACLE_M:.0f}")
+    return (north, east, down)
+
+
+def _obstacles(bus: ZenohBus, least_version: int, say: bytes | None = None) -> ObstaclesMessage:
+    deadline_s = time.monotonic() + _ANSWER_S
+    while time.monotonic() < deadline_s:
+        if say is not None:
+            bus.publish(OBSTACLES, say)
+        time.sleep(_REPEAT_S)
+        for _, payload in bus.receive(OBSTACLES):
+            message = decode_obstacles(payload)
+            if message is not None and message.version >= least_version:
+                return message
+    raise StartError(f"obstacle: the launch did not answer within {_ANSWER_S:.0f} s; see: swarmctl status")
+
+
+def _statuses(
+    bus: ZenohBus, agents: range, timeout_s: float, ahead_us: dict[int, int] | None = None
+) -> dict[int, StatusMessage]:
+    """Newest status of each of `agents`, as soon as all have said one or when time is up.
+
+    `ahead_us` is told by how much the clock of each is ahead of ours.
+    """
+    heard: dict[int, StatusMessage] = {}
+    deadline_s = time.monotonic() + timeout_s
+    while time.monotonic() < deadline_s:
+        for sender, payload in bus.receive(STATUS):
+            status = decode_status(payload)
+            if status is not None and status.agent in agents and sender == agent_name(status.agent):
+                heard[status.agent] = status
+                if ahead_us is not None:
+                    ahead_us[status.agent] = status.utc_us - time.time_ns() // 1000
+        if len(heard) == len(agents):
+            break
+        time.sleep(0.02)
+    return dict(sorted(heard.items()))
+
+
+def _registries() -> list[Path]:
+    """Private directories of this user that may hold notes."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    places = [Path(runtime) / "swarmctl"] if runtime and _is_private(Path(runtime)) else []
+    places += sorted(_temporary_folder().glob(f"{_temporary_name()}*"))
+    return [place for place in places if _is_private(place)]
+
+
+def _runtime_registry() -> Path | None:
+    """The user's own runtime directory is nobody else's to squat on; None where there is none."""
+    runtime = os.environ.get("XDG_RUNTIME_DIR")
+    if not runtime or not _is_private(Path(runtime)):
+        return None
+    registry = Path(runtime) / "swarmctl"
+    with contextlib.suppress(OSError):
+        registry.mkdir(mode=0o700, exist_ok=True)
+    return registry if _is_private(registry) else None
+
+
+def _temporary_registry() -> Path | None:
+    """Where anybody may take the plain name first, one with a name nobody can foresee serves as well."""
+    plain = _temporary_folder() / _temporary_name()
+    with contextlib.suppress(OSError):
+        plain.mkdir(mode=0o700, exist_ok=True)
+    for place in (plain, *sorted(plain.parent.glob(f"{plain.name}-*"))):
+        if _is_private(place):
+            return place
+    with contextlib.suppress(OSError):
+        return Path(tempfile.mkdtemp(prefix=f"{plain.name}-", dir=plain.parent))
+    return None
+
+
+def _temporary_folder() -> Path:
+    return Path(tempfile.gettempdir())
+
+
+def _temporary_name() -> str:
+    return f"swarmctl-{os.getuid()}"
+
+
+def _is_private(place: Path) -> bool:
+    """Whether it is a directory, no link, of this user, and closed to everybody else."""
+    try:
+        status = place.lstat()
+    except OSError:
+        return False
+    return stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid() and not status.st_mode & 0o077
+
+
+def _read(path: Path) -> RunningLaunch | None:
+    try:
+        return msgspec.json.decode(read_file(path, _MOST_BYTES), type=RunningLaunch)
+    except (OSError, msgspec.DecodeError):
+        return None
+
+
+def _runs(launch: RunningLaunch) -> bool:
+    try:
+        return abs(psutil.Process(launch.pid).create_time() - launch.started_s) < _START_TOLERANCE_S
+    except (psutil.Error, ValueError):
+        return False
+
+
+def as_json(statuses: dict[int, StatusMessage]) -> str:
+    """Statuses for programs: a JSON list, one object per agent."""
+    return json.dumps(msgspec.to_builtins(list(statuses.values())), indent=2)  # ASCII: agents may say anything

@@ -1,0 +1,144 @@
+"""Everything that can be refused before anything starts: packages, ports, vehicle links. All problems at once.
+
+What it finds free it keeps: the vehicle ports are bound here and handed down, so that no other launch can take them
+between the check and the flight.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import importlib.util
+import os
+import re
+import socket
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from swarmctl.config import Config
+from swarmctl.errors import StartError
+from swarmctl.mavlink.transport import bind_udp, parse_url
+
+LOOPBACK = "127.0.0.1"
+_VIEW_PORTS_TRIED = 50
+_NEEDED = {
+    "numpy": (2, 2),
+    "scipy": (1, 14),
+    "osqp": (1, 1),
+    "pymavlink": (2, 4),
+    "mavsdk": (4, 1),
+    "eclipse-zenoh": (1, 10),
+    "msgspec": (0, 19),
+    "pyarrow": (18,),
+}
+_NEEDED_TO_VIEW = {"rerun-sdk": (0, 41)}
+
+
+@dataclass(frozen=True, slots=True)
+class Ground:
+    """What preflight found and holds."""
+
+    sockets: tuple[socket.socket, ...]  # one bound socket per agent with the built-in simulator, else none
+    ports: tuple[int, ...]  # theirs
+    view_port: int  # 0 when telemetry is off
+    vehicle_sockets: tuple[socket.socket, ...] = ()  # the simulator's ends of the same links
+
+    def release(self) -> None:
+        """Close this process's copies; agents keep theirs."""
+        for sock in (*self.sockets, *self.vehicle_sockets):
+            sock.close()
+
+
+def inspect(config: Config) -> Ground:
+    """Check everything, then take the ports.
+
+    Raises:
+        StartError: with every problem found, one line each: key, value, fix.
+    """
+    problems = list(_package_problems(config))
+    sockets: tuple[socket.socket, ...] = ()
+    count = config.swarm.agents
+    if config.sitl.enabled:
+        if importlib.util.find_spec("sitl") is None:
+            problems.append("sitl.enabled = true: package 'sitl' is not installed; install the whole distribution")
+        try:
+            sockets = claim_ports(2 * count)  # both ends: an agent then knows where its vehicle is
+        except StartError as error:
+            problems.append(str(error))
+    else:
+        problems += _vehicle_problems(config)
+    view_port = _free_view_port(config.telemetry.port) if config.telemetry.enabled else 0
+    if config.telemetry.enabled and not view_port:
+        problems.append(
+            f"telemetry.port = {config.telemetry.port}: it and the {_VIEW_PORTS_TRIED - 1} after it are taken; "
+            "choose another or set telemetry.enabled = false"
+        )
+    ports = tuple(sock.getsockname()[1] for sock in sockets[:count])
+    ground = Ground(sockets[:count], ports, view_port, sockets[count:])
+    if problems:
+        ground.release()
+        raise StartError("\n".join(problems))
+    return ground
+
+
+def claim_ports(count: int) -> tuple[socket.socket, ...]:
+    """Bind `count` loopback UDP ports that nobody else knows of.
+
+    Not PX4's own 14540 and up: every other simulator on the machine sends there until it is answered, and an agent
+    would take the first one it hears for its vehicle.
+
+    Raises:
+        StartError: the machine has no port left.
+    """
+    return tuple(bind_udp(LOOPBACK, 0) for _ in range(count))
+
+
+def _package_problems(config: Config) -> Iterator[str]:
+    needed = _NEEDED | (_NEEDED_TO_VIEW if config.telemetry.enabled else {})
+    for name, least in needed.items():
+        wanted = ".".join(map(str, least))
+        try:
+            found = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            yield f"package {name}: not installed; pip install '{name}>={wanted}'"
+            continue
+        numbers = tuple(int(part) for part in re.findall(r"\d+", found)[: len(least)])
+        if numbers < least:
+            yield f"package {name} = {found}: too old; pip install '{name}>={wanted}'"
+
+
+def _vehicle_problems(config: Config) -> Iterator[str]:
+    for i, vehicle in enumerate(config.vehicles[: config.swarm.agents]):
+        endpoint = parse_url(vehicle.url)
+        key = f"vehicles.{i}.url = {vehicle.url!r}"
+        if endpoint.scheme == "serial":
+            device = Path(endpoint.where)
+            if not device.exists():
+                here = ", ".join(sorted(str(p) for p in Path("/dev").glob("tty[UA][SC][BM]*"))) or "none"
+                yield f"{key}: {endpoint.where} does not exist; serial ports here: {here}"
+            elif not os.access(device, os.R_OK | os.W_OK):
+                yield f"{key}: no permission to read and write; join the group that owns {endpoint.where}"
+        elif endpoint.scheme == "udpin":
+            try:
+                bind_udp(endpoint.where, endpoint.number).close()
+            except StartError as error:
+                yield f"{key}: {error}"
+        else:
+            try:
+                socket.getaddrinfo(endpoint.where, endpoint.number, socket.AF_INET, socket.SOCK_DGRAM)
+            except OSError as error:
+                yield f"{key}: {endpoint.where} has no address: {error}; check the host"
+
+
+def _free_view_port(first: int) -> int:
+    """First TCP port from `first` on that nobody listens on; 0 when all are taken."""
+    for port in range(first, min(first + _VIEW_PORTS_TRIED, 65536)):
+        with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as sock:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            try:
+                sock.bind((LOOPBACK, port))
+                sock.listen(1)
+            except OSError:
+                continue
+            return port
+    return 0

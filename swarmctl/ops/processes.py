@@ -1,0 +1,259 @@
+"""The processes of a launch: one table of command lines, and a child that is started, watched and ended.
+
+Every child has a session of its own, so that Ctrl-C in the terminal reaches the launcher alone, writes to
+`DIR/<name>.log`, and asks the kernel to end it with the launcher. Nothing here knows about flying.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import secrets
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import psutil
+
+from swarmctl.bus.peers import agent_name
+from swarmctl.bus.zenoh_bus import socket_file
+from swarmctl.config import Config, SitlParams
+from swarmctl.control.reference.mission import MissionReference
+from swarmctl.core.simulated import RealismParams
+from swarmctl.errors import StartError
+from swarmctl.process_lifetime import PARENT_ENV
+from swarmctl.toml_text import toml_value
+
+ROUTER = "router"
+SITL = "sitl"
+VIEWER = "viewer"
+_TAIL_BYTES = 4096
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """One row of the table: what to run under which name, and the descriptors it inherits."""
+
+    name: str
+    argv: tuple[str, ...]
+    fds: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """Where a launch happens: what every command line has in common."""
+
+    run: str
+    endpoint: str
+    directory: Path
+
+
+def run_name(name: str) -> str:
+    """A name for one run on the bus, new every time."""
+    return f"{name}-{secrets.token_hex(4)}"
+
+
+def router_command(endpoint: str) -> Command:
+    """Router of the bus."""
+    return Command(ROUTER, _python("-m", "swarmctl.bus.zenoh_bus", "--router", endpoint, "--die-with-parent"))
+
+
+def agent_commands(
+    config: Config,
+    site: Site,
+    sockets: Sequence[socket.socket],
+    vehicles: Sequence[socket.socket] = (),
+    config_path: Path | None = None,
+) -> tuple[Command, ...]:
+    """One agent for each vehicle; `sockets` are the ends of their links that they inherit, or none.
+
+    `vehicles` are the simulator's ends of them, whose ports the agents are told. `config_path` is where the resolved
+    configuration is, when it is not in the site's folder.
+    """
+    commands = []
+    for agent in range(config.swarm.agents):
+        argv = _python("-m", "swarmctl", "agent", "--config", f"{config_path or site.directory / 'config.toml'}")
+        argv += ("--id", f"{agent}")
+        argv += ("--run", site.run, "--bus", site.endpoint, "--run-dir", f"{site.directory}")
+        fds = (sockets[agent].fileno(),) if sockets else ()
+        argv += ("--fd", f"{fds[0]}") if fds else ()
+        argv += ("--vehicle-port", f"{vehicles[agent].getsockname()[1]}") if vehicles else ()
+        commands.append(Command(agent_name(agent), argv, fds))
+    return tuple(commands)
+
+
+def sitl_command(config: Config, site: Site, ports: Sequence[int], sockets: Sequence[socket.socket] = ()) -> Command:
+    """The built-in simulator, which sends to `ports` on loopback from `sockets`, or chooses its own."""
+    sitl, swarm = config.sitl, config.swarm
+    starts = config.starts_ned_m()
+    if sitl.start == "ground":
+        starts = tuple((x, y, sitl.ground_z_m) for x, y, _ in starts)
+    argv = _python("-m", "sitl", "--vehicles", f"{swarm.agents}", "--preset", sitl.preset)
+    argv += ("--attitude-gains", sitl.attitude_gains, "--estimator", sitl.estimator)
+    argv += ("--autopilot", sitl.autopilot_kind, "--ekf-ready", f"{sitl.ekf_ready_s!r}")
+    argv += ("--gcs-port", f"{sitl.gcs_port}") if sitl.gcs_port else ()
+    argv += () if sitl.reject_bad_setpoints else ("--accept-bad-setpoints",)
+    argv += ("--spawn=" + ";".join(",".join(repr(c) for c in start) for start in starts),)
+    argv += (f"--origin={swarm.origin_lat_deg!r},{swarm.origin_lon_deg!r},{swarm.origin_alt_m!r}",)
+    argv += ("--remote-ports", ",".join(str(port) for port in ports), "--seed", f"{config.seed}")
+    fds = tuple(sock.fileno() for sock in sockets)
+    argv += ("--local-fds", ",".join(map(str, fds))) if fds else ()
+    argv += ("--physics-hz", f"{sitl.physics_hz}", "--mass-scale", f"{sitl.mass_scale!r}", "--start", sitl.start)
+    argv += _realism(sitl)
+    argv += ("--control", f"{control_socket(site.endpoint)}", "--events", f"{site.directory / 'sitl.events.jsonl'}")
+    argv += ("--truth", f"{site.directory / 'truth.bin'}", "--die-with-parent")
+    return Command(SITL, argv, fds)
+
+
+def _realism(sitl: SitlParams) -> tuple[str, ...]:
+    """What differs from a plain flight, as the simulator's own `--set` items."""
+    defaults = RealismParams().model_dump()
+    wanted = sitl.realism().model_dump()
+    return tuple(f"--set={key}={toml_value(wanted[key])}" for key in wanted if wanted[key] != defaults[key])
+
+
+def control_socket(endpoint: str) -> Path:
+    """Where the simulator of a launch listens for faults: beside the bus."""
+    return socket_file(endpoint).with_name("sitl.sock")
+
+
+def viewer_command(config: Config, site: Site, port: int, view: bool) -> Command:
+    """The process that owns rerun."""
+    argv = _python("-m", "swarmctl.telemetry.viewer", "--run", site.run, "--bus", site.endpoint)
+    argv += ("--agents", f"{config.swarm.agents}", "--run-dir", f"{site.directory}", "--port", f"{port}")
+    center, extent_m = _stage(config)
+    argv += ("--look-at", *(f"{c:.3f}" for c in center), "--extent", f"{extent_m:.3f}")
+    argv += ("--rate-hz", f"{config.telemetry.rate_hz!r}", "--separation", f"{config.separation.radius_m!r}")
+    argv += ("--limit", f"{config.limits.min_separation_m!r}")
+    obstacles = [obstacle.model_dump() for obstacle in config.obstacles]
+    argv += ("--obstacles-json", json.dumps(obstacles), "--die-with-parent")
+    return Command(VIEWER, argv + (("--view",) if view else ()))
+
+
+def _stage(config: Config) -> tuple[tuple[float, ...], float]:
+    """Middle (3,) and half size [m] of the box that holds every start and the whole reference, for the camera."""
+    starts = np.array(config.starts_ned_m())
+    times_s = np.linspace(0.0, config.mission.duration_s, 200)
+    flown = [MissionReference(config.mission, starts, agent).sample(times_s)[0] for agent in range(len(starts))]
+    points = np.concatenate([starts, *flown])
+    low, high = points.min(axis=0), points.max(axis=0)
+    middle = 0.5 * (low + high)
+    return tuple(float(c) for c in middle), max(2.0, float(np.max(high - low)) / 2 + config.separation.radius_m)
+
+
+def _python(*arguments: str) -> tuple[str, ...]:
+    return (sys.executable, *arguments)
+
+
+class Child:
+    """One started process. Start it from the main thread: the kernel ties its life to the thread that did."""
+
+    def __init__(self, command: Command, directory: Path) -> None:
+        self.name = command.name
+        self.log = directory / f"{command.name}.log"
+        self.ended_s: float | None = None
+        with self.log.open("ab") as log:
+            try:
+                self._process = subprocess.Popen(
+                    command.argv,
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=subprocess.STDOUT,
+                    env=_environment(os.environ),
+                    pass_fds=command.fds,
+                    start_new_session=True,
+                )
+            except OSError as error:
+                raise StartError(f"{command.name}: {command.argv[0]} can't be started: {error}") from error
+        self.pid = self._process.pid
+
+    def poll(self) -> int | None:
+        """Exit code as a shell has it (128 + signal), None while running."""
+        code = self._process.poll()
+        if code is None:
+            return None
+        if self.ended_s is None:
+            self.ended_s = time.monotonic()
+        return code if code >= 0 else 128 - code
+
+    def is_stopped(self) -> bool:
+        """Whether it is frozen by a signal or a debugger."""
+        with contextlib.suppress(psutil.Error):
+            return bool(psutil.Process(self.pid).status() in (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP))
+        return False
+
+    def signal(self, signum: int) -> None:
+        """Send a signal, unless the process has ended."""
+        with contextlib.suppress(ProcessLookupError):
+            self._process.send_signal(signum)
+
+    def kill_all(self) -> None:
+        """SIGKILL to everything in the child's session, also to what it left behind."""
+        with contextlib.suppress(ProcessLookupError, PermissionError):
+            os.killpg(self.pid, signal.SIGKILL)
+
+    def wait(self, timeout_s: float) -> bool:
+        """Whether it ended in time."""
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            self._process.wait(max(0.0, timeout_s))
+        return self.poll() is not None
+
+    def how_it_ended(self) -> str:
+        """In words, with the last line it wrote."""
+        code = self._process.poll()
+        if code is None:
+            return "is running"
+        if code < 0:
+            return f"was killed by {signal.Signals(-code).name}"
+        last = self.last_line()
+        return f"ended with exit code {code}" + (f": {last}" if last else "")
+
+    def last_line(self) -> str:
+        """Last line of its log that is not empty."""
+        lines = [line.strip() for line in self._tail().splitlines() if line.strip()]
+        return lines[-1] if lines else ""
+
+    def line_with(self, text: str) -> str:
+        """First line of its log that contains `text`, or nothing."""
+        with contextlib.suppress(OSError):
+            for line in self.log.read_text(encoding="utf-8", errors="replace").splitlines():
+                if text in line:
+                    return line.strip()
+        return ""
+
+    def _tail(self) -> str:
+        with contextlib.suppress(OSError), self.log.open("rb") as log:
+            log.seek(max(0, self.log.stat().st_size - _TAIL_BYTES))
+            return log.read().decode("utf-8", errors="replace")
+        return ""
+
+
+def end_all(children: Sequence[Child], grace_s: float) -> None:
+    """SIGTERM, a common deadline, then SIGKILL for whatever is left of their sessions."""
+    for child in children:
+        if child.poll() is None:
+            child.signal(signal.SIGTERM)
+    deadline_s = time.monotonic() + grace_s
+    for child in children:
+        child.wait(deadline_s - time.monotonic())
+    kill_all(children)
+
+
+def kill_all(children: Sequence[Child]) -> None:
+    """End everything now, and collect it."""
+    for child in children:
+        child.kill_all()
+    for child in children:
+        child.wait(2.0)
+
+
+def _environment(base: Mapping[str, str]) -> dict[str, str]:
+    """One thread for what rerun shares out, as `kernels` has for linear algebra: N agents share the cores."""
+    return {**base, "RAYON_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1", PARENT_ENV: str(os.getpid())}

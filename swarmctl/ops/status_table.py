@@ -1,0 +1,159 @@
+"""What a launch shows while it runs: a live table on a terminal, one line per change of phase anywhere else."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol, TextIO
+
+from rich.console import Console
+from rich.live import Live
+from rich.table import Table
+from rich.text import Text
+
+from swarmctl.bus.peers import agent_name
+from swarmctl.bus.topics import StatusMessage
+from swarmctl.core.text import printable
+from swarmctl.core.types import Mode, Phase
+
+REFRESH_HZ = 4.0
+_LINE = 2000  # characters of a line that stays
+_COLUMNS = ("agent", "phase", "mode", "error m", "separation m", "tick p99 ms", "late", "path age ms", "problem")
+
+
+@dataclass(slots=True)
+class AgentView:
+    """What the launcher knows of one agent."""
+
+    agent: int
+    status: StatusMessage | None = None
+    heard_s: float = 0.0  # monotonic, when `status` came
+    note: str = ""  # what the launcher itself has seen: how it ended, that it is silent
+
+
+class Display(Protocol):
+    """Where a launch speaks."""
+
+    def say(self, text: str) -> None:
+        """One line that stays."""
+
+    def show(self, agents: Sequence[AgentView]) -> None:
+        """The present state; cheap to call often."""
+
+    def close(self) -> None:
+        """Leave the last state standing."""
+
+
+def open_display(stream: TextIO | None = None) -> Display:
+    """A live table when `stream` (standard output) is a terminal, plain lines otherwise."""
+    console = Console(file=stream or sys.stdout, highlight=False)
+    return LiveTable(console) if console.is_terminal else PlainLines(stream or sys.stdout)
+
+
+class LiveTable:
+    """Redrawn in place; `say` prints above it. A terminal that is gone is no reason to stop flying."""
+
+    def __init__(self, console: Console) -> None:
+        self._console = console
+        self._live: Live | None = None
+        self._shown_s = 0.0
+
+    def say(self, text: str) -> None:
+        with contextlib.suppress(OSError):
+            self._console.print(printable(text, _LINE), markup=False, soft_wrap=True)
+
+    def show(self, agents: Sequence[AgentView]) -> None:
+        now_s = time.monotonic()
+        if now_s - self._shown_s < 1.0 / REFRESH_HZ:
+            return
+        self._shown_s = now_s
+        with contextlib.suppress(OSError):
+            if self._live is None:
+                self._live = Live(console=self._console, auto_refresh=False)
+                self._live.start()
+            self._live.update(status_table(agents), refresh=True)
+
+    def close(self) -> None:
+        live, self._live = self._live, None
+        with contextlib.suppress(OSError):
+            if live is not None:
+                live.stop()
+
+
+class PlainLines:
+    """For logs and pipes: a line when an agent's phase or the launcher's note on it changes."""
+
+    def __init__(self, stream: TextIO) -> None:
+        self._stream = stream
+        self._started_s = time.monotonic()
+        self._last: dict[int, tuple[str, str]] = {}
+
+    def say(self, text: str) -> None:
+        with contextlib.suppress(OSError):  # the reader of the pipe is gone; the flight goes on
+            print(printable(text, _LINE), file=self._stream, flush=True)
+
+    def show(self, agents: Sequence[AgentView]) -> None:
+        for view in agents:
+            phase = "" if view.status is None else name_of(Phase, view.status.phase)
+            if (phase, view.note) == self._last.get(view.agent, ("", "")):
+                continue
+            self._last[view.agent] = (phase, view.note)
+            problem = view.note or (view.status.problem if view.status else "")
+            elapsed_s = time.monotonic() - self._started_s
+            self.say(f"{elapsed_s:7.1f} s  {agent_name(view.agent)}  {phase}{'  ' + problem if problem else ''}")
+
+    def close(self) -> None:
+        return
+
+
+def print_statuses(agents: Sequence[AgentView]) -> None:
+    """Once, on standard output: a table on a terminal, one line per agent anywhere else."""
+    console = Console(highlight=False)
+    if console.is_terminal:
+        console.print(status_table(agents))
+        return
+    for row in (_COLUMNS, *(status_cells(view) for view in agents)):
+        print("\t".join(row))
+
+
+def status_table(agents: Sequence[AgentView]) -> Table:
+    """One row per agent."""
+    table = Table(*_COLUMNS)
+    for view in agents:
+        table.add_row(*map(Text, status_cells(view)))  # not markup: agents may say "[...]"
+    return table
+
+
+def status_cells(view: AgentView) -> tuple[str, ...]:
+    """Cells of one agent, in the order of the columns."""
+    status = view.status
+    if status is None:
+        return (agent_name(view.agent), *[""] * (len(_COLUMNS) - 2), printable(view.note) or "not heard yet")
+    return (
+        agent_name(view.agent),
+        name_of(Phase, status.phase),
+        name_of(Mode, status.mode),
+        _number(status.position_error_m, 3),
+        _number(status.separation_m, 2),
+        _number(status.tick_p99_ms, 1),
+        f"{status.late_ticks}/{status.ticks}",
+        _number(status.path_age_ms, 0),
+        printable(view.note or status.problem),
+    )
+
+
+def name_of(kind: type[Phase] | type[Mode], number: int) -> str:
+    """Name of an enum value that came over the bus; unknown ones as a number."""
+    try:
+        return kind(number).name
+    except ValueError:
+        return str(number)
+
+
+def _number(value: float | None, digits: int) -> str:
+    """A quantity that can't be negative; below zero says that there is none."""
+    return "-" if value is None or not math.isfinite(value) or value < 0 else f"{value:.{digits}f}"

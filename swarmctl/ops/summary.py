@@ -1,0 +1,142 @@
+"""The end of a run: hand the folder to the referee and say the result in five lines."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from swarmctl.config import Config, load
+from swarmctl.core.text import printable
+from swarmctl.errors import ConfigError
+from swarmctl.ops.supervisor import Verdict
+
+if TYPE_CHECKING:
+    from swarmctl.telemetry.referee import Rules
+
+
+def sum_up(config: Config, directory: Path, verdict: Verdict, say: Callable[[str], None]) -> bool:
+    """Finish the run folder and say how it went; returns whether the referee found a limit broken.
+
+    A folder that can't be read or written is a problem of the run, never a reason to lose the verdict.
+    """
+    from swarmctl.telemetry.recordings import optimize_recording  # heavy
+    from swarmctl.telemetry.run_folder import Outcome, finish_run
+
+    try:
+        rules = _rules(config, verdict)
+        summary, unwritten = finish_run(directory, rules, Outcome(verdict.outcome, tuple(verdict.problems)))
+    except Exception as error:
+        known = {"outcome": verdict.outcome, "violations": list(verdict.problems)}
+        for line in (*violation_lines(known), *summary_lines(known, directory)):
+            say(line)
+        verdict.problems.append(f"summary: {error}")
+        say(f"the run can't be judged: {error!r}. What was recorded is in {directory}")
+        return False
+    for line in (*violation_lines(summary), *summary_lines(summary, directory)):
+        say(line)
+    if unwritten:
+        verdict.problems.append(f"run folder: {'; '.join(unwritten)}")
+        say(unwritten_line(directory, unwritten))
+    optimize_recording(directory)
+    return bool(summary.get("violations"))
+
+
+def unwritten_line(directory: Path, unwritten: Sequence[str]) -> str:
+    """What to say of files that the disk did not take."""
+    return (
+        f"not everything could be written to {directory}: {'; '.join(unwritten)}. "
+        f"Make room, then: swarmctl report {directory}"
+    )
+
+
+def rewrite_report(directory: Path) -> Path:
+    """Write `report.html` of a run folder again; returns its path.
+
+    Raises:
+        ConfigError: it is no run folder.
+    """
+    from swarmctl.telemetry.run_files import CONFIG, read_text, refuse_no_folder  # heavy
+    from swarmctl.telemetry.run_folder import report_run
+
+    refuse_no_folder(directory)
+    if not read_text(directory / CONFIG):
+        raise ConfigError(str(directory), [f"is no run folder: it holds no {CONFIG}"])
+    return report_run(directory, load(directory / CONFIG).rules())
+
+
+def _rules(config: Config, verdict: Verdict) -> Rules:
+    """What the configuration asks for; obstacles as an operator left them."""
+    from swarmctl.telemetry.referee import ObstacleRule
+
+    rules = config.rules()
+    if verdict.obstacles is None:
+        return rules
+    changed = tuple(
+        ObstacleRule(item.center_ned_m, item.keep_out_m, item.vel_ned_m_s, since_us, item.column)
+        for item, since_us in verdict.obstacles.items()
+    )
+    return replace(rules, obstacles=changed)
+
+
+def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...]:
+    """Outcome, separation, timing, solver and bus, folder."""
+    violations = summary.get("violations") or []
+    separation, obstacles = _section(summary, "separation"), _section(summary, "obstacles")
+    timing, solver, comms = (_section(summary, name) for name in ("timing", "solver", "comms"))
+    tick, solve, age = _section(timing, "tick_ms"), _section(timing, "solve_ms"), _section(comms, "path_age_ms")
+    rejected = sum(_section(comms, "rejected").values())
+    outcome = f"{summary.get('outcome')}, index {_m(_section(summary, 'tracking').get('index_m'))}"
+    if len(violations) == 1:
+        outcome += f"; 1 violation: {printable(violations[0])}"
+    elif violations:
+        outcome += f"; {len(violations)} violations, each with a line above"
+    clearance = obstacles.get("min_clearance_m")
+    return (
+        outcome,
+        f"separation {_m(separation.get('min_m'))} (required {_m(separation.get('required_m'))})"
+        + (
+            f", obstacles {_m(clearance)} (required {_m(obstacles.get('required_m'))})" if clearance is not None else ""
+        ),
+        f"ticks {_count(timing, 'ticks')}, late {_count(timing, 'late_ticks')}, "
+        f"tick p50/p99/max {_ms(tick)} ms, solve p50/p99/max {_ms(solve)} ms",
+        f"solver {_count(solver, 'name')}, failed {_count(solver, 'failed')}; "
+        f"path age p50/p99 {_ms(age, ('p50', 'p99'))} ms, {rejected} messages refused"
+        + _unheard(comms)
+        + _deadlocks(summary),
+        f"run folder {directory}",
+    )
+
+
+def _unheard(comms: Mapping[str, Any]) -> str:
+    found = _section(comms, "unheard")
+    return f"; agent-{found['agent']} unheard for {found['longest_s']:.1f} s" if found.get("count") else ""
+
+
+def violation_lines(summary: Mapping[str, Any]) -> tuple[str, ...]:
+    """One line for each violation, where the first line of the summary does not hold the only one."""
+    violations = summary.get("violations") or []
+    return tuple(f"violation: {printable(violation)}" for violation in violations) if len(violations) > 1 else ()
+
+
+def _deadlocks(summary: Mapping[str, Any]) -> str:
+    found = _section(summary, "deadlocks")
+    return f"; {found['count']} deadlocks, {found['unresolved']} unresolved" if found.get("count") else ""
+
+
+def _section(tree: Mapping[str, Any], key: str) -> Mapping[str, Any]:
+    value = tree.get(key)
+    return value if isinstance(value, Mapping) else {}
+
+
+def _count(tree: Mapping[str, Any], key: str) -> str:
+    return str(tree.get(key, "-"))
+
+
+def _m(value: float | None) -> str:
+    return "-" if value is None else f"{value:.3f} m"
+
+
+def _ms(values: Mapping[str, Any], keys: tuple[str, ...] = ("p50", "p99", "max")) -> str:
+    return "/".join("-" if values.get(key) is None else f"{values[key]:.1f}" for key in keys)

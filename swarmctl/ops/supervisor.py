@@ -1,0 +1,372 @@
+"""One flight as its supervisor sees it: listen to agents, watch processes, order the landing, and keep the verdict.
+
+It never flies: it speaks to agents as an operator on the bus. A process that dies is reported and the others go on,
+except when what died carries the flight (router, simulator): then everybody lands.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import signal
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from swarmctl.bus.orders import EVERYBODY, orders
+from swarmctl.bus.peers import Bus, agent_name
+from swarmctl.bus.topics import (
+    COMMAND,
+    OBSTACLES,
+    STATUS,
+    ObstacleMessage,
+    ObstaclesMessage,
+    decode_obstacles,
+    decode_status,
+    encode_message,
+    first_obstacles,
+)
+from swarmctl.config import Config
+from swarmctl.core.types import Phase
+from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START
+from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, Site, kill_all
+from swarmctl.ops.recovery import RECOVERY_S, Recovery
+from swarmctl.ops.status_table import AgentView, Display, name_of
+
+_STEP_S = 0.05
+_HEARD_S = 60.0  # for every agent to be on the bus
+_VEHICLE_S = 90.0  # for every agent to hear its vehicle
+_BEYOND_MISSION_S = 300.0  # take-off, waiting, landing: a flight longer than its mission and this is ended
+_SILENCE_S = 5.0
+_LAND_S = 60.0
+_LAND_REPEAT_S = 0.5
+_LAND_OBEYED_S = 10.0
+_OBSTACLES_REPEAT_S = 1.0
+_AFTER_DEATH_S = 3.0  # a dead agent's vehicle needs its simulator to land
+
+
+class EventLog:
+    """`launch.events.jsonl` of the run folder; a full disk loses events, never the flight."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def write(self, event: str, **fields: Any) -> None:
+        """Append one row, stamped with both clocks."""
+        now = {"utc_us": time.time_ns() // 1000, "t_us": time.monotonic_ns() // 1000, "source": "launch"}
+        with contextlib.suppress(OSError), self._path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps({**now, "event": event, **fields}) + "\n")
+
+
+class Base:
+    """What a flight stands on; `swarmctl.ops.launch` brings it up and takes it down."""
+
+    site: Site
+    log: EventLog
+    children: dict[str, Child]  # by name, agents as on the bus
+    bus: Bus | None = None
+
+    def announce(self, view: str) -> None:
+        """Publish the address of the live view to operators' commands."""
+        raise NotImplementedError
+
+    def recover(self, agent: int) -> Child:
+        """Start an agent on the vehicle of one that ended; it only lands that vehicle."""
+        raise NotImplementedError
+
+
+@dataclass(slots=True)
+class Verdict:
+    """How it went, collected on the way."""
+
+    problems: list[str] = field(default_factory=list)
+    could_not_start: bool = False
+    has_armed: bool = False  # somebody has asked a vehicle to arm
+    left: tuple[str, ...] = ()  # vehicles that may still be armed or in the air, in words
+    interrupted: bool = False
+    obstacles: dict[ObstacleMessage, int | None] | None = None  # since when [us UTC]; None: as configured
+
+    @property
+    def outcome(self) -> str:
+        """As in summary.json."""
+        if self.interrupted:
+            return "interrupted"
+        return "failed" if self.problems else "completed"
+
+    def exit_code(self, violated: bool) -> int:
+        """Of the whole launch; `violated`: the referee found a limit broken."""
+        if self.left:
+            return EXIT_MISSION
+        if self.interrupted:
+            return EXIT_INTERRUPTED
+        if self.could_not_start and not self.has_armed:
+            return EXIT_START
+        return EXIT_MISSION if self.problems or violated else EXIT_OK
+
+
+def why_it_failed(outcome: str, last_line: str) -> str:
+    """Why an agent ended with a failure: what its mission came to, or what went wrong after a complete one."""
+    return (outcome if outcome != "completed" else "") or last_line or "no reason given"
+
+
+class Flight:
+    """Watches one launch until every agent has ended, or has been given up."""
+
+    def __init__(self, config: Config, base: Base, display: Display) -> None:
+        if base.bus is None:
+            raise ValueError("the bus must be up before the flight is watched")
+        self._config = config
+        self._base = base
+        self._bus: Bus = base.bus
+        self._display = display
+        self._verdict = Verdict()
+        self._views = [AgentView(agent) for agent in range(config.swarm.agents)]
+        self._configured = first_obstacles(o.model_dump() for o in config.obstacles)
+        self._obstacles = self._configured
+        self._obstacles_said_s = 0.0
+        self._started_s = time.monotonic()
+        self._reported: set[str] = set()
+        self._carrier_lost = False  # router or simulator is gone
+        self._vehicles_lost = False  # the simulator is gone, and its vehicles with it
+        self._recovery = Recovery(base.recover, config.sysids())
+        self._land_ordered_s: float | None = None
+        self._land_said_s = 0.0
+        self._land_until_s = 0.0
+
+    def fly(self, interrupts: Callable[[], int]) -> Verdict:
+        """Watch to the end.
+
+        Args:
+            interrupts: how often the operator has asked to stop; once lands everybody, twice kills everything.
+        """
+        while interrupts() < 2:
+            self._hear()
+            self._watch_carriers()
+            self._watch_viewer()
+            self._watch_agents()
+            self._watch_time()
+            if interrupts() and not self._verdict.interrupted:
+                self._verdict.interrupted = True
+                self._say("interrupted", "interrupted: landing; once more ends everything at once")
+                self._land(_LAND_S)
+            self._speak()
+            self._display.show(self._views)
+            if self._is_over():
+                return self._name_the_left()
+            time.sleep(_STEP_S)
+        self._verdict.interrupted = True
+        self._fail("killed", "interrupted twice: every process was killed, vehicles were left to their autopilots")
+        running = self._running()
+        kill_all(list(self._base.children.values()))
+        if not self._config.sitl.enabled:
+            self._recovery.give_up(running)
+        return self._name_the_left()
+
+    def _name_the_left(self) -> Verdict:
+        """Say of every vehicle that is not known to be down that it is not."""
+        self._verdict.left = () if self._vehicles_lost else tuple(self._recovery.left(self._views))
+        for words in self._verdict.left:
+            self._fail("vehicle_left", words)
+        return self._verdict
+
+    def _hear(self) -> None:
+        for sender, payload in self._bus.receive(STATUS):
+            status = decode_status(payload)
+            if status is None or not 0 <= status.agent < len(self._views) or sender != agent_name(status.agent):
+                continue
+            view = self._views[status.agent]
+            if view.status is None or view.status.phase != status.phase:
+                self._base.log.write("phase", agent=status.agent, phase=name_of(Phase, status.phase))
+            view.status, view.heard_s = status, time.monotonic()
+            self._verdict.has_armed |= Phase.ARM <= status.phase < Phase.DONE
+        for _, payload in self._bus.receive(OBSTACLES):
+            message = decode_obstacles(payload)
+            if message is not None and message.replaces(self._obstacles.version):
+                self._adopt(message)
+
+    def _adopt(self, message: ObstaclesMessage) -> None:
+        """An operator has changed the list: repeat the new one, and judge what is new in it from now on."""
+        self._obstacles, self._obstacles_said_s = message, 0.0
+        now_us = time.time_ns() // 1000
+        known = self._verdict.obstacles or dict.fromkeys(self._configured.obstacles)
+        self._verdict.obstacles = {item: known.get(item, now_us) for item in message.obstacles}
+        self._say("obstacles", f"{len(message.obstacles)} obstacles, set by an operator", version=message.version)
+
+    def _watch_carriers(self) -> None:
+        """Router and simulator: without them there is nothing to go on with."""
+        for name, land_s in ((ROUTER, _LAND_S), (SITL, _AFTER_DEATH_S)):
+            child = self._base.children.get(name)
+            if child is not None and child.poll() is not None and self._once(name):
+                self._carrier_lost = True
+                self._vehicles_lost |= name == SITL
+                self._verdict.could_not_start |= not any(view.status for view in self._views)
+                self._fail(f"{name}_ended", f"{name} {child.how_it_ended()}; landing. See {child.log}")
+                self._land(land_s)
+
+    def _watch_viewer(self) -> None:
+        child = self._base.children.get(VIEWER)
+        if child is None:
+            return
+        if child.poll() is not None:
+            if self._once(VIEWER):
+                self._say(
+                    "viewer_ended", f"view and recording stopped: viewer {child.how_it_ended()}; the flight goes on"
+                )
+        elif "view address" not in self._reported:
+            line = child.line_with("viewer rerun+")
+            if line and self._once("view address"):
+                address = line.removeprefix("viewer ")
+                self._say("viewer_ready", f"view {address}", url=address)
+                self._base.announce(address)
+        elif child.is_stopped() and self._once("viewer stopped"):
+            self._say("viewer_frozen", "viewer is frozen; the flight goes on")
+
+    def _watch_agents(self) -> None:
+        now_s = time.monotonic()
+        for view in self._views:
+            child = self._base.children[agent_name(view.agent)]
+            code = child.poll()
+            if code is None:
+                self._judge_silence(view, child, now_s)
+            elif self._once(f"{child.name} {child.pid} ended"):
+                self._note_end(view, child, code)
+                self._recover(view, code)
+
+    def _recover(self, view: AgentView, code: int) -> None:
+        """Have a vehicle that is not known to be down landed by another process on its link."""
+        if self._recovery.is_on(view.agent) and code == EXIT_INTERRUPTED:
+            self._say("recovered", f"the vehicle of {agent_name(view.agent)} is on the ground and disarmed")
+        child = None if self._vehicles_lost else self._recovery.begin(view, code)
+        if child is None:
+            return
+        self._base.children[agent_name(view.agent)] = child
+        view.note, view.heard_s = "recovering", time.monotonic()
+        self._say("recovering", f"landing the vehicle of {agent_name(view.agent)}, which may be armed or in the air")
+        if self._land_ordered_s is not None:
+            self._land_until_s = max(self._land_until_s, time.monotonic() + RECOVERY_S)
+
+    def _judge_silence(self, view: AgentView, child: Child, now_s: float) -> None:
+        waited_s = now_s - self._started_s
+        if view.status is None:
+            if waited_s > _HEARD_S and self._once(f"{child.name} unheard"):
+                self._refuse(f"{child.name} is not on the bus after {_HEARD_S:.0f} s; see {child.log}")
+        elif self._recovery.is_on(view.agent):
+            if self._recovery.is_overdue(view.agent):
+                child.kill_all()
+        elif now_s - view.heard_s > _SILENCE_S:
+            view.note = "silent"
+            if self._once(f"{child.name} silent"):
+                self._fail("agent_silent", f"{child.name} has been silent for {_SILENCE_S:.0f} s; the others fly on")
+        elif view.note:
+            view.note = ""
+            self._say("agent_back", f"{child.name} is heard again")
+        elif view.status.phase == Phase.CONNECT and waited_s > _VEHICLE_S and self._once(f"{child.name} vehicle"):
+            url = self._config.vehicles[view.agent].url if self._config.vehicles else "the built-in SITL"
+            self._refuse(
+                f"{child.name} hears no vehicle at {url} after {_VEHICLE_S:.0f} s; check that it is on and sends"
+            )
+
+    def _watch_time(self) -> None:
+        limit_s = self._config.mission.duration_s + _BEYOND_MISSION_S
+        if time.monotonic() - self._started_s > limit_s and self._once("too long"):
+            self._fail("too_long", f"the flight did not end within {limit_s:.0f} s; landing")
+            self._land(_LAND_S)
+
+    def _speak(self) -> None:
+        now_s = time.monotonic()
+        if now_s - self._obstacles_said_s >= _OBSTACLES_REPEAT_S:
+            self._obstacles_said_s = now_s
+            self._bus.publish(OBSTACLES, encode_message(self._obstacles))
+        if self._land_ordered_s is not None and now_s - self._land_said_s >= _LAND_REPEAT_S:
+            self._land_said_s = now_s
+            self._repeat_land_order(now_s, now_s - self._land_ordered_s)
+
+    def _repeat_land_order(self, now_s: float, since_s: float) -> None:
+        """Over the bus until everybody shows that it lands, stamped anew each time, after a while also by signal."""
+        running = (view for view in self._running() if not self._recovery.is_on(view.agent))
+        deaf = [view for view in running if view.status is None or view.status.phase < Phase.GOTO_LAND]
+        if deaf:
+            clocks_us = [
+                view.status.utc_us + round((now_s - view.heard_s) * 1e6) for view in deaf if view.status is not None
+            ]
+            for order in orders("land", EVERYBODY, time.time_ns() // 1000, clocks_us):
+                self._bus.publish(COMMAND, order)
+        for view in deaf:
+            child = self._base.children[agent_name(view.agent)]
+            if since_s > _LAND_OBEYED_S and self._once(f"{child.name} told by signal"):
+                child.signal(signal.SIGTERM)
+
+    def _is_over(self) -> bool:
+        """Whether nobody is left to wait for. Silent agents are given up when nobody else flies."""
+        now_s = time.monotonic()
+        running = self._running()
+        if self._land_ordered_s is not None and now_s > self._land_until_s:
+            for view in running:
+                if not self._recovery.is_on(view.agent):
+                    self._fail("not_landed", f"{agent_name(view.agent)} did not end in time and was killed")
+                kill_all([self._base.children[agent_name(view.agent)]])
+            return not running
+        if not running:
+            deaths_s = [
+                c.ended_s for c in self._base.children.values() if c.ended_s is not None and c.poll() not in (0, 130)
+            ]
+            return self._carrier_lost or not deaths_s or now_s - max(deaths_s) > _AFTER_DEATH_S
+        if self._land_ordered_s is None and all(view.note == "silent" for view in running):
+            bus_is_suspect = len(running) == len(self._views) and len(running) > 1
+            self._land(_LAND_S if bus_is_suspect else _AFTER_DEATH_S)
+        return False
+
+    def _note_end(self, view: AgentView, child: Child, code: int) -> None:
+        view.note = "done" if code == EXIT_OK else f"exit {code}"
+        self._base.log.write("agent_ended", agent=view.agent, exit_code=code)
+        if code == EXIT_OK or self._carrier_lost or self._recovery.is_on(view.agent):
+            return
+        if code == EXIT_INTERRUPTED:
+            self._verdict.interrupted |= self._land_ordered_s is None  # an operator's `land`
+        elif code == EXIT_START:
+            self._refuse(f"{child.name} could not start: {child.last_line()}")
+        elif code == EXIT_MISSION:
+            outcome = view.status.outcome if view.status else ""
+            self._fail("agent_failed", f"{child.name} failed: {why_it_failed(outcome, child.last_line())}")
+        elif view.status is None:
+            self._refuse(f"{child.name} could not start: it {child.how_it_ended()}")
+        else:
+            view.note = "dead"
+            self._fail("agent_died", f"{child.name} {child.how_it_ended()}; the others fly on")
+
+    def _land(self, timeout_s: float) -> None:
+        """Ask all to land, over the bus; by signal where the bus can't reach."""
+        now_s = time.monotonic()
+        if self._land_ordered_s is None:
+            self._land_ordered_s, self._land_until_s = now_s, now_s + timeout_s
+            self._base.log.write("land")
+        self._land_until_s = min(self._land_until_s, now_s + timeout_s)
+        for view in self._running():
+            if self._recovery.is_on(view.agent):
+                continue
+            if self._carrier_lost or view.status is None or view.note == "silent":
+                self._base.children[agent_name(view.agent)].signal(signal.SIGTERM)
+
+    def _refuse(self, problem: str) -> None:
+        self._verdict.could_not_start = True
+        self._fail("start_failed", problem)
+        self._land(_LAND_S)
+
+    def _fail(self, event: str, problem: str) -> None:
+        self._verdict.problems.append(problem)
+        self._say(event, problem)
+
+    def _say(self, event: str, text: str, **fields: Any) -> None:
+        self._base.log.write(event, text=text, **fields)
+        self._display.say(text)
+
+    def _once(self, what: str) -> bool:
+        if what in self._reported:
+            return False
+        self._reported.add(what)
+        return True
+
+    def _running(self) -> list[AgentView]:
+        return [view for view in self._views if self._base.children[agent_name(view.agent)].poll() is None]

@@ -1,0 +1,213 @@
+"""`swarmctl check`: ask every vehicle of a configuration at once, judge, print one table and what to fix.
+
+Changes nothing unless told to apply, and then only wanted parameters of vehicles that are disarmed on the ground. The
+built-in simulator, where the configuration flies it, is started for the check and ended with it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import signal
+import tempfile
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from types import FrameType
+
+from swarmctl.bus.zenoh_bus import SCHEME
+from swarmctl.check.change import Change
+from swarmctl.check.link_facts import VehicleFacts
+from swarmctl.check.listener import NOWHERE, Address, Ear, UdpEar, monotonic_us, open_ear
+from swarmctl.check.parameters import Number, changes, names_to_read, unchangeable
+from swarmctl.check.scan_facts import facts_of, unreached
+from swarmctl.check.scanner import Probe, survey
+from swarmctl.check.swarm import exit_code, findings, standing
+from swarmctl.check.table import as_json, print_check
+from swarmctl.config import Config
+from swarmctl.core.types import GeoOrigin
+from swarmctl.errors import StartError
+from swarmctl.ops.preflight import claim_ports
+from swarmctl.ops.processes import Child, Site, end_all, run_name, sitl_command
+
+_CONNECT_S = 5.0  # heartbeats come once a second
+_SIMULATOR_S = 20.0  # to come up, on a machine that is busy
+_PATIENCE_S = 3.0  # with a vehicle that is not ready yet
+_SIMULATOR_PATIENCE_S = 15.0
+_LONGER_S = 8.0  # than asked for: parameters over a slow link
+_APPLY_S = 15.0
+_STOP_S = 5.0
+
+
+@dataclass(frozen=True, slots=True)
+class CheckOptions:
+    """What is not part of the configuration."""
+
+    apply: bool = False
+    seconds: float = 3.0  # to listen to every vehicle, after its first heartbeat
+    json: Path | None = None
+    connect_s: float = _CONNECT_S
+    to_fly: bool = False  # who is armed already is not for us to fly
+
+
+def check(config: Config, options: CheckOptions) -> int:
+    """Check a configuration's vehicles; returns the exit code.
+
+    Raises:
+        StartError: the built-in simulator does not come up, or the JSON file can't be written.
+    """
+    with _interruptible(), _field(config, options) as field:
+        vehicles, changed = _ask(config, options, field)
+    lines = findings(vehicles, config) + [change.finding() for change in changed if not change.done]
+    if options.to_fly:
+        lines += standing(vehicles)
+    code = exit_code(vehicles, lines)
+    print_check(vehicles, lines, changed)
+    if options.json is not None:
+        text = as_json(vehicles, lines, changed, code)
+        try:
+            options.json.write_text(text, encoding="utf-8")
+        except OSError as error:
+            raise StartError(f"{options.json}: can't be written: {error}. Choose another with --json") from error
+    return code
+
+
+@dataclass(frozen=True, slots=True)
+class _Link:
+    """Where one vehicle is heard, or why it can't be."""
+
+    url: str
+    ear: Ear | None
+    there: Address
+    problem: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class _Field:
+    """All vehicles."""
+
+    links: Sequence[_Link]
+    connect_s: float
+    simulator: Child | None = None
+
+    def ended(self) -> bool:
+        """Whether a simulator that was started here is gone."""
+        return self.simulator is not None and self.simulator.poll() is not None
+
+
+def _ask(config: Config, options: CheckOptions, field: _Field) -> tuple[list[VehicleFacts], list[Change]]:
+    links = field.links
+    sysids = config.sysids()
+    names = partial(names_to_read, config=config)
+    patience_s = _PATIENCE_S if field.simulator is None else _SIMULATOR_PATIENCE_S
+    probes = {
+        agent: Probe(link.ear, link.there, sysids[agent], names, options.seconds, patience_s)
+        for agent, link in enumerate(links)
+        if link.ear is not None
+    }
+    longest_s = field.connect_s + options.seconds + patience_s + _LONGER_S
+    survey(list(probes.values()), field.connect_s, longest_s, field.ended)
+    if field.simulator is not None and field.ended():
+        raise StartError(f"built-in simulator {field.simulator.how_it_ended()}")
+    vehicles = _facts(config, links, probes)
+    if not options.apply:
+        return vehicles, []
+    wanted = {facts.agent: changes(facts, config) for facts in vehicles}
+    for facts in vehicles:
+        if wanted[facts.agent] and not unchangeable(facts):
+            probes[facts.agent].set_parameters(wanted[facts.agent])
+    survey(list(probes.values()), 0.0, _APPLY_S, field.ended)
+    after = _facts(config, links, probes)
+    return after, [
+        _changed(before, now, name, value, probes[before.agent])
+        for before, now in zip(vehicles, after, strict=True)
+        for name, value in wanted[before.agent].items()
+    ]
+
+
+def _facts(config: Config, links: Sequence[_Link], probes: dict[int, Probe]) -> list[VehicleFacts]:
+    swarm, sysids, now_us = config.swarm, config.sysids(), monotonic_us()
+    shared = GeoOrigin(swarm.origin_lat_deg, swarm.origin_lon_deg, swarm.origin_alt_m)
+    return [
+        facts_of(probes[agent], agent, link.url, sysids[agent], shared, now_us)
+        if agent in probes
+        else unreached(agent, link.url, sysids[agent], link.problem)
+        for agent, link in enumerate(links)
+    ]
+
+
+def _changed(before: VehicleFacts, now: VehicleFacts, name: str, wanted: Number, probe: Probe) -> Change:
+    refused = unchangeable(before)
+    if not refused and probe.parameters is not None and probe.parameters.interrupted:
+        refused = "it was armed, or fell silent, meanwhile"
+    was = before.number(name)
+    assert was is not None  # `changes` leaves out what is not known
+    return Change(before.agent, name, was, wanted, now.number(name), refused)
+
+
+# --- where the vehicles are ---
+
+
+@contextlib.contextmanager
+def _field(config: Config, options: CheckOptions) -> Iterator[_Field]:
+    if config.sitl.enabled:
+        with _simulator(config) as field:
+            yield field
+        return
+    links = [_open(vehicle.url) for vehicle in config.vehicles[: config.swarm.agents]]
+    try:
+        yield _Field(links, options.connect_s)
+    finally:
+        _close(links)
+
+
+def _open(url: str) -> _Link:
+    try:
+        ear, there = open_ear(url)
+    except StartError as error:
+        return _Link(url, None, NOWHERE, str(error))
+    return _Link(url, ear, there)
+
+
+def _close(links: Sequence[_Link]) -> None:
+    for link in links:
+        if link.ear is not None:
+            link.ear.close()
+
+
+@contextlib.contextmanager
+def _simulator(config: Config) -> Iterator[_Field]:
+    """The simulator a launch would start, on ports of its own."""
+    sockets = claim_ports(config.swarm.agents)
+    ports = [sock.getsockname()[1] for sock in sockets]
+    links = [_Link(f"built-in simulator, port {p}", UdpEar(s), NOWHERE) for s, p in zip(sockets, ports, strict=True)]
+    directory = Path(tempfile.mkdtemp(prefix="swarm-check-"))
+    children: list[Child] = []
+    site = Site(run_name(config.name), f"{SCHEME}{directory / 'bus.sock'}", directory)
+    try:
+        children.append(Child(sitl_command(config, site, ports), directory))
+        yield _Field(links, _SIMULATOR_S, children[0])
+    finally:
+        end_all(children, _STOP_S)
+        _close(links)
+        shutil.rmtree(directory, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def _interruptible() -> Iterator[None]:
+    """SIGTERM and SIGHUP as Ctrl-C, once: from then on they are ignored, so that what was started here is ended."""
+    signums = (signal.SIGTERM, signal.SIGHUP)
+
+    def interrupt(signum: int, frame: FrameType | None) -> None:
+        for each in signums:
+            signal.signal(each, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    before = [signal.signal(each, interrupt) for each in signums]
+    try:
+        yield
+    finally:
+        for each, handler in zip(signums, before, strict=True):
+            if signal.getsignal(each) is interrupt:
+                signal.signal(each, handler)

@@ -1,0 +1,147 @@
+"""What the tests of the phase machine share: a `Sequence` that is driven with made-up facts."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from swarmctl.control.phases.inputs import Facts, PeerFacts
+from swarmctl.control.phases.sequence import Sequence, SequenceParams
+from swarmctl.control.reference.mission import MissionParams, MissionReference
+from swarmctl.core.types import Command, FlightMode, Landed, Mode, Phase, VehicleState, Verb
+
+UTC0_US = 1_700_000_000_000_000
+START = np.array([1.0, 0.0, -3.0])
+SECOND = 1_000_000
+DURATION_S = 10.0
+RADIUS_M = 0.9
+ON_GROUND, IN_AIR = Landed.ON_GROUND, Landed.IN_AIR
+
+
+class Flight:
+    """One `Sequence`, the vehicle it sees and the time; every call of `step` is 100 ms later."""
+
+    def __init__(self, peers: int = 1, **params: Any) -> None:
+        mission = MissionReference(MissionParams(kind="line"), START[None, :], 0)
+        self.sequence = Sequence(SequenceParams(**params), 0, peers, RADIUS_M, START, DURATION_S, mission)
+        self.now_us = 0
+        self.pos, self.vel = np.array([1.0, 0.0, 0.0]), np.zeros(3)
+        self.armed, self.flight_mode, self.landed = False, FlightMode.HOLD, ON_GROUND
+        self.judged = Mode.IDLE
+        self.prepared = self.armable = True
+        self.failsafe = False
+        self.others: tuple[np.ndarray, ...] = ()
+        self.arm_in: FlightMode | None = None
+        self.boots = 0
+        self.refusal = self.unsettled = ""
+        self.beat_us: int | None = None  # the HEARTBEAT that told `armed`; None: one comes with every step
+        self.busy = self.mute = False
+        self.seen = True
+        self.peers = {k + 1: PeerFacts(Phase.STANDBY, 0, True) for k in range(peers)}
+
+    @property
+    def utc_us(self) -> int:
+        return UTC0_US + self.now_us
+
+    @property
+    def phase(self) -> Phase:
+        return self.sequence.phase
+
+    @property
+    def at(self) -> str:
+        """Name of the phase."""
+        return self.phase.name
+
+    @property
+    def state(self) -> VehicleState | None:
+        if not self.seen:
+            return None
+        q_nb = np.array([1.0, 0.0, 0.0, 0.0])
+        return VehicleState(
+            self.now_us, self.pos, self.vel, q_nb, np.zeros(3), self.armed, self.flight_mode, self.landed, self.failsafe
+        )
+
+    def step(self) -> list[Command]:
+        facts = Facts(
+            now_us=self.now_us,
+            utc_us=self.utc_us,
+            state=self.state,
+            prepared=self.prepared,
+            armable=self.armable,
+            busy=self.busy,
+            mode=self.judged,
+            mute=self.mute,
+            peers=self.peers,
+            others_ned_m=self.others,
+            arm_in=self.arm_in,
+            boots=self.boots,
+            refusal=self.refusal,
+            unsettled=self.unsettled,
+            armed_told_us=self.now_us if self.beat_us is None else self.beat_us,
+        )
+        self.sequence.begin_if_due(facts.now_us, facts.utc_us)  # as the agent does, before it thinks
+        asked = self.sequence.step(facts)
+        self.now_us += 100_000
+        return asked
+
+    def run(self, seconds: float) -> list[Verb]:
+        return [command.verb for _ in range(round(seconds * 10)) for command in self.step()]
+
+    def peer(self, phase: Phase, ready_utc_us: int = 0, alive: bool = True) -> None:
+        self.peers[1] = PeerFacts(phase, ready_utc_us, alive)
+
+    def ask(self, verb: str) -> None:
+        self.sequence.operator(verb, self.now_us, self.utc_us, self.state)
+
+    def until(self, phase: Phase) -> Flight:
+        """Fly on, all going well, until a phase is reached."""
+        for _ in range(400):
+            if self.phase is phase:
+                return self
+            self._obey(self.step())
+        raise AssertionError(f"stuck in {self.phase.name}")
+
+    def _obey(self, commands: list[Command]) -> None:
+        for command in commands:
+            if command.verb in (Verb.ARM, Verb.DISARM):
+                self.armed = command.verb is Verb.ARM
+            elif command.verb is Verb.TAKEOFF:
+                self.pos, self.landed, self.flight_mode = START.copy(), IN_AIR, FlightMode.HOLD
+            elif command.verb is Verb.EXTERNAL:
+                self.flight_mode = FlightMode.EXTERNAL
+            elif command.verb is Verb.LAND:
+                self.flight_mode = FlightMode.LAND
+        if self.phase is Phase.READY and len(self.peers) == 1:
+            self.peer(Phase.READY, UTC0_US + 1)
+        if self.phase is Phase.LAND and self.flight_mode is FlightMode.LAND:
+            self.armed, self.landed = False, ON_GROUND
+
+
+def verbs(commands: list[Command]) -> list[Verb]:
+    return [command.verb for command in commands]
+
+
+def ready(peers: int = 1) -> Flight:
+    flight = Flight(peers).until(Phase.GOTO_START)
+    while flight.phase is not Phase.READY:
+        flight._obey(flight.step()) if flight.flight_mode is not FlightMode.EXTERNAL else flight.step()
+    return flight
+
+
+OURS = (Phase.GOTO_START, Phase.READY, Phase.TRACK, Phase.GOTO_LAND)
+
+
+def controlled(phase: Phase) -> Flight:
+    flight = ready() if phase in (Phase.READY, Phase.TRACK, Phase.GOTO_LAND) else Flight().until(Phase.GOTO_START)
+    if phase is Phase.GOTO_START:
+        flight.flight_mode, flight.pos = FlightMode.EXTERNAL, START + np.array([3.0, 0.0, 0.0])
+        flight.run(0.2)
+    elif phase is not Phase.READY:
+        flight.until(Phase.TRACK)
+    if phase is Phase.GOTO_LAND:
+        flight.pos = START + np.array([3.0, 0.0, 0.0])
+        flight.until(phase)
+    assert flight.phase is phase
+    assert flight.sequence.had_control
+    return flight

@@ -1,0 +1,25 @@
+"""Alerts are shown while their cause is there, and end with it."""
+
+from __future__ import annotations
+
+from swarmctl.agent.alerts import Alerts
+
+SECOND = 1_000_000
+
+
+def test_the_newest_alert_is_shown_and_ends_after_its_cause() -> None:
+    alerts = Alerts()
+    assert alerts.text(0) == ""
+    assert alerts.put("plan", "plan not certified", 0)
+    assert alerts.put("link", "state lost", 1 * SECOND)
+    assert not alerts.put("plan", "plan residual", 2 * SECOND), "it has begun before"
+    assert alerts.text(2 * SECOND) == "state lost"
+    assert alerts.text(round(3.5 * SECOND)) == "plan residual"
+    assert alerts.text(5 * SECOND) == ""
+
+
+def test_a_cause_that_is_known_to_be_gone_is_not_shown_any_longer() -> None:
+    alerts = Alerts()
+    alerts.put("takeoff", "takeoff refused: result 4", 0)
+    alerts.clear("takeoff")
+    assert alerts.text(0) == ""

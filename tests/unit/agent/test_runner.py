@@ -1,0 +1,114 @@
+"""Deadlines of the real-time loop: what is late, what is skipped, and that nothing is ever caught up in a burst."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from pathlib import Path
+
+import pytest
+
+from swarmctl.agent.runner import Pace, WallClock, _give_up_on_silence, _StopRequest
+from swarmctl.config import load
+from swarmctl.errors import MissionError, StartError
+
+MS = 1_000
+
+
+def paced(*ticks_ms: tuple[float, float]) -> Pace:
+    """A 20 ms loop whose ticks sent and ended at the given times [ms] after the first was due."""
+    pace = Pace(20 * MS, 0)
+    for sent_ms, ended_ms in ticks_ms:
+        pace.done(round(sent_ms * MS), round(ended_ms * MS))
+    return pace
+
+
+def test_ticks_in_time_keep_an_absolute_grid() -> None:
+    pace = paced((3, 5), (28, 33), (59.9, 60))
+    assert (pace.late, pace.due_us) == (0, 60 * MS)
+
+
+@pytest.mark.parametrize(
+    ("sent_ms", "ended_ms", "late", "due_ms"),
+    [
+        (20, 20, 0, 20),  # sent at the very moment the next was due: not after it
+        (20.001, 21, 1, 20),  # after it: late; the next starts at once, on its own grid point
+        (10, 35, 0, 20),  # sent in time, recording took long: the next begins 15 ms late but nothing is lost
+        (10, 40, 1, 40),  # due 20 could not begin before 40 was due: skipped
+        (95, 100, 5, 100),  # itself late, and 20, 40, 60, 80 skipped
+        (95, 119, 5, 100),
+        (1000, 1010, 50, 1000),  # a second of standstill is 50 lost ticks
+    ],
+)
+def test_late_and_skipped_by_hand(sent_ms: float, ended_ms: float, late: int, due_ms: float) -> None:
+    pace = paced((sent_ms, ended_ms))
+    assert (pace.late, pace.due_us) == (late, due_ms * MS)
+
+
+def test_after_a_stall_one_tick_follows_and_not_a_burst() -> None:
+    pace = paced((500, 505))
+    assert pace.due_us == 500 * MS  # one overdue tick, begun at once
+    pace.done(508 * MS, 510 * MS)
+    assert pace.due_us == 520 * MS  # and the next one waits for its time
+    assert pace.late == 25
+
+
+def test_sleeping_until_the_past_returns_and_until_the_future_waits() -> None:
+    clock = WallClock()
+    began_us = clock.now_us()
+    clock.sleep_until(began_us - 1_000_000)
+    assert clock.now_us() - began_us < 50_000
+    clock.sleep_until(began_us + 60_000)
+    assert clock.now_us() >= began_us + 60_000
+
+
+def test_a_vehicle_that_was_never_there_is_a_start_error_and_a_lost_one_a_mission_error() -> None:
+    config = load(None, ["agent.connect_timeout_s=5.0"])
+    _give_up_on_silence(5_000_000, False, config, "udpin://x")
+    with pytest.raises(StartError, match="udpin://x"):
+        _give_up_on_silence(5_000_001, False, config, "udpin://x")
+    _give_up_on_silence(15_000_000, True, config, "udpin://x")
+    with pytest.raises(MissionError, match="udpin://x"):
+        _give_up_on_silence(15_000_001, True, config, "udpin://x")
+
+
+@pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])
+def test_a_signal_is_a_stop_request_that_is_taken_once(signum: signal.Signals) -> None:
+    before = {s: signal.getsignal(s) for s in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP)}
+    try:
+        stop = _StopRequest(asked=False)
+        assert not stop.take()
+        os.kill(os.getpid(), signum)
+        assert stop.take()
+        assert not stop.take()
+        assert _StopRequest(asked=True).take(), "an agent that only lands has been asked from the beginning"
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+def test_an_agent_number_outside_the_swarm_is_refused_before_anything_is_opened(tmp_path: Path) -> None:
+    from swarmctl.agent.runner import AgentProcess, run_agent
+
+    path = tmp_path / "config.toml"
+    path.write_text("[swarm]\nagents = 2\n", encoding="utf-8")
+    with pytest.raises(StartError, match=r"--id 2.*0\.\.1"):
+        run_agent(AgentProcess(config_path=path, agent=2, run="run", bus="tcp/127.0.0.1:1", run_dir=tmp_path))
+
+
+def test_a_step_of_the_hosts_utc_is_followed_slowly(monkeypatch: pytest.MonkeyPatch) -> None:
+    elapsed_ns, stepped_ns = 0, 0
+    monkeypatch.setattr(time, "monotonic_ns", lambda: 5_000_000_000 + elapsed_ns)
+    monkeypatch.setattr(time, "time_ns", lambda: 1_700_000_000_000_000_000 + elapsed_ns + stepped_ns)
+    clock = WallClock()
+    began_us = before_us = clock.utc_us()
+    stepped_ns = -500_000_000
+    for _ in range(100):
+        elapsed_ns += 20_000_000
+        now_us = clock.utc_us()
+        assert 19_800 <= now_us - before_us <= 20_200, "neither back nor on"
+        before_us = now_us
+    assert began_us + 2_000_000 - before_us == pytest.approx(20_000, abs=10), "1 % of the time that has passed"
+    elapsed_ns += 100_000_000_000
+    assert clock.utc_us() == (time.time_ns()) // 1000

@@ -1,0 +1,180 @@
+"""What an agent takes in from the bus: within bounds, from whom it is, and what it says of those it does not hear."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from swarmctl.agent.world_model import Surroundings
+from swarmctl.bus import topics
+from swarmctl.bus.peers import LocalHub, agent_name
+from swarmctl.control.collision.separation import SeparationParams
+from swarmctl.core.clock import SimClock
+from swarmctl.core.types import Phase, PredictedPath
+from tests.unit.bus.test_topics import STATUS
+
+BALL = topics.ObstacleMessage((5.0, 0.0, -2.0), 0.5, 1.0, 100.0)
+HERE = np.array([0.0, 0.0, -2.0])
+TICK_US = 20_000
+
+
+@dataclass
+class Bench:
+    """Agent 0 among agents 1 and 2, and an operator."""
+
+    clock: SimClock = field(default_factory=SimClock)
+    told: list[dict[str, Any]] = field(default_factory=list)
+    seq: int = 0
+
+    def __post_init__(self) -> None:
+        self.hub = LocalHub(self.clock.now_us)
+        self.bus = self.hub.attach(agent_name(0))
+        self.peer, self.operator = self.hub.attach(agent_name(1)), self.hub.attach(topics.OPERATOR)
+        note = lambda name, **fields: self.told.append({"event": name, **fields})  # noqa: E731
+        self.surroundings = Surroundings(0, [1, 2], SeparationParams(), self.bus, 50.0, note)
+
+    def tick(self) -> list[str]:
+        self.clock.advance(TICK_US)
+        return list(self.surroundings.listen(self.clock.utc_us()))
+
+    def say_path(self, boot_id: int = 1) -> None:
+        self.seq += 1
+        path = PredictedPath(1, boot_id, self.seq, self.clock.utc_us(), TICK_US, 0.0, np.tile(HERE, (5, 1)))
+        self.peer.publish(topics.PATH, topics.encode_path(path))
+
+    def say_status(self, **fields: Any) -> None:
+        said = msgspec.structs.replace(STATUS, agent=1, ticks=self.seq, ready_utc_us=0)
+        self.peer.publish(topics.STATUS, topics.encode_message(msgspec.structs.replace(said, **fields)))
+
+    def set_obstacles(self, count: int, version: int) -> None:
+        self.operator.publish(
+            topics.OBSTACLES, topics.encode_message(topics.ObstaclesMessage(version, (BALL,) * count))
+        )
+        self.tick()
+
+    @property
+    def seen(self) -> int:
+        return len(self.surroundings.keep_outs(HERE, self.clock.utc_us(), 100_000, 25, Phase.TRACK))
+
+    @property
+    def rejected(self) -> dict[str, int]:
+        return dict(self.surroundings.refusals.by_reason)
+
+    @property
+    def unheard(self) -> list[dict[str, Any]]:
+        return [row for row in self.told if row["event"] == "unheard"]
+
+
+def test_a_list_of_too_many_obstacles_leaves_the_known_one_and_is_said() -> None:
+    bench = Bench()
+    bench.set_obstacles(topics.MAX_OBSTACLES, 1)
+    assert bench.seen == topics.MAX_OBSTACLES
+    for count in (topics.MAX_OBSTACLES + 1, 6000):  # the longer one is not even decoded
+        bench.set_obstacles(count, 2)
+    assert bench.seen == topics.MAX_OBSTACLES
+    assert bench.rejected == {"malformed": 2}
+    assert bench.surroundings.refusals.alert(bench.clock.utc_us()) == "obstacles of operator refused: malformed"
+
+
+def test_as_many_obstacles_as_are_taken_in_cost_a_fraction_of_a_tick() -> None:
+    bench = Bench()
+    bench.set_obstacles(topics.MAX_OBSTACLES, 1)
+    took_ms = []
+    for _ in range(20):
+        began_s = time.perf_counter()
+        bench.surroundings.keep_outs(HERE, bench.clock.utc_us(), 100_000, 25, Phase.TRACK)
+        bench.surroundings.bodies(HERE, bench.clock.utc_us(), 0.1, 0.1)
+        took_ms.append((time.perf_counter() - began_s) * 1e3)
+    assert min(took_ms) < 3.0, "of 20"
+
+
+def test_a_version_out_of_reach_does_not_shut_out_all_later_ones() -> None:
+    bench = Bench()
+    bench.set_obstacles(1, 7)
+    bench.set_obstacles(3, 2**62)
+    assert (bench.seen, bench.rejected) == (1, {"sequence": 1})
+    bench.set_obstacles(2, 8)
+    assert bench.seen == 2
+    bench.set_obstacles(1, 8)
+    bench.set_obstacles(1, 7)
+    assert (bench.seen, bench.rejected) == (2, {"sequence": 1}), "what the launcher repeats is not refused, just known"
+    bench.set_obstacles(4, 8 + topics.MAX_VERSION_STEP)
+    assert bench.seen == 4
+
+
+def test_a_peer_that_is_refused_for_long_is_mute_kept_clear_of_at_any_height_and_named() -> None:
+    """On the bus, alive, and every path it says is stamped far in the future."""
+    bench = Bench()
+    bench.say_path()
+    bench.say_status(phase=int(Phase.TRACK))
+    for _ in range(100):
+        bench.tick()
+        bench.seq += 1
+        ahead = bench.clock.utc_us() + 600_000
+        path = PredictedPath(1, 1, bench.seq, ahead, TICK_US, 0.0, np.tile(HERE, (5, 1)))
+        bench.peer.publish(topics.PATH, topics.encode_path(path))
+    utc_us = bench.clock.utc_us()
+    assert bench.surroundings.somebody_is_mute(utc_us)
+    (kept,) = bench.surroundings.keep_outs(HERE, utc_us, 100_000, 5, Phase.TRACK)
+    assert kept.any_height and kept.radius_m > SeparationParams().radius_m + 0.9
+    assert bench.surroundings.refusals.alert(utc_us) == "path of agent-1 refused: future"
+    assert bench.unheard == [{"event": "unheard", "agent": 1, "begins": True}]
+    assert [row["count"] for row in bench.told if row["event"] == "refused"] == [1, 51]
+    bench.say_path()
+    bench.tick()
+    assert not bench.surroundings.somebody_is_mute(bench.clock.utc_us())
+    assert bench.unheard[1]["begins"] is False
+    assert bench.unheard[1]["lasted_s"] == pytest.approx(2.0, abs=0.1)
+
+
+@pytest.mark.parametrize("why", ["gone", "done"])
+def test_who_is_gone_or_has_landed_is_not_called_unheard(why: str) -> None:
+    bench = Bench()
+    bench.say_path()
+    bench.say_status(phase=int(Phase.DONE if why == "done" else Phase.TRACK))
+    bench.tick()
+    if why == "gone":
+        bench.peer.close()
+    for _ in range(100):
+        bench.tick()
+    assert bench.unheard == []
+
+
+def test_statuses_are_believed_like_paths_and_nobody_gets_ready_in_the_future() -> None:
+    bench = Bench()
+    for _ in range(5):
+        bench.seq += 10
+        bench.say_status(phase=int(Phase.READY), ready_utc_us=7)
+        for _ in range(10):
+            bench.tick()
+    ready = bench.surroundings.peers()[1]
+    assert (ready.phase, ready.ready_utc_us, ready.alive) == (Phase.READY, 7, True)
+    bench.say_status(phase=int(Phase.DONE), boot_id=STATUS.boot_id + 1)
+    bench.say_status(phase=int(Phase.DONE), ticks=2**62)
+    bench.say_status(phase=int(Phase.READY), ready_utc_us=bench.clock.utc_us() + 2_000_000)
+    bench.tick()
+    assert bench.surroundings.peers()[1] == ready
+    assert bench.rejected == {"unconfirmed": 2, "future": 1}
+
+
+def test_a_status_by_somebody_elses_name_or_of_nobody_is_refused() -> None:
+    bench = Bench()
+    bench.say_status(agent=2)
+    bench.operator.publish(topics.STATUS, topics.encode_message(STATUS))
+    bench.peer.publish(topics.STATUS, b"?")
+    bench.tick()
+    assert bench.surroundings.peers() == {}
+    assert bench.rejected == {"identity": 2, "malformed": 1}
+
+
+def test_a_tick_takes_in_a_ring_of_each_sender_and_no_more() -> None:
+    bench = Bench()
+    for _ in range(100):
+        bench.say_path(boot_id=bench.seq)
+    bench.tick()
+    assert bench.surroundings.refusals.total + 1 == topics.PATH.ring

@@ -1,0 +1,252 @@
+"""Which paths of peers are believed, and the in-memory bus of lockstep."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from swarmctl.bus.peers import LEASE_US, LocalBus, LocalHub, PeerPaths, agent_name
+from swarmctl.bus.refusals import Refusals
+from swarmctl.bus.senders import Attendance
+from swarmctl.bus.topics import COMMAND, PATH, TICK, TOO_LONG, encode_path
+from swarmctl.core.clock import SimClock
+from swarmctl.core.types import PredictedPath
+
+NOW_US = 1_700_000_000_000_000
+
+
+def payload(agent: int = 1, boot_id: int = 7, seq: int = 1, t0_utc_us: int = NOW_US) -> bytes:
+    return encode_path(PredictedPath(agent, boot_id, seq, t0_utc_us, 100_000, 0.0, np.zeros((5, 3))))
+
+
+class Store:
+    """Paths of agents 1 and 2 as agent 0 takes them in."""
+
+    def __init__(self) -> None:
+        self.hub = LocalHub(lambda: 0)
+        self.attendance = Attendance(self.hub.attach("agent-0"))
+        self.refusals = Refusals(lambda *_, **__: None)
+        self.paths = PeerPaths([1, 2], 50.0, self.refusals, self.attendance)
+
+    def offer(self, message: bytes, sender: str = "agent-1", utc_us: int = NOW_US) -> None:
+        self.attendance.look(utc_us)
+        self.paths.offer(sender, message, utc_us)
+
+    @property
+    def kept(self) -> list[tuple[int, int, int]]:
+        """(agent, boot id, sequence number) of each."""
+        return [(path.agent, path.boot_id, path.seq) for path in self.paths.latest()]
+
+
+def store_with(*messages: bytes) -> Store:
+    store = Store()
+    for message in messages:
+        store.offer(message)
+    return store
+
+
+def test_newest_path_of_every_peer_is_kept_by_agent_number() -> None:
+    store = Store()
+    store.offer(payload(agent=2, seq=4), "agent-2")
+    store.offer(payload(agent=1, seq=1))
+    store.offer(payload(agent=1, seq=2))
+    assert store.kept == [(1, 7, 2), (2, 7, 4)]
+    assert not store.refusals.total
+
+
+def test_a_silent_peer_is_never_forgotten() -> None:
+    store = store_with(payload())
+    store.offer(payload(agent=2, t0_utc_us=NOW_US + 3600_000_000), "agent-2", NOW_US + 3600_000_000)
+    assert [agent for agent, *_ in store.kept] == [1, 2]
+
+
+@pytest.mark.parametrize(
+    ("sender", "message", "reason"),
+    [
+        ("agent-1", b"", "malformed"),
+        ("agent-1", payload()[:-1], "malformed"),
+        ("agent-1", b"XX" + payload()[2:], "malformed"),
+        ("agent-2", payload(agent=1), "identity"),
+        ("operator", payload(agent=1), "identity"),
+        ("agent-9", payload(agent=9), "unknown_peer"),
+        ("agent-1", payload(seq=5), "replayed"),
+        ("agent-1", payload(seq=4), "replayed"),
+        ("agent-1", payload(seq=5, t0_utc_us=NOW_US + 1), "sequence"),
+        ("agent-1", payload(seq=9, t0_utc_us=NOW_US + 500_001), "future"),
+        ("agent-1", payload(seq=9, t0_utc_us=NOW_US - 2_000_001), "late"),
+        ("agent-1", payload(seq=2**32 - 1, t0_utc_us=NOW_US + 1), "unconfirmed"),
+        ("agent-1", payload(boot_id=8, t0_utc_us=NOW_US + 1), "unconfirmed"),
+        ("agent-1", payload(boot_id=8, seq=99, t0_utc_us=NOW_US - 1000), "replayed"),
+    ],
+)
+def test_refused_with_a_counted_reason_and_the_known_path_stays(sender: str, message: bytes, reason: str) -> None:
+    store = store_with(payload(seq=5))
+    store.offer(message, sender)
+    assert store.refusals.by_reason == {reason: 1}
+    assert store.kept == [(1, 7, 5)]
+
+
+@pytest.mark.parametrize("t0_utc_us", [NOW_US + 500_000, NOW_US - 2_000_000])
+def test_limits_of_age_are_inclusive(t0_utc_us: int) -> None:
+    assert len(store_with(payload(t0_utc_us=t0_utc_us)).kept) == 1
+
+
+def test_random_bytes_never_raise() -> None:
+    rng = np.random.default_rng(4)
+    store = Store()
+    for _ in range(2000):
+        good = bytearray(payload())
+        good[int(rng.integers(len(good)))] = int(rng.integers(256))
+        store.offer(bytes(good))
+        store.offer(rng.bytes(int(rng.integers(0, 200))))
+    assert store.refusals.by_reason["malformed"] >= 2000
+
+
+def hub_of(names: list[str], delay_us: int = 0, loss_01: float = 0.0) -> tuple[SimClock, LocalHub, list[LocalBus]]:
+    clock = SimClock()
+    hub = LocalHub(clock.now_us, seed=5, delay_us=delay_us, loss_01=loss_01)
+    return clock, hub, [hub.attach(name) for name in names]
+
+
+def test_nothing_is_visible_within_the_step_it_was_said_in() -> None:
+    clock, _, (a, b) = hub_of(["agent-0", "agent-1"])
+    a.publish(PATH, b"x")
+    assert b.receive(PATH) == []
+    clock.advance(1)
+    assert b.receive(PATH) == [("agent-0", b"x")]
+    assert b.receive(PATH) == []
+    assert a.receive(PATH) == []
+
+
+def test_delay_is_kept_to_the_microsecond() -> None:
+    clock, _, (a, b) = hub_of(["agent-0", "agent-1"], delay_us=30_000)
+    a.publish(PATH, b"x")
+    clock.advance(29_999)
+    assert b.receive(PATH) == []
+    clock.advance(1)
+    assert b.receive(PATH) == [("agent-0", b"x")]
+
+
+def test_ring_keeps_the_newest_per_sender_and_only_of_what_has_arrived() -> None:
+    clock, _, (a, b, c) = hub_of(["agent-0", "agent-1", "agent-2"], delay_us=10)
+    a.publish(PATH, b"1")
+    clock.advance(5)
+    a.publish(PATH, b"2")
+    b.publish(PATH, b"3")
+    clock.advance(5)
+    assert c.receive(PATH) == [("agent-0", b"1")]
+    for i in range(300):
+        a.publish(TICK, str(i).encode())
+        clock.advance(1)
+    clock.advance(10)
+    ticks = c.receive(TICK)
+    assert len(ticks) == TICK.ring
+    assert ticks[-1] == ("agent-0", b"299")
+    assert c.receive(PATH) == [("agent-0", b"2"), ("agent-1", b"3")]
+    for i in range(9):
+        a.publish(PATH, str(i).encode())
+    clock.advance(10)
+    assert [message for _, message in c.receive(PATH)] == [b"5", b"6", b"7", b"8"]
+
+
+def test_listening_can_be_limited_to_neighbours() -> None:
+    clock, hub, (a, b) = hub_of(["agent-0", "agent-1"])
+    c = hub.attach("agent-2", {PATH: ["agent-1"]})
+    a.publish(PATH, b"a")
+    b.publish(PATH, b"b")
+    b.publish(TICK, b"t")
+    clock.advance(1)
+    assert c.receive(PATH) == [("agent-1", b"b")]
+    assert c.receive(TICK) == []
+
+
+def test_a_dead_participant_says_and_hears_nothing_but_its_last_words_arrive() -> None:
+    clock, hub, (a, b) = hub_of(["agent-0", "agent-1"])
+    a.publish(PATH, b"last")
+    hub.detach("agent-0")
+    a.publish(PATH, b"ghost")
+    b.publish(PATH, b"hello")
+    clock.advance(1)
+    assert b.receive(PATH) == [("agent-0", b"last")]
+    assert a.receive(PATH) == []
+    assert b.alive() == {"agent-1"}
+    again = hub.attach("agent-0")
+    a.publish(PATH, b"ghost")
+    a.close()
+    again.publish(PATH, b"reborn")
+    clock.advance(1)
+    assert b.receive(PATH) == [("agent-0", b"reborn")]
+    assert b.alive() == {"agent-0", "agent-1"}
+
+
+def test_a_name_can_be_taken_once() -> None:
+    _, hub, _ = hub_of(["agent-0"])
+    with pytest.raises(ValueError, match="agent-0"):
+        hub.attach("agent-0")
+
+
+def heard(order: list[int], attach_order: list[int]) -> dict[str, list[tuple[str, bytes]]]:
+    """Everything every agent hears in 400 steps, with agents ticked and attached in the given orders."""
+    clock = SimClock()
+    hub = LocalHub(clock.now_us, seed=5, delay_us=40_000, loss_01=0.3)
+    buses = {i: hub.attach(agent_name(i)) for i in attach_order}
+    log: dict[str, list[tuple[str, bytes]]] = {agent_name(i): [] for i in order}
+    for step in range(400):
+        for i in order:
+            log[agent_name(i)] += buses[i].receive(PATH)
+            buses[i].publish(PATH, f"{i}:{step}".encode())
+        clock.advance(20_000)
+    return log
+
+
+def test_order_of_ticking_and_attaching_changes_nothing() -> None:
+    assert heard([0, 1, 2], [0, 1, 2]) == heard([2, 0, 1], [1, 2, 0])
+
+
+def test_loss_has_the_asked_rate_is_independent_per_receiver_and_spares_reliable_topics() -> None:
+    log = heard([0, 1, 2], [0, 1, 2])
+    from_zero = {name: {p for s, p in log[name] if s == "agent-0"} for name in ("agent-1", "agent-2")}
+    for received in from_zero.values():
+        assert 0.63 < len(received) / 398 < 0.77
+    assert from_zero["agent-1"] != from_zero["agent-2"]
+    clock, _, (a, b) = hub_of(["operator", "agent-1"], loss_01=1.0)
+    a.publish(COMMAND, b"land")
+    a.publish(PATH, b"x")
+    clock.advance(1)
+    assert b.receive(COMMAND) == [("operator", b"land")]
+    assert b.receive(PATH) == []
+
+
+def test_what_is_longer_than_its_topic_allows_is_not_handed_out() -> None:
+    clock, _, (a, b) = hub_of(["agent-0", "agent-1"])
+    a.publish(PATH, bytes(PATH.max_bytes))
+    a.publish(PATH, bytes(PATH.max_bytes + 1))
+    clock.advance(1)
+    assert b.receive(PATH) == [("agent-0", bytes(PATH.max_bytes)), ("agent-0", TOO_LONG)]
+
+
+def test_who_leaves_and_comes_back_at_once_has_come_twice() -> None:
+    _, hub, (a, b) = hub_of(["agent-0", "agent-1"])
+    assert dict(b.arrivals()) == {"agent-0": 1, "agent-1": 1}
+    a.close()
+    assert b.alive() == {"agent-1"}
+    hub.attach("agent-0")
+    assert dict(b.arrivals()) == {"agent-0": 2, "agent-1": 1}
+    assert b.alive() == {"agent-0", "agent-1"}
+
+
+@pytest.mark.parametrize(
+    ("mute_us", "more"), [(LEASE_US - 1, {"agent-0": 1}), (LEASE_US, {"agent-0": 1, "agent-1": 1})]
+)
+def test_a_mute_bus_tells_of_comings_and_goings_when_it_is_whole_again(mute_us: int, more: dict[str, int]) -> None:
+    clock, hub, (a, b) = hub_of(["agent-0", "agent-1"])
+    before = dict(b.arrivals())
+    hub.mute()
+    a.close()
+    assert b.alive() == {"agent-0", "agent-1"}, "nobody can tell us"
+    hub.attach("agent-0")
+    clock.advance(mute_us)
+    assert dict(b.arrivals()) == before
+    hub.unmute()
+    assert dict(b.arrivals()) == {name: count + more.get(name, 0) for name, count in before.items()}
+    assert b.alive() == {"agent-0", "agent-1"}

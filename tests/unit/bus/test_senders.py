@@ -1,0 +1,274 @@
+"""Who is believed under a name: restarts in every order of events, forgeries, and what a network does by itself."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+import pytest
+
+from swarmctl.bus.peers import LocalBus, LocalHub
+from swarmctl.bus.refusals import HARMLESS, Refusals
+from swarmctl.bus.senders import SILENCE_US, Attendance, Said, Speaker, _Stream
+from swarmctl.core.clock import SimClock
+
+RATE_HZ, TICK_US = 50.0, 20_000
+TRUE, REBORN, FORGED = 70, 3, 999
+LAST = 2**32 - 1
+
+
+@dataclass
+class Bench:
+    """What one agent hears of agent-1, whose messages come every tick unless it is told to be silent."""
+
+    clock: SimClock = field(default_factory=SimClock)
+    seq: dict[int, int] = field(default_factory=dict)
+    believed: list[tuple[int, int]] = field(default_factory=list)  # (tick, boot id)
+    told: list[dict[str, object]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self.hub = LocalHub(self.clock.now_us)
+        self.refusals = Refusals(lambda _, **fields: self.told.append(fields))
+        self.attendance = Attendance(self.hub.attach("agent-0"))
+        self.token: LocalBus = self.hub.attach("agent-1")
+        self.speaker = Speaker("agent-1", "path", RATE_HZ, self.refusals, self.attendance)
+
+    def ticks(self, count: int, boots: Iterable[int] = (TRUE,), late_us: int = 0) -> None:
+        """Time goes on, and each of these lives says its next."""
+        for _ in range(count):
+            self.clock.advance(TICK_US)
+            for boot_id in boots:
+                self.seq[boot_id] = self.seq.get(boot_id, 0) + 1
+                self.offer(boot_id, self.seq[boot_id], -late_us)
+            self.attendance.look(self.clock.utc_us())
+
+    def offer(self, boot_id: int, seq: int, shift_us: int = 0, content: bytes = b"") -> bool:
+        utc_us = self.clock.utc_us()
+        self.attendance.look(utc_us)
+        said = Said(boot_id, seq, utc_us + shift_us, content or f"{boot_id} {seq}".encode())
+        if not self.speaker.believes(said, utc_us):
+            return False
+        self.believed.append((utc_us // TICK_US, boot_id))
+        return True
+
+    def leave(self) -> None:
+        self.token.close()
+        self.attendance.look(self.clock.utc_us())
+
+    def come(self) -> None:
+        self.token = self.hub.attach("agent-1")
+        self.attendance.look(self.clock.utc_us())
+
+    def heard_s(self, boot_id: int, since: int) -> float:
+        """From tick `since` until a life is believed."""
+        return min(tick for tick, boot in self.believed if boot == boot_id and tick >= since) * 0.02 - since * 0.02
+
+    @property
+    def tick(self) -> int:
+        return self.clock.utc_us() // TICK_US
+
+    @property
+    def accused(self) -> dict[str, int]:
+        return {reason: n for reason, n in self.refusals.by_reason.items() if reason not in HARMLESS}
+
+
+@pytest.mark.parametrize("shift_us", [0, 400_000, -400_000])
+@pytest.mark.parametrize(("boot_id", "seq"), [(FORGED, 1), (FORGED, LAST), (TRUE, LAST), (TRUE, 5000), (0, 0)])
+def test_one_forged_message_silences_nobody(boot_id: int, seq: int, shift_us: int) -> None:
+    bench = Bench()
+    bench.ticks(50)
+    assert not bench.offer(boot_id, seq, shift_us)
+    bench.ticks(50)
+    assert len(bench.believed) == 100
+    assert sum(bench.refusals.by_reason.values()) == bench.refusals.total == 1
+    if shift_us < 400_000:  # else what follows may have been said before
+        assert sum(bench.accused.values()) == 1
+
+
+def test_controls_without_these_rules_one_message_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A number was believed when it was higher, another boot id when it was stamped later."""
+    with monkeypatch.context() as patch:
+        patch.setattr(_Stream, "goes_on", lambda self, said, *_: said.boot_id == self.boot_id and said.seq > self.seq)
+        bench = Bench()
+        bench.ticks(50)
+        assert bench.offer(TRUE, LAST)
+        bench.ticks(50)
+        assert len(bench.believed) == 51, "the true one is not heard any more"
+    monkeypatch.setattr(Speaker, "_is_confirmed", lambda *_: True)
+    bench = Bench()
+    bench.ticks(50)
+    assert bench.offer(FORGED, 1)
+
+
+def test_a_forger_who_goes_on_and_on_is_refused_as_long_as_the_true_one_speaks() -> None:
+    bench = Bench()
+    bench.ticks(50)
+    bench.ticks(500, (TRUE, FORGED))
+    assert {boot for _, boot in bench.believed} == {TRUE}
+    assert 498 <= bench.accused["boot"] <= 500
+    assert bench.refusals.alert(bench.clock.utc_us()) == "path of agent-1 refused: boot"
+    bench.ticks(251)
+    assert bench.refusals.alert(bench.clock.utc_us()) == "", "shown for some time, then it clears"
+
+
+def test_events_say_by_whose_name_what_was_refused_once_a_second() -> None:
+    bench = Bench()
+    for _ in range(150):
+        bench.ticks(1, (TRUE, FORGED))
+        bench.refusals.tell(bench.clock.utc_us())
+    rows = [row for row in bench.told if row["reason"] == "boot"]
+    assert 3 <= len(rows) <= 4
+    assert rows[-1]["sender"] == "agent-1" and rows[-1]["topic"] == "path"
+    assert int(str(rows[-1]["count"])) > int(str(rows[0]["count"]))
+
+
+def test_a_restart_is_believed_with_its_third_message() -> None:
+    bench = Bench()
+    bench.ticks(500)
+    bench.leave()
+    bench.clock.advance(700_000)
+    bench.come()
+    began = bench.tick
+    bench.ticks(100, (REBORN,))
+    assert bench.heard_s(REBORN, began) == pytest.approx(0.06)
+    assert bench.accused == {}
+
+
+def test_messages_that_overtake_the_token_wait_for_it() -> None:
+    bench = Bench()
+    bench.ticks(500)
+    bench.leave()
+    bench.clock.advance(700_000)
+    began = bench.tick
+    bench.ticks(10, (REBORN,))
+    assert bench.believed[-1][1] == TRUE, "nobody of that name is there"
+    bench.come()
+    bench.ticks(1, (REBORN,))
+    assert bench.heard_s(REBORN, began) == pytest.approx(0.22)
+    assert bench.accused == {}
+
+
+def test_last_words_that_come_after_the_token_do_not_hold_a_restart_up() -> None:
+    bench = Bench()
+    bench.ticks(500)
+    bench.leave()
+    bench.clock.advance(300_000)
+    bench.come()
+    began = bench.tick
+    bench.ticks(5, (TRUE,), late_us=400_000)  # under way since before
+    for _ in range(5):  # both at once
+        bench.ticks(1, (TRUE,), late_us=400_000)
+        bench.offer(REBORN, bench.seq.setdefault(REBORN, 0) + 1)
+        bench.seq[REBORN] += 1
+    bench.ticks(20, (REBORN,))
+    assert bench.heard_s(REBORN, began) < 0.3
+    assert bench.accused == {}
+
+
+def test_a_restart_beside_a_frozen_process_is_believed_after_silence() -> None:
+    """The token never leaves: the old process holds it until its lease is over, the new one from then on."""
+    bench = Bench()
+    bench.ticks(500)
+    began = bench.tick
+    bench.ticks(150, (REBORN,))
+    assert bench.heard_s(REBORN, began) == pytest.approx(SILENCE_US * 1e-6, abs=0.03)
+
+
+def test_a_silent_peer_is_not_impersonated_before_its_token_has_outlived_it() -> None:
+    bench = Bench()
+    bench.ticks(500)
+    bench.ticks(round(1.5 / 0.02), (FORGED,))  # frozen for one and a half seconds
+    bench.ticks(50)
+    assert {boot for _, boot in bench.believed} == {TRUE}
+    assert bench.accused == {"boot": 75}
+
+
+def test_nobody_speaks_for_the_dead() -> None:
+    bench = Bench()
+    bench.ticks(100)
+    bench.leave()
+    bench.ticks(500, (FORGED,))
+    assert {boot for _, boot in bench.believed} == {TRUE}
+    assert bench.accused == {}, "no live peer's messages were refused"
+
+
+def test_a_lost_router_gives_no_forger_an_opening_once_the_peer_has_spoken() -> None:
+    bench = Bench()
+    bench.ticks(100)
+    bench.hub.mute()
+    for _ in range(100):
+        bench.clock.advance(TICK_US)
+        bench.attendance.look(bench.clock.utc_us())
+    bench.hub.unmute()
+    bench.seq[TRUE] += 100
+    bench.ticks(2)
+    bench.ticks(50, (FORGED, TRUE))
+    assert {boot for _, boot in bench.believed} == {TRUE}
+
+
+def test_who_spoke_first_under_a_name_gives_way_to_who_comes_by_it() -> None:
+    bench = Bench()
+    bench.leave()
+    bench.ticks(20, (FORGED,))
+    assert bench.believed, "nothing is known yet"
+    bench.clock.advance(TICK_US)
+    bench.come()
+    bench.ticks(5, (TRUE,))
+    assert bench.believed[-1][1] == TRUE
+
+
+def test_a_forged_first_message_of_the_highest_number_is_forgotten() -> None:
+    bench = Bench()
+    bench.offer(TRUE, LAST)
+    began = bench.tick
+    bench.ticks(150)
+    assert bench.believed[-1] == (bench.tick, TRUE)
+    assert (bench.believed[1][0] - began) * 0.02 == pytest.approx(SILENCE_US * 1e-6, abs=0.03)
+
+
+def test_a_forger_just_ahead_is_caught_up_with_and_betrayed_by_the_numbers() -> None:
+    bench = Bench()
+    bench.ticks(100)
+    assert bench.offer(TRUE, 110, content=b"elsewhere")
+    bench.ticks(30)
+    assert len(bench.believed) == 100 + 1 + 20
+    assert bench.accused == {"sequence": 10}
+
+
+def test_the_stamp_must_allow_for_the_number_and_the_number_for_the_stamp() -> None:
+    bench = Bench()
+    bench.ticks(100)
+    assert not bench.offer(TRUE, 100 + 60, 500_000), "half a second is not 60 ticks"
+    assert not bench.offer(TRUE, 100 + 12), "no time has passed"
+    bench.clock.advance(1_000_000)
+    assert bench.offer(TRUE, 100 + 50), "lost for a second"
+
+
+def test_loss_bursts_duplicates_reordering_and_changing_delay_accuse_nobody() -> None:
+    rng = np.random.default_rng(8)
+    bench = Bench()
+    under_way: list[tuple[int, int, int]] = []  # (arrives, seq, said)
+    for seq in range(1, 4000):
+        bench.clock.advance(TICK_US)
+        now_us = bench.clock.utc_us()
+        if rng.random() > 0.2 and not 1000 < seq < 1060:
+            delay_us = int(rng.uniform(0, 100_000)) + (400_000 if 2000 < seq < 2100 else 0)
+            under_way += [(now_us + delay_us, seq, now_us)] * (1 + int(rng.random() < 0.1))
+        for message in sorted(m for m in under_way if m[0] <= now_us):
+            under_way.remove(message)
+            bench.offer(TRUE, message[1], message[2] - now_us)
+    assert len(bench.believed) > 2000
+    assert bench.tick - bench.believed[-1][0] < 10
+    assert bench.accused == {}
+
+
+def test_a_flood_of_boot_ids_takes_no_memory_and_changes_nothing() -> None:
+    bench = Bench()
+    bench.ticks(10)
+    for boot_id in range(1000, 3000):
+        assert not bench.offer(boot_id, boot_id)
+    bench.ticks(10)
+    assert len(bench.believed) == 20
+    assert len(bench.speaker._claims) == 0
+    assert bench.accused == {"boot": 2000}

@@ -1,0 +1,264 @@
+"""What may come in from the bus: paths and messages survive the way, anything else is None and never an exception."""
+
+from __future__ import annotations
+
+import math
+import struct
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from swarmctl.bus import topics
+from swarmctl.bus.topics import decode_command, decode_obstacles, decode_path, decode_status, encode_message
+from swarmctl.bus.trajectory_messages import MAX_ACKNOWLEDGED, MAX_POINTS, encode_intent
+from swarmctl.core.records import TICK_DTYPE
+from swarmctl.core.trajectory import Trajectory
+from swarmctl.core.trajectory_message import Intent, Proposal
+from swarmctl.core.types import PredictedPath
+
+POINTS = np.array([[1.5, -2.25, -3.0], [1.625, -2.0, -3.5], [1.75, -1.75, -4.0]])
+UTC_US = 1_700_000_000_123_456
+ALL_DECODERS = (decode_path, decode_status, decode_command, decode_obstacles)
+
+STATUS = topics.StatusMessage(
+    agent=2,
+    boot_id=9,
+    sysid=3,
+    phase=6,
+    mode=2,
+    flight_mode=7,
+    armed=True,
+    landed=2,
+    ready_utc_us=UTC_US,
+    outcome="",
+    position_error_m=0.25,
+    separation_m=-1.0,
+    tick_p99_ms=3.5,
+    ticks=1000,
+    late_ticks=2,
+    path_age_ms=41.5,
+    solver_failed=1,
+    problem="plan residual",
+)
+
+
+def path(points: np.ndarray = POINTS, dt_us: int = 20_000, radius_m: float = 0.5) -> PredictedPath:
+    return PredictedPath(4, 0xFFFFFFFF, 123_456, UTC_US, dt_us, radius_m, points)
+
+
+def test_a_path_survives_the_way() -> None:
+    decoded = decode_path(topics.encode_path(path()))
+    assert decoded is not None
+    assert (decoded.agent, decoded.boot_id, decoded.seq) == (4, 0xFFFFFFFF, 123_456)
+    assert (decoded.t0_utc_us, decoded.dt_us, decoded.radius_m) == (UTC_US, 20_000, 0.5)
+    np.testing.assert_array_equal(decoded.pos_ned_m, POINTS)
+    assert decoded.pos_ned_m.dtype == np.float64
+
+
+def test_bytes_of_a_path_parsed_by_hand() -> None:
+    payload = topics.encode_path(path())
+    assert payload[:4] == b"SP\x01\x00"
+    assert struct.unpack_from("<III", payload, 4) == (4, 0xFFFFFFFF, 123_456)
+    assert struct.unpack_from("<q", payload, 16) == (UTC_US,)
+    assert struct.unpack_from("<if", payload, 24) == (20_000, 0.5)
+    assert payload[32:36] == bytes([3, 36, 0, 0])
+    assert struct.unpack_from("<9f", payload, 36) == tuple(POINTS.ravel())
+    assert len(payload) == 36 + 9 * 4
+
+
+def changed(offset: int, code: str, value: float) -> bytes:
+    payload = bytearray(topics.encode_path(path()))
+    struct.pack_into(code, payload, offset, value)
+    return bytes(payload)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+@pytest.mark.parametrize("number", range(9))
+def test_a_number_that_is_not_finite_is_refused(number: int, bad: float) -> None:
+    assert decode_path(changed(36 + 4 * number, "<f", bad)) is None
+
+
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b"",
+        topics.encode_path(path())[:35],
+        topics.encode_path(path())[:-1],
+        topics.encode_path(path()) + b"\x00",
+        changed(0, "<B", ord("X")),
+        changed(2, "<B", 2),  # a version from the future
+        changed(24, "<i", 0),  # dt
+        changed(24, "<i", -20_000),
+        changed(28, "<f", math.nan),  # radius
+        changed(28, "<f", math.inf),
+        changed(28, "<f", -0.5),
+        changed(32, "<B", 2),  # count
+        changed(32, "<B", 4),
+        changed(33, "<B", 35),  # header length
+        changed(33, "<B", 0),
+        changed(32, "<H", 4 | 24 << 8),  # four points from within the header: the length would fit
+        topics.encode_path(path(POINTS[:1])),
+        topics.encode_path(path(np.zeros((251, 3)))),
+    ],
+)
+def test_what_does_not_fit_is_refused(payload: bytes) -> None:
+    assert decode_path(payload) is None
+
+
+@pytest.mark.parametrize("count", [2, 250])
+def test_limits_of_the_number_of_points_are_inclusive(count: int) -> None:
+    decoded = decode_path(topics.encode_path(path(np.full((count, 3), 1.0))))
+    assert decoded is not None
+    assert len(decoded.pos_ned_m) == count
+
+
+def test_a_longer_header_of_a_later_minor_version_is_skipped() -> None:
+    payload = changed(33, "<B", 44)
+    decoded = decode_path(payload[:36] + b"\xff" * 8 + payload[36:])
+    assert decoded is not None
+    np.testing.assert_array_equal(decoded.pos_ned_m, POINTS)
+
+
+@given(st.binary(max_size=200))
+def test_hostile_bytes_give_none(payload: bytes) -> None:
+    for decode in ALL_DECODERS:
+        assert decode(payload) is None
+
+
+@given(st.binary(min_size=68, max_size=68), st.integers(0, 40))
+def test_hostile_bodies_behind_a_good_beginning_give_a_sane_path_or_none(tail: bytes, keep: int) -> None:
+    good = topics.encode_path(path())
+    decoded = decode_path(good[: 4 + keep] + tail[: len(good) - 4 - keep])
+    if decoded is not None:
+        assert np.isfinite(decoded.pos_ned_m).all()
+        assert decoded.dt_us > 0
+        assert math.isfinite(decoded.radius_m)
+        assert decoded.radius_m >= 0.0
+
+
+json_values = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats(allow_nan=False, allow_infinity=False) | st.text(max_size=5),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=5), inner, max_size=4),
+    max_leaves=6,
+)
+
+
+@given(st.sampled_from(STATUS.__struct_fields__), json_values)
+def test_a_status_with_one_hostile_field_is_none_or_well_typed(name: str, value: object) -> None:
+    tree = msgspec.to_builtins(STATUS) | {name: value}
+    try:
+        payload = msgspec.json.encode(tree)
+    except (OverflowError, UnicodeEncodeError, msgspec.MsgspecError):
+        return
+    decoded = decode_status(payload)
+    if decoded is not None:
+        for field in STATUS.__struct_fields__:
+            found = getattr(decoded, field)
+            assert type(found) is type(getattr(STATUS, field))
+            assert not isinstance(found, float) or math.isfinite(found)
+
+
+@pytest.mark.parametrize("decode", [decode_status, decode_command, decode_obstacles])
+@pytest.mark.parametrize(
+    "payload",
+    [
+        b'{"verb":"\xff\xfe","agent":1,"utc_us":1}',  # not UTF-8 where text is compared
+        b'{"outcome":"\xff\xfe"}',
+        b'{"x":' + b"[" * 100_000,  # an unknown key, deeper than any parser's stack
+        b'{"x":' * 100_000,
+    ],
+    ids=["not utf-8 verb", "not utf-8 outcome", "deep lists", "deep objects"],
+)
+def test_hostile_text_gives_none_and_never_raises(decode: object, payload: bytes) -> None:
+    assert callable(decode)
+    assert decode(payload) is None
+
+
+def test_messages_survive_the_way() -> None:
+    assert decode_status(encode_message(STATUS)) == STATUS
+    command = topics.CommandMessage("rtl", -1, UTC_US)
+    assert decode_command(encode_message(command)) == command
+    obstacle = topics.ObstacleMessage((9.5, 5.5, -2.3), 1.0, 1.75, 3.0, (0.0, -0.5, 0.0))
+    obstacles = topics.ObstaclesMessage(3, (obstacle, obstacle))
+    assert decode_obstacles(encode_message(obstacles)) == obstacles
+
+
+@pytest.mark.parametrize("verb", ["disarm", "kill", "", "LAND"])
+def test_only_the_four_verbs_of_the_operator_are_known(verb: str) -> None:
+    assert decode_command(msgspec.json.encode({"verb": verb, "agent": -1, "utc_us": 1})) is None
+
+
+@pytest.mark.parametrize(("name", "value"), [("phase", 10), ("phase", -1), ("phase", 99)])
+def test_a_status_of_a_phase_that_does_not_exist_is_refused(name: str, value: int) -> None:
+    # the agent makes `Phase(status.phase)` of it within the tick
+    assert decode_status(msgspec.json.encode(msgspec.to_builtins(STATUS) | {name: value})) is None
+
+
+def obstacles(**fields: object) -> bytes:
+    good = {"center_ned_m": [0, 0, 0], "radius_m": 1.0, "keep_out_m": 1.75, "visibility_m": 3.0}
+    return msgspec.json.encode({"version": 1, "obstacles": [good | fields]})
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"radius_m": None},
+        {"center_ned_m": [0.0, 0.0]},
+        {"center_ned_m": [0.0, 0.0, 0.0, 0.0]},
+        {"keep_out_m": "1.75"},
+        {"keep_out_m": -1.0},
+        {"radius_m": -1.0},
+        {"visibility_m": -1.0},
+    ],
+)
+def test_obstacles_that_make_no_sense_are_refused(fields: dict[str, object]) -> None:
+    assert decode_obstacles(obstacles()) is not None
+    assert decode_obstacles(obstacles(**fields)) is None
+
+
+def test_numbers_beyond_a_double_are_refused() -> None:
+    assert decode_obstacles(obstacles().replace(b"1.75", b"1e999")) is None
+    assert decode_obstacles(obstacles().replace(b"1.75", b"NaN")) is None
+
+
+def test_every_topic_has_its_own_name_and_few_old_paths_are_kept() -> None:
+    assert len({topic.name for topic in topics.TOPICS}) == len(topics.TOPICS)
+    assert max(topics.PATH.ring, topics.STATUS.ring, topics.OBSTACLES.ring, topics.INTENT.ring) <= 4
+    assert topics.COMMAND.reliable
+    assert topics.OBSTACLES.reliable
+
+
+def test_lists_and_numbers_from_outside_are_bounded() -> None:
+    ball = topics.ObstacleMessage((9.5, 5.5, -2.3), 1.0, 1.75, 3.0)
+    most = topics.ObstaclesMessage(1, (ball,) * topics.MAX_OBSTACLES)
+    assert decode_obstacles(encode_message(most)) == most
+    assert len(encode_message(most)) <= topics.OBSTACLES.max_bytes
+    assert decode_obstacles(encode_message(topics.ObstaclesMessage(1, (ball,) * (topics.MAX_OBSTACLES + 1)))) is None
+    for fields in ({"center_ned_m": [0, 0, 1e5]}, {"vel_ned_m_s": [-1e5, 0, 0]}, {"keep_out_m": 1e5}):
+        assert decode_obstacles(obstacles(**fields)) is None
+    for name in ("agent", "boot_id", "ticks", "ready_utc_us", "utc_us"):
+        for value in (-1, 10**30):
+            assert (
+                decode_status(
+                    msgspec.json.encode(msgspec.to_builtins(STATUS)).replace(
+                        f'"{name}":{getattr(STATUS, name)}'.encode(), f'"{name}":{value}'.encode()
+                    )
+                )
+                is None
+            )
+
+
+def test_the_longest_good_message_of_every_topic_fits() -> None:
+    path = PredictedPath(0, 0, 0, 0, 1, 0.0, np.zeros((topics.MAX_POINTS, 3)))
+    assert len(topics.encode_path(path)) <= topics.PATH.max_bytes
+    trajectory = Trajectory(0, 1, np.zeros((MAX_POINTS, 3)), np.zeros((MAX_POINTS, 3)))
+    heard = dict.fromkeys(range(MAX_ACKNOWLEDGED), 2**60)
+    intent = Intent(0, 0, 0, 0, True, trajectory, Proposal(1, 0, 0, trajectory), heard)
+    assert len(encode_intent(intent)) <= topics.INTENT.max_bytes
+    assert TICK_DTYPE.itemsize + 12 * topics.MAX_POINTS <= topics.TICK.max_bytes
+    status = msgspec.structs.replace(STATUS, outcome="x" * 4000, problem="\u20ac" * 4000)
+    assert len(encode_message(status)) <= topics.STATUS.max_bytes
+    assert len(encode_message(topics.CommandMessage("resume", -1, 2**62))) <= topics.COMMAND.max_bytes

@@ -1,0 +1,164 @@
+"""Intents over the wire: what is said is what is heard, and nothing else is taken in."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from swarmctl.bus.peers import LocalHub, agent_name
+from swarmctl.bus.refusals import Refusals
+from swarmctl.bus.senders import Attendance
+from swarmctl.bus.trajectory_messages import PeerIntents, decode_intent, encode_intent
+from swarmctl.core.clock import SimClock
+from swarmctl.core.trajectory import Trajectory, ending_at_rest, joined, resting, stopping
+from swarmctl.core.trajectory_message import Intent, Proposal
+
+UTC_US = 1_700_000_000_000_000
+
+
+def trajectory(shift_m: float = 0.0) -> Trajectory:
+    return stopping(np.array([shift_m, 1.0, -2.0]), np.array([1.5, -0.5, 0.25]), UTC_US, 100_000, 1.5)
+
+
+def intent(seq: int = 1, agent: int = 2, boot_id: int = 9, propose: bool = True) -> Intent:
+    proposal = Proposal(77, UTC_US + 5, agent, trajectory(0.5)) if propose else None
+    said_utc_us = UTC_US + 20_000 * seq
+    return Intent(agent, boot_id, seq, said_utc_us, True, trajectory(), proposal, {0: 5, 1: UTC_US})
+
+
+@pytest.mark.parametrize("propose", [True, False])
+def test_what_is_said_is_heard(propose: bool) -> None:
+    said = intent(propose=propose)
+    heard = decode_intent(encode_intent(said))
+    assert heard is not None
+    assert (heard.agent, heard.boot_id, heard.seq, heard.promised, heard.heard) == (2, 9, 1, True, said.heard)
+    assert heard.said_utc_us == UTC_US + 20_000
+    np.testing.assert_allclose(heard.committed.pos_ned_m, said.committed.pos_ned_m, atol=1e-6)
+    assert heard.committed.t0_utc_us == UTC_US
+    assert (heard.proposal is not None) is propose
+    if heard.proposal is not None:
+        assert heard.proposal.order == (UTC_US + 5, 2)
+        np.testing.assert_allclose(heard.proposal.trajectory.vel_ned_m_s, trajectory(0.5).vel_ned_m_s, atol=1e-6)
+
+
+def test_truncated_lengthened_and_mutilated_ones_are_none() -> None:
+    good = encode_intent(intent())
+    rng = np.random.default_rng(1)
+    assert all(decode_intent(good[:n]) is None for n in range(len(good)))
+    assert decode_intent(good + b"\0") is None
+    for _ in range(2000):
+        bad = bytearray(good)
+        bad[rng.integers(len(bad))] = rng.integers(256)
+        found = decode_intent(bytes(bad))
+        if found is not None:
+            assert np.isfinite(found.committed.pos_ned_m).all()
+
+
+class Store:
+    """Intents of agents 0 and 2 as agent 1 takes them in, at 50 Hz, one message a tick."""
+
+    def __init__(self) -> None:
+        self.clock = SimClock()
+        self.hub = LocalHub(self.clock.now_us)
+        self.peer = self.hub.attach(agent_name(2))
+        self.attendance = Attendance(self.hub.attach(agent_name(1)))
+        self.refusals = Refusals(lambda *_, **__: None)
+        self.intents = PeerIntents([0, 2], 50.0, self.refusals, self.attendance)
+        self.utc_us = UTC_US
+
+    def offer(self, *said: Intent, sender: str = agent_name(2)) -> None:
+        for each in said:
+            self.utc_us += 20_000
+            self.attendance.look(self.utc_us)
+            self.intents.offer(sender, encode_intent(each), self.utc_us)
+
+
+def test_only_newer_ones_of_expected_peers_are_taken_in() -> None:
+    store = Store()
+    store.offer(intent(seq=3), intent(seq=3), intent(seq=2))
+    store.offer(intent(seq=4), sender=agent_name(0))
+    store.offer(intent(seq=4, agent=1), sender=agent_name(1))
+    store.intents.offer(agent_name(2), b"nonsense", UTC_US)
+    assert set(store.intents.newest) == {2} and store.intents.newest[2].seq == 3
+    assert store.refusals.by_reason == {"replayed": 2, "identity": 1, "unknown_peer": 1, "malformed": 1}
+    assert store.intents.heard() == {2: 77}
+
+
+def test_one_forged_intent_does_not_silence_its_peer() -> None:
+    store = Store()
+    store.offer(intent(seq=3), intent(seq=4, boot_id=10), intent(seq=2**32 - 1), intent(seq=4))
+    assert (store.intents.newest[2].boot_id, store.intents.newest[2].seq) == (9, 4)
+    assert store.refusals.by_reason == {"unconfirmed": 2}
+    store.offer(*(intent(seq=seq) for seq in range(5, 12)))
+    assert store.intents.newest[2].seq == 11
+    assert store.refusals.by_reason["boot"] == 1
+
+
+def test_a_restart_is_heard_with_its_third_intent_and_has_proposed_nothing_yet() -> None:
+    store = Store()
+    store.offer(intent(seq=3))
+    store.peer.close()
+    store.attendance.look(store.utc_us)
+    store.peer = store.hub.attach(agent_name(2))
+    store.offer(
+        *(replace(intent(seq=seq, boot_id=3, propose=False), said_utc_us=UTC_US + seq * 50_000) for seq in (4, 5, 6))
+    )
+    assert store.intents.newest[2].boot_id == 3
+    assert store.intents.heard() == {}
+
+
+def test_what_begins_in_the_future_is_of_another_clock() -> None:
+    store = Store()
+    store.intents.offer(agent_name(2), encode_intent(intent()), UTC_US - 11_000_000)
+    assert store.refusals.by_reason == {"future": 1} and store.intents.newest == {}
+    store.intents.offer(agent_name(2), encode_intent(intent()), UTC_US - 9_000_000)
+    assert store.intents.newest[2].seq == 1
+
+
+def test_a_trajectory_rests_before_and_after_itself_and_is_smooth_between() -> None:
+    path = trajectory()
+    times = np.arange(UTC_US - 200_000, path.end_utc_us + 300_000, 1_000)
+    pos, vel = path.sample(times)
+    np.testing.assert_array_equal(pos[-1], path.pos_ned_m[-1])
+    assert not vel[-1].any() and not vel[0].any()
+    inside = (times > UTC_US) & (times < path.end_utc_us)
+    np.testing.assert_allclose((np.gradient(pos, 1e-3, axis=0) - vel)[inside][2:-2], 0.0, atol=5e-3)
+    np.testing.assert_allclose(
+        path.acceleration(UTC_US + 300_000), -1.5 * vel[400] / np.linalg.norm(vel[400]), atol=0.02
+    )
+
+
+def test_a_proposal_leaves_what_is_committed_and_ends_at_rest() -> None:
+    first = trajectory()
+    branch_us = UTC_US + 237_000
+    pos, vel = first.sample(branch_us + np.arange(5) * 100_000)
+    then = ending_at_rest(branch_us, 100_000, pos + np.linspace(0, 0.3, 5)[:, None], vel, 1.5)
+    whole = joined(first, then, UTC_US + 120_000)
+    early = np.arange(UTC_US + 120_000, branch_us, 5_000)
+    np.testing.assert_allclose(whole.sample(early)[0], first.sample(early)[0], atol=1e-3)
+    assert not whole.vel_ned_m_s[-1].any()
+    np.testing.assert_array_equal(whole.pos_ned_m[-1], whole.pos_ned_m[-2])  # nobody sees it move on
+    assert joined(resting(pos[0], UTC_US, 100_000), replace(then), branch_us).t0_utc_us == branch_us
+
+
+def test_one_time_at_a_time_is_the_same() -> None:
+    path = trajectory()
+    for t_us in np.arange(UTC_US - 200_000, path.end_utc_us + 300_000, 7_001):
+        pos, vel = path.sample(np.array([t_us]))
+        np.testing.assert_allclose(path.at(float(t_us))[0], pos[0], atol=1e-9)
+        np.testing.assert_allclose(path.at(float(t_us))[1], vel[0], atol=1e-6)
+
+
+def test_what_is_said_again_is_the_same_object_again() -> None:
+    store = Store()
+    store.offer(intent(seq=1))
+    before = store.intents.newest[2]
+    store.offer(replace(intent(seq=9, boot_id=4), committed=trajectory(2.0)), intent(seq=2))  # a forger between them
+    after = store.intents.newest[2]
+    assert after.seq == 2 and after.committed is before.committed
+    assert before.proposal is not None and after.proposal is not None
+    assert after.proposal.trajectory is before.proposal.trajectory
+    store.offer(replace(intent(seq=3), committed=trajectory(1.0)))
+    assert store.intents.newest[2].committed is not before.committed

@@ -1,0 +1,450 @@
+"""What a check thinks: every row of the table is triggered by one fact, and by nothing in a healthy vehicle."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from swarmctl.check.change import Change
+from swarmctl.check.finding import SWARM, Finding, Verdict, worst_first
+from swarmctl.check.link_facts import (
+    Estimator,
+    Gps,
+    LinkFacts,
+    Parameter,
+    RoundTrip,
+    Sensors,
+    VehicleFacts,
+    VehicleTime,
+    Version,
+)
+from swarmctl.check.parameters import RC_RECEIVER, ROWS, changes, names_to_read, unchangeable
+from swarmctl.check.scan_facts import unreached
+from swarmctl.check.swarm import exit_code, findings, standing
+from swarmctl.check.table import as_json, print_check
+from swarmctl.config import Config, load
+from swarmctl.core.types import FlightMode, Landed
+from swarmctl.mavlink.dialects import ARDUCOPTER, PX4
+
+OK, NOTE, FIX = Verdict.OK, Verdict.NOTE, Verdict.FIX
+URLS = ("udpin://127.0.0.1:14540", "udpin://127.0.0.1:14541")
+ALL_SENSORS = 0x0200C02F
+PX4_VALUES: dict[str, float | int] = {
+    "COM_OBL_RC_ACT": 4,
+    "COM_OF_LOSS_T": 0.5,
+    "MAV_FWDEXTSP": 1,
+    "COM_RCL_EXCEPT": 0,
+    "COM_RC_IN_MODE": 1,
+    "NAV_RCL_ACT": 2,
+    "NAV_DLL_ACT": 0,
+    "COM_DL_LOSS_T": 10,
+    "MPC_THR_HOVER": 0.5,
+    "THR_MDL_FAC": 0.0,
+    "MAV_SYS_ID": 1,
+}
+COPTER_VALUES: dict[str, float | int] = {
+    "GUID_OPTIONS": 8,
+    "GUID_TIMEOUT": 1.0,
+    "FS_GCS_ENABLE": 5,
+    "FS_GCS_TIMEOUT": 2.0,
+    "ATC_ANGLE_BOOST": 0,
+    "FS_THR_ENABLE": 0,
+    "FS_EKF_ACTION": 1,
+    "ARMING_CHECK": 1,
+    "ANGLE_MAX": 4500,
+    "MOT_THST_HOVER": 0.45,
+    "SYSID_THISMAV": 1,
+    "SYSID_MYGCS": 255,
+}
+LINK = LinkFacts(
+    listened_s=3.0,
+    rates_hz={"ODOMETRY": 30.0, "HEARTBEAT": 1.0},
+    frames_s=430.0,
+    bytes_s=25000.0,
+    lost_01=0.0,
+    mavlink1=0,
+    mavlink2=1300,
+    autopilots=(1,),
+    senders=1,
+    round_trip=RoundTrip(2.0, 9.0, 60, "TIMESYNC"),
+    time=VehicleTime(-12.0, 40.0, 30.0),
+)
+
+
+def parameters(values: dict[str, float | int], **changed: float | int | None) -> dict[str, Parameter]:
+    merged: dict[str, Any] = {**values, **changed}
+    return {name: Parameter(name, value, 6 if isinstance(value, int) else 9) for name, value in merged.items()}
+
+
+HEALTHY = VehicleFacts(
+    agent=0,
+    url=URLS[0],
+    wanted_sysid=1,
+    unreachable="",
+    link=LINK,
+    sysid=1,
+    autopilot="PX4",
+    autopilot_number=12,
+    version=Version((1, 18, 0), "beta", "83c4f4e5", 1, "0", True),
+    mode=FlightMode.HOLD,
+    custom_mode=0x03040000,
+    landed=Landed.ON_GROUND,
+    system_status=3,
+    sensors=Sensors(ALL_SENSORS, ALL_SENSORS | RC_RECEIVER, 0x1320C83F, 16.2, 1.0),
+    estimator=Estimator(1023, 0.1, 0.2),
+    gps=Gps(3, 10, 0.9),
+    pos_ned_m=(0.0, 0.0, 0.0),
+    origin_ned_m=(0.1, 0.0, 0.0),
+    origin_told=True,
+    parameters=parameters(PX4_VALUES),
+)
+COPTER = dataclasses.replace(
+    HEALTHY,
+    autopilot="ArduCopter",
+    autopilot_number=3,
+    version=Version((4, 6, 3), "release", "92b0cd78", 1, "0", None),
+    parameters=parameters(COPTER_VALUES),
+)
+SECOND = dataclasses.replace(
+    HEALTHY, agent=1, url=URLS[1], wanted_sysid=2, sysid=2, pos_ned_m=(3.0, 0.0, 0.0), origin_ned_m=(0.0, 0.2, 0.0)
+)
+
+
+@pytest.fixture(scope="module")
+def config(tmp_path_factory: pytest.TempPathFactory) -> Config:
+    vehicles = "".join(f'[[vehicles]]\nsysid={i + 1}\nurl="{url}"\n' for i, url in enumerate(URLS))
+    path = tmp_path_factory.mktemp("check") / "two.toml"
+    path.write_text(
+        "[swarm]\nagents=2\n[start]\npositions_ned_m=[[0,0,-2.0],[3.0,0,-2.0]]\n[sitl]\nenabled=false\n" + vehicles
+    )
+    return load(path)
+
+
+def with_params(config: Config, **wanted: float) -> Config:
+    """The same with other `agent.autopilot_params`."""
+    agent = config.agent.model_copy(update={"autopilot_params": wanted})
+    return config.model_copy(update={"agent": agent})
+
+
+def line_of(lines: Sequence[Finding], topic: str, agent: int = 0) -> Finding:
+    [found] = [line for line in lines if line.topic == topic and line.agent == agent]
+    return found
+
+
+def changed(facts: VehicleFacts, **fields: Any) -> VehicleFacts:
+    """With other facts; `link_x` replaces a field of the link."""
+    link = {k.removeprefix("link_"): v for k, v in fields.items() if k.startswith("link_")}
+    own = {k: v for k, v in fields.items() if not k.startswith("link_")}
+    return dataclasses.replace(facts, link=dataclasses.replace(facts.link, **link), **own)
+
+
+def test_a_healthy_pair_has_nothing_to_fix_and_nothing_to_know(config: Config) -> None:
+    lines = findings([HEALTHY, SECOND_OK], config)
+    assert worst_first(lines) == []
+    assert exit_code([HEALTHY, SECOND_OK], lines) == 0
+
+
+def test_a_healthy_copter_has_nothing_to_fix(config: Config) -> None:
+    lines = findings([COPTER], with_params(config, GUID_OPTIONS=8))
+    assert worst_first(lines) == []
+
+
+SECOND_OK = changed(SECOND, link_autopilots=(2,), parameters=parameters(PX4_VALUES, MAV_SYS_ID=2))
+_RADIO = Sensors(ALL_SENSORS | RC_RECEIVER, ALL_SENSORS | RC_RECEIVER, 0x1320C83F | RC_RECEIVER, 16.2, 1.0)
+
+# topic, what is changed in a healthy PX4 vehicle, verdict, a word of the advice
+PX4_CASES: list[tuple[str, dict[str, Any], Verdict, str]] = [
+    ("autopilot", {"autopilot": "", "autopilot_number": 4}, FIX, "flies PX4 and ArduCopter"),
+    ("autopilot", {"version": Version((1, 14, 0), "release", "", 1, "0", True)}, NOTE, "measured on 1.18"),
+    ("autopilot", {"version": Version((1, 18, 0), "beta", "", 1, "0", False)}, FIX, "encodes integer"),
+    ("autopilot", {"version": None}, NOTE, "version"),
+    ("system id", {"sysid": 7}, FIX, "MAV_SYS_ID = 1"),
+    ("state", {"armed": True}, NOTE, "left alone"),
+    ("state", {"armed": True, "mode": FlightMode.EXTERNAL}, NOTE, "somebody is flying"),
+    ("state", {"system_status": 5}, FIX, "failsafe"),
+    ("sensors", {"sensors": None}, NOTE, "SYS_STATUS"),
+    ("sensors", {"sensors": Sensors(ALL_SENSORS, ALL_SENSORS, 0x1320C83F & ~4, 16.2, 1.0)}, FIX, "calibrate"),
+    ("sensors", {"sensors": Sensors(ALL_SENSORS, ALL_SENSORS, 0x0320C83F, 16.2, 1.0)}, FIX, "refused in HOLD"),
+    ("battery", {"sensors": Sensors(ALL_SENSORS, ALL_SENSORS, 0x1320C83F, 14.0, 0.1)}, FIX, "charge"),
+    ("battery", {"sensors": Sensors(ALL_SENSORS, ALL_SENSORS, 0x1320C83F, 15.0, 0.4)}, NOTE, "short flight"),
+    ("battery", {"sensors": Sensors(ALL_SENSORS, ALL_SENSORS, 0x1320C83F, None, None)}, NOTE, "not known"),
+    ("estimator", {"estimator": Estimator(1023 & ~16, 0.3, 0.4)}, FIX, "position source"),
+    ("estimator", {"estimator": Estimator(1023 | 1024, 0.3, 0.4)}, FIX, "distrusts"),
+    ("estimator", {"estimator": None, "gps": Gps(2, 4, 9.0)}, FIX, "3-D fix"),
+    ("estimator", {"estimator": None, "gps": Gps(3, 10, None)}, NOTE, "how accurate"),
+    ("origin", {"origin_ned_m": None}, FIX, "can't be placed"),
+    ("origin", {"origin_ned_m": (9000.0, 0.0, 0.0)}, FIX, "swarm.origin_lat_deg"),
+    ("origin", {"origin_told": False}, NOTE, "worked out"),
+    ("link", {"link_mavlink2": 0, "link_mavlink1": 50}, FIX, "MAV_PROTO_VER = 2"),
+    ("link", {"link_autopilots": (1, 4)}, FIX, "link of its own"),
+    ("link", {"link_senders": 2}, FIX, "only the vehicle send"),
+    ("state rate", {"url": "serial:///dev/ttyX:57600", "link_bytes_s": 3000.0}, FIX, "state_rate_hz"),
+    ("loss", {"link_lost_01": 0.02}, NOTE, "lost on the way"),
+    ("loss", {"link_lost_01": 0.2}, FIX, "lost on the way"),
+    ("round trip", {"link_round_trip": None}, NOTE, "neither"),
+    ("round trip", {"link_round_trip": RoundTrip(90.0, 120.0, 60, "PING")}, NOTE, "0.045 s"),
+    ("round trip", {"link_round_trip": RoundTrip(90.0, 900.0, 60, "PING")}, FIX, "state_max_age_s"),
+    ("clock", {"link_time": VehicleTime(0.0, -30000.0, 100.0)}, NOTE, "short of CPU"),
+    ("clock", {"link_time": VehicleTime(0.0, 60000.0, 100.0)}, FIX, "short of CPU"),
+    ("start", {"pos_ned_m": (0.0, 0.0, -1.8)}, FIX, "origin_alt_m"),
+    ("start", {"pos_ned_m": (500.0, 0.0, 0.0)}, FIX, "start_timeout_s"),
+    ("start", {"pos_ned_m": (50.0, 0.0, 0.0)}, NOTE, "far"),
+    ("COM_OF_LOSS_T", {"parameters": parameters(PX4_VALUES, COM_OF_LOSS_T=3.0)}, FIX, "set 1.0"),
+    ("COM_OF_LOSS_T", {"parameters": parameters(PX4_VALUES, COM_OF_LOSS_T=0.05)}, FIX, "set 0.5"),
+    ("COM_OF_LOSS_T", {"parameters": parameters(PX4_VALUES, COM_OF_LOSS_T=None)}, NOTE, "not judged"),
+    ("COM_OBL_RC_ACT", {"parameters": parameters(PX4_VALUES, COM_OBL_RC_ACT=0)}, NOTE, "the agent sets it"),
+    ("COM_OBL_RC_ACT", {"parameters": parameters(PX4_VALUES, COM_OBL_RC_ACT=None)}, FIX, "no such parameter"),
+    ("MAV_FWDEXTSP", {"parameters": parameters(PX4_VALUES, MAV_FWDEXTSP=0)}, FIX, "not flown"),
+    ("COM_RCL_EXCEPT", {"parameters": parameters(PX4_VALUES, COM_RC_IN_MODE=0)}, FIX, "NAV_RCL_ACT = 2"),
+    ("NAV_DLL_ACT", {"parameters": parameters(PX4_VALUES, NAV_DLL_ACT=None)}, FIX, "can't be read"),
+    ("MPC_THR_HOVER", {"parameters": parameters(PX4_VALUES, MPC_THR_HOVER=0.3)}, NOTE, "hover_thrust_01 = 0.3"),
+    ("MAV_SYS_ID", {"parameters": parameters(PX4_VALUES, MAV_SYS_ID=9)}, FIX, "reboot"),
+    ("THR_MDL_FAC", {"version": Version((1, 18, 0), "release", "", 50, "3a91", True, 0x3185)}, NOTE, "calibrate"),
+]
+COPTER_CASES: list[tuple[str, dict[str, Any], Verdict, str]] = [
+    ("GUID_OPTIONS", {"parameters": parameters(COPTER_VALUES, GUID_OPTIONS=0)}, FIX, "climb rate"),
+    ("GUID_OPTIONS", {"parameters": parameters(COPTER_VALUES, GUID_OPTIONS=None)}, FIX, "can't be read"),
+    ("GUID_TIMEOUT", {"parameters": parameters(COPTER_VALUES, GUID_TIMEOUT=3.0)}, NOTE, "set 1"),
+    ("GUID_TIMEOUT", {"parameters": parameters(COPTER_VALUES, GUID_TIMEOUT=30.0)}, FIX, "last attitude"),
+    ("FS_GCS_ENABLE", {"parameters": parameters(COPTER_VALUES, FS_GCS_ENABLE=1)}, FIX, "drift on"),
+    ("FS_THR_ENABLE", {"parameters": parameters(COPTER_VALUES, FS_THR_ENABLE=1)}, NOTE, "no radio"),
+    ("FS_EKF_ACTION", {"parameters": parameters(COPTER_VALUES, FS_EKF_ACTION=2)}, NOTE, "does not land"),
+    ("ARMING_CHECK", {"parameters": parameters(COPTER_VALUES, ARMING_CHECK=0)}, NOTE, "nothing is checked"),
+    ("ANGLE_MAX", {"parameters": parameters(COPTER_VALUES, ANGLE_MAX=3000)}, NOTE, "tilt_max_rad = 0.52"),
+    ("MOT_THST_HOVER", {"parameters": parameters(COPTER_VALUES, MOT_THST_HOVER=0.2)}, NOTE, "hover_thrust_01 = 0.2"),
+    ("SYSID_THISMAV", {"parameters": parameters(COPTER_VALUES, SYSID_THISMAV=4)}, FIX, "reboot"),
+    ("link", {"link_mavlink2": 0, "link_mavlink1": 50}, FIX, "SERIALx_PROTOCOL"),
+    ("system id", {"sysid": 7}, FIX, "SYSID_THISMAV = 1"),
+]
+
+
+@pytest.mark.parametrize(
+    ("topic", "fields", "verdict", "word"), PX4_CASES, ids=lambda v: v if isinstance(v, str) else ""
+)
+def test_px4_rows(config: Config, topic: str, fields: dict[str, Any], verdict: Verdict, word: str) -> None:
+    healthy = line_of(findings([HEALTHY], config), topic)
+    assert healthy.verdict is OK and not healthy.advice
+    plain = with_params(config, COM_OBL_RC_ACT=4)  # the timeout is the autopilot's own
+    found = line_of(findings([changed(HEALTHY, **fields)], plain), topic)
+    assert found.verdict is verdict
+    assert word in found.advice
+
+
+@pytest.mark.parametrize(
+    ("topic", "fields", "verdict", "word"), COPTER_CASES, ids=lambda v: v if isinstance(v, str) else ""
+)
+def test_arducopter_rows(config: Config, topic: str, fields: dict[str, Any], verdict: Verdict, word: str) -> None:
+    plain = with_params(config)
+    assert line_of(findings([COPTER], plain), topic).verdict is OK
+    found = line_of(findings([changed(COPTER, **fields)], plain), topic)
+    assert found.verdict is verdict
+    assert word in found.advice
+
+
+def test_every_judged_parameter_has_a_case() -> None:
+    tested = {topic for topic, *_ in (*PX4_CASES, *COPTER_CASES)}
+    shown_only = {"COM_RC_IN_MODE"}
+    assert {row.name for rows in ROWS.values() for row in rows} - tested == shown_only
+
+
+def test_a_radio_that_is_there_or_not_needed_is_no_finding(config: Config) -> None:
+    expected = changed(HEALTHY, parameters=parameters(PX4_VALUES, COM_RC_IN_MODE=0))
+    excepted = changed(HEALTHY, parameters=parameters(PX4_VALUES, COM_RC_IN_MODE=0, COM_RCL_EXCEPT=4))
+    there = changed(expected, sensors=_RADIO)
+    verdicts = [line_of(findings([f], config), "COM_RCL_EXCEPT").verdict for f in (expected, excepted, there)]
+    assert verdicts == [FIX, OK, OK]
+
+
+def test_what_the_configuration_wants_is_refused_when_it_would_stop_the_motors(config: Config) -> None:
+    falls = with_params(config, COM_OBL_RC_ACT=7)
+    facts = changed(HEALTHY, parameters=parameters(PX4_VALUES, COM_OBL_RC_ACT=7))
+    assert "motors would stop" in line_of(findings([facts], falls), "COM_OBL_RC_ACT").advice
+    assert changes(HEALTHY, falls) == {}
+
+
+def test_the_built_in_simulator_needs_no_fixing_of_what_the_agent_sets_itself() -> None:
+    config = load(None)
+    facts = changed(HEALTHY, parameters=parameters(PX4_VALUES, COM_OBL_RC_ACT=0))
+    assert line_of(findings([facts], config), "COM_OBL_RC_ACT").verdict is NOTE
+    assert changes(facts, config) == {"COM_OBL_RC_ACT": 4}
+
+
+@pytest.mark.parametrize(
+    ("topic", "second", "verdict", "word"),
+    [
+        ("system ids", {"sysid": 1}, FIX, "own"),
+        ("distances", {"pos_ned_m": (0.5, 0.0, 0.0)}, FIX, "apart"),
+    ],
+)
+def test_swarm_rows(config: Config, topic: str, second: dict[str, Any], verdict: Verdict, word: str) -> None:
+    healthy = [line for line in findings([HEALTHY, SECOND_OK], config) if line.topic == topic]
+    assert all(line.verdict is OK for line in healthy)
+    found = line_of(findings([HEALTHY, changed(SECOND_OK, **second)], config), topic, SWARM)
+    assert found.verdict is verdict
+    assert word in found.advice
+
+
+def test_the_radius_has_to_cover_body_tracking_and_estimator(config: Config) -> None:
+    vague = changed(SECOND_OK, estimator=Estimator(1023, 0.3, 0.4))
+    told = config.model_copy(update={"separation": config.separation.model_copy(update={"allow_small_radius": True})})
+    lines = [
+        line_of(findings(vehicles, given), "radius", SWARM)
+        for vehicles, given in (([HEALTHY, SECOND_OK], config), ([HEALTHY, vague], config), ([HEALTHY, vague], told))
+    ]
+    assert [line.verdict for line in lines] == [OK, FIX, NOTE]
+    assert "separation.radius_m = 1.33" in lines[1].advice  # 0.48 + 2 sqrt(2) 0.3
+    alone = load(None, ["swarm.agents=1"])
+    single = changed(HEALTHY, estimator=vague.estimator)
+    assert not [line for line in findings([single], alone) if line.topic == "radius"]
+
+
+def test_a_parameter_meant_for_another_kind_of_autopilot_is_only_told(config: Config) -> None:
+    line = line_of(findings([COPTER], with_params(config, COM_OBL_RC_ACT=4)), "COM_OBL_RC_ACT")
+    assert line.verdict is NOTE and "no such parameter" in line.advice
+
+
+def test_one_board_under_two_urls_is_told_and_two_simulators_are_not_one_board(config: Config) -> None:
+    same = Version((1, 18, 0), "release", "", 50, "3a91", True, 0x3185)
+    lines = findings([changed(HEALTHY, version=same), changed(SECOND_OK, version=same)], config)
+    assert "same board" in line_of(lines, "system ids", SWARM).advice
+    assert not [line for line in findings([HEALTHY, SECOND_OK], config) if line.topic == "system ids"]
+
+
+@pytest.mark.parametrize("uid", ["0", "01", "02"])
+def test_a_simulator_is_not_told_to_calibrate_whatever_its_uid(config: Config, uid: str) -> None:
+    """PX4's simulator has its instance for a uid, and two hosts may fly the same instance."""
+    simulated = Version((1, 18, 0), "beta", "83c4f4e5", 1, uid, True)
+    lines = findings([changed(HEALTHY, version=simulated), changed(SECOND_OK, version=simulated)], config)
+    assert worst_first(lines) == []
+
+
+def test_a_clock_one_percent_slow_is_no_finding(config: Config) -> None:
+    slow = changed(HEALTHY, link_time=VehicleTime(0.0, -11_000.0, 100.0))
+    assert line_of(findings([slow], config), "clock").verdict is OK
+
+
+@pytest.mark.parametrize("url", (*URLS, "udpout://10.0.0.5:14580"))
+def test_silence_over_udp_names_the_first_sender_and_the_cure(config: Config, url: str) -> None:
+    advice = line_of(findings([unreached(0, url, 1, "nothing is heard")], config), "link").advice
+    assert "spoke to it first" in advice
+    assert "restart PX4" in advice
+    serial = line_of(findings([unreached(0, "serial:///dev/ttyACM0:921600", 1, "nothing")], config), "link")
+    assert "spoke to it first" not in serial.advice
+
+
+def test_the_spread_of_origins_is_shown_and_harmless(config: Config) -> None:
+    line = line_of(findings([HEALTHY, SECOND_OK], config), "origins", SWARM)
+    assert line.verdict is OK
+    assert f"{math.hypot(0.1, 0.2):.2f} m" in line.found
+
+
+def test_vehicles_in_each_others_place_are_told(config: Config) -> None:
+    crossed = [changed(HEALTHY, pos_ned_m=(3.0, 0.0, 0.0)), changed(SECOND_OK, pos_ned_m=(0.0, 0.0, 0.0))]
+    assert line_of(findings(crossed, config), "order", SWARM).verdict is NOTE
+    assert not [line for line in findings([HEALTHY, SECOND_OK], config) if line.topic == "order"]
+
+
+def test_a_vehicle_that_is_not_reached_is_the_worst_and_the_exit_code(config: Config) -> None:
+    missing = unreached(1, URLS[1], 2, "udp 127.0.0.1:14541 can't be bound")
+    ill = changed(HEALTHY, sysid=7)
+    lines = findings([ill, missing], config)
+    assert worst_first(lines)[0].agent == 1
+    assert exit_code([ill, missing], lines) == 3
+    assert exit_code([ill], findings([ill], config)) == 4
+
+
+def test_a_fix_comes_before_any_note(config: Config) -> None:
+    ill = changed(HEALTHY, armed=True, link_lost_01=0.02, parameters=parameters(PX4_VALUES, MAV_FWDEXTSP=0))
+    assert [line.verdict for line in worst_first(findings([ill], config))] == [FIX, NOTE, NOTE]
+
+
+def test_apply_sets_what_is_wrong_and_nothing_else(config: Config) -> None:
+    wrong = parameters(PX4_VALUES, COM_OBL_RC_ACT=0, COM_OF_LOSS_T=9.0, MAV_FWDEXTSP=0, NAV_DLL_ACT=0, MAV_SYS_ID=9)
+    assert changes(changed(HEALTHY, parameters=wrong), config) == {
+        "COM_OBL_RC_ACT": 4,
+        "COM_OF_LOSS_T": 0.5,
+        "MAV_FWDEXTSP": 1,
+    }
+    assert changes(HEALTHY, config) == {}
+    copter = changed(COPTER, parameters=parameters(COPTER_VALUES, GUID_OPTIONS=5, GUID_TIMEOUT=3.0))
+    assert changes(copter, with_params(config)) == {"GUID_OPTIONS": 13, "GUID_TIMEOUT": 1.0}
+
+
+@pytest.mark.parametrize(
+    ("fields", "word"),
+    [
+        ({"armed": True}, "armed"),
+        ({"landed": Landed.IN_AIR}, "air"),
+        ({"sysid": 3}, "vehicle 3"),
+        ({"unreachable": "nothing is heard"}, "not reached"),
+        ({}, ""),
+    ],
+)
+def test_whose_parameters_may_be_changed(fields: dict[str, Any], word: str) -> None:
+    assert word in unchangeable(changed(HEALTHY, **fields))
+    assert bool(unchangeable(changed(HEALTHY, **fields))) == bool(word)
+
+
+def test_only_known_names_are_asked_for_and_each_once(config: Config) -> None:
+    names = names_to_read(PX4, config)
+    assert len(set(names)) == len(names)
+    assert {row.name for row in ROWS["PX4"]} <= set(names)
+    assert set(ARDUCOPTER.to_read()) <= set(names_to_read(ARDUCOPTER, config))
+    assert all(len(name) <= 16 for name in names)
+
+
+def test_a_change_that_was_not_done_is_to_fix() -> None:
+    done, kept = Change(0, "A", 0, 4, 4, ""), Change(0, "A", 0, 4, 0, "")
+    assert done.done and "0 -> 4" in done.in_words()
+    assert not kept.done and "not changed to 4" in kept.in_words()
+    assert Change(0, "A", 0.1, 0.2, 0.2 + 1e-9, "").done
+    assert kept.finding().verdict is FIX
+    assert "it is armed" in Change(0, "A", 0, 4, 0, "it is armed").in_words()
+
+
+def test_the_json_is_json_and_the_table_one_line_a_row(
+    config: Config, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    facts = changed(HEALTHY, link_time=VehicleTime(1.0, 0.0, math.inf))
+    lines = findings([facts], config)
+    change = Change(0, "COM_OBL_RC_ACT", 0, 4, 4, "")
+    tree = json.loads(as_json([facts], lines, [change], 0))
+    assert tree["vehicles"][0]["link"]["time"]["sigma_ppm"] is None
+    assert tree["vehicles"][0]["mode"] == "HOLD"
+    assert tree["changes"][0]["done"] is True
+    print_check([facts], lines, [change])
+    printed = capsys.readouterr().out.splitlines()
+    assert sum(line.startswith("agent-0\t") for line in printed) == len(lines)
+    assert "agent-0 COM_OBL_RC_ACT: 0 -> 4" in printed
+    assert printed[-1] == "1 of 1 vehicles reached, nothing to fix, 0 to know"
+
+
+def test_what_a_vehicle_says_steers_no_terminal(config: Config, capsys: pytest.CaptureFixture[str]) -> None:
+    hostile = "\x1b]0;owned\x07\x9b2J\u202e\r\nDONE"
+    facts = changed(HEALTHY, version=Version((1, 18, 0), "beta", hostile, 1, hostile, True))
+    print_check([facts], [*findings([facts], config), Finding(0, "x", FIX, hostile, hostile, hostile)], [])
+    shown = capsys.readouterr().out
+    assert "DONE" in shown
+    assert all(c.isprintable() or c in "\n\t" for c in shown)
+    assert not any(line.startswith("DONE") for line in shown.splitlines())
+
+
+@pytest.mark.parametrize(
+    ("facts", "found"),
+    [
+        (HEALTHY, []),
+        (dataclasses.replace(HEALTHY, armed=True), ["armed"]),
+        (dataclasses.replace(HEALTHY, landed=Landed.IN_AIR), ["in_air"]),
+        (unreached(0, URLS[0], 1, "no heartbeat"), ["unknown"]),
+    ],
+)
+def test_who_does_not_stand_disarmed_may_not_be_flown(facts: VehicleFacts, found: list[str]) -> None:
+    lines = standing([facts])
+    assert [line.found for line in lines] == found
+    assert exit_code([facts], lines) == (0 if not found else 3 if facts.unreachable else 4)

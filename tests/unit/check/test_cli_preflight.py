@@ -1,0 +1,278 @@
+"""What is refused before a launch, the ports it takes, and what it shows while it runs."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import io
+import re
+import signal
+import socket
+from pathlib import Path
+
+import pytest
+from rich.console import Console
+
+from swarmctl.bus.topics import StatusMessage
+from swarmctl.bus.zenoh_bus import SCHEME
+from swarmctl.config import Config, dump, load
+from swarmctl.core.types import FlightMode, Landed, Mode, Phase
+from swarmctl.errors import ConfigError, StartError, SwarmError
+from swarmctl.ops import operator as attach
+from swarmctl.ops import preflight
+from swarmctl.ops.fault import inject, parse_fault
+from swarmctl.ops.launch import Interrupts
+from swarmctl.ops.processes import Site, agent_commands, sitl_command, viewer_command
+from swarmctl.ops.status_table import (
+    AgentView,
+    LiveTable,
+    PlainLines,
+    open_display,
+    print_statuses,
+    status_cells,
+    status_table,
+)
+from swarmctl.ops.summary import summary_lines, violation_lines
+from swarmctl.ops.supervisor import why_it_failed
+
+
+def test_vehicle_ports_are_held_and_are_not_those_every_simulator_sends_to() -> None:
+    held, others = preflight.claim_ports(3), preflight.claim_ports(3)
+    ports = [sock.getsockname()[1] for sock in (*held, *others)]
+    assert len(set(ports)) == 6
+    assert not set(ports) & set(range(14540, 14640))
+    for sock in (*held, *others):
+        sock.close()
+
+
+def test_preflight_holds_the_ports_until_released() -> None:
+    ground = preflight.inspect(load(None, ["telemetry.enabled=false"]))
+    try:
+        assert len(ground.ports) == 3
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as rival, pytest.raises(OSError):
+            rival.bind(("127.0.0.1", ground.ports[0]))
+        assert len({sock.getsockname()[1] for sock in (*ground.sockets, *ground.vehicle_sockets)}) == 6
+    finally:
+        ground.release()
+    assert ground.view_port == 0
+
+
+def test_a_taken_view_port_is_stepped_over() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen(1)
+        port = taken.getsockname()[1]
+        ground = preflight.inspect(load(None, [f"telemetry.port={port}"]))
+        ground.release()
+        assert port < ground.view_port < port + 50
+
+
+def test_every_problem_at_once_and_nothing_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    versions = {"osqp": "0.6.7", "rerun-sdk": None}
+
+    def version(name: str) -> str:
+        found = versions.get(name, "99.0")
+        if found is None:
+            raise importlib.metadata.PackageNotFoundError(name)
+        return found
+
+    monkeypatch.setattr(importlib.metadata, "version", version)
+    monkeypatch.setattr(preflight, "_free_view_port", lambda _: 0)
+    with pytest.raises(StartError) as caught:
+        preflight.inspect(load(None, ["telemetry.port=9876"]))
+    lines = str(caught.value).splitlines()
+    assert len(lines) == 3
+    assert "osqp = 0.6.7: too old; pip install 'osqp>=1.1'" in lines[0]
+    assert "rerun-sdk: not installed" in lines[1]
+    assert "telemetry.port = 9876" in lines[2]
+
+
+def vehicles(tmp_path: Path, url: str) -> Config:
+    path = tmp_path / "one.toml"
+    path.write_text(f'[swarm]\nagents=1\n[sitl]\nenabled=false\n[[vehicles]]\nsysid=1\nurl="{url}"\n')
+    return load(path, ["telemetry.enabled=false"])
+
+
+@pytest.mark.parametrize(
+    ("url", "word"),
+    [
+        ("serial:///dev/no-such:57600", "does not exist"),
+        ("udpin://192.0.2.1:14540", "can't be bound"),
+        ("udpout://no-such-host.invalid:14540", "check the host"),
+    ],
+)
+def test_vehicle_links_are_tried(tmp_path: Path, url: str, word: str) -> None:
+    with pytest.raises(StartError, match=word) as caught:
+        preflight.inspect(vehicles(tmp_path, url))
+    assert "vehicles.0.url" in str(caught.value)
+    assert url in str(caught.value)
+
+
+def test_a_good_vehicle_port_is_left_free(tmp_path: Path) -> None:
+    (held,) = preflight.claim_ports(1)
+    port = held.getsockname()[1]
+    held.close()
+    ground = preflight.inspect(vehicles(tmp_path, f"udpin://127.0.0.1:{port}"))
+    assert ground.sockets == ()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as agent:
+        agent.bind(("127.0.0.1", port))
+
+
+def test_command_lines_say_what_the_configuration_says(tmp_path: Path) -> None:
+    config = load(None, ["swarm.agents=2", "start.spacing_m=1.5", "sitl.mass_scale=1.2", "seed=9"])
+    site = Site("run", "unixsock-stream//tmp/x/bus.sock", tmp_path)
+    sitl = sitl_command(config, site, (14540, 14541)).argv
+    assert "--spawn=-0.75,0.0,2.0;0.75,0.0,2.0" in sitl, "on the ground"
+    assert sitl[sitl.index("--remote-ports") + 1] == "14540,14541"
+    air = sitl_command(load(None, ["swarm.agents=1", "sitl.start='air'"]), site, (1,)).argv
+    assert "--spawn=0.0,0.0,0.0" in air
+    held = preflight.claim_ports(2)
+    agents = agent_commands(config, site, held)
+    assert [command.name for command in agents] == ["agent-0", "agent-1"]
+    assert [command.fds for command in agents] == [(sock.fileno(),) for sock in held]
+    assert not {"--fd", "--vehicle-port"} & set(agent_commands(config, site, ())[0].argv)
+    theirs = preflight.claim_ports(2)
+    told = [command.argv[-2:] for command in agent_commands(config, site, held, theirs)]
+    assert told == [("--vehicle-port", f"{sock.getsockname()[1]}") for sock in theirs]
+    inherits = sitl_command(config, site, (1, 2), theirs)
+    assert inherits.fds == tuple(sock.fileno() for sock in theirs)
+    assert inherits.argv[inherits.argv.index("--local-fds") + 1] == ",".join(map(str, inherits.fds))
+    for sock in (*held, *theirs):
+        sock.close()
+    viewer = viewer_command(config, site, 9876, view=False).argv
+    assert "--view" not in viewer
+    assert viewer[viewer.index("--obstacles-json") + 1] == "[]"
+
+
+def status(phase: int = Phase.TRACK, separation_m: float = 1.25, problem: str = "") -> StatusMessage:
+    said = (Mode.FOLLOW, FlightMode.EXTERNAL, True, Landed.IN_AIR, 0, "", 0.1234, separation_m, 2.0, 100, 3, 20.0, 0)
+    return StatusMessage(0, 1, 1, phase, *said, problem)
+
+
+def test_plain_lines_speak_on_changes_only() -> None:
+    stream = io.StringIO()
+    display = open_display(stream)
+    assert isinstance(display, PlainLines)
+    view = AgentView(0)
+    display.show([view])
+    view.status = status(Phase.ARM)
+    display.show([view])
+    display.show([view])
+    view.status = status(Phase.TRACK, problem="wind")
+    display.show([view])
+    view.note = "dead"
+    display.show([view])
+    lines = stream.getvalue().splitlines()
+    assert len(lines) == 3
+    assert "agent-0  ARM" in lines[0]
+    assert "agent-0  TRACK  wind" in lines[1]
+    assert "agent-0  TRACK  dead" in lines[2]
+
+
+def test_a_lost_terminal_does_not_end_the_flight() -> None:
+    class Gone(io.StringIO):
+        def write(self, _: str) -> int:
+            raise BrokenPipeError
+
+    PlainLines(Gone()).say("x")
+
+
+def test_table_cells() -> None:
+    assert status_cells(AgentView(0, status())) == (
+        *("agent-0", "TRACK", "FOLLOW", "0.123", "1.25", "2.0", "3/100", "20"),
+        "",
+    )
+    assert status_cells(AgentView(0, status(99, -1.0)))[1:5] == ("99", "FOLLOW", "0.123", "-")
+    assert status_cells(AgentView(1))[-1] == "not heard yet"
+
+
+def test_what_an_agent_says_is_shown_as_it_is() -> None:
+    stream = io.StringIO()
+    view = AgentView(0, status(problem="refused [/bold] [red]"))
+    Console(file=stream, width=200).print(status_table([view]))
+    assert "refused [/bold] [red]" in stream.getvalue()
+
+
+def test_what_an_agent_says_steers_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    """ESC, the 8-bit CSI and direction marks, as a status, as the launcher's line and as JSON."""
+    hostile = "\x1b]0;owned\x07\x9b2J\u202e\r\nDONE"
+    stream = io.StringIO()
+    lines = PlainLines(stream)
+    lines.say(hostile)
+    lines.show([AgentView(0, status(problem=hostile))])
+    Console(file=stream, width=200).print(status_table([AgentView(0, status(problem=hostile), note="")]))
+    LiveTable(Console(file=stream, force_terminal=False)).say(hostile)
+    print_statuses([AgentView(0, status(problem=hostile))])
+    print(attach.as_json({0: status(problem=hostile)}))
+    shown = stream.getvalue() + capsys.readouterr().out
+    assert "DONE" in shown
+    assert all(c.isprintable() or c in "\n\t" for c in shown)
+    assert not any(line.lstrip(" ,│").startswith("DONE") for line in shown.splitlines())
+
+
+@pytest.mark.parametrize(
+    ("outcome", "last_line", "words"),
+    [
+        ("not tracking after 90 s", "mission not completed: not tracking after 90 s", "not tracking after 90 s"),
+        ("completed", "vehicle at udpin: silent for 15 s, given up", "vehicle at udpin: silent for 15 s, given up"),
+        ("", "vehicle silent", "vehicle silent"),
+        ("completed", "", "no reason given"),
+    ],
+)
+def test_an_agent_never_failed_with_completed_for_a_reason(outcome: str, last_line: str, words: str) -> None:
+    assert why_it_failed(outcome, last_line) == words
+
+
+@pytest.mark.parametrize(
+    ("settings", "error", "words"),
+    [
+        ((), StartError, "not up yet, or has ended"),
+        (("sitl.enabled=false", "vehicles=[{sysid=1, url='udpin://127.0.0.1:14540'}]"), ConfigError, "no simulator"),
+    ],
+)
+def test_a_fault_without_a_simulator_says_which_kind_of_without(
+    tmp_path: Path, settings: tuple[str, ...], error: type[SwarmError], words: str
+) -> None:
+    (tmp_path / "config.toml").write_text(dump(load(None, ["swarm.agents=1", *settings])))
+    launch = attach.RunningLaunch("run", f"{SCHEME}{tmp_path}/bus.sock", 1, 0.0, 1, str(tmp_path))
+    with pytest.raises(error, match=words):
+        inject(launch, parse_fault({"kind": "gps_loss"}, 1))
+
+
+def test_a_summary_is_five_lines_even_when_almost_empty() -> None:
+    for summary in ({}, {"outcome": "failed", "violations": ["a", "b"], "timing": {"tick_ms": {"p50": None}}}):
+        lines = summary_lines(summary, Path("runs/x"))
+        assert len(lines) == 5
+        assert lines[-1] == "run folder runs/x"
+    assert "2 violations" in lines[0]
+
+
+def test_a_hangup_is_one_request_and_none_under_nohup() -> None:
+    """SIGHUP comes from the kernel and again from the shell; a second Ctrl-C is still a second one."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    try:
+        with Interrupts() as interrupts:
+            for signum, count in ((signal.SIGHUP, 1), (signal.SIGHUP, 1), (signal.SIGINT, 2), (signal.SIGHUP, 2)):
+                signal.raise_signal(signum)
+                assert interrupts.count == count
+        signal.raise_signal(signal.SIGHUP)  # while the run is judged
+        with Interrupts() as interrupts:  # from here on ignored, as nohup begins
+            signal.raise_signal(signal.SIGHUP)
+            assert interrupts.count == 0
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+def test_every_violation_is_said() -> None:
+    assert violation_lines({"violations": ["a", "b\x1b[2J"]}) == ("violation: a", r"violation: b\x1b[2J")
+    alone = {"outcome": "failed", "violations": ["a"]}
+    assert violation_lines(alone) == ()
+    assert summary_lines(alone, Path("runs/x"))[0].endswith("1 violation: a")
+
+
+def test_the_camera_is_given_numbers_argparse_does_not_take_for_options() -> None:
+    """`-5e-05` would be an option to argparse; the circle's middle is such a number."""
+    config = load(None)
+    argv = viewer_command(config, Site("run", "endpoint", Path("dir")), 9877, view=False).argv
+    at = argv.index("--look-at")
+    assert all(re.fullmatch(r"-?\d+\.\d+", number) for number in argv[at + 1 : at + 4])
+    assert float(argv[argv.index("--extent") + 1]) > 5.0

@@ -1,0 +1,52 @@
+"""When an estimator's claimed accuracy may be judged: PX4's claims after boot, measured, must never be taken early."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from swarmctl.control.estimation.accuracy import AccuracyMonitor
+
+SECOND = 1_000_000
+PX4_AFTER_BOOT_S, PX4_CLAIM_M = [1.2, 2.2, 4.2, 9.0, 30.0], [14.1, 0.010, 0.073, 0.285, 0.290]
+
+
+def fed(claims: list[float | None], every_s: float = 1.0) -> AccuracyMonitor:
+    """A monitor that was told each claim for `every_s`, at 50 Hz."""
+    monitor, now_us = AccuracyMonitor(), 0
+    for claim in claims:
+        for _ in range(round(every_s * 50)):
+            monitor.update(now_us, claim)
+            now_us += SECOND // 50
+    return monitor
+
+
+def test_px4s_claims_after_boot_are_judged_only_where_they_stay() -> None:
+    monitor = AccuracyMonitor()
+    judged_s = None
+    for k in range(50, 1500):
+        since_boot_s = k / 50
+        claim_m = float(np.interp(np.floor(since_boot_s), PX4_AFTER_BOOT_S, PX4_CLAIM_M))
+        monitor.update(k * SECOND // 50, claim_m)
+        if judged_s is None and not monitor.unsettled(k * SECOND // 50):
+            judged_s, worst_m = since_boot_s, monitor.worst_m
+    assert judged_s is not None
+    assert 8.0 < judged_s < 16.0
+    assert worst_m is not None
+    assert 0.25 < worst_m < 0.3, "neither the 14 m of the first second nor the 0.01 m of the second"
+
+
+def test_a_constant_claim_is_judged_after_a_window_and_its_worst_counts() -> None:
+    monitor = fed([0.30, 0.33, 0.29, 0.31, 0.30])
+    assert monitor.unsettled(5 * SECOND) == ""
+    assert monitor.worst_m == 0.33
+    assert "settle" in fed([0.3, 0.3]).unsettled(2 * SECOND)
+
+
+def test_a_rising_claim_is_not_judged() -> None:
+    assert "0.90 m" in fed([0.1, 0.3, 0.5, 0.7, 0.9]).unsettled(5 * SECOND)
+
+
+def test_a_vehicle_that_tells_none_is_waited_for_only_a_while() -> None:
+    assert "tell" in fed([None]).unsettled(1 * SECOND)
+    silent = fed([None] * 4)
+    assert (silent.unsettled(4 * SECOND), silent.worst_m) == ("", None)

@@ -1,0 +1,230 @@
+"""The last layer on its own: point masses that want to fly through each other, and what it costs them."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from swarmctl.control.collision.barrier import Barrier, BarrierParams, Body, body_of_obstacle, body_of_peer
+from swarmctl.control.collision.separation import align
+from swarmctl.control.model import VehicleModelParams, acceleration
+from swarmctl.control.mpc.problem import Start
+from swarmctl.core.frames import GRAVITY_M_S2
+from swarmctl.core.types import Array, Obstacle, PredictedPath
+
+PARAMS, MODEL = BarrierParams(), VehicleModelParams()
+DT_S, BODY_M, STILL = 0.02, 0.48, np.zeros(3)
+APART_M = BODY_M + PARAMS.margin_m
+HOVER = np.array([0.0, 0.0, GRAVITY_M_S2])
+
+
+def filtered(barrier: Barrier, virtual: Array, start: Start, bodies: list[Body]) -> Array | None:
+    return barrier.filtered(virtual, start, STILL, 0.5, bodies)
+
+
+def start(pos: Array, vel: Array, held: Array = HOVER) -> Start:
+    return Start(0, pos, vel, 1.0, held)
+
+
+def fly_at_goals(
+    pos: Array,
+    vel: Array,
+    goals: Array,
+    params: BarrierParams | None,
+    others: list[Body] | None = None,
+    for_s: float = 6.0,
+) -> tuple[float, float]:
+    """Point masses under a plain attraction; smallest distance of any two [m] and of any from `others`."""
+    barriers = [Barrier(params, MODEL, DT_S) if params else None for _ in pos]
+    held = np.tile(HOVER, (len(pos), 1))
+    least = beside = math.inf
+    for k in range(round(for_s / DT_S)):
+        moved = [
+            Body(
+                tuple((np.array(o.pos_ned_m) + k * DT_S * np.array(o.vel_ned_m_s)).tolist()),
+                o.vel_ned_m_s,
+                o.apart_m,
+                o.share_01,
+                o.column,
+            )
+            for o in others or []
+        ]
+        bodies = [Body(tuple(p.tolist()), tuple(v.tolist()), APART_M, 0.5) for p, v in zip(pos, vel, strict=True)]
+        commands = []
+        for i, barrier in enumerate(barriers):
+            pull = np.clip(2.0 * (goals[i] - pos[i]) - 2.0 * vel[i], -2.0, 2.0)
+            lift = np.array([0.0, 0.0, GRAVITY_M_S2]) - pull
+            wanted = np.array([*(lift[:2] / np.linalg.norm(lift)), np.linalg.norm(lift)])
+            seen = [b for j, b in enumerate(bodies) if j != i] + moved
+            changed = None if barrier is None else filtered(barrier, wanted, start(pos[i], vel[i], held[i]), seen)
+            commands.append(wanted if changed is None else changed)
+        held = np.array(commands)
+        accel = np.array([acceleration(c) for c in commands])
+        pos, vel = pos + DT_S * vel + 0.5 * DT_S**2 * accel, vel + DT_S * accel
+        for a, b in itertools.combinations(pos, 2):
+            least = min(least, math.dist(a, b))
+        for p, o in itertools.product(pos, moved):
+            axes = 2 if o.column else 3
+            beside = min(beside, math.dist(p[:axes], o.pos_ned_m[:axes]))
+    return least, beside
+
+
+def ring(count: int, radius_m: float, climb_m: float = 0.0) -> Array:
+    angle = 2.0 * math.pi * np.arange(count) / count
+    return np.stack([radius_m * np.cos(angle), radius_m * np.sin(angle), climb_m * np.cos(7.0 * angle)], axis=1)
+
+
+@pytest.mark.parametrize(
+    ("count", "climb_m", "speed_m_s"),
+    [(2, 0.0, 1.5), (2, 0.15, 1.5), (2, 0.0, 2.5), (6, 0.0, 1.5), (6, 0.05, 2.5), (6, 0.1, 1.5), (6, 0.3, 1.0)],
+)
+def test_those_who_fly_at_each_other_do_not_touch(count: int, climb_m: float, speed_m_s: float) -> None:
+    pos = ring(count, 3.0, climb_m)
+    vel = -speed_m_s * pos / np.linalg.norm(pos, axis=1, keepdims=True)
+    assert fly_at_goals(pos, vel, -pos, PARAMS)[0] >= BODY_M
+
+
+@pytest.mark.parametrize("count", [2, 6])
+def test_control_without_it_they_do(count: int) -> None:
+    pos = ring(count, 3.0)
+    assert fly_at_goals(pos, -0.5 * pos, -pos, None)[0] < 0.2
+
+
+@pytest.mark.parametrize("column", [False, True])
+@pytest.mark.parametrize("speed_m_s", [0.0, 1.0])
+def test_an_obstacle_is_left_alone_with_the_whole_of_it(column: bool, speed_m_s: float) -> None:
+    """One that comes on as well: only the own braking counts."""
+    obstacle = [Body((3.0, 0.1, 0.0), (-speed_m_s, 0.0, 0.0), 1.24 + PARAMS.margin_m, 1.0, column)]
+    pos, vel, goal = np.zeros((1, 3)), np.array([[1.5, 0.0, 0.0]]), np.array([[6.0, 0.0, 0.0]])
+    assert fly_at_goals(pos, vel, goal, PARAMS, obstacle, 2.0)[1] >= 1.24
+    assert fly_at_goals(pos, vel, goal, None, obstacle, 2.0)[1] < 0.8
+
+
+def test_both_of_a_pair_brake_and_one_alone_brakes_all_of_it() -> None:
+    barrier = Barrier(PARAMS.model_copy(update={"slew_1_s": 50.0}), MODEL, DT_S)
+    here = start(np.zeros(3), np.array([1.5, 0.0, 0.0]))
+    other = [Body((1.3, 0.0, 0.0), (-1.5, 0.0, 0.0), APART_M, share) for share in (0.5, 1.0)]
+    half, whole = (filtered(barrier, HOVER, here, [body]) for body in other)
+    assert half is not None
+    assert whole is not None
+    assert 0.15 < half[0] < whole[0]
+    mirrored = filtered(
+        barrier, HOVER, start(np.zeros(3), -here.vel_ned_m_s), [Body((-1.3, 0.0, 0.0), (1.5, 0.0, 0.0), APART_M, 0.5)]
+    )
+    assert mirrored is not None
+    np.testing.assert_allclose(mirrored, half * [-1.0, 1.0, 1.0], atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("pos", "vel"),
+    [
+        ((0.9, 0.0, 0.0), (0.0, 0.0, 0.0)),  # side by side
+        ((0.9, 0.0, 0.0), (0.0, 2.0, 0.0)),  # passing by
+        ((3.0, 0.0, 0.0), (-3.0, 0.0, 0.0)),  # coming on, far away
+        ((0.6, 0.0, 0.0), (2.0, 0.0, 0.0)),  # parting
+        ((0.0, 0.0, 0.9), (0.0, 0.0, 0.0)),  # below
+    ],
+)
+def test_it_does_not_act_on_who_keeps_apart(pos: tuple[float, ...], vel: tuple[float, ...]) -> None:
+    barrier = Barrier(PARAMS, MODEL, DT_S)
+    assert (
+        filtered(barrier, np.array([0.2, 0.1, 9.9]), start(np.zeros(3), np.zeros(3)), [Body(pos, vel, APART_M, 0.5)])
+        is None
+    )
+    assert filtered(barrier, HOVER, start(np.zeros(3), np.zeros(3)), []) is None
+
+
+def test_the_airframe_is_not_asked_for_more_than_it_has() -> None:
+    """However hopeless: turned no faster and no farther than it can, thrust within its bounds, finite."""
+    rng = np.random.default_rng(3)
+    barrier, slew = Barrier(PARAMS, MODEL, DT_S), PARAMS.slew_1_s * DT_S
+    acted = 0
+    for _ in range(300):
+        held = np.array([*rng.uniform(-0.5, 0.5, 2), rng.uniform(6.0, 14.0)])
+        wanted = held + np.array([*rng.uniform(-0.04, 0.04, 2), rng.uniform(-1.0, 1.0)])
+        bodies = [
+            Body(
+                tuple(rng.normal(scale=0.5, size=3).tolist()),
+                tuple(rng.normal(scale=2.0, size=3).tolist()),
+                APART_M,
+                1.0,
+            )
+            for _ in range(5)
+        ]
+        found = filtered(barrier, wanted, start(np.zeros(3), rng.normal(size=3), held), bodies)
+        if found is None:
+            continue
+        acted += 1
+        assert np.isfinite(found).all()
+        assert np.abs(found[:2] - held[:2]).max() <= slew + 1e-9
+        assert np.abs(found[:2]).max() <= MODEL.u_max() + 1e-9
+        assert abs(found[2] - wanted[2]) < 3.5
+    assert acted > 150
+
+
+def test_in_one_place_it_parts_along_the_way_they_came() -> None:
+    barrier = Barrier(PARAMS, MODEL, DT_S)
+    found = filtered(
+        barrier,
+        HOVER,
+        start(np.zeros(3), np.array([1.0, 0.0, 0.0])),
+        [Body((0.0,) * 3, (-1.0, 0.0, 0.0), APART_M, 0.5)],
+    )
+    assert found is not None
+    assert found[0] > 0.0
+
+
+# -- what is known of others ------------------------------------------------------------------------------------------
+
+
+def path(t0_us: int, vel: tuple[float, float, float] = (1.0, 0.0, 0.0), points: int = 41) -> PredictedPath:
+    return PredictedPath(1, 1, 1, t0_us, 20_000, 0.0, np.arange(points)[:, None] * 0.02 * np.array(vel))
+
+
+def body(known: PredictedPath, act_us: int, ahead_s: float = 0.0, filters: bool = True) -> Body:
+    return body_of_peer(known, act_us, ahead_s, APART_M, 4.0, 1.0, filters, 2.0)
+
+
+def test_a_peer_is_where_its_path_says_when_the_command_is_felt() -> None:
+    found = body(path(0), 100_000, 0.21)
+    assert found.pos_ned_m == pytest.approx((0.31, 0.0, 0.0))
+    assert found.vel_ned_m_s == pytest.approx((1.0, 0.0, 0.0))
+    assert found.apart_m == pytest.approx(APART_M + 0.02)
+    assert (found.share_01, body(path(0), 100_000, filters=False).share_01) == (0.5, 1.0)
+
+
+def test_who_has_not_been_heard_may_be_farther_from_its_path_every_moment() -> None:
+    reach = [body(path(0), age_us).apart_m for age_us in (0, 100_000, 300_000, 600_000, 5_000_000)]
+    assert reach == sorted(reach)
+    assert reach[-1] == pytest.approx(APART_M + 1.0)
+
+
+@pytest.mark.parametrize("age_us", [100_000, 790_000, 900_000, 1_050_000, 5_000_000])
+@pytest.mark.parametrize("vel", [(1.0, 0.0, 0.0), (0.6, -1.2, 0.1), (0.0, 0.0, 0.0)], ids=str)
+def test_the_silent_are_where_plans_take_them_to_be(vel: tuple[float, float, float], age_us: int) -> None:
+    """Or an agent stands before somebody whom no plan sees there, and nothing looks for a way round."""
+    known = path(0, vel)
+    found = body(known, age_us)
+    assert found.pos_ned_m == pytest.approx(align(known, age_us, 20_000, 1, 2.0)[0])
+    before, after = (np.array(body(known, age_us + by_us).pos_ned_m) for by_us in (-100, 100))
+    assert found.vel_ned_m_s == pytest.approx((after - before) / 2e-4, abs=1e-3)
+
+
+def test_an_obstacle_moves_on() -> None:
+    ball = Obstacle(np.array([1.0, 2.0, 3.0]), 0.5, 1.0, 3.0, np.array([0.0, -1.0, 0.0]), column=True)
+    found = body_of_obstacle(ball, 0.2, 0.29)
+    assert found.pos_ned_m == pytest.approx((1.0, 1.8, 3.0))
+    assert found.apart_m == pytest.approx(0.79)
+    assert (found.share_01, found.column, found.solid) == (1.0, True, True)
+
+
+def test_downwash_keeps_farther_apart_above_each_other_than_beside() -> None:
+    sinking = start(np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, 0.5]))
+    below = [Body((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), APART_M, 0.5)]
+    assert filtered(Barrier(PARAMS, MODEL, DT_S), HOVER, sinking, below) is None
+    found = filtered(Barrier(PARAMS, MODEL, DT_S, downwash=2.0), HOVER, sinking, below)
+    assert found is not None
+    assert found[2] > GRAVITY_M_S2

@@ -1,0 +1,336 @@
+"""Promises are kept apart whatever happens to the messages; controls break the rules one by one."""
+
+from __future__ import annotations
+
+import itertools
+import random
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import partial
+
+import numpy as np
+import pytest
+
+from swarmctl.control.collision.separation import KeepOut, SeparationParams
+from swarmctl.control.commit import trajectory_planner
+from swarmctl.control.commit.protocol import Commitments
+from swarmctl.control.commit.trajectory_planner import CommitParams, Situation, Wish
+from swarmctl.control.mpc.swarm_mpc import MpcParams
+from swarmctl.control.reference.mission import glide_to
+from swarmctl.core.trajectory import Trajectory, ending_at_rest, resting
+from swarmctl.core.trajectory_message import Intent, Proposal
+from swarmctl.core.types import Array, Sampled
+
+UTC_US = 1_700_000_000_000_000
+TICK_US = 40_000
+SEPARATION = SeparationParams(radius_m=0.9)
+CERTIFIED_M = SEPARATION.radius_m - SEPARATION.certify_slack_m
+
+
+@dataclass
+class Network:
+    """Messages with seeded delays and losses; nobody hears anything in the dark."""
+
+    delay_us: tuple[int, int] = (0, 0)
+    loss_01: float = 0.0
+    dark_us: tuple[int, int] = (0, 0)
+    seed: int = 3
+    _under_way: list[tuple[int, int, Intent]] = field(default_factory=list)
+
+    def __post_init__(self) -> None:
+        self._random = random.Random(self.seed)
+
+    def send(self, now_us: int, receiver: int, intent: Intent) -> None:
+        if self._random.random() >= self.loss_01 and not self.dark_us[0] <= now_us - UTC_US < self.dark_us[1]:
+            self._under_way.append((now_us + 1 + self._random.randint(*self.delay_us), receiver, intent))
+
+    def arrived(self, now_us: int, receiver: int) -> list[Intent]:
+        mine = [m for m in self._under_way if m[1] == receiver and m[0] <= now_us]
+        self._under_way = [m for m in self._under_way if not (m[1] == receiver and m[0] <= now_us)]
+        return [intent for _, _, intent in sorted(mine, key=lambda m: m[0])]
+
+
+class Crowd:
+    """Agents that follow their promises exactly, from a ring through its middle to the other side."""
+
+    def __init__(self, count: int, network: Network) -> None:
+        angle = 2.0 * np.pi * np.arange(count) / count
+        self.starts = np.stack([3.0 * np.cos(angle), 3.0 * np.sin(angle), np.full(count, -2.0)], axis=1)
+        self.agents = [
+            Commitments(i, CommitParams(), MpcParams(u_max=0.25), SEPARATION, count, lambda: 0) for i in range(count)
+        ]
+        self.known: list[dict[int, Intent]] = [{} for _ in range(count)]
+        self.network, self.now_us, self.seq = network, UTC_US, 0
+        for agent, start in zip(self.agents, self.starts, strict=True):
+            agent.begin(start, np.zeros(3), UTC_US)
+
+    def heard(self, agent: int) -> Mapping[int, int]:
+        return {a: i.proposal.number for a, i in self.known[agent].items() if i.proposal is not None}
+
+    def step(self) -> None:
+        self.now_us += TICK_US
+        self.seq += 1
+        ids = range(len(self.agents))
+        for i in ids:
+            for intent in self.network.arrived(self.now_us, i):
+                if intent.agent not in self.known[i] or intent.seq > self.known[i][intent.agent].seq:
+                    self.known[i][intent.agent] = intent
+        for i, agent in enumerate(self.agents):
+            agent.hear(self.now_us, self.known[i], set(ids) - {i})
+            if agent.is_due(self.now_us):
+                begin_us = self.now_us + agent.lead_us
+                wish = Wish(partial(self.wanted, i))
+                agent.propose(Situation(self.now_us, begin_us, wish, self.known[i], ()))
+        for i, agent in enumerate(self.agents):
+            assert agent.committed is not None
+            said = Intent(i, 1, self.seq, self.now_us, True, agent.committed, agent.proposal, self.heard(i))
+            for j in ids:
+                if j != i:
+                    self.network.send(self.now_us, j, said)
+
+    def wanted(self, agent: int, offsets_s: Array) -> tuple[Array, Array]:
+        goal = self.starts[agent] * np.array([-1.0, -1.0, 1.0])
+        t_s = (self.now_us - UTC_US) * 1e-6 + offsets_s
+        return glide_to(self.starts[agent], np.zeros(3), goal, 1.5, 1.0).sample(t_s)
+
+    def promised_m(self) -> float:
+        """Smallest distance, from now to their ends, of any two trajectories that are followed now."""
+        followed = [agent.committed for agent in self.agents if agent.committed is not None]
+        end_us = max(self.now_us, *(trajectory.end_utc_us for trajectory in followed))
+        times = np.arange(self.now_us, end_us + 50_001, 50_000)
+        paths = [trajectory.sample(times)[0] for trajectory in followed]
+        return min(float(np.linalg.norm(a - b, axis=1).min()) for a, b in itertools.combinations(paths, 2))
+
+    def run(self, seconds: float) -> float:
+        """Smallest promised distance ever."""
+        least = np.inf
+        for _ in range(round(seconds * 1e6 / TICK_US)):
+            self.step()
+            least = min(least, self.promised_m())
+        return float(least)
+
+    @property
+    def committed(self) -> int:
+        return sum(agent.counts.committed for agent in self.agents)
+
+
+NETWORKS = {
+    "ideal": Network(),
+    "300 ms": Network((300_000, 300_000)),
+    "0 to 400 ms, out of order, 30 % lost": Network((0, 400_000), 0.3),
+    "2 s of silence": Network((20_000, 60_000), 0.1, (1_500_000, 3_500_000)),
+}
+
+
+@pytest.mark.parametrize("network", NETWORKS.values(), ids=NETWORKS.keys())
+def test_promises_never_come_closer_than_certified(network: Network) -> None:
+    crowd = Crowd(4, network)
+    assert crowd.run(6.0) >= CERTIFIED_M - 1e-3
+    assert crowd.committed >= 8, "they do move"
+
+
+class Careless(Crowd):
+    """Commits without waiting for anybody."""
+
+    def step(self) -> None:
+        super().step()
+        for i, agent in enumerate(self.agents):
+            if agent.proposal is not None:
+                everybody = dict(self.known[i])
+                agent.hear(self.now_us, everybody, set())
+
+
+def test_control_promises_that_wait_for_nobody_contradict_each_other() -> None:
+    assert Careless(4, Network((300_000, 300_000))).run(6.0) < CERTIFIED_M - 0.1
+
+
+def test_in_silence_everybody_comes_to_rest_and_stays_apart() -> None:
+    crowd = Crowd(4, Network((20_000, 20_000), dark_us=(1_500_000, 10**9)))
+    crowd.run(1.6)
+    committed = crowd.committed
+    crowd.run(4.0)  # 2 s of plan and the braking after it
+    assert crowd.committed - committed <= 4, "what was acknowledged before may still be flown"
+    for agent in crowd.agents:
+        assert agent.committed is not None
+        assert agent.committed.end_utc_us < crowd.now_us
+
+
+def test_of_two_proposals_in_conflict_the_earlier_one_is_flown() -> None:
+    crowd = Crowd(2, Network((100_000, 100_000)))
+    crowd.run(6.0)
+    assert all(agent.counts.committed > 3 for agent in crowd.agents)
+    assert sum(agent.counts.withdrawn for agent in crowd.agents) > 0
+
+
+def at_goal(offsets_s: Array) -> tuple[Array, Array]:
+    return np.tile([1.0, 0.0, -2.0], (len(offsets_s), 1)), np.zeros((len(offsets_s), 3))
+
+
+def meeting() -> tuple[Commitments, Commitments]:
+    """Two that fly one behind the other at 1.5 m/s, 1 m apart, each on what it has committed to."""
+    pair = []
+    for i, x_m in enumerate((0.0, -1.0)):
+        agent = Commitments(i, CommitParams(), MpcParams(u_max=0.25), SEPARATION, 2, lambda: 0)
+        points = np.array([[x_m + 0.15 * k, 0.0, -2.0] for k in range(21)])
+        agent.committed = ending_at_rest(UTC_US, 100_000, points, np.tile([1.5, 0.0, 0.0], (21, 1)), 1.5)
+        pair.append(agent)
+    return pair[0], pair[1]
+
+
+def said_by(agent: Commitments, number: int) -> dict[int, Intent]:
+    assert agent.committed is not None
+    return {number: Intent(number, 1, 1, UTC_US, True, agent.committed, agent.proposal, {})}
+
+
+def wall(x_m: float, agent: Commitments) -> KeepOut:
+    return KeepOut(np.tile([x_m, 0.0, -2.0], (agent.steps + 1, 1)), 0.9, 0.8, False, -1)
+
+
+def test_a_promise_that_was_changed_without_asking_is_found_by_whom_it_contradicts() -> None:
+    first, second = meeting()
+    assert second.broken(UTC_US, said_by(first, 0)) == set()
+    first.avoid(Situation(UTC_US, UTC_US, Wish(at_goal), {}, [wall(1.6, first)]))
+    assert first.counts.evaded == 1, "before a wall there is no time to ask"
+    assert second.broken(UTC_US, said_by(first, 0)) == {0}
+    assert second.broken(UTC_US, said_by(first, 0)) == {0}, "as long as it does"
+
+
+def test_a_wall_that_leaves_time_to_ask_stops_nobody() -> None:
+    first, _ = meeting()
+    first.avoid(Situation(UTC_US, UTC_US, Wish(at_goal), {}, [wall(2.6, first)]))
+    assert first.counts.evaded == 0
+
+
+def test_who_rests_makes_way_for_what_comes_at_it() -> None:
+    """To stop would change nothing: it rests already."""
+    agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), SEPARATION, 2, lambda: 0)
+    agent.begin(np.array([0.0, 0.0, -2.0]), np.zeros(3), UTC_US)
+    times_s = 0.1 * np.arange(agent.steps + 1)
+    coming = np.stack([2.5 - 1.0 * times_s, 0.3 + 0.0 * times_s, -2.0 + 0.0 * times_s], axis=1)
+    agent.avoid(Situation(UTC_US, UTC_US, Wish(at_goal), {}, [KeepOut(coming, 0.9, 0.8, False, 1)]))
+    assert agent.counts.evaded == 1
+    assert agent.committed is not None
+    apart = agent.committed.sample(UTC_US + times_s * 1e6)[0] - coming
+    assert np.linalg.norm(apart, axis=1).min() > 0.5, "it would have been 0.3 m"
+
+
+@pytest.mark.parametrize(("column", "passes_m"), [(False, 0.9), (True, 0.1)], ids=["ball", "control: column"])
+def test_who_is_hemmed_in_makes_way_upwards(column: bool, passes_m: float) -> None:
+    """Peers rest on the three sides that are left; what comes runs over whoever cannot rise."""
+    agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), SEPARATION, 5, lambda: 0)
+    agent.begin(np.array([0.0, 0.0, -2.0]), np.zeros(3), UTC_US)
+    sides = [[0.0, 0.9, -2.0], [0.0, -0.9, -2.0], [-0.9, 0.0, -2.0]]
+    peers = {
+        i: Intent(i, 1, 1, UTC_US, True, resting(np.array(side), UTC_US, 100_000), None, {})
+        for i, side in enumerate(sides, start=1)
+    }
+    times_s = 0.1 * np.arange(agent.steps + 1)
+    coming = np.stack([3.5 - 1.0 * times_s, 0.0 * times_s, -2.0 + 0.0 * times_s], axis=1)
+    agent.avoid(Situation(UTC_US, UTC_US, Wish(at_goal), peers, [KeepOut(coming, 1.0, 0.9, column, -1)]))
+    assert agent.committed is not None
+    pos = agent.committed.sample(UTC_US + times_s * 1e6)[0]
+    apart = np.linalg.norm((pos - coming)[:, : 2 if column else 3], axis=1)
+    assert (apart.min() >= passes_m) is not column
+    assert np.linalg.norm(pos[:, None] - np.array(sides), axis=2).min() >= CERTIFIED_M
+
+
+def along(corners: Array) -> Sampled:
+    """A way through (K, 2) at 1 m/s."""
+    reached_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
+
+    def sample(offsets_s: Array) -> tuple[Array, Array]:
+        x, y = (np.interp(offsets_s, reached_m, corners[:, i]) for i in (0, 1))
+        leg = np.clip(np.searchsorted(reached_m, offsets_s, side="right") - 1, 0, len(corners) - 2)
+        unit = np.diff(corners, axis=0)[leg] / np.diff(reached_m)[leg, None]
+        return np.stack([x, y, 0.0 * x - 2.0], axis=1), np.column_stack([unit, 0.0 * x])
+
+    return sample
+
+
+@pytest.mark.parametrize(("is_way", "gets_on"), [(True, True), (False, False)])
+def test_along_a_way_round_plans_look_near_the_way(is_way: bool, gets_on: bool) -> None:
+    """The last plan leads north before a wall, the way south through its gap: from one to the other no row leads."""
+    small = SeparationParams(radius_m=0.3, body_m=0.15)
+    agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), small, 5, lambda: 0)
+    to_north = glide_to(np.array([0.0, 0.0, -2.0]), np.zeros(3), np.array([0.1, 0.9, -2.0]), 1.0, 1.0)
+    agent.committed = ending_at_rest(UTC_US, 100_000, *to_north.sample(np.arange(0.0, 2.1, 0.1)), 1.5)
+    posts = [np.array([0.8, y_m, -2.0]) for y_m in (0.3, 0.6, 0.9, 1.2)]
+    wall = [KeepOut(np.tile(post, (agent.steps + 1, 1)), 0.375, 0.275, True, -1) for post in posts]
+    way = along(np.array([[0.0, 0.0], [0.8, -0.4], [3.0, -0.4]]))
+    agent.propose(Situation(UTC_US, UTC_US + agent.lead_us, Wish(way, is_way), {}, wall))
+    assert agent.proposal is not None
+    assert bool(agent.proposal.trajectory.pos_ned_m[-1, 0] > 1.0) is gets_on, "behind the wall"
+
+
+@pytest.mark.parametrize("gathers", [True, False], ids=["", "control: at the way's speed at once"])
+def test_who_rests_at_a_corner_sets_out_at_its_own_speed(gathers: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A way at 1 m/s is round the corner before the agent is: rows of what comes next let its plan cut this one."""
+    if not gathers:
+        monkeypatch.setattr(trajectory_planner, "_gathering_speed", lambda wish, speed_m_s: wish)
+    small = SeparationParams(radius_m=0.3, body_m=0.15)
+    agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), small, 3, lambda: 0)
+    here = np.array([2.716, 2.764, -2.0])
+    agent.begin(here, np.zeros(3), UTC_US)
+    posts = [np.array([3.0, y_m, -2.0]) for y_m in (2.802, 2.502, 2.202)]
+    wall = [KeepOut(np.tile(post, (agent.steps + 1, 1)), 0.375, 0.275, True, -1) for post in posts]
+    way = along(np.array([here[:2], [2.77, 3.14], [3.21, 3.25], [4.19, 3.06]]))
+    agent.propose(Situation(UTC_US, UTC_US + agent.lead_us, Wish(way, is_way=True), {}, wall))
+    assert (agent.proposal is not None) is gathers
+    if agent.proposal is not None:
+        assert agent.proposal.trajectory.pos_ned_m[-1, 0] > 3.4, "behind the wall"
+
+
+def proposing() -> tuple[Commitments, Proposal]:
+    agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), SEPARATION, 2, lambda: 0)
+    agent.begin(np.array([0.0, 0.0, -2.0]), np.zeros(3), UTC_US)
+    agent.propose(Situation(UTC_US, UTC_US + agent.lead_us, Wish(at_goal), {}, ()))
+    assert agent.proposal is not None
+    return agent, agent.proposal
+
+
+def acknowledging(number: int) -> dict[int, Intent]:
+    return {1: Intent(1, 1, 1, UTC_US, True, resting(np.array([9.0, 0.0, 0.0]), UTC_US, 100_000), None, {0: number})}
+
+
+@pytest.mark.parametrize(("off", "commits"), [(0, 1), (1, 0), (-1, 0)])
+def test_only_the_very_proposal_is_acknowledged(off: int, commits: int) -> None:
+    agent, proposal = proposing()
+    agent.hear(UTC_US + 20_000, acknowledging(proposal.number + off), {1})
+    assert agent.counts.committed == commits
+
+
+def test_an_acknowledgement_after_the_moment_to_leave_is_too_late() -> None:
+    agent, proposal = proposing()
+    agent.hear(UTC_US + agent.lead_us + 1, acknowledging(proposal.number), {1})
+    assert (agent.counts.committed, agent.counts.expired, agent.proposal) == (0, 1, None)
+
+
+def test_promises_that_are_too_close_already_do_not_creep_closer() -> None:
+    """Each ends 5 mm nearer than it begins, which the leniency that plans have would let pass, again and again."""
+    agent, _ = proposing()
+    other = resting(np.zeros(3), UTC_US, 100_000)
+    for k in range(10):
+        x_m = CERTIFIED_M - 0.01 - 0.005 * k
+        nearer = np.array([[x_m, 0.0, 0.0], [x_m - 0.005, 0.0, 0.0]])
+        assert agent._planner.conflicts(Trajectory(UTC_US, 100_000, nearer, np.zeros((2, 3))), UTC_US, [other])
+        assert not agent._planner.conflicts(
+            Trajectory(UTC_US, 100_000, nearer[::-1], np.zeros((2, 3))), UTC_US, [other]
+        )
+
+
+def test_what_is_not_a_number_conflicts() -> None:
+    agent, _ = proposing()
+    bad = Trajectory(UTC_US, 100_000, np.full((2, 3), np.nan), np.zeros((2, 3)))
+    assert agent._planner.conflicts(bad, UTC_US, [resting(np.zeros(3), UTC_US, 100_000)])
+
+
+def test_a_slow_network_lengthens_the_lead_and_a_fast_one_shortens_it_again() -> None:
+    crowd = Crowd(2, Network((250_000, 250_000)))
+    before_us = crowd.agents[0].lead_us
+    crowd.run(4.0)
+    slow_us = crowd.agents[0].lead_us
+    crowd.network.delay_us = (0, 0)
+    crowd.run(8.0)
+    assert before_us < 0.3 * slow_us
+    assert slow_us > 450_000
+    assert crowd.agents[0].lead_us < 0.5 * slow_us

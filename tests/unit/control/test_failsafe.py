@@ -1,0 +1,138 @@
+"""Every row of the failsafe table, its limits, and which row wins when several apply."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+
+from swarmctl.control.phases.failsafe import FailsafeParams, judge
+from swarmctl.core.types import FlightMode, Health, Landed, Mode, Phase, PlanStatus
+
+PARAMS = FailsafeParams()  # state 0.2 s, replay 0.4 s, hold 5 s, rest 0.2 m/s
+GOOD = Health(
+    state_age_us=20_000,
+    armed=True,
+    mode=FlightMode.EXTERNAL,
+    landed=Landed.IN_AIR,
+    autopilot_failsafe=False,
+    plan_status=PlanStatus.OK,
+    last_good_plan_age_us=0,
+    planless_us=0,
+    speed_m_s=1.0,
+    phase=Phase.TRACK,
+    had_control=True,
+    yielded=False,
+)
+BAD_PLANS = [s for s in PlanStatus if s is not PlanStatus.OK]
+
+
+def mode_of(**changes: Any) -> Mode:
+    return judge(replace(GOOD, **changes), PARAMS).mode
+
+
+def test_all_well_is_followed_and_before_the_autopilot_follows_it_is_streamed() -> None:
+    assert mode_of() is Mode.FOLLOW
+    assert mode_of(had_control=False) is Mode.STREAM
+    assert mode_of(had_control=False, mode=FlightMode.HOLD) is Mode.STREAM
+
+
+@pytest.mark.parametrize(
+    ("age_us", "mode"), [(-1, Mode.BLIND), (0, Mode.FOLLOW), (200_000, Mode.FOLLOW), (200_001, Mode.BLIND)]
+)
+def test_own_state_older_than_200_ms_sends_nothing(age_us: int, mode: Mode) -> None:
+    assert mode_of(state_age_us=age_us) is mode
+
+
+@pytest.mark.parametrize("phase", list(Phase))
+def test_the_autopilot_flies_outside_the_mission(phase: Phase) -> None:
+    ours = phase in (Phase.GOTO_START, Phase.READY, Phase.TRACK, Phase.GOTO_LAND)
+    assert mode_of(phase=phase) is (Mode.FOLLOW if ours else Mode.IDLE)
+
+
+@pytest.mark.parametrize("mode", [m for m in FlightMode if m is not FlightMode.EXTERNAL])
+def test_a_pilot_or_autopilot_that_leaves_offboard_is_yielded_to(mode: FlightMode) -> None:
+    assert mode_of(mode=mode) is Mode.YIELD
+
+
+@pytest.mark.parametrize("change", [{"armed": False}, {"autopilot_failsafe": True}])
+def test_disarming_and_the_autopilots_failsafe_are_yielded_to(change: dict[str, Any]) -> None:
+    assert mode_of(**change) is Mode.YIELD
+    assert mode_of(had_control=False, **change) is Mode.STREAM
+
+
+@pytest.mark.parametrize("status", BAD_PLANS)
+def test_the_ladder_after_a_bad_plan(status: PlanStatus) -> None:
+    bad: dict[str, Any] = {"plan_status": status}
+    assert mode_of(**bad, last_good_plan_age_us=0) is Mode.REPLAY
+    assert mode_of(**bad, last_good_plan_age_us=400_000) is Mode.REPLAY
+    assert mode_of(**bad, last_good_plan_age_us=400_001) is Mode.BRAKE
+    assert mode_of(**bad, last_good_plan_age_us=-1) is Mode.BRAKE
+    old: dict[str, Any] = {**bad, "last_good_plan_age_us": 1_000_000}
+    assert mode_of(**old, speed_m_s=0.201) is Mode.BRAKE
+    assert mode_of(**old, speed_m_s=0.2) is Mode.HOLD
+    assert mode_of(**old, speed_m_s=0.0, planless_us=5_400_000) is Mode.HOLD
+    assert mode_of(**old, speed_m_s=0.0, planless_us=5_400_001) is Mode.LAND
+    assert mode_of(**old, speed_m_s=9.0, planless_us=5_400_001) is Mode.LAND
+
+
+def test_a_plan_that_is_from_the_future_by_the_delay_is_still_young() -> None:
+    assert mode_of(plan_status=PlanStatus.RESIDUAL, last_good_plan_age_us=60_000) is Mode.REPLAY
+
+
+@pytest.mark.parametrize("status", BAD_PLANS)
+def test_a_bad_plan_is_never_flown_whoever_has_control(status: PlanStatus) -> None:
+    for had_control in (True, False):
+        for age_us in (-1, 0, 10**9):
+            for planless_us in (0, 10**9):
+                flown = mode_of(
+                    had_control=had_control, plan_status=status, last_good_plan_age_us=age_us, planless_us=planless_us
+                )
+                assert flown not in (Mode.FOLLOW, Mode.STREAM)
+
+
+@pytest.mark.parametrize(
+    ("changes", "mode"),
+    [
+        # blind before idle, yield and plans
+        ({"state_age_us": -1, "phase": Phase.STANDBY}, Mode.BLIND),
+        ({"state_age_us": 300_000, "mode": FlightMode.MANUAL}, Mode.BLIND),
+        ({"state_age_us": 300_000, "plan_status": PlanStatus.NONE}, Mode.BLIND),
+        # who has yielded stays so in every phase, but does not see without a state
+        ({"yielded": True, "had_control": False}, Mode.YIELD),
+        ({"yielded": True, "had_control": False, "phase": Phase.LAND}, Mode.YIELD),
+        ({"yielded": True, "had_control": False, "plan_status": PlanStatus.NONE, "planless_us": 10**9}, Mode.YIELD),
+        ({"yielded": True, "state_age_us": 300_000}, Mode.BLIND),
+        # idle before yield: landing by the autopilot is not a take-over
+        ({"phase": Phase.LAND, "mode": FlightMode.LAND}, Mode.IDLE),
+        ({"phase": Phase.DONE, "armed": False}, Mode.IDLE),
+        # yield before everything about plans
+        ({"armed": False, "plan_status": PlanStatus.SOLVER_FAILED}, Mode.YIELD),
+        ({"mode": FlightMode.RTL, "plan_status": PlanStatus.NONE, "planless_us": 10**9}, Mode.YIELD),
+        # a young certified plan before landing, landing before braking
+        ({"plan_status": PlanStatus.NONE, "last_good_plan_age_us": 0, "planless_us": 10**9}, Mode.REPLAY),
+        ({"plan_status": PlanStatus.NONE, "last_good_plan_age_us": -1, "planless_us": 10**9}, Mode.LAND),
+    ],
+)
+def test_order_of_precedence(changes: dict[str, Any], mode: Mode) -> None:
+    assert mode_of(**changes) is mode
+
+
+def test_every_judgement_says_why() -> None:
+    reasons = {
+        judge(replace(GOOD, **change), PARAMS).reason
+        for change in (
+            {},
+            {"state_age_us": -1},
+            {"phase": Phase.ARM},
+            {"yielded": True},
+            {"armed": False},
+            {"plan_status": PlanStatus.NONE},
+            {"plan_status": PlanStatus.NONE, "last_good_plan_age_us": -1},
+            {"plan_status": PlanStatus.NONE, "last_good_plan_age_us": -1, "speed_m_s": 0.0},
+            {"plan_status": PlanStatus.NONE, "last_good_plan_age_us": -1, "planless_us": 10**9},
+        )
+    }
+    assert len(reasons) == 9
+    assert all(reasons)

@@ -1,0 +1,101 @@
+"""Places round one goal: as near to it as can be, far enough from each other, the same for everybody."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from sitl.studies.campaign.layouts import least_sum_m
+from swarmctl.control.reference.goal_assignment import ROOM, arrangement, places_ned_m
+from swarmctl.control.reference.mission import OUTWARD_S_M, GotoParams, MissionParams, MissionReference
+from swarmctl.core.types import Array
+
+APART_M = 0.9
+
+
+def closest_m(points: Array) -> float:
+    return min((math.dist(a, b) for a, b in itertools.combinations(points, 2)), default=math.inf)
+
+
+@pytest.mark.parametrize("count", [1, 3, 6, 10])
+def test_the_arrangement_is_the_least_that_a_search_over_all_finds(count: int) -> None:
+    points = arrangement(count)
+    assert closest_m(points) >= 1.0 - 1e-9
+    assert np.linalg.norm(points, axis=1).sum() <= least_sum_m(count, 1.0) + 1e-3
+
+
+def test_two_keep_the_same_distance_to_their_goal() -> None:
+    np.testing.assert_allclose(np.linalg.norm(arrangement(2), axis=1), 0.5)  # one on it would be as good a sum
+
+
+def test_three_round_one_point_form_a_triangle_at_its_height() -> None:
+    starts = np.array([[4.0, 0.0, -1.0], [-2.0, 3.4, -1.0], [-2.0, -3.4, -2.0]])
+    goals = np.tile([1.0, 1.0, -3.0], (3, 1))
+    places, groups = places_ned_m(starts, goals, APART_M)
+    assert groups == [[0, 1, 2]]
+    np.testing.assert_allclose(places[:, 2], -3.0)
+    np.testing.assert_allclose(np.linalg.norm(places - goals, axis=1), ROOM * APART_M / math.sqrt(3.0), rtol=1e-6)
+    assert closest_m(places) == pytest.approx(ROOM * APART_M)
+    for start, place in zip(starts, places, strict=True):  # each on the side it comes from
+        assert (place - goals[0])[:2] @ (start - goals[0])[:2] > 0.0
+
+
+def test_goals_far_enough_apart_stay_as_they_are() -> None:
+    goals = np.array([[0.0, 0.0, -1.0], [0.95, 0.0, -1.0], [0.0, 0.0, -2.0]])
+    places, groups = places_ned_m(np.zeros((3, 3)), goals, APART_M)
+    np.testing.assert_array_equal(places, goals)
+    assert groups == [[0], [1], [2]]
+
+
+def test_who_would_be_pushed_by_an_arrangement_joins_it() -> None:
+    goals = np.array([[5.0, 0.0, 0.0], [5.0, 0.0, 0.0], [5.9, 0.0, 0.0], [9.0, 0.0, 0.0]])
+    starts = np.arange(4)[:, None] * np.array([2.0, 0.0, 0.0])  # they come along the line of the goals
+    places, groups = places_ned_m(starts, goals, APART_M)
+    assert groups == [[0, 1, 2], [3]]
+    assert closest_m(places) >= APART_M
+    np.testing.assert_array_equal(places[3], goals[3])
+
+
+@pytest.mark.parametrize("count", [6, 10])
+def test_ways_flown_together_never_come_much_closer_than_their_ends(count: int) -> None:
+    starts = np.random.default_rng(count).uniform(-6.0, 6.0, (200, 3)) * [1.0, 1.0, 0.0]
+    chosen: list[Array] = []
+    for start in starts:
+        if all(math.dist(start, other) >= 1.5 for other in chosen):
+            chosen.append(start)
+    starts = np.array(chosen[:count])
+    places, _ = places_ned_m(starts, np.zeros((count, 3)), APART_M)
+    least_m = min(closest_m(starts + s * (places - starts)) for s in np.linspace(0.0, 1.0, 101))
+    assert least_m >= ROOM * APART_M / math.sqrt(2.0) - 1e-6  # where no two gain by exchanging their places
+
+
+def rest_s(references: list[MissionReference]) -> list[float]:
+    """When each comes to rest."""
+    times = np.arange(0.0, 20.0, 0.01)
+    return [float(times[np.linalg.norm(r.sample(times)[1], axis=1).nonzero()[0][-1]]) for r in references]
+
+
+def test_inner_places_are_reached_first() -> None:
+    starts = 5.0 * np.stack([np.cos(np.arange(7.0)), np.sin(np.arange(7.0)), 0.0 * np.arange(7.0)], axis=1)
+    mission = MissionParams(kind="goto", goto=GotoParams(goals_ned_m=((0.0, 0.0, 0.0),)))
+    flown = [MissionReference(mission, starts, agent, APART_M) for agent in range(7)]
+    ends_m = [float(np.linalg.norm(r.sample(np.array([60.0]))[0][0])) for r in flown]
+    first, *others = [t_s for _, t_s in sorted(zip(ends_m, rest_s(flown), strict=True))]
+    assert min(others) - first == pytest.approx(OUTWARD_S_M * ROOM * APART_M, abs=0.05)
+    assert max(others) - min(others) < 0.05
+
+
+def test_everybody_works_out_the_same_and_arrives_as_others_do() -> None:
+    starts = np.array([[4.0, 0.0, -1.0], [-1.0, 1.7, -1.0], [-2.0, -3.4, -2.0]])
+    mission = MissionParams(kind="goto", goto=GotoParams(goals_ned_m=((0.0, 0.0, -1.0),)))
+    flown = [MissionReference(mission, starts, agent, APART_M) for agent in range(3)]
+    ends = np.array([reference.sample(np.array([60.0]))[0][0] for reference in flown])
+    np.testing.assert_allclose(ends, places_ned_m(starts, np.tile([0.0, 0.0, -1.0], (3, 1)), APART_M)[0])
+    assert max(rest_s(flown)) - min(rest_s(flown)) < 0.05, "three places are equally far"
+    alone = mission.model_copy(update={"goto": mission.goto.model_copy(update={"standoff": False})})
+    np.testing.assert_array_equal(
+        MissionReference(alone, starts, 1, APART_M).sample(np.array([60.0]))[0][0], [0, 0, -1]
+    )

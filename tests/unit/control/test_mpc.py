@@ -1,0 +1,298 @@
+"""One step of the swarm MPC: signs by the thesis' equations, and every status of a plan by what brings it about."""
+
+from __future__ import annotations
+
+import math
+from typing import Any, Literal
+
+import numpy as np
+import pytest
+
+from swarmctl.control.collision.separation import KeepOut, SeparationParams, certify
+from swarmctl.control.controller import ControllerParams, make_controller
+from swarmctl.control.model import VehicleModelParams, acceleration
+from swarmctl.control.mpc.axes import AxesSolution
+from swarmctl.control.mpc.problem import Problem, Start
+from swarmctl.control.mpc.qp import QpParams
+from swarmctl.control.mpc.swarm_mpc import RESIDUAL_LIMIT_M, MpcParams, SwarmMpc, nearest
+from swarmctl.core.types import Array, Plan, PlanStatus, Reference
+
+G = 9.81
+HERE = np.array([1.0, 2.0, -3.0])
+
+
+def start(
+    pos: Array = HERE, vel: tuple[float, ...] = (0.0, 0.0, 0.0), virtual: tuple[float, ...] = (0.0, 0.0, G)
+) -> Start:
+    return Start(5_000_000, pos, np.array(vel), 1.0, np.array(virtual))
+
+
+def reference(offset: tuple[float, ...] = (0.0, 0.0, 0.0)) -> Reference:
+    return Reference(np.tile(HERE + offset, (101, 1)), np.zeros((101, 3)), 0.0)
+
+
+def problem(
+    offset: tuple[float, ...] = (0.0, 0.0, 0.0),
+    *keep_outs: KeepOut,
+    wind: tuple[float, ...] = (0.0, 0.0, 0.0),
+    begin: Start | None = None,
+) -> Problem:
+    return Problem(begin or start(), reference(offset), np.array(wind), keep_outs, None)
+
+
+def plan_to(
+    offset: tuple[float, ...],
+    *keep_outs: KeepOut,
+    wind: tuple[float, ...] = (0.0, 0.0, 0.0),
+    begin: Start | None = None,
+    **params: Any,
+) -> Plan:
+    mpc = SwarmMpc(MpcParams(**params), VehicleModelParams(), SeparationParams(), 0, 2, lambda: 0)
+    return mpc.plan(problem(offset, *keep_outs, wind=wind, begin=begin))
+
+
+def fixed(place: Array, allowed_m: float = 0.8, steps: int = 40) -> KeepOut:
+    return KeepOut(np.tile(place, (steps + 1, 1)), allowed_m + 0.1, allowed_m, False, 1)
+
+
+@pytest.mark.parametrize(("axis", "sign"), [(0, 1.0), (0, -1.0), (1, 1.0), (1, -1.0)])
+def test_a_reference_to_the_north_tilts_the_body_axis_south(axis: int, sign: float) -> None:
+    # (3.17) x'' = -(f/m) u_x and y'' = -(f/m) u_y: to accelerate north, u_x must be negative
+    offset = [0.0, 0.0, 0.0]
+    offset[axis] = sign
+    plan = plan_to((offset[0], offset[1], offset[2]))
+    assert plan.status is PlanStatus.OK
+    assert sign * plan.virtual[0, axis] < -0.02
+    assert sign * acceleration(plan.virtual[0])[axis] > 0.2
+    assert sign * (plan.pos_ned_m[-1, axis] - HERE[axis]) > 0.1
+    np.testing.assert_allclose(plan.virtual[:, 1 - axis], 0.0, atol=2e-3)
+
+
+@pytest.mark.parametrize("up_m", [0.5, -0.5])
+def test_a_reference_above_takes_more_thrust_than_the_weight(up_m: float) -> None:
+    plan = plan_to((0.0, 0.0, -up_m))
+    assert (plan.virtual[0, 2] - G) * up_m > 0.1
+    assert (plan.pos_ned_m[-1, 2] - HERE[2]) * -up_m > 0.04  # three increments that end at rest reach 0.1 m
+
+
+def test_at_its_reference_it_hovers() -> None:
+    plan = plan_to((0.0, 0.0, 0.0))
+    np.testing.assert_allclose(plan.virtual, np.tile([0.0, 0.0, G], (40, 1)), atol=5e-3)
+    np.testing.assert_allclose(plan.pos_ned_m, np.tile(HERE, (41, 1)), atol=2e-3)
+    assert (plan.t0_us, plan.dt_us, plan.status) == (5_000_000, 20_000, PlanStatus.OK)
+
+
+def test_a_tilted_vehicle_needs_more_thrust_to_hover() -> None:
+    # (3.11): z'' = g - (f/m) c with c frozen; held at c = 0.9 the equilibrium is g / 0.9
+    begin = Start(0, HERE, np.zeros(3), 0.9, np.array([0.0, 0.0, G / 0.9]))
+    plan = plan_to((0.0, 0.0, 0.0), begin=begin)
+    np.testing.assert_allclose(plan.virtual[:, 2], G / 0.9, atol=5e-3)
+
+
+def test_wind_is_leant_against() -> None:
+    plan = plan_to((0.0, 0.0, 0.0), wind=(1.0, -0.5, 0.4))
+    first_to_last = plan.virtual[-1]
+    assert first_to_last[0] > 0.02 > 0.0 > first_to_last[1]  # wind to the north: body axis north, thrust south
+    assert first_to_last[2] > G + 0.2
+
+
+def test_bounds_of_thrust_and_tilt_hold() -> None:
+    plan = plan_to((50.0, -50.0, -10.0))
+    assert plan.status is PlanStatus.OK
+    assert np.abs(plan.virtual[:, :2]).max() <= 0.2 + 2e-3
+    assert np.abs(np.diff(plan.virtual[:, :2], axis=0, prepend=np.zeros((1, 2)))).max() <= 0.05 + 1e-9
+    assert np.abs(np.diff(plan.virtual[:, 2], prepend=G)).max() <= 5.0 + 1e-9
+
+
+@pytest.mark.parametrize("down_m", [-100.0, -20.0, 20.0, 100.0])
+def test_a_far_reference_is_planned_for_within_the_bounds_of_thrust(down_m: float) -> None:
+    plan = plan_to((0.0, 0.0, down_m))
+    assert plan.status is PlanStatus.OK
+    assert plan.virtual[:, 2].max() <= 20.0 + 0.05
+    assert plan.virtual[:, 2].min() >= -0.05  # a rotor can't pull
+    assert (plan.virtual[0, 2] - G) * down_m < 0.0
+
+
+@pytest.mark.parametrize("cos_tilt", [1.0, 0.9])
+@pytest.mark.parametrize("ahead", ["planned", "held"])
+def test_the_planned_path_is_the_motion_of_its_own_virtual_controls(ahead: str, cos_tilt: float) -> None:
+    wind, vel = np.array([0.3, -0.2, 0.1]), np.array([0.2, 0.1, 0.3])
+    begin = Start(0, HERE, vel, cos_tilt, np.array([0.05, 0.0, 8.0]))
+    plan = plan_to((0.5, -0.3, -0.4), begin=begin, wind=tuple(wind), thrust_ahead=ahead)
+    assert np.ptp(plan.virtual[:, 2]) > 1.0  # the thrust is not constant, so it matters which one x-y is predicted with
+    pos = HERE.copy()
+    for k in range(40):
+        thrust = plan.virtual[k if ahead == "planned" else 0, 2]  # held: the thesis' f_t of now
+        across, up = -thrust * plan.virtual[k, :2], G - cos_tilt * plan.virtual[k, 2]
+        accel = np.array([*across, up]) + wind
+        pos, vel = pos + 0.02 * vel + 0.5 * 0.02**2 * accel, vel + 0.02 * accel
+        np.testing.assert_allclose(plan.pos_ned_m[k + 1], pos, atol=1e-9)
+        np.testing.assert_allclose(plan.vel_ned_m_s[k + 1], vel, atol=1e-9)
+
+
+def test_only_a_thrust_that_changes_makes_held_and_planned_differ() -> None:
+    level = [plan_to((0.5, 0.0, 0.0), thrust_ahead=ahead) for ahead in ("planned", "held")]
+    np.testing.assert_allclose(level[0].pos_ned_m, level[1].pos_ned_m, atol=1e-3)
+    brisk = {"q_pos": 2.0, "q_vel": 0.05, "r": 0.01}
+    climbing = [plan_to((2.0, 0.0, -0.5), thrust_ahead=ahead, z=brisk) for ahead in ("planned", "held")]
+    assert np.abs(climbing[0].pos_ned_m - climbing[1].pos_ned_m).max() > 0.02
+
+
+def test_a_neighbour_in_the_way_is_kept_clear_of() -> None:
+    neighbour = fixed(HERE + np.array([1.3, 0.0, 0.0]))
+    free, kept = plan_to((1.3, 0.0, 0.0)), plan_to((1.3, 0.0, 0.0), neighbour)
+    assert free.status is kept.status is PlanStatus.OK
+    near = np.linalg.norm(kept.pos_ned_m - neighbour.pos_ned_m, axis=1).min()
+    assert near > 0.9 - 0.02
+    assert certify(free.pos_ned_m, [neighbour], 6) < certify(kept.pos_ned_m, [neighbour], 6)
+
+
+def test_a_plan_that_cannot_avoid_is_not_certified_and_says_how_much_it_lacks() -> None:
+    rushing = start(vel=(4.0, 0.0, 0.0))
+    plan = plan_to((5.0, 0.0, 0.0), fixed(HERE + np.array([2.0, 0.0, 0.0])), begin=rushing)
+    assert plan.status is PlanStatus.NOT_CERTIFIED
+    assert certify(plan.pos_ned_m, [fixed(HERE + np.array([2.0, 0.0, 0.0]))], 6) < 0.0
+
+
+def test_a_keep_out_beyond_the_slots_is_still_judged() -> None:
+    near = [fixed(HERE + np.array([0.0, e, 0.0]), 0.8) for e in (0.5, -0.5)]  # nearest two take both slots
+    wall = [fixed(HERE + np.array([3.0, 0.6, 0.0]), 0.8)]
+    plan = plan_to((5.0, 0.0, 0.0), *near, *wall, begin=start(vel=(4.0, 0.0, 0.0)))
+    assert plan.status is PlanStatus.NOT_CERTIFIED
+
+
+def test_a_solver_that_breaks_down_is_a_status_and_not_an_exception() -> None:
+    for bad in (math.nan, math.inf):
+        plan = plan_to((1.0, 0.0, 0.0), begin=start(vel=(bad, 0.0, 0.0)))
+        assert plan.status is PlanStatus.SOLVER_FAILED
+    plan = plan_to((math.nan, 0.0, 0.0))
+    assert plan.status is PlanStatus.SOLVER_FAILED
+
+
+def solution(residual_m: float, solved: bool = True) -> AxesSolution:
+    two = np.zeros((40, 2))
+    return AxesSolution(solved, "", 1, two, np.tile(HERE[:2], (40, 1)), two, 0.0, residual_m, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    ("residual_m", "solved", "status"),
+    [
+        (RESIDUAL_LIMIT_M, True, PlanStatus.OK),
+        (1.01 * RESIDUAL_LIMIT_M, True, PlanStatus.RESIDUAL),
+        (math.inf, True, PlanStatus.RESIDUAL),
+        (0.0, False, PlanStatus.SOLVER_FAILED),
+    ],
+)
+def test_the_answer_of_the_solver_is_looked_at(
+    monkeypatch: pytest.MonkeyPatch, residual_m: float, solved: bool, status: PlanStatus
+) -> None:
+    mpc = SwarmMpc(MpcParams(), VehicleModelParams(), SeparationParams(), 0, 2, lambda: 0)
+    monkeypatch.setattr(mpc._xy_alone, "solve", lambda *_: solution(residual_m, solved))
+    assert mpc.plan(problem()).status is status
+
+
+def test_a_solver_that_is_stopped_too_early_has_a_residual() -> None:
+    qp = QpParams(max_iterations=10, polish=False)
+    plan = plan_to((5.0, 0.5, 0.0), fixed(HERE + np.array([1.0, 0.3, 0.0])), begin=start(vel=(1.5, 0.0, 0.0)), qp=qp)
+    assert plan.status in (PlanStatus.RESIDUAL, PlanStatus.SOLVER_FAILED, PlanStatus.NOT_CERTIFIED)
+    assert plan.residual_m > RESIDUAL_LIMIT_M
+
+
+@pytest.mark.parametrize("horizon_xy", [2, 6])
+def test_a_control_horizon_as_long_as_the_prediction_can_be_flown(horizon_xy: int) -> None:
+    neighbour = fixed(HERE + np.array([3.0, 0.0, 0.0]), steps=horizon_xy)
+    assert plan_to((0.1, 0.0, 0.0), neighbour, horizon_xy=horizon_xy).status is PlanStatus.OK
+
+
+def test_z_longer_or_shorter_than_xy_gives_a_plan_of_xy_length() -> None:
+    for horizon_z in (10, 60):
+        plan = plan_to((0.0, 0.0, -0.2), horizon_z=horizon_z)
+        assert plan.pos_ned_m.shape == (41, 3)
+        assert np.isfinite(plan.pos_ned_m).all()
+        assert plan.virtual.shape == (40, 3)
+
+
+def test_the_controller_without_neighbours_ignores_them_and_the_distributed_one_does_not() -> None:
+    neighbour = fixed(HERE + np.array([0.5, 0.0, 0.0]), 0.8)
+    alone = make_controller(ControllerParams(kind="mpc"), VehicleModelParams(), SeparationParams(), 0, 2, lambda: 0)
+    together = make_controller(ControllerParams(kind="dmpc"), VehicleModelParams(), SeparationParams(), 0, 2, lambda: 0)
+    free, kept = (c.plan(problem((0.5, 0.0, 0.0), neighbour)) for c in (alone, together))
+    assert free.status is PlanStatus.OK
+    assert free.virtual[5, 0] < -0.02  # towards the reference
+    assert kept.virtual[5, 0] > 0.02  # away from the neighbour that is too near
+
+
+def test_times_are_measured_with_the_stopwatch_and_add_up() -> None:
+    now_ns = iter(range(0, 10**9, 1000))  # every reading is 1 us after the last
+    mpc = SwarmMpc(MpcParams(), VehicleModelParams(), SeparationParams(), 0, 2, lambda: next(now_ns))
+    neighbour = fixed(HERE + np.array([1.3, 0.0, 0.0]))
+    times = mpc.plan(problem((0.1, 0.0, 0.0), neighbour)).times
+    # read at the start, round both solves and the half-spaces, after them, and after the certificate: eight intervals
+    assert (times.setup_us, times.spaces_us, times.solve_us, times.certify_us) == (4.0, 1.0, 2.0, 1.0)
+
+
+@pytest.mark.parametrize("horizon_z", [3, 40])
+def test_one_move_for_two_conditions_at_the_end_is_planned_and_not_an_exception(horizon_z: int) -> None:
+    plan = plan_to((0.0, 0.0, -0.1), control_z=1, horizon_z=horizon_z, terminal_z="position_velocity")
+    assert plan.status is PlanStatus.OK
+    assert plan.terminal_gap_m > 0.0
+
+
+@pytest.mark.parametrize("terminal", ["position", "position_velocity"])
+@pytest.mark.parametrize("ahead", ["planned", "held"])
+def test_falling_without_thrust_is_planned_and_not_an_exception(ahead: str, terminal: str) -> None:
+    falling = start(virtual=(0.0, 0.0, 0.0))  # no thrust now, none wanted: tilting moves nothing
+    plan = plan_to((0.0, 0.0, 100.0), begin=falling, terminal_xy=terminal, thrust_ahead=ahead)
+    assert plan.virtual[0, 2] == pytest.approx(0.0, abs=0.1)
+    assert plan.status is PlanStatus.OK
+
+
+def test_on_its_side_a_vehicle_gets_a_plan_and_not_an_exception() -> None:
+    plan = plan_to((0.0, 0.0, -0.1), begin=Start(0, HERE, np.zeros(3), 0.0, np.array([0.0, 0.0, G])))
+    assert np.isfinite(plan.pos_ned_m).all()
+
+
+def wide(place: Array, radius_m: float, any_height: bool = False) -> KeepOut:
+    return KeepOut(np.tile(place, (41, 1)), radius_m, radius_m - 0.1, any_height, 1)
+
+
+@pytest.mark.parametrize(
+    "pressing",
+    [wide(HERE + np.array([4.2, 0.0, 0.0]), 4.0), wide(HERE + np.array([1.0, 0.0, 9.0]), 0.9, any_height=True)],
+    ids=["large", "at any height"],
+)
+def test_slots_go_to_those_whose_surface_is_nearest(pressing: KeepOut) -> None:
+    harmless = wide(HERE + np.array([0.0, 2.0, 0.0]), 0.9)
+    guess = np.tile(HERE, (41, 1))
+    assert nearest([harmless, pressing], guess, 1)[0] is pressing
+
+
+@pytest.mark.parametrize("terminal", ["position", "position_velocity"])
+def test_keeping_clear_comes_before_ending_at_the_reference(terminal: str) -> None:
+    # the reference has moved into a neighbour's place; the end can be met in time, by flying into it
+    neighbour = fixed(HERE + np.array([0.9, 0.0, 0.0]))
+    plan = plan_to((0.03, 0.0, 0.0), neighbour, terminal_xy=terminal, terminal_z="none")
+    assert plan.slack_m < 0.01
+    assert np.linalg.norm(plan.pos_ned_m - neighbour.pos_ned_m, axis=1).min() > 0.9 - 0.01
+
+
+@pytest.mark.parametrize("kind", ["dmpc", "dmpc3"])
+def test_from_rest_peers_that_it_would_meet_far_away_are_kept_clear_of(kind: Literal["dmpc", "dmpc3"]) -> None:
+    """Two peers and the reference go round a circle; the guess stands still, farther than the gate from all of them.
+
+    Of three PX4 one that had stopped found no plan for 5 s, until it gave up.
+    """
+
+    def on_circle(begins_ned_m: tuple[float, float, float], steps: int) -> Array:
+        turned = 0.5 * 0.05 * np.arange(steps + 1)  # 0.5 rad/s
+        c, s, (n, e, d) = np.cos(turned), np.sin(turned), begins_ned_m
+        return np.stack([c * n - s * e, s * n + c * e, np.full(steps + 1, d)], axis=1)
+
+    peers = [on_circle(begins, 40) for begins in ((-0.75, 4.91, -3.3), (0.92, 4.89, -3.3))]
+    ahead = on_circle((-0.1, 5.0, -3.4), 100)
+    along = Reference(ahead, np.gradient(ahead, 0.05, axis=0), 0.0)
+    params = ControllerParams(kind=kind, mpc=MpcParams(dt_s=0.05, control_xy=20, u_max=0.75))
+    mpc = make_controller(params, VehicleModelParams(), SeparationParams(radius_m=1.6), 1, 2, lambda: 0)
+    keep_outs = tuple(KeepOut(path, 1.6, 1.55, False, tie) for path, tie in zip(peers, (0, 2), strict=True))
+    at_rest = start(np.array([0.45, -0.13, -2.5]))
+    assert mpc.plan(Problem(at_rest, along, np.zeros(3), keep_outs, None)).status is PlanStatus.OK

@@ -1,0 +1,151 @@
+"""A stop is never lost, and no vehicle is taken for disarmed without a HEARTBEAT that is newer than the arm request."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from swarmctl.control.phases.sequence import OPERATOR_STOP
+from swarmctl.core.types import FlightMode, Phase, Verb
+from tests.benches.sequenced_flight import IN_AIR, ON_GROUND, START, Flight
+
+
+def asked_to_arm(busy: bool) -> Flight:
+    """In ARM with the request out; the newest HEARTBEAT is older than it and says "disarmed"."""
+    flight = Flight().until(Phase.ARM)
+    flight.beat_us = flight.now_us - 100_000
+    assert flight.run(0.1) == [Verb.ARM]
+    flight.busy = busy
+    return flight
+
+
+@pytest.mark.parametrize("busy", [False, True], ids=["acknowledged", "not acknowledged"])
+@pytest.mark.parametrize("verb", ["land", "rtl"])
+def test_a_stop_between_the_acknowledgement_of_arming_and_its_heartbeat_disarms(busy: bool, verb: str) -> None:
+    flight = asked_to_arm(busy)
+    flight.ask(verb)
+    flight.run(0.5)
+    assert flight.at == "LAND", "the HEARTBEAT that says disarmed is older than the arm request"
+    flight.busy = False
+    assert Verb.DISARM in flight.run(1.0)
+    assert flight.at == "LAND"
+    flight.armed, flight.beat_us = True, flight.now_us  # now it tells
+    assert Verb.DISARM in flight.run(2.0)
+    assert flight.at == "LAND"
+    flight.armed, flight.beat_us = False, flight.now_us
+    flight.run(0.2)
+    assert (flight.at, flight.sequence.outcome) == ("DONE", OPERATOR_STOP)
+
+
+def test_what_refuses_after_arming_was_asked_for_disarms_before_it_gives_up() -> None:
+    flight = asked_to_arm(busy=False)
+    flight.refusal = "COM_OBL_RC_ACT = 7"
+    assert Verb.DISARM in flight.run(1.0)
+    assert flight.at == "LAND"
+    flight.beat_us = flight.now_us
+    flight.run(0.2)
+    assert (flight.at, flight.sequence.outcome) == ("DONE", "COM_OBL_RC_ACT = 7")
+
+
+@pytest.mark.parametrize("verb", ["land", "rtl"])
+def test_a_stop_before_the_first_vehicle_state_is_kept_until_there_is_one(verb: str) -> None:
+    flight = Flight()
+    flight.seen = False
+    flight.ask(verb)
+    flight.run(1.0)
+    assert flight.at == "CONNECT"
+    flight.seen = True
+    assert Verb.ARM not in flight.run(5.0)
+    assert (flight.at, flight.sequence.outcome) == ("DONE", OPERATOR_STOP)
+
+
+def test_a_stop_before_the_first_state_lands_a_vehicle_that_hovers_armed() -> None:
+    """What an agent does that is started beside a vehicle whose agent died."""
+    flight = Flight()
+    flight.seen = False
+    flight.ask("land")
+    flight.run(0.2)
+    flight.seen, flight.armed, flight.landed, flight.pos = True, True, IN_AIR, START.copy()
+    assert flight.run(1.0) == [Verb.LAND]
+    flight.flight_mode = FlightMode.LAND
+    assert flight.run(5.0) == []
+    flight.landed = ON_GROUND
+    flight.run(1.0)
+    assert flight.at == "LAND", "it is still armed"
+    flight.armed = False
+    flight.run(0.2)
+    assert flight.at == "DONE"
+
+
+def test_a_heartbeat_from_before_the_process_proves_nothing() -> None:
+    flight = Flight()
+    flight.beat_us = -1  # buffered in the socket since before this process looked
+    flight.ask("land")
+    flight.run(1.0)
+    assert flight.at == "LAND"
+    flight.beat_us = flight.now_us
+    flight.run(0.2)
+    assert flight.at == "DONE"
+
+
+def test_a_stop_while_the_state_is_lost_in_flight_begins_when_it_is_back() -> None:
+    flight = Flight().until(Phase.TRACK)
+    flight.seen = False
+    flight.ask("land")
+    flight.run(0.5)
+    assert flight.at == "TRACK"
+    flight.seen = True
+    flight.run(0.2)
+    assert flight.at == "GOTO_LAND"
+
+
+def test_land_on_the_way_home_lands_here_and_repeating_it_does_not_begin_again() -> None:
+    flight = Flight().until(Phase.TRACK)
+    flight.pos = START + np.array([4.0, 0.0, 0.0])
+    flight.ask("rtl")
+    flight.run(0.5)
+    target = flight.sequence._bound_for.copy()
+    flight.ask("land")
+    flight.run(0.1)
+    here = flight.sequence._bound_for.copy()
+    assert (target == START).all()
+    assert abs(here[0] - flight.pos[0]) < 0.5
+    began_us = flight.sequence._entered_us
+    flight.ask("land")
+    flight.run(0.1)
+    assert flight.sequence._entered_us == began_us
+
+
+def test_passing_causes_are_waited_for_and_named_when_time_is_up() -> None:
+    flight = Flight(start_timeout_s=20.0)
+    flight.unsettled = "the estimator's accuracy to settle (now 14.10 m)"
+    assert flight.run(19.0) == []
+    assert flight.at == "STANDBY"
+    flight.unsettled = ""
+    assert Verb.ARM in flight.run(0.3)
+    late = Flight(start_timeout_s=20.0)
+    late.unsettled = "the estimator's accuracy to settle (now 14.10 m)"
+    assert late.run(20.5) == []
+    assert late.at == "DONE"
+    assert "14.10 m" in late.sequence.outcome
+
+
+def test_a_vehicle_left_in_offboard_is_put_on_hold_so_that_it_can_be_armed() -> None:
+    flight = Flight()
+    flight.flight_mode, flight.armable = FlightMode.EXTERNAL, False
+    assert flight.run(3.0).count(Verb.HOLD) == 3
+    assert "EXTERNAL" in flight.sequence.waits_for
+    flight.flight_mode, flight.armable = FlightMode.HOLD, True
+    assert Verb.ARM in flight.run(0.3)
+    armed = Flight()
+    armed.flight_mode, armed.armable, armed.armed = FlightMode.EXTERNAL, False, True
+    assert armed.run(3.0) == [], "somebody else flies it"
+
+
+@pytest.mark.parametrize("phase", [Phase.GOTO_LAND, Phase.LAND, Phase.DONE])
+def test_who_waits_for_the_beginning_goes_home_when_a_peer_gives_up(phase: Phase) -> None:
+    flight = Flight().until(Phase.READY)
+    flight.peer(phase)
+    flight.run(0.3)
+    assert flight.phase in (Phase.GOTO_LAND, Phase.LAND), "it stands on its landing place already"
+    assert "gave up" in flight.sequence.outcome

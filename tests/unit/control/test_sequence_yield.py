@@ -1,0 +1,405 @@
+"""The phase machine once others decide: pilots, operators, lost plans, silence, found in the air."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from swarmctl.control.phases.sequence import OPERATOR_STOP, REBOOTED
+from swarmctl.control.reference.landing_places import nearest_in_plane_m, room_for
+from swarmctl.core.types import FlightMode, Landed, Mode, Phase, Verb
+from tests.benches.sequenced_flight import IN_AIR, ON_GROUND, OURS, START, Flight, controlled, ready, verbs
+
+# -- yielding ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("phase", OURS)
+def test_after_a_pilot_took_over_nothing_is_ever_asked_again(phase: Phase) -> None:
+    flight = controlled(phase)
+    flight.judged, flight.flight_mode = Mode.YIELD, FlightMode.MANUAL
+    assert flight.run(0.1) == []
+    assert not flight.sequence.had_control
+    flight.judged = Mode.STREAM  # without control the judge has nothing to yield any more
+    assert flight.run(120.0) == []  # past every timeout
+    flight.flight_mode = FlightMode.EXTERNAL  # not even when the pilot tries our mode
+    assert flight.run(5.0) == []
+    assert not flight.sequence.had_control
+    flight.armed, flight.landed = False, ON_GROUND
+    assert flight.run(5.0) == []
+    assert (flight.phase, flight.sequence.outcome) == (Phase.DONE, "pilot or autopilot took over")
+
+
+@pytest.mark.parametrize("flown", [FlightMode.HOLD, FlightMode.MANUAL], ids=["by the autopilot", "by the pilot"])
+def test_only_the_operator_resumes_and_then_offboard_is_asked_for(flown: FlightMode) -> None:
+    flight = controlled(Phase.TRACK)
+    flight.judged, flight.flight_mode = Mode.YIELD, flown
+    flight.run(1.0)
+    flight.judged = Mode.STREAM
+    flight.ask("resume")
+    assert Verb.EXTERNAL in flight.run(1.5)
+    flight.flight_mode = FlightMode.EXTERNAL
+    flight.run(0.1)
+    assert flight.sequence.had_control
+
+
+@pytest.mark.parametrize("verb", ["hold", "land", "rtl"])
+def test_other_verbs_do_not_take_a_vehicle_from_its_pilot(verb: str) -> None:
+    flight = controlled(Phase.TRACK)
+    flight.judged, flight.flight_mode = Mode.YIELD, FlightMode.MANUAL
+    flight.run(0.5)
+    flight.judged = Mode.STREAM
+    flight.ask(verb)
+    assert flight.run(10.0) == []
+
+
+def test_a_pilot_who_takes_over_while_the_autopilot_lands_is_not_fought() -> None:
+    flight = controlled(Phase.GOTO_LAND)
+    flight.pos = START.copy()
+    flight.until(Phase.LAND)
+    flight._obey(flight.step())
+    assert flight.flight_mode is FlightMode.LAND
+    flight.landed, flight.armed = IN_AIR, True
+    flight.run(1.0)
+    flight.flight_mode = FlightMode.MANUAL
+    assert flight.run(10.0) == []
+
+
+@pytest.mark.parametrize("phase", [Phase.TAKEOFF, Phase.GOTO_START])
+def test_a_pilot_who_flies_before_the_mission_is_not_landed_by_its_time_out(phase: Phase) -> None:
+    flight = Flight().until(phase)
+    flight.flight_mode, flight.landed, flight.pos = FlightMode.MANUAL, IN_AIR, START.copy()
+    assert flight.run(120.0) == []
+
+
+def test_a_pilot_who_takes_over_while_it_is_handed_back_in_the_air_is_not_put_on_hold() -> None:
+    flight = airborne().until(Phase.LAND)
+    flight.flight_mode = FlightMode.MANUAL
+    assert flight.run(10.0) == []
+
+
+# -- operator ---------------------------------------------------------------------------------------------------------
+
+
+def test_hold_stops_where_it_is_and_resume_goes_on_with_the_mission() -> None:
+    flight = controlled(Phase.TRACK)
+    flight.pos, flight.vel = np.array([4.0, 2.0, -2.0]), np.array([1.2, 0.0, 0.0])
+    flight.ask("hold")
+    pos, vel = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([0.0, 60.0]))
+    np.testing.assert_allclose(pos[0], [4.0, 2.0, -2.0])
+    np.testing.assert_allclose(vel, np.array([[1.2, 0.0, 0.0], [0.0, 0.0, 0.0]]))
+    assert pos[1, 0] == pytest.approx(4.0 + 1.2)  # v T / 2 with T = 2 v / a
+    flight.run(30.0)
+    assert flight.at == "TRACK"  # the mission does not end while held
+    flight.ask("resume")
+    flight.run(0.1)
+    assert (flight.phase, flight.sequence.outcome) == (Phase.GOTO_LAND, "completed")
+
+
+@pytest.mark.parametrize(
+    ("verb", "target"), [("land", np.array([4.0, 2.0, -2.0])), ("rtl", START)], ids=["land", "rtl"]
+)
+@pytest.mark.parametrize("phase", [Phase.GOTO_START, Phase.READY, Phase.TRACK])
+def test_land_is_here_and_rtl_is_at_the_start(phase: Phase, verb: str, target: np.ndarray) -> None:
+    flight = controlled(phase)
+    flight.pos = np.array([4.0, 2.0, -2.0])
+    flight.ask(verb)
+    assert (flight.phase, flight.sequence.outcome) == (Phase.GOTO_LAND, OPERATOR_STOP)
+    pos, _ = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([0.0, 60.0]))
+    np.testing.assert_allclose(pos, np.array([np.array([4.0, 2.0, -2.0]), target]), atol=1e-9)
+    flight.pos = target.copy()
+    if verb == "land":  # it may still be pushed aside: first it has to have come to rest
+        assert flight.run(1.0) == []
+    assert Verb.LAND in flight.run(0.3 if verb == "rtl" else 3.0)
+
+
+def test_stopping_on_the_ground_never_takes_off() -> None:
+    standing = Flight().until(Phase.STANDBY)
+    standing.ask("land")
+    assert standing.run(0.1) == []
+    assert standing.at == "DONE"
+    armed = Flight().until(Phase.TAKEOFF)
+    armed.ask("rtl")
+    assert armed.at == "LAND"
+    assert armed.run(0.5) == [Verb.DISARM]
+    armed.armed = False
+    armed.run(0.1)
+    assert armed.at == "DONE"
+
+
+def test_stopping_while_it_climbs_lands_it() -> None:
+    flight = Flight().until(Phase.TAKEOFF)
+    flight.landed, flight.flight_mode = IN_AIR, FlightMode.TAKEOFF
+    flight.ask("land")
+    assert flight.run(1.0) == [Verb.LAND]
+
+
+@pytest.mark.parametrize("verb", ["hold", "resume", "land", "rtl"])
+@pytest.mark.parametrize("phase", [Phase.LAND, Phase.DONE])
+def test_once_landing_verbs_change_nothing(phase: Phase, verb: str) -> None:
+    flight = controlled(Phase.GOTO_LAND)
+    flight.pos = START.copy()
+    flight.until(phase)
+    before = flight.phase, flight.sequence.outcome
+    flight.ask(verb)
+    assert (flight.phase, flight.sequence.outcome) == before
+
+
+# -- what takes too long ----------------------------------------------------------------------------------------------
+
+
+def test_a_start_that_takes_too_long_is_given_up_on_the_ground() -> None:
+    flight = Flight(start_timeout_s=20.0)
+    flight.armable = False
+    flight.run(19.9)
+    assert flight.at == "STANDBY"
+    flight.run(0.5)
+    assert flight.at == "DONE"
+    assert "20 s" in flight.sequence.outcome
+    assert "STANDBY" in flight.sequence.outcome
+
+
+def test_a_start_that_takes_too_long_in_the_air_lands() -> None:
+    flight = ready()
+    assert flight.run(120.0).count(Verb.LAND) > 0
+    assert flight.at == "LAND"
+    assert "READY" in flight.sequence.outcome
+
+
+def test_a_landing_place_that_cannot_be_reached_is_given_up() -> None:
+    flight = controlled(Phase.GOTO_LAND)
+    flight.run(19.0)
+    assert flight.at == "GOTO_LAND"
+    flight.run(2.0)
+    assert flight.at == "LAND"
+
+
+@pytest.mark.parametrize("phase", OURS)
+def test_no_plan_for_too_long_lands(phase: Phase) -> None:
+    flight = controlled(phase)
+    flight.judged = Mode.LAND
+    assert Verb.LAND in flight.run(0.3)
+    assert flight.at == "LAND"
+    assert flight.sequence.outcome
+
+
+# -- found in the air -------------------------------------------------------------------------------------------------
+
+
+def airborne(landed_at_first: Landed = IN_AIR) -> Flight:
+    flight = Flight()
+    flight.armed, flight.pos, flight.landed = True, START.copy(), landed_at_first
+    flight.run(0.2)
+    flight.landed = IN_AIR
+    return flight
+
+
+@pytest.mark.parametrize("landed_at_first", [IN_AIR, Landed.UNKNOWN], ids=["known", "not yet known"])
+def test_a_vehicle_found_in_the_air_is_handed_back_in_the_air(landed_at_first: Landed) -> None:
+    flight = airborne(landed_at_first)
+    asked: list[Verb] = []
+    phases: set[Phase] = set()
+    for _ in range(400):
+        commands = flight.step()
+        phases.add(flight.phase)
+        asked += verbs(commands)
+        flight._obey(commands)
+        if Verb.HOLD in verbs(commands):
+            flight.flight_mode = FlightMode.HOLD
+    assert not {Verb.ARM, Verb.TAKEOFF, Verb.LAND, Verb.DISARM} & set(asked)
+    assert asked[-1] is Verb.HOLD
+    pos, _ = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([60.0]))
+    np.testing.assert_allclose(pos[0], flight.pos, atol=1e-9)  # where the mission ends, not where it began
+    assert (flight.phase, flight.sequence.outcome) == (Phase.DONE, "completed")
+    assert flight.armed
+
+
+# -- silence on the bus -----------------------------------------------------------------------------------------------
+
+
+def test_when_peers_fall_silent_it_comes_to_rest_and_goes_on_when_they_are_back() -> None:
+    flight = controlled(Phase.TRACK)
+    flight.pos, flight.vel, flight.mute = np.array([4.0, 2.0, -2.0]), np.array([1.2, 0.0, 0.0]), True
+    flight.run(0.1)
+    pos, vel = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([60.0]))
+    np.testing.assert_allclose(pos[0], [5.2, 2.0, -2.0])
+    assert not vel.any()
+    flight.run(60.0)
+    assert flight.at == "TRACK"
+    flight.mute = False
+    flight.run(0.1)
+    assert flight.at == "GOTO_LAND"  # its time was over meanwhile
+
+
+def test_who_is_told_to_land_here_does_not_fly_home_because_the_bus_was_silent_for_a_while() -> None:
+    flight = controlled(Phase.TRACK)
+    here = np.array([4.0, 2.0, -2.0])
+    flight.pos = here.copy()
+    flight.ask("land")
+    flight.mute = True
+    flight.run(1.0)
+    flight.mute = False
+    flight.run(0.1)
+    pos, _ = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([60.0]))
+    np.testing.assert_allclose(pos[0], here, atol=1e-9)
+
+
+def test_who_is_told_in_silence_to_land_here_lands_here() -> None:
+    flight = controlled(Phase.TRACK)
+    here = np.array([4.0, 2.0, -2.0])
+    flight.pos, flight.mute = here.copy(), True
+    flight.run(1.0)
+    flight.ask("land")
+    flight.mute = False
+    flight.run(0.1)
+    pos, _ = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([60.0]))
+    np.testing.assert_allclose(pos[0], here, atol=1e-9)
+
+
+def test_silence_does_not_keep_it_in_the_air_for_ever_once_it_goes_home() -> None:
+    flight = controlled(Phase.GOTO_LAND)
+    flight.mute, flight.pos = True, START.copy()
+    assert Verb.LAND in flight.run(25.0)
+
+
+def test_in_silence_nobody_declares_itself_ready_or_lands_among_the_others() -> None:
+    on_its_way = controlled(Phase.GOTO_START)
+    on_its_way.mute, on_its_way.pos = True, START.copy()
+    on_its_way.run(5.0)
+    assert on_its_way.at == "GOTO_START"
+    on_its_way.mute = False
+    on_its_way.run(0.2)
+    assert on_its_way.at == "READY"
+    home = controlled(Phase.GOTO_LAND)
+    home.mute, home.pos = True, START.copy()
+    home.run(0.1)  # braking ends where it is
+    home.run(5.0)
+    assert home.at == "GOTO_LAND"
+
+
+def test_taking_over_in_silence_it_stays_where_it_is() -> None:
+    flight = Flight().until(Phase.GOTO_START)
+    flight.mute, flight.pos = True, START + np.array([3.0, 0.0, 0.0])
+    flight.run(0.5)
+    flight.flight_mode = FlightMode.EXTERNAL
+    flight.run(0.2)
+    pos, _ = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([60.0]))
+    np.testing.assert_allclose(pos[0], START + np.array([3.0, 0.0, 0.0]), atol=1e-9)
+
+
+# -- rebooted ---------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("phase", [Phase.ARM, Phase.TAKEOFF, *OURS])
+def test_after_a_reboot_of_its_autopilot_it_asks_for_nothing_any_more(phase: Phase) -> None:
+    flight = controlled(phase) if phase in OURS else Flight().until(phase)
+    flight.boots, flight.seen = 1, False  # no position yet
+    flight.run(0.2)
+    assert flight.sequence.outcome == REBOOTED
+    flight.seen, flight.armed, flight.flight_mode = True, False, FlightMode.HOLD
+    flight.landed = IN_AIR
+    assert flight.run(5.0) == []
+    flight.landed = ON_GROUND
+    assert flight.run(5.0) == []
+    assert (flight.at, flight.sequence.outcome) == ("DONE", REBOOTED)
+
+
+def test_a_reboot_before_anything_was_armed_costs_nothing() -> None:
+    flight = Flight()
+    flight.armable = False
+    flight.run(0.3)
+    flight.boots, flight.prepared, flight.armable = 1, False, True
+    assert flight.run(2.0) == [], "its parameters are not set again yet"
+    flight.prepared = True
+    assert Verb.ARM in flight.run(0.5)
+
+
+# -- before control ---------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("mode", "failsafe"),
+    [(FlightMode.RTL, True), (FlightMode.LAND, True), (FlightMode.HOLD, True), (FlightMode.MANUAL, False)],
+)
+def test_a_vehicle_found_in_a_failsafe_or_with_a_pilot_is_not_even_streamed_to(
+    mode: FlightMode, failsafe: bool
+) -> None:
+    flight = airborne()
+    flight.flight_mode, flight.failsafe = mode, failsafe
+    assert flight.run(5.0) == []
+    assert flight.phase < Phase.GOTO_START, "in which setpoints flow"
+    assert flight.sequence.yielded
+    flight.ask("resume")
+    assert Verb.EXTERNAL in flight.run(1.0)
+
+
+# -- brake and make room before an autopilot takes over ---------------------------------------------------------------
+
+CLOSE = START + np.array([0.6, 0.0, 0.0])
+
+
+def test_who_lands_where_it_is_goes_where_there_is_room_first() -> None:
+    flight = controlled(Phase.TRACK)
+    flight.pos, flight.others = START.copy(), (CLOSE,)
+    flight.judged = Mode.FOLLOW
+    flight.ask("land")
+    assert Verb.LAND not in flight.run(6.0)
+    pos, _ = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([60.0]))
+    assert np.linalg.norm((pos[0] - CLOSE)[:2]) == pytest.approx(0.9 + 0.2 + 0.1)
+    assert pos[0][2] == START[2]
+    flight.pos = pos[0]
+    assert Verb.LAND in flight.run(6.0)
+
+
+def test_below_is_no_room_and_those_above_each_other_part_in_different_directions() -> None:
+    low, high = START.copy(), START - np.array([0.0, 0.0, 3.0])
+    assert nearest_in_plane_m(low, [high]) == 0.0
+    apart = [room_for(low, [high], 1.2, own) - room_for(high, [low], 1.2, own + 1) for own in range(4)]
+    assert min(np.linalg.norm(gap[:2]) for gap in apart) > 1.2
+    crowd = [np.array([0.3 * k, 0.1 * k * k, -2.0]) for k in range(4)]
+    place = room_for(np.array([0.2, 0.2, -2.0]), crowd, 1.2, 5)
+    assert nearest_in_plane_m(place, crowd) > 1.1
+    np.testing.assert_array_equal(room_for(low, [], 1.2, 0), low)
+
+
+def test_without_room_for_too_long_it_lands_all_the_same() -> None:
+    flight = controlled(Phase.TRACK)
+    flight.pos, flight.others = START.copy(), (CLOSE,)
+    flight.ask("land")
+    assert Verb.LAND not in flight.run(19.0)
+    assert Verb.LAND in flight.run(3.0)
+
+
+def test_a_start_given_up_at_speed_brakes_before_the_autopilot_lands_it() -> None:
+    flight = controlled(Phase.GOTO_START)
+    flight.judged, flight.vel = Mode.FOLLOW, np.array([2.0, 0.0, 0.0])
+    while flight.phase is Phase.GOTO_START:
+        flight.step()
+    assert flight.at == "GOTO_LAND"
+    _, vel = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([0.0, 60.0]))
+    np.testing.assert_allclose(vel[1], 0.0)
+    assert "not tracking" in flight.sequence.outcome
+
+
+def test_only_without_a_plan_it_is_landed_at_once() -> None:
+    flight = controlled(Phase.TRACK)
+    flight.others, flight.judged = (CLOSE,), Mode.LAND
+    assert Verb.LAND in flight.run(0.3)
+
+
+def test_a_landing_place_not_reached_in_time_is_left_at_rest_and_with_room() -> None:
+    flight = controlled(Phase.GOTO_LAND)
+    flight.judged, flight.vel = Mode.FOLLOW, np.array([1.0, 0.0, 0.0])
+    assert Verb.LAND not in flight.run(21.0)
+    assert flight.at == "GOTO_LAND"
+    flight.vel = np.zeros(3)
+    assert Verb.LAND in flight.run(5.0)
+
+
+def test_handed_back_in_the_air_among_others_it_holds_only_at_rest_and_alone_at_once() -> None:
+    for others in (1, 0):
+        flight = Flight(others)
+        flight.armed, flight.pos, flight.landed = True, START.copy(), IN_AIR
+        flight.until(Phase.TRACK)
+        flight.judged, flight.vel = Mode.FOLLOW, np.array([2.0, 0.0, 0.0])
+        asked = flight.run(11.0)
+        assert (Verb.HOLD in asked) is (others == 0)

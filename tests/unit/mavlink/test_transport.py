@@ -1,0 +1,435 @@
+"""Byte links: what a URL may say, who owns a port, whom we answer, when a datagram came, where a frame ends."""
+
+from __future__ import annotations
+
+import os
+import pty
+import socket
+import time
+import tty
+from collections.abc import Iterator
+
+import pytest
+
+from swarmctl.core.clock import SimClock
+from swarmctl.errors import StartError
+from swarmctl.mavlink.transport import (
+    Endpoint,
+    SerialTransport,
+    TcpTransport,
+    UdpTransport,
+    bind_udp,
+    cut_frames,
+    open_transport,
+    parse_url,
+    pipe_pair,
+)
+
+SECOND = 1_000_000
+
+
+def frame(payload: bytes, signed: bool = False) -> bytes:
+    """A frame as far as its length goes."""
+    tail = b"\x11" * (15 if signed else 2)
+    return bytes([0xFD, len(payload), int(signed), 0, 0, 1, 1, 0, 0, 0]) + payload + tail
+
+
+@pytest.mark.parametrize(
+    ("url", "endpoint"),
+    [
+        ("udpin://0.0.0.0:14540", Endpoint("udpin", "0.0.0.0", 14540)),
+        ("udpout://px4.local:1", Endpoint("udpout", "px4.local", 1)),
+        ("udpin://127.0.0.1:65535", Endpoint("udpin", "127.0.0.1", 65535)),
+        ("tcp://127.0.0.1:5760", Endpoint("tcp", "127.0.0.1", 5760)),
+        ("serial:///dev/ttyACM0:57600", Endpoint("serial", "/dev/ttyACM0", 57600)),
+        ("serial:///dev/ttyS1:921600", Endpoint("serial", "/dev/ttyS1", 921600)),
+    ],
+)
+def test_urls(url: str, endpoint: Endpoint) -> None:
+    assert parse_url(url) == endpoint
+
+
+@pytest.mark.parametrize(
+    "url",
+    [
+        "",
+        "14540",
+        "udp://127.0.0.1:14540",
+        "tcp://127.0.0.1",
+        "tcpout://127.0.0.1:5760",
+        "udpin://127.0.0.1",
+        "udpin://:14540",
+        "udpin://127.0.0.1:0",
+        "udpout://127.0.0.1:65536",
+        "udpin://127.0.0.1:-1",
+        "udpin://127.0.0.1:14540/",
+        " udpin://127.0.0.1:14540",
+        "serial:///dev/ttyACM0",
+    ],
+)
+def test_bad_urls_are_refused_with_the_value_and_what_is_allowed(url: str) -> None:
+    with pytest.raises(ValueError, match=r"use udpin://|outside 1\.\.65535") as refused:
+        parse_url(url)
+    assert repr(url) in str(refused.value)
+
+
+@pytest.fixture
+def bound() -> Iterator[socket.socket]:
+    sock = bind_udp("127.0.0.1", 0)
+    yield sock
+    sock.close()
+
+
+def test_a_taken_port_is_refused_even_to_one_that_would_share(bound: socket.socket) -> None:
+    port = bound.getsockname()[1]
+    with pytest.raises(StartError, match=f"127.0.0.1:{port}"):
+        bind_udp("127.0.0.1", port)
+    with pytest.raises(StartError, match=f":{port}"):
+        open_transport(f"udpin://127.0.0.1:{port}")
+    thief = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    thief.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    thief.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEPORT, 1)
+    with pytest.raises(OSError, match="in use"):
+        thief.bind(("127.0.0.1", port))
+    thief.close()
+
+
+def test_a_host_that_is_not_ours_is_a_start_error() -> None:
+    with pytest.raises(StartError, match=r"192\.0\.2\.1"):
+        bind_udp("192.0.2.1", 14540)
+
+
+def wait_for(link: UdpTransport, count: int) -> list[bytes]:
+    got: list[bytes] = []
+    deadline = time.monotonic() + 2.0
+    while len(got) < count and time.monotonic() < deadline:
+        got += [d.data for d in link.receive(time.monotonic_ns() // 1000)]
+    return got
+
+
+def client() -> socket.socket:
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sock.bind(("127.0.0.1", 0))
+    sock.settimeout(1.0)
+    return sock
+
+
+def test_the_first_sender_is_the_peer_and_nobody_else_is_heard_or_answered(bound: socket.socket) -> None:
+    link = UdpTransport(bound)
+    vehicle, stranger = client(), client()
+    link.send(b"to nobody")  # no peer yet: dropped
+    vehicle.sendto(b"first", bound.getsockname())
+    assert wait_for(link, 1) == [b"first"]
+    stranger.sendto(b"intruder", bound.getsockname())
+    vehicle.sendto(b"second", bound.getsockname())
+    assert wait_for(link, 1) == [b"second"]
+    link.send(b"setpoint")
+    assert vehicle.recv(100) == b"setpoint"
+    stranger.settimeout(0.05)
+    with pytest.raises(TimeoutError):
+        stranger.recv(100)
+    vehicle.close()
+    stranger.close()
+
+
+def test_udpout_talks_first_and_hears_the_answer() -> None:
+    vehicle = client()
+    link = open_transport(f"udpout://127.0.0.1:{vehicle.getsockname()[1]}")
+    assert isinstance(link, UdpTransport)
+    link.send(b"hello")
+    data, sender = vehicle.recvfrom(100)
+    vehicle.sendto(b"state", ("127.0.0.1", sender[1]))
+    assert data == b"hello"
+    assert wait_for(link, 1) == [b"state"]
+    vehicle.close()
+    link.close()
+
+
+def test_who_speaks_first_does_so_from_the_same_port_at_every_start() -> None:
+    ports = []
+    for _ in range(2):
+        link = open_transport("udpout://127.0.0.1:14581")
+        assert isinstance(link, UdpTransport)
+        ports.append(socket.socket(fileno=os.dup(link.fd)).getsockname()[1])
+        link.close()
+    assert ports[0] == ports[1]
+    both = [open_transport("udpout://127.0.0.1:14581") for _ in range(2)]
+    for link in both:
+        link.close()
+
+
+def test_arrival_is_stamped_by_the_kernel_and_not_by_the_tick_that_drains(bound: socket.socket) -> None:
+    link = UdpTransport(bound)
+    vehicle = client()
+    sent_us = []
+    for _ in range(2):
+        sent_us.append(time.monotonic_ns() // 1000)
+        vehicle.sendto(b"x", bound.getsockname())
+        time.sleep(0.04)
+    now_us = time.monotonic_ns() // 1000
+    stamps_us = [d.t_us for d in link.receive(now_us)]
+    assert len(stamps_us) == 2
+    for stamp_us, expected_us in zip(stamps_us, sent_us, strict=True):
+        assert abs(stamp_us - expected_us) < 10_000
+    assert stamps_us[0] < stamps_us[1] < now_us
+    vehicle.close()
+
+
+def test_an_inherited_socket_is_used_as_it_is(bound: socket.socket) -> None:
+    link = open_transport("udpin://127.0.0.1:1", os.dup(bound.fileno()))
+    vehicle = client()
+    vehicle.sendto(b"x", bound.getsockname())
+    assert isinstance(link, UdpTransport)
+    assert wait_for(link, 1) == [b"x"]
+    link.close()
+    vehicle.close()
+
+
+def test_nobody_listening_is_not_an_error_of_the_tick() -> None:
+    gone = client()
+    link = open_transport(f"udpout://127.0.0.1:{gone.getsockname()[1]}")
+    gone.close()
+    for _ in range(3):
+        link.send(b"x")
+        assert link.receive(0) == []
+    link.close()
+
+
+def test_frames_are_cut_out_of_a_byte_stream_however_it_is_split() -> None:
+    frames = [frame(b"abc"), frame(b""), frame(b"signed", signed=True), frame(bytes(255))]
+    stream = b"".join(frames)
+    for size in (1, 2, 7, 100, len(stream)):
+        buffer, got = bytearray(), []
+        for start in range(0, len(stream), size):
+            buffer += stream[start : start + size]
+            got += cut_frames(buffer)
+        assert got == frames
+        assert not buffer
+
+
+def test_junk_before_and_between_frames_is_dropped() -> None:
+    good = frame(b"abc")
+    buffer = bytearray(b"\xfe\x01boot text\r\n" + good + b"\x00\x01" + good + b"tail")
+    assert cut_frames(buffer) == [good, good]
+    assert not buffer
+
+
+def test_a_stream_recovers_from_a_false_start() -> None:
+    good = frame(b"abcdefgh")  # 20 bytes
+    buffer = bytearray(b"\xfd\xff" + good * 100)
+    got = cut_frames(buffer)
+    assert got.count(good) >= 85  # one false length swallows at most 280 bytes: 14 frames
+    assert got[-1] == good
+
+
+def test_half_a_frame_waits_for_the_rest() -> None:
+    good = frame(b"abc")
+    buffer = bytearray(good[:-1])
+    assert cut_frames(buffer) == []
+    assert bytes(buffer) == good[:-1]
+    buffer += good[-1:]
+    assert cut_frames(buffer) == [good]
+
+
+def test_serial_hands_on_whole_frames() -> None:
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    link = SerialTransport(os.ttyname(slave), 57600)
+    good = frame(b"abc")
+    os.write(master, b"noise" + good + good[:5])
+    time.sleep(0.02)
+    assert [(d.t_us, d.data) for d in link.receive(77)] == [(77, good)]
+    os.write(master, good[5:])
+    time.sleep(0.02)
+    assert [d.data for d in link.receive(99)] == [good]
+    link.send(good)
+    assert os.read(master, 100) == good
+    link.close()
+    os.close(master)
+    os.close(slave)
+
+
+def test_a_missing_serial_device_is_a_start_error_with_its_name() -> None:
+    with pytest.raises(StartError, match="/dev/no-such-port at 57600"):
+        open_transport("serial:///dev/no-such-port:57600")
+
+
+def test_a_serial_port_that_is_unplugged_is_opened_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    name = os.ttyname(slave)
+    link = SerialTransport(name, 57600)
+    good = frame(b"abc")
+    port = link._port
+
+    def unplugged(size: int) -> bytes:
+        raise OSError("device disconnected")
+
+    monkeypatch.setattr(port, "read", unplugged)
+    assert link.receive(SECOND) == []
+    link.send(good)  # into nothing
+    assert link.receive(SECOND + 1) == []
+    assert link.receive(2 * SECOND) == []
+    assert link._port is None
+    assert link.receive(2 * SECOND + 1) == []
+    assert link._port is not None, "opened again a second later"
+    os.write(master, good)
+    time.sleep(0.02)
+    assert [d.data for d in link.receive(3 * SECOND)] == [good]
+    link.close()
+    os.close(master)
+    os.close(slave)
+
+
+def test_a_host_without_an_address_is_a_start_error() -> None:
+    for url in ("tcp://no-such-host.invalid:5760", "udpout://no-such-host.invalid:14540"):
+        with pytest.raises(StartError, match=r"no-such-host\.invalid has no IPv4 address"):
+            open_transport(url)
+
+
+def test_names_are_resolved_once_so_that_the_answer_is_known_for_the_peers() -> None:
+    vehicle = client()
+    link = open_transport(f"udpout://localhost:{vehicle.getsockname()[1]}")
+    assert isinstance(link, UdpTransport)
+    link.send(b"hello")
+    _, sender = vehicle.recvfrom(100)
+    vehicle.sendto(b"state", ("127.0.0.1", sender[1]))
+    assert wait_for(link, 1) == [b"state"]
+    vehicle.close()
+    link.close()
+
+
+# -- TCP --------------------------------------------------------------------------------------------------------------
+
+
+class Server:
+    """A listening autopilot; `link` has its connection in the first tick that finds it."""
+
+    def __init__(self, port: int = 0) -> None:
+        self.listener = socket.socket()
+        self.listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        self.listener.bind(("127.0.0.1", port))
+        self.listener.listen(1)
+        self.listener.settimeout(2.0)
+        self.port = int(self.listener.getsockname()[1])
+        self.peer: socket.socket | None = None
+
+    def accept(self) -> socket.socket:
+        self.peer, _ = self.listener.accept()
+        self.peer.settimeout(2.0)
+        return self.peer
+
+    def close(self) -> None:
+        if self.peer is not None:
+            self.peer.close()
+        self.listener.close()
+
+
+def drain(link: TcpTransport, now_us: int, count: int) -> list[bytes]:
+    got: list[bytes] = []
+    deadline = time.monotonic() + 2.0
+    while len(got) < count and time.monotonic() < deadline:
+        got += [d.data for d in link.receive(now_us)]
+    return got
+
+
+def tcp_link(port: int) -> TcpTransport:
+    link = open_transport(f"tcp://localhost:{port}")
+    assert isinstance(link, TcpTransport)
+    return link
+
+
+def test_tcp_carries_whole_frames_both_ways() -> None:
+    server = Server()
+    link = tcp_link(server.port)
+    assert link.receive(0) == []
+    peer = server.accept()
+    good = frame(b"abc")
+    peer.sendall(b"banner\r\n" + good + good[:7])
+    assert drain(link, 5, 1) == [good]
+    peer.sendall(good[7:])
+    assert drain(link, 6, 1) == [good]
+    link.send(good)
+    assert peer.recv(100) == good
+    link.close()
+    server.close()
+
+
+def test_tcp_comes_back_a_second_after_the_other_end_has_gone() -> None:
+    server = Server()
+    link = tcp_link(server.port)
+    link.receive(0)
+    peer = server.accept()
+    peer.sendall(frame(b"abc")[:6])
+    time.sleep(0.02)
+    link.receive(1)
+    server.close()
+    time.sleep(0.02)
+    assert link.receive(2) == []
+    link.send(b"into nothing")
+    again = Server(server.port)
+    assert link.receive(SECOND - 1) == []
+    link.receive(SECOND)
+    again.accept().sendall(frame(b"xyz"))
+    assert drain(link, SECOND + 1, 1) == [frame(b"xyz")], "half a frame of the old connection is forgotten"
+    link.close()
+    again.close()
+
+
+def test_tcp_that_nobody_listens_to_is_tried_again_and_never_blocks() -> None:
+    server = Server()
+    server.close()
+    link = tcp_link(server.port)
+    began = time.monotonic()
+    for k in range(100):
+        assert link.receive(k * 20_000) == []
+        link.send(frame(b"abc"))
+    assert time.monotonic() - began < 0.5
+    late = Server(server.port)
+    link.receive(10 * SECOND)
+    silent = late.accept()
+    assert link.receive(15 * SECOND + 1) == [], "connected but silent for too long: connected again"
+    assert silent.recv(1) == b""
+    late.accept().sendall(frame(b"abc"))
+    assert drain(link, 10 * SECOND + 1, 1) == [frame(b"abc")]
+    link.close()
+    late.close()
+
+
+def test_tcp_into_a_full_buffer_drops_whole_frames() -> None:
+    server = Server()
+    link = tcp_link(server.port)
+    link.receive(0)
+    peer = server.accept()
+    sent = [frame(bytes([k % 256]) * 200) for k in range(40_000)]
+    for data in sent:
+        link.send(data)
+    peer.setblocking(False)
+    buffer, got = bytearray(), []
+    for _ in range(1000):
+        try:
+            buffer += peer.recv(1 << 20)
+        except BlockingIOError:
+            link.send(frame(b"last"))
+            time.sleep(0.001)
+        got += cut_frames(buffer)
+        if got and got[-1] == frame(b"last"):
+            break
+    assert got[-1] == frame(b"last")
+    assert 10 < len(got) < len(sent), "some were dropped"
+    assert set(got) <= {*sent, frame(b"last")}, "none was torn"
+    link.close()
+    server.close()
+
+
+def test_pipe_delays_by_its_latency_in_both_directions() -> None:
+    clock = SimClock()
+    left, right = pipe_pair(clock.now_us, latency_us=30)
+    left.send(b"a")
+    right.send(b"b")
+    clock.advance(29)
+    assert right.receive(clock.now_us()) == left.receive(clock.now_us()) == []
+    clock.advance(1)
+    assert right.receive(clock.now_us()) == [(30, b"a")]
+    assert left.receive(clock.now_us()) == [(30, b"b")]
+    assert left.receive(clock.now_us()) == []

@@ -1,0 +1,293 @@
+"""What a link is asked for, once and again: rates, origin, parameters, also after a reboot; and what is refused."""
+
+from __future__ import annotations
+
+import re
+import struct
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import development as mavlink
+
+from swarmctl.core.clock import SimClock
+from swarmctl.core.types import Command, FlightMode, GeoOrigin, Landed, Verb
+from swarmctl.mavlink.autopilot import Autopilot
+from swarmctl.mavlink.codec import Codec, frames
+from swarmctl.mavlink.commands import CodecCommands
+from swarmctl.mavlink.transport import pipe_pair
+from swarmctl.mavlink.vehicle_setup import Upkeep
+
+HOME = GeoOrigin(47.397742, 8.545594, 489.4)
+PX4, ARDUCOPTER = 12, 3
+LEVEL = [1.0, 0.0, 0.0, 0.0]
+
+
+PX4_WITHOUT_AGENT = {"COM_OBL_RC_ACT": 4, "NAV_DLL_ACT": 3, "COM_DL_LOSS_T": 5}
+COPTER_WITHOUT_AGENT = {"FS_GCS_ENABLE": 5, "FS_GCS_TIMEOUT": 2.0, "ATC_ANGLE_BOOST": 0, "SYSID_MYGCS": 255}
+
+
+class Vehicle:
+    """A made-up autopilot at the far end: answers commands and parameters, streams what it was asked to."""
+
+    def __init__(self, autopilot: int = PX4, **params: float) -> None:
+        defaults = {
+            PX4: {**PX4_WITHOUT_AGENT, "MPC_THR_HOVER": 0.45, "THR_MDL_FAC": 0.0, "MPC_THR_MIN": 0.1, "MPC_THR_MAX": 1},
+            ARDUCOPTER: {"GUID_OPTIONS": 8, "GUID_TIMEOUT": 3.0, "MOT_THST_HOVER": 0.35, **COPTER_WITHOUT_AGENT},
+        }
+        self.autopilot, self.params = autopilot, {**defaults[autopilot], **params}
+        self.clock = SimClock()
+        self.ours, self.theirs = pipe_pair(self.clock.now_us)
+        self.codec = Codec(1, 1)
+        self.read_only = False
+        self.talks = self.answers_origin = True
+        self.boot()
+        self.pilot = Autopilot(self.ours, Codec(1, 191), 1, HOME, lambda frame: None)
+        self.port = CodecCommands(self.pilot.send_frame, Codec(1, 191), 1, lambda: self.pilot.dialect)
+        self.pilot.attach(self.port)
+        self.setup: dict[str, int | float] = {}
+        self.upkeep = Upkeep(self.pilot, self.port, self.setup, 1, 50.0)
+
+    def boot(self) -> None:
+        self.booted_us = self.clock.now_us()
+        self.rates_hz: dict[int, float] = {}
+        self.asked: list[tuple[int, float]] = []
+
+    def set_up(self, **setup: int | float) -> Vehicle:
+        self.upkeep = Upkeep(self.pilot, self.port, setup, 1, 50.0)
+        return self
+
+    @property
+    def stamp_us(self) -> int:
+        return self.clock.now_us() - self.booted_us + 1_000_000
+
+    def run(self, seconds: float) -> Vehicle:
+        for _ in range(round(seconds * 50)):
+            self._tick()
+            self.pilot.poll(self.clock.now_us())
+            self.port.step(self.clock.now_us())
+            for result in self.port.results():
+                self.upkeep.took(result)
+            self.upkeep.step(self.clock.now_us())
+            self.clock.advance(20_000)
+        return self
+
+    def say(self, message: Any) -> None:
+        if self.talks:
+            self.theirs.send(self.codec.encode(message))
+
+    def _tick(self) -> None:
+        for datagram in self.theirs.receive(self.clock.now_us()):
+            for frame in frames(datagram.data):
+                self._hear(self.codec.decode(frame))
+        if self.clock.now_us() % 1_000_000 == 0:
+            self.say(mavlink.MAVLink_heartbeat_message(2, self.autopilot, 1, 4 << 16 | 3 << 24, 3, 3))
+        nothing = [0.0] * 21
+        boot_ms = self.stamp_us // 1000
+        if 331 in self.rates_hz:
+            self.say(
+                mavlink.MAVLink_odometry_message(
+                    self.stamp_us, 1, 1, 0, 0, 0, LEVEL, 0, 0, 0, 0, 0, 0, nothing, nothing, 0, 2, 90
+                )
+            )
+        if 31 in self.rates_hz:
+            self.say(mavlink.MAVLink_attitude_quaternion_message(boot_ms, *LEVEL, 0, 0, 0))
+        if 32 in self.rates_hz:
+            self.say(mavlink.MAVLink_local_position_ned_message(boot_ms, 0, 0, 0, 0, 0, 0))
+
+    def _hear(self, message: Any) -> None:
+        kind = message.get_type()
+        if kind == "COMMAND_LONG":
+            self.asked.append((message.command, message.param1))
+            if message.command == 511:
+                self.rates_hz[int(message.param1)] = message.param2
+            self.say(mavlink.MAVLink_command_ack_message(message.command, 0))
+            if message.command == 512 and message.param1 == 49 and self.answers_origin:
+                lat, lon, alt = round(HOME.lat_deg * 1e7), round(HOME.lon_deg * 1e7), round(HOME.alt_m * 1e3)
+                self.say(mavlink.MAVLink_gps_global_origin_message(lat, lon, alt))
+        elif kind == "PARAM_SET" and message.param_id in self.params:
+            if not self.read_only:
+                self.params[message.param_id] = self._from_wire(message.param_id, message.param_value)
+            self._tell(message.param_id)
+        elif kind == "PARAM_REQUEST_READ" and message.param_id in self.params:
+            self._tell(message.param_id)
+        elif kind == "TIMESYNC" and message.tc1 == 0:
+            self.say(mavlink.MAVLink_timesync_message(self.stamp_us * 1000, message.ts1))
+
+    def _from_wire(self, name: str, value: float) -> float:
+        if self.autopilot == PX4 and isinstance(self.params[name], int):
+            return int(struct.unpack("<i", struct.pack("<f", value))[0])
+        return type(self.params[name])(value)
+
+    def _tell(self, name: str) -> None:
+        value = self.params[name]
+        whole = isinstance(value, int)
+        wire = struct.unpack("<f", struct.pack("<i", value))[0] if whole and self.autopilot == PX4 else float(value)
+        self.say(mavlink.MAVLink_param_value_message(name.encode(), wire, 6 if whole else 9, 1, 0))
+
+
+def rates(vehicle: Vehicle) -> set[int]:
+    return {int(first) for command, first in vehicle.asked if command == 511}
+
+
+def test_px4_is_set_up_in_two_seconds_and_left_alone_then() -> None:
+    vehicle = Vehicle(COM_OBL_RC_ACT=0).set_up(COM_OBL_RC_ACT=4).run(2.0)
+    assert vehicle.upkeep.ready
+    assert vehicle.upkeep.refusal == ""
+    assert rates(vehicle) == {331, 83, 245, 436, 230, 30, 31, 33, 105}
+    assert vehicle.params["COM_OBL_RC_ACT"] == vehicle.pilot.params["COM_OBL_RC_ACT"] == 4
+    assert vehicle.pilot.hover_thrust_01 == pytest.approx(0.45)
+    assert vehicle.pilot.offset_ned_m is not None
+    vehicle.asked.clear()
+    vehicle.run(10.0)
+    assert vehicle.asked == []
+
+
+def test_arducopter_is_asked_for_every_message_the_bridge_needs() -> None:
+    vehicle = Vehicle(ARDUCOPTER, GUID_OPTIONS=0).set_up(GUID_OPTIONS=8).run(30.0)  # unknown ones are met by silence
+    assert vehicle.upkeep.ready
+    assert vehicle.upkeep.refusal == ""
+    assert rates(vehicle) == {1, 24, 31, 32, 33, 83, 245}
+    assert vehicle.pilot.params["GUID_OPTIONS"] == 8.0
+    assert vehicle.params["SYSID_MYGCS"] == 1, "its link-loss failsafe heeds the agent's heartbeats"
+    assert vehicle.pilot.hover_thrust_01 == pytest.approx(0.35)
+    assert vehicle.pilot.poll(vehicle.clock.now_us()) is not None
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "why"),
+    [
+        (Vehicle(COM_OBL_RC_ACT=7).set_up(), "COM_OBL_RC_ACT = 7: motors would stop"),
+        (
+            Vehicle(ARDUCOPTER, GUID_OPTIONS=0).set_up(),
+            r"GUID_OPTIONS = 0: .*set agent\.autopilot_params\.GUID_OPTIONS = 8",
+        ),
+        (Vehicle(ARDUCOPTER, GUID_TIMEOUT=60.0).set_up(), "GUID_TIMEOUT = 60"),
+        (Vehicle(ARDUCOPTER, FS_GCS_ENABLE=0).set_up(), "FS_GCS_ENABLE = 0: .*drift"),
+        (Vehicle(ARDUCOPTER, FS_GCS_TIMEOUT=30.0).set_up(), "FS_GCS_TIMEOUT = 30"),
+        (Vehicle(ARDUCOPTER, ATC_ANGLE_BOOST=1).set_up(), "ATC_ANGLE_BOOST = 1"),
+    ],
+    ids=["motors stop", "climb rate", "flies on", "drifts on", "drifts long", "boost"],
+)
+def test_what_a_parameter_would_do_in_flight_is_refused_before_it(vehicle: Vehicle, why: str) -> None:
+    vehicle.run(12.0)
+    assert vehicle.upkeep.ready
+    assert re.search(why, vehicle.upkeep.refusal)
+
+
+def test_an_offboard_loss_action_that_could_not_be_set_or_read_is_refused() -> None:
+    stubborn = Vehicle(COM_OBL_RC_ACT=0)
+    stubborn.read_only = True
+    stubborn.set_up(COM_OBL_RC_ACT=4).run(4.0)
+    assert stubborn.upkeep.refusal == "COM_OBL_RC_ACT could not be set to 4: stays at 0"
+    silent = Vehicle()
+    del silent.params["COM_OBL_RC_ACT"]
+    silent.set_up().run(6.0)
+    assert silent.upkeep.refusal.startswith("COM_OBL_RC_ACT can't be read")
+    harmless = Vehicle().set_up(MPC_LAND_SPEED=0.5).run(6.0)
+    assert (harmless.upkeep.ready, harmless.upkeep.refusal) == (True, ""), "only what matters refuses"
+
+
+def test_a_whole_number_in_the_configuration_is_set_in_the_type_that_the_vehicle_keeps() -> None:
+    vehicle = Vehicle(COM_OF_LOSS_T=1.0, COM_OBL_RC_ACT=0).set_up(COM_OF_LOSS_T=10, COM_OBL_RC_ACT=4.0).run(4.0)
+    assert (vehicle.upkeep.ready, vehicle.upkeep.refusal) == (True, "")
+    assert (vehicle.params["COM_OF_LOSS_T"], vehicle.params["COM_OBL_RC_ACT"]) == (10.0, 4)
+
+
+def test_nothing_is_armed_when_a_parameter_that_is_there_could_not_be_set() -> None:
+    vehicle = Vehicle(MPC_LAND_SPEED=0.7)
+    vehicle.read_only = True
+    vehicle.set_up(MPC_LAND_SPEED=0.5).run(4.0)
+    assert vehicle.upkeep.refusal == "MPC_LAND_SPEED could not be set to 0.5: stays at 0.7"
+
+
+def test_px4_that_would_hover_for_ever_without_its_agent_is_refused() -> None:
+    assert "hover for ever" in Vehicle().set_up(NAV_DLL_ACT=0).run(4.0).upkeep.refusal
+    assert "COM_DL_LOSS_T = 60" in Vehicle().set_up(COM_DL_LOSS_T=60).run(4.0).upkeep.refusal
+    stubborn = Vehicle(NAV_DLL_ACT=0)
+    stubborn.read_only = True
+    assert "NAV_DLL_ACT could not be set to 3" in stubborn.set_up().run(4.0).upkeep.refusal
+    vehicle = Vehicle(NAV_DLL_ACT=0, COM_DL_LOSS_T=60).set_up().run(4.0)
+    assert (vehicle.params["NAV_DLL_ACT"], vehicle.params["COM_DL_LOSS_T"], vehicle.upkeep.refusal) == (3, 5, "")
+
+
+@pytest.mark.parametrize(
+    ("autopilot", "wanted", "came_with"),
+    [
+        (PX4, {"NAV_DLL_ACT": 3, "COM_OBL_RC_ACT": 4}, {"NAV_DLL_ACT": 0, "COM_OBL_RC_ACT": 4}),
+        (ARDUCOPTER, {"FS_GCS_ENABLE": 5}, {"FS_GCS_ENABLE": 0, "SYSID_MYGCS": 255}),
+    ],
+    ids=["PX4", "ArduCopter"],
+)
+def test_after_the_flight_parameters_are_what_they_were(
+    autopilot: int, wanted: dict[str, int], came_with: dict[str, int]
+) -> None:
+    vehicle = Vehicle(autopilot, **came_with).set_up(**wanted).run(30.0)
+    assert wanted.items() <= vehicle.params.items()
+    assert not vehicle.upkeep.restored
+    vehicle.upkeep.restore()
+    vehicle.run(3.0)
+    assert vehicle.upkeep.restored
+    assert came_with.items() <= vehicle.params.items()
+    assert vehicle.upkeep.left_changed == {}
+
+
+def test_a_parameter_that_could_not_be_set_back_is_named_with_its_value() -> None:
+    vehicle = Vehicle(NAV_DLL_ACT=0).set_up(NAV_DLL_ACT=3).run(4.0)
+    vehicle.read_only = True
+    vehicle.upkeep.restore()
+    vehicle.run(3.0)
+    assert (vehicle.upkeep.restored, vehicle.upkeep.left_changed) == (True, {"NAV_DLL_ACT": 0})
+
+
+def test_after_a_reboot_everything_is_asked_for_again() -> None:
+    vehicle = Vehicle(COM_OBL_RC_ACT=0).set_up(COM_OBL_RC_ACT=4).run(3.0)
+    vehicle.boot()
+    vehicle.params["COM_OBL_RC_ACT"] = 0
+    vehicle.rates_hz = {331: 30.0}  # PX4 streams by itself; its clock begins again
+    rebooted_us = vehicle.clock.now_us()
+    while vehicle.pilot.clock.boots == 0:
+        vehicle.run(0.02)
+    assert vehicle.clock.now_us() - rebooted_us <= 600_000
+    assert not vehicle.upkeep.ready
+    assert vehicle.pilot.clock.boots == 1
+    assert (vehicle.pilot.landed, vehicle.pilot.offset_ned_m) == (Landed.UNKNOWN, None)
+    vehicle.run(3.0)
+    assert vehicle.upkeep.ready
+    assert rates(vehicle) == {331, 83, 245, 436, 230, 30, 31, 33, 105}
+    assert vehicle.params["COM_OBL_RC_ACT"] == 4
+    assert vehicle.pilot.mode is FlightMode.HOLD
+
+
+def test_rates_that_were_lost_are_asked_for_again_but_a_silent_vehicle_is_not_shouted_at() -> None:
+    vehicle = Vehicle().set_up().run(5.0)
+    vehicle.talks = False
+    vehicle.run(24.0)  # what was asked at the very beginning of the silence is asked four times
+    vehicle.asked.clear()
+    vehicle.run(10.0)
+    assert vehicle.asked == []
+    vehicle.talks = True
+    vehicle.rates_hz.clear()  # back, without its rates and without a reboot
+    vehicle.run(9.0)
+    assert 331 in rates(vehicle)
+    assert vehicle.pilot.clock.boots == 0
+
+
+def test_the_origin_is_asked_for_until_it_is_told() -> None:
+    vehicle = Vehicle()
+    vehicle.answers_origin = False
+    vehicle.set_up().run(6.0)
+    assert vehicle.asked.count((512, 49.0)) >= 4
+    vehicle.answers_origin = True
+    vehicle.run(1.5)
+    assert vehicle.pilot.offset_ned_m is not None
+    vehicle.asked.clear()
+    vehicle.run(5.0)
+    assert vehicle.asked == []
+
+
+def test_upkeep_asks_one_thing_at_a_time_and_only_when_nobody_else_does() -> None:
+    vehicle = Vehicle().set_up()
+    vehicle.run(0.1)
+    vehicle.port.request(Command(Verb.LAND))
+    vehicle.run(0.2)
+    assert (21, 0.0) in [(command, 0.0) for command, _ in vehicle.asked[-6:]]

@@ -1,0 +1,249 @@
+"""The command line: quick help, exit codes, words instead of tracebacks, options that become overrides."""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from swarmctl.bus.topics import ObstacleMessage
+from swarmctl.errors import ConfigError, MissionError, StartError
+from swarmctl.ops import cli
+from swarmctl.ops import operator as attach
+
+Run = Callable[..., int]
+HEAVY = ("numpy", "scipy", "osqp", "zenoh", "rerun", "pyarrow", "pydantic", "mavsdk", "pymavlink", "psutil", "msgspec")
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch) -> Run:
+    def runner(*arguments: str) -> int:
+        monkeypatch.setattr(sys, "argv", ["swarmctl", *arguments])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        assert isinstance(ended.value.code, int)
+        return ended.value.code
+
+    return runner
+
+
+@pytest.fixture
+def nobody(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+
+
+def test_help_is_quick_and_imports_nothing_heavy() -> None:
+    code = (
+        "import sys; sys.argv = ['swarmctl', '--help']\n"
+        "import atexit; from swarmctl import cli\n"
+        f"atexit.register(lambda: print('heavy:', [m for m in {HEAVY!r} if m in sys.modules]))\ncli.main()"
+    )
+    times_s = []  # of the processor: what a loaded machine adds by waiting is not ours
+    for _ in range(3):
+        before = resource.getrusage(resource.RUSAGE_CHILDREN)
+        answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+        after = resource.getrusage(resource.RUSAGE_CHILDREN)
+        times_s.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
+        assert "heavy: []" in answer.stdout
+    assert min(times_s) < 0.4
+
+
+def test_every_verb_is_there_and_explains_itself(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    verbs = [
+        "launch",
+        "simulate",
+        "check",
+        "agent",
+        "status",
+        "hold",
+        "resume",
+        "land",
+        "rtl",
+        "view",
+        "replay",
+        "report",
+    ]
+    for verb in [*verbs, "obstacle"]:
+        assert run(verb, "--help") == 0
+        assert f"{verb} " in capsys.readouterr().out
+    for verb in ("add", "remove", "list"):
+        assert run("obstacle", verb, "--help") == 0
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [("lanch",), ("launch", "--agents", "x"), ("launch", "--nonsense"), ("agent",), ("launch", "a", "b"), ("replay",)],
+)
+def test_bad_usage_is_2(run: Run, capsys: pytest.CaptureFixture[str], arguments: tuple[str, ...]) -> None:
+    assert run(*arguments) == 2
+    assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("error", "code"), [(ConfigError("file", ["a", "b"]), 2), (StartError("no"), 3), (MissionError("hit"), 4)]
+)
+def test_expected_errors_are_words_and_their_exit_code(
+    run: Run, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, error: Exception, code: int
+) -> None:
+    def fail(*_: object) -> None:
+        raise error
+
+    monkeypatch.setattr(attach, "find_launch", fail)
+    assert run("status") == code
+    captured = capsys.readouterr()
+    assert captured.err == f"{error}\n"
+
+
+def test_unexpected_errors_keep_their_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
+    def fail(*_: object) -> None:
+        raise ZeroDivisionError("bug")
+
+    monkeypatch.setattr(attach, "find_launch", fail)
+    monkeypatch.setattr(sys, "argv", ["swarmctl", "status"])
+    with pytest.raises(ZeroDivisionError, match="bug"):
+        cli.main()
+
+
+@pytest.mark.parametrize("verb", ["status", "hold", "resume", "land", "rtl", "view"])
+@pytest.mark.usefixtures("nobody")
+def test_without_a_launch_operator_verbs_are_3(run: Run, capsys: pytest.CaptureFixture[str], verb: str) -> None:
+    assert run(verb) == 3
+    assert "swarmctl launch" in capsys.readouterr().err
+
+
+def test_a_run_folder_without_a_launch_is_3(run: Run, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert run("land", "--run-dir", str(tmp_path)) == 3
+    assert str(tmp_path) in capsys.readouterr().err
+
+
+def test_options_override_sets_and_simulate_passes_everything_on(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert cli._overrides(4, 5.5, 6, ["swarm.agents=2", "a=b"]) == [
+        "swarm.agents=2",
+        "a=b",
+        "swarm.agents=4",
+        "mission.duration_s=5.5",
+        "seed=6",
+    ]
+    passed: list[tuple[str, list[str]]] = []
+    monkeypatch.setattr(os, "execv", lambda program, arguments: passed.append((program, arguments)))
+    assert run("simulate", "a.toml", "--agents", "4", "--seed", "6", "--set", "a=b", "--set", "c=d", "--no-view") == 0
+    module = [sys.executable, "-m", "sitl.simulate"]
+    assert passed == [
+        (sys.executable, [*module, "a.toml", "--agents=4", "--seed=6", "--set=a=b", "--set=c=d", "--no-view"])
+    ]
+
+
+def test_a_reader_that_goes_away_does_not_change_the_exit_code() -> None:
+    code = (
+        "import sys; from swarmctl import cli, table\n"
+        "cli._run_app = lambda: table.PlainLines(sys.stdout).say('landed') or 4\ncli.main()"
+    )
+    process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
+    assert process.stdout is not None
+    process.stdout.close()
+    assert process.wait(60) == 4
+
+
+def test_obstacles_are_read_strictly() -> None:
+    ball = attach.obstacle("1.5,0,-2", 0.5, 1.0, 3.0, "0,0,0.1")
+    assert ball == ObstacleMessage((1.5, 0.0, -2.0), 0.5, 1.0, 3.0, (0.0, 0.0, 0.1))
+    assert attach.obstacle("1.5,0,-2", 0.5, 1.0, 3.0, "0,0,0.1", column=True).column
+    with pytest.raises(ConfigError) as caught:
+        attach.obstacle("1,2", -1.0, float("nan"), 3.0, "0,inf,0")
+    assert len(caught.value.problems) == 4
+    assert attach.without((ball, ball), 1) == (ball,)
+    with pytest.raises(ConfigError, match="there are 1"):
+        attach.without((ball,), 1)
+
+
+def test_the_registry_knows_live_launches_and_forgets_dead_ones(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    registry, folder = tmp_path / f"swarmctl-{os.getuid()}", tmp_path / "run"
+    folder.mkdir()
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    started_s, pid = attach.process_start_s()
+    launch = attach.RunningLaunch("run", "unixsock-stream//x", pid, started_s, 3, str(folder))
+    attach.announce(launch)
+    assert registry.stat().st_mode & 0o777 == 0o700
+    assert attach.find_launch(None) == launch
+    assert attach.find_launch(folder) == launch
+    attach.announce(attach.RunningLaunch("reused pid", "unixsock-stream//x", pid, started_s - 60, 3, str(folder)))
+    with pytest.raises(StartError):
+        attach.find_launch(folder)
+    with pytest.raises(StartError):
+        attach.find_launch(None)
+    assert list(registry.iterdir()) == []
+
+
+def squat_open(place: Path) -> None:
+    place.mkdir()
+    place.chmod(0o777)
+
+
+def squat_of_another(place: Path) -> None:
+    place.mkdir(mode=0o700)
+    os.chown(place, 12345, 12345)
+
+
+def squat_file(place: Path) -> None:
+    place.write_text("")
+
+
+def squat_link(place: Path) -> None:
+    (place.parent / "elsewhere").mkdir(mode=0o700)
+    place.symlink_to(place.parent / "elsewhere")
+
+
+@pytest.mark.parametrize("squat", [squat_open, squat_of_another, squat_file, squat_link])
+@pytest.mark.parametrize("at_launch", [True, False], ids=["runtime directory at launch", "none at launch"])
+@pytest.mark.parametrize("at_verb", [True, False], ids=["runtime directory at the verb", "none at the verb"])
+def test_a_launch_and_its_verbs_find_each_other_whoever_takes_the_name_first(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, squat: Callable[[Path], None], at_launch: bool, at_verb: bool
+) -> None:
+    temporary, runtime, folder = tmp_path / "tmp", tmp_path / "runtime", tmp_path / "run"
+    for place in (temporary, runtime, folder):
+        place.mkdir(mode=0o700)
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    if squat is squat_of_another and os.getuid() != 0:
+        pytest.skip("only root can give a directory away")
+    squat(temporary / f"swarmctl-{os.getuid()}")
+    started_s, pid = attach.process_start_s()
+    launch = attach.RunningLaunch("run", "unixsock-stream//x", pid, started_s, 3, str(folder))
+    forged = attach.RunningLaunch("forged", "unixsock-stream//evil", pid, started_s + 0.5, 3, str(folder))
+    if squat is not squat_file:
+        (temporary / f"swarmctl-{os.getuid()}" / "1.json").write_bytes(msgspec.json.encode(forged))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime) if at_launch else "")
+    attach.announce(launch)
+    attach.announce(launch)
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime) if at_verb else "")
+    assert attach.find_launch(None) == launch
+    attach.withdraw()
+    if at_launch == at_verb:
+        with pytest.raises(StartError):
+            attach.find_launch(None)
+    assert len(list(temporary.glob("swarmctl-*"))) == 2, "one more, not one each time"
+
+
+def test_a_runtime_directory_of_somebody_else_is_not_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """As after `su` or `sudo -E`."""
+    temporary, runtime, folder = tmp_path / "tmp", tmp_path / "runtime", tmp_path / "run"
+    for place in (temporary, runtime, folder):
+        place.mkdir(mode=0o700)
+    runtime.chmod(0o755)
+    monkeypatch.setattr(tempfile, "tempdir", str(temporary))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
+    started_s, pid = attach.process_start_s()
+    launch = attach.RunningLaunch("run", "unixsock-stream//x", pid, started_s, 3, str(folder))
+    attach.announce(launch)
+    assert list(runtime.iterdir()) == []
+    assert attach.find_launch(None) == launch

@@ -1,0 +1,201 @@
+"""The parts of a campaign that fly nothing: judging, intervals, layouts, the folder, what is refused."""
+
+from __future__ import annotations
+
+import itertools
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.stats import binomtest
+
+from sitl.lockstep import Lockstep
+from sitl.studies.campaign.collision_monitor import Solid, Umpire
+from sitl.studies.campaign.command import main
+from sitl.studies.campaign.events import Appearance
+from sitl.studies.campaign.factors import NOISES, PROTECTIONS
+from sitl.studies.campaign.flight import config_of
+from sitl.studies.campaign.intervals import clopper_pearson
+from sitl.studies.campaign.layouts import least_sum_m
+from sitl.studies.campaign.scenarios import SCENARIOS, layout_of
+from sitl.studies.campaign.store import Store
+from sitl.studies.campaign.trials import SCHEMA, Cell, Row, Trial, cells
+from sitl.studies.campaign.worker_pool import on_cluster, on_this_machine
+from swarmctl.bus import topics
+from swarmctl.bus.peers import LEASE_US, LocalHub, agent_name
+from swarmctl.config import load
+from swarmctl.errors import ConfigError, StartError
+
+CELL = Cell("swap", 3, 0.0, 0.0, "exact", 0.0, "default")
+REST = np.zeros((2, 3))
+
+
+def row_of(trial: Trial, code: str = "this") -> Row:
+    cell = {name: getattr(trial.cell, name) for name in Cell.__dataclass_fields__}
+    return dict.fromkeys(SCHEMA.names) | cell | {"seed": trial.seed, "code": code}
+
+
+def umpire(goals: np.ndarray | None = None) -> Umpire:
+    return Umpire(0.5, goals, 0.1, np.array([True, True]))
+
+
+@pytest.mark.parametrize(("hits", "trials"), [(0, 1), (1, 1), (0, 100), (3, 100), (50, 100), (100, 100), (7, 20)])
+def test_intervals_are_those_of_scipy(hits: int, trials: int) -> None:
+    exact = binomtest(hits, trials).proportion_ci(0.95, method="exact")
+    assert clopper_pearson(hits, trials) == pytest.approx((exact.low, exact.high), abs=1e-9)
+
+
+def test_bodies_that_pass_between_two_samples_have_touched() -> None:
+    judge = umpire()
+    judge.see(0.0, np.array([[-1.0, 0.0, 0.0], [1.0, 0.1, 0.0]]), REST)
+    assert not judge.collided
+    judge.see(0.02, np.array([[1.0, 0.0, 0.0], [-1.0, 0.1, 0.0]]), REST)
+    assert judge.collided
+    assert judge.min_separation_m == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(("column", "collided"), [(True, True), (False, False)])
+def test_a_column_is_in_the_way_at_every_height(column: bool, collided: bool) -> None:
+    judge = umpire()
+    solid = Solid(np.array([0.0, 0.0, 5.0]), 0.3, column)
+    for x in (-2.0, 2.0):  # 0.5 m beside the axis: the hull's 0.25 m and the column's 0.3 m meet
+        judge.see(x, np.array([[x, 0.5, 0.0], [x, 9.0, 0.0]]), REST, [solid])
+    assert judge.collided is collided
+    assert judge.min_separation_m > 8.0
+
+
+def test_who_leaves_again_has_not_arrived() -> None:
+    judge = umpire(np.zeros((2, 3)))
+    there = np.zeros((2, 3))
+    judge.see(1.0, there, REST)
+    assert judge.arrived_s == 1.0
+    judge.see(2.0, there + 0.2, REST)
+    assert judge.arrived_s == np.inf
+    judge.see(3.0, there, REST)
+    assert judge.arrived_s == 3.0
+    judge.see(4.0, there, REST + 0.5)
+    assert judge.arrived_s == np.inf, "passing through"
+
+
+def test_who_stands_still_is_told_from_who_creeps() -> None:
+    judge = umpire(np.zeros((2, 3)))
+    for tick in range(200):
+        judge.see(0.02 * tick, np.array([[1.0, 0.0, 0.0], [0.05 * 0.02 * tick, 3.0, 0.0]]), REST)
+    assert judge.standing().tolist() == [True, False]
+
+
+@pytest.mark.parametrize(
+    ("goal_m", "speed_m_s", "appears"),
+    [(4.0, 0.0, True), (3.0, 0.0, False), (3.0, 0.5, True)],
+    ids=["clear", "on it", "passes"],
+)
+def test_what_stays_never_appears_where_somebody_is_to_arrive(goal_m: float, speed_m_s: float, appears: bool) -> None:
+    """2.5 m before a vehicle that flies north; one metre is kept from it."""
+    goals = np.array([[goal_m, 0.0, 0.0]])
+    appearance = Appearance(0, 1.0, 2.5, 2.2, 0.5, 1.0, speed_m_s, 1, goals)
+    lockstep = Lockstep(load(None, ["swarm.agents=1"]))
+    for t_s in (0.9, 1.1):
+        appearance.step(lockstep, t_s, np.zeros((1, 3)), np.array([[2.0, 0.0, 0.0]]))
+        assert bool(appearance.solids(t_s)) is (appears and t_s > 1.0)
+
+
+@pytest.mark.parametrize("scenario", SCENARIOS)
+def test_every_scenario_is_a_valid_configuration(scenario: str) -> None:
+    agents = max(SCENARIOS[scenario].agents)
+    for seed, noise, protections in ((1, "exact", "default"), (2, "external", "off")):
+        cell = Cell(scenario, agents, 50.0, 0.1, noise, 8.0, protections)
+        layout = layout_of(scenario, seed, agents)
+        config = config_of(cell, seed, layout, agents)
+        assert config.sitl.start == "air"
+        assert config.bus.delay_ms == 50.0
+        apart = [np.linalg.norm(a - b) for a, b in itertools.combinations(layout.starts_ned_m, 2)]
+        assert min(apart) >= config.separation.radius_m
+        if scenario == "forest":
+            assert all(o.keep_out_m - config.separation.certify_slack_m > o.radius_m + 0.075 for o in config.obstacles)
+
+
+@pytest.mark.parametrize("protections", PROTECTIONS)
+def test_a_seed_draws_the_same_layout_under_all_conditions(protections: str) -> None:
+    cell = Cell("random", 6, 0.0, 0.0, "exact", 0.0, protections)
+    drawn = [layout_of("random", seed, 6) for seed in (5, 5, 6)]
+    assert np.array_equal(drawn[0].starts_ned_m, drawn[1].starts_ned_m)
+    assert not np.array_equal(drawn[0].starts_ned_m, drawn[2].starts_ned_m)
+    assert config_of(cell, 5, drawn[0], 6).starts_ned_m() == tuple(map(tuple, drawn[0].starts_ned_m.tolist()))
+
+
+def test_radii_grow_with_the_noise() -> None:
+    layout = layout_of("swap", 1, 3)
+    radii = [config_of(Cell("swap", 3, 0, 0, n, 0, "default"), 1, layout, 3).separation.radius_m for n in NOISES]
+    assert radii == pytest.approx([0.9, 0.9, 1.19])
+
+
+def test_the_least_sum_of_three_and_seven() -> None:
+    assert least_sum_m(3, 1.0) == pytest.approx(3.0 / np.sqrt(3.0), abs=1e-3)  # a triangle
+    assert least_sum_m(7, 1.0) == pytest.approx(6.0, abs=1e-3)  # one in the middle of a hexagon
+
+
+def test_finished_runs_are_not_flown_again(tmp_path: Path) -> None:
+    trials = [
+        Trial(cell, seed) for cell in cells(["swap"], [2, 3], [0, 50], [0], ["exact"], [0], ["off"]) for seed in (1, 2)
+    ]
+    with Store(tmp_path, "this") as store:
+        assert store.missing(trials) == trials
+        for trial in trials[:5]:
+            store.add(row_of(trial))
+    assert Store(tmp_path, "this").missing(trials) == trials[5:]
+    with pytest.raises(ConfigError, match="flown by other sources"):
+        Store(tmp_path, "that")
+    assert Store(tmp_path, "that", mix=True).missing(trials) == trials[5:]
+
+
+def broken(trial: Trial) -> Row:
+    if trial.seed == 2:
+        raise RuntimeError("no such luck")
+    return row_of(trial)
+
+
+def test_a_trial_that_breaks_is_told_and_the_others_go_on() -> None:
+    trials = [Trial(CELL, seed) for seed in (1, 2, 3)]
+    results = dict(on_this_machine(trials, 1, broken))
+    assert results[trials[1]] == "RuntimeError: no such luck"
+    assert [results[trials[i]]["seed"] for i in (0, 2)] == [1, 3]  # type: ignore[index]
+
+
+def test_no_cluster_is_refused_in_words() -> None:
+    with pytest.raises(StartError, match=r"--dask"):
+        list(on_cluster([Trial(CELL, 1)], "127.0.0.1:1"))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "said"),
+    [
+        (["--set", "separation.radious_m=1"], "did you mean 'radius_m'"),
+        (["--agents", "1"], "needs at least 2"),
+        (["--scenario", "maze", "--agents", "60"], "would wait"),
+    ],
+)
+def test_cells_that_cannot_be_flown_are_refused_first(
+    arguments: list[str], said: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*arguments, "--out", str(tmp_path / "none")]) == 2
+    assert said in capsys.readouterr().err
+    assert not (tmp_path / "none").exists()
+
+
+def test_nobody_hears_anybody_on_a_mute_bus() -> None:
+    now_us = 0
+    hub = LocalHub(lambda: now_us)
+    one, other = hub.attach(agent_name(0)), hub.attach(agent_name(1))
+    hub.mute()
+    one.publish(topics.PATH, b"lost")
+    one.publish(topics.COMMAND, b"kept")
+    now_us = LEASE_US - 1
+    assert other.receive(topics.PATH) == other.receive(topics.COMMAND) == []
+    assert one.alive() == {"agent-0", "agent-1"}
+    now_us = LEASE_US
+    assert one.alive() == frozenset()
+    hub.unmute()
+    now_us += 1
+    assert one.alive() == {"agent-0", "agent-1"}
+    assert other.receive(topics.PATH) == []
+    assert other.receive(topics.COMMAND) == [("agent-0", b"kept")]

@@ -1,0 +1,416 @@
+"""The MAVLink face: addressing, streams, requests, parameters, texts, hostile bytes, local origins, determinism."""
+
+from __future__ import annotations
+
+import math
+import struct
+from typing import Any
+
+import numpy as np
+import pymap3d
+import pytest
+from pymavlink.dialects.v20 import development as mav
+
+from sitl.plant.sensors import local_origin
+from sitl.px4.link.schedule import OFFBOARD_HZ, Schedule
+from sitl.px4.link.streams_health import STREAMS
+from sitl.px4.parameters import DEFAULTS, INT32, REAL32, Parameters, int_from_wire, int_to_wire
+from sitl.world import SitlParams, SitlWorld, line_of_spawns
+from swarmctl.core.clock import SimClock
+from swarmctl.core.types import GeoOrigin
+from swarmctl.errors import ConfigError
+from swarmctl.mavlink.codec import Codec, frames
+from swarmctl.mavlink.transport import pipe_pair
+
+ORIGIN = GeoOrigin(47.397742, 8.545594, 489.4)
+NAN = math.nan
+
+
+class Client:
+    """The client ends of a world's links."""
+
+    def __init__(self, vehicles: int = 1, run_s: float = 0.2, ekf_ready_s: float = 0.1, **params: Any) -> None:
+        self.clock = SimClock()
+        pairs = [pipe_pair(self.clock.now_us) for _ in range(vehicles)]
+        self.links = [client_end for _, client_end in pairs]
+        spawns = params.pop("spawn_ned_m", line_of_spawns(vehicles))
+        sitl_params = SitlParams(vehicles, spawns, ekf_ready_s=ekf_ready_s, **params)
+        self.world = SitlWorld(sitl_params, [vehicle_end for vehicle_end, _ in pairs])
+        self.codec = Codec(1, 191)
+        self.run(run_s)
+
+    def run(self, seconds: float, vehicle: int = 0) -> list[Any]:
+        """Messages of one vehicle during that time."""
+        got: list[Any] = []
+        for _ in range(round(seconds * 250)):
+            self.clock.advance(4000)
+            self.world.step(self.clock.now_us())
+        for i, link in enumerate(self.links):
+            for datagram in link.receive(self.clock.now_us()):
+                if i == vehicle:
+                    got += [self.codec.decode(f) for f in frames(datagram.data)]
+        return [m for m in got if m is not None]  # what the dialect module lacks is test_sitl_wire's
+
+    def ask(self, message: Any, vehicle: int = 0) -> list[Any]:
+        self.links[vehicle].send(self.codec.encode(message))
+        return self.run(0.004, vehicle)
+
+    def command(self, number: int, *params: float, target: tuple[int, int] = (1, 1)) -> list[Any]:
+        padded = [*params, *[0.0] * (7 - len(params))]
+        return self.ask(mav.MAVLink_command_long_message(*target, number, 0, *padded))
+
+
+def of(kind: str, messages: list[Any]) -> list[Any]:
+    return [m for m in messages if m.get_type() == kind]
+
+
+def result(messages: list[Any]) -> int | None:
+    acks = of("COMMAND_ACK", messages)
+    return acks[0].result if acks else None
+
+
+# --- addressing ---
+
+
+@pytest.mark.parametrize(("target", "answered"), [((1, 1), True), ((0, 0), True), ((1, 0), True), ((2, 1), False)])
+def test_only_the_addressed_answer(target: tuple[int, int], answered: bool) -> None:
+    assert (result(Client().command(400, 1, target=target)) is not None) == answered
+
+
+def test_another_component_is_ignored() -> None:
+    client = Client()
+    assert result(client.command(400, 1, target=(1, 250))) is None
+    assert not client.world.autopilots[0].armed
+
+
+def test_acks_go_to_the_sender() -> None:
+    (ack,) = of("COMMAND_ACK", Client().command(12345))
+    assert (ack.result, ack.target_system, ack.target_component) == (3, 1, 191)
+
+
+@pytest.mark.parametrize("command", [410, 520, 34, 31010])
+def test_unknown_commands_are_unsupported(command: int) -> None:
+    assert result(Client().command(command, NAN, NAN, NAN, NAN, NAN, NAN, NAN)) == 3
+
+
+def test_command_int_and_set_mode_are_understood() -> None:
+    client = Client()
+    arm = mav.MAVLink_command_int_message(1, 1, 0, 400, 0, 0, 1.0, 0, 0, 0, 0, 0, 0)
+    assert result(client.ask(arm)) == 0
+    (ack,) = of("COMMAND_ACK", client.ask(mav.MAVLink_set_mode_message(1, 1, 4 << 16 | 3 << 24)))
+    assert (ack.command, ack.result) == (176, 0)
+
+
+def test_heartbeats_keep_their_tick_whoever_talks() -> None:
+    client = Client()
+    got = client.ask(mav.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
+    assert not of("HEARTBEAT", got)
+    (beat,) = of("HEARTBEAT", client.run(1.0))
+    assert (beat.type, beat.autopilot, beat.base_mode, beat.custom_mode, beat.system_status) == (
+        2,
+        12,
+        29,
+        0x03040000,
+        3,
+    )
+
+
+# --- streams ---
+
+
+def test_default_rates_are_those_of_the_offboard_link() -> None:
+    got = Client().run(4.0)
+    for message in STREAMS.keys() & mav.mavlink_map.keys():
+        name = mav.mavlink_map[message].msgname
+        assert len(of(name, got)) == pytest.approx(4.0 * OFFBOARD_HZ.get(message, 0.0), abs=1.01), name
+
+
+@pytest.mark.parametrize(("interval_us", "per_second"), [(10000, 100), (20000, 50), (-1, 0), (0, 30), (1, 250)])
+def test_message_intervals(interval_us: int, per_second: int) -> None:
+    client = Client()
+    assert result(client.command(511, 331, interval_us)) == 0
+    assert len(of("ODOMETRY", client.run(2.0))) == pytest.approx(2 * per_second, abs=1)
+
+
+@pytest.mark.parametrize("params", [(9999, 10000), (NAN, 10000), (331, NAN), (math.inf, 1), (331, math.inf)])
+def test_impossible_intervals_fail(params: tuple[float, float]) -> None:
+    assert result(Client().command(511, *params)) == 4
+
+
+def test_odometry_samples_lie_on_the_agents_grid() -> None:
+    client = Client()
+    client.command(511, 331, 20000)
+    assert {m.time_usec % 20000 for m in of("ODOMETRY", client.run(1.0))} == {0}
+
+
+def test_a_late_schedule_sends_once_and_keeps_its_grid() -> None:
+    schedule = Schedule(4000)
+    for message in OFFBOARD_HZ:
+        schedule.set_interval(message, -1, 0)
+    schedule.set_interval(331, 10000, 0)
+    assert schedule.take_due(0) == [331]
+    assert schedule.take_due(95000) == [331]
+    assert schedule.take_due(99000) == []
+    assert schedule.take_due(100000) == [331]
+    schedule.set_interval(331, 1, 100000)
+    assert schedule.interval_us(331) == 4000  # never faster than the physics
+
+
+def test_odometry_carries_ned_velocity_and_boot_time() -> None:
+    client = Client()
+    client.world.plant.state[10:13, 0] = 1.0, 2.0, -3.0
+    yaw = math.radians(90)
+    client.world.plant.state[:4, 0] = math.cos(yaw / 2), 0, 0, math.sin(yaw / 2)
+    client.world.plant.state[7, 0] = 2.0  # forward, that is east
+    m = of("ODOMETRY", client.run(0.1))[0]
+    assert (m.frame_id, m.child_frame_id) == (1, 1)
+    assert m.vy == pytest.approx(2.0, abs=0.02)
+    assert m.vx == pytest.approx(0.0, abs=0.02)
+    assert m.x == pytest.approx(1.0, abs=0.05)
+    assert 0.2e6 < m.time_usec <= 0.3e6
+    assert m.q == pytest.approx([math.sqrt(0.5), 0, 0, math.sqrt(0.5)], abs=1e-6)
+
+
+def test_positions_wait_for_the_estimator() -> None:
+    client = Client(run_s=0.004, ekf_ready_s=0.5)
+    early = client.run(0.4)
+    assert not of("ODOMETRY", early)
+    assert not of("GPS_GLOBAL_ORIGIN", early)
+    late = client.run(0.4)
+    assert of("ODOMETRY", late)
+    assert len(of("GPS_GLOBAL_ORIGIN", late)) == 1
+
+
+def test_health_shows_when_arming_would_be_accepted() -> None:
+    client = Client(run_s=0.004, ekf_ready_s=0.5)
+    (first, *_) = of("SYS_STATUS", client.run(0.4))
+    assert not first.onboard_control_sensors_health & 0x10000000
+    ready = of("SYS_STATUS", client.run(1.5))[-1]
+    assert ready.onboard_control_sensors_health == 0x1320C83F
+    assert ready.onboard_control_sensors_present == 0x0300C02F
+
+
+@pytest.mark.parametrize(("message", "name"), [(148, "AUTOPILOT_VERSION"), (242, "HOME_POSITION")])
+def test_requested_messages(message: int, name: str) -> None:
+    got = Client().command(512, message)
+    assert result(got) == 0
+    assert of(name, got)
+
+
+def test_timesync_and_ping_are_answered() -> None:
+    client = Client()
+    (sync,) = of("TIMESYNC", client.ask(mav.MAVLink_timesync_message(0, 4242)))
+    assert sync.ts1 == 4242
+    assert sync.tc1 == pytest.approx(0.204e9, abs=1e7)
+    assert not of("TIMESYNC", client.ask(mav.MAVLink_timesync_message(5, 4242)))
+    (ping,) = of("PING", client.ask(mav.MAVLink_ping_message(77, 3, 0, 0)))
+    assert (ping.seq, ping.target_system, ping.target_component) == (3, 1, 191)
+
+
+def test_texts_go_to_ground_stations_only() -> None:
+    companion = Client()
+    companion.ask(mav.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
+    assert not of("STATUSTEXT", companion.command(400, 1) + companion.run(0.5))
+    station = Client()
+    station.ask(mav.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3))
+    got = station.command(400, 5) + station.command(400, 1) + station.run(0.5)
+    texts = [m.text for m in of("STATUSTEXT", got)]
+    assert texts == [
+        "Unsupported ARM_DISARM param: 5.000\t",
+        "Armed by external command\t",
+        "[logger] ./log/2026-01-01/00_00_00.ulg\t",
+    ]
+
+
+def test_old_texts_are_dropped() -> None:
+    client = Client()
+    client.command(400, 1)
+    client.run(5.5)
+    client.ask(mav.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3))
+    assert not of("STATUSTEXT", client.run(0.5))
+
+
+# --- parameters ---
+
+
+def test_integers_travel_bytewise() -> None:
+    for value in (0, 1, -1, 4, 894281, -(2**31)):
+        assert struct.unpack("<i", struct.pack("<f", int_to_wire(value)))[0] == value
+        assert int_from_wire(int_to_wire(value)) == value
+
+
+def test_parameter_list_is_complete() -> None:
+    client = Client()
+    client.ask(mav.MAVLink_param_request_list_message(1, 1))
+    values = of("PARAM_VALUE", client.run(0.5))
+    assert {m.param_index for m in values} | {0, 1, 2, 3} == set(range(len(DEFAULTS)))
+    assert {m.param_count for m in values} == {len(DEFAULTS)}
+    sysid = next(m for m in values if m.param_id == "MAV_SYS_ID")
+    assert (int_from_wire(sysid.param_value), sysid.param_type) == (1, INT32)
+
+
+def test_parameters_are_set_and_read_back() -> None:
+    client = Client()
+    set_int = mav.MAVLink_param_set_message(1, 1, b"COM_OBL_RC_ACT", int_to_wire(4), INT32)
+    (value,) = of("PARAM_VALUE", client.ask(set_int))
+    assert int_from_wire(value.param_value) == 4
+    assert client.world.autopilots[0].parameters.integer("COM_OBL_RC_ACT") == 4
+    (value,) = of("PARAM_VALUE", client.ask(mav.MAVLink_param_request_read_message(1, 1, b"COM_OF_LOSS_T", -1)))
+    assert (value.param_value, value.param_type) == (1.0, REAL32)
+
+
+@pytest.mark.parametrize(
+    ("name", "kind", "error"), [(b"NO_SUCH", REAL32, 1), (b"COM_OF_LOSS_T", INT32, 7), (b"COM_OBL_RC_ACT", REAL32, 7)]
+)
+def test_bad_parameter_writes_are_refused(name: bytes, kind: int, error: int) -> None:
+    client = Client()
+    got = client.ask(mav.MAVLink_param_set_message(1, 1, name, 0.25, kind))
+    (refusal,) = of("PARAM_ERROR", got)
+    assert refusal.error == error
+    assert not of("PARAM_VALUE", got)
+    assert client.world.autopilots[0].parameters.real("COM_OF_LOSS_T") == 1.0
+
+
+def test_unknown_parameter_reads_are_refused() -> None:
+    client = Client()
+    for message in (
+        mav.MAVLink_param_request_read_message(1, 1, b"NO_SUCH", -1),
+        mav.MAVLink_param_request_read_message(1, 1, b"", 9999),
+    ):
+        assert of("PARAM_ERROR", client.ask(message))
+
+
+def test_non_finite_floats_are_not_stored() -> None:
+    table = Parameters(1)
+    assert table.set_from_wire("COM_OF_LOSS_T", NAN, REAL32).value == 1.0
+
+
+# --- hostile bytes ---
+
+
+def test_junk_does_not_disturb_a_vehicle() -> None:
+    client = Client()
+    rng = np.random.default_rng([1, 0, 7])
+    good = client.codec.encode(mav.MAVLink_command_long_message(1, 1, 400, 0, 1, *[0.0] * 6))
+    for _ in range(300):
+        client.links[0].send(rng.integers(0, 256, int(rng.integers(0, 80)), dtype=np.uint8).tobytes())
+        broken = bytearray(good)
+        broken[int(rng.integers(0, len(good)))] ^= int(rng.integers(1, 256))
+        client.links[0].send(bytes(broken))
+        client.links[0].send(b"\xfd\xff")
+        client.run(0.004)
+    assert not client.world.autopilots[0].armed
+    assert result(client.command(400, 1)) == 0
+
+
+def test_every_command_survives_extreme_parameters() -> None:
+    client = Client()
+    for command in (400, 176, 22, 21, 20, 185, 511, 512):
+        for value in (NAN, math.inf, -math.inf, 3e38, -1.0):
+            client.command(command, *[value] * 7)
+    assert np.isfinite(client.world.plant.state).all()
+
+
+# --- frames ---
+
+
+@pytest.mark.parametrize(
+    "spawn", [(0.0, 0.0, 0.0), (-1.0, 5.0, 2.0), (1500.0, -2500.0, -30.0), (0.003, -0.004, 0.0004)]
+)
+@pytest.mark.parametrize("origin", [ORIGIN, GeoOrigin(-33.9, 151.2, 20.0), GeoOrigin(64.1, -21.9, 0.0)])
+def test_origin_converts_back_to_the_true_position(spawn: tuple[float, float, float], origin: GeoOrigin) -> None:
+    """A client that puts the sent origin into the shared frame and adds the local position gets the truth."""
+    place: dict[str, Any] = {
+        "origin_lat_deg": origin.lat_deg,
+        "origin_lon_deg": origin.lon_deg,
+        "origin_alt_m": origin.alt_m,
+    }
+    client = Client(spawn_ned_m=np.array([spawn]), run_s=0.004, ekf_ready_s=0.05, **place)
+    got = client.run(0.2)
+    (sent,) = of("GPS_GLOBAL_ORIGIN", got)
+    local = of("ODOMETRY", got)[-1]
+    offset = pymap3d.geodetic2ned(
+        sent.latitude / 1e7, sent.longitude / 1e7, sent.altitude / 1e3, origin.lat_deg, origin.lon_deg, origin.alt_m
+    )
+    truth = client.world.truth_rows()[0]["pos_ned_m"]
+    assert math.dist([o + p for o, p in zip(offset, (local.x, local.y, local.z), strict=True)], truth) < 1e-6
+    assert math.dist(truth, spawn) < 1e-9
+
+
+def test_every_vehicle_has_its_own_origin() -> None:
+    client = Client(vehicles=3)
+    origins = [client.world.origins[i].lat_e7 for i in range(3)]
+    assert len(set(origins)) == 3
+    assert abs(local_origin(np.zeros(3), ORIGIN).lat_e7 - 473977420) <= 1
+
+
+def test_global_position_agrees_with_geodesy() -> None:
+    client = Client()
+    client.world.plant.state[10:13, 0] = 120.0, -80.0, -15.0
+    m = of("GLOBAL_POSITION_INT", client.run(0.1))[0]
+    origin = client.world.origins[0]
+    lat, lon, alt = pymap3d.ned2geodetic(120.0, -80.0, -15.0, origin.lat_e7 / 1e7, origin.lon_e7 / 1e7, 489.4)
+    assert m.lat == pytest.approx(float(lat) * 1e7, abs=2)
+    assert m.lon == pytest.approx(float(lon) * 1e7, abs=2)
+    assert m.alt == pytest.approx(float(alt) * 1e3, abs=100)
+    assert m.relative_alt == pytest.approx(15000, abs=100)
+
+
+# --- the whole world ---
+
+
+def flight(seed: int, reverse: bool = False) -> bytes:
+    """Bytes of a short flight of two vehicles, and of everything they sent."""
+    clock = SimClock()
+    pairs = [pipe_pair(clock.now_us) for _ in range(2)]
+    world = SitlWorld(SitlParams(2, line_of_spawns(2), seed=seed), [p[0] for p in pairs])
+    codec = Codec(1, 191)
+    out = b""
+    for k in range(600):
+        order = (1, 0) if reverse else (0, 1)
+        for i in order:
+            if k == 280:
+                pairs[i][1].send(codec.encode(mav.MAVLink_command_long_message(i + 1, 1, 176, 0, 1, 6, 0, 0, 0, 0, 0)))
+            if k == 290:
+                pairs[i][1].send(codec.encode(mav.MAVLink_command_long_message(i + 1, 1, 400, 0, 1, *[0.0] * 6)))
+            if k >= 270 and k % 5 == 0:
+                q = [math.cos(0.02), 0.0, math.sin(0.02) * (1 - 2 * i), 0.0]
+                pairs[i][1].send(codec.encode(mav.MAVLink_set_attitude_target_message(k, 0, 0, 7, q, 0, 0, 0, 0.6)))
+        clock.advance(4000)
+        world.step(clock.now_us())
+        out += world.truth_rows().tobytes()
+    assert world.truth_rows()[0]["armed"]
+    assert world.truth_rows()[0]["pos_ned_m"][2] < -0.5
+    return out + b"".join(d.data for p in pairs for d in p[1].receive(clock.now_us()))
+
+
+def test_the_same_bytes_give_the_same_flight() -> None:
+    assert flight(1) == flight(1) == flight(1, reverse=True)
+
+
+def test_truth_rows_are_in_the_shared_frame() -> None:
+    rows = Client(vehicles=3, spawn_ned_m=np.array([[0, 0, 1.0], [5, 0, 1], [0, 7, 1]])).world.truth_rows()
+    np.testing.assert_allclose(rows["pos_ned_m"], [[0, 0, 1], [5, 0, 1], [0, 7, 1]], atol=1e-9)
+    assert rows["vehicle"].tolist() == [0, 1, 2]
+    assert rows["t_us"].tolist() == [200_000] * 3
+    assert rows["landed"].tolist() == [1, 1, 1]
+
+
+@pytest.mark.parametrize(
+    ("change", "key"),
+    [
+        ({"vehicles": 0}, "vehicles"),
+        ({"preset": "glider"}, "preset"),
+        ({"physics_hz": 10}, "physics_hz"),
+        ({"mass_scale": 3.0}, "mass_scale"),
+        ({"ekf_ready_s": -1.0}, "ekf_ready_s"),
+        ({"sysid_base": 255}, "sysid_base"),
+        ({"spawn_ned_m": np.zeros((1, 3))}, "spawn"),
+        ({"spawn_ned_m": np.full((2, 3), NAN)}, "spawn"),
+        ({"start": "orbit"}, "start"),
+    ],
+)
+def test_impossible_worlds_are_refused(change: dict[str, Any], key: str) -> None:
+    arguments: dict[str, Any] = {"vehicles": 2, "spawn_ned_m": line_of_spawns(2), **change}
+    with pytest.raises(ConfigError, match=key):
+        SitlParams(**arguments)

@@ -1,0 +1,247 @@
+"""Two links of one vehicle, open ports, and what a reboot leaves of either."""
+
+from __future__ import annotations
+
+import math
+import socket
+
+import pytest
+from pymavlink.dialects.v20 import development as mav
+
+from sitl.net.ports import OpenPort
+from sitl.px4.modes import Px4Mode, Result
+from sitl.px4.parameters import REAL32
+from swarmctl.mavlink.transport import bind_udp
+from tests.benches.px4_bench import COARSE, NAN, SPAWN_NED_M, Bench
+
+BEAT, ACK, TEXT, VALUE = 0, 77, 253, 22
+GCS_BEAT = mav.MAVLink_heartbeat_message(mav.MAV_TYPE_GCS, 8, 0, 0, 4, 3)
+
+
+def test_texts_go_to_the_link_that_hears_a_ground_station() -> None:
+    bench = Bench(gcs=True)
+    bench.send(GCS_BEAT, gcs=True)
+    bench.run(0.02)
+    assert bench.arm() == Result.ACCEPTED
+    bench.run(0.3)
+    texts = [m.text for m in bench.said(TEXT, gcs=True)]
+    assert texts == ["Armed by external command\t", "[logger] ./log/2026-01-01/00_00_00.ulg\t"]
+    assert [m.id for m in bench.said(TEXT, gcs=True)] == [1, 2]
+    assert not bench.said(TEXT)
+    bench.send(GCS_BEAT)  # now the offboard link hears one too
+    bench.run(0.02)
+    bench.command(400, 0)
+    bench.run(0.2)
+    assert [m.text for m in bench.said(TEXT)][-1] == "Disarmed by external command\t"
+
+
+def test_heartbeats_of_clients_are_forwarded_and_acks_are_not() -> None:
+    bench = Bench(gcs=True)
+    bench.forget()
+    bench.send(GCS_BEAT, gcs=True)
+    bench.run(0.02)
+    assert [(m.get_srcSystem(), m.type) for m in bench.said(BEAT)] == [(255, mav.MAV_TYPE_GCS)]
+    assert bench.arm() == Result.ACCEPTED
+    assert not bench.said(ACK, gcs=True)
+    bench.send(mav.MAVLink_command_long_message(1, 1, 400, 0, *[0.0] * 7), gcs=True)
+    bench.forget()
+    bench.run(0.02)
+    assert [(m.result, m.target_system) for m in bench.said(ACK, gcs=True)] == [(Result.ACCEPTED, 255)]
+    assert not bench.said(ACK)
+    assert not bench.pilot.armed
+
+
+def test_a_parameter_set_on_one_link_is_told_on_the_other() -> None:
+    bench = Bench(gcs=True)
+    bench.send(mav.MAVLink_param_set_message(1, 1, b"COM_OF_LOSS_T", 0.5, REAL32))
+    bench.run(0.02)
+    for gcs in (False, True):
+        assert [(m.param_id, m.param_value) for m in bench.said(VALUE, gcs=gcs)] == [("COM_OF_LOSS_T", 0.5)]
+
+
+def test_the_parameter_list_begins_with_its_hash() -> None:
+    bench = Bench()
+    bench.send(mav.MAVLink_param_request_list_message(1, 1))
+    bench.run(0.6)
+    first, *rest = bench.said(VALUE)
+    assert (first.param_id, first.param_index, first.param_type) == ("_HASH_CHECK", 65535, 5)
+    assert [m.param_index for m in rest] == list(range(first.param_count))
+    before = bench.pilot.parameters.checksum().value
+    bench.pilot.parameters.assign("COM_OF_LOSS_T", 0.7)
+    assert bench.pilot.parameters.checksum().value != before
+    bench.forget()
+    bench.send(mav.MAVLink_param_request_list_message(1, 1))
+    bench.run(0.02)
+    bench.send(mav.MAVLink_param_set_message(1, 1, b"_HASH_CHECK", before, 5))  # it knows them: stop
+    bench.run(0.5)
+    assert len(bench.said(VALUE)) < 40
+
+
+def test_an_open_port_hears_everybody_and_answers_the_first() -> None:
+    nobody, first, second = (bind_udp("127.0.0.1", 0) for _ in range(3))
+    for sock in (nobody, first, second):
+        sock.settimeout(1.0)
+    port = OpenPort(bind_udp("127.0.0.1", 0), nobody.getsockname())
+    place = port._sock.getsockname()
+    port.send(b"one")
+    assert nobody.recv(10) == b"one"
+    first.sendto(b"a", place)
+    second.sendto(b"b", place)
+    got: list[bytes] = []
+    while len(got) < 2:
+        got += [d.data for d in port.receive(0)]
+    assert got == [b"a", b"b"]
+    port.send(b"two")
+    assert first.recv(10) == b"two"
+    second.setblocking(False)
+    with pytest.raises(BlockingIOError):
+        second.recv(10)
+    port.close()
+    for sock in (nobody, first, second):
+        sock.close()
+
+
+def test_a_closed_peer_does_not_stop_a_port() -> None:
+    gone = bind_udp("127.0.0.1", 0)
+    where = gone.getsockname()
+    gone.close()
+    port = OpenPort(bind_udp("127.0.0.1", 0), where)
+    for _ in range(3):
+        port.send(b"x")
+        assert port.receive(0) == []
+    port.close()
+
+
+# --- reboot ---
+
+
+def test_a_reboot_is_silence_and_then_a_new_beginning() -> None:
+    bench = Bench(gcs=True)
+    bench.pilot.parameters.assign("COM_OF_LOSS_T", 0.4)
+    bench.setpoint()
+    assert bench.mode(6) == Result.ACCEPTED
+    assert bench.command(246, 1) == Result.ACCEPTED
+    bench.run(0.45)
+    bench.forget()
+    bench.run(1.2)
+    assert not bench.heard
+    assert not bench.gcs_heard
+    assert bench.command(400, 1) is None  # nobody listens
+    bench.run(0.6)
+    (beat, *_) = bench.said(BEAT)
+    assert (beat.custom_mode, beat.base_mode) == (Px4Mode.AUTO_LOITER, 29)
+    assert bench.said(ACK)[0].command == 211
+    bench.command(512, mav.MAVLINK_MSG_ID_SYSTEM_TIME)
+    assert 0 < bench.said(mav.MAVLINK_MSG_ID_SYSTEM_TIME)[-1].time_boot_ms < 1000  # a new clock
+    assert bench.pilot.parameters.real("COM_OF_LOSS_T") == 0.4  # kept
+    assert bench.arm() == Result.ACCEPTED
+
+
+def test_no_reboot_while_armed() -> None:
+    bench = Bench()
+    bench.arm()
+    assert bench.command(246, 1) == Result.DENIED
+    bench.run(1.0)
+    assert bench.pilot.armed
+    assert bench.command(246, 0) == Result.ACCEPTED  # nothing asked
+    bench.run(1.0)
+    assert bench.pilot.armed
+
+
+def test_the_local_frame_begins_where_it_boots() -> None:
+    """Moved by hand between two boots: the new origin is there, and origin plus local position is still the truth."""
+    bench = Bench()
+    before = bench.pilot.boot.origin
+    bench.world.plant.state[10:12, 0] += 40.0, -30.0
+    bench.run(0.1)
+    assert bench.command(246, 1) == Result.ACCEPTED
+    bench.run(2.4)
+    after = bench.pilot.boot.origin
+    assert before is not None
+    assert after is not None
+    north_m = (after.lat_e7 - before.lat_e7) * after.metres_per_e7_north
+    east_m = (after.lon_e7 - before.lon_e7) * after.metres_per_e7_east
+    assert (north_m, east_m) == pytest.approx((40.0, -30.0), abs=0.02)
+    assert bench.command(512, mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED) == Result.ACCEPTED
+    local = bench.said(mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED)[-1]
+    assert math.hypot(local.x, local.y) < 0.02
+    truth = bench.world.truth_rows()[0]["pos_ned_m"]
+    assert (north_m + local.x + SPAWN_NED_M[0], east_m + local.y + SPAWN_NED_M[1]) == pytest.approx(
+        (truth[0], truth[1]), abs=0.01
+    )
+    assert bench.said(mav.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)[-1].latitude == after.lat_e7
+
+
+@pytest.mark.parametrize(
+    ("reject_bad", "alone_s", "poisoned"), [(True, 0.02, False), (False, 0.02, True), (False, 0.0, False)]
+)
+def test_one_bad_quaternion_poisons_until_reboot_unless_refused_or_followed_at_once(
+    reject_bad: bool, alone_s: float, poisoned: bool
+) -> None:
+    bench = Bench("x500", **COARSE, reject_bad_setpoints=reject_bad).in_offboard(height_m=3.0)
+    bench.setpoint(q=[0.0] * 4)
+    if alone_s:
+        bench.run(alone_s)
+    bench.run(0.1, 50)
+    bench.mode(4, 3)
+    wind = 3.0
+    bench.world.set_wind((wind, 0.0, 0.0))
+    bench.run(2.0)
+    held = abs(float(bench.world.truth_rows()[0]["vel_ned_m_s"][0])) < 0.6
+    assert held != poisoned  # no torque: it drifts with the wind, in LOITER too
+    bench.run(0.1)
+    bench.command(400, 0, 21196)
+    bench.run(6.0)
+    assert bench.command(246, 1) == Result.ACCEPTED
+    bench.run(2.5)
+    assert not bench.pilot.stream.poisoned
+
+
+@pytest.mark.parametrize(("reject_bad", "stops"), [(True, False), (False, True)])
+def test_a_thrust_that_is_no_number_stops_the_motors_unless_refused(reject_bad: bool, stops: bool) -> None:
+    bench = Bench(reject_bad_setpoints=reject_bad).in_offboard(height_m=2.0)
+    bench.setpoint(thrust=NAN)
+    bench.run(0.02)
+    assert (float(bench.world.plant.rotor_force_n.sum()) == 0.0) == stops
+    assert bench.pilot.motors_on != stops
+    bench.run(0.04, 50)
+    assert bench.pilot.motors_on
+    assert float(bench.world.plant.rotor_force_n.sum()) > 5.0
+
+
+# --- body rates ---
+
+
+@pytest.mark.parametrize("preset", ["thesis", "x500"])
+def test_body_rates_are_flown(preset: str) -> None:
+    bench = Bench(preset).in_offboard(height_m=4.0)
+    turned = 0.0
+    for _ in range(40):
+        bench.setpoint(mask=128, rates=(0.5, 0.0, 0.0))
+        bench.run(0.02)
+        turned += float(bench.world.plant.rate_frd_rad_s[0, 0]) * 0.02
+    assert float(bench.world.plant.rate_frd_rad_s[0, 0]) == pytest.approx(0.5, abs=0.06)
+    assert turned == pytest.approx(0.4, abs=0.1)
+    bench.run(0.6, 50)  # and an attitude again
+    assert abs(float(bench.world.plant.euler_rad[0, 0])) < 0.35
+    bench.run(0.02)
+    assert bench.pilot.mode == Px4Mode.OFFBOARD
+
+
+def test_a_yaw_rate_beside_an_attitude_is_fed_forward_and_mask_7_ignores_it() -> None:
+    yaws = []
+    for mask in (7, 3):
+        bench = Bench("x500").in_offboard(height_m=2.0)
+        for _ in range(60):
+            bench.setpoint(mask=mask, rates=(0.3, 0.3, 0.4))
+            bench.run(0.02)
+        yaws.append(float(bench.world.plant.euler_rad[2, 0]))
+    assert abs(yaws[0]) < 0.01
+    assert yaws[1] > 0.05
+
+
+def test_a_socket_is_what_a_port_needs() -> None:
+    """The port's own descriptor is a bound datagram socket: selectors wait on it."""
+    port = OpenPort(bind_udp("127.0.0.1", 0), ("127.0.0.1", 9))
+    assert socket.socket(fileno=socket.dup(port.fd)).type == socket.SOCK_DGRAM
+    port.close()

@@ -1,0 +1,111 @@
+"""What a client of PX4 trips over, as the simulated one has it too; figures are those of PX4 1.18 in its simulator."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import development as mav
+
+from sitl.plant.estimator import ESTIMATORS, EXACT_ACCURACY_M
+from sitl.px4.modes import Px4Mode, Result
+from swarmctl.core.types import Landed
+from tests.benches.px4_bench import COARSE, Bench
+
+CURRENT_MODE, ESTIMATOR_STATUS, SYS_STATUS, HEARTBEAT = 436, 230, 1, 0
+PREARM = 0x10000000
+
+
+def test_the_mode_is_told_twice_a_second_however_often_it_is_asked_for() -> None:
+    bench = Bench()
+    assert bench.command(511, CURRENT_MODE, 10_000) == Result.ACCEPTED
+    bench.forget()
+    bench.run(4.0)
+    assert len(bench.said(CURRENT_MODE)) == 8
+
+
+def test_a_change_of_the_mode_is_told_at_once() -> None:
+    bench = Bench()
+    bench.command(511, CURRENT_MODE, 10_000)
+    bench.run(0.3)
+    bench.forget()
+    assert bench.mode(6) == Result.ACCEPTED
+    bench.run(0.03)
+    assert [m.custom_mode for m in bench.said(CURRENT_MODE)] == [Px4Mode.OFFBOARD]
+
+
+def test_after_a_silence_the_mode_stays_untold_for_up_to_half_a_second() -> None:
+    bench = Bench(ekf_ready_s=0.1).in_offboard(2.0)
+    bench.command(511, CURRENT_MODE, 10_000)
+    waited_s = []
+    for _ in range(10):
+        bench.forget()
+        steps = 0
+        while not bench.said(CURRENT_MODE):
+            bench.run(0.02, 50)
+            steps += 1
+        waited_s.append(steps * 0.02)
+        bench.run(0.06, 50)
+    assert max(waited_s) >= 0.4
+
+
+def claims(estimator: str, ekf_ready_s: float = 4.0, seconds: float = 12.0) -> list[Any]:
+    """ESTIMATOR_STATUS at 10 Hz from the first frame on."""
+    bench = Bench(wait_s=1.35, ekf_ready_s=ekf_ready_s, estimator=estimator, **COARSE)
+    bench.command(511, ESTIMATOR_STATUS, 100_000)
+    bench.run(seconds - 1.35)
+    return bench.said(ESTIMATOR_STATUS)
+
+
+@pytest.mark.parametrize("estimator", ["exact", "gps", "external"])
+def test_after_boot_the_estimator_claims_to_be_far_off_then_far_too_good(estimator: str) -> None:
+    model = ESTIMATORS[estimator]
+    settled_m = (model.accuracy_m if model else EXACT_ACCURACY_M)[0]
+    told = {round(m.time_usec * 1e-6, 1): m for m in claims(estimator)}
+    assert told[1.5].pos_horiz_accuracy == pytest.approx(14.14, abs=0.01)
+    assert told[1.5].flags == 164
+    assert told[2.2].pos_horiz_accuracy < 0.06 * settled_m
+    assert told[2.2].flags == 229
+    assert told[4.2].pos_horiz_accuracy == pytest.approx(0.26 * settled_m, rel=0.2)
+    assert told[4.2].flags == 1023
+    assert told[9.0].pos_horiz_accuracy == pytest.approx(settled_m)
+    rise = [m.pos_horiz_accuracy for t_s, m in sorted(told.items()) if t_s >= 2.1]
+    assert all(later >= earlier for earlier, later in pairwise(rise))
+
+
+def test_gps_settles_at_what_real_px4_claims() -> None:
+    assert claims("gps")[-1].pos_horiz_accuracy == pytest.approx(0.285, abs=0.01)
+
+
+def test_a_rebooted_estimator_settles_again() -> None:
+    bench = Bench(ekf_ready_s=4.0, wait_s=12.0, estimator="gps", **COARSE)
+    bench.world.reboot(0, bench.world.since_boot_us)
+    bench.forget()
+    bench.run(3.0)
+    assert bench.said(ESTIMATOR_STATUS)[0].pos_horiz_accuracy > 10.0
+
+
+def test_after_landing_it_stays_disarmed_in_offboard_and_cannot_be_armed() -> None:
+    bench = Bench().in_offboard(2.0)
+    assert bench.mode(4, 6) == Result.ACCEPTED
+    bench.run(12.0)
+    bench.forget()
+    bench.run(1.2)
+    beat, health = bench.said(HEARTBEAT)[-1], bench.said(SYS_STATUS)[-1]
+    assert bench.pilot.landed is Landed.ON_GROUND
+    assert (beat.custom_mode, beat.base_mode, beat.system_status) == (Px4Mode.OFFBOARD, 17, 0)
+    assert not health.onboard_control_sensors_health & PREARM
+    assert bench.arm() == Result.TEMPORARILY_REJECTED
+
+
+def test_another_mode_makes_it_armable_again_after_landing() -> None:
+    bench = Bench().in_offboard(2.0)
+    bench.mode(4, 6)
+    bench.run(12.0)
+    assert bench.mode(4, 3) == Result.ACCEPTED
+    bench.forget()
+    bench.run(1.2)
+    assert bench.said(HEARTBEAT)[-1].system_status == mav.MAV_STATE_STANDBY
+    assert bench.said(SYS_STATUS)[-1].onboard_control_sensors_health & PREARM
+    assert bench.arm() == Result.ACCEPTED

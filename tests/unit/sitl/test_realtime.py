@@ -1,0 +1,147 @@
+"""The real-time loop, its files and ports, and the command line's refusals; no processes."""
+
+from __future__ import annotations
+
+import socket
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sitl import realtime
+from sitl.__main__ import main
+from sitl.world import SitlParams, SitlWorld, line_of_spawns
+from swarmctl.core.clock import SimClock
+from swarmctl.core.records import TRUTH_DTYPE
+from swarmctl.errors import ConfigError, StartError
+from swarmctl.mavlink.transport import pipe_pair
+
+
+class SteppedWorld:
+    """Stands in for a world: counts steps, stalls where told, and stops the loop."""
+
+    def __init__(self, stop: realtime.StopRequest, steps: int, stall_at: int = -1, stall_s: float = 0.0) -> None:
+        self.params = SitlParams(1, line_of_spawns(1))
+        self.times_us: list[int] = []
+        self._stop, self._steps, self._stall_at, self._stall_s = stop, steps, stall_at, stall_s
+
+    def step(self, now_us: int) -> None:
+        self.times_us.append(now_us)
+        if len(self.times_us) == self._stall_at:
+            time.sleep(self._stall_s)
+        self._stop.wanted = len(self.times_us) >= self._steps
+
+
+def flown(steps: int, stall_at: int = -1, stall_s: float = 0.0) -> tuple[realtime.Tally, np.ndarray[Any, Any]]:
+    stop = realtime.StopRequest()
+    world = SteppedWorld(stop, steps, stall_at, stall_s)
+    tally = realtime.fly(world, stop, None)  # type: ignore[arg-type]
+    return tally, np.diff(world.times_us)
+
+
+def test_deadlines_are_absolute() -> None:
+    started = time.monotonic()
+    tally, gaps_us = flown(100)
+    assert tally.steps == 100
+    assert time.monotonic() - started > 0.39
+    if tally.stalls == 0:
+        assert set(gaps_us.tolist()) == {4000}
+
+
+def test_a_short_delay_is_caught_up() -> None:
+    tally, gaps_us = flown(60, stall_at=10, stall_s=0.08)
+    assert tally.late > 0
+    if tally.stalls == 0:
+        assert set(gaps_us.tolist()) == {4000}
+
+
+def test_a_long_stall_is_given_up_and_counted() -> None:
+    tally, gaps_us = flown(60, stall_at=10, stall_s=0.4)
+    assert tally.stalls >= 1
+    assert tally.lost_us > 300_000
+    assert gaps_us.max() > 300_000  # stamps keep up with the clock
+
+
+def test_truth_file_is_an_array(tmp_path: Path) -> None:
+    clock = SimClock()
+    vehicle_end, _ = pipe_pair(clock.now_us)
+    world = SitlWorld(SitlParams(1, line_of_spawns(1)), [vehicle_end])
+    truth = realtime.TruthFile(tmp_path / "truth.bin")
+    for k in range(500):
+        clock.advance(4000)
+        world.step(clock.now_us())
+        truth.record(world, clock.now_us())
+        if k == 300:
+            assert (tmp_path / "truth.bin").stat().st_size > 0  # flushed while flying
+    assert truth.close() == ""
+    rows = np.fromfile(tmp_path / "truth.bin", TRUTH_DTYPE)
+    assert len(rows) == pytest.approx(100, abs=1)
+    assert set(np.diff(rows["t_us"][1:]).tolist()) == {20000}
+
+
+def test_truth_file_in_no_folder_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="truth"):
+        realtime.TruthFile(tmp_path / "missing" / "truth.bin")
+
+
+def test_a_full_disk_does_not_stop_the_flight() -> None:
+    if not Path("/dev/full").exists():
+        pytest.skip("no /dev/full here")
+    clock = SimClock()
+    vehicle_end, _ = pipe_pair(clock.now_us)
+    world = SitlWorld(SitlParams(1, line_of_spawns(1)), [vehicle_end])
+    truth = realtime.TruthFile(Path("/dev/full"))
+    for _ in range(20):
+        clock.advance(1_000_000)
+        truth.record(world, clock.now_us())
+    assert "truth file" in truth.close()
+
+
+def test_a_taken_port_shifts_the_whole_range() -> None:
+    sockets, shift = realtime.bind_range(47100, 3)
+    assert [s.getsockname()[1] for s in sockets] == [47100 + shift + i for i in range(3)]
+    others, more = realtime.bind_range(47100, 3)
+    assert more >= shift + 3
+    for sock in (*sockets, *others):
+        sock.close()
+
+
+def test_the_end_of_the_port_range_is_refused() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 65535))
+        with pytest.raises(StartError, match="free UDP ports"):
+            realtime.bind_range(65535, 1)
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--vehicles", "0"],
+        ["--vehicles", "many"],
+        ["--preset", "glider"],
+        ["--spawn", "1,2"],
+        ["--spawn", "1,2,nan"],
+        ["--spawn", "0,0,0"],
+        ["--origin", "1000,0,0"],
+        ["--physics-hz", "10"],
+        ["--mass-scale", "nan"],
+        ["--port", "70000"],
+        ["--remote-ports", "14540,14541"],
+        ["--ekf-ready", "-1"],
+        ["--sysid-base", "254"],
+        ["--start", "orbit"],
+        ["--truth", "/proc/none/truth.bin"],
+        ["--bogus"],
+    ],
+)
+def test_bad_arguments_are_one_clear_line(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    try:
+        code = main(arguments)
+    except SystemExit as end:
+        code = int(end.code or 0)
+    error = capsys.readouterr().err
+    assert code == 2
+    assert error.count("\n") == 1
+    assert error.startswith("sitl: ")

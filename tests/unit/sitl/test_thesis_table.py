@@ -1,0 +1,324 @@
+"""The table of what is reproduced: every row that was asked for, by its published figure and its limit."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sitl.studies.thesis import experiments as thesis
+from sitl.studies.thesis import reproduce, score
+from sitl.studies.thesis.experiments import FULL_JOBS, PLANT_JOBS, Job
+from sitl.studies.thesis.figures import FLIGHTS, SWARMS
+from sitl.studies.thesis.page import flight_of
+from sitl.studies.thesis.trace import Row, Sphere, Trace
+from swarmctl.built_in_configs import shipped_config
+from swarmctl.config import load
+from swarmctl.errors import EXIT_USAGE, ConfigError
+
+JOBS = (*PLANT_JOBS, *FULL_JOBS)
+RADII = ("3", "2.7", "2.5", "2.3", "2", "1.5", "1")
+INDEX_LIMITS_M = (2.19, 2.04, 1.95, 1.85, 1.80, 1.55, 1.30)
+PUBLISHED_M = (2.19, 2.04, 1.95, 1.85, None, None, None)
+MPC_SLOW_LIMIT_M, MPC_FAST_LIMIT_M = 1.6 * 0.0043, 1.6 * 0.0145
+
+Wanted = tuple[str, float | None, float | None]  # name, published, limit
+SINGLE: list[Wanted] = [
+    ("PID slow, Table 5, mean distance", 0.0205, 1.2 * 0.0205),
+    ("PID slow, Table 5, MSE x", 0.0020, None),
+    ("PID slow, Table 5, MSE y", 9.2778e-5, None),
+    ("PID slow, Table 5, MSE z", 0.0059, None),
+    ("PID slow, Table 5, retuned, mean distance", 0.0205, 0.0150),
+    ("PID fast, Table 6, mean distance", 0.0741, 1.2 * 0.0741),
+    ("PID fast, Table 6, MSE x", 0.0068, None),
+    ("PID fast, Table 6, MSE y", 0.0011, None),
+    ("PID fast, Table 6, MSE z", 0.0197, None),
+    ("PID fast, Table 6, retuned, mean distance", 0.0741, 0.0400),
+    ("MPC slow, Table 11, mean distance", 0.0043, MPC_SLOW_LIMIT_M),
+    ("MPC slow, Table 11, MSE x", 0.0007, None),
+    ("MPC slow, Table 11, MSE y", 0.0, None),
+    ("MPC slow, Table 11, MSE z", 0.0024, None),
+    ("MPC slow, Table 11, improved, matched start, mean distance", 0.0043, 0.0040),
+    ("MPC slow, Table 11, improved, matched start, MSE x", 0.0007, 0.0008),
+    ("MPC slow, Table 11, improved, matched start, MSE z", 0.0024, 0.0021),
+    ("MPC slow, Table 11, improved, steady RMSE", None, 0.0005),
+    ("MPC slow, Table 11, improved, matched start, steady RMSE", None, 0.0005),
+    ("MPC fast, Table 12, matched start, mean distance", 0.0145, MPC_FAST_LIMIT_M),
+    ("MPC fast, Table 12, mean distance", 0.0145, None),
+    ("MPC fast, Table 12, matched start, MSE x", 0.0024, None),
+    ("MPC fast, Table 12, matched start, MSE y", 0.0, None),
+    ("MPC fast, Table 12, matched start, MSE z", 0.0081, None),
+    ("MPC fast, Table 12, improved, matched start, mean distance", 0.0145, 0.0130),
+    ("MPC fast, Table 12, improved, steady RMSE", None, 0.0005),
+    ("MPC fast, Table 12, improved, matched start, steady RMSE", None, 0.0005),
+]
+CIRCLES: list[Wanted] = [
+    wanted
+    for kind in ("dmpc", "dmpc3")
+    for radius, published_m, limit_m in zip(RADII, PUBLISHED_M, INDEX_LIMITS_M, strict=True)
+    for wanted in (
+        (f"circle {kind}, Table 19, {radius} x 0.3 m, index", published_m, limit_m),
+        (f"circle {kind}, Table 19, {radius} x 0.3 m, closer than the radius by", None, 0.01),
+    )
+]
+SETTLED: list[Wanted] = [
+    (f"circle {kind}, Table 19, 3 x 0.3 m, index after 10 s over the least possible", None, 1.05)
+    for kind in ("dmpc", "dmpc3")
+]
+OBSTACLE: list[Wanted] = [
+    ("obstacle dmpc, published, index", 2.88, None),
+    *(
+        wanted
+        for kind in ("dmpc, improved", "dmpc3")
+        for wanted in (
+            (f"obstacle {kind}, index", 2.88, 2.60),
+            (f"obstacle {kind}, inside the keep-out by", None, 0.0),
+            (f"obstacle {kind}, closer to each other by", None, 0.0),
+        )
+    ),
+]
+BETTER: list[Wanted] = [
+    *((f"circle, {radius} x 0.3 m, index, dmpc3 over dmpc", None, 1.0) for radius in RADII),
+    ("circle, 3 x 0.3 m, index after 10 s, dmpc3 over dmpc", None, 1.0),
+    ("obstacle, index, dmpc3 over dmpc", None, 1.0),
+]
+FULL: list[Wanted] = [
+    (f"{name}, full path, index differs from the plant path by", None, 0.05)
+    for name in (
+        *(f"pid_{speed} {preset}" for speed in ("slow", "fast") for preset in ("published", "retuned")),
+        *(f"mpc_{speed} {preset}" for speed in ("slow", "fast") for preset in ("published", "improved")),
+        *(f"circle {kind} {radius} x 0.3 m" for kind in ("dmpc", "dmpc3") for radius in RADII),
+        *(f"obstacle {preset}" for preset in ("published", "improved", "dmpc3")),
+    )
+]
+
+
+def fake(job: Job, apart_m: float = 1.0, off_m: float = 1.0) -> Trace:
+    """A flight nobody flew: 12 s, agents `off_m` above a reference at rest and `apart_m` from each other."""
+    agents = 3 if job.flight in SWARMS else 1
+    t_s = np.asarray(np.arange(600) * 0.02, np.float64)
+    nothing = np.zeros((600, agents, 3))
+    pos = nothing + np.array([0.0, 0.0, -off_m])
+    pos[:, :, 0] += apart_m * np.arange(agents)
+    spheres = (Sphere((0.0, 0.0, 5.0), 1.0, 1.75),) if job.flight == "obstacle" else ()
+    thrust = np.zeros((600, agents))
+    ref = nothing + np.array([1.0, 0.0, 0.0]) * (apart_m * np.arange(agents))[None, :, None]
+    return Trace(job.name, job.path, t_s, pos, nothing, nothing, ref, nothing, thrust, nothing, 0, 0, spheres)
+
+
+def rows_of(jobs: Sequence[Job]) -> dict[str, Row]:
+    return {row.name: row for row in thesis.rows({job.name: fake(job) for job in jobs})}
+
+
+@pytest.fixture(scope="module")
+def table() -> dict[str, Row]:
+    """All rows, the flights at true distance included."""
+    again = [thesis.wider(job, fake(job)) for job in PLANT_JOBS if job.name.startswith("circle dmpc ")]
+    return rows_of([*JOBS, *again])
+
+
+@pytest.mark.parametrize(
+    ("name", "published", "limit"), [*SINGLE, *CIRCLES, *SETTLED, *OBSTACLE, *BETTER, *FULL], ids=lambda v: str(v)
+)
+def test_what_was_asked_for_is_there(
+    table: dict[str, Row], name: str, published: float | None, limit: float | None
+) -> None:
+    row = table[name]
+    assert row.published == published
+    assert row.limit == (None if limit is None else pytest.approx(limit, rel=1e-12))
+    assert row.path == ("full" if ", full path" in name else "plant")
+
+
+def test_nothing_else_is_asked_for(table: dict[str, Row]) -> None:
+    listed = {name for name, _, limit in (*SINGLE, *CIRCLES, *SETTLED, *OBSTACLE, *BETTER, *FULL) if limit is not None}
+    assert {name for name, row in table.items() if row.limit is not None} == listed
+
+
+def test_names_are_unique() -> None:
+    assert len({job.name for job in JOBS}) == len(JOBS)
+    again = [thesis.wider(job, fake(job)) for job in PLANT_JOBS if job.flight == "circle"]
+    names = [row.name for row in thesis.rows({job.name: fake(job) for job in (*JOBS, *again)})]
+    assert len(names) == len(set(names)) > 150
+
+
+def test_every_row_belongs_to_a_flight(table: dict[str, Row]) -> None:
+    flights = {flight_of(name) for name in table}
+    assert flights == {*FLIGHTS} - {"open_loop", "pid_step", "pid_steps"}  # the thesis gives no figures of those
+
+
+def test_without_flights_there_are_no_rows() -> None:
+    assert thesis.rows({}) == []
+
+
+@pytest.mark.parametrize("job", JOBS, ids=lambda job: str(job.name))
+def test_a_flight_alone_makes_only_rows_of_its_own_path(job: Job) -> None:
+    rows = rows_of([job]).values()
+    assert {row.path for row in rows} <= {job.path}
+    assert not any("over dmpc" in row.name or "differs" in row.name for row in rows)
+
+
+@pytest.mark.parametrize(
+    ("name", "ours"),
+    [
+        ("PID fast, Table 6, mean distance", 1.0),
+        ("PID fast, Table 6, MSE x", 0.0),
+        ("PID fast, Table 6, MSE z", 1.0),
+        ("MPC slow, Table 11, improved, steady RMSE", 1.0),
+        ("circle dmpc, Table 19, 2 x 0.3 m, index", 3.0),
+        ("circle dmpc, Table 19, 3 x 0.3 m, closer than the radius by", 0.0),
+        ("circle dmpc, Table 19, 3 x 0.3 m, index after 10 s over the least possible", 3.0 / (math.sqrt(3.0) * 0.9)),
+        ("obstacle dmpc3, inside the keep-out by", 0.0),
+        ("circle, 3 x 0.3 m, index, dmpc3 over dmpc", 1.0),
+        ("mpc_fast improved, full path, index differs from the plant path by", 0.0),
+    ],
+)
+def test_rows_show_their_figure(table: dict[str, Row], name: str, ours: float) -> None:
+    assert table[name].ours == pytest.approx(ours, abs=1e-12)
+
+
+def test_distances_that_were_not_kept_are_told() -> None:
+    near = {job.name: fake(job, apart_m=0.85, off_m=-3.5) for job in JOBS if job.flight in SWARMS}
+    found = {row.name: row for row in thesis.rows(near)}
+    assert found["circle dmpc, Table 19, 3 x 0.3 m, closer than the radius by"].ours == pytest.approx(0.05)
+    assert found["circle dmpc, Table 19, 3 x 0.3 m, closer than the radius by"].met is False
+    assert found["circle dmpc, Table 19, 2.7 x 0.3 m, closer than the radius by"].ours == 0.0
+    assert found["obstacle dmpc3, closer to each other by"].ours == pytest.approx(0.05)
+    assert found["obstacle dmpc, improved, inside the keep-out by"].ours == pytest.approx(0.25)
+
+
+def test_a_ratio_is_of_dmpc3_over_dmpc_and_of_full_over_plant() -> None:
+    jobs = {job.name: job for job in JOBS}
+    name = "circle dmpc 3 x 0.3 m"
+    flown = {
+        name: fake(jobs[name]),
+        name.replace("dmpc", "dmpc3"): fake(jobs[name.replace("dmpc", "dmpc3")], off_m=0.8),
+        f"{name}, full path": fake(jobs[f"{name}, full path"], off_m=0.9),
+    }
+    found = {row.name: row.ours for row in thesis.rows(flown)}
+    assert found["circle, 3 x 0.3 m, index, dmpc3 over dmpc"] == pytest.approx(0.8)
+    assert found[f"{name}, full path, index differs from the plant path by"] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize("job", JOBS, ids=lambda job: str(job.name))
+def test_every_job_names_a_config_that_is_there_and_is_of_its_flight(job: Job) -> None:
+    config = load(shipped_config(job.config), job.overrides)
+    assert config.swarm.agents == (3 if job.flight in SWARMS else 1)
+    assert bool(config.obstacles) is (job.flight == "obstacle")
+    kinds = {"open_loop": "open_loop", "pid": "pid", "mpc": "mpc"}
+    wanted = kinds.get(job.flight, kinds.get(job.flight.split("_")[0], "dmpc3" if "dmpc3" in job.name else "dmpc"))
+    assert config.controller.kind == wanted
+
+
+@pytest.mark.parametrize("flight", [flight for flight in FLIGHTS if flight.endswith(("_slow", "_fast"))])
+def test_what_is_improved_flies_the_published_mission(flight: str) -> None:
+    published, improved = (load(shipped_config(f"{kind}_4_{flight}")) for kind in ("thesis", "improved"))
+    assert improved.mission == published.mission
+    assert improved.starts_ned_m() == published.starts_ned_m()
+
+
+@pytest.mark.parametrize(
+    ("published", "improved"),
+    [
+        ("thesis_5_circle", "improved_5_circle_dmpc3"),
+        ("thesis_6_obstacle", "improved_6_obstacle"),
+        ("thesis_6_obstacle", "improved_6_obstacle_dmpc3"),
+    ],
+)
+def test_improved_swarms_fly_the_published_mission_and_keep_no_less(published: str, improved: str) -> None:
+    before, after = load(shipped_config(published)), load(shipped_config(improved))
+    assert after.mission == before.mission
+    assert after.starts_ned_m() == before.starts_ned_m()
+    assert after.separation.radius_m >= before.separation.radius_m
+    for one, other in zip(before.obstacles, after.obstacles, strict=True):
+        assert (other.center_ned_m, other.radius_m) == (one.center_ned_m, one.radius_m)
+        assert other.visibility_m == one.visibility_m
+        assert other.keep_out_m >= one.keep_out_m
+
+
+def test_a_config_that_is_not_there_is_refused_with_those_that_are() -> None:
+    with pytest.raises(ConfigError, match=r"known are .*thesis_5_circle"):
+        shipped_config("thesis_7")
+
+
+@pytest.mark.parametrize("factor", thesis.RADII)
+def test_radii_are_flown_at_what_they_are_called(factor: float) -> None:
+    (job,) = (job for job in PLANT_JOBS if job.name == f"circle dmpc {factor:g} x 0.3 m")
+    config = load(shipped_config(job.config), job.overrides)
+    assert config.separation.radius_m == pytest.approx(0.3 * factor)
+    assert config.separation.certify_slack_m <= 0.11 * config.separation.radius_m + 1e-9
+
+
+def test_a_flight_at_true_distance_is_wider_by_what_was_missing() -> None:
+    (job,) = (job for job in PLANT_JOBS if job.name == "circle dmpc 2 x 0.3 m")
+    wider = thesis.wider(job, fake(job, apart_m=0.58))
+    config = load(shipped_config(wider.config), wider.overrides)
+    assert config.separation.radius_m == pytest.approx(0.62)
+    row = rows_of([wider])["circle dmpc, Table 19, 2 x 0.3 m, index at equal true distance"]
+    assert row.limit is None
+    kept = thesis.wider(job, fake(job, apart_m=0.61))
+    assert load(shipped_config(kept.config), kept.overrides).separation.radius_m == pytest.approx(0.6)
+
+
+def test_least_index_is_that_of_an_equilateral_triangle() -> None:
+    assert thesis.least_index_m(0.9) == pytest.approx(3 * 0.9 / math.sqrt(3.0))  # circumradius of each corner
+    corners = 0.9 / math.sqrt(3.0) * np.exp(2j * np.pi * np.arange(3) / 3)
+    off = np.stack([corners.real, corners.imag, np.zeros(3)], axis=1)
+    job = PLANT_JOBS[-1]
+    trace = fake(job)
+    trace.pos_ned_m[:] = trace.ref_pos_ned_m[:, :1] + off
+    trace.ref_pos_ned_m[:] = trace.ref_pos_ned_m[:, :1]
+    assert score.separation_m(trace) == pytest.approx(0.9)
+    assert score.index_m(trace) == pytest.approx(thesis.least_index_m(0.9))
+
+
+# -- which flights ----------------------------------------------------------------------------------------------------
+
+
+def flights_and_paths(*only: str, plant: bool = False, full: bool = False) -> set[tuple[str, str]]:
+    return {(job.flight, job.path) for job in reproduce.chosen(only, plant, full)}
+
+
+def test_everything_is_chosen_when_nothing_is_said() -> None:
+    assert reproduce.chosen((), False, False) == list(JOBS)
+    assert reproduce.chosen((), True, True) == list(JOBS)
+    assert {job.flight for job in JOBS} == set(FLIGHTS)
+
+
+def test_one_path_alone() -> None:
+    assert reproduce.chosen((), True, False) == list(PLANT_JOBS)
+    assert reproduce.chosen((), False, True) == list(FULL_JOBS)
+
+
+def test_a_start_in_motion_is_flown_on_the_plant_only() -> None:
+    assert any(job.matched_velocity for job in PLANT_JOBS)
+    assert not any(job.matched_velocity for job in FULL_JOBS)
+    assert len(FULL_JOBS) == sum(not job.matched_velocity for job in PLANT_JOBS)
+
+
+def test_only_some_flights() -> None:
+    assert flights_and_paths("pid_fast", "obstacle", plant=True) == {("pid_fast", "plant"), ("obstacle", "plant")}
+    assert flights_and_paths("pid_fast") == {("pid_fast", "plant"), ("pid_fast", "full")}
+    assert flights_and_paths("circle", full=True) == {("circle", "full")}
+    assert flights_and_paths(reproduce.TIMING) == set()
+
+
+def test_an_unknown_flight_is_refused_with_those_that_are_known() -> None:
+    with pytest.raises(ConfigError) as refused:
+        reproduce.chosen(["pid_fast", "loop", "7"], False, False)
+    assert len(refused.value.problems) == 2
+    for problem, name in zip(refused.value.problems, ("loop", "7"), strict=True):
+        assert repr(name) in problem
+        assert all(known in problem for known in (*FLIGHTS, reproduce.TIMING))
+
+
+@pytest.mark.parametrize("arguments", [["--only=loop"], ["--only", "pid_fast", "--only", "7"], ["--jobs=0"]])
+def test_bad_usage_is_2_and_leaves_nothing(
+    arguments: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert reproduce.main(arguments) == EXIT_USAGE
+    assert arguments[-1].split("=")[-1] in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []

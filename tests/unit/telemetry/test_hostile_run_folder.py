@@ -1,0 +1,194 @@
+"""A run folder of somebody else: whatever is in it, `report` ends in words and writes nothing but the report."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.parquet as pq
+import pytest
+
+from swarmctl.config import Config, dump
+from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
+from swarmctl.errors import ConfigError
+from swarmctl.ops.summary import rewrite_report
+from swarmctl.telemetry.run_folder import Outcome, create_run_folder, finish_run
+from tests.unit.telemetry.test_run_folder import RULES, write_run
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A good run of three, finished."""
+    directory = tmp_path / "run"
+    directory.mkdir()
+    write_run(directory, 3, 6.0)
+    (directory / "config.toml").write_text(dump(Config()))
+    finish_run(directory, RULES, Outcome("completed"))
+    return directory
+
+
+def report(directory: Path) -> subprocess.CompletedProcess[str]:
+    """The verb, as somebody would type it."""
+    command = [sys.executable, "-m", "swarmctl", "report", str(directory)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+
+
+def summary_with(directory: Path, **changes: Any) -> None:
+    path = directory / "summary.json"
+    path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
+
+
+def huge_number(directory: Path) -> None:
+    text = (directory / "summary.json").read_text()
+    (directory / "summary.json").write_text(text.replace('"agents": 3', f'"agents": 1{"0" * 5000}'))
+
+
+def spread_of_times(directory: Path, name: str, dtype: np.dtype[np.void]) -> None:
+    rows = np.zeros(2, dtype)
+    rows["t_us"] = [0, 2**62]
+    rows["armed"] = 1
+    rows.tofile(directory / name)
+
+
+def text_column(directory: Path) -> None:
+    pq.write_table(pa.table({"t_us": ["yesterday", "today"]}), directory / "agent-0.parquet")
+
+
+def pipe_as(name: str) -> Callable[[Path], None]:
+    def make(directory: Path) -> None:
+        (directory / name).unlink(missing_ok=True)
+        os.mkfifo(directory / name)
+
+    return make
+
+
+def device_as(name: str) -> Callable[[Path], None]:
+    def make(directory: Path) -> None:
+        (directory / name).unlink(missing_ok=True)
+        (directory / name).symlink_to("/dev/zero")
+
+    return make
+
+
+def sparse(directory: Path) -> None:
+    with (directory / "truth.bin").open("wb") as file:
+        file.truncate(2**40)
+
+
+_NAMES = ("config.toml", "summary.json", "events.jsonl", "agent-0.parquet", "agent-7.ticks", "truth.bin")
+REFUSED: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "summary torn": (lambda d: (d / "summary.json").write_text('{"outcome": "comp'), "summary.json"),
+    "summary empty": (lambda d: (d / "summary.json").write_text(""), "summary.json"),
+    "summary list": (lambda d: (d / "summary.json").write_text("[]"), "summary.json"),
+    "summary without": (lambda d: (d / "summary.json").write_text('{"outcome": "failed"}'), "violations"),
+    "summary deep": (lambda d: (d / "summary.json").write_text("[" * 100_000), "summary.json"),
+    "agents = 1e9": (lambda d: summary_with(d, agents=10**9), "of 1000000000 agents"),
+    "agents of 5,000 digits": (huge_number, "summary.json"),
+    "outcome of its own": (lambda d: summary_with(d, outcome='"><script>'), "outcome"),
+    "Parquet of text": (text_column, "t_us holds no numbers"),
+    "Parquet torn": (lambda d: (d / "agent-1.parquet").write_bytes(b"PAR1" + bytes(100) + b"PAR1"), "agent-1.parquet"),
+    "Parquet of noise": (lambda d: (d / "agent-1.parquet").write_bytes(os.urandom(1000)), "agent-1.parquet"),
+    "ticks of 10,000 years": (lambda d: spread_of_times(d, "agent-0.ticks", TICK_DTYPE), "spans more than 48 hours"),
+    "truth of 10,000 years": (lambda d: spread_of_times(d, "truth.bin", TRUTH_DTYPE), "spans more than 48 hours"),
+    "truth of 1 TB": (sparse, "is larger than"),
+    **{f"pipe as {name}": (pipe_as(name), "is not a regular file") for name in _NAMES},
+    **{f"device as {name}": (device_as(name), "is a symbolic link") for name in _NAMES},
+}
+
+
+@pytest.mark.timeout(60)
+@pytest.mark.parametrize(("spoil", "words"), REFUSED.values(), ids=REFUSED)
+def test_refused_in_one_line(folder: Path, spoil: Callable[[Path], Any], words: str) -> None:
+    spoil(folder)
+    with pytest.raises(ConfigError) as caught:
+        rewrite_report(folder)
+    assert len(caught.value.problems) == 1
+    assert str(folder) in str(caught.value)
+    assert words in str(caught.value)
+
+
+def test_the_verb_says_it_and_exits_2(folder: Path) -> None:
+    (folder / "summary.json").write_text("\x1b[2J")
+    done = report(folder)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_a_folder_that_is_none_is_called_so(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="no such run folder"):
+        rewrite_report(tmp_path / "nowhere")
+    with pytest.raises(ConfigError, match="is no run folder"):
+        rewrite_report(tmp_path)
+
+
+_DEEP = '{"a":' * 900 + "1" + "}" * 900
+HOSTILE_EVENTS = [
+    "[" * 100_000,
+    _DEEP,
+    f'{{"utc_us": 1{"0" * 5000}}}',
+    f'{{"utc_us": 1{"0" * 400}, "t_us": 1{"0" * 400}, "event": "x"}}',
+    '{"event": "deadlock", "lasted_s": 1e999, "begins": true}',
+    '{"event": "promises", "source": "agent-0", "worst_tracking_m": "much", "proposed": [1]}',
+    '{"event": "bus_summary", "source": "agent-0", "rejected": {"stale": NaN, "x": 1e999}}',
+    '{"event": "\\ud800", "source": {"a": 1}, "utc_us": -9e18, "t_us": true}',
+    '{"event": "<script>alert(1)</script>"}',
+    '{"event": "unheard", "source": "agent-0", "agent": 1, "begins": true, "utc_us": "now"}',
+    '{"event": "unheard", "source": "agent-0", "agent": 1, "begins": false, "lasted_s": "long", "utc_us": [1]}',
+    '{"event": "refused", "source": "agent-0", "sender": {"a": 1}, "topic": [], "reason": null, "count": true}',
+    "\x00\xff",
+]
+
+
+@pytest.mark.parametrize("finished", [True, False])
+def test_hostile_events_cost_themselves_only(folder: Path, finished: bool) -> None:
+    with (folder / "events.jsonl").open("a", encoding="latin-1") as file:
+        file.writelines(f"{line}\n" for line in HOSTILE_EVENTS)
+    if not finished:
+        (folder / "summary.json").unlink()
+    page = rewrite_report(folder).read_text()
+    assert "alert(1)" in page
+    assert "<script" not in page
+
+
+def test_report_writes_through_no_link(folder: Path, tmp_path: Path) -> None:
+    precious = tmp_path / "authorized_keys"
+    for finished in (True, False):
+        precious.write_text("mine")
+        for name in ("report.html", "summary.json", "events.jsonl", "agent-0.parquet"):
+            (folder / f"{name}.part").unlink(missing_ok=True)
+            (folder / f"{name}.part").symlink_to(precious)
+        (folder / "report.html").unlink()
+        (folder / "report.html").symlink_to(precious)
+        if not finished:
+            (folder / "summary.json").unlink()
+        assert report(folder).returncode == 0
+        assert precious.read_text() == "mine"
+        assert not (folder / "report.html").is_symlink()
+
+
+def test_a_new_run_refuses_a_folder_with_links(tmp_path: Path) -> None:
+    (tmp_path / "launch.events.jsonl").symlink_to("/etc/hostname")
+    with pytest.raises(ConfigError, match="symbolic link"):
+        create_run_folder(tmp_path, "circle", 0)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_noise_as_rows_is_reported_or_refused(folder: Path, seed: int) -> None:
+    """Values that no agent records: every phase, NaN and infinity anywhere, times within the same two days."""
+    random = np.random.default_rng(seed)
+    for name, dtype in (("agent-0.ticks", TICK_DTYPE), ("agent-9.ticks", TICK_DTYPE), ("truth.bin", TRUTH_DTYPE)):
+        rows = np.frombuffer(random.bytes(300 * dtype.itemsize), dtype).copy()
+        rows["t_us"] = random.integers(0, 10**10, 300)
+        if "utc_us" in (dtype.names or ()):
+            rows["utc_us"] = random.integers(0, 10**10, 300)
+        rows.tofile(folder / name)
+    (folder / "summary.json").unlink()
+    with np.errstate(all="ignore"):
+        assert rewrite_report(folder).exists()
