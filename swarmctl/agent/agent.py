@@ -17,7 +17,7 @@ from swarmctl.agent.components import (
     make_controllers,
     make_coordination,
     make_estimator,
-    make_last_layer,
+    make_safety_filter,
     make_sequence,
 )
 from swarmctl.agent.reference_selector import Wayfinder
@@ -61,7 +61,7 @@ from swarmctl.mavlink.commands import CommandPort
 from swarmctl.mavlink.vehicle_setup import Upkeep
 
 _NOTHING_US = -1
-_DEVIATES = (Mode.BRAKE, Mode.HOLD, Mode.LAND, Mode.YIELD, Mode.BLIND)  # from what it has promised
+_DEVIATES = (Mode.BRAKE, Mode.HOLD, Mode.LAND, Mode.YIELD, Mode.BLIND)  # from its committed trajectory
 _WAITS_LONG_US = 3_000_000  # for take-off, before it says for what
 _RESTORE_US = 5_000_000  # for parameters to be set back before the process ends
 _AUTOPILOT_HOVERS = (FlightMode.HOLD, FlightMode.EXTERNAL)  # in the latter while it takes off by itself
@@ -92,7 +92,7 @@ class Agent:
         self._controller, self._transit = make_controllers(setup, stopwatch_ns)
         self._observer = make_estimator(setup)
         self._predictor = Predictor(setup.vehicle_model)
-        self._last_layer = make_last_layer(setup, self._surroundings, self._note, stopwatch_ns)
+        self._safety_filter = make_safety_filter(setup, self._surroundings, self._note, stopwatch_ns)
         self._sequence = make_sequence(setup)
         self._wayfinder = Wayfinder(setup, self._sequence, self._note)
         self._judgement = Judgement(Mode.IDLE, "")
@@ -104,7 +104,7 @@ class Agent:
             setup.agent,
             setup.boot_id,
             setup.sysid,
-            setup.promises,
+            setup.uses_commitments,
             autopilot,
             self._surroundings.paths,
             bus,
@@ -112,7 +112,7 @@ class Agent:
             sink,
         )
         self.took = Took(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # of the last tick
-        self._promise_ns = 0  # of the last tick
+        self._commitment_ns = 0  # of the last tick
         self._gaps = self._jumps = 0  # of setpoints and of the estimate, as far as they have been told
         self._announced: tuple[Phase, Mode, FlightMode] | None = None
         self._alerts = Alerts()
@@ -157,7 +157,7 @@ class Agent:
         return None if counts is None else counts.withdrawn + counts.expired
 
     def ask(self, verb: str, now_us: int) -> None:
-        """An operator's wish: hold, resume, land, rtl."""
+        """Follow an operator's verb: hold, resume, land, rtl."""
         self._sequence.operator(verb, now_us, self._clock.utc_us(), self._autopilot.poll(now_us))
         self._note("operator", verb=verb)
 
@@ -178,14 +178,14 @@ class Agent:
         times = NO_TIMES if thought.plan is None else thought.plan.times
         self.took = Took(
             (sensed_ns - began_ns) * 1e-6,
-            (thought_ns - sensed_ns - self._promise_ns) * 1e-6
+            (thought_ns - sensed_ns - self._commitment_ns) * 1e-6
             - (times.spaces_us + times.solve_us + times.certify_us) * 1e-3,
-            self._promise_ns * 1e-6,
+            self._commitment_ns * 1e-6,
             times.spaces_us * 1e-3,
             times.solve_us * 1e-3,
             times.certify_us * 1e-3,
-            self._last_layer.took_ms,
-            (sent_ns - thought_ns) * 1e-6 - self._last_layer.took_ms,
+            self._safety_filter.took_ms,
+            (sent_ns - thought_ns) * 1e-6 - self._safety_filter.took_ms,
         )
         self._share(state, flown)
         self._advance(now_us, state)
@@ -197,7 +197,7 @@ class Agent:
             now_us,
             state,
             thought,
-            Act(self._judgement.mode, flown, setpoint, self._last_layer.acts),
+            Act(self._judgement.mode, flown, setpoint, self._safety_filter.acts),
             self._sequence,
             self._observer.estimate,
             late_ticks,
@@ -219,7 +219,7 @@ class Agent:
         for verb in self._surroundings.listen(self._clock.utc_us()):
             self.ask(verb, now_us)
         if self._coordination is not None:
-            self._coordination.listen(self._clock.utc_us())
+            self._coordination.receive(self._clock.utc_us())
 
     def _sense(self, now_us: int) -> VehicleState | None:
         state = self._autopilot.poll(now_us)
@@ -251,7 +251,7 @@ class Agent:
     # -- think --------------------------------------------------------------------------------------------------------
 
     def _think(self, now_us: int, state: VehicleState | None) -> Thought:
-        self._promise_ns = 0
+        self._commitment_ns = 0
         if state is None or not self._fresh(now_us, state):
             if self._coordination is not None:  # the autopilot flies it, blindly or by its failsafe
                 self._coordination.idle(self._clock.utc_us(), state)
@@ -273,27 +273,27 @@ class Agent:
         grid = np.arange(self._controller.longest + 1, dtype=np.float64)
         ahead_s = self._predictor.delay_us * 1e-6 + dt_us * 1e-6 * grid
         reference, now_ref = self._wayfinder.reference(now_us, self._clock.utc_us(), ahead_s)
-        promised = self._coordinated(now_us, state, flies)
+        committed = self._coordinated(now_us, state, flies)
         if not flies:
             return Thought(start, None, now_ref, keep_outs)
-        if promised is not None:
-            reference = promised
+        if committed is not None:
+            reference = committed
         guess = self._replay.guess_ned_m(act_us)
         controller = self._controller if self._sequence.phase is Phase.TRACK else self._transit
-        kept = tuple(keep_outs) if promised is None else ()  # what it has promised keeps clear already
+        kept = tuple(keep_outs) if committed is None else ()  # the committed trajectory keeps clear already
         plan = controller.plan(Problem(start, reference, estimate.disturbance_ned_m_s2, kept, guess))
         return Thought(start, plan, now_ref, keep_outs)
 
     def _coordinated(self, now_us: int, state: VehicleState, flies: bool) -> Reference | None:
-        """What has been promised, over the horizon from when the setpoint acts; None when nothing is."""
+        """The committed trajectory over the horizon from when the setpoint acts; None when nothing is committed."""
         if self._coordination is None:
             return None
         utc_us, began_ns = self._clock.utc_us(), self._stopwatch_ns()
         if not (flies and self._sequence.had_control) or self._judgement.mode in _DEVIATES:
             self._coordination.idle(utc_us, state)
             return None
-        self._coordination.step(utc_us, state, self._sequence.phase, self._wayfinder.wish(now_us, utc_us))
-        self._promise_ns = self._stopwatch_ns() - began_ns
+        self._coordination.step(utc_us, state, self._sequence.phase, self._wayfinder.desired_reference(now_us, utc_us))
+        self._commitment_ns = self._stopwatch_ns() - began_ns
         act_us = utc_us + self._predictor.delay_us
         pos, vel = self._coordination.follow(act_us + np.arange(self._controller.longest + 1) * self._controller.dt_us)
         return Reference(pos, vel, self._setup.mission.yaw_rad)
@@ -302,7 +302,7 @@ class Agent:
         if not (flies and self._sequence.had_control):
             self._wayfinder.rest(now_us)
             return
-        known = [*keep_outs, *(self._coordination.left_behind if self._coordination else ())]
+        known = [*keep_outs, *(self._coordination.lost_peer_keep_outs if self._coordination else ())]
         landmarks = self._surroundings.landmarks
         deadlock = self._wayfinder.look(now_us, self._clock.utc_us(), state.pos_ned_m, known, landmarks)
         if deadlock is not None:
@@ -364,12 +364,12 @@ class Agent:
 
     def _act(self, now_us: int, flown: Plan | None, start: Start | None) -> AttitudeSetpoint | None:
         if flown is None or start is None:
-            self._last_layer.rest(now_us)
+            self._safety_filter.rest(now_us)
             return None
         act_us = now_us + self._predictor.delay_us
         step = min(max(0, (act_us - flown.t0_us) // flown.dt_us), len(flown.virtual) - 1)
         estimate, flies = self._observer.estimate, self._judgement.mode in FLOWN_BY_AGENT
-        virtual = self._last_layer.keep_apart(now_us, self._utc(act_us), flown.virtual[step], start, estimate, flies)
+        virtual = self._safety_filter.keep_apart(now_us, self._utc(act_us), flown.virtual[step], start, estimate, flies)
         yaw_rad, hover_01 = self._setup.mission.yaw_rad, estimate.hover_thrust_01
         setpoint = setpoint_of(virtual, yaw_rad, hover_01, now_us, self._setup.vehicle_model)
         refused = self._autopilot.send(setpoint, self._clock.now_us())
@@ -397,7 +397,7 @@ class Agent:
             self._autopilot.armable,
             self._commands.busy,
             self._judgement.mode,
-            self._coordination is None and self._surroundings.somebody_is_mute(utc_us),
+            self._coordination is None and self._surroundings.has_unresponsive_peer(utc_us),
             self._surroundings.peers(),
             others_ned_m=self._surroundings.others_ned_m(utc_us),
             arm_in=None if dialect is None else dialect.arm_in,
@@ -454,7 +454,7 @@ class Agent:
         if state is not None:
             self._bus.publish(topics.PATH, topics.encode_path(self._path(state, flown)))
         if self._coordination is not None:
-            self._coordination.say(self._clock.utc_us())
+            self._coordination.publish(self._clock.utc_us())
 
     def _path(self, state: VehicleState, flown: Plan | None) -> PredictedPath:
         setup, seq = self._setup, self._reporter.seq

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from swarmctl.agent.coordination import Coordination
-from swarmctl.agent.safety_filter import LastLayer
+from swarmctl.agent.safety_filter import SafetyFilter
 from swarmctl.agent.setup import AgentSetup
 from swarmctl.agent.world_model import Surroundings
 from swarmctl.bus.peers import Bus
@@ -23,7 +23,7 @@ Stopwatch = Callable[[], int]  # [ns]
 def make_controllers(setup: AgentSetup, stopwatch_ns: Stopwatch) -> tuple[Controller, Controller]:
     """Of the mission, and of the ways there and back."""
     params, rest = setup.controller, (setup.vehicle_model, setup.separation, setup.agent, setup.slots, stopwatch_ns)
-    if setup.promises:
+    if setup.uses_commitments:
         params = params.model_copy(update={"mpc": following(params.mpc, setup.params.commit)})
     mission = make_controller(params, *rest)
     if params.kind != "open_loop":
@@ -35,7 +35,7 @@ def make_coordination(
     setup: AgentSetup, surroundings: Surroundings, bus: Bus, note: Note, stopwatch_ns: Stopwatch
 ) -> Coordination | None:
     """None unless separation is guaranteed."""
-    if not setup.promises:
+    if not setup.uses_commitments:
         return None
     return Coordination(
         setup.agent,
@@ -61,11 +61,13 @@ def make_estimator(setup: AgentSetup) -> DisturbanceObserver | StateFilter:
     return DisturbanceObserver(params.disturbance, model.hover_thrust_01)
 
 
-def make_last_layer(setup: AgentSetup, surroundings: Surroundings, note: Note, stopwatch_ns: Stopwatch) -> LastLayer:
+def make_safety_filter(
+    setup: AgentSetup, surroundings: Surroundings, note: Note, stopwatch_ns: Stopwatch
+) -> SafetyFilter:
     """Of the bodies around it."""
     dt_s = 1.0 / setup.params.rate_hz
     downwash = setup.separation.downwash
-    return LastLayer(setup.params.barrier, setup.vehicle_model, dt_s, surroundings, downwash, note, stopwatch_ns)
+    return SafetyFilter(setup.params.barrier, setup.vehicle_model, dt_s, surroundings, downwash, note, stopwatch_ns)
 
 
 def make_sequence(setup: AgentSetup) -> Sequence:

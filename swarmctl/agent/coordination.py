@@ -1,4 +1,4 @@
-"""An agent's part in guaranteed separation: hears intents, runs `control.commit`, and says its own intent."""
+"""An agent's part in guaranteed separation: hears intents, runs `control.commit`, and says its own message."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ import numpy as np
 from swarmctl.agent.world_model import Surroundings
 from swarmctl.bus import topics
 from swarmctl.bus.peers import Bus, agent_name
-from swarmctl.bus.trajectory_messages import PeerIntents, encode_intent
+from swarmctl.bus.trajectory_messages import PeerTrajectories, encode_trajectory_message
 from swarmctl.control.collision.separation import KeepOut, SeparationParams
 from swarmctl.control.commit.protocol import CommitCounts, Commitments
-from swarmctl.control.commit.trajectory_planner import CommitParams, Situation, Wish, promised_m
+from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference, Situation, committed_m
 from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.core.trajectory import Times
-from swarmctl.core.trajectory_message import Intent
+from swarmctl.core.trajectory_message import TrajectoryMessage
 from swarmctl.core.types import Array, Phase, VehicleState
 
-_DEAD_US = 100_000  # of a token's absence
+_LOST_AFTER_US = 100_000  # of a token's absence
 _SETTLED_US = 2_000_000  # of our own presence, after which absences count
 
 
@@ -31,11 +31,12 @@ class Coordination:
         peers: the others.
         params, mpc, separation, slots, stopwatch_ns: see `Commitments`.
         surroundings: who else is there.
-        bus: is drained by `listen`.
+        bus: is drained by `receive`.
         rate_hz: of every agent's ticks.
-        note: is told `broken_promise` when a peer's promise contradicts ours; `off_promise` when what is flown leaves
-            what is promised by more than half of what is promised beyond touching bodies, and when it is back; and
-            `promises` with all counts when somebody else takes over.
+        note: is told `conflicting_commitment` when a peer's committed trajectory comes too close to the own one;
+            `tracking_violation` when the vehicle leaves its committed trajectory by more than `tracking_m` plus half of
+            the committed distance beyond touching bodies, and when it is back; and `commitments` with all counts when
+            the autopilot or a pilot takes over.
     """
 
     def __init__(
@@ -56,57 +57,59 @@ class Coordination:
         self._agent, self._boot_id, self._bus, self._surroundings = agent, boot_id, bus, surroundings
         self._commitments = Commitments(agent, params, mpc, separation, slots, stopwatch_ns)
         refusals, attendance = surroundings.refusals, surroundings.attendance
-        self._intents, self._peers = PeerIntents(peers, rate_hz, refusals, attendance), frozenset(peers)
+        self._peer_trajectories, self._peers = PeerTrajectories(peers, rate_hz, refusals, attendance), frozenset(peers)
         self._note, self._seq, self._separation = note, 0, separation
-        self._promised = False
-        self._allowed_m = separation.tracking_m + 0.5 * (promised_m(separation) - separation.body_m)
-        self._is_off, self._worst_m = False, 0.0
+        self._is_committed = False
+        self._allowed_m = separation.tracking_m + 0.5 * (committed_m(separation) - separation.body_m)
+        self._is_violating, self._worst_m = False, 0.0
         self._absent_since_us: dict[int, int] = {}
         self._on_bus_since_us: int | None = None
-        self._broken: set[int] = set()
-        self.left_behind: list[KeepOut] = []  # where the gone have promised to end: perhaps they do
+        self._conflicting: set[int] = set()
+        self.lost_peer_keep_outs: list[KeepOut] = []  # where the gone have promised to end: perhaps they do
 
     @property
     def counts(self) -> CommitCounts:
         return self._commitments.counts
 
-    def listen(self, utc_us: int) -> None:
+    def receive(self, utc_us: int) -> None:
         """Rule 1."""
-        for sender, payload in self._bus.receive(topics.INTENT):
-            self._intents.offer(sender, payload, utc_us)
+        for sender, payload in self._bus.receive(topics.TRAJECTORY):
+            self._peer_trajectories.offer(sender, payload, utc_us)
 
-    def step(self, utc_us: int, state: VehicleState, phase: Phase, wish: Wish) -> None:
+    def step(self, utc_us: int, state: VehicleState, phase: Phase, desired: DesiredReference) -> None:
         """Rules 2 to 4, while this agent flies and would like to follow a wish."""
         commitments = self._commitments
-        if not self._promised:
-            self._promised = True
+        if not self._is_committed:
+            self._is_committed = True
             commitments.begin(state.pos_ned_m, state.vel_ned_m_s, utc_us)
-        known, living = self._intents.newest, self._living(utc_us)
-        commitments.hear(utc_us, known, living)
-        broken = commitments.broken(utc_us, known)
-        if broken != self._broken:
-            self._broken = broken
-            self._note("broken_promise", by=sorted(broken))
-        astray = self._surroundings.astray(known, utc_us, self._allowed_m)
-        gone = self._absent_since_us.keys()  # perhaps dead: no longer trusted, still asked
-        self.left_behind = [k for a in known.keys() - living if known[a].promised for k in self._ends(known[a])]
-        taking_part = {a for a in living - gone - broken - astray if a in known and known[a].promised}
-        self._surroundings.promised = {agent: known[agent].followed for agent in taking_part}
+        known, alive_peers = self._peer_trajectories.newest, self._alive_peers(utc_us)
+        commitments.update(utc_us, known, alive_peers)
+        conflicting = commitments.conflicting_peers(utc_us, known)
+        if conflicting != self._conflicting:
+            self._conflicting = conflicting
+            self._note("conflicting_commitment", by=sorted(conflicting))
+        deviating = self._surroundings.deviating_peers(known, utc_us, self._allowed_m)
+        absent = self._absent_since_us.keys()  # perhaps dead: no longer trusted, still asked
+        committed = {agent for agent, message in known.items() if message.is_committed}
+        lost_peers = [agent for agent in known.keys() - alive_peers if agent in committed]
+        self.lost_peer_keep_outs = [keep_out for agent in lost_peers for keep_out in self._ends(known[agent])]
+        taking_part = {a for a in alive_peers - absent - conflicting - deviating if a in committed}
+        self._surroundings.peer_commitments = {agent: known[agent].followed for agent in taking_part}
         partners = {agent: known[agent] for agent in taking_part}
         others = self._others(utc_us, state, phase, taking_part)
-        commitments.avoid(Situation(utc_us, utc_us, wish, partners, others))
+        commitments.evade(Situation(utc_us, utc_us, desired, partners, others))
         if commitments.is_due(utc_us):
             begin_us = utc_us + commitments.lead_us
             others = self._others(begin_us, state, phase, taking_part)
-            commitments.propose(Situation(utc_us, begin_us, wish, known, others))
+            commitments.propose(Situation(utc_us, begin_us, desired, known, others))
         self._watch(float(np.linalg.norm(state.pos_ned_m - self.follow(np.array([utc_us]))[0][0])))
 
     def idle(self, utc_us: int, state: VehicleState | None) -> None:
         """Somebody else flies, or nobody knows: nothing is promised, but peers are still acknowledged."""
-        if self._promised:
-            self._promised = False
-            self._surroundings.promised, self.left_behind = {}, []
-            self._note("promises", **asdict(self.counts), worst_tracking_m=self._worst_m)
+        if self._is_committed:
+            self._is_committed = False
+            self._surroundings.peer_commitments, self.lost_peer_keep_outs = {}, []
+            self._note("commitments", **asdict(self.counts), worst_tracking_m=self._worst_m)
         self._commitments.end(None if state is None else state.pos_ned_m, utc_us)
 
     def follow(self, t_utc_us: Times) -> tuple[Array, Array]:
@@ -114,53 +117,53 @@ class Coordination:
         assert self._commitments.committed is not None
         return self._commitments.committed.sample(t_utc_us)
 
-    def say(self, utc_us: int) -> None:
+    def publish(self, utc_us: int) -> None:
         """Rule 5."""
         if self._commitments.committed is None:
             return
         self._seq += 1
-        intent = Intent(
+        message = TrajectoryMessage(
             self._agent,
             self._boot_id,
             self._seq,
             utc_us,
-            self._promised,
+            self._is_committed,
             self._commitments.committed,
             self._commitments.proposal,
-            self._intents.heard(),
+            self._peer_trajectories.acknowledgements(),
         )
-        self._bus.publish(topics.INTENT, encode_intent(intent))
+        self._bus.publish(topics.TRAJECTORY, encode_trajectory_message(message))
 
     def _watch(self, error_m: float) -> None:
         self._worst_m = max(self._worst_m, error_m)
-        if (error_m > self._allowed_m) != self._is_off:
-            self._is_off = not self._is_off
-            self._note("off_promise", begins=self._is_off, error_m=error_m, allowed_m=self._allowed_m)
+        if (error_m > self._allowed_m) != self._is_violating:
+            self._is_violating = not self._is_violating
+            self._note("tracking_violation", begins=self._is_violating, error_m=error_m, allowed_m=self._allowed_m)
 
-    def _living(self, utc_us: int) -> frozenset[int]:
+    def _alive_peers(self, utc_us: int) -> frozenset[int]:
         """Peers that promise and whose acknowledgement counts.
 
         A peer is dead when it has been off the bus for some ticks while we have been on it for seconds: tokens vanish
         and come back one by one when a router is lost, and two that took each other for dead would both promise.
         """
         alive = self._bus.alive()
-        promising = frozenset(agent for agent in self._peers if self._surroundings.promises(agent))
+        committing = frozenset(agent for agent in self._peers if self._surroundings.uses_commitments(agent))
         if agent_name(self._agent) not in alive:
             self._on_bus_since_us = None
             self._absent_since_us.clear()
-            return promising
+            return committing
         if self._on_bus_since_us is None:
             self._on_bus_since_us = utc_us
         absent = {agent for agent in self._peers if agent_name(agent) not in alive}
         self._absent_since_us = {agent: self._absent_since_us.get(agent, utc_us) for agent in absent}
         if utc_us - self._on_bus_since_us < _SETTLED_US:
-            return promising
-        return promising - {a for a, since_us in self._absent_since_us.items() if utc_us - since_us >= _DEAD_US}
+            return committing
+        return committing - {a for a, since_us in self._absent_since_us.items() if utc_us - since_us >= _LOST_AFTER_US}
 
-    def _ends(self, intent: Intent) -> list[KeepOut]:
+    def _ends(self, message: TrajectoryMessage) -> list[KeepOut]:
         p = self._separation
-        ends = [np.tile(trajectory.pos_ned_m[-1], (2, 1)) for trajectory in intent.followed]
-        return [KeepOut(end, p.planned_m, promised_m(p), False, intent.agent, p.downwash) for end in ends]
+        ends = [np.tile(trajectory.pos_ned_m[-1], (2, 1)) for trajectory in message.followed]
+        return [KeepOut(end, p.planned_m, committed_m(p), False, message.agent, p.downwash) for end in ends]
 
     def _others(self, t0_utc_us: int, state: VehicleState, phase: Phase, taking_part: set[int]) -> list[KeepOut]:
         """Who takes no part, and obstacles, on the planner's grid from a time on.
@@ -170,4 +173,4 @@ class Coordination:
         steps, dt_us = self._commitments.steps, self._commitments.dt_us
         found = self._surroundings.keep_outs(state.pos_ned_m, t0_utc_us, dt_us, steps, phase, taking_part)
         spent_m = self._separation.tracking_m + self._separation.certify_slack_m  # of what plans keep, until refused
-        return [replace(k, certified_m=max(k.certified_m, k.radius_m - spent_m)) for k in found]
+        return [replace(k, hard_min_distance_m=max(k.hard_min_distance_m, k.radius_m - spent_m)) for k in found]

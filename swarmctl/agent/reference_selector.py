@@ -9,9 +9,9 @@ import numpy as np
 
 from swarmctl.agent.setup import AgentSetup
 from swarmctl.control.collision.separation import KeepOut
-from swarmctl.control.commit.trajectory_planner import Wish
+from swarmctl.control.commit.trajectory_planner import DesiredReference
 from swarmctl.control.phases.sequence import Sequence as MissionSequence
-from swarmctl.control.reference.deadlock import Deadlock, Detour
+from swarmctl.control.reference.deadlock import Deadlock, DeadlockRecovery
 from swarmctl.core.types import Array, Obstacle, Reference, Sampled
 
 
@@ -26,7 +26,7 @@ class Wayfinder:
 
     def __init__(self, setup: AgentSetup, sequence: MissionSequence, note: Callable[..., None]) -> None:
         self._sequence, self._note, self._yaw_rad = sequence, note, setup.mission.yaw_rad
-        self._detour = Detour(setup.params.detour, setup.agent, setup.separation.radius_m)
+        self._recovery = DeadlockRecovery(setup.params.deadlock, setup.agent, setup.separation.radius_m)
         self._told: Deadlock | None = None
 
     def look(
@@ -38,33 +38,33 @@ class Wayfinder:
         landmarks: Callable[[], Sequence[Obstacle]],
     ) -> Deadlock | None:
         """Whether the agent, at (3,), gets on among what is known; returns a deadlock that begins."""
-        self._detour.step(now_us, pos_ned_m, self._mission(now_us, utc_us), known, landmarks)
+        self._recovery.step(now_us, pos_ned_m, self._mission(now_us, utc_us), known, landmarks)
         return self._tell(now_us)
 
     def rest(self, now_us: int) -> None:
         """Somebody else flies."""
-        self._detour.reset()
+        self._recovery.reset()
         self._tell(now_us)
 
     def reference(self, now_us: int, utc_us: int, ahead_s: Array) -> tuple[Reference, Reference]:
         """At times (N,) from now, (N, 3) each; and the mission's, now."""
         pos, vel = self._sequence.reference(utc_us, now_us, np.concatenate([[0.0], ahead_s]))
         now_ref = Reference(pos[:1], vel[:1], self._yaw_rad)
-        if self._detour.active:
-            return Reference(*self._detour.sample(ahead_s), self._yaw_rad), now_ref
+        if self._recovery.active:
+            return Reference(*self._recovery.sample(ahead_s), self._yaw_rad), now_ref
         return Reference(pos[1:], vel[1:], self._yaw_rad), now_ref
 
-    def wish(self, now_us: int, utc_us: int) -> Wish:
+    def desired_reference(self, now_us: int, utc_us: int) -> DesiredReference:
         """The same, for whoever plans on another grid."""
-        if self._detour.active:
-            return Wish(self._detour.sample, is_way=True)
-        return Wish(self._mission(now_us, utc_us))
+        if self._recovery.active:
+            return DesiredReference(self._recovery.sample, follows_path=True)
+        return DesiredReference(self._mission(now_us, utc_us))
 
     def _mission(self, now_us: int, utc_us: int) -> Sampled:
         return partial(self._sequence.reference, utc_us, now_us)
 
     def _tell(self, now_us: int) -> Deadlock | None:
-        told, self._told = self._told, self._detour.deadlock
+        told, self._told = self._told, self._recovery.deadlock
         if told is None and self._told is not None:
             self._note("deadlock", begins=True, by=self._told.by)
             return self._told

@@ -152,7 +152,7 @@ def _join(process: AgentProcess, config: Config, clock: WallClock) -> Bus:
     listen = {
         topics.PATH: peers,
         topics.STATUS: peers,
-        topics.INTENT: peers,
+        topics.TRAJECTORY: peers,
         topics.COMMAND: [topics.OPERATOR],
         topics.OBSTACLES: [topics.OPERATOR],
     }

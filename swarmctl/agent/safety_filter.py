@@ -1,4 +1,4 @@
-"""The last layer in flight: hands the barrier what is known, and notes when it acts."""
+"""The safety filter in flight: passes the control barrier function what is known, and notes when it acts."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from swarmctl.core.types import Array
 _QUIET_US = 500_000  # after which it has done with an encounter
 
 
-class LastLayer:
+class SafetyFilter:
     """Changes what is about to be flown when bodies would touch otherwise.
 
     Args:
@@ -68,8 +68,8 @@ class LastLayer:
         self.acts = acts
         if acts:
             if not self._ticks:
-                self._note("barrier", acts=True)
+                self._note("safety_filter", acts=True)
             self._ticks, self._last_us = self._ticks + 1, now_us
         elif self._ticks and now_us - self._last_us > _QUIET_US:
-            self._note("barrier", acts=False, ticks=self._ticks)
+            self._note("safety_filter", acts=False, ticks=self._ticks)
             self._ticks = 0

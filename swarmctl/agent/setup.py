@@ -16,7 +16,7 @@ from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.phases.failsafe import FailsafeParams
 from swarmctl.control.phases.overload import OverloadParams
 from swarmctl.control.phases.sequence import SequenceParams
-from swarmctl.control.reference.deadlock import DetourParams
+from swarmctl.control.reference.deadlock import DeadlockParams
 from swarmctl.control.reference.mission import MissionParams
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array
@@ -34,7 +34,7 @@ class AgentParams(Params):
     state_filter: StateFilterParams = StateFilterParams()
     barrier: BarrierParams = BarrierParams()
     commit: CommitParams = CommitParams()
-    detour: DetourParams = DetourParams()
+    deadlock: DeadlockParams = DeadlockParams()
     autopilot_params: dict[str, int | float] = Field(  # PX4: land when setpoints stop, before it has flown far blindly
         {"COM_OBL_RC_ACT": 4, "COM_OF_LOSS_T": 0.5}
     )
@@ -66,6 +66,6 @@ class AgentSetup:
         return min(len(self.peers), self.separation.max_neighbours) + self.obstacle_slots
 
     @property
-    def promises(self) -> bool:
-        """Whether only what has been promised is flown."""
+    def uses_commitments(self) -> bool:
+        """Whether the agent flies committed trajectories only."""
         return self.separation.mode == "guaranteed"

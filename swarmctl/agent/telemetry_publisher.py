@@ -60,7 +60,7 @@ class Act:
     mode: Mode
     flown: Plan | None
     setpoint: AttitudeSetpoint | None
-    barrier_acted: bool = False
+    safety_filter_acted: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,18 +69,18 @@ class Took:
 
     sense_ms: float  # listen included
     setup_ms: float  # prediction, reference, keep-outs, matrices
-    promise_ms: float  # hearing, judging and planning promises; 0 in best effort
+    commitment_ms: float  # receiving, checking and planning commitments; 0 in best effort
     spaces_ms: float  # half-spaces
     solve_ms: float  # inside the QP solver
     certify_ms: float
-    barrier_ms: float  # the last layer
+    barrier_ms: float  # the safety filter
     send_ms: float  # judging included
 
     @property
     def tick_ms(self) -> float:
         """Listen to send."""
         planned_ms = self.setup_ms + self.spaces_ms + self.solve_ms + self.certify_ms
-        return self.sense_ms + self.promise_ms + planned_ms + self.barrier_ms + self.send_ms
+        return self.sense_ms + self.commitment_ms + planned_ms + self.barrier_ms + self.send_ms
 
 
 class Reporter:
@@ -88,7 +88,7 @@ class Reporter:
 
     Args:
         agent, boot_id, sysid: who reports.
-        promises: it flies only what it has promised.
+        uses_commitments: whether the agent flies committed trajectories only.
         autopilot: the vehicle, for what it says of itself.
         paths: what is known of peers.
         bus, clock, sink: where it goes.
@@ -99,14 +99,14 @@ class Reporter:
         agent: int,
         boot_id: int,
         sysid: int,
-        promises: bool,
+        uses_commitments: bool,
         autopilot: Autopilot,
         paths: PeerPaths,
         bus: Bus,
         clock: Clock,
         sink: TickSink,
     ) -> None:
-        self._agent, self._boot_id, self._sysid, self._promises = agent, boot_id, sysid, promises
+        self._agent, self._boot_id, self._sysid, self._uses_commitments = agent, boot_id, sysid, uses_commitments
         self._autopilot, self._paths = autopilot, paths
         self._bus, self._clock, self._sink = bus, clock, sink
         self._recent_ms: deque[float] = deque(maxlen=_RECENT_TICKS)
@@ -182,7 +182,7 @@ class Reporter:
             tick_ms=took.tick_ms,
             late_ticks=late_ticks,
             plan_pos_ned_m=_NO_PLAN if act.flown is None else act.flown.pos_ned_m,
-            barrier_acted=act.barrier_acted,
+            safety_filter_acted=act.safety_filter_acted,
         )
 
     def _surroundings(self, thought: Thought, utc_us: int) -> tuple[list[float], list[float], float]:
@@ -193,8 +193,8 @@ class Reporter:
         if thought.start is None:
             return [], [], math.nan
         here, act_utc_us = thought.start.pos_ned_m, utc_us + thought.start.t_us - self._clock.now_us()
-        peers = [math.dist(here, k.pos_ned_m[0]) for k in thought.keep_outs if k.tie >= 0]
-        obstacles = [k.distance_m(here) for k in thought.keep_outs if k.tie < 0]
+        peers = [math.dist(here, k.pos_ned_m[0]) for k in thought.keep_outs if k.priority_id >= 0]
+        obstacles = [k.distance_m(here) for k in thought.keep_outs if k.priority_id < 0]
         ages_ms = [(act_utc_us - path.t0_utc_us) * 1e-3 for path in self._paths.latest()]
         return peers, obstacles, max(ages_ms, default=math.nan)
 
@@ -219,7 +219,7 @@ class Reporter:
             path_age_ms=_finite(record.path_age_ms),
             solver_failed=self.failed_plans,
             problem=self.problem,
-            promises=self._promises,
+            uses_commitments=self._uses_commitments,
             utc_us=record.utc_us,
         )
 

@@ -9,7 +9,7 @@ from swarmctl.bus import topics
 from swarmctl.bus.orders import Orders
 from swarmctl.bus.peers import Bus, PeerPaths, agent_name
 from swarmctl.bus.refusals import FUTURE, IDENTITY, MALFORMED, SEQUENCE, UNKNOWN_PEER, Refusals
-from swarmctl.bus.senders import Attendance, Said, Speaker
+from swarmctl.bus.senders import Attendance, ReceivedMessage, SenderVerifier
 from swarmctl.control.collision.barrier import Body, body_of_obstacle, body_of_peer
 from swarmctl.control.collision.separation import (
     KeepOut,
@@ -21,10 +21,10 @@ from swarmctl.control.collision.separation import (
 )
 from swarmctl.control.phases.inputs import PeerFacts
 from swarmctl.core.trajectory import Trajectory
-from swarmctl.core.trajectory_message import Intent
+from swarmctl.core.trajectory_message import TrajectoryMessage
 from swarmctl.core.types import Array, Mode, Obstacle, Phase
 
-_NEW_US = 300_000  # a path that may be compared with promises
+_NEW_US = 300_000  # a path that may be compared with commitments
 _READY_LEAD_US = 1_000_000  # of another clock than ours
 FLOWN_BY_AGENT = frozenset((Mode.FOLLOW, Mode.REPLAY, Mode.BRAKE, Mode.HOLD))
 
@@ -55,14 +55,14 @@ class Surroundings:
         self.refusals, self.attendance = Refusals(note), Attendance(bus)
         shared = rate_hz, self.refusals, self.attendance
         self.paths = PeerPaths(peers, *shared)
-        self._speakers = {peer: Speaker(agent_name(peer), topics.STATUS.name, *shared) for peer in peers}
+        self._verifiers = {peer: SenderVerifier(agent_name(peer), topics.STATUS.name, *shared) for peer in peers}
         self._orders = Orders(agent, self.refusals)
         self._unheard_since_us: dict[int, int] = {}
         self._status: dict[int, topics.StatusMessage] = {}
         self._obstacles: tuple[Obstacle, ...] = ()
         self._obstacles_version: int | None = None
         self._seen: dict[int, Obstacle] = {}  # that have been visible, by identity
-        self.promised: Mapping[int, Sequence[Trajectory]] = {}  # what peers may follow, of those who promise
+        self.peer_commitments: Mapping[int, Sequence[Trajectory]] = {}  # may be followed, by peer that takes part
 
     def listen(self, utc_us: int) -> list[str]:
         """Take in everything that has arrived; returns the operator's verbs for this agent."""
@@ -85,13 +85,15 @@ class Surroundings:
             reason = MALFORMED
         elif sender != agent_name(status.agent):
             reason = IDENTITY
-        elif status.agent not in self._speakers:
+        elif status.agent not in self._verifiers:
             reason = UNKNOWN_PEER
         elif status.ready_utc_us > utc_us + _READY_LEAD_US:
             reason = FUTURE
         if reason or status is None:
             self.refusals.add(sender, topics.STATUS.name, reason, utc_us)
-        elif self._speakers[status.agent].believes(Said(status.boot_id, status.ticks, utc_us, payload), utc_us):
+        elif self._verifiers[status.agent].accepts(
+            ReceivedMessage(status.boot_id, status.ticks, utc_us, payload), utc_us
+        ):
             self._status[status.agent] = status
 
     def _take_obstacles(self, sender: str, payload: bytes, utc_us: int) -> None:
@@ -154,15 +156,15 @@ class Surroundings:
         self._seen.update((id(o), o) for o in seen)
         return found + [keep_out_of_obstacle(o, dt_us, steps, self._params) for o in seen]
 
-    def astray(self, intents: Mapping[int, Intent], utc_us: int, allowed_m: float) -> set[int]:
-        """Peers whose path of just now is farther than allowed from everything that they have promised to follow."""
+    def deviating_peers(self, messages: Mapping[int, TrajectoryMessage], utc_us: int, allowed_m: float) -> set[int]:
+        """Peers whose newest path is farther than allowed from every trajectory that they may follow."""
         found = set()
         for path in self.paths.latest():
-            intent, at_us = intents.get(path.agent), path.t0_utc_us
-            if intent is None or not intent.promised or at_us < utc_us - _NEW_US:
+            message, at_us = messages.get(path.agent), path.t0_utc_us
+            if message is None or not message.is_committed or at_us < utc_us - _NEW_US:
                 continue
             here = path.pos_ned_m[0].tolist()
-            if all(math.dist(here, trajectory.at(at_us)[0]) > allowed_m for trajectory in intent.followed):
+            if all(math.dist(here, trajectory.at(at_us)[0]) > allowed_m for trajectory in message.followed):
                 found.add(path.agent)
         return found
 
@@ -173,16 +175,16 @@ class Surroundings:
     def bodies(self, pos_ned_m: Array, act_utc_us: int, ahead_s: float, margin_m: float) -> list[Body]:
         """What not to touch, `ahead_s` after `act_utc_us`: peers heard of and obstacles seen from `pos_ned_m` (3,).
 
-        Who promises is where it has promised to be, however old the message.
+        A peer that flies by commitments is where its trajectories are, however old the message.
         """
         p, fresh_us = self._params, act_utc_us - round(self._params.lost_after_s * 1e6)
         found: list[Body] = []
-        for agent, trajectories in self.promised.items():
+        for agent, trajectories in self.peer_commitments.items():
             share_01 = 0.5 if self._flies_itself(agent) else 1.0
             for pos, vel in (trajectory.at(act_utc_us + ahead_s * 1e6) for trajectory in trajectories):
                 found.append(Body(pos, vel, p.body_m + margin_m, share_01))
         for path in self.paths.latest():
-            if path.agent in self.promised:
+            if path.agent in self.peer_commitments:
                 continue
             filters = self._flies_itself(path.agent) and path.t0_utc_us >= fresh_us
             growth_m_s2 = 0.0 if self._phase(path.agent) is Phase.DONE else p.age_accel_m_s2
@@ -191,10 +193,10 @@ class Surroundings:
         apart_m = 0.5 * p.body_m + margin_m
         return found + [body_of_obstacle(o, ahead_s, apart_m) for o in visible(self._obstacles, pos_ned_m)]
 
-    def promises(self, agent: int) -> bool:
-        """Whether a peer flies by promises, as far as it is known."""
+    def uses_commitments(self, agent: int) -> bool:
+        """Whether a peer flies committed trajectories only; taken as true until its first status."""
         status = self._status.get(agent)
-        return status is None or status.promises
+        return status is None or status.uses_commitments
 
     def peers(self) -> dict[int, PeerFacts]:
         """Who has been heard of, how far it is, and whether it is still on the bus."""
@@ -209,7 +211,7 @@ class Surroundings:
         paths = self.paths.latest()
         return tuple(aligned(paths, utc_us, 1, 0, self._params.brake_m_s2)[:, 0]) if paths else ()
 
-    def somebody_is_mute(self, utc_us: int) -> bool:
+    def has_unresponsive_peer(self, utc_us: int) -> bool:
         """Whether a peer is silent and not known to be gone: it may be flying on, or the bus is lost to us.
 
         A peer whose liveliness token has gone while ours is there has died; its path has become a keep-out.

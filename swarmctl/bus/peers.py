@@ -15,7 +15,7 @@ from typing import NamedTuple, Protocol
 import numpy as np
 
 from swarmctl.bus.refusals import FUTURE, IDENTITY, LATE, MALFORMED, UNKNOWN_PEER, Refusals
-from swarmctl.bus.senders import Attendance, Said, Speaker
+from swarmctl.bus.senders import Attendance, ReceivedMessage, SenderVerifier
 from swarmctl.bus.topics import PATH, TOO_LONG, TOPICS, Topic, decode_path
 from swarmctl.core.types import PredictedPath
 
@@ -57,7 +57,7 @@ class PeerPaths:
 
     Args:
         peers: agent numbers that are listened to, without the own one.
-        rate_hz, refusals, attendance: see `Speaker`.
+        rate_hz, refusals, attendance: see `SenderVerifier`.
         max_age_us: a path whose first point is older than this when it arrives is refused.
         max_lead_us: a path whose first point is further in the future than this is refused.
     """
@@ -72,7 +72,9 @@ class PeerPaths:
         max_lead_us: int = MAX_LEAD_US,
     ) -> None:
         names = {agent: agent_name(agent) for agent in peers}
-        self._speakers = {a: Speaker(name, PATH.name, rate_hz, refusals, attendance) for a, name in names.items()}
+        self._verifiers = {
+            a: SenderVerifier(name, PATH.name, rate_hz, refusals, attendance) for a, name in names.items()
+        }
         self._max_age_us = max_age_us
         self._max_lead_us = max_lead_us
         self._newest: dict[int, PredictedPath] = {}
@@ -90,7 +92,9 @@ class PeerPaths:
         if path is None or (reason := self._refusal(sender, path, utc_us)):
             self.refusals.add(sender, PATH.name, MALFORMED if path is None else reason, utc_us)
             return
-        if self._speakers[path.agent].believes(Said(path.boot_id, path.seq, path.t0_utc_us, payload), utc_us):
+        if self._verifiers[path.agent].accepts(
+            ReceivedMessage(path.boot_id, path.seq, path.t0_utc_us, payload), utc_us
+        ):
             self._newest[path.agent] = path
 
     def latest(self) -> tuple[PredictedPath, ...]:
@@ -100,7 +104,7 @@ class PeerPaths:
     def _refusal(self, sender: str, path: PredictedPath, utc_us: int) -> str:
         if sender != agent_name(path.agent):
             return IDENTITY
-        if path.agent not in self._speakers:
+        if path.agent not in self._verifiers:
             return UNKNOWN_PEER
         if path.t0_utc_us - utc_us > self._max_lead_us:
             return FUTURE

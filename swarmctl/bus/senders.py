@@ -2,7 +2,7 @@
 
 A sender numbers its messages; the numbers start anew when its process does, under another boot id. So a message of
 another boot id may be a restart, or a forgery that would silence the sender whose next words then look like those of
-a former life. The rules of `Speaker`:
+a former life. The rules of `SenderVerifier`:
 
 1. Boot id and number go on from the message before, and the number is not farther ahead than its sender's rate allows
    for the time between them, as received or as stamped, whichever is longer: believed.
@@ -73,12 +73,12 @@ class Attendance:
         return self._since_us.get(sender)
 
 
-class Said(NamedTuple):
+class ReceivedMessage(NamedTuple):
     """Of a message, what tells whether it is its sender's."""
 
     boot_id: int
     seq: int
-    said_utc_us: int  # by its stamp, or when it came if it has none
+    sent_utc_us: int  # by its stamp, or when it came if it has none
     payload: bytes
 
 
@@ -86,23 +86,23 @@ class Said(NamedTuple):
 class _Stream:
     boot_id: int
     seq: int
-    said_utc_us: int
-    heard_utc_us: int
+    sent_utc_us: int
+    received_utc_us: int
     began_utc_us: int  # stamp of the first
     count: int = 1
 
-    def goes_on(self, said: Said, utc_us: int, rate_hz: float) -> bool:
+    def continues(self, received: ReceivedMessage, utc_us: int, rate_hz: float) -> bool:
         """Whether a message may be the next, or one after some that were lost."""
-        passed_s = max(utc_us - self.heard_utc_us, said.said_utc_us - self.said_utc_us) * 1e-6
+        passed_s = max(utc_us - self.received_utc_us, received.sent_utc_us - self.sent_utc_us) * 1e-6
         ahead = (_AHEAD_S + _RATE_ERROR * passed_s) * rate_hz
-        return said.boot_id == self.boot_id and 0 < said.seq - self.seq <= ahead
+        return received.boot_id == self.boot_id and 0 < received.seq - self.seq <= ahead
 
-    def take(self, said: Said, utc_us: int) -> None:
-        self.seq, self.said_utc_us, self.heard_utc_us = said.seq, said.said_utc_us, utc_us
+    def take(self, received: ReceivedMessage, utc_us: int) -> None:
+        self.seq, self.sent_utc_us, self.received_utc_us = received.seq, received.sent_utc_us, utc_us
         self.count += 1
 
 
-class Speaker:
+class SenderVerifier:
     """One topic of one sender; see the module.
 
     Args:
@@ -119,55 +119,55 @@ class Speaker:
         self._claims: list[_Stream] = []
         self._contents: dict[int, int] = {}  # checksums of what was believed, by number
 
-    def believes(self, said: Said, utc_us: int) -> bool:
+    def accepts(self, received: ReceivedMessage, utc_us: int) -> bool:
         """Judge one message that is good in itself."""
-        reason = self._refusal(said, utc_us)
+        reason = self._refusal(received, utc_us)
         if not reason:
-            self._contents[said.seq] = zlib.crc32(said.payload)
+            self._contents[received.seq] = zlib.crc32(received.payload)
             if len(self._contents) > _REMEMBERED:
                 del self._contents[next(iter(self._contents))]
             return True
         self._refusals.add(self._sender, self._topic, reason, utc_us)
         return False
 
-    def _refusal(self, said: Said, utc_us: int) -> str:
+    def _refusal(self, received: ReceivedMessage, utc_us: int) -> str:
         believed = self._believed
         if believed is None:
-            self._believed = _begun(said, utc_us)
+            self._believed = _new_stream(received, utc_us)
             return ""
-        if believed.goes_on(said, utc_us, self._rate_hz):
-            believed.take(said, utc_us)
-            self._drop([claim for claim in self._claims if claim.began_utc_us < said.said_utc_us], utc_us)
+        if believed.continues(received, utc_us, self._rate_hz):
+            believed.take(received, utc_us)
+            self._drop([claim for claim in self._claims if claim.began_utc_us < received.sent_utc_us], utc_us)
             return ""
-        same_boot = said.boot_id == believed.boot_id
-        if same_boot and said.seq in self._contents:
-            return REPLAYED if self._contents[said.seq] == zlib.crc32(said.payload) else SEQUENCE
-        repeats = same_boot and said.seq <= believed.seq and said.said_utc_us <= believed.said_utc_us
-        if repeats or (not same_boot and said.said_utc_us <= believed.began_utc_us):  # or is of a former life
+        same_boot = received.boot_id == believed.boot_id
+        if same_boot and received.seq in self._contents:
+            return REPLAYED if self._contents[received.seq] == zlib.crc32(received.payload) else SEQUENCE
+        repeats = same_boot and received.seq <= believed.seq and received.sent_utc_us <= believed.sent_utc_us
+        if repeats or (not same_boot and received.sent_utc_us <= believed.began_utc_us):  # or is of a former life
             return REPLAYED
-        claim = self._claim(said, utc_us)
+        claim = self._claim(received, utc_us)
         if not self._is_confirmed(claim, believed, utc_us):
             return UNCONFIRMED
         self._believed, self._claims, self._contents = claim, [], {}
         return ""
 
-    def _claim(self, said: Said, utc_us: int) -> _Stream:
+    def _claim(self, received: ReceivedMessage, utc_us: int) -> _Stream:
         """The claim that a message goes on with, or a new one in the place of that with the fewest messages."""
         for claim in self._claims:
-            if claim.goes_on(said, utc_us, self._rate_hz):
-                claim.take(said, utc_us)
+            if claim.continues(received, utc_us, self._rate_hz):
+                claim.take(received, utc_us)
                 return claim
         if len(self._claims) == _CLAIMS:
-            self._drop([min(self._claims, key=lambda claim: (claim.count, claim.heard_utc_us))], utc_us)
-        self._claims.append(_begun(said, utc_us))
+            self._drop([min(self._claims, key=lambda claim: (claim.count, claim.received_utc_us))], utc_us)
+        self._claims.append(_new_stream(received, utc_us))
         return self._claims[-1]
 
     def _is_confirmed(self, claim: _Stream, believed: _Stream, utc_us: int) -> bool:
         since_us = self._attendance.since_us(self._sender)
         if claim.count < CONFIRMATIONS or since_us is None:
             return False
-        came_back = min(believed.said_utc_us, believed.heard_utc_us) < since_us
-        return came_back or utc_us - believed.heard_utc_us >= SILENCE_US
+        came_back = min(believed.sent_utc_us, believed.received_utc_us) < since_us
+        return came_back or utc_us - believed.received_utc_us >= SILENCE_US
 
     def _drop(self, claims: list[_Stream], utc_us: int) -> None:
         """Of the believed stream nothing else is left to explain them: they were not its sender's."""
@@ -181,5 +181,5 @@ class Speaker:
         self._refusals.turn(self._sender, self._topic, reasons, utc_us)
 
 
-def _begun(said: Said, utc_us: int) -> _Stream:
-    return _Stream(said.boot_id, said.seq, said.said_utc_us, utc_us, said.said_utc_us)
+def _new_stream(received: ReceivedMessage, utc_us: int) -> _Stream:
+    return _Stream(received.boot_id, received.seq, received.sent_utc_us, utc_us, received.sent_utc_us)

@@ -34,8 +34,8 @@ STATUS = Topic("status", ring=4, max_bytes=16_384, reliable=False)
 TICK = Topic("tick", ring=256, max_bytes=4096, reliable=False)
 COMMAND = Topic("command", ring=64, max_bytes=1024, reliable=True)
 OBSTACLES = Topic("obstacles", ring=4, max_bytes=65_536, reliable=True)
-INTENT = Topic("intent", ring=4, max_bytes=131_072, reliable=False)  # the newest says all, a lost one is made good
-TOPICS = (PATH, STATUS, TICK, COMMAND, OBSTACLES, INTENT)
+TRAJECTORY = Topic("trajectory", ring=4, max_bytes=131_072, reliable=False)  # each one replaces all earlier ones
+TOPICS = (PATH, STATUS, TICK, COMMAND, OBSTACLES, TRAJECTORY)
 
 TOO_LONG = b""  # instead of a message that nobody will look into; no decoder takes it
 
@@ -112,7 +112,7 @@ class StatusMessage(msgspec.Struct, frozen=True):
     path_age_ms: float
     solver_failed: int
     problem: str  # newest thing an operator should know, "" when all is well
-    promises: bool = False  # it flies only what it has promised, see `control.commit`
+    uses_commitments: bool = False  # it flies committed trajectories only, see `control.commit`
     utc_us: Count = 0  # when it was said, by the agent's clock
 
 

@@ -13,57 +13,57 @@ import numpy as np
 
 from swarmctl.bus.peers import MAX_LEAD_US, agent_name
 from swarmctl.bus.refusals import FUTURE, IDENTITY, MALFORMED, UNKNOWN_PEER, Refusals
-from swarmctl.bus.senders import Attendance, Said, Speaker
-from swarmctl.bus.topics import INTENT
+from swarmctl.bus.senders import Attendance, ReceivedMessage, SenderVerifier
+from swarmctl.bus.topics import TRAJECTORY
 from swarmctl.core.trajectory import Trajectory
-from swarmctl.core.trajectory_message import Intent, Proposal
+from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
 from swarmctl.core.types import Array
 
-INTENT_VERSION = 2
+TRAJECTORY_VERSION = 2
 MAX_POINTS = 2000
 MAX_STEP_US = 500_000
 MAX_BEGIN_US = 10_000_000  # from now: what begins later is of another clock
 MAX_ACKNOWLEDGED = 256
 _MAGIC = b"SI"
 _HEADER = struct.Struct("<2sBBIIIqH2x")  # magic version flags agent boot seq said acknowledgements
-_PROPOSES, _PROMISED = 1, 2
+_PROPOSES, _IS_COMMITTED = 1, 2
 _PROPOSAL = struct.Struct("<Qq")  # number, time it was made
 _TRAJECTORY = struct.Struct("<qiH2x")
-_HEARD = struct.Struct("<IQ")
+_ACKNOWLEDGEMENT = struct.Struct("<IQ")
 
 Memory = dict[bytes, Trajectory]  # trajectories by their bytes
 
 
-def encode_intent(intent: Intent) -> bytes:
+def encode_trajectory_message(message: TrajectoryMessage) -> bytes:
     """Bytes of one message."""
     parts = [
         _HEADER.pack(
             _MAGIC,
-            INTENT_VERSION,
-            _PROPOSES * (intent.proposal is not None) | _PROMISED * intent.promised,
-            intent.agent,
-            intent.boot_id,
-            intent.seq,
-            intent.said_utc_us,
-            len(intent.heard),
+            TRAJECTORY_VERSION,
+            _PROPOSES * (message.proposal is not None) | _IS_COMMITTED * message.is_committed,
+            message.agent,
+            message.boot_id,
+            message.seq,
+            message.sent_utc_us,
+            len(message.acknowledged),
         ),
-        _encode_trajectory(intent.committed),
+        _encode_trajectory(message.committed),
     ]
-    if intent.proposal is not None:
-        parts.append(_PROPOSAL.pack(intent.proposal.number, intent.proposal.made_utc_us))
-        parts.append(_encode_trajectory(intent.proposal.trajectory))
-    parts += [_HEARD.pack(agent, number) for agent, number in sorted(intent.heard.items())]
+    if message.proposal is not None:
+        parts.append(_PROPOSAL.pack(message.proposal.number, message.proposal.made_utc_us))
+        parts.append(_encode_trajectory(message.proposal.trajectory))
+    parts += [_ACKNOWLEDGEMENT.pack(agent, number) for agent, number in sorted(message.acknowledged.items())]
     return b"".join(parts)
 
 
-def decode_intent(payload: bytes, memory: Memory | None = None) -> Intent | None:
+def decode_trajectory_message(payload: bytes, memory: Memory | None = None) -> TrajectoryMessage | None:
     """The message; None unless magic, version, lengths and every number are good.
 
     `memory` holds the trajectories of the message before: one that is said again is the same object again.
     """
     try:
-        magic, version, flags, agent, boot_id, seq, said_utc_us, count = _HEADER.unpack_from(payload)
-        if magic != _MAGIC or version != INTENT_VERSION or flags > 3 or count > MAX_ACKNOWLEDGED:
+        magic, version, flags, agent, boot_id, seq, sent_utc_us, count = _HEADER.unpack_from(payload)
+        if magic != _MAGIC or version != TRAJECTORY_VERSION or flags > 3 or count > MAX_ACKNOWLEDGED:
             return None
         known, said = memory or {}, Memory()
         committed, at = _decode_trajectory(payload, _HEADER.size, known, said)
@@ -72,13 +72,15 @@ def decode_intent(payload: bytes, memory: Memory | None = None) -> Intent | None
             number, made_utc_us = _PROPOSAL.unpack_from(payload, at)
             trajectory, at = _decode_trajectory(payload, at + _PROPOSAL.size, known, said)
             proposal = Proposal(number, made_utc_us, agent, trajectory)
-        if len(payload) != at + count * _HEARD.size:
+        if len(payload) != at + count * _ACKNOWLEDGEMENT.size:
             return None
-        heard = dict(_HEARD.iter_unpack(payload[at:]))
+        acknowledged = dict(_ACKNOWLEDGEMENT.iter_unpack(payload[at:]))
         if memory is not None:
             memory.clear()
             memory.update(said)
-        return Intent(agent, boot_id, seq, said_utc_us, bool(flags & _PROMISED), committed, proposal, heard)
+        return TrajectoryMessage(
+            agent, boot_id, seq, sent_utc_us, bool(flags & _IS_COMMITTED), committed, proposal, acknowledged
+        )
     except (struct.error, ValueError):
         return None
 
@@ -110,40 +112,42 @@ def _decode_trajectory(payload: bytes, at: int, known: Memory, said: Memory) -> 
     return said[body], end
 
 
-class PeerIntents:
-    """Newest good intent of every peer, whatever its age: nothing is newer than what it says.
+class PeerTrajectories:
+    """Newest good message of every peer, whatever its age: nothing is newer than what it says.
 
     Args:
         peers: agent numbers that are listened to, without the own one.
-        rate_hz, refusals, attendance: see `Speaker`.
+        rate_hz, refusals, attendance: see `SenderVerifier`.
     """
 
     def __init__(self, peers: Iterable[int], rate_hz: float, refusals: Refusals, attendance: Attendance) -> None:
         names = {agent: agent_name(agent) for agent in peers}
-        self._speakers = {a: Speaker(name, INTENT.name, rate_hz, refusals, attendance) for a, name in names.items()}
+        self._verifiers = {
+            a: SenderVerifier(name, TRAJECTORY.name, rate_hz, refusals, attendance) for a, name in names.items()
+        }
         self._refusals = refusals
         self._memory: dict[str, Memory] = {}
-        self.newest: dict[int, Intent] = {}
+        self.newest: dict[int, TrajectoryMessage] = {}
 
     def offer(self, sender: str, payload: bytes, utc_us: int) -> None:
         """Judge one message; `sender` is the name the bus vouches for, `utc_us` now."""
         memory = dict(self._memory.get(sender, {}))
-        intent = decode_intent(payload, memory)
-        if intent is None or (reason := self._refusal(sender, intent, utc_us)):
-            self._refusals.add(sender, INTENT.name, MALFORMED if intent is None else reason, utc_us)
+        message = decode_trajectory_message(payload, memory)
+        if message is None or (reason := self._refusal(sender, message, utc_us)):
+            self._refusals.add(sender, TRAJECTORY.name, MALFORMED if message is None else reason, utc_us)
             return
-        said = Said(intent.boot_id, intent.seq, min(intent.said_utc_us, utc_us + MAX_LEAD_US), payload)
-        if self._speakers[intent.agent].believes(said, utc_us):
-            self.newest[intent.agent], self._memory[sender] = intent, memory
+        said = ReceivedMessage(message.boot_id, message.seq, min(message.sent_utc_us, utc_us + MAX_LEAD_US), payload)
+        if self._verifiers[message.agent].accepts(said, utc_us):
+            self.newest[message.agent], self._memory[sender] = message, memory
 
-    def heard(self) -> dict[int, int]:
+    def acknowledgements(self) -> dict[int, int]:
         """Number of the proposal that each peer is known to make now."""
         return {agent: i.proposal.number for agent, i in self.newest.items() if i.proposal is not None}
 
-    def _refusal(self, sender: str, intent: Intent, utc_us: int) -> str:
-        if sender != agent_name(intent.agent):
+    def _refusal(self, sender: str, message: TrajectoryMessage, utc_us: int) -> str:
+        if sender != agent_name(message.agent):
             return IDENTITY
-        if intent.agent not in self._speakers:
+        if message.agent not in self._verifiers:
             return UNKNOWN_PEER
-        begins_us = max(trajectory.t0_utc_us for trajectory in intent.trajectories)
+        begins_us = max(trajectory.t0_utc_us for trajectory in message.trajectories)
         return FUTURE if begins_us > utc_us + MAX_BEGIN_US else ""

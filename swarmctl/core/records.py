@@ -44,7 +44,7 @@ TICK_DTYPE = np.dtype(
         ("solve_ms", "<f4"),
         ("tick_ms", "<f4"),
         ("late_ticks", "<u4"),
-        ("barrier_acted", "u1"),
+        ("safety_filter_acted", "u1"),
     ]
 )
 

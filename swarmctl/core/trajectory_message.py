@@ -24,17 +24,17 @@ class Proposal:
 
 
 @dataclass(frozen=True, slots=True)
-class Intent:
+class TrajectoryMessage:
     """All that an agent says of its intentions."""
 
     agent: int
     boot_id: int
     seq: int
-    said_utc_us: int
-    promised: bool  # it follows what it has committed to; otherwise somebody else flies it
+    sent_utc_us: int
+    is_committed: bool  # it follows what it has committed to; otherwise somebody else flies it
     committed: Trajectory
     proposal: Proposal | None
-    heard: Mapping[int, int]  # number of the proposal in the newest message taken in of each peer
+    acknowledged: Mapping[int, int]  # number of the proposal in the newest message taken in of each peer
 
     @property
     def trajectories(self) -> tuple[Trajectory, ...]:
@@ -44,4 +44,4 @@ class Intent:
     @property
     def followed(self) -> tuple[Trajectory, ...]:
         """What the agent may follow from now on."""
-        return self.trajectories if self.promised else self.trajectories[1:]
+        return self.trajectories if self.is_committed else self.trajectories[1:]

@@ -52,7 +52,7 @@ class Phase(enum.IntEnum):
     GOTO_START = 4
     READY = 5  # on its start position, waiting for every peer
     TRACK = 6
-    GOTO_LAND = 7  # brake and spread under MPC before the autopilot takes over
+    GOTO_LAND = 7  # brake and separate under MPC before the autopilot takes over
     LAND = 8
     DONE = 9
 
@@ -277,4 +277,4 @@ class TickRecord:
     tick_ms: float  # listen to send
     late_ticks: int  # so far, skipped ones included
     plan_pos_ned_m: Array  # (N+1, 3), empty when there is no plan
-    barrier_acted: bool = False  # the last layer has changed what was flown
+    safety_filter_acted: bool = False  # the safety filter has changed the input

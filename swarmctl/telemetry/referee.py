@@ -110,7 +110,7 @@ def judge(
         "solver": _solver(run.ticks, rules.solver_name),
         "comms": _comms(run),
         "deadlocks": _deadlocks(run.events),
-        "promises": _promises(run.events),
+        "commitments": _commitments(run.events),
     }
     result: dict[str, Any] = plain(summary)
     return result
@@ -276,7 +276,7 @@ def _solver(ticks: Mapping[int, NDArray[np.void]], name: str) -> dict[str, Any]:
         "failed": sum(int(np.isin(rows["plan_status"], _SOLVER_FAILED).sum()) for rows in charged),
         "not_certified": sum(int((rows["plan_status"] == PlanStatus.NOT_CERTIFIED).sum()) for rows in charged),
         "max_residual_m": _spread(residuals)["max"],
-        "barrier_ticks": sum(int(rows["barrier_acted"].sum()) for rows in flights),
+        "safety_filter_ticks": sum(int(rows["safety_filter_acted"].sum()) for rows in flights),
     }
 
 
@@ -304,17 +304,17 @@ def _deadlocks(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     return {"count": begun, "longest_s": max(lasted_s, default=None), "unresolved": begun - len(lasted_s)}
 
 
-def _promises(events: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
-    """Sums over agents of what they counted by their last `promises` event; None where nothing was guaranteed."""
-    last = {event.get("source"): event for event in events if event.get("event") == "promises"}
+def _commitments(events: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
+    """Sums over agents of what they counted by their last `commitments` event; None where nothing was guaranteed."""
+    last = {event.get("source"): event for event in events if event.get("event") == "commitments"}
     if not last:
         return None
     names = ("proposed", "committed", "withdrawn", "expired", "unplanned", "evaded")
     worst_m = max(finite(event.get("worst_tracking_m")) or 0.0 for event in last.values())
-    off = sum(event.get("event") == "off_promise" and event.get("begins") is True for event in events)
+    off = sum(event.get("event") == "tracking_violation" and event.get("begins") is True for event in events)
     return {name: sum(int(finite(event.get(name)) or 0) for event in last.values()) for name in names} | {
         "worst_tracking_m": worst_m,
-        "off_promise": off,
+        "tracking_violation": off,
     }
 
 

@@ -287,7 +287,7 @@ def _summary_rows(summary: Mapping[str, Any], rules: Rules | None) -> Iterator[s
     yield _row("plans refused by their certificate", str(solver["not_certified"]))
     if (deadlocks := summary.get("deadlocks") or {}).get("count"):
         yield _row("deadlocks, the longest", f"{deadlocks['count']}, {_figure(deadlocks['longest_s'], 's', 1)}")
-    yield _row("ticks in which the last layer acted", str(solver.get("barrier_ticks", 0)))
+    yield _row("ticks in which the safety filter acted", str(solver.get("safety_filter_ticks", 0)))
     yield _row("largest residual of a flown plan", _figure(solver["max_residual_m"], "m", 5))
     ages = " / ".join(_figure(comms["path_age_ms"][part], "", 1) for part in ("p50", "p99"))
     yield _row("age of peers' paths, median / p99", f"{ages} ms")

@@ -55,7 +55,7 @@ class _Solver(msgspec.Struct):
     failed: _Count
     not_certified: _Count
     max_residual_m: _Figure | None = None
-    barrier_ticks: _Count = 0
+    safety_filter_ticks: _Count = 0
 
 
 class _Comms(msgspec.Struct):

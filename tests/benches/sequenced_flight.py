@@ -36,7 +36,7 @@ class Flight:
         self.boots = 0
         self.refusal = self.unsettled = ""
         self.beat_us: int | None = None  # the HEARTBEAT that told `armed`; None: one comes with every step
-        self.busy = self.mute = False
+        self.busy = self.unresponsive_peer = False
         self.seen = True
         self.peers = {k + 1: PeerFacts(Phase.STANDBY, 0, True) for k in range(peers)}
 
@@ -71,7 +71,7 @@ class Flight:
             armable=self.armable,
             busy=self.busy,
             mode=self.judged,
-            mute=self.mute,
+            unresponsive_peer=self.unresponsive_peer,
             peers=self.peers,
             others_ned_m=self.others,
             arm_in=self.arm_in,

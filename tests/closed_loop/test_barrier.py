@@ -1,4 +1,4 @@
-"""The last layer alone: half-spaces and certifier switched off, agents that fly through each other."""
+"""The safety filter alone: half-spaces and certifier switched off, agents that fly through each other."""
 
 from __future__ import annotations
 
@@ -36,16 +36,16 @@ def through_each_other(*overrides: str, config: str | None = None) -> Flight:
     return Flight(flight)
 
 
-def barrier_ticks(flight: Flight) -> list[int]:
-    return [int(flight.ticks(i)["barrier_acted"].sum()) for i in range(flight.config.swarm.agents)]
+def safety_filter_ticks(flight: Flight) -> list[int]:
+    return [int(flight.ticks(i)["safety_filter_acted"].sum()) for i in range(flight.config.swarm.agents)]
 
 
 @pytest.mark.parametrize("count", [2, 6])
 def test_they_do_not_touch(count: int) -> None:
     flight = through_each_other(*ring(count))
     assert flight.separation_m() >= BODY_M
-    assert min(barrier_ticks(flight)) > 10
-    begun = [event for event in flight.lockstep.logs[0].events if event["event"] == "barrier"]
+    assert min(safety_filter_ticks(flight)) > 10
+    begun = [event for event in flight.lockstep.logs[0].events if event["event"] == "safety_filter"]
     assert begun[0]["acts"]
 
 
@@ -53,13 +53,13 @@ def test_they_do_not_touch(count: int) -> None:
 def test_control_without_it_they_touch(count: int) -> None:
     flight = through_each_other(*ring(count), OFF)
     assert flight.separation_m() < BODY_M
-    assert not any(barrier_ticks(flight))
+    assert not any(safety_filter_ticks(flight))
 
 
 def test_with_the_dead_time_and_lag_of_a_real_autopilot_they_do_not_touch() -> None:
     flight = through_each_other(*ring(2), "sitl.estimator=exact", config="x500_circle.toml")
     assert flight.separation_m() >= X500_BODY_M
-    assert min(barrier_ticks(flight)) > 10
+    assert min(safety_filter_ticks(flight)) > 10
 
 
 def test_control_of_a_lag_that_it_is_not_told_of_they_touch() -> None:
@@ -69,7 +69,7 @@ def test_control_of_a_lag_that_it_is_not_told_of_they_touch() -> None:
 
 
 def test_it_leaves_an_ordinary_flight_alone_bit_by_bit(fly: Fly, circle: Flight) -> None:
-    assert not any(barrier_ticks(circle))
+    assert not any(safety_filter_ticks(circle))
     short = ("sitl.start=air", "mission.duration_s=2")
     with_it, without = fly(*short), fly(*short, OFF)
     assert with_it.lockstep.truth.tobytes() == without.lockstep.truth.tobytes()

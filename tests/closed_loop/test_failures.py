@@ -165,7 +165,7 @@ def test_others_keep_clear_of_who_has_no_solver(fly: Fly) -> None:
 
 
 def test_a_plan_that_would_come_too_close_is_not_flown(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The QP forgets its half-spaces and the last layer is off: what is left is the certifier, code of its own."""
+    """The QP forgets its half-spaces and the safety filter is off: what is left is the certifier, code of its own."""
     monkeypatch.setattr(mpc, "half_spaces", lambda *_: None)
     flight = fly("mission.duration_s=8", AIR, "agent.barrier.enabled=false")
     certified = flight.separation_m()

@@ -15,8 +15,8 @@ from sitl.lockstep import Lockstep
 from swarmctl.bus import topics
 from swarmctl.bus.orders import Verb
 from swarmctl.bus.peers import agent_name
-from swarmctl.bus.senders import Said, Speaker, _Stream
-from swarmctl.bus.trajectory_messages import decode_intent, encode_intent
+from swarmctl.bus.senders import ReceivedMessage, SenderVerifier, _Stream
+from swarmctl.bus.trajectory_messages import decode_trajectory_message, encode_trajectory_message
 from swarmctl.core.types import Mode, Phase, PredictedPath
 from swarmctl.telemetry.referee import RunData, judge
 from tests.closed_loop.conftest import Flight, Fly, fly_now, mission_t_s
@@ -102,17 +102,17 @@ def test_forged_paths_change_nothing_and_are_told(fly: Fly, twin: Flight) -> Non
     assert summary(twin)["violations"] == []
 
 
-def newest_wins(self: Speaker, said: Said, utc_us: int) -> str:
+def newest_wins(self: SenderVerifier, received: ReceivedMessage, utc_us: int) -> str:
     """What was believed before there were claims."""
-    known, stream = self._believed, _Stream(said.boot_id, said.seq, said.said_utc_us, utc_us, utc_us)
-    if known is not None and (said.boot_id, said.seq) < (known.boot_id, known.seq):
+    known, stream = self._believed, _Stream(received.boot_id, received.seq, received.sent_utc_us, utc_us, utc_us)
+    if known is not None and (received.boot_id, received.seq) < (known.boot_id, known.seq):
         return "replayed"
     self._believed = stream
     return ""
 
 
 def test_control_where_the_newest_is_believed_they_meet(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(Speaker, "_refusal", newest_wins)
+    monkeypatch.setattr(SenderVerifier, "_refusal", newest_wins)
     flight = swap(fly, at={FORGED_S: forge_paths})
     assert flight.separation_m() < 0.1
     found = summary(flight)["comms"]["unheard"]
@@ -141,24 +141,24 @@ def test_a_forged_status_lands_parks_and_delays_nobody(fly: Fly, twin: Flight) -
     assert [of.get("future", 0) for of in rejected] == [1, 0, 1, 1]
 
 
-def forge_intents(heard: list[bytes], running: Lockstep) -> None:
-    """Of another life, and of the highest number: one that promises to be elsewhere."""
-    intent = decode_intent(heard[-1])
-    assert intent is not None
-    away = replace(intent.committed, pos_ned_m=intent.committed.pos_ned_m + np.array([60.0, 0.0, 0.0]))
-    for boot_id, seq in ((STRANGER, 1), (intent.boot_id, LAST)):
-        lie = replace(intent, boot_id=boot_id, seq=seq, committed=away, proposal=None)
-        say(running, topics.INTENT, encode_intent(lie))
+def forge_trajectories(heard: list[bytes], running: Lockstep) -> None:
+    """Of another life, and of the highest number: one that is committed to be elsewhere."""
+    message = decode_trajectory_message(heard[-1])
+    assert message is not None
+    away = replace(message.committed, pos_ned_m=message.committed.pos_ned_m + np.array([60.0, 0.0, 0.0]))
+    for boot_id, seq in ((STRANGER, 1), (message.boot_id, LAST)):
+        lie = replace(message, boot_id=boot_id, seq=seq, committed=away, proposal=None)
+        say(running, topics.TRAJECTORY, encode_trajectory_message(lie))
 
 
-def test_forged_intents_break_no_promise(fly: Fly) -> None:
+def test_forged_trajectories_break_no_commitment(fly: Fly) -> None:
     heard: list[bytes] = []
-    forge = partial(forge_intents, heard)
+    forge = partial(forge_trajectories, heard)
     untouched = swap(fly, GUARANTEED)
-    flight = swap(fly, GUARANTEED, at={0.0: overhear(heard, topics.INTENT), FORGED_S: forge})
+    flight = swap(fly, GUARANTEED, at={0.0: overhear(heard, topics.TRAJECTORY), FORGED_S: forge})
     np.testing.assert_array_equal(flight.pos_ned_m, untouched.pos_ned_m)
     (violation,) = summary(flight)["violations"]
-    assert "(intent boot 3, intent sequence 3)" in violation
+    assert "(trajectory boot 3, trajectory sequence 3)" in violation
 
 
 def test_who_forges_all_the_time_is_told_and_nobody_comes_closer(fly: Fly, twin: Flight) -> None:

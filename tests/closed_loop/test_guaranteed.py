@@ -1,4 +1,4 @@
-"""Guaranteed separation in flight: late and lost messages, a bus that falls apart, and what is said about it."""
+"""Guaranteed separation in flight: late and lost messages, a bus that falls apart, and what is reported of it."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from swarmctl.bus.peers import agent_name
 from swarmctl.config import load
 from swarmctl.core.types import Phase
 
-PROMISED_M = 0.8
+COMMITTED_M = 0.8
 TOUCH_M = 0.48
 
 
@@ -33,24 +33,27 @@ def test_late_and_lost_messages_cost_time_and_no_distance() -> None:
     flight = flown(Cell("swap", 4, 300.0, 0.3, "exact", 0.0, "guaranteed"))
     row = flight.row(None)
     assert row["outcome"] == "arrived"
-    assert row["min_separation_m"] >= PROMISED_M
-    assert events(flight, "off_promise") == []
+    assert row["min_separation_m"] >= COMMITTED_M
+    assert events(flight, "tracking_violation") == []
 
 
 @pytest.mark.parametrize(
     ("traffic_rule", "within_s", "least_m"),
-    [("", 11.0, PROMISED_M), ("agent.commit.bias_rad=0.35 agent.commit.stuck_m=0.1", 14.0, PROMISED_M - 0.03)],
-    ids=["keeping right early", "control: only who stands turns"],
+    [
+        ("", 11.0, COMMITTED_M),
+        ("agent.commit.right_of_way_rad=0.35 agent.commit.stuck_m=0.1", 14.0, COMMITTED_M - 0.03),
+    ],
+    ids=["right of way early", "control: only after standing"],
 )
-def test_who_meets_keeps_right_before_all_stand(traffic_rule: str, within_s: float, least_m: float) -> None:
+def test_agents_that_meet_give_way_by_rule_before_all_stand(traffic_rule: str, within_s: float, least_m: float) -> None:
     """Late plans that end in stops lock in the middle of a swap, and to get out of that takes as long again."""
     row = flown(Cell("swap", 6, 100.0, 0.0, "exact", 0.0, "guaranteed", traffic_rule)).row(None)
     assert row["min_separation_m"] >= least_m
     assert (row["flight_time_s"] < within_s) is (traffic_rule == "")
 
 
-def test_where_a_dead_peer_has_promised_to_end_is_gone_round() -> None:
-    """Unseen by the look-out for deadlocks, somebody stands for good between that and the last path of the dead."""
+def test_agents_fly_around_where_a_lost_peer_was_committed_to_end() -> None:
+    """If recovery did not see it, an agent would stand for good between that place and the lost peer's last path."""
     assert flown(Cell("death", 6, 100.0, 0.0, "exact", 0.0, "guaranteed"), 3).row(None)["outcome"] == "arrived"
 
 
@@ -59,7 +62,7 @@ def test_control_agents_that_see_nobody_touch() -> None:
 
 
 def committed_in_the_dark(sees: type[Coordination] = Coordination) -> int:
-    """How many promises are made from 1.6 s to 2 s after the bus has fallen apart."""
+    """How many trajectories are committed from 1.6 s to 2 s after the bus has fallen apart."""
     flight = Flight(Trial(Cell("swap", 4, 0.0, 0.0, "exact", 0.0, "guaranteed"), 1), layout_of("swap", 1, 4))
     step, counts = flight.lockstep.step, []
     began_us: list[int] = []
@@ -77,24 +80,24 @@ def committed_in_the_dark(sees: type[Coordination] = Coordination) -> int:
     return counts[-1] - counts[-21]
 
 
-def test_who_is_off_the_bus_promises_nothing() -> None:
+def test_an_agent_off_the_bus_commits_nothing() -> None:
     assert committed_in_the_dark() == 0
 
 
-def test_control_who_takes_silence_for_death_promises_against_the_living(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_control_taking_stale_peers_for_lost_commits_against_alive_peers(monkeypatch: pytest.MonkeyPatch) -> None:
     def only_seen(self: Coordination, utc_us: int) -> Set[int]:
         return frozenset(agent for agent in self._peers if agent_name(agent) in self._bus.alive())
 
-    monkeypatch.setattr(Coordination, "_living", only_seen)
+    monkeypatch.setattr(Coordination, "_alive_peers", only_seen)
     assert committed_in_the_dark() > 4
 
 
 @pytest.mark.parametrize(("body_m", "told"), [(0.48, False), (0.8, True)])
-def test_who_flies_beside_what_it_promised_says_so(body_m: float, told: bool) -> None:
-    """Half of what is promised beyond touching bodies may be missed; large ones the last layer pushes aside."""
+def test_a_tracking_violation_is_reported(body_m: float, told: bool) -> None:
+    """The error may be half of the committed distance beyond touching bodies; the safety filter deflects large ones."""
     flight = flown(Cell("swap", 2, 0.0, 0.0, "exact", 0.0, "guaranteed", f"separation.body_m={body_m}"))
     assert flight.row(None)["outcome"] == "arrived"
-    off = events(flight, "off_promise")
+    off = events(flight, "tracking_violation")
     assert bool(off) is told
     if told:
         assert off[0]["begins"] is True
@@ -102,26 +105,26 @@ def test_who_flies_beside_what_it_promised_says_so(body_m: float, told: bool) ->
 
 
 @pytest.mark.parametrize(("weights", "follows"), [("", True), ("{q_pos=2.0,q_vel=0.05,r=1.0}", False)])
-def test_what_is_promised_is_flown_in_height_too(weights: str, follows: bool) -> None:
-    """Into a climbing circle from rest; control: the thesis' soft z, which is good enough for wishes."""
+def test_the_committed_trajectory_is_tracked_in_height_too(weights: str, follows: bool) -> None:
+    """Into a climbing circle from rest; control: the thesis' soft z, which is good enough for a desired reference."""
     sets = ["swarm.agents=1", "sitl.start=air", "separation.mode=guaranteed", "mission.duration_s=2.5"]
     sets += [f"agent.commit.follow_z={weights}"] * bool(weights)
     flight = Lockstep(load(None, sets))
     flight.run()
-    (told,) = [event for event in flight.logs[0].events if event["event"] == "promises"]
+    (told,) = [event for event in flight.logs[0].events if event["event"] == "commitments"]
     assert (told["worst_tracking_m"] < 0.1) is follows
     assert (told["worst_tracking_m"] > 0.2) is not follows
 
 
-def test_a_blind_tick_makes_no_promises_and_takes_no_time_for_them() -> None:
+def test_a_tick_with_a_stale_state_commits_nothing_and_spends_no_time_on_it() -> None:
     flight = Lockstep(load(None, ["swarm.agents=1", "sitl.start=air", "separation.mode=guaranteed"]))
     while not flight.logs[0].rows or flight.logs[0].rows[-1]["phase"][0] != Phase.TRACK:
         flight.step()
     (agent,) = flight.agents
     assert agent is not None
-    assert agent.took.promise_ms > 0.0
+    assert agent.took.commitment_ms > 0.0
     flight.links[0][1].send = lambda data: None  # type: ignore[method-assign]
     for _ in range(15):
         flight.step()
-    assert agent.took.promise_ms == 0.0
+    assert agent.took.commitment_ms == 0.0
     assert agent.took.setup_ms >= 0.0

@@ -29,7 +29,7 @@ def test_everybody_keeps_clear_of_it_and_of_each_other(fly: Fly, seed: int) -> N
     assert clearance_m(past) >= 1.75
     assert past.separation_m() >= 0.89
     for agent in range(3):
-        assert not past.ticks(agent)["barrier_acted"].any(), "the last layer is not needed for it"
+        assert not past.ticks(agent)["safety_filter_acted"].any(), "the safety filter is not needed for it"
         assert past.modes(agent, Phase.TRACK) == {Mode.FOLLOW}
 
 
@@ -38,7 +38,9 @@ def test_with_published_weights_everybody_keeps_clear_from_the_published_start_a
     assert flight.problems == []
     assert clearance_m(flight) >= 1.70
     assert flight.separation_m() >= 0.85
-    assert not any(flight.ticks(i)["barrier_acted"].any() for i in range(3)), "the last layer is not needed for it"
+    assert not any(flight.ticks(i)["safety_filter_acted"].any() for i in range(3)), (
+        "the safety filter is not needed for it"
+    )
 
 
 def test_it_is_known_only_within_the_visibility_distance(flight: Flight) -> None:

@@ -15,7 +15,7 @@ def check(flight: Flight) -> None:
     for agent in range(8):
         _, error = flight.tracked(agent)
         assert np.linalg.norm(error[-1]) < 0.1, "everybody arrives"
-        assert not flight.ticks(agent)["barrier_acted"].any(), "the last layer is not what keeps them apart"
+        assert not flight.ticks(agent)["safety_filter_acted"].any(), "the safety filter is not what keeps them apart"
 
 
 def test_eight_agents_swap_without_touching(fly: Fly) -> None:

@@ -159,9 +159,9 @@ def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Callable[..., La
 
 
 def test_a_killed_agent_fails_the_launch_and_the_others_finish(start: Callable[..., Launched]) -> None:
-    """By promises: who is dead is not waited for, and those who live still ask each other."""
-    promising = ("--set", "telemetry.enabled=false", "--set", "separation.mode=guaranteed")
-    launched = start("--agents", "3", "--duration", "4", *NEAR, *promising)
+    """With guaranteed separation a lost peer is not waited for, and alive peers still acknowledge each other."""
+    guaranteed = ("--set", "telemetry.enabled=false", "--set", "separation.mode=guaranteed")
+    launched = start("--agents", "3", "--duration", "4", *NEAR, *guaranteed)
     launched.until_phase("TRACK", 3)
     os.kill(launched.pid_of("agent", "--id", "1"), signal.SIGKILL)
     assert launched.end() == 4, launched.text()
@@ -173,8 +173,8 @@ def test_a_killed_agent_fails_the_launch_and_the_others_finish(start: Callable[.
     summary = launched.summary()
     assert summary["outcome"] == "failed"
     assert any("agent-1" in violation for violation in summary["violations"])
-    assert summary["promises"]["committed"] > 50
-    assert summary["promises"]["off_promise"] == 0
+    assert summary["commitments"]["committed"] > 50
+    assert summary["commitments"]["tracking_violation"] == 0
     assert summary["separation"]["min_m"] >= 0.8
     assert launched.landed()[0]
     assert launched.landed()[2]

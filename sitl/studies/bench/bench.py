@@ -45,7 +45,7 @@ from swarmctl.core.types import Array, Phase
 from swarmctl.errors import EXIT_OK, ConfigError, MissionError, exit_code_of
 from swarmctl.files import replace_text
 
-PARTS = ("sense", "setup", "promise", "spaces", "solve", "certify", "barrier", "send", "tick")
+PARTS = ("sense", "setup", "commitment", "spaces", "solve", "certify", "barrier", "send", "tick")
 SOLVERS = ("osqp", "daqp")
 NEIGHBOURS = (0, 1, 2, 4, 8, 16, 30)
 MAX_NEIGHBOURS = 99
@@ -53,8 +53,8 @@ _BESIDE_PILLAR = 2  # neighbours of the scenario with an obstacle
 _WARM_UP_S = 5.0  # of the mission: catching up with the circle
 _READY_WITHIN_TICKS = 1500
 _OBSTACLE = ", 1 obstacle"
-_PROMISES = ", guaranteed"
-_PROMISING = 9  # neighbours of the scenario with promises
+_GUARANTEED = ", guaranteed"
+_GUARANTEED_NEIGHBOURS = 9  # neighbours of the scenario with guaranteed separation
 _ENDLESS_S = 3600.0
 _BUSY_LOAD = 0.7  # one-minute load average
 
@@ -97,12 +97,13 @@ def measure_ticks(
     return {solver: np.array(rows) for solver, rows in took.items()}
 
 
-def measure_promises(
+def measure_commitments(
     neighbours: int, solvers: Sequence[str], ticks: int, on_tick: Callable[[], None] = lambda: None
 ) -> dict[str, Array]:
-    """The same of `neighbours + 1` agents that fly a swap by promises: ticks of all of them in turn, (ticks, 9) [ms].
+    """The same of `neighbours + 1` agents that fly a swap with guaranteed separation.
 
-    Paths alone, as in `measure_ticks`, promise nothing: everybody is a whole agent here.
+    Rows (ticks, 9) [ms] are ticks of all agents in turn. Paths alone, as in `measure_ticks`, commit to nothing:
+    everybody is a whole agent here.
     """
     crowds = {solver: Lockstep(_swap_config(solver, neighbours + 1)) for solver in solvers}
     took: dict[str, list[tuple[float, ...]]] = {solver: [] for solver in solvers}
@@ -171,7 +172,7 @@ def bench(
 ) -> list[BenchRow]:
     """Measure everything; shows progress on a terminal."""
     rows: list[BenchRow] = []
-    promising = min(_PROMISING, max(1, *neighbours, 0))
+    guaranteed = min(_GUARANTEED_NEIGHBOURS, max(1, *neighbours, 0))
     with Progress(transient=True, console=console, disable=not console.is_terminal) as bar:
         task = bar.add_task("ticks", total=ticks * (len(neighbours) + 2))
 
@@ -181,8 +182,8 @@ def bench(
         for count in neighbours:
             bar.update(task, description=f"{count} neighbours")
             rows += tick_rows(measure_ticks(count, solvers, ticks, on_tick=on_tick), count)
-        bar.update(task, description=f"{promising} neighbours that promise")
-        rows += tick_rows(measure_promises(promising, solvers, ticks, on_tick), promising, _PROMISES)
+        bar.update(task, description=f"{guaranteed} neighbours{_GUARANTEED}")
+        rows += tick_rows(measure_commitments(guaranteed, solvers, ticks, on_tick), guaranteed, _GUARANTEED)
         bar.update(task, description=f"{_BESIDE_PILLAR} neighbours, 1 obstacle")
         beside = measure_ticks(_BESIDE_PILLAR, solvers, ticks, pillar=True, on_tick=on_tick)
         rows += tick_rows(beside, _BESIDE_PILLAR, _OBSTACLE)
@@ -204,7 +205,7 @@ def show(rows: Sequence[BenchRow], console: Console) -> None:
     """The rows as two tables and the ratios."""
     neighbours = Column("neighbours", min_width=10)
     table = Table("solver", neighbours, *PARTS, title="one tick: p50 (p99) [ms]", box=SIMPLE)
-    for suffix in ("", _PROMISES, _OBSTACLE):
+    for suffix in ("", _GUARANTEED, _OBSTACLE):
         keys = dict.fromkeys((r.neighbours, r.solver) for r in rows if r.name == "tick" + suffix)
         for count, solver in keys:
             found = {r.name: r for r in rows if (r.neighbours, r.solver) == (count, solver)}

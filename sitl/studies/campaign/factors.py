@@ -26,7 +26,7 @@ PROTECTIONS: dict[str, tuple[str, ...]] = {
     "off": ("controller.kind=mpc", "agent.barrier.enabled=false"),  # the same plans, of somebody who sees nobody
 }
 
-UNCOOPERATIVE = (*PROTECTIONS["off"], "separation.mode=best_effort")  # promises nothing either
+UNCOOPERATIVE = (*PROTECTIONS["off"], "separation.mode=best_effort")  # makes no commitments either
 
 NOISES: dict[str, Noise] = {
     "exact": Noise(0.0, 0.0),

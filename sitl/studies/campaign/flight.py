@@ -147,7 +147,7 @@ class Flight:
             "least_sum_m": least_sum_m(cell.agents, separation.radius_m) if layout.settles else None,
             "plans_failed": sum(int(np.isin(rows["plan_status"], _BAD_PLANS).sum()) for rows in charged),
             "commits_refused": self._commits_refused(),
-            "barrier_acted": sum(int(rows["barrier_acted"].sum()) for rows in charged),
+            "barrier_acted": sum(int(rows["safety_filter_acted"].sum()) for rows in charged),
             "simulated_s": self.lockstep.clock.now_us() * 1e-6,
         }
 
@@ -202,10 +202,10 @@ class Flight:
         return tuple(found)
 
     def _commits_refused(self) -> int | None:
-        """Counted by agents that promise; None when none does."""
+        """Counted by agents that fly by commitments; None when none does."""
         counts = [agent.commits_refused for agent in self._agents if agent is not None]
-        promising = [count for count in counts if count is not None]
-        return sum(promising) if promising else None
+        committing = [count for count in counts if count is not None]
+        return sum(committing) if committing else None
 
 
 def _alone_s(trial: Trial, layout: Layout) -> float | None:

@@ -1,4 +1,4 @@
-"""The last layer: a control-barrier filter on the acceleration that is about to be commanded.
+"""The safety filter: a control barrier function on the acceleration that is about to be commanded.
 
 It knows nothing of horizons, rows or certificates, and shares no code with them: from where everybody will be when the
 command acts, it changes the command as little as possible such that bodies can still be kept apart by braking. For
@@ -28,7 +28,7 @@ from dataclasses import dataclass
 import numpy as np
 from pydantic import Field
 
-from swarmctl.control.collision.projection import Row, Vector, nearest_or_least_violating
+from swarmctl.control.collision.projection import Row, Vector, project_or_violate_least
 from swarmctl.control.lag import Lag
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.problem import Start
@@ -37,21 +37,21 @@ from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Obstacle, PredictedPath
 
 _TINY = 1e-6
-_LACK_WEIGHT = 100.0  # more would trade all of the thrust for a trace of distance
+_SLACK_WEIGHT = 100.0  # more would trade all of the thrust for a trace of distance
 _LAG_STEP_S = 1e-3
-_LIFT_M_S2 = 2.5  # thrust may be changed by: without lift there is no braking either
+_THRUST_CHANGE_M_S2 = 2.5  # thrust may be changed by: without lift there is no braking either
 _FARTHEST_M_S2 = 40.0  # a row that is kept by any acceleration
 
 
 class BarrierParams(Params):
-    """When the last layer acts, and how hard."""
+    """When the safety filter acts, and how hard."""
 
     enabled: bool = True
     margin_m: float = Field(0.05, ge=0, le=10)  # beyond touching bodies
     brake_m_s2: float = Field(4.0, gt=0, le=20)  # of one vehicle, level; more is left for the rest
     near_1_s: float = Field(6.0, gt=0, le=50)  # k: approach allowed per metre left, close by
     gain_1_s: float = Field(6.0, gt=0, le=50)  # how fast the allowed approach may be neared
-    react_s: float = Field(0.045, ge=0, le=1)  # of approaching on while the airframe turns to brake
+    react_s: float = Field(0.045, ge=0, le=1)  # of approaching on while the airframe slew_bounds to brake
     escape_m_s: float = Field(0.5, ge=0, le=10)  # parting asked for when closer than allowed
     slew_1_s: float = Field(2.5, gt=0, le=50)  # of (u_x, u_y): a faster turn would saturate rotors and be lost
 
@@ -153,7 +153,7 @@ class Barrier:
         """
         if not bodies or not np.isfinite(virtual).all():
             return None
-        pos, vel = self._felt(start, disturbance_ned_m_s2)
+        pos, vel = self._predicted_state(start, disturbance_ned_m_s2)
         ux, uy, thrust = virtual.tolist()
         upright = math.sqrt(max(0.0, 1.0 - ux * ux - uy * uy))
         wanted = (thrust * ux, thrust * uy, thrust * upright)  # thrust vector over mass, up is +
@@ -164,16 +164,16 @@ class Barrier:
         if all(_dot(normal, wanted) >= offset for normal, offset in rows):
             return None
         rows.sort(key=lambda row: _dot(row[0], wanted) - row[1])  # what is lacking most, first: fewer are active after
-        turns = [self._turn(u, held) for u, held in zip((ux, uy), start.virtual.tolist(), strict=False)]
-        bounds = self._bounds(wanted, thrust, turns, hover_thrust_01)
-        lift = nearest_or_least_violating(wanted, rows, bounds, _LACK_WEIGHT)
-        size = math.sqrt(_dot(lift, lift))
+        slew_bounds = [self._slew_bounds(u, held) for u, held in zip((ux, uy), start.virtual.tolist(), strict=False)]
+        bounds = self._bounds(wanted, thrust, slew_bounds, hover_thrust_01)
+        thrust_vector = project_or_violate_least(wanted, rows, bounds, _SLACK_WEIGHT)
+        size = math.sqrt(_dot(thrust_vector, thrust_vector))
         if size < _TINY:
             return None
-        flown = [min(most, max(least, f / size)) for f, (least, most) in zip(lift, turns, strict=False)]
+        flown = [min(most, max(least, f / size)) for f, (least, most) in zip(thrust_vector, slew_bounds, strict=False)]
         return np.array([*flown, size])
 
-    def _felt(self, start: Start, disturbance_ned_m_s2: Array) -> tuple[Vector, Vector]:
+    def _predicted_state(self, start: Start, disturbance_ned_m_s2: Array) -> tuple[Vector, Vector]:
         """Own position and velocity when a command of now is felt, under what is commanded already."""
         pos, vel = start.pos_ned_m.tolist(), start.vel_ned_m_s.tolist()
         if not self.ahead_s:
@@ -223,19 +223,19 @@ class Barrier:
         nz *= down_01
         return (-nx, -ny, -nz), body.share_01 * need - (nx * rest[0] + ny * rest[1] + nz * rest[2])
 
-    def _turn(self, wanted: float, held: float) -> tuple[float, float]:
+    def _slew_bounds(self, wanted: float, held: float) -> tuple[float, float]:
         """Least and largest u of an axis from what is held now, the wanted one always among them."""
         most = self._vehicle.u_max()
         return min(wanted, max(-most, held - self._slew)), max(wanted, min(most, held + self._slew))
 
     def _bounds(
-        self, wanted: Vector, thrust_m_s2: float, turns: Sequence[tuple[float, float]], hover_thrust_01: float
+        self, wanted: Vector, thrust_m_s2: float, slew_bounds: Sequence[tuple[float, float]], hover_thrust_01: float
     ) -> list[Row]:
         """Rows of what the airframe can do."""
         model, full = self._vehicle, GRAVITY_M_S2 / hover_thrust_01
-        least = max(wanted[2] - _LIFT_M_S2, min(wanted[2], model.thrust_min_01 * full))
-        most = min(wanted[2] + _LIFT_M_S2, max(wanted[2], model.thrust_max_01 * full))
-        spans = [*((thrust_m_s2 * low, thrust_m_s2 * high) for low, high in turns), (least, most)]
+        least = max(wanted[2] - _THRUST_CHANGE_M_S2, min(wanted[2], model.thrust_min_01 * full))
+        most = min(wanted[2] + _THRUST_CHANGE_M_S2, max(wanted[2], model.thrust_max_01 * full))
+        spans = [*((thrust_m_s2 * low, thrust_m_s2 * high) for low, high in slew_bounds), (least, most)]
         rows: list[Row] = []
         for i, (low, high) in enumerate(spans):
             axis = tuple(1.0 if k == i else 0.0 for k in range(3))

@@ -17,7 +17,7 @@ _PARALLEL = 1e-9
 _EPS = 1e-9
 
 
-def nearest_point(wanted: Vector, rows: Sequence[Row]) -> Vector | None:
+def project(wanted: Vector, rows: Sequence[Row]) -> Vector | None:
     """Nearest to `wanted` (n,) of all x with `normal . x >= offset` for every row; None when there is none."""
     found = wanted
     for i, (normal, offset) in enumerate(rows):
@@ -28,14 +28,14 @@ def nearest_point(wanted: Vector, rows: Sequence[Row]) -> Vector | None:
         if length < _PARALLEL:
             return None
         unit = tuple(c / length for c in normal)
-        within = _nearest_on(wanted, unit, offset / length, rows[:i])
+        within = _project_onto_plane(wanted, unit, offset / length, rows[:i])
         if within is None:
             return None
         found = within
     return found
 
 
-def nearest_or_least_violating(wanted: Vector, soft: Sequence[Row], hard: Sequence[Row], weight: float) -> Vector:
+def project_or_violate_least(wanted: Vector, soft: Sequence[Row], hard: Sequence[Row], weight: float) -> Vector:
     """Nearest of all that keep every row; where there is none, keep `hard` and violate `soft` as little as possible.
 
     Args:
@@ -43,21 +43,21 @@ def nearest_or_least_violating(wanted: Vector, soft: Sequence[Row], hard: Sequen
         soft, hard: rows; there must be a point that keeps the hard ones.
         weight: of the squared largest violation of a unit soft row against the squared way from `wanted`.
     """
-    found = nearest_point(wanted, [*hard, *soft])
+    found = project(wanted, [*hard, *soft])
     if found is not None:
         return found
     share = 1.0 / math.sqrt(weight)  # one more coordinate, what all soft rows may lack, measured in the same metric
-    lifted = [((*normal, 0.0), offset) for normal, offset in hard]
-    lifted.append(((0.0,) * len(wanted) + (1.0,), 0.0))
-    lifted += [((*normal, share), offset) for normal, offset in soft]
-    found = nearest_point((*wanted, 0.0), lifted)
+    extended = [((*normal, 0.0), offset) for normal, offset in hard]
+    extended.append(((0.0,) * len(wanted) + (1.0,), 0.0))
+    extended += [((*normal, share), offset) for normal, offset in soft]
+    found = project((*wanted, 0.0), extended)
     return wanted if found is None else found[:-1]
 
 
-def _nearest_on(wanted: Vector, unit: Vector, offset: float, rows: Sequence[Row]) -> Vector | None:
-    """As `nearest_point`, on the plane `unit . x = offset`."""
-    lift = offset - sum(map(_times, unit, wanted))
-    foot = tuple(w + lift * u for w, u in zip(wanted, unit, strict=True))
+def _project_onto_plane(wanted: Vector, unit: Vector, offset: float, rows: Sequence[Row]) -> Vector | None:
+    """As `project`, on the plane `unit . x = offset`."""
+    shift = offset - sum(map(_times, unit, wanted))
+    foot = tuple(w + shift * u for w, u in zip(wanted, unit, strict=True))
     if len(wanted) == 1:
         kept = all(o - n[0] * foot[0] <= _EPS * max(1.0, abs(n[0])) for n, o in rows)
         return foot if kept else None
@@ -73,7 +73,7 @@ def _nearest_on(wanted: Vector, unit: Vector, offset: float, rows: Sequence[Row]
                 return None
             continue
         flat.append((inside, left))
-    found = nearest_point((0.0,) * (len(wanted) - 1), flat)
+    found = project((0.0,) * (len(wanted) - 1), flat)
     if found is None:
         return None
     along = scale * sum(map(_times, mirror[1:], found))

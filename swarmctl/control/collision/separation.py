@@ -42,8 +42,8 @@ class SeparationParams(Params):
     gate_m: float = Field(3.0, gt=0, le=1000)  # rows farther than this from being active are left out
     stop_m_s2: float = Field(1.0, gt=0, le=50)  # braking that plans leave room for beyond their horizon
     relax_01: float = Field(0.9, gt=0, le=1)  # share of the reachable displacement a row may ask for
-    bias_rad: float = Field(0.35, ge=0, le=1.2)  # traffic rule: largest turn of head-on normals among peers
-    bias_obstacle_rad: float = Field(0.35, ge=0, le=1.2)  # likewise, before obstacles
+    right_of_way_rad: float = Field(0.35, ge=0, le=1.2)  # traffic rule: largest turn of head-on normals among peers
+    right_of_way_obstacle_rad: float = Field(0.35, ge=0, le=1.2)  # likewise, before obstacles
     stuck_m: float = Field(0.1, gt=0, le=10)  # a plan that moves less over its horizon gets nowhere
     max_neighbours: int = Field(8, ge=1, le=99)  # nearest ones that get rows
     max_obstacles: int = Field(6, ge=1, le=50)  # likewise; all visible ones are certified against
@@ -60,9 +60,9 @@ class KeepOut:
 
     pos_ned_m: Array  # (Hp+1, 3)
     radius_m: float  # constraint distance between centres
-    certified_m: float  # a plan closer than this is refused
+    hard_min_distance_m: float  # a plan closer than this is refused
     any_height: bool  # a vertical cylinder instead of a sphere
-    tie: int  # decides the side when centres coincide; the larger id goes first
+    priority_id: int  # decides the side when centres coincide; the larger id goes first
     downwash: float = 1.0  # an ellipsoid this many times as high as it is wide, instead of a sphere
 
     @property
@@ -181,7 +181,7 @@ def half_spaces(
     goal_m: Array,
     vel_m_s: Array,
     dt_s: float,
-    own_tie: int,
+    own_priority_id: int,
     params: SeparationParams,
 ) -> HalfSpaces | None:
     """Linearised distance constraints for steps 1..Hp, in the plane or in space.
@@ -192,7 +192,7 @@ def half_spaces(
         goal_m: (2,) or (3,) where the reference ends: decides what head-on means, and how many axes there are.
         vel_m_s: (2,) or (3,) own velocity at the first point.
         dt_s: between points.
-        own_tie: own agent id.
+        own_priority_id: own agent id.
         params: bias and gate.
 
     In the plane height difference counts: a sphere of radius R leaves `sqrt(R^2 - dz^2)` to keep horizontally. A
@@ -212,15 +212,15 @@ def half_spaces(
     apart, others = apart[:, :, :axes], others[:, :, :axes]
     distance = np.sqrt(np.einsum("skc,skc->sk", apart, apart))
     side = np.zeros((len(keep_outs), 1, axes))
-    side[:, 0, 0] = [1.0 if own_tie > k.tie else -1.0 for k in keep_outs]
+    side[:, 0, 0] = [1.0 if own_priority_id > k.priority_id else -1.0 for k in keep_outs]
     normal = np.where(distance[:, :, None] < _TINY_M, side, apart / np.maximum(distance, _TINY_M)[:, :, None])
     moved = math.dist(guess_ned_m[-1, :axes], guess_ned_m[0, :axes])
     stuck = min(1.0, max(0.0, 2.0 - moved / params.stuck_m))
     to_goal = goal_m - guess_ned_m[1:, :axes]  # (Hp, axes)
     across = to_goal[:, 0] * normal[:, :, 1] - to_goal[:, 1] * normal[:, :, 0]  # (slots, Hp) > 0: it is on the left
-    turn_rad = np.full(distance.shape, params.bias_rad * stuck)
-    is_obstacle = np.array([k.tie < 0 for k in keep_outs])
-    turn_rad[is_obstacle] = params.bias_obstacle_rad * np.where(across[is_obstacle] > 0.0, -1.0, 1.0)
+    turn_rad = np.full(distance.shape, params.right_of_way_rad * stuck)
+    is_obstacle = np.array([k.priority_id < 0 for k in keep_outs])
+    turn_rad[is_obstacle] = params.right_of_way_obstacle_rad * np.where(across[is_obstacle] > 0.0, -1.0, 1.0)
     normal = _turned(normal, distance, needed, to_goal, turn_rad)
     if axes == 3:
         normal[:, :, 2] *= vertical_01  # in heights as they are
@@ -279,6 +279,6 @@ def certify(path_ned_m: Array, keep_outs: Sequence[KeepOut], from_step: int, clo
     distance = np.sqrt(np.einsum("mkc,mkc->mk", closest, closest))  # (m, Hp)
     now = np.sqrt(np.einsum("mc,mc->m", apart[:, 0], apart[:, 0]))
     later = distance[:, min(from_step, distance.shape[1] - 1) :].min(axis=1)
-    allowed = np.array([k.certified_m for k in keep_outs])
+    allowed = np.array([k.hard_min_distance_m for k in keep_outs])
     margin = np.where((now < allowed) & (later >= now - closer_m), 0.0, later - allowed)
     return float(margin.min())

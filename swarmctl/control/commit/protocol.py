@@ -29,10 +29,11 @@ What it rests on, and how that is watched in flight:
 - Agents mean the same time: a clock offset of e seconds costs v e metres. `separation.tracking_m` covers it; offsets
   of vehicles' clocks are measured, hosts are to be synchronised.
 - They fly what they follow: half of what is promised beyond touching bodies may be missed by each. An event
-  `off_promise` says who misses more, and `promises` at the end the worst of the flight.
-- Promises are kept. A promise is changed without being asked for only where a vehicle begins to promise at speed, and
-  by `avoid`, before something that takes no part: round it, to a stop, or above it. Whoever finds a peer's promise in
-  contradiction to the own one (`broken`), or a peer beside its promise, keeps clear of it as of one that takes no part.
+  `tracking_violation` says who misses more, and `promises` at the end the worst of the flight.
+- Commitments are kept. A commitment changes without acknowledgement only where a vehicle first commits at speed, and
+  by `evade`, before something that does not take part: around it, to a stop, or above it. An agent that finds a peer's
+  commitment in conflict with its own (`conflicting_peers`), or a peer off its committed trajectory, keeps clear of that
+  peer as of one that does not take part.
 - Everybody takes part. Who does not (a pilot flies, an agent has died) is a keep-out of the best-effort kind, and a
   peer is dead only when its liveliness token is gone while the own one is there: who is off the bus commits nothing.
 """
@@ -49,7 +50,7 @@ from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.commit.trajectory_planner import CommitParams, Situation, TrajectoryPlanner
 from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.core.trajectory import Trajectory, resting
-from swarmctl.core.trajectory_message import Intent, Proposal
+from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
 from swarmctl.core.types import Array
 
 _LATENCIES = 50  # remembered
@@ -101,7 +102,7 @@ class Commitments:
 
     def begin(self, pos_ned_m: Array, vel_ned_m_s: Array, utc_us: int) -> None:
         """Control has been taken: come to rest from here."""
-        self.committed = self._planner.halted(pos_ned_m, vel_ned_m_s, utc_us)
+        self.committed = self._planner.stopping_from(pos_ned_m, vel_ned_m_s, utc_us)
         self.proposal = None
 
     def end(self, pos_ned_m: Array | None, utc_us: int) -> None:
@@ -110,13 +111,13 @@ class Commitments:
         if pos_ned_m is not None:
             self.committed = resting(pos_ned_m, utc_us, self._planner.dt_us)
 
-    def hear(self, utc_us: int, peers: Mapping[int, Intent], living: Set[int]) -> None:
+    def update(self, utc_us: int, peers: Mapping[int, TrajectoryMessage], alive_peers: Set[int]) -> None:
         """Rules 2 and 3.
 
         Args:
             utc_us: now.
             peers: newest message of each, also of those who have died: they may have flown on for a while.
-            living: peers whose acknowledgement counts.
+            alive_peers: peers whose acknowledgement counts.
         """
         mine = self.proposal
         if mine is None:
@@ -126,7 +127,7 @@ class Commitments:
             self.counts.expired += 1
             self._set_lead(2.0 * self._lead_s)
             return
-        known = [intent.committed for intent in peers.values() if intent.promised]
+        known = [message.committed for message in peers.values() if message.is_committed]
         known += [i.proposal.trajectory for i in peers.values() if i.proposal and i.proposal.order < mine.order]
         new = [trajectory for trajectory in known if id(trajectory) not in self._cleared]
         if self._planner.conflicts(mine.trajectory, utc_us, new):
@@ -134,27 +135,27 @@ class Commitments:
             self.counts.withdrawn += 1
             return
         self._cleared.update((id(trajectory), trajectory) for trajectory in new)
-        if all(agent in peers and peers[agent].heard.get(self._agent) == mine.number for agent in living):
+        if all(agent in peers and peers[agent].acknowledged.get(self._agent) == mine.number for agent in alive_peers):
             self.committed, self.proposal = mine.trajectory, None
             self.counts.committed += 1
             self._latencies_s.append((utc_us - mine.made_utc_us) * 1e-6)
             self._set_lead(_LEAD_OVER * float(np.percentile(self._latencies_s, _PERCENTILE)) + _TICK_S)
 
-    def broken(self, utc_us: int, peers: Mapping[int, Intent]) -> set[int]:
+    def conflicting_peers(self, utc_us: int, peers: Mapping[int, TrajectoryMessage]) -> set[int]:
         """Peers whose promise contradicts the own one: somebody had to change his without being asked for it."""
         if self.committed is None:
             return set()
-        promises = {agent: intent.committed for agent, intent in peers.items() if intent.promised}
+        commitments = {agent: message.committed for agent, message in peers.items() if message.is_committed}
         if self._compatible_with is not self.committed:
             self._compatible, self._compatible_with = {}, self.committed
-        new = [t for t in promises.values() if id(t) not in self._compatible]
+        new = [t for t in commitments.values() if id(t) not in self._compatible]
         if new and not self._planner.conflicts(self.committed, utc_us, new):
             self._compatible.update((id(t), t) for t in new)
             new = []
-        unsure = {agent: t for agent, t in promises.items() if any(t is other for other in new)}
+        unsure = {agent: t for agent, t in commitments.items() if any(t is other for other in new)}
         return {agent for agent, t in unsure.items() if self._planner.conflicts(self.committed, utc_us, [t])}
 
-    def avoid(self, now: Situation) -> None:
+    def evade(self, now: Situation) -> None:
         """Change the own promise without asking, where waiting would be too late for those who take no part.
 
         Args:
@@ -163,11 +164,11 @@ class Commitments:
         if self.committed is None or not now.others or self._planner.is_clear(self.committed, now):
             return
         later_us = now.utc_us + self.lead_us + round(_LATER_S * 1e6)
-        if self._planner.is_clear(self._planner.stopped(self.committed, later_us, now.utc_us), now):
+        if self._planner.is_clear(self._planner.stopping_candidate(self.committed, later_us, now.utc_us), now):
             return
-        way_out = self._planner.way_out(self.committed, now)
-        if way_out is not None:
-            self.committed, self.proposal = way_out, None
+        evasive_trajectory = self._planner.evasive_trajectory(self.committed, now)
+        if evasive_trajectory is not None:
+            self.committed, self.proposal = evasive_trajectory, None
             self.counts.evaded += 1
 
     def is_due(self, utc_us: int) -> bool:
@@ -178,7 +179,7 @@ class Commitments:
         """Rule 4, when it `is_due`.
 
         Args:
-            now: a plan would begin `lead_us` from now; peers as of `hear`.
+            now: a plan would begin `lead_us` from now; peers as of `update`.
         """
         assert self.committed is not None
         self._next_us = now.utc_us + round(self._params.period_s * 1e6)

@@ -20,7 +20,7 @@ from swarmctl.control.reference.mission import brake_to_rest, glide_to
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.params import Params
 from swarmctl.core.trajectory import Trajectory, ending_at_rest, joined, places, stopping
-from swarmctl.core.trajectory_message import Intent
+from swarmctl.core.trajectory_message import TrajectoryMessage
 from swarmctl.core.types import Array, Plan, PlanStatus, Reference, Sampled
 
 _BRAKED_FROM_01 = (1.0, 0.75, 0.5, 0.3, 0.15)  # of the plan
@@ -44,17 +44,17 @@ class CommitParams(Params):
     period_s: float = Field(0.1, ge=0, le=2)  # between two plans, at least
     lead_min_s: float = Field(0.06, ge=0.02, le=2)  # from proposing to flying it
     lead_max_s: float = Field(1.5, ge=0.1, le=5)
-    bias_rad: float = Field(1.0, ge=0, le=1.2)  # as in `separation`, in its place: plans that end in stops lock sooner
+    right_of_way_rad: float = Field(1.0, ge=0, le=1.2)  # replaces the one in `separation`: see there
     stuck_m: float = Field(1.0, gt=0, le=10)  # likewise: who meets turns while it still moves
     follow_z: AxisWeights = AxisWeights(q_pos=20.0, q_vel=0.5, r=0.05)  # of flying what is promised: to the centimetre
 
 
 @dataclass(frozen=True, slots=True)
-class Wish:
+class DesiredReference:
     """What an agent would follow if it were alone."""
 
     reference: Sampled
-    is_way: bool = False  # it begins here and is clear of obstacles: look for plans near it, not near the last one
+    follows_path: bool = False  # starts here, clear of obstacles: linearise around it
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,21 +64,21 @@ class Situation:
     Args:
         utc_us: now.
         begin_us: when the plan begins.
-        wish: what the agent would like.
+        desired: what the agent would like.
         peers: who takes part: the newest message of each.
         others: who does not, and obstacles, as from `Surroundings.keep_outs`, from when the plan begins.
     """
 
     utc_us: int
     begin_us: int
-    wish: Wish
-    peers: Mapping[int, Intent]
+    desired: DesiredReference
+    peers: Mapping[int, TrajectoryMessage]
     others: Sequence[KeepOut]
 
     @property
     def followed(self) -> list[Trajectory]:
         """All that peers may follow from now on."""
-        return [trajectory for intent in self.peers.values() for trajectory in intent.followed]
+        return [trajectory for message in self.peers.values() for trajectory in message.followed]
 
 
 class TrajectoryPlanner:
@@ -103,9 +103,11 @@ class TrajectoryPlanner:
         stopwatch_ns: Callable[[], int],
     ) -> None:
         self._params, self._separation = params, separation
-        keeping_right = separation.model_copy(update={"bias_rad": params.bias_rad, "stuck_m": params.stuck_m})
+        right_of_way = separation.model_copy(
+            update={"right_of_way_rad": params.right_of_way_rad, "stuck_m": params.stuck_m}
+        )
         self._mpc = SwarmMpc(
-            _planning(mpc, params), VehicleModelParams(delay_s=0.0), keeping_right, agent, slots, stopwatch_ns
+            _planning(mpc, params), VehicleModelParams(delay_s=0.0), right_of_way, agent, slots, stopwatch_ns
         )
         self.dt_us = round(params.dt_s * 1e6)
         self.steps = self._mpc.steps + math.ceil(_TAIL_S / params.dt_s)  # of `Situation.others`: plan and braking
@@ -113,13 +115,13 @@ class TrajectoryPlanner:
     def proposal(self, committed: Trajectory, now: Situation) -> Trajectory | None:
         """What leaves the committed one where plans begin, clear of everything known; None when nothing does."""
         found = self._clear(committed, self._planned(committed, now), now)
-        if found is None and now.wish.is_way:
+        if found is None and now.desired.follows_path:
             speed_m_s = float(np.linalg.norm(committed.sample(np.array([now.begin_us]))[1]))
-            slower = replace(now, wish=_gathering_speed(now.wish, speed_m_s))
+            slower = replace(now, desired=_gathering_speed(now.desired, speed_m_s))
             found = self._clear(committed, self._planned(committed, slower), slower)
         return found
 
-    def way_out(self, committed: Trajectory, now: Situation) -> Trajectory | None:
+    def evasive_trajectory(self, committed: Trajectory, now: Situation) -> Trajectory | None:
         """What keeps clearer of everything known than the committed one; None when nothing does.
 
         Round everybody, straight to a stop, or over who can be flown over.
@@ -130,7 +132,7 @@ class TrajectoryPlanner:
             return min(self._clearance_m(trajectory, now), self._margin_m(trajectory, now.utc_us, known))
 
         best, best_m = None, margin_m(committed) + _WORTH_M
-        for candidate in self._ways_out(committed, now):
+        for candidate in self._evasive_candidates(committed, now):
             if (found_m := margin_m(candidate)) > best_m:
                 best, best_m = candidate, found_m
         return best
@@ -143,25 +145,25 @@ class TrajectoryPlanner:
         """Whether it comes too close to any of these from now until all are at rest."""
         return not self._margin_m(trajectory, utc_us, known, spare_m) >= 0.0
 
-    def halted(self, pos_ned_m: Array, vel_ned_m_s: Array, utc_us: int) -> Trajectory:
+    def stopping_from(self, pos_ned_m: Array, vel_ned_m_s: Array, utc_us: int) -> Trajectory:
         """To rest from (3,) and (3,), straight ahead."""
         return stopping(pos_ned_m, vel_ned_m_s, utc_us, self.dt_us, self._params.brake_m_s2)
 
-    def stopped(self, committed: Trajectory, brake_us: int, utc_us: int) -> Trajectory:
+    def stopping_candidate(self, committed: Trajectory, brake_us: int, utc_us: int) -> Trajectory:
         """What is committed, braked from a time on, straight ahead."""
         pos, vel = committed.sample(np.array([brake_us]))
-        return joined(committed, self.halted(pos[0], vel[0], brake_us), utc_us)
+        return joined(committed, self.stopping_from(pos[0], vel[0], brake_us), utc_us)
 
-    def _ways_out(self, committed: Trajectory, now: Situation) -> Iterator[Trajectory]:
+    def _evasive_candidates(self, committed: Trajectory, now: Situation) -> Iterator[Trajectory]:
         plan = self._planned(committed, now)
         if plan is not None:
             yield ending_at_rest(now.begin_us, self.dt_us, plan.pos_ned_m, plan.vel_ned_m_s, self._params.brake_m_s2)
-        yield self.stopped(committed, now.begin_us, now.utc_us)
+        yield self.stopping_candidate(committed, now.begin_us, now.utc_us)
         heights_m = [k.radius_m for k in now.others if not k.any_height]
         if heights_m:
-            yield self._risen(committed, now.begin_us, max(heights_m) + _SPARE_M)
+            yield self._climbing_candidate(committed, now.begin_us, max(heights_m) + _SPARE_M)
 
-    def _risen(self, committed: Trajectory, begin_us: int, height_m: float) -> Trajectory:
+    def _climbing_candidate(self, committed: Trajectory, begin_us: int, height_m: float) -> Trajectory:
         """What is committed, left upwards."""
         pos, vel = (found[0] for found in committed.sample(np.array([begin_us])))
         above = brake_to_rest(pos, vel, self._params.brake_m_s2).to_ned_m - [0.0, 0.0, height_m]
@@ -173,12 +175,12 @@ class TrajectoryPlanner:
         steps = self._mpc.steps
         ahead_us = np.arange(steps + 1, dtype=np.float64) * self.dt_us
         pos, vel = committed.sample(now.begin_us + ahead_us)
-        lift = np.array([0.0, 0.0, GRAVITY_M_S2]) - committed.acceleration(now.begin_us)
-        size = float(np.sqrt(lift @ lift))
-        start = Start(now.begin_us, pos[0], vel[0], 1.0, np.array([lift[0] / size, lift[1] / size, size]))
-        wanted = Reference(*now.wish.reference(1e-6 * (ahead_us + (now.begin_us - now.utc_us))), 0.0)
-        guess = wanted.pos_ned_m + (pos[0] - wanted.pos_ned_m[0]) if now.wish.is_way else pos
-        agents = [intent.agent for intent in now.peers.values() for _ in intent.followed]
+        thrust = np.array([0.0, 0.0, GRAVITY_M_S2]) - committed.acceleration(now.begin_us)
+        size = float(np.sqrt(thrust @ thrust))
+        start = Start(now.begin_us, pos[0], vel[0], 1.0, np.array([thrust[0] / size, thrust[1] / size, size]))
+        wanted = Reference(*now.desired.reference(1e-6 * (ahead_us + (now.begin_us - now.utc_us))), 0.0)
+        guess = wanted.pos_ned_m + (pos[0] - wanted.pos_ned_m[0]) if now.desired.follows_path else pos
+        agents = [message.agent for message in now.peers.values() for _ in message.followed]
         keep_outs = self._keep_outs(now.followed, agents, now.begin_us, steps)
         kept = (*keep_outs, *(_begun(other, steps) for other in now.others))
         plan = self._mpc.plan(Problem(start, wanted, np.zeros(3), kept, guess))
@@ -225,10 +227,10 @@ class TrajectoryPlanner:
         if not trajectories:
             return []
         p = self._separation
-        certified_m = promised_m(p) + spare_m
+        hard_min_distance_m = committed_m(p) + spare_m
         where = places(trajectories, t0_utc_us + np.arange(steps + 1) * self.dt_us)
         return [
-            KeepOut(points, p.planned_m, certified_m, False, agent, p.downwash)
+            KeepOut(points, p.planned_m, hard_min_distance_m, False, agent, p.downwash)
             for points, agent in zip(where, agents, strict=True)
         ]
 
@@ -238,32 +240,32 @@ def following(mpc: MpcParams, params: CommitParams) -> MpcParams:
     return mpc.model_copy(update={"z": params.follow_z})
 
 
-def promised_m(params: SeparationParams) -> float:
+def committed_m(params: SeparationParams) -> float:
     """Distance that no two committed trajectories come closer than."""
     slack_m = min(params.certify_slack_m, _SLACK_01 * max(0.0, params.radius_m - params.body_m))
     return params.radius_m - slack_m
 
 
-def _gathering_speed(way: Wish, speed_m_s: float) -> Wish:
+def _gathering_speed(desired: DesiredReference, speed_m_s: float) -> DesiredReference:
     """The same way, begun at an own speed.
 
     Rows keep plans outside obstacles where the way says they will be by then: of a way that begins faster than one is,
     the rows are those of the next corner, and plans cut this one.
     """
-    way_m_s = float(np.linalg.norm(way.reference(np.zeros(1))[1]))
-    if way_m_s <= speed_m_s:
-        return way
-    rate_1_s = _GATHER_M_S2 / way_m_s
-    slow_01 = speed_m_s / way_m_s
+    path_m_s = float(np.linalg.norm(desired.reference(np.zeros(1))[1]))
+    if path_m_s <= speed_m_s:
+        return desired
+    rate_1_s = _GATHER_M_S2 / path_m_s
+    slow_01 = speed_m_s / path_m_s
     late_s = (1.0 - slow_01) / rate_1_s  # until the way's own speed is reached
 
     def reference(offsets_s: Array) -> tuple[Array, Array]:
         begun_s = np.minimum(offsets_s, late_s)
         at_s = (slow_01 + 0.5 * rate_1_s * begun_s) * begun_s + (offsets_s - begun_s)
-        pos, vel = way.reference(at_s)
+        pos, vel = desired.reference(at_s)
         return pos, vel * (slow_01 + rate_1_s * begun_s)[:, None]
 
-    return Wish(reference, is_way=True)
+    return DesiredReference(reference, follows_path=True)
 
 
 def _begun(keep_out: KeepOut, steps: int) -> KeepOut:

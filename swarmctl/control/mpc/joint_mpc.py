@@ -35,11 +35,11 @@ class JointMpc:
         params: MpcParams,
         vehicle: VehicleModelParams,
         separation: SeparationParams,
-        own_tie: int,
+        own_priority_id: int,
         slots: int,
         stopwatch_ns: Callable[[], int],
     ) -> None:
-        self._params, self._separation, self._tie, self._slots = params, separation, own_tie, slots
+        self._params, self._separation, self._priority_id, self._slots = params, separation, own_priority_id, slots
         self._stopwatch_ns = stopwatch_ns
         self.dt_us = round(params.dt_s * 1e6)
         self.steps = self.longest = params.horizon_xy
@@ -58,7 +58,7 @@ class JointMpc:
         """One step of distributed MPC. Never raises for an infeasible problem; the status says what may be flown."""
         began_ns = self._stopwatch_ns()
         guess = first_guess(problem, self._params.dt_s, self.steps)
-        near = partial(near_half_spaces, problem, guess, 3, self._slots, self._params.dt_s, self._tie)
+        near = partial(near_half_spaces, problem, guess, 3, self._slots, self._params.dt_s, self._priority_id)
         return planned(near, partial(self._plan, problem, began_ns), self._separation, self._stopwatch_ns)
 
     def _plan(self, problem: Problem, began_ns: int, spaces: HalfSpaces | None, spaces_us: float) -> Plan:

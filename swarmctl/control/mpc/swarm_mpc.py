@@ -85,11 +85,11 @@ class SwarmMpc:
         params: MpcParams,
         vehicle: VehicleModelParams,
         separation: SeparationParams,
-        own_tie: int,
+        own_priority_id: int,
         slots: int,
         stopwatch_ns: Callable[[], int],
     ) -> None:
-        self._params, self._separation, self._tie, self._slots = params, separation, own_tie, slots
+        self._params, self._separation, self._priority_id, self._slots = params, separation, own_priority_id, slots
         self._stopwatch_ns = stopwatch_ns
         self.dt_us = round(params.dt_s * 1e6)
         self.steps = params.horizon_xy
@@ -123,7 +123,7 @@ class SwarmMpc:
         guess = first_guess(problem, self._params.dt_s, self.steps)
         count = min(self.steps, len(up.pos_m))
         guess[1 : count + 1, 2] = up.pos_m[:count, 0]
-        near = partial(near_half_spaces, problem, guess, 2, self._slots, self._params.dt_s, self._tie)
+        near = partial(near_half_spaces, problem, guess, 2, self._slots, self._params.dt_s, self._priority_id)
         return planned(near, partial(self._plan, problem, up, began_ns), self._separation, self._stopwatch_ns)
 
     def _plan(
@@ -178,7 +178,7 @@ def first_guess(problem: Problem, dt_s: float, steps: int) -> Array:
     return np.asarray(start.pos_ned_m + t_s * start.vel_ned_m_s)
 
 
-def nearest(keep_outs: Sequence[KeepOut], guess_ned_m: Array, slots: int) -> list[KeepOut]:
+def closest_keep_outs(keep_outs: Sequence[KeepOut], guess_ned_m: Array, slots: int) -> list[KeepOut]:
     """The `slots` keep-outs that the guess comes closest to."""
 
     def gap_m(k: KeepOut) -> float:
@@ -189,12 +189,18 @@ def nearest(keep_outs: Sequence[KeepOut], guess_ned_m: Array, slots: int) -> lis
 
 
 def near_half_spaces(
-    problem: Problem, guess_ned_m: Array, axes: int, slots: int, dt_s: float, own_tie: int, params: SeparationParams
+    problem: Problem,
+    guess_ned_m: Array,
+    axes: int,
+    slots: int,
+    dt_s: float,
+    own_priority_id: int,
+    params: SeparationParams,
 ) -> HalfSpaces | None:
     """Distances to what comes nearest, linearised around the guess (steps+1, 3), in the first `axes` axes."""
-    steps, near = len(guess_ned_m) - 1, nearest(problem.keep_outs, guess_ned_m, slots)
+    steps, near = len(guess_ned_m) - 1, closest_keep_outs(problem.keep_outs, guess_ned_m, slots)
     goal, vel = problem.reference.pos_ned_m[steps, :axes], problem.start.vel_ned_m_s[:axes]
-    return half_spaces(near, guess_ned_m, goal, vel, dt_s, own_tie, params)
+    return half_spaces(near, guess_ned_m, goal, vel, dt_s, own_priority_id, params)
 
 
 def planned(

@@ -29,7 +29,7 @@ class Facts:
     armable: bool
     busy: bool  # a command is being executed
     mode: Mode  # last judgement
-    mute: bool  # a peer that may well be flying has not been heard for too long
+    unresponsive_peer: bool  # a peer that may well be flying has not been heard for too long
     peers: Mapping[int, PeerFacts]
     others_ned_m: tuple[Array, ...] = ()  # (3,) each: where peers are now
     arm_in: FlightMode | None = None  # flight mode to be in before arming; None: the one it is in

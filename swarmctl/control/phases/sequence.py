@@ -19,7 +19,7 @@ from pydantic import Field
 from swarmctl.control.phases.arming import ArmingEvidence
 from swarmctl.control.phases.inputs import Facts
 from swarmctl.control.phases.overload import Level
-from swarmctl.control.reference.landing_places import nearest_in_plane_m, room_for
+from swarmctl.control.reference.landing_places import landing_place_ned_m, nearest_in_plane_m
 from swarmctl.control.reference.mission import Glide, MissionReference, brake_to_rest, glide_to
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Command, FlightMode, Landed, Mode, Phase, VehicleState, Verb
@@ -226,7 +226,7 @@ class Sequence:
     def _wait_for_better(self, facts: Facts, state: VehicleState) -> None:
         """Who loses the bus comes to rest: then what peers assume (braking) holds. So does who misses its deadlines."""
         flying = self.had_control and Phase.GOTO_START <= self.phase <= Phase.GOTO_LAND
-        must_wait = facts.mute or facts.overload >= Level.HOLD
+        must_wait = facts.unresponsive_peer or facts.overload >= Level.HOLD
         if must_wait and flying and not self.waiting:
             self.waiting = True
             self._bound_for = self._glide[0].to_ned_m if self._glide else self._start_ned_m
@@ -423,7 +423,7 @@ class Sequence:
             return False
         if self._has_room(facts, state):
             return self._at(state, state.pos_ned_m, math.inf, self._params.arrive_m_s)
-        room = room_for(state.pos_ned_m, facts.others_ned_m, self._apart_m + _ROOM_M, self._agent)
+        room = landing_place_ned_m(state.pos_ned_m, facts.others_ned_m, self._apart_m + _ROOM_M, self._agent)
         self._glide = (self._way_to(room, state), facts.now_us)
         return False
 

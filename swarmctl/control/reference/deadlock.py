@@ -22,7 +22,7 @@ import numpy as np
 from pydantic import Field
 
 from swarmctl.control.collision.separation import KeepOut
-from swarmctl.control.reference.shortest_path import Way, short_way
+from swarmctl.control.reference.shortest_path import Polyline, shortest_path
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Obstacle, Sampled
 
@@ -35,7 +35,7 @@ _SQUEEZE = 3.0  # how much less a gap that may be none is worth after every dead
 _ACCEL_M_S2 = 0.8  # at the end of a way
 
 
-class DetourParams(Params):
+class DeadlockParams(Params):
     """When an agent counts as deadlocked, and how it goes round."""
 
     enabled: bool = True  # false: deadlocks are only noticed
@@ -56,17 +56,17 @@ class Deadlock:
     @property
     def names(self) -> str:
         """Who is in the way, in words."""
-        return ", ".join("an obstacle" if tie < 0 else f"agent {tie}" for tie in self.by)
+        return ", ".join("an obstacle" if priority_id < 0 else f"agent {priority_id}" for priority_id in self.by)
 
 
-class Progress:
+class ProgressMonitor:
     """Watches whether an agent gets nearer to where it should be.
 
     Args:
         params: what counts as nowhere.
     """
 
-    def __init__(self, params: DetourParams) -> None:
+    def __init__(self, params: DeadlockParams) -> None:
         self._params = params
         self._anchor: tuple[Array, int] | None = None  # where and since when
 
@@ -86,14 +86,14 @@ class Progress:
         if now_us - since_us < p.patience_s * 1e6:
             return None
         way = wanted_ned_m - pos_ned_m
-        by = sorted({k.tie for k in keep_outs if _in_the_way(k, pos_ned_m, way, p.near_m)})
+        by = sorted({k.priority_id for k in keep_outs if _blocks(k, pos_ned_m, way, p.near_m)})
         if not by:
             return None  # it is weather or a weak vehicle
         self._anchor = (pos_ned_m.copy(), now_us)
         return Deadlock(since_us, tuple(by))
 
 
-class Detour:
+class DeadlockRecovery:
     """Stands in for the reference of an agent that was deadlocked until it has caught up with it.
 
     Args:
@@ -102,15 +102,15 @@ class Detour:
         radius_m: distance that agents keep; also gives the grid its size.
     """
 
-    def __init__(self, params: DetourParams, agent: int, radius_m: float) -> None:
+    def __init__(self, params: DeadlockParams, agent: int, radius_m: float) -> None:
         self._params, self._agent, self._radius_m = params, agent, radius_m
-        self._progress = Progress(params)
-        self._way: Way | None = None
+        self._progress = ProgressMonitor(params)
+        self._way: Polyline | None = None
         self._planned_us = 0
-        self._rung = 0
+        self._escalation_level = 0
         self._here, self._wanted = np.zeros(3), np.zeros(3)
         self._stuck_at: Array | None = None
-        self._met: set[int] = set()  # peers that were in the way and are still near
+        self._blocking_peers: set[int] = set()  # peers that were in the way and are still near
         self.deadlock: Deadlock | None = None  # until it has moved on
 
     @property
@@ -120,8 +120,8 @@ class Detour:
     def reset(self) -> None:
         """Somebody else has flown, or something else is to be flown."""
         self._progress.reset()
-        self._way, self.deadlock, self._stuck_at, self._rung = None, None, None, 0
-        self._met.clear()
+        self._way, self.deadlock, self._stuck_at, self._escalation_level = None, None, None, 0
+        self._blocking_peers.clear()
 
     def step(
         self,
@@ -147,14 +147,14 @@ class Detour:
         if found is not None:
             since_us = found.since_us if self.deadlock is None else self.deadlock.since_us
             self.deadlock, self._stuck_at = Deadlock(since_us, found.by), pos_ned_m.copy()
-            self._rung += 1
-            self._met.update(found.by)
-        elif self._rung:
+            self._escalation_level += 1
+            self._blocking_peers.update(found.by)
+        elif self._escalation_level:
             self._forget(behind_m, keep_outs)
         if not p.enabled or (self._way is None and found is None):
             return
         if behind_m < p.behind_m:
-            self._way, self._rung = None, 0
+            self._way, self._escalation_level = None, 0
             return
         if found is not None or now_us - self._planned_us >= _REPLAN_US:
             self._planned_us = now_us
@@ -163,18 +163,18 @@ class Detour:
 
     def _forget(self, behind_m: float, keep_outs: Sequence[KeepOut]) -> None:
         """A deadlock ends where it is left behind; whom it was with counts as long as they are near."""
-        near = {k.tie for k in keep_outs if k.distance_m(self._here) < _NEAR_RADII * self._radius_m}
-        self._met &= near - {-1}
+        near = {k.priority_id for k in keep_outs if k.distance_m(self._here) < _NEAR_RADII * self._radius_m}
+        self._blocking_peers &= near - {-1}
         moved_m = 0.0 if self._stuck_at is None else math.dist(self._here, self._stuck_at)
         if behind_m < self._params.behind_m or moved_m > 2.0 * self._radius_m:
             self.deadlock, self._stuck_at = None, None
-        if self.deadlock is None and not self._met:
-            self._rung = 1 if self.active else 0
+        if self.deadlock is None and not self._blocking_peers:
+            self._escalation_level = 1 if self.active else 0
 
     def sample(self, offsets_s: Array) -> tuple[Array, Array]:
         """Positions and velocities, (K, 3) each, at `offsets_s` (K,) from now, along the way."""
         assert self._way is not None
-        at_m = self._way.nearest_m(self._here[:2])
+        at_m = self._way.arc_length_m(self._here[:2])
         left_m = self._way.length_m - at_m
         speed_m_s = min(self._params.speed_m_s, math.sqrt(2.0 * _ACCEL_M_S2 * left_m))
         pos, vel = np.empty((len(offsets_s), 3)), np.zeros((len(offsets_s), 3))
@@ -185,7 +185,7 @@ class Detour:
     def _plan(self, anew: bool, keep_outs: Sequence[KeepOut], obstacles: Sequence[Obstacle]) -> None:
         discs = self._discs(keep_outs, obstacles)
         start, goal = self._here[:2], self._wanted[:2]
-        way = short_way(start, goal, discs, self._radius_m / 3.0, squeeze=_SQUEEZE**self._rung)
+        way = shortest_path(start, goal, discs, self._radius_m / 3.0, squeeze=_SQUEEZE**self._escalation_level)
         if not anew and self._way is not None and math.dist(self._way.corners[-1], goal) < self._params.behind_m:
             rest = self._way.rest(start)
             if rest.is_clear(discs) and way.length_m > _BETTER_01 * rest.length_m:
@@ -196,12 +196,12 @@ class Detour:
         """What to go round (M, 3): centre and radius."""
         found = [_disc(o, float(self._wanted[2])) for o in obstacles]
         for k in keep_outs:
-            if k.tie < 0 or k.distance_m(self._here) > _NEAR_RADII * self._radius_m:
+            if k.priority_id < 0 or k.distance_m(self._here) > _NEAR_RADII * self._radius_m:
                 continue
-            goes_first = k.tie < self._agent
+            goes_first = k.priority_id < self._agent
             stands = math.dist(k.pos_ned_m[0], k.pos_ned_m[-1]) < _STANDS_M
-            met = goes_first and k.tie in self._met
-            if self._rung >= 2 and (met or (stands and (goes_first or self._rung >= 3))):
+            met = goes_first and k.priority_id in self._blocking_peers
+            if self._escalation_level >= 2 and (met or (stands and (goes_first or self._escalation_level >= 3))):
                 found.append((k.pos_ned_m[0, 0], k.pos_ned_m[0, 1], k.radius_m + _MARGIN_M))
         return np.array([d for d in found if d[2] > 0.0]).reshape(-1, 3)
 
@@ -213,7 +213,7 @@ def _disc(obstacle: Obstacle, height_z_m: float) -> tuple[float, float, float]:
     return float(obstacle.center_ned_m[0]), float(obstacle.center_ned_m[1]), radius_m + _MARGIN_M * (radius_m > 0.0)
 
 
-def _in_the_way(keep_out: KeepOut, pos_ned_m: Array, way: Array, near_m: float) -> bool:
+def _blocks(keep_out: KeepOut, pos_ned_m: Array, way: Array, near_m: float) -> bool:
     towards = keep_out.pos_ned_m[0] - pos_ned_m
     if keep_out.any_height:
         towards = towards * [1.0, 1.0, 0.0]

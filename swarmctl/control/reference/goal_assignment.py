@@ -23,7 +23,7 @@ _FAIR = 1e-4  # of equal sums the one with the least unequal distances
 _TINY_M = 1e-6  # computers that round differently must still choose alike
 
 
-def places_ned_m(starts_ned_m: Array, goals_ned_m: Array, apart_m: float) -> tuple[Array, list[list[int]]]:
+def assigned_goals_ned_m(starts_ned_m: Array, goals_ned_m: Array, apart_m: float) -> tuple[Array, list[list[int]]]:
     """Goals (N, 3) that can all be reached at once, and who shares a goal with whom.
 
     Args:
@@ -76,12 +76,12 @@ def _merged(places: Array, groups: list[list[int]], apart_m: float) -> list[list
     """Groups (of agents, in order) joined where a place of one is too close to a place of another."""
     merged: list[list[int]] = []
     for group in groups:
-        near = [m for m in merged if _nearest_m(places[m], places[group]) < apart_m - _TINY_M]
+        near = [m for m in merged if _min_distance_m(places[m], places[group]) < apart_m - _TINY_M]
         merged = [m for m in merged if m not in near] + [sorted(itertools.chain(group, *near))]
     return sorted(merged)
 
 
-def _nearest_m(some: Array, others: Array) -> float:
+def _min_distance_m(some: Array, others: Array) -> float:
     return float(np.linalg.norm(some[:, None] - others[None], axis=2).min())
 
 

@@ -18,14 +18,14 @@ def nearest_in_plane_m(pos_ned_m: Array, others_ned_m: Sequence[Array]) -> float
     return min((math.dist(pos_ned_m[:2], other[:2]) for other in others_ned_m), default=math.inf)
 
 
-def room_for(pos_ned_m: Array, others_ned_m: Sequence[Array], apart_m: float, own_tie: int) -> Array:
+def landing_place_ned_m(pos_ned_m: Array, others_ned_m: Sequence[Array], apart_m: float, agent: int) -> Array:
     """A place (3,) at the same height that is `apart_m` from every other in the plane, near `pos_ned_m` (3,).
 
     Everybody who does this moves the whole way, so nobody depends on the other's good will. Those above each other part
-    along directions of their own (`own_tie`: own index).
+    along directions of their own (`agent`: own index).
     """
     place = pos_ned_m.copy()
-    own_way = 2.4 * own_tie  # rad, the golden angle: no two of a few agree
+    own_way = 2.4 * agent  # rad, the golden angle: no two of a few agree
     for _ in range(_ROUNDS):
         moved = False
         for other in others_ned_m:

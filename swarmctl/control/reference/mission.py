@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from swarmctl.control.reference.goal_assignment import places_ned_m
+from swarmctl.control.reference.goal_assignment import assigned_goals_ned_m
 from swarmctl.core.params import Params, Vec3
 from swarmctl.core.types import Array
 
@@ -58,7 +58,7 @@ class GotoParams(Params):
     goals_ned_m: tuple[Vec3, ...] = Field((), strict=False)  # one an agent, or a single one for all
     speed_m_s: float = Field(2.0, gt=0, le=20)  # peaks, about
     accel_m_s2: float = Field(1.2, gt=0, le=20)
-    standoff: bool = True  # goals too close to each other become an arrangement round them
+    goal_assignment: bool = True  # goals too close to each other become an arrangement round them
 
 
 class IdentifyParams(Params):
@@ -203,8 +203,8 @@ def _ways(params: GotoParams, starts_ned_m: Array, apart_m: float) -> list[Glide
     if len(goals) == 1:
         goals = np.tile(goals, (agents, 1))
     groups = [[i] for i in range(agents)]
-    if params.standoff:
-        goals, groups = places_ned_m(starts_ned_m, goals, apart_m)
+    if params.goal_assignment:
+        goals, groups = assigned_goals_ned_m(starts_ned_m, goals, apart_m)
     ways = [
         glide_to(start, np.zeros(3), goal, params.speed_m_s, params.accel_m_s2)
         for start, goal in zip(starts_ned_m, goals, strict=True)

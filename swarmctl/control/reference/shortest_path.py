@@ -22,7 +22,7 @@ _PRICE_INSIDE = 1000.0  # of a metre farther inside
 _NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))
 
 
-class Way:
+class Polyline:
     """A polyline in the plane, measured along itself.
 
     Args:
@@ -36,18 +36,18 @@ class Way:
         self._reached_m = np.concatenate([[0.0], np.cumsum(self._lengths_m)])
         self.length_m = float(self._reached_m[-1])
 
-    def nearest_m(self, here: Array) -> float:
+    def arc_length_m(self, here: Array) -> float:
         """How far along it the point nearest to `here` (2,) is; the farthest of several."""
         share = np.clip(((here - self.corners[:-1]) * self._legs).sum(axis=1) / self._lengths_m**2, 0.0, 1.0)
         distance = np.linalg.norm(self.corners[:-1] + share[:, None] * self._legs - here, axis=1)
         leg = len(distance) - 1 - int(np.argmin(distance[::-1]))
         return float(self._reached_m[leg] + share[leg] * self._lengths_m[leg])
 
-    def rest(self, here: Array) -> Way:
+    def rest(self, here: Array) -> Polyline:
         """From `here` (2,) on to its end."""
-        ahead = self._reached_m[1:] > self.nearest_m(here)
+        ahead = self._reached_m[1:] > self.arc_length_m(here)
         ahead[-1] = True
-        return Way(np.vstack([here, self.corners[1:][ahead]]))
+        return Polyline(np.vstack([here, self.corners[1:][ahead]]))
 
     def sample(self, along_m: Array) -> tuple[Array, Array]:
         """Points and directions, (K, 2) each, at distances (K,) along it; beyond its end that, without direction."""
@@ -61,7 +61,7 @@ class Way:
         return all(clear(a, b, discs) for a, b in itertools.pairwise(self.corners))
 
 
-def short_way(start: Array, goal: Array, discs: Array, cell_m: float, squeeze: float = 3.0) -> Way:
+def shortest_path(start: Array, goal: Array, discs: Array, cell_m: float, squeeze: float = 3.0) -> Polyline:
     """A short way from `start` (2,) to `goal` (2,) outside `discs` (M, 3): centre and radius.
 
     Args:
@@ -71,7 +71,7 @@ def short_way(start: Array, goal: Array, discs: Array, cell_m: float, squeeze: f
         squeeze: price of a metre through what may be a gap or may be none.
     """
     if clear(start, goal, discs):
-        return Way(np.stack([start, goal]))
+        return Polyline(np.stack([start, goal]))
     points, shape, step_m = _grid(start, goal, discs, cell_m)
     price = np.ones(len(points))
     for x, y, radius in discs:
@@ -125,11 +125,11 @@ def _edges(price: Array, shape: tuple[int, int], step_m: float) -> csr_array:
     return csr_array((np.concatenate(lengths), where), shape=(len(price), len(price)))
 
 
-def _tightened(points: Array, discs: Array) -> Way:
+def _tightened(points: Array, discs: Array) -> Polyline:
     """Through as few of `points` (K, 2) as straight lines allow."""
     kept = [0]
     while kept[-1] < len(points) - 1:
         here = kept[-1]
         straight = [k for k in range(here + 2, len(points)) if clear(points[here], points[k], discs)]
         kept.append(straight[-1] if straight else here + 1)
-    return Way(points[kept])
+    return Polyline(points[kept])

@@ -1,4 +1,4 @@
-"""Whose acknowledgement counts, and who is kept clear of in spite of a promise."""
+"""Which acknowledgements count, and which peers are kept clear of in spite of a commitment."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from swarmctl.agent.coordination import Coordination
 from swarmctl.agent.world_model import Surroundings
 from swarmctl.bus import topics
 from swarmctl.bus.peers import LocalBus, LocalHub, agent_name
-from swarmctl.bus.trajectory_messages import decode_intent, encode_intent
+from swarmctl.bus.trajectory_messages import decode_trajectory_message, encode_trajectory_message
 from swarmctl.control.collision.separation import SeparationParams
-from swarmctl.control.commit.trajectory_planner import CommitParams, Wish
+from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference
 from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.core.clock import SimClock
 from swarmctl.core.trajectory import resting
-from swarmctl.core.trajectory_message import Intent
+from swarmctl.core.trajectory_message import TrajectoryMessage
 from swarmctl.core.types import Array, FlightMode, Landed, Phase, PredictedPath, VehicleState
 
 PEER = agent_name(1)
@@ -67,27 +67,29 @@ class Bench:
             each()
             utc_us = self.clock.utc_us()
             self.surroundings.listen(utc_us)
-            self.coordination.listen(utc_us)
-            self.coordination.step(utc_us, self.state, Phase.TRACK, Wish(self.wanted))
-            self.coordination.say(utc_us)
+            self.coordination.receive(utc_us)
+            self.coordination.step(utc_us, self.state, Phase.TRACK, DesiredReference(self.wanted))
+            self.coordination.publish(utc_us)
 
     def wanted(self, offsets_s: Array) -> tuple[Array, Array]:
         return np.tile(HERE, (len(offsets_s), 1)), np.zeros((len(offsets_s), 3))
 
-    def speak(self, path_at: Array = PLACE, silent: bool = False) -> None:
-        """The peer promises to rest at its place, acknowledges, and is at `path_at`."""
+    def send(self, path_at: Array = PLACE, silent: bool = False) -> None:
+        """The peer is committed to rest at its place, acknowledges, and is at `path_at`."""
         self.seq += 1
         utc_us = self.clock.utc_us()
-        heard = {}
-        for _, payload in self.peer.receive(topics.INTENT):
-            intent = decode_intent(payload)
-            if intent is not None and intent.proposal is not None:
-                heard = {0: intent.proposal.number}
+        acknowledged = {}
+        for _, payload in self.peer.receive(topics.TRAJECTORY):
+            message = decode_trajectory_message(payload)
+            if message is not None and message.proposal is not None:
+                acknowledged = {0: message.proposal.number}
         path = PredictedPath(1, 1, self.seq, utc_us, 20_000, 0.0, np.tile(path_at, (41, 1)))
         self.peer.publish(topics.PATH, topics.encode_path(path))
         if not silent:
-            said = Intent(1, 1, self.seq, utc_us, True, resting(PLACE, utc_us, 100_000), None, heard)
-            self.peer.publish(topics.INTENT, encode_intent(said))
+            message = TrajectoryMessage(
+                1, 1, self.seq, utc_us, True, resting(PLACE, utc_us, 100_000), None, acknowledged
+            )
+            self.peer.publish(topics.TRAJECTORY, encode_trajectory_message(message))
 
     @property
     def committed(self) -> int:
@@ -102,39 +104,39 @@ def bench(monkeypatch: pytest.MonkeyPatch) -> Bench:
 
 
 def test_a_peer_that_acknowledges_lets_us_fly_and_one_that_does_not_does_not(bench: Bench) -> None:
-    bench.fly(1.0, each=bench.speak)
+    bench.fly(1.0, each=bench.send)
     before = bench.committed
     assert before > 3
     bench.fly(2.0)
     assert bench.committed == before
 
 
-def test_a_peer_is_dead_only_after_it_has_been_gone_for_some_ticks(bench: Bench) -> None:
-    bench.fly(2.5, each=bench.speak)
+def test_a_peer_is_lost_only_after_it_has_been_absent_for_some_ticks(bench: Bench) -> None:
+    bench.fly(2.5, each=bench.send)
     before = bench.committed
     bench.alive.discard(PEER)
     bench.fly(0.08)
     assert bench.committed == before, "tokens vanish one by one"
-    assert bench.surroundings.promised == {}, "but its promise is no longer relied on"
+    assert bench.surroundings.peer_commitments == {}, "but its commitment is no longer relied on"
     bench.fly(1.0)
     assert bench.committed > before
 
 
-def test_where_the_gone_have_promised_to_end_is_in_the_way(bench: Bench) -> None:
-    """No promise leads there any more, so whoever does not get past has to look for a way round it."""
-    bench.fly(2.5, each=bench.speak)
-    assert bench.coordination.left_behind == []
+def test_the_committed_end_of_a_lost_peer_is_a_keep_out(bench: Bench) -> None:
+    """No commitment leads there any more, so an agent that is blocked has to look for a path around it."""
+    bench.fly(2.5, each=bench.send)
+    assert bench.coordination.lost_peer_keep_outs == []
     bench.alive.discard(PEER)
     bench.fly(0.3)
-    (left,) = bench.coordination.left_behind
-    assert left.tie == 1
+    (left,) = bench.coordination.lost_peer_keep_outs
+    assert left.priority_id == 1
     assert left.pos_ned_m[0] == pytest.approx(PLACE)
     bench.coordination.idle(bench.clock.utc_us(), None)
-    assert bench.coordination.left_behind == []
+    assert bench.coordination.lost_peer_keep_outs == []
 
 
-def test_who_comes_back_to_the_bus_takes_nobody_for_dead_at_first(bench: Bench) -> None:
-    bench.fly(2.5, each=bench.speak)
+def test_an_agent_back_on_the_bus_takes_no_peer_for_lost_at_first(bench: Bench) -> None:
+    bench.fly(2.5, each=bench.send)
     before = bench.committed
     bench.alive.clear()
     bench.fly(3.0)
@@ -145,43 +147,43 @@ def test_who_comes_back_to_the_bus_takes_nobody_for_dead_at_first(bench: Bench) 
     assert bench.committed > before
 
 
-def test_who_is_beside_its_promise_is_where_it_is(bench: Bench) -> None:
-    bench.fly(0.5, each=bench.speak)
-    assert set(bench.surroundings.promised) == {1}
+def test_a_deviating_peer_is_where_its_path_says(bench: Bench) -> None:
+    bench.fly(0.5, each=bench.send)
+    assert set(bench.surroundings.peer_commitments) == {1}
     aside = PLACE + np.array([0.0, 0.5, 0.0])
-    bench.fly(0.5, each=lambda: bench.speak(aside))
-    assert bench.surroundings.promised == {}
+    bench.fly(0.5, each=lambda: bench.send(aside))
+    assert bench.surroundings.peer_commitments == {}
     (body,) = bench.surroundings.bodies(HERE, bench.clock.utc_us(), 0.0, 0.0)
     assert body.pos_ned_m == pytest.approx(tuple(aside))
 
 
-def test_who_promises_is_not_kept_clear_of_more_because_its_message_is_old(bench: Bench) -> None:
-    bench.fly(0.5, each=bench.speak)
+def test_the_margin_of_a_committed_peer_does_not_grow_with_age(bench: Bench) -> None:
+    bench.fly(0.5, each=bench.send)
     bench.fly(1.0)
     utc_us, apart_m = bench.clock.utc_us(), SeparationParams().body_m
     assert {body.apart_m for body in bench.surroundings.bodies(HERE, utc_us, 0.0, 0.0)} == {apart_m}
-    bench.surroundings.promised = {}
+    bench.surroundings.peer_commitments = {}
     (control,) = bench.surroundings.bodies(HERE, utc_us, 0.0, 0.0)
     assert control.apart_m > apart_m + 0.9, "a path as old may have been left by a metre"
 
 
-def test_who_is_silent_is_certified_against_with_all_of_its_margin(bench: Bench) -> None:
-    bench.fly(0.5, each=bench.speak)
+def test_the_certificate_against_a_stale_peer_has_all_of_its_margin(bench: Bench) -> None:
+    bench.fly(0.5, each=bench.send)
     bench.fly(1.0)
     utc_us, params = bench.clock.utc_us(), SeparationParams()
     (kept,) = bench.coordination._others(utc_us, bench.state, Phase.TRACK, set())
     (control,) = bench.surroundings.keep_outs(HERE, utc_us, 100_000, 5, Phase.TRACK)
-    assert control.certified_m == params.radius_m - params.certify_slack_m, "which would not grow with age"
-    assert kept.certified_m > params.planned_m + 0.5
+    assert control.hard_min_distance_m == params.radius_m - params.certify_slack_m, "which would not grow with age"
+    assert kept.hard_min_distance_m > params.planned_m + 0.5
 
 
-def test_who_does_not_know_where_it_is_promises_nothing(bench: Bench) -> None:
-    bench.fly(1.0, each=bench.speak)
+def test_an_agent_without_a_state_commits_nothing(bench: Bench) -> None:
+    bench.fly(1.0, each=bench.send)
     bench.coordination.idle(bench.clock.utc_us(), None)
-    bench.coordination.say(bench.clock.utc_us())
+    bench.coordination.publish(bench.clock.utc_us())
     bench.clock.advance(20_000)
-    *_, (_, payload) = bench.peer.receive(topics.INTENT)
-    intent = decode_intent(payload)
-    assert intent is not None
-    assert not intent.promised and intent.proposal is None
-    assert [name for name, _ in bench.told] == ["promises"]
+    *_, (_, payload) = bench.peer.receive(topics.TRAJECTORY)
+    message = decode_trajectory_message(payload)
+    assert message is not None
+    assert not message.is_committed and message.proposal is None
+    assert [name for name, _ in bench.told] == ["commitments"]

@@ -119,7 +119,7 @@ def test_a_peer_that_is_refused_for_long_is_mute_kept_clear_of_at_any_height_and
         path = PredictedPath(1, 1, bench.seq, ahead, TICK_US, 0.0, np.tile(HERE, (5, 1)))
         bench.peer.publish(topics.PATH, topics.encode_path(path))
     utc_us = bench.clock.utc_us()
-    assert bench.surroundings.somebody_is_mute(utc_us)
+    assert bench.surroundings.has_unresponsive_peer(utc_us)
     (kept,) = bench.surroundings.keep_outs(HERE, utc_us, 100_000, 5, Phase.TRACK)
     assert kept.any_height and kept.radius_m > SeparationParams().radius_m + 0.9
     assert bench.surroundings.refusals.alert(utc_us) == "path of agent-1 refused: future"
@@ -127,7 +127,7 @@ def test_a_peer_that_is_refused_for_long_is_mute_kept_clear_of_at_any_height_and
     assert [row["count"] for row in bench.told if row["event"] == "refused"] == [1, 51]
     bench.say_path()
     bench.tick()
-    assert not bench.surroundings.somebody_is_mute(bench.clock.utc_us())
+    assert not bench.surroundings.has_unresponsive_peer(bench.clock.utc_us())
     assert bench.unheard[1]["begins"] is False
     assert bench.unheard[1]["lasted_s"] == pytest.approx(2.0, abs=0.1)
 

@@ -10,7 +10,7 @@ import pytest
 
 from swarmctl.bus.peers import LocalBus, LocalHub
 from swarmctl.bus.refusals import HARMLESS, Refusals
-from swarmctl.bus.senders import SILENCE_US, Attendance, Said, Speaker, _Stream
+from swarmctl.bus.senders import SILENCE_US, Attendance, ReceivedMessage, SenderVerifier, _Stream
 from swarmctl.core.clock import SimClock
 
 RATE_HZ, TICK_US = 50.0, 20_000
@@ -32,7 +32,7 @@ class Bench:
         self.refusals = Refusals(lambda _, **fields: self.told.append(fields))
         self.attendance = Attendance(self.hub.attach("agent-0"))
         self.token: LocalBus = self.hub.attach("agent-1")
-        self.speaker = Speaker("agent-1", "path", RATE_HZ, self.refusals, self.attendance)
+        self.verifier = SenderVerifier("agent-1", "path", RATE_HZ, self.refusals, self.attendance)
 
     def ticks(self, count: int, boots: Iterable[int] = (TRUE,), late_us: int = 0) -> None:
         """Time goes on, and each of these lives says its next."""
@@ -46,8 +46,8 @@ class Bench:
     def offer(self, boot_id: int, seq: int, shift_us: int = 0, content: bytes = b"") -> bool:
         utc_us = self.clock.utc_us()
         self.attendance.look(utc_us)
-        said = Said(boot_id, seq, utc_us + shift_us, content or f"{boot_id} {seq}".encode())
-        if not self.speaker.believes(said, utc_us):
+        said = ReceivedMessage(boot_id, seq, utc_us + shift_us, content or f"{boot_id} {seq}".encode())
+        if not self.verifier.accepts(said, utc_us):
             return False
         self.believed.append((utc_us // TICK_US, boot_id))
         return True
@@ -89,13 +89,13 @@ def test_one_forged_message_silences_nobody(boot_id: int, seq: int, shift_us: in
 def test_controls_without_these_rules_one_message_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
     """A number was believed when it was higher, another boot id when it was stamped later."""
     with monkeypatch.context() as patch:
-        patch.setattr(_Stream, "goes_on", lambda self, said, *_: said.boot_id == self.boot_id and said.seq > self.seq)
+        patch.setattr(_Stream, "continues", lambda self, said, *_: said.boot_id == self.boot_id and said.seq > self.seq)
         bench = Bench()
         bench.ticks(50)
         assert bench.offer(TRUE, LAST)
         bench.ticks(50)
         assert len(bench.believed) == 51, "the true one is not heard any more"
-    monkeypatch.setattr(Speaker, "_is_confirmed", lambda *_: True)
+    monkeypatch.setattr(SenderVerifier, "_is_confirmed", lambda *_: True)
     bench = Bench()
     bench.ticks(50)
     assert bench.offer(FORGED, 1)
@@ -270,5 +270,5 @@ def test_a_flood_of_boot_ids_takes_no_memory_and_changes_nothing() -> None:
         assert not bench.offer(boot_id, boot_id)
     bench.ticks(10)
     assert len(bench.believed) == 20
-    assert len(bench.speaker._claims) == 0
+    assert len(bench.verifier._claims) == 0
     assert bench.accused == {"boot": 2000}

@@ -13,10 +13,10 @@ from hypothesis import strategies as st
 
 from swarmctl.bus import topics
 from swarmctl.bus.topics import decode_command, decode_obstacles, decode_path, decode_status, encode_message
-from swarmctl.bus.trajectory_messages import MAX_ACKNOWLEDGED, MAX_POINTS, encode_intent
+from swarmctl.bus.trajectory_messages import MAX_ACKNOWLEDGED, MAX_POINTS, encode_trajectory_message
 from swarmctl.core.records import TICK_DTYPE
 from swarmctl.core.trajectory import Trajectory
-from swarmctl.core.trajectory_message import Intent, Proposal
+from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
 from swarmctl.core.types import PredictedPath
 
 POINTS = np.array([[1.5, -2.25, -3.0], [1.625, -2.0, -3.5], [1.75, -1.75, -4.0]])
@@ -226,7 +226,7 @@ def test_numbers_beyond_a_double_are_refused() -> None:
 
 def test_every_topic_has_its_own_name_and_few_old_paths_are_kept() -> None:
     assert len({topic.name for topic in topics.TOPICS}) == len(topics.TOPICS)
-    assert max(topics.PATH.ring, topics.STATUS.ring, topics.OBSTACLES.ring, topics.INTENT.ring) <= 4
+    assert max(topics.PATH.ring, topics.STATUS.ring, topics.OBSTACLES.ring, topics.TRAJECTORY.ring) <= 4
     assert topics.COMMAND.reliable
     assert topics.OBSTACLES.reliable
 
@@ -256,8 +256,8 @@ def test_the_longest_good_message_of_every_topic_fits() -> None:
     assert len(topics.encode_path(path)) <= topics.PATH.max_bytes
     trajectory = Trajectory(0, 1, np.zeros((MAX_POINTS, 3)), np.zeros((MAX_POINTS, 3)))
     heard = dict.fromkeys(range(MAX_ACKNOWLEDGED), 2**60)
-    intent = Intent(0, 0, 0, 0, True, trajectory, Proposal(1, 0, 0, trajectory), heard)
-    assert len(encode_intent(intent)) <= topics.INTENT.max_bytes
+    message = TrajectoryMessage(0, 0, 0, 0, True, trajectory, Proposal(1, 0, 0, trajectory), heard)
+    assert len(encode_trajectory_message(message)) <= topics.TRAJECTORY.max_bytes
     assert TICK_DTYPE.itemsize + 12 * topics.MAX_POINTS <= topics.TICK.max_bytes
     status = msgspec.structs.replace(STATUS, outcome="x" * 4000, problem="\u20ac" * 4000)
     assert len(encode_message(status)) <= topics.STATUS.max_bytes

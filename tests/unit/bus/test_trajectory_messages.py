@@ -1,4 +1,4 @@
-"""Intents over the wire: what is said is what is heard, and nothing else is taken in."""
+"""Trajectory messages over the wire: what is sent is what is decoded, and everything else is refused."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import pytest
 from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.bus.refusals import Refusals
 from swarmctl.bus.senders import Attendance
-from swarmctl.bus.trajectory_messages import PeerIntents, decode_intent, encode_intent
+from swarmctl.bus.trajectory_messages import PeerTrajectories, decode_trajectory_message, encode_trajectory_message
 from swarmctl.core.clock import SimClock
 from swarmctl.core.trajectory import Trajectory, ending_at_rest, joined, resting, stopping
-from swarmctl.core.trajectory_message import Intent, Proposal
+from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
 
 UTC_US = 1_700_000_000_000_000
 
@@ -22,42 +22,48 @@ def trajectory(shift_m: float = 0.0) -> Trajectory:
     return stopping(np.array([shift_m, 1.0, -2.0]), np.array([1.5, -0.5, 0.25]), UTC_US, 100_000, 1.5)
 
 
-def intent(seq: int = 1, agent: int = 2, boot_id: int = 9, propose: bool = True) -> Intent:
+def message(seq: int = 1, agent: int = 2, boot_id: int = 9, propose: bool = True) -> TrajectoryMessage:
     proposal = Proposal(77, UTC_US + 5, agent, trajectory(0.5)) if propose else None
-    said_utc_us = UTC_US + 20_000 * seq
-    return Intent(agent, boot_id, seq, said_utc_us, True, trajectory(), proposal, {0: 5, 1: UTC_US})
+    sent_utc_us = UTC_US + 20_000 * seq
+    return TrajectoryMessage(agent, boot_id, seq, sent_utc_us, True, trajectory(), proposal, {0: 5, 1: UTC_US})
 
 
 @pytest.mark.parametrize("propose", [True, False])
-def test_what_is_said_is_heard(propose: bool) -> None:
-    said = intent(propose=propose)
-    heard = decode_intent(encode_intent(said))
-    assert heard is not None
-    assert (heard.agent, heard.boot_id, heard.seq, heard.promised, heard.heard) == (2, 9, 1, True, said.heard)
-    assert heard.said_utc_us == UTC_US + 20_000
-    np.testing.assert_allclose(heard.committed.pos_ned_m, said.committed.pos_ned_m, atol=1e-6)
-    assert heard.committed.t0_utc_us == UTC_US
-    assert (heard.proposal is not None) is propose
-    if heard.proposal is not None:
-        assert heard.proposal.order == (UTC_US + 5, 2)
-        np.testing.assert_allclose(heard.proposal.trajectory.vel_ned_m_s, trajectory(0.5).vel_ned_m_s, atol=1e-6)
+def test_a_decoded_message_is_what_was_encoded(propose: bool) -> None:
+    sent = message(propose=propose)
+    decoded = decode_trajectory_message(encode_trajectory_message(sent))
+    assert decoded is not None
+    assert (decoded.agent, decoded.boot_id, decoded.seq, decoded.is_committed, decoded.acknowledged) == (
+        2,
+        9,
+        1,
+        True,
+        sent.acknowledged,
+    )
+    assert decoded.sent_utc_us == UTC_US + 20_000
+    np.testing.assert_allclose(decoded.committed.pos_ned_m, sent.committed.pos_ned_m, atol=1e-6)
+    assert decoded.committed.t0_utc_us == UTC_US
+    assert (decoded.proposal is not None) is propose
+    if decoded.proposal is not None:
+        assert decoded.proposal.order == (UTC_US + 5, 2)
+        np.testing.assert_allclose(decoded.proposal.trajectory.vel_ned_m_s, trajectory(0.5).vel_ned_m_s, atol=1e-6)
 
 
-def test_truncated_lengthened_and_mutilated_ones_are_none() -> None:
-    good = encode_intent(intent())
+def test_truncated_lengthened_and_mutilated_messages_are_refused() -> None:
+    good = encode_trajectory_message(message())
     rng = np.random.default_rng(1)
-    assert all(decode_intent(good[:n]) is None for n in range(len(good)))
-    assert decode_intent(good + b"\0") is None
+    assert all(decode_trajectory_message(good[:n]) is None for n in range(len(good)))
+    assert decode_trajectory_message(good + b"\0") is None
     for _ in range(2000):
         bad = bytearray(good)
         bad[rng.integers(len(bad))] = rng.integers(256)
-        found = decode_intent(bytes(bad))
+        found = decode_trajectory_message(bytes(bad))
         if found is not None:
             assert np.isfinite(found.committed.pos_ned_m).all()
 
 
 class Store:
-    """Intents of agents 0 and 2 as agent 1 takes them in, at 50 Hz, one message a tick."""
+    """Trajectory messages of agents 0 and 2 as agent 1 takes them in, at 50 Hz, one message a tick."""
 
     def __init__(self) -> None:
         self.clock = SimClock()
@@ -65,56 +71,56 @@ class Store:
         self.peer = self.hub.attach(agent_name(2))
         self.attendance = Attendance(self.hub.attach(agent_name(1)))
         self.refusals = Refusals(lambda *_, **__: None)
-        self.intents = PeerIntents([0, 2], 50.0, self.refusals, self.attendance)
+        self.peers = PeerTrajectories([0, 2], 50.0, self.refusals, self.attendance)
         self.utc_us = UTC_US
 
-    def offer(self, *said: Intent, sender: str = agent_name(2)) -> None:
-        for each in said:
+    def offer(self, *sent: TrajectoryMessage, sender: str = agent_name(2)) -> None:
+        for each in sent:
             self.utc_us += 20_000
             self.attendance.look(self.utc_us)
-            self.intents.offer(sender, encode_intent(each), self.utc_us)
+            self.peers.offer(sender, encode_trajectory_message(each), self.utc_us)
 
 
-def test_only_newer_ones_of_expected_peers_are_taken_in() -> None:
+def test_only_newer_messages_of_expected_peers_are_accepted() -> None:
     store = Store()
-    store.offer(intent(seq=3), intent(seq=3), intent(seq=2))
-    store.offer(intent(seq=4), sender=agent_name(0))
-    store.offer(intent(seq=4, agent=1), sender=agent_name(1))
-    store.intents.offer(agent_name(2), b"nonsense", UTC_US)
-    assert set(store.intents.newest) == {2} and store.intents.newest[2].seq == 3
+    store.offer(message(seq=3), message(seq=3), message(seq=2))
+    store.offer(message(seq=4), sender=agent_name(0))
+    store.offer(message(seq=4, agent=1), sender=agent_name(1))
+    store.peers.offer(agent_name(2), b"nonsense", UTC_US)
+    assert set(store.peers.newest) == {2} and store.peers.newest[2].seq == 3
     assert store.refusals.by_reason == {"replayed": 2, "identity": 1, "unknown_peer": 1, "malformed": 1}
-    assert store.intents.heard() == {2: 77}
+    assert store.peers.acknowledgements() == {2: 77}
 
 
-def test_one_forged_intent_does_not_silence_its_peer() -> None:
+def test_one_forged_message_does_not_silence_its_peer() -> None:
     store = Store()
-    store.offer(intent(seq=3), intent(seq=4, boot_id=10), intent(seq=2**32 - 1), intent(seq=4))
-    assert (store.intents.newest[2].boot_id, store.intents.newest[2].seq) == (9, 4)
+    store.offer(message(seq=3), message(seq=4, boot_id=10), message(seq=2**32 - 1), message(seq=4))
+    assert (store.peers.newest[2].boot_id, store.peers.newest[2].seq) == (9, 4)
     assert store.refusals.by_reason == {"unconfirmed": 2}
-    store.offer(*(intent(seq=seq) for seq in range(5, 12)))
-    assert store.intents.newest[2].seq == 11
+    store.offer(*(message(seq=seq) for seq in range(5, 12)))
+    assert store.peers.newest[2].seq == 11
     assert store.refusals.by_reason["boot"] == 1
 
 
-def test_a_restart_is_heard_with_its_third_intent_and_has_proposed_nothing_yet() -> None:
+def test_a_restart_is_accepted_with_its_third_message_and_has_proposed_nothing_yet() -> None:
     store = Store()
-    store.offer(intent(seq=3))
+    store.offer(message(seq=3))
     store.peer.close()
     store.attendance.look(store.utc_us)
     store.peer = store.hub.attach(agent_name(2))
     store.offer(
-        *(replace(intent(seq=seq, boot_id=3, propose=False), said_utc_us=UTC_US + seq * 50_000) for seq in (4, 5, 6))
+        *(replace(message(seq=seq, boot_id=3, propose=False), sent_utc_us=UTC_US + seq * 50_000) for seq in (4, 5, 6))
     )
-    assert store.intents.newest[2].boot_id == 3
-    assert store.intents.heard() == {}
+    assert store.peers.newest[2].boot_id == 3
+    assert store.peers.acknowledgements() == {}
 
 
-def test_what_begins_in_the_future_is_of_another_clock() -> None:
+def test_a_trajectory_that_begins_in_the_far_future_is_refused() -> None:
     store = Store()
-    store.intents.offer(agent_name(2), encode_intent(intent()), UTC_US - 11_000_000)
-    assert store.refusals.by_reason == {"future": 1} and store.intents.newest == {}
-    store.intents.offer(agent_name(2), encode_intent(intent()), UTC_US - 9_000_000)
-    assert store.intents.newest[2].seq == 1
+    store.peers.offer(agent_name(2), encode_trajectory_message(message()), UTC_US - 11_000_000)
+    assert store.refusals.by_reason == {"future": 1} and store.peers.newest == {}
+    store.peers.offer(agent_name(2), encode_trajectory_message(message()), UTC_US - 9_000_000)
+    assert store.peers.newest[2].seq == 1
 
 
 def test_a_trajectory_rests_before_and_after_itself_and_is_smooth_between() -> None:
@@ -130,7 +136,7 @@ def test_a_trajectory_rests_before_and_after_itself_and_is_smooth_between() -> N
     )
 
 
-def test_a_proposal_leaves_what_is_committed_and_ends_at_rest() -> None:
+def test_a_proposal_leaves_the_committed_trajectory_and_ends_at_rest() -> None:
     first = trajectory()
     branch_us = UTC_US + 237_000
     pos, vel = first.sample(branch_us + np.arange(5) * 100_000)
@@ -143,7 +149,7 @@ def test_a_proposal_leaves_what_is_committed_and_ends_at_rest() -> None:
     assert joined(resting(pos[0], UTC_US, 100_000), replace(then), branch_us).t0_utc_us == branch_us
 
 
-def test_one_time_at_a_time_is_the_same() -> None:
+def test_sampling_one_time_equals_sampling_many() -> None:
     path = trajectory()
     for t_us in np.arange(UTC_US - 200_000, path.end_utc_us + 300_000, 7_001):
         pos, vel = path.sample(np.array([t_us]))
@@ -151,14 +157,14 @@ def test_one_time_at_a_time_is_the_same() -> None:
         np.testing.assert_allclose(path.at(float(t_us))[1], vel[0], atol=1e-6)
 
 
-def test_what_is_said_again_is_the_same_object_again() -> None:
+def test_a_repeated_trajectory_is_the_same_object_again() -> None:
     store = Store()
-    store.offer(intent(seq=1))
-    before = store.intents.newest[2]
-    store.offer(replace(intent(seq=9, boot_id=4), committed=trajectory(2.0)), intent(seq=2))  # a forger between them
-    after = store.intents.newest[2]
+    store.offer(message(seq=1))
+    before = store.peers.newest[2]
+    store.offer(replace(message(seq=9, boot_id=4), committed=trajectory(2.0)), message(seq=2))  # a forger between them
+    after = store.peers.newest[2]
     assert after.seq == 2 and after.committed is before.committed
     assert before.proposal is not None and after.proposal is not None
     assert after.proposal.trajectory is before.proposal.trajectory
-    store.offer(replace(intent(seq=3), committed=trajectory(1.0)))
-    assert store.intents.newest[2].committed is not before.committed
+    store.offer(replace(message(seq=3), committed=trajectory(1.0)))
+    assert store.peers.newest[2].committed is not before.committed

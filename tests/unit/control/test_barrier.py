@@ -1,4 +1,4 @@
-"""The last layer on its own: point masses that want to fly through each other, and what it costs them."""
+"""The safety filter on its own: point masses that want to fly through each other, and what it costs them."""
 
 from __future__ import annotations
 

@@ -14,17 +14,17 @@ import pytest
 from swarmctl.control.collision.separation import KeepOut, SeparationParams
 from swarmctl.control.commit import trajectory_planner
 from swarmctl.control.commit.protocol import Commitments
-from swarmctl.control.commit.trajectory_planner import CommitParams, Situation, Wish
+from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference, Situation
 from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.control.reference.mission import glide_to
 from swarmctl.core.trajectory import Trajectory, ending_at_rest, resting
-from swarmctl.core.trajectory_message import Intent, Proposal
+from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
 from swarmctl.core.types import Array, Sampled
 
 UTC_US = 1_700_000_000_000_000
 TICK_US = 40_000
 SEPARATION = SeparationParams(radius_m=0.9)
-CERTIFIED_M = SEPARATION.radius_m - SEPARATION.certify_slack_m
+HARD_MIN_M = SEPARATION.radius_m - SEPARATION.certify_slack_m
 
 
 @dataclass
@@ -35,19 +35,19 @@ class Network:
     loss_01: float = 0.0
     dark_us: tuple[int, int] = (0, 0)
     seed: int = 3
-    _under_way: list[tuple[int, int, Intent]] = field(default_factory=list)
+    _under_way: list[tuple[int, int, TrajectoryMessage]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         self._random = random.Random(self.seed)
 
-    def send(self, now_us: int, receiver: int, intent: Intent) -> None:
+    def send(self, now_us: int, receiver: int, message: TrajectoryMessage) -> None:
         if self._random.random() >= self.loss_01 and not self.dark_us[0] <= now_us - UTC_US < self.dark_us[1]:
-            self._under_way.append((now_us + 1 + self._random.randint(*self.delay_us), receiver, intent))
+            self._under_way.append((now_us + 1 + self._random.randint(*self.delay_us), receiver, message))
 
-    def arrived(self, now_us: int, receiver: int) -> list[Intent]:
+    def arrived(self, now_us: int, receiver: int) -> list[TrajectoryMessage]:
         mine = [m for m in self._under_way if m[1] == receiver and m[0] <= now_us]
         self._under_way = [m for m in self._under_way if not (m[1] == receiver and m[0] <= now_us)]
-        return [intent for _, _, intent in sorted(mine, key=lambda m: m[0])]
+        return [message for _, _, message in sorted(mine, key=lambda m: m[0])]
 
 
 class Crowd:
@@ -59,12 +59,12 @@ class Crowd:
         self.agents = [
             Commitments(i, CommitParams(), MpcParams(u_max=0.25), SEPARATION, count, lambda: 0) for i in range(count)
         ]
-        self.known: list[dict[int, Intent]] = [{} for _ in range(count)]
+        self.known: list[dict[int, TrajectoryMessage]] = [{} for _ in range(count)]
         self.network, self.now_us, self.seq = network, UTC_US, 0
         for agent, start in zip(self.agents, self.starts, strict=True):
             agent.begin(start, np.zeros(3), UTC_US)
 
-    def heard(self, agent: int) -> Mapping[int, int]:
+    def acknowledged(self, agent: int) -> Mapping[int, int]:
         return {a: i.proposal.number for a, i in self.known[agent].items() if i.proposal is not None}
 
     def step(self) -> None:
@@ -72,28 +72,30 @@ class Crowd:
         self.seq += 1
         ids = range(len(self.agents))
         for i in ids:
-            for intent in self.network.arrived(self.now_us, i):
-                if intent.agent not in self.known[i] or intent.seq > self.known[i][intent.agent].seq:
-                    self.known[i][intent.agent] = intent
+            for message in self.network.arrived(self.now_us, i):
+                if message.agent not in self.known[i] or message.seq > self.known[i][message.agent].seq:
+                    self.known[i][message.agent] = message
         for i, agent in enumerate(self.agents):
-            agent.hear(self.now_us, self.known[i], set(ids) - {i})
+            agent.update(self.now_us, self.known[i], set(ids) - {i})
             if agent.is_due(self.now_us):
                 begin_us = self.now_us + agent.lead_us
-                wish = Wish(partial(self.wanted, i))
-                agent.propose(Situation(self.now_us, begin_us, wish, self.known[i], ()))
+                desired = DesiredReference(partial(self.wanted, i))
+                agent.propose(Situation(self.now_us, begin_us, desired, self.known[i], ()))
         for i, agent in enumerate(self.agents):
             assert agent.committed is not None
-            said = Intent(i, 1, self.seq, self.now_us, True, agent.committed, agent.proposal, self.heard(i))
+            message = TrajectoryMessage(
+                i, 1, self.seq, self.now_us, True, agent.committed, agent.proposal, self.acknowledged(i)
+            )
             for j in ids:
                 if j != i:
-                    self.network.send(self.now_us, j, said)
+                    self.network.send(self.now_us, j, message)
 
     def wanted(self, agent: int, offsets_s: Array) -> tuple[Array, Array]:
         goal = self.starts[agent] * np.array([-1.0, -1.0, 1.0])
         t_s = (self.now_us - UTC_US) * 1e-6 + offsets_s
         return glide_to(self.starts[agent], np.zeros(3), goal, 1.5, 1.0).sample(t_s)
 
-    def promised_m(self) -> float:
+    def committed_m(self) -> float:
         """Smallest distance, from now to their ends, of any two trajectories that are followed now."""
         followed = [agent.committed for agent in self.agents if agent.committed is not None]
         end_us = max(self.now_us, *(trajectory.end_utc_us for trajectory in followed))
@@ -106,7 +108,7 @@ class Crowd:
         least = np.inf
         for _ in range(round(seconds * 1e6 / TICK_US)):
             self.step()
-            least = min(least, self.promised_m())
+            least = min(least, self.committed_m())
         return float(least)
 
     @property
@@ -125,7 +127,7 @@ NETWORKS = {
 @pytest.mark.parametrize("network", NETWORKS.values(), ids=NETWORKS.keys())
 def test_promises_never_come_closer_than_certified(network: Network) -> None:
     crowd = Crowd(4, network)
-    assert crowd.run(6.0) >= CERTIFIED_M - 1e-3
+    assert crowd.run(6.0) >= HARD_MIN_M - 1e-3
     assert crowd.committed >= 8, "they do move"
 
 
@@ -137,11 +139,11 @@ class Careless(Crowd):
         for i, agent in enumerate(self.agents):
             if agent.proposal is not None:
                 everybody = dict(self.known[i])
-                agent.hear(self.now_us, everybody, set())
+                agent.update(self.now_us, everybody, set())
 
 
 def test_control_promises_that_wait_for_nobody_contradict_each_other() -> None:
-    assert Careless(4, Network((300_000, 300_000))).run(6.0) < CERTIFIED_M - 0.1
+    assert Careless(4, Network((300_000, 300_000))).run(6.0) < HARD_MIN_M - 0.1
 
 
 def test_in_silence_everybody_comes_to_rest_and_stays_apart() -> None:
@@ -177,9 +179,9 @@ def meeting() -> tuple[Commitments, Commitments]:
     return pair[0], pair[1]
 
 
-def said_by(agent: Commitments, number: int) -> dict[int, Intent]:
+def message_of(agent: Commitments, number: int) -> dict[int, TrajectoryMessage]:
     assert agent.committed is not None
-    return {number: Intent(number, 1, 1, UTC_US, True, agent.committed, agent.proposal, {})}
+    return {number: TrajectoryMessage(number, 1, 1, UTC_US, True, agent.committed, agent.proposal, {})}
 
 
 def wall(x_m: float, agent: Commitments) -> KeepOut:
@@ -188,16 +190,16 @@ def wall(x_m: float, agent: Commitments) -> KeepOut:
 
 def test_a_promise_that_was_changed_without_asking_is_found_by_whom_it_contradicts() -> None:
     first, second = meeting()
-    assert second.broken(UTC_US, said_by(first, 0)) == set()
-    first.avoid(Situation(UTC_US, UTC_US, Wish(at_goal), {}, [wall(1.6, first)]))
+    assert second.conflicting_peers(UTC_US, message_of(first, 0)) == set()
+    first.evade(Situation(UTC_US, UTC_US, DesiredReference(at_goal), {}, [wall(1.6, first)]))
     assert first.counts.evaded == 1, "before a wall there is no time to ask"
-    assert second.broken(UTC_US, said_by(first, 0)) == {0}
-    assert second.broken(UTC_US, said_by(first, 0)) == {0}, "as long as it does"
+    assert second.conflicting_peers(UTC_US, message_of(first, 0)) == {0}
+    assert second.conflicting_peers(UTC_US, message_of(first, 0)) == {0}, "as long as it does"
 
 
 def test_a_wall_that_leaves_time_to_ask_stops_nobody() -> None:
     first, _ = meeting()
-    first.avoid(Situation(UTC_US, UTC_US, Wish(at_goal), {}, [wall(2.6, first)]))
+    first.evade(Situation(UTC_US, UTC_US, DesiredReference(at_goal), {}, [wall(2.6, first)]))
     assert first.counts.evaded == 0
 
 
@@ -207,7 +209,7 @@ def test_who_rests_makes_way_for_what_comes_at_it() -> None:
     agent.begin(np.array([0.0, 0.0, -2.0]), np.zeros(3), UTC_US)
     times_s = 0.1 * np.arange(agent.steps + 1)
     coming = np.stack([2.5 - 1.0 * times_s, 0.3 + 0.0 * times_s, -2.0 + 0.0 * times_s], axis=1)
-    agent.avoid(Situation(UTC_US, UTC_US, Wish(at_goal), {}, [KeepOut(coming, 0.9, 0.8, False, 1)]))
+    agent.evade(Situation(UTC_US, UTC_US, DesiredReference(at_goal), {}, [KeepOut(coming, 0.9, 0.8, False, 1)]))
     assert agent.counts.evaded == 1
     assert agent.committed is not None
     apart = agent.committed.sample(UTC_US + times_s * 1e6)[0] - coming
@@ -221,17 +223,17 @@ def test_who_is_hemmed_in_makes_way_upwards(column: bool, passes_m: float) -> No
     agent.begin(np.array([0.0, 0.0, -2.0]), np.zeros(3), UTC_US)
     sides = [[0.0, 0.9, -2.0], [0.0, -0.9, -2.0], [-0.9, 0.0, -2.0]]
     peers = {
-        i: Intent(i, 1, 1, UTC_US, True, resting(np.array(side), UTC_US, 100_000), None, {})
+        i: TrajectoryMessage(i, 1, 1, UTC_US, True, resting(np.array(side), UTC_US, 100_000), None, {})
         for i, side in enumerate(sides, start=1)
     }
     times_s = 0.1 * np.arange(agent.steps + 1)
     coming = np.stack([3.5 - 1.0 * times_s, 0.0 * times_s, -2.0 + 0.0 * times_s], axis=1)
-    agent.avoid(Situation(UTC_US, UTC_US, Wish(at_goal), peers, [KeepOut(coming, 1.0, 0.9, column, -1)]))
+    agent.evade(Situation(UTC_US, UTC_US, DesiredReference(at_goal), peers, [KeepOut(coming, 1.0, 0.9, column, -1)]))
     assert agent.committed is not None
     pos = agent.committed.sample(UTC_US + times_s * 1e6)[0]
     apart = np.linalg.norm((pos - coming)[:, : 2 if column else 3], axis=1)
     assert (apart.min() >= passes_m) is not column
-    assert np.linalg.norm(pos[:, None] - np.array(sides), axis=2).min() >= CERTIFIED_M
+    assert np.linalg.norm(pos[:, None] - np.array(sides), axis=2).min() >= HARD_MIN_M
 
 
 def along(corners: Array) -> Sampled:
@@ -247,8 +249,8 @@ def along(corners: Array) -> Sampled:
     return sample
 
 
-@pytest.mark.parametrize(("is_way", "gets_on"), [(True, True), (False, False)])
-def test_along_a_way_round_plans_look_near_the_way(is_way: bool, gets_on: bool) -> None:
+@pytest.mark.parametrize(("follows_path", "gets_on"), [(True, True), (False, False)])
+def test_along_a_way_round_plans_look_near_the_way(follows_path: bool, gets_on: bool) -> None:
     """The last plan leads north before a wall, the way south through its gap: from one to the other no row leads."""
     small = SeparationParams(radius_m=0.3, body_m=0.15)
     agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), small, 5, lambda: 0)
@@ -257,7 +259,7 @@ def test_along_a_way_round_plans_look_near_the_way(is_way: bool, gets_on: bool) 
     posts = [np.array([0.8, y_m, -2.0]) for y_m in (0.3, 0.6, 0.9, 1.2)]
     wall = [KeepOut(np.tile(post, (agent.steps + 1, 1)), 0.375, 0.275, True, -1) for post in posts]
     way = along(np.array([[0.0, 0.0], [0.8, -0.4], [3.0, -0.4]]))
-    agent.propose(Situation(UTC_US, UTC_US + agent.lead_us, Wish(way, is_way), {}, wall))
+    agent.propose(Situation(UTC_US, UTC_US + agent.lead_us, DesiredReference(way, follows_path), {}, wall))
     assert agent.proposal is not None
     assert bool(agent.proposal.trajectory.pos_ned_m[-1, 0] > 1.0) is gets_on, "behind the wall"
 
@@ -266,7 +268,7 @@ def test_along_a_way_round_plans_look_near_the_way(is_way: bool, gets_on: bool) 
 def test_who_rests_at_a_corner_sets_out_at_its_own_speed(gathers: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """A way at 1 m/s is round the corner before the agent is: rows of what comes next let its plan cut this one."""
     if not gathers:
-        monkeypatch.setattr(trajectory_planner, "_gathering_speed", lambda wish, speed_m_s: wish)
+        monkeypatch.setattr(trajectory_planner, "_gathering_speed", lambda desired, speed_m_s: desired)
     small = SeparationParams(radius_m=0.3, body_m=0.15)
     agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), small, 3, lambda: 0)
     here = np.array([2.716, 2.764, -2.0])
@@ -274,7 +276,7 @@ def test_who_rests_at_a_corner_sets_out_at_its_own_speed(gathers: bool, monkeypa
     posts = [np.array([3.0, y_m, -2.0]) for y_m in (2.802, 2.502, 2.202)]
     wall = [KeepOut(np.tile(post, (agent.steps + 1, 1)), 0.375, 0.275, True, -1) for post in posts]
     way = along(np.array([here[:2], [2.77, 3.14], [3.21, 3.25], [4.19, 3.06]]))
-    agent.propose(Situation(UTC_US, UTC_US + agent.lead_us, Wish(way, is_way=True), {}, wall))
+    agent.propose(Situation(UTC_US, UTC_US + agent.lead_us, DesiredReference(way, follows_path=True), {}, wall))
     assert (agent.proposal is not None) is gathers
     if agent.proposal is not None:
         assert agent.proposal.trajectory.pos_ned_m[-1, 0] > 3.4, "behind the wall"
@@ -283,25 +285,29 @@ def test_who_rests_at_a_corner_sets_out_at_its_own_speed(gathers: bool, monkeypa
 def proposing() -> tuple[Commitments, Proposal]:
     agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), SEPARATION, 2, lambda: 0)
     agent.begin(np.array([0.0, 0.0, -2.0]), np.zeros(3), UTC_US)
-    agent.propose(Situation(UTC_US, UTC_US + agent.lead_us, Wish(at_goal), {}, ()))
+    agent.propose(Situation(UTC_US, UTC_US + agent.lead_us, DesiredReference(at_goal), {}, ()))
     assert agent.proposal is not None
     return agent, agent.proposal
 
 
-def acknowledging(number: int) -> dict[int, Intent]:
-    return {1: Intent(1, 1, 1, UTC_US, True, resting(np.array([9.0, 0.0, 0.0]), UTC_US, 100_000), None, {0: number})}
+def acknowledging(number: int) -> dict[int, TrajectoryMessage]:
+    return {
+        1: TrajectoryMessage(
+            1, 1, 1, UTC_US, True, resting(np.array([9.0, 0.0, 0.0]), UTC_US, 100_000), None, {0: number}
+        )
+    }
 
 
 @pytest.mark.parametrize(("off", "commits"), [(0, 1), (1, 0), (-1, 0)])
 def test_only_the_very_proposal_is_acknowledged(off: int, commits: int) -> None:
     agent, proposal = proposing()
-    agent.hear(UTC_US + 20_000, acknowledging(proposal.number + off), {1})
+    agent.update(UTC_US + 20_000, acknowledging(proposal.number + off), {1})
     assert agent.counts.committed == commits
 
 
 def test_an_acknowledgement_after_the_moment_to_leave_is_too_late() -> None:
     agent, proposal = proposing()
-    agent.hear(UTC_US + agent.lead_us + 1, acknowledging(proposal.number), {1})
+    agent.update(UTC_US + agent.lead_us + 1, acknowledging(proposal.number), {1})
     assert (agent.counts.committed, agent.counts.expired, agent.proposal) == (0, 1, None)
 
 
@@ -310,7 +316,7 @@ def test_promises_that_are_too_close_already_do_not_creep_closer() -> None:
     agent, _ = proposing()
     other = resting(np.zeros(3), UTC_US, 100_000)
     for k in range(10):
-        x_m = CERTIFIED_M - 0.01 - 0.005 * k
+        x_m = HARD_MIN_M - 0.01 - 0.005 * k
         nearer = np.array([[x_m, 0.0, 0.0], [x_m - 0.005, 0.0, 0.0]])
         assert agent._planner.conflicts(Trajectory(UTC_US, 100_000, nearer, np.zeros((2, 3))), UTC_US, [other])
         assert not agent._planner.conflicts(

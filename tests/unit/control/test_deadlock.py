@@ -8,18 +8,18 @@ import numpy as np
 import pytest
 
 from swarmctl.control.collision.separation import KeepOut
-from swarmctl.control.reference.deadlock import Detour, DetourParams, Progress
+from swarmctl.control.reference.deadlock import DeadlockParams, DeadlockRecovery, ProgressMonitor
 from swarmctl.core.types import Array, Obstacle
 
-PARAMS = DetourParams(behind_m=0.2, moved_m=0.2, patience_s=1.5, near_m=0.4, speed_m_s=1.0)
+PARAMS = DeadlockParams(behind_m=0.2, moved_m=0.2, patience_s=1.5, near_m=0.4, speed_m_s=1.0)
 WANTED = np.array([5.0, 0.0, -2.0])
 HERE = np.array([0.0, 0.0, -2.0])
 
 
-def keep_out(north_m: float, east_m: float = 0.0, tie: int = 1, ends_m: float = 0.0) -> KeepOut:
-    """A peer (an obstacle with `tie` -1) that means to move `ends_m` north over the horizon."""
+def keep_out(north_m: float, east_m: float = 0.0, priority_id: int = 1, ends_m: float = 0.0) -> KeepOut:
+    """A peer (an obstacle with `priority_id` -1) that means to move `ends_m` north over the horizon."""
     path = np.linspace([north_m, east_m, -2.0], [north_m + ends_m, east_m, -2.0], 41)
-    return KeepOut(path, 0.9, 0.8, tie < 0, tie)
+    return KeepOut(path, 0.9, 0.8, priority_id < 0, priority_id)
 
 
 def reference(offsets_s: Array) -> tuple[Array, Array]:
@@ -27,13 +27,13 @@ def reference(offsets_s: Array) -> tuple[Array, Array]:
 
 
 def watched(seconds: float, keep_outs: list[KeepOut], speed_m_s: float = 0.0, wanted: Array = WANTED) -> list[Any]:
-    progress = Progress(PARAMS)
+    progress = ProgressMonitor(PARAMS)
     ticks = [(k * 20_000, HERE + np.array([speed_m_s * k * 0.02, 0.0, 0.0])) for k in range(round(seconds * 50) + 1)]
     return [d for t_us, pos in ticks if (d := progress.step(t_us, pos, wanted, keep_outs)) is not None]
 
 
 def test_who_stands_before_somebody_is_deadlocked_once_it_has_lasted() -> None:
-    before = [keep_out(1.0, tie=3), keep_out(0.8, 0.5, tie=-1)]
+    before = [keep_out(1.0, priority_id=3), keep_out(0.8, 0.5, priority_id=-1)]
     assert watched(1.4, before) == []
     found = watched(3.2, before)
     assert [d.by for d in found] == [(-1, 3)] * 2  # told again every 1.5 s
@@ -56,36 +56,38 @@ def test_who_moves_or_has_nobody_before_it_is_not(keep_outs: list[KeepOut], spee
     assert watched(4.0, keep_outs, speed_m_s, wanted) == []
 
 
-def stood(detour: Detour, seconds: float, keep_outs: list[KeepOut], obstacles: tuple[Obstacle, ...] = ()) -> None:
+def stood(
+    recovery: DeadlockRecovery, seconds: float, keep_outs: list[KeepOut], obstacles: tuple[Obstacle, ...] = ()
+) -> None:
     for k in range(round(seconds * 50) + 1):
-        detour.step(k * 20_000, HERE, reference, keep_outs, lambda: obstacles)
+        recovery.step(k * 20_000, HERE, reference, keep_outs, lambda: obstacles)
 
 
-def aside_m(detour: Detour) -> float:
+def aside_m(recovery: DeadlockRecovery) -> float:
     """How far beside the straight line the way leads in the next seconds."""
-    return float(np.abs(detour.sample(np.linspace(0.0, 4.0, 81))[0][:, 1]).max())
+    return float(np.abs(recovery.sample(np.linspace(0.0, 4.0, 81))[0][:, 1]).max())
 
 
 @pytest.mark.parametrize(("agent", "seconds", "gives_way"), [(2, 1.6, False), (2, 3.2, True), (0, 3.2, False)])
 def test_the_higher_id_goes_round_the_lower_one(agent: int, seconds: float, gives_way: bool) -> None:
-    detour = Detour(PARAMS, agent, 0.9)
-    stood(detour, seconds, [keep_out(1.0)])
-    assert detour.active
-    assert (aside_m(detour) > 0.8) == gives_way
+    recovery = DeadlockRecovery(PARAMS, agent, 0.9)
+    stood(recovery, seconds, [keep_out(1.0)])
+    assert recovery.active
+    assert (aside_m(recovery) > 0.8) == gives_way
 
 
 def test_the_lower_one_goes_round_too_when_that_was_not_enough() -> None:
-    detour = Detour(PARAMS, 0, 0.9)
-    stood(detour, 4.7, [keep_out(1.0)])
-    assert aside_m(detour) > 0.8
+    recovery = DeadlockRecovery(PARAMS, 0, 0.9)
+    stood(recovery, 4.7, [keep_out(1.0)])
+    assert aside_m(recovery) > 0.8
 
 
 def test_whom_it_was_deadlocked_with_is_gone_round_although_it_moves_now() -> None:
-    detour = Detour(PARAMS, 2, 0.9)
-    stood(detour, 3.2, [keep_out(1.0, ends_m=-0.5)])
-    assert aside_m(detour) > 0.8
-    passing = Detour(PARAMS, 2, 0.9)
-    stood(passing, 3.2, [keep_out(1.0, tie=-1), keep_out(3.0, ends_m=-0.5)])
+    recovery = DeadlockRecovery(PARAMS, 2, 0.9)
+    stood(recovery, 3.2, [keep_out(1.0, ends_m=-0.5)])
+    assert aside_m(recovery) > 0.8
+    passing = DeadlockRecovery(PARAMS, 2, 0.9)
+    stood(passing, 3.2, [keep_out(1.0, priority_id=-1), keep_out(3.0, ends_m=-0.5)])
     assert aside_m(passing) < 0.1, "who is only passing is not"
 
 
@@ -93,37 +95,37 @@ def test_round_a_wall_at_once_and_back_on_the_reference_when_it_is_reached() -> 
     posts = tuple(
         Obstacle(np.array([1.5, east, 0.0]), 0.3, 0.9, 3.0, np.zeros(3), column=True) for east in (-0.6, 0.0, 0.6)
     )
-    detour = Detour(PARAMS, 0, 0.9)
-    stood(detour, 1.6, [keep_out(1.0, tie=-1)], posts)
-    assert aside_m(detour) > 1.4
-    assert detour.deadlock is not None
-    pos, vel = detour.sample(np.array([0.0, 0.5]))
+    recovery = DeadlockRecovery(PARAMS, 0, 0.9)
+    stood(recovery, 1.6, [keep_out(1.0, priority_id=-1)], posts)
+    assert aside_m(recovery) > 1.4
+    assert recovery.deadlock is not None
+    pos, vel = recovery.sample(np.array([0.0, 0.5]))
     np.testing.assert_allclose(np.linalg.norm(pos[1] - pos[0]), 0.5)
     np.testing.assert_allclose(np.linalg.norm(vel, axis=1), 1.0)
-    detour.step(1_700_000, HERE + np.array([0.0, 2.0, 0.0]), reference, [], lambda: posts)
-    assert detour.active
-    assert detour.deadlock is None, "it has got on"
-    detour.step(9_000_000, WANTED - [0.1, 0.0, 0.0], reference, [], lambda: posts)
-    assert not detour.active
+    recovery.step(1_700_000, HERE + np.array([0.0, 2.0, 0.0]), reference, [], lambda: posts)
+    assert recovery.active
+    assert recovery.deadlock is None, "it has got on"
+    recovery.step(9_000_000, WANTED - [0.1, 0.0, 0.0], reference, [], lambda: posts)
+    assert not recovery.active
 
 
 def test_a_ball_below_is_not_gone_round() -> None:
     ball = Obstacle(np.array([1.5, 0.0, 0.0]), 0.3, 0.9, 3.0, np.zeros(3))
-    detour = Detour(PARAMS, 0, 0.9)
-    stood(detour, 1.6, [keep_out(1.0, tie=-1)], (ball,))
-    assert aside_m(detour) < 0.1
+    recovery = DeadlockRecovery(PARAMS, 0, 0.9)
+    stood(recovery, 1.6, [keep_out(1.0, priority_id=-1)], (ball,))
+    assert aside_m(recovery) < 0.1
 
 
 def test_switched_off_it_only_notices() -> None:
-    detour = Detour(PARAMS.model_copy(update={"enabled": False}), 2, 0.9)
-    stood(detour, 4.0, [keep_out(1.0)])
-    assert detour.deadlock is not None
-    assert not detour.active
+    recovery = DeadlockRecovery(PARAMS.model_copy(update={"enabled": False}), 2, 0.9)
+    stood(recovery, 4.0, [keep_out(1.0)])
+    assert recovery.deadlock is not None
+    assert not recovery.active
 
 
 def test_reset_forgets_everything() -> None:
-    detour = Detour(PARAMS, 2, 0.9)
-    stood(detour, 4.0, [keep_out(1.0)])
-    detour.reset()
-    assert detour.deadlock is None
-    assert not detour.active
+    recovery = DeadlockRecovery(PARAMS, 2, 0.9)
+    stood(recovery, 4.0, [keep_out(1.0)])
+    recovery.reset()
+    assert recovery.deadlock is None
+    assert not recovery.active

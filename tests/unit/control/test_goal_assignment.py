@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from sitl.studies.campaign.layouts import least_sum_m
-from swarmctl.control.reference.goal_assignment import ROOM, arrangement, places_ned_m
+from swarmctl.control.reference.goal_assignment import ROOM, arrangement, assigned_goals_ned_m
 from swarmctl.control.reference.mission import OUTWARD_S_M, GotoParams, MissionParams, MissionReference
 from swarmctl.core.types import Array
 
@@ -34,7 +34,7 @@ def test_two_keep_the_same_distance_to_their_goal() -> None:
 def test_three_round_one_point_form_a_triangle_at_its_height() -> None:
     starts = np.array([[4.0, 0.0, -1.0], [-2.0, 3.4, -1.0], [-2.0, -3.4, -2.0]])
     goals = np.tile([1.0, 1.0, -3.0], (3, 1))
-    places, groups = places_ned_m(starts, goals, APART_M)
+    places, groups = assigned_goals_ned_m(starts, goals, APART_M)
     assert groups == [[0, 1, 2]]
     np.testing.assert_allclose(places[:, 2], -3.0)
     np.testing.assert_allclose(np.linalg.norm(places - goals, axis=1), ROOM * APART_M / math.sqrt(3.0), rtol=1e-6)
@@ -45,7 +45,7 @@ def test_three_round_one_point_form_a_triangle_at_its_height() -> None:
 
 def test_goals_far_enough_apart_stay_as_they_are() -> None:
     goals = np.array([[0.0, 0.0, -1.0], [0.95, 0.0, -1.0], [0.0, 0.0, -2.0]])
-    places, groups = places_ned_m(np.zeros((3, 3)), goals, APART_M)
+    places, groups = assigned_goals_ned_m(np.zeros((3, 3)), goals, APART_M)
     np.testing.assert_array_equal(places, goals)
     assert groups == [[0], [1], [2]]
 
@@ -53,7 +53,7 @@ def test_goals_far_enough_apart_stay_as_they_are() -> None:
 def test_who_would_be_pushed_by_an_arrangement_joins_it() -> None:
     goals = np.array([[5.0, 0.0, 0.0], [5.0, 0.0, 0.0], [5.9, 0.0, 0.0], [9.0, 0.0, 0.0]])
     starts = np.arange(4)[:, None] * np.array([2.0, 0.0, 0.0])  # they come along the line of the goals
-    places, groups = places_ned_m(starts, goals, APART_M)
+    places, groups = assigned_goals_ned_m(starts, goals, APART_M)
     assert groups == [[0, 1, 2], [3]]
     assert closest_m(places) >= APART_M
     np.testing.assert_array_equal(places[3], goals[3])
@@ -67,7 +67,7 @@ def test_ways_flown_together_never_come_much_closer_than_their_ends(count: int) 
         if all(math.dist(start, other) >= 1.5 for other in chosen):
             chosen.append(start)
     starts = np.array(chosen[:count])
-    places, _ = places_ned_m(starts, np.zeros((count, 3)), APART_M)
+    places, _ = assigned_goals_ned_m(starts, np.zeros((count, 3)), APART_M)
     least_m = min(closest_m(starts + s * (places - starts)) for s in np.linspace(0.0, 1.0, 101))
     assert least_m >= ROOM * APART_M / math.sqrt(2.0) - 1e-6  # where no two gain by exchanging their places
 
@@ -93,9 +93,9 @@ def test_everybody_works_out_the_same_and_arrives_as_others_do() -> None:
     mission = MissionParams(kind="goto", goto=GotoParams(goals_ned_m=((0.0, 0.0, -1.0),)))
     flown = [MissionReference(mission, starts, agent, APART_M) for agent in range(3)]
     ends = np.array([reference.sample(np.array([60.0]))[0][0] for reference in flown])
-    np.testing.assert_allclose(ends, places_ned_m(starts, np.tile([0.0, 0.0, -1.0], (3, 1)), APART_M)[0])
+    np.testing.assert_allclose(ends, assigned_goals_ned_m(starts, np.tile([0.0, 0.0, -1.0], (3, 1)), APART_M)[0])
     assert max(rest_s(flown)) - min(rest_s(flown)) < 0.05, "three places are equally far"
-    alone = mission.model_copy(update={"goto": mission.goto.model_copy(update={"standoff": False})})
+    alone = mission.model_copy(update={"goto": mission.goto.model_copy(update={"goal_assignment": False})})
     np.testing.assert_array_equal(
         MissionReference(alone, starts, 1, APART_M).sample(np.array([60.0]))[0][0], [0, 0, -1]
     )

@@ -48,9 +48,9 @@ def joint(slots: int = 4, separation: SeparationParams | None = None, **params: 
     return JointMpc(MpcParams(**params), VehicleModelParams(), separation or SeparationParams(), 0, slots, lambda: 0)
 
 
-def ball(offset: Point, any_height: bool = False, tie: int = -1) -> KeepOut:
+def ball(offset: Point, any_height: bool = False, priority_id: int = -1) -> KeepOut:
     """0.9 m round a place that is `offset` from HERE; certified from 0.8 m on; an obstacle unless it has a number."""
-    return KeepOut(np.tile(HERE + np.array(offset), (41, 1)), 0.9, 0.8, any_height, tie)
+    return KeepOut(np.tile(HERE + np.array(offset), (41, 1)), 0.9, 0.8, any_height, priority_id)
 
 
 def distances(path: Array, keep_out: KeepOut) -> Array:
@@ -134,7 +134,7 @@ def test_the_planned_path_is_the_motion_of_its_own_virtual_controls(climb_m: flo
 
 
 def test_what_is_certified_is_what_would_be_flown() -> None:
-    near = ball((1.1424, 0.4675, -1.7551), tie=1)
+    near = ball((1.1424, 0.4675, -1.7551), priority_id=1)
     state = {"vel": (-0.1647, -0.4631, 1.3129), "virtual": (-0.0542, -0.1913, 7.899)}
     asked = problem((3.2193, 1.9425, -1.0748), [near], **state)  # type: ignore[arg-type]
     plan = joint(terminal_z=FREE_END, qp=DAQP).plan(asked)
@@ -165,7 +165,7 @@ class Flight:
 
 def _lasting(keep_out: KeepOut, points: int) -> KeepOut:
     still = np.tile(keep_out.pos_ned_m[0], (points, 1))
-    return KeepOut(still, keep_out.radius_m, keep_out.certified_m, keep_out.any_height, keep_out.tie)
+    return KeepOut(still, keep_out.radius_m, keep_out.hard_min_distance_m, keep_out.any_height, keep_out.priority_id)
 
 
 def fly(mpc: JointMpc | SwarmMpc, goal: Point, keep_outs: Sequence[KeepOut], ticks: int = 350) -> Flight:
@@ -230,7 +230,7 @@ def test_what_is_kept_clear_of_at_every_height_is_never_passed_above(lower_m: fl
 
 
 def test_above_its_place_it_stays_above_when_the_reference_falls_into_a_keep_out() -> None:
-    below = ball((0.0, 0.0, 1.2), tie=1)
+    below = ball((0.0, 0.0, 1.2), priority_id=1)
     for terminal in ("none", "region"):
         plan = joint(terminal_z=terminal).plan(problem((0.0, 0.0, 1.2), [below], vel=(0.0, 0.0, 0.3)))
         assert plan.status is PlanStatus.OK
@@ -239,7 +239,7 @@ def test_above_its_place_it_stays_above_when_the_reference_falls_into_a_keep_out
 
 @pytest.mark.parametrize("terminal", ["position", "position_velocity"])  # the second is the default
 def test_keeping_clear_comes_before_ending_at_the_reference(terminal: str) -> None:
-    below = ball((0.0, 0.0, 0.9), tie=1)
+    below = ball((0.0, 0.0, 0.9), priority_id=1)
     plan = joint(terminal_z=terminal).plan(problem((0.0, 0.0, 0.08), [below]))
     assert plan.slack_m < 0.01
     assert distances(plan.pos_ned_m, below).min() > 0.9 - 0.01
@@ -264,15 +264,15 @@ def mirrored(asked: Problem, by: Array) -> Problem:
         Start(0, turned(start.pos_ned_m), by @ start.vel_ned_m_s, 1.0, rest + by @ (start.virtual - rest)),
         Reference(turned(reference.pos_ned_m), reference.vel_ned_m_s @ by.T, 0.0),
         by @ asked.disturbance_ned_m_s2,
-        tuple(KeepOut(turned(k.pos_ned_m), 0.9, 0.8, k.any_height, k.tie) for k in asked.keep_outs),
+        tuple(KeepOut(turned(k.pos_ned_m), 0.9, 0.8, k.any_height, k.priority_id) for k in asked.keep_outs),
         None if asked.guess_ned_m is None else turned(asked.guess_ned_m),
     )
 
 
-def random_problem(seed: int, tie: int) -> Problem:
+def random_problem(seed: int, priority_id: int) -> Problem:
     rng = np.random.default_rng([seed, 0, 9])
     places = rng.uniform(-1.0, 1.0, (3, 3)) + np.array([1.6, 0.0, 0.0])
-    keep_outs = [ball(place, any_height=k == 2, tie=tie) for k, place in enumerate(places)]
+    keep_outs = [ball(place, any_height=k == 2, priority_id=priority_id) for k, place in enumerate(places)]
     virtual = (*rng.uniform(-0.1, 0.1, 2), G)
     goal, wind = rng.uniform(-3.0, 3.0, 3), rng.uniform(-0.5, 0.5, 3)
     vel = rng.uniform(-0.6, 0.6, 3) + np.array([1.0, 0.0, 0.0])  # towards them
@@ -280,7 +280,7 @@ def random_problem(seed: int, tie: int) -> Problem:
 
 
 @pytest.mark.parametrize(
-    ("by", "tie", "bias_rad"),
+    ("by", "priority_id", "right_of_way_rad"),
     [
         pytest.param(SWAP, -1, 0.35, id="x and y, obstacles"),  # passed on the side one is on, whichever that is
         pytest.param(SWAP, 1, 0.0, id="x and y, peers without the traffic rule"),
@@ -288,10 +288,10 @@ def random_problem(seed: int, tie: int) -> Problem:
         pytest.param(QUARTER, 1, 0.35, id="quarter turn, peers"),  # the rule has a hand, so only turns keep it
     ],
 )
-def test_a_mirrored_problem_has_the_mirrored_plan(by: Array, tie: int, bias_rad: float) -> None:
-    separation, matters = SeparationParams(bias_rad=bias_rad), 0
+def test_a_mirrored_problem_has_the_mirrored_plan(by: Array, priority_id: int, right_of_way_rad: float) -> None:
+    separation, matters = SeparationParams(right_of_way_rad=right_of_way_rad), 0
     for seed in range(12):
-        asked = random_problem(seed, tie)
+        asked = random_problem(seed, priority_id)
         alone = replace(asked, keep_outs=())
         one, two, free = (
             joint(3, separation, terminal_z=FREE_END, qp=DAQP).plan(p) for p in (asked, mirrored(asked, by), alone)
@@ -312,7 +312,7 @@ def test_up_and_down_are_mirrored_where_there_is_as_much_thrust_for_both(goal_m:
     mpc = joint(terminal_z=FREE_END, qp=DAQP, **room)
     plans = []
     for sign in (-1.0, 1.0):
-        in_the_way = () if any_room else (ball((0.0, 0.0, 1.2 * sign), tie=1),)
+        in_the_way = () if any_room else (ball((0.0, 0.0, 1.2 * sign), priority_id=1),)
         plans.append(mpc.plan(problem((0.0, 0.0, goal_m * sign), in_the_way, vel=(0.0, 0.0, 0.3 * sign))))
     up, down = plans
     assert up.status is down.status is PlanStatus.OK

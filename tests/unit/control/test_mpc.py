@@ -14,7 +14,7 @@ from swarmctl.control.model import VehicleModelParams, acceleration
 from swarmctl.control.mpc.axes import AxesSolution
 from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.control.mpc.qp import QpParams
-from swarmctl.control.mpc.swarm_mpc import RESIDUAL_LIMIT_M, MpcParams, SwarmMpc, nearest
+from swarmctl.control.mpc.swarm_mpc import RESIDUAL_LIMIT_M, MpcParams, SwarmMpc, closest_keep_outs
 from swarmctl.core.types import Array, Plan, PlanStatus, Reference
 
 G = 9.81
@@ -264,7 +264,7 @@ def wide(place: Array, radius_m: float, any_height: bool = False) -> KeepOut:
 def test_slots_go_to_those_whose_surface_is_nearest(pressing: KeepOut) -> None:
     harmless = wide(HERE + np.array([0.0, 2.0, 0.0]), 0.9)
     guess = np.tile(HERE, (41, 1))
-    assert nearest([harmless, pressing], guess, 1)[0] is pressing
+    assert closest_keep_outs([harmless, pressing], guess, 1)[0] is pressing
 
 
 @pytest.mark.parametrize("terminal", ["position", "position_velocity"])
@@ -293,6 +293,8 @@ def test_from_rest_peers_that_it_would_meet_far_away_are_kept_clear_of(kind: Lit
     along = Reference(ahead, np.gradient(ahead, 0.05, axis=0), 0.0)
     params = ControllerParams(kind=kind, mpc=MpcParams(dt_s=0.05, control_xy=20, u_max=0.75))
     mpc = make_controller(params, VehicleModelParams(), SeparationParams(radius_m=1.6), 1, 2, lambda: 0)
-    keep_outs = tuple(KeepOut(path, 1.6, 1.55, False, tie) for path, tie in zip(peers, (0, 2), strict=True))
+    keep_outs = tuple(
+        KeepOut(path, 1.6, 1.55, False, priority_id) for path, priority_id in zip(peers, (0, 2), strict=True)
+    )
     at_rest = start(np.array([0.45, -0.13, -2.5]))
     assert mpc.plan(Problem(at_rest, along, np.zeros(3), keep_outs, None)).status is PlanStatus.OK

@@ -32,9 +32,11 @@ def start_at(t_us: int) -> Start:
     return Start(t_us, np.array([0.0, 0.0, -2.0]), np.zeros(3), 1.0, np.array([0.0, 0.0, 9.81]))
 
 
-def wall(north_m: float, certified_m: float = 0.8) -> KeepOut:
+def wall(north_m: float, hard_min_distance_m: float = 0.8) -> KeepOut:
     """Something that stands at height 2 m."""
-    return KeepOut(np.tile([north_m, 0.0, -2.0], (STEPS + 1, 1)), certified_m + 0.1, certified_m, False, 1)
+    return KeepOut(
+        np.tile([north_m, 0.0, -2.0], (STEPS + 1, 1)), hard_min_distance_m + 0.1, hard_min_distance_m, False, 1
+    )
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.optimize import linprog, minimize
 
-from swarmctl.control.collision.projection import Row, nearest_or_least_violating, nearest_point
+from swarmctl.control.collision.projection import Row, project, project_or_violate_least
 
 
 def random_rows(rng: np.random.Generator, dims: int, count: int, inside: bool) -> list[Row]:
@@ -26,7 +26,7 @@ def test_it_is_the_nearest_there_is(dims: int) -> None:
     for _ in range(25):
         rows = random_rows(rng, dims, 3 * dims, inside=True)
         wanted = rng.normal(scale=3.0, size=dims)
-        found = nearest_point(tuple(wanted.tolist()), rows)
+        found = project(tuple(wanted.tolist()), rows)
         assert found is not None
         a, b = np.array([n for n, _ in rows]), np.array([o for _, o in rows])
         assert (a @ np.array(found) - b).min() > -1e-7
@@ -47,7 +47,7 @@ def test_none_when_there_is_none_and_only_then() -> None:
         rows = random_rows(rng, 3, 8, inside=False)
         a, b = np.array([n for n, _ in rows]), np.array([o for _, o in rows])
         feasible = linprog(np.zeros(3), A_ub=-a, b_ub=-b, bounds=[(None, None)] * 3).status == 0
-        assert (nearest_point((0.0, 0.0, 0.0), rows) is not None) == feasible
+        assert (project((0.0, 0.0, 0.0), rows) is not None) == feasible
         seen.add(feasible)
     assert seen == {True, False}
 
@@ -55,11 +55,11 @@ def test_none_when_there_is_none_and_only_then() -> None:
 def test_rows_that_can_not_be_kept_lack_evenly_and_hard_ones_are_kept() -> None:
     soft: list[Row] = [((1.0, 0.0), 2.0), ((-1.0, 0.0), 0.0)]  # x >= 2 and x <= 0
     hard: list[Row] = [((0.0, 1.0), -1.0), ((0.0, -1.0), -1.0)]
-    x, y = nearest_or_least_violating((5.0, 3.0), soft, hard, 1e4)
+    x, y = project_or_violate_least((5.0, 3.0), soft, hard, 1e4)
     assert x == pytest.approx(1.0, abs=1e-3)
     assert y == pytest.approx(1.0, abs=1e-9)
 
 
 def test_what_needs_no_change_is_returned_as_it_is() -> None:
     wanted = (0.1, 0.2, 0.3)
-    assert nearest_point(wanted, [((1.0, 0.0, 0.0), 0.0)]) is wanted
+    assert project(wanted, [((1.0, 0.0, 0.0), 0.0)]) is wanted

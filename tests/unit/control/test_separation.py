@@ -83,8 +83,8 @@ def test_keep_out_grows_with_age_to_its_cap_and_a_lost_peer_is_a_cylinder(
     path = peer(np.zeros((3, 3)), radius_m=0.25, agent=4)
     keep_out = keep_out_of_peer(path, at_us, DT_US, STEPS, PARAMS)
     assert keep_out.radius_m == pytest.approx(0.9 + 0.25 + margin_m)
-    assert keep_out.certified_m == pytest.approx(0.9 + 0.25 - 0.1)
-    assert (keep_out.any_height, keep_out.tie) == (any_height, 4)
+    assert keep_out.hard_min_distance_m == pytest.approx(0.9 + 0.25 - 0.1)
+    assert (keep_out.any_height, keep_out.priority_id) == (any_height, 4)
 
 
 def test_a_peer_that_has_landed_is_kept_clear_of_but_does_not_grow() -> None:
@@ -97,7 +97,7 @@ def test_a_moving_obstacle_is_taken_at_constant_velocity_and_seen_only_from_near
     obstacle = Obstacle(np.array([5.0, 0.0, -2.0]), 1.0, 1.75, 3.0, np.array([-1.0, 0.5, 0.0]))
     keep_out = keep_out_of_obstacle(obstacle, 200_000, 2, PARAMS)
     np.testing.assert_allclose(keep_out.pos_ned_m, [[5.0, 0.0, -2.0], [4.8, 0.1, -2.0], [4.6, 0.2, -2.0]])
-    assert [keep_out.radius_m, keep_out.certified_m] == pytest.approx([1.75, 1.65])
+    assert [keep_out.radius_m, keep_out.hard_min_distance_m] == pytest.approx([1.75, 1.65])
     assert visible([obstacle], np.array([2.001, 0.0, -2.0])) == [obstacle]
     assert visible([obstacle], np.array([2.0, 0.0, -2.0])) == []
     assert visible([obstacle], np.array([5.0, 0.0, 1.0])) == []  # height counts
@@ -173,9 +173,11 @@ def test_control_horizon_as_long_as_the_prediction_leaves_the_end_to_be_judged()
 # -- half-spaces ------------------------------------------------------------------------------------------------------
 
 
-def spaces_of(guess: Array, *keep_outs: KeepOut, tie: int = 0, goal: tuple[float, float] = (0.0, 0.0)) -> HalfSpaces:
+def spaces_of(
+    guess: Array, *keep_outs: KeepOut, priority_id: int = 0, goal: tuple[float, float] = (0.0, 0.0)
+) -> HalfSpaces:
     """Of an agent at rest."""
-    spaces = half_spaces(keep_outs, guess, np.array(goal), np.zeros(2), 0.1, tie, PARAMS)
+    spaces = half_spaces(keep_outs, guess, np.array(goal), np.zeros(2), 0.1, priority_id, PARAMS)
     assert spaces is not None
     return spaces
 
@@ -262,10 +264,10 @@ def test_far_ones_get_no_row() -> None:
 
 def test_two_at_the_same_place_take_opposite_sides_by_their_numbers() -> None:
     place = (1.0, 2.0, -2.0)
-    other_of_0 = KeepOut(still(place), 0.9, 0.8, False, tie=1)
-    other_of_1 = KeepOut(still(place), 0.9, 0.8, False, tie=0)
-    first = spaces_of(still(place), other_of_0, tie=0, goal=(1.0, 2.0))
-    second = spaces_of(still(place), other_of_1, tie=1, goal=(1.0, 2.0))
+    other_of_0 = KeepOut(still(place), 0.9, 0.8, False, priority_id=1)
+    other_of_1 = KeepOut(still(place), 0.9, 0.8, False, priority_id=0)
+    first = spaces_of(still(place), other_of_0, priority_id=0, goal=(1.0, 2.0))
+    second = spaces_of(still(place), other_of_1, priority_id=1, goal=(1.0, 2.0))
     assert np.isfinite(first.normal).all()
     np.testing.assert_allclose(first.normal[0, 0], [-1.0, 0.0])
     np.testing.assert_allclose(second.normal[0, 0], [1.0, 0.0])
@@ -275,8 +277,8 @@ def test_two_at_the_same_place_take_opposite_sides_by_their_numbers() -> None:
 
 def test_head_on_agents_that_get_nowhere_turn_to_opposite_sides_of_the_line() -> None:
     north_bound, south_bound = still((0.0, 0.0, 0.0)), still((1.0, 0.0, 0.0))
-    a = spaces_of(north_bound, KeepOut(south_bound, 0.9, 0.8, False, 1), tie=0, goal=(5.0, 0.0))
-    b = spaces_of(south_bound, KeepOut(north_bound, 0.9, 0.8, False, 0), tie=1, goal=(-5.0, 0.0))
+    a = spaces_of(north_bound, KeepOut(south_bound, 0.9, 0.8, False, 1), priority_id=0, goal=(5.0, 0.0))
+    b = spaces_of(south_bound, KeepOut(north_bound, 0.9, 0.8, False, 0), priority_id=1, goal=(-5.0, 0.0))
     # turned by 0.35 rad: (-1, 0) -> (-cos, -sin), (1, 0) -> (cos, sin)
     np.testing.assert_allclose(a.normal[0, 0], [-math.cos(0.35), -math.sin(0.35)], atol=1e-9)
     np.testing.assert_allclose(b.normal[0, 0], [math.cos(0.35), math.sin(0.35)], atol=1e-9)
@@ -302,7 +304,7 @@ def test_obstacles_are_passed_on_the_side_one_is_on(east_m: float, axes: int) ->
 def test_stopping_row_asks_for_the_braking_distance_and_not_when_opening() -> None:
     guess = still((-3.0, 0.0, 0.0))
     wall = [fixed((0.0, 0.0, 0.0), 0.8)]
-    params = PARAMS.model_copy(update={"bias_rad": 0.0, "bias_obstacle_rad": 0.0})
+    params = PARAMS.model_copy(update={"right_of_way_rad": 0.0, "right_of_way_obstacle_rad": 0.0})
     closing = half_spaces(wall, guess, np.array([5.0, 0.0]), np.array([2.8, 0.0]), 0.1, 0, params)
     assert closing is not None
     # v / (2 a): p + v * v / (2 a) is where braking with a = 1.4 from 2.8 m/s ends
@@ -315,7 +317,7 @@ def test_stopping_row_asks_for_the_braking_distance_and_not_when_opening() -> No
 
 def test_stopping_row_knows_that_the_other_moves_too() -> None:
     other = KeepOut(line((0.0, 0.0, 0.0), (-1.0, 0.0, 0.0)), 0.9, 0.8, False, 1)  # 1 m/s south
-    params = PARAMS.model_copy(update={"bias_rad": 0.0, "bias_obstacle_rad": 0.0})
+    params = PARAMS.model_copy(update={"right_of_way_rad": 0.0, "right_of_way_obstacle_rad": 0.0})
     spaces = half_spaces([other], still((-3.0, 0.0, 0.0)), np.array([5.0, 0.0]), np.array([1.8, 0.0]), 0.1, 0, params)
     assert spaces is not None
     assert spaces.stop_s[0] == pytest.approx(2.8 / 2.8)  # closing speed 1.8 + 1.0
@@ -327,10 +329,10 @@ def test_stopping_row_knows_that_the_other_moves_too() -> None:
 
 
 def in_space(
-    guess: Array, *keep_outs: KeepOut, tie: int = 0, goal: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    guess: Array, *keep_outs: KeepOut, priority_id: int = 0, goal: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> HalfSpaces:
     """Of an agent at rest."""
-    spaces = half_spaces(keep_outs, guess, np.array(goal), np.zeros(3), 0.1, tie, PARAMS)
+    spaces = half_spaces(keep_outs, guess, np.array(goal), np.zeros(3), 0.1, priority_id, PARAMS)
     assert spaces is not None
     return spaces
 
@@ -394,9 +396,9 @@ def test_in_space_a_cylinder_is_kept_clear_of_sideways_only() -> None:
 def test_in_space_coincident_centres_have_a_side(above_m: float, any_height: bool) -> None:
     place = (1.0, 2.0, -2.0)
     over = still((1.0, 2.0, -2.0 - (above_m if any_height else 0.0)))  # straight above a cylinder is inside it too
-    for tie, north in ((0, -1.0), (1, 1.0)):
-        other = KeepOut(still(place), 0.9, 0.8, any_height, tie=1 - tie)
-        spaces = in_space(over, other, tie=tie, goal=(1.0, 2.0, -2.0))
+    for priority_id, north in ((0, -1.0), (1, 1.0)):
+        other = KeepOut(still(place), 0.9, 0.8, any_height, priority_id=1 - priority_id)
+        spaces = in_space(over, other, priority_id=priority_id, goal=(1.0, 2.0, -2.0))
         np.testing.assert_allclose(spaces.normal[0], np.tile([north, 0.0, 0.0], (STEPS, 1)))
         np.testing.assert_allclose(spaces.offset_m[0], north * 1.0 + 0.9)
         assert np.isfinite(spaces.stop_offset_m).all()
@@ -452,4 +454,4 @@ def test_a_radius_that_is_too_small_is_refused_unless_told_so(
 def test_plans_keep_what_tracking_will_miss_and_the_certificate_asks_for_the_radius() -> None:
     keep_out = keep_out_of_peer(peer(np.zeros((3, 3))), UTC_US, DT_US, 2, SeparationParams(tracking_m=0.07))
     assert keep_out.radius_m == pytest.approx(0.97)
-    assert keep_out.certified_m == pytest.approx(0.8)
+    assert keep_out.hard_min_distance_m == pytest.approx(0.8)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from swarmctl.control.phases.sequence import OPERATOR_STOP, REBOOTED
-from swarmctl.control.reference.landing_places import nearest_in_plane_m, room_for
+from swarmctl.control.reference.landing_places import landing_place_ned_m, nearest_in_plane_m
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase, Verb
 from tests.benches.sequenced_flight import IN_AIR, ON_GROUND, OURS, START, Flight, controlled, ready, verbs
 
@@ -218,14 +218,14 @@ def test_a_vehicle_found_in_the_air_is_handed_back_in_the_air(landed_at_first: L
 
 def test_when_peers_fall_silent_it_comes_to_rest_and_goes_on_when_they_are_back() -> None:
     flight = controlled(Phase.TRACK)
-    flight.pos, flight.vel, flight.mute = np.array([4.0, 2.0, -2.0]), np.array([1.2, 0.0, 0.0]), True
+    flight.pos, flight.vel, flight.unresponsive_peer = np.array([4.0, 2.0, -2.0]), np.array([1.2, 0.0, 0.0]), True
     flight.run(0.1)
     pos, vel = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([60.0]))
     np.testing.assert_allclose(pos[0], [5.2, 2.0, -2.0])
     assert not vel.any()
     flight.run(60.0)
     assert flight.at == "TRACK"
-    flight.mute = False
+    flight.unresponsive_peer = False
     flight.run(0.1)
     assert flight.at == "GOTO_LAND"  # its time was over meanwhile
 
@@ -235,9 +235,9 @@ def test_who_is_told_to_land_here_does_not_fly_home_because_the_bus_was_silent_f
     here = np.array([4.0, 2.0, -2.0])
     flight.pos = here.copy()
     flight.ask("land")
-    flight.mute = True
+    flight.unresponsive_peer = True
     flight.run(1.0)
-    flight.mute = False
+    flight.unresponsive_peer = False
     flight.run(0.1)
     pos, _ = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([60.0]))
     np.testing.assert_allclose(pos[0], here, atol=1e-9)
@@ -246,10 +246,10 @@ def test_who_is_told_to_land_here_does_not_fly_home_because_the_bus_was_silent_f
 def test_who_is_told_in_silence_to_land_here_lands_here() -> None:
     flight = controlled(Phase.TRACK)
     here = np.array([4.0, 2.0, -2.0])
-    flight.pos, flight.mute = here.copy(), True
+    flight.pos, flight.unresponsive_peer = here.copy(), True
     flight.run(1.0)
     flight.ask("land")
-    flight.mute = False
+    flight.unresponsive_peer = False
     flight.run(0.1)
     pos, _ = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([60.0]))
     np.testing.assert_allclose(pos[0], here, atol=1e-9)
@@ -257,20 +257,20 @@ def test_who_is_told_in_silence_to_land_here_lands_here() -> None:
 
 def test_silence_does_not_keep_it_in_the_air_for_ever_once_it_goes_home() -> None:
     flight = controlled(Phase.GOTO_LAND)
-    flight.mute, flight.pos = True, START.copy()
+    flight.unresponsive_peer, flight.pos = True, START.copy()
     assert Verb.LAND in flight.run(25.0)
 
 
 def test_in_silence_nobody_declares_itself_ready_or_lands_among_the_others() -> None:
     on_its_way = controlled(Phase.GOTO_START)
-    on_its_way.mute, on_its_way.pos = True, START.copy()
+    on_its_way.unresponsive_peer, on_its_way.pos = True, START.copy()
     on_its_way.run(5.0)
     assert on_its_way.at == "GOTO_START"
-    on_its_way.mute = False
+    on_its_way.unresponsive_peer = False
     on_its_way.run(0.2)
     assert on_its_way.at == "READY"
     home = controlled(Phase.GOTO_LAND)
-    home.mute, home.pos = True, START.copy()
+    home.unresponsive_peer, home.pos = True, START.copy()
     home.run(0.1)  # braking ends where it is
     home.run(5.0)
     assert home.at == "GOTO_LAND"
@@ -278,7 +278,7 @@ def test_in_silence_nobody_declares_itself_ready_or_lands_among_the_others() -> 
 
 def test_taking_over_in_silence_it_stays_where_it_is() -> None:
     flight = Flight().until(Phase.GOTO_START)
-    flight.mute, flight.pos = True, START + np.array([3.0, 0.0, 0.0])
+    flight.unresponsive_peer, flight.pos = True, START + np.array([3.0, 0.0, 0.0])
     flight.run(0.5)
     flight.flight_mode = FlightMode.EXTERNAL
     flight.run(0.2)
@@ -353,12 +353,14 @@ def test_who_lands_where_it_is_goes_where_there_is_room_first() -> None:
 def test_below_is_no_room_and_those_above_each_other_part_in_different_directions() -> None:
     low, high = START.copy(), START - np.array([0.0, 0.0, 3.0])
     assert nearest_in_plane_m(low, [high]) == 0.0
-    apart = [room_for(low, [high], 1.2, own) - room_for(high, [low], 1.2, own + 1) for own in range(4)]
+    apart = [
+        landing_place_ned_m(low, [high], 1.2, own) - landing_place_ned_m(high, [low], 1.2, own + 1) for own in range(4)
+    ]
     assert min(np.linalg.norm(gap[:2]) for gap in apart) > 1.2
     crowd = [np.array([0.3 * k, 0.1 * k * k, -2.0]) for k in range(4)]
-    place = room_for(np.array([0.2, 0.2, -2.0]), crowd, 1.2, 5)
+    place = landing_place_ned_m(np.array([0.2, 0.2, -2.0]), crowd, 1.2, 5)
     assert nearest_in_plane_m(place, crowd) > 1.1
-    np.testing.assert_array_equal(room_for(low, [], 1.2, 0), low)
+    np.testing.assert_array_equal(landing_place_ned_m(low, [], 1.2, 0), low)
 
 
 def test_without_room_for_too_long_it_lands_all_the_same() -> None:

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from swarmctl.control.reference.shortest_path import Way, clear, short_way
+from swarmctl.control.reference.shortest_path import Polyline, clear, shortest_path
 from swarmctl.core.types import Array
 
 START, GOAL = np.array([-2.0, 0.0]), np.array([2.0, 0.0])
@@ -21,13 +21,13 @@ def wall(low_m: float, high_m: float, radius_m: float = 0.4) -> Array:
 
 def test_nothing_in_the_way_is_a_straight_line() -> None:
     aside = np.array([[0.0, 1.0, 0.9]])
-    np.testing.assert_array_equal(short_way(START, GOAL, aside, 0.1).corners, [START, GOAL])
-    assert short_way(START, GOAL, np.zeros((0, 3)), 0.1).length_m == 4.0
+    np.testing.assert_array_equal(shortest_path(START, GOAL, aside, 0.1).corners, [START, GOAL])
+    assert shortest_path(START, GOAL, np.zeros((0, 3)), 0.1).length_m == 4.0
 
 
 def test_round_the_nearer_end_of_a_wall() -> None:
     discs = wall(-1.2, 2.4)
-    way = short_way(START, GOAL, discs, 0.1)
+    way = shortest_path(START, GOAL, discs, 0.1)
     assert way.is_clear(discs)
     assert way.corners[:, 1].min() <= -1.6
     assert way.corners[:, 1].max() <= 0.1
@@ -38,7 +38,7 @@ def test_round_the_nearer_end_of_a_wall() -> None:
 def test_out_of_a_trap_and_round_it() -> None:
     back = np.array([[x, y, 0.4] for x in (-1.2, -0.9, -0.6, -0.3) for y in (-1.2, 1.2)])
     discs = np.vstack([wall(-1.2, 1.2), back])
-    way = short_way(np.array([-0.6, 0.0]), GOAL, discs, 0.1)
+    way = shortest_path(np.array([-0.6, 0.0]), GOAL, discs, 0.1)
     assert way.is_clear(discs)
     assert way.corners[:, 0].min() < -1.4  # back first
 
@@ -46,7 +46,9 @@ def test_out_of_a_trap_and_round_it() -> None:
 def test_through_the_gap_and_not_round_the_wall() -> None:
     discs = np.vstack([wall(-3.0, -0.75), wall(0.75, 3.0)])
     assert (
-        np.abs(short_way(START + np.array([0.0, 1.0]), GOAL + np.array([0.0, 1.0]), discs, 0.1).corners[1:-1, 1]).max()
+        np.abs(
+            shortest_path(START + np.array([0.0, 1.0]), GOAL + np.array([0.0, 1.0]), discs, 0.1).corners[1:-1, 1]
+        ).max()
         < 0.4
     )
 
@@ -54,15 +56,15 @@ def test_through_the_gap_and_not_round_the_wall() -> None:
 def test_what_may_be_no_gap_is_worth_less_and_less() -> None:
     """The middle of this one is 2 cm inside the discs of both sides, as far as a free one can be from a grid point."""
     discs = np.vstack([wall(-2.48, -0.38), wall(0.38, 2.4)])
-    through, round_it = (short_way(START, GOAL, discs, 0.1, squeeze) for squeeze in (3.0, 27.0))
+    through, round_it = (shortest_path(START, GOAL, discs, 0.1, squeeze) for squeeze in (3.0, 27.0))
     assert np.abs(through.corners[:, 1]).max() < 0.2
     assert np.abs(round_it.corners[:, 1]).max() > 2.4
 
 
 def test_there_is_a_way_even_where_all_is_closed_or_where_one_should_not_be() -> None:
     ring = 1.0 * np.stack([np.cos(a := np.arange(0.0, 6.2, 0.2)), np.sin(a), np.full(len(a), 0.3)], axis=1)
-    assert short_way(np.zeros(2), GOAL, ring, 0.1).length_m < 4.0
-    inside = short_way(np.array([-0.2, 0.0]), GOAL, np.array([[0.0, 0.0, 0.4]]), 0.1)
+    assert shortest_path(np.zeros(2), GOAL, ring, 0.1).length_m < 4.0
+    inside = shortest_path(np.array([-0.2, 0.0]), GOAL, np.array([[0.0, 0.0, 0.4]]), 0.1)
     assert inside.length_m < 2.8
 
 
@@ -73,9 +75,9 @@ def test_a_disc_one_is_in_may_be_left_but_not_crossed() -> None:
 
 
 def test_a_way_is_measured_along_itself() -> None:
-    way = Way(np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 4.0]]))
+    way = Polyline(np.array([[0.0, 0.0], [3.0, 0.0], [3.0, 4.0]]))
     assert way.length_m == 7.0
-    assert way.nearest_m(np.array([3.5, 1.0])) == pytest.approx(4.0)
+    assert way.arc_length_m(np.array([3.5, 1.0])) == pytest.approx(4.0)
     points, directions = way.sample(np.array([1.0, 5.0, 9.0]))
     np.testing.assert_allclose(points, [[1.0, 0.0], [3.0, 2.0], [3.0, 4.0]])
     np.testing.assert_allclose(directions, [[1.0, 0.0], [0.0, 1.0], [0.0, 0.0]])
@@ -84,4 +86,6 @@ def test_a_way_is_measured_along_itself() -> None:
 
 def test_it_is_quick_enough_for_a_tick() -> None:
     discs = np.random.default_rng(1).uniform([-6.0, -6.0, 0.3], [6.0, 6.0, 0.4], (80, 3))
-    assert short_way(np.array([-7.0, 0.0]), np.array([7.0, 0.0]), discs, 0.01).length_m > 14.0  # 60 x 60 cells at most
+    assert (
+        shortest_path(np.array([-7.0, 0.0]), np.array([7.0, 0.0]), discs, 0.01).length_m > 14.0
+    )  # 60 x 60 cells at most

@@ -49,7 +49,7 @@ def record(plan: np.ndarray = PLAN) -> TickRecord:
         solve_ms=1.25,
         tick_ms=2.75,
         late_ticks=65_537,
-        barrier_acted=True,
+        safety_filter_acted=True,
         plan_pos_ned_m=plan,
     )
 

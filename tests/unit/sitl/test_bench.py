@@ -34,12 +34,12 @@ def captured() -> Captured:
 @pytest.mark.usefixtures("quick")
 @pytest.mark.parametrize("guaranteed", [False, True])
 def test_parts_of_a_tick_add_up_to_it(guaranteed: bool) -> None:
-    measure = bench.measure_promises if guaranteed else bench.measure_ticks
+    measure = bench.measure_commitments if guaranteed else bench.measure_ticks
     parts = measure(2, ["osqp"], 10)["osqp"]
     assert parts.shape == (10, len(bench.PARTS))
-    promise = bench.PARTS.index("promise")
-    assert (np.delete(parts, promise, axis=1) > 0.0).all()
-    assert (parts[:, promise] > 0.0).all() == guaranteed
+    commitment = bench.PARTS.index("commitment")
+    assert (np.delete(parts, commitment, axis=1) > 0.0).all()
+    assert (parts[:, commitment] > 0.0).all() == guaranteed
     np.testing.assert_allclose(parts[:, :-1].sum(axis=1), parts[:, -1], atol=1e-6)
 
 
@@ -112,7 +112,7 @@ def test_the_agent_flies_pressed_against_its_neighbours(neighbours: int, pillar:
 def test_captured_problems_have_two_neighbours_and_an_obstacle(captured: Captured) -> None:
     assert len(captured.problems) == len(captured.tick_ms) == 240
     for problem in captured.problems:
-        assert [k.tie for k in problem.keep_outs].count(-1) == 1
+        assert [k.priority_id for k in problem.keep_outs].count(-1) == 1
         assert len(problem.keep_outs) == 3
     assert (captured.tick_ms > 0.0).all()
 

@@ -135,7 +135,7 @@ HOSTILE_EVENTS = [
     f'{{"utc_us": 1{"0" * 5000}}}',
     f'{{"utc_us": 1{"0" * 400}, "t_us": 1{"0" * 400}, "event": "x"}}',
     '{"event": "deadlock", "lasted_s": 1e999, "begins": true}',
-    '{"event": "promises", "source": "agent-0", "worst_tracking_m": "much", "proposed": [1]}',
+    '{"event": "commitments", "source": "agent-0", "worst_tracking_m": "much", "proposed": [1]}',
     '{"event": "bus_summary", "source": "agent-0", "rejected": {"stale": NaN, "x": 1e999}}',
     '{"event": "\\ud800", "source": {"a": 1}, "utc_us": -9e18, "t_us": true}',
     '{"event": "<script>alert(1)</script>"}',

@@ -255,14 +255,14 @@ def test_solver_failures_count_while_the_agent_is_in_charge() -> None:
     rows["plan_status"][10], rows["mode"][10] = PlanStatus.SOLVER_FAILED, Mode.YIELD
     rows["residual_m"] = 1e-4
     rows["residual_m"][0] = 7.0  # refused, never flown
-    rows["barrier_acted"][5:8] = 1
+    rows["safety_filter_acted"][5:8] = 1
     solver = judge(run({0: rows}), Rules(1, 0.5, solver_name="daqp"), "completed")["solver"]
     assert solver == {
         "name": "daqp",
         "failed": 2,
         "not_certified": 1,
         "max_residual_m": pytest.approx(1e-4),
-        "barrier_ticks": 3,
+        "safety_filter_ticks": 3,
     }
 
 
