@@ -1,4 +1,4 @@
-"""An agent's part in guaranteed separation: hears intents, runs `control.commit`, and says its own message."""
+"""An agent's part in guaranteed separation: receives peers' messages, runs `control.commit`, publishes its own."""
 
 from __future__ import annotations
 
@@ -19,20 +19,20 @@ from swarmctl.core.trajectory import Times
 from swarmctl.core.trajectory_message import TrajectoryMessage
 from swarmctl.core.types import Array, Phase, VehicleState
 
-_LOST_AFTER_US = 100_000  # of a token's absence
-_SETTLED_US = 2_000_000  # of our own presence, after which absences count
+_LOST_AFTER_US = 100_000  # absence of a token after which its peer counts as lost
+_SETTLED_US = 2_000_000  # own presence on the bus after which absences of others count
 
 
 class Coordination:
-    """See the module.
+    """Connects the protocol of one agent to the bus, the world model and the events.
 
     Args:
-        agent, boot_id: who speaks.
-        peers: the others.
+        agent, boot_id: identity in the own messages.
+        peers: numbers of the other agents.
         params, mpc, separation, slots, stopwatch_ns: see `Commitments`.
-        surroundings: who else is there.
+        surroundings: paths, statuses and presence of peers, and obstacles.
         bus: is drained by `receive`.
-        rate_hz: of every agent's ticks.
+        rate_hz: tick rate of every agent.
         note: is told `conflicting_commitment` when a peer's committed trajectory comes too close to the own one;
             `tracking_violation` when the vehicle leaves its committed trajectory by more than `tracking_m` plus half of
             the committed distance beyond touching bodies, and when it is back; and `commitments` with all counts when
@@ -65,19 +65,19 @@ class Coordination:
         self._absent_since_us: dict[int, int] = {}
         self._on_bus_since_us: int | None = None
         self._conflicting: set[int] = set()
-        self.lost_peer_keep_outs: list[KeepOut] = []  # where the gone have promised to end: perhaps they do
+        self.lost_peer_keep_outs: list[KeepOut] = []  # at the ends of lost peers' trajectories
 
     @property
     def counts(self) -> CommitCounts:
         return self._commitments.counts
 
     def receive(self, utc_us: int) -> None:
-        """Rule 1."""
+        """Apply rule 1: take in every message that has arrived."""
         for sender, payload in self._bus.receive(topics.TRAJECTORY):
             self._peer_trajectories.offer(sender, payload, utc_us)
 
     def step(self, utc_us: int, state: VehicleState, phase: Phase, desired: DesiredReference) -> None:
-        """Rules 2 to 4, while this agent flies and would like to follow a wish."""
+        """Apply rules 2 to 4 while this agent flies; `desired` is what it would follow alone."""
         commitments = self._commitments
         if not self._is_committed:
             self._is_committed = True
@@ -89,7 +89,7 @@ class Coordination:
             self._conflicting = conflicting
             self._note("conflicting_commitment", by=sorted(conflicting))
         deviating = self._surroundings.deviating_peers(known, utc_us, self._allowed_m)
-        absent = self._absent_since_us.keys()  # perhaps dead: no longer trusted, still asked
+        absent = self._absent_since_us.keys()  # perhaps lost: no longer trusted, still required to acknowledge
         committed = {agent for agent, message in known.items() if message.is_committed}
         lost_peers = [agent for agent in known.keys() - alive_peers if agent in committed]
         self.lost_peer_keep_outs = [keep_out for agent in lost_peers for keep_out in self._ends(known[agent])]
@@ -105,7 +105,7 @@ class Coordination:
         self._watch(float(np.linalg.norm(state.pos_ned_m - self.follow(np.array([utc_us]))[0][0])))
 
     def idle(self, utc_us: int, state: VehicleState | None) -> None:
-        """Somebody else flies, or nobody knows: nothing is promised, but peers are still acknowledged."""
+        """Commit nothing while a pilot or the autopilot flies, or the state is stale; peers are still acknowledged."""
         if self._is_committed:
             self._is_committed = False
             self._surroundings.peer_commitments, self.lost_peer_keep_outs = {}, []
@@ -118,7 +118,7 @@ class Coordination:
         return self._commitments.committed.sample(t_utc_us)
 
     def publish(self, utc_us: int) -> None:
-        """Rule 5."""
+        """Apply rule 5: publish the own message, once there is a committed trajectory."""
         if self._commitments.committed is None:
             return
         self._seq += 1
@@ -141,10 +141,11 @@ class Coordination:
             self._note("tracking_violation", begins=self._is_violating, error_m=error_m, allowed_m=self._allowed_m)
 
     def _alive_peers(self, utc_us: int) -> frozenset[int]:
-        """Peers that promise and whose acknowledgement counts.
+        """Peers that fly by commitments and have to acknowledge.
 
-        A peer is dead when it has been off the bus for some ticks while we have been on it for seconds: tokens vanish
-        and come back one by one when a router is lost, and two that took each other for dead would both promise.
+        A peer is lost when it has been off the bus for some ticks while this agent has been on it for seconds: tokens
+        vanish and come back one by one when a router is lost, and two agents that took each other for lost would both
+        commit.
         """
         alive = self._bus.alive()
         committing = frozenset(agent for agent in self._peers if self._surroundings.uses_commitments(agent))
@@ -166,11 +167,13 @@ class Coordination:
         return [KeepOut(end, p.planned_m, committed_m(p), False, message.agent, p.downwash) for end in ends]
 
     def _others(self, t0_utc_us: int, state: VehicleState, phase: Phase, taking_part: set[int]) -> list[KeepOut]:
-        """Who takes no part, and obstacles, on the planner's grid from a time on.
+        """Keep-outs of obstacles and of peers that do not take part, on the planner's grid from `t0_utc_us` on.
 
-        Nobody can tell what the silent do: they are kept clear of with all of the margin that grows with age.
+        What a stale peer does is unknown, so its hard minimum distance includes all of the margin that grows with age.
         """
         steps, dt_us = self._commitments.steps, self._commitments.dt_us
         found = self._surroundings.keep_outs(state.pos_ned_m, t0_utc_us, dt_us, steps, phase, taking_part)
-        spent_m = self._separation.tracking_m + self._separation.certify_slack_m  # of what plans keep, until refused
+        spent_m = (
+            self._separation.tracking_m + self._separation.certify_slack_m
+        )  # by which planned and hard minimum distance differ
         return [replace(k, hard_min_distance_m=max(k.hard_min_distance_m, k.radius_m - spent_m)) for k in found]

@@ -1,41 +1,43 @@
-"""Guaranteed separation: nothing is flown that has not been promised, nothing promised that somebody contradicts.
+"""Guaranteed separation: an agent flies only trajectories that every alive peer has acknowledged.
 
-Every agent follows a *committed* trajectory, which ends at rest. To fly on it makes a *proposal*, which leaves the
-committed trajectory a little later, keeps its distance to everything it knows its peers have committed to or propose,
-and ends at rest again. It commits to the proposal only when every living peer has acknowledged it. All agents say all
-of this in one message a tick, the newest of which is all that counts: committed, proposal, acknowledgements.
+Every agent follows a *committed* trajectory, which ends at rest. To fly on, it makes a *proposal*: a trajectory that
+leaves the committed one a little later, keeps its distance to everything its peers are known to have committed to or
+to propose, and ends at rest again. It commits to the proposal only when every alive peer has acknowledged it. Each
+agent sends all of this in one message a tick (committed trajectory, proposal, acknowledgements), and only the newest
+message counts.
 
-Rules, in this order in every tick:
+Each tick applies these rules in this order:
 
-1. Take in the newest message of every peer.
-2. Withdraw the own proposal if it comes too close to what a peer has committed to, or to a peer's proposal that is
+1. Receive the newest message of every peer.
+2. Withdraw the own proposal if it comes too close to a peer's committed trajectory, or to a peer's proposal that is
    *earlier* (by time of proposal, then agent number; both are in the messages, so both sides order them alike).
-3. Commit if all living peers have acknowledged it; withdraw it once the moment has passed where it leaves the old one.
-4. Without a proposal make one, clear of everything known, both of what peers have committed to and of what they
-   propose.
-5. Say what is committed, proposed, and which proposal of each peer has been taken in.
+3. Commit if all alive peers have acknowledged the proposal; withdraw it once the time has passed at which it leaves
+   the committed trajectory.
+4. Without a proposal, make one that is clear of everything known: peers' committed trajectories and their proposals.
+5. Publish the committed trajectory, the proposal, and the number of the proposal received from each peer.
 
-*No two agents are ever committed to trajectories that come closer than the certified distance.* Let A commit to a
-and, not earlier, B to b. A has heard a message of B that acknowledges a. If b was proposed before B sent it, the
-message carries b, as proposal or as committed: were b earlier, A would have withdrawn a (rule 2); were it later, B,
-which knew a when it sent that message, would have withdrawn b. If b was proposed after it, B knew a and kept clear of
-it (rule 4), for B forgets a only when A says it has withdrawn it. So a and b do not conflict. Nothing is assumed of
-delay, loss, order or duplication: without messages no acknowledgement comes, and everybody comes to rest where the
-committed trajectory ends. It replaces the waiting time of two-step commit (RMADER, Kondo et al. 2023), whose
-guarantee ends where a message is late.
+*No two agents are ever committed to trajectories that come closer than the hard minimum distance.* Proof: let A commit
+to a and, not earlier, B to b. A has received a message of B that acknowledges a. If b was proposed before B sent it,
+the message carries b, as proposal or as committed: were b earlier, A would have withdrawn a (rule 2); were it later,
+B, which knew a when it sent that message, would have withdrawn b. If b was proposed after it, B knew a and kept clear
+of it (rule 4), for B forgets a only when A publishes that it has withdrawn it. So a and b do not conflict. Nothing is
+assumed of delay, loss, order or duplication: without messages no acknowledgement arrives, and every agent comes to
+rest where its committed trajectory ends. This replaces the delay check of RMADER (Kondo et al. 2023), whose guarantee
+ends where a message is later than the check.
 
-What it rests on, and how that is watched in flight:
+The proof rests on these assumptions, each of which is watched in flight:
 
-- Agents mean the same time: a clock offset of e seconds costs v e metres. `separation.tracking_m` covers it; offsets
-  of vehicles' clocks are measured, hosts are to be synchronised.
-- They fly what they follow: half of what is promised beyond touching bodies may be missed by each. An event
-  `tracking_violation` says who misses more, and `promises` at the end the worst of the flight.
+- Clocks agree: a clock offset of e seconds costs v e metres, which `separation.tracking_m` has to cover. Offsets of
+  vehicles' clocks are measured; clocks of hosts have to be synchronised.
+- Vehicles track what they are committed to: each may miss by half of the committed distance beyond touching bodies.
+  The event `tracking_violation` reports larger errors, and `commitments` at the end the worst one of the flight.
 - Commitments are kept. A commitment changes without acknowledgement only where a vehicle first commits at speed, and
   by `evade`, before something that does not take part: around it, to a stop, or above it. An agent that finds a peer's
   commitment in conflict with its own (`conflicting_peers`), or a peer off its committed trajectory, keeps clear of that
   peer as of one that does not take part.
-- Everybody takes part. Who does not (a pilot flies, an agent has died) is a keep-out of the best-effort kind, and a
-  peer is dead only when its liveliness token is gone while the own one is there: who is off the bus commits nothing.
+- Every agent takes part. A vehicle that does not (a pilot flies it, its agent has died) is a keep-out of the
+  best-effort kind. A peer counts as lost only when its liveliness token is gone while the own token is present: an
+  agent that is off the bus commits nothing.
 """
 
 from __future__ import annotations
@@ -53,27 +55,27 @@ from swarmctl.core.trajectory import Trajectory, resting
 from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
 from swarmctl.core.types import Array
 
-_LATENCIES = 50  # remembered
+_LATENCIES = 50  # remembered, of the newest commitments
 _PERCENTILE = 90.0
-_LEAD_OVER = 1.2  # times that percentile of the time acknowledgements take
-_LATER_S = 0.2  # after the lead: the last moment to brake without asking
-_TICK_S = 0.04  # sending and hearing, at least
+_LEAD_FACTOR = 1.2  # the lead is this many times that percentile of the time acknowledgements take
+_EVASION_DELAY_S = 0.2  # braking this much after the lead must still be clear, otherwise the agent evades
+_TICK_S = 0.04  # sending and receiving take at least this long
 
 
 @dataclass(slots=True)
 class CommitCounts:
-    """Since the start."""
+    """Numbers of proposals by what became of them, since the start of the agent."""
 
     proposed: int = 0
     committed: int = 0
     withdrawn: int = 0
     expired: int = 0
     unplanned: int = 0
-    evaded: int = 0  # changed at once, because of somebody who takes no part
+    evaded: int = 0  # committed trajectory replaced without acknowledgement
 
 
 class Commitments:
-    """The five rules for one agent.
+    """Applies rules 2 to 4 for one agent; `swarmctl.agent.coordination` receives and publishes the messages.
 
     Args:
         agent, params, mpc, separation, slots, stopwatch_ns: see `TrajectoryPlanner`.
@@ -93,31 +95,31 @@ class Commitments:
         self._latencies_s: deque[float] = deque(maxlen=_LATENCIES)
         self._lead_s = params.lead_min_s
         self._number, self._next_us = 0, 0
-        self._cleared: dict[int, Trajectory] = {}  # by identity: what the own proposal is known to be clear of
-        self._compatible: dict[int, Trajectory] = {}  # likewise, of what is committed
+        self._cleared: dict[int, Trajectory] = {}  # by identity: known not to conflict with the own proposal
+        self._compatible: dict[int, Trajectory] = {}  # by identity: known not to conflict with `_compatible_with`
         self._compatible_with: Trajectory | None = None
         self.committed: Trajectory | None = None
         self.proposal: Proposal | None = None
         self.counts = CommitCounts()
 
     def begin(self, pos_ned_m: Array, vel_ned_m_s: Array, utc_us: int) -> None:
-        """Control has been taken: come to rest from here."""
+        """Commit to braking to rest from a position (3,) [m] and velocity (3,) [m/s], where the agent takes control."""
         self.committed = self._planner.stopping_from(pos_ned_m, vel_ned_m_s, utc_us)
         self.proposal = None
 
     def end(self, pos_ned_m: Array | None, utc_us: int) -> None:
-        """Somebody else flies, from (3,) if it is known where."""
+        """Drop the proposal while a pilot or the autopilot flies, and commit to rest at the position (3,), if known."""
         self.proposal = None
         if pos_ned_m is not None:
             self.committed = resting(pos_ned_m, utc_us, self._planner.dt_us)
 
     def update(self, utc_us: int, peers: Mapping[int, TrajectoryMessage], alive_peers: Set[int]) -> None:
-        """Rules 2 and 3.
+        """Apply rules 2 and 3 to the own proposal.
 
         Args:
             utc_us: now.
-            peers: newest message of each, also of those who have died: they may have flown on for a while.
-            alive_peers: peers whose acknowledgement counts.
+            peers: newest message of each peer, lost ones included: their vehicles may have flown on for a while.
+            alive_peers: peers whose acknowledgement is required.
         """
         mine = self.proposal
         if mine is None:
@@ -139,10 +141,10 @@ class Commitments:
             self.committed, self.proposal = mine.trajectory, None
             self.counts.committed += 1
             self._latencies_s.append((utc_us - mine.made_utc_us) * 1e-6)
-            self._set_lead(_LEAD_OVER * float(np.percentile(self._latencies_s, _PERCENTILE)) + _TICK_S)
+            self._set_lead(_LEAD_FACTOR * float(np.percentile(self._latencies_s, _PERCENTILE)) + _TICK_S)
 
     def conflicting_peers(self, utc_us: int, peers: Mapping[int, TrajectoryMessage]) -> set[int]:
-        """Peers whose promise contradicts the own one: somebody had to change his without being asked for it."""
+        """Peers whose committed trajectory conflicts with the own one, because one of the two had to evade."""
         if self.committed is None:
             return set()
         commitments = {agent: message.committed for agent, message in peers.items() if message.is_committed}
@@ -156,14 +158,16 @@ class Commitments:
         return {agent for agent, t in unsure.items() if self._planner.conflicts(self.committed, utc_us, [t])}
 
     def evade(self, now: Situation) -> None:
-        """Change the own promise without asking, where waiting would be too late for those who take no part.
+        """Replace the committed trajectory without acknowledgement, where waiting for one would be too late.
+
+        It is replaced only when it hits a keep-out and so does braking `_EVASION_DELAY_S` after the lead.
 
         Args:
-            now: a plan would begin at once.
+            now: a plan that begins at once, and keep-outs from now on.
         """
         if self.committed is None or not now.others or self._planner.is_clear(self.committed, now):
             return
-        later_us = now.utc_us + self.lead_us + round(_LATER_S * 1e6)
+        later_us = now.utc_us + self.lead_us + round(_EVASION_DELAY_S * 1e6)
         if self._planner.is_clear(self._planner.stopping_candidate(self.committed, later_us, now.utc_us), now):
             return
         evasive_trajectory = self._planner.evasive_trajectory(self.committed, now)
@@ -172,14 +176,14 @@ class Commitments:
             self.counts.evaded += 1
 
     def is_due(self, utc_us: int) -> bool:
-        """Whether there is no proposal and it is time for one."""
+        """Whether there is no proposal and `period_s` has passed since the last attempt."""
         return self.proposal is None and self.committed is not None and utc_us >= self._next_us
 
     def propose(self, now: Situation) -> None:
-        """Rule 4, when it `is_due`.
+        """Apply rule 4; call it when it `is_due`.
 
         Args:
-            now: a plan would begin `lead_us` from now; peers as of `update`.
+            now: a plan that begins `lead_us` from now; peers as given to `update`.
         """
         assert self.committed is not None
         self._next_us = now.utc_us + round(self._params.period_s * 1e6)
@@ -187,19 +191,19 @@ class Commitments:
         if trajectory is None:
             self.counts.unplanned += 1
             return
-        self._number = max(self._number + 1, now.utc_us)  # none of before a restart
+        self._number = max(self._number + 1, now.utc_us)  # above all numbers used before a restart
         self.proposal = Proposal(self._number, now.utc_us, self._agent, trajectory)
         self._cleared = {id(known): known for known in now.followed}
         self.counts.proposed += 1
 
     @property
     def lead_us(self) -> int:
-        """From proposing to flying it [us]."""
+        """Time between making a proposal and leaving the committed trajectory for it [us]."""
         return round(self._lead_s * 1e6)
 
     @property
     def steps(self) -> int:
-        """Of `Situation.others`."""
+        """Number of time steps that keep-outs in `Situation.others` cover."""
         return self._planner.steps
 
     @property

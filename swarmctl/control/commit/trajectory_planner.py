@@ -1,6 +1,6 @@
-"""Plans in the space of trajectories: what an agent proposes to fly, and how it gets out of the way at once.
+"""Planning in the space of trajectories: proposals that peers can acknowledge, and evasive trajectories.
 
-Each trajectory leaves what is committed, keeps clear of all that is known, and ends at rest.
+Each planned trajectory leaves the committed one, keeps clear of everything known, and ends at rest.
 """
 
 from __future__ import annotations
@@ -23,35 +23,37 @@ from swarmctl.core.trajectory import Trajectory, ending_at_rest, joined, places,
 from swarmctl.core.trajectory_message import TrajectoryMessage
 from swarmctl.core.types import Array, Plan, PlanStatus, Reference, Sampled
 
-_BRAKED_FROM_01 = (1.0, 0.75, 0.5, 0.3, 0.15)  # of the plan
-_WORTH_M = 0.02  # by which a way out has to be better than what has been promised
-_RISE_M_S, _RISE_M_S2 = 2.0, 2.0
-_GATHER_M_S2 = 0.8  # of who sets out on a way
-_TAIL_S = 2.0  # of braking, judged against who takes no part
-_CLOSER_M = 0.001  # than now, of promises that are too close already
-_SPARE_M = 0.01  # proposals keep more than promises need: between points they are judged by straight lines
-_SLACK_01 = 1.0 / 3.0  # of what is kept beyond touching bodies plans may use up at most
+_BRAKE_POINTS_01 = (1.0, 0.75, 0.5, 0.3, 0.15)  # shares of the plan after which braking is tried, latest first
+_MIN_GAIN_M = 0.02  # clearance an evasive trajectory has to gain over the committed one
+_CLIMB_M_S, _CLIMB_M_S2 = 2.0, 2.0
+_RUN_UP_M_S2 = 0.8  # acceleration along a path up to its own speed
+_BRAKING_TAIL_S = 2.0  # part of the final braking that is checked against keep-outs
+_APPROACH_TOLERANCE_M = 0.001  # approach allowed to trajectories that are too close already
+_INTERPOLATION_MARGIN_M = 0.01  # kept by proposals on top: they are checked as straight lines between points
+_MAX_SLACK_01 = 1.0 / 3.0  # share of the distance beyond touching bodies that slack may use up
 
 
 class CommitParams(Params):
-    """Planning in the space of trajectories; of `separation.mode = "guaranteed"`."""
+    """Parameters of planning with `separation.mode = "guaranteed"`."""
 
     dt_s: float = Field(0.1, ge=0.05, le=0.5)
-    horizon: int = Field(20, ge=5, le=60)  # steps, before the braking that every plan ends in
+    horizon: int = Field(20, ge=5, le=60)  # steps before the final braking
     moves: int = Field(8, ge=2, le=40)
-    brake_m_s2: float = Field(1.5, ge=0.5, le=10)  # of that braking
-    share_01: float = Field(0.8, gt=0, le=1)  # of the controller's tilt that plans may use; the rest is for tracking
-    period_s: float = Field(0.1, ge=0, le=2)  # between two plans, at least
-    lead_min_s: float = Field(0.06, ge=0.02, le=2)  # from proposing to flying it
+    brake_m_s2: float = Field(1.5, ge=0.5, le=10)  # deceleration of the final braking
+    share_01: float = Field(
+        0.8, gt=0, le=1
+    )  # share of the controller's tilt that plans may use; the rest is for tracking
+    period_s: float = Field(0.1, ge=0, le=2)  # least time between two plans
+    lead_min_s: float = Field(0.06, ge=0.02, le=2)  # least time from proposing to flying
     lead_max_s: float = Field(1.5, ge=0.1, le=5)
-    right_of_way_rad: float = Field(1.0, ge=0, le=1.2)  # replaces the one in `separation`: see there
-    stuck_m: float = Field(1.0, gt=0, le=10)  # likewise: who meets turns while it still moves
-    follow_z: AxisWeights = AxisWeights(q_pos=20.0, q_vel=0.5, r=0.05)  # of flying what is promised: to the centimetre
+    right_of_way_rad: float = Field(1.0, ge=0, le=1.2)  # overrides `separation`: plans with stops lock sooner
+    stuck_m: float = Field(1.0, gt=0, le=10)  # overrides `separation`: agents that meet turn while they still move
+    follow_z: AxisWeights = AxisWeights(q_pos=20.0, q_vel=0.5, r=0.05)  # tracks commitments to the centimetre
 
 
 @dataclass(frozen=True, slots=True)
 class DesiredReference:
-    """What an agent would follow if it were alone."""
+    """The motion an agent would follow if it were alone."""
 
     reference: Sampled
     follows_path: bool = False  # starts here, clear of obstacles: linearise around it
@@ -59,14 +61,14 @@ class DesiredReference:
 
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """What a plan is made for.
+    """Inputs of one plan.
 
     Args:
         utc_us: now.
-        begin_us: when the plan begins.
-        desired: what the agent would like.
-        peers: who takes part: the newest message of each.
-        others: who does not, and obstacles, as from `Surroundings.keep_outs`, from when the plan begins.
+        begin_us: UTC at which the plan begins.
+        desired: motion to approximate.
+        peers: newest message of each peer that takes part, by agent number.
+        others: keep-outs of obstacles and of peers that do not take part, on the planner's grid from `begin_us` on.
     """
 
     utc_us: int
@@ -77,19 +79,19 @@ class Situation:
 
     @property
     def followed(self) -> list[Trajectory]:
-        """All that peers may follow from now on."""
+        """All trajectories that peers may follow from now on."""
         return [trajectory for message in self.peers.values() for trajectory in message.followed]
 
 
 class TrajectoryPlanner:
-    """See the module.
+    """Plans proposals and evasive trajectories of one agent with an MPC on a coarse grid.
 
     Args:
         agent: own number.
-        params: planning.
+        params: parameters of planning.
         mpc: the controller's bounds and weights.
-        separation: distances.
-        slots: how many neighbours and obstacles get rows.
+        separation: distances to keep.
+        slots: number of neighbours and obstacles that get rows in the MPC.
         stopwatch_ns: see `CondensedMpc`.
     """
 
@@ -110,47 +112,49 @@ class TrajectoryPlanner:
             _planning(mpc, params), VehicleModelParams(delay_s=0.0), right_of_way, agent, slots, stopwatch_ns
         )
         self.dt_us = round(params.dt_s * 1e6)
-        self.steps = self._mpc.steps + math.ceil(_TAIL_S / params.dt_s)  # of `Situation.others`: plan and braking
+        self.steps = self._mpc.steps + math.ceil(
+            _BRAKING_TAIL_S / params.dt_s
+        )  # grid of `Situation.others`: plan and final braking
 
     def proposal(self, committed: Trajectory, now: Situation) -> Trajectory | None:
-        """What leaves the committed one where plans begin, clear of everything known; None when nothing does."""
+        """A trajectory that leaves `committed` at `now.begin_us`, clear of everything known; None if none is found."""
         found = self._clear(committed, self._planned(committed, now), now)
         if found is None and now.desired.follows_path:
             speed_m_s = float(np.linalg.norm(committed.sample(np.array([now.begin_us]))[1]))
-            slower = replace(now, desired=_gathering_speed(now.desired, speed_m_s))
+            slower = replace(now, desired=_with_run_up(now.desired, speed_m_s))
             found = self._clear(committed, self._planned(committed, slower), slower)
         return found
 
     def evasive_trajectory(self, committed: Trajectory, now: Situation) -> Trajectory | None:
-        """What keeps clearer of everything known than the committed one; None when nothing does.
+        """A trajectory that keeps more distance to everything known than `committed`; None when none is found.
 
-        Round everybody, straight to a stop, or over who can be flown over.
+        Candidates are the MPC's plan, a straight stop, and a climb over keep-outs that end at some height.
         """
         known = now.followed
 
         def margin_m(trajectory: Trajectory) -> float:
             return min(self._clearance_m(trajectory, now), self._margin_m(trajectory, now.utc_us, known))
 
-        best, best_m = None, margin_m(committed) + _WORTH_M
+        best, best_m = None, margin_m(committed) + _MIN_GAIN_M
         for candidate in self._evasive_candidates(committed, now):
             if (found_m := margin_m(candidate)) > best_m:
                 best, best_m = candidate, found_m
         return best
 
     def is_clear(self, trajectory: Trajectory, now: Situation) -> bool:
-        """Of who takes no part, and obstacles."""
+        """Whether a trajectory keeps the hard minimum distance to every keep-out in `now.others`."""
         return self._clearance_m(trajectory, now) >= 0.0
 
     def conflicts(self, trajectory: Trajectory, utc_us: int, known: Sequence[Trajectory], spare_m: float = 0.0) -> bool:
-        """Whether it comes too close to any of these from now until all are at rest."""
+        """Whether a trajectory comes too close to any of `known` between `utc_us` and the time when all are at rest."""
         return not self._margin_m(trajectory, utc_us, known, spare_m) >= 0.0
 
     def stopping_from(self, pos_ned_m: Array, vel_ned_m_s: Array, utc_us: int) -> Trajectory:
-        """To rest from (3,) and (3,), straight ahead."""
+        """The trajectory that brakes straight ahead from a position (3,) and velocity (3,)."""
         return stopping(pos_ned_m, vel_ned_m_s, utc_us, self.dt_us, self._params.brake_m_s2)
 
     def stopping_candidate(self, committed: Trajectory, brake_us: int, utc_us: int) -> Trajectory:
-        """What is committed, braked from a time on, straight ahead."""
+        """The committed trajectory from `utc_us` on, left for straight braking at `brake_us`."""
         pos, vel = committed.sample(np.array([brake_us]))
         return joined(committed, self.stopping_from(pos[0], vel[0], brake_us), utc_us)
 
@@ -161,13 +165,13 @@ class TrajectoryPlanner:
         yield self.stopping_candidate(committed, now.begin_us, now.utc_us)
         heights_m = [k.radius_m for k in now.others if not k.any_height]
         if heights_m:
-            yield self._climbing_candidate(committed, now.begin_us, max(heights_m) + _SPARE_M)
+            yield self._climbing_candidate(committed, now.begin_us, max(heights_m) + _INTERPOLATION_MARGIN_M)
 
     def _climbing_candidate(self, committed: Trajectory, begin_us: int, height_m: float) -> Trajectory:
-        """What is committed, left upwards."""
+        """The committed trajectory, left at `begin_us` for a climb by `height_m` above where it would brake to rest."""
         pos, vel = (found[0] for found in committed.sample(np.array([begin_us])))
         above = brake_to_rest(pos, vel, self._params.brake_m_s2).to_ned_m - [0.0, 0.0, height_m]
-        glide = glide_to(pos, vel, above, _RISE_M_S, _RISE_M_S2)
+        glide = glide_to(pos, vel, above, _CLIMB_M_S, _CLIMB_M_S2)
         ahead_s = self._params.dt_s * np.arange(math.ceil(glide.travel_s / self._params.dt_s) + 1, dtype=np.float64)
         return ending_at_rest(begin_us, self.dt_us, *glide.sample(ahead_s), self._params.brake_m_s2)
 
@@ -182,22 +186,22 @@ class TrajectoryPlanner:
         guess = wanted.pos_ned_m + (pos[0] - wanted.pos_ned_m[0]) if now.desired.follows_path else pos
         agents = [message.agent for message in now.peers.values() for _ in message.followed]
         keep_outs = self._keep_outs(now.followed, agents, now.begin_us, steps)
-        kept = (*keep_outs, *(_begun(other, steps) for other in now.others))
+        kept = (*keep_outs, *(_first_steps(other, steps) for other in now.others))
         plan = self._mpc.plan(Problem(start, wanted, np.zeros(3), kept, guess))
         return None if plan.status is PlanStatus.SOLVER_FAILED else plan
 
     def _clear(self, committed: Trajectory, plan: Plan | None, now: Situation) -> Trajectory | None:
-        """The plan, braked from as late as it then stays clear of everything known; None when it never does."""
+        """The longest part of a plan that, followed by braking, is clear of everything known; None when none is."""
         if plan is None:
             return None
         known = now.followed
-        for share in _BRAKED_FROM_01:
+        for share in _BRAKE_POINTS_01:
             end = max(1, round(share * self._mpc.steps)) + 1
             braked = ending_at_rest(
                 now.begin_us, self.dt_us, plan.pos_ned_m[:end], plan.vel_ned_m_s[:end], self._params.brake_m_s2
             )
             whole = joined(committed, braked, now.utc_us)
-            if self.is_clear(whole, now) and not self.conflicts(whole, now.utc_us, known, _SPARE_M):
+            if self.is_clear(whole, now) and not self.conflicts(whole, now.utc_us, known, _INTERPOLATION_MARGIN_M):
                 return whole
         return None
 
@@ -214,7 +218,7 @@ class TrajectoryPlanner:
         steps = max(1, -(-(end_us - utc_us) // self.dt_us))
         own = trajectory.sample(utc_us + np.arange(steps + 1) * self.dt_us)[0]
         kept = self._keep_outs(known, [0] * len(known), utc_us, steps, spare_m)
-        return certify(own, kept, 0, _CLOSER_M)
+        return certify(own, kept, 0, _APPROACH_TOLERANCE_M)
 
     def _keep_outs(
         self,
@@ -236,45 +240,45 @@ class TrajectoryPlanner:
 
 
 def following(mpc: MpcParams, params: CommitParams) -> MpcParams:
-    """The controller that flies what is promised: a stiffer z, where wishes may be met softly and promises may not."""
+    """Controller parameters for tracking commitments: z is stiffer than for a desired reference."""
     return mpc.model_copy(update={"z": params.follow_z})
 
 
 def committed_m(params: SeparationParams) -> float:
-    """Distance that no two committed trajectories come closer than."""
-    slack_m = min(params.certify_slack_m, _SLACK_01 * max(0.0, params.radius_m - params.body_m))
+    """Hard minimum distance between two committed trajectories [m]."""
+    slack_m = min(params.certify_slack_m, _MAX_SLACK_01 * max(0.0, params.radius_m - params.body_m))
     return params.radius_m - slack_m
 
 
-def _gathering_speed(desired: DesiredReference, speed_m_s: float) -> DesiredReference:
-    """The same way, begun at an own speed.
+def _with_run_up(desired: DesiredReference, speed_m_s: float) -> DesiredReference:
+    """The same path, entered at the agent's own speed and accelerated along.
 
-    Rows keep plans outside obstacles where the way says they will be by then: of a way that begins faster than one is,
-    the rows are those of the next corner, and plans cut this one.
+    Half-spaces are linearised where the path says the agent will be. On a path that begins faster than the agent moves,
+    they are those of the next corner, and plans cut the present one.
     """
     path_m_s = float(np.linalg.norm(desired.reference(np.zeros(1))[1]))
     if path_m_s <= speed_m_s:
         return desired
-    rate_1_s = _GATHER_M_S2 / path_m_s
+    rate_1_s = _RUN_UP_M_S2 / path_m_s
     slow_01 = speed_m_s / path_m_s
-    late_s = (1.0 - slow_01) / rate_1_s  # until the way's own speed is reached
+    run_up_s = (1.0 - slow_01) / rate_1_s  # until the path's own speed is reached
 
     def reference(offsets_s: Array) -> tuple[Array, Array]:
-        begun_s = np.minimum(offsets_s, late_s)
-        at_s = (slow_01 + 0.5 * rate_1_s * begun_s) * begun_s + (offsets_s - begun_s)
+        spent_s = np.minimum(offsets_s, run_up_s)
+        at_s = (slow_01 + 0.5 * rate_1_s * spent_s) * spent_s + (offsets_s - spent_s)
         pos, vel = desired.reference(at_s)
-        return pos, vel * (slow_01 + rate_1_s * begun_s)[:, None]
+        return pos, vel * (slow_01 + rate_1_s * spent_s)[:, None]
 
     return DesiredReference(reference, follows_path=True)
 
 
-def _begun(keep_out: KeepOut, steps: int) -> KeepOut:
-    """Its first steps."""
+def _first_steps(keep_out: KeepOut, steps: int) -> KeepOut:
+    """The keep-out, cut to its first `steps`."""
     return replace(keep_out, pos_ned_m=keep_out.pos_ned_m[: steps + 1])
 
 
 def _planning(mpc: MpcParams, params: CommitParams) -> MpcParams:
-    """The controller's weights and bounds on the planner's grid."""
+    """Controller parameters on the planner's grid, with bounds that leave room for tracking."""
     return mpc.model_copy(
         update={
             "dt_s": params.dt_s,

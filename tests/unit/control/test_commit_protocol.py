@@ -268,7 +268,7 @@ def test_along_a_way_round_plans_look_near_the_way(follows_path: bool, gets_on: 
 def test_who_rests_at_a_corner_sets_out_at_its_own_speed(gathers: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     """A way at 1 m/s is round the corner before the agent is: rows of what comes next let its plan cut this one."""
     if not gathers:
-        monkeypatch.setattr(trajectory_planner, "_gathering_speed", lambda desired, speed_m_s: desired)
+        monkeypatch.setattr(trajectory_planner, "_with_run_up", lambda desired, speed_m_s: desired)
     small = SeparationParams(radius_m=0.3, body_m=0.15)
     agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), small, 3, lambda: 0)
     here = np.array([2.716, 2.764, -2.0])
