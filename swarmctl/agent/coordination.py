@@ -141,7 +141,7 @@ class Coordination:
             self._note("tracking_violation", begins=self._is_violating, error_m=error_m, allowed_m=self._allowed_m)
 
     def _alive_peers(self, utc_us: int) -> frozenset[int]:
-        """Peers that fly by commitments and have to acknowledge.
+        """Return peers that fly by commitments and have to acknowledge.
 
         A peer is lost when it has been off the bus for some ticks while this agent has been on it for seconds: tokens
         vanish and come back one by one when a router is lost, and two agents that took each other for lost would both
@@ -167,7 +167,7 @@ class Coordination:
         return [KeepOut(end, p.planned_m, committed_m(p), False, message.agent, p.downwash) for end in ends]
 
     def _others(self, t0_utc_us: int, state: VehicleState, phase: Phase, taking_part: set[int]) -> list[KeepOut]:
-        """Keep-outs of obstacles and of peers that do not take part, on the planner's grid from `t0_utc_us` on.
+        """Return keep-outs of obstacles and of peers that do not take part, on the planner's grid from `t0_utc_us` on.
 
         What a stale peer does is unknown, so its hard minimum distance includes all of the margin that grows with age.
         """

@@ -1,4 +1,4 @@
-"""The safety filter in flight: passes the control barrier function what is known, and notes when it acts."""
+"""The safety filter in flight: gives the barrier function the known bodies, and records when it acts."""
 
 from __future__ import annotations
 

@@ -1,22 +1,22 @@
 """The safety filter: a control barrier function on the acceleration that is about to be commanded.
 
-It knows nothing of horizons, rows or certificates, and shares no code with them: from where everybody will be when the
-command acts, it changes the command as little as possible such that bodies can still be kept apart by braking. For
-every pair with distance r, r' its rate and D the distance of touching bodies plus a margin, the approach may be no
-faster than
+It knows nothing of horizons, rows or certificates, and shares no code with them. From the predicted states of all
+vehicles when the command acts, it changes the command as little as possible such that bodies can still be kept apart
+by braking. For a pair with distance r, rate r' and D the distance of touching bodies plus a margin, the approach may
+be no faster than
 
     v(d) = k d                          for d = r + react r' - D below a / k^2,
            sqrt(2 a (d - a / 2 k^2))    beyond,
 
 which leaves room to stop at D with the braking `a` of both; h = r' + v(d) >= 0 is made a barrier by h' >= -gain h.
-That is a half-plane of accelerations for each pair, and both of a pair take half of it (U. Borrmann, L. Wang, A. Ames,
-M. Egerstedt 2015; L. Wang, A. Ames, M. Egerstedt 2017). What does not filter itself, an obstacle, a silent peer or one
-that its autopilot flies, is left all of it. Of accelerations that keep every half-plane and the airframe's bounds the
-nearest to the wanted one is flown; where there is none, the one that lacks least.
+That is a half-plane of accelerations for each pair, of which each vehicle takes half (U. Borrmann, L. Wang, A. Ames,
+M. Egerstedt 2015; L. Wang, A. Ames, M. Egerstedt 2017). Against what does not filter itself (an obstacle, a stale peer,
+or one that its autopilot flies) the own vehicle takes all of it. The command is the acceleration nearest to the wanted
+one within all half-planes and the airframe's bounds; if there is none, the one of least slack.
 
-What is guaranteed: bodies that are apart stay apart, as long as every one of a pair brakes with `brake_m_s2`, positions
-and velocities are within `margin_m` together with what the prediction over dead time and lag is off by, and h >= 0 to
-begin with. Several neighbours at once may ask for more than the airframe has; then the largest lack is least.
+Guarantee: bodies that are apart stay apart, as long as both of a pair brake with `brake_m_s2`, `margin_m` covers the
+errors of positions, velocities and the prediction over dead time and lag, and h >= 0 to begin with. Several neighbours
+at once may ask for more than the airframe has; then the largest slack is minimal.
 """
 
 from __future__ import annotations
@@ -37,35 +37,35 @@ from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Obstacle, PredictedPath
 
 _TINY = 1e-6
-_SLACK_WEIGHT = 100.0  # more would trade all of the thrust for a trace of distance
+_SLACK_WEIGHT = 100.0  # a larger one would trade all of the thrust for a trace of distance
 _LAG_STEP_S = 1e-3
-_THRUST_CHANGE_M_S2 = 2.5  # thrust may be changed by: without lift there is no braking either
-_FARTHEST_M_S2 = 40.0  # a row that is kept by any acceleration
+_THRUST_CHANGE_M_S2 = 2.5  # largest change of vertical thrust: without thrust there is no braking either
+_FARTHEST_M_S2 = 40.0  # rows that ask for less than minus this are met by any acceleration
 
 
 class BarrierParams(Params):
     """When the safety filter acts, and how hard."""
 
     enabled: bool = True
-    margin_m: float = Field(0.05, ge=0, le=10)  # beyond touching bodies
-    brake_m_s2: float = Field(4.0, gt=0, le=20)  # of one vehicle, level; more is left for the rest
-    near_1_s: float = Field(6.0, gt=0, le=50)  # k: approach allowed per metre left, close by
-    gain_1_s: float = Field(6.0, gt=0, le=50)  # how fast the allowed approach may be neared
+    margin_m: float = Field(0.05, ge=0, le=10)  # distance kept beyond touching bodies
+    brake_m_s2: float = Field(4.0, gt=0, le=20)  # level braking of one vehicle; the rest of its thrust is reserve
+    near_1_s: float = Field(6.0, gt=0, le=50)  # k: approach speed allowed per metre left, close by
+    gain_1_s: float = Field(6.0, gt=0, le=50)  # how fast the allowed approach speed may be reached
     react_s: float = Field(0.045, ge=0, le=1)  # of approaching on while the airframe slew_bounds to brake
-    escape_m_s: float = Field(0.5, ge=0, le=10)  # parting asked for when closer than allowed
-    slew_1_s: float = Field(2.5, gt=0, le=50)  # of (u_x, u_y): a faster turn would saturate rotors and be lost
+    escape_m_s: float = Field(0.5, ge=0, le=10)  # separating speed asked for when closer than allowed
+    slew_1_s: float = Field(2.5, gt=0, le=50)  # of (u_x, u_y); faster attitude changes would saturate rotors
 
 
 @dataclass(frozen=True, slots=True)
 class Body:
-    """Something not to touch, when the command acts."""
+    """Describes one thing not to touch, at the time the command acts."""
 
     pos_ned_m: Vector  # (3,)
     vel_ned_m_s: Vector  # (3,)
-    apart_m: float  # of centres
-    share_01: float  # of keeping apart that is ours
-    column: bool = False  # of any height
-    solid: bool = False  # without downwash
+    apart_m: float  # distance of centres to keep
+    share_01: float  # share of the avoidance that is the own vehicle's
+    column: bool = False  # unbounded in height
+    solid: bool = False  # has no downwash
 
 
 def body_of_peer(
@@ -78,17 +78,17 @@ def body_of_peer(
     filters: bool,
     brake_m_s2: float,
 ) -> Body:
-    """A peer on its newest path.
+    """Return the body of a peer, predicted on its newest path.
 
     Args:
-        path: positions; beyond its end it is taken to brake.
-        act_utc_us: when the own command arrives at the vehicle.
-        ahead_s: after that, when it is felt.
-        apart_m: centres of two vehicles that touch, and the margin.
-        growth_m_s2: what it may have accelerated beside its path since.
-        growth_max_m: limit of that.
-        filters: it does its half.
-        brake_m_s2: how it is taken to stop, as plans take it: whom this layer alone sees nothing plans a way round.
+        path: positions; beyond its end the peer is assumed to brake.
+        act_utc_us: UTC at which the own command arrives at the vehicle.
+        ahead_s: time after that at which the command takes effect.
+        apart_m: distance of two centres that touch, plus the margin.
+        growth_m_s2: acceleration off its path that the peer may have had since.
+        growth_max_m: limit of the distance that follows from it.
+        filters: whether the peer takes its half.
+        brake_m_s2: assumed braking, the same as in plans: no plan avoids what only the filter sees.
     """
     age_s = max(0.0, (act_utc_us - path.t0_utc_us) * 1e-6)
     points, dt_s = path.pos_ned_m, path.dt_us * 1e-6
@@ -111,59 +111,63 @@ def body_of_peer(
 def _braked(pos: Vector, vel: Vector, t_s: float, brake_m_s2: float) -> tuple[Vector, Vector]:
     stop_s = math.sqrt(_dot(vel, vel)) / brake_m_s2
     done_01 = t_s / stop_s if t_s < stop_s else 1.0
-    moved_s = stop_s * done_01 * (1.0 - 0.5 * done_01)  # at the first speed
+    moved_s = stop_s * done_01 * (1.0 - 0.5 * done_01)  # seconds at the first speed
     return tuple(p + moved_s * v for p, v in zip(pos, vel, strict=True)), tuple((1.0 - done_01) * v for v in vel)
 
 
 def body_of_obstacle(obstacle: Obstacle, ahead_s: float, apart_m: float) -> Body:
-    """An obstacle `ahead_s` from now, at constant velocity; `apart_m` from its surface to the own centre."""
+    """Return an obstacle `ahead_s` from now, at constant velocity; `apart_m` is from its surface to the own centre."""
     vel = obstacle.vel_ned_m_s.tolist()
     pos = tuple(p + ahead_s * v for p, v in zip(obstacle.center_ned_m.tolist(), vel, strict=True))
     return Body(pos, tuple(vel), obstacle.radius_m + apart_m, 1.0, obstacle.column, True)
 
 
 class Barrier:
-    """The filter of one vehicle.
+    """Filters the commands of one vehicle.
 
     Args:
-        params: when and how hard.
+        params: limits of the approach.
         vehicle: bounds, lag and drag.
-        dt_s: between two commands.
-        downwash: vertical distances count this many times less.
+        dt_s: time between two commands.
+        downwash: divisor of vertical distances to peers.
     """
 
     def __init__(self, params: BarrierParams, vehicle: VehicleModelParams, dt_s: float, downwash: float = 1.0) -> None:
         self._params, self._vehicle, self._down_01 = params, vehicle, 1.0 / downwash
         self._slew = params.slew_1_s * dt_s
         lag = vehicle.lag()
-        self.ahead_s = 0.0 if lag is None else lag.ramp_delay_s  # from acting to being felt
+        self.ahead_s = 0.0 if lag is None else lag.ramp_delay_s  # from acting to taking effect
         self._responses = _responses(lag, vehicle.drag_1_s, self.ahead_s)
 
     def filtered(
         self, virtual: Array, start: Start, disturbance_ned_m_s2: Array, hover_thrust_01: float, bodies: Sequence[Body]
     ) -> Array | None:
-        """The virtual controls (3,) to fly in place of `virtual`; None when those will do.
+        """Return the virtual controls (3,) to fly in place of `virtual`; None when those are safe.
 
         Args:
-            virtual: u_x, u_y, thrust over mass, wanted.
+            virtual: (3,) wanted u_x, u_y and thrust over mass [m/s2].
             start: own state when they act.
-            disturbance_ned_m_s2: (3,).
+            disturbance_ned_m_s2: (3,) estimate.
             hover_thrust_01: scales the bounds of thrust.
-            bodies: when they are felt.
+            bodies: predicted bodies when the command takes effect.
         """
         if not bodies or not np.isfinite(virtual).all():
             return None
         pos, vel = self._predicted_state(start, disturbance_ned_m_s2)
         ux, uy, thrust = virtual.tolist()
         upright = math.sqrt(max(0.0, 1.0 - ux * ux - uy * uy))
-        wanted = (thrust * ux, thrust * uy, thrust * upright)  # thrust vector over mass, up is +
+        wanted = (thrust * ux, thrust * uy, thrust * upright)  # thrust vector over mass, up positive
         dx, dy, dz = disturbance_ned_m_s2.tolist()
         drag = self._vehicle.drag_1_s
-        rest = (dx - drag * vel[0], dy - drag * vel[1], GRAVITY_M_S2 + dz - drag * vel[2])  # acceleration without it
+        rest = (
+            dx - drag * vel[0],
+            dy - drag * vel[1],
+            GRAVITY_M_S2 + dz - drag * vel[2],
+        )  # acceleration without thrust
         rows = [row for body in bodies if (row := self._row(body, pos, vel, rest)) is not None]
         if all(_dot(normal, wanted) >= offset for normal, offset in rows):
             return None
-        rows.sort(key=lambda row: _dot(row[0], wanted) - row[1])  # what is lacking most, first: fewer are active after
+        rows.sort(key=lambda row: _dot(row[0], wanted) - row[1])  # most violated rows first: fewer become active after
         slew_bounds = [self._slew_bounds(u, held) for u, held in zip((ux, uy), start.virtual.tolist(), strict=False)]
         bounds = self._bounds(wanted, thrust, slew_bounds, hover_thrust_01)
         thrust_vector = project_or_violate_least(wanted, rows, bounds, _SLACK_WEIGHT)
@@ -174,7 +178,7 @@ class Barrier:
         return np.array([*flown, size])
 
     def _predicted_state(self, start: Start, disturbance_ned_m_s2: Array) -> tuple[Vector, Vector]:
-        """Own position and velocity when a command of now is felt, under what is commanded already."""
+        """Predict the own position and velocity (3,) to when a command of now takes effect, under the one now held."""
         pos, vel = start.pos_ned_m.tolist(), start.vel_ned_m_s.tolist()
         if not self.ahead_s:
             return tuple(pos), tuple(vel)
@@ -193,7 +197,7 @@ class Barrier:
         )
 
     def _row(self, body: Body, pos: Vector, vel: Vector, rest: Vector) -> Row | None:
-        """`normal . thrust vector >= offset` of one body; None when it is too far to matter."""
+        """Return the row `normal . thrust vector >= offset` of one body; None when it is too far to matter."""
         p, (bx, by, bz), (bu, bv, bw) = self._params, body.pos_ned_m, body.vel_ned_m_s
         down_01 = 0.0 if body.column else 1.0 if body.solid else self._down_01
         x, y, z = pos[0] - bx, pos[1] - by, down_01 * (pos[2] - bz)
@@ -202,7 +206,7 @@ class Barrier:
         distance = math.sqrt(x * x + y * y + z * z)
         if distance > _TINY:
             nx, ny, nz = x / distance, y / distance, z / distance
-        else:  # one inside the other: back to where each came from
+        else:  # centres coincide: back along the relative velocity
             size = math.sqrt(speed2) + _TINY
             nx, ny, nz = -u / size, -v / size, -w / size
         rate = nx * u + ny * v + nz * w
@@ -216,22 +220,24 @@ class Barrier:
             allowed, slope = p.near_1_s * left, p.near_1_s
             if allowed < -p.escape_m_s:
                 allowed, slope = -p.escape_m_s, 0.0
-        turning = (speed2 - rate * rate) / max(distance, 0.5 * body.apart_m)  # r'' of passing by
-        need = -(slope * rate + p.gain_1_s * (rate + allowed)) / (1.0 + slope * react_s) - turning  # least r''
+        turning = (speed2 - rate * rate) / max(distance, 0.5 * body.apart_m)  # r'' due to the transverse velocity
+        need = (
+            -(slope * rate + p.gain_1_s * (rate + allowed)) / (1.0 + slope * react_s) - turning
+        )  # least r'' that keeps h' >= -gain h
         if need < -_FARTHEST_M_S2:
             return None
         nz *= down_01
         return (-nx, -ny, -nz), body.share_01 * need - (nx * rest[0] + ny * rest[1] + nz * rest[2])
 
     def _slew_bounds(self, wanted: float, held: float) -> tuple[float, float]:
-        """Least and largest u of an axis from what is held now, the wanted one always among them."""
+        """Return the least and largest u of an axis from the held one on; the wanted u is always within them."""
         most = self._vehicle.u_max()
         return min(wanted, max(-most, held - self._slew)), max(wanted, min(most, held + self._slew))
 
     def _bounds(
         self, wanted: Vector, thrust_m_s2: float, slew_bounds: Sequence[tuple[float, float]], hover_thrust_01: float
     ) -> list[Row]:
-        """Rows of what the airframe can do."""
+        """Return rows of the bounds of the airframe: u_x, u_y and vertical thrust."""
         model, full = self._vehicle, GRAVITY_M_S2 / hover_thrust_01
         least = max(wanted[2] - _THRUST_CHANGE_M_S2, min(wanted[2], model.thrust_min_01 * full))
         most = min(wanted[2] + _THRUST_CHANGE_M_S2, max(wanted[2], model.thrust_max_01 * full))
@@ -246,11 +252,11 @@ class Barrier:
 
 @dataclass(frozen=True, slots=True)
 class _Responses:
-    """Displacement and velocity over a fixed time of unit starts and of a unit acceleration."""
+    """Holds displacement and velocity after a fixed time, due to unit initial values and a unit acceleration."""
 
     of_velocity: tuple[float, float]
     of_accel: tuple[float, float]
-    of_tilt: tuple[float, float]  # of tilt at the start alone, thrust over mass 1
+    of_tilt: tuple[float, float]  # initial tilt alone, thrust over mass 1
     of_rate: tuple[float, float]
     of_command: tuple[float, float]
 

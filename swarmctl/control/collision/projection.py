@@ -1,7 +1,7 @@
-"""The point of a polyhedron that is nearest to a given one: exact, for few dimensions and rows, in plain Python.
+"""Projection onto a polyhedron, exact, for few dimensions and rows, in plain Python.
 
-Rows are taken one after the other. A row that the nearest point so far violates is active at the next one (strict
-convexity), so that the search goes on in the row's plane, one dimension lower, with the rows before it.
+Rows are added one after the other. A row that the projection so far violates is active at the next one (strict
+convexity), so the search continues in the row's plane, one dimension lower, with the rows before it.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ _EPS = 1e-9
 
 
 def project(wanted: Vector, rows: Sequence[Row]) -> Vector | None:
-    """Nearest to `wanted` (n,) of all x with `normal . x >= offset` for every row; None when there is none."""
+    """Return the x (n,) nearest to `wanted` (n,) with `normal . x >= offset` for every row; None if there is none."""
     found = wanted
     for i, (normal, offset) in enumerate(rows):
         length = math.sqrt(sum(c * c for c in normal))
-        short = offset - sum(map(_times, normal, found))
+        short = offset - sum(map(_product, normal, found))
         if short <= _EPS * max(1.0, length):
             continue
         if length < _PARALLEL:
@@ -36,17 +36,17 @@ def project(wanted: Vector, rows: Sequence[Row]) -> Vector | None:
 
 
 def project_or_violate_least(wanted: Vector, soft: Sequence[Row], hard: Sequence[Row], weight: float) -> Vector:
-    """Nearest of all that keep every row; where there is none, keep `hard` and violate `soft` as little as possible.
+    """Project onto all rows; if no point meets them, meet `hard` and violate `soft` as little as possible.
 
     Args:
-        wanted: (n,).
-        soft, hard: rows; there must be a point that keeps the hard ones.
-        weight: of the squared largest violation of a unit soft row against the squared way from `wanted`.
+        wanted: (n,) point to project.
+        soft, hard: rows; some point has to meet all hard ones.
+        weight: weight of the squared largest violation of a unit soft row against the squared distance from `wanted`.
     """
     found = project(wanted, [*hard, *soft])
     if found is not None:
         return found
-    share = 1.0 / math.sqrt(weight)  # one more coordinate, what all soft rows may lack, measured in the same metric
+    share = 1.0 / math.sqrt(weight)  # one more coordinate: the slack of all soft rows, in the same metric
     extended = [((*normal, 0.0), offset) for normal, offset in hard]
     extended.append(((0.0,) * len(wanted) + (1.0,), 0.0))
     extended += [((*normal, share), offset) for normal, offset in soft]
@@ -55,8 +55,8 @@ def project_or_violate_least(wanted: Vector, soft: Sequence[Row], hard: Sequence
 
 
 def _project_onto_plane(wanted: Vector, unit: Vector, offset: float, rows: Sequence[Row]) -> Vector | None:
-    """As `project`, on the plane `unit . x = offset`."""
-    shift = offset - sum(map(_times, unit, wanted))
+    """Project as `project` does, within the plane `unit . x = offset`."""
+    shift = offset - sum(map(_product, unit, wanted))
     foot = tuple(w + shift * u for w, u in zip(wanted, unit, strict=True))
     if len(wanted) == 1:
         kept = all(o - n[0] * foot[0] <= _EPS * max(1.0, abs(n[0])) for n, o in rows)
@@ -64,9 +64,9 @@ def _project_onto_plane(wanted: Vector, unit: Vector, offset: float, rows: Seque
     mirror, scale = _mirror(unit)
     flat: list[Row] = []
     for normal, row_offset in rows:
-        along = scale * sum(map(_times, mirror, normal))
+        along = scale * sum(map(_product, mirror, normal))
         inside = tuple(n - along * m for n, m in zip(normal[1:], mirror[1:], strict=True))
-        left = row_offset - sum(map(_times, normal, foot))
+        left = row_offset - sum(map(_product, normal, foot))
         size = math.sqrt(sum(c * c for c in inside))
         if size < _PARALLEL:
             if left > _EPS:
@@ -76,16 +76,16 @@ def _project_onto_plane(wanted: Vector, unit: Vector, offset: float, rows: Seque
     found = project((0.0,) * (len(wanted) - 1), flat)
     if found is None:
         return None
-    along = scale * sum(map(_times, mirror[1:], found))
+    along = scale * sum(map(_product, mirror[1:], found))
     return tuple(f + x - along * m for f, x, m in zip(foot, (0.0, *found), mirror, strict=True))
 
 
 def _mirror(unit: Vector) -> tuple[Vector, float]:
-    """Householder reflection x - scale (m . x) m that takes `unit` to the first axis."""
+    """Return m (n,) and scale of the Householder reflection x - scale (m . x) m that maps `unit` to the first axis."""
     first = unit[0] + math.copysign(1.0, unit[0])
     mirror = (first, *unit[1:])
     return mirror, 2.0 / sum(c * c for c in mirror)
 
 
-def _times(a: float, b: float) -> float:
+def _product(a: float, b: float) -> float:
     return a * b

@@ -1,7 +1,7 @@
-"""Keeping apart: peers' paths aligned in time, half-spaces for the MPC, and a certifier that is independent of the QP.
+"""Separation: aligns peers' paths in time, linearises distances for the MPC, certifies plans independently of the QP.
 
 Peers' predictions are time-stamped; each is interpolated at the own prediction times, continued beyond its end by
-braking to a stop, and given a margin that grows with age. A silent peer therefore turns into a keep-out where it was
+braking to a stop, and given a margin that grows with age. A stale peer therefore turns into a keep-out where it was
 last expected to stop. Half-spaces are the thesis' distance constraints (4.1), (4.2) linearised at the own previous
 prediction.
 """
@@ -22,71 +22,71 @@ from swarmctl.core.trajectory import between
 from swarmctl.core.types import Array, Obstacle, PredictedPath
 
 _TINY_M = 1e-6
-_CLOSER_M = 0.02  # than now, where it is too close already
+_APPROACH_TOLERANCE_M = 0.02  # approach allowed to a keep-out that is violated already
 
 
 class SeparationParams(Params):
-    """What distance is kept and how uncertainty is paid for."""
+    """Sets the distances that are kept and the margins for uncertainty."""
 
-    mode: Literal["best_effort", "guaranteed"] = "best_effort"  # guaranteed: only what all have acknowledged is flown
+    mode: Literal["best_effort", "guaranteed"] = "best_effort"  # guaranteed: see `swarmctl.control.commit.protocol`
     radius_m: float = Field(0.9, gt=0, le=100)  # centre to centre, thesis 3 x 0.3
     body_m: float = Field(0.48, gt=0, le=100)  # centres of two vehicles that touch; thesis: twice its arm of 0.24 m
-    tracking_m: float = Field(0.0, ge=0, le=10)  # what is flown closer than planned: plans keep this much more
-    downwash: float = Field(1.0, ge=1, le=10)  # among peers heights count this many times less: 2 for x500-size rotors
+    tracking_m: float = Field(0.0, ge=0, le=10)  # tracking error: plans keep this much more
+    downwash: float = Field(1.0, ge=1, le=10)  # divides height differences among peers: 2 for x500-size rotors
     allow_small_radius: bool = False  # fly although radius_m is below what body, tracking and estimator need
     certify_slack_m: float = Field(0.1, ge=0, le=10)  # a plan closer than radius minus this is never flown
     age_accel_m_s2: float = Field(4.0, ge=0, le=50)  # margin a t^2 / 2 with the age of a path
     age_margin_max_m: float = Field(1.0, ge=0, le=50)
-    brake_m_s2: float = Field(3.0, gt=0, le=50)  # how a peer is assumed to stop beyond its prediction
-    lost_after_s: float = Field(0.5, gt=0, le=60)  # from this age on a peer is kept clear of at every height
+    brake_m_s2: float = Field(3.0, gt=0, le=50)  # assumed braking of a peer beyond its prediction
+    lost_after_s: float = Field(0.5, gt=0, le=60)  # a path this old is kept clear of at every height
     gate_m: float = Field(3.0, gt=0, le=1000)  # rows farther than this from being active are left out
     stop_m_s2: float = Field(1.0, gt=0, le=50)  # braking that plans leave room for beyond their horizon
     relax_01: float = Field(0.9, gt=0, le=1)  # share of the reachable displacement a row may ask for
-    right_of_way_rad: float = Field(0.35, ge=0, le=1.2)  # traffic rule: largest turn of head-on normals among peers
-    right_of_way_obstacle_rad: float = Field(0.35, ge=0, le=1.2)  # likewise, before obstacles
-    stuck_m: float = Field(0.1, gt=0, le=10)  # a plan that moves less over its horizon gets nowhere
-    max_neighbours: int = Field(8, ge=1, le=99)  # nearest ones that get rows
-    max_obstacles: int = Field(6, ge=1, le=50)  # likewise; all visible ones are certified against
+    right_of_way_rad: float = Field(0.35, ge=0, le=1.2)  # largest turn of head-on normals among peers
+    right_of_way_obstacle_rad: float = Field(0.35, ge=0, le=1.2)  # largest turn of head-on normals before obstacles
+    stuck_m: float = Field(0.1, gt=0, le=10)  # a plan that moves less over its horizon is stuck
+    max_neighbours: int = Field(8, ge=1, le=99)  # the nearest peers get rows
+    max_obstacles: int = Field(6, ge=1, le=50)  # the nearest get rows; all visible ones are certified against
 
     @property
     def planned_m(self) -> float:
-        """What plans keep."""
+        """Return the distance that plans keep [m]."""
         return self.radius_m + self.tracking_m
 
 
 @dataclass(frozen=True, slots=True)
 class KeepOut:
-    """Something to stay clear of over the horizon, in the own prediction's time."""
+    """Describes one thing to keep clear of, at the times of the own prediction."""
 
     pos_ned_m: Array  # (Hp+1, 3)
     radius_m: float  # constraint distance between centres
-    hard_min_distance_m: float  # a plan closer than this is refused
+    hard_min_distance_m: float  # plans that come closer are refused
     any_height: bool  # a vertical cylinder instead of a sphere
-    priority_id: int  # decides the side when centres coincide; the larger id goes first
-    downwash: float = 1.0  # an ellipsoid this many times as high as it is wide, instead of a sphere
+    priority_id: int  # agent number, -1 an obstacle; decides the side when centres coincide
+    downwash: float = 1.0  # ratio of height to width of the ellipsoid; 1 is a sphere
 
     @property
     def vertical_01(self) -> float:
-        """What a vertical distance counts."""
+        """Return the factor on vertical distances."""
         return 0.0 if self.any_height else 1.0 / self.downwash
 
     def distance_m(self, pos_ned_m: Array) -> float:
-        """Of a position (3,) from where it is now; in the plane when it is kept clear of at any height."""
+        """Return the distance [m] of a position (3,) from its centre now; in the plane when it holds at any height."""
         axes = 2 if self.any_height else 3
         return math.dist(self.pos_ned_m[0, :axes], pos_ned_m[:axes])
 
 
 def required_radius_m(params: SeparationParams, accuracy_m: float) -> float:
-    """Distance of believed positions at which true bodies stay apart.
+    """Return the distance of estimated positions [m] at which true bodies stay apart.
 
-    Body, tracking error, and twice the rms difference of two independent horizontal errors of rms `accuracy_m` each. At
-    0.9 m and default GPS, 6 of 16 flights of real autopilots came closer than 0.6 m in truth.
+    It adds body, tracking error, and twice the rms difference of two independent horizontal errors of rms `accuracy_m`
+    each. At 0.9 m and default GPS, 6 of 16 flights of real autopilots came closer than 0.6 m in truth.
     """
     return params.body_m + params.tracking_m + 2.0 * math.sqrt(2.0) * accuracy_m
 
 
 def radius_problem(params: SeparationParams, accuracy_m: float) -> str:
-    """Why the configured radius is too small for this accuracy, and what to do; "" when it is not, or was told so."""
+    """Say why the radius is too small for this accuracy, and what to do; "" when it is large enough or allowed."""
     needed_m = required_radius_m(params, accuracy_m)
     if params.allow_small_radius or params.radius_m >= needed_m:
         return ""
@@ -98,14 +98,15 @@ def radius_problem(params: SeparationParams, accuracy_m: float) -> str:
 
 
 def align(path: PredictedPath, t0_utc_us: int, dt_us: int, steps: int, brake_m_s2: float) -> Array:
-    """Positions (steps+1, 3) of a peer at `t0_utc_us + k dt_us`; see `aligned`."""
+    """Return positions (steps+1, 3) of one peer at `t0_utc_us + k dt_us`; see `aligned`."""
     return np.asarray(aligned([path], t0_utc_us, dt_us, steps, brake_m_s2)[0])
 
 
 def aligned(paths: Sequence[PredictedPath], t0_utc_us: int, dt_us: int, steps: int, brake_m_s2: float) -> Array:
-    """Positions (N, steps+1, 3) of peers at `t0_utc_us + k dt_us`: interpolated, then braking to a stop.
+    """Return positions (N, steps+1, 3) NED [m] of N peers at `t0_utc_us + k dt_us`.
 
-    Times before the first point are extrapolated backwards along the first segment.
+    Paths are interpolated, then continued by braking to a stop. Times before the first point are extrapolated
+    backwards along the first segment.
     """
     lasts = np.array([len(path.pos_ned_m) - 1 for path in paths])[:, None]
     since = np.array([(t0_utc_us - path.t0_utc_us) / path.dt_us for path in paths])[:, None]
@@ -120,7 +121,7 @@ def aligned(paths: Sequence[PredictedPath], t0_utc_us: int, dt_us: int, steps: i
 
 
 def _brake(found_ned_m: Array, path: PredictedPath, beyond_s: Array, brake_m_s2: float) -> None:
-    """Move positions (steps+1, 3) on by what it takes to stop beyond the path's end."""
+    """Advance positions (steps+1, 3) in place by the braking distance beyond the path's end."""
     vel = (path.pos_ned_m[-1] - path.pos_ned_m[-2]) / (path.dt_us * 1e-6)  # (3,)
     speed = math.sqrt(float(vel @ vel))
     if speed < _TINY_M:
@@ -140,15 +141,15 @@ def keep_out_of_peer(
     landing: bool = False,
     points: Array | None = None,
 ) -> KeepOut:
-    """What to stay clear of because of one peer.
+    """Return the keep-out of one peer.
 
     Args:
-        path: the peer's newest.
-        t0_utc_us, dt_us, steps: the own prediction's times.
+        path: the peer's newest path.
+        t0_utc_us, dt_us, steps: times of the own prediction.
         params: distance and margins.
-        parked: it has landed, so its path does not grow with age.
-        landing: it or we are about to descend, so it is kept clear of at every height.
-        points: as from `align`, if that has been done.
+        parked: whether the peer has landed, so that its margin does not grow with age.
+        landing: whether either vehicle is about to descend, so that the keep-out holds at every height.
+        points: result of `align`, if it is known already.
     """
     age_s = max(0.0, (t0_utc_us - path.t0_utc_us) * 1e-6)
     margin_m = 0.0 if parked else min(0.5 * params.age_accel_m_s2 * age_s * age_s, params.age_margin_max_m)
@@ -164,14 +165,14 @@ def keep_out_of_peer(
 
 
 def keep_out_of_obstacle(obstacle: Obstacle, dt_us: int, steps: int, params: SeparationParams) -> KeepOut:
-    """What to stay clear of because of an obstacle seen now; moving ones are taken at constant velocity."""
+    """Return the keep-out of a visible obstacle, predicted at constant velocity."""
     t_s = np.arange(steps + 1) * (dt_us * 1e-6)
     pos = obstacle.center_ned_m + t_s[:, None] * obstacle.vel_ned_m_s
     return KeepOut(pos, obstacle.keep_out_m, obstacle.keep_out_m - params.certify_slack_m, obstacle.column, -1)
 
 
 def visible(obstacles: Sequence[Obstacle], pos_ned_m: Array) -> list[Obstacle]:
-    """Obstacles whose centre is closer than their visibility distance now (4.2, as corrected)."""
+    """Return obstacles whose centre is closer than their visibility distance now (4.2, as corrected)."""
     return [o for o in obstacles if o.distance_m(pos_ned_m) < o.visibility_m]
 
 
@@ -184,20 +185,19 @@ def half_spaces(
     own_priority_id: int,
     params: SeparationParams,
 ) -> HalfSpaces | None:
-    """Linearised distance constraints for steps 1..Hp, in the plane or in space.
+    """Linearise distance constraints for steps 1..Hp, in the plane or in space; None without keep-outs.
 
     Args:
         keep_outs: at most as many as the problem has slots.
         guess_ned_m: (Hp+1, 3) own previous prediction at the same times.
-        goal_m: (2,) or (3,) where the reference ends: decides what head-on means, and how many axes there are.
+        goal_m: (2,) or (3,) end of the reference: defines head-on, and the number of axes.
         vel_m_s: (2,) or (3,) own velocity at the first point.
-        dt_s: between points.
+        dt_s: time between points.
         own_priority_id: own agent id.
-        params: bias and gate.
+        params: right of way, gate and braking.
 
-    In the plane height difference counts: a sphere of radius R leaves `sqrt(R^2 - dz^2)` to keep horizontally. A
-    keep-out at any height is a vertical cylinder, in the plane and in space, and one with downwash an ellipsoid: a
-    sphere in space with heights scaled.
+    In the plane, a height difference dz leaves `sqrt(R^2 - dz^2)` of a radius R to keep horizontally. A keep-out at any
+    height is a vertical cylinder. A keep-out with downwash is an ellipsoid: a sphere after heights are scaled.
     """
     if not keep_outs:
         return None
@@ -217,31 +217,31 @@ def half_spaces(
     moved = math.dist(guess_ned_m[-1, :axes], guess_ned_m[0, :axes])
     stuck = min(1.0, max(0.0, 2.0 - moved / params.stuck_m))
     to_goal = goal_m - guess_ned_m[1:, :axes]  # (Hp, axes)
-    across = to_goal[:, 0] * normal[:, :, 1] - to_goal[:, 1] * normal[:, :, 0]  # (slots, Hp) > 0: it is on the left
-    turn_rad = np.full(distance.shape, params.right_of_way_rad * stuck)
+    across = to_goal[:, 0] * normal[:, :, 1] - to_goal[:, 1] * normal[:, :, 0]  # (slots, Hp), > 0: keep-out on the left
+    angle_rad = np.full(distance.shape, params.right_of_way_rad * stuck)
     is_obstacle = np.array([k.priority_id < 0 for k in keep_outs])
-    turn_rad[is_obstacle] = params.right_of_way_obstacle_rad * np.where(across[is_obstacle] > 0.0, -1.0, 1.0)
-    normal = _turned(normal, distance, needed, to_goal, turn_rad)
+    angle_rad[is_obstacle] = params.right_of_way_obstacle_rad * np.where(across[is_obstacle] > 0.0, -1.0, 1.0)
+    normal = _with_right_of_way(normal, distance, needed, to_goal, angle_rad)
     if axes == 3:
-        normal[:, :, 2] *= vertical_01  # in heights as they are
+        normal[:, :, 2] *= vertical_01  # back from scaled to true heights
     offset = np.einsum("skc,skc->sk", normal, others) + needed
     idle = (needed <= 0.0) | (distance > needed + params.gate_m)
-    ends = (others[:, -1] - others[:, -2]) / dt_s  # (slots, axes) velocity of each at the end
+    ends = (others[:, -1] - others[:, -2]) / dt_s  # (slots, axes) velocity of each keep-out at the end
     closing = -np.einsum("sc,sc->s", normal[:, -1], vel_m_s - ends)
     stop_s = np.maximum(closing, 0.0) / (2.0 * params.stop_m_s2)
     squeezed = np.array([k.downwash > 1.0 and not k.any_height for k in keep_outs])
-    stop_s[squeezed] /= np.maximum(np.linalg.norm(normal[squeezed, -1], axis=1), _TINY_M)  # so is what braking gains
+    stop_s[squeezed] /= np.maximum(np.linalg.norm(normal[squeezed, -1], axis=1), _TINY_M)  # braking is scaled likewise
     stop_offset = offset[:, -1] + stop_s * np.einsum("sc,sc->s", normal[:, -1], ends)
     return HalfSpaces(normal, np.where(idle, -np.inf, offset), stop_s, np.where(idle[:, -1], -np.inf, stop_offset))
 
 
-def _turned(normal: Array, distance: Array, needed: Array, to_goal: Array, angle_rad: Array) -> Array:
-    """Turn normals that point straight against the way to the goal, so that head-on agents pass on one side.
+def _with_right_of_way(normal: Array, distance: Array, needed: Array, to_goal: Array, angle_rad: Array) -> Array:
+    """Return normals (slots, Hp, axes), turned where they point against the goal, so that head-on agents pass.
 
-    Among peers everybody turns the same way (clockwise seen from above, as NED yaw), which is a rule, not a draw;
-    obstacles are passed on the side one is on. `angle_rad` (slots, Hp) is the largest turn: full for obstacles, for
-    peers only when the own plan gets nowhere, because turned normals would also keep a swarm that shares one goal from
-    closing in evenly.
+    Peers follow one right-of-way rule: each turns normals clockwise seen from above (as NED yaw), so that two that meet
+    head-on both give way to the left. Obstacles are passed on the side the agent is on. `angle_rad` (slots, Hp) is the
+    largest turn: full for obstacles, for peers only when the own plan is stuck, because turned normals would also keep
+    a swarm that shares one goal from closing in evenly.
     """
     span = np.sqrt(np.einsum("kc,kc->k", to_goal, to_goal))  # (Hp,)
     ahead = -np.einsum("skc,kc->sk", normal, to_goal) / np.maximum(span, _TINY_M)  # cosine: 1 is head-on
@@ -254,18 +254,20 @@ def _turned(normal: Array, distance: Array, needed: Array, to_goal: Array, angle
     return turned
 
 
-def certify(path_ned_m: Array, keep_outs: Sequence[KeepOut], from_step: int, closer_m: float = _CLOSER_M) -> float:
-    """Smallest margin [m] of a planned path against everything known, over true distances between samples too.
+def certify(
+    path_ned_m: Array, keep_outs: Sequence[KeepOut], from_step: int, approach_m: float = _APPROACH_TOLERANCE_M
+) -> float:
+    """Return the smallest margin [m] of a path to all keep-outs, over true distances between samples too.
 
     Args:
         path_ned_m: (Hp+1, 3) own plan.
-        keep_outs: aligned with it.
-        from_step: steps before this one can't be changed by the plan any more.
-        closer_m: where a keep-out is violated now already, a path may come this much closer.
+        keep_outs: keep-outs at the same times.
+        from_step: first step that the plan can still change.
+        approach_m: how much closer a path may come to a keep-out that is violated already.
 
     Returns:
-        min over keep-outs of (distance - certified distance); where a keep-out is violated now already, a path that
-        does not come closer than now has margin 0. Infinite without keep-outs.
+        The minimum over keep-outs of distance minus hard minimum distance. Where a keep-out is violated now already, a
+        path that does not come closer than now has margin 0. Infinite without keep-outs.
     """
     if not keep_outs:
         return math.inf
@@ -280,5 +282,5 @@ def certify(path_ned_m: Array, keep_outs: Sequence[KeepOut], from_step: int, clo
     now = np.sqrt(np.einsum("mc,mc->m", apart[:, 0], apart[:, 0]))
     later = distance[:, min(from_step, distance.shape[1] - 1) :].min(axis=1)
     allowed = np.array([k.hard_min_distance_m for k in keep_outs])
-    margin = np.where((now < allowed) & (later >= now - closer_m), 0.0, later - allowed)
+    margin = np.where((now < allowed) & (later >= now - approach_m), 0.0, later - allowed)
     return float(margin.min())

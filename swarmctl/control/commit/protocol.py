@@ -64,7 +64,7 @@ _TICK_S = 0.04  # sending and receiving take at least this long
 
 @dataclass(slots=True)
 class CommitCounts:
-    """Numbers of proposals by what became of them, since the start of the agent."""
+    """Counts proposals by what became of them, since the start of the agent."""
 
     proposed: int = 0
     committed: int = 0
@@ -144,7 +144,7 @@ class Commitments:
             self._set_lead(_LEAD_FACTOR * float(np.percentile(self._latencies_s, _PERCENTILE)) + _TICK_S)
 
     def conflicting_peers(self, utc_us: int, peers: Mapping[int, TrajectoryMessage]) -> set[int]:
-        """Peers whose committed trajectory conflicts with the own one, because one of the two had to evade."""
+        """Return peers whose committed trajectory conflicts with the own one, because one of the two had to evade."""
         if self.committed is None:
             return set()
         commitments = {agent: message.committed for agent, message in peers.items() if message.is_committed}
@@ -176,7 +176,7 @@ class Commitments:
             self.counts.evaded += 1
 
     def is_due(self, utc_us: int) -> bool:
-        """Whether there is no proposal and `period_s` has passed since the last attempt."""
+        """Tell whether there is no proposal and `period_s` has passed since the last attempt."""
         return self.proposal is None and self.committed is not None and utc_us >= self._next_us
 
     def propose(self, now: Situation) -> None:
@@ -198,12 +198,12 @@ class Commitments:
 
     @property
     def lead_us(self) -> int:
-        """Time between making a proposal and leaving the committed trajectory for it [us]."""
+        """Return the time between making a proposal and leaving the committed trajectory for it [us]."""
         return round(self._lead_s * 1e6)
 
     @property
     def steps(self) -> int:
-        """Number of time steps that keep-outs in `Situation.others` cover."""
+        """Return the number of time steps that keep-outs in `Situation.others` cover."""
         return self._planner.steps
 
     @property

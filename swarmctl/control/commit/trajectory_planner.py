@@ -34,7 +34,7 @@ _MAX_SLACK_01 = 1.0 / 3.0  # share of the distance beyond touching bodies that s
 
 
 class CommitParams(Params):
-    """Parameters of planning with `separation.mode = "guaranteed"`."""
+    """Sets up planning with `separation.mode = "guaranteed"`."""
 
     dt_s: float = Field(0.1, ge=0.05, le=0.5)
     horizon: int = Field(20, ge=5, le=60)  # steps before the final braking
@@ -53,7 +53,7 @@ class CommitParams(Params):
 
 @dataclass(frozen=True, slots=True)
 class DesiredReference:
-    """The motion an agent would follow if it were alone."""
+    """Describes the motion an agent would follow if it were alone."""
 
     reference: Sampled
     follows_path: bool = False  # starts here, clear of obstacles: linearise around it
@@ -61,7 +61,7 @@ class DesiredReference:
 
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """Inputs of one plan.
+    """Collects the inputs of one plan.
 
     Args:
         utc_us: now.
@@ -79,7 +79,7 @@ class Situation:
 
     @property
     def followed(self) -> list[Trajectory]:
-        """All trajectories that peers may follow from now on."""
+        """Return all trajectories that peers may follow from now on."""
         return [trajectory for message in self.peers.values() for trajectory in message.followed]
 
 
@@ -117,7 +117,7 @@ class TrajectoryPlanner:
         )  # grid of `Situation.others`: plan and final braking
 
     def proposal(self, committed: Trajectory, now: Situation) -> Trajectory | None:
-        """A trajectory that leaves `committed` at `now.begin_us`, clear of everything known; None if none is found."""
+        """Return a trajectory that leaves `committed` at `now.begin_us`, clear of everything known; None if none is."""
         found = self._clear(committed, self._planned(committed, now), now)
         if found is None and now.desired.follows_path:
             speed_m_s = float(np.linalg.norm(committed.sample(np.array([now.begin_us]))[1]))
@@ -126,7 +126,7 @@ class TrajectoryPlanner:
         return found
 
     def evasive_trajectory(self, committed: Trajectory, now: Situation) -> Trajectory | None:
-        """A trajectory that keeps more distance to everything known than `committed`; None when none is found.
+        """Return a trajectory that keeps more distance to everything known than `committed`; None when none is found.
 
         Candidates are the MPC's plan, a straight stop, and a climb over keep-outs that end at some height.
         """
@@ -142,19 +142,19 @@ class TrajectoryPlanner:
         return best
 
     def is_clear(self, trajectory: Trajectory, now: Situation) -> bool:
-        """Whether a trajectory keeps the hard minimum distance to every keep-out in `now.others`."""
+        """Tell whether a trajectory keeps the hard minimum distance to every keep-out in `now.others`."""
         return self._clearance_m(trajectory, now) >= 0.0
 
     def conflicts(self, trajectory: Trajectory, utc_us: int, known: Sequence[Trajectory], spare_m: float = 0.0) -> bool:
-        """Whether a trajectory comes too close to any of `known` between `utc_us` and the time when all are at rest."""
+        """Tell whether a trajectory comes too close to any of `known` between `utc_us` and when all are at rest."""
         return not self._margin_m(trajectory, utc_us, known, spare_m) >= 0.0
 
     def stopping_from(self, pos_ned_m: Array, vel_ned_m_s: Array, utc_us: int) -> Trajectory:
-        """The trajectory that brakes straight ahead from a position (3,) and velocity (3,)."""
+        """Return the trajectory that brakes straight ahead from a position (3,) and velocity (3,)."""
         return stopping(pos_ned_m, vel_ned_m_s, utc_us, self.dt_us, self._params.brake_m_s2)
 
     def stopping_candidate(self, committed: Trajectory, brake_us: int, utc_us: int) -> Trajectory:
-        """The committed trajectory from `utc_us` on, left for straight braking at `brake_us`."""
+        """Return the committed trajectory from `utc_us` on, left for straight braking at `brake_us`."""
         pos, vel = committed.sample(np.array([brake_us]))
         return joined(committed, self.stopping_from(pos[0], vel[0], brake_us), utc_us)
 
@@ -168,7 +168,7 @@ class TrajectoryPlanner:
             yield self._climbing_candidate(committed, now.begin_us, max(heights_m) + _INTERPOLATION_MARGIN_M)
 
     def _climbing_candidate(self, committed: Trajectory, begin_us: int, height_m: float) -> Trajectory:
-        """The committed trajectory, left at `begin_us` for a climb by `height_m` above where it would brake to rest."""
+        """Return the committed trajectory, left at `begin_us` for a climb by `height_m` over where it would stop."""
         pos, vel = (found[0] for found in committed.sample(np.array([begin_us])))
         above = brake_to_rest(pos, vel, self._params.brake_m_s2).to_ned_m - [0.0, 0.0, height_m]
         glide = glide_to(pos, vel, above, _CLIMB_M_S, _CLIMB_M_S2)
@@ -191,7 +191,7 @@ class TrajectoryPlanner:
         return None if plan.status is PlanStatus.SOLVER_FAILED else plan
 
     def _clear(self, committed: Trajectory, plan: Plan | None, now: Situation) -> Trajectory | None:
-        """The longest part of a plan that, followed by braking, is clear of everything known; None when none is."""
+        """Return the longest part of a plan that is clear of everything known when followed by braking, or None."""
         if plan is None:
             return None
         known = now.followed
@@ -240,18 +240,18 @@ class TrajectoryPlanner:
 
 
 def following(mpc: MpcParams, params: CommitParams) -> MpcParams:
-    """Controller parameters for tracking commitments: z is stiffer than for a desired reference."""
+    """Return controller parameters for tracking commitments: z is stiffer than for a desired reference."""
     return mpc.model_copy(update={"z": params.follow_z})
 
 
 def committed_m(params: SeparationParams) -> float:
-    """Hard minimum distance between two committed trajectories [m]."""
+    """Return the hard minimum distance between two committed trajectories [m]."""
     slack_m = min(params.certify_slack_m, _MAX_SLACK_01 * max(0.0, params.radius_m - params.body_m))
     return params.radius_m - slack_m
 
 
 def _with_run_up(desired: DesiredReference, speed_m_s: float) -> DesiredReference:
-    """The same path, entered at the agent's own speed and accelerated along.
+    """Return the same path, entered at the agent's own speed and accelerated along.
 
     Half-spaces are linearised where the path says the agent will be. On a path that begins faster than the agent moves,
     they are those of the next corner, and plans cut the present one.
@@ -273,12 +273,12 @@ def _with_run_up(desired: DesiredReference, speed_m_s: float) -> DesiredReferenc
 
 
 def _first_steps(keep_out: KeepOut, steps: int) -> KeepOut:
-    """The keep-out, cut to its first `steps`."""
+    """Return the keep-out, cut to its first `steps`."""
     return replace(keep_out, pos_ned_m=keep_out.pos_ned_m[: steps + 1])
 
 
 def _planning(mpc: MpcParams, params: CommitParams) -> MpcParams:
-    """Controller parameters on the planner's grid, with bounds that leave room for tracking."""
+    """Return controller parameters on the planner's grid, with bounds that leave room for tracking."""
     return mpc.model_copy(
         update={
             "dt_s": params.dt_s,
