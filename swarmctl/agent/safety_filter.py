@@ -11,19 +11,19 @@ from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.problem import Start
 from swarmctl.core.types import Array
 
-_QUIET_US = 500_000  # after which it has done with an encounter
+_QUIET_US = 500_000  # without a change of the input, after which an encounter counts as over
 
 
 class SafetyFilter:
-    """Changes what is about to be flown when bodies would touch otherwise.
+    """Replaces the virtual controls of a tick when bodies would touch otherwise.
 
     Args:
-        params, vehicle: of the barrier.
-        dt_s: between two commands.
-        surroundings: who and what there is.
+        params, vehicle: see `Barrier`.
+        dt_s: time between two commands.
+        surroundings: source of bodies.
         downwash: see `SeparationParams`.
-        note: is told `acts=True` when it begins and `acts=False, ticks=...` when it has done.
-        stopwatch_ns: measures it, and has no influence.
+        note: is told `safety_filter`, with `acts=True` when an encounter begins and `acts=False, ticks=...` at its end.
+        stopwatch_ns: measures the filter and has no influence.
     """
 
     def __init__(
@@ -45,7 +45,7 @@ class SafetyFilter:
     def keep_apart(
         self, now_us: int, act_utc_us: int, virtual: Array, start: Start, estimate: Estimate, flies: bool
     ) -> Array:
-        """Virtual controls (3,) to fly from `act_utc_us` on in place of `virtual`; the same unless `flies`."""
+        """Return virtual controls (3,) to fly from `act_utc_us` on in place of `virtual`; unchanged unless `flies`."""
         began_ns, changed = self._stopwatch_ns(), None
         if self._params.enabled and flies:
             changed = self._barrier.filtered(
@@ -60,7 +60,7 @@ class SafetyFilter:
         return virtual if changed is None else changed
 
     def rest(self, now_us: int) -> None:
-        """Nothing is flown."""
+        """Record a tick in which the agent sends no setpoint."""
         self._count(now_us, False)
         self.took_ms = 0.0
 

@@ -124,12 +124,14 @@ def test_control_without_places_of_their_own_they_push(seed: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("outward_s_m", "settled"), [(mission.OUTWARD_S_M, True), (0.0, False)], ids=["", "control: all at the same time"]
+    ("outer_delay_s_m", "settled"),
+    [(mission.OUTER_DELAY_S_M, True), (0.0, False)],
+    ids=["", "control: all at the same time"],
 )
 def test_ten_sent_to_one_point_get_inside_before_the_ring_closes(
-    outward_s_m: float, settled: bool, monkeypatch: pytest.MonkeyPatch
+    outer_delay_s_m: float, settled: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(mission, "OUTWARD_S_M", outward_s_m)
+    monkeypatch.setattr(mission, "OUTER_DELAY_S_M", outer_delay_s_m)
     starts = layout_of("same_goal", 8, 10).starts_ned_m
     flown = Flown(starts, np.zeros((1, 3)), 6.5, "sitl.physics_hz=100")
     assert (flown.moved_m < 0.02) is settled

@@ -51,7 +51,7 @@ class BarrierParams(Params):
     brake_m_s2: float = Field(4.0, gt=0, le=20)  # level braking of one vehicle; the rest of its thrust is reserve
     near_1_s: float = Field(6.0, gt=0, le=50)  # k: approach speed allowed per metre left, close by
     gain_1_s: float = Field(6.0, gt=0, le=50)  # how fast the allowed approach speed may be reached
-    react_s: float = Field(0.045, ge=0, le=1)  # of approaching on while the airframe slew_bounds to brake
+    react_s: float = Field(0.045, ge=0, le=1)  # time the approach continues while the airframe slew_bounds to brake
     escape_m_s: float = Field(0.5, ge=0, le=10)  # separating speed asked for when closer than allowed
     slew_1_s: float = Field(2.5, gt=0, le=50)  # of (u_x, u_y); faster attitude changes would saturate rotors
 
@@ -159,11 +159,8 @@ class Barrier:
         wanted = (thrust * ux, thrust * uy, thrust * upright)  # thrust vector over mass, up positive
         dx, dy, dz = disturbance_ned_m_s2.tolist()
         drag = self._vehicle.drag_1_s
-        rest = (
-            dx - drag * vel[0],
-            dy - drag * vel[1],
-            GRAVITY_M_S2 + dz - drag * vel[2],
-        )  # acceleration without thrust
+        # acceleration without thrust
+        rest = (dx - drag * vel[0], dy - drag * vel[1], GRAVITY_M_S2 + dz - drag * vel[2])
         rows = [row for body in bodies if (row := self._row(body, pos, vel, rest)) is not None]
         if all(_dot(normal, wanted) >= offset for normal, offset in rows):
             return None
@@ -220,10 +217,9 @@ class Barrier:
             allowed, slope = p.near_1_s * left, p.near_1_s
             if allowed < -p.escape_m_s:
                 allowed, slope = -p.escape_m_s, 0.0
-        turning = (speed2 - rate * rate) / max(distance, 0.5 * body.apart_m)  # r'' due to the transverse velocity
-        need = (
-            -(slope * rate + p.gain_1_s * (rate + allowed)) / (1.0 + slope * react_s) - turning
-        )  # least r'' that keeps h' >= -gain h
+        transverse = (speed2 - rate * rate) / max(distance, 0.5 * body.apart_m)  # r'' due to the transverse velocity
+        # least r'' that keeps h' >= -gain h
+        need = -(slope * rate + p.gain_1_s * (rate + allowed)) / (1.0 + slope * react_s) - transverse
         if need < -_FARTHEST_M_S2:
             return None
         nz *= down_01

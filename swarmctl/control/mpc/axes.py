@@ -1,4 +1,4 @@
-"""What a condensed MPC problem consists of and what comes back: axes, horizon, penalties, half-spaces, solution."""
+"""Inputs and outputs of a condensed MPC problem: axes, horizon, penalties, half-spaces, solution."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Terminal = Literal["none", "position", "position_velocity", "region"]
 
 @dataclass(frozen=True, slots=True)
 class Axis:
-    """Weights and bounds of one axis (thesis Tables 9, 10, 17, 21)."""
+    """Holds weights and bounds of one axis (thesis Tables 9, 10, 17, 21)."""
 
     q_pos: float
     q_vel: float
@@ -24,20 +24,20 @@ class Axis:
     u_min: float
     u_max: float
     du_max: float
-    u_rest: float  # input that holds still
+    u_rest: float  # input that holds the vehicle still
     gain_m_s2: float  # nominal acceleration of a unit input; scales cost and terminal region
     terminal: Terminal
-    lag: Lag | None = None  # how the input is realised; None at once
+    lag: Lag | None = None  # lag from input to acceleration; None for none
 
     @property
     def u_scale(self) -> float:
-        """Largest magnitude of the input."""
+        """Return the largest magnitude of the input."""
         return max(abs(self.u_min), abs(self.u_max))
 
 
 @dataclass(frozen=True, slots=True)
 class Horizon:
-    """Lengths and sample time of the prediction, and the motion of a point under drag over it: p'' = a - drag p'."""
+    """Holds lengths and sample time of the prediction, and computes motion under drag over it: p'' = a - drag p'."""
 
     control: int
     prediction: int
@@ -46,16 +46,16 @@ class Horizon:
     drag_1_s: float = 0.0
 
     def t_s(self) -> Array:
-        """(Hp,) times of steps 1..Hp."""
+        """Return times (Hp,) [s] of steps 1..Hp."""
         return np.asarray(self.dt_s * np.arange(1, self.prediction + 1), np.float64)
 
     def held(self) -> Array:
-        """(Hp, Hc) inputs over each step of a unit increment at each control step."""
+        """Return inputs (Hp, Hc) over each step, due to a unit increment at each control step."""
         steps, moves = np.arange(self.prediction), np.arange(self.control)
         return np.asarray(np.minimum.outer(steps, moves) == moves, np.float64)
 
     def of_velocity_s(self) -> tuple[Array, Array]:
-        """(Hp,), (Hp,) displacement [s] and velocity [1] at steps 1..Hp of a unit velocity at the start."""
+        """Return displacement (Hp,) [s] and velocity (Hp,) [1] at steps 1..Hp, due to a unit velocity at the start."""
         t_s, drag = self.t_s(), self.drag_1_s
         if drag == 0.0:
             return t_s, np.ones(self.prediction)
@@ -63,10 +63,10 @@ class Horizon:
         return (1.0 - left) / drag, left
 
     def of_acceleration(self) -> tuple[Array, Array]:
-        """(Hp, Hp), (Hp, Hp) displacement [s2] and velocity [s] at steps 1..Hp of unit accelerations over each step."""
+        """Return displacement [s2] and velocity [s] (Hp, Hp) at steps 1..Hp, due to unit accelerations over steps."""
         dt_s, drag = self.dt_s, self.drag_1_s
         steps = np.arange(1, self.prediction + 1)
-        since = steps[:, None] - steps[None, :]  # steps after the one an acceleration has acted in
+        since = steps[:, None] - steps[None, :]  # steps since the one in which an acceleration acted
         acted = since >= 0
         if drag == 0.0:
             own = 0.0 if self.euler else 0.5
@@ -79,24 +79,24 @@ class Horizon:
 
 @dataclass(frozen=True, slots=True)
 class Penalties:
-    """Exact (linear) and quadratic weights of what is softened.
+    """Holds exact (linear) and quadratic weights of softened constraints.
 
     A linear penalty is exact when it exceeds the multiplier of the hard constraint, that is the slope of the tracking
     cost along the constraint; so the slack's weight follows that slope.
     """
 
-    floor: float = 50.0  # per metre; on top of `over` times the tracking cost's own slope
+    floor: float = 50.0  # per metre, added to `over` times the slope of the tracking cost
     over: float = 3.0
-    over_terminal: float = 100.0  # bounds that are active as well make these multipliers far larger than the slope
+    over_terminal: float = 100.0  # with active bounds these multipliers are far larger than the slope
     slack_quadratic: float = 20000.0
 
 
 @dataclass(frozen=True, slots=True)
 class HalfSpaces:
-    """`normal[s, k] . p_k >= offset[s, k]` for slots s and steps k = 1..Hp; offset -inf switches a row off.
+    """Holds rows `normal[s, k] . p_k >= offset[s, k]` for slots s and steps k = 1..Hp; offset -inf disables a row.
 
-    Only steps 0.08 s apart become rows, from the first on that moves can change: between them the certificate looks at
-    true distances anyway. One more row a slot looks beyond the horizon, so that there is room left to stop:
+    Only steps 0.08 s apart become rows, from the first one that increments can change: the certificate checks true
+    distances in between. One more row for each slot looks beyond the horizon, so that there is room left to stop:
     `normal[s, -1] . (p_Hp + stop_s[s] v_Hp) >= stop_offset_m[s]`.
     """
 
@@ -108,25 +108,25 @@ class HalfSpaces:
 
 @dataclass(frozen=True, slots=True)
 class AxesProblem:
-    """One receding-horizon step: where the prediction starts from and where it is to go."""
+    """Holds the data of one receding-horizon step: initial state, gains, drift and reference."""
 
     pos_m: Array  # (axes,)
     vel_m_s: Array  # (axes,)
-    u_prev: Array  # (axes,) input now held
+    u_prev: Array  # (axes,) input held now
     gain_m_s2: Array  # (Hp, axes) acceleration of a unit input over each step, sign included
     drift_m_s2: Array  # (axes,) acceleration without input
     ref_pos_m: Array  # (Hp, axes) at steps 1..Hp
     ref_vel_m_s: Array  # (Hp, axes)
-    realised: Array | None = None  # (axes,) what of the input acts at the start; None as held. For axes with a lag
-    realised_1_s: Array | None = None  # (axes,) its rate; None at rest
+    realised: Array | None = None  # (axes,) input realised at the start, of axes with a lag; None for the held one
+    realised_1_s: Array | None = None  # (axes,) rate of `realised`; None for 0
 
 
 @dataclass(frozen=True, slots=True)
 class AxesSolution:
-    """Predicted motion of the axes; `solved` False leaves the arrays at the free response.
+    """Holds the predicted motion of the axes; with `solved` False it is the free response.
 
-    Increments and inputs are within their bounds exactly; `residual_m` is the largest violation of a half-space after
-    that. An unfinished iterate comes as solved: its residual decides.
+    Increments and inputs are within their bounds exactly, and `residual_m` is the largest violation of a half-space
+    that remains. An unfinished iterate counts as solved: its residual decides.
     """
 
     solved: bool

@@ -2,8 +2,8 @@
 
 Every axis obeys `p'' = gain(k) a + drift - drag p'`, where `a` is the input u or, with a lag, what follows it. The
 decision variables are the increments of `u` over the control horizon Hc, scaled to about [-1, 1]; after Hc the input
-stays. Rows: increment bounds, input bounds, softened terminal conditions, and half-spaces `n . p_k >= b_k` with one
-slack a slot. Nothing here knows which axis is which.
+is constant. Rows are increment bounds, input bounds, softened terminal conditions, and half-spaces `n . p_k >= b_k`
+with one slack for each slot. The problem does not depend on which axis is which.
 """
 
 from __future__ import annotations
@@ -20,25 +20,25 @@ from swarmctl.control.mpc.qp import INFINITY, QpParams, make_solver, pattern_ind
 from swarmctl.control.mpc.terminal import TerminalRegion, terminal_region
 from swarmctl.core.types import Array
 
-_SLACK_SCALE_M = 0.1  # slack variables are in units of this, so that they are about 1 like all others
+_SLACK_SCALE_M = 0.1  # unit of slack variables, so that they are about 1 like all others
 _SLACK_USED_M = 1e-3
-_MOVES_S = 0.12  # what is flown in this time after the dead time is decided already
-_REACHED_01 = 0.998  # of what bounded increments can reach is asked for in place of an end farther away
-_ROW_EVERY_S = 0.08  # neighbouring rows are nearly parallel, which slows a first-order solver down
+_DECIDED_S = 0.12  # motion within this time after the dead time can hardly be changed
+_REACHABLE_01 = 0.998  # share of the reachable displacement that replaces an end out of reach
+_ROW_SPACING_S = 0.08  # closer rows are nearly parallel, which slows a first-order solver down
 
 
 class CondensedMpc:
-    """One problem family with fixed sparsity; `solve` is called every tick.
+    """Solves one family of problems with fixed sparsity; `solve` is called every tick.
 
     Args:
-        axes: one entry an axis.
+        axes: weights and bounds of each axis.
         horizon: lengths and sample time.
-        slots: how many half-space families (neighbours and obstacles) there is room for.
-        relax_01: half-space rows never ask for more than this share of what the bounded increments can reach, so rows
-            inside the dead time can't be infeasible and push agents away (`1` asks for all).
-        penalties: weights of what is softened.
+        slots: largest number of half-space families (neighbours and obstacles).
+        relax_01: half-space rows ask for at most this share of what the bounded increments can reach, so that rows
+            inside the dead time are never infeasible and never push agents away (1 asks for all).
+        penalties: weights of softened constraints.
         qp: solver settings.
-        stopwatch_ns: measures the solver, and has no influence.
+        stopwatch_ns: measures the solver and has no influence.
     """
 
     def __init__(
@@ -59,27 +59,28 @@ class CondensedMpc:
         self._build_response()
         self._build_layout()
         self._build_cost()
-        if slots == 0:  # small: tight tolerances cost less than polishing
+        if slots == 0:  # a small problem: tight tolerances cost less than polishing
             qp = qp.model_copy(update={"polish": False, "eps": 0.01 * qp.eps, "eps_relative": 0.01 * qp.eps_relative})
         self._solver = make_solver(self._p_pattern, self._a_pattern, qp)
         self._soft_solver = make_solver(self._p_pattern, self._a_pattern, qp) if self._terminals else self._solver
 
     def _build_response(self) -> None:
-        """Positions and velocities at steps 1..Hp of a unit acceleration held over each step; what is constant."""
+        """Compute the constant responses: positions and velocities at steps 1..Hp to accelerations and increments."""
         hp = self.horizon.prediction
         self._pos_of_accel, self._vel_of_accel = self.horizon.of_acceleration()
         self._pos_of_vel, self._vel_of_vel = self.horizon.of_velocity_s()
         self._hold = self.horizon.held()
         self._lags = [lag_response(a.lag, self.horizon.dt_s, hp) for a in self.axes]
         self._acted = np.stack([response.of_command @ self._hold for response in self._lags])  # (axes, Hp, Hc)
-        first, stride = self.first_row(), max(1, round(_ROW_EVERY_S / self.horizon.dt_s))
+        first, stride = self.first_row(), max(1, round(_ROW_SPACING_S / self.horizon.dt_s))
         self._checked = np.arange(hp - 1, first - 1, -stride)[::-1]  # 0-based steps that get half-space rows
         step_m_s2 = max(a.du_max * a.gain_m_s2 for a in self.axes)
         response = (self._pos_of_accel @ self._acted[0])[self._checked].max(axis=1) * step_m_s2
-        response = np.append(response, response[-1])  # and the stopping row
+        response = np.append(response, response[-1])  # the stopping row
         self._row_scale = 1.0 / np.maximum(response, 0.01)  # rows of about unit size suit a first-order solver
 
     def _build_layout(self) -> None:
+        """Number variables and rows, and build the sparsity patterns."""
         n, hc, checks = len(self.axes), self.horizon.control, len(self._row_scale)
         ends = [a.terminal for a in self.axes]
         self._terminals = [(i, "pos") for i, end in enumerate(ends) if end in ("position", "position_velocity")]
@@ -126,6 +127,7 @@ class CondensedMpc:
         self._upper = np.full(rows, INFINITY)
 
     def _region(self, axis: Axis) -> TerminalRegion:
+        """Return the terminal region of an axis, in units of acceleration."""
         gain = axis.gain_m_s2
         room = min(axis.u_max - axis.u_rest, axis.u_rest - axis.u_min)
         return terminal_region(
@@ -133,6 +135,7 @@ class CondensedMpc:
         )
 
     def _build_cost(self) -> None:
+        """Fill the parts of cost and rows that never change, and find the scale of the cost."""
         n, hc = len(self.axes), self.horizon.control
         largest = 0.0
         for i, axis in enumerate(self.axes):
@@ -167,7 +170,7 @@ class CondensedMpc:
         assert len(self._q_soft) == self._columns - n * hc
 
     def solve(self, asked: AxesProblem, half_spaces: HalfSpaces | None = None) -> AxesSolution:
-        """One receding-horizon step, with at most `slots` families of half-spaces; None for none."""
+        """Solve one receding-horizon step, with at most `slots` families of half-spaces; None for none."""
         gain_m_s2, ref_pos_m, ref_vel_m_s = asked.gain_m_s2, asked.ref_pos_m, asked.ref_vel_m_s
         u_prev = np.minimum(np.maximum(asked.u_prev, self._u_min), self._u_max)
         held = np.broadcast_to(u_prev, gain_m_s2.shape)
@@ -178,7 +181,7 @@ class CondensedMpc:
         pos_error, vel_error = free_pos - ref_pos_m, free_vel - ref_vel_m_s
         ref_accel = (ref_vel_m_s[-1] - ref_vel_m_s[-2]) / self.horizon.dt_s if len(ref_vel_m_s) > 1 else 0.0 * u_prev
         surplus = accel[-1] - self.horizon.drag_1_s * ref_vel_m_s[-1] - ref_accel
-        ends = np.stack([pos_error[-1], vel_error[-1], surplus])  # (3, axes) without any move
+        ends = np.stack([pos_error[-1], vel_error[-1], surplus])  # (3, axes) error at the end without increments
         q = self._fill_cost(gain_m_s2, phi_pos, phi_vel, pos_error, vel_error, ends)
         self._fill_inputs(u_prev)
         self._fill_terminals(phi_pos[:, -1], phi_vel[:, -1], u_prev, pos_error[-1], vel_error[-1])
@@ -186,18 +189,18 @@ class CondensedMpc:
         p_values, a_values = self._p_dense[self._p_index], self._a_dense[self._a_index]
         began_ns = self._stopwatch_ns()
         solution = self._solver.solve(p_values, q, a_values, self._lower, self._upper)
-        for softened in (self._end_velocities, self._ends):  # not feasible: exact penalties instead of equalities
+        for softened in (self._end_velocities, self._ends):  # if infeasible, exact penalties replace equalities
             if len(softened) and not solution.exact:
                 self._soften(q, softened)
                 solution = self._soft_solver.solve(p_values, q, a_values, self._lower, self._upper)
         if len(self._ends) and self.slots and self._distance_slack_m(solution.x) > _SLACK_USED_M:
-            self._soften(q, self._ends)  # distances come first: let go of the end
+            self._soften(q, self._ends)  # distances have priority over the end
             q[self._moves + self._ends] = 0.0
             solution = self._soft_solver.solve(p_values, q, a_values, self._lower, self._upper)
         solve_us = (self._stopwatch_ns() - began_ns) * 1e-3
         inputs = self._inputs(solution.x, u_prev)
-        moves = np.diff(inputs, axis=0, prepend=u_prev[None])  # within both bounds, whatever the solver's tolerance
-        slack_m, residual_m, gap_m = self._shortfalls(solution.x, moves)
+        moves = np.diff(inputs, axis=0, prepend=u_prev[None])  # within both bounds exactly
+        slack_m, residual_m, gap_m = self._violations(solution.x, moves)
         pos = free_pos + np.einsum("akc,ca->ka", phi_pos, moves)
         vel = free_vel + np.einsum("akc,ca->ka", phi_vel, moves)
         for i, region in self._regions.items():
@@ -218,15 +221,16 @@ class CondensedMpc:
         )
 
     def first_row(self) -> int:
-        """0-based step from which on the moves can change a position by enough to matter."""
+        """Return the 0-based index of the first step at which increments change a position noticeably."""
         slowest_s = max((a.lag.ramp_delay_s for a in self.axes if a.lag is not None), default=0.0)
-        steps = math.ceil((_MOVES_S + slowest_s) / self.horizon.dt_s - 1e-9)
+        steps = math.ceil((_DECIDED_S + slowest_s) / self.horizon.dt_s - 1e-9)
         return min(steps, self.horizon.prediction - 1)
 
     def realised(self, u: Array, at_start: Array | None, rate_1_s: Array | None) -> Array:
-        """Mean realised inputs (Hp, axes) over each step of commanded ones (Hp, axes).
+        """Return mean realised inputs (Hp, axes) over each step, for commanded inputs `u` (Hp, axes).
 
-        `at_start` (axes,) acts already, None as commanded first, and changes by `rate_1_s` (axes,), None not at all.
+        `at_start` (axes,) is the input realised at the start (None: the first command), `rate_1_s` (axes,) its rate
+        (None: 0).
         """
         acts = np.empty(u.shape)
         for i, lag in enumerate(self._lags):
@@ -237,13 +241,14 @@ class CondensedMpc:
         return acts
 
     def motion(self, pos_m: Array, vel_m_s: Array, accel_m_s2: Array) -> tuple[Array, Array]:
-        """Positions and velocities (Hp, axes) under accelerations (Hp, axes) held over each step."""
+        """Return positions and velocities (Hp, axes) under accelerations (Hp, axes) held over each step."""
         pos = pos_m + self._pos_of_vel[:, None] * vel_m_s + self._pos_of_accel @ accel_m_s2
         return pos, self._vel_of_vel[:, None] * vel_m_s + self._vel_of_accel @ accel_m_s2
 
     def _fill_cost(
         self, gain_m_s2: Array, phi_pos: Array, phi_vel: Array, pos_error: Array, vel_error: Array, ends: Array
     ) -> Array:
+        """Fill the Hessian and return the linear cost (n,)."""
         hc = self.horizon.control
         q = np.empty(self._columns)
         q[self._moves :] = self._q_soft
@@ -264,6 +269,7 @@ class CondensedMpc:
         return q
 
     def _fill_inputs(self, u_prev: Array) -> None:
+        """Fill the bounds of the inputs, relative to the held input (axes,)."""
         hc = self.horizon.control
         for i, axis in enumerate(self.axes):
             block = slice(self._row_input + i * hc, self._row_input + (i + 1) * hc)
@@ -274,9 +280,9 @@ class CondensedMpc:
     def _fill_terminals(
         self, end_pos: Array, end_vel: Array, u_prev: Array, pos_error: Array, vel_error: Array
     ) -> None:
-        """Equalities `gap = 0`, slacks fixed.
+        """Fill terminal conditions as equalities `gap = 0` with slacks fixed at 0.
 
-        No end is asked for that the bounded increments can't reach: towards a far one they go as far as they can.
+        An end that the bounded increments can't reach is replaced by the farthest one that they can.
         """
         hc, out_of_reach = self.horizon.control, set[int]()
         for j, (i, what) in enumerate(self._terminals):
@@ -288,15 +294,15 @@ class CondensedMpc:
             least, most = sorted(float(response @ moves) for moves in self._extremes(i, u_prev))
             self._lower[row : row + 2], self._upper[row : row + 2] = -INFINITY, INFINITY
             if i in out_of_reach:
-                continue  # on the way there its velocity does not matter
+                continue  # its end velocity then does not matter
             if not least <= asked <= most:
                 out_of_reach.add(i)
-                asked = _REACHED_01 * (most if asked > most else least)
+                asked = _REACHABLE_01 * (most if asked > most else least)
             self._lower[row : row + 2] = self._upper[row : row + 2] = asked
         self._upper[self._row_soft + self._ends] = 0.0
 
     def _extremes(self, i: int, u_prev: Array) -> tuple[Array, Array]:
-        """Increments (Hc,) of axis `i` that raise and that lower its input as fast as the bounds allow."""
+        """Return increments (Hc,) of axis `i` that raise, and that lower, its input as fast as the bounds allow."""
         axis, ramp = self.axes[i], np.arange(1, self.horizon.control + 1)
         rise = np.minimum(u_prev[i] + axis.du_max * ramp, axis.u_max)
         fall = np.maximum(u_prev[i] - axis.du_max * ramp, axis.u_min)
@@ -304,13 +310,14 @@ class CondensedMpc:
         return rise - np.concatenate([before, rise[:-1]]), fall - np.concatenate([before, fall[:-1]])
 
     def _distance_slack_m(self, x: Array | None) -> float:
+        """Return the largest slack of a half-space [m] in a solution."""
         return 0.0 if x is None else float(x[self._moves + len(self._terminals) :].max()) * _SLACK_SCALE_M
 
     def _soften(self, q: Array, which: NDArray[np.intp]) -> None:
-        """Rows `gap + slack >= 0` and `gap - slack <= 0` with free slacks, for these terminal conditions.
+        """Replace terminal conditions `which` by `gap + slack >= 0` and `gap - slack <= 0` with free slacks.
 
-        The multipliers that balance the cost's slope g along the rows R, (R R')^-1 R g, are the scale of the weights
-        that make them exact.
+        The multipliers that balance the slope g of the cost along the rows R, (R R')^-1 R g, scale the weights that
+        make the penalties exact.
         """
         hc = self.horizon.control
         for i, own in self._terminals_of.items():
@@ -330,6 +337,7 @@ class CondensedMpc:
         free_vel: Array,
         spaces: HalfSpaces | None,
     ) -> None:
+        """Fill the rows of half-spaces; without any they are disabled."""
         hc, checks = self.horizon.control, len(self._row_scale)
         self._lower[self._row_half :] = -INFINITY
         if spaces is None or len(spaces.normal) == 0:
@@ -356,7 +364,7 @@ class CondensedMpc:
         self._lower[rows] = np.where(np.isfinite(offset), lower, -INFINITY).ravel()
 
     def _inputs(self, x: Array | None, u_prev: Array) -> Array:
-        """Inputs (Hc, axes) of a solution, clipped to all bounds; without one, held."""
+        """Return inputs (Hc, axes) of a solution, clipped to all bounds; without one the held input."""
         hc, n = self.horizon.control, len(self.axes)
         if x is None:
             return np.tile(u_prev, (hc, 1))
@@ -364,8 +372,8 @@ class CondensedMpc:
         wanted = np.minimum(np.maximum(wanted, -self._du_max), self._du_max)
         return np.asarray(np.minimum(np.maximum(u_prev + np.cumsum(wanted, axis=0), self._u_min), self._u_max))
 
-    def _shortfalls(self, x: Array | None, moves: Array) -> tuple[float, float, float]:
-        """Largest slack used, violation of a half-space and gap of a terminal row [m] for the moves as clipped."""
+    def _violations(self, x: Array | None, moves: Array) -> tuple[float, float, float]:
+        """Return the largest slack, half-space violation and terminal gap [m] of the clipped increments."""
         if x is None:
             return 0.0, np.inf, np.inf
         soft = len(self._terminals)

@@ -1,4 +1,4 @@
-"""What a controller is asked each tick: one frozen noun for every kind of controller, and for whoever records it."""
+"""The problem a controller solves each tick, the same type for every kind of controller and for recorders."""
 
 from __future__ import annotations
 
@@ -12,23 +12,23 @@ from swarmctl.core.types import Array, Reference
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """Where a plan begins: the predicted own state when its first setpoint acts."""
+    """Holds the initial state of a plan: the own state, predicted to when its first setpoint acts."""
 
     t_us: int
     pos_ned_m: Array  # (3,)
     vel_ned_m_s: Array  # (3,)
     cos_tilt: float  # cos(phi) cos(theta) now
-    virtual: Array  # (3,) u_x, u_y, thrust over mass now held
-    tilt: Array = field(default_factory=lambda: np.zeros(2))  # (2,) u_x, u_y realised, of a vehicle with a lag
-    tilt_rate_1_s: Array = field(default_factory=lambda: np.zeros(2))  # (2,)
+    virtual: Array  # (3,) u_x, u_y, thrust over mass held now
+    tilt: Array = field(default_factory=lambda: np.zeros(2))  # (2,) realised u_x, u_y of a vehicle with a lag
+    tilt_rate_1_s: Array = field(default_factory=lambda: np.zeros(2))  # (2,) rate of `tilt`
 
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """One tick's question."""
+    """Holds the problem of one tick."""
 
     start: Start
     reference: Reference  # at least the controller's `longest` + 1 points from `start.t_us` on
-    disturbance_ned_m_s2: Array  # (3,) taken as constant
+    disturbance_ned_m_s2: Array  # (3,) constant over the horizon
     keep_outs: tuple[KeepOut, ...]  # peers and obstacles, aligned with the plan's times
     guess_ned_m: Array | None  # (steps+1, 3) own previous prediction at the new times; None for constant velocity

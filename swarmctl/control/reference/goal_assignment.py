@@ -1,9 +1,9 @@
-"""Several agents sent to one point: each takes a place of its own round it, so that they come to rest in order.
+"""Goal assignment: agents sent to one point each get a place of their own around it.
 
-Left to themselves they push for ever, and stop wherever they happen to block each other: of three, one on the goal and
-two beside it, a sum of distances 18 % above the least. The places are those points of a triangular lattice whose sum of
-distances to the goal is least. Everybody knows all starts and goals and works out the same places: there is nothing to
-agree on in flight, and no leader to lose.
+Without it they push for ever and stop wherever they block each other: of three agents one stops on the goal and two
+beside it, with a sum of distances 18 % above the least. The places are those points of a triangular lattice whose sum
+of distances to the goal is least. Every agent knows all starts and goals and computes the same places, so nothing has
+to be agreed in flight and no leader can be lost.
 """
 
 from __future__ import annotations
@@ -15,24 +15,24 @@ import numpy as np
 
 from swarmctl.core.types import Array
 
-ROOM = 1.05  # places are this much farther apart than agents keep: nobody pushes once all are there
-_CENTRES = 13  # tried along each edge of a lattice triangle
-_TURNS = 72
-_ROUNDS = 30
-_FAIR = 1e-4  # of equal sums the one with the least unequal distances
-_TINY_M = 1e-6  # computers that round differently must still choose alike
+ROOM = 1.05  # places are this much farther apart than agents keep, so that no agent pushes once all have arrived
+_CENTRE_SAMPLES = 13  # candidate centres along each edge of a lattice triangle
+_ROTATIONS = 72
+_ITERATIONS = 30
+_FAIRNESS = 1e-4  # weight of the sum of squares, which breaks ties in favour of equal distances
+_TINY_M = 1e-6  # above rounding: all computers must choose alike
 
 
 def assigned_goals_ned_m(starts_ned_m: Array, goals_ned_m: Array, apart_m: float) -> tuple[Array, list[list[int]]]:
-    """Goals (N, 3) that can all be reached at once, and who shares a goal with whom.
+    """Return goals (N, 3) NED [m] that all agents can occupy at once, and the groups that share a goal.
 
     Args:
-        starts_ned_m: (N, 3) who comes from where.
-        goals_ned_m: (N, 3) where each is sent.
+        starts_ned_m: (N, 3) start of each agent.
+        goals_ned_m: (N, 3) requested goal of each agent.
         apart_m: distance that agents keep.
 
     Returns:
-        Places at the height of the goal; the given ones of whoever is alone. Groups of agents, each in order.
+        Places at the height of the goal; an agent that shares none keeps its own. Groups of agent indices, sorted.
     """
     places, groups = goals_ned_m.copy(), [[agent] for agent in range(len(goals_ned_m))]
     while len(merged := _merged(places, groups, apart_m)) < len(groups):
@@ -47,33 +47,33 @@ def assigned_goals_ned_m(starts_ned_m: Array, goals_ned_m: Array, apart_m: float
 
 
 def arrangement(count: int) -> Array:
-    """Points (count, 2), a distance of 1 or more apart, whose sum of distances to the origin is about the least."""
+    """Return points (count, 2), at least 1 apart, whose sum of distances to the origin is about the least."""
     reach = math.ceil(math.sqrt(count)) + 2
     rows, columns = np.meshgrid(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1), indexing="ij")
     lattice = np.stack([columns + 0.5 * rows, math.sqrt(0.75) * rows], axis=-1).reshape(-1, 2)
     best, least = lattice[:count], math.inf
-    for i, j in itertools.product(range(_CENTRES), repeat=2):
-        if i + j >= _CENTRES:
+    for i, j in itertools.product(range(_CENTRE_SAMPLES), repeat=2):
+        if i + j >= _CENTRE_SAMPLES:
             continue
-        u, v = i / (_CENTRES - 1), j / (_CENTRES - 1)
+        u, v = i / (_CENTRE_SAMPLES - 1), j / (_CENTRE_SAMPLES - 1)
         points = _round_median(lattice, np.array([u + 0.5 * v, math.sqrt(0.75) * v]), count)
-        total = float(np.linalg.norm(points, axis=1).sum()) + _FAIR * float((points**2).sum())
+        total = float(np.linalg.norm(points, axis=1).sum()) + _FAIRNESS * float((points**2).sum())
         if total < least - _TINY_M:
             best, least = points, total
     return best
 
 
 def _round_median(lattice: Array, center: Array, count: int) -> Array:
-    """The `count` lattice points nearest to `center` (2,), as seen from their own geometric median (Weiszfeld)."""
+    """Return the `count` lattice points nearest to `center` (2,), relative to their geometric median (Weiszfeld)."""
     chosen = lattice[np.argsort(np.round(np.linalg.norm(lattice - center, axis=1), 6), kind="stable")[:count]]
-    for _ in range(_ROUNDS):
+    for _ in range(_ITERATIONS):
         weight = 1.0 / np.maximum(np.linalg.norm(chosen - center, axis=1), 1e-9)
         center = weight @ chosen / weight.sum()
     return np.asarray(chosen - center)
 
 
 def _merged(places: Array, groups: list[list[int]], apart_m: float) -> list[list[int]]:
-    """Groups (of agents, in order) joined where a place of one is too close to a place of another."""
+    """Return the groups, merged where a place of one is too close to a place of another."""
     merged: list[list[int]] = []
     for group in groups:
         near = [m for m in merged if _min_distance_m(places[m], places[group]) < apart_m - _TINY_M]
@@ -86,18 +86,18 @@ def _min_distance_m(some: Array, others: Array) -> float:
 
 
 def _assigned(starts: Array, places: Array) -> Array:
-    """Places (N, 2), turned about the origin and dealt out so that ways from `starts` (N, 2) are short.
+    """Return places (N, 2), rotated about the origin and permuted so that paths from `starts` (N, 2) are short.
 
-    No two would gain by exchanging theirs, so ways flown in the same time cross as little as they can.
+    No two agents would gain by an exchange, so paths flown in the same time cross as little as possible.
     """
     best, least = places, math.inf
-    for turn in range(_TURNS):
-        angle = 2.0 * math.pi * turn / _TURNS
+    for rotation in range(_ROTATIONS):
+        angle = 2.0 * math.pi * rotation / _ROTATIONS
         c, s = math.cos(angle), math.sin(angle)
-        dealt = _exchanged(starts, places @ np.array([[c, s], [-s, c]]))
-        total = float(((dealt - starts) ** 2).sum())
+        assigned = _exchanged(starts, places @ np.array([[c, s], [-s, c]]))
+        total = float(((assigned - starts) ** 2).sum())
         if total < least - _TINY_M:
-            best, least = dealt, total
+            best, least = assigned, total
     return best
 
 

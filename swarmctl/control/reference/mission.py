@@ -1,6 +1,6 @@
-"""References: where to be at a given mission time. All agents share one reference unless each has a way of its own.
+"""Mission references: position and velocity at a given mission time, shared by all agents unless each has its own.
 
-Pure functions of time; the flight before and after (to the start, to the landing place) is a `Glide`.
+They are pure functions of time; the flight before and after (to the start, to the landing place) is a `Glide`.
 """
 
 from __future__ import annotations
@@ -17,15 +17,15 @@ from swarmctl.control.reference.goal_assignment import assigned_goals_ned_m
 from swarmctl.core.params import Params, Vec3
 from swarmctl.core.types import Array
 
-_TO_AND_FRO = np.array(
+_STEP_DIRECTIONS = np.array(
     [(1, 0, 0), (0, 0, 0), (-1, 0, 0), (0, 0, 0), (0, 1, 0), (0, 0, 0), (0, -1, 0), (0, 0, 0), (0, 0, -1), (0, 0, 0)]
 )
-OUTWARD_S_M = 0.5  # how much later places of one goal are reached that are farther from it
+OUTER_DELAY_S_M = 0.5  # delay of arrival per metre that a place is farther out
 Waypoint = Annotated[tuple[float, float, float, float], Field(strict=False)]
 
 
 class CircleParams(Params):
-    """Climbing circle: `center + (r cos wt, r sin wt, climb t)` (thesis 4.3 and, with r 0.5, its tracking sets)."""
+    """Describes a climbing circle `center + (r cos wt, r sin wt, climb t)` (thesis 4.3; tracking sets have r 0.5)."""
 
     center_ned_m: Vec3 = (0.0, 0.0, -1.0)
     radius_m: float = Field(5.0, ge=0, le=1000)
@@ -34,56 +34,56 @@ class CircleParams(Params):
 
 
 class LineParams(Params):
-    """Straight line at constant velocity (thesis 4.4)."""
+    """Describes a straight line at constant velocity (thesis 4.4)."""
 
     origin_ned_m: Vec3 = (2.0, 2.0, -2.0)
     velocity_ned_m_s: Vec3 = (1.5, 0.7, -0.1)
 
 
 class StepsParams(Params):
-    """Piecewise constant positions: rows of `[from_s, x, y, z]` in order of time (thesis 2.4)."""
+    """Describes piecewise constant positions: rows of `[from_s, x, y, z]` in order of time (thesis 2.4)."""
 
     rows: tuple[Waypoint, ...] = Field(((0.0, 1.0, 1.0, -1.0),), strict=False)
 
 
 class SwapParams(Params):
-    """Every agent flies to the point opposite its start, smoothly, in `travel_s`."""
+    """Lets every agent fly smoothly to the point opposite its start, in `travel_s`."""
 
     travel_s: float = Field(8.0, gt=0, le=600)
 
 
 class GotoParams(Params):
-    """Every agent flies smoothly from its start to its goal and stays there; who shares one stays round it."""
+    """Lets every agent fly smoothly to its goal and stay there, or around a goal that several share."""
 
-    goals_ned_m: tuple[Vec3, ...] = Field((), strict=False)  # one an agent, or a single one for all
-    speed_m_s: float = Field(2.0, gt=0, le=20)  # peaks, about
+    goals_ned_m: tuple[Vec3, ...] = Field((), strict=False)  # one for each agent, or a single one for all
+    speed_m_s: float = Field(2.0, gt=0, le=20)  # approximate peak
     accel_m_s2: float = Field(1.2, gt=0, le=20)
-    goal_assignment: bool = True  # goals too close to each other become an arrangement round them
+    goal_assignment: bool = True  # replace goals that are too close by places around them
 
 
 class IdentifyParams(Params):
-    """Steps about the own start, to and fro along each axis: what `swarmctl check --identify` flies."""
+    """Describes steps about the own start, to and fro along each axis, as `swarmctl check --identify` flies them."""
 
     step_m: float = Field(2.0, gt=0.1, le=20)  # north, south, east, west
     climb_m: float = Field(0.5, ge=0, le=20)
     hold_s: float = Field(2.5, ge=0.5, le=30)  # before the next step
     repeats: int = Field(2, ge=1, le=20)
-    distance_max_m: float = Field(5.0, gt=0.1, le=100)  # farther from the start, or faster, it stops and lands
-    speed_max_m_s: float = Field(5.0, gt=0.1, le=30)
+    distance_max_m: float = Field(5.0, gt=0.1, le=100)  # beyond it the vehicle stops and lands
+    speed_max_m_s: float = Field(5.0, gt=0.1, le=30)  # likewise
 
     @property
     def duration_s(self) -> float:
-        """Of all steps, and a hover behind them."""
-        return self.hold_s * (self.repeats * len(_TO_AND_FRO) + 1)
+        """Return the duration of all steps and a final hover [s]."""
+        return self.hold_s * (self.repeats * len(_STEP_DIRECTIONS) + 1)
 
     def rows(self) -> Array:
-        """Steps (R, 4): from when, and where relative to the start."""
-        places = np.tile(_TO_AND_FRO, (self.repeats, 1)) * (self.step_m, self.step_m, self.climb_m)
+        """Return steps (R, 4): start time [s], and position relative to the start [m]."""
+        places = np.tile(_STEP_DIRECTIONS, (self.repeats, 1)) * (self.step_m, self.step_m, self.climb_m)
         return np.column_stack([self.hold_s * np.arange(1, len(places) + 1), places])
 
 
 class MissionParams(Params):
-    """What is flown between start and landing."""
+    """Sets what is flown between start and landing."""
 
     kind: Literal["hover", "circle", "line", "steps", "swap", "goto", "identify"] = "circle"
     duration_s: float = Field(37.7, gt=0, le=36000)
@@ -96,7 +96,7 @@ class MissionParams(Params):
     identify: IdentifyParams = IdentifyParams()
 
     def problems(self, agents: int) -> Iterator[str]:
-        """What no single key can tell."""
+        """Yield problems that involve several keys."""
         times = [row[0] for row in self.steps.rows]
         if self.kind == "steps" and (not times or times != sorted(times)):
             yield f"mission.steps.rows: times {times} must be given, in increasing order"
@@ -114,13 +114,13 @@ class MissionParams(Params):
 
 
 class MissionReference:
-    """The reference of one agent.
+    """Computes the reference of one agent.
 
     Args:
-        params: what is flown.
+        params: the mission.
         starts_ned_m: (agents, 3) start positions.
         agent: own index.
-        apart_m: distance that agents keep, for a mission that sends several to one point.
+        apart_m: distance that agents keep, for goals that several share.
     """
 
     def __init__(self, params: MissionParams, starts_ned_m: Array, agent: int, apart_m: float = 0.0) -> None:
@@ -128,10 +128,10 @@ class MissionReference:
         self._start = starts_ned_m[agent]
         self._opposite = 2.0 * starts_ned_m.mean(axis=0) - self._start
         if params.kind == "goto":
-            self._way = _ways(params.goto, starts_ned_m, apart_m)[agent]
+            self._flight = _goal_flights(params.goto, starts_ned_m, apart_m)[agent]
 
     def sample(self, t_s: Array) -> tuple[Array, Array]:
-        """Positions and velocities, (K, 3) each, at mission times `t_s` (K,); before 0 the value at 0, at rest."""
+        """Return positions and velocities, (K, 3) NED each, at mission times `t_s` (K,); at rest before 0."""
         shapes = {
             "hover": self._hover,
             "circle": self._circle,
@@ -168,14 +168,14 @@ class MissionReference:
         return glide.sample(t_s)
 
     def _goto(self, t_s: Array) -> tuple[Array, Array]:
-        return self._way.sample(t_s)
+        return self._flight.sample(t_s)
 
     def _identify(self, t_s: Array) -> tuple[Array, Array]:
         rows = np.concatenate([np.zeros((1, 4)), self._params.identify.rows()])
         return self._start + _held(rows, t_s), np.zeros((len(t_s), 3))
 
     def excess(self, pos_ned_m: Array, vel_ned_m_s: Array) -> str:
-        """Why an identification flight must end, or "": its vehicle is flown by figures that may be wrong."""
+        """Say why an identification flight must end, or "": its vehicle is flown with a model that may be wrong."""
         if self._params.kind != "identify":
             return ""
         p, away_m, speed_m_s = self._params.identify, math.dist(pos_ned_m, self._start), math.hypot(*vel_ned_m_s)
@@ -187,16 +187,16 @@ class MissionReference:
 
 
 def _held(rows: Array, t_s: Array) -> Array:
-    """Positions (K, 3) at times (K,) of steps (R, 4)."""
+    """Return positions (K, 3) at times (K,) of steps (R, 4)."""
     index = np.maximum(np.searchsorted(rows[:, 0], t_s + 1e-9, side="right") - 1, 0)
     held: Array = rows[index, 1:]
     return held
 
 
-def _ways(params: GotoParams, starts_ned_m: Array, apart_m: float) -> list[Glide]:
-    """Of every agent; those who share a goal get there at the same time, farther out a little later.
+def _goal_flights(params: GotoParams, starts_ned_m: Array, apart_m: float) -> list[Glide]:
+    """Return the flight of every agent; agents that share a goal arrive together, outer ones a little later.
 
-    A ring that closes before somebody is inside it opens only after much pushing.
+    A ring of agents that closes before the inner ones have arrived opens only after much pushing.
     """
     agents = len(starts_ned_m)
     goals = np.array(params.goals_ned_m) if params.goals_ned_m else starts_ned_m
@@ -205,21 +205,21 @@ def _ways(params: GotoParams, starts_ned_m: Array, apart_m: float) -> list[Glide
     groups = [[i] for i in range(agents)]
     if params.goal_assignment:
         goals, groups = assigned_goals_ned_m(starts_ned_m, goals, apart_m)
-    ways = [
+    flights = [
         glide_to(start, np.zeros(3), goal, params.speed_m_s, params.accel_m_s2)
         for start, goal in zip(starts_ned_m, goals, strict=True)
     ]
     for group in groups:
-        slowest_s = max(ways[i].travel_s for i in group)
+        slowest_s = max(flights[i].travel_s for i in group)
         from_center_m = np.linalg.norm(goals[group] - goals[group].mean(axis=0), axis=1)
         for i, outward_m in zip(group, from_center_m - from_center_m.min(), strict=True):
-            ways[i] = replace(ways[i], travel_s=slowest_s + OUTWARD_S_M * outward_m)
-    return ways
+            flights[i] = replace(flights[i], travel_s=slowest_s + OUTER_DELAY_S_M * outward_m)
+    return flights
 
 
 @dataclass(frozen=True, slots=True)
 class Glide:
-    """Quintic from a position and velocity to rest at a target: continuous in acceleration."""
+    """A quintic polynomial from a position and velocity to rest at a target, continuous in acceleration."""
 
     from_ned_m: Array  # (3,)
     vel_ned_m_s: Array  # (3,)
@@ -227,7 +227,7 @@ class Glide:
     travel_s: float
 
     def sample(self, t_s: Array) -> tuple[Array, Array]:
-        """Positions and velocities, (K, 3) each, at times `t_s` (K,) since it began."""
+        """Return positions and velocities, (K, 3) each, at times `t_s` (K,) [s] since the start."""
         s = np.clip(t_s / self.travel_s, 0.0, 1.0)[:, None]
         delta, carry = self.to_ned_m - self.from_ned_m, self.vel_ned_m_s * self.travel_s
         blend = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
@@ -240,7 +240,7 @@ class Glide:
 
 
 def glide_to(pos: Array, vel: Array, target: Array, speed_m_s: float, accel_m_s2: float) -> Glide:
-    """The quickest `Glide` whose peak speed and acceleration stay near the given ones.
+    """Return the fastest `Glide` whose peak speed and acceleration stay near the given ones.
 
     A quintic from rest peaks at 1.875 of its mean speed and at 5.77 distance / T^2.
     """
@@ -251,7 +251,7 @@ def glide_to(pos: Array, vel: Array, target: Array, speed_m_s: float, accel_m_s2
 
 
 def brake_to_rest(pos: Array, vel: Array, accel_m_s2: float) -> Glide:
-    """A `Glide` that stops about as soon as `accel_m_s2` allows, straight ahead."""
+    """Return a `Glide` that stops straight ahead, about as soon as `accel_m_s2` allows."""
     speed = math.sqrt(float(vel @ vel))
     travel_s = max(0.5, 2.0 * speed / accel_m_s2)
     return Glide(pos, vel, pos + 0.5 * travel_s * vel, travel_s)

@@ -1,8 +1,8 @@
-"""The shortest way in the plane round discs: a grid, Dijkstra from the goal, and a string pulled tight.
+"""The shortest path in the plane around discs: Dijkstra's algorithm on a grid, then shortcuts between corners.
 
-Only asked by who stands still before something (`swarmctl.control.reference.deadlock`): the MPC looks 0.8 s ahead and
-has no way of knowing on which side a wall ends. Cells inside a disc are passable at a price, so that there is always an
-answer, also from where one should not be and through gaps that the grid is too coarse for.
+Only an agent that stands before something asks for it (`swarmctl.control.reference.deadlock`): the MPC looks 0.8 s
+ahead and cannot know on which side a wall ends. Cells inside a disc are passable at a price, so there is always an
+answer, also from inside a disc and through gaps that the grid is too coarse for.
 """
 
 from __future__ import annotations
@@ -17,16 +17,16 @@ from scipy.sparse.csgraph import dijkstra
 from swarmctl.core.types import Array
 
 _CELLS = 60  # along the longer side
-_EDGE_CELLS = 0.7  # a point so far inside a disc may have a free one in its cell
-_PRICE_INSIDE = 1000.0  # of a metre farther inside
+_EDGE_CELLS = 0.7  # a cell this far inside a disc may still hold a free point
+_PRICE_INSIDE = 1000.0  # price of a metre farther inside
 _NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))
 
 
 class Polyline:
-    """A polyline in the plane, measured along itself.
+    """A polyline in the plane, parametrised by arc length.
 
     Args:
-        corners: (K, 2), at least 2.
+        corners: (K, 2) points [m], at least 2.
     """
 
     def __init__(self, corners: Array) -> None:
@@ -37,38 +37,38 @@ class Polyline:
         self.length_m = float(self._reached_m[-1])
 
     def arc_length_m(self, here: Array) -> float:
-        """How far along it the point nearest to `here` (2,) is; the farthest of several."""
+        """Return the arc length [m] of the point nearest to `here` (2,); the largest of several."""
         share = np.clip(((here - self.corners[:-1]) * self._legs).sum(axis=1) / self._lengths_m**2, 0.0, 1.0)
         distance = np.linalg.norm(self.corners[:-1] + share[:, None] * self._legs - here, axis=1)
         leg = len(distance) - 1 - int(np.argmin(distance[::-1]))
         return float(self._reached_m[leg] + share[leg] * self._lengths_m[leg])
 
-    def rest(self, here: Array) -> Polyline:
-        """From `here` (2,) on to its end."""
+    def remainder(self, here: Array) -> Polyline:
+        """Return the part from `here` (2,) to the end."""
         ahead = self._reached_m[1:] > self.arc_length_m(here)
         ahead[-1] = True
         return Polyline(np.vstack([here, self.corners[1:][ahead]]))
 
     def sample(self, along_m: Array) -> tuple[Array, Array]:
-        """Points and directions, (K, 2) each, at distances (K,) along it; beyond its end that, without direction."""
+        """Return points and unit directions, (K, 2) each, at arc lengths (K,); past the end the end, direction 0."""
         leg = np.clip(np.searchsorted(self._reached_m, along_m, side="right") - 1, 0, len(self._legs) - 1)
         unit = self._legs[leg] / self._lengths_m[leg, None]
         here_m = np.minimum(along_m, self.length_m) - self._reached_m[leg]
         return self.corners[leg] + here_m[:, None] * unit, np.where((along_m < self.length_m)[:, None], unit, 0.0)
 
     def is_clear(self, discs: Array) -> bool:
-        """Whether all of it stays outside `discs` (M, 3)."""
+        """Tell whether the polyline stays outside `discs` (M, 3)."""
         return all(clear(a, b, discs) for a, b in itertools.pairwise(self.corners))
 
 
 def shortest_path(start: Array, goal: Array, discs: Array, cell_m: float, squeeze: float = 3.0) -> Polyline:
-    """A short way from `start` (2,) to `goal` (2,) outside `discs` (M, 3): centre and radius.
+    """Return a short path from `start` (2,) to `goal` (2,) outside `discs`.
 
     Args:
-        start, goal: its first and last point.
-        discs: what to go round.
-        cell_m: of the grid; larger where the ground is large.
-        squeeze: price of a metre through what may be a gap or may be none.
+        start, goal: first and last point [m].
+        discs: (M, 3) north, east and radius [m].
+        cell_m: least cell size of the grid; it grows with the area.
+        squeeze: price of a metre through a gap that the grid cannot resolve.
     """
     if clear(start, goal, discs):
         return Polyline(np.stack([start, goal]))
@@ -88,20 +88,20 @@ def shortest_path(start: Array, goal: Array, discs: Array, cell_m: float, squeez
 
 
 def clear(a: Array, b: Array, discs: Array) -> bool:
-    """Whether the segment from `a` (2,) to `b` (2,) stays outside all discs; one it begins in may be left."""
+    """Tell whether the segment from `a` (2,) to `b` (2,) stays outside all discs; it may leave one it begins in."""
     if not len(discs):
         return True
-    way = b - a
-    length2 = max(float(way @ way), 1e-12)
+    step = b - a
+    length2 = max(float(step @ step), 1e-12)
     from_a = discs[:, :2] - a
-    along = np.clip(from_a @ way / length2, 0.0, 1.0)
-    nearest = np.linalg.norm(from_a - along[:, None] * way, axis=1)
+    along = np.clip(from_a @ step / length2, 0.0, 1.0)
+    nearest = np.linalg.norm(from_a - along[:, None] * step, axis=1)
     leaves = (np.linalg.norm(from_a, axis=1) < discs[:, 2]) & (along <= 0.0)
     return bool(((nearest >= discs[:, 2]) | leaves).all())
 
 
 def _grid(start: Array, goal: Array, discs: Array, cell_m: float) -> tuple[Array, tuple[int, int], float]:
-    """Points (rows * columns, 2) round everything, with room to pass outside."""
+    """Return points (rows * columns, 2), shape and cell size of a grid around all discs, with room to pass outside."""
     largest_m = float(discs[:, 2].max())
     corners = np.vstack([start, goal, discs[:, :2] - discs[:, 2:], discs[:, :2] + discs[:, 2:]])
     low, high = corners.min(axis=0) - largest_m, corners.max(axis=0) + largest_m
@@ -112,7 +112,7 @@ def _grid(start: Array, goal: Array, discs: Array, cell_m: float) -> tuple[Array
 
 
 def _edges(price: Array, shape: tuple[int, int], step_m: float) -> csr_array:
-    """Each cell with its eight neighbours; every edge once."""
+    """Return edges between each cell and its eight neighbours, each edge once."""
     index = np.arange(len(price)).reshape(shape)
     starts, ends, lengths = [], [], []
     for down, right in _NEIGHBOURS:
@@ -126,7 +126,7 @@ def _edges(price: Array, shape: tuple[int, int], step_m: float) -> csr_array:
 
 
 def _tightened(points: Array, discs: Array) -> Polyline:
-    """Through as few of `points` (K, 2) as straight lines allow."""
+    """Return the polyline through as few of `points` (K, 2) as clear segments allow."""
     kept = [0]
     while kept[-1] < len(points) - 1:
         here = kept[-1]

@@ -10,7 +10,7 @@ import pytest
 
 from sitl.studies.campaign.layouts import least_sum_m
 from swarmctl.control.reference.goal_assignment import ROOM, arrangement, assigned_goals_ned_m
-from swarmctl.control.reference.mission import OUTWARD_S_M, GotoParams, MissionParams, MissionReference
+from swarmctl.control.reference.mission import OUTER_DELAY_S_M, GotoParams, MissionParams, MissionReference
 from swarmctl.core.types import Array
 
 APART_M = 0.9
@@ -84,7 +84,7 @@ def test_inner_places_are_reached_first() -> None:
     flown = [MissionReference(mission, starts, agent, APART_M) for agent in range(7)]
     ends_m = [float(np.linalg.norm(r.sample(np.array([60.0]))[0][0])) for r in flown]
     first, *others = [t_s for _, t_s in sorted(zip(ends_m, rest_s(flown), strict=True))]
-    assert min(others) - first == pytest.approx(OUTWARD_S_M * ROOM * APART_M, abs=0.05)
+    assert min(others) - first == pytest.approx(OUTER_DELAY_S_M * ROOM * APART_M, abs=0.05)
     assert max(others) - min(others) < 0.05
 
 
