@@ -66,7 +66,7 @@ class Surroundings:
 
     def listen(self, utc_us: int) -> list[str]:
         """Take in everything that has arrived; returns the operator's verbs for this agent."""
-        self.attendance.look(utc_us)
+        self.attendance.update(utc_us)
         for sender, payload in self._bus.receive(topics.PATH):
             self.paths.offer(sender, payload, utc_us)
         for sender, payload in self._bus.receive(topics.STATUS):
@@ -74,7 +74,7 @@ class Surroundings:
         for sender, payload in self._bus.receive(topics.OBSTACLES):
             self._take_obstacles(sender, payload, utc_us)
         verbs = [self._orders.take(*received, utc_us) for received in self._bus.receive(topics.COMMAND)]
-        self.refusals.tell(utc_us)
+        self.refusals.report(utc_us)
         self._watch_unheard(utc_us)
         return [verb for verb in verbs if verb is not None]
 

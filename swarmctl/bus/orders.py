@@ -1,4 +1,4 @@
-"""Operators' orders: how long one is valid, which of several is obeyed, and whose clock it is stamped by. Pure."""
+"""Operators' orders: their validity, which of several is obeyed, and whose clock stamps them. Pure."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ from typing import Literal
 from swarmctl.bus.refusals import FUTURE_ORDER, MALFORMED, REPLAYED, STALE_ORDER, SUPERSEDED_ORDER, Refusals
 from swarmctl.bus.topics import COMMAND, CommandMessage, decode_command, encode_message
 
-VALID_US = 2_000_000  # after its stamp
-MAX_LEAD_US = 500_000  # a stamp further in the future is of another clock
+VALID_US = 2_000_000  # from its stamp on
+MAX_LEAD_US = 500_000  # a stamp further in the future comes from another clock
 _SAME_CLOCK_US = 500_000
 EVERYBODY = -1
 
@@ -17,23 +17,23 @@ Verb = Literal["hold", "resume", "land", "rtl"]
 
 
 class Orders:
-    """Takes what operators ask of one agent, each order once, however often it is repeated.
+    """Filters the orders to one agent, so that each is obeyed once, however often it is repeated.
 
-    An order counts for `VALID_US`: an old one says what somebody wanted of another flight. Of two the one that was
-    asked for later counts, in whatever order they come, so a repeated `hold` does not undo a `resume`. Only `land` is
-    obeyed whatever came before it: a stamp a little in the future must not be able to hold it up.
+    An order is valid for `VALID_US`: an older one may have been meant for another flight. Of two orders the one with
+    the later stamp counts, in whatever order they arrive, so a repeated `hold` does not undo a `resume`. Only `land` is
+    obeyed whatever came before it: a stamp a little in the future must not delay it.
 
     Args:
         agent: own index.
-        refusals: is told what is not obeyed.
+        refusals: counts orders that are not obeyed.
     """
 
     def __init__(self, agent: int, refusals: Refusals) -> None:
         self._agent, self._refusals = agent, refusals
-        self._newest: CommandMessage | None = None  # that was obeyed
+        self._newest: CommandMessage | None = None  # newest one obeyed
 
     def take(self, sender: str, payload: bytes, utc_us: int) -> Verb | None:
-        """The verb, if it is for this agent and to be obeyed now."""
+        """Return the verb if it is for this agent and to be obeyed now, otherwise None."""
         order = decode_command(payload)
         if order is not None and order.agent not in (EVERYBODY, self._agent):
             return None
@@ -58,15 +58,15 @@ class Orders:
 
 
 def orders(verb: Verb, agent: int, utc_us: int, clocks_us: Iterable[int]) -> list[bytes]:
-    """Messages that ask for a verb now: one by the own clock, and one by every clock that differs from it.
+    """Return messages that ask for a verb now: one stamped by the own clock, and one by every clock that differs.
 
-    Agents follow a step of UTC slowly, so in flight their clock and the operator's may be far apart. One by the own
-    clock is always there: who forges a status must not be able to make an order invalid.
+    Agents follow a step of UTC slowly, so in flight their clock and the operator's may be far apart. One message
+    always bears the own stamp, so that a forged status cannot make an order invalid.
 
     Args:
-        agent: who is asked, or `EVERYBODY`.
+        agent: number of the agent asked, or `EVERYBODY`.
         utc_us: own clock.
-        clocks_us: what the clocks of those asked say now, by their statuses.
+        clocks_us: clocks of the agents asked, by their statuses.
     """
     stamps_us = [utc_us]
     for clock_us in sorted(clocks_us):

@@ -1,8 +1,8 @@
-"""What an agent knows of its peers, and the bus as one protocol. Pure: no zenoh, no clock, no thread.
+"""The bus as one protocol, the newest path of every peer, and a bus in memory. Pure: no Zenoh, no clock, no thread.
 
-`PeerPaths` judges freshness by what the payload says, never by the bus, and identity by `links.speakers`. It keeps
-every peer's newest path whatever its age; what an old path means for separation is decided in `swarmctl.control`.
-`LocalHub` is the bus of lockstep.
+`PeerPaths` judges freshness by the payload, never by the bus, and identity by `swarmctl.bus.senders`. It keeps every
+peer's newest path whatever its age; what an old path means for separation is decided in `swarmctl.control`. `LocalHub`
+is the bus of lockstep flights.
 """
 
 from __future__ import annotations
@@ -21,42 +21,42 @@ from swarmctl.core.types import PredictedPath
 
 MAX_AGE_US = 2_000_000
 MAX_LEAD_US = 500_000
-LEASE_US = 1_500_000  # after which a silent link of the bus in memory is taken for dead, as bus.lease_ms
-_LOSS = 1  # purpose of the random stream
+LEASE_US = 1_500_000  # time after which a failed `LocalHub` drops all tokens, as bus.lease_ms
+_LOSS_STREAM = 1  # key of the random stream of losses
 
 
 def agent_name(agent: int) -> str:
-    """Sender name of an agent on the bus."""
+    """Return the sender name of an agent on the bus."""
     return f"agent-{agent}"
 
 
 class Bus(Protocol):
-    """Publish to everybody, receive without ever blocking."""
+    """Publishes to all subscribers and receives without blocking."""
 
     def publish(self, topic: Topic, payload: bytes) -> None:
-        """Send to all who listen to this sender; dropped, never queued for long."""
+        """Send to all subscribers; a message is dropped rather than queued for long."""
 
     def receive(self, topic: Topic) -> list[tuple[str, bytes]]:
-        """(sender, payload) of what is kept since the last call, oldest first for each sender.
+        """Return (sender, payload) of the messages since the last call, oldest first for each sender.
 
-        At most a ring of each sender, and `TOO_LONG` instead of every message that is longer than its topic allows.
+        There is at most one ring of each sender, and `TOO_LONG` replaces a message that is too long for its topic.
         """
 
     def alive(self) -> frozenset[str]:
-        """Senders that are attached now, this one included. Advisory: it proves a process, not a control loop."""
+        """Return senders attached now, this one included. It shows that a process lives, not that its loop runs."""
 
     def arrivals(self) -> Mapping[str, int]:
-        """How often each sender has been seen to come, so that one that left and came back at once is noticed."""
+        """Return how often each sender has joined, so that one that left and rejoined at once is noticed."""
 
     def close(self) -> None:
         """Leave the bus."""
 
 
 class PeerPaths:
-    """Newest good path of every peer; what is refused is counted by reason and leaves the known path untouched.
+    """Keeps the newest valid path of every peer; refused messages are counted by reason and change nothing.
 
     Args:
-        peers: agent numbers that are listened to, without the own one.
+        peers: numbers of the other agents.
         rate_hz, refusals, attendance: see `SenderVerifier`.
         max_age_us: a path whose first point is older than this when it arrives is refused.
         max_lead_us: a path whose first point is further in the future than this is refused.
@@ -81,10 +81,10 @@ class PeerPaths:
         self.refusals = refusals
 
     def offer(self, sender: str, payload: bytes, utc_us: int) -> None:
-        """Judge one message of the PATH topic.
+        """Check one message of the PATH topic, and keep it if it is accepted.
 
         Args:
-            sender: name of the key it arrived on, which the bus vouches for.
+            sender: name in the key it arrived on, which the bus guarantees.
             payload: bytes as received.
             utc_us: now, disciplined UTC [us].
         """
@@ -98,7 +98,7 @@ class PeerPaths:
             self._newest[path.agent] = path
 
     def latest(self) -> tuple[PredictedPath, ...]:
-        """Newest path of every peer ever heard, whatever its age, by agent number."""
+        """Return the newest path of every peer, whatever its age, sorted by agent number."""
         return tuple(self._newest[agent] for agent in sorted(self._newest))
 
     def _refusal(self, sender: str, path: PredictedPath, utc_us: int) -> str:
@@ -117,15 +117,15 @@ class _Message(NamedTuple):
 
 
 class LocalHub:
-    """A bus in memory, on a simulated clock, for agents that are ticked one after another.
+    """A bus in memory, on a simulated clock, for agents that tick one after another.
 
-    What is published at `t` is visible to others from `t + max(1, delay_us)` on, so within one step nobody sees what
-    somebody else has just said, and the order in which agents are ticked does not matter.
+    A message published at `t` arrives at `t + max(1, delay_us)`, so within one step no agent receives what another has
+    just published, and the order in which agents tick does not matter.
 
     Args:
         now_us: the simulated clock.
-        seed: of the losses.
-        delay_us: travel time.
+        seed: seed of the losses.
+        delay_us: delay of every message.
         loss_01: probability that one receiver misses one message of an unreliable topic.
     """
 
@@ -135,99 +135,103 @@ class LocalHub:
         self._travel_us = max(1, delay_us)
         self._loss_01 = loss_01
         self._attached: dict[str, LocalBus] = {}
-        self._alive: frozenset[str] = frozenset()  # as the router last told
+        self._alive: frozenset[str] = frozenset()  # as last reported
         self._arrivals: Counter[str] = Counter()
-        self._came: set[str] = set()  # while it was mute
+        self._joined: set[str] = set()  # while it had failed
         self._streams: dict[tuple[str, str], np.random.Generator] = {}
-        self._mute_since_us: int | None = None
-        self._held: list[tuple[str, Topic, bytes]] = []  # reliable messages said while it is mute
+        self._failed_since_us: int | None = None
+        self._held: list[tuple[str, Topic, bytes]] = []  # reliable messages published while it has failed
 
-    def mute(self) -> None:
-        """The bus falls apart: nobody hears anybody. Reliable messages wait, the others are lost."""
-        self._mute_since_us = self._now_us()
-        self._came = set()
+    def fail(self) -> None:
+        """Stop delivery, as without a router. Reliable messages wait, the others are lost."""
+        self._failed_since_us = self._now_us()
+        self._joined = set()
 
-    def unmute(self) -> None:
-        """It is whole again; what has waited is under way from now on."""
-        came = set(self._attached) if self._has_lost_tokens() else self._came & self._attached.keys()
-        held, self._held, self._mute_since_us = self._held, [], None
-        self._arrivals.update(came)
+    def recover(self) -> None:
+        """Resume delivery; reliable messages that have waited are sent now."""
+        joined = set(self._attached) if self._has_lost_tokens() else self._joined & self._attached.keys()
+        held, self._held, self._failed_since_us = self._held, [], None
+        self._arrivals.update(joined)
         self._alive = frozenset(self._attached)
         for sender, topic, payload in held:
             self.carry(sender, topic, payload)
 
-    def attach(self, name: str, listen: Mapping[Topic, Sequence[str]] | None = None) -> LocalBus:
+    def attach(self, name: str, subscriptions: Mapping[Topic, Sequence[str]] | None = None) -> LocalBus:
         """Join as `name`.
 
         Args:
             name: sender name, free at the moment.
-            listen: senders heard per topic; None hears everybody but itself.
+            subscriptions: senders to receive per topic; None receives all but the own messages.
         """
         if name in self._attached:
             raise ValueError(f"{name!r} is attached already")
-        bus = LocalBus(self, name, listen)
+        bus = LocalBus(self, name, subscriptions)
         self._attached[name] = bus
-        self._tell(came=name)
+        self._update_presence(joined=name)
         return bus
 
     def detach(self, name: str) -> None:
-        """Leave, or die: nothing more is sent or received; what is under way still arrives."""
+        """Detach a participant: it sends and receives nothing more; its messages under way still arrive."""
         self._attached.pop(name, None)
-        self._tell()
+        self._update_presence()
 
     def alive(self) -> frozenset[str]:
-        """Everybody; as it was when the bus became mute, and nobody, not even oneself, after `LEASE_US` of that."""
+        """Return all participants; on a failed bus those of before, and none, not even the caller, after `LEASE_US`."""
         return frozenset() if self._has_lost_tokens() else self._alive
 
     def arrivals(self) -> Mapping[str, int]:
-        """How often each has come; once more for everybody after a mute bus had lost them."""
+        """Return how often each has joined; all join once more after a failed bus had dropped them."""
         return self._arrivals
 
     def _has_lost_tokens(self) -> bool:
-        return self._mute_since_us is not None and self._now_us() - self._mute_since_us >= LEASE_US
+        return self._failed_since_us is not None and self._now_us() - self._failed_since_us >= LEASE_US
 
-    def _tell(self, came: str = "") -> None:
-        if self._mute_since_us is not None:
-            self._came |= {came} - {""}
+    def _update_presence(self, joined: str = "") -> None:
+        if self._failed_since_us is not None:
+            self._joined |= {joined} - {""}
             return
         self._alive = frozenset(self._attached)
-        self._arrivals.update([came] if came else [])
+        self._arrivals.update([joined] if joined else [])
 
     def now_us(self) -> int:
+        """Return the simulated time [us]."""
         return self._now_us()
 
     def is_attached(self, bus: LocalBus) -> bool:
+        """Tell whether this very participant is attached, not another one of its name."""
         return self._attached.get(bus.name) is bus
 
     def carry(self, sender: str, topic: Topic, payload: bytes) -> None:
-        """Put a message under way to every receiver that does not lose it."""
-        if self._mute_since_us is not None:
+        """Send a message to every receiver that does not lose it."""
+        if self._failed_since_us is not None:
             if topic.reliable:
                 self._held.append((sender, topic, payload))
             return
         now_us = self._now_us()
         message = _Message(now_us + self._travel_us, payload)
         for bus in self._attached.values():
-            if bus.hears(topic, sender) and not self._is_lost(sender, bus.name, topic):
+            if bus.subscribes_to(topic, sender) and not self._is_lost(sender, bus.name, topic):
                 bus.accept(topic, sender, message, now_us)
 
     def _is_lost(self, sender: str, receiver: str, topic: Topic) -> bool:
         if topic.reliable or self._loss_01 <= 0.0:
             return False
         stream = self._streams.get((sender, receiver))
-        if stream is None:  # one stream per link: its draws depend on the sender's messages only
-            key = [self._seed, zlib.crc32(sender.encode()), zlib.crc32(receiver.encode()), _LOSS]
+        if stream is None:  # one stream for each link, so that draws depend on the sender's messages only
+            key = [self._seed, zlib.crc32(sender.encode()), zlib.crc32(receiver.encode()), _LOSS_STREAM]
             stream = self._streams[(sender, receiver)] = np.random.default_rng(key)
         return bool(stream.random() < self._loss_01)
 
 
 class LocalBus:
-    """One participant of a `LocalHub`."""
+    """A participant of a `LocalHub`."""
 
-    def __init__(self, hub: LocalHub, name: str, listen: Mapping[Topic, Sequence[str]] | None) -> None:
+    def __init__(self, hub: LocalHub, name: str, subscriptions: Mapping[Topic, Sequence[str]] | None) -> None:
         self._hub = hub
         self.name = name
-        self._listen = None if listen is None else {topic: frozenset(names) for topic, names in listen.items()}
+        self._subscriptions = (
+            None if subscriptions is None else {topic: frozenset(names) for topic, names in subscriptions.items()}
+        )
         self._inboxes: dict[Topic, dict[str, deque[_Message]]] = {topic: {} for topic in TOPICS}
 
     def publish(self, topic: Topic, payload: bytes) -> None:
@@ -245,7 +249,7 @@ class LocalBus:
                 message = inbox.popleft()
                 payload = message.payload if len(message.payload) <= topic.max_bytes else TOO_LONG
                 arrived.append((message.visible_us, sender, payload))
-        arrived.sort(key=lambda item: item[:2])  # stable: a sender's own order stays
+        arrived.sort(key=lambda item: item[:2])  # stable: keeps the order of each sender
         return [(sender, payload) for _, sender, payload in arrived]
 
     def alive(self) -> frozenset[str]:
@@ -258,18 +262,20 @@ class LocalBus:
         if self._hub.is_attached(self):
             self._hub.detach(self.name)
 
-    def hears(self, topic: Topic, sender: str) -> bool:
-        if self._listen is None:
+    def subscribes_to(self, topic: Topic, sender: str) -> bool:
+        """Tell whether messages of a sender are received."""
+        if self._subscriptions is None:
             return sender != self.name
-        return sender in self._listen.get(topic, ())
+        return sender in self._subscriptions.get(topic, ())
 
     def accept(self, topic: Topic, sender: str, message: _Message, now_us: int) -> None:
+        """Queue a message under way."""
         inbox = self._inboxes.setdefault(topic, {}).setdefault(sender, deque())
         inbox.append(message)
         _trim(inbox, topic.ring, now_us)
 
 
 def _trim(inbox: deque[_Message], ring: int, now_us: int) -> None:
-    """Keep the newest `ring` of the messages that have arrived; those under way do not push anything out yet."""
+    """Keep the newest `ring` messages that have arrived; messages under way do not count."""
     while len(inbox) > ring and inbox[ring].visible_us <= now_us:
         inbox.popleft()

@@ -1,8 +1,8 @@
-"""What travels over the bus: one table of topics, and the layout of every message.
+"""Messages of the bus: one table of topics, and the layout of every message.
 
 Paths are a little-endian struct header and float32 points, ticks are `core.records` rows, the rest is msgspec JSON.
-A bus hands out nothing longer than its topic allows. Decoders bound-check and return None for anything that does not
-fit; they never raise.
+A bus delivers no message that is too long for its topic. Decoders check bounds and return None for anything that does
+not fit; they never raise.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from swarmctl.core.types import MAX_RADIUS_M, FlightMode, Mode, Obstacle, Phase,
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """One stream of an agent (or of the operator) on the bus."""
+    """Describes one stream of an agent, or of the operator, on the bus."""
 
     name: str
-    ring: int  # newest samples kept per sender; more than one, so that a forged one does not push out the true one
-    max_bytes: int  # longer ones are handed out as `TOO_LONG`
+    ring: int  # newest samples kept per sender; several, so that a forged one does not displace the true one
+    max_bytes: int  # longer messages are delivered as `TOO_LONG`
     reliable: bool
 
 
@@ -37,9 +37,9 @@ OBSTACLES = Topic("obstacles", ring=4, max_bytes=65_536, reliable=True)
 TRAJECTORY = Topic("trajectory", ring=4, max_bytes=131_072, reliable=False)  # each one replaces all earlier ones
 TOPICS = (PATH, STATUS, TICK, COMMAND, OBSTACLES, TRAJECTORY)
 
-TOO_LONG = b""  # instead of a message that nobody will look into; no decoder takes it
+TOO_LONG = b""  # replaces a message that is too long; every decoder refuses it
 
-OPERATOR = "operator"  # the sender name of launch and of the operator verbs
+OPERATOR = "operator"  # sender name of the launcher and of operator verbs
 
 PATH_VERSION = 1
 MAX_POINTS = 250
@@ -47,16 +47,16 @@ _PATH_HEADER = struct.Struct("<2sBBIIIqifBB2x")  # magic ver flags agent boot se
 _MAGIC = b"SP"
 _Message = TypeVar("_Message")
 
-MAX_OBSTACLES = 64  # measured: 20 us each in every tick that sees it, of 20 ms; 6000 took 130 ms
-MAX_OBSTACLE_M = 10_000.0  # of every length and coordinate
-MAX_VERSION_STEP = 64  # changes of the list that may be missed; a version out of reach would shut out all later ones
+MAX_OBSTACLES = 64  # each visible one takes 20 us of a tick of 20 ms; 6000 took 130 ms
+MAX_OBSTACLE_M = 10_000.0  # limit of every length and coordinate
+MAX_VERSION_STEP = 64  # largest step of the list's version; an extreme one would lock out all later ones
 Length = Annotated[float, msgspec.Meta(gt=0.0, le=MAX_OBSTACLE_M)]
 Coordinate = Annotated[float, msgspec.Meta(ge=-MAX_OBSTACLE_M, le=MAX_OBSTACLE_M)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
 
 
 def encode_path(path: PredictedPath) -> bytes:
-    """Bytes of a predicted path."""
+    """Encode a predicted path."""
     points = np.ascontiguousarray(path.pos_ned_m, dtype="<f4")
     header = _PATH_HEADER.pack(
         _MAGIC,
@@ -75,7 +75,7 @@ def encode_path(path: PredictedPath) -> bytes:
 
 
 def decode_path(payload: bytes) -> PredictedPath | None:
-    """Path of a payload; None unless magic, version, lengths and every number are good."""
+    """Decode a path; None unless magic, version, lengths and all numbers are valid."""
     if len(payload) < _PATH_HEADER.size:
         return None
     magic, version, _, agent, boot_id, seq, t0_utc_us, dt_us, radius_m, count, header_len = _PATH_HEADER.unpack_from(
@@ -92,7 +92,7 @@ def decode_path(payload: bytes) -> PredictedPath | None:
 
 
 class StatusMessage(msgspec.Struct, frozen=True):
-    """What an agent says of itself five times a second; peers read `phase` and `ready_utc_us`, people the rest."""
+    """Holds the status an agent publishes five times a second; peers use `phase` and `ready_utc_us`."""
 
     agent: Count
     boot_id: Count
@@ -102,7 +102,7 @@ class StatusMessage(msgspec.Struct, frozen=True):
     flight_mode: Annotated[int, msgspec.Meta(ge=0, le=int(max(FlightMode)))]
     armed: bool
     landed: int
-    ready_utc_us: Count  # when it reached its start position, 0 before
+    ready_utc_us: Count  # time of reaching its start position, 0 before
     outcome: str  # "" while flying, "completed", or why the mission failed
     position_error_m: float
     separation_m: float  # to the nearest peer now
@@ -111,21 +111,21 @@ class StatusMessage(msgspec.Struct, frozen=True):
     late_ticks: int
     path_age_ms: float
     solver_failed: int
-    problem: str  # newest thing an operator should know, "" when all is well
+    problem: str  # newest active alert, "" for none
     uses_commitments: bool = False  # it flies committed trajectories only, see `control.commit`
-    utc_us: Count = 0  # when it was said, by the agent's clock
+    utc_us: Count = 0  # time of sending, by the agent's clock
 
 
 class CommandMessage(msgspec.Struct, frozen=True):
-    """What an operator asks of one agent or of all (`agent` -1)."""
+    """Holds an operator's request to one agent or to all (`agent` -1)."""
 
     verb: Literal["hold", "resume", "land", "rtl"]
     agent: int
-    utc_us: Count  # when it was asked for, by the clock of those asked
+    utc_us: Count  # time of the request, by the clock of the agents asked
 
 
 class ObstacleMessage(msgspec.Struct, frozen=True):
-    """One obstacle, a sphere or a column of any height, shared NED [m]."""
+    """Describes one obstacle, a sphere or a column of any height, in shared NED [m]."""
 
     center_ned_m: tuple[Coordinate, Coordinate, Coordinate]
     radius_m: Length
@@ -135,41 +135,44 @@ class ObstacleMessage(msgspec.Struct, frozen=True):
     column: bool = False
 
     def obstacle(self) -> Obstacle:
-        """As plans see it."""
+        """Return the obstacle as a core type."""
         center, vel = np.array(self.center_ned_m), np.array(self.vel_ned_m_s)
         return Obstacle(center, self.radius_m, self.keep_out_m, self.visibility_m, vel, self.column)
 
 
 class ObstaclesMessage(msgspec.Struct, frozen=True):
-    """The whole list of obstacles; a higher `version` replaces a lower one."""
+    """Holds the whole list of obstacles; a higher `version` replaces a lower one."""
 
     version: Count
     obstacles: Annotated[tuple[ObstacleMessage, ...], msgspec.Meta(max_length=MAX_OBSTACLES)]
 
     def replaces(self, version: int | None) -> bool:
-        """Whether it is newer than the known version (None: none is known), and may be the next or one soon after."""
+        """Tell whether the list is newer than the known version (None: no list), by at most `MAX_VERSION_STEP`."""
         return version is None or 0 < self.version - version <= MAX_VERSION_STEP
 
 
 def first_obstacles(items: Iterable[Mapping[str, Any]]) -> ObstaclesMessage:
-    """Version 1 of the list: items as configured."""
+    """Return version 1 of the list, with items as configured."""
     return ObstaclesMessage(1, tuple(ObstacleMessage(**item) for item in items))
 
 
 def encode_message(message: msgspec.Struct) -> bytes:
-    """Bytes of a control-plane message."""
+    """Encode a message as JSON."""
     return msgspec.json.encode(message)
 
 
 def decode_status(payload: bytes) -> StatusMessage | None:
+    """Decode a status; None if it is malformed or out of bounds."""
     return _decode(payload, _STATUS_DECODER)
 
 
 def decode_command(payload: bytes) -> CommandMessage | None:
+    """Decode an operator's request; None if it is malformed or out of bounds."""
     return _decode(payload, _COMMAND_DECODER)
 
 
 def decode_obstacles(payload: bytes) -> ObstaclesMessage | None:
+    """Decode a list of obstacles; None if it is malformed or out of bounds."""
     return _decode(payload, _OBSTACLES_DECODER)
 
 

@@ -1,7 +1,7 @@
-"""Messages of `swarmctl.control.commit.protocol`: bytes of one intent, and the newest good one of every peer.
+"""Trajectory messages of `swarmctl.control.commit.protocol`: their encoding, and the newest one of every peer.
 
-Layout, little-endian: a header; the committed trajectory; a proposal, if any; acknowledgements (agent, number). A
-trajectory is t0, step, count, then positions and velocities as float32.
+The layout is little-endian: a header, the committed trajectory, a proposal if there is one, and acknowledgements
+(agent, number). A trajectory is t0, step and count, then positions and velocities as float32.
 """
 
 from __future__ import annotations
@@ -22,25 +22,25 @@ from swarmctl.core.types import Array
 TRAJECTORY_VERSION = 2
 MAX_POINTS = 2000
 MAX_STEP_US = 500_000
-MAX_BEGIN_US = 10_000_000  # from now: what begins later is of another clock
+MAX_BEGIN_US = 10_000_000  # from now; a trajectory that begins later comes from another clock
 MAX_ACKNOWLEDGED = 256
 _MAGIC = b"SI"
-_HEADER = struct.Struct("<2sBBIIIqH2x")  # magic version flags agent boot seq said acknowledgements
-_PROPOSES, _IS_COMMITTED = 1, 2
-_PROPOSAL = struct.Struct("<Qq")  # number, time it was made
+_HEADER = struct.Struct("<2sBBIIIqH2x")  # magic version flags agent boot seq sent count
+_HAS_PROPOSAL, _IS_COMMITTED = 1, 2
+_PROPOSAL = struct.Struct("<Qq")  # number, time of proposal
 _TRAJECTORY = struct.Struct("<qiH2x")
 _ACKNOWLEDGEMENT = struct.Struct("<IQ")
 
-Memory = dict[bytes, Trajectory]  # trajectories by their bytes
+Memory = dict[bytes, Trajectory]  # decoded trajectories by their bytes
 
 
 def encode_trajectory_message(message: TrajectoryMessage) -> bytes:
-    """Bytes of one message."""
+    """Encode one message."""
     parts = [
         _HEADER.pack(
             _MAGIC,
             TRAJECTORY_VERSION,
-            _PROPOSES * (message.proposal is not None) | _IS_COMMITTED * message.is_committed,
+            _HAS_PROPOSAL * (message.proposal is not None) | _IS_COMMITTED * message.is_committed,
             message.agent,
             message.boot_id,
             message.seq,
@@ -57,27 +57,28 @@ def encode_trajectory_message(message: TrajectoryMessage) -> bytes:
 
 
 def decode_trajectory_message(payload: bytes, memory: Memory | None = None) -> TrajectoryMessage | None:
-    """The message; None unless magic, version, lengths and every number are good.
+    """Decode one message; None unless magic, version, lengths and all numbers are valid.
 
-    `memory` holds the trajectories of the message before: one that is said again is the same object again.
+    `memory` holds the trajectories of the previous message: a trajectory that is repeated becomes the same object, by
+    which the protocol knows that it has checked it before.
     """
     try:
         magic, version, flags, agent, boot_id, seq, sent_utc_us, count = _HEADER.unpack_from(payload)
         if magic != _MAGIC or version != TRAJECTORY_VERSION or flags > 3 or count > MAX_ACKNOWLEDGED:
             return None
-        known, said = memory or {}, Memory()
-        committed, at = _decode_trajectory(payload, _HEADER.size, known, said)
+        known, sent = memory or {}, Memory()
+        committed, at = _decode_trajectory(payload, _HEADER.size, known, sent)
         proposal = None
-        if flags & _PROPOSES:
+        if flags & _HAS_PROPOSAL:
             number, made_utc_us = _PROPOSAL.unpack_from(payload, at)
-            trajectory, at = _decode_trajectory(payload, at + _PROPOSAL.size, known, said)
+            trajectory, at = _decode_trajectory(payload, at + _PROPOSAL.size, known, sent)
             proposal = Proposal(number, made_utc_us, agent, trajectory)
         if len(payload) != at + count * _ACKNOWLEDGEMENT.size:
             return None
         acknowledged = dict(_ACKNOWLEDGEMENT.iter_unpack(payload[at:]))
         if memory is not None:
             memory.clear()
-            memory.update(said)
+            memory.update(sent)
         return TrajectoryMessage(
             agent, boot_id, seq, sent_utc_us, bool(flags & _IS_COMMITTED), committed, proposal, acknowledged
         )
@@ -90,33 +91,33 @@ def _encode_trajectory(trajectory: Trajectory) -> bytes:
     return _TRAJECTORY.pack(trajectory.t0_utc_us, trajectory.dt_us, len(points)) + points.tobytes()
 
 
-def _decode_trajectory(payload: bytes, at: int, known: Memory, said: Memory) -> tuple[Trajectory, int]:
-    """The trajectory that begins there, and where it ends.
+def _decode_trajectory(payload: bytes, at: int, known: Memory, sent: Memory) -> tuple[Trajectory, int]:
+    """Return the trajectory encoded at offset `at`, and the offset of its end.
 
     Raises:
-        ValueError, struct.error: it is none.
+        ValueError, struct.error: the bytes are no trajectory.
     """
     t0_utc_us, dt_us, count = _TRAJECTORY.unpack_from(payload, at)
     end = at + _TRAJECTORY.size + 24 * count
     body = payload[at:end]
     if body in known:
-        said[body] = known[body]
-        return said[body], end
+        sent[body] = known[body]
+        return sent[body], end
     at += _TRAJECTORY.size
     if not 2 <= count <= MAX_POINTS or not 0 < dt_us <= MAX_STEP_US or len(payload) < at + 24 * count:
         raise ValueError("no trajectory")
     points: Array = np.frombuffer(payload, "<f4", 6 * count, at).reshape(count, 6).astype(np.float64)
     if not np.isfinite(points).all():
         raise ValueError("not finite")
-    said[body] = Trajectory(t0_utc_us, dt_us, points[:, :3].copy(), points[:, 3:].copy())
-    return said[body], end
+    sent[body] = Trajectory(t0_utc_us, dt_us, points[:, :3].copy(), points[:, 3:].copy())
+    return sent[body], end
 
 
 class PeerTrajectories:
-    """Newest good message of every peer, whatever its age: nothing is newer than what it says.
+    """Keeps the newest valid message of every peer, whatever its age.
 
     Args:
-        peers: agent numbers that are listened to, without the own one.
+        peers: numbers of the other agents.
         rate_hz, refusals, attendance: see `SenderVerifier`.
     """
 
@@ -130,18 +131,18 @@ class PeerTrajectories:
         self.newest: dict[int, TrajectoryMessage] = {}
 
     def offer(self, sender: str, payload: bytes, utc_us: int) -> None:
-        """Judge one message; `sender` is the name the bus vouches for, `utc_us` now."""
+        """Check one message and keep it if it is accepted; the bus guarantees the name `sender`, `utc_us` is now."""
         memory = dict(self._memory.get(sender, {}))
         message = decode_trajectory_message(payload, memory)
         if message is None or (reason := self._refusal(sender, message, utc_us)):
             self._refusals.add(sender, TRAJECTORY.name, MALFORMED if message is None else reason, utc_us)
             return
-        said = ReceivedMessage(message.boot_id, message.seq, min(message.sent_utc_us, utc_us + MAX_LEAD_US), payload)
-        if self._verifiers[message.agent].accepts(said, utc_us):
+        sent = ReceivedMessage(message.boot_id, message.seq, min(message.sent_utc_us, utc_us + MAX_LEAD_US), payload)
+        if self._verifiers[message.agent].accepts(sent, utc_us):
             self.newest[message.agent], self._memory[sender] = message, memory
 
     def acknowledgements(self) -> dict[int, int]:
-        """Number of the proposal that each peer is known to make now."""
+        """Return the number of the current proposal of each peer that has one."""
         return {agent: i.proposal.number for agent, i in self.newest.items() if i.proposal is not None}
 
     def _refusal(self, sender: str, message: TrajectoryMessage, utc_us: int) -> str:

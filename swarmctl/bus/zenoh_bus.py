@@ -1,8 +1,8 @@
-"""The Zenoh bus: a client for agents and operators, and the router process they meet at.
+"""The Zenoh bus: a client for agents and operators, and the router process that connects them.
 
-One Unix socket in a private directory, no port, no discovery. Samples wait in one ring per topic and sender and are
-drained by the tick: no callback, no FIFO, nothing that could block reception. Freshness is judged by
-`swarmctl.bus.peers` from the payload; nothing here looks into one.
+It uses one Unix socket in a private directory, without port or discovery. Samples wait in one ring for each topic and
+sender until the tick drains them: no callback and no FIFO could block reception. `swarmctl.bus.peers` judges freshness
+from the payload; nothing here looks into a payload.
 
 `python -m swarmctl.bus.zenoh_bus --router unixsock-stream/DIR/bus.sock` is the router.
 """
@@ -27,7 +27,7 @@ from swarmctl.errors import StartError, SwarmError
 from swarmctl.process_lifetime import die_with_parent, remove_socket
 
 SCHEME = "unixsock-stream/"
-NO_BUS = "none"  # endpoint of an agent that flies by itself
+NO_BUS = "none"  # endpoint of an agent without a bus
 CONNECT_TIMEOUT_MS = 10_000
 CLOSE_DEADLINE_S = 2.0
 _MAX_MESSAGE_BYTES = 1 << 20
@@ -45,15 +45,15 @@ _COMMON: dict[str, Any] = {
 
 
 class ZenohBus:
-    """A client session that implements `swarmctl.bus.peers.Bus`.
+    """Implements `swarmctl.bus.peers.Bus` by a client session.
 
     Args:
         endpoint: the router's, for example `unixsock-stream//tmp/swarm-x/bus.sock`.
-        run: name of the run; other runs are never heard.
+        run: name of the run, which separates it from other runs.
         me: own sender name.
-        listen: senders to hear, per topic.
-        lease_ms: others declare this session dead after so much silence of its link.
-        connect_timeout_ms: how long to wait for the router.
+        subscriptions: senders to receive, per topic.
+        lease_ms: silence of the link after which the router drops this session.
+        connect_timeout_ms: longest wait for the router.
 
     Raises:
         StartError: the router does not answer in time.
@@ -64,7 +64,7 @@ class ZenohBus:
         endpoint: str,
         run: str,
         me: str,
-        listen: Mapping[Topic, Sequence[str]],
+        subscriptions: Mapping[Topic, Sequence[str]],
         lease_ms: int = 1500,
         connect_timeout_ms: int = CONNECT_TIMEOUT_MS,
     ) -> None:
@@ -73,22 +73,22 @@ class ZenohBus:
         self._publishers = {topic: self._publisher(f"{prefix}/{me}/{topic.name}", topic) for topic in TOPICS}
         self._subscribers = {
             topic: [(sender, self._subscriber(f"{prefix}/{sender}/{topic.name}", topic)) for sender in senders]
-            for topic, senders in listen.items()
+            for topic, senders in subscriptions.items()
         }
         self._alive: set[str] = set()
         self._arrivals: Counter[str] = Counter()
-        self._lives = self._session.liveliness().declare_subscriber(
+        self._token_samples = self._session.liveliness().declare_subscriber(
             f"{prefix}/*/alive", zenoh.handlers.RingChannel(_ALIVE_RING), history=True
         )
         self._token = self._session.liveliness().declare_token(f"{prefix}/{me}/alive")
 
     def publish(self, topic: Topic, payload: bytes) -> None:
-        """Hand over to the session; dropped when its queue is full or the bus is gone."""
+        """Pass a message to the session; it is dropped when the queue is full or the bus is lost."""
         with contextlib.suppress(zenoh.ZError):
             self._publishers[topic].put(payload)
 
     def receive(self, topic: Topic) -> list[tuple[str, bytes]]:
-        """Everything in the rings of a topic, oldest first for each sender; at most one ring of each."""
+        """Return (sender, payload) of a topic, oldest first for each sender, at most one ring of each."""
         arrived: list[tuple[str, bytes]] = []
         for sender, subscriber in self._subscribers.get(topic, ()):
             payloads = (sample.payload for sample in _drain(subscriber, topic.ring))
@@ -96,25 +96,25 @@ class ZenohBus:
         return arrived
 
     def alive(self) -> frozenset[str]:
-        """Senders whose liveliness token is present; empty, even of this one, while the router is gone."""
+        """Return senders whose liveliness token is present; none, not even this one, while the router is lost."""
         self._watch_tokens()
         return frozenset(self._alive)
 
     def arrivals(self) -> Mapping[str, int]:
-        """How often each token has come; one that left and came back between two looks has come twice."""
+        """Return how often each token has appeared; one that left and returned between two calls counts twice."""
         self._watch_tokens()
         return self._arrivals
 
     def close(self) -> None:
-        """Leave the bus; gives up after `CLOSE_DEADLINE_S`, since a link that lost its other end can hold it up."""
+        """Leave the bus; give up after `CLOSE_DEADLINE_S`, since a link without its other end can block."""
         _close_within(self._session, CLOSE_DEADLINE_S)
 
     def _watch_tokens(self) -> None:
-        for sample in _drain(self._lives, _ALIVE_RING):
+        for sample in _drain(self._token_samples, _ALIVE_RING):
             sender = str(sample.key_expr).split("/")[2]
             if sample.kind != zenoh.SampleKind.PUT:
                 self._alive.discard(sender)
-            elif sender not in self._alive:  # a second process of that name has not come anew
+            elif sender not in self._alive:  # a second process of the same name is no new arrival
                 self._alive.add(sender)
                 self._arrivals[sender] += 1
 
@@ -131,7 +131,7 @@ class ZenohBus:
 
 
 def run_router(endpoint: str) -> None:
-    """Route until SIGTERM, which the caller has blocked, then take the socket and its directory away.
+    """Run the router until SIGTERM, which the caller has blocked, then remove the socket and its directory.
 
     Raises:
         StartError: the endpoint is not a Unix socket in a private directory, or another router holds it.
@@ -150,10 +150,10 @@ def run_router(endpoint: str) -> None:
 
 
 def socket_file(endpoint: str) -> Path:
-    """Path of a Unix socket endpoint.
+    """Return the path of a Unix socket endpoint.
 
     Raises:
-        StartError: it is of another kind, or too long for the kernel.
+        StartError: the endpoint is of another kind, or its path too long for the kernel.
     """
     path = endpoint.removeprefix(SCHEME)
     if path == endpoint or not path.startswith("/"):
@@ -202,7 +202,7 @@ def _open(settings: Mapping[str, Any]) -> Any:
 
 
 def _drain(subscriber: Any, limit: int) -> list[Any]:
-    """At most `limit` samples, so that a flood can't hold the caller."""
+    """Return at most `limit` samples, so that a flood cannot block the caller."""
     samples: list[Any] = []
     with contextlib.suppress(zenoh.ZError):  # the session is closed
         while len(samples) < limit and (sample := subscriber.try_recv()) is not None:
@@ -221,7 +221,7 @@ def _close_within(session: Any, deadline_s: float) -> None:
 
 
 def main() -> int:
-    """Entry of the router process."""
+    """Run the router process from the command line."""
     parser = argparse.ArgumentParser(prog="python -m swarmctl.bus.zenoh_bus", description="Router of one swarm's bus.")
     parser.add_argument("--router", required=True, metavar="ENDPOINT", help=f"{SCHEME}/DIR/bus.sock")
     parser.add_argument("--die-with-parent", action="store_true", help="end when the parent process ends")

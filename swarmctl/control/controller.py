@@ -1,4 +1,4 @@
-"""The controllers a config can choose from, behind one call."""
+"""The controllers that a configuration can choose from, behind one interface."""
 
 from __future__ import annotations
 
@@ -19,37 +19,37 @@ from swarmctl.core.types import NO_TIMES, Plan, PlanStatus
 
 
 class ControllerParams(Params):
-    """Which controller flies, and the parameters of each."""
+    """Selects the controller and holds the parameters of each."""
 
     kind: Literal["dmpc", "dmpc3", "mpc", "pid", "open_loop"] = "dmpc"
-    mpc: MpcParams = MpcParams()  # of dmpc, dmpc3 (all axes in one problem) and mpc (nothing to keep clear of)
+    mpc: MpcParams = MpcParams()  # for dmpc, dmpc3 (all axes in one problem) and mpc (without keep-outs)
     pid: PidParams = PidParams()
 
 
 class Controller(Protocol):
-    """Plans one tick. Failure is a value: `Plan.status`."""
+    """Plans one tick; failure is a value, `Plan.status`."""
 
     @property
     def dt_us(self) -> int:
-        """Time between plan points."""
+        """Return the time between plan points [us]."""
 
     @property
     def steps(self) -> int:
-        """Steps of a plan, N."""
+        """Return the number of steps of a plan, N."""
 
     @property
     def longest(self) -> int:
-        """Steps of reference needed."""
+        """Return the number of steps of reference that a problem has to hold."""
 
     def plan(self, problem: Problem) -> Plan:
-        """What to fly from `problem.start` on. Never raises for a problem without a solution."""
+        """Return a plan from `problem.start` on. Never raises for a problem without a solution."""
 
     def reset(self) -> None:
-        """Forget the past: somebody else has flown."""
+        """Forget the past, after a handover."""
 
 
 class _Mpc:
-    """Both kinds of MPC keep nothing between ticks but their warm start."""
+    """Adapts both kinds of MPC, which keep nothing between ticks but their warm start."""
 
     def __init__(self, mpc: SwarmMpc | JointMpc, alone: bool) -> None:
         self._mpc, self._alone = mpc, alone
@@ -63,6 +63,8 @@ class _Mpc:
 
 
 class _Pid:
+    """Adapts the PID cascade."""
+
     def __init__(self, params: PidParams) -> None:
         self._pid = PidController(params)
         self.dt_us, self.steps, self.longest = self._pid.dt_us, self._pid.steps, self._pid.steps
@@ -75,7 +77,7 @@ class _Pid:
 
 
 class _OpenLoop:
-    """Zero input (thesis 1.6): level and no thrust, whatever the state."""
+    """Commands zero input (thesis 1.6): level attitude and no thrust, whatever the state."""
 
     def __init__(self, params: MpcParams) -> None:
         self.dt_us, self.steps = round(params.dt_s * 1e6), params.horizon_xy
@@ -101,7 +103,7 @@ def make_controller(
     slots: int,
     stopwatch_ns: Callable[[], int],
 ) -> Controller:
-    """The controller a config asks for; `slots` is how many keep-outs it can hold at once."""
+    """Return the controller that a configuration asks for; `slots` is the number of keep-outs it can hold at once."""
     if params.kind == "pid":
         return _Pid(params.pid)
     if params.kind == "open_loop":

@@ -1,4 +1,4 @@
-"""What is flown when there is no plan: come to rest, then stay. No solver, no neighbours, no way to fail."""
+"""The plan flown when planning fails: brake to rest, then hold. It needs neither solver nor neighbours."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.types import NO_TIMES, Array, Plan, PlanStatus
 
 _DAMPING_1_S = 4.0
-_DAMPING_RAD = 0.5  # over the lag: more would swing
+_DAMPING_RAD = 0.5  # damping times lag: more would oscillate
 _ACCEL_MAX_M_S2 = 3.0
-_TILT_RATE_1_S = 2.5  # of (u_x, u_y): a faster turn would saturate rotors and be lost
+_TILT_RATE_1_S = 2.5  # of (u_x, u_y): faster attitude changes would saturate rotors
 
 
 def rest_plan(
     start: Start, at_ned_m: Array | None, disturbance_ned_m_s2: Array, lag: Lag | None, dt_us: int, steps: int
 ) -> Plan:
-    """Brake, and when `at_ned_m` (3,) is given return to it, as a critically damped spring of bounded acceleration.
+    """Brake, or return to `at_ned_m` (3,) if given, like a critically damped spring of bounded acceleration.
 
     The path is the motion this law gives a vehicle with that `lag`, so that peers can keep clear of it.
     """
@@ -34,10 +34,14 @@ def rest_plan(
         if at_ned_m is not None:
             wanted = wanted + stiffness * (at_ned_m - pos[k])
         accel = np.clip(wanted, -_ACCEL_MAX_M_S2, _ACCEL_MAX_M_S2)
-        lift = np.array([0.0, 0.0, GRAVITY_M_S2]) + disturbance_ned_m_s2 - accel  # thrust vector over mass, up is +
+        thrust_vector = (
+            np.array([0.0, 0.0, GRAVITY_M_S2]) + disturbance_ned_m_s2 - accel
+        )  # thrust vector over mass, up positive
         slew = _TILT_RATE_1_S * dt_s
-        u = np.clip(lift[:2] / float(np.sqrt(lift @ lift)), commanded - slew, commanded + slew)
-        thrust = float(lift[2]) / float(np.sqrt(1.0 - u @ u))  # carries the weight at the tilt that is flown
+        u = np.clip(
+            thrust_vector[:2] / float(np.sqrt(thrust_vector @ thrust_vector)), commanded - slew, commanded + slew
+        )
+        thrust = float(thrust_vector[2]) / float(np.sqrt(1.0 - u @ u))  # supports the weight at the commanded tilt
         virtual[k], commanded = (u[0], u[1], thrust), u
         acts = u
         if lag is not None:

@@ -1,9 +1,9 @@
-"""How an attitude loop follows its setpoint: a second-order lag, exact for commands held over equal steps.
+"""Second-order lag of an attitude loop behind its setpoint, exact for commands held over equal steps.
 
     tilt'' = w^2 (u - tilt) - 2 zeta w tilt'
 
-u is the commanded, tilt the realised horizontal part of the body's down axis. Fitted to a real PX4 quadrotor: w 9 to
-10.5 rad/s, zeta 0.95 to 1.05, behind a dead time of 80 ms, which is not part of it (`VehicleModelParams.delay_s`).
+where u is the commanded and tilt the realised horizontal part of the body's down axis. A real PX4 quadrotor has w 9 to
+10.5 rad/s, zeta 0.95 to 1.05, and a dead time of 80 ms, which is not part of the lag (`VehicleModelParams.delay_s`).
 """
 
 from __future__ import annotations
@@ -15,24 +15,24 @@ import numpy as np
 
 from swarmctl.core.types import Array
 
-_TERMS = 16  # of the Taylor series: exact to rounding over what one step covers
-_STEP_RAD = 0.5  # of the natural frequency
+_TERMS = 16  # terms of the Taylor series: exact to rounding over one step
+_STEP_RAD = 0.5  # largest step, times the natural frequency
 
 
 @dataclass(frozen=True, slots=True)
 class Lag:
-    """A second-order lag."""
+    """A second-order lag with natural frequency [rad/s] and damping ratio."""
 
     natural_rad_s: float
     damping: float
 
     @property
     def ramp_delay_s(self) -> float:
-        """How far a steady ramp of the command is ahead of what is realised."""
+        """Return the time [s] by which a steady ramp of the command leads the realised tilt."""
         return 2.0 * self.damping / self.natural_rad_s
 
     def advance(self, tilt: float, rate_1_s: float, command: float, t_s: float) -> tuple[float, float, float]:
-        """Tilt, its rate and its integral [s] after `t_s` of a held command."""
+        """Return tilt [1], its rate [1/s] and its integral [s] after `t_s` of a held command."""
         count = max(1, math.ceil(self.natural_rad_s * t_s / _STEP_RAD))
         total = 0.0
         for _ in range(count):
@@ -41,7 +41,7 @@ class Lag:
         return tilt, rate_1_s, total
 
     def _step(self, tilt: float, rate_1_s: float, command: float, t_s: float) -> tuple[float, float, float]:
-        """Taylor series of e = tilt - command, e'' = -w^2 e - 2 zeta w e', of its derivative and its integral."""
+        """Sum the Taylor series of e = tilt - command, e'' = -w^2 e - 2 zeta w e', of its rate and its integral."""
         stiffness, friction = self.natural_rad_s**2, 2.0 * self.damping * self.natural_rad_s
         this, following = tilt - command, rate_1_s  # n-th derivative of e, and the next
         power = 1.0  # t^n / n!
@@ -57,7 +57,7 @@ class Lag:
 
 @dataclass(frozen=True, slots=True)
 class LagResponse:
-    """Mean realised tilt over each of `steps` equal steps: of a command held over one step, and of the start alone."""
+    """Holds mean realised tilts over equal steps: due to a command held over one step, and to the initial state."""
 
     of_command: Array  # (steps, steps) lower triangular
     of_tilt: Array  # (steps,)
@@ -65,7 +65,7 @@ class LagResponse:
 
 
 def lag_response(lag: Lag | None, dt_s: float, steps: int) -> LagResponse:
-    """Without a lag the command is realised at once, wherever the tilt was."""
+    """Return the response over `steps` steps of `dt_s`; without a lag the command is realised at once."""
     if lag is None:
         return LagResponse(np.eye(steps), np.zeros(steps), np.zeros(steps))
     of_tilt, of_rate_s, held = (_means(lag, *start, dt_s, steps) for start in ((1, 0, 0), (0, 1, 0), (0, 0, 1)))

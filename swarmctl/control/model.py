@@ -1,4 +1,4 @@
-"""What the controller believes of its vehicle: delay, lag, drag, bounds, and where it will be when a setpoint acts.
+"""The controller's model of its vehicle: delay, lag, drag, bounds, and prediction to when a setpoint acts.
 
 The model knows no mass: thrust enters as acceleration (thrust over mass), and the estimator in
 `swarmctl.control.estimation.disturbance` finds the hover thrust that converts it to the autopilot's 0..1.
@@ -20,53 +20,53 @@ from swarmctl.core.types import Array, VehicleState
 
 
 class VehicleModelParams(Params):
-    """Bounds and lags of the airframe, not of the controller."""
+    """Sets bounds and lags of the airframe, independent of the controller."""
 
-    delay_s: float = Field(0.06, ge=0, le=1)  # dead time: from sending a setpoint to the body beginning to follow it
-    attitude_rad_s: float = Field(0.0, ge=0, le=100)  # natural frequency of the attitude's answer; 0: follows at once
-    attitude_damping: float = Field(1.0, ge=0.3, le=3)  # of that answer
+    delay_s: float = Field(0.06, ge=0, le=1)  # dead time from sending a setpoint to the first response
+    attitude_rad_s: float = Field(0.0, ge=0, le=100)  # natural frequency of the attitude response; 0: immediate
+    attitude_damping: float = Field(1.0, ge=0.3, le=3)  # damping ratio of the attitude response
     drag_1_s: float = Field(0.0, ge=0, le=10)  # linear drag over mass
-    hover_thrust_01: float = Field(0.5, gt=0.05, lt=0.95)  # first guess; estimated in flight
-    thrust_min_01: float = Field(0.05, ge=0, lt=1)  # motors keep turning
+    hover_thrust_01: float = Field(0.5, gt=0.05, lt=0.95)  # initial value; estimated in flight
+    thrust_min_01: float = Field(0.05, ge=0, lt=1)  # keeps motors turning
     thrust_max_01: float = Field(1.0, gt=0, le=1)
     tilt_max_rad: float = Field(0.6, gt=0, lt=1.5)
 
     def lag(self) -> Lag | None:
-        """How attitude setpoints are followed; None at once."""
+        """Return the lag of the attitude behind its setpoints; None if it follows at once."""
         return Lag(self.attitude_rad_s, self.attitude_damping) if self.attitude_rad_s > 0 else None
 
     def u_max(self) -> float:
-        """Largest horizontal part of the body's down axis."""
+        """Return the largest horizontal part of the body's down axis."""
         return math.sin(self.tilt_max_rad)
 
 
 class Predictor:
-    """Own motion from the newest sample to the moment a setpoint sent now acts.
+    """Predicts the own motion from the newest sample to the time at which a setpoint sent now acts.
 
-    After the dead time the thrust is there at once and the attitude follows its lag, from the measured attitude and
-    body rates on. Without a lag the body flies the command of `t - delay`.
+    After the dead time the thrust acts at once and the attitude follows its lag, from the measured attitude and body
+    rates on. Without a lag the body follows the command of `t - delay`.
     """
 
     def __init__(self, params: VehicleModelParams) -> None:
         self._delay_us = round(params.delay_s * 1e6)
         self._lag, self._drag_1_s = params.lag(), params.drag_1_s
-        self._sent: deque[tuple[int, Array]] = deque(maxlen=128)  # time it acts from, virtual controls (3,)
+        self._sent: deque[tuple[int, Array]] = deque(maxlen=128)  # time from which it acts, virtual controls (3,)
 
     @property
     def delay_us(self) -> int:
-        """From sending to acting [us]."""
+        """Return the time from sending to acting [us]."""
         return self._delay_us
 
     def sent(self, now_us: int, virtual: Array) -> None:
-        """Remember a command: virtual controls (3,), which act after the delay."""
+        """Remember a command, virtual controls (3,), that acts after the delay."""
         self._sent.append((now_us + self._delay_us, virtual))
 
     def clear(self) -> None:
-        """Forget what was sent: somebody else has flown."""
+        """Forget remembered commands, after a handover."""
         self._sent.clear()
 
     def acting(self, t_us: int) -> Array | None:
-        """Virtual controls (3,) that have passed the dead time at `t_us`; None before the first."""
+        """Return the virtual controls (3,) that act at `t_us`; None before the first."""
         acting = None
         for start_us, virtual in self._sent:
             if start_us > t_us:
@@ -75,10 +75,10 @@ class Predictor:
         return acting
 
     def start(self, state: VehicleState, until_us: int, disturbance_ned_m_s2: Array, held: Array) -> Start:
-        """Where a plan begins that acts from `until_us` on, after `held` (3,) was commanded last.
+        """Return the start of a plan that acts from `until_us` on, after `held` (3,) was commanded last.
 
-        The remembered commands act one after the other, each from its own time; before the first one the vehicle is
-        taken to hold itself against the disturbance.
+        The remembered commands act one after the other, each from its own time. Before the first one the vehicle is
+        assumed to compensate the disturbance.
         """
         pos, vel, t_us = state.pos_ned_m, state.vel_ned_m_s, state.t_us
         down = body_z_ned(state.q_nb)
@@ -123,13 +123,13 @@ class Predictor:
 
 
 def tilt_rate(state: VehicleState) -> Array:
-    """Rate (2,) [1/s] of the horizontal part of the body's down axis."""
+    """Return the rate (2,) [1/s] of the horizontal part of the body's down axis."""
     p, q, _ = (float(w) for w in state.rate_frd_rad_s)
     return rotate_to_ned(state.q_nb, np.array([q, -p, 0.0]))[:2]
 
 
 def acceleration(virtual: Array) -> Array:
-    """Acceleration (3,) NED of virtual controls (u_x, u_y, thrust over mass), gravity included (thesis 3.2)."""
+    """Return the acceleration (3,) NED [m/s2] of virtual controls (3,), gravity included (thesis 3.2)."""
     ux, uy, thrust = (float(c) for c in virtual)
     down = max(0.0, 1.0 - ux * ux - uy * uy) ** 0.5
     return np.array([-thrust * ux, -thrust * uy, GRAVITY_M_S2 - thrust * down])

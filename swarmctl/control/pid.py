@@ -20,7 +20,7 @@ from swarmctl.core.types import NO_TIMES, Array, Plan, PlanStatus, Reference
 
 
 class PidParams(Params):
-    """Gains (kP, kI, kD) in the thesis' signs; the defaults are its trajectory set."""
+    """Sets gains (kP, kI, kD) in the thesis' signs; the defaults are its trajectory set."""
 
     derivative: Literal["error", "measurement"] = "error"
     x: Vec3 = (-0.25, -0.001, -0.3)  # m -> rad of pitch
@@ -31,11 +31,11 @@ class PidParams(Params):
     thrust_max_m_s2: float = Field(20.0, gt=9.9, le=100)
     integral_max: float = Field(5.0, ge=0, le=1e3)  # m s
     dt_s: float = Field(0.02, gt=0.001, le=0.5)
-    path_steps: int = Field(40, ge=2, le=200)  # length of the shared path, at constant velocity
+    path_steps: int = Field(40, ge=2, le=200)  # points of the shared path, at constant velocity
 
 
 class PidController:
-    """Keeps integrals and last errors between ticks."""
+    """Computes virtual controls from position errors; keeps integrals and last errors between ticks."""
 
     def __init__(self, params: PidParams) -> None:
         self._params = params
@@ -47,18 +47,20 @@ class PidController:
 
     @property
     def dt_us(self) -> int:
+        """Return the time between plan points [us]."""
         return round(self._params.dt_s * 1e6)
 
     @property
     def steps(self) -> int:
+        """Return the number of steps of a plan."""
         return self._params.path_steps
 
     def reset(self) -> None:
-        """Forget the past: somebody else has flown."""
+        """Forget integrals and last errors, after a handover."""
         self._integral, self._last = np.zeros(3), None
 
     def plan(self, problem: Problem) -> Plan:
-        """Virtual controls of this tick; the path is the own velocity, continued."""
+        """Return a plan that holds the virtual controls of this tick; its path continues the own velocity."""
         p, start = self._params, problem.start
         error = problem.reference.pos_ned_m[0] - start.pos_ned_m
         watched = error if p.derivative == "error" else -start.pos_ned_m
@@ -79,7 +81,7 @@ class PidController:
         return Plan(PlanStatus.OK, start.t_us, self.dt_us, pos, vel, held, NO_TIMES, 0, 0.0, 0.0, 0.0)
 
     def _ahead(self, reference: Reference) -> Array:
-        """Pitch, roll and thrust over mass (3,) that the reference's acceleration takes (linearised at hover)."""
+        """Return pitch, roll and thrust over mass (3,) for the reference's acceleration (linearised at hover)."""
         accel = (reference.vel_ned_m_s[1] - reference.vel_ned_m_s[0]) / self._params.dt_s
         north, east, down = (self._params.accel_feed_forward * float(a) for a in accel)
         return np.array([-north / GRAVITY_M_S2, east / GRAVITY_M_S2, -down])

@@ -1,4 +1,4 @@
-"""Virtual controls -> attitude and normalised thrust."""
+"""Conversion of virtual controls to an attitude setpoint with normalised thrust."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from swarmctl.control.model import VehicleModelParams
 from swarmctl.core.frames import GRAVITY_M_S2, quat_from_body_z
 from swarmctl.core.types import Array, AttitudeSetpoint
 
-VALID_US = 100_000  # a setpoint that could not leave by then is stale
+VALID_US = 100_000  # a setpoint is stale after this time
 
 
 def setpoint_of(
     virtual: Array, yaw_rad: float, hover_thrust_01: float, now_us: int, params: VehicleModelParams
 ) -> AttitudeSetpoint:
-    """Attitude and thrust of virtual controls (u_x, u_y, thrust over mass [m/s2]).
+    """Return the attitude and thrust of virtual controls (3,): u_x, u_y, thrust over mass [m/s2].
 
-    The body down axis is (u_x, u_y, sqrt(1 - u_x^2 - u_y^2)): thesis (3.26) and (3.33) without their singularity, tilt
-    limited by shortening (u_x, u_y). Thrust is linear in the autopilot's 0..1, `hover_thrust_01` carrying the weight.
+    The body down axis is (u_x, u_y, sqrt(1 - u_x^2 - u_y^2)): thesis (3.26) and (3.33) without their singularity. Tilt
+    is limited by shortening (u_x, u_y). Thrust is linear in the autopilot's 0..1; `hover_thrust_01` holds the weight.
     """
     ux, uy, specific = (float(c) for c in virtual)
     tilt = math.hypot(ux, uy)

@@ -1,4 +1,4 @@
-"""The two clocks of a process, as one protocol that is passed in.
+"""The two clocks of a process behind one protocol, which is passed in as an argument.
 
 Monotonic microseconds (`now_us`) are for deadlines and ages inside this process; disciplined UTC microseconds
 (`utc_us`) are for everything that leaves it. The wall-clock implementation lives in `swarmctl.agent.runner`.
@@ -10,17 +10,17 @@ from typing import Protocol
 
 
 class Clock(Protocol):
-    """Source of time for an agent and its links."""
+    """Provides the time to an agent and its links."""
 
     def now_us(self) -> int:
-        """Monotonic time of this process [us]."""
+        """Return monotonic time of this process [us]."""
 
     def utc_us(self) -> int:
-        """Disciplined UTC [us since 1970], comparable between hosts."""
+        """Return disciplined UTC [us since 1970], comparable between hosts."""
 
 
 class SimClock:
-    """Simulated time: it moves only when told to. Both clocks tick together, `epoch_us` apart."""
+    """Simulated time, which moves only by `advance`. Both clocks tick together, `epoch_us` apart."""
 
     def __init__(self, epoch_us: int = 1_700_000_000_000_000) -> None:
         self._now_us = 0
@@ -33,7 +33,7 @@ class SimClock:
         return self._epoch_us + self._now_us
 
     def advance(self, step_us: int) -> None:
-        """Move time forward by `step_us` (> 0)."""
+        """Advance time by `step_us` (> 0)."""
         if step_us <= 0:
             raise ValueError(f"step_us: {step_us} must be positive")
         self._now_us += step_us

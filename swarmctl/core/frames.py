@@ -1,6 +1,6 @@
 """Rotations between body FRD and world NED. Quaternions are (w, x, y, z) and rotate body vectors into NED.
 
-The only conversions in the project; MAVLink uses the same conventions, so its codec rotates nothing.
+All conversions of the project are here; MAVLink uses the same conventions, so its codec rotates nothing.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 
 def quat_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Array:
-    """Quaternion (4,) wxyz body->NED of ZYX Euler angles [rad]."""
+    """Return the quaternion (4,) wxyz, body to NED, of ZYX Euler angles [rad]."""
     cr, sr = math.cos(roll_rad / 2), math.sin(roll_rad / 2)
     cp, sp = math.cos(pitch_rad / 2), math.sin(pitch_rad / 2)
     cy, sy = math.cos(yaw_rad / 2), math.sin(yaw_rad / 2)
@@ -31,7 +31,7 @@ def quat_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Array:
 
 
 def euler_from_quat(q_nb: Array) -> tuple[float, float, float]:
-    """ZYX Euler angles (roll, pitch, yaw) [rad] of a unit quaternion (4,) wxyz."""
+    """Return ZYX Euler angles (roll, pitch, yaw) [rad] of a unit quaternion (4,) wxyz."""
     w, x, y, z = (float(c) for c in q_nb)
     roll_rad = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch_rad = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
@@ -40,15 +40,15 @@ def euler_from_quat(q_nb: Array) -> tuple[float, float, float]:
 
 
 def body_z_ned(q_nb: Array) -> Array:
-    """Body down axis in NED (3,): the thesis' (u_x, u_y, c_phi c_theta) of eqs. (3.16), (3.23)."""
+    """Return the body down axis (3,) in NED: the thesis' (u_x, u_y, c_phi c_theta) of eqs. (3.16), (3.23)."""
     w, x, y, z = (float(c) for c in q_nb)
     return np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
 
 
 def quat_from_body_z(down_ned: Array, yaw_rad: float) -> Array:
-    """Quaternion (4,) wxyz whose body down axis is the unit vector `down_ned` (3,) and whose ZYX yaw is `yaw_rad`.
+    """Return the quaternion (4,) wxyz with body down axis `down_ned` (3,), a unit vector, and ZYX yaw `yaw_rad`.
 
-    The exact inverse of thesis eqs. (3.16) and (3.23), that is (3.26) and the consistent form of (3.33),
+    It is the exact inverse of thesis eqs. (3.16) and (3.23), that is (3.26) and the consistent form of (3.33),
     `phi = -asin(u_y c_psi - u_x s_psi)`, without their singularity in the measured angles.
     """
     ux, uy, uz = (float(c) for c in down_ned)

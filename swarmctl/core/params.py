@@ -1,6 +1,6 @@
-"""The parent of every parameter class: frozen, unknown keys refused, no NaN, no silent conversion from text.
+"""The base of every parameter class: frozen, no unknown keys, no NaN, no silent conversion from text.
 
-Bounds and units are written where the parameter is declared, so that a refusal can quote them.
+Bounds and units are declared with the parameter, so that an error message can quote them.
 """
 
 from __future__ import annotations
@@ -11,9 +11,9 @@ from pydantic import BaseModel, ConfigDict, Field
 
 
 class Params(BaseModel):
-    """Frozen configuration section."""
+    """Base of a frozen section of the configuration."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", strict=True, allow_inf_nan=False)
 
 
-Vec3 = Annotated[tuple[float, float, float], Field(strict=False)]  # TOML arrays are lists
+Vec3 = Annotated[tuple[float, float, float], Field(strict=False)]  # not strict: TOML arrays are lists

@@ -1,7 +1,7 @@
 """The byte layout of per-tick records: one table serves the bus, the run files and every reader.
 
-`TICK_DTYPE` is what an agent knows of its own tick, `TRUTH_DTYPE` what a simulator knows of a vehicle. Both are
-little-endian and fixed size, so a file of them is an array.
+`TICK_DTYPE` holds one tick of an agent, `TRUTH_DTYPE` one true state of a simulated vehicle. Both are little-endian and
+of fixed size, so a file of them is an array.
 """
 
 from __future__ import annotations
@@ -66,20 +66,20 @@ _TICK_FIELDS = TICK_DTYPE.names or ()
 
 
 def tick_row(record: TickRecord) -> NDArray[np.void]:
-    """One record as a (1,) structured array of `TICK_DTYPE`."""
+    """Return one record as a (1,) structured array of `TICK_DTYPE`."""
     row = np.zeros(1, TICK_DTYPE)
     row[0] = tuple(getattr(record, name) for name in _TICK_FIELDS)
     return row
 
 
 def pack_tick(record: TickRecord) -> bytes:
-    """Bytes of a record for the bus: a fixed row, the number of plan points (u16), the points as float32."""
+    """Encode a record for the bus: a fixed row, the number of plan points (u16), and the points as float32."""
     plan = np.ascontiguousarray(record.plan_pos_ned_m, dtype="<f4")
     return tick_row(record).tobytes() + _PLAN_HEADER.pack(len(plan)) + plan.tobytes()
 
 
 def unpack_tick(payload: bytes) -> tuple[NDArray[np.void], Array] | None:
-    """Inverse of `pack_tick`: the (1,) row and the plan (M, 3); None when the length does not fit."""
+    """Decode the bytes of `pack_tick` to the (1,) row and the plan (M, 3); None when the length does not fit."""
     size = TICK_DTYPE.itemsize
     if len(payload) < size + _PLAN_HEADER.size:
         return None

@@ -1,7 +1,7 @@
-"""What a simulated flight can be given beside its airframe: wind, battery, rotors, ground effect, faults.
+"""Parameters of realism in simulated flights: wind, battery, rotors, ground effect, faults.
 
-Shared by the configuration of a run (`[sitl.wind]`, `[[sitl.faults]]`, ...) and the simulator itself. Everything is off
-by default. Data only: the physics is in `sitl`.
+The configuration of a run (`[sitl.wind]`, `[[sitl.faults]]`, ...) and the simulator share them. Everything is off by
+default. The module holds data only: the physics is in `sitl`.
 """
 
 from __future__ import annotations
@@ -19,29 +19,29 @@ Wind3 = Annotated[tuple[_Speed, _Speed, _Speed], Field(strict=False)]
 
 
 class WindParams(Params):
-    """Air that moves: a mean, turbulence on it, and one gust."""
+    """Sets the wind: a mean, turbulence, and one gust."""
 
-    mean_ned_m_s: Wind3 = (0.0, 0.0, 0.0)  # where it blows to
-    turbulence_m_s: float = Field(0.0, ge=0, le=30)  # wind at 6 m that sets Dryden's intensity; light is 7.7
+    mean_ned_m_s: Wind3 = (0.0, 0.0, 0.0)  # velocity of the air
+    turbulence_m_s: float = Field(0.0, ge=0, le=30)  # wind at 6 m, sets the Dryden intensity; light is 7.7
     gust_ned_m_s: Wind3 = (0.0, 0.0, 0.0)  # peak of a 1-cosine gust
-    gust_at_s: float = Field(0.0, ge=0, le=86400)  # since the simulator's start
+    gust_at_s: float = Field(0.0, ge=0, le=86400)  # after the simulator's start
     gust_for_s: float = Field(2.0, ge=0.1, le=600)
 
 
 class BatteryParams(Params):
-    """One pack of lithium-polymer cells; sagging voltage takes thrust away."""
+    """Sets a pack of lithium-polymer cells, whose sagging voltage reduces thrust."""
 
-    capacity_mah: float = Field(0.0, ge=0, le=100000)  # 0: it never empties and never sags
+    capacity_mah: float = Field(0.0, ge=0, le=100000)  # 0: no discharge and no sag
     resistance_ohm: float = Field(0.02, ge=0, le=2)  # of the whole pack; x500's 4 cells 0.02, crazyflie's one cell 0.2
     charge_01: float = Field(1.0, gt=0, le=1)  # at the start
 
 
 class FaultRule(NamedTuple):
-    """What a kind of fault takes as its value."""
+    """Describes the value that a kind of fault takes."""
 
     low: float
     high: float
-    default: float | None  # None: has to be given
+    default: float | None  # None: the value is required
     meaning: str
 
 
@@ -80,10 +80,10 @@ FaultKind = Literal[
 
 
 class FaultParams(Params):
-    """Something that goes wrong, on one vehicle or on all."""
+    """Describes one injected fault, on one vehicle or on all."""
 
     kind: FaultKind
-    at_s: float = Field(0.0, ge=0, le=86400)  # since the simulator's start
+    at_s: float = Field(0.0, ge=0, le=86400)  # after the simulator's start
     vehicle: int = Field(EVERY_VEHICLE, ge=EVERY_VEHICLE, le=99)  # -1: all
     value: float | None = None  # see FAULTS
     for_s: float = Field(0.0, ge=0, le=86400)  # 0: to the end
@@ -93,11 +93,11 @@ class FaultParams(Params):
 
     @property
     def amount(self) -> float:
-        """The value, or the kind's default."""
+        """Return the value, or the default of the kind."""
         return self.value if self.value is not None else FAULTS[self.kind].default or 0.0
 
     def problems(self, vehicles: int) -> Iterator[str]:
-        """What the kind or the number of vehicles does not allow."""
+        """Yield what the kind or the number of vehicles does not allow."""
         rule = FAULTS[self.kind]
         if self.vehicle >= vehicles:
             yield f"vehicle = {self.vehicle}: allowed: 0 to {vehicles - 1}, or {EVERY_VEHICLE} for all"
@@ -113,17 +113,17 @@ class FaultParams(Params):
 
 
 class RealismParams(Params):
-    """Everything above, and the rotors."""
+    """Collects all parameters of realism, and those of the rotors."""
 
     wind: WindParams = WindParams()
     battery: BatteryParams = BatteryParams()
     faults: tuple[FaultParams, ...] = Field((), strict=False)
     thrust_curve_01: float = Field(0.0, ge=0, le=1)  # k in force = (1 - k) u + k u^2 of a rotor's command u; 0 linear
-    motor_tau_s: float | None = Field(None, ge=0, le=0.5)  # lag of the rotors; left out: the airframe's own
-    drag_scale: float = Field(1.0, ge=0, le=10)  # of the airframe's drag; 0: none
+    motor_tau_s: float | None = Field(None, ge=0, le=0.5)  # lag of the rotors; None: that of the airframe
+    drag_scale: float = Field(1.0, ge=0, le=10)  # factor on the airframe's drag; 0: none
     ground_effect: bool = False
 
     def fault_problems(self, vehicles: int) -> Iterator[str]:
-        """What no single key can tell about the faults."""
+        """Yield problems of the faults that involve several keys."""
         for number, fault in enumerate(self.faults):
             yield from (f"faults.{number}.{problem}" for problem in fault.problems(vehicles))

@@ -1,4 +1,4 @@
-"""Text from outside as it may be shown: what a vehicle, a peer or a file says must not steer somebody's terminal."""
+"""Sanitising of text from outside, so that no vehicle, peer or file can control a terminal."""
 
 from __future__ import annotations
 
@@ -6,9 +6,9 @@ MOST_SHOWN = 500
 
 
 def printable(text: str, most: int = MOST_SHOWN) -> str:
-    """`text` on one line and without control characters, which are written as escapes; shortened in the middle.
+    """Return `text` on one line, shortened in the middle, with control characters written as escapes.
 
-    A terminal obeys ESC and the 8-bit controls, and direction marks reorder what is read: none is printable.
+    Terminals act on ESC and the 8-bit controls, and direction marks reorder text: none of them is printable.
     """
     half = most // 2
     short = text if len(text) <= most else f"{text[:half]} ... {text[-half:]}"
@@ -16,7 +16,7 @@ def printable(text: str, most: int = MOST_SHOWN) -> str:
 
 
 def printable_lines(text: str) -> str:
-    """The same for text that may have several lines."""
+    """Apply `printable` to each line of `text`."""
     return "\n".join(printable(line, 10 * MOST_SHOWN) for line in text.split("\n"))
 
 

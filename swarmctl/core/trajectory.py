@@ -1,4 +1,4 @@
-"""A timed motion that ends at rest: what an agent has promised to follow, or proposes to."""
+"""Timed motions that end at rest, to which agents commit or which they propose."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from swarmctl.core.types import Array
 
-Times = NDArray[Any]  # [us] of UTC, whole or not
+Times = NDArray[Any]  # UTC [us], integer or float
 _STOPPED_M_S = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
 class Trajectory:
-    """Positions and velocities at equal steps from `t0_utc_us` on; before it as at its beginning, after it at rest."""
+    """Holds positions and velocities at equal steps from `t0_utc_us` on; at rest before and after them."""
 
     t0_utc_us: int
     dt_us: int
@@ -27,11 +27,11 @@ class Trajectory:
 
     @property
     def end_utc_us(self) -> int:
-        """From here on it rests."""
+        """Return the UTC [us] from which the motion is at rest."""
         return self.t0_utc_us + (len(self.pos_ned_m) - 1) * self.dt_us
 
     def sample(self, t_utc_us: Times) -> tuple[Array, Array]:
-        """Positions and velocities (M, 3), (M, 3) at times (M,): cubic between the points."""
+        """Return positions and velocities, (M, 3) NED each, at times (M,); cubic interpolation."""
         last, dt_s = len(self.pos_ned_m) - 1, self.dt_us * 1e-6
         k = np.clip((np.asarray(t_utc_us, np.float64) - self.t0_utc_us) / self.dt_us, 0.0, last)
         low = np.minimum(k.astype(int), last - 1)
@@ -45,7 +45,7 @@ class Trajectory:
         return pos, np.where(inside, vel, 0.0)
 
     def at(self, t_utc_us: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
-        """Position and velocity at one time, as `sample` has them, without its arrays."""
+        """Return position and velocity, (3,) each, at one time; faster than `sample` for one."""
         last, dt_s = len(self.pos_ned_m) - 1, self.dt_us * 1e-6
         k = (t_utc_us - self.t0_utc_us) / self.dt_us
         if not 0.0 <= k < last:
@@ -60,26 +60,26 @@ class Trajectory:
         return tuple(pos), tuple(vel)
 
     def acceleration(self, t_utc_us: float) -> Array:
-        """(3,) at a time, from the velocities around it."""
+        """Return the acceleration (3,) NED [m/s2] at a time, by central difference of velocities."""
         half_us = 0.5 * self.dt_us
         vel = self.sample(np.array([t_utc_us - half_us, t_utc_us + half_us]))[1]
         return np.asarray((vel[1] - vel[0]) / (self.dt_us * 1e-6))
 
 
-def places(trajectories: Sequence[Trajectory], t_utc_us: Times) -> Array:
-    """Positions (N, M, 3) of several at times (M,), straight between their points."""
+def positions_at(trajectories: Sequence[Trajectory], t_utc_us: Times) -> Array:
+    """Return positions (N, M, 3) NED of N trajectories at times (M,), by linear interpolation."""
     begins = np.array([t.t0_utc_us for t in trajectories], np.float64)[:, None]
     steps = np.array([t.dt_us for t in trajectories], np.float64)[:, None]
-    return between([t.pos_ned_m for t in trajectories], np.maximum((t_utc_us - begins) / steps, 0.0))
+    return interpolate([t.pos_ned_m for t in trajectories], np.maximum((t_utc_us - begins) / steps, 0.0))
 
 
-def between(polylines: Sequence[Array], k: Array) -> Array:
-    """Positions (N, M, 3) at indices (N, M) into N polylines, straight between their points.
+def interpolate(polylines: Sequence[Array], k: Array) -> Array:
+    """Return positions (N, M, 3) at fractional indices (N, M) into N polylines, by linear interpolation.
 
-    Before the first point the first segment goes on backwards; after the last point is the last point.
+    Before the first point the first segment is extrapolated; after the last point the last point is returned.
     """
     lasts = np.array([len(points) - 1 for points in polylines])[:, None]
-    firsts = np.cumsum(lasts + 1)[:, None] - lasts - 1  # (N, 1) in all points
+    firsts = np.cumsum(lasts + 1)[:, None] - lasts - 1  # (N, 1) index of each first point in the concatenation
     points = np.concatenate(polylines)
     low = np.minimum(np.maximum(np.floor(k).astype(np.int64), 0), lasts - 1)
     begins = points[firsts + low]
@@ -87,23 +87,23 @@ def between(polylines: Sequence[Array], k: Array) -> Array:
 
 
 def resting(pos_ned_m: Array, t_utc_us: int, dt_us: int) -> Trajectory:
-    """Stay here."""
+    """Return the trajectory that rests at a position (3,)."""
     return Trajectory(t_utc_us, dt_us, np.tile(pos_ned_m, (2, 1)), np.zeros((2, 3)))
 
 
 def stopping(pos_ned_m: Array, vel_ned_m_s: Array, t_utc_us: int, dt_us: int, brake_m_s2: float) -> Trajectory:
-    """Come to rest straight ahead at constant deceleration."""
+    """Return the trajectory that brakes from a position and velocity, (3,) each, at constant deceleration."""
     return ending_at_rest(t_utc_us, dt_us, pos_ned_m[None], vel_ned_m_s[None], brake_m_s2)
 
 
 def ending_at_rest(t0_utc_us: int, dt_us: int, pos_ned_m: Array, vel_ned_m_s: Array, brake_m_s2: float) -> Trajectory:
-    """A plan (K+1, 3), continued by braking from its last velocity."""
+    """Return a plan, positions and velocities (K+1, 3), continued by braking from its last velocity."""
     pos, vel = _brake(pos_ned_m[-1], vel_ned_m_s[-1], dt_us * 1e-6, brake_m_s2)
     return Trajectory(t0_utc_us, dt_us, np.vstack([pos_ned_m, pos]), np.vstack([vel_ned_m_s, vel]))
 
 
 def joined(first: Trajectory, then: Trajectory, from_utc_us: int) -> Trajectory:
-    """The first from a time on, up to where the second begins, on the second's grid; they meet there."""
+    """Return `first` from a time on, continued by `then` where that begins, on the grid of `then`."""
     missing = max(0, math.ceil((then.t0_utc_us - from_utc_us) / then.dt_us))
     if missing == 0:
         return then
@@ -113,7 +113,7 @@ def joined(first: Trajectory, then: Trajectory, from_utc_us: int) -> Trajectory:
 
 
 def _brake(pos_ned_m: Array, vel_ned_m_s: Array, dt_s: float, brake_m_s2: float) -> tuple[Array, Array]:
-    """Points after the given one, (L, 3) and (L, 3), at least one; the last two at rest in the same place."""
+    """Return positions and velocities of braking, (L, 3) each, L >= 1, after the given point; the last is at rest."""
     speed = math.sqrt(float(vel_ned_m_s @ vel_ned_m_s))
     if speed < _STOPPED_M_S:
         return pos_ned_m[None].copy(), np.zeros((1, 3))

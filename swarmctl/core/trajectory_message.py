@@ -1,4 +1,4 @@
-"""What agents tell each other of their intentions; the rules are in `swarmctl.control.commit.protocol`."""
+"""The message by which agents exchange commitments; the rules are in `swarmctl.control.commit.protocol`."""
 
 from __future__ import annotations
 
@@ -10,38 +10,38 @@ from swarmctl.core.trajectory import Trajectory
 
 @dataclass(frozen=True, slots=True)
 class Proposal:
-    """What an agent would like to follow."""
+    """Holds a trajectory to which an agent wants to commit."""
 
-    number: int  # counts up, 64 bit: never used again, not after a restart either
+    number: int  # increasing, 64 bit; never reused, not even after a restart
     made_utc_us: int
     agent: int
     trajectory: Trajectory
 
     @property
     def order(self) -> tuple[int, int]:
-        """Earlier ones go first."""
+        """Return the sort key by which earlier proposals have priority."""
         return self.made_utc_us, self.agent
 
 
 @dataclass(frozen=True, slots=True)
 class TrajectoryMessage:
-    """All that an agent says of its intentions."""
+    """Holds the committed trajectory, proposal and acknowledgements of one agent."""
 
     agent: int
     boot_id: int
     seq: int
     sent_utc_us: int
-    is_committed: bool  # it follows what it has committed to; otherwise somebody else flies it
+    is_committed: bool  # the agent follows `committed`; otherwise a pilot or the autopilot flies
     committed: Trajectory
     proposal: Proposal | None
-    acknowledged: Mapping[int, int]  # number of the proposal in the newest message taken in of each peer
+    acknowledged: Mapping[int, int]  # by peer: number of the proposal in its newest message
 
     @property
     def trajectories(self) -> tuple[Trajectory, ...]:
-        """All that it speaks of."""
+        """Return the committed trajectory, and the proposed one if there is one."""
         return (self.committed,) if self.proposal is None else (self.committed, self.proposal.trajectory)
 
     @property
     def followed(self) -> tuple[Trajectory, ...]:
-        """What the agent may follow from now on."""
+        """Return the trajectories that the agent may follow from now on."""
         return self.trajectories if self.is_committed else self.trajectories[1:]

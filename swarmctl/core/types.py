@@ -1,6 +1,6 @@
-"""The nouns every module speaks in. Frozen; unit and frame in the name; shape in the comment.
+"""The data types that all modules share: frozen, with unit and frame in the name and shape in the comment.
 
-NED is the world of one *shared* origin, FRD the body. Quaternions are (w, x, y, z), body -> NED.
+NED is the world frame of one *shared* origin, FRD the body frame. Quaternions are (w, x, y, z), body -> NED.
 `t_us` is monotonic time of this process, `utc_us` disciplined UTC.
 """
 
@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-MAX_RADIUS_M = 10.0  # of what a path claims round itself: one peer must not ground all others
-Sampled = Callable[[Array], tuple[Array, Array]]  # offsets [s] from now (K,) -> positions, velocities (K, 3)
+MAX_RADIUS_M = 10.0  # limit of the radius in a path, so that one peer cannot ground all others
+Sampled = Callable[[Array], tuple[Array, Array]]  # offsets (K,) [s] from now -> positions, velocities, (K, 3) each
 
 
 class FlightMode(enum.IntEnum):
-    """What the autopilot is doing, independent of its dialect."""
+    """The autopilot's flight mode, independent of its dialect."""
 
     UNKNOWN = 0
     MANUAL = 1
@@ -29,11 +29,11 @@ class FlightMode(enum.IntEnum):
     LAND = 4
     RTL = 5
     MISSION = 6
-    EXTERNAL = 7  # PX4 OFFBOARD, ArduCopter GUIDED: the tick's setpoints fly the vehicle
+    EXTERNAL = 7  # PX4 OFFBOARD, ArduCopter GUIDED: it follows setpoints
 
 
 class Landed(enum.IntEnum):
-    """MAV_LANDED_STATE."""
+    """The landed state, with the values of MAV_LANDED_STATE."""
 
     UNKNOWN = 0
     ON_GROUND = 1
@@ -43,7 +43,7 @@ class Landed(enum.IntEnum):
 
 
 class Phase(enum.IntEnum):
-    """Where an agent is in its mission; moves forward only."""
+    """The phase of an agent's mission; it only moves forward."""
 
     CONNECT = 0  # no vehicle state yet, or its link is not set up
     STANDBY = 1  # vehicle seen, waiting for health and for every peer
@@ -72,10 +72,10 @@ class Mode(enum.IntEnum):
 
 
 class Verb(enum.Enum):
-    """What can be asked of an autopilot."""
+    """The kinds of requests to an autopilot."""
 
     ARM = "arm"
-    DISARM = "disarm"  # refused in the air by the autopilot
+    DISARM = "disarm"  # the autopilot refuses it in the air
     TAKEOFF = "takeoff"  # value: height above the take-off place [m]
     EXTERNAL = "external"  # PX4 OFFBOARD, ArduCopter GUIDED
     HOLD = "hold"
@@ -89,7 +89,7 @@ class Verb(enum.Enum):
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """One request to an autopilot."""
+    """Holds one request to an autopilot."""
 
     verb: Verb
     value: float = 0.0
@@ -98,18 +98,18 @@ class Command:
 
 
 class PlanStatus(enum.IntEnum):
-    """Whether a plan may be flown, and if not, why."""
+    """The reason why a plan may or may not be flown."""
 
     OK = 0
     SOLVER_FAILED = 1
-    RESIDUAL = 2  # the solver said solved, its residual in metres says otherwise
-    NOT_CERTIFIED = 3  # true distances over the horizon would be violated
-    NONE = 4  # nothing was planned
+    RESIDUAL = 2  # the solver reports success, but its residual in metres is too large
+    NOT_CERTIFIED = 3  # it would violate true distances over the horizon
+    NONE = 4  # there was no plan
 
 
 @dataclass(frozen=True, slots=True)
 class GeoOrigin:
-    """WGS-84 origin of a local frame; heights above mean sea level and above the ellipsoid are taken as one."""
+    """Holds the WGS-84 origin of a local frame; sea level and ellipsoid are taken as one height."""
 
     lat_deg: float
     lon_deg: float
@@ -118,9 +118,9 @@ class GeoOrigin:
 
 @dataclass(frozen=True, slots=True)
 class VehicleState:
-    """Newest estimate of the own vehicle, in the shared frame."""
+    """Holds the newest estimate of the own vehicle, in the shared frame."""
 
-    t_us: int  # monotonic time the sample is valid for
+    t_us: int  # monotonic time of validity
     pos_ned_m: Array  # (3,)
     vel_ned_m_s: Array  # (3,)
     q_nb: Array  # (4,)
@@ -133,37 +133,37 @@ class VehicleState:
 
 @dataclass(frozen=True, slots=True)
 class PredictedPath:
-    """One agent's predicted positions, as they travel over the bus."""
+    """Holds predicted positions of one agent, as sent over the bus."""
 
     agent: int
     boot_id: int
     seq: int
-    t0_utc_us: int  # the time the first point is valid for
+    t0_utc_us: int  # time of the first point
     dt_us: int
-    radius_m: float  # extra keep-out of this agent beyond the swarm's constraint radius
+    radius_m: float  # margin on top of the swarm's constraint radius
     pos_ned_m: Array  # (N+1, 3)
 
 
 @dataclass(frozen=True, slots=True)
 class Obstacle:
-    """A sphere or an upright column to keep out of, visible only from closer than `visibility_m`."""
+    """Describes a sphere or an upright column to avoid, visible only from closer than `visibility_m`."""
 
     center_ned_m: Array  # (3,)
     radius_m: float  # physical radius
     keep_out_m: float  # constraint radius, measured from the centre
     visibility_m: float
     vel_ned_m_s: Array  # (3,)
-    column: bool = False  # of any height, round its centre
+    column: bool = False  # unbounded in height
 
     def distance_m(self, pos_ned_m: Array) -> float:
-        """From its centre, of a column from its axis."""
+        """Return the distance [m] of a position (3,) from the centre, or from the axis of a column."""
         axes = 2 if self.column else 3
         return math.dist(self.center_ned_m[:axes], pos_ned_m[:axes])
 
 
 @dataclass(frozen=True, slots=True)
 class Reference:
-    """Where to be over the horizon."""
+    """Holds the desired motion over the horizon."""
 
     pos_ned_m: Array  # (N+1, 3)
     vel_ned_m_s: Array  # (N+1, 3)
@@ -172,7 +172,7 @@ class Reference:
 
 @dataclass(frozen=True, slots=True)
 class PlanTimes:
-    """Where the time of planning went; measured, and of no influence."""
+    """Holds measured times of planning, which have no influence."""
 
     setup_us: float  # matrices
     solve_us: float  # inside the QP solver
@@ -185,7 +185,7 @@ NO_TIMES = PlanTimes(0.0, 0.0, 0.0)
 
 @dataclass(frozen=True, slots=True)
 class Plan:
-    """Answer of one MPC step: predicted motion and the virtual controls that produce it."""
+    """Holds the result of one MPC step: the predicted motion and the virtual controls that produce it."""
 
     status: PlanStatus
     t0_us: int  # monotonic time of the first point
@@ -197,19 +197,19 @@ class Plan:
     iterations: int
     slack_m: float  # largest separation slack used
     residual_m: float  # largest primal residual, in metres of position
-    terminal_gap_m: float  # how far the softened terminal condition is from met
+    terminal_gap_m: float  # violation of the softened terminal condition
 
 
 @dataclass(frozen=True, slots=True)
 class AttitudeSetpoint:
-    """The one command of a tick."""
+    """Holds the attitude command of a tick."""
 
     q_nb: Array  # (4,) unit
     thrust_01: float  # [0, 1]
     valid_until_us: int
 
     def problem(self, now_us: int) -> str:
-        """Why this must not leave now, or "".
+        """Say why the setpoint must not be sent now, or "".
 
         A zero or non-finite quaternion corrupts PX4's attitude controller until reboot, a NaN thrust stops its motors.
         """
@@ -227,7 +227,7 @@ class AttitudeSetpoint:
 
 @dataclass(frozen=True, slots=True)
 class Health:
-    """What the failsafe judges; ages are -1 before the first sample."""
+    """Holds the inputs of the failsafe; ages are -1 before the first sample."""
 
     state_age_us: int
     armed: bool
@@ -235,17 +235,17 @@ class Health:
     landed: Landed
     autopilot_failsafe: bool
     plan_status: PlanStatus
-    last_good_plan_age_us: int  # of the newest certified plan that what is known now still allows
-    planless_us: int  # since a plan was last certified
+    last_good_plan_age_us: int  # of the newest certified plan that is still safe
+    planless_us: int  # time since a plan was last certified
     speed_m_s: float
     phase: Phase
-    had_control: bool  # the autopilot has followed our setpoints and we have not given it back
-    yielded: bool  # somebody took over; stays until an operator resumes
+    had_control: bool  # the autopilot follows setpoints and has not been released
+    yielded: bool  # a pilot or the autopilot took over, until an operator resumes
 
 
 @dataclass(frozen=True, slots=True)
 class TickRecord:
-    """Everything worth keeping of one tick; `core.records` lays it out as bytes."""
+    """Holds the recorded values of one tick; `core.records` encodes them."""
 
     t_us: int
     utc_us: int
@@ -264,17 +264,17 @@ class TickRecord:
     setpoint_thrust_01: float  # NaN when none was sent
     hover_thrust_01: float
     disturbance_ned_m_s2: Array  # (3,)
-    nearest_peer_m: float  # to the newest prediction of any peer, now; inf without peers
+    nearest_peer_m: float  # to the newest prediction of any peer; inf without peers
     nearest_obstacle_m: float  # centre distance of the nearest visible obstacle; inf without
-    path_age_ms: float  # oldest of the newest paths; NaN without peers
-    peers: int  # paths in use
-    rejected: int  # bus messages refused so far
+    path_age_ms: float  # the oldest newest path; NaN without peers
+    peers: int  # number of paths in use
+    rejected: int  # number of bus messages refused so far
     plan_status: PlanStatus
     slack_m: float
     residual_m: float
     iterations: int
     solve_ms: float
-    tick_ms: float  # listen to send
-    late_ticks: int  # so far, skipped ones included
+    tick_ms: float  # from receiving to sending
+    late_ticks: int  # number so far, skipped ticks included
     plan_pos_ned_m: Array  # (N+1, 3), empty when there is no plan
     safety_filter_acted: bool = False  # the safety filter has changed the input

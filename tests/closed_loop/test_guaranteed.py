@@ -71,7 +71,7 @@ def committed_in_the_dark(sees: type[Coordination] = Coordination) -> int:
         step()
         if flight._tracking() and not began_us:
             began_us.append(flight.lockstep.clock.now_us())
-            flight.lockstep.hub.mute()
+            flight.lockstep.hub.fail()
         coordinations = [agent._coordination for agent in flight._agents if agent is not None]
         counts.append(sum(c.counts.committed for c in coordinations if c is not None))
 

@@ -60,7 +60,7 @@ class Listener:
         while time.monotonic() < deadline_s:
             if until():
                 return True
-            self.attendance.look(now_us())
+            self.attendance.update(now_us())
             for sender, payload in self._bus.receive(PATH):
                 self.paths.offer(sender, payload, now_us())
             for path in self.paths.latest():

@@ -50,7 +50,7 @@ class Partition:
     def step(self, lockstep: Lockstep, t_s: float, pos_ned_m: Array, vel_ned_m_s: Array) -> None:
         if self._due and t_s >= self._due[0][0]:
             _, falls = self._due.pop(0)
-            (lockstep.hub.mute if falls else lockstep.hub.unmute)()
+            (lockstep.hub.fail if falls else lockstep.hub.recover)()
 
     def solids(self, t_s: float) -> Sequence[Solid]:
         return ()

@@ -18,7 +18,7 @@ from pydantic import Field
 
 from swarmctl.control.mpc.axes import HalfSpaces
 from swarmctl.core.params import Params
-from swarmctl.core.trajectory import between
+from swarmctl.core.trajectory import interpolate
 from swarmctl.core.types import Array, Obstacle, PredictedPath
 
 _TINY_M = 1e-6
@@ -112,7 +112,7 @@ def aligned(paths: Sequence[PredictedPath], t0_utc_us: int, dt_us: int, steps: i
     since = np.array([(t0_utc_us - path.t0_utc_us) / path.dt_us for path in paths])[:, None]
     pace = np.array([dt_us / path.dt_us for path in paths])[:, None]
     k = since + np.arange(steps + 1) * pace  # (N, steps+1) in points
-    found = between([path.pos_ned_m for path in paths], k)
+    found = interpolate([path.pos_ned_m for path in paths], k)
     beyond = k - lasts
     for i, path in enumerate(paths):
         if beyond[i, -1] > 0.0:

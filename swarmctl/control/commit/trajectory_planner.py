@@ -19,7 +19,7 @@ from swarmctl.control.mpc.swarm_mpc import AxisWeights, MpcParams, SwarmMpc
 from swarmctl.control.reference.mission import brake_to_rest, glide_to
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.params import Params
-from swarmctl.core.trajectory import Trajectory, ending_at_rest, joined, places, stopping
+from swarmctl.core.trajectory import Trajectory, ending_at_rest, joined, positions_at, stopping
 from swarmctl.core.trajectory_message import TrajectoryMessage
 from swarmctl.core.types import Array, Plan, PlanStatus, Reference, Sampled
 
@@ -232,7 +232,7 @@ class TrajectoryPlanner:
             return []
         p = self._separation
         hard_min_distance_m = committed_m(p) + spare_m
-        where = places(trajectories, t0_utc_us + np.arange(steps + 1) * self.dt_us)
+        where = positions_at(trajectories, t0_utc_us + np.arange(steps + 1) * self.dt_us)
         return [
             KeepOut(points, p.planned_m, hard_min_distance_m, False, agent, p.downwash)
             for points, agent in zip(where, agents, strict=True)

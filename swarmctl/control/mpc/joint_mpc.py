@@ -1,9 +1,9 @@
-"""One MPC for the three axes (thesis 5.2: "mitigate the perceived bias towards the z axis"): keeping clear in space.
+"""One MPC for all three axes (thesis 5.2: "mitigate the perceived bias towards the z axis"), with distances in space.
 
 The same axes, weights and bounds as `swarmctl.control.mpc.swarm_mpc`, but z, x and y are one problem, so that an agent
 may pass above or below what it must keep clear of. The products f u_x and f u_y are linearised by solving twice, the
-second time with the thrust f that the first has planned; the path that is certified and shared is the motion under the
-products themselves.
+second time with the thrust f that the first has planned. The path that is certified and shared is the motion under
+the products themselves.
 """
 
 from __future__ import annotations
@@ -23,12 +23,14 @@ from swarmctl.control.mpc.swarm_mpc import MpcParams, first_guess, judged, near_
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.types import Array, Plan
 
-_TIGHTER_01 = 0.1  # of the solver's tolerance: z, whose increments are ten times larger, sets the scale of the cost
-_THRUST_LEAST_M_S2 = 1.0  # without thrust tilting would have no effect at all
+_TOLERANCE_01 = (
+    0.1  # factor on the solver's tolerance: z has ten times larger increments and sets the scale of the cost
+)
+_MIN_THRUST_M_S2 = 1.0  # without thrust, tilt would have no effect in the model
 
 
 class JointMpc:
-    """x, y and z together with half-spaces, then a certificate over true distances."""
+    """Plans x, y and z in one problem with half-spaces, and certifies the result over true distances."""
 
     def __init__(
         self,
@@ -43,7 +45,7 @@ class JointMpc:
         self._stopwatch_ns = stopwatch_ns
         self.dt_us = round(params.dt_s * 1e6)
         self.steps = self.longest = params.horizon_xy
-        eps, eps_relative = _TIGHTER_01 * params.qp.eps, _TIGHTER_01 * params.qp.eps_relative
+        eps, eps_relative = _TOLERANCE_01 * params.qp.eps, _TOLERANCE_01 * params.qp.eps_relative
         self._mpc = CondensedMpc(
             (*params.horizontal(vehicle), params.vertical()),
             params.horizon(params.control_xy, params.horizon_xy, vehicle),
@@ -55,7 +57,7 @@ class JointMpc:
         )
 
     def plan(self, problem: Problem) -> Plan:
-        """One step of distributed MPC. Never raises for an infeasible problem; the status says what may be flown."""
+        """Solve one step of distributed MPC. Infeasibility is a status, never an exception."""
         began_ns = self._stopwatch_ns()
         guess = first_guess(problem, self._params.dt_s, self.steps)
         near = partial(near_half_spaces, problem, guess, 3, self._slots, self._params.dt_s, self._priority_id)
@@ -63,7 +65,7 @@ class JointMpc:
 
     def _plan(self, problem: Problem, began_ns: int, spaces: HalfSpaces | None, spaces_us: float) -> Plan:
         start, steps = problem.start, self.steps
-        held = max(_THRUST_LEAST_M_S2, float(start.virtual[2]))
+        held = max(_MIN_THRUST_M_S2, float(start.virtual[2]))
         first = self._solve(problem, np.full(steps, held), spaces)
         found = self._solve(problem, first.u[:, 2], spaces)
         found = replace(found, solve_us=first.solve_us + found.solve_us, iterations=first.iterations + found.iterations)
@@ -91,10 +93,11 @@ class JointMpc:
 
     @staticmethod
     def _acting(problem: Problem) -> tuple[Array, Array]:
-        """What of the three inputs acts at the start, and its rate."""
+        """Return the realised inputs (3,) at the start, and their rates (3,)."""
         start = problem.start
         return np.append(start.tilt, start.virtual[2]), np.append(start.tilt_rate_1_s, 0.0)
 
     @staticmethod
     def _drift(problem: Problem) -> Array:
+        """Return the acceleration (3,) NED [m/s2] without thrust."""
         return np.asarray(problem.disturbance_ned_m_s2 + np.array([0.0, 0.0, GRAVITY_M_S2]))

@@ -1,4 +1,4 @@
-"""The newest certified plan: what the next one is linearised around, and what is flown when the next one fails."""
+"""The newest certified plan: the next plan is linearised around it, and it is flown when the next plan fails."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ class Replay:
 
     Args:
         agent: own id.
-        dt_us, steps: of the controller's plans.
-        brake_m_s2: how a plan is continued beyond its end.
+        dt_us, steps: grid of the controller's plans.
+        brake_m_s2: deceleration that continues a plan beyond its end.
     """
 
     def __init__(self, agent: int, dt_us: int, steps: int, brake_m_s2: float) -> None:
@@ -32,12 +32,12 @@ class Replay:
                 self.plan = None
 
     def guess_ned_m(self, t0_us: int) -> Array | None:
-        """Positions (steps+1, 3) of the plan from `t0_us` on; None when there is none or it has run out."""
+        """Return positions (steps+1, 3) NED [m] of the plan from `t0_us` on; None without a plan or after its end."""
         if self.plan is None or t0_us - self.plan.t0_us >= self._steps * self._dt_us:
             return None
         return self.positions_ned_m(self.plan, t0_us)
 
     def positions_ned_m(self, plan: Plan, t0_us: int) -> Array:
-        """Positions (steps+1, 3) of any plan from `t0_us` on."""
+        """Return positions (steps+1, 3) NED [m] of any plan from `t0_us` on."""
         path = PredictedPath(self._agent, 0, 0, plan.t0_us, plan.dt_us, 0.0, plan.pos_ned_m)
         return align(path, t0_us, self._dt_us, self._steps, self._brake_m_s2)

@@ -1,8 +1,8 @@
-"""The solver seam: minimise 1/2 x'Px + q'x subject to l <= Ax <= u, with a fixed sparsity pattern.
+"""The QP solver interface: minimise 1/2 x'Px + q'x subject to l <= Ax <= u, with a fixed sparsity pattern.
 
-OSQP is set up once and updated in place; every status is looked at. It is first order: callers judge a solution by
-residuals in their own units, not by its status alone. Wall-clock time must not influence the iterates, or runs would
-not repeat, hence the fixed `adaptive_rho_interval`. DAQP, an exact active-set solver, is an optional extra.
+OSQP is set up once and updated in place; every status is checked. It is a first-order method: callers judge a solution
+by residuals in their own units, not by its status alone. Wall-clock time must not influence the iterates, or runs
+would not repeat, hence the fixed `adaptive_rho_interval`. DAQP, an exact active-set solver, is an optional extra.
 """
 
 from __future__ import annotations
@@ -21,19 +21,19 @@ from scipy import sparse
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array
 
-INFINITY = 1e20  # what OSQP takes for no bound
-_RUIZ_AGAIN = 10  # scaling passes: solve the problems that crawl without, and are no gain on the rest
+INFINITY = 1e20  # OSQP's value for a missing bound
+_RETRY_SCALINGS = 10  # scaling passes of a retry: they help problems that converge slowly, and no others
 _SOLVED = osqp.SolverStatus.OSQP_SOLVED
-_USABLE = frozenset(  # the last two are unfinished iterates
+_USABLE = frozenset(  # the last two statuses come with unfinished iterates
     int(status)
     for status in (_SOLVED, osqp.SolverStatus.OSQP_SOLVED_INACCURATE, osqp.SolverStatus.OSQP_MAX_ITER_REACHED)
 )
 
 
 class QpParams(Params):
-    """Which solver, and its settings: all are OSQP's, DAQP is exact and takes `max_iterations` only."""
+    """Sets the solver and its parameters: all apply to OSQP; DAQP is exact and takes `max_iterations` only."""
 
-    solver: Literal["osqp", "daqp"] = "osqp"  # daqp: quicker on small swarms, needs the extra swarmctl[daqp]
+    solver: Literal["osqp", "daqp"] = "osqp"  # daqp: faster on small swarms, needs the extra swarmctl[daqp]
     eps: float = Field(3e-3, gt=0, le=0.1)  # absolute; variables and rows are scaled to about 1
     eps_relative: float = Field(3e-4, ge=0, le=0.1)  # small: bounds far from active must not loosen the others
     max_iterations: int = Field(2500, ge=10, le=100000)
@@ -45,7 +45,7 @@ class QpParams(Params):
     @field_validator("solver")
     @classmethod
     def _installed(cls, solver: str) -> str:
-        """Refuse here what could otherwise only fail when the first agent starts."""
+        """Refuse a solver that is not installed, before the first agent starts."""
         if solver == "daqp" and not _daqp_is_usable():
             raise PydanticCustomError(
                 "missing_package", "daqp is not installed; pip install 'swarmctl[daqp]', or use solver = 'osqp'"
@@ -55,7 +55,7 @@ class QpParams(Params):
 
 @dataclass(frozen=True, slots=True)
 class QpSolution:
-    """`x` is None when nothing came back; unless `exact` it is an unfinished iterate that the caller must judge."""
+    """Holds the result of a solve: `x` is None without one, and an unfinished iterate to be judged unless `exact`."""
 
     x: Array | None
     exact: bool
@@ -63,23 +63,23 @@ class QpSolution:
     iterations: int
 
 
-NOT_FINITE = QpSolution(None, False, "not finite", 0)  # such values would poison the next warm start
+NOT_FINITE = QpSolution(None, False, "not finite", 0)  # such values would spoil the next warm start
 
 
 class QpSolver(Protocol):
-    """A solver of one problem family; called with all values, in the pattern it was built with."""
+    """Solves problems of one family; every call passes all values, in the pattern given at construction."""
 
     def solve(self, p_values: Array, q: Array, a_values: Array, lower: Array, upper: Array) -> QpSolution:
         """Solve for new values, warm-started from the last solution. Never raises for an infeasible problem."""
 
 
 class OsqpSolver:
-    """OSQP behind the seam.
+    """Solves with OSQP.
 
     Args:
         p_pattern: (n, n) boolean, upper triangle used.
         a_pattern: (m, n) boolean.
-        params: settings.
+        params: solver settings.
 
     `p_values` and `a_values` of `solve` are the entries of the patterns in column-major order; see `pattern_index`.
     """
@@ -99,8 +99,8 @@ class OsqpSolver:
         solution = self._run()
         if solution.exact:
             return solution
-        # neither "infeasible" (false ones are known) nor a crawl from a warm start is trusted: once more from scratch
-        again = self._cold(p_values, q, a_values, lower, upper, _RUIZ_AGAIN)
+        # a warm start can end in false infeasibility or slow convergence: retry from scratch
+        again = self._cold(p_values, q, a_values, lower, upper, _RETRY_SCALINGS)
         return again if again.exact or solution.x is None else solution
 
     def _cold(self, p_values: Array, q: Array, a_values: Array, lower: Array, upper: Array, scaling: int) -> QpSolution:
@@ -123,7 +123,7 @@ class OsqpSolver:
             adaptive_rho_interval=params.adaptive_rho_interval,
             check_termination=params.check_every,
             scaling=scaling,
-            check_dualgap=False,  # with slack rows far from active it never closes; residuals are judged by the caller
+            check_dualgap=False,  # inactive slack rows keep it open; callers judge residuals
             warm_starting=True,
         )
         return self._run()
@@ -134,27 +134,27 @@ class OsqpSolver:
         x, status = result.x, result.info.status_val
         finite = bool(np.isfinite(x).all())
         if not finite:
-            self._solver = None  # start afresh next time
+            self._solver = None  # the next solve is a cold start
         usable = finite and status in _USABLE
         return QpSolution(x if usable else None, status == _SOLVED, str(result.info.status), int(result.info.iter))
 
 
 def pattern_index(pattern: NDArray[np.bool_], upper: bool = False) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Row and column of every stored value, column-major: what `solve` expects its values ordered by."""
+    """Return rows and columns of the stored values in column-major order, the order of values in `solve`."""
     kept = np.triu(pattern) if upper else pattern
     columns, rows = np.nonzero(kept.T)
     return rows, columns
 
 
 def is_finite(*values: Array) -> bool:
-    """Whether every number of every vector is one; missing bounds are `INFINITY`, which is."""
-    return bool(np.isfinite(np.concatenate(values)).all())  # at once: a third of the time of one after the other
+    """Tell whether all numbers of all vectors are finite; missing bounds are `INFINITY`, which is finite."""
+    return bool(np.isfinite(np.concatenate(values)).all())  # one call takes a third of the time of many
 
 
 def make_solver(p_pattern: NDArray[np.bool_], a_pattern: NDArray[np.bool_], params: QpParams) -> QpSolver:
-    """The solver a configuration asks for."""
+    """Return the solver that the configuration asks for."""
     if params.solver == "daqp":
-        from swarmctl.control.mpc.qp_daqp import DaqpSolver  # an extra: only who asks for it needs it
+        from swarmctl.control.mpc.qp_daqp import DaqpSolver  # an optional package
 
         return DaqpSolver(p_pattern, a_pattern, params)
     return OsqpSolver(p_pattern, a_pattern, params)

@@ -1,4 +1,4 @@
-"""DAQP behind the solver seam: a dual active-set method, exact up to rounding, dense, quick for tens of variables.
+"""Solver interface to DAQP: a dual active-set method, exact up to rounding, dense, fast for tens of variables.
 
 Imported only when a configuration asks for it (extra `swarmctl[daqp]`).
 """
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from swarmctl.control.mpc.qp import INFINITY, NOT_FINITE, QpParams, QpSolution, is_finite, pattern_index
 from swarmctl.core.types import Array
 
-_UNBOUNDED = 1e30  # what DAQP takes for no bound
+_UNBOUNDED = 1e30  # DAQP's value for a missing bound
 _PROXIMAL_IF_SINGULAR = -1e-6  # `eps_prox`: negative is automatic, positive would regularise every problem
 _OPTIMAL = 1
 _STATUS = {  # DAQP's exit flags
@@ -29,12 +29,12 @@ _STATUS = {  # DAQP's exit flags
 
 
 class DaqpSolver:
-    """DAQP behind the seam; see `OsqpSolver` for the arguments.
+    """Solves with DAQP; see `OsqpSolver` for the arguments.
 
-    The working set of the last solution is the warm start of the next. DAQP wants a positive definite Hessian. Ours
-    is: increments cost at least r, and every slack has a quadratic weight (1e-3 for a terminal condition, more for a
-    half-space). A weight r near 0 makes it singular in floating point; for that alone DAQP's automatic proximal
-    regularisation is on, which leaves the answers to positive definite problems as they are, bit for bit.
+    The working set of the last solution is the warm start of the next. DAQP needs a positive definite Hessian, and
+    this one is: increments cost at least r, and every slack has a quadratic weight (1e-3 for a terminal condition, more
+    for a half-space). A weight r near 0 makes it singular in floating point; only for that case DAQP's automatic
+    proximal regularisation is on, which leaves solutions of positive definite problems unchanged, bit for bit.
     """
 
     def __init__(self, p_pattern: NDArray[np.bool_], a_pattern: NDArray[np.bool_], params: QpParams) -> None:
@@ -56,7 +56,7 @@ class DaqpSolver:
             solution = self._warm(self._model, q, low, high)
             if solution.exact:
                 return solution
-        return self._cold(q, low, high)  # an old working set can be a bad start; no failure is trusted before this
+        return self._cold(q, low, high)  # an old working set can be a bad start: failures are retried cold
 
     def _warm(self, model: daqp.Model, q: Array, low: Array, high: Array) -> QpSolution:
         flag = model.update(H=self._p, f=q, A=self._a, bupper=high, blower=low)
@@ -65,14 +65,14 @@ class DaqpSolver:
     def _cold(self, q: Array, low: Array, high: Array) -> QpSolution:
         model = daqp.Model()
         model.settings = {"iter_limit": self._limit, "eps_prox": _PROXIMAL_IF_SINGULAR}
-        # copies: the model keeps what it is given, and the next call writes into ours
+        # copies: the model keeps references, and the next call overwrites these arrays
         flag, _ = model.setup(self._p.copy(), q.copy(), self._a.copy(), high, low)
         return self._run(model) if flag >= 0 else _failed(flag)
 
     def _run(self, model: daqp.Model) -> QpSolution:
         x, _, flag, info = model.solve()
         if flag != _OPTIMAL or not np.isfinite(x).all():
-            self._model = None  # start afresh next time
+            self._model = None  # the next solve is a cold start
             failed = _failed(flag)
             return QpSolution(None, False, failed.status, int(info["iterations"]))
         self._model = model

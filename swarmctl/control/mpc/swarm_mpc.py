@@ -1,9 +1,9 @@
-"""The thesis' MPC for one vehicle of a swarm: z first, then x-y together with what must be kept clear of (ch. 3, 4).
+"""The thesis' distributed MPC for one vehicle of a swarm: z first, then x-y with the distance constraints (ch. 3, 4).
 
 z'' = g - (f/m) c, with c = cos(phi) cos(theta) frozen at the current attitude (3.11); x'' = -(f/m) u_x and
 y'' = -(f/m) u_y with the thrust that the z problem has just chosen (3.18), (3.24). Thrust over mass is the z input, so
-the thesis' newtons for its 1 kg are our m/s2. z knows nothing of collisions. The disturbance estimate is a constant
-drift of each axis.
+the thesis' newtons for its 1 kg are m/s2 here. The z problem has no distance constraints. The disturbance estimate is
+a constant drift of each axis.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Plan, PlanStatus, PlanTimes
 
-RESIDUAL_LIMIT_M = 0.05  # a solution that misses a constraint by more is none; the certificate judges the rest
+RESIDUAL_LIMIT_M = 0.05  # a solution that violates a constraint by more is refused; the certificate checks the rest
 
 
 class AxisWeights(Params):
-    """Quadratic weights of one axis."""
+    """Sets the quadratic weights of one axis."""
 
     q_pos: float = Field(gt=0, le=1e4)
     q_vel: float = Field(ge=0, le=1e4)
@@ -38,16 +38,16 @@ class AxisWeights(Params):
 
 
 class MpcParams(Params):
-    """Horizons, weights and bounds; defaults are the thesis' swarm flight (its section 4.3) but for z's end and r."""
+    """Sets horizons, weights and bounds; defaults are those of thesis section 4.3 except for the end and the r of z."""
 
     dt_s: float = Field(0.02, gt=0.001, le=0.5)
     discretisation: Literal["zoh", "euler"] = "zoh"  # euler is the thesis' (3.6)
-    thrust_ahead: Literal["held", "planned"] = "held"  # x-y predicted with f_t of now (thesis) or of the z plan
+    thrust_ahead: Literal["held", "planned"] = "held"  # x-y uses the thrust of now (thesis) or of the z plan
     control_z: int = Field(3, ge=1, le=50)
     horizon_z: int = Field(40, ge=2, le=200)
     control_xy: int = Field(6, ge=1, le=50)  # and of dmpc3, for all three axes
     horizon_xy: int = Field(40, ge=2, le=200)
-    z: AxisWeights = AxisWeights(q_pos=2.0, q_vel=0.05, r=1.0)  # thesis r 0.01: starves x-y of thrust in fast climbs
+    z: AxisWeights = AxisWeights(q_pos=2.0, q_vel=0.05, r=1.0)  # thesis r 0.01 leaves x-y no thrust in fast climbs
     x: AxisWeights = AxisWeights(q_pos=1.5, q_vel=0.5, r=0.01)
     y: AxisWeights = AxisWeights(q_pos=1.5, q_vel=0.5, r=0.01)
     thrust_min_m_s2: float = Field(0.0, ge=-20, le=9)  # thesis -20 (a rotor can't pull)
@@ -55,18 +55,18 @@ class MpcParams(Params):
     dthrust_max_m_s2: float = Field(5.0, gt=0, le=100)  # per step
     u_max: float = Field(0.2, gt=0, lt=1)  # sine of the tilt, each axis
     du_max: float = Field(0.05, gt=0, lt=1)  # per step
-    terminal_z: Terminal = "region"  # thesis: an equality, which limit-cycles once a link delays it by half a tick
+    terminal_z: Terminal = "region"  # thesis: an equality, which limit-cycles with half a tick of delay
     terminal_xy: Terminal = "none"
     qp: QpParams = QpParams()
 
     def vertical(self) -> Axis:
-        """z: the input is thrust over mass, which follows at once."""
+        """Return the z axis: its input is thrust over mass, realised at once."""
         w = self.z
         least, most, step = self.thrust_min_m_s2, self.thrust_max_m_s2, self.dthrust_max_m_s2
         return Axis(w.q_pos, w.q_vel, w.r, least, most, step, GRAVITY_M_S2, 1.0, self.terminal_z)
 
     def horizontal(self, vehicle: VehicleModelParams) -> tuple[Axis, Axis]:
-        """x and y: the inputs are u_x and u_y, which the attitude follows."""
+        """Return the x and y axes: their inputs are u_x and u_y, which the attitude follows."""
         return self._lateral(self.x, vehicle), self._lateral(self.y, vehicle)
 
     def _lateral(self, w: AxisWeights, vehicle: VehicleModelParams) -> Axis:
@@ -74,11 +74,12 @@ class MpcParams(Params):
         return Axis(w.q_pos, w.q_vel, w.r, -u, u, du, 0.0, GRAVITY_M_S2, self.terminal_xy, vehicle.lag())
 
     def horizon(self, control: int, prediction: int, vehicle: VehicleModelParams) -> Horizon:
+        """Return the horizon with `control` and `prediction` steps, under the vehicle's drag."""
         return Horizon(control, prediction, self.dt_s, self.discretisation == "euler", vehicle.drag_1_s)
 
 
 class SwarmMpc:
-    """z-MPC, then x-y MPC with half-spaces, then a certificate over true distances."""
+    """Plans with the z-MPC, then the x-y MPC with half-spaces, and certifies the result over true distances."""
 
     def __init__(
         self,
@@ -103,7 +104,7 @@ class SwarmMpc:
             params.qp,
             stopwatch_ns,
         )
-        self._xy, self._xy_alone = (  # without anything to keep clear of the problem is small and solved exactly
+        self._xy, self._xy_alone = (  # without keep-outs the problem is small and solved exactly
             CondensedMpc(
                 params.horizontal(vehicle),
                 params.horizon(params.control_xy, params.horizon_xy, vehicle),
@@ -117,7 +118,7 @@ class SwarmMpc:
         )
 
     def plan(self, problem: Problem) -> Plan:
-        """One step of distributed MPC. Never raises for an infeasible problem; the status says what may be flown."""
+        """Solve one step of distributed MPC. Infeasibility is a status, never an exception."""
         began_ns = self._stopwatch_ns()
         up = self._solve_z(problem)
         guess = first_guess(problem, self._params.dt_s, self.steps)
@@ -164,14 +165,14 @@ class SwarmMpc:
         return self._z.solve(asked)
 
     def _thrust_ahead(self, up: AxesSolution) -> Array:
-        """Thrust over mass (steps,) that x-y is predicted with."""
+        """Return thrust over mass (steps,) [m/s2] for the prediction of x-y."""
         if self._params.thrust_ahead == "held":
             return np.full(self.steps, up.u[0, 0])
         return np.asarray(up.u[np.minimum(np.arange(self.steps), len(up.u) - 1), 0])
 
 
 def first_guess(problem: Problem, dt_s: float, steps: int) -> Array:
-    """Positions (steps+1, 3) to linearise around: the own previous prediction, or constant velocity."""
+    """Return positions (steps+1, 3) to linearise around: the previous prediction, or constant velocity."""
     if problem.guess_ned_m is not None:
         return problem.guess_ned_m.copy()
     start, t_s = problem.start, np.arange(steps + 1)[:, None] * dt_s
@@ -179,7 +180,7 @@ def first_guess(problem: Problem, dt_s: float, steps: int) -> Array:
 
 
 def closest_keep_outs(keep_outs: Sequence[KeepOut], guess_ned_m: Array, slots: int) -> list[KeepOut]:
-    """The `slots` keep-outs that the guess comes closest to."""
+    """Return the `slots` keep-outs that the guess (steps+1, 3) comes closest to."""
 
     def gap_m(k: KeepOut) -> float:
         apart = (guess_ned_m - k.pos_ned_m) * (1.0, 1.0, k.vertical_01)
@@ -197,7 +198,7 @@ def near_half_spaces(
     own_priority_id: int,
     params: SeparationParams,
 ) -> HalfSpaces | None:
-    """Distances to what comes nearest, linearised around the guess (steps+1, 3), in the first `axes` axes."""
+    """Return half-spaces of the closest keep-outs around the guess (steps+1, 3), in the first `axes` axes."""
     steps, near = len(guess_ned_m) - 1, closest_keep_outs(problem.keep_outs, guess_ned_m, slots)
     goal, vel = problem.reference.pos_ned_m[steps, :axes], problem.start.vel_ned_m_s[:axes]
     return half_spaces(near, guess_ned_m, goal, vel, dt_s, own_priority_id, params)
@@ -209,15 +210,15 @@ def planned(
     separation: SeparationParams,
     stopwatch_ns: Callable[[], int],
 ) -> Plan:
-    """The plan within the half-spaces near its guess or, if that is not certified, within those far from it as well.
+    """Plan within the half-spaces near the guess and, if the plan is not certified, again within all half-spaces.
 
-    A plan leaves a guess that stands still far behind, and half-spaces that are far from the guess are left out: it
-    then runs into peers that are out there by the time it arrives, and so does every next one from the same guess.
+    A plan may move far away from a guess that stands still, while half-spaces far from the guess are left out. It then
+    runs into peers that are there by the time it arrives, and so does every following plan from the same guess.
 
     Args:
-        spaces_of: half-spaces by parameters.
+        spaces_of: returns half-spaces for given parameters.
         plan: makes a plan within half-spaces, given the time [us] that they took.
-        separation: parameters; those of the second plan leave nothing out.
+        separation: parameters of the first plan; the second plan has no gate.
         stopwatch_ns: see `CondensedMpc`.
     """
     began_ns = stopwatch_ns()
@@ -244,17 +245,17 @@ def judged(
     spaces_us: float,
     stopwatch_ns: Callable[[], int],
 ) -> Plan:
-    """A plan with what may be done with it: solved, within the residual limit, certified.
+    """Return the plan with its status: whether it is solved, within the residual limit, and certified.
 
     Args:
-        problem: what was asked.
+        problem: the problem it solves.
         pos_ned_m, vel_ned_m_s: (steps, 3) at steps 1..Hp.
         virtual: (steps, 3).
-        solutions: of all problems solved for it.
-        from_step: steps before this one are not certified: they can't be changed any more.
+        solutions: solutions of all problems solved for it.
+        from_step: first certified step; earlier ones cannot be changed any more.
         dt_us: step.
-        began_ns: on the stopwatch.
-        spaces_us: what half-spaces took since.
+        began_ns: stopwatch reading at the start of planning.
+        spaces_us: time that half-spaces took.
         stopwatch_ns: see `CondensedMpc`.
     """
     start = problem.start

@@ -1,4 +1,4 @@
-"""A terminal region instead of a terminal equality (what thesis 5.2 leaves open).
+"""The terminal region of the MPC, in place of a terminal equality (thesis 5.2 leaves it open).
 
 The error to the reference is e = (position, velocity, acceleration); the increment d of the acceleration is the input.
 With the input held over a step,
@@ -16,9 +16,9 @@ invariant under it. The terminal region is the largest such set in which that la
 The MPC's sum counts the stage cost of its last predicted state already, so P - Q is what it adds there. With as many
 free increments as steps and an end inside the region, its cost is then that of the infinite horizon: the MPC is the
 unconstrained optimal regulator, its optimal cost falls every step by at least the stage cost, and no equality has to be
-met (Mayne, Rawlings, Rao and Scokaert 2000, conditions A1 to A4). With fewer increments (3 of 40) this holds but for
-what the missing ones would still gain. A plan that ends outside is flown all the same and reported by how far it is
-outside; a steady disturbance shifts the acceleration and takes as much from the bounds.
+met (Mayne, Rawlings, Rao and Scokaert 2000, conditions A1 to A4). With fewer increments (3 of 40) this holds except for
+what the missing ones would gain. A plan that ends outside is flown all the same, and its distance is reported. A steady
+disturbance shifts the acceleration and reduces the bounds by as much.
 """
 
 from __future__ import annotations
@@ -34,21 +34,21 @@ from swarmctl.core.types import Array
 
 @dataclass(frozen=True, slots=True)
 class TerminalRegion:
-    """{e: e' P e <= alpha} for e = (position [m], velocity [m/s], acceleration [m/s2]) error of one axis."""
+    """Describes the set {e: e' P e <= alpha} of errors e = (position [m], velocity [m/s], acceleration [m/s2])."""
 
     cost_to_go: Array  # (3, 3) P
-    beyond: Array  # (3, 3) P - Q: V of the end without its own stage cost, which the sum has already
+    beyond: Array  # (3, 3) P - Q: V of the end without its stage cost, which the sum contains
     gain: Array  # (3,) K
     level: float  # alpha
 
     def outside_m(self, error: Array) -> float:
-        """How far `error` (3,) is outside, as the position error that would cost the same; 0 inside."""
+        """Return how far `error` (3,) is outside, as the position error [m] of the same cost; 0 inside."""
         value = max(0.0, float(error @ self.cost_to_go @ error))
         return max(0.0, math.sqrt(value) - math.sqrt(self.level)) / math.sqrt(float(self.cost_to_go[0, 0]))
 
 
 def transition(dt_s: float) -> tuple[Array, Array]:
-    """A (3, 3) and B (3, 1) of the module's error model."""
+    """Return A (3, 3) and B (3, 1) of the error model above."""
     half = 0.5 * dt_s * dt_s
     a = np.array([[1.0, dt_s, half], [0.0, 1.0, dt_s], [0.0, 0.0, 1.0]])
     return a, np.array([[half], [dt_s], [1.0]])
@@ -57,7 +57,7 @@ def transition(dt_s: float) -> tuple[Array, Array]:
 def terminal_region(
     q_pos: float, q_vel: float, r: float, accel_max_m_s2: float, daccel_max_m_s2: float, dt_s: float
 ) -> TerminalRegion:
-    """The region of one axis.
+    """Return the terminal region of one axis.
 
     Args:
         q_pos, q_vel: stage weights, `q_pos` > 0.

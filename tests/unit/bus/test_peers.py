@@ -29,7 +29,7 @@ class Store:
         self.paths = PeerPaths([1, 2], 50.0, self.refusals, self.attendance)
 
     def offer(self, message: bytes, sender: str = "agent-1", utc_us: int = NOW_US) -> None:
-        self.attendance.look(utc_us)
+        self.attendance.update(utc_us)
         self.paths.offer(sender, message, utc_us)
 
     @property
@@ -236,17 +236,17 @@ def test_who_leaves_and_comes_back_at_once_has_come_twice() -> None:
 
 
 @pytest.mark.parametrize(
-    ("mute_us", "more"), [(LEASE_US - 1, {"agent-0": 1}), (LEASE_US, {"agent-0": 1, "agent-1": 1})]
+    ("failed_us", "more"), [(LEASE_US - 1, {"agent-0": 1}), (LEASE_US, {"agent-0": 1, "agent-1": 1})]
 )
-def test_a_mute_bus_tells_of_comings_and_goings_when_it_is_whole_again(mute_us: int, more: dict[str, int]) -> None:
+def test_a_failed_bus_reports_arrivals_and_departures_once_it_recovers(failed_us: int, more: dict[str, int]) -> None:
     clock, hub, (a, b) = hub_of(["agent-0", "agent-1"])
     before = dict(b.arrivals())
-    hub.mute()
+    hub.fail()
     a.close()
     assert b.alive() == {"agent-0", "agent-1"}, "nobody can tell us"
     hub.attach("agent-0")
-    clock.advance(mute_us)
+    clock.advance(failed_us)
     assert dict(b.arrivals()) == before
-    hub.unmute()
+    hub.recover()
     assert dict(b.arrivals()) == {name: count + more.get(name, 0) for name, count in before.items()}
     assert b.alive() == {"agent-0", "agent-1"}

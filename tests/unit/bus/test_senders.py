@@ -41,11 +41,11 @@ class Bench:
             for boot_id in boots:
                 self.seq[boot_id] = self.seq.get(boot_id, 0) + 1
                 self.offer(boot_id, self.seq[boot_id], -late_us)
-            self.attendance.look(self.clock.utc_us())
+            self.attendance.update(self.clock.utc_us())
 
     def offer(self, boot_id: int, seq: int, shift_us: int = 0, content: bytes = b"") -> bool:
         utc_us = self.clock.utc_us()
-        self.attendance.look(utc_us)
+        self.attendance.update(utc_us)
         said = ReceivedMessage(boot_id, seq, utc_us + shift_us, content or f"{boot_id} {seq}".encode())
         if not self.verifier.accepts(said, utc_us):
             return False
@@ -54,11 +54,11 @@ class Bench:
 
     def leave(self) -> None:
         self.token.close()
-        self.attendance.look(self.clock.utc_us())
+        self.attendance.update(self.clock.utc_us())
 
     def come(self) -> None:
         self.token = self.hub.attach("agent-1")
-        self.attendance.look(self.clock.utc_us())
+        self.attendance.update(self.clock.utc_us())
 
     def heard_s(self, boot_id: int, since: int) -> float:
         """From tick `since` until a life is believed."""
@@ -116,7 +116,7 @@ def test_events_say_by_whose_name_what_was_refused_once_a_second() -> None:
     bench = Bench()
     for _ in range(150):
         bench.ticks(1, (TRUE, FORGED))
-        bench.refusals.tell(bench.clock.utc_us())
+        bench.refusals.report(bench.clock.utc_us())
     rows = [row for row in bench.told if row["reason"] == "boot"]
     assert 3 <= len(rows) <= 4
     assert rows[-1]["sender"] == "agent-1" and rows[-1]["topic"] == "path"
@@ -196,11 +196,11 @@ def test_nobody_speaks_for_the_dead() -> None:
 def test_a_lost_router_gives_no_forger_an_opening_once_the_peer_has_spoken() -> None:
     bench = Bench()
     bench.ticks(100)
-    bench.hub.mute()
+    bench.hub.fail()
     for _ in range(100):
         bench.clock.advance(TICK_US)
-        bench.attendance.look(bench.clock.utc_us())
-    bench.hub.unmute()
+        bench.attendance.update(bench.clock.utc_us())
+    bench.hub.recover()
     bench.seq[TRUE] += 100
     bench.ticks(2)
     bench.ticks(50, (FORGED, TRUE))

@@ -77,7 +77,7 @@ class Store:
     def offer(self, *sent: TrajectoryMessage, sender: str = agent_name(2)) -> None:
         for each in sent:
             self.utc_us += 20_000
-            self.attendance.look(self.utc_us)
+            self.attendance.update(self.utc_us)
             self.peers.offer(sender, encode_trajectory_message(each), self.utc_us)
 
 
@@ -106,7 +106,7 @@ def test_a_restart_is_accepted_with_its_third_message_and_has_proposed_nothing_y
     store = Store()
     store.offer(message(seq=3))
     store.peer.close()
-    store.attendance.look(store.utc_us)
+    store.attendance.update(store.utc_us)
     store.peer = store.hub.attach(agent_name(2))
     store.offer(
         *(replace(message(seq=seq, boot_id=3, propose=False), sent_utc_us=UTC_US + seq * 50_000) for seq in (4, 5, 6))

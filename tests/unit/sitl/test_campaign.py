@@ -182,11 +182,11 @@ def test_cells_that_cannot_be_flown_are_refused_first(
     assert not (tmp_path / "none").exists()
 
 
-def test_nobody_hears_anybody_on_a_mute_bus() -> None:
+def test_no_message_arrives_on_a_failed_bus() -> None:
     now_us = 0
     hub = LocalHub(lambda: now_us)
     one, other = hub.attach(agent_name(0)), hub.attach(agent_name(1))
-    hub.mute()
+    hub.fail()
     one.publish(topics.PATH, b"lost")
     one.publish(topics.COMMAND, b"kept")
     now_us = LEASE_US - 1
@@ -194,7 +194,7 @@ def test_nobody_hears_anybody_on_a_mute_bus() -> None:
     assert one.alive() == {"agent-0", "agent-1"}
     now_us = LEASE_US
     assert one.alive() == frozenset()
-    hub.unmute()
+    hub.recover()
     now_us += 1
     assert one.alive() == {"agent-0", "agent-1"}
     assert other.receive(topics.PATH) == []
