@@ -104,10 +104,10 @@ def test_forged_paths_change_nothing_and_are_told(fly: Fly, twin: Flight) -> Non
 
 def newest_wins(self: SenderVerifier, received: ReceivedMessage, utc_us: int) -> str:
     """What was believed before there were claims."""
-    known, stream = self._believed, _Stream(received.boot_id, received.seq, received.sent_utc_us, utc_us, utc_us)
+    known, stream = self._accepted, _Stream(received.boot_id, received.seq, received.sent_utc_us, utc_us, utc_us)
     if known is not None and (received.boot_id, received.seq) < (known.boot_id, known.seq):
         return "replayed"
-    self._believed = stream
+    self._accepted = stream
     return ""
 
 

@@ -1,4 +1,4 @@
-"""Operators' orders: valid for seconds, once each, the last one counts, by whose clock ever they are stamped."""
+"""Operators' orders are valid for seconds and obeyed once; the newest one counts, whatever clock stamps it."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ NOW_US = 1_700_000_000_000_000
 
 
 class Agent3:
-    """Agent 3, and what it does about orders."""
+    """Agent 3 and the orders it obeys."""
 
     def __init__(self) -> None:
         self.refusals = Refusals(lambda *_, **__: None)
         self.orders = Orders(3, self.refusals)
 
-    def hears(self, verb: Verb, stamp_us: int, now_us: int = NOW_US, agent: int = EVERYBODY) -> bool:
+    def obeys(self, verb: Verb, stamp_us: int, now_us: int = NOW_US, agent: int = EVERYBODY) -> bool:
         return self.orders.take(OPERATOR, encode_message(CommandMessage(verb, agent, stamp_us)), now_us) == verb
 
 
@@ -31,39 +31,39 @@ def test_an_order_is_valid_for_two_seconds(verb: Verb) -> None:
         (2**62, "future_order"),
     ):
         agent = Agent3()
-        assert not agent.hears(verb, stamp_us)
+        assert not agent.obeys(verb, stamp_us)
         assert agent.refusals.by_reason == {reason: 1}
         assert agent.refusals.alert(NOW_US) == f"command of operator refused: {reason}"
     for stamp_us in (NOW_US - VALID_US, NOW_US, NOW_US + MAX_LEAD_US):
-        assert Agent3().hears(verb, stamp_us)
+        assert Agent3().obeys(verb, stamp_us)
 
 
 def test_an_order_that_is_repeated_is_obeyed_once_and_alarms_nobody() -> None:
     agent = Agent3()
-    assert [agent.hears("hold", NOW_US, NOW_US + 200_000 * i) for i in range(5)] == [True, *[False] * 4]
+    assert [agent.obeys("hold", NOW_US, NOW_US + 200_000 * i) for i in range(5)] == [True, *[False] * 4]
     assert agent.refusals.by_reason == {"replayed": 4}
     assert agent.refusals.alert(NOW_US + 1_000_000) == ""
 
 
-def test_the_one_asked_for_last_counts_in_whatever_order_they_come() -> None:
+def test_the_newest_order_counts_in_whatever_sequence_they_arrive() -> None:
     agent = Agent3()
-    assert agent.hears("hold", NOW_US)
-    assert agent.hears("resume", NOW_US + 300_000, NOW_US + 400_000)
-    assert not agent.hears("hold", NOW_US, NOW_US + 500_000)
-    assert not agent.hears("rtl", NOW_US + 200_000, NOW_US + 500_000)
+    assert agent.obeys("hold", NOW_US)
+    assert agent.obeys("resume", NOW_US + 300_000, NOW_US + 400_000)
+    assert not agent.obeys("hold", NOW_US, NOW_US + 500_000)
+    assert not agent.obeys("rtl", NOW_US + 200_000, NOW_US + 500_000)
     assert agent.refusals.by_reason == {"superseded_order": 2}
 
 
 def test_nothing_holds_up_a_landing() -> None:
     agent = Agent3()
-    assert agent.hears("hold", NOW_US + MAX_LEAD_US)
-    assert agent.hears("land", NOW_US)
+    assert agent.obeys("hold", NOW_US + MAX_LEAD_US)
+    assert agent.obeys("land", NOW_US)
 
 
-def test_orders_to_others_are_none_of_ours() -> None:
+def test_orders_to_other_agents_are_ignored() -> None:
     agent = Agent3()
-    assert not agent.hears("hold", NOW_US + 1, agent=2)
-    assert agent.hears("hold", NOW_US, agent=3)
+    assert not agent.obeys("hold", NOW_US + 1, agent=2)
+    assert agent.obeys("hold", NOW_US, agent=3)
     assert agent.refusals.total == 0
     assert agent.orders.take(OPERATOR, b"{}", NOW_US) is None
     assert agent.refusals.by_reason == {"malformed": 1}
@@ -72,11 +72,11 @@ def test_orders_to_others_are_none_of_ours() -> None:
 @pytest.mark.parametrize("step_us", [0, 400_000, 3_600_000_000, -3_600_000_000])
 def test_agents_that_have_not_followed_a_step_of_utc_yet_obey_all_the_same(step_us: int) -> None:
     operators_us, agents_us = NOW_US + step_us, [NOW_US, NOW_US + 1000, NOW_US - 1000]
-    said = orders("land", EVERYBODY, operators_us, agents_us)
-    assert len(said) == (1 if abs(step_us) < 500_000 else 2)
+    messages = orders("land", EVERYBODY, operators_us, agents_us)
+    assert len(messages) == (1 if abs(step_us) < 500_000 else 2)
     for now_us in agents_us:
         agent = Orders(0, Refusals(lambda *_, **__: None))
-        assert "land" in [agent.take(OPERATOR, payload, now_us) for payload in said]
+        assert "land" in [agent.take(OPERATOR, payload, now_us) for payload in messages]
 
 
 def test_a_forged_clock_makes_no_order_invalid() -> None:

@@ -1,4 +1,4 @@
-"""Which paths of peers are believed, and the in-memory bus of lockstep."""
+"""Acceptance of peers' paths, and the in-memory bus of lockstep."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ def payload(agent: int = 1, boot_id: int = 7, seq: int = 1, t0_utc_us: int = NOW
 
 
 class Store:
-    """Paths of agents 1 and 2 as agent 0 takes them in."""
+    """Paths of agents 1 and 2 as agent 0 receives them."""
 
     def __init__(self) -> None:
         self.hub = LocalHub(lambda: 0)
@@ -54,7 +54,7 @@ def test_newest_path_of_every_peer_is_kept_by_agent_number() -> None:
     assert not store.refusals.total
 
 
-def test_a_silent_peer_is_never_forgotten() -> None:
+def test_the_path_of_a_stale_peer_is_kept() -> None:
     store = store_with(payload())
     store.offer(payload(agent=2, t0_utc_us=NOW_US + 3600_000_000), "agent-2", NOW_US + 3600_000_000)
     assert [agent for agent, *_ in store.kept] == [1, 2]
@@ -108,7 +108,7 @@ def hub_of(names: list[str], delay_us: int = 0, loss_01: float = 0.0) -> tuple[S
     return clock, hub, [hub.attach(name) for name in names]
 
 
-def test_nothing_is_visible_within_the_step_it_was_said_in() -> None:
+def test_no_message_arrives_within_the_step_of_its_publication() -> None:
     clock, _, (a, b) = hub_of(["agent-0", "agent-1"])
     a.publish(PATH, b"x")
     assert b.receive(PATH) == []
@@ -149,7 +149,7 @@ def test_ring_keeps_the_newest_per_sender_and_only_of_what_has_arrived() -> None
     assert [message for _, message in c.receive(PATH)] == [b"5", b"6", b"7", b"8"]
 
 
-def test_listening_can_be_limited_to_neighbours() -> None:
+def test_subscriptions_can_be_limited_to_neighbours() -> None:
     clock, hub, (a, b) = hub_of(["agent-0", "agent-1"])
     c = hub.attach("agent-2", {PATH: ["agent-1"]})
     a.publish(PATH, b"a")
@@ -160,7 +160,7 @@ def test_listening_can_be_limited_to_neighbours() -> None:
     assert c.receive(TICK) == []
 
 
-def test_a_dead_participant_says_and_hears_nothing_but_its_last_words_arrive() -> None:
+def test_a_detached_participant_is_cut_off_but_its_last_messages_arrive() -> None:
     clock, hub, (a, b) = hub_of(["agent-0", "agent-1"])
     a.publish(PATH, b"last")
     hub.detach("agent-0")
@@ -185,8 +185,8 @@ def test_a_name_can_be_taken_once() -> None:
         hub.attach("agent-0")
 
 
-def heard(order: list[int], attach_order: list[int]) -> dict[str, list[tuple[str, bytes]]]:
-    """Everything every agent hears in 400 steps, with agents ticked and attached in the given orders."""
+def deliveries(order: list[int], attach_order: list[int]) -> dict[str, list[tuple[str, bytes]]]:
+    """Return all messages received in 400 steps, with agents ticked and attached in the given orders."""
     clock = SimClock()
     hub = LocalHub(clock.now_us, seed=5, delay_us=40_000, loss_01=0.3)
     buses = {i: hub.attach(agent_name(i)) for i in attach_order}
@@ -200,11 +200,11 @@ def heard(order: list[int], attach_order: list[int]) -> dict[str, list[tuple[str
 
 
 def test_order_of_ticking_and_attaching_changes_nothing() -> None:
-    assert heard([0, 1, 2], [0, 1, 2]) == heard([2, 0, 1], [1, 2, 0])
+    assert deliveries([0, 1, 2], [0, 1, 2]) == deliveries([2, 0, 1], [1, 2, 0])
 
 
 def test_loss_has_the_asked_rate_is_independent_per_receiver_and_spares_reliable_topics() -> None:
-    log = heard([0, 1, 2], [0, 1, 2])
+    log = deliveries([0, 1, 2], [0, 1, 2])
     from_zero = {name: {p for s, p in log[name] if s == "agent-0"} for name in ("agent-1", "agent-2")}
     for received in from_zero.values():
         assert 0.63 < len(received) / 398 < 0.77
@@ -217,7 +217,7 @@ def test_loss_has_the_asked_rate_is_independent_per_receiver_and_spares_reliable
     assert b.receive(PATH) == []
 
 
-def test_what_is_longer_than_its_topic_allows_is_not_handed_out() -> None:
+def test_a_message_too_long_for_its_topic_is_not_delivered() -> None:
     clock, _, (a, b) = hub_of(["agent-0", "agent-1"])
     a.publish(PATH, bytes(PATH.max_bytes))
     a.publish(PATH, bytes(PATH.max_bytes + 1))
@@ -225,7 +225,7 @@ def test_what_is_longer_than_its_topic_allows_is_not_handed_out() -> None:
     assert b.receive(PATH) == [("agent-0", bytes(PATH.max_bytes)), ("agent-0", TOO_LONG)]
 
 
-def test_who_leaves_and_comes_back_at_once_has_come_twice() -> None:
+def test_leaving_and_rejoining_at_once_counts_as_a_second_arrival() -> None:
     _, hub, (a, b) = hub_of(["agent-0", "agent-1"])
     assert dict(b.arrivals()) == {"agent-0": 1, "agent-1": 1}
     a.close()

@@ -1,4 +1,4 @@
-"""Who is believed under a name: restarts in every order of events, forgeries, and what a network does by itself."""
+"""Acceptance of messages by sender: restarts in every order of events, forgeries, and network effects."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ LAST = 2**32 - 1
 
 @dataclass
 class Bench:
-    """What one agent hears of agent-1, whose messages come every tick unless it is told to be silent."""
+    """One agent that receives a message of agent-1 every tick, unless that is silent."""
 
     clock: SimClock = field(default_factory=SimClock)
     seq: dict[int, int] = field(default_factory=dict)
-    believed: list[tuple[int, int]] = field(default_factory=list)  # (tick, boot id)
+    accepted: list[tuple[int, int]] = field(default_factory=list)  # (tick, boot id)
     told: list[dict[str, object]] = field(default_factory=list)
 
     def __post_init__(self) -> None:
@@ -35,7 +35,7 @@ class Bench:
         self.verifier = SenderVerifier("agent-1", "path", RATE_HZ, self.refusals, self.attendance)
 
     def ticks(self, count: int, boots: Iterable[int] = (TRUE,), late_us: int = 0) -> None:
-        """Time goes on, and each of these lives says its next."""
+        """Advance ticks, in each of which the given processes publish their next message."""
         for _ in range(count):
             self.clock.advance(TICK_US)
             for boot_id in boots:
@@ -46,10 +46,10 @@ class Bench:
     def offer(self, boot_id: int, seq: int, shift_us: int = 0, content: bytes = b"") -> bool:
         utc_us = self.clock.utc_us()
         self.attendance.update(utc_us)
-        said = ReceivedMessage(boot_id, seq, utc_us + shift_us, content or f"{boot_id} {seq}".encode())
-        if not self.verifier.accepts(said, utc_us):
+        received = ReceivedMessage(boot_id, seq, utc_us + shift_us, content or f"{boot_id} {seq}".encode())
+        if not self.verifier.accepts(received, utc_us):
             return False
-        self.believed.append((utc_us // TICK_US, boot_id))
+        self.accepted.append((utc_us // TICK_US, boot_id))
         return True
 
     def leave(self) -> None:
@@ -60,9 +60,9 @@ class Bench:
         self.token = self.hub.attach("agent-1")
         self.attendance.update(self.clock.utc_us())
 
-    def heard_s(self, boot_id: int, since: int) -> float:
-        """From tick `since` until a life is believed."""
-        return min(tick for tick, boot in self.believed if boot == boot_id and tick >= since) * 0.02 - since * 0.02
+    def accepted_s(self, boot_id: int, since: int) -> float:
+        """Return the time [s] from tick `since` until messages of a boot id are accepted."""
+        return min(tick for tick, boot in self.accepted if boot == boot_id and tick >= since) * 0.02 - since * 0.02
 
     @property
     def tick(self) -> int:
@@ -75,44 +75,44 @@ class Bench:
 
 @pytest.mark.parametrize("shift_us", [0, 400_000, -400_000])
 @pytest.mark.parametrize(("boot_id", "seq"), [(FORGED, 1), (FORGED, LAST), (TRUE, LAST), (TRUE, 5000), (0, 0)])
-def test_one_forged_message_silences_nobody(boot_id: int, seq: int, shift_us: int) -> None:
+def test_one_forged_message_locks_out_no_sender(boot_id: int, seq: int, shift_us: int) -> None:
     bench = Bench()
     bench.ticks(50)
     assert not bench.offer(boot_id, seq, shift_us)
     bench.ticks(50)
-    assert len(bench.believed) == 100
+    assert len(bench.accepted) == 100
     assert sum(bench.refusals.by_reason.values()) == bench.refusals.total == 1
-    if shift_us < 400_000:  # else what follows may have been said before
+    if shift_us < 400_000:  # else what follows may have been sent before
         assert sum(bench.accused.values()) == 1
 
 
 def test_controls_without_these_rules_one_message_is_enough(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A number was believed when it was higher, another boot id when it was stamped later."""
+    """Here any higher number is accepted, and any boot id with a later stamp."""
     with monkeypatch.context() as patch:
-        patch.setattr(_Stream, "continues", lambda self, said, *_: said.boot_id == self.boot_id and said.seq > self.seq)
+        patch.setattr(_Stream, "continues", lambda self, new, *_: new.boot_id == self.boot_id and new.seq > self.seq)
         bench = Bench()
         bench.ticks(50)
         assert bench.offer(TRUE, LAST)
         bench.ticks(50)
-        assert len(bench.believed) == 51, "the true one is not heard any more"
+        assert len(bench.accepted) == 51, "the true sender is locked out"
     monkeypatch.setattr(SenderVerifier, "_is_confirmed", lambda *_: True)
     bench = Bench()
     bench.ticks(50)
     assert bench.offer(FORGED, 1)
 
 
-def test_a_forger_who_goes_on_and_on_is_refused_as_long_as_the_true_one_speaks() -> None:
+def test_a_persistent_forger_is_refused_while_the_true_sender_publishes() -> None:
     bench = Bench()
     bench.ticks(50)
     bench.ticks(500, (TRUE, FORGED))
-    assert {boot for _, boot in bench.believed} == {TRUE}
+    assert {boot for _, boot in bench.accepted} == {TRUE}
     assert 498 <= bench.accused["boot"] <= 500
     assert bench.refusals.alert(bench.clock.utc_us()) == "path of agent-1 refused: boot"
     bench.ticks(251)
     assert bench.refusals.alert(bench.clock.utc_us()) == "", "shown for some time, then it clears"
 
 
-def test_events_say_by_whose_name_what_was_refused_once_a_second() -> None:
+def test_refusals_are_reported_by_sender_once_a_second() -> None:
     bench = Bench()
     for _ in range(150):
         bench.ticks(1, (TRUE, FORGED))
@@ -123,7 +123,7 @@ def test_events_say_by_whose_name_what_was_refused_once_a_second() -> None:
     assert int(str(rows[-1]["count"])) > int(str(rows[0]["count"]))
 
 
-def test_a_restart_is_believed_with_its_third_message() -> None:
+def test_a_restart_is_accepted_with_its_third_message() -> None:
     bench = Bench()
     bench.ticks(500)
     bench.leave()
@@ -131,7 +131,7 @@ def test_a_restart_is_believed_with_its_third_message() -> None:
     bench.come()
     began = bench.tick
     bench.ticks(100, (REBORN,))
-    assert bench.heard_s(REBORN, began) == pytest.approx(0.06)
+    assert bench.accepted_s(REBORN, began) == pytest.approx(0.06)
     assert bench.accused == {}
 
 
@@ -142,14 +142,14 @@ def test_messages_that_overtake_the_token_wait_for_it() -> None:
     bench.clock.advance(700_000)
     began = bench.tick
     bench.ticks(10, (REBORN,))
-    assert bench.believed[-1][1] == TRUE, "nobody of that name is there"
+    assert bench.accepted[-1][1] == TRUE, "nobody of that name is there"
     bench.come()
     bench.ticks(1, (REBORN,))
-    assert bench.heard_s(REBORN, began) == pytest.approx(0.22)
+    assert bench.accepted_s(REBORN, began) == pytest.approx(0.22)
     assert bench.accused == {}
 
 
-def test_last_words_that_come_after_the_token_do_not_hold_a_restart_up() -> None:
+def test_late_messages_of_the_old_process_do_not_delay_a_restart() -> None:
     bench = Bench()
     bench.ticks(500)
     bench.leave()
@@ -162,17 +162,17 @@ def test_last_words_that_come_after_the_token_do_not_hold_a_restart_up() -> None
         bench.offer(REBORN, bench.seq.setdefault(REBORN, 0) + 1)
         bench.seq[REBORN] += 1
     bench.ticks(20, (REBORN,))
-    assert bench.heard_s(REBORN, began) < 0.3
+    assert bench.accepted_s(REBORN, began) < 0.3
     assert bench.accused == {}
 
 
-def test_a_restart_beside_a_frozen_process_is_believed_after_silence() -> None:
+def test_a_restart_beside_a_frozen_process_is_accepted_after_silence() -> None:
     """The token never leaves: the old process holds it until its lease is over, the new one from then on."""
     bench = Bench()
     bench.ticks(500)
     began = bench.tick
     bench.ticks(150, (REBORN,))
-    assert bench.heard_s(REBORN, began) == pytest.approx(SILENCE_US * 1e-6, abs=0.03)
+    assert bench.accepted_s(REBORN, began) == pytest.approx(SILENCE_US * 1e-6, abs=0.03)
 
 
 def test_a_silent_peer_is_not_impersonated_before_its_token_has_outlived_it() -> None:
@@ -180,20 +180,20 @@ def test_a_silent_peer_is_not_impersonated_before_its_token_has_outlived_it() ->
     bench.ticks(500)
     bench.ticks(round(1.5 / 0.02), (FORGED,))  # frozen for one and a half seconds
     bench.ticks(50)
-    assert {boot for _, boot in bench.believed} == {TRUE}
+    assert {boot for _, boot in bench.accepted} == {TRUE}
     assert bench.accused == {"boot": 75}
 
 
-def test_nobody_speaks_for_the_dead() -> None:
+def test_no_claim_is_accepted_without_a_token() -> None:
     bench = Bench()
     bench.ticks(100)
     bench.leave()
     bench.ticks(500, (FORGED,))
-    assert {boot for _, boot in bench.believed} == {TRUE}
+    assert {boot for _, boot in bench.accepted} == {TRUE}
     assert bench.accused == {}, "no live peer's messages were refused"
 
 
-def test_a_lost_router_gives_no_forger_an_opening_once_the_peer_has_spoken() -> None:
+def test_a_lost_router_helps_no_forger_once_the_peer_has_published() -> None:
     bench = Bench()
     bench.ticks(100)
     bench.hub.fail()
@@ -204,18 +204,18 @@ def test_a_lost_router_gives_no_forger_an_opening_once_the_peer_has_spoken() -> 
     bench.seq[TRUE] += 100
     bench.ticks(2)
     bench.ticks(50, (FORGED, TRUE))
-    assert {boot for _, boot in bench.believed} == {TRUE}
+    assert {boot for _, boot in bench.accepted} == {TRUE}
 
 
-def test_who_spoke_first_under_a_name_gives_way_to_who_comes_by_it() -> None:
+def test_a_forger_that_was_first_is_replaced_by_the_true_sender() -> None:
     bench = Bench()
     bench.leave()
     bench.ticks(20, (FORGED,))
-    assert bench.believed, "nothing is known yet"
+    assert bench.accepted, "nothing is known yet"
     bench.clock.advance(TICK_US)
     bench.come()
     bench.ticks(5, (TRUE,))
-    assert bench.believed[-1][1] == TRUE
+    assert bench.accepted[-1][1] == TRUE
 
 
 def test_a_forged_first_message_of_the_highest_number_is_forgotten() -> None:
@@ -223,16 +223,16 @@ def test_a_forged_first_message_of_the_highest_number_is_forgotten() -> None:
     bench.offer(TRUE, LAST)
     began = bench.tick
     bench.ticks(150)
-    assert bench.believed[-1] == (bench.tick, TRUE)
-    assert (bench.believed[1][0] - began) * 0.02 == pytest.approx(SILENCE_US * 1e-6, abs=0.03)
+    assert bench.accepted[-1] == (bench.tick, TRUE)
+    assert (bench.accepted[1][0] - began) * 0.02 == pytest.approx(SILENCE_US * 1e-6, abs=0.03)
 
 
-def test_a_forger_just_ahead_is_caught_up_with_and_betrayed_by_the_numbers() -> None:
+def test_a_forger_just_ahead_is_revealed_by_duplicate_numbers() -> None:
     bench = Bench()
     bench.ticks(100)
     assert bench.offer(TRUE, 110, content=b"elsewhere")
     bench.ticks(30)
-    assert len(bench.believed) == 100 + 1 + 20
+    assert len(bench.accepted) == 100 + 1 + 20
     assert bench.accused == {"sequence": 10}
 
 
@@ -248,7 +248,7 @@ def test_the_stamp_must_allow_for_the_number_and_the_number_for_the_stamp() -> N
 def test_loss_bursts_duplicates_reordering_and_changing_delay_accuse_nobody() -> None:
     rng = np.random.default_rng(8)
     bench = Bench()
-    under_way: list[tuple[int, int, int]] = []  # (arrives, seq, said)
+    under_way: list[tuple[int, int, int]] = []  # (arrival, seq, sent)
     for seq in range(1, 4000):
         bench.clock.advance(TICK_US)
         now_us = bench.clock.utc_us()
@@ -258,8 +258,8 @@ def test_loss_bursts_duplicates_reordering_and_changing_delay_accuse_nobody() ->
         for message in sorted(m for m in under_way if m[0] <= now_us):
             under_way.remove(message)
             bench.offer(TRUE, message[1], message[2] - now_us)
-    assert len(bench.believed) > 2000
-    assert bench.tick - bench.believed[-1][0] < 10
+    assert len(bench.accepted) > 2000
+    assert bench.tick - bench.accepted[-1][0] < 10
     assert bench.accused == {}
 
 
@@ -269,6 +269,6 @@ def test_a_flood_of_boot_ids_takes_no_memory_and_changes_nothing() -> None:
     for boot_id in range(1000, 3000):
         assert not bench.offer(boot_id, boot_id)
     bench.ticks(10)
-    assert len(bench.believed) == 20
+    assert len(bench.accepted) == 20
     assert len(bench.verifier._claims) == 0
     assert bench.accused == {"boot": 2000}

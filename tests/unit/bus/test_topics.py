@@ -1,4 +1,4 @@
-"""What may come in from the bus: paths and messages survive the way, anything else is None and never an exception."""
+"""Paths and messages survive encoding; anything else decodes to None and never raises."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def path(points: np.ndarray = POINTS, dt_us: int = 20_000, radius_m: float = 0.5
     return PredictedPath(4, 0xFFFFFFFF, 123_456, UTC_US, dt_us, radius_m, points)
 
 
-def test_a_path_survives_the_way() -> None:
+def test_a_path_survives_encoding() -> None:
     decoded = decode_path(topics.encode_path(path()))
     assert decoded is not None
     assert (decoded.agent, decoded.boot_id, decoded.seq) == (4, 0xFFFFFFFF, 123_456)
@@ -104,7 +104,7 @@ def test_a_number_that_is_not_finite_is_refused(number: int, bad: float) -> None
         topics.encode_path(path(np.zeros((251, 3)))),
     ],
 )
-def test_what_does_not_fit_is_refused(payload: bytes) -> None:
+def test_malformed_paths_are_refused(payload: bytes) -> None:
     assert decode_path(payload) is None
 
 
@@ -177,7 +177,7 @@ def test_hostile_text_gives_none_and_never_raises(decode: object, payload: bytes
     assert decode(payload) is None
 
 
-def test_messages_survive_the_way() -> None:
+def test_messages_survive_encoding() -> None:
     assert decode_status(encode_message(STATUS)) == STATUS
     command = topics.CommandMessage("rtl", -1, UTC_US)
     assert decode_command(encode_message(command)) == command
@@ -255,8 +255,8 @@ def test_the_longest_good_message_of_every_topic_fits() -> None:
     path = PredictedPath(0, 0, 0, 0, 1, 0.0, np.zeros((topics.MAX_POINTS, 3)))
     assert len(topics.encode_path(path)) <= topics.PATH.max_bytes
     trajectory = Trajectory(0, 1, np.zeros((MAX_POINTS, 3)), np.zeros((MAX_POINTS, 3)))
-    heard = dict.fromkeys(range(MAX_ACKNOWLEDGED), 2**60)
-    message = TrajectoryMessage(0, 0, 0, 0, True, trajectory, Proposal(1, 0, 0, trajectory), heard)
+    acknowledged = dict.fromkeys(range(MAX_ACKNOWLEDGED), 2**60)
+    message = TrajectoryMessage(0, 0, 0, 0, True, trajectory, Proposal(1, 0, 0, trajectory), acknowledged)
     assert len(encode_trajectory_message(message)) <= topics.TRAJECTORY.max_bytes
     assert TICK_DTYPE.itemsize + 12 * topics.MAX_POINTS <= topics.TICK.max_bytes
     status = msgspec.structs.replace(STATUS, outcome="x" * 4000, problem="\u20ac" * 4000)

@@ -1,4 +1,4 @@
-"""The safety filter on its own: point masses that want to fly through each other, and what it costs them."""
+"""The safety filter alone keeps point masses apart that are steered through each other."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def fly_at_goals(
     others: list[Body] | None = None,
     for_s: float = 6.0,
 ) -> tuple[float, float]:
-    """Point masses under a plain attraction; smallest distance of any two [m] and of any from `others`."""
+    """Simulate attracted point masses; return the smallest distance of any two [m] and of any from `others`."""
     barriers = [Barrier(params, MODEL, DT_S) if params else None for _ in pos]
     held = np.tile(HOVER, (len(pos), 1))
     least = beside = math.inf
@@ -81,7 +81,7 @@ def ring(count: int, radius_m: float, climb_m: float = 0.0) -> Array:
     ("count", "climb_m", "speed_m_s"),
     [(2, 0.0, 1.5), (2, 0.15, 1.5), (2, 0.0, 2.5), (6, 0.0, 1.5), (6, 0.05, 2.5), (6, 0.1, 1.5), (6, 0.3, 1.0)],
 )
-def test_those_who_fly_at_each_other_do_not_touch(count: int, climb_m: float, speed_m_s: float) -> None:
+def test_agents_that_fly_at_each_other_do_not_touch(count: int, climb_m: float, speed_m_s: float) -> None:
     pos = ring(count, 3.0, climb_m)
     vel = -speed_m_s * pos / np.linalg.norm(pos, axis=1, keepdims=True)
     assert fly_at_goals(pos, vel, -pos, PARAMS)[0] >= BODY_M
@@ -95,8 +95,8 @@ def test_control_without_it_they_do(count: int) -> None:
 
 @pytest.mark.parametrize("column", [False, True])
 @pytest.mark.parametrize("speed_m_s", [0.0, 1.0])
-def test_an_obstacle_is_left_alone_with_the_whole_of_it(column: bool, speed_m_s: float) -> None:
-    """One that comes on as well: only the own braking counts."""
+def test_against_an_obstacle_the_vehicle_brakes_alone(column: bool, speed_m_s: float) -> None:
+    """The obstacle may approach as well: only the own braking counts."""
     obstacle = [Body((3.0, 0.1, 0.0), (-speed_m_s, 0.0, 0.0), 1.24 + PARAMS.margin_m, 1.0, column)]
     pos, vel, goal = np.zeros((1, 3)), np.array([[1.5, 0.0, 0.0]]), np.array([[6.0, 0.0, 0.0]])
     assert fly_at_goals(pos, vel, goal, PARAMS, obstacle, 2.0)[1] >= 1.24
@@ -128,7 +128,7 @@ def test_both_of_a_pair_brake_and_one_alone_brakes_all_of_it() -> None:
         ((0.0, 0.0, 0.9), (0.0, 0.0, 0.0)),  # below
     ],
 )
-def test_it_does_not_act_on_who_keeps_apart(pos: tuple[float, ...], vel: tuple[float, ...]) -> None:
+def test_the_filter_does_not_act_on_agents_that_keep_apart(pos: tuple[float, ...], vel: tuple[float, ...]) -> None:
     barrier = Barrier(PARAMS, MODEL, DT_S)
     assert (
         filtered(barrier, np.array([0.2, 0.1, 9.9]), start(np.zeros(3), np.zeros(3)), [Body(pos, vel, APART_M, 0.5)])
@@ -137,8 +137,8 @@ def test_it_does_not_act_on_who_keeps_apart(pos: tuple[float, ...], vel: tuple[f
     assert filtered(barrier, HOVER, start(np.zeros(3), np.zeros(3)), []) is None
 
 
-def test_the_airframe_is_not_asked_for_more_than_it_has() -> None:
-    """However hopeless: turned no faster and no farther than it can, thrust within its bounds, finite."""
+def test_commands_stay_within_the_airframe_bounds() -> None:
+    """Even without a feasible command, tilt, slew and thrust stay within bounds and finite."""
     rng = np.random.default_rng(3)
     barrier, slew = Barrier(PARAMS, MODEL, DT_S), PARAMS.slew_1_s * DT_S
     acted = 0
@@ -165,7 +165,7 @@ def test_the_airframe_is_not_asked_for_more_than_it_has() -> None:
     assert acted > 150
 
 
-def test_in_one_place_it_parts_along_the_way_they_came() -> None:
+def test_coincident_bodies_part_along_their_relative_velocity() -> None:
     barrier = Barrier(PARAMS, MODEL, DT_S)
     found = filtered(
         barrier,
@@ -188,7 +188,7 @@ def body(known: PredictedPath, act_us: int, ahead_s: float = 0.0, filters: bool 
     return body_of_peer(known, act_us, ahead_s, APART_M, 4.0, 1.0, filters, 2.0)
 
 
-def test_a_peer_is_where_its_path_says_when_the_command_is_felt() -> None:
+def test_a_peer_is_predicted_to_when_the_command_takes_effect() -> None:
     found = body(path(0), 100_000, 0.21)
     assert found.pos_ned_m == pytest.approx((0.31, 0.0, 0.0))
     assert found.vel_ned_m_s == pytest.approx((1.0, 0.0, 0.0))
@@ -196,7 +196,7 @@ def test_a_peer_is_where_its_path_says_when_the_command_is_felt() -> None:
     assert (found.share_01, body(path(0), 100_000, filters=False).share_01) == (0.5, 1.0)
 
 
-def test_who_has_not_been_heard_may_be_farther_from_its_path_every_moment() -> None:
+def test_the_margin_of_a_stale_peer_grows_with_time() -> None:
     reach = [body(path(0), age_us).apart_m for age_us in (0, 100_000, 300_000, 600_000, 5_000_000)]
     assert reach == sorted(reach)
     assert reach[-1] == pytest.approx(APART_M + 1.0)
@@ -204,8 +204,8 @@ def test_who_has_not_been_heard_may_be_farther_from_its_path_every_moment() -> N
 
 @pytest.mark.parametrize("age_us", [100_000, 790_000, 900_000, 1_050_000, 5_000_000])
 @pytest.mark.parametrize("vel", [(1.0, 0.0, 0.0), (0.6, -1.2, 0.1), (0.0, 0.0, 0.0)], ids=str)
-def test_the_silent_are_where_plans_take_them_to_be(vel: tuple[float, float, float], age_us: int) -> None:
-    """Or an agent stands before somebody whom no plan sees there, and nothing looks for a way round."""
+def test_a_stale_peer_is_where_plans_assume_it(vel: tuple[float, float, float], age_us: int) -> None:
+    """Otherwise an agent would stand before a peer that no plan sees, and no recovery would begin."""
     known = path(0, vel)
     found = body(known, age_us)
     assert found.pos_ned_m == pytest.approx(align(known, age_us, 20_000, 1, 2.0)[0])
@@ -221,7 +221,7 @@ def test_an_obstacle_moves_on() -> None:
     assert (found.share_01, found.column, found.solid) == (1.0, True, True)
 
 
-def test_downwash_keeps_farther_apart_above_each_other_than_beside() -> None:
+def test_downwash_demands_more_distance_vertically_than_horizontally() -> None:
     sinking = start(np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, 0.5]))
     below = [Body((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), APART_M, 0.5)]
     assert filtered(Barrier(PARAMS, MODEL, DT_S), HOVER, sinking, below) is None

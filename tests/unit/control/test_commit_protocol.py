@@ -1,4 +1,4 @@
-"""Promises are kept apart whatever happens to the messages; controls break the rules one by one."""
+"""Commitments keep apart whatever happens to the messages; negative controls break the rules one by one."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ HARD_MIN_M = SEPARATION.radius_m - SEPARATION.certify_slack_m
 
 @dataclass
 class Network:
-    """Messages with seeded delays and losses; nobody hears anything in the dark."""
+    """A network with seeded delays and losses, and an outage."""
 
     delay_us: tuple[int, int] = (0, 0)
     loss_01: float = 0.0
@@ -51,7 +51,7 @@ class Network:
 
 
 class Crowd:
-    """Agents that follow their promises exactly, from a ring through its middle to the other side."""
+    """Agents that track commitments exactly, from a ring through its middle to the other side."""
 
     def __init__(self, count: int, network: Network) -> None:
         angle = 2.0 * np.pi * np.arange(count) / count
@@ -104,7 +104,7 @@ class Crowd:
         return min(float(np.linalg.norm(a - b, axis=1).min()) for a, b in itertools.combinations(paths, 2))
 
     def run(self, seconds: float) -> float:
-        """Smallest promised distance ever."""
+        """Run for some time and return the smallest distance between commitments [m]."""
         least = np.inf
         for _ in range(round(seconds * 1e6 / TICK_US)):
             self.step()
@@ -125,14 +125,14 @@ NETWORKS = {
 
 
 @pytest.mark.parametrize("network", NETWORKS.values(), ids=NETWORKS.keys())
-def test_promises_never_come_closer_than_certified(network: Network) -> None:
+def test_commitments_keep_the_hard_minimum_distance(network: Network) -> None:
     crowd = Crowd(4, network)
     assert crowd.run(6.0) >= HARD_MIN_M - 1e-3
     assert crowd.committed >= 8, "they do move"
 
 
 class Careless(Crowd):
-    """Commits without waiting for anybody."""
+    """Agents that commit without waiting for acknowledgements."""
 
     def step(self) -> None:
         super().step()
@@ -142,11 +142,11 @@ class Careless(Crowd):
                 agent.update(self.now_us, everybody, set())
 
 
-def test_control_promises_that_wait_for_nobody_contradict_each_other() -> None:
+def test_control_commitments_without_acknowledgements_conflict() -> None:
     assert Careless(4, Network((300_000, 300_000))).run(6.0) < HARD_MIN_M - 0.1
 
 
-def test_in_silence_everybody_comes_to_rest_and_stays_apart() -> None:
+def test_without_messages_all_agents_come_to_rest_and_stay_apart() -> None:
     crowd = Crowd(4, Network((20_000, 20_000), dark_us=(1_500_000, 10**9)))
     crowd.run(1.6)
     committed = crowd.committed
@@ -169,7 +169,7 @@ def at_goal(offsets_s: Array) -> tuple[Array, Array]:
 
 
 def meeting() -> tuple[Commitments, Commitments]:
-    """Two that fly one behind the other at 1.5 m/s, 1 m apart, each on what it has committed to."""
+    """Return two agents that fly one behind the other at 1.5 m/s, 1 m apart, each on its committed trajectory."""
     pair = []
     for i, x_m in enumerate((0.0, -1.0)):
         agent = Commitments(i, CommitParams(), MpcParams(u_max=0.25), SEPARATION, 2, lambda: 0)
@@ -188,23 +188,23 @@ def wall(x_m: float, agent: Commitments) -> KeepOut:
     return KeepOut(np.tile([x_m, 0.0, -2.0], (agent.steps + 1, 1)), 0.9, 0.8, False, -1)
 
 
-def test_a_promise_that_was_changed_without_asking_is_found_by_whom_it_contradicts() -> None:
+def test_an_evasion_is_found_by_the_peer_it_conflicts_with() -> None:
     first, second = meeting()
     assert second.conflicting_peers(UTC_US, message_of(first, 0)) == set()
     first.evade(Situation(UTC_US, UTC_US, DesiredReference(at_goal), {}, [wall(1.6, first)]))
-    assert first.counts.evaded == 1, "before a wall there is no time to ask"
+    assert first.counts.evaded == 1, "before a wall there is no time for acknowledgements"
     assert second.conflicting_peers(UTC_US, message_of(first, 0)) == {0}
     assert second.conflicting_peers(UTC_US, message_of(first, 0)) == {0}, "as long as it does"
 
 
-def test_a_wall_that_leaves_time_to_ask_stops_nobody() -> None:
+def test_a_wall_that_leaves_time_for_acknowledgements_triggers_no_evasion() -> None:
     first, _ = meeting()
     first.evade(Situation(UTC_US, UTC_US, DesiredReference(at_goal), {}, [wall(2.6, first)]))
     assert first.counts.evaded == 0
 
 
-def test_who_rests_makes_way_for_what_comes_at_it() -> None:
-    """To stop would change nothing: it rests already."""
+def test_an_agent_at_rest_evades_what_approaches() -> None:
+    """A stop would change nothing: it rests already."""
     agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), SEPARATION, 2, lambda: 0)
     agent.begin(np.array([0.0, 0.0, -2.0]), np.zeros(3), UTC_US)
     times_s = 0.1 * np.arange(agent.steps + 1)
@@ -217,8 +217,8 @@ def test_who_rests_makes_way_for_what_comes_at_it() -> None:
 
 
 @pytest.mark.parametrize(("column", "passes_m"), [(False, 0.9), (True, 0.1)], ids=["ball", "control: column"])
-def test_who_is_hemmed_in_makes_way_upwards(column: bool, passes_m: float) -> None:
-    """Peers rest on the three sides that are left; what comes runs over whoever cannot rise."""
+def test_an_agent_that_is_enclosed_evades_upwards(column: bool, passes_m: float) -> None:
+    """Peers rest on the three other sides, so the only evasive trajectory is a climb."""
     agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), SEPARATION, 5, lambda: 0)
     agent.begin(np.array([0.0, 0.0, -2.0]), np.zeros(3), UTC_US)
     sides = [[0.0, 0.9, -2.0], [0.0, -0.9, -2.0], [-0.9, 0.0, -2.0]]
@@ -237,7 +237,7 @@ def test_who_is_hemmed_in_makes_way_upwards(column: bool, passes_m: float) -> No
 
 
 def along(corners: Array) -> Sampled:
-    """A way through (K, 2) at 1 m/s."""
+    """Return a path through corners (K, 2) at 1 m/s."""
     reached_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(corners, axis=0), axis=1))])
 
     def sample(offsets_s: Array) -> tuple[Array, Array]:
@@ -249,25 +249,25 @@ def along(corners: Array) -> Sampled:
     return sample
 
 
-@pytest.mark.parametrize(("follows_path", "gets_on"), [(True, True), (False, False)])
-def test_along_a_way_round_plans_look_near_the_way(follows_path: bool, gets_on: bool) -> None:
-    """The last plan leads north before a wall, the way south through its gap: from one to the other no row leads."""
+@pytest.mark.parametrize(("follows_path", "passes"), [(True, True), (False, False)])
+def test_plans_along_a_path_are_linearised_around_it(follows_path: bool, passes: bool) -> None:
+    """The last plan leads north before a wall, the path south through a gap: rows of one exclude the other."""
     small = SeparationParams(radius_m=0.3, body_m=0.15)
     agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), small, 5, lambda: 0)
     to_north = glide_to(np.array([0.0, 0.0, -2.0]), np.zeros(3), np.array([0.1, 0.9, -2.0]), 1.0, 1.0)
     agent.committed = ending_at_rest(UTC_US, 100_000, *to_north.sample(np.arange(0.0, 2.1, 0.1)), 1.5)
     posts = [np.array([0.8, y_m, -2.0]) for y_m in (0.3, 0.6, 0.9, 1.2)]
     wall = [KeepOut(np.tile(post, (agent.steps + 1, 1)), 0.375, 0.275, True, -1) for post in posts]
-    way = along(np.array([[0.0, 0.0], [0.8, -0.4], [3.0, -0.4]]))
-    agent.propose(Situation(UTC_US, UTC_US + agent.lead_us, DesiredReference(way, follows_path), {}, wall))
+    path = along(np.array([[0.0, 0.0], [0.8, -0.4], [3.0, -0.4]]))
+    agent.propose(Situation(UTC_US, UTC_US + agent.lead_us, DesiredReference(path, follows_path), {}, wall))
     assert agent.proposal is not None
-    assert bool(agent.proposal.trajectory.pos_ned_m[-1, 0] > 1.0) is gets_on, "behind the wall"
+    assert bool(agent.proposal.trajectory.pos_ned_m[-1, 0] > 1.0) is passes, "behind the wall"
 
 
-@pytest.mark.parametrize("gathers", [True, False], ids=["", "control: at the way's speed at once"])
-def test_who_rests_at_a_corner_sets_out_at_its_own_speed(gathers: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A way at 1 m/s is round the corner before the agent is: rows of what comes next let its plan cut this one."""
-    if not gathers:
+@pytest.mark.parametrize("runs_up", [True, False], ids=["", "control: at the speed of the path at once"])
+def test_a_path_from_rest_begins_at_the_own_speed(runs_up: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A path at 1 m/s is past the corner before the agent is: rows of the next corner let its plan cut this one."""
+    if not runs_up:
         monkeypatch.setattr(trajectory_planner, "_with_run_up", lambda desired, speed_m_s: desired)
     small = SeparationParams(radius_m=0.3, body_m=0.15)
     agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), small, 3, lambda: 0)
@@ -275,9 +275,9 @@ def test_who_rests_at_a_corner_sets_out_at_its_own_speed(gathers: bool, monkeypa
     agent.begin(here, np.zeros(3), UTC_US)
     posts = [np.array([3.0, y_m, -2.0]) for y_m in (2.802, 2.502, 2.202)]
     wall = [KeepOut(np.tile(post, (agent.steps + 1, 1)), 0.375, 0.275, True, -1) for post in posts]
-    way = along(np.array([here[:2], [2.77, 3.14], [3.21, 3.25], [4.19, 3.06]]))
-    agent.propose(Situation(UTC_US, UTC_US + agent.lead_us, DesiredReference(way, follows_path=True), {}, wall))
-    assert (agent.proposal is not None) is gathers
+    path = along(np.array([here[:2], [2.77, 3.14], [3.21, 3.25], [4.19, 3.06]]))
+    agent.propose(Situation(UTC_US, UTC_US + agent.lead_us, DesiredReference(path, follows_path=True), {}, wall))
+    assert (agent.proposal is not None) is runs_up
     if agent.proposal is not None:
         assert agent.proposal.trajectory.pos_ned_m[-1, 0] > 3.4, "behind the wall"
 
@@ -299,20 +299,20 @@ def acknowledging(number: int) -> dict[int, TrajectoryMessage]:
 
 
 @pytest.mark.parametrize(("off", "commits"), [(0, 1), (1, 0), (-1, 0)])
-def test_only_the_very_proposal_is_acknowledged(off: int, commits: int) -> None:
+def test_an_acknowledgement_counts_for_its_proposal_only(off: int, commits: int) -> None:
     agent, proposal = proposing()
     agent.update(UTC_US + 20_000, acknowledging(proposal.number + off), {1})
     assert agent.counts.committed == commits
 
 
-def test_an_acknowledgement_after_the_moment_to_leave_is_too_late() -> None:
+def test_an_acknowledgement_after_the_lead_is_too_late() -> None:
     agent, proposal = proposing()
     agent.update(UTC_US + agent.lead_us + 1, acknowledging(proposal.number), {1})
     assert (agent.counts.committed, agent.counts.expired, agent.proposal) == (0, 1, None)
 
 
-def test_promises_that_are_too_close_already_do_not_creep_closer() -> None:
-    """Each ends 5 mm nearer than it begins, which the leniency that plans have would let pass, again and again."""
+def test_commitments_that_are_too_close_already_do_not_creep_closer() -> None:
+    """Each ends 5 mm nearer than it begins, which the tolerance of plans would allow again and again."""
     agent, _ = proposing()
     other = resting(np.zeros(3), UTC_US, 100_000)
     for k in range(10):

@@ -1,4 +1,4 @@
-"""The condensed MPC against solutions it knows nothing of: least squares by simulation, and a dense QP by SLSQP."""
+"""The condensed MPC agrees with independent solutions: least squares by simulation, and a dense QP by SLSQP."""
 
 from __future__ import annotations
 
@@ -398,7 +398,7 @@ def test_the_first_input_towards_an_end_out_of_reach_is_the_optimal_one(
         assert flown.u[0, 0] == pytest.approx(exact.u[0, 0], abs=0.1)
 
 
-def test_nonsense_is_not_solved_and_does_not_poison_the_next_problem() -> None:
+def test_invalid_numbers_are_not_solved_and_do_not_spoil_the_next_problem() -> None:
     problem = mpc(AXIS)
     expected = solve_one(mpc(AXIS), 0.0, 0.0, 0.0, 0.3)
     assert not solve_one(problem, math.nan, 0.0, 0.0, 0.3).solved

@@ -1,4 +1,4 @@
-"""Every kind of controller a configuration can ask for, behind the one call."""
+"""Every kind of controller a configuration can choose works behind the one interface."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_every_horizon_a_configuration_allows_can_be_flown(
 
 
 @pytest.mark.parametrize("kind", ["dmpc", "dmpc3"])
-def test_without_room_for_neighbours_they_are_still_judged(kind: Kind) -> None:
+def test_without_slots_neighbours_are_still_certified(kind: Kind) -> None:
     controller = make(kind, slots=0)
     plan = controller.plan(hover(controller, (0.5, 0.0, 0.0), near(controller, HERE + np.array([0.85, 0.0, 0.0]))))
     check(controller, plan)
@@ -119,7 +119,7 @@ def test_alone_keep_outs_change_nothing_at_all(guessed: bool) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_was_asked_is_not_written_to(kind: Kind) -> None:
+def test_the_problem_is_not_modified(kind: Kind) -> None:
     controller = make(kind)
     asked = hover(controller, (0.5, 0.2, -0.3), near(controller, HERE + np.array([1.2, 0.0, 0.2])))
     asked = replace(asked, guess_ned_m=np.tile(HERE, (controller.steps + 1, 1)))

@@ -1,4 +1,4 @@
-"""When an agent counts as deadlocked, who is in its way, and who gives way to whom."""
+"""Detection of deadlocks, blocking peers, and the rule by which agents yield."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ HERE = np.array([0.0, 0.0, -2.0])
 
 
 def keep_out(north_m: float, east_m: float = 0.0, priority_id: int = 1, ends_m: float = 0.0) -> KeepOut:
-    """A peer (an obstacle with `priority_id` -1) that means to move `ends_m` north over the horizon."""
+    """A peer (an obstacle with `priority_id` -1) that plans to move `ends_m` north over the horizon."""
     path = np.linspace([north_m, east_m, -2.0], [north_m + ends_m, east_m, -2.0], 41)
     return KeepOut(path, 0.9, 0.8, priority_id < 0, priority_id)
 
@@ -32,7 +32,7 @@ def watched(seconds: float, keep_outs: list[KeepOut], speed_m_s: float = 0.0, wa
     return [d for t_us, pos in ticks if (d := progress.step(t_us, pos, wanted, keep_outs)) is not None]
 
 
-def test_who_stands_before_somebody_is_deadlocked_once_it_has_lasted() -> None:
+def test_a_blocked_agent_at_rest_is_deadlocked_after_its_patience() -> None:
     before = [keep_out(1.0, priority_id=3), keep_out(0.8, 0.5, priority_id=-1)]
     assert watched(1.4, before) == []
     found = watched(3.2, before)
@@ -52,7 +52,9 @@ def test_who_stands_before_somebody_is_deadlocked_once_it_has_lasted() -> None:
     ],
     ids=["moving", "arrived", "behind", "far", "alone"],
 )
-def test_who_moves_or_has_nobody_before_it_is_not(keep_outs: list[KeepOut], speed_m_s: float, wanted: Array) -> None:
+def test_a_moving_or_unblocked_agent_is_not_deadlocked(
+    keep_outs: list[KeepOut], speed_m_s: float, wanted: Array
+) -> None:
     assert watched(4.0, keep_outs, speed_m_s, wanted) == []
 
 
@@ -64,25 +66,25 @@ def stood(
 
 
 def aside_m(recovery: DeadlockRecovery) -> float:
-    """How far beside the straight line the way leads in the next seconds."""
+    """Return how far beside the straight line the path leads in the next seconds [m]."""
     return float(np.abs(recovery.sample(np.linspace(0.0, 4.0, 81))[0][:, 1]).max())
 
 
-@pytest.mark.parametrize(("agent", "seconds", "gives_way"), [(2, 1.6, False), (2, 3.2, True), (0, 3.2, False)])
-def test_the_higher_id_goes_round_the_lower_one(agent: int, seconds: float, gives_way: bool) -> None:
+@pytest.mark.parametrize(("agent", "seconds", "yields"), [(2, 1.6, False), (2, 3.2, True), (0, 3.2, False)])
+def test_the_higher_id_yields_to_the_lower_one(agent: int, seconds: float, yields: bool) -> None:
     recovery = DeadlockRecovery(PARAMS, agent, 0.9)
     stood(recovery, seconds, [keep_out(1.0)])
     assert recovery.active
-    assert (aside_m(recovery) > 0.8) == gives_way
+    assert (aside_m(recovery) > 0.8) == yields
 
 
-def test_the_lower_one_goes_round_too_when_that_was_not_enough() -> None:
+def test_the_lower_id_yields_too_at_the_third_level() -> None:
     recovery = DeadlockRecovery(PARAMS, 0, 0.9)
     stood(recovery, 4.7, [keep_out(1.0)])
     assert aside_m(recovery) > 0.8
 
 
-def test_whom_it_was_deadlocked_with_is_gone_round_although_it_moves_now() -> None:
+def test_a_blocking_peer_is_avoided_although_it_moves_now() -> None:
     recovery = DeadlockRecovery(PARAMS, 2, 0.9)
     stood(recovery, 3.2, [keep_out(1.0, ends_m=-0.5)])
     assert aside_m(recovery) > 0.8
@@ -91,7 +93,7 @@ def test_whom_it_was_deadlocked_with_is_gone_round_although_it_moves_now() -> No
     assert aside_m(passing) < 0.1, "who is only passing is not"
 
 
-def test_round_a_wall_at_once_and_back_on_the_reference_when_it_is_reached() -> None:
+def test_a_wall_is_avoided_at_the_first_level_until_the_reference_is_reached() -> None:
     posts = tuple(
         Obstacle(np.array([1.5, east, 0.0]), 0.3, 0.9, 3.0, np.zeros(3), column=True) for east in (-0.6, 0.0, 0.6)
     )
@@ -104,26 +106,26 @@ def test_round_a_wall_at_once_and_back_on_the_reference_when_it_is_reached() -> 
     np.testing.assert_allclose(np.linalg.norm(vel, axis=1), 1.0)
     recovery.step(1_700_000, HERE + np.array([0.0, 2.0, 0.0]), reference, [], lambda: posts)
     assert recovery.active
-    assert recovery.deadlock is None, "it has got on"
+    assert recovery.deadlock is None, "it has moved on"
     recovery.step(9_000_000, WANTED - [0.1, 0.0, 0.0], reference, [], lambda: posts)
     assert not recovery.active
 
 
-def test_a_ball_below_is_not_gone_round() -> None:
+def test_a_sphere_below_is_not_avoided() -> None:
     ball = Obstacle(np.array([1.5, 0.0, 0.0]), 0.3, 0.9, 3.0, np.zeros(3))
     recovery = DeadlockRecovery(PARAMS, 0, 0.9)
     stood(recovery, 1.6, [keep_out(1.0, priority_id=-1)], (ball,))
     assert aside_m(recovery) < 0.1
 
 
-def test_switched_off_it_only_notices() -> None:
+def test_a_disabled_recovery_only_reports() -> None:
     recovery = DeadlockRecovery(PARAMS.model_copy(update={"enabled": False}), 2, 0.9)
     stood(recovery, 4.0, [keep_out(1.0)])
     assert recovery.deadlock is not None
     assert not recovery.active
 
 
-def test_reset_forgets_everything() -> None:
+def test_a_reset_ends_the_recovery() -> None:
     recovery = DeadlockRecovery(PARAMS, 2, 0.9)
     stood(recovery, 4.0, [keep_out(1.0)])
     recovery.reset()

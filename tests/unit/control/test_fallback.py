@@ -32,7 +32,7 @@ def brake(
 
 
 @pytest.mark.parametrize("speed_m_s", [0.5, 1.0, 2.5, 5.0])
-def test_stops_within_braking_distance_and_the_way_lost_to_tilting(speed_m_s: float) -> None:
+def test_stops_within_braking_distance_and_the_distance_lost_to_tilting(speed_m_s: float) -> None:
     plan = brake((speed_m_s, 0.0, 0.0))
     # v^2 / (2 * 3) at full braking, 0.12 s to tilt (0.3 at 2.5 per second), 1 / 4 s tail of the damping: v / 4
     limit_m = speed_m_s**2 / 6.0 + 0.12 * speed_m_s + min(speed_m_s, 0.75) / 4.0

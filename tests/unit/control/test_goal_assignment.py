@@ -1,4 +1,4 @@
-"""Places round one goal: as near to it as can be, far enough from each other, the same for everybody."""
+"""Places around one goal are as near to it as possible, far enough apart, and the same for every agent."""
 
 from __future__ import annotations
 
@@ -27,11 +27,11 @@ def test_the_arrangement_is_the_least_that_a_search_over_all_finds(count: int) -
     assert np.linalg.norm(points, axis=1).sum() <= least_sum_m(count, 1.0) + 1e-3
 
 
-def test_two_keep_the_same_distance_to_their_goal() -> None:
+def test_two_agents_keep_the_same_distance_to_their_goal() -> None:
     np.testing.assert_allclose(np.linalg.norm(arrangement(2), axis=1), 0.5)  # one on it would be as good a sum
 
 
-def test_three_round_one_point_form_a_triangle_at_its_height() -> None:
+def test_three_agents_around_one_point_form_a_triangle_at_its_height() -> None:
     starts = np.array([[4.0, 0.0, -1.0], [-2.0, 3.4, -1.0], [-2.0, -3.4, -2.0]])
     goals = np.tile([1.0, 1.0, -3.0], (3, 1))
     places, groups = assigned_goals_ned_m(starts, goals, APART_M)
@@ -50,7 +50,7 @@ def test_goals_far_enough_apart_stay_as_they_are() -> None:
     assert groups == [[0], [1], [2]]
 
 
-def test_who_would_be_pushed_by_an_arrangement_joins_it() -> None:
+def test_an_agent_too_close_to_an_arrangement_joins_it() -> None:
     goals = np.array([[5.0, 0.0, 0.0], [5.0, 0.0, 0.0], [5.9, 0.0, 0.0], [9.0, 0.0, 0.0]])
     starts = np.arange(4)[:, None] * np.array([2.0, 0.0, 0.0])  # they come along the line of the goals
     places, groups = assigned_goals_ned_m(starts, goals, APART_M)
@@ -60,7 +60,7 @@ def test_who_would_be_pushed_by_an_arrangement_joins_it() -> None:
 
 
 @pytest.mark.parametrize("count", [6, 10])
-def test_ways_flown_together_never_come_much_closer_than_their_ends(count: int) -> None:
+def test_simultaneous_flights_never_come_much_closer_than_their_ends(count: int) -> None:
     starts = np.random.default_rng(count).uniform(-6.0, 6.0, (200, 3)) * [1.0, 1.0, 0.0]
     chosen: list[Array] = []
     for start in starts:
@@ -73,7 +73,7 @@ def test_ways_flown_together_never_come_much_closer_than_their_ends(count: int) 
 
 
 def rest_s(references: list[MissionReference]) -> list[float]:
-    """When each comes to rest."""
+    """Return the time at which each agent comes to rest [s]."""
     times = np.arange(0.0, 20.0, 0.01)
     return [float(times[np.linalg.norm(r.sample(times)[1], axis=1).nonzero()[0][-1]]) for r in references]
 
@@ -88,7 +88,7 @@ def test_inner_places_are_reached_first() -> None:
     assert max(others) - min(others) < 0.05
 
 
-def test_everybody_works_out_the_same_and_arrives_as_others_do() -> None:
+def test_all_agents_compute_the_same_places() -> None:
     starts = np.array([[4.0, 0.0, -1.0], [-1.0, 1.7, -1.0], [-2.0, -3.4, -2.0]])
     mission = MissionParams(kind="goto", goto=GotoParams(goals_ned_m=((0.0, 0.0, -1.0),)))
     flown = [MissionReference(mission, starts, agent, APART_M) for agent in range(3)]

@@ -1,4 +1,4 @@
-"""One problem for three axes: signs, agreement with the thesis' two, passing above and below, and no favourite axis."""
+"""One problem for three axes has the right signs, agrees with the thesis' two, and favours no axis."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def joint(slots: int = 4, separation: SeparationParams | None = None, **params: 
 
 
 def ball(offset: Point, any_height: bool = False, priority_id: int = -1) -> KeepOut:
-    """0.9 m round a place that is `offset` from HERE; certified from 0.8 m on; an obstacle unless it has a number."""
+    """Return a keep-out of 0.9 m (hard minimum 0.8 m) at `offset` from HERE; an obstacle unless it has an id."""
     return KeepOut(np.tile(HERE + np.array(offset), (41, 1)), 0.9, 0.8, any_height, priority_id)
 
 
@@ -92,7 +92,7 @@ def test_bounds_of_thrust_and_tilt_hold() -> None:
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_nonsense_is_a_status_and_not_an_exception(bad: float) -> None:
+def test_invalid_numbers_are_a_status_and_not_an_exception(bad: float) -> None:
     mpc = joint()
     with np.errstate(invalid="ignore"):
         for nonsense in (problem((bad, 0.0, 0.0)), problem((0.0, 0.0, 0.0), vel=(0.0, 0.0, bad))):
@@ -133,7 +133,7 @@ def test_the_planned_path_is_the_motion_of_its_own_virtual_controls(climb_m: flo
     np.testing.assert_allclose(motion(asked, plan), plan.pos_ned_m, atol=0.01)
 
 
-def test_what_is_certified_is_what_would_be_flown() -> None:
+def test_the_certified_path_is_the_motion_of_the_inputs() -> None:
     near = ball((1.1424, 0.4675, -1.7551), priority_id=1)
     state = {"vel": (-0.1647, -0.4631, 1.3129), "virtual": (-0.0542, -0.1913, 7.899)}
     asked = problem((3.2193, 1.9425, -1.0748), [near], **state)  # type: ignore[arg-type]
@@ -215,7 +215,7 @@ def test_the_thesis_controller_cannot_pass_that_wall() -> None:
 
 
 @pytest.mark.parametrize("lower_m", [0.2, -0.2])
-def test_what_is_kept_clear_of_at_every_height_is_never_passed_above(lower_m: float) -> None:
+def test_a_keep_out_at_every_height_is_never_passed_above(lower_m: float) -> None:
     keep_outs = wall(lower_m, any_height=True)
     flight = fly(joint(terminal_z=FREE_END), (4.0, 0.0, 0.0), keep_outs)
     assert all(plan.status is PlanStatus.OK for plan in flight.plans)
@@ -238,7 +238,7 @@ def test_above_its_place_it_stays_above_when_the_reference_falls_into_a_keep_out
 
 
 @pytest.mark.parametrize("terminal", ["position", "position_velocity"])  # the second is the default
-def test_keeping_clear_comes_before_ending_at_the_reference(terminal: str) -> None:
+def test_distances_have_priority_over_the_terminal_condition(terminal: str) -> None:
     below = ball((0.0, 0.0, 0.9), priority_id=1)
     plan = joint(terminal_z=terminal).plan(problem((0.0, 0.0, 0.08), [below]))
     assert plan.slack_m < 0.01

@@ -1,4 +1,4 @@
-"""The attitude's answer: against closed forms, against a fine integration, and inside the MPC's prediction."""
+"""The attitude lag agrees with closed forms, with a fine integration, and with the MPC's prediction."""
 
 from __future__ import annotations
 

@@ -72,7 +72,7 @@ def test_a_swap_ends_opposite_through_the_middle_of_the_swarm() -> None:
         np.testing.assert_allclose(vel[1], 1.875 * (pos[2] - pos[0]) / 8.0, atol=1e-12)
 
 
-def test_everybody_goes_to_its_own_goal_or_all_to_one_and_stays() -> None:
+def test_agents_fly_to_their_own_goals_or_to_a_shared_one_and_stay() -> None:
     goals = [[5.0, 0.0, -1.0], [0.0, 6.0, -2.0], [1.0, 3.0, -4.0]]
     for agent in range(3):
         pos, vel = sample([0.0, 60.0, 90.0], agent, kind="goto", goto={"goals_ned_m": goals})
@@ -83,7 +83,7 @@ def test_everybody_goes_to_its_own_goal_or_all_to_one_and_stays() -> None:
         )
 
 
-def test_the_way_to_a_goal_keeps_to_speed_and_acceleration() -> None:
+def test_the_flight_to_a_goal_keeps_speed_and_acceleration() -> None:
     t_s = np.arange(0.0, 20.0, 0.01)
     goto = {"goals_ned_m": [[9.0, 8.0, -1.0]], "speed_m_s": 1.5, "accel_m_s2": 1.0}
     _, vel = sample(t_s.tolist(), kind="goto", goto=goto)

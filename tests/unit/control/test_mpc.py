@@ -1,4 +1,4 @@
-"""One step of the swarm MPC: signs by the thesis' equations, and every status of a plan by what brings it about."""
+"""One step of the swarm MPC has the signs of the thesis' equations, and every status of a plan has its cause."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ def test_a_reference_above_takes_more_thrust_than_the_weight(up_m: float) -> Non
     assert (plan.pos_ned_m[-1, 2] - HERE[2]) * -up_m > 0.04  # three increments that end at rest reach 0.1 m
 
 
-def test_at_its_reference_it_hovers() -> None:
+def test_a_vehicle_at_its_reference_hovers() -> None:
     plan = plan_to((0.0, 0.0, 0.0))
     np.testing.assert_allclose(plan.virtual, np.tile([0.0, 0.0, G], (40, 1)), atol=5e-3)
     np.testing.assert_allclose(plan.pos_ned_m, np.tile(HERE, (41, 1)), atol=2e-3)
@@ -89,7 +89,7 @@ def test_a_tilted_vehicle_needs_more_thrust_to_hover() -> None:
     np.testing.assert_allclose(plan.virtual[:, 2], G / 0.9, atol=5e-3)
 
 
-def test_wind_is_leant_against() -> None:
+def test_the_plan_leans_against_wind() -> None:
     plan = plan_to((0.0, 0.0, 0.0), wind=(1.0, -0.5, 0.4))
     first_to_last = plan.virtual[-1]
     assert first_to_last[0] > 0.02 > 0.0 > first_to_last[1]  # wind to the north: body axis north, thrust south
@@ -138,7 +138,7 @@ def test_only_a_thrust_that_changes_makes_held_and_planned_differ() -> None:
     assert np.abs(climbing[0].pos_ned_m - climbing[1].pos_ned_m).max() > 0.02
 
 
-def test_a_neighbour_in_the_way_is_kept_clear_of() -> None:
+def test_a_neighbour_ahead_is_avoided() -> None:
     neighbour = fixed(HERE + np.array([1.3, 0.0, 0.0]))
     free, kept = plan_to((1.3, 0.0, 0.0)), plan_to((1.3, 0.0, 0.0), neighbour)
     assert free.status is kept.status is PlanStatus.OK
@@ -147,14 +147,14 @@ def test_a_neighbour_in_the_way_is_kept_clear_of() -> None:
     assert certify(free.pos_ned_m, [neighbour], 6) < certify(kept.pos_ned_m, [neighbour], 6)
 
 
-def test_a_plan_that_cannot_avoid_is_not_certified_and_says_how_much_it_lacks() -> None:
+def test_a_plan_that_cannot_avoid_is_not_certified_and_reports_its_slack() -> None:
     rushing = start(vel=(4.0, 0.0, 0.0))
     plan = plan_to((5.0, 0.0, 0.0), fixed(HERE + np.array([2.0, 0.0, 0.0])), begin=rushing)
     assert plan.status is PlanStatus.NOT_CERTIFIED
     assert certify(plan.pos_ned_m, [fixed(HERE + np.array([2.0, 0.0, 0.0]))], 6) < 0.0
 
 
-def test_a_keep_out_beyond_the_slots_is_still_judged() -> None:
+def test_a_keep_out_beyond_the_slots_is_still_certified() -> None:
     near = [fixed(HERE + np.array([0.0, e, 0.0]), 0.8) for e in (0.5, -0.5)]  # nearest two take both slots
     wall = [fixed(HERE + np.array([3.0, 0.6, 0.0]), 0.8)]
     plan = plan_to((5.0, 0.0, 0.0), *near, *wall, begin=start(vel=(4.0, 0.0, 0.0)))
@@ -183,7 +183,7 @@ def solution(residual_m: float, solved: bool = True) -> AxesSolution:
         (0.0, False, PlanStatus.SOLVER_FAILED),
     ],
 )
-def test_the_answer_of_the_solver_is_looked_at(
+def test_every_solver_status_is_checked(
     monkeypatch: pytest.MonkeyPatch, residual_m: float, solved: bool, status: PlanStatus
 ) -> None:
     mpc = SwarmMpc(MpcParams(), VehicleModelParams(), SeparationParams(), 0, 2, lambda: 0)
@@ -261,14 +261,14 @@ def wide(place: Array, radius_m: float, any_height: bool = False) -> KeepOut:
     [wide(HERE + np.array([4.2, 0.0, 0.0]), 4.0), wide(HERE + np.array([1.0, 0.0, 9.0]), 0.9, any_height=True)],
     ids=["large", "at any height"],
 )
-def test_slots_go_to_those_whose_surface_is_nearest(pressing: KeepOut) -> None:
+def test_slots_go_to_the_keep_outs_with_the_nearest_surface(pressing: KeepOut) -> None:
     harmless = wide(HERE + np.array([0.0, 2.0, 0.0]), 0.9)
     guess = np.tile(HERE, (41, 1))
     assert closest_keep_outs([harmless, pressing], guess, 1)[0] is pressing
 
 
 @pytest.mark.parametrize("terminal", ["position", "position_velocity"])
-def test_keeping_clear_comes_before_ending_at_the_reference(terminal: str) -> None:
+def test_distances_have_priority_over_the_terminal_condition(terminal: str) -> None:
     # the reference has moved into a neighbour's place; the end can be met in time, by flying into it
     neighbour = fixed(HERE + np.array([0.9, 0.0, 0.0]))
     plan = plan_to((0.03, 0.0, 0.0), neighbour, terminal_xy=terminal, terminal_z="none")
@@ -277,7 +277,7 @@ def test_keeping_clear_comes_before_ending_at_the_reference(terminal: str) -> No
 
 
 @pytest.mark.parametrize("kind", ["dmpc", "dmpc3"])
-def test_from_rest_peers_that_it_would_meet_far_away_are_kept_clear_of(kind: Literal["dmpc", "dmpc3"]) -> None:
+def test_from_rest_peers_beyond_the_gate_are_avoided(kind: Literal["dmpc", "dmpc3"]) -> None:
     """Two peers and the reference go round a circle; the guess stands still, farther than the gate from all of them.
 
     Of three PX4 one that had stopped found no plan for 5 s, until it gave up.

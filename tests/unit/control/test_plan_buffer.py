@@ -86,7 +86,7 @@ def test_after_a_bad_plan_the_last_good_one_is_kept_where_it_is_free(replay: Rep
 
 @pytest.mark.parametrize("status", BAD)
 def test_it_is_dropped_when_braking_comes_less_close(replay: Replay, status: PlanStatus) -> None:
-    """It flies through the wall at 2 m; who brakes stays 1.8 m away from it."""
+    """The plan flies through the wall at 2 m; braking stays 1.8 m away from it."""
     replay.take(moving(), start_at(0), [], rest)
     replay.take(moving(100_000, status=status), start_at(100_000), [wall(2.0)], rest)
     assert replay.plan is None

@@ -1,4 +1,4 @@
-"""The nearest point of a polyhedron: against a general solver, in every dimension it is used in."""
+"""Projection onto a polyhedron agrees with a general solver, in every dimension that is used."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def random_rows(rng: np.random.Generator, dims: int, count: int, inside: bool) -
 
 
 @pytest.mark.parametrize("dims", [1, 2, 3, 4])
-def test_it_is_the_nearest_there_is(dims: int) -> None:
+def test_the_projection_is_the_nearest_point(dims: int) -> None:
     rng = np.random.default_rng(dims)
     for _ in range(25):
         rows = random_rows(rng, dims, 3 * dims, inside=True)
@@ -40,7 +40,7 @@ def test_it_is_the_nearest_there_is(dims: int) -> None:
         assert math.dist(found, wanted.tolist()) == pytest.approx(math.sqrt(best.fun), abs=1e-4)
 
 
-def test_none_when_there_is_none_and_only_then() -> None:
+def test_the_projection_is_none_exactly_for_an_empty_polyhedron() -> None:
     rng = np.random.default_rng(5)
     seen = set()
     for _ in range(120):
@@ -52,7 +52,7 @@ def test_none_when_there_is_none_and_only_then() -> None:
     assert seen == {True, False}
 
 
-def test_rows_that_can_not_be_kept_lack_evenly_and_hard_ones_are_kept() -> None:
+def test_violation_is_shared_evenly_and_hard_rows_are_met() -> None:
     soft: list[Row] = [((1.0, 0.0), 2.0), ((-1.0, 0.0), 0.0)]  # x >= 2 and x <= 0
     hard: list[Row] = [((0.0, 1.0), -1.0), ((0.0, -1.0), -1.0)]
     x, y = project_or_violate_least((5.0, 3.0), soft, hard, 1e4)
@@ -60,6 +60,6 @@ def test_rows_that_can_not_be_kept_lack_evenly_and_hard_ones_are_kept() -> None:
     assert y == pytest.approx(1.0, abs=1e-9)
 
 
-def test_what_needs_no_change_is_returned_as_it_is() -> None:
+def test_a_point_inside_is_returned_unchanged() -> None:
     wanted = (0.1, 0.2, 0.3)
     assert project(wanted, [((1.0, 0.0, 0.0), 0.0)]) is wanted

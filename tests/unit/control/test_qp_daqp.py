@@ -1,4 +1,4 @@
-"""DAQP behind the solver seam: it answers as OSQP does, exactly, and fails as a value."""
+"""DAQP behind the solver interface agrees with OSQP, is exact, and reports failure as a value."""
 
 from __future__ import annotations
 

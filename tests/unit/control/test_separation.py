@@ -1,4 +1,4 @@
-"""Keeping apart: time alignment, growth with age, half-spaces and the certificate, by numbers worked out by hand."""
+"""Time alignment, growth with age, half-spaces and the certificate agree with numbers worked out by hand."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def peer(points: Array, dt_us: int = DT_US, radius_m: float = 0.0, agent: int = 
 
 
 def straight(speed_m_s: float, points: int = 6, dt_us: int = DT_US) -> PredictedPath:
-    """Along north from the origin."""
+    """Return points along north from the origin."""
     north = np.arange(points) * speed_m_s * dt_us * 1e-6
     return peer(np.stack([north, np.zeros(points), np.full(points, -2.0)], axis=1), dt_us)
 
@@ -62,12 +62,12 @@ def test_beyond_its_end_a_peer_brakes_to_a_stop() -> None:
     np.testing.assert_allclose(aligned[:, 2], -2.0)
 
 
-def test_an_hour_old_path_is_a_place_and_not_a_projectile() -> None:
+def test_a_path_one_hour_old_has_stopped() -> None:
     aligned = align(straight(3.0), UTC_US + 3_600_000_000, DT_US, 2, 3.0)
     np.testing.assert_allclose(aligned[:, 0], 3.0)
 
 
-def test_a_peer_at_rest_stays() -> None:
+def test_a_path_at_rest_is_not_extrapolated() -> None:
     aligned = align(straight(0.0), UTC_US + 10_000_000, DT_US, 2, 3.0)
     np.testing.assert_allclose(aligned, np.tile([0.0, 0.0, -2.0], (3, 1)))
 
@@ -87,13 +87,13 @@ def test_keep_out_grows_with_age_to_its_cap_and_a_lost_peer_is_a_cylinder(
     assert (keep_out.any_height, keep_out.priority_id) == (any_height, 4)
 
 
-def test_a_peer_that_has_landed_is_kept_clear_of_but_does_not_grow() -> None:
+def test_the_keep_out_of_a_landed_peer_does_not_grow() -> None:
     keep_out = keep_out_of_peer(peer(np.zeros((3, 3))), UTC_US + 600_000_000, DT_US, STEPS, PARAMS, parked=True)
     assert keep_out.radius_m == pytest.approx(0.9)
     assert not keep_out.any_height
 
 
-def test_a_moving_obstacle_is_taken_at_constant_velocity_and_seen_only_from_near() -> None:
+def test_a_moving_obstacle_has_constant_velocity_and_limited_visibility() -> None:
     obstacle = Obstacle(np.array([5.0, 0.0, -2.0]), 1.0, 1.75, 3.0, np.array([-1.0, 0.5, 0.0]))
     keep_out = keep_out_of_obstacle(obstacle, 200_000, 2, PARAMS)
     np.testing.assert_allclose(keep_out.pos_ned_m, [[5.0, 0.0, -2.0], [4.8, 0.1, -2.0], [4.6, 0.2, -2.0]])
@@ -114,7 +114,7 @@ def line(start: tuple[float, float, float], end: tuple[float, float, float], ste
     return np.linspace(start, end, steps + 1)
 
 
-def test_margin_is_true_distance_minus_what_is_allowed() -> None:
+def test_margin_is_true_distance_minus_hard_minimum_distance() -> None:
     path = line((-5.0, 2.0, 0.0), (5.0, 2.0, 0.0))
     assert certify(path, [fixed((0.0, 0.0, 0.0), 0.8)], 0) == pytest.approx(1.2)
     assert certify(path, [fixed((0.0, 0.0, 0.0), 0.8), fixed((0.0, 1.5, 0.0), 0.8)], 0) == pytest.approx(-0.3)
@@ -138,7 +138,7 @@ def test_a_path_that_jumps_over_an_obstacle_between_two_samples_is_caught() -> N
     assert certify(path, [fixed((0.0, 0.0, 0.0), 0.4)], 0) == pytest.approx(-0.4)
 
 
-def test_two_that_swap_places_between_two_samples_are_caught() -> None:
+def test_a_swap_of_places_between_two_samples_is_caught() -> None:
     other = KeepOut(line((10.0, 0.0, 0.0), (0.0, 0.0, 0.0), 5), 0.9, 0.8, False, 1)
     own = line((0.0, 0.0, 0.0), (10.0, 0.0, 0.0), 5)  # at no sample nearer than 2 m
     assert certify(own, [other], 0) == pytest.approx(-0.8)
@@ -150,14 +150,14 @@ def test_height_separates_from_a_sphere_but_not_from_a_cylinder() -> None:
     assert certify(path, [fixed((0.0, 0.0, 0.0), 0.8, any_height=True)], 0) == pytest.approx(-0.8)
 
 
-def test_what_cannot_be_changed_any_more_is_not_judged() -> None:
+def test_steps_before_the_first_one_that_can_change_are_not_certified() -> None:
     path = line((0.85, 0.0, 0.0), (10.85, 0.0, 0.0))  # leaves; margin 0.05 in the first segment, 1.05 from the second
     keep_out = [fixed((0.0, 0.0, 0.0), 0.8)]
     assert certify(path, keep_out, 0) == pytest.approx(0.05)
     assert certify(path, keep_out, 1) == pytest.approx(1.05)
 
 
-def test_where_it_is_too_close_now_a_way_out_is_allowed_and_a_way_in_is_not() -> None:
+def test_from_inside_a_keep_out_a_plan_may_leave_but_not_approach() -> None:
     keep_out = [fixed((0.0, 0.0, 0.0), 0.8)]
     assert certify(line((0.5, 0.0, 0.0), (3.0, 0.0, 0.0)), keep_out, 0) == 0.0
     assert certify(line((0.5, 0.0, 0.0), (0.1, 0.0, 0.0)), keep_out, 0) == pytest.approx(-0.7)
@@ -165,7 +165,7 @@ def test_where_it_is_too_close_now_a_way_out_is_allowed_and_a_way_in_is_not() ->
     assert certify(line((0.5, 0.0, 0.0), (3.0, 0.0, 0.0)), [*keep_out, fixed((3.0, 0.0, 0.0), 0.8)], 0) < 0.0
 
 
-def test_control_horizon_as_long_as_the_prediction_leaves_the_end_to_be_judged() -> None:
+def test_a_full_control_horizon_leaves_the_last_step_to_certify() -> None:
     path = line((0.0, 0.0, 0.0), (5.0, 0.0, 0.0), 6)
     assert certify(path, [fixed((5.0, 0.0, 0.0), 0.8, steps=6)], 6) < 0.0
 
@@ -176,7 +176,7 @@ def test_control_horizon_as_long_as_the_prediction_leaves_the_end_to_be_judged()
 def spaces_of(
     guess: Array, *keep_outs: KeepOut, priority_id: int = 0, goal: tuple[float, float] = (0.0, 0.0)
 ) -> HalfSpaces:
-    """Of an agent at rest."""
+    """Return half-spaces of an agent at rest."""
     spaces = half_spaces(keep_outs, guess, np.array(goal), np.zeros(2), 0.1, priority_id, PARAMS)
     assert spaces is not None
     return spaces
@@ -187,7 +187,7 @@ def still(place: tuple[float, float, float]) -> Array:
 
 
 @pytest.mark.parametrize(("north", "east"), list(product((-2.0, 0.0, 2.0), (-1.5, 1.5))))
-def test_half_space_faces_from_the_other_to_us_and_stands_at_the_radius(north: float, east: float) -> None:
+def test_a_half_space_faces_the_agent_at_the_radius(north: float, east: float) -> None:
     own = np.array([north, east])
     spaces = spaces_of(still((north, east, 0.0)), fixed((0.0, 0.0, 0.0), 0.8), goal=(north, east))
     normal, offset = spaces.normal[0, -1], spaces.offset_m[0, -1]
@@ -197,7 +197,7 @@ def test_half_space_faces_from_the_other_to_us_and_stands_at_the_radius(north: f
     assert normal @ np.zeros(2) < offset  # the other is not
 
 
-def test_offset_moves_with_the_other() -> None:
+def test_the_offset_moves_with_the_keep_out() -> None:
     spaces = spaces_of(still((10.0, 5.0, 0.0)), fixed((10.0, 3.0, 0.0), 0.8), goal=(10.0, 5.0))
     assert spaces.offset_m[0, 0] == pytest.approx(3.0 + 0.9)  # along east
 
@@ -205,7 +205,7 @@ def test_offset_moves_with_the_other() -> None:
 @pytest.mark.parametrize(
     ("height_m", "needed_m"), [(0.0, 0.9), (0.54, 0.72), (-0.72, 0.54), (0.9, -math.inf), (5.0, -math.inf)]
 )
-def test_height_difference_relieves_what_must_be_kept_horizontally(height_m: float, needed_m: float) -> None:
+def test_a_height_difference_reduces_the_horizontal_distance(height_m: float, needed_m: float) -> None:
     sphere = fixed((0.0, 0.0, 0.0), 0.8)
     spaces = spaces_of(still((2.0, 0.0, height_m)), sphere, goal=(2.0, 0.0))
     assert spaces.offset_m[0, 3] == pytest.approx(needed_m)
@@ -214,13 +214,13 @@ def test_height_difference_relieves_what_must_be_kept_horizontally(height_m: flo
 
 
 def squeezed(place: tuple[float, float, float]) -> KeepOut:
-    """With a downwash of 2, allowed 0.8 m."""
+    """Return a keep-out with downwash 2 and hard minimum distance 0.8 m."""
     return replace(fixed(place, 0.8), downwash=2.0)
 
 
 @pytest.mark.parametrize(("height_m", "needed_m"), [(0.0, 0.9), (1.0, math.sqrt(0.81 - 0.25)), (1.8, 0.0)])
 def test_downwash_reaches_higher_than_wide(height_m: float, needed_m: float) -> None:
-    """In the plane, in space and in the certificate alike."""
+    """The plane, space and the certificate agree."""
     spaces = spaces_of(still((2.0, 0.0, height_m)), squeezed((0.0, 0.0, 0.0)), goal=(2.0, 0.0))
     if needed_m:
         assert spaces.offset_m[0, 3] == pytest.approx(needed_m)
@@ -239,7 +239,7 @@ def test_downwash_reaches_higher_than_wide(height_m: float, needed_m: float) -> 
     assert certify(still((0.9, 0.0, 0.0)), [squeezed((0.0, 0.0, 0.0))], 0) == pytest.approx(0.1)
 
 
-def test_downwash_is_of_peers_not_of_obstacles() -> None:
+def test_downwash_applies_to_peers_and_not_to_obstacles() -> None:
     params = SeparationParams(downwash=2.0)
     path = PredictedPath(1, 1, 1, 0, DT_US, 0.0, still((0.0, 0.0, 0.0)))
     assert keep_out_of_peer(path, 0, DT_US, STEPS, params).downwash == 2.0
@@ -256,13 +256,13 @@ def test_downwash_takes_as_long_to_stop_from_above() -> None:
         assert spaces.stop_s[0] == pytest.approx(2.8 / (2 * 1.4))
 
 
-def test_far_ones_get_no_row() -> None:
+def test_far_keep_outs_get_no_row() -> None:
     assert np.isneginf(spaces_of(still((4.0, 0.0, 0.0)), fixed((0.0, 0.0, 0.0), 0.8)).offset_m).all()
     assert np.isfinite(spaces_of(still((3.8, 0.0, 0.0)), fixed((0.0, 0.0, 0.0), 0.8)).offset_m).all()
     assert half_spaces([], still((4.0, 0.0, 0.0)), np.zeros(2), np.zeros(2), 0.1, 0, PARAMS) is None
 
 
-def test_two_at_the_same_place_take_opposite_sides_by_their_numbers() -> None:
+def test_coincident_agents_take_opposite_sides_by_their_ids() -> None:
     place = (1.0, 2.0, -2.0)
     other_of_0 = KeepOut(still(place), 0.9, 0.8, False, priority_id=1)
     other_of_1 = KeepOut(still(place), 0.9, 0.8, False, priority_id=0)
@@ -275,14 +275,14 @@ def test_two_at_the_same_place_take_opposite_sides_by_their_numbers() -> None:
     assert -first.offset_m[0, 0] + 1.0 + second.offset_m[0, 0] - 1.0 >= 1.8 - 1e-9
 
 
-def test_head_on_agents_that_get_nowhere_turn_to_opposite_sides_of_the_line() -> None:
+def test_stuck_head_on_agents_turn_to_opposite_sides() -> None:
     north_bound, south_bound = still((0.0, 0.0, 0.0)), still((1.0, 0.0, 0.0))
     a = spaces_of(north_bound, KeepOut(south_bound, 0.9, 0.8, False, 1), priority_id=0, goal=(5.0, 0.0))
     b = spaces_of(south_bound, KeepOut(north_bound, 0.9, 0.8, False, 0), priority_id=1, goal=(-5.0, 0.0))
     # turned by 0.35 rad: (-1, 0) -> (-cos, -sin), (1, 0) -> (cos, sin)
     np.testing.assert_allclose(a.normal[0, 0], [-math.cos(0.35), -math.sin(0.35)], atol=1e-9)
     np.testing.assert_allclose(b.normal[0, 0], [math.cos(0.35), math.sin(0.35)], atol=1e-9)
-    moving = np.linspace((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), STEPS + 1)  # gets somewhere: peers' normals stay
+    moving = np.linspace((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), STEPS + 1)  # makes progress: peers' normals stay
     c = spaces_of(moving, KeepOut(still((2.0, 0.0, 0.0)), 0.9, 0.8, False, 1), goal=(5.0, 0.0))
     np.testing.assert_allclose(c.normal[0, 0], [-1.0, 0.0], atol=1e-9)
     obstacle = KeepOut(still((2.0, 0.0, 0.0)), 0.9, 0.8, False, -1)  # obstacles do not evade: always turned
@@ -291,7 +291,7 @@ def test_head_on_agents_that_get_nowhere_turn_to_opposite_sides_of_the_line() ->
 
 @pytest.mark.parametrize("axes", [2, 3])
 @pytest.mark.parametrize("east_m", [0.05, -0.05])
-def test_obstacles_are_passed_on_the_side_one_is_on(east_m: float, axes: int) -> None:
+def test_obstacles_are_passed_on_the_side_the_agent_is_on(east_m: float, axes: int) -> None:
     moving = np.linspace((0.0, east_m, 0.0), (1.0, east_m, 0.0), STEPS + 1)
     obstacle = KeepOut(still((2.0, 0.0, 0.0)), 0.9, 0.8, False, -1)
     spaces = half_spaces([obstacle], moving, np.array([5.0, 0.0, 0.0][:axes]), np.zeros(axes), 0.1, 0, PARAMS)
@@ -301,7 +301,7 @@ def test_obstacles_are_passed_on_the_side_one_is_on(east_m: float, axes: int) ->
     assert (np.abs(normal[:, 1]) > 0.2).all()  # more than the 0.05 / 2 without the turn
 
 
-def test_stopping_row_asks_for_the_braking_distance_and_not_when_opening() -> None:
+def test_the_stopping_row_adds_the_braking_distance_only_when_closing() -> None:
     guess = still((-3.0, 0.0, 0.0))
     wall = [fixed((0.0, 0.0, 0.0), 0.8)]
     params = PARAMS.model_copy(update={"right_of_way_rad": 0.0, "right_of_way_obstacle_rad": 0.0})
@@ -315,7 +315,7 @@ def test_stopping_row_asks_for_the_braking_distance_and_not_when_opening() -> No
     assert opening.stop_s[0] == 0.0
 
 
-def test_stopping_row_knows_that_the_other_moves_too() -> None:
+def test_the_stopping_row_includes_the_motion_of_the_peer() -> None:
     other = KeepOut(line((0.0, 0.0, 0.0), (-1.0, 0.0, 0.0)), 0.9, 0.8, False, 1)  # 1 m/s south
     params = PARAMS.model_copy(update={"right_of_way_rad": 0.0, "right_of_way_obstacle_rad": 0.0})
     spaces = half_spaces([other], still((-3.0, 0.0, 0.0)), np.array([5.0, 0.0]), np.array([1.8, 0.0]), 0.1, 0, params)
@@ -331,7 +331,7 @@ def test_stopping_row_knows_that_the_other_moves_too() -> None:
 def in_space(
     guess: Array, *keep_outs: KeepOut, priority_id: int = 0, goal: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> HalfSpaces:
-    """Of an agent at rest."""
+    """Return half-spaces of an agent at rest."""
     spaces = half_spaces(keep_outs, guess, np.array(goal), np.zeros(3), 0.1, priority_id, PARAMS)
     assert spaces is not None
     return spaces
@@ -339,7 +339,7 @@ def in_space(
 
 @pytest.mark.parametrize("axes", [2, 3])
 @pytest.mark.parametrize("seed", range(20))
-def test_whoever_is_in_a_half_space_is_at_least_the_radius_away(seed: int, axes: int) -> None:
+def test_positions_within_a_half_space_are_at_least_the_radius_away(seed: int, axes: int) -> None:
     rng = np.random.default_rng([seed, 0, 11])
     guess = np.cumsum(rng.normal(0.0, 0.2, (STEPS + 1, 3)), axis=0)
     goal = rng.normal(0.0, 4.0, 3)
@@ -375,7 +375,7 @@ def test_whoever_is_in_a_half_space_is_at_least_the_radius_away(seed: int, axes:
             assert np.linalg.norm(apart, axis=1).min() >= keep_out.radius_m - 1e-9
 
 
-def test_in_space_who_is_above_is_kept_above() -> None:
+def test_in_space_an_agent_above_is_kept_above() -> None:
     spaces = in_space(still((0.0, 0.0, -2.0)), fixed((0.0, 0.0, -1.0), 0.8), goal=(0.0, 0.0, -2.0))
     np.testing.assert_allclose(spaces.normal[0], np.tile([0.0, 0.0, -1.0], (STEPS, 1)))
     np.testing.assert_allclose(spaces.offset_m[0], 1.0 + 0.9)  # -z >= 1.9: at most 1.9 m below the origin's height
@@ -384,7 +384,7 @@ def test_in_space_who_is_above_is_kept_above() -> None:
     assert oblique.offset_m[0, 0] == pytest.approx(0.9)  # all of it: height is no relief but a direction
 
 
-def test_in_space_a_cylinder_is_kept_clear_of_sideways_only() -> None:
+def test_in_space_a_cylinder_is_avoided_sideways_only() -> None:
     cylinder = fixed((0.0, 0.0, 0.0), 0.8, any_height=True)
     spaces = in_space(still((1.2, 0.0, -1.6)), cylinder, goal=(1.2, 0.0, -1.6))
     np.testing.assert_allclose(spaces.normal[0], np.tile([1.0, 0.0, 0.0], (STEPS, 1)))
@@ -405,7 +405,7 @@ def test_in_space_coincident_centres_have_a_side(above_m: float, any_height: boo
         assert np.isfinite(spaces.stop_s).all()
 
 
-def test_in_space_the_stopping_row_knows_vertical_speed() -> None:
+def test_in_space_the_stopping_row_includes_vertical_speed() -> None:
     sinking = half_spaces(
         [fixed((0.0, 0.0, 0.0), 0.8)], still((0.0, 0.0, -3.0)), np.zeros(3), np.array([0.0, 0.0, 2.8]), 0.1, 0, PARAMS
     )
@@ -418,7 +418,7 @@ def test_in_space_the_stopping_row_knows_vertical_speed() -> None:
     assert spaces.stop_offset_m[0] == pytest.approx(1.0 + 0.9 + 1.0 / 2.8)  # -z: where it is then, and the radius
 
 
-def test_in_space_who_climbs_gets_somewhere() -> None:
+def test_in_space_a_climb_counts_as_progress() -> None:
     peer_ahead = KeepOut(np.linspace((1.5, 0.0, -0.2), (1.5, 0.0, -2.2), STEPS + 1), 0.9, 0.8, False, 1)
     climbing = np.linspace((0.0, 0.0, 0.0), (0.05, 0.0, -2.0), STEPS + 1)  # 2 m, of which 5 cm are not up
     turned = in_space(climbing, peer_ahead, goal=(9.0, 0.0, -2.0)).normal[0, :, 1]
@@ -428,7 +428,7 @@ def test_in_space_who_climbs_gets_somewhere() -> None:
 # -- how large the radius has to be -----------------------------------------------------------------------------------
 
 
-def test_the_radius_covers_bodies_tracking_and_two_wrong_positions() -> None:
+def test_the_required_radius_covers_bodies_tracking_and_two_position_errors() -> None:
     params = SeparationParams(radius_m=0.9, body_m=0.48, tracking_m=0.05)
     assert required_radius_m(params, 0.0) == pytest.approx(0.53)
     assert 1.2 < required_radius_m(params, 0.28) < 1.5  # of an autopilot on plain GPS, as flights of them suggest
@@ -442,7 +442,7 @@ def test_the_radius_covers_bodies_tracking_and_two_wrong_positions() -> None:
     ("told", "accuracy_m", "refused"),
     [({}, 0.0, False), ({}, 0.28, True), ({"radius_m": 1.4}, 0.28, False), ({"allow_small_radius": True}, 0.28, False)],
 )
-def test_a_radius_that_is_too_small_is_refused_unless_told_so(
+def test_a_radius_that_is_too_small_is_refused_unless_allowed(
     told: dict[str, Any], accuracy_m: float, refused: bool
 ) -> None:
     problem = radius_problem(SeparationParams(**told), accuracy_m)
@@ -451,7 +451,7 @@ def test_a_radius_that_is_too_small_is_refused_unless_told_so(
         assert all(part in problem for part in ("separation.radius_m = 0.9", "1.27 m", "allow_small_radius"))
 
 
-def test_plans_keep_what_tracking_will_miss_and_the_certificate_asks_for_the_radius() -> None:
+def test_plans_keep_the_tracking_error_on_top_and_the_certificate_does_not() -> None:
     keep_out = keep_out_of_peer(peer(np.zeros((3, 3))), UTC_US, DT_US, 2, SeparationParams(tracking_m=0.07))
     assert keep_out.radius_m == pytest.approx(0.97)
     assert keep_out.hard_min_distance_m == pytest.approx(0.8)
