@@ -69,6 +69,7 @@ class Coordination:
 
     @property
     def counts(self) -> CommitCounts:
+        """Return the counts of proposals so far."""
         return self._commitments.counts
 
     def receive(self, utc_us: int) -> None:
@@ -113,7 +114,7 @@ class Coordination:
         self._commitments.end(None if state is None else state.pos_ned_m, utc_us)
 
     def follow(self, t_utc_us: Times) -> tuple[Array, Array]:
-        """Committed positions and velocities (M, 3) at times (M,)."""
+        """Return committed positions and velocities, (M, 3) NED each, at times (M,)."""
         assert self._commitments.committed is not None
         return self._commitments.committed.sample(t_utc_us)
 
@@ -173,7 +174,6 @@ class Coordination:
         """
         steps, dt_us = self._commitments.steps, self._commitments.dt_us
         found = self._surroundings.keep_outs(state.pos_ned_m, t0_utc_us, dt_us, steps, phase, taking_part)
-        spent_m = (
-            self._separation.tracking_m + self._separation.certify_slack_m
-        )  # by which planned and hard minimum distance differ
+        # by which planned and hard minimum distance differ
+        spent_m = self._separation.tracking_m + self._separation.certify_slack_m
         return [replace(k, hard_min_distance_m=max(k.hard_min_distance_m, k.radius_m - spent_m)) for k in found]

@@ -101,6 +101,7 @@ class _Stream:
         return received.boot_id == self.boot_id and 0 < received.seq - self.seq <= ahead
 
     def take(self, received: ReceivedMessage, utc_us: int) -> None:
+        """Make a message the newest one."""
         self.seq, self.sent_utc_us, self.received_utc_us = received.seq, received.sent_utc_us, utc_us
         self.count += 1
 

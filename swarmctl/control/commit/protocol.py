@@ -208,6 +208,7 @@ class Commitments:
 
     @property
     def dt_us(self) -> int:
+        """Return the step of that grid [us]."""
         return self._planner.dt_us
 
     def _set_lead(self, lead_s: float) -> None:

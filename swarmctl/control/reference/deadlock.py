@@ -72,6 +72,7 @@ class ProgressMonitor:
         self._anchor: tuple[Array, int] | None = None  # position and time of the last progress
 
     def reset(self) -> None:
+        """Forget the last progress."""
         self._anchor = None
 
     def step(self, now_us: int, pos_ned_m: Array, wanted_ned_m: Array, keep_outs: Sequence[KeepOut]) -> Deadlock | None:
@@ -116,6 +117,7 @@ class DeadlockRecovery:
 
     @property
     def active(self) -> bool:
+        """Tell whether a path replaces the reference."""
         return self._path is not None
 
     def reset(self) -> None:
