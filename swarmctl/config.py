@@ -118,7 +118,7 @@ class LimitParams(Params):
 
     min_separation_m: float = Field(0.85, ge=0, le=100)
     obstacle_margin_m: float = Field(0.05, ge=0, le=10)  # allowed intrusion into keep_out_m
-    late_ticks_01: float = Field(0.2, ge=0, le=1)  # a gross failure of timing; figures are in summary.json
+    deadline_misses_01: float = Field(0.2, ge=0, le=1)  # a gross failure of timing; figures are in summary.json
 
 
 class Config(Params):
@@ -170,7 +170,7 @@ class Config(Params):
                 ObstacleRule(o.center_ned_m, o.keep_out_m, o.vel_ned_m_s, column=o.column) for o in self.obstacles
             ),
             obstacle_margin_m=self.limits.obstacle_margin_m,
-            late_ticks_01=self.limits.late_ticks_01,
+            deadline_misses_01=self.limits.deadline_misses_01,
             mode=mode,
             duration_s=self.mission.duration_s,
             downwash=self.separation.downwash,

@@ -18,23 +18,23 @@ from swarmctl.agent.components import (
     make_coordination,
     make_estimator,
     make_last_layer,
-    make_sequence,
+    make_state_machine,
 )
-from swarmctl.agent.reference_selector import Wayfinder
+from swarmctl.agent.reference_selector import ReferenceSelector
 from swarmctl.agent.setup import AgentSetup
-from swarmctl.agent.telemetry_publisher import Act, Reporter, Thought, TickSink, Took
-from swarmctl.agent.world_model import FLOWN_BY_AGENT, Surroundings
+from swarmctl.agent.telemetry_publisher import ControlOutput, PlanningResult, TelemetryPublisher, TickSink, TickTiming
+from swarmctl.agent.world_model import FLOWN_BY_AGENT, WorldModel
 from swarmctl.bus import topics
 from swarmctl.bus.peers import Bus
 from swarmctl.control.collision.separation import KeepOut, radius_problem
 from swarmctl.control.estimation.accuracy import AccuracyMonitor
-from swarmctl.control.estimation.constant_velocity import coasting
-from swarmctl.control.fallback import rest_plan
+from swarmctl.control.estimation.constant_velocity import predict_constant_velocity
+from swarmctl.control.fallback import brake_and_hold_plan
 from swarmctl.control.model import Predictor
-from swarmctl.control.mpc.plan_buffer import Replay
+from swarmctl.control.mpc.plan_buffer import PlanBuffer
 from swarmctl.control.mpc.problem import Problem, Start
-from swarmctl.control.phases.failsafe import Judgement, judge
-from swarmctl.control.phases.inputs import Facts
+from swarmctl.control.phases.failsafe import FailsafeDecision, decide
+from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.control.phases.overload import Level, Overload
 from swarmctl.control.setpoint import setpoint_of
 from swarmctl.core.clock import Clock
@@ -61,7 +61,7 @@ from swarmctl.mavlink.commands import CommandPort
 from swarmctl.mavlink.vehicle_setup import Upkeep
 
 _NOTHING_US = -1
-_DEVIATES = (Mode.BRAKE, Mode.HOLD, Mode.LAND, Mode.YIELD, Mode.BLIND)  # from what it has promised
+_DEVIATES = (Mode.BRAKE, Mode.HOLD, Mode.LAND, Mode.PILOT_OVERRIDE, Mode.STATE_STALE)  # from what it has promised
 _WAITS_LONG_US = 3_000_000  # for take-off, before it says for what
 _RESTORE_US = 5_000_000  # for parameters to be set back before the process ends
 _AUTOPILOT_HOVERS = (FlightMode.HOLD, FlightMode.EXTERNAL)  # in the latter while it takes off by itself
@@ -83,35 +83,37 @@ class Agent:
         self._setup, self._autopilot, self._commands = setup, autopilot, commands
         self._bus, self._clock, self._sink, self._stopwatch_ns = bus, clock, sink, stopwatch_ns
         self._upkeep = Upkeep(
-            autopilot, commands, setup.params.autopilot_params, setup.sysid, setup.params.sequence.state_rate_hz
+            autopilot, commands, setup.params.autopilot_params, setup.sysid, setup.params.state_machine.state_rate_hz
         )
-        self._surroundings = Surroundings(
+        self._world_model = WorldModel(
             setup.agent, setup.peers, setup.separation, bus, setup.params.rate_hz, self._note
         )
-        self._coordination = make_coordination(setup, self._surroundings, bus, self._note, stopwatch_ns)
+        self._coordination = make_coordination(setup, self._world_model, bus, self._note, stopwatch_ns)
         self._controller, self._transit = make_controllers(setup, stopwatch_ns)
         self._observer = make_estimator(setup)
         self._predictor = Predictor(setup.vehicle_model)
-        self._last_layer = make_last_layer(setup, self._surroundings, self._note, stopwatch_ns)
-        self._sequence = make_sequence(setup)
-        self._wayfinder = Wayfinder(setup, self._sequence, self._note)
-        self._judgement = Judgement(Mode.IDLE, "")
-        self._virtual = np.array([0.0, 0.0, GRAVITY_M_S2])
-        self._replay = Replay(setup.agent, self._controller.dt_us, self._controller.steps, setup.separation.brake_m_s2)
+        self._last_layer = make_last_layer(setup, self._world_model, self._note, stopwatch_ns)
+        self._state_machine = make_state_machine(setup)
+        self._reference_selector = ReferenceSelector(setup, self._state_machine, self._note)
+        self._decision = FailsafeDecision(Mode.IDLE, "")
+        self._virtual_control = np.array([0.0, 0.0, GRAVITY_M_S2])
+        self._plan_buffer = PlanBuffer(
+            setup.agent, self._controller.dt_us, self._controller.steps, setup.separation.brake_m_s2
+        )
         self._certified_us: int | None = None
         self._hold_at: Array | None = None
-        self._reporter = Reporter(
+        self._publisher = TelemetryPublisher(
             setup.agent,
             setup.boot_id,
             setup.sysid,
             setup.promises,
             autopilot,
-            self._surroundings.paths,
+            self._world_model.paths,
             bus,
             clock,
             sink,
         )
-        self.took = Took(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # of the last tick
+        self.timing = TickTiming(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # of the last tick
         self._promise_ns = 0  # of the last tick
         self._gaps = self._jumps = 0  # of setpoints and of the estimate, as far as they have been told
         self._announced: tuple[Phase, Mode, FlightMode] | None = None
@@ -133,22 +135,22 @@ class Agent:
     @property
     def finished(self) -> bool:
         """Done, and so is every peer that is still there."""
-        return self.done and all(p.phase is Phase.DONE or not p.alive for p in self._surroundings.peers().values())
+        return self.done and all(p.phase is Phase.DONE or not p.alive for p in self._world_model.peers().values())
 
     @property
     def outcome(self) -> str:
         """ "completed", or why not."""
-        return self._sequence.outcome or "stopped before the mission began"
+        return self._state_machine.outcome or "stopped before the mission began"
 
     @property
     def has_armed(self) -> bool:
         """Whether the autopilot has been asked to arm: before that a mission that ends could not start."""
-        return self._sequence.arming.requested
+        return self._state_machine.arming.requested
 
     @property
     def rejected(self) -> dict[str, int]:
         """Bus messages refused so far, by reason."""
-        return dict(self._surroundings.refusals.by_reason)
+        return dict(self._world_model.refusals.by_reason)
 
     @property
     def commits_refused(self) -> int | None:
@@ -158,55 +160,55 @@ class Agent:
 
     def ask(self, verb: str, now_us: int) -> None:
         """An operator's wish: hold, resume, land, rtl."""
-        self._sequence.operator(verb, now_us, self._clock.utc_us(), self._autopilot.poll(now_us))
+        self._state_machine.operator(verb, now_us, self._clock.utc_us(), self._autopilot.poll(now_us))
         self._note("operator", verb=verb)
 
-    def tick(self, now_us: int, late_ticks: int) -> TickRecord:
+    def tick(self, now_us: int, deadline_misses: int) -> TickRecord:
         """One control step at monotonic time `now_us`, with the deadlines missed so far."""
         began_ns = self._stopwatch_ns()
-        self._watch_deadlines(now_us, late_ticks)
+        self._watch_deadlines(now_us, deadline_misses)
         self._listen(now_us)
         state = self._sense(now_us)
-        self._sequence.begin_if_due(now_us, self._clock.utc_us())
+        self._state_machine.begin_if_due(now_us, self._clock.utc_us())
         sensed_ns = self._stopwatch_ns()
-        thought = self._think(now_us, state)
-        thought_ns = self._stopwatch_ns()
-        self._judge(now_us, state, thought)
-        flown = self._flown(state, thought)
-        setpoint = self._act(now_us, flown, thought.start)
+        planning = self._plan(now_us, state)
+        planned_ns = self._stopwatch_ns()
+        self._decide(now_us, state, planning)
+        flown = self._flown(state, planning)
+        setpoint = self._act(now_us, flown, planning.start)
         sent_ns = self._stopwatch_ns()
-        times = NO_TIMES if thought.plan is None else thought.plan.times
-        self.took = Took(
+        times = NO_TIMES if planning.plan is None else planning.plan.times
+        self.timing = TickTiming(
             (sensed_ns - began_ns) * 1e-6,
-            (thought_ns - sensed_ns - self._promise_ns) * 1e-6
+            (planned_ns - sensed_ns - self._promise_ns) * 1e-6
             - (times.spaces_us + times.solve_us + times.certify_us) * 1e-3,
             self._promise_ns * 1e-6,
             times.spaces_us * 1e-3,
             times.solve_us * 1e-3,
             times.certify_us * 1e-3,
             self._last_layer.took_ms,
-            (sent_ns - thought_ns) * 1e-6 - self._last_layer.took_ms,
+            (sent_ns - planned_ns) * 1e-6 - self._last_layer.took_ms,
         )
         self._share(state, flown)
         self._advance(now_us, state)
-        refusals = self._surroundings.refusals.alert(self._clock.utc_us())
+        refusals = self._world_model.refusals.alert(self._clock.utc_us())
         if refusals:
             self._alerts.put("bus", refusals, now_us)
-        self._reporter.problem = self._alerts.text(now_us)
-        return self._reporter.report(
+        self._publisher.active_alert = self._alerts.text(now_us)
+        return self._publisher.report(
             now_us,
             state,
-            thought,
-            Act(self._judgement.mode, flown, setpoint, self._last_layer.acts),
-            self._sequence,
+            planning,
+            ControlOutput(self._decision.mode, flown, setpoint, self._last_layer.acts),
+            self._state_machine,
             self._observer.estimate,
-            late_ticks,
-            self.took,
+            deadline_misses,
+            self.timing,
         )
 
-    def _watch_deadlines(self, now_us: int, late_ticks: int) -> None:
+    def _watch_deadlines(self, now_us: int, deadline_misses: int) -> None:
         before = self._overload.level
-        self._overload.update(now_us, late_ticks)
+        self._overload.update(now_us, deadline_misses)
         level = self._overload.level
         if level is not Level.NONE:
             self._alerts.put("overload", self._overload.text(), now_us)
@@ -216,7 +218,7 @@ class Agent:
     # -- listen, sense ------------------------------------------------------------------------------------------------
 
     def _listen(self, now_us: int) -> None:
-        for verb in self._surroundings.listen(self._clock.utc_us()):
+        for verb in self._world_model.listen(self._clock.utc_us()):
             self.ask(verb, now_us)
         if self._coordination is not None:
             self._coordination.listen(self._clock.utc_us())
@@ -241,8 +243,8 @@ class Agent:
         if state is None or state.t_us == self._last_state_us:
             return state
         self._last_state_us = state.t_us
-        self._observer.update(state, self._thrust_01 if self._sequence.had_control else None)
-        if self._sequence.had_control:
+        self._observer.update(state, self._thrust_01 if self._state_machine.had_control else None)
+        if self._state_machine.had_control:
             return state
         if self._autopilot.hover_thrust_01 is not None and state.mode in _AUTOPILOT_HOVERS:
             self._observer.learn_hover(self._autopilot.hover_thrust_01 * float(body_z_ned(state.q_nb)[2]))
@@ -250,79 +252,83 @@ class Agent:
 
     # -- think --------------------------------------------------------------------------------------------------------
 
-    def _think(self, now_us: int, state: VehicleState | None) -> Thought:
+    def _plan(self, now_us: int, state: VehicleState | None) -> PlanningResult:
         self._promise_ns = 0
         if state is None or not self._fresh(now_us, state):
             if self._coordination is not None:  # the autopilot flies it, blindly or by its failsafe
                 self._coordination.idle(self._clock.utc_us(), state)
-            return Thought(None, None, None, [])
+            return PlanningResult(None, None, None, [])
         estimate = self._observer.estimate
         act_us = now_us + self._predictor.delay_us
-        if self._sequence.had_control:
+        if self._state_machine.had_control:
             start = self._predictor.start(
-                self._observer.state(state), act_us, estimate.disturbance_ned_m_s2, self._virtual
+                self._observer.state(state), act_us, estimate.disturbance_ned_m_s2, self._virtual_control
             )
         else:
-            self._virtual = np.array([0.0, 0.0, GRAVITY_M_S2])
-            upright = float(body_z_ned(state.q_nb)[2])
-            start = Start(act_us, state.pos_ned_m, state.vel_ned_m_s, upright, self._virtual)
+            self._virtual_control = np.array([0.0, 0.0, GRAVITY_M_S2])
+            cos_tilt = float(body_z_ned(state.q_nb)[2])
+            start = Start(act_us, state.pos_ned_m, state.vel_ned_m_s, cos_tilt, self._virtual_control)
         steps, dt_us = self._controller.steps, self._controller.dt_us
-        keep_outs = self._surroundings.keep_outs(state.pos_ned_m, self._utc(act_us), dt_us, steps, self._sequence.phase)
-        flies = Phase.GOTO_START <= self._sequence.phase <= Phase.GOTO_LAND
+        keep_outs = self._world_model.keep_outs(
+            state.pos_ned_m, self._utc(act_us), dt_us, steps, self._state_machine.phase
+        )
+        flies = Phase.GOTO_START <= self._state_machine.phase <= Phase.GOTO_LAND
         self._look_for_deadlock(now_us, state, keep_outs, flies)
         grid = np.arange(self._controller.longest + 1, dtype=np.float64)
         ahead_s = self._predictor.delay_us * 1e-6 + dt_us * 1e-6 * grid
-        reference, now_ref = self._wayfinder.reference(now_us, self._clock.utc_us(), ahead_s)
+        reference, now_ref = self._reference_selector.reference(now_us, self._clock.utc_us(), ahead_s)
         promised = self._coordinated(now_us, state, flies)
         if not flies:
-            return Thought(start, None, now_ref, keep_outs)
+            return PlanningResult(start, None, now_ref, keep_outs)
         if promised is not None:
             reference = promised
-        guess = self._replay.guess_ned_m(act_us)
-        controller = self._controller if self._sequence.phase is Phase.TRACK else self._transit
+        guess = self._plan_buffer.guess_ned_m(act_us)
+        controller = self._controller if self._state_machine.phase is Phase.TRACK else self._transit
         kept = tuple(keep_outs) if promised is None else ()  # what it has promised keeps clear already
         plan = controller.plan(Problem(start, reference, estimate.disturbance_ned_m_s2, kept, guess))
-        return Thought(start, plan, now_ref, keep_outs)
+        return PlanningResult(start, plan, now_ref, keep_outs)
 
     def _coordinated(self, now_us: int, state: VehicleState, flies: bool) -> Reference | None:
         """What has been promised, over the horizon from when the setpoint acts; None when nothing is."""
         if self._coordination is None:
             return None
         utc_us, began_ns = self._clock.utc_us(), self._stopwatch_ns()
-        if not (flies and self._sequence.had_control) or self._judgement.mode in _DEVIATES:
+        if not (flies and self._state_machine.had_control) or self._decision.mode in _DEVIATES:
             self._coordination.idle(utc_us, state)
             return None
-        self._coordination.step(utc_us, state, self._sequence.phase, self._wayfinder.wish(now_us, utc_us))
+        self._coordination.step(utc_us, state, self._state_machine.phase, self._reference_selector.wish(now_us, utc_us))
         self._promise_ns = self._stopwatch_ns() - began_ns
         act_us = utc_us + self._predictor.delay_us
         pos, vel = self._coordination.follow(act_us + np.arange(self._controller.longest + 1) * self._controller.dt_us)
         return Reference(pos, vel, self._setup.mission.yaw_rad)
 
     def _look_for_deadlock(self, now_us: int, state: VehicleState, keep_outs: list[KeepOut], flies: bool) -> None:
-        if not (flies and self._sequence.had_control):
-            self._wayfinder.rest(now_us)
+        if not (flies and self._state_machine.had_control):
+            self._reference_selector.rest(now_us)
             return
         known = [*keep_outs, *(self._coordination.left_behind if self._coordination else ())]
-        landmarks = self._surroundings.landmarks
-        deadlock = self._wayfinder.look(now_us, self._clock.utc_us(), state.pos_ned_m, known, landmarks)
+        landmarks = self._world_model.landmarks
+        deadlock = self._reference_selector.look(now_us, self._clock.utc_us(), state.pos_ned_m, known, landmarks)
         if deadlock is not None:
             self._alerts.put("deadlock", f"deadlocked by {deadlock.names}", now_us)
 
     # -- judge, act ---------------------------------------------------------------------------------------------------
 
-    def _judge(self, now_us: int, state: VehicleState | None, thought: Thought) -> None:
-        plan = thought.plan
+    def _decide(self, now_us: int, state: VehicleState | None, planning: PlanningResult) -> None:
+        plan = planning.plan
         if plan is None:
             self._certified_us = now_us  # none was asked for
         if plan is not None:
-            assert thought.start is not None
-            self._replay.take(plan, thought.start, thought.keep_outs, partial(self._rest, thought.start))
+            assert planning.start is not None
+            self._plan_buffer.take(
+                plan, planning.start, planning.keep_outs, partial(self._brake_and_hold, planning.start)
+            )
         if plan is not None and plan.status is PlanStatus.OK:
             self._certified_us = now_us
         elif plan is not None:
-            self._reporter.failed_plans += 1
+            self._publisher.failed_plans += 1
             self._alerts.put("plan", f"plan {plan.status.name.lower()}", now_us)
-        good = self._replay.plan
+        good = self._plan_buffer.plan
         delay_us = self._predictor.delay_us
         health = Health(
             _NOTHING_US if state is None else max(0, now_us - state.t_us),
@@ -334,32 +340,34 @@ class Agent:
             _NOTHING_US if good is None else now_us + delay_us - good.t0_us,
             0 if self._certified_us is None else now_us - self._certified_us,
             0.0 if state is None else math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s)),
-            self._sequence.phase,
-            self._sequence.had_control,
-            self._sequence.yielded,
+            self._state_machine.phase,
+            self._state_machine.had_control,
+            self._state_machine.pilot_override,
         )
-        self._judgement = judge(health, self._setup.params.failsafe)
+        self._decision = decide(health, self._setup.params.failsafe)
 
-    def _rest(self, start: Start) -> Plan:
+    def _brake_and_hold(self, start: Start) -> Plan:
         disturbance = self._observer.estimate.disturbance_ned_m_s2
         lag = self._setup.vehicle_model.lag()
-        return rest_plan(start, self._hold_at, disturbance, lag, self._controller.dt_us, self._controller.steps)
+        return brake_and_hold_plan(
+            start, self._hold_at, disturbance, lag, self._controller.dt_us, self._controller.steps
+        )
 
-    def _flown(self, state: VehicleState | None, thought: Thought) -> Plan | None:
+    def _flown(self, state: VehicleState | None, planning: PlanningResult) -> Plan | None:
         """The plan whose first input is sent and whose path is shared; None when the autopilot flies."""
-        mode = self._judgement.mode
+        mode = self._decision.mode
         if mode is not Mode.HOLD:
             self._hold_at = None
-        if thought.start is None or state is None:
+        if planning.start is None or state is None:
             return None
-        if mode in (Mode.FOLLOW, Mode.STREAM):
-            return thought.plan
+        if mode in (Mode.TRACKING, Mode.PRIMING):
+            return planning.plan
         if mode is Mode.REPLAY:
-            return self._replay.plan
+            return self._plan_buffer.plan
         if mode in (Mode.BRAKE, Mode.HOLD):
             if mode is Mode.HOLD and self._hold_at is None:
                 self._hold_at = state.pos_ned_m
-            return self._rest(thought.start)
+            return self._brake_and_hold(planning.start)
         return None
 
     def _act(self, now_us: int, flown: Plan | None, start: Start | None) -> AttitudeSetpoint | None:
@@ -367,11 +375,13 @@ class Agent:
             self._last_layer.rest(now_us)
             return None
         act_us = now_us + self._predictor.delay_us
-        step = min(max(0, (act_us - flown.t0_us) // flown.dt_us), len(flown.virtual) - 1)
-        estimate, flies = self._observer.estimate, self._judgement.mode in FLOWN_BY_AGENT
-        virtual = self._last_layer.keep_apart(now_us, self._utc(act_us), flown.virtual[step], start, estimate, flies)
+        step = min(max(0, (act_us - flown.t0_us) // flown.dt_us), len(flown.virtual_control) - 1)
+        estimate, flies = self._observer.estimate, self._decision.mode in FLOWN_BY_AGENT
+        virtual_control = self._last_layer.keep_apart(
+            now_us, self._utc(act_us), flown.virtual_control[step], start, estimate, flies
+        )
         yaw_rad, hover_01 = self._setup.mission.yaw_rad, estimate.hover_thrust_01
-        setpoint = setpoint_of(virtual, yaw_rad, hover_01, now_us, self._setup.vehicle_model)
+        setpoint = setpoint_of(virtual_control, yaw_rad, hover_01, now_us, self._setup.vehicle_model)
         refused = self._autopilot.send(setpoint, self._clock.now_us())
         if refused:
             self._alerts.put("setpoint", f"setpoint refused: {refused}", now_us)
@@ -382,24 +392,24 @@ class Agent:
             text = f"setpoints had stopped for {gap_s:.2f} s: the autopilot's failsafe may have acted"
             self._alerts.put("gap", text, now_us)
             self._note("setpoint_gap", seconds=gap_s)
-        self._virtual, self._thrust_01 = virtual, setpoint.thrust_01
-        self._predictor.sent(now_us, virtual)
+        self._virtual_control, self._thrust_01 = virtual_control, setpoint.thrust_01
+        self._predictor.sent(now_us, virtual_control)
         return setpoint
 
     def _advance(self, now_us: int, state: VehicleState | None) -> None:
-        before = self._sequence.phase, self._sequence.had_control
+        before = self._state_machine.phase, self._state_machine.had_control
         utc_us, dialect = self._clock.utc_us(), self._autopilot.dialect
-        facts = Facts(
+        inputs = PhaseInputs(
             now_us,
             utc_us,
             state,
             self._upkeep.ready,
             self._autopilot.armable,
             self._commands.busy,
-            self._judgement.mode,
-            self._coordination is None and self._surroundings.somebody_is_mute(utc_us),
-            self._surroundings.peers(),
-            others_ned_m=self._surroundings.others_ned_m(utc_us),
+            self._decision.mode,
+            self._coordination is None and self._world_model.is_bus_lost(utc_us),
+            self._world_model.peers(),
+            others_ned_m=self._world_model.others_ned_m(utc_us),
             arm_in=None if dialect is None else dialect.arm_in,
             boots=self._autopilot.clock.boots,
             refusal=self._upkeep.refusal,
@@ -407,31 +417,31 @@ class Agent:
             overload=self._overload.level,
             armed_told_us=self._autopilot.armed_told_us,
         )
-        for command in self._sequence.step(facts):
+        for command in self._state_machine.step(inputs):
             self._commands.request(command)
         self._tell_what_is_waited_for(now_us)
         self._give_parameters_back(now_us)
         self._upkeep.step(now_us)
-        if not before[1] and self._sequence.had_control:
+        if not before[1] and self._state_machine.had_control:
             self._predictor.clear()
             self._observer.reset()
             self._controller.reset()
-        now = (self._sequence.phase, self._judgement.mode, self._autopilot.mode)
+        now = (self._state_machine.phase, self._decision.mode, self._autopilot.mode)
         if now != self._announced:
             self._announced = now
             names = {"phase": now[0].name, "mode": now[1].name, "flight_mode": now[2].name}
-            self._note("state", **names, reason=self._judgement.reason)
+            self._note("state", **names, reason=self._decision.reason)
 
     def _tell_what_is_waited_for(self, now_us: int) -> None:
-        waits_for = self._sequence.waits_for
-        if self._sequence.phase is not Phase.STANDBY:
+        waits_for = self._state_machine.waits_for
+        if self._state_machine.phase is not Phase.STANDBY:
             self._standby_us = now_us
         elif waits_for and now_us - self._standby_us > _WAITS_LONG_US:
             self._alerts.put("start", f"waits for {waits_for}", now_us)
 
     def _give_parameters_back(self, now_us: int) -> None:
         """Once the mission has ended: set the autopilot's parameters back, and say which of them could not be."""
-        if not self._sequence.finished:
+        if not self._state_machine.finished:
             return
         if self._done_us is None:
             self._done_us = now_us
@@ -442,7 +452,7 @@ class Agent:
 
     def _unsettled(self, now_us: int) -> str:
         """Why nothing may be armed yet: the estimator settles, or is too inaccurate for the distances asked for."""
-        if len(self._setup.starts_ned_m) == 1 or self._sequence.phase > Phase.STANDBY:
+        if len(self._setup.starts_ned_m) == 1 or self._state_machine.phase > Phase.STANDBY:
             return ""
         self._accuracy.update(now_us, self._autopilot.pos_accuracy_m)
         accuracy_m = self._accuracy.worst_m or 0.0  # not told: body and tracking are left to judge by
@@ -457,7 +467,7 @@ class Agent:
             self._coordination.say(self._clock.utc_us())
 
     def _path(self, state: VehicleState, flown: Plan | None) -> PredictedPath:
-        setup, seq = self._setup, self._reporter.seq
+        setup, seq = self._setup, self._publisher.seq
         margin_m = min(MAX_RADIUS_M, self._autopilot.frame.margin_m + self._overload.margin_m)
         if flown is not None:
             t0_us, dt_us, pos = self._utc(flown.t0_us), flown.dt_us, flown.pos_ned_m
@@ -465,7 +475,7 @@ class Agent:
         act_us, dt_us = self._clock.now_us() + self._predictor.delay_us, self._controller.dt_us
         grid = np.arange(self._controller.steps + 1, dtype=np.float64)
         ahead_s = grid * (dt_us * 1e-6) + (act_us - state.t_us) * 1e-6
-        pos = coasting(state, ahead_s, setup.separation.brake_m_s2)
+        pos = predict_constant_velocity(state, ahead_s, setup.separation.brake_m_s2)
         return PredictedPath(setup.agent, setup.boot_id, seq, self._utc(act_us), dt_us, margin_m, pos)
 
     def _fresh(self, now_us: int, state: VehicleState) -> bool:

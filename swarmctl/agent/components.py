@@ -7,13 +7,13 @@ from collections.abc import Callable
 from swarmctl.agent.coordination import Coordination
 from swarmctl.agent.safety_filter import LastLayer
 from swarmctl.agent.setup import AgentSetup
-from swarmctl.agent.world_model import Surroundings
+from swarmctl.agent.world_model import WorldModel
 from swarmctl.bus.peers import Bus
 from swarmctl.control.commit.trajectory_planner import following
 from swarmctl.control.controller import Controller, make_controller
 from swarmctl.control.estimation.disturbance import DisturbanceObserver
 from swarmctl.control.estimation.state_filter import StateFilter
-from swarmctl.control.phases.sequence import Sequence
+from swarmctl.control.phases.state_machine import MissionStateMachine
 from swarmctl.control.reference.mission import MissionReference
 
 Note = Callable[..., None]
@@ -22,7 +22,10 @@ Stopwatch = Callable[[], int]  # [ns]
 
 def make_controllers(setup: AgentSetup, stopwatch_ns: Stopwatch) -> tuple[Controller, Controller]:
     """Of the mission, and of the ways there and back."""
-    params, rest = setup.controller, (setup.vehicle_model, setup.separation, setup.agent, setup.slots, stopwatch_ns)
+    params, rest = (
+        setup.controller,
+        (setup.vehicle_model, setup.separation, setup.agent, setup.max_keep_outs, stopwatch_ns),
+    )
     if setup.promises:
         params = params.model_copy(update={"mpc": following(params.mpc, setup.params.commit)})
     mission = make_controller(params, *rest)
@@ -32,7 +35,7 @@ def make_controllers(setup: AgentSetup, stopwatch_ns: Stopwatch) -> tuple[Contro
 
 
 def make_coordination(
-    setup: AgentSetup, surroundings: Surroundings, bus: Bus, note: Note, stopwatch_ns: Stopwatch
+    setup: AgentSetup, world_model: WorldModel, bus: Bus, note: Note, stopwatch_ns: Stopwatch
 ) -> Coordination | None:
     """None unless separation is guaranteed."""
     if not setup.promises:
@@ -44,8 +47,8 @@ def make_coordination(
         setup.params.commit,
         setup.controller.mpc,
         setup.separation,
-        setup.slots,
-        surroundings,
+        setup.max_keep_outs,
+        world_model,
         bus,
         note,
         stopwatch_ns,
@@ -61,18 +64,18 @@ def make_estimator(setup: AgentSetup) -> DisturbanceObserver | StateFilter:
     return DisturbanceObserver(params.disturbance, model.hover_thrust_01)
 
 
-def make_last_layer(setup: AgentSetup, surroundings: Surroundings, note: Note, stopwatch_ns: Stopwatch) -> LastLayer:
+def make_last_layer(setup: AgentSetup, world_model: WorldModel, note: Note, stopwatch_ns: Stopwatch) -> LastLayer:
     """Of the bodies around it."""
     dt_s = 1.0 / setup.params.rate_hz
     downwash = setup.separation.downwash
-    return LastLayer(setup.params.barrier, setup.vehicle_model, dt_s, surroundings, downwash, note, stopwatch_ns)
+    return LastLayer(setup.params.barrier, setup.vehicle_model, dt_s, world_model, downwash, note, stopwatch_ns)
 
 
-def make_sequence(setup: AgentSetup) -> Sequence:
+def make_state_machine(setup: AgentSetup) -> MissionStateMachine:
     """Of its mission."""
     reference = MissionReference(setup.mission, setup.starts_ned_m, setup.agent, setup.separation.planned_m)
-    return Sequence(
-        setup.params.sequence,
+    return MissionStateMachine(
+        setup.params.state_machine,
         setup.agent,
         len(setup.peers),
         setup.separation.radius_m,

@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 
 import numpy as np
 
-from swarmctl.agent.world_model import Surroundings
+from swarmctl.agent.world_model import WorldModel
 from swarmctl.bus import topics
 from swarmctl.bus.peers import Bus, agent_name
 from swarmctl.bus.trajectory_messages import PeerIntents, encode_intent
@@ -29,8 +29,8 @@ class Coordination:
     Args:
         agent, boot_id: who speaks.
         peers: the others.
-        params, mpc, separation, slots, stopwatch_ns: see `Commitments`.
-        surroundings: who else is there.
+        params, mpc, separation, max_keep_outs, stopwatch_ns: see `Commitments`.
+        world_model: who else is there.
         bus: is drained by `listen`.
         rate_hz: of every agent's ticks.
         note: is told `broken_promise` when a peer's promise contradicts ours; `off_promise` when what is flown leaves
@@ -46,16 +46,16 @@ class Coordination:
         params: CommitParams,
         mpc: MpcParams,
         separation: SeparationParams,
-        slots: int,
-        surroundings: Surroundings,
+        max_keep_outs: int,
+        world_model: WorldModel,
         bus: Bus,
         note: Callable[..., None],
         stopwatch_ns: Callable[[], int],
         rate_hz: float,
     ) -> None:
-        self._agent, self._boot_id, self._bus, self._surroundings = agent, boot_id, bus, surroundings
-        self._commitments = Commitments(agent, params, mpc, separation, slots, stopwatch_ns)
-        refusals, attendance = surroundings.refusals, surroundings.attendance
+        self._agent, self._boot_id, self._bus, self._world_model = agent, boot_id, bus, world_model
+        self._commitments = Commitments(agent, params, mpc, separation, max_keep_outs, stopwatch_ns)
+        refusals, attendance = world_model.refusals, world_model.attendance
         self._intents, self._peers = PeerIntents(peers, rate_hz, refusals, attendance), frozenset(peers)
         self._note, self._seq, self._separation = note, 0, separation
         self._promised = False
@@ -87,11 +87,11 @@ class Coordination:
         if broken != self._broken:
             self._broken = broken
             self._note("broken_promise", by=sorted(broken))
-        astray = self._surroundings.astray(known, utc_us, self._allowed_m)
+        astray = self._world_model.astray(known, utc_us, self._allowed_m)
         gone = self._absent_since_us.keys()  # perhaps dead: no longer trusted, still asked
         self.left_behind = [k for a in known.keys() - living if known[a].promised for k in self._ends(known[a])]
         taking_part = {a for a in living - gone - broken - astray if a in known and known[a].promised}
-        self._surroundings.promised = {agent: known[agent].followed for agent in taking_part}
+        self._world_model.promised = {agent: known[agent].followed for agent in taking_part}
         partners = {agent: known[agent] for agent in taking_part}
         others = self._others(utc_us, state, phase, taking_part)
         commitments.avoid(Situation(utc_us, utc_us, wish, partners, others))
@@ -105,7 +105,7 @@ class Coordination:
         """Somebody else flies, or nobody knows: nothing is promised, but peers are still acknowledged."""
         if self._promised:
             self._promised = False
-            self._surroundings.promised, self.left_behind = {}, []
+            self._world_model.promised, self.left_behind = {}, []
             self._note("promises", **asdict(self.counts), worst_tracking_m=self._worst_m)
         self._commitments.end(None if state is None else state.pos_ned_m, utc_us)
 
@@ -144,7 +144,7 @@ class Coordination:
         and come back one by one when a router is lost, and two that took each other for dead would both promise.
         """
         alive = self._bus.alive()
-        promising = frozenset(agent for agent in self._peers if self._surroundings.promises(agent))
+        promising = frozenset(agent for agent in self._peers if self._world_model.promises(agent))
         if agent_name(self._agent) not in alive:
             self._on_bus_since_us = None
             self._absent_since_us.clear()
@@ -168,6 +168,6 @@ class Coordination:
         Nobody can tell what the silent do: they are kept clear of with all of the margin that grows with age.
         """
         steps, dt_us = self._commitments.steps, self._commitments.dt_us
-        found = self._surroundings.keep_outs(state.pos_ned_m, t0_utc_us, dt_us, steps, phase, taking_part)
+        found = self._world_model.keep_outs(state.pos_ned_m, t0_utc_us, dt_us, steps, phase, taking_part)
         spent_m = self._separation.tracking_m + self._separation.certify_slack_m  # of what plans keep, until refused
         return [replace(k, certified_m=max(k.certified_m, k.radius_m - spent_m)) for k in found]

@@ -10,22 +10,22 @@ import numpy as np
 from swarmctl.agent.setup import AgentSetup
 from swarmctl.control.collision.separation import KeepOut
 from swarmctl.control.commit.trajectory_planner import Wish
-from swarmctl.control.phases.sequence import Sequence as MissionSequence
+from swarmctl.control.phases.state_machine import MissionStateMachine
 from swarmctl.control.reference.deadlock import Deadlock, Detour
 from swarmctl.core.types import Array, Obstacle, Reference, Sampled
 
 
-class Wayfinder:
+class ReferenceSelector:
     """See the module.
 
     Args:
         setup: of the agent.
-        sequence: knows the mission's reference.
+        state_machine: knows the mission's reference.
         note: is told `deadlock`, when one begins and when it is over.
     """
 
-    def __init__(self, setup: AgentSetup, sequence: MissionSequence, note: Callable[..., None]) -> None:
-        self._sequence, self._note, self._yaw_rad = sequence, note, setup.mission.yaw_rad
+    def __init__(self, setup: AgentSetup, state_machine: MissionStateMachine, note: Callable[..., None]) -> None:
+        self._state_machine, self._note, self._yaw_rad = state_machine, note, setup.mission.yaw_rad
         self._detour = Detour(setup.params.detour, setup.agent, setup.separation.radius_m)
         self._told: Deadlock | None = None
 
@@ -48,7 +48,7 @@ class Wayfinder:
 
     def reference(self, now_us: int, utc_us: int, ahead_s: Array) -> tuple[Reference, Reference]:
         """At times (N,) from now, (N, 3) each; and the mission's, now."""
-        pos, vel = self._sequence.reference(utc_us, now_us, np.concatenate([[0.0], ahead_s]))
+        pos, vel = self._state_machine.reference(utc_us, now_us, np.concatenate([[0.0], ahead_s]))
         now_ref = Reference(pos[:1], vel[:1], self._yaw_rad)
         if self._detour.active:
             return Reference(*self._detour.sample(ahead_s), self._yaw_rad), now_ref
@@ -61,7 +61,7 @@ class Wayfinder:
         return Wish(self._mission(now_us, utc_us))
 
     def _mission(self, now_us: int, utc_us: int) -> Sampled:
-        return partial(self._sequence.reference, utc_us, now_us)
+        return partial(self._state_machine.reference, utc_us, now_us)
 
     def _tell(self, now_us: int) -> Deadlock | None:
         told, self._told = self._told, self._detour.deadlock

@@ -19,7 +19,7 @@ from swarmctl.bus import topics
 from swarmctl.bus.peers import Bus, LocalHub, agent_name
 from swarmctl.bus.zenoh_bus import NO_BUS, ZenohBus
 from swarmctl.config import Config, load
-from swarmctl.control.phases.sequence import OPERATOR_STOP
+from swarmctl.control.phases.state_machine import OPERATOR_STOP
 from swarmctl.core.types import Mode
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, MissionError, StartError
 from swarmctl.mavlink.autopilot import Autopilot
@@ -173,7 +173,7 @@ def _loop(agent: Agent, config: Config, clock: WallClock, stop: _StopRequest, ve
             agent.ask("land", now_us)
         record = agent.tick(now_us, pace.late)
         pace.done(now_us + round(record.tick_ms * 1000), clock.now_us())
-        if record.mode is not Mode.BLIND:
+        if record.mode is not Mode.STATE_STALE:
             seen_us, ever_seen = now_us, True
         _give_up_on_silence(now_us - seen_us, ever_seen, config, vehicle)
         if agent.done if only_land else agent.finished:

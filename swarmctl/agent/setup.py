@@ -15,7 +15,7 @@ from swarmctl.control.estimation.state_filter import StateFilterParams
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.phases.failsafe import FailsafeParams
 from swarmctl.control.phases.overload import OverloadParams
-from swarmctl.control.phases.sequence import SequenceParams
+from swarmctl.control.phases.state_machine import StateMachineParams
 from swarmctl.control.reference.deadlock import DetourParams
 from swarmctl.control.reference.mission import MissionParams
 from swarmctl.core.params import Params
@@ -27,7 +27,7 @@ class AgentParams(Params):
 
     rate_hz: float = Field(50.0, ge=10, le=200)
     connect_timeout_s: float = Field(15.0, gt=0, le=600)
-    sequence: SequenceParams = SequenceParams()
+    state_machine: StateMachineParams = StateMachineParams()
     failsafe: FailsafeParams = FailsafeParams()
     overload: OverloadParams = OverloadParams()
     disturbance: DisturbanceParams = DisturbanceParams()
@@ -53,7 +53,7 @@ class AgentSetup:
     controller: ControllerParams
     separation: SeparationParams
     vehicle_model: VehicleModelParams
-    obstacle_slots: int
+    max_obstacles: int
 
     @property
     def peers(self) -> list[int]:
@@ -61,9 +61,9 @@ class AgentSetup:
         return [i for i in range(len(self.starts_ned_m)) if i != self.agent]
 
     @property
-    def slots(self) -> int:
+    def max_keep_outs(self) -> int:
         """How many neighbours and obstacles get rows in a problem."""
-        return min(len(self.peers), self.separation.max_neighbours) + self.obstacle_slots
+        return min(len(self.peers), self.separation.max_neighbours) + self.max_obstacles
 
     @property
     def promises(self) -> bool:

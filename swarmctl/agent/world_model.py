@@ -19,17 +19,17 @@ from swarmctl.control.collision.separation import (
     keep_out_of_peer,
     visible,
 )
-from swarmctl.control.phases.inputs import PeerFacts
+from swarmctl.control.phases.inputs import PeerInputs
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.trajectory_message import Intent
 from swarmctl.core.types import Array, Mode, Obstacle, Phase
 
 _NEW_US = 300_000  # a path that may be compared with promises
 _READY_LEAD_US = 1_000_000  # of another clock than ours
-FLOWN_BY_AGENT = frozenset((Mode.FOLLOW, Mode.REPLAY, Mode.BRAKE, Mode.HOLD))
+FLOWN_BY_AGENT = frozenset((Mode.TRACKING, Mode.REPLAY, Mode.BRAKE, Mode.HOLD))
 
 
-class Surroundings:
+class WorldModel:
     """Peers' newest paths and statuses, and the obstacles the operator has told of.
 
     Args:
@@ -196,11 +196,11 @@ class Surroundings:
         status = self._status.get(agent)
         return status is None or status.promises
 
-    def peers(self) -> dict[int, PeerFacts]:
+    def peers(self) -> dict[int, PeerInputs]:
         """Who has been heard of, how far it is, and whether it is still on the bus."""
         alive = self._bus.alive()
         return {
-            agent: PeerFacts(Phase(status.phase), status.ready_utc_us, agent_name(agent) in alive)
+            agent: PeerInputs(Phase(status.phase), status.ready_utc_us, agent_name(agent) in alive)
             for agent, status in self._status.items()
         }
 
@@ -209,7 +209,7 @@ class Surroundings:
         paths = self.paths.latest()
         return tuple(aligned(paths, utc_us, 1, 0, self._params.brake_m_s2)[:, 0]) if paths else ()
 
-    def somebody_is_mute(self, utc_us: int) -> bool:
+    def is_bus_lost(self, utc_us: int) -> bool:
         """Whether a peer is silent and not known to be gone: it may be flying on, or the bus is lost to us.
 
         A peer whose liveliness token has gone while ours is there has died; its path has become a keep-out.

@@ -108,10 +108,10 @@ class StatusMessage(msgspec.Struct, frozen=True):
     separation_m: float  # to the nearest peer now
     tick_p99_ms: float
     ticks: Count
-    late_ticks: int
-    path_age_ms: float
+    deadline_misses: int
+    plan_staleness_ms: float
     solver_failed: int
-    problem: str  # newest thing an operator should know, "" when all is well
+    active_alert: str  # newest thing an operator should know, "" when all is well
     promises: bool = False  # it flies only what it has promised, see `control.commit`
     utc_us: Count = 0  # when it was said, by the agent's clock
 

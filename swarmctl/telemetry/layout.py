@@ -60,7 +60,7 @@ def _swarm_plots() -> Any:
         _plot("/plot/separation", "Smallest separation and its limit [m]"),
         _plot("/plot/solve_ms", "Solve time [ms]"),
         _plot("/plot/tick_ms", "Tick time, listen to send [ms]"),
-        _plot("/plot/late_ticks", "Late ticks so far"),
+        _plot("/plot/deadline_misses", "Deadline misses so far"),
         name="Swarm",
     )
 

@@ -28,7 +28,7 @@ from swarmctl.telemetry.tracks import (
     utc_offset_us,
 )
 
-_CONTROLLED = (Mode.FOLLOW, Mode.REPLAY, Mode.BRAKE)
+_CONTROLLED = (Mode.TRACKING, Mode.REPLAY, Mode.BRAKE)
 _SOLVER_FAILED = (PlanStatus.SOLVER_FAILED, PlanStatus.RESIDUAL)
 _LISTED = 10  # violations of one kind that are spelled out
 _DURATION_SLACK_S = 1.0  # of the mission that may be missing at its end before it counts as cut short
@@ -52,7 +52,7 @@ class Rules:
     required_separation_m: float
     obstacles: tuple[ObstacleRule, ...] = ()
     obstacle_margin_m: float = 0.05  # allowed intrusion into keep_out_m
-    late_ticks_01: float = 0.2  # share of the ticks that were due, flown or skipped, that may be late
+    deadline_misses_01: float = 0.2  # share of the ticks that were due, flown or skipped, that may be late
     solver_name: str = "osqp"
     mode: Literal["realtime", "lockstep"] = "realtime"
     duration_s: float | None = None  # of mission time a completed run must have tracked
@@ -207,7 +207,7 @@ def _judge_timing(
     """Tick and solve times between arming and the end of landing."""
     flights = [flight_rows(rows) for rows in ticks.values()]
     total = sum(len(rows) for rows in flights)
-    steps = [np.maximum(np.diff(rows["late_ticks"].astype(np.int64)), 0) for rows in flights]
+    steps = [np.maximum(np.diff(rows["deadline_misses"].astype(np.int64)), 0) for rows in flights]
     late = sum(int(step.sum()) for step in steps)
     # of what is late between two ticks, one at most was flown; the others were skipped, and were due all the same
     due = total + sum(int(np.maximum(step - 1, 0).sum()) for step in steps)
@@ -219,8 +219,8 @@ def _judge_timing(
         "solve_ms": _spread([rows["solve_ms"][rows["iterations"] > 0] for rows in flights]),
         "speed_factor": speed_factor,
     }
-    if due and late > rules.late_ticks_01 * due:
-        return timing, [f"late ticks {late / due:.1%} above {rules.late_ticks_01:.1%} ({late} of {due} due)"]
+    if due and late > rules.deadline_misses_01 * due:
+        return timing, [f"deadline misses {late / due:.1%} above {rules.deadline_misses_01:.1%} ({late} of {due} due)"]
     return timing, []
 
 
@@ -282,7 +282,7 @@ def _solver(ticks: Mapping[int, NDArray[np.void]], name: str) -> dict[str, Any]:
 
 def _comms(run: RunData) -> dict[str, Any]:
     """Age of the oldest path in use, what the agents' buses refused (their last `bus_summary`), who went unheard."""
-    ages = _spread([flight_rows(rows)["path_age_ms"] for rows in run.ticks.values()])
+    ages = _spread([flight_rows(rows)["plan_staleness_ms"] for rows in run.ticks.values()])
     last = {event.get("source"): event for event in run.events if event.get("event") == "bus_summary"}
     rejected: Counter[str] = Counter()
     for event in last.values():

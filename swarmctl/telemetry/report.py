@@ -273,11 +273,11 @@ def _summary_rows(summary: Mapping[str, Any], rules: Rules | None) -> Iterator[s
         yield _least("nearest to an obstacle's centre", obstacles["min_clearance_m"], obstacles["required_m"])
     due = timing.get("due_ticks") or timing["ticks"]
     share = timing["late_ticks"] / due if due else None
-    most = rules.late_ticks_01 if rules else None
+    most = rules.deadline_misses_01 if rules else None
     good = None if share is None or most is None else share <= most
     late = f"{timing['late_ticks']} of {due}"
-    yield _row("late ticks", late, "" if most is None else f"{most:.0%}", good)
-    yield _row("tracking index, sum of mean distances", _figure(summary["tracking"]["index_m"], "m", 3))
+    yield _row("deadline misses", late, "" if most is None else f"{most:.0%}", good)
+    yield _row("summed mean tracking error", _figure(summary["tracking"]["index_m"], "m", 3))
     yield _row("the same after 10 s", _figure(summary["tracking"]["index_after_10s_m"], "m", 3))
     for name, key in (("tick time", "tick_ms"), ("solve time", "solve_ms")):
         values = " / ".join(_figure(timing[key][part], "", 2) for part in ("p50", "p99", "max"))

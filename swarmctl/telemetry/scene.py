@@ -28,7 +28,7 @@ _PROBLEMS = {
     PlanStatus.RESIDUAL: "residual too large",
     PlanStatus.NOT_CERTIFIED: "plan would violate true distances",
 }
-_WARN_MODES = (Mode.REPLAY, Mode.BRAKE, Mode.YIELD)
+_WARN_MODES = (Mode.REPLAY, Mode.BRAKE, Mode.PILOT_OVERRIDE)
 
 
 class _Seen(NamedTuple):
@@ -92,7 +92,7 @@ class Scene:
         for plot in ("track_err", "solve_ms", "tick_ms"):
             self._static(f"plot/{plot}/{agent}", rr.SeriesLines(names=[name], colors=[rgb]))
         step = rr.SeriesLines(names=[name], colors=[rgb], interpolation_mode="StepAfter")
-        self._static(f"plot/late_ticks/{agent}", step)
+        self._static(f"plot/deadline_misses/{agent}", step)
         for plot, names in (("roll", "measured"), ("pitch", "measured"), ("thrust", "hover estimate")):
             lines = rr.SeriesLines(names=["setpoint", names], colors=[(148, 163, 184), rgb])
             self._static(f"plot/att/{agent}/{plot}", lines)
@@ -187,7 +187,7 @@ class Scene:
         solved = rows["iterations"] > 0
         self._scalars(f"plot/solve_ms/{agent}", t_us[solved], rows["solve_ms"][solved])
         self._scalars(f"plot/tick_ms/{agent}", t_us, rows["tick_ms"])
-        self._scalars(f"plot/late_ticks/{agent}", t_us[-1:], rows["late_ticks"][-1:])
+        self._scalars(f"plot/deadline_misses/{agent}", t_us[-1:], rows["deadline_misses"][-1:])
         asked_deg, had_deg = (np.degrees(roll_pitch_rad(rows[name])) for name in ("setpoint_q_nb", "q_nb"))
         pairs = {
             "roll": np.column_stack([asked_deg[:, 0], had_deg[:, 0]]),
@@ -251,7 +251,7 @@ def _changes(rows: NDArray[np.void], before: _Seen | None) -> Iterator[tuple[int
                 continue
             level = "INFO"
             if kind == "mode":
-                level = "ERROR" if value == Mode.BLIND else "WARN" if value in _WARN_MODES else "INFO"
+                level = "ERROR" if value == Mode.STATE_STALE else "WARN" if value in _WARN_MODES else "INFO"
             yield k, level, f"{kind} {_name(enum, value)}"
 
 

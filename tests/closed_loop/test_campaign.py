@@ -93,7 +93,7 @@ def test_incidents_happen_in_flight() -> None:
     flight.run()
     assert flight.row(None)["outcome"] == "arrived"
     for log in flight.lockstep.logs:
-        ages_ms = log.ticks["path_age_ms"][log.ticks["phase"] == Phase.TRACK]
+        ages_ms = log.ticks["plan_staleness_ms"][log.ticks["phase"] == Phase.TRACK]
         assert 1950.0 < ages_ms.max() < 2200.0
         assert ages_ms[-1] < 150.0
 

@@ -32,7 +32,7 @@ def test_no_plan_fails(circle: Flight) -> None:
     for agent in range(3):
         ticks, _ = circle.tracked(agent)
         assert not np.isin(ticks["plan_status"], (PlanStatus.SOLVER_FAILED, PlanStatus.RESIDUAL)).any()
-        assert circle.modes(agent, Phase.TRACK) == {Mode.FOLLOW}
+        assert circle.modes(agent, Phase.TRACK) == {Mode.TRACKING}
 
 
 def test_vehicles_come_down_a_metre_apart(circle: Flight) -> None:

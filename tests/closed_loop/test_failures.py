@@ -62,9 +62,9 @@ def test_a_frozen_agent_is_landed_by_its_autopilot_and_never_retakes_control(fly
     assert flight.separation_m() >= 0.85
     ticks = flight.ticks(1)
     after = ticks[ticks["t_us"] > ticks["t_us"][np.argmax(np.diff(ticks["t_us"]))]]
-    assert Mode.YIELD in set(after["mode"])
-    first = int(np.argmax(after["mode"] == Mode.YIELD))
-    assert np.isnan(after["setpoint_thrust_01"][first:]).all(), "no setpoint after it has yielded"
+    assert Mode.PILOT_OVERRIDE in set(after["mode"])
+    first = int(np.argmax(after["mode"] == Mode.PILOT_OVERRIDE))
+    assert np.isnan(after["setpoint_thrust_01"][first:]).all(), "no setpoint after a pilot override"
     assert flight.problems == ["agent 1: pilot or autopilot took over"]
 
 
@@ -83,9 +83,9 @@ def test_the_pilot_wins(fly: Fly) -> None:
     landing = {8.0: take_over, 9.5: lambda running: running.command("land")}
     flight = fly(MISSION, at=landing, until=others_have_landed)
     ticks = flight.ticks(2)
-    yielded = ticks["mode"] == Mode.YIELD
-    assert yielded.any()
-    first = int(np.argmax(yielded))
+    overridden = ticks["mode"] == Mode.PILOT_OVERRIDE
+    assert overridden.any()
+    first = int(np.argmax(overridden))
     until_operator = ticks[first : first + 20]
     assert (until_operator["flight_mode"] == FlightMode.HOLD).all()
     assert np.isnan(ticks["setpoint_thrust_01"][first:]).all()
@@ -101,7 +101,7 @@ def test_no_state_no_setpoints(fly: Fly) -> None:
 
     flight = fly(MISSION, "swarm.agents=1", "mission.duration_s=10", at={4.0: deafen})
     ticks = flight.ticks(0)
-    blind = ticks[(ticks["mode"] == Mode.BLIND) & (ticks["phase"] >= Phase.TRACK)]
+    blind = ticks[(ticks["mode"] == Mode.STATE_STALE) & (ticks["phase"] >= Phase.TRACK)]
     assert len(blind) and np.isnan(blind["setpoint_thrust_01"]).all()
     assert blind["state_age_ms"].min() <= 221.0, "setpoints stop within 200 ms and a tick"
     assert landed_by_itself(flight.lockstep.truth, 0, 1)

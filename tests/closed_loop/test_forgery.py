@@ -192,10 +192,10 @@ def test_orders_of_another_day_are_not_obeyed_and_the_last_one_counts(fly: Fly) 
         agent = running.agents[0]
         assert agent is not None
         assert agent.rejected == {"stale_order": 1, "future_order": 1, "superseded_order": 1}
-        assert agent._reporter.problem == "command of operator refused: future_order"
+        assert agent._publisher.active_alert == "command of operator refused: future_order"
         speeds_m_s.append(float(np.linalg.norm(running.logs[0].rows[-1]["vel_ned_m_s"][0])))
 
     flight = swap(fly, at={1.0: orders, 2.5: look})
     assert speeds_m_s[0] > 0.3
-    assert flight.modes(0, Phase.TRACK) == {Mode.FOLLOW}
+    assert flight.modes(0, Phase.TRACK) == {Mode.TRACKING}
     assert not (flight.ticks(0)["phase"] > Phase.TRACK).any()

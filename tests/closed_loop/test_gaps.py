@@ -48,8 +48,8 @@ def fly_stopped_for(fly: Fly, seconds: float) -> Flight:
     return fly(*ALONE, at={AT_S: stop}, until=over)
 
 
-def has_yielded(flight: Flight) -> bool:
-    return Mode.YIELD in flight.modes(0)
+def is_overridden(flight: Flight) -> bool:
+    return Mode.PILOT_OVERRIDE in flight.modes(0)
 
 
 def test_an_agent_that_was_stopped_for_a_third_of_a_second_flies_on_before_a_failsafe_acts(fly: Fly) -> None:
@@ -58,17 +58,17 @@ def test_an_agent_that_was_stopped_for_a_third_of_a_second_flies_on_before_a_fai
     assert gaps(flight)[1] < 0.05
     ticks = flight.ticks(0)
     assert set(ticks["flight_mode"][ticks["phase"] == Phase.TRACK].tolist()) == {FlightMode.EXTERNAL}
-    assert not has_yielded(flight)
+    assert not is_overridden(flight)
     assert "setpoint_gap" not in flight.event_names(0)
 
 
 def test_control_who_waits_to_be_told_the_mode_loses_the_vehicle(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Autopilot, "_ask_for", lambda *_: None)
     flight = fly_stopped_for(fly, 0.32)
-    assert has_yielded(flight)
+    assert is_overridden(flight)
 
 
 def test_an_agent_that_was_stopped_for_longer_yields_to_the_failsafe_that_acted(fly: Fly) -> None:
     flight = fly_stopped_for(fly, 0.8)
-    assert has_yielded(flight)
+    assert is_overridden(flight)
     assert np.isnan(flight.ticks(0)["setpoint_thrust_01"][-100:]).all()

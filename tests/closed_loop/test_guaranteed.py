@@ -119,9 +119,9 @@ def test_a_blind_tick_makes_no_promises_and_takes_no_time_for_them() -> None:
         flight.step()
     (agent,) = flight.agents
     assert agent is not None
-    assert agent.took.promise_ms > 0.0
+    assert agent.timing.promise_ms > 0.0
     flight.links[0][1].send = lambda data: None  # type: ignore[method-assign]
     for _ in range(15):
         flight.step()
-    assert agent.took.promise_ms == 0.0
-    assert agent.took.setup_ms >= 0.0
+    assert agent.timing.promise_ms == 0.0
+    assert agent.timing.setup_ms >= 0.0

@@ -14,8 +14,8 @@ from pymavlink.dialects.v20 import development as mavlink
 from sitl.lockstep import Lockstep
 from swarmctl.agent.agent import Agent
 from swarmctl.config import load
-from swarmctl.control.phases import sequence
-from swarmctl.control.phases.sequence import REBOOTED, TAKEN_OVER, Sequence
+from swarmctl.control.phases import state_machine
+from swarmctl.control.phases.state_machine import REBOOTED, TAKEN_OVER, MissionStateMachine
 from swarmctl.core.types import FlightMode, Phase, VehicleState
 from swarmctl.mavlink import mode_watch
 from swarmctl.mavlink.codec import Codec, frames, message_id
@@ -51,11 +51,11 @@ def test_who_is_told_to_land_at_speed_among_others_brakes_and_makes_room_first(f
 def test_control_an_autopilot_that_lands_at_speed_among_others_comes_too_close(
     fly: Fly, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def land_at_once(self: Sequence, now_us: int, state: VehicleState) -> None:
+    def land_at_once(self: MissionStateMachine, now_us: int, state: VehicleState) -> None:
         if self._stop_verb:
             self.outcome, self.phase, self._entered_us = "stopped", Phase.LAND, now_us
 
-    monkeypatch.setattr(Sequence, "_apply_stop", land_at_once)
+    monkeypatch.setattr(MissionStateMachine, "_apply_stop", land_at_once)
     assert fly(*CROSSING, at=LAND_NOW).separation_m() < 0.75
 
 
@@ -167,8 +167,8 @@ def test_a_restarted_agent_leaves_a_vehicle_to_the_failsafe_that_has_it() -> Non
 
 def test_control_streaming_to_a_vehicle_that_is_not_ours_takes_it(monkeypatch: pytest.MonkeyPatch) -> None:
     def switch_off() -> None:
-        monkeypatch.setattr(sequence, "_is_theirs", lambda state: False)
-        monkeypatch.setattr(Sequence, "_ask_for_control", lambda *_: [])  # streaming is enough
+        monkeypatch.setattr(state_machine, "_is_theirs", lambda state: False)
+        monkeypatch.setattr(MissionStateMachine, "_ask_for_control", lambda *_: [])  # streaming is enough
 
     flight = restarted_while_the_autopilot_flies_home(switch_off)
     assert flight.setpoints_us

@@ -21,7 +21,7 @@ CONFIG = Path(__file__).parents[2] / "configs" / "x500_circle.toml"
 SEEDS = (1, 2, 3, 4)
 DRAG_1_S, HOVER_01 = 1.0, 9.81 / 20.0  # of the x500: 1 N/(m/s), 1 kg, 20 N
 ALONE = ("swarm.agents=1", "sitl.estimator=gps", "start.center_ned_m=[0, 0, -3]")
-AIR = ("sitl.start=air", "agent.sequence.arrive_m=1")
+AIR = ("sitl.start=air", "agent.state_machine.arrive_m=1")
 UNKNOWN = ("vehicle_model.delay_s=0.06", "vehicle_model.attitude_rad_s=0", "vehicle_model.drag_1_s=0")
 STEPS = ("mission.kind=identify", "mission.identify.repeats=1", "mission.duration_s=27.5")
 CIRCLE = ("start.center_ned_m=[5, 0, -3]", "mission.circle.climb_ned_m_s=0", "mission.duration_s=20")

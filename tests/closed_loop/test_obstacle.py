@@ -30,7 +30,7 @@ def test_everybody_keeps_clear_of_it_and_of_each_other(fly: Fly, seed: int) -> N
     assert past.separation_m() >= 0.89
     for agent in range(3):
         assert not past.ticks(agent)["barrier_acted"].any(), "the last layer is not needed for it"
-        assert past.modes(agent, Phase.TRACK) == {Mode.FOLLOW}
+        assert past.modes(agent, Phase.TRACK) == {Mode.TRACKING}
 
 
 def test_with_published_weights_everybody_keeps_clear_from_the_published_start_and_comes_home(flight: Flight) -> None:

@@ -21,7 +21,7 @@ ALONE = (
     "start.center_ned_m=[5, 0, -3]",
     "mission.circle.climb_ned_m_s=0",
     "mission.duration_s=16",
-    "agent.sequence.arrive_m=1",
+    "agent.state_machine.arrive_m=1",
 )
 HEAVY = ("sitl.mass_scale=1.2", "sitl.battery.capacity_mah=5000", "sitl.battery.charge_01=0.9")
 WIND = ("sitl.wind.mean_ned_m_s=[8,0,0]",)

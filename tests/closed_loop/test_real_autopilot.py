@@ -19,7 +19,12 @@ from swarmctl.core.types import Array, Phase, PlanStatus
 
 CONFIG = Path(__file__).parents[2] / "configs" / "x500_circle.toml"
 WIND_NED_M_S = (3.6, 0.0, 0.0)
-AIR = ("sitl.start=air", "start.center_ned_m=[5, 0, -3]", "mission.circle.climb_ned_m_s=0", "agent.sequence.arrive_m=1")
+AIR = (
+    "sitl.start=air",
+    "start.center_ned_m=[5, 0, -3]",
+    "mission.circle.climb_ned_m_s=0",
+    "agent.state_machine.arrive_m=1",
+)
 ALONE = (*AIR, "swarm.agents=1", "sitl.estimator=gps", "mission.duration_s=20")
 STEP = ("mission.kind=steps", "mission.steps.rows=[[0, 5, 0, -3], [2, 10, 0, -3]]", "mission.duration_s=9")
 PLAIN = ("vehicle_model.attitude_rad_s=0", "vehicle_model.drag_1_s=0", "agent.state_filter.enabled=false")
@@ -128,7 +133,7 @@ def test_three_vehicles_without_lag_and_dead_time_in_the_prediction_do_not() -> 
 
 def outcome(*overrides: str) -> tuple[str, bool]:
     """Why an agent ended, and whether anything was ever armed."""
-    flight = Lockstep(load(CONFIG, (*overrides, "mission.duration_s=1", "agent.sequence.start_timeout_s=25")))
+    flight = Lockstep(load(CONFIG, (*overrides, "mission.duration_s=1", "agent.state_machine.start_timeout_s=25")))
     while not flight.finished and flight.clock.now_us() < 30e6:
         flight.step()
     assert flight.agents[0] is not None

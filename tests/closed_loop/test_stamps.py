@@ -9,7 +9,7 @@ import pytest
 from pymavlink.dialects.v20 import development as dialect
 
 from sitl.lockstep import Lockstep
-from swarmctl.control.phases.sequence import REBOOTED
+from swarmctl.control.phases.state_machine import REBOOTED
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.vehicle_clock import VehicleClock
 from tests.closed_loop.conftest import Flight, Fly

@@ -140,23 +140,28 @@ class Barrier:
         self._responses = _responses(lag, vehicle.drag_1_s, self.ahead_s)
 
     def filtered(
-        self, virtual: Array, start: Start, disturbance_ned_m_s2: Array, hover_thrust_01: float, bodies: Sequence[Body]
+        self,
+        virtual_control: Array,
+        start: Start,
+        disturbance_ned_m_s2: Array,
+        hover_thrust_01: float,
+        bodies: Sequence[Body],
     ) -> Array | None:
-        """The virtual controls (3,) to fly in place of `virtual`; None when those will do.
+        """The virtual controls (3,) to fly in place of `virtual_control`; None when those will do.
 
         Args:
-            virtual: u_x, u_y, thrust over mass, wanted.
+            virtual_control: u_x, u_y, thrust over mass, wanted.
             start: own state when they act.
             disturbance_ned_m_s2: (3,).
             hover_thrust_01: scales the bounds of thrust.
             bodies: when they are felt.
         """
-        if not bodies or not np.isfinite(virtual).all():
+        if not bodies or not np.isfinite(virtual_control).all():
             return None
         pos, vel = self._felt(start, disturbance_ned_m_s2)
-        ux, uy, thrust = virtual.tolist()
-        upright = math.sqrt(max(0.0, 1.0 - ux * ux - uy * uy))
-        wanted = (thrust * ux, thrust * uy, thrust * upright)  # thrust vector over mass, up is +
+        ux, uy, thrust = virtual_control.tolist()
+        cos_tilt = math.sqrt(max(0.0, 1.0 - ux * ux - uy * uy))
+        wanted = (thrust * ux, thrust * uy, thrust * cos_tilt)  # thrust vector over mass, up is +
         dx, dy, dz = disturbance_ned_m_s2.tolist()
         drag = self._vehicle.drag_1_s
         rest = (dx - drag * vel[0], dy - drag * vel[1], GRAVITY_M_S2 + dz - drag * vel[2])  # acceleration without it
@@ -164,7 +169,7 @@ class Barrier:
         if all(_dot(normal, wanted) >= offset for normal, offset in rows):
             return None
         rows.sort(key=lambda row: _dot(row[0], wanted) - row[1])  # what is lacking most, first: fewer are active after
-        turns = [self._turn(u, held) for u, held in zip((ux, uy), start.virtual.tolist(), strict=False)]
+        turns = [self._turn(u, held) for u, held in zip((ux, uy), start.virtual_control.tolist(), strict=False)]
         bounds = self._bounds(wanted, thrust, turns, hover_thrust_01)
         lift = nearest_or_least_violating(wanted, rows, bounds, _LACK_WEIGHT)
         size = math.sqrt(_dot(lift, lift))
@@ -178,7 +183,7 @@ class Barrier:
         pos, vel = start.pos_ned_m.tolist(), start.vel_ned_m_s.tolist()
         if not self.ahead_s:
             return tuple(pos), tuple(vel)
-        r, held, d = self._responses, start.virtual.tolist(), disturbance_ned_m_s2.tolist()
+        r, held, d = self._responses, start.virtual_control.tolist(), disturbance_ned_m_s2.tolist()
         pushed = [[0.0, 0.0], [0.0, 0.0], [0.0, 0.0]]
         for i in (0, 1):
             tilt, rate = float(start.tilt[i]), float(start.tilt_rate_1_s[i])

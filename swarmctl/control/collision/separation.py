@@ -187,7 +187,7 @@ def half_spaces(
     """Linearised distance constraints for steps 1..Hp, in the plane or in space.
 
     Args:
-        keep_outs: at most as many as the problem has slots.
+        keep_outs: at most as many as `max_keep_outs` of the problem.
         guess_ned_m: (Hp+1, 3) own previous prediction at the same times.
         goal_m: (2,) or (3,) where the reference ends: decides what head-on means, and how many axes there are.
         vel_m_s: (2,) or (3,) own velocity at the first point.
@@ -202,13 +202,13 @@ def half_spaces(
     if not keep_outs:
         return None
     axes = len(goal_m)
-    others = np.stack([k.pos_ned_m for k in keep_outs])[:, 1:]  # (slots, Hp, 3)
+    others = np.stack([k.pos_ned_m for k in keep_outs])[:, 1:]  # (keep-outs, Hp, 3)
     radius = np.array([k.radius_m for k in keep_outs])
-    apart = guess_ned_m[1:] - others  # (slots, Hp, 3)
+    apart = guess_ned_m[1:] - others  # (keep-outs, Hp, 3)
     vertical_01 = np.array([k.vertical_01 for k in keep_outs])[:, None]
     apart[:, :, 2] *= vertical_01
     below_m = apart[:, :, 2] if axes == 2 else np.zeros(apart.shape[:2])
-    needed = np.sqrt(np.maximum(radius[:, None] ** 2 - below_m**2, 0.0))  # (slots, Hp)
+    needed = np.sqrt(np.maximum(radius[:, None] ** 2 - below_m**2, 0.0))  # (keep-outs, Hp)
     apart, others = apart[:, :, :axes], others[:, :, :axes]
     distance = np.sqrt(np.einsum("skc,skc->sk", apart, apart))
     side = np.zeros((len(keep_outs), 1, axes))
@@ -217,7 +217,7 @@ def half_spaces(
     moved = math.dist(guess_ned_m[-1, :axes], guess_ned_m[0, :axes])
     stuck = min(1.0, max(0.0, 2.0 - moved / params.stuck_m))
     to_goal = goal_m - guess_ned_m[1:, :axes]  # (Hp, axes)
-    across = to_goal[:, 0] * normal[:, :, 1] - to_goal[:, 1] * normal[:, :, 0]  # (slots, Hp) > 0: it is on the left
+    across = to_goal[:, 0] * normal[:, :, 1] - to_goal[:, 1] * normal[:, :, 0]  # (keep-outs, Hp) > 0: it is on the left
     turn_rad = np.full(distance.shape, params.bias_rad * stuck)
     is_obstacle = np.array([k.tie < 0 for k in keep_outs])
     turn_rad[is_obstacle] = params.bias_obstacle_rad * np.where(across[is_obstacle] > 0.0, -1.0, 1.0)
@@ -226,7 +226,7 @@ def half_spaces(
         normal[:, :, 2] *= vertical_01  # in heights as they are
     offset = np.einsum("skc,skc->sk", normal, others) + needed
     idle = (needed <= 0.0) | (distance > needed + params.gate_m)
-    ends = (others[:, -1] - others[:, -2]) / dt_s  # (slots, axes) velocity of each at the end
+    ends = (others[:, -1] - others[:, -2]) / dt_s  # (keep-outs, axes) velocity of each at the end
     closing = -np.einsum("sc,sc->s", normal[:, -1], vel_m_s - ends)
     stop_s = np.maximum(closing, 0.0) / (2.0 * params.stop_m_s2)
     squeezed = np.array([k.downwash > 1.0 and not k.any_height for k in keep_outs])
@@ -239,7 +239,7 @@ def _turned(normal: Array, distance: Array, needed: Array, to_goal: Array, angle
     """Turn normals that point straight against the way to the goal, so that head-on agents pass on one side.
 
     Among peers everybody turns the same way (clockwise seen from above, as NED yaw), which is a rule, not a draw;
-    obstacles are passed on the side one is on. `angle_rad` (slots, Hp) is the largest turn: full for obstacles, for
+    obstacles are passed on the side one is on. `angle_rad` (keep-outs, Hp) is the largest turn: full for obstacles, for
     peers only when the own plan gets nowhere, because turned normals would also keep a swarm that shares one goal from
     closing in evenly.
     """

@@ -16,7 +16,7 @@ from swarmctl.control.collision.separation import KeepOut, SeparationParams, cer
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.control.mpc.swarm_mpc import AxisWeights, MpcParams, SwarmMpc
-from swarmctl.control.reference.mission import brake_to_rest, glide_to
+from swarmctl.control.reference.mission import brake_to_rest, quintic_to
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.params import Params
 from swarmctl.core.trajectory import Trajectory, ending_at_rest, joined, places, stopping
@@ -66,7 +66,7 @@ class Situation:
         begin_us: when the plan begins.
         wish: what the agent would like.
         peers: who takes part: the newest message of each.
-        others: who does not, and obstacles, as from `Surroundings.keep_outs`, from when the plan begins.
+        others: who does not, and obstacles, as from `WorldModel.keep_outs`, from when the plan begins.
     """
 
     utc_us: int
@@ -89,7 +89,7 @@ class TrajectoryPlanner:
         params: planning.
         mpc: the controller's bounds and weights.
         separation: distances.
-        slots: how many neighbours and obstacles get rows.
+        max_keep_outs: how many neighbours and obstacles get rows.
         stopwatch_ns: see `CondensedMpc`.
     """
 
@@ -99,13 +99,13 @@ class TrajectoryPlanner:
         params: CommitParams,
         mpc: MpcParams,
         separation: SeparationParams,
-        slots: int,
+        max_keep_outs: int,
         stopwatch_ns: Callable[[], int],
     ) -> None:
         self._params, self._separation = params, separation
         keeping_right = separation.model_copy(update={"bias_rad": params.bias_rad, "stuck_m": params.stuck_m})
         self._mpc = SwarmMpc(
-            _planning(mpc, params), VehicleModelParams(delay_s=0.0), keeping_right, agent, slots, stopwatch_ns
+            _planning(mpc, params), VehicleModelParams(delay_s=0.0), keeping_right, agent, max_keep_outs, stopwatch_ns
         )
         self.dt_us = round(params.dt_s * 1e6)
         self.steps = self._mpc.steps + math.ceil(_TAIL_S / params.dt_s)  # of `Situation.others`: plan and braking
@@ -165,9 +165,11 @@ class TrajectoryPlanner:
         """What is committed, left upwards."""
         pos, vel = (found[0] for found in committed.sample(np.array([begin_us])))
         above = brake_to_rest(pos, vel, self._params.brake_m_s2).to_ned_m - [0.0, 0.0, height_m]
-        glide = glide_to(pos, vel, above, _RISE_M_S, _RISE_M_S2)
-        ahead_s = self._params.dt_s * np.arange(math.ceil(glide.travel_s / self._params.dt_s) + 1, dtype=np.float64)
-        return ending_at_rest(begin_us, self.dt_us, *glide.sample(ahead_s), self._params.brake_m_s2)
+        trajectory = quintic_to(pos, vel, above, _RISE_M_S, _RISE_M_S2)
+        ahead_s = self._params.dt_s * np.arange(
+            math.ceil(trajectory.travel_s / self._params.dt_s) + 1, dtype=np.float64
+        )
+        return ending_at_rest(begin_us, self.dt_us, *trajectory.sample(ahead_s), self._params.brake_m_s2)
 
     def _planned(self, committed: Trajectory, now: Situation) -> Plan | None:
         steps = self._mpc.steps

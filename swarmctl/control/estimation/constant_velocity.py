@@ -11,7 +11,7 @@ from swarmctl.core.types import Array, FlightMode, VehicleState
 _STOPS = (FlightMode.HOLD, FlightMode.LAND)  # modes in which an autopilot is about to brake
 
 
-def coasting(state: VehicleState, ahead_s: Array, brake_m_s2: float) -> Array:
+def predict_constant_velocity(state: VehicleState, ahead_s: Array, brake_m_s2: float) -> Array:
     """Positions (N, 3) at times (N,) after a state: its velocity continued, or braked where the autopilot will stop."""
     if state.mode in _STOPS:
         speed = math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s))

@@ -36,10 +36,10 @@ class JointMpc:
         vehicle: VehicleModelParams,
         separation: SeparationParams,
         own_tie: int,
-        slots: int,
+        max_keep_outs: int,
         stopwatch_ns: Callable[[], int],
     ) -> None:
-        self._params, self._separation, self._tie, self._slots = params, separation, own_tie, slots
+        self._params, self._separation, self._tie, self._max_keep_outs = params, separation, own_tie, max_keep_outs
         self._stopwatch_ns = stopwatch_ns
         self.dt_us = round(params.dt_s * 1e6)
         self.steps = self.longest = params.horizon_xy
@@ -47,7 +47,7 @@ class JointMpc:
         self._mpc = CondensedMpc(
             (*params.horizontal(vehicle), params.vertical()),
             params.horizon(params.control_xy, params.horizon_xy, vehicle),
-            slots,
+            max_keep_outs,
             separation.relax_01,
             Penalties(),
             params.qp.model_copy(update={"eps": eps, "eps_relative": eps_relative}),
@@ -58,12 +58,12 @@ class JointMpc:
         """One step of distributed MPC. Never raises for an infeasible problem; the status says what may be flown."""
         began_ns = self._stopwatch_ns()
         guess = first_guess(problem, self._params.dt_s, self.steps)
-        near = partial(near_half_spaces, problem, guess, 3, self._slots, self._params.dt_s, self._tie)
+        near = partial(near_half_spaces, problem, guess, 3, self._max_keep_outs, self._params.dt_s, self._tie)
         return planned(near, partial(self._plan, problem, began_ns), self._separation, self._stopwatch_ns)
 
     def _plan(self, problem: Problem, began_ns: int, spaces: HalfSpaces | None, spaces_us: float) -> Plan:
         start, steps = problem.start, self.steps
-        held = max(_THRUST_LEAST_M_S2, float(start.virtual[2]))
+        held = max(_THRUST_LEAST_M_S2, float(start.virtual_control[2]))
         first = self._solve(problem, np.full(steps, held), spaces)
         found = self._solve(problem, first.u[:, 2], spaces)
         found = replace(found, solve_us=first.solve_us + found.solve_us, iterations=first.iterations + found.iterations)
@@ -80,7 +80,7 @@ class JointMpc:
         asked = AxesProblem(
             start.pos_ned_m,
             start.vel_ned_m_s,
-            start.virtual,
+            start.virtual_control,
             np.column_stack([-thrust_m_s2, -thrust_m_s2, np.full(steps, -start.cos_tilt)]),
             self._drift(problem),
             reference.pos_ned_m[1 : steps + 1],
@@ -93,7 +93,7 @@ class JointMpc:
     def _acting(problem: Problem) -> tuple[Array, Array]:
         """What of the three inputs acts at the start, and its rate."""
         start = problem.start
-        return np.append(start.tilt, start.virtual[2]), np.append(start.tilt_rate_1_s, 0.0)
+        return np.append(start.tilt, start.virtual_control[2]), np.append(start.tilt_rate_1_s, 0.0)
 
     @staticmethod
     def _drift(problem: Problem) -> Array:

@@ -6,7 +6,7 @@ newest HEARTBEAT says "disarmed" of a vehicle whose motors turn.
 
 from __future__ import annotations
 
-from swarmctl.control.phases.inputs import Facts
+from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.core.types import VehicleState
 
 
@@ -26,17 +26,17 @@ class ArmingEvidence:
         """Note that arming is being asked for now."""
         self.requested = self._open = True
 
-    def update(self, facts: Facts) -> None:
+    def update(self, inputs: PhaseInputs) -> None:
         """Advance by one tick, before this tick's requests.
 
         What was received before this process looked is as old as an arm request still open in the command port.
         """
         if self._settled_us is None or self._open:
-            self._settled_us = facts.now_us
-        self._open = self._open and facts.busy
+            self._settled_us = inputs.now_us
+        self._open = self._open and inputs.busy
 
-    def is_disarmed(self, facts: Facts, state: VehicleState) -> bool:
+    def is_disarmed(self, inputs: PhaseInputs, state: VehicleState) -> bool:
         """Whether a HEARTBEAT that is newer than every arm request says that the vehicle is disarmed."""
         if state.armed or self._open or self._settled_us is None:
             return False
-        return facts.armed_told_us > self._settled_us
+        return inputs.armed_told_us > self._settled_us

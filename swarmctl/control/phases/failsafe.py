@@ -24,7 +24,7 @@ class FailsafeParams(Params):
 
 
 @dataclass(frozen=True, slots=True)
-class Judgement:
+class FailsafeDecision:
     """A mode and why."""
 
     mode: Mode
@@ -34,31 +34,31 @@ class Judgement:
 _FLYING = (Phase.GOTO_START, Phase.READY, Phase.TRACK, Phase.GOTO_LAND)
 
 
-def judge(health: Health, params: FailsafeParams) -> Judgement:
+def decide(health: Health, params: FailsafeParams) -> FailsafeDecision:
     """Mode of this tick: that of the first row of the table that applies to `health`."""
     for applies, mode, reason in _TABLE:
         if applies(health, params):
-            return Judgement(mode, reason)
-    return Judgement(Mode.FOLLOW, "plan certified")
+            return FailsafeDecision(mode, reason)
+    return FailsafeDecision(Mode.TRACKING, "plan certified")
 
 
-def _blind(h: Health, p: FailsafeParams) -> bool:
+def _state_stale(h: Health, p: FailsafeParams) -> bool:
     return h.state_age_us < 0 or h.state_age_us > p.state_max_age_s * 1e6
 
 
-def _not_ours(h: Health, _: FailsafeParams) -> bool:
+def _autopilot_flies(h: Health, _: FailsafeParams) -> bool:
     return h.phase not in _FLYING
 
 
-def _yielded(h: Health, _: FailsafeParams) -> bool:
-    return h.yielded
+def _overridden(h: Health, _: FailsafeParams) -> bool:
+    return h.pilot_override
 
 
-def _taken(h: Health, _: FailsafeParams) -> bool:
+def _taken_over(h: Health, _: FailsafeParams) -> bool:
     return h.had_control and (h.mode is not FlightMode.EXTERNAL or not h.armed or h.autopilot_failsafe)
 
 
-def _young(h: Health, p: FailsafeParams) -> bool:
+def _plan_is_young(h: Health, p: FailsafeParams) -> bool:
     return h.plan_status is not PlanStatus.OK and 0 <= h.last_good_plan_age_us <= p.replay_s * 1e6
 
 
@@ -66,7 +66,7 @@ def _moving(h: Health, p: FailsafeParams) -> bool:
     return h.plan_status is not PlanStatus.OK and h.speed_m_s > p.rest_speed_m_s
 
 
-def _stuck(h: Health, p: FailsafeParams) -> bool:
+def _planless_too_long(h: Health, p: FailsafeParams) -> bool:
     return h.plan_status is not PlanStatus.OK and h.planless_us > (p.replay_s + p.hold_s) * 1e6
 
 
@@ -74,19 +74,19 @@ def _planless(h: Health, _: FailsafeParams) -> bool:
     return h.plan_status is not PlanStatus.OK
 
 
-def _waiting(h: Health, _: FailsafeParams) -> bool:
+def _not_in_control(h: Health, _: FailsafeParams) -> bool:
     return not h.had_control
 
 
 _Row = tuple[Callable[[Health, FailsafeParams], bool], Mode, str]
 _TABLE: tuple[_Row, ...] = (
-    (_blind, Mode.BLIND, "own state too old"),
-    (_yielded, Mode.YIELD, "pilot or autopilot flies until an operator resumes"),
-    (_not_ours, Mode.IDLE, "autopilot flies"),
-    (_taken, Mode.YIELD, "pilot or autopilot took over"),
-    (_young, Mode.REPLAY, "no new plan: last certified one"),
-    (_stuck, Mode.LAND, "no plan for too long"),
+    (_state_stale, Mode.STATE_STALE, "own state too old"),
+    (_overridden, Mode.PILOT_OVERRIDE, "pilot or autopilot flies until an operator resumes"),
+    (_autopilot_flies, Mode.IDLE, "autopilot flies"),
+    (_taken_over, Mode.PILOT_OVERRIDE, "pilot or autopilot took over"),
+    (_plan_is_young, Mode.REPLAY, "no new plan: last certified one"),
+    (_planless_too_long, Mode.LAND, "no plan for too long"),
     (_moving, Mode.BRAKE, "no plan: braking"),
     (_planless, Mode.HOLD, "no plan: holding"),
-    (_waiting, Mode.STREAM, "waiting for the autopilot to follow"),
+    (_not_in_control, Mode.PRIMING, "waiting for the autopilot to follow"),
 )

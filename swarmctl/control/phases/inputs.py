@@ -10,7 +10,7 @@ from swarmctl.core.types import Array, FlightMode, Mode, Phase, VehicleState
 
 
 @dataclass(frozen=True, slots=True)
-class PeerFacts:
+class PeerInputs:
     """What the sequence needs to know of a peer."""
 
     phase: Phase
@@ -19,7 +19,7 @@ class PeerFacts:
 
 
 @dataclass(frozen=True, slots=True)
-class Facts:
+class PhaseInputs:
     """This tick, as the sequence sees it."""
 
     now_us: int
@@ -29,8 +29,8 @@ class Facts:
     armable: bool
     busy: bool  # a command is being executed
     mode: Mode  # last judgement
-    mute: bool  # a peer that may well be flying has not been heard for too long
-    peers: Mapping[int, PeerFacts]
+    bus_lost: bool  # a peer that may well be flying has not been heard for too long
+    peers: Mapping[int, PeerInputs]
     others_ned_m: tuple[Array, ...] = ()  # (3,) each: where peers are now
     arm_in: FlightMode | None = None  # flight mode to be in before arming; None: the one it is in
     boots: int = 0  # reboots of the autopilot so far

@@ -1,6 +1,6 @@
 """References: where to be at a given mission time. All agents share one reference unless each has a way of its own.
 
-Pure functions of time; the flight before and after (to the start, to the landing place) is a `Glide`.
+Pure functions of time; the flight before and after (to the start, to the landing place) is a `QuinticTrajectory`.
 """
 
 from __future__ import annotations
@@ -164,8 +164,8 @@ class MissionReference:
         return _held(np.array(self._params.steps.rows), t_s), np.zeros((len(t_s), 3))
 
     def _swap(self, t_s: Array) -> tuple[Array, Array]:
-        glide = Glide(self._start, np.zeros(3), self._opposite, self._params.swap.travel_s)
-        return glide.sample(t_s)
+        trajectory = QuinticTrajectory(self._start, np.zeros(3), self._opposite, self._params.swap.travel_s)
+        return trajectory.sample(t_s)
 
     def _goto(self, t_s: Array) -> tuple[Array, Array]:
         return self._way.sample(t_s)
@@ -193,7 +193,7 @@ def _held(rows: Array, t_s: Array) -> Array:
     return held
 
 
-def _ways(params: GotoParams, starts_ned_m: Array, apart_m: float) -> list[Glide]:
+def _ways(params: GotoParams, starts_ned_m: Array, apart_m: float) -> list[QuinticTrajectory]:
     """Of every agent; those who share a goal get there at the same time, farther out a little later.
 
     A ring that closes before somebody is inside it opens only after much pushing.
@@ -206,7 +206,7 @@ def _ways(params: GotoParams, starts_ned_m: Array, apart_m: float) -> list[Glide
     if params.standoff:
         goals, groups = places_ned_m(starts_ned_m, goals, apart_m)
     ways = [
-        glide_to(start, np.zeros(3), goal, params.speed_m_s, params.accel_m_s2)
+        quintic_to(start, np.zeros(3), goal, params.speed_m_s, params.accel_m_s2)
         for start, goal in zip(starts_ned_m, goals, strict=True)
     ]
     for group in groups:
@@ -218,7 +218,7 @@ def _ways(params: GotoParams, starts_ned_m: Array, apart_m: float) -> list[Glide
 
 
 @dataclass(frozen=True, slots=True)
-class Glide:
+class QuinticTrajectory:
     """Quintic from a position and velocity to rest at a target: continuous in acceleration."""
 
     from_ned_m: Array  # (3,)
@@ -239,19 +239,19 @@ class Glide:
         return pos, vel
 
 
-def glide_to(pos: Array, vel: Array, target: Array, speed_m_s: float, accel_m_s2: float) -> Glide:
-    """The quickest `Glide` whose peak speed and acceleration stay near the given ones.
+def quintic_to(pos: Array, vel: Array, target: Array, speed_m_s: float, accel_m_s2: float) -> QuinticTrajectory:
+    """The quickest `QuinticTrajectory` whose peak speed and acceleration stay near the given ones.
 
     A quintic from rest peaks at 1.875 of its mean speed and at 5.77 distance / T^2.
     """
     distance = math.dist(pos, target)
     initial = math.sqrt(float(vel @ vel))
     travel_s = max(1.875 * distance / speed_m_s, math.sqrt(5.77 * distance / accel_m_s2), 3.0 * initial / accel_m_s2)
-    return Glide(pos, vel, target, max(travel_s, 0.5))
+    return QuinticTrajectory(pos, vel, target, max(travel_s, 0.5))
 
 
-def brake_to_rest(pos: Array, vel: Array, accel_m_s2: float) -> Glide:
-    """A `Glide` that stops about as soon as `accel_m_s2` allows, straight ahead."""
+def brake_to_rest(pos: Array, vel: Array, accel_m_s2: float) -> QuinticTrajectory:
+    """A `QuinticTrajectory` that stops about as soon as `accel_m_s2` allows, straight ahead."""
     speed = math.sqrt(float(vel @ vel))
     travel_s = max(0.5, 2.0 * speed / accel_m_s2)
-    return Glide(pos, vel, pos + 0.5 * travel_s * vel, travel_s)
+    return QuinticTrajectory(pos, vel, pos + 0.5 * travel_s * vel, travel_s)

@@ -29,7 +29,7 @@ def record(seq: int) -> TickRecord:
         seq=seq,
         mission_t_s=float("nan"),
         phase=Phase.TRACK,
-        mode=Mode.FOLLOW,
+        mode=Mode.TRACKING,
         flight_mode=FlightMode.EXTERNAL,
         armed=True,
         state_age_ms=4.0,
@@ -43,7 +43,7 @@ def record(seq: int) -> TickRecord:
         disturbance_ned_m_s2=zero,
         nearest_peer_m=float("inf"),
         nearest_obstacle_m=float("inf"),
-        path_age_ms=float("nan"),
+        plan_staleness_ms=float("nan"),
         peers=0,
         rejected=0,
         plan_status=PlanStatus.OK,
@@ -52,7 +52,7 @@ def record(seq: int) -> TickRecord:
         iterations=25,
         solve_ms=1.0,
         tick_ms=2.0,
-        late_ticks=0,
+        deadline_misses=0,
         plan_pos_ned_m=np.zeros((26, 3)),
     )
 
@@ -132,7 +132,7 @@ _CHILD = """
 import sys, time, resource
 from pathlib import Path
 sys.path.insert(0, {folder!r})
-from test_telemetry_recorder import Recorder, record
+from test_recorder import Recorder, record
 limit = {limit}
 if limit:
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))

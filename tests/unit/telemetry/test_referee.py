@@ -26,10 +26,10 @@ def ticks(seconds: float, pos_ned_m: Any, first_s: float = 0.0, rate_hz: int = 5
     rows["t_us"] = START_US + np.round(t_s * 1e6).astype(np.int64)
     rows["utc_us"] = rows["t_us"] + UTC0_US
     rows["mission_t_s"] = t_s
-    rows["phase"], rows["mode"], rows["armed"] = Phase.TRACK, Mode.FOLLOW, 1
+    rows["phase"], rows["mode"], rows["armed"] = Phase.TRACK, Mode.TRACKING, 1
     rows["pos_ned_m"] = pos_ned_m
     rows["q_nb"][:, 0] = 1.0
-    rows["iterations"], rows["solve_ms"], rows["tick_ms"], rows["path_age_ms"] = 25, 2.0, 4.0, 30.0
+    rows["iterations"], rows["solve_ms"], rows["tick_ms"], rows["plan_staleness_ms"] = 25, 2.0, 4.0, 30.0
     return rows
 
 
@@ -190,25 +190,25 @@ def test_obstacle_set_in_flight_counts_from_then_on() -> None:
 def test_timing_counts_flight_ticks_and_late_ones() -> None:
     rows = ticks(2, (0.0, 0.0, 0.0))  # 101 ticks
     rows["phase"][:10] = Phase.STANDBY
-    rows["late_ticks"] = 3 + np.clip(np.arange(101) - 40, 0, 30)  # 30 during the flight, one after the other
+    rows["deadline_misses"] = 3 + np.clip(np.arange(101) - 40, 0, 30)  # 30 during the flight, one after the other
     rows["tick_ms"] = 4.0
     rows["tick_ms"][60] = 9.0
     rows["solve_ms"][70], rows["iterations"][70] = 99.0, 0  # nothing was solved in this tick
-    summary = judge(run({0: rows}), Rules(1, 0.5, late_ticks_01=0.2), "completed", speed_factor=8.0)
+    summary = judge(run({0: rows}), Rules(1, 0.5, deadline_misses_01=0.2), "completed", speed_factor=8.0)
     timing = summary["timing"]
     assert (timing["ticks"], timing["late_ticks"], timing["speed_factor"]) == (91, 30, 8.0)
     assert timing["tick_ms"] == {"p50": 4.0, "p99": pytest.approx(4.5), "max": 9.0}
     assert timing["solve_ms"]["max"] == 2.0
-    assert summary["violations"] == ["late ticks 33.0% above 20.0% (30 of 91 due)"]
-    assert judge(run({0: rows}), Rules(1, 0.5, late_ticks_01=0.4), "completed")["violations"] == []
+    assert summary["violations"] == ["deadline misses 33.0% above 20.0% (30 of 91 due)"]
+    assert judge(run({0: rows}), Rules(1, 0.5, deadline_misses_01=0.4), "completed")["violations"] == []
 
 
 def test_ticks_that_were_skipped_were_due() -> None:
     rows = ticks(2, (0.0, 0.0, 0.0))  # 101 ticks
-    rows["late_ticks"] = 3 * np.arange(101)  # each of them late, and two skipped before it
-    summary = judge(run({0: rows}), Rules(1, 0.5, late_ticks_01=0.2), "completed")
+    rows["deadline_misses"] = 3 * np.arange(101)  # each of them late, and two skipped before it
+    summary = judge(run({0: rows}), Rules(1, 0.5, deadline_misses_01=0.2), "completed")
     assert (summary["timing"]["ticks"], summary["timing"]["due_ticks"]) == (101, 301)
-    assert summary["violations"] == ["late ticks 99.7% above 20.0% (300 of 301 due)"]
+    assert summary["violations"] == ["deadline misses 99.7% above 20.0% (300 of 301 due)"]
 
 
 def vanishing(heard: bool) -> RunData:
@@ -252,7 +252,7 @@ def test_clocks_of_different_years_have_no_common_instants() -> None:
 def test_solver_failures_count_while_the_agent_is_in_charge() -> None:
     rows = ticks(2, (0.0, 0.0, 0.0))
     rows["plan_status"][:4] = [PlanStatus.SOLVER_FAILED, PlanStatus.RESIDUAL, PlanStatus.NOT_CERTIFIED, PlanStatus.NONE]
-    rows["plan_status"][10], rows["mode"][10] = PlanStatus.SOLVER_FAILED, Mode.YIELD
+    rows["plan_status"][10], rows["mode"][10] = PlanStatus.SOLVER_FAILED, Mode.PILOT_OVERRIDE
     rows["residual_m"] = 1e-4
     rows["residual_m"][0] = 7.0  # refused, never flown
     rows["barrier_acted"][5:8] = 1

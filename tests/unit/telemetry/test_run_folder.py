@@ -30,7 +30,7 @@ def flight(agent: int, agents: int, seconds: float) -> tuple[NDArray[np.void], N
     rows["utc_us"] = rows["t_us"] + UTC_US
     rows["seq"] = np.arange(len(t_s))
     rows["phase"] = np.select([t_s < 1, t_s < 3, t_s < seconds - 1], [Phase.STANDBY, Phase.TAKEOFF, Phase.TRACK], 8)
-    rows["mode"] = np.where(rows["phase"] == Phase.TRACK, Mode.FOLLOW, Mode.IDLE)
+    rows["mode"] = np.where(rows["phase"] == Phase.TRACK, Mode.TRACKING, Mode.IDLE)
     rows["mission_t_s"] = np.where(rows["phase"] == Phase.TRACK, t_s - 3, np.nan)
     rows["armed"] = true["armed"] = t_s >= 1
     angle = 0.5 * t_s
@@ -43,7 +43,7 @@ def flight(agent: int, agents: int, seconds: float) -> tuple[NDArray[np.void], N
     noise = np.random.default_rng([1, agent]).gamma(2.0, 0.5, (2, len(t_s)))
     rows["solve_ms"], rows["tick_ms"], rows["iterations"] = 1 + noise[0], 2 + noise[1], 25
     rows["setpoint_thrust_01"], rows["hover_thrust_01"] = 0.5 + 0.02 * noise[0], 0.5
-    rows["path_age_ms"] = np.nan
+    rows["plan_staleness_ms"] = np.nan
     true["vehicle"] = agent
     return rows, true
 

@@ -17,10 +17,10 @@ import numpy as np
 from pydantic import Field
 
 from swarmctl.control.phases.arming import ArmingEvidence
-from swarmctl.control.phases.inputs import Facts
+from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.control.phases.overload import Level
 from swarmctl.control.reference.landing_places import nearest_in_plane_m, room_for
-from swarmctl.control.reference.mission import Glide, MissionReference, brake_to_rest, glide_to
+from swarmctl.control.reference.mission import MissionReference, QuinticTrajectory, brake_to_rest, quintic_to
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Command, FlightMode, Landed, Mode, Phase, VehicleState, Verb
 
@@ -30,7 +30,7 @@ _SETTLE_S = 2.0
 _BEGIN_AFTER_US = 1_000_000
 _HOVER_US = 1_000_000  # of the autopilot's own hover, to learn its thrust where no HOLD separates it from our flight
 _ROOM_M = 0.1  # gone farther than has to be, so that it is reached
-_PLANNED = (Mode.FOLLOW, Mode.REPLAY)
+_PLANNED = (Mode.TRACKING, Mode.REPLAY)
 _OURS = (FlightMode.HOLD, FlightMode.TAKEOFF, FlightMode.EXTERNAL)  # modes nobody but us has asked for
 OPERATOR_STOP = "stopped by the operator"
 TAKEN_OVER = "pilot or autopilot took over"
@@ -38,7 +38,7 @@ REBOOTED = "the autopilot rebooted"
 OVERLOADED = "overload: deadlines were missed for too long"
 
 
-class SequenceParams(Params):
+class StateMachineParams(Params):
     """Speeds of the way there and back, and patience."""
 
     speed_m_s: float = Field(2.0, gt=0, le=20)
@@ -53,7 +53,7 @@ class SequenceParams(Params):
     apart_m: float = Field(0.2, ge=0, le=20)  # beyond separation.radius_m, between who lands where it is and others
 
 
-class Sequence:
+class MissionStateMachine:
     """Phases of one agent.
 
     Args:
@@ -68,7 +68,7 @@ class Sequence:
 
     def __init__(
         self,
-        params: SequenceParams,
+        params: StateMachineParams,
         agent: int,
         peers: int,
         radius_m: float,
@@ -90,13 +90,13 @@ class Sequence:
         self.held = False  # by the operator
         self.waiting = False  # for mute peers, or for its processor
         self._bound_for = start_ned_m  # before it had to wait
-        self._glide: tuple[Glide, int] | None = None  # and when it began
-        self._rejoin: tuple[Glide, int] | None = None  # the same, of the offset to the mission's reference
+        self._trajectory: tuple[QuinticTrajectory, int] | None = None  # and when it began
+        self._rejoin: tuple[QuinticTrajectory, int] | None = None  # the same, of the offset to the mission's reference
         self._entered_us = 0
         self._born_us: int | None = None
         self._asked_us = -_ASK_EVERY_US
         self._boots = 0
-        self.yielded = False
+        self.pilot_override = False
         self._ground_z_m = 0.0
         self._hovering_us: int | None = None
         self._airborne = False
@@ -104,7 +104,7 @@ class Sequence:
         self._landing_seen = False
         self._lands_here = False  # where it comes to rest, instead of on the start
         self._outcome_before = ""  # it yielded
-        self._steps: dict[Phase, Callable[[Facts, VehicleState], list[Command]]] = {
+        self._steps: dict[Phase, Callable[[PhaseInputs, VehicleState], list[Command]]] = {
             Phase.STANDBY: self._standby,
             Phase.ARM: self._arm,
             Phase.TAKEOFF: self._takeoff,
@@ -119,53 +119,53 @@ class Sequence:
     def finished(self) -> bool:
         return self.phase is Phase.DONE
 
-    def step(self, facts: Facts) -> list[Command]:
+    def step(self, inputs: PhaseInputs) -> list[Command]:
         """Advance by what is true now; returns what to ask of the autopilot."""
-        self._born_us = facts.now_us if self._born_us is None else self._born_us
-        self.arming.update(facts)
-        state = facts.state
-        if facts.boots != self._boots:
-            self._boots = facts.boots
-            if Phase.ARM <= self.phase < Phase.DONE and not self.yielded:
-                self._yield(REBOOTED)
+        self._born_us = inputs.now_us if self._born_us is None else self._born_us
+        self.arming.update(inputs)
+        state = inputs.state
+        if inputs.boots != self._boots:
+            self._boots = inputs.boots
+            if Phase.ARM <= self.phase < Phase.DONE and not self.pilot_override:
+                self._override(REBOOTED)
         if state is None:
             return []
-        self._apply_stop(facts.now_us, state)
-        if self.phase is Phase.CONNECT and facts.prepared:  # not before: peers arm when everybody stands by
-            self._enter(Phase.STANDBY, facts.now_us)
-            return self._refuse(facts.refusal, facts) if facts.refusal else []
-        if facts.mode is Mode.YIELD and not self.yielded:
-            self._yield(TAKEN_OVER)
-        if self.yielded:
-            if self._is_down(facts, state):
-                self._enter(Phase.DONE, facts.now_us)
+        self._apply_stop(inputs.now_us, state)
+        if self.phase is Phase.CONNECT and inputs.prepared:  # not before: peers arm when everybody stands by
+            self._enter(Phase.STANDBY, inputs.now_us)
+            return self._refuse(inputs.refusal, inputs) if inputs.refusal else []
+        if inputs.mode is Mode.PILOT_OVERRIDE and not self.pilot_override:
+            self._override(TAKEN_OVER)
+        if self.pilot_override:
+            if self._is_down(inputs, state):
+                self._enter(Phase.DONE, inputs.now_us)
             return []
-        if facts.mode is Mode.LAND and self.phase < Phase.LAND:
-            self._give_up("no plan for too long", facts, state)
-        if facts.overload is Level.LAND and self.phase < Phase.GOTO_LAND:
-            self._give_up(OVERLOADED, facts, state)
-        self._wait_for_better(facts, state)
+        if inputs.mode is Mode.LAND and self.phase < Phase.LAND:
+            self._give_up("no plan for too long", inputs, state)
+        if inputs.overload is Level.LAND and self.phase < Phase.GOTO_LAND:
+            self._give_up(OVERLOADED, inputs, state)
+        self._wait_for_better(inputs, state)
         if state.mode is FlightMode.EXTERNAL and Phase.GOTO_START <= self.phase < Phase.LAND:
-            self._take_control(facts, state)
+            self._take_control(inputs, state)
         patience_us = self._params.start_timeout_s * 1e6
-        if self.phase < Phase.TRACK and facts.now_us - self._born_us > patience_us:
+        if self.phase < Phase.TRACK and inputs.now_us - self._born_us > patience_us:
             cause = f"not tracking after {self._params.start_timeout_s:.0f} s ({self.phase.name})"
-            self._give_up(f"{cause}: {self.waits_for}" if self.waits_for else cause, facts, state)
+            self._give_up(f"{cause}: {self.waits_for}" if self.waits_for else cause, inputs, state)
         handler = self._steps.get(self.phase)
-        return handler(facts, state) if handler else []
+        return handler(inputs, state) if handler else []
 
     def reference(self, utc_us: int, now_us: int, offsets_s: Array) -> tuple[Array, Array]:
         """Where to be, (K, 3) and (K, 3), at `offsets_s` (K,) from now."""
         if self.phase is Phase.TRACK and not (self.held or self.waiting) and self.begin_utc_us is not None:
             pos, vel = self._reference.sample((utc_us - self.begin_utc_us) * 1e-6 + offsets_s)
             if self._rejoin is not None:
-                glide, began_us = self._rejoin
-                offset, drift = glide.sample((now_us - began_us) * 1e-6 + offsets_s)
+                trajectory, began_us = self._rejoin
+                offset, drift = trajectory.sample((now_us - began_us) * 1e-6 + offsets_s)
                 pos, vel = pos + offset, vel + drift
             return pos, vel
-        if self._glide is not None:
-            glide, began_us = self._glide
-            return glide.sample((now_us - began_us) * 1e-6 + offsets_s)
+        if self._trajectory is not None:
+            trajectory, began_us = self._trajectory
+            return trajectory.sample((now_us - began_us) * 1e-6 + offsets_s)
         return np.tile(self._start_ned_m, (len(offsets_s), 1)), np.zeros((len(offsets_s), 3))
 
     def begin_if_due(self, now_us: int, utc_us: int) -> None:
@@ -192,16 +192,16 @@ class Sequence:
         self._apply_stop(now_us, state)
         if verb == "hold" and self.phase is Phase.TRACK:
             self.held = True
-            self._glide = (self._stop_glide(state), now_us)
+            self._trajectory = (self._stop_trajectory(state), now_us)
         elif verb == "resume":
-            if self.held or self.yielded:
+            if self.held or self.pilot_override:
                 self._go_on(now_us, utc_us, state)
             self.held = False
-            if self.yielded:
-                self.yielded, self.outcome, self._invited = False, self._outcome_before, True
+            if self.pilot_override:
+                self.pilot_override, self.outcome, self._invited = False, self._outcome_before, True
 
-    def _yield(self, why: str) -> None:
-        self.yielded, self.had_control, self._invited = True, False, False
+    def _override(self, why: str) -> None:
+        self.pilot_override, self.had_control, self._invited = True, False, False
         self._outcome_before = self.outcome
         self.outcome = why
 
@@ -211,7 +211,7 @@ class Sequence:
         if not verb or self.phase >= Phase.LAND:
             return
         self.outcome = self.outcome or OPERATOR_STOP
-        if self.phase < Phase.GOTO_START or self.yielded:
+        if self.phase < Phase.GOTO_START or self.pilot_override:
             self._enter(Phase.LAND, now_us)  # which is done at once where the vehicle is known to be disarmed
         elif self.phase < Phase.GOTO_LAND and verb == "rtl":
             self._lands_here = False
@@ -219,26 +219,26 @@ class Sequence:
         elif verb == "land" and not self._lands_here:
             self._stop_here(now_us, state)
 
-    def _is_down(self, facts: Facts, state: VehicleState) -> bool:
+    def _is_down(self, inputs: PhaseInputs, state: VehicleState) -> bool:
         """Whether the vehicle is on the ground and known to be disarmed."""
-        return state.landed is Landed.ON_GROUND and self.arming.is_disarmed(facts, state)
+        return state.landed is Landed.ON_GROUND and self.arming.is_disarmed(inputs, state)
 
-    def _wait_for_better(self, facts: Facts, state: VehicleState) -> None:
+    def _wait_for_better(self, inputs: PhaseInputs, state: VehicleState) -> None:
         """Who loses the bus comes to rest: then what peers assume (braking) holds. So does who misses its deadlines."""
         flying = self.had_control and Phase.GOTO_START <= self.phase <= Phase.GOTO_LAND
-        must_wait = facts.mute or facts.overload >= Level.HOLD
+        must_wait = inputs.bus_lost or inputs.overload >= Level.HOLD
         if must_wait and flying and not self.waiting:
             self.waiting = True
-            self._bound_for = self._glide[0].to_ned_m if self._glide else self._start_ned_m
-            self._glide = (self._stop_glide(state), facts.now_us)
+            self._bound_for = self._trajectory[0].to_ned_m if self._trajectory else self._start_ned_m
+            self._trajectory = (self._stop_trajectory(state), inputs.now_us)
         elif self.waiting and not must_wait:
             self.waiting = False
             if self.phase in (Phase.GOTO_START, Phase.GOTO_LAND):
-                self._glide = (self._way_to(self._bound_for, state), facts.now_us)
+                self._trajectory = (self._trajectory_to(self._bound_for, state), inputs.now_us)
             elif self.held:
-                self._glide = (self._stop_glide(state), facts.now_us)
+                self._trajectory = (self._stop_trajectory(state), inputs.now_us)
             else:
-                self._go_on(facts.now_us, facts.utc_us, state)
+                self._go_on(inputs.now_us, inputs.utc_us, state)
 
     def _go_on(self, now_us: int, utc_us: int, state: VehicleState) -> None:
         """Close in smoothly on the mission's reference, which has moved on: a jump would have all race to one point."""
@@ -246,164 +246,167 @@ class Sequence:
             return
         pos, vel = self._reference.sample(np.array([(utc_us - self.begin_utc_us) * 1e-6]))
         p, offset, drift = self._params, state.pos_ned_m - pos[0], state.vel_ned_m_s - vel[0]
-        self._rejoin = (glide_to(offset, drift, np.zeros(3), p.speed_m_s, p.accel_m_s2), now_us)
+        self._rejoin = (quintic_to(offset, drift, np.zeros(3), p.speed_m_s, p.accel_m_s2), now_us)
 
-    def _stop_glide(self, state: VehicleState) -> Glide:
+    def _stop_trajectory(self, state: VehicleState) -> QuinticTrajectory:
         return brake_to_rest(state.pos_ned_m, state.vel_ned_m_s, self._params.accel_m_s2)
 
-    def _standby(self, facts: Facts, state: VehicleState) -> list[Command]:
-        if not facts.prepared:  # any more: it has rebooted
+    def _standby(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
+        if not inputs.prepared:  # any more: it has rebooted
             self.waits_for = "the link to be set up again after a reboot of the autopilot"
             return []
-        if facts.refusal:
-            return self._refuse(facts.refusal, facts)
-        if any(p.phase is Phase.DONE and p.alive for p in facts.peers.values()):
-            return self._refuse("a peer gave up before take-off", facts)
-        self.waits_for = self._missing(facts, state)
+        if inputs.refusal:
+            return self._refuse(inputs.refusal, inputs)
+        if any(p.phase is Phase.DONE and p.alive for p in inputs.peers.values()):
+            return self._refuse("a peer gave up before take-off", inputs)
+        self.waits_for = self._missing(inputs, state)
         if not self.waits_for:
             self._ground_z_m = float(state.pos_ned_m[2])
             self._airborne = state.landed is Landed.IN_AIR
-            self._enter(Phase.ARM, facts.now_us)
+            self._enter(Phase.ARM, inputs.now_us)
             return []
-        stays = state.mode is FlightMode.EXTERNAL and facts.arm_in is None and not facts.armable
-        if stays and not state.armed and self._may_ask(facts):
+        stays = state.mode is FlightMode.EXTERNAL and inputs.arm_in is None and not inputs.armable
+        if stays and not state.armed and self._may_ask(inputs):
             return [Command(Verb.HOLD)]  # PX4 stays in OFFBOARD after a landing, where it can't be armed
         return []
 
-    def _missing(self, facts: Facts, state: VehicleState) -> str:
+    def _missing(self, inputs: PhaseInputs, state: VehicleState) -> str:
         """What has to be true before arming and is not, or ""."""
         if state.landed not in (Landed.ON_GROUND, Landed.IN_AIR):
             return "the autopilot to tell whether it has landed"
-        if not facts.armable:
+        if not inputs.armable:
             return f"the autopilot to be ready to arm (it is in {state.mode.name})"
-        if facts.unsettled:
-            return facts.unsettled
-        absent = self._expected - sum(p.phase >= Phase.STANDBY and p.alive for p in facts.peers.values())
+        if inputs.unsettled:
+            return inputs.unsettled
+        absent = self._expected - sum(p.phase >= Phase.STANDBY and p.alive for p in inputs.peers.values())
         if absent:
             return f"{absent} of {self._expected} peers to stand by"
-        return "the autopilot's answers" if facts.busy else ""
+        return "the autopilot's answers" if inputs.busy else ""
 
-    def _refuse(self, why: str, facts: Facts) -> list[Command]:
+    def _refuse(self, why: str, inputs: PhaseInputs) -> list[Command]:
         """Give up before take-off: nothing more will be armed, and what has been armed is disarmed."""
         self.outcome = self.outcome or why
-        self._enter(Phase.LAND if self.arming.requested else Phase.DONE, facts.now_us)
+        self._enter(Phase.LAND if self.arming.requested else Phase.DONE, inputs.now_us)
         return []
 
-    def _arm(self, facts: Facts, state: VehicleState) -> list[Command]:
+    def _arm(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
         if state.armed and self._airborne and not self._invited and _is_theirs(state):
-            self._yield(TAKEN_OVER)  # before anything is streamed: one setpoint would take it
+            self._override(TAKEN_OVER)  # before anything is streamed: one setpoint would take it
             return []
         if state.armed:
-            self._enter(Phase.GOTO_START if self._airborne else Phase.TAKEOFF, facts.now_us)
+            self._enter(Phase.GOTO_START if self._airborne else Phase.TAKEOFF, inputs.now_us)
             return []
-        if facts.refusal:
-            return self._refuse(facts.refusal, facts)
-        if not self._may_ask(facts):
+        if inputs.refusal:
+            return self._refuse(inputs.refusal, inputs)
+        if not self._may_ask(inputs):
             return []
-        if facts.arm_in not in (None, state.mode):
+        if inputs.arm_in not in (None, state.mode):
             return [Command(Verb.EXTERNAL)]
         self.arming.request()
         return [Command(Verb.ARM)]
 
-    def _takeoff(self, facts: Facts, state: VehicleState) -> list[Command]:
+    def _takeoff(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
         height_m = self._ground_z_m - float(self._start_ned_m[2])
         climbed_m = self._ground_z_m - float(state.pos_ned_m[2])
         settled = abs(float(state.vel_ned_m_s[2])) < 0.3 and abs(climbed_m - height_m) < 0.4
-        hovers = state.mode in (FlightMode.HOLD, facts.arm_in) and state.landed is Landed.IN_AIR and settled
-        self._hovering_us = (self._hovering_us or facts.now_us) if hovers else None
-        learned = facts.arm_in is None or facts.now_us - (self._hovering_us or facts.now_us) >= _HOVER_US
+        hovers = state.mode in (FlightMode.HOLD, inputs.arm_in) and state.landed is Landed.IN_AIR and settled
+        self._hovering_us = (self._hovering_us or inputs.now_us) if hovers else None
+        learned = inputs.arm_in is None or inputs.now_us - (self._hovering_us or inputs.now_us) >= _HOVER_US
         if hovers and learned:
-            self._enter(Phase.GOTO_START, facts.now_us)
+            self._enter(Phase.GOTO_START, inputs.now_us)
             return []
         if not state.armed:  # somebody, or the autopilot, thought better of it: never armed again
-            self._give_up("disarmed before take-off", facts, state)
+            self._give_up("disarmed before take-off", inputs, state)
             return []
         if (
             state.mode is not FlightMode.TAKEOFF
             and state.landed is Landed.ON_GROUND
-            and self._may_ask(facts, _SPIN_UP_US)
+            and self._may_ask(inputs, _SPIN_UP_US)
         ):
             return [Command(Verb.TAKEOFF, height_m)]
         return []
 
-    def _goto_start(self, facts: Facts, state: VehicleState) -> list[Command]:
+    def _goto_start(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
         if not self.had_control:
-            if self._glide is None:
-                self._glide = (Glide(state.pos_ned_m, np.zeros(3), state.pos_ned_m, 1.0), facts.now_us)
-            return self._ask_for_control(facts, state)
+            if self._trajectory is None:
+                self._trajectory = (
+                    QuinticTrajectory(state.pos_ned_m, np.zeros(3), state.pos_ned_m, 1.0),
+                    inputs.now_us,
+                )
+            return self._ask_for_control(inputs, state)
         p = self._params
         if self._at(state, self._start_ned_m, p.arrive_m, p.arrive_m_s) and not self.waiting:
-            self.ready_utc_us = facts.utc_us
-            self._enter(Phase.READY, facts.now_us)
+            self.ready_utc_us = inputs.utc_us
+            self._enter(Phase.READY, inputs.now_us)
         return []
 
-    def _ask_for_control(self, facts: Facts, state: VehicleState) -> list[Command]:
+    def _ask_for_control(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
         """Control is taken from the autopilot's own hold; from anybody else only after an operator's `resume`.
 
         Not even setpoints may flow meanwhile: PX4 returns to OFFBOARD by itself when they resume after a failsafe.
         """
         if not self._invited and _is_theirs(state):
-            self._yield(TAKEN_OVER)
+            self._override(TAKEN_OVER)
             return []
-        return [Command(Verb.EXTERNAL)] if self._may_ask(facts) else []
+        return [Command(Verb.EXTERNAL)] if self._may_ask(inputs) else []
 
-    def _ready(self, facts: Facts, state: VehicleState) -> list[Command]:
-        if any(not p.alive or p.phase >= Phase.GOTO_LAND for p in facts.peers.values()):
+    def _ready(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
+        if any(not p.alive or p.phase >= Phase.GOTO_LAND for p in inputs.peers.values()):
             self.outcome = "a peer gave up or was lost before the mission began"
-            self._go_home(facts.now_us, state)
+            self._go_home(inputs.now_us, state)
             return []
-        ready = [p.ready_utc_us for p in facts.peers.values() if p.ready_utc_us > 0]
+        ready = [p.ready_utc_us for p in inputs.peers.values() if p.ready_utc_us > 0]
         if len(ready) == self._expected:
             self.begin_utc_us = max([self.ready_utc_us, *ready]) + _BEGIN_AFTER_US
         return []
 
-    def _track(self, facts: Facts, state: VehicleState) -> list[Command]:
+    def _track(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
         assert self.begin_utc_us is not None
         if not self.had_control:
-            return self._ask_for_control(facts, state)
+            return self._ask_for_control(inputs, state)
         if excess := self._reference.excess(state.pos_ned_m, state.vel_ned_m_s):
-            self._give_up(excess, facts, state)
+            self._give_up(excess, inputs, state)
             return []
-        if facts.utc_us - self.begin_utc_us >= self._duration_us and not (self.held or self.waiting):
+        if inputs.utc_us - self.begin_utc_us >= self._duration_us and not (self.held or self.waiting):
             self.outcome = self.outcome or "completed"
-            if self._airborne and not facts.peers:
-                self._enter(Phase.LAND, facts.now_us)
+            if self._airborne and not inputs.peers:
+                self._enter(Phase.LAND, inputs.now_us)
             elif self._airborne:
-                self._stop_here(facts.now_us, state)
+                self._stop_here(inputs.now_us, state)
             else:
-                self._go_home(facts.now_us, state)
+                self._go_home(inputs.now_us, state)
         return []
 
-    def _goto_land(self, facts: Facts, state: VehicleState) -> list[Command]:
-        waited_us = facts.now_us - self._entered_us
-        if self._may_land(facts, state):
-            self._enter(Phase.LAND, facts.now_us)
+    def _goto_land(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
+        waited_us = inputs.now_us - self._entered_us
+        if self._may_land(inputs, state):
+            self._enter(Phase.LAND, inputs.now_us)
         elif waited_us > self._params.land_timeout_s * 1e6:
             at_rest = self._at(state, state.pos_ned_m, math.inf, self._params.arrive_m_s)
-            if self._lands_here or (at_rest and self._has_room(facts, state)) or facts.mode not in _PLANNED:
-                self._enter(Phase.LAND, facts.now_us)
+            if self._lands_here or (at_rest and self._has_room(inputs, state)) or inputs.mode not in _PLANNED:
+                self._enter(Phase.LAND, inputs.now_us)
             else:
-                self._stop_here(facts.now_us, state)
+                self._stop_here(inputs.now_us, state)
         return []
 
-    def _land(self, facts: Facts, state: VehicleState) -> list[Command]:
+    def _land(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
         self.had_control = False
         if self._airborne:  # found in the air, handed back in the air
             if state.mode is not FlightMode.EXTERNAL:
-                self._enter(Phase.DONE, facts.now_us)
+                self._enter(Phase.DONE, inputs.now_us)
                 return []
-            return [Command(Verb.HOLD)] if self._may_ask(facts) else []
-        if self._is_down(facts, state):
-            self._enter(Phase.DONE, facts.now_us)
+            return [Command(Verb.HOLD)] if self._may_ask(inputs) else []
+        if self._is_down(inputs, state):
+            self._enter(Phase.DONE, inputs.now_us)
             return []
         if state.mode is FlightMode.LAND:
             self._landing_seen = True
             return []
         ours = state.mode in _OURS and not self._landing_seen  # else a pilot flies, or broke the landing off
         if not ours and state.landed is not Landed.ON_GROUND:
-            self._yield(TAKEN_OVER)
+            self._override(TAKEN_OVER)
             return []
-        if not self._may_ask(facts):
+        if not self._may_ask(inputs):
             return []
         return [Command(Verb.DISARM if state.landed is Landed.ON_GROUND else Verb.LAND)]
 
@@ -412,55 +415,55 @@ class Sequence:
         speed = math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s))
         return math.dist(state.pos_ned_m, target) < within_m and speed < slower_m_s
 
-    def _may_land(self, facts: Facts, state: VehicleState) -> bool:
+    def _may_land(self, inputs: PhaseInputs, state: VehicleState) -> bool:
         """On the landing place; who lands where it is must be at rest, pushed aside as it may be, and to have room."""
-        if self._glide is None:
+        if self._trajectory is None:
             return True
-        glide, began_us = self._glide
+        trajectory, began_us = self._trajectory
         if not self._lands_here:
-            return self._at(state, glide.to_ned_m, self._params.land_m, self._params.land_m_s) and not self.waiting
-        if facts.now_us - began_us <= (glide.travel_s + _SETTLE_S) * 1e6:
+            return self._at(state, trajectory.to_ned_m, self._params.land_m, self._params.land_m_s) and not self.waiting
+        if inputs.now_us - began_us <= (trajectory.travel_s + _SETTLE_S) * 1e6:
             return False
-        if self._has_room(facts, state):
+        if self._has_room(inputs, state):
             return self._at(state, state.pos_ned_m, math.inf, self._params.arrive_m_s)
-        room = room_for(state.pos_ned_m, facts.others_ned_m, self._apart_m + _ROOM_M, self._agent)
-        self._glide = (self._way_to(room, state), facts.now_us)
+        room = room_for(state.pos_ned_m, inputs.others_ned_m, self._apart_m + _ROOM_M, self._agent)
+        self._trajectory = (self._trajectory_to(room, state), inputs.now_us)
         return False
 
-    def _has_room(self, facts: Facts, state: VehicleState) -> bool:
+    def _has_room(self, inputs: PhaseInputs, state: VehicleState) -> bool:
         """Whether an autopilot may take over among the others; without control nothing can be done about it."""
-        return not self.had_control or nearest_in_plane_m(state.pos_ned_m, facts.others_ned_m) >= self._apart_m
+        return not self.had_control or nearest_in_plane_m(state.pos_ned_m, inputs.others_ned_m) >= self._apart_m
 
-    def _take_control(self, facts: Facts, state: VehicleState) -> None:
+    def _take_control(self, inputs: PhaseInputs, state: VehicleState) -> None:
         if self.had_control:
             return
         self.had_control = True
         if self.phase is Phase.GOTO_START:
-            self._glide = (self._home(state), facts.now_us)
+            self._trajectory = (self._trajectory_home(state), inputs.now_us)
 
-    def _home(self, state: VehicleState) -> Glide:
-        return self._way_to(self._start_ned_m, state)
+    def _trajectory_home(self, state: VehicleState) -> QuinticTrajectory:
+        return self._trajectory_to(self._start_ned_m, state)
 
-    def _way_to(self, target_ned_m: Array, state: VehicleState) -> Glide:
+    def _trajectory_to(self, target_ned_m: Array, state: VehicleState) -> QuinticTrajectory:
         p = self._params
-        return glide_to(state.pos_ned_m, state.vel_ned_m_s, target_ned_m, p.speed_m_s, p.accel_m_s2)
+        return quintic_to(state.pos_ned_m, state.vel_ned_m_s, target_ned_m, p.speed_m_s, p.accel_m_s2)
 
     def _go_home(self, now_us: int, state: VehicleState) -> None:
-        self._glide, self._bound_for = (self._home(state), now_us), self._start_ned_m
+        self._trajectory, self._bound_for = (self._trajectory_home(state), now_us), self._start_ned_m
         self.held = False
         self._enter(Phase.GOTO_LAND, now_us)
 
-    def _give_up(self, why: str, facts: Facts, state: VehicleState) -> None:
+    def _give_up(self, why: str, inputs: PhaseInputs, state: VehicleState) -> None:
         self.outcome = self.outcome or why
-        if self.had_control and facts.mode in _PLANNED:
-            self._stop_here(facts.now_us, state)
+        if self.had_control and inputs.mode in _PLANNED:
+            self._stop_here(inputs.now_us, state)
             return
-        self._enter(Phase.DONE if self._is_down(facts, state) else Phase.LAND, facts.now_us)
+        self._enter(Phase.DONE if self._is_down(inputs, state) else Phase.LAND, inputs.now_us)
 
     def _stop_here(self, now_us: int, state: VehicleState) -> None:
         """Brake and make room under the own plan, then hand over where that ends."""
-        glide = self._stop_glide(state)
-        self._glide, self._bound_for = (glide, now_us), glide.to_ned_m
+        trajectory = self._stop_trajectory(state)
+        self._trajectory, self._bound_for = (trajectory, now_us), trajectory.to_ned_m
         self._lands_here, self.held = True, False
         self._enter(Phase.GOTO_LAND, now_us)
 
@@ -469,10 +472,10 @@ class Sequence:
         self._entered_us = now_us
         self._asked_us = now_us - _SPIN_UP_US
 
-    def _may_ask(self, facts: Facts, every_us: int = _ASK_EVERY_US) -> bool:
-        if facts.busy or facts.now_us - self._asked_us < every_us:
+    def _may_ask(self, inputs: PhaseInputs, every_us: int = _ASK_EVERY_US) -> bool:
+        if inputs.busy or inputs.now_us - self._asked_us < every_us:
             return False
-        self._asked_us = facts.now_us
+        self._asked_us = inputs.now_us
         return True
 
 
