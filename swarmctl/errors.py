@@ -15,7 +15,7 @@ EXIT_USAGE = 2
 EXIT_START = 3
 EXIT_MISSION = 4
 EXIT_INTERRUPTED = 130
-_MOST_SHOWN = 2000  # characters of one problem
+_MAX_CHARACTERS = 2000  # characters of one problem
 
 
 class SwarmError(Exception):
@@ -32,7 +32,7 @@ class ConfigError(SwarmError):
     def __init__(self, source: str, problems: Sequence[str]) -> None:
         self.source = source
         self.problems = tuple(problems)
-        super().__init__("\n".join(printable(f"{source}: {problem}", _MOST_SHOWN) for problem in self.problems))
+        super().__init__("\n".join(printable(f"{source}: {problem}", _MAX_CHARACTERS) for problem in self.problems))
 
 
 class StartError(SwarmError):

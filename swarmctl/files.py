@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-_NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+_CREATE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 def read_file(path: Path, most_bytes: int, follow: bool = False) -> bytes:
@@ -60,7 +60,7 @@ def replaced(path: Path) -> Iterator[BinaryIO]:
         OSError: the disk refuses; the old file is untouched.
     """
     part = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
-    fd = os.open(part, _NEW, 0o644)
+    fd = os.open(part, _CREATE_FLAGS, 0o644)
     try:
         with os.fdopen(fd, "wb") as file:
             yield file

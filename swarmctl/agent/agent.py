@@ -60,11 +60,12 @@ from swarmctl.mavlink.autopilot import Autopilot
 from swarmctl.mavlink.commands import CommandPort
 from swarmctl.mavlink.vehicle_setup import Upkeep
 
-_NOTHING_US = -1
-_DEVIATES = (Mode.BRAKE, Mode.HOLD, Mode.LAND, Mode.PILOT_OVERRIDE, Mode.STATE_STALE)  # from what it has promised
-_WAITS_LONG_US = 3_000_000  # for take-off, before it says for what
-_RESTORE_US = 5_000_000  # for parameters to be set back before the process ends
-_AUTOPILOT_HOVERS = (FlightMode.HOLD, FlightMode.EXTERNAL)  # in the latter while it takes off by itself
+_NO_TIME_US = -1
+# modes in which the vehicle does not follow its committed trajectory
+_DEVIATING_MODES = (Mode.BRAKE, Mode.HOLD, Mode.LAND, Mode.PILOT_OVERRIDE, Mode.STATE_STALE)
+_START_ALERT_DELAY_US = 3_000_000  # for take-off, before it says for what
+_RESTORE_TIMEOUT_US = 5_000_000  # for parameters to be set back before the process ends
+_AUTOPILOT_HOVER_MODES = (FlightMode.HOLD, FlightMode.EXTERNAL)  # in the latter while it takes off by itself
 
 
 class Agent:
@@ -122,7 +123,7 @@ class Agent:
         self._standby_us = 0
         self._overload = Overload(setup.params.overload, round(1e6 / setup.params.rate_hz))
         self._done_us: int | None = None
-        self._last_state_us = _NOTHING_US
+        self._last_state_us = _NO_TIME_US
         self._thrust_01 = setup.vehicle_model.hover_thrust_01
 
     @property
@@ -130,7 +131,7 @@ class Agent:
         """Landed, disarmed, and its parameters as they were."""
         if self._done_us is None:
             return False
-        return self._upkeep.restored or self._clock.now_us() - self._done_us > _RESTORE_US
+        return self._upkeep.restored or self._clock.now_us() - self._done_us > _RESTORE_TIMEOUT_US
 
     @property
     def finished(self) -> bool:
@@ -195,7 +196,7 @@ class Agent:
         if refusals:
             self._alerts.put("bus", refusals, now_us)
         self._publisher.active_alert = self._alerts.text(now_us)
-        return self._publisher.report(
+        return self._publisher.publish(
             now_us,
             state,
             planning,
@@ -246,7 +247,7 @@ class Agent:
         self._observer.update(state, self._thrust_01 if self._state_machine.had_control else None)
         if self._state_machine.had_control:
             return state
-        if self._autopilot.hover_thrust_01 is not None and state.mode in _AUTOPILOT_HOVERS:
+        if self._autopilot.hover_thrust_01 is not None and state.mode in _AUTOPILOT_HOVER_MODES:
             self._observer.learn_hover(self._autopilot.hover_thrust_01 * float(body_z_ned(state.q_nb)[2]))
         return state
 
@@ -273,7 +274,7 @@ class Agent:
             state.pos_ned_m, self._utc(act_us), dt_us, steps, self._state_machine.phase
         )
         flies = Phase.GOTO_START <= self._state_machine.phase <= Phase.GOTO_LAND
-        self._look_for_deadlock(now_us, state, keep_outs, flies)
+        self._detect_deadlock(now_us, state, keep_outs, flies)
         grid = np.arange(self._controller.longest + 1, dtype=np.float64)
         ahead_s = self._predictor.delay_us * 1e-6 + dt_us * 1e-6 * grid
         reference, now_ref = self._reference_selector.reference(now_us, self._clock.utc_us(), ahead_s)
@@ -293,7 +294,7 @@ class Agent:
         if self._coordination is None:
             return None
         utc_us, began_ns = self._clock.utc_us(), self._stopwatch_ns()
-        if not (flies and self._state_machine.had_control) or self._decision.mode in _DEVIATES:
+        if not (flies and self._state_machine.had_control) or self._decision.mode in _DEVIATING_MODES:
             self._coordination.idle(utc_us, state)
             return None
         self._coordination.step(utc_us, state, self._state_machine.phase, self._reference_selector.wish(now_us, utc_us))
@@ -302,13 +303,13 @@ class Agent:
         pos, vel = self._coordination.follow(act_us + np.arange(self._controller.longest + 1) * self._controller.dt_us)
         return Reference(pos, vel, self._setup.mission.yaw_rad)
 
-    def _look_for_deadlock(self, now_us: int, state: VehicleState, keep_outs: list[KeepOut], flies: bool) -> None:
+    def _detect_deadlock(self, now_us: int, state: VehicleState, keep_outs: list[KeepOut], flies: bool) -> None:
         if not (flies and self._state_machine.had_control):
-            self._reference_selector.rest(now_us)
+            self._reference_selector.reset(now_us)
             return
         known = [*keep_outs, *(self._coordination.left_behind if self._coordination else ())]
         landmarks = self._world_model.landmarks
-        deadlock = self._reference_selector.look(now_us, self._clock.utc_us(), state.pos_ned_m, known, landmarks)
+        deadlock = self._reference_selector.update(now_us, self._clock.utc_us(), state.pos_ned_m, known, landmarks)
         if deadlock is not None:
             self._alerts.put("deadlock", f"deadlocked by {deadlock.names}", now_us)
 
@@ -331,13 +332,13 @@ class Agent:
         good = self._plan_buffer.plan
         delay_us = self._predictor.delay_us
         health = Health(
-            _NOTHING_US if state is None else max(0, now_us - state.t_us),
+            _NO_TIME_US if state is None else max(0, now_us - state.t_us),
             state is not None and state.armed,
             FlightMode.UNKNOWN if state is None else state.mode,
             Landed.UNKNOWN if state is None else state.landed,
             state is not None and state.failsafe,
             PlanStatus.NONE if plan is None else plan.status,
-            _NOTHING_US if good is None else now_us + delay_us - good.t0_us,
+            _NO_TIME_US if good is None else now_us + delay_us - good.t0_us,
             0 if self._certified_us is None else now_us - self._certified_us,
             0.0 if state is None else math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s)),
             self._state_machine.phase,
@@ -419,8 +420,8 @@ class Agent:
         )
         for command in self._state_machine.step(inputs):
             self._commands.request(command)
-        self._tell_what_is_waited_for(now_us)
-        self._give_parameters_back(now_us)
+        self._report_start_blocker(now_us)
+        self._restore_parameters(now_us)
         self._upkeep.step(now_us)
         if not before[1] and self._state_machine.had_control:
             self._predictor.clear()
@@ -432,14 +433,14 @@ class Agent:
             names = {"phase": now[0].name, "mode": now[1].name, "flight_mode": now[2].name}
             self._note("state", **names, reason=self._decision.reason)
 
-    def _tell_what_is_waited_for(self, now_us: int) -> None:
+    def _report_start_blocker(self, now_us: int) -> None:
         waits_for = self._state_machine.waits_for
         if self._state_machine.phase is not Phase.STANDBY:
             self._standby_us = now_us
-        elif waits_for and now_us - self._standby_us > _WAITS_LONG_US:
+        elif waits_for and now_us - self._standby_us > _START_ALERT_DELAY_US:
             self._alerts.put("start", f"waits for {waits_for}", now_us)
 
-    def _give_parameters_back(self, now_us: int) -> None:
+    def _restore_parameters(self, now_us: int) -> None:
         """Once the mission has ended: set the autopilot's parameters back, and say which of them could not be."""
         if not self._state_machine.finished:
             return

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-_LASTS_US = 2_000_000  # after its cause: long enough to be read
+_ALERT_LIFETIME_US = 2_000_000  # after its cause: long enough to be read
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +39,6 @@ class Alerts:
 
     def text(self, now_us: int) -> str:
         """Text of the alert that began last, or ""."""
-        self._active = {c: a for c, a in self._active.items() if now_us - self._raised_us[c] <= _LASTS_US}
+        self._active = {c: a for c, a in self._active.items() if now_us - self._raised_us[c] <= _ALERT_LIFETIME_US}
         newest = max(self._active.values(), key=lambda alert: alert.since_us, default=None)
         return "" if newest is None else newest.text

@@ -21,15 +21,15 @@ class ReferenceSelector:
     Args:
         setup: of the agent.
         state_machine: knows the mission's reference.
-        note: is told `deadlock`, when one begins and when it is over.
+        note: is reported `deadlock`, when one begins and when it is over.
     """
 
     def __init__(self, setup: AgentSetup, state_machine: MissionStateMachine, note: Callable[..., None]) -> None:
         self._state_machine, self._note, self._yaw_rad = state_machine, note, setup.mission.yaw_rad
         self._detour = Detour(setup.params.detour, setup.agent, setup.separation.radius_m)
-        self._told: Deadlock | None = None
+        self._reported: Deadlock | None = None
 
-    def look(
+    def update(
         self,
         now_us: int,
         utc_us: int,
@@ -39,12 +39,12 @@ class ReferenceSelector:
     ) -> Deadlock | None:
         """Whether the agent, at (3,), gets on among what is known; returns a deadlock that begins."""
         self._detour.step(now_us, pos_ned_m, self._mission(now_us, utc_us), known, landmarks)
-        return self._tell(now_us)
+        return self._report(now_us)
 
-    def rest(self, now_us: int) -> None:
+    def reset(self, now_us: int) -> None:
         """Somebody else flies."""
         self._detour.reset()
-        self._tell(now_us)
+        self._report(now_us)
 
     def reference(self, now_us: int, utc_us: int, ahead_s: Array) -> tuple[Reference, Reference]:
         """At times (N,) from now, (N, 3) each; and the mission's, now."""
@@ -63,11 +63,11 @@ class ReferenceSelector:
     def _mission(self, now_us: int, utc_us: int) -> Sampled:
         return partial(self._state_machine.reference, utc_us, now_us)
 
-    def _tell(self, now_us: int) -> Deadlock | None:
-        told, self._told = self._told, self._detour.deadlock
-        if told is None and self._told is not None:
-            self._note("deadlock", begins=True, by=self._told.by)
-            return self._told
-        if told is not None and self._told is None:
-            self._note("deadlock", begins=False, lasted_s=(now_us - told.since_us) * 1e-6)
+    def _report(self, now_us: int) -> Deadlock | None:
+        reported, self._reported = self._reported, self._detour.deadlock
+        if reported is None and self._reported is not None:
+            self._note("deadlock", begins=True, by=self._reported.by)
+            return self._reported
+        if reported is not None and self._reported is None:
+            self._note("deadlock", begins=False, lasted_s=(now_us - reported.since_us) * 1e-6)
         return None

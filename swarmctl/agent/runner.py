@@ -30,7 +30,7 @@ from swarmctl.mavlink.transport import open_transport
 from swarmctl.telemetry.recorder import Recorder
 
 _LOOPBACK = "127.0.0.1"
-_SLEW_01 = 0.01  # of elapsed time, by which UTC may be corrected
+_UTC_SLEW_01 = 0.01  # of elapsed time, by which UTC may be corrected
 _LINGER_S = 1.0  # after the end, so that peers learn of it
 _VEHICLE_LOST_S = 15.0  # no state at all: nothing left to do here
 
@@ -47,7 +47,7 @@ class WallClock:
 
     def utc_us(self) -> int:
         now_ns = time.monotonic_ns()
-        most_ns = int((now_ns - self._read_ns) * _SLEW_01)
+        most_ns = int((now_ns - self._read_ns) * _UTC_SLEW_01)
         off_ns = time.time_ns() - now_ns - self._offset_ns
         self._offset_ns += min(most_ns, max(-most_ns, off_ns))
         self._read_ns = now_ns
@@ -68,15 +68,15 @@ class Pace:
 
     def __init__(self, period_us: int, first_us: int) -> None:
         self.period_us, self.due_us = period_us, first_us
-        self.late = 0
+        self.missed = 0
 
     def done(self, sent_us: int, now_us: int) -> None:
         """Account for the tick that was due, and set the next deadline."""
         if sent_us > self.due_us + self.period_us:
-            self.late += 1
+            self.missed += 1
         self.due_us += self.period_us
         skipped = max(0, (now_us - self.due_us) // self.period_us)
-        self.late += skipped
+        self.missed += skipped
         self.due_us += skipped * self.period_us
 
 
@@ -171,18 +171,18 @@ def _loop(agent: Agent, config: Config, clock: WallClock, stop: _StopRequest, ve
         now_us = clock.now_us()
         if stop.take():
             agent.ask("land", now_us)
-        record = agent.tick(now_us, pace.late)
+        record = agent.tick(now_us, pace.missed)
         pace.done(now_us + round(record.tick_ms * 1000), clock.now_us())
         if record.mode is not Mode.STATE_STALE:
             seen_us, ever_seen = now_us, True
-        _give_up_on_silence(now_us - seen_us, ever_seen, config, vehicle)
+        _check_vehicle_silence(now_us - seen_us, ever_seen, config, vehicle)
         if agent.done if only_land else agent.finished:
             finished_us = finished_us or now_us
             if now_us - finished_us > _LINGER_S * 1e6:
                 return _exit_code(agent)
 
 
-def _give_up_on_silence(silent_us: int, ever_seen: bool, config: Config, vehicle: str) -> None:
+def _check_vehicle_silence(silent_us: int, ever_seen: bool, config: Config, vehicle: str) -> None:
     if not ever_seen and silent_us > config.agent.connect_timeout_s * 1e6:
         raise StartError(
             f"vehicle at {vehicle}: no heartbeat and position within {config.agent.connect_timeout_s:.0f} s. "

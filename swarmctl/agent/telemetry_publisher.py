@@ -115,7 +115,7 @@ class TelemetryPublisher:
         self.failed_plans = 0
         self.active_alert = ""
 
-    def report(
+    def publish(
         self,
         now_us: int,
         state: VehicleState | None,

@@ -24,7 +24,7 @@ from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.trajectory_message import Intent
 from swarmctl.core.types import Array, Mode, Obstacle, Phase
 
-_NEW_US = 300_000  # a path that may be compared with promises
+_RECENT_PATH_US = 300_000  # a path that may be compared with promises
 _READY_LEAD_US = 1_000_000  # of another clock than ours
 FLOWN_BY_AGENT = frozenset((Mode.TRACKING, Mode.REPLAY, Mode.BRAKE, Mode.HOLD))
 
@@ -159,7 +159,7 @@ class WorldModel:
         found = set()
         for path in self.paths.latest():
             intent, at_us = intents.get(path.agent), path.t0_utc_us
-            if intent is None or not intent.promised or at_us < utc_us - _NEW_US:
+            if intent is None or not intent.promised or at_us < utc_us - _RECENT_PATH_US:
                 continue
             here = path.pos_ned_m[0].tolist()
             if all(math.dist(here, trajectory.at(at_us)[0]) > allowed_m for trajectory in intent.followed):

@@ -20,14 +20,14 @@ from swarmctl.telemetry.palette import LIMIT_RGB, css
 
 WIDTH = 640
 _LEFT, _RIGHT, _TOP, _BOTTOM = 52, 12, 8, 24
-_FAR = 1e9  # no unit of ours gets there; a damaged recording does, and would press all else flat
+_MAX_DRAWN = 1e9  # no unit of ours gets there; a damaged recording does, and would press all else flat
 _LOOK_RAD, _DOWN_RAD = math.radians(35), math.radians(24)  # the oblique view looks this far east of north, and down
 
 
 def _near(values: Array) -> Array:
     """What can be drawn; NaN for the rest."""
     values = np.asarray(values, np.float64)
-    return np.where(np.abs(values) < _FAR, values, np.nan)
+    return np.where(np.abs(values) < _MAX_DRAWN, values, np.nan)
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,9 +22,9 @@ if TYPE_CHECKING:
 
 RECORDING = "telemetry.rrd"
 APPLICATION = "swarmctl"
-_LEAST_BYTES = 4096  # a packed recording without any entity is smaller: that was no recording
-_CHUNK = 50  # ticks of an agent sent at once: one second
-_OWN_PORT = ("--bind", "127.0.0.1", "--port", "auto")  # else it feeds our server's data back to our server
+_MIN_RECORDING_BYTES = 4096  # a packed recording without any entity is smaller: that was no recording
+_CHUNK_TICKS = 50  # ticks of an agent sent at once: one second
+_VIEWER_PORT_OPTIONS = ("--bind", "127.0.0.1", "--port", "auto")  # else it feeds our server's data back to our server
 _WINDOW_MEMORY = "2GB"  # the viewer's own default is 75 % of the machine
 
 
@@ -56,7 +56,7 @@ def open_viewer(target: str, log: Path | None = None) -> subprocess.Popen[bytes]
         )
     if "://" not in target and not Path(target).is_file():
         raise StartError(f"{target}: no such recording")
-    command = [str(viewer_binary()), target, "--memory-limit", _WINDOW_MEMORY, *_OWN_PORT]
+    command = [str(viewer_binary()), target, "--memory-limit", _WINDOW_MEMORY, *_VIEWER_PORT_OPTIONS]
     try:
         with (log or Path(os.devnull)).open("ab") as output:
             return subprocess.Popen(
@@ -90,7 +90,7 @@ def _packed(source: Path, packed: Path, timeout_s: float) -> bool:
         done = subprocess.run(
             [*command, *more], stdin=subprocess.DEVNULL, capture_output=True, timeout=left_s, check=False
         )
-        if done.returncode == 0 and packed.stat().st_size >= _LEAST_BYTES:
+        if done.returncode == 0 and packed.stat().st_size >= _MIN_RECORDING_BYTES:
             return True
         packed.unlink(missing_ok=True)
     return False
@@ -129,9 +129,9 @@ def simulated_recording(
     epoch_us = min((int(rows["utc_us"][0]) for rows in flown.values()), default=0)
     drawn = read_obstacles(list(obstacles)) or []
     scene.obstacles(drawn, 0, 0.0)
-    for first in range(0, max(map(len, flown.values()), default=0), _CHUNK):
+    for first in range(0, max(map(len, flown.values()), default=0), _CHUNK_TICKS):
         for agent, rows in flown.items():
-            chunk = rows[first : first + _CHUNK]
+            chunk = rows[first : first + _CHUNK_TICKS]
             scene.ticks(agent, chunk["utc_us"] - epoch_us, chunk, None)
         if any(obstacle.moves for obstacle in drawn):
             scene.obstacles(drawn, first * 20_000, first * 0.02)

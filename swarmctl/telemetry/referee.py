@@ -30,7 +30,7 @@ from swarmctl.telemetry.tracks import (
 
 _CONTROLLED = (Mode.TRACKING, Mode.REPLAY, Mode.BRAKE)
 _SOLVER_FAILED = (PlanStatus.SOLVER_FAILED, PlanStatus.RESIDUAL)
-_LISTED = 10  # violations of one kind that are spelled out
+_MAX_LISTED = 10  # violations of one kind that are spelled out
 _DURATION_SLACK_S = 1.0  # of the mission that may be missing at its end before it counts as cut short
 
 
@@ -342,6 +342,6 @@ def _spread(parts: Sequence[Array]) -> dict[str, float | None]:
 
 
 def _shorten(violations: list[str]) -> list[str]:
-    if len(violations) <= _LISTED:
+    if len(violations) <= _MAX_LISTED:
         return violations
-    return [*violations[:_LISTED], f"and {len(violations) - _LISTED} more like the last"]
+    return [*violations[:_MAX_LISTED], f"and {len(violations) - _MAX_LISTED} more like the last"]

@@ -21,7 +21,7 @@ from swarmctl.errors import ConfigError
 from swarmctl.files import read_file, replaced
 from swarmctl.telemetry.referee import RunData
 from swarmctl.telemetry.summary_file import decode_summary
-from swarmctl.telemetry.tracks import LONGEST_US
+from swarmctl.telemetry.tracks import MAX_RUN_US
 
 EVENTS = "events.jsonl"
 SUMMARY = "summary.json"
@@ -30,11 +30,11 @@ CONFIG = "config.toml"
 RECORDING = "telemetry.rrd"
 AGENT_FILE = re.compile(r"^agent-(\d{1,3})\.(ticks|parquet)$")
 
-_MOST_ROWS_BYTES = 2**31  # a day of one agent; more would not fit a laptop's memory either
-_MOST_EVENTS_BYTES = 2**28
-_MOST_TEXT_BYTES = 2**24
-_MOST_ROWS = _MOST_ROWS_BYTES // TICK_DTYPE.itemsize
-_DEEPEST_EVENT = 8  # ours nest twice
+_MAX_ROWS_BYTES = 2**31  # a day of one agent; more would not fit a laptop's memory either
+_MAX_EVENTS_BYTES = 2**28
+_MAX_TEXT_BYTES = 2**24
+_MAX_ROWS = _MAX_ROWS_BYTES // TICK_DTYPE.itemsize
+_MAX_EVENT_DEPTH = 8  # ours nest twice
 _INT64 = range(-(2**63), 2**63)
 _AXES = {3: ("x", "y", "z"), 4: ("w", "x", "y", "z")}
 
@@ -72,19 +72,19 @@ def refuse_no_folder(directory: Path) -> None:
 
 def read_rows(path: Path, dtype: np.dtype[np.void]) -> NDArray[np.void]:
     """Whole rows of a raw file; empty when there is none."""
-    data = _content(path, _MOST_ROWS_BYTES)
+    data = _content(path, _MAX_ROWS_BYTES)
     return np.frombuffer(data, dtype, len(data) // dtype.itemsize)
 
 
 def read_text(path: Path) -> str:
     """Text of a file of the folder; empty when there is none."""
-    return _content(path, _MOST_TEXT_BYTES).decode("utf-8", errors="replace")
+    return _content(path, _MAX_TEXT_BYTES).decode("utf-8", errors="replace")
 
 
 def read_summary(directory: Path) -> dict[str, Any] | None:
     """The summary of a finished run, None when there is none."""
     path = directory / SUMMARY
-    content = _content(path, _MOST_TEXT_BYTES)
+    content = _content(path, _MAX_TEXT_BYTES)
     if not content and not path.exists():
         return None
     try:
@@ -97,7 +97,7 @@ def read_events(directory: Path) -> list[dict[str, Any]]:
     """Events of every source in a run folder, sorted by UTC, each once; lines that aren't one of ours are skipped."""
     lines: dict[bytes, None] = {}
     for path in sorted(directory.glob(f"*{EVENTS}")):
-        lines.update(dict.fromkeys(_content(path, _MOST_EVENTS_BYTES).splitlines()))
+        lines.update(dict.fromkeys(_content(path, _MAX_EVENTS_BYTES).splitlines()))
     rows = (_event(line) for line in lines)
     return sorted((row for row in rows if row is not None), key=utc_us_of)
 
@@ -119,7 +119,7 @@ def _event(line: bytes) -> dict[str, Any] | None:
 def _is_sane(row: dict[str, Any]) -> bool:
     """Whether no value is nested deeper, and no integer larger, than what reads it can bear."""
     level: list[Any] = [row]
-    for _ in range(_DEEPEST_EVENT):
+    for _ in range(_MAX_EVENT_DEPTH):
         if any(isinstance(value, int) and value not in _INT64 for value in level):
             return False
         lists = [value for value in level if isinstance(value, list)]
@@ -142,8 +142,8 @@ def _content(path: Path, most_bytes: int) -> bytes:
 def _in_time(path: Path, rows: NDArray[np.void], clocks: tuple[str, ...]) -> NDArray[np.void]:
     """`rows`, when they are of one run by all its clocks."""
     for clock in clocks:
-        if len(rows) and int(rows[clock].max()) - int(rows[clock].min()) > LONGEST_US:
-            raise _damaged(path, f"damaged: {clock} spans more than {LONGEST_US / 3.6e9:.0f} hours")
+        if len(rows) and int(rows[clock].max()) - int(rows[clock].min()) > MAX_RUN_US:
+            raise _damaged(path, f"damaged: {clock} spans more than {MAX_RUN_US / 3.6e9:.0f} hours")
     return rows
 
 
@@ -178,8 +178,8 @@ def read_parquet(path: Path) -> NDArray[np.void]:
     import pyarrow.parquet as pq
 
     try:
-        file = pq.ParquetFile(pa.BufferReader(_content(path, _MOST_ROWS_BYTES)))
-        if file.metadata.num_rows > _MOST_ROWS:
+        file = pq.ParquetFile(pa.BufferReader(_content(path, _MAX_ROWS_BYTES)))
+        if file.metadata.num_rows > _MAX_ROWS:
             raise _damaged(path, f"has {file.metadata.num_rows} rows, more than a day of one agent")
         return _tick_rows(file)
     except (OSError, ValueError, pa.ArrowException) as error:  # of a damaged one, each of them

@@ -16,7 +16,7 @@ from swarmctl.core.types import Array, Phase
 _GRID_US = 20_000
 _GAP_US = 500_000  # reported positions further apart than this are not joined by a line
 _STALE_MS = _GAP_US / 1e3  # an agent that hears nothing goes on recording where it saw its vehicle last
-LONGEST_US = 48 * 3_600_000_000  # of a run; clocks further apart have no instants in common
+MAX_RUN_US = 48 * 3_600_000_000  # of a run; clocks further apart have no instants in common
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ def flight_rows(rows: NDArray[np.void]) -> NDArray[np.void]:
 
 def tracking_rows(rows: NDArray[np.void]) -> NDArray[np.void]:
     """The ticks of the mission itself."""
-    during: NDArray[np.void] = rows[(rows["phase"] == Phase.TRACK) & (np.abs(rows["mission_t_s"]) < LONGEST_US / 1e6)]
+    during: NDArray[np.void] = rows[(rows["phase"] == Phase.TRACK) & (np.abs(rows["mission_t_s"]) < MAX_RUN_US / 1e6)]
     return during
 
 
@@ -94,7 +94,7 @@ def _reported_tracks(ticks: Mapping[int, NDArray[np.void]], agents: int) -> Trac
     if not armed_us:
         return nothing
     first_us, last_us = min(armed_us), max(int(rows["utc_us"].max()) for rows in known.values() if len(rows))
-    if last_us - first_us > LONGEST_US:
+    if last_us - first_us > MAX_RUN_US:
         return nothing
     t_us = np.arange(first_us, last_us + 1, _GRID_US)
     pos_ned_m = np.full((len(t_us), agents, 3), np.nan)
@@ -112,7 +112,7 @@ def _located(rows: NDArray[np.void]) -> NDArray[np.bool_]:
 
 def _state_utc_us(rows: NDArray[np.void]) -> NDArray[np.int64]:
     """When the recorded states were true (T,), of ticks with a state."""
-    age_us = np.clip(rows["state_age_ms"].astype(np.float64) * 1e3, 0.0, LONGEST_US)
+    age_us = np.clip(rows["state_age_ms"].astype(np.float64) * 1e3, 0.0, MAX_RUN_US)
     when_us: NDArray[np.int64] = rows["utc_us"] - np.round(age_us).astype(np.int64)
     return when_us
 

@@ -31,10 +31,10 @@ URL_FILE = "viewer.url"
 _HOST = "127.0.0.1"
 _PORTS_TRIED = 50
 _SERVER_MEMORY = "512MiB"  # history for viewers that come late
-_EXIT_S = 4.0  # from SIGTERM to the end, whatever hangs
-_FLUSH_S = 2.0
-_PLOTS_S = 0.4  # curves are sent this often, poses at --rate-hz
-_REDRAW_S = 5.0  # obstacles at rest are sent again: a late viewer's history loses rare data first
+_EXIT_TIMEOUT_S = 4.0  # from SIGTERM to the end, whatever hangs
+_FLUSH_TIMEOUT_S = 2.0
+_PLOT_PERIOD_S = 0.4  # curves are sent this often, poses at --rate-hz
+_REDRAW_PERIOD_S = 5.0  # obstacles at rest are sent again: a late viewer's history loses rare data first
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -120,7 +120,7 @@ class Pump:
             self.step()
             if time.monotonic() >= next_plots_s:
                 self._scene.plots()
-                next_plots_s = time.monotonic() + _PLOTS_S - period_s / 2
+                next_plots_s = time.monotonic() + _PLOT_PERIOD_S - period_s / 2
             next_s = max(next_s + period_s, time.monotonic())  # after a freeze: go on, don't catch up
             stop.wait(next_s - time.monotonic())
         self.step()
@@ -138,7 +138,7 @@ class Pump:
 
     def _draw_obstacles(self) -> None:
         since_s = None if self._drawn_us is None else (self._newest_us - self._drawn_us) / 1e6
-        due_s = 0.0 if any(obstacle.moves for obstacle in self._obstacles) else _REDRAW_S
+        due_s = 0.0 if any(obstacle.moves for obstacle in self._obstacles) else _REDRAW_PERIOD_S
         if since_s is None or since_s > due_s:
             self._scene.obstacles(self._obstacles, self._newest_us, (self._newest_us - self._set_us) / 1e6)
             self._drawn_us = self._newest_us
@@ -227,12 +227,12 @@ def _announce(options: argparse.Namespace, url: str) -> None:
 
 def _end(rec: Any, bus: Any, last_line: str) -> None:
     """Bounded end: a frozen viewer makes flush and disconnect hang."""
-    watchdog = threading.Timer(_EXIT_S, os._exit, [EXIT_OK])
+    watchdog = threading.Timer(_EXIT_TIMEOUT_S, os._exit, [EXIT_OK])
     watchdog.daemon = True
     watchdog.start()
     print(last_line, flush=True)
     try:
-        rec.flush(timeout_sec=_FLUSH_S)
+        rec.flush(timeout_sec=_FLUSH_TIMEOUT_S)
     except Exception as error:
         print(f"viewer: flush: {error}", file=sys.stderr, flush=True)
     rec.disconnect()

@@ -167,8 +167,8 @@ def test_a_restarted_agent_leaves_a_vehicle_to_the_failsafe_that_has_it() -> Non
 
 def test_control_streaming_to_a_vehicle_that_is_not_ours_takes_it(monkeypatch: pytest.MonkeyPatch) -> None:
     def switch_off() -> None:
-        monkeypatch.setattr(state_machine, "_is_theirs", lambda state: False)
-        monkeypatch.setattr(MissionStateMachine, "_ask_for_control", lambda *_: [])  # streaming is enough
+        monkeypatch.setattr(state_machine, "_is_under_other_control", lambda state: False)
+        monkeypatch.setattr(MissionStateMachine, "_request_control", lambda *_: [])  # streaming is enough
 
     flight = restarted_while_the_autopilot_flies_home(switch_off)
     assert flight.setpoints_us

@@ -14,7 +14,7 @@ import pytest
 
 from sitl.lockstep import Lockstep
 from swarmctl.config import load
-from swarmctl.control.estimation.identification import Flown, Identified, flown, identify
+from swarmctl.control.estimation.identification import FlightSegment, Identified, identify, longest_segment
 from swarmctl.core.types import Landed, Phase
 
 CONFIG = Path(__file__).parents[2] / "configs" / "x500_circle.toml"
@@ -38,8 +38,8 @@ def fly(*overrides: str, until: Phase = Phase.GOTO_LAND) -> Lockstep:
 
 @functools.cache
 def found(seed: int) -> Identified:
-    flight = flown(fly(*AIR, *UNKNOWN, *STEPS, f"seed={seed}").logs[0].ticks)
-    assert isinstance(flight, Flown), flight
+    flight = longest_segment(fly(*AIR, *UNKNOWN, *STEPS, f"seed={seed}").logs[0].ticks)
+    assert isinstance(flight, FlightSegment), flight
     result = identify(flight)
     assert isinstance(result, Identified), result
     return result

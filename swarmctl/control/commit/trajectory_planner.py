@@ -40,7 +40,7 @@ class CommitParams(Params):
     horizon: int = Field(20, ge=5, le=60)  # steps, before the braking that every plan ends in
     moves: int = Field(8, ge=2, le=40)
     brake_m_s2: float = Field(1.5, ge=0.5, le=10)  # of that braking
-    share_01: float = Field(0.8, gt=0, le=1)  # of the controller's tilt that plans may use; the rest is for tracking
+    tilt_fraction_01: float = Field(0.8, gt=0, le=1)  # of the controller's tilt, for plans; the rest is for tracking
     period_s: float = Field(0.1, ge=0, le=2)  # between two plans, at least
     lead_min_s: float = Field(0.06, ge=0.02, le=2)  # from proposing to flying it
     lead_max_s: float = Field(1.5, ge=0.1, le=5)
@@ -284,7 +284,7 @@ def _planning(mpc: MpcParams, params: CommitParams) -> MpcParams:
             "horizon_z": params.horizon,
             "control_xy": params.moves,
             "horizon_xy": params.horizon,
-            "u_max": params.share_01 * mpc.u_max,
+            "u_max": params.tilt_fraction_01 * mpc.u_max,
             "thrust_min_m_s2": max(mpc.thrust_min_m_s2, 0.7 * GRAVITY_M_S2),
             "thrust_max_m_s2": min(mpc.thrust_max_m_s2, 1.3 * GRAVITY_M_S2),
             "terminal_z": "none",

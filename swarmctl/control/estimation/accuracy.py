@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections import deque
 
 _WINDOW_US = 4_000_000
-_CHANGE_01 = 0.25  # of the claims of one window; a change of satellites alone is less
-_CHANGE_M = 0.02
-_UNTOLD_US = 3_000_000  # a vehicle that tells it at all has told it by then
+_SETTLED_CHANGE_01 = 0.25  # of the claims of one window; a change of satellites alone is less
+_SETTLED_CHANGE_M = 0.02
+_NO_CLAIM_TIMEOUT_US = 3_000_000  # a vehicle that tells it at all has told it by then
 
 
 class AccuracyMonitor:
@@ -42,8 +42,8 @@ class AccuracyMonitor:
         """Why it can't be judged yet, or ""."""
         waited_us = 0 if self._since_us is None else now_us - self._since_us
         if not self._claims:
-            return "" if waited_us >= _UNTOLD_US else "the estimator to tell its accuracy"
+            return "" if waited_us >= _NO_CLAIM_TIMEOUT_US else "the estimator to tell its accuracy"
         claims_m = [claim for _, claim in self._claims]
-        if waited_us < _WINDOW_US or max(claims_m) > min(claims_m) * (1.0 + _CHANGE_01) + _CHANGE_M:
+        if waited_us < _WINDOW_US or max(claims_m) > min(claims_m) * (1.0 + _SETTLED_CHANGE_01) + _SETTLED_CHANGE_M:
             return f"the estimator's accuracy to settle (now {claims_m[-1]:.2f} m)"
         return ""

@@ -28,17 +28,17 @@ from swarmctl.core.types import Array, Phase
 _GRID_S = 0.004
 _SETTLE_S = 1.0  # at the beginning, while the fitted lag forgets where it began
 _GAP_S = 0.1  # without a setpoint for longer, somebody else flew
-_LEAST_S = 10.0
-_LEAST_TILT = 0.03  # rms; of less the estimator's own errors are a large part
+_MIN_DURATION_S = 10.0
+_MIN_TILT_RMS = 0.03  # rms; of less the estimator's own errors are a large part
 _BLOCK_S = 2.0  # residuals farther apart are taken to be independent
 _WINDOW_S = 1.5
 _THRUST_DELAYS_S = np.arange(0.0, 0.21, 0.01)
 _CONFIDENCE = 0.95
 _ITERATIONS = 30
-_FIRST = (0.06, 10.0, 1.0)  # delay, natural frequency, damping
-_LEAST = (0.0, 1.0, 0.3)
-_MOST = (0.5, 60.0, 3.0)
-_MISFIT_01 = 0.3  # of the tilt's own rms: an attitude that follows otherwise is not described by these figures
+_INITIAL_PARAMETERS = (0.06, 10.0, 1.0)  # delay, natural frequency, damping
+_LOWER_BOUNDS = (0.0, 1.0, 0.3)
+_UPPER_BOUNDS = (0.5, 60.0, 3.0)
+_MAX_MISFIT_01 = 0.3  # of the tilt's own rms: an attitude that follows otherwise is not described by these figures
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +70,7 @@ class Identified:
 
 
 @dataclass(frozen=True, slots=True)
-class Flown:
+class FlightSegment:
     """What was sent and what was measured, each at its own times [s] from a common zero."""
 
     sent_s: Array  # (T,)
@@ -81,7 +81,7 @@ class Flown:
     seen_pos_ned_m: Array  # (S, 3)
 
 
-def flown(ticks: NDArray[np.void]) -> Flown | str:
+def longest_segment(ticks: NDArray[np.void]) -> FlightSegment | str:
     """The longest part of a flight (`TICK_DTYPE`) that setpoints flew without a gap; or why there is none."""
     ours = (ticks["phase"] >= Phase.GOTO_START) & (ticks["phase"] <= Phase.GOTO_LAND)
     ours &= np.isfinite(ticks["setpoint_thrust_01"]) & np.isfinite(ticks["state_age_ms"])
@@ -93,14 +93,14 @@ def flown(ticks: NDArray[np.void]) -> Flown | str:
     longest = int(np.argmax(t_s[starts[1:] - 1] - t_s[starts[:-1]]))
     part = slice(starts[longest], starts[longest + 1])
     rows, t_s = rows[part], t_s[part] - t_s[part][0]
-    if t_s[-1] < _LEAST_S:
-        return f"setpoints were flown for {t_s[-1]:.1f} s at a stretch; {_LEAST_S:.0f} s are needed"
+    if t_s[-1] < _MIN_DURATION_S:
+        return f"setpoints were flown for {t_s[-1]:.1f} s at a stretch; {_MIN_DURATION_S:.0f} s are needed"
     seen_s = t_s - rows["state_age_ms"].astype(np.float64) * 1e-3
     new = np.diff(seen_s, prepend=-math.inf) > 1e-3
     sent_down = _down(rows["setpoint_q_nb"].astype(np.float64))[:, :2]
-    if float(np.sqrt(np.mean(np.var(sent_down, axis=0)))) < _LEAST_TILT:
+    if float(np.sqrt(np.mean(np.var(sent_down, axis=0)))) < _MIN_TILT_RMS:
         return "it hardly tilted: nothing can be told from this flight"
-    return Flown(
+    return FlightSegment(
         t_s,
         sent_down,
         rows["setpoint_thrust_01"].astype(np.float64),
@@ -110,7 +110,7 @@ def flown(ticks: NDArray[np.void]) -> Flown | str:
     )
 
 
-def identify(flight: Flown) -> Identified | str:
+def identify(flight: FlightSegment) -> Identified | str:
     """Fit everything; or why it can't be."""
     attitude = _fit_attitude(flight)
     if isinstance(attitude, str):
@@ -130,7 +130,7 @@ def identify(flight: Flown) -> Identified | str:
 # -- attitude ---------------------------------------------------------------------------------------------------------
 
 
-def _fit_attitude(flight: Flown) -> tuple[Figure, Figure, Figure] | str:
+def _fit_attitude(flight: FlightSegment) -> tuple[Figure, Figure, Figure] | str:
     """Dead time, natural frequency and damping; a constant offset of each axis takes up what levels are off."""
     used = flight.seen_s > _SETTLE_S
     at_s, measured = flight.seen_s[used], flight.seen_down[used, :2]
@@ -140,19 +140,19 @@ def _fit_attitude(flight: Flown) -> tuple[Figure, Figure, Figure] | str:
         followed = _followed(flight, delay_s, natural_rad_s, damping, at_s)
         return np.asarray(followed + parameters[3:] - measured)  # (S, 2)
 
-    least, most = np.array([*_LEAST, -1.0, -1.0]), np.array([*_MOST, 1.0, 1.0])
-    best = _least_squares(residuals, np.array([*_FIRST, 0.0, 0.0]), least, most)
+    least, most = np.array([*_LOWER_BOUNDS, -1.0, -1.0]), np.array([*_UPPER_BOUNDS, 1.0, 1.0])
+    best = _least_squares(residuals, np.array([*_INITIAL_PARAMETERS, 0.0, 0.0]), least, most)
     misfit = float(np.sqrt(np.mean(residuals(best) ** 2)))
-    if misfit > _MISFIT_01 * float(np.sqrt(np.mean(np.var(measured, axis=0)))):
+    if misfit > _MAX_MISFIT_01 * float(np.sqrt(np.mean(np.var(measured, axis=0)))):
         return f"its attitude does not follow setpoints as a second-order lag: off by {misfit:.3f} rad rms"
     blocks = (at_s / _BLOCK_S).astype(int)
     wide = _half_widths(_jacobian(residuals, best), residuals(best), blocks)
-    values = zip(best[:3], wide[:3], _LEAST, strict=True)
+    values = zip(best[:3], wide[:3], _LOWER_BOUNDS, strict=True)
     delay, natural, damping = (Figure(float(b), float(max(b - w, lo)), float(b + w)) for b, w, lo in values)
     return delay, natural, damping
 
 
-def _followed(flight: Flown, delay_s: float, natural_rad_s: float, damping: float, at_s: Array) -> Array:
+def _followed(flight: FlightSegment, delay_s: float, natural_rad_s: float, damping: float, at_s: Array) -> Array:
     """Tilt (S, 2) at times `at_s` (S,) of a vehicle with these parameters."""
     from scipy.signal import lfilter  # heavy, and not needed to fly
 
@@ -184,7 +184,7 @@ def _held_mean(sent_s: Array, sent: Array, from_s: Array) -> Array:
 # -- translation ------------------------------------------------------------------------------------------------------
 
 
-def _on_grid(flight: Flown, delay_s: float) -> tuple[Array, Array, Array]:
+def _on_grid(flight: FlightSegment, delay_s: float) -> tuple[Array, Array, Array]:
     """Thrust (G,) that acts, position (G, 3) and body down axis (G, 3) at common times."""
     grid_s = np.arange(flight.seen_s[0] + _SETTLE_S, flight.seen_s[-1], _GRID_S)
     pos = np.column_stack([np.interp(grid_s, flight.seen_s, flight.seen_pos_ned_m[:, i]) for i in range(3)])
@@ -193,7 +193,7 @@ def _on_grid(flight: Flown, delay_s: float) -> tuple[Array, Array, Array]:
     return flight.sent_thrust_01[np.maximum(held, 0)], pos, down
 
 
-def _fit_vertical(flight: Flown) -> tuple[Figure, Array, Array, Array]:
+def _fit_vertical(flight: FlightSegment) -> tuple[Figure, Array, Array, Array]:
     """1 / hover thrust, with what `_on_grid` gives; vertical drag is fitted beside it and forgotten.
 
     Thrust has a dead time of its own, motors included: the one that leaves least unexplained.

@@ -54,8 +54,8 @@ class Overload:
         p = self._params
         if self.level is Level.NONE:
             return 0.0
-        share_01 = (self.missed_01 - p.widen_01) / max(1e-9, p.hold_01 - p.widen_01)
-        return p.margin_max_m * min(1.0, max(0.0, share_01))
+        excess_01 = (self.missed_01 - p.widen_01) / max(1e-9, p.hold_01 - p.widen_01)
+        return p.margin_max_m * min(1.0, max(0.0, excess_01))
 
     def text(self) -> str:
         """The cause in words."""

@@ -24,14 +24,14 @@ from swarmctl.control.reference.mission import MissionReference, QuinticTrajecto
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Command, FlightMode, Landed, Mode, Phase, VehicleState, Verb
 
-_ASK_EVERY_US = 1_000_000
+_REQUEST_PERIOD_US = 1_000_000
 _SPIN_UP_US = 6_000_000  # ArduCopter's rotors spin up for over 3 s, and it refuses to be asked again meanwhile
 _SETTLE_S = 2.0
-_BEGIN_AFTER_US = 1_000_000
-_HOVER_US = 1_000_000  # of the autopilot's own hover, to learn its thrust where no HOLD separates it from our flight
-_ROOM_M = 0.1  # gone farther than has to be, so that it is reached
-_PLANNED = (Mode.TRACKING, Mode.REPLAY)
-_OURS = (FlightMode.HOLD, FlightMode.TAKEOFF, FlightMode.EXTERNAL)  # modes nobody but us has asked for
+_BEGIN_DELAY_US = 1_000_000
+_HOVER_LEARNING_US = 1_000_000  # hover flown by the autopilot itself, during which its hover thrust is learned
+_ROOM_MARGIN_M = 0.1  # gone farther than has to be, so that it is reached
+_PLAN_MODES = (Mode.TRACKING, Mode.REPLAY)
+_OWN_MODES = (FlightMode.HOLD, FlightMode.TAKEOFF, FlightMode.EXTERNAL)  # modes nobody but us has asked for
 OPERATOR_STOP = "stopped by the operator"
 TAKEN_OVER = "pilot or autopilot took over"
 REBOOTED = "the autopilot rebooted"
@@ -88,21 +88,21 @@ class MissionStateMachine:
         self._stop_verb = ""  # land or rtl, from when it is asked for until it is under way
         self.had_control = False
         self.held = False  # by the operator
-        self.waiting = False  # for mute peers, or for its processor
-        self._bound_for = start_ned_m  # before it had to wait
+        self.paused = False  # for mute peers, or for its processor
+        self._destination_ned_m = start_ned_m  # before it had to wait
         self._trajectory: tuple[QuinticTrajectory, int] | None = None  # and when it began
-        self._rejoin: tuple[QuinticTrajectory, int] | None = None  # the same, of the offset to the mission's reference
+        self._rejoin_offset: tuple[QuinticTrajectory, int] | None = None  # of the offset to the mission
         self._entered_us = 0
-        self._born_us: int | None = None
-        self._asked_us = -_ASK_EVERY_US
+        self._first_tick_us: int | None = None
+        self._requested_us = -_REQUEST_PERIOD_US
         self._boots = 0
         self.pilot_override = False
         self._ground_z_m = 0.0
         self._hovering_us: int | None = None
         self._airborne = False
-        self._invited = False  # by an operator's resume, to take control from whoever has it
+        self._may_take_control = False  # by an operator's resume, to take control from whoever has it
         self._landing_seen = False
-        self._lands_here = False  # where it comes to rest, instead of on the start
+        self._lands_in_place = False  # where it comes to rest, instead of on the start
         self._outcome_before = ""  # it yielded
         self._steps: dict[Phase, Callable[[PhaseInputs, VehicleState], list[Command]]] = {
             Phase.STANDBY: self._standby,
@@ -121,7 +121,7 @@ class MissionStateMachine:
 
     def step(self, inputs: PhaseInputs) -> list[Command]:
         """Advance by what is true now; returns what to ask of the autopilot."""
-        self._born_us = inputs.now_us if self._born_us is None else self._born_us
+        self._first_tick_us = inputs.now_us if self._first_tick_us is None else self._first_tick_us
         self.arming.update(inputs)
         state = inputs.state
         if inputs.boots != self._boots:
@@ -144,11 +144,11 @@ class MissionStateMachine:
             self._give_up("no plan for too long", inputs, state)
         if inputs.overload is Level.LAND and self.phase < Phase.GOTO_LAND:
             self._give_up(OVERLOADED, inputs, state)
-        self._wait_for_better(inputs, state)
+        self._pause(inputs, state)
         if state.mode is FlightMode.EXTERNAL and Phase.GOTO_START <= self.phase < Phase.LAND:
             self._take_control(inputs, state)
         patience_us = self._params.start_timeout_s * 1e6
-        if self.phase < Phase.TRACK and inputs.now_us - self._born_us > patience_us:
+        if self.phase < Phase.TRACK and inputs.now_us - self._first_tick_us > patience_us:
             cause = f"not tracking after {self._params.start_timeout_s:.0f} s ({self.phase.name})"
             self._give_up(f"{cause}: {self.waits_for}" if self.waits_for else cause, inputs, state)
         handler = self._steps.get(self.phase)
@@ -156,10 +156,10 @@ class MissionStateMachine:
 
     def reference(self, utc_us: int, now_us: int, offsets_s: Array) -> tuple[Array, Array]:
         """Where to be, (K, 3) and (K, 3), at `offsets_s` (K,) from now."""
-        if self.phase is Phase.TRACK and not (self.held or self.waiting) and self.begin_utc_us is not None:
+        if self.phase is Phase.TRACK and not (self.held or self.paused) and self.begin_utc_us is not None:
             pos, vel = self._reference.sample((utc_us - self.begin_utc_us) * 1e-6 + offsets_s)
-            if self._rejoin is not None:
-                trajectory, began_us = self._rejoin
+            if self._rejoin_offset is not None:
+                trajectory, began_us = self._rejoin_offset
                 offset, drift = trajectory.sample((now_us - began_us) * 1e-6 + offsets_s)
                 pos, vel = pos + offset, vel + drift
             return pos, vel
@@ -172,7 +172,7 @@ class MissionStateMachine:
         """Enter the mission on time: before a tick thinks, so that its first plan is the mission's already."""
         if self.phase is Phase.READY and self.begin_utc_us is not None and utc_us >= self.begin_utc_us:
             self.phase = Phase.TRACK
-            self._entered_us, self._asked_us = now_us, now_us - _ASK_EVERY_US
+            self._entered_us, self._requested_us = now_us, now_us - _REQUEST_PERIOD_US
 
     def mission_t_s(self, utc_us: int) -> float:
         """Mission time while tracking, else NaN."""
@@ -195,13 +195,13 @@ class MissionStateMachine:
             self._trajectory = (self._stop_trajectory(state), now_us)
         elif verb == "resume":
             if self.held or self.pilot_override:
-                self._go_on(now_us, utc_us, state)
+                self._rejoin_mission(now_us, utc_us, state)
             self.held = False
             if self.pilot_override:
-                self.pilot_override, self.outcome, self._invited = False, self._outcome_before, True
+                self.pilot_override, self.outcome, self._may_take_control = False, self._outcome_before, True
 
     def _override(self, why: str) -> None:
-        self.pilot_override, self.had_control, self._invited = True, False, False
+        self.pilot_override, self.had_control, self._may_take_control = True, False, False
         self._outcome_before = self.outcome
         self.outcome = why
 
@@ -214,39 +214,39 @@ class MissionStateMachine:
         if self.phase < Phase.GOTO_START or self.pilot_override:
             self._enter(Phase.LAND, now_us)  # which is done at once where the vehicle is known to be disarmed
         elif self.phase < Phase.GOTO_LAND and verb == "rtl":
-            self._lands_here = False
+            self._lands_in_place = False
             self._go_home(now_us, state)
-        elif verb == "land" and not self._lands_here:
-            self._stop_here(now_us, state)
+        elif verb == "land" and not self._lands_in_place:
+            self._stop_in_place(now_us, state)
 
     def _is_down(self, inputs: PhaseInputs, state: VehicleState) -> bool:
         """Whether the vehicle is on the ground and known to be disarmed."""
         return state.landed is Landed.ON_GROUND and self.arming.is_disarmed(inputs, state)
 
-    def _wait_for_better(self, inputs: PhaseInputs, state: VehicleState) -> None:
+    def _pause(self, inputs: PhaseInputs, state: VehicleState) -> None:
         """Who loses the bus comes to rest: then what peers assume (braking) holds. So does who misses its deadlines."""
         flying = self.had_control and Phase.GOTO_START <= self.phase <= Phase.GOTO_LAND
         must_wait = inputs.bus_lost or inputs.overload >= Level.HOLD
-        if must_wait and flying and not self.waiting:
-            self.waiting = True
-            self._bound_for = self._trajectory[0].to_ned_m if self._trajectory else self._start_ned_m
+        if must_wait and flying and not self.paused:
+            self.paused = True
+            self._destination_ned_m = self._trajectory[0].to_ned_m if self._trajectory else self._start_ned_m
             self._trajectory = (self._stop_trajectory(state), inputs.now_us)
-        elif self.waiting and not must_wait:
-            self.waiting = False
+        elif self.paused and not must_wait:
+            self.paused = False
             if self.phase in (Phase.GOTO_START, Phase.GOTO_LAND):
-                self._trajectory = (self._trajectory_to(self._bound_for, state), inputs.now_us)
+                self._trajectory = (self._trajectory_to(self._destination_ned_m, state), inputs.now_us)
             elif self.held:
                 self._trajectory = (self._stop_trajectory(state), inputs.now_us)
             else:
-                self._go_on(inputs.now_us, inputs.utc_us, state)
+                self._rejoin_mission(inputs.now_us, inputs.utc_us, state)
 
-    def _go_on(self, now_us: int, utc_us: int, state: VehicleState) -> None:
+    def _rejoin_mission(self, now_us: int, utc_us: int, state: VehicleState) -> None:
         """Close in smoothly on the mission's reference, which has moved on: a jump would have all race to one point."""
         if self.phase is not Phase.TRACK or self.begin_utc_us is None:
             return
         pos, vel = self._reference.sample(np.array([(utc_us - self.begin_utc_us) * 1e-6]))
         p, offset, drift = self._params, state.pos_ned_m - pos[0], state.vel_ned_m_s - vel[0]
-        self._rejoin = (quintic_to(offset, drift, np.zeros(3), p.speed_m_s, p.accel_m_s2), now_us)
+        self._rejoin_offset = (quintic_to(offset, drift, np.zeros(3), p.speed_m_s, p.accel_m_s2), now_us)
 
     def _stop_trajectory(self, state: VehicleState) -> QuinticTrajectory:
         return brake_to_rest(state.pos_ned_m, state.vel_ned_m_s, self._params.accel_m_s2)
@@ -259,18 +259,18 @@ class MissionStateMachine:
             return self._refuse(inputs.refusal, inputs)
         if any(p.phase is Phase.DONE and p.alive for p in inputs.peers.values()):
             return self._refuse("a peer gave up before take-off", inputs)
-        self.waits_for = self._missing(inputs, state)
+        self.waits_for = self._start_blocker(inputs, state)
         if not self.waits_for:
             self._ground_z_m = float(state.pos_ned_m[2])
             self._airborne = state.landed is Landed.IN_AIR
             self._enter(Phase.ARM, inputs.now_us)
             return []
         stays = state.mode is FlightMode.EXTERNAL and inputs.arm_in is None and not inputs.armable
-        if stays and not state.armed and self._may_ask(inputs):
+        if stays and not state.armed and self._may_request(inputs):
             return [Command(Verb.HOLD)]  # PX4 stays in OFFBOARD after a landing, where it can't be armed
         return []
 
-    def _missing(self, inputs: PhaseInputs, state: VehicleState) -> str:
+    def _start_blocker(self, inputs: PhaseInputs, state: VehicleState) -> str:
         """What has to be true before arming and is not, or ""."""
         if state.landed not in (Landed.ON_GROUND, Landed.IN_AIR):
             return "the autopilot to tell whether it has landed"
@@ -290,7 +290,7 @@ class MissionStateMachine:
         return []
 
     def _arm(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
-        if state.armed and self._airborne and not self._invited and _is_theirs(state):
+        if state.armed and self._airborne and not self._may_take_control and _is_under_other_control(state):
             self._override(TAKEN_OVER)  # before anything is streamed: one setpoint would take it
             return []
         if state.armed:
@@ -298,7 +298,7 @@ class MissionStateMachine:
             return []
         if inputs.refusal:
             return self._refuse(inputs.refusal, inputs)
-        if not self._may_ask(inputs):
+        if not self._may_request(inputs):
             return []
         if inputs.arm_in not in (None, state.mode):
             return [Command(Verb.EXTERNAL)]
@@ -311,7 +311,7 @@ class MissionStateMachine:
         settled = abs(float(state.vel_ned_m_s[2])) < 0.3 and abs(climbed_m - height_m) < 0.4
         hovers = state.mode in (FlightMode.HOLD, inputs.arm_in) and state.landed is Landed.IN_AIR and settled
         self._hovering_us = (self._hovering_us or inputs.now_us) if hovers else None
-        learned = inputs.arm_in is None or inputs.now_us - (self._hovering_us or inputs.now_us) >= _HOVER_US
+        learned = inputs.arm_in is None or inputs.now_us - (self._hovering_us or inputs.now_us) >= _HOVER_LEARNING_US
         if hovers and learned:
             self._enter(Phase.GOTO_START, inputs.now_us)
             return []
@@ -321,7 +321,7 @@ class MissionStateMachine:
         if (
             state.mode is not FlightMode.TAKEOFF
             and state.landed is Landed.ON_GROUND
-            and self._may_ask(inputs, _SPIN_UP_US)
+            and self._may_request(inputs, _SPIN_UP_US)
         ):
             return [Command(Verb.TAKEOFF, height_m)]
         return []
@@ -333,22 +333,22 @@ class MissionStateMachine:
                     QuinticTrajectory(state.pos_ned_m, np.zeros(3), state.pos_ned_m, 1.0),
                     inputs.now_us,
                 )
-            return self._ask_for_control(inputs, state)
+            return self._request_control(inputs, state)
         p = self._params
-        if self._at(state, self._start_ned_m, p.arrive_m, p.arrive_m_s) and not self.waiting:
+        if self._at(state, self._start_ned_m, p.arrive_m, p.arrive_m_s) and not self.paused:
             self.ready_utc_us = inputs.utc_us
             self._enter(Phase.READY, inputs.now_us)
         return []
 
-    def _ask_for_control(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
+    def _request_control(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
         """Control is taken from the autopilot's own hold; from anybody else only after an operator's `resume`.
 
         Not even setpoints may flow meanwhile: PX4 returns to OFFBOARD by itself when they resume after a failsafe.
         """
-        if not self._invited and _is_theirs(state):
+        if not self._may_take_control and _is_under_other_control(state):
             self._override(TAKEN_OVER)
             return []
-        return [Command(Verb.EXTERNAL)] if self._may_ask(inputs) else []
+        return [Command(Verb.EXTERNAL)] if self._may_request(inputs) else []
 
     def _ready(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
         if any(not p.alive or p.phase >= Phase.GOTO_LAND for p in inputs.peers.values()):
@@ -357,22 +357,22 @@ class MissionStateMachine:
             return []
         ready = [p.ready_utc_us for p in inputs.peers.values() if p.ready_utc_us > 0]
         if len(ready) == self._expected:
-            self.begin_utc_us = max([self.ready_utc_us, *ready]) + _BEGIN_AFTER_US
+            self.begin_utc_us = max([self.ready_utc_us, *ready]) + _BEGIN_DELAY_US
         return []
 
     def _track(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
         assert self.begin_utc_us is not None
         if not self.had_control:
-            return self._ask_for_control(inputs, state)
+            return self._request_control(inputs, state)
         if excess := self._reference.excess(state.pos_ned_m, state.vel_ned_m_s):
             self._give_up(excess, inputs, state)
             return []
-        if inputs.utc_us - self.begin_utc_us >= self._duration_us and not (self.held or self.waiting):
+        if inputs.utc_us - self.begin_utc_us >= self._duration_us and not (self.held or self.paused):
             self.outcome = self.outcome or "completed"
             if self._airborne and not inputs.peers:
                 self._enter(Phase.LAND, inputs.now_us)
             elif self._airborne:
-                self._stop_here(inputs.now_us, state)
+                self._stop_in_place(inputs.now_us, state)
             else:
                 self._go_home(inputs.now_us, state)
         return []
@@ -383,10 +383,10 @@ class MissionStateMachine:
             self._enter(Phase.LAND, inputs.now_us)
         elif waited_us > self._params.land_timeout_s * 1e6:
             at_rest = self._at(state, state.pos_ned_m, math.inf, self._params.arrive_m_s)
-            if self._lands_here or (at_rest and self._has_room(inputs, state)) or inputs.mode not in _PLANNED:
+            if self._lands_in_place or (at_rest and self._has_room(inputs, state)) or inputs.mode not in _PLAN_MODES:
                 self._enter(Phase.LAND, inputs.now_us)
             else:
-                self._stop_here(inputs.now_us, state)
+                self._stop_in_place(inputs.now_us, state)
         return []
 
     def _land(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
@@ -395,18 +395,18 @@ class MissionStateMachine:
             if state.mode is not FlightMode.EXTERNAL:
                 self._enter(Phase.DONE, inputs.now_us)
                 return []
-            return [Command(Verb.HOLD)] if self._may_ask(inputs) else []
+            return [Command(Verb.HOLD)] if self._may_request(inputs) else []
         if self._is_down(inputs, state):
             self._enter(Phase.DONE, inputs.now_us)
             return []
         if state.mode is FlightMode.LAND:
             self._landing_seen = True
             return []
-        ours = state.mode in _OURS and not self._landing_seen  # else a pilot flies, or broke the landing off
+        ours = state.mode in _OWN_MODES and not self._landing_seen  # else a pilot flies, or broke the landing off
         if not ours and state.landed is not Landed.ON_GROUND:
             self._override(TAKEN_OVER)
             return []
-        if not self._may_ask(inputs):
+        if not self._may_request(inputs):
             return []
         return [Command(Verb.DISARM if state.landed is Landed.ON_GROUND else Verb.LAND)]
 
@@ -420,13 +420,13 @@ class MissionStateMachine:
         if self._trajectory is None:
             return True
         trajectory, began_us = self._trajectory
-        if not self._lands_here:
-            return self._at(state, trajectory.to_ned_m, self._params.land_m, self._params.land_m_s) and not self.waiting
+        if not self._lands_in_place:
+            return self._at(state, trajectory.to_ned_m, self._params.land_m, self._params.land_m_s) and not self.paused
         if inputs.now_us - began_us <= (trajectory.travel_s + _SETTLE_S) * 1e6:
             return False
         if self._has_room(inputs, state):
             return self._at(state, state.pos_ned_m, math.inf, self._params.arrive_m_s)
-        room = room_for(state.pos_ned_m, inputs.others_ned_m, self._apart_m + _ROOM_M, self._agent)
+        room = room_for(state.pos_ned_m, inputs.others_ned_m, self._apart_m + _ROOM_MARGIN_M, self._agent)
         self._trajectory = (self._trajectory_to(room, state), inputs.now_us)
         return False
 
@@ -449,36 +449,36 @@ class MissionStateMachine:
         return quintic_to(state.pos_ned_m, state.vel_ned_m_s, target_ned_m, p.speed_m_s, p.accel_m_s2)
 
     def _go_home(self, now_us: int, state: VehicleState) -> None:
-        self._trajectory, self._bound_for = (self._trajectory_home(state), now_us), self._start_ned_m
+        self._trajectory, self._destination_ned_m = (self._trajectory_home(state), now_us), self._start_ned_m
         self.held = False
         self._enter(Phase.GOTO_LAND, now_us)
 
     def _give_up(self, why: str, inputs: PhaseInputs, state: VehicleState) -> None:
         self.outcome = self.outcome or why
-        if self.had_control and inputs.mode in _PLANNED:
-            self._stop_here(inputs.now_us, state)
+        if self.had_control and inputs.mode in _PLAN_MODES:
+            self._stop_in_place(inputs.now_us, state)
             return
         self._enter(Phase.DONE if self._is_down(inputs, state) else Phase.LAND, inputs.now_us)
 
-    def _stop_here(self, now_us: int, state: VehicleState) -> None:
+    def _stop_in_place(self, now_us: int, state: VehicleState) -> None:
         """Brake and make room under the own plan, then hand over where that ends."""
         trajectory = self._stop_trajectory(state)
-        self._trajectory, self._bound_for = (trajectory, now_us), trajectory.to_ned_m
-        self._lands_here, self.held = True, False
+        self._trajectory, self._destination_ned_m = (trajectory, now_us), trajectory.to_ned_m
+        self._lands_in_place, self.held = True, False
         self._enter(Phase.GOTO_LAND, now_us)
 
     def _enter(self, phase: Phase, now_us: int) -> None:
         self.phase = phase
         self._entered_us = now_us
-        self._asked_us = now_us - _SPIN_UP_US
+        self._requested_us = now_us - _SPIN_UP_US
 
-    def _may_ask(self, inputs: PhaseInputs, every_us: int = _ASK_EVERY_US) -> bool:
-        if inputs.busy or inputs.now_us - self._asked_us < every_us:
+    def _may_request(self, inputs: PhaseInputs, every_us: int = _REQUEST_PERIOD_US) -> bool:
+        if inputs.busy or inputs.now_us - self._requested_us < every_us:
             return False
-        self._asked_us = inputs.now_us
+        self._requested_us = inputs.now_us
         return True
 
 
-def _is_theirs(state: VehicleState) -> bool:
+def _is_under_other_control(state: VehicleState) -> bool:
     """Whether a pilot, an operator or a failsafe has the vehicle."""
-    return state.mode not in _OURS or state.failsafe
+    return state.mode not in _OWN_MODES or state.failsafe

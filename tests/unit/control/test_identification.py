@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from swarmctl.config import Config, load
-from swarmctl.control.estimation.identification import Figure, Flown, Identified, flown, identify
+from swarmctl.control.estimation.identification import Figure, FlightSegment, Identified, identify, longest_segment
 from swarmctl.control.lag import Lag
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.reference.mission import MissionParams, MissionReference
@@ -70,8 +70,8 @@ def follow(flight_s: float, seed: int, truth: VehicleModelParams = TRUTH, errors
 
 
 def result(ticks: NDArray[np.void]) -> Identified:
-    flight = flown(ticks)
-    assert isinstance(flight, Flown), flight
+    flight = longest_segment(ticks)
+    assert isinstance(flight, FlightSegment), flight
     found = identify(flight)
     assert isinstance(found, Identified), found
     return found
@@ -104,8 +104,8 @@ def test_dead_times_far_from_the_first_guess_are_found(delay_s: float) -> None:
 def test_setpoints_that_somebody_else_interrupted_are_used_up_to_there() -> None:
     ticks = follow(40.0, 4)
     ticks["setpoint_thrust_01"][1200:1300] = np.nan  # 24 s, 2 s of a pilot, 14 s
-    flight = flown(ticks)
-    assert isinstance(flight, Flown)
+    flight = longest_segment(ticks)
+    assert isinstance(flight, FlightSegment)
     assert flight.sent_s[-1] == pytest.approx(1199 * DT_S)
     assert result(ticks).hover_thrust_01.value == pytest.approx(TRUTH.hover_thrust_01, rel=0.02)
 
@@ -135,8 +135,8 @@ def grounded(ticks: NDArray[np.void]) -> NDArray[np.void]:
     ],
 )
 def test_a_flight_that_tells_nothing_is_refused(spoil, why: str) -> None:  # type: ignore[no-untyped-def]
-    flight = flown(spoil(follow(40.0, 5)))
-    found = identify(flight) if isinstance(flight, Flown) else flight
+    flight = longest_segment(spoil(follow(40.0, 5)))
+    found = identify(flight) if isinstance(flight, FlightSegment) else flight
     assert isinstance(found, str)
     assert why in found
 
