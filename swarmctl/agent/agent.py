@@ -1,6 +1,7 @@
-"""One agent: `tick(now)` listens, senses, thinks, judges, acts, shares and records. Nothing else happens anywhere.
+"""One agent: `tick(now)` receives, senses, plans, decides the mode, sends a setpoint, publishes and records.
 
-It has no thread, socket, sleep or simulation branch: transport, bus, slow path, clock and recorder are handed in.
+The agent owns no thread, socket or sleep and has no branch for simulation: transport, bus, command executor, clock and
+recorder are passed in. Everything it does, it does inside the tick.
 """
 
 from __future__ import annotations
@@ -63,13 +64,26 @@ from swarmctl.mavlink.vehicle_setup import Upkeep
 _NO_TIME_US = -1
 # modes in which the vehicle does not follow its committed trajectory
 _DEVIATING_MODES = (Mode.BRAKE, Mode.HOLD, Mode.LAND, Mode.PILOT_OVERRIDE, Mode.STATE_STALE)
-_START_ALERT_DELAY_US = 3_000_000  # for take-off, before it says for what
-_RESTORE_TIMEOUT_US = 5_000_000  # for parameters to be set back before the process ends
-_AUTOPILOT_HOVER_MODES = (FlightMode.HOLD, FlightMode.EXTERNAL)  # in the latter while it takes off by itself
+_START_ALERT_DELAY_US = 3_000_000  # time on the ground after which the unmet condition is raised as an alert
+_RESTORE_TIMEOUT_US = 5_000_000  # longest wait for parameters to be restored before the process ends
+_AUTOPILOT_HOVER_MODES = (FlightMode.HOLD, FlightMode.EXTERNAL)  # ArduCopter takes off by itself in the latter
 
 
 class Agent:
-    """See the module. `stopwatch_ns` only measures the tick; it never influences it."""
+    """One agent beside one autopilot.
+
+    Args:
+        setup: parameters and place in the swarm.
+        autopilot: the vehicle's hot path: states in, setpoints out.
+        commands: executor of the slow path: arming, modes, parameters.
+        bus: connection to peers and operator.
+        clock: monotonic time and UTC [us].
+        sink: recorder of ticks and events.
+        stopwatch_ns: measures the tick and never influences it.
+
+    Attributes:
+        timing: durations of the last tick.
+    """
 
     def __init__(
         self,
@@ -114,9 +128,9 @@ class Agent:
             clock,
             sink,
         )
-        self.timing = TickTiming(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # of the last tick
+        self.timing = TickTiming(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
         self._promise_ns = 0  # of the last tick
-        self._gaps = self._jumps = 0  # of setpoints and of the estimate, as far as they have been told
+        self._gaps = self._jumps = 0  # setpoint gaps and estimate jumps already reported
         self._announced: tuple[Phase, Mode, FlightMode] | None = None
         self._alerts = Alerts()
         self._accuracy = AccuracyMonitor()
@@ -128,29 +142,29 @@ class Agent:
 
     @property
     def done(self) -> bool:
-        """Landed, disarmed, and its parameters as they were."""
+        """Whether the mission has ended and the autopilot's parameters are restored, or the wait for it timed out."""
         if self._done_us is None:
             return False
         return self._upkeep.restored or self._clock.now_us() - self._done_us > _RESTORE_TIMEOUT_US
 
     @property
     def finished(self) -> bool:
-        """Done, and so is every peer that is still there."""
+        """Whether this agent and every peer still on the bus are done."""
         return self.done and all(p.phase is Phase.DONE or not p.alive for p in self._world_model.peers().values())
 
     @property
     def outcome(self) -> str:
-        """ "completed", or why not."""
+        """ "completed", or the reason why the mission was not."""
         return self._state_machine.outcome or "stopped before the mission began"
 
     @property
     def has_armed(self) -> bool:
-        """Whether the autopilot has been asked to arm: before that a mission that ends could not start."""
+        """Whether arming has been requested; a mission that ends before that counts as one that could not start."""
         return self._state_machine.arming.requested
 
     @property
     def rejected(self) -> dict[str, int]:
-        """Bus messages refused so far, by reason."""
+        """Number of bus messages refused so far, by reason."""
         return dict(self._world_model.refusals.by_reason)
 
     @property
@@ -160,12 +174,20 @@ class Agent:
         return None if counts is None else counts.withdrawn + counts.expired
 
     def ask(self, verb: str, now_us: int) -> None:
-        """An operator's wish: hold, resume, land, rtl."""
+        """Apply an operator's command: hold, resume, land or rtl."""
         self._state_machine.operator(verb, now_us, self._clock.utc_us(), self._autopilot.poll(now_us))
         self._note("operator", verb=verb)
 
     def tick(self, now_us: int, deadline_misses: int) -> TickRecord:
-        """One control step at monotonic time `now_us`, with the deadlines missed so far."""
+        """Run one control step at monotonic time `now_us`.
+
+        Args:
+            now_us: monotonic time of the step.
+            deadline_misses: deadlines missed since the start, skipped ticks included.
+
+        Returns:
+            the record of the tick, already handed to the sink.
+        """
         began_ns = self._stopwatch_ns()
         self._watch_deadlines(now_us, deadline_misses)
         self._listen(now_us)
@@ -216,7 +238,7 @@ class Agent:
         if level is not before:
             self._note("overload", level=level.name, missed_01=round(self._overload.missed_01, 3))
 
-    # -- listen, sense ------------------------------------------------------------------------------------------------
+    # -- receive, sense -----------------------------------------------------------------------------------------------
 
     def _listen(self, now_us: int) -> None:
         for verb in self._world_model.listen(self._clock.utc_us()):
@@ -251,12 +273,12 @@ class Agent:
             self._observer.learn_hover(self._autopilot.hover_thrust_01 * float(body_z_ned(state.q_nb)[2]))
         return state
 
-    # -- think --------------------------------------------------------------------------------------------------------
+    # -- plan ---------------------------------------------------------------------------------------------------------
 
     def _plan(self, now_us: int, state: VehicleState | None) -> PlanningResult:
         self._promise_ns = 0
         if state is None or not self._fresh(now_us, state):
-            if self._coordination is not None:  # the autopilot flies it, blindly or by its failsafe
+            if self._coordination is not None:  # the autopilot flies the vehicle, on stale setpoints or by its failsafe
                 self._coordination.idle(self._clock.utc_us(), state)
             return PlanningResult(None, None, None, [])
         estimate = self._observer.estimate
@@ -313,12 +335,12 @@ class Agent:
         if deadlock is not None:
             self._alerts.put("deadlock", f"deadlocked by {deadlock.names}", now_us)
 
-    # -- judge, act ---------------------------------------------------------------------------------------------------
+    # -- decide the mode, send ----------------------------------------------------------------------------------------
 
     def _decide(self, now_us: int, state: VehicleState | None, planning: PlanningResult) -> None:
         plan = planning.plan
         if plan is None:
-            self._certified_us = now_us  # none was asked for
+            self._certified_us = now_us  # no plan was needed in this tick, so its absence is no failure
         if plan is not None:
             assert planning.start is not None
             self._plan_buffer.take(
@@ -355,7 +377,7 @@ class Agent:
         )
 
     def _flown(self, state: VehicleState | None, planning: PlanningResult) -> Plan | None:
-        """The plan whose first input is sent and whose path is shared; None when the autopilot flies."""
+        """Return the plan whose input is sent and whose path is published; None when the autopilot flies."""
         mode = self._decision.mode
         if mode is not Mode.HOLD:
             self._hold_at = None
@@ -441,7 +463,7 @@ class Agent:
             self._alerts.put("start", f"waits for {waits_for}", now_us)
 
     def _restore_parameters(self, now_us: int) -> None:
-        """Once the mission has ended: set the autopilot's parameters back, and say which of them could not be."""
+        """After the mission, restore the autopilot's parameters and report those that could not be restored."""
         if not self._state_machine.finished:
             return
         if self._done_us is None:
@@ -452,14 +474,14 @@ class Agent:
             self._note("parameters_left_changed", were=left)
 
     def _unsettled(self, now_us: int) -> str:
-        """Why nothing may be armed yet: the estimator settles, or is too inaccurate for the distances asked for."""
+        """Return why arming must wait: the estimator still settles, or is too inaccurate for the separation; or ""."""
         if len(self._setup.starts_ned_m) == 1 or self._state_machine.phase > Phase.STANDBY:
             return ""
         self._accuracy.update(now_us, self._autopilot.pos_accuracy_m)
-        accuracy_m = self._accuracy.worst_m or 0.0  # not told: body and tracking are left to judge by
+        accuracy_m = self._accuracy.worst_m or 0.0  # if not reported, only body size and tracking error are checked
         return self._accuracy.unsettled(now_us) or radius_problem(self._setup.separation, accuracy_m)
 
-    # -- share, record ------------------------------------------------------------------------------------------------
+    # -- publish, record ----------------------------------------------------------------------------------------------
 
     def _share(self, state: VehicleState | None, flown: Plan | None) -> None:
         if state is not None:
@@ -483,7 +505,7 @@ class Agent:
         return now_us - state.t_us <= self._setup.params.failsafe.state_max_age_s * 1e6
 
     def _utc(self, t_us: int) -> int:
-        """UTC of a monotonic time of this process."""
+        """Convert monotonic time of this process to UTC [us]."""
         return self._clock.utc_us() + t_us - self._clock.now_us()
 
     def _note(self, name: str, **fields: Any) -> None:

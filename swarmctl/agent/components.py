@@ -1,4 +1,4 @@
-"""What an agent is made of, put together from what it is told."""
+"""Factories for the components of an agent, each built from `AgentSetup`."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from swarmctl.control.phases.state_machine import MissionStateMachine
 from swarmctl.control.reference.mission import MissionReference
 
 Note = Callable[..., None]
-Stopwatch = Callable[[], int]  # [ns]
+Stopwatch = Callable[[], int]  # returns a running time [ns]
 
 
 def make_controllers(setup: AgentSetup, stopwatch_ns: Stopwatch) -> tuple[Controller, Controller]:
-    """Of the mission, and of the ways there and back."""
+    """Return the controller for the mission and the one for the transits to the start and to the landing place."""
     params, rest = (
         setup.controller,
         (setup.vehicle_model, setup.separation, setup.agent, setup.max_keep_outs, stopwatch_ns),
@@ -31,13 +31,13 @@ def make_controllers(setup: AgentSetup, stopwatch_ns: Stopwatch) -> tuple[Contro
     mission = make_controller(params, *rest)
     if params.kind != "open_loop":
         return mission, mission
-    return mission, make_controller(params.model_copy(update={"kind": "dmpc"}), *rest)  # the other can't go anywhere
+    return mission, make_controller(params.model_copy(update={"kind": "dmpc"}), *rest)  # open loop ignores references
 
 
 def make_coordination(
     setup: AgentSetup, world_model: WorldModel, bus: Bus, note: Note, stopwatch_ns: Stopwatch
 ) -> Coordination | None:
-    """None unless separation is guaranteed."""
+    """Return the coordination protocol; None unless separation is guaranteed."""
     if not setup.promises:
         return None
     return Coordination(
@@ -57,7 +57,7 @@ def make_coordination(
 
 
 def make_estimator(setup: AgentSetup) -> DisturbanceObserver | StateFilter:
-    """Of state and disturbance, as configured."""
+    """Return the estimator of state and disturbance that the configuration asks for."""
     params, model = setup.params, setup.vehicle_model
     if params.state_filter.enabled:
         return StateFilter(params.state_filter, params.disturbance, model)
@@ -72,7 +72,7 @@ def make_last_layer(setup: AgentSetup, world_model: WorldModel, note: Note, stop
 
 
 def make_state_machine(setup: AgentSetup) -> MissionStateMachine:
-    """Of its mission."""
+    """Return the state machine of the agent's mission."""
     reference = MissionReference(setup.mission, setup.starts_ned_m, setup.agent, setup.separation.planned_m)
     return MissionStateMachine(
         setup.params.state_machine,

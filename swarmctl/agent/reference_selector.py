@@ -1,4 +1,4 @@
-"""What an agent would like: to be where its mission has it, or on a way round what it is deadlocked by."""
+"""Selects the reference an agent follows: its mission's, or a detour around what it is deadlocked by."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from swarmctl.core.types import Array, Obstacle, Reference, Sampled
 
 
 class ReferenceSelector:
-    """See the module.
+    """Chooses between the mission's reference and a detour, and reports deadlocks.
 
     Args:
-        setup: of the agent.
-        state_machine: knows the mission's reference.
-        note: is reported `deadlock`, when one begins and when it is over.
+        setup: parameters of the agent.
+        state_machine: source of the mission's reference.
+        note: receives the event `deadlock` when one begins and when it ends.
     """
 
     def __init__(self, setup: AgentSetup, state_machine: MissionStateMachine, note: Callable[..., None]) -> None:
@@ -37,17 +37,24 @@ class ReferenceSelector:
         known: Sequence[KeepOut],
         landmarks: Callable[[], Sequence[Obstacle]],
     ) -> Deadlock | None:
-        """Whether the agent, at (3,), gets on among what is known; returns a deadlock that begins."""
+        """Check progress and plan a detour if there is none; returns a deadlock only in the tick it begins.
+
+        Args:
+            now_us, utc_us: monotonic time and UTC.
+            pos_ned_m: own position (3,).
+            known: regions to keep out of.
+            landmarks: returns the obstacles seen so far, which a detour leads around.
+        """
         self._detour.step(now_us, pos_ned_m, self._mission(now_us, utc_us), known, landmarks)
         return self._report(now_us)
 
     def reset(self, now_us: int) -> None:
-        """Somebody else flies."""
+        """Forget progress and detour: the agent does not control the vehicle."""
         self._detour.reset()
         self._report(now_us)
 
     def reference(self, now_us: int, utc_us: int, ahead_s: Array) -> tuple[Reference, Reference]:
-        """At times (N,) from now, (N, 3) each; and the mission's, now."""
+        """Return the reference at times `ahead_s` (N,) from now, (N, 3) each, and the mission's own one now, (1, 3)."""
         pos, vel = self._state_machine.reference(utc_us, now_us, np.concatenate([[0.0], ahead_s]))
         now_ref = Reference(pos[:1], vel[:1], self._yaw_rad)
         if self._detour.active:
@@ -55,7 +62,7 @@ class ReferenceSelector:
         return Reference(pos[1:], vel[1:], self._yaw_rad), now_ref
 
     def wish(self, now_us: int, utc_us: int) -> Wish:
-        """The same, for whoever plans on another grid."""
+        """Return the same reference as a function of time, for a planner with another time grid."""
         if self._detour.active:
             return Wish(self._detour.sample, is_way=True)
         return Wish(self._mission(now_us, utc_us))

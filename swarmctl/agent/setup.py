@@ -1,4 +1,4 @@
-"""What one agent is told before it starts: its parameters, its place in the swarm, its vehicle."""
+"""Parameters of one agent, its place in the swarm and the model of its vehicle."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from swarmctl.core.types import Array
 
 
 class AgentParams(Params):
-    """Everything of an agent that is neither controller nor vehicle."""
+    """Parameters of an agent that belong neither to the controller nor to the vehicle model."""
 
     rate_hz: float = Field(50.0, ge=10, le=200)
     connect_timeout_s: float = Field(15.0, gt=0, le=600)
@@ -35,14 +35,14 @@ class AgentParams(Params):
     barrier: BarrierParams = BarrierParams()
     commit: CommitParams = CommitParams()
     detour: DetourParams = DetourParams()
-    autopilot_params: dict[str, int | float] = Field(  # PX4: land when setpoints stop, before it has flown far blindly
+    autopilot_params: dict[str, int | float] = Field(  # PX4: land 0.5 s after setpoints stop, before it has drifted far
         {"COM_OBL_RC_ACT": 4, "COM_OF_LOSS_T": 0.5}
     )
 
 
 @dataclass(frozen=True, slots=True)
 class AgentSetup:
-    """What one agent is told before it starts."""
+    """Everything one agent needs before it starts."""
 
     agent: int
     boot_id: int
@@ -57,15 +57,15 @@ class AgentSetup:
 
     @property
     def peers(self) -> list[int]:
-        """Indices of the others."""
+        """Indices of the other agents."""
         return [i for i in range(len(self.starts_ned_m)) if i != self.agent]
 
     @property
     def max_keep_outs(self) -> int:
-        """How many neighbours and obstacles get rows in a problem."""
+        """Largest number of neighbours and obstacles that get constraint rows in one MPC problem."""
         return min(len(self.peers), self.separation.max_neighbours) + self.max_obstacles
 
     @property
     def promises(self) -> bool:
-        """Whether only what has been promised is flown."""
+        """Whether the agent flies only trajectories it has committed to."""
         return self.separation.mode == "guaranteed"

@@ -1,4 +1,4 @@
-"""What one tick leaves behind: its record for the recorder and the viewer, and a status for peers and people."""
+"""Publishes the results of a tick: the record for recorder and viewer, the status for peers and operators."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ _NO_PLAN = np.empty((0, 3))
 
 
 class TickSink(Protocol):
-    """Where records go; never blocks."""
+    """Destination of records and events; its methods never block."""
 
     def tick(self, record: TickRecord) -> None: ...
 
@@ -45,17 +45,17 @@ class TickSink(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class PlanningResult:
-    """What a tick has worked out; all but `keep_outs` None while the own state is too old."""
+    """Result of the planning part of a tick; all but `keep_outs` is None while the own state is stale."""
 
     start: Start | None
-    plan: Plan | None  # None as well while the autopilot flies
-    reference: Reference | None  # now, one point
+    plan: Plan | None  # also None while the autopilot flies
+    reference: Reference | None  # the mission's reference now, one point
     keep_outs: list[KeepOut]
 
 
 @dataclass(frozen=True, slots=True)
 class ControlOutput:
-    """What a tick has done."""
+    """Output of a tick: mode, flown plan and setpoint sent."""
 
     mode: Mode
     flown: Plan | None
@@ -65,33 +65,33 @@ class ControlOutput:
 
 @dataclass(frozen=True, slots=True)
 class TickTiming:
-    """How long the parts of a tick took [ms]."""
+    """Durations of the parts of a tick [ms]."""
 
-    sense_ms: float  # listen included
+    sense_ms: float  # receiving included
     setup_ms: float  # prediction, reference, keep-outs, matrices
     promise_ms: float  # hearing, judging and planning promises; 0 in best effort
     spaces_ms: float  # half-spaces
     solve_ms: float  # inside the QP solver
     certify_ms: float
     barrier_ms: float  # the last layer
-    send_ms: float  # judging included
+    send_ms: float  # failsafe decision included
 
     @property
     def tick_ms(self) -> float:
-        """Listen to send."""
+        """Duration from receiving to sending the setpoint."""
         planned_ms = self.setup_ms + self.spaces_ms + self.solve_ms + self.certify_ms
         return self.sense_ms + self.promise_ms + planned_ms + self.barrier_ms + self.send_ms
 
 
 class TelemetryPublisher:
-    """Counts ticks, writes their records and says the agent's status five times a second.
+    """Counts ticks, records them and publishes the agent's status five times a second.
 
     Args:
-        agent, boot_id, sysid: who reports.
-        promises: it flies only what it has promised.
-        autopilot: the vehicle, for what it says of itself.
-        paths: what is known of peers.
-        bus, clock, sink: where it goes.
+        agent, boot_id, sysid: identity in the messages.
+        promises: whether the agent flies only trajectories it has committed to.
+        autopilot: source of the vehicle's reported modes.
+        paths: newest paths of peers.
+        bus, clock, sink: where messages go, their stamps, where records go.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class TelemetryPublisher:
         deadline_misses: int,
         timing: TickTiming,
     ) -> TickRecord:
-        """Record and publish one tick; the setpoint has left already."""
+        """Record and publish one tick; the setpoint has been sent before."""
         self.seq += 1
         record = self._record(now_us, state, planning, output, state_machine, estimate, deadline_misses, timing)
         self._recent_ms.append(timing.tick_ms)
@@ -186,9 +186,9 @@ class TelemetryPublisher:
         )
 
     def _distances(self, planning: PlanningResult, utc_us: int) -> tuple[list[float], list[float], float]:
-        """Distances to peers and to visible obstacles [m] when the setpoint acts; age of the oldest newest path [ms].
+        """Return distances to peers and visible obstacles [m] when the setpoint acts, and the largest staleness [ms].
 
-        A path begins when its sender's setpoint acts, so its age counts from there to when ours does.
+        A path begins when its sender's setpoint acts, so its staleness counts from there to when our setpoint acts.
         """
         if planning.start is None:
             return [], [], math.nan
@@ -225,5 +225,5 @@ class TelemetryPublisher:
 
 
 def _finite(value: float) -> float:
-    """JSON has no infinity: -1 says there is none."""
+    """Return the value, or -1 in place of NaN and infinity, which JSON lacks."""
     return value if math.isfinite(value) else -1.0

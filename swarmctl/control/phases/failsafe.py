@@ -1,6 +1,7 @@
-"""Health -> Mode: one table, first matching row wins. Pure; the only state is passed in.
+"""Maps `Health` to `Mode` by one table whose first matching row applies. Pure; all state is passed in.
 
-The ladder after a bad plan: fly the shifted last certified plan while it is young -> brake -> hold -> land.
+After a plan that must not be flown the modes are, in order: replay the shifted last certified plan while it is recent,
+brake, hold, land.
 """
 
 from __future__ import annotations
@@ -15,17 +16,17 @@ from swarmctl.core.types import FlightMode, Health, Mode, Phase, PlanStatus
 
 
 class FailsafeParams(Params):
-    """How long what is trusted."""
+    """Time limits and thresholds of the failsafe."""
 
-    state_max_age_s: float = Field(0.2, gt=0, le=5)
-    replay_s: float = Field(0.4, ge=0, le=5)  # how long an old certified plan is flown
-    hold_s: float = Field(5.0, ge=0, le=600)  # at rest without a plan, then land
-    rest_speed_m_s: float = Field(0.2, gt=0, le=5)
+    state_max_age_s: float = Field(0.2, gt=0, le=5)  # an older vehicle state is stale
+    replay_s: float = Field(0.4, ge=0, le=5)  # longest replay of the last certified plan
+    hold_s: float = Field(5.0, ge=0, le=600)  # longest hold without a plan; then land
+    rest_speed_m_s: float = Field(0.2, gt=0, le=5)  # a faster vehicle brakes before it holds
 
 
 @dataclass(frozen=True, slots=True)
 class FailsafeDecision:
-    """A mode and why."""
+    """The mode of a tick and the reason for it."""
 
     mode: Mode
     reason: str
@@ -35,7 +36,7 @@ _FLYING = (Phase.GOTO_START, Phase.READY, Phase.TRACK, Phase.GOTO_LAND)
 
 
 def decide(health: Health, params: FailsafeParams) -> FailsafeDecision:
-    """Mode of this tick: that of the first row of the table that applies to `health`."""
+    """Return the mode of this tick: that of the first row of the table that applies to `health`."""
     for applies, mode, reason in _TABLE:
         if applies(health, params):
             return FailsafeDecision(mode, reason)
