@@ -137,7 +137,7 @@ class WorldModel:
             pos_ned_m: own position (3,), which decides which obstacles are visible.
             t0_utc_us: UTC of the first point.
             dt_us, steps: time grid of the plan.
-            phase: own phase; while landing, margins of peers on the ground differ.
+            phase: own phase; in GOTO_LAND peers are kept clear of at every height.
             without: peers to leave out, because their committed trajectories are known.
         """
         paths = [path for path in self.paths.latest() if path.agent not in without]
@@ -176,9 +176,15 @@ class WorldModel:
         return [o for o in self._seen.values() if not o.vel_ned_m_s.any()]
 
     def bodies(self, pos_ned_m: Array, act_utc_us: int, ahead_s: float, margin_m: float) -> list[Body]:
-        """What not to touch, `ahead_s` after `act_utc_us`: peers heard of and obstacles seen from `pos_ned_m` (3,).
+        """Return the bodies not to touch `ahead_s` after `act_utc_us`: peers, and obstacles visible from `pos_ned_m`.
 
-        Who promises is where it has promised to be, however old the message.
+        A peer that has committed to trajectories is placed on them, however old its message; others on their path.
+
+        Args:
+            pos_ned_m: own position (3,).
+            act_utc_us: UTC at which the setpoint acts.
+            ahead_s: time from then to the instant the bodies are valid for.
+            margin_m: distance added to the size of every body.
         """
         p, fresh_us = self._params, act_utc_us - round(self._params.lost_after_s * 1e6)
         found: list[Body] = []

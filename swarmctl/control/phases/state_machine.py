@@ -1,11 +1,11 @@
-"""The mission of one agent, phase by phase: what is asked of the autopilot and which reference is followed.
+"""State machine of one agent's mission: the requests to the autopilot and the reference to follow in each phase.
 
-Pure. Agents agree on the beginning without a leader: each says when it was ready, and all begin one second after the
-last one. What the operator asks (hold, resume, land, rtl) is applied here too. A vehicle that was found in the air is
-handed back in the air, holding.
+Pure. Agents agree on the start of the mission without a leader: each publishes when it became ready, and all start one
+second after the latest of these times. The operator's commands (hold, resume, land, rtl) are applied here too. A
+vehicle found in the air at start-up is handed back in the air, in the autopilot's hold.
 
-Autopilots know nothing of each other: before one takes over, the agent comes to rest and makes room under its own plan.
-Only without a plan does the autopilot land from where it is.
+Autopilots do not know each other. Before one takes over, the agent therefore comes to rest and moves away from others
+under its own plan. Only without a plan does the autopilot land the vehicle from where it is.
 """
 
 from __future__ import annotations
@@ -24,14 +24,14 @@ from swarmctl.control.reference.mission import MissionReference, QuinticTrajecto
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Command, FlightMode, Landed, Mode, Phase, VehicleState, Verb
 
-_REQUEST_PERIOD_US = 1_000_000
-_SPIN_UP_US = 6_000_000  # ArduCopter's rotors spin up for over 3 s, and it refuses to be asked again meanwhile
-_SETTLE_S = 2.0
-_BEGIN_DELAY_US = 1_000_000
+_REQUEST_PERIOD_US = 1_000_000  # time between repetitions of a request
+_SPIN_UP_US = 6_000_000  # ArduCopter's rotors spin up for over 3 s, during which it refuses a second TAKEOFF
+_SETTLE_S = 2.0  # time after a stop trajectory in which the vehicle comes to rest
+_BEGIN_DELAY_US = 1_000_000  # from the last agent's readiness to mission time 0, longer than any message takes
 _HOVER_LEARNING_US = 1_000_000  # hover flown by the autopilot itself, during which its hover thrust is learned
-_ROOM_MARGIN_M = 0.1  # gone farther than has to be, so that it is reached
+_ROOM_MARGIN_M = 0.1  # the target lies beyond the required distance, because it is reached with a tolerance
 _PLAN_MODES = (Mode.TRACKING, Mode.REPLAY)
-_OWN_MODES = (FlightMode.HOLD, FlightMode.TAKEOFF, FlightMode.EXTERNAL)  # modes nobody but us has asked for
+_OWN_MODES = (FlightMode.HOLD, FlightMode.TAKEOFF, FlightMode.EXTERNAL)  # modes that follow from our own requests
 OPERATOR_STOP = "stopped by the operator"
 TAKEN_OVER = "pilot or autopilot took over"
 REBOOTED = "the autopilot rebooted"
@@ -39,31 +39,42 @@ OVERLOADED = "overload: deadlines were missed for too long"
 
 
 class StateMachineParams(Params):
-    """Speeds of the way there and back, and patience."""
+    """Speeds of the transits to the start and to the landing place, tolerances and timeouts."""
 
-    speed_m_s: float = Field(2.0, gt=0, le=20)
-    accel_m_s2: float = Field(1.2, gt=0, le=20)
-    state_rate_hz: float = Field(100.0, ge=20, le=250)
-    arrive_m: float = Field(0.15, gt=0, le=5)
-    arrive_m_s: float = Field(0.15, gt=0, le=5)
-    land_m: float = Field(0.06, gt=0, le=5)  # what is missed here, and drifted, is missing between landing places
-    land_m_s: float = Field(0.06, gt=0, le=5)
+    speed_m_s: float = Field(2.0, gt=0, le=20)  # peak speed of a transit
+    accel_m_s2: float = Field(1.2, gt=0, le=20)  # peak acceleration of a transit, and of stops
+    state_rate_hz: float = Field(100.0, ge=20, le=250)  # rate requested for position and attitude
+    arrive_m: float = Field(0.15, gt=0, le=5)  # tolerance of the start position
+    arrive_m_s: float = Field(0.15, gt=0, le=5)  # largest speed of a vehicle at rest
+    land_m: float = Field(0.06, gt=0, le=5)  # tolerance of the landing place; reduces the gap to neighbouring places
+    land_m_s: float = Field(0.06, gt=0, le=5)  # largest speed above the landing place
     start_timeout_s: float = Field(90.0, gt=0, le=3600)  # from process start to TRACK
-    land_timeout_s: float = Field(20.0, gt=0, le=600)  # for reaching the landing place; then land where it is
-    apart_m: float = Field(0.2, ge=0, le=20)  # beyond separation.radius_m, between who lands where it is and others
+    land_timeout_s: float = Field(20.0, gt=0, le=600)  # to reach the landing place; then land in place
+    apart_m: float = Field(0.2, ge=0, le=20)  # beyond separation.radius_m, around an agent that lands in place
 
 
 class MissionStateMachine:
-    """Phases of one agent.
+    """Moves one agent through the phases of its mission.
 
     Args:
-        params: speeds and patience.
-        agent: own index.
-        peers: how many others take part.
-        radius_m: distance that agents keep.
-        start_ned_m: (3,) own start, also the landing place.
-        duration_s: of the tracked mission.
-        reference: of the tracked mission.
+        params: speeds, tolerances and timeouts.
+        agent: index of this agent.
+        peers: number of the other agents.
+        radius_m: separation that agents keep.
+        start_ned_m: (3,) start position, also the landing place.
+        duration_s: duration of the tracked mission.
+        reference: reference of the tracked mission.
+
+    Attributes:
+        phase: current phase.
+        ready_utc_us: UTC at which the start position was reached, 0 before.
+        begin_utc_us: UTC of mission time 0, None until all are ready.
+        outcome: "completed", or why the mission was not; "" while it is under way.
+        waits_for: unmet condition that keeps the vehicle on the ground, or "".
+        had_control: the autopilot follows our setpoints and control has not been given back.
+        held: the operator has asked to hold.
+        paused: the agent rests because the bus is lost or its processor is overloaded.
+        pilot_override: pilot or autopilot took over; lasts until an operator resumes.
     """
 
     def __init__(
@@ -81,17 +92,17 @@ class MissionStateMachine:
         self._start_ned_m, self._duration_us, self._reference = start_ned_m, round(duration_s * 1e6), reference
         self.phase = Phase.CONNECT
         self.ready_utc_us = 0
-        self.begin_utc_us: int | None = None  # mission time 0
+        self.begin_utc_us: int | None = None
         self.outcome = ""
-        self.waits_for = ""  # what keeps it on the ground
+        self.waits_for = ""
         self.arming = ArmingEvidence()
-        self._stop_verb = ""  # land or rtl, from when it is asked for until it is under way
+        self._stop_verb = ""  # land or rtl, from the command until the stop begins
         self.had_control = False
-        self.held = False  # by the operator
-        self.paused = False  # for mute peers, or for its processor
-        self._destination_ned_m = start_ned_m  # before it had to wait
-        self._trajectory: tuple[QuinticTrajectory, int] | None = None  # and when it began
-        self._rejoin_offset: tuple[QuinticTrajectory, int] | None = None  # of the offset to the mission
+        self.held = False
+        self.paused = False
+        self._destination_ned_m = start_ned_m  # end of the transit that a pause interrupts
+        self._trajectory: tuple[QuinticTrajectory, int] | None = None  # transit or stop, and its start time
+        self._rejoin_offset: tuple[QuinticTrajectory, int] | None = None  # decaying offset to the mission's reference
         self._entered_us = 0
         self._first_tick_us: int | None = None
         self._requested_us = -_REQUEST_PERIOD_US
@@ -100,10 +111,10 @@ class MissionStateMachine:
         self._ground_z_m = 0.0
         self._hovering_us: int | None = None
         self._airborne = False
-        self._may_take_control = False  # by an operator's resume, to take control from whoever has it
+        self._may_take_control = False  # an operator's resume permits taking control from any mode
         self._landing_seen = False
-        self._lands_in_place = False  # where it comes to rest, instead of on the start
-        self._outcome_before = ""  # it yielded
+        self._lands_in_place = False  # lands where it came to rest instead of at the start position
+        self._outcome_before = ""  # outcome before the override, restored by resume
         self._steps: dict[Phase, Callable[[PhaseInputs, VehicleState], list[Command]]] = {
             Phase.STANDBY: self._standby,
             Phase.ARM: self._arm,
@@ -120,7 +131,7 @@ class MissionStateMachine:
         return self.phase is Phase.DONE
 
     def step(self, inputs: PhaseInputs) -> list[Command]:
-        """Advance by what is true now; returns what to ask of the autopilot."""
+        """Advance by one tick; returns the requests to the autopilot."""
         self._first_tick_us = inputs.now_us if self._first_tick_us is None else self._first_tick_us
         self.arming.update(inputs)
         state = inputs.state
@@ -131,7 +142,7 @@ class MissionStateMachine:
         if state is None:
             return []
         self._apply_stop(inputs.now_us, state)
-        if self.phase is Phase.CONNECT and inputs.prepared:  # not before: peers arm when everybody stands by
+        if self.phase is Phase.CONNECT and inputs.prepared:  # peers arm as soon as all agents stand by
             self._enter(Phase.STANDBY, inputs.now_us)
             return self._refuse(inputs.refusal, inputs) if inputs.refusal else []
         if inputs.mode is Mode.PILOT_OVERRIDE and not self.pilot_override:
@@ -155,7 +166,7 @@ class MissionStateMachine:
         return handler(inputs, state) if handler else []
 
     def reference(self, utc_us: int, now_us: int, offsets_s: Array) -> tuple[Array, Array]:
-        """Where to be, (K, 3) and (K, 3), at `offsets_s` (K,) from now."""
+        """Return reference positions and velocities, (K, 3) each, NED, at `offsets_s` (K,) from now."""
         if self.phase is Phase.TRACK and not (self.held or self.paused) and self.begin_utc_us is not None:
             pos, vel = self._reference.sample((utc_us - self.begin_utc_us) * 1e-6 + offsets_s)
             if self._rejoin_offset is not None:
@@ -169,21 +180,21 @@ class MissionStateMachine:
         return np.tile(self._start_ned_m, (len(offsets_s), 1)), np.zeros((len(offsets_s), 3))
 
     def begin_if_due(self, now_us: int, utc_us: int) -> None:
-        """Enter the mission on time: before a tick thinks, so that its first plan is the mission's already."""
+        """Enter TRACK on time. Called before planning, so that the first plan of the mission follows its reference."""
         if self.phase is Phase.READY and self.begin_utc_us is not None and utc_us >= self.begin_utc_us:
             self.phase = Phase.TRACK
             self._entered_us, self._requested_us = now_us, now_us - _REQUEST_PERIOD_US
 
     def mission_t_s(self, utc_us: int) -> float:
-        """Mission time while tracking, else NaN."""
+        """Return the mission time [s] while tracking, else NaN."""
         if self.phase is not Phase.TRACK or self.begin_utc_us is None:
             return math.nan
         return (utc_us - self.begin_utc_us) * 1e-6
 
     def operator(self, verb: str, now_us: int, utc_us: int, state: VehicleState | None) -> None:
-        """Apply hold, resume, land or rtl.
+        """Apply an operator's command: hold, resume, land or rtl.
 
-        A stop (land, rtl) is kept until there is a vehicle state to begin it with: it is lost in no phase.
+        A stop (land, rtl) is kept until a vehicle state is known to begin it from, so it is lost in no phase.
         """
         if verb in ("land", "rtl"):
             self._stop_verb = verb
@@ -206,13 +217,13 @@ class MissionStateMachine:
         self.outcome = why
 
     def _apply_stop(self, now_us: int, state: VehicleState) -> None:
-        """Begin the stop that has been asked for, if it is not under way."""
+        """Begin the stop that has been commanded, unless it is under way."""
         verb, self._stop_verb = self._stop_verb, ""
         if not verb or self.phase >= Phase.LAND:
             return
         self.outcome = self.outcome or OPERATOR_STOP
         if self.phase < Phase.GOTO_START or self.pilot_override:
-            self._enter(Phase.LAND, now_us)  # which is done at once where the vehicle is known to be disarmed
+            self._enter(Phase.LAND, now_us)  # ends at once if the vehicle is known to be disarmed
         elif self.phase < Phase.GOTO_LAND and verb == "rtl":
             self._lands_in_place = False
             self._go_home(now_us, state)
@@ -220,11 +231,11 @@ class MissionStateMachine:
             self._stop_in_place(now_us, state)
 
     def _is_down(self, inputs: PhaseInputs, state: VehicleState) -> bool:
-        """Whether the vehicle is on the ground and known to be disarmed."""
+        """Return whether the vehicle is on the ground and known to be disarmed."""
         return state.landed is Landed.ON_GROUND and self.arming.is_disarmed(inputs, state)
 
     def _pause(self, inputs: PhaseInputs, state: VehicleState) -> None:
-        """Who loses the bus comes to rest: then what peers assume (braking) holds. So does who misses its deadlines."""
+        """Come to rest while the bus is lost, because peers then assume braking, and while deadlines are missed."""
         flying = self.had_control and Phase.GOTO_START <= self.phase <= Phase.GOTO_LAND
         must_wait = inputs.bus_lost or inputs.overload >= Level.HOLD
         if must_wait and flying and not self.paused:
@@ -241,7 +252,7 @@ class MissionStateMachine:
                 self._rejoin_mission(inputs.now_us, inputs.utc_us, state)
 
     def _rejoin_mission(self, now_us: int, utc_us: int, state: VehicleState) -> None:
-        """Close in smoothly on the mission's reference, which has moved on: a jump would have all race to one point."""
+        """Rejoin the mission's moving reference along a quintic offset: after a jump all agents would rush together."""
         if self.phase is not Phase.TRACK or self.begin_utc_us is None:
             return
         pos, vel = self._reference.sample(np.array([(utc_us - self.begin_utc_us) * 1e-6]))
@@ -252,7 +263,7 @@ class MissionStateMachine:
         return brake_to_rest(state.pos_ned_m, state.vel_ned_m_s, self._params.accel_m_s2)
 
     def _standby(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
-        if not inputs.prepared:  # any more: it has rebooted
+        if not inputs.prepared:  # the autopilot has rebooted since CONNECT
             self.waits_for = "the link to be set up again after a reboot of the autopilot"
             return []
         if inputs.refusal:
@@ -271,7 +282,7 @@ class MissionStateMachine:
         return []
 
     def _start_blocker(self, inputs: PhaseInputs, state: VehicleState) -> str:
-        """What has to be true before arming and is not, or ""."""
+        """Return the first condition for arming that is not met, or ""."""
         if state.landed not in (Landed.ON_GROUND, Landed.IN_AIR):
             return "the autopilot to tell whether it has landed"
         if not inputs.armable:
@@ -284,14 +295,14 @@ class MissionStateMachine:
         return "the autopilot's answers" if inputs.busy else ""
 
     def _refuse(self, why: str, inputs: PhaseInputs) -> list[Command]:
-        """Give up before take-off: nothing more will be armed, and what has been armed is disarmed."""
+        """Give up before take-off: nothing is armed any more, and a vehicle that has been armed is disarmed."""
         self.outcome = self.outcome or why
         self._enter(Phase.LAND if self.arming.requested else Phase.DONE, inputs.now_us)
         return []
 
     def _arm(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
         if state.armed and self._airborne and not self._may_take_control and _is_under_other_control(state):
-            self._override(TAKEN_OVER)  # before anything is streamed: one setpoint would take it
+            self._override(TAKEN_OVER)  # decided before the first setpoint, which would already take control
             return []
         if state.armed:
             self._enter(Phase.GOTO_START if self._airborne else Phase.TAKEOFF, inputs.now_us)
@@ -315,7 +326,7 @@ class MissionStateMachine:
         if hovers and learned:
             self._enter(Phase.GOTO_START, inputs.now_us)
             return []
-        if not state.armed:  # somebody, or the autopilot, thought better of it: never armed again
+        if not state.armed:  # pilot or autopilot disarmed it: it is not armed again
             self._give_up("disarmed before take-off", inputs, state)
             return []
         if (
@@ -341,9 +352,9 @@ class MissionStateMachine:
         return []
 
     def _request_control(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
-        """Control is taken from the autopilot's own hold; from anybody else only after an operator's `resume`.
+        """Request control from the autopilot's own hold; from any other mode only after an operator's `resume`.
 
-        Not even setpoints may flow meanwhile: PX4 returns to OFFBOARD by itself when they resume after a failsafe.
+        No setpoints may be sent meanwhile: PX4 returns to OFFBOARD by itself when they reappear after a failsafe.
         """
         if not self._may_take_control and _is_under_other_control(state):
             self._override(TAKEN_OVER)
@@ -402,7 +413,7 @@ class MissionStateMachine:
         if state.mode is FlightMode.LAND:
             self._landing_seen = True
             return []
-        ours = state.mode in _OWN_MODES and not self._landing_seen  # else a pilot flies, or broke the landing off
+        ours = state.mode in _OWN_MODES and not self._landing_seen  # else a pilot flies, or has aborted the landing
         if not ours and state.landed is not Landed.ON_GROUND:
             self._override(TAKEN_OVER)
             return []
@@ -416,7 +427,10 @@ class MissionStateMachine:
         return math.dist(state.pos_ned_m, target) < within_m and speed < slower_m_s
 
     def _may_land(self, inputs: PhaseInputs, state: VehicleState) -> bool:
-        """On the landing place; who lands where it is must be at rest, pushed aside as it may be, and to have room."""
+        """Return whether the autopilot may land the vehicle: it is at its landing place, or at rest with enough room.
+
+        A vehicle that lands in place and lacks room is sent to a free place first.
+        """
         if self._trajectory is None:
             return True
         trajectory, began_us = self._trajectory
@@ -431,7 +445,7 @@ class MissionStateMachine:
         return False
 
     def _has_room(self, inputs: PhaseInputs, state: VehicleState) -> bool:
-        """Whether an autopilot may take over among the others; without control nothing can be done about it."""
+        """Return whether peers are far enough for a landing; always true without control, which could not change it."""
         return not self.had_control or nearest_in_plane_m(state.pos_ned_m, inputs.others_ned_m) >= self._apart_m
 
     def _take_control(self, inputs: PhaseInputs, state: VehicleState) -> None:
@@ -461,7 +475,7 @@ class MissionStateMachine:
         self._enter(Phase.DONE if self._is_down(inputs, state) else Phase.LAND, inputs.now_us)
 
     def _stop_in_place(self, now_us: int, state: VehicleState) -> None:
-        """Brake and make room under the own plan, then hand over where that ends."""
+        """Brake and move away from others under the own plan, then let the autopilot land there."""
         trajectory = self._stop_trajectory(state)
         self._trajectory, self._destination_ned_m = (trajectory, now_us), trajectory.to_ned_m
         self._lands_in_place, self.held = True, False
@@ -480,5 +494,5 @@ class MissionStateMachine:
 
 
 def _is_under_other_control(state: VehicleState) -> bool:
-    """Whether a pilot, an operator or a failsafe has the vehicle."""
+    """Return whether a pilot, a ground station or a failsafe controls the vehicle."""
     return state.mode not in _OWN_MODES or state.failsafe
