@@ -244,17 +244,17 @@ def _judge_tracking(run: RunData, agents: int, steady_after_s: float) -> tuple[d
                 "steady_rmse_m": float(np.sqrt(np.mean(error.distance_m[steady] ** 2))) if steady.any() else None,
             }
         )
-    indices: tuple[float | None, float | None] = (None, None)
+    summed_m: tuple[float | None, float | None] = (None, None)
     if len(errors) == agents:
         first_s = max(error.mission_t_s[0] for error in errors.values())
         last_s = min(error.mission_t_s[-1] for error in errors.values())
         spans = [(first_s, last_s), (max(first_s, steady_after_s), last_s)]
-        indices = (_index_m(errors, *spans[0]), _index_m(errors, *spans[1]))
+        summed_m = (_summed_mean_error_m(errors, *spans[0]), _summed_mean_error_m(errors, *spans[1]))
     tracked_s = {agent: float(error.mission_t_s[-1]) for agent, error in errors.items()}
-    return {"index_m": indices[0], "index_after_10s_m": indices[1], "agents": rows}, tracked_s
+    return {"index_m": summed_m[0], "index_after_10s_m": summed_m[1], "agents": rows}, tracked_s
 
 
-def _index_m(errors: Mapping[int, Any], first_s: float, last_s: float) -> float | None:
+def _summed_mean_error_m(errors: Mapping[int, Any], first_s: float, last_s: float) -> float | None:
     total_m = 0.0
     for error in errors.values():
         common = (error.mission_t_s >= first_s) & (error.mission_t_s <= last_s)

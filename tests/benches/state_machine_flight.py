@@ -1,4 +1,4 @@
-"""What the tests of the phase machine share: a `MissionStateMachine` that is driven with made-up inputs."""
+"""Test bench of the mission state machine: drives a `MissionStateMachine` with synthetic inputs."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ON_GROUND, IN_AIR = Landed.ON_GROUND, Landed.IN_AIR
 
 
 class Flight:
-    """One `MissionStateMachine`, the vehicle it sees and the time; every call of `step` is 100 ms later."""
+    """One `MissionStateMachine`, its vehicle and its clock; every call of `step` is 100 ms later."""
 
     def __init__(self, peers: int = 1, **params: Any) -> None:
         mission = MissionReference(MissionParams(kind="line"), START[None, :], 0)
@@ -52,7 +52,7 @@ class Flight:
 
     @property
     def at(self) -> str:
-        """Name of the phase."""
+        """Return the name of the phase."""
         return self.phase.name
 
     @property
@@ -82,7 +82,7 @@ class Flight:
             unsettled=self.unsettled,
             armed_told_us=self.now_us if self.beat_us is None else self.beat_us,
         )
-        self.state_machine.begin_if_due(inputs.now_us, inputs.utc_us)  # as the agent does, before it thinks
+        self.state_machine.begin_if_due(inputs.now_us, inputs.utc_us)  # called before planning, as by the agent
         asked = self.state_machine.step(inputs)
         self.now_us += 100_000
         return asked
@@ -97,7 +97,7 @@ class Flight:
         self.state_machine.operator(verb, self.now_us, self.utc_us, self.state)
 
     def until(self, phase: Phase) -> Flight:
-        """Fly on, all going well, until a phase is reached."""
+        """Continue without faults until a phase is reached."""
         for _ in range(400):
             if self.phase is phase:
                 return self

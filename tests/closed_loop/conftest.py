@@ -68,7 +68,7 @@ class Flight:
         true = [np.interp(ticks["t_us"] * 1e-6, self.t_s, self.pos_ned_m[:, agent, c]) for c in range(3)]
         return ticks, np.stack(true, axis=1) - ticks["ref_pos_ned_m"]
 
-    def index_m(self, after_s: float = 0.0) -> float:
+    def summed_mean_error_m(self, after_s: float = 0.0) -> float:
         """Sum over agents of the mean distance to the reference (thesis Table 19)."""
         total = 0.0
         for agent in range(self.config.swarm.agents):

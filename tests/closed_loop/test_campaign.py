@@ -86,7 +86,7 @@ def test_the_report_has_every_cell_with_its_exact_interval(quick: Path) -> None:
     assert "--scenario swap --agents 3 --delay 100 --loss 0.1" in page, "what flies a failed run again"
 
 
-def test_incidents_happen_in_flight() -> None:
+def test_scenario_events_happen_in_flight() -> None:
     """Two agents; the bus falls apart for 2 s: paths age, both come through."""
     trial = Trial(Cell("partition", 2, 0.0, 0.0, "exact", 0.0, "default"), 1)
     flight = Flight(trial, layout_of("partition", 1, 2))
@@ -99,7 +99,7 @@ def test_incidents_happen_in_flight() -> None:
 
 
 @pytest.mark.process
-def test_a_killed_campaign_goes_on_where_it_was(tmp_path: Path) -> None:
+def test_a_killed_campaign_resumes(tmp_path: Path) -> None:
     asked = ["--scenario", "swap", "--agents", "2", "--protections", "off", "--jobs", "2", "--out", str(tmp_path)]
     command = [sys.executable, str(ROOT / "tools" / "campaign.py"), *asked, "--trials", "50"]
     campaign = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL)

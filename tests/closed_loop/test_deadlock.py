@@ -92,7 +92,7 @@ def test_two_that_meet_in_a_corridor_get_by(met: Flown) -> None:
     assert met.separation_m > 0.25
 
 
-def test_it_is_noticed_and_told(met: Flown) -> None:
+def test_the_deadlock_is_reported(met: Flown) -> None:
     begun = [e for e in met.noted if e["begins"]]
     assert any(set(e["by"]) & {0, 1} for e in begun)
     assert all(e["lasted_s"] >= 1.5 for e in met.noted if not e["begins"])

@@ -24,7 +24,7 @@ def scaled_m(flight: Flight, downwash: float) -> float:
 
 
 @pytest.mark.parametrize("kind", ["dmpc", "dmpc3"])  # one goes round, the other over
-def test_nobody_passes_closely_below(fly: Fly, kind: str) -> None:
+def test_no_vehicle_passes_closely_below_another(fly: Fly, kind: str) -> None:
     flight = fly(*CROSSING, f"controller.kind={kind}", "separation.downwash=2.0")
     assert flight.problems == []
     assert scaled_m(flight, 2.0) >= 0.85

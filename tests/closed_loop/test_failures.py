@@ -79,7 +79,7 @@ def others_have_landed(running: Lockstep) -> bool:
     return all(len(log.rows) and log.rows[-1]["phase"][0] == Phase.DONE for log in running.logs[:2])
 
 
-def test_the_pilot_wins(fly: Fly) -> None:
+def test_a_pilot_override_is_respected(fly: Fly) -> None:
     landing = {8.0: take_over, 9.5: lambda running: running.command("land")}
     flight = fly(MISSION, at=landing, until=others_have_landed)
     ticks = flight.ticks(2)
@@ -124,7 +124,7 @@ def _solve_from(running: Lockstep, from_s: float, solve: Callable[..., QpSolutio
 @pytest.mark.parametrize(
     ("lasts_s", "reached"), [(0.3, Mode.REPLAY), (2.0, Mode.HOLD), (8.0, Mode.LAND)], ids=["replay", "hold", "land"]
 )
-def test_ladder_after_solver_failure(fly: Fly, lasts_s: float, reached: Mode) -> None:
+def test_modes_after_a_solver_failure(fly: Fly, lasts_s: float, reached: Mode) -> None:
     broken = {9.0: lambda running: break_solver(running, 0, lasts_s)}
     flight = fly("mission.duration_s=18", "swarm.agents=1", at=broken)
     ladder = [Mode.REPLAY, Mode.BRAKE, Mode.HOLD, Mode.LAND]
@@ -135,7 +135,7 @@ def test_ladder_after_solver_failure(fly: Fly, lasts_s: float, reached: Mode) ->
 
 
 @pytest.mark.parametrize(("loss_s", "blind_s"), [(None, 0.5), (1.0, 1.0)], ids=["set by agents", "control"])
-def test_the_vehicle_of_a_dead_agent_flies_on_blindly_for_half_a_second(
+def test_the_vehicle_of_a_dead_agent_keeps_its_attitude_for_half_a_second(
     fly: Fly, loss_s: float | None, blind_s: float
 ) -> None:
     """PX4 holds the last attitude for COM_OF_LOSS_T, which is a second of its own accord."""
@@ -153,7 +153,7 @@ def test_the_vehicle_of_a_dead_agent_flies_on_blindly_for_half_a_second(
     assert flight.lockstep.clock.now_us() * 1e-6 - died[0] == pytest.approx(blind_s, abs=0.12)
 
 
-def test_others_keep_clear_of_who_has_no_solver(fly: Fly) -> None:
+def test_others_keep_clear_of_an_agent_without_a_solver(fly: Fly) -> None:
     """It replays, then comes to a hold and returns, and in the end lands."""
     broken = {
         at_s: partial(break_solver, agent=0, lasts_s=lasts_s) for at_s, lasts_s in ((6.0, 0.3), (8.0, 2.0), (14.0, 8.0))

@@ -87,7 +87,7 @@ def twin() -> Flight:
     return swap(fly_now)
 
 
-def test_forged_paths_change_nothing_and_are_told(fly: Fly, twin: Flight) -> None:
+def test_forged_paths_change_nothing_and_are_reported(fly: Fly, twin: Flight) -> None:
     flight = swap(fly, at={FORGED_S: forge_paths})
     assert twin.separation_m() >= 0.85
     np.testing.assert_array_equal(flight.pos_ned_m, twin.pos_ned_m)
@@ -119,7 +119,7 @@ def test_control_where_the_newest_is_believed_they_meet(fly: Fly, monkeypatch: p
     assert found["longest_s"] > 1.0, "who was silenced is named"
 
 
-def test_a_forged_status_lands_parks_and_delays_nobody(fly: Fly, twin: Flight) -> None:
+def test_forged_statuses_have_no_effect(fly: Fly, twin: Flight) -> None:
     heard: list[bytes] = []
 
     def forge(running: Lockstep) -> None:
@@ -161,18 +161,18 @@ def test_forged_intents_break_no_promise(fly: Fly) -> None:
     assert "(intent boot 3, intent sequence 3)" in violation
 
 
-def test_who_forges_all_the_time_is_told_and_nobody_comes_closer(fly: Fly, twin: Flight) -> None:
+def test_permanent_forgery_is_reported_and_distances_are_kept(fly: Fly, twin: Flight) -> None:
     flight = swap(fly, at={0.5 + 0.02 * i: forge_paths for i in range(200)})
     np.testing.assert_array_equal(flight.pos_ned_m, twin.pos_ned_m)
     assert len(summary(flight)["violations"]) == AGENTS
 
 
-def test_late_and_lost_messages_accuse_nobody(fly: Fly) -> None:
+def test_late_and_lost_messages_raise_no_forgery_alarm(fly: Fly) -> None:
     flight = swap(fly, "bus.delay_ms=300", "bus.loss_01=0.2")
     assert not [violation for violation in summary(flight)["violations"] if "refused" in violation]
 
 
-def test_orders_of_another_day_are_not_obeyed_and_the_last_one_counts(fly: Fly) -> None:
+def test_commands_with_old_or_future_stamps_are_refused_and_the_last_one_counts(fly: Fly) -> None:
     """A `land` of 1970, one of in an hour, and a `hold` that comes again after it was lifted."""
     speeds_m_s: list[float] = []
 

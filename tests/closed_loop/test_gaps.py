@@ -52,7 +52,7 @@ def is_overridden(flight: Flight) -> bool:
     return Mode.PILOT_OVERRIDE in flight.modes(0)
 
 
-def test_an_agent_that_was_stopped_for_a_third_of_a_second_flies_on_before_a_failsafe_acts(fly: Fly) -> None:
+def test_an_agent_stopped_for_a_third_of_a_second_continues_before_a_failsafe_acts(fly: Fly) -> None:
     flight = fly_stopped_for(fly, 0.32)
     assert 0.32 <= gaps(flight)[0] < 0.40
     assert gaps(flight)[1] < 0.05
@@ -68,7 +68,7 @@ def test_control_who_waits_to_be_told_the_mode_loses_the_vehicle(fly: Fly, monke
     assert is_overridden(flight)
 
 
-def test_an_agent_that_was_stopped_for_longer_yields_to_the_failsafe_that_acted(fly: Fly) -> None:
+def test_an_agent_stopped_for_longer_leaves_control_to_the_failsafe(fly: Fly) -> None:
     flight = fly_stopped_for(fly, 0.8)
     assert is_overridden(flight)
     assert np.isnan(flight.ticks(0)["setpoint_thrust_01"][-100:]).all()

@@ -36,7 +36,7 @@ CROSSING = (
 LAND_NOW: dict[float, Callable[[Lockstep], None]] = {1.7: lambda running: running.command("land")}
 
 
-def test_who_is_told_to_land_at_speed_among_others_brakes_and_makes_room_first(fly: Fly) -> None:
+def test_a_landing_at_speed_among_others_brakes_and_moves_apart_first(fly: Fly) -> None:
     flight = fly(*CROSSING, at=LAND_NOW)
     assert flight.separation_m() >= 0.85
     final = flight.pos_ned_m[-1]
@@ -129,7 +129,7 @@ def asleep_past_the_loss() -> Watched:
     return flight
 
 
-def test_an_agent_that_slept_past_the_loss_takes_nothing_back() -> None:
+def test_an_agent_stopped_past_the_loss_does_not_retake_control() -> None:
     flight = asleep_past_the_loss()
     assert flight.setpoints_us == flight.offboard_us == []
     assert flight.agent.outcome == TAKEN_OVER
@@ -156,7 +156,7 @@ def restarted_while_the_autopilot_flies_home(switched_off: Callable[[], None] = 
     return flight
 
 
-def test_a_restarted_agent_leaves_a_vehicle_to_the_failsafe_that_has_it() -> None:
+def test_a_restarted_agent_leaves_control_to_an_active_failsafe() -> None:
     flight = restarted_while_the_autopilot_flies_home()
     assert flight.setpoints_us == flight.offboard_us == []
     flight.run.command("resume")  # an operator means it

@@ -31,7 +31,7 @@ def fly_with_a_jump(fly: Fly) -> tuple[Flight, float]:
     return flight, jumped_us[0] * 1e-6
 
 
-def test_a_jump_of_the_estimate_brings_nobody_closer_and_is_told(fly: Fly) -> None:
+def test_a_jump_of_the_estimate_keeps_distances_and_is_reported(fly: Fly) -> None:
     flight, jumped_s = fly_with_a_jump(fly)
     assert flight.separation_m() >= 0.85
     assert flight.event_names(0).count("estimate_jumped") == 1

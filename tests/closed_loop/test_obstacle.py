@@ -23,7 +23,7 @@ def clearance_m(flight: Flight) -> float:
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_everybody_keeps_clear_of_it_and_of_each_other(fly: Fly, seed: int) -> None:
+def test_all_keep_clear_of_the_obstacle_and_of_each_other(fly: Fly, seed: int) -> None:
     """Worst of starts 1 to 3, a millimetre off: 1.763 m and 0.908 m."""
     past = fly("sitl.start=air", config=CONFIG, until=mission_is_over, seed=seed)
     assert clearance_m(past) >= 1.75
@@ -33,7 +33,7 @@ def test_everybody_keeps_clear_of_it_and_of_each_other(fly: Fly, seed: int) -> N
         assert past.modes(agent, Phase.TRACK) == {Mode.TRACKING}
 
 
-def test_with_published_weights_everybody_keeps_clear_from_the_published_start_and_comes_home(flight: Flight) -> None:
+def test_with_published_weights_all_keep_clear_from_the_published_start_and_land(flight: Flight) -> None:
     """Without a weight on velocity they overshoot: from starts a millimetre off the worst of six is 1.64 m."""
     assert flight.problems == []
     assert clearance_m(flight) >= 1.70
@@ -41,7 +41,7 @@ def test_with_published_weights_everybody_keeps_clear_from_the_published_start_a
     assert not any(flight.ticks(i)["barrier_acted"].any() for i in range(3)), "the last layer is not needed for it"
 
 
-def test_it_is_known_only_within_the_visibility_distance(flight: Flight) -> None:
+def test_the_obstacle_is_known_only_within_the_visibility_distance(flight: Flight) -> None:
     for agent in range(3):
         ticks = flight.ticks(agent)
         seen = np.isfinite(ticks["nearest_obstacle_m"])

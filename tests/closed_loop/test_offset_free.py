@@ -54,18 +54,18 @@ def errors(*overrides: str) -> Errors:
     return Errors(float(np.sqrt((error**2).sum(axis=1).mean())), float(down.mean()), float(np.abs(down).max()))
 
 
-def test_wind_gusts_mass_and_battery_leave_centimetres() -> None:
+def test_wind_gusts_mass_and_battery_cost_centimetres() -> None:
     found = errors(*WIND, *HEAVY, *GUSTS)
     assert found.rmse_m <= 0.045
     assert abs(found.mean_down_m) <= 0.005
     assert found.largest_down_m <= 0.02
 
 
-def test_turbulence_on_top_leaves_centimetres() -> None:
+def test_additional_turbulence_costs_centimetres() -> None:
     assert errors(*WIND, *HEAVY, *GUSTS, *EDDIES).rmse_m <= 0.05
 
 
-def test_at_rest_nothing_is_left() -> None:
+def test_at_rest_no_error_remains() -> None:
     hover = ("mission.kind=hover", "mission.duration_s=15")
     found = errors(*hover, *WIND, *HEAVY, *CURVE)
     assert found.rmse_m <= 0.005

@@ -28,7 +28,7 @@ def swapped(*more: str, until_s: float, at: dict[float, Callable[[Lockstep], Non
     return fly_now(*SWAP, *more, config="swap8.toml", at=at, until=over)
 
 
-def test_who_misses_nine_deadlines_of_ten_comes_to_rest_far_from_the_others_and_lands() -> None:
+def test_agents_missing_nine_of_ten_deadlines_come_to_rest_far_apart_and_land() -> None:
     flight = swapped(until_s=30.0, at={0.5: one_tick_of(10)})
     assert flight.separation_m() > 1.5
     assert {agent.outcome.split(":")[0] for agent in flight.lockstep.agents if agent} == {"overload"}

@@ -58,7 +58,7 @@ def test_core_types_do_not_matter(core_type: str) -> None:
     assert fly({"OPENBLAS_CORETYPE": core_type}) == plain()
 
 
-def test_what_is_asked_of_numpy_does_not_matter() -> None:
+def test_user_settings_of_numpy_do_not_matter() -> None:
     assert fly({"NPY_ENABLE_CPU_FEATURES": "X86_V3", "OPENBLAS_NUM_THREADS": "2"}) == plain()
     assert fly({"NPY_DISABLE_CPU_FEATURES": "X86_V3"}) == plain()
     assert plain()[1] == "", "and nothing is warned of"
@@ -71,7 +71,7 @@ def test_control_left_to_themselves_processors_differ_and_it_is_said() -> None:
         assert native[0][0] != native[1][0]
 
 
-def test_numpy_that_was_loaded_first_is_said() -> None:
+def test_numpy_loaded_first_is_reported() -> None:
     _, said = fly({}, "numpy", until_us=20_000)
     assert "numpy was loaded before swarmctl" in said
 

@@ -25,6 +25,6 @@ def test_eight_agents_swap_without_touching(fly: Fly) -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_so_they_do_from_starts_a_millimetre_off(fly: Fly, seed: int) -> None:
+def test_eight_agents_swap_from_starts_a_millimetre_off(fly: Fly, seed: int) -> None:
     """Who gives way to whom differs, and so does how long it takes."""
     check(fly(*SWAP, "mission.duration_s=20", config="swap8.toml", until=mission_is_over, seed=seed))

@@ -1,4 +1,4 @@
-"""What an agent takes in from the bus: within bounds, from whom it is, and what it says of those it does not hear."""
+"""Tests of the world model: bounded input, checked senders, and reports of unheard peers."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class Bench:
         return [row for row in self.told if row["event"] == "unheard"]
 
 
-def test_a_list_of_too_many_obstacles_leaves_the_known_one_and_is_said() -> None:
+def test_a_list_of_too_many_obstacles_is_refused_and_reported() -> None:
     bench = Bench()
     bench.set_obstacles(topics.MAX_OBSTACLES, 1)
     assert bench.seen == topics.MAX_OBSTACLES
@@ -81,7 +81,7 @@ def test_a_list_of_too_many_obstacles_leaves_the_known_one_and_is_said() -> None
     assert bench.world_model.refusals.alert(bench.clock.utc_us()) == "obstacles of operator refused: malformed"
 
 
-def test_as_many_obstacles_as_are_taken_in_cost_a_fraction_of_a_tick() -> None:
+def test_the_largest_list_of_obstacles_costs_a_fraction_of_a_tick() -> None:
     bench = Bench()
     bench.set_obstacles(topics.MAX_OBSTACLES, 1)
     took_ms = []
@@ -93,7 +93,7 @@ def test_as_many_obstacles_as_are_taken_in_cost_a_fraction_of_a_tick() -> None:
     assert min(took_ms) < 3.0, "of 20"
 
 
-def test_a_version_out_of_reach_does_not_shut_out_all_later_ones() -> None:
+def test_a_version_far_ahead_does_not_block_later_ones() -> None:
     bench = Bench()
     bench.set_obstacles(1, 7)
     bench.set_obstacles(3, 2**62)
@@ -107,8 +107,8 @@ def test_a_version_out_of_reach_does_not_shut_out_all_later_ones() -> None:
     assert bench.seen == 4
 
 
-def test_a_peer_that_is_refused_for_long_is_mute_kept_clear_of_at_any_height_and_named() -> None:
-    """On the bus, alive, and every path it says is stamped far in the future."""
+def test_a_peer_refused_for_long_counts_as_bus_loss_and_is_avoided_at_any_height() -> None:
+    """The peer is on the bus and alive, but every path it publishes has a stamp in the future."""
     bench = Bench()
     bench.say_path()
     bench.say_status(phase=int(Phase.TRACK))
@@ -133,7 +133,7 @@ def test_a_peer_that_is_refused_for_long_is_mute_kept_clear_of_at_any_height_and
 
 
 @pytest.mark.parametrize("why", ["gone", "done"])
-def test_who_is_gone_or_has_landed_is_not_called_unheard(why: str) -> None:
+def test_a_peer_that_died_or_landed_is_not_reported_unheard(why: str) -> None:
     bench = Bench()
     bench.say_path()
     bench.say_status(phase=int(Phase.DONE if why == "done" else Phase.TRACK))
@@ -145,7 +145,7 @@ def test_who_is_gone_or_has_landed_is_not_called_unheard(why: str) -> None:
     assert bench.unheard == []
 
 
-def test_statuses_are_believed_like_paths_and_nobody_gets_ready_in_the_future() -> None:
+def test_statuses_are_accepted_like_paths_and_future_ready_times_refused() -> None:
     bench = Bench()
     for _ in range(5):
         bench.seq += 10
@@ -162,7 +162,7 @@ def test_statuses_are_believed_like_paths_and_nobody_gets_ready_in_the_future() 
     assert bench.rejected == {"unconfirmed": 2, "future": 1}
 
 
-def test_a_status_by_somebody_elses_name_or_of_nobody_is_refused() -> None:
+def test_a_status_under_a_foreign_or_unknown_name_is_refused() -> None:
     bench = Bench()
     bench.say_status(agent=2)
     bench.operator.publish(topics.STATUS, topics.encode_message(STATUS))
@@ -172,7 +172,7 @@ def test_a_status_by_somebody_elses_name_or_of_nobody_is_refused() -> None:
     assert bench.rejected == {"identity": 2, "malformed": 1}
 
 
-def test_a_tick_takes_in_a_ring_of_each_sender_and_no_more() -> None:
+def test_a_tick_processes_at_most_one_ring_of_messages_per_sender() -> None:
     bench = Bench()
     for _ in range(100):
         bench.say_path(boot_id=bench.seq)

@@ -1,4 +1,4 @@
-"""Every row of the failsafe table, its limits, and which row wins when several apply."""
+"""Tests of every row of the failsafe table, its limits, and the precedence of rows."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def mode_of(**changes: Any) -> Mode:
     return decide(replace(GOOD, **changes), PARAMS).mode
 
 
-def test_all_well_is_followed_and_before_the_autopilot_follows_it_is_streamed() -> None:
+def test_a_good_plan_is_tracked_and_primed_before_the_autopilot_follows() -> None:
     assert mode_of() is Mode.TRACKING
     assert mode_of(had_control=False) is Mode.PRIMING
     assert mode_of(had_control=False, mode=FlightMode.HOLD) is Mode.PRIMING
@@ -78,7 +78,7 @@ def test_the_ladder_after_a_bad_plan(status: PlanStatus) -> None:
     assert mode_of(**old, speed_m_s=9.0, planless_us=5_400_001) is Mode.LAND
 
 
-def test_a_plan_that_is_from_the_future_by_the_delay_is_still_young() -> None:
+def test_a_plan_that_begins_one_delay_ahead_is_recent() -> None:
     assert mode_of(plan_status=PlanStatus.RESIDUAL, last_good_plan_age_us=60_000) is Mode.REPLAY
 
 
@@ -96,7 +96,7 @@ def test_a_bad_plan_is_never_flown_whoever_has_control(status: PlanStatus) -> No
 @pytest.mark.parametrize(
     ("changes", "mode"),
     [
-        # blind before idle, yield and plans
+        # a stale state before idle, override and plans
         ({"state_age_us": -1, "phase": Phase.STANDBY}, Mode.STATE_STALE),
         ({"state_age_us": 300_000, "mode": FlightMode.MANUAL}, Mode.STATE_STALE),
         ({"state_age_us": 300_000, "plan_status": PlanStatus.NONE}, Mode.STATE_STALE),
@@ -108,13 +108,13 @@ def test_a_bad_plan_is_never_flown_whoever_has_control(status: PlanStatus) -> No
             Mode.PILOT_OVERRIDE,
         ),
         ({"pilot_override": True, "state_age_us": 300_000}, Mode.STATE_STALE),
-        # idle before yield: landing by the autopilot is not a take-over
+        # idle before override: landing by the autopilot is no take-over
         ({"phase": Phase.LAND, "mode": FlightMode.LAND}, Mode.IDLE),
         ({"phase": Phase.DONE, "armed": False}, Mode.IDLE),
-        # yield before everything about plans
+        # override before everything about plans
         ({"armed": False, "plan_status": PlanStatus.SOLVER_FAILED}, Mode.PILOT_OVERRIDE),
         ({"mode": FlightMode.RTL, "plan_status": PlanStatus.NONE, "planless_us": 10**9}, Mode.PILOT_OVERRIDE),
-        # a young certified plan before landing, landing before braking
+        # a recent certified plan before landing, landing before braking
         ({"plan_status": PlanStatus.NONE, "last_good_plan_age_us": 0, "planless_us": 10**9}, Mode.REPLAY),
         ({"plan_status": PlanStatus.NONE, "last_good_plan_age_us": -1, "planless_us": 10**9}, Mode.LAND),
     ],
@@ -123,7 +123,7 @@ def test_order_of_precedence(changes: dict[str, Any], mode: Mode) -> None:
     assert mode_of(**changes) is mode
 
 
-def test_every_judgement_says_why() -> None:
+def test_every_decision_has_a_reason() -> None:
     reasons = {
         decide(replace(GOOD, **change), PARAMS).reason
         for change in (

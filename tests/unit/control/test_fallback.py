@@ -1,4 +1,4 @@
-"""Braking without a plan: within a distance that can be stated, with tilts and turns a vehicle can follow."""
+"""Tests of the brake-and-hold plan: stopping distance, and tilts and rates that a vehicle can follow."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def test_acceleration_is_bounded_and_thrust_finite() -> None:
     assert np.hypot(plan.virtual_control[:, 0], plan.virtual_control[:, 1]).max() < math.sin(0.6)
 
 
-def test_the_shared_path_is_the_motion_the_commands_cause() -> None:
+def test_the_published_path_is_the_motion_the_commands_cause() -> None:
     wind = np.array([0.5, -0.8, 0.3])
     plan = brake((3.0, -1.0, 0.5), wind=wind, tilt=(0.1, 0.05))
     pos, vel = plan.pos_ned_m[0].copy(), plan.vel_ned_m_s[0].copy()
@@ -87,7 +87,7 @@ def test_returns_to_the_place_to_hold_and_stays() -> None:
 
 
 @pytest.mark.parametrize("wind", [(1.5, 0.0, 0.0), (-0.5, 2.0, 0.0), (0.0, 0.0, 1.0)])
-def test_a_known_wind_is_leant_against(wind: tuple[float, ...]) -> None:
+def test_a_known_wind_is_compensated(wind: tuple[float, ...]) -> None:
     plan = brake((0.0, 0.0, 0.0), at=np.array([0.0, 0.0, -5.0]), wind=np.array(wind))
     np.testing.assert_allclose(acceleration(plan.virtual_control[-1]), -np.array(wind), atol=0.02)
     assert np.abs(plan.pos_ned_m - [0.0, 0.0, -5.0]).max() < 0.15
@@ -109,7 +109,7 @@ SLOW = Lag(4.0, 0.8)
 def flown(
     believed: Lag | None, true: Lag, vel: tuple[float, ...], at: Array | None, seconds: float
 ) -> tuple[Array, Array]:
-    """Positions and velocities (T, 3) of a vehicle with a lag that flies the first command of a new plan each tick."""
+    """Return positions, velocities (T, 3) of a lagging vehicle that flies the first command of each tick's plan."""
     pos, v, tilt, rate, commanded = np.zeros(3), np.array(vel), np.zeros(2), np.zeros(2), np.zeros(2)
     path, speeds = [], []
     for _ in range(round(seconds / DT_S)):
@@ -134,12 +134,12 @@ def test_a_lagging_vehicle_comes_to_rest_and_does_not_swing(lag: Lag) -> None:
 
 
 def test_the_damping_for_a_vehicle_without_lag_would_swing_a_slow_one() -> None:
-    """The control of the test above."""
+    """Negative control of the test above."""
     _, speeds = flown(None, SLOW, (3.0, 0.0, 0.0), None, 8.0)
     assert speeds[:, 0].min() < -0.5
 
 
-def test_the_path_it_shares_is_the_one_a_lagging_vehicle_flies() -> None:
+def test_the_published_path_is_the_one_a_lagging_vehicle_flies() -> None:
     begin = Start(0, np.zeros(3), np.array([2.0, -1.0, 0.0]), 1.0, np.array([0.1, 0.0, 9.81]), np.array([0.1, 0.0]))
     plan = brake_and_hold_plan(begin, None, NO_WIND, LAG, DT_US, STEPS)
     pos, vel, tilt, rate = np.zeros(3), np.array([2.0, -1.0, 0.0]), np.array([0.1, 0.0]), np.zeros(2)

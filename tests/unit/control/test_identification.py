@@ -32,7 +32,7 @@ NAMES = Identified.__slots__
 
 
 def follow(flight_s: float, seed: int, truth: VehicleModelParams = TRUTH, errors: float = 1.0) -> NDArray[np.void]:
-    """Ticks of a flight round its start, by a hand that pushes it back; `errors` scales the estimator's."""
+    """Return ticks of a flight around its start with random pushes; `errors` scales the estimator's errors."""
     rng = np.random.default_rng(seed)
     count, fine_s = round(flight_s / DT_S), 0.004
     lag, late = Lag(truth.attitude_rad_s, truth.attitude_damping), round(truth.delay_s / fine_s)
@@ -77,7 +77,7 @@ def result(ticks: NDArray[np.void]) -> Identified:
     return found
 
 
-def test_a_flight_without_errors_gives_the_vehicle_back() -> None:
+def test_a_flight_without_errors_recovers_the_vehicle() -> None:
     found = result(follow(40.0, 1, errors=0.0))
     for name in NAMES:
         assert getattr(found, name).value == pytest.approx(getattr(TRUTH, name), rel=0.02), name
@@ -101,7 +101,7 @@ def test_dead_times_far_from_the_first_guess_are_found(delay_s: float) -> None:
     assert found.delay_s.low >= 0.0
 
 
-def test_setpoints_that_somebody_else_interrupted_are_used_up_to_there() -> None:
+def test_only_setpoints_before_an_interruption_are_used() -> None:
     ticks = follow(40.0, 4)
     ticks["setpoint_thrust_01"][1200:1300] = np.nan  # 24 s, 2 s of a pilot, 14 s
     flight = longest_segment(ticks)
@@ -134,7 +134,7 @@ def grounded(ticks: NDArray[np.void]) -> NDArray[np.void]:
         (lambda ticks: ticks[:400], "10 s are needed"),
     ],
 )
-def test_a_flight_that_tells_nothing_is_refused(spoil, why: str) -> None:  # type: ignore[no-untyped-def]
+def test_a_flight_without_information_is_refused(spoil, why: str) -> None:  # type: ignore[no-untyped-def]
     flight = longest_segment(spoil(follow(40.0, 5)))
     found = identify(flight) if isinstance(flight, FlightSegment) else flight
     assert isinstance(found, str)
@@ -167,9 +167,7 @@ def test_steps_begin_and_end_on_the_own_start_and_go_both_ways() -> None:
         ((5.0, 0.0, -3.0), (3.0, 3.0, 3.0), "speed_max_m_s is 5"),
     ],
 )
-def test_what_goes_too_far_or_too_fast_ends_the_flight(
-    pos: tuple[float, ...], vel: tuple[float, ...], why: str
-) -> None:
+def test_leaving_the_limits_ends_the_flight(pos: tuple[float, ...], vel: tuple[float, ...], why: str) -> None:
     excess = reference().excess(np.array(pos), np.array(vel))
     assert (why in excess) if why else excess == ""
 

@@ -1,4 +1,4 @@
-"""The newest certified plan: kept while it is worth flying, continued by braking, gone when it has run out."""
+"""Tests of the buffer of the newest certified plan: kept, continued by braking, dropped, run out."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ BAD = tuple(status for status in PlanStatus if status is not PlanStatus.OK)
 
 
 def plan_at(t0_us: int, north_m: Array, status: PlanStatus = PlanStatus.OK) -> Plan:
-    """Along north at height 2 m."""
+    """Return a plan that moves north at height 2 m."""
     pos = np.column_stack([north_m, np.zeros(len(north_m)), np.full(len(north_m), -2.0)])
     held = np.tile([0.0, 0.0, 9.81], (len(north_m) - 1, 1))
     return Plan(status, t0_us, DT_US, pos, np.zeros_like(pos), held, NO_TIMES, 0, 0.0, 0.0, 0.0)
@@ -33,7 +33,7 @@ def start_at(t_us: int) -> Start:
 
 
 def wall(north_m: float, certified_m: float = 0.8) -> KeepOut:
-    """Something that stands at height 2 m."""
+    """Return a keep-out at rest at height 2 m."""
     return KeepOut(np.tile([north_m, 0.0, -2.0], (STEPS + 1, 1)), certified_m + 0.1, certified_m, False, 1)
 
 
@@ -43,11 +43,11 @@ def buffer() -> PlanBuffer:
 
 
 def rest() -> Plan:
-    """Stays where the plan of `moving` is after one step."""
+    """Return a plan that stays where the plan of `moving` is after one step."""
     return moving(100_000, 0.0, 0.2)
 
 
-def test_at_first_there_is_nothing(buffer: PlanBuffer) -> None:
+def test_the_buffer_is_empty_at_first(buffer: PlanBuffer) -> None:
     assert buffer.plan is None
     assert buffer.guess_ned_m(0) is None
 
@@ -67,7 +67,7 @@ def test_a_good_plan_is_kept_until_the_next_good_one(buffer: PlanBuffer) -> None
 
 
 def test_a_good_plan_is_kept_whatever_is_near(buffer: PlanBuffer) -> None:
-    """It has been certified; that is not judged here again."""
+    """It has been certified before and is not checked again."""
     plan = moving()
     buffer.take(plan, start_at(0), [wall(1.5)], rest)
     assert buffer.plan is plan
@@ -83,8 +83,8 @@ def test_after_a_bad_plan_the_last_good_one_is_kept_where_it_is_free(buffer: Pla
 
 
 @pytest.mark.parametrize("status", BAD)
-def test_it_is_dropped_when_braking_comes_less_close(buffer: PlanBuffer, status: PlanStatus) -> None:
-    """It flies through the wall at 2 m; who brakes stays 1.8 m away from it."""
+def test_a_plan_is_dropped_when_braking_comes_less_close(buffer: PlanBuffer, status: PlanStatus) -> None:
+    """The plan flies through the wall at 2 m; a braking vehicle stays 1.8 m away from it."""
     buffer.take(moving(), start_at(0), [], rest)
     buffer.take(moving(100_000, status=status), start_at(100_000), [wall(2.0)], rest)
     assert buffer.plan is None
@@ -104,7 +104,7 @@ def test_of_two_that_come_too_close_the_less_close_is_flown(
     assert (buffer.plan is good) is kept
 
 
-def test_it_is_kept_when_braking_comes_just_as_close(buffer: PlanBuffer) -> None:
+def test_a_plan_is_kept_when_braking_comes_just_as_close(buffer: PlanBuffer) -> None:
     good = moving(speed_m_s=0.5)
     buffer.take(good, start_at(0), [], rest)
     same = plan_at(100_000, buffer.positions_ned_m(good, 100_000)[:, 0])
@@ -113,8 +113,8 @@ def test_it_is_kept_when_braking_comes_just_as_close(buffer: PlanBuffer) -> None
     assert buffer.plan is good
 
 
-def test_what_it_has_flown_already_is_not_held_against_it(buffer: PlanBuffer) -> None:
-    """The wall stands where the plan began, a second ago."""
+def test_the_flown_part_of_a_plan_is_not_checked(buffer: PlanBuffer) -> None:
+    """The wall stands where the plan began one second before."""
     good = moving(speed_m_s=2.0)
     buffer.take(good, start_at(0), [], rest)
     buffer.take(moving(900_000, status=PlanStatus.RESIDUAL), start_at(900_000), [wall(0.0)], rest)
@@ -142,5 +142,5 @@ def test_the_guess_is_none_once_the_plan_has_run_out(buffer: PlanBuffer, t_us: i
     good = moving()
     buffer.take(good, start_at(0), [], rest)
     assert (buffer.guess_ned_m(t_us) is not None) is there
-    assert buffer.plan is good  # how old may be flown is the failsafe's affair
+    assert buffer.plan is good  # the failsafe decides how old a flown plan may be
     np.testing.assert_allclose(buffer.positions_ned_m(good, t_us)[-1, 0], 2.0 + 2.0 / 3.0, atol=1e-9)

@@ -1,4 +1,4 @@
-"""The phase machine of one agent up to the common beginning: what is asked of the autopilot, and when."""
+"""Tests of the mission state machine up to the common beginning: requests to the autopilot and their times."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ import pytest
 from swarmctl.core.types import Command, FlightMode, Phase, Verb
 from tests.benches.state_machine_flight import IN_AIR, SECOND, START, UTC0_US, Flight, ready
 
-# -- the way there ----------------------------------------------------------------------------------------------------
+# -- transit to the start ---------------------------------------------------------------------------------------------
 
 
-def test_a_whole_flight_asks_for_each_thing_once_and_in_order() -> None:
+def test_a_whole_flight_requests_each_command_once_and_in_order() -> None:
     flight, asked = Flight(), []
     phases: list[Phase] = []
     for _ in range(600):
@@ -27,7 +27,7 @@ def test_a_whole_flight_asks_for_each_thing_once_and_in_order() -> None:
     assert (flight.state_machine.finished, flight.state_machine.outcome) == (True, "completed")
 
 
-def test_without_a_vehicle_or_before_its_link_is_set_up_nothing_is_asked_for() -> None:
+def test_without_a_vehicle_or_link_setup_nothing_is_requested() -> None:
     flight = Flight()
     flight.seen = flight.prepared = False
     assert flight.run(3.0) == []
@@ -40,7 +40,7 @@ def test_without_a_vehicle_or_before_its_link_is_set_up_nothing_is_asked_for() -
 
 
 @pytest.mark.parametrize("phase", [Phase.CONNECT, Phase.STANDBY, Phase.ARM])
-def test_what_refuses_to_arm_ends_the_mission_with_its_reason(phase: Phase) -> None:
+def test_a_refusal_to_arm_ends_the_mission_with_its_reason(phase: Phase) -> None:
     flight = Flight()
     flight.prepared, flight.armable = phase is not Phase.CONNECT, phase is Phase.ARM
     flight.run(0.3)
@@ -52,7 +52,7 @@ def test_what_refuses_to_arm_ends_the_mission_with_its_reason(phase: Phase) -> N
     assert flight.run(5.0) == []
 
 
-def test_when_a_peer_gives_up_on_the_ground_nobody_else_takes_off() -> None:
+def test_when_a_peer_gives_up_on_the_ground_no_agent_takes_off() -> None:
     flight = Flight()
     flight.peer(Phase.DONE)
     assert flight.run(5.0) == []
@@ -81,7 +81,7 @@ def test_arducopter_is_guided_before_it_is_armed_and_takes_off_in_that_mode() ->
 
 
 @pytest.mark.parametrize("missing", ["armable", "answers", "peer", "peer alive", "peer vehicle"])
-def test_nobody_arms_before_everybody_stands_by(missing: str) -> None:
+def test_no_agent_arms_before_all_stand_by(missing: str) -> None:
     flight = Flight()
     flight.armable = missing != "armable"
     flight.busy = missing == "answers"
@@ -98,7 +98,7 @@ def test_nobody_arms_before_everybody_stands_by(missing: str) -> None:
     assert Verb.ARM in flight.run(0.3)
 
 
-def test_arming_is_asked_once_a_second_and_never_while_an_answer_is_open() -> None:
+def test_arming_is_requested_once_a_second_and_never_while_a_command_is_open() -> None:
     flight = Flight().until(Phase.ARM)
     assert flight.run(3.0).count(Verb.ARM) == 3
     flight.busy = True
@@ -132,12 +132,12 @@ def test_takeoff_is_over_when_it_hovers_at_its_height() -> None:
 def test_disarmed_on_the_ground_it_is_never_armed_again() -> None:
     flight = Flight().until(Phase.TAKEOFF)
     flight.run(0.2)
-    flight.armed = False  # somebody walked up and disarmed it, or the autopilot gave up waiting
+    flight.armed = False  # disarmed by a pilot, or by the autopilot after a timeout
     assert flight.run(20.0) == []
     assert flight.at == "DONE"
 
 
-def test_offboard_is_not_taken_from_a_pilot_who_flies_already() -> None:
+def test_offboard_is_not_taken_from_a_pilot_in_control() -> None:
     flight = Flight().until(Phase.GOTO_START)
     flight.flight_mode = FlightMode.MANUAL
     assert Verb.EXTERNAL not in flight.run(5.0)
@@ -162,7 +162,7 @@ def test_ready_means_at_the_start_and_at_rest() -> None:
 # -- the common beginning ---------------------------------------------------------------------------------------------
 
 
-def test_everybody_waits_for_the_last_one_and_begins_a_second_after_it() -> None:
+def test_all_wait_for_the_last_agent_and_begin_a_second_later() -> None:
     flight = ready()
     flight.run(30.0)
     assert flight.at == "READY"
@@ -191,7 +191,7 @@ def test_one_of_two_peers_is_not_enough() -> None:
     assert (flight.phase, flight.state_machine.begin_utc_us) == (Phase.READY, None)
 
 
-def test_a_peer_lost_before_the_beginning_sends_everybody_home() -> None:
+def test_a_peer_lost_before_the_beginning_sends_all_home() -> None:
     flight = ready()
     flight.peer(Phase.READY, 0, alive=False)
     flight.run(0.1)

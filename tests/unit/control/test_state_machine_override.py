@@ -1,4 +1,4 @@
-"""The phase machine once others decide: pilots, operators, lost plans, silence, found in the air."""
+"""Tests of the mission state machine under overrides, operators, lost plans, bus loss and vehicles found in the air."""
 
 from __future__ import annotations
 
@@ -10,16 +10,16 @@ from swarmctl.control.reference.landing_places import nearest_in_plane_m, room_f
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase, Verb
 from tests.benches.state_machine_flight import IN_AIR, ON_GROUND, OURS, START, Flight, controlled, ready, verbs
 
-# -- yielding ---------------------------------------------------------------------------------------------------------
+# -- pilot override ---------------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("phase", OURS)
-def test_after_a_pilot_took_over_nothing_is_ever_asked_again(phase: Phase) -> None:
+def test_after_a_pilot_override_nothing_is_requested(phase: Phase) -> None:
     flight = controlled(phase)
     flight.failsafe_mode, flight.flight_mode = Mode.PILOT_OVERRIDE, FlightMode.MANUAL
     assert flight.run(0.1) == []
     assert not flight.state_machine.had_control
-    flight.failsafe_mode = Mode.PRIMING  # without control the judge has nothing to yield any more
+    flight.failsafe_mode = Mode.PRIMING  # without control the failsafe sees no override any more
     assert flight.run(120.0) == []  # past every timeout
     flight.flight_mode = FlightMode.EXTERNAL  # not even when the pilot tries our mode
     assert flight.run(5.0) == []
@@ -30,7 +30,7 @@ def test_after_a_pilot_took_over_nothing_is_ever_asked_again(phase: Phase) -> No
 
 
 @pytest.mark.parametrize("flown", [FlightMode.HOLD, FlightMode.MANUAL], ids=["by the autopilot", "by the pilot"])
-def test_only_the_operator_resumes_and_then_offboard_is_asked_for(flown: FlightMode) -> None:
+def test_only_the_operator_resumes_and_then_offboard_is_requested(flown: FlightMode) -> None:
     flight = controlled(Phase.TRACK)
     flight.failsafe_mode, flight.flight_mode = Mode.PILOT_OVERRIDE, flown
     flight.run(1.0)
@@ -52,7 +52,7 @@ def test_other_verbs_do_not_take_a_vehicle_from_its_pilot(verb: str) -> None:
     assert flight.run(10.0) == []
 
 
-def test_a_pilot_who_takes_over_while_the_autopilot_lands_is_not_fought() -> None:
+def test_a_pilot_override_during_the_landing_is_respected() -> None:
     flight = controlled(Phase.GOTO_LAND)
     flight.pos = START.copy()
     flight.until(Phase.LAND)
@@ -65,13 +65,13 @@ def test_a_pilot_who_takes_over_while_the_autopilot_lands_is_not_fought() -> Non
 
 
 @pytest.mark.parametrize("phase", [Phase.TAKEOFF, Phase.GOTO_START])
-def test_a_pilot_who_flies_before_the_mission_is_not_landed_by_its_time_out(phase: Phase) -> None:
+def test_a_pilot_in_control_before_the_mission_is_not_landed_by_the_timeout(phase: Phase) -> None:
     flight = Flight().until(phase)
     flight.flight_mode, flight.landed, flight.pos = FlightMode.MANUAL, IN_AIR, START.copy()
     assert flight.run(120.0) == []
 
 
-def test_a_pilot_who_takes_over_while_it_is_handed_back_in_the_air_is_not_put_on_hold() -> None:
+def test_a_pilot_override_during_handback_in_the_air_is_not_put_on_hold() -> None:
     flight = airborne().until(Phase.LAND)
     flight.flight_mode = FlightMode.MANUAL
     assert flight.run(10.0) == []
@@ -135,7 +135,7 @@ def test_stopping_while_it_climbs_lands_it() -> None:
 
 @pytest.mark.parametrize("verb", ["hold", "resume", "land", "rtl"])
 @pytest.mark.parametrize("phase", [Phase.LAND, Phase.DONE])
-def test_once_landing_verbs_change_nothing(phase: Phase, verb: str) -> None:
+def test_during_the_landing_verbs_change_nothing(phase: Phase, verb: str) -> None:
     flight = controlled(Phase.GOTO_LAND)
     flight.pos = START.copy()
     flight.until(phase)
@@ -144,7 +144,7 @@ def test_once_landing_verbs_change_nothing(phase: Phase, verb: str) -> None:
     assert (flight.phase, flight.state_machine.outcome) == before
 
 
-# -- what takes too long ----------------------------------------------------------------------------------------------
+# -- timeouts ---------------------------------------------------------------------------------------------------------
 
 
 def test_a_start_that_takes_too_long_is_given_up_on_the_ground() -> None:
@@ -213,10 +213,10 @@ def test_a_vehicle_found_in_the_air_is_handed_back_in_the_air(landed_at_first: L
     assert flight.armed
 
 
-# -- silence on the bus -----------------------------------------------------------------------------------------------
+# -- bus loss ---------------------------------------------------------------------------------------------------------
 
 
-def test_when_peers_fall_silent_it_comes_to_rest_and_goes_on_when_they_are_back() -> None:
+def test_bus_loss_brings_it_to_rest_and_recovery_resumes_the_mission() -> None:
     flight = controlled(Phase.TRACK)
     flight.pos, flight.vel, flight.bus_lost = np.array([4.0, 2.0, -2.0]), np.array([1.2, 0.0, 0.0]), True
     flight.run(0.1)
@@ -230,7 +230,7 @@ def test_when_peers_fall_silent_it_comes_to_rest_and_goes_on_when_they_are_back(
     assert flight.at == "GOTO_LAND"  # its time was over meanwhile
 
 
-def test_who_is_told_to_land_here_does_not_fly_home_because_the_bus_was_silent_for_a_while() -> None:
+def test_a_landing_in_place_stays_in_place_after_a_bus_loss() -> None:
     flight = controlled(Phase.TRACK)
     here = np.array([4.0, 2.0, -2.0])
     flight.pos = here.copy()
@@ -243,7 +243,7 @@ def test_who_is_told_to_land_here_does_not_fly_home_because_the_bus_was_silent_f
     np.testing.assert_allclose(pos[0], here, atol=1e-9)
 
 
-def test_who_is_told_in_silence_to_land_here_lands_here() -> None:
+def test_a_land_command_during_bus_loss_lands_in_place() -> None:
     flight = controlled(Phase.TRACK)
     here = np.array([4.0, 2.0, -2.0])
     flight.pos, flight.bus_lost = here.copy(), True
@@ -255,13 +255,13 @@ def test_who_is_told_in_silence_to_land_here_lands_here() -> None:
     np.testing.assert_allclose(pos[0], here, atol=1e-9)
 
 
-def test_silence_does_not_keep_it_in_the_air_for_ever_once_it_goes_home() -> None:
+def test_bus_loss_does_not_prevent_the_landing_on_the_way_home() -> None:
     flight = controlled(Phase.GOTO_LAND)
     flight.bus_lost, flight.pos = True, START.copy()
     assert Verb.LAND in flight.run(25.0)
 
 
-def test_in_silence_nobody_declares_itself_ready_or_lands_among_the_others() -> None:
+def test_during_bus_loss_no_agent_gets_ready_or_lands_among_others() -> None:
     on_its_way = controlled(Phase.GOTO_START)
     on_its_way.bus_lost, on_its_way.pos = True, START.copy()
     on_its_way.run(5.0)
@@ -276,7 +276,7 @@ def test_in_silence_nobody_declares_itself_ready_or_lands_among_the_others() -> 
     assert home.at == "GOTO_LAND"
 
 
-def test_taking_over_in_silence_it_stays_where_it_is() -> None:
+def test_control_taken_during_bus_loss_stays_in_place() -> None:
     flight = Flight().until(Phase.GOTO_START)
     flight.bus_lost, flight.pos = True, START + np.array([3.0, 0.0, 0.0])
     flight.run(0.5)
@@ -290,7 +290,7 @@ def test_taking_over_in_silence_it_stays_where_it_is() -> None:
 
 
 @pytest.mark.parametrize("phase", [Phase.ARM, Phase.TAKEOFF, *OURS])
-def test_after_a_reboot_of_its_autopilot_it_asks_for_nothing_any_more(phase: Phase) -> None:
+def test_after_a_reboot_of_the_autopilot_nothing_is_requested(phase: Phase) -> None:
     flight = controlled(phase) if phase in OURS else Flight().until(phase)
     flight.boots, flight.seen = 1, False  # no position yet
     flight.run(0.2)
@@ -320,9 +320,7 @@ def test_a_reboot_before_anything_was_armed_costs_nothing() -> None:
     ("mode", "failsafe"),
     [(FlightMode.RTL, True), (FlightMode.LAND, True), (FlightMode.HOLD, True), (FlightMode.MANUAL, False)],
 )
-def test_a_vehicle_found_in_a_failsafe_or_with_a_pilot_is_not_even_streamed_to(
-    mode: FlightMode, failsafe: bool
-) -> None:
+def test_no_setpoints_are_sent_to_a_vehicle_in_failsafe_or_with_a_pilot(mode: FlightMode, failsafe: bool) -> None:
     flight = airborne()
     flight.flight_mode, flight.failsafe = mode, failsafe
     assert flight.run(5.0) == []
@@ -337,7 +335,7 @@ def test_a_vehicle_found_in_a_failsafe_or_with_a_pilot_is_not_even_streamed_to(
 CLOSE = START + np.array([0.6, 0.0, 0.0])
 
 
-def test_who_lands_where_it_is_goes_where_there_is_room_first() -> None:
+def test_a_landing_in_place_moves_to_a_free_place_first() -> None:
     flight = controlled(Phase.TRACK)
     flight.pos, flight.others = START.copy(), (CLOSE,)
     flight.failsafe_mode = Mode.TRACKING
@@ -350,7 +348,7 @@ def test_who_lands_where_it_is_goes_where_there_is_room_first() -> None:
     assert Verb.LAND in flight.run(6.0)
 
 
-def test_below_is_no_room_and_those_above_each_other_part_in_different_directions() -> None:
+def test_stacked_vehicles_part_in_different_directions_before_landing() -> None:
     low, high = START.copy(), START - np.array([0.0, 0.0, 3.0])
     assert nearest_in_plane_m(low, [high]) == 0.0
     apart = [room_for(low, [high], 1.2, own) - room_for(high, [low], 1.2, own + 1) for own in range(4)]
@@ -361,7 +359,7 @@ def test_below_is_no_room_and_those_above_each_other_part_in_different_direction
     np.testing.assert_array_equal(room_for(low, [], 1.2, 0), low)
 
 
-def test_without_room_for_too_long_it_lands_all_the_same() -> None:
+def test_after_the_timeout_it_lands_even_without_room() -> None:
     flight = controlled(Phase.TRACK)
     flight.pos, flight.others = START.copy(), (CLOSE,)
     flight.ask("land")
@@ -386,7 +384,7 @@ def test_only_without_a_plan_it_is_landed_at_once() -> None:
     assert Verb.LAND in flight.run(0.3)
 
 
-def test_a_landing_place_not_reached_in_time_is_left_at_rest_and_with_room() -> None:
+def test_after_the_timeout_of_a_landing_place_it_lands_at_rest_and_with_room() -> None:
     flight = controlled(Phase.GOTO_LAND)
     flight.failsafe_mode, flight.vel = Mode.TRACKING, np.array([1.0, 0.0, 0.0])
     assert Verb.LAND not in flight.run(21.0)

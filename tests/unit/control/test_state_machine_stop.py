@@ -1,4 +1,4 @@
-"""A stop is never lost, and no vehicle is taken for disarmed without a HEARTBEAT that is newer than the arm request."""
+"""Tests that no stop is lost and that "disarmed" needs a HEARTBEAT newer than the arm request."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.benches.state_machine_flight import IN_AIR, ON_GROUND, START, Flight
 
 
 def asked_to_arm(busy: bool) -> Flight:
-    """In ARM with the request out; the newest HEARTBEAT is older than it and says "disarmed"."""
+    """Return a flight in ARM with an open request, whose newest HEARTBEAT is older and says "disarmed"."""
     flight = Flight().until(Phase.ARM)
     flight.beat_us = flight.now_us - 100_000
     assert flight.run(0.1) == [Verb.ARM]
@@ -37,7 +37,7 @@ def test_a_stop_between_the_acknowledgement_of_arming_and_its_heartbeat_disarms(
     assert (flight.at, flight.state_machine.outcome) == ("DONE", OPERATOR_STOP)
 
 
-def test_what_refuses_after_arming_was_asked_for_disarms_before_it_gives_up() -> None:
+def test_a_refusal_after_an_arm_request_disarms_before_giving_up() -> None:
     flight = asked_to_arm(busy=False)
     flight.refusal = "COM_OBL_RC_ACT = 7"
     assert Verb.DISARM in flight.run(1.0)
@@ -60,7 +60,7 @@ def test_a_stop_before_the_first_vehicle_state_is_kept_until_there_is_one(verb: 
 
 
 def test_a_stop_before_the_first_state_lands_a_vehicle_that_hovers_armed() -> None:
-    """What an agent does that is started beside a vehicle whose agent died."""
+    """The case of an agent started beside a vehicle whose agent died."""
     flight = Flight()
     flight.seen = False
     flight.ask("land")
@@ -116,7 +116,7 @@ def test_land_on_the_way_home_lands_here_and_repeating_it_does_not_begin_again()
     assert flight.state_machine._entered_us == began_us
 
 
-def test_passing_causes_are_waited_for_and_named_when_time_is_up() -> None:
+def test_temporary_causes_are_waited_for_and_named_at_the_timeout() -> None:
     flight = Flight(start_timeout_s=20.0)
     flight.unsettled = "the estimator's accuracy to settle (now 14.10 m)"
     assert flight.run(19.0) == []
@@ -143,7 +143,7 @@ def test_a_vehicle_left_in_offboard_is_put_on_hold_so_that_it_can_be_armed() -> 
 
 
 @pytest.mark.parametrize("phase", [Phase.GOTO_LAND, Phase.LAND, Phase.DONE])
-def test_who_waits_for_the_beginning_goes_home_when_a_peer_gives_up(phase: Phase) -> None:
+def test_an_agent_waiting_for_the_beginning_goes_home_when_a_peer_gives_up(phase: Phase) -> None:
     flight = Flight().until(Phase.READY)
     flight.peer(phase)
     flight.run(0.3)
