@@ -129,7 +129,7 @@ class Agent:
             sink,
         )
         self.timing = TickTiming(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-        self._promise_ns = 0  # of the last tick
+        self._promise_ns = 0  # time spent on coordination in the last tick
         self._gaps = self._jumps = 0  # setpoint gaps and estimate jumps already reported
         self._announced: tuple[Phase, Mode, FlightMode] | None = None
         self._alerts = Alerts()
@@ -169,7 +169,7 @@ class Agent:
 
     @property
     def commits_refused(self) -> int | None:
-        """Proposals that were not flown after peers had been heard; None unless separation is guaranteed."""
+        """Number of proposals withdrawn or expired; None unless separation is guaranteed."""
         counts = None if self._coordination is None else self._coordination.counts
         return None if counts is None else counts.withdrawn + counts.expired
 
@@ -307,12 +307,12 @@ class Agent:
             reference = promised
         guess = self._plan_buffer.guess_ned_m(act_us)
         controller = self._controller if self._state_machine.phase is Phase.TRACK else self._transit
-        kept = tuple(keep_outs) if promised is None else ()  # what it has promised keeps clear already
+        kept = tuple(keep_outs) if promised is None else ()  # a committed trajectory keeps clear of them already
         plan = controller.plan(Problem(start, reference, estimate.disturbance_ned_m_s2, kept, guess))
         return PlanningResult(start, plan, now_ref, keep_outs)
 
     def _coordinated(self, now_us: int, state: VehicleState, flies: bool) -> Reference | None:
-        """What has been promised, over the horizon from when the setpoint acts; None when nothing is."""
+        """Return the committed trajectory over the horizon from when the setpoint acts; None if there is none."""
         if self._coordination is None:
             return None
         utc_us, began_ns = self._clock.utc_us(), self._stopwatch_ns()

@@ -65,7 +65,7 @@ def make_estimator(setup: AgentSetup) -> DisturbanceObserver | StateFilter:
 
 
 def make_last_layer(setup: AgentSetup, world_model: WorldModel, note: Note, stopwatch_ns: Stopwatch) -> LastLayer:
-    """Of the bodies around it."""
+    """Return the safety filter that keeps the vehicle clear of the bodies around it."""
     dt_s = 1.0 / setup.params.rate_hz
     downwash = setup.separation.downwash
     return LastLayer(setup.params.barrier, setup.vehicle_model, dt_s, world_model, downwash, note, stopwatch_ns)

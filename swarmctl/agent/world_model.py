@@ -160,7 +160,7 @@ class WorldModel:
         return found + [keep_out_of_obstacle(o, dt_us, steps, self._params) for o in seen]
 
     def astray(self, intents: Mapping[int, Intent], utc_us: int, allowed_m: float) -> set[int]:
-        """Peers whose path of just now is farther than allowed from everything that they have promised to follow."""
+        """Return peers whose recent path deviates by more than `allowed_m` from all trajectories they committed to."""
         found = set()
         for path in self.paths.latest():
             intent, at_us = intents.get(path.agent), path.t0_utc_us
@@ -203,7 +203,7 @@ class WorldModel:
         return found + [body_of_obstacle(o, ahead_s, apart_m) for o in visible(self._obstacles, pos_ned_m)]
 
     def promises(self, agent: int) -> bool:
-        """Whether a peer flies by promises, as far as it is known."""
+        """Return whether a peer flies by commitments; true while its status is unknown."""
         status = self._status.get(agent)
         return status is None or status.promises
 

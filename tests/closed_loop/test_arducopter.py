@@ -1,4 +1,4 @@
-"""The default circle on simulated ArduCopters: GUIDED, C-cast parameters, nothing told unless asked for."""
+"""Tests of the default circle on simulated ArduCopters: GUIDED, C-cast parameters, streams on request only."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CONFIG = "ardupilot_sitl.toml"
 
 @pytest.fixture(scope="module")
 def circle() -> Iterator[Flight]:
-    """Three agents, 10 s, from the ground and back."""
+    """Fly three agents for 10 s, from the ground and back."""
     yield fly_now("mission.duration_s=10", config=CONFIG)
 
 

@@ -1,4 +1,4 @@
-"""A small campaign: protections and their control, the same seed twice, going on after it was killed, the report."""
+"""Tests of a small campaign: protections and negative control, repeated seeds, resuming after a kill, the report."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def rows_in(directory: Path) -> list[Row]:
 
 @pytest.fixture(scope="module")
 def quick(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What README.md shows."""
+    """The campaign shown in README.md."""
     out = tmp_path_factory.mktemp("campaign")
     (line,) = (line for line in (ROOT / "README.md").read_text().splitlines() if line.startswith(SHOWN))
     command = [sys.executable, *shlex.split(line)[1:], "--out", str(out)]
@@ -87,7 +87,7 @@ def test_the_report_has_every_cell_with_its_exact_interval(quick: Path) -> None:
 
 
 def test_scenario_events_happen_in_flight() -> None:
-    """Two agents; the bus falls apart for 2 s: paths age, both come through."""
+    """The bus of two agents is partitioned for 2 s: plans get stale, and both reach their goals."""
     trial = Trial(Cell("partition", 2, 0.0, 0.0, "exact", 0.0, "default"), 1)
     flight = Flight(trial, layout_of("partition", 1, 2))
     flight.run()

@@ -1,4 +1,4 @@
-"""The default mission: three agents share a climbing circle (thesis 4.3)."""
+"""Tests of the default mission: three agents share a climbing circle (thesis 4.3)."""
 
 from __future__ import annotations
 

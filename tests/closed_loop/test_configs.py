@@ -1,4 +1,4 @@
-"""Every file of configs/ is flown, shortened, or validated when it needs vehicles of its own."""
+"""Tests every file of configs/: it is flown, shortened, or only validated when it needs other vehicles."""
 
 from __future__ import annotations
 

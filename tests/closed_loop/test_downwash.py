@@ -1,4 +1,4 @@
-"""Two agents whose ways cross one above the other: with downwash neither passes closely below."""
+"""Tests that with downwash neither of two agents with crossing references passes closely below the other."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ CROSSING = (
 
 
 def scaled_m(flight: Flight, downwash: float) -> float:
-    """Smallest true distance with heights scaled."""
+    """Return the smallest true distance with heights scaled."""
     apart = (flight.pos_ned_m[:, 0] - flight.pos_ned_m[:, 1]) * [1.0, 1.0, 1.0 / downwash]
     return float(np.linalg.norm(apart, axis=1).min())
 

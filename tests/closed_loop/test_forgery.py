@@ -1,4 +1,4 @@
-"""A stranger on the bus writes under a peer's name. Nobody is silenced, nobody comes closer, and the run says so."""
+"""Tests of forged messages under a peer's name: no peer is silenced, distances are kept, the run reports it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.closed_loop.conftest import Flight, Fly, fly_now, mission_t_s
 
 AGENTS, VICTIM, STRANGER = 4, 1, 999
 LAST = 2**32 - 1
-CROSSED_S = 5.0  # they meet after three
+CROSSED_S = 5.0  # the agents meet after 3 s
 FORGED_S = 2.0
 GUARANTEED = "separation.mode=guaranteed"
 SWAP = (
@@ -44,7 +44,7 @@ def swap(fly: Fly, *overrides: str, at: dict[float, Callable[[Lockstep], None]] 
 
 
 def summary(flight: Flight) -> dict[str, Any]:
-    """As the run folder would say, had all gone well from there."""
+    """Return the summary of the flight so far as if it had been completed."""
     logs = flight.lockstep.logs
     events = [event for log in logs for event in log.events]
     data = RunData({log.agent: log.ticks for log in logs}, flight.lockstep.truth, events)
@@ -56,7 +56,7 @@ def say(running: Lockstep, topic: topics.Topic, payload: bytes, name: int = VICT
 
 
 def forge_paths(running: Lockstep) -> None:
-    """By everybody's name one of another life and one of the highest number: far away, at rest."""
+    """Forge two paths under each name, far away and at rest: one with another boot id, one with the highest number."""
     at_us = running.clock.utc_us() + 40_000
     for agent in range(AGENTS):
         away = np.tile([60.0, 20.0 * agent, -2.0], (26, 1))
@@ -66,7 +66,7 @@ def forge_paths(running: Lockstep) -> None:
 
 
 def overhear(heard: list[bytes], topic: topics.Topic) -> Callable[[Lockstep], None]:
-    """Keep what the victim says on a topic."""
+    """Record the messages of the victim on a topic."""
 
     def tap(running: Lockstep) -> None:
         carry = running.hub.carry
@@ -83,7 +83,7 @@ def overhear(heard: list[bytes], topic: topics.Topic) -> Callable[[Lockstep], No
 
 @pytest.fixture(scope="module")
 def twin() -> Flight:
-    """The same flight, untouched."""
+    """Fly the same flight without forgery."""
     return swap(fly_now)
 
 
@@ -103,7 +103,7 @@ def test_forged_paths_change_nothing_and_are_reported(fly: Fly, twin: Flight) ->
 
 
 def newest_wins(self: Speaker, said: Said, utc_us: int) -> str:
-    """What was believed before there were claims."""
+    """Accept the message with the highest number, without the checks under test."""
     known, stream = self._believed, _Stream(said.boot_id, said.seq, said.said_utc_us, utc_us, utc_us)
     if known is not None and (said.boot_id, said.seq) < (known.boot_id, known.seq):
         return "replayed"
@@ -173,7 +173,7 @@ def test_late_and_lost_messages_raise_no_forgery_alarm(fly: Fly) -> None:
 
 
 def test_commands_with_old_or_future_stamps_are_refused_and_the_last_one_counts(fly: Fly) -> None:
-    """A `land` of 1970, one of in an hour, and a `hold` that comes again after it was lifted."""
+    """The commands are a `land` stamped 1970, one stamped in an hour, and a `hold` repeated after its resume."""
     speeds_m_s: list[float] = []
 
     def order(running: Lockstep, verb: Verb, at_us: int) -> None:

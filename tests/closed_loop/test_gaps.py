@@ -1,4 +1,4 @@
-"""An agent that was stopped for a moment: it rejoins before the autopilot's failsafe acts, or learns that it has."""
+"""Tests of an agent stopped briefly: it continues before the autopilot's failsafe acts, or notices that it has."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ AT_S = 4.03
 
 
 def freeze(running: Lockstep) -> None:
-    """Its modes are told by HEARTBEAT alone, once a second: between two of them, unless it is asked."""
+    """The vehicle reports modes by HEARTBEAT only, once a second, or on request."""
     endpoint = running.world.endpoints[0]
     assert isinstance(endpoint, Endpoint)
     endpoint.set_interval(dialect.MAVLINK_MSG_ID_CURRENT_MODE, -1)
@@ -25,14 +25,14 @@ def freeze(running: Lockstep) -> None:
 
 
 def gaps(flight: Flight) -> list[float]:
-    """Times between setpoints while tracking [s], the longest first."""
+    """Return the times between setpoints while tracking [s], the longest first."""
     ticks = flight.ticks(0)
     ticks = ticks[(ticks["phase"] == Phase.TRACK) & np.isfinite(ticks["setpoint_thrust_01"])]
     return sorted((np.diff(ticks["t_us"]) * 1e-6).tolist(), reverse=True)
 
 
 def fly_stopped_for(fly: Fly, seconds: float) -> Flight:
-    """Until three seconds after the agent was stopped."""
+    """Fly until three seconds after the agent was stopped."""
     stopped_us: list[int] = []
 
     def stop(running: Lockstep) -> None:

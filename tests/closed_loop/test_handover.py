@@ -1,6 +1,6 @@
-"""Between agent, autopilot and pilot: who flies, how it is handed over, and that nobody takes it back unasked.
+"""Tests of handovers between agent, autopilot and pilot; control is never retaken without a command.
 
-Each protection beside the same flight without it.
+Each protection is tested beside the same flight without it.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from swarmctl.mavlink.transport import PipeTransport
 from tests.closed_loop.conftest import Fly, mission_t_s
 
 SETPOINT = 82  # SET_ATTITUDE_TARGET
-SLEEP_S = 1.62  # wakes in a tick in which the state is told but not the mode
+SLEEP_S = 1.62  # the first tick afterwards receives a state but no mode
 
-# four cross one point at close quarters and at speed, all told to land there
+# four agents cross one point closely and fast, and are commanded to land there
 CROSSING = (
     "swarm.agents=4",
     "start.positions_ned_m=[[3.0,0.0,0.0],[-3.0,0.1,0.0],[0.1,3.0,0.0],[0.0,-3.0,0.0]]",
@@ -65,7 +65,7 @@ ALONE = ("swarm.agents=1", "mission.duration_s=8")
 
 
 class Watched:
-    """One agent and its vehicle; notes when setpoints leave and when the vehicle is in OFFBOARD, armed."""
+    """One agent and its vehicle; records when setpoints leave and when the vehicle is armed in OFFBOARD."""
 
     def __init__(self, *overrides: str) -> None:
         self.run = Lockstep(load(None, (*ALONE, *overrides)))
@@ -97,7 +97,7 @@ class Watched:
         return self
 
     def restart_agent(self) -> None:
-        """A new process beside the same vehicle."""
+        """Start a new agent process beside the same vehicle."""
         self.run.agents[0] = self.run._agent(0, self.run.links[0][0])
 
     def _listen(self) -> None:
@@ -111,7 +111,7 @@ class Watched:
 
 
 def asleep_past_the_loss() -> Watched:
-    """The agent's process stands still; its socket keeps half a second and drops the rest, as UDP's does."""
+    """Stop the agent's process; its socket keeps half a second of datagrams and drops the rest, as UDP does."""
     flight = Watched().until_mission(2.0)
     ours, vehicles = flight.run.links[0]
     flight.run.frozen.add(0)
@@ -143,7 +143,7 @@ def test_control_without_doubting_the_mode_it_returns_to_offboard(monkeypatch: p
 
 
 def restarted_while_the_autopilot_flies_home(switched_off: Callable[[], None] = lambda: None) -> Watched:
-    """With PX4's own choice of what to do when setpoints stop."""
+    """Use PX4's default action for the loss of setpoints."""
     flight = Watched("agent.autopilot_params.COM_OBL_RC_ACT=3").until_mission(3.0)
     switched_off()
     flight.run.kill(0)
@@ -159,7 +159,7 @@ def restarted_while_the_autopilot_flies_home(switched_off: Callable[[], None] = 
 def test_a_restarted_agent_leaves_control_to_an_active_failsafe() -> None:
     flight = restarted_while_the_autopilot_flies_home()
     assert flight.setpoints_us == flight.offboard_us == []
-    flight.run.command("resume")  # an operator means it
+    flight.run.command("resume")  # the operator's explicit command
     flight.step_for(1.0)
     assert flight.setpoints_us
     assert flight.offboard_us

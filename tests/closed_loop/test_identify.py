@@ -1,7 +1,6 @@
-"""What `swarmctl check --identify` flies, in lockstep: it finds the vehicle, comes back, and pays off on the circle.
+"""Tests of the flight of `swarmctl check --identify`: it identifies the vehicle, lands, and improves the circle.
 
-The x500 answers as PX4 does and its estimator errs as PX4's does; the agent begins with a model that knows neither lag
-nor drag.
+The x500 responds as PX4 does and its estimator has PX4's errors; the agent begins with a model without lag and drag.
 """
 
 from __future__ import annotations
@@ -58,7 +57,7 @@ def test_the_interval_of_drag_holds_the_truth_and_is_narrow() -> None:
 
 
 def circle_rmse_m(*overrides: str) -> float:
-    """Of the reported position, from 10 s on."""
+    """Return the error of the reported position from 10 s on [m]."""
     ticks = fly(*AIR, *CIRCLE, *overrides).logs[0].ticks
     late = ticks[(ticks["phase"] == Phase.TRACK) & (ticks["mission_t_s"] >= 10.0)]
     assert len(late) > 450

@@ -1,4 +1,4 @@
-"""Wind, a heavier vehicle, a sagging battery and a wrong thrust curve at once cost a lone vehicle next to nothing."""
+"""Tests that wind, a heavier vehicle, a sagging battery and a wrong thrust curve together cost little accuracy."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ BLIND = ("agent.disturbance.limit_m_s2=0.01",)
 
 
 class Errors(NamedTuple):
-    """Of the true position against the reference once steady [m]."""
+    """Return the steady error of the true position against the reference [m]."""
 
     rmse_m: float
     mean_down_m: float
@@ -77,7 +77,7 @@ def test_at_rest_no_error_remains() -> None:
     [
         (BLIND, 1.0),
         (("agent.disturbance.limit_m_s2=4",), 0.4),  # 8 m/s are 8 m/s2 at 1 1/s of drag
-        (("agent.state_filter.enabled=false",), 0.2),  # the plain observer takes drag for wind that turns
+        (("agent.state_filter.enabled=false",), 0.2),  # the plain observer mistakes drag for a rotating wind
         (("controller.mpc.u_max=0.45", "vehicle_model.tilt_max_rad=0.47"), 1.0),
     ],
     ids=["no estimate", "4 m/s2 at most", "no filter", "no room to lean"],

@@ -1,7 +1,7 @@
-"""Which QP solver flies must not matter: what is promised of a flight is the same with either.
+"""Tests that every claim about a flight holds with either QP solver.
 
-Not so where everybody is, centimetre by centimetre. Three vehicles that press towards one moving point may stand round
-it at any angle, so the way they settle depends on the smallest difference; the control below shows how much.
+Single positions may differ. Three vehicles that close in on one moving point may settle around it at any angle, which
+depends on the smallest difference; the negative control below shows how much.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def daqp() -> Flight:
 
 
 def apart_m(one: Flight, other: Flight) -> NDArray[np.float64]:
-    """Distance of every vehicle between two flights (K, N) at the same mission times, one each 0.02 s."""
+    """Return the distance (K, N) of every vehicle between two flights at common mission times, 0.02 s apart."""
     paths = []
     for flight in (one, other):
         began_s = flight.tracked(0)[0]["t_us"][0] * 1e-6

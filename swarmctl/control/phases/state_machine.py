@@ -27,7 +27,7 @@ from swarmctl.core.types import Array, Command, FlightMode, Landed, Mode, Phase,
 _REQUEST_PERIOD_US = 1_000_000  # time between repetitions of a request
 _SPIN_UP_US = 6_000_000  # ArduCopter's rotors spin up for over 3 s, during which it refuses a second TAKEOFF
 _SETTLE_S = 2.0  # time after a stop trajectory in which the vehicle comes to rest
-_BEGIN_DELAY_US = 1_000_000  # from the last agent's readiness to mission time 0, longer than any message takes
+_BEGIN_DELAY_US = 1_000_000  # from the last agent's readiness to mission time 0; several statuses are sent meanwhile
 _HOVER_LEARNING_US = 1_000_000  # hover flown by the autopilot itself, during which its hover thrust is learned
 _ROOM_MARGIN_M = 0.1  # the target lies beyond the required distance, because it is reached with a tolerance
 _PLAN_MODES = (Mode.TRACKING, Mode.REPLAY)
