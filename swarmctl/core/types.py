@@ -58,7 +58,7 @@ class Phase(enum.IntEnum):
 
 
 class Mode(enum.IntEnum):
-    """What the agent does this tick; decided by `control.failsafe` from `Health`."""
+    """Mode of the agent in a tick, decided by `control.phases.failsafe` from `Health`."""
 
     IDLE = 0  # nothing is sent: before take-off, after landing
     PRIMING = 1  # setpoints flow but the autopilot still flies
@@ -240,7 +240,7 @@ class Health:
     speed_m_s: float
     phase: Phase
     had_control: bool  # the autopilot has followed our setpoints and we have not given it back
-    pilot_override: bool  # somebody took over; stays until an operator resumes
+    pilot_override: bool  # pilot or autopilot took over; lasts until an operator resumes
 
 
 @dataclass(frozen=True, slots=True)

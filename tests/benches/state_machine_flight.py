@@ -37,7 +37,9 @@ class Flight:
         self.arm_in: FlightMode | None = None
         self.boots = 0
         self.refusal = self.unsettled = ""
-        self.beat_us: int | None = None  # the HEARTBEAT that told `armed`; None: one comes with every step
+        self.beat_us: int | None = (
+            None  # arrival of the HEARTBEAT that reported `armed`; None: one arrives with every step
+        )
         self.busy = self.bus_lost = False
         self.seen = True
         self.peers = {k + 1: PeerInputs(Phase.STANDBY, 0, True) for k in range(peers)}
@@ -131,7 +133,7 @@ def ready(peers: int = 1) -> Flight:
     return flight
 
 
-OURS = (Phase.GOTO_START, Phase.READY, Phase.TRACK, Phase.GOTO_LAND)
+CONTROLLED_PHASES = (Phase.GOTO_START, Phase.READY, Phase.TRACK, Phase.GOTO_LAND)
 
 
 def controlled(phase: Phase) -> Flight:

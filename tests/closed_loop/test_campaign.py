@@ -113,7 +113,7 @@ def test_a_killed_campaign_resumes(tmp_path: Path) -> None:
         campaign.send_signal(signal.SIGKILL)
         campaign.wait()
     _, alive = psutil.wait_procs(children, timeout=10.0)
-    assert children and alive == [], "nobody flies on for nobody"
+    assert children and alive == [], "no worker outlives its campaign"
     before = rows_in(tmp_path)
     assert 1 <= len(before) < 50
     highest = max(row["seed"] for row in before)

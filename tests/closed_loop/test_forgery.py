@@ -116,7 +116,7 @@ def test_control_where_the_newest_is_believed_they_meet(fly: Fly, monkeypatch: p
     flight = swap(fly, at={FORGED_S: forge_paths})
     assert flight.separation_m() < 0.1
     found = summary(flight)["comms"]["unheard"]
-    assert found["longest_s"] > 1.0, "who was silenced is named"
+    assert found["longest_s"] > 1.0, "the silenced peer is named"
 
 
 def test_forged_statuses_have_no_effect(fly: Fly, twin: Flight) -> None:

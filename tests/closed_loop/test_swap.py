@@ -14,7 +14,7 @@ def check(flight: Flight) -> None:
     assert flight.separation_m() >= 0.85
     for agent in range(8):
         _, error = flight.tracked(agent)
-        assert np.linalg.norm(error[-1]) < 0.1, "everybody arrives"
+        assert np.linalg.norm(error[-1]) < 0.1, "all arrive"
         assert not flight.ticks(agent)["barrier_acted"].any(), "the last layer is not what keeps them apart"
 
 

@@ -28,14 +28,14 @@ class Bench:
     """Agent 0 among agents 1 and 2, and an operator."""
 
     clock: SimClock = field(default_factory=SimClock)
-    told: list[dict[str, Any]] = field(default_factory=list)
+    events: list[dict[str, Any]] = field(default_factory=list)
     seq: int = 0
 
     def __post_init__(self) -> None:
         self.hub = LocalHub(self.clock.now_us)
         self.bus = self.hub.attach(agent_name(0))
         self.peer, self.operator = self.hub.attach(agent_name(1)), self.hub.attach(topics.OPERATOR)
-        note = lambda name, **fields: self.told.append({"event": name, **fields})  # noqa: E731
+        note = lambda name, **fields: self.events.append({"event": name, **fields})  # noqa: E731
         self.world_model = WorldModel(0, [1, 2], SeparationParams(), self.bus, 50.0, note)
 
     def tick(self) -> list[str]:
@@ -67,7 +67,7 @@ class Bench:
 
     @property
     def unheard(self) -> list[dict[str, Any]]:
-        return [row for row in self.told if row["event"] == "unheard"]
+        return [row for row in self.events if row["event"] == "unheard"]
 
 
 def test_a_list_of_too_many_obstacles_is_refused_and_reported() -> None:
@@ -124,7 +124,7 @@ def test_a_peer_refused_for_long_counts_as_bus_loss_and_is_avoided_at_any_height
     assert kept.any_height and kept.radius_m > SeparationParams().radius_m + 0.9
     assert bench.world_model.refusals.alert(utc_us) == "path of agent-1 refused: future"
     assert bench.unheard == [{"event": "unheard", "agent": 1, "begins": True}]
-    assert [row["count"] for row in bench.told if row["event"] == "refused"] == [1, 51]
+    assert [row["count"] for row in bench.events if row["event"] == "refused"] == [1, 51]
     bench.say_path()
     bench.tick()
     assert not bench.world_model.is_bus_lost(bench.clock.utc_us())

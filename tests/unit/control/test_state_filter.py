@@ -78,7 +78,7 @@ def test_a_bias_of_the_reported_velocity_is_taken_out() -> None:
     left = velocity_error_m_s(World(np.zeros(3), bias_m_s=0.25, noise=0.02), make(), 30.0, 5.0)
     believed = velocity_error_m_s(World(np.zeros(3), bias_m_s=0.25, noise=0.02), make(bias_m_s=0.0), 30.0, 5.0)
     assert left < 0.06
-    assert believed > 2.0 * left, "the control: without the bias state it is believed"
+    assert believed > 2.0 * left, "negative control: without the bias state the bias remains"
 
 
 def test_exact_states_stay_as_they_are() -> None:

@@ -8,12 +8,21 @@ import pytest
 from swarmctl.control.phases.state_machine import OPERATOR_STOP, REBOOTED
 from swarmctl.control.reference.landing_places import nearest_in_plane_m, room_for
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase, Verb
-from tests.benches.state_machine_flight import IN_AIR, ON_GROUND, OURS, START, Flight, controlled, ready, verbs
+from tests.benches.state_machine_flight import (
+    IN_AIR,
+    ON_GROUND,
+    CONTROLLED_PHASES,
+    START,
+    Flight,
+    controlled,
+    ready,
+    verbs,
+)
 
 # -- pilot override ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("phase", OURS)
+@pytest.mark.parametrize("phase", CONTROLLED_PHASES)
 def test_after_a_pilot_override_nothing_is_requested(phase: Phase) -> None:
     flight = controlled(phase)
     flight.failsafe_mode, flight.flight_mode = Mode.PILOT_OVERRIDE, FlightMode.MANUAL
@@ -173,7 +182,7 @@ def test_a_landing_place_that_cannot_be_reached_is_given_up() -> None:
     assert flight.at == "LAND"
 
 
-@pytest.mark.parametrize("phase", OURS)
+@pytest.mark.parametrize("phase", CONTROLLED_PHASES)
 def test_no_plan_for_too_long_lands(phase: Phase) -> None:
     flight = controlled(phase)
     flight.failsafe_mode = Mode.LAND
@@ -289,9 +298,9 @@ def test_control_taken_during_bus_loss_stays_in_place() -> None:
 # -- rebooted ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("phase", [Phase.ARM, Phase.TAKEOFF, *OURS])
+@pytest.mark.parametrize("phase", [Phase.ARM, Phase.TAKEOFF, *CONTROLLED_PHASES])
 def test_after_a_reboot_of_the_autopilot_nothing_is_requested(phase: Phase) -> None:
-    flight = controlled(phase) if phase in OURS else Flight().until(phase)
+    flight = controlled(phase) if phase in CONTROLLED_PHASES else Flight().until(phase)
     flight.boots, flight.seen = 1, False  # no position yet
     flight.run(0.2)
     assert flight.state_machine.outcome == REBOOTED

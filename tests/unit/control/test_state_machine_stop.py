@@ -139,7 +139,7 @@ def test_a_vehicle_left_in_offboard_is_put_on_hold_so_that_it_can_be_armed() -> 
     assert Verb.ARM in flight.run(0.3)
     armed = Flight()
     armed.flight_mode, armed.armable, armed.armed = FlightMode.EXTERNAL, False, True
-    assert armed.run(3.0) == [], "somebody else flies it"
+    assert armed.run(3.0) == [], "another pilot controls it"
 
 
 @pytest.mark.parametrize("phase", [Phase.GOTO_LAND, Phase.LAND, Phase.DONE])

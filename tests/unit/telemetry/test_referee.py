@@ -236,7 +236,7 @@ def test_a_vanished_vehicle_is_named_and_not_judged_by_its_last_position() -> No
 def test_a_reported_state_counts_at_its_own_time() -> None:
     delayed, still = ticks(10, (0.0, 0.0, 0.0)), ticks(10, (10.0, 0.0, 0.0))
     delayed["state_age_ms"] = 200.0
-    delayed["pos_ned_m"][:, 0] = delayed["mission_t_s"] - 0.2  # 1 m/s north, told 200 ms later
+    delayed["pos_ned_m"][:, 0] = delayed["mission_t_s"] - 0.2  # 1 m/s north, reported 200 ms later
     pair = judge(run({0: delayed, 1: still}), Rules(2, 0.1), "failed")["separation"]
     assert pair["min_m"] == pytest.approx(0.2, abs=0.03)
     assert pair["min_at_s"] == pytest.approx(9.8, abs=0.03)
