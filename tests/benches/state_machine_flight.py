@@ -37,9 +37,7 @@ class Flight:
         self.arm_in: FlightMode | None = None
         self.boots = 0
         self.refusal = self.unsettled = ""
-        self.beat_us: int | None = (
-            None  # arrival of the HEARTBEAT that reported `armed`; None: one arrives with every step
-        )
+        self.beat_us: int | None = None  # arrival of the HEARTBEAT that reported `armed`; None: one with every step
         self.busy = self.bus_lost = False
         self.seen = True
         self.peers = {k + 1: PeerInputs(Phase.STANDBY, 0, True) for k in range(peers)}

@@ -9,9 +9,9 @@ from swarmctl.control.phases.state_machine import OPERATOR_STOP, REBOOTED
 from swarmctl.control.reference.landing_places import nearest_in_plane_m, room_for
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase, Verb
 from tests.benches.state_machine_flight import (
+    CONTROLLED_PHASES,
     IN_AIR,
     ON_GROUND,
-    CONTROLLED_PHASES,
     START,
     Flight,
     controlled,
