@@ -131,7 +131,10 @@ class SitlWorld:
     """
 
     def __init__(
-        self, params: SitlParams, transports: Sequence[Transport], gcs_transports: Sequence[Transport] = ()
+        self,
+        params: SitlParams,
+        transports: Sequence[Transport],
+        gcs_transports: Sequence[Transport] = (),
     ) -> None:
         if len(transports) != params.vehicles or len(gcs_transports) not in (0, params.vehicles):
             raise ValueError(f"transports: {len(transports)} and {len(gcs_transports)} for {params.vehicles} vehicles")
@@ -302,7 +305,7 @@ class SitlWorld:
         )
         pilot.start_at(self.origins[vehicle])
         sysid, step_us = params.sysid_base + vehicle, round(self.plant.dt_s * 1e6)
-        report = self._reporter(vehicle, pilot)
+        report = self._publisher(vehicle, pilot)
         endpoint = Endpoint(sysid, link, pilot, report, step_us)
         if self._gcs_links:
             ground = Endpoint(sysid, self._gcs_links[vehicle], pilot, report, step_us, GCS_HZ)
@@ -325,7 +328,7 @@ class SitlWorld:
         self.gcs_endpoints.extend(faces[1:])
         return pilot, faces[0]
 
-    def _reporter(self, vehicle: int, pilot: Autopilot) -> Callable[[], Report]:
+    def _publisher(self, vehicle: int, pilot: Autopilot) -> Callable[[], Report]:
         plant, origin = self.plant, self.origins[vehicle]
         rotor_scale = 1.0 / plant.preset.rotor_force_max_n
         cached: list[Report] = []  # of the newest step, for the other link

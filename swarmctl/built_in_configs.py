@@ -1,4 +1,4 @@
-"""Where the configurations are that come with swarmctl: beside the package in a checkout, inside it when installed."""
+"""Finds the built-in configurations: beside the package in a checkout, inside it when installed."""
 
 from __future__ import annotations
 
@@ -10,10 +10,10 @@ _PLACES = (Path(__file__).parents[1] / "configs", Path(__file__).parent / "confi
 
 
 def shipped_config(name: str) -> Path:
-    """Path of `<name>.toml`.
+    """Return the path of the built-in configuration `<name>.toml`.
 
     Raises:
-        ConfigError: there is none.
+        ConfigError: there is none of that name.
     """
     for place in _PLACES:
         path = place / f"{name}.toml"

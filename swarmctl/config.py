@@ -1,7 +1,7 @@
-"""One frozen tree for a whole run, read from TOML. Config is refused, not repaired: all problems at once.
+"""Configuration of a whole run: one frozen tree, read from TOML. An invalid one is refused with all its problems.
 
-The parameter classes live beside the code they feed; this module composes them, checks what only the whole can tell,
-and writes the resolved copy. It does not open sockets or start anything.
+Parameter classes live beside the code that uses them. This module composes them, checks constraints between sections,
+and writes the resolved copy. It opens no sockets and starts nothing.
 """
 
 from __future__ import annotations
@@ -38,16 +38,16 @@ _PROBLEMS_SHOWN = 30
 
 
 class SwarmParams(Params):
-    """Who flies and in which frame."""
+    """Size of the swarm and origin of its frame."""
 
     agents: int = Field(3, ge=1, le=MAX_AGENTS)
-    origin_lat_deg: float = Field(47.397742, ge=-90, le=90)  # shared origin of every position in this file
+    origin_lat_deg: float = Field(47.397742, ge=-90, le=90)  # shared origin of all positions in the configuration
     origin_lon_deg: float = Field(8.545594, ge=-180, le=180)
     origin_alt_m: float = Field(489.4, ge=-500, le=9000)  # above mean sea level
 
 
 class StartParams(Params):
-    """Where each agent waits, at rest, until the mission begins; `positions_ned_m` wins over the line."""
+    """Positions at which agents wait for the mission to begin: a line, or `positions_ned_m` if given."""
 
     positions_ned_m: tuple[Vec3, ...] = Field((), strict=False)
     center_ned_m: Vec3 = (0.0, 0.0, 0.0)
@@ -56,54 +56,54 @@ class StartParams(Params):
 
 
 class VehicleParams(Params):
-    """One autopilot."""
+    """Address of one autopilot and, optionally, a model of its vehicle."""
 
     sysid: int = Field(ge=1, le=255)
     url: str
-    model: VehicleModelParams | None = None  # where it differs from the others; whole, instead of vehicle_model
+    model: VehicleModelParams | None = None  # replaces the whole section vehicle_model for this vehicle
 
 
 class SitlParams(RealismParams):
-    """The built-in simulator that launch starts; switched off to fly vehicles somebody else runs."""
+    """The built-in simulator that launch starts; disabled to fly other vehicles."""
 
     enabled: bool = True
     preset: Literal["thesis", "x500", "crazyflie", "arducopter"] = "thesis"
-    attitude_gains: Literal["swarm", "single", "pid_step", "pid_trajectory"] = "swarm"  # of the thesis airframe
+    attitude_gains: Literal["swarm", "single", "pid_step", "pid_trajectory"] = "swarm"  # for the thesis airframe only
     ground_z_m: float = Field(2.0, ge=-1000, le=1000)  # height of the ground below the shared origin, NED z
-    start: Literal["ground", "air"] = "ground"  # air: held at the start position, no ground anywhere (thesis)
-    ekf_ready_s: float = Field(1.0, ge=0, le=60)  # from its start until it can be armed; PX4 takes 4
+    start: Literal["ground", "air"] = "ground"  # air: vehicles begin at their start positions, without ground (thesis)
+    ekf_ready_s: float = Field(1.0, ge=0, le=60)  # from power-up until arming is possible; 4 in PX4
     mass_scale: float = Field(1.0, ge=0.3, le=1.9)  # true mass over the preset's, unknown to the bridge
-    estimator: Literal["exact", "gps", "external"] = "exact"  # what the autopilots' estimates are off by
-    autopilot_kind: Literal["px4", "arducopter"] = "px4"  # whose face the simulator shows
+    estimator: Literal["exact", "gps", "external"] = "exact"  # error model of the autopilots' estimates
+    autopilot_kind: Literal["px4", "arducopter"] = "px4"  # autopilot whose MAVLink interface is simulated
     link_latency_ms: float = Field(0.0, ge=0, le=1000)  # lockstep only
     physics_hz: int = Field(250, ge=50, le=1000)
-    gcs_port: int = Field(0, ge=0, le=65535)  # every vehicle has a second link to a ground station there; 0: none
-    reject_bad_setpoints: bool = True  # false: NaN and zero quaternions do what they do to PX4 1.18
-    speed: float = Field(1.0, gt=0, le=100)  # simulated over wall time; agents can't follow any but 1
+    gcs_port: int = Field(0, ge=0, le=65535)  # ground station, with a second link to every vehicle; 0: none
+    reject_bad_setpoints: bool = True  # false: NaN and zero quaternions have the effects they have on PX4 1.18
+    speed: float = Field(1.0, gt=0, le=100)  # simulated over wall time; agents require 1
 
     def realism(self) -> RealismParams:
-        """What the simulator's physics is given beside its airframe."""
+        """Return the realism parameters of the simulated physics."""
         return RealismParams(**{key: getattr(self, key) for key in RealismParams.model_fields})
 
 
 class BusParams(Params):
-    """Zenoh, and the seeded faults of the lockstep bus."""
+    """Parameters of the Zenoh bus, and the seeded faults of the lockstep bus."""
 
-    lease_ms: int = Field(1500, ge=500, le=10000)  # a silent link is declared dead after this
+    lease_ms: int = Field(1500, ge=500, le=10000)  # silence after which Zenoh closes a link
     delay_ms: float = Field(0.0, ge=0, le=5000)  # lockstep only, on top of one tick
     loss_01: float = Field(0.0, ge=0, le=1)  # lockstep only
 
 
 class TelemetryParams(Params):
-    """The one process that owns rerun."""
+    """Parameters of the viewer, the one process that uses rerun."""
 
     enabled: bool = True
-    port: int = Field(9877, ge=1, le=65535)  # loopback, not rerun's own default; the next free one when it is taken
+    port: int = Field(9877, ge=1, le=65535)  # loopback, not the default of rerun; the next free one if taken
     rate_hz: float = Field(10.0, gt=0, le=50)
 
 
 class ObstacleParams(Params):
-    """A sphere, or an upright column of any height, that agents see only from closer than `visibility_m`."""
+    """A sphere, or a vertical column of any height, visible to agents only from closer than `visibility_m`."""
 
     center_ned_m: Vec3
     column: bool = False
@@ -114,15 +114,15 @@ class ObstacleParams(Params):
 
 
 class LimitParams(Params):
-    """What the referee calls a violation."""
+    """Limits beyond which the referee counts a violation."""
 
     min_separation_m: float = Field(0.85, ge=0, le=100)
     obstacle_margin_m: float = Field(0.05, ge=0, le=10)  # allowed intrusion into keep_out_m
-    late_ticks_01: float = Field(0.2, ge=0, le=1)  # a gross failure of timing; figures are in summary.json
+    deadline_misses_01: float = Field(0.2, ge=0, le=1)  # largest fraction of deadlines missed
 
 
 class Config(Params):
-    """A whole run."""
+    """Configuration of a whole run."""
 
     name: str = Field("swarm", pattern=r"^[A-Za-z0-9_-]{1,40}$")
     seed: int = Field(1, ge=0, le=2**31 - 1)
@@ -141,7 +141,7 @@ class Config(Params):
     limits: LimitParams = LimitParams()
 
     def starts_ned_m(self) -> tuple[tuple[float, float, float], ...]:
-        """Start position of every agent, shared NED [m]."""
+        """Return the start position of every agent, shared NED [m]."""
         if self.start.positions_ned_m:
             return self.start.positions_ned_m[: self.swarm.agents]
         norm = math.sqrt(sum(c * c for c in self.start.direction_ned))
@@ -151,18 +151,18 @@ class Config(Params):
         return tuple((x + o * unit[0], y + o * unit[1], z + o * unit[2]) for o in offsets)
 
     def sysids(self) -> tuple[int, ...]:
-        """MAVLink system id of every agent's vehicle."""
+        """Return the MAVLink system id of every agent's vehicle."""
         if self.vehicles:
             return tuple(v.sysid for v in self.vehicles[: self.swarm.agents])
         return tuple(i + 1 for i in range(self.swarm.agents))
 
     def model_of(self, agent: int) -> VehicleModelParams:
-        """What is believed of one agent's vehicle."""
+        """Return the vehicle model of one agent."""
         own = self.vehicles[agent].model if self.vehicles else None
         return own or self.vehicle_model
 
     def rules(self, mode: Literal["realtime", "lockstep"] = "realtime") -> Rules:
-        """What the referee judges this run by."""
+        """Return the rules by which the referee judges this run."""
         return Rules(
             agents=self.swarm.agents,
             required_separation_m=self.limits.min_separation_m,
@@ -170,7 +170,7 @@ class Config(Params):
                 ObstacleRule(o.center_ned_m, o.keep_out_m, o.vel_ned_m_s, column=o.column) for o in self.obstacles
             ),
             obstacle_margin_m=self.limits.obstacle_margin_m,
-            late_ticks_01=self.limits.late_ticks_01,
+            deadline_misses_01=self.limits.deadline_misses_01,
             mode=mode,
             duration_s=self.mission.duration_s,
             downwash=self.separation.downwash,
@@ -185,7 +185,7 @@ def load(path: Path | None, overrides: Sequence[str] = ()) -> Config:
         overrides: `key.sub=value` items, values in TOML syntax (bare words are strings); list items by index.
 
     Raises:
-        ConfigError: every problem found, each with key, value, allowed range and fix.
+        ConfigError: the configuration is invalid; lists all problems with key, value, allowed range and fix.
     """
     source = str(path) if path else "defaults"
     tree = read_tree(path)
@@ -205,12 +205,12 @@ def load(path: Path | None, overrides: Sequence[str] = ()) -> Config:
 
 
 def dump(config: Config) -> str:
-    """The resolved configuration as TOML that `load` reads back to the same tree."""
+    """Return the resolved configuration as TOML, which `load` reads back to the same tree."""
     return toml_text(config.model_dump())
 
 
 def _explain(error: dict[str, Any]) -> str:
-    """One line with key, value, allowed range and fix."""
+    """Return one line with key, value, allowed range and fix."""
     location = [str(part) for part in error["loc"]]
     key = printable(".".join(location), 100)
     value = shown(error.get("input"))
@@ -224,7 +224,7 @@ def _explain(error: dict[str, Any]) -> str:
 
 
 def _hint(location: Sequence[str]) -> str:
-    """What somebody who wrote an unknown key may have meant: the same word elsewhere, or a like one here."""
+    """Suggest a correction for an unknown key: the same word in another section, or a similar one in this section."""
     elsewhere = [key for key in _all_keys(Config, "") if key.rpartition(".")[2] == location[-1]]
     if elsewhere:
         return f"did you mean {' or '.join(map(repr, elsewhere[:_PLACES_SHOWN]))}?"
@@ -280,7 +280,7 @@ def _range_of(location: Sequence[str]) -> str:
 
 
 def _whole(config: Config) -> Iterator[str]:
-    """What no single key can tell."""
+    """Yield problems between keys and sections."""
     agents = config.swarm.agents
     listed = len(config.start.positions_ned_m)
     if listed and listed < agents:
@@ -309,7 +309,7 @@ def _whole(config: Config) -> Iterator[str]:
 
 
 def _obstacle_problems(config: Config) -> Iterator[str]:
-    """What agents would refuse to hear of."""
+    """Yield problems with obstacles that agents would refuse as messages."""
     if len(config.obstacles) > MAX_OBSTACLES:
         yield f"obstacles: {len(config.obstacles)} are listed, agents keep {MAX_OBSTACLES} at most"
         return
@@ -376,7 +376,7 @@ def _vehicle_problems(config: Config) -> Iterator[str]:
 
 
 def _same_place(a: Endpoint, b: Endpoint) -> bool:
-    """Whether two links would meet: one serial device, one local port, or one remote address."""
+    """Return whether two links share a serial device, a local port or a remote address."""
     if a.scheme != b.scheme:
         return False
     if a.scheme == "serial":

@@ -1,7 +1,7 @@
-"""From a TOML file and `--set` items to a plain tree, refused in words where it could not be read, shown or nested.
+"""Reads a TOML file and `--set` items into a plain tree, and refuses what can't be read, shown or checked.
 
-What the keys mean is the business of `config`; here only the shape counts: a regular file of bounded size, tables and
-lists nested as deeply as a configuration has them, and integers that TOML allows (64 bits).
+`config` checks the meaning of keys. This module checks the form: a regular file of bounded size, bounded nesting, and
+integers of 64 bits, as in TOML.
 """
 
 from __future__ import annotations
@@ -16,23 +16,23 @@ from swarmctl.core.text import printable
 from swarmctl.errors import ConfigError
 from swarmctl.files import read_file
 
-_MOST_BYTES = 4_000_000
-_DEEPEST = 12  # sections and lists inside each other; ours need 5
+_MAX_BYTES = 4_000_000
+_MAX_DEPTH = 12  # nesting of sections and lists; a configuration needs 5
 _INT64 = range(-(2**63), 2**63)
-_SHOWN = 80
-_LONGEST_INDEX = 6  # digits
+_MAX_SHOWN = 80
+_MAX_INDEX_DIGITS = 6  # digits
 
 
 def read_tree(path: Path | None) -> dict[str, Any]:
-    """The tree of a TOML file; empty without one.
+    """Return the tree of a TOML file, empty for None.
 
     Raises:
-        ConfigError: there is no such file, or it can't be read as TOML.
+        ConfigError: the file does not exist or is no TOML.
     """
     if path is None:
         return {}
     try:
-        tree = tomllib.loads(read_file(path, _MOST_BYTES, follow=True).decode("utf-8"))
+        tree = tomllib.loads(read_file(path, _MAX_BYTES, follow=True).decode("utf-8"))
     except FileNotFoundError as error:
         raise ConfigError(str(path), ["no such file. Give the path of a TOML file, for example configs/"]) from error
     except OSError as error:
@@ -42,8 +42,10 @@ def read_tree(path: Path | None) -> dict[str, Any]:
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(str(path), [f"not TOML: {error}"]) from error
     except RecursionError as error:
-        raise ConfigError(str(path), [f"nested too deeply; allowed: {_DEEPEST} sections inside each other"]) from error
-    except ValueError as error:  # of a number: TOML's parser leaves its digits to Python
+        raise ConfigError(
+            str(path), [f"nested too deeply; allowed: {_MAX_DEPTH} sections inside each other"]
+        ) from error
+    except ValueError as error:  # raised by Python's int for too many digits
         raise ConfigError(str(path), ["holds an integer of too many digits; TOML's have 64 bits"]) from error
     problems = list(shape_problems(tree))
     if problems:
@@ -52,20 +54,20 @@ def read_tree(path: Path | None) -> dict[str, Any]:
 
 
 def override(tree: dict[str, Any], item: str) -> list[str]:
-    """Set `key.sub=value` in `tree`; returns what is wrong with it."""
+    """Set `key.sub=value` in `tree`; returns the problems with it."""
     key, equals, text = item.partition("=")
     parts = key.strip().split(".")
     if not equals or not all(parts):
         return [f"--set {shown(item)}: write it as key.sub=value"]
-    if len(parts) > _DEEPEST:
-        return [f"--set {printable(key, _SHOWN)}: {len(parts)} sections inside each other; allowed: {_DEEPEST}"]
+    if len(parts) > _MAX_DEPTH:
+        return [f"--set {printable(key, _MAX_SHOWN)}: {len(parts)} sections inside each other; allowed: {_MAX_DEPTH}"]
     try:
         value = _value(text)
     except ValueError as error:
-        return [f"--set {printable(key, _SHOWN)}: {error}"]
+        return [f"--set {printable(key, _MAX_SHOWN)}: {error}"]
     wrong = _place(tree, parts, value)
     if wrong:
-        return [f"--set {printable(key, _SHOWN)}: {wrong}"]
+        return [f"--set {printable(key, _MAX_SHOWN)}: {wrong}"]
     return [f"--set {problem}" for problem in shape_problems({key: value})]
 
 
@@ -92,41 +94,41 @@ def _place(tree: dict[str, Any], parts: list[str], value: Any) -> str:
 
 
 def _index(part: str, length: int) -> int | None:
-    """Place in a list of `length`, None for what is none."""
-    if not part.isdecimal() or len(part) > _LONGEST_INDEX:
+    """Return the list index that `part` names, None if it is not one of a list of `length`."""
+    if not part.isdecimal() or len(part) > _MAX_INDEX_DIGITS:
         return None
     return at if (at := int(part)) < length else None
 
 
 def _value(text: str) -> Any:
-    """A TOML value; anything that is not exactly one is the text itself.
+    """Parse a TOML value; text that is not exactly one value is returned as a string.
 
     Raises:
-        ValueError: it is one, but a number of too many digits or nested too deeply.
+        ValueError: a number has too many digits, or the value is nested too deeply.
     """
     try:
         tree = tomllib.loads(f"v = {text}")
     except tomllib.TOMLDecodeError:
         return text
     except RecursionError as error:
-        raise ValueError(f"nested too deeply; allowed: {_DEEPEST}") from error
+        raise ValueError(f"nested too deeply; allowed: {_MAX_DEPTH}") from error
     except ValueError as error:
         raise ValueError("an integer of too many digits; TOML's have 64 bits") from error
     return tree["v"] if tree.keys() == {"v"} else text
 
 
 def shape_problems(tree: dict[str, Any]) -> Iterator[str]:
-    """What is nested too deeply to be checked, and integers too large to be shown; without recursion."""
+    """Yield values nested too deeply and integers beyond 64 bits; works without recursion."""
     level: list[tuple[str, Any]] = list(tree.items())
-    for _ in range(_DEEPEST):
+    for _ in range(_MAX_DEPTH):
         for key, value in level:
             if isinstance(value, int) and value not in _INT64:
-                yield f"{printable(key, _SHOWN)} = {shown(value)}: TOML's integers have 64 bits"
+                yield f"{printable(key, _MAX_SHOWN)} = {shown(value)}: TOML's integers have 64 bits"
         level = [inner for key, value in level for inner in _inside(key, value)]
         if not level:
             return
     key = level[0][0]
-    yield f"{printable(key, _SHOWN)}: nested too deeply; allowed: {_DEEPEST} sections and lists inside each other"
+    yield f"{printable(key, _MAX_SHOWN)}: nested too deeply; allowed: {_MAX_DEPTH} sections and lists inside each other"
 
 
 def _inside(key: str, value: Any) -> Iterator[tuple[str, Any]]:
@@ -137,7 +139,7 @@ def _inside(key: str, value: Any) -> Iterator[tuple[str, Any]]:
 
 
 def shown(value: Any) -> str:
-    """A refused value in a message, of bounded length."""
+    """Return a refused value as text of bounded length."""
     if isinstance(value, int) and value not in _INT64:
         return f"an integer of {value.bit_length()} bits"
-    return printable(repr(value), _SHOWN)
+    return printable(repr(value), _MAX_SHOWN)

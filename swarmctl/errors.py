@@ -1,6 +1,6 @@
-"""One exception tree; every branch is one exit code of the command line.
+"""Exceptions of the program in one tree; every class has one exit code of the command line.
 
-Exceptions live at the borders (config, start-up, files). Inside a tick a failure is a value.
+Exceptions are raised at the borders (configuration, start-up, files). Inside a tick a failure is a value.
 """
 
 from __future__ import annotations
@@ -15,40 +15,40 @@ EXIT_USAGE = 2
 EXIT_START = 3
 EXIT_MISSION = 4
 EXIT_INTERRUPTED = 130
-_MOST_SHOWN = 2000  # characters of one problem
+_MAX_CHARACTERS = 2000  # characters of one problem
 
 
 class SwarmError(Exception):
-    """Anything the command line reports in words instead of a traceback."""
+    """Base of errors that the command line reports in words instead of a traceback."""
 
     exit_code = EXIT_MISSION
 
 
 class ConfigError(SwarmError):
-    """Bad usage or configuration; carries every problem found, not only the first."""
+    """Wrong usage or configuration; carries every problem found, not only the first."""
 
     exit_code = EXIT_USAGE
 
     def __init__(self, source: str, problems: Sequence[str]) -> None:
         self.source = source
         self.problems = tuple(problems)
-        super().__init__("\n".join(printable(f"{source}: {problem}", _MOST_SHOWN) for problem in self.problems))
+        super().__init__("\n".join(printable(f"{source}: {problem}", _MAX_CHARACTERS) for problem in self.problems))
 
 
 class StartError(SwarmError):
-    """A process, port, vehicle or link that was needed did not come up."""
+    """A required process, port, vehicle or link did not come up."""
 
     exit_code = EXIT_START
 
 
 class MissionError(SwarmError):
-    """The flight began and did not end as asked, or a limit was violated."""
+    """The flight began but its mission failed, or a limit was violated."""
 
     exit_code = EXIT_MISSION
 
 
 def exit_code_of(run: Callable[[], int], when_interrupted: str = "") -> int:
-    """What `run` returns; of an error, in words on standard error, and of Ctrl-C the exit code that says so."""
+    """Run `run` and return its exit code; errors go to standard error, Ctrl-C gives `EXIT_INTERRUPTED`."""
     try:
         return run()
     except SwarmError as error:

@@ -1,7 +1,7 @@
-"""Files at the border: read only what is a file of bounded size, replace in one step, never write through a link.
+"""Safe file access: reads only regular files of bounded size, replaces files atomically, never writes through links.
 
-A run folder, a campaign or a configuration may come from somebody else. What lies in it under an expected name can be
-a pipe that never ends, a device, or a symbolic link to a file of ours.
+A run folder, a campaign or a configuration may come from another person. A file in it with an expected name can be a
+pipe that never ends, a device, or a symbolic link to a private file.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import BinaryIO
 
-_NEW = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+_CREATE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
 def read_file(path: Path, most_bytes: int, follow: bool = False) -> bytes:
-    """Content of a regular file.
+    """Return the content of a regular file.
 
     Args:
-        path: of the file.
-        most_bytes: a larger file is refused before it is read.
+        path: path of the file.
+        most_bytes: largest size; a larger file is refused before it is read.
         follow: whether `path` itself may be a symbolic link.
 
     Raises:
-        FileNotFoundError: there is none.
-        OSError: it is something else than a regular file, is larger, or can't be read; `strerror` says which.
+        FileNotFoundError: the file does not exist.
+        OSError: it is not a regular file, is larger, or can't be read; `strerror` says which.
     """
-    flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | (0 if follow else os.O_NOFOLLOW)  # a pipe must not block
+    flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | (0 if follow else os.O_NOFOLLOW)  # opening a pipe would block
     try:
         fd = os.open(path, flags)
     except OSError as error:
@@ -52,15 +52,15 @@ def read_file(path: Path, most_bytes: int, follow: bool = False) -> bytes:
 
 @contextmanager
 def replaced(path: Path) -> Iterator[BinaryIO]:
-    """A new file that becomes `path` when the block ends well: a reader, or a crash, finds the old one or the new one.
+    """Open a new file that atomically becomes `path` when the block ends without an exception.
 
-    A symbolic link at `path` is replaced itself; what it points to stays as it is.
+    A symbolic link at `path` is itself replaced; its target stays as it is.
 
     Raises:
-        OSError: the disk refuses; the old file is untouched.
+        OSError: writing failed; the old file is untouched.
     """
     part = path.with_name(f".{path.name}.{secrets.token_hex(8)}.part")
-    fd = os.open(part, _NEW, 0o644)
+    fd = os.open(part, _CREATE_FLAGS, 0o644)
     try:
         with os.fdopen(fd, "wb") as file:
             yield file
@@ -71,7 +71,7 @@ def replaced(path: Path) -> Iterator[BinaryIO]:
 
 
 def replace_bytes(path: Path, content: bytes) -> None:
-    """Write a whole file in one step.
+    """Write a whole file atomically.
 
     Raises:
         OSError: the disk refuses; the old file is untouched.
@@ -81,7 +81,7 @@ def replace_bytes(path: Path, content: bytes) -> None:
 
 
 def replace_text(path: Path, text: str) -> None:
-    """Write a whole file of UTF-8 text in one step; what UTF-8 has no bytes for becomes a question mark.
+    """Write a whole file of UTF-8 text atomically; lone surrogates become question marks.
 
     Raises:
         OSError: the disk refuses; the old file is untouched.
@@ -91,7 +91,7 @@ def replace_text(path: Path, text: str) -> None:
 
 @contextmanager
 def replaced_by_program(path: Path) -> Iterator[Path]:
-    """A path that another program may write, in a private folder beside `path`, and that becomes `path` if it did.
+    """Yield a path in a private folder for another program to write to; if it did, the file becomes `path`.
 
     Raises:
         OSError: the disk refuses; the old file is untouched.
@@ -104,7 +104,7 @@ def replaced_by_program(path: Path) -> Iterator[Path]:
 
 
 def write_each(writers: Mapping[str, Callable[[], object]]) -> tuple[str, ...]:
-    """Call every writer, whatever becomes of the others; returns what the disk did not take, by name, in words."""
+    """Call every writer even if others fail; returns one line "name: reason" for each failure."""
     unwritten = []
     for name, write in writers.items():
         try:

@@ -1,4 +1,4 @@
-"""How a child process ends: with the launcher that started it (Linux only), or when it is asked to, leaving nothing."""
+"""Ends child processes cleanly: with the launcher that started them (Linux only), or on a signal."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from pathlib import Path
 from types import FrameType
 
 _PR_SET_PDEATHSIG = 1
-PARENT_ENV = "SWARMCTL_PARENT_PID"  # set by a launcher that wants a child to notice a death before it could ask
+PARENT_ENV = "SWARMCTL_PARENT_PID"  # set by the launcher, so that a child notices a death before its own first check
 
 
 def die_with_parent(signum: int = signal.SIGTERM) -> None:
-    """Have the kernel send this process `signum` when its parent dies, and send it now if that has happened already.
+    """Have the kernel send this process `signum` when its parent dies; send it now if the parent is dead already.
 
     The kernel watches the *thread* that started the child, so a launcher starts its children from its main thread.
     """
@@ -29,7 +29,7 @@ def die_with_parent(signum: int = signal.SIGTERM) -> None:
 
 
 def remove_socket(path: Path) -> None:
-    """Delete a Unix socket, its lock, and their directory if that leaves it empty: who ends last takes it away."""
+    """Delete a Unix socket and its lock, and their directory if it is then empty."""
     for name in (path, path.with_name(path.name + ".lock")):
         name.unlink(missing_ok=True)
     with contextlib.suppress(OSError):
@@ -37,9 +37,9 @@ def remove_socket(path: Path) -> None:
 
 
 class StopRequest:
-    """Set by a signal, waited for by the thread the signal interrupts.
+    """A stop flag set by signals, for which the interrupted thread can wait.
 
-    Not a `threading.Event`: a handler that runs while that thread holds the event's lock waits for it for ever.
+    It is no `threading.Event`, because a signal handler that runs while its thread holds the event's lock deadlocks.
     """
 
     def __init__(self, *signums: int) -> None:
@@ -53,13 +53,13 @@ class StopRequest:
         return self._wanted
 
     def wait(self, timeout_s: float) -> bool:
-        """Whether it has been asked for, at the latest after `timeout_s`."""
+        """Wait for at most `timeout_s`; returns whether a stop has been requested."""
         if not self._wanted:
             select.select([self._read_fd], [], [], max(0.0, timeout_s))
         return self._wanted
 
     def close(self) -> None:
-        """Give both descriptors back; the handlers stay."""
+        """Close both descriptors; the signal handlers stay installed."""
         for fd in (self._read_fd, self._write_fd):
             os.close(fd)
 

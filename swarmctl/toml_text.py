@@ -1,4 +1,4 @@
-"""A plain tree written as TOML, which the standard library only reads."""
+"""Writes a plain tree as TOML; the standard library can only read it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 
 def toml_text(tree: dict[str, Any]) -> str:
-    """The whole tree; keys must be bare, and what is None is left out."""
+    """Return the whole tree as TOML text; keys must be bare, values of None are left out."""
     lines: list[str] = []
     _dump_table(tree, "", lines)
     return "\n".join(lines) + "\n"
@@ -29,7 +29,7 @@ def _dump_table(table: dict[str, Any], prefix: str, lines: list[str]) -> None:
 
 
 def toml_value(value: Any) -> str:
-    """A value as TOML, on one line; what is None inside a table is left out."""
+    """Return a value as TOML on one line; None inside a table is left out."""
     if isinstance(value, bool):
         return "true" if value else "false"
     if isinstance(value, (int, float)):

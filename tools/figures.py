@@ -17,22 +17,22 @@ from pathlib import Path
 from typing import Any
 
 FIGURES: tuple[tuple[str, tuple[str, ...], str], ...] = (
-    ("index, whole mission [m]", ("tracking", "index_m"), ".3f"),
-    ("index after 10 s [m]", ("tracking", "index_after_10s_m"), ".3f"),
+    ("summed mean tracking error, whole mission [m]", ("tracking", "index_m"), ".3f"),
+    ("summed mean tracking error after 10 s [m]", ("tracking", "index_after_10s_m"), ".3f"),
     ("separation, smallest [m]", ("separation", "min_m"), ".3f"),
     ("solver failed [ticks]", ("solver", "failed"), ".0f"),
     ("not certified [ticks]", ("solver", "not_certified"), ".0f"),
     ("tick p50 [ms]", ("timing", "tick_ms", "p50"), ".2f"),
     ("tick p99 [ms]", ("timing", "tick_ms", "p99"), ".2f"),
-    ("late ticks [%]", ("timing", "late_percent"), ".2f"),
-    ("path age p50 [ms]", ("comms", "path_age_ms", "p50"), ".1f"),
-    ("path age p99 [ms]", ("comms", "path_age_ms", "p99"), ".1f"),
+    ("deadline misses [%]", ("timing", "missed_percent"), ".2f"),
+    ("plan staleness p50 [ms]", ("comms", "path_age_ms", "p50"), ".1f"),
+    ("plan staleness p99 [ms]", ("comms", "path_age_ms", "p99"), ".1f"),
     ("speed [x real time]", ("timing", "speed_factor"), ".2f"),
 )
 
 
 def fly(verb: str, agents: int, directory: Path) -> dict[str, Any]:
-    """One flight; its summary, with the share of late ticks added."""
+    """One flight; its summary, with the share of deadline misses added."""
     command = [
         sys.executable,
         "-m",
@@ -48,7 +48,7 @@ def fly(verb: str, agents: int, directory: Path) -> dict[str, Any]:
     print(f"{verb}: exit {done.returncode}", file=sys.stderr)
     summary: dict[str, Any] = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
     timing = summary["timing"]
-    timing["late_percent"] = 100.0 * timing["late_ticks"] / max(1, timing["ticks"])
+    timing["missed_percent"] = 100.0 * timing["late_ticks"] / max(1, timing["ticks"])
     return summary
 
 

@@ -41,7 +41,7 @@ TIMESPEC = struct.Struct("@qq")
 BUFFER_BYTES = 1 << 22
 SETPOINT_US = 20_000
 HOVER_01 = 0.492
-LIMITS = {32: {"late_percent": 1.0, "latency_p99_ms": 5.0}, 3: {"cpu_percent": 15.0}}
+LIMITS = {32: {"missed_percent": 1.0, "latency_p99_ms": 5.0}, 3: {"cpu_percent": 15.0}}
 
 
 @dataclass
@@ -50,7 +50,7 @@ class Measured:
 
     vehicles: int
     steps: int
-    late_percent: float  # of the physics steps, begun more than a step after their deadline
+    missed_percent: float  # of the physics steps, begun more than a step after their deadline
     stalls: int
     cpu_percent: float  # of one core
     latency_p50_ms: float
@@ -203,7 +203,7 @@ def _summed(clients: Sequence[Client], told: dict[str, Any], cpu_s: float, wall_
     return Measured(
         vehicles=len(clients),
         steps=told["steps"],
-        late_percent=100.0 * told["late"] / told["steps"],
+        missed_percent=100.0 * told["late"] / told["steps"],
         stalls=told["stalls"],
         cpu_percent=100.0 * cpu_s / wall_s,
         latency_p50_ms=float(np.percentile(latency_ms, 50)),
@@ -232,7 +232,7 @@ def misses(row: dict[str, float]) -> Iterator[str]:
 def _table(rows: Sequence[dict[str, float]]) -> Iterator[str]:
     columns = (
         ("vehicles", "vehicles", 0),
-        ("late %", "late_percent", 2),
+        ("late %", "missed_percent", 2),
         ("stalls", "stalls", 0),
         ("CPU %", "cpu_percent", 1),
         ("p50 ms", "latency_p50_ms", 2),

@@ -162,7 +162,12 @@ class ArduCopter:
     # --- setpoints ---
 
     def on_setpoint(
-        self, type_mask: int, q_nb: Sequence[float], rates: Sequence[float], thrust: float, now_us: int
+        self,
+        type_mask: int,
+        q_nb: Sequence[float],
+        rates: Sequence[float],
+        thrust: float,
+        now_us: int,
     ) -> bool:
         """SET_ATTITUDE_TARGET, see `Setpoints.take`; True when it will be flown."""
         if self.mode != CopterMode.GUIDED:

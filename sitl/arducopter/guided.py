@@ -65,7 +65,13 @@ class Setpoints:
         self._accepted_us = 0
 
     def take(
-        self, type_mask: int, q_nb: Sequence[float], rates: Sequence[float], thrust: float, flown: Array, now_us: int
+        self,
+        type_mask: int,
+        q_nb: Sequence[float],
+        rates: Sequence[float],
+        thrust: float,
+        flown: Array,
+        now_us: int,
     ) -> str:
         """Accept a SET_ATTITUDE_TARGET, or say why not.
 

@@ -34,7 +34,7 @@ NOT_FLOWN_HERE = {  # modes ArduCopter 4.6 has and this simulator does not enter
     20: "GUIDED_NOGPS",
     21: "SMART_RTL",
     22: "FLOWHOLD",
-    23: "FOLLOW",
+    23: "TRACKING",
     24: "ZIGZAG",
     25: "SYSTEMID",
     26: "AUTOROTATE",

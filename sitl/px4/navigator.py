@@ -186,8 +186,8 @@ class Navigator:
         self._acc_m_s2 = list(_limited(self._acc_m_s2[0] + d_n, self._acc_m_s2[1] + d_e, level))
         down = np.array([-self._acc_m_s2[0], -self._acc_m_s2[1], GRAVITY_M_S2 - acc_d])
         down /= math.sqrt(float(down @ down))
-        upright = max(0.5, estimate.down_axis_ned[2])
-        thrust = self.hover_01 * (1.0 - acc_d / GRAVITY_M_S2) / upright
+        cos_tilt = max(0.5, estimate.down_axis_ned[2])
+        thrust = self.hover_01 * (1.0 - acc_d / GRAVITY_M_S2) / cos_tilt
         ceiling = self._parameters.real("MPC_THR_MAX")
         floor = min(self._parameters.real("MPC_THR_MIN"), ceiling) if not estimate.on_ground else THRUST_MIN_01
         return Command(quat_from_body_z(down, self._yaw_rad), max(0.0, min(1.0, ceiling, max(floor, thrust))))

@@ -32,7 +32,12 @@ class RateLoop:
         self.feeding = False
         self.feed_rad_s = np.zeros((3, vehicles))
 
-    def set(self, vehicle: int, rate_frd_rad_s: Sequence[float] | None, feed_frd_rad_s: Sequence[float] | None) -> None:
+    def set(
+        self,
+        vehicle: int,
+        rate_frd_rad_s: Sequence[float] | None,
+        feed_frd_rad_s: Sequence[float] | None,
+    ) -> None:
         """New setpoint of one vehicle: rates to fly, or None for its attitude; and a feed-forward."""
         if rate_frd_rad_s is not None:
             if not self._on[vehicle]:

@@ -1,6 +1,7 @@
-"""One agent: `tick(now)` listens, senses, thinks, judges, acts, shares and records. Nothing else happens anywhere.
+"""One agent: `tick(now)` receives, senses, plans, decides the mode, sends a setpoint, publishes and records.
 
-It has no thread, socket, sleep or simulation branch: transport, bus, slow path, clock and recorder are handed in.
+The agent owns no thread, socket or sleep and has no branch for simulation: transport, bus, command executor, clock and
+recorder are passed in. Everything it does, it does inside the tick.
 """
 
 from __future__ import annotations
@@ -18,23 +19,23 @@ from swarmctl.agent.components import (
     make_coordination,
     make_estimator,
     make_safety_filter,
-    make_sequence,
+    make_state_machine,
 )
-from swarmctl.agent.reference_selector import Wayfinder
+from swarmctl.agent.reference_selector import ReferenceSelector
 from swarmctl.agent.setup import AgentSetup
-from swarmctl.agent.telemetry_publisher import Act, Reporter, Thought, TickSink, Took
-from swarmctl.agent.world_model import FLOWN_BY_AGENT, Surroundings
+from swarmctl.agent.telemetry_publisher import ControlOutput, PlanningResult, TelemetryPublisher, TickSink, TickTiming
+from swarmctl.agent.world_model import FLOWN_BY_AGENT, WorldModel
 from swarmctl.bus import topics
 from swarmctl.bus.peers import Bus
 from swarmctl.control.collision.separation import KeepOut, radius_problem
 from swarmctl.control.estimation.accuracy import AccuracyMonitor
-from swarmctl.control.estimation.constant_velocity import coasting
-from swarmctl.control.fallback import rest_plan
+from swarmctl.control.estimation.constant_velocity import predict_constant_velocity
+from swarmctl.control.fallback import brake_and_hold_plan
 from swarmctl.control.model import Predictor
-from swarmctl.control.mpc.plan_buffer import Replay
+from swarmctl.control.mpc.plan_buffer import PlanBuffer
 from swarmctl.control.mpc.problem import Problem, Start
-from swarmctl.control.phases.failsafe import Judgement, judge
-from swarmctl.control.phases.inputs import Facts
+from swarmctl.control.phases.failsafe import FailsafeDecision, decide
+from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.control.phases.overload import Level, Overload
 from swarmctl.control.setpoint import setpoint_of
 from swarmctl.core.clock import Clock
@@ -60,15 +61,29 @@ from swarmctl.mavlink.autopilot import Autopilot
 from swarmctl.mavlink.commands import CommandPort
 from swarmctl.mavlink.vehicle_setup import Upkeep
 
-_NOTHING_US = -1
-_DEVIATES = (Mode.BRAKE, Mode.HOLD, Mode.LAND, Mode.YIELD, Mode.BLIND)  # from its committed trajectory
-_WAITS_LONG_US = 3_000_000  # for take-off, before it says for what
-_RESTORE_US = 5_000_000  # for parameters to be set back before the process ends
-_AUTOPILOT_HOVERS = (FlightMode.HOLD, FlightMode.EXTERNAL)  # in the latter while it takes off by itself
+_NO_TIME_US = -1
+# modes in which the vehicle does not follow its committed trajectory
+_DEVIATING_MODES = (Mode.BRAKE, Mode.HOLD, Mode.LAND, Mode.PILOT_OVERRIDE, Mode.STATE_STALE)
+_START_ALERT_DELAY_US = 3_000_000  # time on the ground after which the unmet condition is raised as an alert
+_RESTORE_TIMEOUT_US = 5_000_000  # longest wait for parameters to be restored before the process ends
+_AUTOPILOT_HOVER_MODES = (FlightMode.HOLD, FlightMode.EXTERNAL)  # ArduCopter takes off by itself in the latter
 
 
 class Agent:
-    """See the module. `stopwatch_ns` only measures the tick; it never influences it."""
+    """One agent beside one autopilot.
+
+    Args:
+        setup: parameters and place in the swarm.
+        autopilot: the vehicle's hot path: states in, setpoints out.
+        commands: executor of the slow path: arming, modes, parameters.
+        bus: connection to peers and operator.
+        clock: monotonic time and UTC [us].
+        sink: recorder of ticks and events.
+        stopwatch_ns: measures the tick and never influences it.
+
+    Attributes:
+        timing: durations of the last tick.
+    """
 
     def __init__(
         self,
@@ -83,140 +98,150 @@ class Agent:
         self._setup, self._autopilot, self._commands = setup, autopilot, commands
         self._bus, self._clock, self._sink, self._stopwatch_ns = bus, clock, sink, stopwatch_ns
         self._upkeep = Upkeep(
-            autopilot, commands, setup.params.autopilot_params, setup.sysid, setup.params.sequence.state_rate_hz
+            autopilot, commands, setup.params.autopilot_params, setup.sysid, setup.params.state_machine.state_rate_hz
         )
-        self._surroundings = Surroundings(
+        self._world_model = WorldModel(
             setup.agent, setup.peers, setup.separation, bus, setup.params.rate_hz, self._note
         )
-        self._coordination = make_coordination(setup, self._surroundings, bus, self._note, stopwatch_ns)
+        self._coordination = make_coordination(setup, self._world_model, bus, self._note, stopwatch_ns)
         self._controller, self._transit = make_controllers(setup, stopwatch_ns)
         self._observer = make_estimator(setup)
         self._predictor = Predictor(setup.vehicle_model)
-        self._safety_filter = make_safety_filter(setup, self._surroundings, self._note, stopwatch_ns)
-        self._sequence = make_sequence(setup)
-        self._wayfinder = Wayfinder(setup, self._sequence, self._note)
-        self._judgement = Judgement(Mode.IDLE, "")
-        self._virtual = np.array([0.0, 0.0, GRAVITY_M_S2])
-        self._replay = Replay(setup.agent, self._controller.dt_us, self._controller.steps, setup.separation.brake_m_s2)
+        self._safety_filter = make_safety_filter(setup, self._world_model, self._note, stopwatch_ns)
+        self._state_machine = make_state_machine(setup)
+        self._reference_selector = ReferenceSelector(setup, self._state_machine, self._note)
+        self._decision = FailsafeDecision(Mode.IDLE, "")
+        self._virtual_control = np.array([0.0, 0.0, GRAVITY_M_S2])
+        self._plan_buffer = PlanBuffer(
+            setup.agent, self._controller.dt_us, self._controller.steps, setup.separation.brake_m_s2
+        )
         self._certified_us: int | None = None
         self._hold_at: Array | None = None
-        self._reporter = Reporter(
+        self._publisher = TelemetryPublisher(
             setup.agent,
             setup.boot_id,
             setup.sysid,
             setup.uses_commitments,
             autopilot,
-            self._surroundings.paths,
+            self._world_model.paths,
             bus,
             clock,
             sink,
         )
-        self.took = Took(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)  # of the last tick
-        self._commitment_ns = 0  # of the last tick
-        self._gaps = self._jumps = 0  # of setpoints and of the estimate, as far as they have been told
+        self.timing = TickTiming(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        self._commitment_ns = 0  # time spent on coordination in the last tick
+        self._gaps = self._jumps = 0  # setpoint gaps and estimate jumps already reported
         self._announced: tuple[Phase, Mode, FlightMode] | None = None
         self._alerts = Alerts()
         self._accuracy = AccuracyMonitor()
         self._standby_us = 0
         self._overload = Overload(setup.params.overload, round(1e6 / setup.params.rate_hz))
         self._done_us: int | None = None
-        self._last_state_us = _NOTHING_US
+        self._last_state_us = _NO_TIME_US
         self._thrust_01 = setup.vehicle_model.hover_thrust_01
 
     @property
     def done(self) -> bool:
-        """Landed, disarmed, and its parameters as they were."""
+        """Whether the mission has ended and the autopilot's parameters are restored, or the wait for it timed out."""
         if self._done_us is None:
             return False
-        return self._upkeep.restored or self._clock.now_us() - self._done_us > _RESTORE_US
+        return self._upkeep.restored or self._clock.now_us() - self._done_us > _RESTORE_TIMEOUT_US
 
     @property
     def finished(self) -> bool:
-        """Done, and so is every peer that is still there."""
-        return self.done and all(p.phase is Phase.DONE or not p.alive for p in self._surroundings.peers().values())
+        """Whether this agent and every peer still on the bus are done."""
+        return self.done and all(p.phase is Phase.DONE or not p.alive for p in self._world_model.peers().values())
 
     @property
     def outcome(self) -> str:
-        """ "completed", or why not."""
-        return self._sequence.outcome or "stopped before the mission began"
+        """ "completed", or the reason why the mission was not."""
+        return self._state_machine.outcome or "stopped before the mission began"
 
     @property
     def has_armed(self) -> bool:
-        """Whether the autopilot has been asked to arm: before that a mission that ends could not start."""
-        return self._sequence.arming.requested
+        """Whether arming has been requested; a mission that ends before that counts as one that could not start."""
+        return self._state_machine.arming.requested
 
     @property
     def rejected(self) -> dict[str, int]:
-        """Bus messages refused so far, by reason."""
-        return dict(self._surroundings.refusals.by_reason)
+        """Number of bus messages refused so far, by reason."""
+        return dict(self._world_model.refusals.by_reason)
 
     @property
     def commits_refused(self) -> int | None:
-        """Proposals that were not flown after peers had been heard; None unless separation is guaranteed."""
+        """Number of proposals withdrawn or expired; None unless separation is guaranteed."""
         counts = None if self._coordination is None else self._coordination.counts
         return None if counts is None else counts.withdrawn + counts.expired
 
     def ask(self, verb: str, now_us: int) -> None:
-        """Follow an operator's verb: hold, resume, land, rtl."""
-        self._sequence.operator(verb, now_us, self._clock.utc_us(), self._autopilot.poll(now_us))
+        """Apply an operator's command: hold, resume, land or rtl."""
+        self._state_machine.operator(verb, now_us, self._clock.utc_us(), self._autopilot.poll(now_us))
         self._note("operator", verb=verb)
 
-    def tick(self, now_us: int, late_ticks: int) -> TickRecord:
-        """One control step at monotonic time `now_us`, with the deadlines missed so far."""
+    def tick(self, now_us: int, deadline_misses: int) -> TickRecord:
+        """Run one control step at monotonic time `now_us`.
+
+        Args:
+            now_us: monotonic time of the step.
+            deadline_misses: deadlines missed since the start, skipped ticks included.
+
+        Returns:
+            the record of the tick, already handed to the sink.
+        """
         began_ns = self._stopwatch_ns()
-        self._watch_deadlines(now_us, late_ticks)
+        self._watch_deadlines(now_us, deadline_misses)
         self._listen(now_us)
         state = self._sense(now_us)
-        self._sequence.begin_if_due(now_us, self._clock.utc_us())
+        self._state_machine.begin_if_due(now_us, self._clock.utc_us())
         sensed_ns = self._stopwatch_ns()
-        thought = self._think(now_us, state)
-        thought_ns = self._stopwatch_ns()
-        self._judge(now_us, state, thought)
-        flown = self._flown(state, thought)
-        setpoint = self._act(now_us, flown, thought.start)
+        planning = self._plan(now_us, state)
+        planned_ns = self._stopwatch_ns()
+        self._decide(now_us, state, planning)
+        flown = self._flown(state, planning)
+        setpoint = self._act(now_us, flown, planning.start)
         sent_ns = self._stopwatch_ns()
-        times = NO_TIMES if thought.plan is None else thought.plan.times
-        self.took = Took(
+        times = NO_TIMES if planning.plan is None else planning.plan.times
+        self.timing = TickTiming(
             (sensed_ns - began_ns) * 1e-6,
-            (thought_ns - sensed_ns - self._commitment_ns) * 1e-6
+            (planned_ns - sensed_ns - self._commitment_ns) * 1e-6
             - (times.spaces_us + times.solve_us + times.certify_us) * 1e-3,
             self._commitment_ns * 1e-6,
             times.spaces_us * 1e-3,
             times.solve_us * 1e-3,
             times.certify_us * 1e-3,
             self._safety_filter.took_ms,
-            (sent_ns - thought_ns) * 1e-6 - self._safety_filter.took_ms,
+            (sent_ns - planned_ns) * 1e-6 - self._safety_filter.took_ms,
         )
         self._share(state, flown)
         self._advance(now_us, state)
-        refusals = self._surroundings.refusals.alert(self._clock.utc_us())
+        refusals = self._world_model.refusals.alert(self._clock.utc_us())
         if refusals:
             self._alerts.put("bus", refusals, now_us)
-        self._reporter.problem = self._alerts.text(now_us)
-        return self._reporter.report(
+        self._publisher.active_alert = self._alerts.text(now_us)
+        return self._publisher.publish(
             now_us,
             state,
-            thought,
-            Act(self._judgement.mode, flown, setpoint, self._safety_filter.acts),
-            self._sequence,
+            planning,
+            ControlOutput(self._decision.mode, flown, setpoint, self._safety_filter.acts),
+            self._state_machine,
             self._observer.estimate,
-            late_ticks,
-            self.took,
+            deadline_misses,
+            self.timing,
         )
 
-    def _watch_deadlines(self, now_us: int, late_ticks: int) -> None:
+    def _watch_deadlines(self, now_us: int, deadline_misses: int) -> None:
         before = self._overload.level
-        self._overload.update(now_us, late_ticks)
+        self._overload.update(now_us, deadline_misses)
         level = self._overload.level
         if level is not Level.NONE:
             self._alerts.put("overload", self._overload.text(), now_us)
         if level is not before:
             self._note("overload", level=level.name, missed_01=round(self._overload.missed_01, 3))
 
-    # -- listen, sense ------------------------------------------------------------------------------------------------
+    # -- receive, sense -----------------------------------------------------------------------------------------------
 
     def _listen(self, now_us: int) -> None:
-        for verb in self._surroundings.listen(self._clock.utc_us()):
+        for verb in self._world_model.listen(self._clock.utc_us()):
             self.ask(verb, now_us)
         if self._coordination is not None:
             self._coordination.receive(self._clock.utc_us())
@@ -241,125 +266,133 @@ class Agent:
         if state is None or state.t_us == self._last_state_us:
             return state
         self._last_state_us = state.t_us
-        self._observer.update(state, self._thrust_01 if self._sequence.had_control else None)
-        if self._sequence.had_control:
+        self._observer.update(state, self._thrust_01 if self._state_machine.had_control else None)
+        if self._state_machine.had_control:
             return state
-        if self._autopilot.hover_thrust_01 is not None and state.mode in _AUTOPILOT_HOVERS:
+        if self._autopilot.hover_thrust_01 is not None and state.mode in _AUTOPILOT_HOVER_MODES:
             self._observer.learn_hover(self._autopilot.hover_thrust_01 * float(body_z_ned(state.q_nb)[2]))
         return state
 
-    # -- think --------------------------------------------------------------------------------------------------------
+    # -- plan ---------------------------------------------------------------------------------------------------------
 
-    def _think(self, now_us: int, state: VehicleState | None) -> Thought:
+    def _plan(self, now_us: int, state: VehicleState | None) -> PlanningResult:
         self._commitment_ns = 0
         if state is None or not self._fresh(now_us, state):
-            if self._coordination is not None:  # the autopilot flies it, blindly or by its failsafe
+            if self._coordination is not None:  # the autopilot flies the vehicle, on stale setpoints or by its failsafe
                 self._coordination.idle(self._clock.utc_us(), state)
-            return Thought(None, None, None, [])
+            return PlanningResult(None, None, None, [])
         estimate = self._observer.estimate
         act_us = now_us + self._predictor.delay_us
-        if self._sequence.had_control:
+        if self._state_machine.had_control:
             start = self._predictor.start(
-                self._observer.state(state), act_us, estimate.disturbance_ned_m_s2, self._virtual
+                self._observer.state(state), act_us, estimate.disturbance_ned_m_s2, self._virtual_control
             )
         else:
-            self._virtual = np.array([0.0, 0.0, GRAVITY_M_S2])
-            upright = float(body_z_ned(state.q_nb)[2])
-            start = Start(act_us, state.pos_ned_m, state.vel_ned_m_s, upright, self._virtual)
+            self._virtual_control = np.array([0.0, 0.0, GRAVITY_M_S2])
+            cos_tilt = float(body_z_ned(state.q_nb)[2])
+            start = Start(act_us, state.pos_ned_m, state.vel_ned_m_s, cos_tilt, self._virtual_control)
         steps, dt_us = self._controller.steps, self._controller.dt_us
-        keep_outs = self._surroundings.keep_outs(state.pos_ned_m, self._utc(act_us), dt_us, steps, self._sequence.phase)
-        flies = Phase.GOTO_START <= self._sequence.phase <= Phase.GOTO_LAND
-        self._look_for_deadlock(now_us, state, keep_outs, flies)
+        keep_outs = self._world_model.keep_outs(
+            state.pos_ned_m, self._utc(act_us), dt_us, steps, self._state_machine.phase
+        )
+        flies = Phase.GOTO_START <= self._state_machine.phase <= Phase.GOTO_LAND
+        self._detect_deadlock(now_us, state, keep_outs, flies)
         grid = np.arange(self._controller.longest + 1, dtype=np.float64)
         ahead_s = self._predictor.delay_us * 1e-6 + dt_us * 1e-6 * grid
-        reference, now_ref = self._wayfinder.reference(now_us, self._clock.utc_us(), ahead_s)
+        reference, now_ref = self._reference_selector.reference(now_us, self._clock.utc_us(), ahead_s)
         committed = self._coordinated(now_us, state, flies)
         if not flies:
-            return Thought(start, None, now_ref, keep_outs)
+            return PlanningResult(start, None, now_ref, keep_outs)
         if committed is not None:
             reference = committed
-        guess = self._replay.guess_ned_m(act_us)
-        controller = self._controller if self._sequence.phase is Phase.TRACK else self._transit
-        kept = tuple(keep_outs) if committed is None else ()  # the committed trajectory keeps clear already
+        guess = self._plan_buffer.guess_ned_m(act_us)
+        controller = self._controller if self._state_machine.phase is Phase.TRACK else self._transit
+        kept = tuple(keep_outs) if committed is None else ()  # a committed trajectory keeps clear of them already
         plan = controller.plan(Problem(start, reference, estimate.disturbance_ned_m_s2, kept, guess))
-        return Thought(start, plan, now_ref, keep_outs)
+        return PlanningResult(start, plan, now_ref, keep_outs)
 
     def _coordinated(self, now_us: int, state: VehicleState, flies: bool) -> Reference | None:
-        """The committed trajectory over the horizon from when the setpoint acts; None when nothing is committed."""
+        """Return the committed trajectory over the horizon from when the setpoint acts; None if there is none."""
         if self._coordination is None:
             return None
         utc_us, began_ns = self._clock.utc_us(), self._stopwatch_ns()
-        if not (flies and self._sequence.had_control) or self._judgement.mode in _DEVIATES:
+        if not (flies and self._state_machine.had_control) or self._decision.mode in _DEVIATING_MODES:
             self._coordination.idle(utc_us, state)
             return None
-        self._coordination.step(utc_us, state, self._sequence.phase, self._wayfinder.desired_reference(now_us, utc_us))
+        self._coordination.step(
+            utc_us, state, self._state_machine.phase, self._reference_selector.desired(now_us, utc_us)
+        )
         self._commitment_ns = self._stopwatch_ns() - began_ns
         act_us = utc_us + self._predictor.delay_us
         pos, vel = self._coordination.follow(act_us + np.arange(self._controller.longest + 1) * self._controller.dt_us)
         return Reference(pos, vel, self._setup.mission.yaw_rad)
 
-    def _look_for_deadlock(self, now_us: int, state: VehicleState, keep_outs: list[KeepOut], flies: bool) -> None:
-        if not (flies and self._sequence.had_control):
-            self._wayfinder.rest(now_us)
+    def _detect_deadlock(self, now_us: int, state: VehicleState, keep_outs: list[KeepOut], flies: bool) -> None:
+        if not (flies and self._state_machine.had_control):
+            self._reference_selector.reset(now_us)
             return
         known = [*keep_outs, *(self._coordination.lost_peer_keep_outs if self._coordination else ())]
-        landmarks = self._surroundings.landmarks
-        deadlock = self._wayfinder.look(now_us, self._clock.utc_us(), state.pos_ned_m, known, landmarks)
+        landmarks = self._world_model.landmarks
+        deadlock = self._reference_selector.update(now_us, self._clock.utc_us(), state.pos_ned_m, known, landmarks)
         if deadlock is not None:
             self._alerts.put("deadlock", f"deadlocked by {deadlock.names}", now_us)
 
-    # -- judge, act ---------------------------------------------------------------------------------------------------
+    # -- decide the mode, send ----------------------------------------------------------------------------------------
 
-    def _judge(self, now_us: int, state: VehicleState | None, thought: Thought) -> None:
-        plan = thought.plan
+    def _decide(self, now_us: int, state: VehicleState | None, planning: PlanningResult) -> None:
+        plan = planning.plan
         if plan is None:
-            self._certified_us = now_us  # none was asked for
+            self._certified_us = now_us  # no plan was needed in this tick, so its absence is no failure
         if plan is not None:
-            assert thought.start is not None
-            self._replay.take(plan, thought.start, thought.keep_outs, partial(self._rest, thought.start))
+            assert planning.start is not None
+            self._plan_buffer.take(
+                plan, planning.start, planning.keep_outs, partial(self._brake_and_hold, planning.start)
+            )
         if plan is not None and plan.status is PlanStatus.OK:
             self._certified_us = now_us
         elif plan is not None:
-            self._reporter.failed_plans += 1
+            self._publisher.failed_plans += 1
             self._alerts.put("plan", f"plan {plan.status.name.lower()}", now_us)
-        good = self._replay.plan
+        good = self._plan_buffer.plan
         delay_us = self._predictor.delay_us
         health = Health(
-            _NOTHING_US if state is None else max(0, now_us - state.t_us),
+            _NO_TIME_US if state is None else max(0, now_us - state.t_us),
             state is not None and state.armed,
             FlightMode.UNKNOWN if state is None else state.mode,
             Landed.UNKNOWN if state is None else state.landed,
             state is not None and state.failsafe,
             PlanStatus.NONE if plan is None else plan.status,
-            _NOTHING_US if good is None else now_us + delay_us - good.t0_us,
+            _NO_TIME_US if good is None else now_us + delay_us - good.t0_us,
             0 if self._certified_us is None else now_us - self._certified_us,
             0.0 if state is None else math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s)),
-            self._sequence.phase,
-            self._sequence.had_control,
-            self._sequence.yielded,
+            self._state_machine.phase,
+            self._state_machine.had_control,
+            self._state_machine.pilot_override,
         )
-        self._judgement = judge(health, self._setup.params.failsafe)
+        self._decision = decide(health, self._setup.params.failsafe)
 
-    def _rest(self, start: Start) -> Plan:
+    def _brake_and_hold(self, start: Start) -> Plan:
         disturbance = self._observer.estimate.disturbance_ned_m_s2
         lag = self._setup.vehicle_model.lag()
-        return rest_plan(start, self._hold_at, disturbance, lag, self._controller.dt_us, self._controller.steps)
+        return brake_and_hold_plan(
+            start, self._hold_at, disturbance, lag, self._controller.dt_us, self._controller.steps
+        )
 
-    def _flown(self, state: VehicleState | None, thought: Thought) -> Plan | None:
-        """The plan whose first input is sent and whose path is shared; None when the autopilot flies."""
-        mode = self._judgement.mode
+    def _flown(self, state: VehicleState | None, planning: PlanningResult) -> Plan | None:
+        """Return the plan whose input is sent and whose path is published; None when the autopilot flies."""
+        mode = self._decision.mode
         if mode is not Mode.HOLD:
             self._hold_at = None
-        if thought.start is None or state is None:
+        if planning.start is None or state is None:
             return None
-        if mode in (Mode.FOLLOW, Mode.STREAM):
-            return thought.plan
+        if mode in (Mode.TRACKING, Mode.PRIMING):
+            return planning.plan
         if mode is Mode.REPLAY:
-            return self._replay.plan
+            return self._plan_buffer.plan
         if mode in (Mode.BRAKE, Mode.HOLD):
             if mode is Mode.HOLD and self._hold_at is None:
                 self._hold_at = state.pos_ned_m
-            return self._rest(thought.start)
+            return self._brake_and_hold(planning.start)
         return None
 
     def _act(self, now_us: int, flown: Plan | None, start: Start | None) -> AttitudeSetpoint | None:
@@ -367,11 +400,13 @@ class Agent:
             self._safety_filter.rest(now_us)
             return None
         act_us = now_us + self._predictor.delay_us
-        step = min(max(0, (act_us - flown.t0_us) // flown.dt_us), len(flown.virtual) - 1)
-        estimate, flies = self._observer.estimate, self._judgement.mode in FLOWN_BY_AGENT
-        virtual = self._safety_filter.keep_apart(now_us, self._utc(act_us), flown.virtual[step], start, estimate, flies)
+        step = min(max(0, (act_us - flown.t0_us) // flown.dt_us), len(flown.virtual_control) - 1)
+        estimate, flies = self._observer.estimate, self._decision.mode in FLOWN_BY_AGENT
+        virtual_control = self._safety_filter.keep_apart(
+            now_us, self._utc(act_us), flown.virtual_control[step], start, estimate, flies
+        )
         yaw_rad, hover_01 = self._setup.mission.yaw_rad, estimate.hover_thrust_01
-        setpoint = setpoint_of(virtual, yaw_rad, hover_01, now_us, self._setup.vehicle_model)
+        setpoint = setpoint_of(virtual_control, yaw_rad, hover_01, now_us, self._setup.vehicle_model)
         refused = self._autopilot.send(setpoint, self._clock.now_us())
         if refused:
             self._alerts.put("setpoint", f"setpoint refused: {refused}", now_us)
@@ -382,24 +417,24 @@ class Agent:
             text = f"setpoints had stopped for {gap_s:.2f} s: the autopilot's failsafe may have acted"
             self._alerts.put("gap", text, now_us)
             self._note("setpoint_gap", seconds=gap_s)
-        self._virtual, self._thrust_01 = virtual, setpoint.thrust_01
-        self._predictor.sent(now_us, virtual)
+        self._virtual_control, self._thrust_01 = virtual_control, setpoint.thrust_01
+        self._predictor.sent(now_us, virtual_control)
         return setpoint
 
     def _advance(self, now_us: int, state: VehicleState | None) -> None:
-        before = self._sequence.phase, self._sequence.had_control
+        before = self._state_machine.phase, self._state_machine.had_control
         utc_us, dialect = self._clock.utc_us(), self._autopilot.dialect
-        facts = Facts(
+        inputs = PhaseInputs(
             now_us,
             utc_us,
             state,
             self._upkeep.ready,
             self._autopilot.armable,
             self._commands.busy,
-            self._judgement.mode,
-            self._coordination is None and self._surroundings.has_unresponsive_peer(utc_us),
-            self._surroundings.peers(),
-            others_ned_m=self._surroundings.others_ned_m(utc_us),
+            self._decision.mode,
+            self._coordination is None and self._world_model.has_unresponsive_peer(utc_us),
+            self._world_model.peers(),
+            others_ned_m=self._world_model.others_ned_m(utc_us),
             arm_in=None if dialect is None else dialect.arm_in,
             boots=self._autopilot.clock.boots,
             refusal=self._upkeep.refusal,
@@ -407,31 +442,31 @@ class Agent:
             overload=self._overload.level,
             armed_told_us=self._autopilot.armed_told_us,
         )
-        for command in self._sequence.step(facts):
+        for command in self._state_machine.step(inputs):
             self._commands.request(command)
-        self._tell_what_is_waited_for(now_us)
-        self._give_parameters_back(now_us)
+        self._report_start_blocker(now_us)
+        self._restore_parameters(now_us)
         self._upkeep.step(now_us)
-        if not before[1] and self._sequence.had_control:
+        if not before[1] and self._state_machine.had_control:
             self._predictor.clear()
             self._observer.reset()
             self._controller.reset()
-        now = (self._sequence.phase, self._judgement.mode, self._autopilot.mode)
+        now = (self._state_machine.phase, self._decision.mode, self._autopilot.mode)
         if now != self._announced:
             self._announced = now
             names = {"phase": now[0].name, "mode": now[1].name, "flight_mode": now[2].name}
-            self._note("state", **names, reason=self._judgement.reason)
+            self._note("state", **names, reason=self._decision.reason)
 
-    def _tell_what_is_waited_for(self, now_us: int) -> None:
-        waits_for = self._sequence.waits_for
-        if self._sequence.phase is not Phase.STANDBY:
+    def _report_start_blocker(self, now_us: int) -> None:
+        waits_for = self._state_machine.waits_for
+        if self._state_machine.phase is not Phase.STANDBY:
             self._standby_us = now_us
-        elif waits_for and now_us - self._standby_us > _WAITS_LONG_US:
+        elif waits_for and now_us - self._standby_us > _START_ALERT_DELAY_US:
             self._alerts.put("start", f"waits for {waits_for}", now_us)
 
-    def _give_parameters_back(self, now_us: int) -> None:
-        """Once the mission has ended: set the autopilot's parameters back, and say which of them could not be."""
-        if not self._sequence.finished:
+    def _restore_parameters(self, now_us: int) -> None:
+        """After the mission, restore the autopilot's parameters and report those that could not be restored."""
+        if not self._state_machine.finished:
             return
         if self._done_us is None:
             self._done_us = now_us
@@ -441,14 +476,14 @@ class Agent:
             self._note("parameters_left_changed", were=left)
 
     def _unsettled(self, now_us: int) -> str:
-        """Why nothing may be armed yet: the estimator settles, or is too inaccurate for the distances asked for."""
-        if len(self._setup.starts_ned_m) == 1 or self._sequence.phase > Phase.STANDBY:
+        """Return why arming must wait: the estimator still settles, or is too inaccurate for the separation; or ""."""
+        if len(self._setup.starts_ned_m) == 1 or self._state_machine.phase > Phase.STANDBY:
             return ""
         self._accuracy.update(now_us, self._autopilot.pos_accuracy_m)
-        accuracy_m = self._accuracy.worst_m or 0.0  # not told: body and tracking are left to judge by
+        accuracy_m = self._accuracy.worst_m or 0.0  # if not reported, only body size and tracking error are checked
         return self._accuracy.unsettled(now_us) or radius_problem(self._setup.separation, accuracy_m)
 
-    # -- share, record ------------------------------------------------------------------------------------------------
+    # -- publish, record ----------------------------------------------------------------------------------------------
 
     def _share(self, state: VehicleState | None, flown: Plan | None) -> None:
         if state is not None:
@@ -457,7 +492,7 @@ class Agent:
             self._coordination.publish(self._clock.utc_us())
 
     def _path(self, state: VehicleState, flown: Plan | None) -> PredictedPath:
-        setup, seq = self._setup, self._reporter.seq
+        setup, seq = self._setup, self._publisher.seq
         margin_m = min(MAX_RADIUS_M, self._autopilot.frame.margin_m + self._overload.margin_m)
         if flown is not None:
             t0_us, dt_us, pos = self._utc(flown.t0_us), flown.dt_us, flown.pos_ned_m
@@ -465,14 +500,14 @@ class Agent:
         act_us, dt_us = self._clock.now_us() + self._predictor.delay_us, self._controller.dt_us
         grid = np.arange(self._controller.steps + 1, dtype=np.float64)
         ahead_s = grid * (dt_us * 1e-6) + (act_us - state.t_us) * 1e-6
-        pos = coasting(state, ahead_s, setup.separation.brake_m_s2)
+        pos = predict_constant_velocity(state, ahead_s, setup.separation.brake_m_s2)
         return PredictedPath(setup.agent, setup.boot_id, seq, self._utc(act_us), dt_us, margin_m, pos)
 
     def _fresh(self, now_us: int, state: VehicleState) -> bool:
         return now_us - state.t_us <= self._setup.params.failsafe.state_max_age_s * 1e6
 
     def _utc(self, t_us: int) -> int:
-        """UTC of a monotonic time of this process."""
+        """Convert monotonic time of this process to UTC [us]."""
         return self._clock.utc_us() + t_us - self._clock.now_us()
 
     def _note(self, name: str, **fields: Any) -> None:

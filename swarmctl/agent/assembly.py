@@ -1,4 +1,4 @@
-"""Builds one `Agent` from a whole configuration; real time and lockstep differ only in what they hand in."""
+"""Builds one `Agent` from a whole configuration; real time and lockstep differ only in the arguments they pass."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ def make_agent(
     slow_path: Callable[[Autopilot, Codec], CommandPort],
     stopwatch_ns: Callable[[], int],
 ) -> Agent:
-    """Wire an agent to its vehicle, its peers and its recorder.
+    """Build an agent and connect it to its vehicle, its peers and its recorder.
 
     Args:
-        config: the run.
-        agent: own index, from 0.
+        config: configuration of the run.
+        agent: index of this agent, from 0.
         boot_id: differs between restarts of the same agent.
         transport, bus, clock, sink: see `Agent`.
-        on_frame: told of every MAVLink frame in and out.
-        slow_path: makes the command executor for the vehicle.
-        stopwatch_ns: measures the tick.
+        on_frame: called with every MAVLink frame sent or received.
+        slow_path: builds the command executor for the vehicle.
+        stopwatch_ns: measures the tick [ns].
     """
     sysid = config.sysids()[agent]
     swarm = config.swarm

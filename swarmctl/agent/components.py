@@ -1,4 +1,4 @@
-"""What an agent is made of, put together from what it is told."""
+"""Factories for the components of an agent, each built from `AgentSetup`."""
 
 from __future__ import annotations
 
@@ -7,34 +7,37 @@ from collections.abc import Callable
 from swarmctl.agent.coordination import Coordination
 from swarmctl.agent.safety_filter import SafetyFilter
 from swarmctl.agent.setup import AgentSetup
-from swarmctl.agent.world_model import Surroundings
+from swarmctl.agent.world_model import WorldModel
 from swarmctl.bus.peers import Bus
 from swarmctl.control.commit.trajectory_planner import following
 from swarmctl.control.controller import Controller, make_controller
 from swarmctl.control.estimation.disturbance import DisturbanceObserver
 from swarmctl.control.estimation.state_filter import StateFilter
-from swarmctl.control.phases.sequence import Sequence
+from swarmctl.control.phases.state_machine import MissionStateMachine
 from swarmctl.control.reference.mission import MissionReference
 
 Note = Callable[..., None]
-Stopwatch = Callable[[], int]  # [ns]
+Stopwatch = Callable[[], int]  # returns a running time [ns]
 
 
 def make_controllers(setup: AgentSetup, stopwatch_ns: Stopwatch) -> tuple[Controller, Controller]:
-    """Of the mission, and of the ways there and back."""
-    params, rest = setup.controller, (setup.vehicle_model, setup.separation, setup.agent, setup.slots, stopwatch_ns)
+    """Return the controller for the mission and the one for the transits to the start and to the landing place."""
+    params, rest = (
+        setup.controller,
+        (setup.vehicle_model, setup.separation, setup.agent, setup.max_keep_outs, stopwatch_ns),
+    )
     if setup.uses_commitments:
         params = params.model_copy(update={"mpc": following(params.mpc, setup.params.commit)})
     mission = make_controller(params, *rest)
     if params.kind != "open_loop":
         return mission, mission
-    return mission, make_controller(params.model_copy(update={"kind": "dmpc"}), *rest)  # the other can't go anywhere
+    return mission, make_controller(params.model_copy(update={"kind": "dmpc"}), *rest)  # open loop ignores references
 
 
 def make_coordination(
-    setup: AgentSetup, surroundings: Surroundings, bus: Bus, note: Note, stopwatch_ns: Stopwatch
+    setup: AgentSetup, world_model: WorldModel, bus: Bus, note: Note, stopwatch_ns: Stopwatch
 ) -> Coordination | None:
-    """None unless separation is guaranteed."""
+    """Return the coordination protocol; None unless separation is guaranteed."""
     if not setup.uses_commitments:
         return None
     return Coordination(
@@ -44,8 +47,8 @@ def make_coordination(
         setup.params.commit,
         setup.controller.mpc,
         setup.separation,
-        setup.slots,
-        surroundings,
+        setup.max_keep_outs,
+        world_model,
         bus,
         note,
         stopwatch_ns,
@@ -54,27 +57,25 @@ def make_coordination(
 
 
 def make_estimator(setup: AgentSetup) -> DisturbanceObserver | StateFilter:
-    """Of state and disturbance, as configured."""
+    """Return the estimator of state and disturbance that the configuration asks for."""
     params, model = setup.params, setup.vehicle_model
     if params.state_filter.enabled:
         return StateFilter(params.state_filter, params.disturbance, model)
     return DisturbanceObserver(params.disturbance, model.hover_thrust_01)
 
 
-def make_safety_filter(
-    setup: AgentSetup, surroundings: Surroundings, note: Note, stopwatch_ns: Stopwatch
-) -> SafetyFilter:
-    """Of the bodies around it."""
+def make_safety_filter(setup: AgentSetup, world_model: WorldModel, note: Note, stopwatch_ns: Stopwatch) -> SafetyFilter:
+    """Return the safety filter that keeps the vehicle clear of the bodies around it."""
     dt_s = 1.0 / setup.params.rate_hz
     downwash = setup.separation.downwash
-    return SafetyFilter(setup.params.barrier, setup.vehicle_model, dt_s, surroundings, downwash, note, stopwatch_ns)
+    return SafetyFilter(setup.params.barrier, setup.vehicle_model, dt_s, world_model, downwash, note, stopwatch_ns)
 
 
-def make_sequence(setup: AgentSetup) -> Sequence:
-    """Of its mission."""
+def make_state_machine(setup: AgentSetup) -> MissionStateMachine:
+    """Return the state machine of the agent's mission."""
     reference = MissionReference(setup.mission, setup.starts_ned_m, setup.agent, setup.separation.planned_m)
-    return Sequence(
-        setup.params.sequence,
+    return MissionStateMachine(
+        setup.params.state_machine,
         setup.agent,
         len(setup.peers),
         setup.separation.radius_m,

@@ -7,7 +7,7 @@ from dataclasses import asdict, replace
 
 import numpy as np
 
-from swarmctl.agent.world_model import Surroundings
+from swarmctl.agent.world_model import WorldModel
 from swarmctl.bus import topics
 from swarmctl.bus.peers import Bus, agent_name
 from swarmctl.bus.trajectory_messages import PeerTrajectories, encode_trajectory_message
@@ -29,8 +29,8 @@ class Coordination:
     Args:
         agent, boot_id: identity in the own messages.
         peers: numbers of the other agents.
-        params, mpc, separation, slots, stopwatch_ns: see `Commitments`.
-        surroundings: paths, statuses and presence of peers, and obstacles.
+        params, mpc, separation, max_keep_outs, stopwatch_ns: see `Commitments`.
+        world_model: paths, statuses and presence of peers, and obstacles.
         bus: is drained by `receive`.
         rate_hz: tick rate of every agent.
         note: is told `conflicting_commitment` when a peer's committed trajectory comes too close to the own one;
@@ -47,16 +47,16 @@ class Coordination:
         params: CommitParams,
         mpc: MpcParams,
         separation: SeparationParams,
-        slots: int,
-        surroundings: Surroundings,
+        max_keep_outs: int,
+        world_model: WorldModel,
         bus: Bus,
         note: Callable[..., None],
         stopwatch_ns: Callable[[], int],
         rate_hz: float,
     ) -> None:
-        self._agent, self._boot_id, self._bus, self._surroundings = agent, boot_id, bus, surroundings
-        self._commitments = Commitments(agent, params, mpc, separation, slots, stopwatch_ns)
-        refusals, attendance = surroundings.refusals, surroundings.attendance
+        self._agent, self._boot_id, self._bus, self._world_model = agent, boot_id, bus, world_model
+        self._commitments = Commitments(agent, params, mpc, separation, max_keep_outs, stopwatch_ns)
+        refusals, attendance = world_model.refusals, world_model.attendance
         self._peer_trajectories, self._peers = PeerTrajectories(peers, rate_hz, refusals, attendance), frozenset(peers)
         self._note, self._seq, self._separation = note, 0, separation
         self._is_committed = False
@@ -89,13 +89,13 @@ class Coordination:
         if conflicting != self._conflicting:
             self._conflicting = conflicting
             self._note("conflicting_commitment", by=sorted(conflicting))
-        deviating = self._surroundings.deviating_peers(known, utc_us, self._allowed_m)
+        deviating = self._world_model.deviating_peers(known, utc_us, self._allowed_m)
         absent = self._absent_since_us.keys()  # perhaps lost: no longer trusted, still required to acknowledge
         committed = {agent for agent, message in known.items() if message.is_committed}
         lost_peers = [agent for agent in known.keys() - alive_peers if agent in committed]
         self.lost_peer_keep_outs = [keep_out for agent in lost_peers for keep_out in self._ends(known[agent])]
         taking_part = {a for a in alive_peers - absent - conflicting - deviating if a in committed}
-        self._surroundings.peer_commitments = {agent: known[agent].followed for agent in taking_part}
+        self._world_model.peer_commitments = {agent: known[agent].followed for agent in taking_part}
         partners = {agent: known[agent] for agent in taking_part}
         others = self._others(utc_us, state, phase, taking_part)
         commitments.evade(Situation(utc_us, utc_us, desired, partners, others))
@@ -109,7 +109,7 @@ class Coordination:
         """Commit nothing while a pilot or the autopilot flies, or the state is stale; peers are still acknowledged."""
         if self._is_committed:
             self._is_committed = False
-            self._surroundings.peer_commitments, self.lost_peer_keep_outs = {}, []
+            self._world_model.peer_commitments, self.lost_peer_keep_outs = {}, []
             self._note("commitments", **asdict(self.counts), worst_tracking_m=self._worst_m)
         self._commitments.end(None if state is None else state.pos_ned_m, utc_us)
 
@@ -149,7 +149,7 @@ class Coordination:
         commit.
         """
         alive = self._bus.alive()
-        committing = frozenset(agent for agent in self._peers if self._surroundings.uses_commitments(agent))
+        committing = frozenset(agent for agent in self._peers if self._world_model.uses_commitments(agent))
         if agent_name(self._agent) not in alive:
             self._on_bus_since_us = None
             self._absent_since_us.clear()
@@ -173,7 +173,7 @@ class Coordination:
         What a stale peer does is unknown, so its hard minimum distance includes all of the margin that grows with age.
         """
         steps, dt_us = self._commitments.steps, self._commitments.dt_us
-        found = self._surroundings.keep_outs(state.pos_ned_m, t0_utc_us, dt_us, steps, phase, taking_part)
+        found = self._world_model.keep_outs(state.pos_ned_m, t0_utc_us, dt_us, steps, phase, taking_part)
         # by which planned and hard minimum distance differ
         spent_m = self._separation.tracking_m + self._separation.certify_slack_m
         return [replace(k, hard_min_distance_m=max(k.hard_min_distance_m, k.radius_m - spent_m)) for k in found]

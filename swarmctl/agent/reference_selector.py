@@ -1,4 +1,4 @@
-"""What an agent would like: to be where its mission has it, or on a way round what it is deadlocked by."""
+"""Selects the reference an agent follows: its mission's, or a detour around what it is deadlocked by."""
 
 from __future__ import annotations
 
@@ -10,26 +10,26 @@ import numpy as np
 from swarmctl.agent.setup import AgentSetup
 from swarmctl.control.collision.separation import KeepOut
 from swarmctl.control.commit.trajectory_planner import DesiredReference
-from swarmctl.control.phases.sequence import Sequence as MissionSequence
+from swarmctl.control.phases.state_machine import MissionStateMachine
 from swarmctl.control.reference.deadlock import Deadlock, DeadlockRecovery
 from swarmctl.core.types import Array, Obstacle, Reference, Sampled
 
 
-class Wayfinder:
-    """See the module.
+class ReferenceSelector:
+    """Chooses between the mission's reference and a detour, and reports deadlocks.
 
     Args:
-        setup: of the agent.
-        sequence: knows the mission's reference.
-        note: is told `deadlock`, when one begins and when it is over.
+        setup: parameters of the agent.
+        state_machine: source of the mission's reference.
+        note: receives the event `deadlock` when one begins and when it ends.
     """
 
-    def __init__(self, setup: AgentSetup, sequence: MissionSequence, note: Callable[..., None]) -> None:
-        self._sequence, self._note, self._yaw_rad = sequence, note, setup.mission.yaw_rad
+    def __init__(self, setup: AgentSetup, state_machine: MissionStateMachine, note: Callable[..., None]) -> None:
+        self._state_machine, self._note, self._yaw_rad = state_machine, note, setup.mission.yaw_rad
         self._recovery = DeadlockRecovery(setup.params.deadlock, setup.agent, setup.separation.radius_m)
-        self._told: Deadlock | None = None
+        self._reported: Deadlock | None = None
 
-    def look(
+    def update(
         self,
         now_us: int,
         utc_us: int,
@@ -37,37 +37,44 @@ class Wayfinder:
         known: Sequence[KeepOut],
         landmarks: Callable[[], Sequence[Obstacle]],
     ) -> Deadlock | None:
-        """Whether the agent, at (3,), gets on among what is known; returns a deadlock that begins."""
-        self._recovery.step(now_us, pos_ned_m, self._mission(now_us, utc_us), known, landmarks)
-        return self._tell(now_us)
+        """Check progress and plan a detour if there is none; returns a deadlock only in the tick it begins.
 
-    def rest(self, now_us: int) -> None:
-        """Somebody else flies."""
+        Args:
+            now_us, utc_us: monotonic time and UTC.
+            pos_ned_m: own position (3,).
+            known: regions to keep out of.
+            landmarks: returns the obstacles seen so far, which a detour leads around.
+        """
+        self._recovery.step(now_us, pos_ned_m, self._mission(now_us, utc_us), known, landmarks)
+        return self._report(now_us)
+
+    def reset(self, now_us: int) -> None:
+        """Forget progress and detour: the agent does not control the vehicle."""
         self._recovery.reset()
-        self._tell(now_us)
+        self._report(now_us)
 
     def reference(self, now_us: int, utc_us: int, ahead_s: Array) -> tuple[Reference, Reference]:
-        """At times (N,) from now, (N, 3) each; and the mission's, now."""
-        pos, vel = self._sequence.reference(utc_us, now_us, np.concatenate([[0.0], ahead_s]))
+        """Return the reference at times `ahead_s` (N,) from now, (N, 3) each, and the mission's own one now, (1, 3)."""
+        pos, vel = self._state_machine.reference(utc_us, now_us, np.concatenate([[0.0], ahead_s]))
         now_ref = Reference(pos[:1], vel[:1], self._yaw_rad)
         if self._recovery.active:
             return Reference(*self._recovery.sample(ahead_s), self._yaw_rad), now_ref
         return Reference(pos[1:], vel[1:], self._yaw_rad), now_ref
 
-    def desired_reference(self, now_us: int, utc_us: int) -> DesiredReference:
-        """The same, for whoever plans on another grid."""
+    def desired(self, now_us: int, utc_us: int) -> DesiredReference:
+        """Return the same reference as a function of time, for a planner with another time grid."""
         if self._recovery.active:
             return DesiredReference(self._recovery.sample, follows_path=True)
         return DesiredReference(self._mission(now_us, utc_us))
 
     def _mission(self, now_us: int, utc_us: int) -> Sampled:
-        return partial(self._sequence.reference, utc_us, now_us)
+        return partial(self._state_machine.reference, utc_us, now_us)
 
-    def _tell(self, now_us: int) -> Deadlock | None:
-        told, self._told = self._told, self._recovery.deadlock
-        if told is None and self._told is not None:
-            self._note("deadlock", begins=True, by=self._told.by)
-            return self._told
-        if told is not None and self._told is None:
-            self._note("deadlock", begins=False, lasted_s=(now_us - told.since_us) * 1e-6)
+    def _report(self, now_us: int) -> Deadlock | None:
+        reported, self._reported = self._reported, self._recovery.deadlock
+        if reported is None and self._reported is not None:
+            self._note("deadlock", begins=True, by=self._reported.by)
+            return self._reported
+        if reported is not None and self._reported is None:
+            self._note("deadlock", begins=False, lasted_s=(now_us - reported.since_us) * 1e-6)
         return None

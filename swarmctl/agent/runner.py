@@ -1,6 +1,6 @@
-"""The real-time loop around one agent: absolute deadlines, missed ticks skipped and counted, never caught up.
+"""The real-time loop around one agent: absolute deadlines; missed ticks are skipped and counted, never caught up.
 
-Setpoints leave from the tick only. If this loop stalls they stop, and the autopilot's own failsafe acts.
+Setpoints are sent from the tick only. If this loop stalls they stop, and the autopilot's own failsafe acts.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from swarmctl.bus import topics
 from swarmctl.bus.peers import Bus, LocalHub, agent_name
 from swarmctl.bus.zenoh_bus import NO_BUS, ZenohBus
 from swarmctl.config import Config, load
-from swarmctl.control.phases.sequence import OPERATOR_STOP
+from swarmctl.control.phases.state_machine import OPERATOR_STOP
 from swarmctl.core.types import Mode
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, MissionError, StartError
 from swarmctl.mavlink.autopilot import Autopilot
@@ -30,13 +30,13 @@ from swarmctl.mavlink.transport import open_transport
 from swarmctl.telemetry.recorder import Recorder
 
 _LOOPBACK = "127.0.0.1"
-_SLEW_01 = 0.01  # of elapsed time, by which UTC may be corrected
-_LINGER_S = 1.0  # after the end, so that peers learn of it
-_VEHICLE_LOST_S = 15.0  # no state at all: nothing left to do here
+_UTC_SLEW_01 = 0.01  # largest correction of UTC per elapsed time
+_LINGER_S = 1.0  # time the process lives on after its end, so that peers receive the last status
+_VEHICLE_LOST_S = 15.0  # time without any vehicle state after which the process gives up
 
 
 class WallClock:
-    """The host's clocks. A step of UTC is followed slowly: in flight, time neither jumps nor runs backwards."""
+    """Reads the host's clocks. UTC steps are slewed, so that in flight time neither jumps nor runs backwards."""
 
     def __init__(self) -> None:
         self._read_ns = time.monotonic_ns()
@@ -47,58 +47,62 @@ class WallClock:
 
     def utc_us(self) -> int:
         now_ns = time.monotonic_ns()
-        most_ns = int((now_ns - self._read_ns) * _SLEW_01)
+        most_ns = int((now_ns - self._read_ns) * _UTC_SLEW_01)
         off_ns = time.time_ns() - now_ns - self._offset_ns
         self._offset_ns += min(most_ns, max(-most_ns, off_ns))
         self._read_ns = now_ns
         return (now_ns + self._offset_ns) // 1000
 
     def sleep_until(self, t_us: int) -> None:
-        """Return at monotonic `t_us` or, when it has passed, at once."""
+        """Return at monotonic time `t_us`, or at once when it has passed."""
         left_us = t_us - self.now_us()
         if left_us > 0:
             time.sleep(left_us * 1e-6)
 
 
 class Pace:
-    """Deadlines of a periodic loop and the count of those that were missed.
+    """Keeps the deadlines of a periodic loop and counts those that were missed.
 
-    A tick is late when its setpoint leaves after the next tick was due; a tick that is skipped counts as late.
+    A deadline is missed when the setpoint leaves after the next tick was due; a skipped tick counts as missed.
+
+    Attributes:
+        due_us: monotonic time the next tick is due.
+        missed: deadlines missed so far.
     """
 
     def __init__(self, period_us: int, first_us: int) -> None:
         self.period_us, self.due_us = period_us, first_us
-        self.late = 0
+        self.missed = 0
 
     def done(self, sent_us: int, now_us: int) -> None:
-        """Account for the tick that was due, and set the next deadline."""
+        """Count the tick that was due, whose setpoint left at `sent_us`, and set the next deadline after `now_us`."""
         if sent_us > self.due_us + self.period_us:
-            self.late += 1
+            self.missed += 1
         self.due_us += self.period_us
         skipped = max(0, (now_us - self.due_us) // self.period_us)
-        self.late += skipped
+        self.missed += skipped
         self.due_us += skipped * self.period_us
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AgentProcess:
-    """What one agent process is told on its command line."""
+    """Command-line arguments of one agent process."""
 
     config_path: Path  # resolved configuration
-    agent: int  # own index, from 0
+    agent: int  # index of this agent, from 0
     run: str  # name of the run on the bus
-    bus: str  # the router's endpoint; `NO_BUS`: it flies by itself
+    bus: str  # endpoint of the router; `NO_BUS`: the agent flies without peers
     run_dir: Path  # folder to record into
     fd: int | None = None  # bound UDP socket inherited from the launcher
-    vehicle_port: int | None = None  # loopback port at its other end; None where that is not known
-    only_land: bool = False  # whatever the vehicle does, it is landed and disarmed, and that is all
+    vehicle_port: int | None = None  # loopback port of the vehicle; None if unknown
+    only_land: bool = False  # land and disarm the vehicle, whatever it is doing, then end
 
 
 def run_agent(process: AgentProcess) -> int:
-    """Fly one agent until its mission has ended; returns the exit code.
+    """Run one agent until its mission has ended; returns the exit code.
 
     Raises:
-        StartError: link, bus or vehicle is not there.
+        StartError: link, bus or vehicle can't be reached.
         ConfigError: the configuration is not valid.
     """
     agent = process.agent
@@ -144,7 +148,7 @@ def run_agent(process: AgentProcess) -> int:
 
 
 def _join(process: AgentProcess, config: Config, clock: WallClock) -> Bus:
-    """Return the bus of the run; one with nobody else on it where there is no router."""
+    """Connect to the bus of the run, or to an empty local one when there is no router."""
     me = agent_name(process.agent)
     if process.bus == NO_BUS:
         return LocalHub(clock.now_us).attach(me)
@@ -161,7 +165,7 @@ def _join(process: AgentProcess, config: Config, clock: WallClock) -> Bus:
 
 def _loop(agent: Agent, config: Config, clock: WallClock, stop: _StopRequest, vehicle: str, only_land: bool) -> int:
     gc.collect()
-    gc.freeze()  # start-up garbage is not looked at again during flight
+    gc.freeze()  # keep objects of the start-up out of collections during flight
     pace = Pace(round(1e6 / config.agent.rate_hz), clock.now_us())
     seen_us = clock.now_us()
     ever_seen = False
@@ -171,18 +175,18 @@ def _loop(agent: Agent, config: Config, clock: WallClock, stop: _StopRequest, ve
         now_us = clock.now_us()
         if stop.take():
             agent.ask("land", now_us)
-        record = agent.tick(now_us, pace.late)
+        record = agent.tick(now_us, pace.missed)
         pace.done(now_us + round(record.tick_ms * 1000), clock.now_us())
-        if record.mode is not Mode.BLIND:
+        if record.mode is not Mode.STATE_STALE:
             seen_us, ever_seen = now_us, True
-        _give_up_on_silence(now_us - seen_us, ever_seen, config, vehicle)
+        _check_vehicle_silence(now_us - seen_us, ever_seen, config, vehicle)
         if agent.done if only_land else agent.finished:
             finished_us = finished_us or now_us
             if now_us - finished_us > _LINGER_S * 1e6:
                 return _exit_code(agent)
 
 
-def _give_up_on_silence(silent_us: int, ever_seen: bool, config: Config, vehicle: str) -> None:
+def _check_vehicle_silence(silent_us: int, ever_seen: bool, config: Config, vehicle: str) -> None:
     if not ever_seen and silent_us > config.agent.connect_timeout_s * 1e6:
         raise StartError(
             f"vehicle at {vehicle}: no heartbeat and position within {config.agent.connect_timeout_s:.0f} s. "
@@ -203,7 +207,7 @@ def _exit_code(agent: Agent) -> int:
 
 
 class _StopRequest:
-    """SIGINT, SIGTERM or SIGHUP (its terminal has gone): land. Taken once by the loop; the agent keeps it."""
+    """Holds a request to land after SIGINT, SIGTERM or SIGHUP (terminal closed) until the loop takes it, once."""
 
     def __init__(self, asked: bool) -> None:
         self._asked = asked

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from swarmctl.agent.world_model import Surroundings
+from swarmctl.agent.world_model import WorldModel
 from swarmctl.control.collision.barrier import Barrier, BarrierParams
 from swarmctl.control.estimation.disturbance import Estimate
 from swarmctl.control.model import VehicleModelParams
@@ -20,7 +20,7 @@ class SafetyFilter:
     Args:
         params, vehicle: see `Barrier`.
         dt_s: time between two commands.
-        surroundings: source of bodies.
+        world_model: source of bodies.
         downwash: see `SeparationParams`.
         note: is told `safety_filter`, with `acts=True` when an encounter begins and `acts=False, ticks=...` at its end.
         stopwatch_ns: measures the filter and has no influence.
@@ -31,33 +31,33 @@ class SafetyFilter:
         params: BarrierParams,
         vehicle: VehicleModelParams,
         dt_s: float,
-        surroundings: Surroundings,
+        world_model: WorldModel,
         downwash: float,
         note: Callable[..., None],
         stopwatch_ns: Callable[[], int],
     ) -> None:
-        self._params, self._surroundings, self._note = params, surroundings, note
+        self._params, self._world_model, self._note = params, world_model, note
         self._barrier = Barrier(params, vehicle, dt_s, downwash)
         self._stopwatch_ns = stopwatch_ns
         self._ticks, self._last_us = 0, 0
         self.acts, self.took_ms = False, 0.0  # in the newest tick
 
     def keep_apart(
-        self, now_us: int, act_utc_us: int, virtual: Array, start: Start, estimate: Estimate, flies: bool
+        self, now_us: int, act_utc_us: int, virtual_control: Array, start: Start, estimate: Estimate, flies: bool
     ) -> Array:
-        """Return virtual controls (3,) to fly from `act_utc_us` on in place of `virtual`; unchanged unless `flies`."""
+        """Return the virtual controls (3,) to fly from `act_utc_us` on; unchanged ones unless the agent `flies`."""
         began_ns, changed = self._stopwatch_ns(), None
         if self._params.enabled and flies:
             changed = self._barrier.filtered(
-                virtual,
+                virtual_control,
                 start,
                 estimate.disturbance_ned_m_s2,
                 estimate.hover_thrust_01,
-                self._surroundings.bodies(start.pos_ned_m, act_utc_us, self._barrier.ahead_s, self._params.margin_m),
+                self._world_model.bodies(start.pos_ned_m, act_utc_us, self._barrier.ahead_s, self._params.margin_m),
             )
         self._count(now_us, changed is not None)
         self.took_ms = (self._stopwatch_ns() - began_ns) * 1e-6
-        return virtual if changed is None else changed
+        return virtual_control if changed is None else changed
 
     def rest(self, now_us: int) -> None:
         """Record a tick in which the agent sends no setpoint."""

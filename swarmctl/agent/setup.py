@@ -1,4 +1,4 @@
-"""What one agent is told before it starts: its parameters, its place in the swarm, its vehicle."""
+"""Parameters of one agent, its place in the swarm and the model of its vehicle."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from swarmctl.control.estimation.state_filter import StateFilterParams
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.phases.failsafe import FailsafeParams
 from swarmctl.control.phases.overload import OverloadParams
-from swarmctl.control.phases.sequence import SequenceParams
+from swarmctl.control.phases.state_machine import StateMachineParams
 from swarmctl.control.reference.deadlock import DeadlockParams
 from swarmctl.control.reference.mission import MissionParams
 from swarmctl.core.params import Params
@@ -23,11 +23,11 @@ from swarmctl.core.types import Array
 
 
 class AgentParams(Params):
-    """Everything of an agent that is neither controller nor vehicle."""
+    """Parameters of an agent that belong neither to the controller nor to the vehicle model."""
 
     rate_hz: float = Field(50.0, ge=10, le=200)
     connect_timeout_s: float = Field(15.0, gt=0, le=600)
-    sequence: SequenceParams = SequenceParams()
+    state_machine: StateMachineParams = StateMachineParams()
     failsafe: FailsafeParams = FailsafeParams()
     overload: OverloadParams = OverloadParams()
     disturbance: DisturbanceParams = DisturbanceParams()
@@ -35,14 +35,14 @@ class AgentParams(Params):
     barrier: BarrierParams = BarrierParams()
     commit: CommitParams = CommitParams()
     deadlock: DeadlockParams = DeadlockParams()
-    autopilot_params: dict[str, int | float] = Field(  # PX4: land when setpoints stop, before it has flown far blindly
+    autopilot_params: dict[str, int | float] = Field(  # PX4: land 0.5 s after setpoints stop, before it has drifted far
         {"COM_OBL_RC_ACT": 4, "COM_OF_LOSS_T": 0.5}
     )
 
 
 @dataclass(frozen=True, slots=True)
 class AgentSetup:
-    """What one agent is told before it starts."""
+    """Everything one agent needs before it starts."""
 
     agent: int
     boot_id: int
@@ -53,19 +53,19 @@ class AgentSetup:
     controller: ControllerParams
     separation: SeparationParams
     vehicle_model: VehicleModelParams
-    obstacle_slots: int
+    max_obstacles: int
 
     @property
     def peers(self) -> list[int]:
-        """Indices of the others."""
+        """Indices of the other agents."""
         return [i for i in range(len(self.starts_ned_m)) if i != self.agent]
 
     @property
-    def slots(self) -> int:
-        """How many neighbours and obstacles get rows in a problem."""
-        return min(len(self.peers), self.separation.max_neighbours) + self.obstacle_slots
+    def max_keep_outs(self) -> int:
+        """Largest number of neighbours and obstacles that get constraint rows in one MPC problem."""
+        return min(len(self.peers), self.separation.max_neighbours) + self.max_obstacles
 
     @property
     def uses_commitments(self) -> bool:
-        """Whether the agent flies committed trajectories only."""
+        """Whether the agent flies only trajectories it has committed to."""
         return self.separation.mode == "guaranteed"

@@ -1,4 +1,4 @@
-"""What one tick leaves behind: its record for the recorder and the viewer, and a status for peers and people."""
+"""Publishes the results of a tick: the record for recorder and viewer, the status for peers and operators."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from swarmctl.bus.peers import Bus, PeerPaths
 from swarmctl.control.collision.separation import KeepOut
 from swarmctl.control.estimation.disturbance import Estimate
 from swarmctl.control.mpc.problem import Start
-from swarmctl.control.phases.sequence import Sequence
+from swarmctl.control.phases.state_machine import MissionStateMachine
 from swarmctl.core.clock import Clock
 from swarmctl.core.records import pack_tick
 from swarmctl.core.types import (
@@ -36,7 +36,7 @@ _NO_PLAN = np.empty((0, 3))
 
 
 class TickSink(Protocol):
-    """Where records go; never blocks."""
+    """Destination of records and events; its methods never block."""
 
     def tick(self, record: TickRecord) -> None: ...
 
@@ -44,18 +44,18 @@ class TickSink(Protocol):
 
 
 @dataclass(frozen=True, slots=True)
-class Thought:
-    """What a tick has worked out; all but `keep_outs` None while the own state is too old."""
+class PlanningResult:
+    """Result of the planning part of a tick; all but `keep_outs` is None while the own state is stale."""
 
     start: Start | None
-    plan: Plan | None  # None as well while the autopilot flies
-    reference: Reference | None  # now, one point
+    plan: Plan | None  # also None while the autopilot flies
+    reference: Reference | None  # the mission's reference now, one point
     keep_outs: list[KeepOut]
 
 
 @dataclass(frozen=True, slots=True)
-class Act:
-    """What a tick has done."""
+class ControlOutput:
+    """Output of a tick: mode, flown plan and setpoint sent."""
 
     mode: Mode
     flown: Plan | None
@@ -64,34 +64,34 @@ class Act:
 
 
 @dataclass(frozen=True, slots=True)
-class Took:
-    """How long the parts of a tick took [ms]."""
+class TickTiming:
+    """Durations of the parts of a tick [ms]."""
 
-    sense_ms: float  # listen included
+    sense_ms: float  # receiving included
     setup_ms: float  # prediction, reference, keep-outs, matrices
     commitment_ms: float  # receiving, checking and planning commitments; 0 in best effort
     spaces_ms: float  # half-spaces
     solve_ms: float  # inside the QP solver
     certify_ms: float
     barrier_ms: float  # the safety filter
-    send_ms: float  # judging included
+    send_ms: float  # failsafe decision included
 
     @property
     def tick_ms(self) -> float:
-        """Listen to send."""
+        """Duration from receiving to sending the setpoint."""
         planned_ms = self.setup_ms + self.spaces_ms + self.solve_ms + self.certify_ms
         return self.sense_ms + self.commitment_ms + planned_ms + self.barrier_ms + self.send_ms
 
 
-class Reporter:
-    """Counts ticks, writes their records and says the agent's status five times a second.
+class TelemetryPublisher:
+    """Counts ticks, records them and publishes the agent's status five times a second.
 
     Args:
-        agent, boot_id, sysid: who reports.
-        uses_commitments: whether the agent flies committed trajectories only.
-        autopilot: the vehicle, for what it says of itself.
-        paths: what is known of peers.
-        bus, clock, sink: where it goes.
+        agent, boot_id, sysid: identity in the messages.
+        uses_commitments: whether the agent flies only trajectories it has committed to.
+        autopilot: source of the vehicle's reported modes.
+        paths: newest paths of peers.
+        bus, clock, sink: where messages go, their stamps, where records go.
     """
 
     def __init__(
@@ -113,92 +113,92 @@ class Reporter:
         self._status_us = -_STATUS_EVERY_US
         self.seq = 0
         self.failed_plans = 0
-        self.problem = ""
+        self.active_alert = ""
 
-    def report(
+    def publish(
         self,
         now_us: int,
         state: VehicleState | None,
-        thought: Thought,
-        act: Act,
-        sequence: Sequence,
+        planning: PlanningResult,
+        output: ControlOutput,
+        state_machine: MissionStateMachine,
         estimate: Estimate,
-        late_ticks: int,
-        took: Took,
+        deadline_misses: int,
+        timing: TickTiming,
     ) -> TickRecord:
-        """Record and publish one tick; the setpoint has left already."""
+        """Record and publish one tick; the setpoint has been sent before."""
         self.seq += 1
-        record = self._record(now_us, state, thought, act, sequence, estimate, late_ticks, took)
-        self._recent_ms.append(took.tick_ms)
+        record = self._record(now_us, state, planning, output, state_machine, estimate, deadline_misses, timing)
+        self._recent_ms.append(timing.tick_ms)
         self._sink.tick(record)
         self._bus.publish(topics.TICK, pack_tick(record))
         if now_us - self._status_us >= _STATUS_EVERY_US:
             self._status_us = now_us
-            self._bus.publish(topics.STATUS, topics.encode_message(self._status(record, sequence)))
+            self._bus.publish(topics.STATUS, topics.encode_message(self._status(record, state_machine)))
         return record
 
     def _record(
         self,
         now_us: int,
         state: VehicleState | None,
-        thought: Thought,
-        act: Act,
-        sequence: Sequence,
+        planning: PlanningResult,
+        output: ControlOutput,
+        state_machine: MissionStateMachine,
         estimate: Estimate,
-        late_ticks: int,
-        took: Took,
+        deadline_misses: int,
+        timing: TickTiming,
     ) -> TickRecord:
         utc_us = self._clock.utc_us()
-        plan, setpoint = thought.plan, act.setpoint
-        peers, obstacles, age_ms = self._surroundings(thought, utc_us)
+        plan, setpoint = planning.plan, output.setpoint
+        peers, obstacles, age_ms = self._distances(planning, utc_us)
         return TickRecord(
             t_us=now_us,
             utc_us=utc_us,
             seq=self.seq,
-            mission_t_s=sequence.mission_t_s(utc_us),
-            phase=sequence.phase,
-            mode=act.mode,
+            mission_t_s=state_machine.mission_t_s(utc_us),
+            phase=state_machine.phase,
+            mode=output.mode,
             flight_mode=self._autopilot.mode,
             armed=self._autopilot.armed,
             state_age_ms=math.nan if state is None else (now_us - state.t_us) * 1e-3,
             pos_ned_m=_NAN3 if state is None else state.pos_ned_m,
             vel_ned_m_s=_NAN3 if state is None else state.vel_ned_m_s,
             q_nb=_NAN4 if state is None else state.q_nb,
-            ref_pos_ned_m=_NAN3 if thought.reference is None else thought.reference.pos_ned_m[0],
+            ref_pos_ned_m=_NAN3 if planning.reference is None else planning.reference.pos_ned_m[0],
             setpoint_q_nb=_NAN4 if setpoint is None else setpoint.q_nb,
             setpoint_thrust_01=math.nan if setpoint is None else setpoint.thrust_01,
             hover_thrust_01=estimate.hover_thrust_01,
             disturbance_ned_m_s2=estimate.disturbance_ned_m_s2,
             nearest_peer_m=min(peers, default=math.inf),
             nearest_obstacle_m=min(obstacles, default=math.inf),
-            path_age_ms=age_ms,
+            plan_staleness_ms=age_ms,
             peers=len(peers),
             rejected=self._paths.refusals.total,
             plan_status=PlanStatus.NONE if plan is None else plan.status,
             slack_m=0.0 if plan is None else plan.slack_m,
             residual_m=0.0 if plan is None else plan.residual_m,
             iterations=0 if plan is None else plan.iterations,
-            solve_ms=took.solve_ms,
-            tick_ms=took.tick_ms,
-            late_ticks=late_ticks,
-            plan_pos_ned_m=_NO_PLAN if act.flown is None else act.flown.pos_ned_m,
-            safety_filter_acted=act.safety_filter_acted,
+            solve_ms=timing.solve_ms,
+            tick_ms=timing.tick_ms,
+            deadline_misses=deadline_misses,
+            plan_pos_ned_m=_NO_PLAN if output.flown is None else output.flown.pos_ned_m,
+            safety_filter_acted=output.safety_filter_acted,
         )
 
-    def _surroundings(self, thought: Thought, utc_us: int) -> tuple[list[float], list[float], float]:
-        """Distances to peers and to visible obstacles [m] when the setpoint acts; age of the oldest newest path [ms].
+    def _distances(self, planning: PlanningResult, utc_us: int) -> tuple[list[float], list[float], float]:
+        """Return distances to peers and visible obstacles [m] when the setpoint acts, and the largest staleness [ms].
 
-        A path begins when its sender's setpoint acts, so its age counts from there to when ours does.
+        A path begins when its sender's setpoint acts, so its staleness counts from there to when our setpoint acts.
         """
-        if thought.start is None:
+        if planning.start is None:
             return [], [], math.nan
-        here, act_utc_us = thought.start.pos_ned_m, utc_us + thought.start.t_us - self._clock.now_us()
-        peers = [math.dist(here, k.pos_ned_m[0]) for k in thought.keep_outs if k.priority_id >= 0]
-        obstacles = [k.distance_m(here) for k in thought.keep_outs if k.priority_id < 0]
+        here, act_utc_us = planning.start.pos_ned_m, utc_us + planning.start.t_us - self._clock.now_us()
+        peers = [math.dist(here, k.pos_ned_m[0]) for k in planning.keep_outs if k.priority_id >= 0]
+        obstacles = [k.distance_m(here) for k in planning.keep_outs if k.priority_id < 0]
         ages_ms = [(act_utc_us - path.t0_utc_us) * 1e-3 for path in self._paths.latest()]
         return peers, obstacles, max(ages_ms, default=math.nan)
 
-    def _status(self, record: TickRecord, sequence: Sequence) -> topics.StatusMessage:
+    def _status(self, record: TickRecord, state_machine: MissionStateMachine) -> topics.StatusMessage:
         error = record.pos_ned_m - record.ref_pos_ned_m
         return topics.StatusMessage(
             agent=self._agent,
@@ -209,21 +209,21 @@ class Reporter:
             flight_mode=int(record.flight_mode),
             armed=record.armed,
             landed=int(self._autopilot.landed),
-            ready_utc_us=sequence.ready_utc_us,
-            outcome=sequence.outcome,
+            ready_utc_us=state_machine.ready_utc_us,
+            outcome=state_machine.outcome,
             position_error_m=_finite(math.sqrt(float(error @ error))),
             separation_m=_finite(record.nearest_peer_m),
             tick_p99_ms=float(np.percentile(self._recent_ms, 99)),
             ticks=record.seq,
-            late_ticks=record.late_ticks,
-            path_age_ms=_finite(record.path_age_ms),
+            deadline_misses=record.deadline_misses,
+            plan_staleness_ms=_finite(record.plan_staleness_ms),
             solver_failed=self.failed_plans,
-            problem=self.problem,
+            active_alert=self.active_alert,
             uses_commitments=self._uses_commitments,
             utc_us=record.utc_us,
         )
 
 
 def _finite(value: float) -> float:
-    """JSON has no infinity: -1 says there is none."""
+    """Return the value, or -1 in place of NaN and infinity, which JSON lacks."""
     return value if math.isfinite(value) else -1.0

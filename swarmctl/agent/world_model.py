@@ -1,4 +1,4 @@
-"""What an agent knows of its peers and of obstacles: hears the bus, answers what to keep clear of and who is there."""
+"""World model of an agent: peers and obstacles received over the bus, and the keep-outs and bodies that follow."""
 
 from __future__ import annotations
 
@@ -19,27 +19,27 @@ from swarmctl.control.collision.separation import (
     keep_out_of_peer,
     visible,
 )
-from swarmctl.control.phases.inputs import PeerFacts
+from swarmctl.control.phases.inputs import PeerInputs
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.trajectory_message import TrajectoryMessage
 from swarmctl.core.types import Array, Mode, Obstacle, Phase
 
-_NEW_US = 300_000  # a path that may be compared with commitments
-_READY_LEAD_US = 1_000_000  # of another clock than ours
-FLOWN_BY_AGENT = frozenset((Mode.FOLLOW, Mode.REPLAY, Mode.BRAKE, Mode.HOLD))
+_RECENT_PATH_US = 300_000  # largest age of a path that is compared with commitments
+_READY_LEAD_US = 1_000_000  # largest lead of a peer's clock over ours
+FLOWN_BY_AGENT = frozenset((Mode.TRACKING, Mode.REPLAY, Mode.BRAKE, Mode.HOLD))
 
 
-class Surroundings:
-    """Peers' newest paths and statuses, and the obstacles the operator has told of.
+class WorldModel:
+    """Keeps the newest paths and statuses of peers, and the obstacles published by the operator.
 
     Args:
-        agent: own index.
-        peers: indices of the others.
+        agent: index of this agent.
+        peers: indices of the other agents.
         params: distances and ages.
-        bus: is drained by `listen`.
-        rate_hz: of every agent's ticks.
-        note: is told `refused` (see `Refusals`); `unheard` when a peer that is on the bus has said no path that is
-            believed for `lost_after_s`, and when that ends, with how long it lasted.
+        bus: source of messages, drained by `listen`.
+        rate_hz: tick rate of every agent.
+        note: receives the events `refused` (see `Refusals`) and `unheard`: a peer on the bus has published no
+            accepted path for `lost_after_s`; also when that ends, with its duration.
     """
 
     def __init__(
@@ -61,11 +61,11 @@ class Surroundings:
         self._status: dict[int, topics.StatusMessage] = {}
         self._obstacles: tuple[Obstacle, ...] = ()
         self._obstacles_version: int | None = None
-        self._seen: dict[int, Obstacle] = {}  # that have been visible, by identity
-        self.peer_commitments: Mapping[int, Sequence[Trajectory]] = {}  # may be followed, by peer that takes part
+        self._seen: dict[int, Obstacle] = {}  # obstacles that have been visible, by identity
+        self.peer_commitments: Mapping[int, Sequence[Trajectory]] = {}  # what peers that have committed may follow
 
     def listen(self, utc_us: int) -> list[str]:
-        """Take in everything that has arrived; returns the operator's verbs for this agent."""
+        """Process everything that has arrived; returns the operator's verbs for this agent."""
         self.attendance.update(utc_us)
         for sender, payload in self._bus.receive(topics.PATH):
             self.paths.offer(sender, payload, utc_us)
@@ -107,7 +107,7 @@ class Surroundings:
             self.refusals.add(sender, topics.OBSTACLES.name, SEQUENCE, utc_us)
 
     def _watch_unheard(self, utc_us: int) -> None:
-        """Tell of peers that are there, but of which no path is believed."""
+        """Report peers that are on the bus but whose paths have not been accepted for too long."""
         oldest_us = utc_us - round(self._params.lost_after_s * 1e6)
         unheard = {
             path.agent: path.t0_utc_us
@@ -133,9 +133,14 @@ class Surroundings:
         phase: Phase,
         without: Set[int] = frozenset(),
     ) -> list[KeepOut]:
-        """Everything to stay clear of over `steps` steps from `t0_utc_us`, seen from `pos_ned_m` (3,) in `phase`.
+        """Return the keep-outs of peers and visible obstacles over `steps` steps of `dt_us` from `t0_utc_us`.
 
-        Peers in `without` are left out: what they will do is known better.
+        Args:
+            pos_ned_m: own position (3,), which decides which obstacles are visible.
+            t0_utc_us: UTC of the first point.
+            dt_us, steps: time grid of the plan.
+            phase: own phase; in GOTO_LAND peers are kept clear of at every height.
+            without: peers to leave out, because their committed trajectories are known.
         """
         paths = [path for path in self.paths.latest() if path.agent not in without]
         places = aligned(paths, t0_utc_us, dt_us, steps, self._params.brake_m_s2) if paths else ()
@@ -157,11 +162,11 @@ class Surroundings:
         return found + [keep_out_of_obstacle(o, dt_us, steps, self._params) for o in seen]
 
     def deviating_peers(self, messages: Mapping[int, TrajectoryMessage], utc_us: int, allowed_m: float) -> set[int]:
-        """Peers whose newest path is farther than allowed from every trajectory that they may follow."""
+        """Return peers whose recent path deviates by more than `allowed_m` from all trajectories they committed to."""
         found = set()
         for path in self.paths.latest():
             message, at_us = messages.get(path.agent), path.t0_utc_us
-            if message is None or not message.is_committed or at_us < utc_us - _NEW_US:
+            if message is None or not message.is_committed or at_us < utc_us - _RECENT_PATH_US:
                 continue
             here = path.pos_ned_m[0].tolist()
             if all(math.dist(here, trajectory.at(at_us)[0]) > allowed_m for trajectory in message.followed):
@@ -169,13 +174,19 @@ class Surroundings:
         return found
 
     def landmarks(self) -> list[Obstacle]:
-        """Obstacles at rest that have been visible so far."""
+        """Return obstacles at rest that have been visible so far."""
         return [o for o in self._seen.values() if not o.vel_ned_m_s.any()]
 
     def bodies(self, pos_ned_m: Array, act_utc_us: int, ahead_s: float, margin_m: float) -> list[Body]:
-        """What not to touch, `ahead_s` after `act_utc_us`: peers heard of and obstacles seen from `pos_ned_m` (3,).
+        """Return the bodies not to touch `ahead_s` after `act_utc_us`: peers, and obstacles visible from `pos_ned_m`.
 
-        A peer that flies by commitments is where its trajectories are, however old the message.
+        A peer that has committed to trajectories is placed on them, however old its message; others on their path.
+
+        Args:
+            pos_ned_m: own position (3,).
+            act_utc_us: UTC at which the setpoint acts.
+            ahead_s: time from then to the instant the bodies are valid for.
+            margin_m: distance added to the size of every body.
         """
         p, fresh_us = self._params, act_utc_us - round(self._params.lost_after_s * 1e6)
         found: list[Body] = []
@@ -194,27 +205,27 @@ class Surroundings:
         return found + [body_of_obstacle(o, ahead_s, apart_m) for o in visible(self._obstacles, pos_ned_m)]
 
     def uses_commitments(self, agent: int) -> bool:
-        """Whether a peer flies committed trajectories only; taken as true until its first status."""
+        """Return whether a peer flies by commitments; true while its status is unknown."""
         status = self._status.get(agent)
         return status is None or status.uses_commitments
 
-    def peers(self) -> dict[int, PeerFacts]:
-        """Who has been heard of, how far it is, and whether it is still on the bus."""
+    def peers(self) -> dict[int, PeerInputs]:
+        """Return phase, ready time and liveliness of every peer that has published a status."""
         alive = self._bus.alive()
         return {
-            agent: PeerFacts(Phase(status.phase), status.ready_utc_us, agent_name(agent) in alive)
+            agent: PeerInputs(Phase(status.phase), status.ready_utc_us, agent_name(agent) in alive)
             for agent, status in self._status.items()
         }
 
     def others_ned_m(self, utc_us: int) -> tuple[Array, ...]:
-        """Where each peer is now (3,), by its newest path."""
+        """Return the present position (3,) of each peer by its newest path."""
         paths = self.paths.latest()
         return tuple(aligned(paths, utc_us, 1, 0, self._params.brake_m_s2)[:, 0]) if paths else ()
 
     def has_unresponsive_peer(self, utc_us: int) -> bool:
-        """Whether a peer is silent and not known to be gone: it may be flying on, or the bus is lost to us.
+        """Return whether some peer is silent and not known to have died: it may be flying on, or our bus is lost.
 
-        A peer whose liveliness token has gone while ours is there has died; its path has become a keep-out.
+        A peer whose liveliness token has gone while ours is present has died; its path has become a keep-out.
         """
         alive = self._bus.alive()
         connected = agent_name(self._agent) in alive
@@ -226,7 +237,7 @@ class Surroundings:
         return False
 
     def _flies_itself(self, agent: int) -> bool:
-        """Whether its agent flies it, and so filters as we do."""
+        """Return whether a peer's agent controls its vehicle, and so runs the same safety filter as ours."""
         status = self._status.get(agent)
         return status is not None and status.mode in FLOWN_BY_AGENT
 

@@ -108,10 +108,10 @@ class StatusMessage(msgspec.Struct, frozen=True):
     separation_m: float  # to the nearest peer now
     tick_p99_ms: float
     ticks: Count
-    late_ticks: int
-    path_age_ms: float
+    deadline_misses: int
+    plan_staleness_ms: float
     solver_failed: int
-    problem: str  # newest active alert, "" for none
+    active_alert: str  # newest one, "" for none
     uses_commitments: bool = False  # it flies committed trajectories only, see `control.commit`
     utc_us: Count = 0  # time of sending, by the agent's clock
 

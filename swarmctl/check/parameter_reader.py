@@ -45,7 +45,7 @@ class ParameterReader:
         self._target, self._dialect = (sysid, compid), dialect
         self._names = tuple(names)
         self._tries = dict.fromkeys(names, 0)
-        self._asked_us: dict[str, int] = {}
+        self._requested_us: dict[str, int] = {}
         self._given_up: set[str] = set()
         self._batch_us = 0
         self._settings: dict[str, _Setting] = {}
@@ -76,12 +76,12 @@ class ParameterReader:
         if now_us < self._batch_us:
             return []
         self._batch_us = now_us + _BATCH_US
-        waiting = [name for name in self._open() if now_us - self._asked_us.get(name, -_ASK_US) >= _ASK_US]
+        waiting = [name for name in self._open() if now_us - self._requested_us.get(name, -_ASK_US) >= _ASK_US]
         self._given_up.update(name for name in waiting if self._tries[name] >= _TRIES)
         asked = [name for name in waiting if name not in self._given_up][:_AT_ONCE]
         for name in asked:
             self._tries[name] += 1
-            self._asked_us[name] = now_us
+            self._requested_us[name] = now_us
         return [self._read(name) for name in asked]
 
     def hear(self, message: Any) -> None:

@@ -66,9 +66,10 @@ def _start(facts: VehicleFacts, config: Config) -> list[Finding]:
             "positive) or correct swarm.origin_alt_m"
         )
         return line(FIX, advice, 77)
-    sequence = config.agent.sequence
-    if away_m / sequence.speed_m_s > sequence.start_timeout_s:
-        advice = f"it can't get there within agent.sequence.start_timeout_s = {sequence.start_timeout_s:g}: move it"
+    state_machine = config.agent.state_machine
+    if away_m / state_machine.speed_m_s > state_machine.start_timeout_s:
+        within = f"agent.state_machine.start_timeout_s = {state_machine.start_timeout_s:g}"
+        advice = f"it can't get there within {within}: move it"
         return line(FIX, advice, 76)
     if away_m > _FAR_M:
         return line(NOTE, "far from its start; is the way there free?", 6)

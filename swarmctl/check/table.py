@@ -24,7 +24,11 @@ _COLUMNS = ("vehicle", "what", "found", "wanted", "verdict")
 _STYLES = {Verdict.OK: "green", Verdict.NOTE: "yellow", Verdict.FIX: "bold red"}
 
 
-def print_check(vehicles: Sequence[VehicleFacts], lines: Sequence[Finding], changes: Sequence[Change]) -> None:
+def print_check(
+    vehicles: Sequence[VehicleFacts],
+    lines: Sequence[Finding],
+    changes: Sequence[Change],
+) -> None:
     """On standard output: a drawn table on a terminal, tab-separated lines anywhere else."""
     console = Console(highlight=False)
     if console.is_terminal:
@@ -37,7 +41,12 @@ def print_check(vehicles: Sequence[VehicleFacts], lines: Sequence[Finding], chan
         console.print(printable(text, _LINE), markup=False, soft_wrap=True)
 
 
-def as_json(vehicles: Sequence[VehicleFacts], lines: Sequence[Finding], changes: Sequence[Change], code: int) -> str:
+def as_json(
+    vehicles: Sequence[VehicleFacts],
+    lines: Sequence[Finding],
+    changes: Sequence[Change],
+    code: int,
+) -> str:
     """Everything a program may want, findings in the order of the table."""
     tree = {
         "exit_code": code,
@@ -70,7 +79,11 @@ def _who(agent: int) -> str:
     return "swarm" if agent == SWARM else agent_name(agent)
 
 
-def _after_table(vehicles: Sequence[VehicleFacts], lines: Sequence[Finding], changes: Sequence[Change]) -> list[str]:
+def _after_table(
+    vehicles: Sequence[VehicleFacts],
+    lines: Sequence[Finding],
+    changes: Sequence[Change],
+) -> list[str]:
     texts = [f"{agent_name(change.agent)} {change.in_words()}" for change in changes]
     found = worst_first(lines)
     alike: dict[tuple[Verdict, str], list[str]] = {}  # one text for all it is true of

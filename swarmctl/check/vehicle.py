@@ -224,7 +224,7 @@ def _rates(facts: VehicleFacts, config: Config) -> Finding | None:
     dialect = DIALECTS.get(facts.autopilot_number)
     if dialect is None:
         return None
-    asked_hz = config.agent.sequence.state_rate_hz
+    asked_hz = config.agent.state_machine.state_rate_hz
     names = [_NAMES.get(number, f"message {number}") for number in dialect.state]
     rates = facts.link.rates_hz
     found = ", ".join(f"{name} {rates.get(name, 0.0):.0f} Hz" for name in names)
@@ -238,7 +238,7 @@ def _rates(facts: VehicleFacts, config: Config) -> Finding | None:
         if planned > most:
             advice = (
                 f"{planned / 1e3:.1f} kB/s would be sent over a link for {most / 1e3:.1f}: raise the baud rate, "
-                "lower agent.sequence.state_rate_hz, or stop other streams"
+                "lower agent.state_machine.state_rate_hz, or stop other streams"
             )
             return Finding(facts.agent, "state rate", FIX, found, wanted, advice, 68)
     return Finding(facts.agent, "state rate", OK, found, wanted)

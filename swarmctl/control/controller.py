@@ -100,15 +100,15 @@ def make_controller(
     vehicle: VehicleModelParams,
     separation: SeparationParams,
     agent: int,
-    slots: int,
+    max_keep_outs: int,
     stopwatch_ns: Callable[[], int],
 ) -> Controller:
-    """Return the controller that a configuration asks for; `slots` is the number of keep-outs it can hold at once."""
+    """Return the controller that a configuration asks for, with rows for `max_keep_outs` keep-outs at once."""
     if params.kind == "pid":
         return _Pid(params.pid)
     if params.kind == "open_loop":
         return _OpenLoop(params.mpc)
     if params.kind == "dmpc3":
-        return _Mpc(JointMpc(params.mpc, vehicle, separation, agent, slots, stopwatch_ns), False)
+        return _Mpc(JointMpc(params.mpc, vehicle, separation, agent, max_keep_outs, stopwatch_ns), False)
     alone = params.kind == "mpc"
-    return _Mpc(SwarmMpc(params.mpc, vehicle, separation, agent, 0 if alone else slots, stopwatch_ns), alone)
+    return _Mpc(SwarmMpc(params.mpc, vehicle, separation, agent, 0 if alone else max_keep_outs, stopwatch_ns), alone)

@@ -15,7 +15,7 @@ _ACCEL_MAX_M_S2 = 3.0
 _TILT_RATE_1_S = 2.5  # of (u_x, u_y): faster attitude changes would saturate rotors
 
 
-def rest_plan(
+def brake_and_hold_plan(
     start: Start, at_ned_m: Array | None, disturbance_ned_m_s2: Array, lag: Lag | None, dt_us: int, steps: int
 ) -> Plan:
     """Brake, or return to `at_ned_m` (3,) if given, like a critically damped spring of bounded acceleration.
@@ -26,8 +26,8 @@ def rest_plan(
     damping = _DAMPING_1_S if lag is None else min(_DAMPING_1_S, _DAMPING_RAD / lag.ramp_delay_s)
     stiffness = 0.25 * damping * damping
     pos, vel = np.empty((steps + 1, 3)), np.empty((steps + 1, 3))
-    virtual = np.empty((steps, 3))
-    pos[0], vel[0], commanded = start.pos_ned_m, start.vel_ned_m_s, start.virtual[:2]
+    virtual_control = np.empty((steps, 3))
+    pos[0], vel[0], commanded = start.pos_ned_m, start.vel_ned_m_s, start.virtual_control[:2]
     tilt, rate = start.tilt, start.tilt_rate_1_s
     for k in range(steps):
         wanted = -damping * vel[k]
@@ -42,7 +42,7 @@ def rest_plan(
             thrust_vector[:2] / float(np.sqrt(thrust_vector @ thrust_vector)), commanded - slew, commanded + slew
         )
         thrust = float(thrust_vector[2]) / float(np.sqrt(1.0 - u @ u))  # supports the weight at the commanded tilt
-        virtual[k], commanded = (u[0], u[1], thrust), u
+        virtual_control[k], commanded = (u[0], u[1], thrust), u
         acts = u
         if lag is not None:
             ends = [lag.advance(float(tilt[i]), float(rate[i]), float(u[i]), dt_s) for i in (0, 1)]
@@ -51,4 +51,4 @@ def rest_plan(
         accel[:2] = disturbance_ned_m_s2[:2] - thrust * acts
         pos[k + 1] = pos[k] + dt_s * vel[k] + 0.5 * dt_s * dt_s * accel
         vel[k + 1] = vel[k] + dt_s * accel
-    return Plan(PlanStatus.NONE, start.t_us, dt_us, pos, vel, virtual, NO_TIMES, 0, 0.0, 0.0, 0.0)
+    return Plan(PlanStatus.NONE, start.t_us, dt_us, pos, vel, virtual_control, NO_TIMES, 0, 0.0, 0.0, 0.0)

@@ -57,9 +57,9 @@ class Predictor:
         """Return the time from sending to acting [us]."""
         return self._delay_us
 
-    def sent(self, now_us: int, virtual: Array) -> None:
-        """Remember a command, virtual controls (3,), that acts after the delay."""
-        self._sent.append((now_us + self._delay_us, virtual))
+    def sent(self, now_us: int, virtual_control: Array) -> None:
+        """Remember a command, virtual_control controls (3,), that acts after the delay."""
+        self._sent.append((now_us + self._delay_us, virtual_control))
 
     def clear(self) -> None:
         """Forget remembered commands, after a handover."""
@@ -68,10 +68,10 @@ class Predictor:
     def acting(self, t_us: int) -> Array | None:
         """Return the virtual controls (3,) that act at `t_us`; None before the first."""
         acting = None
-        for start_us, virtual in self._sent:
+        for start_us, virtual_control in self._sent:
             if start_us > t_us:
                 break
-            acting = virtual
+            acting = virtual_control
         return acting
 
     def start(self, state: VehicleState, until_us: int, disturbance_ned_m_s2: Array, held: Array) -> Start:
@@ -84,7 +84,7 @@ class Predictor:
         down = body_z_ned(state.q_nb)
         tilt, rate = down[:2], tilt_rate(state)
         current = None if not self._sent else self._sent[0][1]
-        for start_us, virtual in self._sent:
+        for start_us, virtual_control in self._sent:
             if start_us > t_us:
                 if start_us >= until_us:
                     break
@@ -92,13 +92,13 @@ class Predictor:
                     pos, vel, tilt, rate, current, disturbance_ned_m_s2, start_us - t_us
                 )
                 t_us = start_us
-            current = virtual
+            current = virtual_control
         left_us = max(0, until_us - t_us)
         pos, vel, tilt, rate = self._advance(pos, vel, tilt, rate, current, disturbance_ned_m_s2, left_us)
         if self._lag is None:
             return Start(until_us, pos, vel, float(down[2]), held)
-        upright = math.sqrt(max(0.0, 1.0 - float(tilt @ tilt)))
-        return Start(until_us, pos, vel, upright, held, tilt, rate)
+        cos_tilt = math.sqrt(max(0.0, 1.0 - float(tilt @ tilt)))
+        return Start(until_us, pos, vel, cos_tilt, held, tilt, rate)
 
     def _advance(
         self,
@@ -128,9 +128,9 @@ def tilt_rate(state: VehicleState) -> Array:
     return rotate_to_ned(state.q_nb, np.array([q, -p, 0.0]))[:2]
 
 
-def acceleration(virtual: Array) -> Array:
-    """Return the acceleration (3,) NED [m/s2] of virtual controls (3,), gravity included (thesis 3.2)."""
-    ux, uy, thrust = (float(c) for c in virtual)
+def acceleration(virtual_control: Array) -> Array:
+    """Return the acceleration (3,) NED [m/s2] of virtual_control controls (3,), gravity included (thesis 3.2)."""
+    ux, uy, thrust = (float(c) for c in virtual_control)
     down = max(0.0, 1.0 - ux * ux - uy * uy) ** 0.5
     return np.array([-thrust * ux, -thrust * uy, GRAVITY_M_S2 - thrust * down])
 

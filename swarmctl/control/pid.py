@@ -73,11 +73,11 @@ class PidController:
         winding = (wanted != out) & (np.sign(gains[:, 1] * error) == np.sign(wanted))
         self._integral = np.where(winding, self._integral, integral)
         pitch, roll, thrust = float(out[0]), float(out[1]), GRAVITY_M_S2 + float(out[2])
-        virtual = np.array([math.sin(pitch) * math.cos(roll), -math.sin(roll), thrust])
+        virtual_control = np.array([math.sin(pitch) * math.cos(roll), -math.sin(roll), thrust])
         t_s = np.arange(p.path_steps + 1)[:, None] * p.dt_s
         pos = start.pos_ned_m + t_s * start.vel_ned_m_s
         vel = np.tile(start.vel_ned_m_s, (p.path_steps + 1, 1))
-        held = np.tile(virtual, (p.path_steps, 1))
+        held = np.tile(virtual_control, (p.path_steps, 1))
         return Plan(PlanStatus.OK, start.t_us, self.dt_us, pos, vel, held, NO_TIMES, 0, 0.0, 0.0, 0.0)
 
     def _ahead(self, reference: Reference) -> Array:

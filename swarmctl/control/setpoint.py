@@ -14,14 +14,14 @@ VALID_US = 100_000  # a setpoint is stale after this time
 
 
 def setpoint_of(
-    virtual: Array, yaw_rad: float, hover_thrust_01: float, now_us: int, params: VehicleModelParams
+    virtual_control: Array, yaw_rad: float, hover_thrust_01: float, now_us: int, params: VehicleModelParams
 ) -> AttitudeSetpoint:
     """Return the attitude and thrust of virtual controls (3,): u_x, u_y, thrust over mass [m/s2].
 
     The body down axis is (u_x, u_y, sqrt(1 - u_x^2 - u_y^2)): thesis (3.26) and (3.33) without their singularity. Tilt
     is limited by shortening (u_x, u_y). Thrust is linear in the autopilot's 0..1; `hover_thrust_01` holds the weight.
     """
-    ux, uy, specific = (float(c) for c in virtual)
+    ux, uy, specific = (float(c) for c in virtual_control)
     tilt = math.hypot(ux, uy)
     limit = math.sin(params.tilt_max_rad)
     if tilt > limit:

@@ -34,7 +34,7 @@ TICK_DTYPE = np.dtype(
         ("disturbance_ned_m_s2", "<f4", (3,)),
         ("nearest_peer_m", "<f4"),
         ("nearest_obstacle_m", "<f4"),
-        ("path_age_ms", "<f4"),
+        ("plan_staleness_ms", "<f4"),
         ("peers", "<u2"),
         ("rejected", "<u4"),
         ("plan_status", "u1"),
@@ -43,7 +43,7 @@ TICK_DTYPE = np.dtype(
         ("iterations", "<u4"),
         ("solve_ms", "<f4"),
         ("tick_ms", "<f4"),
-        ("late_ticks", "<u4"),
+        ("deadline_misses", "<u4"),
         ("safety_filter_acted", "u1"),
     ]
 )

@@ -58,17 +58,17 @@ class Phase(enum.IntEnum):
 
 
 class Mode(enum.IntEnum):
-    """What the agent does this tick; decided by `control.failsafe` from `Health`."""
+    """Mode of the agent in a tick, decided by `control.phases.failsafe` from `Health`."""
 
     IDLE = 0  # nothing is sent: before take-off, after landing
-    STREAM = 1  # setpoints flow but the autopilot still flies
-    FOLLOW = 2  # the plan of this tick is flown
+    PRIMING = 1  # setpoints flow but the autopilot still flies
+    TRACKING = 2  # the plan of this tick is flown
     REPLAY = 3  # solver failed: the shifted last certified plan is flown
     BRAKE = 4  # no valid plan: bring the vehicle to rest
     HOLD = 5  # at rest, keep position
     LAND = 6  # the autopilot lands
-    YIELD = 7  # pilot or autopilot took over: nothing is sent, nothing is commanded
-    BLIND = 8  # own state too old: nothing is sent, the autopilot's failsafe acts
+    PILOT_OVERRIDE = 7  # pilot or autopilot took over: nothing is sent, nothing is commanded
+    STATE_STALE = 8  # own state too old: nothing is sent, the autopilot's failsafe acts
 
 
 class Verb(enum.Enum):
@@ -192,7 +192,7 @@ class Plan:
     dt_us: int
     pos_ned_m: Array  # (N+1, 3)
     vel_ned_m_s: Array  # (N+1, 3)
-    virtual: Array  # (N, 3): virtual controls u_x, u_y [-] and thrust over mass [m/s2], held over each step
+    virtual_control: Array  # (N, 3): virtual controls u_x, u_y [-] and thrust over mass [m/s2], held over each step
     times: PlanTimes
     iterations: int
     slack_m: float  # largest separation slack used
@@ -240,7 +240,7 @@ class Health:
     speed_m_s: float
     phase: Phase
     had_control: bool  # the autopilot follows setpoints and has not been released
-    yielded: bool  # a pilot or the autopilot took over, until an operator resumes
+    pilot_override: bool  # a pilot or the autopilot timing over, until an operator resumes
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,7 +266,7 @@ class TickRecord:
     disturbance_ned_m_s2: Array  # (3,)
     nearest_peer_m: float  # to the newest prediction of any peer; inf without peers
     nearest_obstacle_m: float  # centre distance of the nearest visible obstacle; inf without
-    path_age_ms: float  # the oldest newest path; NaN without peers
+    plan_staleness_ms: float  # the oldest newest path; NaN without peers
     peers: int  # number of paths in use
     rejected: int  # number of bus messages refused so far
     plan_status: PlanStatus
@@ -275,6 +275,6 @@ class TickRecord:
     iterations: int
     solve_ms: float
     tick_ms: float  # from receiving to sending
-    late_ticks: int  # number so far, skipped ticks included
+    deadline_misses: int  # number so far, skipped ticks included
     plan_pos_ned_m: Array  # (N+1, 3), empty when there is no plan
     safety_filter_acted: bool = False  # the safety filter has changed the input

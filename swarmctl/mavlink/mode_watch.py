@@ -11,7 +11,7 @@ from swarmctl.core.types import FlightMode
 
 _GAP_US = 300_000  # a silence this long, ours or the link's
 _TOLD_LATELY_US = 100_000  # a mode this young at the end of our own silence was not held up in a full buffer
-_ASK_EVERY_US = 60_000
+_REQUEST_PERIOD_US = 60_000
 
 
 class ModeWatch:
@@ -33,7 +33,7 @@ class ModeWatch:
         self._shown_us: int | None = None
         self._polled_us: int | None = None
         self._heard_us: int | None = None
-        self._asked_us: int | None = None
+        self._requested_us: int | None = None
         self._doubt_us: int | None = None  # the mode has to be told after this
 
     @property
@@ -69,9 +69,9 @@ class ModeWatch:
 
     def asks(self, now_us: int) -> bool:
         """Whether to ask the vehicle for its HEARTBEAT now."""
-        if not self.in_doubt or (self._asked_us is not None and now_us - self._asked_us < _ASK_EVERY_US):
+        if not self.in_doubt or (self._requested_us is not None and now_us - self._requested_us < _REQUEST_PERIOD_US):
             return False
-        self._asked_us = now_us
+        self._requested_us = now_us
         return True
 
     def show(self, now_us: int) -> tuple[FlightMode, bool]:

@@ -30,7 +30,7 @@ _URL = re.compile(r"^(?P<scheme>udpin|udpout|tcp|serial)://(?P<where>[^:]+):(?P<
 _LOCAL_PORTS = (20000, 32700)  # towards vehicles that are spoken to first; below the ones systems hand out
 _NEIGHBOURS = 16
 _REOPEN_US = 1_000_000
-_DEAD_US = 5_000_000  # every autopilot beats once a second
+_LOST_AFTER_US = 5_000_000  # every autopilot beats once a second
 
 
 class Datagram(NamedTuple):
@@ -252,7 +252,7 @@ class TcpTransport:
             self._lose()
 
     def receive(self, now_us: int) -> list[Datagram]:
-        if self._sock is not None and now_us - self._heard_us > _DEAD_US:
+        if self._sock is not None and now_us - self._heard_us > _LOST_AFTER_US:
             self._lose()  # an end that vanished without a word would be waited for for a quarter of an hour
         if self._sock is None and (self._open_us is None or now_us - self._open_us >= _REOPEN_US):
             self._open(now_us)

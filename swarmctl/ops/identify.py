@@ -13,7 +13,7 @@ from pathlib import Path
 
 from swarmctl.bus.peers import agent_name
 from swarmctl.config import Config
-from swarmctl.control.estimation.identification import Figure, Identified, flown, identify
+from swarmctl.control.estimation.identification import Figure, Identified, identify, longest_segment
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, StartError
 from swarmctl.ops.launch import LaunchOptions, launch
@@ -90,7 +90,7 @@ def identified(directory: Path, agents: int) -> dict[int, Identified | str]:
     run = load_run(directory)
     found: dict[int, Identified | str] = {}
     for agent in range(agents):
-        flight = flown(run.ticks[agent]) if agent in run.ticks else "nothing was recorded"
+        flight = longest_segment(run.ticks[agent]) if agent in run.ticks else "nothing was recorded"
         found[agent] = flight if isinstance(flight, str) else identify(flight)
     return found
 

@@ -47,7 +47,7 @@ LAUNCH_FILE = "launch.json"
 _ANSWER_S = 5.0
 _REPEAT_S = 0.2
 _START_TOLERANCE_S = 1.0
-_MOST_BYTES = 65_536  # of a note
+_MAX_BYTES = 65_536  # of a note
 
 
 class RunningLaunch(msgspec.Struct, frozen=True):
@@ -313,7 +313,7 @@ def _is_private(place: Path) -> bool:
 
 def _read(path: Path) -> RunningLaunch | None:
     try:
-        return msgspec.json.decode(read_file(path, _MOST_BYTES), type=RunningLaunch)
+        return msgspec.json.decode(read_file(path, _MAX_BYTES), type=RunningLaunch)
     except (OSError, msgspec.DecodeError):
         return None
 

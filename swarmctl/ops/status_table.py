@@ -22,7 +22,7 @@ from swarmctl.core.types import Mode, Phase
 
 REFRESH_HZ = 4.0
 _LINE = 2000  # characters of a line that stays
-_COLUMNS = ("agent", "phase", "mode", "error m", "separation m", "tick p99 ms", "late", "path age ms", "problem")
+_COLUMNS = ("agent", "phase", "mode", "error m", "separation m", "tick p99 ms", "missed", "staleness ms", "alert")
 
 
 @dataclass(slots=True)
@@ -102,9 +102,9 @@ class PlainLines:
             if (phase, view.note) == self._last.get(view.agent, ("", "")):
                 continue
             self._last[view.agent] = (phase, view.note)
-            problem = view.note or (view.status.problem if view.status else "")
+            alert = view.note or (view.status.active_alert if view.status else "")
             elapsed_s = time.monotonic() - self._started_s
-            self.say(f"{elapsed_s:7.1f} s  {agent_name(view.agent)}  {phase}{'  ' + problem if problem else ''}")
+            self.say(f"{elapsed_s:7.1f} s  {agent_name(view.agent)}  {phase}{'  ' + alert if alert else ''}")
 
     def close(self) -> None:
         return
@@ -140,9 +140,9 @@ def status_cells(view: AgentView) -> tuple[str, ...]:
         _number(status.position_error_m, 3),
         _number(status.separation_m, 2),
         _number(status.tick_p99_ms, 1),
-        f"{status.late_ticks}/{status.ticks}",
-        _number(status.path_age_ms, 0),
-        printable(view.note or status.problem),
+        f"{status.deadline_misses}/{status.ticks}",
+        _number(status.plan_staleness_ms, 0),
+        printable(view.note or status.active_alert),
     )
 
 

@@ -87,7 +87,7 @@ def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...
     timing, solver, comms = (_section(summary, name) for name in ("timing", "solver", "comms"))
     tick, solve, age = _section(timing, "tick_ms"), _section(timing, "solve_ms"), _section(comms, "path_age_ms")
     rejected = sum(_section(comms, "rejected").values())
-    outcome = f"{summary.get('outcome')}, index {_m(_section(summary, 'tracking').get('index_m'))}"
+    outcome = f"{summary.get('outcome')}, summed mean tracking error {_m(_section(summary, 'tracking').get('index_m'))}"
     if len(violations) == 1:
         outcome += f"; 1 violation: {printable(violations[0])}"
     elif violations:
@@ -99,10 +99,10 @@ def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...
         + (
             f", obstacles {_m(clearance)} (required {_m(obstacles.get('required_m'))})" if clearance is not None else ""
         ),
-        f"ticks {_count(timing, 'ticks')}, late {_count(timing, 'late_ticks')}, "
+        f"ticks {_count(timing, 'ticks')}, deadline misses {_count(timing, 'late_ticks')}, "
         f"tick p50/p99/max {_ms(tick)} ms, solve p50/p99/max {_ms(solve)} ms",
         f"solver {_count(solver, 'name')}, failed {_count(solver, 'failed')}; "
-        f"path age p50/p99 {_ms(age, ('p50', 'p99'))} ms, {rejected} messages refused"
+        f"plan staleness p50/p99 {_ms(age, ('p50', 'p99'))} ms, {rejected} messages refused"
         + _unheard(comms)
         + _deadlocks(summary),
         f"run folder {directory}",

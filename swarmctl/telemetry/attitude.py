@@ -1,4 +1,4 @@
-"""Roll and pitch of whole recordings at once; single quaternions are the business of `core.frames`."""
+"""Computes roll and pitch of whole recordings at once; `core.frames` handles single quaternions."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from swarmctl.core.types import Array
 
 
 def roll_pitch_rad(q_nb: NDArray[np.floating]) -> Array:
-    """Roll and pitch (T, 2) [rad] of quaternions (T, 4) wxyz body -> NED; NaN stays NaN."""
+    """Return roll and pitch (T, 2) [rad] of quaternions (T, 4) wxyz body -> NED; NaN stays NaN."""
     w, x, y, z = np.asarray(q_nb, np.float64).T
     roll_rad = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch_rad = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))

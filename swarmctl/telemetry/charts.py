@@ -1,6 +1,6 @@
-"""Inline SVG, written by hand: time charts, a top view, an oblique view and bars. No script, no font, no request.
+"""Draws inline SVG: time charts, a top view, an oblique view and state bars, without scripts, fonts or requests.
 
-Every function returns text. Lines are thinned to a number of points that keeps their extremes.
+Every function returns text. Lines are thinned to a number of points, which keeps their extremes.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from swarmctl.telemetry.palette import LIMIT_RGB, css
 
 WIDTH = 640
 _LEFT, _RIGHT, _TOP, _BOTTOM = 52, 12, 8, 24
-_FAR = 1e9  # no unit of ours gets there; a damaged recording does, and would press all else flat
-_LOOK_RAD, _DOWN_RAD = math.radians(35), math.radians(24)  # the oblique view looks this far east of north, and down
+_MAX_DRAWN = 1e9  # larger values come from damaged recordings and would flatten all other curves
+_LOOK_RAD, _DOWN_RAD = math.radians(35), math.radians(24)  # direction of the oblique view: east of north, and down
 
 
 def _near(values: Array) -> Array:
-    """What can be drawn; NaN for the rest."""
+    """Return values that can be drawn, and NaN for others."""
     values = np.asarray(values, np.float64)
-    return np.where(np.abs(values) < _FAR, values, np.nan)
+    return np.where(np.abs(values) < _MAX_DRAWN, values, np.nan)
 
 
 @dataclass(frozen=True, slots=True)
 class Line:
-    """One curve; NaN, and what is too far off to draw, breaks it."""
+    """One curve; NaN and values too large to draw interrupt it."""
 
     x: Array  # (T,)
     y: Array  # (T,)
@@ -41,7 +41,7 @@ class Line:
     dash: str = ""
     width: float = 1.4
     opacity: float = 1.0
-    marks: bool = False  # a dot on every point
+    marks: bool = False  # draw a dot on every point
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "x", _near(self.x))
@@ -50,7 +50,7 @@ class Line:
 
 @dataclass(frozen=True, slots=True)
 class SpaceLine:
-    """One path in space; NaN breaks it."""
+    """One path in space; NaN interrupts it."""
 
     pos_ned_m: Array  # (T, 3)
     color: str
@@ -61,7 +61,7 @@ class SpaceLine:
 
 
 class Limit(NamedTuple):
-    """A horizontal line that should not be crossed."""
+    """A limit, drawn as a horizontal line."""
 
     value: float
     label: str
@@ -77,7 +77,7 @@ class Span(NamedTuple):
 
 
 class Window(NamedTuple):
-    """A part of a time chart: what an obstacle takes up of one axis while the reference leads through it."""
+    """A shaded part of a time chart: the extent of an obstacle on one axis while the reference passes through it."""
 
     start: float
     end: float
@@ -129,19 +129,19 @@ def time_chart(
     ceiling: float | None = None,
     windows: Sequence[Window] = (),
 ) -> str:
-    """A figure with one chart over time.
+    """Return a figure with one chart over time.
 
     Args:
-        title: what is drawn, with its unit.
+        title: quantity drawn, with its unit.
         lines: curves over seconds.
         x_range: seconds shown.
         limits: horizontal lines.
-        band: seconds to shade, the mission.
-        points: kept per line.
-        height: of the plot [px].
-        from_zero: the value axis begins at 0.
+        band: seconds to shade, usually the mission.
+        points: number of points kept of each line.
+        height: height of the plot [px].
+        from_zero: whether the value axis begins at 0.
         ceiling: largest value shown; higher ones leave the plot.
-        windows: shaded parts, cut where they leave the plot.
+        windows: shaded parts, clipped to the plot.
     """
     low, high = _value_range([line.y for line in lines], [limit.value for limit in limits], from_zero, ceiling)
     x = _Axis(*_widened(*x_range), _LEFT, WIDTH - _RIGHT)
@@ -160,7 +160,7 @@ def time_chart(
 
 
 def top_view(title: str, lines: Sequence[Line], circles: Sequence[Circle], points: int = 600) -> str:
-    """A figure seen from above, equal scales; x is to the right, y up."""
+    """Return a figure seen from above with equal scales; x is to the right, y up."""
     xs = [line.x for line in lines] + [np.array([c.x - c.radius, c.x + c.radius]) for c in circles]
     ys = [line.y for line in lines] + [np.array([c.y - c.radius, c.y + c.radius]) for c in circles]
     (x_low, x_high), (y_low, y_high) = _value_range(xs), _value_range(ys)
@@ -186,10 +186,10 @@ def top_view(title: str, lines: Sequence[Line], circles: Sequence[Circle], point
 
 
 def space_view(title: str, lines: Sequence[SpaceLine], balls: Sequence[Ball] = (), points: int = 600) -> str:
-    """A figure seen from the south-west and from above; up is up, north to the left, east to the right.
+    """Return a figure seen from the south-west and above; north is to the left, east to the right.
 
-    Scales are equal, so that a ball is round. Without balls, paths far taller or flatter than wide are drawn with
-    another scale for heights, which is said.
+    Scales are equal, so that balls are round. Without balls, paths far taller or flatter than wide are drawn with
+    another scale of heights, which the axis states.
     """
     spread = [line.pos_ned_m for line in lines]
     spread += [np.array([ball.center_ned_m]) + side * ball.radius_m for ball in balls for side in (-1, 1)]
@@ -229,24 +229,24 @@ class _Oblique:
         self.height = _TOP + float(np.ptp(up_m)) * self.scale + 34
 
     def px(self, pos_ned_m: Array) -> tuple[Array, Array]:
-        """Pixels (...,) right and down of positions (..., 3)."""
+        """Return pixels (...,) to the right and down of positions (..., 3), NED."""
         right_m, up_m = self._plane_m(pos_ned_m)
         return self._left_px + right_m * self.scale, self._top_px - up_m * self.scale
 
     def _plane_m(self, pos_ned_m: Array) -> tuple[Array, Array]:
-        """Right and up (...,) in the plane of the drawing [m]."""
+        """Return coordinates right and up (...,) in the plane of the drawing [m]."""
         n, e, down = pos_ned_m[..., 0], pos_ned_m[..., 1], pos_ned_m[..., 2] * self._heights
         right_m = e * math.cos(_LOOK_RAD) - n * math.sin(_LOOK_RAD)
         ahead_m = n * math.cos(_LOOK_RAD) + e * math.sin(_LOOK_RAD)
         return right_m, ahead_m * math.sin(_DOWN_RAD) - down * math.cos(_DOWN_RAD)
 
     def depth_m(self, pos_ned_m: Array) -> Array:
-        """How far behind the origin positions (..., 3) are, seen from the camera [m]."""
+        """Return the distance (...,) [m] of positions (..., 3) behind the origin, seen from the camera."""
         ahead_m = pos_ned_m[..., 0] * math.cos(_LOOK_RAD) + pos_ned_m[..., 1] * math.sin(_LOOK_RAD)
         return np.asarray(ahead_m * math.cos(_DOWN_RAD) + pos_ned_m[..., 2] * math.sin(_DOWN_RAD))
 
     def frame(self) -> str:
-        """Floor, the two walls behind, ticks and names of the axes."""
+        """Return floor, the two walls behind, ticks and names of the axes."""
         (n0, e0, top), (n1, e1, floor) = self._low, self._high
         parts = []
         for n in _nice(n0, n1, 4):
@@ -275,7 +275,7 @@ class _Oblique:
 
 
 def state_bars(title: str, rows: Sequence[tuple[str, Sequence[Span]]], x_range: tuple[float, float]) -> str:
-    """A figure with one bar per row, coloured by state."""
+    """Return a figure with one bar for each row, coloured by state."""
     x = _Axis(*_widened(*x_range), _LEFT + 40, WIDTH - _RIGHT)
     parts, names = [], {}
     for number, (label, spans) in enumerate(rows):
@@ -299,7 +299,7 @@ def state_bars(title: str, rows: Sequence[tuple[str, Sequence[Span]]], x_range: 
 
 
 def thin(x: Array, y: Array, points: int) -> tuple[Array, Array]:
-    """At most `points` of a curve, keeping the smallest and the largest value of every stretch."""
+    """Return at most `points` points of a curve (T,), with the smallest and largest value of every part."""
     if len(x) <= points:
         return x, y
     buckets = np.array_split(np.arange(len(x)), max(1, points // 2))
@@ -327,7 +327,7 @@ def _polyline(line: Line, x: _Axis, y: _Axis, curve: tuple[Array, Array]) -> str
 
 
 def _stroke(line: Line | SpaceLine, px: Array, py: Array) -> str:
-    """One path through points (T,) given in pixels; NaN breaks it."""
+    """Return one path through points (T,) in pixels; NaN interrupts it."""
     path = "".join(
         "M" + "L".join(f"{a:.1f} {b:.1f}" for a, b in zip(px[part], py[part], strict=True))
         for part in _stretches(np.isfinite(px) & np.isfinite(py))
@@ -391,7 +391,10 @@ def _key(label: str, color: str, dash: str) -> str:
 
 
 def _value_range(
-    values: Sequence[Array], extra: Sequence[float] = (), from_zero: bool = False, ceiling: float | None = None
+    values: Sequence[Array],
+    extra: Sequence[float] = (),
+    from_zero: bool = False,
+    ceiling: float | None = None,
 ) -> tuple[float, float]:
     finite = [array[np.isfinite(array)] for array in values]
     known = [*extra, *(float(f(array)) for array in finite if len(array) for f in (np.min, np.max))]
@@ -409,7 +412,7 @@ def _widened(low: float, high: float) -> tuple[float, float]:
 
 
 def _nice(low: float, high: float, count: int) -> list[float]:
-    """Round numbers inside [low, high], about `count` of them."""
+    """Return about `count` round numbers within [low, high]."""
     raw = (high - low) / count
     power = 10.0 ** math.floor(math.log10(raw))
     step = next(power * m for m in (1, 2, 5, 10) if power * m >= raw)

@@ -1,6 +1,6 @@
-"""The viewer's ear on the bus: tick records of every agent and the operator's obstacles.
+"""The viewer's subscriber: tick records of every agent and the operator's obstacles, received over the bus.
 
-Rings drop the oldest sample when the viewer is slow, so neither the bus nor an agent ever waits for it.
+The bus drops the oldest samples when the viewer is slow, so neither the bus nor an agent waits for it.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from swarmctl.telemetry.obstacles import MovingObstacle
 
 
 class Batch(NamedTuple):
-    """New ticks of one agent."""
+    """New tick records of one agent."""
 
     agent: int
     t_us: NDArray[np.int64]  # (T,) since the first sample of the swarm, increasing
@@ -27,7 +27,16 @@ class Batch(NamedTuple):
 
 
 class Feed:
-    """What a run says; `bus` hears `listens_to(agents)`."""
+    """Collects the messages of a run.
+
+    Args:
+        bus: connection that receives the topics of `listens_to(agents)`.
+        agents: size of the swarm.
+
+    Attributes:
+        received: tick records received so far.
+        malformed: messages that could not be decoded so far.
+    """
 
     def __init__(self, bus: Bus, agents: int) -> None:
         self._bus = bus
@@ -40,11 +49,11 @@ class Feed:
 
     @property
     def lost(self) -> int:
-        """Ticks that agents published and this process never saw."""
+        """Number of ticks that agents published but this process did not receive."""
         return sum(clock.lost for clock in self._clocks)
 
     def take(self) -> list[Batch]:
-        """Everything that has arrived since the last call."""
+        """Return the ticks that have arrived since the last call, one batch for each agent."""
         arrived: dict[int, list[tuple[NDArray[np.void], Array]]] = {}
         for sender, payload in self._bus.receive(topics.TICK):
             tick = unpack_tick(payload)
@@ -58,7 +67,7 @@ class Feed:
         return [batch for agent, samples in arrived.items() for batch in self._batch(agent, samples)]
 
     def take_obstacles(self) -> list[MovingObstacle] | None:
-        """The operator's newest list of obstacles; None when there is no newer one."""
+        """Return the operator's newest list of obstacles; None when there is no newer one."""
         newest: list[MovingObstacle] | None = None
         for _, payload in self._bus.receive(topics.OBSTACLES):
             message = topics.decode_obstacles(payload)
@@ -81,14 +90,14 @@ class Feed:
 
 
 def listens_to(agents: int) -> dict[topics.Topic, list[str]]:
-    """Topics and senders a viewer of `agents` agents hears."""
+    """Return the topics and senders that a viewer of `agents` agents subscribes to."""
     return {topics.TICK: [agent_name(agent) for agent in range(agents)], topics.OBSTACLES: [topics.OPERATOR]}
 
 
 class AgentClock:
-    """Puts one agent's ticks on the shared timeline: its monotonic clock, tied to UTC once.
+    """Maps one agent's ticks to the shared timeline by its monotonic clock, aligned with UTC once.
 
-    Agents may run on several hosts, so only UTC compares; within an agent the monotonic clock has no steps.
+    Agents may run on several hosts, so only UTC is comparable; within an agent the monotonic clock has no steps.
     """
 
     def __init__(self) -> None:
@@ -98,7 +107,7 @@ class AgentClock:
         self._last_seq = -1
 
     def place(self, rows: NDArray[np.void], epoch_us: int) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-        """Time of each row since `epoch_us` (T,), and which rows are newer than all before (T,)."""
+        """Return the time (T,) of each row since `epoch_us` and a mask (T,) of rows newer than all before."""
         t_us = np.zeros(len(rows), np.int64)
         newer = np.zeros(len(rows), bool)
         for k, row in enumerate(rows):

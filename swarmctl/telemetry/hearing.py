@@ -1,4 +1,4 @@
-"""Whether agents believed each other, from their events: whose messages were refused, and who went unheard."""
+"""Evaluates from events whether agents accepted each other's messages: refusals, and peers that went unheard."""
 
 from __future__ import annotations
 
@@ -8,19 +8,19 @@ from typing import Any
 
 from swarmctl.telemetry.plain import finite
 
-_ALLOWED = {  # of one topic of one peer, by one agent; other reasons are what a network or a restart does by itself
+_ALLOWED = {  # refusals by one agent for each peer and topic; other reasons are normal for a network or a restart
     "boot": 0,
     "sequence": 0,
     "identity": 0,
     "unknown_peer": 0,
-    "malformed": 50,  # a second of paths
+    "malformed": 50,  # the paths of one second
     "future": 50,
 }
 
 
 def refused_peers(events: Sequence[Mapping[str, Any]]) -> Iterator[str]:
-    """Violations: messages in the name of a peer that its sender can't have said, or that nobody could take in."""
-    counts: dict[tuple[str, str, str], dict[str, int]] = defaultdict(dict)  # (name, topic, reason): by agent, the last
+    """Yield violations: messages under a peer's name that were forged or could not be decoded."""
+    counts: dict[tuple[str, str, str], dict[str, int]] = defaultdict(dict)  # (name, topic, reason): last count by agent
     for event in events:
         if event.get("event") == "refused" and isinstance(event.get("count"), int):
             sender, topic, reason = (str(event.get(key)) for key in ("sender", "topic", "reason"))
@@ -37,7 +37,7 @@ def refused_peers(events: Sequence[Mapping[str, Any]]) -> Iterator[str]:
 
 
 def unheard(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """How often a peer that was on the bus said no path that was believed, and who it was for longest, to whom."""
+    """Return how often no path of a peer on the bus was accepted, and the longest time with both agents involved."""
     count, since_us = 0, dict[tuple[str, int], int]()
     worst: tuple[float, int | None, str | None] = (0.0, None, None)
     for event in events:
@@ -50,7 +50,7 @@ def unheard(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         elif since_us.pop((source, agent), None) is not None:
             worst = max(worst, (finite(event.get("lasted_s")) or 0.0, agent, source), key=lambda item: item[0])
     last_us = max(map(_utc_us, events), default=0)
-    for (source, agent), began_us in since_us.items():  # to the end
+    for (source, agent), began_us in since_us.items():  # those that lasted to the end of the run
         worst = max(worst, ((last_us - began_us) * 1e-6, agent, source), key=lambda item: item[0])
     longest_s, agent_, by = worst
     return {"count": count, "longest_s": longest_s if count else None, "agent": agent_, "by": by}

@@ -1,4 +1,4 @@
-"""What a person sees: the rerun blueprint for `n` agents. Paths are those of `scene`."""
+"""The rerun blueprint: views and plots for a number of agents. Entity paths are those of `scene`."""
 
 from __future__ import annotations
 
@@ -9,19 +9,19 @@ import rerun.blueprint as rrb
 
 TIMELINE = "flight_time"
 _PLOT_S = 20.0  # sliding window of the plots
-_TRAIL_S = 12.0
-_TABS = 10  # agents with a tab of their own
+_TRAIL_S = 12.0  # length of the trails behind vehicles
+_TABS = 10  # largest number of agents that get a tab
 
 
 class Stage(NamedTuple):
-    """Where the flight happens; the camera stands south-west of it and above."""
+    """Bounds of the flight; the camera is placed to the south-west and above."""
 
     center_ned_m: tuple[float, float, float] = (0.0, 0.0, -2.0)
     extent_m: float = 6.0  # from the centre to the edge
 
 
 def layout(agents: int, stage: Stage) -> Any:
-    """Scene on the left with mode bars and log below, plots of the swarm and of each agent on the right."""
+    """Return the blueprint: scene, mode bars and log on the left, plots of the swarm and of each agent on the right."""
     names = [f"Agent {i}" for i in range(min(agents, _TABS))]
     tabs = [_swarm_plots(), *(_agent_plots(i, name) for i, name in enumerate(names))]
     below = rrb.Horizontal(
@@ -60,7 +60,7 @@ def _swarm_plots() -> Any:
         _plot("/plot/separation", "Smallest separation and its limit [m]"),
         _plot("/plot/solve_ms", "Solve time [ms]"),
         _plot("/plot/tick_ms", "Tick time, listen to send [ms]"),
-        _plot("/plot/late_ticks", "Late ticks so far"),
+        _plot("/plot/deadline_misses", "Deadline misses so far"),
         name="Swarm",
     )
 

@@ -1,4 +1,4 @@
-"""Obstacles as the viewer gets them: JSON of the configuration or of the operator's message."""
+"""Obstacles for the viewer, read from JSON of the configuration or from the operator's message."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from swarmctl.core.types import Array
 
 
 class MovingObstacle(NamedTuple):
-    """A sphere, or a column of any height, that keeps its velocity."""
+    """A sphere, or a column of any height, with constant velocity."""
 
-    center_ned_m: Array  # (3,) when it was set
+    center_ned_m: Array  # (3,) when the obstacle was set
     radius_m: float
     keep_out_m: float
     vel_ned_m_s: Array  # (3,)
     column: bool = False
 
     def center_after(self, elapsed_s: float) -> Array:
-        """Centre (3,) NED [m], `elapsed_s` after it was set."""
+        """Return the centre (3,) NED [m], `elapsed_s` after the obstacle was set."""
         return self.center_ned_m + elapsed_s * self.vel_ned_m_s
 
     @property
@@ -30,7 +30,7 @@ class MovingObstacle(NamedTuple):
 
 
 def read_obstacles(listed: object) -> list[MovingObstacle] | None:
-    """Obstacles of parsed JSON; None when one of them doesn't fit."""
+    """Return the obstacles of parsed JSON; None when one of them is invalid."""
     if not isinstance(listed, Sequence) or isinstance(listed, str):
         return None
     try:

@@ -1,4 +1,4 @@
-"""One colour per agent, the same in the live view, the recording and the report; readable on dark and on white."""
+"""Colours of agents, phases and modes, shared by live view, recording and report; readable on dark and on white."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _AGENTS = (
     (202, 138, 4),  # ochre
 )
 
-LIMIT_RGB = (239, 68, 68)  # limits, obstacles and violations; no agent has it
+LIMIT_RGB = (239, 68, 68)  # limits, obstacles and violations; used by no agent
 REFERENCE_RGB = (148, 163, 184)
 SUM_RGB = (100, 116, 139)
 
@@ -36,19 +36,19 @@ PHASE_RGB = {
 
 MODE_RGB = {
     "IDLE": (71, 85, 105),
-    "STREAM": (14, 165, 233),
-    "FOLLOW": (34, 160, 90),
+    "PRIMING": (14, 165, 233),
+    "TRACKING": (34, 160, 90),
     "REPLAY": (234, 179, 8),
     "BRAKE": (249, 115, 22),
     "HOLD": (45, 212, 191),
     "LAND": (99, 102, 241),
-    "YIELD": (168, 85, 247),
-    "BLIND": (220, 38, 38),
+    "PILOT_OVERRIDE": (168, 85, 247),
+    "STATE_STALE": (220, 38, 38),
 }
 
 
 def agent_rgb(agent: int) -> tuple[int, int, int]:
-    """Colour of an agent, (r, g, b) in 0..255; beyond the table hues go round by the golden ratio."""
+    """Return the colour of an agent, (r, g, b) in 0..255; beyond the table hues advance by the golden ratio."""
     if agent < len(_AGENTS):
         return _AGENTS[agent]
     r, g, b = colorsys.hsv_to_rgb((0.61803398875 * agent) % 1.0, 0.65, 0.85)
@@ -56,5 +56,5 @@ def agent_rgb(agent: int) -> tuple[int, int, int]:
 
 
 def css(rgb: tuple[int, int, int]) -> str:
-    """Colour as `#rrggbb`."""
+    """Return a colour as `#rrggbb`."""
     return f"#{rgb[0]:02x}{rgb[1]:02x}{rgb[2]:02x}"

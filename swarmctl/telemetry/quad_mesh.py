@@ -1,4 +1,4 @@
-"""A small quadrotor as a binary glTF, authored in FRD [m]: front rotors in the agent's colour, rear ones dark."""
+"""Mesh of a small quadrotor as binary glTF, in FRD [m]: front rotors in the agent's colour, rear ones dark."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import struct
 import numpy as np
 from numpy.typing import NDArray
 
-_ARM_M = 0.17  # centre to rotor
+_ARM_M = 0.17  # distance from the centre to a rotor
 _ROTOR_M = 0.095
 _DARK = (0.13, 0.15, 0.19)
 _GREY = (0.42, 0.46, 0.52)
@@ -18,7 +18,7 @@ Color = tuple[float, float, float]  # linear RGB in 0..1
 
 
 def quad_glb(rgb: tuple[int, int, int]) -> bytes:
-    """Bytes of the mesh for an agent of colour `rgb` (0..255)."""
+    """Return the bytes of the mesh for an agent of colour `rgb` (0..255)."""
     r, g, b = (float((c / 255) ** 2.2) for c in rgb)
     accent = (r, g, b)
     arms = np.concatenate([_box((0.0, 0.0, 0.0), (_ARM_M, 0.009, 0.008), yaw) for yaw in (np.pi / 4, -np.pi / 4)])

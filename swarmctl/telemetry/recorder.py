@@ -1,7 +1,7 @@
-"""The agent's recorder: the tick hands over bytes and goes on; one thread of our own writes them.
+"""The agent's recorder: the tick queues bytes, and a background thread writes them.
 
-Never blocks and never raises into the tick. What doesn't fit the queue, or the disk refuses, is dropped and counted.
-Files only grow by whole rows, so a killed agent leaves readable files; at most `_FLUSH_S` of them is missing.
+It never blocks the tick and never raises into it. Rows that don't fit the queue, or that the disk refuses, are dropped
+and counted. Files grow by whole rows only, so a killed agent leaves readable files that lack the last seconds at most.
 """
 
 from __future__ import annotations
@@ -21,17 +21,17 @@ from swarmctl.core.records import TICK_DTYPE, tick_row
 from swarmctl.core.types import TickRecord
 from swarmctl.telemetry.plain import to_json
 
-_FLUSH_S = 0.25
+_FLUSH_TIMEOUT_S = 0.25
 _QUEUE = 16384  # items; about 20 s of ticks and frames, 4 MB
-_REOPEN_S = 1.0  # a file that can't be opened is tried again this often
+_REOPEN_S = 1.0  # time between attempts to open a file
 _TLOG_STAMP = struct.Struct(">Q")
 
 
 class Recorder:
-    """Ticks, MAVLink frames and events of one agent, in three files of a run folder.
+    """Writes ticks, MAVLink frames and events of one agent to three files of a run folder.
 
-    `agent-<i>.ticks` holds raw `TICK_DTYPE` rows, `agent-<i>.tlog` frames behind their UTC [us] (the format of every
-    ground station), `agent-<i>.events.jsonl` one JSON object a line.
+    `agent-<i>.ticks` holds raw `TICK_DTYPE` rows, `agent-<i>.tlog` frames preceded by their UTC [us] (the format of
+    ground stations), `agent-<i>.events.jsonl` one JSON object on each line.
     """
 
     def __init__(self, directory: Path, agent: int) -> None:
@@ -49,24 +49,24 @@ class Recorder:
 
     @property
     def lost(self) -> int:
-        """Rows that will never be on disk, so far."""
+        """Number of rows dropped so far."""
         return self._refused + sum(file.lost for file in self._files)
 
     def tick(self, record: TickRecord) -> None:
-        """Keep one tick."""
+        """Record one tick."""
         self._put(0, tick_row(record).tobytes())
 
     def frame(self, utc_us: int, frame: bytes) -> None:
-        """Keep one MAVLink frame, sent or received at `utc_us`."""
+        """Record one MAVLink frame, sent or received at `utc_us`."""
         self._put(1, _TLOG_STAMP.pack(utc_us) + frame)
 
     def event(self, name: str, t_us: int, utc_us: int, **fields: Any) -> None:
-        """Keep one event: something that happens now and then, with its figures."""
+        """Record one event with its fields; events are rare, unlike ticks."""
         row = {"utc_us": utc_us, "t_us": t_us, "source": self._source, "event": name, **fields}
         self._put(2, to_json(row).encode() + b"\n")
 
     def close(self, timeout_s: float = 2.0) -> None:
-        """Write what is queued; a disk that hangs for `timeout_s` is left alone and its rows counted."""
+        """Write what is queued; after `timeout_s` of a hanging disk the remaining rows count as lost."""
         self._stop.set()
         self._thread.join(timeout_s)
         if self._thread.is_alive():
@@ -79,7 +79,7 @@ class Recorder:
         self._queue.append((file, row))
 
     def _run(self) -> None:
-        while not self._stop.wait(_FLUSH_S):
+        while not self._stop.wait(_FLUSH_TIMEOUT_S):
             self._drain()
         self._drain()
         for file in self._files:
@@ -96,7 +96,7 @@ class Recorder:
 
 
 class _RowFile:
-    """A file that grows by whole rows or not at all, and counts the rows it could not take."""
+    """A file that grows by whole rows only and counts the rows that could not be written."""
 
     def __init__(self, path: Path, row_bytes: int = 1) -> None:
         self.lost = 0
@@ -120,7 +120,7 @@ class _RowFile:
             self._keep_whole(rows, done)
 
     def _keep_whole(self, rows: list[bytes], done: int) -> None:
-        """After a write that stopped `done` bytes into `rows`: half a row would shift every later one."""
+        """Truncate after a write that stopped `done` bytes into `rows`: a partial row would shift every later one."""
         ends = list(itertools.accumulate(map(len, rows)))
         kept = bisect.bisect_right(ends, done)
         self.lost += len(rows) - kept
@@ -143,7 +143,7 @@ class _RowFile:
                 size = os.fstat(self._fd).st_size
                 self._good_size = size - size % self._row_bytes
                 if self._good_size < size:
-                    os.ftruncate(self._fd, self._good_size)  # a killed predecessor's half row
+                    os.ftruncate(self._fd, self._good_size)  # remove the partial row of a killed predecessor
             except OSError:
                 self.close()
         return self._fd >= 0

@@ -1,4 +1,4 @@
-"""Recordings as files and windows: pack one, draw one offline, open one in the native viewer."""
+"""Rerun recordings: packs a file, draws one offline from a finished run, opens one in the native viewer."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ if TYPE_CHECKING:
 
 RECORDING = "telemetry.rrd"
 APPLICATION = "swarmctl"
-_LEAST_BYTES = 4096  # a packed recording without any entity is smaller: that was no recording
-_CHUNK = 50  # ticks of an agent sent at once: one second
-_OWN_PORT = ("--bind", "127.0.0.1", "--port", "auto")  # else it feeds our server's data back to our server
+_MIN_RECORDING_BYTES = 4096  # a smaller packed recording contains no entity and is rejected
+_CHUNK_TICKS = 50  # ticks of an agent sent at once: one second
+_VIEWER_PORT_OPTIONS = ("--bind", "127.0.0.1", "--port", "auto")  # the default port would loop data back to our server
 _WINDOW_MEMORY = "2GB"  # the viewer's own default is 75 % of the machine
 
 
 def viewer_binary() -> Path:
-    """The native viewer; not the script of the same name, which passes on no signals."""
+    """Return the path of the native viewer, not of the script of the same name, which forwards no signals."""
     import rerun_cli
 
     return Path(rerun_cli.__file__).parent / "rerun"
 
 
 def has_display() -> bool:
-    """Whether a window could be opened at all."""
+    """Return whether a window can be opened."""
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
@@ -45,10 +45,10 @@ def open_viewer(target: str, log: Path | None = None) -> subprocess.Popen[bytes]
 
     Args:
         target: `rerun+http://...` or the path of an `.rrd`.
-        log: file for what the viewer prints; None to drop it.
+        log: file for the viewer's output; None to discard it.
 
     Raises:
-        StartError: no display, no such recording, or the viewer can't be started.
+        StartError: there is no display or no such recording, or the viewer can't be started.
     """
     if not has_display():
         raise StartError(
@@ -56,7 +56,7 @@ def open_viewer(target: str, log: Path | None = None) -> subprocess.Popen[bytes]
         )
     if "://" not in target and not Path(target).is_file():
         raise StartError(f"{target}: no such recording")
-    command = [str(viewer_binary()), target, "--memory-limit", _WINDOW_MEMORY, *_OWN_PORT]
+    command = [str(viewer_binary()), target, "--memory-limit", _WINDOW_MEMORY, *_VIEWER_PORT_OPTIONS]
     try:
         with (log or Path(os.devnull)).open("ab") as output:
             return subprocess.Popen(
@@ -67,9 +67,10 @@ def open_viewer(target: str, log: Path | None = None) -> subprocess.Popen[bytes]
 
 
 def optimize_recording(directory: Path, timeout_s: float = 60.0) -> bool:
-    """Pack `telemetry.rrd` of a run folder, which also gives it the footer a live file lacks.
+    """Pack `telemetry.rrd` of a run folder, which also adds the footer that a live file lacks.
 
-    Returns: whether the file was replaced; on failure, or after `timeout_s`, the original stays.
+    Returns:
+        whether the file was replaced; on failure, or after `timeout_s`, the original stays.
     """
     source = directory / RECORDING
     if source.is_symlink() or not source.is_file():
@@ -82,15 +83,15 @@ def optimize_recording(directory: Path, timeout_s: float = 60.0) -> bool:
 
 
 def _packed(source: Path, packed: Path, timeout_s: float) -> bool:
-    """Have `packed` written from `source`; it is there afterwards only if it is good."""
+    """Write `packed` from `source`; returns whether it succeeded, else `packed` does not exist."""
     command = [str(viewer_binary()), "rrd", "optimize", str(source), "-o", str(packed)]
     until_s = time.monotonic() + timeout_s
-    for more in ((), ("--continue-on-error",)):  # the second for a file whose writer was killed
+    for more in ((), ("--continue-on-error",)):  # the second attempt is for a file whose writer was killed
         left_s = max(0.1, until_s - time.monotonic())
         done = subprocess.run(
             [*command, *more], stdin=subprocess.DEVNULL, capture_output=True, timeout=left_s, check=False
         )
-        if done.returncode == 0 and packed.stat().st_size >= _LEAST_BYTES:
+        if done.returncode == 0 and packed.stat().st_size >= _MIN_RECORDING_BYTES:
             return True
         packed.unlink(missing_ok=True)
     return False
@@ -104,13 +105,13 @@ def simulated_recording(
     limit_m: float,
     obstacles: Sequence[dict[str, Any]] = (),
 ) -> Path:
-    """Write `telemetry.rrd` of a finished run from its recorded ticks; predicted paths aren't in there.
+    """Write `telemetry.rrd` of a finished run from its recorded ticks, which contain no predicted paths.
 
     Args:
         directory: the run folder.
-        run: the recording.
+        run: the recorded run.
         agents: size of the swarm.
-        separation_m: distance that agents keep.
+        separation_m: separation that agents keep.
         limit_m: distance below which the referee sees a violation.
         obstacles: as in the configuration: center_ned_m, radius_m, keep_out_m, vel_ned_m_s.
     """
@@ -129,9 +130,9 @@ def simulated_recording(
     epoch_us = min((int(rows["utc_us"][0]) for rows in flown.values()), default=0)
     drawn = read_obstacles(list(obstacles)) or []
     scene.obstacles(drawn, 0, 0.0)
-    for first in range(0, max(map(len, flown.values()), default=0), _CHUNK):
+    for first in range(0, max(map(len, flown.values()), default=0), _CHUNK_TICKS):
         for agent, rows in flown.items():
-            chunk = rows[first : first + _CHUNK]
+            chunk = rows[first : first + _CHUNK_TICKS]
             scene.ticks(agent, chunk["utc_us"] - epoch_us, chunk, None)
         if any(obstacle.moves for obstacle in drawn):
             scene.obstacles(drawn, first * 20_000, first * 0.02)
@@ -142,7 +143,7 @@ def simulated_recording(
 
 
 def _stage(flown: Mapping[int, NDArray[np.void]]) -> Stage:
-    """The box that holds every flown position."""
+    """Return bounds that contain every flown position."""
     from swarmctl.telemetry.layout import Stage
 
     pos_ned_m = np.concatenate([rows["pos_ned_m"] for rows in flown.values()]) if flown else np.zeros((1, 3))

@@ -1,6 +1,6 @@
-"""Judges a finished run from its recording: pure numpy, no files, no opinion of the agents themselves.
+"""Judges a finished run from its recording, independently of the agents. Pure numpy, no files.
 
-Positions are the simulator's true ones where there are any, otherwise what the agents reported. The result is the
+Positions are the simulator's true ones if there are any, otherwise those reported by the agents. The result is the
 content of `summary.json`; a figure that can't be known is None.
 """
 
@@ -28,43 +28,43 @@ from swarmctl.telemetry.tracks import (
     utc_offset_us,
 )
 
-_CONTROLLED = (Mode.FOLLOW, Mode.REPLAY, Mode.BRAKE)
+_CONTROLLED = (Mode.TRACKING, Mode.REPLAY, Mode.BRAKE)
 _SOLVER_FAILED = (PlanStatus.SOLVER_FAILED, PlanStatus.RESIDUAL)
-_LISTED = 10  # violations of one kind that are spelled out
-_DURATION_SLACK_S = 1.0  # of the mission that may be missing at its end before it counts as cut short
+_MAX_LISTED = 10  # largest number of violations of one kind listed in full
+_DURATION_SLACK_S = 1.0  # mission time that may be missing at the end of a completed run
 
 
 class ObstacleRule(NamedTuple):
-    """A sphere, or a column of any height, to stay out of."""
+    """A sphere, or a column of any height, that vehicles must not enter."""
 
-    center_ned_m: Sequence[float]  # (3,) when it begins to count
-    keep_out_m: float  # from the centre
+    center_ned_m: Sequence[float]  # (3,) when it becomes effective
+    keep_out_m: float  # radius around the centre
     vel_ned_m_s: Sequence[float] = (0.0, 0.0, 0.0)
-    since_utc_us: int | None = None  # when an operator set it; None: `center` holds at mission start, judged throughout
+    since_utc_us: int | None = None  # when an operator set it; None: effective throughout, centre as at mission start
     column: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Rules:
-    """What a run is judged by."""
+    """Limits by which a run is judged."""
 
     agents: int
     required_separation_m: float
     obstacles: tuple[ObstacleRule, ...] = ()
     obstacle_margin_m: float = 0.05  # allowed intrusion into keep_out_m
-    late_ticks_01: float = 0.2  # share of the ticks that were due, flown or skipped, that may be late
+    deadline_misses_01: float = 0.2  # largest fraction of due ticks, flown or skipped, that may miss their deadline
     solver_name: str = "osqp"
     mode: Literal["realtime", "lockstep"] = "realtime"
-    duration_s: float | None = None  # of mission time a completed run must have tracked
-    downwash: float = 1.0  # heights count this many times less in `scaled_min_m`, which is reported, not judged
+    duration_s: float | None = None  # mission time that a completed run must have tracked
+    downwash: float = 1.0  # heights are divided by this in `scaled_min_m`, which is reported but not judged
 
 
 @dataclass(frozen=True, slots=True)
 class RunData:
-    """The recording of a run."""
+    """The recorded data of a run."""
 
-    ticks: dict[int, NDArray[np.void]]  # per agent, TICK_DTYPE
-    truth: NDArray[np.void]  # TRUTH_DTYPE, empty without a simulator
+    ticks: dict[int, NDArray[np.void]]  # by agent, rows of TICK_DTYPE
+    truth: NDArray[np.void]  # rows of TRUTH_DTYPE, empty without a simulator
     events: list[dict[str, Any]]
 
 
@@ -76,15 +76,15 @@ def judge(
     speed_factor: float | None = None,
     steady_after_s: float = 10.0,
 ) -> dict[str, Any]:
-    """Figures and violations of a run.
+    """Return the figures and violations of a run as the content of `summary.json`.
 
     Args:
-        run: the recording.
+        run: the recorded run.
         rules: limits.
-        outcome: "completed" | "failed" | "interrupted", as the launcher saw it.
-        problems: what went wrong in words, from the launcher; each one is a violation.
+        outcome: "completed" | "failed" | "interrupted", as reported by the launcher.
+        problems: problems reported by the launcher in words; each is a violation.
         speed_factor: simulated seconds per wall second.
-        steady_after_s: mission time from which `steady_rmse_m` and `index_after_10s_m` are taken.
+        steady_after_s: mission time from which `steady_rmse_m` and `index_after_10s_m` are computed.
     """
     tracks = merge_tracks(run.ticks, run.truth, rules.agents)
     clock = _MissionClock(run.ticks, tracks)
@@ -117,7 +117,7 @@ def judge(
 
 
 class _MissionClock:
-    """Words for instants: mission time where there is a mission, otherwise time since the first arming."""
+    """Converts instants to mission time if there is a mission, otherwise to time since the first arming."""
 
     def __init__(self, ticks: Mapping[int, NDArray[np.void]], tracks: Tracks) -> None:
         first_us = float(tracks.t_us[0]) if len(tracks.t_us) else 0.0
@@ -130,7 +130,7 @@ class _MissionClock:
 
 
 def _judge_separation(tracks: Tracks, rules: Rules, clock: _MissionClock) -> tuple[dict[str, Any], list[str]]:
-    """Smallest distance of every pair at every common instant; also with heights scaled by the downwash."""
+    """Find the smallest distance over all pairs and common instants, also with heights scaled by the downwash."""
     found: dict[str, Any] = {
         "min_m": None,
         "required_m": rules.required_separation_m,
@@ -161,7 +161,7 @@ def _judge_separation(tracks: Tracks, rules: Rules, clock: _MissionClock) -> tup
 
 
 def _unseen(ticks: Mapping[int, NDArray[np.void]], agents: int, clock: _MissionClock) -> Iterator[str]:
-    """Flight of which nothing is known: without true positions nobody can say how close it came."""
+    """Yield a violation for each agent that flew without a known position, as its separation can't be judged."""
     for agent, rows in ticks.items():
         spans = unseen_spans(flight_rows(rows), "utc_us") if agent < agents else []
         if spans:
@@ -173,8 +173,8 @@ def _unseen(ticks: Mapping[int, NDArray[np.void]], agents: int, clock: _MissionC
 
 
 def _judge_obstacles(tracks: Tracks, rules: Rules, clock: _MissionClock) -> tuple[dict[str, float | None], list[str]]:
-    """Distance to the centre (of a column, the axis) of the obstacle respected least, and what it had to be."""
-    worst: tuple[float, float] | None = None  # (distance, required) with the least room
+    """Return distance and required distance to the centre (axis of a column) of the obstacle with the least margin."""
+    worst: tuple[float, float] | None = None  # (distance, required) with the least margin
     violations = []
     for number, rule in enumerate(rules.obstacles):
         required_m = rule.keep_out_m - rules.obstacle_margin_m
@@ -204,12 +204,12 @@ def _judge_obstacles(tracks: Tracks, rules: Rules, clock: _MissionClock) -> tupl
 def _judge_timing(
     ticks: Mapping[int, NDArray[np.void]], rules: Rules, speed_factor: float | None
 ) -> tuple[dict[str, Any], list[str]]:
-    """Tick and solve times between arming and the end of landing."""
+    """Summarise tick times, solve times and deadline misses between arming and the end of landing."""
     flights = [flight_rows(rows) for rows in ticks.values()]
     total = sum(len(rows) for rows in flights)
-    steps = [np.maximum(np.diff(rows["late_ticks"].astype(np.int64)), 0) for rows in flights]
+    steps = [np.maximum(np.diff(rows["deadline_misses"].astype(np.int64)), 0) for rows in flights]
     late = sum(int(step.sum()) for step in steps)
-    # of what is late between two ticks, one at most was flown; the others were skipped, and were due all the same
+    # of the deadlines missed between two ticks at most one belongs to a flown tick; the others were due but skipped
     due = total + sum(int(np.maximum(step - 1, 0).sum()) for step in steps)
     timing = {
         "ticks": total,
@@ -219,16 +219,16 @@ def _judge_timing(
         "solve_ms": _spread([rows["solve_ms"][rows["iterations"] > 0] for rows in flights]),
         "speed_factor": speed_factor,
     }
-    if due and late > rules.late_ticks_01 * due:
-        return timing, [f"late ticks {late / due:.1%} above {rules.late_ticks_01:.1%} ({late} of {due} due)"]
+    if due and late > rules.deadline_misses_01 * due:
+        return timing, [f"deadline misses {late / due:.1%} above {rules.deadline_misses_01:.1%} ({late} of {due} due)"]
     return timing, []
 
 
 def _judge_tracking(run: RunData, agents: int, steady_after_s: float) -> tuple[dict[str, Any], dict[int, float]]:
-    """Distance to the reference while tracking; also how long each agent tracked [s of mission time].
+    """Return tracking errors and, for each agent, the mission time it tracked [s].
 
-    The index is thesis Table 19: the sum over agents of the distance to the shared reference, averaged over the
-    mission time that all agents have in common.
+    The index of thesis Table 19 is the summed mean tracking error: the sum over agents of the distance to the shared
+    reference, averaged over the mission time common to all agents.
     """
     errors = {agent: track_error(rows, run.truth, agent) for agent, rows in run.ticks.items() if agent < agents}
     errors = {agent: error for agent, error in errors.items() if len(error.mission_t_s)}
@@ -244,17 +244,17 @@ def _judge_tracking(run: RunData, agents: int, steady_after_s: float) -> tuple[d
                 "steady_rmse_m": float(np.sqrt(np.mean(error.distance_m[steady] ** 2))) if steady.any() else None,
             }
         )
-    indices: tuple[float | None, float | None] = (None, None)
+    summed_m: tuple[float | None, float | None] = (None, None)
     if len(errors) == agents:
         first_s = max(error.mission_t_s[0] for error in errors.values())
         last_s = min(error.mission_t_s[-1] for error in errors.values())
         spans = [(first_s, last_s), (max(first_s, steady_after_s), last_s)]
-        indices = (_index_m(errors, *spans[0]), _index_m(errors, *spans[1]))
+        summed_m = (_summed_mean_error_m(errors, *spans[0]), _summed_mean_error_m(errors, *spans[1]))
     tracked_s = {agent: float(error.mission_t_s[-1]) for agent, error in errors.items()}
-    return {"index_m": indices[0], "index_after_10s_m": indices[1], "agents": rows}, tracked_s
+    return {"index_m": summed_m[0], "index_after_10s_m": summed_m[1], "agents": rows}, tracked_s
 
 
-def _index_m(errors: Mapping[int, Any], first_s: float, last_s: float) -> float | None:
+def _summed_mean_error_m(errors: Mapping[int, Any], first_s: float, last_s: float) -> float | None:
     total_m = 0.0
     for error in errors.values():
         common = (error.mission_t_s >= first_s) & (error.mission_t_s <= last_s)
@@ -265,7 +265,7 @@ def _index_m(errors: Mapping[int, Any], first_s: float, last_s: float) -> float 
 
 
 def _solver(ticks: Mapping[int, NDArray[np.void]], name: str) -> dict[str, Any]:
-    """Failures while the agent was in charge, and the largest residual of a plan that was good enough to fly."""
+    """Count solver failures while the agent had control, and find the largest residual of a plan that was flown."""
     flights = [flight_rows(rows) for rows in ticks.values()]
     charged = [rows[np.isin(rows["mode"], _CONTROLLED)] for rows in flights]
     residuals = [
@@ -281,8 +281,8 @@ def _solver(ticks: Mapping[int, NDArray[np.void]], name: str) -> dict[str, Any]:
 
 
 def _comms(run: RunData) -> dict[str, Any]:
-    """Age of the oldest path in use, what the agents' buses refused (their last `bus_summary`), who went unheard."""
-    ages = _spread([flight_rows(rows)["path_age_ms"] for rows in run.ticks.values()])
+    """Summarise plan staleness, messages refused (last `bus_summary` of each agent) and unheard peers."""
+    ages = _spread([flight_rows(rows)["plan_staleness_ms"] for rows in run.ticks.values()])
     last = {event.get("source"): event for event in run.events if event.get("event") == "bus_summary"}
     rejected: Counter[str] = Counter()
     for event in last.values():
@@ -297,7 +297,7 @@ def _comms(run: RunData) -> dict[str, Any]:
 
 
 def _deadlocks(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """How often agents noticed that they got nowhere, and for how long at most."""
+    """Count deadlocks, those that were not resolved, and the longest duration."""
     noticed = [event for event in events if event.get("event") == "deadlock"]
     lasted_s = [seconds for event in noticed if (seconds := finite(event.get("lasted_s"))) is not None]
     begun = sum(event.get("begins") is True for event in noticed)
@@ -332,7 +332,7 @@ def _cut_short(tracked_s: Mapping[int, float], rules: Rules) -> Iterator[str]:
 
 
 def _spread(parts: Sequence[Array]) -> dict[str, float | None]:
-    """Median, 99th percentile and maximum of the finite values."""
+    """Return median, 99th percentile and maximum of the finite values."""
     values = np.concatenate([np.asarray(part, np.float64) for part in parts]) if parts else np.zeros(0)
     values = values[np.isfinite(values)]
     if not len(values):
@@ -342,6 +342,6 @@ def _spread(parts: Sequence[Array]) -> dict[str, float | None]:
 
 
 def _shorten(violations: list[str]) -> list[str]:
-    if len(violations) <= _LISTED:
+    if len(violations) <= _MAX_LISTED:
         return violations
-    return [*violations[:_LISTED], f"and {len(violations) - _LISTED} more like the last"]
+    return [*violations[:_MAX_LISTED], f"and {len(violations) - _MAX_LISTED} more like the last"]

@@ -1,4 +1,4 @@
-"""`report.html` of a run: one self-contained page, under 1 MB, that needs neither network nor script."""
+"""Writes `report.html` of a run: one self-contained page below 1 MB, without scripts or network requests."""
 
 from __future__ import annotations
 
@@ -29,22 +29,22 @@ from swarmctl.telemetry.tracks import (
 )
 
 REPORT = "report.html"
-_ALL_POINTS = 42_000  # of all lines together, 13 bytes each: keeps the page under 1 MB
-_DETAILED_AGENTS = 6  # attitude charts of the first ones only
+_ALL_POINTS = 42_000  # points of all lines together, 13 bytes each: keeps the page below 1 MB
+_DETAILED_AGENTS = 6  # number of agents with attitude charts
 _EVENTS_LISTED = 400
 
 
 def write_report(
     directory: Path, run: RunData, summary: Mapping[str, Any], config_text: str, rules: Rules | None = None
 ) -> Path:
-    """Write the page of a judged run into its folder.
+    """Write the page of a judged run into its folder; returns its path.
 
     Args:
         directory: the run folder.
-        run: the recording.
-        summary: what the referee said of it.
-        config_text: resolved configuration, shown as it is.
-        rules: limits and obstacles to draw; those in `summary` are drawn anyway.
+        run: the recorded run.
+        summary: result of the referee.
+        config_text: resolved configuration, shown verbatim.
+        rules: limits and obstacles to draw, in addition to those in `summary`.
     """
     page = _Page(run, summary, rules)
     title = html.escape(directory.resolve().name)
@@ -80,7 +80,7 @@ def write_report(
 
 
 class _Page:
-    """The charts of one run, on one time axis."""
+    """Draws the charts of one run on a common time axis."""
 
     def __init__(self, run: RunData, summary: Mapping[str, Any], rules: Rules | None) -> None:
         self._run = run
@@ -136,7 +136,7 @@ class _Page:
                 rows = flight_rows(self._run.ticks[agent])
                 pos_ned_m = true_positions(rows, self._run.truth, agent)
                 lines.append(self._line(agent, rows, pos_ned_m[:, k], f"agent {agent}"))
-            shown: dict[bytes, tuple[int, NDArray[np.void]]] = {}  # one reference when all share it
+            shown: dict[bytes, tuple[int, NDArray[np.void]]] = {}  # different references only, one if all share it
             for agent in self._agents:
                 rows = tracking_rows(self._run.ticks[agent])
                 shown.setdefault(np.round(rows["ref_pos_ned_m"][-1:, k], 1).tobytes(), (agent, rows))
@@ -273,11 +273,11 @@ def _summary_rows(summary: Mapping[str, Any], rules: Rules | None) -> Iterator[s
         yield _least("nearest to an obstacle's centre", obstacles["min_clearance_m"], obstacles["required_m"])
     due = timing.get("due_ticks") or timing["ticks"]
     share = timing["late_ticks"] / due if due else None
-    most = rules.late_ticks_01 if rules else None
+    most = rules.deadline_misses_01 if rules else None
     good = None if share is None or most is None else share <= most
     late = f"{timing['late_ticks']} of {due}"
-    yield _row("late ticks", late, "" if most is None else f"{most:.0%}", good)
-    yield _row("tracking index, sum of mean distances", _figure(summary["tracking"]["index_m"], "m", 3))
+    yield _row("deadline misses", late, "" if most is None else f"{most:.0%}", good)
+    yield _row("summed mean tracking error", _figure(summary["tracking"]["index_m"], "m", 3))
     yield _row("the same after 10 s", _figure(summary["tracking"]["index_after_10s_m"], "m", 3))
     for name, key in (("tick time", "tick_ms"), ("solve time", "solve_ms")):
         values = " / ".join(_figure(timing[key][part], "", 2) for part in ("p50", "p99", "max"))

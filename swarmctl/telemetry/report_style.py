@@ -1,4 +1,4 @@
-"""Style sheet of the report: light, one column on a phone, two or three on a screen."""
+"""Style sheet of the report: light colours, one column on a phone, two or three on a screen."""
 
 STYLE = """
 :root { color-scheme: light }

@@ -1,8 +1,8 @@
-"""The files of a run folder, as arrays and rows; a folder may come from somebody else, so nothing in it is believed.
+"""Reads and writes the files of a run folder. A folder may come from another person, so its content is validated.
 
 Formats: `agent-<i>.ticks` and `truth.bin` are raw rows of `core.records`; `agent-<i>.parquet` is the same table with
-vectors expanded to one column per component. Half rows at the end, of a killed process, are ignored. Whatever is no
-regular file of bounded size, or does not hold what its name says, is refused in words.
+vectors expanded to one column per component. A partial last row, left by a killed process, is ignored. Anything but a
+regular file of bounded size and expected content is refused with a reason.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from swarmctl.errors import ConfigError
 from swarmctl.files import read_file, replaced
 from swarmctl.telemetry.referee import RunData
 from swarmctl.telemetry.summary_file import decode_summary
-from swarmctl.telemetry.tracks import LONGEST_US
+from swarmctl.telemetry.tracks import MAX_RUN_US
 
 EVENTS = "events.jsonl"
 SUMMARY = "summary.json"
@@ -30,24 +30,24 @@ CONFIG = "config.toml"
 RECORDING = "telemetry.rrd"
 AGENT_FILE = re.compile(r"^agent-(\d{1,3})\.(ticks|parquet)$")
 
-_MOST_ROWS_BYTES = 2**31  # a day of one agent; more would not fit a laptop's memory either
-_MOST_EVENTS_BYTES = 2**28
-_MOST_TEXT_BYTES = 2**24
-_MOST_ROWS = _MOST_ROWS_BYTES // TICK_DTYPE.itemsize
-_DEEPEST_EVENT = 8  # ours nest twice
+_MAX_ROWS_BYTES = 2**31  # a day of one agent, about the memory of a laptop
+_MAX_EVENTS_BYTES = 2**28
+_MAX_TEXT_BYTES = 2**24
+_MAX_ROWS = _MAX_ROWS_BYTES // TICK_DTYPE.itemsize
+_MAX_EVENT_DEPTH = 8  # largest nesting of an event; written events nest twice
 _INT64 = range(-(2**63), 2**63)
 _AXES = {3: ("x", "y", "z"), 4: ("w", "x", "y", "z")}
 
 
 def load_run(directory: Path) -> RunData:
-    """Everything recorded in a run folder, whether finished or not.
+    """Return everything recorded in a run folder, whether the run was finished or not.
 
     Raises:
-        ConfigError: there is no such folder, or something in it is not what its name says.
+        ConfigError: the folder does not exist, or a file in it has not the expected content.
     """
     refuse_no_folder(directory)
     ticks: dict[int, NDArray[np.void]] = {}
-    for path in sorted(directory.iterdir(), key=lambda path: path.suffix):  # raw rows win over their Parquet
+    for path in sorted(directory.iterdir(), key=lambda path: path.suffix):  # raw rows come last and replace Parquet
         match = AGENT_FILE.match(path.name)
         if match:
             rows = read_rows(path, TICK_DTYPE) if match[2] == "ticks" else read_parquet(path)
@@ -61,30 +61,30 @@ def load_run(directory: Path) -> RunData:
 
 
 def refuse_no_folder(directory: Path) -> None:
-    """Say so when there is no run folder at all.
+    """Check that a run folder exists.
 
     Raises:
-        ConfigError: there is no such folder.
+        ConfigError: it does not.
     """
     if not directory.is_dir():
         raise ConfigError(str(directory), ["no such run folder. Give one that launch or simulate wrote"])
 
 
 def read_rows(path: Path, dtype: np.dtype[np.void]) -> NDArray[np.void]:
-    """Whole rows of a raw file; empty when there is none."""
-    data = _content(path, _MOST_ROWS_BYTES)
+    """Return the whole rows of a raw file; none if the file does not exist."""
+    data = _content(path, _MAX_ROWS_BYTES)
     return np.frombuffer(data, dtype, len(data) // dtype.itemsize)
 
 
 def read_text(path: Path) -> str:
-    """Text of a file of the folder; empty when there is none."""
-    return _content(path, _MOST_TEXT_BYTES).decode("utf-8", errors="replace")
+    """Return the text of a file of the folder; "" if it does not exist."""
+    return _content(path, _MAX_TEXT_BYTES).decode("utf-8", errors="replace")
 
 
 def read_summary(directory: Path) -> dict[str, Any] | None:
-    """The summary of a finished run, None when there is none."""
+    """Return the summary of a finished run; None if there is none."""
     path = directory / SUMMARY
-    content = _content(path, _MOST_TEXT_BYTES)
+    content = _content(path, _MAX_TEXT_BYTES)
     if not content and not path.exists():
         return None
     try:
@@ -94,16 +94,16 @@ def read_summary(directory: Path) -> dict[str, Any] | None:
 
 
 def read_events(directory: Path) -> list[dict[str, Any]]:
-    """Events of every source in a run folder, sorted by UTC, each once; lines that aren't one of ours are skipped."""
+    """Return the events of all sources in a run folder, sorted by UTC, without duplicates and invalid lines."""
     lines: dict[bytes, None] = {}
     for path in sorted(directory.glob(f"*{EVENTS}")):
-        lines.update(dict.fromkeys(_content(path, _MOST_EVENTS_BYTES).splitlines()))
+        lines.update(dict.fromkeys(_content(path, _MAX_EVENTS_BYTES).splitlines()))
     rows = (_event(line) for line in lines)
     return sorted((row for row in rows if row is not None), key=utc_us_of)
 
 
 def utc_us_of(row: Mapping[str, Any]) -> int:
-    """When an event was, 0 when it does not say."""
+    """Return the UTC of an event [us]; 0 if it has none."""
     utc_us = row.get("utc_us")
     return utc_us if isinstance(utc_us, int) else 0
 
@@ -117,9 +117,9 @@ def _event(line: bytes) -> dict[str, Any] | None:
 
 
 def _is_sane(row: dict[str, Any]) -> bool:
-    """Whether no value is nested deeper, and no integer larger, than what reads it can bear."""
+    """Return whether nesting and integers of an event are within the limits of the code that reads it."""
     level: list[Any] = [row]
-    for _ in range(_DEEPEST_EVENT):
+    for _ in range(_MAX_EVENT_DEPTH):
         if any(isinstance(value, int) and value not in _INT64 for value in level):
             return False
         lists = [value for value in level if isinstance(value, list)]
@@ -140,10 +140,10 @@ def _content(path: Path, most_bytes: int) -> bytes:
 
 
 def _in_time(path: Path, rows: NDArray[np.void], clocks: tuple[str, ...]) -> NDArray[np.void]:
-    """`rows`, when they are of one run by all its clocks."""
+    """Return `rows` after a check that each clock spans no more than the longest run."""
     for clock in clocks:
-        if len(rows) and int(rows[clock].max()) - int(rows[clock].min()) > LONGEST_US:
-            raise _damaged(path, f"damaged: {clock} spans more than {LONGEST_US / 3.6e9:.0f} hours")
+        if len(rows) and int(rows[clock].max()) - int(rows[clock].min()) > MAX_RUN_US:
+            raise _damaged(path, f"damaged: {clock} spans more than {MAX_RUN_US / 3.6e9:.0f} hours")
     return rows
 
 
@@ -152,8 +152,8 @@ def _damaged(path: Path, problem: str) -> ConfigError:
 
 
 def write_parquet(path: Path, rows: NDArray[np.void]) -> None:
-    """Structured rows as Parquet; `pos_ned_m` becomes `pos_ned_m_x`, `_y`, `_z`, quaternions `_w` to `_z`."""
-    import pyarrow as pa  # an agent process must not pay for it
+    """Write structured rows as Parquet; `pos_ned_m` becomes `pos_ned_m_x`, `_y`, `_z`, quaternions `_w` to `_z`."""
+    import pyarrow as pa  # imported here to keep it out of agent processes
     import pyarrow.parquet as pq
 
     columns: dict[str, Any] = {}
@@ -169,20 +169,20 @@ def write_parquet(path: Path, rows: NDArray[np.void]) -> None:
 
 
 def read_parquet(path: Path) -> NDArray[np.void]:
-    """Inverse of `write_parquet` for ticks; columns this version doesn't know are ignored, missing ones are zero.
+    """Read ticks written by `write_parquet`; unknown columns are ignored, missing ones are zero.
 
     Raises:
-        ConfigError: it is no Parquet, is too long, or a column is no number.
+        ConfigError: the file is no Parquet, has too many rows, or a column holds no numbers.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
-        file = pq.ParquetFile(pa.BufferReader(_content(path, _MOST_ROWS_BYTES)))
-        if file.metadata.num_rows > _MOST_ROWS:
+        file = pq.ParquetFile(pa.BufferReader(_content(path, _MAX_ROWS_BYTES)))
+        if file.metadata.num_rows > _MAX_ROWS:
             raise _damaged(path, f"has {file.metadata.num_rows} rows, more than a day of one agent")
         return _tick_rows(file)
-    except (OSError, ValueError, pa.ArrowException) as error:  # of a damaged one, each of them
+    except (OSError, ValueError, pa.ArrowException) as error:  # a damaged file can raise any of these
         raise _damaged(path, f"is no recording of ticks: {error}. Remove it to see the others") from error
 
 
@@ -200,6 +200,6 @@ def _tick_rows(file: Any) -> NDArray[np.void]:
 
 
 def _columns() -> dict[str, list[str]]:
-    """Columns of every field of a tick."""
+    """Return the Parquet columns of every field of a tick."""
     shapes = {name: TICK_DTYPE[name].shape for name in TICK_DTYPE.names or ()}
     return {name: [f"{name}_{axis}" for axis in _AXES[s[0]]] if s else [name] for name, s in shapes.items()}

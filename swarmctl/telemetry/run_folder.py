@@ -1,4 +1,4 @@
-"""The folder of one run: made before the flight, judged and finished after it, reported again at any time."""
+"""Manages the folder of one run: creates it before the flight, judges and closes it afterwards, reports it again."""
 
 from __future__ import annotations
 
@@ -35,16 +35,16 @@ _LAUNCHES_PER_SECOND = 1000
 
 
 def create_run_folder(base: Path | None, name: str, utc_us: int) -> Path:
-    """A fresh folder for one run.
+    """Create and return the folder of a new run.
 
     Args:
-        base: the folder itself; None for `runs/<UTC>-<name>`, with a number behind it when that second has one.
-        name: of the configuration.
+        base: the folder itself; None for `runs/<UTC>-<name>`, with a number appended if that name is taken.
+        name: name of the configuration.
         utc_us: start of the run [us since 1970].
 
     Raises:
-        ConfigError: `base` holds a run already, or a symbolic link that the run might be written through.
-        StartError: the folder can't be made.
+        ConfigError: `base` contains a run already, or a symbolic link through which files would be written.
+        StartError: the folder can't be created.
     """
     try:
         if base is not None:
@@ -78,34 +78,34 @@ def _claim(base: Path) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """How the launcher, or lockstep, saw the run end."""
+    """End of a run as seen by the launcher or by lockstep."""
 
     outcome: str  # "completed" | "failed" | "interrupted"
-    problems: tuple[str, ...] = ()  # what went wrong, in words; each becomes a violation
+    problems: tuple[str, ...] = ()  # problems in words; each becomes a violation
     speed_factor: float | None = None  # simulated seconds per wall second
-    events: Sequence[Mapping[str, Any]] = field(default=())  # the launcher's own rows
+    events: Sequence[Mapping[str, Any]] = field(default=())  # events of the launcher itself
 
 
 class Finished(NamedTuple):
-    """A judged run, and what of it could not be written."""
+    """A judged run, and the files that could not be written."""
 
     summary: dict[str, Any]
     unwritten: tuple[str, ...]  # "summary.json: No space left on device", ...
 
 
 def finish_run(directory: Path, rules: Rules, outcome: Outcome, recorded: RunData | None = None) -> Finished:
-    """Close a run folder: judgement, one event file, Parquet, report. May be repeated.
+    """Judge a run and close its folder: summary, one event file, Parquet, report. May be repeated.
 
-    A disk that is full costs files, never the judgement: the run is judged first, from what is there.
+    The run is judged before anything is written, so that a full disk costs files but never the result.
 
     Args:
         directory: the run folder.
         rules: limits.
         outcome: how the run ended.
-        recorded: what was flown, from who still has it in memory; None: what the folder holds.
+        recorded: the recorded run if it is still in memory; None to load it from the folder.
 
     Raises:
-        ConfigError: something in the folder can't be read.
+        ConfigError: a file in the folder can't be read.
     """
     run = load_run(directory) if recorded is None else recorded
     run.events[:] = _merged(run.events, outcome.events)
@@ -120,10 +120,10 @@ def finish_run(directory: Path, rules: Rules, outcome: Outcome, recorded: RunDat
 
 
 def report_run(directory: Path, rules: Rules) -> Path:
-    """Write `report.html` again from what is in the folder; a run that never finished is finished first, as failed.
+    """Write `report.html` again; a run that was never finished is finished first, as failed.
 
     Raises:
-        ConfigError: something in the folder is not what its name says.
+        ConfigError: a file in the folder has not the expected content.
         StartError: the folder can't be written to.
     """
     summary = read_summary(directory)
@@ -142,7 +142,7 @@ def report_run(directory: Path, rules: Rules) -> Path:
 
 
 def _merged(*sources: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
-    """Rows in order of time, each once."""
+    """Return the rows of all sources in order of time, without duplicates."""
     rows = sorted((dict(row) for source in sources for row in source), key=utc_us_of)
     return list({to_json(row): row for row in rows}.values())
 
@@ -154,6 +154,6 @@ def _write_events(directory: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _pack_ticks(path: Path) -> None:
-    """Parquet instead of raw rows."""
+    """Replace a file of raw rows by Parquet."""
     write_parquet(path.with_suffix(".parquet"), read_rows(path, TICK_DTYPE))
     path.unlink()

@@ -1,6 +1,6 @@
-"""Ticks -> rerun entities. The live viewer and the offline recording draw with the same code.
+"""Converts ticks to rerun entities, for the live viewer and the offline recording alike.
 
-Batches of rows in, one `send_columns` per entity out. Knows nothing of the bus, of files or of processes.
+Each batch of rows becomes one `send_columns` per entity. The module knows no bus, files or processes.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ from swarmctl.telemetry.quad_mesh import quad_glb
 from swarmctl.telemetry.separation_feed import SeparationFeed
 
 _STAGE = Stage()
-_REPEAT_US = 2_000_000  # states are sent again this often: a late viewer's buffer loses rare data first
-_COLUMN_HALF_M = 30.0  # drawn of a column to either side of its centre
+_REPEAT_US = 2_000_000  # period of repeated states, because the server's buffer drops rare data first
+_COLUMN_HALF_M = 30.0  # half of the height drawn of a column
 _PROBLEMS = {
     PlanStatus.SOLVER_FAILED: "solver failed",
     PlanStatus.RESIDUAL: "residual too large",
     PlanStatus.NOT_CERTIFIED: "plan would violate true distances",
 }
-_WARN_MODES = (Mode.REPLAY, Mode.BRAKE, Mode.YIELD)
+_WARN_MODES = (Mode.REPLAY, Mode.BRAKE, Mode.PILOT_OVERRIDE)
 
 
 class _Seen(NamedTuple):
-    """Newest row of an agent that was drawn."""
+    """Newest drawn row of an agent."""
 
     pos_ned_m: Array  # (3,)
     phase: int
@@ -42,14 +42,14 @@ class _Seen(NamedTuple):
 
 
 class Scene:
-    """The entities of one swarm on one recording stream.
+    """Draws the entities of one swarm on one recording stream.
 
     Args:
         rec: stream whose sinks are set.
         agents: size of the swarm.
-        separation_m: distance that agents keep; radius of the drawn spheres is half of it.
+        separation_m: separation that agents keep; the drawn spheres have half of it as radius.
         limit_m: distance below which the referee sees a violation.
-        stage: what the camera looks at.
+        stage: bounds of the scene for the camera.
     """
 
     def __init__(self, rec: Any, agents: int, separation_m: float, limit_m: float, stage: Stage = _STAGE) -> None:
@@ -64,7 +64,7 @@ class Scene:
         self._separation = SeparationFeed(agents)
 
     def begin(self) -> None:
-        """Send the blueprint and everything that never changes; first call on a fresh stream."""
+        """Send the blueprint and all static entities; must be the first call on a new stream."""
         self._rec.send_blueprint(layout(self._agents, self._stage), make_active=True, make_default=True)
         self._static("world", rr.ViewCoordinates.FRD)
         self._static("world/reference", rr.Points3D.from_fields(colors=[REFERENCE_RGB], radii=[0.09]))
@@ -92,7 +92,7 @@ class Scene:
         for plot in ("track_err", "solve_ms", "tick_ms"):
             self._static(f"plot/{plot}/{agent}", rr.SeriesLines(names=[name], colors=[rgb]))
         step = rr.SeriesLines(names=[name], colors=[rgb], interpolation_mode="StepAfter")
-        self._static(f"plot/late_ticks/{agent}", step)
+        self._static(f"plot/deadline_misses/{agent}", step)
         for plot, names in (("roll", "measured"), ("pitch", "measured"), ("thrust", "hover estimate")):
             lines = rr.SeriesLines(names=["setpoint", names], colors=[(148, 163, 184), rgb])
             self._static(f"plot/att/{agent}/{plot}", lines)
@@ -100,7 +100,7 @@ class Scene:
             self._static(f"state/{agent}/{kind}", _state_style(colors))
 
     def obstacles(self, obstacles: Sequence[MovingObstacle], t_us: int, elapsed_s: float) -> None:
-        """Draw this list of obstacles, instead of any earlier one, from `t_us` on; they were set `elapsed_s` before."""
+        """Replace the drawn obstacles from `t_us` on; `elapsed_s` is the time since the obstacles were set."""
         self._rec.set_time(TIMELINE, duration=np.timedelta64(t_us, "us"))
         for path, radii_m, mode, alpha in (
             ("world/obstacles/body", [o.radius_m for o in obstacles], "solid", 255),
@@ -120,13 +120,13 @@ class Scene:
         self._rec.reset_time()
 
     def ticks(self, agent: int, t_us: NDArray[np.int64], rows: NDArray[np.void], plan_ned_m: Array | None) -> None:
-        """Draw where an agent went and what changed; its curves wait for `plots`.
+        """Draw poses, trails and changes of state of an agent; its curves are drawn by `plots`.
 
         Args:
-            agent: whose.
+            agent: index of the agent.
             t_us: time of each row on the shared timeline (T,), increasing.
             rows: `TICK_DTYPE` rows (T,).
-            plan_ned_m: newest predicted path (M, 3), drawn at the last row; None to leave the old one.
+            plan_ned_m: newest predicted path (M, 3), drawn at the last row; None to keep the old one.
         """
         if not len(rows):
             return
@@ -143,21 +143,21 @@ class Scene:
         self._seen[agent] = _Seen(np.array(last["pos_ned_m"]), *state, sent_us)
 
     def plots(self) -> None:
-        """Draw the curves of every tick since the last call; called less often, because a chunk costs 3 kB."""
+        """Draw the curves of all ticks since the last call; called less often, because each chunk costs 3 kB."""
         for agent, parts in self._pending.items():
             self._plots(agent, np.concatenate([t_us for t_us, _ in parts]), np.concatenate([rows for _, rows in parts]))
         self._pending.clear()
         self._least_distance()
 
     def _least_distance(self) -> None:
-        """Up to the newest instant that every live agent has reported."""
+        """Draw the smallest separation up to the newest instant that every live agent has reported."""
         t_us, least_m = self._separation.take()
         if len(t_us):
             self._scalars("plot/separation/min", t_us, least_m)
             self._scalars("plot/separation/limit", t_us[[0, -1]], np.full(2, self._limit_m))
 
     def log(self, source: str, t_us: int, level: str, text: str) -> None:
-        """One line in the event view."""
+        """Add one line to the event view."""
         columns = rr.TextLog.columns(text=[f"{source}: {text}"], level=[level])
         self._rec.send_columns(f"events/{source}", self._when(np.array([t_us])), columns)
 
@@ -187,7 +187,7 @@ class Scene:
         solved = rows["iterations"] > 0
         self._scalars(f"plot/solve_ms/{agent}", t_us[solved], rows["solve_ms"][solved])
         self._scalars(f"plot/tick_ms/{agent}", t_us, rows["tick_ms"])
-        self._scalars(f"plot/late_ticks/{agent}", t_us[-1:], rows["late_ticks"][-1:])
+        self._scalars(f"plot/deadline_misses/{agent}", t_us[-1:], rows["deadline_misses"][-1:])
         asked_deg, had_deg = (np.degrees(roll_pitch_rad(rows[name])) for name in ("setpoint_q_nb", "q_nb"))
         pairs = {
             "roll": np.column_stack([asked_deg[:, 0], had_deg[:, 0]]),
@@ -198,7 +198,7 @@ class Scene:
             self._scalars(f"plot/att/{agent}/{name}", t_us, pair)
 
     def _states(self, agent: int, t_us: NDArray[np.int64], rows: NDArray[np.void]) -> None:
-        """Bars and log lines at each change; bars also every `_REPEAT_US`."""
+        """Send state bars and log lines at each change, and bars also every `_REPEAT_US`."""
         before = self._seen.get(agent)
         repeat = before is None or t_us[-1] - before.state_us >= _REPEAT_US
         if before is not None and repeat:
@@ -240,7 +240,7 @@ class Scene:
 
 
 def _changes(rows: NDArray[np.void], before: _Seen | None) -> Iterator[tuple[int, str, str]]:
-    """(row, level, words) of every change of phase, mode and plan status."""
+    """Yield (row, log level, text) of every change of phase, mode and plan status."""
     for kind, enum in (("phase", Phase), ("mode", Mode), ("plan_status", PlanStatus)):
         old = getattr(before, kind) if before else int(rows[kind][0])
         for k in np.flatnonzero(np.diff(rows[kind].astype(int), prepend=old)).tolist():
@@ -251,7 +251,7 @@ def _changes(rows: NDArray[np.void], before: _Seen | None) -> Iterator[tuple[int
                 continue
             level = "INFO"
             if kind == "mode":
-                level = "ERROR" if value == Mode.BLIND else "WARN" if value in _WARN_MODES else "INFO"
+                level = "ERROR" if value == Mode.STATE_STALE else "WARN" if value in _WARN_MODES else "INFO"
             yield k, level, f"{kind} {_name(enum, value)}"
 
 

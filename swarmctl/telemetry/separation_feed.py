@@ -1,6 +1,6 @@
-"""Smallest distance of a live swarm: agents report at different instants, so reports are brought to one grid.
+"""Computes the smallest distance within a live swarm; reports are interpolated to one grid of instants.
 
-An agent that falls silent stops counting after a second; it must not stop the others' figure.
+A silent agent is left out after one second, so that the distance of the others is still computed.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ _SILENT_US = 1_000_000
 
 
 class SeparationFeed:
-    """Batches of positions in, smallest pairwise distance at 50 Hz out."""
+    """Takes batches of positions and returns the smallest pairwise distance at 50 Hz."""
 
     def __init__(self, agents: int) -> None:
         self._t_us: list[NDArray[np.int64]] = [np.zeros(0, np.int64) for _ in range(agents)]
@@ -25,12 +25,12 @@ class SeparationFeed:
         self._next_us: int | None = None
 
     def offer(self, agent: int, t_us: NDArray[np.int64], pos_ned_m: Array) -> None:
-        """Positions (T, 3) of one agent at `t_us` (T,), increasing."""
+        """Add positions (T, 3), NED, of one agent at `t_us` (T,), increasing."""
         self._t_us[agent] = np.concatenate([self._t_us[agent], t_us])
         self._pos_ned_m[agent] = np.vstack([self._pos_ned_m[agent], pos_ned_m])
 
     def take(self) -> tuple[NDArray[np.int64], Array]:
-        """Instants (G,) and smallest distances (G,) since the last call, as far as every live agent has reported."""
+        """Return instants (G,) and smallest distances (G,) [m] since the last call, up to the last common report."""
         ends_us = {agent: int(t_us[-1]) for agent, t_us in enumerate(self._t_us) if len(t_us)}
         if not ends_us:
             return np.zeros(0, np.int64), np.zeros(0)
@@ -51,12 +51,12 @@ class SeparationFeed:
     def _forget(self, before_us: int) -> None:
         for agent, t_us in enumerate(self._t_us):
             first = int(np.searchsorted(t_us, before_us))
-            first = min(first, max(0, len(t_us) - 1))  # the newest one stays: it says who is live
+            first = min(first, max(0, len(t_us) - 1))  # the newest sample stays, because it decides who is live
             self._t_us[agent], self._pos_ned_m[agent] = t_us[first:], self._pos_ned_m[agent][first:]
 
 
 def _least_distance_m(pos_ned_m: Array) -> Array:
-    """Smallest pairwise distance (G,) of positions (G, n, 3); NaN where no pair is known."""
+    """Return the smallest pairwise distance (G,) of positions (G, n, 3); NaN where no pair is known."""
     least_m = np.full(len(pos_ned_m), np.inf)
     for i in range(pos_ned_m.shape[1] - 1):
         apart_m = np.linalg.norm(pos_ned_m[:, i + 1 :] - pos_ned_m[:, i : i + 1], axis=2)

@@ -1,4 +1,4 @@
-"""`summary.json` read back: what the report needs of it, checked before it is believed."""
+"""Reads and validates `summary.json`, as far as the report needs it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal
 import msgspec
 
 Outcome = Literal["completed", "failed", "interrupted"]
-_Figure = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]  # what can be printed and drawn
+_Figure = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]  # range that can be printed and drawn
 _Count = Annotated[int, msgspec.Meta(ge=0, lt=2**53)]
 
 
@@ -85,10 +85,10 @@ class _Summary(msgspec.Struct):
 
 
 def decode_summary(content: bytes) -> dict[str, Any]:
-    """What the report needs of a summary; the rest is dropped.
+    """Return the part of a summary that the report needs.
 
     Raises:
-        ValueError: it is not JSON, or a key is missing or of another type; the text says which.
+        ValueError: it is not JSON, or a key is missing or has another type; the text says which.
     """
     try:
         summary: dict[str, Any] = msgspec.to_builtins(msgspec.json.decode(content, type=_Summary))

@@ -1,6 +1,6 @@
-"""Recorded rows as motion: where every vehicle was at common instants, and how far from its reference.
+"""Computes tracks from recorded rows: positions of all vehicles at common instants, and tracking errors.
 
-Pure numpy; shared by the referee and the report so that they can't disagree.
+Pure numpy. Referee and report share this module, so that their figures agree.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 from swarmctl.core.types import Array, Phase
 
 _GRID_US = 20_000
-_GAP_US = 500_000  # reported positions further apart than this are not joined by a line
-_STALE_MS = _GAP_US / 1e3  # an agent that hears nothing goes on recording where it saw its vehicle last
-LONGEST_US = 48 * 3_600_000_000  # of a run; clocks further apart have no instants in common
+_GAP_US = 500_000  # no interpolation between reported positions farther apart in time
+_STALE_MS = _GAP_US / 1e3  # an agent that receives nothing keeps recording the last known position
+MAX_RUN_US = 48 * 3_600_000_000  # longest run; clocks farther apart belong to different runs
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,7 +30,7 @@ class Tracks:
 
 @dataclass(frozen=True, slots=True)
 class TrackError:
-    """One agent against its reference, one row a tick of the mission."""
+    """Tracking error of one agent, one row for each tick of the mission."""
 
     mission_t_s: Array  # (T,)
     error_ned_m: Array  # (T, 3) position minus reference
@@ -38,19 +38,19 @@ class TrackError:
 
 
 def flight_rows(rows: NDArray[np.void]) -> NDArray[np.void]:
-    """The ticks between arming and the end of landing."""
+    """Return the ticks between arming and the end of landing."""
     during: NDArray[np.void] = rows[(rows["phase"] >= Phase.ARM) & (rows["phase"] < Phase.DONE)]
     return during
 
 
 def tracking_rows(rows: NDArray[np.void]) -> NDArray[np.void]:
-    """The ticks of the mission itself."""
-    during: NDArray[np.void] = rows[(rows["phase"] == Phase.TRACK) & (np.abs(rows["mission_t_s"]) < LONGEST_US / 1e6)]
+    """Return the ticks of the mission itself."""
+    during: NDArray[np.void] = rows[(rows["phase"] == Phase.TRACK) & (np.abs(rows["mission_t_s"]) < MAX_RUN_US / 1e6)]
     return during
 
 
 def mission_start_us(ticks: Mapping[int, NDArray[np.void]], time_field: str) -> float | None:
-    """When mission time was zero, in the clock `time_field` names; None without a mission."""
+    """Return the instant of mission time 0 in the clock named by `time_field`; None without a mission."""
     for rows in ticks.values():
         tracking = tracking_rows(rows)
         if len(tracking):
@@ -59,7 +59,7 @@ def mission_start_us(ticks: Mapping[int, NDArray[np.void]], time_field: str) -> 
 
 
 def utc_offset_us(ticks: Mapping[int, NDArray[np.void]]) -> float:
-    """UTC minus monotonic time of this host [us], 0 when nothing was recorded."""
+    """Return UTC minus monotonic time of the host [us]; 0 when nothing was recorded."""
     for rows in ticks.values():
         if len(rows):
             return float(np.median(rows["utc_us"] - rows["t_us"]))
@@ -67,10 +67,10 @@ def utc_offset_us(ticks: Mapping[int, NDArray[np.void]]) -> float:
 
 
 def merge_tracks(ticks: Mapping[int, NDArray[np.void]], truth: NDArray[np.void], agents: int) -> Tracks:
-    """Positions at common instants: every instant of the simulator, else reports interpolated to 50 Hz.
+    """Return positions at common instants: every instant of the simulator, else reports interpolated to 50 Hz.
 
-    A report counts at the instant its state is of, not at the tick that repeats it: a vehicle that is no longer heard
-    has no position, however often its last one was recorded.
+    A report counts at the time of its state, not at the tick that repeats it: a vehicle that is no longer received has
+    no position, however often its last one was recorded.
     """
     return _true_tracks(truth, agents) if len(truth) else _reported_tracks(ticks, agents)
 
@@ -94,7 +94,7 @@ def _reported_tracks(ticks: Mapping[int, NDArray[np.void]], agents: int) -> Trac
     if not armed_us:
         return nothing
     first_us, last_us = min(armed_us), max(int(rows["utc_us"].max()) for rows in known.values() if len(rows))
-    if last_us - first_us > LONGEST_US:
+    if last_us - first_us > MAX_RUN_US:
         return nothing
     t_us = np.arange(first_us, last_us + 1, _GRID_US)
     pos_ned_m = np.full((len(t_us), agents, 3), np.nan)
@@ -105,20 +105,20 @@ def _reported_tracks(ticks: Mapping[int, NDArray[np.void]], agents: int) -> Trac
 
 
 def _located(rows: NDArray[np.void]) -> NDArray[np.bool_]:
-    """Ticks that knew where their vehicle was, at some time."""
+    """Return a mask (T,) of ticks that contain a position, of whatever age."""
     located: NDArray[np.bool_] = np.isfinite(rows["pos_ned_m"]).all(axis=1) & np.isfinite(rows["state_age_ms"])
     return located
 
 
 def _state_utc_us(rows: NDArray[np.void]) -> NDArray[np.int64]:
-    """When the recorded states were true (T,), of ticks with a state."""
-    age_us = np.clip(rows["state_age_ms"].astype(np.float64) * 1e3, 0.0, LONGEST_US)
+    """Return the UTC (T,) [us] of the recorded states, for ticks with a state."""
+    age_us = np.clip(rows["state_age_ms"].astype(np.float64) * 1e3, 0.0, MAX_RUN_US)
     when_us: NDArray[np.int64] = rows["utc_us"] - np.round(age_us).astype(np.int64)
     return when_us
 
 
 def unseen_spans(rows: NDArray[np.void], time_field: str) -> list[tuple[float, float]]:
-    """Beginning and end of every time in which an armed vehicle was not heard for too long to know where it was."""
+    """Return begin and end of every interval in which an armed vehicle's position was stale or unknown."""
     unseen = (rows["armed"] != 0) & ~(_located(rows) & (rows["state_age_ms"] <= _STALE_MS))
     edges = np.flatnonzero(np.diff(np.concatenate([[False], unseen, [False]])))
     t_us = rows[time_field].astype(np.float64)
@@ -126,10 +126,10 @@ def unseen_spans(rows: NDArray[np.void], time_field: str) -> list[tuple[float, f
 
 
 def interpolate(at_us: NDArray[np.int64], t_us: NDArray[np.int64], values: Array, gap_us: int) -> Array:
-    """Linear interpolation of rows (T, k), NaN outside the data and inside gaps longer than `gap_us`."""
+    """Interpolate rows (T, k) at `t_us` (T,) linearly to `at_us`; NaN outside and in gaps longer than `gap_us`."""
     if not len(t_us):
         return np.full((len(at_us), values.shape[1]), np.nan)
-    base = t_us[0]  # microseconds of UTC would cost float64 its last digits
+    base = t_us[0]  # float64 would lose digits on microseconds of UTC
     at, t = (at_us - base).astype(np.float64), (t_us - base).astype(np.float64)
     result = np.column_stack([np.interp(at, t, values[:, k]) for k in range(values.shape[1])])
     after = np.clip(np.searchsorted(t_us, at_us), 1, max(1, len(t_us) - 1))
@@ -140,7 +140,7 @@ def interpolate(at_us: NDArray[np.int64], t_us: NDArray[np.int64], values: Array
 
 
 def true_positions(rows: NDArray[np.void], truth: NDArray[np.void], agent: int) -> Array:
-    """Where the vehicle of `agent` was at each tick (T, 3), NaN where unknown: interpolated truth, else its report."""
+    """Return positions (T, 3) of an agent's vehicle at each tick: interpolated truth, else its report; else NaN."""
     if not len(truth):
         heard = _located(rows) & (rows["state_age_ms"] <= _STALE_MS)
         return np.where(heard[:, None], rows["pos_ned_m"], np.nan)
@@ -149,7 +149,7 @@ def true_positions(rows: NDArray[np.void], truth: NDArray[np.void], agent: int) 
 
 
 def track_error(rows: NDArray[np.void], truth: NDArray[np.void], agent: int) -> TrackError:
-    """Distance of one agent to its reference at each tick of the mission; ticks without both are left out."""
+    """Return the tracking error of one agent at each tick of the mission with known position and reference."""
     tracking = tracking_rows(rows)
     error_ned_m = true_positions(tracking, truth, agent) - tracking["ref_pos_ned_m"]
     known = np.isfinite(error_ned_m).all(axis=1)

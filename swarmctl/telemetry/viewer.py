@@ -1,8 +1,8 @@
-"""The one process that owns rerun: ticks from the bus in, live server and `telemetry.rrd` out.
+"""The only process that uses rerun: reads ticks from the bus, serves a live view and writes `telemetry.rrd`.
 
-`python -m swarmctl.telemetry.viewer --run R --bus ENDPOINT --agents N --run-dir DIR`. It serves and never connects, so
-nothing it does can hold up an agent; frozen or killed, it costs pictures only. The launcher decides when it ends
-(SIGTERM, or SIGHUP where somebody started it by hand); Ctrl-C is not its business.
+`python -m swarmctl.telemetry.viewer --run R --bus ENDPOINT --agents N --run-dir DIR`. It only serves, so it can't delay
+an agent; if it freezes or is killed, only the view is lost. The launcher ends it by SIGTERM (SIGHUP works as well when
+it was started by hand); it ignores Ctrl-C.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from swarmctl.telemetry.recordings import APPLICATION, RECORDING, has_display, o
 URL_FILE = "viewer.url"
 _HOST = "127.0.0.1"
 _PORTS_TRIED = 50
-_SERVER_MEMORY = "512MiB"  # history for viewers that come late
-_EXIT_S = 4.0  # from SIGTERM to the end, whatever hangs
-_FLUSH_S = 2.0
-_PLOTS_S = 0.4  # curves are sent this often, poses at --rate-hz
-_REDRAW_S = 5.0  # obstacles at rest are sent again: a late viewer's history loses rare data first
+_SERVER_MEMORY = "512MiB"  # history for viewers that connect late
+_EXIT_TIMEOUT_S = 4.0  # longest time from SIGTERM to the exit, whatever hangs
+_FLUSH_TIMEOUT_S = 2.0
+_PLOT_PERIOD_S = 0.4  # period of curves; poses are sent at --rate-hz
+_REDRAW_PERIOD_S = 5.0  # period of obstacles at rest, because the server's history drops rare data first
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -102,7 +102,7 @@ def _run(options: argparse.Namespace, obstacles: list[MovingObstacle], stop: Sto
 
 
 class Pump:
-    """Moves what has arrived into the scene, at a fixed rate."""
+    """Draws everything that has arrived, at a fixed rate."""
 
     def __init__(self, feed: Any, scene: Any, obstacles: list[MovingObstacle]) -> None:
         self._feed = feed
@@ -113,15 +113,15 @@ class Pump:
         self._drawn_us: int | None = None
 
     def run(self, period_s: float, stop: StopRequest) -> None:
-        """Until `stop`, and once more for what arrived meanwhile."""
+        """Draw until `stop`, and once more for what arrived meanwhile."""
         next_s = time.monotonic()
         next_plots_s = next_s
         while not stop.is_set():
             self.step()
             if time.monotonic() >= next_plots_s:
                 self._scene.plots()
-                next_plots_s = time.monotonic() + _PLOTS_S - period_s / 2
-            next_s = max(next_s + period_s, time.monotonic())  # after a freeze: go on, don't catch up
+                next_plots_s = time.monotonic() + _PLOT_PERIOD_S - period_s / 2
+            next_s = max(next_s + period_s, time.monotonic())  # missed periods after a freeze are not caught up
             stop.wait(next_s - time.monotonic())
         self.step()
         self._scene.plots()
@@ -138,14 +138,14 @@ class Pump:
 
     def _draw_obstacles(self) -> None:
         since_s = None if self._drawn_us is None else (self._newest_us - self._drawn_us) / 1e6
-        due_s = 0.0 if any(obstacle.moves for obstacle in self._obstacles) else _REDRAW_S
+        due_s = 0.0 if any(obstacle.moves for obstacle in self._obstacles) else _REDRAW_PERIOD_S
         if since_s is None or since_s > due_s:
             self._scene.obstacles(self._obstacles, self._newest_us, (self._newest_us - self._set_us) / 1e6)
             self._drawn_us = self._newest_us
 
 
 def _interruptible(connect: Callable[[], Any], stop: StopRequest) -> Any:
-    """Result of a blocking connect, or None when `stop` comes first: native code sees no signals."""
+    """Return the result of a blocking connect, or None if `stop` comes first; native code handles no signals."""
     answer: list[Any] = []
 
     def attempt() -> None:
@@ -166,7 +166,7 @@ def _interruptible(connect: Callable[[], Any], stop: StopRequest) -> Any:
 
 
 def _serve(run: str, directory: Path, port: int) -> tuple[Any, str]:
-    """A stream that serves on loopback and writes the recording, if the disk takes one; and its URL."""
+    """Return a stream that serves on loopback and, if the disk allows, writes the recording; and its URL."""
     import rerun as rr
 
     rec = rr.RecordingStream(APPLICATION, recording_id=run, batcher_config=rr.ChunkBatcherConfig(flush_tick=0.25))
@@ -205,7 +205,7 @@ def _is_free(port: int) -> bool:
 
 
 def _is_ours(port: int, timeout_s: float = 2.0) -> bool:
-    """Whether this process listens there: the server binds later, and a lost race is only logged."""
+    """Return whether this process listens on the port; the server binds later and only logs a lost race."""
     until_s = time.monotonic() + timeout_s
     while time.monotonic() < until_s:
         for connection in psutil.Process().net_connections("tcp4"):
@@ -226,13 +226,13 @@ def _announce(options: argparse.Namespace, url: str) -> None:
 
 
 def _end(rec: Any, bus: Any, last_line: str) -> None:
-    """Bounded end: a frozen viewer makes flush and disconnect hang."""
-    watchdog = threading.Timer(_EXIT_S, os._exit, [EXIT_OK])
+    """Close stream and bus within a bounded time, because flush and disconnect hang while a viewer is frozen."""
+    watchdog = threading.Timer(_EXIT_TIMEOUT_S, os._exit, [EXIT_OK])
     watchdog.daemon = True
     watchdog.start()
     print(last_line, flush=True)
     try:
-        rec.flush(timeout_sec=_FLUSH_S)
+        rec.flush(timeout_sec=_FLUSH_TIMEOUT_S)
     except Exception as error:
         print(f"viewer: flush: {error}", file=sys.stderr, flush=True)
     rec.disconnect()

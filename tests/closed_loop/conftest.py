@@ -1,7 +1,7 @@
-"""Flights in lockstep and what is measured on their true states.
+"""Flights in lockstep and measurements on their true states.
 
-What is claimed of a flight holds for starts that are a millimetre elsewhere as well, or it is one rounding's luck:
-`pytest tests/closed_loop --nudged SEED` flies all of them so. Claims that were found to be sensitive are parametrised.
+A claim about a flight must also hold for starts shifted by a millimetre, or it depends on one rounding:
+`pytest tests/closed_loop --nudged SEED` flies all of them so. Claims found to be sensitive are parametrised.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Flight:
 
     @property
     def pos_ned_m(self) -> NDArray[np.float64]:
-        """(T, N, 3), true."""
+        """True positions (T, N, 3), NED [m]."""
         return np.asarray(self._truth["pos_ned_m"])
 
     @cached_property
@@ -62,14 +62,14 @@ class Flight:
         return self._ticks[agent]
 
     def tracked(self, agent: int) -> tuple[Any, NDArray[np.float64]]:
-        """Ticks of the mission proper, and true position minus reference (K, 3) at each."""
+        """Return the ticks of the mission itself, and true position minus reference (K, 3) at each."""
         ticks = self.ticks(agent)
         ticks = ticks[np.isfinite(ticks["mission_t_s"])]
         true = [np.interp(ticks["t_us"] * 1e-6, self.t_s, self.pos_ned_m[:, agent, c]) for c in range(3)]
         return ticks, np.stack(true, axis=1) - ticks["ref_pos_ned_m"]
 
-    def index_m(self, after_s: float = 0.0) -> float:
-        """Sum over agents of the mean distance to the reference (thesis Table 19)."""
+    def summed_mean_error_m(self, after_s: float = 0.0) -> float:
+        """Return the sum over agents of the mean distance to the reference (index of thesis Table 19)."""
         total = 0.0
         for agent in range(self.config.swarm.agents):
             ticks, error = self.tracked(agent)
@@ -77,7 +77,7 @@ class Flight:
         return total
 
     def separation_m(self, only: int | None = None) -> float:
-        """Smallest true distance of any two vehicles at any time, on the ground and in the air."""
+        """Return the smallest true distance of any two vehicles at any time, on the ground and in the air."""
         pos = self.pos_ned_m
         pairs = itertools.combinations(range(pos.shape[1]), 2)
         chosen = [(i, j) for i, j in pairs if only is None or only in (i, j)]
@@ -96,7 +96,7 @@ Fly = Callable[..., Flight]
 
 
 def nudged(starts_ned_m: Array, seed: int) -> Array:
-    """Places (N, 3) up to a millimetre elsewhere in the plane; 0 leaves them where they are."""
+    """Return places (N, 3) shifted by up to a millimetre in the plane; seed 0 leaves them unchanged."""
     offsets = np.zeros(starts_ned_m.shape)
     if seed:
         offsets[:, :2] = np.random.default_rng(seed).uniform(-_NUDGE_M, _NUDGE_M, (len(starts_ned_m), 2))
@@ -111,9 +111,9 @@ def fly_now(
     until: Callable[[Lockstep], bool] | None = None,
     seed: int = 0,
 ) -> Flight:
-    """Fly a configuration to its end, or `until` nothing more is asked of it.
+    """Fly a configuration to its end, or until `until` returns true.
 
-    `at` maps mission times [s] to what happens then, once; `seed` is that of `nudged`.
+    `at` maps mission times [s] to actions, each run once; `seed` is that of `nudged`.
     """
     path = ROOT / "configs" / config if config else None
     starts = nudged(np.array(load(path, overrides).starts_ned_m()), seed)
@@ -137,19 +137,19 @@ def fly_now(
 
 
 def mission_t_s(lockstep: Lockstep) -> float:
-    """Newest mission time of any agent that is tracking, else -1."""
+    """Return the newest mission time [s] of any agent that is tracking, else -1."""
     times = [float(log.rows[-1]["mission_t_s"][0]) for log in lockstep.logs if log.rows]
     return max((t for t in times if np.isfinite(t)), default=-1.0)
 
 
 def mission_is_over(lockstep: Lockstep) -> bool:
-    """Nobody is on the way to the start or in the mission any more."""
+    """Return whether no agent is on its transit to the start or in the mission any more."""
     return all(len(log.rows) and log.rows[-1]["phase"][0] > Phase.TRACK for log in lockstep.logs)
 
 
 @pytest.fixture(scope="session", autouse=True)
 def nudged_starts(request: pytest.FixtureRequest) -> Iterator[None]:
-    """Vehicles of every flight stand a millimetre elsewhere, as `--nudged` says."""
+    """Shift the vehicles of every flight by up to a millimetre, by the seed of `--nudged`."""
     seed, as_configured = int(request.config.getoption("--nudged")), sitl.lockstep.sitl_params
 
     def elsewhere(config: Config) -> SitlParams:
@@ -168,5 +168,5 @@ def fly() -> Fly:
 
 @pytest.fixture(scope="session")
 def circle() -> Flight:
-    """The default mission, whole."""
+    """Fly the whole default mission."""
     return fly_now()

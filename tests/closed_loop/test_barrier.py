@@ -11,21 +11,26 @@ from sitl.lockstep import Lockstep
 from swarmctl.config import load
 from tests.closed_loop.conftest import ROOT, Flight, Fly
 
-BLIND = ("mission.kind=swap", "sitl.start=air", "controller.kind=mpc", "mission.duration_s=7")
+STATE_STALE = ("mission.kind=swap", "sitl.start=air", "controller.kind=mpc", "mission.duration_s=7")
 OFF = "agent.barrier.enabled=false"
 BODY_M, X500_BODY_M = 0.48, 0.65
 RADIUS_M, TRAVEL_S = 2.6, 6.5  # peaks at 1.5 m/s, so they close in at 3 m/s
 
 
 def ring(count: int) -> tuple[str, ...]:
-    """`count` agents on a circle, each with the opposite place as its goal."""
+    """Return overrides for `count` agents on a circle, each with the opposite place as its goal."""
     angles = [2.0 * math.pi * i / count for i in range(count)]
     places = [[round(RADIUS_M * math.cos(a), 3), round(RADIUS_M * math.sin(a), 3), -3.0] for a in angles]
-    return (f"swarm.agents={count}", f"start.positions_ned_m={places}", f"mission.swap.travel_s={TRAVEL_S}", *BLIND)
+    return (
+        f"swarm.agents={count}",
+        f"start.positions_ned_m={places}",
+        f"mission.swap.travel_s={TRAVEL_S}",
+        *STATE_STALE,
+    )
 
 
 def through_each_other(*overrides: str, config: str | None = None) -> Flight:
-    """Until they have touched, or long enough to have gone through."""
+    """Fly until bodies have touched, or until all have passed."""
     flight = Lockstep(load(ROOT / "configs" / config if config else None, overrides))
     while flight.clock.now_us() < 60e6:
         flight.step()

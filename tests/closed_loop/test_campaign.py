@@ -1,4 +1,4 @@
-"""A small campaign: protections and their control, the same seed twice, going on after it was killed, the report."""
+"""Tests of a small campaign: protections and negative control, repeated seeds, resuming after a kill, the report."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def rows_in(directory: Path) -> list[Row]:
 
 @pytest.fixture(scope="module")
 def quick(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What README.md shows."""
+    """The campaign shown in README.md."""
     out = tmp_path_factory.mktemp("campaign")
     (line,) = (line for line in (ROOT / "README.md").read_text().splitlines() if line.startswith(SHOWN))
     command = [sys.executable, *shlex.split(line)[1:], "--out", str(out)]
@@ -86,20 +86,20 @@ def test_the_report_has_every_cell_with_its_exact_interval(quick: Path) -> None:
     assert "--scenario swap --agents 3 --delay 100 --loss 0.1" in page, "what flies a failed run again"
 
 
-def test_incidents_happen_in_flight() -> None:
-    """Two agents; the bus falls apart for 2 s: paths age, both come through."""
+def test_scenario_events_happen_in_flight() -> None:
+    """The bus of two agents is partitioned for 2 s: plans get stale, and both reach their goals."""
     trial = Trial(Cell("partition", 2, 0.0, 0.0, "exact", 0.0, "default"), 1)
     flight = Flight(trial, layout_of("partition", 1, 2))
     flight.run()
     assert flight.row(None)["outcome"] == "arrived"
     for log in flight.lockstep.logs:
-        ages_ms = log.ticks["path_age_ms"][log.ticks["phase"] == Phase.TRACK]
+        ages_ms = log.ticks["plan_staleness_ms"][log.ticks["phase"] == Phase.TRACK]
         assert 1950.0 < ages_ms.max() < 2200.0
         assert ages_ms[-1] < 150.0
 
 
 @pytest.mark.process
-def test_a_killed_campaign_goes_on_where_it_was(tmp_path: Path) -> None:
+def test_a_killed_campaign_resumes(tmp_path: Path) -> None:
     asked = ["--scenario", "swap", "--agents", "2", "--protections", "off", "--jobs", "2", "--out", str(tmp_path)]
     command = [sys.executable, str(ROOT / "tools" / "campaign.py"), *asked, "--trials", "50"]
     campaign = subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL)
@@ -113,7 +113,7 @@ def test_a_killed_campaign_goes_on_where_it_was(tmp_path: Path) -> None:
         campaign.send_signal(signal.SIGKILL)
         campaign.wait()
     _, alive = psutil.wait_procs(children, timeout=10.0)
-    assert children and alive == [], "nobody flies on for nobody"
+    assert children and alive == [], "no worker outlives its campaign"
     before = rows_in(tmp_path)
     assert 1 <= len(before) < 50
     highest = max(row["seed"] for row in before)

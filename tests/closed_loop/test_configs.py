@@ -1,4 +1,4 @@
-"""Every file of configs/ is flown, shortened, or validated when it needs vehicles of its own."""
+"""Tests every file of configs/: it is flown, shortened, or only validated when it needs other vehicles."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ FLOWN_ELSEWHERE = {  # and for longer
 FILES = sorted(path.name for path in (ROOT / "configs").glob("*.toml"))
 
 
-def test_the_promised_files_are_there() -> None:
+def test_the_documented_files_exist() -> None:
     promised = {"swap8", "px4_udp", "px4_serial", "ardupilot_udp", "thesis_5_circle", "thesis_6_obstacle"}
     assert promised <= {name.removesuffix(".toml") for name in FILES}
     assert {name.split("_")[1] for name in FILES if name.startswith("thesis_")} == set("123456")

@@ -1,4 +1,4 @@
-"""Nobody gets stuck for good: exact symmetry, one goal for all, a corridor too narrow to pass each other."""
+"""Tests that deadlocks are resolved: exact symmetry, one goal for all, a corridor too narrow to pass each other."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ ARRIVED_M = 0.05
 
 
 class Flown:
-    """The mission of a flight, until everybody has arrived or the time is up."""
+    """The mission of a flight, until all agents have arrived or the time is up."""
 
     def __init__(self, starts: Array, goals: Array, seconds: float, *sets: str) -> None:
         config = load(
@@ -65,7 +65,7 @@ class Flown:
 
     @property
     def moved_m(self) -> float:
-        """Farthest way of any agent from where it ends, in the last second."""
+        """Return the largest distance of any agent, in the last second, from its final position."""
         return float(np.linalg.norm(self.pos_ned_m[-50:] - self.pos_ned_m[-1], axis=2).max())
 
 
@@ -92,7 +92,7 @@ def test_two_that_meet_in_a_corridor_get_by(met: Flown) -> None:
     assert met.separation_m > 0.25
 
 
-def test_it_is_noticed_and_told(met: Flown) -> None:
+def test_the_deadlock_is_reported(met: Flown) -> None:
     begun = [e for e in met.noted if e["begins"]]
     assert any(set(e["by"]) & {0, 1} for e in begun)
     assert all(e["lasted_s"] >= 1.5 for e in met.noted if not e["begins"])

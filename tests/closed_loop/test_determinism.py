@@ -1,4 +1,4 @@
-"""Lockstep repeats bit for bit, whatever the order agents are ticked in."""
+"""Tests that lockstep repeats bit for bit in any order of the agents' ticks."""
 
 from __future__ import annotations
 

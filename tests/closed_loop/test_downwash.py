@@ -1,4 +1,4 @@
-"""Two agents whose ways cross one above the other: with downwash neither passes closely below."""
+"""Tests that with downwash neither of two agents with crossing references passes closely below the other."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ CROSSING = (
 
 
 def scaled_m(flight: Flight, downwash: float) -> float:
-    """Smallest true distance with heights scaled."""
+    """Return the smallest true distance with heights scaled."""
     apart = (flight.pos_ned_m[:, 0] - flight.pos_ned_m[:, 1]) * [1.0, 1.0, 1.0 / downwash]
     return float(np.linalg.norm(apart, axis=1).min())
 
 
 @pytest.mark.parametrize("kind", ["dmpc", "dmpc3"])  # one goes round, the other over
-def test_nobody_passes_closely_below(fly: Fly, kind: str) -> None:
+def test_no_vehicle_passes_closely_below_another(fly: Fly, kind: str) -> None:
     flight = fly(*CROSSING, f"controller.kind={kind}", "separation.downwash=2.0")
     assert flight.problems == []
     assert scaled_m(flight, 2.0) >= 0.85

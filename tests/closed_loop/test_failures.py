@@ -1,4 +1,4 @@
-"""Every row of the failure table that one process can show, each beside a flight with the protection switched off."""
+"""Tests every failure that one process can show, each beside a flight with the protection disabled."""
 
 from __future__ import annotations
 
@@ -62,9 +62,9 @@ def test_a_frozen_agent_is_landed_by_its_autopilot_and_never_retakes_control(fly
     assert flight.separation_m() >= 0.85
     ticks = flight.ticks(1)
     after = ticks[ticks["t_us"] > ticks["t_us"][np.argmax(np.diff(ticks["t_us"]))]]
-    assert Mode.YIELD in set(after["mode"])
-    first = int(np.argmax(after["mode"] == Mode.YIELD))
-    assert np.isnan(after["setpoint_thrust_01"][first:]).all(), "no setpoint after it has yielded"
+    assert Mode.PILOT_OVERRIDE in set(after["mode"])
+    first = int(np.argmax(after["mode"] == Mode.PILOT_OVERRIDE))
+    assert np.isnan(after["setpoint_thrust_01"][first:]).all(), "no setpoint after a pilot override"
     assert flight.problems == ["agent 1: pilot or autopilot took over"]
 
 
@@ -75,40 +75,40 @@ def take_over(running: Lockstep) -> None:
 
 
 def others_have_landed(running: Lockstep) -> bool:
-    """Vehicle 2 stays with its pilot for ever."""
+    """The pilot keeps control of vehicle 2."""
     return all(len(log.rows) and log.rows[-1]["phase"][0] == Phase.DONE for log in running.logs[:2])
 
 
-def test_the_pilot_wins(fly: Fly) -> None:
+def test_a_pilot_override_is_respected(fly: Fly) -> None:
     landing = {8.0: take_over, 9.5: lambda running: running.command("land")}
     flight = fly(MISSION, at=landing, until=others_have_landed)
     ticks = flight.ticks(2)
-    yielded = ticks["mode"] == Mode.YIELD
-    assert yielded.any()
-    first = int(np.argmax(yielded))
+    overridden = ticks["mode"] == Mode.PILOT_OVERRIDE
+    assert overridden.any()
+    first = int(np.argmax(overridden))
     until_operator = ticks[first : first + 20]
     assert (until_operator["flight_mode"] == FlightMode.HOLD).all()
     assert np.isnan(ticks["setpoint_thrust_01"][first:]).all()
-    # the hold brakes at 3 m/s2 what flies 0.9 m ahead; u_max 0.2 lets the others brake at 2 m/s2
+    # in hold the vehicle brakes at 3 m/s2, 0.9 m ahead of the others, which brake at 2 m/s2 at most (u_max 0.2)
     assert flight.separation_m() >= 0.80
 
 
 def test_no_state_no_setpoints(fly: Fly) -> None:
-    """The vehicle hears us, we don't hear it: setpoints stop within 200 ms + a tick, and it lands by itself."""
+    """Only messages from the vehicle are lost: setpoints stop within 200 ms and a tick, and it lands by itself."""
 
     def deafen(running: Lockstep) -> None:
         running.links[0][1].send = lambda data: None  # type: ignore[method-assign]
 
     flight = fly(MISSION, "swarm.agents=1", "mission.duration_s=10", at={4.0: deafen})
     ticks = flight.ticks(0)
-    blind = ticks[(ticks["mode"] == Mode.BLIND) & (ticks["phase"] >= Phase.TRACK)]
+    blind = ticks[(ticks["mode"] == Mode.STATE_STALE) & (ticks["phase"] >= Phase.TRACK)]
     assert len(blind) and np.isnan(blind["setpoint_thrust_01"]).all()
     assert blind["state_age_ms"].min() <= 221.0, "setpoints stop within 200 ms and a tick"
     assert landed_by_itself(flight.lockstep.truth, 0, 1)
 
 
 def break_solver(running: Lockstep, agent: int, lasts_s: float) -> None:
-    """OSQP of one agent returns nothing for a while."""
+    """Make OSQP of one agent return nothing for a while."""
     until_s = running.clock.now_us() * 1e-6 + lasts_s
     flown = running.agents[agent]
     assert flown is not None
@@ -124,7 +124,7 @@ def _solve_from(running: Lockstep, from_s: float, solve: Callable[..., QpSolutio
 @pytest.mark.parametrize(
     ("lasts_s", "reached"), [(0.3, Mode.REPLAY), (2.0, Mode.HOLD), (8.0, Mode.LAND)], ids=["replay", "hold", "land"]
 )
-def test_ladder_after_solver_failure(fly: Fly, lasts_s: float, reached: Mode) -> None:
+def test_modes_after_a_solver_failure(fly: Fly, lasts_s: float, reached: Mode) -> None:
     broken = {9.0: lambda running: break_solver(running, 0, lasts_s)}
     flight = fly("mission.duration_s=18", "swarm.agents=1", at=broken)
     ladder = [Mode.REPLAY, Mode.BRAKE, Mode.HOLD, Mode.LAND]
@@ -135,10 +135,10 @@ def test_ladder_after_solver_failure(fly: Fly, lasts_s: float, reached: Mode) ->
 
 
 @pytest.mark.parametrize(("loss_s", "blind_s"), [(None, 0.5), (1.0, 1.0)], ids=["set by agents", "control"])
-def test_the_vehicle_of_a_dead_agent_flies_on_blindly_for_half_a_second(
+def test_the_vehicle_of_a_dead_agent_keeps_its_attitude_for_half_a_second(
     fly: Fly, loss_s: float | None, blind_s: float
 ) -> None:
-    """PX4 holds the last attitude for COM_OF_LOSS_T, which is a second of its own accord."""
+    """PX4 holds the last attitude for COM_OF_LOSS_T, one second by default."""
     own = f"agent.autopilot_params={{COM_OBL_RC_ACT=4,COM_OF_LOSS_T={loss_s}}}"
     died: list[float] = []
 
@@ -153,8 +153,8 @@ def test_the_vehicle_of_a_dead_agent_flies_on_blindly_for_half_a_second(
     assert flight.lockstep.clock.now_us() * 1e-6 - died[0] == pytest.approx(blind_s, abs=0.12)
 
 
-def test_others_keep_clear_of_who_has_no_solver(fly: Fly) -> None:
-    """It replays, then comes to a hold and returns, and in the end lands."""
+def test_others_keep_clear_of_an_agent_without_a_solver(fly: Fly) -> None:
+    """The agent replays its last plan, brakes, holds and finally lands."""
     broken = {
         at_s: partial(break_solver, agent=0, lasts_s=lasts_s) for at_s, lasts_s in ((6.0, 0.3), (8.0, 2.0), (14.0, 8.0))
     }
@@ -165,7 +165,7 @@ def test_others_keep_clear_of_who_has_no_solver(fly: Fly) -> None:
 
 
 def test_a_plan_that_would_come_too_close_is_not_flown(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The QP forgets its half-spaces and the safety filter is off: what is left is the certifier, code of its own."""
+    """The QP has no half-spaces and the safety filter is off: only the certifier, which is separate code, remains."""
     monkeypatch.setattr(mpc, "half_spaces", lambda *_: None)
     flight = fly("mission.duration_s=8", AIR, "agent.barrier.enabled=false")
     certified = flight.separation_m()

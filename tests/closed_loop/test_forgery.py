@@ -1,4 +1,4 @@
-"""A stranger on the bus writes under a peer's name. Nobody is silenced, nobody comes closer, and the run says so."""
+"""Tests of forged messages under a peer's name: no peer is silenced, distances are kept, the run reports it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.closed_loop.conftest import Flight, Fly, fly_now, mission_t_s
 
 AGENTS, VICTIM, STRANGER = 4, 1, 999
 LAST = 2**32 - 1
-CROSSED_S = 5.0  # they meet after three
+CROSSED_S = 5.0  # the agents meet after 3 s
 FORGED_S = 2.0
 GUARANTEED = "separation.mode=guaranteed"
 SWAP = (
@@ -44,7 +44,7 @@ def swap(fly: Fly, *overrides: str, at: dict[float, Callable[[Lockstep], None]] 
 
 
 def summary(flight: Flight) -> dict[str, Any]:
-    """As the run folder would say, had all gone well from there."""
+    """Return the summary of the flight so far as if it had been completed."""
     logs = flight.lockstep.logs
     events = [event for log in logs for event in log.events]
     data = RunData({log.agent: log.ticks for log in logs}, flight.lockstep.truth, events)
@@ -56,7 +56,7 @@ def say(running: Lockstep, topic: topics.Topic, payload: bytes, name: int = VICT
 
 
 def forge_paths(running: Lockstep) -> None:
-    """By everybody's name one of another life and one of the highest number: far away, at rest."""
+    """Forge two paths under each name, far away and at rest: one with another boot id, one with the highest number."""
     at_us = running.clock.utc_us() + 40_000
     for agent in range(AGENTS):
         away = np.tile([60.0, 20.0 * agent, -2.0], (26, 1))
@@ -66,7 +66,7 @@ def forge_paths(running: Lockstep) -> None:
 
 
 def overhear(heard: list[bytes], topic: topics.Topic) -> Callable[[Lockstep], None]:
-    """Keep what the victim says on a topic."""
+    """Record the messages of the victim on a topic."""
 
     def tap(running: Lockstep) -> None:
         carry = running.hub.carry
@@ -83,11 +83,11 @@ def overhear(heard: list[bytes], topic: topics.Topic) -> Callable[[Lockstep], No
 
 @pytest.fixture(scope="module")
 def twin() -> Flight:
-    """The same flight, untouched."""
+    """Fly the same flight without forgery."""
     return swap(fly_now)
 
 
-def test_forged_paths_change_nothing_and_are_told(fly: Fly, twin: Flight) -> None:
+def test_forged_paths_change_nothing_and_are_reported(fly: Fly, twin: Flight) -> None:
     flight = swap(fly, at={FORGED_S: forge_paths})
     assert twin.separation_m() >= 0.85
     np.testing.assert_array_equal(flight.pos_ned_m, twin.pos_ned_m)
@@ -116,10 +116,10 @@ def test_control_where_the_newest_is_believed_they_meet(fly: Fly, monkeypatch: p
     flight = swap(fly, at={FORGED_S: forge_paths})
     assert flight.separation_m() < 0.1
     found = summary(flight)["comms"]["unheard"]
-    assert found["longest_s"] > 1.0, "who was silenced is named"
+    assert found["longest_s"] > 1.0, "the silenced peer is named"
 
 
-def test_a_forged_status_lands_parks_and_delays_nobody(fly: Fly, twin: Flight) -> None:
+def test_forged_statuses_have_no_effect(fly: Fly, twin: Flight) -> None:
     heard: list[bytes] = []
 
     def forge(running: Lockstep) -> None:
@@ -161,19 +161,19 @@ def test_forged_trajectories_break_no_commitment(fly: Fly) -> None:
     assert "(trajectory boot 3, trajectory sequence 3)" in violation
 
 
-def test_who_forges_all_the_time_is_told_and_nobody_comes_closer(fly: Fly, twin: Flight) -> None:
+def test_permanent_forgery_is_reported_and_distances_are_kept(fly: Fly, twin: Flight) -> None:
     flight = swap(fly, at={0.5 + 0.02 * i: forge_paths for i in range(200)})
     np.testing.assert_array_equal(flight.pos_ned_m, twin.pos_ned_m)
     assert len(summary(flight)["violations"]) == AGENTS
 
 
-def test_late_and_lost_messages_accuse_nobody(fly: Fly) -> None:
+def test_late_and_lost_messages_raise_no_forgery_alarm(fly: Fly) -> None:
     flight = swap(fly, "bus.delay_ms=300", "bus.loss_01=0.2")
     assert not [violation for violation in summary(flight)["violations"] if "refused" in violation]
 
 
-def test_orders_of_another_day_are_not_obeyed_and_the_last_one_counts(fly: Fly) -> None:
-    """A `land` of 1970, one of in an hour, and a `hold` that comes again after it was lifted."""
+def test_commands_with_old_or_future_stamps_are_refused_and_the_last_one_counts(fly: Fly) -> None:
+    """The commands are a `land` stamped 1970, one stamped in an hour, and a `hold` repeated after its resume."""
     speeds_m_s: list[float] = []
 
     def order(running: Lockstep, verb: Verb, at_us: int) -> None:
@@ -192,10 +192,10 @@ def test_orders_of_another_day_are_not_obeyed_and_the_last_one_counts(fly: Fly) 
         agent = running.agents[0]
         assert agent is not None
         assert agent.rejected == {"stale_order": 1, "future_order": 1, "superseded_order": 1}
-        assert agent._reporter.problem == "command of operator refused: future_order"
+        assert agent._publisher.active_alert == "command of operator refused: future_order"
         speeds_m_s.append(float(np.linalg.norm(running.logs[0].rows[-1]["vel_ned_m_s"][0])))
 
     flight = swap(fly, at={1.0: orders, 2.5: look})
     assert speeds_m_s[0] > 0.3
-    assert flight.modes(0, Phase.TRACK) == {Mode.FOLLOW}
+    assert flight.modes(0, Phase.TRACK) == {Mode.TRACKING}
     assert not (flight.ticks(0)["phase"] > Phase.TRACK).any()

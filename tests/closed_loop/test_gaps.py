@@ -1,4 +1,4 @@
-"""An agent that was stopped for a moment: it rejoins before the autopilot's failsafe acts, or learns that it has."""
+"""Tests of an agent stopped briefly: it continues before the autopilot's failsafe acts, or notices that it has."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ AT_S = 4.03
 
 
 def freeze(running: Lockstep) -> None:
-    """Its modes are told by HEARTBEAT alone, once a second: between two of them, unless it is asked."""
+    """The vehicle reports modes by HEARTBEAT only, once a second, or on request."""
     endpoint = running.world.endpoints[0]
     assert isinstance(endpoint, Endpoint)
     endpoint.set_interval(dialect.MAVLINK_MSG_ID_CURRENT_MODE, -1)
@@ -25,14 +25,14 @@ def freeze(running: Lockstep) -> None:
 
 
 def gaps(flight: Flight) -> list[float]:
-    """Times between setpoints while tracking [s], the longest first."""
+    """Return the times between setpoints while tracking [s], the longest first."""
     ticks = flight.ticks(0)
     ticks = ticks[(ticks["phase"] == Phase.TRACK) & np.isfinite(ticks["setpoint_thrust_01"])]
     return sorted((np.diff(ticks["t_us"]) * 1e-6).tolist(), reverse=True)
 
 
 def fly_stopped_for(fly: Fly, seconds: float) -> Flight:
-    """Until three seconds after the agent was stopped."""
+    """Fly until three seconds after the agent was stopped."""
     stopped_us: list[int] = []
 
     def stop(running: Lockstep) -> None:
@@ -48,27 +48,27 @@ def fly_stopped_for(fly: Fly, seconds: float) -> Flight:
     return fly(*ALONE, at={AT_S: stop}, until=over)
 
 
-def has_yielded(flight: Flight) -> bool:
-    return Mode.YIELD in flight.modes(0)
+def is_overridden(flight: Flight) -> bool:
+    return Mode.PILOT_OVERRIDE in flight.modes(0)
 
 
-def test_an_agent_that_was_stopped_for_a_third_of_a_second_flies_on_before_a_failsafe_acts(fly: Fly) -> None:
+def test_an_agent_stopped_for_a_third_of_a_second_continues_before_a_failsafe_acts(fly: Fly) -> None:
     flight = fly_stopped_for(fly, 0.32)
     assert 0.32 <= gaps(flight)[0] < 0.40
     assert gaps(flight)[1] < 0.05
     ticks = flight.ticks(0)
     assert set(ticks["flight_mode"][ticks["phase"] == Phase.TRACK].tolist()) == {FlightMode.EXTERNAL}
-    assert not has_yielded(flight)
+    assert not is_overridden(flight)
     assert "setpoint_gap" not in flight.event_names(0)
 
 
 def test_control_who_waits_to_be_told_the_mode_loses_the_vehicle(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Autopilot, "_ask_for", lambda *_: None)
     flight = fly_stopped_for(fly, 0.32)
-    assert has_yielded(flight)
+    assert is_overridden(flight)
 
 
-def test_an_agent_that_was_stopped_for_longer_yields_to_the_failsafe_that_acted(fly: Fly) -> None:
+def test_an_agent_stopped_for_longer_leaves_control_to_the_failsafe(fly: Fly) -> None:
     flight = fly_stopped_for(fly, 0.8)
-    assert has_yielded(flight)
+    assert is_overridden(flight)
     assert np.isnan(flight.ticks(0)["setpoint_thrust_01"][-100:]).all()

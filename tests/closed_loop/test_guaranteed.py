@@ -122,9 +122,9 @@ def test_a_tick_with_a_stale_state_commits_nothing_and_spends_no_time_on_it() ->
         flight.step()
     (agent,) = flight.agents
     assert agent is not None
-    assert agent.took.commitment_ms > 0.0
+    assert agent.timing.commitment_ms > 0.0
     flight.links[0][1].send = lambda data: None  # type: ignore[method-assign]
     for _ in range(15):
         flight.step()
-    assert agent.took.commitment_ms == 0.0
-    assert agent.took.setup_ms >= 0.0
+    assert agent.timing.commitment_ms == 0.0
+    assert agent.timing.setup_ms >= 0.0

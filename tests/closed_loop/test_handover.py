@@ -1,6 +1,6 @@
-"""Between agent, autopilot and pilot: who flies, how it is handed over, and that nobody takes it back unasked.
+"""Tests of handovers between agent, autopilot and pilot; control is never retaken without a command.
 
-Each protection beside the same flight without it.
+Each protection is tested beside the same flight without it.
 """
 
 from __future__ import annotations
@@ -14,8 +14,8 @@ from pymavlink.dialects.v20 import development as mavlink
 from sitl.lockstep import Lockstep
 from swarmctl.agent.agent import Agent
 from swarmctl.config import load
-from swarmctl.control.phases import sequence
-from swarmctl.control.phases.sequence import REBOOTED, TAKEN_OVER, Sequence
+from swarmctl.control.phases import state_machine
+from swarmctl.control.phases.state_machine import REBOOTED, TAKEN_OVER, MissionStateMachine
 from swarmctl.core.types import FlightMode, Phase, VehicleState
 from swarmctl.mavlink import mode_watch
 from swarmctl.mavlink.codec import Codec, frames, message_id
@@ -23,9 +23,9 @@ from swarmctl.mavlink.transport import PipeTransport
 from tests.closed_loop.conftest import Fly, mission_t_s
 
 SETPOINT = 82  # SET_ATTITUDE_TARGET
-SLEEP_S = 1.62  # wakes in a tick in which the state is told but not the mode
+SLEEP_S = 1.62  # the first tick afterwards receives a state but no mode
 
-# four cross one point at close quarters and at speed, all told to land there
+# four agents cross one point closely and fast, and are commanded to land there
 CROSSING = (
     "swarm.agents=4",
     "start.positions_ned_m=[[3.0,0.0,0.0],[-3.0,0.1,0.0],[0.1,3.0,0.0],[0.0,-3.0,0.0]]",
@@ -36,7 +36,7 @@ CROSSING = (
 LAND_NOW: dict[float, Callable[[Lockstep], None]] = {1.7: lambda running: running.command("land")}
 
 
-def test_who_is_told_to_land_at_speed_among_others_brakes_and_makes_room_first(fly: Fly) -> None:
+def test_a_landing_at_speed_among_others_brakes_and_moves_apart_first(fly: Fly) -> None:
     flight = fly(*CROSSING, at=LAND_NOW)
     assert flight.separation_m() >= 0.85
     final = flight.pos_ned_m[-1]
@@ -51,11 +51,11 @@ def test_who_is_told_to_land_at_speed_among_others_brakes_and_makes_room_first(f
 def test_control_an_autopilot_that_lands_at_speed_among_others_comes_too_close(
     fly: Fly, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def land_at_once(self: Sequence, now_us: int, state: VehicleState) -> None:
+    def land_at_once(self: MissionStateMachine, now_us: int, state: VehicleState) -> None:
         if self._stop_verb:
             self.outcome, self.phase, self._entered_us = "stopped", Phase.LAND, now_us
 
-    monkeypatch.setattr(Sequence, "_apply_stop", land_at_once)
+    monkeypatch.setattr(MissionStateMachine, "_apply_stop", land_at_once)
     assert fly(*CROSSING, at=LAND_NOW).separation_m() < 0.75
 
 
@@ -65,7 +65,7 @@ ALONE = ("swarm.agents=1", "mission.duration_s=8")
 
 
 class Watched:
-    """One agent and its vehicle; notes when setpoints leave and when the vehicle is in OFFBOARD, armed."""
+    """One agent and its vehicle; records when setpoints leave and when the vehicle is armed in OFFBOARD."""
 
     def __init__(self, *overrides: str) -> None:
         self.run = Lockstep(load(None, (*ALONE, *overrides)))
@@ -97,7 +97,7 @@ class Watched:
         return self
 
     def restart_agent(self) -> None:
-        """A new process beside the same vehicle."""
+        """Start a new agent process beside the same vehicle."""
         self.run.agents[0] = self.run._agent(0, self.run.links[0][0])
 
     def _listen(self) -> None:
@@ -111,7 +111,7 @@ class Watched:
 
 
 def asleep_past_the_loss() -> Watched:
-    """The agent's process stands still; its socket keeps half a second and drops the rest, as UDP's does."""
+    """Stop the agent's process; its socket keeps half a second of datagrams and drops the rest, as UDP does."""
     flight = Watched().until_mission(2.0)
     ours, vehicles = flight.run.links[0]
     flight.run.frozen.add(0)
@@ -129,7 +129,7 @@ def asleep_past_the_loss() -> Watched:
     return flight
 
 
-def test_an_agent_that_slept_past_the_loss_takes_nothing_back() -> None:
+def test_an_agent_stopped_past_the_loss_does_not_retake_control() -> None:
     flight = asleep_past_the_loss()
     assert flight.setpoints_us == flight.offboard_us == []
     assert flight.agent.outcome == TAKEN_OVER
@@ -143,7 +143,7 @@ def test_control_without_doubting_the_mode_it_returns_to_offboard(monkeypatch: p
 
 
 def restarted_while_the_autopilot_flies_home(switched_off: Callable[[], None] = lambda: None) -> Watched:
-    """With PX4's own choice of what to do when setpoints stop."""
+    """Use PX4's default action for the loss of setpoints."""
     flight = Watched("agent.autopilot_params.COM_OBL_RC_ACT=3").until_mission(3.0)
     switched_off()
     flight.run.kill(0)
@@ -156,10 +156,10 @@ def restarted_while_the_autopilot_flies_home(switched_off: Callable[[], None] = 
     return flight
 
 
-def test_a_restarted_agent_leaves_a_vehicle_to_the_failsafe_that_has_it() -> None:
+def test_a_restarted_agent_leaves_control_to_an_active_failsafe() -> None:
     flight = restarted_while_the_autopilot_flies_home()
     assert flight.setpoints_us == flight.offboard_us == []
-    flight.run.command("resume")  # an operator means it
+    flight.run.command("resume")  # the operator's explicit command
     flight.step_for(1.0)
     assert flight.setpoints_us
     assert flight.offboard_us
@@ -167,8 +167,8 @@ def test_a_restarted_agent_leaves_a_vehicle_to_the_failsafe_that_has_it() -> Non
 
 def test_control_streaming_to_a_vehicle_that_is_not_ours_takes_it(monkeypatch: pytest.MonkeyPatch) -> None:
     def switch_off() -> None:
-        monkeypatch.setattr(sequence, "_is_theirs", lambda state: False)
-        monkeypatch.setattr(Sequence, "_ask_for_control", lambda *_: [])  # streaming is enough
+        monkeypatch.setattr(state_machine, "_is_under_other_control", lambda state: False)
+        monkeypatch.setattr(MissionStateMachine, "_request_control", lambda *_: [])  # streaming is enough
 
     flight = restarted_while_the_autopilot_flies_home(switch_off)
     assert flight.setpoints_us

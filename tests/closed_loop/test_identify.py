@@ -1,7 +1,6 @@
-"""What `swarmctl check --identify` flies, in lockstep: it finds the vehicle, comes back, and pays off on the circle.
+"""Tests of the flight of `swarmctl check --identify`: it identifies the vehicle, lands, and improves the circle.
 
-The x500 answers as PX4 does and its estimator errs as PX4's does; the agent begins with a model that knows neither lag
-nor drag.
+The x500 responds as PX4 does and its estimator has PX4's errors; the agent begins with a model without lag and drag.
 """
 
 from __future__ import annotations
@@ -14,14 +13,14 @@ import pytest
 
 from sitl.lockstep import Lockstep
 from swarmctl.config import load
-from swarmctl.control.estimation.identification import Flown, Identified, flown, identify
+from swarmctl.control.estimation.identification import FlightSegment, Identified, identify, longest_segment
 from swarmctl.core.types import Landed, Phase
 
 CONFIG = Path(__file__).parents[2] / "configs" / "x500_circle.toml"
 SEEDS = (1, 2, 3, 4)
 DRAG_1_S, HOVER_01 = 1.0, 9.81 / 20.0  # of the x500: 1 N/(m/s), 1 kg, 20 N
 ALONE = ("swarm.agents=1", "sitl.estimator=gps", "start.center_ned_m=[0, 0, -3]")
-AIR = ("sitl.start=air", "agent.sequence.arrive_m=1")
+AIR = ("sitl.start=air", "agent.state_machine.arrive_m=1")
 UNKNOWN = ("vehicle_model.delay_s=0.06", "vehicle_model.attitude_rad_s=0", "vehicle_model.drag_1_s=0")
 STEPS = ("mission.kind=identify", "mission.identify.repeats=1", "mission.duration_s=27.5")
 CIRCLE = ("start.center_ned_m=[5, 0, -3]", "mission.circle.climb_ned_m_s=0", "mission.duration_s=20")
@@ -38,8 +37,8 @@ def fly(*overrides: str, until: Phase = Phase.GOTO_LAND) -> Lockstep:
 
 @functools.cache
 def found(seed: int) -> Identified:
-    flight = flown(fly(*AIR, *UNKNOWN, *STEPS, f"seed={seed}").logs[0].ticks)
-    assert isinstance(flight, Flown), flight
+    flight = longest_segment(fly(*AIR, *UNKNOWN, *STEPS, f"seed={seed}").logs[0].ticks)
+    assert isinstance(flight, FlightSegment), flight
     result = identify(flight)
     assert isinstance(result, Identified), result
     return result
@@ -58,7 +57,7 @@ def test_the_interval_of_drag_holds_the_truth_and_is_narrow() -> None:
 
 
 def circle_rmse_m(*overrides: str) -> float:
-    """Of the reported position, from 10 s on."""
+    """Return the error of the reported position from 10 s on [m]."""
     ticks = fly(*AIR, *CIRCLE, *overrides).logs[0].ticks
     late = ticks[(ticks["phase"] == Phase.TRACK) & (ticks["mission_t_s"] >= 10.0)]
     assert len(late) > 450

@@ -1,4 +1,4 @@
-"""An estimate that jumps in flight: the vehicle has not moved, nobody flies across the difference, and peers know."""
+"""Tests of an estimate that jumps in flight: no vehicle flies across the difference, and peers are informed."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from swarmctl.mavlink.local_frame import LocalFrame
 from tests.closed_loop.conftest import Flight, Fly
 
 JUMP_M = 5.0
-AT_S = 4.0  # of the mission
+AT_S = 4.0  # mission time of the jump
 WATCHED_S = 5.0
 
 
 def fly_with_a_jump(fly: Fly) -> tuple[Flight, float]:
-    """Vehicle 0 takes itself for 5 m farther from vehicle 1 than it is, and so would fly through it to come back."""
+    """The estimate of vehicle 0 jumps 5 m away from vehicle 1, through which it would fly to return."""
     jumped_us: list[int] = []
 
     def jump(running: Lockstep) -> None:
@@ -31,7 +31,7 @@ def fly_with_a_jump(fly: Fly) -> tuple[Flight, float]:
     return flight, jumped_us[0] * 1e-6
 
 
-def test_a_jump_of_the_estimate_brings_nobody_closer_and_is_told(fly: Fly) -> None:
+def test_a_jump_of_the_estimate_keeps_distances_and_is_reported(fly: Fly) -> None:
     flight, jumped_s = fly_with_a_jump(fly)
     assert flight.separation_m() >= 0.85
     assert flight.event_names(0).count("estimate_jumped") == 1

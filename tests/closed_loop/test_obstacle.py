@@ -1,4 +1,4 @@
-"""An obstacle on the way that is seen only from close (thesis 4.4)."""
+"""Tests of an obstacle on the path that is visible only from close (thesis 4.4)."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ CONFIG, PUBLISHED = "improved_6_obstacle.toml", "thesis_6_obstacle.toml"
 
 @pytest.fixture(scope="module")
 def flight() -> Flight:
-    """From the ground and home again, past the obstacle twice."""
+    """Fly from the ground and back, past the obstacle twice."""
     return fly_now(config=PUBLISHED)
 
 
@@ -23,18 +23,18 @@ def clearance_m(flight: Flight) -> float:
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_everybody_keeps_clear_of_it_and_of_each_other(fly: Fly, seed: int) -> None:
-    """Worst of starts 1 to 3, a millimetre off: 1.763 m and 0.908 m."""
+def test_all_keep_clear_of_the_obstacle_and_of_each_other(fly: Fly, seed: int) -> None:
+    """The worst of starts 1 to 3, shifted by a millimetre, are 1.763 m and 0.908 m."""
     past = fly("sitl.start=air", config=CONFIG, until=mission_is_over, seed=seed)
     assert clearance_m(past) >= 1.75
     assert past.separation_m() >= 0.89
     for agent in range(3):
         assert not past.ticks(agent)["safety_filter_acted"].any(), "the safety filter is not needed for it"
-        assert past.modes(agent, Phase.TRACK) == {Mode.FOLLOW}
+        assert past.modes(agent, Phase.TRACK) == {Mode.TRACKING}
 
 
-def test_with_published_weights_everybody_keeps_clear_from_the_published_start_and_comes_home(flight: Flight) -> None:
-    """Without a weight on velocity they overshoot: from starts a millimetre off the worst of six is 1.64 m."""
+def test_with_published_weights_all_keep_clear_from_the_published_start_and_land(flight: Flight) -> None:
+    """Without a weight on velocity agents overshoot: the worst of six starts shifted by a millimetre is 1.64 m."""
     assert flight.problems == []
     assert clearance_m(flight) >= 1.70
     assert flight.separation_m() >= 0.85
@@ -43,7 +43,7 @@ def test_with_published_weights_everybody_keeps_clear_from_the_published_start_a
     )
 
 
-def test_it_is_known_only_within_the_visibility_distance(flight: Flight) -> None:
+def test_the_obstacle_is_known_only_within_the_visibility_distance(flight: Flight) -> None:
     for agent in range(3):
         ticks = flight.ticks(agent)
         seen = np.isfinite(ticks["nearest_obstacle_m"])

@@ -1,4 +1,4 @@
-"""Wind, a heavier vehicle, a sagging battery and a wrong thrust curve at once cost a lone vehicle next to nothing."""
+"""Tests that wind, a heavier vehicle, a sagging battery and a wrong thrust curve together cost little accuracy."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ ALONE = (
     "start.center_ned_m=[5, 0, -3]",
     "mission.circle.climb_ned_m_s=0",
     "mission.duration_s=16",
-    "agent.sequence.arrive_m=1",
+    "agent.state_machine.arrive_m=1",
 )
 HEAVY = ("sitl.mass_scale=1.2", "sitl.battery.capacity_mah=5000", "sitl.battery.charge_01=0.9")
 WIND = ("sitl.wind.mean_ned_m_s=[8,0,0]",)
 GUSTS = ("sitl.wind.gust_ned_m_s=[2,1,0]", "sitl.wind.gust_at_s=12", "sitl.wind.gust_for_s=2")
 EDDIES = ("sitl.wind.turbulence_m_s=3",)
 CURVE = ("sitl.thrust_curve_01=0.3",)
-BLIND = ("agent.disturbance.limit_m_s2=0.01",)
+STATE_STALE = ("agent.disturbance.limit_m_s2=0.01",)
 
 
 class Errors(NamedTuple):
-    """Of the true position against the reference once steady [m]."""
+    """Return the steady error of the true position against the reference [m]."""
 
     rmse_m: float
     mean_down_m: float
@@ -54,18 +54,18 @@ def errors(*overrides: str) -> Errors:
     return Errors(float(np.sqrt((error**2).sum(axis=1).mean())), float(down.mean()), float(np.abs(down).max()))
 
 
-def test_wind_gusts_mass_and_battery_leave_centimetres() -> None:
+def test_wind_gusts_mass_and_battery_cost_centimetres() -> None:
     found = errors(*WIND, *HEAVY, *GUSTS)
     assert found.rmse_m <= 0.045
     assert abs(found.mean_down_m) <= 0.005
     assert found.largest_down_m <= 0.02
 
 
-def test_turbulence_on_top_leaves_centimetres() -> None:
+def test_additional_turbulence_costs_centimetres() -> None:
     assert errors(*WIND, *HEAVY, *GUSTS, *EDDIES).rmse_m <= 0.05
 
 
-def test_at_rest_nothing_is_left() -> None:
+def test_at_rest_no_error_remains() -> None:
     hover = ("mission.kind=hover", "mission.duration_s=15")
     found = errors(*hover, *WIND, *HEAVY, *CURVE)
     assert found.rmse_m <= 0.005
@@ -75,9 +75,9 @@ def test_at_rest_nothing_is_left() -> None:
 @pytest.mark.parametrize(
     ("without", "at_least_m"),
     [
-        (BLIND, 1.0),
+        (STATE_STALE, 1.0),
         (("agent.disturbance.limit_m_s2=4",), 0.4),  # 8 m/s are 8 m/s2 at 1 1/s of drag
-        (("agent.state_filter.enabled=false",), 0.2),  # the plain observer takes drag for wind that turns
+        (("agent.state_filter.enabled=false",), 0.2),  # the plain observer mistakes drag for a rotating wind
         (("controller.mpc.u_max=0.45", "vehicle_model.tilt_max_rad=0.47"), 1.0),
     ],
     ids=["no estimate", "4 m/s2 at most", "no filter", "no room to lean"],

@@ -1,4 +1,4 @@
-"""Agents whose processor is too slow: they come to rest far from each other, name it, and land if it lasts."""
+"""Tests of agents with too slow a processor: they come to rest far apart, report it, and land if it lasts."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from tests.closed_loop.conftest import Flight, fly_now
 
 SWAP = ("swarm.agents=4", "start={positions_ned_m=[[4,0,0],[0,4,0],[-4,0,0],[0,-4,0]]}", "sitl.start=air")
 UNPROTECTED = ("agent.overload.widen_01=1", "agent.overload.hold_01=1", "agent.overload.clear_01=1")
-BODY_M = 0.48  # touching, with the default airframe
+BODY_M = 0.48  # distance at which two default airframes touch
 
 
 def one_tick_of(count: int) -> Callable[[Lockstep], None]:
-    """What makes every agent do one tick of `count` from now on."""
+    """Return a function that makes every agent run only one of `count` ticks from now on."""
 
     def begin(lockstep: Lockstep) -> None:
         lockstep.starved = dict.fromkeys(range(4), count)
@@ -28,7 +28,7 @@ def swapped(*more: str, until_s: float, at: dict[float, Callable[[Lockstep], Non
     return fly_now(*SWAP, *more, config="swap8.toml", at=at, until=over)
 
 
-def test_who_misses_nine_deadlines_of_ten_comes_to_rest_far_from_the_others_and_lands() -> None:
+def test_agents_missing_nine_of_ten_deadlines_come_to_rest_far_apart_and_land() -> None:
     flight = swapped(until_s=30.0, at={0.5: one_tick_of(10)})
     assert flight.separation_m() > 1.5
     assert {agent.outcome.split(":")[0] for agent in flight.lockstep.agents if agent} == {"overload"}

@@ -1,4 +1,4 @@
-"""A flight is the same bit for bit on every x86-64 processor, whichever kernels it would have been given there."""
+"""Tests that a flight is the same bit for bit on every x86-64 processor, whatever kernels numpy would select."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ while flight.clock.now_us() < {until_us}:
     flight.step()
 print(hashlib.sha256(flight.truth.tobytes()).hexdigest())
 """
-CORE_TYPES = {"Prescott": "pni", "Haswell": "fma", "Zen": "fma", "SkylakeX": "avx512dq"}  # and the flag each needs
+CORE_TYPES = {"Prescott": "pni", "Haswell": "fma", "Zen": "fma", "SkylakeX": "avx512dq"}  # with the flag required
 _VARIABLES = ("OPENBLAS_CORETYPE", "NPY_DISABLE_CPU_FEATURES", "NPY_ENABLE_CPU_FEATURES", NATIVE_ENV)
 
 
 def processor_flags() -> set[str]:
-    """What the processor at hand can do."""
+    """Return the feature flags of this processor."""
     lines = Path("/proc/cpuinfo").read_text(encoding="ascii", errors="replace").splitlines()
     return {flag for line in lines if line.startswith("flags") for flag in line.split(":")[1].split()}
 
@@ -37,11 +37,11 @@ RUN_HERE = [name for name, flag in CORE_TYPES.items() if flag in processor_flags
 pytestmark = pytest.mark.skipif(not RUN_HERE, reason="not an x86-64 processor: nothing is pinned there")
 
 
-UNDER_WAY_US = 7_000_000  # seconds of planning among three, once their estimators have settled
+UNDER_WAY_US = 7_000_000  # includes seconds of planning by three agents after their estimators have settled
 
 
 def fly(variables: dict[str, str], first: str = "sitl", until_us: int = UNDER_WAY_US) -> tuple[str, str]:
-    """Hash of the truth, and standard error, of a flight in a process of its own that loads `first` first."""
+    """Return hash of the truth and standard error of a flight in a separate process that loads `first` first."""
     kept = {name: value for name, value in os.environ.items() if name not in _VARIABLES}
     command = [sys.executable, "-c", FLIGHT.format(first=first, until_us=until_us)]
     done = subprocess.run(command, env=kept | variables, cwd=ROOT, capture_output=True, text=True, check=True)
@@ -58,7 +58,7 @@ def test_core_types_do_not_matter(core_type: str) -> None:
     assert fly({"OPENBLAS_CORETYPE": core_type}) == plain()
 
 
-def test_what_is_asked_of_numpy_does_not_matter() -> None:
+def test_user_settings_of_numpy_do_not_matter() -> None:
     assert fly({"NPY_ENABLE_CPU_FEATURES": "X86_V3", "OPENBLAS_NUM_THREADS": "2"}) == plain()
     assert fly({"NPY_DISABLE_CPU_FEATURES": "X86_V3"}) == plain()
     assert plain()[1] == "", "and nothing is warned of"
@@ -71,7 +71,7 @@ def test_control_left_to_themselves_processors_differ_and_it_is_said() -> None:
         assert native[0][0] != native[1][0]
 
 
-def test_numpy_that_was_loaded_first_is_said() -> None:
+def test_numpy_loaded_first_is_reported() -> None:
     _, said = fly({}, "numpy", until_us=20_000)
     assert "numpy was loaded before swarmctl" in said
 

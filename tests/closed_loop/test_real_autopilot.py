@@ -1,7 +1,7 @@
-"""What a real autopilot needs: dead time, lag and drag in the prediction, and a filter on what it reports.
+"""Tests of what a real autopilot needs: dead time, lag and drag in the prediction, and a filter on its estimates.
 
-The simulator's x500 answers as measured on PX4, and its estimator errs as PX4's does. Figures are those of `px4_flight`
-flights of real autopilots; each is claimed once and lost once, with the part that earns it switched off.
+The simulator's x500 responds as measured on PX4, and its estimator has PX4's errors. Figures are those of `px4_flight`
+flights of real autopilots; each is tested once, and once more with the responsible part disabled.
 """
 
 from __future__ import annotations
@@ -19,7 +19,12 @@ from swarmctl.core.types import Array, Phase, PlanStatus
 
 CONFIG = Path(__file__).parents[2] / "configs" / "x500_circle.toml"
 WIND_NED_M_S = (3.6, 0.0, 0.0)
-AIR = ("sitl.start=air", "start.center_ned_m=[5, 0, -3]", "mission.circle.climb_ned_m_s=0", "agent.sequence.arrive_m=1")
+AIR = (
+    "sitl.start=air",
+    "start.center_ned_m=[5, 0, -3]",
+    "mission.circle.climb_ned_m_s=0",
+    "agent.state_machine.arrive_m=1",
+)
 ALONE = (*AIR, "swarm.agents=1", "sitl.estimator=gps", "mission.duration_s=20")
 STEP = ("mission.kind=steps", "mission.steps.rows=[[0, 5, 0, -3], [2, 10, 0, -3]]", "mission.duration_s=9")
 PLAIN = ("vehicle_model.attitude_rad_s=0", "vehicle_model.drag_1_s=0", "agent.state_filter.enabled=false")
@@ -27,7 +32,7 @@ PLAIN = ("vehicle_model.attitude_rad_s=0", "vehicle_model.drag_1_s=0", "agent.st
 
 @functools.cache
 def fly(*overrides: str, wind_ned_m_s: tuple[float, float, float] | None = None) -> Lockstep:
-    """Until the mission is over."""
+    """Fly until the mission is over."""
     flight = Lockstep(load(CONFIG, overrides))
     if wind_ned_m_s is not None:
         flight.world.set_wind(wind_ned_m_s)
@@ -44,7 +49,7 @@ def tracked(flight: Lockstep, agent: int = 0) -> NDArray[np.void]:
 
 
 def rmse_m(flight: Lockstep) -> float:
-    """Of the reported position, from 10 s on."""
+    """Return the error of the reported position from 10 s on [m]."""
     ticks = tracked(flight)
     late = ticks[ticks["mission_t_s"] >= 10.0]
     assert len(late) > 450
@@ -86,14 +91,14 @@ def test_a_step_of_five_metres_does_not_overshoot_and_settles() -> None:
 
 
 def separations_m(positions_ned_m: Array) -> float:
-    """Smallest distance of any two of (agents, T, 3)."""
+    """Return the smallest distance between any two of (agents, T, 3)."""
     count = len(positions_ned_m)
     pairs = [(i, j) for i in range(count) for j in range(i)]
     return min(float(np.linalg.norm(positions_ned_m[i] - positions_ned_m[j], axis=1).min()) for i, j in pairs)
 
 
 def together(flight: Lockstep) -> tuple[float, float, float]:
-    """Index after 10 s, smallest reported and smallest true separation while tracking."""
+    """Return the summed mean error after 10 s and the smallest reported and true separation while tracking [m]."""
     all_ticks = [tracked(flight, i) for i in range(3)]
     length = min(len(ticks) for ticks in all_ticks)
     errors = [np.linalg.norm((ticks["pos_ned_m"] - ticks["ref_pos_ned_m"])[:length], axis=1) for ticks in all_ticks]
@@ -112,8 +117,8 @@ SWARM = ("sitl.start=air", "mission.duration_s=26")
 
 
 def test_three_vehicles_keep_apart_and_close_to_the_reference() -> None:
-    index_m, reported_m, true_m = together(fly(*SWARM))
-    assert index_m <= 2.0
+    summed_mean_error_m, reported_m, true_m = together(fly(*SWARM))
+    assert summed_mean_error_m <= 2.0
     assert reported_m >= 0.87
     assert true_m >= 0.79
 
@@ -123,12 +128,12 @@ def test_three_vehicles_without_lag_and_dead_time_in_the_prediction_do_not() -> 
     assert true_m < 0.6
 
 
-# -- the radius against what the estimator claims ---------------------------------------------------------------------
+# -- separation radius and reported accuracy --------------------------------------------------------------------------
 
 
 def outcome(*overrides: str) -> tuple[str, bool]:
-    """Why an agent ended, and whether anything was ever armed."""
-    flight = Lockstep(load(CONFIG, (*overrides, "mission.duration_s=1", "agent.sequence.start_timeout_s=25")))
+    """Return why the first agent ended, and whether any vehicle was ever armed."""
+    flight = Lockstep(load(CONFIG, (*overrides, "mission.duration_s=1", "agent.state_machine.start_timeout_s=25")))
     while not flight.finished and flight.clock.now_us() < 30e6:
         flight.step()
     assert flight.agents[0] is not None
@@ -141,5 +146,5 @@ def test_a_radius_below_what_the_estimator_claims_is_refused_before_arming() -> 
     assert not armed
 
 
-def test_told_so_it_flies() -> None:
+def test_with_allow_small_radius_it_flies() -> None:
     assert outcome("sitl.estimator=gps", "separation.allow_small_radius=true")[1]

@@ -1,4 +1,4 @@
-"""What a reproduction claims, flown; beside every claim a flight without the mechanism that earns it."""
+"""Tests the claims of the reproduction, each beside a flight without the mechanism responsible for it."""
 
 from __future__ import annotations
 
@@ -98,7 +98,7 @@ def test_control_over_a_slow_link_it_does_not() -> None:
 
 
 def climb_beside_obstacle_m(trace: Trace) -> float:
-    """Largest height any agent leaves its reference by, closer than 3 m to the centre."""
+    """Return the largest height error of any agent closer than 3 m to the centre [m]."""
     near = np.linalg.norm(trace.pos_ned_m - np.array(trace.obstacles[0].center_ned_m), axis=2) < 3.0
     return float(np.abs((trace.pos_ned_m - trace.ref_pos_ned_m)[near][:, 2]).max())
 
@@ -122,7 +122,7 @@ def test_control_agents_that_see_nothing_fly_through_it_and_each_other() -> None
 
 @pytest.mark.parametrize(("kind", "kept"), [("dmpc", True), ("mpc", False)])
 def test_true_distance_falls_short_of_the_constraint_radius_by_less_than_a_centimetre(kind: str, kept: bool) -> None:
-    """At 2 x 0.3 m, where the published run violated its constraint; `mpc` keeps clear of nothing."""
+    """The radius is 2 x 0.3 m, where the published run violated its constraint; `mpc` has no constraints."""
     radius_m = 2.0 * thesis.SAFE_RADIUS_M
     overrides = (*thesis.at_radius(radius_m), "mission.duration_s=10", f"controller.kind={kind}")
     trace = on_plant("thesis_5_circle", *overrides)

@@ -1,4 +1,4 @@
-"""States of another time that reach an agent in flight change nothing: neither its mission nor a bit of its flight."""
+"""Tests that states with wrong stamps, received in flight, change neither the mission nor any bit of the flight."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 from pymavlink.dialects.v20 import development as dialect
 
 from sitl.lockstep import Lockstep
-from swarmctl.control.phases.sequence import REBOOTED
+from swarmctl.control.phases.state_machine import REBOOTED
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.vehicle_clock import VehicleClock
 from tests.closed_loop.conftest import Flight, Fly
@@ -19,7 +19,7 @@ NOTHING = [math.nan] * 21
 
 
 def flown_with(fly: Fly, forged: bool) -> Flight:
-    """The first seconds of a lone mission; one forged state every tenth of a second."""
+    """Fly the first seconds of a mission of one agent with one forged state every tenth of a second."""
     codec = Codec(1, 1)
 
     def over(running: Lockstep) -> bool:

@@ -1,4 +1,4 @@
-"""Eight agents change places through one centre."""
+"""Tests that eight agents swap places through one centre."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pytest
 
 from tests.closed_loop.conftest import Flight, Fly, mission_is_over
 
-SWAP = ("mission.duration_s=12", "sitl.start=air")  # all have arrived after 10.4 s
+SWAP = ("mission.duration_s=12", "sitl.start=air")  # all agents arrive within 10.4 s
 
 
 def check(flight: Flight) -> None:
@@ -25,6 +25,6 @@ def test_eight_agents_swap_without_touching(fly: Fly) -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_so_they_do_from_starts_a_millimetre_off(fly: Fly, seed: int) -> None:
-    """Who gives way to whom differs, and so does how long it takes."""
+def test_eight_agents_swap_from_starts_a_millimetre_off(fly: Fly, seed: int) -> None:
+    """Which agent yields differs between starts, and so does the duration."""
     check(fly(*SWAP, "mission.duration_s=20", config="swap8.toml", until=mission_is_over, seed=seed))

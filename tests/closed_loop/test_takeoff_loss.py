@@ -1,4 +1,4 @@
-"""An agent that dies before OFFBOARD leaves no vehicle hovering: PX4's data-link failsafe lands it."""
+"""Tests that PX4's data-link failsafe lands a vehicle whose agent dies before OFFBOARD."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PHASES = [Phase.ARM, Phase.TAKEOFF]
 
 
 def died_in(phase: Phase) -> Lockstep:
-    """Forty seconds after the only agent of a vehicle died, a while into a phase."""
+    """Return a flight forty seconds after the only agent of the vehicle died in the given phase."""
     flight = Lockstep(load(None, ["swarm.agents=1", "mission.duration_s=5"]))
     entered_us: int | None = None
     while entered_us is None or flight.clock.now_us() < entered_us + (2_000_000 if phase is Phase.TAKEOFF else 60_000):

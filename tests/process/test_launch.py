@@ -139,7 +139,7 @@ def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Callable[..., La
     assert "bus " in lines[1]
     assert str(launched.run_dir) in lines[2]
     assert any("agent-2  TRACK" in line for line in lines)
-    assert any(line.startswith("completed, index") for line in lines[-6:])
+    assert any(line.startswith("completed, summed mean tracking error") for line in lines[-6:])
     summary = launched.summary()
     assert summary["outcome"] == "completed"
     assert summary["violations"] == []
@@ -187,7 +187,7 @@ def test_ctrl_c_lands_and_sums_up(start: Callable[..., Launched]) -> None:
     assert launched.end() == 130, launched.text()
     assert launched.landed() == {0: True, 1: True}
     assert launched.summary()["outcome"] == "interrupted"
-    assert "interrupted, index" in launched.text()
+    assert "interrupted, summed mean tracking error" in launched.text()
 
 
 def test_a_second_ctrl_c_ends_everything_at_once(start: Callable[..., Launched]) -> None:

@@ -51,7 +51,7 @@ def ends(code: int, after_s: float = 0.3) -> str:
 
 
 def status_of(agent: int, phase: Phase, utc_us: int) -> bytes:
-    said = (Mode.FOLLOW, FlightMode.EXTERNAL, True, Landed.IN_AIR, 0, "", 0.1, 1.0, 2.0, 9, 0, 5.0, 0, "", False)
+    said = (Mode.TRACKING, FlightMode.EXTERNAL, True, Landed.IN_AIR, 0, "", 0.1, 1.0, 2.0, 9, 0, 5.0, 0, "", False)
     message = StatusMessage(agent, 1, agent + 1, phase, *said, utc_us)
     return encode_message(message)
 

@@ -69,7 +69,7 @@ class Swarm:
     def payload(self, agent: int) -> bytes:
         row = np.zeros(1, TICK_DTYPE)
         row["t_us"], row["utc_us"], row["seq"] = time.monotonic_ns() // 1000, time.time_ns() // 1000, self.seq
-        row["phase"], row["mode"], row["mission_t_s"] = Phase.TRACK, Mode.FOLLOW, self.seq * 0.02
+        row["phase"], row["mode"], row["mission_t_s"] = Phase.TRACK, Mode.TRACKING, self.seq * 0.02
         if self.seq % 50 == 25:
             row["mode"], row["plan_status"] = Mode.REPLAY, PlanStatus.SOLVER_FAILED
         row["ref_pos_ned_m"] = (0.01 * self.seq, 0.0, -2.0)
@@ -78,7 +78,7 @@ class Swarm:
         row["q_nb"] = (np.cos(0.05), np.sin(0.05), 0.0, 0.0)  # roll 0.1 rad
         row["setpoint_q_nb"] = (np.cos(0.1), np.sin(0.1), 0.0, 0.0)
         row["setpoint_thrust_01"], row["hover_thrust_01"] = 0.6, 0.5
-        row["iterations"], row["solve_ms"], row["tick_ms"], row["late_ticks"] = 25, 2.5, 4.5, self.seq // 10
+        row["iterations"], row["solve_ms"], row["tick_ms"], row["deadline_misses"] = 25, 2.5, 4.5, self.seq // 10
         plan = (row["pos_ned_m"] + np.arange(26)[:, None] * (0.02, 0.0, 0.0)).astype("<f4")
         payload: bytes = row.tobytes() + struct.pack("<H", len(plan)) + plan.tobytes()
         return payload
@@ -145,7 +145,7 @@ def scalars(rows: list[Any]) -> list[list[float]]:
 
 def expected_entities() -> set[str]:
     each = ["world/agent/{}", "world/agent/{}/body", "world/agent/{}/safety", "world/trail/{}", "world/plan/{}"]
-    each += ["plot/track_err/{}", "plot/solve_ms/{}", "plot/tick_ms/{}", "plot/late_ticks/{}"]
+    each += ["plot/track_err/{}", "plot/solve_ms/{}", "plot/tick_ms/{}", "plot/deadline_misses/{}"]
     each += ["plot/att/{}/roll", "plot/att/{}/pitch", "plot/att/{}/thrust"]
     each += ["state/{}/phase", "state/{}/mode", "events/agent-{}"]
     shared = {"world", "world/reference", "world/reference_trail", "world/obstacles/body", "world/obstacles/keep_out"}

@@ -1,4 +1,4 @@
-"""Property tests judge answers, not the speed of a shared machine."""
+"""Disables the deadlines of property tests, which would measure the load of a shared machine."""
 
 from __future__ import annotations
 

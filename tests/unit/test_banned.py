@@ -1,4 +1,4 @@
-"""Calls that have hurt before, and must not come back."""
+"""Tests that calls known to be harmful are not used."""
 
 from __future__ import annotations
 
@@ -30,6 +30,6 @@ def test_setpoints_are_packed_in_one_place() -> None:
 
 
 def code_of(path: Path) -> str:
-    """Source without docstrings and comments, which may name what is banned."""
+    """Return the source without docstrings and comments, which may name banned calls."""
     text = re.sub(r'"""(.|\n)*?"""', "", path.read_text())
     return re.sub(r"#.*", "", text)

@@ -1,4 +1,4 @@
-"""What a configuration is refused for, in which words, and that what is accepted survives a round trip."""
+"""Tests of configurations: reasons and messages of refusals, and the round trip of accepted ones."""
 
 from __future__ import annotations
 
@@ -103,7 +103,7 @@ def test_refused_in_one_line_with_key_value_and_what_is_allowed(
     assert "\n" not in text
 
 
-def test_a_refused_count_of_agents_is_said_once() -> None:
+def test_a_refused_number_of_agents_is_reported_once() -> None:
     assert len(refusals(None, "swarm.agents=0")) == 1
     assert len(refusals(None, "swarm.agents=1000")) == 1
 
@@ -119,7 +119,7 @@ def test_all_problems_at_once(tmp_path: Path) -> None:
         load(path)
 
 
-def test_a_crowd_of_close_starts_is_summed_up() -> None:
+def test_many_close_starts_are_summarised() -> None:
     problems = refusals(None, "swarm.agents=50", "start.spacing_m=0.01")
     assert len(problems) == 4
     assert "1222 more pairs" in problems[-1]
@@ -168,7 +168,7 @@ def test_two_agents_on_one_port(tmp_path: Path, url_a: str, url_b: str) -> None:
         ("serial:///dev/ttyUSB0:57600", "serial:///dev/ttyUSB1:57600"),
     ],
 )
-def test_links_of_their_own(tmp_path: Path, url_a: str, url_b: str) -> None:
+def test_different_links_are_accepted(tmp_path: Path, url_a: str, url_b: str) -> None:
     assert load(vehicles(tmp_path, url_a, url_b, a=7, b=9)).sysids() == (7, 9)
 
 
@@ -252,14 +252,14 @@ def test_a_hostile_file_is_refused_in_one_short_printable_line(tmp_path: Path, t
     assert str(caught.value).isprintable()
 
 
-def test_many_problems_are_not_all_told(tmp_path: Path) -> None:
+def test_the_number_of_reported_problems_is_bounded(tmp_path: Path) -> None:
     problems = refusals(file_with(tmp_path, "".join(f"key{i} = 1\n" for i in range(10_000))))
     assert len(problems) == 31
     assert problems[-1] == "and 9970 more problems"
 
 
 @pytest.mark.timeout(20)
-def test_what_is_no_file_is_refused_at_once(tmp_path: Path) -> None:
+def test_pipes_and_devices_are_refused_at_once(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "link").symlink_to("/dev/zero")
     with (tmp_path / "huge").open("wb") as file:
@@ -285,7 +285,7 @@ def test_start_line_is_centred_and_spaced() -> None:
     assert [s[1] for s in config.starts_ned_m()] == [-3.0, -1.0, 1.0, 3.0]
 
 
-def test_more_obstacles_or_farther_ones_than_agents_take_in_are_refused(tmp_path: Path) -> None:
+def test_obstacles_that_agents_would_refuse_are_refused(tmp_path: Path) -> None:
     ball = "[[obstacles]]\ncenter_ned_m = [1, 2, -3]\n"
     path = tmp_path / "run.toml"
     path.write_text(ball * MAX_OBSTACLES)

@@ -1,4 +1,4 @@
-"""What is read is a file of bounded size, and what is written never goes through somebody else's link."""
+"""Tests that only files of bounded size are read and that nothing is written through symbolic links."""
 
 from __future__ import annotations
 
@@ -72,6 +72,6 @@ def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> 
     assert [p.name for p in tmp_path.iterdir()] == ["summary.json"]
 
 
-def test_text_that_is_no_unicode_is_written_all_the_same(tmp_path: Path) -> None:
+def test_text_with_lone_surrogates_is_written(tmp_path: Path) -> None:
     replace_text(tmp_path / "a", "lone \ud800 surrogate")
     assert (tmp_path / "a").read_text() == "lone ? surrogate"

@@ -32,7 +32,7 @@ class MissionLink:
         self._wanted = 0  # items of the running upload; 0: none runs
         self._received: list[Item] = []
         self._partner = (0, 0)
-        self._heard_us = self._asked_us = 0
+        self._heard_us = self._requested_us = 0
 
     # --- upload ---
 
@@ -87,7 +87,7 @@ class MissionLink:
             return
         if now_us - self._heard_us >= TIMEOUT_US:
             self._wanted = 0
-        elif now_us - self._asked_us >= RETRY_US:
+        elif now_us - self._requested_us >= RETRY_US:
             self._request(now_us)
 
     def _give_up(self, why: MissionResult) -> None:
@@ -95,7 +95,7 @@ class MissionLink:
         self._acknowledge(why, self._kind)
 
     def _request(self, now_us: int) -> None:
-        self._asked_us = now_us
+        self._requested_us = now_us
         self._link.send(_REQUEST, len(self._received), *self._partner, self._kind)
 
     # --- download and the rest ---

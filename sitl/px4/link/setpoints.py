@@ -52,7 +52,14 @@ class OffboardStream:
         return math.inf if self._last_us is None else now_us - self._last_us
 
     def take(
-        self, type_mask: int, q_nb: Sequence[float], rates: Triple, thrust_01: float, now_us: int, *, flying: bool
+        self,
+        type_mask: int,
+        q_nb: Sequence[float],
+        rates: Triple,
+        thrust_01: float,
+        now_us: int,
+        *,
+        flying: bool,
     ) -> bool:
         """A setpoint addressed to this vehicle; True when it counts as a stream.
 

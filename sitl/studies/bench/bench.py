@@ -39,7 +39,7 @@ from sitl.studies.bench.formation import Formation, formation_config
 from sitl.studies.campaign.flight import config_of
 from sitl.studies.campaign.scenarios import layout_of
 from sitl.studies.campaign.trials import Cell
-from swarmctl.agent.telemetry_publisher import Took
+from swarmctl.agent.telemetry_publisher import TickTiming
 from swarmctl.config import Config
 from swarmctl.core.types import Array, Phase
 from swarmctl.errors import EXIT_OK, ConfigError, MissionError, exit_code_of
@@ -85,16 +85,16 @@ def measure_ticks(
     formations = {solver: Formation(formation_config(solver, neighbours, pillar)) for solver in solvers}
     for solver, formation in formations.items():
         _get_under_way(solver, formation.step, partial(_is_warm, formation))
-    took: dict[str, list[tuple[float, ...]]] = {solver: [] for solver in solvers}
+    timings: dict[str, list[tuple[float, ...]]] = {solver: [] for solver in solvers}
     with settled_garbage():
         for _ in range(ticks):
             for solver, formation in formations.items():
                 formation.step()
                 if not formation.planned:
                     raise MissionError(f"bench: {solver} with {neighbours} neighbours: a tick without a plan")
-                took[solver].append(_parts(formation.took))
+                timings[solver].append(_parts(formation.timing))
             on_tick()
-    return {solver: np.array(rows) for solver, rows in took.items()}
+    return {solver: np.array(rows) for solver, rows in timings.items()}
 
 
 def measure_commitments(
@@ -106,17 +106,17 @@ def measure_commitments(
     everybody is a whole agent here.
     """
     crowds = {solver: Lockstep(_swap_config(solver, neighbours + 1)) for solver in solvers}
-    took: dict[str, list[tuple[float, ...]]] = {solver: [] for solver in solvers}
+    timings: dict[str, list[tuple[float, ...]]] = {solver: [] for solver in solvers}
     for solver, crowd in crowds.items():
         _get_under_way(solver, crowd.step, partial(_tracks, crowd))
     with settled_garbage():
         for _ in range(0, ticks, neighbours + 1):
             for solver, crowd in crowds.items():
                 crowd.step()
-                took[solver] += [_parts(agent.took) for agent in crowd.agents if agent is not None]
+                timings[solver] += [_parts(agent.timing) for agent in crowd.agents if agent is not None]
             for _ in range(neighbours + 1):
                 on_tick()
-    return {solver: np.array(rows[:ticks]) for solver, rows in took.items()}
+    return {solver: np.array(rows[:ticks]) for solver, rows in timings.items()}
 
 
 def _swap_config(solver: str, agents: int) -> Config:
@@ -141,14 +141,14 @@ def _get_under_way(solver: str, step: Callable[[], None], ready: Callable[[], bo
     raise MissionError(f"bench: the agent with {solver} did not begin within {_READY_WITHIN_TICKS} ticks")
 
 
-def _parts(took: Took) -> tuple[float, ...]:
-    return (*astuple(took), took.tick_ms)
+def _parts(timing: TickTiming) -> tuple[float, ...]:
+    return (*astuple(timing), timing.tick_ms)
 
 
-def tick_rows(took: dict[str, Array], neighbours: int, suffix: str = "") -> list[BenchRow]:
+def tick_rows(timings: dict[str, Array], neighbours: int, suffix: str = "") -> list[BenchRow]:
     """Rows of one scenario."""
     rows = []
-    for solver, parts in took.items():
+    for solver, parts in timings.items():
         for name, column in zip(PARTS, parts.T, strict=True):
             rows.append(_row(name + suffix, solver, neighbours, times_of(column)))
     return rows

@@ -40,7 +40,7 @@ Mask = NDArray[np.bool_]
 _OBSTACLE = "obstacles=[{center_ned_m=[-5.0,-1.5,-1.8],radius_m=1.0,keep_out_m=1.75,visibility_m=3.0}]"
 _MISSION = "mission.duration_s=9.0"  # the obstacle is passed at about 7 s
 _WARM_UP = 20  # problems that are solved and not counted
-_SLOTS = 3  # two neighbours, one obstacle
+_MAX_KEEP_OUTS = 3  # two neighbours, one obstacle
 
 
 def circle_with_obstacle() -> Config:
@@ -84,7 +84,7 @@ class Recording:
         self._controller.reset()
 
 
-def capture(config: Config, keep_outs: int = _SLOTS, most: int = 240) -> Captured:
+def capture(config: Config, keep_outs: int = _MAX_KEEP_OUTS, most: int = 240) -> Captured:
     """Fly `config` in lockstep; keep at most `most` tracking problems with exactly `keep_outs` things to avoid.
 
     They are consecutive, agent after agent.
@@ -99,7 +99,7 @@ def capture(config: Config, keep_outs: int = _SLOTS, most: int = 240) -> Capture
 
     def on_step(_: Lockstep) -> None:
         for agent, recording, kept in zip(agents, recordings, found, strict=True):
-            kept += [(p, agent.took.tick_ms) for p in recording.problems if len(p.keep_outs) == keep_outs]
+            kept += [(p, agent.timing.tick_ms) for p in recording.problems if len(p.keep_outs) == keep_outs]
             recording.problems.clear()
 
     with settled_garbage():
@@ -123,9 +123,13 @@ class TappedMpc(SwarmMpc):
     """The controller of a flight with its x-y problem in sight: what it was asked last, and how long that took."""
 
     def __init__(
-        self, params: MpcParams, vehicle: VehicleModelParams, separation: SeparationParams, slots: int = _SLOTS
+        self,
+        params: MpcParams,
+        vehicle: VehicleModelParams,
+        separation: SeparationParams,
+        max_keep_outs: int = _MAX_KEEP_OUTS,
     ) -> None:
-        super().__init__(params, vehicle, separation, 0, slots, time.thread_time_ns)
+        super().__init__(params, vehicle, separation, 0, max_keep_outs, time.thread_time_ns)
         self._genuine = self._xy.solve
         self._xy.solve = self._watched  # type: ignore[method-assign]
         self.solve_ms = 0.0

@@ -17,7 +17,7 @@ import numpy as np
 from sitl.lockstep import obstacles_message, sitl_params
 from sitl.world import SitlWorld
 from swarmctl.agent.assembly import make_agent
-from swarmctl.agent.telemetry_publisher import Took
+from swarmctl.agent.telemetry_publisher import TickTiming
 from swarmctl.bus import topics
 from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.config import Config, load
@@ -156,9 +156,9 @@ class Formation:
         return -1.0 if record is None or not math.isfinite(record.mission_t_s) else record.mission_t_s
 
     @property
-    def took(self) -> Took:
+    def timing(self) -> TickTiming:
         """Parts of the newest tick."""
-        return self.agent.took
+        return self.agent.timing
 
     @property
     def record(self) -> TickRecord:
@@ -212,8 +212,8 @@ class Formation:
             separation_m=0.0,
             tick_p99_ms=0.0,
             ticks=0,
-            late_ticks=0,
-            path_age_ms=0.0,
+            deadline_misses=0,
+            plan_staleness_ms=0.0,
             solver_failed=0,
-            problem="",
+            active_alert="",
         )

@@ -54,7 +54,12 @@ class NonlinearXy:
     """
 
     def __init__(
-        self, axes: Sequence[Axis], horizon: Horizon, asked: AxesProblem, keep_outs: Sequence[KeepOut], z_ned_m: Array
+        self,
+        axes: Sequence[Axis],
+        horizon: Horizon,
+        asked: AxesProblem,
+        keep_outs: Sequence[KeepOut],
+        z_ned_m: Array,
     ) -> None:
         hp, self._hc = horizon.prediction, horizon.control
         count = len(axes)

@@ -16,8 +16,8 @@ class Noise:
 
 _WANDERING = (
     "agent.state_filter.enabled=true",  # the reported velocity is biased against the reported position
-    "agent.sequence.arrive_m=0.5",
-    "agent.sequence.arrive_m_s=0.4",
+    "agent.state_machine.arrive_m=0.5",
+    "agent.state_machine.arrive_m_s=0.4",
 )
 
 PROTECTIONS: dict[str, tuple[str, ...]] = {

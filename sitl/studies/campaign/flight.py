@@ -147,7 +147,7 @@ class Flight:
             "least_sum_m": least_sum_m(cell.agents, separation.radius_m) if layout.settles else None,
             "plans_failed": sum(int(np.isin(rows["plan_status"], _BAD_PLANS).sum()) for rows in charged),
             "commits_refused": self._commits_refused(),
-            "barrier_acted": sum(int(rows["safety_filter_acted"].sum()) for rows in charged),
+            "safety_filter_acted": sum(int(rows["safety_filter_acted"].sum()) for rows in charged),
             "simulated_s": self.lockstep.clock.now_us() * 1e-6,
         }
 

@@ -14,7 +14,7 @@ from swarmctl.files import replace_text
 from swarmctl.telemetry.report_style import STYLE
 
 REPORT = "report.html"
-_LISTED = 300
+_MAX_LISTED = 300
 _BAR_PX = 90
 _BAR_STYLE = """
 .share { width: 90px; height: 10px; display: inline-block; vertical-align: -1px; margin-right: 6px }
@@ -87,9 +87,10 @@ def _failures(rows: Sequence[Row]) -> str:
     failed = sorted((row for row in rows if not row["arrived"]), key=trial_of)
     if not failed:
         return "<h2>Runs that did not arrive</h2><p>None.</p>"
-    more = f"<p>and {len(failed) - _LISTED} more</p>" if len(failed) > _LISTED else ""
+    more = f"<p>and {len(failed) - _MAX_LISTED} more</p>" if len(failed) > _MAX_LISTED else ""
     lines = "".join(
-        f"<tr><td>{html.escape(row['outcome'])}</td><td>{html.escape(again(row))}</td></tr>" for row in failed[:_LISTED]
+        f"<tr><td>{html.escape(row['outcome'])}</td><td>{html.escape(again(row))}</td></tr>"
+        for row in failed[:_MAX_LISTED]
     )
     return (
         "<h2>Runs that did not arrive</h2><details class=card><summary>"
@@ -128,6 +129,6 @@ _COLUMNS: tuple[_Column, ...] = (
     ("over least sum", lambda s: _number(s.over_least, " x")),
     ("plans failed", lambda s: _number(s.plans_failed, digits=1) if s.plans_failed else ""),
     ("commits refused", lambda s: _number(s.commits_refused, digits=1) if s.commits_refused else ""),
-    ("barrier acted", lambda s: _number(s.barrier_acted, digits=1) if s.barrier_acted else ""),
+    ("barrier acted", lambda s: _number(s.safety_filter_acted, digits=1) if s.safety_filter_acted else ""),
     ("CPU a run", lambda s: _number(s.cpu_s, " s", 1)),
 )

@@ -16,7 +16,7 @@ from swarmctl.files import read_file, replaced
 
 ROWS = "rows.parquet"
 _SAVE_EVERY_S = 1.0
-_MOST_BYTES = 2**31
+_MAX_BYTES = 2**31
 
 
 class Store:
@@ -80,7 +80,7 @@ class Store:
 
 def _read(path: Path) -> list[Row]:
     try:
-        table = pq.read_table(pa.BufferReader(read_file(path, _MOST_BYTES)))
+        table = pq.read_table(pa.BufferReader(read_file(path, _MAX_BYTES)))
     except (OSError, pa.ArrowException) as error:
         raise ConfigError(str(path), [f"can't be read ({error}); give another --out"]) from error
     if table.schema.names != SCHEMA.names:

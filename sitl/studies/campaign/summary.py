@@ -44,7 +44,7 @@ class CellSummary:
     over_least: float | None  # largest sum of distances over the least
     plans_failed: float  # mean per run
     commits_refused: float
-    barrier_acted: float
+    safety_filter_acted: float
     cpu_s: float
 
 
@@ -73,7 +73,7 @@ def _summary(cell: Cell, rows: Sequence[Row]) -> CellSummary:
         max(sums, default=None),
         fmean(row["plans_failed"] for row in rows),
         fmean(row["commits_refused"] or 0 for row in rows),
-        fmean(row["barrier_acted"] for row in rows),
+        fmean(row["safety_filter_acted"] for row in rows),
         fmean(row["cpu_s"] for row in rows),
     )
 

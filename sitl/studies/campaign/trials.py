@@ -59,7 +59,7 @@ SCHEMA = pa.schema(
         pa.field("least_sum_m", pa.float64()),  # the least that sum can be (same goal)
         pa.field("plans_failed", pa.int64()),  # ticks of all agents without a certified plan
         pa.field("commits_refused", pa.int64()),  # plans of all agents not flown after others were heard
-        pa.field("barrier_acted", pa.int64()),  # ticks of all agents in which the safety filter changed the input
+        pa.field("safety_filter_acted", pa.int64()),  # ticks of all agents in which the safety filter changed the input
         pa.field("simulated_s", pa.float64()),
         pa.field("cpu_s", pa.float64()),  # processor time, the only column that is not a function of the trial
         pa.field("code", pa.string()),  # of the sources that flew it

@@ -22,9 +22,9 @@ from swarmctl.config import Config
 from swarmctl.control.collision.separation import KeepOut, keep_out_of_obstacle, keep_out_of_peer, visible
 from swarmctl.control.controller import make_controller
 from swarmctl.control.estimation.disturbance import DisturbanceObserver
-from swarmctl.control.fallback import rest_plan
+from swarmctl.control.fallback import brake_and_hold_plan
 from swarmctl.control.model import Predictor
-from swarmctl.control.mpc.plan_buffer import Replay
+from swarmctl.control.mpc.plan_buffer import PlanBuffer
 from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.control.reference.mission import MissionReference
 from swarmctl.control.setpoint import setpoint_of
@@ -49,9 +49,9 @@ class Pilot:
 
     def __init__(self, config: Config, agent: int) -> None:
         self._config, self._agent = config, agent
-        slots = min(config.swarm.agents - 1, config.separation.max_neighbours) + len(config.obstacles)
+        max_keep_outs = min(config.swarm.agents - 1, config.separation.max_neighbours) + len(config.obstacles)
         self._controller = make_controller(
-            config.controller, config.vehicle_model, config.separation, agent, slots, time.perf_counter_ns
+            config.controller, config.vehicle_model, config.separation, agent, max_keep_outs, time.perf_counter_ns
         )
         self._dt_us, self._steps = self._controller.dt_us, self._controller.steps
         self._predictor = Predictor(config.vehicle_model)
@@ -59,10 +59,10 @@ class Pilot:
         self._observer = DisturbanceObserver(config.agent.disturbance, hover_01)
         starts = np.array(config.starts_ned_m())
         self._reference = MissionReference(config.mission, starts, agent, config.separation.planned_m)
-        self._virtual = np.array([0.0, 0.0, GRAVITY_M_S2])
+        self._virtual_control = np.array([0.0, 0.0, GRAVITY_M_S2])
         self._thrust_01 = hover_01
         brake_m_s2 = config.separation.brake_m_s2
-        self._replay = Replay(agent, self._dt_us, self._steps, brake_m_s2)
+        self._plan_buffer = PlanBuffer(agent, self._dt_us, self._steps, brake_m_s2)
         self._replay_us = round(config.agent.failsafe.replay_s * 1e6)
         self._obstacles = tuple(o.obstacle() for o in obstacles_message(config).obstacles)
         self.path: PredictedPath | None = None
@@ -76,7 +76,7 @@ class Pilot:
     def prime(self, state: VehicleState) -> None:
         """Plan to stay and share it, as an agent that waits for the mission does: errors then begin from zero."""
         act_us = state.t_us + self._predictor.delay_us
-        start = Start(act_us - self._dt_us, state.pos_ned_m, state.vel_ned_m_s, 1.0, self._virtual)
+        start = Start(act_us - self._dt_us, state.pos_ned_m, state.vel_ned_m_s, 1.0, self._virtual_control)
         points, yaw_rad = self._controller.longest + 1, self._config.mission.yaw_rad
         stay = Reference(np.tile(state.pos_ned_m, (points, 1)), np.zeros((points, 3)), yaw_rad)
         plan = self._controller.plan(Problem(start, stay, np.zeros(3), (), None))
@@ -86,7 +86,7 @@ class Pilot:
         """The setpoint of this step; `path` is what peers may know of it."""
         now_us, estimate = state.t_us, self._observer.estimate
         act_us = now_us + self._predictor.delay_us
-        start = self._predictor.start(state, act_us, estimate.disturbance_ned_m_s2, self._virtual)
+        start = self._predictor.start(state, act_us, estimate.disturbance_ned_m_s2, self._virtual_control)
         keep_outs = self._keep_outs(state.pos_ned_m, act_us, peers)
         plan = self._controller.plan(
             Problem(
@@ -94,16 +94,18 @@ class Pilot:
                 self._horizon(act_us),
                 estimate.disturbance_ned_m_s2,
                 keep_outs,
-                self._replay.guess_ned_m(act_us),
+                self._plan_buffer.guess_ned_m(act_us),
             )
         )
         self.terminal_missed += plan.terminal_gap_m > _TERMINAL_MET_M
         flown = self._flown(plan, start, keep_outs)
         self.path = self._path(flown)
-        self._virtual = flown.virtual[min((act_us - flown.t0_us) // self._dt_us, len(flown.virtual) - 1)]
-        self._predictor.sent(now_us, self._virtual)
+        self._virtual_control = flown.virtual_control[
+            min((act_us - flown.t0_us) // self._dt_us, len(flown.virtual_control) - 1)
+        ]
+        self._predictor.sent(now_us, self._virtual_control)
         setpoint = setpoint_of(
-            self._virtual,
+            self._virtual_control,
             self._config.mission.yaw_rad,
             estimate.hover_thrust_01,
             now_us,
@@ -128,13 +130,13 @@ class Pilot:
 
     def _flown(self, plan: Plan, start: Start, keep_outs: tuple[KeepOut, ...]) -> Plan:
         disturbance = self._observer.estimate.disturbance_ned_m_s2
-        rest = partial(rest_plan, start, None, disturbance, None, self._dt_us, self._steps)
-        self._replay.take(plan, start, keep_outs, rest)
+        stop = partial(brake_and_hold_plan, start, None, disturbance, None, self._dt_us, self._steps)
+        self._plan_buffer.take(plan, start, keep_outs, stop)
         if plan.status is PlanStatus.OK:
             return plan
         self.failed += 1
-        good = self._replay.plan
-        return rest() if good is None or start.t_us - good.t0_us > self._replay_us else good
+        good = self._plan_buffer.plan
+        return stop() if good is None or start.t_us - good.t0_us > self._replay_us else good
 
     def _path(self, plan: Plan) -> PredictedPath:
         return PredictedPath(self._agent, 1, 1, plan.t0_us, plan.dt_us, 0.0, plan.pos_ned_m)

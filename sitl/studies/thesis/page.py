@@ -58,7 +58,10 @@ _ERRATA = (
 
 
 def write_page(
-    directory: Path, rows: Sequence[Row], traces: Mapping[str, Sequence[Trace]], extra: Extra | None = None
+    directory: Path,
+    rows: Sequence[Row],
+    traces: Mapping[str, Sequence[Trace]],
+    extra: Extra | None = None,
 ) -> Path:
     """Write the page; flights without traces leave their figures out.
 

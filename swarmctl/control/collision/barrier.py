@@ -140,23 +140,28 @@ class Barrier:
         self._responses = _responses(lag, vehicle.drag_1_s, self.ahead_s)
 
     def filtered(
-        self, virtual: Array, start: Start, disturbance_ned_m_s2: Array, hover_thrust_01: float, bodies: Sequence[Body]
+        self,
+        virtual_control: Array,
+        start: Start,
+        disturbance_ned_m_s2: Array,
+        hover_thrust_01: float,
+        bodies: Sequence[Body],
     ) -> Array | None:
-        """Return the virtual controls (3,) to fly in place of `virtual`; None when those are safe.
+        """Return the virtual_control controls (3,) to fly in place of `virtual_control`; None when those are safe.
 
         Args:
-            virtual: (3,) wanted u_x, u_y and thrust over mass [m/s2].
+            virtual_control: (3,) wanted u_x, u_y and thrust over mass [m/s2].
             start: own state when they act.
             disturbance_ned_m_s2: (3,) estimate.
             hover_thrust_01: scales the bounds of thrust.
             bodies: predicted bodies when the command takes effect.
         """
-        if not bodies or not np.isfinite(virtual).all():
+        if not bodies or not np.isfinite(virtual_control).all():
             return None
         pos, vel = self._predicted_state(start, disturbance_ned_m_s2)
-        ux, uy, thrust = virtual.tolist()
-        upright = math.sqrt(max(0.0, 1.0 - ux * ux - uy * uy))
-        wanted = (thrust * ux, thrust * uy, thrust * upright)  # thrust vector over mass, up positive
+        ux, uy, thrust = virtual_control.tolist()
+        cos_tilt = math.sqrt(max(0.0, 1.0 - ux * ux - uy * uy))
+        wanted = (thrust * ux, thrust * uy, thrust * cos_tilt)  # thrust vector over mass, up positive
         dx, dy, dz = disturbance_ned_m_s2.tolist()
         drag = self._vehicle.drag_1_s
         # acceleration without thrust
@@ -165,7 +170,9 @@ class Barrier:
         if all(_dot(normal, wanted) >= offset for normal, offset in rows):
             return None
         rows.sort(key=lambda row: _dot(row[0], wanted) - row[1])  # most violated rows first: fewer become active after
-        slew_bounds = [self._slew_bounds(u, held) for u, held in zip((ux, uy), start.virtual.tolist(), strict=False)]
+        slew_bounds = [
+            self._slew_bounds(u, held) for u, held in zip((ux, uy), start.virtual_control.tolist(), strict=False)
+        ]
         bounds = self._bounds(wanted, thrust, slew_bounds, hover_thrust_01)
         thrust_vector = project_or_violate_least(wanted, rows, bounds, _SLACK_WEIGHT)
         size = math.sqrt(_dot(thrust_vector, thrust_vector))
@@ -179,7 +186,7 @@ class Barrier:
         pos, vel = start.pos_ned_m.tolist(), start.vel_ned_m_s.tolist()
         if not self.ahead_s:
             return tuple(pos), tuple(vel)
-        r, held, d = self._responses, start.virtual.tolist(), disturbance_ned_m_s2.tolist()
+        r, held, d = self._responses, start.virtual_control.tolist(), disturbance_ned_m_s2.tolist()
         pushed = [[0.0, 0.0], [0.0, 0.0], [0.0, 0.0]]
         for i in (0, 1):
             tilt, rate = float(start.tilt[i]), float(start.tilt_rate_1_s[i])
@@ -231,7 +238,11 @@ class Barrier:
         return min(wanted, max(-most, held - self._slew)), max(wanted, min(most, held + self._slew))
 
     def _bounds(
-        self, wanted: Vector, thrust_m_s2: float, slew_bounds: Sequence[tuple[float, float]], hover_thrust_01: float
+        self,
+        wanted: Vector,
+        thrust_m_s2: float,
+        slew_bounds: Sequence[tuple[float, float]],
+        hover_thrust_01: float,
     ) -> list[Row]:
         """Return rows of the bounds of the airframe: u_x, u_y and vertical thrust."""
         model, full = self._vehicle, GRAVITY_M_S2 / hover_thrust_01

@@ -188,7 +188,7 @@ def half_spaces(
     """Linearise distance constraints for steps 1..Hp, in the plane or in space; None without keep-outs.
 
     Args:
-        keep_outs: at most as many as the problem has slots.
+        keep_outs: at most as many as `max_keep_outs` of the problem.
         guess_ned_m: (Hp+1, 3) own previous prediction at the same times.
         goal_m: (2,) or (3,) end of the reference: defines head-on, and the number of axes.
         vel_m_s: (2,) or (3,) own velocity at the first point.
@@ -202,13 +202,13 @@ def half_spaces(
     if not keep_outs:
         return None
     axes = len(goal_m)
-    others = np.stack([k.pos_ned_m for k in keep_outs])[:, 1:]  # (slots, Hp, 3)
+    others = np.stack([k.pos_ned_m for k in keep_outs])[:, 1:]  # (keep-outs, Hp, 3)
     radius = np.array([k.radius_m for k in keep_outs])
-    apart = guess_ned_m[1:] - others  # (slots, Hp, 3)
+    apart = guess_ned_m[1:] - others  # (keep-outs, Hp, 3)
     vertical_01 = np.array([k.vertical_01 for k in keep_outs])[:, None]
     apart[:, :, 2] *= vertical_01
     below_m = apart[:, :, 2] if axes == 2 else np.zeros(apart.shape[:2])
-    needed = np.sqrt(np.maximum(radius[:, None] ** 2 - below_m**2, 0.0))  # (slots, Hp)
+    needed = np.sqrt(np.maximum(radius[:, None] ** 2 - below_m**2, 0.0))  # (keep-outs, Hp)
     apart, others = apart[:, :, :axes], others[:, :, :axes]
     distance = np.sqrt(np.einsum("skc,skc->sk", apart, apart))
     side = np.zeros((len(keep_outs), 1, axes))
@@ -217,7 +217,9 @@ def half_spaces(
     moved = math.dist(guess_ned_m[-1, :axes], guess_ned_m[0, :axes])
     stuck = min(1.0, max(0.0, 2.0 - moved / params.stuck_m))
     to_goal = goal_m - guess_ned_m[1:, :axes]  # (Hp, axes)
-    across = to_goal[:, 0] * normal[:, :, 1] - to_goal[:, 1] * normal[:, :, 0]  # (slots, Hp), > 0: keep-out on the left
+    across = (
+        to_goal[:, 0] * normal[:, :, 1] - to_goal[:, 1] * normal[:, :, 0]
+    )  # (max_keep_outs, Hp), > 0: keep-out on the left
     angle_rad = np.full(distance.shape, params.right_of_way_rad * stuck)
     is_obstacle = np.array([k.priority_id < 0 for k in keep_outs])
     angle_rad[is_obstacle] = params.right_of_way_obstacle_rad * np.where(across[is_obstacle] > 0.0, -1.0, 1.0)
@@ -226,7 +228,7 @@ def half_spaces(
         normal[:, :, 2] *= vertical_01  # back from scaled to true heights
     offset = np.einsum("skc,skc->sk", normal, others) + needed
     idle = (needed <= 0.0) | (distance > needed + params.gate_m)
-    ends = (others[:, -1] - others[:, -2]) / dt_s  # (slots, axes) velocity of each keep-out at the end
+    ends = (others[:, -1] - others[:, -2]) / dt_s  # (max_keep_outs, axes) velocity of each keep-out at the end
     closing = -np.einsum("sc,sc->s", normal[:, -1], vel_m_s - ends)
     stop_s = np.maximum(closing, 0.0) / (2.0 * params.stop_m_s2)
     squeezed = np.array([k.downwash > 1.0 and not k.any_height for k in keep_outs])
@@ -239,8 +241,8 @@ def _with_right_of_way(normal: Array, distance: Array, needed: Array, to_goal: A
     """Return normals (slots, Hp, axes), turned where they point against the goal, so that head-on agents pass.
 
     Peers follow one right-of-way rule: each turns normals clockwise seen from above (as NED yaw), so that two that meet
-    head-on both give way to the left. Obstacles are passed on the side the agent is on. `angle_rad` (slots, Hp) is the
-    largest turn: full for obstacles, for peers only when the own plan is stuck, because turned normals would also keep
+    head-on both give way to the left. Obstacles are passed on the side the agent is on. `angle_rad` (max_keep_outs, Hp)
+    is the largest turn: full for obstacles, for peers only when the own plan is stuck, because turned normals would also keep
     a swarm that shares one goal from closing in evenly.
     """
     span = np.sqrt(np.einsum("kc,kc->k", to_goal, to_goal))  # (Hp,)
@@ -255,7 +257,10 @@ def _with_right_of_way(normal: Array, distance: Array, needed: Array, to_goal: A
 
 
 def certify(
-    path_ned_m: Array, keep_outs: Sequence[KeepOut], from_step: int, approach_m: float = _APPROACH_TOLERANCE_M
+    path_ned_m: Array,
+    keep_outs: Sequence[KeepOut],
+    from_step: int,
+    approach_m: float = _APPROACH_TOLERANCE_M,
 ) -> float:
     """Return the smallest margin [m] of a path to all keep-outs, over true distances between samples too.
 

@@ -78,7 +78,7 @@ class Commitments:
     """Applies rules 2 to 4 for one agent; `swarmctl.agent.coordination` receives and publishes the messages.
 
     Args:
-        agent, params, mpc, separation, slots, stopwatch_ns: see `TrajectoryPlanner`.
+        agent, params, mpc, separation, max_keep_outs, stopwatch_ns: see `TrajectoryPlanner`.
     """
 
     def __init__(
@@ -87,11 +87,11 @@ class Commitments:
         params: CommitParams,
         mpc: MpcParams,
         separation: SeparationParams,
-        slots: int,
+        max_keep_outs: int,
         stopwatch_ns: Callable[[], int],
     ) -> None:
         self._agent, self._params = agent, params
-        self._planner = TrajectoryPlanner(agent, params, mpc, separation, slots, stopwatch_ns)
+        self._planner = TrajectoryPlanner(agent, params, mpc, separation, max_keep_outs, stopwatch_ns)
         self._latencies_s: deque[float] = deque(maxlen=_LATENCIES)
         self._lead_s = params.lead_min_s
         self._number, self._next_us = 0, 0

@@ -16,7 +16,7 @@ from swarmctl.control.collision.separation import KeepOut, SeparationParams, cer
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.control.mpc.swarm_mpc import AxisWeights, MpcParams, SwarmMpc
-from swarmctl.control.reference.mission import brake_to_rest, glide_to
+from swarmctl.control.reference.mission import brake_to_rest, quintic_to
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.params import Params
 from swarmctl.core.trajectory import Trajectory, ending_at_rest, joined, positions_at, stopping
@@ -40,7 +40,7 @@ class CommitParams(Params):
     horizon: int = Field(20, ge=5, le=60)  # steps before the final braking
     moves: int = Field(8, ge=2, le=40)
     brake_m_s2: float = Field(1.5, ge=0.5, le=10)  # deceleration of the final braking
-    share_01: float = Field(
+    tilt_fraction_01: float = Field(
         0.8, gt=0, le=1
     )  # share of the controller's tilt that plans may use; the rest is for tracking
     period_s: float = Field(0.1, ge=0, le=2)  # least time between two plans
@@ -91,7 +91,7 @@ class TrajectoryPlanner:
         params: parameters of planning.
         mpc: the controller's bounds and weights.
         separation: distances to keep.
-        slots: number of neighbours and obstacles that get rows in the MPC.
+        max_keep_outs: number of neighbours and obstacles that get rows in the MPC.
         stopwatch_ns: see `CondensedMpc`.
     """
 
@@ -101,7 +101,7 @@ class TrajectoryPlanner:
         params: CommitParams,
         mpc: MpcParams,
         separation: SeparationParams,
-        slots: int,
+        max_keep_outs: int,
         stopwatch_ns: Callable[[], int],
     ) -> None:
         self._params, self._separation = params, separation
@@ -109,7 +109,7 @@ class TrajectoryPlanner:
             update={"right_of_way_rad": params.right_of_way_rad, "stuck_m": params.stuck_m}
         )
         self._mpc = SwarmMpc(
-            _planning(mpc, params), VehicleModelParams(delay_s=0.0), right_of_way, agent, slots, stopwatch_ns
+            _planning(mpc, params), VehicleModelParams(delay_s=0.0), right_of_way, agent, max_keep_outs, stopwatch_ns
         )
         self.dt_us = round(params.dt_s * 1e6)
         self.steps = self._mpc.steps + math.ceil(
@@ -171,9 +171,11 @@ class TrajectoryPlanner:
         """Return the committed trajectory, left at `begin_us` for a climb by `height_m` over where it would stop."""
         pos, vel = (found[0] for found in committed.sample(np.array([begin_us])))
         above = brake_to_rest(pos, vel, self._params.brake_m_s2).to_ned_m - [0.0, 0.0, height_m]
-        glide = glide_to(pos, vel, above, _CLIMB_M_S, _CLIMB_M_S2)
-        ahead_s = self._params.dt_s * np.arange(math.ceil(glide.travel_s / self._params.dt_s) + 1, dtype=np.float64)
-        return ending_at_rest(begin_us, self.dt_us, *glide.sample(ahead_s), self._params.brake_m_s2)
+        trajectory = quintic_to(pos, vel, above, _CLIMB_M_S, _CLIMB_M_S2)
+        ahead_s = self._params.dt_s * np.arange(
+            math.ceil(trajectory.travel_s / self._params.dt_s) + 1, dtype=np.float64
+        )
+        return ending_at_rest(begin_us, self.dt_us, *trajectory.sample(ahead_s), self._params.brake_m_s2)
 
     def _planned(self, committed: Trajectory, now: Situation) -> Plan | None:
         steps = self._mpc.steps
@@ -288,7 +290,7 @@ def _planning(mpc: MpcParams, params: CommitParams) -> MpcParams:
             "horizon_z": params.horizon,
             "control_xy": params.moves,
             "horizon_xy": params.horizon,
-            "u_max": params.share_01 * mpc.u_max,
+            "u_max": params.tilt_fraction_01 * mpc.u_max,
             "thrust_min_m_s2": max(mpc.thrust_min_m_s2, 0.7 * GRAVITY_M_S2),
             "thrust_max_m_s2": min(mpc.thrust_max_m_s2, 1.3 * GRAVITY_M_S2),
             "terminal_z": "none",

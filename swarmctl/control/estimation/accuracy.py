@@ -1,7 +1,7 @@
-"""Whether an estimator's claimed accuracy may be judged: while a filter settles, its claim means nothing.
+"""Waits until an estimator's reported accuracy is meaningful: while a filter settles, its figure is not.
 
-PX4 claims 14 m one second after boot, 0.01 m at two, and rises to 0.29 m by nine seconds, where it stays (measured,
-simulated GPS). What is judged is the worst claim of a window in which it has hardly changed.
+PX4 reports 14 m one second after boot, 0.01 m at two, and rises to 0.29 m by nine seconds, where it stays (measured,
+simulated GPS). The accuracy used is the largest figure of a window in which it has hardly changed.
 """
 
 from __future__ import annotations
@@ -9,20 +9,20 @@ from __future__ import annotations
 from collections import deque
 
 _WINDOW_US = 4_000_000
-_CHANGE_01 = 0.25  # of the claims of one window; a change of satellites alone is less
-_CHANGE_M = 0.02
-_UNTOLD_US = 3_000_000  # a vehicle that tells it at all has told it by then
+_SETTLED_CHANGE_01 = 0.25  # largest relative change within a window; a change of satellites alone is less
+_SETTLED_CHANGE_M = 0.02
+_NO_CLAIM_TIMEOUT_US = 3_000_000  # a vehicle that reports its accuracy at all has done so by then
 
 
 class AccuracyMonitor:
-    """Takes in what a vehicle claims about its horizontal position, 1-sigma [m]; times are monotonic."""
+    """Monitors the reported accuracy of the horizontal position, 1-sigma [m]; times are monotonic."""
 
     def __init__(self) -> None:
         self._claims: deque[tuple[int, float]] = deque()
         self._since_us: int | None = None
 
     def update(self, now_us: int, claim_m: float | None) -> None:
-        """Take in the newest claim, None while there is none."""
+        """Update with the newest reported accuracy [m], None while there is none."""
         self._since_us = now_us if self._since_us is None else self._since_us
         if claim_m is None:
             self._claims.clear()
@@ -35,15 +35,15 @@ class AccuracyMonitor:
 
     @property
     def worst_m(self) -> float | None:
-        """Largest claim of the window; None while the vehicle tells none."""
+        """Largest accuracy figure of the window [m]; None while the vehicle reports none."""
         return max((claim for _, claim in self._claims), default=None)
 
     def unsettled(self, now_us: int) -> str:
-        """Why it can't be judged yet, or ""."""
+        """Return what has to happen before the accuracy can be used, or ""."""
         waited_us = 0 if self._since_us is None else now_us - self._since_us
         if not self._claims:
-            return "" if waited_us >= _UNTOLD_US else "the estimator to tell its accuracy"
+            return "" if waited_us >= _NO_CLAIM_TIMEOUT_US else "the estimator to tell its accuracy"
         claims_m = [claim for _, claim in self._claims]
-        if waited_us < _WINDOW_US or max(claims_m) > min(claims_m) * (1.0 + _CHANGE_01) + _CHANGE_M:
+        if waited_us < _WINDOW_US or max(claims_m) > min(claims_m) * (1.0 + _SETTLED_CHANGE_01) + _SETTLED_CHANGE_M:
             return f"the estimator's accuracy to settle (now {claims_m[-1]:.2f} m)"
         return ""

@@ -1,8 +1,8 @@
-"""Offset-free flight: estimates of the hover thrust and of a constant disturbance acceleration.
+"""Estimates of the hover thrust and of a constant disturbance acceleration, for offset-free tracking.
 
-The observer compares measured velocity with the velocity that the *measured* attitude and the sent thrust explain, so
-attitude lag does not look like wind. What is left vertically is slowly moved into the hover thrust: a wrong mass or
-thrust scale then costs no altitude, and horizontal gains (thrust over mass) become right as well.
+The observer compares the measured velocity with the one predicted from the *measured* attitude and the sent thrust, so
+that attitude lag is not taken for wind. The vertical disturbance is slowly moved into the hover thrust: a wrong mass or
+thrust scale then causes no altitude error, and horizontal gains (thrust over mass) become right as well.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from swarmctl.core.types import Array, VehicleState
 
 
 class DisturbanceParams(Params):
-    """Bandwidths of the estimators."""
+    """Bandwidths and limits of the estimators."""
 
     enabled: bool = True
     bandwidth_rad_s: float = Field(2.0, gt=0, le=50)
@@ -28,28 +28,38 @@ class DisturbanceParams(Params):
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """What is known beyond the nominal model."""
+    """Estimated deviations from the nominal model."""
 
     disturbance_ned_m_s2: Array  # (3,)
     hover_thrust_01: float
 
 
 class HoverThrust:
-    """Estimate of the thrust setpoint that carries the weight; a wrong mass or battery then costs no altitude."""
+    """Estimates the thrust setpoint (0..1) that carries the weight, within 0.4 to 2.2 of the first guess.
+
+    Args:
+        hover_thrust_01: first guess.
+        time_s: time constant.
+    """
 
     def __init__(self, hover_thrust_01: float, time_s: float) -> None:
         self.value_01, self._time_s = hover_thrust_01, time_s
         self._least, self._most = 0.4 * hover_thrust_01, min(0.95, 2.2 * hover_thrust_01)
 
     def learn(self, thrust_01: float) -> None:
-        """Take over the vertical thrust the autopilot itself hovers with, before the bridge flies."""
+        """Move the estimate towards the thrust with which the autopilot itself hovers, before the bridge flies."""
         self.value_01 += 0.2 * (min(self._most, max(self._least, thrust_01)) - self.value_01)
 
     def explain(self, down_m_s2: float, thrust_01: float, dt_s: float) -> float:
-        """Move a share of a vertical remainder into the hover thrust: thrust g / hover must grow by `-down_m_s2`.
+        """Move a fraction of the vertical disturbance into the hover thrust; thrust g / hover must grow by -down_m_s2.
+
+        Args:
+            down_m_s2: estimated vertical disturbance, down positive.
+            thrust_01: thrust setpoint that acted.
+            dt_s: time since the last call.
 
         Returns:
-            what has moved [m/s2]; to be taken off the remainder.
+            the acceleration moved [m/s2], to be subtracted from the disturbance.
         """
         share = dt_s / self._time_s
         specific = max(1.0, thrust_01 * GRAVITY_M_S2 / self.value_01)
@@ -61,7 +71,7 @@ class HoverThrust:
 
 
 class DisturbanceObserver:
-    """Second-order observer on velocity, per axis, and an integrating hover-thrust estimate.
+    """Second-order observer of the disturbance on each velocity axis, with an integrating hover-thrust estimate.
 
     v' = a_model + d + l1 (v - v_hat), d' = l2 (v - v_hat) with both poles at `bandwidth_rad_s`.
     """
@@ -78,12 +88,12 @@ class DisturbanceObserver:
         return Estimate(self._disturbance, self._hover.value_01)
 
     def reset(self) -> None:
-        """Forget velocity and disturbance (not the hover thrust): the vehicle was flown by somebody else."""
+        """Forget velocity and disturbance, not the hover thrust, after the vehicle was flown by its autopilot."""
         self._velocity = None
         self._disturbance = np.zeros(3)
 
     def update(self, state: VehicleState, thrust_01: float | None) -> Estimate:
-        """Take in one new sample; `thrust_01` is what has acted since the last one, None when nobody knows."""
+        """Update with one new sample; `thrust_01` has acted since the last one, None if it is unknown."""
         if not self._params.enabled or thrust_01 is None:
             return self.estimate
         if self._velocity is None or not 0 < state.t_us - self._t_us < 200_000:
@@ -106,10 +116,10 @@ class DisturbanceObserver:
         return self.estimate
 
     def learn_hover(self, thrust_01: float) -> None:
-        """See `HoverThrust.learn`."""
+        """Move the hover thrust towards the autopilot's own, see `HoverThrust.learn`."""
         if self._params.enabled:
             self._hover.learn(thrust_01)
 
     def state(self, reported: VehicleState) -> VehicleState:
-        """The state to plan from: as reported."""
+        """Return the state to plan from, here the reported one."""
         return reported

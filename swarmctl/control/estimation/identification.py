@@ -1,8 +1,8 @@
-"""What a recorded flight says of its vehicle: dead time, attitude lag, drag and hover thrust, with intervals.
+"""Identifies dead time, attitude lag, drag and hover thrust of a vehicle from a recorded flight, with intervals.
 
-Attitude: the tilt that follows the setpoints sent, by dead time and `swarmctl.control.lag`, is fitted to the tilt
-measured, both axes with one set of parameters. Translation: the equation of motion is integrated against smooth
-windows, so that positions need not be differentiated and the reported velocity, which is biased, is not used:
+Attitude: the response of dead time and `swarmctl.control.lag` to the setpoints sent is fitted to the measured tilt,
+both axes with one set of parameters. Translation: the equation of motion is integrated against smooth windows, so that
+positions need not be differentiated and the reported velocity, which is biased, is not used:
 
     p'' = -k g u d + drag (wind - v) + g   gives   int w'' p = -k int w g u d + drag (wind int w + int w' p) + g int w
 
@@ -26,19 +26,19 @@ from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.types import Array, Phase
 
 _GRID_S = 0.004
-_SETTLE_S = 1.0  # at the beginning, while the fitted lag forgets where it began
-_GAP_S = 0.1  # without a setpoint for longer, somebody else flew
-_LEAST_S = 10.0
-_LEAST_TILT = 0.03  # rms; of less the estimator's own errors are a large part
+_SETTLE_S = 1.0  # initial time left out, in which the initial state of the fitted lag decays
+_GAP_S = 0.1  # longest time between setpoints; after a longer one the autopilot flew
+_MIN_DURATION_S = 10.0
+_MIN_TILT_RMS = 0.03  # below, the estimator's own errors are a large part of the tilt
 _BLOCK_S = 2.0  # residuals farther apart are taken to be independent
 _WINDOW_S = 1.5
 _THRUST_DELAYS_S = np.arange(0.0, 0.21, 0.01)
 _CONFIDENCE = 0.95
 _ITERATIONS = 30
-_FIRST = (0.06, 10.0, 1.0)  # delay, natural frequency, damping
-_LEAST = (0.0, 1.0, 0.3)
-_MOST = (0.5, 60.0, 3.0)
-_MISFIT_01 = 0.3  # of the tilt's own rms: an attitude that follows otherwise is not described by these figures
+_INITIAL_PARAMETERS = (0.06, 10.0, 1.0)  # delay, natural frequency, damping
+_LOWER_BOUNDS = (0.0, 1.0, 0.3)
+_UPPER_BOUNDS = (0.5, 60.0, 3.0)
+_MAX_MISFIT_01 = 0.3  # rms residual over rms tilt; above it a second-order lag does not describe the vehicle
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,7 +55,7 @@ class Figure:
 
 @dataclass(frozen=True, slots=True)
 class Identified:
-    """One vehicle, as its flight showed it."""
+    """Identified parameters of one vehicle."""
 
     delay_s: Figure
     attitude_rad_s: Figure
@@ -64,25 +64,29 @@ class Identified:
     hover_thrust_01: Figure
 
     def model(self, before: VehicleModelParams) -> VehicleModelParams:
-        """The vehicle's parameters with these figures; bounds stay as configured."""
+        """Return `before` with these values; its bounds stay."""
         figures = {name: float(f"{getattr(self, name).value:.3g}") for name in self.__slots__}
         return VehicleModelParams.model_validate({**before.model_dump(), **figures})
 
 
 @dataclass(frozen=True, slots=True)
-class Flown:
-    """What was sent and what was measured, each at its own times [s] from a common zero."""
+class FlightSegment:
+    """Setpoints sent and states measured, each at its own times [s] from a common zero."""
 
     sent_s: Array  # (T,)
-    sent_down: Array  # (T, 2) horizontal part of the body's down axis asked for
+    sent_down: Array  # (T, 2) horizontal part of the commanded body down axis
     sent_thrust_01: Array  # (T,)
     seen_s: Array  # (S,)
     seen_down: Array  # (S, 3) body down axis, NED
     seen_pos_ned_m: Array  # (S, 3)
 
 
-def flown(ticks: NDArray[np.void]) -> Flown | str:
-    """The longest part of a flight (`TICK_DTYPE`) that setpoints flew without a gap; or why there is none."""
+def longest_segment(ticks: NDArray[np.void]) -> FlightSegment | str:
+    """Return the longest part of a flight that was flown by setpoints without a gap, or why there is none.
+
+    Args:
+        ticks: (T,) rows of `TICK_DTYPE`.
+    """
     ours = (ticks["phase"] >= Phase.GOTO_START) & (ticks["phase"] <= Phase.GOTO_LAND)
     ours &= np.isfinite(ticks["setpoint_thrust_01"]) & np.isfinite(ticks["state_age_ms"])
     rows = ticks[ours]
@@ -93,14 +97,14 @@ def flown(ticks: NDArray[np.void]) -> Flown | str:
     longest = int(np.argmax(t_s[starts[1:] - 1] - t_s[starts[:-1]]))
     part = slice(starts[longest], starts[longest + 1])
     rows, t_s = rows[part], t_s[part] - t_s[part][0]
-    if t_s[-1] < _LEAST_S:
-        return f"setpoints were flown for {t_s[-1]:.1f} s at a stretch; {_LEAST_S:.0f} s are needed"
+    if t_s[-1] < _MIN_DURATION_S:
+        return f"setpoints were flown for {t_s[-1]:.1f} s at a stretch; {_MIN_DURATION_S:.0f} s are needed"
     seen_s = t_s - rows["state_age_ms"].astype(np.float64) * 1e-3
     new = np.diff(seen_s, prepend=-math.inf) > 1e-3
     sent_down = _down(rows["setpoint_q_nb"].astype(np.float64))[:, :2]
-    if float(np.sqrt(np.mean(np.var(sent_down, axis=0)))) < _LEAST_TILT:
+    if float(np.sqrt(np.mean(np.var(sent_down, axis=0)))) < _MIN_TILT_RMS:
         return "it hardly tilted: nothing can be told from this flight"
-    return Flown(
+    return FlightSegment(
         t_s,
         sent_down,
         rows["setpoint_thrust_01"].astype(np.float64),
@@ -110,8 +114,8 @@ def flown(ticks: NDArray[np.void]) -> Flown | str:
     )
 
 
-def identify(flight: Flown) -> Identified | str:
-    """Fit everything; or why it can't be."""
+def identify(flight: FlightSegment) -> Identified | str:
+    """Fit all parameters; returns the reason in words if that is impossible."""
     attitude = _fit_attitude(flight)
     if isinstance(attitude, str):
         return attitude
@@ -130,8 +134,8 @@ def identify(flight: Flown) -> Identified | str:
 # -- attitude ---------------------------------------------------------------------------------------------------------
 
 
-def _fit_attitude(flight: Flown) -> tuple[Figure, Figure, Figure] | str:
-    """Dead time, natural frequency and damping; a constant offset of each axis takes up what levels are off."""
+def _fit_attitude(flight: FlightSegment) -> tuple[Figure, Figure, Figure] | str:
+    """Fit dead time, natural frequency and damping; a constant offset per axis absorbs errors of the level attitude."""
     used = flight.seen_s > _SETTLE_S
     at_s, measured = flight.seen_s[used], flight.seen_down[used, :2]
 
@@ -140,21 +144,21 @@ def _fit_attitude(flight: Flown) -> tuple[Figure, Figure, Figure] | str:
         followed = _followed(flight, delay_s, natural_rad_s, damping, at_s)
         return np.asarray(followed + parameters[3:] - measured)  # (S, 2)
 
-    least, most = np.array([*_LEAST, -1.0, -1.0]), np.array([*_MOST, 1.0, 1.0])
-    best = _least_squares(residuals, np.array([*_FIRST, 0.0, 0.0]), least, most)
+    least, most = np.array([*_LOWER_BOUNDS, -1.0, -1.0]), np.array([*_UPPER_BOUNDS, 1.0, 1.0])
+    best = _least_squares(residuals, np.array([*_INITIAL_PARAMETERS, 0.0, 0.0]), least, most)
     misfit = float(np.sqrt(np.mean(residuals(best) ** 2)))
-    if misfit > _MISFIT_01 * float(np.sqrt(np.mean(np.var(measured, axis=0)))):
+    if misfit > _MAX_MISFIT_01 * float(np.sqrt(np.mean(np.var(measured, axis=0)))):
         return f"its attitude does not follow setpoints as a second-order lag: off by {misfit:.3f} rad rms"
     blocks = (at_s / _BLOCK_S).astype(int)
     wide = _half_widths(_jacobian(residuals, best), residuals(best), blocks)
-    values = zip(best[:3], wide[:3], _LEAST, strict=True)
+    values = zip(best[:3], wide[:3], _LOWER_BOUNDS, strict=True)
     delay, natural, damping = (Figure(float(b), float(max(b - w, lo)), float(b + w)) for b, w, lo in values)
     return delay, natural, damping
 
 
-def _followed(flight: Flown, delay_s: float, natural_rad_s: float, damping: float, at_s: Array) -> Array:
-    """Tilt (S, 2) at times `at_s` (S,) of a vehicle with these parameters."""
-    from scipy.signal import lfilter  # heavy, and not needed to fly
+def _followed(flight: FlightSegment, delay_s: float, natural_rad_s: float, damping: float, at_s: Array) -> Array:
+    """Return the tilt (S, 2) at times `at_s` (S,) of a vehicle with these parameters."""
+    from scipy.signal import lfilter  # slow to import, and not needed to fly
 
     grid_s = np.arange(flight.sent_s[0], flight.sent_s[-1] + _GRID_S, _GRID_S)
     command = _held_mean(flight.sent_s, flight.sent_down, grid_s - delay_s)
@@ -162,14 +166,14 @@ def _followed(flight: Flown, delay_s: float, natural_rad_s: float, damping: floa
     (a, b, _), (c, d, _), (e, f, _) = (
         lag.advance(*start, _GRID_S) for start in ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0))
     )
-    denominator = [1.0, -(a + d), a * d - b * c]  # of x' = [[a, c], [b, d]] x + [e, f] u, tilt the first of x
+    denominator = [1.0, -(a + d), a * d - b * c]  # transfer function of x' = [[a, c], [b, d]] x + [e, f] u to x_1, tilt
     numerator = [0.0, e, c * f - d * e]
     tilt = command[0] + lfilter(numerator, denominator, command - command[0], axis=0)
     return np.column_stack([np.interp(at_s, grid_s, tilt[:, i]) for i in range(2)])
 
 
 def _held_mean(sent_s: Array, sent: Array, from_s: Array) -> Array:
-    """Mean (G, k), over one grid step from `from_s` (G,) on, of commands (T, k) that are held until the next."""
+    """Return means (G, k), over one grid step from `from_s` (G,) on, of commands (T, k) held until the next one."""
     ends_s = np.append(sent_s, sent_s[-1] + 10.0)
     area = np.concatenate([np.zeros((1, sent.shape[1])), np.cumsum(sent * np.diff(ends_s)[:, None], axis=0)])
     before = np.minimum(from_s - sent_s[0], 0.0)[:, None] * sent[0]
@@ -184,8 +188,8 @@ def _held_mean(sent_s: Array, sent: Array, from_s: Array) -> Array:
 # -- translation ------------------------------------------------------------------------------------------------------
 
 
-def _on_grid(flight: Flown, delay_s: float) -> tuple[Array, Array, Array]:
-    """Thrust (G,) that acts, position (G, 3) and body down axis (G, 3) at common times."""
+def _on_grid(flight: FlightSegment, delay_s: float) -> tuple[Array, Array, Array]:
+    """Return acting thrust (G,), position (G, 3) and body down axis (G, 3) on one time grid."""
     grid_s = np.arange(flight.seen_s[0] + _SETTLE_S, flight.seen_s[-1], _GRID_S)
     pos = np.column_stack([np.interp(grid_s, flight.seen_s, flight.seen_pos_ned_m[:, i]) for i in range(3)])
     down = np.column_stack([np.interp(grid_s, flight.seen_s, flight.seen_down[:, i]) for i in range(3)])
@@ -193,10 +197,10 @@ def _on_grid(flight: Flown, delay_s: float) -> tuple[Array, Array, Array]:
     return flight.sent_thrust_01[np.maximum(held, 0)], pos, down
 
 
-def _fit_vertical(flight: Flown) -> tuple[Figure, Array, Array, Array]:
-    """1 / hover thrust, with what `_on_grid` gives; vertical drag is fitted beside it and forgotten.
+def _fit_vertical(flight: FlightSegment) -> tuple[Figure, Array, Array, Array]:
+    """Fit 1 / hover thrust and vertical drag, which is discarded; returns the former and the result of `_on_grid`.
 
-    Thrust has a dead time of its own, motors included: the one that leaves least unexplained.
+    Thrust has a dead time of its own, motors included: the one with the smallest residual is taken.
     """
     motions = [_on_grid(flight, float(delay_s)) for delay_s in _THRUST_DELAYS_S]
     fits = [_vertical_rows(*motion) for motion in motions]
@@ -212,7 +216,7 @@ def _vertical_rows(thrust_01: Array, pos: Array, down: Array) -> tuple[Array, Ar
 
 
 def _fit_drag(thrust_01: Array, pos: Array, down: Array, inverse_hover: float) -> Figure:
-    """Horizontal drag over mass, both axes together; a constant of each is drag times the wind."""
+    """Fit horizontal drag over mass, both axes together, with one constant per axis for drag times wind."""
     rows, left = [], []
     for i in range(2):
         accel, drag, force, blocks = _windows(-GRAVITY_M_S2 * thrust_01 * down[:, i], pos[:, i])
@@ -224,7 +228,12 @@ def _fit_drag(thrust_01: Array, pos: Array, down: Array, inverse_hover: float) -
 
 
 def _windows(force: Array, pos: Array) -> tuple[Array, Array, Array, NDArray[np.int64]]:
-    """Integrals over overlapping windows of unit area: acceleration, minus velocity, force, and each one's block."""
+    """Return integrals over W overlapping windows of unit area: acceleration, minus velocity, force, and block number.
+
+    Args:
+        force: (G,) force along one axis, still to be divided by the hover thrust.
+        pos: (G,) position on that axis.
+    """
     count = round(_WINDOW_S / _GRID_S)
     s = (np.arange(count) + 0.5) / count
     weight = s**4 * (1.0 - s) ** 4
@@ -233,7 +242,7 @@ def _windows(force: Array, pos: Array) -> tuple[Array, Array, Array, NDArray[np.
     area = float(np.sum(weight))
     first = np.arange(0, len(pos) - count, count // 6)
     over = first[:, None] + np.arange(count)
-    near = pos[over] - pos[first][:, None]  # the integrals of slope and curve alone are zero: only rounding
+    near = pos[over] - pos[first][:, None]  # slope and curve integrate to zero, so the shift only reduces rounding
     blocks = (first * _GRID_S / _BLOCK_S).astype(np.int64)
     return near @ curve / area, near @ slope / area, force[over] @ weight / area, blocks
 
@@ -242,7 +251,7 @@ def _windows(force: Array, pos: Array) -> tuple[Array, Array, Array, NDArray[np.
 
 
 def _regress(rows: Array, left: Array, blocks: NDArray[np.int64]) -> Figure:
-    """The first coefficient of linear least squares; rows (W, axes, p), left sides (W, axes)."""
+    """Return the first coefficient of a linear least-squares fit; rows (W, axes, p), left sides (W, axes)."""
     flat = rows.reshape(-1, rows.shape[2])
     best = np.linalg.lstsq(flat, left.reshape(-1), rcond=None)[0]
     wide = _half_widths(rows, rows @ best - left, blocks)
@@ -250,8 +259,8 @@ def _regress(rows: Array, left: Array, blocks: NDArray[np.int64]) -> Figure:
 
 
 def _half_widths(jacobian: Array, residuals: Array, blocks: NDArray[np.int64]) -> Array:
-    """Half widths (p,) of the intervals: jacobian (S, axes, p), residuals (S, axes), each sample's block (S,)."""
-    from scipy.special import stdtrit  # heavy, and not needed to fly
+    """Return half widths (p,) of the intervals from jacobian (S, axes, p), residuals (S, axes) and blocks (S,)."""
+    from scipy.special import stdtrit  # slow to import, and not needed to fly
 
     scores = np.einsum("sap,sa->sp", jacobian, residuals)
     names = np.unique(blocks)
@@ -267,7 +276,7 @@ def _half_widths(jacobian: Array, residuals: Array, blocks: NDArray[np.int64]) -
 
 
 def _least_squares(residuals: Callable[[Array], Array], first: Array, least: Array, most: Array) -> Array:
-    """Levenberg-Marquardt within bounds, which end a component's step."""
+    """Minimise the sum of squares by Levenberg-Marquardt; steps are clipped to the bounds. All vectors are (p,)."""
     best, damping = first, 1e-3
     cost = float(np.sum(residuals(best) ** 2))
     for _ in range(_ITERATIONS):
@@ -289,7 +298,7 @@ def _least_squares(residuals: Callable[[Array], Array], first: Array, least: Arr
 
 
 def _jacobian(residuals: Callable[[Array], Array], at: Array) -> Array:
-    """Central differences (S, axes, p)."""
+    """Return the Jacobian (S, axes, p) by central differences at `at` (p,)."""
     columns = []
     for i, value in enumerate(at):
         step = np.zeros(len(at))
@@ -299,6 +308,6 @@ def _jacobian(residuals: Callable[[Array], Array], at: Array) -> Array:
 
 
 def _down(q_nb: Array) -> Array:
-    """Body down axes (T, 3), NED, of attitudes (T, 4)."""
+    """Return body down axes (T, 3), NED, of attitudes (T, 4) wxyz."""
     w, x, y, z = q_nb.T
     return np.column_stack([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])

@@ -1,13 +1,13 @@
-"""Kalman filter on what an autopilot reports: position, velocity, bias of the reported velocity, and disturbance.
+"""Kalman filter on the states reported by an autopilot: position, velocity, bias of that velocity, and disturbance.
 
 An EKF that fuses GPS reports a velocity that is biased against its own position by 0.1 to 0.3 m/s, wandering over
-seconds; a controller that believes it circles beside its reference. Per axis, with the model's acceleration `a` of the
-measured attitude and the thrust that acts,
+seconds; a controller that uses it unfiltered circles beside its reference. Per axis, with the model's acceleration `a`
+of the measured attitude and the acting thrust,
 
     p' = v,   v' = a + d - drag v + w_a,   b' = -b / T_b + w_b,   d' = w_d,      measured: p + n_p,  v + b + n_v.
 
-The axes share one covariance, because their noises are equal and samples come for all at once. While somebody else
-flies, the acceleration is unknown: it is then noise, and d is left alone.
+The axes share one covariance, because their noises are equal and samples come for all at once. While the autopilot
+flies, the acceleration is unknown: it is then modelled as noise, and d stays constant.
 """
 
 from __future__ import annotations
@@ -26,30 +26,30 @@ from swarmctl.core.types import VehicleState
 
 _POS, _VEL, _BIAS, _DIST = range(4)
 _STALE_US = 200_000
-_UNKNOWN_M_S2 = 3.0  # acceleration while somebody else flies
-_FIRST_M_S2 = 1.0  # disturbance at take-over, one sigma
+_UNKNOWN_M_S2 = 3.0  # one sigma of the acceleration while the autopilot flies
+_FIRST_M_S2 = 1.0  # one sigma of the disturbance when the agent takes control
 
 
 class StateFilterParams(Params):
-    """One sigma of what is wrong with an autopilot's estimate; off for exact states."""
+    """Noise model, one sigma each, of an autopilot's estimate; the filter is off for exact states."""
 
     enabled: bool = False
     pos_m: float = Field(0.02, gt=0, le=10)  # noise of a reported position
     vel_m_s: float = Field(0.05, gt=0, le=10)  # noise of a reported velocity
-    bias_m_s: float = Field(0.2, ge=0, le=10)  # wandering bias of it
+    bias_m_s: float = Field(0.2, ge=0, le=10)  # wandering bias of a reported velocity
     bias_time_s: float = Field(4.0, gt=0, le=600)  # correlation time of that bias
-    accel_m_s2: float = Field(0.5, gt=0, le=20)  # what the model misses, white, over one second
-    disturbance_m_s2: float = Field(0.5, gt=0, le=20)  # growth of the disturbance over one second
-    jump_m: float = Field(1.0, gt=0, le=100)  # a reported position farther off begins anew: the estimator was reset
+    accel_m_s2: float = Field(0.5, gt=0, le=20)  # unmodelled acceleration, white, over one second
+    disturbance_m_s2: float = Field(0.5, gt=0, le=20)  # random walk of the disturbance over one second
+    jump_m: float = Field(1.0, gt=0, le=100)  # a larger position innovation restarts the filter: estimator reset
 
 
 class StateFilter:
-    """See the module.
+    """Filters reported states and estimates disturbance and hover thrust.
 
     Args:
-        params: noises.
+        params: noise model.
         disturbance: limits and the hover thrust's time constant, shared with the observer.
-        model: drag, dead time, first hover thrust.
+        model: drag, dead time and first guess of the hover thrust.
     """
 
     def __init__(self, params: StateFilterParams, disturbance: DisturbanceParams, model: VehicleModelParams) -> None:
@@ -66,18 +66,18 @@ class StateFilter:
         return Estimate(self._mean[_DIST].copy(), self._hover.value_01)
 
     def reset(self) -> None:
-        """Begin to estimate the disturbance: from now on it is known what acts."""
+        """Begin to estimate the disturbance: from now on the acting thrust is known."""
         self._mean[_DIST] = 0.0
         self._covariance[_DIST] = self._covariance[:, _DIST] = 0.0
         self._covariance[_DIST, _DIST] = _FIRST_M_S2**2
         self._thrusts.clear()
 
     def learn_hover(self, thrust_01: float) -> None:
-        """See `HoverThrust.learn`."""
+        """Move the hover thrust towards the autopilot's own, see `HoverThrust.learn`."""
         self._hover.learn(thrust_01)
 
     def update(self, state: VehicleState, thrust_01: float | None) -> Estimate:
-        """Take in one new sample; `thrust_01` is what is being sent, None while somebody else flies."""
+        """Update with one new sample; `thrust_01` is the setpoint being sent, None while the autopilot flies."""
         if thrust_01 is not None:
             self._thrusts.append((state.t_us, thrust_01))
         if self._t_us is None or not 0 < state.t_us - self._t_us < _STALE_US or self._jumped(state):
@@ -94,7 +94,7 @@ class StateFilter:
         return self.estimate
 
     def state(self, reported: VehicleState) -> VehicleState:
-        """The state to plan from: filtered position and velocity, as old as the sample."""
+        """Return the state to plan from: filtered position and velocity at the time of the sample."""
         if self._t_us != reported.t_us:
             return reported
         return replace(reported, pos_ned_m=self._mean[_POS].copy(), vel_ned_m_s=self._mean[_VEL].copy())
@@ -113,7 +113,7 @@ class StateFilter:
         return float(off @ off) > self._params.jump_m**2
 
     def _acting(self, t_us: int, newest_01: float) -> float:
-        """Thrust that has passed the dead time at `t_us`."""
+        """Return the thrust setpoint that has passed the dead time at `t_us`."""
         acting_01 = newest_01 if not self._thrusts else self._thrusts[0][1]
         while self._thrusts and self._thrusts[0][0] + self._delay_us <= t_us:
             acting_01 = self._thrusts[0][1]

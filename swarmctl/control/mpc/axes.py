@@ -93,17 +93,17 @@ class Penalties:
 
 @dataclass(frozen=True, slots=True)
 class HalfSpaces:
-    """Holds rows `normal[s, k] . p_k >= offset[s, k]` for slots s and steps k = 1..Hp; offset -inf disables a row.
+    """Holds rows `normal[s, k] . p_k >= offset[s, k]` for keep-outs s and steps k = 1..Hp; offset -inf disables a row.
 
     Only steps 0.08 s apart become rows, from the first one that increments can change: the certificate checks true
     distances in between. One more row for each slot looks beyond the horizon, so that there is room left to stop:
     `normal[s, -1] . (p_Hp + stop_s[s] v_Hp) >= stop_offset_m[s]`.
     """
 
-    normal: Array  # (slots, Hp, axes)
-    offset_m: Array  # (slots, Hp)
-    stop_s: Array  # (slots,)
-    stop_offset_m: Array  # (slots,)
+    normal: Array  # (keep-outs, Hp, axes)
+    offset_m: Array  # (keep-outs, Hp)
+    stop_s: Array  # (keep-outs,)
+    stop_offset_m: Array  # (keep-outs,)
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,7 +33,7 @@ class CondensedMpc:
     Args:
         axes: weights and bounds of each axis.
         horizon: lengths and sample time.
-        slots: largest number of half-space families (neighbours and obstacles).
+        max_keep_outs: largest number of half-space families (neighbours and obstacles).
         relax_01: half-space rows ask for at most this share of what the bounded increments can reach, so that rows
             inside the dead time are never infeasible and never push agents away (1 asks for all).
         penalties: weights of softened constraints.
@@ -45,13 +45,13 @@ class CondensedMpc:
         self,
         axes: tuple[Axis, ...],
         horizon: Horizon,
-        slots: int,
+        max_keep_outs: int,
         relax_01: float,
         penalties: Penalties,
         qp: QpParams,
         stopwatch_ns: Callable[[], int],
     ) -> None:
-        self.axes, self.horizon, self.slots, self._relax_01 = axes, horizon, slots, relax_01
+        self.axes, self.horizon, self.max_keep_outs, self._relax_01 = axes, horizon, max_keep_outs, relax_01
         self._penalties, self._stopwatch_ns = penalties, stopwatch_ns
         self._u_min = np.array([a.u_min for a in axes])
         self._u_max = np.array([a.u_max for a in axes])
@@ -59,7 +59,7 @@ class CondensedMpc:
         self._build_response()
         self._build_layout()
         self._build_cost()
-        if slots == 0:  # a small problem: tight tolerances cost less than polishing
+        if max_keep_outs == 0:  # a small problem: tight tolerances cost less than polishing
             qp = qp.model_copy(update={"polish": False, "eps": 0.01 * qp.eps, "eps_relative": 0.01 * qp.eps_relative})
         self._solver = make_solver(self._p_pattern, self._a_pattern, qp)
         self._soft_solver = make_solver(self._p_pattern, self._a_pattern, qp) if self._terminals else self._solver
@@ -94,24 +94,24 @@ class CondensedMpc:
         }
         self._regions = {i: self._region(a) for i, a in enumerate(self.axes) if a.terminal == "region"}
         moves, soft = n * hc, len(self._terminals)
-        self._moves, self._columns = moves, moves + soft + self.slots
+        self._moves, self._columns = moves, moves + soft + self.max_keep_outs
         self._row_input = moves
         self._row_soft = 2 * moves
-        self._row_terminal = self._row_soft + soft + self.slots
+        self._row_terminal = self._row_soft + soft + self.max_keep_outs
         self._row_half = self._row_terminal + 2 * soft
-        rows = self._row_half + self.slots * checks
+        rows = self._row_half + self.max_keep_outs * checks
         a = np.zeros((rows, self._columns), bool)
         a[np.arange(moves), np.arange(moves)] = True
         for i in range(n):
             block = slice(moves + i * hc, moves + (i + 1) * hc)
             a[block, i * hc : (i + 1) * hc] = np.tri(hc, dtype=bool)
-        extra = np.arange(soft + self.slots)
+        extra = np.arange(soft + self.max_keep_outs)
         a[self._row_soft + extra, moves + extra] = True
         for j, (i, _) in enumerate(self._terminals):
             for row in (self._row_terminal + 2 * j, self._row_terminal + 2 * j + 1):
                 a[row, i * hc : (i + 1) * hc] = True
                 a[row, moves + j] = True
-        for s in range(self.slots):
+        for s in range(self.max_keep_outs):
             block = slice(self._row_half + s * checks, self._row_half + (s + 1) * checks)
             a[block, :moves] = True
             a[block, moves + soft + s] = True
@@ -153,24 +153,26 @@ class CondensedMpc:
             self._upper[i * hc : (i + 1) * hc] = 1.0
         moves, soft = self._moves, len(self._terminals)
         self._a_dense[np.arange(moves), np.arange(moves)] = 1.0
-        extra = np.arange(soft + self.slots)
+        extra = np.arange(soft + self.max_keep_outs)
         self._a_dense[self._row_soft + extra, moves + extra] = 1.0
         self._lower[self._row_soft + extra] = 0.0
         for j in range(soft):
             self._a_dense[self._row_terminal + 2 * j, moves + j] = _SLACK_SCALE_M
             self._a_dense[self._row_terminal + 2 * j + 1, moves + j] = -_SLACK_SCALE_M
         checks = len(self._row_scale)
-        for s in range(self.slots):
+        for s in range(self.max_keep_outs):
             block = slice(self._row_half + s * checks, self._row_half + (s + 1) * checks)
             self._a_dense[block, moves + soft + s] = _SLACK_SCALE_M * self._row_scale
         weights = self._penalties
-        quadratic = [1e-3] * soft + [2 * weights.slack_quadratic * _SLACK_SCALE_M**2 * self._cost_scale] * self.slots
+        quadratic = [1e-3] * soft + [
+            2 * weights.slack_quadratic * _SLACK_SCALE_M**2 * self._cost_scale
+        ] * self.max_keep_outs
         self._p_dense[np.arange(moves, self._columns), np.arange(moves, self._columns)] = quadratic
-        self._q_soft = np.full(soft + self.slots, weights.floor * _SLACK_SCALE_M * self._cost_scale)
+        self._q_soft = np.full(soft + self.max_keep_outs, weights.floor * _SLACK_SCALE_M * self._cost_scale)
         assert len(self._q_soft) == self._columns - n * hc
 
     def solve(self, asked: AxesProblem, half_spaces: HalfSpaces | None = None) -> AxesSolution:
-        """Solve one receding-horizon step, with at most `slots` families of half-spaces; None for none."""
+        """Solve one receding-horizon step, with at most `max_keep_outs` families of half-spaces; None for none."""
         gain_m_s2, ref_pos_m, ref_vel_m_s = asked.gain_m_s2, asked.ref_pos_m, asked.ref_vel_m_s
         u_prev = np.minimum(np.maximum(asked.u_prev, self._u_min), self._u_max)
         held = np.broadcast_to(u_prev, gain_m_s2.shape)
@@ -193,7 +195,7 @@ class CondensedMpc:
             if len(softened) and not solution.exact:
                 self._soften(q, softened)
                 solution = self._soft_solver.solve(p_values, q, a_values, self._lower, self._upper)
-        if len(self._ends) and self.slots and self._distance_slack_m(solution.x) > _SLACK_USED_M:
+        if len(self._ends) and self.max_keep_outs and self._distance_slack_m(solution.x) > _SLACK_USED_M:
             self._soften(q, self._ends)  # distances have priority over the end
             q[self._moves + self._ends] = 0.0
             solution = self._soft_solver.solve(p_values, q, a_values, self._lower, self._upper)
@@ -382,5 +384,5 @@ class CondensedMpc:
         rows = self._a_dense[self._row_terminal : self._row_half : 2, : self._moves]
         gap = np.abs(rows @ flown[: self._moves] - self._end_wanted)
         shortfall = self._lower[self._row_half :] - self._a_dense[self._row_half :] @ flown
-        shortfall = shortfall / np.tile(self._row_scale, self.slots)
+        shortfall = shortfall / np.tile(self._row_scale, self.max_keep_outs)
         return float(slack.max(initial=0.0)), float(shortfall.max(initial=0.0)), float(gap.max(initial=0.0))

@@ -38,10 +38,15 @@ class JointMpc:
         vehicle: VehicleModelParams,
         separation: SeparationParams,
         own_priority_id: int,
-        slots: int,
+        max_keep_outs: int,
         stopwatch_ns: Callable[[], int],
     ) -> None:
-        self._params, self._separation, self._priority_id, self._slots = params, separation, own_priority_id, slots
+        self._params, self._separation, self._priority_id, self._max_keep_outs = (
+            params,
+            separation,
+            own_priority_id,
+            max_keep_outs,
+        )
         self._stopwatch_ns = stopwatch_ns
         self.dt_us = round(params.dt_s * 1e6)
         self.steps = self.longest = params.horizon_xy
@@ -49,7 +54,7 @@ class JointMpc:
         self._mpc = CondensedMpc(
             (*params.horizontal(vehicle), params.vertical()),
             params.horizon(params.control_xy, params.horizon_xy, vehicle),
-            slots,
+            max_keep_outs,
             separation.relax_01,
             Penalties(),
             params.qp.model_copy(update={"eps": eps, "eps_relative": eps_relative}),
@@ -60,12 +65,12 @@ class JointMpc:
         """Solve one step of distributed MPC. Infeasibility is a status, never an exception."""
         began_ns = self._stopwatch_ns()
         guess = first_guess(problem, self._params.dt_s, self.steps)
-        near = partial(near_half_spaces, problem, guess, 3, self._slots, self._params.dt_s, self._priority_id)
+        near = partial(near_half_spaces, problem, guess, 3, self._max_keep_outs, self._params.dt_s, self._priority_id)
         return planned(near, partial(self._plan, problem, began_ns), self._separation, self._stopwatch_ns)
 
     def _plan(self, problem: Problem, began_ns: int, spaces: HalfSpaces | None, spaces_us: float) -> Plan:
         start, steps = problem.start, self.steps
-        held = max(_MIN_THRUST_M_S2, float(start.virtual[2]))
+        held = max(_MIN_THRUST_M_S2, float(start.virtual_control[2]))
         first = self._solve(problem, np.full(steps, held), spaces)
         found = self._solve(problem, first.u[:, 2], spaces)
         found = replace(found, solve_us=first.solve_us + found.solve_us, iterations=first.iterations + found.iterations)
@@ -82,7 +87,7 @@ class JointMpc:
         asked = AxesProblem(
             start.pos_ned_m,
             start.vel_ned_m_s,
-            start.virtual,
+            start.virtual_control,
             np.column_stack([-thrust_m_s2, -thrust_m_s2, np.full(steps, -start.cos_tilt)]),
             self._drift(problem),
             reference.pos_ned_m[1 : steps + 1],
@@ -95,7 +100,7 @@ class JointMpc:
     def _acting(problem: Problem) -> tuple[Array, Array]:
         """Return the realised inputs (3,) at the start, and their rates (3,)."""
         start = problem.start
-        return np.append(start.tilt, start.virtual[2]), np.append(start.tilt_rate_1_s, 0.0)
+        return np.append(start.tilt, start.virtual_control[2]), np.append(start.tilt_rate_1_s, 0.0)
 
     @staticmethod
     def _drift(problem: Problem) -> Array:

@@ -9,7 +9,7 @@ from swarmctl.control.mpc.problem import Start
 from swarmctl.core.types import Array, Plan, PlanStatus, PredictedPath
 
 
-class Replay:
+class PlanBuffer:
     """Keeps a plan as long as it is worth flying.
 
     Args:
@@ -22,13 +22,13 @@ class Replay:
         self._agent, self._dt_us, self._steps, self._brake_m_s2 = agent, dt_us, steps, brake_m_s2
         self.plan: Plan | None = None
 
-    def take(self, plan: Plan, start: Start, keep_outs: Sequence[KeepOut], rest: Callable[[], Plan]) -> None:
-        """Keep a good plan; after a bad one drop the last good one if braking (`rest`) comes less close than it."""
+    def take(self, plan: Plan, start: Start, keep_outs: Sequence[KeepOut], fallback: Callable[[], Plan]) -> None:
+        """Keep a good plan; after a bad one drop the last good one if braking (`fallback`) comes less close than it."""
         if plan.status is PlanStatus.OK:
             self.plan = plan
         elif self.plan is not None:
             replayed_m = certify(self.positions_ned_m(self.plan, start.t_us), keep_outs, 0)
-            if replayed_m < 0.0 and replayed_m < certify(rest().pos_ned_m, keep_outs, 0):
+            if replayed_m < 0.0 and replayed_m < certify(fallback().pos_ned_m, keep_outs, 0):
                 self.plan = None
 
     def guess_ned_m(self, t0_us: int) -> Array | None:

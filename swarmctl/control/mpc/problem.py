@@ -18,7 +18,7 @@ class Start:
     pos_ned_m: Array  # (3,)
     vel_ned_m_s: Array  # (3,)
     cos_tilt: float  # cos(phi) cos(theta) now
-    virtual: Array  # (3,) u_x, u_y, thrust over mass held now
+    virtual_control: Array  # (3,) u_x, u_y, thrust over mass held now
     tilt: Array = field(default_factory=lambda: np.zeros(2))  # (2,) realised u_x, u_y of a vehicle with a lag
     tilt_rate_1_s: Array = field(default_factory=lambda: np.zeros(2))  # (2,) rate of `tilt`
 

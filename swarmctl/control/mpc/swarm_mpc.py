@@ -87,10 +87,15 @@ class SwarmMpc:
         vehicle: VehicleModelParams,
         separation: SeparationParams,
         own_priority_id: int,
-        slots: int,
+        max_keep_outs: int,
         stopwatch_ns: Callable[[], int],
     ) -> None:
-        self._params, self._separation, self._priority_id, self._slots = params, separation, own_priority_id, slots
+        self._params, self._separation, self._priority_id, self._max_keep_outs = (
+            params,
+            separation,
+            own_priority_id,
+            max_keep_outs,
+        )
         self._stopwatch_ns = stopwatch_ns
         self.dt_us = round(params.dt_s * 1e6)
         self.steps = params.horizon_xy
@@ -114,7 +119,7 @@ class SwarmMpc:
                 params.qp,
                 stopwatch_ns,
             )
-            for room in (slots, 0)
+            for room in (max_keep_outs, 0)
         )
 
     def plan(self, problem: Problem) -> Plan:
@@ -124,7 +129,7 @@ class SwarmMpc:
         guess = first_guess(problem, self._params.dt_s, self.steps)
         count = min(self.steps, len(up.pos_m))
         guess[1 : count + 1, 2] = up.pos_m[:count, 0]
-        near = partial(near_half_spaces, problem, guess, 2, self._slots, self._params.dt_s, self._priority_id)
+        near = partial(near_half_spaces, problem, guess, 2, self._max_keep_outs, self._params.dt_s, self._priority_id)
         return planned(near, partial(self._plan, problem, up, began_ns), self._separation, self._stopwatch_ns)
 
     def _plan(
@@ -134,7 +139,7 @@ class SwarmMpc:
         asked = AxesProblem(
             start.pos_ned_m[:2],
             start.vel_ned_m_s[:2],
-            start.virtual[:2],
+            start.virtual_control[:2],
             np.repeat(-self._thrust_ahead(up)[:, None], 2, axis=1),
             problem.disturbance_ned_m_s2[:2],
             problem.reference.pos_ned_m[1 : steps + 1, :2],
@@ -144,19 +149,25 @@ class SwarmMpc:
         )
         across = (self._xy_alone if spaces is None else self._xy).solve(asked, spaces)
         pos, vel = np.empty((steps, 3)), np.zeros((steps, 3))
-        virtual = np.empty((steps, 3))
-        pos[:, :2], vel[:, :2], virtual[:, :2] = across.pos_m, across.vel_m_s, across.u
-        pos[:count, 2:], vel[:count, 2:], virtual[:count, 2:] = up.pos_m[:count], up.vel_m_s[:count], up.u[:count]
-        pos[count:, 2], virtual[count:, 2] = up.pos_m[-1, 0], up.u[-1, 0]
+        virtual_control = np.empty((steps, 3))
+        pos[:, :2], vel[:, :2], virtual_control[:, :2] = across.pos_m, across.vel_m_s, across.u
+        pos[:count, 2:], vel[:count, 2:], virtual_control[:count, 2:] = (
+            up.pos_m[:count],
+            up.vel_m_s[:count],
+            up.u[:count],
+        )
+        pos[count:, 2], virtual_control[count:, 2] = up.pos_m[-1, 0], up.u[-1, 0]
         first, stopwatch_ns = self._xy.first_row(), self._stopwatch_ns
-        return judged(problem, pos, vel, virtual, (up, across), first, self.dt_us, began_ns, spaces_us, stopwatch_ns)
+        return judged(
+            problem, pos, vel, virtual_control, (up, across), first, self.dt_us, began_ns, spaces_us, stopwatch_ns
+        )
 
     def _solve_z(self, problem: Problem) -> AxesSolution:
         steps, start, reference = self._params.horizon_z, problem.start, problem.reference
         asked = AxesProblem(
             start.pos_ned_m[2:],
             start.vel_ned_m_s[2:],
-            start.virtual[2:],
+            start.virtual_control[2:],
             np.full((steps, 1), -start.cos_tilt),
             GRAVITY_M_S2 + problem.disturbance_ned_m_s2[2:],
             reference.pos_ned_m[1 : steps + 1, 2:],
@@ -179,27 +190,27 @@ def first_guess(problem: Problem, dt_s: float, steps: int) -> Array:
     return np.asarray(start.pos_ned_m + t_s * start.vel_ned_m_s)
 
 
-def closest_keep_outs(keep_outs: Sequence[KeepOut], guess_ned_m: Array, slots: int) -> list[KeepOut]:
-    """Return the `slots` keep-outs that the guess (steps+1, 3) comes closest to."""
+def closest_keep_outs(keep_outs: Sequence[KeepOut], guess_ned_m: Array, max_keep_outs: int) -> list[KeepOut]:
+    """Return the `max_keep_outs` keep-outs that the guess (steps+1, 3) comes closest to."""
 
     def gap_m(k: KeepOut) -> float:
         apart = (guess_ned_m - k.pos_ned_m) * (1.0, 1.0, k.vertical_01)
         return float(np.sqrt(np.min(np.sum(apart**2, axis=1)))) - k.radius_m
 
-    return sorted(keep_outs, key=gap_m)[:slots]
+    return sorted(keep_outs, key=gap_m)[:max_keep_outs]
 
 
 def near_half_spaces(
     problem: Problem,
     guess_ned_m: Array,
     axes: int,
-    slots: int,
+    max_keep_outs: int,
     dt_s: float,
     own_priority_id: int,
     params: SeparationParams,
 ) -> HalfSpaces | None:
     """Return half-spaces of the closest keep-outs around the guess (steps+1, 3), in the first `axes` axes."""
-    steps, near = len(guess_ned_m) - 1, closest_keep_outs(problem.keep_outs, guess_ned_m, slots)
+    steps, near = len(guess_ned_m) - 1, closest_keep_outs(problem.keep_outs, guess_ned_m, max_keep_outs)
     goal, vel = problem.reference.pos_ned_m[steps, :axes], problem.start.vel_ned_m_s[:axes]
     return half_spaces(near, guess_ned_m, goal, vel, dt_s, own_priority_id, params)
 
@@ -237,7 +248,7 @@ def judged(
     problem: Problem,
     pos_ned_m: Array,
     vel_ned_m_s: Array,
-    virtual: Array,
+    virtual_control: Array,
     solutions: Sequence[AxesSolution],
     from_step: int,
     dt_us: int,
@@ -250,7 +261,7 @@ def judged(
     Args:
         problem: the problem it solves.
         pos_ned_m, vel_ned_m_s: (steps, 3) at steps 1..Hp.
-        virtual: (steps, 3).
+        virtual_control: (steps, 3).
         solutions: solutions of all problems solved for it.
         from_step: first certified step; earlier ones cannot be changed any more.
         dt_us: step.
@@ -277,7 +288,7 @@ def judged(
         dt_us,
         pos,
         np.concatenate([start.vel_ned_m_s[None], vel_ned_m_s]),
-        virtual,
+        virtual_control,
         PlanTimes((solved_ns - began_ns) * 1e-3 - solve_us - spaces_us, solve_us, certify_us, spaces_us),
         sum(s.iterations for s in solutions),
         max(s.slack_m for s in solutions),

@@ -1,20 +1,20 @@
-"""Whether a vehicle is disarmed, by evidence: an arm request and the HEARTBEAT that shows its effect arrive apart.
+"""Decides whether a vehicle is known to be disarmed, although HEARTBEATs lag behind arm requests.
 
-An autopilot acknowledges arming at once and tells `armed` in its next HEARTBEAT, up to a second later. Until then the
-newest HEARTBEAT says "disarmed" of a vehicle whose motors turn.
+An autopilot acknowledges arming at once and reports `armed` in its next HEARTBEAT, up to a second later. Until then the
+newest HEARTBEAT says "disarmed" about a vehicle whose motors turn.
 """
 
 from __future__ import annotations
 
-from swarmctl.control.phases.inputs import Facts
+from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.core.types import VehicleState
 
 
 class ArmingEvidence:
-    """Judges `VehicleState.armed` by when the HEARTBEAT that told it arrived.
+    """Accepts "disarmed" only from a HEARTBEAT that arrived after every arm request was settled.
 
     Attributes:
-        requested: this agent has asked the autopilot to arm.
+        requested: whether this agent has asked the autopilot to arm.
     """
 
     def __init__(self) -> None:
@@ -23,20 +23,20 @@ class ArmingEvidence:
         self._settled_us: int | None = None  # a HEARTBEAT before this time proves nothing
 
     def request(self) -> None:
-        """Note that arming is being asked for now."""
+        """Note that arming is requested now."""
         self.requested = self._open = True
 
-    def update(self, facts: Facts) -> None:
+    def update(self, inputs: PhaseInputs) -> None:
         """Advance by one tick, before this tick's requests.
 
-        What was received before this process looked is as old as an arm request still open in the command port.
+        HEARTBEATs received before the first tick, or while an arm request is open, prove nothing.
         """
         if self._settled_us is None or self._open:
-            self._settled_us = facts.now_us
-        self._open = self._open and facts.busy
+            self._settled_us = inputs.now_us
+        self._open = self._open and inputs.busy
 
-    def is_disarmed(self, facts: Facts, state: VehicleState) -> bool:
-        """Whether a HEARTBEAT that is newer than every arm request says that the vehicle is disarmed."""
+    def is_disarmed(self, inputs: PhaseInputs, state: VehicleState) -> bool:
+        """Return whether a HEARTBEAT newer than every arm request reports the vehicle as disarmed."""
         if state.armed or self._open or self._settled_us is None:
             return False
-        return facts.armed_told_us > self._settled_us
+        return inputs.armed_told_us > self._settled_us

@@ -1,6 +1,7 @@
-"""Health -> Mode: one table, first matching row wins. Pure; the only state is passed in.
+"""Maps `Health` to `Mode` by one table whose first matching row applies. Pure; all state is passed in.
 
-The ladder after a bad plan: fly the shifted last certified plan while it is young -> brake -> hold -> land.
+After a plan that must not be flown the modes are, in order: replay the shifted last certified plan while it is recent,
+brake, hold, land.
 """
 
 from __future__ import annotations
@@ -15,17 +16,17 @@ from swarmctl.core.types import FlightMode, Health, Mode, Phase, PlanStatus
 
 
 class FailsafeParams(Params):
-    """How long what is trusted."""
+    """Time limits and thresholds of the failsafe."""
 
-    state_max_age_s: float = Field(0.2, gt=0, le=5)
-    replay_s: float = Field(0.4, ge=0, le=5)  # how long an old certified plan is flown
-    hold_s: float = Field(5.0, ge=0, le=600)  # at rest without a plan, then land
-    rest_speed_m_s: float = Field(0.2, gt=0, le=5)
+    state_max_age_s: float = Field(0.2, gt=0, le=5)  # an older vehicle state is stale
+    replay_s: float = Field(0.4, ge=0, le=5)  # longest replay of the last certified plan
+    hold_s: float = Field(5.0, ge=0, le=600)  # longest hold without a plan; then land
+    rest_speed_m_s: float = Field(0.2, gt=0, le=5)  # a faster vehicle brakes before it holds
 
 
 @dataclass(frozen=True, slots=True)
-class Judgement:
-    """A mode and why."""
+class FailsafeDecision:
+    """The mode of a tick and the reason for it."""
 
     mode: Mode
     reason: str
@@ -34,31 +35,31 @@ class Judgement:
 _FLYING = (Phase.GOTO_START, Phase.READY, Phase.TRACK, Phase.GOTO_LAND)
 
 
-def judge(health: Health, params: FailsafeParams) -> Judgement:
-    """Mode of this tick: that of the first row of the table that applies to `health`."""
+def decide(health: Health, params: FailsafeParams) -> FailsafeDecision:
+    """Return the mode of this tick: that of the first row of the table that applies to `health`."""
     for applies, mode, reason in _TABLE:
         if applies(health, params):
-            return Judgement(mode, reason)
-    return Judgement(Mode.FOLLOW, "plan certified")
+            return FailsafeDecision(mode, reason)
+    return FailsafeDecision(Mode.TRACKING, "plan certified")
 
 
-def _blind(h: Health, p: FailsafeParams) -> bool:
+def _state_stale(h: Health, p: FailsafeParams) -> bool:
     return h.state_age_us < 0 or h.state_age_us > p.state_max_age_s * 1e6
 
 
-def _not_ours(h: Health, _: FailsafeParams) -> bool:
+def _autopilot_flies(h: Health, _: FailsafeParams) -> bool:
     return h.phase not in _FLYING
 
 
-def _yielded(h: Health, _: FailsafeParams) -> bool:
-    return h.yielded
+def _overridden(h: Health, _: FailsafeParams) -> bool:
+    return h.pilot_override
 
 
-def _taken(h: Health, _: FailsafeParams) -> bool:
+def _taken_over(h: Health, _: FailsafeParams) -> bool:
     return h.had_control and (h.mode is not FlightMode.EXTERNAL or not h.armed or h.autopilot_failsafe)
 
 
-def _young(h: Health, p: FailsafeParams) -> bool:
+def _plan_is_young(h: Health, p: FailsafeParams) -> bool:
     return h.plan_status is not PlanStatus.OK and 0 <= h.last_good_plan_age_us <= p.replay_s * 1e6
 
 
@@ -66,7 +67,7 @@ def _moving(h: Health, p: FailsafeParams) -> bool:
     return h.plan_status is not PlanStatus.OK and h.speed_m_s > p.rest_speed_m_s
 
 
-def _stuck(h: Health, p: FailsafeParams) -> bool:
+def _planless_too_long(h: Health, p: FailsafeParams) -> bool:
     return h.plan_status is not PlanStatus.OK and h.planless_us > (p.replay_s + p.hold_s) * 1e6
 
 
@@ -74,19 +75,19 @@ def _planless(h: Health, _: FailsafeParams) -> bool:
     return h.plan_status is not PlanStatus.OK
 
 
-def _waiting(h: Health, _: FailsafeParams) -> bool:
+def _not_in_control(h: Health, _: FailsafeParams) -> bool:
     return not h.had_control
 
 
 _Row = tuple[Callable[[Health, FailsafeParams], bool], Mode, str]
 _TABLE: tuple[_Row, ...] = (
-    (_blind, Mode.BLIND, "own state too old"),
-    (_yielded, Mode.YIELD, "pilot or autopilot flies until an operator resumes"),
-    (_not_ours, Mode.IDLE, "autopilot flies"),
-    (_taken, Mode.YIELD, "pilot or autopilot took over"),
-    (_young, Mode.REPLAY, "no new plan: last certified one"),
-    (_stuck, Mode.LAND, "no plan for too long"),
+    (_state_stale, Mode.STATE_STALE, "own state too old"),
+    (_overridden, Mode.PILOT_OVERRIDE, "pilot or autopilot flies until an operator resumes"),
+    (_autopilot_flies, Mode.IDLE, "autopilot flies"),
+    (_taken_over, Mode.PILOT_OVERRIDE, "pilot or autopilot took over"),
+    (_plan_is_young, Mode.REPLAY, "no new plan: last certified one"),
+    (_planless_too_long, Mode.LAND, "no plan for too long"),
     (_moving, Mode.BRAKE, "no plan: braking"),
     (_planless, Mode.HOLD, "no plan: holding"),
-    (_waiting, Mode.STREAM, "waiting for the autopilot to follow"),
+    (_not_in_control, Mode.PRIMING, "waiting for the autopilot to follow"),
 )

@@ -1,4 +1,4 @@
-"""What the sequence of phases goes by: one tick, as it sees it."""
+"""Inputs of the mission state machine in one tick."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from swarmctl.core.types import Array, FlightMode, Mode, Phase, VehicleState
 
 
 @dataclass(frozen=True, slots=True)
-class PeerFacts:
-    """What the sequence needs to know of a peer."""
+class PeerInputs:
+    """The status of one peer, as far as the state machine needs it."""
 
     phase: Phase
     ready_utc_us: int
@@ -19,22 +19,22 @@ class PeerFacts:
 
 
 @dataclass(frozen=True, slots=True)
-class Facts:
-    """This tick, as the sequence sees it."""
+class PhaseInputs:
+    """Everything the state machine's step depends on."""
 
     now_us: int
     utc_us: int
     state: VehicleState | None
-    prepared: bool  # the link is set up: all that had to be asked of the autopilot has been answered
+    prepared: bool  # link setup is complete: the autopilot has answered every request
     armable: bool
     busy: bool  # a command is being executed
-    mode: Mode  # last judgement
-    unresponsive_peer: bool  # a peer that may well be flying has not been heard for too long
-    peers: Mapping[int, PeerFacts]
-    others_ned_m: tuple[Array, ...] = ()  # (3,) each: where peers are now
-    arm_in: FlightMode | None = None  # flight mode to be in before arming; None: the one it is in
+    mode: Mode  # last decision of the failsafe
+    unresponsive_peer: bool  # no message for too long from a peer that may be flying
+    peers: Mapping[int, PeerInputs]
+    others_ned_m: tuple[Array, ...] = ()  # present position (3,) of each peer
+    arm_in: FlightMode | None = None  # flight mode required for arming; None: any
     boots: int = 0  # reboots of the autopilot so far
-    refusal: str = ""  # why nothing may be armed
-    unsettled: str = ""  # why nothing may be armed yet; it may pass
-    overload: Level = Level.NONE  # what missed deadlines ask for
-    armed_told_us: int = -1  # arrival of the HEARTBEAT that told `state.armed`
+    refusal: str = ""  # reason why arming is refused for good
+    unsettled: str = ""  # reason why arming must wait
+    overload: Level = Level.NONE  # response to missed deadlines
+    armed_told_us: int = -1  # arrival time of the HEARTBEAT that reported `state.armed`

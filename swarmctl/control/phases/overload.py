@@ -1,7 +1,7 @@
-"""Whether an agent still keeps its deadlines, and what follows when it does not.
+"""Monitors missed deadlines and decides on the response: wider distances, hold, land.
 
-Pure. Every protection counts on setpoints that leave in time and on plans made from what is true now. An agent whose
-processor is too slow widens what it keeps clear of and asks its peers to; then it comes to rest; then it lands.
+Pure. Every protection relies on setpoints that leave in time and on plans made from fresh states. An agent whose
+processor is too slow first widens its own and its peers' distances, then comes to rest, then lands.
 """
 
 from __future__ import annotations
@@ -15,18 +15,18 @@ from swarmctl.core.params import Params
 
 
 class OverloadParams(Params):
-    """Shares of missed deadlines, each over `window_s`."""
+    """Thresholds on the fraction of deadlines missed within `window_s`."""
 
     window_s: float = Field(2.0, gt=0, le=60)
-    widen_01: float = Field(0.15, gt=0, le=1)  # from here on distances grow
-    margin_max_m: float = Field(0.2, ge=0, le=10)  # by so much where the agent comes to rest
-    hold_01: float = Field(0.4, gt=0, le=1)  # from here on it comes to rest
-    clear_01: float = Field(0.2, ge=0, le=1)  # below, it goes on
-    land_after_s: float = Field(10.0, gt=0, le=600)  # of holding for this reason
+    widen_01: float = Field(0.15, gt=0, le=1)  # above this fraction distances grow
+    margin_max_m: float = Field(0.2, ge=0, le=10)  # growth of distances at `hold_01`
+    hold_01: float = Field(0.4, gt=0, le=1)  # from this fraction on the agent comes to rest
+    clear_01: float = Field(0.2, ge=0, le=1)  # below this fraction a resting agent continues
+    land_after_s: float = Field(10.0, gt=0, le=600)  # longest hold for this reason; then land
 
 
 class Level(enum.IntEnum):
-    """What missed deadlines ask for."""
+    """Response to missed deadlines, in increasing order."""
 
     NONE = 0
     WIDEN = 1
@@ -35,11 +35,15 @@ class Level(enum.IntEnum):
 
 
 class Overload:
-    """Share of deadlines missed, and what it asks for.
+    """Measures the fraction of deadlines missed and derives the response.
+
+    Args:
+        params: thresholds.
+        period_us: period of the ticks.
 
     Attributes:
-        level: what is to be done now.
-        missed_01: share of deadlines missed in the window.
+        level: response required now.
+        missed_01: fraction of deadlines missed in the window.
     """
 
     def __init__(self, params: OverloadParams, period_us: int) -> None:
@@ -50,19 +54,19 @@ class Overload:
 
     @property
     def margin_m(self) -> float:
-        """What to add to every distance: from 0 at `widen_01` to `margin_max_m` at `hold_01`."""
+        """Margin to add to every distance [m]: from 0 at `widen_01` linearly to `margin_max_m` at `hold_01`."""
         p = self._params
         if self.level is Level.NONE:
             return 0.0
-        share_01 = (self.missed_01 - p.widen_01) / max(1e-9, p.hold_01 - p.widen_01)
-        return p.margin_max_m * min(1.0, max(0.0, share_01))
+        excess_01 = (self.missed_01 - p.widen_01) / max(1e-9, p.hold_01 - p.widen_01)
+        return p.margin_max_m * min(1.0, max(0.0, excess_01))
 
     def text(self) -> str:
-        """The cause in words."""
+        """Return the text of the alert."""
         return f"overload: {100.0 * self.missed_01:.0f} % of deadlines missed"
 
     def update(self, now_us: int, missed: int) -> None:
-        """Take in the deadlines missed so far, at monotonic `now_us`."""
+        """Update with the number of deadlines missed so far at monotonic time `now_us`."""
         p = self._params
         self._seen.append((now_us, missed))
         while len(self._seen) > 2 and now_us - self._seen[1][0] >= p.window_s * 1e6:

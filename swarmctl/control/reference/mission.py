@@ -1,6 +1,7 @@
 """Mission references: position and velocity at a given mission time, shared by all agents unless each has its own.
 
-They are pure functions of time; the flight before and after (to the start, to the landing place) is a `Glide`.
+They are pure functions of time; the flight before and after (to the start, to the landing place) is a
+`QuinticTrajectory`.
 """
 
 from __future__ import annotations
@@ -164,8 +165,8 @@ class MissionReference:
         return _held(np.array(self._params.steps.rows), t_s), np.zeros((len(t_s), 3))
 
     def _swap(self, t_s: Array) -> tuple[Array, Array]:
-        glide = Glide(self._start, np.zeros(3), self._opposite, self._params.swap.travel_s)
-        return glide.sample(t_s)
+        trajectory = QuinticTrajectory(self._start, np.zeros(3), self._opposite, self._params.swap.travel_s)
+        return trajectory.sample(t_s)
 
     def _goto(self, t_s: Array) -> tuple[Array, Array]:
         return self._flight.sample(t_s)
@@ -193,7 +194,7 @@ def _held(rows: Array, t_s: Array) -> Array:
     return held
 
 
-def _goal_flights(params: GotoParams, starts_ned_m: Array, apart_m: float) -> list[Glide]:
+def _goal_flights(params: GotoParams, starts_ned_m: Array, apart_m: float) -> list[QuinticTrajectory]:
     """Return the flight of every agent; agents that share a goal arrive together, outer ones a little later.
 
     A ring of agents that closes before the inner ones have arrived opens only after much pushing.
@@ -206,7 +207,7 @@ def _goal_flights(params: GotoParams, starts_ned_m: Array, apart_m: float) -> li
     if params.goal_assignment:
         goals, groups = assigned_goals_ned_m(starts_ned_m, goals, apart_m)
     flights = [
-        glide_to(start, np.zeros(3), goal, params.speed_m_s, params.accel_m_s2)
+        quintic_to(start, np.zeros(3), goal, params.speed_m_s, params.accel_m_s2)
         for start, goal in zip(starts_ned_m, goals, strict=True)
     ]
     for group in groups:
@@ -218,7 +219,7 @@ def _goal_flights(params: GotoParams, starts_ned_m: Array, apart_m: float) -> li
 
 
 @dataclass(frozen=True, slots=True)
-class Glide:
+class QuinticTrajectory:
     """A quintic polynomial from a position and velocity to rest at a target, continuous in acceleration."""
 
     from_ned_m: Array  # (3,)
@@ -239,19 +240,19 @@ class Glide:
         return pos, vel
 
 
-def glide_to(pos: Array, vel: Array, target: Array, speed_m_s: float, accel_m_s2: float) -> Glide:
-    """Return the fastest `Glide` whose peak speed and acceleration stay near the given ones.
+def quintic_to(pos: Array, vel: Array, target: Array, speed_m_s: float, accel_m_s2: float) -> QuinticTrajectory:
+    """Return the fastest `QuinticTrajectory` whose peak speed and acceleration stay near the given ones.
 
     A quintic from rest peaks at 1.875 of its mean speed and at 5.77 distance / T^2.
     """
     distance = math.dist(pos, target)
     initial = math.sqrt(float(vel @ vel))
     travel_s = max(1.875 * distance / speed_m_s, math.sqrt(5.77 * distance / accel_m_s2), 3.0 * initial / accel_m_s2)
-    return Glide(pos, vel, target, max(travel_s, 0.5))
+    return QuinticTrajectory(pos, vel, target, max(travel_s, 0.5))
 
 
-def brake_to_rest(pos: Array, vel: Array, accel_m_s2: float) -> Glide:
-    """Return a `Glide` that stops straight ahead, about as soon as `accel_m_s2` allows."""
+def brake_to_rest(pos: Array, vel: Array, accel_m_s2: float) -> QuinticTrajectory:
+    """Return a `QuinticTrajectory` that stops straight ahead, about as soon as `accel_m_s2` allows."""
     speed = math.sqrt(float(vel @ vel))
     travel_s = max(0.5, 2.0 * speed / accel_m_s2)
-    return Glide(pos, vel, pos + 0.5 * travel_s * vel, travel_s)
+    return QuinticTrajectory(pos, vel, pos + 0.5 * travel_s * vel, travel_s)

@@ -1,4 +1,4 @@
-"""Alerts are shown while their cause is there, and end with it."""
+"""Tests that alerts are shown while their cause lasts and expire afterwards."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def test_the_newest_alert_is_shown_and_ends_after_its_cause() -> None:
     assert alerts.text(5 * SECOND) == ""
 
 
-def test_a_cause_that_is_known_to_be_gone_is_not_shown_any_longer() -> None:
+def test_a_cleared_alert_is_not_shown() -> None:
     alerts = Alerts()
     alerts.put("takeoff", "takeoff refused: result 4", 0)
     alerts.clear("takeoff")

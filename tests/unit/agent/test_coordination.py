@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from swarmctl.agent.coordination import Coordination
-from swarmctl.agent.world_model import Surroundings
+from swarmctl.agent.world_model import WorldModel
 from swarmctl.bus import topics
 from swarmctl.bus.peers import LocalBus, LocalHub, agent_name
 from swarmctl.bus.trajectory_messages import decode_trajectory_message, encode_trajectory_message
@@ -37,7 +37,7 @@ class Bench:
         self.peer: LocalBus = hub.attach(PEER)
         self.alive = {agent_name(0), PEER}
         separation = SeparationParams()
-        self.surroundings = Surroundings(0, [1], separation, self.bus, RATE_HZ, lambda *_, **__: None)
+        self.world_model = WorldModel(0, [1], separation, self.bus, RATE_HZ, lambda *_, **__: None)
         self.coordination = Coordination(
             0,
             1,
@@ -46,7 +46,7 @@ class Bench:
             MpcParams(),
             separation,
             2,
-            self.surroundings,
+            self.world_model,
             self.bus,
             lambda name, **fields: self.told.append((name, fields)),
             lambda: 0,
@@ -66,7 +66,7 @@ class Bench:
             self.clock.advance(20_000)
             each()
             utc_us = self.clock.utc_us()
-            self.surroundings.listen(utc_us)
+            self.world_model.listen(utc_us)
             self.coordination.receive(utc_us)
             self.coordination.step(utc_us, self.state, Phase.TRACK, DesiredReference(self.wanted))
             self.coordination.publish(utc_us)
@@ -117,7 +117,7 @@ def test_a_peer_is_lost_only_after_it_has_been_absent_for_some_ticks(bench: Benc
     bench.alive.discard(PEER)
     bench.fly(0.08)
     assert bench.committed == before, "tokens vanish one by one"
-    assert bench.surroundings.peer_commitments == {}, "but its commitment is no longer relied on"
+    assert bench.world_model.peer_commitments == {}, "but its commitment is no longer relied on"
     bench.fly(1.0)
     assert bench.committed > before
 
@@ -149,11 +149,11 @@ def test_an_agent_back_on_the_bus_takes_no_peer_for_lost_at_first(bench: Bench) 
 
 def test_a_deviating_peer_is_where_its_path_says(bench: Bench) -> None:
     bench.fly(0.5, each=bench.send)
-    assert set(bench.surroundings.peer_commitments) == {1}
+    assert set(bench.world_model.peer_commitments) == {1}
     aside = PLACE + np.array([0.0, 0.5, 0.0])
     bench.fly(0.5, each=lambda: bench.send(aside))
-    assert bench.surroundings.peer_commitments == {}
-    (body,) = bench.surroundings.bodies(HERE, bench.clock.utc_us(), 0.0, 0.0)
+    assert bench.world_model.peer_commitments == {}
+    (body,) = bench.world_model.bodies(HERE, bench.clock.utc_us(), 0.0, 0.0)
     assert body.pos_ned_m == pytest.approx(tuple(aside))
 
 
@@ -161,9 +161,9 @@ def test_the_margin_of_a_committed_peer_does_not_grow_with_age(bench: Bench) -> 
     bench.fly(0.5, each=bench.send)
     bench.fly(1.0)
     utc_us, apart_m = bench.clock.utc_us(), SeparationParams().body_m
-    assert {body.apart_m for body in bench.surroundings.bodies(HERE, utc_us, 0.0, 0.0)} == {apart_m}
-    bench.surroundings.peer_commitments = {}
-    (control,) = bench.surroundings.bodies(HERE, utc_us, 0.0, 0.0)
+    assert {body.apart_m for body in bench.world_model.bodies(HERE, utc_us, 0.0, 0.0)} == {apart_m}
+    bench.world_model.peer_commitments = {}
+    (control,) = bench.world_model.bodies(HERE, utc_us, 0.0, 0.0)
     assert control.apart_m > apart_m + 0.9, "a path as old may have been left by a metre"
 
 
@@ -172,7 +172,7 @@ def test_the_certificate_against_a_stale_peer_has_all_of_its_margin(bench: Bench
     bench.fly(1.0)
     utc_us, params = bench.clock.utc_us(), SeparationParams()
     (kept,) = bench.coordination._others(utc_us, bench.state, Phase.TRACK, set())
-    (control,) = bench.surroundings.keep_outs(HERE, utc_us, 100_000, 5, Phase.TRACK)
+    (control,) = bench.world_model.keep_outs(HERE, utc_us, 100_000, 5, Phase.TRACK)
     assert control.hard_min_distance_m == params.radius_m - params.certify_slack_m, "which would not grow with age"
     assert kept.hard_min_distance_m > params.planned_m + 0.5
 

@@ -1,4 +1,4 @@
-"""Deadlines of the real-time loop: what is late, what is skipped, and that nothing is ever caught up in a burst."""
+"""Tests of the real-time loop: missed and skipped deadlines, which are never caught up in a burst."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from swarmctl.agent.runner import Pace, WallClock, _give_up_on_silence, _StopRequest
+from swarmctl.agent.runner import Pace, WallClock, _check_vehicle_silence, _StopRequest
 from swarmctl.config import load
 from swarmctl.errors import MissionError, StartError
 
@@ -17,7 +17,7 @@ MS = 1_000
 
 
 def paced(*ticks_ms: tuple[float, float]) -> Pace:
-    """A 20 ms loop whose ticks sent and ended at the given times [ms] after the first was due."""
+    """Run a 20 ms loop whose ticks sent and ended at the given times [ms] after the first was due."""
     pace = Pace(20 * MS, 0)
     for sent_ms, ended_ms in ticks_ms:
         pace.done(round(sent_ms * MS), round(ended_ms * MS))
@@ -26,7 +26,7 @@ def paced(*ticks_ms: tuple[float, float]) -> Pace:
 
 def test_ticks_in_time_keep_an_absolute_grid() -> None:
     pace = paced((3, 5), (28, 33), (59.9, 60))
-    assert (pace.late, pace.due_us) == (0, 60 * MS)
+    assert (pace.missed, pace.due_us) == (0, 60 * MS)
 
 
 @pytest.mark.parametrize(
@@ -41,9 +41,9 @@ def test_ticks_in_time_keep_an_absolute_grid() -> None:
         (1000, 1010, 50, 1000),  # a second of standstill is 50 lost ticks
     ],
 )
-def test_late_and_skipped_by_hand(sent_ms: float, ended_ms: float, late: int, due_ms: float) -> None:
+def test_missed_deadlines_of_late_and_skipped_ticks(sent_ms: float, ended_ms: float, late: int, due_ms: float) -> None:
     pace = paced((sent_ms, ended_ms))
-    assert (pace.late, pace.due_us) == (late, due_ms * MS)
+    assert (pace.missed, pace.due_us) == (late, due_ms * MS)
 
 
 def test_after_a_stall_one_tick_follows_and_not_a_burst() -> None:
@@ -51,7 +51,7 @@ def test_after_a_stall_one_tick_follows_and_not_a_burst() -> None:
     assert pace.due_us == 500 * MS  # one overdue tick, begun at once
     pace.done(508 * MS, 510 * MS)
     assert pace.due_us == 520 * MS  # and the next one waits for its time
-    assert pace.late == 25
+    assert pace.missed == 25
 
 
 def test_sleeping_until_the_past_returns_and_until_the_future_waits() -> None:
@@ -63,14 +63,14 @@ def test_sleeping_until_the_past_returns_and_until_the_future_waits() -> None:
     assert clock.now_us() >= began_us + 60_000
 
 
-def test_a_vehicle_that_was_never_there_is_a_start_error_and_a_lost_one_a_mission_error() -> None:
+def test_a_vehicle_never_seen_is_a_start_error_and_a_lost_one_a_mission_error() -> None:
     config = load(None, ["agent.connect_timeout_s=5.0"])
-    _give_up_on_silence(5_000_000, False, config, "udpin://x")
+    _check_vehicle_silence(5_000_000, False, config, "udpin://x")
     with pytest.raises(StartError, match="udpin://x"):
-        _give_up_on_silence(5_000_001, False, config, "udpin://x")
-    _give_up_on_silence(15_000_000, True, config, "udpin://x")
+        _check_vehicle_silence(5_000_001, False, config, "udpin://x")
+    _check_vehicle_silence(15_000_000, True, config, "udpin://x")
     with pytest.raises(MissionError, match="udpin://x"):
-        _give_up_on_silence(15_000_001, True, config, "udpin://x")
+        _check_vehicle_silence(15_000_001, True, config, "udpin://x")
 
 
 @pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])

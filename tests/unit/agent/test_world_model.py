@@ -1,4 +1,4 @@
-"""What an agent takes in from the bus: within bounds, from whom it is, and what it says of those it does not hear."""
+"""Tests of the world model: bounded input, checked senders, and reports of unheard peers."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from swarmctl.agent.world_model import Surroundings
+from swarmctl.agent.world_model import WorldModel
 from swarmctl.bus import topics
 from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.control.collision.separation import SeparationParams
@@ -28,19 +28,19 @@ class Bench:
     """Agent 0 among agents 1 and 2, and an operator."""
 
     clock: SimClock = field(default_factory=SimClock)
-    told: list[dict[str, Any]] = field(default_factory=list)
+    events: list[dict[str, Any]] = field(default_factory=list)
     seq: int = 0
 
     def __post_init__(self) -> None:
         self.hub = LocalHub(self.clock.now_us)
         self.bus = self.hub.attach(agent_name(0))
         self.peer, self.operator = self.hub.attach(agent_name(1)), self.hub.attach(topics.OPERATOR)
-        note = lambda name, **fields: self.told.append({"event": name, **fields})  # noqa: E731
-        self.surroundings = Surroundings(0, [1, 2], SeparationParams(), self.bus, 50.0, note)
+        note = lambda name, **fields: self.events.append({"event": name, **fields})  # noqa: E731
+        self.world_model = WorldModel(0, [1, 2], SeparationParams(), self.bus, 50.0, note)
 
     def tick(self) -> list[str]:
         self.clock.advance(TICK_US)
-        return list(self.surroundings.listen(self.clock.utc_us()))
+        return list(self.world_model.listen(self.clock.utc_us()))
 
     def say_path(self, boot_id: int = 1) -> None:
         self.seq += 1
@@ -59,18 +59,18 @@ class Bench:
 
     @property
     def seen(self) -> int:
-        return len(self.surroundings.keep_outs(HERE, self.clock.utc_us(), 100_000, 25, Phase.TRACK))
+        return len(self.world_model.keep_outs(HERE, self.clock.utc_us(), 100_000, 25, Phase.TRACK))
 
     @property
     def rejected(self) -> dict[str, int]:
-        return dict(self.surroundings.refusals.by_reason)
+        return dict(self.world_model.refusals.by_reason)
 
     @property
     def unheard(self) -> list[dict[str, Any]]:
-        return [row for row in self.told if row["event"] == "unheard"]
+        return [row for row in self.events if row["event"] == "unheard"]
 
 
-def test_a_list_of_too_many_obstacles_leaves_the_known_one_and_is_said() -> None:
+def test_a_list_of_too_many_obstacles_is_refused_and_reported() -> None:
     bench = Bench()
     bench.set_obstacles(topics.MAX_OBSTACLES, 1)
     assert bench.seen == topics.MAX_OBSTACLES
@@ -78,22 +78,22 @@ def test_a_list_of_too_many_obstacles_leaves_the_known_one_and_is_said() -> None
         bench.set_obstacles(count, 2)
     assert bench.seen == topics.MAX_OBSTACLES
     assert bench.rejected == {"malformed": 2}
-    assert bench.surroundings.refusals.alert(bench.clock.utc_us()) == "obstacles of operator refused: malformed"
+    assert bench.world_model.refusals.alert(bench.clock.utc_us()) == "obstacles of operator refused: malformed"
 
 
-def test_as_many_obstacles_as_are_taken_in_cost_a_fraction_of_a_tick() -> None:
+def test_the_largest_list_of_obstacles_costs_a_fraction_of_a_tick() -> None:
     bench = Bench()
     bench.set_obstacles(topics.MAX_OBSTACLES, 1)
     took_ms = []
     for _ in range(20):
         began_s = time.perf_counter()
-        bench.surroundings.keep_outs(HERE, bench.clock.utc_us(), 100_000, 25, Phase.TRACK)
-        bench.surroundings.bodies(HERE, bench.clock.utc_us(), 0.1, 0.1)
+        bench.world_model.keep_outs(HERE, bench.clock.utc_us(), 100_000, 25, Phase.TRACK)
+        bench.world_model.bodies(HERE, bench.clock.utc_us(), 0.1, 0.1)
         took_ms.append((time.perf_counter() - began_s) * 1e3)
     assert min(took_ms) < 3.0, "of 20"
 
 
-def test_a_version_out_of_reach_does_not_shut_out_all_later_ones() -> None:
+def test_a_version_far_ahead_does_not_block_later_ones() -> None:
     bench = Bench()
     bench.set_obstacles(1, 7)
     bench.set_obstacles(3, 2**62)
@@ -107,8 +107,8 @@ def test_a_version_out_of_reach_does_not_shut_out_all_later_ones() -> None:
     assert bench.seen == 4
 
 
-def test_a_peer_that_is_refused_for_long_is_mute_kept_clear_of_at_any_height_and_named() -> None:
-    """On the bus, alive, and every path it says is stamped far in the future."""
+def test_a_peer_refused_for_long_counts_as_bus_loss_and_is_avoided_at_any_height() -> None:
+    """The peer is on the bus and alive, but every path it publishes has a stamp in the future."""
     bench = Bench()
     bench.say_path()
     bench.say_status(phase=int(Phase.TRACK))
@@ -119,21 +119,21 @@ def test_a_peer_that_is_refused_for_long_is_mute_kept_clear_of_at_any_height_and
         path = PredictedPath(1, 1, bench.seq, ahead, TICK_US, 0.0, np.tile(HERE, (5, 1)))
         bench.peer.publish(topics.PATH, topics.encode_path(path))
     utc_us = bench.clock.utc_us()
-    assert bench.surroundings.has_unresponsive_peer(utc_us)
-    (kept,) = bench.surroundings.keep_outs(HERE, utc_us, 100_000, 5, Phase.TRACK)
+    assert bench.world_model.has_unresponsive_peer(utc_us)
+    (kept,) = bench.world_model.keep_outs(HERE, utc_us, 100_000, 5, Phase.TRACK)
     assert kept.any_height and kept.radius_m > SeparationParams().radius_m + 0.9
-    assert bench.surroundings.refusals.alert(utc_us) == "path of agent-1 refused: future"
+    assert bench.world_model.refusals.alert(utc_us) == "path of agent-1 refused: future"
     assert bench.unheard == [{"event": "unheard", "agent": 1, "begins": True}]
-    assert [row["count"] for row in bench.told if row["event"] == "refused"] == [1, 51]
+    assert [row["count"] for row in bench.events if row["event"] == "refused"] == [1, 51]
     bench.say_path()
     bench.tick()
-    assert not bench.surroundings.has_unresponsive_peer(bench.clock.utc_us())
+    assert not bench.world_model.has_unresponsive_peer(bench.clock.utc_us())
     assert bench.unheard[1]["begins"] is False
     assert bench.unheard[1]["lasted_s"] == pytest.approx(2.0, abs=0.1)
 
 
 @pytest.mark.parametrize("why", ["gone", "done"])
-def test_who_is_gone_or_has_landed_is_not_called_unheard(why: str) -> None:
+def test_a_peer_that_died_or_landed_is_not_reported_unheard(why: str) -> None:
     bench = Bench()
     bench.say_path()
     bench.say_status(phase=int(Phase.DONE if why == "done" else Phase.TRACK))
@@ -145,36 +145,36 @@ def test_who_is_gone_or_has_landed_is_not_called_unheard(why: str) -> None:
     assert bench.unheard == []
 
 
-def test_statuses_are_believed_like_paths_and_nobody_gets_ready_in_the_future() -> None:
+def test_statuses_are_accepted_like_paths_and_future_ready_times_refused() -> None:
     bench = Bench()
     for _ in range(5):
         bench.seq += 10
         bench.say_status(phase=int(Phase.READY), ready_utc_us=7)
         for _ in range(10):
             bench.tick()
-    ready = bench.surroundings.peers()[1]
+    ready = bench.world_model.peers()[1]
     assert (ready.phase, ready.ready_utc_us, ready.alive) == (Phase.READY, 7, True)
     bench.say_status(phase=int(Phase.DONE), boot_id=STATUS.boot_id + 1)
     bench.say_status(phase=int(Phase.DONE), ticks=2**62)
     bench.say_status(phase=int(Phase.READY), ready_utc_us=bench.clock.utc_us() + 2_000_000)
     bench.tick()
-    assert bench.surroundings.peers()[1] == ready
+    assert bench.world_model.peers()[1] == ready
     assert bench.rejected == {"unconfirmed": 2, "future": 1}
 
 
-def test_a_status_by_somebody_elses_name_or_of_nobody_is_refused() -> None:
+def test_a_status_under_a_foreign_or_unknown_name_is_refused() -> None:
     bench = Bench()
     bench.say_status(agent=2)
     bench.operator.publish(topics.STATUS, topics.encode_message(STATUS))
     bench.peer.publish(topics.STATUS, b"?")
     bench.tick()
-    assert bench.surroundings.peers() == {}
+    assert bench.world_model.peers() == {}
     assert bench.rejected == {"identity": 2, "malformed": 1}
 
 
-def test_a_tick_takes_in_a_ring_of_each_sender_and_no_more() -> None:
+def test_a_tick_processes_at_most_one_ring_of_messages_per_sender() -> None:
     bench = Bench()
     for _ in range(100):
         bench.say_path(boot_id=bench.seq)
     bench.tick()
-    assert bench.surroundings.refusals.total + 1 == topics.PATH.ring
+    assert bench.world_model.refusals.total + 1 == topics.PATH.ring

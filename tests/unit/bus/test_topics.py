@@ -38,10 +38,10 @@ STATUS = topics.StatusMessage(
     separation_m=-1.0,
     tick_p99_ms=3.5,
     ticks=1000,
-    late_ticks=2,
-    path_age_ms=41.5,
+    deadline_misses=2,
+    plan_staleness_ms=41.5,
     solver_failed=1,
-    problem="plan residual",
+    active_alert="plan residual",
 )
 
 
@@ -259,6 +259,6 @@ def test_the_longest_good_message_of_every_topic_fits() -> None:
     message = TrajectoryMessage(0, 0, 0, 0, True, trajectory, Proposal(1, 0, 0, trajectory), acknowledged)
     assert len(encode_trajectory_message(message)) <= topics.TRAJECTORY.max_bytes
     assert TICK_DTYPE.itemsize + 12 * topics.MAX_POINTS <= topics.TICK.max_bytes
-    status = msgspec.structs.replace(STATUS, outcome="x" * 4000, problem="\u20ac" * 4000)
+    status = msgspec.structs.replace(STATUS, outcome="x" * 4000, active_alert="\u20ac" * 4000)
     assert len(encode_message(status)) <= topics.STATUS.max_bytes
     assert len(encode_message(topics.CommandMessage("resume", -1, 2**62))) <= topics.COMMAND.max_bytes

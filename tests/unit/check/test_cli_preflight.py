@@ -143,9 +143,9 @@ def test_command_lines_say_what_the_configuration_says(tmp_path: Path) -> None:
     assert viewer[viewer.index("--obstacles-json") + 1] == "[]"
 
 
-def status(phase: int = Phase.TRACK, separation_m: float = 1.25, problem: str = "") -> StatusMessage:
-    said = (Mode.FOLLOW, FlightMode.EXTERNAL, True, Landed.IN_AIR, 0, "", 0.1234, separation_m, 2.0, 100, 3, 20.0, 0)
-    return StatusMessage(0, 1, 1, phase, *said, problem)
+def status(phase: int = Phase.TRACK, separation_m: float = 1.25, active_alert: str = "") -> StatusMessage:
+    said = (Mode.TRACKING, FlightMode.EXTERNAL, True, Landed.IN_AIR, 0, "", 0.1234, separation_m, 2.0, 100, 3, 20.0, 0)
+    return StatusMessage(0, 1, 1, phase, *said, active_alert)
 
 
 def test_plain_lines_speak_on_changes_only() -> None:
@@ -157,7 +157,7 @@ def test_plain_lines_speak_on_changes_only() -> None:
     view.status = status(Phase.ARM)
     display.show([view])
     display.show([view])
-    view.status = status(Phase.TRACK, problem="wind")
+    view.status = status(Phase.TRACK, active_alert="wind")
     display.show([view])
     view.note = "dead"
     display.show([view])
@@ -178,16 +178,16 @@ def test_a_lost_terminal_does_not_end_the_flight() -> None:
 
 def test_table_cells() -> None:
     assert status_cells(AgentView(0, status())) == (
-        *("agent-0", "TRACK", "FOLLOW", "0.123", "1.25", "2.0", "3/100", "20"),
+        *("agent-0", "TRACK", "TRACKING", "0.123", "1.25", "2.0", "3/100", "20"),
         "",
     )
-    assert status_cells(AgentView(0, status(99, -1.0)))[1:5] == ("99", "FOLLOW", "0.123", "-")
+    assert status_cells(AgentView(0, status(99, -1.0)))[1:5] == ("99", "TRACKING", "0.123", "-")
     assert status_cells(AgentView(1))[-1] == "not heard yet"
 
 
 def test_what_an_agent_says_is_shown_as_it_is() -> None:
     stream = io.StringIO()
-    view = AgentView(0, status(problem="refused [/bold] [red]"))
+    view = AgentView(0, status(active_alert="refused [/bold] [red]"))
     Console(file=stream, width=200).print(status_table([view]))
     assert "refused [/bold] [red]" in stream.getvalue()
 
@@ -198,11 +198,11 @@ def test_what_an_agent_says_steers_no_terminal(capsys: pytest.CaptureFixture[str
     stream = io.StringIO()
     lines = PlainLines(stream)
     lines.say(hostile)
-    lines.show([AgentView(0, status(problem=hostile))])
-    Console(file=stream, width=200).print(status_table([AgentView(0, status(problem=hostile), note="")]))
+    lines.show([AgentView(0, status(active_alert=hostile))])
+    Console(file=stream, width=200).print(status_table([AgentView(0, status(active_alert=hostile), note="")]))
     LiveTable(Console(file=stream, force_terminal=False)).say(hostile)
-    print_statuses([AgentView(0, status(problem=hostile))])
-    print(attach.as_json({0: status(problem=hostile)}))
+    print_statuses([AgentView(0, status(active_alert=hostile))])
+    print(attach.as_json({0: status(active_alert=hostile)}))
     shown = stream.getvalue() + capsys.readouterr().out
     assert "DONE" in shown
     assert all(c.isprintable() or c in "\n\t" for c in shown)

@@ -1,4 +1,4 @@
-"""When an estimator's claimed accuracy may be judged: PX4's claims after boot, measured, must never be taken early."""
+"""Tests of when a reported accuracy is used: PX4's measured figures after boot must not be used early."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ PX4_AFTER_BOOT_S, PX4_CLAIM_M = [1.2, 2.2, 4.2, 9.0, 30.0], [14.1, 0.010, 0.073,
 
 
 def fed(claims: list[float | None], every_s: float = 1.0) -> AccuracyMonitor:
-    """A monitor that was told each claim for `every_s`, at 50 Hz."""
+    """Return a monitor updated at 50 Hz with each figure for `every_s`."""
     monitor, now_us = AccuracyMonitor(), 0
     for claim in claims:
         for _ in range(round(every_s * 50)):
@@ -20,7 +20,7 @@ def fed(claims: list[float | None], every_s: float = 1.0) -> AccuracyMonitor:
     return monitor
 
 
-def test_px4s_claims_after_boot_are_judged_only_where_they_stay() -> None:
+def test_px4s_accuracy_after_boot_is_used_only_once_settled() -> None:
     monitor = AccuracyMonitor()
     judged_s = None
     for k in range(50, 1500):
@@ -35,18 +35,18 @@ def test_px4s_claims_after_boot_are_judged_only_where_they_stay() -> None:
     assert 0.25 < worst_m < 0.3, "neither the 14 m of the first second nor the 0.01 m of the second"
 
 
-def test_a_constant_claim_is_judged_after_a_window_and_its_worst_counts() -> None:
+def test_a_constant_accuracy_is_used_after_a_window_by_its_largest_value() -> None:
     monitor = fed([0.30, 0.33, 0.29, 0.31, 0.30])
     assert monitor.unsettled(5 * SECOND) == ""
     assert monitor.worst_m == 0.33
     assert "settle" in fed([0.3, 0.3]).unsettled(2 * SECOND)
 
 
-def test_a_rising_claim_is_not_judged() -> None:
+def test_a_rising_accuracy_is_not_used() -> None:
     assert "0.90 m" in fed([0.1, 0.3, 0.5, 0.7, 0.9]).unsettled(5 * SECOND)
 
 
-def test_a_vehicle_that_tells_none_is_waited_for_only_a_while() -> None:
+def test_a_vehicle_that_reports_no_accuracy_is_waited_for_briefly() -> None:
     assert "tell" in fed([None]).unsettled(1 * SECOND)
     silent = fed([None] * 4)
     assert (silent.unsettled(4 * SECOND), silent.worst_m) == ("", None)

@@ -21,8 +21,8 @@ APART_M = BODY_M + PARAMS.margin_m
 HOVER = np.array([0.0, 0.0, GRAVITY_M_S2])
 
 
-def filtered(barrier: Barrier, virtual: Array, start: Start, bodies: list[Body]) -> Array | None:
-    return barrier.filtered(virtual, start, STILL, 0.5, bodies)
+def filtered(barrier: Barrier, virtual_control: Array, start: Start, bodies: list[Body]) -> Array | None:
+    return barrier.filtered(virtual_control, start, STILL, 0.5, bodies)
 
 
 def start(pos: Array, vel: Array, held: Array = HOVER) -> Start:

@@ -16,7 +16,7 @@ from swarmctl.control.commit import trajectory_planner
 from swarmctl.control.commit.protocol import Commitments
 from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference, Situation
 from swarmctl.control.mpc.swarm_mpc import MpcParams
-from swarmctl.control.reference.mission import glide_to
+from swarmctl.control.reference.mission import quintic_to
 from swarmctl.core.trajectory import Trajectory, ending_at_rest, resting
 from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
 from swarmctl.core.types import Array, Sampled
@@ -93,7 +93,7 @@ class Crowd:
     def wanted(self, agent: int, offsets_s: Array) -> tuple[Array, Array]:
         goal = self.starts[agent] * np.array([-1.0, -1.0, 1.0])
         t_s = (self.now_us - UTC_US) * 1e-6 + offsets_s
-        return glide_to(self.starts[agent], np.zeros(3), goal, 1.5, 1.0).sample(t_s)
+        return quintic_to(self.starts[agent], np.zeros(3), goal, 1.5, 1.0).sample(t_s)
 
     def committed_m(self) -> float:
         """Smallest distance, from now to their ends, of any two trajectories that are followed now."""
@@ -254,7 +254,7 @@ def test_plans_along_a_path_are_linearised_around_it(follows_path: bool, passes:
     """The last plan leads north before a wall, the path south through a gap: rows of one exclude the other."""
     small = SeparationParams(radius_m=0.3, body_m=0.15)
     agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), small, 5, lambda: 0)
-    to_north = glide_to(np.array([0.0, 0.0, -2.0]), np.zeros(3), np.array([0.1, 0.9, -2.0]), 1.0, 1.0)
+    to_north = quintic_to(np.array([0.0, 0.0, -2.0]), np.zeros(3), np.array([0.1, 0.9, -2.0]), 1.0, 1.0)
     agent.committed = ending_at_rest(UTC_US, 100_000, *to_north.sample(np.arange(0.0, 2.1, 0.1)), 1.5)
     posts = [np.array([0.8, y_m, -2.0]) for y_m in (0.3, 0.6, 0.9, 1.2)]
     wall = [KeepOut(np.tile(post, (agent.steps + 1, 1)), 0.375, 0.275, True, -1) for post in posts]

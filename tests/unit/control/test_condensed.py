@@ -27,9 +27,9 @@ FIELDS = ("normal", "offset_m", "stop_s", "stop_offset_m")
 
 
 def mpc(
-    *axes: Axis, horizon: Horizon = HORIZON, slots: int = 0, relax_01: float = 1.0, qp: QpParams = EXACT
+    *axes: Axis, horizon: Horizon = HORIZON, max_keep_outs: int = 0, relax_01: float = 1.0, qp: QpParams = EXACT
 ) -> CondensedMpc:
-    return CondensedMpc(axes, horizon, slots, relax_01, Penalties(), qp, lambda: 0)
+    return CondensedMpc(axes, horizon, max_keep_outs, relax_01, Penalties(), qp, lambda: 0)
 
 
 def same_gain(steps: int, axes: int) -> Array:
@@ -222,7 +222,7 @@ def test_half_spaces_against_a_dense_solver(
     euler: bool, normal: tuple[float, float], offset_m: float, stop_s: float, gain: Array
 ) -> None:
     horizon = Horizon(control=5, prediction=25, dt_s=0.02, euler=euler)
-    problem = mpc(AXIS, replace(AXIS, q_pos=1.0), horizon=horizon, slots=2)
+    problem = mpc(AXIS, replace(AXIS, q_pos=1.0), horizon=horizon, max_keep_outs=2)
     pos, vel, u_prev, ref = np.array([0.0, 0.0]), np.array([0.2, 0.1]), np.array([0.01, -0.02]), np.array([0.5, 0.3])
     spaces = wall(normal, offset_m, 25, stop_s)
     tick = (pos, vel, u_prev, np.stack([gain, gain], axis=1), np.zeros(2), np.tile(ref, (25, 1)), np.zeros((25, 2)))
@@ -241,14 +241,14 @@ def test_half_spaces_against_a_dense_solver(
 
 
 def test_rows_are_at_the_end_of_the_horizon_and_none_before_it_can_be_influenced() -> None:
-    problem = mpc(AXIS, AXIS, slots=1)
+    problem = mpc(AXIS, AXIS, max_keep_outs=1)
     assert problem._checked[-1] == 39
     assert problem._checked[0] >= 6
     assert np.diff(problem._checked).max() * HORIZON.dt_s <= 0.081  # between samples the certificate looks
 
 
 def test_rows_that_cannot_be_met_give_slack_and_not_failure() -> None:
-    problem = mpc(AXIS, AXIS, slots=2, qp=QpParams())
+    problem = mpc(AXIS, AXIS, max_keep_outs=2, qp=QpParams())
     still, origin = np.zeros((40, 2)), np.zeros(2)
     north, south = wall((1.0, 0.0), 0.1, 40), wall((-1.0, 0.0), 0.1, 40)  # north of 0.1 m and south of -0.1 m
     both = HalfSpaces(*(np.concatenate([getattr(w, name) for w in (north, south)]) for name in FIELDS))
@@ -261,7 +261,7 @@ def test_rows_that_cannot_be_met_give_slack_and_not_failure() -> None:
 
 @pytest.mark.parametrize("ref_m", [1.0, 10.0, 50.0])
 def test_no_reference_is_worth_any_slack_where_the_rows_can_be_met(ref_m: float) -> None:
-    problem = mpc(AXIS, AXIS, slots=1, qp=QpParams())
+    problem = mpc(AXIS, AXIS, max_keep_outs=1, qp=QpParams())
     origin, reference = np.zeros(2), np.tile([ref_m, 0.0], (40, 1))
     spaces = wall((-1.0, 0.0), -0.1, 40)  # stay south of 0.1 m
     solution = problem.solve(
@@ -272,7 +272,7 @@ def test_no_reference_is_worth_any_slack_where_the_rows_can_be_met(ref_m: float)
 
 
 def test_relaxed_rows_ask_for_no_more_than_can_be_reached() -> None:
-    problem = mpc(AXIS, AXIS, slots=1, relax_01=0.9, qp=QpParams())
+    problem = mpc(AXIS, AXIS, max_keep_outs=1, relax_01=0.9, qp=QpParams())
     still, origin = np.zeros((40, 2)), np.zeros(2)
     spaces = wall((1.0, 0.0), 2.0, 40)
     solution = problem.solve(AxesProblem(origin, origin, origin, same_gain(40, 2), origin, still, still), spaces)
@@ -303,7 +303,7 @@ ENDS = {
     "z six moves": (VERTICAL, Horizon(6, 40, 0.02, False), 0),
     "x position": (replace(AXIS, terminal="position"), Horizon(6, 20, 0.02, True), 0),
     "x rest": (replace(AXIS, terminal="position_velocity"), Horizon(6, 40, 0.02, False), 0),
-    "x rest, slots": (replace(AXIS, terminal="position_velocity"), Horizon(6, 20, 0.02, False), 2),
+    "x rest, keep-outs": (replace(AXIS, terminal="position_velocity"), Horizon(6, 20, 0.02, False), 2),
 }
 
 
@@ -341,12 +341,16 @@ def least_gap(
 def test_ends_are_met_exactly_whenever_any_increments_can_and_reported_when_none_can(
     name: str, solver: Literal["osqp", "daqp"]
 ) -> None:
-    axis, horizon, slots = ENDS[name]
-    problem = mpc(axis, horizon=horizon, slots=slots, qp=QpParams(solver=solver))  # the settings that are flown
+    axis, horizon, max_keep_outs = ENDS[name]
+    problem = mpc(
+        axis, horizon=horizon, max_keep_outs=max_keep_outs, qp=QpParams(solver=solver)
+    )  # the settings that are flown
     rng = np.random.default_rng([0, len(name), 4])
     gain, within = -axis.gain_m_s2, (0.97 if solver == "osqp" else 1.0)  # a first-order solver, thin feasible sets
     met = missed = 0
-    near_m, near_m_s = (1e-4, 1e-3) if solver == "daqp" or slots == 0 else (1e-3, 5e-3)  # there eps is 3e-3 a row
+    near_m, near_m_s = (
+        (1e-4, 1e-3) if solver == "daqp" or max_keep_outs == 0 else (1e-3, 5e-3)
+    )  # there eps is 3e-3 a row
     for k in range(60):
         pos, vel, ref = float(rng.normal(0, 0.3)), float(rng.normal(0, 0.5)), rng.normal(0.0, 0.5, 2)
         u_prev = axis.u_rest + float(rng.uniform(-0.3, 0.3)) * (axis.u_max - axis.u_rest)

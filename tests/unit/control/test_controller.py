@@ -25,9 +25,14 @@ Kind = Literal["dmpc", "dmpc3", "mpc", "pid", "open_loop"]
 PLANNING: list[Kind] = ["dmpc", "dmpc3", "mpc"]
 
 
-def make(kind: Kind, slots: int = 2, **params: Any) -> Controller:
+def make(kind: Kind, max_keep_outs: int = 2, **params: Any) -> Controller:
     return make_controller(
-        ControllerParams(kind=kind, **params), VehicleModelParams(), SeparationParams(), 0, slots, time.perf_counter_ns
+        ControllerParams(kind=kind, **params),
+        VehicleModelParams(),
+        SeparationParams(),
+        0,
+        max_keep_outs,
+        time.perf_counter_ns,
     )
 
 
@@ -46,8 +51,8 @@ def near(controller: Controller, place: Array) -> KeepOut:
 def check(controller: Controller, plan: Plan) -> None:
     steps = controller.steps
     assert plan.pos_ned_m.shape == plan.vel_ned_m_s.shape == (steps + 1, 3)
-    assert plan.virtual.shape == (steps, 3)
-    for values in (plan.pos_ned_m, plan.vel_ned_m_s, plan.virtual):
+    assert plan.virtual_control.shape == (steps, 3)
+    for values in (plan.pos_ned_m, plan.vel_ned_m_s, plan.virtual_control):
         assert np.isfinite(values).all()
     assert (plan.t0_us, plan.dt_us) == (7_000_000, controller.dt_us)
     np.testing.assert_array_equal(plan.pos_ned_m[0], HERE)
@@ -65,7 +70,7 @@ def test_every_kind_plans_hovering(kind: Kind) -> None:
     check(controller, plan)
     assert plan.status is PlanStatus.OK
     wanted = [0.0, 0.0, 0.0 if kind == "open_loop" else G]  # open loop is free fall (thesis 1.6)
-    np.testing.assert_allclose(plan.virtual, np.tile(wanted, (controller.steps, 1)), atol=5e-3)
+    np.testing.assert_allclose(plan.virtual_control, np.tile(wanted, (controller.steps, 1)), atol=5e-3)
 
 
 @pytest.mark.parametrize(
@@ -97,7 +102,7 @@ def test_every_horizon_a_configuration_allows_can_be_flown(
 
 @pytest.mark.parametrize("kind", ["dmpc", "dmpc3"])
 def test_without_slots_neighbours_are_still_certified(kind: Kind) -> None:
-    controller = make(kind, slots=0)
+    controller = make(kind, max_keep_outs=0)
     plan = controller.plan(hover(controller, (0.5, 0.0, 0.0), near(controller, HERE + np.array([0.85, 0.0, 0.0]))))
     check(controller, plan)
     assert plan.status is PlanStatus.NOT_CERTIFIED
@@ -111,11 +116,13 @@ def test_alone_keep_outs_change_nothing_at_all(guessed: bool) -> None:
     asked = replace(hover(alone, (0.5, 0.0, 0.0), neighbour), guess_ned_m=guess)
     plan, same = alone.plan(asked), free.plan(replace(asked, keep_outs=()))
     assert plan.status is PlanStatus.OK
-    np.testing.assert_array_equal(plan.virtual, same.virtual)
+    np.testing.assert_array_equal(plan.virtual_control, same.virtual_control)
     np.testing.assert_array_equal(plan.pos_ned_m, same.pos_ned_m)
     for kind in ("dmpc", "dmpc3"):
         kept = make(kind)
-        assert kept.plan(asked).virtual[5, 0] > 0.02 > -0.02 > plan.virtual[5, 0]  # away from it, not through it
+        assert (
+            kept.plan(asked).virtual_control[5, 0] > 0.02 > -0.02 > plan.virtual_control[5, 0]
+        )  # away from it, not through it
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -126,7 +133,7 @@ def test_the_problem_is_not_modified(kind: Kind) -> None:
     arrays = [
         asked.start.pos_ned_m,
         asked.start.vel_ned_m_s,
-        asked.start.virtual,
+        asked.start.virtual_control,
         asked.reference.pos_ned_m,
         asked.reference.vel_ned_m_s,
         asked.keep_outs[0].pos_ned_m,
@@ -146,7 +153,7 @@ def test_two_of_a_kind_give_the_same_bits(kind: Kind) -> None:
     one, two = make(kind), make(kind)
     for offset in ((0.5, -0.2, -0.3), (3.0, 1.0, -8.0), (0.0, 0.0, 0.0)):
         plans = [c.plan(hover(c, offset, near(c, HERE + np.array([1.3, 0.0, 0.0])))) for c in (one, two)]
-        np.testing.assert_array_equal(plans[0].virtual, plans[1].virtual)
+        np.testing.assert_array_equal(plans[0].virtual_control, plans[1].virtual_control)
         np.testing.assert_array_equal(plans[0].pos_ned_m, plans[1].pos_ned_m)
 
 
@@ -158,38 +165,42 @@ def test_after_a_reset_the_past_is_forgotten(kind: Kind) -> None:
         used.plan(hover(used, offset))
     used.reset()
     plans = [c.plan(hover(c, (0.2, 0.1, -0.1))) for c in (used, fresh)]
-    np.testing.assert_allclose(plans[0].virtual, plans[1].virtual, atol=1e-6)
+    np.testing.assert_allclose(plans[0].virtual_control, plans[1].virtual_control, atol=1e-6)
     np.testing.assert_allclose(plans[0].pos_ned_m, plans[1].pos_ned_m, atol=1e-6)
 
 
 def test_a_pid_remembers_until_it_is_reset() -> None:
     pid = make("pid", pid={"x": (-0.25, -0.1, -0.3), "y": (0.05, 0.0, 0.45), "z": (-3.5, -0.1, -4.0)})
-    first = pid.plan(hover(pid, (1.0, 0.0, -1.0))).virtual[0]
-    kick = pid.plan(hover(pid, (2.0, 0.0, -1.0))).virtual[0]  # the derivative of the error sees the reference jump
+    first = pid.plan(hover(pid, (1.0, 0.0, -1.0))).virtual_control[0]
+    kick = pid.plan(hover(pid, (2.0, 0.0, -1.0))).virtual_control[
+        0
+    ]  # the derivative of the error sees the reference jump
     assert kick[0] < first[0] - 0.1
-    wound = pid.plan(hover(pid, (2.0, 0.0, -1.0))).virtual[0]
+    wound = pid.plan(hover(pid, (2.0, 0.0, -1.0))).virtual_control[0]
     pid.reset()
-    again = pid.plan(hover(pid, (1.0, 0.0, -1.0))).virtual[0]
+    again = pid.plan(hover(pid, (1.0, 0.0, -1.0))).virtual_control[0]
     np.testing.assert_array_equal(again, first)
     assert (wound != first).any()
 
 
-@pytest.mark.parametrize(("axis", "virtual"), [(0, 0), (1, 1), (2, 2)])
-def test_pid_signs_and_feed_forward(axis: int, virtual: int) -> None:
+@pytest.mark.parametrize(("axis", "entry"), [(0, 0), (1, 1), (2, 2)])
+def test_pid_signs_and_feed_forward(axis: int, entry: int) -> None:
     offset = [0.0, 0.0, 0.0]
     offset[axis] = 0.1
     level = np.array([0.0, 0.0, G])
     pid = make("pid")
-    towards = pid.plan(hover(pid, (offset[0], offset[1], offset[2]))).virtual[0] - level
-    assert towards[virtual] < 0.0  # north, east, down: x'' = -f u_x, y'' = -f u_y, z'' = g - f
+    towards = pid.plan(hover(pid, (offset[0], offset[1], offset[2]))).virtual_control[0] - level
+    assert towards[entry] < 0.0  # north, east, down: x'' = -f u_x, y'' = -f u_y, z'' = g - f
     ahead = make("pid", pid=PidParams(accel_feed_forward=1.0))
     asked = hover(ahead)
     speed = asked.reference.vel_ned_m_s.copy()
     speed[1:, axis] = 0.5 * 0.02  # the reference accelerates by 0.5 m/s2
     asked = replace(asked, reference=replace(asked.reference, vel_ned_m_s=speed))
-    lean = ahead.plan(asked).virtual[0] - level
-    assert lean[virtual] == pytest.approx(-0.5 / (1.0 if axis == 2 else G), rel=1e-3)
-    np.testing.assert_allclose(make("pid").plan(asked).virtual[0], level, atol=1e-9)  # off by default, as in the thesis
+    lean = ahead.plan(asked).virtual_control[0] - level
+    assert lean[entry] == pytest.approx(-0.5 / (1.0 if axis == 2 else G), rel=1e-3)
+    np.testing.assert_allclose(
+        make("pid").plan(asked).virtual_control[0], level, atol=1e-9
+    )  # off by default, as in the thesis
 
 
 def test_the_thesis_bounds_with_negative_thrust_are_allowed() -> None:
@@ -198,4 +209,4 @@ def test_the_thesis_bounds_with_negative_thrust_are_allowed() -> None:
         controller = make(kind, mpc=mpc)
         plan = controller.plan(hover(controller, (0.0, 0.0, 50.0)))
         check(controller, plan)
-        assert plan.virtual[:, 2].min() < -1.0
+        assert plan.virtual_control[:, 2].min() < -1.0

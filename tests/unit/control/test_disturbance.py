@@ -1,4 +1,4 @@
-"""What the observer finds: the hover thrust of a vehicle it was told wrong about, a constant wind, and their signs."""
+"""Tests of the observer: hover thrust of a wrongly modelled vehicle, constant wind, and the signs of both."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def sample(t_us: int, vel: Array, q_nb: Array = LEVEL) -> VehicleState:
 def observe(
     observer: DisturbanceObserver, seconds: float, accel: Array, thrust_01: float, q_nb: Array = LEVEL, from_us: int = 0
 ) -> None:
-    """A vehicle that truly accelerates by `accel` while the given thrust acts."""
+    """Observe a vehicle that accelerates by `accel` while the given thrust acts."""
     for k in range(round(seconds * 1e6) // DT_US + 1):
         observer.update(sample(from_us + k * DT_US, accel * k * DT_US * 1e-6, q_nb), thrust_01)
 
@@ -51,7 +51,7 @@ def test_a_wrong_hover_thrust_converges_and_leaves_no_disturbance_behind(believe
     np.testing.assert_allclose(observer.estimate.disturbance_ned_m_s2, 0.0, atol=0.05)
 
 
-def test_a_vehicle_heavier_than_believed_sinks_until_hover_thrust_grows() -> None:
+def test_a_vehicle_heavier_than_modelled_sinks_until_hover_thrust_grows() -> None:
     observer = DisturbanceObserver(DisturbanceParams(), 0.5)
     # with the weight of 0.6 at thrust 0.5: down by g (1 - 5/6)
     observe(observer, 1.0, np.array([0.0, 0.0, G / 6]), 0.5)
@@ -82,7 +82,7 @@ def test_a_vehicle_that_leans_and_does_not_move_stands_against_a_wind() -> None:
     np.testing.assert_allclose(observer.estimate.disturbance_ned_m_s2[:2], [-G * math.tan(0.2), 0.0], atol=0.02)
 
 
-def test_what_is_believed_is_limited() -> None:
+def test_estimates_are_limited() -> None:
     observer = DisturbanceObserver(DisturbanceParams(limit_m_s2=1.0), 0.5)
     observe(observer, 20.0, np.array([6.0, -6.0, 9.0]), 0.5)
     assert np.abs(observer.estimate.disturbance_ned_m_s2[:2]).max() <= 1.0
@@ -120,7 +120,7 @@ def test_the_autopilots_own_hover_thrust_is_taken_over_slowly_and_within_reason(
     assert observer.estimate.hover_thrust_01 == pytest.approx(0.2, abs=1e-3)  # 0.4 of the first guess at least
 
 
-def test_switched_off_it_believes_what_it_was_told() -> None:
+def test_disabled_it_keeps_the_configured_values() -> None:
     observer = DisturbanceObserver(DisturbanceParams(enabled=False), 0.5)
     observe(observer, 2.0, np.array([1.0, 0.0, 1.0]), 0.5)
     observer.learn_hover(0.9)

@@ -1,4 +1,4 @@
-"""Every row of the failsafe table, its limits, and which row wins when several apply."""
+"""Tests of every row of the failsafe table, its limits, and the precedence of rows."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from swarmctl.control.phases.failsafe import FailsafeParams, judge
+from swarmctl.control.phases.failsafe import FailsafeParams, decide
 from swarmctl.core.types import FlightMode, Health, Landed, Mode, Phase, PlanStatus
 
 PARAMS = FailsafeParams()  # state 0.2 s, replay 0.4 s, hold 5 s, rest 0.2 m/s
@@ -23,23 +23,24 @@ GOOD = Health(
     speed_m_s=1.0,
     phase=Phase.TRACK,
     had_control=True,
-    yielded=False,
+    pilot_override=False,
 )
 BAD_PLANS = [s for s in PlanStatus if s is not PlanStatus.OK]
 
 
 def mode_of(**changes: Any) -> Mode:
-    return judge(replace(GOOD, **changes), PARAMS).mode
+    return decide(replace(GOOD, **changes), PARAMS).mode
 
 
-def test_all_well_is_followed_and_before_the_autopilot_follows_it_is_streamed() -> None:
-    assert mode_of() is Mode.FOLLOW
-    assert mode_of(had_control=False) is Mode.STREAM
-    assert mode_of(had_control=False, mode=FlightMode.HOLD) is Mode.STREAM
+def test_a_good_plan_is_tracked_and_primed_before_the_autopilot_follows() -> None:
+    assert mode_of() is Mode.TRACKING
+    assert mode_of(had_control=False) is Mode.PRIMING
+    assert mode_of(had_control=False, mode=FlightMode.HOLD) is Mode.PRIMING
 
 
 @pytest.mark.parametrize(
-    ("age_us", "mode"), [(-1, Mode.BLIND), (0, Mode.FOLLOW), (200_000, Mode.FOLLOW), (200_001, Mode.BLIND)]
+    ("age_us", "mode"),
+    [(-1, Mode.STATE_STALE), (0, Mode.TRACKING), (200_000, Mode.TRACKING), (200_001, Mode.STATE_STALE)],
 )
 def test_own_state_older_than_200_ms_sends_nothing(age_us: int, mode: Mode) -> None:
     assert mode_of(state_age_us=age_us) is mode
@@ -48,18 +49,18 @@ def test_own_state_older_than_200_ms_sends_nothing(age_us: int, mode: Mode) -> N
 @pytest.mark.parametrize("phase", list(Phase))
 def test_the_autopilot_flies_outside_the_mission(phase: Phase) -> None:
     ours = phase in (Phase.GOTO_START, Phase.READY, Phase.TRACK, Phase.GOTO_LAND)
-    assert mode_of(phase=phase) is (Mode.FOLLOW if ours else Mode.IDLE)
+    assert mode_of(phase=phase) is (Mode.TRACKING if ours else Mode.IDLE)
 
 
 @pytest.mark.parametrize("mode", [m for m in FlightMode if m is not FlightMode.EXTERNAL])
-def test_a_pilot_or_autopilot_that_leaves_offboard_is_yielded_to(mode: FlightMode) -> None:
-    assert mode_of(mode=mode) is Mode.YIELD
+def test_leaving_offboard_is_a_pilot_override(mode: FlightMode) -> None:
+    assert mode_of(mode=mode) is Mode.PILOT_OVERRIDE
 
 
 @pytest.mark.parametrize("change", [{"armed": False}, {"autopilot_failsafe": True}])
-def test_disarming_and_the_autopilots_failsafe_are_yielded_to(change: dict[str, Any]) -> None:
-    assert mode_of(**change) is Mode.YIELD
-    assert mode_of(had_control=False, **change) is Mode.STREAM
+def test_disarming_and_the_autopilots_failsafe_are_an_override(change: dict[str, Any]) -> None:
+    assert mode_of(**change) is Mode.PILOT_OVERRIDE
+    assert mode_of(had_control=False, **change) is Mode.PRIMING
 
 
 @pytest.mark.parametrize("status", BAD_PLANS)
@@ -77,7 +78,7 @@ def test_the_ladder_after_a_bad_plan(status: PlanStatus) -> None:
     assert mode_of(**old, speed_m_s=9.0, planless_us=5_400_001) is Mode.LAND
 
 
-def test_a_plan_that_is_from_the_future_by_the_delay_is_still_young() -> None:
+def test_a_plan_that_begins_one_delay_ahead_is_recent() -> None:
     assert mode_of(plan_status=PlanStatus.RESIDUAL, last_good_plan_age_us=60_000) is Mode.REPLAY
 
 
@@ -89,28 +90,31 @@ def test_a_bad_plan_is_never_flown_whoever_has_control(status: PlanStatus) -> No
                 flown = mode_of(
                     had_control=had_control, plan_status=status, last_good_plan_age_us=age_us, planless_us=planless_us
                 )
-                assert flown not in (Mode.FOLLOW, Mode.STREAM)
+                assert flown not in (Mode.TRACKING, Mode.PRIMING)
 
 
 @pytest.mark.parametrize(
     ("changes", "mode"),
     [
-        # blind before idle, yield and plans
-        ({"state_age_us": -1, "phase": Phase.STANDBY}, Mode.BLIND),
-        ({"state_age_us": 300_000, "mode": FlightMode.MANUAL}, Mode.BLIND),
-        ({"state_age_us": 300_000, "plan_status": PlanStatus.NONE}, Mode.BLIND),
-        # who has yielded stays so in every phase, but does not see without a state
-        ({"yielded": True, "had_control": False}, Mode.YIELD),
-        ({"yielded": True, "had_control": False, "phase": Phase.LAND}, Mode.YIELD),
-        ({"yielded": True, "had_control": False, "plan_status": PlanStatus.NONE, "planless_us": 10**9}, Mode.YIELD),
-        ({"yielded": True, "state_age_us": 300_000}, Mode.BLIND),
-        # idle before yield: landing by the autopilot is not a take-over
+        # a stale state before idle, override and plans
+        ({"state_age_us": -1, "phase": Phase.STANDBY}, Mode.STATE_STALE),
+        ({"state_age_us": 300_000, "mode": FlightMode.MANUAL}, Mode.STATE_STALE),
+        ({"state_age_us": 300_000, "plan_status": PlanStatus.NONE}, Mode.STATE_STALE),
+        # an override lasts through every phase; a stale state comes first
+        ({"pilot_override": True, "had_control": False}, Mode.PILOT_OVERRIDE),
+        ({"pilot_override": True, "had_control": False, "phase": Phase.LAND}, Mode.PILOT_OVERRIDE),
+        (
+            {"pilot_override": True, "had_control": False, "plan_status": PlanStatus.NONE, "planless_us": 10**9},
+            Mode.PILOT_OVERRIDE,
+        ),
+        ({"pilot_override": True, "state_age_us": 300_000}, Mode.STATE_STALE),
+        # idle before override: landing by the autopilot is no take-over
         ({"phase": Phase.LAND, "mode": FlightMode.LAND}, Mode.IDLE),
         ({"phase": Phase.DONE, "armed": False}, Mode.IDLE),
-        # yield before everything about plans
-        ({"armed": False, "plan_status": PlanStatus.SOLVER_FAILED}, Mode.YIELD),
-        ({"mode": FlightMode.RTL, "plan_status": PlanStatus.NONE, "planless_us": 10**9}, Mode.YIELD),
-        # a young certified plan before landing, landing before braking
+        # override before everything about plans
+        ({"armed": False, "plan_status": PlanStatus.SOLVER_FAILED}, Mode.PILOT_OVERRIDE),
+        ({"mode": FlightMode.RTL, "plan_status": PlanStatus.NONE, "planless_us": 10**9}, Mode.PILOT_OVERRIDE),
+        # a recent certified plan before landing, landing before braking
         ({"plan_status": PlanStatus.NONE, "last_good_plan_age_us": 0, "planless_us": 10**9}, Mode.REPLAY),
         ({"plan_status": PlanStatus.NONE, "last_good_plan_age_us": -1, "planless_us": 10**9}, Mode.LAND),
     ],
@@ -119,14 +123,14 @@ def test_order_of_precedence(changes: dict[str, Any], mode: Mode) -> None:
     assert mode_of(**changes) is mode
 
 
-def test_every_judgement_says_why() -> None:
+def test_every_decision_has_a_reason() -> None:
     reasons = {
-        judge(replace(GOOD, **change), PARAMS).reason
+        decide(replace(GOOD, **change), PARAMS).reason
         for change in (
             {},
             {"state_age_us": -1},
             {"phase": Phase.ARM},
-            {"yielded": True},
+            {"pilot_override": True},
             {"armed": False},
             {"plan_status": PlanStatus.NONE},
             {"plan_status": PlanStatus.NONE, "last_good_plan_age_us": -1},

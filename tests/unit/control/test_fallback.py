@@ -1,4 +1,4 @@
-"""Braking without a plan: within a distance that can be stated, with tilts and turns a vehicle can follow."""
+"""Tests of the brake-and-hold plan: stopping distance, and tilts and rates that a vehicle can follow."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from swarmctl.control.fallback import rest_plan
+from swarmctl.control.fallback import brake_and_hold_plan
 from swarmctl.control.lag import Lag
 from swarmctl.control.model import acceleration
 from swarmctl.control.mpc.problem import Start
@@ -28,7 +28,7 @@ def start(
 def brake(
     vel: tuple[float, ...], at: Array | None = None, wind: Array = NO_WIND, tilt: tuple[float, ...] = (0.0, 0.0)
 ) -> Plan:
-    return rest_plan(start(vel, tilt=tilt), at, wind, None, DT_US, STEPS)
+    return brake_and_hold_plan(start(vel, tilt=tilt), at, wind, None, DT_US, STEPS)
 
 
 @pytest.mark.parametrize("speed_m_s", [0.5, 1.0, 2.5, 5.0])
@@ -44,7 +44,7 @@ def test_stops_within_braking_distance_and_the_distance_lost_to_tilting(speed_m_
 
 def test_braking_pushes_against_the_motion() -> None:
     plan = brake((2.0, -1.0, 0.5))
-    wanted = acceleration(plan.virtual[20])
+    wanted = acceleration(plan.virtual_control[20])
     assert wanted[0] < 0.0 < wanted[1]
     assert wanted[2] < 0.0  # sinking is braked upwards
     assert plan.status is PlanStatus.NONE
@@ -53,7 +53,7 @@ def test_braking_pushes_against_the_motion() -> None:
 @pytest.mark.parametrize("tilt", [(0.0, 0.0), (-0.25, 0.1), (0.3, 0.3)])
 def test_slew_of_the_tilt_is_respected_from_the_tilt_now_held(tilt: tuple[float, float]) -> None:
     plan = brake((5.0, -5.0, 0.0), tilt=tilt)
-    tilts = np.vstack([tilt, plan.virtual[:, :2]])
+    tilts = np.vstack([tilt, plan.virtual_control[:, :2]])
     assert np.abs(np.diff(tilts, axis=0)).max() <= 2.5 * DT_S + 1e-12
 
 
@@ -61,18 +61,18 @@ def test_acceleration_is_bounded_and_thrust_finite() -> None:
     plan = brake((30.0, -30.0, 10.0))
     accel = np.diff(plan.vel_ned_m_s, axis=0) / DT_S
     assert np.abs(accel).max() <= 3.0 + 0.3  # the slewed tilt meets the unslewed thrust
-    assert np.isfinite(plan.virtual).all()
-    assert (plan.virtual[:, 2] > 5.0).all()
-    assert np.hypot(plan.virtual[:, 0], plan.virtual[:, 1]).max() < math.sin(0.6)
+    assert np.isfinite(plan.virtual_control).all()
+    assert (plan.virtual_control[:, 2] > 5.0).all()
+    assert np.hypot(plan.virtual_control[:, 0], plan.virtual_control[:, 1]).max() < math.sin(0.6)
 
 
-def test_the_shared_path_is_the_motion_the_commands_cause() -> None:
+def test_the_published_path_is_the_motion_the_commands_cause() -> None:
     wind = np.array([0.5, -0.8, 0.3])
     plan = brake((3.0, -1.0, 0.5), wind=wind, tilt=(0.1, 0.05))
     pos, vel = plan.pos_ned_m[0].copy(), plan.vel_ned_m_s[0].copy()
     worst = 0.0
     for k in range(STEPS):
-        accel = acceleration(plan.virtual[k]) + wind
+        accel = acceleration(plan.virtual_control[k]) + wind
         pos, vel = pos + DT_S * vel + 0.5 * DT_S**2 * accel, vel + DT_S * accel
         worst = max(worst, float(np.abs(pos - plan.pos_ned_m[k + 1])[:2].max()))
     assert worst < 1e-9
@@ -87,16 +87,16 @@ def test_returns_to_the_place_to_hold_and_stays() -> None:
 
 
 @pytest.mark.parametrize("wind", [(1.5, 0.0, 0.0), (-0.5, 2.0, 0.0), (0.0, 0.0, 1.0)])
-def test_a_known_wind_is_leant_against(wind: tuple[float, ...]) -> None:
+def test_a_known_wind_is_compensated(wind: tuple[float, ...]) -> None:
     plan = brake((0.0, 0.0, 0.0), at=np.array([0.0, 0.0, -5.0]), wind=np.array(wind))
-    np.testing.assert_allclose(acceleration(plan.virtual[-1]), -np.array(wind), atol=0.02)
+    np.testing.assert_allclose(acceleration(plan.virtual_control[-1]), -np.array(wind), atol=0.02)
     assert np.abs(plan.pos_ned_m - [0.0, 0.0, -5.0]).max() < 0.15
 
 
 def test_at_rest_on_its_place_nothing_moves() -> None:
     plan = brake((0.0, 0.0, 0.0), at=np.array([0.0, 0.0, -5.0]))
     np.testing.assert_allclose(plan.pos_ned_m, np.tile([0.0, 0.0, -5.0], (STEPS + 1, 1)))
-    np.testing.assert_allclose(plan.virtual, np.tile([0.0, 0.0, 9.81], (STEPS, 1)))
+    np.testing.assert_allclose(plan.virtual_control, np.tile([0.0, 0.0, 9.81], (STEPS, 1)))
     assert (plan.t0_us, plan.dt_us) == (1_000_000, DT_US)
 
 
@@ -109,16 +109,16 @@ SLOW = Lag(4.0, 0.8)
 def flown(
     believed: Lag | None, true: Lag, vel: tuple[float, ...], at: Array | None, seconds: float
 ) -> tuple[Array, Array]:
-    """Positions and velocities (T, 3) of a vehicle with a lag that flies the first command of a new plan each tick."""
+    """Return positions, velocities (T, 3) of a lagging vehicle that flies the first command of each tick's plan."""
     pos, v, tilt, rate, commanded = np.zeros(3), np.array(vel), np.zeros(2), np.zeros(2), np.zeros(2)
     path, speeds = [], []
     for _ in range(round(seconds / DT_S)):
         begin = Start(0, pos, v, 1.0, np.array([*commanded, 9.81]), tilt, rate)
-        virtual = rest_plan(begin, at, NO_WIND, believed, DT_US, 2).virtual[0]
-        ends = [true.advance(float(tilt[i]), float(rate[i]), float(virtual[i]), DT_S) for i in (0, 1)]
+        virtual_control = brake_and_hold_plan(begin, at, NO_WIND, believed, DT_US, 2).virtual_control[0]
+        ends = [true.advance(float(tilt[i]), float(rate[i]), float(virtual_control[i]), DT_S) for i in (0, 1)]
         tilt, rate = np.array([e[0] for e in ends]), np.array([e[1] for e in ends])
-        accel = acceleration(np.array([ends[0][2] / DT_S, ends[1][2] / DT_S, virtual[2]]))
-        pos, v, commanded = pos + DT_S * v + 0.5 * DT_S**2 * accel, v + DT_S * accel, virtual[:2]
+        accel = acceleration(np.array([ends[0][2] / DT_S, ends[1][2] / DT_S, virtual_control[2]]))
+        pos, v, commanded = pos + DT_S * v + 0.5 * DT_S**2 * accel, v + DT_S * accel, virtual_control[:2]
         path.append(pos)
         speeds.append(v)
     return np.array(path), np.array(speeds)
@@ -134,18 +134,18 @@ def test_a_lagging_vehicle_comes_to_rest_and_does_not_swing(lag: Lag) -> None:
 
 
 def test_the_damping_for_a_vehicle_without_lag_would_swing_a_slow_one() -> None:
-    """The control of the test above."""
+    """Negative control of the test above."""
     _, speeds = flown(None, SLOW, (3.0, 0.0, 0.0), None, 8.0)
     assert speeds[:, 0].min() < -0.5
 
 
-def test_the_path_it_shares_is_the_one_a_lagging_vehicle_flies() -> None:
+def test_the_published_path_is_the_one_a_lagging_vehicle_flies() -> None:
     begin = Start(0, np.zeros(3), np.array([2.0, -1.0, 0.0]), 1.0, np.array([0.1, 0.0, 9.81]), np.array([0.1, 0.0]))
-    plan = rest_plan(begin, None, NO_WIND, LAG, DT_US, STEPS)
+    plan = brake_and_hold_plan(begin, None, NO_WIND, LAG, DT_US, STEPS)
     pos, vel, tilt, rate = np.zeros(3), np.array([2.0, -1.0, 0.0]), np.array([0.1, 0.0]), np.zeros(2)
-    for k, virtual in enumerate(plan.virtual):
-        ends = [LAG.advance(float(tilt[i]), float(rate[i]), float(virtual[i]), DT_S) for i in (0, 1)]
+    for k, virtual_control in enumerate(plan.virtual_control):
+        ends = [LAG.advance(float(tilt[i]), float(rate[i]), float(virtual_control[i]), DT_S) for i in (0, 1)]
         tilt, rate = np.array([e[0] for e in ends]), np.array([e[1] for e in ends])
-        accel = acceleration(np.array([ends[0][2] / DT_S, ends[1][2] / DT_S, virtual[2]]))
+        accel = acceleration(np.array([ends[0][2] / DT_S, ends[1][2] / DT_S, virtual_control[2]]))
         pos, vel = pos + DT_S * vel + 0.5 * DT_S**2 * accel, vel + DT_S * accel
         np.testing.assert_allclose(plan.pos_ned_m[k + 1, :2], pos[:2], atol=0.02)

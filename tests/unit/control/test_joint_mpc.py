@@ -32,20 +32,22 @@ def problem(
     *,
     pos: Array = HERE,
     vel: Point = (0.0, 0.0, 0.0),
-    virtual: Point = (0.0, 0.0, G),
+    virtual_control: Point = (0.0, 0.0, G),
     wind: Point = (0.0, 0.0, 0.0),
     guess: Array | None = None,
 ) -> Problem:
     """Go to `goal`, metres from HERE, and be at rest there."""
     reference = Reference(np.tile(HERE + np.array(goal), (61, 1)), np.zeros((61, 3)), 0.0)
     return Problem(
-        Start(0, pos, np.array(vel), 1.0, np.array(virtual)), reference, np.array(wind), tuple(keep_outs), guess
+        Start(0, pos, np.array(vel), 1.0, np.array(virtual_control)), reference, np.array(wind), tuple(keep_outs), guess
     )
 
 
-def joint(slots: int = 4, separation: SeparationParams | None = None, **params: Any) -> JointMpc:
+def joint(max_keep_outs: int = 4, separation: SeparationParams | None = None, **params: Any) -> JointMpc:
     params.setdefault("z", {"q_pos": 2.0, "q_vel": 0.05, "r": 0.01})  # as configs/improved_5_circle_dmpc3.toml
-    return JointMpc(MpcParams(**params), VehicleModelParams(), separation or SeparationParams(), 0, slots, lambda: 0)
+    return JointMpc(
+        MpcParams(**params), VehicleModelParams(), separation or SeparationParams(), 0, max_keep_outs, lambda: 0
+    )
 
 
 def ball(offset: Point, any_height: bool = False, priority_id: int = -1) -> KeepOut:
@@ -65,18 +67,20 @@ def test_the_first_command_accelerates_towards_the_reference(axis: int, sign: fl
     goal[axis] = sign
     plan = joint(terminal_z=FREE_END, qp=DAQP).plan(problem(goal))
     assert plan.status is PlanStatus.OK
-    virtual = plan.virtual[0] - [0.0, 0.0, G]
-    assert sign * virtual[axis] < -0.02  # x'' = -f u_x, y'' = -f u_y, z'' = g - f: north, east, down are all minus
-    assert sign * acceleration(plan.virtual[0])[axis] > 0.2
+    virtual_control = plan.virtual_control[0] - [0.0, 0.0, G]
+    assert (
+        sign * virtual_control[axis] < -0.02
+    )  # x'' = -f u_x, y'' = -f u_y, z'' = g - f: north, east, down are all minus
+    assert sign * acceleration(plan.virtual_control[0])[axis] > 0.2
     assert sign * (plan.pos_ned_m[-1] - HERE)[axis] > 0.1
-    np.testing.assert_allclose(np.delete(virtual, axis), 0.0, atol=1e-6)
+    np.testing.assert_allclose(np.delete(virtual_control, axis), 0.0, atol=1e-6)
 
 
 def test_at_its_reference_it_hovers_and_leans_against_wind() -> None:
     plan = joint().plan(problem((0.0, 0.0, 0.0)))
-    np.testing.assert_allclose(plan.virtual, np.tile([0.0, 0.0, G], (40, 1)), atol=5e-3)
+    np.testing.assert_allclose(plan.virtual_control, np.tile([0.0, 0.0, G], (40, 1)), atol=5e-3)
     np.testing.assert_allclose(plan.pos_ned_m, np.tile(HERE, (41, 1)), atol=2e-3)
-    leant = joint().plan(problem((0.0, 0.0, 0.0), wind=(1.0, -0.5, 0.4))).virtual[-1]
+    leant = joint().plan(problem((0.0, 0.0, 0.0), wind=(1.0, -0.5, 0.4))).virtual_control[-1]
     assert leant[0] > 0.02 > 0.0 > leant[1]
     assert leant[2] > G + 0.2
 
@@ -85,10 +89,10 @@ def test_bounds_of_thrust_and_tilt_hold() -> None:
     for goal in ((50.0, -50.0, -10.0), (0.0, 50.0, 100.0)):
         plan = joint().plan(problem(goal))
         assert plan.status is PlanStatus.OK
-        assert np.abs(plan.virtual[:, :2]).max() <= 0.2 + 1e-9
-        assert np.abs(np.diff(plan.virtual[:, :2], axis=0, prepend=np.zeros((1, 2)))).max() <= 0.05 + 1e-9
-        assert np.abs(np.diff(plan.virtual[:, 2], prepend=G)).max() <= 5.0 + 1e-9
-        assert 0.0 - 1e-9 <= plan.virtual[:, 2].min() <= plan.virtual[:, 2].max() <= 20.0 + 1e-9
+        assert np.abs(plan.virtual_control[:, :2]).max() <= 0.2 + 1e-9
+        assert np.abs(np.diff(plan.virtual_control[:, :2], axis=0, prepend=np.zeros((1, 2)))).max() <= 0.05 + 1e-9
+        assert np.abs(np.diff(plan.virtual_control[:, 2], prepend=G)).max() <= 5.0 + 1e-9
+        assert 0.0 - 1e-9 <= plan.virtual_control[:, 2].min() <= plan.virtual_control[:, 2].max() <= 20.0 + 1e-9
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
@@ -111,7 +115,7 @@ def test_with_nothing_near_it_plans_what_the_two_problems_of_the_thesis_do(
         for kind in (JointMpc, SwarmMpc)
     ]
     assert both[0].status is both[1].status is PlanStatus.OK
-    np.testing.assert_allclose(both[0].virtual, both[1].virtual, atol=1e-5)
+    np.testing.assert_allclose(both[0].virtual_control, both[1].virtual_control, atol=1e-5)
     np.testing.assert_allclose(both[0].pos_ned_m, both[1].pos_ned_m, atol=1e-6)
     np.testing.assert_allclose(both[0].vel_ned_m_s, both[1].vel_ned_m_s, atol=1e-5)
     assert both[0].terminal_gap_m == pytest.approx(both[1].terminal_gap_m, abs=1e-5)
@@ -135,7 +139,7 @@ def test_the_planned_path_is_the_motion_of_its_own_virtual_controls(climb_m: flo
 
 def test_the_certified_path_is_the_motion_of_the_inputs() -> None:
     near = ball((1.1424, 0.4675, -1.7551), priority_id=1)
-    state = {"vel": (-0.1647, -0.4631, 1.3129), "virtual": (-0.0542, -0.1913, 7.899)}
+    state = {"vel": (-0.1647, -0.4631, 1.3129), "virtual_control": (-0.0542, -0.1913, 7.899)}
     asked = problem((3.2193, 1.9425, -1.0748), [near], **state)  # type: ignore[arg-type]
     plan = joint(terminal_z=FREE_END, qp=DAQP).plan(asked)
     assert plan.status is PlanStatus.NOT_CERTIFIED or certify(motion(asked, plan), [near], 6) >= 0.0
@@ -144,7 +148,7 @@ def test_the_certified_path_is_the_motion_of_the_inputs() -> None:
 def motion(asked: Problem, plan: Plan) -> Array:
     """Positions (steps+1, 3) of x'' = -f u_x, y'' = -f u_y, z'' = g - f under the plan's virtual controls."""
     pos, vel, path = asked.start.pos_ned_m, asked.start.vel_ned_m_s, [asked.start.pos_ned_m]
-    for u_x, u_y, thrust in plan.virtual:
+    for u_x, u_y, thrust in plan.virtual_control:
         accel = np.array([-thrust * u_x, -thrust * u_y, G - thrust]) + asked.disturbance_ned_m_s2
         pos, vel = pos + 0.02 * vel + 0.5 * 0.02**2 * accel, vel + 0.02 * accel
         path.append(pos)
@@ -159,7 +163,7 @@ class Flight:
     path: Array  # (ticks+1, 3)
     plans: list[Plan]
 
-    def nearest_m(self, keep_outs: Sequence[KeepOut]) -> float:
+    def arc_length_m(self, keep_outs: Sequence[KeepOut]) -> float:
         return min(float(distances(self.path, _lasting(k, len(self.path))).min()) for k in keep_outs)
 
 
@@ -170,12 +174,14 @@ def _lasting(keep_out: KeepOut, points: int) -> KeepOut:
 
 def fly(mpc: JointMpc | SwarmMpc, goal: Point, keep_outs: Sequence[KeepOut], ticks: int = 350) -> Flight:
     """Closed loop with x'' = -f u_x, y'' = -f u_y, z'' = g - f, which is not what dmpc3 predicts with."""
-    pos, vel, virtual, guess = HERE.copy(), np.zeros(3), np.array([0.0, 0.0, G]), None
+    pos, vel, virtual_control, guess = HERE.copy(), np.zeros(3), np.array([0.0, 0.0, G]), None
     path, plans = [pos], []
     for _ in range(ticks):
-        plan = mpc.plan(problem(goal, keep_outs, pos=pos, vel=vel, virtual=virtual, guess=guess))
-        virtual = plan.virtual[0]
-        accel = np.array([-virtual[2] * virtual[0], -virtual[2] * virtual[1], G - virtual[2]])
+        plan = mpc.plan(problem(goal, keep_outs, pos=pos, vel=vel, virtual_control=virtual_control, guess=guess))
+        virtual_control = plan.virtual_control[0]
+        accel = np.array(
+            [-virtual_control[2] * virtual_control[0], -virtual_control[2] * virtual_control[1], G - virtual_control[2]]
+        )
         pos, vel = pos + 0.02 * vel + 0.5 * 0.02**2 * accel, vel + 0.02 * accel
         guess = np.vstack([plan.pos_ned_m[1:], plan.pos_ned_m[-1] + 0.02 * plan.vel_ned_m_s[-1]])
         path.append(pos)
@@ -195,7 +201,7 @@ def test_a_wall_is_passed_above_or_below_with_every_plan_certified(lower_m: floa
     flight = fly(joint(terminal_z=terminal), (4.0, 0.0, 0.0), keep_outs)
     assert all(plan.status is PlanStatus.OK for plan in flight.plans)
     assert min(certify(plan.pos_ned_m, keep_outs, 6) for plan in flight.plans) >= 0.0
-    assert flight.nearest_m(keep_outs) > 0.85  # true distances of what was flown; 0.9 asked, 0.8 certified
+    assert flight.arc_length_m(keep_outs) > 0.85  # true distances of what was flown; 0.9 asked, 0.8 certified
     assert np.linalg.norm(flight.path[-1] - HERE - [4.0, 0.0, 0.0]) < 0.2
     height_m = HERE[2] - flight.path[:, 2]
     over = height_m[np.abs(flight.path[:, 0] - HERE[0] - 2.0) < 0.2]
@@ -219,12 +225,12 @@ def test_a_keep_out_at_every_height_is_never_passed_above(lower_m: float) -> Non
     keep_outs = wall(lower_m, any_height=True)
     flight = fly(joint(terminal_z=FREE_END), (4.0, 0.0, 0.0), keep_outs)
     assert all(plan.status is PlanStatus.OK for plan in flight.plans)
-    assert flight.nearest_m(keep_outs) > 0.85  # horizontally
+    assert flight.arc_length_m(keep_outs) > 0.85  # horizontally
     assert (flight.path[:, 0] < HERE[0] + 2.0).all()  # and so not past it
     assert np.abs(flight.path[:, 2] - HERE[2]).max() < 0.01  # nor is climbing tried
     alone = [ball((2.0, 0.0, lower_m), any_height=True)]
     round_it = fly(joint(terminal_z=FREE_END), (4.0, 0.0, 0.0), alone)
-    assert round_it.nearest_m(alone) > 0.85
+    assert round_it.arc_length_m(alone) > 0.85
     assert np.linalg.norm(round_it.path[-1] - HERE - [4.0, 0.0, 0.0]) < 0.2  # round is allowed
     assert np.abs(round_it.path[:, 2] - HERE[2]).max() < 0.01
 
@@ -261,7 +267,7 @@ def mirrored(asked: Problem, by: Array) -> Problem:
     start, reference = asked.start, asked.reference
     rest = np.array([0.0, 0.0, G])
     return Problem(
-        Start(0, turned(start.pos_ned_m), by @ start.vel_ned_m_s, 1.0, rest + by @ (start.virtual - rest)),
+        Start(0, turned(start.pos_ned_m), by @ start.vel_ned_m_s, 1.0, rest + by @ (start.virtual_control - rest)),
         Reference(turned(reference.pos_ned_m), reference.vel_ned_m_s @ by.T, 0.0),
         by @ asked.disturbance_ned_m_s2,
         tuple(KeepOut(turned(k.pos_ned_m), 0.9, 0.8, k.any_height, k.priority_id) for k in asked.keep_outs),
@@ -273,10 +279,10 @@ def random_problem(seed: int, priority_id: int) -> Problem:
     rng = np.random.default_rng([seed, 0, 9])
     places = rng.uniform(-1.0, 1.0, (3, 3)) + np.array([1.6, 0.0, 0.0])
     keep_outs = [ball(place, any_height=k == 2, priority_id=priority_id) for k, place in enumerate(places)]
-    virtual = (*rng.uniform(-0.1, 0.1, 2), G)
+    virtual_control = (*rng.uniform(-0.1, 0.1, 2), G)
     goal, wind = rng.uniform(-3.0, 3.0, 3), rng.uniform(-0.5, 0.5, 3)
     vel = rng.uniform(-0.6, 0.6, 3) + np.array([1.0, 0.0, 0.0])  # towards them
-    return problem(goal, keep_outs, vel=vel, virtual=virtual, wind=wind)
+    return problem(goal, keep_outs, vel=vel, virtual_control=virtual_control, wind=wind)
 
 
 @pytest.mark.parametrize(
@@ -299,7 +305,9 @@ def test_a_mirrored_problem_has_the_mirrored_plan(by: Array, priority_id: int, r
         assert one.status is two.status
         assert one.slack_m == pytest.approx(two.slack_m, abs=1e-6)
         np.testing.assert_allclose(two.pos_ned_m - HERE, (one.pos_ned_m - HERE) @ by.T, atol=1e-5)
-        np.testing.assert_allclose(two.virtual - [0.0, 0.0, G], (one.virtual - [0.0, 0.0, G]) @ by.T, atol=1e-3)
+        np.testing.assert_allclose(
+            two.virtual_control - [0.0, 0.0, G], (one.virtual_control - [0.0, 0.0, G]) @ by.T, atol=1e-3
+        )
         matters += bool(np.abs(one.pos_ned_m - free.pos_ned_m).max() > 0.01)
     assert matters >= 5  # plans that the keep-outs have changed
 
@@ -317,7 +325,7 @@ def test_up_and_down_are_mirrored_where_there_is_as_much_thrust_for_both(goal_m:
     up, down = plans
     assert up.status is down.status is PlanStatus.OK
     np.testing.assert_allclose((up.pos_ned_m - HERE) @ FLIP, down.pos_ned_m - HERE, atol=1e-6)
-    np.testing.assert_allclose(up.virtual[:, 2] - G, G - down.virtual[:, 2], atol=1e-5)
+    np.testing.assert_allclose(up.virtual_control[:, 2] - G, G - down.virtual_control[:, 2], atol=1e-5)
     if not any_room:
         assert np.abs(up.pos_ned_m[:, 2] - HERE[2]).max() < 0.3 + 0.01
 

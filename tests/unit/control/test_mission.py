@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from swarmctl.control.reference.mission import (
-    Glide,
     GotoParams,
     MissionParams,
     MissionReference,
+    QuinticTrajectory,
     brake_to_rest,
-    glide_to,
+    quintic_to,
 )
 from swarmctl.core.types import Array
 
@@ -116,34 +116,34 @@ def test_missions_that_make_no_sense_are_refused() -> None:
         assert [f"{goals} goals" in p for p in MissionParams(kind="goto", goto=goto).problems(3)] == [True] * refused
 
 
-# -- glides -----------------------------------------------------------------------------------------------------------
+# -- quintic trajectories ----------------------------------------------------------------------------------------------
 
 FROM, VEL, TO = np.array([1.0, -2.0, -3.0]), np.array([1.5, 0.5, -0.25]), np.array([4.0, 4.0, -2.0])
 
 
-def derivatives(glide: Glide) -> tuple[Array, Array, Array]:
+def derivatives(trajectory: QuinticTrajectory) -> tuple[Array, Array, Array]:
     """Velocity as said, velocity and acceleration by finite differences, at the same times through both ends."""
     h = 1e-4
-    t_s = np.linspace(-0.2, glide.travel_s + 0.2, 1501)
-    t_s = t_s[(np.abs(t_s) > 2 * h) & (np.abs(t_s - glide.travel_s) > 2 * h)]
-    before, after = glide.sample(t_s - h), glide.sample(t_s + h)
+    t_s = np.linspace(-0.2, trajectory.travel_s + 0.2, 1501)
+    t_s = t_s[(np.abs(t_s) > 2 * h) & (np.abs(t_s - trajectory.travel_s) > 2 * h)]
+    before, after = trajectory.sample(t_s - h), trajectory.sample(t_s + h)
     inside = t_s > 0.0
     return (
-        glide.sample(t_s)[1][inside],
+        trajectory.sample(t_s)[1][inside],
         ((after[0] - before[0]) / (2 * h))[inside],
         ((after[1] - before[1]) / (2 * h))[inside],
     )
 
 
 def test_a_glide_begins_as_it_is_and_ends_at_rest_on_its_target() -> None:
-    glide = Glide(FROM, VEL, TO, 5.0)
-    pos, vel = glide.sample(np.array([0.0, 5.0, 60.0]))
+    trajectory = QuinticTrajectory(FROM, VEL, TO, 5.0)
+    pos, vel = trajectory.sample(np.array([0.0, 5.0, 60.0]))
     np.testing.assert_allclose(pos, [FROM, TO, TO], atol=1e-12)
     np.testing.assert_allclose(vel, [VEL, np.zeros(3), np.zeros(3)], atol=1e-12)
 
 
 def test_a_glide_is_continuous_in_velocity_and_acceleration() -> None:
-    said, velocity, accel = derivatives(Glide(FROM, VEL, TO, 5.0))
+    said, velocity, accel = derivatives(QuinticTrajectory(FROM, VEL, TO, 5.0))
     np.testing.assert_allclose(said, velocity, atol=1e-6)
     assert np.abs(np.diff(said, axis=0)).max() < 0.02  # 3.6 ms apart: no jump
     assert np.abs(np.diff(accel, axis=0)).max() < 0.05
@@ -153,7 +153,7 @@ def test_a_glide_is_continuous_in_velocity_and_acceleration() -> None:
 
 def test_a_glide_halfway_by_hand() -> None:
     # s = 1/2: blend 1/2, coast 1/2 - 6/8 + 8/16 - 3/32 = 5/32; slopes 1.875 and 1 - 18/4 + 32/8 - 15/16 = -7/16
-    pos, vel = Glide(FROM, VEL, TO, 4.0).sample(np.array([2.0]))
+    pos, vel = QuinticTrajectory(FROM, VEL, TO, 4.0).sample(np.array([2.0]))
     np.testing.assert_allclose(pos[0], 0.5 * (FROM + TO) + 5 / 32 * 4.0 * VEL)
     np.testing.assert_allclose(vel[0], 1.875 * (TO - FROM) / 4.0 - 7 / 16 * VEL)
 
@@ -161,8 +161,8 @@ def test_a_glide_halfway_by_hand() -> None:
 @pytest.mark.parametrize("distance_m", [0.1, 1.0, 5.0, 200.0])
 def test_from_rest_a_glide_keeps_speed_and_acceleration(distance_m: float) -> None:
     target = np.array([0.6, 0.0, -0.8]) * distance_m
-    glide = glide_to(np.zeros(3), np.zeros(3), target, 2.0, 1.2)
-    said, _, accel = derivatives(glide)
+    trajectory = quintic_to(np.zeros(3), np.zeros(3), target, 2.0, 1.2)
+    said, _, accel = derivatives(trajectory)
     assert np.linalg.norm(said, axis=1).max() <= 2.0 + 1e-6
     assert np.linalg.norm(accel, axis=1).max() <= 1.2 * 1.01
     if distance_m == 200.0:  # and is as quick as the speed allows
@@ -170,19 +170,19 @@ def test_from_rest_a_glide_keeps_speed_and_acceleration(distance_m: float) -> No
 
 
 def test_a_glide_that_must_turn_round_stays_near_its_acceleration() -> None:
-    glide = glide_to(np.zeros(3), np.array([2.0, 0.0, 0.0]), np.array([-1.0, 0.0, 0.0]), 2.0, 1.2)
-    _, _, accel = derivatives(glide)
+    trajectory = quintic_to(np.zeros(3), np.array([2.0, 0.0, 0.0]), np.array([-1.0, 0.0, 0.0]), 2.0, 1.2)
+    _, _, accel = derivatives(trajectory)
     assert np.linalg.norm(accel, axis=1).max() < 1.6 * 1.2
 
 
 @pytest.mark.parametrize("speed_m_s", [0.0, 0.3, 2.5, 10.0])
 def test_braking_is_straight_ahead_without_overshoot_and_within_the_acceleration(speed_m_s: float) -> None:
     vel = speed_m_s * np.array([0.6, 0.8, 0.0])
-    glide = brake_to_rest(FROM, vel, 1.2)
-    said, _, accel = derivatives(glide)
+    trajectory = brake_to_rest(FROM, vel, 1.2)
+    said, _, accel = derivatives(trajectory)
     along = said @ np.array([0.6, 0.8, 0.0])
     np.testing.assert_allclose(said, np.outer(along, [0.6, 0.8, 0.0]), atol=1e-9)
     assert along.min() > -1e-9
     assert (np.diff(along) < 1e-9).all()
     assert np.linalg.norm(accel, axis=1).max() <= 1.2
-    np.testing.assert_allclose(glide.sample(np.array([100.0]))[1], 0.0)
+    np.testing.assert_allclose(trajectory.sample(np.array([100.0]))[1], 0.0)

@@ -22,9 +22,9 @@ HERE = np.array([1.0, 2.0, -3.0])
 
 
 def start(
-    pos: Array = HERE, vel: tuple[float, ...] = (0.0, 0.0, 0.0), virtual: tuple[float, ...] = (0.0, 0.0, G)
+    pos: Array = HERE, vel: tuple[float, ...] = (0.0, 0.0, 0.0), virtual_control: tuple[float, ...] = (0.0, 0.0, G)
 ) -> Start:
-    return Start(5_000_000, pos, np.array(vel), 1.0, np.array(virtual))
+    return Start(5_000_000, pos, np.array(vel), 1.0, np.array(virtual_control))
 
 
 def reference(offset: tuple[float, ...] = (0.0, 0.0, 0.0)) -> Reference:
@@ -62,22 +62,22 @@ def test_a_reference_to_the_north_tilts_the_body_axis_south(axis: int, sign: flo
     offset[axis] = sign
     plan = plan_to((offset[0], offset[1], offset[2]))
     assert plan.status is PlanStatus.OK
-    assert sign * plan.virtual[0, axis] < -0.02
-    assert sign * acceleration(plan.virtual[0])[axis] > 0.2
+    assert sign * plan.virtual_control[0, axis] < -0.02
+    assert sign * acceleration(plan.virtual_control[0])[axis] > 0.2
     assert sign * (plan.pos_ned_m[-1, axis] - HERE[axis]) > 0.1
-    np.testing.assert_allclose(plan.virtual[:, 1 - axis], 0.0, atol=2e-3)
+    np.testing.assert_allclose(plan.virtual_control[:, 1 - axis], 0.0, atol=2e-3)
 
 
 @pytest.mark.parametrize("up_m", [0.5, -0.5])
 def test_a_reference_above_takes_more_thrust_than_the_weight(up_m: float) -> None:
     plan = plan_to((0.0, 0.0, -up_m))
-    assert (plan.virtual[0, 2] - G) * up_m > 0.1
+    assert (plan.virtual_control[0, 2] - G) * up_m > 0.1
     assert (plan.pos_ned_m[-1, 2] - HERE[2]) * -up_m > 0.04  # three increments that end at rest reach 0.1 m
 
 
 def test_a_vehicle_at_its_reference_hovers() -> None:
     plan = plan_to((0.0, 0.0, 0.0))
-    np.testing.assert_allclose(plan.virtual, np.tile([0.0, 0.0, G], (40, 1)), atol=5e-3)
+    np.testing.assert_allclose(plan.virtual_control, np.tile([0.0, 0.0, G], (40, 1)), atol=5e-3)
     np.testing.assert_allclose(plan.pos_ned_m, np.tile(HERE, (41, 1)), atol=2e-3)
     assert (plan.t0_us, plan.dt_us, plan.status) == (5_000_000, 20_000, PlanStatus.OK)
 
@@ -86,12 +86,12 @@ def test_a_tilted_vehicle_needs_more_thrust_to_hover() -> None:
     # (3.11): z'' = g - (f/m) c with c frozen; held at c = 0.9 the equilibrium is g / 0.9
     begin = Start(0, HERE, np.zeros(3), 0.9, np.array([0.0, 0.0, G / 0.9]))
     plan = plan_to((0.0, 0.0, 0.0), begin=begin)
-    np.testing.assert_allclose(plan.virtual[:, 2], G / 0.9, atol=5e-3)
+    np.testing.assert_allclose(plan.virtual_control[:, 2], G / 0.9, atol=5e-3)
 
 
 def test_the_plan_leans_against_wind() -> None:
     plan = plan_to((0.0, 0.0, 0.0), wind=(1.0, -0.5, 0.4))
-    first_to_last = plan.virtual[-1]
+    first_to_last = plan.virtual_control[-1]
     assert first_to_last[0] > 0.02 > 0.0 > first_to_last[1]  # wind to the north: body axis north, thrust south
     assert first_to_last[2] > G + 0.2
 
@@ -99,18 +99,18 @@ def test_the_plan_leans_against_wind() -> None:
 def test_bounds_of_thrust_and_tilt_hold() -> None:
     plan = plan_to((50.0, -50.0, -10.0))
     assert plan.status is PlanStatus.OK
-    assert np.abs(plan.virtual[:, :2]).max() <= 0.2 + 2e-3
-    assert np.abs(np.diff(plan.virtual[:, :2], axis=0, prepend=np.zeros((1, 2)))).max() <= 0.05 + 1e-9
-    assert np.abs(np.diff(plan.virtual[:, 2], prepend=G)).max() <= 5.0 + 1e-9
+    assert np.abs(plan.virtual_control[:, :2]).max() <= 0.2 + 2e-3
+    assert np.abs(np.diff(plan.virtual_control[:, :2], axis=0, prepend=np.zeros((1, 2)))).max() <= 0.05 + 1e-9
+    assert np.abs(np.diff(plan.virtual_control[:, 2], prepend=G)).max() <= 5.0 + 1e-9
 
 
 @pytest.mark.parametrize("down_m", [-100.0, -20.0, 20.0, 100.0])
 def test_a_far_reference_is_planned_for_within_the_bounds_of_thrust(down_m: float) -> None:
     plan = plan_to((0.0, 0.0, down_m))
     assert plan.status is PlanStatus.OK
-    assert plan.virtual[:, 2].max() <= 20.0 + 0.05
-    assert plan.virtual[:, 2].min() >= -0.05  # a rotor can't pull
-    assert (plan.virtual[0, 2] - G) * down_m < 0.0
+    assert plan.virtual_control[:, 2].max() <= 20.0 + 0.05
+    assert plan.virtual_control[:, 2].min() >= -0.05  # a rotor can't pull
+    assert (plan.virtual_control[0, 2] - G) * down_m < 0.0
 
 
 @pytest.mark.parametrize("cos_tilt", [1.0, 0.9])
@@ -119,11 +119,13 @@ def test_the_planned_path_is_the_motion_of_its_own_virtual_controls(ahead: str, 
     wind, vel = np.array([0.3, -0.2, 0.1]), np.array([0.2, 0.1, 0.3])
     begin = Start(0, HERE, vel, cos_tilt, np.array([0.05, 0.0, 8.0]))
     plan = plan_to((0.5, -0.3, -0.4), begin=begin, wind=tuple(wind), thrust_ahead=ahead)
-    assert np.ptp(plan.virtual[:, 2]) > 1.0  # the thrust is not constant, so it matters which one x-y is predicted with
+    assert (
+        np.ptp(plan.virtual_control[:, 2]) > 1.0
+    )  # the thrust is not constant, so it matters which one x-y is predicted with
     pos = HERE.copy()
     for k in range(40):
-        thrust = plan.virtual[k if ahead == "planned" else 0, 2]  # held: the thesis' f_t of now
-        across, up = -thrust * plan.virtual[k, :2], G - cos_tilt * plan.virtual[k, 2]
+        thrust = plan.virtual_control[k if ahead == "planned" else 0, 2]  # held: the thesis' f_t of now
+        across, up = -thrust * plan.virtual_control[k, :2], G - cos_tilt * plan.virtual_control[k, 2]
         accel = np.array([*across, up]) + wind
         pos, vel = pos + 0.02 * vel + 0.5 * 0.02**2 * accel, vel + 0.02 * accel
         np.testing.assert_allclose(plan.pos_ned_m[k + 1], pos, atol=1e-9)
@@ -155,7 +157,7 @@ def test_a_plan_that_cannot_avoid_is_not_certified_and_reports_its_slack() -> No
 
 
 def test_a_keep_out_beyond_the_slots_is_still_certified() -> None:
-    near = [fixed(HERE + np.array([0.0, e, 0.0]), 0.8) for e in (0.5, -0.5)]  # nearest two take both slots
+    near = [fixed(HERE + np.array([0.0, e, 0.0]), 0.8) for e in (0.5, -0.5)]  # nearest two take both max_keep_outs
     wall = [fixed(HERE + np.array([3.0, 0.6, 0.0]), 0.8)]
     plan = plan_to((5.0, 0.0, 0.0), *near, *wall, begin=start(vel=(4.0, 0.0, 0.0)))
     assert plan.status is PlanStatus.NOT_CERTIFIED
@@ -209,7 +211,7 @@ def test_z_longer_or_shorter_than_xy_gives_a_plan_of_xy_length() -> None:
         plan = plan_to((0.0, 0.0, -0.2), horizon_z=horizon_z)
         assert plan.pos_ned_m.shape == (41, 3)
         assert np.isfinite(plan.pos_ned_m).all()
-        assert plan.virtual.shape == (40, 3)
+        assert plan.virtual_control.shape == (40, 3)
 
 
 def test_the_controller_without_neighbours_ignores_them_and_the_distributed_one_does_not() -> None:
@@ -218,8 +220,8 @@ def test_the_controller_without_neighbours_ignores_them_and_the_distributed_one_
     together = make_controller(ControllerParams(kind="dmpc"), VehicleModelParams(), SeparationParams(), 0, 2, lambda: 0)
     free, kept = (c.plan(problem((0.5, 0.0, 0.0), neighbour)) for c in (alone, together))
     assert free.status is PlanStatus.OK
-    assert free.virtual[5, 0] < -0.02  # towards the reference
-    assert kept.virtual[5, 0] > 0.02  # away from the neighbour that is too near
+    assert free.virtual_control[5, 0] < -0.02  # towards the reference
+    assert kept.virtual_control[5, 0] > 0.02  # away from the neighbour that is too near
 
 
 def test_times_are_measured_with_the_stopwatch_and_add_up() -> None:
@@ -241,9 +243,9 @@ def test_one_move_for_two_conditions_at_the_end_is_planned_and_not_an_exception(
 @pytest.mark.parametrize("terminal", ["position", "position_velocity"])
 @pytest.mark.parametrize("ahead", ["planned", "held"])
 def test_falling_without_thrust_is_planned_and_not_an_exception(ahead: str, terminal: str) -> None:
-    falling = start(virtual=(0.0, 0.0, 0.0))  # no thrust now, none wanted: tilting moves nothing
+    falling = start(virtual_control=(0.0, 0.0, 0.0))  # no thrust now, none wanted: tilting moves nothing
     plan = plan_to((0.0, 0.0, 100.0), begin=falling, terminal_xy=terminal, thrust_ahead=ahead)
-    assert plan.virtual[0, 2] == pytest.approx(0.0, abs=0.1)
+    assert plan.virtual_control[0, 2] == pytest.approx(0.0, abs=0.1)
     assert plan.status is PlanStatus.OK
 
 

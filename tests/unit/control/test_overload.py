@@ -1,4 +1,4 @@
-"""What missed deadlines ask for: more room, then rest, then landing; and that it ends with them."""
+"""Tests of the response to missed deadlines: wider distances, rest, landing; and of its end."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ PERIOD_US = 20_000
 
 
 def ran(pattern: list[tuple[float, float]]) -> Overload:
-    """An agent that misses `share` of its deadlines for `seconds`, one after the other."""
+    """Run an agent that misses the fraction `share` of its deadlines for `seconds`, for each pair in turn."""
     overload, now_us, missed, debt = Overload(OverloadParams(), PERIOD_US), 0, 0, 0.0
     for share, seconds in pattern:
         for _ in range(round(seconds * 50)):
@@ -18,7 +18,7 @@ def ran(pattern: list[tuple[float, float]]) -> Overload:
             now_us += PERIOD_US
             if debt >= 1.0:
                 debt, missed = debt - 1.0, missed + 1
-                continue  # skipped: nobody looks
+                continue  # a skipped tick calls no update
             overload.update(now_us, missed)
     return overload
 
@@ -42,7 +42,7 @@ def test_levels(pattern: list[tuple[float, float]], level: Level) -> None:
     assert ran(pattern).level is level
 
 
-def test_margin_grows_with_the_share_and_is_bounded() -> None:
+def test_margin_grows_with_the_fraction_and_is_bounded() -> None:
     margins = [ran([(share, 5)]).margin_m for share in (0.0, 0.2, 0.3, 0.6)]
     assert margins[0] == 0.0
     assert margins == sorted(margins)
@@ -53,7 +53,7 @@ def test_the_cause_is_named() -> None:
     assert ran([(0.5, 5)]).text() == "overload: 50 % of deadlines missed"
 
 
-def test_what_was_missed_before_the_first_look_does_not_count() -> None:
+def test_deadlines_missed_before_the_first_update_do_not_count() -> None:
     overload = Overload(OverloadParams(), PERIOD_US)
     overload.update(1_000_000, 500)
     assert overload.level is Level.NONE

@@ -1,4 +1,4 @@
-"""The newest certified plan: kept while it is worth flying, continued by braking, gone when it has run out."""
+"""Tests of the buffer of the newest certified plan: kept, continued by braking, dropped, run out."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from swarmctl.control.collision.separation import KeepOut
-from swarmctl.control.mpc.plan_buffer import Replay
+from swarmctl.control.mpc.plan_buffer import PlanBuffer
 from swarmctl.control.mpc.problem import Start
 from swarmctl.core.types import NO_TIMES, Array, Plan, PlanStatus
 
@@ -17,7 +17,7 @@ BAD = tuple(status for status in PlanStatus if status is not PlanStatus.OK)
 
 
 def plan_at(t0_us: int, north_m: Array, status: PlanStatus = PlanStatus.OK) -> Plan:
-    """Along north at height 2 m."""
+    """Return a plan that moves north at height 2 m."""
     pos = np.column_stack([north_m, np.zeros(len(north_m)), np.full(len(north_m), -2.0)])
     held = np.tile([0.0, 0.0, 9.81], (len(north_m) - 1, 1))
     return Plan(status, t0_us, DT_US, pos, np.zeros_like(pos), held, NO_TIMES, 0, 0.0, 0.0, 0.0)
@@ -40,52 +40,52 @@ def wall(north_m: float, hard_min_distance_m: float = 0.8) -> KeepOut:
 
 
 @pytest.fixture
-def replay() -> Replay:
-    return Replay(0, DT_US, STEPS, BRAKE_M_S2)
+def buffer() -> PlanBuffer:
+    return PlanBuffer(0, DT_US, STEPS, BRAKE_M_S2)
 
 
 def rest() -> Plan:
-    """Stays where the plan of `moving` is after one step."""
+    """Return a plan that stays where the plan of `moving` is after one step."""
     return moving(100_000, 0.0, 0.2)
 
 
-def test_at_first_there_is_nothing(replay: Replay) -> None:
-    assert replay.plan is None
-    assert replay.guess_ned_m(0) is None
+def test_the_buffer_is_empty_at_first(buffer: PlanBuffer) -> None:
+    assert buffer.plan is None
+    assert buffer.guess_ned_m(0) is None
 
 
 @pytest.mark.parametrize("status", BAD)
-def test_a_bad_plan_is_not_kept(replay: Replay, status: PlanStatus) -> None:
-    replay.take(moving(status=status), start_at(0), [], rest)
-    assert replay.plan is None
+def test_a_bad_plan_is_not_kept(buffer: PlanBuffer, status: PlanStatus) -> None:
+    buffer.take(moving(status=status), start_at(0), [], rest)
+    assert buffer.plan is None
 
 
-def test_a_good_plan_is_kept_until_the_next_good_one(replay: Replay) -> None:
+def test_a_good_plan_is_kept_until_the_next_good_one(buffer: PlanBuffer) -> None:
     first, second = moving(), moving(100_000)
-    replay.take(first, start_at(0), [], rest)
-    assert replay.plan is first
-    replay.take(second, start_at(100_000), [], rest)
-    assert replay.plan is second
+    buffer.take(first, start_at(0), [], rest)
+    assert buffer.plan is first
+    buffer.take(second, start_at(100_000), [], rest)
+    assert buffer.plan is second
 
 
-def test_a_good_plan_is_kept_whatever_is_near(replay: Replay) -> None:
-    """It has been certified; that is not judged here again."""
+def test_a_good_plan_is_kept_whatever_is_near(buffer: PlanBuffer) -> None:
+    """It has been certified before and is not checked again."""
     plan = moving()
-    replay.take(plan, start_at(0), [wall(1.5)], rest)
-    assert replay.plan is plan
+    buffer.take(plan, start_at(0), [wall(1.5)], rest)
+    assert buffer.plan is plan
 
 
 @pytest.mark.parametrize("status", BAD)
-def test_after_a_bad_plan_the_last_good_one_is_kept_where_it_is_free(replay: Replay, status: PlanStatus) -> None:
+def test_after_a_bad_plan_the_last_good_one_is_kept_where_it_is_free(buffer: PlanBuffer, status: PlanStatus) -> None:
     good = moving()
-    replay.take(good, start_at(0), [], rest)
+    buffer.take(good, start_at(0), [], rest)
     for keep_outs in ([], [wall(5.0)]):
-        replay.take(moving(100_000, status=status), start_at(100_000), keep_outs, rest)
-        assert replay.plan is good
+        buffer.take(moving(100_000, status=status), start_at(100_000), keep_outs, rest)
+        assert buffer.plan is good
 
 
 @pytest.mark.parametrize("status", BAD)
-def test_it_is_dropped_when_braking_comes_less_close(replay: Replay, status: PlanStatus) -> None:
+def test_it_is_dropped_when_braking_comes_less_close(replay: PlanBuffer, status: PlanStatus) -> None:
     """The plan flies through the wall at 2 m; braking stays 1.8 m away from it."""
     replay.take(moving(), start_at(0), [], rest)
     replay.take(moving(100_000, status=status), start_at(100_000), [wall(2.0)], rest)
@@ -94,53 +94,55 @@ def test_it_is_dropped_when_braking_comes_less_close(replay: Replay, status: Pla
 
 
 @pytest.mark.parametrize(("braking_to_m", "kept"), [(0.85, True), (0.54, True), (0.53, False), (0.1, False)])
-def test_of_two_that_come_too_close_the_less_close_is_flown(replay: Replay, braking_to_m: float, kept: bool) -> None:
+def test_of_two_that_come_too_close_the_less_close_is_flown(
+    buffer: PlanBuffer, braking_to_m: float, kept: bool
+) -> None:
     """The plan ends at 0.5 m and is at 0.535 m a step later, closer than 0.8 m to what stands at 1 m."""
     good = moving(speed_m_s=0.5)
-    replay.take(good, start_at(0), [], rest)
+    buffer.take(good, start_at(0), [], rest)
     braking = plan_at(100_000, np.linspace(0.05, braking_to_m, STEPS + 1))
     bad = moving(100_000, status=PlanStatus.NOT_CERTIFIED)
-    replay.take(bad, start_at(100_000), [wall(1.0)], lambda: braking)
-    assert (replay.plan is good) is kept
+    buffer.take(bad, start_at(100_000), [wall(1.0)], lambda: braking)
+    assert (buffer.plan is good) is kept
 
 
-def test_it_is_kept_when_braking_comes_just_as_close(replay: Replay) -> None:
+def test_a_plan_is_kept_when_braking_comes_just_as_close(buffer: PlanBuffer) -> None:
     good = moving(speed_m_s=0.5)
-    replay.take(good, start_at(0), [], rest)
-    same = plan_at(100_000, replay.positions_ned_m(good, 100_000)[:, 0])
+    buffer.take(good, start_at(0), [], rest)
+    same = plan_at(100_000, buffer.positions_ned_m(good, 100_000)[:, 0])
     bad = moving(100_000, status=PlanStatus.NOT_CERTIFIED)
-    replay.take(bad, start_at(100_000), [wall(1.0)], lambda: same)
-    assert replay.plan is good
+    buffer.take(bad, start_at(100_000), [wall(1.0)], lambda: same)
+    assert buffer.plan is good
 
 
-def test_what_it_has_flown_already_is_not_held_against_it(replay: Replay) -> None:
-    """The wall stands where the plan began, a second ago."""
+def test_the_flown_part_of_a_plan_is_not_checked(buffer: PlanBuffer) -> None:
+    """The wall stands where the plan began one second before."""
     good = moving(speed_m_s=2.0)
-    replay.take(good, start_at(0), [], rest)
-    replay.take(moving(900_000, status=PlanStatus.RESIDUAL), start_at(900_000), [wall(0.0)], rest)
-    assert replay.plan is good
+    buffer.take(good, start_at(0), [], rest)
+    buffer.take(moving(900_000, status=PlanStatus.RESIDUAL), start_at(900_000), [wall(0.0)], rest)
+    assert buffer.plan is good
 
 
-def test_the_guess_is_the_plan_at_its_own_times(replay: Replay) -> None:
+def test_the_guess_is_the_plan_at_its_own_times(buffer: PlanBuffer) -> None:
     good = moving()
-    replay.take(good, start_at(0), [], rest)
-    guess = replay.guess_ned_m(0)
+    buffer.take(good, start_at(0), [], rest)
+    guess = buffer.guess_ned_m(0)
     assert guess is not None
     np.testing.assert_allclose(guess, good.pos_ned_m)
 
 
-def test_positions_between_points_are_interpolated_and_beyond_the_end_braked(replay: Replay) -> None:
+def test_positions_between_points_are_interpolated_and_beyond_the_end_braked(buffer: PlanBuffer) -> None:
     # 2 m/s at the end (2 m at 1 s), brake 3 m/s2: 2 t - 1.5 t^2, stops 2/3 s later 2/3 m on
     braked = [2.0 + 2.0 * t - 1.5 * t * t for t in (0.05, 0.15, 0.25, 0.35, 0.45, 0.55, 0.65)] + [2.0 + 2.0 / 3.0]
-    positions = replay.positions_ned_m(moving(), 750_000)
+    positions = buffer.positions_ned_m(moving(), 750_000)
     np.testing.assert_allclose(positions[:, 0], [1.5, 1.7, 1.9, *braked], atol=1e-12)
     np.testing.assert_allclose(positions[:, 1:], np.tile([0.0, -2.0], (STEPS + 1, 1)))
 
 
 @pytest.mark.parametrize(("t_us", "there"), [(999_999, True), (1_000_000, False), (5_000_000, False)])
-def test_the_guess_is_none_once_the_plan_has_run_out(replay: Replay, t_us: int, there: bool) -> None:
+def test_the_guess_is_none_once_the_plan_has_run_out(buffer: PlanBuffer, t_us: int, there: bool) -> None:
     good = moving()
-    replay.take(good, start_at(0), [], rest)
-    assert (replay.guess_ned_m(t_us) is not None) is there
-    assert replay.plan is good  # how old may be flown is the failsafe's affair
-    np.testing.assert_allclose(replay.positions_ned_m(good, t_us)[-1, 0], 2.0 + 2.0 / 3.0, atol=1e-9)
+    buffer.take(good, start_at(0), [], rest)
+    assert (buffer.guess_ned_m(t_us) is not None) is there
+    assert buffer.plan is good  # the failsafe decides how old a flown plan may be
+    np.testing.assert_allclose(buffer.positions_ned_m(good, t_us)[-1, 0], 2.0 + 2.0 / 3.0, atol=1e-9)

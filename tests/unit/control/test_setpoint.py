@@ -72,16 +72,16 @@ def test_thrust_is_linear_in_weights_and_bounded(specific_m_s2: float, hover_01:
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("entry", range(3))
 def test_nonsense_in_is_a_setpoint_that_is_refused(entry: int, bad: float) -> None:
-    virtual = np.array([0.1, -0.1, G])
-    virtual[entry] = bad
-    assert setpoint_of(virtual, 0.0, 0.5, 0, MODEL).problem(0)
+    virtual_control = np.array([0.1, -0.1, G])
+    virtual_control[entry] = bad
+    assert setpoint_of(virtual_control, 0.0, 0.5, 0, MODEL).problem(0)
 
 
 def test_acceleration_of_virtual_controls_by_hand() -> None:
     np.testing.assert_allclose(acceleration(np.array([0.0, 0.0, G])), 0.0, atol=1e-12)
     # 30 degrees nose down with the vertical part carrying the weight: g tan 30 to the north
-    virtual = np.array([-0.5, 0.0, G / math.cos(math.radians(30))])
-    np.testing.assert_allclose(acceleration(virtual), [G * math.tan(math.radians(30)), 0.0, 0.0], atol=1e-12)
+    virtual_control = np.array([-0.5, 0.0, G / math.cos(math.radians(30))])
+    np.testing.assert_allclose(acceleration(virtual_control), [G * math.tan(math.radians(30)), 0.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(acceleration(np.array([0.0, 0.0, 0.0])), [0.0, 0.0, G])
 
 

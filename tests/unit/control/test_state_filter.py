@@ -1,4 +1,4 @@
-"""What an autopilot's estimate is wrong by is taken out again, and nothing is invented where it is right."""
+"""Tests that the filter removes errors of an autopilot's estimate and leaves exact states unchanged."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def sample(t_us: int, pos: Array, vel: Array, q_nb: Array | None = None) -> Vehi
 
 
 class World:
-    """A point mass that flies to and fro in wind and drag, and an estimator that is wrong about it."""
+    """A point mass that flies to and fro with wind and drag, and an estimator with errors."""
 
     def __init__(self, wind_m_s2: Array, bias_m_s: float = 0.0, noise: float = 0.0, seed: int = 1) -> None:
         self.t_us, self.pos, self.vel = 0, np.zeros(3), np.zeros(3)
@@ -63,7 +63,7 @@ class World:
 
 
 def velocity_error_m_s(world: World, filtered: StateFilter, seconds: float, skip_s: float) -> float:
-    """RMS over time and axes of the velocity planned from."""
+    """Return the RMS error over time and axes of the velocity used for planning."""
     errors = []
     for k in range(round(seconds / STEP_S)):
         truth = world.vel.copy()
@@ -78,7 +78,7 @@ def test_a_bias_of_the_reported_velocity_is_taken_out() -> None:
     left = velocity_error_m_s(World(np.zeros(3), bias_m_s=0.25, noise=0.02), make(), 30.0, 5.0)
     believed = velocity_error_m_s(World(np.zeros(3), bias_m_s=0.25, noise=0.02), make(bias_m_s=0.0), 30.0, 5.0)
     assert left < 0.06
-    assert believed > 2.0 * left, "the control: without the bias state it is believed"
+    assert believed > 2.0 * left, "negative control: without the bias state the bias remains"
 
 
 def test_exact_states_stay_as_they_are() -> None:
@@ -101,7 +101,7 @@ def test_a_disturbance_is_bounded() -> None:
     assert abs(float(estimate.disturbance_ned_m_s2[0])) == pytest.approx(DisturbanceParams().limit_m_s2)
 
 
-def test_while_somebody_else_flies_no_disturbance_is_learned_and_velocity_is_still_right() -> None:
+def test_while_the_autopilot_flies_no_disturbance_is_learned_and_velocity_is_right() -> None:
     filtered, world = make(), World(np.array([2.0, 0.0, 0.0]), bias_m_s=0.2)
     for _ in range(500):
         truth = world.vel.copy()
@@ -123,7 +123,7 @@ def test_a_jump_of_the_reported_position_is_taken_over_at_once_and_the_wind_is_k
     np.testing.assert_array_equal(after.disturbance_ned_m_s2, before.disturbance_ned_m_s2)
 
 
-def test_a_gap_begins_anew() -> None:
+def test_a_gap_restarts_the_filter() -> None:
     filtered = make()
     filtered.update(sample(0, np.zeros(3), np.ones(3)), None)
     late = sample(1_000_000, np.ones(3), np.zeros(3))
@@ -137,7 +137,7 @@ def test_a_sample_it_has_not_seen_is_passed_on() -> None:
 
 
 def test_thrust_acts_after_the_dead_time() -> None:
-    """A thrust step is explained when it arrives, not when it is sent: no disturbance appears."""
+    """A thrust step is expected when it acts, not when it is sent, so that no disturbance appears."""
     model = VehicleModelParams(delay_s=0.1, hover_thrust_01=HOVER_01)
     worst = {}
     for name, dead_us in (("modelled", 100_000), ("ignored", 0)):

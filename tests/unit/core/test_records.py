@@ -39,7 +39,7 @@ def record(plan: np.ndarray = PLAN) -> TickRecord:
         disturbance_ned_m_s2=np.array([0.0625, -0.5, 2.0]),
         nearest_peer_m=math.inf,
         nearest_obstacle_m=3.5,
-        path_age_ms=12.5,
+        plan_staleness_ms=12.5,
         peers=513,
         rejected=70_000,
         plan_status=PlanStatus.NOT_CERTIFIED,
@@ -48,7 +48,7 @@ def record(plan: np.ndarray = PLAN) -> TickRecord:
         iterations=1_500,
         solve_ms=1.25,
         tick_ms=2.75,
-        late_ticks=65_537,
+        deadline_misses=65_537,
         safety_filter_acted=True,
         plan_pos_ned_m=plan,
     )
@@ -111,4 +111,4 @@ def test_hostile_bytes_never_raise(payload: bytes) -> None:
 def test_rows_of_a_file_are_an_array() -> None:
     rows = np.frombuffer(tick_row(record()).tobytes() * 3, TICK_DTYPE)
     assert rows.shape == (3,)
-    assert rows["late_ticks"].tolist() == [65_537] * 3
+    assert rows["deadline_misses"].tolist() == [65_537] * 3

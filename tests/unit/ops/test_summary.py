@@ -45,7 +45,7 @@ def test_a_full_disk_costs_the_files_and_not_the_verdict(folder: Path) -> None:
     lines = sum_up(folder, 0)
     assert lines[:2] == ["violation: agent-1 was killed by SIGKILL", "violation: agent-2 has been silent for 5 s"]
     verdict, separation, *_ = (line for line in lines if not line.startswith("violation: "))
-    assert verdict.startswith("failed, index")
+    assert verdict.startswith("failed, summed mean tracking error")
     assert separation.startswith("separation 1.039 m (required 0.850 m)")
     assert f"run folder {folder}" in lines
     assert "summary.json: File too large" in lines[-2]

@@ -123,7 +123,7 @@ def nonlinear_series(captured: Captured, every: int) -> list[tuple[NonlinearXy, 
     for problem in captured.problems[::every]:
         plan = mpc.plan(problem)
         nonlinear = mpc.nonlinear(problem, plan)
-        series.append((nonlinear, nonlinear.moves_of(plan.virtual[:, :2]), plan.pos_ned_m[1:, :2]))
+        series.append((nonlinear, nonlinear.moves_of(plan.virtual_control[:, :2]), plan.pos_ned_m[1:, :2]))
     return series
 
 
@@ -137,7 +137,7 @@ def test_its_cost_is_the_thesis_cost(captured: Captured) -> None:
     for problem in captured.problems[::40]:
         plan = mpc.plan(problem)
         nonlinear = mpc.nonlinear(problem, plan)
-        moves = nonlinear.moves_of(plan.virtual[:, :2])
+        moves = nonlinear.moves_of(plan.virtual_control[:, :2])
         error = problem.reference.pos_ned_m[1:41, :2] - plan.pos_ned_m[1:, :2]
         vel_error = problem.reference.vel_ned_m_s[1:41, :2] - plan.vel_ned_m_s[1:, :2]
         terms = ((weights.q_pos, error), (weights.q_vel, vel_error), (weights.r, moves))

@@ -1,4 +1,4 @@
-"""The drawings of the reports: where things are, and what breaks a line."""
+"""Tests of the charts in reports: positions of drawn items and interruptions of lines."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Array = NDArray[np.float64]
 
 
 def point(drawing: str, color: str) -> tuple[float, float]:
-    """Where the dot at the end of a path is, right and down in pixels."""
+    """Return the position of the dot at the end of a path, right and down in pixels."""
     found = re.search(rf'<circle cx="([-\d.]+)" cy="([-\d.]+)" r="4" fill="{color}"/>', drawing)
     assert found is not None
     return float(found[1]), float(found[2])
@@ -36,7 +36,7 @@ def test_space_view_keeps_up_up_north_left_and_east_right() -> None:
     assert ey < oy
 
 
-def test_a_ball_is_round_and_where_it_is() -> None:
+def test_a_ball_is_drawn_round_and_at_its_place() -> None:
     center_ned_m, radius_m = (9.5, 5.5, -2.3), 1.75
     look = math.radians(35)
     edge_ned_m = (9.5 - radius_m * math.sin(look), 5.5 + radius_m * math.cos(look), -2.3)
@@ -59,7 +59,7 @@ def test_only_the_near_side_is_drawn_over_a_ball() -> None:
     assert near.count("L") == all_of_it.count("L") // 2
 
 
-def test_a_tall_path_says_that_its_heights_are_shrunk() -> None:
+def test_a_tall_path_states_its_scale_of_heights() -> None:
     t = np.linspace(0, 37.7, 400)
     spiral = SpaceLine(np.column_stack([0.5 * np.cos(t), 0.5 * np.sin(t), -1 - t]), "#s")
     assert re.search(r"z down \[m\], scale x 0\.0\d+<", space_view("spiral", [spiral]))

@@ -1,4 +1,4 @@
-"""A run folder of somebody else: whatever is in it, `report` ends in words and writes nothing but the report."""
+"""Tests of `report` on run folders with hostile content: it ends with a message and writes nothing but the report."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.unit.telemetry.test_run_folder import RULES, write_run
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """A good run of three, finished."""
+    """A finished run of three agents without faults."""
     directory = tmp_path / "run"
     directory.mkdir()
     write_run(directory, 3, 6.0)
@@ -35,7 +35,7 @@ def folder(tmp_path: Path) -> Path:
 
 
 def report(directory: Path) -> subprocess.CompletedProcess[str]:
-    """The verb, as somebody would type it."""
+    """Run the verb as on the command line."""
     command = [sys.executable, "-m", "swarmctl", "report", str(directory)]
     return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
 
@@ -114,14 +114,14 @@ def test_refused_in_one_line(folder: Path, spoil: Callable[[Path], Any], words: 
     assert words in str(caught.value)
 
 
-def test_the_verb_says_it_and_exits_2(folder: Path) -> None:
+def test_the_verb_reports_it_and_exits_2(folder: Path) -> None:
     (folder / "summary.json").write_text("\x1b[2J")
     done = report(folder)
     assert (done.returncode, done.stdout) == (2, "")
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_a_folder_that_is_none_is_called_so(tmp_path: Path) -> None:
+def test_a_path_that_is_no_folder_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no such run folder"):
         rewrite_report(tmp_path / "nowhere")
     with pytest.raises(ConfigError, match="is no run folder"):
@@ -147,7 +147,7 @@ HOSTILE_EVENTS = [
 
 
 @pytest.mark.parametrize("finished", [True, False])
-def test_hostile_events_cost_themselves_only(folder: Path, finished: bool) -> None:
+def test_hostile_events_are_skipped(folder: Path, finished: bool) -> None:
     with (folder / "events.jsonl").open("a", encoding="latin-1") as file:
         file.writelines(f"{line}\n" for line in HOSTILE_EVENTS)
     if not finished:

@@ -29,7 +29,7 @@ def record(seq: int) -> TickRecord:
         seq=seq,
         mission_t_s=float("nan"),
         phase=Phase.TRACK,
-        mode=Mode.FOLLOW,
+        mode=Mode.TRACKING,
         flight_mode=FlightMode.EXTERNAL,
         armed=True,
         state_age_ms=4.0,
@@ -43,7 +43,7 @@ def record(seq: int) -> TickRecord:
         disturbance_ned_m_s2=zero,
         nearest_peer_m=float("inf"),
         nearest_obstacle_m=float("inf"),
-        path_age_ms=float("nan"),
+        plan_staleness_ms=float("nan"),
         peers=0,
         rejected=0,
         plan_status=PlanStatus.OK,
@@ -52,7 +52,7 @@ def record(seq: int) -> TickRecord:
         iterations=25,
         solve_ms=1.0,
         tick_ms=2.0,
-        late_ticks=0,
+        deadline_misses=0,
         plan_pos_ned_m=np.zeros((26, 3)),
     )
 
@@ -81,7 +81,7 @@ def test_round_trip(tmp_path: Path) -> None:
     }
 
 
-def test_full_disk_is_counted_and_stays_the_recorders_problem(tmp_path: Path) -> None:
+def test_rows_lost_to_a_full_disk_are_counted_and_raise_nothing(tmp_path: Path) -> None:
     (tmp_path / "agent-0.ticks").symlink_to("/dev/full")
     recorder = Recorder(tmp_path, 0)
     for seq in range(10):
@@ -132,7 +132,7 @@ _CHILD = """
 import sys, time, resource
 from pathlib import Path
 sys.path.insert(0, {folder!r})
-from test_telemetry_recorder import Recorder, record
+from test_recorder import Recorder, record
 limit = {limit}
 if limit:
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
@@ -161,7 +161,7 @@ def test_disk_that_fills_up_mid_row_leaves_whole_rows(tmp_path: Path) -> None:
     assert int(output) == 50
 
 
-def test_killed_agent_leaves_all_but_the_last_moments(tmp_path: Path) -> None:
+def test_killed_agent_loses_only_the_last_moments(tmp_path: Path) -> None:
     process = child(tmp_path, limit=0, count=10_000, pause_s=0.005)
     path = tmp_path / "agent-0.ticks"
     until_s = time.monotonic() + 30
@@ -174,7 +174,7 @@ def test_killed_agent_leaves_all_but_the_last_moments(tmp_path: Path) -> None:
     assert rows["seq"].tolist() == list(range(len(rows)))
 
 
-def test_half_row_of_a_killed_agent_does_not_shift_its_successors(tmp_path: Path) -> None:
+def test_partial_row_of_a_killed_agent_does_not_shift_later_rows(tmp_path: Path) -> None:
     path = tmp_path / "agent-0.ticks"
     recorder = Recorder(tmp_path, 0)
     recorder.tick(record(0))

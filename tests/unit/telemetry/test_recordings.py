@@ -1,4 +1,4 @@
-"""Recordings drawn offline, the mesh, and the parts of the live view that can be judged without a bus."""
+"""Tests of offline recordings, of the mesh, and of the parts of the live view that need no bus."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def flown(agent: int, count: int = 120) -> NDArray[np.void]:
     rows["t_us"] = 20_000 * np.arange(count)
     rows["utc_us"] = rows["t_us"] + 1_780_000_000_000_000
     rows["seq"] = np.arange(count)
-    rows["phase"], rows["mode"], rows["iterations"], rows["solve_ms"] = Phase.TRACK, Mode.FOLLOW, 25, 1.5
+    rows["phase"], rows["mode"], rows["iterations"], rows["solve_ms"] = Phase.TRACK, Mode.TRACKING, 25, 1.5
     rows["pos_ned_m"][:, 0] = float(agent)
     rows["q_nb"][:, 0] = 1.0
     rows["setpoint_q_nb"] = np.nan
@@ -76,14 +76,14 @@ def test_recording_of_a_killed_viewer_is_repaired(tmp_path: Path) -> None:
     assert path.stat().st_size > 20_000
 
 
-def test_opening_a_window_without_a_display_is_refused_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_opening_a_window_without_a_display_is_refused_with_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
     with pytest.raises(StartError, match="no display"):
         open_viewer("rerun+http://127.0.0.1:9876/proxy")
 
 
-def test_launcher_can_import_recordings_without_paying_for_rerun() -> None:
+def test_recordings_can_be_imported_without_rerun() -> None:
     modules = "swarmctl.telemetry.recordings, swarmctl.telemetry.run_folder"
     code = f"import sys, {modules}; print({{'pyarrow', 'rerun', 'zenoh'}} & set(sys.modules))"
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
@@ -108,7 +108,7 @@ def test_mesh_is_a_sound_glb_of_a_small_quadrotor() -> None:
     assert size_m[2] < 0.1
 
 
-def test_least_distance_of_agents_that_report_at_different_instants() -> None:
+def test_smallest_distance_of_agents_that_report_at_different_instants() -> None:
     feed = SeparationFeed(3)
     t_us = 20_000 * np.arange(50)
     feed.offer(0, t_us, np.zeros((50, 3)))

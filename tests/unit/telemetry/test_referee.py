@@ -1,4 +1,4 @@
-"""The referee against runs small enough to judge by hand; every claim fails when its rule is off."""
+"""Tests of the referee on runs small enough to judge by hand; every claim fails when its rule is disabled."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ START_US = 1_000_000  # monotonic time of mission start
 
 
 def ticks(seconds: float, pos_ned_m: Any, first_s: float = 0.0, rate_hz: int = 50) -> NDArray[np.void]:
-    """Ticks of an agent in the mission whose reference stays in the origin; `pos_ned_m` (3,) or (T, 3)."""
+    """Return mission ticks of an agent whose reference stays at the origin; `pos_ned_m` (3,) or (T, 3)."""
     t_s = first_s + np.arange(round(seconds * rate_hz) + 1) / rate_hz
     rows = np.zeros(len(t_s), TICK_DTYPE)
     rows["t_us"] = START_US + np.round(t_s * 1e6).astype(np.int64)
     rows["utc_us"] = rows["t_us"] + UTC0_US
     rows["mission_t_s"] = t_s
-    rows["phase"], rows["mode"], rows["armed"] = Phase.TRACK, Mode.FOLLOW, 1
+    rows["phase"], rows["mode"], rows["armed"] = Phase.TRACK, Mode.TRACKING, 1
     rows["pos_ned_m"] = pos_ned_m
     rows["q_nb"][:, 0] = 1.0
-    rows["iterations"], rows["solve_ms"], rows["tick_ms"], rows["path_age_ms"] = 25, 2.0, 4.0, 30.0
+    rows["iterations"], rows["solve_ms"], rows["tick_ms"], rows["plan_staleness_ms"] = 25, 2.0, 4.0, 30.0
     return rows
 
 
 def truth(vehicle: int, t_s: Any, pos_ned_m: Any, armed: Any = 1) -> NDArray[np.void]:
-    """True states at mission times `t_s`."""
+    """Return true states at mission times `t_s`."""
     rows = np.zeros(len(t_s), TRUTH_DTYPE)
     rows["t_us"] = START_US + np.round(np.asarray(t_s) * 1e6).astype(np.int64)
     rows["vehicle"], rows["pos_ned_m"], rows["armed"] = vehicle, pos_ned_m, armed
@@ -48,7 +48,7 @@ def run(by_agent: dict[int, NDArray[np.void]], *true: NDArray[np.void], events: 
 APART = {0: ticks(20, (1.0, 0.0, 0.0)), 1: ticks(20, (0.0, 0.0, 2.0))}
 
 
-def test_index_is_the_sum_of_mean_distances() -> None:
+def test_summed_mean_tracking_error_is_the_sum_of_mean_distances() -> None:
     tracking = judge(run(APART), Rules(2, 0.5), "completed")["tracking"]
     assert tracking["index_m"] == pytest.approx(1.0 + 2.0)
     assert tracking["agents"][0]["mse_m2"] == pytest.approx([1.0, 0.0, 0.0])
@@ -66,14 +66,14 @@ def test_mean_and_rmse_of_a_changing_error() -> None:
     assert row["rmse_m"] == pytest.approx(math.sqrt((51 * 9 + 50) / 101))
 
 
-def test_index_counts_only_the_time_all_agents_share() -> None:
+def test_summed_mean_tracking_error_counts_only_common_time() -> None:
     late = ticks(20, (2.0, 0.0, 0.0))
     late["pos_ned_m"][late["mission_t_s"] > 10.0] = (100.0, 0.0, 0.0)
     both = {0: late, 1: ticks(10, (0.0, 1.0, 0.0))}
     assert judge(run(both), Rules(2, 0.5), "failed")["tracking"]["index_m"] == pytest.approx(3.0)
 
 
-def test_index_is_unknown_when_an_agent_never_tracked() -> None:
+def test_summed_mean_tracking_error_is_unknown_when_an_agent_never_tracked() -> None:
     assert judge(run({0: APART[0]}), Rules(2, 0.5), "failed")["tracking"]["index_m"] is None
 
 
@@ -96,7 +96,7 @@ def test_truth_wins_over_reports_and_is_interpolated() -> None:
 
 
 def closing(least_m: float) -> RunData:
-    """Two agents whose distance falls from 2 m to `least_m` at 5 s and grows again."""
+    """Return ticks of two agents whose distance falls from 2 m to `least_m` at 5 s and grows again."""
     t_s = np.arange(0, 10.001, 0.01)
     gap = least_m + np.abs(t_s - 5.0) * (2.0 - least_m) / 5.0
     other = np.column_stack([gap, 0 * gap, 0 * gap])
@@ -112,7 +112,7 @@ def test_separation_names_value_limit_pair_and_time() -> None:
     assert summary["outcome"] == "failed"
 
 
-def test_separation_with_heights_scaled_is_told_beside_the_true_one() -> None:
+def test_separation_with_scaled_heights_is_reported_beside_the_true_one() -> None:
     t_s = np.arange(0, 5.001, 0.01)
     low, high = truth(0, t_s, (0.0, 0.0, 0.0)), truth(1, t_s, (0.3, 0.0, -1.6))
     found = judge(run(APART, low, high), Rules(2, 0.85, downwash=2.0), "completed")["separation"]
@@ -187,32 +187,32 @@ def test_obstacle_set_in_flight_counts_from_then_on() -> None:
     assert judge(run({0: rows}), Rules(1, 0.5, (ObstacleRule((0, 0, 0), 1.0),)), "completed")["outcome"] == "failed"
 
 
-def test_timing_counts_flight_ticks_and_late_ones() -> None:
+def test_timing_counts_flight_ticks_and_deadline_misses() -> None:
     rows = ticks(2, (0.0, 0.0, 0.0))  # 101 ticks
     rows["phase"][:10] = Phase.STANDBY
-    rows["late_ticks"] = 3 + np.clip(np.arange(101) - 40, 0, 30)  # 30 during the flight, one after the other
+    rows["deadline_misses"] = 3 + np.clip(np.arange(101) - 40, 0, 30)  # 30 during the flight, one after the other
     rows["tick_ms"] = 4.0
     rows["tick_ms"][60] = 9.0
     rows["solve_ms"][70], rows["iterations"][70] = 99.0, 0  # nothing was solved in this tick
-    summary = judge(run({0: rows}), Rules(1, 0.5, late_ticks_01=0.2), "completed", speed_factor=8.0)
+    summary = judge(run({0: rows}), Rules(1, 0.5, deadline_misses_01=0.2), "completed", speed_factor=8.0)
     timing = summary["timing"]
     assert (timing["ticks"], timing["late_ticks"], timing["speed_factor"]) == (91, 30, 8.0)
     assert timing["tick_ms"] == {"p50": 4.0, "p99": pytest.approx(4.5), "max": 9.0}
     assert timing["solve_ms"]["max"] == 2.0
-    assert summary["violations"] == ["late ticks 33.0% above 20.0% (30 of 91 due)"]
-    assert judge(run({0: rows}), Rules(1, 0.5, late_ticks_01=0.4), "completed")["violations"] == []
+    assert summary["violations"] == ["deadline misses 33.0% above 20.0% (30 of 91 due)"]
+    assert judge(run({0: rows}), Rules(1, 0.5, deadline_misses_01=0.4), "completed")["violations"] == []
 
 
 def test_ticks_that_were_skipped_were_due() -> None:
     rows = ticks(2, (0.0, 0.0, 0.0))  # 101 ticks
-    rows["late_ticks"] = 3 * np.arange(101)  # each of them late, and two skipped before it
-    summary = judge(run({0: rows}), Rules(1, 0.5, late_ticks_01=0.2), "completed")
+    rows["deadline_misses"] = 3 * np.arange(101)  # each of them late, and two skipped before it
+    summary = judge(run({0: rows}), Rules(1, 0.5, deadline_misses_01=0.2), "completed")
     assert (summary["timing"]["ticks"], summary["timing"]["due_ticks"]) == (101, 301)
-    assert summary["violations"] == ["late ticks 99.7% above 20.0% (300 of 301 due)"]
+    assert summary["violations"] == ["deadline misses 99.7% above 20.0% (300 of 301 due)"]
 
 
 def vanishing(heard: bool) -> RunData:
-    """Agent 1 flies past where agent 0's vehicle was at 5 s. Unless heard, that one's last state is repeated since."""
+    """Agent 1 flies past the position of agent 0 at 5 s. Unless `heard`, agent 0 repeats its state of 5 s from then."""
     passing, seen = ticks(20, (0.0, 0.0, 0.0)), ticks(20, (0.0, 0.0, 0.0))
     t_s = passing["mission_t_s"]
     seen["pos_ned_m"][:, 0] = np.minimum(t_s, 20.0 if heard else 5.0)  # 1 m/s north
@@ -222,7 +222,7 @@ def vanishing(heard: bool) -> RunData:
     return run({0: seen, 1: passing})
 
 
-def test_a_vehicle_that_vanished_is_named_and_not_judged_by_where_it_was_seen_last() -> None:
+def test_a_vanished_vehicle_is_named_and_not_judged_by_its_last_position() -> None:
     summary = judge(vanishing(heard=False), Rules(2, 0.85), "failed")
     assert summary["separation"]["min_m"] == pytest.approx(5.4)  # at 5 s, the last that is known
     assert summary["violations"] == [
@@ -233,10 +233,10 @@ def test_a_vehicle_that_vanished_is_named_and_not_judged_by_where_it_was_seen_la
     )
 
 
-def test_a_reported_state_counts_when_it_was_true_not_when_it_was_recorded() -> None:
+def test_a_reported_state_counts_at_its_own_time() -> None:
     delayed, still = ticks(10, (0.0, 0.0, 0.0)), ticks(10, (10.0, 0.0, 0.0))
     delayed["state_age_ms"] = 200.0
-    delayed["pos_ned_m"][:, 0] = delayed["mission_t_s"] - 0.2  # 1 m/s north, told 200 ms later
+    delayed["pos_ned_m"][:, 0] = delayed["mission_t_s"] - 0.2  # 1 m/s north, reported 200 ms later
     pair = judge(run({0: delayed, 1: still}), Rules(2, 0.1), "failed")["separation"]
     assert pair["min_m"] == pytest.approx(0.2, abs=0.03)
     assert pair["min_at_s"] == pytest.approx(9.8, abs=0.03)
@@ -249,10 +249,10 @@ def test_clocks_of_different_years_have_no_common_instants() -> None:
     assert "can't be judged" in summary["violations"][0]
 
 
-def test_solver_failures_count_while_the_agent_is_in_charge() -> None:
+def test_solver_failures_count_while_the_agent_has_control() -> None:
     rows = ticks(2, (0.0, 0.0, 0.0))
     rows["plan_status"][:4] = [PlanStatus.SOLVER_FAILED, PlanStatus.RESIDUAL, PlanStatus.NOT_CERTIFIED, PlanStatus.NONE]
-    rows["plan_status"][10], rows["mode"][10] = PlanStatus.SOLVER_FAILED, Mode.YIELD
+    rows["plan_status"][10], rows["mode"][10] = PlanStatus.SOLVER_FAILED, Mode.PILOT_OVERRIDE
     rows["residual_m"] = 1e-4
     rows["residual_m"][0] = 7.0  # refused, never flown
     rows["safety_filter_acted"][5:8] = 1
@@ -289,7 +289,7 @@ def refused(by: int, reason: str, count: int, sender: str = "agent-1", topic: st
     }
 
 
-def test_messages_refused_in_a_peers_name_are_a_violation_and_what_a_network_does_is_not() -> None:
+def test_forged_messages_are_a_violation_and_network_faults_are_not() -> None:
     network = [refused(0, "late", 4000), refused(0, "replayed", 900), refused(0, "unconfirmed", 70)]
     clumsy = [refused(0, "malformed", 50), refused(0, "stale_order", 3, "operator", "command")]
     summary = judge(run(APART, events=network + clumsy), Rules(2, 0.5), "completed")
@@ -307,7 +307,7 @@ def test_messages_refused_in_a_peers_name_are_a_violation_and_what_a_network_doe
     ]
 
 
-def test_who_went_unheard_longest_is_named() -> None:
+def test_the_peer_unheard_for_longest_is_named() -> None:
     def row(by: int, agent: int, at_s: float, **fields: Any) -> dict[str, Any]:
         return {"source": f"agent-{by}", "event": "unheard", "agent": agent, "utc_us": round(at_s * 1e6), **fields}
 
@@ -358,7 +358,7 @@ def test_diverged_truth_is_no_pass() -> None:
 
 
 @pytest.mark.parametrize("data", [run({}), run({0: ticks(0, (0, 0, 0))[:0]}), run(APART)], ids=["none", "empty", "run"])
-def test_summary_holds_no_nan_and_every_promised_key(data: RunData) -> None:
+def test_summary_holds_no_nan_and_every_contract_key(data: RunData) -> None:
     summary = judge(data, Rules(2, 0.85), "interrupted")
 
     def refuse(constant: str) -> None:

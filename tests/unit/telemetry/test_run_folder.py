@@ -1,4 +1,4 @@
-"""A run folder is unique, survives crashes, and ends up complete."""
+"""Tests that a run folder is unique, survives crashes and ends up complete."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ UTC_US = 1_780_000_000_000_000
 
 
 def flight(agent: int, agents: int, seconds: float) -> tuple[NDArray[np.void], NDArray[np.void]]:
-    """Ticks and truth of one agent on a circle, take-off and landing included."""
+    """Return ticks and truth of one agent on a circle, with take-off and landing."""
     t_s = np.arange(0, seconds, 0.02)
     rows, true = np.zeros(len(t_s), TICK_DTYPE), np.zeros(len(t_s), TRUTH_DTYPE)
     rows["t_us"] = true["t_us"] = 5_000_000 + (t_s * 1e6).astype(np.int64)
     rows["utc_us"] = rows["t_us"] + UTC_US
     rows["seq"] = np.arange(len(t_s))
     rows["phase"] = np.select([t_s < 1, t_s < 3, t_s < seconds - 1], [Phase.STANDBY, Phase.TAKEOFF, Phase.TRACK], 8)
-    rows["mode"] = np.where(rows["phase"] == Phase.TRACK, Mode.FOLLOW, Mode.IDLE)
+    rows["mode"] = np.where(rows["phase"] == Phase.TRACK, Mode.TRACKING, Mode.IDLE)
     rows["mission_t_s"] = np.where(rows["phase"] == Phase.TRACK, t_s - 3, np.nan)
     rows["armed"] = true["armed"] = t_s >= 1
     angle = 0.5 * t_s
@@ -43,13 +43,13 @@ def flight(agent: int, agents: int, seconds: float) -> tuple[NDArray[np.void], N
     noise = np.random.default_rng([1, agent]).gamma(2.0, 0.5, (2, len(t_s)))
     rows["solve_ms"], rows["tick_ms"], rows["iterations"] = 1 + noise[0], 2 + noise[1], 25
     rows["setpoint_thrust_01"], rows["hover_thrust_01"] = 0.5 + 0.02 * noise[0], 0.5
-    rows["path_age_ms"] = np.nan
+    rows["plan_staleness_ms"] = np.nan
     true["vehicle"] = agent
     return rows, true
 
 
 def write_run(directory: Path, agents: int, seconds: float) -> None:
-    """What processes leave behind, before the launcher finishes the run."""
+    """Write the files that processes leave before the launcher finishes the run."""
     true = []
     for agent in range(agents):
         rows, own = flight(agent, agents, seconds)
@@ -73,7 +73,7 @@ def test_launches_in_the_same_second_get_folders_of_their_own(tmp_path: Path, mo
     assert Path("runs/20260528T202640Z-circle") in folders
 
 
-def test_given_folder_is_taken_as_it_is_but_never_twice(tmp_path: Path) -> None:
+def test_a_given_folder_is_used_once(tmp_path: Path) -> None:
     folder = create_run_folder(tmp_path / "a" / "b", "circle", UTC_US)
     assert folder == tmp_path / "a" / "b"
     (folder / "console.log").write_text("")
@@ -97,7 +97,7 @@ def test_parquet_gives_back_every_column(tmp_path: Path) -> None:
         np.testing.assert_array_equal(again[name], rows[name], err_msg=name)
 
 
-def test_half_rows_and_half_lines_are_ignored(tmp_path: Path) -> None:
+def test_partial_rows_and_lines_are_ignored(tmp_path: Path) -> None:
     write_run(tmp_path, 2, 5.0)
     whole = load_run(tmp_path)
     for name in ("agent-0.ticks", "truth.bin", "agent-1.events.jsonl"):
@@ -109,7 +109,7 @@ def test_half_rows_and_half_lines_are_ignored(tmp_path: Path) -> None:
     assert again.events == whole.events
 
 
-def test_missing_folder_is_refused_in_words(tmp_path: Path) -> None:
+def test_a_missing_folder_is_refused_with_a_reason(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="no such run folder"):
         load_run(tmp_path / "nowhere")
 
@@ -141,7 +141,7 @@ def test_report_of_a_run_whose_launcher_died_says_so(tmp_path: Path) -> None:
 
 
 class _Page(HTMLParser):
-    """Collects what a report must and must not have."""
+    """Collects the elements that a report must and must not contain."""
 
     def __init__(self) -> None:
         super().__init__()

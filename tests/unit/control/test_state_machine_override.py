@@ -1,58 +1,67 @@
-"""The phase machine once others decide: pilots, operators, lost plans, silence, found in the air."""
+"""Tests of the mission state machine under overrides, operators, lost plans, bus loss and vehicles found in the air."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from swarmctl.control.phases.sequence import OPERATOR_STOP, REBOOTED
+from swarmctl.control.phases.state_machine import OPERATOR_STOP, REBOOTED
 from swarmctl.control.reference.landing_places import landing_place_ned_m, nearest_in_plane_m
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase, Verb
-from tests.benches.sequenced_flight import IN_AIR, ON_GROUND, OURS, START, Flight, controlled, ready, verbs
+from tests.benches.state_machine_flight import (
+    CONTROLLED_PHASES,
+    IN_AIR,
+    ON_GROUND,
+    START,
+    Flight,
+    controlled,
+    ready,
+    verbs,
+)
 
-# -- yielding ---------------------------------------------------------------------------------------------------------
+# -- pilot override ---------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("phase", OURS)
-def test_after_a_pilot_took_over_nothing_is_ever_asked_again(phase: Phase) -> None:
+@pytest.mark.parametrize("phase", CONTROLLED_PHASES)
+def test_after_a_pilot_override_nothing_is_requested(phase: Phase) -> None:
     flight = controlled(phase)
-    flight.judged, flight.flight_mode = Mode.YIELD, FlightMode.MANUAL
+    flight.failsafe_mode, flight.flight_mode = Mode.PILOT_OVERRIDE, FlightMode.MANUAL
     assert flight.run(0.1) == []
-    assert not flight.sequence.had_control
-    flight.judged = Mode.STREAM  # without control the judge has nothing to yield any more
+    assert not flight.state_machine.had_control
+    flight.failsafe_mode = Mode.PRIMING  # without control the failsafe sees no override any more
     assert flight.run(120.0) == []  # past every timeout
     flight.flight_mode = FlightMode.EXTERNAL  # not even when the pilot tries our mode
     assert flight.run(5.0) == []
-    assert not flight.sequence.had_control
+    assert not flight.state_machine.had_control
     flight.armed, flight.landed = False, ON_GROUND
     assert flight.run(5.0) == []
-    assert (flight.phase, flight.sequence.outcome) == (Phase.DONE, "pilot or autopilot took over")
+    assert (flight.phase, flight.state_machine.outcome) == (Phase.DONE, "pilot or autopilot took over")
 
 
 @pytest.mark.parametrize("flown", [FlightMode.HOLD, FlightMode.MANUAL], ids=["by the autopilot", "by the pilot"])
-def test_only_the_operator_resumes_and_then_offboard_is_asked_for(flown: FlightMode) -> None:
+def test_only_the_operator_resumes_and_then_offboard_is_requested(flown: FlightMode) -> None:
     flight = controlled(Phase.TRACK)
-    flight.judged, flight.flight_mode = Mode.YIELD, flown
+    flight.failsafe_mode, flight.flight_mode = Mode.PILOT_OVERRIDE, flown
     flight.run(1.0)
-    flight.judged = Mode.STREAM
+    flight.failsafe_mode = Mode.PRIMING
     flight.ask("resume")
     assert Verb.EXTERNAL in flight.run(1.5)
     flight.flight_mode = FlightMode.EXTERNAL
     flight.run(0.1)
-    assert flight.sequence.had_control
+    assert flight.state_machine.had_control
 
 
 @pytest.mark.parametrize("verb", ["hold", "land", "rtl"])
 def test_other_verbs_do_not_take_a_vehicle_from_its_pilot(verb: str) -> None:
     flight = controlled(Phase.TRACK)
-    flight.judged, flight.flight_mode = Mode.YIELD, FlightMode.MANUAL
+    flight.failsafe_mode, flight.flight_mode = Mode.PILOT_OVERRIDE, FlightMode.MANUAL
     flight.run(0.5)
-    flight.judged = Mode.STREAM
+    flight.failsafe_mode = Mode.PRIMING
     flight.ask(verb)
     assert flight.run(10.0) == []
 
 
-def test_a_pilot_who_takes_over_while_the_autopilot_lands_is_not_fought() -> None:
+def test_a_pilot_override_during_the_landing_is_respected() -> None:
     flight = controlled(Phase.GOTO_LAND)
     flight.pos = START.copy()
     flight.until(Phase.LAND)
@@ -65,13 +74,13 @@ def test_a_pilot_who_takes_over_while_the_autopilot_lands_is_not_fought() -> Non
 
 
 @pytest.mark.parametrize("phase", [Phase.TAKEOFF, Phase.GOTO_START])
-def test_a_pilot_who_flies_before_the_mission_is_not_landed_by_its_time_out(phase: Phase) -> None:
+def test_a_pilot_in_control_before_the_mission_is_not_landed_by_the_timeout(phase: Phase) -> None:
     flight = Flight().until(phase)
     flight.flight_mode, flight.landed, flight.pos = FlightMode.MANUAL, IN_AIR, START.copy()
     assert flight.run(120.0) == []
 
 
-def test_a_pilot_who_takes_over_while_it_is_handed_back_in_the_air_is_not_put_on_hold() -> None:
+def test_a_pilot_override_during_handback_in_the_air_is_not_put_on_hold() -> None:
     flight = airborne().until(Phase.LAND)
     flight.flight_mode = FlightMode.MANUAL
     assert flight.run(10.0) == []
@@ -84,7 +93,7 @@ def test_hold_stops_where_it_is_and_resume_goes_on_with_the_mission() -> None:
     flight = controlled(Phase.TRACK)
     flight.pos, flight.vel = np.array([4.0, 2.0, -2.0]), np.array([1.2, 0.0, 0.0])
     flight.ask("hold")
-    pos, vel = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([0.0, 60.0]))
+    pos, vel = flight.state_machine.reference(flight.utc_us, flight.now_us, np.array([0.0, 60.0]))
     np.testing.assert_allclose(pos[0], [4.0, 2.0, -2.0])
     np.testing.assert_allclose(vel, np.array([[1.2, 0.0, 0.0], [0.0, 0.0, 0.0]]))
     assert pos[1, 0] == pytest.approx(4.0 + 1.2)  # v T / 2 with T = 2 v / a
@@ -92,7 +101,7 @@ def test_hold_stops_where_it_is_and_resume_goes_on_with_the_mission() -> None:
     assert flight.at == "TRACK"  # the mission does not end while held
     flight.ask("resume")
     flight.run(0.1)
-    assert (flight.phase, flight.sequence.outcome) == (Phase.GOTO_LAND, "completed")
+    assert (flight.phase, flight.state_machine.outcome) == (Phase.GOTO_LAND, "completed")
 
 
 @pytest.mark.parametrize(
@@ -103,8 +112,8 @@ def test_land_is_here_and_rtl_is_at_the_start(phase: Phase, verb: str, target: n
     flight = controlled(phase)
     flight.pos = np.array([4.0, 2.0, -2.0])
     flight.ask(verb)
-    assert (flight.phase, flight.sequence.outcome) == (Phase.GOTO_LAND, OPERATOR_STOP)
-    pos, _ = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([0.0, 60.0]))
+    assert (flight.phase, flight.state_machine.outcome) == (Phase.GOTO_LAND, OPERATOR_STOP)
+    pos, _ = flight.state_machine.reference(flight.utc_us, flight.now_us, np.array([0.0, 60.0]))
     np.testing.assert_allclose(pos, np.array([np.array([4.0, 2.0, -2.0]), target]), atol=1e-9)
     flight.pos = target.copy()
     if verb == "land":  # it may still be pushed aside: first it has to have come to rest
@@ -135,16 +144,16 @@ def test_stopping_while_it_climbs_lands_it() -> None:
 
 @pytest.mark.parametrize("verb", ["hold", "resume", "land", "rtl"])
 @pytest.mark.parametrize("phase", [Phase.LAND, Phase.DONE])
-def test_once_landing_verbs_change_nothing(phase: Phase, verb: str) -> None:
+def test_during_the_landing_verbs_change_nothing(phase: Phase, verb: str) -> None:
     flight = controlled(Phase.GOTO_LAND)
     flight.pos = START.copy()
     flight.until(phase)
-    before = flight.phase, flight.sequence.outcome
+    before = flight.phase, flight.state_machine.outcome
     flight.ask(verb)
-    assert (flight.phase, flight.sequence.outcome) == before
+    assert (flight.phase, flight.state_machine.outcome) == before
 
 
-# -- what takes too long ----------------------------------------------------------------------------------------------
+# -- timeouts ---------------------------------------------------------------------------------------------------------
 
 
 def test_a_start_that_takes_too_long_is_given_up_on_the_ground() -> None:
@@ -154,15 +163,15 @@ def test_a_start_that_takes_too_long_is_given_up_on_the_ground() -> None:
     assert flight.at == "STANDBY"
     flight.run(0.5)
     assert flight.at == "DONE"
-    assert "20 s" in flight.sequence.outcome
-    assert "STANDBY" in flight.sequence.outcome
+    assert "20 s" in flight.state_machine.outcome
+    assert "STANDBY" in flight.state_machine.outcome
 
 
 def test_a_start_that_takes_too_long_in_the_air_lands() -> None:
     flight = ready()
     assert flight.run(120.0).count(Verb.LAND) > 0
     assert flight.at == "LAND"
-    assert "READY" in flight.sequence.outcome
+    assert "READY" in flight.state_machine.outcome
 
 
 def test_a_landing_place_that_cannot_be_reached_is_given_up() -> None:
@@ -173,13 +182,13 @@ def test_a_landing_place_that_cannot_be_reached_is_given_up() -> None:
     assert flight.at == "LAND"
 
 
-@pytest.mark.parametrize("phase", OURS)
+@pytest.mark.parametrize("phase", CONTROLLED_PHASES)
 def test_no_plan_for_too_long_lands(phase: Phase) -> None:
     flight = controlled(phase)
-    flight.judged = Mode.LAND
+    flight.failsafe_mode = Mode.LAND
     assert Verb.LAND in flight.run(0.3)
     assert flight.at == "LAND"
-    assert flight.sequence.outcome
+    assert flight.state_machine.outcome
 
 
 # -- found in the air -------------------------------------------------------------------------------------------------
@@ -207,20 +216,20 @@ def test_a_vehicle_found_in_the_air_is_handed_back_in_the_air(landed_at_first: L
             flight.flight_mode = FlightMode.HOLD
     assert not {Verb.ARM, Verb.TAKEOFF, Verb.LAND, Verb.DISARM} & set(asked)
     assert asked[-1] is Verb.HOLD
-    pos, _ = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([60.0]))
+    pos, _ = flight.state_machine.reference(flight.utc_us, flight.now_us, np.array([60.0]))
     np.testing.assert_allclose(pos[0], flight.pos, atol=1e-9)  # where the mission ends, not where it began
-    assert (flight.phase, flight.sequence.outcome) == (Phase.DONE, "completed")
+    assert (flight.phase, flight.state_machine.outcome) == (Phase.DONE, "completed")
     assert flight.armed
 
 
-# -- silence on the bus -----------------------------------------------------------------------------------------------
+# -- bus loss ---------------------------------------------------------------------------------------------------------
 
 
-def test_when_peers_fall_silent_it_comes_to_rest_and_goes_on_when_they_are_back() -> None:
+def test_bus_loss_brings_it_to_rest_and_recovery_resumes_the_mission() -> None:
     flight = controlled(Phase.TRACK)
     flight.pos, flight.vel, flight.unresponsive_peer = np.array([4.0, 2.0, -2.0]), np.array([1.2, 0.0, 0.0]), True
     flight.run(0.1)
-    pos, vel = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([60.0]))
+    pos, vel = flight.state_machine.reference(flight.utc_us, flight.now_us, np.array([60.0]))
     np.testing.assert_allclose(pos[0], [5.2, 2.0, -2.0])
     assert not vel.any()
     flight.run(60.0)
@@ -230,7 +239,7 @@ def test_when_peers_fall_silent_it_comes_to_rest_and_goes_on_when_they_are_back(
     assert flight.at == "GOTO_LAND"  # its time was over meanwhile
 
 
-def test_who_is_told_to_land_here_does_not_fly_home_because_the_bus_was_silent_for_a_while() -> None:
+def test_a_landing_in_place_stays_in_place_after_a_bus_loss() -> None:
     flight = controlled(Phase.TRACK)
     here = np.array([4.0, 2.0, -2.0])
     flight.pos = here.copy()
@@ -239,11 +248,11 @@ def test_who_is_told_to_land_here_does_not_fly_home_because_the_bus_was_silent_f
     flight.run(1.0)
     flight.unresponsive_peer = False
     flight.run(0.1)
-    pos, _ = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([60.0]))
+    pos, _ = flight.state_machine.reference(flight.utc_us, flight.now_us, np.array([60.0]))
     np.testing.assert_allclose(pos[0], here, atol=1e-9)
 
 
-def test_who_is_told_in_silence_to_land_here_lands_here() -> None:
+def test_a_land_command_during_bus_loss_lands_in_place() -> None:
     flight = controlled(Phase.TRACK)
     here = np.array([4.0, 2.0, -2.0])
     flight.pos, flight.unresponsive_peer = here.copy(), True
@@ -251,17 +260,17 @@ def test_who_is_told_in_silence_to_land_here_lands_here() -> None:
     flight.ask("land")
     flight.unresponsive_peer = False
     flight.run(0.1)
-    pos, _ = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([60.0]))
+    pos, _ = flight.state_machine.reference(flight.utc_us, flight.now_us, np.array([60.0]))
     np.testing.assert_allclose(pos[0], here, atol=1e-9)
 
 
-def test_silence_does_not_keep_it_in_the_air_for_ever_once_it_goes_home() -> None:
+def test_bus_loss_does_not_prevent_the_landing_on_the_way_home() -> None:
     flight = controlled(Phase.GOTO_LAND)
     flight.unresponsive_peer, flight.pos = True, START.copy()
     assert Verb.LAND in flight.run(25.0)
 
 
-def test_in_silence_nobody_declares_itself_ready_or_lands_among_the_others() -> None:
+def test_during_bus_loss_no_agent_gets_ready_or_lands_among_others() -> None:
     on_its_way = controlled(Phase.GOTO_START)
     on_its_way.unresponsive_peer, on_its_way.pos = True, START.copy()
     on_its_way.run(5.0)
@@ -276,31 +285,31 @@ def test_in_silence_nobody_declares_itself_ready_or_lands_among_the_others() -> 
     assert home.at == "GOTO_LAND"
 
 
-def test_taking_over_in_silence_it_stays_where_it_is() -> None:
+def test_control_taken_during_bus_loss_stays_in_place() -> None:
     flight = Flight().until(Phase.GOTO_START)
     flight.unresponsive_peer, flight.pos = True, START + np.array([3.0, 0.0, 0.0])
     flight.run(0.5)
     flight.flight_mode = FlightMode.EXTERNAL
     flight.run(0.2)
-    pos, _ = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([60.0]))
+    pos, _ = flight.state_machine.reference(flight.utc_us, flight.now_us, np.array([60.0]))
     np.testing.assert_allclose(pos[0], START + np.array([3.0, 0.0, 0.0]), atol=1e-9)
 
 
 # -- rebooted ---------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("phase", [Phase.ARM, Phase.TAKEOFF, *OURS])
-def test_after_a_reboot_of_its_autopilot_it_asks_for_nothing_any_more(phase: Phase) -> None:
-    flight = controlled(phase) if phase in OURS else Flight().until(phase)
+@pytest.mark.parametrize("phase", [Phase.ARM, Phase.TAKEOFF, *CONTROLLED_PHASES])
+def test_after_a_reboot_of_the_autopilot_nothing_is_requested(phase: Phase) -> None:
+    flight = controlled(phase) if phase in CONTROLLED_PHASES else Flight().until(phase)
     flight.boots, flight.seen = 1, False  # no position yet
     flight.run(0.2)
-    assert flight.sequence.outcome == REBOOTED
+    assert flight.state_machine.outcome == REBOOTED
     flight.seen, flight.armed, flight.flight_mode = True, False, FlightMode.HOLD
     flight.landed = IN_AIR
     assert flight.run(5.0) == []
     flight.landed = ON_GROUND
     assert flight.run(5.0) == []
-    assert (flight.at, flight.sequence.outcome) == ("DONE", REBOOTED)
+    assert (flight.at, flight.state_machine.outcome) == ("DONE", REBOOTED)
 
 
 def test_a_reboot_before_anything_was_armed_costs_nothing() -> None:
@@ -320,14 +329,12 @@ def test_a_reboot_before_anything_was_armed_costs_nothing() -> None:
     ("mode", "failsafe"),
     [(FlightMode.RTL, True), (FlightMode.LAND, True), (FlightMode.HOLD, True), (FlightMode.MANUAL, False)],
 )
-def test_a_vehicle_found_in_a_failsafe_or_with_a_pilot_is_not_even_streamed_to(
-    mode: FlightMode, failsafe: bool
-) -> None:
+def test_no_setpoints_are_sent_to_a_vehicle_in_failsafe_or_with_a_pilot(mode: FlightMode, failsafe: bool) -> None:
     flight = airborne()
     flight.flight_mode, flight.failsafe = mode, failsafe
     assert flight.run(5.0) == []
     assert flight.phase < Phase.GOTO_START, "in which setpoints flow"
-    assert flight.sequence.yielded
+    assert flight.state_machine.pilot_override
     flight.ask("resume")
     assert Verb.EXTERNAL in flight.run(1.0)
 
@@ -337,20 +344,20 @@ def test_a_vehicle_found_in_a_failsafe_or_with_a_pilot_is_not_even_streamed_to(
 CLOSE = START + np.array([0.6, 0.0, 0.0])
 
 
-def test_who_lands_where_it_is_goes_where_there_is_room_first() -> None:
+def test_a_landing_in_place_moves_to_a_free_place_first() -> None:
     flight = controlled(Phase.TRACK)
     flight.pos, flight.others = START.copy(), (CLOSE,)
-    flight.judged = Mode.FOLLOW
+    flight.failsafe_mode = Mode.TRACKING
     flight.ask("land")
     assert Verb.LAND not in flight.run(6.0)
-    pos, _ = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([60.0]))
+    pos, _ = flight.state_machine.reference(flight.utc_us, flight.now_us, np.array([60.0]))
     assert np.linalg.norm((pos[0] - CLOSE)[:2]) == pytest.approx(0.9 + 0.2 + 0.1)
     assert pos[0][2] == START[2]
     flight.pos = pos[0]
     assert Verb.LAND in flight.run(6.0)
 
 
-def test_below_is_no_room_and_those_above_each_other_part_in_different_directions() -> None:
+def test_stacked_vehicles_part_in_different_directions_before_landing() -> None:
     low, high = START.copy(), START - np.array([0.0, 0.0, 3.0])
     assert nearest_in_plane_m(low, [high]) == 0.0
     apart = [
@@ -363,7 +370,7 @@ def test_below_is_no_room_and_those_above_each_other_part_in_different_direction
     np.testing.assert_array_equal(landing_place_ned_m(low, [], 1.2, 0), low)
 
 
-def test_without_room_for_too_long_it_lands_all_the_same() -> None:
+def test_after_the_timeout_it_lands_even_without_room() -> None:
     flight = controlled(Phase.TRACK)
     flight.pos, flight.others = START.copy(), (CLOSE,)
     flight.ask("land")
@@ -373,24 +380,24 @@ def test_without_room_for_too_long_it_lands_all_the_same() -> None:
 
 def test_a_start_given_up_at_speed_brakes_before_the_autopilot_lands_it() -> None:
     flight = controlled(Phase.GOTO_START)
-    flight.judged, flight.vel = Mode.FOLLOW, np.array([2.0, 0.0, 0.0])
+    flight.failsafe_mode, flight.vel = Mode.TRACKING, np.array([2.0, 0.0, 0.0])
     while flight.phase is Phase.GOTO_START:
         flight.step()
     assert flight.at == "GOTO_LAND"
-    _, vel = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([0.0, 60.0]))
+    _, vel = flight.state_machine.reference(flight.utc_us, flight.now_us, np.array([0.0, 60.0]))
     np.testing.assert_allclose(vel[1], 0.0)
-    assert "not tracking" in flight.sequence.outcome
+    assert "not tracking" in flight.state_machine.outcome
 
 
 def test_only_without_a_plan_it_is_landed_at_once() -> None:
     flight = controlled(Phase.TRACK)
-    flight.others, flight.judged = (CLOSE,), Mode.LAND
+    flight.others, flight.failsafe_mode = (CLOSE,), Mode.LAND
     assert Verb.LAND in flight.run(0.3)
 
 
-def test_a_landing_place_not_reached_in_time_is_left_at_rest_and_with_room() -> None:
+def test_after_the_timeout_of_a_landing_place_it_lands_at_rest_and_with_room() -> None:
     flight = controlled(Phase.GOTO_LAND)
-    flight.judged, flight.vel = Mode.FOLLOW, np.array([1.0, 0.0, 0.0])
+    flight.failsafe_mode, flight.vel = Mode.TRACKING, np.array([1.0, 0.0, 0.0])
     assert Verb.LAND not in flight.run(21.0)
     assert flight.at == "GOTO_LAND"
     flight.vel = np.zeros(3)
@@ -402,6 +409,6 @@ def test_handed_back_in_the_air_among_others_it_holds_only_at_rest_and_alone_at_
         flight = Flight(others)
         flight.armed, flight.pos, flight.landed = True, START.copy(), IN_AIR
         flight.until(Phase.TRACK)
-        flight.judged, flight.vel = Mode.FOLLOW, np.array([2.0, 0.0, 0.0])
+        flight.failsafe_mode, flight.vel = Mode.TRACKING, np.array([2.0, 0.0, 0.0])
         asked = flight.run(11.0)
         assert (Verb.HOLD in asked) is (others == 0)

@@ -1,4 +1,4 @@
-"""The phase machine of one agent up to the common beginning: what is asked of the autopilot, and when."""
+"""Tests of the mission state machine up to the common beginning: requests to the autopilot and their times."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 
 from swarmctl.core.types import Command, FlightMode, Phase, Verb
-from tests.benches.sequenced_flight import IN_AIR, SECOND, START, UTC0_US, Flight, ready
+from tests.benches.state_machine_flight import IN_AIR, SECOND, START, UTC0_US, Flight, ready
 
-# -- the way there ----------------------------------------------------------------------------------------------------
+# -- transit to the start ---------------------------------------------------------------------------------------------
 
 
-def test_a_whole_flight_asks_for_each_thing_once_and_in_order() -> None:
+def test_a_whole_flight_requests_each_command_once_and_in_order() -> None:
     flight, asked = Flight(), []
     phases: list[Phase] = []
     for _ in range(600):
@@ -24,10 +24,10 @@ def test_a_whole_flight_asks_for_each_thing_once_and_in_order() -> None:
             phases.append(flight.phase)
     assert asked == [Verb.ARM, Verb.TAKEOFF, Verb.EXTERNAL, Verb.LAND]
     assert phases == list(Phase)[1:]
-    assert (flight.sequence.finished, flight.sequence.outcome) == (True, "completed")
+    assert (flight.state_machine.finished, flight.state_machine.outcome) == (True, "completed")
 
 
-def test_without_a_vehicle_or_before_its_link_is_set_up_nothing_is_asked_for() -> None:
+def test_without_a_vehicle_or_link_setup_nothing_is_requested() -> None:
     flight = Flight()
     flight.seen = flight.prepared = False
     assert flight.run(3.0) == []
@@ -40,23 +40,23 @@ def test_without_a_vehicle_or_before_its_link_is_set_up_nothing_is_asked_for() -
 
 
 @pytest.mark.parametrize("phase", [Phase.CONNECT, Phase.STANDBY, Phase.ARM])
-def test_what_refuses_to_arm_ends_the_mission_with_its_reason(phase: Phase) -> None:
+def test_a_refusal_to_arm_ends_the_mission_with_its_reason(phase: Phase) -> None:
     flight = Flight()
     flight.prepared, flight.armable = phase is not Phase.CONNECT, phase is Phase.ARM
     flight.run(0.3)
     assert flight.phase is phase
     flight.prepared, flight.refusal = True, "COM_OBL_RC_ACT can't be read"
     assert flight.run(5.0) == []
-    assert (flight.at, flight.sequence.outcome) == ("DONE", "COM_OBL_RC_ACT can't be read")
+    assert (flight.at, flight.state_machine.outcome) == ("DONE", "COM_OBL_RC_ACT can't be read")
     flight.refusal = ""
     assert flight.run(5.0) == []
 
 
-def test_when_a_peer_gives_up_on_the_ground_nobody_else_takes_off() -> None:
+def test_when_a_peer_gives_up_on_the_ground_no_agent_takes_off() -> None:
     flight = Flight()
     flight.peer(Phase.DONE)
     assert flight.run(5.0) == []
-    assert (flight.at, flight.sequence.outcome) == ("DONE", "a peer gave up before take-off")
+    assert (flight.at, flight.state_machine.outcome) == ("DONE", "a peer gave up before take-off")
 
 
 def test_arducopter_is_guided_before_it_is_armed_and_takes_off_in_that_mode() -> None:
@@ -72,16 +72,16 @@ def test_arducopter_is_guided_before_it_is_armed_and_takes_off_in_that_mode() ->
     assert flight.run(0.3) == [Verb.TAKEOFF]
     flight.landed, flight.vel = IN_AIR, np.array([0.0, 0.0, -1.0])
     assert flight.run(1.0) == []
-    assert (flight.at, flight.sequence.had_control) == ("TAKEOFF", False), "it climbs by itself"
+    assert (flight.at, flight.state_machine.had_control) == ("TAKEOFF", False), "it climbs by itself"
     flight.pos, flight.vel = START.copy(), np.zeros(3)
     flight.run(0.8)
-    assert not flight.sequence.had_control, "its hover thrust is being learned"
+    assert not flight.state_machine.had_control, "its hover thrust is being learned"
     flight.run(0.5)
-    assert flight.sequence.had_control
+    assert flight.state_machine.had_control
 
 
 @pytest.mark.parametrize("missing", ["armable", "answers", "peer", "peer alive", "peer vehicle"])
-def test_nobody_arms_before_everybody_stands_by(missing: str) -> None:
+def test_no_agent_arms_before_all_stand_by(missing: str) -> None:
     flight = Flight()
     flight.armable = missing != "armable"
     flight.busy = missing == "answers"
@@ -98,7 +98,7 @@ def test_nobody_arms_before_everybody_stands_by(missing: str) -> None:
     assert Verb.ARM in flight.run(0.3)
 
 
-def test_arming_is_asked_once_a_second_and_never_while_an_answer_is_open() -> None:
+def test_arming_is_requested_once_a_second_and_never_while_a_command_is_open() -> None:
     flight = Flight().until(Phase.ARM)
     assert flight.run(3.0).count(Verb.ARM) == 3
     flight.busy = True
@@ -132,12 +132,12 @@ def test_takeoff_is_over_when_it_hovers_at_its_height() -> None:
 def test_disarmed_on_the_ground_it_is_never_armed_again() -> None:
     flight = Flight().until(Phase.TAKEOFF)
     flight.run(0.2)
-    flight.armed = False  # somebody walked up and disarmed it, or the autopilot gave up waiting
+    flight.armed = False  # disarmed by a pilot, or by the autopilot after a timeout
     assert flight.run(20.0) == []
     assert flight.at == "DONE"
 
 
-def test_offboard_is_not_taken_from_a_pilot_who_flies_already() -> None:
+def test_offboard_is_not_taken_from_a_pilot_in_control() -> None:
     flight = Flight().until(Phase.GOTO_START)
     flight.flight_mode = FlightMode.MANUAL
     assert Verb.EXTERNAL not in flight.run(5.0)
@@ -147,8 +147,8 @@ def test_ready_means_at_the_start_and_at_rest() -> None:
     flight = Flight().until(Phase.GOTO_START)
     flight.flight_mode, flight.pos = FlightMode.EXTERNAL, START + np.array([0.5, 0.0, 0.0])
     flight.run(1.0)
-    assert (flight.phase, flight.sequence.had_control) == (Phase.GOTO_START, True)
-    pos, _ = flight.sequence.reference(flight.utc_us, flight.now_us, np.array([-10.0, 60.0]))
+    assert (flight.phase, flight.state_machine.had_control) == (Phase.GOTO_START, True)
+    pos, _ = flight.state_machine.reference(flight.utc_us, flight.now_us, np.array([-10.0, 60.0]))
     np.testing.assert_allclose(pos, [START + np.array([0.5, 0.0, 0.0]), START], atol=1e-9)
     flight.pos, flight.vel = START.copy(), np.array([0.5, 0.0, 0.0])
     flight.run(0.5)
@@ -156,56 +156,56 @@ def test_ready_means_at_the_start_and_at_rest() -> None:
     flight.vel = np.zeros(3)
     ready_us = flight.utc_us
     flight.run(0.1)
-    assert (flight.phase, flight.sequence.ready_utc_us) == (Phase.READY, ready_us)
+    assert (flight.phase, flight.state_machine.ready_utc_us) == (Phase.READY, ready_us)
 
 
 # -- the common beginning ---------------------------------------------------------------------------------------------
 
 
-def test_everybody_waits_for_the_last_one_and_begins_a_second_after_it() -> None:
+def test_all_wait_for_the_last_agent_and_begin_a_second_later() -> None:
     flight = ready()
     flight.run(30.0)
     assert flight.at == "READY"
     late_us = flight.utc_us - 50_000
     flight.peer(Phase.READY, late_us)
     flight.run(0.9)
-    assert (flight.phase, flight.sequence.begin_utc_us) == (Phase.READY, late_us + SECOND)
+    assert (flight.phase, flight.state_machine.begin_utc_us) == (Phase.READY, late_us + SECOND)
     flight.run(0.2)
     assert flight.at == "TRACK"
 
 
 def test_all_agents_compute_the_same_beginning() -> None:
     one, other = ready(), ready()
-    one.sequence.ready_utc_us, other.sequence.ready_utc_us = UTC0_US + 7, UTC0_US + 99
+    one.state_machine.ready_utc_us, other.state_machine.ready_utc_us = UTC0_US + 7, UTC0_US + 99
     one.peer(Phase.READY, UTC0_US + 99)
     other.peer(Phase.TRACK, UTC0_US + 7)
     one.run(0.1)
     other.run(0.1)
-    assert one.sequence.begin_utc_us == other.sequence.begin_utc_us == UTC0_US + 99 + SECOND
+    assert one.state_machine.begin_utc_us == other.state_machine.begin_utc_us == UTC0_US + 99 + SECOND
 
 
 def test_one_of_two_peers_is_not_enough() -> None:
     flight = ready(2)
     flight.peer(Phase.READY, UTC0_US + 5)
     flight.run(20.0)
-    assert (flight.phase, flight.sequence.begin_utc_us) == (Phase.READY, None)
+    assert (flight.phase, flight.state_machine.begin_utc_us) == (Phase.READY, None)
 
 
-def test_a_peer_lost_before_the_beginning_sends_everybody_home() -> None:
+def test_a_peer_lost_before_the_beginning_sends_all_home() -> None:
     flight = ready()
     flight.peer(Phase.READY, 0, alive=False)
     flight.run(0.1)
     assert flight.at == "GOTO_LAND"
-    assert "was lost before the mission began" in flight.sequence.outcome
+    assert "was lost before the mission began" in flight.state_machine.outcome
 
 
 def test_the_reference_runs_on_the_common_clock_and_only_while_tracking() -> None:
     flight = ready()
-    assert math.isnan(flight.sequence.mission_t_s(flight.utc_us))
+    assert math.isnan(flight.state_machine.mission_t_s(flight.utc_us))
     flight.until(Phase.TRACK)
-    begin_us = flight.sequence.begin_utc_us
+    begin_us = flight.state_machine.begin_utc_us
     assert begin_us is not None
-    pos, vel = flight.sequence.reference(begin_us + 2 * SECOND, 0, np.array([0.0, 1.0]))
+    pos, vel = flight.state_machine.reference(begin_us + 2 * SECOND, 0, np.array([0.0, 1.0]))
     np.testing.assert_allclose(pos, [[5.0, 3.4, -2.2], [6.5, 4.1, -2.3]])
     np.testing.assert_allclose(vel, [[1.5, 0.7, -0.1]] * 2)
-    assert flight.sequence.mission_t_s(begin_us + 2 * SECOND) == 2.0
+    assert flight.state_machine.mission_t_s(begin_us + 2 * SECOND) == 2.0

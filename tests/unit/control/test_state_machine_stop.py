@@ -1,17 +1,17 @@
-"""A stop is never lost, and no vehicle is taken for disarmed without a HEARTBEAT that is newer than the arm request."""
+"""Tests that no stop is lost and that "disarmed" needs a HEARTBEAT newer than the arm request."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from swarmctl.control.phases.sequence import OPERATOR_STOP
+from swarmctl.control.phases.state_machine import OPERATOR_STOP
 from swarmctl.core.types import FlightMode, Phase, Verb
-from tests.benches.sequenced_flight import IN_AIR, ON_GROUND, START, Flight
+from tests.benches.state_machine_flight import IN_AIR, ON_GROUND, START, Flight
 
 
 def asked_to_arm(busy: bool) -> Flight:
-    """In ARM with the request out; the newest HEARTBEAT is older than it and says "disarmed"."""
+    """Return a flight in ARM with an open request, whose newest HEARTBEAT is older and says "disarmed"."""
     flight = Flight().until(Phase.ARM)
     flight.beat_us = flight.now_us - 100_000
     assert flight.run(0.1) == [Verb.ARM]
@@ -34,17 +34,17 @@ def test_a_stop_between_the_acknowledgement_of_arming_and_its_heartbeat_disarms(
     assert flight.at == "LAND"
     flight.armed, flight.beat_us = False, flight.now_us
     flight.run(0.2)
-    assert (flight.at, flight.sequence.outcome) == ("DONE", OPERATOR_STOP)
+    assert (flight.at, flight.state_machine.outcome) == ("DONE", OPERATOR_STOP)
 
 
-def test_what_refuses_after_arming_was_asked_for_disarms_before_it_gives_up() -> None:
+def test_a_refusal_after_an_arm_request_disarms_before_giving_up() -> None:
     flight = asked_to_arm(busy=False)
     flight.refusal = "COM_OBL_RC_ACT = 7"
     assert Verb.DISARM in flight.run(1.0)
     assert flight.at == "LAND"
     flight.beat_us = flight.now_us
     flight.run(0.2)
-    assert (flight.at, flight.sequence.outcome) == ("DONE", "COM_OBL_RC_ACT = 7")
+    assert (flight.at, flight.state_machine.outcome) == ("DONE", "COM_OBL_RC_ACT = 7")
 
 
 @pytest.mark.parametrize("verb", ["land", "rtl"])
@@ -56,11 +56,11 @@ def test_a_stop_before_the_first_vehicle_state_is_kept_until_there_is_one(verb: 
     assert flight.at == "CONNECT"
     flight.seen = True
     assert Verb.ARM not in flight.run(5.0)
-    assert (flight.at, flight.sequence.outcome) == ("DONE", OPERATOR_STOP)
+    assert (flight.at, flight.state_machine.outcome) == ("DONE", OPERATOR_STOP)
 
 
 def test_a_stop_before_the_first_state_lands_a_vehicle_that_hovers_armed() -> None:
-    """What an agent does that is started beside a vehicle whose agent died."""
+    """The case of an agent started beside a vehicle whose agent died."""
     flight = Flight()
     flight.seen = False
     flight.ask("land")
@@ -104,19 +104,19 @@ def test_land_on_the_way_home_lands_here_and_repeating_it_does_not_begin_again()
     flight.pos = START + np.array([4.0, 0.0, 0.0])
     flight.ask("rtl")
     flight.run(0.5)
-    target = flight.sequence._bound_for.copy()
+    target = flight.state_machine._destination_ned_m.copy()
     flight.ask("land")
     flight.run(0.1)
-    here = flight.sequence._bound_for.copy()
+    here = flight.state_machine._destination_ned_m.copy()
     assert (target == START).all()
     assert abs(here[0] - flight.pos[0]) < 0.5
-    began_us = flight.sequence._entered_us
+    began_us = flight.state_machine._entered_us
     flight.ask("land")
     flight.run(0.1)
-    assert flight.sequence._entered_us == began_us
+    assert flight.state_machine._entered_us == began_us
 
 
-def test_passing_causes_are_waited_for_and_named_when_time_is_up() -> None:
+def test_temporary_causes_are_waited_for_and_named_at_the_timeout() -> None:
     flight = Flight(start_timeout_s=20.0)
     flight.unsettled = "the estimator's accuracy to settle (now 14.10 m)"
     assert flight.run(19.0) == []
@@ -127,25 +127,25 @@ def test_passing_causes_are_waited_for_and_named_when_time_is_up() -> None:
     late.unsettled = "the estimator's accuracy to settle (now 14.10 m)"
     assert late.run(20.5) == []
     assert late.at == "DONE"
-    assert "14.10 m" in late.sequence.outcome
+    assert "14.10 m" in late.state_machine.outcome
 
 
 def test_a_vehicle_left_in_offboard_is_put_on_hold_so_that_it_can_be_armed() -> None:
     flight = Flight()
     flight.flight_mode, flight.armable = FlightMode.EXTERNAL, False
     assert flight.run(3.0).count(Verb.HOLD) == 3
-    assert "EXTERNAL" in flight.sequence.waits_for
+    assert "EXTERNAL" in flight.state_machine.waits_for
     flight.flight_mode, flight.armable = FlightMode.HOLD, True
     assert Verb.ARM in flight.run(0.3)
     armed = Flight()
     armed.flight_mode, armed.armable, armed.armed = FlightMode.EXTERNAL, False, True
-    assert armed.run(3.0) == [], "somebody else flies it"
+    assert armed.run(3.0) == [], "another pilot controls it"
 
 
 @pytest.mark.parametrize("phase", [Phase.GOTO_LAND, Phase.LAND, Phase.DONE])
-def test_who_waits_for_the_beginning_goes_home_when_a_peer_gives_up(phase: Phase) -> None:
+def test_an_agent_waiting_for_the_beginning_goes_home_when_a_peer_gives_up(phase: Phase) -> None:
     flight = Flight().until(Phase.READY)
     flight.peer(phase)
     flight.run(0.3)
     assert flight.phase in (Phase.GOTO_LAND, Phase.LAND), "it stands on its landing place already"
-    assert "gave up" in flight.sequence.outcome
+    assert "gave up" in flight.state_machine.outcome

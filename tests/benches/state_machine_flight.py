@@ -1,4 +1,4 @@
-"""What the tests of the phase machine share: a `Sequence` that is driven with made-up facts."""
+"""Test bench of the mission state machine: drives a `MissionStateMachine` with synthetic inputs."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from swarmctl.control.phases.inputs import Facts, PeerFacts
-from swarmctl.control.phases.sequence import Sequence, SequenceParams
+from swarmctl.control.phases.inputs import PeerInputs, PhaseInputs
+from swarmctl.control.phases.state_machine import MissionStateMachine, StateMachineParams
 from swarmctl.control.reference.mission import MissionParams, MissionReference
 from swarmctl.core.types import Command, FlightMode, Landed, Mode, Phase, VehicleState, Verb
 
@@ -20,25 +20,27 @@ ON_GROUND, IN_AIR = Landed.ON_GROUND, Landed.IN_AIR
 
 
 class Flight:
-    """One `Sequence`, the vehicle it sees and the time; every call of `step` is 100 ms later."""
+    """One `MissionStateMachine`, its vehicle and its clock; every call of `step` is 100 ms later."""
 
     def __init__(self, peers: int = 1, **params: Any) -> None:
         mission = MissionReference(MissionParams(kind="line"), START[None, :], 0)
-        self.sequence = Sequence(SequenceParams(**params), 0, peers, RADIUS_M, START, DURATION_S, mission)
+        self.state_machine = MissionStateMachine(
+            StateMachineParams(**params), 0, peers, RADIUS_M, START, DURATION_S, mission
+        )
         self.now_us = 0
         self.pos, self.vel = np.array([1.0, 0.0, 0.0]), np.zeros(3)
         self.armed, self.flight_mode, self.landed = False, FlightMode.HOLD, ON_GROUND
-        self.judged = Mode.IDLE
+        self.failsafe_mode = Mode.IDLE
         self.prepared = self.armable = True
         self.failsafe = False
         self.others: tuple[np.ndarray, ...] = ()
         self.arm_in: FlightMode | None = None
         self.boots = 0
         self.refusal = self.unsettled = ""
-        self.beat_us: int | None = None  # the HEARTBEAT that told `armed`; None: one comes with every step
+        self.beat_us: int | None = None  # arrival of the HEARTBEAT that reported `armed`; None: one with every step
         self.busy = self.unresponsive_peer = False
         self.seen = True
-        self.peers = {k + 1: PeerFacts(Phase.STANDBY, 0, True) for k in range(peers)}
+        self.peers = {k + 1: PeerInputs(Phase.STANDBY, 0, True) for k in range(peers)}
 
     @property
     def utc_us(self) -> int:
@@ -46,11 +48,11 @@ class Flight:
 
     @property
     def phase(self) -> Phase:
-        return self.sequence.phase
+        return self.state_machine.phase
 
     @property
     def at(self) -> str:
-        """Name of the phase."""
+        """Return the name of the phase."""
         return self.phase.name
 
     @property
@@ -63,14 +65,14 @@ class Flight:
         )
 
     def step(self) -> list[Command]:
-        facts = Facts(
+        inputs = PhaseInputs(
             now_us=self.now_us,
             utc_us=self.utc_us,
             state=self.state,
             prepared=self.prepared,
             armable=self.armable,
             busy=self.busy,
-            mode=self.judged,
+            mode=self.failsafe_mode,
             unresponsive_peer=self.unresponsive_peer,
             peers=self.peers,
             others_ned_m=self.others,
@@ -80,8 +82,8 @@ class Flight:
             unsettled=self.unsettled,
             armed_told_us=self.now_us if self.beat_us is None else self.beat_us,
         )
-        self.sequence.begin_if_due(facts.now_us, facts.utc_us)  # as the agent does, before it thinks
-        asked = self.sequence.step(facts)
+        self.state_machine.begin_if_due(inputs.now_us, inputs.utc_us)  # called before planning, as by the agent
+        asked = self.state_machine.step(inputs)
         self.now_us += 100_000
         return asked
 
@@ -89,13 +91,13 @@ class Flight:
         return [command.verb for _ in range(round(seconds * 10)) for command in self.step()]
 
     def peer(self, phase: Phase, ready_utc_us: int = 0, alive: bool = True) -> None:
-        self.peers[1] = PeerFacts(phase, ready_utc_us, alive)
+        self.peers[1] = PeerInputs(phase, ready_utc_us, alive)
 
     def ask(self, verb: str) -> None:
-        self.sequence.operator(verb, self.now_us, self.utc_us, self.state)
+        self.state_machine.operator(verb, self.now_us, self.utc_us, self.state)
 
     def until(self, phase: Phase) -> Flight:
-        """Fly on, all going well, until a phase is reached."""
+        """Continue without faults until a phase is reached."""
         for _ in range(400):
             if self.phase is phase:
                 return self
@@ -129,7 +131,7 @@ def ready(peers: int = 1) -> Flight:
     return flight
 
 
-OURS = (Phase.GOTO_START, Phase.READY, Phase.TRACK, Phase.GOTO_LAND)
+CONTROLLED_PHASES = (Phase.GOTO_START, Phase.READY, Phase.TRACK, Phase.GOTO_LAND)
 
 
 def controlled(phase: Phase) -> Flight:
@@ -143,5 +145,5 @@ def controlled(phase: Phase) -> Flight:
         flight.pos = START + np.array([3.0, 0.0, 0.0])
         flight.until(phase)
     assert flight.phase is phase
-    assert flight.sequence.had_control
+    assert flight.state_machine.had_control
     return flight
