@@ -23,7 +23,7 @@ from sitl.plant.attitude import THESIS_GAINS
 from swarmctl.errors import EXIT_OK, EXIT_USAGE, SwarmError
 
 if TYPE_CHECKING:
-    from sitl.realtime import Tally
+    from sitl.realtime import LoopStatistics
     from sitl.world import SitlParams, SitlWorld
     from swarmctl.core.simulated import RealismParams
     from swarmctl.mavlink.transport import Transport
@@ -247,7 +247,7 @@ def _run(options: argparse.Namespace) -> int:
     try:
         gc.freeze()  # what has been built stays: nothing for the collector to walk through in flight
         gate = realtime.Gate(world) if options.lockstep else None
-        tally = realtime.fly(world, stop, truth, speed=options.speed, control=control, gate=gate)
+        statistics = realtime.fly(world, stop, truth, speed=options.speed, control=control, gate=gate)
     finally:
         if control is not None:
             control.close()
@@ -255,8 +255,8 @@ def _run(options: argparse.Namespace) -> int:
         for endpoint in (*world.endpoints, *world.gcs_endpoints):
             endpoint.transport.close()
     if options.stats:
-        options.stats.write_text(json.dumps({"boot_us": world.boot_us, **asdict(tally)}), encoding="utf-8")
-    print("; ".join(filter(None, (_summary(world, tally), complaint))), flush=True)
+        options.stats.write_text(json.dumps({"boot_us": world.boot_us, **asdict(statistics)}), encoding="utf-8")
+    print("; ".join(filter(None, (_summary(world, statistics), complaint))), flush=True)
     return EXIT_OK
 
 
@@ -314,13 +314,13 @@ def _tcp_links(options: argparse.Namespace) -> tuple[list[Transport], list[str]]
     return list(servers), [f"tcp={server.port}" for server in servers]
 
 
-def _summary(world: SitlWorld, tally: Tally) -> str:
-    seconds = tally.steps / world.params.physics_hz
+def _summary(world: SitlWorld, statistics: LoopStatistics) -> str:
+    seconds = statistics.steps / world.params.physics_hz
     ignored = sum(sum(e.ignored.values()) for e in world.endpoints)
     refused = sum(sum(p.refused.values()) for p in world.autopilots)
     return (
-        f"sitl: {seconds:.1f} s in {tally.steps} steps, {tally.late} late, {tally.stalls} stalls "
-        f"({tally.lost_us / 1e6:.1f} s), {ignored} frames ignored, {refused} setpoints refused"
+        f"sitl: {seconds:.1f} s in {statistics.steps} steps, {statistics.late} late, {statistics.stalls} stalls "
+        f"({statistics.lost_us / 1e6:.1f} s), {ignored} frames ignored, {refused} setpoints refused"
     )
 
 

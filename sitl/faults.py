@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from sitl.net.lossy import LossyLink, Way
+from sitl.net.lossy import LinkDirection, LossyLink
 from sitl.plant.estimator import Estimator
 from sitl.plant.physics import Physics
 from sitl.plant.vehicle import Array
@@ -22,7 +22,7 @@ Undo = Callable[[], None]
 _NEVER_US = 1 << 62
 
 
-class Afflicted(Protocol):
+class FaultTarget(Protocol):
     """What faults act on."""
 
     @property
@@ -40,33 +40,33 @@ class Afflicted(Protocol):
         """Start its autopilot again."""
 
 
-def _gps_loss(world: Afflicted, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
+def _gps_loss(world: FaultTarget, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
     world.estimator.lose_gps(vehicle)
     return lambda: world.estimator.find_gps(vehicle)
 
 
-def _estimator_jump(world: Afflicted, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
+def _estimator_jump(world: FaultTarget, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
     by_ned_m = fault.amount * _towards(fault)
     world.estimator.jump(vehicle, by_ned_m)
     return lambda: world.estimator.jump(vehicle, -by_ned_m)
 
 
-def _estimator_freeze(world: Afflicted, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
+def _estimator_freeze(world: FaultTarget, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
     world.estimator.freeze(vehicle, now_us)
     return lambda: world.estimator.thaw(vehicle)
 
 
-def _motor(world: Afflicted, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
+def _motor(world: FaultTarget, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
     world.physics.set_rotor_health(vehicle, fault.rotor, fault.amount)
     return lambda: world.physics.set_rotor_health(vehicle, fault.rotor, 1.0)
 
 
-def _mass(world: Afflicted, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
+def _mass(world: FaultTarget, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
     world.physics.set_mass(vehicle, fault.amount)
     return lambda: world.physics.set_mass(vehicle, 1.0)
 
 
-def _gust(world: Afflicted, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
+def _gust(world: FaultTarget, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
     on = np.zeros(world.physics.plant.state.shape[1])
     on[vehicle] = 1.0
     gust = Gust(fault.amount * _towards(fault).reshape(3, 1), now_us * 1e-6, fault.for_s, on)
@@ -74,23 +74,23 @@ def _gust(world: Afflicted, vehicle: int, fault: FaultParams, now_us: int) -> Un
     return lambda: None  # it blows itself out
 
 
-def _battery(world: Afflicted, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
+def _battery(world: FaultTarget, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
     world.physics.drain(vehicle, fault.amount)
     return lambda: None
 
 
-def _reboot(world: Afflicted, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
+def _reboot(world: FaultTarget, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
     world.reboot(vehicle, now_us)
     return lambda: None
 
 
-def _link(trouble: str) -> Callable[[Afflicted, int, FaultParams, int], Undo]:
-    def begin(world: Afflicted, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
-        ways = list(_ways(world.links_of(vehicle), fault.direction))
+def _link(impairment: str) -> Callable[[FaultTarget, int, FaultParams, int], Undo]:
+    def begin(world: FaultTarget, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
+        directions = list(_directions(world.links_of(vehicle), fault.direction))
 
         def put(amount: float) -> None:
-            for way in ways:
-                way.trouble(trouble, amount)
+            for direction in directions:
+                direction.set_impairment(impairment, amount)
 
         put(fault.amount)
         return lambda: put(0.0)
@@ -98,7 +98,7 @@ def _link(trouble: str) -> Callable[[Afflicted, int, FaultParams, int], Undo]:
     return begin
 
 
-_BEGIN: dict[str, Callable[[Afflicted, int, FaultParams, int], Undo]] = {
+_BEGIN: dict[str, Callable[[FaultTarget, int, FaultParams, int], Undo]] = {
     "gps_loss": _gps_loss,
     "estimator_jump": _estimator_jump,
     "estimator_freeze": _estimator_freeze,
@@ -123,7 +123,7 @@ class Faults:
         on_event: told of every beginning and end: name, time since boot [us], fields.
     """
 
-    def __init__(self, world: Afflicted, scheduled: Iterable[FaultParams], vehicles: int) -> None:
+    def __init__(self, world: FaultTarget, scheduled: Iterable[FaultParams], vehicles: int) -> None:
         self.on_event: Callable[[str, int, dict[str, Any]], None] = lambda name, t_us, fields: None
         self._world = world
         self._vehicles = vehicles
@@ -177,7 +177,7 @@ def _towards(fault: FaultParams) -> Array:
     return np.array([math.cos(azimuth_rad), math.sin(azimuth_rad), 0.0])
 
 
-def _ways(links: Sequence[LossyLink], direction: str) -> Iterable[Way]:
+def _directions(links: Sequence[LossyLink], direction: str) -> Iterable[LinkDirection]:
     for link in links:
         if direction in ("both", "to_vehicle"):
             yield link.to_vehicle

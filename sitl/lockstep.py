@@ -33,7 +33,7 @@ from swarmctl.mavlink.autopilot import Autopilot
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.commands import CodecCommands
 from swarmctl.mavlink.transport import pipe_pair
-from swarmctl.telemetry.plain import plain
+from swarmctl.telemetry.json_safe import json_safe
 from swarmctl.telemetry.referee import RunData
 
 _TAIL_S = 120.0  # flight allowed before and after the mission
@@ -196,7 +196,7 @@ class Lockstep:
     def recorded(self) -> RunData:
         """What a run folder would hold of the flight so far."""
         events = [event for log in self.logs for event in log.events] + self.fault_events
-        return RunData({log.agent: log.ticks for log in self.logs}, self.truth, [plain(event) for event in events])
+        return RunData({log.agent: log.ticks for log in self.logs}, self.truth, [json_safe(event) for event in events])
 
     def problems(self) -> list[str]:
         """Why the mission is not complete; empty when it is."""

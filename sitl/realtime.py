@@ -35,7 +35,7 @@ _GATE_POLL_S = 1e-4
 
 
 @dataclass
-class Tally:
+class LoopStatistics:
     """What the loop has done so far."""
 
     steps: int = 0
@@ -148,7 +148,7 @@ def fly(
     speed: float = 1.0,
     control: ControlSocket | None = None,
     gate: Gate | None = None,
-) -> Tally:
+) -> LoopStatistics:
     """Step the world at its physics rate until `stop`.
 
     Args:
@@ -159,7 +159,7 @@ def fly(
         control: asked for faults ten times a second.
         gate: makes the physics wait for its clients; time spent so is given up, on both clocks.
     """
-    tally = Tally()
+    statistics = LoopStatistics()
     period_us = 1e6 / world.params.physics_hz
     gate_every, control_every = round(GATE_US / period_us), max(1, round(CONTROL_US * speed / period_us))
     start_us = sim_start_us = monotonic_us()
@@ -171,13 +171,13 @@ def fly(
             time.sleep(-behind_us * 1e-6)
             continue
         if behind_us > STALL_US:
-            tally.stalls += 1
-            tally.lost_us += round(behind_us * speed)
+            statistics.stalls += 1
+            statistics.lost_us += round(behind_us * speed)
             start_us += behind_us
             sim_start_us += round(behind_us * speed)
             sim_us += round(behind_us * speed)
         elif behind_us * speed > period_us:
-            tally.late += 1
+            statistics.late += 1
         if gate is not None and count % gate_every == 0:
             waited_us = -monotonic_us()
             gate.wait(stop, sim_us)
@@ -188,8 +188,8 @@ def fly(
         if truth is not None:
             truth.record(world, sim_us)
         count += 1
-    tally.steps = count
-    return tally
+    statistics.steps = count
+    return statistics
 
 
 def bind_range(first: int, count: int) -> tuple[list[socket.socket], int]:

@@ -1,4 +1,4 @@
-"""What a `SitlWorld` needs of a vehicle's brain and of its MAVLink face, whichever autopilot they imitate."""
+"""What a `SitlWorld` needs of a vehicle's brain and of its MAVLink interface, whichever autopilot they imitate."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Commander(Protocol):
         """One step of the autopilot; `now_us` is time since boot."""
 
 
-class Face(Protocol):
+class MavlinkInterface(Protocol):
     """One vehicle on one MAVLink link."""
 
     @property

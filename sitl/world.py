@@ -28,7 +28,7 @@ from sitl.px4.link.schedule import GCS_HZ
 from sitl.px4.link.streams import Report
 from sitl.px4.navigator import IDLE, Navigator
 from sitl.px4.parameters import Parameters
-from sitl.vehicle_parts import Commander, Face
+from sitl.vehicle_parts import Commander, MavlinkInterface
 from swarmctl.core.records import TRUTH_DTYPE
 from swarmctl.core.simulated import FaultParams, RealismParams
 from swarmctl.core.types import FlightMode, GeoOrigin
@@ -52,7 +52,7 @@ class Metered(Protocol):
 
 @runtime_checkable
 class Rebooting(Protocol):
-    """A MAVLink face whose autopilot can start again."""
+    """A MAVLink interface whose autopilot can start again."""
 
     def reboot(self, now_us: int) -> None:
         """As after power-up; `now_us` is on the clock of the simulation."""
@@ -159,9 +159,9 @@ class SitlWorld:
             self.plant, self.attitude, self.estimator, params.realism, params.seed, self._autopilot_every
         )
         self.autopilots: list[Commander] = []
-        self.endpoints: list[Face] = []
+        self.endpoints: list[MavlinkInterface] = []
         self._links = [LossyLink(link, (params.seed, i, _LINK_PURPOSE)) for i, link in enumerate(transports)]
-        self.gcs_endpoints: list[Face] = []
+        self.gcs_endpoints: list[MavlinkInterface] = []
         self._gcs_links = [
             LossyLink(link, (params.seed, i, _GCS_LINK_PURPOSE)) for i, link in enumerate(gcs_transports)
         ]
@@ -246,9 +246,9 @@ class SitlWorld:
 
     def reboot(self, vehicle: int, now_us: int) -> None:
         """Start an autopilot again; its vehicle goes on as physics has it."""
-        face = self.endpoints[vehicle]
-        if isinstance(face, Rebooting):
-            face.reboot(now_us)
+        interface = self.endpoints[vehicle]
+        if isinstance(interface, Rebooting):
+            interface.reboot(now_us)
 
     def can(self, fault: FaultParams) -> Iterator[str]:
         """What is wrong with asking for a fault here; all problems."""
@@ -289,7 +289,7 @@ class SitlWorld:
         np.logical_and(self._powered, ~self.plant.contact, out=self._live, casting="unsafe")
         self._live *= ~self.plant.held
 
-    def _px4(self, vehicle: int, link: Transport) -> tuple[Commander, Face]:
+    def _px4(self, vehicle: int, link: Transport) -> tuple[Commander, MavlinkInterface]:
         params, table = self.params, Parameters(self.params.sysid_base + vehicle)
         navigator = Navigator(table, self.plant.hover_thrust_01)
         airborne = params.start == "air"
@@ -310,7 +310,7 @@ class SitlWorld:
             endpoint.join(ground)
         return pilot, endpoint
 
-    def _arducopter(self, vehicle: int, link: Transport) -> tuple[Commander, Face]:
+    def _arducopter(self, vehicle: int, link: Transport) -> tuple[Commander, MavlinkInterface]:
         from sitl.arducopter.endpoint import Start, arducopter_vehicle  # with a second dialect module: 20 MB
 
         params = self.params
@@ -321,9 +321,9 @@ class SitlWorld:
             params.start == "air",
         )
         links = [link, *self._gcs_links[vehicle : vehicle + 1]]
-        pilot, faces = arducopter_vehicle(params.sysid_base + vehicle, links, self.plant, vehicle, start)
-        self.gcs_endpoints.extend(faces[1:])
-        return pilot, faces[0]
+        pilot, interfaces = arducopter_vehicle(params.sysid_base + vehicle, links, self.plant, vehicle, start)
+        self.gcs_endpoints.extend(interfaces[1:])
+        return pilot, interfaces[0]
 
     def _reporter(self, vehicle: int, pilot: Autopilot) -> Callable[[], Report]:
         plant, origin = self.plant, self.origins[vehicle]

@@ -19,7 +19,7 @@ _NOTHING = (0.0,) * 5
 
 
 @dataclass
-class Troubles:
+class Impairments:
     """Of one direction; probabilities are per datagram."""
 
     loss_01: float = 0.0
@@ -33,7 +33,7 @@ class Troubles:
         return (self.loss_01, self.delay_ms, self.duplicate_01, self.reorder_01, self.corrupt_01) != _NOTHING
 
 
-class Way:
+class LinkDirection:
     """One direction of a link.
 
     Attributes:
@@ -42,31 +42,31 @@ class Way:
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.clear = True
-        self.troubles = Troubles()
+        self.impairments = Impairments()
         self._rng = rng
         self._queue: list[tuple[int, int, bytes]] = []  # due, number, datagram
         self._overtaken: tuple[int, bytes] | None = None  # patience ends, datagram
         self._number = 0
 
-    def trouble(self, name: str, amount: float) -> None:
-        """Set one of the troubles; 0 takes it away."""
-        setattr(self.troubles, name, amount)
+    def set_impairment(self, name: str, amount: float) -> None:
+        """Set one of the impairments; 0 takes it away."""
+        setattr(self.impairments, name, amount)
         self._look()
 
     def offer(self, now_us: int, data: bytes) -> None:
         """One datagram enters."""
-        troubles, rng = self.troubles, self._rng
-        if self._happens(troubles.loss_01):
+        impairments, rng = self.impairments, self._rng
+        if self._happens(impairments.loss_01):
             return
-        if self._happens(troubles.corrupt_01) and data:
+        if self._happens(impairments.corrupt_01) and data:
             spoilt = bytearray(data)
             spoilt[int(rng.integers(len(data)))] ^= 1 << int(rng.integers(8))
             data = bytes(spoilt)
-        if self._overtaken is None and self._happens(troubles.reorder_01):
+        if self._overtaken is None and self._happens(impairments.reorder_01):
             self._overtaken = now_us + _OVERTAKEN_US, data
             return
-        due_us = now_us + round(troubles.delay_ms * 1e3)
-        for _ in range(2 if self._happens(troubles.duplicate_01) else 1):
+        due_us = now_us + round(impairments.delay_ms * 1e3)
+        for _ in range(2 if self._happens(impairments.duplicate_01) else 1):
             self._push(due_us, data)
         if self._overtaken is not None:
             self._push(due_us, self._overtaken[1])
@@ -85,7 +85,7 @@ class Way:
         return out
 
     def _look(self) -> None:
-        self.clear = not (self._queue or self._overtaken or self.troubles.any())
+        self.clear = not (self._queue or self._overtaken or self.impairments.any())
 
     def _push(self, due_us: int, data: bytes) -> None:
         self._number += 1
@@ -107,14 +107,16 @@ class LossyLink:
         self._inner = inner
         self._now_us = 0
         self._setpoints: int | None = None
-        self.to_vehicle, self.from_vehicle = (Way(np.random.default_rng([*seed, way])) for way in (0, 1))
+        self.to_vehicle, self.from_vehicle = (
+            LinkDirection(np.random.default_rng([*seed, direction])) for direction in (0, 1)
+        )
 
     def send(self, data: bytes) -> None:
-        way = self.from_vehicle
-        if way.clear:
+        direction = self.from_vehicle
+        if direction.clear:
             self._inner.send(data)
             return
-        way.offer(self._now_us, data)
+        direction.offer(self._now_us, data)
         self._release()
 
     def receive(self, now_us: int) -> list[Datagram]:
@@ -122,11 +124,11 @@ class LossyLink:
         if not self.from_vehicle.clear:
             self._release()
         arrived = self._inner.receive(now_us)
-        way = self.to_vehicle
-        if not way.clear:
+        direction = self.to_vehicle
+        if not direction.clear:
             for datagram in arrived:
-                way.offer(datagram.t_us, datagram.data)
-            arrived = way.take(now_us)
+                direction.offer(datagram.t_us, datagram.data)
+            arrived = direction.take(now_us)
         if self._setpoints is not None:
             self._setpoints += sum(
                 message_id(frame) == _SET_ATTITUDE_TARGET for datagram in arrived for frame in frames(datagram.data)

@@ -58,7 +58,7 @@ from swarmctl.core.types import (
 )
 from swarmctl.mavlink.autopilot import Autopilot
 from swarmctl.mavlink.commands import CommandPort
-from swarmctl.mavlink.vehicle_setup import Upkeep
+from swarmctl.mavlink.vehicle_setup import VehicleSetup
 
 _NOTHING_US = -1
 _DEVIATES = (Mode.BRAKE, Mode.HOLD, Mode.LAND, Mode.YIELD, Mode.BLIND)  # from what it has promised
@@ -82,7 +82,7 @@ class Agent:
     ) -> None:
         self._setup, self._autopilot, self._commands = setup, autopilot, commands
         self._bus, self._clock, self._sink, self._stopwatch_ns = bus, clock, sink, stopwatch_ns
-        self._upkeep = Upkeep(
+        self._vehicle_setup = VehicleSetup(
             autopilot, commands, setup.params.autopilot_params, setup.sysid, setup.params.sequence.state_rate_hz
         )
         self._surroundings = Surroundings(
@@ -128,7 +128,7 @@ class Agent:
         """Landed, disarmed, and its parameters as they were."""
         if self._done_us is None:
             return False
-        return self._upkeep.restored or self._clock.now_us() - self._done_us > _RESTORE_US
+        return self._vehicle_setup.restored or self._clock.now_us() - self._done_us > _RESTORE_US
 
     @property
     def finished(self) -> bool:
@@ -225,7 +225,7 @@ class Agent:
         state = self._autopilot.poll(now_us)
         self._commands.step(now_us)
         for result in self._commands.results():
-            self._upkeep.took(result)
+            self._vehicle_setup.took(result)
             asked = f"{result.command.verb.value} {result.command.name}".rstrip()
             if result.ok:
                 self._alerts.clear(asked)
@@ -393,7 +393,7 @@ class Agent:
             now_us,
             utc_us,
             state,
-            self._upkeep.ready,
+            self._vehicle_setup.ready,
             self._autopilot.armable,
             self._commands.busy,
             self._judgement.mode,
@@ -402,7 +402,7 @@ class Agent:
             others_ned_m=self._surroundings.others_ned_m(utc_us),
             arm_in=None if dialect is None else dialect.arm_in,
             boots=self._autopilot.clock.boots,
-            refusal=self._upkeep.refusal,
+            refusal=self._vehicle_setup.refusal,
             unsettled=self._unsettled(now_us),
             overload=self._overload.level,
             armed_told_us=self._autopilot.armed_told_us,
@@ -411,7 +411,7 @@ class Agent:
             self._commands.request(command)
         self._tell_what_is_waited_for(now_us)
         self._give_parameters_back(now_us)
-        self._upkeep.step(now_us)
+        self._vehicle_setup.step(now_us)
         if not before[1] and self._sequence.had_control:
             self._predictor.clear()
             self._observer.reset()
@@ -435,8 +435,8 @@ class Agent:
             return
         if self._done_us is None:
             self._done_us = now_us
-            self._upkeep.restore()
-        left = self._upkeep.left_changed
+            self._vehicle_setup.restore()
+        left = self._vehicle_setup.left_changed
         if left and self.done and self._alerts.put("restore", f"parameters left changed, they were: {left}", now_us):
             self._note("parameters_left_changed", were=left)
 

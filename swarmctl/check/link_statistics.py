@@ -23,7 +23,7 @@ class Answer:
     vehicle_us: float  # the other side's clock when it answered; NaN when it did not say
 
 
-class FrameTally:
+class FrameStatistics:
     """Frames of one component."""
 
     def __init__(self) -> None:

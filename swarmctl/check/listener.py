@@ -19,7 +19,7 @@ _MAX_DATAGRAM = 2048
 _DATAGRAMS_AT_ONCE = 200  # one flooded link must not starve the others
 
 
-class Heard(NamedTuple):
+class ReceivedDatagram(NamedTuple):
     """Bytes, when they arrived (monotonic) and who sent them."""
 
     t_us: int
@@ -27,10 +27,10 @@ class Heard(NamedTuple):
     sender: Address
 
 
-class Ear(Protocol):
+class Listener(Protocol):
     """One vehicle's link. Never blocks."""
 
-    def receive(self) -> list[Heard]:
+    def receive(self) -> list[ReceivedDatagram]:
         """What has arrived since the last call."""
 
     def send(self, data: bytes, to: Address) -> None:
@@ -48,7 +48,7 @@ def monotonic_us() -> int:
     return time.monotonic_ns() // 1000
 
 
-def open_ear(url: str) -> tuple[Ear, Address]:
+def open_listener(url: str) -> tuple[Listener, Address]:
     """The link a URL names, and where to speak before anybody was heard (`NOWHERE`: nowhere).
 
     Raises:
@@ -56,23 +56,23 @@ def open_ear(url: str) -> tuple[Ear, Address]:
     """
     endpoint = parse_url(url)
     if endpoint.scheme == "udpin":
-        return UdpEar(bind_udp(endpoint.where, endpoint.number)), NOWHERE
+        return UdpListener(bind_udp(endpoint.where, endpoint.number)), NOWHERE
     if endpoint.scheme == "udpout":
         there = resolve(endpoint.where), endpoint.number
-        return UdpEar(bind_towards(there)), there
+        return UdpListener(bind_towards(there)), there
     there = endpoint.where, endpoint.number
-    return WireEar(open_transport(url), there), there
+    return TransportListener(open_transport(url), there), there
 
 
-class UdpEar:
+class UdpListener:
     """A bound UDP socket."""
 
     def __init__(self, sock: socket.socket) -> None:
         self._sock = sock
         self._sock.setblocking(False)
 
-    def receive(self) -> list[Heard]:
-        heard: list[Heard] = []
+    def receive(self) -> list[ReceivedDatagram]:
+        heard: list[ReceivedDatagram] = []
         for _ in range(_DATAGRAMS_AT_ONCE):
             try:
                 data, sender = self._sock.recvfrom(_MAX_DATAGRAM)
@@ -80,7 +80,7 @@ class UdpEar:
                 continue  # ICMP port unreachable surfaces here once
             except OSError:
                 break
-            heard.append(Heard(monotonic_us(), data, sender))
+            heard.append(ReceivedDatagram(monotonic_us(), data, sender))
         return heard
 
     def send(self, data: bytes, to: Address) -> None:
@@ -94,14 +94,14 @@ class UdpEar:
         self._sock.close()
 
 
-class WireEar:
+class TransportListener:
     """Serial and TCP: there is one other end."""
 
     def __init__(self, transport: Transport, there: Address) -> None:
         self._transport, self._there = transport, there
 
-    def receive(self) -> list[Heard]:
-        return [Heard(d.t_us, d.data, self._there) for d in self._transport.receive(monotonic_us())]
+    def receive(self) -> list[ReceivedDatagram]:
+        return [ReceivedDatagram(d.t_us, d.data, self._there) for d in self._transport.receive(monotonic_us())]
 
     def send(self, data: bytes, to: Address) -> None:
         self._transport.send(data)

@@ -1,6 +1,6 @@
 """Questions to one vehicle, and what it says: nothing is armed, no mode, rate or parameter is changed by asking.
 
-A probe sends its heartbeat, TIMESYNC, PING, requests for single messages and parameter reads. `set_parameters` is the
+A scan sends its heartbeat, TIMESYNC, PING, requests for single messages and parameter reads. `set_parameters` is the
 one thing that changes a vehicle; it stops by itself when the vehicle is, or becomes, armed.
 """
 
@@ -14,13 +14,13 @@ from typing import Any, NamedTuple
 
 from pymavlink.dialects.v20 import development as mavlink
 
-from swarmctl.check.link_statistics import Answer, FrameTally
-from swarmctl.check.listener import NOWHERE, Address, Ear, Heard, monotonic_us
+from swarmctl.check.link_statistics import Answer, FrameStatistics
+from swarmctl.check.listener import NOWHERE, Address, Listener, ReceivedDatagram, monotonic_us
 from swarmctl.check.parameter_reader import ParameterReader
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.dialects import DIALECTS, Dialect
 
-PROBE_COMPID = 192  # MAV_COMP_ID_ONBOARD_COMPUTER2: sequence numbers apart from those of an agent that may be flying
+SCANNER_COMPID = 192  # MAV_COMP_ID_ONBOARD_COMPUTER2: sequence numbers apart from those of an agent that may be flying
 AUTOPILOT_COMPID = 1
 ARMED_FLAG = 128
 _NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: a companion, a ground station
@@ -49,11 +49,11 @@ class Newest(NamedTuple):
     message: Any
 
 
-class Probe:
+class VehicleScan:
     """One vehicle.
 
     Args:
-        ear: its link, owned by the probe.
+        listener: its link, owned by the scan.
         there: where to speak before anybody was heard.
         wanted_sysid: the vehicle the configuration names; another one is taken when it is not heard.
         names_of: parameters to read of an autopilot of this dialect.
@@ -63,25 +63,25 @@ class Probe:
 
     def __init__(
         self,
-        ear: Ear,
+        listener: Listener,
         there: Address,
         wanted_sysid: int,
         names_of: Callable[[Dialect], Sequence[str]],
         seconds: float,
         patience_s: float = 0.0,
     ) -> None:
-        self.ear = ear
+        self.listener = listener
         self.sysid = 0  # of the vehicle that is asked; 0 before its first heartbeat
         self.began_us: int | None = None
         self.mavlink1 = self.mavlink2 = 0
         self.senders: set[Address] = set()
         self.newest: dict[tuple[int, str], Newest] = {}
-        self.tallies: dict[int, FrameTally] = {}
+        self.statistics: dict[int, FrameStatistics] = {}
         self.answers: dict[str, list[Answer]] = {"TIMESYNC": [], "PING": []}
         self.parameters: ParameterReader | None = None
         self._there, self._wanted, self._names_of, self._seconds = there, wanted_sysid, names_of, seconds
         self._patience_s = patience_s
-        self._codec = Codec(wanted_sysid, PROBE_COMPID)
+        self._codec = Codec(wanted_sysid, SCANNER_COMPID)
         self._due_us: dict[str, int] = {}
         self._asked: dict[int, int] = {}
         self._timesyncs: dict[int, int] = {}  # ts1 [ns] -> sent [us]
@@ -130,7 +130,7 @@ class Probe:
 
     def step(self, now_us: int) -> None:
         """Take in what has arrived, and ask what is due."""
-        for heard in self.ear.receive():
+        for heard in self.listener.receive():
             self._take(heard)
         if self._there == NOWHERE:
             return
@@ -179,11 +179,11 @@ class Probe:
         return True
 
     def _send(self, message: Any) -> None:
-        self.ear.send(self._codec.encode(message), self._there)
+        self.listener.send(self._codec.encode(message), self._there)
 
     # --- listening ---
 
-    def _take(self, heard: Heard) -> None:
+    def _take(self, heard: ReceivedDatagram) -> None:
         for frame in frames_of_any_version(heard.data):
             if frame[0] == mavlink.PROTOCOL_MARKER_V1:
                 sysid, compid, seq = frame[3], frame[4], frame[2]
@@ -195,10 +195,10 @@ class Probe:
             if message is None and frame[0] == mavlink.PROTOCOL_MARKER_V1:
                 continue
             self._count(frame, heard.sender)
-            tally = self.tallies.setdefault(sysid, FrameTally())
-            tally.frame(seq, len(frame))
+            statistics = self.statistics.setdefault(sysid, FrameStatistics())
+            statistics.frame(seq, len(frame))
             if message is not None:
-                tally.message(message.get_type(), heard.t_us)
+                statistics.message(message.get_type(), heard.t_us)
                 self._message(sysid, message, heard)
 
     def _count(self, frame: bytes, sender: Address) -> None:
@@ -208,7 +208,7 @@ class Probe:
         else:
             self.mavlink2 += 1
 
-    def _message(self, sysid: int, message: Any, heard: Heard) -> None:
+    def _message(self, sysid: int, message: Any, heard: ReceivedDatagram) -> None:
         name = message.get_type()
         if name == "HEARTBEAT":
             if message.autopilot == _NO_AUTOPILOT:
@@ -220,13 +220,13 @@ class Probe:
         if name == "TIMESYNC":
             self._timesync(message, heard.t_us)
         elif name == "PING":
-            sent_us = self._pings.get(message.seq) if message.target_component == PROBE_COMPID else None
+            sent_us = self._pings.get(message.seq) if message.target_component == SCANNER_COMPID else None
             if sent_us is not None:
                 self.answers["PING"].append(Answer(sent_us, heard.t_us, math.nan))
         elif self.parameters is not None:
             self.parameters.hear(message)
 
-    def _choose(self, sysid: int, autopilot: int, heard: Heard) -> None:
+    def _choose(self, sysid: int, autopilot: int, heard: ReceivedDatagram) -> None:
         """The first autopilot, until the one the configuration names is heard."""
         if self.sysid in (sysid, self._wanted):
             return
@@ -264,24 +264,24 @@ def frames_of_any_version(datagram: bytes) -> Iterator[bytes]:
         start = end
 
 
-def survey(probes: Sequence[Probe], connect_s: float, longest_s: float, ended: Callable[[], bool]) -> None:
+def run_scans(scans: Sequence[VehicleScan], connect_s: float, longest_s: float, ended: Callable[[], bool]) -> None:
     """Ask all vehicles at once until each has finished, was not heard for `connect_s`, or `ended`."""
     began_us = monotonic_us()
     with selectors.DefaultSelector() as selector:
         blind = False
-        for probe in probes:
-            fd = probe.ear.fd()
+        for scan in scans:
+            fd = scan.listener.fd()
             blind = blind or fd is None
             if fd is not None:
                 selector.register(fd, selectors.EVENT_READ)
         while not ended():
             now_us = monotonic_us()
             waited_s = (now_us - began_us) * 1e-6
-            open_probes = [p for p in probes if not (p.finished(now_us) or (not p.heard and waited_s > connect_s))]
-            if not open_probes or waited_s > longest_s:
+            open_scans = [p for p in scans if not (p.finished(now_us) or (not p.heard and waited_s > connect_s))]
+            if not open_scans or waited_s > longest_s:
                 return
-            for probe in probes:
-                probe.step(now_us)
+            for scan in scans:
+                scan.step(now_us)
             if blind or not selector.get_map():
                 time.sleep(_POLL_S)
             else:

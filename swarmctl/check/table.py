@@ -41,9 +41,9 @@ def as_json(vehicles: Sequence[VehicleFacts], lines: Sequence[Finding], changes:
     """Everything a program may want, findings in the order of the table."""
     tree = {
         "exit_code": code,
-        "vehicles": [_plain(dataclasses.asdict(v)) for v in vehicles],
-        "findings": [_plain(dataclasses.asdict(line)) for line in lines],
-        "changes": [_plain({**dataclasses.asdict(c), "done": c.done}) for c in changes],
+        "vehicles": [_json_safe(dataclasses.asdict(v)) for v in vehicles],
+        "findings": [_json_safe(dataclasses.asdict(line)) for line in lines],
+        "changes": [_json_safe({**dataclasses.asdict(c), "done": c.done}) for c in changes],
     }
     return json.dumps(tree, indent=1, allow_nan=False) + "\n"
 
@@ -85,14 +85,14 @@ def _after_table(vehicles: Sequence[VehicleFacts], lines: Sequence[Finding], cha
     return texts
 
 
-def _plain(value: Any) -> Any:
+def _json_safe(value: Any) -> Any:
     """For JSON: enums by name, no infinities."""
     if isinstance(value, enum.Enum):
         return value.name
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): _json_safe(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
+        return [_json_safe(item) for item in value]
     return value

@@ -24,7 +24,7 @@ _SILENT_US = 1_200_000  # not even a heartbeat: there is nobody to ask
 _ENOUGH_01 = 0.5
 
 
-class Upkeep:
+class VehicleSetup:
     """Sets up one autopilot and watches that it stays so.
 
     Args:

@@ -177,11 +177,11 @@ def status(
     as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
 ) -> int:
     """Show every agent of a running launch."""
-    from swarmctl.ops import operator as attach
+    from swarmctl.ops import operator
 
-    launch = attach.find_launch(run_dir)
-    statuses = attach.read_statuses(launch)
-    print(attach.as_json(statuses)) if as_json else _show(statuses, range(launch.agents))
+    launch = operator.find_launch(run_dir)
+    statuses = operator.read_statuses(launch)
+    print(operator.as_json(statuses)) if as_json else _show(statuses, range(launch.agents))
     return EXIT_OK
 
 
@@ -221,10 +221,10 @@ def fault(
     run_dir: RunningDir = None,
 ) -> int:
     """Let something go wrong in the simulator of a running launch; refused where real vehicles fly."""
-    from swarmctl.ops import operator as attach
+    from swarmctl.ops import operator
     from swarmctl.ops.fault import inject, parse_fault
 
-    launch = attach.find_launch(run_dir)
+    launch = operator.find_launch(run_dir)
     wanted = {"kind": kind, "vehicle": vehicle, "value": value, "for_s": for_s, "rotor": rotor}
     asked = parse_fault({**wanted, "direction": direction, "towards_deg": towards}, launch.agents)
     print(inject(launch, asked))
@@ -234,9 +234,9 @@ def fault(
 @obstacle_app.command("list")
 def obstacle_list(run_dir: RunningDir = None) -> int:
     """Show the obstacles agents know of."""
-    from swarmctl.ops import operator as attach
+    from swarmctl.ops import operator
 
-    _show_obstacles(attach.read_obstacles(attach.find_launch(run_dir)))
+    _show_obstacles(operator.read_obstacles(operator.find_launch(run_dir)))
     return EXIT_OK
 
 
@@ -251,12 +251,12 @@ def obstacle_add(
     run_dir: RunningDir = None,
 ) -> int:
     """Put a sphere or a column into a running launch."""
-    from swarmctl.ops import operator as attach
+    from swarmctl.ops import operator
 
     keep_out_m = radius + 0.75 if keep_out is None else keep_out
-    obstacle = attach.obstacle(center, radius, keep_out_m, visibility, velocity, column)
-    launch = attach.find_launch(run_dir)
-    _show_obstacles(attach.change_obstacles(launch, lambda known: (*known, obstacle)))
+    obstacle = operator.obstacle(center, radius, keep_out_m, visibility, velocity, column)
+    launch = operator.find_launch(run_dir)
+    _show_obstacles(operator.change_obstacles(launch, lambda known: (*known, obstacle)))
     return EXIT_OK
 
 
@@ -265,20 +265,20 @@ def obstacle_remove(
     number: Annotated[int, typer.Argument(help="As `obstacle list` counts, from 0.")], run_dir: RunningDir = None
 ) -> int:
     """Take an obstacle out of a running launch."""
-    from swarmctl.ops import operator as attach
+    from swarmctl.ops import operator
 
-    launch = attach.find_launch(run_dir)
-    _show_obstacles(attach.change_obstacles(launch, lambda known: attach.without(known, number)))
+    launch = operator.find_launch(run_dir)
+    _show_obstacles(operator.change_obstacles(launch, lambda known: operator.without(known, number)))
     return EXIT_OK
 
 
 @app.command()
 def view(run_dir: RunningDir = None) -> int:
     """Open the live view of a running launch."""
-    from swarmctl.ops import operator as attach
+    from swarmctl.ops import operator
     from swarmctl.telemetry.recordings import open_viewer
 
-    open_viewer(attach.view_address(attach.find_launch(run_dir)))
+    open_viewer(operator.view_address(operator.find_launch(run_dir)))
     return EXIT_OK
 
 
@@ -339,10 +339,10 @@ def _become(module: str, arguments: list[str]) -> NoReturn:
 
 
 def _command(verb: str, run_dir: Path | None, agent: int | None) -> int:
-    from swarmctl.ops import operator as attach
+    from swarmctl.ops import operator
 
-    launch = attach.find_launch(run_dir)
-    _show(attach.command(launch, verb, agent), range(launch.agents) if agent is None else range(agent, agent + 1))
+    launch = operator.find_launch(run_dir)
+    _show(operator.command(launch, verb, agent), range(launch.agents) if agent is None else range(agent, agent + 1))
     return EXIT_OK
 
 

@@ -22,12 +22,12 @@ from swarmctl.config import Config, dump
 from swarmctl.errors import StartError
 from swarmctl.files import replace_text
 from swarmctl.ops.operator import RunningLaunch, announce, process_start_s, withdraw
-from swarmctl.ops.preflight import LOOPBACK, Ground, inspect
+from swarmctl.ops.preflight import LOOPBACK, ReservedPorts, inspect
 from swarmctl.ops.processes import (
     ROUTER,
     Child,
     Command,
-    Site,
+    RunContext,
     agent_commands,
     end_all,
     router_command,
@@ -37,7 +37,7 @@ from swarmctl.ops.processes import (
 )
 from swarmctl.ops.status_table import Display, open_display
 from swarmctl.ops.summary import sum_up
-from swarmctl.ops.supervisor import Base, EventLog, Flight
+from swarmctl.ops.supervisor import EventLog, Flight, Services
 
 _BUS_S = 20.0  # for the router to answer
 _BUS_TRY_MS = 500
@@ -89,21 +89,21 @@ def launch(config: Config, options: LaunchOptions) -> int:
         ConfigError, StartError: it was refused, or did not come up; nothing is left running.
     """
     with Interrupts() as interrupts:
-        ground = inspect(config)
+        reserved = inspect(config)
         try:
             directory = _run_folder(config, options)
         except BaseException:
-            ground.release()
+            reserved.release()
             raise
         display = open_display()
-        base = Bringup(config, options, ground, directory, display)
+        services = Launcher(config, options, reserved, directory, display)
         grace_s = _LAND_S  # should anything go wrong from here on, agents still get to land
         try:
-            base.start()
-            verdict = Flight(config, base, display).fly(lambda: interrupts.count)
+            services.start()
+            verdict = Flight(config, services, display).fly(lambda: interrupts.count)
             grace_s = 0.0  # who was waited for has ended
         finally:
-            base.stop(grace_s)
+            services.stop(grace_s)
             display.close()
     # from here on Ctrl-C acts as usual: nothing is left to land
     violated = sum_up(config, directory, verdict, display.say)
@@ -121,18 +121,18 @@ def _run_folder(config: Config, options: LaunchOptions) -> Path:
     return directory
 
 
-class Bringup(Base):
+class Launcher(Services):
     """Everything that was started for one launch, and how to end it."""
 
     def __init__(
-        self, config: Config, options: LaunchOptions, ground: Ground, directory: Path, display: Display
+        self, config: Config, options: LaunchOptions, reserved: ReservedPorts, directory: Path, display: Display
     ) -> None:
         self._socket_dir = Path(tempfile.mkdtemp(prefix="swarm-"))  # mode 0700
         self._config = config
         self._options = options
-        self._ground = ground
+        self._reserved = reserved
         self._display = display
-        self.site = Site(run_name(config.name), f"{SCHEME}{self._socket_dir}/bus.sock", directory)
+        self.context = RunContext(run_name(config.name), f"{SCHEME}{self._socket_dir}/bus.sock", directory)
         self.log = EventLog(directory / "launch.events.jsonl")
         self.children: dict[str, Child] = {}
 
@@ -142,20 +142,20 @@ class Bringup(Base):
         Raises:
             StartError: a program can't be run or the router does not answer.
         """
-        config, site, ground = self._config, self.site, self._ground
-        socket_file(site.endpoint)
-        self._spawn(router_command(site.endpoint))
+        config, context, reserved = self._config, self.context, self._reserved
+        socket_file(context.endpoint)
+        self._spawn(router_command(context.endpoint))
         self.bus = self._join_bus()
-        if ground.view_port:
-            self._spawn(viewer_command(config, site, ground.view_port, self._options.view))
+        if reserved.view_port:
+            self._spawn(viewer_command(config, context, reserved.view_port, self._options.view))
         if config.sitl.enabled:
-            self._spawn(sitl_command(config, site, ground.ports, ground.vehicle_sockets))
-        for command in agent_commands(config, site, ground.sockets, ground.vehicle_sockets):
+            self._spawn(sitl_command(config, context, reserved.ports, reserved.vehicle_sockets))
+        for command in agent_commands(config, context, reserved.sockets, reserved.vehicle_sockets):
             self._spawn(command)
         self.announce("")
-        for line in _introduction(config, site, ground):
+        for line in _introduction(config, context, reserved):
             self._display.say(line)
-        self.log.write("started", run=site.run, ports=list(ground.ports))
+        self.log.write("started", run=context.run, ports=list(reserved.ports))
 
     def stop(self, agents_grace_s: float) -> None:
         """End every process, agents first, the router last, and leave nothing behind. Safe at any point."""
@@ -167,7 +167,7 @@ class Bringup(Base):
         if self.bus is not None:
             self.bus.close()
         end_all(router, _ROUTER_STOP_S)
-        self._ground.release()
+        self._reserved.release()
         shutil.rmtree(self._socket_dir, ignore_errors=True)
         withdraw()
         self.log.write("stopped", exit_codes={name: child.poll() for name, child in self.children.items()})
@@ -175,24 +175,26 @@ class Bringup(Base):
     def recover(self, agent: int) -> Child:
         """Start an agent on the vehicle of one that ended; it records beside, and flies without a router if it must."""
         router = self.children[ROUTER]
-        endpoint = self.site.endpoint if router.poll() is None else NO_BUS
-        directory = self.site.directory / "recovery"
+        endpoint = self.context.endpoint if router.poll() is None else NO_BUS
+        directory = self.context.directory / "recovery"
         directory.mkdir(exist_ok=True)
-        site = Site(self.site.run, endpoint, directory)
-        ends = self._ground.sockets, self._ground.vehicle_sockets
-        command = agent_commands(self._config, site, *ends, self.site.directory / "config.toml")[agent]
+        context = RunContext(self.context.run, endpoint, directory)
+        ends = self._reserved.sockets, self._reserved.vehicle_sockets
+        command = agent_commands(self._config, context, *ends, self.context.directory / "config.toml")[agent]
         return Child(replace(command, argv=(*command.argv, "--only-land")), directory)
 
     def announce(self, view: str) -> None:
         """Let operators' commands find this launch."""
-        site = self.site
+        context = self.context
         start_s, pid = process_start_s()
         announce(
-            RunningLaunch(site.run, site.endpoint, pid, start_s, self._config.swarm.agents, str(site.directory), view)
+            RunningLaunch(
+                context.run, context.endpoint, pid, start_s, self._config.swarm.agents, str(context.directory), view
+            )
         )
 
     def _spawn(self, command: Command) -> None:
-        self.children[command.name] = Child(command, self.site.directory)
+        self.children[command.name] = Child(command, self.context.directory)
 
     def _join_bus(self) -> ZenohBus:
         senders = [agent_name(agent) for agent in range(self._config.swarm.agents)]
@@ -202,7 +204,7 @@ class Bringup(Base):
         while True:
             try:
                 return ZenohBus(
-                    self.site.endpoint, self.site.run, OPERATOR, listen, self._config.bus.lease_ms, _BUS_TRY_MS
+                    self.context.endpoint, self.context.run, OPERATOR, listen, self._config.bus.lease_ms, _BUS_TRY_MS
                 )
             except StartError as error:
                 if router.poll() is not None:
@@ -211,16 +213,16 @@ class Bringup(Base):
                     raise StartError(f"router does not answer within {_BUS_S:.0f} s; see {router.log}") from error
 
 
-def _introduction(config: Config, site: Site, ground: Ground) -> tuple[str, ...]:
+def _introduction(config: Config, context: RunContext, reserved: ReservedPorts) -> tuple[str, ...]:
     """Three lines that say what runs."""
     agents = config.swarm.agents
     if config.sitl.enabled:
         vehicles = f"built-in SITL ({config.sitl.preset}) on {LOOPBACK}"
     else:
         vehicles = ", ".join(vehicle.url for vehicle in config.vehicles[:agents])
-    view = f"view on port {ground.view_port}" if ground.view_port else "no view"
+    view = f"view on port {reserved.view_port}" if reserved.view_port else "no view"
     return (
-        f"{site.run}: {agents} agent{'s' if agents > 1 else ''}, {vehicles}",
-        f"bus {site.endpoint}; {view}",
-        f"run folder {site.directory}",
+        f"{context.run}: {agents} agent{'s' if agents > 1 else ''}, {vehicles}",
+        f"bus {context.endpoint}; {view}",
+        f"run folder {context.directory}",
     )

@@ -35,7 +35,7 @@ _NEEDED_TO_VIEW = {"rerun-sdk": (0, 41)}
 
 
 @dataclass(frozen=True, slots=True)
-class Ground:
+class ReservedPorts:
     """What preflight found and holds."""
 
     sockets: tuple[socket.socket, ...]  # one bound socket per agent with the built-in simulator, else none
@@ -49,7 +49,7 @@ class Ground:
             sock.close()
 
 
-def inspect(config: Config) -> Ground:
+def inspect(config: Config) -> ReservedPorts:
     """Check everything, then take the ports.
 
     Raises:
@@ -74,11 +74,11 @@ def inspect(config: Config) -> Ground:
             "choose another or set telemetry.enabled = false"
         )
     ports = tuple(sock.getsockname()[1] for sock in sockets[:count])
-    ground = Ground(sockets[:count], ports, view_port, sockets[count:])
+    reserved = ReservedPorts(sockets[:count], ports, view_port, sockets[count:])
     if problems:
-        ground.release()
+        reserved.release()
         raise StartError("\n".join(problems))
-    return ground
+    return reserved
 
 
 def claim_ports(count: int) -> tuple[socket.socket, ...]:

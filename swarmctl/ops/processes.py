@@ -47,7 +47,7 @@ class Command:
 
 
 @dataclass(frozen=True, slots=True)
-class Site:
+class RunContext:
     """Where a launch happens: what every command line has in common."""
 
     run: str
@@ -67,7 +67,7 @@ def router_command(endpoint: str) -> Command:
 
 def agent_commands(
     config: Config,
-    site: Site,
+    context: RunContext,
     sockets: Sequence[socket.socket],
     vehicles: Sequence[socket.socket] = (),
     config_path: Path | None = None,
@@ -75,13 +75,13 @@ def agent_commands(
     """One agent for each vehicle; `sockets` are the ends of their links that they inherit, or none.
 
     `vehicles` are the simulator's ends of them, whose ports the agents are told. `config_path` is where the resolved
-    configuration is, when it is not in the site's folder.
+    configuration is, when it is not in the context's folder.
     """
     commands = []
     for agent in range(config.swarm.agents):
-        argv = _python("-m", "swarmctl", "agent", "--config", f"{config_path or site.directory / 'config.toml'}")
+        argv = _python("-m", "swarmctl", "agent", "--config", f"{config_path or context.directory / 'config.toml'}")
         argv += ("--id", f"{agent}")
-        argv += ("--run", site.run, "--bus", site.endpoint, "--run-dir", f"{site.directory}")
+        argv += ("--run", context.run, "--bus", context.endpoint, "--run-dir", f"{context.directory}")
         fds = (sockets[agent].fileno(),) if sockets else ()
         argv += ("--fd", f"{fds[0]}") if fds else ()
         argv += ("--vehicle-port", f"{vehicles[agent].getsockname()[1]}") if vehicles else ()
@@ -89,7 +89,9 @@ def agent_commands(
     return tuple(commands)
 
 
-def sitl_command(config: Config, site: Site, ports: Sequence[int], sockets: Sequence[socket.socket] = ()) -> Command:
+def sitl_command(
+    config: Config, context: RunContext, ports: Sequence[int], sockets: Sequence[socket.socket] = ()
+) -> Command:
     """The built-in simulator, which sends to `ports` on loopback from `sockets`, or chooses its own."""
     sitl, swarm = config.sitl, config.swarm
     starts = config.starts_ned_m()
@@ -107,8 +109,13 @@ def sitl_command(config: Config, site: Site, ports: Sequence[int], sockets: Sequ
     argv += ("--local-fds", ",".join(map(str, fds))) if fds else ()
     argv += ("--physics-hz", f"{sitl.physics_hz}", "--mass-scale", f"{sitl.mass_scale!r}", "--start", sitl.start)
     argv += _realism(sitl)
-    argv += ("--control", f"{control_socket(site.endpoint)}", "--events", f"{site.directory / 'sitl.events.jsonl'}")
-    argv += ("--truth", f"{site.directory / 'truth.bin'}", "--die-with-parent")
+    argv += (
+        "--control",
+        f"{control_socket(context.endpoint)}",
+        "--events",
+        f"{context.directory / 'sitl.events.jsonl'}",
+    )
+    argv += ("--truth", f"{context.directory / 'truth.bin'}", "--die-with-parent")
     return Command(SITL, argv, fds)
 
 
@@ -124,10 +131,10 @@ def control_socket(endpoint: str) -> Path:
     return socket_file(endpoint).with_name("sitl.sock")
 
 
-def viewer_command(config: Config, site: Site, port: int, view: bool) -> Command:
+def viewer_command(config: Config, context: RunContext, port: int, view: bool) -> Command:
     """The process that owns rerun."""
-    argv = _python("-m", "swarmctl.telemetry.viewer", "--run", site.run, "--bus", site.endpoint)
-    argv += ("--agents", f"{config.swarm.agents}", "--run-dir", f"{site.directory}", "--port", f"{port}")
+    argv = _python("-m", "swarmctl.telemetry.viewer", "--run", context.run, "--bus", context.endpoint)
+    argv += ("--agents", f"{config.swarm.agents}", "--run-dir", f"{context.directory}", "--port", f"{port}")
     center, extent_m = _stage(config)
     argv += ("--look-at", *(f"{c:.3f}" for c in center), "--extent", f"{extent_m:.3f}")
     argv += ("--rate-hz", f"{config.telemetry.rate_hz!r}", "--separation", f"{config.separation.radius_m!r}")

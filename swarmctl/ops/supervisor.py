@@ -31,7 +31,7 @@ from swarmctl.bus.topics import (
 from swarmctl.config import Config
 from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START
-from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, Site, kill_all
+from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, RunContext, kill_all
 from swarmctl.ops.recovery import RECOVERY_S, Recovery
 from swarmctl.ops.status_table import AgentView, Display, name_of
 
@@ -60,10 +60,10 @@ class EventLog:
             file.write(json.dumps({**now, "event": event, **fields}) + "\n")
 
 
-class Base:
+class Services:
     """What a flight stands on; `swarmctl.ops.launch` brings it up and takes it down."""
 
-    site: Site
+    context: RunContext
     log: EventLog
     children: dict[str, Child]  # by name, agents as on the bus
     bus: Bus | None = None
@@ -114,12 +114,12 @@ def why_it_failed(outcome: str, last_line: str) -> str:
 class Flight:
     """Watches one launch until every agent has ended, or has been given up."""
 
-    def __init__(self, config: Config, base: Base, display: Display) -> None:
-        if base.bus is None:
+    def __init__(self, config: Config, services: Services, display: Display) -> None:
+        if services.bus is None:
             raise ValueError("the bus must be up before the flight is watched")
         self._config = config
-        self._base = base
-        self._bus: Bus = base.bus
+        self._services = services
+        self._bus: Bus = services.bus
         self._display = display
         self._verdict = Verdict()
         self._views = [AgentView(agent) for agent in range(config.swarm.agents)]
@@ -128,9 +128,9 @@ class Flight:
         self._obstacles_said_s = 0.0
         self._started_s = time.monotonic()
         self._reported: set[str] = set()
-        self._carrier_lost = False  # router or simulator is gone
+        self._essential_lost = False  # router or simulator is gone
         self._vehicles_lost = False  # the simulator is gone, and its vehicles with it
-        self._recovery = Recovery(base.recover, config.sysids())
+        self._recovery = Recovery(services.recover, config.sysids())
         self._land_ordered_s: float | None = None
         self._land_said_s = 0.0
         self._land_until_s = 0.0
@@ -143,7 +143,7 @@ class Flight:
         """
         while interrupts() < 2:
             self._hear()
-            self._watch_carriers()
+            self._watch_essential_processes()
             self._watch_viewer()
             self._watch_agents()
             self._watch_time()
@@ -159,7 +159,7 @@ class Flight:
         self._verdict.interrupted = True
         self._fail("killed", "interrupted twice: every process was killed, vehicles were left to their autopilots")
         running = self._running()
-        kill_all(list(self._base.children.values()))
+        kill_all(list(self._services.children.values()))
         if not self._config.sitl.enabled:
             self._recovery.give_up(running)
         return self._name_the_left()
@@ -178,7 +178,7 @@ class Flight:
                 continue
             view = self._views[status.agent]
             if view.status is None or view.status.phase != status.phase:
-                self._base.log.write("phase", agent=status.agent, phase=name_of(Phase, status.phase))
+                self._services.log.write("phase", agent=status.agent, phase=name_of(Phase, status.phase))
             view.status, view.heard_s = status, time.monotonic()
             self._verdict.has_armed |= Phase.ARM <= status.phase < Phase.DONE
         for _, payload in self._bus.receive(OBSTACLES):
@@ -194,19 +194,19 @@ class Flight:
         self._verdict.obstacles = {item: known.get(item, now_us) for item in message.obstacles}
         self._say("obstacles", f"{len(message.obstacles)} obstacles, set by an operator", version=message.version)
 
-    def _watch_carriers(self) -> None:
+    def _watch_essential_processes(self) -> None:
         """Router and simulator: without them there is nothing to go on with."""
         for name, land_s in ((ROUTER, _LAND_S), (SITL, _AFTER_DEATH_S)):
-            child = self._base.children.get(name)
+            child = self._services.children.get(name)
             if child is not None and child.poll() is not None and self._once(name):
-                self._carrier_lost = True
+                self._essential_lost = True
                 self._vehicles_lost |= name == SITL
                 self._verdict.could_not_start |= not any(view.status for view in self._views)
                 self._fail(f"{name}_ended", f"{name} {child.how_it_ended()}; landing. See {child.log}")
                 self._land(land_s)
 
     def _watch_viewer(self) -> None:
-        child = self._base.children.get(VIEWER)
+        child = self._services.children.get(VIEWER)
         if child is None:
             return
         if child.poll() is not None:
@@ -219,14 +219,14 @@ class Flight:
             if line and self._once("view address"):
                 address = line.removeprefix("viewer ")
                 self._say("viewer_ready", f"view {address}", url=address)
-                self._base.announce(address)
+                self._services.announce(address)
         elif child.is_stopped() and self._once("viewer stopped"):
             self._say("viewer_frozen", "viewer is frozen; the flight goes on")
 
     def _watch_agents(self) -> None:
         now_s = time.monotonic()
         for view in self._views:
-            child = self._base.children[agent_name(view.agent)]
+            child = self._services.children[agent_name(view.agent)]
             code = child.poll()
             if code is None:
                 self._judge_silence(view, child, now_s)
@@ -241,7 +241,7 @@ class Flight:
         child = None if self._vehicles_lost else self._recovery.begin(view, code)
         if child is None:
             return
-        self._base.children[agent_name(view.agent)] = child
+        self._services.children[agent_name(view.agent)] = child
         view.note, view.heard_s = "recovering", time.monotonic()
         self._say("recovering", f"landing the vehicle of {agent_name(view.agent)}, which may be armed or in the air")
         if self._land_ordered_s is not None:
@@ -294,7 +294,7 @@ class Flight:
             for order in orders("land", EVERYBODY, time.time_ns() // 1000, clocks_us):
                 self._bus.publish(COMMAND, order)
         for view in deaf:
-            child = self._base.children[agent_name(view.agent)]
+            child = self._services.children[agent_name(view.agent)]
             if since_s > _LAND_OBEYED_S and self._once(f"{child.name} told by signal"):
                 child.signal(signal.SIGTERM)
 
@@ -306,13 +306,15 @@ class Flight:
             for view in running:
                 if not self._recovery.is_on(view.agent):
                     self._fail("not_landed", f"{agent_name(view.agent)} did not end in time and was killed")
-                kill_all([self._base.children[agent_name(view.agent)]])
+                kill_all([self._services.children[agent_name(view.agent)]])
             return not running
         if not running:
             deaths_s = [
-                c.ended_s for c in self._base.children.values() if c.ended_s is not None and c.poll() not in (0, 130)
+                c.ended_s
+                for c in self._services.children.values()
+                if c.ended_s is not None and c.poll() not in (0, 130)
             ]
-            return self._carrier_lost or not deaths_s or now_s - max(deaths_s) > _AFTER_DEATH_S
+            return self._essential_lost or not deaths_s or now_s - max(deaths_s) > _AFTER_DEATH_S
         if self._land_ordered_s is None and all(view.note == "silent" for view in running):
             bus_is_suspect = len(running) == len(self._views) and len(running) > 1
             self._land(_LAND_S if bus_is_suspect else _AFTER_DEATH_S)
@@ -320,8 +322,8 @@ class Flight:
 
     def _note_end(self, view: AgentView, child: Child, code: int) -> None:
         view.note = "done" if code == EXIT_OK else f"exit {code}"
-        self._base.log.write("agent_ended", agent=view.agent, exit_code=code)
-        if code == EXIT_OK or self._carrier_lost or self._recovery.is_on(view.agent):
+        self._services.log.write("agent_ended", agent=view.agent, exit_code=code)
+        if code == EXIT_OK or self._essential_lost or self._recovery.is_on(view.agent):
             return
         if code == EXIT_INTERRUPTED:
             self._verdict.interrupted |= self._land_ordered_s is None  # an operator's `land`
@@ -341,13 +343,13 @@ class Flight:
         now_s = time.monotonic()
         if self._land_ordered_s is None:
             self._land_ordered_s, self._land_until_s = now_s, now_s + timeout_s
-            self._base.log.write("land")
+            self._services.log.write("land")
         self._land_until_s = min(self._land_until_s, now_s + timeout_s)
         for view in self._running():
             if self._recovery.is_on(view.agent):
                 continue
-            if self._carrier_lost or view.status is None or view.note == "silent":
-                self._base.children[agent_name(view.agent)].signal(signal.SIGTERM)
+            if self._essential_lost or view.status is None or view.note == "silent":
+                self._services.children[agent_name(view.agent)].signal(signal.SIGTERM)
 
     def _refuse(self, problem: str) -> None:
         self._verdict.could_not_start = True
@@ -359,7 +361,7 @@ class Flight:
         self._say(event, problem)
 
     def _say(self, event: str, text: str, **fields: Any) -> None:
-        self._base.log.write(event, text=text, **fields)
+        self._services.log.write(event, text=text, **fields)
         self._display.say(text)
 
     def _once(self, what: str) -> bool:
@@ -369,4 +371,4 @@ class Flight:
         return True
 
     def _running(self) -> list[AgentView]:
-        return [view for view in self._views if self._base.children[agent_name(view.agent)].poll() is None]
+        return [view for view in self._views if self._services.children[agent_name(view.agent)].poll() is None]

@@ -19,17 +19,17 @@ from types import FrameType
 from swarmctl.bus.zenoh_bus import SCHEME
 from swarmctl.check.change import Change
 from swarmctl.check.link_facts import VehicleFacts
-from swarmctl.check.listener import NOWHERE, Address, Ear, UdpEar, monotonic_us, open_ear
+from swarmctl.check.listener import NOWHERE, Address, Listener, UdpListener, monotonic_us, open_listener
 from swarmctl.check.parameters import Number, changes, names_to_read, unchangeable
 from swarmctl.check.scan_facts import facts_of, unreached
-from swarmctl.check.scanner import Probe, survey
+from swarmctl.check.scanner import VehicleScan, run_scans
 from swarmctl.check.swarm import exit_code, findings, standing
 from swarmctl.check.table import as_json, print_check
 from swarmctl.config import Config
 from swarmctl.core.types import GeoOrigin
 from swarmctl.errors import StartError
 from swarmctl.ops.preflight import claim_ports
-from swarmctl.ops.processes import Child, Site, end_all, run_name, sitl_command
+from swarmctl.ops.processes import Child, RunContext, end_all, run_name, sitl_command
 
 _CONNECT_S = 5.0  # heartbeats come once a second
 _SIMULATOR_S = 20.0  # to come up, on a machine that is busy
@@ -78,7 +78,7 @@ class _Link:
     """Where one vehicle is heard, or why it can't be."""
 
     url: str
-    ear: Ear | None
+    listener: Listener | None
     there: Address
     problem: str = ""
 
@@ -101,45 +101,45 @@ def _ask(config: Config, options: CheckOptions, field: _Field) -> tuple[list[Veh
     sysids = config.sysids()
     names = partial(names_to_read, config=config)
     patience_s = _PATIENCE_S if field.simulator is None else _SIMULATOR_PATIENCE_S
-    probes = {
-        agent: Probe(link.ear, link.there, sysids[agent], names, options.seconds, patience_s)
+    scans = {
+        agent: VehicleScan(link.listener, link.there, sysids[agent], names, options.seconds, patience_s)
         for agent, link in enumerate(links)
-        if link.ear is not None
+        if link.listener is not None
     }
     longest_s = field.connect_s + options.seconds + patience_s + _LONGER_S
-    survey(list(probes.values()), field.connect_s, longest_s, field.ended)
+    run_scans(list(scans.values()), field.connect_s, longest_s, field.ended)
     if field.simulator is not None and field.ended():
         raise StartError(f"built-in simulator {field.simulator.how_it_ended()}")
-    vehicles = _facts(config, links, probes)
+    vehicles = _facts(config, links, scans)
     if not options.apply:
         return vehicles, []
     wanted = {facts.agent: changes(facts, config) for facts in vehicles}
     for facts in vehicles:
         if wanted[facts.agent] and not unchangeable(facts):
-            probes[facts.agent].set_parameters(wanted[facts.agent])
-    survey(list(probes.values()), 0.0, _APPLY_S, field.ended)
-    after = _facts(config, links, probes)
+            scans[facts.agent].set_parameters(wanted[facts.agent])
+    run_scans(list(scans.values()), 0.0, _APPLY_S, field.ended)
+    after = _facts(config, links, scans)
     return after, [
-        _changed(before, now, name, value, probes[before.agent])
+        _changed(before, now, name, value, scans[before.agent])
         for before, now in zip(vehicles, after, strict=True)
         for name, value in wanted[before.agent].items()
     ]
 
 
-def _facts(config: Config, links: Sequence[_Link], probes: dict[int, Probe]) -> list[VehicleFacts]:
+def _facts(config: Config, links: Sequence[_Link], scans: dict[int, VehicleScan]) -> list[VehicleFacts]:
     swarm, sysids, now_us = config.swarm, config.sysids(), monotonic_us()
     shared = GeoOrigin(swarm.origin_lat_deg, swarm.origin_lon_deg, swarm.origin_alt_m)
     return [
-        facts_of(probes[agent], agent, link.url, sysids[agent], shared, now_us)
-        if agent in probes
+        facts_of(scans[agent], agent, link.url, sysids[agent], shared, now_us)
+        if agent in scans
         else unreached(agent, link.url, sysids[agent], link.problem)
         for agent, link in enumerate(links)
     ]
 
 
-def _changed(before: VehicleFacts, now: VehicleFacts, name: str, wanted: Number, probe: Probe) -> Change:
+def _changed(before: VehicleFacts, now: VehicleFacts, name: str, wanted: Number, scan: VehicleScan) -> Change:
     refused = unchangeable(before)
-    if not refused and probe.parameters is not None and probe.parameters.interrupted:
+    if not refused and scan.parameters is not None and scan.parameters.interrupted:
         refused = "it was armed, or fell silent, meanwhile"
     was = before.number(name)
     assert was is not None  # `changes` leaves out what is not known
@@ -164,16 +164,16 @@ def _field(config: Config, options: CheckOptions) -> Iterator[_Field]:
 
 def _open(url: str) -> _Link:
     try:
-        ear, there = open_ear(url)
+        listener, there = open_listener(url)
     except StartError as error:
         return _Link(url, None, NOWHERE, str(error))
-    return _Link(url, ear, there)
+    return _Link(url, listener, there)
 
 
 def _close(links: Sequence[_Link]) -> None:
     for link in links:
-        if link.ear is not None:
-            link.ear.close()
+        if link.listener is not None:
+            link.listener.close()
 
 
 @contextlib.contextmanager
@@ -181,12 +181,14 @@ def _simulator(config: Config) -> Iterator[_Field]:
     """The simulator a launch would start, on ports of its own."""
     sockets = claim_ports(config.swarm.agents)
     ports = [sock.getsockname()[1] for sock in sockets]
-    links = [_Link(f"built-in simulator, port {p}", UdpEar(s), NOWHERE) for s, p in zip(sockets, ports, strict=True)]
+    links = [
+        _Link(f"built-in simulator, port {p}", UdpListener(s), NOWHERE) for s, p in zip(sockets, ports, strict=True)
+    ]
     directory = Path(tempfile.mkdtemp(prefix="swarm-check-"))
     children: list[Child] = []
-    site = Site(run_name(config.name), f"{SCHEME}{directory / 'bus.sock'}", directory)
+    context = RunContext(run_name(config.name), f"{SCHEME}{directory / 'bus.sock'}", directory)
     try:
-        children.append(Child(sitl_command(config, site, ports), directory))
+        children.append(Child(sitl_command(config, context, ports), directory))
         yield _Field(links, _SIMULATOR_S, children[0])
     finally:
         end_all(children, _STOP_S)

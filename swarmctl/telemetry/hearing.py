@@ -6,7 +6,7 @@ from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from swarmctl.telemetry.plain import finite
+from swarmctl.telemetry.json_safe import finite
 
 _ALLOWED = {  # of one topic of one peer, by one agent; other reasons are what a network or a restart does by itself
     "boot": 0,

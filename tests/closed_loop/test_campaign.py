@@ -53,7 +53,7 @@ def test_agents_that_see_each_other_do_not_collide(quick: Path) -> None:
     assert 2.0 < alone < 8.0
 
 
-def test_control_agents_that_see_nobody_do(quick: Path) -> None:
+def test_negative_control_agents_that_see_nobody_do(quick: Path) -> None:
     rows = [row for row in rows_in(quick) if row["protections"] == "off"]
     assert rows and all(row["collided"] and not row["arrived"] for row in rows)
     assert all(row["min_separation_m"] < TOUCH_M[row["scenario"]] for row in rows)
@@ -86,7 +86,7 @@ def test_the_report_has_every_cell_with_its_exact_interval(quick: Path) -> None:
     assert "--scenario swap --agents 3 --delay 100 --loss 0.1" in page, "what flies a failed run again"
 
 
-def test_incidents_happen_in_flight() -> None:
+def test_scenario_events_happen_in_flight() -> None:
     """Two agents; the bus falls apart for 2 s: paths age, both come through."""
     trial = Trial(Cell("partition", 2, 0.0, 0.0, "exact", 0.0, "default"), 1)
     flight = Flight(trial, layout_of("partition", 1, 2))

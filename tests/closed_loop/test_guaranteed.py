@@ -38,14 +38,14 @@ def test_late_and_lost_messages_cost_time_and_no_distance() -> None:
 
 
 @pytest.mark.parametrize(
-    ("traffic_rule", "within_s", "least_m"),
+    ("traffic_rule", "within_s", "bound_m"),
     [("", 11.0, PROMISED_M), ("agent.commit.bias_rad=0.35 agent.commit.stuck_m=0.1", 14.0, PROMISED_M - 0.03)],
     ids=["keeping right early", "control: only who stands turns"],
 )
-def test_who_meets_keeps_right_before_all_stand(traffic_rule: str, within_s: float, least_m: float) -> None:
+def test_who_meets_keeps_right_before_all_stand(traffic_rule: str, within_s: float, bound_m: float) -> None:
     """Late plans that end in stops lock in the middle of a swap, and to get out of that takes as long again."""
     row = flown(Cell("swap", 6, 100.0, 0.0, "exact", 0.0, "guaranteed", traffic_rule)).row(None)
-    assert row["min_separation_m"] >= least_m
+    assert row["min_separation_m"] >= bound_m
     assert (row["flight_time_s"] < within_s) is (traffic_rule == "")
 
 
@@ -54,7 +54,7 @@ def test_where_a_dead_peer_has_promised_to_end_is_gone_round() -> None:
     assert flown(Cell("death", 6, 100.0, 0.0, "exact", 0.0, "guaranteed"), 3).row(None)["outcome"] == "arrived"
 
 
-def test_control_agents_that_see_nobody_touch() -> None:
+def test_negative_control_agents_that_see_nobody_touch() -> None:
     assert flown(Cell("swap", 4, 300.0, 0.3, "exact", 0.0, "off")).row(None)["min_separation_m"] < TOUCH_M
 
 
@@ -81,7 +81,9 @@ def test_who_is_off_the_bus_promises_nothing() -> None:
     assert committed_in_the_dark() == 0
 
 
-def test_control_who_takes_silence_for_death_promises_against_the_living(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_negative_control_who_takes_silence_for_death_promises_against_the_living(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def only_seen(self: Coordination, utc_us: int) -> Set[int]:
         return frozenset(agent for agent in self._peers if agent_name(agent) in self._bus.alive())
 

@@ -48,7 +48,7 @@ def test_who_is_told_to_land_at_speed_among_others_brakes_and_makes_room_first(f
         assert np.linalg.norm(handed["vel_ned_m_s"]) < 0.2
 
 
-def test_control_an_autopilot_that_lands_at_speed_among_others_comes_too_close(
+def test_negative_control_an_autopilot_that_lands_at_speed_among_others_comes_too_close(
     fly: Fly, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def land_at_once(self: Sequence, now_us: int, state: VehicleState) -> None:
@@ -135,7 +135,7 @@ def test_an_agent_that_slept_past_the_loss_takes_nothing_back() -> None:
     assert flight.agent.outcome == TAKEN_OVER
 
 
-def test_control_without_doubting_the_mode_it_returns_to_offboard(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_negative_control_without_doubting_the_mode_it_returns_to_offboard(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mode_watch, "_GAP_US", 10**12)
     flight = asleep_past_the_loss()
     assert flight.setpoints_us
@@ -165,7 +165,7 @@ def test_a_restarted_agent_leaves_a_vehicle_to_the_failsafe_that_has_it() -> Non
     assert flight.offboard_us
 
 
-def test_control_streaming_to_a_vehicle_that_is_not_ours_takes_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_negative_control_streaming_to_a_vehicle_that_is_not_ours_takes_it(monkeypatch: pytest.MonkeyPatch) -> None:
     def switch_off() -> None:
         monkeypatch.setattr(sequence, "_is_theirs", lambda state: False)
         monkeypatch.setattr(Sequence, "_ask_for_control", lambda *_: [])  # streaming is enough

@@ -29,9 +29,9 @@ from swarmctl.bus.topics import (
 from swarmctl.config import load
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START
-from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, Command, Site, kill_all
+from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, Command, RunContext, kill_all
 from swarmctl.ops.status_table import AgentView
-from swarmctl.ops.supervisor import Base, EventLog, Flight, Verdict
+from swarmctl.ops.supervisor import EventLog, Flight, Services, Verdict
 
 pytestmark = pytest.mark.process
 
@@ -56,12 +56,12 @@ def status_of(agent: int, phase: Phase, utc_us: int) -> bytes:
     return encode_message(message)
 
 
-class Scene(Base):
-    """A base of scripted processes; it also is the display, which the flight calls once in every step."""
+class Scene(Services):
+    """A services of scripted processes; it also is the display, which the flight calls once in every step."""
 
     def __init__(self, directory: Path, agents: Sequence[str], others: dict[str, str] | None = None) -> None:
         self.log = EventLog(directory / "launch.events.jsonl")
-        self.site = Site("run", "unixsock-stream//nowhere", directory)
+        self.context = RunContext("run", "unixsock-stream//nowhere", directory)
         scripts = {agent_name(i): script for i, script in enumerate(agents)} | (others or {ROUTER: FLIES_LONG})
         self.children = {
             name: Child(Command(name, (sys.executable, "-ESc", script)), directory) for name, script in scripts.items()
@@ -294,14 +294,14 @@ def test_second_interrupt_kills_at_once(tmp_path: Path) -> None:
     assert {child.poll() for child in scene.children.values()} == {137}
 
 
-@pytest.mark.parametrize("carrier", [ROUTER, SITL])
-def test_without_router_or_simulator_everybody_lands(tmp_path: Path, carrier: str) -> None:
+@pytest.mark.parametrize("name", [ROUTER, SITL])
+def test_without_router_or_simulator_everybody_lands(tmp_path: Path, name: str) -> None:
     scene = Scene(tmp_path, [FLIES_LONG, FLIES_LONG], {ROUTER: FLIES_LONG, SITL: FLIES_LONG})
-    scene.act = lambda: scene.kill(carrier)
+    scene.act = lambda: scene.kill(name)
     verdict = scene.fly()
     assert verdict.exit_code(violated=False) == EXIT_MISSION
     assert len(verdict.problems) == 1
-    assert scene.heard(carrier, "SIGKILL")
+    assert scene.heard(name, "SIGKILL")
     assert [scene.children[f"agent-{i}"].poll() for i in range(2)] == [130, 130]
 
 

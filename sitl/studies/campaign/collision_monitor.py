@@ -30,7 +30,7 @@ class Solid:
     column: bool
 
 
-class Umpire:
+class CollisionMonitor:
     """Sees every true state of one flight, in order.
 
     Args:

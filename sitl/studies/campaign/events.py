@@ -16,7 +16,7 @@ from swarmctl.core.types import Array
 _TOLD_EVERY_S = 0.1  # of a moving obstacle: messages have no time, so it has to be followed
 
 
-class Incident(Protocol):
+class ScenarioEvent(Protocol):
     """One per flight: it may remember."""
 
     def step(self, lockstep: Lockstep, t_s: float, pos_ned_m: Array, vel_ned_m_s: Array) -> None:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sitl.lockstep import Lockstep
-from sitl.studies.campaign.collision_monitor import Solid, Umpire
+from sitl.studies.campaign.collision_monitor import CollisionMonitor, Solid
 from sitl.studies.campaign.factors import NOISES, PROTECTIONS, UNCOOPERATIVE, wind_settings
 from sitl.studies.campaign.layouts import least_sum_m
 from sitl.studies.campaign.scenarios import SCENARIOS, Layout, layout_of, settings_of
@@ -84,7 +84,7 @@ class Flight:
         self._agents = list(self.lockstep.agents)  # those that will have died, too
         expected = np.array([i not in layout.lost for i in range(agents)])
         arrive_m = math.inf if layout.settles else layout.arrive_m + NOISES[cell.noise].arrive_m
-        self.umpire = Umpire(config.separation.body_m, layout.goals_ned_m, arrive_m, expected)
+        self.monitor = CollisionMonitor(config.separation.body_m, layout.goals_ned_m, arrive_m, expected)
         self._fixed = tuple(Solid(np.array(o.center_ned_m), o.radius_m, o.column) for o in config.obstacles)
         self._begin_s = math.nan
         self._resting_since_s = math.inf
@@ -104,26 +104,26 @@ class Flight:
                 self._begin_s = now_s
             t_s = now_s - self._begin_s
             if t_s >= 0.0:
-                for incident in self._layout.incidents:
-                    incident.step(lockstep, t_s, pos, vel)
-            solids = [s for incident in self._layout.incidents for s in incident.solids(t_s)]
-            self.umpire.see(now_s, pos, vel, (*self._fixed, *solids))
+                for event in self._layout.events:
+                    event.step(lockstep, t_s, pos, vel)
+            solids = [s for event in self._layout.events for s in event.solids(t_s)]
+            self.monitor.see(now_s, pos, vel, (*self._fixed, *solids))
             slow = t_s > _REST_S and np.linalg.norm(vel, axis=1).max() < _REST_M_S
             self._resting_since_s = min(self._resting_since_s, now_s) if slow else math.inf
-            if self.umpire.collided:
+            if self.monitor.collided:
                 self._contact_s = min(self._contact_s, now_s)
 
     def row(self, alone_s: float | None) -> Row:
         """What came of it."""
-        umpire, cell, layout = self.umpire, self._trial.cell, self._layout
-        collided = umpire.collided
+        monitor, cell, layout = self.monitor, self._trial.cell, self._layout
+        collided = monitor.collided
         arrived = not collided and not self._problems and self._arrived_s() < math.inf
         stuck = self._out_of_time and self._someone_stands_short()
         outcome = self._outcome(collided, arrived, stuck)
         ticks = [log.ticks for log in self.lockstep.logs]
         charged = [rows[rows["phase"] == Phase.TRACK] for rows in ticks]
         separation = self.lockstep.config.separation
-        goal_sum_m = None if layout.goals_ned_m is None else float(umpire.distance_m().sum())
+        goal_sum_m = None if layout.goals_ned_m is None else float(monitor.distance_m().sum())
         return {
             "scenario": cell.scenario,
             "agents": cell.agents,
@@ -132,7 +132,7 @@ class Flight:
             "seed": self._trial.seed,
             "protections": cell.protections,
             "collided": collided,
-            "min_separation_m": _finite(umpire.min_separation_m),
+            "min_separation_m": _finite(monitor.min_separation_m),
             "arrived": arrived,
             "flight_time_s": self._arrived_s() - self._begin_s if arrived else None,
             "noise": cell.noise,
@@ -140,7 +140,7 @@ class Flight:
             "sets": cell.sets,
             "deadlocked": stuck and not collided,
             "outcome": outcome,
-            "min_clearance_m": _finite(umpire.min_clearance_m),
+            "min_clearance_m": _finite(monitor.min_clearance_m),
             "arrived_agents": self._arrived_agents(arrived),
             "unconstrained_time_s": alone_s,
             "goal_sum_m": goal_sum_m,
@@ -169,18 +169,18 @@ class Flight:
         """When the last one arrived; infinite before. Without goals: when the mission has been flown to its end."""
         if self._layout.goals_ned_m is None:
             return self._begin_s + self._layout.limit_s if self._out_of_time else math.inf
-        return self._resting_since_s if self._layout.settles else self.umpire.arrived_s
+        return self._resting_since_s if self._layout.settles else self.monitor.arrived_s
 
     def _arrived_agents(self, arrived: bool) -> int | None:
         if self._layout.goals_ned_m is None or self._layout.settles:
             return self._trial.cell.agents if arrived else None
-        return int(self.umpire.arrived.sum())
+        return int(self.monitor.arrived.sum())
 
     def _someone_stands_short(self) -> bool:
         if self._layout.goals_ned_m is None or self._layout.settles:
             return False
         expected = np.array([i not in self._layout.lost for i in range(self._trial.cell.agents)])
-        return bool((self.umpire.standing() & ~self.umpire.arrived & expected).any())
+        return bool((self.monitor.standing() & ~self.monitor.arrived & expected).any())
 
     def _outcome(self, collided: bool, arrived: bool, stuck: bool) -> str:
         if collided:
@@ -224,7 +224,7 @@ def _alone_s(trial: Trial, layout: Layout) -> float | None:
             *speeds,
             f"mission.goto={{goals_ned_m={goal.tolist()},speed_m_s={goto.speed_m_s},accel_m_s2={goto.accel_m_s2}}}",
         ),
-        incidents=(),
+        events=(),
         uncooperative=frozenset(),
         lost=frozenset(),
     )

@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sitl.studies.campaign.events import Appearance, Death, Incident, Partition
+from sitl.studies.campaign.events import Appearance, Death, Partition, ScenarioEvent
 from sitl.studies.campaign.layouts import far_goals, forest, ring, scattered, walls
 from swarmctl.core.types import Array
 from swarmctl.toml_text import toml_value
@@ -52,7 +52,7 @@ class Layout:
     goals_ned_m: Array | None = None  # (N, 3); None: the mission is flown to its end
     arrive_m: float = 0.15
     settles: bool = False  # one goal for all: arrived when everybody has come to rest
-    incidents: tuple[Incident, ...] = ()
+    events: tuple[ScenarioEvent, ...] = ()
     uncooperative: frozenset[int] = frozenset()  # avoid nobody
     lost: frozenset[int] = frozenset()  # not expected to arrive
 
@@ -145,8 +145,8 @@ def _maze(rng: np.random.Generator, agents: int) -> Layout:
     return Layout(SMALL, starts, settings, 60.0, goals, arrive_m=0.1)
 
 
-def _with(layout: Layout, incident: Incident, **changes: object) -> Layout:
-    return replace(layout, incidents=(incident,), **changes)  # type: ignore[arg-type]
+def _with(layout: Layout, event: ScenarioEvent, **changes: object) -> Layout:
+    return replace(layout, events=(event,), **changes)  # type: ignore[arg-type]
 
 
 def _sudden(rng: np.random.Generator, agents: int, speed_m_s: float) -> Layout:

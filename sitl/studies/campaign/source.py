@@ -7,7 +7,14 @@ from functools import cache
 from pathlib import Path
 
 _PACKAGES = ("sitl", "swarmctl")
-_PAGES = {"page.py", "store.py", "crew.py", "intervals.py", "summary.py", "command.py"}  # of this package: no flight
+_PAGES = {
+    "page.py",
+    "store.py",
+    "worker_pool.py",
+    "intervals.py",
+    "summary.py",
+    "command.py",
+}  # of this package: no flight
 
 
 @cache

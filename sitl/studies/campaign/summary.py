@@ -40,8 +40,8 @@ class CellSummary:
     min_clearance_m: float | None
     time_median_s: float | None  # of the runs that arrived
     time_max_s: float | None
-    over_alone: float | None  # median of flight time over the unconstrained one
-    over_least: float | None  # largest sum of distances over the least
+    time_relative: float | None  # median of flight time relative to the single-agent time
+    sum_relative: float | None  # largest sum of distances to the goals, relative to its theoretical lower bound
     plans_failed: float  # mean per run
     commits_refused: float
     barrier_acted: float

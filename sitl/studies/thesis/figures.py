@@ -192,7 +192,7 @@ def error_chart(flight: Flight, traces: Sequence[Trace], separation_m: Mapping[s
     radius_m = separation_m.get(traces[0].name, separation_m.get(flight))
     limits = []
     if radius_m is not None and traces[0].pos_ned_m.shape[1] == 3:
-        limits = [Limit(math.sqrt(3) * radius_m, "least possible for three agents")]
+        limits = [Limit(math.sqrt(3) * radius_m, "theoretical lower bound for three agents")]
     title = "Distances to the shared reference, sum [m]" if flight in SWARMS else "Distance to the reference [m]"
     return time_chart(title, lines, _seconds(traces), limits=limits, points=points, from_zero=True, height=300)
 
@@ -231,7 +231,7 @@ def above_chart(trace: Trace, points: int) -> str:
 
 
 def index_chart(index: Sequence[IndexPoint]) -> str:
-    """Tracking index over constraint radius: Table 19, ours, and the least that three agents can reach."""
+    """Tracking index over constraint radius: Table 19, ours, and the theoretical lower bound for three agents."""
     radii = np.array(sorted({point.radius_m for point in index}))
     published = sorted({(p.radius_m, p.published_m) for p in index if p.published_m is not None})
     lines = []
@@ -239,7 +239,7 @@ def index_chart(index: Sequence[IndexPoint]) -> str:
         ours = sorted((p.radius_m, p.ours_m) for p in index if p.series == name and p.ours_m is not None)
         lines.append(_marked(ours, css(agent_rgb(k)), name))
     lines.append(_marked(published, _PUBLISHED, "published, Table 19"))
-    lines.append(Line(radii, math.sqrt(3) * radii, css(LIMIT_RGB), "least possible, sqrt(3) r", "5 4", 1.2))
+    lines.append(Line(radii, math.sqrt(3) * radii, css(LIMIT_RGB), "theoretical lower bound, sqrt(3) r", "5 4", 1.2))
     shown = (float(radii[0]) - 0.03, float(radii[-1]) + 0.03)
     title = "Tracking index [m] over constraint radius [m], three periods of the circle"
     return time_chart(title, lines, shown, from_zero=True, height=240)

@@ -1,7 +1,7 @@
 """The same flights through the whole bridge: agents, MAVLink frames, commands and the simulator's own loops.
 
 Ideal link: no latency, no loss. The simulator's physics runs at the thesis' 50 Hz, so that what is left of a difference
-to the plant path is the bridge itself: frames in single precision, the sequence from arming to tracking, and its
+to a model-only flight is the bridge itself: frames in single precision, the sequence from arming to tracking, and its
 estimate of the hover thrust.
 """
 

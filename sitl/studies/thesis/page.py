@@ -36,7 +36,7 @@ _NOT_A_NUMBER = "not finite"
 _READING = (
     "Every row is an error, a distance from the goal or a time: lower is better. The ratio is ours over the published "
     "figure, below 1 is better than published; there is none where the thesis prints 0. A limit is what this project "
-    "asks of itself; least is what no controller can go below: three agents that keep r from each other around one "
+    "asks of itself; no controller can go below the lower bound: three agents that keep r from each other around one "
     "shared point are at best an equilateral triangle, a sum of sqrt(3) r.",
     "Path plant: every controller acts on the plant itself once in 0.02 s, as in the thesis. Path full: agents fly "
     "simulated autopilots over an ideal MAVLink link, without torques, which a MAVLink vehicle does not tell.",
@@ -135,7 +135,7 @@ def _finite(value: float | None) -> float | None:
 
 
 def _json_row(row: Row) -> dict[str, Any]:
-    numbers = {"published": row.published, "ours": row.ours, "limit": row.limit, "least": row.least}
+    numbers = {"published": row.published, "ours": row.ours, "limit": row.limit, "least": row.lower_bound}
     broken = [
         f"{key} is {_NOT_A_NUMBER}" for key, value in numbers.items() if value is not None and _finite(value) is None
     ]
@@ -148,7 +148,7 @@ def _json_row(row: Row) -> dict[str, Any]:
         "unit": row.unit,
         "note": "; ".join([*([row.note] if row.note else []), *broken]),
         "ratio": ratio(row),
-        "least": _finite(row.least),
+        "least": _finite(row.lower_bound),
         "met": row.met,
     }
 
@@ -184,7 +184,7 @@ def _missed(rows: Sequence[Row]) -> str:
 def _rows_table(rows: Sequence[Row]) -> str:
     if not rows:
         return ""
-    names = ("", "published", "ours", "ratio", "limit", "least", "unit", "path", "", "note")
+    names = ("", "published", "ours", "ratio", "limit", "lower bound", "unit", "path", "", "note")
     head = "".join(f'<th class="{"n" if 0 < k < 6 else ""}">{name}</th>' for k, name in enumerate(names))
     parts = []
     for key, title in [*FLIGHTS.items(), (None, "Other")]:
@@ -198,7 +198,7 @@ def _rows_table(rows: Sequence[Row]) -> str:
 def _row(row: Row) -> str:
     share = ratio(row)
     numbers = (_number(row.published), _number(row.ours), "" if share is None else f"{share:.2f}", _number(row.limit))
-    cells = "".join(f"<td class=n>{number}</td>" for number in (*numbers, _number(row.least)))
+    cells = "".join(f"<td class=n>{number}</td>" for number in (*numbers, _number(row.lower_bound)))
     verdict = {None: "", True: '<span class="ok">met</span>', False: '<span class="bad">missed</span>'}[row.met]
     return (
         f"<tr><td>{html.escape(row.name)}</td>{cells}<td>{html.escape(row.unit)}</td><td>{row.path}</td>"

@@ -30,7 +30,7 @@ from sitl.studies.thesis.mavlink_flight import fly_over_mavlink
 from sitl.studies.thesis.model_flight import fly_on_plant
 from sitl.studies.thesis.page import write_json, write_page
 from sitl.studies.thesis.trace import Row, Trace
-from swarmctl.built_in_configs import shipped_config
+from swarmctl.built_in_configs import built_in_config
 from swarmctl.config import load
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, ConfigError, StartError, exit_code_of
 from swarmctl.process_lifetime import die_with_parent
@@ -41,7 +41,7 @@ TIMING = "timing"  # what `--only` calls the rows that are no flight's
 
 def fly(job: Job) -> Trace:
     """One flight."""
-    config = load(shipped_config(job.config), job.overrides)
+    config = load(built_in_config(job.config), job.overrides)
     if job.path == "plant":
         return fly_on_plant(job.name, config, matched_velocity=job.matched_velocity)
     return fly_over_mavlink(job.name, config)
@@ -117,11 +117,13 @@ def show(rows: Sequence[Row], console: Console) -> None:
     """The rows as a table."""
     table = Table(show_edge=False)
     table.add_column("row")
-    for name in ("published", "ours", "limit", "least"):
+    for name in ("published", "ours", "limit", "lower bound"):
         table.add_column(name, justify="right")
     table.add_column("")
     for row in rows:
-        cells = ["" if value is None else f"{value:.4g}" for value in (row.published, row.ours, row.limit, row.least)]
+        cells = [
+            "" if value is None else f"{value:.4g}" for value in (row.published, row.ours, row.limit, row.lower_bound)
+        ]
         verdict = {None: "", True: "[green]met", False: "[red]missed"}[row.met]
         table.add_row(row.name, *cells, verdict)
     console.print(table)

@@ -26,7 +26,7 @@ class Trace:
     """One flight from mission start to mission end, true states at every tick of 0.02 s.
 
     The setpoint at index k is the one computed from the state at index k. NaN where nothing was recorded: torques exist
-    on the plant path only.
+    in model-only flights only.
     """
 
     name: str  # of the flight, unique: "circle 0.90 dmpc"
@@ -55,7 +55,7 @@ class Row:
     path: Path
     unit: str
     note: str = ""
-    least: float | None = None  # the least possible, where it is known
+    lower_bound: float | None = None  # the theoretical lower bound, where it is known
 
     @property
     def met(self) -> bool | None:

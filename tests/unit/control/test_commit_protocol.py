@@ -140,7 +140,7 @@ class Careless(Crowd):
                 agent.hear(self.now_us, everybody, set())
 
 
-def test_control_promises_that_wait_for_nobody_contradict_each_other() -> None:
+def test_negative_control_promises_that_wait_for_nobody_contradict_each_other() -> None:
     assert Careless(4, Network((300_000, 300_000))).run(6.0) < CERTIFIED_M - 0.1
 
 

@@ -165,7 +165,7 @@ def test_where_it_is_too_close_now_a_way_out_is_allowed_and_a_way_in_is_not() ->
     assert certify(line((0.5, 0.0, 0.0), (3.0, 0.0, 0.0)), [*keep_out, fixed((3.0, 0.0, 0.0), 0.8)], 0) < 0.0
 
 
-def test_control_horizon_as_long_as_the_prediction_leaves_the_end_to_be_judged() -> None:
+def test_negative_control_horizon_as_long_as_the_prediction_leaves_the_end_to_be_judged() -> None:
     path = line((0.0, 0.0, 0.0), (5.0, 0.0, 0.0), 6)
     assert certify(path, [fixed((5.0, 0.0, 0.0), 0.8, steps=6)], 6) < 0.0
 

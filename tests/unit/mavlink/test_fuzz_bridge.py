@@ -141,7 +141,7 @@ def test_hostile_frames_do_not_change_what_is_believed(seed: int, said: list[lis
     assert twin.autopilot.armed
 
 
-def test_control_one_whole_frame_of_the_vehicle_is_believed(said: list[list[bytes]]) -> None:
+def test_negative_control_one_whole_frame_of_the_vehicle_is_believed(said: list[list[bytes]]) -> None:
     victim, twin = Listener(), Listener()
     for valid in said[:50]:
         assert victim.hear(valid) == twin.hear(valid)

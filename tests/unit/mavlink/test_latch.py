@@ -236,7 +236,7 @@ def test_a_flood_costs_the_tick_nothing_and_loses_nothing_of_the_vehicle(port: s
     assert worst_ms < 5.0
 
 
-def test_control_without_the_kernels_help_the_drain_is_bounded_but_frames_are_lost(
+def test_negative_control_without_the_kernels_help_the_drain_is_bounded_but_frames_are_lost(
     port: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(transport, "admit_only", lambda *_: None)

@@ -105,7 +105,7 @@ def test_a_seed_repeats_and_another_does_not() -> None:
     assert not np.allclose(first["pos"], other["pos"])
 
 
-def test_control_exact_is_the_truth() -> None:
+def test_negative_control_exact_is_the_truth() -> None:
     flown = still("exact", vehicles=2, seconds=1)
     assert not flown["pos"].any()
     assert not flown["vel"].any()

@@ -47,13 +47,13 @@ class Wire:
         return
 
 
-def through(count: int = 1000, *, outwards: bool = True, seed: int = 1, **troubles: float) -> list[tuple[int, bytes]]:
+def through(count: int = 1000, *, outwards: bool = True, seed: int = 1, **impaired: float) -> list[tuple[int, bytes]]:
     """(step, datagram) of numbered datagrams, one a step, that come out of a troubled link."""
     wire = Wire()
     link = LossyLink(wire, (seed,))
-    way = link.from_vehicle if outwards else link.to_vehicle
-    for key, value in troubles.items():
-        way.trouble(key, value)
+    direction = link.from_vehicle if outwards else link.to_vehicle
+    for key, value in impaired.items():
+        direction.set_impairment(key, value)
     out = []
     for k in range(count + 50):
         if not outwards and k < count:

@@ -81,7 +81,7 @@ def all_traces() -> dict[str, Sequence[Trace]]:
 ROWS = [
     Row("slow PID, MSE x", 0.0020, 0.0022, 0.0025, "plant", "m2"),
     Row("fast MPC, MSE y", 0.0, 6e-6, None, "plant", "m2", "printed as 0.0000"),
-    Row("circle, index at 0.90 m", 2.19, 2.38, 2.19, "full", "m", "R < 1 & so on", least=1.559),
+    Row("circle, index at 0.90 m", 2.19, 2.38, 2.19, "full", "m", "R < 1 & so on", lower_bound=1.559),
     Row("wall time", None, float("nan"), 600.0, "plant", "s"),
 ]
 
@@ -210,7 +210,7 @@ def test_a_flight_that_never_began_is_drawn_empty(tmp_path: Path, flight: Flight
     parsed(text)
 
 
-def test_torques_the_full_path_does_not_have() -> None:
+def test_torques_the_full_mavlink_loop_does_not_have() -> None:
     (figure,) = (figure for figure in FIGURES if figure.number == 68)
     plant, full = line_trace("plant", "mpc_slow"), line_trace("full", "mpc_slow", full=True)
     alone = draw(figure, [full])

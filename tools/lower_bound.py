@@ -1,7 +1,7 @@
 """The least errors that any controller can reach on the thesis' trajectories: optimal control of its own model.
 
     pip install 'swarmctl[bounds]'
-    python tools/least_possible.py
+    python tools/lower_bound.py
 
 The `least` figures of `swarmctl reproduce` come from here. Rigid body as a point under thrust, tilt following its
 setpoint with the attitude loop's lag, no drag, the bounds of Table 10; from the origin at rest, and with the
