@@ -13,6 +13,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
+import swarmctl
 from swarmctl.bus.topics import ObstacleMessage
 from swarmctl.errors import ConfigError, MissionError, StartError
 from swarmctl.ops import cli, operator
@@ -42,7 +43,7 @@ def nobody(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 def test_help_is_quick_and_imports_nothing_heavy() -> None:
     code = (
         "import sys; sys.argv = ['swarmctl', '--help']\n"
-        "import atexit; from swarmctl import cli\n"
+        "import atexit; from swarmctl.ops import cli\n"
         f"atexit.register(lambda: print('heavy:', [m for m in {HEAVY!r} if m in sys.modules]))\ncli.main()"
     )
     times_s = []  # of the processor: what a loaded machine adds by waiting is not ours
@@ -75,6 +76,33 @@ def test_every_verb_is_there_and_explains_itself(run: Run, capsys: pytest.Captur
         assert f"{verb} " in capsys.readouterr().out
     for verb in ("add", "remove", "list"):
         assert run("obstacle", verb, "--help") == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "unit"),
+    [
+        (("launch",), "Duration of the mission [s]"),
+        (("check",), "Time to listen to each vehicle [s]"),
+        (("fault",), "[deg from north]"),
+        (("obstacle", "add"), "Velocity, shared NED [m/s]"),
+    ],
+)
+def test_help_keeps_units_in_brackets(
+    run: Run, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], unit: str
+) -> None:
+    monkeypatch.setenv("COLUMNS", "160")
+    assert run(*arguments, "--help") == 0
+    assert unit in " ".join(capsys.readouterr().out.split())
+
+
+def test_rtl_help_says_that_the_agent_flies_home(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("rtl", "--help") == 0
+    assert "own MPC, then land" in " ".join(capsys.readouterr().out.split())
+
+
+def test_version_is_printed(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("--version") == 0
+    assert capsys.readouterr().out == f"swarmctl {swarmctl.__version__}\n"
 
 
 @pytest.mark.parametrize(
@@ -142,8 +170,8 @@ def test_options_override_sets_and_simulate_passes_everything_on(run: Run, monke
 
 def test_a_reader_that_goes_away_does_not_change_the_exit_code() -> None:
     code = (
-        "import sys; from swarmctl import cli, table\n"
-        "cli._run_app = lambda: table.PlainLines(sys.stdout).say('landed') or 4\ncli.main()"
+        "import sys; from swarmctl.ops import cli, status_table\n"
+        "cli._run_app = lambda: status_table.PlainLines(sys.stdout).say('landed') or 4\ncli.main()"
     )
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
     assert process.stdout is not None
