@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sitl.studies.bench.bench import PARTS, SOLVERS
+from sitl.studies.bench.bench import PARTS
+from swarmctl.control.mpc.qp import SOLVERS
 from swarmctl.core.records import TRUTH_DTYPE
 from swarmctl.core.types import Landed
 

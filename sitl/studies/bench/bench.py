@@ -41,12 +41,12 @@ from sitl.studies.campaign.scenarios import layout_of
 from sitl.studies.campaign.trials import Cell
 from swarmctl.agent.telemetry_publisher import Took
 from swarmctl.config import Config
+from swarmctl.control.mpc.qp import SOLVERS, installed_solvers
 from swarmctl.core.types import Array, Phase
 from swarmctl.errors import EXIT_OK, ConfigError, MissionError, exit_code_of
 from swarmctl.files import replace_text
 
 PARTS = ("sense", "setup", "promise", "spaces", "solve", "certify", "barrier", "send", "tick")
-SOLVERS = ("osqp", "daqp")
 NEIGHBOURS = (0, 1, 2, 4, 8, 16, 30)
 MAX_NEIGHBOURS = 99
 _BESIDE_PILLAR = 2  # neighbours of the scenario with an obstacle
@@ -200,6 +200,16 @@ def busy_note(load: float, processors: int) -> str:
     return f"load {load:.1f} on {processors} processors before the start: p99 of ticks includes other processes' work"
 
 
+def chosen_solvers(asked: Sequence[str]) -> tuple[list[str], str]:
+    """Return the solvers to measure, and what to say of those that are left out because they are not installed."""
+    if asked:
+        return list(dict.fromkeys(asked)), ""
+    installed = installed_solvers()
+    missing = [name for name in SOLVERS if name not in installed]
+    notes = [f"{name} is left out: it is not installed; pip install 'swarmctl[{name}]'" for name in missing]
+    return list(installed), "; ".join(notes)
+
+
 def show(rows: Sequence[BenchRow], console: Console) -> None:
     """The rows as two tables and the ratios."""
     neighbours = Column("neighbours", min_width=10)
@@ -256,7 +266,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="swarmctl bench", description=__doc__.splitlines()[0])
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path(), help="where bench.json goes")
     parser.add_argument("--neighbours", metavar="K,K", type=_counts, default=list(NEIGHBOURS))
-    parser.add_argument("--solver", action="append", choices=SOLVERS, help="may be given twice; default: both")
+    parser.add_argument("--solver", action="append", choices=SOLVERS, help="repeatable; default: all installed")
     parser.add_argument("--ticks", metavar="N", type=_ticks, default=300, help="measured for each solver and scenario")
     parser.add_argument("--slsqp", action=argparse.BooleanOptionalAction, default=True, help="the nonlinear baseline")
     return parser
@@ -270,7 +280,9 @@ def main(arguments: list[str] | None = None) -> int:
 def _run(options: argparse.Namespace) -> int:
     console = Console()
     note = busy_note(os.getloadavg()[0], os.cpu_count() or 1)
-    solvers = list(dict.fromkeys(options.solver or SOLVERS))
+    solvers, left_out = chosen_solvers(options.solver or ())
+    if left_out:
+        console.print(left_out, markup=False)
     rows = bench(options.neighbours, solvers, options.ticks, options.slsqp, console)
     show(rows, console)
     if note:

@@ -32,7 +32,7 @@ from swarmctl.control.controller import Controller
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, HalfSpaces
 from swarmctl.control.mpc.problem import Problem
-from swarmctl.control.mpc.qp import QpParams
+from swarmctl.control.mpc.qp import QpParams, installed_solvers
 from swarmctl.control.mpc.swarm_mpc import MpcParams, SwarmMpc
 from swarmctl.core.types import Array, Plan
 
@@ -218,14 +218,15 @@ class XyTimes:
 
 def measure_xy(
     captured: Captured,
-    solvers: Sequence[str] = ("osqp", "daqp"),
+    solvers: Sequence[str] | None = None,
     slsqp: bool = True,
     on_problem: Callable[[], None] = lambda: None,
 ) -> XyTimes:
     """Solve every captured problem with every solver in turn, so that a busy machine slows all of them down alike.
 
-    The first 20 are solved and not counted.
+    The first 20 are solved and not counted. `solvers` None: all that are installed.
     """
+    solvers = installed_solvers() if solvers is None else solvers
     mpcs = {name: tapped(captured.config, name) for name in solvers}
     qp_ms: dict[str, list[float]] = {name: [] for name in solvers}
     baselines = (_Running(False), _Running(True)) if slsqp else ()
