@@ -12,8 +12,8 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 
-from sitl.arducopter.ground import Ground
 from sitl.arducopter.guided import LEVEL, SOME_RATES, Guided, Setpoints, Target
+from sitl.arducopter.land_detector import LandDetector
 from sitl.arducopter.modes import (
     BASE_ALWAYS,
     BASE_ARMED,
@@ -31,7 +31,7 @@ from sitl.arducopter.modes import (
 )
 from sitl.arducopter.navigator import CopterNavigator
 from sitl.arducopter.parameters import CopterParameters
-from sitl.arducopter.return_home import Stage, WayHome
+from sitl.arducopter.return_home import ReturnHome, ReturnStage
 from sitl.plant.sensors import Estimate, LocalOrigin
 from sitl.plant.vehicle import Array
 from sitl.px4.boot import Boot
@@ -100,9 +100,9 @@ class ArduCopter:
         self.home_set = 0
         self.output = IDLE
         self.target_q_nb, self.throttle_in_01 = LEVEL, 0.0
-        self._ground = Ground(self.parameters, self._navigator.hover_01, self._airborne)
+        self._land_detector = LandDetector(self.parameters, self._navigator.hover_01, self._airborne)
         self._setpoints = Setpoints(self.parameters)
-        self._way_home = WayHome(self.parameters, self._navigator)
+        self._return_home = ReturnHome(self.parameters, self._navigator)
         self._takeoff_z_m = 0.0
         self._takeoff_reached = False
         self._estimate: Estimate | None = None
@@ -130,7 +130,7 @@ class ArduCopter:
 
     @property
     def landed(self) -> Landed:
-        if self._ground.landed:
+        if self._land_detector.landed:
             return Landed.ON_GROUND
         if self.armed and self._lands():
             return Landed.LANDING
@@ -149,7 +149,7 @@ class ArduCopter:
             return CopterState.BOOT
         if self.failsafe:
             return CopterState.CRITICAL
-        return CopterState.STANDBY if self._ground.landed else CopterState.ACTIVE
+        return CopterState.STANDBY if self._land_detector.landed else CopterState.ACTIVE
 
     def flight_mode(self) -> FlightMode:
         return FLIGHT_MODES.get(self.mode, FlightMode.MANUAL)
@@ -177,7 +177,7 @@ class ArduCopter:
         if not self.armed:
             return True
         self.released = True
-        if not self._ground.landed:  # acts at once: the real one's loop runs at 400 Hz
+        if not self._land_detector.landed:  # acts at once: the real one's loop runs at 400 Hz
             target = self._setpoints.target
             self._put_out(target.q_nb, self.throttle_in_01 if target.thrust_01 is None else target.thrust_01)
         return True
@@ -202,7 +202,7 @@ class ArduCopter:
         if reasons or self._estimate is None:
             return Result.FAILED
         self.armed = True
-        self._ground.armed_at(now_us)
+        self._land_detector.armed_at(now_us)
         self._set_home(self._estimate)
         self.say(Severity.INFO, "Arming motors")
         self._engage()
@@ -212,7 +212,7 @@ class ArduCopter:
         """MAV_CMD_COMPONENT_ARM_DISARM p1=0; in the air only with `force`."""
         if not self.armed:
             return Result.ACCEPTED
-        if not self._ground.landed and self.released and not force:
+        if not self._land_detector.landed and self.released and not force:
             return Result.FAILED
         self._disarm()
         return Result.ACCEPTED
@@ -242,7 +242,7 @@ class ArduCopter:
         estimate, home = self._estimate, self.home_ned_m
         if (
             not self.armed
-            or not self._ground.landed
+            or not self._land_detector.landed
             or self.mode != CopterMode.GUIDED
             or estimate is None
             or home is None
@@ -266,14 +266,14 @@ class ArduCopter:
     def _enter(self, mode: CopterMode) -> None:
         self.mode = mode
         self.guided = Guided.STOP
-        self._ground.stay()
+        self._land_detector.stay()
         if self._estimate is not None and self.home_ned_m is not None:
-            self._way_home.begin(self._estimate, self.home_ned_m)
+            self._return_home.begin(self._estimate, self.home_ned_m)
         self._engage()
 
     def _enter_guided(self, what: Guided) -> None:
         self.guided = what
-        self._ground.stay()
+        self._land_detector.stay()
         self._engage()
 
     def _engage(self) -> None:
@@ -293,15 +293,15 @@ class ArduCopter:
         estimate = self.clock.local(estimate)
         self._estimate, self._now_us = estimate, now_us
         self._boot_on(estimate, now_us)
-        self._ground.watch(estimate, self.throttle_in_01, self.armed, now_us)
+        self._land_detector.watch(estimate, self.throttle_in_01, self.armed, now_us)
         self._watch_gcs(now_us)
         if not self.armed:
             return
-        if self._ground.disarms(self.mode in ENDS_ON_GROUND, now_us):
+        if self._land_detector.disarms(self.mode in ENDS_ON_GROUND, now_us):
             self._disarm()
             return
-        if self._ground.landed and not self._lifts_off(now_us):
-            self.throttle_in_01 = self._ground.takeoff_throttle_01(now_us) if self._takes_off() else 0.0
+        if self._land_detector.landed and not self._lifts_off(now_us):
+            self.throttle_in_01 = self._land_detector.takeoff_throttle_01(now_us) if self._takes_off() else 0.0
             self.output = Command(IDLE.q_nb, self.throttle_in_01) if self.throttle_in_01 else IDLE
             return
         self._put_out(*self._fliers[self.mode](estimate, dt_s))
@@ -321,7 +321,7 @@ class ArduCopter:
 
     def _watch_gcs(self, now_us: int) -> None:
         action = self.parameters.integer("FS_GCS_ENABLE")
-        if not action or not self.armed or self.failsafe or self._gcs_us is None or self._ground.landed:
+        if not action or not self.armed or self.failsafe or self._gcs_us is None or self._land_detector.landed:
             return
         if now_us - self._gcs_us > self.parameters.real("FS_GCS_TIMEOUT") * 1e6:
             self.failsafe = True
@@ -334,8 +334,8 @@ class ArduCopter:
             self.guided is Guided.TAKEOFF or (self.guided is Guided.ANGLE and self._target().rises)
         )
         if not asked:
-            self._ground.stay()
-        if not asked or not self._ground.lifts_off(now_us, slowly=self.guided is Guided.TAKEOFF):
+            self._land_detector.stay()
+        if not asked or not self._land_detector.lifts_off(now_us, slowly=self.guided is Guided.TAKEOFF):
             return False
         self._engage()
         return True
@@ -394,12 +394,14 @@ class ArduCopter:
         return self._setpoints.target
 
     def _return(self, estimate: Estimate, dt_s: float) -> tuple[Array, float]:
-        if self._way_home.stage is Stage.LAND:
+        if self._return_home.stage is ReturnStage.LAND:
             return self._land(estimate, dt_s)
-        return self._way_home.fly(estimate, self.home_ned_m or estimate.pos_ned_m, self._now_us, dt_s)
+        return self._return_home.fly(estimate, self.home_ned_m or estimate.pos_ned_m, self._now_us, dt_s)
 
     def _lands(self) -> bool:
-        return self.mode == CopterMode.LAND or (self.mode == CopterMode.RTL and self._way_home.stage is Stage.LAND)
+        return self.mode == CopterMode.LAND or (
+            self.mode == CopterMode.RTL and self._return_home.stage is ReturnStage.LAND
+        )
 
     def _takes_off(self) -> bool:
         return self.mode == CopterMode.GUIDED and self.guided is Guided.TAKEOFF and not self._takeoff_reached

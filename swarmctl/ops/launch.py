@@ -37,7 +37,7 @@ from swarmctl.ops.processes import (
 )
 from swarmctl.ops.status_table import Display, open_display
 from swarmctl.ops.summary import sum_up
-from swarmctl.ops.supervisor import EventLog, Flight, Services
+from swarmctl.ops.supervisor import EventLog, FlightSupervisor, Services
 
 _BUS_S = 20.0  # for the router to answer
 _BUS_TRY_MS = 500
@@ -59,7 +59,7 @@ class Interrupts:
 
     A terminal that is closed sends SIGHUP more than once, the kernel to its foreground and the shell to its jobs: that
     is nobody who asks again, and no reason to kill what is landing. Under `nohup` it is not heard at all, and never
-    after the flight: it would cost the verdict.
+    after the flight: it would cost the result.
     """
 
     _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -100,14 +100,14 @@ def launch(config: Config, options: LaunchOptions) -> int:
         grace_s = _LAND_S  # should anything go wrong from here on, agents still get to land
         try:
             services.start()
-            verdict = Flight(config, services, display).fly(lambda: interrupts.count)
+            result = FlightSupervisor(config, services, display).fly(lambda: interrupts.count)
             grace_s = 0.0  # who was waited for has ended
         finally:
             services.stop(grace_s)
             display.close()
     # from here on Ctrl-C acts as usual: nothing is left to land
-    violated = sum_up(config, directory, verdict, display.say)
-    return verdict.exit_code(violated)
+    violated = sum_up(config, directory, result, display.say)
+    return result.exit_code(violated)
 
 
 def _run_folder(config: Config, options: LaunchOptions) -> Path:

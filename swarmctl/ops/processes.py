@@ -135,7 +135,7 @@ def viewer_command(config: Config, context: RunContext, port: int, view: bool) -
     """The process that owns rerun."""
     argv = _python("-m", "swarmctl.telemetry.viewer", "--run", context.run, "--bus", context.endpoint)
     argv += ("--agents", f"{config.swarm.agents}", "--run-dir", f"{context.directory}", "--port", f"{port}")
-    center, extent_m = _stage(config)
+    center, extent_m = _scene_bounds(config)
     argv += ("--look-at", *(f"{c:.3f}" for c in center), "--extent", f"{extent_m:.3f}")
     argv += ("--rate-hz", f"{config.telemetry.rate_hz!r}", "--separation", f"{config.separation.radius_m!r}")
     argv += ("--limit", f"{config.limits.min_separation_m!r}")
@@ -144,7 +144,7 @@ def viewer_command(config: Config, context: RunContext, port: int, view: bool) -
     return Command(VIEWER, argv + (("--view",) if view else ()))
 
 
-def _stage(config: Config) -> tuple[tuple[float, ...], float]:
+def _scene_bounds(config: Config) -> tuple[tuple[float, ...], float]:
     """Middle (3,) and half size [m] of the box that holds every start and the whole reference, for the camera."""
     starts = np.array(config.starts_ned_m())
     times_s = np.linspace(0.0, config.mission.duration_s, 200)

@@ -10,34 +10,34 @@ from typing import TYPE_CHECKING, Any
 from swarmctl.config import Config, load
 from swarmctl.core.text import printable
 from swarmctl.errors import ConfigError
-from swarmctl.ops.supervisor import Verdict
+from swarmctl.ops.supervisor import LaunchResult
 
 if TYPE_CHECKING:
     from swarmctl.telemetry.referee import Rules
 
 
-def sum_up(config: Config, directory: Path, verdict: Verdict, say: Callable[[str], None]) -> bool:
+def sum_up(config: Config, directory: Path, result: LaunchResult, say: Callable[[str], None]) -> bool:
     """Finish the run folder and say how it went; returns whether the referee found a limit broken.
 
-    A folder that can't be read or written is a problem of the run, never a reason to lose the verdict.
+    A folder that can't be read or written is a problem of the run, never a reason to lose the result.
     """
     from swarmctl.telemetry.recordings import optimize_recording  # heavy
     from swarmctl.telemetry.run_folder import Outcome, finish_run
 
     try:
-        rules = _rules(config, verdict)
-        summary, unwritten = finish_run(directory, rules, Outcome(verdict.outcome, tuple(verdict.problems)))
+        rules = _rules(config, result)
+        summary, unwritten = finish_run(directory, rules, Outcome(result.outcome, tuple(result.problems)))
     except Exception as error:
-        known = {"outcome": verdict.outcome, "violations": list(verdict.problems)}
+        known = {"outcome": result.outcome, "violations": list(result.problems)}
         for line in (*violation_lines(known), *summary_lines(known, directory)):
             say(line)
-        verdict.problems.append(f"summary: {error}")
+        result.problems.append(f"summary: {error}")
         say(f"the run can't be judged: {error!r}. What was recorded is in {directory}")
         return False
     for line in (*violation_lines(summary), *summary_lines(summary, directory)):
         say(line)
     if unwritten:
-        verdict.problems.append(f"run folder: {'; '.join(unwritten)}")
+        result.problems.append(f"run folder: {'; '.join(unwritten)}")
         say(unwritten_line(directory, unwritten))
     optimize_recording(directory)
     return bool(summary.get("violations"))
@@ -66,16 +66,16 @@ def rewrite_report(directory: Path) -> Path:
     return report_run(directory, load(directory / CONFIG).rules())
 
 
-def _rules(config: Config, verdict: Verdict) -> Rules:
+def _rules(config: Config, result: LaunchResult) -> Rules:
     """What the configuration asks for; obstacles as an operator left them."""
     from swarmctl.telemetry.referee import ObstacleRule
 
     rules = config.rules()
-    if verdict.obstacles is None:
+    if result.obstacles is None:
         return rules
     changed = tuple(
         ObstacleRule(item.center_ned_m, item.keep_out_m, item.vel_ned_m_s, since_us, item.column)
-        for item, since_us in verdict.obstacles.items()
+        for item, since_us in result.obstacles.items()
     )
     return replace(rules, obstacles=changed)
 

@@ -1,4 +1,4 @@
-"""One flight as its supervisor sees it: listen to agents, watch processes, order the landing, and keep the verdict.
+"""One flight as its supervisor sees it: listen to agents, watch processes, order the landing, and keep the result.
 
 It never flies: it speaks to agents as an operator on the bus. A process that dies is reported and the others go on,
 except when what died carries the flight (router, simulator): then everybody lands.
@@ -78,7 +78,7 @@ class Services:
 
 
 @dataclass(slots=True)
-class Verdict:
+class LaunchResult:
     """How it went, collected on the way."""
 
     problems: list[str] = field(default_factory=list)
@@ -111,7 +111,7 @@ def why_it_failed(outcome: str, last_line: str) -> str:
     return (outcome if outcome != "completed" else "") or last_line or "no reason given"
 
 
-class Flight:
+class FlightSupervisor:
     """Watches one launch until every agent has ended, or has been given up."""
 
     def __init__(self, config: Config, services: Services, display: Display) -> None:
@@ -121,7 +121,7 @@ class Flight:
         self._services = services
         self._bus: Bus = services.bus
         self._display = display
-        self._verdict = Verdict()
+        self._result = LaunchResult()
         self._views = [AgentView(agent) for agent in range(config.swarm.agents)]
         self._configured = first_obstacles(o.model_dump() for o in config.obstacles)
         self._obstacles = self._configured
@@ -135,7 +135,7 @@ class Flight:
         self._land_said_s = 0.0
         self._land_until_s = 0.0
 
-    def fly(self, interrupts: Callable[[], int]) -> Verdict:
+    def fly(self, interrupts: Callable[[], int]) -> LaunchResult:
         """Watch to the end.
 
         Args:
@@ -147,29 +147,29 @@ class Flight:
             self._watch_viewer()
             self._watch_agents()
             self._watch_time()
-            if interrupts() and not self._verdict.interrupted:
-                self._verdict.interrupted = True
+            if interrupts() and not self._result.interrupted:
+                self._result.interrupted = True
                 self._say("interrupted", "interrupted: landing; once more ends everything at once")
                 self._land(_LAND_S)
             self._speak()
             self._display.show(self._views)
             if self._is_over():
-                return self._name_the_left()
+                return self._report_left_vehicles()
             time.sleep(_STEP_S)
-        self._verdict.interrupted = True
+        self._result.interrupted = True
         self._fail("killed", "interrupted twice: every process was killed, vehicles were left to their autopilots")
         running = self._running()
         kill_all(list(self._services.children.values()))
         if not self._config.sitl.enabled:
             self._recovery.give_up(running)
-        return self._name_the_left()
+        return self._report_left_vehicles()
 
-    def _name_the_left(self) -> Verdict:
+    def _report_left_vehicles(self) -> LaunchResult:
         """Say of every vehicle that is not known to be down that it is not."""
-        self._verdict.left = () if self._vehicles_lost else tuple(self._recovery.left(self._views))
-        for words in self._verdict.left:
+        self._result.left = () if self._vehicles_lost else tuple(self._recovery.left(self._views))
+        for words in self._result.left:
             self._fail("vehicle_left", words)
-        return self._verdict
+        return self._result
 
     def _hear(self) -> None:
         for sender, payload in self._bus.receive(STATUS):
@@ -180,7 +180,7 @@ class Flight:
             if view.status is None or view.status.phase != status.phase:
                 self._services.log.write("phase", agent=status.agent, phase=name_of(Phase, status.phase))
             view.status, view.heard_s = status, time.monotonic()
-            self._verdict.has_armed |= Phase.ARM <= status.phase < Phase.DONE
+            self._result.has_armed |= Phase.ARM <= status.phase < Phase.DONE
         for _, payload in self._bus.receive(OBSTACLES):
             message = decode_obstacles(payload)
             if message is not None and message.replaces(self._obstacles.version):
@@ -190,18 +190,18 @@ class Flight:
         """An operator has changed the list: repeat the new one, and judge what is new in it from now on."""
         self._obstacles, self._obstacles_said_s = message, 0.0
         now_us = time.time_ns() // 1000
-        known = self._verdict.obstacles or dict.fromkeys(self._configured.obstacles)
-        self._verdict.obstacles = {item: known.get(item, now_us) for item in message.obstacles}
+        known = self._result.obstacles or dict.fromkeys(self._configured.obstacles)
+        self._result.obstacles = {item: known.get(item, now_us) for item in message.obstacles}
         self._say("obstacles", f"{len(message.obstacles)} obstacles, set by an operator", version=message.version)
 
     def _watch_essential_processes(self) -> None:
         """Router and simulator: without them there is nothing to go on with."""
         for name, land_s in ((ROUTER, _LAND_S), (SITL, _AFTER_DEATH_S)):
             child = self._services.children.get(name)
-            if child is not None and child.poll() is not None and self._once(name):
+            if child is not None and child.poll() is not None and self._is_first(name):
                 self._essential_lost = True
                 self._vehicles_lost |= name == SITL
-                self._verdict.could_not_start |= not any(view.status for view in self._views)
+                self._result.could_not_start |= not any(view.status for view in self._views)
                 self._fail(f"{name}_ended", f"{name} {child.how_it_ended()}; landing. See {child.log}")
                 self._land(land_s)
 
@@ -210,17 +210,17 @@ class Flight:
         if child is None:
             return
         if child.poll() is not None:
-            if self._once(VIEWER):
+            if self._is_first(VIEWER):
                 self._say(
                     "viewer_ended", f"view and recording stopped: viewer {child.how_it_ended()}; the flight goes on"
                 )
         elif "view address" not in self._reported:
             line = child.line_with("viewer rerun+")
-            if line and self._once("view address"):
+            if line and self._is_first("view address"):
                 address = line.removeprefix("viewer ")
                 self._say("viewer_ready", f"view {address}", url=address)
                 self._services.announce(address)
-        elif child.is_stopped() and self._once("viewer stopped"):
+        elif child.is_stopped() and self._is_first("viewer stopped"):
             self._say("viewer_frozen", "viewer is frozen; the flight goes on")
 
     def _watch_agents(self) -> None:
@@ -230,7 +230,7 @@ class Flight:
             code = child.poll()
             if code is None:
                 self._judge_silence(view, child, now_s)
-            elif self._once(f"{child.name} {child.pid} ended"):
+            elif self._is_first(f"{child.name} {child.pid} ended"):
                 self._note_end(view, child, code)
                 self._recover(view, code)
 
@@ -250,19 +250,19 @@ class Flight:
     def _judge_silence(self, view: AgentView, child: Child, now_s: float) -> None:
         waited_s = now_s - self._started_s
         if view.status is None:
-            if waited_s > _HEARD_S and self._once(f"{child.name} unheard"):
+            if waited_s > _HEARD_S and self._is_first(f"{child.name} unheard"):
                 self._refuse(f"{child.name} is not on the bus after {_HEARD_S:.0f} s; see {child.log}")
         elif self._recovery.is_on(view.agent):
             if self._recovery.is_overdue(view.agent):
                 child.kill_all()
         elif now_s - view.heard_s > _SILENCE_S:
             view.note = "silent"
-            if self._once(f"{child.name} silent"):
+            if self._is_first(f"{child.name} silent"):
                 self._fail("agent_silent", f"{child.name} has been silent for {_SILENCE_S:.0f} s; the others fly on")
         elif view.note:
             view.note = ""
             self._say("agent_back", f"{child.name} is heard again")
-        elif view.status.phase == Phase.CONNECT and waited_s > _VEHICLE_S and self._once(f"{child.name} vehicle"):
+        elif view.status.phase == Phase.CONNECT and waited_s > _VEHICLE_S and self._is_first(f"{child.name} vehicle"):
             url = self._config.vehicles[view.agent].url if self._config.vehicles else "the built-in SITL"
             self._refuse(
                 f"{child.name} hears no vehicle at {url} after {_VEHICLE_S:.0f} s; check that it is on and sends"
@@ -270,7 +270,7 @@ class Flight:
 
     def _watch_time(self) -> None:
         limit_s = self._config.mission.duration_s + _BEYOND_MISSION_S
-        if time.monotonic() - self._started_s > limit_s and self._once("too long"):
+        if time.monotonic() - self._started_s > limit_s and self._is_first("too long"):
             self._fail("too_long", f"the flight did not end within {limit_s:.0f} s; landing")
             self._land(_LAND_S)
 
@@ -295,7 +295,7 @@ class Flight:
                 self._bus.publish(COMMAND, order)
         for view in deaf:
             child = self._services.children[agent_name(view.agent)]
-            if since_s > _LAND_OBEYED_S and self._once(f"{child.name} told by signal"):
+            if since_s > _LAND_OBEYED_S and self._is_first(f"{child.name} told by signal"):
                 child.signal(signal.SIGTERM)
 
     def _is_over(self) -> bool:
@@ -326,7 +326,7 @@ class Flight:
         if code == EXIT_OK or self._essential_lost or self._recovery.is_on(view.agent):
             return
         if code == EXIT_INTERRUPTED:
-            self._verdict.interrupted |= self._land_ordered_s is None  # an operator's `land`
+            self._result.interrupted |= self._land_ordered_s is None  # an operator's `land`
         elif code == EXIT_START:
             self._refuse(f"{child.name} could not start: {child.last_line()}")
         elif code == EXIT_MISSION:
@@ -352,19 +352,19 @@ class Flight:
                 self._services.children[agent_name(view.agent)].signal(signal.SIGTERM)
 
     def _refuse(self, problem: str) -> None:
-        self._verdict.could_not_start = True
+        self._result.could_not_start = True
         self._fail("start_failed", problem)
         self._land(_LAND_S)
 
     def _fail(self, event: str, problem: str) -> None:
-        self._verdict.problems.append(problem)
+        self._result.problems.append(problem)
         self._say(event, problem)
 
     def _say(self, event: str, text: str, **fields: Any) -> None:
         self._services.log.write(event, text=text, **fields)
         self._display.say(text)
 
-    def _once(self, what: str) -> bool:
+    def _is_first(self, what: str) -> bool:
         if what in self._reported:
             return False
         self._reported.add(what)

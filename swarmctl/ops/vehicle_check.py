@@ -57,8 +57,8 @@ def check(config: Config, options: CheckOptions) -> int:
     Raises:
         StartError: the built-in simulator does not come up, or the JSON file can't be written.
     """
-    with _interruptible(), _field(config, options) as field:
-        vehicles, changed = _ask(config, options, field)
+    with _interruptible(), _vehicle_links(config, options) as opened:
+        vehicles, changed = _scan(config, options, opened)
     lines = findings(vehicles, config) + [change.finding() for change in changed if not change.done]
     if options.to_fly:
         lines += standing(vehicles)
@@ -84,7 +84,7 @@ class _Link:
 
 
 @dataclass(frozen=True, slots=True)
-class _Field:
+class _VehicleLinks:
     """All vehicles."""
 
     links: Sequence[_Link]
@@ -96,20 +96,20 @@ class _Field:
         return self.simulator is not None and self.simulator.poll() is not None
 
 
-def _ask(config: Config, options: CheckOptions, field: _Field) -> tuple[list[VehicleFacts], list[Change]]:
-    links = field.links
+def _scan(config: Config, options: CheckOptions, opened: _VehicleLinks) -> tuple[list[VehicleFacts], list[Change]]:
+    links = opened.links
     sysids = config.sysids()
     names = partial(names_to_read, config=config)
-    patience_s = _PATIENCE_S if field.simulator is None else _SIMULATOR_PATIENCE_S
+    patience_s = _PATIENCE_S if opened.simulator is None else _SIMULATOR_PATIENCE_S
     scans = {
         agent: VehicleScan(link.listener, link.there, sysids[agent], names, options.seconds, patience_s)
         for agent, link in enumerate(links)
         if link.listener is not None
     }
-    longest_s = field.connect_s + options.seconds + patience_s + _LONGER_S
-    run_scans(list(scans.values()), field.connect_s, longest_s, field.ended)
-    if field.simulator is not None and field.ended():
-        raise StartError(f"built-in simulator {field.simulator.how_it_ended()}")
+    longest_s = opened.connect_s + options.seconds + patience_s + _LONGER_S
+    run_scans(list(scans.values()), opened.connect_s, longest_s, opened.ended)
+    if opened.simulator is not None and opened.ended():
+        raise StartError(f"built-in simulator {opened.simulator.how_it_ended()}")
     vehicles = _facts(config, links, scans)
     if not options.apply:
         return vehicles, []
@@ -117,7 +117,7 @@ def _ask(config: Config, options: CheckOptions, field: _Field) -> tuple[list[Veh
     for facts in vehicles:
         if wanted[facts.agent] and not unchangeable(facts):
             scans[facts.agent].set_parameters(wanted[facts.agent])
-    run_scans(list(scans.values()), 0.0, _APPLY_S, field.ended)
+    run_scans(list(scans.values()), 0.0, _APPLY_S, opened.ended)
     after = _facts(config, links, scans)
     return after, [
         _changed(before, now, name, value, scans[before.agent])
@@ -150,14 +150,14 @@ def _changed(before: VehicleFacts, now: VehicleFacts, name: str, wanted: Number,
 
 
 @contextlib.contextmanager
-def _field(config: Config, options: CheckOptions) -> Iterator[_Field]:
+def _vehicle_links(config: Config, options: CheckOptions) -> Iterator[_VehicleLinks]:
     if config.sitl.enabled:
-        with _simulator(config) as field:
-            yield field
+        with _simulator(config) as opened:
+            yield opened
         return
     links = [_open(vehicle.url) for vehicle in config.vehicles[: config.swarm.agents]]
     try:
-        yield _Field(links, options.connect_s)
+        yield _VehicleLinks(links, options.connect_s)
     finally:
         _close(links)
 
@@ -177,7 +177,7 @@ def _close(links: Sequence[_Link]) -> None:
 
 
 @contextlib.contextmanager
-def _simulator(config: Config) -> Iterator[_Field]:
+def _simulator(config: Config) -> Iterator[_VehicleLinks]:
     """The simulator a launch would start, on ports of its own."""
     sockets = claim_ports(config.swarm.agents)
     ports = [sock.getsockname()[1] for sock in sockets]
@@ -189,7 +189,7 @@ def _simulator(config: Config) -> Iterator[_Field]:
     context = RunContext(run_name(config.name), f"{SCHEME}{directory / 'bus.sock'}", directory)
     try:
         children.append(Child(sitl_command(config, context, ports), directory))
-        yield _Field(links, _SIMULATOR_S, children[0])
+        yield _VehicleLinks(links, _SIMULATOR_S, children[0])
     finally:
         end_all(children, _STOP_S)
         _close(links)

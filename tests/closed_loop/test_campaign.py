@@ -16,7 +16,7 @@ import pytest
 from scipy.stats import binomtest
 
 from sitl.studies.campaign.command import main
-from sitl.studies.campaign.flight import Flight, fly
+from sitl.studies.campaign.flight import TrialFlight, fly
 from sitl.studies.campaign.page import REPORT
 from sitl.studies.campaign.quick import QUICK
 from sitl.studies.campaign.scenarios import layout_of
@@ -89,7 +89,7 @@ def test_the_report_has_every_cell_with_its_exact_interval(quick: Path) -> None:
 def test_scenario_events_happen_in_flight() -> None:
     """Two agents; the bus falls apart for 2 s: paths age, both come through."""
     trial = Trial(Cell("partition", 2, 0.0, 0.0, "exact", 0.0, "default"), 1)
-    flight = Flight(trial, layout_of("partition", 1, 2))
+    flight = TrialFlight(trial, layout_of("partition", 1, 2))
     flight.run()
     assert flight.row(None)["outcome"] == "arrived"
     for log in flight.lockstep.logs:

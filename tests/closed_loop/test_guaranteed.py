@@ -7,7 +7,7 @@ from collections.abc import Set
 import pytest
 
 from sitl.lockstep import Lockstep
-from sitl.studies.campaign.flight import Flight
+from sitl.studies.campaign.flight import TrialFlight
 from sitl.studies.campaign.scenarios import layout_of
 from sitl.studies.campaign.trials import Cell, Trial
 from swarmctl.agent.coordination import Coordination
@@ -19,13 +19,13 @@ PROMISED_M = 0.8
 TOUCH_M = 0.48
 
 
-def flown(cell: Cell, seed: int = 1) -> Flight:
-    flight = Flight(Trial(cell, seed), layout_of(cell.scenario, seed, cell.agents))
+def flown(cell: Cell, seed: int = 1) -> TrialFlight:
+    flight = TrialFlight(Trial(cell, seed), layout_of(cell.scenario, seed, cell.agents))
     flight.run()
     return flight
 
 
-def events(flight: Flight, name: str) -> list[dict[str, object]]:
+def events(flight: TrialFlight, name: str) -> list[dict[str, object]]:
     return [event for log in flight.lockstep.logs for event in log.events if event["event"] == name]
 
 
@@ -60,7 +60,7 @@ def test_negative_control_agents_that_see_nobody_touch() -> None:
 
 def committed_in_the_dark(sees: type[Coordination] = Coordination) -> int:
     """How many promises are made from 1.6 s to 2 s after the bus has fallen apart."""
-    flight = Flight(Trial(Cell("swap", 4, 0.0, 0.0, "exact", 0.0, "guaranteed"), 1), layout_of("swap", 1, 4))
+    flight = TrialFlight(Trial(Cell("swap", 4, 0.0, 0.0, "exact", 0.0, "guaranteed"), 1), layout_of("swap", 1, 4))
     step, counts = flight.lockstep.step, []
     began_us: list[int] = []
 

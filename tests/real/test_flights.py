@@ -63,7 +63,7 @@ def test_three_px4_fly_twice_as_they_are_however_early_they_are_launched(field: 
     assert here.witness.min_separation_m() > BODIES_M
 
 
-def test_three_px4_fly_the_shipped_mission(field: Fielder) -> None:
+def test_three_px4_fly_the_built_in_mission(field: Fielder) -> None:
     here = field(PX4, 3)
     launched = flown(here, PX4_CONFIG)
     assert launched.summary()["violations"] == []
@@ -77,7 +77,7 @@ def booted(field: Fielder, count: int) -> Field:
     return here
 
 
-def test_a_lone_arducopter_hovers_as_shipped(field: Fielder) -> None:
+def test_a_lone_arducopter_hovers_in_its_built_in_mission(field: Fielder) -> None:
     here = booted(field, 1)
     launched = flown(here, ARDUPILOT_CONFIG)
     assert launched.summary()["tracking"]["agents"][0]["steady_rmse_m"] < 0.1

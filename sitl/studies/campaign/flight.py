@@ -35,7 +35,7 @@ def fly(trial: Trial) -> Row:
     began_s = time.process_time()
     cell = trial.cell
     layout = layout_of(cell.scenario, trial.seed, cell.agents)
-    flight = Flight(trial, layout)
+    flight = TrialFlight(trial, layout)
     flight.run()
     alone_s = _alone_s(trial, layout) if SCENARIOS[cell.scenario].alone else None
     return flight.row(alone_s) | {"cpu_s": time.process_time() - began_s, "code": code_id()}
@@ -72,7 +72,7 @@ def config_of(cell: Cell, seed: int, layout: Layout, agents: int, extra: Sequenc
     return config.model_copy(update={"separation": wider})
 
 
-class Flight:
+class TrialFlight:
     """A flight that watches itself."""
 
     def __init__(self, trial: Trial, layout: Layout) -> None:
@@ -228,7 +228,7 @@ def _alone_s(trial: Trial, layout: Layout) -> float | None:
         uncooperative=frozenset(),
         lost=frozenset(),
     )
-    flight = Flight(Trial(replace(trial.cell, agents=1, delay_ms=0.0, loss=0.0), trial.seed), lone)
+    flight = TrialFlight(Trial(replace(trial.cell, agents=1, delay_ms=0.0, loss=0.0), trial.seed), lone)
     flight.run()
     found: Any = flight.row(None)["flight_time_s"]
     return None if found is None else float(found)

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from sitl.studies.thesis import score
-from sitl.studies.thesis.figures import Flight
+from sitl.studies.thesis.figures import FlightName
 from sitl.studies.thesis.trace import Path, Row, Trace
 
 SAFE_RADIUS_M = 0.3
@@ -24,7 +24,7 @@ Flown = Mapping[str, Trace]  # by name of the job
 class Job:
     """One flight."""
 
-    flight: Flight
+    flight: FlightName
     name: str
     config: str  # of those that come with swarmctl
     path: Path = "plant"
@@ -68,8 +68,8 @@ def radius_name(kind: str, factor: float) -> str:
 
 
 def _single(speed: str) -> Iterator[Job]:
-    pid: Flight = "pid_slow" if speed == "slow" else "pid_fast"
-    mpc: Flight = "mpc_slow" if speed == "slow" else "mpc_fast"
+    pid: FlightName = "pid_slow" if speed == "slow" else "pid_fast"
+    mpc: FlightName = "mpc_slow" if speed == "slow" else "mpc_fast"
     yield Job(pid, f"{pid} published", f"thesis_4_{pid}")
     yield Job(pid, f"{pid} retuned", f"improved_4_{pid}")
     yield Job(mpc, f"{mpc} published", f"thesis_4_{mpc}")

@@ -18,12 +18,12 @@ from sitl.studies.thesis.trace import Array, Trace
 from swarmctl.telemetry.charts import Ball, Circle, Limit, Line, SpaceLine, Window, space_view, time_chart, top_view
 from swarmctl.telemetry.palette import LIMIT_RGB, SUM_RGB, agent_rgb, css
 
-Flight = Literal[
+FlightName = Literal[
     "open_loop", "pid_step", "pid_steps", "pid_slow", "pid_fast", "mpc_slow", "mpc_fast", "circle", "obstacle"
 ]
 Drawn = Literal["states", "x", "y", "z", "roll", "pitch", "yaw", "thrust", "torque_x", "torque_y", "torque_z", "space"]
 
-FLIGHTS: dict[Flight, str] = {
+FLIGHTS: dict[FlightName, str] = {
     "open_loop": "Open loop, zero input",
     "pid_step": "PID, one step",
     "pid_steps": "PID, consecutive steps",
@@ -34,7 +34,7 @@ FLIGHTS: dict[Flight, str] = {
     "circle": "Swarm on a climbing circle",
     "obstacle": "Swarm and a suddenly seen obstacle",
 }
-SWARMS: tuple[Flight, ...] = ("circle", "obstacle")
+SWARMS: tuple[FlightName, ...] = ("circle", "obstacle")
 
 _QUANTITIES: dict[Drawn, str] = {
     "x": "position x [m]",
@@ -63,7 +63,7 @@ class Figure:
 
     number: int
     caption: str
-    flight: Flight
+    flight: FlightName
     drawn: Drawn
 
     @property
@@ -96,7 +96,7 @@ class Extra:
     notes: Sequence[str] = ()
 
 
-def _run_of(first: int, flight: Flight, drawn: Sequence[Drawn], by: str) -> tuple[Figure, ...]:
+def _run_of(first: int, flight: FlightName, drawn: Sequence[Drawn], by: str) -> tuple[Figure, ...]:
     return tuple(Figure(first + k, f"{_QUANTITIES[what]}, {by}", flight, what) for k, what in enumerate(drawn))
 
 
@@ -173,7 +173,9 @@ def nearest_pair_m(trace: Trace) -> Array:
     return np.asarray(np.fmin.reduce(np.linalg.norm(pos[:, first] - pos[:, second], axis=2), axis=1))
 
 
-def separation_chart(flight: Flight, traces: Sequence[Trace], separation_m: Mapping[str, float], points: int) -> str:
+def separation_chart(
+    flight: FlightName, traces: Sequence[Trace], separation_m: Mapping[str, float], points: int
+) -> str:
     """Smallest distance of two agents over time, with the constraint radius of every trace."""
     colors = [css(agent_rgb(k)) for k in range(len(traces))]
     lines = [Line(t.t_s, nearest_pair_m(t), c, t.name) for t, c in zip(traces, colors, strict=True)]
@@ -183,7 +185,7 @@ def separation_chart(flight: Flight, traces: Sequence[Trace], separation_m: Mapp
     return time_chart(title, lines, _seconds(traces), limits=limits, points=points, from_zero=True, height=300)
 
 
-def error_chart(flight: Flight, traces: Sequence[Trace], separation_m: Mapping[str, float], points: int) -> str:
+def error_chart(flight: FlightName, traces: Sequence[Trace], separation_m: Mapping[str, float], points: int) -> str:
     """Distance to the reference over time, summed over agents; its mean is the published index."""
     lines = []
     for k, trace in enumerate(traces):

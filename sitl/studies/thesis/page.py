@@ -15,7 +15,7 @@ from sitl.studies.thesis.figures import (
     FLIGHTS,
     SWARMS,
     Extra,
-    Flight,
+    FlightName,
     above_chart,
     draw,
     error_chart,
@@ -76,7 +76,7 @@ def write_page(
     if unknown:
         raise ValueError(f"traces: unknown flights {unknown}; known are {list(FLIGHTS)}")
     extra = extra or Extra()
-    flown: dict[Flight, Sequence[Trace]] = {key: traces[key] for key in FLIGHTS if traces.get(key)}
+    flown: dict[FlightName, Sequence[Trace]] = {key: traces[key] for key in FLIGHTS if traces.get(key)}
     sections = "".join(_sections(flown, extra))
     links = "".join(f'<a href="#{key}">{FLIGHTS[key]}</a>' for key in flown)
     body = "".join(
@@ -123,10 +123,10 @@ def ratio(row: Row) -> float | None:
     return _finite(row.ours / row.published)
 
 
-def flight_of(name: str) -> Flight | None:
+def flight_of(name: str) -> FlightName | None:
     """The flight a row's name speaks of: all words of its key occur, in any order; the longest key wins."""
     words = set(re.split(r"[^a-z0-9]+", name.lower()))
-    spoken: list[Flight] = [key for key in FLIGHTS if words.issuperset(key.split("_"))]
+    spoken: list[FlightName] = [key for key in FLIGHTS if words.issuperset(key.split("_"))]
     return max(spoken, key=len, default=None)
 
 
@@ -153,7 +153,7 @@ def _json_row(row: Row) -> dict[str, Any]:
     }
 
 
-def _tiles(rows: Sequence[Row], flown: Mapping[Flight, Sequence[Trace]]) -> str:
+def _tiles(rows: Sequence[Row], flown: Mapping[FlightName, Sequence[Trace]]) -> str:
     judged = [row for row in rows if row.met is not None]
     met = sum(bool(row.met) for row in judged)
     ratios = [value for value in map(ratio, rows) if value is not None]
@@ -216,7 +216,7 @@ def _count(value: int | None) -> str:
     return "-" if value is None else str(value)
 
 
-def _flights_table(flown: Mapping[Flight, Sequence[Trace]]) -> str:
+def _flights_table(flown: Mapping[FlightName, Sequence[Trace]]) -> str:
     rows = "".join(
         f"<tr><td>{FLIGHTS[key]}</td><td>{html.escape(trace.name)}</td><td>{trace.path}</td>"
         f"<td class=n>{trace.pos_ned_m.shape[1]}</td><td class=n>{trace.t_s[-1] if len(trace.t_s) else 0:.1f}</td>"
@@ -235,7 +235,7 @@ def _flights_table(flown: Mapping[Flight, Sequence[Trace]]) -> str:
     return f"<h2>Flights</h2><details class=card><summary>{count} flights drawn below</summary>{table}</details>"
 
 
-def _sections(flown: Mapping[Flight, Sequence[Trace]], extra: Extra) -> Iterator[str]:
+def _sections(flown: Mapping[FlightName, Sequence[Trace]], extra: Extra) -> Iterator[str]:
     lines = sum(len(flown.get(figure.flight, ())) + 1 for figure in FIGURES) + 12 * len(flown)
     points = max(60, min(_MOST_POINTS, _ALL_POINTS // lines))
     for key, traces in flown.items():
@@ -252,7 +252,7 @@ def _sections(flown: Mapping[Flight, Sequence[Trace]], extra: Extra) -> Iterator
         yield f'<div class="cards halves">{index_chart(extra.index)}</div>'
 
 
-def _further(key: Flight, traces: Sequence[Trace], extra: Extra, points: int) -> Iterator[str]:
+def _further(key: FlightName, traces: Sequence[Trace], extra: Extra, points: int) -> Iterator[str]:
     """Charts the thesis does not have."""
     if traces[0].obstacles:
         yield above_chart(traces[0], points)

@@ -12,7 +12,7 @@ TAKEOFF_SLEW_1_S = 0.5  # throttle of NAV_TAKEOFF once they have: TKOFF_SLEW_TIM
 LIFTS_AT = 0.95  # of hover
 
 
-class Ground:
+class LandDetector:
     """Landing detector of one vehicle.
 
     Args:
