@@ -1,4 +1,4 @@
-"""From a scan's messages to `VehicleFacts`: units, bits and frames. No judgement."""
+"""Converts the messages of a scan to `VehicleFacts`: units, bits and frames, without judgement."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _UNKNOWN_8, _UNKNOWN_16 = 255, 65535
 
 
 def unreached(agent: int, url: str, wanted_sysid: int, why: str) -> VehicleFacts:
-    """A link that could not even be opened."""
+    """Return the facts of a vehicle whose link could not be opened."""
     link = LinkFacts(0.0, {}, 0.0, 0.0, 0.0, 0, 0, (), 0, None, None)
     return VehicleFacts(agent, url, wanted_sysid, why, link)
 
@@ -36,13 +36,13 @@ def unreached(agent: int, url: str, wanted_sysid: int, why: str) -> VehicleFacts
 def facts_of(
     scan: VehicleScan, agent: int, url: str, wanted_sysid: int, shared: GeoOrigin, now_us: int
 ) -> VehicleFacts:
-    """Everything a scan has heard until `now_us`.
+    """Return everything that a scan has received until `now_us`.
 
     Args:
-        scan: of this vehicle.
-        agent, url, wanted_sysid: what the configuration says.
-        shared: origin of the swarm's frame.
-        now_us: monotonic.
+        scan: the scan of this vehicle.
+        agent, url, wanted_sysid: values of the configuration.
+        shared: origin of the shared frame.
+        now_us: monotonic time.
     """
     link = _link(scan, scan.listened_s(now_us))
     beat = scan.message("HEARTBEAT")
@@ -146,7 +146,7 @@ def _estimator(message: Any | None) -> Estimator | None:
 
 
 def _told(value: float) -> float | None:
-    """An accuracy; zero, negative or not finite is none."""
+    """Return an accuracy, or None when it is zero, negative or not finite."""
     return float(value) if math.isfinite(value) and value > 0 else None
 
 
@@ -158,7 +158,7 @@ def _gps(message: Any | None) -> Gps | None:
 
 
 def _place(scan: VehicleScan, shared: GeoOrigin) -> tuple[Ned | None, Ned | None, bool]:
-    """Position and local origin in the shared frame, and whether the vehicle told its origin itself."""
+    """Return position and local origin in the shared frame, and whether the vehicle reported its origin itself."""
     local = scan.message("LOCAL_POSITION_NED") or scan.message("ODOMETRY")
     world = scan.message("GLOBAL_POSITION_INT")
     zero = scan.message("GPS_GLOBAL_ORIGIN")

@@ -1,4 +1,4 @@
-"""What a check shows: one table, a block for each vehicle; what to fix, the worst first; and the same as JSON."""
+"""Output of a check: a table with a block per vehicle, a list of what to fix with the worst first, and JSON."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ from swarmctl.check.finding import SWARM, Finding, Verdict, worst_first
 from swarmctl.check.link_facts import VehicleFacts
 from swarmctl.core.text import printable
 
-_LINE = 2000  # characters of one thing to fix
+_LINE = 2000  # characters of one line of the list
 _COLUMNS = ("vehicle", "what", "found", "wanted", "verdict")
 _STYLES = {Verdict.OK: "green", Verdict.NOTE: "yellow", Verdict.FIX: "bold red"}
 
 
 def print_check(vehicles: Sequence[VehicleFacts], lines: Sequence[Finding], changes: Sequence[Change]) -> None:
-    """On standard output: a drawn table on a terminal, tab-separated lines anywhere else."""
+    """Print to standard output: a drawn table on a terminal, tab-separated lines elsewhere."""
     console = Console(highlight=False)
     if console.is_terminal:
         console.print(_drawn(lines))
@@ -38,7 +38,7 @@ def print_check(vehicles: Sequence[VehicleFacts], lines: Sequence[Finding], chan
 
 
 def as_json(vehicles: Sequence[VehicleFacts], lines: Sequence[Finding], changes: Sequence[Change], code: int) -> str:
-    """Everything a program may want, findings in the order of the table."""
+    """Return everything as JSON, findings in the order of the table."""
     tree = {
         "exit_code": code,
         "vehicles": [_json_safe(dataclasses.asdict(v)) for v in vehicles],
@@ -55,7 +55,7 @@ def _drawn(lines: Sequence[Finding]) -> Table:
         if before is not None and line.agent != before:
             table.add_section()
         first, *middle, verdict = _cells(line)
-        name = Text(first if line.agent != before else "")  # not markup: vehicles may say "[...]"
+        name = Text(first if line.agent != before else "")  # not markup: a vehicle's text may contain "[...]"
         table.add_row(name, *map(Text, middle), Text(verdict, style=_STYLES[line.verdict]))
         before = line.agent
     return table
@@ -73,7 +73,7 @@ def _who(agent: int) -> str:
 def _after_table(vehicles: Sequence[VehicleFacts], lines: Sequence[Finding], changes: Sequence[Change]) -> list[str]:
     texts = [f"{agent_name(change.agent)} {change.in_words()}" for change in changes]
     found = worst_first(lines)
-    alike: dict[tuple[Verdict, str], list[str]] = {}  # one text for all it is true of
+    alike: dict[tuple[Verdict, str], list[str]] = {}  # one text with the names of all vehicles it applies to
     for line in found:
         said = f"{line.topic}: {line.found}. {line.advice}"
         alike.setdefault((line.verdict, said), []).append(_who(line.agent))
@@ -86,7 +86,7 @@ def _after_table(vehicles: Sequence[VehicleFacts], lines: Sequence[Finding], cha
 
 
 def _json_safe(value: Any) -> Any:
-    """For JSON: enums by name, no infinities."""
+    """Return the value for JSON: enums by name, infinities as null."""
     if isinstance(value, enum.Enum):
         return value.name
     if isinstance(value, float) and not math.isfinite(value):

@@ -6,9 +6,9 @@ also jump, towards the truth or away from it: then the position has moved but th
 
 A position that no flight can explain is bridged: the difference is subtracted, so that the vehicle keeps its place and
 no agent flies across the difference. A newly reported origin explains the difference and ends the bridge. Otherwise the
-vehicle may be at either place, and `margin_m` is the extra distance to keep from it. A short bridge is drawn in
-slowly once positions have been steady. A long bridge stays until the estimate jumps back or the vehicle has landed: which place
-is right can't be known, and to continue as before endangers no vehicle that was safe.
+vehicle may be at either place, and `margin_m` is the extra distance to keep from it. A short bridge is drawn in slowly
+once positions have been steady. A long bridge stays until the estimate jumps back or the vehicle has landed: which
+place is right can't be known, and to continue as before endangers no vehicle that was safe.
 """
 
 from __future__ import annotations

@@ -30,9 +30,7 @@ _SAME_BOOT_US = 500_000  # agreement of two kinds of message
 _WITNESSES = 2  # frames of another kind
 _PATIENCE_US = 3_000_000  # a run this long needs no witness: the vehicle sends nothing else any more
 _BOUND_SLACK_US = 1_000
-_MOVED_US = (
-    5_000  # a line that misses the bound by more is older than a stop of the clock; less is corrected by the bound
-)
+_MOVED_US = 5_000  # a line farther below the bound is older than a stop of the clock; else the bound corrects it
 _UNKNOWN_RATE_US = 200_000  # the same while no rate is known
 _LOOP_US = 4_000  # time an autopilot's loop may take to answer, of what is left between the bounds
 _QUESTIONS = 32  # requests remembered
