@@ -66,7 +66,7 @@ def _run_app() -> int:
     except (typer.Abort, KeyboardInterrupt):
         return EXIT_INTERRUPTED
     except Exception as error:
-        show = getattr(error, "show", None)  # click's usage errors, whichever click typer brings
+        show = getattr(error, "show", None)  # usage errors of whichever click typer brings
         if show is None or not hasattr(error, "exit_code"):
             raise
         show()

@@ -1,7 +1,7 @@
-"""The launcher: refuse what can be refused, start the table of processes, fly, stop all of it, sum up.
+"""The launcher: runs the preflight, starts the processes, supervises the flight, stops all processes, and sums up.
 
-Who watches the flight is `swarmctl.ops.supervisor`; what may start at all is `swarmctl.ops.preflight`. Whatever
-happens, nothing that was started here outlives this module: no process, no socket, no port.
+`swarmctl.ops.supervisor` watches the flight, and `swarmctl.ops.preflight` decides whether it may start. In every case
+all processes, sockets and ports that were started here end with this module.
 """
 
 from __future__ import annotations
@@ -39,27 +39,27 @@ from swarmctl.ops.status_table import Display, open_display
 from swarmctl.ops.summary import sum_up
 from swarmctl.ops.supervisor import EventLog, FlightSupervisor, Services
 
-_BUS_S = 20.0  # for the router to answer
+_BUS_S = 20.0  # timeout for the router to answer
 _BUS_TRY_MS = 500
 _LAND_S = 30.0
-_STOP_S = 10.0  # viewer and simulator write their files out
+_STOP_S = 10.0  # time for viewer and simulator to write their files
 _ROUTER_STOP_S = 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class LaunchOptions:
-    """What is not part of the flight's configuration."""
+    """Options of a launch that are not part of the configuration."""
 
     run_dir: Path | None = None
-    view: bool = False  # open the viewer's window
+    view: bool = False  # open the viewer window
 
 
 class Interrupts:
-    """Counts SIGINT and SIGTERM instead of raising, and as the first of them SIGHUP.
+    """Counts SIGINT, SIGTERM and the first SIGHUP instead of raising.
 
-    A terminal that is closed sends SIGHUP more than once, the kernel to its foreground and the shell to its jobs: that
-    is nobody who asks again, and no reason to kill what is landing. Under `nohup` it is not heard at all, and never
-    after the flight: it would cost the result.
+    A closing terminal sends SIGHUP more than once, from the kernel and from the shell. That is no second request, and
+    must not kill vehicles that are landing. SIGHUP is ignored under `nohup`, and after the flight, where it would lose
+    the result.
     """
 
     _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -70,7 +70,7 @@ class Interrupts:
 
     def __enter__(self) -> Interrupts:
         ignored = (signal.SIGHUP,) if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN else ()
-        heard = [signum for signum in self._SIGNALS if signum not in ignored]  # a stop is heeded in the background too
+        heard = [signum for signum in self._SIGNALS if signum not in ignored]  # SIGINT is handled in the background too
         self._before = {signum: signal.signal(signum, self._note) for signum in heard}
         return self
 
@@ -83,7 +83,7 @@ class Interrupts:
 
 
 def launch(config: Config, options: LaunchOptions) -> int:
-    """Fly a configuration; returns the exit code.
+    """Fly a configuration and return the exit code.
 
     Raises:
         ConfigError, StartError: it was refused, or did not come up; nothing is left running.
@@ -97,15 +97,15 @@ def launch(config: Config, options: LaunchOptions) -> int:
             raise
         display = open_display()
         services = Launcher(config, options, reserved, directory, display)
-        grace_s = _LAND_S  # should anything go wrong from here on, agents still get to land
+        grace_s = _LAND_S  # after a failure from here on, agents still get time to land
         try:
             services.start()
             result = FlightSupervisor(config, services, display).fly(lambda: interrupts.count)
-            grace_s = 0.0  # who was waited for has ended
+            grace_s = 0.0  # every agent has ended
         finally:
             services.stop(grace_s)
             display.close()
-    # from here on Ctrl-C acts as usual: nothing is left to land
+    # From here on Ctrl-C acts as usual: nothing is left to land.
     violated = sum_up(config, directory, result, display.say)
     return result.exit_code(violated)
 
@@ -122,7 +122,7 @@ def _run_folder(config: Config, options: LaunchOptions) -> Path:
 
 
 class Launcher(Services):
-    """Everything that was started for one launch, and how to end it."""
+    """Starts the processes of one launch, and ends them."""
 
     def __init__(
         self, config: Config, options: LaunchOptions, reserved: ReservedPorts, directory: Path, display: Display
@@ -137,7 +137,7 @@ class Launcher(Services):
         self.children: dict[str, Child] = {}
 
     def start(self) -> None:
-        """Bring everything up as far as the bus; the rest shows itself in flight.
+        """Start every process and join the bus; later failures are seen by the supervisor.
 
         Raises:
             StartError: a program can't be run or the router does not answer.
@@ -158,7 +158,7 @@ class Launcher(Services):
         self.log.write("started", run=context.run, ports=list(reserved.ports))
 
     def stop(self, agents_grace_s: float) -> None:
-        """End every process, agents first, the router last, and leave nothing behind. Safe at any point."""
+        """End every process, agents first and the router last, and remove all temporary files. Safe at any point."""
         router = [child for name, child in self.children.items() if name == ROUTER]
         agents = [child for name, child in self.children.items() if name.startswith(agent_name(0)[:-1])]
         others = [child for child in self.children.values() if child not in router + agents]
@@ -173,7 +173,7 @@ class Launcher(Services):
         self.log.write("stopped", exit_codes={name: child.poll() for name, child in self.children.items()})
 
     def recover(self, agent: int) -> Child:
-        """Start an agent on the vehicle of one that ended; it records beside, and flies without a router if it must."""
+        """Start an agent on the vehicle of an ended one; it records separately, and flies without a router if it must."""
         router = self.children[ROUTER]
         endpoint = self.context.endpoint if router.poll() is None else NO_BUS
         directory = self.context.directory / "recovery"
@@ -184,7 +184,7 @@ class Launcher(Services):
         return Child(replace(command, argv=(*command.argv, "--only-land")), directory)
 
     def announce(self, view: str) -> None:
-        """Let operators' commands find this launch."""
+        """Publish this launch to the operator's commands."""
         context = self.context
         start_s, pid = process_start_s()
         announce(
@@ -214,7 +214,7 @@ class Launcher(Services):
 
 
 def _introduction(config: Config, context: RunContext, reserved: ReservedPorts) -> tuple[str, ...]:
-    """Three lines that say what runs."""
+    """Return three lines that say what runs."""
     agents = config.swarm.agents
     if config.sitl.enabled:
         vehicles = f"built-in SITL ({config.sitl.preset}) on {LOOPBACK}"

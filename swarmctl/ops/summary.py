@@ -1,4 +1,4 @@
-"""The end of a run: hand the folder to the referee and say the result in five lines."""
+"""End of a run: the referee judges the run folder, and the result is printed in five lines."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 
 def sum_up(config: Config, directory: Path, result: LaunchResult, say: Callable[[str], None]) -> bool:
-    """Finish the run folder and say how it went; returns whether the referee found a limit broken.
+    """Finish the run folder and print the result; return whether the referee found a violation.
 
-    A folder that can't be read or written is a problem of the run, never a reason to lose the result.
+    A folder that can't be read or written is a problem of the run, and never loses the result.
     """
     from swarmctl.telemetry.recordings import optimize_recording  # heavy
     from swarmctl.telemetry.run_folder import Outcome, finish_run
@@ -44,7 +44,7 @@ def sum_up(config: Config, directory: Path, result: LaunchResult, say: Callable[
 
 
 def unwritten_line(directory: Path, unwritten: Sequence[str]) -> str:
-    """What to say of files that the disk did not take."""
+    """Return the line that reports files the disk did not take."""
     return (
         f"not everything could be written to {directory}: {'; '.join(unwritten)}. "
         f"Make room, then: swarmctl report {directory}"
@@ -52,7 +52,7 @@ def unwritten_line(directory: Path, unwritten: Sequence[str]) -> str:
 
 
 def rewrite_report(directory: Path) -> Path:
-    """Write `report.html` of a run folder again; returns its path.
+    """Write `report.html` of a run folder again and return its path.
 
     Raises:
         ConfigError: it is no run folder.
@@ -67,7 +67,7 @@ def rewrite_report(directory: Path) -> Path:
 
 
 def _rules(config: Config, result: LaunchResult) -> Rules:
-    """What the configuration asks for; obstacles as an operator left them."""
+    """Return the limits of the configuration, with obstacles as an operator left them."""
     from swarmctl.telemetry.referee import ObstacleRule
 
     rules = config.rules()
@@ -81,7 +81,7 @@ def _rules(config: Config, result: LaunchResult) -> Rules:
 
 
 def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...]:
-    """Outcome, separation, timing, solver and bus, folder."""
+    """Return five lines: outcome, separation, timing, solver and bus, folder."""
     violations = summary.get("violations") or []
     separation, obstacles = _section(summary, "separation"), _section(summary, "obstacles")
     timing, solver, comms = (_section(summary, name) for name in ("timing", "solver", "comms"))
@@ -115,7 +115,7 @@ def _unheard(comms: Mapping[str, Any]) -> str:
 
 
 def violation_lines(summary: Mapping[str, Any]) -> tuple[str, ...]:
-    """One line for each violation, where the first line of the summary does not hold the only one."""
+    """Return one line per violation when there are several; the summary's first line holds a single one."""
     violations = summary.get("violations") or []
     return tuple(f"violation: {printable(violation)}" for violation in violations) if len(violations) > 1 else ()
 

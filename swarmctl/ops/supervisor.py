@@ -1,7 +1,7 @@
-"""One flight as its supervisor sees it: listen to agents, watch processes, order the landing, and keep the result.
+"""Supervision of one flight: reads agents' status, watches processes, orders the landing and collects the result.
 
-It never flies: it speaks to agents as an operator on the bus. A process that dies is reported and the others go on,
-except when what died carries the flight (router, simulator): then everybody lands.
+The supervisor never flies: it commands agents as an operator on the bus. When a process dies, that is reported and the
+others go on; only without an essential process (router, simulator) all agents land.
 """
 
 from __future__ import annotations
@@ -36,67 +36,67 @@ from swarmctl.ops.recovery import RECOVERY_S, Recovery
 from swarmctl.ops.status_table import AgentView, Display, name_of
 
 _STEP_S = 0.05
-_HEARD_S = 60.0  # for every agent to be on the bus
-_VEHICLE_S = 90.0  # for every agent to hear its vehicle
-_BEYOND_MISSION_S = 300.0  # take-off, waiting, landing: a flight longer than its mission and this is ended
+_HEARD_S = 60.0  # timeout for every agent to appear on the bus
+_VEHICLE_S = 90.0  # timeout for every agent to receive its vehicle
+_BEYOND_MISSION_S = 300.0  # for take-off, waiting and landing; a longer flight is ended
 _SILENCE_S = 5.0
 _LAND_S = 60.0
 _LAND_REPEAT_S = 0.5
 _LAND_OBEYED_S = 10.0
 _OBSTACLES_REPEAT_S = 1.0
-_AFTER_DEATH_S = 3.0  # a dead agent's vehicle needs its simulator to land
+_AFTER_DEATH_S = 3.0  # the simulator must outlive a dead agent until its vehicle has landed
 
 
 class EventLog:
-    """`launch.events.jsonl` of the run folder; a full disk loses events, never the flight."""
+    """Writes `launch.events.jsonl` of the run folder; a full disk loses events, never the flight."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
     def write(self, event: str, **fields: Any) -> None:
-        """Append one row, stamped with both clocks."""
+        """Append one row with both clocks."""
         now = {"utc_us": time.time_ns() // 1000, "t_us": time.monotonic_ns() // 1000, "source": "launch"}
         with contextlib.suppress(OSError), self._path.open("a", encoding="utf-8") as file:
             file.write(json.dumps({**now, "event": event, **fields}) + "\n")
 
 
 class Services:
-    """What a flight stands on; `swarmctl.ops.launch` brings it up and takes it down."""
+    """Services that a flight relies on; `swarmctl.ops.launch` starts and stops them."""
 
     context: RunContext
     log: EventLog
-    children: dict[str, Child]  # by name, agents as on the bus
+    children: dict[str, Child]  # by name; agents have their names on the bus
     bus: Bus | None = None
 
     def announce(self, view: str) -> None:
-        """Publish the address of the live view to operators' commands."""
+        """Publish the address of the live view to the operator's commands."""
         raise NotImplementedError
 
     def recover(self, agent: int) -> Child:
-        """Start an agent on the vehicle of one that ended; it only lands that vehicle."""
+        """Start an agent that only lands the vehicle of an ended one."""
         raise NotImplementedError
 
 
 @dataclass(slots=True)
 class LaunchResult:
-    """How it went, collected on the way."""
+    """The result of a launch, collected during the flight."""
 
     problems: list[str] = field(default_factory=list)
     could_not_start: bool = False
-    has_armed: bool = False  # somebody has asked a vehicle to arm
+    has_armed: bool = False  # an agent has requested arming
     left: tuple[str, ...] = ()  # vehicles that may still be armed or in the air, in words
     interrupted: bool = False
-    obstacles: dict[ObstacleMessage, int | None] | None = None  # since when [us UTC]; None: as configured
+    obstacles: dict[ObstacleMessage, int | None] | None = None  # obstacle -> since when [us UTC]; None: as configured
 
     @property
     def outcome(self) -> str:
-        """As in summary.json."""
+        """Outcome as in summary.json."""
         if self.interrupted:
             return "interrupted"
         return "failed" if self.problems else "completed"
 
     def exit_code(self, violated: bool) -> int:
-        """Of the whole launch; `violated`: the referee found a limit broken."""
+        """Return the exit code of the launch; `violated`: the referee found a violation."""
         if self.left:
             return EXIT_MISSION
         if self.interrupted:
@@ -107,12 +107,12 @@ class LaunchResult:
 
 
 def why_it_failed(outcome: str, last_line: str) -> str:
-    """Why an agent ended with a failure: what its mission came to, or what went wrong after a complete one."""
+    """Return why an agent failed: the outcome of its mission, or its last line after a complete one."""
     return (outcome if outcome != "completed" else "") or last_line or "no reason given"
 
 
 class FlightSupervisor:
-    """Watches one launch until every agent has ended, or has been given up."""
+    """Watches one launch until every agent has ended or has been given up."""
 
     def __init__(self, config: Config, services: Services, display: Display) -> None:
         if services.bus is None:
@@ -128,18 +128,18 @@ class FlightSupervisor:
         self._obstacles_said_s = 0.0
         self._started_s = time.monotonic()
         self._reported: set[str] = set()
-        self._essential_lost = False  # router or simulator is gone
-        self._vehicles_lost = False  # the simulator is gone, and its vehicles with it
+        self._essential_lost = False  # an essential process, router or simulator, has ended
+        self._vehicles_lost = False  # the simulator has ended, and its vehicles with it
         self._recovery = Recovery(services.recover, config.sysids())
         self._land_ordered_s: float | None = None
         self._land_said_s = 0.0
         self._land_until_s = 0.0
 
     def fly(self, interrupts: Callable[[], int]) -> LaunchResult:
-        """Watch to the end.
+        """Watch the flight to its end.
 
         Args:
-            interrupts: how often the operator has asked to stop; once lands everybody, twice kills everything.
+            interrupts: number of stop requests; the first lands all agents, the second kills all processes.
         """
         while interrupts() < 2:
             self._hear()
@@ -165,7 +165,7 @@ class FlightSupervisor:
         return self._report_left_vehicles()
 
     def _report_left_vehicles(self) -> LaunchResult:
-        """Say of every vehicle that is not known to be down that it is not."""
+        """Report every vehicle that is not known to be on the ground."""
         self._result.left = () if self._vehicles_lost else tuple(self._recovery.left(self._views))
         for words in self._result.left:
             self._fail("vehicle_left", words)
@@ -187,7 +187,7 @@ class FlightSupervisor:
                 self._adopt(message)
 
     def _adopt(self, message: ObstaclesMessage) -> None:
-        """An operator has changed the list: repeat the new one, and judge what is new in it from now on."""
+        """Adopt an operator's obstacle list: repeat it, and judge its new obstacles from now on."""
         self._obstacles, self._obstacles_said_s = message, 0.0
         now_us = time.time_ns() // 1000
         known = self._result.obstacles or dict.fromkeys(self._configured.obstacles)
@@ -195,7 +195,7 @@ class FlightSupervisor:
         self._say("obstacles", f"{len(message.obstacles)} obstacles, set by an operator", version=message.version)
 
     def _watch_essential_processes(self) -> None:
-        """Router and simulator: without them there is nothing to go on with."""
+        """Land all agents when the router or the simulator, without which the flight can't go on, has ended."""
         for name, land_s in ((ROUTER, _LAND_S), (SITL, _AFTER_DEATH_S)):
             child = self._services.children.get(name)
             if child is not None and child.poll() is not None and self._is_first(name):
@@ -235,7 +235,7 @@ class FlightSupervisor:
                 self._recover(view, code)
 
     def _recover(self, view: AgentView, code: int) -> None:
-        """Have a vehicle that is not known to be down landed by another process on its link."""
+        """Start another process that lands a vehicle which is not known to be down."""
         if self._recovery.is_on(view.agent) and code == EXIT_INTERRUPTED:
             self._say("recovered", f"the vehicle of {agent_name(view.agent)} is on the ground and disarmed")
         child = None if self._vehicles_lost else self._recovery.begin(view, code)
@@ -284,7 +284,7 @@ class FlightSupervisor:
             self._repeat_land_order(now_s, now_s - self._land_ordered_s)
 
     def _repeat_land_order(self, now_s: float, since_s: float) -> None:
-        """Over the bus until everybody shows that it lands, stamped anew each time, after a while also by signal."""
+        """Repeat the order on the bus, newly stamped, until every agent shows that it lands; later also by signal."""
         running = (view for view in self._running() if not self._recovery.is_on(view.agent))
         deaf = [view for view in running if view.status is None or view.status.phase < Phase.GOTO_LAND]
         if deaf:
@@ -299,7 +299,7 @@ class FlightSupervisor:
                 child.signal(signal.SIGTERM)
 
     def _is_over(self) -> bool:
-        """Whether nobody is left to wait for. Silent agents are given up when nobody else flies."""
+        """Return whether no agent is left to wait for. Silent agents are given up when no other one flies."""
         now_s = time.monotonic()
         running = self._running()
         if self._land_ordered_s is not None and now_s > self._land_until_s:
@@ -326,7 +326,7 @@ class FlightSupervisor:
         if code == EXIT_OK or self._essential_lost or self._recovery.is_on(view.agent):
             return
         if code == EXIT_INTERRUPTED:
-            self._result.interrupted |= self._land_ordered_s is None  # an operator's `land`
+            self._result.interrupted |= self._land_ordered_s is None  # ended by an operator's `land`
         elif code == EXIT_START:
             self._refuse(f"{child.name} could not start: {child.last_line()}")
         elif code == EXIT_MISSION:
@@ -339,7 +339,7 @@ class FlightSupervisor:
             self._fail("agent_died", f"{child.name} {child.how_it_ended()}; the others fly on")
 
     def _land(self, timeout_s: float) -> None:
-        """Ask all to land, over the bus; by signal where the bus can't reach."""
+        """Order all agents to land over the bus; by signal where the bus does not reach."""
         now_s = time.monotonic()
         if self._land_ordered_s is None:
             self._land_ordered_s, self._land_until_s = now_s, now_s + timeout_s

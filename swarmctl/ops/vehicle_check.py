@@ -1,7 +1,7 @@
-"""`swarmctl check`: ask every vehicle of a configuration at once, judge, print one table and what to fix.
+"""`swarmctl check`: scans all vehicles of a configuration at once, and prints one table and what to fix.
 
-Changes nothing unless told to apply, and then only wanted parameters of vehicles that are disarmed on the ground. The
-built-in simulator, where the configuration flies it, is started for the check and ended with it.
+Nothing is changed without `--apply`, and with it only wanted parameters of vehicles that are disarmed on the ground. A
+configured built-in simulator is started for the check and ended with it.
 """
 
 from __future__ import annotations
@@ -32,27 +32,27 @@ from swarmctl.ops.preflight import claim_ports
 from swarmctl.ops.processes import Child, RunContext, end_all, run_name, sitl_command
 
 _CONNECT_S = 5.0  # heartbeats come once a second
-_SIMULATOR_S = 20.0  # to come up, on a machine that is busy
-_PATIENCE_S = 3.0  # with a vehicle that is not ready yet
+_SIMULATOR_S = 20.0  # to start on a busy machine
+_PATIENCE_S = 3.0  # for a vehicle that is not ready yet
 _SIMULATOR_PATIENCE_S = 15.0
-_LONGER_S = 8.0  # than asked for: parameters over a slow link
+_LONGER_S = 8.0  # for parameters over a slow link
 _APPLY_S = 15.0
 _STOP_S = 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class CheckOptions:
-    """What is not part of the configuration."""
+    """Options of the check that are not part of the configuration."""
 
     apply: bool = False
-    seconds: float = 3.0  # to listen to every vehicle, after its first heartbeat
+    seconds: float = 3.0  # time to listen to every vehicle after its first heartbeat
     json: Path | None = None
     connect_s: float = _CONNECT_S
-    to_fly: bool = False  # who is armed already is not for us to fly
+    to_fly: bool = False  # a flight follows: armed vehicles are findings, because another party flies them
 
 
 def check(config: Config, options: CheckOptions) -> int:
-    """Check a configuration's vehicles; returns the exit code.
+    """Check the vehicles of a configuration and return the exit code.
 
     Raises:
         StartError: the built-in simulator does not come up, or the JSON file can't be written.
@@ -75,7 +75,7 @@ def check(config: Config, options: CheckOptions) -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Link:
-    """Where one vehicle is heard, or why it can't be."""
+    """The opened link of one vehicle, or why it can't be opened."""
 
     url: str
     listener: Listener | None
@@ -85,14 +85,14 @@ class _Link:
 
 @dataclass(frozen=True, slots=True)
 class _VehicleLinks:
-    """All vehicles."""
+    """The links of all vehicles."""
 
     links: Sequence[_Link]
     connect_s: float
     simulator: Child | None = None
 
     def ended(self) -> bool:
-        """Whether a simulator that was started here is gone."""
+        """Return whether a simulator that was started here has ended."""
         return self.simulator is not None and self.simulator.poll() is not None
 
 
@@ -142,11 +142,11 @@ def _changed(before: VehicleFacts, now: VehicleFacts, name: str, wanted: Number,
     if not refused and scan.parameters is not None and scan.parameters.interrupted:
         refused = "it was armed, or fell silent, meanwhile"
     was = before.number(name)
-    assert was is not None  # `changes` leaves out what is not known
+    assert was is not None  # `changes` leaves out unknown values
     return Change(before.agent, name, was, wanted, now.number(name), refused)
 
 
-# --- where the vehicles are ---
+# --- vehicle links ---
 
 
 @contextlib.contextmanager
@@ -178,7 +178,7 @@ def _close(links: Sequence[_Link]) -> None:
 
 @contextlib.contextmanager
 def _simulator(config: Config) -> Iterator[_VehicleLinks]:
-    """The simulator a launch would start, on ports of its own."""
+    """Start the simulator of a launch on separate ports, and yield its links."""
     sockets = claim_ports(config.swarm.agents)
     ports = [sock.getsockname()[1] for sock in sockets]
     links = [
@@ -198,7 +198,7 @@ def _simulator(config: Config) -> Iterator[_VehicleLinks]:
 
 @contextlib.contextmanager
 def _interruptible() -> Iterator[None]:
-    """SIGTERM and SIGHUP as Ctrl-C, once: from then on they are ignored, so that what was started here is ended."""
+    """Handle the first SIGTERM or SIGHUP as Ctrl-C and ignore later ones, so that started processes are ended."""
     signums = (signal.SIGTERM, signal.SIGHUP)
 
     def interrupt(signum: int, frame: FrameType | None) -> None:
