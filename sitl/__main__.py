@@ -1,7 +1,7 @@
-"""`python -m sitl`: N PX4-like vehicles on loopback UDP, in real time. Arguments in, exit code out.
+"""`python -m sitl`: simulates N vehicles on loopback UDP in real time.
 
-Vehicle i listens on 127.0.0.1:(local-port + i) and sends to 127.0.0.1:(port + i) until the first datagram arrives; from
-then on it talks to that sender only, though it obeys everybody, as PX4 does. Given `--remote-ports` it obeys those.
+Vehicle i listens on 127.0.0.1:(local-port + i) and sends to 127.0.0.1:(port + i) until the first datagram arrives. From
+then on it sends to that sender only, but obeys every sender, as PX4 does. With `--remote-ports` it obeys only those.
 With `--gcs-port` each vehicle has a second link to a ground station there, from 127.0.0.1:(18570 + i). With
 `--tcp-port` it serves one client on TCP (tcp-port + 10 i) instead, as ArduCopter's own simulator does.
 """
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 _SET_HELP = "wind, battery, rotors, faults as under [sitl] of a configuration, such as wind.turbulence_m_s=5"
 
-GCS_LOCAL_PORT = 18570  # of the first vehicle, as PX4's
+GCS_LOCAL_PORT = 18570  # of the first vehicle, as in PX4
 
 
 class _OneLineParser(argparse.ArgumentParser):
@@ -138,7 +138,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _joined(arguments: list[str]) -> list[str]:
-    """`--spawn -1,0,0` as `--spawn=-1,0,0`: argparse would take a value that begins with a minus for an option."""
+    """Join `--spawn -1,0,0` to `--spawn=-1,0,0`: argparse takes a value that begins with a minus for an option."""
     joined: list[str] = []
     for argument in arguments:
         if joined and joined[-1] in ("--spawn", "--origin", "--wind"):
@@ -149,7 +149,7 @@ def _joined(arguments: list[str]) -> list[str]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the simulator; returns the process exit code."""
+    """Run the simulator and return the process exit code."""
     options = _parser().parse_args(_joined(sys.argv[1:] if arguments is None else arguments))
     if options.die_with_parent:
         from swarmctl.process_lifetime import die_with_parent
@@ -191,7 +191,7 @@ def _params(options: argparse.Namespace) -> SitlParams:
 
 
 def _realism(options: argparse.Namespace) -> RealismParams:
-    """Wind, battery, rotors, faults; read and refused as the configuration of a run is."""
+    """Return wind, battery, rotors and faults, parsed and refused as in the configuration of a run."""
     from swarmctl.core.simulated import RealismParams
 
     sets = [f"wind.mean_ned_m_s={list(options.mean_wind)}"] if options.mean_wind else []
@@ -245,7 +245,7 @@ def _run(options: argparse.Namespace) -> int:
     complaint = ""
     control = ControlSocket(options.control, options.die_with_parent) if options.control else None
     try:
-        gc.freeze()  # what has been built stays: nothing for the collector to walk through in flight
+        gc.freeze()  # the garbage collector need not traverse start-up objects in flight
         gate = realtime.Gate(world) if options.lockstep else None
         statistics = realtime.fly(world, stop, truth, speed=options.speed, control=control, gate=gate)
     finally:
@@ -261,7 +261,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _udp_links(options: argparse.Namespace) -> tuple[list[Transport], list[str]]:
-    """Links of all vehicles, and where each is."""
+    """Return the links of all vehicles, and their addresses."""
     from sitl import realtime
     from sitl.net.ports import OpenPort
     from swarmctl.errors import ConfigError
@@ -291,7 +291,7 @@ def _udp_links(options: argparse.Namespace) -> tuple[list[Transport], list[str]]
 
 
 def _gcs_links(options: argparse.Namespace) -> tuple[list[Transport], str]:
-    """A ground station's links, and where they are; none when there is no port for it."""
+    """Return the links to a ground station, and their addresses; none without a port for it."""
     from sitl import realtime
     from sitl.net.ports import OpenPort
     from swarmctl.errors import ConfigError

@@ -1,6 +1,6 @@
-"""Faults: what each kind does to a world, when it begins and when it ends.
+"""Faults: the effect of each kind on a world at its begin and its end.
 
-A fault of the same kind on the same vehicle (and rotor) replaces the one before. Everything here is on simulated time.
+A fault replaces an earlier one of the same kind on the same vehicle (and rotor). All times are simulated.
 """
 
 from __future__ import annotations
@@ -23,21 +23,21 @@ _NEVER_US = 1 << 62
 
 
 class FaultTarget(Protocol):
-    """What faults act on."""
+    """The interface of a world that faults act on."""
 
     @property
     def physics(self) -> Physics:
-        """Plant, air, battery."""
+        """Plant, air and battery."""
 
     @property
     def estimator(self) -> Estimator:
-        """What the vehicles believe."""
+        """Estimates of all vehicles."""
 
     def links_of(self, vehicle: int) -> Sequence[LossyLink]:
-        """Every link of a vehicle."""
+        """Return every link of a vehicle."""
 
     def reboot(self, vehicle: int, now_us: int) -> None:
-        """Start its autopilot again."""
+        """Restart the autopilot of a vehicle."""
 
 
 def _gps_loss(world: FaultTarget, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
@@ -71,7 +71,7 @@ def _gust(world: FaultTarget, vehicle: int, fault: FaultParams, now_us: int) -> 
     on[vehicle] = 1.0
     gust = Gust(fault.amount * _towards(fault).reshape(3, 1), now_us * 1e-6, fault.for_s, on)
     world.physics.air.gusts.append(gust)
-    return lambda: None  # it blows itself out
+    return lambda: None  # a gust ends by itself
 
 
 def _battery(world: FaultTarget, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
@@ -120,7 +120,7 @@ class Faults:
     """Begins and ends the faults of one world.
 
     Attributes:
-        on_event: told of every beginning and end: name, time since boot [us], fields.
+        on_event: called at every begin and end with name, time since boot [us] and fields.
     """
 
     def __init__(self, world: FaultTarget, scheduled: Iterable[FaultParams], vehicles: int) -> None:
@@ -132,7 +132,7 @@ class Faults:
         self._next_us = self._earliest_us()
 
     def step(self, now_us: int) -> None:
-        """Begin and end what is due; `now_us` since boot."""
+        """Begin and end the faults that are due at `now_us` since boot."""
         if now_us < self._next_us:
             return
         for key, (end_us, fault, vehicle, undo) in list(self._running.items()):
@@ -145,7 +145,7 @@ class Faults:
         self._next_us = self._earliest_us()
 
     def begin(self, fault: FaultParams, now_us: int) -> None:
-        """Let a fault happen now, whatever its `at_s`."""
+        """Begin a fault now, whatever its `at_s`."""
         self._begin(fault, now_us)
         self._next_us = self._earliest_us()
 

@@ -1,6 +1,6 @@
-"""A link that loses, delays, doubles, reorders and corrupts datagrams, seeded, each direction by itself.
+"""A link that loses, delays, duplicates, reorders and corrupts datagrams, seeded, each direction separately.
 
-Without a fault it hands everything through untouched. What is late is released when the simulator next steps.
+Without an impairment it passes everything unchanged. Late datagrams are released when the simulator next steps.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ import numpy as np
 from swarmctl.mavlink.codec import frames, message_id
 from swarmctl.mavlink.transport import Datagram, Transport
 
-_OVERTAKEN_US = 100_000  # a datagram waits this long for one to overtake it
+_OVERTAKEN_US = 100_000  # longest time that a datagram waits for another to overtake it
 _SET_ATTITUDE_TARGET = 82
 _NOTHING = (0.0,) * 5
 
 
 @dataclass
 class Impairments:
-    """Of one direction; probabilities are per datagram."""
+    """Impairments of one link direction; probabilities are per datagram."""
 
     loss_01: float = 0.0
     delay_ms: float = 0.0
@@ -29,7 +29,7 @@ class Impairments:
     corrupt_01: float = 0.0
 
     def any(self) -> bool:
-        """Whether there is one."""
+        """Return whether any impairment is set."""
         return (self.loss_01, self.delay_ms, self.duplicate_01, self.reorder_01, self.corrupt_01) != _NOTHING
 
 
@@ -37,7 +37,7 @@ class LinkDirection:
     """One direction of a link.
 
     Attributes:
-        clear: datagrams pass untouched and none is waiting; kept up to date, because every datagram asks.
+        clear: datagrams pass unchanged and none is waiting; a cached flag, because every datagram tests it.
     """
 
     def __init__(self, rng: np.random.Generator) -> None:
@@ -45,16 +45,16 @@ class LinkDirection:
         self.impairments = Impairments()
         self._rng = rng
         self._queue: list[tuple[int, int, bytes]] = []  # due, number, datagram
-        self._overtaken: tuple[int, bytes] | None = None  # patience ends, datagram
+        self._overtaken: tuple[int, bytes] | None = None  # end of the wait, datagram
         self._number = 0
 
     def set_impairment(self, name: str, amount: float) -> None:
-        """Set one of the impairments; 0 takes it away."""
+        """Set one of the impairments; 0 removes it."""
         setattr(self.impairments, name, amount)
         self._look()
 
     def offer(self, now_us: int, data: bytes) -> None:
-        """One datagram enters."""
+        """Enter one datagram."""
         impairments, rng = self.impairments, self._rng
         if self._happens(impairments.loss_01):
             return
@@ -73,7 +73,7 @@ class LinkDirection:
             self._overtaken = None
 
     def take(self, now_us: int) -> list[Datagram]:
-        """Everything that comes out by now, stamped with its own time."""
+        """Return every datagram that leaves by now, stamped with its own time."""
         if self._overtaken is not None and now_us >= self._overtaken[0]:
             self._push(*self._overtaken)
             self._overtaken = None
@@ -92,12 +92,12 @@ class LinkDirection:
         heapq.heappush(self._queue, (due_us, self._number, data))
 
     def _happens(self, probability_01: float) -> bool:
-        """A draw only where it matters, so that one fault does not change what another does."""
+        """Draw only where it matters, so that one fault does not change the random numbers of another."""
         return probability_01 > 0.0 and float(self._rng.random()) < probability_01
 
 
 class LossyLink:
-    """A transport around another one.
+    """A transport that impairs another one.
 
     Attributes:
         to_vehicle, from_vehicle: its two directions.
@@ -136,7 +136,7 @@ class LossyLink:
         return arrived
 
     def setpoints(self) -> int:
-        """SET_ATTITUDE_TARGET frames that have come out since the first call."""
+        """Return the number of SET_ATTITUDE_TARGET frames that have come out since the first call."""
         self._setpoints = self._setpoints or 0
         return self._setpoints
 

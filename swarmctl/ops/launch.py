@@ -173,7 +173,7 @@ class Launcher(Services):
         self.log.write("stopped", exit_codes={name: child.poll() for name, child in self.children.items()})
 
     def recover(self, agent: int) -> Child:
-        """Start an agent on the vehicle of an ended one; it records separately, and flies without a router if it must."""
+        """Start an agent on the vehicle of an ended one; it records separately and can fly without a router."""
         router = self.children[ROUTER]
         endpoint = self.context.endpoint if router.poll() is None else NO_BUS
         directory = self.context.directory / "recovery"
