@@ -1,8 +1,9 @@
 """ArduCopter 4.6's commander for one vehicle: modes, arming, GUIDED attitude setpoints, landing, GCS failsafe.
 
-Scalar code at autopilot rate. It speaks in results and texts, not in MAVLink messages (`arducopter_endpoint` does).
+Scalar code at autopilot rate. Its results and texts are not MAVLink messages (`sitl.arducopter.endpoint` converts
+them).
 
-Nobody holds the radio: its sticks are centred while the vehicle flies (STABILIZE hovers on hover thrust, LOITER and
+No radio is operated: its sticks are centred while the vehicle flies (STABILIZE hovers on hover thrust, LOITER and
 ALT_HOLD keep the height) and its throttle is down on the ground. Unlike ArduCopter, body rates that are not finite are
 refused; everything else about setpoints is as measured, GUID_OPTIONS and type masks included.
 """
@@ -45,22 +46,22 @@ REACHED_M = 0.1
 
 
 class ArduCopter:
-    """Commander of one vehicle.
+    """The commander of one vehicle.
 
     Attributes:
         clock: its own time and local frame.
-        boot: when what works, on that clock.
+        boot: times at which its parts start to work, on that clock.
         armed: motors may turn.
-        mode: what flies.
+        mode: mode that flies.
         guided: what GUIDED does.
         home_ned_m: local position of the last arming, or of the EKF origin before.
-        home_set: how often home has been set.
+        home_set: number of times home has been set.
         output: attitude and thrust to fly.
         target_q_nb, throttle_in_01: the attitude controller's input, before angle boost (ATTITUDE_TARGET).
         released: an air start's clamp has been opened.
         has_origin: the EKF has its origin, and so a position.
         failsafe: the ground station is lost.
-        refused: setpoints not used, by reason.
+        refused: number of unused setpoints, by reason.
     """
 
     def __init__(
@@ -112,20 +113,20 @@ class ArduCopter:
         self.failsafe = False
 
     def reboot(self, now_us: int) -> None:
-        """Start again at `now_us` of the simulation; parameters are kept, the local frame begins where it is."""
+        """Restart at `now_us` of the simulation; parameters are kept, the local frame begins at the vehicle's place."""
         self.clock.again(now_us, self._estimate)
         self._power_up()
 
     # --- what others ask ---
 
     def outbox(self) -> deque[tuple[Severity, str]]:
-        """A new queue that every text is put into: one for each link."""
+        """Return a new queue that receives every text: one for each link."""
         box: deque[tuple[Severity, str]] = deque(maxlen=64)
         self._outboxes.append(box)
         return box
 
     def prearm_passed(self, now_us: int) -> bool:
-        """PREARM_CHECK of SYS_STATUS; whatever the mode."""
+        """Whether the PREARM_CHECK of SYS_STATUS passes, independent of the mode."""
         return self.armed or now_us >= self.boot.armable_us
 
     @property
@@ -139,7 +140,7 @@ class ArduCopter:
         return Landed.IN_AIR
 
     def base_mode(self) -> int:
-        """HEARTBEAT.base_mode: bit 8 while the horizontal position controller is at work."""
+        """HEARTBEAT.base_mode: bit 8 while the horizontal position controller is active."""
         angle = self.mode == CopterMode.GUIDED and self.guided is Guided.ANGLE
         positions = self.mode not in WITHOUT_POSITION_CONTROL and not angle
         return BASE_ALWAYS | (BASE_POSITION_CONTROL if positions else 0) | (BASE_ARMED if self.armed else 0)
@@ -155,7 +156,7 @@ class ArduCopter:
         return FLIGHT_MODES.get(self.mode, FlightMode.MANUAL)
 
     def say(self, severity: Severity, text: str) -> None:
-        """A STATUSTEXT on every link."""
+        """Queue a STATUSTEXT on every link."""
         for box in self._outboxes:
             box.append((severity, text))
 
@@ -164,7 +165,7 @@ class ArduCopter:
     def on_setpoint(
         self, type_mask: int, q_nb: Sequence[float], rates: Sequence[float], thrust: float, now_us: int
     ) -> bool:
-        """SET_ATTITUDE_TARGET, see `Setpoints.take`; True when it will be flown."""
+        """Take a SET_ATTITUDE_TARGET, see `Setpoints.take`; return whether it will be flown."""
         if self.mode != CopterMode.GUIDED:
             return self._refuse("not_guided")
         refusal = self._setpoints.take(type_mask, q_nb, rates, thrust, self.target_q_nb, now_us)
@@ -189,7 +190,7 @@ class ArduCopter:
     # --- commands ---
 
     def arm(self, now_us: int, *, force: bool = False) -> Result:
-        """MAV_CMD_COMPONENT_ARM_DISARM p1=1."""
+        """Execute MAV_CMD_COMPONENT_ARM_DISARM p1=1."""
         if self.armed:
             return Result.ACCEPTED
         reasons = arming_refusals(self.boot, now_us)
@@ -209,7 +210,7 @@ class ArduCopter:
         return Result.ACCEPTED
 
     def disarm(self, *, force: bool = False) -> Result:
-        """MAV_CMD_COMPONENT_ARM_DISARM p1=0; in the air only with `force`."""
+        """Execute MAV_CMD_COMPONENT_ARM_DISARM p1=0; in the air only with `force`."""
         if not self.armed:
             return Result.ACCEPTED
         if not self._land_detector.landed and self.released and not force:
@@ -223,7 +224,7 @@ class ArduCopter:
         self.say(Severity.INFO, "Disarming motors")
 
     def set_mode(self, number: int) -> Result:
-        """A commanded mode; while disarmed any mode can be set."""
+        """Change the mode by command; while disarmed any mode can be set."""
         if number not in set(CopterMode):
             known = NOT_FLOWN_HERE.get(number)
             text = f"Mode change to {known} failed: init failed" if known else f"No such mode {number}"
@@ -238,7 +239,7 @@ class ArduCopter:
         return Result.ACCEPTED
 
     def take_off(self, height_m: float) -> Result:
-        """MAV_CMD_NAV_TAKEOFF: `height_m` above home. In GUIDED, armed, on the ground."""
+        """Execute MAV_CMD_NAV_TAKEOFF: `height_m` above home. In GUIDED, armed, on the ground."""
         estimate, home = self._estimate, self.home_ned_m
         if (
             not self.armed
@@ -249,15 +250,15 @@ class ArduCopter:
         ):
             return Result.FAILED
         z_m = home[2] - height_m
-        if not z_m < estimate.pos_ned_m[2]:  # not up, or not a number
+        if not z_m < estimate.pos_ned_m[2]:  # not above it, or not a number
             return Result.FAILED
         self._takeoff_z_m, self._takeoff_reached = z_m, False
-        if self.guided is not Guided.TAKEOFF:  # asked again while motors spin up, it goes on
+        if self.guided is not Guided.TAKEOFF:  # a repeated request continues the spin-up
             self._enter_guided(Guided.TAKEOFF)
         return Result.ACCEPTED
 
     def gcs_heard(self, now_us: int) -> None:
-        """HEARTBEAT from SYSID_MYGCS."""
+        """Take a HEARTBEAT from SYSID_MYGCS."""
         self._gcs_us = now_us
         if self.failsafe:
             self.failsafe = False
@@ -329,7 +330,7 @@ class ArduCopter:
             self._enter(CopterMode.LAND if action in (4, 5, 7) else CopterMode.RTL)
 
     def _lifts_off(self, now_us: int) -> bool:
-        """On the ground: whether what is asked takes off, and the motors have spun up for it."""
+        """Return whether a vehicle on the ground is to take off and its motors have spun up."""
         asked = self.mode == CopterMode.GUIDED and (
             self.guided is Guided.TAKEOFF or (self.guided is Guided.ANGLE and self._target().rises)
         )
@@ -341,7 +342,7 @@ class ArduCopter:
         return True
 
     def _put_out(self, q_nb: Array, throttle_01: float) -> None:
-        """Hand an attitude and a throttle to the attitude controller, which boosts it by the tilt asked for."""
+        """Pass attitude and throttle to the attitude controller, which boosts the throttle by the requested tilt."""
         self.target_q_nb, self.throttle_in_01 = q_nb, throttle_01
         boost = 1.0
         if self.parameters.integer("ATC_ANGLE_BOOST"):
@@ -386,7 +387,7 @@ class ArduCopter:
         return target.q_nb, self._navigator.climb(estimate, target.climb_m_s, dt_s)
 
     def _target(self) -> Target:
-        """The newest setpoint; when it is too old: level, climb rate 0, whatever thrust meant."""
+        """Return the newest setpoint; when it is too old: level, climb rate 0, for either meaning of thrust."""
         if self._setpoints.stale(self._now_us):
             if self._setpoints.target.thrust_01 is not None and self._estimate is not None:
                 self._navigator.engage(self._estimate)

@@ -1,4 +1,4 @@
-"""ArduCopter's RTL up to the landing: climb, go home, wait above it."""
+"""ArduCopter's RTL up to the landing: climb, fly home, wait above it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Position = tuple[float, float, float]
 
 
 class ReturnStage(enum.Enum):
-    """Where RTL is."""
+    """Stages of RTL."""
 
     CLIMB = "climb"
     RETURN = "return"
@@ -44,7 +44,7 @@ class ReturnHome:
         self._z_m = home_ned_m[2] - max(height_m, min(self._parameters.metres("RTL_ALT"), cone_m))
 
     def fly(self, estimate: Estimate, home_ned_m: Position, now_us: int, dt_s: float) -> tuple[Array, float]:
-        """Attitude (4,) and throttle of this tick."""
+        """Return attitude (4,) and throttle of this tick."""
         x_m, y_m, z_m = estimate.pos_ned_m
         throttle = self._navigator.to_height(estimate, self._z_m, dt_s)
         if self.stage is ReturnStage.CLIMB:
