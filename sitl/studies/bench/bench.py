@@ -1,4 +1,4 @@
-"""The `bench` verb: how long an agent's tick takes, split into its parts, for growing swarms and for both QP solvers.
+"""The `bench` verb: measures the duration of an agent's tick, split into parts, for growing swarms and each QP solver.
 
 `python -m sitl.studies.bench.bench [--out DIR] [--neighbours 0,1,2] [--solver osqp] [--ticks N] [--no-slsqp]`
 
@@ -49,12 +49,12 @@ from swarmctl.files import replace_text
 PARTS = ("sense", "setup", "promise", "spaces", "solve", "certify", "barrier", "send", "tick")
 NEIGHBOURS = (0, 1, 2, 4, 8, 16, 30)
 MAX_NEIGHBOURS = 99
-_BESIDE_PILLAR = 2  # neighbours of the scenario with an obstacle
-_WARM_UP_S = 5.0  # of the mission: catching up with the circle
+_BESIDE_PILLAR = 2  # neighbours in the scenario with an obstacle
+_WARM_UP_S = 5.0  # mission time for catching up with the circle
 _READY_WITHIN_TICKS = 1500
 _OBSTACLE = ", 1 obstacle"
 _PROMISES = ", guaranteed"
-_PROMISING = 9  # neighbours of the scenario with promises
+_PROMISING = 9  # neighbours in the scenario with commitments
 _ENDLESS_S = 3600.0
 _BUSY_LOAD = 0.7  # one-minute load average
 
@@ -77,10 +77,11 @@ def measure_ticks(
     pillar: bool = False,
     on_tick: Callable[[], None] = lambda: None,
 ) -> dict[str, Array]:
-    """Parts of `ticks` ticks, (ticks, 9) [ms] in the order of `PARTS`, by solver.
+    """Return the parts of `ticks` ticks, (ticks, 9) [ms] in the order of `PARTS`, by solver.
 
     Raises:
-        MissionError: an agent did not get under way, or had no plan at a counted tick: a failing tick is no figure.
+        MissionError: an agent did not reach the mission, or had no plan at a counted tick, which would be no valid
+        figure.
     """
     formations = {solver: Formation(formation_config(solver, neighbours, pillar)) for solver in solvers}
     for solver, formation in formations.items():
@@ -100,9 +101,9 @@ def measure_ticks(
 def measure_promises(
     neighbours: int, solvers: Sequence[str], ticks: int, on_tick: Callable[[], None] = lambda: None
 ) -> dict[str, Array]:
-    """The same of `neighbours + 1` agents that fly a swap by promises: ticks of all of them in turn, (ticks, 9) [ms].
+    """Measure `neighbours + 1` agents in a swap with guaranteed commitments; (ticks, 9) [ms] over all agents.
 
-    Paths alone, as in `measure_ticks`, promise nothing: everybody is a whole agent here.
+    The neighbours of `measure_ticks` are paths only and can't commit, so every neighbour is a whole agent here.
     """
     crowds = {solver: Lockstep(_swap_config(solver, neighbours + 1)) for solver in solvers}
     took: dict[str, list[tuple[float, ...]]] = {solver: [] for solver in solvers}
@@ -145,7 +146,7 @@ def _parts(took: Took) -> tuple[float, ...]:
 
 
 def tick_rows(took: dict[str, Array], neighbours: int, suffix: str = "") -> list[BenchRow]:
-    """Rows of one scenario."""
+    """Return the rows of one scenario."""
     rows = []
     for solver, parts in took.items():
         for name, column in zip(PARTS, parts.T, strict=True):
@@ -154,7 +155,7 @@ def tick_rows(took: dict[str, Array], neighbours: int, suffix: str = "") -> list
 
 
 def xy_rows(times: XyTimes) -> list[BenchRow]:
-    """Rows of the x-y problem alone: QP, and true distances as in the thesis."""
+    """Return the rows of the x-y problem alone: the QP, and the thesis' problem with true distances."""
     rows = [_row("solve x-y" + _OBSTACLE, solver, 2, times.qp(solver)) for solver in times.qp_ms]
     if times.fmincon is not None and times.gradients is not None:
         rows.append(_row("solve x-y, nonlinear" + _OBSTACLE, "slsqp", 2, times.fmincon.times))
@@ -169,7 +170,7 @@ def _row(name: str, solver: str, neighbours: int, times: Times) -> BenchRow:
 def bench(
     neighbours: Sequence[int], solvers: Sequence[str], ticks: int, slsqp: bool, console: Console
 ) -> list[BenchRow]:
-    """Measure everything; shows progress on a terminal."""
+    """Run all measurements; shows progress on a terminal."""
     rows: list[BenchRow] = []
     promising = min(_PROMISING, max(1, *neighbours, 0))
     with Progress(transient=True, console=console, disable=not console.is_terminal) as bar:
@@ -194,14 +195,14 @@ def bench(
 
 
 def busy_note(load: float, processors: int) -> str:
-    """What to say of the machine before anything is measured; "" when it is quiet."""
+    """Return a note on a busy machine, from the load before the measurement; "" when it is quiet."""
     if load < _BUSY_LOAD:
         return ""
     return f"load {load:.1f} on {processors} processors before the start: p99 of ticks includes other processes' work"
 
 
 def chosen_solvers(asked: Sequence[str]) -> tuple[list[str], str]:
-    """Return the solvers to measure, and what to say of those that are left out because they are not installed."""
+    """Return the solvers to measure, and a note on those that are left out because they are not installed."""
     if asked:
         return list(dict.fromkeys(asked)), ""
     installed = installed_solvers()
@@ -211,7 +212,7 @@ def chosen_solvers(asked: Sequence[str]) -> tuple[list[str], str]:
 
 
 def show(rows: Sequence[BenchRow], console: Console) -> None:
-    """The rows as two tables and the ratios."""
+    """Print the rows as two tables and the ratios."""
     neighbours = Column("neighbours", min_width=10)
     table = Table("solver", neighbours, *PARTS, title="one tick: p50 (p99) [ms]", box=SIMPLE)
     for suffix in ("", _PROMISES, _OBSTACLE):
@@ -236,7 +237,7 @@ def show(rows: Sequence[BenchRow], console: Console) -> None:
 
 
 def write(rows: Sequence[BenchRow], directory: Path) -> Path:
-    """`bench.json` in `directory`, which is made if need be."""
+    """Write `bench.json` to `directory`, which is made if necessary, and return its path."""
     try:
         directory.mkdir(parents=True, exist_ok=True)
         path = directory / "bench.json"
@@ -273,7 +274,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the verb; returns the process exit code."""
+    """Run the verb and return the process exit code."""
     return exit_code_of(partial(_run, _parser().parse_args(arguments)))
 
 

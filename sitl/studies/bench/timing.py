@@ -1,7 +1,7 @@
-"""The rows of `reproduce` that are about time: measured after all flights, alone, solvers in turn on the same problems.
+"""Timing rows of `reproduce`: measured after all flights, alone, solvers in turn on the same problems.
 
-The x-y problem with two neighbours and an obstacle is captured from a flight. SLSQP solves the thesis' own problem on
-them: true distances, hard, at every step, without gradients given, as fmincon does unless told better.
+The x-y problem with two neighbours and an obstacle is captured from a flight. SLSQP solves the thesis' own problem:
+true distances, hard, at every step, without gradients, as fmincon does by default.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from sitl.studies.bench.captured import capture, circle_with_obstacle, measure_x
 from sitl.studies.thesis.trace import Row
 
 _PROBLEM = "x-y problem, 2 neighbours and 1 obstacle"
-_FASTER = 50.0  # times than SLSQP
+_FASTER = 50.0  # required speed-up over SLSQP
 
 
 def timing_rows(bar: Progress) -> list[Row]:
-    """Medians and 99th percentiles in one run on this machine."""
+    """Return medians and 99th percentiles of one run on this machine."""
     captured = capture(circle_with_obstacle())
     task = bar.add_task("solving", total=len(captured.problems))
     found = measure_xy(captured, on_problem=lambda: bar.update(task, advance=1))

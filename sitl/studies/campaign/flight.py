@@ -21,17 +21,17 @@ from swarmctl.config import Config, load
 from swarmctl.control.collision.separation import required_radius_m
 from swarmctl.core.types import Array, Phase, PlanStatus
 
-PHYSICS_HZ = 100  # thesis and crazyflie fly as at 250 Hz: a 3.3 m transition ends within 2 cm and 0.1 s of it
-_BEGIN_WITHIN_S = 60.0  # of simulated time, or the mission has failed to begin
-_SETTLED_S = 1.0  # who has been there so long has arrived
-_REST_S = 2.0  # same goal: everybody slow for so long
+PHYSICS_HZ = 100  # thesis and crazyflie behave as at 250 Hz: a 3.3 m transition ends within 2 cm and 0.1 s of it
+_BEGIN_WITHIN_S = 60.0  # simulated time after which the mission has failed to begin
+_SETTLED_S = 1.0  # time at the goal after which a vehicle has arrived
+_REST_S = 2.0  # same goal: time for which all vehicles are slow
 _REST_M_S = 0.1
-_AFTER_CONTACT_S = 0.5  # flown on, to see how deep it was
+_AFTER_CONTACT_S = 0.5  # flown on, to measure the depth of a contact
 _BAD_PLANS = (PlanStatus.SOLVER_FAILED, PlanStatus.RESIDUAL, PlanStatus.NOT_CERTIFIED)
 
 
 def fly(trial: Trial) -> Row:
-    """Fly one trial; the row of the table it becomes, a pure function of the trial but for `cpu_s`."""
+    """Fly one trial and return its row, a pure function of the trial except `cpu_s`."""
     began_s = time.process_time()
     cell = trial.cell
     layout = layout_of(cell.scenario, trial.seed, cell.agents)
@@ -42,7 +42,7 @@ def fly(trial: Trial) -> Row:
 
 
 def config_of(cell: Cell, seed: int, layout: Layout, agents: int, extra: Sequence[str] = ()) -> Config:
-    """The configuration of a trial.
+    """Return the configuration of a trial.
 
     Raises:
         ConfigError: a setting does not exist, or values don't go together.
@@ -73,7 +73,7 @@ def config_of(cell: Cell, seed: int, layout: Layout, agents: int, extra: Sequenc
 
 
 class TrialFlight:
-    """A flight that watches itself."""
+    """A lockstep flight with a collision monitor."""
 
     def __init__(self, trial: Trial, layout: Layout) -> None:
         cell, agents = trial.cell, len(layout.starts_ned_m)
@@ -81,7 +81,7 @@ class TrialFlight:
         config = config_of(cell, trial.seed, layout, agents)
         blind = {i: config_of(cell, trial.seed, layout, agents, UNCOOPERATIVE) for i in layout.uncooperative}
         self.lockstep = Lockstep(config, own=blind)
-        self._agents = list(self.lockstep.agents)  # those that will have died, too
+        self._agents = list(self.lockstep.agents)  # including those that will have died
         expected = np.array([i not in layout.lost for i in range(agents)])
         arrive_m = math.inf if layout.settles else layout.arrive_m + NOISES[cell.noise].arrive_m
         self.monitor = CollisionMonitor(config.separation.body_m, layout.goals_ned_m, arrive_m, expected)
@@ -93,7 +93,7 @@ class TrialFlight:
         self._out_of_time = False
 
     def run(self) -> None:
-        """Fly until everybody has arrived, somebody has collided, something failed, or the time is up."""
+        """Fly until all have arrived, two bodies have collided, an agent failed, or the time is up."""
         lockstep = self.lockstep
         offset = lockstep.world.truth_rows()["pos_ned_m"] - lockstep.world.plant.pos_ned_m.T
         while not self._over():
@@ -114,7 +114,7 @@ class TrialFlight:
                 self._contact_s = min(self._contact_s, now_s)
 
     def row(self, alone_s: float | None) -> Row:
-        """What came of it."""
+        """Return the result as a row."""
         monitor, cell, layout = self.monitor, self._trial.cell, self._layout
         collided = monitor.collided
         arrived = not collided and not self._problems and self._arrived_s() < math.inf
@@ -166,7 +166,7 @@ class TrialFlight:
         return bool(self._problems) or self._out_of_time or done
 
     def _arrived_s(self) -> float:
-        """When the last one arrived; infinite before. Without goals: when the mission has been flown to its end."""
+        """Return the time of the last arrival, infinite before. Without goals: the end of the mission."""
         if self._layout.goals_ned_m is None:
             return self._begin_s + self._layout.limit_s if self._out_of_time else math.inf
         return self._resting_since_s if self._layout.settles else self.monitor.arrived_s
@@ -194,7 +194,7 @@ class TrialFlight:
         return all(int(row["phase"][0]) == Phase.TRACK for row in rows)
 
     def _failed(self) -> tuple[str, ...]:
-        """Agents that have left the mission although nobody meant them to."""
+        """Return the agents that have left the mission unintentionally."""
         found = []
         for i, (agent, log) in enumerate(zip(self.lockstep.agents, self.lockstep.logs, strict=True)):
             if agent is not None and int(log.rows[-1]["phase"][0]) != Phase.TRACK and not self._out_of_time:
@@ -202,14 +202,14 @@ class TrialFlight:
         return tuple(found)
 
     def _commits_refused(self) -> int | None:
-        """Counted by agents that promise; None when none does."""
+        """Return the number of refused commitments; None when no agent commits."""
         counts = [agent.commits_refused for agent in self._agents if agent is not None]
         promising = [count for count in counts if count is not None]
         return sum(promising) if promising else None
 
 
 def _alone_s(trial: Trial, layout: Layout) -> float | None:
-    """Flight time of the longest way with nobody and nothing else there."""
+    """Return the single-agent flight time of the longest path, without obstacles."""
     if layout.goals_ned_m is None:
         return None
     far = int(np.linalg.norm(layout.goals_ned_m - layout.starts_ned_m, axis=1).argmax())

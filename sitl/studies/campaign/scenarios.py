@@ -1,4 +1,4 @@
-"""What is flown: one table of scenarios, each a function of seed and agents.
+"""Scenarios of a campaign: one table, each row a function of seed and agents.
 
 Two sizes of vehicle. `THESIS`: its airframe, bodies of 0.48 m that keep 0.9 m, as everywhere else here. `SMALL`: a
 Crazyflie (0.14 m from tip to tip, counted as 0.15 m) that keeps 0.3 m, the figures of the public baselines for boxes,
@@ -22,7 +22,7 @@ from swarmctl.toml_text import toml_value
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """A vehicle and what it keeps."""
+    """A vehicle and its separation."""
 
     radius_m: float
     body_m: float
@@ -51,10 +51,10 @@ class Layout:
     limit_s: float  # of mission time
     goals_ned_m: Array | None = None  # (N, 3); None: the mission is flown to its end
     arrive_m: float = 0.15
-    settles: bool = False  # one goal for all: arrived when everybody has come to rest
+    settles: bool = False  # one goal for all: arrived when all vehicles are at rest
     events: tuple[ScenarioEvent, ...] = ()
-    uncooperative: frozenset[int] = frozenset()  # avoid nobody
-    lost: frozenset[int] = frozenset()  # not expected to arrive
+    uncooperative: frozenset[int] = frozenset()  # agents that avoid nothing
+    lost: frozenset[int] = frozenset()  # agents that are not expected to arrive
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,9 +63,9 @@ class Scenario:
 
     title: str
     draw: Callable[[np.random.Generator, int], Layout]
-    agents: tuple[int, ...]  # flown unless others are asked for
-    alone: bool = False  # also fly the longest way alone, for comparison
-    needs: int = 1  # fewest agents that make sense
+    agents: tuple[int, ...]  # default numbers of agents
+    alone: bool = False  # also fly the longest path with a single agent, for comparison
+    needs: int = 1  # smallest sensible number of agents
 
 
 _JITTER_M = 0.05
@@ -74,7 +74,7 @@ _SMALL_M_S, _SMALL_M_S2 = 1.0, 1.0
 _COLUMN_M = 0.3  # radius of a tree
 _POST_RADIUS_M = 0.15
 _HULL_MARGIN_M = 0.15  # planned between a small vehicle's hull and a surface; plans are certified to 0.1 m less
-_SWAP_S = (1.5, 3.5)  # mission time while everybody is under way to the middle
+_SWAP_S = (1.5, 3.5)  # mission time at which all vehicles are on the way to the middle
 
 
 def _go(goals: Array, speed_m_s: float = _SPEED_M_S, accel_m_s2: float = _ACCEL_M_S2) -> tuple[str, ...]:
@@ -206,13 +206,13 @@ SCENARIOS: dict[str, Scenario] = {
 
 
 def layout_of(scenario: str, seed: int, agents: int) -> Layout:
-    """The instance that a seed draws; the same for every other condition of a cell."""
+    """Return the instance that a seed draws; it is the same for every other condition of a cell."""
     rng = np.random.default_rng([seed, agents, zlib.crc32(scenario.encode()), _LAYOUT])
     return SCENARIOS[scenario].draw(rng, agents)
 
 
 def settings_of(layout: Layout, agents: int) -> Sequence[str]:
-    """The layout as settings of a run's configuration."""
+    """Return the layout as settings of a run's configuration."""
     size = layout.size
     return (
         *size.settings,

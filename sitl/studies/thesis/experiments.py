@@ -1,4 +1,4 @@
-"""The thesis' six experiments as a table: what is flown, what was published, and what is asked of us."""
+"""The six experiments of the thesis as a table: flights, published figures, and required limits."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ SAFE_RADIUS_M = 0.3
 RADII: tuple[float, ...] = (3.0, 2.7, 2.5, 2.3, 2.0, 1.5, 1.0)  # times SAFE_RADIUS_M
 TABLE_19_M: dict[float, float | None] = {3.0: 2.19, 2.7: 2.04, 2.5: 1.95, 2.3: 1.85}  # violated at 2
 _INDEX_LIMIT_M: dict[float, float] = {3.0: 2.19, 2.7: 2.04, 2.5: 1.95, 2.3: 1.85, 2.0: 1.80, 1.5: 1.55, 1.0: 1.30}
-_CLOSER_M = 0.01  # a true distance may fall short of the constraint radius by this
-_CERTIFIED_01 = 0.11  # of the radius: certificate slack when the radius is small
+_CLOSER_M = 0.01  # tolerated shortfall of a true distance from the constraint radius
+_CERTIFIED_01 = 0.11  # share of the radius: certificate slack when the radius is small
 
-Flown = Mapping[str, Trace]  # by name of the job
+Flown = Mapping[str, Trace]  # by job name
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """One flight."""
+    """One flight of the table."""
 
     flight: FlightName
     name: str
-    config: str  # of those that come with swarmctl
+    config: str  # name of a built-in configuration
     path: Path = "plant"
     overrides: tuple[str, ...] = ()
-    matched_velocity: bool = False  # starts with the reference's velocity; plant only
+    matched_velocity: bool = False  # starts with the reference's velocity; model only
     radius_m: float | None = None  # constraint radius, where a row depends on it
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """One row of `reproduce.json` to be worked out from one flight."""
+    """One row of `reproduce.json` that is computed from one flight."""
 
     name: str
     job: str
@@ -53,11 +53,11 @@ def lower_bound_index_m(radius_m: float) -> float:
 
 
 def at_radius(radius_m: float) -> tuple[str, ...]:
-    """Overrides of a swarm flight at another constraint radius."""
+    """Return the overrides of a swarm flight at another constraint radius."""
     slack_m = min(0.1, _CERTIFIED_01 * radius_m)
     return (
         f"separation.radius_m={radius_m:.4f}",
-        "separation.allow_small_radius=true",  # the thesis' vehicles have no bodies
+        "separation.allow_small_radius=true",  # the thesis' vehicles are points
         f"separation.certify_slack_m={slack_m:.4f}",
         "limits.min_separation_m=0.1",
     )
@@ -105,19 +105,19 @@ FULL_JOBS: tuple[Job, ...] = tuple(
 
 
 def is_flown_again(job: Job) -> bool:
-    """Whether a second flight is asked for, at equal true distance: the thesis' own controller on its own path."""
+    """Return whether a second flight is needed, at equal true distance: the thesis' own controller, model only."""
     return job.path == "plant" and job.config == "thesis_5_circle" and job.radius_m is not None
 
 
 def wider(job: Job, trace: Trace) -> Job:
-    """The same swarm flight with the constraint radius widened by what its true distances fell short of it."""
+    """Return the same swarm flight with the constraint radius widened by the shortfall of its true distances."""
     assert job.radius_m is not None
     radius_m = job.radius_m + max(0.0, job.radius_m - score.separation_m(trace))
     return replace(job, name=f"{job.name}, true distance", overrides=at_radius(radius_m), radius_m=radius_m)
 
 
 def rows(flown: Flown) -> list[Row]:
-    """Every row that the flights at hand allow, in the thesis' order."""
+    """Return every row that the given flights allow, in the thesis' order."""
     asked = [*_tables_5_6(), *_tables_11_12(), *_table_19(), *_obstacle()]
     found = [_row(item, flown[item.job]) for item in asked if item.job in flown]
     return [*found, *_true_distance_rows(flown), *_dmpc3_rows(flown), *_full_rows(flown)]
@@ -265,7 +265,7 @@ def _true_distance_rows(flown: Flown) -> Iterator[Row]:
 
 
 def _dmpc3_rows(flown: Flown) -> Iterator[Row]:
-    """`dmpc3` over `dmpc` on every row they share: 1 and below is not worse."""
+    """Yield `dmpc3` relative to `dmpc` on every row they share: 1 and below is not worse."""
     pairs: list[tuple[str, str, str, Callable[[Trace], float]]] = [
         (f"circle, {factor:g} x 0.3 m, index", radius_name("dmpc", factor), radius_name("dmpc3", factor), score.index_m)
         for factor in RADII
@@ -280,7 +280,7 @@ def _dmpc3_rows(flown: Flown) -> Iterator[Row]:
 
 
 def _full_rows(flown: Flown) -> Iterator[Row]:
-    """What the full MAVLink loop flies, and how far it is from the model-only flight."""
+    """Yield the figures of the full MAVLink loop, and their difference from the model-only flights."""
     for job in FULL_JOBS:
         trace, plant = flown.get(job.name), flown.get(job.name.removesuffix(", full MAVLink loop"))
         if trace is None or job.flight in ("open_loop", "pid_step", "pid_steps"):

@@ -1,7 +1,7 @@
-"""Every figure of the thesis that shows a result, as a table, and how each is drawn from flights.
+"""All result figures of the thesis, as a table, and how each is drawn from flights.
 
 A flight is given as several traces: the first is the published preset, further ones are alternatives (another preset,
-the path over MAVLink) and are drawn beside it. Swarm figures show the agents of the first trace only.
+the full MAVLink loop) and are drawn beside it. Swarm figures show the agents of the first trace only.
 """
 
 from __future__ import annotations
@@ -83,7 +83,7 @@ class IndexPoint:
 
 @dataclass(frozen=True, slots=True)
 class Extra:
-    """What the page shows that is in no trace.
+    """Content of the page that is in no trace.
 
     Attributes:
         separation_m: constraint radius by trace name or, for all traces of a flight, by flight.
@@ -117,10 +117,10 @@ FIGURES: tuple[Figure, ...] = (
 
 
 def draw(figure: Figure, traces: Sequence[Trace], points: int = 300) -> str:
-    """One figure of the thesis as HTML.
+    """Return one figure of the thesis as HTML.
 
     Args:
-        figure: which.
+        figure: entry of the table.
         traces: of its flight, the published preset first; at least one.
         points: kept per line.
     """
@@ -135,7 +135,7 @@ def draw(figure: Figure, traces: Sequence[Trace], points: int = 300) -> str:
 
 
 def body_rates_rad_s(trace: Trace, agent: int = 0) -> Array:
-    """Body FRD rates p, q, r (T, 3) [rad/s] by central differences of the recorded angles; a trace has no rates."""
+    """Return body FRD rates p, q, r (T, 3) [rad/s] by central differences of the angles; a trace has no rates."""
     euler_rad = trace.euler_rad[:, agent]
     if len(euler_rad) < 2:
         return np.full_like(euler_rad, np.nan)
@@ -151,7 +151,7 @@ def body_rates_rad_s(trace: Trace, agent: int = 0) -> Array:
 
 
 def body_velocity_m_s(trace: Trace, agent: int = 0) -> Array:
-    """Body FRD velocity u, v, w (T, 3) [m/s]: the NED velocity turned by the ZYX angles."""
+    """Return the body FRD velocity u, v, w (T, 3) [m/s]: the NED velocity turned by the ZYX angles."""
     sr, sp, sy = np.sin(trace.euler_rad[:, agent]).T
     cr, cp, cy = np.cos(trace.euler_rad[:, agent]).T
     to_body = np.array(
@@ -165,7 +165,7 @@ def body_velocity_m_s(trace: Trace, agent: int = 0) -> Array:
 
 
 def nearest_pair_m(trace: Trace) -> Array:
-    """Smallest distance between two agents at every tick (T,) [m], NaN where unknown or alone."""
+    """Return the smallest distance of two agents at every tick (T,) [m], NaN where unknown or alone."""
     pos = trace.pos_ned_m  # (T, N, 3)
     first, second = np.triu_indices(pos.shape[1], k=1)
     if not len(first):
@@ -176,7 +176,7 @@ def nearest_pair_m(trace: Trace) -> Array:
 def separation_chart(
     flight: FlightName, traces: Sequence[Trace], separation_m: Mapping[str, float], points: int
 ) -> str:
-    """Smallest distance of two agents over time, with the constraint radius of every trace."""
+    """Draw the smallest distance of two agents over time, with the constraint radius of every trace."""
     colors = [css(agent_rgb(k)) for k in range(len(traces))]
     lines = [Line(t.t_s, nearest_pair_m(t), c, t.name) for t, c in zip(traces, colors, strict=True)]
     radii = {separation_m.get(trace.name, separation_m.get(flight)) for trace in traces}
@@ -186,7 +186,7 @@ def separation_chart(
 
 
 def error_chart(flight: FlightName, traces: Sequence[Trace], separation_m: Mapping[str, float], points: int) -> str:
-    """Distance to the reference over time, summed over agents; its mean is the published index."""
+    """Draw the distance to the reference over time, summed over agents; its mean is the published index."""
     lines = []
     for k, trace in enumerate(traces):
         sum_m = np.linalg.norm(trace.pos_ned_m - trace.ref_pos_ned_m, axis=2).sum(axis=1)
@@ -200,7 +200,7 @@ def error_chart(flight: FlightName, traces: Sequence[Trace], separation_m: Mappi
 
 
 def obstacle_chart(traces: Sequence[Trace], points: int) -> str:
-    """Distance to the centre of the first obstacle: all agents of the first trace, the nearest of the others."""
+    """Draw the distance to the first obstacle's centre: all agents of the first trace, the nearest of the others."""
     sphere = traces[0].obstacles[0]
     center_ned_m = np.array(sphere.center_ned_m)
     lines = []
@@ -217,7 +217,7 @@ def obstacle_chart(traces: Sequence[Trace], points: int) -> str:
 
 
 def above_chart(trace: Trace, points: int) -> str:
-    """Agents, reference and obstacles from above; circles are the keep-out and the obstacle."""
+    """Draw agents, reference and obstacles from above; circles are the keep-out and the obstacle."""
     lines = [
         Line(trace.pos_ned_m[:, i, 1], trace.pos_ned_m[:, i, 0], css(agent_rgb(i)), f"agent {i}")
         for i in range(trace.pos_ned_m.shape[1])
@@ -233,7 +233,7 @@ def above_chart(trace: Trace, points: int) -> str:
 
 
 def index_chart(index: Sequence[IndexPoint]) -> str:
-    """Tracking index over constraint radius: Table 19, ours, and the theoretical lower bound for three agents."""
+    """Draw the tracking index over the constraint radius: Table 19, ours, and the theoretical lower bound."""
     radii = np.array(sorted({point.radius_m for point in index}))
     published = sorted({(p.radius_m, p.published_m) for p in index if p.published_m is not None})
     lines = []
@@ -262,7 +262,7 @@ def _seconds(traces: Sequence[Trace]) -> tuple[float, float]:
 
 
 def _single_lines(figure: Figure, traces: Sequence[Trace]) -> list[Line]:
-    """The response of every trace, and what the first one was asked for."""
+    """Return the response of every trace, and the reference of the first one."""
     lines = []
     for k, trace in enumerate(traces):
         values = _response(trace, figure.drawn, 0)
@@ -285,7 +285,7 @@ def _swarm_lines(figure: Figure, trace: Trace) -> list[Line]:
 
 
 def _response(trace: Trace, drawn: Drawn, agent: int) -> Array:
-    """What is drawn of one agent (T,)."""
+    """Return the drawn state of one agent (T,)."""
     if drawn in _AXES:
         return trace.pos_ned_m[:, agent, _AXES.index(drawn)]
     if drawn in _ANGLES:
@@ -296,7 +296,7 @@ def _response(trace: Trace, drawn: Drawn, agent: int) -> Array:
 
 
 def _asked(trace: Trace, drawn: Drawn) -> Array | None:
-    """Reference or attitude setpoint of the first agent (T,); None where the thesis has none."""
+    """Return the reference or attitude setpoint of the first agent (T,); None where the thesis has none."""
     if drawn in _AXES:
         return trace.ref_pos_ned_m[:, 0, _AXES.index(drawn)]
     if drawn in _ANGLES:
@@ -305,7 +305,7 @@ def _asked(trace: Trace, drawn: Drawn) -> Array | None:
 
 
 def _windows(trace: Trace, axis: int) -> list[Window]:
-    """What every obstacle takes up of one axis while the reference is inside it."""
+    """Return the extent of every obstacle on one axis while the reference is inside it."""
     found = []
     for sphere in trace.obstacles:
         away_m = np.linalg.norm(trace.ref_pos_ned_m[:, 0] - np.array(sphere.center_ned_m), axis=1)
@@ -338,7 +338,7 @@ def _space(figure: Figure, traces: Sequence[Trace], points: int) -> str:
 
 
 def _states(figure: Figure, traces: Sequence[Trace], points: int) -> str:
-    """Four panels of three states; further traces are dashed."""
+    """Draw four panels of three states; further traces are dashed."""
     panels: tuple[tuple[str, str], ...] = (
         ("angles [rad]", "phi theta psi"),
         ("body rates [rad/s]", "p q r"),

@@ -1,4 +1,4 @@
-"""What `swarmctl reproduce` leaves behind: `report.html`, one page without script or request, and `reproduce.json`."""
+"""Output of `swarmctl reproduce`: `report.html`, one page without script or request, and `reproduce.json`."""
 
 from __future__ import annotations
 
@@ -60,11 +60,11 @@ _ERRATA = (
 def write_page(
     directory: Path, rows: Sequence[Row], traces: Mapping[str, Sequence[Trace]], extra: Extra | None = None
 ) -> Path:
-    """Write the page; flights without traces leave their figures out.
+    """Write the page and return its path; flights without traces leave their figures out.
 
     Args:
         directory: exists.
-        rows: what is judged; grouped by the flight their names speak of, see `flight_of`.
+        rows: results, grouped by the flight in their names, see `flight_of`.
         traces: by key of `FLIGHTS`; of each the published preset on the plant first.
         extra: constraint radii, points of Table 19, notes.
 
@@ -117,14 +117,14 @@ def write_json(directory: Path, rows: Sequence[Row]) -> Path:
 
 
 def ratio(row: Row) -> float | None:
-    """Ours over published; None where the thesis has no figure or prints 0."""
+    """Return ours over published; None where the thesis has no figure or prints 0."""
     if row.published is None or row.published == 0.0:
         return None
     return _finite(row.ours / row.published)
 
 
 def flight_of(name: str) -> FlightName | None:
-    """The flight a row's name speaks of: all words of its key occur, in any order; the longest key wins."""
+    """Return the flight in a row's name: all words of its key occur, in any order; the longest key wins."""
     words = set(re.split(r"[^a-z0-9]+", name.lower()))
     spoken: list[FlightName] = [key for key in FLIGHTS if words.issuperset(key.split("_"))]
     return max(spoken, key=len, default=None)
@@ -253,7 +253,7 @@ def _sections(flown: Mapping[FlightName, Sequence[Trace]], extra: Extra) -> Iter
 
 
 def _further(key: FlightName, traces: Sequence[Trace], extra: Extra, points: int) -> Iterator[str]:
-    """Charts the thesis does not have."""
+    """Draw the charts that the thesis does not have."""
     if traces[0].obstacles:
         yield above_chart(traces[0], points)
     if key != "open_loop":
