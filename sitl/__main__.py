@@ -106,7 +106,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--attitude-gains", choices=tuple(THESIS_GAINS), default="swarm", help="attitude PIDs of the thesis airframe")
     add("--estimator", choices=("exact", "gps", "external"), default="exact", help="errors of the vehicles' estimates")
-    add("--autopilot", choices=("px4", "arducopter"), default="px4", help="whose face the vehicles show")
+    add("--autopilot", choices=("px4", "arducopter"), default="px4", help="autopilot that the vehicles imitate")
     add("--spawn", type=_spawns, metavar='"x,y,z;..."', help="NED metres; default: a line along x, 1 m apart")
     add("--origin", type=_origin, default=(47.397742, 8.545594, 489.4), metavar="LAT,LON,ALT", help="shared origin")
     add("--port", type=_integer(1, 65535), default=14540, help="first vehicle sends here until somebody talks to it")

@@ -74,7 +74,7 @@ class SitlParams(RealismParams):
     ekf_ready_s: float = Field(1.0, ge=0, le=60)  # from its start until it can be armed; PX4 takes 4
     mass_scale: float = Field(1.0, ge=0.3, le=1.9)  # true mass over the preset's, unknown to the bridge
     estimator: Literal["exact", "gps", "external"] = "exact"  # what the autopilots' estimates are off by
-    autopilot_kind: Literal["px4", "arducopter"] = "px4"  # whose face the simulator shows
+    autopilot_kind: Literal["px4", "arducopter"] = "px4"  # autopilot that the simulator imitates
     link_latency_ms: float = Field(0.0, ge=0, le=1000)  # lockstep only
     physics_hz: int = Field(250, ge=50, le=1000)
     gcs_port: int = Field(0, ge=0, le=65535)  # every vehicle has a second link to a ground station there; 0: none

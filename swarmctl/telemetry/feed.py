@@ -1,4 +1,4 @@
-"""The viewer's ear on the bus: tick records of every agent and the operator's obstacles.
+"""The viewer's subscriptions on the bus: tick records of every agent and the operator's obstacles.
 
 Rings drop the oldest sample when the viewer is slow, so neither the bus nor an agent ever waits for it.
 """
