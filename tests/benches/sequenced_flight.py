@@ -1,4 +1,4 @@
-"""What the tests of the phase machine share: a `Sequence` that is driven with made-up facts."""
+"""Shared by the tests of the phase machine: a `Sequence` that is driven with scripted facts."""
 
 from __future__ import annotations
 

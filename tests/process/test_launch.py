@@ -264,7 +264,7 @@ def test_the_flight_does_not_need_its_viewer(start: Callable[..., Launched]) -> 
 
 
 def test_two_launches_at_once_beside_another_simulator(start: Callable[..., Launched]) -> None:
-    """Every PX4-like simulator sends to 14540 and up until somebody answers: neither takes its vehicles for its own."""
+    """Every PX4-like simulator sends to 14540 and up until answered: neither launch takes the other's vehicles."""
     others = subprocess.Popen([sys.executable, "-m", "sitl", "--vehicles", "3"], stdout=subprocess.DEVNULL)
     try:
         first, second = (start(*TWO, *AIR, "--duration", "2") for _ in range(2))

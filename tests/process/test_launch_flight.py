@@ -1,4 +1,4 @@
-"""How a launch is supervised, with processes that only sleep and end: who is blamed, who goes on, what comes out."""
+"""Supervision of a launch, with processes that only sleep and end: which fails, which go on, and the result."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def status_of(agent: int, phase: Phase, utc_us: int) -> bytes:
 
 
 class ScriptedServices(Services):
-    """A services of scripted processes; it also is the display, which the flight calls once in every step."""
+    """Services made of scripted processes; it is also the display, which the flight calls once in every step."""
 
     def __init__(self, directory: Path, agents: Sequence[str], others: dict[str, str] | None = None) -> None:
         self.log = EventLog(directory / "launch.events.jsonl")
@@ -95,7 +95,7 @@ class ScriptedServices(Services):
         return Child(Command(agent_name(agent), (sys.executable, "-ESc", self.lands)), self.directory)
 
     def hear_operators(self) -> None:
-        """Listen to the own name, under which operators' commands speak too."""
+        """Receive under its own name, which operators' commands use too."""
         self.hub.detach(OPERATOR)
         senders = [agent_name(i) for i in range(len(self.agents))]
         self.bus = self.hub.attach(OPERATOR, {OBSTACLES: [OPERATOR], STATUS: senders})
@@ -242,13 +242,13 @@ def test_an_agent_that_can_not_start_lands_the_others(tmp_path: Path) -> None:
     assert scene.children["agent-0"].poll() == 130
 
 
-def test_an_agent_never_heard_that_crashes_did_not_start(tmp_path: Path) -> None:
+def test_an_agent_that_crashes_before_its_first_status_did_not_start(tmp_path: Path) -> None:
     scene = ScriptedServices(tmp_path, [ends(1)])
     scene.silent.add(0)
     assert scene.fly().exit_code(violated=False) == EXIT_START
 
 
-def test_first_interrupt_lands_everybody(tmp_path: Path) -> None:
+def test_first_interrupt_lands_all_agents(tmp_path: Path) -> None:
     scene = ScriptedServices(tmp_path, [FLIES_LONG, FLIES_LONG])
     scene.act = lambda: setattr(scene, "interrupts", 1)
     result = scene.fly()
@@ -258,7 +258,7 @@ def test_first_interrupt_lands_everybody(tmp_path: Path) -> None:
     assert [scene.children[f"agent-{i}"].poll() for i in range(2)] == [130, 130]
 
 
-def test_who_does_not_hear_the_order_is_told_by_signal(tmp_path: Path) -> None:
+def test_an_agent_that_misses_the_order_gets_a_signal(tmp_path: Path) -> None:
     scene = ScriptedServices(tmp_path, [FLIES_LONG])
     scene.obeys = False
     scene.act = lambda: setattr(scene, "interrupts", 1)
@@ -295,7 +295,7 @@ def test_second_interrupt_kills_at_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", [ROUTER, SITL])
-def test_without_router_or_simulator_everybody_lands(tmp_path: Path, name: str) -> None:
+def test_without_router_or_simulator_all_agents_land(tmp_path: Path, name: str) -> None:
     scene = ScriptedServices(tmp_path, [FLIES_LONG, FLIES_LONG], {ROUTER: FLIES_LONG, SITL: FLIES_LONG})
     scene.act = lambda: scene.kill(name)
     result = scene.fly()

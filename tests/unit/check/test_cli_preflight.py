@@ -1,4 +1,4 @@
-"""What is refused before a launch, the ports it takes, and what it shows while it runs."""
+"""Refusals before a launch, the ports it reserves, and its display while it runs."""
 
 from __future__ import annotations
 
@@ -191,7 +191,7 @@ def test_what_an_agent_says_is_shown_as_it_is() -> None:
     assert "refused [/bold] [red]" in stream.getvalue()
 
 
-def test_what_an_agent_says_steers_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_agents_text_controls_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     """ESC, the 8-bit CSI and direction marks, as a status, as the launcher's line and as JSON."""
     hostile = "\x1b]0;owned\x07\x9b2J\u202e\r\nDONE"
     stream = io.StringIO()

@@ -1,4 +1,4 @@
-"""A check's questions: what it hears on a link, what it asks, and that asking changes nothing."""
+"""Scans of a vehicle: what is received on a link, what is requested, and that a scan changes nothing."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ class ScriptedListener:
 
 
 class Vehicle:
-    """An autopilot as far as a check talks to it."""
+    """The autopilot side of a scan."""
 
     def __init__(self, listener: ScriptedListener, sysid: int = 1, autopilot: int = PX4, mode: int = HOLD) -> None:
         self.listener, self.sysid, self.autopilot, self.mode = listener, sysid, autopilot, mode
@@ -124,7 +124,7 @@ def names(*wanted: str) -> Callable[[Dialect], Sequence[str]]:
 
 
 def run(scan: VehicleScan, vehicle: Vehicle, seconds: float, beating: bool = True) -> VehicleFacts:
-    """Both ends, step by step, on a clock of their own."""
+    """Run both ends, step by step, on one simulated clock."""
     listener = vehicle.listener
     until_us = listener.now_us + round(seconds * 1e6)
     while listener.now_us < until_us:
@@ -162,7 +162,7 @@ def test_asking_changes_nothing(listener: ScriptedListener, armed: bool) -> None
     assert all(message.tc1 == 0 for message, _ in listener.sent if message.get_type() == "TIMESYNC")
 
 
-def test_nobody_is_spoken_to_before_an_autopilot_was_heard(listener: ScriptedListener) -> None:
+def test_nothing_is_sent_before_an_autopilot_was_received(listener: ScriptedListener) -> None:
     vehicle = Vehicle(listener)
     scan = VehicleScan(listener, NOWHERE, 1, names(), 1.0)
     run(scan, vehicle, 1.5, beating=False)
@@ -247,7 +247,7 @@ def test_a_vehicle_that_is_not_ready_is_waited_for_and_asked_again(listener: Scr
     assert hopeless.finished(listener.now_us)
 
 
-def test_another_vehicle_is_reported_until_the_wanted_one_speaks(listener: ScriptedListener) -> None:
+def test_another_vehicle_is_reported_until_the_configured_one_sends(listener: ScriptedListener) -> None:
     other, wanted = Vehicle(listener, sysid=4), Vehicle(listener, sysid=1)
     scan = VehicleScan(listener, NOWHERE, 1, names(), 1.0)
     other.beat()
@@ -287,7 +287,7 @@ def test_mavlink_1_is_recognised(listener: ScriptedListener) -> None:
     assert list(frames_of_any_version(beat + vehicle.codec.encode(mavlink.MAVLink_ping_message(0, 0, 0, 0)) + b"x"))
 
 
-def test_an_autopilot_that_is_not_known_is_heard_and_has_no_parameters(listener: ScriptedListener) -> None:
+def test_an_unsupported_autopilot_is_reported_without_parameters(listener: ScriptedListener) -> None:
     scan = VehicleScan(listener, NOWHERE, 1, names("X"), 1.0)
     facts = run(scan, Vehicle(listener, autopilot=4), 1.5)
     assert (facts.unreachable, facts.autopilot, facts.autopilot_number, facts.parameters) == ("", "", 4, {})
@@ -469,7 +469,7 @@ def bound() -> Iterator[socket.socket]:
         yield sock
 
 
-def test_an_ear_hears_everybody_and_answers_one(bound: socket.socket) -> None:
+def test_a_listener_receives_from_every_sender_and_answers_one(bound: socket.socket) -> None:
     own = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     own.bind(("127.0.0.1", 0))
     listener = UdpListener(own)
@@ -484,7 +484,7 @@ def test_an_ear_hears_everybody_and_answers_one(bound: socket.socket) -> None:
     listener.close()
 
 
-def test_a_serial_link_is_heard_and_spoken_to() -> None:
+def test_a_serial_link_is_read_and_written() -> None:
     master, slave = os.openpty()
     tty.setraw(slave)
     listener, there = open_listener(f"serial://{os.ttyname(slave)}:57600")

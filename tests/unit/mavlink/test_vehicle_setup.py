@@ -1,4 +1,4 @@
-"""What a link is asked for, once and again: rates, origin, parameters, also after a reboot; and what is refused."""
+"""Setup of a link: rates, origin and parameters, also after a reboot, and the refusals."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ COPTER_WITHOUT_AGENT = {"FS_GCS_ENABLE": 5, "FS_GCS_TIMEOUT": 2.0, "ATC_ANGLE_BO
 
 
 class Vehicle:
-    """A made-up autopilot at the far end: answers commands and parameters, streams what it was asked to."""
+    """A scripted autopilot at the far end: answers commands and parameters, streams the requested messages."""
 
     def __init__(self, autopilot: int = PX4, **params: float) -> None:
         defaults = {
@@ -258,7 +258,7 @@ def test_after_a_reboot_everything_is_asked_for_again() -> None:
     assert vehicle.pilot.mode is FlightMode.HOLD
 
 
-def test_rates_that_were_lost_are_asked_for_again_but_a_silent_vehicle_is_not_shouted_at() -> None:
+def test_lost_rates_are_requested_again_but_not_from_a_silent_vehicle() -> None:
     vehicle = Vehicle().set_up().run(5.0)
     vehicle.talks = False
     vehicle.run(24.0)  # what was asked at the very beginning of the silence is asked four times
@@ -272,7 +272,7 @@ def test_rates_that_were_lost_are_asked_for_again_but_a_silent_vehicle_is_not_sh
     assert vehicle.pilot.clock.boots == 0
 
 
-def test_the_origin_is_asked_for_until_it_is_told() -> None:
+def test_the_origin_is_requested_until_it_is_reported() -> None:
     vehicle = Vehicle()
     vehicle.answers_origin = False
     vehicle.set_up().run(6.0)
@@ -285,7 +285,7 @@ def test_the_origin_is_asked_for_until_it_is_told() -> None:
     assert vehicle.asked == []
 
 
-def test_upkeep_asks_one_thing_at_a_time_and_only_when_nobody_else_does() -> None:
+def test_vehicle_setup_requests_one_thing_at_a_time_and_only_on_an_idle_port() -> None:
     vehicle = Vehicle().set_up()
     vehicle.run(0.1)
     vehicle.port.request(Command(Verb.LAND))

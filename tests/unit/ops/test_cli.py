@@ -234,7 +234,7 @@ def squat_link(place: Path) -> None:
 @pytest.mark.parametrize("squat", [squat_open, squat_of_another, squat_file, squat_link])
 @pytest.mark.parametrize("at_launch", [True, False], ids=["runtime directory at launch", "none at launch"])
 @pytest.mark.parametrize("at_verb", [True, False], ids=["runtime directory at the verb", "none at the verb"])
-def test_a_launch_and_its_verbs_find_each_other_whoever_takes_the_name_first(
+def test_a_launch_and_its_verbs_find_each_other_although_another_user_takes_the_name(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, squat: Callable[[Path], None], at_launch: bool, at_verb: bool
 ) -> None:
     temporary, runtime, folder = tmp_path / "tmp", tmp_path / "runtime", tmp_path / "run"
@@ -261,7 +261,7 @@ def test_a_launch_and_its_verbs_find_each_other_whoever_takes_the_name_first(
     assert len(list(temporary.glob("swarmctl-*"))) == 2, "one more, not one each time"
 
 
-def test_a_runtime_directory_of_somebody_else_is_not_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_runtime_directory_of_another_user_is_not_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """As after `su` or `sudo -E`."""
     temporary, runtime, folder = tmp_path / "tmp", tmp_path / "runtime", tmp_path / "run"
     for place in (temporary, runtime, folder):

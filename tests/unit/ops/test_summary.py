@@ -1,4 +1,4 @@
-"""How a flight went is said whatever becomes of the disk it was recorded on."""
+"""The result of a flight is printed whatever happens to the disk it was recorded on."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from swarmctl.config import Config, dump
 from tests.unit.telemetry.test_run_folder import write_run
 
-# What the launcher does when everybody has landed; `limit` is the largest file the system lets it write.
+# What the launcher does after all agents have landed; `limit` is the largest file the system lets it write.
 _SUM_UP = """
 import resource, sys
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""How the simulated ArduCopter flies: measured steps, thrust and climb-rate semantics, masks, timeouts, modes."""
+"""Flight of the simulated ArduCopter: measured steps, thrust and climb-rate semantics, masks, timeouts, modes."""
 
 from __future__ import annotations
 

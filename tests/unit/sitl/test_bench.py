@@ -1,4 +1,4 @@
-"""The bench measures what it says: a real agent in a plausible crowd, and one problem for all solvers."""
+"""The bench measures a real agent among plausible neighbours, and one problem for all solvers."""
 
 from __future__ import annotations
 

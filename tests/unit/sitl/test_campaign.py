@@ -1,4 +1,4 @@
-"""The parts of a campaign that fly nothing: judging, intervals, layouts, the folder, what is refused."""
+"""The parts of a campaign that fly nothing: judging, intervals, layouts, the folder, and refusals."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def test_a_column_is_in_the_way_at_every_height(column: bool, collided: bool) ->
     assert watcher.min_separation_m > 8.0
 
 
-def test_who_leaves_again_has_not_arrived() -> None:
+def test_a_vehicle_that_leaves_again_has_not_arrived() -> None:
     watcher = monitor(np.zeros((2, 3)))
     there = np.zeros((2, 3))
     watcher.see(1.0, there, REST)
@@ -77,7 +77,7 @@ def test_who_leaves_again_has_not_arrived() -> None:
     assert watcher.arrived_s == np.inf, "passing through"
 
 
-def test_who_stands_still_is_told_from_who_creeps() -> None:
+def test_standing_still_is_distinguished_from_creeping() -> None:
     watcher = monitor(np.zeros((2, 3)))
     for tick in range(200):
         watcher.see(0.02 * tick, np.array([[1.0, 0.0, 0.0], [0.05 * 0.02 * tick, 3.0, 0.0]]), REST)
@@ -89,7 +89,7 @@ def test_who_stands_still_is_told_from_who_creeps() -> None:
     [(4.0, 0.0, True), (3.0, 0.0, False), (3.0, 0.5, True)],
     ids=["clear", "on it", "passes"],
 )
-def test_what_stays_never_appears_where_somebody_is_to_arrive(goal_m: float, speed_m_s: float, appears: bool) -> None:
+def test_a_static_obstacle_never_appears_at_a_goal(goal_m: float, speed_m_s: float, appears: bool) -> None:
     """2.5 m before a vehicle that flies north; one metre is kept from it."""
     goals = np.array([[goal_m, 0.0, 0.0]])
     appearance = Appearance(0, 1.0, 2.5, 2.2, 0.5, 1.0, speed_m_s, 1, goals)
@@ -154,7 +154,7 @@ def broken(trial: Trial) -> Row:
     return row_of(trial)
 
 
-def test_a_trial_that_breaks_is_told_and_the_others_go_on() -> None:
+def test_a_trial_that_fails_is_reported_and_the_others_go_on() -> None:
     trials = [Trial(CELL, seed) for seed in (1, 2, 3)]
     results = dict(on_this_machine(trials, 1, broken))
     assert results[trials[1]] == "RuntimeError: no such luck"
@@ -182,7 +182,7 @@ def test_cells_that_cannot_be_flown_are_refused_first(
     assert not (tmp_path / "none").exists()
 
 
-def test_nobody_hears_anybody_on_a_mute_bus() -> None:
+def test_a_partitioned_bus_delivers_nothing() -> None:
     now_us = 0
     hub = LocalHub(lambda: now_us)
     one, other = hub.attach(agent_name(0)), hub.attach(agent_name(1))

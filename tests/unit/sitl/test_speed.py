@@ -172,7 +172,7 @@ def test_a_silent_client_is_waited_for_once_only(monkeypatch: pytest.MonkeyPatch
     assert time.monotonic() - began >= 0.2  # and is waited for again
 
 
-def test_nobody_in_offboard_is_not_waited_for() -> None:
+def test_without_a_vehicle_in_offboard_the_physics_does_not_wait() -> None:
     flown = offboard_world()
     gate = realtime.Gate(flown.world)
     began = time.monotonic()

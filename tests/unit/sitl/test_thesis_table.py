@@ -1,4 +1,4 @@
-"""The table of what is reproduced: every row that was asked for, by its published figure and its limit."""
+"""The table of the reproduction: every required row, with its published figure and its limit."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ FULL: list[Wanted] = [
 
 
 def fake(job: Job, apart_m: float = 1.0, off_m: float = 1.0) -> Trace:
-    """A flight nobody flew: 12 s, agents `off_m` above a reference at rest and `apart_m` from each other."""
+    """A synthetic flight: 12 s, agents `off_m` above a reference at rest and `apart_m` from each other."""
     agents = 3 if job.flight in SWARMS else 1
     t_s = np.asarray(np.arange(600) * 0.02, np.float64)
     nothing = np.zeros((600, agents, 3))
@@ -182,7 +182,7 @@ def test_rows_show_their_figure(table: dict[str, Row], name: str, ours: float) -
     assert table[name].ours == pytest.approx(ours, abs=1e-12)
 
 
-def test_distances_that_were_not_kept_are_told() -> None:
+def test_distances_that_were_not_kept_are_reported() -> None:
     near = {job.name: fake(job, apart_m=0.85, off_m=-3.5) for job in JOBS if job.flight in SWARMS}
     found = {row.name: row for row in thesis.rows(near)}
     assert found["circle dmpc, Table 19, 3 x 0.3 m, closer than the radius by"].ours == pytest.approx(0.05)

@@ -1,4 +1,4 @@
-"""Wind: MIL-F-8785C's numbers, what it does to a vehicle, and that still air is still."""
+"""Wind: MIL-F-8785C's numbers, the effect on a vehicle, and still air."""
 
 from __future__ import annotations
 
