@@ -109,7 +109,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--autopilot", choices=("px4", "arducopter"), default="px4", help="autopilot that the vehicles imitate")
     add("--spawn", type=_spawns, metavar='"x,y,z;..."', help="NED metres; default: a line along x, 1 m apart")
     add("--origin", type=_origin, default=(47.397742, 8.545594, 489.4), metavar="LAT,LON,ALT", help="shared origin")
-    add("--port", type=_integer(1, 65535), default=14540, help="first vehicle sends here until somebody talks to it")
+    add("--port", type=_integer(1, 65535), default=14540, help="first vehicle sends here until it receives")
     add("--local-port", type=_integer(1, 65535), default=14580, help="first vehicle listens here")
     add("--local-fds", type=_ports, metavar="FD,...", help="inherited, bound UDP sockets instead, one for each vehicle")
     add("--gcs-port", type=_integer(0, 65535), default=0, help="second link of every vehicle to here; 0: none")

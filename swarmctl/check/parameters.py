@@ -184,7 +184,7 @@ ROWS: dict[str, tuple[Row, ...]] = {
         Row("COM_RC_IN_MODE", "where sticks come from", _radio_source),
         Row("MPC_THR_HOVER", "what hovers", _hover),
         Row("THR_MDL_FAC", "how thrust becomes motor speed", _thrust_model),
-        Row("MAV_SYS_ID", "who it is after the next boot", _own_sysid),
+        Row("MAV_SYS_ID", "its system id after the next boot", _own_sysid),
     ),
     "ArduCopter": (
         Row("GUID_OPTIONS", "what thrust means", _guided_options),
@@ -195,7 +195,7 @@ ROWS: dict[str, tuple[Row, ...]] = {
         Row("ARMING_CHECK", "what is checked before arming", _arming_check),
         Row("ANGLE_MAX", "how far it tilts", _angle_max),
         Row("MOT_THST_HOVER", "what hovers", _hover),
-        Row("SYSID_THISMAV", "who it is after the next boot", _own_sysid),
+        Row("SYSID_THISMAV", "its system id after the next boot", _own_sysid),
     ),
 }
 _ALSO_READ = {"PX4": ("NAV_RCL_ACT",), "ArduCopter": ()}  # parameters that rows refer to

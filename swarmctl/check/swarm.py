@@ -36,7 +36,7 @@ def exit_code(vehicles: Sequence[VehicleFacts], lines: Sequence[Finding]) -> int
 
 def standing(vehicles: Sequence[VehicleFacts]) -> list[Finding]:
     """Return a finding for each vehicle that may not be flown now: armed, in the air, or of unknown state."""
-    advice = "somebody else flies it, or has left it armed: land and disarm it first"
+    advice = "another program flies it, or has left it armed: land and disarm it first"
     return [
         Finding(facts.agent, "to fly", FIX, "armed" if facts.armed else facts.landed.name.lower(), "on ground", advice)
         for facts in vehicles

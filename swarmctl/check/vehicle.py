@@ -45,7 +45,7 @@ _DRIFT_NOTE_PPM, _DRIFT_FIX_PPM = 20_000.0, 50_000.0
 _ORIGIN_FAR_M = 1000.0  # local frames are rotated against each other, and the earth is curved
 _LINK_SHARE_01 = 0.7  # usable share of a serial link's capacity
 _LATCH = (
-    "PX4 sends only to whoever spoke to it first, for good: if another program did, restart PX4, "
+    "PX4 sends only to its first sender, for good: if that was another program, restart PX4, "
     "or use the port of that program"
 )
 _BITS_A_BYTE = 10  # with start and stop bit
@@ -135,9 +135,9 @@ def _state(facts: VehicleFacts, config: Config) -> Finding:
     if facts.system_status >= _CRITICAL:
         return line(FIX, f"the autopilot reports a failsafe or emergency (MAV_STATE {facts.system_status})", 99)
     if facts.armed and facts.mode is FlightMode.EXTERNAL:
-        return line(NOTE, "somebody is flying it by setpoints now; it is left alone", 9)
+        return line(NOTE, "another program flies it by setpoints now; it is not changed", 9)
     if facts.armed:
-        return line(NOTE, "it is armed; it is left alone", 8)
+        return line(NOTE, "it is armed; it is not changed", 8)
     return line(OK)
 
 

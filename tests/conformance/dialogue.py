@@ -113,7 +113,7 @@ class Dialogue:
 
     @property
     def text_link(self) -> str:
-        """Where texts are told: the link that hears a ground station."""
+        """Return the link that receives texts: the one with a ground station."""
         return v.GCS_LINK if v.GCS_LINK in self.partner.links else v.OFFBOARD_LINK
 
     @property

@@ -191,17 +191,17 @@ def _partition(rng: np.random.Generator, agents: int) -> Layout:
 
 SCENARIOS: dict[str, Scenario] = {
     "circle": Scenario("the thesis' climbing circle, one reference for all", _circle, (3,)),
-    "swap": Scenario("everybody to the opposite side of a circle, starts 5 cm off", _swap, (6, 10), needs=2),
+    "swap": Scenario("every agent to the opposite side of a circle, starts 5 cm off", _swap, (6, 10), needs=2),
     "symmetric": Scenario("the same from a perfect polygon", _symmetric, (6, 10), needs=2),
     "random": Scenario("random transitions in 3 x 3 x 2 m, small vehicles", _random, (4, 10, 20), alone=True),
-    "same_goal": Scenario("everybody to one point", _same_goal, (3, 6, 10)),
+    "same_goal": Scenario("all agents to one point", _same_goal, (3, 6, 10)),
     "forest": Scenario("swap through 20 columns, small vehicles", _forest, (10,), needs=2),
     "maze": Scenario("both ways through four rows of walls, small vehicles", _maze, (10,)),
     "sudden_static": Scenario("an obstacle appears in the middle of a swap", _sudden_static, (6,), needs=2),
     "sudden_moving": Scenario("one crosses the swap at 0.5 to 1 m/s", _sudden_moving, (6,), needs=2),
-    "uncooperative": Scenario("one of a swap avoids nobody", _uncooperative, (6,), needs=2),
+    "uncooperative": Scenario("one agent of a swap avoids nothing", _uncooperative, (6,), needs=2),
     "death": Scenario("one agent of a swap dies on the way", _death, (6,), needs=2),
-    "partition": Scenario("nobody hears anybody for 2 s of a swap", _partition, (6, 10), needs=2),
+    "partition": Scenario("the bus delivers nothing for 2 s of a swap", _partition, (6, 10), needs=2),
 }
 
 

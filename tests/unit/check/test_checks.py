@@ -165,8 +165,8 @@ PX4_CASES: list[tuple[str, dict[str, Any], Verdict, str]] = [
     ("autopilot", {"version": Version((1, 18, 0), "beta", "", 1, "0", False)}, FIX, "encodes integer"),
     ("autopilot", {"version": None}, NOTE, "version"),
     ("system id", {"sysid": 7}, FIX, "MAV_SYS_ID = 1"),
-    ("state", {"armed": True}, NOTE, "left alone"),
-    ("state", {"armed": True, "mode": FlightMode.EXTERNAL}, NOTE, "somebody is flying"),
+    ("state", {"armed": True}, NOTE, "not changed"),
+    ("state", {"armed": True, "mode": FlightMode.EXTERNAL}, NOTE, "another program flies"),
     ("state", {"system_status": 5}, FIX, "failsafe"),
     ("sensors", {"sensors": None}, NOTE, "SYS_STATUS"),
     ("sensors", {"sensors": Sensors(ALL_SENSORS, ALL_SENSORS, 0x1320C83F & ~4, 16.2, 1.0)}, FIX, "calibrate"),
@@ -332,10 +332,10 @@ def test_a_clock_one_percent_slow_is_no_finding(config: Config) -> None:
 @pytest.mark.parametrize("url", (*URLS, "udpout://10.0.0.5:14580"))
 def test_silence_over_udp_names_the_first_sender_and_the_cure(config: Config, url: str) -> None:
     advice = line_of(findings([unreached(0, url, 1, "nothing is heard")], config), "link").advice
-    assert "spoke to it first" in advice
+    assert "to its first sender" in advice
     assert "restart PX4" in advice
     serial = line_of(findings([unreached(0, "serial:///dev/ttyACM0:921600", 1, "nothing")], config), "link")
-    assert "spoke to it first" not in serial.advice
+    assert "to its first sender" not in serial.advice
 
 
 def test_the_spread_of_origins_is_shown_and_harmless(config: Config) -> None:
