@@ -1,7 +1,7 @@
-"""`python -m sitl`: N PX4-like vehicles on loopback UDP, in real time. Arguments in, exit code out.
+"""`python -m sitl`: simulates N vehicles on loopback UDP in real time.
 
-Vehicle i listens on 127.0.0.1:(local-port + i) and sends to 127.0.0.1:(port + i) until the first datagram arrives; from
-then on it talks to that sender only, though it obeys everybody, as PX4 does. Given `--remote-ports` it obeys those.
+Vehicle i listens on 127.0.0.1:(local-port + i) and sends to 127.0.0.1:(port + i) until the first datagram arrives. From
+then on it sends to that sender only, but obeys every sender, as PX4 does. With `--remote-ports` it obeys only those.
 With `--gcs-port` each vehicle has a second link to a ground station there, from 127.0.0.1:(18570 + i). With
 `--tcp-port` it serves one client on TCP (tcp-port + 10 i) instead, as ArduCopter's own simulator does.
 """
@@ -23,7 +23,7 @@ from sitl.plant.attitude import THESIS_GAINS
 from swarmctl.errors import EXIT_OK, EXIT_USAGE, SwarmError
 
 if TYPE_CHECKING:
-    from sitl.realtime import Tally
+    from sitl.realtime import LoopStatistics
     from sitl.world import SitlParams, SitlWorld
     from swarmctl.core.simulated import RealismParams
     from swarmctl.mavlink.transport import Transport
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 _SET_HELP = "wind, battery, rotors, faults as under [sitl] of a configuration, such as wind.turbulence_m_s=5"
 
-GCS_LOCAL_PORT = 18570  # of the first vehicle, as PX4's
+GCS_LOCAL_PORT = 18570  # of the first vehicle, as in PX4
 
 
 class _OneLineParser(argparse.ArgumentParser):
@@ -106,10 +106,10 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--attitude-gains", choices=tuple(THESIS_GAINS), default="swarm", help="attitude PIDs of the thesis airframe")
     add("--estimator", choices=("exact", "gps", "external"), default="exact", help="errors of the vehicles' estimates")
-    add("--autopilot", choices=("px4", "arducopter"), default="px4", help="whose face the vehicles show")
+    add("--autopilot", choices=("px4", "arducopter"), default="px4", help="autopilot that the vehicles imitate")
     add("--spawn", type=_spawns, metavar='"x,y,z;..."', help="NED metres; default: a line along x, 1 m apart")
     add("--origin", type=_origin, default=(47.397742, 8.545594, 489.4), metavar="LAT,LON,ALT", help="shared origin")
-    add("--port", type=_integer(1, 65535), default=14540, help="first vehicle sends here until somebody talks to it")
+    add("--port", type=_integer(1, 65535), default=14540, help="first vehicle sends here until it receives")
     add("--local-port", type=_integer(1, 65535), default=14580, help="first vehicle listens here")
     add("--local-fds", type=_ports, metavar="FD,...", help="inherited, bound UDP sockets instead, one for each vehicle")
     add("--gcs-port", type=_integer(0, 65535), default=0, help="second link of every vehicle to here; 0: none")
@@ -138,7 +138,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _joined(arguments: list[str]) -> list[str]:
-    """`--spawn -1,0,0` as `--spawn=-1,0,0`: argparse would take a value that begins with a minus for an option."""
+    """Join `--spawn -1,0,0` to `--spawn=-1,0,0`: argparse takes a value that begins with a minus for an option."""
     joined: list[str] = []
     for argument in arguments:
         if joined and joined[-1] in ("--spawn", "--origin", "--wind"):
@@ -149,7 +149,7 @@ def _joined(arguments: list[str]) -> list[str]:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the simulator; returns the process exit code."""
+    """Run the simulator and return the process exit code."""
     options = _parser().parse_args(_joined(sys.argv[1:] if arguments is None else arguments))
     if options.die_with_parent:
         from swarmctl.process_lifetime import die_with_parent
@@ -191,7 +191,7 @@ def _params(options: argparse.Namespace) -> SitlParams:
 
 
 def _realism(options: argparse.Namespace) -> RealismParams:
-    """Wind, battery, rotors, faults; read and refused as the configuration of a run is."""
+    """Return wind, battery, rotors and faults, parsed and refused as in the configuration of a run."""
     from swarmctl.core.simulated import RealismParams
 
     sets = [f"wind.mean_ned_m_s={list(options.mean_wind)}"] if options.mean_wind else []
@@ -245,9 +245,9 @@ def _run(options: argparse.Namespace) -> int:
     complaint = ""
     control = ControlSocket(options.control, options.die_with_parent) if options.control else None
     try:
-        gc.freeze()  # what has been built stays: nothing for the collector to walk through in flight
+        gc.freeze()  # the garbage collector need not traverse start-up objects in flight
         gate = realtime.Gate(world) if options.lockstep else None
-        tally = realtime.fly(world, stop, truth, speed=options.speed, control=control, gate=gate)
+        statistics = realtime.fly(world, stop, truth, speed=options.speed, control=control, gate=gate)
     finally:
         if control is not None:
             control.close()
@@ -255,13 +255,13 @@ def _run(options: argparse.Namespace) -> int:
         for endpoint in (*world.endpoints, *world.gcs_endpoints):
             endpoint.transport.close()
     if options.stats:
-        options.stats.write_text(json.dumps({"boot_us": world.boot_us, **asdict(tally)}), encoding="utf-8")
-    print("; ".join(filter(None, (_summary(world, tally), complaint))), flush=True)
+        options.stats.write_text(json.dumps({"boot_us": world.boot_us, **asdict(statistics)}), encoding="utf-8")
+    print("; ".join(filter(None, (_summary(world, statistics), complaint))), flush=True)
     return EXIT_OK
 
 
 def _udp_links(options: argparse.Namespace) -> tuple[list[Transport], list[str]]:
-    """Links of all vehicles, and where each is."""
+    """Return the links of all vehicles, and their addresses."""
     from sitl import realtime
     from sitl.net.ports import OpenPort
     from swarmctl.errors import ConfigError
@@ -291,7 +291,7 @@ def _udp_links(options: argparse.Namespace) -> tuple[list[Transport], list[str]]
 
 
 def _gcs_links(options: argparse.Namespace) -> tuple[list[Transport], str]:
-    """A ground station's links, and where they are; none when there is no port for it."""
+    """Return the links to a ground station, and their addresses; none without a port for it."""
     from sitl import realtime
     from sitl.net.ports import OpenPort
     from swarmctl.errors import ConfigError
@@ -314,13 +314,13 @@ def _tcp_links(options: argparse.Namespace) -> tuple[list[Transport], list[str]]
     return list(servers), [f"tcp={server.port}" for server in servers]
 
 
-def _summary(world: SitlWorld, tally: Tally) -> str:
-    seconds = tally.steps / world.params.physics_hz
+def _summary(world: SitlWorld, statistics: LoopStatistics) -> str:
+    seconds = statistics.steps / world.params.physics_hz
     ignored = sum(sum(e.ignored.values()) for e in world.endpoints)
     refused = sum(sum(p.refused.values()) for p in world.autopilots)
     return (
-        f"sitl: {seconds:.1f} s in {tally.steps} steps, {tally.late} late, {tally.stalls} stalls "
-        f"({tally.lost_us / 1e6:.1f} s), {ignored} frames ignored, {refused} setpoints refused"
+        f"sitl: {seconds:.1f} s in {statistics.steps} steps, {statistics.late} late, {statistics.stalls} stalls "
+        f"({statistics.lost_us / 1e6:.1f} s), {ignored} frames ignored, {refused} setpoints refused"
     )
 
 

@@ -1,4 +1,4 @@
-"""A running simulator's ear for faults: JSON requests on a Unix datagram socket, each answered to its sender.
+"""Fault interface of a running simulator: JSON requests on a Unix datagram socket, each answered to its sender.
 
 `{"fault": {"kind": "motor", "vehicle": 0, "value": 0.5, "for_s": 2}}` is answered by `{"ok": true, "since_boot_s": 12}`
 or by `{"ok": false, "problems": ["value = 7: allowed for motor: 0 to 1 (...)"]}`.
@@ -23,10 +23,10 @@ _LARGEST = 8192
 
 
 class ControlSocket:
-    """Bound where the launcher said; gone with `close`.
+    """The control socket, bound to a path until `close`.
 
     Args:
-        of_launch: the folder is a launch's own; whoever ends last, the router or this, takes it away.
+        of_launch: the folder belongs to a launch; the last of router and simulator to end removes it.
 
     Raises:
         ConfigError: the path is taken or can't be made.
@@ -49,7 +49,7 @@ class ControlSocket:
         self._socket.setblocking(False)
 
     def poll(self, world: SitlWorld) -> None:
-        """Answer what has arrived."""
+        """Answer every request that has arrived."""
         while True:
             try:
                 request, sender = self._socket.recvfrom(_LARGEST)
@@ -59,7 +59,7 @@ class ControlSocket:
             try:
                 self._socket.sendto(answer, sender)
             except (OSError, TypeError):
-                continue  # it has no address, or did not wait
+                continue  # the sender has no address, or did not wait
 
     def close(self) -> None:
         self._socket.close()
@@ -70,7 +70,7 @@ class ControlSocket:
 
 
 def handle(request: bytes, world: SitlWorld) -> dict[str, Any]:
-    """Do what a request asks, or say everything that is wrong with it."""
+    """Execute a request, or return everything that is wrong with it."""
     try:
         asked = json.loads(request)
         wanted = asked["fault"]

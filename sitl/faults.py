@@ -1,6 +1,6 @@
-"""Faults: what each kind does to a world, when it begins and when it ends.
+"""Faults: the effect of each kind on a world at its begin and its end.
 
-A fault of the same kind on the same vehicle (and rotor) replaces the one before. Everything here is on simulated time.
+A fault replaces an earlier one of the same kind on the same vehicle (and rotor). All times are simulated.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from sitl.net.lossy import LossyLink, Way
+from sitl.net.lossy import LinkDirection, LossyLink
 from sitl.plant.estimator import Estimator
 from sitl.plant.physics import Physics
 from sitl.plant.vehicle import Array
@@ -22,75 +22,75 @@ Undo = Callable[[], None]
 _NEVER_US = 1 << 62
 
 
-class Afflicted(Protocol):
-    """What faults act on."""
+class FaultTarget(Protocol):
+    """The interface of a world that faults act on."""
 
     @property
     def physics(self) -> Physics:
-        """Plant, air, battery."""
+        """Plant, air and battery."""
 
     @property
     def estimator(self) -> Estimator:
-        """What the vehicles believe."""
+        """Estimates of all vehicles."""
 
     def links_of(self, vehicle: int) -> Sequence[LossyLink]:
-        """Every link of a vehicle."""
+        """Return every link of a vehicle."""
 
     def reboot(self, vehicle: int, now_us: int) -> None:
-        """Start its autopilot again."""
+        """Restart the autopilot of a vehicle."""
 
 
-def _gps_loss(world: Afflicted, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
+def _gps_loss(world: FaultTarget, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
     world.estimator.lose_gps(vehicle)
     return lambda: world.estimator.find_gps(vehicle)
 
 
-def _estimator_jump(world: Afflicted, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
+def _estimator_jump(world: FaultTarget, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
     by_ned_m = fault.amount * _towards(fault)
     world.estimator.jump(vehicle, by_ned_m)
     return lambda: world.estimator.jump(vehicle, -by_ned_m)
 
 
-def _estimator_freeze(world: Afflicted, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
+def _estimator_freeze(world: FaultTarget, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
     world.estimator.freeze(vehicle, now_us)
     return lambda: world.estimator.thaw(vehicle)
 
 
-def _motor(world: Afflicted, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
+def _motor(world: FaultTarget, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
     world.physics.set_rotor_health(vehicle, fault.rotor, fault.amount)
     return lambda: world.physics.set_rotor_health(vehicle, fault.rotor, 1.0)
 
 
-def _mass(world: Afflicted, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
+def _mass(world: FaultTarget, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
     world.physics.set_mass(vehicle, fault.amount)
     return lambda: world.physics.set_mass(vehicle, 1.0)
 
 
-def _gust(world: Afflicted, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
+def _gust(world: FaultTarget, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
     on = np.zeros(world.physics.plant.state.shape[1])
     on[vehicle] = 1.0
     gust = Gust(fault.amount * _towards(fault).reshape(3, 1), now_us * 1e-6, fault.for_s, on)
     world.physics.air.gusts.append(gust)
-    return lambda: None  # it blows itself out
+    return lambda: None  # a gust ends by itself
 
 
-def _battery(world: Afflicted, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
+def _battery(world: FaultTarget, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
     world.physics.drain(vehicle, fault.amount)
     return lambda: None
 
 
-def _reboot(world: Afflicted, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
+def _reboot(world: FaultTarget, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
     world.reboot(vehicle, now_us)
     return lambda: None
 
 
-def _link(trouble: str) -> Callable[[Afflicted, int, FaultParams, int], Undo]:
-    def begin(world: Afflicted, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
-        ways = list(_ways(world.links_of(vehicle), fault.direction))
+def _link(impairment: str) -> Callable[[FaultTarget, int, FaultParams, int], Undo]:
+    def begin(world: FaultTarget, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
+        directions = list(_directions(world.links_of(vehicle), fault.direction))
 
         def put(amount: float) -> None:
-            for way in ways:
-                way.trouble(trouble, amount)
+            for direction in directions:
+                direction.set_impairment(impairment, amount)
 
         put(fault.amount)
         return lambda: put(0.0)
@@ -98,7 +98,7 @@ def _link(trouble: str) -> Callable[[Afflicted, int, FaultParams, int], Undo]:
     return begin
 
 
-_BEGIN: dict[str, Callable[[Afflicted, int, FaultParams, int], Undo]] = {
+_BEGIN: dict[str, Callable[[FaultTarget, int, FaultParams, int], Undo]] = {
     "gps_loss": _gps_loss,
     "estimator_jump": _estimator_jump,
     "estimator_freeze": _estimator_freeze,
@@ -120,10 +120,10 @@ class Faults:
     """Begins and ends the faults of one world.
 
     Attributes:
-        on_event: told of every beginning and end: name, time since boot [us], fields.
+        on_event: called at every begin and end with name, time since boot [us] and fields.
     """
 
-    def __init__(self, world: Afflicted, scheduled: Iterable[FaultParams], vehicles: int) -> None:
+    def __init__(self, world: FaultTarget, scheduled: Iterable[FaultParams], vehicles: int) -> None:
         self.on_event: Callable[[str, int, dict[str, Any]], None] = lambda name, t_us, fields: None
         self._world = world
         self._vehicles = vehicles
@@ -132,7 +132,7 @@ class Faults:
         self._next_us = self._earliest_us()
 
     def step(self, now_us: int) -> None:
-        """Begin and end what is due; `now_us` since boot."""
+        """Begin and end the faults that are due at `now_us` since boot."""
         if now_us < self._next_us:
             return
         for key, (end_us, fault, vehicle, undo) in list(self._running.items()):
@@ -145,7 +145,7 @@ class Faults:
         self._next_us = self._earliest_us()
 
     def begin(self, fault: FaultParams, now_us: int) -> None:
-        """Let a fault happen now, whatever its `at_s`."""
+        """Begin a fault now, whatever its `at_s`."""
         self._begin(fault, now_us)
         self._next_us = self._earliest_us()
 
@@ -177,7 +177,7 @@ def _towards(fault: FaultParams) -> Array:
     return np.array([math.cos(azimuth_rad), math.sin(azimuth_rad), 0.0])
 
 
-def _ways(links: Sequence[LossyLink], direction: str) -> Iterable[Way]:
+def _directions(links: Sequence[LossyLink], direction: str) -> Iterable[LinkDirection]:
     for link in links:
         if direction in ("both", "to_vehicle"):
             yield link.to_vehicle

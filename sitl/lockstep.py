@@ -1,7 +1,7 @@
-"""A whole flight in one process on a simulated clock: the real `Agent`, real MAVLink bytes, faster than real time.
+"""Flies a run in one process on a simulated clock: real agents, real MAVLink bytes, faster than real time.
 
-Nothing here depends on wall time, and `swarmctl.kernels` keeps the processor out of it, so a seed gives the same states
-bit for bit, in whatever order agents are ticked.
+Nothing depends on wall time, and `swarmctl.kernels` makes results independent of the processor: a seed gives the same
+states bit for bit, in whatever order agents are ticked.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ from swarmctl.mavlink.autopilot import Autopilot
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.commands import CodecCommands
 from swarmctl.mavlink.transport import pipe_pair
-from swarmctl.telemetry.plain import plain
+from swarmctl.telemetry.json_safe import json_safe
 from swarmctl.telemetry.referee import RunData
 
-_TAIL_S = 120.0  # flight allowed before and after the mission
+_TAIL_S = 120.0  # time allowed before and after the mission
 _TRUTH_EVERY_US = 20_000
 _OBSTACLES_EVERY_US = 1_000_000
 
 
 @dataclass
 class FlightLog:
-    """What one agent leaves behind; in memory, and in a run folder when there is one."""
+    """Records of one agent, in memory and, if there is one, in a run folder."""
 
     directory: Path | None
     agent: int
@@ -74,7 +74,7 @@ class FlightLog:
         return np.concatenate(self.rows) if self.rows else np.zeros(0, TICK_DTYPE)
 
     def close(self) -> None:
-        """Write what a live agent would have written.
+        """Write the files that a live agent writes.
 
         Raises:
             OSError: the disk refuses.
@@ -88,13 +88,13 @@ class FlightLog:
 
 
 class Lockstep:
-    """One flight, step by step.
+    """Steps one flight.
 
     Args:
         config: the run.
-        directory: where agents' files go; None keeps everything in memory.
-        order: in which agents are ticked within a step; must not matter.
-        own: configurations of agents that fly by another one than the run's.
+        directory: folder for the agents' files; None keeps everything in memory.
+        order: order of ticking agents within a step; has no effect on the result.
+        own: configurations of agents that differ from the run's.
     """
 
     def __init__(
@@ -124,7 +124,7 @@ class Lockstep:
         self._own = dict(own or {})
         self.agents: list[Agent | None] = [self._agent(i, self.links[i][0]) for i in range(agents)]
         self.frozen: set[int] = set()  # agents whose process is stopped: alive on the bus, but not ticking
-        self.starved: dict[int, int] = {}  # agent -> of how many ticks its processor lets it do one
+        self.starved: dict[int, int] = {}  # agent -> its processor executes one tick out of this many
         self._missed = [0] * agents
         self._steps = 0
         self._order = list(order) if order is not None else list(range(agents))
@@ -150,7 +150,7 @@ class Lockstep:
         )
 
     def step(self) -> None:
-        """One tick of every agent, then the physics up to the next."""
+        """Tick every agent once, then step the physics to the next tick."""
         now_us = self.clock.now_us()
         if now_us % _OBSTACLES_EVERY_US == 0:
             self._operator.publish(topics.OBSTACLES, topics.encode_message(self._obstacles))
@@ -170,17 +170,17 @@ class Lockstep:
             self._truth.append(self.world.truth_rows())
 
     def kill(self, index: int) -> None:
-        """An agent process dies: no more setpoints, gone from the bus."""
+        """End an agent's process: no more setpoints, and its bus session closes."""
         self.agents[index] = None
         self.hub.detach(agent_name(index))
 
     def command(self, verb: Any, agent: int = -1) -> None:
-        """What an operator's verb does."""
+        """Send an operator's command, as a verb does."""
         message = topics.CommandMessage(verb, agent, self.clock.utc_us())
         self._operator.publish(topics.COMMAND, topics.encode_message(message))
 
     def set_obstacles(self, obstacles: Sequence[topics.ObstacleMessage]) -> None:
-        """What an operator's verb does: the whole list, which replaces the one before."""
+        """Replace the obstacle list, as an operator's verb does."""
         self._obstacles = topics.ObstaclesMessage(self._obstacles.version + 1, tuple(obstacles))
         self._operator.publish(topics.OBSTACLES, topics.encode_message(self._obstacles))
 
@@ -194,12 +194,12 @@ class Lockstep:
         return np.concatenate(self._truth) if self._truth else np.zeros(0, TRUTH_DTYPE)
 
     def recorded(self) -> RunData:
-        """What a run folder would hold of the flight so far."""
+        """Return what a run folder would hold of the flight so far."""
         events = [event for log in self.logs for event in log.events] + self.fault_events
-        return RunData({log.agent: log.ticks for log in self.logs}, self.truth, [plain(event) for event in events])
+        return RunData({log.agent: log.ticks for log in self.logs}, self.truth, [json_safe(event) for event in events])
 
     def problems(self) -> list[str]:
-        """Why the mission is not complete; empty when it is."""
+        """Return why the mission is not complete; empty when it is."""
         found = []
         for i, agent in enumerate(self.agents):
             if agent is None:
@@ -209,7 +209,7 @@ class Lockstep:
         return found
 
     def run(self, on_step: Callable[[Lockstep], None] | None = None) -> None:
-        """Fly until every agent has landed, or far longer than the mission should take."""
+        """Fly until every agent has landed, or the time limit is reached."""
         limit_us = round((self.config.mission.duration_s + _TAIL_S) * 1e6)
         while not self.finished and self.clock.now_us() < limit_us:
             self.step()
@@ -218,12 +218,12 @@ class Lockstep:
 
 
 def write_events(path: Path, events: Sequence[dict[str, Any]]) -> None:
-    """One JSON object a line, as live processes log them."""
+    """Write one JSON object per line, as live processes log them."""
     path.write_bytes(b"".join(msgspec.json.encode(event) + b"\n" for event in events))
 
 
 def sitl_params(config: Config) -> SitlParams:
-    """The simulator of a configuration."""
+    """Return the simulator parameters of a configuration."""
     spawn = np.array(config.starts_ned_m())
     if config.sitl.start == "ground":
         spawn[:, 2] = config.sitl.ground_z_m
@@ -248,5 +248,5 @@ def sitl_params(config: Config) -> SitlParams:
 
 
 def obstacles_message(config: Config) -> topics.ObstaclesMessage:
-    """The configured obstacles as agents hear of them."""
+    """Return the message that publishes the configured obstacles."""
     return topics.first_obstacles(o.model_dump() for o in config.obstacles)

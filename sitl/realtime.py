@@ -1,8 +1,8 @@
 """Flies a `SitlWorld` against the wall clock: absolute deadlines, bounded catch-up, a truth file, a clean end.
 
-Short of CPU it first catches up step by step; after a stall longer than `STALL_US` the missed steps are given up, so
-that vehicles stand still for that time while their clocks go on, and clients keep a constant clock offset. Simulated
-time may run faster than the wall clock, and with a gate it waits for its clients instead of leaving them behind.
+Short of CPU, the loop first catches up step by step. After a stall longer than `STALL_US` it gives the missed steps up:
+vehicles stand still for that time while their clocks go on, so that clients keep a constant clock offset. Simulated
+time may run faster than the wall clock; with a gate it waits for its clients.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ _GATE_POLL_S = 1e-4
 
 
 @dataclass
-class Tally:
-    """What the loop has done so far."""
+class LoopStatistics:
+    """Timing counters of the loop."""
 
     steps: int = 0
-    late: int = 0  # began more than one step after their deadline
+    late: int = 0  # steps that began more than one step after their deadline
     stalls: int = 0
-    lost_us: int = 0  # of simulated motion, in stalls
+    lost_us: int = 0  # simulated motion lost in stalls
 
 
 class TruthFile:
-    """Raw `TRUTH_DTYPE` rows appended at 50 Hz, on disk within a second."""
+    """Appends raw `TRUTH_DTYPE` rows at 50 Hz, on disk within a second."""
 
     def __init__(self, path: Path) -> None:
         try:
@@ -56,7 +56,7 @@ class TruthFile:
         self._broken: OSError | None = None
 
     def record(self, world: SitlWorld, now_us: int) -> None:
-        """Append one row a vehicle when due; a full disk ends the file, not the flight."""
+        """Append one row per vehicle when due; a full disk ends the file, not the flight."""
         if now_us < self._next_us or self._broken is not None:
             return
         self._next_us = now_us - now_us % TRUTH_US + TRUTH_US
@@ -69,7 +69,7 @@ class TruthFile:
             self._broken = error
 
     def close(self) -> str:
-        """Flush and close; a complaint, or an empty string."""
+        """Flush and close; return a complaint, or ""."""
         try:
             self._file.close()
         except OSError as error:
@@ -78,13 +78,13 @@ class TruthFile:
 
 
 class StopRequest:
-    """Set by SIGINT or SIGTERM."""
+    """Records that SIGINT or SIGTERM has arrived."""
 
     def __init__(self) -> None:
         self.wanted = False
 
     def install(self) -> None:
-        """Take both signals over for the rest of the process."""
+        """Handle both signals for the rest of the process."""
         signal.signal(signal.SIGINT, self._on_signal)
         signal.signal(signal.SIGTERM, self._on_signal)
 
@@ -93,28 +93,28 @@ class StopRequest:
 
 
 def monotonic_us() -> int:
-    """CLOCK_MONOTONIC [us], comparable between processes of this host."""
+    """Return CLOCK_MONOTONIC [us], which is comparable between processes of this host."""
     return time.monotonic_ns() // 1000
 
 
 class EventFile:
-    """Faults as they begin and end, one JSON object a line; a full disk loses events, never the flight."""
+    """Writes faults at begin and end, one JSON object per line; a full disk loses events, never the flight."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
     def write(self, name: str, since_boot_us: int, fields: dict[str, Any]) -> None:
-        """Append one."""
+        """Append one event."""
         stamp = {"utc_us": time.time_ns() // 1000, "t_us": monotonic_us(), "source": "sitl", "event": name}
         with contextlib.suppress(OSError), self._path.open("a", encoding="utf-8") as file:
             file.write(json.dumps({**stamp, "since_boot_us": since_boot_us, **fields}) + "\n")
 
 
 class Gate:
-    """Holds the physics every `GATE_US` until each vehicle in OFFBOARD has got a new setpoint.
+    """Holds the physics every `GATE_US` until each vehicle in OFFBOARD has received a new setpoint.
 
-    A vehicle whose client says nothing for a second of wall time is not waited for until the client speaks again, so
-    that the autopilot can notice the loss.
+    A vehicle whose client is silent for a second of wall time is not waited for until the client sends again, so that
+    the autopilot can detect the loss.
     """
 
     def __init__(self, world: SitlWorld) -> None:
@@ -123,7 +123,7 @@ class Gate:
         self._given_up: set[int] = set()
 
     def wait(self, stop: StopRequest, now_us: int) -> None:
-        """Return when all have spoken."""
+        """Wait until all clients have sent."""
         deadline_us = monotonic_us() + GATE_PATIENCE_US
         while not stop.wanted:
             counts = self._world.setpoint_counts()
@@ -148,18 +148,18 @@ def fly(
     speed: float = 1.0,
     control: ControlSocket | None = None,
     gate: Gate | None = None,
-) -> Tally:
+) -> LoopStatistics:
     """Step the world at its physics rate until `stop`.
 
     Args:
-        world: what to step.
+        world: the simulation.
         stop: ends the flight.
-        truth: where true states go.
-        speed: simulated over wall time; with a gate, at most.
-        control: asked for faults ten times a second.
-        gate: makes the physics wait for its clients; time spent so is given up, on both clocks.
+        truth: file for true states, or None.
+        speed: simulated over wall time; an upper limit with a gate.
+        control: source of fault requests, polled ten times a second.
+        gate: makes the physics wait for its clients; this time is lost on both clocks.
     """
-    tally = Tally()
+    statistics = LoopStatistics()
     period_us = 1e6 / world.params.physics_hz
     gate_every, control_every = round(GATE_US / period_us), max(1, round(CONTROL_US * speed / period_us))
     start_us = sim_start_us = monotonic_us()
@@ -171,13 +171,13 @@ def fly(
             time.sleep(-behind_us * 1e-6)
             continue
         if behind_us > STALL_US:
-            tally.stalls += 1
-            tally.lost_us += round(behind_us * speed)
+            statistics.stalls += 1
+            statistics.lost_us += round(behind_us * speed)
             start_us += behind_us
             sim_start_us += round(behind_us * speed)
             sim_us += round(behind_us * speed)
         elif behind_us * speed > period_us:
-            tally.late += 1
+            statistics.late += 1
         if gate is not None and count % gate_every == 0:
             waited_us = -monotonic_us()
             gate.wait(stop, sim_us)
@@ -188,12 +188,12 @@ def fly(
         if truth is not None:
             truth.record(world, sim_us)
         count += 1
-    tally.steps = count
-    return tally
+    statistics.steps = count
+    return statistics
 
 
 def bind_range(first: int, count: int) -> tuple[list[socket.socket], int]:
-    """`count` sockets on consecutive loopback ports, from `first` or the next range that is free; and the shift.
+    """Bind `count` sockets on consecutive loopback ports, from `first` or the next free range; also return the shift.
 
     Raises:
         StartError: no range is free up to port 65535.
@@ -218,5 +218,5 @@ def _bind_all(first: int, count: int) -> list[socket.socket]:
 
 
 def remote_ports(first: int, shift: int, count: int, fixed: Sequence[int]) -> list[int]:
-    """Where each vehicle talks before anybody has talked to it."""
+    """Return the port to which each vehicle sends before it has received anything."""
     return list(fixed) if fixed else [first + shift + i for i in range(count)]

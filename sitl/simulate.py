@@ -30,7 +30,7 @@ from swarmctl.telemetry.run_folder import Outcome, create_run_folder, finish_run
 
 
 def simulate(config: Config, directory: Path) -> int:
-    """Fly `config` in lockstep into the run folder `directory`; returns the exit code."""
+    """Fly `config` in lockstep into the run folder `directory` and return the exit code."""
     replace_text(directory / "config.toml", dump(config))
     flight = Lockstep(config, directory)
     stop = _Interrupt()
@@ -69,8 +69,8 @@ def simulate(config: Config, directory: Path) -> int:
 
 @contextmanager
 def _progress(config: Config) -> Iterator[Callable[[float], None]]:
-    """A bar on a terminal; takes the simulated time [s]. A terminal that is gone is no reason to stop flying."""
-    total_s = config.mission.duration_s + 20.0  # there and back
+    """Yield a function of simulated time [s] that draws a bar on a terminal; a lost terminal stops nothing."""
+    total_s = config.mission.duration_s + 20.0  # time to the start and back
     bar = Progress(transient=True, disable=not sys.stdout.isatty())
     task = bar.add_task(f"simulating {config.swarm.agents} agents", total=total_s)
     with suppress(OSError):
@@ -83,7 +83,7 @@ def _progress(config: Config) -> Iterator[Callable[[float], None]]:
 
 
 def _write_rows(flight: Lockstep, directory: Path) -> tuple[str, ...]:
-    """What live processes would have left behind; returns what the disk did not take."""
+    """Write the files that live processes write; return what the disk did not take."""
     writers: dict[str, Callable[[], object]] = {
         "truth.bin": lambda: replace_bytes(directory / "truth.bin", flight.truth.tobytes()),
         **{f"agent-{log.agent}.ticks": log.close for log in flight.logs},
@@ -106,7 +106,7 @@ def _write_recording(config: Config, directory: Path) -> None:
 
 
 class _Interrupt:
-    """First Ctrl-C lands, the second ends at once; a closed terminal is the first only, however often it says so."""
+    """Counts stop requests: the first Ctrl-C lands, the second ends at once; a closed terminal is the first only."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -141,7 +141,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the verb; returns the process exit code."""
+    """Run the verb and return the process exit code."""
     options: dict[str, Any] = vars(_parser().parse_args(arguments))
     return exit_code_of(partial(_run, options))
 

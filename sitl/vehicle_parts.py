@@ -1,4 +1,4 @@
-"""What a `SitlWorld` needs of a vehicle's brain and of its MAVLink face, whichever autopilot they imitate."""
+"""Interfaces of a vehicle's autopilot and of its MAVLink side, as `SitlWorld` uses them for every dialect."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from swarmctl.mavlink.transport import Transport
 
 
 class ParameterTable(Protocol):
-    """Parameters by name, whatever their encoding on the wire."""
+    """Parameters by name, independent of their MAVLink encoding."""
 
     def real(self, name: str) -> float:
-        """Value of a parameter as a number."""
+        """Return a parameter as a real number."""
 
     def integer(self, name: str) -> int:
-        """Value of an integer parameter."""
+        """Return an integer parameter."""
 
     def assign(self, name: str, value: float) -> None:
-        """Set a parameter in this process, without the wire."""
+        """Set a parameter in this process, without MAVLink."""
 
 
 class Commander(Protocol):
@@ -29,37 +29,37 @@ class Commander(Protocol):
 
     @property
     def armed(self) -> bool:
-        """Motors may turn."""
+        """Whether the motors may turn."""
 
     @property
     def landed(self) -> Landed:
-        """MAV_LANDED_STATE."""
+        """The MAV_LANDED_STATE of the vehicle."""
 
     @property
     def output(self) -> Command:
-        """Attitude and thrust to fly; the object `IDLE` when motors rest."""
+        """Attitude and thrust to fly; the object `IDLE` while motors rest."""
 
     @property
     def released(self) -> bool:
-        """An air start's clamp has been opened."""
+        """Whether the clamp of an air start has been opened."""
 
     @property
     def refused(self) -> Counter[str]:
-        """Setpoints not used, by reason."""
+        """Number of unused setpoints, by reason."""
 
     @property
     def parameters(self) -> ParameterTable:
-        """The autopilot's parameters."""
+        """The parameters of the autopilot."""
 
     def flight_mode(self) -> FlightMode:
-        """What flies, independent of the dialect."""
+        """Return the flight mode, independent of the dialect."""
 
     def tick(self, estimate: Estimate, now_us: int, dt_s: float) -> None:
-        """One step of the autopilot; `now_us` is time since boot."""
+        """Run one step of the autopilot; `now_us` is time since boot."""
 
 
-class Face(Protocol):
-    """One vehicle on one MAVLink link."""
+class MavlinkInterface(Protocol):
+    """The MAVLink interface of one vehicle on one link."""
 
     @property
     def transport(self) -> Transport:
@@ -67,10 +67,10 @@ class Face(Protocol):
 
     @property
     def ignored(self) -> Counter[str]:
-        """Frames not used, by reason."""
+        """Number of unused frames, by reason."""
 
     def receive(self, now_us: int, transport_now_us: int) -> None:
         """Handle everything that has arrived; `now_us` is time since boot."""
 
     def send_due(self, now_us: int) -> None:
-        """Send what is due."""
+        """Send the messages that are due."""

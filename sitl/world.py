@@ -1,7 +1,7 @@
-"""All vehicles of one simulation: one plant, one autopilot and one MAVLink endpoint each, stepped together.
+"""All vehicles of a simulation, stepped together: one plant, and one autopilot and MAVLink endpoint per vehicle.
 
 The world has no clock and no thread. `step(now_us)` advances it by one physics step *to* `now_us`; the same calls with
-the same bytes give the same flight. Setpoints that have arrived by then act in that very step.
+the same bytes give the same flight. Setpoints that have arrived by then act in that step.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from sitl.px4.link.schedule import GCS_HZ
 from sitl.px4.link.streams import Report
 from sitl.px4.navigator import IDLE, Navigator
 from sitl.px4.parameters import Parameters
-from sitl.vehicle_parts import Commander, Face
+from sitl.vehicle_parts import Commander, MavlinkInterface
 from swarmctl.core.records import TRUTH_DTYPE
 from swarmctl.core.simulated import FaultParams, RealismParams
 from swarmctl.core.types import FlightMode, GeoOrigin
@@ -37,7 +37,7 @@ from swarmctl.mavlink.transport import Transport
 
 AUTOPILOT_HZ = 50
 _SCALED_TIMEOUTS = ("COM_OF_LOSS_T", "COM_DL_LOSS_T", "COM_RC_LOSS_T")
-_LINK_PURPOSE, _GCS_LINK_PURPOSE = 3, 4  # of the random streams, beside run seed and vehicle
+_LINK_PURPOSE, _GCS_LINK_PURPOSE = 3, 4  # purposes of random streams, beside run seed and vehicle
 MAX_VEHICLES = 100
 
 
@@ -52,20 +52,20 @@ class Metered(Protocol):
 
 @runtime_checkable
 class Rebooting(Protocol):
-    """A MAVLink face whose autopilot can start again."""
+    """A MAVLink interface whose autopilot can restart."""
 
     def reboot(self, now_us: int) -> None:
-        """As after power-up; `now_us` is on the clock of the simulation."""
+        """Restart as after power-up; `now_us` is on the clock of the simulation."""
 
 
 @dataclass(frozen=True, slots=True)
 class SitlParams:
-    """What to simulate. `spawn_ned_m` (N, 3) is in the shared frame, whose origin the next three give."""
+    """Parameters of a simulation. `spawn_ned_m` (N, 3) is in the shared frame, whose origin the next three give."""
 
     vehicles: int
     spawn_ned_m: Array
     preset: str = "thesis"
-    attitude_gains: str = "swarm"  # of sitl.plant.attitude.THESIS_GAINS
+    attitude_gains: str = "swarm"  # a key of sitl.plant.attitude.THESIS_GAINS
     origin_lat_deg: float = 47.397742
     origin_lon_deg: float = 8.545594
     origin_alt_m: float = 489.4
@@ -75,10 +75,10 @@ class SitlParams:
     start: Literal["ground", "air"] = "ground"
     ekf_ready_s: float = 1.0  # PX4 takes 4 s
     sysid_base: int = 1
-    estimator: str = "exact"  # of sitl.estimator.ESTIMATORS
+    estimator: str = "exact"  # a key of sitl.plant.estimator.ESTIMATORS
     autopilot_kind: Literal["px4", "arducopter"] = "px4"
     realism: RealismParams = field(default_factory=RealismParams)
-    reject_bad_setpoints: bool = True  # False: NaN and zero quaternions do what they do to PX4 1.18
+    reject_bad_setpoints: bool = True  # False: NaN and zero quaternions have the same effect as in PX4 1.18
 
     def __post_init__(self) -> None:
         problems = list(self._problems())
@@ -118,16 +118,16 @@ class SitlParams:
 
 
 def line_of_spawns(vehicles: int) -> Array:
-    """Default spawn positions (N, 3): along x, 1 m apart, centred, on z = 0."""
+    """Return default spawn positions (N, 3): along x, 1 m apart, centred, on z = 0."""
     spawns = np.zeros((vehicles, 3))
     spawns[:, 0] = np.arange(vehicles) - (vehicles - 1) / 2
     return spawns
 
 
 class SitlWorld:
-    """The simulation; `transports` are the vehicle ends of the links, in vehicle order.
+    """The simulation. `transports` are the vehicle ends of the links, in vehicle order.
 
-    `gcs_transports` are those of a second link each, to a ground station, as PX4 has one.
+    `gcs_transports` are those of a second link per vehicle, to a ground station, as in PX4.
     """
 
     def __init__(
@@ -162,9 +162,9 @@ class SitlWorld:
             self.plant, self.attitude, self.estimator, params.realism, params.seed, self._autopilot_every
         )
         self.autopilots: list[Commander] = []
-        self.endpoints: list[Face] = []
+        self.endpoints: list[MavlinkInterface] = []
         self._links = [LossyLink(link, (params.seed, i, _LINK_PURPOSE)) for i, link in enumerate(transports)]
-        self.gcs_endpoints: list[Face] = []
+        self.gcs_endpoints: list[MavlinkInterface] = []
         self._gcs_links = [
             LossyLink(link, (params.seed, i, _GCS_LINK_PURPOSE)) for i, link in enumerate(gcs_transports)
         ]
@@ -188,7 +188,7 @@ class SitlWorld:
         self.faults = Faults(self, params.realism.faults, count)
 
     def step(self, now_us: int) -> None:
-        """One physics step that ends at `now_us` (monotonic); then everything due is sent, stamped with it."""
+        """Do one physics step that ends at `now_us` (monotonic); then send everything due, stamped with it."""
         if self._boot_us is None:
             self._boot_us = now_us - round(1e6 / self.params.physics_hz)
         since_boot_us = now_us - self._boot_us
@@ -220,47 +220,47 @@ class SitlWorld:
             endpoint.receive(since_boot_us, now_us)
 
     def offboard_vehicles(self) -> set[int]:
-        """Vehicles that a client flies now."""
+        """Return the vehicles that a client flies now."""
         return {i for i, p in enumerate(self.autopilots) if p.armed and p.flight_mode() == FlightMode.EXTERNAL}
 
     def setpoint_counts(self) -> list[int]:
-        """SET_ATTITUDE_TARGET frames that have reached each vehicle; counted from the first call on."""
+        """Return the number of SET_ATTITUDE_TARGET frames per vehicle since the first call."""
         return [sum(link.setpoints() for link in self.links_of(i)) for i in range(self.params.vehicles)]
 
     def scale_timeouts(self, speed: float) -> None:
-        """Keep timeouts as they are on the wall clock, as PX4 does when it starts a fast simulation."""
+        """Keep timeouts constant in wall time, as PX4 does when it starts a simulation faster than real time."""
         for pilot in self.autopilots:
             for name in _SCALED_TIMEOUTS if self.params.autopilot_kind == "px4" else ():
                 pilot.parameters.assign(name, speed * pilot.parameters.real(name))
 
     @property
     def boot_us(self) -> int:
-        """When its clock read 0, on the clock it is stepped by; 0 before the first step."""
+        """Begin of the simulation, on the clock it is stepped by; 0 before the first step."""
         return self._boot_us or 0
 
     @property
     def since_boot_us(self) -> int:
-        """Simulated time of the newest step; what faults and stamps count in."""
+        """Simulated time of the newest step, the time base of faults and stamps."""
         return 0 if self._boot_us is None else self._now_us - self._boot_us
 
     def links_of(self, vehicle: int) -> Sequence[LossyLink]:
-        """Every link of a vehicle, for faults."""
+        """Return every link of a vehicle, for faults."""
         return self._links[vehicle : vehicle + 1] + self._gcs_links[vehicle : vehicle + 1]
 
     def reboot(self, vehicle: int, now_us: int) -> None:
-        """Start an autopilot again; its vehicle goes on as physics has it."""
-        face = self.endpoints[vehicle]
-        if isinstance(face, Rebooting):
-            face.reboot(now_us)
+        """Restart an autopilot; its vehicle moves on by physics."""
+        interface = self.endpoints[vehicle]
+        if isinstance(interface, Rebooting):
+            interface.reboot(now_us)
 
     def can(self, fault: FaultParams) -> Iterator[str]:
-        """What is wrong with asking for a fault here; all problems."""
+        """Return every reason why a fault is not possible here."""
         yield from fault.problems(self.params.vehicles)
         if fault.kind == "reboot" and not isinstance(self.endpoints[0], Rebooting):
             yield f"kind = reboot: {self.params.autopilot_kind} vehicles can't; choose another"
 
     def truth_rows(self) -> NDArray[np.void]:
-        """True states (N,) of `TRUTH_DTYPE`, shared frame."""
+        """Return true states (N,) of `TRUTH_DTYPE`, shared frame."""
         rows = np.zeros(self.params.vehicles, TRUTH_DTYPE)
         rows["t_us"] = self._now_us
         rows["vehicle"] = np.arange(self.params.vehicles)
@@ -273,11 +273,11 @@ class SitlWorld:
         return rows
 
     def set_wind(self, wind_ned_m_s: Sequence[float]) -> None:
-        """Steady wind (3,) NED [m/s] on every vehicle."""
+        """Set a steady wind (3,) NED [m/s] on every vehicle."""
         self.physics.air.mean_ned_m_s = np.array(wind_ned_m_s, dtype=np.float64).reshape(3, 1)
 
     def _take_outputs(self) -> None:
-        """Hand changed setpoints to the attitude loops; open clamps; note who flies."""
+        """Pass changed setpoints to the attitude loops, open clamps, and note which vehicles fly."""
         thrust_max_n = self.plant.preset.thrust_max_n
         for i, pilot in enumerate(self.autopilots):
             output = pilot.output
@@ -292,7 +292,7 @@ class SitlWorld:
         np.logical_and(self._powered, ~self.plant.contact, out=self._live, casting="unsafe")
         self._live *= ~self.plant.held
 
-    def _px4(self, vehicle: int, link: Transport) -> tuple[Commander, Face]:
+    def _px4(self, vehicle: int, link: Transport) -> tuple[Commander, MavlinkInterface]:
         params, table = self.params, Parameters(self.params.sysid_base + vehicle)
         navigator = Navigator(table, self.plant.hover_thrust_01)
         airborne = params.start == "air"
@@ -313,8 +313,8 @@ class SitlWorld:
             endpoint.join(ground)
         return pilot, endpoint
 
-    def _arducopter(self, vehicle: int, link: Transport) -> tuple[Commander, Face]:
-        from sitl.arducopter.endpoint import Start, arducopter_vehicle  # with a second dialect module: 20 MB
+    def _arducopter(self, vehicle: int, link: Transport) -> tuple[Commander, MavlinkInterface]:
+        from sitl.arducopter.endpoint import Start, arducopter_vehicle  # imports a second dialect module: 20 MB
 
         params = self.params
         start = Start(
@@ -324,9 +324,9 @@ class SitlWorld:
             params.start == "air",
         )
         links = [link, *self._gcs_links[vehicle : vehicle + 1]]
-        pilot, faces = arducopter_vehicle(params.sysid_base + vehicle, links, self.plant, vehicle, start)
-        self.gcs_endpoints.extend(faces[1:])
-        return pilot, faces[0]
+        pilot, interfaces = arducopter_vehicle(params.sysid_base + vehicle, links, self.plant, vehicle, start)
+        self.gcs_endpoints.extend(interfaces[1:])
+        return pilot, interfaces[0]
 
     def _publisher(self, vehicle: int, pilot: Autopilot) -> Callable[[], Report]:
         plant, origin = self.plant, self.origins[vehicle]

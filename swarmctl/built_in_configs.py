@@ -9,7 +9,7 @@ from swarmctl.errors import ConfigError
 _PLACES = (Path(__file__).parents[1] / "configs", Path(__file__).parent / "configs")
 
 
-def shipped_config(name: str) -> Path:
+def built_in_config(name: str) -> Path:
     """Return the path of the built-in configuration `<name>.toml`.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Fly the default mission several times, in real time and in lockstep, and print medians of what is promised.
+"""Flies the default mission several times, in real time and in lockstep, and prints medians of the quoted figures.
 
     python tools/figures.py [--repeats 3] [--agents 3]
 
@@ -32,7 +32,7 @@ FIGURES: tuple[tuple[str, tuple[str, ...], str], ...] = (
 
 
 def fly(verb: str, agents: int, directory: Path) -> dict[str, Any]:
-    """One flight; its summary, with the share of deadline misses added."""
+    """Fly once; return its summary, with the share of late ticks added."""
     command = [
         sys.executable,
         "-m",
@@ -69,7 +69,7 @@ def main() -> int:
 
 
 def cell(summaries: list[dict[str, Any]], path: tuple[str, ...], style: str) -> str:
-    """Median and range over the repeats."""
+    """Return median and range over the repeats."""
     values = []
     for summary in summaries:
         value: Any = summary

@@ -1,7 +1,7 @@
-"""Hashes of the true states of twelve lockstep flights, one a line: equal wherever flights are the same bit for bit.
+"""Prints hashes of the true states of twelve lockstep flights, one per line: equal where flights agree bit for bit.
 
-`python tools/flight_hashes.py [--only NAME,NAME]`. Two processors, or two settings of `OPENBLAS_CORETYPE` and
-`NPY_DISABLE_CPU_FEATURES`, are compared by `diff`. Standard error says when nothing keeps the processor out of it.
+`python tools/flight_hashes.py [--only NAME,NAME]`. Compare two processors, or two settings of `OPENBLAS_CORETYPE` and
+`NPY_DISABLE_CPU_FEATURES`, with `diff`. A note on standard error says when results depend on the processor.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from sitl.lockstep import Lockstep
 from swarmctl.config import load
 
 CONFIGS = Path(__file__).parents[1] / "configs"
-DIES_AT_US = 9_000_000  # under way on the circle
+DIES_AT_US = 9_000_000  # on the way along the circle
 UNTIL_US = 13_000_000  # every mission has begun by 10 s
 
 
 @dataclass(frozen=True, slots=True)
 class Flown:
-    """A row of the table: what is flown, and who dies on the way."""
+    """A row of the table: the flight, and the agent that dies on the way."""
 
     config: str | None
     sets: tuple[str, ...] = ()
@@ -46,7 +46,7 @@ FLIGHTS = {
 
 
 def truth_hash(flown: Flown) -> str:
-    """Fly it; 16 hexadecimal digits of SHA-256 over every true state of its first seconds."""
+    """Fly and return 16 hexadecimal digits of SHA-256 over every true state of its first seconds."""
     lockstep = Lockstep(load(CONFIGS / flown.config if flown.config else None, ("sitl.start=air", *flown.sets)))
     while lockstep.clock.now_us() < UNTIL_US:
         if flown.dies is not None and lockstep.clock.now_us() == DIES_AT_US:
@@ -56,7 +56,7 @@ def truth_hash(flown: Flown) -> str:
 
 
 def main() -> None:
-    """Fly what is asked for and print a line each."""
+    """Fly what is requested and print a line each."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", metavar="NAME,NAME", default=",".join(FLIGHTS), help=f"of {', '.join(FLIGHTS)}")
     names = parser.parse_args().only.split(",")

@@ -1,4 +1,4 @@
-"""Renders a run's `telemetry.rrd`, or a live URL, without a display: what a person would see, as a PNG.
+"""Renders a run's `telemetry.rrd`, or a live URL, to a PNG without a display.
 
     python tools/screenshot.py runs/<run>/telemetry.rrd swarm.png --at 30
 

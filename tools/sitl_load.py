@@ -1,4 +1,4 @@
-"""What one simulator process can carry: late physics steps, state-to-wire latency and CPU, with real UDP clients.
+"""Load of one simulator process: late physics steps, state-to-wire latency and CPU, with real UDP clients.
 
 The simulator is pinned to one core and its clients to the others. Every client streams a heartbeat and 50 setpoints a
 second to its vehicle, in OFFBOARD. Latency is the time from the deadline of the physics step a message is stamped with
@@ -46,7 +46,7 @@ LIMITS = {32: {"missed_percent": 1.0, "latency_p99_ms": 5.0}, 3: {"cpu_percent":
 
 @dataclass
 class Measured:
-    """One run."""
+    """Results of one run."""
 
     vehicles: int
     steps: int
@@ -63,7 +63,7 @@ class Measured:
 
 
 class Client:
-    """One vehicle's ground: hears everything, streams setpoints."""
+    """The client of one vehicle: receives everything, streams setpoints."""
 
     def __init__(self, number: int, port: int) -> None:
         self.sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -79,7 +79,7 @@ class Client:
         self.main_mode = 0
 
     def send(self, message: Any) -> None:
-        """One message to the vehicle."""
+        """Send one message to the vehicle."""
         self.sock.sendto(self._codec.encode(message), self._to)
 
     def heartbeat(self) -> None:
@@ -93,7 +93,7 @@ class Client:
         self.send(mav.MAVLink_command_long_message(self._target, 1, command, 0, *filled))
 
     def drain(self, real_minus_monotonic_us: int) -> None:
-        """Everything that has arrived."""
+        """Receive everything that has arrived."""
         while True:
             try:
                 data, ancillary, _, _ = self.sock.recvmsg(2048, 64)
@@ -112,13 +112,13 @@ class Client:
                     self.main_mode = frame[12]
 
     def forget(self) -> None:
-        """Start counting again."""
+        """Reset the counters."""
         self.datagrams = self.messages = self.octets = 0
         self.arrivals.clear()
 
 
 def fly(clients: Sequence[Client], seconds: float) -> None:
-    """Stream and listen for a while."""
+    """Stream and receive for a while."""
     poller = select.epoll()
     by_fd = {client.sock.fileno(): client for client in clients}
     for fd in by_fd:
@@ -140,12 +140,12 @@ def fly(clients: Sequence[Client], seconds: float) -> None:
             if now_us >= beat_us[i]:
                 beat_us[i] += 1_000_000
                 client.heartbeat()
-        time.sleep(0.0005)  # one wake-up for what a step sends to many
+        time.sleep(0.0005)  # one wake-up for all messages of a step
     poller.close()
 
 
 def measure(vehicles: int, seconds: float, core: int, arguments: Sequence[str]) -> Measured:
-    """One simulator, one run."""
+    """Run one simulator and return its results."""
     with tempfile.TemporaryDirectory(prefix="load-") as folder:
         stats = Path(folder) / "stats.json"
         command = [sys.executable, "-m", "sitl", "--vehicles", f"{vehicles}", "--local-port", f"{LOCAL_PORT}"]
@@ -178,7 +178,7 @@ def measure(vehicles: int, seconds: float, core: int, arguments: Sequence[str]) 
 
 
 def _ports(process: subprocess.Popen[str], vehicles: int) -> list[int]:
-    """Where the simulator says its vehicles listen."""
+    """Return the ports that the simulator reports."""
     assert process.stdout is not None
     lines = (line for line in process.stdout if line.startswith("vehicle "))
     found = [int(line.partition("local=")[2].split()[0]) for _, line in zip(range(vehicles), lines, strict=False)]
@@ -217,13 +217,13 @@ def _summed(clients: Sequence[Client], told: dict[str, Any], cpu_s: float, wall_
 
 
 def median(runs: Sequence[Measured]) -> dict[str, float]:
-    """Of every figure."""
+    """Return the median of every figure."""
     rows = [asdict(run) for run in runs]
     return {key: statistics.median(row[key] for row in rows) for key in rows[0]}
 
 
 def misses(row: dict[str, float]) -> Iterator[str]:
-    """Figures of a row above their limit."""
+    """Return the figures of a row that exceed their limit."""
     for key, limit in LIMITS.get(int(row["vehicles"]), {}).items():
         if row[key] > limit:
             yield f"{row['vehicles']:.0f} vehicles: {key} = {row[key]:.2f} > {limit}"
@@ -249,7 +249,7 @@ def _table(rows: Sequence[dict[str, float]]) -> Iterator[str]:
 
 
 def main() -> int:
-    """Measure, print, write; 1 when a limit is missed."""
+    """Measure, print and write; return 1 when a limit is missed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--vehicles", default="3,32", metavar="N,N,..")
     parser.add_argument("--seconds", type=float, default=20.0)

@@ -1,11 +1,11 @@
-"""Stop a launch in every phase, in every way, and see that no vehicle is left armed, or that it is named.
+"""Stops a launch in every phase, in every way, and checks that every vehicle left armed is named.
 
     python tools/stop_matrix.py --cells sigint:ARM,kill-agent:TAKEOFF
     python tools/stop_matrix.py --config configs/px4_udp.toml --witness-port 14550
 
-Without `--config` each cell flies vehicles of a simulator of its own (`python -m sitl`), which outlives the launch.
-With it the vehicles are those of the configuration, real ones too, that run already. A second link of every vehicle
-(PX4's ground-station link) is the witness: whether a vehicle is armed, its own HEARTBEAT says there.
+Without `--config` each cell flies vehicles of a separate simulator (`python -m sitl`), which outlives the launch. With
+it the vehicles are those of the configuration, real ones too, that run already. A second link to every vehicle (PX4's
+ground-station link) shows by the vehicle's own HEARTBEAT whether it is armed.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Cell:
 
 
 class Witness:
-    """Hears every vehicle on a second link and says nothing."""
+    """Receives from every vehicle on a second link and never sends."""
 
     def __init__(self, port: int) -> None:
         self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
@@ -77,7 +77,7 @@ class Witness:
 
 
 def free_ports(count: int) -> list[int]:
-    """UDP ports of loopback that nobody holds now."""
+    """Return UDP ports of loopback that are free now."""
     sockets = claim_ports(count)
     ports = [int(sock.getsockname()[1]) for sock in sockets]
     for sock in sockets:
@@ -87,7 +87,7 @@ def free_ports(count: int) -> list[int]:
 
 @contextmanager
 def vehicles(config: Path | None, folder: Path, witness_port: int) -> Iterator[Path]:
-    """Configuration of vehicles that run for as long as this lasts."""
+    """Yield the configuration of vehicles that run inside the context."""
     if config is not None:
         yield config
         return
@@ -109,7 +109,7 @@ def vehicles(config: Path | None, folder: Path, witness_port: int) -> Iterator[P
 
 
 def phases(run_dir: Path) -> set[str]:
-    """Names of the phases that any agent has told its launch of so far; HOLD is a TRACK."""
+    """Return the names of the phases that any agent has reported so far; HOLD is a TRACK."""
     found = set()
     with contextlib.suppress(OSError):
         for line in (run_dir / "launch.events.jsonl").read_text(encoding="utf-8").splitlines():
@@ -119,7 +119,7 @@ def phases(run_dir: Path) -> set[str]:
 
 
 def child_of(launcher: psutil.Process, words: str) -> psutil.Process:
-    """The launch's process whose command line has these words."""
+    """Return the launch's process whose command line has these words."""
     return next(c for c in launcher.children(recursive=True) if words in " ".join(c.cmdline()))
 
 
@@ -129,7 +129,7 @@ def verb(run_dir: Path, *words: str) -> None:
 
 
 def stop(cell: Cell, launch: subprocess.Popen[bytes], run_dir: Path) -> None:
-    """Do what the cell says."""
+    """Execute the stop of a cell."""
     if cell.stop in SIGNALS:
         launch.send_signal(SIGNALS[cell.stop])
     elif cell.stop == "land":
@@ -140,7 +140,7 @@ def stop(cell: Cell, launch: subprocess.Popen[bytes], run_dir: Path) -> None:
 
 
 def fly(cell: Cell, config: Path | None, witness_port: int) -> tuple[bool, str]:
-    """Whether a cell holds, and what happened."""
+    """Fly a cell; return whether it holds, and what happened."""
     with tempfile.TemporaryDirectory(prefix="stops") as name:
         folder, port = Path(name), witness_port or free_ports(1)[0]
         witness = Witness(port)
@@ -181,7 +181,7 @@ def _fly(cell: Cell, path: Path, folder: Path, witness: Witness) -> tuple[bool, 
 
 
 def _alone(folder: Path) -> bool:
-    """Whether no process of the launch is left, also of one whose launcher was killed."""
+    """Return whether no process of the launch is left, also after the launcher was killed."""
     return not any(
         str(folder) in " ".join(p.info["cmdline"] or ()) and p.pid != os.getpid()
         for p in psutil.process_iter(["cmdline"])
@@ -202,7 +202,7 @@ def _reach(cell: Cell, run_dir: Path, launch: subprocess.Popen[bytes], witness: 
 
 
 def cells_of(text: str) -> list[Cell]:
-    """Cells such as `sigint:ARM+0.05,land:TRACK`, or all of them."""
+    """Return cells such as `sigint:ARM+0.05,land:TRACK`, or all of them."""
     if text == "all":
         once = [Cell(stop=s, phase=p) for p in PHASES for s in STOPS]
         return once + [Cell(stop=s, phase="ARM", after_s=0.05 * k) for s in STOPS for k in range(1, 21)]
@@ -221,7 +221,7 @@ def main() -> int:
     parser.add_argument("--witness-port", type=int, default=0, help="their second link's port here")
     options = parser.parse_args()
     for signum in (signal.SIGINT, signal.SIGHUP):
-        signal.signal(signum, signal.SIG_DFL)  # in the background a shell has them ignored, and a launch inherits that
+        signal.signal(signum, signal.SIG_DFL)  # in the background a shell ignores them, and a launch inherits that
     failed = 0
     for cell in options.cells:
         holds, what = fly(cell, options.config, options.witness_port)

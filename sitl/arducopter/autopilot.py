@@ -1,8 +1,9 @@
 """ArduCopter 4.6's commander for one vehicle: modes, arming, GUIDED attitude setpoints, landing, GCS failsafe.
 
-Scalar code at autopilot rate. It speaks in results and texts, not in MAVLink messages (`arducopter_endpoint` does).
+Scalar code at autopilot rate. Its results and texts are not MAVLink messages (`sitl.arducopter.endpoint` converts
+them).
 
-Nobody holds the radio: its sticks are centred while the vehicle flies (STABILIZE hovers on hover thrust, LOITER and
+No radio is operated: its sticks are centred while the vehicle flies (STABILIZE hovers on hover thrust, LOITER and
 ALT_HOLD keep the height) and its throttle is down on the ground. Unlike ArduCopter, body rates that are not finite are
 refused; everything else about setpoints is as measured, GUID_OPTIONS and type masks included.
 """
@@ -12,8 +13,8 @@ from __future__ import annotations
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
 
-from sitl.arducopter.ground import Ground
 from sitl.arducopter.guided import LEVEL, SOME_RATES, Guided, Setpoints, Target
+from sitl.arducopter.land_detector import LandDetector
 from sitl.arducopter.modes import (
     BASE_ALWAYS,
     BASE_ARMED,
@@ -31,7 +32,7 @@ from sitl.arducopter.modes import (
 )
 from sitl.arducopter.navigator import CopterNavigator
 from sitl.arducopter.parameters import CopterParameters
-from sitl.arducopter.return_home import Stage, WayHome
+from sitl.arducopter.return_home import ReturnHome, ReturnStage
 from sitl.plant.sensors import Estimate, LocalOrigin
 from sitl.plant.vehicle import Array
 from sitl.px4.boot import Boot
@@ -45,22 +46,22 @@ REACHED_M = 0.1
 
 
 class ArduCopter:
-    """Commander of one vehicle.
+    """The commander of one vehicle.
 
     Attributes:
         clock: its own time and local frame.
-        boot: when what works, on that clock.
+        boot: times at which its parts start to work, on that clock.
         armed: motors may turn.
-        mode: what flies.
+        mode: mode that flies.
         guided: what GUIDED does.
         home_ned_m: local position of the last arming, or of the EKF origin before.
-        home_set: how often home has been set.
+        home_set: number of times home has been set.
         output: attitude and thrust to fly.
         target_q_nb, throttle_in_01: the attitude controller's input, before angle boost (ATTITUDE_TARGET).
         released: an air start's clamp has been opened.
         has_origin: the EKF has its origin, and so a position.
         failsafe: the ground station is lost.
-        refused: setpoints not used, by reason.
+        refused: number of unused setpoints, by reason.
     """
 
     def __init__(
@@ -100,9 +101,9 @@ class ArduCopter:
         self.home_set = 0
         self.output = IDLE
         self.target_q_nb, self.throttle_in_01 = LEVEL, 0.0
-        self._ground = Ground(self.parameters, self._navigator.hover_01, self._airborne)
+        self._land_detector = LandDetector(self.parameters, self._navigator.hover_01, self._airborne)
         self._setpoints = Setpoints(self.parameters)
-        self._way_home = WayHome(self.parameters, self._navigator)
+        self._return_home = ReturnHome(self.parameters, self._navigator)
         self._takeoff_z_m = 0.0
         self._takeoff_reached = False
         self._estimate: Estimate | None = None
@@ -112,25 +113,25 @@ class ArduCopter:
         self.failsafe = False
 
     def reboot(self, now_us: int) -> None:
-        """Start again at `now_us` of the simulation; parameters are kept, the local frame begins where it is."""
+        """Restart at `now_us` of the simulation; parameters are kept, the local frame begins at the vehicle's place."""
         self.clock.again(now_us, self._estimate)
         self._power_up()
 
     # --- what others ask ---
 
     def outbox(self) -> deque[tuple[Severity, str]]:
-        """A new queue that every text is put into: one for each link."""
+        """Return a new queue that receives every text: one for each link."""
         box: deque[tuple[Severity, str]] = deque(maxlen=64)
         self._outboxes.append(box)
         return box
 
     def prearm_passed(self, now_us: int) -> bool:
-        """PREARM_CHECK of SYS_STATUS; whatever the mode."""
+        """Whether the PREARM_CHECK of SYS_STATUS passes, independent of the mode."""
         return self.armed or now_us >= self.boot.armable_us
 
     @property
     def landed(self) -> Landed:
-        if self._ground.landed:
+        if self._land_detector.landed:
             return Landed.ON_GROUND
         if self.armed and self._lands():
             return Landed.LANDING
@@ -139,7 +140,7 @@ class ArduCopter:
         return Landed.IN_AIR
 
     def base_mode(self) -> int:
-        """HEARTBEAT.base_mode: bit 8 while the horizontal position controller is at work."""
+        """HEARTBEAT.base_mode: bit 8 while the horizontal position controller is active."""
         angle = self.mode == CopterMode.GUIDED and self.guided is Guided.ANGLE
         positions = self.mode not in WITHOUT_POSITION_CONTROL and not angle
         return BASE_ALWAYS | (BASE_POSITION_CONTROL if positions else 0) | (BASE_ARMED if self.armed else 0)
@@ -149,13 +150,13 @@ class ArduCopter:
             return CopterState.BOOT
         if self.failsafe:
             return CopterState.CRITICAL
-        return CopterState.STANDBY if self._ground.landed else CopterState.ACTIVE
+        return CopterState.STANDBY if self._land_detector.landed else CopterState.ACTIVE
 
     def flight_mode(self) -> FlightMode:
         return FLIGHT_MODES.get(self.mode, FlightMode.MANUAL)
 
     def say(self, severity: Severity, text: str) -> None:
-        """A STATUSTEXT on every link."""
+        """Queue a STATUSTEXT on every link."""
         for box in self._outboxes:
             box.append((severity, text))
 
@@ -169,7 +170,7 @@ class ArduCopter:
         thrust: float,
         now_us: int,
     ) -> bool:
-        """SET_ATTITUDE_TARGET, see `Setpoints.take`; True when it will be flown."""
+        """Take a SET_ATTITUDE_TARGET, see `Setpoints.take`; return whether it will be flown."""
         if self.mode != CopterMode.GUIDED:
             return self._refuse("not_guided")
         refusal = self._setpoints.take(type_mask, q_nb, rates, thrust, self.target_q_nb, now_us)
@@ -182,7 +183,7 @@ class ArduCopter:
         if not self.armed:
             return True
         self.released = True
-        if not self._ground.landed:  # acts at once: the real one's loop runs at 400 Hz
+        if not self._land_detector.landed:  # acts at once: the real one's loop runs at 400 Hz
             target = self._setpoints.target
             self._put_out(target.q_nb, self.throttle_in_01 if target.thrust_01 is None else target.thrust_01)
         return True
@@ -194,7 +195,7 @@ class ArduCopter:
     # --- commands ---
 
     def arm(self, now_us: int, *, force: bool = False) -> Result:
-        """MAV_CMD_COMPONENT_ARM_DISARM p1=1."""
+        """Execute MAV_CMD_COMPONENT_ARM_DISARM p1=1."""
         if self.armed:
             return Result.ACCEPTED
         reasons = arming_refusals(self.boot, now_us)
@@ -207,17 +208,17 @@ class ArduCopter:
         if reasons or self._estimate is None:
             return Result.FAILED
         self.armed = True
-        self._ground.armed_at(now_us)
+        self._land_detector.armed_at(now_us)
         self._set_home(self._estimate)
         self.say(Severity.INFO, "Arming motors")
         self._engage()
         return Result.ACCEPTED
 
     def disarm(self, *, force: bool = False) -> Result:
-        """MAV_CMD_COMPONENT_ARM_DISARM p1=0; in the air only with `force`."""
+        """Execute MAV_CMD_COMPONENT_ARM_DISARM p1=0; in the air only with `force`."""
         if not self.armed:
             return Result.ACCEPTED
-        if not self._ground.landed and self.released and not force:
+        if not self._land_detector.landed and self.released and not force:
             return Result.FAILED
         self._disarm()
         return Result.ACCEPTED
@@ -228,7 +229,7 @@ class ArduCopter:
         self.say(Severity.INFO, "Disarming motors")
 
     def set_mode(self, number: int) -> Result:
-        """A commanded mode; while disarmed any mode can be set."""
+        """Change the mode by command; while disarmed any mode can be set."""
         if number not in set(CopterMode):
             known = NOT_FLOWN_HERE.get(number)
             text = f"Mode change to {known} failed: init failed" if known else f"No such mode {number}"
@@ -243,26 +244,26 @@ class ArduCopter:
         return Result.ACCEPTED
 
     def take_off(self, height_m: float) -> Result:
-        """MAV_CMD_NAV_TAKEOFF: `height_m` above home. In GUIDED, armed, on the ground."""
+        """Execute MAV_CMD_NAV_TAKEOFF: `height_m` above home. In GUIDED, armed, on the ground."""
         estimate, home = self._estimate, self.home_ned_m
         if (
             not self.armed
-            or not self._ground.landed
+            or not self._land_detector.landed
             or self.mode != CopterMode.GUIDED
             or estimate is None
             or home is None
         ):
             return Result.FAILED
         z_m = home[2] - height_m
-        if not z_m < estimate.pos_ned_m[2]:  # not up, or not a number
+        if not z_m < estimate.pos_ned_m[2]:  # not above it, or not a number
             return Result.FAILED
         self._takeoff_z_m, self._takeoff_reached = z_m, False
-        if self.guided is not Guided.TAKEOFF:  # asked again while motors spin up, it goes on
+        if self.guided is not Guided.TAKEOFF:  # a repeated request continues the spin-up
             self._enter_guided(Guided.TAKEOFF)
         return Result.ACCEPTED
 
     def gcs_heard(self, now_us: int) -> None:
-        """HEARTBEAT from SYSID_MYGCS."""
+        """Take a HEARTBEAT from SYSID_MYGCS."""
         self._gcs_us = now_us
         if self.failsafe:
             self.failsafe = False
@@ -271,14 +272,14 @@ class ArduCopter:
     def _enter(self, mode: CopterMode) -> None:
         self.mode = mode
         self.guided = Guided.STOP
-        self._ground.stay()
+        self._land_detector.stay()
         if self._estimate is not None and self.home_ned_m is not None:
-            self._way_home.begin(self._estimate, self.home_ned_m)
+            self._return_home.begin(self._estimate, self.home_ned_m)
         self._engage()
 
     def _enter_guided(self, what: Guided) -> None:
         self.guided = what
-        self._ground.stay()
+        self._land_detector.stay()
         self._engage()
 
     def _engage(self) -> None:
@@ -298,15 +299,15 @@ class ArduCopter:
         estimate = self.clock.local(estimate)
         self._estimate, self._now_us = estimate, now_us
         self._boot_on(estimate, now_us)
-        self._ground.watch(estimate, self.throttle_in_01, self.armed, now_us)
+        self._land_detector.watch(estimate, self.throttle_in_01, self.armed, now_us)
         self._watch_gcs(now_us)
         if not self.armed:
             return
-        if self._ground.disarms(self.mode in ENDS_ON_GROUND, now_us):
+        if self._land_detector.disarms(self.mode in ENDS_ON_GROUND, now_us):
             self._disarm()
             return
-        if self._ground.landed and not self._lifts_off(now_us):
-            self.throttle_in_01 = self._ground.takeoff_throttle_01(now_us) if self._takes_off() else 0.0
+        if self._land_detector.landed and not self._lifts_off(now_us):
+            self.throttle_in_01 = self._land_detector.takeoff_throttle_01(now_us) if self._takes_off() else 0.0
             self.output = Command(IDLE.q_nb, self.throttle_in_01) if self.throttle_in_01 else IDLE
             return
         self._put_out(*self._fliers[self.mode](estimate, dt_s))
@@ -326,7 +327,7 @@ class ArduCopter:
 
     def _watch_gcs(self, now_us: int) -> None:
         action = self.parameters.integer("FS_GCS_ENABLE")
-        if not action or not self.armed or self.failsafe or self._gcs_us is None or self._ground.landed:
+        if not action or not self.armed or self.failsafe or self._gcs_us is None or self._land_detector.landed:
             return
         if now_us - self._gcs_us > self.parameters.real("FS_GCS_TIMEOUT") * 1e6:
             self.failsafe = True
@@ -334,19 +335,19 @@ class ArduCopter:
             self._enter(CopterMode.LAND if action in (4, 5, 7) else CopterMode.RTL)
 
     def _lifts_off(self, now_us: int) -> bool:
-        """On the ground: whether what is asked takes off, and the motors have spun up for it."""
+        """Return whether a vehicle on the ground is to take off and its motors have spun up."""
         asked = self.mode == CopterMode.GUIDED and (
             self.guided is Guided.TAKEOFF or (self.guided is Guided.ANGLE and self._target().rises)
         )
         if not asked:
-            self._ground.stay()
-        if not asked or not self._ground.lifts_off(now_us, slowly=self.guided is Guided.TAKEOFF):
+            self._land_detector.stay()
+        if not asked or not self._land_detector.lifts_off(now_us, slowly=self.guided is Guided.TAKEOFF):
             return False
         self._engage()
         return True
 
     def _put_out(self, q_nb: Array, throttle_01: float) -> None:
-        """Hand an attitude and a throttle to the attitude controller, which boosts it by the tilt asked for."""
+        """Pass attitude and throttle to the attitude controller, which boosts the throttle by the requested tilt."""
         self.target_q_nb, self.throttle_in_01 = q_nb, throttle_01
         boost = 1.0
         if self.parameters.integer("ATC_ANGLE_BOOST"):
@@ -391,7 +392,7 @@ class ArduCopter:
         return target.q_nb, self._navigator.climb(estimate, target.climb_m_s, dt_s)
 
     def _target(self) -> Target:
-        """The newest setpoint; when it is too old: level, climb rate 0, whatever thrust meant."""
+        """Return the newest setpoint; when it is too old: level, climb rate 0, for either meaning of thrust."""
         if self._setpoints.stale(self._now_us):
             if self._setpoints.target.thrust_01 is not None and self._estimate is not None:
                 self._navigator.engage(self._estimate)
@@ -399,12 +400,14 @@ class ArduCopter:
         return self._setpoints.target
 
     def _return(self, estimate: Estimate, dt_s: float) -> tuple[Array, float]:
-        if self._way_home.stage is Stage.LAND:
+        if self._return_home.stage is ReturnStage.LAND:
             return self._land(estimate, dt_s)
-        return self._way_home.fly(estimate, self.home_ned_m or estimate.pos_ned_m, self._now_us, dt_s)
+        return self._return_home.fly(estimate, self.home_ned_m or estimate.pos_ned_m, self._now_us, dt_s)
 
     def _lands(self) -> bool:
-        return self.mode == CopterMode.LAND or (self.mode == CopterMode.RTL and self._way_home.stage is Stage.LAND)
+        return self.mode == CopterMode.LAND or (
+            self.mode == CopterMode.RTL and self._return_home.stage is ReturnStage.LAND
+        )
 
     def _takes_off(self) -> bool:
         return self.mode == CopterMode.GUIDED and self.guided is Guided.TAKEOFF and not self._takeoff_reached

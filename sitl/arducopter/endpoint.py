@@ -1,7 +1,7 @@
-"""MAVLink face of one ArduCopter: frames in, commands and setpoints out, reports back. Manners of 4.6.3.
+"""MAVLink interface of one ArduCopter: receives commands and setpoints, sends reports; protocol as 4.6.3.
 
-It decides who is addressed, which command means what, and what is sent when; what happens then is `ArduCopter`'s.
-Deaf and mute until its boot reaches the first HEARTBEAT.
+It decides on addressing, on the meaning of commands, and on sending times; `ArduCopter` decides the consequences. It
+neither receives nor sends until its boot reaches the first HEARTBEAT.
 """
 
 from __future__ import annotations
@@ -31,14 +31,14 @@ CUSTOM_MODE_FLAG = 1
 HEARTBEAT_US = 1_000_000
 TIMESYNC_US = 10_000_000
 PARAMS_PER_S = 1700
-REBOOT_AFTER_US = 200_000  # the ack has to leave
+REBOOT_AFTER_US = 200_000  # the ack is sent first
 TEXT_CHARS = 50
 Params = tuple[float, float, float, float, float, float, float]
 
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """What a vehicle begins with."""
+    """Initial conditions of a vehicle."""
 
     origin: LocalOrigin
     estimate: Callable[[], Estimate]  # of this instant
@@ -52,7 +52,7 @@ class ArduCopterEndpoint:
     Args:
         sysid: MAVLink system id.
         transport: link to the client.
-        pilot: what obeys.
+        pilot: executes commands and setpoints.
         report: makes a `CopterReport` of this instant; called only when something is sent.
         step_us: physics step, the fastest message interval.
     """
@@ -67,7 +67,7 @@ class ArduCopterEndpoint:
         self._report = report
         self._codec = Codec(sysid, COMPONENT)
         self._step_us = step_us
-        self._waited_us = 0  # since the datagram in hand arrived
+        self._waited_us = 0  # since the arrival of the current datagram
         self._texts = pilot.outbox()
         self._params_per_step = max(1, round(PARAMS_PER_S * step_us * 1e-6))
         self._sender = (0, 0)
@@ -111,11 +111,11 @@ class ArduCopterEndpoint:
         self._clock_us = self._pilot.clock.at_us
 
     def reboot(self, now_us: int) -> None:
-        """As after power-up, with every link of the vehicle; `now_us` is on the clock of the simulation."""
+        """Restart as after power-up, with every link of the vehicle; `now_us` is on the clock of the simulation."""
         self._pilot.reboot(now_us)
 
     def _at(self, now_us: int) -> int:
-        """Time since the autopilot's boot; what this link knew is forgotten when that was lately."""
+        """Return the time since the autopilot's boot; after a recent boot the link's state is discarded."""
         if self._clock_us != self._pilot.clock.at_us:
             self._power_up()
         self._now_us = self._pilot.clock.since_us(now_us)
@@ -134,7 +134,7 @@ class ArduCopterEndpoint:
                 self._on_frame(frame)
 
     def send_due(self, now_us: int) -> None:
-        """Send heartbeats, news, what the intervals, a parameter list, or texts ask for."""
+        """Send heartbeats, news, and what intervals, a parameter list, or texts require."""
         if self._reboot_us is not None and now_us >= self._reboot_us:
             self.reboot(now_us)
         now_us = self._at(now_us)
@@ -156,7 +156,7 @@ class ArduCopterEndpoint:
             self._send_text(*self._texts.popleft())
 
     def _send_heartbeat(self, now_us: int) -> None:
-        """At 1 Hz, and at once when the mode has changed; arming waits for its turn."""
+        """Send a HEARTBEAT at 1 Hz, and at once when the mode has changed; arming waits for the next one."""
         if now_us >= self._beat_us:
             self._beat_us += HEARTBEAT_US * (1 + (now_us - self._beat_us) // HEARTBEAT_US)
         elif self._told_mode == self._pilot.mode:
@@ -174,7 +174,7 @@ class ArduCopterEndpoint:
         handler = self._handlers.get(message.get_msgId())
         if handler is None:
             return
-        if getattr(message, "target_system", 0) not in (0, self.sysid):  # whatever component: executed
+        if getattr(message, "target_system", 0) not in (0, self.sysid):  # executed for every component
             self.ignored["not_addressed"] += 1
             return
         self._sender = message.get_srcSystem(), message.get_srcComponent()
@@ -282,7 +282,7 @@ class ArduCopterEndpoint:
         try:
             found = table.by_index(message.param_index) if message.param_index >= 0 else table.by_name(message.param_id)
         except UnknownParameterError:
-            return  # silence, as of the real one
+            return  # no answer, as the real one
         self._send_param(found)
 
     def _on_param_set(self, message: Any) -> None:
@@ -310,7 +310,7 @@ class ArduCopterEndpoint:
                 self._send(stream.build(report))
 
     def _send_text(self, severity: Severity, text: str) -> None:
-        """To every link, whoever listens."""
+        """Queue a text on every link."""
         self._text_id = self._text_id % 65535 + 1
         raw = text.encode("ascii", "replace")
         chunks = [raw[i : i + TEXT_CHARS] for i in range(0, len(raw), TEXT_CHARS)]
@@ -319,14 +319,14 @@ class ArduCopterEndpoint:
 
 
 def _whole(value: float) -> int | None:
-    """Integer of a command parameter; None for NaN and infinities."""
+    """Return the integer of a command parameter; None for NaN and infinities."""
     return int(value) if math.isfinite(value) else None
 
 
 def arducopter_vehicle(
     sysid: int, links: Sequence[Transport], plant: Plant, vehicle: int, start: Start
 ) -> tuple[ArduCopter, list[ArduCopterEndpoint]]:
-    """Brain of one vehicle of a plant, and its face on each link."""
+    """Return the autopilot of one vehicle of a plant, and its MAVLink interface on each link."""
     parameters = CopterParameters(sysid)
     navigator = CopterNavigator(parameters, plant.hover_thrust_01)
     pilot = ArduCopter(parameters, navigator, start.origin, ekf_ready_us=start.ekf_ready_us, airborne=start.airborne)

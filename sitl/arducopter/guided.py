@@ -1,4 +1,4 @@
-"""ArduCopter's GUIDED attitude setpoints: which are flown, what their thrust means, and what is left when they stop."""
+"""ArduCopter's GUIDED attitude setpoints: which are flown, the meaning of their thrust, and their timeout."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from sitl.arducopter.parameters import CopterParameters
 from sitl.plant.vehicle import Array
 
 MASK_RATES, MASK_NO_THRUST, MASK_NO_ATTITUDE = 7, 64, 128
-OPTION_THRUST = 8  # GUID_OPTIONS: the setpoint's thrust is thrust
+OPTION_THRUST = 8  # GUID_OPTIONS: the thrust field is a thrust
 NORM_TOLERANCE = 1e-3  # of the squared norm of a setpoint's quaternion
 SOME_RATES = "some_rates"  # the refusal that also stops GUIDED
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
@@ -21,16 +21,16 @@ _STILL = (0.0, 0.0, 0.0)
 
 
 class Guided(enum.Enum):
-    """What GUIDED does."""
+    """States of GUIDED."""
 
     STOP = "stop"  # brake and hold
     TAKEOFF = "takeoff"
-    ANGLE = "angle"  # the setpoints' attitude
+    ANGLE = "angle"  # the attitude of the setpoints
 
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """What is flown: an attitude that turns at body rates, with a thrust or, if that is None, at a climb rate."""
+    """Flown target: an attitude that turns at body rates, with a thrust or, if that is None, at a climb rate."""
 
     q_nb: Array = field(default_factory=lambda: LEVEL)  # (4,) wxyz
     rate_frd_rad_s: tuple[float, float, float] = _STILL
@@ -39,11 +39,11 @@ class Target:
 
     @property
     def rises(self) -> bool:
-        """Takes off when landed."""
+        """Whether it takes off when landed."""
         return (self.climb_m_s if self.thrust_01 is None else self.thrust_01) > 0.0
 
     def turned(self, dt_s: float) -> Target:
-        """The same after `dt_s`: body rates move the attitude."""
+        """Return the target after `dt_s`: body rates turn the attitude."""
         if not any(self.rate_frd_rad_s):
             return self
         rate = np.array(self.rate_frd_rad_s)
@@ -73,14 +73,14 @@ class Setpoints:
         flown: Array,
         now_us: int,
     ) -> str:
-        """Accept a SET_ATTITUDE_TARGET, or say why not.
+        """Accept a SET_ATTITUDE_TARGET, or return why not.
 
         Args:
-            type_mask: as on the wire; THRUST_BODY_SET (32) is ignored. Attitude, or all three rates, or both.
+            type_mask: as in MAVLink; THRUST_BODY_SET (32) is ignored. Attitude, or all three rates, or both.
             q_nb: wxyz.
             rates: body [rad/s]; they turn the attitude from then on.
             thrust: thrust or climb rate, by GUID_OPTIONS; NaN becomes mid-range.
-            flown: (4,) the present target attitude: where rates without an attitude begin.
+            flown: (4,) the present target attitude, at which rates without an attitude begin.
             now_us: time since boot.
         """
         if type_mask & MASK_NO_THRUST:
@@ -109,5 +109,5 @@ class Setpoints:
         return replace(target, climb_m_s=0.0 if abs(share) < 1e-6 else share * scale)
 
     def stale(self, now_us: int) -> bool:
-        """Nothing was accepted for GUID_TIMEOUT."""
+        """Return whether no setpoint was accepted for GUID_TIMEOUT."""
         return now_us - self._accepted_us > self._parameters.real("GUID_TIMEOUT") * 1e6

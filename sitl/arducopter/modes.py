@@ -1,4 +1,4 @@
-"""ArduCopter's modes and boot on the wire: custom_mode numbers, MAV_STATE, refusals. Tables only."""
+"""ArduCopter's modes and boot in MAVLink: custom_mode numbers, MAV_STATE, refusals. Tables only."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from swarmctl.core.types import FlightMode
 
 
 class CopterMode(enum.IntEnum):
-    """custom_mode of HEARTBEAT, those that are flown here."""
+    """custom_mode of HEARTBEAT for the modes that are flown here."""
 
     STABILIZE = 0
     ALT_HOLD = 2
@@ -20,7 +20,7 @@ class CopterMode(enum.IntEnum):
     BRAKE = 17
 
 
-NOT_FLOWN_HERE = {  # modes ArduCopter 4.6 has and this simulator does not enter
+NOT_FLOWN_HERE = {  # modes of ArduCopter 4.6 that this simulator does not enter
     1: "ACRO",
     3: "AUTO",
     7: "CIRCLE",
@@ -43,9 +43,9 @@ NOT_FLOWN_HERE = {  # modes ArduCopter 4.6 has and this simulator does not enter
 }
 NEEDS_POSITION = frozenset(
     {CopterMode.GUIDED, CopterMode.LOITER, CopterMode.RTL, CopterMode.BRAKE}
-)  # to be entered while armed; LAND comes down without one
+)  # modes that need a position while armed; LAND descends without one
 NO_ARMING_IN = frozenset({CopterMode.RTL, CopterMode.LAND, CopterMode.BRAKE})
-ENDS_ON_GROUND = frozenset({CopterMode.RTL, CopterMode.LAND})  # disarm by themselves after touchdown
+ENDS_ON_GROUND = frozenset({CopterMode.RTL, CopterMode.LAND})  # these disarm by themselves after touchdown
 WITHOUT_POSITION_CONTROL = frozenset({CopterMode.STABILIZE, CopterMode.ALT_HOLD})
 
 FLIGHT_MODES = {
@@ -62,7 +62,7 @@ BASE_POSITION_CONTROL = 8
 
 
 class CopterState(enum.IntEnum):
-    """MAV_STATE, as ArduCopter uses it: standby means on the ground, armed or not."""
+    """MAV_STATE as ArduCopter uses it: standby means on the ground, armed or not."""
 
     BOOT = 1
     STANDBY = 3
@@ -72,7 +72,7 @@ class CopterState(enum.IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class BootTimes:
-    """When things happen after start [us]; in the measured order and proportions, with wiped parameters."""
+    """Times of the boot steps after start [us]; in the measured order and proportions, with wiped parameters."""
 
     heartbeat_us: int
     initialised_us: int  # the mode is STABILIZE again
@@ -81,11 +81,11 @@ class BootTimes:
 
     @classmethod
     def armable_after(cls, armable_us: int) -> BootTimes:
-        """The measured boot (1.05, 2.45, 20.0, 23.7 s), scaled to be armable at `armable_us`."""
+        """Return the measured boot (1.05, 2.45, 20.0, 23.7 s), scaled to be armable at `armable_us`."""
         return cls(*(round(armable_us * at_s / 23.7) for at_s in (1.05, 2.45, 20.0, 23.7)))
 
 
-_CONSISTENT_AFTER = 0.5  # of the boot time: not measured, only that these texts come first
+_CONSISTENT_AFTER = 0.5  # share of the boot time: only the order of these texts was measured
 _NOT_READY = (
     "Arm: Accels inconsistent",
     "Arm: Gyros inconsistent",
@@ -93,7 +93,7 @@ _NOT_READY = (
 
 
 def arming_refusals(boot: BootTimes, now_us: int) -> tuple[str, ...]:
-    """Why arming is refused so long after start; empty once it is not."""
+    """Return why arming is refused at this time after start; empty once it is not."""
     if now_us < boot.initialised_us:
         return ("Arm: System not initialised",)
     if now_us < boot.armable_us * _CONSISTENT_AFTER:

@@ -1,4 +1,4 @@
-"""How ArduCopter flies by itself: climb rates, heights, braking, holding, going somewhere. Local NED, scalar code.
+"""Position control of ArduCopter itself: climb rates, heights, braking, holding, going to a place. Local NED, scalar.
 
 Vertical and horizontal are separate, because GUIDED flies a given attitude at a controlled climb rate. Speeds are
 shaped by an acceleration limit; position and velocity errors are fed back on top (PSC_*). It knows the true hover
@@ -16,14 +16,14 @@ from sitl.plant.sensors import Estimate
 from sitl.plant.vehicle import Array
 from swarmctl.core.frames import GRAVITY_M_S2, quat_from_body_z
 
-LEASH_M = 1.0  # how far the shaped height may run ahead of the vehicle
-Z_I_1_S2 = 2.0  # stands for PSC_ACCZ_I
+LEASH_M = 1.0  # limit of the shaped height's lead over the vehicle
+Z_I_1_S2 = 2.0  # in place of PSC_ACCZ_I
 Z_I_MAX_M_S2 = 3.0
 XY_I_MAX_M_S2 = 2.0
 DOWN_MAX_M_S2 = 0.9 * GRAVITY_M_S2
 UP_MAX_M_S2 = 6.0
 JERK_MAX_M_S3 = 15.0
-HOLD_SPEED_M_S = 0.3  # slower than this, the position is latched
+HOLD_SPEED_M_S = 0.3  # below this speed the position is latched
 
 
 class CopterNavigator:
@@ -40,7 +40,7 @@ class CopterNavigator:
         self._acc_m_s2 = [0.0, 0.0]
 
     def engage(self, estimate: Estimate) -> None:
-        """Begin from here, as if nothing had been flown before."""
+        """Start from the present state, without memory of the flight before."""
         self._yaw_rad = estimate.yaw_rad
         self._hold_xy_m = self._hold_z_m = None
         self._z_m, self._down_m_s = estimate.pos_ned_m[2], estimate.vel_ned_m_s[2]
@@ -51,12 +51,12 @@ class CopterNavigator:
     # --- vertical: throttle before angle boost ---
 
     def climb(self, estimate: Estimate, up_m_s: float, dt_s: float) -> float:
-        """Throttle that climbs at a rate."""
+        """Return the throttle for a climb rate."""
         self._hold_z_m = None
         return self._throttle(estimate, -up_m_s, dt_s)
 
     def to_height(self, estimate: Estimate, z_ned_m: float, dt_s: float) -> float:
-        """Throttle that goes to a height and stays there."""
+        """Return the throttle that flies to a height and holds it."""
         error = z_ned_m - self._z_m
         acc, gain = self._parameters.metres("WPNAV_ACCEL_Z"), self._parameters.real("PSC_POSZ_P")
         near = acc / gain**2
@@ -65,7 +65,7 @@ class CopterNavigator:
         return self._throttle(estimate, max(-up, min(down, speed)), dt_s)
 
     def hold_height(self, estimate: Estimate, dt_s: float) -> float:
-        """Throttle that brakes and stays at that height."""
+        """Return the throttle that brakes and holds the height."""
         if self._hold_z_m is None and abs(self._down_m_s) < 1e-6:
             self._hold_z_m = self._z_m
         if self._hold_z_m is None:
@@ -90,7 +90,7 @@ class CopterNavigator:
     # --- horizontal: attitude (4,) wxyz ---
 
     def hold(self, estimate: Estimate, dt_s: float) -> Array:
-        """Attitude that brakes, latches the position and keeps it."""
+        """Return the attitude that brakes, latches the position and holds it."""
         x_m, y_m, _ = estimate.pos_ned_m
         if self._hold_xy_m is None and math.hypot(*estimate.vel_ned_m_s[:2]) < HOLD_SPEED_M_S:
             self._hold_xy_m = x_m, y_m
@@ -99,7 +99,7 @@ class CopterNavigator:
         return self._toward(estimate, self._hold_xy_m, dt_s)
 
     def go_to(self, estimate: Estimate, xy_m: tuple[float, float], dt_s: float) -> Array:
-        """Attitude that goes to a place; it is held from then on."""
+        """Return the attitude that flies to a place, which is held from then on."""
         self._hold_xy_m = xy_m
         return self._toward(estimate, xy_m, dt_s)
 

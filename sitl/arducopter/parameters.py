@@ -1,6 +1,6 @@
-"""ArduCopter parameters of one vehicle: names, defaults, and integers cast to float on the wire (C-cast).
+"""ArduCopter parameters of one vehicle: names, defaults, and integers cast to float in MAVLink (C-cast).
 
-Only what this simulator uses, or clients commonly ask for. Decoding them bytewise, as for PX4, reads 1 as 1065353216.
+Only what this simulator uses, or clients commonly request. Decoding them bytewise, as for PX4, reads 1 as 1065353216.
 """
 
 from __future__ import annotations
@@ -77,7 +77,7 @@ DEFAULTS: dict[str, tuple[int, float]] = {  # name -> MAV_PARAM_TYPE, value
 
 
 class CopterParameters:
-    """The table of one vehicle. Values out of the documented range are stored, as by ArduCopter."""
+    """The parameters of one vehicle. Values out of the documented range are stored, as by ArduCopter."""
 
     def __init__(self, sysid: int) -> None:
         self._values = {name: value for name, (_, value) in DEFAULTS.items()}
@@ -88,19 +88,19 @@ class CopterParameters:
         return len(self._names)
 
     def real(self, name: str) -> float:
-        """Value of a parameter as a number."""
+        """Return a parameter as a real number."""
         return float(self._values[name])
 
     def metres(self, name: str) -> float:
-        """Value of a parameter in cm, cm/s or cm/s2, in metres."""
+        """Return a parameter in cm, cm/s or cm/s2 in metres."""
         return 0.01 * float(self._values[name])
 
     def integer(self, name: str) -> int:
-        """Value of an integer parameter."""
+        """Return an integer parameter."""
         return int(self._values[name])
 
     def assign(self, name: str, value: float) -> None:
-        """Set a parameter, rounded and limited to what its type holds; a value that is not finite is not stored.
+        """Set a parameter, rounded and limited to its type; a value that is not finite is not stored.
 
         Raises:
             UnknownParameterError: no such name.
@@ -117,13 +117,13 @@ class CopterParameters:
             self._values[name] = max(-limit, min(limit - 1, round(value)))
 
     def by_name(self, name: str) -> WireValue:
-        """Raises `UnknownParameterError`."""
+        """Return a parameter by name; raises `UnknownParameterError`."""
         if name not in self._values:
             raise UnknownParameterError(name)
         return WireValue(name, float(self._values[name]), DEFAULTS[name][0], INDEX_NOT_TOLD)
 
     def by_index(self, index: int) -> WireValue:
-        """Raises `UnknownParameterError` outside the table."""
+        """Return a parameter by index; raises `UnknownParameterError` outside the table."""
         if not 0 <= index < len(self._names):
             raise UnknownParameterError(str(index))
         name = self._names[index]

@@ -1,7 +1,7 @@
-"""What an ArduCopter reports: a builder a message, the groups of REQUEST_DATA_STREAM, and what is due when.
+"""Reports of an ArduCopter: a builder per message, the groups of REQUEST_DATA_STREAM, and the send times.
 
-Every builder takes the same `CopterReport` and returns a dialect message. Nothing but HEARTBEAT and TIMESYNC flows
-before it is asked for (SR0_* = 0).
+Every builder takes the same `CopterReport` and returns a dialect message. Only HEARTBEAT and TIMESYNC are sent without
+a request (SR0_* = 0).
 """
 
 from __future__ import annotations
@@ -161,7 +161,7 @@ def battery_status(r: CopterReport) -> Any:
 
 
 def ekf_status(r: CopterReport) -> Any:
-    """The "variances" are test ratios of innovations, not metres."""
+    """Build EKF_STATUS_REPORT; its "variances" are test ratios of innovations, not metres."""
     if not r.pilot.has_origin:
         return mav.MAVLink_ekf_status_report_message(_EKF_NO_POSITION, 0, 0, 0, 0, 0)
     horizontal_m, vertical_m = r.estimate.pos_accuracy_m
@@ -180,11 +180,11 @@ ALL_GROUPS = 0
 
 @dataclass(frozen=True, slots=True)
 class CopterStream:
-    """One message this vehicle can send."""
+    """One message that this vehicle can send."""
 
     build: Callable[[CopterReport], Any]
-    group: int | None = None  # of REQUEST_DATA_STREAM; None: by SET_MESSAGE_INTERVAL or REQUEST_MESSAGE only
-    needs_position: bool = False  # not before the EKF has its origin
+    group: int | None = None  # group of REQUEST_DATA_STREAM; None: by SET_MESSAGE_INTERVAL or REQUEST_MESSAGE only
+    needs_position: bool = False  # only after the EKF has its origin
 
 
 STREAMS: dict[int, CopterStream] = {
@@ -209,7 +209,7 @@ STREAMS: dict[int, CopterStream] = {
 
 
 class Intervals:
-    """Which messages are due. Times are since boot and lie on a grid from boot, so that samples repeat exactly."""
+    """Decides which messages are due. Times since boot lie on a grid from boot, so that samples repeat exactly."""
 
     def __init__(self, step_us: int) -> None:
         self._step_us = step_us
@@ -218,7 +218,7 @@ class Intervals:
         self._earliest_us = 0
 
     def set_interval(self, message: int, interval_us: int, now_us: int) -> None:
-        """Interval of a message [us], never faster than one physics step; 0 and less: off."""
+        """Set the interval of a message [us], never below one physics step; 0 and less: off."""
         if interval_us <= 0:
             self._interval_us.pop(message, None)
             self._next_us.pop(message, None)
@@ -229,7 +229,7 @@ class Intervals:
         self._earliest_us = min(self._next_us.values(), default=0)
 
     def take_due(self, now_us: int) -> list[int]:
-        """Ids due at `now_us`, in ascending order (attitude before position); missed ones are sent once."""
+        """Return the ids due at `now_us`, in ascending order (attitude before position); a missed one is sent once."""
         if now_us < self._earliest_us:
             return []
         due = sorted(message for message, at_us in self._next_us.items() if at_us <= now_us)

@@ -1,6 +1,6 @@
-"""A link that loses, delays, doubles, reorders and corrupts datagrams, seeded, each direction by itself.
+"""A link that loses, delays, duplicates, reorders and corrupts datagrams, seeded, each direction separately.
 
-Without a fault it hands everything through untouched. What is late is released when the simulator next steps.
+Without an impairment it passes everything unchanged. Late datagrams are released when the simulator next steps.
 """
 
 from __future__ import annotations
@@ -13,14 +13,14 @@ import numpy as np
 from swarmctl.mavlink.codec import frames, message_id
 from swarmctl.mavlink.transport import Datagram, Transport
 
-_OVERTAKEN_US = 100_000  # a datagram waits this long for one to overtake it
+_OVERTAKEN_US = 100_000  # longest time that a datagram waits for another to overtake it
 _SET_ATTITUDE_TARGET = 82
 _NOTHING = (0.0,) * 5
 
 
 @dataclass
-class Troubles:
-    """Of one direction; probabilities are per datagram."""
+class Impairments:
+    """Impairments of one link direction; probabilities are per datagram."""
 
     loss_01: float = 0.0
     delay_ms: float = 0.0
@@ -29,51 +29,51 @@ class Troubles:
     corrupt_01: float = 0.0
 
     def any(self) -> bool:
-        """Whether there is one."""
+        """Return whether any impairment is set."""
         return (self.loss_01, self.delay_ms, self.duplicate_01, self.reorder_01, self.corrupt_01) != _NOTHING
 
 
-class Way:
+class LinkDirection:
     """One direction of a link.
 
     Attributes:
-        clear: datagrams pass untouched and none is waiting; kept up to date, because every datagram asks.
+        clear: datagrams pass unchanged and none is waiting; a cached flag, because every datagram tests it.
     """
 
     def __init__(self, rng: np.random.Generator) -> None:
         self.clear = True
-        self.troubles = Troubles()
+        self.impairments = Impairments()
         self._rng = rng
         self._queue: list[tuple[int, int, bytes]] = []  # due, number, datagram
-        self._overtaken: tuple[int, bytes] | None = None  # patience ends, datagram
+        self._overtaken: tuple[int, bytes] | None = None  # end of the wait, datagram
         self._number = 0
 
-    def trouble(self, name: str, amount: float) -> None:
-        """Set one of the troubles; 0 takes it away."""
-        setattr(self.troubles, name, amount)
+    def set_impairment(self, name: str, amount: float) -> None:
+        """Set one of the impairments; 0 removes it."""
+        setattr(self.impairments, name, amount)
         self._look()
 
     def offer(self, now_us: int, data: bytes) -> None:
-        """One datagram enters."""
-        troubles, rng = self.troubles, self._rng
-        if self._happens(troubles.loss_01):
+        """Enter one datagram."""
+        impairments, rng = self.impairments, self._rng
+        if self._happens(impairments.loss_01):
             return
-        if self._happens(troubles.corrupt_01) and data:
+        if self._happens(impairments.corrupt_01) and data:
             spoilt = bytearray(data)
             spoilt[int(rng.integers(len(data)))] ^= 1 << int(rng.integers(8))
             data = bytes(spoilt)
-        if self._overtaken is None and self._happens(troubles.reorder_01):
+        if self._overtaken is None and self._happens(impairments.reorder_01):
             self._overtaken = now_us + _OVERTAKEN_US, data
             return
-        due_us = now_us + round(troubles.delay_ms * 1e3)
-        for _ in range(2 if self._happens(troubles.duplicate_01) else 1):
+        due_us = now_us + round(impairments.delay_ms * 1e3)
+        for _ in range(2 if self._happens(impairments.duplicate_01) else 1):
             self._push(due_us, data)
         if self._overtaken is not None:
             self._push(due_us, self._overtaken[1])
             self._overtaken = None
 
     def take(self, now_us: int) -> list[Datagram]:
-        """Everything that comes out by now, stamped with its own time."""
+        """Return every datagram that leaves by now, stamped with its own time."""
         if self._overtaken is not None and now_us >= self._overtaken[0]:
             self._push(*self._overtaken)
             self._overtaken = None
@@ -85,19 +85,19 @@ class Way:
         return out
 
     def _look(self) -> None:
-        self.clear = not (self._queue or self._overtaken or self.troubles.any())
+        self.clear = not (self._queue or self._overtaken or self.impairments.any())
 
     def _push(self, due_us: int, data: bytes) -> None:
         self._number += 1
         heapq.heappush(self._queue, (due_us, self._number, data))
 
     def _happens(self, probability_01: float) -> bool:
-        """A draw only where it matters, so that one fault does not change what another does."""
+        """Draw only where it matters, so that one fault does not change the random numbers of another."""
         return probability_01 > 0.0 and float(self._rng.random()) < probability_01
 
 
 class LossyLink:
-    """A transport around another one.
+    """A transport that impairs another one.
 
     Attributes:
         to_vehicle, from_vehicle: its two directions.
@@ -107,14 +107,16 @@ class LossyLink:
         self._inner = inner
         self._now_us = 0
         self._setpoints: int | None = None
-        self.to_vehicle, self.from_vehicle = (Way(np.random.default_rng([*seed, way])) for way in (0, 1))
+        self.to_vehicle, self.from_vehicle = (
+            LinkDirection(np.random.default_rng([*seed, direction])) for direction in (0, 1)
+        )
 
     def send(self, data: bytes) -> None:
-        way = self.from_vehicle
-        if way.clear:
+        direction = self.from_vehicle
+        if direction.clear:
             self._inner.send(data)
             return
-        way.offer(self._now_us, data)
+        direction.offer(self._now_us, data)
         self._release()
 
     def receive(self, now_us: int) -> list[Datagram]:
@@ -122,11 +124,11 @@ class LossyLink:
         if not self.from_vehicle.clear:
             self._release()
         arrived = self._inner.receive(now_us)
-        way = self.to_vehicle
-        if not way.clear:
+        direction = self.to_vehicle
+        if not direction.clear:
             for datagram in arrived:
-                way.offer(datagram.t_us, datagram.data)
-            arrived = way.take(now_us)
+                direction.offer(datagram.t_us, datagram.data)
+            arrived = direction.take(now_us)
         if self._setpoints is not None:
             self._setpoints += sum(
                 message_id(frame) == _SET_ATTITUDE_TARGET for datagram in arrived for frame in frames(datagram.data)
@@ -134,7 +136,7 @@ class LossyLink:
         return arrived
 
     def setpoints(self) -> int:
-        """SET_ATTITUDE_TARGET frames that have come out since the first call."""
+        """Return the number of SET_ATTITUDE_TARGET frames that have come out since the first call."""
         self._setpoints = self._setpoints or 0
         return self._setpoints
 

@@ -1,4 +1,4 @@
-"""A vehicle's UDP port as PX4 has one: it listens to everybody, and talks to whoever was first."""
+"""A vehicle's UDP port as in PX4: it receives from every sender, and sends to the first one."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _MAX_DATAGRAM = 2048
 class OpenPort:
     """Sends to `remote` until the first datagram arrives, from then on to its sender for good.
 
-    Datagrams of all senders are handed on: PX4 obeys them too, and answers the first.
+    Datagrams of all senders are passed on: PX4 obeys them too, and answers the first.
     """
 
     def __init__(self, sock: socket.socket, remote: tuple[str, int]) -> None:
@@ -23,18 +23,18 @@ class OpenPort:
 
     @property
     def fd(self) -> int:
-        """File descriptor, for a selector."""
+        """Return the file descriptor, for a selector."""
         return self._sock.fileno()
 
     def send(self, data: bytes) -> None:
-        """Hand over one frame; dropped when the socket can't take it."""
+        """Send one frame; it is dropped when the socket can't take it."""
         try:
             self._sock.sendto(data, self._remote)
         except OSError:
             return
 
     def receive(self, now_us: int) -> list[Datagram]:
-        """Everything that has arrived since the last call."""
+        """Return everything that has arrived since the last call."""
         arrived: list[Datagram] = []
         while True:
             try:

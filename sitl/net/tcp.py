@@ -1,6 +1,6 @@
-"""TCP links as of ArduCopter's own simulator: vehicle i serves one client at a time on port 5760 + 10 i.
+"""TCP links as in ArduCopter's own simulator: vehicle i serves one client at a time on port 5760 + 10 i.
 
-Nothing here blocks. While no client is connected, what is sent is dropped.
+Nothing here blocks. Frames sent while no client is connected are dropped.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _BACKLOG_BYTES = 1 << 16  # a client that does not read loses whole frames beyon
 
 
 class TcpServerTransport:
-    """A listening socket, and the client that has connected to it; another one may follow when it leaves."""
+    """A listening socket and its connected client; another client may follow when it leaves."""
 
     def __init__(self, listener: socket.socket) -> None:
         self._listener = listener
@@ -27,7 +27,7 @@ class TcpServerTransport:
 
     @property
     def port(self) -> int:
-        """Where it listens."""
+        """The port it listens on."""
         port: int = self._listener.getsockname()[1]
         return port
 
@@ -67,7 +67,7 @@ class TcpServerTransport:
     def _accept(self) -> None:
         try:
             self._client, _ = self._listener.accept()
-        except OSError:  # nobody waits
+        except OSError:  # no client waits
             return
         self._client.setblocking(False)
         self._client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -81,7 +81,7 @@ class TcpServerTransport:
 
 
 def serve_tcp(host: str, first: int, vehicles: int) -> list[TcpServerTransport]:
-    """A server for each vehicle, on ports `first`, `first` + 10, ...
+    """Return a server for each vehicle, on ports `first`, `first` + 10, ...
 
     Raises:
         StartError: a port is taken or beyond 65535.
@@ -89,7 +89,7 @@ def serve_tcp(host: str, first: int, vehicles: int) -> list[TcpServerTransport]:
     servers: list[TcpServerTransport] = []
     for port in range(first, first + PORT_STEP * vehicles, PORT_STEP):
         listener = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
-        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # of a port in TIME_WAIT; listeners still clash
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # for a port in TIME_WAIT; listeners still clash
         try:
             listener.bind((host, port))
             listener.listen(1)

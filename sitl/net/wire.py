@@ -1,7 +1,8 @@
-"""MAVLink frames of the simulator: packed straight from tuples, and cut out of what arrives.
+"""MAVLink frames of the simulator: packed directly from tuples, and cut out of received bytes.
 
-A dialect object costs 5-40 us to pack, a tuple about 2: one core has to carry 25,000 messages a second. PX4 sends eight
-messages the dialect module lacks; they are defined here. `tests/unit/test_sitl_wire.py` checks all against pymavlink.
+A dialect object takes 5-40 us to pack, a tuple about 2: one core has to carry 25,000 messages a second. PX4 sends eight
+messages that the dialect module lacks; they are defined here. `tests/unit/sitl/test_wire.py` compares all with
+pymavlink.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ _SIGNED = 1
 
 
 class Kind(NamedTuple):
-    """One message on the wire; `layout` takes its fields in wire order (largest type first)."""
+    """Layout of one message; `layout` takes its fields in wire order (largest type first)."""
 
     number: int
     name: str
@@ -117,7 +118,7 @@ KINDS = _kinds()
 
 
 class FrameWriter:
-    """Frames of one component on one link; the sequence number is the link's."""
+    """Writes the frames of one component on one link, with the link's sequence number."""
 
     def __init__(self, sysid: int, compid: int) -> None:
         self.sysid = sysid
@@ -125,7 +126,7 @@ class FrameWriter:
         self.sequence = 0
 
     def frame(self, kind: Kind, fields: tuple[Any, ...]) -> bytes:
-        """MAVLink 2 frame of a message from its fields in wire order."""
+        """Return the MAVLink 2 frame of a message from its fields in wire order."""
         payload = kind.layout.pack(*fields).rstrip(b"\0") or b"\0"
         number = kind.number
         body = (
@@ -148,7 +149,7 @@ class FrameWriter:
 
 
 def frames(datagram: bytes) -> Iterator[bytes]:
-    """Frames of MAVLink 2 and 1 in a datagram; bytes that begin none are skipped, a cut-off one ends it."""
+    """Yield the MAVLink 2 and 1 frames of a datagram; other bytes are skipped, a truncated frame ends it."""
     start, size = 0, len(datagram)
     while start + 8 <= size:
         magic = datagram[start]

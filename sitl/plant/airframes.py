@@ -1,4 +1,4 @@
-"""Airframes: numbers of a vehicle and where they come from. No equations."""
+"""Airframes: the numbers of a vehicle and their sources. No equations."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Preset:
-    """Airframe numbers, nominal mass."""
+    """The numbers of an airframe at nominal mass."""
 
     name: str
     mass_kg: float
@@ -19,14 +19,14 @@ class Preset:
     rotor_inertia_kg_m2: float  # Jr
     drag_rotation_1_s: tuple[float, float, float]  # kp, kq, kr
     drag_n_s_m: tuple[float, float, float]  # ku, kv, kw times the nominal mass, body axes
-    drag_scales_with_mass: bool  # thesis: an acceleration whatever the mass; SIH: a force
-    motor_tau_s: float  # 0: rotors follow at once
-    rotor_radius_m: float  # disc of each rotor: power drawn, ground effect
+    drag_scales_with_mass: bool  # thesis: an acceleration, independent of the mass; SIH: a force
+    motor_tau_s: float  # 0: no lag
+    rotor_radius_m: float  # of each rotor's disc, for power and ground effect
     cells: int = 4  # lithium-polymer cells in series
 
     @property
     def thrust_max_n(self) -> float:
-        """Collective thrust of setpoint 1.0."""
+        """Collective thrust at setpoint 1.0 [N]."""
         return 4.0 * self.rotor_force_max_n
 
 
@@ -36,7 +36,7 @@ PRESETS = {
         mass_kg=1.0,
         inertia_kg_m2=(8e-3, 8e-3, 14.2e-3),
         arm_m=0.24,
-        rotor_force_max_n=5.0,  # its 20 N bound, shared out
+        rotor_force_max_n=5.0,  # a quarter of its 20 N bound
         yaw_per_force_m=1.1e-6 / 54.2e-6,
         thrust_coeff_n_s2=54.2e-6,
         rotor_inertia_kg_m2=1.08e-6,
@@ -81,7 +81,7 @@ PRESETS = {
         cells=1,
     ),
     # ArduCopter 4.6.3 as measured with GUID_OPTIONS 8: hover 0.364-0.368, mean acceleration 0.25-0.7 s after
-    # steps to 0.318, 0.418, 0.468. Vertical drag is fitted to these; hardly any sideways, for it drifts on when level.
+    # steps to 0.318, 0.418, 0.468. Vertical drag is fitted to these; lateral drag is small, as it drifts on when level.
     "arducopter": Preset(
         name="arducopter",
         mass_kg=3.0,

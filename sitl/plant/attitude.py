@@ -1,8 +1,8 @@
 """Attitude loops of all vehicles at once, at physics rate: the thesis' PIDs, and a PX4-like cascade.
 
-Both turn an attitude setpoint per vehicle into body torques (3, N) [N m]. They know no modes: a vehicle that is idle
-(disarmed, on the ground, clamped) gets zero torque and loses its memory, so that at release the loop sees the setpoint
-as a step from where the vehicle is.
+Both turn one attitude setpoint per vehicle into body torques (3, N) [N m]. They know no modes: an idle vehicle
+(disarmed, on the ground, clamped) gets zero torque and its loop is reset, so that at release the setpoint acts as a
+step from the attitude of the vehicle.
 """
 
 from __future__ import annotations
@@ -22,41 +22,41 @@ _TURN_RAD = 2.0 * math.pi
 
 
 class Sensed(Protocol):
-    """Attitude and rates of a batch, true (`Plant`) or as the autopilots believe (`Estimator`)."""
+    """Attitude and rates of all vehicles: true (`Plant`), or as estimated by the autopilots (`Estimator`)."""
 
     @property
     def q_nb(self) -> Array:
-        """(4, N) wxyz."""
+        """Attitude (4, N), wxyz."""
 
     @property
     def euler_rad(self) -> Array:
-        """(3, N) roll, pitch, yaw."""
+        """Roll, pitch, yaw (3, N) [rad]."""
 
     @property
     def rate_frd_rad_s(self) -> Array:
-        """(3, N)."""
+        """Body rates (3, N), FRD [rad/s]."""
 
 
 class AttitudeLoop(Protocol):
-    """What flies the attitude setpoints of a batch."""
+    """Follows the attitude setpoints of all vehicles."""
 
     rates: RateLoop
 
     def set_reference(self, vehicle: int, q_nb: Array) -> None:
-        """New setpoint of one vehicle, (4,) wxyz; it acts from the next step."""
+        """Set the setpoint (4,) wxyz of one vehicle; it acts from the next step."""
 
     def torque(self, sensed: Sensed, live: Array, out: Array) -> None:
-        """Torques (3, N) [N m] into `out`; `live` (N,) is 1.0 for vehicles in free flight and 0.0 for idle ones."""
+        """Write torques (3, N) [N m] to `out`; `live` (N,) is 1.0 in free flight and 0.0 for idle vehicles."""
 
 
 @dataclass(frozen=True, slots=True)
 class PidGains:
-    """Roll, pitch, yaw; error in rad, output N m."""
+    """PID gains of roll, pitch, yaw; error in rad, output in N m."""
 
     proportional: tuple[float, float, float]
     integral: tuple[float, float, float]
     derivative: tuple[float, float, float]
-    on_measurement: bool = False  # the derivative, so that a step of the reference does not kick
+    on_measurement: bool = False  # derivative of the measurement, so that a reference step does not kick
 
 
 THESIS_GAINS = {
@@ -87,7 +87,7 @@ class ThesisAttitude:
         self.rates = RateLoop(self._rate_gain, vehicles, dt_s)
         self._past = np.zeros((self._window, 3, vehicles))
         self._head = 0
-        self._integral = np.zeros((3, vehicles))  # times kI already
+        self._integral = np.zeros((3, vehicles))  # already multiplied by kI
         self._error = np.zeros((3, vehicles))
         self._term = np.zeros((3, vehicles))
 
@@ -100,13 +100,13 @@ class ThesisAttitude:
         np.multiply(error, 1.0 / _TURN_RAD, out=term)
         np.rint(term, out=term)
         term *= _TURN_RAD
-        error -= term  # nearest turn
+        error -= term  # wrapped to the nearest turn
         error *= live
         past = self._past[self._head]
         watched = np.remainder(-sensed.euler_rad, _TURN_RAD) * live if self._on_measurement else error
         np.subtract(watched, past, out=term)
         if self._on_measurement:
-            term -= np.rint(term / _TURN_RAD) * _TURN_RAD  # nearest turn
+            term -= np.rint(term / _TURN_RAD) * _TURN_RAD  # wrapped to the nearest turn
         past[...] = watched
         self._head = (self._head + 1) % self._window
         np.multiply(term, self._kd, out=out)
@@ -124,14 +124,14 @@ class ThesisAttitude:
 
 @dataclass(frozen=True, slots=True)
 class CascadeGains:
-    """Of one airframe's loops; roll, pitch, yaw."""
+    """Gains of one airframe's loops; roll, pitch, yaw."""
 
     attitude_1_s: tuple[float, float, float]
     rate_1_s: tuple[float, float, float]  # angular acceleration over rate error
     rate_integral_1_s2: tuple[float, float, float]
     rate_derivative: tuple[float, float, float]
     rate_limit_rad_s: tuple[float, float, float]
-    delay_s: float  # setpoint to first reaction of the loop
+    delay_s: float  # from a setpoint to the first reaction of the loop
 
 
 CASCADE_GAINS = {
@@ -143,13 +143,13 @@ CASCADE_GAINS = {
         rate_limit_rad_s=(3.84, 3.84, 3.49),  # MC_ROLLRATE_MAX 220, MC_YAWRATE_MAX 200 deg/s
         delay_s=0.036,
     ),
-    "crazyflie": CascadeGains(  # as fast as its rotors' lag allows without overshoot; no published step response
+    "crazyflie": CascadeGains(  # as fast as its rotor lag allows without overshoot; no published step response
         attitude_1_s=(7.0, 7.0, 4.0),
         rate_1_s=(20.0, 20.0, 8.0),
         rate_integral_1_s2=(2.0, 2.0, 0.5),
         rate_derivative=(0.1, 0.1, 0.0),
         rate_limit_rad_s=(5.0, 5.0, 3.5),
-        delay_s=0.008,  # radio to stabiliser
+        delay_s=0.008,  # from radio to stabiliser
     ),
     "arducopter": CascadeGains(  # fitted to ArduCopter 4.6.3: t10, t50, t63, t90 of a roll step; yaw not measured
         attitude_1_s=(5.3, 5.3, 4.0),
@@ -226,7 +226,7 @@ class CascadeAttitude:
 
 
 def attitude_loop(preset: Preset, vehicles: int, dt_s: float, gains: str = "swarm") -> AttitudeLoop:
-    """The loop that belongs to an airframe; `gains` names one of `THESIS_GAINS` and matters to that airframe only."""
+    """Return the loop of an airframe; `gains` is a key of `THESIS_GAINS` and used by that airframe only."""
     if preset.name == "thesis":
         return ThesisAttitude(vehicles, dt_s, THESIS_GAINS[gains])
     return CascadeAttitude(preset, vehicles, dt_s)

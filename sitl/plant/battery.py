@@ -1,7 +1,7 @@
-"""One pack of lithium-polymer cells a vehicle: charge used, sagging voltage, and the thrust that costs.
+"""One lithium-polymer pack per vehicle: used charge, sagging voltage, and the resulting loss of thrust.
 
-Power of a rotor is momentum theory's T^1.5 / sqrt(2 rho A) over one efficiency for propeller, motor and controller.
-Thrust goes with the square of the voltage at the rotor's terminals; the airframe's force limit belongs to a full pack.
+Rotor power is momentum theory's T^1.5 / sqrt(2 rho A) over one efficiency for propeller, motor and controller. Thrust
+is proportional to the square of the rotor's terminal voltage; the airframe's force limit is that of a full pack.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ _AIR_KG_M3 = 1.225
 _EFFICIENCY = 0.55
 _CHARGE_01 = (0.0, 0.05, 0.1, 0.2, 0.4, 0.6, 0.8, 1.0)
 _CELL_V = (3.0, 3.45, 3.6, 3.7, 3.78, 3.88, 4.02, 4.2)  # at rest
-_EMPTY_V = 2.5  # a cell never shows less
+_EMPTY_V = 2.5  # lower limit of a cell's voltage
 
 
 class Battery:
     """Packs of all vehicles.
 
     Attributes:
-        charge_01: (N,) what is left.
+        charge_01: (N,) remaining charge.
         volts: (N,) under load.
-        amperes: (N,) drawn.
+        amperes: (N,) current drawn.
         force_01: (N,) available rotor force over that of a full pack.
     """
 
@@ -43,7 +43,7 @@ class Battery:
 
     @property
     def modelled(self) -> bool:
-        """Whether anything is drawn at all."""
+        """Whether any current is modelled."""
         return self._capacity_c > 0
 
     @property
@@ -51,12 +51,12 @@ class Battery:
         return self._cells * _CELL_V[-1]
 
     def drain_to(self, vehicle: int, charge_01: float) -> None:
-        """Take charge away, as a fault; never give any."""
+        """Remove charge down to a level, as a fault; charge is never added."""
         self.charge_01[vehicle] = min(charge_01, self.charge_01[vehicle])
         self._load()
 
     def advance(self, dt_s: float, rotor_force_n: Array) -> None:
-        """Draw what rotors at `rotor_force_n` (4, N) need for `dt_s`."""
+        """Draw for `dt_s` what rotors at `rotor_force_n` (4, N) need."""
         if not self.modelled:
             return
         watts = self._watts_per_n15 * np.sum(np.maximum(rotor_force_n, 0.0) ** 1.5, axis=0)

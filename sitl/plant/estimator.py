@@ -1,8 +1,8 @@
-"""What is wrong with each autopilot's estimate of itself: seeded error models, one independent error a vehicle.
+"""Errors of each autopilot's own estimate: seeded error models, independent for each vehicle.
 
-The autopilot's own navigator and its attitude loop fly on the same wrong estimate that its client is told. With the
-model `exact` there is no error and nothing is drawn. Stamps say when an estimate was published; how old the sample
-behind it is (`latency_s`) is told to nobody, as on a real autopilot.
+The autopilot's navigator and attitude loop use the same estimate that its client receives. The model `exact` has no
+error and draws nothing. Stamps give the publishing time of an estimate; the age of its sample (`latency_s`) is not
+reported, as on a real autopilot.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from sitl.plant.sensors import FULL, Estimate, Power
 from sitl.plant.vehicle import Array, Plant
 
 _BLOCK = 50  # steps of random numbers drawn at a time
-_DRAWS = 17  # a step and vehicle: wander of position 3, velocity 3, tilt 2; white noise on each 3, 3, 3
-_PURPOSE = 1  # of the random stream, beside run seed and vehicle
-_LOST_M_S2 = 0.05  # acceleration that 0.3 deg of tilt error leaks into a position that nothing corrects
+_DRAWS = 17  # per step and vehicle: wander of position 3, velocity 3, tilt 2; white noise on each 3, 3, 3
+_PURPOSE = 1  # purpose of the random stream, beside run seed and vehicle
+_LOST_M_S2 = 0.05  # acceleration that a tilt error of 0.3 deg causes in an uncorrected position
 EXACT_ACCURACY_M = (0.01, 0.01)
 
 
@@ -28,8 +28,8 @@ EXACT_ACCURACY_M = (0.01, 0.01)
 class ErrorModel:
     """Slow errors: root mean square and correlation time, NED per axis.
 
-    They are white noise behind two equal low-passes: a filter that integrates inertial data, as an autopilot's does,
-    is wrong smoothly, so that its position can still be differentiated.
+    They are white noise behind two equal low-passes. A filter that integrates inertial data, as an autopilot's does,
+    has smooth errors, so that its position can still be differentiated.
     """
 
     position_m: tuple[float, float, float]
@@ -41,16 +41,16 @@ class ErrorModel:
     noise_position_m: float  # white, per axis and physics step
     noise_velocity_m_s: float
     noise_attitude_rad: float
-    latency_s: tuple[float, float]  # age of a sample when published; every vehicle has its own between these
+    latency_s: tuple[float, float]  # age of a sample when published; drawn for each vehicle from this interval
 
     @property
     def accuracy_m(self) -> tuple[float, float]:
-        """1 sigma, horizontal (both axes together, as PX4 reports it) and vertical."""
+        """Accuracy [m], 1 sigma, horizontal (both axes together, as PX4 reports it) and vertical."""
         north, east, down = (math.hypot(rms_m, self.noise_position_m) for rms_m in self.position_m)
         return math.hypot(north, east), down
 
 
-_PERFECT = ErrorModel((0.0,) * 3, 1.0, (0.0,) * 3, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0, (0.0, 0.0))  # to carry faults
+_PERFECT = ErrorModel((0.0,) * 3, 1.0, (0.0,) * 3, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0, (0.0, 0.0))  # carries faults only
 
 ESTIMATORS: dict[str, ErrorModel | None] = {
     "exact": None,
@@ -82,13 +82,13 @@ ESTIMATORS: dict[str, ErrorModel | None] = {
 
 
 class Estimator:
-    """Estimates of all vehicles. `advance` after every physics step; `of` whenever somebody asks.
+    """Estimates of all vehicles. Call `advance` after every physics step; `of` returns an estimate.
 
     Attributes:
-        q_nb: (4, N) attitude as the attitude loop knows it: without latency and white noise.
+        q_nb: (4, N) attitude for the attitude loop: without latency and white noise.
         euler_rad: (3, N) the same as roll, pitch, yaw.
-        rate_frd_rad_s: (3, N).
-        power: what each vehicle's power module measures.
+        rate_frd_rad_s: (3, N) body rates.
+        power: measurements of each vehicle's power module.
     """
 
     def __init__(self, model: ErrorModel | None, plant: Plant, seed: int) -> None:
@@ -100,11 +100,11 @@ class Estimator:
         count = plant.state.shape[1]
         self.power: list[Power] = [FULL] * count
         self._jump_ned_m = np.zeros((3, count))
-        self._lost_s = np.zeros(count)  # since GPS was lost; 0: it is there
+        self._lost_s = np.zeros(count)  # since GPS was lost; 0: GPS is available
         self._lost = np.zeros(count)
         self._drift_axis = np.zeros((3, count))
         self._frozen: dict[int, Estimate] = {}
-        self._rows: list[Any] = []  # (19,) of each vehicle: see `_believed`
+        self._rows: list[Any] = []  # (19,) per vehicle: see `_believed`
         self._on_ground: list[bool] = []
         if model is not None:
             self._start(model, plant, seed)
@@ -122,7 +122,7 @@ class Estimator:
         )[:, None]
         first = np.stack([rng.standard_normal((2, 8)) for rng in self._rngs], axis=2)  # (2, 8, N)
         self._wander = first[0] * rms[:, None]
-        self._rough = self._wander + first[1] * rms[:, None]  # variance and correlation of the two at rest
+        self._rough = self._wander + first[1] * rms[:, None]  # stationary variance and correlation of the two
         low_s, high_s = model.latency_s
         lags = [round(rng.uniform(low_s, high_s) / dt_s) for rng in self._rngs]
         self._lag_steps = np.array(lags)
@@ -135,7 +135,7 @@ class Estimator:
         self._tilt_quat()
 
     def advance(self) -> None:
-        """The physics has made a step."""
+        """Update the estimates after a physics step."""
         self._stale = True
         if self._model is None:
             return
@@ -154,7 +154,7 @@ class Estimator:
         self._tilt_quat()
 
     def of(self, vehicle: int, t_us: int) -> Estimate:
-        """What a vehicle believes; `t_us` is its stamp, since boot."""
+        """Return the estimate of a vehicle; its stamp is `t_us` since boot."""
         frozen = self._frozen.get(vehicle)
         if frozen is not None:
             return replace(frozen, t_us=t_us, on_ground=bool(self._plant.contact[vehicle]), battery=self.power[vehicle])
@@ -183,32 +183,32 @@ class Estimator:
 
     @property
     def sensed(self) -> Sensed:
-        """What the attitude loop flies on."""
+        """Return the attitude and rates that the attitude loop uses."""
         return self._plant if self._model is None else self
 
     def jump(self, vehicle: int, by_ned_m: Array) -> None:
-        """Move the reported position by (3,); the negative takes it back."""
+        """Shift the reported position by (3,) [m]; the negative reverts it."""
         self._wake()
         self._jump_ned_m[:, vehicle] += by_ned_m
         self._stale = True
 
     def freeze(self, vehicle: int, t_us: int) -> None:
-        """Go on reporting what is believed now."""
+        """Repeat the present estimate from now on."""
         self._frozen[vehicle] = self.of(vehicle, t_us)
 
     def thaw(self, vehicle: int) -> None:
-        """Report what is believed again."""
+        """Resume the estimate."""
         self._frozen.pop(vehicle, None)
 
     def lose_gps(self, vehicle: int) -> None:
-        """From now on position is dead-reckoned: its error accelerates, horizontally; height has a barometer."""
+        """Dead-reckon the position from now on: its horizontal error accelerates; height has a barometer."""
         self._wake()
         heading = np.random.default_rng([self._seed, vehicle, _PURPOSE, 1]).uniform(0.0, 2.0 * math.pi)
         self._drift_axis[:, vehicle] = math.cos(heading), math.sin(heading), 0.0
         self._lost[vehicle], self._lost_s[vehicle] = 1.0, 0.0
 
     def find_gps(self, vehicle: int) -> None:
-        """GPS is back: the estimate jumps to where it says."""
+        """Restore GPS: the estimate jumps to its position."""
         self._lost[vehicle] = self._lost_s[vehicle] = 0.0
 
     def _wake(self) -> None:
@@ -217,18 +217,18 @@ class Estimator:
             self._start(_PERFECT, self._plant, self._seed)
 
     def _sample(self) -> Array:
-        """(13, N) position, NED velocity, rates and attitude of this instant."""
+        """Return position, NED velocity, rates and attitude of this instant, (13, N)."""
         plant = self._plant
         return np.concatenate([plant.pos_ned_m, plant.vel_ned_m_s, plant.rate_frd_rad_s, plant.q_nb])
 
     def _tilt_quat(self) -> None:
-        """What the attitude loop flies on."""
+        """Return the attitude that the attitude loop uses."""
         self.q_nb = _turned(self._plant.q_nb, self._wander[6], self._wander[7], 0.0)
         self.euler_rad, _ = _euler_and_down(self.q_nb)
         self.rate_frd_rad_s = self._plant.rate_frd_rad_s
 
     def _publish(self) -> None:
-        """Rows of numbers for all vehicles at once: one conversion a step instead of six a message."""
+        """Convert the numbers of all vehicles at once: one conversion per step instead of six per message."""
         self._stale = False
         self._on_ground = self._plant.contact.tolist()
         if self._model is None:
@@ -239,7 +239,7 @@ class Estimator:
         self._rows = list(zip(*believed.tolist(), strict=True))
 
     def _believed(self) -> Array:
-        """(19, N) position, velocity, rates, attitude, Euler angles and down axis, each vehicle's own age."""
+        """Return position, velocity, rates, attitude, Euler angles and down axis (19, N), delayed per vehicle."""
         rows = (self._head - self._lag_steps) % len(self._history)
         seen = self._history[rows, :, self._columns].T  # (13, N), each vehicle's own age
         reported = seen[:9].copy()
@@ -252,7 +252,7 @@ class Estimator:
 
 
 def _turned(q_nb: Array, roll_rad: Array, pitch_rad: Array, yaw_rad: Array | float) -> Array:
-    """Attitudes (4, N) with small errors about the body axes; unit length."""
+    """Return attitudes (4, N) with small errors about the body axes; unit length."""
     w, x, y, z = q_nb
     a, b, c = 0.5 * roll_rad, 0.5 * pitch_rad, 0.5 * yaw_rad
     turned = np.stack(
@@ -263,7 +263,7 @@ def _turned(q_nb: Array, roll_rad: Array, pitch_rad: Array, yaw_rad: Array | flo
 
 
 def _euler_and_down(q_nb: Array) -> tuple[Array, Array]:
-    """Roll, pitch, yaw (3, N) and the body's down axis in NED (3, N)."""
+    """Return roll, pitch, yaw (3, N) and the body's down axis in NED (3, N)."""
     w, x, y, z = q_nb
     down = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z])
     roll = np.arctan2(2 * (y * z + w * x), down[2])

@@ -1,4 +1,4 @@
-"""What accelerometers of all vehicles feel: specific force from the change of true velocity between two samples."""
+"""Accelerometers of all vehicles: specific force from the change of true velocity between two samples."""
 
 from __future__ import annotations
 
@@ -9,11 +9,7 @@ from swarmctl.core.frames import GRAVITY_M_S2
 
 
 class Imu:
-    """Mean specific force, body axes FRD, over one autopilot tick; it contains every force there is.
-
-    Attributes:
-        force_frd_m_s2: (3, N) at the newest sample.
-    """
+    """Mean specific force, body axes FRD, over one autopilot tick; it contains every force."""
 
     def __init__(self, plant: Plant, period_s: float) -> None:
         count = plant.state.shape[1]
@@ -25,7 +21,7 @@ class Imu:
         self._force_ned = np.zeros((3, count))
 
     def sample(self) -> None:
-        """Once every period."""
+        """Take a sample; called once every period."""
         plant, force = self._plant, self._force_ned
         np.subtract(plant.vel_ned_m_s, self._vel_ned_m_s, out=force)
         force *= self._per_s

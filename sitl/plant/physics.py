@@ -1,6 +1,6 @@
-"""Everything that moves the vehicles of a world: plant and attitude loops, air, battery, and what estimates them.
+"""Physics of all vehicles of a world: plant, attitude loops, air, battery and estimators.
 
-One call a physics step; weather and battery change every `slow_every` steps. It knows no modes and no MAVLink.
+One call does one physics step; weather and battery change every `slow_every` steps. It knows no modes and no MAVLink.
 """
 
 from __future__ import annotations
@@ -20,10 +20,10 @@ from swarmctl.core.simulated import RealismParams
 
 
 class Physics:
-    """One step of everything but the autopilots.
+    """Steps everything but the autopilots.
 
     Attributes:
-        rotor_health_01: (4, N) of its force that each rotor keeps; 1 unless a fault says otherwise.
+        rotor_health_01: (4, N) share of its force that each rotor keeps; 1 without a fault.
     """
 
     def __init__(
@@ -58,18 +58,18 @@ class Physics:
         self.estimator.advance()
 
     def set_rotor_health(self, vehicle: int, rotor: int, share_01: float) -> None:
-        """Let a rotor keep only this share of its force."""
+        """Limit a rotor to this share of its force."""
         self.rotor_health_01[rotor, vehicle] = share_01
         self._share_force()
 
     def set_mass(self, vehicle: int, ratio: float) -> None:
-        """Mass over the mass at the start."""
+        """Set the mass, relative to the mass at the start."""
         if self.plant.mass_ratio is None:
             self.plant.mass_ratio = np.ones(self.plant.state.shape[1])
         self.plant.mass_ratio[vehicle] = ratio
 
     def drain(self, vehicle: int, charge_01: float) -> None:
-        """Leave a battery with this charge, as a fault."""
+        """Discharge a battery to this level, as a fault."""
         self.battery.drain_to(vehicle, charge_01)
         self._share_force()
         self._tell_power()
@@ -101,7 +101,7 @@ class Physics:
 
 
 def outfitted(preset: Preset, realism: RealismParams) -> Preset:
-    """The airframe with the rotors' lag and drag that were asked for."""
+    """Return the airframe with the requested rotor lag and drag."""
     drag = tuple(k * realism.drag_scale for k in preset.drag_n_s_m)
     tau_s = preset.motor_tau_s if realism.motor_tau_s is None else realism.motor_tau_s
     return replace(preset, drag_n_s_m=(drag[0], drag[1], drag[2]), motor_tau_s=tau_s)

@@ -1,4 +1,4 @@
-"""What the autopilot believes about itself: the estimate, and its own local frame on the Earth.
+"""Data that the autopilot has of itself: the estimate, and its local frame on the Earth.
 
 Every vehicle's local NED frame starts at its own spawn point, rounded to the grid MAVLink can carry (1e-7 deg, 1 mm),
 as every real EKF has its own origin. The plant's true position in the shared frame is the offset of that rounded origin
@@ -33,12 +33,12 @@ class LocalOrigin:
     metres_per_e7_east: float
 
     def to_geo_e7(self, x_m: float, y_m: float) -> tuple[int, int]:
-        """Latitude and longitude [1e-7 deg] of a local position; flat over the few km a flight covers."""
+        """Return latitude and longitude [1e-7 deg] of a local position; flat over the few km of a flight."""
         return self.lat_e7 + round(x_m / self.metres_per_e7_north), self.lon_e7 + round(y_m / self.metres_per_e7_east)
 
 
 def local_origin(spawn_ned_m: Array, shared: GeoOrigin) -> LocalOrigin:
-    """The rounded local origin of a vehicle that spawns at `spawn_ned_m` (3,) in the shared frame."""
+    """Return the rounded local origin of a vehicle that spawns at `spawn_ned_m` (3,) in the shared frame."""
     lat, lon, alt = pymap3d.ned2geodetic(*(float(c) for c in spawn_ned_m), shared.lat_deg, shared.lon_deg, shared.alt_m)
     lat_e7, lon_e7, alt_mm = round(float(lat) * 1e7), round(float(lon) * 1e7), round(float(alt) * 1e3)
     offset = pymap3d.geodetic2ned(
@@ -59,7 +59,7 @@ def local_origin(spawn_ned_m: Array, shared: GeoOrigin) -> LocalOrigin:
 
 
 class Power(NamedTuple):
-    """What the autopilot's power module measures."""
+    """Measurements of the autopilot's power module."""
 
     charge_01: float
     volts: float
@@ -71,7 +71,7 @@ FULL = Power(1.0, 16.2, -1.0)  # as PX4's SIH reports its simulated pack
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """State of one vehicle as its autopilot knows it, local NED."""
+    """State of one vehicle as its autopilot estimates it, local NED."""
 
     t_us: int  # since boot
     pos_ned_m: tuple[float, float, float]
@@ -81,7 +81,7 @@ class Estimate:
     rate_frd_rad_s: tuple[float, float, float]
     down_axis_ned: tuple[float, float, float]  # body down axis
     on_ground: bool
-    pos_accuracy_m: tuple[float, float] = (0.01, 0.01)  # 1 sigma as the autopilot knows it: horizontal, vertical
+    pos_accuracy_m: tuple[float, float] = (0.01, 0.01)  # 1 sigma as the autopilot reports it: horizontal, vertical
     gps_ok: bool = True
     battery: Power = FULL
 

@@ -21,8 +21,8 @@ from swarmctl.core.frames import GRAVITY_M_S2
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-RATE_LIMIT_RAD_S = 60.0  # a tumbling vehicle stays finite under an explicit integrator; no controlled flight comes near
-GROUND_FRICTION = 0.8  # of the weight; a vehicle that touches down at 1 m/s slides 6 cm
+RATE_LIMIT_RAD_S = 60.0  # keeps a tumbling vehicle finite under an explicit integrator; no controlled flight comes near
+GROUND_FRICTION = 0.8  # share of the weight; a vehicle that touches down at 1 m/s slides 6 cm
 
 
 # Rows of the polynomial's argument: constant, rotor speed sum, quaternion, body rates, body velocity.
@@ -45,7 +45,7 @@ _ROTATION: tuple[tuple[tuple[str, str, float], ...], ...] = (
 
 
 def _quadratic_rows(preset: Preset, mass_kg: float) -> Array:
-    """(19, 144): state derivative (quaternion, rates, velocity) and rotation matrix over products of `_ARGUMENTS`."""
+    """Return (19, 144): derivative (quaternion, rates, velocity), rotation matrix; over products of `_ARGUMENTS`."""
     ix, iy, iz = preset.inertia_kg_m2
     kp, kq, kr = preset.drag_rotation_1_s
     ku, kv, kw = (k / (preset.mass_kg if preset.drag_scales_with_mass else mass_kg) for k in preset.drag_n_s_m)
@@ -71,7 +71,7 @@ def _quadratic_rows(preset: Preset, mass_kg: float) -> Array:
 
 
 def _attitude_rows() -> Array:
-    """(13, 16): the rotation matrix, then (r21, r10, r22, r00), the arguments of roll's and yaw's arctangents."""
+    """Return (13, 16): rotation matrix, then (r21, r10, r22, r00), the arguments of roll's and yaw's arctangents."""
     names = ("qw", "qx", "qy", "qz")
     table = np.zeros((13, 4, 4))
     for row, source in enumerate((*range(9), 7, 3, 8, 0)):
@@ -81,10 +81,10 @@ def _attitude_rows() -> Array:
 
 
 class Mixer:
-    """Wrench -> rotor forces and back: the A matrix of thesis (1.13)-(1.16), plus configuration.
+    """Maps wrench to rotor forces and back: the A matrix of thesis (1.13)-(1.16), plus configuration.
 
-    Every rotor stays within [0, rotor_force_max_n]. Roll, pitch and thrust are clipped rotor by rotor; yaw gets what
-    room is left, because its lever is 12 times shorter and a yaw step would otherwise cost all attitude control.
+    Every rotor stays within [0, rotor_force_max_n]. Roll, pitch and thrust are clipped rotor by rotor; yaw gets the
+    remaining range, because its lever is 12 times shorter and a yaw step would otherwise cost all attitude control.
     """
 
     def __init__(self, preset: Preset, vehicles: int) -> None:
@@ -105,7 +105,7 @@ class Mixer:
         self._share = np.zeros((4, vehicles))
 
     def allocate(self, wrench: Array) -> Array:
-        """Rotor forces (4, N) [N] for a wrench (4, N) of f_t [N], tau_x, tau_y, tau_z [N m]; the buffer is reused."""
+        """Return rotor forces (4, N) [N] for a wrench (4, N): f_t [N], tau_x, tau_y, tau_z [N m]; reuses its buffer."""
         forces, room, yaw, least = self._forces, self._room, self._yaw, self._least
         np.matmul(self._from_wrench, wrench[:3], out=forces)
         np.maximum(forces, 0.0, out=forces)
@@ -135,7 +135,7 @@ class Plant:
         euler_rad: (3, N) roll, pitch, yaw, of the current state.
         contact: (N,) resting on or sliding over the ground.
         rotor_force_n: (4, N) after motor lag.
-        rotor_share_01: (4, N) of its force that each rotor still gives, or None for all: battery, failures.
+        rotor_share_01: (4, N) share of its force that each rotor still gives, or None for all: battery, failures.
         mass_ratio: (N,) mass over the mass at the start, or None.
     """
 
@@ -150,7 +150,7 @@ class Plant:
         thrust_curve_01: float = 0.0,
         ground_effect: bool = False,
     ) -> None:
-        """Vehicles at rest, level, nose north.
+        """Create vehicles at rest, level, nose north.
 
         Args:
             preset: airframe.
@@ -159,7 +159,7 @@ class Plant:
             ground: False for no ground at all.
             mass_scale: true mass over the preset's.
             thrust_curve_01: k of a rotor's force (1 - k) u + k u^2 over its limit, at command u; PX4's THR_MDL_FAC.
-            ground_effect: rotors push harder close to the ground.
+            ground_effect: whether thrust increases close to the ground.
         """
         count = len(pos_ned_m)
         self.preset = preset
@@ -223,7 +223,7 @@ class Plant:
 
     @property
     def hover_thrust_01(self) -> float:
-        """Thrust setpoint that carries the true mass."""
+        """Thrust setpoint (0..1) that carries the true mass."""
         force_01, k = self.mass_kg * GRAVITY_M_S2 / self.preset.thrust_max_n, self._curve_01
         if not k:
             return force_01
@@ -231,12 +231,12 @@ class Plant:
 
     @property
     def height_m(self) -> Array:
-        """(N,) above the ground; above z = 0 where there is none."""
+        """Heights (N,) above the ground; above z = 0 where there is none."""
         height_m: Array = (self.ground_z_m if self.ground_z_m is not None else 0.0) - self.state[12]
         return height_m
 
     def set_wind(self, wind_ned_m_s: Array | None) -> None:
-        """Air velocity (3, N) NED that drag acts against; None for still air. Frozen in the body over one step."""
+        """Set the air velocity (3, N) NED that drag acts against; None for still air. Constant over one step."""
         self._wind_ned_m_s = None if wind_ned_m_s is None else np.array(wind_ned_m_s, dtype=np.float64)
 
     def step(self, rotor_cmd_n: Array) -> None:
@@ -266,14 +266,14 @@ class Plant:
         self.refresh()
 
     def _achievable(self, rotor_cmd_n: Array) -> Array:
-        """Force that the commanded ones become; thrust curve first, then what battery and rotor can give."""
+        """Return the real force of the commanded ones: thrust curve first, then battery and rotor health."""
         if self._curve_01:
             command = rotor_cmd_n / self.preset.rotor_force_max_n
             rotor_cmd_n = rotor_cmd_n * (1.0 - self._curve_01 + self._curve_01 * command)
         return rotor_cmd_n if self.rotor_share_01 is None else rotor_cmd_n * self.rotor_share_01
 
     def _near_ground(self) -> Array:
-        """(N,) thrust over that of the same rotor far up: I. C. Cheeseman and W. E. Bennett, ARC R&M 3021, 1955.
+        """Return thrust (N,) over that of the same rotor far up: I. C. Cheeseman and W. E. Bennett, ARC R&M 3021, 1955.
 
         One rotor's formula, 1 / (1 - (R / 4 z)^2); the rotor is taken to stand one radius above the skids.
         """
@@ -283,14 +283,14 @@ class Plant:
         return gain
 
     def _reweigh(self, mass_ratio: Array) -> None:
-        """Thrust and drag forces act on another mass; the inertia stays (the load is at the centre)."""
+        """Apply another mass to thrust and drag; the inertia stays (the load is at the centre)."""
         lighter = 1.0 / mass_ratio
         self._forcing[9] *= lighter
         if not self.preset.drag_scales_with_mass:
             self._forcing[_VEL] += self._drag_1_s() * (1.0 - lighter) * self.state[_VEL]
 
     def _drag_1_s(self) -> Array:
-        """(3, 1) of the mass at the start."""
+        """Return the drag rates (3, 1) [1/s] of the mass at the start."""
         mass_kg = self.preset.mass_kg if self.preset.drag_scales_with_mass else self.mass_kg
         rate: Array = np.array(self.preset.drag_n_s_m)[:, None] / mass_kg
         return rate
@@ -323,7 +323,7 @@ class Plant:
         quat /= self._norm
 
     def _slope(self, state: Array, out: Array) -> None:
-        """Right-hand side of (1.18) at `state` (13, N) into `out` (13, N)."""
+        """Evaluate the right-hand side of (1.18) at `state` (13, N) into `out` (13, N)."""
         args = self._args
         args[2:] = state[:10]
         np.multiply(args[:, None], args[None], out=self._products)
@@ -333,7 +333,7 @@ class Plant:
         np.add.reduce(self._lever, axis=1, out=out[_POS])
 
     def refresh(self) -> None:
-        """Rotation, NED velocity and Euler angles of the current state."""
+        """Update rotation, NED velocity and Euler angles from the current state."""
         quat = self.state[_QUAT]
         np.multiply(quat[:, None], quat[None], out=self._quat_products)
         np.matmul(self._attitude_rows, self._quat_products.reshape(16, -1), out=self._attitude)
@@ -358,7 +358,7 @@ class Plant:
             self._rest_on_ground(int(i), float(lift_n[i]), float(self.ground_z_m[i]))
 
     def _rest_on_ground(self, i: int, lift_n: float, ground_z_m: float) -> None:
-        """No penetration, upright on the skids, Coulomb friction; a vehicle with more lift than weight may leave."""
+        """Enforce the ground: no penetration, upright on the skids, Coulomb friction; lift above weight takes off."""
         state = self.state
         yaw = math.atan2(self.rotation[3, i], self.rotation[0, i])
         north, east, down = (float(v) for v in self.vel_ned_m_s[:, i])

@@ -1,6 +1,6 @@
-"""Air over each vehicle: mean wind, Dryden turbulence and 1-cosine gusts, all of MIL-F-8785C, low altitude.
+"""Air at each vehicle: mean wind, Dryden turbulence and 1-cosine gusts, all of MIL-F-8785C, low altitude.
 
-Turbulence of every vehicle is its own (seeded, independent): vehicles metres apart would share some of it. It is frozen
+Turbulence is independent for each vehicle (seeded); vehicles metres apart would really share some of it. It is constant
 over one update, and Taylor's hypothesis turns lengths into times with the airspeed.
 """
 
@@ -16,14 +16,14 @@ from swarmctl.core.simulated import WindParams
 
 _FOOT_M = 0.3048
 _LOWEST_FT, _HIGHEST_FT = 10.0, 1000.0  # validity of the low-altitude forms
-_SLOWEST_M_S = 1.0  # airspeed below which the eddies' own motion takes over
+_SLOWEST_M_S = 1.0  # below this airspeed the motion of the eddies themselves dominates
 _BLOCK = 64
 _PURPOSE = 2
 
 
 @dataclass(frozen=True, slots=True)
 class Gust:
-    """Peak (3, 1) NED [m/s] reached half-way, on some vehicles (N,)."""
+    """A gust with its peak (3, 1) NED [m/s] at half its length, on some vehicles (N,)."""
 
     peak_ned_m_s: Array
     from_s: float
@@ -31,7 +31,7 @@ class Gust:
     on: Array
 
     def at(self, t_s: float) -> Array | None:
-        """(3, N) [m/s]; None before and after."""
+        """Return the velocity (3, N) [m/s]; None before and after."""
         x = (t_s - self.from_s) / self.for_s
         if not 0.0 <= x <= 1.0:
             return None
@@ -39,13 +39,13 @@ class Gust:
 
 
 class Air:
-    """Wind over all vehicles.
+    """Wind at all vehicles.
 
     Args:
-        params: what blows.
-        vehicles: how many.
-        dt_s: between two updates.
-        seed: of the run.
+        params: parameters of wind and turbulence.
+        vehicles: number of vehicles.
+        dt_s: time between two updates.
+        seed: seed of the run.
     """
 
     def __init__(self, params: WindParams, vehicles: int, dt_s: float, seed: int) -> None:
@@ -65,11 +65,11 @@ class Air:
 
     @property
     def still(self) -> bool:
-        """Nothing moves, and nothing will unless somebody adds it."""
+        """Whether the air is at rest and stays so unless a gust is added."""
         return not (self._intensity_m_s or self.gusts or self.mean_ned_m_s.any())
 
     def velocity_ned_m_s(self, t_s: float, height_m: Array, vel_ned_m_s: Array) -> Array:
-        """Air velocity (3, N) at `t_s`, for vehicles `height_m` (N,) above the ground that move with (3, N)."""
+        """Return the air velocity (3, N) at `t_s`, for vehicles at `height_m` (N,) with velocity (3, N)."""
         total = np.repeat(self.mean_ned_m_s, self._count, axis=1)
         if self._intensity_m_s:
             relative = vel_ned_m_s - self.mean_ned_m_s
@@ -84,7 +84,7 @@ class Air:
         return total
 
     def _turbulence(self, height_m: Array, speed_m_s: Array) -> Array:
-        """(3, N) NED: u along the mean wind, v across, w down."""
+        """Return the turbulence (3, N) NED: u along the mean wind, v across, w down."""
         height_ft = np.clip(height_m / _FOOT_M, _LOWEST_FT, _HIGHEST_FT)
         shape = 0.177 + 0.000823 * height_ft
         along_m, up_m = height_ft / shape**1.2 * _FOOT_M, height_ft * _FOOT_M  # scale lengths L_u = L_v, L_w
@@ -99,7 +99,7 @@ class Air:
         return np.stack([c * u - s * v, s * u + c * v, w])
 
     def _stir(self, across: Array, upward: Array) -> None:
-        """One update of the unit-variance eddies; arguments are the step over each filter's time constant L/V."""
+        """Update the unit-variance eddies; arguments are the step over each filter's time constant L/V."""
         white = self._noise()
         if self._fresh:
             self._fresh = False
@@ -121,7 +121,7 @@ class Air:
 
 
 def _shaped(states: Array) -> Array:
-    """Output of Dryden's (1 + sqrt(3) T s) / (1 + T s)^2 from its two states (2, N), unit variance."""
+    """Return the output of Dryden's (1 + sqrt(3) T s) / (1 + T s)^2 from its two states (2, N), unit variance."""
     root3 = math.sqrt(3.0)
     output: Array = (root3 * states[0] + (1.0 - root3) * states[1]) / math.sqrt(2.0)
     return output

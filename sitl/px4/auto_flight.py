@@ -1,6 +1,6 @@
-"""The AUTO modes of one vehicle, tick by tick: take off, hold, go home, land, and a mission's items.
+"""AUTO modes of one vehicle: take-off, hold, return, landing, and the items of a mission, tick by tick.
 
-It decides where to be; the `Navigator` flies there, the `Autopilot` decides when. Local NED, time since boot.
+It decides the target; the `Navigator` flies there, and the `Autopilot` decides when. Local NED, time since boot.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from sitl.px4.parameters import Parameters
 TAKEOFF_REACHED_M = 0.1
 HEIGHT_REACHED_M = 0.5
 HOME_REACHED_M = 0.5
-RAMP_S = 0.9  # thrust from idle to hover after spool-up: PX4 shows take-off 2.0 s after arming
-_JUMPS_MAX = 100  # a mission may jump this often without flying anywhere
+RAMP_S = 0.9  # from idle to hover thrust after spool-up: PX4 reports take-off 2.0 s after arming
+_JUMPS_MAX = 100  # limit of mission jumps without a flown item
 Ned = tuple[float, float, float]
 Xy = tuple[float, float]
 
 
 class Phase(enum.IntEnum):
-    """What EXTENDED_SYS_STATE shows of an AUTO flight in the air."""
+    """Part of an AUTO flight in the air that EXTENDED_SYS_STATE reports."""
 
     CRUISE = 0
     TAKEOFF = 1
@@ -45,7 +45,7 @@ class Phase(enum.IntEnum):
 
 
 class AutoFlight:
-    """One vehicle's AUTO flight. `engage` at entry to a mode, then `fly` every tick.
+    """Flies the AUTO modes of one vehicle: `engage` at entry to a mode, then `fly` every tick.
 
     Attributes:
         phase: taking off, landing, or neither.
@@ -71,13 +71,13 @@ class AutoFlight:
         self.reset()
 
     def reset(self) -> None:
-        """As after boot."""
+        """Reset to the state after boot."""
         self.phase = Phase.CRUISE
         self.done = self.mission_finished = False
         self.reached: list[int] = []
         self.takeoff_alt_amsl_m: float | None = None
         self._takeoff_z_m: float | None = None
-        self._goal_ned_m: Ned | None = None  # of DO_REPOSITION
+        self._goal_ned_m: Ned | None = None  # target of DO_REPOSITION
         self._return_z_m: float | None = None
         self._climb_xy_m: Xy | None = None
         self._climbed = False
@@ -86,7 +86,7 @@ class AutoFlight:
         self._jumps: dict[int, int] = {}
 
     def engage(self, mode: Px4Mode, estimate: Estimate, *, fresh: bool) -> None:
-        """Begin a mode where the vehicle is; see `Navigator.engage` for `fresh`."""
+        """Begin a mode at the vehicle's place; see `Navigator.engage` for `fresh`."""
         self.phase = Phase.CRUISE
         self.done = False
         self._takeoff_z_m = self._return_z_m = self._climb_xy_m = self._goal_ned_m = self._inside_us = None
@@ -100,22 +100,22 @@ class AutoFlight:
         self._seen_changes = self._store.changes
 
     def target(self) -> tuple[float, ...]:
-        """(11,) see `Navigator.target`."""
+        """Target (11,), see `Navigator.target`."""
         return self._navigator.target()
 
     def cruise(self, speed_m_s: float | None) -> None:
-        """Speed of AUTO flight; None: MPC_XY_CRUISE."""
+        """Set the speed of AUTO flight [m/s]; None: MPC_XY_CRUISE."""
         self._navigator.speed_m_s = speed_m_s
 
     def reposition(self, goal_ned_m: Ned, yaw_rad: float) -> None:
-        """Hold there instead of here (DO_REPOSITION)."""
+        """Set the place to hold (DO_REPOSITION)."""
         self._goal_ned_m = goal_ned_m
         self._navigator.face(yaw_rad)
 
     def fly(
         self, mode: Px4Mode, estimate: Estimate, home_ned_m: Ned | None, armed_us: int, now_us: int, dt_s: float
     ) -> Command:
-        """What to fly now; `armed_us` is when the motors began to turn."""
+        """Return the command of this tick; `armed_us` is when the motors began to turn."""
         home = home_ned_m or estimate.pos_ned_m
         if mode == Px4Mode.AUTO_TAKEOFF:
             return self._take_off(estimate, home, self._takeoff_alt(home), armed_us, now_us, dt_s)
@@ -151,7 +151,7 @@ class AutoFlight:
             return Command(IDLE.q_nb, self._navigator.hover_01 * since_s / RAMP_S)
         if estimate.pos_ned_m[2] <= self._takeoff_z_m + TAKEOFF_REACHED_M:
             self.done, self.phase = True, Phase.CRUISE
-            climbed = estimate.pos_ned_m[2] > self._takeoff_z_m - 1.0  # not started above it
+            climbed = estimate.pos_ned_m[2] > self._takeoff_z_m - 1.0  # false when it started above it
             self._navigator.engage(estimate, fresh=False)
             if climbed:
                 self._navigator.keep_height(self._takeoff_z_m)
@@ -165,7 +165,7 @@ class AutoFlight:
         return self._navigator.descend(estimate, home[2], dt_s, xy_m)
 
     def _return(self, estimate: Estimate, home: Ned, dt_s: float) -> Command:
-        """Climb to the return height, go home at it, land there."""
+        """Climb to the return height, fly home at it, and land there."""
         x_m, y_m, z_m = estimate.pos_ned_m
         away_m = math.hypot(x_m - home[0], y_m - home[1])
         if self.phase == Phase.LANDING:
@@ -186,7 +186,7 @@ class AutoFlight:
         return self._navigator.go_to(estimate, home[:2], self._return_z_m, dt_s)
 
     def _return_height(self, away_m: float, home: Ned, z_m: float) -> float:
-        """PX4's cone: near home it climbs less, close above it not at all; never lower than it is."""
+        """Return the height of PX4's cone: lower near home, no climb close above it; never below the vehicle."""
         real = self._parameters.real
         highest_m, radius_m = real("RTL_RETURN_ALT"), real("NAV_ACC_RAD")
         cone_deg = real("RTL_CONE_ANG")
@@ -229,7 +229,7 @@ class AutoFlight:
     def _fly_takeoff(
         self, item: Item, estimate: Estimate, home: Ned, armed_us: int, now_us: int, dt_s: float
     ) -> Command:
-        """NAV_TAKEOFF; a mission that begins on the ground with anything else takes off first, too."""
+        """Fly NAV_TAKEOFF; a mission that begins on the ground with another item takes off first, too."""
         if item.command in (NAV_LAND, NAV_RETURN) and self.phase == Phase.LANDING:
             self._advance()
             return IDLE
@@ -244,7 +244,7 @@ class AutoFlight:
         return command
 
     def _stayed(self, item: Item, goal: Ned, estimate: Estimate, now_us: int) -> bool:
-        """It has been at the item as long as it is asked to."""
+        """Return whether it has stayed at the item for the requested time."""
         away_m = math.dist(goal[:2], estimate.pos_ned_m[:2])
         radius_m = item.params[1] if item.params[1] > 0 else self._parameters.real("NAV_ACC_RAD")
         if away_m > radius_m or abs(goal[2] - estimate.pos_ned_m[2]) > HEIGHT_REACHED_M:
@@ -265,7 +265,7 @@ class AutoFlight:
             self.mission_finished = True
 
     def _skip_unflown(self) -> None:
-        """Carry out items that are no place to be."""
+        """Carry out items without a place."""
         store = self._store
         for _ in range(_JUMPS_MAX):
             if self.mission_finished or store.current >= len(store.mission):
@@ -297,7 +297,7 @@ class AutoFlight:
         return self._navigator.hold(estimate, dt_s)
 
     def _place(self, item: Item, home: Ned, estimate: Estimate) -> Ned:
-        """Local NED of an item; one without a position means here."""
+        """Return the local NED place of an item; without a position, the vehicle's own."""
         if self.origin is None or (item.lat_e7 == 0 and item.lon_e7 == 0):
             x_m, y_m = estimate.pos_ned_m[:2]
         else:

@@ -1,6 +1,6 @@
 """PX4's commander for one vehicle: modes, arming, offboard entry and loss, failsafes, landing detection.
 
-Scalar code at autopilot rate. It speaks in results and texts, not in MAVLink messages (`endpoint` does), and turns the
+Scalar code at autopilot rate. Its results and texts are not MAVLink messages (`endpoint` converts them). It turns the
 mode into one `Command`, from the offboard stream (`setpoints`) or from the AUTO modes (`auto_flight`).
 """
 
@@ -37,32 +37,32 @@ from sitl.px4.navigator import IDLE, Command, Navigator, Triple
 from sitl.px4.parameters import Parameters
 from swarmctl.core.types import FlightMode, Landed
 
-CHECK_US = 100_000  # grid on which PX4 looks for reasons to act
+CHECK_US = 100_000  # period of PX4's failsafe checks
 RESUME_US = 20_000  # from a resumed stream to OFFBOARD, before the next tick
-DEAD_RECKONING_US = 5_000_000  # EKF2_NOAID_TOUT: so long a position without GPS is believed
-REBOOT_AFTER_US = 400_000  # the acknowledgement gets out first
-REFUSED_EVERY_US = 1_000_000  # a refused mode is not explained more often
-STATUS_EVERY_US = 500_000  # and at once when anything in it changes
-EPOCH_UTC_US = 1_767_225_600_000_000  # 2026-01-01, of flights that have no wall clock
+DEAD_RECKONING_US = 5_000_000  # EKF2_NOAID_TOUT: how long a position without GPS is valid
+REBOOT_AFTER_US = 400_000  # the acknowledgement is sent first
+REFUSED_EVERY_US = 1_000_000  # shortest interval between explanations of refused modes
+STATUS_EVERY_US = 500_000  # also sent at every change
+EPOCH_UTC_US = 1_767_225_600_000_000  # 2026-01-01, for flights without a wall clock
 _HEALTH_TEXT = "Arming denied: Resolve system health failures first\t"
 _LOSS_MODES = {OffboardLoss.LAND: Px4Mode.AUTO_LAND, OffboardLoss.HOLD: Px4Mode.AUTO_LOITER}
 _ACTION_MODES = {Action.HOLD: Px4Mode.AUTO_LOITER, Action.RETURN: Px4Mode.AUTO_RTL, Action.LAND: Px4Mode.AUTO_LAND}
 
 
 class Autopilot:
-    """Commander of one vehicle. `now_us` is time since its boot, except in `tick` and `reboot`.
+    """The commander of one vehicle. `now_us` is time since its boot, except in `tick` and `reboot`.
 
     Attributes:
         armed: motors may turn.
-        mode: what flies now.
-        intended: what was commanded; differs from `mode` only in a failsafe.
+        mode: mode that flies now.
+        intended: commanded mode; differs from `mode` only in a failsafe.
         failsafe: the autopilot acts on its own.
         terminated: motors off until reboot.
         home_ned_m: local position of the last arming.
-        output: what to fly.
+        output: command to fly.
         released: an air start's clamp has been opened.
         texts: (severity, text) not yet sent.
-        reboot_at_us: when it will go down; None: it stays up.
+        reboot_at_us: time of a pending reboot, or None.
         position_ok: input; there is a horizontal position.
         battery_01, battery_v, battery_a: input; charge, voltage, current (-1: not measured).
         boot_utc_us: UTC of its boot.
@@ -95,7 +95,7 @@ class Autopilot:
         self._begin()
 
     def _begin(self) -> None:
-        """Begin anew; parameters and uploads stay."""
+        """Restart; parameters and uploads stay."""
         self.armed = self.failsafe = self.terminated = False
         self.mode = self.intended = self._resting_mode = Px4Mode.AUTO_LOITER
         self._land_detector.reset()
@@ -111,10 +111,10 @@ class Autopilot:
         self._refused_us = -REFUSED_EVERY_US
         self._armed_us = self._next_check_us = self._aided_us = self._unaided_us = 0
         self._resume_us: int | None = None
-        self._delayed: tuple[int, Action] | None = None  # when to do what, after a while in Hold
+        self._delayed: tuple[int, Action] | None = None  # time and action after a delay in Hold
 
     def reboot(self, now_us: int) -> None:
-        """Go down now and start again; `now_us` is on the clock of the simulation."""
+        """Restart now; `now_us` is on the clock of the simulation."""
         before_us = self.boot.at_us
         self.boot.again(now_us, self._estimate)
         self.boot_utc_us += self.boot.at_us - before_us
@@ -134,7 +134,7 @@ class Autopilot:
         self.texts.append((severity, text))
 
     def ready(self, now_us: int) -> bool:
-        """The estimator has settled."""
+        """Whether the estimator has settled."""
         return now_us >= self._ekf_ready_us
 
     def settled_share(self, now_us: int) -> float:
@@ -142,11 +142,11 @@ class Autopilot:
         return now_us / self._ekf_ready_us if self._ekf_ready_us else math.inf
 
     def stream_alive(self, now_us: int) -> bool:
-        """A usable setpoint is younger than COM_OF_LOSS_T."""
+        """Whether a usable setpoint is younger than COM_OF_LOSS_T."""
         return self.stream.age_us(now_us) <= self.parameters.real("COM_OF_LOSS_T") * 1e6
 
     def armable(self, now_us: int) -> bool:
-        """PREARM_CHECK: arming would be accepted in the present mode."""
+        """Whether arming would be accepted in the present mode (PREARM_CHECK)."""
         if not self.ready(now_us) or self.terminated or self.intended in NO_ARMING_IN:
             return False
         if self.watch.fence_broken or self.watch.battery_warning >= 2:
@@ -164,7 +164,7 @@ class Autopilot:
         return MavState.STANDBY if self.armable(now_us) else MavState.UNINIT
 
     def status(self, now_us: int) -> tuple[object, ...]:
-        """What PX4 publishes of itself, and so may tell: another value each time it is published."""
+        """Status that PX4 publishes, and so may report: another value each time it is published."""
         flags = self.armed, self.failsafe, self.system_status(now_us)
         return now_us // STATUS_EVERY_US, self.mode, self.intended, *flags
 
@@ -173,22 +173,22 @@ class Autopilot:
 
     @property
     def has_position(self) -> bool:
-        """A horizontal position, measured or dead-reckoned for a short while."""
+        """Whether there is a horizontal position, measured or dead-reckoned for a short while."""
         return self.position_ok and self._unaided_us <= DEAD_RECKONING_US
 
     @property
     def position_ned_m(self) -> Triple | None:
-        """Where it believes to be; None without a position."""
+        """Return the estimated position, or None without one."""
         return self._estimate.pos_ned_m if self._estimate is not None and self.has_position else None
 
     @property
     def refused(self) -> Counter[str]:
-        """Setpoints not used, by reason."""
+        """Number of unused setpoints, by reason."""
         return self.stream.refused
 
     @property
     def landed(self) -> Landed:
-        """MAV_LANDED_STATE."""
+        """The MAV_LANDED_STATE of the vehicle."""
         return self._land_detector.landed
 
     @property
@@ -197,13 +197,13 @@ class Autopilot:
 
     @property
     def battery_warning(self) -> int:
-        """0 none, 1 low, 2 critical, 3 emergency."""
+        """Battery warning: 0 none, 1 low, 2 critical, 3 emergency."""
         return self.watch.battery_warning
 
     # --- the offboard stream ---
 
     def on_setpoint(self, type_mask: int, q_nb: Sequence[float], rates: Triple, thrust_01: float, now_us: int) -> bool:
-        """SET_ATTITUDE_TARGET addressed to this vehicle; True when it counts as a stream."""
+        """Take a SET_ATTITUDE_TARGET addressed to this vehicle; return whether it counts as a stream."""
         flying = self.mode == Px4Mode.OFFBOARD
         if not self.stream.take(type_mask, q_nb, rates, thrust_01, now_us, flying=flying):
             return False
@@ -216,7 +216,7 @@ class Autopilot:
     # --- commands ---
 
     def arm(self, now_us: int) -> Result:
-        """MAV_CMD_COMPONENT_ARM_DISARM p1=1."""
+        """Execute MAV_CMD_COMPONENT_ARM_DISARM p1=1."""
         if self.armed:
             return Result.ACCEPTED
         if not self.armable(now_us):
@@ -242,7 +242,7 @@ class Autopilot:
         return Result.ACCEPTED
 
     def disarm(self, force: bool) -> Result:
-        """MAV_CMD_COMPONENT_ARM_DISARM p1=0; in the air only with `force`."""
+        """Execute MAV_CMD_COMPONENT_ARM_DISARM p1=0; in the air only with `force`."""
         if not self.armed:
             return Result.ACCEPTED
         if self.landed != Landed.ON_GROUND and self.released and not force:
@@ -263,9 +263,9 @@ class Autopilot:
     def set_mode(
         self, mode: Px4Mode, now_us: int, takeoff_alt_amsl_m: float | None = None, *, tell: bool = True
     ) -> Result:
-        """A commanded mode change; cancels a running failsafe.
+        """Change the mode by command; this cancels a running failsafe.
 
-        No takeoff height given: MIS_TAKEOFF_ALT. `tell`: say why it is refused.
+        Without a take-off height, MIS_TAKEOFF_ALT is used. `tell`: explain a refusal.
         """
         if self.terminated:
             return Result.TEMPORARILY_REJECTED
@@ -293,7 +293,7 @@ class Autopilot:
         return mode not in NEEDS_PILOT and (self.has_position or mode in FLIES_BLIND)
 
     def terminate(self) -> Result:
-        """MAV_CMD_DO_FLIGHTTERMINATION: motors off until reboot."""
+        """Execute MAV_CMD_DO_FLIGHTTERMINATION: motors off until reboot."""
         if not self.armed:
             return Result.DENIED
         self.mode = Px4Mode.TERMINATION
@@ -305,14 +305,14 @@ class Autopilot:
         self.output = IDLE
 
     def request_reboot(self, now_us: int) -> Result:
-        """MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN p1=1; the world does it."""
+        """Request MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN p1=1, which the world executes."""
         if self.armed:
             return Result.DENIED
         self.reboot_at_us = now_us + REBOOT_AFTER_US
         return Result.ACCEPTED
 
     def reposition(self, goal_ned_m: Triple, yaw_rad: float) -> None:
-        """Where LOITER is to hold (MAV_CMD_DO_REPOSITION)."""
+        """Set the place that LOITER holds (MAV_CMD_DO_REPOSITION)."""
         if self.armed and self.mode == Px4Mode.AUTO_LOITER and self.landed != Landed.ON_GROUND:
             self.flight.reposition(goal_ned_m, yaw_rad)
 
@@ -326,7 +326,7 @@ class Autopilot:
     # --- every tick ---
 
     def tick(self, estimate: Estimate, now_us: int, dt_s: float) -> None:
-        """Detect landing, judge stream and failsafes, disarm when due, and fly AUTO modes.
+        """Detect landing, check stream and failsafes, disarm when due, and fly AUTO modes.
 
         `now_us` and the estimate are the simulation's: this autopilot may have booted later, and elsewhere.
         """
@@ -364,7 +364,7 @@ class Autopilot:
     # --- failsafes ---
 
     def _check(self, estimate: Estimate, now_us: int) -> None:
-        """What PX4 looks at ten times a second."""
+        """Run the checks that PX4 does ten times a second."""
         origin = self.flight.origin
         breaches = self._fence.breaches(estimate.pos_ned_m, self.home_ned_m, origin) if origin else []
         cause, action = self.watch.check(breaches, self.battery_01, now_us, armed=self.armed)
@@ -394,7 +394,7 @@ class Autopilot:
             self._fail(Cause.OFFBOARD, _LOSS_MODES.get(known, Px4Mode.AUTO_RTL))
 
     def _act(self, cause: Cause, action: Action, now_us: int) -> None:
-        """Carry out a failsafe's action; Return and Land give a pilot time in Hold first."""
+        """Carry out a failsafe's action; Return and Land first wait in Hold for a pilot."""
         wait_s = self.parameters.real("COM_FAIL_ACT_T")
         if action in (Action.RETURN, Action.LAND) and wait_s > 0:
             self._fail(cause, Px4Mode.AUTO_LOITER)
@@ -415,7 +415,7 @@ class Autopilot:
             self._disarm("Disarmed by failsafe\t", keep_mode=True)
 
     def _fail(self, cause: Cause, mode: Px4Mode) -> None:
-        """Fly `mode` until a mode is commanded, or the cause is gone where PX4 goes back by itself."""
+        """Fly `mode` until a mode is commanded, or until the cause has ended where PX4 then returns by itself."""
         self._delayed = self._resume_us = None
         if not self.failsafe or cause != self._cause:
             self.say(Severity.CRITICAL, "Failsafe activated\t")
@@ -429,7 +429,7 @@ class Autopilot:
         self._cause = self._delayed = self._resume_us = None
 
     def _resume(self, now_us: int) -> None:
-        """The stream is back after a loss: OFFBOARD again, unless it has gone once more."""
+        """Resume OFFBOARD after a loss of the stream, unless it is lost again."""
         self._resume_us = None
         if self.stream_alive(now_us) and self.intended == Px4Mode.OFFBOARD:
             self._clear_failsafe()

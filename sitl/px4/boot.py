@@ -1,4 +1,4 @@
-"""An autopilot's own clock and local frame: both begin anew when it reboots, while the simulation goes on."""
+"""An autopilot's own clock and local frame: both restart at a reboot, while the simulation goes on."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from sitl.plant.sensors import Estimate, LocalOrigin
 from sitl.px4.missions import local_xy_m
 
 BOOT_US = 1_300_000  # from power to the first HEARTBEAT, when the estimator takes its 4 s
-_BOOT_SHARE = 0.325  # of the time the estimator takes, when it is given less
+_BOOT_SHARE = 0.325  # share of the estimator's time, when that is shorter
 
 
 class Boot:
-    """When and where one autopilot has started.
+    """Time and place at which one autopilot has started.
 
     Attributes:
         at_us: on the clock of the simulation.
@@ -21,18 +21,18 @@ class Boot:
     """
 
     def __init__(self, ekf_ready_us: int = 0) -> None:
-        """`ekf_ready_us` since boot: links wait for a share of it, and for nothing where it is 0."""
+        """Set `ekf_ready_us` since boot: links start after a share of it, or at once where it is 0."""
         self.at_us = 0
         self.quiet_us = min(BOOT_US, round(_BOOT_SHARE * ekf_ready_us))
         self.origin: LocalOrigin | None = None
         self._shift_ned_m = (0.0, 0.0, 0.0)
 
     def since_us(self, now_us: int) -> int:
-        """Time since boot; negative while it starts."""
+        """Return the time since boot; negative while it starts."""
         return now_us - self.at_us
 
     def again(self, now_us: int, where: Estimate | None) -> None:
-        """Start anew at `now_us`; the local frame begins where the vehicle is, `where` in the old one."""
+        """Restart at `now_us`; the local frame begins at the vehicle's place, `where` in the old one."""
         self.at_us = now_us + BOOT_US - self.quiet_us
         origin = self.origin
         if origin is None or where is None:
@@ -46,7 +46,7 @@ class Boot:
         self.origin = replace(origin, lat_e7=lat_e7, lon_e7=lon_e7, alt_mm=alt_mm)
 
     def local(self, estimate: Estimate) -> Estimate:
-        """An estimate of the simulation on this clock and in this frame."""
+        """Convert an estimate of the simulation to this clock and this frame."""
         if self.at_us == 0:
             return estimate
         (x_m, y_m, z_m), (dx_m, dy_m, dz_m) = estimate.pos_ned_m, self._shift_ned_m

@@ -1,7 +1,7 @@
-"""When PX4 acts on its own, besides a lost setpoint stream: geofence, battery, ground station link.
+"""Failsafes of PX4 besides a lost setpoint stream: geofence, battery, ground-station link.
 
-It watches and says what should be done; the `Autopilot` does it. A Return or Land waits COM_FAIL_ACT_T seconds in Hold,
-so that a pilot can take over. A commanded mode ends a failsafe, and the same cause acts again only after it was gone.
+This module monitors and requests actions; the `Autopilot` executes them. A Return or Land waits COM_FAIL_ACT_T seconds
+in Hold, so that a pilot can take over. A commanded mode ends a failsafe, and its cause acts again only after it ended.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from sitl.px4.parameters import Parameters
 
 
 class Action(enum.IntEnum):
-    """What to do, in rising order of severity."""
+    """Actions in rising order of severity."""
 
     NONE = 0
     WARN = 1
@@ -27,7 +27,7 @@ class Action(enum.IntEnum):
 
 
 class Cause(enum.IntEnum):
-    """Why the autopilot acts on its own."""
+    """Reasons why the autopilot acts on its own."""
 
     OFFBOARD = 0
     POSITION = 1
@@ -53,11 +53,11 @@ CIRCUIT_BREAKER = 894281
 
 
 class Watch:
-    """Conditions of one vehicle.
+    """Monitors the failsafe conditions of one vehicle.
 
     Attributes:
         battery_warning: 0 none, 1 low, 2 critical, 3 emergency; never falls while armed.
-        fence_broken: it is on the wrong side of a fence that matters.
+        fence_broken: it is on the wrong side of an active fence.
     """
 
     def __init__(self, parameters: Parameters, say: Callable[[Severity, str], None]) -> None:
@@ -66,7 +66,7 @@ class Watch:
         self.reset()
 
     def reset(self) -> None:
-        """As after boot."""
+        """Reset to the state after boot."""
         self.battery_warning = 0
         self.fence_broken = False
         self._gcs_us: int | None = None
@@ -74,18 +74,18 @@ class Watch:
         self._acted: dict[Cause, Action] = {}
 
     def on_gcs_heartbeat(self, now_us: int) -> None:
-        """HEARTBEAT of type 6 on any link."""
+        """Take a HEARTBEAT of type 6 from any link."""
         if self._gcs_lost:
             self._gcs_lost = False
             self._say(Severity.INFO, "GCS connection regained\t")
         self._gcs_us = now_us
 
     def forget(self) -> None:
-        """Disarmed: what has acted may act again."""
+        """Allow causes to act again, after disarming."""
         self._acted.clear()
 
     def check(self, breaches: Sequence[str], battery_01: float, now_us: int, *, armed: bool) -> tuple[Cause, Action]:
-        """The newest thing to act on; WARN or less: nothing to do."""
+        """Return the newest action; WARN or less: nothing to do."""
         wanted = (
             (Cause.GEOFENCE, self._fence(breaches)),
             (Cause.BATTERY, self._battery(battery_01, armed=armed)),

@@ -15,7 +15,7 @@ TEXT_AREA = "Geofence: approaching or outside geofence"
 
 
 class Geofence:
-    """Judges positions; it does not act."""
+    """Tests positions against the fences; it does not act."""
 
     def __init__(self, parameters: Parameters, store: Store) -> None:
         self._parameters = parameters
@@ -27,7 +27,7 @@ class Geofence:
     def breaches(
         self, pos_ned_m: tuple[float, float, float], home_ned_m: tuple[float, float, float] | None, origin: LocalOrigin
     ) -> list[str]:
-        """PX4's text for every fence a position is on the wrong side of; empty inside."""
+        """Return PX4's text for every fence that a position violates; empty inside."""
         found: list[str] = []
         x_m, y_m, z_m = pos_ned_m
         if home_ned_m is not None:
@@ -43,7 +43,7 @@ class Geofence:
         return found
 
     def _allowed(self, at_m: Xy) -> bool:
-        """Outside every exclusion, and inside one inclusion if there are any."""
+        """Return whether a position is outside every exclusion and, if there are any, inside an inclusion."""
         inclusions: list[bool] = []
         for keep_in, corners in self._areas:
             inside = _inside(at_m, corners)
@@ -83,7 +83,7 @@ class Geofence:
 
 
 def _inside(at_m: Xy, corners: list[Xy]) -> bool:
-    """Even-odd rule."""
+    """Apply the even-odd rule."""
     x_m, y_m = at_m
     inside = False
     for (ax, ay), (bx, by) in zip(corners, corners[1:] + corners[:1], strict=True):

@@ -1,4 +1,4 @@
-"""Whether one vehicle stands on the ground, and when it disarms by itself because of that."""
+"""Landing detection and automatic disarming of one vehicle."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from sitl.px4.modes import Severity
 from sitl.px4.parameters import Parameters
 from swarmctl.core.types import Landed
 
-LANDED_AFTER_US = 500_000  # continuous ground contact
+LANDED_AFTER_US = 500_000  # time of continuous ground contact
 
 
 class LandDetector:
@@ -25,19 +25,19 @@ class LandDetector:
         self.reset()
 
     def reset(self) -> None:
-        """As after boot."""
+        """Reset to the state after boot."""
         self.landed = Landed.IN_AIR if self._airborne else Landed.ON_GROUND
         self._contact_us: int | None = None
         self._armed_us = self._landed_us = 0
         self._flown = False
 
     def arm(self, now_us: int) -> None:
-        """A new flight begins."""
+        """Begin a new flight."""
         self._armed_us = self._landed_us = now_us
         self._flown = self._airborne
 
     def update(self, on_ground: bool, in_the_air: Landed, now_us: int) -> None:
-        """Every tick; `in_the_air` is what to call it when it flies."""
+        """Update every tick; `in_the_air` is the state reported in flight."""
         if self._airborne:
             return
         if not on_ground:
@@ -54,7 +54,7 @@ class LandDetector:
             self._say(Severity.INFO, "Landing detected\t")
 
     def disarm_text(self, now_us: int) -> str:
-        """Why an armed vehicle should disarm now; empty while it need not."""
+        """Return why an armed vehicle should disarm now; empty while it need not."""
         if self.landed != Landed.ON_GROUND:
             return ""
         real = self._parameters.real

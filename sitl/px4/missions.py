@@ -1,4 +1,4 @@
-"""What can be uploaded to a vehicle: mission, geofence and rally items; which PX4 refuses. No protocol, no flight."""
+"""Uploads to a vehicle: mission, geofence and rally items, and which of them PX4 refuses. No protocol, no flight."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _UNPLACED = frozenset({NAV_RETURN, NAV_DELAY, DO_JUMP, DO_CHANGE_SPEED})
 
 
 class MissionResult(enum.IntEnum):
-    """MAV_MISSION_RESULT."""
+    """Values of MAV_MISSION_RESULT."""
 
     ACCEPTED = 0
     ERROR = 1
@@ -62,12 +62,12 @@ class Item(NamedTuple):
 
     @property
     def relative(self) -> bool:
-        """The height is over home, not over the sea."""
+        """Whether the height is above home instead of above the sea."""
         return self.frame in _RELATIVE_FRAMES
 
 
 class Progress(NamedTuple):
-    """MISSION_CURRENT."""
+    """Content of MISSION_CURRENT."""
 
     seq: int
     total: int
@@ -76,7 +76,7 @@ class Progress(NamedTuple):
 
 
 def local_xy_m(origin: LocalOrigin, lat_e7: float, lon_e7: float) -> tuple[float, float]:
-    """Local NED position of a place [1e-7 deg]; flat, the inverse of `LocalOrigin.to_geo_e7`."""
+    """Return the local NED position of a place [1e-7 deg]; flat, the inverse of `LocalOrigin.to_geo_e7`."""
     return (
         (lat_e7 - origin.lat_e7) * origin.metres_per_e7_north,
         (lon_e7 - origin.lon_e7) * origin.metres_per_e7_east,
@@ -84,7 +84,7 @@ def local_xy_m(origin: LocalOrigin, lat_e7: float, lon_e7: float) -> tuple[float
 
 
 def judge(kind: int, item: Item) -> MissionResult:
-    """What PX4 answers to an item of this mission type."""
+    """Return PX4's result for an item of this mission type."""
     if item.frame == _FRAME_MISSION:
         known = kind == MISSION and item.command in _UNPLACED
         return MissionResult.ACCEPTED if known else MissionResult.UNSUPPORTED
@@ -109,14 +109,14 @@ def _judge_fence(item: Item) -> MissionResult:
 
 @dataclass(slots=True)
 class Store:
-    """Everything uploaded to one vehicle; it outlives a reboot."""
+    """Everything uploaded to one vehicle; it survives a reboot."""
 
     items: dict[int, tuple[Item, ...]] = field(default_factory=lambda: {MISSION: (), FENCE: (), RALLY: ()})
     current: int = 0
-    changes: int = 0  # counts replacements, so that who flies or fences notices
+    changes: int = 0  # counts replacements, so that a running flight or fence notices them
 
     def replace(self, kind: int, items: tuple[Item, ...]) -> None:
-        """Take a whole new list; a mission begins at its first item."""
+        """Replace the whole list; a mission begins at its first item."""
         kinds = (MISSION, FENCE, RALLY) if kind == ALL else (kind,)
         for each in kinds:
             self.items[each] = items
@@ -129,7 +129,7 @@ class Store:
         return self.items[MISSION]
 
     def jump(self, seq: int) -> bool:
-        """Make item `seq` the current one; False when there is none."""
+        """Make item `seq` the current one; return False when there is none."""
         if not 0 <= seq < len(self.mission):
             return False
         self.current = seq
@@ -137,7 +137,7 @@ class Store:
         return True
 
     def progress(self, *, flying: bool, finished: bool) -> Progress:
-        """What MISSION_CURRENT says."""
+        """Return the content of MISSION_CURRENT."""
         total = len(self.mission)
         if not total:
             return Progress(0, 0, MissionState.NO_MISSION, 0)

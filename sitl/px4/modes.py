@@ -1,4 +1,4 @@
-"""PX4's modes on the wire: custom_mode numbers, base_mode, MAV_STATE, and MAVLink results. Tables only."""
+"""PX4's modes in MAVLink: custom_mode numbers, base_mode, MAV_STATE, and results. Tables only."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Px4Mode(enum.IntEnum):
     TERMINATION = _main(10)
 
 
-MODE_NAMES = {  # as PX4 refuses them
+MODE_NAMES = {  # names in PX4's refusals
     Px4Mode.MANUAL: "Manual",
     Px4Mode.ALTCTL: "Altitude",
     Px4Mode.POSCTL: "Position",
@@ -44,7 +44,7 @@ MODE_NAMES = {  # as PX4 refuses them
 NEEDS_PILOT = frozenset({Px4Mode.MANUAL, Px4Mode.ALTCTL, Px4Mode.POSCTL, Px4Mode.ACRO, Px4Mode.STABILIZED})
 NO_ARMING_IN = frozenset({Px4Mode.AUTO_RTL, Px4Mode.AUTO_LAND, *NEEDS_PILOT})
 NOT_KEPT_AFTER_LANDING = frozenset({Px4Mode.AUTO_TAKEOFF, Px4Mode.AUTO_LAND, Px4Mode.AUTO_RTL})
-FLIES_BLIND = frozenset({Px4Mode.OFFBOARD, Px4Mode.AUTO_LAND})  # without a position; LAND then only descends
+FLIES_BLIND = frozenset({Px4Mode.OFFBOARD, Px4Mode.AUTO_LAND})  # modes without a position; LAND then only descends
 
 FLIGHT_MODES = {
     Px4Mode.AUTO_TAKEOFF: FlightMode.TAKEOFF,
@@ -72,7 +72,7 @@ BASE_OFFBOARD_NO_STREAM_YET = 1
 
 
 def base_mode(mode: Px4Mode, *, armed: bool, streamed: bool) -> int:
-    """HEARTBEAT.base_mode; `streamed`: a setpoint stream has been seen since boot."""
+    """Return HEARTBEAT.base_mode; `streamed`: a setpoint stream has been seen since boot."""
     if mode == Px4Mode.OFFBOARD:
         flags = BASE_OFFBOARD if streamed or armed else BASE_OFFBOARD_NO_STREAM_YET
     elif mode in (Px4Mode.MANUAL, Px4Mode.ACRO):
@@ -85,7 +85,7 @@ def base_mode(mode: Px4Mode, *, armed: bool, streamed: bool) -> int:
 
 
 class MavState(enum.IntEnum):
-    """MAV_STATE."""
+    """Values of MAV_STATE."""
 
     UNINIT = 0
     STANDBY = 3
@@ -95,7 +95,7 @@ class MavState(enum.IntEnum):
 
 
 class Result(enum.IntEnum):
-    """MAV_RESULT."""
+    """Values of MAV_RESULT."""
 
     ACCEPTED = 0
     TEMPORARILY_REJECTED = 1
@@ -105,7 +105,7 @@ class Result(enum.IntEnum):
 
 
 class Severity(enum.IntEnum):
-    """MAV_SEVERITY."""
+    """Values of MAV_SEVERITY."""
 
     EMERGENCY = 0
     CRITICAL = 2
@@ -124,7 +124,7 @@ class MissionState(enum.IntEnum):
 
 
 class OffboardLoss(enum.IntEnum):
-    """COM_OBL_RC_ACT; the first four need a pilot or mean Return, and end in RTL without one."""
+    """Values of COM_OBL_RC_ACT; the first four need a pilot or mean Return, and end in RTL without one."""
 
     POSITION = 0
     ALTITUDE = 1

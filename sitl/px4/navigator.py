@@ -1,7 +1,7 @@
-"""How the autopilot itself flies: hold, climb, go, descend. P on position, PID on velocity -> attitude and thrust.
+"""Position control of the autopilot itself: hold, climb, go to, descend. P on position, PID on velocity.
 
-Scalar code at autopilot rate for one vehicle; local NED. It knows the true hover thrust, as an autopilot's hover-thrust
-estimator does. Limits are parameters and act at once.
+Scalar code at autopilot rate for one vehicle; local NED; the output is attitude and thrust. It knows the true hover
+thrust, as an autopilot's hover-thrust estimator does. Limits are parameters and act at once.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ VEL_P_1_S = 1.8  # MPC_XY_VEL_P_ACC
 VEL_I_1_S2 = 0.4
 Z_VEL_P_1_S = 4.0  # MPC_Z_VEL_P_ACC
 Z_VEL_I_1_S2 = 2.0
-ACC_MAX_M_S2 = 3.0  # MPC_ACC_HOR: also how hard it brakes
+ACC_MAX_M_S2 = 3.0  # MPC_ACC_HOR: also the braking acceleration
 ACC_UP_MAX_M_S2 = 4.0
 ACC_DOWN_MAX_M_S2 = 3.0
 JERK_MAX_M_S3 = 20.0  # 0.4 m/s2, 2.3 deg a tick: the thesis' attitude loop follows ramps, not jumps
-HOLD_SPEED_M_S = 0.3  # slower than this, the position is latched
+HOLD_SPEED_M_S = 0.3  # below this speed the position is latched
 THRUST_MIN_01 = 0.06
 CLIMB_FAST_ABOVE_M, CLIMB_GAIN = 25.0, 0.6  # fitted: 2.5 m in 7.8 s after arming, 30 m in 20-22 s
 SLOW_BELOW_M, FAST_ABOVE_M = 5.0, 10.0  # MPC_LAND_ALT2, MPC_LAND_ALT1: between them vertical speed limits blend
@@ -34,13 +34,13 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """What one vehicle's attitude loop is to fly: attitude or body rates, and collective thrust.
+    """Command to one vehicle's attitude loop: attitude or body rates, and collective thrust.
 
     Attributes:
         q_nb: (4,) wxyz, unit length.
-        thrust_01: of full thrust.
-        rate_frd_rad_s: fly these instead of the attitude; NaN: that axis is left alone.
-        feed_frd_rad_s: added to what the attitude asks for.
+        thrust_01: share of full thrust.
+        rate_frd_rad_s: rates to fly instead of the attitude; NaN: that axis is uncontrolled.
+        feed_frd_rad_s: feed-forward added to the rates of the attitude loop.
         stopped: motors do not turn though armed.
         loose: no torque at all.
     """
@@ -71,7 +71,7 @@ class Navigator:
         self._speed_ned_m_s: Triple = (0.0, 0.0, 0.0)
 
     def engage(self, estimate: Estimate, *, fresh: bool) -> None:
-        """Brake, then hold where that ends. `fresh`: forget the integrals too (the last flight was not ours)."""
+        """Brake, then hold where that ends. `fresh`: reset the integrals too (another controller flew before)."""
         self._yaw_rad = estimate.yaw_rad
         self._hold_xy_m = self._hold_z_m = None
         if fresh:
@@ -80,28 +80,28 @@ class Navigator:
             self._acc_m_s2 = [-GRAVITY_M_S2 * down[0], -GRAVITY_M_S2 * down[1]]
 
     def target(self) -> tuple[float, ...]:
-        """(11,) position, velocity and acceleration setpoints NED, yaw, yaw rate; NaN: none."""
+        """Setpoints (11,) of position, velocity and acceleration NED, yaw, yaw rate; NaN: none."""
         x_m, y_m = self._hold_xy_m or (_NAN, _NAN)
         z_m = _NAN if self._hold_z_m is None else self._hold_z_m
         return x_m, y_m, z_m, *self._speed_ned_m_s, *self._acc_m_s2, _NAN, self._yaw_rad, _NAN
 
     def keep_height(self, z_ned_m: float) -> None:
-        """Hold at this height instead of where braking ends."""
+        """Hold this height instead of the one where braking ends."""
         self._hold_z_m = z_ned_m
 
     def face(self, yaw_rad: float) -> None:
-        """Turn the nose; NaN leaves it."""
+        """Turn the nose to a yaw; NaN leaves it."""
         if math.isfinite(yaw_rad):
             self._yaw_rad = yaw_rad
 
     def hold(self, estimate: Estimate, dt_s: float) -> Command:
-        """LOITER: brake, latch the position, keep it."""
+        """Fly LOITER: brake, latch the position, hold it."""
         if self._hold_z_m is None and abs(estimate.vel_ned_m_s[2]) < HOLD_SPEED_M_S:
             self._hold_z_m = estimate.pos_ned_m[2]
         return self._fly(estimate, self._speed_z(estimate, self._hold_z_m), dt_s)
 
     def climb_to(self, estimate: Estimate, z_ned_m: float, ground_z_m: float, ramp_01: float, dt_s: float) -> Command:
-        """Take off to a height above where the climb began: slowly near the ground; `ramp_01` of the speed."""
+        """Take off to a height above the begin of the climb, slowly near the ground; `ramp_01` scales the speed."""
         if self._hold_xy_m is None:
             self._hold_xy_m = estimate.pos_ned_m[0], estimate.pos_ned_m[1]
         self._hold_z_m = z_ned_m
@@ -112,14 +112,14 @@ class Navigator:
         return self._fly(estimate, max(-limit, min(slow, wanted)), dt_s)
 
     def go_to(self, estimate: Estimate, xy_m: tuple[float, float], z_ned_m: float, dt_s: float) -> Command:
-        """Straight to a point."""
+        """Fly straight to a point."""
         self._hold_xy_m, self._hold_z_m = xy_m, z_ned_m
         return self._fly(estimate, self._speed_z(estimate, z_ned_m), dt_s)
 
     def descend(
         self, estimate: Estimate, ground_z_m: float, dt_s: float, xy_m: tuple[float, float] | None = None
     ) -> Command:
-        """LAND where braking ends, or at `xy_m`: fast above `FAST_ABOVE_M`, MPC_LAND_SPEED near the ground."""
+        """Fly LAND where braking ends, or at `xy_m`: fast above `FAST_ABOVE_M`, MPC_LAND_SPEED near the ground."""
         if xy_m is not None:
             self._hold_xy_m = xy_m
         self._hold_z_m = None
@@ -169,7 +169,7 @@ class Navigator:
         return max(-ACC_UP_MAX_M_S2, min(ACC_DOWN_MAX_M_S2, Z_VEL_P_1_S * error + summed))
 
     def _summed(self, estimate: Estimate, axis: int, gain: float, limit: float, error: float, dt_s: float) -> float:
-        """The integral of a velocity error; it rests while the error is large, and on the ground unless to leave it."""
+        """Return the velocity-error integral; frozen while the error is large, and on the ground except to take off."""
         leaving = axis == 2 and error < 0.0
         if (leaving or not estimate.on_ground) and abs(error) < 1.0:
             summed = self._integral_m_s2[axis] + gain * error * dt_s
@@ -182,7 +182,7 @@ class Navigator:
         step = JERK_MAX_M_S3 * dt_s
         d_n, d_e = _limited(acc_n - self._acc_m_s2[0], acc_e - self._acc_m_s2[1], step)
         tilt_rad = math.radians(max(1.0, min(85.0, self._parameters.real("MPC_TILTMAX_AIR"))))
-        level = (GRAVITY_M_S2 - acc_d) * math.tan(tilt_rad)  # horizontal acceleration that this tilt gives
+        level = (GRAVITY_M_S2 - acc_d) * math.tan(tilt_rad)  # horizontal acceleration at this tilt
         self._acc_m_s2 = list(_limited(self._acc_m_s2[0] + d_n, self._acc_m_s2[1] + d_e, level))
         down = np.array([-self._acc_m_s2[0], -self._acc_m_s2[1], GRAVITY_M_S2 - acc_d])
         down /= math.sqrt(float(down @ down))

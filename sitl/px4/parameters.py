@@ -1,7 +1,7 @@
-"""PX4 parameters of one vehicle: names, defaults, and the bytewise encoding that puts integers into a float field.
+"""PX4 parameters of one vehicle: names, defaults, and the bytewise encoding of integers in a float field.
 
-What this simulator uses, and what clients commonly ask for of a multicopter. Values out of the documented range are
-accepted, as by PX4.
+The table holds what this simulator uses and what clients commonly request of a multicopter. Values out of the
+documented range are accepted, as by PX4.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ THR_MDL_FAC=0.0
 
 
 def _default(text: str) -> int | float:
-    return float(text) if "." in text else int(text)  # the type is in the writing
+    return float(text) if "." in text else int(text)  # the notation gives the type
 
 
 DEFAULTS = {name: _default(text) for name, _, text in (entry.partition("=") for entry in _TABLE.split())}
@@ -92,27 +92,27 @@ class WireValue:
 
 
 class UnknownParameterError(KeyError):
-    """No parameter of that name."""
+    """There is no parameter of that name."""
 
 
 class WrongTypeError(TypeError):
-    """PARAM_SET with another MAV_PARAM_TYPE than the parameter has."""
+    """PARAM_SET has another MAV_PARAM_TYPE than the parameter."""
 
 
 def int_to_wire(value: int) -> float:
-    """Float whose bits are those of the int32."""
+    """Return the float whose bits are those of the int32."""
     wire: float = _FLOAT.unpack(_INT.pack(value))[0]
     return wire
 
 
 def int_from_wire(value: float) -> int:
-    """The int32 in a float's bits. A signalling NaN pattern does not survive Python's float; PX4 has none."""
+    """Return the int32 in a float's bits. A signalling NaN does not survive Python's float; PX4 has none."""
     number: int = _INT.unpack(_FLOAT.pack(value))[0]
     return number
 
 
 class Parameters:
-    """The table of one vehicle; types are those of the defaults."""
+    """The parameters of one vehicle; types are those of the defaults."""
 
     def __init__(self, sysid: int) -> None:
         self._values = dict(DEFAULTS)
@@ -124,15 +124,15 @@ class Parameters:
         return len(self._names)
 
     def real(self, name: str) -> float:
-        """Value of a parameter as a number."""
+        """Return a parameter as a real number."""
         return float(self._values[name])
 
     def integer(self, name: str) -> int:
-        """Value of an integer parameter."""
+        """Return an integer parameter."""
         return int(self._values[name])
 
     def assign(self, name: str, value: float) -> None:
-        """Set a parameter in this process, without the wire.
+        """Set a parameter in this process, without MAVLink.
 
         Raises:
             UnknownParameterError: no such name.
@@ -141,11 +141,11 @@ class Parameters:
         self._values[name] = kind(value)
 
     def by_name(self, name: str) -> WireValue:
-        """Raises `UnknownParameterError`."""
+        """Return a parameter by name; raises `UnknownParameterError`."""
         return self.by_index(self._index[self._known(name)])
 
     def by_index(self, index: int) -> WireValue:
-        """Raises `UnknownParameterError` outside the table."""
+        """Return a parameter by index; raises `UnknownParameterError` outside the table."""
         if not 0 <= index < len(self._names):
             raise UnknownParameterError(str(index))
         name = self._names[index]
@@ -155,7 +155,7 @@ class Parameters:
         return WireValue(name, value, REAL32, index)
 
     def checksum(self) -> WireValue:
-        """`_HASH_CHECK`: a client that knows it already can skip the list."""
+        """Return `_HASH_CHECK`: a client that knows it can skip the list."""
         crc = 0
         for name in self._names:
             wire = self.by_name(name)
@@ -164,7 +164,7 @@ class Parameters:
         return WireValue(HASH_NAME, value, UINT32, HASH_INDEX)
 
     def set_from_wire(self, name: str, value: float, kind: int) -> WireValue:
-        """Apply a PARAM_SET and return what is stored now; a non-finite float is not stored.
+        """Apply a PARAM_SET and return the stored value; a non-finite float is not stored.
 
         Raises:
             UnknownParameterError: no such name.

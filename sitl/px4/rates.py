@@ -1,4 +1,4 @@
-"""Body-rate setpoints beside the attitude loops: flown instead of an attitude, or fed forward on top of one."""
+"""Body-rate setpoints beside the attitude loops: flown instead of an attitude, or as feed-forward to one."""
 
 from __future__ import annotations
 
@@ -14,31 +14,26 @@ _WINDUP_RAD_S = 1.0
 
 
 class RateLoop:
-    """PI loops on body rates of the vehicles that fly rates; costs nothing while none does.
+    """PI loops on body rates of the vehicles that fly rates; without cost while none does.
 
     Attributes:
         feeding: some vehicle has a feed-forward.
-        feed_rad_s: (3, N) body rates to add to what the attitude asks for.
+        feed_rad_s: (3, N) body rates to add to those of the attitude loop.
     """
 
     def __init__(self, gain_nm_s: Array, vehicles: int, dt_s: float) -> None:
-        """`gain_nm_s` (3, 1): torque over rate error."""
+        """Set `gain_nm_s` (3, 1), torque over rate error."""
         self._gain_nm_s = gain_nm_s
         self._dt_s = dt_s
-        self._wanted_rad_s = np.zeros((3, vehicles))  # NaN: that axis is left alone
+        self._wanted_rad_s = np.zeros((3, vehicles))  # NaN: that axis is uncontrolled
         self._integral_rad = np.zeros((3, vehicles))
         self._on: Mask = np.zeros(vehicles, dtype=bool)
         self._active = False
         self.feeding = False
         self.feed_rad_s = np.zeros((3, vehicles))
 
-    def set(
-        self,
-        vehicle: int,
-        rate_frd_rad_s: Sequence[float] | None,
-        feed_frd_rad_s: Sequence[float] | None,
-    ) -> None:
-        """New setpoint of one vehicle: rates to fly, or None for its attitude; and a feed-forward."""
+    def set(self, vehicle: int, rate_frd_rad_s: Sequence[float] | None, feed_frd_rad_s: Sequence[float] | None) -> None:
+        """Set the setpoint of one vehicle: rates to fly, or None for its attitude; and a feed-forward."""
         if rate_frd_rad_s is not None:
             if not self._on[vehicle]:
                 self._integral_rad[:, vehicle] = 0.0

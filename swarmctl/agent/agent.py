@@ -59,7 +59,7 @@ from swarmctl.core.types import (
 )
 from swarmctl.mavlink.autopilot import Autopilot
 from swarmctl.mavlink.commands import CommandPort
-from swarmctl.mavlink.vehicle_setup import Upkeep
+from swarmctl.mavlink.vehicle_setup import VehicleSetup
 
 _NO_TIME_US = -1
 # modes in which the vehicle does not follow its committed trajectory
@@ -97,7 +97,7 @@ class Agent:
     ) -> None:
         self._setup, self._autopilot, self._commands = setup, autopilot, commands
         self._bus, self._clock, self._sink, self._stopwatch_ns = bus, clock, sink, stopwatch_ns
-        self._upkeep = Upkeep(
+        self._vehicle_setup = VehicleSetup(
             autopilot, commands, setup.params.autopilot_params, setup.sysid, setup.params.state_machine.state_rate_hz
         )
         self._world_model = WorldModel(
@@ -145,7 +145,7 @@ class Agent:
         """Whether the mission has ended and the autopilot's parameters are restored, or the wait for it timed out."""
         if self._done_us is None:
             return False
-        return self._upkeep.restored or self._clock.now_us() - self._done_us > _RESTORE_TIMEOUT_US
+        return self._vehicle_setup.restored or self._clock.now_us() - self._done_us > _RESTORE_TIMEOUT_US
 
     @property
     def finished(self) -> bool:
@@ -250,7 +250,7 @@ class Agent:
         state = self._autopilot.poll(now_us)
         self._commands.step(now_us)
         for result in self._commands.results():
-            self._upkeep.took(result)
+            self._vehicle_setup.took(result)
             asked = f"{result.command.verb.value} {result.command.name}".rstrip()
             if result.ok:
                 self._alerts.clear(asked)
@@ -428,7 +428,7 @@ class Agent:
             now_us,
             utc_us,
             state,
-            self._upkeep.ready,
+            self._vehicle_setup.ready,
             self._autopilot.armable,
             self._commands.busy,
             self._decision.mode,
@@ -437,7 +437,7 @@ class Agent:
             others_ned_m=self._world_model.others_ned_m(utc_us),
             arm_in=None if dialect is None else dialect.arm_in,
             boots=self._autopilot.clock.boots,
-            refusal=self._upkeep.refusal,
+            refusal=self._vehicle_setup.refusal,
             unsettled=self._unsettled(now_us),
             overload=self._overload.level,
             armed_told_us=self._autopilot.armed_told_us,
@@ -446,7 +446,7 @@ class Agent:
             self._commands.request(command)
         self._report_start_blocker(now_us)
         self._restore_parameters(now_us)
-        self._upkeep.step(now_us)
+        self._vehicle_setup.step(now_us)
         if not before[1] and self._state_machine.had_control:
             self._predictor.clear()
             self._observer.reset()
@@ -470,8 +470,8 @@ class Agent:
             return
         if self._done_us is None:
             self._done_us = now_us
-            self._upkeep.restore()
-        left = self._upkeep.left_changed
+            self._vehicle_setup.restore()
+        left = self._vehicle_setup.left_changed
         if left and self.done and self._alerts.put("restore", f"parameters left changed, they were: {left}", now_us):
             self._note("parameters_left_changed", were=left)
 

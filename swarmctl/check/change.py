@@ -1,4 +1,4 @@
-"""What `--apply` was to set, and what came of it."""
+"""Parameter changes of `swarmctl check --apply`, and their results."""
 
 from __future__ import annotations
 
@@ -11,27 +11,27 @@ from swarmctl.check.parameters import Number
 
 @dataclass(frozen=True, slots=True)
 class Change:
-    """One parameter."""
+    """One parameter that was to be changed."""
 
     agent: int
     name: str
     before: Number
     wanted: Number
-    after: Number | None  # as read back
-    refused: str  # why it was not tried, or ""
+    after: Number | None  # value read back
+    refused: str  # why the change was not tried, or ""
 
     @property
     def done(self) -> bool:
         return self.after is not None and math.isclose(self.after, self.wanted, rel_tol=1e-6, abs_tol=1e-9)
 
     def in_words(self) -> str:
-        """Before and after."""
+        """Return the values before and after as text."""
         if self.done:
             return f"{self.name}: {self.before:g} -> {self.after:g}"
         return f"{self.name}: {self.before:g}, not changed to {self.wanted:g} ({self._why()})"
 
     def finding(self) -> Finding:
-        """Of a change that was not done."""
+        """Return the finding for a change that was not made."""
         found = "not told" if self.after is None else f"{self.after:g}"
         advice = f"--apply did not set it: {self._why()}"
         return Finding(self.agent, f"apply {self.name}", Verdict.FIX, found, f"{self.wanted:g}", advice, 98)

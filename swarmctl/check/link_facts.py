@@ -1,6 +1,6 @@
-"""What a check has found out about one vehicle and its link, as plain values. No judgement, no I/O.
+"""Facts that a check has gathered about one vehicle and its link, as plain values without judgement.
 
-`None` means that the vehicle never told.
+`None` means that the vehicle has not reported the value.
 """
 
 from __future__ import annotations
@@ -15,27 +15,27 @@ Ned = tuple[float, float, float]
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
-    """One parameter as the autopilot holds it; `value` None when it has none of that name, or never answered."""
+    """One parameter as the autopilot stores it; `value` is None when it does not exist or was not answered."""
 
     name: str
     value: float | int | None
     kind: int = 0  # MAV_PARAM_TYPE
-    refused: bool = False  # the autopilot itself said that there is none of that name
+    refused: bool = False  # the autopilot has reported that it does not exist
 
 
 @dataclass(frozen=True, slots=True)
 class RoundTrip:
-    """Of requests that were answered."""
+    """Round-trip times of the answered requests."""
 
     p50_ms: float
     p99_ms: float
     answers: int
-    by: str  # TIMESYNC or PING
+    by: str  # message used: TIMESYNC or PING
 
 
 @dataclass(frozen=True, slots=True)
 class VehicleTime:
-    """The vehicle's clock against the monotonic one of this host."""
+    """The vehicle's clock against the monotonic clock of this host."""
 
     offset_s: float  # vehicle minus host
     drift_ppm: float  # vehicle seconds gained per million host seconds
@@ -44,7 +44,7 @@ class VehicleTime:
 
 @dataclass(frozen=True, slots=True)
 class LinkFacts:
-    """One link, for as long as it was listened to."""
+    """Statistics of one link over the time it was listened to."""
 
     listened_s: float
     rates_hz: Mapping[str, float]  # message name -> rate of arrival
@@ -54,32 +54,32 @@ class LinkFacts:
     mavlink1: int  # frames
     mavlink2: int
     autopilots: tuple[int, ...]  # system ids
-    senders: int  # addresses that frames came from
+    senders: int  # number of addresses that frames came from
     round_trip: RoundTrip | None
     time: VehicleTime | None
 
 
 @dataclass(frozen=True, slots=True)
 class Version:
-    """AUTOPILOT_VERSION."""
+    """Firmware and board from AUTOPILOT_VERSION."""
 
     firmware: tuple[int, int, int]
     stage: str  # dev, alpha, beta, rc, release
     git: str
     board: int
-    uid: str  # uid2, hexadecimal; of PX4's simulator the number of its instance, so it tells nothing of what it is
-    bytewise: bool | None  # which parameter encoding it announces
-    vendor: int = 0  # of its USB port; 0 where there is none: simulators, and boards that run Linux
+    uid: str  # uid2, hexadecimal; PX4's simulator reports its instance number, so it does not identify a board
+    bytewise: bool | None  # announced encoding of integer parameters
+    vendor: int = 0  # USB vendor id; 0 for simulators and for boards that run Linux
 
     @property
     def has_usb(self) -> bool:
-        """Whether this is a board of its own, for sure; False says nothing."""
+        """Whether this is certainly a board; False leaves it open."""
         return self.vendor != 0
 
 
 @dataclass(frozen=True, slots=True)
 class Estimator:
-    """ESTIMATOR_STATUS."""
+    """Flags and accuracies from ESTIMATOR_STATUS."""
 
     flags: int
     pos_horiz_m: float | None  # 1 sigma
@@ -88,16 +88,16 @@ class Estimator:
 
 @dataclass(frozen=True, slots=True)
 class Gps:
-    """GPS_RAW_INT."""
+    """Fix and accuracy from GPS_RAW_INT."""
 
     fix_type: int  # 3: three-dimensional
     satellites: int | None
-    pos_horiz_m: float | None  # its own accuracy
+    pos_horiz_m: float | None  # reported by the receiver
 
 
 @dataclass(frozen=True, slots=True)
 class Sensors:
-    """SYS_STATUS: bits of MAV_SYS_STATUS_SENSOR, and the battery."""
+    """Sensor bits (MAV_SYS_STATUS_SENSOR) and battery from SYS_STATUS."""
 
     present: int
     enabled: int
@@ -108,15 +108,15 @@ class Sensors:
 
 @dataclass(frozen=True, slots=True)
 class VehicleFacts:
-    """One vehicle of the configuration."""
+    """Everything known about one vehicle of the configuration."""
 
     agent: int
     url: str
     wanted_sysid: int
-    unreachable: str  # why, or "" when its heartbeat was heard
+    unreachable: str  # why, or "" once its heartbeat was received
     link: LinkFacts
     sysid: int = 0
-    autopilot: str = ""  # name of the dialect, "" for one we don't speak
+    autopilot: str = ""  # name of the dialect; "" for an unsupported one
     autopilot_number: int = 0  # MAV_AUTOPILOT
     version: Version | None = None
     mode: FlightMode = FlightMode.UNKNOWN
@@ -128,23 +128,23 @@ class VehicleFacts:
     estimator: Estimator | None = None
     gps: Gps | None = None
     pos_ned_m: Ned | None = None  # shared frame
-    origin_ned_m: Ned | None = None  # of its local frame, in the shared one
-    origin_told: bool = False  # by GPS_GLOBAL_ORIGIN; else worked out from its global position
+    origin_ned_m: Ned | None = None  # origin of the local frame, in the shared frame
+    origin_told: bool = False  # reported by GPS_GLOBAL_ORIGIN; else computed from the global position
     parameters: Mapping[str, Parameter] | None = None
 
     @property
     def pos_accuracy_m(self) -> float | None:
-        """Horizontal accuracy, 1 sigma: the estimator's, else the receiver's."""
+        """Horizontal accuracy [m], 1 sigma: the estimator's, else the receiver's."""
         if self.estimator is not None and self.estimator.pos_horiz_m is not None:
             return self.estimator.pos_horiz_m
         return None if self.gps is None else self.gps.pos_horiz_m
 
     @property
     def reached(self) -> bool:
-        """Whether there is anything to judge beyond the link."""
+        """Whether the vehicle was reached, so that more than the link can be judged."""
         return not self.unreachable
 
     def number(self, name: str) -> float | None:
-        """Value of a parameter, None when it is not known."""
+        """Return the value of a parameter, or None while it is unknown."""
         parameter = (self.parameters or {}).get(name)
         return None if parameter is None or parameter.value is None else float(parameter.value)

@@ -1,4 +1,4 @@
-"""What is counted on a link: rates, lost frames, round trips, the other side's clock. Pure; times are arguments."""
+"""Statistics of a link: message rates, lost frames, round trips and the vehicle's clock. Pure; times are arguments."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 
 from swarmctl.check.link_facts import RoundTrip, VehicleTime
 
-_REORDERED = 128  # a sequence number this far behind is an old frame, not a gap
-_CLOCK_ANSWERS, _CLOCK_SPAN_S = 8, 0.8  # fewer say nothing of drift
+_REORDERED = 128  # a sequence number this far behind belongs to a late frame, not to a gap
+_CLOCK_ANSWERS, _CLOCK_SPAN_S = 8, 0.8  # fewer answers or a shorter span give no drift
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,11 +20,11 @@ class Answer:
 
     sent_us: int
     arrived_us: int
-    vehicle_us: float  # the other side's clock when it answered; NaN when it did not say
+    vehicle_us: float  # vehicle clock at the answer; NaN when not reported
 
 
-class FrameTally:
-    """Frames of one component."""
+class FrameStatistics:
+    """Counts the frames and messages of one component."""
 
     def __init__(self) -> None:
         self.frames = 0
@@ -36,14 +36,14 @@ class FrameTally:
         self._last_us: dict[str, int] = {}
 
     def frame(self, seq: int, size: int) -> None:
-        """A frame with a good checksum or of an unknown kind: both take a sequence number."""
+        """Count a frame with a valid checksum or of unknown type: both take a sequence number."""
         self.frames += 1
         self.bytes += size
         if self._last_seq is not None:
             ahead = (seq - self._last_seq) % 256
             if 0 < ahead < _REORDERED:
                 self.lost += ahead - 1
-            else:  # late or twice: it was counted as lost, if anything
+            else:  # late or duplicate: a late one was counted as lost before
                 self.lost = max(0, self.lost - 1)
                 return
         self._last_seq = seq
@@ -54,7 +54,7 @@ class FrameTally:
         self._last_us[name] = t_us
 
     def rates_hz(self, listened_s: float) -> dict[str, float]:
-        """Rate of every message seen; from the first to the last of it where there are three or more."""
+        """Return the rate of every message seen, from first to last arrival where there are three or more."""
         rates = {}
         for name, count in self._count.items():
             span_s = (self._last_us[name] - self._first_us[name]) * 1e-6
@@ -67,7 +67,7 @@ class FrameTally:
 
 
 def round_trip(answers: Sequence[Answer], by: str) -> RoundTrip | None:
-    """Median and 99th percentile of the answers; None without one."""
+    """Return median and 99th percentile of the answers, or None without any."""
     if not answers:
         return None
     took_ms = np.array([a.arrived_us - a.sent_us for a in answers]) * 1e-3  # (answers,)
@@ -75,9 +75,9 @@ def round_trip(answers: Sequence[Answer], by: str) -> RoundTrip | None:
 
 
 def vehicle_time(answers: Sequence[Answer]) -> VehicleTime | None:
-    """Offset and drift of the other side's clock, from the quicker half of the answers.
+    """Return offset and drift of the vehicle's clock, from the faster half of the answers; None without any.
 
-    The vehicle's time is taken as that of the middle of the round trip; a lasting asymmetry of the link is not seen.
+    The vehicle's time is assigned to the middle of the round trip: a constant asymmetry of the link is not seen.
     """
     told = [a for a in answers if np.isfinite(a.vehicle_us)]
     if not told:

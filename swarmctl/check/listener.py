@@ -1,7 +1,7 @@
-"""A vehicle link that hears everybody, for checks: who else sends here, and in which protocol, is part of the answer.
+"""MAVLink listener for checks: receives from every sender, because foreign senders and protocols are findings.
 
-The flying link (`transport`) obeys its vehicle and drops the rest; this one tells them apart. It answers only the
-address it is told to.
+The flying link (`transport`) accepts its vehicle alone; this one reports the sender of each datagram. It sends only to
+the address that it is given.
 """
 
 from __future__ import annotations
@@ -16,63 +16,63 @@ from swarmctl.mavlink.transport import Transport, bind_towards, bind_udp, open_t
 Address = tuple[str, int]
 NOWHERE: Address = ("", 0)
 _MAX_DATAGRAM = 2048
-_DATAGRAMS_AT_ONCE = 200  # one flooded link must not starve the others
+_DATAGRAMS_AT_ONCE = 200  # bounded, so that one flooded link does not starve the others
 
 
-class Heard(NamedTuple):
-    """Bytes, when they arrived (monotonic) and who sent them."""
+class ReceivedDatagram(NamedTuple):
+    """A datagram with its monotonic arrival time [us] and its sender."""
 
     t_us: int
     data: bytes
     sender: Address
 
 
-class Ear(Protocol):
-    """One vehicle's link. Never blocks."""
+class Listener(Protocol):
+    """Receives and sends on one vehicle's link without blocking."""
 
-    def receive(self) -> list[Heard]:
-        """What has arrived since the last call."""
+    def receive(self) -> list[ReceivedDatagram]:
+        """Return everything that has arrived since the last call."""
 
     def send(self, data: bytes, to: Address) -> None:
-        """Hand over one frame; dropped when the link can't take it."""
+        """Send one frame; it is dropped when the link can't take it."""
 
     def fd(self) -> int | None:
-        """Descriptor to wait for, None where there is none."""
+        """Return the file descriptor to wait for, or None where there is none."""
 
     def close(self) -> None:
         """Release the port."""
 
 
 def monotonic_us() -> int:
-    """Now, of the clock that every time in a check is of."""
+    """Return the monotonic time [us], the clock of all times in a check."""
     return time.monotonic_ns() // 1000
 
 
-def open_ear(url: str) -> tuple[Ear, Address]:
-    """The link a URL names, and where to speak before anybody was heard (`NOWHERE`: nowhere).
+def open_listener(url: str) -> tuple[Listener, Address]:
+    """Open the link that a URL names; return it with the address to send to first (`NOWHERE`: wait for the vehicle).
 
     Raises:
         StartError: the port is taken, the host has no address, or the device does not exist.
     """
     endpoint = parse_url(url)
     if endpoint.scheme == "udpin":
-        return UdpEar(bind_udp(endpoint.where, endpoint.number)), NOWHERE
+        return UdpListener(bind_udp(endpoint.where, endpoint.number)), NOWHERE
     if endpoint.scheme == "udpout":
         there = resolve(endpoint.where), endpoint.number
-        return UdpEar(bind_towards(there)), there
+        return UdpListener(bind_towards(there)), there
     there = endpoint.where, endpoint.number
-    return WireEar(open_transport(url), there), there
+    return TransportListener(open_transport(url), there), there
 
 
-class UdpEar:
-    """A bound UDP socket."""
+class UdpListener:
+    """Listens on a bound UDP socket."""
 
     def __init__(self, sock: socket.socket) -> None:
         self._sock = sock
         self._sock.setblocking(False)
 
-    def receive(self) -> list[Heard]:
-        heard: list[Heard] = []
+    def receive(self) -> list[ReceivedDatagram]:
+        heard: list[ReceivedDatagram] = []
         for _ in range(_DATAGRAMS_AT_ONCE):
             try:
                 data, sender = self._sock.recvfrom(_MAX_DATAGRAM)
@@ -80,7 +80,7 @@ class UdpEar:
                 continue  # ICMP port unreachable surfaces here once
             except OSError:
                 break
-            heard.append(Heard(monotonic_us(), data, sender))
+            heard.append(ReceivedDatagram(monotonic_us(), data, sender))
         return heard
 
     def send(self, data: bytes, to: Address) -> None:
@@ -94,14 +94,14 @@ class UdpEar:
         self._sock.close()
 
 
-class WireEar:
-    """Serial and TCP: there is one other end."""
+class TransportListener:
+    """Listens on a serial or TCP link, which has one other end."""
 
     def __init__(self, transport: Transport, there: Address) -> None:
         self._transport, self._there = transport, there
 
-    def receive(self) -> list[Heard]:
-        return [Heard(d.t_us, d.data, self._there) for d in self._transport.receive(monotonic_us())]
+    def receive(self) -> list[ReceivedDatagram]:
+        return [ReceivedDatagram(d.t_us, d.data, self._there) for d in self._transport.receive(monotonic_us())]
 
     def send(self, data: bytes, to: Address) -> None:
         self._transport.send(data)

@@ -1,6 +1,6 @@
-"""Reads parameters by name, and sets some of them: re-asked until answered, given up after a few tries. No socket.
+"""Reads parameters by name and sets some of them; requests are repeated a few times until answered. No socket.
 
-Every value that was set is read again afterwards: what the autopilot has, not what it was told, is what counts.
+Every value that was set is read again, because only the stored value counts.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ _REAL32 = mavlink.MAV_PARAM_TYPE_REAL32
 _ASK_US = 400_000
 _BATCH_US = 50_000
 _TRIES = 4
-_AT_ONCE = 6  # slow serial links
+_AT_ONCE = 6  # few, for slow serial links
 _DOES_NOT_EXIST = 1  # MAV_PARAM_ERROR
 
 
@@ -29,16 +29,16 @@ class _Setting:
     value: float | int
     tries: int = 0
     due_us: int = 0
-    reading: bool = False  # it was acknowledged, and is being read back
+    reading: bool = False  # acknowledged; now read back
 
 
 class ParameterReader:
-    """Parameters of one vehicle.
+    """Reads and sets the parameters of one vehicle.
 
     Args:
-        sysid, compid: who is asked.
-        names: what to read.
-        dialect: decides how integers are encoded.
+        sysid, compid: address of the autopilot.
+        names: parameters to read.
+        dialect: defines the encoding of integers.
     """
 
     def __init__(self, sysid: int, compid: int, names: Sequence[str], dialect: Dialect) -> None:
@@ -50,23 +50,23 @@ class ParameterReader:
         self._batch_us = 0
         self._settings: dict[str, _Setting] = {}
         self.values: dict[str, Parameter] = {}
-        self.interrupted = False  # the vehicle was armed while something was left to be set
+        self.interrupted = False  # the vehicle was armed while values were left to be set
 
     @property
     def settled(self) -> bool:
-        """Nothing is left to ask or to set."""
+        """Whether nothing is left to read or to set."""
         return not self._settings and not self._open()
 
     def facts(self) -> dict[str, Parameter]:
-        """All that were asked for; those that never answered without a value."""
+        """Return all requested parameters; those that were never answered have no value."""
         return {name: self.values.get(name, Parameter(name, None)) for name in self._names}
 
     def set_all(self, values: Mapping[str, float | int]) -> None:
-        """Queue values to be set; each is of the kind it was read with."""
+        """Queue values to be set, each in the type it was read with."""
         self._settings |= {name: _Setting(value) for name, value in values.items() if name in self.values}
 
     def step(self, now_us: int, may_change: bool) -> list[Any]:
-        """Messages to send now."""
+        """Return the messages to send now."""
         if self._settings:
             if not may_change:
                 self._settings.clear()
@@ -85,7 +85,7 @@ class ParameterReader:
         return [self._read(name) for name in asked]
 
     def hear(self, message: Any) -> None:
-        """PARAM_VALUE and PARAM_ERROR; everything else is ignored."""
+        """Take a PARAM_VALUE or PARAM_ERROR; ignore everything else."""
         kind = message.get_type()
         if kind == "PARAM_VALUE":
             name = _text(message.param_id)
@@ -93,7 +93,7 @@ class ParameterReader:
                 return
             value = self._dialect.from_wire(message.param_value, message.param_type)
             if not math.isfinite(value):
-                return  # no answer
+                return  # not an answer to a request
             whole = message.param_type < _REAL32
             self.values[name] = Parameter(name, int(value) if whole else value, message.param_type)
             self._confirm(name)

@@ -1,7 +1,7 @@
-"""Parameters that matter for flying by setpoints, with the value wanted and why. One table for each autopilot.
+"""Parameters that matter for flying by setpoints, with the wanted value and the reason: one table per autopilot.
 
-Wanted are, in this order: what `agent.autopilot_params` says, what the dialect's rules ask for, and these tables.
-Only what has a value `to_set` is ever changed by `--apply`.
+Wanted values come from, in this order, `agent.autopilot_params`, the rules of the dialect, and these tables. `--apply`
+changes only those with a value `to_set`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _WEIGHT_WANTED, _WEIGHT_TABLE = 60, 50
 
 @dataclass(frozen=True, slots=True)
 class Opinion:
-    """On one value of one parameter."""
+    """An assessment of one value of one parameter."""
 
     verdict: Verdict
     wanted: str
@@ -41,10 +41,10 @@ _Judge = Callable[[float, VehicleFacts, Config], Opinion]
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """One parameter and how its value is judged."""
+    """One parameter and the rule that assesses its value."""
 
     name: str
-    why: str  # it matters
+    why: str  # why it matters
     judge: _Judge
 
 
@@ -102,7 +102,7 @@ def _radio_source(value: float, facts: VehicleFacts, config: Config) -> Opinion:
 
 
 def _thrust_model(value: float, facts: VehicleFacts, config: Config) -> Opinion:
-    if value == 0 and facts.version is not None and facts.version.has_usb:  # no simulator has
+    if value == 0 and facts.version is not None and facts.version.has_usb:  # simulators have no such circuit
         return Opinion(
             Verdict.NOTE, "0.2 to 0.5", "thrust is taken as linear, real propellers are not: calibrate it to hover well"
         )
@@ -184,7 +184,7 @@ ROWS: dict[str, tuple[Row, ...]] = {
         Row("COM_RC_IN_MODE", "where sticks come from", _radio_source),
         Row("MPC_THR_HOVER", "what hovers", _hover),
         Row("THR_MDL_FAC", "how thrust becomes motor speed", _thrust_model),
-        Row("MAV_SYS_ID", "who it is after the next boot", _own_sysid),
+        Row("MAV_SYS_ID", "its system id after the next boot", _own_sysid),
     ),
     "ArduCopter": (
         Row("GUID_OPTIONS", "what thrust means", _guided_options),
@@ -195,26 +195,26 @@ ROWS: dict[str, tuple[Row, ...]] = {
         Row("ARMING_CHECK", "what is checked before arming", _arming_check),
         Row("ANGLE_MAX", "how far it tilts", _angle_max),
         Row("MOT_THST_HOVER", "what hovers", _hover),
-        Row("SYSID_THISMAV", "who it is after the next boot", _own_sysid),
+        Row("SYSID_THISMAV", "its system id after the next boot", _own_sysid),
     ),
 }
-_ALSO_READ = {"PX4": ("NAV_RCL_ACT",), "ArduCopter": ()}  # what rows refer to
+_ALSO_READ = {"PX4": ("NAV_RCL_ACT",), "ArduCopter": ()}  # parameters that rows refer to
 
 
 def names_to_read(dialect: Dialect, config: Config) -> tuple[str, ...]:
-    """Parameters to ask an autopilot for."""
+    """Return the names of the parameters to read from an autopilot."""
     rows = (row.name for row in ROWS[dialect.name])
     names = (*config.agent.autopilot_params, *dialect.to_read(), *rows, *_ALSO_READ[dialect.name])
     return tuple(dict.fromkeys(names))
 
 
 def parameter_findings(facts: VehicleFacts, config: Config) -> list[Finding]:
-    """One line for each parameter that is wanted, ruled or judged; nothing for an autopilot we don't speak."""
+    """Return one finding per wanted or assessed parameter; none for an unsupported autopilot."""
     return [_finding(facts, name, opinion) for name, opinion in _opinions(facts, config).items()]
 
 
 def unchangeable(facts: VehicleFacts) -> str:
-    """Why no parameter of this vehicle may be changed now, or ""."""
+    """Return why no parameter of this vehicle may be changed now, or ""."""
     if not facts.reached:
         return "it is not reached"
     if facts.sysid != facts.wanted_sysid:
@@ -227,7 +227,7 @@ def unchangeable(facts: VehicleFacts) -> str:
 
 
 def changes(facts: VehicleFacts, config: Config) -> dict[str, Number]:
-    """What `--apply` sets on this vehicle."""
+    """Return the parameters that `--apply` sets on this vehicle."""
     return {
         name: opinion.to_set
         for name, opinion in _opinions(facts, config).items()

@@ -1,4 +1,4 @@
-"""From a probe's messages to `VehicleFacts`: units, bits and frames. No judgement."""
+"""Converts the messages of a scan to `VehicleFacts`: units, bits and frames, without judgement."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from swarmctl.check.link_facts import (
     VehicleFacts,
     Version,
 )
-from swarmctl.check.link_statistics import FrameTally, round_trip, vehicle_time
-from swarmctl.check.scanner import ARMED_FLAG, Probe
+from swarmctl.check.link_statistics import FrameStatistics, round_trip, vehicle_time
+from swarmctl.check.scanner import ARMED_FLAG, VehicleScan
 from swarmctl.core.types import FlightMode, GeoOrigin, Landed
 from swarmctl.mavlink.dialects import DIALECTS
 
@@ -28,73 +28,75 @@ _UNKNOWN_8, _UNKNOWN_16 = 255, 65535
 
 
 def unreached(agent: int, url: str, wanted_sysid: int, why: str) -> VehicleFacts:
-    """A link that could not even be opened."""
+    """Return the facts of a vehicle whose link could not be opened."""
     link = LinkFacts(0.0, {}, 0.0, 0.0, 0.0, 0, 0, (), 0, None, None)
     return VehicleFacts(agent, url, wanted_sysid, why, link)
 
 
-def facts_of(probe: Probe, agent: int, url: str, wanted_sysid: int, shared: GeoOrigin, now_us: int) -> VehicleFacts:
-    """Everything a probe has heard until `now_us`.
+def facts_of(
+    scan: VehicleScan, agent: int, url: str, wanted_sysid: int, shared: GeoOrigin, now_us: int
+) -> VehicleFacts:
+    """Return everything that a scan has received until `now_us`.
 
     Args:
-        probe: of this vehicle.
-        agent, url, wanted_sysid: what the configuration says.
-        shared: origin of the swarm's frame.
-        now_us: monotonic.
+        scan: the scan of this vehicle.
+        agent, url, wanted_sysid: values of the configuration.
+        shared: origin of the shared frame.
+        now_us: monotonic time.
     """
-    link = _link(probe, probe.listened_s(now_us))
-    beat = probe.message("HEARTBEAT")
+    link = _link(scan, scan.listened_s(now_us))
+    beat = scan.message("HEARTBEAT")
     if beat is None:
-        return VehicleFacts(agent, url, wanted_sysid, _silence(probe), link)
+        return VehicleFacts(agent, url, wanted_sysid, _silence(scan), link)
     dialect = DIALECTS.get(beat.autopilot)
-    pos, origin, told = _place(probe, shared)
+    pos, origin, told = _place(scan, shared)
     return VehicleFacts(
         agent=agent,
         url=url,
         wanted_sysid=wanted_sysid,
         unreachable="",
         link=link,
-        sysid=probe.sysid,
+        sysid=scan.sysid,
         autopilot="" if dialect is None else dialect.name,
         autopilot_number=beat.autopilot,
-        version=_version(probe.message("AUTOPILOT_VERSION")),
+        version=_version(scan.message("AUTOPILOT_VERSION")),
         mode=FlightMode.UNKNOWN if dialect is None else dialect.mode(beat.custom_mode),
         custom_mode=beat.custom_mode,
         armed=bool(beat.base_mode & ARMED_FLAG),
-        landed=_landed(probe.message("EXTENDED_SYS_STATE")),
+        landed=_landed(scan.message("EXTENDED_SYS_STATE")),
         system_status=beat.system_status,
-        sensors=_sensors(probe.message("SYS_STATUS")),
-        estimator=_estimator(probe.message("ESTIMATOR_STATUS")),
-        gps=_gps(probe.message("GPS_RAW_INT")),
+        sensors=_sensors(scan.message("SYS_STATUS")),
+        estimator=_estimator(scan.message("ESTIMATOR_STATUS")),
+        gps=_gps(scan.message("GPS_RAW_INT")),
         pos_ned_m=pos,
         origin_ned_m=origin,
         origin_told=told,
-        parameters={} if probe.parameters is None else probe.parameters.facts(),
+        parameters={} if scan.parameters is None else scan.parameters.facts(),
     )
 
 
-def _silence(probe: Probe) -> str:
-    if not probe.senders:
+def _silence(scan: VehicleScan) -> str:
+    if not scan.senders:
         return "nothing is heard"
     return "frames are heard, but no autopilot's heartbeat"
 
 
-def _link(probe: Probe, listened_s: float) -> LinkFacts:
-    tally = probe.tallies.get(probe.sysid, FrameTally())
-    by = "TIMESYNC" if len(probe.answers["TIMESYNC"]) >= _ENOUGH_ANSWERS else "PING"
+def _link(scan: VehicleScan, listened_s: float) -> LinkFacts:
+    statistics = scan.statistics.get(scan.sysid, FrameStatistics())
+    by = "TIMESYNC" if len(scan.answers["TIMESYNC"]) >= _ENOUGH_ANSWERS else "PING"
     span_s = max(listened_s, 1e-6)
     return LinkFacts(
         listened_s=listened_s,
-        rates_hz=tally.rates_hz(listened_s),
-        frames_s=tally.frames / span_s,
-        bytes_s=tally.bytes / span_s,
-        lost_01=tally.lost_01,
-        mavlink1=probe.mavlink1,
-        mavlink2=probe.mavlink2,
-        autopilots=probe.autopilots(),
-        senders=len(probe.senders),
-        round_trip=round_trip(probe.answers[by], by),
-        time=vehicle_time(probe.answers["TIMESYNC"]),
+        rates_hz=statistics.rates_hz(listened_s),
+        frames_s=statistics.frames / span_s,
+        bytes_s=statistics.bytes / span_s,
+        lost_01=statistics.lost_01,
+        mavlink1=scan.mavlink1,
+        mavlink2=scan.mavlink2,
+        autopilots=scan.autopilots(),
+        senders=len(scan.senders),
+        round_trip=round_trip(scan.answers[by], by),
+        time=vehicle_time(scan.answers["TIMESYNC"]),
     )
 
 
@@ -144,7 +146,7 @@ def _estimator(message: Any | None) -> Estimator | None:
 
 
 def _told(value: float) -> float | None:
-    """An accuracy; zero, negative or not finite is none."""
+    """Return an accuracy, or None when it is zero, negative or not finite."""
     return float(value) if math.isfinite(value) and value > 0 else None
 
 
@@ -155,11 +157,11 @@ def _gps(message: Any | None) -> Gps | None:
     return Gps(message.fix_type, satellites, message.h_acc * 1e-3 if message.h_acc else None)
 
 
-def _place(probe: Probe, shared: GeoOrigin) -> tuple[Ned | None, Ned | None, bool]:
-    """Position and local origin in the shared frame, and whether the vehicle told its origin itself."""
-    local = probe.message("LOCAL_POSITION_NED") or probe.message("ODOMETRY")
-    world = probe.message("GLOBAL_POSITION_INT")
-    zero = probe.message("GPS_GLOBAL_ORIGIN")
+def _place(scan: VehicleScan, shared: GeoOrigin) -> tuple[Ned | None, Ned | None, bool]:
+    """Return position and local origin in the shared frame, and whether the vehicle reported its origin itself."""
+    local = scan.message("LOCAL_POSITION_NED") or scan.message("ODOMETRY")
+    world = scan.message("GLOBAL_POSITION_INT")
+    zero = scan.message("GPS_GLOBAL_ORIGIN")
     here = None if local is None else _ned(local.x, local.y, local.z)
     if zero is not None:
         origin = _in_shared(zero.latitude, zero.longitude, zero.altitude, shared)

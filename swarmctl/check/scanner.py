@@ -1,7 +1,7 @@
-"""Questions to one vehicle, and what it says: nothing is armed, no mode, rate or parameter is changed by asking.
+"""Scans one vehicle: sends requests and collects the answers without arming or changing any mode, rate or parameter.
 
-A probe sends its heartbeat, TIMESYNC, PING, requests for single messages and parameter reads. `set_parameters` is the
-one thing that changes a vehicle; it stops by itself when the vehicle is, or becomes, armed.
+A scan sends its heartbeat, TIMESYNC, PING, requests for single messages and parameter reads. Only `set_parameters`
+changes a vehicle; it stops by itself when the vehicle is or becomes armed.
 """
 
 from __future__ import annotations
@@ -14,24 +14,24 @@ from typing import Any, NamedTuple
 
 from pymavlink.dialects.v20 import development as mavlink
 
-from swarmctl.check.link_statistics import Answer, FrameTally
-from swarmctl.check.listener import NOWHERE, Address, Ear, Heard, monotonic_us
+from swarmctl.check.link_statistics import Answer, FrameStatistics
+from swarmctl.check.listener import NOWHERE, Address, Listener, ReceivedDatagram, monotonic_us
 from swarmctl.check.parameter_reader import ParameterReader
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.dialects import DIALECTS, Dialect
 
-PROBE_COMPID = 192  # MAV_COMP_ID_ONBOARD_COMPUTER2: sequence numbers apart from those of an agent that may be flying
+SCANNER_COMPID = 192  # MAV_COMP_ID_ONBOARD_COMPUTER2: keeps sequence numbers apart from those of a flying agent
 AUTOPILOT_COMPID = 1
 ARMED_FLAG = 128
 _NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: a companion, a ground station
 _HEARTBEAT_US, _TIMESYNC_US, _PING_US, _REQUEST_US = 1_000_000, 50_000, 200_000, 500_000
-_REQUESTS = 4  # without an answer
+_REQUESTS = 4  # repetitions without an answer
 _STALE_US = 1_000_000
 _PREARM = 1 << 28  # MAV_SYS_STATUS_PREARM_CHECK
-_FRESH_US = 2_500_000  # a heartbeat older than this says nothing about armed
+_FRESH_US = 2_500_000  # an older heartbeat does not show the armed state
 _POLL_S = 0.005
 _ONCE = (mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
-ASKED = (  # for, one by one, when they do not come by themselves
+ASKED = (  # messages that are requested when they do not arrive by themselves
     *_ONCE,
     mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE,
     mavlink.MAVLINK_MSG_ID_SYS_STATUS,
@@ -43,74 +43,74 @@ ASKED = (  # for, one by one, when they do not come by themselves
 
 
 class Newest(NamedTuple):
-    """A message and when it arrived."""
+    """A message and its arrival time."""
 
     t_us: int
     message: Any
 
 
-class Probe:
-    """One vehicle.
+class VehicleScan:
+    """Scans one vehicle over its link.
 
     Args:
-        ear: its link, owned by the probe.
-        there: where to speak before anybody was heard.
-        wanted_sysid: the vehicle the configuration names; another one is taken when it is not heard.
-        names_of: parameters to read of an autopilot of this dialect.
-        seconds: how long to listen after its first heartbeat.
-        patience_s: how much longer to wait for a vehicle that is not ready to arm yet.
+        listener: link of the vehicle, owned by the scan.
+        there: address to send to before any sender was received.
+        wanted_sysid: system id in the configuration; another vehicle is scanned when this one is not received.
+        names_of: returns the parameters to read, by dialect.
+        seconds: time to listen after the first heartbeat.
+        patience_s: additional time for a vehicle that is not ready to arm yet.
     """
 
     def __init__(
         self,
-        ear: Ear,
+        listener: Listener,
         there: Address,
         wanted_sysid: int,
         names_of: Callable[[Dialect], Sequence[str]],
         seconds: float,
         patience_s: float = 0.0,
     ) -> None:
-        self.ear = ear
-        self.sysid = 0  # of the vehicle that is asked; 0 before its first heartbeat
+        self.listener = listener
+        self.sysid = 0  # system id of the scanned vehicle; 0 before its first heartbeat
         self.began_us: int | None = None
         self.mavlink1 = self.mavlink2 = 0
         self.senders: set[Address] = set()
         self.newest: dict[tuple[int, str], Newest] = {}
-        self.tallies: dict[int, FrameTally] = {}
+        self.statistics: dict[int, FrameStatistics] = {}
         self.answers: dict[str, list[Answer]] = {"TIMESYNC": [], "PING": []}
         self.parameters: ParameterReader | None = None
         self._there, self._wanted, self._names_of, self._seconds = there, wanted_sysid, names_of, seconds
         self._patience_s = patience_s
-        self._codec = Codec(wanted_sysid, PROBE_COMPID)
+        self._codec = Codec(wanted_sysid, SCANNER_COMPID)
         self._due_us: dict[str, int] = {}
         self._asked: dict[int, int] = {}
         self._timesyncs: dict[int, int] = {}  # ts1 [ns] -> sent [us]
         self._pings: dict[int, int] = {}  # seq -> sent [us]
 
-    # --- what is known ---
+    # --- results ---
 
     @property
     def heard(self) -> bool:
-        """Whether an autopilot's heartbeat came."""
+        """Whether an autopilot's heartbeat was received."""
         return self.began_us is not None
 
     def listened_s(self, now_us: int) -> float:
         return 0.0 if self.began_us is None else (now_us - self.began_us) * 1e-6
 
     def finished(self, now_us: int) -> bool:
-        """Listened for long enough, and every parameter is read or given up."""
+        """Whether it has listened for long enough and every parameter is read or given up."""
         least_s = self._seconds if self._ready() else self._seconds + self._patience_s
         if not self.heard or self.listened_s(now_us) < least_s:
             return False
         return self.parameters is None or self.parameters.settled
 
     def message(self, name: str) -> Any | None:
-        """Newest message of a kind from the vehicle."""
+        """Return the newest message of a type from the vehicle, or None."""
         found = self.newest.get((self.sysid, name))
         return None if found is None else found.message
 
     def autopilots(self) -> tuple[int, ...]:
-        """System ids that autopilots on this link have."""
+        """Return the system ids of the autopilots on this link."""
         return tuple(sorted(sysid for sysid, name in self.newest if name == "HEARTBEAT"))
 
     def _ready(self) -> bool:
@@ -120,17 +120,17 @@ class Probe:
         return health is not None and bool(health.onboard_control_sensors_health & _PREARM)
 
     def may_change(self, now_us: int) -> bool:
-        """Whether the vehicle has said just now that it is disarmed."""
+        """Whether a recent heartbeat shows that the vehicle is disarmed."""
         beat = self.newest.get((self.sysid, "HEARTBEAT"))
         if beat is None or now_us - beat.t_us > _FRESH_US or self.sysid != self._wanted:
             return False
         return not beat.message.base_mode & ARMED_FLAG
 
-    # --- asking ---
+    # --- requests ---
 
     def step(self, now_us: int) -> None:
-        """Take in what has arrived, and ask what is due."""
-        for heard in self.ear.receive():
+        """Take in what has arrived, and send the requests that are due."""
+        for heard in self.listener.receive():
             self._take(heard)
         if self._there == NOWHERE:
             return
@@ -152,7 +152,7 @@ class Probe:
                 self._send(message)
 
     def set_parameters(self, values: Mapping[str, float | int]) -> None:
-        """Set these, one after the other, and read each back; only while the vehicle says that it is disarmed."""
+        """Set parameters one after the other and read each back, only while the vehicle reports that it is disarmed."""
         assert self.parameters is not None
         self.parameters.set_all(values)
 
@@ -179,11 +179,11 @@ class Probe:
         return True
 
     def _send(self, message: Any) -> None:
-        self.ear.send(self._codec.encode(message), self._there)
+        self.listener.send(self._codec.encode(message), self._there)
 
-    # --- listening ---
+    # --- reception ---
 
-    def _take(self, heard: Heard) -> None:
+    def _take(self, heard: ReceivedDatagram) -> None:
         for frame in frames_of_any_version(heard.data):
             if frame[0] == mavlink.PROTOCOL_MARKER_V1:
                 sysid, compid, seq = frame[3], frame[4], frame[2]
@@ -195,10 +195,10 @@ class Probe:
             if message is None and frame[0] == mavlink.PROTOCOL_MARKER_V1:
                 continue
             self._count(frame, heard.sender)
-            tally = self.tallies.setdefault(sysid, FrameTally())
-            tally.frame(seq, len(frame))
+            statistics = self.statistics.setdefault(sysid, FrameStatistics())
+            statistics.frame(seq, len(frame))
             if message is not None:
-                tally.message(message.get_type(), heard.t_us)
+                statistics.message(message.get_type(), heard.t_us)
                 self._message(sysid, message, heard)
 
     def _count(self, frame: bytes, sender: Address) -> None:
@@ -208,7 +208,7 @@ class Probe:
         else:
             self.mavlink2 += 1
 
-    def _message(self, sysid: int, message: Any, heard: Heard) -> None:
+    def _message(self, sysid: int, message: Any, heard: ReceivedDatagram) -> None:
         name = message.get_type()
         if name == "HEARTBEAT":
             if message.autopilot == _NO_AUTOPILOT:
@@ -220,14 +220,14 @@ class Probe:
         if name == "TIMESYNC":
             self._timesync(message, heard.t_us)
         elif name == "PING":
-            sent_us = self._pings.get(message.seq) if message.target_component == PROBE_COMPID else None
+            sent_us = self._pings.get(message.seq) if message.target_component == SCANNER_COMPID else None
             if sent_us is not None:
                 self.answers["PING"].append(Answer(sent_us, heard.t_us, math.nan))
         elif self.parameters is not None:
             self.parameters.hear(message)
 
-    def _choose(self, sysid: int, autopilot: int, heard: Heard) -> None:
-        """The first autopilot, until the one the configuration names is heard."""
+    def _choose(self, sysid: int, autopilot: int, heard: ReceivedDatagram) -> None:
+        """Select the first autopilot, until the configured one is received."""
         if self.sysid in (sysid, self._wanted):
             return
         if self.sysid and sysid != self._wanted:
@@ -249,7 +249,7 @@ class Probe:
 
 
 def frames_of_any_version(datagram: bytes) -> Iterator[bytes]:
-    """Split a datagram into MAVLink 1 and 2 frames; the rest is dropped at the first surprise."""
+    """Yield the MAVLink 1 and 2 frames of a datagram; the rest is dropped at the first byte that fits no frame."""
     start = 0
     while start + 8 <= len(datagram):
         if datagram[start] == mavlink.PROTOCOL_MARKER_V1:
@@ -264,24 +264,24 @@ def frames_of_any_version(datagram: bytes) -> Iterator[bytes]:
         start = end
 
 
-def survey(probes: Sequence[Probe], connect_s: float, longest_s: float, ended: Callable[[], bool]) -> None:
-    """Ask all vehicles at once until each has finished, was not heard for `connect_s`, or `ended`."""
+def run_scans(scans: Sequence[VehicleScan], connect_s: float, longest_s: float, ended: Callable[[], bool]) -> None:
+    """Run all scans at once until each has finished or has heard nothing for `connect_s`, or until `ended`."""
     began_us = monotonic_us()
     with selectors.DefaultSelector() as selector:
         blind = False
-        for probe in probes:
-            fd = probe.ear.fd()
+        for scan in scans:
+            fd = scan.listener.fd()
             blind = blind or fd is None
             if fd is not None:
                 selector.register(fd, selectors.EVENT_READ)
         while not ended():
             now_us = monotonic_us()
             waited_s = (now_us - began_us) * 1e-6
-            open_probes = [p for p in probes if not (p.finished(now_us) or (not p.heard and waited_s > connect_s))]
-            if not open_probes or waited_s > longest_s:
+            open_scans = [p for p in scans if not (p.finished(now_us) or (not p.heard and waited_s > connect_s))]
+            if not open_scans or waited_s > longest_s:
                 return
-            for probe in probes:
-                probe.step(now_us)
+            for scan in scans:
+                scan.step(now_us)
             if blind or not selector.get_map():
                 time.sleep(_POLL_S)
             else:

@@ -1,4 +1,4 @@
-"""All vehicles together: ids, places against the start, and the whole judgement in one call. Pure."""
+"""Checks of all vehicles together: ids, positions against the start, and the complete list of findings. Pure."""
 
 from __future__ import annotations
 
@@ -16,27 +16,27 @@ from swarmctl.core.types import Landed
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, EXIT_START
 
 OK, NOTE, FIX = Verdict.OK, Verdict.NOTE, Verdict.FIX
-_FAR_M = 30.0  # from the start, horizontally: worth a look
+_FAR_M = 30.0  # horizontal distance from the start that is worth a note
 _CLIMB_LEAST_M = 0.5
-_SWAPPED_BY_M = 0.5  # what changing places would save, at least
+_SWAPPED_BY_M = 0.5  # least saving that reports two vehicles as swapped
 
 
 def findings(vehicles: Sequence[VehicleFacts], config: Config) -> list[Finding]:
-    """Every line of the check: each vehicle's, in order, then those about all of them."""
+    """Return all findings: those of each vehicle in order, then those about all vehicles."""
     lines = [line for facts in vehicles for line in (*vehicle_findings(facts, config), *_own(facts, config))]
     return lines + [line for judge in _SWARM_ROWS for line in judge(vehicles, config)]
 
 
 def exit_code(vehicles: Sequence[VehicleFacts], lines: Sequence[Finding]) -> int:
-    """0 nothing to fix; 3 a vehicle was not reached; 4 something to fix."""
+    """Return 0 when nothing is to fix, 3 when a vehicle was not reached, 4 when something is to fix."""
     if any(not facts.reached for facts in vehicles):
         return EXIT_START
     return EXIT_MISSION if any(line.verdict is FIX for line in lines) else EXIT_OK
 
 
 def standing(vehicles: Sequence[VehicleFacts]) -> list[Finding]:
-    """Who may not be flown from here on: armed, in the air, or never told where."""
-    advice = "somebody else flies it, or has left it armed: land and disarm it first"
+    """Return a finding for each vehicle that may not be flown now: armed, in the air, or of unknown state."""
+    advice = "another program flies it, or has left it armed: land and disarm it first"
     return [
         Finding(facts.agent, "to fly", FIX, "armed" if facts.armed else facts.landed.name.lower(), "on ground", advice)
         for facts in vehicles
@@ -49,7 +49,7 @@ def _own(facts: VehicleFacts, config: Config) -> list[Finding]:
 
 
 def _start(facts: VehicleFacts, config: Config) -> list[Finding]:
-    """Where it stands against where it will wait."""
+    """Compare the position of a vehicle with its start."""
     pos = facts.pos_ned_m
     if pos is None:
         return []
@@ -89,7 +89,7 @@ def _duplicates(vehicles: Sequence[VehicleFacts], config: Config) -> list[Findin
 
 
 def _origins(vehicles: Sequence[VehicleFacts], config: Config) -> list[Finding]:
-    """Each vehicle has its own local frame; agents convert, so the spread itself is harmless."""
+    """Compare the local origins; agents convert between frames, so a spread of origins itself is harmless."""
     known = [v.origin_ned_m for v in vehicles if v.origin_ned_m is not None]
     if len(known) < 2:
         return []
@@ -98,7 +98,7 @@ def _origins(vehicles: Sequence[VehicleFacts], config: Config) -> list[Finding]:
 
 
 def _apart(vehicles: Sequence[VehicleFacts], config: Config) -> list[Finding]:
-    """Horizontally: the autopilots climb on the spot, before the agents keep them apart."""
+    """Check horizontal distances: autopilots climb vertically before the agents keep vehicles apart."""
     placed = [(v.agent, v.pos_ned_m) for v in vehicles if v.pos_ned_m is not None]
     if len(placed) < 2:
         return []
@@ -123,7 +123,7 @@ def _apart(vehicles: Sequence[VehicleFacts], config: Config) -> list[Finding]:
 
 
 def _radius(vehicles: Sequence[VehicleFacts], config: Config) -> list[Finding]:
-    """The distance kept, against what bodies, tracking and the least accurate estimator need."""
+    """Compare the separation distance with what bodies, tracking and the least accurate estimator need."""
     told = [v.pos_accuracy_m for v in vehicles if v.pos_accuracy_m is not None]
     if len(vehicles) < 2 or not told:
         return []
@@ -142,7 +142,7 @@ def _radius(vehicles: Sequence[VehicleFacts], config: Config) -> list[Finding]:
 
 
 def _swapped(vehicles: Sequence[VehicleFacts], config: Config) -> list[Finding]:
-    """Pairs whose ways to the start would be shorter if they changed places."""
+    """Return the pairs whose paths to the start would be shorter if they changed places."""
     starts = config.starts_ned_m()
     placed = [(v.agent, v.pos_ned_m) for v in vehicles if v.pos_ned_m is not None]
     lines = []

@@ -1,4 +1,4 @@
-"""What a check shows: one table, a block for each vehicle; what to fix, the worst first; and the same as JSON."""
+"""Output of a check: a table with a block per vehicle, a list of what to fix with the worst first, and JSON."""
 
 from __future__ import annotations
 
@@ -19,17 +19,13 @@ from swarmctl.check.finding import SWARM, Finding, Verdict, worst_first
 from swarmctl.check.link_facts import VehicleFacts
 from swarmctl.core.text import printable
 
-_LINE = 2000  # characters of one thing to fix
+_LINE = 2000  # characters of one line of the list
 _COLUMNS = ("vehicle", "what", "found", "wanted", "verdict")
 _STYLES = {Verdict.OK: "green", Verdict.NOTE: "yellow", Verdict.FIX: "bold red"}
 
 
-def print_check(
-    vehicles: Sequence[VehicleFacts],
-    lines: Sequence[Finding],
-    changes: Sequence[Change],
-) -> None:
-    """On standard output: a drawn table on a terminal, tab-separated lines anywhere else."""
+def print_check(vehicles: Sequence[VehicleFacts], lines: Sequence[Finding], changes: Sequence[Change]) -> None:
+    """Print to standard output: a drawn table on a terminal, tab-separated lines elsewhere."""
     console = Console(highlight=False)
     if console.is_terminal:
         console.print(_drawn(lines))
@@ -41,18 +37,13 @@ def print_check(
         console.print(printable(text, _LINE), markup=False, soft_wrap=True)
 
 
-def as_json(
-    vehicles: Sequence[VehicleFacts],
-    lines: Sequence[Finding],
-    changes: Sequence[Change],
-    code: int,
-) -> str:
-    """Everything a program may want, findings in the order of the table."""
+def as_json(vehicles: Sequence[VehicleFacts], lines: Sequence[Finding], changes: Sequence[Change], code: int) -> str:
+    """Return everything as JSON, findings in the order of the table."""
     tree = {
         "exit_code": code,
-        "vehicles": [_plain(dataclasses.asdict(v)) for v in vehicles],
-        "findings": [_plain(dataclasses.asdict(line)) for line in lines],
-        "changes": [_plain({**dataclasses.asdict(c), "done": c.done}) for c in changes],
+        "vehicles": [_json_safe(dataclasses.asdict(v)) for v in vehicles],
+        "findings": [_json_safe(dataclasses.asdict(line)) for line in lines],
+        "changes": [_json_safe({**dataclasses.asdict(c), "done": c.done}) for c in changes],
     }
     return json.dumps(tree, indent=1, allow_nan=False) + "\n"
 
@@ -64,7 +55,7 @@ def _drawn(lines: Sequence[Finding]) -> Table:
         if before is not None and line.agent != before:
             table.add_section()
         first, *middle, verdict = _cells(line)
-        name = Text(first if line.agent != before else "")  # not markup: vehicles may say "[...]"
+        name = Text(first if line.agent != before else "")  # not markup: a vehicle's text may contain "[...]"
         table.add_row(name, *map(Text, middle), Text(verdict, style=_STYLES[line.verdict]))
         before = line.agent
     return table
@@ -86,7 +77,7 @@ def _after_table(
 ) -> list[str]:
     texts = [f"{agent_name(change.agent)} {change.in_words()}" for change in changes]
     found = worst_first(lines)
-    alike: dict[tuple[Verdict, str], list[str]] = {}  # one text for all it is true of
+    alike: dict[tuple[Verdict, str], list[str]] = {}  # one text with the names of all vehicles it applies to
     for line in found:
         said = f"{line.topic}: {line.found}. {line.advice}"
         alike.setdefault((line.verdict, said), []).append(_who(line.agent))
@@ -98,14 +89,14 @@ def _after_table(
     return texts
 
 
-def _plain(value: Any) -> Any:
-    """For JSON: enums by name, no infinities."""
+def _json_safe(value: Any) -> Any:
+    """Return the value for JSON: enums by name, infinities as null."""
     if isinstance(value, enum.Enum):
         return value.name
     if isinstance(value, float) and not math.isfinite(value):
         return None
     if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
+        return {str(key): _json_safe(item) for key, item in value.items()}
     if isinstance(value, (list, tuple)):
-        return [_plain(item) for item in value]
+        return [_json_safe(item) for item in value]
     return value

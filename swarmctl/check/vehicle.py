@@ -1,4 +1,4 @@
-"""One vehicle and its link, judged row by row. Pure: facts and configuration in, one line a row out."""
+"""Checks of one vehicle and its link, one function per row: facts and configuration in, one finding out. Pure."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from swarmctl.mavlink.dialects import DIALECTS
 from swarmctl.mavlink.transport import parse_url
 
 OK, NOTE, FIX = Verdict.OK, Verdict.NOTE, Verdict.FIX
-_KNOWN_VERSIONS = {"PX4": (1, 18), "ArduCopter": (4, 6)}  # whose behaviour was measured
+_KNOWN_VERSIONS = {"PX4": (1, 18), "ArduCopter": (4, 6)}  # versions whose behaviour was measured
 _CRITICAL = 5  # MAV_STATE
 _SENSOR_BITS = {
     0: "gyro",
@@ -39,23 +39,23 @@ _ESTIMATOR_FAULTS = {10: "GPS glitch", 11: "bad accelerometer"}  # bits of ESTIM
 _FIX_3D = 3
 _BATTERY_LOW_01, _BATTERY_EMPTY_01 = 0.5, 0.25
 _LOSS_NOTE_01, _LOSS_FIX_01 = 0.01, 0.05
-# PX4's SIH runs 1 % slow on a busy machine, and agents follow far more; at 5 % the vehicle is a tenth of a second
-# behind at the end of a plan, which is what tracking may be off by.
+# PX4's SIH runs 1 % slow on a busy machine, and agents follow far larger drifts. At 5 % the vehicle is a tenth of a
+# second behind at the end of a plan, the tolerance of tracking.
 _DRIFT_NOTE_PPM, _DRIFT_FIX_PPM = 20_000.0, 50_000.0
-_ORIGIN_FAR_M = 1000.0  # local frames turn against each other, and the earth is not flat
-_LINK_SHARE_01 = 0.7  # of a serial link's capacity that may be planned for
+_ORIGIN_FAR_M = 1000.0  # local frames are rotated against each other, and the earth is curved
+_LINK_SHARE_01 = 0.7  # usable share of a serial link's capacity
 _LATCH = (
-    "PX4 sends only to whoever spoke to it first, for good: if another program did, restart PX4, "
+    "PX4 sends only to its first sender, for good: if that was another program, restart PX4, "
     "or use the port of that program"
 )
-_BITS_A_BYTE = 10  # start and stop bit
+_BITS_A_BYTE = 10  # with start and stop bit
 _MESSAGE_BYTES = {"ODOMETRY": 244, "LOCAL_POSITION_NED": 40, "ATTITUDE_QUATERNION": 44}
 _SMALL_MESSAGE_BYTES = 40
 _NAMES = {331: "ODOMETRY", 32: "LOCAL_POSITION_NED", 31: "ATTITUDE_QUATERNION"}
 
 
 def vehicle_findings(facts: VehicleFacts, config: Config) -> list[Finding]:
-    """Every row that applies; of a vehicle that is not reached only that."""
+    """Return the finding of every row that applies; for an unreached vehicle only that."""
     if not facts.reached:
         return [_unreached(facts)]
     return [line for judge in _ROWS if (line := judge(facts, config)) is not None]
@@ -135,9 +135,9 @@ def _state(facts: VehicleFacts, config: Config) -> Finding:
     if facts.system_status >= _CRITICAL:
         return line(FIX, f"the autopilot reports a failsafe or emergency (MAV_STATE {facts.system_status})", 99)
     if facts.armed and facts.mode is FlightMode.EXTERNAL:
-        return line(NOTE, "somebody is flying it by setpoints now; it is left alone", 9)
+        return line(NOTE, "another program flies it by setpoints now; it is not changed", 9)
     if facts.armed:
-        return line(NOTE, "it is armed; it is left alone", 8)
+        return line(NOTE, "it is armed; it is not changed", 8)
     return line(OK)
 
 

@@ -1,7 +1,8 @@
-"""One vehicle as the tick sees it: MAVLink in, `VehicleState` in the shared frame out; setpoints in, bytes out.
+"""Interface to one vehicle for the tick: decodes MAVLink into a `VehicleState`, encodes setpoints into frames.
 
-Newest sample wins. `VehicleClock` says when it was true, `LocalFrame` where; which messages mean what, the dialect that
-the HEARTBEAT names. There is no state, and so nothing is sent, while any of it is in doubt, the mode included.
+The newest sample wins. `VehicleClock` gives its time, `LocalFrame` its position in the shared frame, and the dialect
+that the HEARTBEAT names the meaning of messages. While any of these is in doubt, the flight mode included, there is no
+state, and therefore no setpoint is sent.
 """
 
 from __future__ import annotations
@@ -23,24 +24,24 @@ from swarmctl.mavlink.mode_watch import ModeWatch
 from swarmctl.mavlink.transport import Transport
 from swarmctl.mavlink.vehicle_clock import VehicleClock
 
-_ATTITUDE_ONLY = 7  # type_mask: body rates ignored; mask 0 would fly rates and attitude against each other
+_ATTITUDE_ONLY = 7  # type_mask that ignores body rates; with mask 0 rate and attitude setpoints would compete
 _ARMED_FLAG = 128
 _CRITICAL = 5
 _PREARM = 1 << 28
 _LOCAL_NED = mavlink.MAV_FRAME_LOCAL_NED
-_BODY_FRD = (mavlink.MAV_FRAME_BODY_NED, mavlink.MAV_FRAME_BODY_FRD)  # of ODOMETRY's velocity
-_STATE = frozenset({"ODOMETRY", "LOCAL_POSITION_NED"})  # whose stamps are the state's
-_FAST = frozenset({mavlink.MAVLINK_MSG_ID_ODOMETRY})  # not worth passing to the slow path
+_BODY_FRD = (mavlink.MAV_FRAME_BODY_NED, mavlink.MAV_FRAME_BODY_FRD)  # frames of the velocity in ODOMETRY
+_STATE = frozenset({"ODOMETRY", "LOCAL_POSITION_NED"})  # messages whose time stamps are those of the state
+_FAST = frozenset({mavlink.MAVLINK_MSG_ID_ODOMETRY})  # messages that the command port does not need
 _SYNC_EVERY_US = 200_000
-_OWN_FLIGHT_US = 1_000_000  # without setpoints for so long the autopilot flies by itself, whatever its mode
+_OWN_FLIGHT_US = 1_000_000  # after this long without setpoints the autopilot flies by itself, whatever its mode
 _HOVER_M_S = 0.2
 
 
 class _Sample(NamedTuple):
-    """Newest state in the vehicle's own clock and frame."""
+    """The newest state, in the clock and the local frame of the vehicle."""
 
     vehicle_us: int
-    t_us: int  # our monotonic time
+    t_us: int  # monotonic time of this host
     pos_ned_m: Array  # (3,)
     vel_ned_m_s: Array  # (3,)
     q_nb: Array  # (4,)
@@ -48,29 +49,29 @@ class _Sample(NamedTuple):
 
 
 class Autopilot:
-    """The link to one vehicle.
+    """Connects the agent to one vehicle.
 
     Args:
-        transport: bytes.
-        codec: own identity.
+        transport: byte link to the vehicle.
+        codec: packs frames under the agent's identity.
         sysid: the vehicle's system id; everything else is ignored.
-        shared: origin of the swarm's frame.
-        on_frame: told of every frame in and out (recording).
+        shared: origin of the shared frame.
+        on_frame: called with every frame received or sent, for recording.
 
     Attributes:
         clock: the vehicle's clock; `clock.boots` counts its reboots.
         frame: the vehicle's local frame.
-        params: parameters the vehicle has told of.
-        whole_params: names of those that it keeps as integers.
-        armed_told_us: arrival of the HEARTBEAT that told `armed`, our time; -1 before the first.
-        hover_thrust_01: what the autopilot flies with while it hovers by itself; before that, what its parameter says.
-        pos_accuracy_m: horizontal 1-sigma accuracy it claims; None while untold.
-        samples: states received; the difference of two readings is the rate.
-        heard_us: arrival of the last frame, our time.
-        invalid: polls without a state although there was a sample, by reason.
+        params: parameters that the vehicle has reported.
+        whole_params: names of the parameters that it stores as integers.
+        armed_told_us: arrival time of the HEARTBEAT that reported `armed`, host clock; -1 before the first.
+        hover_thrust_01: thrust with which the autopilot hovers by itself; until observed, the value of its parameter.
+        pos_accuracy_m: reported horizontal accuracy, 1 sigma; None while unreported.
+        samples: number of states received; two readings give the rate.
+        heard_us: arrival time of the last frame, host clock.
+        invalid: number of polls without a state although a sample existed, by reason.
         watch: the vehicle's flight mode and failsafe, and whether they are in doubt.
-        gaps: how often setpoints were resumed, in that mode, after so long that its failsafe may have acted unseen.
-        gap_s: the last of them.
+        gaps: number of setpoint gaps so long that the autopilot's failsafe may have acted unseen.
+        gap_s: length of the newest such gap.
     """
 
     params: dict[str, float]
@@ -78,10 +79,10 @@ class Autopilot:
     hover_thrust_01: float | None
     pos_accuracy_m: float | None
     _sample: _Sample | None
-    _placed: tuple[_Sample, Array] | None  # the sample, and its position in the shared frame
-    _attitude: tuple[int, Array, Array] | None  # arrival, attitude, rates
+    _placed: tuple[_Sample, Array] | None  # the sample and its position (3,) in the shared frame
+    _attitude: tuple[int, Array, Array] | None  # arrival time, attitude (4,), rates (3,)
     _reset_counter: int | None
-    _was_reset: bool  # the estimator has said so, since the newest placed sample
+    _was_reset: bool  # the estimator has reported a reset since the newest placed sample
 
     def __init__(
         self,
@@ -106,11 +107,11 @@ class Autopilot:
         self.heard_us: int | None = None
         self.invalid: Counter[str] = Counter()
         self.gaps, self.gap_s = 0, 0.0
-        self._departures = 0  # up to the newest setpoint
+        self._departures = 0  # count of departures from the external mode at the newest setpoint
         self._setpoint_us: int | None = None
         self._sync_us = 0
-        self._syncs: deque[int] = deque(maxlen=16)  # our times in open TIMESYNC questions [ns]
-        self._boots = self._restarts = 0  # of the clock, as far as they have been heeded
+        self._syncs: deque[int] = deque(maxlen=16)  # host times of unanswered TIMESYNC requests [ns]
+        self._boots = self._restarts = 0  # counters of the clock that have been handled
         self._forget()
         self._handlers: dict[str, Callable[[Any, int], None]] = {
             "HEARTBEAT": self._heartbeat,
@@ -132,30 +133,30 @@ class Autopilot:
 
     @property
     def mode(self) -> FlightMode:
-        """As told last."""
+        """The newest reported flight mode."""
         return self.watch.mode
 
     @property
     def failsafe(self) -> bool:
-        """Whether the autopilot's failsafe acts, as told last."""
+        """Whether the vehicle has reported that its failsafe acts."""
         return self.watch.failsafe
 
     @property
     def offset_ned_m(self) -> Array | None:
-        """Local origin (3,) in the shared frame."""
+        """Origin (3,) of the local frame in the shared frame."""
         return self.frame.offset_ned_m
 
     def attach(self, slow: CommandPort) -> None:
-        """Pass everything but the fast state messages on to the slow path."""
+        """Pass every frame except the fast state messages to the command port `slow`."""
         self._slow = slow
 
     def send_frame(self, frame: bytes) -> None:
-        """For the slow path: its bytes leave by the same link."""
+        """Send a frame of the command port over the same link."""
         self._on_frame(frame)
         self._transport.send(frame)
 
     def poll(self, now_us: int) -> VehicleState | None:
-        """Drain the link; the newest state, or None before the first complete one and while it is in doubt."""
+        """Drain the link and return the newest state; None before the first complete one and while it is in doubt."""
         self.watch.poll(now_us)
         for datagram in self._transport.receive(now_us):
             for frame in frames(datagram.data):
@@ -171,9 +172,9 @@ class Autopilot:
         return self._state(self._sample, now_us)
 
     def send(self, setpoint: AttitudeSetpoint, now_us: int) -> str:
-        """Send one setpoint; returns why it was refused, or "".
+        """Send one setpoint and return the reason of a refusal, or "".
 
-        Nothing else in the project sends setpoints.
+        No other code in the project sends setpoints.
         """
         refused = setpoint.problem(now_us)
         if refused:
@@ -191,9 +192,9 @@ class Autopilot:
         self._transport.close()
 
     def _measure_gap(self, now_us: int) -> None:
-        """How long setpoints had stopped, if that was longer than the autopilot waits for them.
+        """Count a pause of the setpoints that was longer than the autopilot waits for them.
 
-        PX4 returns to OFFBOARD by itself when they resume, sooner than CURRENT_MODE may tell that it was away.
+        PX4 returns to OFFBOARD by itself when setpoints resume, perhaps before CURRENT_MODE reports the departure.
         """
         last_us, stayed = self._setpoint_us, self._departures == self.watch.departures
         self._setpoint_us, self._departures = now_us, self.watch.departures
@@ -231,7 +232,7 @@ class Autopilot:
         self.watch.told(dialect.mode(message.custom_mode), arrived_us)
 
     def _current_mode(self, message: Any, arrived_us: int) -> None:
-        """The same as in HEARTBEAT, but on change: a pilot's switch must not stay unseen for a second."""
+        """Take the mode as from a HEARTBEAT; sent on change, so that a pilot's switch is seen within a tick."""
         if self.dialect is not None:
             self.watch.told(self.dialect.mode(message.custom_mode), arrived_us)
 
@@ -273,14 +274,14 @@ class Autopilot:
         self._attitude = (arrived_us, q_nb, rate)
 
     def _local_position(self, message: Any, arrived_us: int) -> None:
-        """Fallback for autopilots without ODOMETRY: position with the newest attitude."""
+        """Combine a local position with the newest attitude, for autopilots without ODOMETRY."""
         if self._attitude is None or (arrived_us - self._odometry_us < 500_000 and self._odometry_us):
             return
         pos, vel = np.array([message.x, message.y, message.z]), np.array([message.vx, message.vy, message.vz])
         self._take(message.time_boot_ms * 1000, arrived_us, pos, vel, self._attitude[1], self._attitude[2])
 
     def _take(self, vehicle_us: int, arrived_us: int, pos: Array, vel: Array, q_nb: Array, rate: Array) -> bool:
-        """Keep a sample if it is good and the newest."""
+        """Keep a sample if it is valid and the newest; return whether it was kept."""
         norm = float(np.sqrt(q_nb @ q_nb))
         if not (np.isfinite(pos).all() and np.isfinite(vel).all() and np.isfinite(rate).all() and 0.9 < norm < 1.1):
             self._codec.refused["state not finite"] += 1
@@ -313,7 +314,7 @@ class Autopilot:
         return VehicleState(sample.t_us, pos, vel, q_nb, rate, self.armed, mode, self.landed, failsafe)
 
     def _forget(self) -> None:
-        """The vehicle has rebooted, or was never heard: nothing it said holds."""
+        """Discard everything the vehicle has reported: it has rebooted, or was never received."""
         self._sample = self._placed = self._attitude = self._reset_counter = None
         self._was_reset = False
         self._odometry_us = 0
@@ -351,7 +352,7 @@ class Autopilot:
         self._accuracy("GPS_RAW_INT", message.h_acc * 1e-3)
 
     def _accuracy(self, source: str, sigma_m: float) -> None:
-        """0 means untold in both messages."""
+        """Return an accuracy [m], or None for 0, which both messages use for unknown."""
         if self.dialect is not None and self.dialect.horizontal_accuracy == source and 0.0 < sigma_m < np.inf:
             self.pos_accuracy_m = float(sigma_m)
 
@@ -368,7 +369,7 @@ class Autopilot:
             self.hover_thrust_01 = value
 
     def _attitude_target(self, message: Any, arrived_us: int) -> None:
-        """Thrust of a hover that is the autopilot's own: in HOLD, or where take-off and our control share one mode."""
+        """Learn the hover thrust while the autopilot hovers by itself: in HOLD, or where take-off shares our mode."""
         if self.landed is Landed.IN_AIR and 0.05 < message.thrust < 1.0 and self._hovers_by_itself(arrived_us):
             self.hover_thrust_01 = float(message.thrust)
 

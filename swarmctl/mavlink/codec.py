@@ -1,4 +1,4 @@
-"""MAVLink 2 codec: bytes <-> dialect messages, one datagram at a time. No socket, no vehicle logic.
+"""MAVLink 2 codec that converts bytes and dialect messages, one datagram at a time. It knows no socket and no vehicle.
 
 `parse_buffer` is never used: as a stream parser it loses most good frames after two bytes of junk.
 """
@@ -19,7 +19,7 @@ _AUTOPILOT_COMPID = 1
 
 
 def frames(datagram: bytes) -> Iterator[bytes]:
-    """Split a datagram into frames; the rest is dropped at the first surprise."""
+    """Yield the frames of a datagram; the rest is dropped at the first byte that fits no frame."""
     start = 0
     while start + _HEADER + _CHECKSUM <= len(datagram) and datagram[start] == MAVLINK2_MAGIC:
         signed = _SIGNATURE if datagram[start + 2] & 1 else 0
@@ -31,14 +31,14 @@ def frames(datagram: bytes) -> Iterator[bytes]:
 
 
 def message_id(frame: bytes) -> int:
-    """Message id of a frame that `frames` produced."""
+    """Return the message id of a frame that `frames` yielded."""
     return int.from_bytes(frame[7:10], "little")
 
 
 def heartbeat_of(sysid: int) -> Callable[[bytes], bool]:
-    """A test of datagrams: whether one holds a good HEARTBEAT of the autopilot with this system id.
+    """Return a predicate: does a datagram hold a valid HEARTBEAT of the autopilot with this system id?
 
-    Ground stations and companions beat too, some with a vehicle's system id; what they name is no autopilot.
+    Ground stations and companions send HEARTBEAT too, some with a vehicle's system id; they name no autopilot type.
     """
     codec = Codec(sysid, _AUTOPILOT_COMPID)
 
@@ -55,7 +55,7 @@ def heartbeat_of(sysid: int) -> Callable[[bytes], bool]:
 
 
 class Codec:
-    """Packs messages as one component and unpacks what it is given, counting what it refuses."""
+    """Packs messages as one component, and decodes frames; counts what it refuses."""
 
     def __init__(self, sysid: int, compid: int) -> None:
         self._mav = dialect.MAVLink(None, srcSystem=sysid, srcComponent=compid)
@@ -65,13 +65,13 @@ class Codec:
         self.refused: Counter[str] = Counter()
 
     def encode(self, message: Any) -> bytes:
-        """Frame of a dialect message, with this component's ids and the next sequence number."""
+        """Return the frame of a dialect message, with this component's ids and the next sequence number."""
         frame: bytes = message.pack(self._mav)
         self._mav.seq = (self._mav.seq + 1) % 256
         return frame
 
     def decode(self, frame: bytes) -> Any | None:
-        """Message of one frame, or None (counted) when it is not one of ours."""
+        """Return the message of one frame, or None for a refused one, which is counted."""
         try:
             message = self._mav.decode(bytearray(frame))
         except (dialect.MAVError, IndexError, ValueError, KeyError) as error:

@@ -1,7 +1,7 @@
-"""The slow path: arming, modes, parameters and rates, as commands that are requested and answered later.
+"""Command port: arming, modes, parameters and message rates, requested now and answered later.
 
-One table of MAVLink commands serves both executors: `CodecCommands` here (lockstep; also plain links without MAVSDK)
-and `MavsdkCommands`, which runs MAVSDK over the same socket. The tick never waits for either.
+One table of MAVLink commands serves both executors: `CodecCommands` here (lockstep, and links without MAVSDK) and
+`MavsdkCommands`, which runs MAVSDK over the same socket. The tick never waits for either.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _GROUND_STATION, _NO_AUTOPILOT, _ACTIVE = 6, 8, 4  # MAV_TYPE_GCS: what PX4 coun
 
 @dataclass(frozen=True, slots=True)
 class CommandResult:
-    """One answer; `text` says what the autopilot said."""
+    """The outcome of one command; `text` is the autopilot's answer in words."""
 
     command: Command
     ok: bool
@@ -40,35 +40,35 @@ class CommandPort(Protocol):
 
     @property
     def busy(self) -> bool:
-        """Whether something is asked and not answered yet."""
+        """Whether a command is still unanswered."""
 
     def request(self, command: Command) -> None:
         """Queue a command."""
 
     def results(self) -> list[CommandResult]:
-        """Answers since the last call."""
+        """Return the results since the last call."""
 
     def frame(self, frame: bytes, message: Any) -> None:
-        """Everything the vehicle says, except the fast state messages."""
+        """Take a frame of the vehicle; every message except the fast state messages is passed here."""
 
     def step(self, now_us: int) -> None:
-        """Called once a tick."""
+        """Advance the queue; called once per tick."""
 
     def close(self) -> None:
-        """Release everything."""
+        """Release all resources."""
 
 
 class CodecCommands:
-    """Commands through the codec, re-sent until acknowledged; also sends the agent's heartbeat.
+    """Executes commands with the codec, repeats them until acknowledged, and sends the agent's heartbeat.
 
-    It is a ground station's: only those count for PX4's data-link failsafe, which lands a vehicle whose agent dies
-    before OFFBOARD, and only to them PX4 sends its texts.
+    The heartbeat is that of a ground station. PX4 counts only those for its data-link failsafe, which lands a vehicle
+    whose agent dies before OFFBOARD, and sends its texts only to them.
 
     Args:
-        send: hands a frame to the vehicle.
-        codec: own identity.
-        target: the vehicle's system id.
-        dialect: the autopilot's, or None while nobody knows; commands wait for it.
+        send: sends a frame to the vehicle.
+        codec: packs frames under the agent's identity.
+        target: system id of the vehicle.
+        dialect: returns the autopilot's dialect, or None while unknown; commands wait for it.
     """
 
     def __init__(
@@ -81,8 +81,8 @@ class CodecCommands:
         self._send, self._codec, self._target = send, codec, target
         self._dialect = dialect
         self._asked: deque[Command] = deque()
-        self._steps: deque[Command] = deque()  # of the one being executed
-        self._spoken: Dialect | None = None  # in which it is being asked
+        self._steps: deque[Command] = deque()  # steps of the command that is being executed
+        self._spoken: Dialect | None = None  # dialect of the command that is being executed
         self._tries = 0
         self._next_us = 0
         self._heartbeat_us = 0
@@ -150,7 +150,7 @@ class CodecCommands:
         self._finish(bits == wanted, "set" if bits == wanted else f"stays at {told:g}")
 
     def _finish(self, ok: bool, text: str) -> None:
-        """Of the current step: the next one follows at once, but not after a failure."""
+        """Finish the current step; the next one follows at once, unless this one failed."""
         current = self._steps.popleft()
         self._results.append(CommandResult(current, ok, text))
         self._tries, self._next_us = 0, 0

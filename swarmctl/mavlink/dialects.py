@@ -1,6 +1,6 @@
-"""PX4 and ArduCopter: everything in which they differ, as one table each. Which one it is, the HEARTBEAT says.
+"""Dialects of PX4 and ArduCopter: one table each of all their differences, selected by the HEARTBEAT.
 
-Figures and rules are measured or read in their sources; commands are MAVLink's COMMAND_LONG unless they are parameters.
+Figures and rules are measured or read in their sources. Commands are COMMAND_LONG unless they are parameters.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from swarmctl.core.types import Command, FlightMode, Verb
 
 _INT32, _REAL32 = 6, 9  # MAV_PARAM_TYPE
 _CUSTOM_MODE = 1.0  # DO_SET_MODE p1: MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
-LAST_INTEGER_TYPE = 8  # MAV_PARAM_TYPE_INT64; what follows is a float
+LAST_INTEGER_TYPE = 8  # MAV_PARAM_TYPE_INT64; larger types are floats
 _ARM, _TAKEOFF, _LAND, _SET_MODE, _INTERVAL, _REQUEST = 400, 22, 21, 176, 511, 512
 _NAN = math.nan
 
@@ -25,7 +25,7 @@ ESTIMATOR_STATUS, EXTENDED_SYS_STATE, ODOMETRY, CURRENT_MODE = 230, 245, 331, 43
 
 @dataclass(frozen=True, slots=True)
 class LongCommand:
-    """A COMMAND_LONG: id and its first parameters; the others are 0."""
+    """A COMMAND_LONG: its id and first parameters; the remaining parameters are 0."""
 
     command: int
     params: tuple[float, ...]
@@ -33,14 +33,14 @@ class LongCommand:
 
 @dataclass(frozen=True, slots=True)
 class Rule:
-    """A parameter without whose right value nothing is armed."""
+    """A parameter that must have a safe value before arming."""
 
     name: str
     holds: Callable[[float], bool]
-    otherwise: str  # what a wrong value does, and the fix
+    otherwise: str  # effect of a wrong value, and the fix
 
     def problem(self, value: float | None) -> str:
-        """Why not to fly with this value (None: it could not be read), or ""."""
+        """Return why this value forbids flight (None: the value could not be read), or ""."""
         if value is None:
             return f"{self.name} can't be read, and it decides what happens when setpoints stop or what they mean"
         return "" if self.holds(value) else f"{self.name} = {value:g}: {self.otherwise}"
@@ -48,42 +48,42 @@ class Rule:
 
 @dataclass(frozen=True, slots=True)
 class Dialect:
-    """What differs between autopilots."""
+    """The differences between autopilots."""
 
     name: str
-    modes: Mapping[int, FlightMode]  # HEARTBEAT.custom_mode -> mode; what is not here, a pilot flies
+    modes: Mapping[int, FlightMode]  # HEARTBEAT.custom_mode -> mode; an unlisted mode is flown by a pilot
     external: tuple[float, ...]  # DO_SET_MODE p2, p3 of the mode that follows setpoints
     hold: tuple[float, ...]
     land: LongCommand
-    takeoff_parameter: str  # the height of a take-off; "": it travels in NAV_TAKEOFF's p7
-    arm_in: FlightMode | None  # mode to be in before arming and taking off; None: any that can be armed
-    integers_bytewise: bool  # an int32's bits in the float of PARAM_*, or its value
-    state: tuple[int, ...]  # messages that carry the state, at the state's rate
-    rates_hz: Mapping[int, float]  # the others that must flow
+    takeoff_parameter: str  # parameter of the take-off height; "": the height is NAV_TAKEOFF's p7
+    arm_in: FlightMode | None  # mode required before arming and take-off; None: any mode that can be armed
+    integers_bytewise: bool  # PARAM_* carries the bits of an int32 in its float; else the value
+    state: tuple[int, ...]  # messages that carry the state, at the state rate
+    rates_hz: Mapping[int, float]  # the other required messages
     rules: tuple[Rule, ...]
-    given: Mapping[str, int | float]  # parameters that every flight sets unless it is configured otherwise
+    given: Mapping[str, int | float]  # parameters that every flight sets unless configured otherwise
     hover_parameter: str
-    thrust_parameters: tuple[str, ...]  # read and recorded: they say what thrust means
-    horizontal_accuracy: str  # message that tells it
-    loss_parameter: str  # how long it waits for setpoints [s]
-    heeds_parameter: str = ""  # whose heartbeats its link-loss failsafe counts; "": anybody's
+    thrust_parameters: tuple[str, ...]  # read and recorded: they define the meaning of thrust
+    horizontal_accuracy: str  # message that reports it
+    loss_parameter: str  # parameter of the setpoint timeout [s]
+    heeds_parameter: str = ""  # system id whose heartbeats its link-loss failsafe counts; "": any
 
     def mode(self, custom_mode: int) -> FlightMode:
-        """Mode of a HEARTBEAT or CURRENT_MODE."""
+        """Return the mode of a HEARTBEAT or CURRENT_MODE."""
         return self.modes.get(custom_mode, FlightMode.MANUAL)
 
     def to_read(self) -> tuple[str, ...]:
-        """Parameters to be known before flight."""
+        """Return the names of the parameters to read before flight."""
         return tuple(dict.fromkeys([*(r.name for r in self.rules), self.hover_parameter, *self.thrust_parameters]))
 
     def steps(self, command: Command) -> tuple[Command, ...]:
-        """What one request is made of."""
+        """Return the commands that make up one request."""
         if command.verb is Verb.TAKEOFF and self.takeoff_parameter:
             return Command(Verb.PARAM_FLOAT, value=command.value, name=self.takeoff_parameter), command
         return (command,)
 
     def long_command(self, command: Command) -> LongCommand | None:
-        """COMMAND_LONG of a command, or None when it is about a parameter."""
+        """Return the COMMAND_LONG of a command, or None for a parameter."""
         interval_us = 1e6 / command.value if command.value > 0 else -1.0
         height = (_NAN,) * 7 if self.takeoff_parameter else (0.0,) * 6 + (command.value,)
         table: dict[Verb, LongCommand] = {
@@ -99,7 +99,7 @@ class Dialect:
         return table.get(command.verb)
 
     def to_wire(self, command: Command) -> tuple[float, int]:
-        """Value and MAV_PARAM_TYPE that PARAM_SET carries for PARAM_INT and PARAM_FLOAT."""
+        """Return the value and MAV_PARAM_TYPE that PARAM_SET carries for PARAM_INT and PARAM_FLOAT."""
         if command.verb is not Verb.PARAM_INT:
             return float(struct.unpack("<f", struct.pack("<f", command.value))[0]), _REAL32
         if self.integers_bytewise:
@@ -107,7 +107,7 @@ class Dialect:
         return float(struct.unpack("<f", struct.pack("<f", command.number))[0]), _INT32
 
     def from_wire(self, value: float, kind: int) -> float:
-        """Number that a PARAM_VALUE carries."""
+        """Return the number that a PARAM_VALUE carries."""
         if self.integers_bytewise and kind <= LAST_INTEGER_TYPE:
             return float(struct.unpack("<i", struct.pack("<f", value))[0])
         return value
@@ -137,9 +137,9 @@ PX4 = Dialect(
     rates_hz={
         ATTITUDE_TARGET: 5.0,
         EXTENDED_SYS_STATE: 10.0,
-        CURRENT_MODE: 50.0,  # how often it looks whether the mode has changed; it is sent at 2 Hz and on change
+        CURRENT_MODE: 50.0,  # interval at which PX4 looks for a change; it is sent at 2 Hz and on change
         ESTIMATOR_STATUS: 1.0,
-        ATTITUDE: 2.0,  # these four come at 50 to 100 Hz otherwise: half of all that is to be decoded, for nobody
+        ATTITUDE: 2.0,  # these four default to 50 to 100 Hz, half of all decoded frames, and are not used
         ATTITUDE_QUATERNION: 2.0,
         HIGHRES_IMU: 2.0,
         GLOBAL_POSITION_INT: 2.0,
@@ -222,7 +222,7 @@ ARDUCOPTER = Dialect(
     given={},
     hover_parameter="MOT_THST_HOVER",
     thrust_parameters=("MOT_THST_EXPO", "MOT_SPIN_ARM", "MOT_SPIN_MIN", "MOT_SPIN_MAX"),
-    horizontal_accuracy="GPS_RAW_INT",  # its EKF's own figures are test ratios, not metres
+    horizontal_accuracy="GPS_RAW_INT",  # its EKF reports test ratios, not metres
     loss_parameter="GUID_TIMEOUT",
     heeds_parameter="SYSID_MYGCS",
 )

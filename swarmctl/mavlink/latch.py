@@ -1,7 +1,7 @@
-"""Whom a UDP port belongs to: the sender of a vehicle's heartbeat, for as long as it speaks, and nobody else.
+"""Ownership of a UDP port: the sender of the vehicle's heartbeat owns it for as long as it sends.
 
-Pure; what makes a datagram a vehicle's is handed in. `admit_only` has the kernel drop everybody else's datagrams, so
-that a flood neither fills the socket's buffer nor costs the tick anything.
+This module is pure; the test of a datagram is passed in. `admit_only` makes the kernel drop all other datagrams, so
+that a flood neither fills the socket buffer nor costs the tick time.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ from collections.abc import Callable
 Address = tuple[str, int]
 IsVehicle = Callable[[bytes], bool]  # whether a datagram shows that its sender is the vehicle
 
-_SILENT_US = 3_000_000  # after which the vehicle may speak from another address
-_SLEPT_US = 500_000  # without a poll for so long, nobody knows who was silent
+_SILENT_US = 3_000_000  # after this silence the vehicle may send from another address
+_SLEPT_US = 500_000  # after this long without a poll, silence can't be attributed
 _SO_ATTACH_FILTER, _SO_DETACH_FILTER = 26, 27  # Linux
 _INSTRUCTION = struct.Struct("=HBBI")  # code, jump if true, jump if false, constant
 _LOAD_HALF, _LOAD_WORD, _JUMP_IF_EQUAL, _RETURN = 0x28, 0x20, 0x15, 0x06
@@ -26,49 +26,49 @@ _WHOLE = 0xFFFFFFFF
 
 
 def anybody(data: bytes) -> bool:
-    """The first sender of anything: for ports that only the vehicle knows of."""
+    """Accept the first sender of anything: for ports that only the vehicle knows."""
     return True
 
 
 def nobody(data: bytes) -> bool:
-    """No sender but the given one, however long it is silent."""
+    """Accept no other sender than the given one, however long it is silent."""
     return False
 
 
 class Latch:
-    """Which sender is the vehicle.
+    """Decides which sender is the vehicle.
 
     Args:
         is_vehicle: whether a datagram shows that its sender is the vehicle.
-        remote: where the vehicle is expected; None: it will speak first.
+        remote: expected address of the vehicle; None: it sends first.
 
     Attributes:
-        remote: where the vehicle is; None before it was heard.
-        strangers: datagrams of others so far, as far as the kernel has let them through.
-        moves: how often the vehicle has been followed to another address.
+        remote: address of the vehicle; None before its first datagram.
+        strangers: number of datagrams of other senders that the kernel has let through.
+        moves: number of address changes that have been followed.
     """
 
     def __init__(self, is_vehicle: IsVehicle, remote: Address | None = None) -> None:
         self._is_vehicle = is_vehicle
         self.remote = remote
         self.strangers = self.moves = 0
-        self._heard_us: int | None = None  # the vehicle, or when waiting for it began
+        self._heard_us: int | None = None  # last datagram of the vehicle, or begin of the wait for it
         self._polled_us: int | None = None
 
     @property
     def only(self) -> Address | None:
-        """The only sender worth hearing; None while it may be anybody."""
+        """The only sender to receive from; None while any sender is possible."""
         return None if self.remote is None or self._silent else self.remote
 
     def poll(self, now_us: int) -> None:
-        """Called before every draining of the port: judges silence, and only while somebody has listened."""
+        """Judge silence; called before each drain of the port, because only a polled port can be silent."""
         slept = self._polled_us is None or now_us - self._polled_us > _SLEPT_US
         self._polled_us = now_us
         if slept or self._heard_us is None:
             self._heard_us = now_us
 
     def admits(self, sender: Address, data: bytes) -> bool:
-        """Whether a datagram is the vehicle's."""
+        """Return whether a datagram is the vehicle's."""
         if sender == self.remote:
             self._heard_us = self._polled_us
             return True
@@ -87,9 +87,9 @@ class Latch:
 
 
 def admit_only(sock: socket.socket, sender: Address | None) -> None:
-    """Have the kernel drop the datagrams of everybody but `sender`; None: of nobody. Without effect but on Linux.
+    """Have the kernel drop datagrams of every sender but `sender` (None: of no sender). Linux only.
 
-    A connected socket would do the same, but hears nothing that is sent to another of the host's addresses.
+    A connected socket would do the same, but receives nothing that is sent to another of the host's addresses.
     """
     if sys.platform != "linux":
         return

@@ -1,14 +1,14 @@
-"""Where a vehicle's own local origin lies in the swarm's frame, and whether a position fits what was known before.
+"""Position of a vehicle's local origin in the shared frame, and the test of positions against earlier ones.
 
-Every autopilot counts from where its own estimator began, and may move that origin in flight. Positions and origin come
-in separate messages in either order, so that for a moment they do not belong together. And an estimator may jump, to
-what is right or to what is wrong: then its position has moved, but the vehicle has not.
+Every autopilot counts from the point at which its estimator began, and may move that origin in flight. Positions and
+origin arrive in separate messages, in either order, so that for a moment they do not belong together. The estimate may
+also jump, towards the truth or away from it: then the position has moved but the vehicle has not.
 
-A position that no flight can explain is therefore bridged: what it is off by is taken from it, so that the vehicle
-stays where it was and nobody flies across the difference. A newly told origin explains it and ends the bridge. Else
-the vehicle may be at either place: `margin_m` is what has to be kept clear of around it. A short bridge is drawn in
-slowly once positions have been steady for a while. A long one stays until the estimate jumps back or the vehicle has
-landed: nobody can tell which place is right, and only to go on as before puts nobody in danger who was not before.
+A position that no flight can explain is bridged: the difference is subtracted, so that the vehicle keeps its place and
+no agent flies across the difference. A newly reported origin explains the difference and ends the bridge. Otherwise the
+vehicle may be at either place, and `margin_m` is the extra distance to keep from it. A short bridge is drawn in slowly
+once positions have been steady. A long bridge stays until the estimate jumps back or the vehicle has landed: which
+place is right can't be known, and to continue as before endangers no vehicle that was safe.
 """
 
 from __future__ import annotations
@@ -21,42 +21,42 @@ import pymap3d
 
 from swarmctl.core.types import MAX_RADIUS_M, Array, GeoOrigin
 
-_SAME_M = 0.02  # GPS_GLOBAL_ORIGIN counts in 1e-7 degrees, 11 mm
-_JUMP_M = 0.3  # estimators that are corrected step by less
-_RESET_M = 0.02  # of a step that the estimator itself tells of
-_ACCEL_M_S2 = 10.0  # no vehicle leaves its velocity faster
-_LEEWAY_S = 0.5  # nor for longer without a sample between
-_FORGET_S = 1.0  # a position this old predicts nothing
-_ASKED_US = 500_000  # for the origin, after which it is taken not to have moved
-_STEADY_US = 3_000_000  # of positions after a jump, before they are believed
-_DRAW_IN_M_S = 0.3  # how fast a bridge shortens: what a vehicle is moved by it
-_SHORT_M = 1.0  # a margin that peers can give and fly on; drawn in, 5 m ended in a collision in truth
-_WIDEN_M_S = 2.0  # how fast the margin grows: others can make room so fast
+_SAME_M = 0.02  # resolution of GPS_GLOBAL_ORIGIN: 1e-7 degrees, 11 mm
+_JUMP_M = 0.3  # smaller steps are corrections of the estimator
+_RESET_M = 0.02  # smallest step that counts when the estimator itself reports a reset
+_ACCEL_M_S2 = 10.0  # largest acceleration of a vehicle
+_LEEWAY_S = 0.5  # largest time without a sample for which that acceleration is assumed
+_FORGET_S = 1.0  # an older position predicts nothing
+_ASKED_US = 500_000  # wait for the origin; after it the origin is taken as unmoved
+_STEADY_US = 3_000_000  # positions must be steady for this long after a jump to be believed
+_DRAW_IN_M_S = 0.3  # speed at which a bridge shortens, and the vehicle is moved by it
+_SHORT_M = 1.0  # longest bridge that is drawn in: peers can give this margin; drawing in 5 m has ended in a collision
+_WIDEN_M_S = 2.0  # growth of the margin: peers can make room at this speed
 _NARROW_M_S = 0.5
-_NEAR_US = 100_000  # a geodetic and a local position of one moment
-_FALLBACK_US = 3_000_000  # without GPS_GLOBAL_ORIGIN for so long, the origin is worked out from positions
+_NEAR_US = 100_000  # largest time between a geodetic and a local position of one moment
+_FALLBACK_US = 3_000_000  # after this long without GPS_GLOBAL_ORIGIN the origin is computed from positions
 _FALLBACK_POINTS = 9
 _NOTHING = np.zeros(3)
 
 
 class LocalFrame:
-    """One vehicle's origin.
+    """Tracks the origin of one vehicle's local frame.
 
     Args:
-        shared: origin of the swarm's frame.
+        shared: origin of the shared frame.
 
     Attributes:
         offset_ned_m: (3,) local origin in the shared frame; None while unknown.
-        bridge_ned_m: (3,) added to positions since they have jumped.
-        margin_m: by how much the vehicle may be elsewhere than its position says, because of a jump.
+        bridge_ned_m: (3,) correction added to positions since the newest jump.
+        margin_m: distance by which the vehicle may be away from its reported position, because of a jump.
         jump_m: size of the newest jump.
-        invalid: positions that were not believed, by reason.
-        jumps: how often the estimate has jumped.
+        invalid: number of positions that were not believed, by reason.
+        jumps: number of jumps of the estimate.
     """
 
     bridge_ned_m: Array
     margin_m: float
-    _unexplained: bool  # bridged, and nobody has said yet whether the origin has moved
+    _unexplained: bool  # bridged, and not yet known whether the origin has moved
     _jumped_us: int
 
     def __init__(self, shared: GeoOrigin) -> None:
@@ -65,25 +65,25 @@ class LocalFrame:
         self.invalid: Counter[str] = Counter()
         self.jumps = 0
         self.jump_m = 0.0
-        self._moved_to: Array | None = None  # (3,) told, but positions do not fit it yet
-        self._last: tuple[int, Array, Array] | None = None  # time, shared position and velocity of the last one
+        self._moved_to: Array | None = None  # (3,) reported origin that positions do not fit yet
+        self._last: tuple[int, Array, Array] | None = None  # time, shared position and velocity of the newest sample
         self._guesses: deque[Array] = deque(maxlen=_FALLBACK_POINTS)
         self._guessing_us: int | None = None
         self._settle()
 
     @property
     def wants_origin(self) -> bool:
-        """Whether GPS_GLOBAL_ORIGIN would help now."""
+        """Whether GPS_GLOBAL_ORIGIN should be requested now."""
         return self.offset_ned_m is None or self._unexplained
 
     def forget(self) -> None:
-        """The vehicle has rebooted: it counts from somewhere else."""
+        """Discard the origin: the vehicle has rebooted and counts from another point."""
         self.offset_ned_m = self._moved_to = self._last = self._guessing_us = None
         self._guesses.clear()
         self._settle()
 
     def told(self, origin: GeoOrigin) -> None:
-        """GPS_GLOBAL_ORIGIN."""
+        """Take a GPS_GLOBAL_ORIGIN."""
         offset_ned_m = self._in_shared(origin)
         if self.offset_ned_m is None:
             self.offset_ned_m = offset_ned_m
@@ -91,11 +91,11 @@ class LocalFrame:
             self._moved_to = offset_ned_m
         else:
             self._moved_to = None
-            self.jumps += self._unexplained  # the frame is the same: it is the estimate that has jumped
+            self.jumps += self._unexplained  # the frame is unchanged, so the estimate has jumped
             self._unexplained = False
 
     def seen(self, place: GeoOrigin, t_us: int, local_us: int, pos_ned_m: Array, vel_ned_m_s: Array) -> None:
-        """A geodetic position at `t_us`, beside the newest local one at `local_us`: all there is without an origin."""
+        """Take a geodetic position at `t_us` beside the newest local one at `local_us`: the fallback for the origin."""
         if self.offset_ned_m is not None or abs(t_us - local_us) > _NEAR_US:
             return
         self._guessing_us = t_us if self._guessing_us is None else self._guessing_us
@@ -104,13 +104,13 @@ class LocalFrame:
             self.offset_ned_m = np.median(np.stack(self._guesses), axis=0)
 
     def place(self, t_us: int, pos_ned_m: Array, vel_ned_m_s: Array, armed: bool, reset: bool = False) -> Array | None:
-        """Position (3,) in the shared frame of a local one, or None while it can't be told.
+        """Return the shared position (3,) of a local one, or None while it can't be known.
 
         Args:
-            t_us: time of the sample; any clock that does not jump.
-            pos_ned_m, vel_ned_m_s: (3,) local.
-            armed: on the ground, disarmed, an estimator may still be settling: everything is believed.
-            reset: the estimator itself says that it has moved its position, by whatever it may be.
+            t_us: time of the sample, on a clock without jumps.
+            pos_ned_m, vel_ned_m_s: (3,) in the local frame.
+            armed: False: the estimator may still be settling on the ground, so every position is believed.
+            reset: the estimator itself reports that it has moved its position.
         """
         if self.offset_ned_m is None:
             self.invalid["no origin"] += 1
@@ -129,7 +129,7 @@ class LocalFrame:
         return placed
 
     def _fit(self, t_us: int, pos_ned_m: Array, expected_ned_m: Array, since_s: float, reset: bool) -> None:
-        """Take the explanation that brings a local position to where it is expected; without one, bridge it."""
+        """Apply the origin that brings a local position to its expected place; without one, bridge the difference."""
         assert self.offset_ned_m is not None
         step_m = _RESET_M if reset else _JUMP_M
         leeway_m = step_m + 0.5 * _ACCEL_M_S2 * min(since_s, _LEEWAY_S) ** 2
@@ -144,13 +144,13 @@ class LocalFrame:
             return
         self.bridge_ned_m, self._jumped_us = missing_ned_m, t_us
         self.jump_m = math.sqrt(float(missing_ned_m @ missing_ned_m))
-        self._unexplained = not reset and self.jump_m >= step_m  # else it has jumped back
+        self._unexplained = not reset and self.jump_m >= step_m  # otherwise it has jumped back
         self.jumps += reset
 
     def _draw_in(self, t_us: int, since_s: float) -> None:
-        """Widen or narrow the margin, and shorten a short bridge once positions have been steady."""
+        """Adapt the margin, and shorten a short bridge once positions have been steady."""
         left_m = math.sqrt(float(self.bridge_ned_m @ self.bridge_ned_m))
-        if self._unexplained and t_us - self._jumped_us > _ASKED_US:  # nobody tells of an origin that has moved
+        if self._unexplained and t_us - self._jumped_us > _ASKED_US:  # no moved origin has been reported
             self._unexplained = False
             self.jumps += 1
         wanted_m = min(self.jump_m, MAX_RADIUS_M) if left_m and not self._unexplained else 0.0
@@ -160,7 +160,7 @@ class LocalFrame:
             self.bridge_ned_m = self.bridge_ned_m * max(0.0, 1.0 - _DRAW_IN_M_S * since_s / left_m)
 
     def _take_origin(self) -> None:
-        """The origin has moved, and positions with it: what was told last holds, and there was no jump."""
+        """Adopt a moved origin: positions have moved with it, and there was no jump."""
         if self._moved_to is not None:
             self.offset_ned_m, self._moved_to = self._moved_to, None
             self.bridge_ned_m, self._unexplained = _NOTHING, False

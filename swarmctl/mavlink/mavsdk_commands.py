@@ -1,10 +1,10 @@
-"""The slow path on a real link: MAVSDK over `raw://`, fed by the agent's own socket.
+"""Command port on a real link: MAVSDK over `raw://`, fed from the agent's own socket.
 
-MAVSDK keeps retries and acknowledgements of commands; what a command is made of, the dialect says. Heartbeats leave
-from the tick: a thread that sent them beside a tick that hangs would hide its death from the autopilot.
-Parameters go through our own codec, because MAVSDK only says that it was not refused, not what is stored now.
+MAVSDK does retries and acknowledgements; the dialect defines the content of a command. Heartbeats are sent by the tick:
+a separate thread would hide a hanging tick from the autopilot. Parameters use our own codec, because MAVSDK reports
+only that a value was not refused, not what is stored.
 
-Its Offboard plugin is never created: it re-sends the last setpoint from a C++ thread for ever, which defeats the
+Its Offboard plugin is never created: it repeats the last setpoint from a C++ thread without end, which defeats the
 autopilot's offboard-loss failsafe. Blocking calls run in one worker thread; the tick only exchanges queue entries.
 """
 
@@ -33,12 +33,12 @@ _JOIN_S = 5.0
 
 
 class MavsdkCommands:
-    """`CommandPort` on MAVSDK.
+    """Implements `CommandPort` on MAVSDK.
 
     Args:
-        send: hands a frame to the vehicle; called from MAVSDK's thread.
-        target: the vehicle's system id, also ours (PX4 convention for companions).
-        dialect: the autopilot's, or None while nobody knows; commands wait for it.
+        send: sends a frame to the vehicle; called from MAVSDK's thread.
+        target: system id of the vehicle, also ours (PX4 convention for companions).
+        dialect: returns the autopilot's dialect, or None while unknown; commands wait for it.
     """
 
     def __init__(self, send: Callable[[bytes], None], target: int, dialect: Callable[[], Dialect | None]) -> None:
@@ -48,7 +48,7 @@ class MavsdkCommands:
         self._raw = self._sdk.subscribe_raw_bytes_to_be_sent(send)
         self._parameters = CodecCommands(send, Codec(target, OWN_COMPID), target, dialect)
         self._wanted: deque[Command] = deque()
-        self._steps: deque[Command] = deque()  # of the one being executed
+        self._steps: deque[Command] = deque()  # steps of the command that is being executed
         self._open = False  # the first step has been handed to MAVSDK or the codec
         self._results: list[CommandResult] = []
         self._asked: queue.SimpleQueue[tuple[Command, LongCommand] | None] = queue.SimpleQueue()
@@ -122,7 +122,7 @@ class MavsdkCommands:
                     self._answered.put(CommandResult(command, False, "MAVSDK has not discovered the vehicle"))
                     continue
                 answer = json.loads(direct.send_command(self._message(long)).fields_json)
-                result = answer.get("result")  # any answer at all is a success to MAVSDK
+                result = answer.get("result")  # MAVSDK counts any answer as success
                 self._answered.put(CommandResult(command, result == 0, f"result {result}"))
             except Exception as error:  # MAVSDK's errors share no base class across plugins; all mean "refused"
                 self._answered.put(CommandResult(command, False, f"{type(error).__name__}: {error}"))

@@ -1,81 +1,81 @@
-"""Which flight mode a vehicle is in, when that is in doubt, and what happened between two polls. Pure.
+"""Flight mode of a vehicle, the times when it is in doubt, and mode changes between two polls. Pure.
 
-One setpoint brings PX4 back to OFFBOARD, whoever has taken it over meanwhile. So after a silence, ours or the link's,
-the mode is in doubt until the vehicle has told it again; asked for its HEARTBEAT, it does within milliseconds. And of
-modes and failsafes between two polls it is not the newest that counts: one that came and went is shown once.
+One setpoint brings PX4 back to OFFBOARD even after a pilot has taken over. So after a silence, of agent or link, the
+mode is in doubt until the vehicle reports it again; a requested HEARTBEAT arrives within milliseconds. A mode or
+failsafe that came and went between two polls is shown once, although it is not the newest.
 """
 
 from __future__ import annotations
 
 from swarmctl.core.types import FlightMode
 
-_GAP_US = 300_000  # a silence this long, ours or the link's
-_TOLD_LATELY_US = 100_000  # a mode this young at the end of our own silence was not held up in a full buffer
+_GAP_US = 300_000  # length of a silence, of the agent or the link, that puts the mode in doubt
+_TOLD_LATELY_US = 100_000  # a mode report this young at the end of our own pause was not delayed in a full buffer
 _REQUEST_PERIOD_US = 60_000
 
 
 class ModeWatch:
-    """Of one vehicle.
+    """Watches the flight mode of one vehicle.
 
     Attributes:
-        mode: as told last.
-        failsafe: likewise, whether its autopilot's failsafe acts.
-        departures: how often the vehicle has left the mode in which it follows setpoints.
-        told_us: arrival of the message that told the mode.
+        mode: newest reported mode.
+        failsafe: newest report whether the autopilot's failsafe acts.
+        departures: number of departures from the mode that follows setpoints.
+        told_us: arrival time of the message that reported the mode.
     """
 
     def __init__(self) -> None:
         self.mode = FlightMode.UNKNOWN
         self.failsafe = False
         self.departures = self.told_us = 0
-        self._left: FlightMode | None = None  # mode it was in meanwhile, of a departure that was not shown yet
+        self._left: FlightMode | None = None  # intermediate mode of a departure that was not shown yet
         self._alarmed = False  # a failsafe that was not shown yet
         self._shown_us: int | None = None
         self._polled_us: int | None = None
         self._heard_us: int | None = None
         self._requested_us: int | None = None
-        self._doubt_us: int | None = None  # the mode has to be told after this
+        self._doubt_us: int | None = None  # a mode report must be newer than this
 
     @property
     def in_doubt(self) -> bool:
-        """Whether nobody can know the mode now."""
+        """Whether the mode can't be known now."""
         return self._doubt_us is not None and self.told_us < self._doubt_us
 
     def poll(self, now_us: int) -> None:
-        """Called before what has arrived is taken in."""
+        """Judge our own pause; called before received frames are handled."""
         if self._polled_us is not None and now_us - self._polled_us > _GAP_US:
-            self._doubt_us = now_us - _TOLD_LATELY_US  # we slept: what was buffered may end long ago
+            self._doubt_us = now_us - _TOLD_LATELY_US  # we paused: buffered frames may be old
         self._polled_us = now_us
         if self._shown_us is not None and now_us > self._shown_us:
             self._left, self._alarmed, self._shown_us = None, False, None
 
     def heard(self, arrived_us: int) -> None:
-        """Anything of the vehicle."""
+        """Note the arrival of a frame of the vehicle."""
         if self._heard_us is not None and arrived_us - self._heard_us > _GAP_US:
-            self._doubt_us = arrived_us  # the link was silent: what was said meanwhile is lost
+            self._doubt_us = arrived_us  # the link was silent: frames of that time are lost
         self._heard_us = arrived_us
 
     def told(self, mode: FlightMode, arrived_us: int) -> None:
-        """HEARTBEAT or CURRENT_MODE."""
+        """Take the mode of a HEARTBEAT or CURRENT_MODE."""
         if self.mode is FlightMode.EXTERNAL and mode is not FlightMode.EXTERNAL:
             self.departures += 1
             self._left = mode
         self.mode, self.told_us = mode, arrived_us
 
     def alarm(self, failsafe: bool) -> None:
-        """HEARTBEAT."""
+        """Take the failsafe state of a HEARTBEAT."""
         self.failsafe = failsafe
         self._alarmed |= failsafe
 
     def asks(self, now_us: int) -> bool:
-        """Whether to ask the vehicle for its HEARTBEAT now."""
+        """Whether to request a HEARTBEAT now."""
         if not self.in_doubt or (self._requested_us is not None and now_us - self._requested_us < _REQUEST_PERIOD_US):
             return False
         self._requested_us = now_us
         return True
 
     def show(self, now_us: int) -> tuple[FlightMode, bool]:
-        """Mode and failsafe for the state of this poll."""
+        """Return mode and failsafe for the state of this poll."""
         self._shown_us = now_us
         came_back = self.mode is FlightMode.EXTERNAL
         mode = self._left if came_back and self._left is not None else self.mode

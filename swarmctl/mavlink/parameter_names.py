@@ -1,6 +1,6 @@
-"""What every autopilot takes for a parameter: a name as MAVLink carries it, and a number of 32 bits.
+"""Form of a parameter that every autopilot accepts: a MAVLink name and a 32-bit number.
 
-Whether it is kept as an integer or a float the vehicle says itself, and the agent sets it so.
+The vehicle itself reports whether it stores an integer or a float, and the agent sends that type.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ _REAL32_MAX = 3.4028235e38
 
 
 def parameter_problems(wanted: Mapping[str, int | float]) -> Iterator[str]:
-    """Why parameters of `agent.autopilot_params` could not be set, one line each."""
+    """Return one line for each parameter of `agent.autopilot_params` that could not be set, with the reason."""
     for name, value in wanted.items():
         key = f"agent.autopilot_params.{printable(name, 40)}"
         if not _NAME.fullmatch(name):

@@ -1,7 +1,7 @@
-"""Byte links to a vehicle: UDP, TCP, serial, and an in-memory pipe for lockstep. None of them ever blocks.
+"""Byte links to a vehicle: UDP, TCP, serial, and an in-memory pipe for lockstep. None of them blocks.
 
-A transport moves datagrams and stamps their arrival; it knows nothing of MAVLink except, in a byte stream, where a
-frame ends. Streams that break are opened again for as long as it takes: whether a vehicle is lost is judged elsewhere.
+A transport moves datagrams and stamps their arrival. It knows nothing of MAVLink except the end of a frame in a byte
+stream. Broken streams are reopened without limit: a lost vehicle is judged elsewhere.
 """
 
 from __future__ import annotations
@@ -22,32 +22,32 @@ from swarmctl.mavlink.latch import Address, IsVehicle, Latch, admit_only, anybod
 
 _MAX_DATAGRAM = 2048
 _CHUNK = 65536
-_DATAGRAMS_A_POLL, _BYTES_A_POLL = 600, 131_072  # what one tick can take in; the rest waits for the next
-_BUFFER_BYTES = 1 << 20  # as much as the system allows: what a vehicle says while its agent sleeps is not lost
+_DATAGRAMS_A_POLL, _BYTES_A_POLL = 600, 131_072  # limits of one tick; the rest waits for the next
+_BUFFER_BYTES = 1 << 20  # as much as the system allows, so that frames survive a pause of the agent
 _SO_TIMESTAMPNS = 35  # Linux; socket.SO_TIMESTAMPNS is not exported before Python 3.13
 _TIMESPEC = struct.Struct("@qq")
 _URL = re.compile(r"^(?P<scheme>udpin|udpout|tcp|serial)://(?P<where>[^:]+):(?P<number>\d+)$")
-_LOCAL_PORTS = (20000, 32700)  # towards vehicles that are spoken to first; below the ones systems hand out
+_LOCAL_PORTS = (20000, 32700)  # local ports towards vehicles that we address first; below the ephemeral range
 _NEIGHBOURS = 16
 _REOPEN_US = 1_000_000
-_LOST_AFTER_US = 5_000_000  # every autopilot beats once a second
+_LOST_AFTER_US = 5_000_000  # every autopilot sends a heartbeat once a second
 
 
 class Datagram(NamedTuple):
-    """Bytes and the monotonic time they arrived [us]."""
+    """Received bytes and their monotonic arrival time [us]."""
 
     t_us: int
     data: bytes
 
 
 class Transport(Protocol):
-    """One vehicle's byte link."""
+    """A byte link to one vehicle."""
 
     def send(self, data: bytes) -> None:
-        """Hand over one frame; dropped, never queued, when the link can't take it."""
+        """Send one frame; it is dropped, never queued, when the link can't take it."""
 
     def receive(self, now_us: int) -> list[Datagram]:
-        """Everything that has arrived since the last call."""
+        """Return everything that has arrived since the last call."""
 
     def close(self) -> None:
         """Release the port."""
@@ -81,14 +81,14 @@ def parse_url(url: str) -> Endpoint:
 def open_transport(
     url: str, inherited_fd: int | None = None, is_vehicle: IsVehicle = anybody, remote: Address | None = None
 ) -> Transport:
-    """Open the link a URL names.
+    """Open the link that a URL names.
 
     Args:
         url: see `parse_url`.
-        inherited_fd: an already bound UDP socket from the launcher, which holds the port so that no other launch can
+        inherited_fd: a bound UDP socket from the launcher, which holds the port so that no other launch can
             take it between the check and the flight.
-        is_vehicle: whether a datagram shows that its sender is the vehicle; UDP belongs to the first who sends one.
-        remote: where the other end of an inherited socket is known to be.
+        is_vehicle: whether a datagram shows that its sender is the vehicle; the first sender of one owns the port.
+        remote: known address of the other end of an inherited socket.
 
     Raises:
         StartError: the port is taken, the host has no address, or the device does not exist.
@@ -105,10 +105,10 @@ def open_transport(
 
 
 def resolve(host: str) -> str:
-    """IPv4 address of a host, once: a name server in the tick would stop it.
+    """Return the IPv4 address of a host. Resolved once, because a name server would stall the tick.
 
     Raises:
-        StartError: it has none.
+        StartError: the host has no address.
     """
     try:
         return socket.gethostbyname(host)
@@ -117,7 +117,7 @@ def resolve(host: str) -> str:
 
 
 def bind_udp(host: str, port: int) -> socket.socket:
-    """A bound UDP socket, without address reuse: a second binder must fail, not steal the traffic.
+    """Return a bound UDP socket without address reuse: a second binder must fail instead of taking the traffic.
 
     Raises:
         StartError: the port is taken or the host is not ours.
@@ -132,21 +132,21 @@ def bind_udp(host: str, port: int) -> socket.socket:
 
 
 def bind_towards(remote: tuple[str, int]) -> socket.socket:
-    """A UDP socket on a local port that is the same at every start: PX4 talks to the first port that ever spoke to it.
+    """Return a UDP socket on a local port that is the same at every start, as PX4 sends to the first port only.
 
     Raises:
         StartError: the port and its neighbours are taken.
     """
     host = _own_address(remote)
     first = _LOCAL_PORTS[0] + zlib.crc32(f"{remote[0]}:{remote[1]}".encode()) % (_LOCAL_PORTS[1] - _LOCAL_PORTS[0])
-    for port in range(first, first + _NEIGHBOURS):  # another vehicle's may be the same
+    for port in range(first, first + _NEIGHBOURS):  # another vehicle may have the same port
         with contextlib.suppress(StartError):
             return bind_udp(host, port)
     raise StartError(f"udp ports {first} to {port} are taken. Stop what talks to {remote[0]}:{remote[1]} already")
 
 
 def _own_address(remote: tuple[str, int]) -> str:
-    """Address of the interface that leads to `remote`; every interface while no way leads there yet."""
+    """Return the address of the interface that leads to `remote`; every interface while there is no route."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(remote)  # sends nothing
@@ -156,10 +156,10 @@ def _own_address(remote: tuple[str, int]) -> str:
 
 
 class UdpTransport:
-    """A UDP socket that hears and answers one sender: the vehicle, see `Latch`.
+    """A UDP socket that receives from and sends to one address: the vehicle, see `Latch`.
 
-    With `remote` set it talks first. Arrival is stamped by the kernel, so a tick that drains the socket every 20 ms
-    still knows when each sample came. One call takes in so much and no more, whoever floods the port.
+    With `remote` set it sends first. The kernel stamps arrivals, so a tick that drains the socket every 20 ms still
+    knows the arrival time of each sample. One call reads a bounded amount, so that a flood can't stall the tick.
     """
 
     def __init__(self, sock: socket.socket, remote: Address | None = None, is_vehicle: IsVehicle = anybody) -> None:
@@ -167,7 +167,7 @@ class UdpTransport:
         self._sock.setblocking(False)
         self._sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
         self.latch = Latch(is_vehicle, remote)
-        self._admitted: Address | None = None  # by the kernel; None: everybody
+        self._admitted: Address | None = None  # sender that the kernel admits; None: every sender
         self._stamped = sys.platform == "linux"
         if self._stamped:
             self._sock.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
@@ -183,7 +183,7 @@ class UdpTransport:
         try:
             self._sock.sendto(data, self.latch.remote)
         except OSError:
-            return  # full buffer, or nobody listens: the autopilot's own failsafe judges silence
+            return  # full buffer, or no receiver: the autopilot's own failsafe judges silence
 
     def receive(self, now_us: int) -> list[Datagram]:
         latch = self.latch
@@ -197,7 +197,7 @@ class UdpTransport:
             except ConnectionRefusedError:
                 continue  # ICMP port unreachable surfaces here once
             except OSError:
-                break  # all of it
+                break  # the socket is empty
             if latch.admits(sender, data):
                 arrived.append(Datagram(self._arrival_us(ancillary, now_us), data))
                 left -= len(data)
@@ -224,19 +224,19 @@ class UdpTransport:
 
 
 class TcpTransport:
-    """A TCP client (ArduPilot listens on 5760); frames are cut out of the byte stream.
+    """A TCP client (ArduPilot listens on 5760) that cuts frames out of the byte stream.
 
-    It connects while the tick runs, and again a second after the other end has gone. What does not fit into the
-    socket's buffer is dropped by whole frames.
+    It connects while the tick runs, and again a second after the other end has gone. Frames that do not fit into the
+    socket buffer are dropped whole.
     """
 
     def __init__(self, remote: tuple[str, int]) -> None:
         self._remote = remote
         self._sock: socket.socket | None = None
-        self._open_us: int | None = None  # when the last attempt began
+        self._open_us: int | None = None  # begin of the last attempt
         self._heard_us = 0
         self._buffer = bytearray()
-        self._rest = b""  # of a frame that left in part
+        self._rest = b""  # remainder of a frame that was sent in part
 
     def send(self, data: bytes) -> None:
         if self._sock is None:
@@ -253,7 +253,7 @@ class TcpTransport:
 
     def receive(self, now_us: int) -> list[Datagram]:
         if self._sock is not None and now_us - self._heard_us > _LOST_AFTER_US:
-            self._lose()  # an end that vanished without a word would be waited for for a quarter of an hour
+            self._lose()  # a peer that vanished without FIN would block for a quarter of an hour
         if self._sock is None and (self._open_us is None or now_us - self._open_us >= _REOPEN_US):
             self._open(now_us)
         try:
@@ -264,7 +264,7 @@ class TcpTransport:
                 self._buffer += data
                 self._heard_us = now_us
         except (BlockingIOError, InterruptedError):
-            pass  # all of it, or still connecting
+            pass  # the socket is empty, or still connecting
         except OSError:
             self._lose()
         return [Datagram(now_us, frame) for frame in cut_frames(self._buffer)]
@@ -277,7 +277,7 @@ class TcpTransport:
         self._sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         self._sock.setblocking(False)
         self._sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        with contextlib.suppress(BlockingIOError, OSError):  # recv says whether it has worked
+        with contextlib.suppress(BlockingIOError, OSError):  # recv tells whether it has worked
             self._sock.connect(self._remote)
 
     def _lose(self) -> None:
@@ -288,10 +288,10 @@ class TcpTransport:
 
 
 class SerialTransport:
-    """A serial port; frames are cut out of the byte stream and handed on one by one. Unplugged, it is opened again."""
+    """A serial port that cuts frames out of the byte stream; it is reopened after it was unplugged."""
 
     def __init__(self, device: str, baud: int) -> None:
-        import serial  # only vehicles on a wire need it
+        import serial  # only serial links need it
 
         def open_port() -> Any:
             return serial.Serial(device, baud, timeout=0, write_timeout=0)
@@ -342,7 +342,7 @@ class SerialTransport:
 
 
 def cut_frames(buffer: bytearray) -> list[bytes]:
-    """Take every complete MAVLink 2 frame off the front of `buffer`; junk before a start byte is dropped."""
+    """Remove and return all complete MAVLink 2 frames at the front of `buffer`; junk before a start byte is dropped."""
     frames: list[bytes] = []
     while True:
         start = buffer.find(0xFD)
@@ -382,7 +382,7 @@ class PipeTransport:
 
 
 def pipe_pair(now_us: Callable[[], int], latency_us: int = 0) -> tuple[PipeTransport, PipeTransport]:
-    """Two connected ends."""
+    """Return two connected ends."""
     left, right = PipeTransport(now_us, latency_us), PipeTransport(now_us, latency_us)
     left.other, right.other = right, left
     return left, right

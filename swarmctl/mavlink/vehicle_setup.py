@@ -1,8 +1,8 @@
-"""What a link needs before flight and keeps needing: messages at their rates, the origin, parameters set and read back.
+"""Setup of a vehicle's link: message rates, origin, and parameters that are set and read back.
 
-All of it is asked again when the autopilot has rebooted, rates also when they have been lost. One command at a time,
-and only when nobody else is asking: a request to land never waits for more than one answer. Parameters are set for the
-flight alone: afterwards they are what they were before, because with them a vehicle counts on an agent beside it.
+Everything is requested again after a reboot of the autopilot, and rates also after they were lost. One command is open
+at a time, and only when no other part waits: a request to land never waits for more than one answer. Parameters are set
+for the flight alone and restored afterwards, because with them the vehicle relies on an agent.
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ from swarmctl.mavlink.commands import CommandPort, CommandResult
 from swarmctl.mavlink.dialects import GPS_GLOBAL_ORIGIN, Dialect
 
 _ORIGIN_EVERY_US = 1_000_000
-_ORIGIN_SOON_US = 200_000  # positions do not fit: there is no state until it is told
+_ORIGIN_SOON_US = 200_000  # positions do not fit: there is no state until the origin is reported
 _WATCH_US = 2_000_000
-_WATCH_MAX_US = 30_000_000  # a link that can't carry the rate is not asked for ever more often
-_SILENT_US = 1_200_000  # not even a heartbeat: there is nobody to ask
+_WATCH_MAX_US = 30_000_000  # a link that can't carry the rate is asked ever less often
+_SILENT_US = 1_200_000  # not even a heartbeat: the vehicle can't answer
 _ENOUGH_01 = 0.5
 
 
-class Upkeep:
-    """Sets up one autopilot and watches that it stays so.
+class VehicleSetup:
+    """Sets up one autopilot and keeps it set up.
 
     Args:
-        autopilot: what is told of it.
-        commands: how it is asked.
-        setup: parameters it is given, name -> value.
-        sysid: the agent's own system id, which heartbeats carry.
-        state_rate_hz: of the messages that carry the state.
+        autopilot: provides what the vehicle reports.
+        commands: executes the requests.
+        setup: parameters to set, name -> value.
+        sysid: system id of the agent, which its heartbeats carry.
+        state_rate_hz: rate of the messages that carry the state.
 
     Attributes:
-        ready: everything has been asked and answered, since the last reboot.
-        restored: every parameter that was changed has been set back, or could not be.
+        ready: everything has been requested and answered since the last reboot.
+        restored: every changed parameter has been set back, or could not be.
     """
 
     def __init__(
@@ -53,11 +53,11 @@ class Upkeep:
         self._boots = -1
         self._dialect: Dialect | None = None
         self._todo: deque[Command] = deque()
-        self._compared = False  # what was read with what is wanted
-        self._before: dict[str, Command] = {}  # parameter -> what sets it to the value that the vehicle came with
+        self._compared = False  # read values have been compared with wanted ones
+        self._before: dict[str, Command] = {}  # parameter -> command that restores its original value
         self._restoring = False
         self._open: Command | None = None
-        self._failed: dict[str, str] = {}  # parameter -> what the autopilot said
+        self._failed: dict[str, str] = {}  # parameter -> answer of the autopilot
         self._origin_us = 0
         self._watched_us = 0
         self._watch_us = _WATCH_US
@@ -66,7 +66,7 @@ class Upkeep:
 
     @property
     def refusal(self) -> str:
-        """Why nothing may be armed, or ""; not known before `ready`."""
+        """Reason that forbids arming, or ""; unknown before `ready`."""
         if not self.ready or self._dialect is None:
             return ""
         heeds = self._dialect.heeds_parameter
@@ -80,16 +80,16 @@ class Upkeep:
 
     @property
     def left_changed(self) -> dict[str, float]:
-        """Parameters that could not be set back, with the values that the vehicle came with."""
+        """Parameters that could not be restored, with their original values."""
         return {name: set_back.value or float(set_back.number) for name, set_back in self._before.items()}
 
     def restore(self) -> None:
-        """Begin to set every changed parameter back; the vehicle is disarmed or has been handed back."""
+        """Begin to restore every changed parameter; the vehicle is disarmed or has been handed back."""
         self._todo = deque(reversed(self._before.values()))
         self._restoring = True
 
     def took(self, result: CommandResult) -> None:
-        """An answer of the command port, whoever asked."""
+        """Take a result of the command port, whichever part requested it."""
         if result.command != self._open:
             return
         self._open = None
@@ -100,7 +100,7 @@ class Upkeep:
             self._failed[name] = result.text
 
     def step(self, now_us: int) -> None:
-        """Ask for what is missing. Called last in a tick, so that everybody else asks first."""
+        """Request what is missing. Called last in a tick, so that all other parts request first."""
         self._notice_reboot(now_us)
         if self._dialect is None or self._commands.busy:
             return
@@ -132,7 +132,7 @@ class Upkeep:
         self._todo = deque(self._rates(self._dialect) + origin + reads)
 
     def _compare(self) -> None:
-        """Ask for what was read to be what is wanted; nothing left to ask for: the link is set up."""
+        """Queue a command for each value that differs from the wanted one; without any, the link is set up."""
         if self._compared:
             self.ready = True
             return
@@ -147,7 +147,7 @@ class Upkeep:
         return state + [Command(Verb.RATE, rate_hz, number) for number, rate_hz in dialect.rates_hz.items()]
 
     def _setting(self, name: str, value: float) -> Command:
-        """Request for a value in the type that the vehicle keeps it in, whatever the configuration wrote."""
+        """Return the request for a value in the type in which the vehicle stores it."""
         if name in self._autopilot.whole_params and float(value).is_integer():
             return Command(Verb.PARAM_INT, number=int(value), name=name)
         return Command(Verb.PARAM_FLOAT, value=float(value), name=name)
@@ -161,7 +161,7 @@ class Upkeep:
         return Command(Verb.MESSAGE, number=GPS_GLOBAL_ORIGIN)
 
     def _watch(self, now_us: int) -> None:
-        """A vehicle that talks but tells its state at less than half the rate has lost what it was asked."""
+        """Request the rates again when the vehicle sends, but its state comes at less than half the rate."""
         waited_us = now_us - self._watched_us
         if waited_us < self._watch_us:
             return

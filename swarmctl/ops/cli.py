@@ -1,6 +1,6 @@
-"""Verbs of the command line. No logic: each reads its arguments and calls the module that does the work.
+"""The verbs of the command line: each reads its arguments and calls the module that does the work.
 
-Everything heavy is imported inside the verb that needs it, so that `--help` is quick.
+Heavy modules are imported inside the verb that needs them, so that `--help` answers in a fraction of a second.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
+from swarmctl import __version__
 from swarmctl.core.text import printable_lines
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, ConfigError, SwarmError
 
@@ -23,30 +24,35 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
+    rich_markup_mode=None,  # markup would take units such as [m] for tags and drop them
     context_settings={"help_option_names": ["-h", "--help"]},
     help="Fly a swarm of quadrotors with one distributed-MPC agent beside every autopilot.",
 )
-obstacle_app = typer.Typer(no_args_is_help=True, help="Change the obstacles of a running launch.")
+obstacle_app = typer.Typer(
+    no_args_is_help=True, rich_markup_mode=None, help="Change the obstacles of a running launch."
+)
 app.add_typer(obstacle_app, name="obstacle")
 
-ConfigPath = Annotated[Path | None, typer.Argument(help="TOML file; without one the defaults, the thesis circle.")]
-Agents = Annotated[int | None, typer.Option("--agents", help="Number of agents, over swarm.agents.")]
-Duration = Annotated[float | None, typer.Option("--duration", help="Length of the mission [s].")]
-Seed = Annotated[int | None, typer.Option("--seed", help="Seed of everything random.")]
-Set = Annotated[list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override any key; may be repeated.")]
-NewRunDir = Annotated[Path | None, typer.Option("--run-dir", help="Folder to write; default runs/<UTC>-<name>.")]
-View = Annotated[bool | None, typer.Option("--view/--no-view", help="Open the viewer's window.")]
-RunningDir = Annotated[Path | None, typer.Option("--run-dir", help="Run folder of the launch; default the newest.")]
-OneAgent = Annotated[int | None, typer.Option("--agent", help="One agent; default all.")]
+ConfigPath = Annotated[Path | None, typer.Argument(help="TOML file; default: the circle of the thesis.")]
+Agents = Annotated[int | None, typer.Option("--agents", help="Number of agents; overrides swarm.agents.")]
+Duration = Annotated[float | None, typer.Option("--duration", help="Duration of the mission [s].")]
+Seed = Annotated[int | None, typer.Option("--seed", help="Seed of every random stream.")]
+Set = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a configuration key; repeatable.")
+]
+NewRunDir = Annotated[Path | None, typer.Option("--run-dir", help="Run folder to create; default runs/<UTC>-<name>.")]
+View = Annotated[bool | None, typer.Option("--view/--no-view", help="Open the viewer window.")]
+RunningDir = Annotated[Path | None, typer.Option("--run-dir", help="Run folder of the launch; default: the newest.")]
+OneAgent = Annotated[int | None, typer.Option("--agent", help="Address one agent; default: all.")]
 Folder = Annotated[Path, typer.Argument(help="Run folder.")]
 
 
 def main() -> None:
-    """Run the command line; expected errors become words and an exit code, unexpected ones keep their traceback."""
+    """Run the command line: print expected errors and return their exit code, let unexpected ones raise."""
     code = _run_app()
     try:
         sys.stdout.flush()
-    except OSError:  # nobody reads any more; without this the interpreter would change the exit code
+    except OSError:  # the reader has closed the pipe; the interpreter would change the exit code
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     sys.exit(code)
 
@@ -60,12 +66,27 @@ def _run_app() -> int:
     except (typer.Abort, KeyboardInterrupt):
         return EXIT_INTERRUPTED
     except Exception as error:
-        show = getattr(error, "show", None)  # click's usage errors, whichever click typer brings
+        show = getattr(error, "show", None)  # usage errors of whichever click typer brings
         if show is None or not hasattr(error, "exit_code"):
             raise
         show()
         return EXIT_USAGE
     return code if isinstance(code, int) else EXIT_OK
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        print(f"swarmctl {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _global_options(
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    return
 
 
 @app.command()
@@ -78,7 +99,7 @@ def launch(
     sets: Set = None,
     view: View = None,
 ) -> int:
-    """Bring up simulator, agents, bus and view, and fly. Ctrl-C lands, a second one ends everything at once."""
+    """Start simulator, agents, bus and view, and fly. Ctrl-C lands; a second Ctrl-C kills every process."""
     from swarmctl.config import load
     from swarmctl.ops.launch import LaunchOptions
     from swarmctl.ops.launch import launch as fly
@@ -97,7 +118,7 @@ def simulate(
     sets: Set = None,
     view: View = None,
 ) -> NoReturn:
-    """Fly the same agents in one process on a simulated clock: deterministic, faster than real time."""
+    """Fly the same agents in one process on a simulated clock. Deterministic, faster than real time."""
     arguments = [] if config is None else [str(config)]
     for name, value in (("--agents", agents), ("--duration", duration), ("--run-dir", run_dir), ("--seed", seed)):
         arguments += [] if value is None else [f"{name}={value}"]
@@ -112,27 +133,31 @@ def check(
     agents: Agents = None,
     sets: Set = None,
     apply: Annotated[
-        bool, typer.Option("--apply", help="Set wanted parameters, on disarmed vehicles; else nothing is changed.")
+        bool, typer.Option("--apply", help="Set the wanted parameters of disarmed vehicles; default: change nothing.")
     ] = False,
-    seconds: Annotated[float, typer.Option("--seconds", min=1.0, max=600.0, help="Listen to each vehicle [s].")] = 3.0,
-    json: Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write everything found, too.")] = None,
+    seconds: Annotated[
+        float, typer.Option("--seconds", min=1.0, max=600.0, help="Time to listen to each vehicle [s].")
+    ] = 3.0,
+    json: Annotated[
+        Path | None, typer.Option("--json", metavar="FILE", help="Also write all findings to FILE.")
+    ] = None,
     identify: Annotated[
-        bool, typer.Option("--identify", help="Then FLY: steps about the start; identify delay, lag, drag, thrust.")
+        bool, typer.Option("--identify", help="Then FLY small steps and identify delay, lag, drag and thrust.")
     ] = False,
     write: Annotated[
-        Path | None, typer.Option("--write", metavar="FILE", help="With --identify: the vehicle model as TOML.")
+        Path | None, typer.Option("--write", metavar="FILE", help="With --identify: write the vehicle model as TOML.")
     ] = None,
 ) -> int:
-    """Ask every vehicle and say what to fix. Exit 0: nothing; 3: one is not reached; 4: something."""
+    """Pre-flight check of every vehicle. Exit code 0: ready; 3: a vehicle is not reached; 4: something is to fix."""
     from swarmctl.config import load
     from swarmctl.ops.vehicle_check import CheckOptions
-    from swarmctl.ops.vehicle_check import check as ask
+    from swarmctl.ops.vehicle_check import check as check_vehicles
 
     if write is not None and not identify:
         raise ConfigError("--write", ["there is nothing to write without --identify"])
     asked, options = load(config, _overrides(agents, None, None, sets)), CheckOptions(apply, seconds, json)
     if not identify:
-        return ask(asked, options)
+        return check_vehicles(asked, options)
     from swarmctl.ops.identify import IdentifyOptions, check_and_identify
 
     return check_and_identify(asked, IdentifyOptions(options, write))
@@ -140,18 +165,18 @@ def check(
 
 @app.command()
 def agent(
-    config: Annotated[Path, typer.Option("--config", help="Resolved TOML file.")],
-    number: Annotated[int, typer.Option("--id", help="Number of this agent, from 0.")],
+    config: Annotated[Path, typer.Option("--config", help="Resolved configuration, a TOML file.")],
+    number: Annotated[int, typer.Option("--id", help="Index of this agent, from 0.")],
     run: Annotated[str, typer.Option("--run", help="Name of the run on the bus.")],
-    bus: Annotated[str, typer.Option("--bus", help="Endpoint of the router.")],
+    bus: Annotated[str, typer.Option("--bus", help="Endpoint of the bus router.")],
     run_dir: Annotated[Path, typer.Option("--run-dir", help="Folder to record into.")],
-    fd: Annotated[int | None, typer.Option("--fd", help="Inherited, bound UDP socket of the vehicle.")] = None,
+    fd: Annotated[int | None, typer.Option("--fd", help="Inherited, bound UDP socket to the vehicle.")] = None,
     vehicle_port: Annotated[
-        int | None, typer.Option("--vehicle-port", help="Loopback port at the other end of that socket.")
+        int | None, typer.Option("--vehicle-port", help="Loopback port of the vehicle on that link.")
     ] = None,
-    only_land: Annotated[bool, typer.Option("--only-land", help="Land and disarm the vehicle, then end.")] = False,
+    only_land: Annotated[bool, typer.Option("--only-land", help="Land and disarm the vehicle, then exit.")] = False,
 ) -> int:
-    """One agent beside one autopilot. `launch` starts them; on a companion computer start it yourself."""
+    """Run one agent for one autopilot. `launch` starts agents; on a companion computer start it yourself."""
     from swarmctl.agent.runner import AgentProcess, run_agent
     from swarmctl.process_lifetime import PARENT_ENV, die_with_parent
 
@@ -174,57 +199,59 @@ def agent(
 @app.command()
 def status(
     run_dir: RunningDir = None,
-    as_json: Annotated[bool, typer.Option("--json", help="For programs.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> int:
-    """Show every agent of a running launch."""
-    from swarmctl.ops import operator as attach
+    """Show the status of every agent of a running launch."""
+    from swarmctl.ops import operator
 
-    launch = attach.find_launch(run_dir)
-    statuses = attach.read_statuses(launch)
-    print(attach.as_json(statuses)) if as_json else _show(statuses, range(launch.agents))
+    launch = operator.find_launch(run_dir)
+    statuses = operator.read_statuses(launch)
+    print(operator.as_json(statuses)) if as_json else _show(statuses, range(launch.agents))
     return EXIT_OK
 
 
 @app.command()
 def hold(run_dir: RunningDir = None, agent: OneAgent = None) -> int:
-    """Brake and stay."""
+    """Brake and hold position."""
     return _command("hold", run_dir, agent)
 
 
 @app.command()
 def resume(run_dir: RunningDir = None, agent: OneAgent = None) -> int:
-    """Go on with the mission after hold."""
+    """Resume the mission after `hold`."""
     return _command("resume", run_dir, agent)
 
 
 @app.command()
 def land(run_dir: RunningDir = None, agent: OneAgent = None) -> int:
-    """Spread and land."""
+    """Separate, then land."""
     return _command("land", run_dir, agent)
 
 
 @app.command()
 def rtl(run_dir: RunningDir = None, agent: OneAgent = None) -> int:
-    """Hand over to the autopilot's return to launch."""
+    """Fly back to the start under the agent's own MPC, then land. The autopilot's return mode is not used."""
     return _command("rtl", run_dir, agent)
 
 
 @app.command()
 def fault(
-    kind: Annotated[str, typer.Argument(help="gps_loss, motor, link_loss, gust, ...; a wrong one lists them all.")],
-    vehicle: Annotated[int, typer.Option("--vehicle", help="Which, from 0; -1 for all.")] = -1,
-    value: Annotated[float | None, typer.Option("--value", help="Of the kind: fraction, metres, ms, ...")] = None,
-    for_s: Annotated[float, typer.Option("--for", help="How long [s]; 0 to the end.")] = 0.0,
-    rotor: Annotated[int, typer.Option("--rotor", help="Of a motor fault, 0 to 3.")] = 0,
-    direction: Annotated[str, typer.Option("--direction", help="Of a link: both, to_vehicle, from_vehicle.")] = "both",
-    towards: Annotated[float, typer.Option("--towards", help="Of a gust or jump, degrees from north.")] = 0.0,
+    kind: Annotated[str, typer.Argument(help="gps_loss, motor, link_loss, gust, ...; an unknown kind lists all.")],
+    vehicle: Annotated[int, typer.Option("--vehicle", help="Vehicle index, from 0; -1: all.")] = -1,
+    value: Annotated[float | None, typer.Option("--value", help="Magnitude, in the unit of the kind.")] = None,
+    for_s: Annotated[float, typer.Option("--for", help="Duration [s]; 0: to the end.")] = 0.0,
+    rotor: Annotated[int, typer.Option("--rotor", help="Rotor of a motor fault, 0 to 3.")] = 0,
+    direction: Annotated[
+        str, typer.Option("--direction", help="Link direction: both, to_vehicle, from_vehicle.")
+    ] = "both",
+    towards: Annotated[float, typer.Option("--towards", help="Direction of a gust or jump [deg from north].")] = 0.0,
     run_dir: RunningDir = None,
 ) -> int:
-    """Let something go wrong in the simulator of a running launch; refused where real vehicles fly."""
-    from swarmctl.ops import operator as attach
+    """Inject a fault into the simulator of a running launch. Refused where real vehicles fly."""
+    from swarmctl.ops import operator
     from swarmctl.ops.fault import inject, parse_fault
 
-    launch = attach.find_launch(run_dir)
+    launch = operator.find_launch(run_dir)
     wanted = {"kind": kind, "vehicle": vehicle, "value": value, "for_s": for_s, "rotor": rotor}
     asked = parse_fault({**wanted, "direction": direction, "towards_deg": towards}, launch.agents)
     print(inject(launch, asked))
@@ -233,10 +260,10 @@ def fault(
 
 @obstacle_app.command("list")
 def obstacle_list(run_dir: RunningDir = None) -> int:
-    """Show the obstacles agents know of."""
-    from swarmctl.ops import operator as attach
+    """List the obstacles that the agents know."""
+    from swarmctl.ops import operator
 
-    _show_obstacles(attach.read_obstacles(attach.find_launch(run_dir)))
+    _show_obstacles(operator.read_obstacles(operator.find_launch(run_dir)))
     return EXIT_OK
 
 
@@ -244,41 +271,45 @@ def obstacle_list(run_dir: RunningDir = None) -> int:
 def obstacle_add(
     center: Annotated[str, typer.Option("--center", metavar="N,E,D", help="Centre, shared NED [m].")],
     radius: Annotated[float, typer.Option("--radius", help="Physical radius [m].")] = 1.0,
-    keep_out: Annotated[float | None, typer.Option("--keep-out", help="From the centre [m]; radius + 0.75.")] = None,
-    visibility: Annotated[float, typer.Option("--visibility", help="Agents see it from closer than this [m].")] = 3.0,
-    velocity: Annotated[str, typer.Option("--velocity", metavar="N,E,D", help="[m/s].")] = "0,0,0",
-    column: Annotated[bool, typer.Option("--column", help="An upright column of any height, not a sphere.")] = False,
+    keep_out: Annotated[
+        float | None, typer.Option("--keep-out", help="Keep-out radius [m]; default: radius + 0.75.")
+    ] = None,
+    visibility: Annotated[float, typer.Option("--visibility", help="Range at which agents see it [m].")] = 3.0,
+    velocity: Annotated[str, typer.Option("--velocity", metavar="N,E,D", help="Velocity, shared NED [m/s].")] = "0,0,0",
+    column: Annotated[
+        bool, typer.Option("--column", help="A vertical column of unlimited height, not a sphere.")
+    ] = False,
     run_dir: RunningDir = None,
 ) -> int:
-    """Put a sphere or a column into a running launch."""
-    from swarmctl.ops import operator as attach
+    """Add a sphere or a column to a running launch."""
+    from swarmctl.ops import operator
 
     keep_out_m = radius + 0.75 if keep_out is None else keep_out
-    obstacle = attach.obstacle(center, radius, keep_out_m, visibility, velocity, column)
-    launch = attach.find_launch(run_dir)
-    _show_obstacles(attach.change_obstacles(launch, lambda known: (*known, obstacle)))
+    obstacle = operator.obstacle(center, radius, keep_out_m, visibility, velocity, column)
+    launch = operator.find_launch(run_dir)
+    _show_obstacles(operator.change_obstacles(launch, lambda known: (*known, obstacle)))
     return EXIT_OK
 
 
 @obstacle_app.command("remove")
 def obstacle_remove(
-    number: Annotated[int, typer.Argument(help="As `obstacle list` counts, from 0.")], run_dir: RunningDir = None
+    number: Annotated[int, typer.Argument(help="Index in `obstacle list`, from 0.")], run_dir: RunningDir = None
 ) -> int:
-    """Take an obstacle out of a running launch."""
-    from swarmctl.ops import operator as attach
+    """Remove an obstacle from a running launch."""
+    from swarmctl.ops import operator
 
-    launch = attach.find_launch(run_dir)
-    _show_obstacles(attach.change_obstacles(launch, lambda known: attach.without(known, number)))
+    launch = operator.find_launch(run_dir)
+    _show_obstacles(operator.change_obstacles(launch, lambda known: operator.without(known, number)))
     return EXIT_OK
 
 
 @app.command()
 def view(run_dir: RunningDir = None) -> int:
     """Open the live view of a running launch."""
-    from swarmctl.ops import operator as attach
+    from swarmctl.ops import operator
     from swarmctl.telemetry.recordings import open_viewer
 
-    open_viewer(attach.view_address(attach.find_launch(run_dir)))
+    open_viewer(operator.view_address(operator.find_launch(run_dir)))
     return EXIT_OK
 
 
@@ -293,7 +324,7 @@ def replay(folder: Folder) -> int:
 
 @app.command()
 def report(folder: Folder) -> int:
-    """Write the report of a run again, and finish a run that was cut off."""
+    """Write the report of a run again. Completes a run that was cut off."""
     from swarmctl.ops.summary import rewrite_report
 
     print(rewrite_report(folder))
@@ -302,13 +333,17 @@ def report(folder: Folder) -> int:
 
 @app.command()
 def reproduce(
-    only: Annotated[list[str] | None, typer.Option("--only", metavar="FLIGHT", help="One experiment; repeat.")] = None,
-    plant: Annotated[bool, typer.Option("--plant", help="Only on the plant itself, as the thesis did.")] = False,
-    full: Annotated[bool, typer.Option("--full", help="Only over MAVLink, through the whole bridge.")] = False,
+    only: Annotated[
+        list[str] | None, typer.Option("--only", metavar="FLIGHT", help="One experiment; repeatable.")
+    ] = None,
+    plant: Annotated[bool, typer.Option("--plant", help="Fly the model only, as the thesis did.")] = False,
+    full: Annotated[bool, typer.Option("--full", help="Fly the full MAVLink loop only.")] = False,
     out: Annotated[Path | None, typer.Option("--out", help="Folder to write; default runs/<UTC>-reproduce.")] = None,
-    jobs: Annotated[int | None, typer.Option("--jobs", metavar="N", help="Processes; default one a processor.")] = None,
+    jobs: Annotated[
+        int | None, typer.Option("--jobs", metavar="N", help="Worker processes; default: one per processor, at most 8.")
+    ] = None,
 ) -> NoReturn:
-    """Fly the thesis' six experiments again and write them beside what it published."""
+    """Reproduce the six experiments of the thesis. Writes each result beside the published figure."""
     arguments = [f"--only={name}" for name in only or ()]
     arguments += [flag for flag, given in (("--plant", plant), ("--full", full)) if given]
     arguments += [] if out is None else [f"--out={out}"]
@@ -318,13 +353,19 @@ def reproduce(
 
 @app.command()
 def bench(
-    out: Annotated[Path | None, typer.Option("--out", help="Folder of bench.json; default here.")] = None,
-    neighbours: Annotated[str | None, typer.Option("--neighbours", metavar="N,N,..", help="How many, 0 to 30.")] = None,
-    solver: Annotated[list[str] | None, typer.Option("--solver", help="osqp or daqp; repeat.")] = None,
-    ticks: Annotated[int | None, typer.Option("--ticks", metavar="N", help="Measured ticks a case.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder of bench.json; default: the working directory.")
+    ] = None,
+    neighbours: Annotated[
+        str | None, typer.Option("--neighbours", metavar="N,N,..", help="Neighbour counts, 0 to 99.")
+    ] = None,
+    solver: Annotated[
+        list[str] | None, typer.Option("--solver", help="osqp or daqp; repeatable; default: all installed.")
+    ] = None,
+    ticks: Annotated[int | None, typer.Option("--ticks", metavar="N", help="Measured ticks per case.")] = None,
     slsqp: Annotated[bool | None, typer.Option("--slsqp/--no-slsqp", help="Measure the nonlinear baseline.")] = None,
 ) -> NoReturn:
-    """Measure one agent's tick, part by part, for 0 to 30 neighbours and every solver."""
+    """Measure the tick of one agent, part by part. Covers 0 to 30 neighbours and each installed solver."""
     arguments = [f"--solver={name}" for name in solver or ()]
     for name, value in (("--out", out), ("--neighbours", neighbours), ("--ticks", ticks)):
         arguments += [] if value is None else [f"{name}={value}"]
@@ -333,21 +374,21 @@ def bench(
 
 
 def _become(module: str, arguments: list[str]) -> NoReturn:
-    """Replace this process: the bridge never imports the simulator."""
+    """Replace this process by a module of the simulator, which the bridge never imports."""
     sys.stdout.flush()
     os.execv(sys.executable, [sys.executable, "-m", module, *arguments])
 
 
 def _command(verb: str, run_dir: Path | None, agent: int | None) -> int:
-    from swarmctl.ops import operator as attach
+    from swarmctl.ops import operator
 
-    launch = attach.find_launch(run_dir)
-    _show(attach.command(launch, verb, agent), range(launch.agents) if agent is None else range(agent, agent + 1))
+    launch = operator.find_launch(run_dir)
+    _show(operator.command(launch, verb, agent), range(launch.agents) if agent is None else range(agent, agent + 1))
     return EXIT_OK
 
 
 def _overrides(agents: int | None, duration: float | None, seed: int | None, sets: list[str] | None) -> list[str]:
-    """Options as `--set` items, the named ones last: they win."""
+    """Return the options as `--set` items, the named ones last so that they take precedence."""
     named = (("swarm.agents", agents), ("mission.duration_s", duration), ("seed", seed))
     return [*(sets or ()), *(f"{key}={value}" for key, value in named if value is not None)]
 

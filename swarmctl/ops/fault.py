@@ -1,7 +1,6 @@
-"""`swarmctl fault`: let something go wrong in a running simulator, and say what it answered.
+"""`swarmctl fault`: injects a fault into a running simulator and prints its answer.
 
-Only the simulator that the launch started can take faults: a run that flies vehicles of its own has no control socket,
-and is refused.
+Only the simulator that a launch started takes faults: a run with real vehicles has no control socket and is refused.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ _OPTIONS = {"for_s": "--for", "towards_deg": "--towards", "kind": "KIND"}
 
 
 def parse_fault(wanted: Mapping[str, Any], vehicles: int) -> FaultParams:
-    """A fault from what somebody typed; what is None was not given.
+    """Return the fault that a command line describes; values of None were not given.
 
     Raises:
         ConfigError: with every problem: kind, vehicle, value, times.
@@ -46,10 +45,10 @@ def parse_fault(wanted: Mapping[str, Any], vehicles: int) -> FaultParams:
 
 
 def inject(launch: RunningLaunch, fault: FaultParams) -> str:
-    """Send a fault to the simulator of a launch; returns what it says.
+    """Send a fault to the simulator of a launch and return its answer.
 
     Raises:
-        ConfigError: the launch flies vehicles that are not simulated by it, or the simulator refuses.
+        ConfigError: the launch does not simulate its vehicles, or the simulator refuses the fault.
         StartError: the simulator does not answer, or has ended with the flight.
     """
     path = control_socket(launch.bus)
@@ -67,7 +66,7 @@ def inject(launch: RunningLaunch, fault: FaultParams) -> str:
 
 
 def _ask(path: Path, request: dict[str, Any]) -> dict[str, Any]:
-    """One request, one answer, over a socket of our own in a private folder."""
+    """Send one request and return its answer, over a socket in a private folder."""
     with (
         tempfile.TemporaryDirectory(prefix="swarm-") as folder,
         socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as sock,
@@ -90,7 +89,7 @@ def _explain(error: dict[str, Any]) -> str:
 
 
 def _missed(given: dict[str, Any], vehicles: int, found: list[str]) -> Iterator[str]:
-    """What the first check could not get to: the vehicle of a fault whose kind is unknown, the value of a known one."""
+    """Yield problems that the validation did not reach: the vehicle of an unknown kind, the value of a known one."""
     vehicle = given.get("vehicle", -1)
     if not any("--vehicle" in problem for problem in found) and vehicle >= vehicles:
         yield f"--vehicle = {vehicle}: allowed: 0 to {vehicles - 1}, or -1 for all"
@@ -101,6 +100,6 @@ def _missed(given: dict[str, Any], vehicles: int, found: list[str]) -> Iterator[
 
 
 def _as_option(problem: str) -> str:
-    """`for_s = 0: ...` as the command line calls it."""
+    """Return a problem with the key replaced by the command-line option."""
     key = problem.split(" ", 1)[0].split(":", 1)[0]
     return problem.replace(key, _OPTIONS.get(key, f"--{key}"), 1)

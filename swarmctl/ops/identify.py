@@ -1,7 +1,7 @@
-"""`swarmctl check --identify`: fly every vehicle through small steps and write down what it is.
+"""`swarmctl check --identify`: flies every vehicle through small steps and identifies its model.
 
-It flies, so it begins with the check itself and goes no further while anything is to fix. The flight is a launch like
-any other, its mission `identify`; the same figures can be had of any run folder whose flight moved enough.
+Because it flies, it first runs the check and stops while anything is to fix. The flight is a launch with the mission
+`identify`; any run folder with enough motion gives the same figures.
 """
 
 from __future__ import annotations
@@ -31,15 +31,15 @@ _UNITS = {
 
 @dataclass(frozen=True, slots=True)
 class IdentifyOptions:
-    """What is not part of the configuration."""
+    """Options of the verb that are not part of the configuration."""
 
     check: CheckOptions
-    write: Path | None = None  # the table, as a file of its own
+    write: Path | None = None  # file for the model table
     run_dir: Path | None = None
 
 
 def check_and_identify(config: Config, options: IdentifyOptions) -> int:
-    """Check all vehicles, fly them, and print what was identified; returns the exit code.
+    """Check all vehicles, fly them, print the identified models, and return the exit code.
 
     Raises:
         StartError: the vehicles or the simulator do not come up, or the table can't be written.
@@ -73,7 +73,7 @@ def check_and_identify(config: Config, options: IdentifyOptions) -> int:
 
 
 def identification(config: Config) -> Config:
-    """The flight that is identified from."""
+    """Return the configuration of the identification flight."""
     mission = config.mission.model_copy(
         update={"kind": "identify", "duration_s": config.mission.identify.duration_s, "yaw_rad": 0.0}
     )
@@ -84,7 +84,7 @@ def identification(config: Config) -> Config:
 
 
 def identified(directory: Path, agents: int) -> dict[int, Identified | str]:
-    """Of every agent of a run folder: its vehicle, or why nothing can be told."""
+    """Return the identified model of each agent of a run folder, or why there is none."""
     from swarmctl.telemetry.run_files import load_run  # heavy
 
     run = load_run(directory)
@@ -96,7 +96,7 @@ def identified(directory: Path, agents: int) -> dict[int, Identified | str]:
 
 
 def lines(found: Mapping[int, Identified | str]) -> list[str]:
-    """For people: a line for each figure, tabs between."""
+    """Return one line per figure for people, separated by tabs."""
     shown = ["vehicle\twhat\testimate\t95 % interval\tunit"]
     for agent, result in found.items():
         if isinstance(result, str):
@@ -111,7 +111,7 @@ def lines(found: Mapping[int, Identified | str]) -> list[str]:
 
 
 def table(config: Config, models: Mapping[int, Identified], date: str) -> str:
-    """TOML for the configuration: a model for each listed vehicle; for the built-in simulator one, of its first."""
+    """Return TOML for the configuration: a model per listed vehicle, or one for the built-in simulator (its first)."""
     text = [f"# swarmctl check --identify, {date}; behind each figure its 95 % interval"]
     for agent, found in models.items():
         if config.vehicles:

@@ -1,7 +1,7 @@
-"""The launcher: refuse what can be refused, start the table of processes, fly, stop all of it, sum up.
+"""The launcher: runs the preflight, starts the processes, supervises the flight, stops all processes, and sums up.
 
-Who watches the flight is `swarmctl.ops.supervisor`; what may start at all is `swarmctl.ops.preflight`. Whatever
-happens, nothing that was started here outlives this module: no process, no socket, no port.
+`swarmctl.ops.supervisor` watches the flight, and `swarmctl.ops.preflight` decides whether it may start. In every case
+all processes, sockets and ports that were started here end with this module.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from swarmctl.config import Config, dump
 from swarmctl.errors import StartError
 from swarmctl.files import replace_text
 from swarmctl.ops.operator import RunningLaunch, announce, process_start_s, withdraw
-from swarmctl.ops.preflight import LOOPBACK, Ground, inspect
+from swarmctl.ops.preflight import LOOPBACK, ReservedPorts, inspect
 from swarmctl.ops.processes import (
     ROUTER,
     Child,
     Command,
-    Site,
+    RunContext,
     agent_commands,
     end_all,
     router_command,
@@ -37,29 +37,29 @@ from swarmctl.ops.processes import (
 )
 from swarmctl.ops.status_table import Display, open_display
 from swarmctl.ops.summary import sum_up
-from swarmctl.ops.supervisor import Base, EventLog, Flight
+from swarmctl.ops.supervisor import EventLog, FlightSupervisor, Services
 
-_BUS_S = 20.0  # for the router to answer
+_BUS_S = 20.0  # timeout for the router to answer
 _BUS_TRY_MS = 500
 _LAND_S = 30.0
-_STOP_S = 10.0  # viewer and simulator write their files out
+_STOP_S = 10.0  # time for viewer and simulator to write their files
 _ROUTER_STOP_S = 3.0
 
 
 @dataclass(frozen=True, slots=True)
 class LaunchOptions:
-    """What is not part of the flight's configuration."""
+    """Options of a launch that are not part of the configuration."""
 
     run_dir: Path | None = None
-    view: bool = False  # open the viewer's window
+    view: bool = False  # open the viewer window
 
 
 class Interrupts:
-    """Counts SIGINT and SIGTERM instead of raising, and as the first of them SIGHUP.
+    """Counts SIGINT, SIGTERM and the first SIGHUP instead of raising.
 
-    A terminal that is closed sends SIGHUP more than once, the kernel to its foreground and the shell to its jobs: that
-    is nobody who asks again, and no reason to kill what is landing. Under `nohup` it is not heard at all, and never
-    after the flight: it would cost the verdict.
+    A closing terminal sends SIGHUP more than once, from the kernel and from the shell. That is no second request, and
+    must not kill vehicles that are landing. SIGHUP is ignored under `nohup`, and after the flight, where it would lose
+    the result.
     """
 
     _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -70,7 +70,7 @@ class Interrupts:
 
     def __enter__(self) -> Interrupts:
         ignored = (signal.SIGHUP,) if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN else ()
-        heard = [signum for signum in self._SIGNALS if signum not in ignored]  # a stop is heeded in the background too
+        heard = [signum for signum in self._SIGNALS if signum not in ignored]  # SIGINT is handled in the background too
         self._before = {signum: signal.signal(signum, self._note) for signum in heard}
         return self
 
@@ -83,31 +83,31 @@ class Interrupts:
 
 
 def launch(config: Config, options: LaunchOptions) -> int:
-    """Fly a configuration; returns the exit code.
+    """Fly a configuration and return the exit code.
 
     Raises:
         ConfigError, StartError: it was refused, or did not come up; nothing is left running.
     """
     with Interrupts() as interrupts:
-        ground = inspect(config)
+        reserved = inspect(config)
         try:
             directory = _run_folder(config, options)
         except BaseException:
-            ground.release()
+            reserved.release()
             raise
         display = open_display()
-        base = Bringup(config, options, ground, directory, display)
-        grace_s = _LAND_S  # should anything go wrong from here on, agents still get to land
+        services = Launcher(config, options, reserved, directory, display)
+        grace_s = _LAND_S  # after a failure from here on, agents still get time to land
         try:
-            base.start()
-            verdict = Flight(config, base, display).fly(lambda: interrupts.count)
-            grace_s = 0.0  # who was waited for has ended
+            services.start()
+            result = FlightSupervisor(config, services, display).fly(lambda: interrupts.count)
+            grace_s = 0.0  # every agent has ended
         finally:
-            base.stop(grace_s)
+            services.stop(grace_s)
             display.close()
-    # from here on Ctrl-C acts as usual: nothing is left to land
-    violated = sum_up(config, directory, verdict, display.say)
-    return verdict.exit_code(violated)
+    # From here on Ctrl-C acts as usual: nothing is left to land.
+    violated = sum_up(config, directory, result, display.say)
+    return result.exit_code(violated)
 
 
 def _run_folder(config: Config, options: LaunchOptions) -> Path:
@@ -121,44 +121,44 @@ def _run_folder(config: Config, options: LaunchOptions) -> Path:
     return directory
 
 
-class Bringup(Base):
-    """Everything that was started for one launch, and how to end it."""
+class Launcher(Services):
+    """Starts the processes of one launch, and ends them."""
 
     def __init__(
-        self, config: Config, options: LaunchOptions, ground: Ground, directory: Path, display: Display
+        self, config: Config, options: LaunchOptions, reserved: ReservedPorts, directory: Path, display: Display
     ) -> None:
         self._socket_dir = Path(tempfile.mkdtemp(prefix="swarm-"))  # mode 0700
         self._config = config
         self._options = options
-        self._ground = ground
+        self._reserved = reserved
         self._display = display
-        self.site = Site(run_name(config.name), f"{SCHEME}{self._socket_dir}/bus.sock", directory)
+        self.context = RunContext(run_name(config.name), f"{SCHEME}{self._socket_dir}/bus.sock", directory)
         self.log = EventLog(directory / "launch.events.jsonl")
         self.children: dict[str, Child] = {}
 
     def start(self) -> None:
-        """Bring everything up as far as the bus; the rest shows itself in flight.
+        """Start every process and join the bus; later failures are seen by the supervisor.
 
         Raises:
             StartError: a program can't be run or the router does not answer.
         """
-        config, site, ground = self._config, self.site, self._ground
-        socket_file(site.endpoint)
-        self._spawn(router_command(site.endpoint))
+        config, context, reserved = self._config, self.context, self._reserved
+        socket_file(context.endpoint)
+        self._spawn(router_command(context.endpoint))
         self.bus = self._join_bus()
-        if ground.view_port:
-            self._spawn(viewer_command(config, site, ground.view_port, self._options.view))
+        if reserved.view_port:
+            self._spawn(viewer_command(config, context, reserved.view_port, self._options.view))
         if config.sitl.enabled:
-            self._spawn(sitl_command(config, site, ground.ports, ground.vehicle_sockets))
-        for command in agent_commands(config, site, ground.sockets, ground.vehicle_sockets):
+            self._spawn(sitl_command(config, context, reserved.ports, reserved.vehicle_sockets))
+        for command in agent_commands(config, context, reserved.sockets, reserved.vehicle_sockets):
             self._spawn(command)
         self.announce("")
-        for line in _introduction(config, site, ground):
+        for line in _introduction(config, context, reserved):
             self._display.say(line)
-        self.log.write("started", run=site.run, ports=list(ground.ports))
+        self.log.write("started", run=context.run, ports=list(reserved.ports))
 
     def stop(self, agents_grace_s: float) -> None:
-        """End every process, agents first, the router last, and leave nothing behind. Safe at any point."""
+        """End every process, agents first and the router last, and remove all temporary files. Safe at any point."""
         router = [child for name, child in self.children.items() if name == ROUTER]
         agents = [child for name, child in self.children.items() if name.startswith(agent_name(0)[:-1])]
         others = [child for child in self.children.values() if child not in router + agents]
@@ -167,32 +167,34 @@ class Bringup(Base):
         if self.bus is not None:
             self.bus.close()
         end_all(router, _ROUTER_STOP_S)
-        self._ground.release()
+        self._reserved.release()
         shutil.rmtree(self._socket_dir, ignore_errors=True)
         withdraw()
         self.log.write("stopped", exit_codes={name: child.poll() for name, child in self.children.items()})
 
     def recover(self, agent: int) -> Child:
-        """Start an agent on the vehicle of one that ended; it records beside, and flies without a router if it must."""
+        """Start an agent on the vehicle of an ended one; it records separately and can fly without a router."""
         router = self.children[ROUTER]
-        endpoint = self.site.endpoint if router.poll() is None else NO_BUS
-        directory = self.site.directory / "recovery"
+        endpoint = self.context.endpoint if router.poll() is None else NO_BUS
+        directory = self.context.directory / "recovery"
         directory.mkdir(exist_ok=True)
-        site = Site(self.site.run, endpoint, directory)
-        ends = self._ground.sockets, self._ground.vehicle_sockets
-        command = agent_commands(self._config, site, *ends, self.site.directory / "config.toml")[agent]
+        context = RunContext(self.context.run, endpoint, directory)
+        ends = self._reserved.sockets, self._reserved.vehicle_sockets
+        command = agent_commands(self._config, context, *ends, self.context.directory / "config.toml")[agent]
         return Child(replace(command, argv=(*command.argv, "--only-land")), directory)
 
     def announce(self, view: str) -> None:
-        """Let operators' commands find this launch."""
-        site = self.site
+        """Publish this launch to the operator's commands."""
+        context = self.context
         start_s, pid = process_start_s()
         announce(
-            RunningLaunch(site.run, site.endpoint, pid, start_s, self._config.swarm.agents, str(site.directory), view)
+            RunningLaunch(
+                context.run, context.endpoint, pid, start_s, self._config.swarm.agents, str(context.directory), view
+            )
         )
 
     def _spawn(self, command: Command) -> None:
-        self.children[command.name] = Child(command, self.site.directory)
+        self.children[command.name] = Child(command, self.context.directory)
 
     def _join_bus(self) -> ZenohBus:
         senders = [agent_name(agent) for agent in range(self._config.swarm.agents)]
@@ -202,7 +204,7 @@ class Bringup(Base):
         while True:
             try:
                 return ZenohBus(
-                    self.site.endpoint, self.site.run, OPERATOR, listen, self._config.bus.lease_ms, _BUS_TRY_MS
+                    self.context.endpoint, self.context.run, OPERATOR, listen, self._config.bus.lease_ms, _BUS_TRY_MS
                 )
             except StartError as error:
                 if router.poll() is not None:
@@ -211,16 +213,16 @@ class Bringup(Base):
                     raise StartError(f"router does not answer within {_BUS_S:.0f} s; see {router.log}") from error
 
 
-def _introduction(config: Config, site: Site, ground: Ground) -> tuple[str, ...]:
-    """Three lines that say what runs."""
+def _introduction(config: Config, context: RunContext, reserved: ReservedPorts) -> tuple[str, ...]:
+    """Return three lines that say what runs."""
     agents = config.swarm.agents
     if config.sitl.enabled:
         vehicles = f"built-in SITL ({config.sitl.preset}) on {LOOPBACK}"
     else:
         vehicles = ", ".join(vehicle.url for vehicle in config.vehicles[:agents])
-    view = f"view on port {ground.view_port}" if ground.view_port else "no view"
+    view = f"view on port {reserved.view_port}" if reserved.view_port else "no view"
     return (
-        f"{site.run}: {agents} agent{'s' if agents > 1 else ''}, {vehicles}",
-        f"bus {site.endpoint}; {view}",
-        f"run folder {site.directory}",
+        f"{context.run}: {agents} agent{'s' if agents > 1 else ''}, {vehicles}",
+        f"bus {context.endpoint}; {view}",
+        f"run folder {context.directory}",
     )

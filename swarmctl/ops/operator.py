@@ -1,10 +1,9 @@
-"""How an operator's command finds a running launch and speaks to it over the bus.
+"""Operator client: finds a running launch and commands it over the bus.
 
-A launch leaves a note in its run folder and one in each registry: private directories of the user, in the user's
-runtime directory and beside other temporary files, so that a verb from a session without the former finds it as well.
-Every note holds the launch's process, so that a stale one is recognised; what is not private or of somebody else is
-ignored, whatever its name. The verbs repeat what they say until they see an answer, because a fresh session may speak
-before its router has told it who listens.
+A launch leaves a note in its run folder and in each registry, a private directory of the user: one in the runtime
+directory and one beside other temporary files, so that sessions without a runtime directory find it too. A note holds
+the process id and start time, so that a stale one is recognised; what is not private or not owned by the user is
+ignored. Verbs repeat their message until answered, because the router of a fresh session may not know the subscribers.
 """
 
 from __future__ import annotations
@@ -47,23 +46,23 @@ LAUNCH_FILE = "launch.json"
 _ANSWER_S = 5.0
 _REPEAT_S = 0.2
 _START_TOLERANCE_S = 1.0
-_MAX_BYTES = 65_536  # of a note
+_MAX_BYTES = 65_536  # size limit of a note
 
 
 class RunningLaunch(msgspec.Struct, frozen=True):
-    """What an operator needs to join a launch."""
+    """Data with which an operator joins a launch."""
 
     run: str
     bus: str
     pid: int
-    started_s: float  # of the process, UTC; a reused pid has another
+    started_s: float  # start of the process, UTC; a reused pid has another
     agents: int
     run_dir: str
-    view: str = ""  # address of the live view, "" without
+    view: str = ""  # address of the live view; "" without one
 
 
 def announce(launch: RunningLaunch) -> None:
-    """Write the notes of a launch; a disk that takes none costs the operator's verbs, never the flight."""
+    """Write the notes of a launch; on a full disk the operator's verbs are lost, but not the flight."""
     payload = msgspec.json.encode(launch)
     notes = [Path(launch.run_dir) / LAUNCH_FILE]
     notes += [place / f"{launch.pid}.json" for place in (_runtime_registry(), _temporary_registry()) if place]
@@ -73,19 +72,19 @@ def announce(launch: RunningLaunch) -> None:
 
 
 def withdraw() -> None:
-    """Take this process's notes out of the registries."""
+    """Remove this process's notes from the registries."""
     for registry in _registries():
         with contextlib.suppress(OSError):
             (registry / f"{os.getpid()}.json").unlink(missing_ok=True)
 
 
 def process_start_s() -> tuple[float, int]:
-    """When this process began, UTC [s], and its id."""
+    """Return the start time of this process, UTC [s], and its id."""
     return psutil.Process().create_time(), os.getpid()
 
 
 def find_launch(run_dir: Path | None) -> RunningLaunch:
-    """The launch of a run folder, or this user's newest that runs.
+    """Return the launch of a run folder, or the newest running launch of this user.
 
     Raises:
         StartError: there is none.
@@ -119,7 +118,7 @@ def _joined(launch: RunningLaunch) -> Iterator[ZenohBus]:
 
 
 def view_address(launch: RunningLaunch) -> str:
-    """Where the live view is served.
+    """Return the address of the live view.
 
     Raises:
         StartError: this launch has none.
@@ -130,16 +129,16 @@ def view_address(launch: RunningLaunch) -> str:
 
 
 def read_statuses(launch: RunningLaunch) -> dict[int, StatusMessage]:
-    """Newest status of every agent that says one in time."""
+    """Return the newest status of every agent that publishes one in time, by agent."""
     with _joined(launch) as bus:
         return _statuses(bus, range(launch.agents), _ANSWER_S)
 
 
 def command(launch: RunningLaunch, verb: str, agent: int | None) -> dict[int, StatusMessage]:
-    """Ask one agent, or all, for a verb; returns what the asked ones say a second later.
+    """Send a verb to one agent or to all, and return the statuses of the addressed ones a second later.
 
     Raises:
-        StartError: there is no such agent, or none of the asked ones is on the bus.
+        StartError: there is no such agent, or none of the addressed agents is on the bus.
     """
     if agent is not None and not 0 <= agent < launch.agents:
         raise StartError(f"--agent {agent}: this launch has agents 0 to {launch.agents - 1}")
@@ -160,10 +159,10 @@ def command(launch: RunningLaunch, verb: str, agent: int | None) -> dict[int, St
 
 
 def read_obstacles(launch: RunningLaunch) -> ObstaclesMessage:
-    """The list of obstacles the launch repeats.
+    """Return the obstacle list that the launch repeats.
 
     Raises:
-        StartError: it says nothing in time.
+        StartError: the launch does not answer in time.
     """
     with _joined(launch) as bus:
         return _obstacles(bus, 0)
@@ -172,11 +171,7 @@ def read_obstacles(launch: RunningLaunch) -> ObstaclesMessage:
 def change_obstacles(
     launch: RunningLaunch, change: Callable[[tuple[ObstacleMessage, ...]], tuple[ObstacleMessage, ...]]
 ) -> ObstaclesMessage:
-    """Replace the list by `change(list)` and wait until the launch repeats the new one.
-
-    Raises:
-        StartError: the launch does not answer.
-    """
+    """Replace the obstacle list by `change(list)` and wait until the launch repeats the new one."""
     with _joined(launch) as bus:
         old = _obstacles(bus, 0)
         changed = change(old.obstacles)
@@ -189,7 +184,7 @@ def change_obstacles(
 def obstacle(
     center: str, radius_m: float, keep_out_m: float, visibility_m: float, velocity: str, column: bool = False
 ) -> ObstacleMessage:
-    """An obstacle from what somebody typed; vectors as `north,east,down`, shared frame.
+    """Return the obstacle that a command line describes; vectors are `north,east,down`, shared frame.
 
     Raises:
         ConfigError: a number is missing, not finite or out of range.
@@ -206,10 +201,10 @@ def obstacle(
 
 
 def without(known: tuple[ObstacleMessage, ...], number: int) -> tuple[ObstacleMessage, ...]:
-    """The list without one of its members.
+    """Return the list without the member of index `number`.
 
     Raises:
-        ConfigError: it has none of that number.
+        ConfigError: there is no such index.
     """
     if not 0 <= number < len(known):
         raise ConfigError("obstacle", [f"remove {number}: there are {len(known)}, counted from 0; see: obstacle list"])
@@ -243,9 +238,9 @@ def _obstacles(bus: ZenohBus, least_version: int, say: bytes | None = None) -> O
 def _statuses(
     bus: ZenohBus, agents: range, timeout_s: float, ahead_us: dict[int, int] | None = None
 ) -> dict[int, StatusMessage]:
-    """Newest status of each of `agents`, as soon as all have said one or when time is up.
+    """Return the newest status of each of `agents`, once all have published one or the time is up.
 
-    `ahead_us` is told by how much the clock of each is ahead of ours.
+    `ahead_us` receives the offset of each agent's clock from ours [us].
     """
     heard: dict[int, StatusMessage] = {}
     deadline_s = time.monotonic() + timeout_s
@@ -263,7 +258,7 @@ def _statuses(
 
 
 def _registries() -> list[Path]:
-    """Private directories of this user that may hold notes."""
+    """Return the private directories of this user that may hold notes."""
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     places = [Path(runtime) / "swarmctl"] if runtime and _is_private(Path(runtime)) else []
     places += sorted(_temporary_folder().glob(f"{_temporary_name()}*"))
@@ -271,7 +266,7 @@ def _registries() -> list[Path]:
 
 
 def _runtime_registry() -> Path | None:
-    """The user's own runtime directory is nobody else's to squat on; None where there is none."""
+    """Return the registry in the user's runtime directory, which no other user can write, or None without one."""
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     if not runtime or not _is_private(Path(runtime)):
         return None
@@ -282,7 +277,7 @@ def _runtime_registry() -> Path | None:
 
 
 def _temporary_registry() -> Path | None:
-    """Where anybody may take the plain name first, one with a name nobody can foresee serves as well."""
+    """Return a private registry among temporary files; with a random name if another user has taken the usual one."""
     plain = _temporary_folder() / _temporary_name()
     with contextlib.suppress(OSError):
         plain.mkdir(mode=0o700, exist_ok=True)
@@ -303,7 +298,7 @@ def _temporary_name() -> str:
 
 
 def _is_private(place: Path) -> bool:
-    """Whether it is a directory, no link, of this user, and closed to everybody else."""
+    """Return whether this is a directory (no link) of this user that is closed to all others."""
     try:
         status = place.lstat()
     except OSError:
@@ -326,5 +321,7 @@ def _runs(launch: RunningLaunch) -> bool:
 
 
 def as_json(statuses: dict[int, StatusMessage]) -> str:
-    """Statuses for programs: a JSON list, one object per agent."""
-    return json.dumps(msgspec.to_builtins(list(statuses.values())), indent=2)  # ASCII: agents may say anything
+    """Return statuses as a JSON list with one object per agent."""
+    return json.dumps(
+        msgspec.to_builtins(list(statuses.values())), indent=2
+    )  # ASCII: an agent's text may contain anything

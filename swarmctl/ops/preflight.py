@@ -1,7 +1,6 @@
-"""Everything that can be refused before anything starts: packages, ports, vehicle links. All problems at once.
+"""Preflight: checks packages, ports and vehicle links before a launch, and reports all problems at once.
 
-What it finds free it keeps: the vehicle ports are bound here and handed down, so that no other launch can take them
-between the check and the flight.
+Free vehicle ports are bound here and passed on, so that no other launch can take them between the check and the flight.
 """
 
 from __future__ import annotations
@@ -35,25 +34,25 @@ _NEEDED_TO_VIEW = {"rerun-sdk": (0, 41)}
 
 
 @dataclass(frozen=True, slots=True)
-class Ground:
-    """What preflight found and holds."""
+class ReservedPorts:
+    """Ports that the preflight has bound for the launch."""
 
-    sockets: tuple[socket.socket, ...]  # one bound socket per agent with the built-in simulator, else none
-    ports: tuple[int, ...]  # theirs
+    sockets: tuple[socket.socket, ...]  # with the built-in simulator one bound socket per agent, else none
+    ports: tuple[int, ...]  # ports of these sockets
     view_port: int  # 0 when telemetry is off
     vehicle_sockets: tuple[socket.socket, ...] = ()  # the simulator's ends of the same links
 
     def release(self) -> None:
-        """Close this process's copies; agents keep theirs."""
+        """Close this process's copies of the sockets; agents keep theirs."""
         for sock in (*self.sockets, *self.vehicle_sockets):
             sock.close()
 
 
-def inspect(config: Config) -> Ground:
-    """Check everything, then take the ports.
+def inspect(config: Config) -> ReservedPorts:
+    """Check everything, then bind the ports.
 
     Raises:
-        StartError: with every problem found, one line each: key, value, fix.
+        StartError: with every problem, one line each: key, value, fix.
     """
     problems = list(_package_problems(config))
     sockets: tuple[socket.socket, ...] = ()
@@ -62,7 +61,7 @@ def inspect(config: Config) -> Ground:
         if importlib.util.find_spec("sitl") is None:
             problems.append("sitl.enabled = true: package 'sitl' is not installed; install the whole distribution")
         try:
-            sockets = claim_ports(2 * count)  # both ends: an agent then knows where its vehicle is
+            sockets = claim_ports(2 * count)  # both ends, so that an agent knows the address of its vehicle
         except StartError as error:
             problems.append(str(error))
     else:
@@ -74,18 +73,18 @@ def inspect(config: Config) -> Ground:
             "choose another or set telemetry.enabled = false"
         )
     ports = tuple(sock.getsockname()[1] for sock in sockets[:count])
-    ground = Ground(sockets[:count], ports, view_port, sockets[count:])
+    reserved = ReservedPorts(sockets[:count], ports, view_port, sockets[count:])
     if problems:
-        ground.release()
+        reserved.release()
         raise StartError("\n".join(problems))
-    return ground
+    return reserved
 
 
 def claim_ports(count: int) -> tuple[socket.socket, ...]:
-    """Bind `count` loopback UDP ports that nobody else knows of.
+    """Bind `count` loopback UDP ports that no other program knows.
 
-    Not PX4's own 14540 and up: every other simulator on the machine sends there until it is answered, and an agent
-    would take the first one it hears for its vehicle.
+    PX4's usual ports from 14540 on are avoided: every other simulator on the machine sends there until it is answered,
+    and an agent would take the first sender for its vehicle.
 
     Raises:
         StartError: the machine has no port left.
@@ -131,7 +130,7 @@ def _vehicle_problems(config: Config) -> Iterator[str]:
 
 
 def _free_view_port(first: int) -> int:
-    """First TCP port from `first` on that nobody listens on; 0 when all are taken."""
+    """Return the first TCP port from `first` on without a listener; 0 when all are taken."""
     for port in range(first, min(first + _VIEW_PORTS_TRIED, 65536)):
         with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as sock:
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)

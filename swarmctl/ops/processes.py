@@ -1,7 +1,7 @@
-"""The processes of a launch: one table of command lines, and a child that is started, watched and ended.
+"""The processes of a launch: a table of command lines, and a child process that is started, watched and ended.
 
-Every child has a session of its own, so that Ctrl-C in the terminal reaches the launcher alone, writes to
-`DIR/<name>.log`, and asks the kernel to end it with the launcher. Nothing here knows about flying.
+Every child has its own session, so that Ctrl-C in the terminal reaches the launcher alone. It writes to
+`DIR/<name>.log`, and the kernel ends it with the launcher.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ _TAIL_BYTES = 4096
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """One row of the table: what to run under which name, and the descriptors it inherits."""
+    """One process to start: its name, its command line, and the file descriptors it inherits."""
 
     name: str
     argv: tuple[str, ...]
@@ -47,8 +47,8 @@ class Command:
 
 
 @dataclass(frozen=True, slots=True)
-class Site:
-    """Where a launch happens: what every command line has in common."""
+class RunContext:
+    """Values that all command lines of a launch share: run name, bus endpoint, run folder."""
 
     run: str
     endpoint: str
@@ -56,32 +56,36 @@ class Site:
 
 
 def run_name(name: str) -> str:
-    """A name for one run on the bus, new every time."""
+    """Return a name for one run on the bus that is new every time."""
     return f"{name}-{secrets.token_hex(4)}"
 
 
 def router_command(endpoint: str) -> Command:
-    """Router of the bus."""
+    """Return the command of the bus router."""
     return Command(ROUTER, _python("-m", "swarmctl.bus.zenoh_bus", "--router", endpoint, "--die-with-parent"))
 
 
 def agent_commands(
     config: Config,
-    site: Site,
+    context: RunContext,
     sockets: Sequence[socket.socket],
     vehicles: Sequence[socket.socket] = (),
     config_path: Path | None = None,
 ) -> tuple[Command, ...]:
-    """One agent for each vehicle; `sockets` are the ends of their links that they inherit, or none.
+    """Return one agent command per vehicle.
 
-    `vehicles` are the simulator's ends of them, whose ports the agents are told. `config_path` is where the resolved
-    configuration is, when it is not in the site's folder.
+    Args:
+        config: the configuration of the launch.
+        context: the run.
+        sockets: the agents' ends of the vehicle links, which they inherit; empty for real vehicles.
+        vehicles: the simulator's ends of these links, whose ports the agents are given.
+        config_path: resolved configuration, when it is not in the run folder.
     """
     commands = []
     for agent in range(config.swarm.agents):
-        argv = _python("-m", "swarmctl", "agent", "--config", f"{config_path or site.directory / 'config.toml'}")
+        argv = _python("-m", "swarmctl", "agent", "--config", f"{config_path or context.directory / 'config.toml'}")
         argv += ("--id", f"{agent}")
-        argv += ("--run", site.run, "--bus", site.endpoint, "--run-dir", f"{site.directory}")
+        argv += ("--run", context.run, "--bus", context.endpoint, "--run-dir", f"{context.directory}")
         fds = (sockets[agent].fileno(),) if sockets else ()
         argv += ("--fd", f"{fds[0]}") if fds else ()
         argv += ("--vehicle-port", f"{vehicles[agent].getsockname()[1]}") if vehicles else ()
@@ -89,8 +93,10 @@ def agent_commands(
     return tuple(commands)
 
 
-def sitl_command(config: Config, site: Site, ports: Sequence[int], sockets: Sequence[socket.socket] = ()) -> Command:
-    """The built-in simulator, which sends to `ports` on loopback from `sockets`, or chooses its own."""
+def sitl_command(
+    config: Config, context: RunContext, ports: Sequence[int], sockets: Sequence[socket.socket] = ()
+) -> Command:
+    """Return the command of the built-in simulator, which sends from `sockets`, or own ports, to loopback `ports`."""
     sitl, swarm = config.sitl, config.swarm
     starts = config.starts_ned_m()
     if sitl.start == "ground":
@@ -107,28 +113,33 @@ def sitl_command(config: Config, site: Site, ports: Sequence[int], sockets: Sequ
     argv += ("--local-fds", ",".join(map(str, fds))) if fds else ()
     argv += ("--physics-hz", f"{sitl.physics_hz}", "--mass-scale", f"{sitl.mass_scale!r}", "--start", sitl.start)
     argv += _realism(sitl)
-    argv += ("--control", f"{control_socket(site.endpoint)}", "--events", f"{site.directory / 'sitl.events.jsonl'}")
-    argv += ("--truth", f"{site.directory / 'truth.bin'}", "--die-with-parent")
+    argv += (
+        "--control",
+        f"{control_socket(context.endpoint)}",
+        "--events",
+        f"{context.directory / 'sitl.events.jsonl'}",
+    )
+    argv += ("--truth", f"{context.directory / 'truth.bin'}", "--die-with-parent")
     return Command(SITL, argv, fds)
 
 
 def _realism(sitl: SitlParams) -> tuple[str, ...]:
-    """What differs from a plain flight, as the simulator's own `--set` items."""
+    """Return the simulator's `--set` items for every realism parameter that differs from its default."""
     defaults = RealismParams().model_dump()
     wanted = sitl.realism().model_dump()
     return tuple(f"--set={key}={toml_value(wanted[key])}" for key in wanted if wanted[key] != defaults[key])
 
 
 def control_socket(endpoint: str) -> Path:
-    """Where the simulator of a launch listens for faults: beside the bus."""
+    """Return the path of the socket on which the simulator of a launch takes faults: beside the bus."""
     return socket_file(endpoint).with_name("sitl.sock")
 
 
-def viewer_command(config: Config, site: Site, port: int, view: bool) -> Command:
-    """The process that owns rerun."""
-    argv = _python("-m", "swarmctl.telemetry.viewer", "--run", site.run, "--bus", site.endpoint)
-    argv += ("--agents", f"{config.swarm.agents}", "--run-dir", f"{site.directory}", "--port", f"{port}")
-    center, extent_m = _stage(config)
+def viewer_command(config: Config, context: RunContext, port: int, view: bool) -> Command:
+    """Return the command of the viewer process, which owns rerun."""
+    argv = _python("-m", "swarmctl.telemetry.viewer", "--run", context.run, "--bus", context.endpoint)
+    argv += ("--agents", f"{config.swarm.agents}", "--run-dir", f"{context.directory}", "--port", f"{port}")
+    center, extent_m = _scene_bounds(config)
     argv += ("--look-at", *(f"{c:.3f}" for c in center), "--extent", f"{extent_m:.3f}")
     argv += ("--rate-hz", f"{config.telemetry.rate_hz!r}", "--separation", f"{config.separation.radius_m!r}")
     argv += ("--limit", f"{config.limits.min_separation_m!r}")
@@ -137,8 +148,8 @@ def viewer_command(config: Config, site: Site, port: int, view: bool) -> Command
     return Command(VIEWER, argv + (("--view",) if view else ()))
 
 
-def _stage(config: Config) -> tuple[tuple[float, ...], float]:
-    """Middle (3,) and half size [m] of the box that holds every start and the whole reference, for the camera."""
+def _scene_bounds(config: Config) -> tuple[tuple[float, ...], float]:
+    """Return the centre (3,) and half size [m] of the box round all starts and the reference, for the camera."""
     starts = np.array(config.starts_ned_m())
     times_s = np.linspace(0.0, config.mission.duration_s, 200)
     flown = [MissionReference(config.mission, starts, agent).sample(times_s)[0] for agent in range(len(starts))]
@@ -153,7 +164,7 @@ def _python(*arguments: str) -> tuple[str, ...]:
 
 
 class Child:
-    """One started process. Start it from the main thread: the kernel ties its life to the thread that did."""
+    """A started process. Start it from the main thread: the kernel ties its life to the thread that did."""
 
     def __init__(self, command: Command, directory: Path) -> None:
         self.name = command.name
@@ -175,7 +186,7 @@ class Child:
         self.pid = self._process.pid
 
     def poll(self) -> int | None:
-        """Exit code as a shell has it (128 + signal), None while running."""
+        """Return the exit code as a shell does (128 + signal), or None while running."""
         code = self._process.poll()
         if code is None:
             return None
@@ -184,7 +195,7 @@ class Child:
         return code if code >= 0 else 128 - code
 
     def is_stopped(self) -> bool:
-        """Whether it is frozen by a signal or a debugger."""
+        """Return whether it is stopped by a signal or a debugger."""
         with contextlib.suppress(psutil.Error):
             return bool(psutil.Process(self.pid).status() in (psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP))
         return False
@@ -195,18 +206,18 @@ class Child:
             self._process.send_signal(signum)
 
     def kill_all(self) -> None:
-        """SIGKILL to everything in the child's session, also to what it left behind."""
+        """Send SIGKILL to every process of the child's session, also to orphans of it."""
         with contextlib.suppress(ProcessLookupError, PermissionError):
             os.killpg(self.pid, signal.SIGKILL)
 
     def wait(self, timeout_s: float) -> bool:
-        """Whether it ended in time."""
+        """Wait, and return whether it ended in time."""
         with contextlib.suppress(subprocess.TimeoutExpired):
             self._process.wait(max(0.0, timeout_s))
         return self.poll() is not None
 
     def how_it_ended(self) -> str:
-        """In words, with the last line it wrote."""
+        """Return how it ended, in words, with its last line of output."""
         code = self._process.poll()
         if code is None:
             return "is running"
@@ -216,12 +227,12 @@ class Child:
         return f"ended with exit code {code}" + (f": {last}" if last else "")
 
     def last_line(self) -> str:
-        """Last line of its log that is not empty."""
+        """Return the last line of its log that is not empty."""
         lines = [line.strip() for line in self._tail().splitlines() if line.strip()]
         return lines[-1] if lines else ""
 
     def line_with(self, text: str) -> str:
-        """First line of its log that contains `text`, or nothing."""
+        """Return the first line of its log that contains `text`, or ""."""
         with contextlib.suppress(OSError):
             for line in self.log.read_text(encoding="utf-8", errors="replace").splitlines():
                 if text in line:
@@ -236,7 +247,7 @@ class Child:
 
 
 def end_all(children: Sequence[Child], grace_s: float) -> None:
-    """SIGTERM, a common deadline, then SIGKILL for whatever is left of their sessions."""
+    """Send SIGTERM, wait for a common deadline, then SIGKILL the remaining sessions."""
     for child in children:
         if child.poll() is None:
             child.signal(signal.SIGTERM)
@@ -247,7 +258,7 @@ def end_all(children: Sequence[Child], grace_s: float) -> None:
 
 
 def kill_all(children: Sequence[Child]) -> None:
-    """End everything now, and collect it."""
+    """Kill every process now, and reap it."""
     for child in children:
         child.kill_all()
     for child in children:
@@ -255,5 +266,5 @@ def kill_all(children: Sequence[Child]) -> None:
 
 
 def _environment(base: Mapping[str, str]) -> dict[str, str]:
-    """One thread for what rerun shares out, as `kernels` has for linear algebra: N agents share the cores."""
+    """Return the environment of a child. Rayon (rerun) gets one thread, as linear algebra: agents share the cores."""
     return {**base, "RAYON_NUM_THREADS": "1", "PYTHONUNBUFFERED": "1", PARENT_ENV: str(os.getpid())}

@@ -1,8 +1,8 @@
-"""What becomes of a vehicle whose agent ended before the vehicle was known to be on the ground and disarmed.
+"""Recovery of a vehicle whose agent ended before the vehicle was known to be on the ground and disarmed.
 
-A second agent is started on the same link that only lands it and waits for the HEARTBEAT that says "disarmed". The
-autopilot's own failsafes act meanwhile; this is for what they leave over, and to know. A vehicle that can't be
-recovered is named: no launch ends with an armed vehicle unsaid.
+A second agent is started on the same link. It only lands the vehicle and waits for the HEARTBEAT that reports it as
+disarmed; the autopilot's own failsafes act meanwhile. A vehicle that can't be recovered is named, so that no launch
+ends with an armed vehicle unreported.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_START
 from swarmctl.ops.processes import Child
 from swarmctl.ops.status_table import AgentView, name_of
 
-RECOVERY_S = 90.0  # a failsafe that first returns home needs most of it
+RECOVERY_S = 90.0  # a failsafe that returns home first needs most of it
 _DOWN = (EXIT_OK, EXIT_INTERRUPTED)  # an agent ends with these only when its vehicle is down
 
 
 class Recovery:
-    """Keeps account of every vehicle of a launch.
+    """Keeps track of every vehicle of a launch that may be left armed.
 
     Args:
         start: starts an agent on a vehicle's link that only lands it.
@@ -30,18 +30,18 @@ class Recovery:
     def __init__(self, start: Callable[[int], Child], sysids: Sequence[int]) -> None:
         self._start, self._sysids = start, sysids
         self._begun_s: dict[int, float] = {}
-        self._lost: set[int] = set()  # agents whose vehicles are not known to be down, and nobody looks any more
+        self._lost: set[int] = set()  # agents whose vehicles are not known to be down, and are not watched any more
 
     def is_on(self, agent: int) -> bool:
-        """Whether the agent that runs, or ran last, on this vehicle only lands it."""
+        """Return whether the newest agent of this vehicle only lands it."""
         return agent in self._begun_s
 
     def is_overdue(self, agent: int) -> bool:
-        """Whether landing a vehicle takes longer than it may."""
+        """Return whether the recovery of a vehicle takes longer than allowed."""
         return agent in self._begun_s and time.monotonic() - self._begun_s[agent] > RECOVERY_S
 
     def begin(self, view: AgentView, code: int) -> Child | None:
-        """Take note of an agent that ended; returns the process that goes on with its vehicle, or None."""
+        """Register an ended agent; return the process that recovers its vehicle, or None."""
         if code in _DOWN or (code == EXIT_START and not self.is_on(view.agent)):
             self._lost.discard(view.agent)
             return None
@@ -54,11 +54,11 @@ class Recovery:
         return self._start(view.agent)
 
     def left(self, views: Sequence[AgentView]) -> list[str]:
-        """Vehicles that may still be armed or in the air, in words."""
+        """Return one line for each vehicle that may still be armed or in the air."""
         return [self._words(view) for view in views if view.agent in self._lost]
 
     def give_up(self, views: Sequence[AgentView]) -> None:
-        """Count every vehicle whose agent is killed now, and was not done, as lost."""
+        """Count every vehicle whose agent is killed before it was done as lost."""
         going = (view for view in views if view.status is not None and view.status.phase != Phase.DONE)
         self._lost |= {view.agent for view in going if view.status and view.status.phase >= Phase.ARM}
 

@@ -1,4 +1,4 @@
-"""What a launch shows while it runs: a live table on a terminal, one line per change of phase anywhere else."""
+"""Status display of a launch: a live table on a terminal, one line per change of phase elsewhere."""
 
 from __future__ import annotations
 
@@ -21,41 +21,41 @@ from swarmctl.core.text import printable
 from swarmctl.core.types import Mode, Phase
 
 REFRESH_HZ = 4.0
-_LINE = 2000  # characters of a line that stays
+_LINE = 2000  # longest printed line
 _COLUMNS = ("agent", "phase", "mode", "error m", "separation m", "tick p99 ms", "missed", "staleness ms", "alert")
 
 
 @dataclass(slots=True)
 class AgentView:
-    """What the launcher knows of one agent."""
+    """The launcher's view of one agent."""
 
     agent: int
     status: StatusMessage | None = None
-    heard_s: float = 0.0  # monotonic, when `status` came
-    note: str = ""  # what the launcher itself has seen: how it ended, that it is silent
+    heard_s: float = 0.0  # arrival of `status`, monotonic
+    note: str = ""  # the launcher's own observation: how it ended, that it is silent
 
 
 class Display(Protocol):
-    """Where a launch speaks."""
+    """Output of a launch."""
 
     def say(self, text: str) -> None:
-        """One line that stays."""
+        """Print one line that stays."""
 
     def show(self, agents: Sequence[AgentView]) -> None:
-        """The present state; cheap to call often."""
+        """Show the present state; cheap to call often."""
 
     def close(self) -> None:
-        """Leave the last state standing."""
+        """Leave the last state on the screen."""
 
 
 def open_display(stream: TextIO | None = None) -> Display:
-    """A live table when `stream` (standard output) is a terminal, plain lines otherwise."""
+    """Return a live table when `stream` (default: standard output) is a terminal, plain lines otherwise."""
     console = Console(file=stream or sys.stdout, highlight=False)
     return LiveTable(console) if console.is_terminal else PlainLines(stream or sys.stdout)
 
 
 class LiveTable:
-    """Redrawn in place; `say` prints above it. A terminal that is gone is no reason to stop flying."""
+    """Redraws a table in place and prints lines above it. A lost terminal does not stop the flight."""
 
     def __init__(self, console: Console) -> None:
         self._console = console
@@ -85,7 +85,7 @@ class LiveTable:
 
 
 class PlainLines:
-    """For logs and pipes: a line when an agent's phase or the launcher's note on it changes."""
+    """Prints a line when an agent's phase or the launcher's note on it changes, for logs and pipes."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
@@ -93,7 +93,7 @@ class PlainLines:
         self._last: dict[int, tuple[str, str]] = {}
 
     def say(self, text: str) -> None:
-        with contextlib.suppress(OSError):  # the reader of the pipe is gone; the flight goes on
+        with contextlib.suppress(OSError):  # the pipe is closed; the flight goes on
             print(printable(text, _LINE), file=self._stream, flush=True)
 
     def show(self, agents: Sequence[AgentView]) -> None:
@@ -111,7 +111,7 @@ class PlainLines:
 
 
 def print_statuses(agents: Sequence[AgentView]) -> None:
-    """Once, on standard output: a table on a terminal, one line per agent anywhere else."""
+    """Print the statuses once: a table on a terminal, one line per agent elsewhere."""
     console = Console(highlight=False)
     if console.is_terminal:
         console.print(status_table(agents))
@@ -121,15 +121,15 @@ def print_statuses(agents: Sequence[AgentView]) -> None:
 
 
 def status_table(agents: Sequence[AgentView]) -> Table:
-    """One row per agent."""
+    """Return the table with one row per agent."""
     table = Table(*_COLUMNS)
     for view in agents:
-        table.add_row(*map(Text, status_cells(view)))  # not markup: agents may say "[...]"
+        table.add_row(*map(Text, status_cells(view)))  # not markup: an agent's text may contain "[...]"
     return table
 
 
 def status_cells(view: AgentView) -> tuple[str, ...]:
-    """Cells of one agent, in the order of the columns."""
+    """Return the cells of one agent, in the order of the columns."""
     status = view.status
     if status is None:
         return (agent_name(view.agent), *[""] * (len(_COLUMNS) - 2), printable(view.note) or "not heard yet")
@@ -147,7 +147,7 @@ def status_cells(view: AgentView) -> tuple[str, ...]:
 
 
 def name_of(kind: type[Phase] | type[Mode], number: int) -> str:
-    """Name of an enum value that came over the bus; unknown ones as a number."""
+    """Return the name of an enum value from the bus; an unknown one as a number."""
     try:
         return kind(number).name
     except ValueError:
@@ -155,5 +155,5 @@ def name_of(kind: type[Phase] | type[Mode], number: int) -> str:
 
 
 def _number(value: float | None, digits: int) -> str:
-    """A quantity that can't be negative; below zero says that there is none."""
+    """Format a quantity that can't be negative; a negative value means that there is none."""
     return "-" if value is None or not math.isfinite(value) or value < 0 else f"{value:.{digits}f}"

@@ -1,4 +1,4 @@
-"""The end of a run: hand the folder to the referee and say the result in five lines."""
+"""End of a run: the referee judges the run folder, and the result is printed in five lines."""
 
 from __future__ import annotations
 
@@ -10,41 +10,41 @@ from typing import TYPE_CHECKING, Any
 from swarmctl.config import Config, load
 from swarmctl.core.text import printable
 from swarmctl.errors import ConfigError
-from swarmctl.ops.supervisor import Verdict
+from swarmctl.ops.supervisor import LaunchResult
 
 if TYPE_CHECKING:
     from swarmctl.telemetry.referee import Rules
 
 
-def sum_up(config: Config, directory: Path, verdict: Verdict, say: Callable[[str], None]) -> bool:
-    """Finish the run folder and say how it went; returns whether the referee found a limit broken.
+def sum_up(config: Config, directory: Path, result: LaunchResult, say: Callable[[str], None]) -> bool:
+    """Finish the run folder and print the result; return whether the referee found a violation.
 
-    A folder that can't be read or written is a problem of the run, never a reason to lose the verdict.
+    A folder that can't be read or written is a problem of the run, and never loses the result.
     """
     from swarmctl.telemetry.recordings import optimize_recording  # heavy
     from swarmctl.telemetry.run_folder import Outcome, finish_run
 
     try:
-        rules = _rules(config, verdict)
-        summary, unwritten = finish_run(directory, rules, Outcome(verdict.outcome, tuple(verdict.problems)))
+        rules = _rules(config, result)
+        summary, unwritten = finish_run(directory, rules, Outcome(result.outcome, tuple(result.problems)))
     except Exception as error:
-        known = {"outcome": verdict.outcome, "violations": list(verdict.problems)}
+        known = {"outcome": result.outcome, "violations": list(result.problems)}
         for line in (*violation_lines(known), *summary_lines(known, directory)):
             say(line)
-        verdict.problems.append(f"summary: {error}")
+        result.problems.append(f"summary: {error}")
         say(f"the run can't be judged: {error!r}. What was recorded is in {directory}")
         return False
     for line in (*violation_lines(summary), *summary_lines(summary, directory)):
         say(line)
     if unwritten:
-        verdict.problems.append(f"run folder: {'; '.join(unwritten)}")
+        result.problems.append(f"run folder: {'; '.join(unwritten)}")
         say(unwritten_line(directory, unwritten))
     optimize_recording(directory)
     return bool(summary.get("violations"))
 
 
 def unwritten_line(directory: Path, unwritten: Sequence[str]) -> str:
-    """What to say of files that the disk did not take."""
+    """Return the line that reports files the disk did not take."""
     return (
         f"not everything could be written to {directory}: {'; '.join(unwritten)}. "
         f"Make room, then: swarmctl report {directory}"
@@ -52,7 +52,7 @@ def unwritten_line(directory: Path, unwritten: Sequence[str]) -> str:
 
 
 def rewrite_report(directory: Path) -> Path:
-    """Write `report.html` of a run folder again; returns its path.
+    """Write `report.html` of a run folder again and return its path.
 
     Raises:
         ConfigError: it is no run folder.
@@ -66,22 +66,22 @@ def rewrite_report(directory: Path) -> Path:
     return report_run(directory, load(directory / CONFIG).rules())
 
 
-def _rules(config: Config, verdict: Verdict) -> Rules:
-    """What the configuration asks for; obstacles as an operator left them."""
+def _rules(config: Config, result: LaunchResult) -> Rules:
+    """Return the limits of the configuration, with obstacles as an operator left them."""
     from swarmctl.telemetry.referee import ObstacleRule
 
     rules = config.rules()
-    if verdict.obstacles is None:
+    if result.obstacles is None:
         return rules
     changed = tuple(
         ObstacleRule(item.center_ned_m, item.keep_out_m, item.vel_ned_m_s, since_us, item.column)
-        for item, since_us in verdict.obstacles.items()
+        for item, since_us in result.obstacles.items()
     )
     return replace(rules, obstacles=changed)
 
 
 def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...]:
-    """Outcome, separation, timing, solver and bus, folder."""
+    """Return five lines: outcome, separation, timing, solver and bus, folder."""
     violations = summary.get("violations") or []
     separation, obstacles = _section(summary, "separation"), _section(summary, "obstacles")
     timing, solver, comms = (_section(summary, name) for name in ("timing", "solver", "comms"))
@@ -115,7 +115,7 @@ def _unheard(comms: Mapping[str, Any]) -> str:
 
 
 def violation_lines(summary: Mapping[str, Any]) -> tuple[str, ...]:
-    """One line for each violation, where the first line of the summary does not hold the only one."""
+    """Return one line per violation when there are several; the summary's first line holds a single one."""
     violations = summary.get("violations") or []
     return tuple(f"violation: {printable(violation)}" for violation in violations) if len(violations) > 1 else ()
 

@@ -1,7 +1,7 @@
-"""One flight as its supervisor sees it: listen to agents, watch processes, order the landing, and keep the verdict.
+"""Supervision of one flight: reads agents' status, watches processes, orders the landing and collects the result.
 
-It never flies: it speaks to agents as an operator on the bus. A process that dies is reported and the others go on,
-except when what died carries the flight (router, simulator): then everybody lands.
+The supervisor never flies: it commands agents as an operator on the bus. When a process dies, that is reported and the
+others go on; only without an essential process (router, simulator) all agents land.
 """
 
 from __future__ import annotations
@@ -31,72 +31,72 @@ from swarmctl.bus.topics import (
 from swarmctl.config import Config
 from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START
-from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, Site, kill_all
+from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, RunContext, kill_all
 from swarmctl.ops.recovery import RECOVERY_S, Recovery
 from swarmctl.ops.status_table import AgentView, Display, name_of
 
 _STEP_S = 0.05
-_HEARD_S = 60.0  # for every agent to be on the bus
-_VEHICLE_S = 90.0  # for every agent to hear its vehicle
-_BEYOND_MISSION_S = 300.0  # take-off, waiting, landing: a flight longer than its mission and this is ended
+_HEARD_S = 60.0  # timeout for every agent to appear on the bus
+_VEHICLE_S = 90.0  # timeout for every agent to receive its vehicle
+_BEYOND_MISSION_S = 300.0  # for take-off, waiting and landing; a longer flight is ended
 _SILENCE_S = 5.0
 _LAND_S = 60.0
 _LAND_REPEAT_S = 0.5
 _LAND_OBEYED_S = 10.0
 _OBSTACLES_REPEAT_S = 1.0
-_AFTER_DEATH_S = 3.0  # a dead agent's vehicle needs its simulator to land
+_AFTER_DEATH_S = 3.0  # the simulator must outlive a dead agent until its vehicle has landed
 
 
 class EventLog:
-    """`launch.events.jsonl` of the run folder; a full disk loses events, never the flight."""
+    """Writes `launch.events.jsonl` of the run folder; a full disk loses events, never the flight."""
 
     def __init__(self, path: Path) -> None:
         self._path = path
 
     def write(self, event: str, **fields: Any) -> None:
-        """Append one row, stamped with both clocks."""
+        """Append one row with both clocks."""
         now = {"utc_us": time.time_ns() // 1000, "t_us": time.monotonic_ns() // 1000, "source": "launch"}
         with contextlib.suppress(OSError), self._path.open("a", encoding="utf-8") as file:
             file.write(json.dumps({**now, "event": event, **fields}) + "\n")
 
 
-class Base:
-    """What a flight stands on; `swarmctl.ops.launch` brings it up and takes it down."""
+class Services:
+    """Services that a flight relies on; `swarmctl.ops.launch` starts and stops them."""
 
-    site: Site
+    context: RunContext
     log: EventLog
-    children: dict[str, Child]  # by name, agents as on the bus
+    children: dict[str, Child]  # by name; agents have their names on the bus
     bus: Bus | None = None
 
     def announce(self, view: str) -> None:
-        """Publish the address of the live view to operators' commands."""
+        """Publish the address of the live view to the operator's commands."""
         raise NotImplementedError
 
     def recover(self, agent: int) -> Child:
-        """Start an agent on the vehicle of one that ended; it only lands that vehicle."""
+        """Start an agent that only lands the vehicle of an ended one."""
         raise NotImplementedError
 
 
 @dataclass(slots=True)
-class Verdict:
-    """How it went, collected on the way."""
+class LaunchResult:
+    """The result of a launch, collected during the flight."""
 
     problems: list[str] = field(default_factory=list)
     could_not_start: bool = False
-    has_armed: bool = False  # somebody has asked a vehicle to arm
+    has_armed: bool = False  # an agent has requested arming
     left: tuple[str, ...] = ()  # vehicles that may still be armed or in the air, in words
     interrupted: bool = False
-    obstacles: dict[ObstacleMessage, int | None] | None = None  # since when [us UTC]; None: as configured
+    obstacles: dict[ObstacleMessage, int | None] | None = None  # obstacle -> since when [us UTC]; None: as configured
 
     @property
     def outcome(self) -> str:
-        """As in summary.json."""
+        """Outcome as in summary.json."""
         if self.interrupted:
             return "interrupted"
         return "failed" if self.problems else "completed"
 
     def exit_code(self, violated: bool) -> int:
-        """Of the whole launch; `violated`: the referee found a limit broken."""
+        """Return the exit code of the launch; `violated`: the referee found a violation."""
         if self.left:
             return EXIT_MISSION
         if self.interrupted:
@@ -107,69 +107,69 @@ class Verdict:
 
 
 def why_it_failed(outcome: str, last_line: str) -> str:
-    """Why an agent ended with a failure: what its mission came to, or what went wrong after a complete one."""
+    """Return why an agent failed: the outcome of its mission, or its last line after a complete one."""
     return (outcome if outcome != "completed" else "") or last_line or "no reason given"
 
 
-class Flight:
-    """Watches one launch until every agent has ended, or has been given up."""
+class FlightSupervisor:
+    """Watches one launch until every agent has ended or has been given up."""
 
-    def __init__(self, config: Config, base: Base, display: Display) -> None:
-        if base.bus is None:
+    def __init__(self, config: Config, services: Services, display: Display) -> None:
+        if services.bus is None:
             raise ValueError("the bus must be up before the flight is watched")
         self._config = config
-        self._base = base
-        self._bus: Bus = base.bus
+        self._services = services
+        self._bus: Bus = services.bus
         self._display = display
-        self._verdict = Verdict()
+        self._result = LaunchResult()
         self._views = [AgentView(agent) for agent in range(config.swarm.agents)]
         self._configured = first_obstacles(o.model_dump() for o in config.obstacles)
         self._obstacles = self._configured
         self._obstacles_said_s = 0.0
         self._started_s = time.monotonic()
         self._reported: set[str] = set()
-        self._carrier_lost = False  # router or simulator is gone
-        self._vehicles_lost = False  # the simulator is gone, and its vehicles with it
-        self._recovery = Recovery(base.recover, config.sysids())
+        self._essential_lost = False  # an essential process, router or simulator, has ended
+        self._vehicles_lost = False  # the simulator has ended, and its vehicles with it
+        self._recovery = Recovery(services.recover, config.sysids())
         self._land_ordered_s: float | None = None
         self._land_said_s = 0.0
         self._land_until_s = 0.0
 
-    def fly(self, interrupts: Callable[[], int]) -> Verdict:
-        """Watch to the end.
+    def fly(self, interrupts: Callable[[], int]) -> LaunchResult:
+        """Watch the flight to its end.
 
         Args:
-            interrupts: how often the operator has asked to stop; once lands everybody, twice kills everything.
+            interrupts: number of stop requests; the first lands all agents, the second kills all processes.
         """
         while interrupts() < 2:
             self._hear()
-            self._watch_carriers()
+            self._watch_essential_processes()
             self._watch_viewer()
             self._watch_agents()
             self._watch_time()
-            if interrupts() and not self._verdict.interrupted:
-                self._verdict.interrupted = True
+            if interrupts() and not self._result.interrupted:
+                self._result.interrupted = True
                 self._say("interrupted", "interrupted: landing; once more ends everything at once")
                 self._land(_LAND_S)
             self._speak()
             self._display.show(self._views)
             if self._is_over():
-                return self._name_the_left()
+                return self._report_left_vehicles()
             time.sleep(_STEP_S)
-        self._verdict.interrupted = True
+        self._result.interrupted = True
         self._fail("killed", "interrupted twice: every process was killed, vehicles were left to their autopilots")
         running = self._running()
-        kill_all(list(self._base.children.values()))
+        kill_all(list(self._services.children.values()))
         if not self._config.sitl.enabled:
             self._recovery.give_up(running)
-        return self._name_the_left()
+        return self._report_left_vehicles()
 
-    def _name_the_left(self) -> Verdict:
-        """Say of every vehicle that is not known to be down that it is not."""
-        self._verdict.left = () if self._vehicles_lost else tuple(self._recovery.left(self._views))
-        for words in self._verdict.left:
+    def _report_left_vehicles(self) -> LaunchResult:
+        """Report every vehicle that is not known to be on the ground."""
+        self._result.left = () if self._vehicles_lost else tuple(self._recovery.left(self._views))
+        for words in self._result.left:
             self._fail("vehicle_left", words)
-        return self._verdict
+        return self._result
 
     def _hear(self) -> None:
         for sender, payload in self._bus.receive(STATUS):
@@ -178,70 +178,70 @@ class Flight:
                 continue
             view = self._views[status.agent]
             if view.status is None or view.status.phase != status.phase:
-                self._base.log.write("phase", agent=status.agent, phase=name_of(Phase, status.phase))
+                self._services.log.write("phase", agent=status.agent, phase=name_of(Phase, status.phase))
             view.status, view.heard_s = status, time.monotonic()
-            self._verdict.has_armed |= Phase.ARM <= status.phase < Phase.DONE
+            self._result.has_armed |= Phase.ARM <= status.phase < Phase.DONE
         for _, payload in self._bus.receive(OBSTACLES):
             message = decode_obstacles(payload)
             if message is not None and message.replaces(self._obstacles.version):
                 self._adopt(message)
 
     def _adopt(self, message: ObstaclesMessage) -> None:
-        """An operator has changed the list: repeat the new one, and judge what is new in it from now on."""
+        """Adopt an operator's obstacle list: repeat it, and judge its new obstacles from now on."""
         self._obstacles, self._obstacles_said_s = message, 0.0
         now_us = time.time_ns() // 1000
-        known = self._verdict.obstacles or dict.fromkeys(self._configured.obstacles)
-        self._verdict.obstacles = {item: known.get(item, now_us) for item in message.obstacles}
+        known = self._result.obstacles or dict.fromkeys(self._configured.obstacles)
+        self._result.obstacles = {item: known.get(item, now_us) for item in message.obstacles}
         self._say("obstacles", f"{len(message.obstacles)} obstacles, set by an operator", version=message.version)
 
-    def _watch_carriers(self) -> None:
-        """Router and simulator: without them there is nothing to go on with."""
+    def _watch_essential_processes(self) -> None:
+        """Land all agents when the router or the simulator, without which the flight can't go on, has ended."""
         for name, land_s in ((ROUTER, _LAND_S), (SITL, _AFTER_DEATH_S)):
-            child = self._base.children.get(name)
-            if child is not None and child.poll() is not None and self._once(name):
-                self._carrier_lost = True
+            child = self._services.children.get(name)
+            if child is not None and child.poll() is not None and self._is_first(name):
+                self._essential_lost = True
                 self._vehicles_lost |= name == SITL
-                self._verdict.could_not_start |= not any(view.status for view in self._views)
+                self._result.could_not_start |= not any(view.status for view in self._views)
                 self._fail(f"{name}_ended", f"{name} {child.how_it_ended()}; landing. See {child.log}")
                 self._land(land_s)
 
     def _watch_viewer(self) -> None:
-        child = self._base.children.get(VIEWER)
+        child = self._services.children.get(VIEWER)
         if child is None:
             return
         if child.poll() is not None:
-            if self._once(VIEWER):
+            if self._is_first(VIEWER):
                 self._say(
                     "viewer_ended", f"view and recording stopped: viewer {child.how_it_ended()}; the flight goes on"
                 )
         elif "view address" not in self._reported:
             line = child.line_with("viewer rerun+")
-            if line and self._once("view address"):
+            if line and self._is_first("view address"):
                 address = line.removeprefix("viewer ")
                 self._say("viewer_ready", f"view {address}", url=address)
-                self._base.announce(address)
-        elif child.is_stopped() and self._once("viewer stopped"):
+                self._services.announce(address)
+        elif child.is_stopped() and self._is_first("viewer stopped"):
             self._say("viewer_frozen", "viewer is frozen; the flight goes on")
 
     def _watch_agents(self) -> None:
         now_s = time.monotonic()
         for view in self._views:
-            child = self._base.children[agent_name(view.agent)]
+            child = self._services.children[agent_name(view.agent)]
             code = child.poll()
             if code is None:
                 self._judge_silence(view, child, now_s)
-            elif self._once(f"{child.name} {child.pid} ended"):
+            elif self._is_first(f"{child.name} {child.pid} ended"):
                 self._note_end(view, child, code)
                 self._recover(view, code)
 
     def _recover(self, view: AgentView, code: int) -> None:
-        """Have a vehicle that is not known to be down landed by another process on its link."""
+        """Start another process that lands a vehicle which is not known to be down."""
         if self._recovery.is_on(view.agent) and code == EXIT_INTERRUPTED:
             self._say("recovered", f"the vehicle of {agent_name(view.agent)} is on the ground and disarmed")
         child = None if self._vehicles_lost else self._recovery.begin(view, code)
         if child is None:
             return
-        self._base.children[agent_name(view.agent)] = child
+        self._services.children[agent_name(view.agent)] = child
         view.note, view.heard_s = "recovering", time.monotonic()
         self._say("recovering", f"landing the vehicle of {agent_name(view.agent)}, which may be armed or in the air")
         if self._land_ordered_s is not None:
@@ -250,19 +250,19 @@ class Flight:
     def _judge_silence(self, view: AgentView, child: Child, now_s: float) -> None:
         waited_s = now_s - self._started_s
         if view.status is None:
-            if waited_s > _HEARD_S and self._once(f"{child.name} unheard"):
+            if waited_s > _HEARD_S and self._is_first(f"{child.name} unheard"):
                 self._refuse(f"{child.name} is not on the bus after {_HEARD_S:.0f} s; see {child.log}")
         elif self._recovery.is_on(view.agent):
             if self._recovery.is_overdue(view.agent):
                 child.kill_all()
         elif now_s - view.heard_s > _SILENCE_S:
             view.note = "silent"
-            if self._once(f"{child.name} silent"):
+            if self._is_first(f"{child.name} silent"):
                 self._fail("agent_silent", f"{child.name} has been silent for {_SILENCE_S:.0f} s; the others fly on")
         elif view.note:
             view.note = ""
             self._say("agent_back", f"{child.name} is heard again")
-        elif view.status.phase == Phase.CONNECT and waited_s > _VEHICLE_S and self._once(f"{child.name} vehicle"):
+        elif view.status.phase == Phase.CONNECT and waited_s > _VEHICLE_S and self._is_first(f"{child.name} vehicle"):
             url = self._config.vehicles[view.agent].url if self._config.vehicles else "the built-in SITL"
             self._refuse(
                 f"{child.name} hears no vehicle at {url} after {_VEHICLE_S:.0f} s; check that it is on and sends"
@@ -270,7 +270,7 @@ class Flight:
 
     def _watch_time(self) -> None:
         limit_s = self._config.mission.duration_s + _BEYOND_MISSION_S
-        if time.monotonic() - self._started_s > limit_s and self._once("too long"):
+        if time.monotonic() - self._started_s > limit_s and self._is_first("too long"):
             self._fail("too_long", f"the flight did not end within {limit_s:.0f} s; landing")
             self._land(_LAND_S)
 
@@ -284,7 +284,7 @@ class Flight:
             self._repeat_land_order(now_s, now_s - self._land_ordered_s)
 
     def _repeat_land_order(self, now_s: float, since_s: float) -> None:
-        """Over the bus until everybody shows that it lands, stamped anew each time, after a while also by signal."""
+        """Repeat the order on the bus, newly stamped, until every agent shows that it lands; later also by signal."""
         running = (view for view in self._running() if not self._recovery.is_on(view.agent))
         deaf = [view for view in running if view.status is None or view.status.phase < Phase.GOTO_LAND]
         if deaf:
@@ -294,25 +294,27 @@ class Flight:
             for order in orders("land", EVERYBODY, time.time_ns() // 1000, clocks_us):
                 self._bus.publish(COMMAND, order)
         for view in deaf:
-            child = self._base.children[agent_name(view.agent)]
-            if since_s > _LAND_OBEYED_S and self._once(f"{child.name} told by signal"):
+            child = self._services.children[agent_name(view.agent)]
+            if since_s > _LAND_OBEYED_S and self._is_first(f"{child.name} told by signal"):
                 child.signal(signal.SIGTERM)
 
     def _is_over(self) -> bool:
-        """Whether nobody is left to wait for. Silent agents are given up when nobody else flies."""
+        """Return whether no agent is left to wait for. Silent agents are given up when no other one flies."""
         now_s = time.monotonic()
         running = self._running()
         if self._land_ordered_s is not None and now_s > self._land_until_s:
             for view in running:
                 if not self._recovery.is_on(view.agent):
                     self._fail("not_landed", f"{agent_name(view.agent)} did not end in time and was killed")
-                kill_all([self._base.children[agent_name(view.agent)]])
+                kill_all([self._services.children[agent_name(view.agent)]])
             return not running
         if not running:
             deaths_s = [
-                c.ended_s for c in self._base.children.values() if c.ended_s is not None and c.poll() not in (0, 130)
+                c.ended_s
+                for c in self._services.children.values()
+                if c.ended_s is not None and c.poll() not in (0, 130)
             ]
-            return self._carrier_lost or not deaths_s or now_s - max(deaths_s) > _AFTER_DEATH_S
+            return self._essential_lost or not deaths_s or now_s - max(deaths_s) > _AFTER_DEATH_S
         if self._land_ordered_s is None and all(view.note == "silent" for view in running):
             bus_is_suspect = len(running) == len(self._views) and len(running) > 1
             self._land(_LAND_S if bus_is_suspect else _AFTER_DEATH_S)
@@ -320,11 +322,11 @@ class Flight:
 
     def _note_end(self, view: AgentView, child: Child, code: int) -> None:
         view.note = "done" if code == EXIT_OK else f"exit {code}"
-        self._base.log.write("agent_ended", agent=view.agent, exit_code=code)
-        if code == EXIT_OK or self._carrier_lost or self._recovery.is_on(view.agent):
+        self._services.log.write("agent_ended", agent=view.agent, exit_code=code)
+        if code == EXIT_OK or self._essential_lost or self._recovery.is_on(view.agent):
             return
         if code == EXIT_INTERRUPTED:
-            self._verdict.interrupted |= self._land_ordered_s is None  # an operator's `land`
+            self._result.interrupted |= self._land_ordered_s is None  # ended by an operator's `land`
         elif code == EXIT_START:
             self._refuse(f"{child.name} could not start: {child.last_line()}")
         elif code == EXIT_MISSION:
@@ -337,36 +339,36 @@ class Flight:
             self._fail("agent_died", f"{child.name} {child.how_it_ended()}; the others fly on")
 
     def _land(self, timeout_s: float) -> None:
-        """Ask all to land, over the bus; by signal where the bus can't reach."""
+        """Order all agents to land over the bus; by signal where the bus does not reach."""
         now_s = time.monotonic()
         if self._land_ordered_s is None:
             self._land_ordered_s, self._land_until_s = now_s, now_s + timeout_s
-            self._base.log.write("land")
+            self._services.log.write("land")
         self._land_until_s = min(self._land_until_s, now_s + timeout_s)
         for view in self._running():
             if self._recovery.is_on(view.agent):
                 continue
-            if self._carrier_lost or view.status is None or view.note == "silent":
-                self._base.children[agent_name(view.agent)].signal(signal.SIGTERM)
+            if self._essential_lost or view.status is None or view.note == "silent":
+                self._services.children[agent_name(view.agent)].signal(signal.SIGTERM)
 
     def _refuse(self, problem: str) -> None:
-        self._verdict.could_not_start = True
+        self._result.could_not_start = True
         self._fail("start_failed", problem)
         self._land(_LAND_S)
 
     def _fail(self, event: str, problem: str) -> None:
-        self._verdict.problems.append(problem)
+        self._result.problems.append(problem)
         self._say(event, problem)
 
     def _say(self, event: str, text: str, **fields: Any) -> None:
-        self._base.log.write(event, text=text, **fields)
+        self._services.log.write(event, text=text, **fields)
         self._display.say(text)
 
-    def _once(self, what: str) -> bool:
+    def _is_first(self, what: str) -> bool:
         if what in self._reported:
             return False
         self._reported.add(what)
         return True
 
     def _running(self) -> list[AgentView]:
-        return [view for view in self._views if self._base.children[agent_name(view.agent)].poll() is None]
+        return [view for view in self._views if self._services.children[agent_name(view.agent)].poll() is None]

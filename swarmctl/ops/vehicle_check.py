@@ -1,7 +1,7 @@
-"""`swarmctl check`: ask every vehicle of a configuration at once, judge, print one table and what to fix.
+"""`swarmctl check`: scans all vehicles of a configuration at once, and prints one table and what to fix.
 
-Changes nothing unless told to apply, and then only wanted parameters of vehicles that are disarmed on the ground. The
-built-in simulator, where the configuration flies it, is started for the check and ended with it.
+Nothing is changed without `--apply`, and with it only wanted parameters of vehicles that are disarmed on the ground. A
+configured built-in simulator is started for the check and ended with it.
 """
 
 from __future__ import annotations
@@ -19,46 +19,46 @@ from types import FrameType
 from swarmctl.bus.zenoh_bus import SCHEME
 from swarmctl.check.change import Change
 from swarmctl.check.link_facts import VehicleFacts
-from swarmctl.check.listener import NOWHERE, Address, Ear, UdpEar, monotonic_us, open_ear
+from swarmctl.check.listener import NOWHERE, Address, Listener, UdpListener, monotonic_us, open_listener
 from swarmctl.check.parameters import Number, changes, names_to_read, unchangeable
 from swarmctl.check.scan_facts import facts_of, unreached
-from swarmctl.check.scanner import Probe, survey
+from swarmctl.check.scanner import VehicleScan, run_scans
 from swarmctl.check.swarm import exit_code, findings, standing
 from swarmctl.check.table import as_json, print_check
 from swarmctl.config import Config
 from swarmctl.core.types import GeoOrigin
 from swarmctl.errors import StartError
 from swarmctl.ops.preflight import claim_ports
-from swarmctl.ops.processes import Child, Site, end_all, run_name, sitl_command
+from swarmctl.ops.processes import Child, RunContext, end_all, run_name, sitl_command
 
 _CONNECT_S = 5.0  # heartbeats come once a second
-_SIMULATOR_S = 20.0  # to come up, on a machine that is busy
-_PATIENCE_S = 3.0  # with a vehicle that is not ready yet
+_SIMULATOR_S = 20.0  # to start on a busy machine
+_PATIENCE_S = 3.0  # for a vehicle that is not ready yet
 _SIMULATOR_PATIENCE_S = 15.0
-_LONGER_S = 8.0  # than asked for: parameters over a slow link
+_LONGER_S = 8.0  # for parameters over a slow link
 _APPLY_S = 15.0
 _STOP_S = 5.0
 
 
 @dataclass(frozen=True, slots=True)
 class CheckOptions:
-    """What is not part of the configuration."""
+    """Options of the check that are not part of the configuration."""
 
     apply: bool = False
-    seconds: float = 3.0  # to listen to every vehicle, after its first heartbeat
+    seconds: float = 3.0  # time to listen to every vehicle after its first heartbeat
     json: Path | None = None
     connect_s: float = _CONNECT_S
-    to_fly: bool = False  # who is armed already is not for us to fly
+    to_fly: bool = False  # a flight follows: armed vehicles are findings, because another party flies them
 
 
 def check(config: Config, options: CheckOptions) -> int:
-    """Check a configuration's vehicles; returns the exit code.
+    """Check the vehicles of a configuration and return the exit code.
 
     Raises:
         StartError: the built-in simulator does not come up, or the JSON file can't be written.
     """
-    with _interruptible(), _field(config, options) as field:
-        vehicles, changed = _ask(config, options, field)
+    with _interruptible(), _vehicle_links(config, options) as opened:
+        vehicles, changed = _scan(config, options, opened)
     lines = findings(vehicles, config) + [change.finding() for change in changed if not change.done]
     if options.to_fly:
         lines += standing(vehicles)
@@ -75,119 +75,121 @@ def check(config: Config, options: CheckOptions) -> int:
 
 @dataclass(frozen=True, slots=True)
 class _Link:
-    """Where one vehicle is heard, or why it can't be."""
+    """The opened link of one vehicle, or why it can't be opened."""
 
     url: str
-    ear: Ear | None
+    listener: Listener | None
     there: Address
     problem: str = ""
 
 
 @dataclass(frozen=True, slots=True)
-class _Field:
-    """All vehicles."""
+class _VehicleLinks:
+    """The links of all vehicles."""
 
     links: Sequence[_Link]
     connect_s: float
     simulator: Child | None = None
 
     def ended(self) -> bool:
-        """Whether a simulator that was started here is gone."""
+        """Return whether a simulator that was started here has ended."""
         return self.simulator is not None and self.simulator.poll() is not None
 
 
-def _ask(config: Config, options: CheckOptions, field: _Field) -> tuple[list[VehicleFacts], list[Change]]:
-    links = field.links
+def _scan(config: Config, options: CheckOptions, opened: _VehicleLinks) -> tuple[list[VehicleFacts], list[Change]]:
+    links = opened.links
     sysids = config.sysids()
     names = partial(names_to_read, config=config)
-    patience_s = _PATIENCE_S if field.simulator is None else _SIMULATOR_PATIENCE_S
-    probes = {
-        agent: Probe(link.ear, link.there, sysids[agent], names, options.seconds, patience_s)
+    patience_s = _PATIENCE_S if opened.simulator is None else _SIMULATOR_PATIENCE_S
+    scans = {
+        agent: VehicleScan(link.listener, link.there, sysids[agent], names, options.seconds, patience_s)
         for agent, link in enumerate(links)
-        if link.ear is not None
+        if link.listener is not None
     }
-    longest_s = field.connect_s + options.seconds + patience_s + _LONGER_S
-    survey(list(probes.values()), field.connect_s, longest_s, field.ended)
-    if field.simulator is not None and field.ended():
-        raise StartError(f"built-in simulator {field.simulator.how_it_ended()}")
-    vehicles = _facts(config, links, probes)
+    longest_s = opened.connect_s + options.seconds + patience_s + _LONGER_S
+    run_scans(list(scans.values()), opened.connect_s, longest_s, opened.ended)
+    if opened.simulator is not None and opened.ended():
+        raise StartError(f"built-in simulator {opened.simulator.how_it_ended()}")
+    vehicles = _facts(config, links, scans)
     if not options.apply:
         return vehicles, []
     wanted = {facts.agent: changes(facts, config) for facts in vehicles}
     for facts in vehicles:
         if wanted[facts.agent] and not unchangeable(facts):
-            probes[facts.agent].set_parameters(wanted[facts.agent])
-    survey(list(probes.values()), 0.0, _APPLY_S, field.ended)
-    after = _facts(config, links, probes)
+            scans[facts.agent].set_parameters(wanted[facts.agent])
+    run_scans(list(scans.values()), 0.0, _APPLY_S, opened.ended)
+    after = _facts(config, links, scans)
     return after, [
-        _changed(before, now, name, value, probes[before.agent])
+        _changed(before, now, name, value, scans[before.agent])
         for before, now in zip(vehicles, after, strict=True)
         for name, value in wanted[before.agent].items()
     ]
 
 
-def _facts(config: Config, links: Sequence[_Link], probes: dict[int, Probe]) -> list[VehicleFacts]:
+def _facts(config: Config, links: Sequence[_Link], scans: dict[int, VehicleScan]) -> list[VehicleFacts]:
     swarm, sysids, now_us = config.swarm, config.sysids(), monotonic_us()
     shared = GeoOrigin(swarm.origin_lat_deg, swarm.origin_lon_deg, swarm.origin_alt_m)
     return [
-        facts_of(probes[agent], agent, link.url, sysids[agent], shared, now_us)
-        if agent in probes
+        facts_of(scans[agent], agent, link.url, sysids[agent], shared, now_us)
+        if agent in scans
         else unreached(agent, link.url, sysids[agent], link.problem)
         for agent, link in enumerate(links)
     ]
 
 
-def _changed(before: VehicleFacts, now: VehicleFacts, name: str, wanted: Number, probe: Probe) -> Change:
+def _changed(before: VehicleFacts, now: VehicleFacts, name: str, wanted: Number, scan: VehicleScan) -> Change:
     refused = unchangeable(before)
-    if not refused and probe.parameters is not None and probe.parameters.interrupted:
+    if not refused and scan.parameters is not None and scan.parameters.interrupted:
         refused = "it was armed, or fell silent, meanwhile"
     was = before.number(name)
-    assert was is not None  # `changes` leaves out what is not known
+    assert was is not None  # `changes` leaves out unknown values
     return Change(before.agent, name, was, wanted, now.number(name), refused)
 
 
-# --- where the vehicles are ---
+# --- vehicle links ---
 
 
 @contextlib.contextmanager
-def _field(config: Config, options: CheckOptions) -> Iterator[_Field]:
+def _vehicle_links(config: Config, options: CheckOptions) -> Iterator[_VehicleLinks]:
     if config.sitl.enabled:
-        with _simulator(config) as field:
-            yield field
+        with _simulator(config) as opened:
+            yield opened
         return
     links = [_open(vehicle.url) for vehicle in config.vehicles[: config.swarm.agents]]
     try:
-        yield _Field(links, options.connect_s)
+        yield _VehicleLinks(links, options.connect_s)
     finally:
         _close(links)
 
 
 def _open(url: str) -> _Link:
     try:
-        ear, there = open_ear(url)
+        listener, there = open_listener(url)
     except StartError as error:
         return _Link(url, None, NOWHERE, str(error))
-    return _Link(url, ear, there)
+    return _Link(url, listener, there)
 
 
 def _close(links: Sequence[_Link]) -> None:
     for link in links:
-        if link.ear is not None:
-            link.ear.close()
+        if link.listener is not None:
+            link.listener.close()
 
 
 @contextlib.contextmanager
-def _simulator(config: Config) -> Iterator[_Field]:
-    """The simulator a launch would start, on ports of its own."""
+def _simulator(config: Config) -> Iterator[_VehicleLinks]:
+    """Start the simulator of a launch on separate ports, and yield its links."""
     sockets = claim_ports(config.swarm.agents)
     ports = [sock.getsockname()[1] for sock in sockets]
-    links = [_Link(f"built-in simulator, port {p}", UdpEar(s), NOWHERE) for s, p in zip(sockets, ports, strict=True)]
+    links = [
+        _Link(f"built-in simulator, port {p}", UdpListener(s), NOWHERE) for s, p in zip(sockets, ports, strict=True)
+    ]
     directory = Path(tempfile.mkdtemp(prefix="swarm-check-"))
     children: list[Child] = []
-    site = Site(run_name(config.name), f"{SCHEME}{directory / 'bus.sock'}", directory)
+    context = RunContext(run_name(config.name), f"{SCHEME}{directory / 'bus.sock'}", directory)
     try:
-        children.append(Child(sitl_command(config, site, ports), directory))
-        yield _Field(links, _SIMULATOR_S, children[0])
+        children.append(Child(sitl_command(config, context, ports), directory))
+        yield _VehicleLinks(links, _SIMULATOR_S, children[0])
     finally:
         end_all(children, _STOP_S)
         _close(links)
@@ -196,7 +198,7 @@ def _simulator(config: Config) -> Iterator[_Field]:
 
 @contextlib.contextmanager
 def _interruptible() -> Iterator[None]:
-    """SIGTERM and SIGHUP as Ctrl-C, once: from then on they are ignored, so that what was started here is ended."""
+    """Handle the first SIGTERM or SIGHUP as Ctrl-C and ignore later ones, so that started processes are ended."""
     signums = (signal.SIGTERM, signal.SIGHUP)
 
     def interrupt(signum: int, frame: FrameType | None) -> None:

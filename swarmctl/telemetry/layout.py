@@ -13,21 +13,21 @@ _TRAIL_S = 12.0  # length of the trails behind vehicles
 _TABS = 10  # largest number of agents that get a tab
 
 
-class Stage(NamedTuple):
+class SceneBounds(NamedTuple):
     """Bounds of the flight; the camera is placed to the south-west and above."""
 
     center_ned_m: tuple[float, float, float] = (0.0, 0.0, -2.0)
     extent_m: float = 6.0  # from the centre to the edge
 
 
-def layout(agents: int, stage: Stage) -> Any:
+def layout(agents: int, bounds: SceneBounds) -> Any:
     """Return the blueprint: scene, mode bars and log on the left, plots of the swarm and of each agent on the right."""
     names = [f"Agent {i}" for i in range(min(agents, _TABS))]
     tabs = [_swarm_plots(), *(_agent_plots(i, name) for i, name in enumerate(names))]
     below = rrb.Horizontal(
         rrb.StateTimelineView(origin="/state", name="Phase and mode"), _log(), column_shares=[3, 2], name="State"
     )
-    left = rrb.Vertical(_scene(agents, stage), below, row_shares=[5, 2])
+    left = rrb.Vertical(_scene(agents, bounds), below, row_shares=[5, 2])
     return rrb.Blueprint(
         rrb.Horizontal(left, rrb.Tabs(*tabs, active_tab=0), column_shares=[8, 5]),
         rrb.BlueprintPanel(state="collapsed"),
@@ -38,9 +38,9 @@ def layout(agents: int, stage: Stage) -> Any:
     )
 
 
-def _scene(agents: int, stage: Stage) -> Any:
-    north_m, east_m, down_m = stage.center_ned_m
-    away_m = max(stage.extent_m, 2.0)
+def _scene(agents: int, bounds: SceneBounds) -> Any:
+    north_m, east_m, down_m = bounds.center_ned_m
+    away_m = max(bounds.extent_m, 2.0)
     eye = (north_m - 1.2 * away_m, east_m - 1.05 * away_m, down_m - 1.2 * away_m)
     window = rr.VisibleTimeRange(TIMELINE, start=_cursor(-_TRAIL_S), end=_cursor())
     trails = [f"/world/trail/{i}" for i in range(agents)] + ["/world/reference_trail"]
@@ -49,7 +49,7 @@ def _scene(agents: int, stage: Stage) -> Any:
         name="Swarm, NED",
         background=[17, 21, 29],
         overrides={path: rrb.VisibleTimeRanges([window]) for path in trails},
-        eye_controls=rrb.EyeControls3D(position=eye, look_target=stage.center_ned_m, eye_up=(0, 0, -1)),
+        eye_controls=rrb.EyeControls3D(position=eye, look_target=bounds.center_ned_m, eye_up=(0, 0, -1)),
         line_grid=rrb.LineGrid3D(spacing=1.0, plane=rr.components.Plane3D.XY, color=[120, 130, 150, 60]),
     )
 

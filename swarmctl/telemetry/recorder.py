@@ -19,7 +19,7 @@ from typing import Any
 
 from swarmctl.core.records import TICK_DTYPE, tick_row
 from swarmctl.core.types import TickRecord
-from swarmctl.telemetry.plain import to_json
+from swarmctl.telemetry.json_safe import to_json
 
 _FLUSH_TIMEOUT_S = 0.25
 _QUEUE = 16384  # items; about 20 s of ticks and frames, 4 MB

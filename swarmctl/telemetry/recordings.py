@@ -18,7 +18,7 @@ from swarmctl.files import replaced_by_program
 from swarmctl.telemetry.referee import RunData
 
 if TYPE_CHECKING:
-    from swarmctl.telemetry.layout import Stage  # rerun takes a second to import
+    from swarmctl.telemetry.layout import SceneBounds  # rerun takes a second to import
 
 RECORDING = "telemetry.rrd"
 APPLICATION = "swarmctl"
@@ -125,7 +125,7 @@ def simulated_recording(
     rec.set_log_time_enabled(False)
     rec.set_sinks(rr.FileSink(path))
     flown = {agent: rows for agent, rows in run.ticks.items() if agent < agents and len(rows)}
-    scene = Scene(rec, agents, separation_m, limit_m, _stage(flown))
+    scene = Scene(rec, agents, separation_m, limit_m, _bounds(flown))
     scene.begin()
     epoch_us = min((int(rows["utc_us"][0]) for rows in flown.values()), default=0)
     drawn = read_obstacles(list(obstacles)) or []
@@ -142,14 +142,14 @@ def simulated_recording(
     return path
 
 
-def _stage(flown: Mapping[int, NDArray[np.void]]) -> Stage:
+def _bounds(flown: Mapping[int, NDArray[np.void]]) -> SceneBounds:
     """Return bounds that contain every flown position."""
-    from swarmctl.telemetry.layout import Stage
+    from swarmctl.telemetry.layout import SceneBounds
 
     pos_ned_m = np.concatenate([rows["pos_ned_m"] for rows in flown.values()]) if flown else np.zeros((1, 3))
     pos_ned_m = pos_ned_m[np.isfinite(pos_ned_m).all(axis=1)]
     if not len(pos_ned_m):
-        return Stage()
+        return SceneBounds()
     low, high = pos_ned_m.min(axis=0), pos_ned_m.max(axis=0)
     north_m, east_m, down_m = ((low + high) / 2).tolist()
-    return Stage((north_m, east_m, down_m), float((high - low).max() / 2) + 1.0)
+    return SceneBounds((north_m, east_m, down_m), float((high - low).max() / 2) + 1.0)

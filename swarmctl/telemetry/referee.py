@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from swarmctl.core.types import Array, Mode, PlanStatus
 from swarmctl.telemetry.hearing import refused_peers, unheard
-from swarmctl.telemetry.plain import finite, plain
+from swarmctl.telemetry.json_safe import finite, json_safe
 from swarmctl.telemetry.tracks import (
     Tracks,
     flight_rows,
@@ -112,7 +112,7 @@ def judge(
         "deadlocks": _deadlocks(run.events),
         "commitments": _commitments(run.events),
     }
-    result: dict[str, Any] = plain(summary)
+    result: dict[str, Any] = json_safe(summary)
     return result
 
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from swarmctl.core.records import TICK_DTYPE
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import replace_text, write_each
-from swarmctl.telemetry.plain import to_json
+from swarmctl.telemetry.json_safe import to_json
 from swarmctl.telemetry.referee import Rules, RunData, judge
 from swarmctl.telemetry.report import REPORT, write_report
 from swarmctl.telemetry.run_files import (

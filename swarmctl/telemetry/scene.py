@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from swarmctl.core.types import Array, Mode, Phase, PlanStatus
 from swarmctl.telemetry.attitude import roll_pitch_rad
-from swarmctl.telemetry.layout import TIMELINE, Stage, layout
+from swarmctl.telemetry.layout import TIMELINE, SceneBounds, layout
 from swarmctl.telemetry.obstacles import MovingObstacle
 from swarmctl.telemetry.palette import LIMIT_RGB, MODE_RGB, PHASE_RGB, REFERENCE_RGB, agent_rgb
 from swarmctl.telemetry.quad_mesh import quad_glb
 from swarmctl.telemetry.separation_feed import SeparationFeed
 
-_STAGE = Stage()
+_BOUNDS = SceneBounds()
 _REPEAT_US = 2_000_000  # period of repeated states, because the server's buffer drops rare data first
 _COLUMN_HALF_M = 30.0  # half of the height drawn of a column
 _PROBLEMS = {
@@ -49,15 +49,17 @@ class Scene:
         agents: size of the swarm.
         separation_m: separation that agents keep; the drawn spheres have half of it as radius.
         limit_m: distance below which the referee sees a violation.
-        stage: bounds of the scene for the camera.
+        bounds: bounds of the scene for the camera.
     """
 
-    def __init__(self, rec: Any, agents: int, separation_m: float, limit_m: float, stage: Stage = _STAGE) -> None:
+    def __init__(
+        self, rec: Any, agents: int, separation_m: float, limit_m: float, bounds: SceneBounds = _BOUNDS
+    ) -> None:
         self._rec = rec
         self._agents = agents
         self._separation_m = separation_m
         self._limit_m = limit_m
-        self._stage = stage
+        self._bounds = bounds
         self._seen: dict[int, _Seen] = {}
         self._pending: dict[int, list[tuple[NDArray[np.int64], NDArray[np.void]]]] = {}
         self._reference_ned_m: Array | None = None
@@ -65,7 +67,7 @@ class Scene:
 
     def begin(self) -> None:
         """Send the blueprint and all static entities; must be the first call on a new stream."""
-        self._rec.send_blueprint(layout(self._agents, self._stage), make_active=True, make_default=True)
+        self._rec.send_blueprint(layout(self._agents, self._bounds), make_active=True, make_default=True)
         self._static("world", rr.ViewCoordinates.FRD)
         self._static("world/reference", rr.Points3D.from_fields(colors=[REFERENCE_RGB], radii=[0.09]))
         self._static(

@@ -83,7 +83,7 @@ def _listed(text: str) -> object:
 def _run(options: argparse.Namespace, obstacles: list[MovingObstacle], stop: StopRequest) -> int:
     from swarmctl.bus.zenoh_bus import ZenohBus
     from swarmctl.telemetry.feed import Feed, listens_to
-    from swarmctl.telemetry.layout import Stage
+    from swarmctl.telemetry.layout import SceneBounds
     from swarmctl.telemetry.scene import Scene
 
     bus = _interruptible(lambda: ZenohBus(options.bus, options.run, "viewer", listens_to(options.agents)), stop)
@@ -92,7 +92,9 @@ def _run(options: argparse.Namespace, obstacles: list[MovingObstacle], stop: Sto
     rec, url = _serve(options.run, options.run_dir, options.port)
     limit_m = options.separation if options.limit is None else options.limit
     north_m, east_m, down_m = options.look_at
-    scene = Scene(rec, options.agents, options.separation, limit_m, Stage((north_m, east_m, down_m), options.extent))
+    scene = Scene(
+        rec, options.agents, options.separation, limit_m, SceneBounds((north_m, east_m, down_m), options.extent)
+    )
     scene.begin()
     feed = Feed(bus, options.agents)
     _announce(options, url)

@@ -88,7 +88,7 @@ class Hostile:
     # --- kinds ---
 
     def misaddressed(self) -> bytes:
-        """Any message of the dialect, every bit of it random, addressed to somebody else or to nobody."""
+        """Return any message of the dialect with random bits, addressed to another vehicle or to none."""
         shape = SHAPES[int(self._rng.integers(len(SHAPES)))]
         payload = bytearray(self._rng.bytes(shape.size))
         if shape.target_at is not None:
@@ -111,7 +111,7 @@ class Hostile:
         return self._nonsense[int(self._rng.integers(len(self._nonsense)))]
 
     def poisoned(self) -> bytes:
-        """Two bytes that promise a long frame, before and between harmless ones."""
+        """Return two bytes that announce a long frame, before and between harmless ones."""
         return POISON + self.misaddressed() + (POISON if self._rng.integers(2) else b"") + self.misaddressed()
 
     def signed_wrongly(self) -> bytes:
@@ -129,7 +129,7 @@ class Hostile:
         return bytes(plain) + self._rng.bytes(SIGNATURE_BYTES)
 
     def mavlink_1(self) -> bytes:
-        """An old frame to somebody else, whole or not."""
+        """Return an old frame to another vehicle, whole or not."""
         payload = struct.pack("<7fHBBB", *[1.0] * 7, ARM_DISARM, self._somebody_else(), 1, 0)
         body = struct.pack("<BBBBB", len(payload), 0, *self._source(), 76) + payload
         checksum = crc16.mcrf4xx(body + bytes((mav.mavlink_map[76].crc_extra,)))
@@ -207,7 +207,7 @@ class Hostile:
         yield from self._nonsense_transfers(not_finite)
 
     def _nonsense_transfers(self, not_finite: float) -> Iterator[Any]:
-        """Parameters that are not there, and mission steps nobody is waiting for."""
+        """Return reads of unknown parameters, and mission steps that no transfer expects."""
         sysid, rng = self._sysid, self._rng
         name = UNKNOWN_NAMES[int(rng.integers(len(UNKNOWN_NAMES)))]
         kind, index = int(rng.integers(256)), int(rng.choice([-32768, -2, 5000, 32767]))

@@ -81,7 +81,7 @@ class Bench:
                         heard[message_id(frame)].append(frame)
 
     def forget(self) -> None:
-        """What was heard so far is of no interest."""
+        """Discard everything received so far."""
         self.heard.clear()
         self.gcs_heard.clear()
 
@@ -120,7 +120,7 @@ class Bench:
         return self.command(176, 1, main, sub)
 
     def as_ground_station(self) -> Bench:
-        """From now on this end speaks as a ground station, which is told why a mode is refused."""
+        """Act as a ground station from now on, which receives the reason of a refused mode."""
         self.codec = Codec(1, GROUND_STATION)
         return self
 

@@ -39,7 +39,7 @@ def test_true_separation_is_kept_throughout(circle: Flight) -> None:
 
 
 def test_the_circle_is_tracked_with_every_plan_good(circle: Flight) -> None:
-    assert circle.summed_mean_error_m(after_s=5.0) <= 1.8, "least possible: 1.56"
+    assert circle.summed_mean_error_m(after_s=5.0) <= 1.8, "theoretical lower bound: 1.56"
     for agent in range(3):
         assert circle.modes(agent, Phase.TRACK) == {Mode.TRACKING}
 
@@ -52,7 +52,7 @@ def test_setpoints_were_taken_as_thrust_and_all_accepted(circle: Flight) -> None
         assert float(np.median(ticks["setpoint_thrust_01"])) == pytest.approx(0.3645, abs=0.02)
 
 
-def test_control_without_the_option_nothing_is_armed() -> None:
+def test_negative_control_without_the_option_nothing_is_armed() -> None:
     flight = fly_now("swarm.agents=1", "agent.autopilot_params.GUID_OPTIONS=0", config=CONFIG)
     (agent,) = flight.lockstep.agents
     assert agent is not None and "GUID_OPTIONS" in agent.outcome
@@ -70,7 +70,7 @@ def test_the_vehicle_of_a_dead_agent_lands_and_the_other_keeps_clear() -> None:
     assert flight.separation_m() >= 0.85
 
 
-def test_control_without_its_failsafe_it_would_never_be_armed() -> None:
+def test_negative_control_without_its_failsafe_it_would_never_be_armed() -> None:
     flight = fly_now("swarm.agents=1", "agent.autopilot_params.FS_GCS_ENABLE=0", config=CONFIG)
     (agent,) = flight.lockstep.agents
     assert agent is not None and "FS_GCS_ENABLE" in agent.outcome

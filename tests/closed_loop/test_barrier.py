@@ -55,7 +55,7 @@ def test_they_do_not_touch(count: int) -> None:
 
 
 @pytest.mark.parametrize("count", [2, 6])
-def test_control_without_it_they_touch(count: int) -> None:
+def test_negative_control_without_it_they_touch(count: int) -> None:
     flight = through_each_other(*ring(count), OFF)
     assert flight.separation_m() < BODY_M
     assert not any(safety_filter_ticks(flight))
@@ -67,7 +67,7 @@ def test_with_the_dead_time_and_lag_of_a_real_autopilot_they_do_not_touch() -> N
     assert min(safety_filter_ticks(flight)) > 10
 
 
-def test_control_of_a_lag_that_it_is_not_told_of_they_touch() -> None:
+def test_negative_control_of_a_lag_that_it_is_not_told_of_they_touch() -> None:
     plain = ("vehicle_model.attitude_rad_s=0", "vehicle_model.delay_s=0", "vehicle_model.drag_1_s=0")
     flight = through_each_other(*ring(2), "sitl.estimator=exact", *plain, config="x500_circle.toml")
     assert flight.separation_m() < X500_BODY_M

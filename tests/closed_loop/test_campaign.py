@@ -16,7 +16,7 @@ import pytest
 from scipy.stats import binomtest
 
 from sitl.studies.campaign.command import main
-from sitl.studies.campaign.flight import Flight, fly
+from sitl.studies.campaign.flight import TrialFlight, fly
 from sitl.studies.campaign.page import REPORT
 from sitl.studies.campaign.quick import QUICK
 from sitl.studies.campaign.scenarios import layout_of
@@ -53,7 +53,7 @@ def test_agents_that_see_each_other_do_not_collide(quick: Path) -> None:
     assert 2.0 < alone < 8.0
 
 
-def test_control_agents_that_see_nobody_do(quick: Path) -> None:
+def test_negative_control_agents_that_see_nobody_do(quick: Path) -> None:
     rows = [row for row in rows_in(quick) if row["protections"] == "off"]
     assert rows and all(row["collided"] and not row["arrived"] for row in rows)
     assert all(row["min_separation_m"] < TOUCH_M[row["scenario"]] for row in rows)
@@ -89,7 +89,7 @@ def test_the_report_has_every_cell_with_its_exact_interval(quick: Path) -> None:
 def test_scenario_events_happen_in_flight() -> None:
     """The bus of two agents is partitioned for 2 s: plans get stale, and both reach their goals."""
     trial = Trial(Cell("partition", 2, 0.0, 0.0, "exact", 0.0, "default"), 1)
-    flight = Flight(trial, layout_of("partition", 1, 2))
+    flight = TrialFlight(trial, layout_of("partition", 1, 2))
     flight.run()
     assert flight.row(None)["outcome"] == "arrived"
     for log in flight.lockstep.logs:

@@ -25,7 +25,7 @@ def test_true_separation_is_kept_throughout(circle: Flight) -> None:
 
 def test_summed_mean_tracking_error(circle: Flight) -> None:
     assert circle.summed_mean_error_m() <= 2.19, "thesis Table 19 at 3 x 0.3 m"
-    assert circle.summed_mean_error_m(after_s=10.0) <= 1.05 * np.sqrt(3) * 0.9, "within 5 % of the least possible"
+    assert circle.summed_mean_error_m(after_s=10.0) <= 1.05 * np.sqrt(3) * 0.9, "within 5 % of the lower bound"
 
 
 def test_no_plan_fails(circle: Flight) -> None:
@@ -41,7 +41,7 @@ def test_vehicles_come_down_a_metre_apart(circle: Flight) -> None:
     assert np.linalg.norm((down - starts)[:, :2], axis=1).max() < 0.3
 
 
-def test_control_agents_that_ignore_each_other_collide(fly: Fly) -> None:
+def test_negative_control_agents_that_ignore_each_other_collide(fly: Fly) -> None:
     alone = fly("controller.kind='mpc'", "agent.barrier.enabled=false", "mission.duration_s=5")
     assert alone.separation_m() < 0.3
 
@@ -52,7 +52,7 @@ def test_a_wrong_mass_costs_no_altitude(fly: Fly) -> None:
     assert np.abs(error[ticks["mission_t_s"] > 10, 2]).max() < 0.01
 
 
-def test_control_without_the_observer_a_wrong_mass_does(fly: Fly) -> None:
+def test_negative_control_without_the_observer_a_wrong_mass_does(fly: Fly) -> None:
     heavy = fly("sitl.mass_scale=1.25", "swarm.agents=1", "mission.duration_s=15", "agent.disturbance.enabled=false")
     ticks, error = heavy.tracked(0)
     assert np.abs(error[ticks["mission_t_s"] > 10, 2]).mean() > 0.05

@@ -17,8 +17,8 @@ FILES = sorted(path.name for path in (ROOT / "configs").glob("*.toml"))
 
 
 def test_the_documented_files_exist() -> None:
-    promised = {"swap8", "px4_udp", "px4_serial", "ardupilot_udp", "thesis_5_circle", "thesis_6_obstacle"}
-    assert promised <= {name.removesuffix(".toml") for name in FILES}
+    expected = {"swap8", "px4_udp", "px4_serial", "ardupilot_udp", "thesis_5_circle", "thesis_6_obstacle"}
+    assert expected <= {name.removesuffix(".toml") for name in FILES}
     assert {name.split("_")[1] for name in FILES if name.startswith("thesis_")} == set("123456")
 
 

@@ -99,7 +99,7 @@ def test_the_deadlock_is_reported(met: Flown) -> None:
     assert len(begun) == len(met.noted) / 2, "every deadlock has ended"
 
 
-def test_control_without_the_rule_they_do_not_get_by() -> None:
+def test_negative_control_without_the_rule_they_do_not_get_by() -> None:
     """They stand or push each other to and fro, which is the luck of a rounding; whether that is noticed as well."""
     flown = Flown(ENDS, -ENDS, 14.0, corridor(), *SMALL, "mission.goto.speed_m_s=1.0", "agent.deadlock.enabled=false")
     assert flown.distance_m.min() > 1.0
@@ -117,7 +117,7 @@ def test_three_sent_to_one_point_come_to_rest_round_it(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_control_without_places_of_their_own_they_push(seed: int) -> None:
+def test_negative_control_without_places_of_their_own_they_push(seed: int) -> None:
     """Whether one gets to the middle or they circle round it is the luck of a rounding, but none comes to rest."""
     flown = Flown(nudged(TRIANGLE, seed), np.zeros((1, 3)), 7.0, "mission.goto.goal_assignment=false")
     assert flown.moved_m > 0.1

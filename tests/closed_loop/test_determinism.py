@@ -19,6 +19,6 @@ def test_same_seed_same_bytes_in_any_order(first: Flight, fly: Fly) -> None:
     assert first.lockstep.truth.tobytes() == again.lockstep.truth.tobytes()
 
 
-def test_control_another_seed_loses_other_messages(first: Flight, fly: Fly) -> None:
+def test_negative_control_another_seed_loses_other_messages(first: Flight, fly: Fly) -> None:
     other = fly(*SHORT, "seed=8")
     assert first.lockstep.truth.tobytes() != other.lockstep.truth.tobytes()

@@ -33,7 +33,7 @@ def test_no_vehicle_passes_closely_below_another(fly: Fly, kind: str) -> None:
         assert np.linalg.norm(error[-1]) < 0.3, "both arrive"
 
 
-def test_control_as_spheres_they_do(fly: Fly) -> None:
+def test_negative_control_as_spheres_they_do(fly: Fly) -> None:
     flight = fly(*CROSSING)
     assert scaled_m(flight, 1.0) >= 0.85
     assert scaled_m(flight, 2.0) < 0.7

@@ -37,7 +37,9 @@ def test_a_dead_agent_lands_and_the_others_keep_clear(fly: Fly, victim: int, at_
 CLUSTER = ("mission.circle.radius_m=0.0", "mission.circle.climb_ned_m_s=0.0", "mission.duration_s=12")
 
 
-def test_control_a_dead_agent_that_is_forgotten_is_closed_in_on(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_negative_control_a_dead_agent_that_is_forgotten_is_closed_in_on(
+    fly: Fly, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Three wait around one point; the one that dies sinks in its place, which the others would take."""
     died = {8.0: lambda running: running.kill(0)}
     remembered = fly(*CLUSTER, at=died).separation_m(only=0)

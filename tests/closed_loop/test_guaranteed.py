@@ -7,7 +7,7 @@ from collections.abc import Set
 import pytest
 
 from sitl.lockstep import Lockstep
-from sitl.studies.campaign.flight import Flight
+from sitl.studies.campaign.flight import TrialFlight
 from sitl.studies.campaign.scenarios import layout_of
 from sitl.studies.campaign.trials import Cell, Trial
 from swarmctl.agent.coordination import Coordination
@@ -19,13 +19,13 @@ COMMITTED_M = 0.8
 TOUCH_M = 0.48
 
 
-def flown(cell: Cell, seed: int = 1) -> Flight:
-    flight = Flight(Trial(cell, seed), layout_of(cell.scenario, seed, cell.agents))
+def flown(cell: Cell, seed: int = 1) -> TrialFlight:
+    flight = TrialFlight(Trial(cell, seed), layout_of(cell.scenario, seed, cell.agents))
     flight.run()
     return flight
 
 
-def events(flight: Flight, name: str) -> list[dict[str, object]]:
+def events(flight: TrialFlight, name: str) -> list[dict[str, object]]:
     return [event for log in flight.lockstep.logs for event in log.events if event["event"] == name]
 
 
@@ -38,17 +38,17 @@ def test_late_and_lost_messages_cost_time_and_no_distance() -> None:
 
 
 @pytest.mark.parametrize(
-    ("traffic_rule", "within_s", "least_m"),
+    ("traffic_rule", "within_s", "bound_m"),
     [
         ("", 11.0, COMMITTED_M),
         ("agent.commit.right_of_way_rad=0.35 agent.commit.stuck_m=0.1", 14.0, COMMITTED_M - 0.03),
     ],
     ids=["right of way early", "control: only after standing"],
 )
-def test_agents_that_meet_give_way_by_rule_before_all_stand(traffic_rule: str, within_s: float, least_m: float) -> None:
+def test_agents_that_meet_give_way_by_rule_before_all_stand(traffic_rule: str, within_s: float, bound_m: float) -> None:
     """Late plans that end in stops lock in the middle of a swap, and to get out of that takes as long again."""
     row = flown(Cell("swap", 6, 100.0, 0.0, "exact", 0.0, "guaranteed", traffic_rule)).row(None)
-    assert row["min_separation_m"] >= least_m
+    assert row["min_separation_m"] >= bound_m
     assert (row["flight_time_s"] < within_s) is (traffic_rule == "")
 
 
@@ -57,13 +57,13 @@ def test_agents_fly_around_where_a_lost_peer_was_committed_to_end() -> None:
     assert flown(Cell("death", 6, 100.0, 0.0, "exact", 0.0, "guaranteed"), 3).row(None)["outcome"] == "arrived"
 
 
-def test_control_agents_that_see_nobody_touch() -> None:
+def test_negative_control_agents_that_see_nobody_touch() -> None:
     assert flown(Cell("swap", 4, 300.0, 0.3, "exact", 0.0, "off")).row(None)["min_separation_m"] < TOUCH_M
 
 
 def committed_in_the_dark(sees: type[Coordination] = Coordination) -> int:
     """How many trajectories are committed from 1.6 s to 2 s after the bus has fallen apart."""
-    flight = Flight(Trial(Cell("swap", 4, 0.0, 0.0, "exact", 0.0, "guaranteed"), 1), layout_of("swap", 1, 4))
+    flight = TrialFlight(Trial(Cell("swap", 4, 0.0, 0.0, "exact", 0.0, "guaranteed"), 1), layout_of("swap", 1, 4))
     step, counts = flight.lockstep.step, []
     began_us: list[int] = []
 
@@ -84,7 +84,9 @@ def test_an_agent_off_the_bus_commits_nothing() -> None:
     assert committed_in_the_dark() == 0
 
 
-def test_control_taking_stale_peers_for_lost_commits_against_alive_peers(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_negative_control_taking_stale_peers_for_lost_commits_against_alive_peers(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     def only_seen(self: Coordination, utc_us: int) -> Set[int]:
         return frozenset(agent for agent in self._peers if agent_name(agent) in self._bus.alive())
 

@@ -48,7 +48,7 @@ def test_a_landing_at_speed_among_others_brakes_and_moves_apart_first(fly: Fly) 
         assert np.linalg.norm(handed["vel_ned_m_s"]) < 0.2
 
 
-def test_control_an_autopilot_that_lands_at_speed_among_others_comes_too_close(
+def test_negative_control_an_autopilot_that_lands_at_speed_among_others_comes_too_close(
     fly: Fly, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def land_at_once(self: MissionStateMachine, now_us: int, state: VehicleState) -> None:
@@ -135,7 +135,7 @@ def test_an_agent_stopped_past_the_loss_does_not_retake_control() -> None:
     assert flight.agent.outcome == TAKEN_OVER
 
 
-def test_control_without_doubting_the_mode_it_returns_to_offboard(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_negative_control_without_doubting_the_mode_it_returns_to_offboard(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mode_watch, "_GAP_US", 10**12)
     flight = asleep_past_the_loss()
     assert flight.setpoints_us
@@ -165,7 +165,7 @@ def test_a_restarted_agent_leaves_control_to_an_active_failsafe() -> None:
     assert flight.offboard_us
 
 
-def test_control_streaming_to_a_vehicle_that_is_not_ours_takes_it(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_negative_control_streaming_to_a_vehicle_that_is_not_ours_takes_it(monkeypatch: pytest.MonkeyPatch) -> None:
     def switch_off() -> None:
         monkeypatch.setattr(state_machine, "_is_under_other_control", lambda state: False)
         monkeypatch.setattr(MissionStateMachine, "_request_control", lambda *_: [])  # streaming is enough

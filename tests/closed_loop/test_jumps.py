@@ -43,7 +43,9 @@ def test_a_jump_of_the_estimate_keeps_distances_and_is_reported(fly: Fly) -> Non
     assert apart_m[-1].min() > 1.3, "its peers make room for where else it may be"
 
 
-def test_control_a_jump_that_is_believed_at_once_ends_in_a_collision(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_negative_control_a_jump_that_is_believed_at_once_ends_in_a_collision(
+    fly: Fly, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(LocalFrame, "_fit", lambda *_: None)
     flight, _ = fly_with_a_jump(fly)
     assert flight.separation_m() < flight.config.separation.body_m

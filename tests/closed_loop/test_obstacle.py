@@ -52,6 +52,6 @@ def test_the_obstacle_is_known_only_within_the_visibility_distance(flight: Fligh
         assert distance[seen].max() < 3.0
 
 
-def test_control_unseen_it_is_hit(fly: Fly) -> None:
+def test_negative_control_unseen_it_is_hit(fly: Fly) -> None:
     blind = fly("obstacles.0.visibility_m=0.1", "mission.duration_s=6", config=PUBLISHED)  # hit after 4.4 s
     assert clearance_m(blind) < 1.0

@@ -82,10 +82,10 @@ def test_at_rest_no_error_remains() -> None:
     ],
     ids=["no estimate", "4 m/s2 at most", "no filter", "no room to lean"],
 )
-def test_control_without_its_parts_it_does_not(without: tuple[str, ...], at_least_m: float) -> None:
+def test_negative_control_without_its_parts_it_does_not(without: tuple[str, ...], at_least_m: float) -> None:
     assert errors(*WIND, *HEAVY, *GUSTS, *without).rmse_m > at_least_m
 
 
-def test_control_a_disturbance_that_walks_slower_lags_behind() -> None:
+def test_negative_control_a_disturbance_that_walks_slower_lags_behind() -> None:
     slow = errors(*WIND, *HEAVY, *GUSTS, "agent.state_filter.disturbance_m_s2=0.2")
     assert slow.rmse_m > 0.05

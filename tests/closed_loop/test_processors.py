@@ -64,7 +64,7 @@ def test_user_settings_of_numpy_do_not_matter() -> None:
     assert plain()[1] == "", "and nothing is warned of"
 
 
-def test_control_left_to_themselves_processors_differ_and_it_is_said() -> None:
+def test_negative_control_left_to_themselves_processors_differ_and_it_is_said() -> None:
     native = [fly({"OPENBLAS_CORETYPE": name, NATIVE_ENV: "1"}) for name in (RUN_HERE[0], RUN_HERE[-1])]
     assert all(f"{NATIVE_ENV} is set" in said for _, said in native)
     if len(RUN_HERE) > 1:

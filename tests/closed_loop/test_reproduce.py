@@ -12,7 +12,7 @@ from sitl.studies.thesis import score
 from sitl.studies.thesis.mavlink_flight import fly_over_mavlink
 from sitl.studies.thesis.model_flight import fly_on_plant
 from sitl.studies.thesis.trace import Trace
-from swarmctl.built_in_configs import shipped_config
+from swarmctl.built_in_configs import built_in_config
 from swarmctl.config import load
 
 PUBLISHED_PID_FAST_M, RETUNED_M = 0.0741, 0.0400  # thesis Table 6; limit of the retuned gains
@@ -24,11 +24,11 @@ SHORT = "mission.duration_s=6.3"  # half a period of the fast trajectory
 
 @cache
 def on_plant(config: str, *overrides: str, matched: bool = False) -> Trace:
-    return fly_on_plant(config, load(shipped_config(config), overrides), matched_velocity=matched)
+    return fly_on_plant(config, load(built_in_config(config), overrides), matched_velocity=matched)
 
 
 def over_mavlink(config: str, *overrides: str) -> Trace:
-    return fly_over_mavlink(config, load(shipped_config(config), overrides))
+    return fly_over_mavlink(config, load(built_in_config(config), overrides))
 
 
 def mean_m(config: str, *overrides: str, matched: bool = False) -> float:
@@ -46,12 +46,12 @@ def test_published_mpc_is_within_10_percent_of_table_12() -> None:
     np.testing.assert_allclose(trace.vel_ned_m_s[0, 0], (0.0, 0.5 * 0.5, -1.0))  # but in motion
 
 
-def test_control_without_terminal_conditions_it_is_not() -> None:
+def test_negative_control_without_terminal_conditions_it_is_not() -> None:
     off = ("controller.mpc.terminal_z=none", "controller.mpc.terminal_xy=none")
     assert mean_m("thesis_4_mpc_fast", *off, matched=True) > TOO_FAR_OFF * PUBLISHED_MPC_FAST_M
 
 
-def test_control_from_rest_it_is_not() -> None:
+def test_negative_control_from_rest_it_is_not() -> None:
     assert mean_m("thesis_4_mpc_fast") > TOO_FAR_OFF * PUBLISHED_MPC_FAST_M
 
 
@@ -59,7 +59,7 @@ def test_improved_mpc_is_better_than_published() -> None:
     assert mean_m("improved_4_mpc_fast", matched=True) <= IMPROVED_M
 
 
-def test_control_without_predicting_over_the_attitude_lag_it_is_not() -> None:
+def test_negative_control_without_predicting_over_the_attitude_lag_it_is_not() -> None:
     assert mean_m("improved_4_mpc_fast", "vehicle_model.delay_s=0.0", matched=True) > PUBLISHED_MPC_FAST_M
 
 
@@ -71,14 +71,14 @@ def test_retuned_pid_halves_the_published_error() -> None:
     assert mean_m("improved_4_pid_fast") <= RETUNED_M
 
 
-def test_control_without_feed_forward_it_does_not() -> None:
+def test_negative_control_without_feed_forward_it_does_not() -> None:
     assert mean_m("improved_4_pid_fast", "controller.pid.accel_feed_forward=0.0") > RETUNED_M
 
 
 # -- over MAVLink -----------------------------------------------------------------------------------------------------
 
 
-def test_over_an_ideal_link_the_bridge_flies_what_the_plant_path_flies() -> None:
+def test_over_an_ideal_link_the_bridge_flies_what_the_model_only_path_flies() -> None:
     plant, full = on_plant("thesis_4_mpc_fast", SHORT), over_mavlink("thesis_4_mpc_fast", SHORT)
     assert score.mean_distance_m(full) == pytest.approx(score.mean_distance_m(plant), rel=0.05)
     np.testing.assert_array_equal(full.ref_pos_ned_m, plant.ref_pos_ned_m)
@@ -86,7 +86,7 @@ def test_over_an_ideal_link_the_bridge_flies_what_the_plant_path_flies() -> None
     assert np.abs(full.thrust_n - plant.thrust_n).max() < 0.01
 
 
-def test_control_over_a_slow_link_it_does_not() -> None:
+def test_negative_control_over_a_slow_link_it_does_not() -> None:
     plant, late = (
         on_plant("thesis_4_mpc_fast", SHORT),
         over_mavlink("thesis_4_mpc_fast", SHORT, "sitl.link_latency_ms=60"),
@@ -114,7 +114,7 @@ def test_the_obstacle_is_passed_with_distances_kept_and_in_space_shorter_than_be
     assert climb_beside_obstacle_m(beside) < 0.05
 
 
-def test_control_agents_that_see_nothing_fly_through_it_and_each_other() -> None:
+def test_negative_control_agents_that_see_nothing_fly_through_it_and_each_other() -> None:
     blind = on_plant("improved_6_obstacle", "mission.duration_s=6", "controller.kind=mpc")
     assert score.clearance_m(blind) < 1.0
     assert score.separation_m(blind) < 0.3

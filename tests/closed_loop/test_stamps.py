@@ -40,7 +40,7 @@ def test_forged_states_of_another_time_change_no_bit_of_the_flight(fly: Fly) -> 
     assert touched.lockstep.truth.tobytes() == twin.lockstep.truth.tobytes()
 
 
-def test_control_believed_at_once_they_end_the_mission(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_negative_control_believed_at_once_they_end_the_mission(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
     def believe(clock: VehicleClock, vehicle_us: int, arrived_us: int) -> bool:
         clock.boots += 1
         clock.restarts += 1

@@ -1,7 +1,7 @@
-"""Talks to one vehicle: keeps our heartbeats and setpoint stream going, and remembers what came.
+"""A dialogue with one vehicle: keeps our heartbeats and setpoint stream going, and logs what arrives.
 
-The same code talks to a simulated vehicle on a simulated clock and to a real one on the wall clock. It judges nothing;
-`tests.conformance.player` does.
+The same code runs with a simulated vehicle on a simulated clock and with a real one on the wall clock. It judges
+nothing; `tests.conformance.player` does.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Deviation(AssertionError):  # noqa: N818 - what the sheet calls it
 
 @dataclass(frozen=True)
 class Arrived:
-    """A frame from the vehicle; decoded when somebody looks."""
+    """A frame from the vehicle; decoded on first access."""
 
     t_s: float
     number: int
@@ -98,7 +98,7 @@ class Dialogue:
         self.begin()
 
     def begin(self) -> None:
-        """Forget everything: a vehicle that has just started."""
+        """Reset for a vehicle that has just started."""
         self.sysid = 0
         self._log: dict[tuple[str, int, bool], list[Arrived]] = {}  # by link, message, and whether it is the vehicle's
         self._arrivals = 0
@@ -113,7 +113,7 @@ class Dialogue:
 
     @property
     def text_link(self) -> str:
-        """Where texts are told: the link that hears a ground station."""
+        """Return the link that receives texts: the one with a ground station."""
         return v.GCS_LINK if v.GCS_LINK in self.partner.links else v.OFFBOARD_LINK
 
     @property
@@ -168,7 +168,7 @@ class Dialogue:
             self.pump()
 
     def run_until(self, met: Callable[[], bool], limit_s: float) -> bool:
-        """Run until it is met, or that long after the mark (plus what the partner's clock may cost)."""
+        """Run until it is met, or that long after the mark (plus the tolerance of the partner's clock)."""
         while not met():
             if self.partner.now_s() - self.mark_s >= limit_s + self.partner.slack_s - 1e-9:
                 return False

@@ -1,4 +1,4 @@
-"""What a row may want of a received field."""
+"""Conditions on received fields."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class Each:
 
 
 def fits(value: Any, wanted: Any) -> bool:
-    """Whether a received field is what a row wants of it."""
+    """Return whether a received field meets a row's condition."""
     if hasattr(wanted, "accepts"):
         return bool(wanted.accepts(value))
     if isinstance(wanted, float):

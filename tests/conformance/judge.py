@@ -1,4 +1,4 @@
-"""Plays the steps of a row in a dialogue and complains when something else comes back than it says."""
+"""Plays the steps of a row in a dialogue and raises when the answer differs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How a vehicle moved, in figures: what the sheet says of thrust and attitude, measured from what it reports.
+"""Figures of a vehicle's motion: thrust and attitude response, measured from its reports.
 
 Each measure looks at samples (seconds since the mark, message), newest last.
 """

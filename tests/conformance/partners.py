@@ -1,6 +1,6 @@
-"""Who is at the other end of a dialogue: a simulated vehicle in this process, or any autopilot by URL.
+"""Partners of a dialogue: a simulated vehicle in this process, or any autopilot by URL.
 
-Both give transports and let time pass; nothing else differs for whoever talks to them.
+Both provide transports and the passing of time; they do not differ otherwise.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Partner(Protocol):
 
 
 class TamperedLink:
-    """A link whose incoming frames pass through somebody else's hands."""
+    """A link whose incoming frames are modified by a function."""
 
     def __init__(self, inner: Transport, tamper: Tamper) -> None:
         self._inner = inner

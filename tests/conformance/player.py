@@ -1,7 +1,7 @@
-"""Plays whole rows: brings the vehicle to where a row starts, then judges its steps.
+"""Plays whole rows: prepares the vehicle for a row, then judges its steps.
 
-A simulated vehicle is made anew for every row. One given by URL is landed, disarmed and put back to LOITER with its
-parameters as they were, or restarted where a row needs that.
+A simulated vehicle is created for every row. One given by URL is landed, disarmed and put back to LOITER with its
+original parameters, or restarted where a row needs that.
 """
 
 from __future__ import annotations

@@ -56,7 +56,7 @@ EXTENDED = "EXTENDED_SYS_STATE"
 
 
 def refused_mode(main: int, sub: int = 0) -> Command:
-    """DO_SET_MODE from the ground station: only to its component is told why it is refused."""
+    """DO_SET_MODE from the ground station: only its component receives the reason of a refusal."""
     return Command(SET_MODE, (1, main, sub), TEMPORARILY_REJECTED, link=GCS_LINK)
 
 

@@ -1,4 +1,4 @@
-"""Section 1 of the sheet: who is answered and where, requests and intervals, texts, time."""
+"""Section 1 of the sheet: addressing and replies, requests and intervals, texts, time."""
 
 from __future__ import annotations
 
@@ -266,7 +266,7 @@ LINK_ROWS = (
         (
             Mute(GCS_LINK),
             Mark(),
-            SaysNothing(13.0),  # that it is lost is told to nobody
+            SaysNothing(13.0),  # its loss is not reported
             Mute(GCS_LINK, muted=False),
             Mark(),
             Says("GCS connection regained\t", 6, 3.0),

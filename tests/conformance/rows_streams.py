@@ -1,4 +1,4 @@
-"""Section 1 of the sheet: what comes on each link by itself, nobody talking, and how often [Hz]."""
+"""Section 1 of the sheet: default messages of each link without traffic to it, and their rates [Hz]."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ def without(kind: str) -> Tamper:
 
 
 class Lying(InProcess):
-    """The simulator behind somebody who changes what it says, once a row has begun."""
+    """The simulator behind a link that modifies its frames once a row has begun."""
 
     def lie(self, tamper: Tamper) -> None:
         self.links = {name: TamperedLink(link, tamper) for name, link in self.links.items()}
@@ -110,7 +110,7 @@ def test_no_row_is_met_by_a_dead_autopilot() -> None:
 
 
 def test_a_wrong_default_rate_is_seen() -> None:
-    """Counted as `test_streams` counts, after somebody has made ATTITUDE 10 % slower."""
+    """Counted as in `test_streams`, with ATTITUDE made 10 % slower."""
     partner = InProcess()
     dialogue = Dialogue(partner)
     dialogue.run_until(lambda: bool(dialogue.sysid), 2.0)

@@ -1,4 +1,4 @@
-"""What an autopilot sends when nobody talks to it: every message of section 1, counted on both links at once."""
+"""Default output of an autopilot without traffic to it: every message of section 1, counted on both links at once."""
 
 from __future__ import annotations
 

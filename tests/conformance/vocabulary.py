@@ -101,7 +101,7 @@ class Send:
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """Send a command; the answer must be this ack, from nobody else, to us; or NO_ACK."""
+    """Send a command; the answer must be this ack, from that vehicle alone, to us; or NO_ACK."""
 
     number: int
     params: tuple[float, ...] = ()

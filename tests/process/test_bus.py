@@ -96,7 +96,7 @@ def test_newest_path_only_but_every_command_in_order(join: Callable[..., ZenohBu
     assert ticks[-1] == ("agent-1", b"399")
 
 
-def test_only_the_senders_and_the_run_asked_for_are_heard(join: Callable[..., ZenohBus]) -> None:
+def test_only_the_requested_senders_and_run_are_received(join: Callable[..., ZenohBus]) -> None:
     agent = join("agent-0", {PATH: ["agent-0", "agent-1"]})
     stranger, foreign, peer = join("agent-2"), join("agent-1", run="other"), join("agent-1")
     assert until(lambda: agent.alive() == {"agent-0", "agent-1", "agent-2"})

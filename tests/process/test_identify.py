@@ -1,4 +1,4 @@
-"""`swarmctl check --identify` as a program, on the built-in simulator in real time: what it flies and writes."""
+"""`swarmctl check --identify` as a program, on the built-in simulator in real time: its flight and its output."""
 
 from __future__ import annotations
 

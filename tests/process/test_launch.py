@@ -30,7 +30,7 @@ READY_S = 90.0
 END_S = 150.0
 TWO = ("--agents", "2", "--set", "telemetry.enabled=false")
 STAY = ("--set", "mission.kind=swap", "--set", "mission.swap.travel_s=600", "--set", "start.spacing_m=2")
-NEAR = (*STAY, "--set", "sitl.ground_z_m=1")  # nowhere to go, nobody in the way, and soon down
+NEAR = (*STAY, "--set", "sitl.ground_z_m=1")  # nothing to reach, nothing in the way, and a short landing
 PATIENT = "agent.autopilot_params={COM_OBL_RC_ACT=4,COM_OF_LOSS_T=3}"  # where there is no ground no failsafe ever lands
 AIR = (*STAY, "--set", "sitl.start=air", "--set", PATIENT)  # neither taken off nor landed, where that is not asked
 
@@ -159,7 +159,7 @@ def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Callable[..., La
 
 
 def test_a_killed_agent_fails_the_launch_and_the_others_finish(start: Callable[..., Launched]) -> None:
-    """With guaranteed separation a lost peer is not waited for, and alive peers still acknowledge each other."""
+    """In guaranteed mode a dead agent is not waited for, and the others still ask each other."""
     guaranteed = ("--set", "telemetry.enabled=false", "--set", "separation.mode=guaranteed")
     launched = start("--agents", "3", "--duration", "4", *NEAR, *guaranteed)
     launched.until_phase("TRACK", 3)
@@ -209,7 +209,7 @@ def test_a_closed_terminal_lands_and_keeps_the_verdict(start: Callable[..., Laun
         time.sleep(0.1)
     deadline_s = time.monotonic() + END_S
     while launched.process.poll() is None and time.monotonic() < deadline_s:
-        if launched.events("stopped"):  # everybody has landed, the run is being judged
+        if launched.events("stopped"):  # all have landed, the run is being judged
             launched.process.send_signal(signal.SIGHUP)
         time.sleep(0.05)
     assert launched.end() == 130, launched.text()
@@ -264,7 +264,7 @@ def test_the_flight_does_not_need_its_viewer(start: Callable[..., Launched]) -> 
 
 
 def test_two_launches_at_once_beside_another_simulator(start: Callable[..., Launched]) -> None:
-    """Every PX4-like simulator sends to 14540 and up until somebody answers: neither takes its vehicles for its own."""
+    """Every PX4-like simulator sends to 14540 and up until answered: neither launch takes the other's vehicles."""
     others = subprocess.Popen([sys.executable, "-m", "sitl", "--vehicles", "3"], stdout=subprocess.DEVNULL)
     try:
         first, second = (start(*TWO, *AIR, "--duration", "2") for _ in range(2))

@@ -1,4 +1,4 @@
-"""How a launch is supervised, with processes that only sleep and end: who is blamed, who goes on, what comes out."""
+"""Supervision of a launch, with processes that only sleep and end: which fails, which go on, and the result."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ from swarmctl.bus.topics import (
 from swarmctl.config import load
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START
-from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, Command, Site, kill_all
+from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, Command, RunContext, kill_all
 from swarmctl.ops.status_table import AgentView
-from swarmctl.ops.supervisor import Base, EventLog, Flight, Verdict
+from swarmctl.ops.supervisor import EventLog, FlightSupervisor, LaunchResult, Services
 
 pytestmark = pytest.mark.process
 
@@ -56,12 +56,12 @@ def status_of(agent: int, phase: Phase, utc_us: int) -> bytes:
     return encode_message(message)
 
 
-class Scene(Base):
-    """A base of scripted processes; it also is the display, which the flight calls once in every step."""
+class ScriptedServices(Services):
+    """Services made of scripted processes; it is also the display, which the flight calls once in every step."""
 
     def __init__(self, directory: Path, agents: Sequence[str], others: dict[str, str] | None = None) -> None:
         self.log = EventLog(directory / "launch.events.jsonl")
-        self.site = Site("run", "unixsock-stream//nowhere", directory)
+        self.context = RunContext("run", "unixsock-stream//nowhere", directory)
         scripts = {agent_name(i): script for i, script in enumerate(agents)} | (others or {ROUTER: FLIES_LONG})
         self.children = {
             name: Child(Command(name, (sys.executable, "-ESc", script)), directory) for name, script in scripts.items()
@@ -95,7 +95,7 @@ class Scene(Base):
         return Child(Command(agent_name(agent), (sys.executable, "-ESc", self.lands)), self.directory)
 
     def hear_operators(self) -> None:
-        """Listen to the own name, under which operators' commands speak too."""
+        """Receive under its own name, which operators' commands use too."""
         self.hub.detach(OPERATOR)
         senders = [agent_name(i) for i in range(len(self.agents))]
         self.bus = self.hub.attach(OPERATOR, {OBSTACLES: [OPERATOR], STATUS: senders})
@@ -120,10 +120,10 @@ class Scene(Base):
             act, self.act = self.act, lambda: None
             act()
 
-    def fly(self) -> Verdict:
+    def fly(self) -> LaunchResult:
         config = load(None, [f"swarm.agents={len(self.agents)}"])
         try:
-            return Flight(config, self, self).fly(lambda: self.interrupts)
+            return FlightSupervisor(config, self, self).fly(lambda: self.interrupts)
         finally:
             kill_all(list(self.children.values()))
 
@@ -142,39 +142,39 @@ def short_times(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_all_agents_finish(tmp_path: Path) -> None:
-    verdict = Scene(tmp_path, [ends(0), ends(0, 0.6)]).fly()
-    assert (verdict.outcome, verdict.problems) == ("completed", [])
-    assert verdict.exit_code(violated=False) == EXIT_OK
-    assert verdict.exit_code(violated=True) == EXIT_MISSION
+    result = ScriptedServices(tmp_path, [ends(0), ends(0, 0.6)]).fly()
+    assert (result.outcome, result.problems) == ("completed", [])
+    assert result.exit_code(violated=False) == EXIT_OK
+    assert result.exit_code(violated=True) == EXIT_MISSION
 
 
 def test_a_killed_agent_is_named_and_the_others_finish(tmp_path: Path) -> None:
-    scene = Scene(tmp_path, [FLIES_LONG, ends(0, 2.0), ends(0, 2.0)])
+    scene = ScriptedServices(tmp_path, [FLIES_LONG, ends(0, 2.0), ends(0, 2.0)])
     scene.act = lambda: scene.kill("agent-0")
-    verdict = scene.fly()
-    assert verdict.exit_code(violated=False) == EXIT_MISSION
-    assert verdict.outcome == "failed"
+    result = scene.fly()
+    assert result.exit_code(violated=False) == EXIT_MISSION
+    assert result.outcome == "failed"
     assert scene.heard("agent-0", "SIGKILL")
     assert scene.recovered == [0]
     assert scene.heard("the vehicle of agent-0", "disarmed")
-    assert verdict.left == ()
+    assert result.left == ()
     assert [scene.children[f"agent-{i}"].poll() for i in range(3)] == [130, 0, 0]
     assert "land" not in scene.orders
 
 
 def test_a_vehicle_that_can_not_be_recovered_is_named(tmp_path: Path) -> None:
-    scene = Scene(tmp_path, [FLIES_LONG, ends(0, 2.0)])
+    scene = ScriptedServices(tmp_path, [FLIES_LONG, ends(0, 2.0)])
     scene.lands = ends(3, 0.3)
     scene.act = lambda: scene.kill("agent-0")
-    verdict = scene.fly()
+    result = scene.fly()
     assert scene.recovered == [0]
-    assert len(verdict.left) == 1
+    assert len(result.left) == 1
     assert scene.heard("vehicle 1", "may be armed", "TRACK", "by hand")
-    assert verdict.exit_code(violated=False) == EXIT_MISSION
+    assert result.exit_code(violated=False) == EXIT_MISSION
 
 
 def test_an_interrupted_launch_that_leaves_a_vehicle_is_a_failed_one(tmp_path: Path) -> None:
-    scene = Scene(tmp_path, [FLIES_LONG, FLIES_LONG])
+    scene = ScriptedServices(tmp_path, [FLIES_LONG, FLIES_LONG])
     scene.lands = ends(3, 0.3)
 
     def interrupt_and_kill() -> None:
@@ -182,43 +182,43 @@ def test_an_interrupted_launch_that_leaves_a_vehicle_is_a_failed_one(tmp_path: P
         scene.kill("agent-1")
 
     scene.act = interrupt_and_kill
-    verdict = scene.fly()
-    assert verdict.interrupted
-    assert len(verdict.left) == 1
-    assert verdict.exit_code(violated=False) == EXIT_MISSION
+    result = scene.fly()
+    assert result.interrupted
+    assert len(result.left) == 1
+    assert result.exit_code(violated=False) == EXIT_MISSION
 
 
 def test_a_recovery_that_takes_too_long_is_ended_and_the_vehicle_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(swarmctl.ops.recovery, "RECOVERY_S", 1.0)
-    scene = Scene(tmp_path, [FLIES_LONG, ends(0, 1.0)])
+    scene = ScriptedServices(tmp_path, [FLIES_LONG, ends(0, 1.0)])
     scene.lands = FLIES_LONG
     scene.act = lambda: scene.kill("agent-0")
     began_s = time.monotonic()
-    verdict = scene.fly()
+    result = scene.fly()
     assert time.monotonic() - began_s < 20.0
-    assert len(verdict.left) == 1
+    assert len(result.left) == 1
 
 
 def test_an_agent_that_ends_before_anything_was_armed_could_not_start(tmp_path: Path) -> None:
-    scene = Scene(tmp_path, [ends(3, 1.0), FLIES_LONG])
+    scene = ScriptedServices(tmp_path, [ends(3, 1.0), FLIES_LONG])
     scene.phase = Phase.STANDBY
-    verdict = scene.fly()
+    result = scene.fly()
     assert scene.recovered == []
-    assert verdict.exit_code(violated=False) == EXIT_START
+    assert result.exit_code(violated=False) == EXIT_START
 
 
 def test_a_frozen_agent_is_given_up_when_the_others_have_finished(tmp_path: Path) -> None:
-    scene = Scene(tmp_path, [FLIES_LONG, ends(0, 3.0)])
+    scene = ScriptedServices(tmp_path, [FLIES_LONG, ends(0, 3.0)])
 
     def freeze() -> None:
         os.kill(scene.children["agent-0"].pid, signal.SIGSTOP)
         scene.silent.add(0)
 
     scene.act = freeze
-    verdict = scene.fly()
-    assert verdict.exit_code(violated=False) == EXIT_MISSION
+    result = scene.fly()
+    assert result.exit_code(violated=False) == EXIT_MISSION
     assert scene.heard("agent-0", "silent")
     assert scene.children["agent-1"].poll() == 0
     assert scene.recovered == [0], "what is frozen is killed, and its vehicle landed"
@@ -226,44 +226,44 @@ def test_a_frozen_agent_is_given_up_when_the_others_have_finished(tmp_path: Path
 
 
 def test_one_failed_mission_fails_the_launch_and_says_why(tmp_path: Path) -> None:
-    scene = Scene(tmp_path, [ends(4, 1.0), ends(0, 1.5)])
-    verdict = scene.fly()
-    assert verdict.exit_code(violated=False) == EXIT_MISSION
+    scene = ScriptedServices(tmp_path, [ends(4, 1.0), ends(0, 1.5)])
+    result = scene.fly()
+    assert result.exit_code(violated=False) == EXIT_MISSION
     assert scene.heard("agent-0", "because")
     assert scene.children["agent-1"].poll() == 0
 
 
 def test_an_agent_that_can_not_start_lands_the_others(tmp_path: Path) -> None:
-    scene = Scene(tmp_path, [FLIES_LONG, ends(3)])
+    scene = ScriptedServices(tmp_path, [FLIES_LONG, ends(3)])
     scene.phase = Phase.STANDBY
-    verdict = scene.fly()
-    assert verdict.exit_code(violated=False) == EXIT_START
+    result = scene.fly()
+    assert result.exit_code(violated=False) == EXIT_START
     assert scene.heard("agent-1", "could not start", "because")
     assert scene.children["agent-0"].poll() == 130
 
 
-def test_an_agent_never_heard_that_crashes_did_not_start(tmp_path: Path) -> None:
-    scene = Scene(tmp_path, [ends(1)])
+def test_an_agent_that_crashes_before_its_first_status_did_not_start(tmp_path: Path) -> None:
+    scene = ScriptedServices(tmp_path, [ends(1)])
     scene.silent.add(0)
     assert scene.fly().exit_code(violated=False) == EXIT_START
 
 
-def test_first_interrupt_lands_everybody(tmp_path: Path) -> None:
-    scene = Scene(tmp_path, [FLIES_LONG, FLIES_LONG])
+def test_first_interrupt_lands_all_agents(tmp_path: Path) -> None:
+    scene = ScriptedServices(tmp_path, [FLIES_LONG, FLIES_LONG])
     scene.act = lambda: setattr(scene, "interrupts", 1)
-    verdict = scene.fly()
-    assert (verdict.outcome, verdict.problems) == ("interrupted", [])
-    assert verdict.exit_code(violated=True) == EXIT_INTERRUPTED
+    result = scene.fly()
+    assert (result.outcome, result.problems) == ("interrupted", [])
+    assert result.exit_code(violated=True) == EXIT_INTERRUPTED
     assert "land" in scene.orders
     assert [scene.children[f"agent-{i}"].poll() for i in range(2)] == [130, 130]
 
 
-def test_who_does_not_hear_the_order_is_told_by_signal(tmp_path: Path) -> None:
-    scene = Scene(tmp_path, [FLIES_LONG])
+def test_an_agent_that_misses_the_order_gets_a_signal(tmp_path: Path) -> None:
+    scene = ScriptedServices(tmp_path, [FLIES_LONG])
     scene.obeys = False
     scene.act = lambda: setattr(scene, "interrupts", 1)
-    verdict = scene.fly()
-    assert verdict.problems == []
+    result = scene.fly()
+    assert result.problems == []
     assert scene.children["agent-0"].poll() == 130
     stamps_us = sorted({stamp_us for stamp_us, _ in scene.stamped_us})
     assert len(stamps_us) >= 2, "stamped anew every time: it would not be valid for long"
@@ -271,7 +271,7 @@ def test_who_does_not_hear_the_order_is_told_by_signal(tmp_path: Path) -> None:
 
 
 def test_agents_whose_clock_is_an_hour_behind_are_ordered_to_land_by_their_own(tmp_path: Path) -> None:
-    scene = Scene(tmp_path, [FLIES_LONG, FLIES_LONG])
+    scene = ScriptedServices(tmp_path, [FLIES_LONG, FLIES_LONG])
     scene.obeys, scene.behind_us = False, 3_600_000_000
     scene.act = lambda: setattr(scene, "interrupts", 1)
     scene.fly()
@@ -280,7 +280,7 @@ def test_agents_whose_clock_is_an_hour_behind_are_ordered_to_land_by_their_own(t
 
 
 def test_second_interrupt_kills_at_once(tmp_path: Path) -> None:
-    scene = Scene(tmp_path, [FLIES_LONG, FLIES_LONG], {ROUTER: FLIES_LONG, SITL: FLIES_LONG})
+    scene = ScriptedServices(tmp_path, [FLIES_LONG, FLIES_LONG], {ROUTER: FLIES_LONG, SITL: FLIES_LONG})
     scene.obeys = False
 
     def twice() -> None:
@@ -294,19 +294,19 @@ def test_second_interrupt_kills_at_once(tmp_path: Path) -> None:
     assert {child.poll() for child in scene.children.values()} == {137}
 
 
-@pytest.mark.parametrize("carrier", [ROUTER, SITL])
-def test_without_router_or_simulator_everybody_lands(tmp_path: Path, carrier: str) -> None:
-    scene = Scene(tmp_path, [FLIES_LONG, FLIES_LONG], {ROUTER: FLIES_LONG, SITL: FLIES_LONG})
-    scene.act = lambda: scene.kill(carrier)
-    verdict = scene.fly()
-    assert verdict.exit_code(violated=False) == EXIT_MISSION
-    assert len(verdict.problems) == 1
-    assert scene.heard(carrier, "SIGKILL")
+@pytest.mark.parametrize("name", [ROUTER, SITL])
+def test_without_router_or_simulator_all_agents_land(tmp_path: Path, name: str) -> None:
+    scene = ScriptedServices(tmp_path, [FLIES_LONG, FLIES_LONG], {ROUTER: FLIES_LONG, SITL: FLIES_LONG})
+    scene.act = lambda: scene.kill(name)
+    result = scene.fly()
+    assert result.exit_code(violated=False) == EXIT_MISSION
+    assert len(result.problems) == 1
+    assert scene.heard(name, "SIGKILL")
     assert [scene.children[f"agent-{i}"].poll() for i in range(2)] == [130, 130]
 
 
 def test_a_simulator_that_refuses_to_start_is_a_failed_start(tmp_path: Path) -> None:
-    scene = Scene(tmp_path, [FLIES_LONG], {ROUTER: FLIES_LONG, SITL: ends(2, 0.0)})
+    scene = ScriptedServices(tmp_path, [FLIES_LONG], {ROUTER: FLIES_LONG, SITL: ends(2, 0.0)})
     scene.silent.add(0)
     assert scene.fly().exit_code(violated=False) == EXIT_START
     assert scene.heard("sitl", "because")
@@ -315,23 +315,23 @@ def test_a_simulator_that_refuses_to_start_is_a_failed_start(tmp_path: Path) -> 
 @pytest.mark.parametrize("signum", [signal.SIGKILL, signal.SIGSTOP])
 def test_without_its_viewer_the_flight_goes_on(tmp_path: Path, signum: signal.Signals) -> None:
     viewer = "import time; print('viewer rerun+http://127.0.0.1:9876/proxy', flush=True); time.sleep(60)"
-    scene = Scene(tmp_path, [ends(0, 2.0)], {ROUTER: FLIES_LONG, VIEWER: viewer})
+    scene = ScriptedServices(tmp_path, [ends(0, 2.0)], {ROUTER: FLIES_LONG, VIEWER: viewer})
     scene.act = lambda: os.kill(scene.children[VIEWER].pid, signum)
-    verdict = scene.fly()
-    assert verdict.exit_code(violated=False) == EXIT_OK
+    result = scene.fly()
+    assert result.exit_code(violated=False) == EXIT_OK
     assert scene.heard("announced rerun+http://127.0.0.1:9876/proxy")
     assert sum("the flight goes on" in line for line in scene.said) == 1
 
 
 def test_landed_by_an_operator_is_an_interrupted_flight(tmp_path: Path) -> None:
-    scene = Scene(tmp_path, [ends(130), ends(130)])
-    verdict = scene.fly()
-    assert (verdict.outcome, verdict.problems) == ("interrupted", [])
-    assert verdict.exit_code(violated=False) == EXIT_INTERRUPTED
+    scene = ScriptedServices(tmp_path, [ends(130), ends(130)])
+    result = scene.fly()
+    assert (result.outcome, result.problems) == ("interrupted", [])
+    assert result.exit_code(violated=False) == EXIT_INTERRUPTED
 
 
 def test_obstacles_of_an_operator_are_adopted_and_repeated(tmp_path: Path) -> None:
-    scene = Scene(tmp_path, [ends(0, 2.0)])
+    scene = ScriptedServices(tmp_path, [ends(0, 2.0)])
     ball = ObstacleMessage((1.0, 2.0, -3.0), 0.5, 1.0, 3.0)
     repeated: list[int] = []
 
@@ -348,8 +348,8 @@ def test_obstacles_of_an_operator_are_adopted_and_repeated(tmp_path: Path) -> No
 
     scene.act = set_ball
     scene.hear_operators()
-    verdict = scene.fly()
+    result = scene.fly()
     assert repeated[-1] == 5
-    assert verdict.obstacles is not None
-    assert list(verdict.obstacles) == [ball]
-    assert all(since_us is not None for since_us in verdict.obstacles.values())
+    assert result.obstacles is not None
+    assert list(result.obstacles) == [ball]
+    assert all(since_us is not None for since_us in result.obstacles.values())

@@ -16,7 +16,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from sitl.studies.bench.bench import PARTS, SOLVERS
+from sitl.studies.bench.bench import PARTS
+from swarmctl.control.mpc.qp import SOLVERS
 from swarmctl.core.records import TRUTH_DTYPE
 from swarmctl.core.types import Landed
 
@@ -150,7 +151,7 @@ def test_a_launch_its_operator_and_what_is_left(tmp_path: Path) -> None:
     assert "no display" in refused.stderr
 
 
-def test_vehicles_that_somebody_else_runs(tmp_path: Path) -> None:
+def test_vehicles_of_another_process(tmp_path: Path) -> None:
     (simulator,) = shown(r"^python -m sitl ")
     (line,) = shown(r"^swarmctl launch configs/px4_udp")
     command, *arguments = shlex.split(simulator)

@@ -1,4 +1,4 @@
-"""Who is believed on the real bus: a restarted process at once, a stranger under the same name never."""
+"""Accepted senders on the real bus: a restarted process at once, a stranger under the same name never."""
 
 from __future__ import annotations
 
@@ -125,7 +125,7 @@ def test_a_peer_restarted_beside_its_frozen_former_self_is_believed_after_silenc
     assert second.poll() is None
 
 
-def test_a_stranger_silences_nobody(
+def test_a_stranger_silences_no_agent(
     listener: Listener,
     start: Callable[[int], subprocess.Popen[bytes]],
     join: Callable[..., ZenohBus],  # noqa: F811

@@ -1,4 +1,4 @@
-"""Real autopilots in their own simulators: N processes of somebody's build, on their usual ports.
+"""Real autopilots in their own simulators: N processes of a build of yours, on their usual ports.
 
 A build is found by an environment variable; `docs/real_autopilots.md` says how.
 """
@@ -25,7 +25,7 @@ PARAMETER_FILES = ("copter.parm", "../../../Tools/autotest/default_params/copter
 
 @dataclass(frozen=True, slots=True)
 class Start:
-    """Where one vehicle is to be started."""
+    """Place at which one vehicle is to be started."""
 
     index: int
     folder: Path
@@ -37,7 +37,7 @@ class Start:
 
 @dataclass(frozen=True, slots=True)
 class Kind:
-    """One autopilot: where its vehicles are by default, its ports, and how one is started.
+    """One autopilot: default place, ports, and how a vehicle is started.
 
     Attributes:
         variable: environment variable with the path of its binary.
@@ -59,7 +59,7 @@ class Kind:
 
     @property
     def binary(self) -> Path | None:
-        """The build to test with, if there is one."""
+        """Return the build to test with, or None."""
         given = os.environ.get(self.variable, "")
         return Path(given).expanduser().absolute() if given else None
 
@@ -67,12 +67,12 @@ class Kind:
         return [Path("/tmp") / self.lock_name.format(i) for i in range(count)] if self.lock_name else []
 
     def place(self, index: int, count: int, folder: Path, parameters: Mapping[str, float] | None = None) -> Start:
-        """Where the vehicle of that index stands among so many."""
+        """Return the place of the vehicle of that index among so many."""
         lat_deg = self.origin.lat_deg + math.degrees(north_m(index, count) / EARTH_RADIUS_M)
         return Start(index, folder, lat_deg, self.origin.lon_deg, self.origin.alt_m, parameters or {})
 
     def shell_line(self, start: Start) -> list[str]:
-        """What starts it, from any folder and any environment."""
+        """Return the shell line that starts it, from any folder and any environment."""
         assert self.binary is not None
         told = [f"{name}={value}" for name, value in self.environment(start).items()]
         return ["env", "-C", str(start.folder), *told, *self.command(self.binary, start)]
@@ -125,7 +125,7 @@ ARDUCOPTER = Kind("SWARMCTL_ARDUCOPTER", GeoOrigin(-35.363262, 149.165237, 584.0
 
 
 def north_m(index: int, count: int) -> float:
-    """Where a vehicle stands."""
+    """Return the north coordinate of a vehicle's place."""
     return (index - (count - 1) / 2) * SPACING_M
 
 
@@ -148,7 +148,7 @@ class Fleet:
             self.start(index)
 
     def start(self, index: int) -> None:
-        """Power up; what it has stored stays as it was."""
+        """Start the autopilot; its stored data stays."""
         folder = self._directory / str(index)
         folder.mkdir(parents=True, exist_ok=True)
         start = self.kind.place(index, self.count, folder, self._parameters)
@@ -162,7 +162,7 @@ class Fleet:
             )
 
     def stop(self, index: int) -> None:
-        """Cut its power."""
+        """End the autopilot."""
         process = self._running.pop(index)
         process.kill()
         process.wait(STOP_S)

@@ -28,7 +28,7 @@ class Inside(Launched):
 
 
 class Field:
-    """Where vehicles stand, with somebody who watches them; launches fly them one after the other."""
+    """Real vehicles with a witness; launches fly them one after the other."""
 
     def __init__(self, fleet: Fleet, witness: Witness, directory: Path) -> None:
         self.fleet, self.witness = fleet, witness
@@ -64,7 +64,7 @@ def network() -> Iterator[Network]:
 
 @pytest.fixture
 def field(network: Network, tmp_path: Path) -> Iterator[Fielder]:
-    """Powers up N vehicles of a kind; skips where no build of it is named."""
+    """Start N vehicles of a kind; skip where no build of it is named."""
     fields: list[Field] = []
 
     def power_up(
@@ -84,7 +84,7 @@ def field(network: Network, tmp_path: Path) -> Iterator[Fielder]:
 
 
 def require(kind: Kind, network: Network, count: int) -> None:
-    """Skip where there is nothing to fly; fail where what is named is not there."""
+    """Skip without a build; fail where a named build does not exist."""
     if kind.binary is None:
         pytest.skip(f"{kind.variable} names no build")
     assert kind.binary.is_file(), f"{kind.variable}: {kind.binary} is no file"
@@ -97,7 +97,7 @@ def require(kind: Kind, network: Network, count: int) -> None:
 
 
 def held(lock: Path) -> bool:
-    """Whether a process has locked that file."""
+    """Return whether a process has locked that file."""
     if not lock.exists():
         return False
     with lock.open("r+b") as file:

@@ -20,7 +20,7 @@ _NAMESPACES = Path("/var/run/netns")
 
 
 class Network:
-    """Where a test's processes and sockets live.
+    """The network in which a test's processes and sockets live.
 
     Attributes:
         prefix: of a command line that is to run in it.
@@ -44,7 +44,7 @@ class Network:
                 _enter(home.fileno())
 
     def taken(self, ports: Iterable[int]) -> list[int]:
-        """UDP ports that somebody else has."""
+        """Return the UDP ports that other processes hold."""
         return [port for port in ports if not self._free(port)]
 
     def _free(self, port: int) -> bool:
@@ -64,7 +64,7 @@ def _enter(namespace: int) -> None:
 
 @contextmanager
 def own_network() -> Iterator[Network]:
-    """A fresh one where this user may make it; else the machine's."""
+    """Return a new network where this user may make one; else the machine's."""
     name = f"swarmctl-{os.getpid()}-{next(_NAMES)}"
     if os.geteuid() != 0 or not _did("ip", "netns", "add", name):
         yield Network()

@@ -21,7 +21,7 @@ NO_COVARIANCE = [math.nan] * 21
 
 
 def feed(witness: Witness, index: int, truth: Truth) -> None:
-    """First where the frame is, then one sample of the truth after the other."""
+    """Send the origin of the frame, then one sample of the truth after the other."""
     samples = len(witness.vehicles[index].t_s)
     if samples < ORIGIN_UNTIL:
         if samples % ORIGIN_EVERY == 0:

@@ -1,4 +1,4 @@
-"""Whole missions on real autopilots, launched as a user launches them, judged by what really happened."""
+"""Whole missions on real autopilots, launched as a user launches them, judged on true states."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ THREE_ARDUCOPTERS = str(Path(__file__).with_name("three_arducopters.toml"))
 
 
 def flown(field: Field, *arguments: str) -> Launched:
-    """A launch that completes, and vehicles that are on the ground and disarmed after it."""
+    """Return a launch that completes, and whose vehicles are on the ground and disarmed after it."""
     launched = field.launch(*arguments)
     assert launched.end(END_S) == 0, launched.text()
     field.witness.wait(field.witness.all_rest, GROUND_S, "all vehicles landed and disarmed")
@@ -36,7 +36,7 @@ def flown(field: Field, *arguments: str) -> Launched:
 
 
 def true_rmse_m(launched: Launched, seen: Seen, agent: int = 0) -> float:
-    """Of the true position against the reference, from 10 s of the mission on."""
+    """Return the RMSE of the true position against the reference, from 10 s of the mission on."""
     table = pq.read_table(Path(launched.run_dir) / f"agent-{agent}.parquet")
     rows = {name: table.column(name).to_numpy() for name in ("t_us", "phase", "mission_t_s")}
     wanted = np.stack([table.column(f"ref_pos_ned_m_{axis}").to_numpy() for axis in "xyz"], axis=1)
@@ -63,7 +63,7 @@ def test_three_px4_fly_twice_as_they_are_however_early_they_are_launched(field: 
     assert here.witness.min_separation_m() > BODIES_M
 
 
-def test_three_px4_fly_the_shipped_mission(field: Fielder) -> None:
+def test_three_px4_fly_the_built_in_mission(field: Fielder) -> None:
     here = field(PX4, 3)
     launched = flown(here, PX4_CONFIG)
     assert launched.summary()["violations"] == []
@@ -71,13 +71,13 @@ def test_three_px4_fly_the_shipped_mission(field: Fielder) -> None:
 
 
 def booted(field: Fielder, count: int) -> Field:
-    """ArduCopters that know where they are: it takes their filters up to a minute to use GPS."""
+    """ArduCopters with a position: their filters take up to a minute to use GPS."""
     here = field(ARDUCOPTER, count)
     here.witness.wait(here.witness.all_placed, PLACED_S, "a position")
     return here
 
 
-def test_a_lone_arducopter_hovers_as_shipped(field: Fielder) -> None:
+def test_a_lone_arducopter_hovers_in_its_built_in_mission(field: Fielder) -> None:
     here = booted(field, 1)
     launched = flown(here, ARDUPILOT_CONFIG)
     assert launched.summary()["tracking"]["agents"][0]["steady_rmse_m"] < 0.1

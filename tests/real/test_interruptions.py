@@ -1,4 +1,4 @@
-"""What goes wrong around a flight of real autopilots: an agent dies, a pilot takes over, an autopilot starts again."""
+"""Interruptions of flights with real autopilots: an agent dies, a pilot takes over, an autopilot restarts."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ STOPPED_S = 60.0  # within which nothing is armed any more, or it is named
 
 
 def tracked_s(launched: Launched, agent: int) -> float:
-    """How far an agent got in its mission."""
+    """Return the mission time that an agent reached."""
     table = pq.read_table(launched.run_dir / f"agent-{agent}.parquet", columns=["phase", "mission_t_s"])
     times_s = table.column("mission_t_s").to_numpy()[table.column("phase").to_numpy() == Phase.TRACK]
     return float(times_s.max(initial=0.0))

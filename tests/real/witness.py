@@ -1,7 +1,7 @@
-"""What really happens: true positions from the autopilots' own simulators, and whether a vehicle is armed.
+"""A witness of the truth: true positions from the autopilots' own simulators, and whether a vehicle is armed.
 
-It listens where the bridge does not: PX4 sends its simulator's state to a display, and heartbeats to a ground station;
-ArduCopter has a second serial port on TCP. It is also the ground station by which a test's pilot speaks.
+It listens on other links than the bridge: PX4 sends its simulator's state to a display, and heartbeats to a ground
+station; ArduCopter has a second serial port on TCP. It is also the ground station of a test's pilot.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class Truth:
 
 @dataclass
 class Seen:
-    """Of one vehicle. Times are of the monotonic clock."""
+    """Samples of one vehicle. Times are of the monotonic clock."""
 
     t_s: list[float] = field(default_factory=list)
     pos_ned_m: list[tuple[float, float, float]] = field(default_factory=list)  # about the origin
@@ -67,18 +67,18 @@ class Seen:
         return any(armed for _, armed, _ in self.beats)
 
     def height_m(self) -> float:
-        """Above where it stood first."""
+        """Return the height above its first place."""
         return self.pos_ned_m[0][2] - self.pos_ned_m[-1][2]
 
     def at(self, t_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(T, 3) positions at these times."""
+        """Return the positions (T, 3) at these times."""
         samples = np.array(self.pos_ned_m)
         times_s = self.t_s[: len(samples)]  # it is still being added to
         return np.stack([np.interp(t_s, times_s, samples[:, axis]) for axis in range(3)], axis=1)
 
 
 class UdpLink:
-    """A port that every vehicle sends to, and what it hears by instance: `towards` + i is where an answer goes."""
+    """A port that every vehicle sends to, and what it receives by instance; replies go to `towards` + i."""
 
     def __init__(self, port: int, towards: int) -> None:
         self._towards = towards
@@ -99,7 +99,7 @@ class UdpLink:
 
 
 class TcpLink:
-    """A client of one vehicle's port, which may not be there yet."""
+    """A client of one vehicle's port, which may not exist yet."""
 
     def __init__(self, port: int) -> None:
         self._port = port
@@ -150,7 +150,7 @@ class Witness:
             link.close()
 
     def say(self, index: int, message: mav.MAVLink_message) -> None:
-        """As a ground station, to one vehicle."""
+        """Send a message to one vehicle, as a ground station."""
         link = self._links[index if self._fleet.kind is ARDUCOPTER else 0]
         link.send(self._codec.encode(message), index)
 
@@ -161,7 +161,7 @@ class Witness:
     # --- what has been seen ---
 
     def min_separation_m(self) -> float:
-        """Least true distance of two vehicles while all were flying."""
+        """Return the least true distance of two vehicles while all were flying."""
         begin_s, end_s = self._all_armed()
         grid_s = np.arange(begin_s, end_s, GRID_S)
         paths = [vehicle.at(grid_s) for vehicle in self.vehicles]
@@ -188,7 +188,7 @@ class Witness:
         return all(vehicle.placed for vehicle in self.vehicles)
 
     def all_rest(self) -> bool:
-        """Every vehicle is disarmed, and where it is on the ground."""
+        """Return whether every vehicle is disarmed and, on its ground, at rest."""
         return all(vehicle.pos_ned_m and not vehicle.armed and vehicle.height_m() < 0.3 for vehicle in self.vehicles)
 
     # --- listening ---

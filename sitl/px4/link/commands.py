@@ -1,4 +1,4 @@
-"""What each MAV_CMD means to one vehicle, and PX4's answer. It decides nothing about flight: the `Autopilot` does."""
+"""Meaning of each MAV_CMD for one vehicle, and PX4's answer. Flight decisions are the `Autopilot`'s."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from sitl.px4.modes import MODE_NAMES, Px4Mode, Result, Severity
 
 FORCE = 21196.0  # p2 of ARM/DISARM
 CUSTOM_MODE_FLAG = 1
-CHANGE_MODE_FLAG = 1  # of DO_REPOSITION
+CHANGE_MODE_FLAG = 1  # p2 flag of DO_REPOSITION
 Params = tuple[float, float, float, float, float, float, float]
 _MAIN_AUTO, _SUB_MISSION = 4, 4
-_TOLD_WHY = 190  # the component of a ground station: nobody else is told why a mode is refused
+_TOLD_WHY = 190  # component of a ground station, which alone receives the reason of a refused mode
 _AFTER_TERMINATION = frozenset(
     {
         mav.MAV_CMD_SET_MESSAGE_INTERVAL,
@@ -29,15 +29,15 @@ _AFTER_TERMINATION = frozenset(
 
 
 class Messages(Protocol):
-    """What a link can do about messages."""
+    """Message operations of a link."""
 
     sender: tuple[int, int]  # system and component of the command being handled
 
     def set_interval(self, message: int, interval_us: int) -> bool:
-        """False: no such message."""
+        """Set the interval of a message; return False when there is no such message."""
 
     def request(self, message: int, argument: float) -> bool:
-        """Send it once; False: there is no such message, or nothing to tell in it."""
+        """Send a message once; return False when there is no such message, or no content for it."""
 
 
 class Commands:
@@ -67,7 +67,7 @@ class Commands:
         }
 
     def run(self, command: int, params: Params, now_us: int) -> Result | None:
-        """Do it; None: PX4 does not even acknowledge."""
+        """Execute a command; None: PX4 does not even acknowledge it."""
         self._now_us = now_us
         action = self._actions.get(command)
         if action is None:
@@ -77,7 +77,7 @@ class Commands:
         return action(params)
 
     def set_mode(self, base: int, custom_mode: int, now_us: int) -> Result | None:
-        """SET_MODE, the message."""
+        """Execute the message SET_MODE."""
         main, sub = custom_mode >> 16 & 0xFF, custom_mode >> 24 & 0xFF
         params = (float(base), float(main), float(sub), 0.0, 0.0, 0.0, 0.0)
         return self.run(mav.MAV_CMD_DO_SET_MODE, params, now_us)
@@ -172,7 +172,7 @@ class Commands:
 
     def _reboot(self, params: Params) -> Result:
         if params[0] == 0.0:
-            return Result.ACCEPTED  # nothing asked of the autopilot itself
+            return Result.ACCEPTED  # nothing requested of the autopilot itself
         return self._autopilot.request_reboot(self._now_us) if params[0] == 1.0 else Result.DENIED
 
     # --- messages ---
@@ -195,5 +195,5 @@ class Commands:
 
 
 def _whole(value: float) -> int | None:
-    """Integer of a command parameter; None for NaN and infinities."""
+    """Return the integer of a command parameter; None for NaN and infinities."""
     return int(value) if math.isfinite(value) else None

@@ -1,7 +1,7 @@
-"""MAVLink face of one vehicle on one link: frames in, setpoints and commands on, reports out. PX4's manners.
+"""MAVLink interface of one vehicle on one link: receives setpoints and commands, sends reports; protocol as PX4.
 
-It decides who is addressed and what is sent when. What commands mean is `commands`', parameters and missions have
-modules of their own, and what happens then is the `Autopilot`'s.
+It decides on addressing and on sending times. The meaning of commands is in `commands`; parameters and missions have
+modules of their own; the `Autopilot` decides the consequences.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ TYPE_GCS = 6
 TEXT_CHARS = 50
 TEXT_MAX_AGE_US = 5_000_000
 TEXT_EVERY_US = 50_000
-GCS_GONE_US = 2_500_000  # without its heartbeat
-BOOT_COMMAND = 211  # PX4 acknowledges it unasked when it has started
+GCS_GONE_US = 2_500_000  # timeout of a ground station's heartbeat
+BOOT_COMMAND = 211  # PX4 acknowledges it unasked at start
 _ACK = KINDS[mav.MAVLINK_MSG_ID_COMMAND_ACK]
 _TEXT = KINDS[mav.MAVLINK_MSG_ID_STATUSTEXT]
 _TIMESYNC = KINDS[mav.MAVLINK_MSG_ID_TIMESYNC]
@@ -40,7 +40,7 @@ _INTERVAL = KINDS[mav.MAVLINK_MSG_ID_MESSAGE_INTERVAL]
 _AVAILABLE = KINDS[mav.MAVLINK_MSG_ID_AVAILABLE_MODES]
 _CURRENT_MODE = mav.MAVLINK_MSG_ID_CURRENT_MODE
 _ORIGIN = mav.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN
-_UNKNOWN_PLACE = 2**31 - 1  # of COMMAND_INT
+_UNKNOWN_PLACE = 2**31 - 1  # value of COMMAND_INT for no place
 
 
 class Endpoint:
@@ -49,10 +49,10 @@ class Endpoint:
     Args:
         sysid: MAVLink system id.
         transport: link to the client.
-        autopilot: what obeys.
+        autopilot: executes commands and setpoints.
         report: makes a `Report` of this instant; called only when something is sent.
         step_us: physics step, the fastest message interval.
-        default_hz: what the link sends unasked.
+        default_hz: default rates of the link.
     """
 
     def __init__(
@@ -67,11 +67,11 @@ class Endpoint:
         self.sysid = sysid
         self.transport = transport
         self.ignored: Counter[str] = Counter()
-        self.sender = (0, 0)  # of the message being handled
+        self.sender = (0, 0)  # system and component of the message being handled
         self._autopilot = autopilot
         self._report = report
         self._step_us = step_us
-        self._waited_us = 0  # since the datagram in hand arrived
+        self._waited_us = 0  # since the arrival of the current datagram
         self._default_hz = OFFBOARD_HZ if default_hz is None else default_hz
         self._codec = Codec(sysid, COMPONENT)
         self._writer = FrameWriter(sysid, COMPONENT)
@@ -80,11 +80,11 @@ class Endpoint:
         self._begin()
 
     def _begin(self) -> None:
-        """As after boot."""
+        """Reset to the state after boot."""
         self._schedule = Schedule(self._step_us, self._default_hz, self._autopilot.boot.quiet_us)
         self._counts = LinkCounts()
         self._greeted = False
-        self._gcs_us: int | None = None  # when a ground station was last heard
+        self._gcs_us: int | None = None  # last heartbeat of a ground station
         self._origin_sent: object = None
         self._status_sent: tuple[object, ...] = ()
         self._seen: set[tuple[int, int]] = set()
@@ -95,12 +95,12 @@ class Endpoint:
         self._missions = MissionLink(self._autopilot.store, self)
 
     def join(self, other: Endpoint) -> None:
-        """Both are links of one vehicle."""
+        """Join two links of one vehicle."""
         self._others.append(other)
         other._others.append(self)
 
     def reboot(self, now_us: int) -> None:
-        """The autopilot goes down and starts again, on all its links; `now_us` is on the simulation's clock."""
+        """Restart the autopilot, on all its links; `now_us` is on the simulation's clock."""
         self._autopilot.reboot(now_us)
         for endpoint in (self, *self._others):
             endpoint._begin()
@@ -112,7 +112,7 @@ class Endpoint:
             return
         self._now_us = self._autopilot.boot.since_us(now_us)
         if self._now_us < self._autopilot.boot.quiet_us:
-            return  # it is starting: nobody listens
+            return  # it is starting and does not receive
         for datagram in arrived:
             self._waited_us = max(0, min(self._step_us, transport_now_us - datagram.t_us))
             self._counts.received_bytes += len(datagram.data)
@@ -121,7 +121,7 @@ class Endpoint:
         self._autopilot.stream.flown()
 
     def send_due(self, now_us: int) -> None:
-        """Send what the schedule, running transfers, or pending texts ask for; `now_us` as in `receive`."""
+        """Send what the schedule, running transfers, or pending texts require; `now_us` as in `receive`."""
         pilot = self._autopilot
         self._now_us = pilot.boot.since_us(now_us)
         if self._now_us < pilot.boot.quiet_us:
@@ -205,7 +205,7 @@ class Endpoint:
 
     def _on_timesync(self, message: Any) -> None:
         if message.tc1 == 0:
-            self.send(_TIMESYNC, (self._now_us - self._waited_us) * 1000, message.ts1)  # when it arrived
+            self.send(_TIMESYNC, (self._now_us - self._waited_us) * 1000, message.ts1)  # time of arrival
 
     def _on_ping(self, message: Any) -> None:
         if message.target_system == 0 and message.target_component == 0:
@@ -228,21 +228,21 @@ class Endpoint:
         self._acknowledge(mav.MAV_CMD_DO_SET_MODE, result)
 
     def _acknowledge(self, command: int, result: Result | None) -> None:
-        """To the sender, on every link it has been heard on."""
+        """Send an acknowledgement to the sender, on every link it was received on."""
         if result is None:
             return
         for link in (self, *(o for o in self._others if self.sender in o._seen)):
             link.send(_ACK, command, result, 0, 0, *self.sender)
 
     def set_interval(self, message: int, interval_us: int) -> bool:
-        """SET_MESSAGE_INTERVAL; False: no such message."""
+        """Execute SET_MESSAGE_INTERVAL; return False when there is no such message."""
         if message not in STREAMS:
             return False
         self._schedule.set_interval(message, interval_us, self._now_us)
         return True
 
     def request(self, message: int, argument: float) -> bool:
-        """REQUEST_MESSAGE; False when nothing was sent."""
+        """Execute REQUEST_MESSAGE; return False when nothing was sent."""
         if message in STREAMS:
             return self._send_streams([message]) == 1
         if message == mav.MAVLINK_MSG_ID_MESSAGE_INTERVAL and 0 <= argument <= 0xFFFF:
@@ -255,7 +255,7 @@ class Endpoint:
         return True
 
     def _send_available_modes(self, argument: float) -> None:
-        """All modes, or the one with that index, from 1 on."""
+        """Send all modes, or the one with that index, from 1 on."""
         for index, (mode, name) in enumerate(MODE_NAMES.items(), 1):
             if argument in (0.0, float(index)):
                 standard = STANDARD_MODES.get(mode, 0)
@@ -264,18 +264,18 @@ class Endpoint:
     # --- sending ---
 
     def send(self, kind: Kind, *fields: Any) -> None:
-        """One message from its fields in wire order."""
+        """Send one message from its fields in wire order."""
         try:
             frame = self._writer.frame(kind, fields)
         except struct.error:
-            self.ignored[f"not_sent {kind.name}"] += 1  # a number no field holds: never stop the flight for it
+            self.ignored[f"not_sent {kind.name}"] += 1  # a number that no field can hold must not stop the flight
             return
         self._counts.sent += 1
         self._counts.sent_bytes += len(frame)
         self.transport.send(frame)
 
     def _send_streams(self, messages: list[int]) -> int:
-        """How many of them there was something to tell in."""
+        """Send the streams that are due; return how many had content."""
         report = self._report()
         report.counts = self._counts
         placed = self._autopilot.has_position and self._autopilot.ready(self._now_us)
@@ -290,7 +290,7 @@ class Endpoint:
         return told
 
     def _status_is_new(self) -> bool:
-        """PX4 tells its mode when it has published it, twice a second and on change, however often it is asked to."""
+        """Return whether PX4 has published its status anew: twice a second and on change, whatever the requests."""
         before, self._status_sent = self._status_sent, self._autopilot.status(self._now_us)
         return before != self._status_sent
 
@@ -306,7 +306,7 @@ class Endpoint:
             other._parameters.send(value)
 
     def _send_texts(self) -> None:
-        """PX4 tells only links with a ground station (HEARTBEAT type 6) now, at most 20/s, nothing older than 5 s."""
+        """Send texts: only to links with a ground station (HEARTBEAT type 6), at most 20/s, none older than 5 s."""
         for severity, text in self._autopilot.texts:
             for link in (self, *self._others):
                 link._texts.append((self._now_us, severity, text))

@@ -19,17 +19,17 @@ _ITEM = KINDS[mav.MAVLINK_MSG_ID_MISSION_ITEM_INT]
 _FLOAT_ITEM = KINDS[mav.MAVLINK_MSG_ID_MISSION_ITEM]
 _REACHED = KINDS[mav.MAVLINK_MSG_ID_MISSION_ITEM_REACHED]
 _MISSION_FRAME = 2
-_INT_FRAMES = {0: 5, 3: 6}  # how MISSION_ITEM_INT names a frame of MISSION_ITEM
+_INT_FRAMES = {0: 5, 3: 6}  # frame of a MISSION_ITEM -> frame of MISSION_ITEM_INT
 
 
 class MissionLink:
-    """One vehicle's uploads on one link; one upload at a time."""
+    """Uploads to one vehicle over one link; one upload at a time."""
 
     def __init__(self, store: Store, link: Sender) -> None:
         self._store = store
         self._link = link
         self._kind = MISSION
-        self._wanted = 0  # items of the running upload; 0: none runs
+        self._wanted = 0  # items of the running upload; 0: none is running
         self._received: list[Item] = []
         self._partner = (0, 0)
         self._heard_us = self._requested_us = 0
@@ -37,7 +37,7 @@ class MissionLink:
     # --- upload ---
 
     def count(self, m: Any, now_us: int) -> None:
-        """MISSION_COUNT: a client wants to upload."""
+        """Take MISSION_COUNT: a client wants to upload."""
         capacity = CAPACITY.get(m.mission_type)
         if capacity is None:
             self._acknowledge(MissionResult.UNSUPPORTED, m.mission_type)
@@ -55,7 +55,7 @@ class MissionLink:
             self._request(now_us)
 
     def item(self, m: Any, now_us: int) -> None:
-        """MISSION_ITEM_INT or MISSION_ITEM of the running upload; others are ignored, as are repeated ones."""
+        """Take a MISSION_ITEM_INT or MISSION_ITEM of the running upload; others and repeated ones are ignored."""
         if not self._wanted or self._link.sender != self._partner or m.mission_type != self._kind:
             self._acknowledge(MissionResult.ERROR, m.mission_type)
             return
@@ -82,7 +82,7 @@ class MissionLink:
         self._acknowledge(MissionResult.ACCEPTED, self._kind)
 
     def send_due(self, now_us: int) -> None:
-        """Ask again for an item that did not come; give up after a while without a word."""
+        """Request a missing item again; give up after a silence."""
         if not self._wanted:
             return
         if now_us - self._heard_us >= TIMEOUT_US:
@@ -101,14 +101,14 @@ class MissionLink:
     # --- download and the rest ---
 
     def list(self, m: Any) -> None:
-        """MISSION_REQUEST_LIST."""
+        """Answer MISSION_REQUEST_LIST."""
         if m.mission_type not in CAPACITY:
             self._acknowledge(MissionResult.UNSUPPORTED, m.mission_type)
             return
         self._link.send(_COUNT, len(self._store.items[m.mission_type]), *self._link.sender, m.mission_type)
 
     def request(self, m: Any) -> None:
-        """MISSION_REQUEST_INT, or the older MISSION_REQUEST, which gets a MISSION_ITEM."""
+        """Answer MISSION_REQUEST_INT, or the older MISSION_REQUEST, which gets a MISSION_ITEM."""
         items = self._store.items.get(m.mission_type, ())
         if m.seq >= len(items):
             return  # PX4 answers nothing
@@ -124,7 +124,7 @@ class MissionLink:
             self._link.send(_FLOAT_ITEM, *item.params, *place, item.z_m, *tail, item.frame, *rest)
 
     def clear(self, m: Any) -> None:
-        """MISSION_CLEAR_ALL."""
+        """Execute MISSION_CLEAR_ALL."""
         if m.mission_type in CAPACITY or m.mission_type == ALL:
             self._store.replace(m.mission_type, ())
             self._acknowledge(MissionResult.ACCEPTED, m.mission_type)
@@ -132,11 +132,11 @@ class MissionLink:
             self._acknowledge(MissionResult.UNSUPPORTED, m.mission_type)
 
     def set_current(self, m: Any) -> None:
-        """MISSION_SET_CURRENT; MISSION_CURRENT shows whether there was such an item."""
+        """Execute MISSION_SET_CURRENT; MISSION_CURRENT shows whether there was such an item."""
         self._store.jump(m.seq)
 
     def reached(self, seq: int) -> None:
-        """MISSION_ITEM_REACHED."""
+        """Send MISSION_ITEM_REACHED."""
         self._link.send(_REACHED, seq)
 
     def _acknowledge(self, result: MissionResult, kind: int) -> None:

@@ -11,37 +11,37 @@ from sitl.net.wire import KINDS
 from sitl.px4.parameters import HASH_NAME, Parameters, UnknownParameterError, WireValue, WrongTypeError
 
 UNKNOWN, WRONG_TYPE = 1, 7  # MAV_PARAM_ERROR
-STALE_INDEX = 511  # PX4 leaves the index of a PARAM_ERROR by name unset; this is what it then shows
+STALE_INDEX = 511  # PX4 leaves the index of a PARAM_ERROR by name unset; this value then appears
 LIST_EVERY_US = 1000
 _VALUE = KINDS[mav.MAVLINK_MSG_ID_PARAM_VALUE]
 _ERROR = KINDS[mav.MAVLINK_MSG_ID_PARAM_ERROR]
 
 
 class Sender(Protocol):
-    """What a protocol needs of its link."""
+    """Operations that the protocol needs of its link."""
 
     sender: tuple[int, int]  # system and component of the message being handled
 
     def send(self, kind: Any, *fields: Any) -> None:
-        """One message from its fields in wire order."""
+        """Send one message from its fields in wire order."""
 
 
 class ParameterLink:
-    """One vehicle's parameters on one link; `on_change` tells the other links."""
+    """Parameters of one vehicle on one link; `on_change` tells the other links."""
 
     def __init__(self, table: Parameters, link: Sender, on_change: Callable[[WireValue], None]) -> None:
         self._table = table
         self._link = link
         self._on_change = on_change
-        self._next: int | None = None  # of the running list; -1: the hash
+        self._next: int | None = None  # index in the running list; -1: the hash
         self._due_us = 0
 
     def list(self, now_us: int) -> None:
-        """PARAM_REQUEST_LIST."""
+        """Answer PARAM_REQUEST_LIST."""
         self._next, self._due_us = -1, now_us
 
     def read(self, message: Any) -> None:
-        """PARAM_REQUEST_READ."""
+        """Answer PARAM_REQUEST_READ."""
         by_name = message.param_index < 0
         if by_name and message.param_id == HASH_NAME:
             self.send(self._table.checksum())
@@ -54,7 +54,7 @@ class ParameterLink:
             self.send(found)
 
     def write(self, message: Any) -> None:
-        """PARAM_SET; of the hash: the client has the list already."""
+        """Execute PARAM_SET; of the hash it means that the client has the list already."""
         if message.param_id == HASH_NAME:
             self._next = None
             return
@@ -69,14 +69,14 @@ class ParameterLink:
             self._on_change(stored)
 
     def send_due(self, now_us: int) -> None:
-        """Go on with the list: about a thousand a second."""
+        """Continue the list, about a thousand a second."""
         while self._next is not None and self._due_us <= now_us:
             self._due_us += LIST_EVERY_US
             self.send(self._table.checksum() if self._next < 0 else self._table.by_index(self._next))
             self._next = self._next + 1 if self._next + 1 < len(self._table) else None
 
     def send(self, value: WireValue) -> None:
-        """PARAM_VALUE."""
+        """Send PARAM_VALUE."""
         self._link.send(_VALUE, value.value, len(self._table), value.index, value.name.encode(), value.kind)
 
     def _refuse(self, name: str, index: int, error: int) -> None:

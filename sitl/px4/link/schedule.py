@@ -1,6 +1,6 @@
-"""Which messages a link sends by default, how often, and when the next ones are due.
+"""Default messages of a link, their rates, and the times at which they are due.
 
-Rates are those of PX4 1.18 as measured on the ground; what is not listed goes out only when asked for.
+Rates are those of PX4 1.18 as measured on the ground; unlisted messages are sent only on request.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ _NEVER_US = 1 << 62
 
 
 class Schedule:
-    """Which messages are due. Times are since boot; intervals lie on a grid from boot, so samples repeat exactly.
+    """Decides which messages are due. Times since boot; intervals lie on a grid from boot, so samples repeat exactly.
 
     All but odometry are shifted by their id, so that one step never has to send everything; the heartbeat's grid begins
     with the first message.
@@ -69,12 +69,12 @@ class Schedule:
         self._default_hz = OFFBOARD_HZ if default_hz is None else default_hz
         self._interval_us: dict[int, int] = {}
         self._next_us: dict[int, int] = {}
-        self._queue: list[tuple[int, int]] = []  # (due, message); entries that `_next_us` contradicts are dead
+        self._queue: list[tuple[int, int]] = []  # (due, message); entries that `_next_us` contradicts are stale
         for message in self._default_hz:
             self.set_interval(message, 0, first_us)
 
     def set_interval(self, message: int, interval_us: int, now_us: int) -> None:
-        """Interval of a message [us]; 0 its default, negative off. Never faster than one physics step."""
+        """Set the interval of a message [us]: 0 its default, negative off; never below one physics step."""
         if interval_us == 0:
             rate_hz = self._default_hz.get(message, 0.0)
             interval_us = round(1e6 / rate_hz) if rate_hz > 0 else -1
@@ -91,11 +91,11 @@ class Schedule:
         heapq.heappush(self._queue, (self._next_us[message], message))
 
     def interval_us(self, message: int) -> int:
-        """Interval of a message, -1 when it is off."""
+        """Return the interval of a message [us], -1 when it is off."""
         return self._interval_us.get(message, -1)
 
     def take_due(self, now_us: int) -> list[int]:
-        """Ids due at `now_us`, in order of their times; missed ones are sent once, not made up for."""
+        """Return the ids due at `now_us`, in order of their times; a missed one is sent once."""
         due: list[int] = []
         queue, next_us = self._queue, self._next_us
         while queue and queue[0][0] <= now_us:

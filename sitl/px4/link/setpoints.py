@@ -1,8 +1,8 @@
-"""SET_ATTITUDE_TARGET as PX4 1.18 takes it: which type masks count as a stream, and what each makes the vehicle fly.
+"""SET_ATTITUDE_TARGET as PX4 1.18 takes it: the type masks that count as a stream, and their effect.
 
 PX4 validates nothing: a thrust that is not a number stops the motors while it lasts, and one zero or non-finite
-quaternion poisons the attitude controller until reboot. Here such setpoints are refused and counted, unless
-`reject_bad` is off: then they do what they do to PX4.
+quaternion corrupts the attitude controller until reboot. Here such setpoints are refused and counted, unless
+`reject_bad` is off: then they have the same effect as in PX4.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from sitl.px4.navigator import IDLE, Command
 
 NO_ROLL_RATE, NO_PITCH_RATE, NO_YAW_RATE = 1, 2, 4
 THRUST_BODY, NO_THRUST, NO_ATTITUDE = 32, 64, 128
-BOTH_RATES_SHARE = 0.1  # of a roll rate that fights the attitude: 0.5 rad/s held 0.7 deg too much at gain 4
+BOTH_RATES_SHARE = 0.1  # of a roll rate that opposes the attitude: 0.5 rad/s held 0.7 deg too much at gain 4
 _LEVEL = (1.0, 0.0, 0.0, 0.0)
 _NO_RATES = (0.0, 0.0, 0.0)
 Triple = tuple[float, float, float]
@@ -30,8 +30,8 @@ class OffboardStream:
     Attributes:
         command: the newest usable setpoint that came while OFFBOARD was on; what OFFBOARD flies.
         seen: there has been a stream since boot.
-        poisoned: the attitude controller is broken until reboot.
-        refused: setpoints not used, by reason.
+        poisoned: the attitude controller is corrupted until reboot.
+        refused: number of unused setpoints, by reason.
         echo: quaternion as sent, thrust without sign, and body rates of `command`, for ATTITUDE_TARGET.
     """
 
@@ -41,14 +41,14 @@ class OffboardStream:
         self.reset()
 
     def reset(self) -> None:
-        """As after boot."""
+        """Reset to the state after boot."""
         self.command = IDLE
         self.seen = self.poisoned = self._bad = False
         self.echo: tuple[Sequence[float], float, Triple] = (_LEVEL, 0.0, _NO_RATES)
         self._last_us: int | None = None
 
     def age_us(self, now_us: int) -> float:
-        """Since the newest setpoint that proves a stream; infinite before the first."""
+        """Return the age of the newest setpoint that proves a stream; infinite before the first."""
         return math.inf if self._last_us is None else now_us - self._last_us
 
     def take(
@@ -61,7 +61,7 @@ class OffboardStream:
         *,
         flying: bool,
     ) -> bool:
-        """A setpoint addressed to this vehicle; True when it counts as a stream.
+        """Take a setpoint addressed to this vehicle; return whether it counts as a stream.
 
         Args:
             type_mask: ATTITUDE_TARGET_TYPEMASK.
@@ -105,12 +105,12 @@ class OffboardStream:
         self.echo = q_nb, abs(thrust_01), _NO_RATES
 
     def flown(self) -> None:
-        """The attitude controller takes the newest setpoint; what came just before that one never reaches it."""
+        """Note that the attitude controller uses the newest setpoint, so that the one before is skipped."""
         self.poisoned = self.poisoned or self._bad
         self._bad = False
 
     def spoiled(self, command: Command) -> Command:
-        """A command of any mode as a poisoned attitude controller flies it: thrust, but no torque."""
+        """Return a command of any mode as a corrupted attitude controller flies it: thrust, but no torque."""
         if not self.poisoned or command.loose or command.rate_frd_rad_s is not None:
             return command
         return replace(command, loose=True)
@@ -121,7 +121,7 @@ class OffboardStream:
 
 
 def _complaint(type_mask: int, q_nb: Sequence[float], rates: Triple, thrust_01: float) -> str:
-    """Why a setpoint would harm PX4; empty when it would not."""
+    """Return why a setpoint would harm PX4; empty when it would not."""
     if not math.isfinite(thrust_01):
         return "not_finite"
     used = [rate for bit, rate in zip((1, 2, 4), rates, strict=True) if not type_mask & bit]
@@ -136,7 +136,7 @@ def _complaint(type_mask: int, q_nb: Sequence[float], rates: Triple, thrust_01: 
 
 
 def _feed(type_mask: int, rates: Triple) -> Triple | None:
-    """Body rates that act beside an attitude: yaw's as feed-forward, roll's and pitch's fighting it."""
+    """Return the body rates that act beside an attitude: yaw's as feed-forward, roll's and pitch's against it."""
     roll = 0.0 if type_mask & NO_ROLL_RATE else rates[0] * BOTH_RATES_SHARE
     pitch = 0.0 if type_mask & NO_PITCH_RATE else rates[1] * BOTH_RATES_SHARE
     yaw = 0.0 if type_mask & NO_YAW_RATE else rates[2]

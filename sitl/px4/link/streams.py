@@ -1,6 +1,6 @@
-"""What one vehicle reports about its flight: state, mode, targets. Every builder returns fields in wire order.
+"""Reports of one vehicle about its flight: state, mode, targets. Every builder returns fields in wire order.
 
-What its sensors, power and estimator report is `sitl.px4.link.streams_health`'s; `STREAMS` has all of them.
+`sitl.px4.link.streams_health` reports sensors, power and estimator; its `STREAMS` lists all messages.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _INT32 = 2**31 - 1
 
 @dataclass(slots=True)
 class LinkCounts:
-    """What one link has carried so far."""
+    """Traffic counters of one link."""
 
     sent: int = 0
     sent_bytes: int = 0
@@ -53,8 +53,8 @@ class Report:
     autopilot: Autopilot
     origin: LocalOrigin
     rotor_01: tuple[float, ...]  # (4,) forces
-    force_frd_m_s2: tuple[float, float, float] = REST_FORCE_M_S2  # what accelerometers feel, body axes
-    simulation_us: int = -1  # when this was, on the simulation's clock
+    force_frd_m_s2: tuple[float, float, float] = REST_FORCE_M_S2  # specific force, body axes
+    simulation_us: int = -1  # the instant, on the simulation's clock
     counts: LinkCounts | None = None
 
 
@@ -149,7 +149,7 @@ def vfr_hud(r: Report) -> Fields:
 
 
 def attitude_target(r: Report) -> Fields:
-    """What the attitude controller follows; a stream's setpoint as it was sent. type_mask is always 0."""
+    """Build ATTITUDE_TARGET: the target that is followed; a stream's setpoint as sent. type_mask is always 0."""
     pilot, output = r.autopilot, r.autopilot.output
     rates: tuple[float, ...] = (0.0, 0.0, 0.0)
     if pilot.stream.poisoned:
@@ -166,7 +166,7 @@ def attitude_target(r: Report) -> Fields:
 
 
 def _turn_rad(q_nb: Sequence[float], wanted: Sequence[float]) -> tuple[float, float, float]:
-    """Small rotation from one attitude to another, body axes."""
+    """Return the small rotation from one attitude to another, body axes."""
     w, x, y, z = q_nb
     a, b, c, d = wanted
     two = 2.0 if w * a + x * b + y * c + z * d >= 0 else -2.0
@@ -178,7 +178,7 @@ def _turn_rad(q_nb: Sequence[float], wanted: Sequence[float]) -> tuple[float, fl
 
 
 def position_target(r: Report) -> Fields:
-    """Setpoints of AUTO flight; NaN, and ignored in the mask, where there are none."""
+    """Build the setpoints of AUTO flight; NaN, and ignored in the mask, where there are none."""
     pilot = r.autopilot
     auto = pilot.armed and pilot.mode != Px4Mode.OFFBOARD and pilot.output is not IDLE
     target = pilot.flight.target() if auto else _NO_TARGET
@@ -203,7 +203,7 @@ def mission_current(r: Report) -> Fields:
 
 
 def time_estimates(r: Report) -> Fields:
-    """Seconds until it would have landed, were it to return now; -1: none."""
+    """Build the seconds until landing if it returned now; -1: none."""
     home = r.autopilot.home_ned_m
     if not r.autopilot.armed or home is None:
         return -1, -1, -1, -1, -1
@@ -230,12 +230,12 @@ _HASH = tuple(reversed(bytes.fromhex("83c4f4e580000000")))  # of the release tha
 
 
 def ms(r: Report) -> int:
-    """Time since boot [ms], as 32 bits."""
+    """Return the time since boot [ms], as 32 bits."""
     return r.estimate.t_us // 1000 & 0xFFFFFFFF
 
 
 def home_z_m(r: Report) -> float:
-    """Local z of home, 0 before there is one."""
+    """Return the local z of home; 0 before there is one."""
     return r.autopilot.home_ned_m[2] if r.autopilot.home_ned_m else 0.0
 
 
@@ -249,10 +249,10 @@ def _int16(value: float) -> int:
 
 @dataclass(frozen=True, slots=True)
 class Stream:
-    """One message this vehicle can send."""
+    """One message that this vehicle can send."""
 
     build: Callable[[Report], Fields]
-    needs_position: bool = False  # not before the estimator is ready, nor without a position
+    needs_position: bool = False  # only with a ready estimator and a position
 
 
 FLIGHT_STREAMS: dict[int, Stream] = {

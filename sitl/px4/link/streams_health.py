@@ -1,4 +1,4 @@
-"""What one vehicle reports about its sensors, power, estimator and link; and the table of all it can send."""
+"""Reports of one vehicle about its sensors, power, estimator and link, and the table of all messages."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def scaled_pressure(r: Report) -> Fields:
 
 
 def distance_sensor(r: Report) -> Fields:
-    """A lidar that looks down: height over the vehicle's own ground along its body axis."""
+    """Build the message of a lidar that looks down: height over the vehicle's own ground along its body axis."""
     height_m = (home_z_m(r) - r.estimate.pos_ned_m[2]) / max(0.1, r.estimate.down_axis_ned[2])
     range_cm = max(_LIDAR_MIN_CM, min(_LIDAR_MAX_CM, round(height_m * 100)))
     fields = _LIDAR_MIN_CM, _LIDAR_MAX_CM, range_cm, 0, 0, _DOWNWARD, 0
@@ -178,7 +178,7 @@ def drone_id_location(r: Report) -> Fields:
 
 
 def drone_id_system(r: Report) -> Fields:
-    """The operator stands where the vehicle took off."""
+    """Build the operator's position: where the vehicle took off."""
     x_m, y_m, z_m = r.autopilot.home_ned_m or (0.0, 0.0, 0.0)
     lat_e7, lon_e7 = r.origin.to_geo_e7(x_m, y_m)
     since_2019_s = max(0, (r.autopilot.boot_utc_us + r.estimate.t_us) // 1_000_000 - 1_546_300_800) & 0xFFFFFFFF
@@ -195,7 +195,7 @@ def link_node_status(r: Report) -> Fields:
 
 
 def timesync(r: Report) -> Fields:
-    """Its own request: a client answers with tc1."""
+    """Build a request of its own, which a client answers with tc1."""
     return 0, r.estimate.t_us * 1000
 
 
@@ -210,13 +210,13 @@ def event_sequence(_: Report) -> Fields:
 
 
 def _air(altitude_m: float) -> tuple[float, float]:
-    """Pressure [hPa] and temperature [deg C] of the standard atmosphere's lowest layer."""
+    """Return pressure [hPa] and temperature [deg C] of the standard atmosphere's lowest layer."""
     kelvin = max(100.0, _SEA_LEVEL_K - _LAPSE_K_M * altitude_m)
     return _SEA_LEVEL_HPA * (kelvin / _SEA_LEVEL_K) ** _EXPONENT, kelvin - 273.15
 
 
 def _in_body(q_nb: tuple[float, float, float, float], v: tuple[float, float, float]) -> tuple[float, float, float]:
-    """A NED vector in body axes: conj(q) v q."""
+    """Return a NED vector in body axes: conj(q) v q."""
     w, x, y, z = q_nb
     a, b, c = v
     tx, ty, tz = 2 * (z * b - y * c), 2 * (x * c - z * a), 2 * (y * a - x * b)

@@ -1,4 +1,4 @@
-"""The `bench` verb: how long an agent's tick takes, split into its parts, for growing swarms and for both QP solvers.
+"""The `bench` verb: measures the duration of an agent's tick, split into parts, for growing swarms and each QP solver.
 
 `python -m sitl.studies.bench.bench [--out DIR] [--neighbours 0,1,2] [--solver osqp] [--ticks N] [--no-slsqp]`
 
@@ -41,20 +41,20 @@ from sitl.studies.campaign.scenarios import layout_of
 from sitl.studies.campaign.trials import Cell
 from swarmctl.agent.telemetry_publisher import TickTiming
 from swarmctl.config import Config
+from swarmctl.control.mpc.qp import SOLVERS, installed_solvers
 from swarmctl.core.types import Array, Phase
 from swarmctl.errors import EXIT_OK, ConfigError, MissionError, exit_code_of
 from swarmctl.files import replace_text
 
 PARTS = ("sense", "setup", "commitment", "spaces", "solve", "certify", "barrier", "send", "tick")
-SOLVERS = ("osqp", "daqp")
 NEIGHBOURS = (0, 1, 2, 4, 8, 16, 30)
 MAX_NEIGHBOURS = 99
-_BESIDE_PILLAR = 2  # neighbours of the scenario with an obstacle
-_WARM_UP_S = 5.0  # of the mission: catching up with the circle
+_BESIDE_PILLAR = 2  # neighbours in the scenario with an obstacle
+_WARM_UP_S = 5.0  # mission time for catching up with the circle
 _READY_WITHIN_TICKS = 1500
 _OBSTACLE = ", 1 obstacle"
 _GUARANTEED = ", guaranteed"
-_GUARANTEED_NEIGHBOURS = 9  # neighbours of the scenario with guaranteed separation
+_GUARANTEED_NEIGHBOURS = 9  # neighbours in the scenario with commitments
 _ENDLESS_S = 3600.0
 _BUSY_LOAD = 0.7  # one-minute load average
 
@@ -77,10 +77,11 @@ def measure_ticks(
     pillar: bool = False,
     on_tick: Callable[[], None] = lambda: None,
 ) -> dict[str, Array]:
-    """Parts of `ticks` ticks, (ticks, 9) [ms] in the order of `PARTS`, by solver.
+    """Return the parts of `ticks` ticks, (ticks, 9) [ms] in the order of `PARTS`, by solver.
 
     Raises:
-        MissionError: an agent did not get under way, or had no plan at a counted tick: a failing tick is no figure.
+        MissionError: an agent did not reach the mission, or had no plan at a counted tick, which would be no valid
+        figure.
     """
     formations = {solver: Formation(formation_config(solver, neighbours, pillar)) for solver in solvers}
     for solver, formation in formations.items():
@@ -100,10 +101,9 @@ def measure_ticks(
 def measure_commitments(
     neighbours: int, solvers: Sequence[str], ticks: int, on_tick: Callable[[], None] = lambda: None
 ) -> dict[str, Array]:
-    """The same of `neighbours + 1` agents that fly a swap with guaranteed separation.
+    """Measure `neighbours + 1` agents in a swap with guaranteed commitments; (ticks, 9) [ms] over all agents.
 
-    Rows (ticks, 9) [ms] are ticks of all agents in turn. Paths alone, as in `measure_ticks`, commit to nothing:
-    everybody is a whole agent here.
+    The neighbours of `measure_ticks` are paths only and can't commit, so every neighbour is a whole agent here.
     """
     crowds = {solver: Lockstep(_swap_config(solver, neighbours + 1)) for solver in solvers}
     timings: dict[str, list[tuple[float, ...]]] = {solver: [] for solver in solvers}
@@ -146,7 +146,7 @@ def _parts(timing: TickTiming) -> tuple[float, ...]:
 
 
 def tick_rows(timings: dict[str, Array], neighbours: int, suffix: str = "") -> list[BenchRow]:
-    """Rows of one scenario."""
+    """Return the rows of one scenario."""
     rows = []
     for solver, parts in timings.items():
         for name, column in zip(PARTS, parts.T, strict=True):
@@ -155,7 +155,7 @@ def tick_rows(timings: dict[str, Array], neighbours: int, suffix: str = "") -> l
 
 
 def xy_rows(times: XyTimes) -> list[BenchRow]:
-    """Rows of the x-y problem alone: QP, and true distances as in the thesis."""
+    """Return the rows of the x-y problem alone: the QP, and the thesis' problem with true distances."""
     rows = [_row("solve x-y" + _OBSTACLE, solver, 2, times.qp(solver)) for solver in times.qp_ms]
     if times.fmincon is not None and times.gradients is not None:
         rows.append(_row("solve x-y, nonlinear" + _OBSTACLE, "slsqp", 2, times.fmincon.times))
@@ -170,7 +170,7 @@ def _row(name: str, solver: str, neighbours: int, times: Times) -> BenchRow:
 def bench(
     neighbours: Sequence[int], solvers: Sequence[str], ticks: int, slsqp: bool, console: Console
 ) -> list[BenchRow]:
-    """Measure everything; shows progress on a terminal."""
+    """Run all measurements; shows progress on a terminal."""
     rows: list[BenchRow] = []
     guaranteed = min(_GUARANTEED_NEIGHBOURS, max(1, *neighbours, 0))
     with Progress(transient=True, console=console, disable=not console.is_terminal) as bar:
@@ -195,14 +195,24 @@ def bench(
 
 
 def busy_note(load: float, processors: int) -> str:
-    """What to say of the machine before anything is measured; "" when it is quiet."""
+    """Return a note on a busy machine, from the load before the measurement; "" when it is quiet."""
     if load < _BUSY_LOAD:
         return ""
     return f"load {load:.1f} on {processors} processors before the start: p99 of ticks includes other processes' work"
 
 
+def chosen_solvers(asked: Sequence[str]) -> tuple[list[str], str]:
+    """Return the solvers to measure, and a note on those that are left out because they are not installed."""
+    if asked:
+        return list(dict.fromkeys(asked)), ""
+    installed = installed_solvers()
+    missing = [name for name in SOLVERS if name not in installed]
+    notes = [f"{name} is left out: it is not installed; pip install 'swarmctl[{name}]'" for name in missing]
+    return list(installed), "; ".join(notes)
+
+
 def show(rows: Sequence[BenchRow], console: Console) -> None:
-    """The rows as two tables and the ratios."""
+    """Print the rows as two tables and the ratios."""
     neighbours = Column("neighbours", min_width=10)
     table = Table("solver", neighbours, *PARTS, title="one tick: p50 (p99) [ms]", box=SIMPLE)
     for suffix in ("", _GUARANTEED, _OBSTACLE):
@@ -227,7 +237,7 @@ def show(rows: Sequence[BenchRow], console: Console) -> None:
 
 
 def write(rows: Sequence[BenchRow], directory: Path) -> Path:
-    """`bench.json` in `directory`, which is made if need be."""
+    """Write `bench.json` to `directory`, which is made if necessary, and return its path."""
     try:
         directory.mkdir(parents=True, exist_ok=True)
         path = directory / "bench.json"
@@ -257,21 +267,23 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="swarmctl bench", description=__doc__.splitlines()[0])
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path(), help="where bench.json goes")
     parser.add_argument("--neighbours", metavar="K,K", type=_counts, default=list(NEIGHBOURS))
-    parser.add_argument("--solver", action="append", choices=SOLVERS, help="may be given twice; default: both")
+    parser.add_argument("--solver", action="append", choices=SOLVERS, help="repeatable; default: all installed")
     parser.add_argument("--ticks", metavar="N", type=_ticks, default=300, help="measured for each solver and scenario")
     parser.add_argument("--slsqp", action=argparse.BooleanOptionalAction, default=True, help="the nonlinear baseline")
     return parser
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the verb; returns the process exit code."""
+    """Run the verb and return the process exit code."""
     return exit_code_of(partial(_run, _parser().parse_args(arguments)))
 
 
 def _run(options: argparse.Namespace) -> int:
     console = Console()
     note = busy_note(os.getloadavg()[0], os.cpu_count() or 1)
-    solvers = list(dict.fromkeys(options.solver or SOLVERS))
+    solvers, left_out = chosen_solvers(options.solver or ())
+    if left_out:
+        console.print(left_out, markup=False)
     rows = bench(options.neighbours, solvers, options.ticks, options.slsqp, console)
     show(rows, console)
     if note:

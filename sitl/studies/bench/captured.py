@@ -1,16 +1,15 @@
-"""Problems of a real flight, solved again: the x-y QP by OSQP and DAQP, the thesis' own problem by SLSQP, in one run.
+"""Solves the problems of a real flight again: the x-y QP by the QP solvers, and the thesis' own problem by SLSQP.
 
 The flight is the thesis' circle with an obstacle on the way: agents and their MAVLink bytes in lockstep. Problems are
 recorded where an agent sees both neighbours and the obstacle.
 
-What is compared with what: of the QP the call of the solver from Python is timed, updating its matrices included,
-working them out not (that is a tick's `setup`). Of the nonlinear problem the call of SciPy is timed, callbacks
-included, working out its constants not. Both are warm-started from their own last answer. SLSQP runs twice: with
-finite differences, fmincon's way and the stand-in for it, and with analytic gradients. Its constraints are hard, those
-of the QP give way by slacks: about a third of these problems ask for a distance that is lost already, and what has no
-solution is left out of the ratio. All are timed on the processor: on a busy machine a wall clock would charge the
-slower one with the time slices of others, which the quicker one slips through between. The whole ticks of the flight
-are wall-clock time.
+Timed parts: for the QP the solver call from Python, including the update of its matrices but not their computation
+(which is a tick's `setup`); for the nonlinear problem the SciPy call, including callbacks but not the computation of
+constants. Both are warm-started from their own last answer. SLSQP runs twice: with finite differences, as fmincon does
+and in its place, and with analytic gradients. Its constraints are hard, those of the QP have slacks: about a third of
+these problems ask for a distance that is lost already, and problems without a solution are left out of the ratio. All
+times are processor times: on a busy machine wall time would include the time slices of other processes, which hit the
+slower solver more often. Only the whole ticks of the flight are in wall time.
 """
 
 from __future__ import annotations
@@ -32,25 +31,25 @@ from swarmctl.control.controller import Controller
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, HalfSpaces
 from swarmctl.control.mpc.problem import Problem
-from swarmctl.control.mpc.qp import QpParams
+from swarmctl.control.mpc.qp import QpParams, installed_solvers
 from swarmctl.control.mpc.swarm_mpc import MpcParams, SwarmMpc
 from swarmctl.core.types import Array, Plan
 
 Mask = NDArray[np.bool_]
 _OBSTACLE = "obstacles=[{center_ned_m=[-5.0,-1.5,-1.8],radius_m=1.0,keep_out_m=1.75,visibility_m=3.0}]"
 _MISSION = "mission.duration_s=9.0"  # the obstacle is passed at about 7 s
-_WARM_UP = 20  # problems that are solved and not counted
+_WARM_UP = 20  # problems that are solved but not counted
 _MAX_KEEP_OUTS = 3  # two neighbours, one obstacle
 
 
 def circle_with_obstacle() -> Config:
-    """The thesis' circle (its section 4.3) with an obstacle like that of its section 4.4 on the way."""
+    """Return the thesis' circle (its section 4.3) with an obstacle like that of its section 4.4 on the way."""
     return load(None, [_MISSION, _OBSTACLE, "sitl.start='air'"])
 
 
 @dataclass(frozen=True, slots=True)
 class Captured:
-    """What agents were asked in flight, one after the other, and how long their whole ticks took then."""
+    """The planning problems of a flight in order, and the durations of their whole ticks."""
 
     config: Config
     problems: tuple[Problem, ...]
@@ -58,7 +57,7 @@ class Captured:
 
 
 class Recording:
-    """A controller that remembers what it is asked."""
+    """A controller that records its problems."""
 
     def __init__(self, controller: Controller) -> None:
         self._controller = controller
@@ -85,7 +84,7 @@ class Recording:
 
 
 def capture(config: Config, keep_outs: int = _MAX_KEEP_OUTS, most: int = 240) -> Captured:
-    """Fly `config` in lockstep; keep at most `most` tracking problems with exactly `keep_outs` things to avoid.
+    """Fly `config` in lockstep and keep up to `most` tracking problems with exactly `keep_outs` things to avoid.
 
     They are consecutive, agent after agent.
     """
@@ -94,7 +93,7 @@ def capture(config: Config, keep_outs: int = _MAX_KEEP_OUTS, most: int = 240) ->
     recordings = []
     for agent in agents:
         recordings.append(Recording(agent._controller))
-        agent._controller = recordings[-1]  # `_transit` stays: only tracking is recorded
+        agent._controller = recordings[-1]  # only tracking is recorded, so `_transit` stays
     found: list[list[tuple[Problem, float]]] = [[] for _ in agents]
 
     def on_step(_: Lockstep) -> None:
@@ -110,7 +109,7 @@ def capture(config: Config, keep_outs: int = _MAX_KEEP_OUTS, most: int = 240) ->
 
 @contextmanager
 def settled_garbage() -> Iterator[None]:
-    """As the real-time loop does it: start-up garbage is not looked at again while something is measured."""
+    """Exclude start-up garbage from collection while something is measured, as the real-time loop does."""
     gc.collect()
     gc.freeze()
     try:
@@ -120,7 +119,7 @@ def settled_garbage() -> Iterator[None]:
 
 
 class TappedMpc(SwarmMpc):
-    """The controller of a flight with its x-y problem in sight: what it was asked last, and how long that took."""
+    """The controller of a flight that records its last x-y problem and the duration of its solution."""
 
     def __init__(
         self,
@@ -142,7 +141,7 @@ class TappedMpc(SwarmMpc):
         return answer
 
     def nonlinear(self, problem: Problem, plan: Plan) -> NonlinearXy:
-        """The x-y problem of the last plan as the thesis poses it; same z, same thrust."""
+        """Return the x-y problem of the last plan as the thesis poses it; same z, same thrust."""
         assert self._asked is not None
         xy = self._xy
         return NonlinearXy(xy.axes, xy.horizon, self._asked, problem.keep_outs, plan.pos_ned_m[1:, 2])
@@ -157,23 +156,23 @@ class Times:
 
 
 def times_of(took_ms: Sequence[float] | Array) -> Times:
-    """p50 and p99 of at least one duration [ms]."""
+    """Return p50 and p99 of at least one duration [ms]."""
     p50_ms, p99_ms = np.percentile(np.asarray(took_ms), (50, 99))
     return Times(float(p50_ms), float(p99_ms))
 
 
 @dataclass(frozen=True, slots=True)
 class Baseline:
-    """SLSQP on the counted problems, as the thesis poses them."""
+    """Answers of SLSQP to the counted problems, as the thesis poses them."""
 
     took_ms: Array  # (problems,)
-    solved: Mask  # (problems,) by its own account
-    at_limit: Mask  # (problems,) of iterations
+    solved: Mask  # (problems,) reported as solved
+    at_limit: Mask  # (problems,) reached the iteration limit
     kept: Mask  # (problems,) whether its answer keeps every true distance
 
     @property
     def times(self) -> Times:
-        """Of all problems, those without a solution included."""
+        """Times of all problems, including those without a solution."""
         return times_of(self.took_ms)
 
     @property
@@ -186,7 +185,7 @@ class Baseline:
 
     @property
     def infeasible_01(self) -> float:
-        """Share for which it says that it found nothing to satisfy the constraints."""
+        """Share of problems for which it reports that the constraints can't be satisfied."""
         return float((~self.solved & ~self.at_limit).mean())
 
     @property
@@ -196,23 +195,23 @@ class Baseline:
 
 @dataclass(frozen=True, slots=True)
 class XyTimes:
-    """The x-y problem with two neighbours and an obstacle: how long it takes each solver, on the processor."""
+    """Processor time of each solver for the x-y problem with two neighbours and an obstacle."""
 
-    tick: Times  # whole ticks in which they were asked, in flight, by the wall clock
+    tick: Times  # whole ticks of the problems in flight, wall time
     qp_ms: dict[str, Array]  # by solver: the QP, (problems,)
-    fmincon: Baseline | None  # stand-in for it: finite differences; None when not asked for
-    gradients: Baseline | None  # the same with analytic gradients, the best that can be done for it
+    fmincon: Baseline | None  # SLSQP with finite differences, in place of fmincon; None when not requested
+    gradients: Baseline | None  # SLSQP with analytic gradients, its best case
 
     @property
     def problems(self) -> int:
-        """How many were counted."""
+        """Number of counted problems."""
         return len(next(iter(self.qp_ms.values())))
 
     def qp(self, solver: str) -> Times:
         return times_of(self.qp_ms[solver])
 
     def speed_up(self, solver: str = "osqp", gradients: bool = False) -> float:
-        """How many times longer SLSQP takes (p50), on the problems that it has solved; NaN when not measured."""
+        """Return the p50 of SLSQP over that of a solver, on the problems SLSQP has solved; NaN when not measured."""
         baseline = self.gradients if gradients else self.fmincon
         if baseline is None or not baseline.solved.any():
             return float("nan")
@@ -222,14 +221,15 @@ class XyTimes:
 
 def measure_xy(
     captured: Captured,
-    solvers: Sequence[str] = ("osqp", "daqp"),
+    solvers: Sequence[str] | None = None,
     slsqp: bool = True,
     on_problem: Callable[[], None] = lambda: None,
 ) -> XyTimes:
-    """Solve every captured problem with every solver in turn, so that a busy machine slows all of them down alike.
+    """Solve every captured problem with every solver in turn, so that a busy machine slows all of them alike.
 
-    The first 20 are solved and not counted.
+    The first 20 are solved but not counted. `solvers` None: all that are installed.
     """
+    solvers = installed_solvers() if solvers is None else solvers
     mpcs = {name: tapped(captured.config, name) for name in solvers}
     qp_ms: dict[str, list[float]] = {name: [] for name in solvers}
     baselines = (_Running(False), _Running(True)) if slsqp else ()
@@ -247,14 +247,14 @@ def measure_xy(
 
 
 def tapped(config: Config, solver: str) -> TappedMpc:
-    """The controller of `config` with another QP solver."""
+    """Return the controller of `config` with another QP solver."""
     params = config.controller.mpc
     qp = QpParams.model_validate({**params.qp.model_dump(), "solver": solver})
     return TappedMpc(params.model_copy(update={"qp": qp}), config.vehicle_model, config.separation)
 
 
 class _Running:
-    """SLSQP from its own last answer, shifted by one step."""
+    """SLSQP started from its own last answer, shifted by one step."""
 
     def __init__(self, gradients: bool) -> None:
         self._gradients = gradients

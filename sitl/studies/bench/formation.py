@@ -1,8 +1,8 @@
 """One real agent, with its vehicle and MAVLink bytes, among neighbours that are only paths on the bus.
 
-Neighbours keep their places in a formation that moves and turns with the circle all share, and sway a little. Each
-publishes an ordinary predicted path every tick, as an agent would. The rearmost place is left to the agent, which is
-drawn to the middle like everybody else and so presses against those before it. Nothing of it needs wall time.
+Neighbours keep their places in a formation that moves and turns with the shared circle, and sway a little. Each
+publishes a predicted path every tick, as an agent would. The agent has the rearmost place and is drawn to the middle,
+so that it is pressed against the neighbours before it. Nothing depends on wall time.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.commands import CodecCommands
 from swarmctl.mavlink.transport import pipe_pair
 
-SPACING_M = 1.0  # of places; what is kept is 0.9 m
+SPACING_M = 1.0  # distance of places; 0.9 m is kept
 RADIUS_M, OMEGA_RAD_S, HEIGHT_M = 5.0, 0.5, 1.0  # of the circle, thesis 4.3 without the climb
-_PILLAR_KEEP_OUT_M = 5.2  # an obstacle that fills the circle and a little more: always in sight, always in the way
+_PILLAR_KEEP_OUT_M = 5.2  # keep-out of an obstacle that fills the circle: always in sight, always active
 _SWAY_M = 0.03
 _SWAY_HZ = (0.2, 0.5)
 _SWAY = 1  # purpose of the random stream
@@ -40,7 +40,7 @@ _ENDLESS_S = 3600.0
 
 
 def places_m(count: int) -> Array:
-    """`count` places (count, 2) of a triangular lattice round its own middle: outward and along the circle.
+    """Return `count` places (count, 2) of a triangular lattice round its centre: outward and along the circle.
 
     The rearmost comes first.
     """
@@ -52,13 +52,13 @@ def places_m(count: int) -> Array:
 
 
 def column_m(count: int) -> Array:
-    """`count` places (count, 2) one behind the other along the rim of the pillar, the rearmost first."""
+    """Return `count` places (count, 2) one behind the other along the rim of the pillar, the rearmost first."""
     along = SPACING_M * (np.arange(count) - 0.5 * (count - 1))
     return np.stack([np.full(count, _PILLAR_KEEP_OUT_M + 0.05 - RADIUS_M), along], axis=1)
 
 
 class Neighbours:
-    """Where the others are at mission time t: `places` (K, 2) about the reference, turned with it, swaying."""
+    """Positions of the neighbours: `places` (K, 2) about the reference, turned with it, swaying."""
 
     def __init__(self, places: Array, seed: int) -> None:
         rng = np.random.default_rng([seed, len(places), _SWAY])
@@ -67,7 +67,7 @@ class Neighbours:
         self._phase_rad = rng.uniform(0.0, 2.0 * math.pi, size=(len(places), 2))
 
     def positions_ned_m(self, t_s: Array) -> Array:
-        """(K, T, 3) at mission times `t_s` (T,); at rest and without sway before 0."""
+        """Return (K, T, 3) at mission times `t_s` (T,); at rest and without sway before 0."""
         t_s = np.maximum(t_s, 0.0)
         sway = _SWAY_M * np.sin(self._rate_rad_s[:, None] * t_s[:, None] + self._phase_rad[:, None])
         sway -= _SWAY_M * np.sin(self._phase_rad)[:, None]
@@ -75,7 +75,7 @@ class Neighbours:
 
 
 def turned_ned_m(places: Array, t_s: Array) -> Array:
-    """Places (K, T, 2) outward and along the circle, at the reference's place at `t_s` (T,), as (K, T, 3) NED."""
+    """Return places (K, T, 2), outward and along the circle, as (K, T, 3) NED about the reference at `t_s` (T,)."""
     angle = OMEGA_RAD_S * t_s
     out, along = np.stack([np.cos(angle), np.sin(angle)], 1), np.stack([-np.sin(angle), np.cos(angle)], 1)  # (T, 2)
     flat = (RADIUS_M + places[:, :, :1]) * out + places[:, :, 1:] * along
@@ -83,7 +83,7 @@ def turned_ned_m(places: Array, t_s: Array) -> Array:
 
 
 def formation_config(solver: str, neighbours: int, pillar: bool) -> Config:
-    """The thesis' circle for one agent and `neighbours` others, every one of which gets rows in the problem."""
+    """Return the thesis' circle for one agent and `neighbours` others, each of which gets rows in the problem."""
     places = column_m(neighbours + 1) if pillar else places_m(neighbours + 1)
     starts = turned_ned_m(places[:, None], np.zeros(1))[:, 0]
     overrides = [
@@ -115,7 +115,7 @@ class _Newest:
 
 
 class Formation:
-    """The agent (number 0), its vehicle and its neighbours, step by step."""
+    """Steps the agent (number 0), its vehicle and its neighbours."""
 
     def __init__(self, config: Config) -> None:
         self.clock = SimClock()
@@ -151,18 +151,18 @@ class Formation:
 
     @property
     def mission_t_s(self) -> float:
-        """Of the newest tick; -1 before the mission."""
+        """Mission time of the newest tick; -1 before the mission."""
         record = self._sink.record
         return -1.0 if record is None or not math.isfinite(record.mission_t_s) else record.mission_t_s
 
     @property
     def timing(self) -> TickTiming:
-        """Parts of the newest tick."""
+        """Timing of the newest tick."""
         return self.agent.timing
 
     @property
     def record(self) -> TickRecord:
-        """The newest tick."""
+        """Record of the newest tick."""
         assert self._sink.record is not None
         return self._sink.record
 
@@ -172,7 +172,7 @@ class Formation:
         return self.record.plan_status is PlanStatus.OK
 
     def step(self) -> None:
-        """Neighbours speak, the agent ticks, physics moves on to the next tick."""
+        """Publish the neighbours' messages, tick the agent, and step the physics to the next tick."""
         self._speak()
         self.agent.tick(self.clock.now_us(), 0)
         for _ in range(self._tick_us // self._physics_us):

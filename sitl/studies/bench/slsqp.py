@@ -32,7 +32,7 @@ _LEAST_M = 1e-9
 
 @dataclass(frozen=True, slots=True)
 class NonlinearAnswer:
-    """What SLSQP returned. Not solved and not at its limit: it found nothing that satisfies the constraints."""
+    """Answer of SLSQP. Neither solved nor at its limit: it reports that the constraints can't be satisfied."""
 
     moves: Array  # (2 Hc,) increments of u_x, then of u_y
     cost: float
@@ -100,29 +100,29 @@ class NonlinearXy:
         self._radius_m = np.array([k.radius_m for k in keep_outs])[:, None]
 
     def positions_m(self, moves: Array) -> Array:
-        """(Hp, 2) at steps 1..Hp."""
+        """Return positions (Hp, 2) [m] at steps 1..Hp."""
         return np.asarray((self._free_m + self._push @ moves).reshape(2, -1).T)
 
     def shortfall_m(self, moves: Array) -> float:
-        """Largest violation of a distance."""
+        """Return the largest violation of a distance [m]."""
         return float(np.max(-self.margins_m(moves), initial=0.0))
 
     def moves_of(self, u: Array) -> Array:
-        """The increments (2 Hc,) that make inputs (>= Hc, 2) of the ones held now."""
+        """Return the increments (2 Hc,) from the held input to inputs (>= Hc, 2)."""
         return np.asarray(np.diff(u[: self._hc], axis=0, prepend=self._u_prev[None]).T.ravel())
 
     def inputs(self, moves: Array) -> Array:
-        """Inputs (Hc, 2) that the increments make of the ones held now."""
+        """Return the inputs (Hc, 2) that increments make of the held ones."""
         return np.asarray(self._u_prev + np.cumsum(moves.reshape(2, self._hc).T, axis=0))
 
     def shifted(self, moves: Array) -> Array:
-        """The last answer one step on: every increment a step earlier, none at the end."""
+        """Return the last answer shifted by one step; the last increment is zero."""
         guess = np.zeros((2, self._hc))
         guess[:, :-1] = moves.reshape(2, self._hc)[:, 1:]
         return guess.ravel()
 
     def solve(self, guess: Array | None = None, gradients: bool = False) -> NonlinearAnswer:
-        """SLSQP from `guess` (2 Hc,), or from no move; with analytic gradients, or with finite differences."""
+        """Run SLSQP from `guess` (2 Hc,), or from zero; with analytic gradients, or with finite differences."""
         distances = {"type": "ineq", "fun": self.margins_m}
         if gradients:
             distances["jac"] = self.margin_gradients
@@ -142,7 +142,7 @@ class NonlinearXy:
         )
 
     def cost(self, moves: Array) -> float:
-        """(3.27) and (3.34)."""
+        """Return the cost (3.27) and (3.34)."""
         errors = self._at_rest + self._effect @ moves
         return float(errors @ errors)
 
@@ -151,18 +151,18 @@ class NonlinearXy:
         return float(errors @ errors), 2.0 * (errors @ self._effect)
 
     def margins_m(self, moves: Array) -> Array:
-        """What is left of every distance at every step, (K Hp,)."""
+        """Return the margin of every distance at every step, (K Hp,) [m]."""
         return np.asarray((self._distances(moves)[1] - self._radius_m).ravel())
 
     def margin_gradients(self, moves: Array) -> Array:
-        """(K Hp, 2 Hc)."""
+        """Return the gradients of the margins, (K Hp, 2 Hc)."""
         apart, distance = self._distances(moves)
         normal = apart / np.maximum(distance, _LEAST_M)[:, None]  # (K, 2, Hp)
         push = self._push.reshape(2, -1, 2 * self._hc)
         return np.asarray((normal[:, 0, :, None] * push[0] + normal[:, 1, :, None] * push[1]).reshape(-1, 2 * self._hc))
 
     def _distances(self, moves: Array) -> tuple[Array, Array]:
-        """Horizontal difference (K, 2, Hp) and distance (K, Hp) to everything to keep clear of."""
+        """Return the horizontal difference (K, 2, Hp) and the distance (K, Hp) to everything that is avoided."""
         apart = (self._free_m + self._push @ moves).reshape(2, -1) - self._others_m
         return apart, np.sqrt(np.einsum("sck,sck->sk", apart, apart) + self._dz2)
 
@@ -171,7 +171,7 @@ class NonlinearXy:
 
 
 def _blocks(of_axes: Sequence[Array]) -> Array:
-    """Matrices of the axes on the diagonal of a large one: axes do not act on each other."""
+    """Return the block-diagonal matrix of the axes, which do not interact."""
     rows, columns = of_axes[0].shape
     whole = np.zeros((len(of_axes) * rows, len(of_axes) * columns))
     for i, block in enumerate(of_axes):

@@ -1,6 +1,6 @@
-"""Who touched what, from true states only: closest approaches between samples, arrival, standstill.
+"""Collision monitor on true states: closest approaches between samples, arrival, standstill.
 
-Between two samples every body is taken to move in a straight line. Knows nothing of what agents believe or plan.
+Between two samples every body is taken to move in a straight line. It knows nothing of the agents' beliefs or plans.
 """
 
 from __future__ import annotations
@@ -16,41 +16,41 @@ from swarmctl.core.types import Array
 
 Mask = NDArray[np.bool_]
 
-_ARRIVED_M_S = 0.2  # faster than this is passing through
-_STILL_M = 0.1  # who moves less than this ...
-_STILL_S = 3.0  # ... in so long stands still
+_ARRIVED_M_S = 0.2  # a faster vehicle passes through
+_STILL_M = 0.1  # a vehicle that moves less than this ...
+_STILL_S = 3.0  # ... in this time stands still
 
 
 @dataclass(frozen=True, slots=True)
 class Solid:
-    """A sphere or an upright column at one instant."""
+    """A sphere or a vertical column at one instant."""
 
     center_ned_m: Array  # (3,)
     radius_m: float
     column: bool
 
 
-class Umpire:
-    """Sees every true state of one flight, in order.
+class CollisionMonitor:
+    """Evaluates every true state of one flight, in order.
 
     Args:
-        body_m: centres of two bodies that touch.
-        goals_ned_m: (N, 3), or None when there is nowhere to arrive.
-        arrive_m: who is closer than this to his goal, and slow, has arrived.
-        expected: (N,) whose arrival counts.
+        body_m: distance of the centres of two bodies that touch.
+        goals_ned_m: (N, 3), or None without goals.
+        arrive_m: a slow vehicle closer than this to its goal has arrived.
+        expected: (N,) vehicles whose arrival counts.
     """
 
     def __init__(self, body_m: float, goals_ned_m: Array | None, arrive_m: float, expected: Mask) -> None:
         self._body_m, self._goals, self._arrive_m, self._expected = body_m, goals_ned_m, arrive_m, expected
         self._pairs = np.triu_indices(len(expected), 1)
         self._before: tuple[Array, tuple[Solid, ...]] | None = None
-        self._since_s = np.full(len(expected), math.inf)  # when each arrived for good; inf: it has not
+        self._since_s = np.full(len(expected), math.inf)  # time of each final arrival; inf: not arrived
         self._trail: list[tuple[float, Array]] = []
         self.min_separation_m = math.inf
         self.min_clearance_m = math.inf  # of a hull from a surface
 
     def see(self, t_s: float, pos_ned_m: Array, vel_ned_m_s: Array, solids: Sequence[Solid] = ()) -> None:
-        """One sample: (N, 3) of every vehicle, and every obstacle; a change of their number begins anew."""
+        """Take one sample of every vehicle (N, 3) and obstacle; a new number of obstacles restarts the comparison."""
         before_pos, before_solids = self._before or (pos_ned_m, tuple(solids))
         i, j = self._pairs
         if len(i):
@@ -70,21 +70,21 @@ class Umpire:
 
     @property
     def collided(self) -> bool:
-        """Two bodies have touched, or one and an obstacle."""
+        """Whether two bodies have touched, or a body and an obstacle."""
         return self.min_separation_m < self._body_m or self.min_clearance_m < 0.0
 
     @property
     def arrived(self) -> Mask:
-        """(N,) who is where he should be, for good so far."""
+        """Vehicles (N,) that are at their goals, for good so far."""
         return np.asarray(np.isfinite(self._since_s))
 
     @property
     def arrived_s(self) -> float:
-        """When the last of those expected arrived; infinite when not all have."""
+        """Arrival time of the last expected vehicle; infinite when not all have arrived."""
         return float(self._since_s[self._expected].max(initial=0.0))
 
     def standing(self) -> Mask:
-        """(N,) who has moved less than 0.1 m in the last 3 s; nobody before."""
+        """Return the vehicles (N,) that have moved less than 0.1 m in the last 3 s; none before."""
         end_s = self._trail[-1][0] if self._trail else 0.0
         recent = [pos for t_s, pos in self._trail if t_s >= end_s - _STILL_S]
         if not self._trail or end_s - self._trail[0][0] < _STILL_S:
@@ -93,7 +93,7 @@ class Umpire:
         return np.asarray(moved < _STILL_M)
 
     def distance_m(self) -> Array:
-        """(N,) of everybody from his goal, at the last sample."""
+        """Return the distances (N,) to the goals at the last sample."""
         assert self._before is not None and self._goals is not None
         return np.asarray(np.linalg.norm(self._before[0] - self._goals, axis=1))
 
@@ -106,7 +106,7 @@ class Umpire:
 
 
 def closest_m(before: Array, now: Array) -> Array:
-    """Least distance (M,) from the origin of points that move straight from `before` (M, D) to `now`."""
+    """Return the least distance (M,) from the origin of points that move straight from `before` (M, D) to `now`."""
     step = now - before
     length2 = np.maximum(np.einsum("mc,mc->m", step, step), 1e-18)
     share = np.clip(-np.einsum("mc,mc->m", before, step) / length2, 0.0, 1.0)

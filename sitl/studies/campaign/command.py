@@ -1,4 +1,4 @@
-"""Seeded Monte Carlo in lockstep: scenario x agents x delay x loss x noise x wind x protections, judged on true states.
+"""Seeded Monte Carlo in lockstep: scenario x agents x delay x loss x noise x wind x protections, on true states.
 
 Every combination is a cell, flown with the same seeds. Rows go to `OUT/rows.parquet` as they come in; the same call
 again flies only what is missing there. `OUT/report.html` has every cell with exact binomial intervals.
@@ -37,12 +37,12 @@ from sitl.studies.campaign.worker_pool import on_cluster, on_this_machine
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, ConfigError, exit_code_of
 
 MAX_AGENTS = 100
-_SAY_EVERY_S = 30.0  # where there is no terminal to draw a bar on
+_SAY_EVERY_S = 30.0  # interval of progress lines where there is no terminal
 _Value = TypeVar("_Value")
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Fly what is asked for and not there yet; 4 when a trial could not be flown at all."""
+    """Fly the requested trials that are missing; return 4 when a trial could not be flown at all."""
     options = _parser().parse_args(arguments)
     return exit_code_of(partial(_run, options), f"interrupted; the same call goes on from {options.out}")
 
@@ -74,10 +74,10 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _trials(options: argparse.Namespace) -> list[Trial]:
-    """What is asked for.
+    """Return the requested trials.
 
     Raises:
-        ConfigError: every cell that can't be flown, and why.
+        ConfigError: with every cell that can't be flown, and why.
     """
     if options.quick:
         return list(QUICK)
@@ -92,7 +92,9 @@ def _trials(options: argparse.Namespace) -> list[Trial]:
     if problems:
         raise ConfigError("campaign", list(problems))
     seeds = range(options.first_seed, options.first_seed + options.trials)
-    return [Trial(cell, seed) for seed in seeds for cell in found]  # all cells grow together
+    return [
+        Trial(cell, seed) for seed in seeds for cell in found
+    ]  # seeds are the outer loop, so that all cells grow together
 
 
 def _problems(cell: Cell, seed: int) -> Iterator[str]:
@@ -109,7 +111,7 @@ def _problems(cell: Cell, seed: int) -> Iterator[str]:
 
 
 def _shown(flown: Iterator[tuple[Trial, Any]], total: int) -> Iterator[tuple[Trial, Any]]:
-    """The same, with a bar on a terminal and a line now and then elsewhere."""
+    """Yield the same items with a progress bar on a terminal, and a line now and then elsewhere."""
     collided = done = 0
     began_s = said_s = time.monotonic()
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())

@@ -1,4 +1,4 @@
-"""What happens in the middle of a flight: an agent dies, the bus falls apart, an obstacle appears."""
+"""Scenario events in the middle of a flight: an agent dies, the bus is partitioned, an obstacle appears."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ from sitl.studies.campaign.collision_monitor import Solid
 from swarmctl.bus import topics
 from swarmctl.core.types import Array
 
-_TOLD_EVERY_S = 0.1  # of a moving obstacle: messages have no time, so it has to be followed
+_TOLD_EVERY_S = 0.1  # of a moving obstacle: messages carry no time, so it is repeated
 
 
-class Incident(Protocol):
-    """One per flight: it may remember."""
+class ScenarioEvent(Protocol):
+    """An event of one flight; it may keep state."""
 
     def step(self, lockstep: Lockstep, t_s: float, pos_ned_m: Array, vel_ned_m_s: Array) -> None:
-        """Called every tick with the mission time and the true states (N, 3); does something when it is due."""
+        """Act when due; called every tick with the mission time and the true states (N, 3)."""
 
     def solids(self, t_s: float) -> Sequence[Solid]:
-        """What is in the way now beside the configured obstacles."""
+        """Return the solids of this event now, beside the configured obstacles."""
 
 
 class Death:
-    """One agent's process dies; its vehicle is left to its autopilot."""
+    """An agent's process dies; its vehicle is left to its autopilot."""
 
     def __init__(self, agent: int, at_s: float) -> None:
         self._agent, self._at_s, self._done = agent, at_s, False
@@ -42,7 +42,7 @@ class Death:
 
 
 class Partition:
-    """Nobody hears anybody for a while."""
+    """No agent receives any other one for a while."""
 
     def __init__(self, at_s: float, for_s: float) -> None:
         self._due = [(at_s, True), (at_s + for_s, False)]
@@ -57,20 +57,20 @@ class Partition:
 
 
 class Appearance:
-    """An obstacle appears in front of a vehicle, and everybody is told at once, as by `swarmctl obstacle`.
+    """An obstacle appears in front of a vehicle and is published at once, as by `swarmctl obstacle`.
 
-    Not before there is room to avoid it: `ahead_m` along the victim's velocity, and nobody else inside `clear_m`; and
-    not where one that stays would keep somebody from arriving. A moving one begins `ahead_m` to the victim's side,
-    heads for where the victim will be and is gone after its way.
+    It appears when there is room to avoid it: `ahead_m` along the victim's velocity, and no vehicle inside `clear_m`. A
+    static one never blocks a goal. A moving one begins `ahead_m` to the victim's side, heads for the victim's future
+    place and disappears at the end of its path.
 
     Args:
         victim: agent.
         at_s: earliest mission time.
-        ahead_m: from the victim.
-        clear_m: from everybody.
+        ahead_m: distance from the victim.
+        clear_m: least distance from every vehicle.
         radius_m, keep_out_m: of the obstacle.
-        speed_m_s: 0: it stays.
-        side: -1 or 1, where a moving one comes from.
+        speed_m_s: 0: static.
+        side: -1 or 1, side from which a moving one comes.
         goals_ned_m: (N, 3), which stay free.
     """
 
@@ -89,7 +89,7 @@ class Appearance:
         self._goals_ned_m = goals_ned_m
         self._victim, self._at_s, self._ahead_m, self._clear_m = victim, at_s, ahead_m, clear_m
         self._radius_m, self._keep_out_m, self._speed_m_s, self._side = radius_m, keep_out_m, speed_m_s, side
-        self._from: tuple[float, Array, Array] | None = None  # when, where (3,), velocity (3,)
+        self._from: tuple[float, Array, Array] | None = None  # begin time, place (3,), velocity (3,)
         self._told_s = -math.inf
         self._gone = False
 
@@ -139,4 +139,4 @@ class Appearance:
 _SEEN_M = 100.0
 _FLYING_M_S = 0.5
 _MET_M = 3.0
-_ARRIVING_M = 0.3  # beyond what is kept from an obstacle, where one arrives
+_ARRIVING_M = 0.3  # added to the keep-out at a goal

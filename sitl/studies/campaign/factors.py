@@ -1,4 +1,4 @@
-"""What a cell switches: protections and estimator noise, each as settings of the run's configuration."""
+"""Factors of a cell: protections and estimator noise, each as settings of the run's configuration."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True, slots=True)
 class Noise:
-    """An estimator of `sitl.estimator`, and what flying on it takes."""
+    """An estimator of `sitl.plant.estimator`, and the margins for flying on it."""
 
     accuracy_m: float  # rms per horizontal axis; radii grow to what it needs
-    arrive_m: float  # added to a scenario's own: nobody can tell better where he is
+    arrive_m: float  # added to the scenario's own, because positions are this uncertain
     settings: tuple[str, ...] = ()
 
 
@@ -23,7 +23,7 @@ _WANDERING = (
 PROTECTIONS: dict[str, tuple[str, ...]] = {
     "guaranteed": ("separation.mode=guaranteed",),
     "default": (),
-    "off": ("controller.kind=mpc", "agent.barrier.enabled=false"),  # the same plans, of somebody who sees nobody
+    "off": ("controller.kind=mpc", "agent.barrier.enabled=false"),  # the same plans without avoidance
 }
 
 UNCOOPERATIVE = (*PROTECTIONS["off"], "separation.mode=best_effort")  # makes no commitments either
@@ -36,7 +36,7 @@ NOISES: dict[str, Noise] = {
 
 
 def wind_settings(wind_m_s: float) -> tuple[str, ...]:
-    """Steady wind that blows east, and Dryden turbulence of the same wind at 6 m."""
+    """Return the settings of a steady wind that blows east, and Dryden turbulence of the same wind at 6 m."""
     if not wind_m_s:
         return ()
     return (f"sitl.wind.mean_ned_m_s=[0.0, {wind_m_s}, 0.0]", f"sitl.wind.turbulence_m_s={wind_m_s}")

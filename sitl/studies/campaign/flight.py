@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sitl.lockstep import Lockstep
-from sitl.studies.campaign.collision_monitor import Solid, Umpire
+from sitl.studies.campaign.collision_monitor import CollisionMonitor, Solid
 from sitl.studies.campaign.factors import NOISES, PROTECTIONS, UNCOOPERATIVE, wind_settings
 from sitl.studies.campaign.layouts import least_sum_m
 from sitl.studies.campaign.scenarios import SCENARIOS, Layout, layout_of, settings_of
@@ -21,28 +21,28 @@ from swarmctl.config import Config, load
 from swarmctl.control.collision.separation import required_radius_m
 from swarmctl.core.types import Array, Phase, PlanStatus
 
-PHYSICS_HZ = 100  # thesis and crazyflie fly as at 250 Hz: a 3.3 m transition ends within 2 cm and 0.1 s of it
-_BEGIN_WITHIN_S = 60.0  # of simulated time, or the mission has failed to begin
-_SETTLED_S = 1.0  # who has been there so long has arrived
-_REST_S = 2.0  # same goal: everybody slow for so long
+PHYSICS_HZ = 100  # thesis and crazyflie behave as at 250 Hz: a 3.3 m transition ends within 2 cm and 0.1 s of it
+_BEGIN_WITHIN_S = 60.0  # simulated time after which the mission has failed to begin
+_SETTLED_S = 1.0  # time at the goal after which a vehicle has arrived
+_REST_S = 2.0  # same goal: time for which all vehicles are slow
 _REST_M_S = 0.1
-_AFTER_CONTACT_S = 0.5  # flown on, to see how deep it was
+_AFTER_CONTACT_S = 0.5  # flown on, to measure the depth of a contact
 _BAD_PLANS = (PlanStatus.SOLVER_FAILED, PlanStatus.RESIDUAL, PlanStatus.NOT_CERTIFIED)
 
 
 def fly(trial: Trial) -> Row:
-    """Fly one trial; the row of the table it becomes, a pure function of the trial but for `cpu_s`."""
+    """Fly one trial and return its row, a pure function of the trial except `cpu_s`."""
     began_s = time.process_time()
     cell = trial.cell
     layout = layout_of(cell.scenario, trial.seed, cell.agents)
-    flight = Flight(trial, layout)
+    flight = TrialFlight(trial, layout)
     flight.run()
     alone_s = _alone_s(trial, layout) if SCENARIOS[cell.scenario].alone else None
     return flight.row(alone_s) | {"cpu_s": time.process_time() - began_s, "code": code_id()}
 
 
 def config_of(cell: Cell, seed: int, layout: Layout, agents: int, extra: Sequence[str] = ()) -> Config:
-    """The configuration of a trial.
+    """Return the configuration of a trial.
 
     Raises:
         ConfigError: a setting does not exist, or values don't go together.
@@ -72,8 +72,8 @@ def config_of(cell: Cell, seed: int, layout: Layout, agents: int, extra: Sequenc
     return config.model_copy(update={"separation": wider})
 
 
-class Flight:
-    """A flight that watches itself."""
+class TrialFlight:
+    """A lockstep flight with a collision monitor."""
 
     def __init__(self, trial: Trial, layout: Layout) -> None:
         cell, agents = trial.cell, len(layout.starts_ned_m)
@@ -81,10 +81,10 @@ class Flight:
         config = config_of(cell, trial.seed, layout, agents)
         blind = {i: config_of(cell, trial.seed, layout, agents, UNCOOPERATIVE) for i in layout.uncooperative}
         self.lockstep = Lockstep(config, own=blind)
-        self._agents = list(self.lockstep.agents)  # those that will have died, too
+        self._agents = list(self.lockstep.agents)  # including those that will have died
         expected = np.array([i not in layout.lost for i in range(agents)])
         arrive_m = math.inf if layout.settles else layout.arrive_m + NOISES[cell.noise].arrive_m
-        self.umpire = Umpire(config.separation.body_m, layout.goals_ned_m, arrive_m, expected)
+        self.monitor = CollisionMonitor(config.separation.body_m, layout.goals_ned_m, arrive_m, expected)
         self._fixed = tuple(Solid(np.array(o.center_ned_m), o.radius_m, o.column) for o in config.obstacles)
         self._begin_s = math.nan
         self._resting_since_s = math.inf
@@ -93,7 +93,7 @@ class Flight:
         self._out_of_time = False
 
     def run(self) -> None:
-        """Fly until everybody has arrived, somebody has collided, something failed, or the time is up."""
+        """Fly until all have arrived, two bodies have collided, an agent failed, or the time is up."""
         lockstep = self.lockstep
         offset = lockstep.world.truth_rows()["pos_ned_m"] - lockstep.world.plant.pos_ned_m.T
         while not self._over():
@@ -104,26 +104,26 @@ class Flight:
                 self._begin_s = now_s
             t_s = now_s - self._begin_s
             if t_s >= 0.0:
-                for incident in self._layout.incidents:
-                    incident.step(lockstep, t_s, pos, vel)
-            solids = [s for incident in self._layout.incidents for s in incident.solids(t_s)]
-            self.umpire.see(now_s, pos, vel, (*self._fixed, *solids))
+                for event in self._layout.events:
+                    event.step(lockstep, t_s, pos, vel)
+            solids = [s for event in self._layout.events for s in event.solids(t_s)]
+            self.monitor.see(now_s, pos, vel, (*self._fixed, *solids))
             slow = t_s > _REST_S and np.linalg.norm(vel, axis=1).max() < _REST_M_S
             self._resting_since_s = min(self._resting_since_s, now_s) if slow else math.inf
-            if self.umpire.collided:
+            if self.monitor.collided:
                 self._contact_s = min(self._contact_s, now_s)
 
     def row(self, alone_s: float | None) -> Row:
-        """What came of it."""
-        umpire, cell, layout = self.umpire, self._trial.cell, self._layout
-        collided = umpire.collided
+        """Return the result as a row."""
+        monitor, cell, layout = self.monitor, self._trial.cell, self._layout
+        collided = monitor.collided
         arrived = not collided and not self._problems and self._arrived_s() < math.inf
         stuck = self._out_of_time and self._someone_stands_short()
         outcome = self._outcome(collided, arrived, stuck)
         ticks = [log.ticks for log in self.lockstep.logs]
         charged = [rows[rows["phase"] == Phase.TRACK] for rows in ticks]
         separation = self.lockstep.config.separation
-        goal_sum_m = None if layout.goals_ned_m is None else float(umpire.distance_m().sum())
+        goal_sum_m = None if layout.goals_ned_m is None else float(monitor.distance_m().sum())
         return {
             "scenario": cell.scenario,
             "agents": cell.agents,
@@ -132,7 +132,7 @@ class Flight:
             "seed": self._trial.seed,
             "protections": cell.protections,
             "collided": collided,
-            "min_separation_m": _finite(umpire.min_separation_m),
+            "min_separation_m": _finite(monitor.min_separation_m),
             "arrived": arrived,
             "flight_time_s": self._arrived_s() - self._begin_s if arrived else None,
             "noise": cell.noise,
@@ -140,7 +140,7 @@ class Flight:
             "sets": cell.sets,
             "deadlocked": stuck and not collided,
             "outcome": outcome,
-            "min_clearance_m": _finite(umpire.min_clearance_m),
+            "min_clearance_m": _finite(monitor.min_clearance_m),
             "arrived_agents": self._arrived_agents(arrived),
             "unconstrained_time_s": alone_s,
             "goal_sum_m": goal_sum_m,
@@ -166,21 +166,21 @@ class Flight:
         return bool(self._problems) or self._out_of_time or done
 
     def _arrived_s(self) -> float:
-        """When the last one arrived; infinite before. Without goals: when the mission has been flown to its end."""
+        """Return the time of the last arrival, infinite before. Without goals: the end of the mission."""
         if self._layout.goals_ned_m is None:
             return self._begin_s + self._layout.limit_s if self._out_of_time else math.inf
-        return self._resting_since_s if self._layout.settles else self.umpire.arrived_s
+        return self._resting_since_s if self._layout.settles else self.monitor.arrived_s
 
     def _arrived_agents(self, arrived: bool) -> int | None:
         if self._layout.goals_ned_m is None or self._layout.settles:
             return self._trial.cell.agents if arrived else None
-        return int(self.umpire.arrived.sum())
+        return int(self.monitor.arrived.sum())
 
     def _someone_stands_short(self) -> bool:
         if self._layout.goals_ned_m is None or self._layout.settles:
             return False
         expected = np.array([i not in self._layout.lost for i in range(self._trial.cell.agents)])
-        return bool((self.umpire.standing() & ~self.umpire.arrived & expected).any())
+        return bool((self.monitor.standing() & ~self.monitor.arrived & expected).any())
 
     def _outcome(self, collided: bool, arrived: bool, stuck: bool) -> str:
         if collided:
@@ -194,7 +194,7 @@ class Flight:
         return all(int(row["phase"][0]) == Phase.TRACK for row in rows)
 
     def _failed(self) -> tuple[str, ...]:
-        """Agents that have left the mission although nobody meant them to."""
+        """Return the agents that have left the mission unintentionally."""
         found = []
         for i, (agent, log) in enumerate(zip(self.lockstep.agents, self.lockstep.logs, strict=True)):
             if agent is not None and int(log.rows[-1]["phase"][0]) != Phase.TRACK and not self._out_of_time:
@@ -202,14 +202,14 @@ class Flight:
         return tuple(found)
 
     def _commits_refused(self) -> int | None:
-        """Counted by agents that fly by commitments; None when none does."""
+        """Return the number of refused commitments; None when no agent commits."""
         counts = [agent.commits_refused for agent in self._agents if agent is not None]
         committing = [count for count in counts if count is not None]
         return sum(committing) if committing else None
 
 
 def _alone_s(trial: Trial, layout: Layout) -> float | None:
-    """Flight time of the longest way with nobody and nothing else there."""
+    """Return the single-agent flight time of the longest path, without obstacles."""
     if layout.goals_ned_m is None:
         return None
     far = int(np.linalg.norm(layout.goals_ned_m - layout.starts_ned_m, axis=1).argmax())
@@ -224,11 +224,11 @@ def _alone_s(trial: Trial, layout: Layout) -> float | None:
             *speeds,
             f"mission.goto={{goals_ned_m={goal.tolist()},speed_m_s={goto.speed_m_s},accel_m_s2={goto.accel_m_s2}}}",
         ),
-        incidents=(),
+        events=(),
         uncooperative=frozenset(),
         lost=frozenset(),
     )
-    flight = Flight(Trial(replace(trial.cell, agents=1, delay_ms=0.0, loss=0.0), trial.seed), lone)
+    flight = TrialFlight(Trial(replace(trial.cell, agents=1, delay_ms=0.0, loss=0.0), trial.seed), lone)
     flight.run()
     found: Any = flight.row(None)["flight_time_s"]
     return None if found is None else float(found)

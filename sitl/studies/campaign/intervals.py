@@ -17,7 +17,7 @@ class Interval(NamedTuple):
 
 
 def clopper_pearson(hits: int, trials: int, level: float = LEVEL) -> Interval:
-    """Two-sided interval that covers the true probability with at least `level`; 0..1 without trials.
+    """Return the two-sided interval that covers the true probability with at least `level`; 0..1 without trials.
 
     The bounds are quantiles of beta distributions: B(a/2; k, n - k + 1) and B(1 - a/2; k + 1, n - k).
     """

@@ -13,13 +13,13 @@ _RESTARTS = 200
 
 
 def ring(agents: int, radius_m: float, turn_rad: float) -> Array:
-    """Corners (N, 3) of a regular polygon at z = 0, the first one at `turn_rad`."""
+    """Return the corners (N, 3) of a regular polygon at z = 0, the first one at `turn_rad`."""
     angle = turn_rad + 2.0 * math.pi * np.arange(agents) / agents
     return np.stack([radius_m * np.cos(angle), radius_m * np.sin(angle), np.zeros(agents)], axis=1)
 
 
 def scattered(rng: np.random.Generator, count: int, low_m: Array, high_m: Array, apart_m: float) -> Array:
-    """Uniform points (count, D) of a box, drawn again until no two are closer than `apart_m`.
+    """Return uniform points (count, D) of a box, drawn again until no two are closer than `apart_m`.
 
     Raises:
         ValueError: they don't fit.
@@ -38,7 +38,7 @@ def scattered(rng: np.random.Generator, count: int, low_m: Array, high_m: Array,
 def far_goals(
     rng: np.random.Generator, starts: Array, low_m: Array, high_m: Array, apart_m: float, way_m: float
 ) -> Array:
-    """Goals (N, 3), `apart_m` from each other and each at least `way_m` from its own start."""
+    """Return goals (N, 3), `apart_m` from each other and each at least `way_m` from its own start."""
     for _ in range(_RESTARTS):
         goals = scattered(rng, len(starts), low_m, high_m, apart_m)
         for _ in range(_TRIES):
@@ -49,7 +49,7 @@ def far_goals(
 
 
 def forest(rng: np.random.Generator, columns: int, radius_m: float, apart_m: float) -> Array:
-    """Axes (columns, 3) of columns inside a circle round the origin, no two closer than `apart_m`."""
+    """Return axes (columns, 3) of columns inside a circle round the origin, no two closer than `apart_m`."""
     axes: list[Array] = []
     for _ in range(_TRIES * _RESTARTS):
         drawn = rng.uniform(-radius_m, radius_m, 2)
@@ -63,11 +63,11 @@ def forest(rng: np.random.Generator, columns: int, radius_m: float, apart_m: flo
 def walls(
     rng: np.random.Generator, rows_x_m: Array, half_width_m: float, wall_m: tuple[float, float], gap_m: float
 ) -> Array:
-    """Columns (M, 3), `_POST_M` apart, that make rows of walls across x with gaps between them.
+    """Return columns (M, 3), `_POST_M` apart, that form rows of walls across x with gaps between them.
 
     Args:
-        rng: draws the lengths of the walls and where each row begins.
-        rows_x_m: where the rows stand.
+        rng: draws the lengths of the walls and the begin of each row.
+        rows_x_m: x of each row.
         half_width_m: of every row, about y = 0.
         wall_m: shortest and longest wall, between the axes of its first and last post.
         gap_m: between the axes of the posts on both sides of a gap.
@@ -87,11 +87,11 @@ _POST_M = 0.3
 
 
 def least_sum_m(count: int, apart_m: float) -> float:
-    """Least sum of distances to one point of `count` points in the plane that keep `apart_m` from each other.
+    """Return the least sum of distances to one point of `count` points in the plane that keep `apart_m` apart.
 
-    The best of many descents from seeded starts: a good upper bound, not a proof.
+    It is the best of many descents from seeded starts: a good upper bound, not a proof.
     """
-    from scipy.optimize import minimize  # half a second, needed by one scenario
+    from scipy.optimize import minimize  # imports for half a second, needed by one scenario
 
     if count == 1:
         return 0.0

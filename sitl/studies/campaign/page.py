@@ -26,7 +26,7 @@ _Column = tuple[str, Callable[[CellSummary], str]]
 
 
 def write_page(directory: Path, rows: Sequence[Row], runs_per_hour: float | None = None) -> Path:
-    """Write the report of all rows into the campaign's folder.
+    """Write the report of all rows into the campaign's folder and return its path.
 
     Args:
         directory: of the campaign.
@@ -63,7 +63,7 @@ def _section(scenario: str, found: Sequence[CellSummary]) -> str:
 
 
 def share_text(share: Share) -> str:
-    """`3/100 3.0 % [0.6, 8.5]`."""
+    """Return a share as `3/100 3.0 % [0.6, 8.5]`."""
     low, high = share.interval
     return f"{share.hits}/{share.trials} {share.share:.1%} [{100 * low:.1f}, {100 * high:.1f}]".replace("%", " %")
 
@@ -100,7 +100,7 @@ def _failures(rows: Sequence[Row]) -> str:
 
 
 def again(row: Row) -> str:
-    """The command that flies a row again."""
+    """Return the command that flies a row again."""
     sets = "".join(f" --set {item}" for item in row["sets"].split())
     return (
         f"python tools/campaign.py --scenario {row['scenario']} --agents {row['agents']} --delay {row['delay_ms']:g} "
@@ -125,8 +125,8 @@ _COLUMNS: tuple[_Column, ...] = (
     ("least clearance", lambda s: _number(s.min_clearance_m, " m")),
     ("time, median", lambda s: _number(s.time_median_s, " s", 1)),
     ("longest", lambda s: _number(s.time_max_s, " s", 1)),
-    ("over alone", lambda s: _number(s.over_alone, " x")),
-    ("over least sum", lambda s: _number(s.over_least, " x")),
+    ("relative to single-agent time", lambda s: _number(s.time_relative, " x")),
+    ("relative to lower bound", lambda s: _number(s.sum_relative, " x")),
     ("plans failed", lambda s: _number(s.plans_failed, digits=1) if s.plans_failed else ""),
     ("commits refused", lambda s: _number(s.commits_refused, digits=1) if s.commits_refused else ""),
     ("barrier acted", lambda s: _number(s.safety_filter_acted, digits=1) if s.safety_filter_acted else ""),

@@ -1,4 +1,4 @@
-"""The subset that is flown with every change: small cells that show the tool, a protection and its control."""
+"""The subset that is flown with every change: small cells for the tool, a protection and its negative control."""
 
 from __future__ import annotations
 

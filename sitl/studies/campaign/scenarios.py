@@ -1,4 +1,4 @@
-"""What is flown: one table of scenarios, each a function of seed and agents.
+"""Scenarios of a campaign: one table, each row a function of seed and agents.
 
 Two sizes of vehicle. `THESIS`: its airframe, bodies of 0.48 m that keep 0.9 m, as everywhere else here. `SMALL`: a
 Crazyflie (0.14 m from tip to tip, counted as 0.15 m) that keeps 0.3 m, the figures of the public baselines for boxes,
@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from sitl.studies.campaign.events import Appearance, Death, Incident, Partition
+from sitl.studies.campaign.events import Appearance, Death, Partition, ScenarioEvent
 from sitl.studies.campaign.layouts import far_goals, forest, ring, scattered, walls
 from swarmctl.core.types import Array
 from swarmctl.toml_text import toml_value
@@ -22,7 +22,7 @@ from swarmctl.toml_text import toml_value
 
 @dataclass(frozen=True, slots=True)
 class Size:
-    """A vehicle and what it keeps."""
+    """A vehicle and its separation."""
 
     radius_m: float
     body_m: float
@@ -51,10 +51,10 @@ class Layout:
     limit_s: float  # of mission time
     goals_ned_m: Array | None = None  # (N, 3); None: the mission is flown to its end
     arrive_m: float = 0.15
-    settles: bool = False  # one goal for all: arrived when everybody has come to rest
-    incidents: tuple[Incident, ...] = ()
-    uncooperative: frozenset[int] = frozenset()  # avoid nobody
-    lost: frozenset[int] = frozenset()  # not expected to arrive
+    settles: bool = False  # one goal for all: arrived when all vehicles are at rest
+    events: tuple[ScenarioEvent, ...] = ()
+    uncooperative: frozenset[int] = frozenset()  # agents that avoid nothing
+    lost: frozenset[int] = frozenset()  # agents that are not expected to arrive
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,9 +63,9 @@ class Scenario:
 
     title: str
     draw: Callable[[np.random.Generator, int], Layout]
-    agents: tuple[int, ...]  # flown unless others are asked for
-    alone: bool = False  # also fly the longest way alone, for comparison
-    needs: int = 1  # fewest agents that make sense
+    agents: tuple[int, ...]  # default numbers of agents
+    alone: bool = False  # also fly the longest path with a single agent, for comparison
+    needs: int = 1  # smallest sensible number of agents
 
 
 _JITTER_M = 0.05
@@ -74,7 +74,7 @@ _SMALL_M_S, _SMALL_M_S2 = 1.0, 1.0
 _COLUMN_M = 0.3  # radius of a tree
 _POST_RADIUS_M = 0.15
 _HULL_MARGIN_M = 0.15  # planned between a small vehicle's hull and a surface; plans are certified to 0.1 m less
-_SWAP_S = (1.5, 3.5)  # mission time while everybody is under way to the middle
+_SWAP_S = (1.5, 3.5)  # mission time at which all vehicles are on the way to the middle
 
 
 def _go(goals: Array, speed_m_s: float = _SPEED_M_S, accel_m_s2: float = _ACCEL_M_S2) -> tuple[str, ...]:
@@ -145,8 +145,8 @@ def _maze(rng: np.random.Generator, agents: int) -> Layout:
     return Layout(SMALL, starts, settings, 60.0, goals, arrive_m=0.1)
 
 
-def _with(layout: Layout, incident: Incident, **changes: object) -> Layout:
-    return replace(layout, incidents=(incident,), **changes)  # type: ignore[arg-type]
+def _with(layout: Layout, event: ScenarioEvent, **changes: object) -> Layout:
+    return replace(layout, events=(event,), **changes)  # type: ignore[arg-type]
 
 
 def _sudden(rng: np.random.Generator, agents: int, speed_m_s: float) -> Layout:
@@ -191,28 +191,28 @@ def _partition(rng: np.random.Generator, agents: int) -> Layout:
 
 SCENARIOS: dict[str, Scenario] = {
     "circle": Scenario("the thesis' climbing circle, one reference for all", _circle, (3,)),
-    "swap": Scenario("everybody to the opposite side of a circle, starts 5 cm off", _swap, (6, 10), needs=2),
+    "swap": Scenario("every agent to the opposite side of a circle, starts 5 cm off", _swap, (6, 10), needs=2),
     "symmetric": Scenario("the same from a perfect polygon", _symmetric, (6, 10), needs=2),
     "random": Scenario("random transitions in 3 x 3 x 2 m, small vehicles", _random, (4, 10, 20), alone=True),
-    "same_goal": Scenario("everybody to one point", _same_goal, (3, 6, 10)),
+    "same_goal": Scenario("all agents to one point", _same_goal, (3, 6, 10)),
     "forest": Scenario("swap through 20 columns, small vehicles", _forest, (10,), needs=2),
     "maze": Scenario("both ways through four rows of walls, small vehicles", _maze, (10,)),
     "sudden_static": Scenario("an obstacle appears in the middle of a swap", _sudden_static, (6,), needs=2),
     "sudden_moving": Scenario("one crosses the swap at 0.5 to 1 m/s", _sudden_moving, (6,), needs=2),
-    "uncooperative": Scenario("one of a swap avoids nobody", _uncooperative, (6,), needs=2),
+    "uncooperative": Scenario("one agent of a swap avoids nothing", _uncooperative, (6,), needs=2),
     "death": Scenario("one agent of a swap dies on the way", _death, (6,), needs=2),
-    "partition": Scenario("nobody hears anybody for 2 s of a swap", _partition, (6, 10), needs=2),
+    "partition": Scenario("the bus delivers nothing for 2 s of a swap", _partition, (6, 10), needs=2),
 }
 
 
 def layout_of(scenario: str, seed: int, agents: int) -> Layout:
-    """The instance that a seed draws; the same for every other condition of a cell."""
+    """Return the instance that a seed draws; it is the same for every other condition of a cell."""
     rng = np.random.default_rng([seed, agents, zlib.crc32(scenario.encode()), _LAYOUT])
     return SCENARIOS[scenario].draw(rng, agents)
 
 
 def settings_of(layout: Layout, agents: int) -> Sequence[str]:
-    """The layout as settings of a run's configuration."""
+    """Return the layout as settings of a run's configuration."""
     size = layout.size
     return (
         *size.settings,

@@ -1,4 +1,4 @@
-"""Which code flew a trial: a digest of the sources that can change its result."""
+"""Identity of the code that flew a trial: a digest of the sources that can change its result."""
 
 from __future__ import annotations
 
@@ -7,12 +7,19 @@ from functools import cache
 from pathlib import Path
 
 _PACKAGES = ("sitl", "swarmctl")
-_PAGES = {"page.py", "store.py", "crew.py", "intervals.py", "summary.py", "command.py"}  # of this package: no flight
+_PAGES = {
+    "page.py",
+    "store.py",
+    "worker_pool.py",
+    "intervals.py",
+    "summary.py",
+    "command.py",
+}  # modules of this package that do not affect a flight
 
 
 @cache
 def code_id() -> str:
-    """12 hexadecimal digits of SHA-256 over every module of the simulator and the bridge."""
+    """Return 12 hexadecimal digits of SHA-256 over every module of the simulator and the bridge."""
     root = Path(__file__).parents[3]
     digest = hashlib.sha256()
     for path in sorted(path for package in _PACKAGES for path in (root / package).rglob("*.py")):

@@ -20,11 +20,11 @@ _MAX_BYTES = 2**31
 
 
 class Store:
-    """Rows of one campaign; a context that saves what is left when it ends.
+    """Rows of one campaign; a context manager that saves the rest when it ends.
 
     Args:
         directory: made when it is missing.
-        code: of the sources that fly now.
+        code: digest of the present sources.
         mix: accept rows flown by other sources.
 
     Raises:
@@ -58,11 +58,11 @@ class Store:
         self.save()
 
     def missing(self, trials: Iterable[Trial]) -> list[Trial]:
-        """Those not flown yet, in order, each once."""
+        """Return the trials not flown yet, in order, each once."""
         return [trial for trial in dict.fromkeys(trials) if trial not in self._finished]
 
     def add(self, row: Row) -> None:
-        """Take a finished row; it is on disk within a second, or with the next one."""
+        """Add a finished row; it is on disk within a second, or with the next one."""
         self.rows.append(row)
         self._finished.add(trial_of(row))
         if time.monotonic() - self._saved_s >= _SAVE_EVERY_S:

@@ -1,4 +1,4 @@
-"""What the rows of each cell come to: counts with exact intervals, times and distances. No formatting."""
+"""Summary of each cell's rows: counts with exact intervals, times and distances. No formatting."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from sitl.studies.campaign.trials import Cell, Row, cell_of
 
 @dataclass(frozen=True, slots=True)
 class Share:
-    """How often something happened."""
+    """Frequency of an outcome."""
 
     hits: int
     trials: int
 
     @property
     def share(self) -> float:
-        """0..1."""
+        """Share, 0..1."""
         return self.hits / self.trials if self.trials else 0.0
 
     @property
     def interval(self) -> Interval:
-        """95 %, exact."""
+        """Exact 95 % interval."""
         return clopper_pearson(self.hits, self.trials)
 
 
@@ -40,8 +40,8 @@ class CellSummary:
     min_clearance_m: float | None
     time_median_s: float | None  # of the runs that arrived
     time_max_s: float | None
-    over_alone: float | None  # median of flight time over the unconstrained one
-    over_least: float | None  # largest sum of distances over the least
+    time_relative: float | None  # median of flight time relative to the single-agent time
+    sum_relative: float | None  # largest ratio of the sum of goal distances to its theoretical lower bound
     plans_failed: float  # mean per run
     commits_refused: float
     safety_filter_acted: float
@@ -49,7 +49,7 @@ class CellSummary:
 
 
 def summaries(rows: Sequence[Row]) -> list[CellSummary]:
-    """One of every cell, in the cells' order."""
+    """Return one summary per cell, in the cells' order."""
     grouped: dict[Cell, list[Row]] = {}
     for row in rows:
         grouped.setdefault(cell_of(row), []).append(row)

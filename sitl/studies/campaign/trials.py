@@ -1,4 +1,4 @@
-"""What a campaign is made of: cells, trials and the table row that a flown trial becomes. Data only."""
+"""Data of a campaign: cells, trials and the table row of a flown trial."""
 
 from __future__ import annotations
 
@@ -43,14 +43,14 @@ SCHEMA = pa.schema(
         pa.field("loss", pa.float64()),
         pa.field("seed", pa.int64()),
         pa.field("protections", pa.string()),
-        pa.field("collided", pa.bool_()),  # in truth: two bodies touched, or one and an obstacle
+        pa.field("collided", pa.bool_()),  # in truth: two bodies touched, or a body and an obstacle
         pa.field("min_separation_m", pa.float64()),  # smallest true distance of two centres at any time
-        pa.field("arrived", pa.bool_()),  # everybody who should, for good, and nobody collided
-        pa.field("flight_time_s", pa.float64()),  # from the mission's begin to the last arrival
+        pa.field("arrived", pa.bool_()),  # all expected vehicles, for good, without collision
+        pa.field("flight_time_s", pa.float64()),  # from the begin of the mission to the last arrival
         pa.field("noise", pa.string()),
         pa.field("wind_m_s", pa.float64()),
         pa.field("sets", pa.string()),
-        pa.field("deadlocked", pa.bool_()),  # time ran out, and somebody who has not arrived stands still
+        pa.field("deadlocked", pa.bool_()),  # time ran out, and a vehicle that has not arrived stands still
         pa.field("outcome", pa.string()),  # arrived, collided, deadlocked, late, or what went wrong
         pa.field("min_clearance_m", pa.float64()),  # smallest true distance of a body's hull to an obstacle's surface
         pa.field("arrived_agents", pa.int32()),

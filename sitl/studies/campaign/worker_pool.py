@@ -1,6 +1,6 @@
-"""Who flies the trials: processes on this machine, or the workers of a Dask cluster. Rows come back as they finish.
+"""Worker pool for trials: processes on this machine, or workers of a Dask cluster. Rows are returned as they finish.
 
-Every process has one thread: a flight is one, and numpy's own would only get in each other's way.
+Every process has one thread, because a flight is single-threaded and numpy's threads would compete.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Fly = Callable[[Trial], Row]
 
 
 def fly_trial(trial: Trial) -> Row:
-    """`sitl.studies.campaign.flight.fly`, imported where it runs."""
+    """Call `sitl.studies.campaign.flight.fly`, imported in the worker."""
     from sitl.studies.campaign.flight import fly
 
     return fly(trial)
@@ -29,10 +29,10 @@ def fly_trial(trial: Trial) -> Row:
 def on_this_machine(
     trials: Sequence[Trial], jobs: int, fly: Fly = fly_trial
 ) -> Generator[tuple[Trial, Row | str], None, None]:
-    """Fly in `jobs` processes; yields each trial with its row, or with what went wrong in words.
+    """Fly in `jobs` processes; yield each trial with its row, or with the error as text.
 
     Raises:
-        StartError: a process ended by itself, for want of memory or by a signal.
+        StartError: a process ended by itself, from lack of memory or by a signal.
     """
     if jobs == 1:
         yield from ((trial, _flown(fly, trial)) for trial in trials)
@@ -54,7 +54,7 @@ def on_this_machine(
     finally:
         processes = list((pool._processes or {}).values())
         pool.shutdown(wait=False, cancel_futures=True)
-        for process in processes:  # a flight under way is not waited for: it is flown again
+        for process in processes:  # a running flight is not waited for: it is flown again
             process.terminate()
 
 
@@ -84,7 +84,7 @@ def on_cluster(
 
 
 def _begin() -> None:
-    """Of a child process: Ctrl-C is the parent's to judge, and its end is ours."""
+    """Prepare a child process: it ignores Ctrl-C, which the parent handles, and dies with the parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     die_with_parent(signal.SIGKILL)
 

@@ -1,4 +1,4 @@
-"""The thesis' six experiments as a table: what is flown, what was published, and what is asked of us."""
+"""The six experiments of the thesis as a table: flights, published figures, and required limits."""
 
 from __future__ import annotations
 
@@ -7,35 +7,35 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 from sitl.studies.thesis import score
-from sitl.studies.thesis.figures import Flight
+from sitl.studies.thesis.figures import FlightName
 from sitl.studies.thesis.trace import Path, Row, Trace
 
 SAFE_RADIUS_M = 0.3
 RADII: tuple[float, ...] = (3.0, 2.7, 2.5, 2.3, 2.0, 1.5, 1.0)  # times SAFE_RADIUS_M
 TABLE_19_M: dict[float, float | None] = {3.0: 2.19, 2.7: 2.04, 2.5: 1.95, 2.3: 1.85}  # violated at 2
 _INDEX_LIMIT_M: dict[float, float] = {3.0: 2.19, 2.7: 2.04, 2.5: 1.95, 2.3: 1.85, 2.0: 1.80, 1.5: 1.55, 1.0: 1.30}
-_CLOSER_M = 0.01  # a true distance may fall short of the constraint radius by this
-_CERTIFIED_01 = 0.11  # of the radius: certificate slack when the radius is small
+_CLOSER_M = 0.01  # tolerated shortfall of a true distance from the constraint radius
+_CERTIFIED_01 = 0.11  # share of the radius: certificate slack when the radius is small
 
-Flown = Mapping[str, Trace]  # by name of the job
+Flown = Mapping[str, Trace]  # by job name
 
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """One flight."""
+    """One flight of the table."""
 
-    flight: Flight
+    flight: FlightName
     name: str
-    config: str  # of those that come with swarmctl
+    config: str  # name of a built-in configuration
     path: Path = "plant"
     overrides: tuple[str, ...] = ()
-    matched_velocity: bool = False  # starts with the reference's velocity; plant only
+    matched_velocity: bool = False  # starts with the reference's velocity; model only
     radius_m: float | None = None  # constraint radius, where a row depends on it
 
 
 @dataclass(frozen=True, slots=True)
 class Asked:
-    """One row of `reproduce.json` to be worked out from one flight."""
+    """One row of `reproduce.json` that is computed from one flight."""
 
     name: str
     job: str
@@ -44,20 +44,20 @@ class Asked:
     published: float | None = None
     limit: float | None = None
     note: str = ""
-    least: float | None = None
+    lower_bound: float | None = None
 
 
-def least_index_m(radius_m: float) -> float:
-    """Least possible tracking index of three agents `radius_m` apart around one point: an equilateral triangle."""
+def lower_bound_index_m(radius_m: float) -> float:
+    """Theoretical lower bound [m] of the tracking index: three agents `radius_m` apart form an equilateral triangle."""
     return math.sqrt(3.0) * radius_m
 
 
 def at_radius(radius_m: float) -> tuple[str, ...]:
-    """Overrides of a swarm flight at another constraint radius."""
+    """Return the overrides of a swarm flight at another constraint radius."""
     slack_m = min(0.1, _CERTIFIED_01 * radius_m)
     return (
         f"separation.radius_m={radius_m:.4f}",
-        "separation.allow_small_radius=true",  # the thesis' vehicles have no bodies
+        "separation.allow_small_radius=true",  # the thesis' vehicles are points
         f"separation.certify_slack_m={slack_m:.4f}",
         "limits.min_separation_m=0.1",
     )
@@ -68,8 +68,8 @@ def radius_name(kind: str, factor: float) -> str:
 
 
 def _single(speed: str) -> Iterator[Job]:
-    pid: Flight = "pid_slow" if speed == "slow" else "pid_fast"
-    mpc: Flight = "mpc_slow" if speed == "slow" else "mpc_fast"
+    pid: FlightName = "pid_slow" if speed == "slow" else "pid_fast"
+    mpc: FlightName = "mpc_slow" if speed == "slow" else "mpc_fast"
     yield Job(pid, f"{pid} published", f"thesis_4_{pid}")
     yield Job(pid, f"{pid} retuned", f"improved_4_{pid}")
     yield Job(mpc, f"{mpc} published", f"thesis_4_{mpc}")
@@ -100,24 +100,24 @@ def _circle(kind: str, factor: float, config: str) -> Job:
 
 PLANT_JOBS: tuple[Job, ...] = tuple(_plant_jobs())
 FULL_JOBS: tuple[Job, ...] = tuple(
-    replace(job, name=f"{job.name}, full path", path="full") for job in PLANT_JOBS if not job.matched_velocity
+    replace(job, name=f"{job.name}, full MAVLink loop", path="full") for job in PLANT_JOBS if not job.matched_velocity
 )
 
 
 def is_flown_again(job: Job) -> bool:
-    """Whether a second flight is asked for, at equal true distance: the thesis' own controller on its own path."""
+    """Return whether a second flight is needed, at equal true distance: the thesis' own controller, model only."""
     return job.path == "plant" and job.config == "thesis_5_circle" and job.radius_m is not None
 
 
 def wider(job: Job, trace: Trace) -> Job:
-    """The same swarm flight with the constraint radius widened by what its true distances fell short of it."""
+    """Return the same swarm flight with the constraint radius widened by the shortfall of its true distances."""
     assert job.radius_m is not None
     radius_m = job.radius_m + max(0.0, job.radius_m - score.separation_m(trace))
     return replace(job, name=f"{job.name}, true distance", overrides=at_radius(radius_m), radius_m=radius_m)
 
 
 def rows(flown: Flown) -> list[Row]:
-    """Every row that the flights at hand allow, in the thesis' order."""
+    """Return every row that the given flights allow, in the thesis' order."""
     asked = [*_tables_5_6(), *_tables_11_12(), *_table_19(), *_obstacle()]
     found = [_row(item, flown[item.job]) for item in asked if item.job in flown]
     return [*found, *_true_distance_rows(flown), *_dmpc3_rows(flown), *_full_rows(flown)]
@@ -125,7 +125,7 @@ def rows(flown: Flown) -> list[Row]:
 
 def _row(asked: Asked, trace: Trace) -> Row:
     ours = asked.figure(trace)
-    return Row(asked.name, asked.published, ours, asked.limit, trace.path, asked.unit, asked.note, asked.least)
+    return Row(asked.name, asked.published, ours, asked.limit, trace.path, asked.unit, asked.note, asked.lower_bound)
 
 
 def _mse(axis: int) -> Callable[[Trace], float]:
@@ -151,7 +151,7 @@ def _tables_5_6() -> Iterator[Asked]:
         )
 
 
-# mean distance, MSE; limits of the improved preset; least possible from rest and with a matched start: mean, MSE x, z
+# Mean distance, MSE; limits of the improved preset; lower bounds from rest and with a matched start: mean, MSE x, z.
 _MPC_TABLES = {
     "slow": (
         0.0043,
@@ -168,11 +168,11 @@ _MPC_TABLES = {
         (0.01172, 0.00234, 0.00663),
     ),
 }
-_LEAST_NOTE = "least: optimal control of the thesis' model under the same bounds, attitude lag included"
+_BOUND_NOTE = "lower bound: optimal control of the thesis' model under the same bounds, attitude lag included"
 _REST_NOTE = {
-    "slow": f"from rest at the origin; {_LEAST_NOTE}",
-    "fast": "from rest at the origin, where the published MSE z of 0.0081 is below the least possible (0.0102 m2, and "
-    "0.0101 with thrust down to -20 N): the published run must have begun in motion",
+    "slow": f"from rest at the origin; {_BOUND_NOTE}",
+    "fast": "from rest at the origin, where the published MSE z of 0.0081 is below the theoretical lower bound "
+    "(0.0102 m2, and 0.0101 with thrust down to -20 N): the published run must have begun in motion",
 }
 _MATCHED_NOTE = "start: at the origin with the reference's velocity; nothing else is changed"
 
@@ -182,21 +182,21 @@ def _tables_11_12() -> Iterator[Asked]:
         mean_m, mse_m2, limits, from_rest, matched = _MPC_TABLES[speed]
         key, text = f"mpc_{speed}", f"MPC {speed}, Table {table}"
         starts = (("", _REST_NOTE[speed], from_rest), (", matched start", _MATCHED_NOTE, matched))
-        for suffix, note, least in starts:
+        for suffix, note, bound in starts:
             job, asked = f"{key} published{suffix}", suffix if speed == "fast" else not suffix
             limit = 1.6 * mean_m if asked else None
             figure = score.mean_distance_m
-            yield Asked(f"{text}{suffix}, mean distance", job, figure, "m", mean_m, limit, note, least[0])
+            yield Asked(f"{text}{suffix}, mean distance", job, figure, "m", mean_m, limit, note, bound[0])
             for axis, letter in enumerate("xyz"):
-                low = {0: least[1], 2: least[2]}.get(axis)
+                low = {0: bound[1], 2: bound[2]}.get(axis)
                 yield Asked(f"{text}{suffix}, MSE {letter}", job, _mse(axis), "m2", mse_m2[axis], None, "", low)
-        for suffix, note, least in starts:
+        for suffix, note, bound in starts:
             job, ours = f"{key} improved{suffix}", f"{text}, improved{suffix}"
             limit = limits[0] if suffix else None
-            yield Asked(f"{ours}, mean distance", job, score.mean_distance_m, "m", mean_m, limit, note, least[0])
+            yield Asked(f"{ours}, mean distance", job, score.mean_distance_m, "m", mean_m, limit, note, bound[0])
             for axis, letter, at in ((0, "x", 1), (2, "z", 2)):
                 limit = limits[at] if suffix else None
-                yield Asked(f"{ours}, MSE {letter}", job, _mse(axis), "m2", mse_m2[axis], limit, "", least[at])
+                yield Asked(f"{ours}, MSE {letter}", job, _mse(axis), "m2", mse_m2[axis], limit, "", bound[at])
             note = "largest of the axes, after 10 s"
             yield Asked(f"{ours}, steady RMSE", job, score.steady_rmse_m, "m", None, 0.0005, note)
 
@@ -205,8 +205,8 @@ def _short_of(radius_m: float) -> Callable[[Trace], float]:
     return lambda trace: max(0.0, radius_m - score.separation_m(trace))
 
 
-def _settled_over_least(radius_m: float) -> Callable[[Trace], float]:
-    return lambda trace: score.index_m(trace, score.STEADY_AFTER_S) / least_index_m(radius_m)
+def _settled_over_bound(radius_m: float) -> Callable[[Trace], float]:
+    return lambda trace: score.index_m(trace, score.STEADY_AFTER_S) / lower_bound_index_m(radius_m)
 
 
 _TABLE_19_NOTE = "thesis' weights but for z, which ends in a region and whose moves weigh 1.0"
@@ -219,13 +219,15 @@ def _table_19() -> Iterator[Asked]:
             text = f"circle {kind}, Table 19, {factor:g} x 0.3 m"
             published = TABLE_19_M.get(factor)
             note = _TABLE_19_NOTE + ("; published: collision constraint violated" if factor == 2.0 else "")
-            least_m = least_index_m(radius_m)
-            yield Asked(f"{text}, index", job, score.index_m, "m", published, _INDEX_LIMIT_M[factor], note, least_m)
+            bound_m = lower_bound_index_m(radius_m)
+            yield Asked(f"{text}, index", job, score.index_m, "m", published, _INDEX_LIMIT_M[factor], note, bound_m)
             note = "constraint radius minus the smallest true distance"
             yield Asked(f"{text}, closer than the radius by", job, _short_of(radius_m), "m", None, _CLOSER_M, note, 0.0)
-            settled = _settled_over_least(radius_m)
+            settled = _settled_over_bound(radius_m)
             limit = 1.05 if factor == 3.0 else None
-            yield Asked(f"{text}, index after 10 s over the least possible", job, settled, "1", None, limit, "", 1.0)
+            yield Asked(
+                f"{text}, index after 10 s over the theoretical lower bound", job, settled, "1", None, limit, "", 1.0
+            )
 
 
 _OBSTACLE_M, _APART_M = 1.75, 0.9
@@ -235,7 +237,7 @@ def _obstacle() -> Iterator[Asked]:
     for kind, preset, limit in (("dmpc", "published", None), ("dmpc", "improved", 2.60), ("dmpc3", "dmpc3", 2.60)):
         job, text = f"obstacle {preset}", f"obstacle {kind}" + ("" if preset == kind else f", {preset}")
         held = 0.0 if limit else None
-        yield Asked(f"{text}, index", job, score.index_m, "m", 2.88, limit, "", least_index_m(_APART_M))
+        yield Asked(f"{text}, index", job, score.index_m, "m", 2.88, limit, "", lower_bound_index_m(_APART_M))
         note = "1.75 m minus the smallest distance to the centre"
         yield Asked(
             f"{text}, inside the keep-out by",
@@ -258,17 +260,17 @@ def _true_distance_rows(flown: Flown) -> Iterator[Row]:
             apart_m = score.separation_m(trace)
             note = f"smallest true distance {apart_m:.4f} m, the constraint being wider by what was missing"
             name = f"circle dmpc, Table 19, {factor:g} x 0.3 m, index at equal true distance"
-            least_m = least_index_m(factor * SAFE_RADIUS_M)
-            yield Row(name, TABLE_19_M.get(factor), score.index_m(trace), None, "plant", "m", note, least_m)
+            bound_m = lower_bound_index_m(factor * SAFE_RADIUS_M)
+            yield Row(name, TABLE_19_M.get(factor), score.index_m(trace), None, "plant", "m", note, bound_m)
 
 
 def _dmpc3_rows(flown: Flown) -> Iterator[Row]:
-    """`dmpc3` over `dmpc` on every row they share: 1 and below is not worse."""
+    """Yield `dmpc3` relative to `dmpc` on every row they share: 1 and below is not worse."""
     pairs: list[tuple[str, str, str, Callable[[Trace], float]]] = [
         (f"circle, {factor:g} x 0.3 m, index", radius_name("dmpc", factor), radius_name("dmpc3", factor), score.index_m)
         for factor in RADII
     ]
-    settled = _settled_over_least(RADII[0] * SAFE_RADIUS_M)
+    settled = _settled_over_bound(RADII[0] * SAFE_RADIUS_M)
     widest = radius_name("dmpc", RADII[0]), radius_name("dmpc3", RADII[0])
     pairs.append((f"circle, {RADII[0]:g} x 0.3 m, index after 10 s", *widest, settled))
     pairs.append(("obstacle, index", "obstacle improved", "obstacle dmpc3", score.index_m))
@@ -278,13 +280,13 @@ def _dmpc3_rows(flown: Flown) -> Iterator[Row]:
 
 
 def _full_rows(flown: Flown) -> Iterator[Row]:
-    """What the MAVLink path flies, and how far it is from the plant path."""
+    """Yield the figures of the full MAVLink loop, and their difference from the model-only flights."""
     for job in FULL_JOBS:
-        trace, plant = flown.get(job.name), flown.get(job.name.removesuffix(", full path"))
+        trace, plant = flown.get(job.name), flown.get(job.name.removesuffix(", full MAVLink loop"))
         if trace is None or job.flight in ("open_loop", "pid_step", "pid_steps"):
             continue
         ours = score.index_m(trace)
         yield Row(f"{job.name}, index", None, ours, None, "full", "m", "for one vehicle: its mean distance")
         if plant is not None:
             apart = abs(ours / score.index_m(plant) - 1.0)
-            yield Row(f"{job.name}, index differs from the plant path by", None, apart, 0.05, "full", "1")
+            yield Row(f"{job.name}, index differs from model only by", None, apart, 0.05, "full", "1")

@@ -1,7 +1,7 @@
-"""Every figure of the thesis that shows a result, as a table, and how each is drawn from flights.
+"""All result figures of the thesis, as a table, and how each is drawn from flights.
 
 A flight is given as several traces: the first is the published preset, further ones are alternatives (another preset,
-the path over MAVLink) and are drawn beside it. Swarm figures show the agents of the first trace only.
+the full MAVLink loop) and are drawn beside it. Swarm figures show the agents of the first trace only.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from sitl.studies.thesis.trace import Array, Trace
 from swarmctl.telemetry.charts import Ball, Circle, Limit, Line, SpaceLine, Window, space_view, time_chart, top_view
 from swarmctl.telemetry.palette import LIMIT_RGB, SUM_RGB, agent_rgb, css
 
-Flight = Literal[
+FlightName = Literal[
     "open_loop", "pid_step", "pid_steps", "pid_slow", "pid_fast", "mpc_slow", "mpc_fast", "circle", "obstacle"
 ]
 Drawn = Literal["states", "x", "y", "z", "roll", "pitch", "yaw", "thrust", "torque_x", "torque_y", "torque_z", "space"]
 
-FLIGHTS: dict[Flight, str] = {
+FLIGHTS: dict[FlightName, str] = {
     "open_loop": "Open loop, zero input",
     "pid_step": "PID, one step",
     "pid_steps": "PID, consecutive steps",
@@ -34,7 +34,7 @@ FLIGHTS: dict[Flight, str] = {
     "circle": "Swarm on a climbing circle",
     "obstacle": "Swarm and a suddenly seen obstacle",
 }
-SWARMS: tuple[Flight, ...] = ("circle", "obstacle")
+SWARMS: tuple[FlightName, ...] = ("circle", "obstacle")
 
 _QUANTITIES: dict[Drawn, str] = {
     "x": "position x [m]",
@@ -63,7 +63,7 @@ class Figure:
 
     number: int
     caption: str
-    flight: Flight
+    flight: FlightName
     drawn: Drawn
 
     @property
@@ -83,7 +83,7 @@ class IndexPoint:
 
 @dataclass(frozen=True, slots=True)
 class Extra:
-    """What the page shows that is in no trace.
+    """Content of the page that is in no trace.
 
     Attributes:
         separation_m: constraint radius by trace name or, for all traces of a flight, by flight.
@@ -96,7 +96,7 @@ class Extra:
     notes: Sequence[str] = ()
 
 
-def _run_of(first: int, flight: Flight, drawn: Sequence[Drawn], by: str) -> tuple[Figure, ...]:
+def _run_of(first: int, flight: FlightName, drawn: Sequence[Drawn], by: str) -> tuple[Figure, ...]:
     return tuple(Figure(first + k, f"{_QUANTITIES[what]}, {by}", flight, what) for k, what in enumerate(drawn))
 
 
@@ -117,10 +117,10 @@ FIGURES: tuple[Figure, ...] = (
 
 
 def draw(figure: Figure, traces: Sequence[Trace], points: int = 300) -> str:
-    """One figure of the thesis as HTML.
+    """Return one figure of the thesis as HTML.
 
     Args:
-        figure: which.
+        figure: entry of the table.
         traces: of its flight, the published preset first; at least one.
         points: kept per line.
     """
@@ -135,7 +135,7 @@ def draw(figure: Figure, traces: Sequence[Trace], points: int = 300) -> str:
 
 
 def body_rates_rad_s(trace: Trace, agent: int = 0) -> Array:
-    """Body FRD rates p, q, r (T, 3) [rad/s] by central differences of the recorded angles; a trace has no rates."""
+    """Return body FRD rates p, q, r (T, 3) [rad/s] by central differences of the angles; a trace has no rates."""
     euler_rad = trace.euler_rad[:, agent]
     if len(euler_rad) < 2:
         return np.full_like(euler_rad, np.nan)
@@ -151,7 +151,7 @@ def body_rates_rad_s(trace: Trace, agent: int = 0) -> Array:
 
 
 def body_velocity_m_s(trace: Trace, agent: int = 0) -> Array:
-    """Body FRD velocity u, v, w (T, 3) [m/s]: the NED velocity turned by the ZYX angles."""
+    """Return the body FRD velocity u, v, w (T, 3) [m/s]: the NED velocity turned by the ZYX angles."""
     sr, sp, sy = np.sin(trace.euler_rad[:, agent]).T
     cr, cp, cy = np.cos(trace.euler_rad[:, agent]).T
     to_body = np.array(
@@ -165,7 +165,7 @@ def body_velocity_m_s(trace: Trace, agent: int = 0) -> Array:
 
 
 def nearest_pair_m(trace: Trace) -> Array:
-    """Smallest distance between two agents at every tick (T,) [m], NaN where unknown or alone."""
+    """Return the smallest distance of two agents at every tick (T,) [m], NaN where unknown or alone."""
     pos = trace.pos_ned_m  # (T, N, 3)
     first, second = np.triu_indices(pos.shape[1], k=1)
     if not len(first):
@@ -173,8 +173,10 @@ def nearest_pair_m(trace: Trace) -> Array:
     return np.asarray(np.fmin.reduce(np.linalg.norm(pos[:, first] - pos[:, second], axis=2), axis=1))
 
 
-def separation_chart(flight: Flight, traces: Sequence[Trace], separation_m: Mapping[str, float], points: int) -> str:
-    """Smallest distance of two agents over time, with the constraint radius of every trace."""
+def separation_chart(
+    flight: FlightName, traces: Sequence[Trace], separation_m: Mapping[str, float], points: int
+) -> str:
+    """Draw the smallest distance of two agents over time, with the constraint radius of every trace."""
     colors = [css(agent_rgb(k)) for k in range(len(traces))]
     lines = [Line(t.t_s, nearest_pair_m(t), c, t.name) for t, c in zip(traces, colors, strict=True)]
     radii = {separation_m.get(trace.name, separation_m.get(flight)) for trace in traces}
@@ -183,8 +185,8 @@ def separation_chart(flight: Flight, traces: Sequence[Trace], separation_m: Mapp
     return time_chart(title, lines, _seconds(traces), limits=limits, points=points, from_zero=True, height=300)
 
 
-def error_chart(flight: Flight, traces: Sequence[Trace], separation_m: Mapping[str, float], points: int) -> str:
-    """Distance to the reference over time, summed over agents; its mean is the published index."""
+def error_chart(flight: FlightName, traces: Sequence[Trace], separation_m: Mapping[str, float], points: int) -> str:
+    """Draw the distance to the reference over time, summed over agents; its mean is the published index."""
     lines = []
     for k, trace in enumerate(traces):
         sum_m = np.linalg.norm(trace.pos_ned_m - trace.ref_pos_ned_m, axis=2).sum(axis=1)
@@ -192,13 +194,13 @@ def error_chart(flight: Flight, traces: Sequence[Trace], separation_m: Mapping[s
     radius_m = separation_m.get(traces[0].name, separation_m.get(flight))
     limits = []
     if radius_m is not None and traces[0].pos_ned_m.shape[1] == 3:
-        limits = [Limit(math.sqrt(3) * radius_m, "least possible for three agents")]
+        limits = [Limit(math.sqrt(3) * radius_m, "theoretical lower bound for three agents")]
     title = "Distances to the shared reference, sum [m]" if flight in SWARMS else "Distance to the reference [m]"
     return time_chart(title, lines, _seconds(traces), limits=limits, points=points, from_zero=True, height=300)
 
 
 def obstacle_chart(traces: Sequence[Trace], points: int) -> str:
-    """Distance to the centre of the first obstacle: all agents of the first trace, the nearest of the others."""
+    """Draw the distance to the first obstacle's centre: all agents of the first trace, the nearest of the others."""
     sphere = traces[0].obstacles[0]
     center_ned_m = np.array(sphere.center_ned_m)
     lines = []
@@ -215,7 +217,7 @@ def obstacle_chart(traces: Sequence[Trace], points: int) -> str:
 
 
 def above_chart(trace: Trace, points: int) -> str:
-    """Agents, reference and obstacles from above; circles are the keep-out and the obstacle."""
+    """Draw agents, reference and obstacles from above; circles are the keep-out and the obstacle."""
     lines = [
         Line(trace.pos_ned_m[:, i, 1], trace.pos_ned_m[:, i, 0], css(agent_rgb(i)), f"agent {i}")
         for i in range(trace.pos_ned_m.shape[1])
@@ -231,7 +233,7 @@ def above_chart(trace: Trace, points: int) -> str:
 
 
 def index_chart(index: Sequence[IndexPoint]) -> str:
-    """Tracking index over constraint radius: Table 19, ours, and the least that three agents can reach."""
+    """Draw the tracking index over the constraint radius: Table 19, ours, and the theoretical lower bound."""
     radii = np.array(sorted({point.radius_m for point in index}))
     published = sorted({(p.radius_m, p.published_m) for p in index if p.published_m is not None})
     lines = []
@@ -239,7 +241,7 @@ def index_chart(index: Sequence[IndexPoint]) -> str:
         ours = sorted((p.radius_m, p.ours_m) for p in index if p.series == name and p.ours_m is not None)
         lines.append(_marked(ours, css(agent_rgb(k)), name))
     lines.append(_marked(published, _PUBLISHED, "published, Table 19"))
-    lines.append(Line(radii, math.sqrt(3) * radii, css(LIMIT_RGB), "least possible, sqrt(3) r", "5 4", 1.2))
+    lines.append(Line(radii, math.sqrt(3) * radii, css(LIMIT_RGB), "theoretical lower bound, sqrt(3) r", "5 4", 1.2))
     shown = (float(radii[0]) - 0.03, float(radii[-1]) + 0.03)
     title = "Tracking index [m] over constraint radius [m], three periods of the circle"
     return time_chart(title, lines, shown, from_zero=True, height=240)
@@ -260,7 +262,7 @@ def _seconds(traces: Sequence[Trace]) -> tuple[float, float]:
 
 
 def _single_lines(figure: Figure, traces: Sequence[Trace]) -> list[Line]:
-    """The response of every trace, and what the first one was asked for."""
+    """Return the response of every trace, and the reference of the first one."""
     lines = []
     for k, trace in enumerate(traces):
         values = _response(trace, figure.drawn, 0)
@@ -283,7 +285,7 @@ def _swarm_lines(figure: Figure, trace: Trace) -> list[Line]:
 
 
 def _response(trace: Trace, drawn: Drawn, agent: int) -> Array:
-    """What is drawn of one agent (T,)."""
+    """Return the drawn state of one agent (T,)."""
     if drawn in _AXES:
         return trace.pos_ned_m[:, agent, _AXES.index(drawn)]
     if drawn in _ANGLES:
@@ -294,7 +296,7 @@ def _response(trace: Trace, drawn: Drawn, agent: int) -> Array:
 
 
 def _asked(trace: Trace, drawn: Drawn) -> Array | None:
-    """Reference or attitude setpoint of the first agent (T,); None where the thesis has none."""
+    """Return the reference or attitude setpoint of the first agent (T,); None where the thesis has none."""
     if drawn in _AXES:
         return trace.ref_pos_ned_m[:, 0, _AXES.index(drawn)]
     if drawn in _ANGLES:
@@ -303,7 +305,7 @@ def _asked(trace: Trace, drawn: Drawn) -> Array | None:
 
 
 def _windows(trace: Trace, axis: int) -> list[Window]:
-    """What every obstacle takes up of one axis while the reference is inside it."""
+    """Return the extent of every obstacle on one axis while the reference is inside it."""
     found = []
     for sphere in trace.obstacles:
         away_m = np.linalg.norm(trace.ref_pos_ned_m[:, 0] - np.array(sphere.center_ned_m), axis=1)
@@ -336,7 +338,7 @@ def _space(figure: Figure, traces: Sequence[Trace], points: int) -> str:
 
 
 def _states(figure: Figure, traces: Sequence[Trace], points: int) -> str:
-    """Four panels of three states; further traces are dashed."""
+    """Draw four panels of three states; further traces are dashed."""
     panels: tuple[tuple[str, str], ...] = (
         ("angles [rad]", "phi theta psi"),
         ("body rates [rad/s]", "p q r"),

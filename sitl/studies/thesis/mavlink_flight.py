@@ -1,7 +1,7 @@
-"""The same flights through the whole bridge: agents, MAVLink frames, commands and the simulator's own loops.
+"""Flights in the full MAVLink loop: agents, MAVLink frames, commands and the simulator's own loops.
 
 Ideal link: no latency, no loss. The simulator's physics runs at the thesis' 50 Hz, so that what is left of a difference
-to the plant path is the bridge itself: frames in single precision, the sequence from arming to tracking, and its
+to a model-only flight is the bridge itself: frames in single precision, the sequence from arming to tracking, and its
 estimate of the hover thrust.
 """
 
@@ -21,7 +21,7 @@ PHYSICS_HZ = round(1.0 / THESIS_SAMPLE_S)
 
 
 def fly_over_mavlink(name: str, config: Config) -> Trace:
-    """Fly a configuration's mission in lockstep; the trace is of the mission proper, from true states.
+    """Fly a configuration's mission in lockstep; return the trace of the mission alone, from true states.
 
     Raises:
         RuntimeError: the mission did not complete.
@@ -62,6 +62,6 @@ def fly_over_mavlink(name: str, config: Config) -> Trace:
 
 
 def _euler(q_nb: Array) -> Array:
-    """Roll, pitch, yaw (T, N, 3) of quaternions (T, N, 4)."""
+    """Return roll, pitch, yaw (T, N, 3) of quaternions (T, N, 4)."""
     flat = [euler_from_quat(np.asarray(q, np.float64)) for q in q_nb.reshape(-1, 4)]
     return np.array(flat).reshape(*q_nb.shape[:2], 3)

@@ -1,9 +1,8 @@
-"""Flights on the plant itself, as the thesis flew them: no MAVLink, no agent process, one sample time for everything.
+"""Model-only flights, as the thesis flew them: no MAVLink, no agent process, one sample time for everything.
 
 Every 0.02 s each controller gets the true state of its vehicle and the paths its peers shared one step ago, and its
-attitude and thrust act at once. The controllers, the half-spaces, the certificate and the plant are those that fly
-over MAVLink; what is missing is the bridge: no estimate of the hover thrust, no phases, no failsafe but the replay of
-the last certified plan.
+attitude and thrust act at once. Controllers, half-spaces, certificate and plant are those of the full MAVLink loop. The
+bridge is missing: no estimate of the hover thrust, no phases, no failsafe but the replay of the last certified plan.
 """
 
 from __future__ import annotations
@@ -45,7 +44,7 @@ _TERMINAL_MET_M = 0.01
 
 
 class Pilot:
-    """One vehicle's controller and what it remembers between steps."""
+    """The controller of one vehicle and its state between steps."""
 
     def __init__(self, config: Config, agent: int) -> None:
         self._config, self._agent = config, agent
@@ -70,11 +69,11 @@ class Pilot:
         self.terminal_missed = 0
 
     def reference_ned_m(self, t_us: int) -> Array:
-        """Where to be now, (3,)."""
+        """Return the reference position now, (3,)."""
         return np.asarray(self._reference.sample(np.array([t_us * 1e-6]))[0][0])
 
     def prime(self, state: VehicleState) -> None:
-        """Plan to stay and share it, as an agent that waits for the mission does: errors then begin from zero."""
+        """Plan to stay and share the plan, as an agent does before the mission, so that errors begin at zero."""
         act_us = state.t_us + self._predictor.delay_us
         start = Start(act_us - self._dt_us, state.pos_ned_m, state.vel_ned_m_s, 1.0, self._virtual_control)
         points, yaw_rad = self._controller.longest + 1, self._config.mission.yaw_rad
@@ -83,7 +82,7 @@ class Pilot:
         self.path = self._path(self._flown(plan, start, ()))
 
     def step(self, state: VehicleState, peers: list[PredictedPath]) -> AttitudeSetpoint:
-        """The setpoint of this step; `path` is what peers may know of it."""
+        """Return the setpoint of this step; `path` is what peers receive of it."""
         now_us, estimate = state.t_us, self._observer.estimate
         act_us = now_us + self._predictor.delay_us
         start = self._predictor.start(state, act_us, estimate.disturbance_ned_m_s2, self._virtual_control)
@@ -115,7 +114,7 @@ class Pilot:
         return setpoint
 
     def observe(self, state: VehicleState) -> None:
-        """Learn from what the last setpoint has done."""
+        """Update the estimate from the effect of the last setpoint."""
         self._observer.update(state, self._thrust_01)
 
     def _horizon(self, act_us: int) -> Reference:
@@ -143,7 +142,7 @@ class Pilot:
 
 
 def fly_on_plant(name: str, config: Config, *, matched_velocity: bool = False) -> Trace:
-    """Fly a configuration's mission on the thesis plant.
+    """Fly a configuration's mission on the thesis plant and return its trace.
 
     Args:
         name: of the trace.

@@ -1,4 +1,4 @@
-"""What `swarmctl reproduce` leaves behind: `report.html`, one page without script or request, and `reproduce.json`."""
+"""Output of `swarmctl reproduce`: `report.html`, one page without script or request, and `reproduce.json`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sitl.studies.thesis.figures import (
     FLIGHTS,
     SWARMS,
     Extra,
-    Flight,
+    FlightName,
     above_chart,
     draw,
     error_chart,
@@ -36,7 +36,7 @@ _NOT_A_NUMBER = "not finite"
 _READING = (
     "Every row is an error, a distance from the goal or a time: lower is better. The ratio is ours over the published "
     "figure, below 1 is better than published; there is none where the thesis prints 0. A limit is what this project "
-    "asks of itself; least is what no controller can go below: three agents that keep r from each other around one "
+    "asks of itself; no controller can go below the lower bound: three agents that keep r from each other around one "
     "shared point are at best an equilateral triangle, a sum of sqrt(3) r.",
     "Path plant: every controller acts on the plant itself once in 0.02 s, as in the thesis. Path full: agents fly "
     "simulated autopilots over an ideal MAVLink link, without torques, which a MAVLink vehicle does not tell.",
@@ -63,11 +63,11 @@ def write_page(
     traces: Mapping[str, Sequence[Trace]],
     extra: Extra | None = None,
 ) -> Path:
-    """Write the page; flights without traces leave their figures out.
+    """Write the page and return its path; flights without traces leave their figures out.
 
     Args:
         directory: exists.
-        rows: what is judged; grouped by the flight their names speak of, see `flight_of`.
+        rows: results, grouped by the flight in their names, see `flight_of`.
         traces: by key of `FLIGHTS`; of each the published preset on the plant first.
         extra: constraint radii, points of Table 19, notes.
 
@@ -79,7 +79,7 @@ def write_page(
     if unknown:
         raise ValueError(f"traces: unknown flights {unknown}; known are {list(FLIGHTS)}")
     extra = extra or Extra()
-    flown: dict[Flight, Sequence[Trace]] = {key: traces[key] for key in FLIGHTS if traces.get(key)}
+    flown: dict[FlightName, Sequence[Trace]] = {key: traces[key] for key in FLIGHTS if traces.get(key)}
     sections = "".join(_sections(flown, extra))
     links = "".join(f'<a href="#{key}">{FLIGHTS[key]}</a>' for key in flown)
     body = "".join(
@@ -120,16 +120,16 @@ def write_json(directory: Path, rows: Sequence[Row]) -> Path:
 
 
 def ratio(row: Row) -> float | None:
-    """Ours over published; None where the thesis has no figure or prints 0."""
+    """Return ours over published; None where the thesis has no figure or prints 0."""
     if row.published is None or row.published == 0.0:
         return None
     return _finite(row.ours / row.published)
 
 
-def flight_of(name: str) -> Flight | None:
-    """The flight a row's name speaks of: all words of its key occur, in any order; the longest key wins."""
+def flight_of(name: str) -> FlightName | None:
+    """Return the flight in a row's name: all words of its key occur, in any order; the longest key wins."""
     words = set(re.split(r"[^a-z0-9]+", name.lower()))
-    spoken: list[Flight] = [key for key in FLIGHTS if words.issuperset(key.split("_"))]
+    spoken: list[FlightName] = [key for key in FLIGHTS if words.issuperset(key.split("_"))]
     return max(spoken, key=len, default=None)
 
 
@@ -138,7 +138,7 @@ def _finite(value: float | None) -> float | None:
 
 
 def _json_row(row: Row) -> dict[str, Any]:
-    numbers = {"published": row.published, "ours": row.ours, "limit": row.limit, "least": row.least}
+    numbers = {"published": row.published, "ours": row.ours, "limit": row.limit, "least": row.lower_bound}
     broken = [
         f"{key} is {_NOT_A_NUMBER}" for key, value in numbers.items() if value is not None and _finite(value) is None
     ]
@@ -151,12 +151,12 @@ def _json_row(row: Row) -> dict[str, Any]:
         "unit": row.unit,
         "note": "; ".join([*([row.note] if row.note else []), *broken]),
         "ratio": ratio(row),
-        "least": _finite(row.least),
+        "least": _finite(row.lower_bound),
         "met": row.met,
     }
 
 
-def _tiles(rows: Sequence[Row], flown: Mapping[Flight, Sequence[Trace]]) -> str:
+def _tiles(rows: Sequence[Row], flown: Mapping[FlightName, Sequence[Trace]]) -> str:
     judged = [row for row in rows if row.met is not None]
     met = sum(bool(row.met) for row in judged)
     ratios = [value for value in map(ratio, rows) if value is not None]
@@ -187,7 +187,7 @@ def _missed(rows: Sequence[Row]) -> str:
 def _rows_table(rows: Sequence[Row]) -> str:
     if not rows:
         return ""
-    names = ("", "published", "ours", "ratio", "limit", "least", "unit", "path", "", "note")
+    names = ("", "published", "ours", "ratio", "limit", "lower bound", "unit", "path", "", "note")
     head = "".join(f'<th class="{"n" if 0 < k < 6 else ""}">{name}</th>' for k, name in enumerate(names))
     parts = []
     for key, title in [*FLIGHTS.items(), (None, "Other")]:
@@ -201,7 +201,7 @@ def _rows_table(rows: Sequence[Row]) -> str:
 def _row(row: Row) -> str:
     share = ratio(row)
     numbers = (_number(row.published), _number(row.ours), "" if share is None else f"{share:.2f}", _number(row.limit))
-    cells = "".join(f"<td class=n>{number}</td>" for number in (*numbers, _number(row.least)))
+    cells = "".join(f"<td class=n>{number}</td>" for number in (*numbers, _number(row.lower_bound)))
     verdict = {None: "", True: '<span class="ok">met</span>', False: '<span class="bad">missed</span>'}[row.met]
     return (
         f"<tr><td>{html.escape(row.name)}</td>{cells}<td>{html.escape(row.unit)}</td><td>{row.path}</td>"
@@ -219,7 +219,7 @@ def _count(value: int | None) -> str:
     return "-" if value is None else str(value)
 
 
-def _flights_table(flown: Mapping[Flight, Sequence[Trace]]) -> str:
+def _flights_table(flown: Mapping[FlightName, Sequence[Trace]]) -> str:
     rows = "".join(
         f"<tr><td>{FLIGHTS[key]}</td><td>{html.escape(trace.name)}</td><td>{trace.path}</td>"
         f"<td class=n>{trace.pos_ned_m.shape[1]}</td><td class=n>{trace.t_s[-1] if len(trace.t_s) else 0:.1f}</td>"
@@ -238,7 +238,7 @@ def _flights_table(flown: Mapping[Flight, Sequence[Trace]]) -> str:
     return f"<h2>Flights</h2><details class=card><summary>{count} flights drawn below</summary>{table}</details>"
 
 
-def _sections(flown: Mapping[Flight, Sequence[Trace]], extra: Extra) -> Iterator[str]:
+def _sections(flown: Mapping[FlightName, Sequence[Trace]], extra: Extra) -> Iterator[str]:
     lines = sum(len(flown.get(figure.flight, ())) + 1 for figure in FIGURES) + 12 * len(flown)
     points = max(60, min(_MOST_POINTS, _ALL_POINTS // lines))
     for key, traces in flown.items():
@@ -255,8 +255,8 @@ def _sections(flown: Mapping[Flight, Sequence[Trace]], extra: Extra) -> Iterator
         yield f'<div class="cards halves">{index_chart(extra.index)}</div>'
 
 
-def _further(key: Flight, traces: Sequence[Trace], extra: Extra, points: int) -> Iterator[str]:
-    """Charts the thesis does not have."""
+def _further(key: FlightName, traces: Sequence[Trace], extra: Extra, points: int) -> Iterator[str]:
+    """Draw the charts that the thesis does not have."""
     if traces[0].obstacles:
         yield above_chart(traces[0], points)
     if key != "open_loop":

@@ -1,4 +1,4 @@
-"""The `reproduce` verb: fly all six experiments of the thesis again and write what came out beside what was published.
+"""The `reproduce` verb: flies the six experiments of the thesis and writes the results beside the published ones.
 
 `python -m sitl.studies.thesis.reproduce [--only FLIGHT]... [--plant] [--full] [--out DIR] [--jobs N]`
 
@@ -30,36 +30,36 @@ from sitl.studies.thesis.mavlink_flight import fly_over_mavlink
 from sitl.studies.thesis.model_flight import fly_on_plant
 from sitl.studies.thesis.page import write_json, write_page
 from sitl.studies.thesis.trace import Row, Trace
-from swarmctl.built_in_configs import shipped_config
+from swarmctl.built_in_configs import built_in_config
 from swarmctl.config import load
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, ConfigError, StartError, exit_code_of
 from swarmctl.process_lifetime import die_with_parent
 from swarmctl.telemetry.run_folder import create_run_folder
 
-TIMING = "timing"  # what `--only` calls the rows that are no flight's
+TIMING = "timing"  # name of the timing rows for `--only`
 
 
 def fly(job: Job) -> Trace:
-    """One flight."""
-    config = load(shipped_config(job.config), job.overrides)
+    """Fly one job."""
+    config = load(built_in_config(job.config), job.overrides)
     if job.path == "plant":
         return fly_on_plant(job.name, config, matched_velocity=job.matched_velocity)
     return fly_over_mavlink(job.name, config)
 
 
 def fly_job(job: Job) -> tuple[Job, list[Trace], str]:
-    """What a worker does: the traces of a job (see `thesis.is_flown_again`), or why there is none."""
+    """Fly a job in a worker: return its traces (see `thesis.is_flown_again`), or why there is none."""
     try:
         traces = [fly(job)]
         if thesis.is_flown_again(job):
             traces.append(fly(thesis.wider(job, traces[0])))
-    except Exception as error:  # one flight's failure must not cost the others
+    except Exception as error:  # a failed flight must not end the others
         return job, [], f"{type(error).__name__}: {error}"
     return job, traces, ""
 
 
 def fly_all(jobs: Sequence[Job], processes: int, bar: Progress) -> tuple[dict[str, Trace], dict[str, str]]:
-    """Traces by name, and what went wrong by job name. Leaving early, by Ctrl-C too, ends the workers."""
+    """Return traces by name, and errors by job name. An early exit, also by Ctrl-C, ends the workers."""
     flown: dict[str, Trace] = {}
     failed: dict[str, str] = {}
     task = bar.add_task("flying", total=len(jobs))
@@ -74,12 +74,12 @@ def fly_all(jobs: Sequence[Job], processes: int, bar: Progress) -> tuple[dict[st
 
 
 def _prepare_worker() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
     die_with_parent(signal.SIGKILL)
 
 
 def chosen(only: Sequence[str], plant: bool, full: bool) -> list[Job]:
-    """The jobs asked for; neither path named means both.
+    """Return the requested jobs; without a path, both.
 
     Raises:
         ConfigError: a flight is not known.
@@ -94,7 +94,7 @@ def chosen(only: Sequence[str], plant: bool, full: bool) -> list[Job]:
 
 
 def by_flight(jobs: Sequence[Job], flown: dict[str, Trace]) -> dict[str, list[Trace]]:
-    """Traces for the page: of a swarm one of each path and kind, of single vehicles all."""
+    """Return the traces of the page: of a swarm one per path and kind, of single vehicles all."""
     found: dict[str, list[Trace]] = {}
     for job in jobs:
         other_radius = job.radius_m is not None and job.radius_m != thesis.RADII[0] * thesis.SAFE_RADIUS_M
@@ -104,7 +104,7 @@ def by_flight(jobs: Sequence[Job], flown: dict[str, Trace]) -> dict[str, list[Tr
 
 
 def index_points(flown: dict[str, Trace]) -> Iterator[IndexPoint]:
-    """Points of the index over the constraint radius (Table 19)."""
+    """Yield the points of the index over the constraint radius (Table 19)."""
     for kind in ("dmpc", "dmpc3"):
         for factor in thesis.RADII:
             trace = flown.get(thesis.radius_name(kind, factor))
@@ -114,21 +114,23 @@ def index_points(flown: dict[str, Trace]) -> Iterator[IndexPoint]:
 
 
 def show(rows: Sequence[Row], console: Console) -> None:
-    """The rows as a table."""
+    """Print the rows as a table."""
     table = Table(show_edge=False)
     table.add_column("row")
-    for name in ("published", "ours", "limit", "least"):
+    for name in ("published", "ours", "limit", "lower bound"):
         table.add_column(name, justify="right")
     table.add_column("")
     for row in rows:
-        cells = ["" if value is None else f"{value:.4g}" for value in (row.published, row.ours, row.limit, row.least)]
+        cells = [
+            "" if value is None else f"{value:.4g}" for value in (row.published, row.ours, row.limit, row.lower_bound)
+        ]
         verdict = {None: "", True: "[green]met", False: "[red]missed"}[row.met]
         table.add_row(row.name, *cells, verdict)
     console.print(table)
 
 
 def reproduce(only: Sequence[str], plant: bool, full: bool, directory: Path, processes: int) -> int:
-    """Fly, judge, write; returns the exit code."""
+    """Fly, evaluate and write; return the exit code."""
     console, began_s = Console(), time.perf_counter()
     jobs = chosen(only, plant, full)
     with Progress(console=console, transient=True, disable=not sys.stdout.isatty()) as bar:
@@ -167,7 +169,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run the verb; returns the process exit code."""
+    """Run the verb and return the process exit code."""
     return exit_code_of(partial(_run, _parser().parse_args(arguments)))
 
 

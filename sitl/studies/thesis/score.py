@@ -13,35 +13,35 @@ STEADY_AFTER_S = 10.0
 
 
 def mean_distance_m(trace: Trace) -> float:
-    """Mean Euclidean distance of the first vehicle to its reference (2.7)."""
+    """Return the mean Euclidean distance of the first vehicle to its reference (2.7)."""
     return float(_distance_m(trace)[:, 0].mean())
 
 
 def mse_m2(trace: Trace, axis: int) -> float:
-    """Mean squared error of the first vehicle on one axis (2.6)."""
+    """Return the mean squared error of the first vehicle on one axis (2.6)."""
     return float((_error_m(trace)[:, 0, axis] ** 2).mean())
 
 
 def steady_rmse_m(trace: Trace) -> float:
-    """Largest root mean squared error of the first vehicle on any axis after 10 s."""
+    """Return the largest root mean squared error of the first vehicle on any axis after 10 s."""
     error = _error_m(trace)[trace.t_s >= STEADY_AFTER_S, 0]
     return float(np.sqrt((error**2).mean(axis=0)).max())
 
 
 def index_m(trace: Trace, after_s: float = 0.0) -> float:
-    """Sum over agents of the mean distance to the shared reference (Table 19)."""
+    """Return the sum over agents of the mean distance to the shared reference (Table 19)."""
     return float(_distance_m(trace)[trace.t_s >= after_s].mean(axis=0).sum())
 
 
 def separation_m(trace: Trace) -> float:
-    """Smallest distance of any two agents at any step; infinite for one."""
+    """Return the smallest distance of two agents at any step; infinite for one agent."""
     pairs = itertools.combinations(range(trace.pos_ned_m.shape[1]), 2)
     pos = trace.pos_ned_m
     return min((float(np.linalg.norm(pos[:, i] - pos[:, j], axis=1).min()) for i, j in pairs), default=math.inf)
 
 
 def clearance_m(trace: Trace) -> float:
-    """Smallest distance of any agent to the centre of any obstacle; infinite without."""
+    """Return the smallest distance of an agent to the centre of an obstacle; infinite without obstacles."""
     centers = [np.array(obstacle.center_ned_m) for obstacle in trace.obstacles]
     return min((float(np.linalg.norm(trace.pos_ned_m - c, axis=2).min()) for c in centers), default=math.inf)
 

@@ -1,4 +1,4 @@
-"""What a reproduced experiment leaves behind: the flight as arrays, and the rows it is judged by."""
+"""Results of a reproduced experiment: the flight as arrays, and its rows."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-Path = Literal["plant", "full"]  # controllers on the plant itself; agents over MAVLink
+Path = Literal["plant", "full"]  # plant: model only; full: full MAVLink loop
 
 
 @dataclass(frozen=True, slots=True)
 class Sphere:
-    """An obstacle that agents see only from close by."""
+    """An obstacle with limited visibility."""
 
     center_ned_m: tuple[float, float, float]
     radius_m: float
@@ -26,10 +26,10 @@ class Trace:
     """One flight from mission start to mission end, true states at every tick of 0.02 s.
 
     The setpoint at index k is the one computed from the state at index k. NaN where nothing was recorded: torques exist
-    on the plant path only.
+    in model-only flights only.
     """
 
-    name: str  # of the flight, unique: "circle 0.90 dmpc"
+    name: str  # unique name of the flight: "circle 0.90 dmpc"
     path: Path
     t_s: Array  # (T,)
     pos_ned_m: Array  # (T, N, 3)
@@ -51,13 +51,13 @@ class Row:
     name: str
     published: float | None
     ours: float
-    limit: float | None  # what must be reached
+    limit: float | None  # required value
     path: Path
     unit: str
     note: str = ""
-    least: float | None = None  # the least possible, where it is known
+    lower_bound: float | None = None  # the theoretical lower bound, where it is known
 
     @property
     def met(self) -> bool | None:
-        """Whether the limit is kept; None without one."""
+        """Whether the limit is kept; None without a limit."""
         return None if self.limit is None else self.ours <= self.limit

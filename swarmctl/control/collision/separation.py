@@ -242,8 +242,8 @@ def _with_right_of_way(normal: Array, distance: Array, needed: Array, to_goal: A
 
     Peers follow one right-of-way rule: each turns normals clockwise seen from above (as NED yaw), so that two that meet
     head-on both give way to the left. Obstacles are passed on the side the agent is on. `angle_rad` (max_keep_outs, Hp)
-    is the largest turn: full for obstacles, for peers only when the own plan is stuck, because turned normals would also keep
-    a swarm that shares one goal from closing in evenly.
+    is the largest turn: full for obstacles, for peers only when the own plan is stuck, because turned normals would
+    also keep a swarm that shares one goal from closing in evenly.
     """
     span = np.sqrt(np.einsum("kc,kc->k", to_goal, to_goal))  # (Hp,)
     ahead = -np.einsum("skc,kc->sk", normal, to_goal) / np.maximum(span, _TINY_M)  # cosine: 1 is head-on

@@ -22,6 +22,7 @@ from swarmctl.core.params import Params
 from swarmctl.core.types import Array
 
 INFINITY = 1e20  # OSQP's value for a missing bound
+SOLVERS = ("osqp", "daqp")
 _RETRY_SCALINGS = 10  # scaling passes of a retry: they help problems that converge slowly, and no others
 _SOLVED = osqp.SolverStatus.OSQP_SOLVED
 _USABLE = frozenset(  # the last two statuses come with unfinished iterates
@@ -158,6 +159,11 @@ def make_solver(p_pattern: NDArray[np.bool_], a_pattern: NDArray[np.bool_], para
 
         return DaqpSolver(p_pattern, a_pattern, params)
     return OsqpSolver(p_pattern, a_pattern, params)
+
+
+def installed_solvers() -> tuple[str, ...]:
+    """Return the names of the QP solvers that can be imported: OSQP always, DAQP with the extra `swarmctl[daqp]`."""
+    return tuple(name for name in SOLVERS if name == "osqp" or _daqp_is_usable())
 
 
 def _daqp_is_usable() -> bool:

@@ -1,4 +1,4 @@
-"""What a check thinks: every row of the table is triggered by one fact, and by nothing in a healthy vehicle."""
+"""Findings of a check: every row of the table is triggered by one fact, and by none of a healthy vehicle."""
 
 from __future__ import annotations
 
@@ -165,8 +165,8 @@ PX4_CASES: list[tuple[str, dict[str, Any], Verdict, str]] = [
     ("autopilot", {"version": Version((1, 18, 0), "beta", "", 1, "0", False)}, FIX, "encodes integer"),
     ("autopilot", {"version": None}, NOTE, "version"),
     ("system id", {"sysid": 7}, FIX, "MAV_SYS_ID = 1"),
-    ("state", {"armed": True}, NOTE, "left alone"),
-    ("state", {"armed": True, "mode": FlightMode.EXTERNAL}, NOTE, "somebody is flying"),
+    ("state", {"armed": True}, NOTE, "not changed"),
+    ("state", {"armed": True, "mode": FlightMode.EXTERNAL}, NOTE, "another program flies"),
     ("state", {"system_status": 5}, FIX, "failsafe"),
     ("sensors", {"sensors": None}, NOTE, "SYS_STATUS"),
     ("sensors", {"sensors": Sensors(ALL_SENSORS, ALL_SENSORS, 0x1320C83F & ~4, 16.2, 1.0)}, FIX, "calibrate"),
@@ -304,12 +304,12 @@ def test_the_radius_has_to_cover_body_tracking_and_estimator(config: Config) -> 
     assert not [line for line in findings([single], alone) if line.topic == "radius"]
 
 
-def test_a_parameter_meant_for_another_kind_of_autopilot_is_only_told(config: Config) -> None:
+def test_a_parameter_of_another_kind_of_autopilot_is_only_a_note(config: Config) -> None:
     line = line_of(findings([COPTER], with_params(config, COM_OBL_RC_ACT=4)), "COM_OBL_RC_ACT")
     assert line.verdict is NOTE and "no such parameter" in line.advice
 
 
-def test_one_board_under_two_urls_is_told_and_two_simulators_are_not_one_board(config: Config) -> None:
+def test_one_board_under_two_urls_is_found_and_two_simulators_are_not_one_board(config: Config) -> None:
     same = Version((1, 18, 0), "release", "", 50, "3a91", True, 0x3185)
     lines = findings([changed(HEALTHY, version=same), changed(SECOND_OK, version=same)], config)
     assert "same board" in line_of(lines, "system ids", SWARM).advice
@@ -332,10 +332,10 @@ def test_a_clock_one_percent_slow_is_no_finding(config: Config) -> None:
 @pytest.mark.parametrize("url", (*URLS, "udpout://10.0.0.5:14580"))
 def test_silence_over_udp_names_the_first_sender_and_the_cure(config: Config, url: str) -> None:
     advice = line_of(findings([unreached(0, url, 1, "nothing is heard")], config), "link").advice
-    assert "spoke to it first" in advice
+    assert "to its first sender" in advice
     assert "restart PX4" in advice
     serial = line_of(findings([unreached(0, "serial:///dev/ttyACM0:921600", 1, "nothing")], config), "link")
-    assert "spoke to it first" not in serial.advice
+    assert "to its first sender" not in serial.advice
 
 
 def test_the_spread_of_origins_is_shown_and_harmless(config: Config) -> None:
@@ -344,7 +344,7 @@ def test_the_spread_of_origins_is_shown_and_harmless(config: Config) -> None:
     assert f"{math.hypot(0.1, 0.2):.2f} m" in line.found
 
 
-def test_vehicles_in_each_others_place_are_told(config: Config) -> None:
+def test_vehicles_in_each_others_place_are_found(config: Config) -> None:
     crossed = [changed(HEALTHY, pos_ned_m=(3.0, 0.0, 0.0)), changed(SECOND_OK, pos_ned_m=(0.0, 0.0, 0.0))]
     assert line_of(findings(crossed, config), "order", SWARM).verdict is NOTE
     assert not [line for line in findings([HEALTHY, SECOND_OK], config) if line.topic == "order"]
@@ -386,7 +386,7 @@ def test_apply_sets_what_is_wrong_and_nothing_else(config: Config) -> None:
         ({}, ""),
     ],
 )
-def test_whose_parameters_may_be_changed(fields: dict[str, Any], word: str) -> None:
+def test_which_vehicles_parameters_may_be_changed(fields: dict[str, Any], word: str) -> None:
     assert word in unchangeable(changed(HEALTHY, **fields))
     assert bool(unchangeable(changed(HEALTHY, **fields))) == bool(word)
 
@@ -444,7 +444,7 @@ def test_what_a_vehicle_says_steers_no_terminal(config: Config, capsys: pytest.C
         (unreached(0, URLS[0], 1, "no heartbeat"), ["unknown"]),
     ],
 )
-def test_who_does_not_stand_disarmed_may_not_be_flown(facts: VehicleFacts, found: list[str]) -> None:
+def test_only_a_vehicle_disarmed_on_the_ground_may_be_flown(facts: VehicleFacts, found: list[str]) -> None:
     lines = standing([facts])
     assert [line.found for line in lines] == found
     assert exit_code([facts], lines) == (0 if not found else 3 if facts.unreachable else 4)

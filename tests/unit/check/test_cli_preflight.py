@@ -1,4 +1,4 @@
-"""What is refused before a launch, the ports it takes, and what it shows while it runs."""
+"""Refusals before a launch, the ports it reserves, and its display while it runs."""
 
 from __future__ import annotations
 
@@ -17,11 +17,10 @@ from swarmctl.bus.zenoh_bus import SCHEME
 from swarmctl.config import Config, dump, load
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase
 from swarmctl.errors import ConfigError, StartError, SwarmError
-from swarmctl.ops import operator as attach
-from swarmctl.ops import preflight
+from swarmctl.ops import operator, preflight
 from swarmctl.ops.fault import inject, parse_fault
 from swarmctl.ops.launch import Interrupts
-from swarmctl.ops.processes import Site, agent_commands, sitl_command, viewer_command
+from swarmctl.ops.processes import RunContext, agent_commands, sitl_command, viewer_command
 from swarmctl.ops.status_table import (
     AgentView,
     LiveTable,
@@ -119,26 +118,26 @@ def test_a_good_vehicle_port_is_left_free(tmp_path: Path) -> None:
 
 def test_command_lines_say_what_the_configuration_says(tmp_path: Path) -> None:
     config = load(None, ["swarm.agents=2", "start.spacing_m=1.5", "sitl.mass_scale=1.2", "seed=9"])
-    site = Site("run", "unixsock-stream//tmp/x/bus.sock", tmp_path)
-    sitl = sitl_command(config, site, (14540, 14541)).argv
+    context = RunContext("run", "unixsock-stream//tmp/x/bus.sock", tmp_path)
+    sitl = sitl_command(config, context, (14540, 14541)).argv
     assert "--spawn=-0.75,0.0,2.0;0.75,0.0,2.0" in sitl, "on the ground"
     assert sitl[sitl.index("--remote-ports") + 1] == "14540,14541"
-    air = sitl_command(load(None, ["swarm.agents=1", "sitl.start='air'"]), site, (1,)).argv
+    air = sitl_command(load(None, ["swarm.agents=1", "sitl.start='air'"]), context, (1,)).argv
     assert "--spawn=0.0,0.0,0.0" in air
     held = preflight.claim_ports(2)
-    agents = agent_commands(config, site, held)
+    agents = agent_commands(config, context, held)
     assert [command.name for command in agents] == ["agent-0", "agent-1"]
     assert [command.fds for command in agents] == [(sock.fileno(),) for sock in held]
-    assert not {"--fd", "--vehicle-port"} & set(agent_commands(config, site, ())[0].argv)
+    assert not {"--fd", "--vehicle-port"} & set(agent_commands(config, context, ())[0].argv)
     theirs = preflight.claim_ports(2)
-    told = [command.argv[-2:] for command in agent_commands(config, site, held, theirs)]
+    told = [command.argv[-2:] for command in agent_commands(config, context, held, theirs)]
     assert told == [("--vehicle-port", f"{sock.getsockname()[1]}") for sock in theirs]
-    inherits = sitl_command(config, site, (1, 2), theirs)
+    inherits = sitl_command(config, context, (1, 2), theirs)
     assert inherits.fds == tuple(sock.fileno() for sock in theirs)
     assert inherits.argv[inherits.argv.index("--local-fds") + 1] == ",".join(map(str, inherits.fds))
     for sock in (*held, *theirs):
         sock.close()
-    viewer = viewer_command(config, site, 9876, view=False).argv
+    viewer = viewer_command(config, context, 9876, view=False).argv
     assert "--view" not in viewer
     assert viewer[viewer.index("--obstacles-json") + 1] == "[]"
 
@@ -192,7 +191,7 @@ def test_what_an_agent_says_is_shown_as_it_is() -> None:
     assert "refused [/bold] [red]" in stream.getvalue()
 
 
-def test_what_an_agent_says_steers_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_agents_text_controls_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
     """ESC, the 8-bit CSI and direction marks, as a status, as the launcher's line and as JSON."""
     hostile = "\x1b]0;owned\x07\x9b2J\u202e\r\nDONE"
     stream = io.StringIO()
@@ -202,7 +201,7 @@ def test_what_an_agent_says_steers_no_terminal(capsys: pytest.CaptureFixture[str
     Console(file=stream, width=200).print(status_table([AgentView(0, status(active_alert=hostile), note="")]))
     LiveTable(Console(file=stream, force_terminal=False)).say(hostile)
     print_statuses([AgentView(0, status(active_alert=hostile))])
-    print(attach.as_json({0: status(active_alert=hostile)}))
+    print(operator.as_json({0: status(active_alert=hostile)}))
     shown = stream.getvalue() + capsys.readouterr().out
     assert "DONE" in shown
     assert all(c.isprintable() or c in "\n\t" for c in shown)
@@ -233,7 +232,7 @@ def test_a_fault_without_a_simulator_says_which_kind_of_without(
     tmp_path: Path, settings: tuple[str, ...], error: type[SwarmError], words: str
 ) -> None:
     (tmp_path / "config.toml").write_text(dump(load(None, ["swarm.agents=1", *settings])))
-    launch = attach.RunningLaunch("run", f"{SCHEME}{tmp_path}/bus.sock", 1, 0.0, 1, str(tmp_path))
+    launch = operator.RunningLaunch("run", f"{SCHEME}{tmp_path}/bus.sock", 1, 0.0, 1, str(tmp_path))
     with pytest.raises(error, match=words):
         inject(launch, parse_fault({"kind": "gps_loss"}, 1))
 
@@ -272,7 +271,7 @@ def test_every_violation_is_said() -> None:
 def test_the_camera_is_given_numbers_argparse_does_not_take_for_options() -> None:
     """`-5e-05` would be an option to argparse; the circle's middle is such a number."""
     config = load(None)
-    argv = viewer_command(config, Site("run", "endpoint", Path("dir")), 9877, view=False).argv
+    argv = viewer_command(config, RunContext("run", "endpoint", Path("dir")), 9877, view=False).argv
     at = argv.index("--look-at")
     assert all(re.fullmatch(r"-?\d+\.\d+", number) for number in argv[at + 1 : at + 4])
     assert float(argv[argv.index("--extent") + 1]) > 5.0

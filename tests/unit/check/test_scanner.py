@@ -1,4 +1,4 @@
-"""A check's questions: what it hears on a link, what it asks, and that asking changes nothing."""
+"""Scans of a vehicle: what is received on a link, what is requested, and that a scan changes nothing."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ import pytest
 from pymavlink.dialects.v20 import development as mavlink
 
 from swarmctl.check.link_facts import VehicleFacts
-from swarmctl.check.link_statistics import Answer, FrameTally, round_trip, vehicle_time
-from swarmctl.check.listener import NOWHERE, Address, Heard, UdpEar, open_ear
+from swarmctl.check.link_statistics import Answer, FrameStatistics, round_trip, vehicle_time
+from swarmctl.check.listener import NOWHERE, Address, ReceivedDatagram, UdpListener, open_listener
 from swarmctl.check.parameters import names_to_read
 from swarmctl.check.scan_facts import facts_of
-from swarmctl.check.scanner import ASKED, PROBE_COMPID, Probe, frames_of_any_version
+from swarmctl.check.scanner import ASKED, SCANNER_COMPID, VehicleScan, frames_of_any_version
 from swarmctl.check.swarm import exit_code, findings
 from swarmctl.check.table import as_json
 from swarmctl.config import load
@@ -35,16 +35,16 @@ HOLD, GUIDED = 4 << 16 | 3 << 24, 4
 STEP_US = 10_000
 
 
-class ScriptedEar:
+class ScriptedListener:
     """A link whose other end is a function: frames sent to it are answered by what it returns."""
 
     def __init__(self) -> None:
-        self.inbox: list[Heard] = []
+        self.inbox: list[ReceivedDatagram] = []
         self.sent: list[tuple[Any, Address]] = []
         self.now_us = 1_000_000
         self._codec = Codec(99, 99)
 
-    def receive(self) -> list[Heard]:
+    def receive(self) -> list[ReceivedDatagram]:
         heard, self.inbox = self.inbox, []
         return heard
 
@@ -59,10 +59,10 @@ class ScriptedEar:
 
 
 class Vehicle:
-    """An autopilot as far as a check talks to it."""
+    """The autopilot side of a scan."""
 
-    def __init__(self, ear: ScriptedEar, sysid: int = 1, autopilot: int = PX4, mode: int = HOLD) -> None:
-        self.ear, self.sysid, self.autopilot, self.mode = ear, sysid, autopilot, mode
+    def __init__(self, listener: ScriptedListener, sysid: int = 1, autopilot: int = PX4, mode: int = HOLD) -> None:
+        self.listener, self.sysid, self.autopilot, self.mode = listener, sysid, autopilot, mode
         self.armed = False
         self.values: dict[str, tuple[int, float | int]] = {}  # name -> kind, value
         self.keeps = False  # its own values, whatever it is told
@@ -72,7 +72,9 @@ class Vehicle:
         self._read = 0
 
     def say(self, message: Any, sender: Address = VEHICLE, codec: Codec | None = None) -> None:
-        self.ear.inbox.append(Heard(self.ear.now_us, (codec or self.codec).encode(message), sender))
+        self.listener.inbox.append(
+            ReceivedDatagram(self.listener.now_us, (codec or self.codec).encode(message), sender)
+        )
 
     def beat(self, sender: Address = VEHICLE) -> None:
         base = 29 | (128 if self.armed else 0)
@@ -80,13 +82,13 @@ class Vehicle:
 
     def answer(self) -> None:
         """Answer what has been asked since the last call."""
-        asked, self._read = self.ear.sent[self._read :], len(self.ear.sent)
+        asked, self._read = self.listener.sent[self._read :], len(self.listener.sent)
         for message, _ in asked:
             kind = message.get_type()
             if kind == "TIMESYNC":
-                self.say(mavlink.MAVLink_timesync_message(self.ear.now_us * 1000 + 5_000_000_000, message.ts1))
+                self.say(mavlink.MAVLink_timesync_message(self.listener.now_us * 1000 + 5_000_000_000, message.ts1))
             elif kind == "PING":
-                self.say(mavlink.MAVLink_ping_message(message.time_usec, message.seq, 1, PROBE_COMPID))
+                self.say(mavlink.MAVLink_ping_message(message.time_usec, message.seq, 1, SCANNER_COMPID))
             elif kind == "COMMAND_LONG" and message.param1 == mavlink.MAVLINK_MSG_ID_SYS_STATUS and self.health:
                 self.say(mavlink.MAVLink_sys_status_message(1, 1, self.health, 0, 0, 0, -1, 0, 0, 0, 0, 0, 0))
             elif kind == "PARAM_REQUEST_READ":
@@ -99,7 +101,7 @@ class Vehicle:
             return
         if name not in self.values:
             if self.autopilot == PX4:
-                self.say(mavlink.MAVLink_param_error_message(1, PROBE_COMPID, name.encode(), -1, 1))
+                self.say(mavlink.MAVLink_param_error_message(1, SCANNER_COMPID, name.encode(), -1, 1))
             return
         kind, value = self.values[name]
         wire = float(value)
@@ -121,22 +123,22 @@ def names(*wanted: str) -> Callable[[Dialect], Sequence[str]]:
     return lambda dialect: wanted
 
 
-def run(probe: Probe, vehicle: Vehicle, seconds: float, beating: bool = True) -> VehicleFacts:
-    """Both ends, step by step, on a clock of their own."""
-    ear = vehicle.ear
-    until_us = ear.now_us + round(seconds * 1e6)
-    while ear.now_us < until_us:
-        if beating and ear.now_us % 1_000_000 < STEP_US:
+def run(scan: VehicleScan, vehicle: Vehicle, seconds: float, beating: bool = True) -> VehicleFacts:
+    """Run both ends, step by step, on one simulated clock."""
+    listener = vehicle.listener
+    until_us = listener.now_us + round(seconds * 1e6)
+    while listener.now_us < until_us:
+        if beating and listener.now_us % 1_000_000 < STEP_US:
             vehicle.beat()
         vehicle.answer()
-        probe.step(ear.now_us)
-        ear.now_us += STEP_US
-    return facts_of(probe, 0, "udpin://0.0.0.0:14540", 1, SHARED, ear.now_us)
+        scan.step(listener.now_us)
+        listener.now_us += STEP_US
+    return facts_of(scan, 0, "udpin://0.0.0.0:14540", 1, SHARED, listener.now_us)
 
 
 @pytest.fixture
-def ear(monkeypatch: pytest.MonkeyPatch) -> ScriptedEar:
-    scripted = ScriptedEar()
+def listener(monkeypatch: pytest.MonkeyPatch) -> ScriptedListener:
+    scripted = ScriptedListener()
     monkeypatch.setattr("swarmctl.check.scanner.monotonic_us", lambda: scripted.now_us)
     return scripted
 
@@ -145,38 +147,38 @@ def ear(monkeypatch: pytest.MonkeyPatch) -> ScriptedEar:
 
 
 @pytest.mark.parametrize("armed", [False, True])
-def test_asking_changes_nothing(ear: ScriptedEar, armed: bool) -> None:
-    vehicle = Vehicle(ear)
+def test_asking_changes_nothing(listener: ScriptedListener, armed: bool) -> None:
+    vehicle = Vehicle(listener)
     vehicle.armed = armed
     vehicle.values = {"COM_OBL_RC_ACT": (6, 0)}
-    probe = Probe(ear, NOWHERE, 1, names("COM_OBL_RC_ACT", "COM_NOT_THERE"), 2.0)
-    run(probe, vehicle, 3.0)
-    kinds = {message.get_type() for message, _ in ear.sent}
+    scan = VehicleScan(listener, NOWHERE, 1, names("COM_OBL_RC_ACT", "COM_NOT_THERE"), 2.0)
+    run(scan, vehicle, 3.0)
+    kinds = {message.get_type() for message, _ in listener.sent}
     assert kinds == {"HEARTBEAT", "TIMESYNC", "PING", "COMMAND_LONG", "PARAM_REQUEST_READ"}
-    commands = {message.command for message, _ in ear.sent if message.get_type() == "COMMAND_LONG"}
+    commands = {message.command for message, _ in listener.sent if message.get_type() == "COMMAND_LONG"}
     assert commands == {mavlink.MAV_CMD_REQUEST_MESSAGE}
-    beats = [message for message, _ in ear.sent if message.get_type() == "HEARTBEAT"]
+    beats = [message for message, _ in listener.sent if message.get_type() == "HEARTBEAT"]
     assert all(beat.type == mavlink.MAV_TYPE_ONBOARD_CONTROLLER for beat in beats)  # a GCS's loss is a failsafe
-    assert all(message.tc1 == 0 for message, _ in ear.sent if message.get_type() == "TIMESYNC")
+    assert all(message.tc1 == 0 for message, _ in listener.sent if message.get_type() == "TIMESYNC")
 
 
-def test_nobody_is_spoken_to_before_an_autopilot_was_heard(ear: ScriptedEar) -> None:
-    vehicle = Vehicle(ear)
-    probe = Probe(ear, NOWHERE, 1, names(), 1.0)
-    run(probe, vehicle, 1.5, beating=False)
-    assert ear.sent == []
-    assert not probe.heard
-    run(probe, vehicle, 1.5)
-    assert {to for _, to in ear.sent} == {VEHICLE}
+def test_nothing_is_sent_before_an_autopilot_was_received(listener: ScriptedListener) -> None:
+    vehicle = Vehicle(listener)
+    scan = VehicleScan(listener, NOWHERE, 1, names(), 1.0)
+    run(scan, vehicle, 1.5, beating=False)
+    assert listener.sent == []
+    assert not scan.heard
+    run(scan, vehicle, 1.5)
+    assert {to for _, to in listener.sent} == {VEHICLE}
 
 
 # --- what is heard ---
 
 
-def test_facts_of_a_px4(ear: ScriptedEar) -> None:
-    vehicle = Vehicle(ear)
+def test_facts_of_a_px4(listener: ScriptedListener) -> None:
+    vehicle = Vehicle(listener)
     vehicle.values = {"COM_OBL_RC_ACT": (6, 4), "COM_OF_LOSS_T": (9, 0.5)}
-    probe = Probe(ear, NOWHERE, 1, names("COM_OBL_RC_ACT", "COM_OF_LOSS_T", "COM_NOT_THERE"), 2.0)
+    scan = VehicleScan(listener, NOWHERE, 1, names("COM_OBL_RC_ACT", "COM_OF_LOSS_T", "COM_NOT_THERE"), 2.0)
     vehicle.beat()
     version, none = 0x01120080, [0] * 8
     git = [0, 0, 0, 0x80, 0xE5, 0xF4, 0xC4, 0x83]
@@ -190,8 +192,8 @@ def test_facts_of_a_px4(ear: ScriptedEar) -> None:
         mavlink.MAVLink_local_position_ned_message(0, 1.0, 2.0, -3.0, 0, 0, 0),
     ):
         vehicle.say(message)
-    facts = run(probe, vehicle, 2.5)
-    assert probe.finished(ear.now_us)
+    facts = run(scan, vehicle, 2.5)
+    assert scan.finished(listener.now_us)
     assert (facts.autopilot, facts.mode, facts.armed, facts.landed) == ("PX4", FlightMode.HOLD, False, Landed.ON_GROUND)
     assert facts.version is not None
     assert (facts.version.firmware, facts.version.stage, facts.version.uid) == ((1, 18, 0), "beta", "0")
@@ -210,103 +212,107 @@ def test_facts_of_a_px4(ear: ScriptedEar) -> None:
     assert facts.link.time.offset_s == pytest.approx(5.0, abs=0.02)
 
 
-def test_a_place_without_an_origin_message_comes_from_the_global_position(ear: ScriptedEar) -> None:
-    vehicle = Vehicle(ear)
+def test_a_place_without_an_origin_message_comes_from_the_global_position(listener: ScriptedListener) -> None:
+    vehicle = Vehicle(listener)
     vehicle.beat()
     vehicle.say(mavlink.MAVLink_global_position_int_message(0, 473977420, 85455940, 499400, 0, 0, 0, 0, 0))
     vehicle.say(mavlink.MAVLink_local_position_ned_message(0, 0.0, 0.0, -8.0, 0, 0, 0))
-    facts = run(Probe(ear, NOWHERE, 1, names(), 1.0), vehicle, 1.5)
+    facts = run(VehicleScan(listener, NOWHERE, 1, names(), 1.0), vehicle, 1.5)
     assert not facts.origin_told and facts.pos_ned_m is not None and facts.origin_ned_m is not None
     np.testing.assert_allclose(facts.pos_ned_m, (0.0, 0.0, -10.0), atol=0.02)
     np.testing.assert_allclose(facts.origin_ned_m, (0.0, 0.0, -2.0), atol=0.02)
 
 
-def test_what_is_missing_is_asked_for_a_few_times_and_no_more(ear: ScriptedEar) -> None:
-    vehicle = Vehicle(ear)
-    run(Probe(ear, NOWHERE, 1, names(), 1.0), vehicle, 8.0)
-    asked = [m.param1 for m, _ in ear.sent if m.get_type() == "COMMAND_LONG"]
+def test_what_is_missing_is_asked_for_a_few_times_and_no_more(listener: ScriptedListener) -> None:
+    vehicle = Vehicle(listener)
+    run(VehicleScan(listener, NOWHERE, 1, names(), 1.0), vehicle, 8.0)
+    asked = [m.param1 for m, _ in listener.sent if m.get_type() == "COMMAND_LONG"]
     assert asked.count(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION) == 4
 
 
-def test_a_vehicle_that_is_not_ready_is_waited_for_and_asked_again(ear: ScriptedEar) -> None:
-    vehicle = Vehicle(ear, autopilot=COPTER, mode=GUIDED)
+def test_a_vehicle_that_is_not_ready_is_waited_for_and_asked_again(listener: ScriptedListener) -> None:
+    vehicle = Vehicle(listener, autopilot=COPTER, mode=GUIDED)
     vehicle.health = 1
-    probe = Probe(ear, NOWHERE, 1, names(), 1.0, patience_s=4.0)
-    run(probe, vehicle, 2.5)
-    assert not probe.finished(ear.now_us)
+    scan = VehicleScan(listener, NOWHERE, 1, names(), 1.0, patience_s=4.0)
+    run(scan, vehicle, 2.5)
+    assert not scan.finished(listener.now_us)
     vehicle.health = 1 | 1 << 28
-    facts = run(probe, vehicle, 2.0)
-    assert probe.finished(ear.now_us)
+    facts = run(scan, vehicle, 2.0)
+    assert scan.finished(listener.now_us)
     assert facts.sensors is not None and facts.sensors.healthy == vehicle.health
 
-    hopeless = Probe(ear, NOWHERE, 1, names(), 1.0, patience_s=1.0)
+    hopeless = VehicleScan(listener, NOWHERE, 1, names(), 1.0, patience_s=1.0)
     vehicle.health = 1
     run(hopeless, vehicle, 2.5)
-    assert hopeless.finished(ear.now_us)
+    assert hopeless.finished(listener.now_us)
 
 
-def test_another_vehicle_is_reported_until_the_wanted_one_speaks(ear: ScriptedEar) -> None:
-    other, wanted = Vehicle(ear, sysid=4), Vehicle(ear, sysid=1)
-    probe = Probe(ear, NOWHERE, 1, names(), 1.0)
+def test_another_vehicle_is_reported_until_the_configured_one_sends(listener: ScriptedListener) -> None:
+    other, wanted = Vehicle(listener, sysid=4), Vehicle(listener, sysid=1)
+    scan = VehicleScan(listener, NOWHERE, 1, names(), 1.0)
     other.beat()
-    assert run(probe, wanted, 0.2, beating=False).sysid == 4
+    assert run(scan, wanted, 0.2, beating=False).sysid == 4
     wanted.beat()
-    facts = run(probe, wanted, 0.2, beating=False)
+    facts = run(scan, wanted, 0.2, beating=False)
     assert (facts.sysid, facts.link.autopilots) == (1, (1, 4))
 
 
-def test_companions_and_ground_stations_are_not_vehicles(ear: ScriptedEar) -> None:
-    vehicle = Vehicle(ear)
+def test_companions_and_ground_stations_are_not_vehicles(listener: ScriptedListener) -> None:
+    vehicle = Vehicle(listener)
     vehicle.autopilot = 8
-    assert "no autopilot" in run(Probe(ear, NOWHERE, 1, names(), 1.0), vehicle, 1.2).unreachable
+    assert "no autopilot" in run(VehicleScan(listener, NOWHERE, 1, names(), 1.0), vehicle, 1.2).unreachable
     vehicle.say(mavlink.MAVLink_heartbeat_message(2, PX4, 29, HOLD, 3, 3), codec=Codec(1, 25))
-    assert run(Probe(ear, NOWHERE, 1, names(), 1.0), vehicle, 0.1, beating=False).unreachable
+    assert run(VehicleScan(listener, NOWHERE, 1, names(), 1.0), vehicle, 0.1, beating=False).unreachable
 
 
-def test_a_second_sender_is_counted_and_the_vehicle_answered(ear: ScriptedEar) -> None:
-    vehicle = Vehicle(ear)
-    probe = Probe(ear, NOWHERE, 1, names(), 1.0)
+def test_a_second_sender_is_counted_and_the_vehicle_answered(listener: ScriptedListener) -> None:
+    vehicle = Vehicle(listener)
+    scan = VehicleScan(listener, NOWHERE, 1, names(), 1.0)
     vehicle.beat()
     vehicle.beat(STRANGER)
-    facts = run(probe, vehicle, 0.5, beating=False)
+    facts = run(scan, vehicle, 0.5, beating=False)
     assert facts.link.senders == 2
-    assert {to for _, to in ear.sent} == {VEHICLE}
+    assert {to for _, to in listener.sent} == {VEHICLE}
 
 
-def test_mavlink_1_is_recognised(ear: ScriptedEar) -> None:
-    vehicle = Vehicle(ear)
+def test_mavlink_1_is_recognised(listener: ScriptedListener) -> None:
+    vehicle = Vehicle(listener)
     packer = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     beat = mavlink.MAVLink_heartbeat_message(2, PX4, 29, HOLD, 3, 3).pack(packer, force_mavlink1=True)
-    ear.inbox.append(Heard(ear.now_us, beat, VEHICLE))
-    probe = Probe(ear, NOWHERE, 1, names(), 1.0)
-    probe.step(ear.now_us)
-    facts = facts_of(probe, 0, "udpin://0.0.0.0:14540", 1, SHARED, ear.now_us)
+    listener.inbox.append(ReceivedDatagram(listener.now_us, beat, VEHICLE))
+    scan = VehicleScan(listener, NOWHERE, 1, names(), 1.0)
+    scan.step(listener.now_us)
+    facts = facts_of(scan, 0, "udpin://0.0.0.0:14540", 1, SHARED, listener.now_us)
     assert (facts.link.mavlink1, facts.link.mavlink2, facts.sysid, facts.unreachable) == (1, 0, 1, "")
     assert list(frames_of_any_version(beat + vehicle.codec.encode(mavlink.MAVLink_ping_message(0, 0, 0, 0)) + b"x"))
 
 
-def test_an_autopilot_that_is_not_known_is_heard_and_has_no_parameters(ear: ScriptedEar) -> None:
-    probe = Probe(ear, NOWHERE, 1, names("X"), 1.0)
-    facts = run(probe, Vehicle(ear, autopilot=4), 1.5)
+def test_an_unsupported_autopilot_is_reported_without_parameters(listener: ScriptedListener) -> None:
+    scan = VehicleScan(listener, NOWHERE, 1, names("X"), 1.0)
+    facts = run(scan, Vehicle(listener, autopilot=4), 1.5)
     assert (facts.unreachable, facts.autopilot, facts.autopilot_number, facts.parameters) == ("", "", 4, {})
-    assert probe.finished(ear.now_us)
+    assert scan.finished(listener.now_us)
 
 
-def test_junk_is_survived(ear: ScriptedEar) -> None:
+def test_junk_is_survived(listener: ScriptedListener) -> None:
     rng = np.random.default_rng([7])
-    vehicle = Vehicle(ear)
-    probe = Probe(ear, NOWHERE, 1, names(), 1.0)
+    vehicle = Vehicle(listener)
+    scan = VehicleScan(listener, NOWHERE, 1, names(), 1.0)
     good = vehicle.codec.encode(mavlink.MAVLink_heartbeat_message(2, PX4, 29, HOLD, 3, 3))
     for _ in range(2000):
         frame = bytearray(good)
         frame[int(rng.integers(1, len(frame)))] ^= 1 << int(rng.integers(8))
-        ear.inbox.append(Heard(ear.now_us, bytes(frame[: int(rng.integers(1, len(frame) + 1))]), STRANGER))
-    ear.inbox += [Heard(ear.now_us, data, STRANGER) for data in (b"", b"\xfd\xff", b"\xfe", bytes([0xFD] * 300))]
-    probe.step(ear.now_us)
-    assert not probe.heard
+        listener.inbox.append(
+            ReceivedDatagram(listener.now_us, bytes(frame[: int(rng.integers(1, len(frame) + 1))]), STRANGER)
+        )
+    listener.inbox += [
+        ReceivedDatagram(listener.now_us, data, STRANGER) for data in (b"", b"\xfd\xff", b"\xfe", bytes([0xFD] * 300))
+    ]
+    scan.step(listener.now_us)
+    assert not scan.heard
 
 
-def test_whatever_an_autopilot_says_a_check_ends_in_words(ear: ScriptedEar) -> None:
+def test_whatever_an_autopilot_says_a_check_ends_in_words(listener: ScriptedListener) -> None:
     rng = np.random.default_rng([11])
     config = load(None, ["swarm.agents=1"])
     kinds = [
@@ -314,9 +320,9 @@ def test_whatever_an_autopilot_says_a_check_ends_in_words(ear: ScriptedEar) -> N
         *(mavlink.MAVLINK_MSG_ID_TIMESYNC, mavlink.MAVLINK_MSG_ID_PING, mavlink.MAVLINK_MSG_ID_PARAM_VALUE),
     ]
     for autopilot in (PX4, COPTER):
-        vehicle = Vehicle(ear, autopilot=autopilot)
+        vehicle = Vehicle(listener, autopilot=autopilot)
         for _ in range(60):
-            probe = Probe(ear, NOWHERE, 1, lambda dialect: names_to_read(dialect, config), 1.0)
+            scan = VehicleScan(listener, NOWHERE, 1, lambda dialect: names_to_read(dialect, config), 1.0)
             vehicle.beat()
             read = names_to_read(DIALECTS[autopilot], config)
             for kind in kinds:
@@ -326,13 +332,13 @@ def test_whatever_an_autopilot_says_a_check_ends_in_words(ear: ScriptedEar) -> N
                 )
                 if kind == mavlink.MAVLINK_MSG_ID_PARAM_VALUE:
                     payload[8:24] = str(rng.choice(np.array(read))).encode().ljust(16, b"\0")
-                ear.inbox.append(Heard(ear.now_us, raw_frame(1, 1, kind, bytes(payload)), VEHICLE))
-            probe.step(ear.now_us)
-            facts = facts_of(probe, 0, "udpin://0.0.0.0:14540", 1, SHARED, ear.now_us + 10_000)
+                listener.inbox.append(ReceivedDatagram(listener.now_us, raw_frame(1, 1, kind, bytes(payload)), VEHICLE))
+            scan.step(listener.now_us)
+            facts = facts_of(scan, 0, "udpin://0.0.0.0:14540", 1, SHARED, listener.now_us + 10_000)
             assert facts.sysid == 1
             lines = findings([facts], config)
             assert as_json([facts], lines, [], exit_code([facts], lines))
-            ear.now_us += STEP_US
+            listener.now_us += STEP_US
 
 
 def raw_frame(sysid: int, compid: int, kind: int, payload: bytes) -> bytes:
@@ -346,60 +352,62 @@ def raw_frame(sysid: int, compid: int, kind: int, payload: bytes) -> bytes:
 
 
 @pytest.mark.parametrize("autopilot", [PX4, COPTER])
-def test_parameters_are_set_in_the_autopilots_encoding_and_read_back(ear: ScriptedEar, autopilot: int) -> None:
-    vehicle = Vehicle(ear, autopilot=autopilot, mode=GUIDED)
+def test_parameters_are_set_in_the_autopilots_encoding_and_read_back(
+    listener: ScriptedListener, autopilot: int
+) -> None:
+    vehicle = Vehicle(listener, autopilot=autopilot, mode=GUIDED)
     vehicle.values = {"AN_INT": (6, 1), "A_SMALL": (2, 3), "A_REAL": (9, 3.0)}
-    probe = Probe(ear, NOWHERE, 1, names("AN_INT", "A_SMALL", "A_REAL"), 1.0)
-    before = run(probe, vehicle, 1.5).parameters or {}
+    scan = VehicleScan(listener, NOWHERE, 1, names("AN_INT", "A_SMALL", "A_REAL"), 1.0)
+    before = run(scan, vehicle, 1.5).parameters or {}
     assert {name: p.value for name, p in before.items()} == {"AN_INT": 1, "A_SMALL": 3, "A_REAL": 3.0}
-    probe.set_parameters({"AN_INT": 70000, "A_REAL": 1.5})
-    after = run(probe, vehicle, 1.5).parameters or {}
+    scan.set_parameters({"AN_INT": 70000, "A_REAL": 1.5})
+    after = run(scan, vehicle, 1.5).parameters or {}
     assert {name: p.value for name, p in after.items()} == {"AN_INT": 70000, "A_SMALL": 3, "A_REAL": 1.5}
-    sets = [m.param_id for m, _ in ear.sent if m.get_type() == "PARAM_SET"]
+    sets = [m.param_id for m, _ in listener.sent if m.get_type() == "PARAM_SET"]
     assert sets == ["AN_INT", "A_REAL"]
 
 
-def test_what_the_autopilot_keeps_is_what_counts(ear: ScriptedEar) -> None:
-    vehicle = Vehicle(ear)
+def test_what_the_autopilot_keeps_is_what_counts(listener: ScriptedListener) -> None:
+    vehicle = Vehicle(listener)
     vehicle.values, vehicle.keeps = {"AN_INT": (6, 1)}, True
-    probe = Probe(ear, NOWHERE, 1, names("AN_INT"), 1.0)
-    run(probe, vehicle, 1.5)
-    probe.set_parameters({"AN_INT": 4})
-    facts = run(probe, vehicle, 1.5)
+    scan = VehicleScan(listener, NOWHERE, 1, names("AN_INT"), 1.0)
+    run(scan, vehicle, 1.5)
+    scan.set_parameters({"AN_INT": 4})
+    facts = run(scan, vehicle, 1.5)
     assert facts.number("AN_INT") == 1
-    assert probe.finished(ear.now_us)
+    assert scan.finished(listener.now_us)
 
 
 @pytest.mark.parametrize("why", ["armed", "silent", "another"])
-def test_nothing_is_set_on_a_vehicle_that_is_armed_silent_or_another(ear: ScriptedEar, why: str) -> None:
-    vehicle = Vehicle(ear, sysid=4 if why == "another" else 1)
+def test_nothing_is_set_on_a_vehicle_that_is_armed_silent_or_another(listener: ScriptedListener, why: str) -> None:
+    vehicle = Vehicle(listener, sysid=4 if why == "another" else 1)
     vehicle.values = {"AN_INT": (6, 1)}
-    probe = Probe(ear, NOWHERE, 1, names("AN_INT"), 1.0)
-    run(probe, vehicle, 1.5)
+    scan = VehicleScan(listener, NOWHERE, 1, names("AN_INT"), 1.0)
+    run(scan, vehicle, 1.5)
     if why == "silent":
-        run(probe, vehicle, 3.0, beating=False)
+        run(scan, vehicle, 3.0, beating=False)
     if why == "armed":
         vehicle.armed = True
         vehicle.beat()
-        probe.step(ear.now_us)
-    probe.set_parameters({"AN_INT": 4})
-    run(probe, vehicle, 1.0, beating=False)
-    assert not [m for m, _ in ear.sent if m.get_type() == "PARAM_SET"]
-    assert probe.parameters is not None and probe.parameters.interrupted
-    assert probe.finished(ear.now_us)
+        scan.step(listener.now_us)
+    scan.set_parameters({"AN_INT": 4})
+    run(scan, vehicle, 1.0, beating=False)
+    assert not [m for m, _ in listener.sent if m.get_type() == "PARAM_SET"]
+    assert scan.parameters is not None and scan.parameters.interrupted
+    assert scan.finished(listener.now_us)
 
 
-def test_setting_stops_when_the_vehicle_is_armed_meanwhile(ear: ScriptedEar) -> None:
-    vehicle = Vehicle(ear)
+def test_setting_stops_when_the_vehicle_is_armed_meanwhile(listener: ScriptedListener) -> None:
+    vehicle = Vehicle(listener)
     vehicle.values = {"A_FIRST": (6, 1), "A_SECOND": (6, 1)}
-    probe = Probe(ear, NOWHERE, 1, names("A_FIRST", "A_SECOND"), 1.0)
-    run(probe, vehicle, 1.5)
+    scan = VehicleScan(listener, NOWHERE, 1, names("A_FIRST", "A_SECOND"), 1.0)
+    run(scan, vehicle, 1.5)
     vehicle.silent_about = {"A_FIRST"}
-    probe.set_parameters({"A_FIRST": 2, "A_SECOND": 2})
-    run(probe, vehicle, 0.1, beating=False)
+    scan.set_parameters({"A_FIRST": 2, "A_SECOND": 2})
+    run(scan, vehicle, 0.1, beating=False)
     vehicle.armed = True
-    run(probe, vehicle, 5.0)
-    assert {m.param_id for m, _ in ear.sent if m.get_type() == "PARAM_SET"} == {"A_FIRST"}
+    run(scan, vehicle, 5.0)
+    assert {m.param_id for m, _ in listener.sent if m.get_type() == "PARAM_SET"} == {"A_FIRST"}
     assert vehicle.values["A_SECOND"] == (6, 1)
 
 
@@ -417,19 +425,19 @@ def test_setting_stops_when_the_vehicle_is_armed_meanwhile(ear: ScriptedEar) -> 
     ],
 )
 def test_lost_frames(seqs: Sequence[int], lost: int) -> None:
-    tally = FrameTally()
+    statistics = FrameStatistics()
     for seq in seqs:
-        tally.frame(seq % 256, 20)
-    assert tally.lost == lost
-    assert tally.lost_01 == pytest.approx(lost / (lost + len(seqs)))
+        statistics.frame(seq % 256, 20)
+    assert statistics.lost == lost
+    assert statistics.lost_01 == pytest.approx(lost / (lost + len(seqs)))
 
 
 def test_rates_come_from_the_spacing() -> None:
-    tally = FrameTally()
+    statistics = FrameStatistics()
     for k in range(10):
-        tally.message("ODOMETRY", 500_000 + k * 20_000)
-    tally.message("PING", 0)
-    assert tally.rates_hz(4.0) == pytest.approx({"ODOMETRY": 50.0, "PING": 0.25})
+        statistics.message("ODOMETRY", 500_000 + k * 20_000)
+    statistics.message("PING", 0)
+    assert statistics.rates_hz(4.0) == pytest.approx({"ODOMETRY": 50.0, "PING": 0.25})
 
 
 def test_offset_and_drift_of_a_clock() -> None:
@@ -461,35 +469,35 @@ def bound() -> Iterator[socket.socket]:
         yield sock
 
 
-def test_an_ear_hears_everybody_and_answers_one(bound: socket.socket) -> None:
+def test_a_listener_receives_from_every_sender_and_answers_one(bound: socket.socket) -> None:
     own = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     own.bind(("127.0.0.1", 0))
-    ear = UdpEar(own)
+    listener = UdpListener(own)
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         bound.sendto(b"one", own.getsockname())
         other.sendto(b"two", own.getsockname())
-        heard = ear.receive()
+        heard = listener.receive()
     assert [h.data for h in heard] == [b"one", b"two"]
     assert len({h.sender for h in heard}) == 2
-    ear.send(b"answer", heard[0].sender)
+    listener.send(b"answer", heard[0].sender)
     assert bound.recv(100) == b"answer"
-    ear.close()
+    listener.close()
 
 
-def test_a_serial_link_is_heard_and_spoken_to() -> None:
+def test_a_serial_link_is_read_and_written() -> None:
     master, slave = os.openpty()
     tty.setraw(slave)
-    ear, there = open_ear(f"serial://{os.ttyname(slave)}:57600")
+    listener, there = open_listener(f"serial://{os.ttyname(slave)}:57600")
     beat = Codec(1, 1).encode(mavlink.MAVLink_heartbeat_message(2, PX4, 29, HOLD, 3, 3))
     os.write(master, b"junk" + beat)
-    heard: list[Heard] = []
+    heard: list[ReceivedDatagram] = []
     deadline_s = time.monotonic() + 2.0
     while not heard and time.monotonic() < deadline_s:
-        heard = ear.receive()
+        heard = listener.receive()
     assert [(h.data, h.sender) for h in heard] == [(beat, there)]
-    ear.send(beat, there)
+    listener.send(beat, there)
     assert os.read(master, 100) == beat
-    ear.close()
+    listener.close()
     os.close(master)
     os.close(slave)
 
@@ -497,11 +505,11 @@ def test_a_serial_link_is_heard_and_spoken_to() -> None:
 def test_urls_that_can_not_be_opened_say_why(bound: socket.socket) -> None:
     host, port = bound.getsockname()
     with pytest.raises(StartError, match="can't be bound"):
-        open_ear(f"udpin://{host}:{port}")
-    ear, there = open_ear(f"udpout://{host}:{port}")
+        open_listener(f"udpin://{host}:{port}")
+    listener, there = open_listener(f"udpout://{host}:{port}")
     assert there == (host, port)
-    ear.send(b"hello", there)
+    listener.send(b"hello", there)
     assert bound.recv(100) == b"hello"
-    ear.close()
+    listener.close()
     with pytest.raises(StartError):
-        open_ear("serial:///dev/does-not-exist:57600")
+        open_listener("serial:///dev/does-not-exist:57600")

@@ -88,7 +88,7 @@ def test_agents_that_fly_at_each_other_do_not_touch(count: int, climb_m: float, 
 
 
 @pytest.mark.parametrize("count", [2, 6])
-def test_control_without_it_they_do(count: int) -> None:
+def test_negative_control_without_it_they_do(count: int) -> None:
     pos = ring(count, 3.0)
     assert fly_at_goals(pos, -0.5 * pos, -pos, None)[0] < 0.2
 

@@ -142,7 +142,7 @@ class Careless(Crowd):
                 agent.update(self.now_us, everybody, set())
 
 
-def test_control_commitments_without_acknowledgements_conflict() -> None:
+def test_negative_control_commitments_without_acknowledgements_conflict() -> None:
     assert Careless(4, Network((300_000, 300_000))).run(6.0) < HARD_MIN_M - 0.1
 
 

@@ -285,7 +285,7 @@ def test_during_bus_loss_no_agent_gets_ready_or_lands_among_others() -> None:
     assert home.at == "GOTO_LAND"
 
 
-def test_control_taken_during_bus_loss_stays_in_place() -> None:
+def test_negative_control_taken_during_bus_loss_stays_in_place() -> None:
     flight = Flight().until(Phase.GOTO_START)
     flight.unresponsive_peer, flight.pos = True, START + np.array([3.0, 0.0, 0.0])
     flight.run(0.5)

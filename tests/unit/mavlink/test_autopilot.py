@@ -1,4 +1,4 @@
-"""One vehicle's link: which bytes are believed, in which frame, when they were true, which setpoints may leave."""
+"""Link of one vehicle: which bytes are believed, in which frame and at which time, and which setpoints are sent."""
 
 from __future__ import annotations
 
@@ -420,7 +420,7 @@ def flying(bench: Bench, seconds: float, mode_hz: float = 25.0) -> Any:
     return state
 
 
-def test_after_the_link_was_silent_there_is_no_state_until_the_mode_is_told_again() -> None:
+def test_after_a_silent_link_there_is_no_state_until_the_mode_is_reported_again() -> None:
     bench = Bench().ready()
     assert flying(bench, 1.0) is not None
     bench.clock.advance(400_000)  # a failsafe may have acted: PX4 retakes OFFBOARD from a single setpoint
@@ -510,7 +510,7 @@ def test_a_failsafe_that_came_and_went_between_two_polls_is_shown_once() -> None
     assert not flying(bench, 0.02, mode_hz=0.0).failsafe
 
 
-def test_setpoints_that_resume_after_the_failsafe_may_have_acted_are_told() -> None:
+def test_a_setpoint_gap_in_which_the_failsafe_may_have_acted_is_counted() -> None:
     bench = Bench().ready()
     bench.say(dialect.MAVLink_param_value_message(b"COM_OF_LOSS_T", 0.5, 9, 1, 0))
 

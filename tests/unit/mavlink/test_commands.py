@@ -1,4 +1,4 @@
-"""The slow path through the codec: asked again until answered, one at a time, integers bytewise in the float."""
+"""Command port through the codec: repeated until answered, one command at a time, integers bytewise in the float."""
 
 from __future__ import annotations
 

@@ -64,7 +64,7 @@ class Listener:
         self.recorded += 1
 
     def hear(self, data: list[bytes]) -> str:
-        """Take these; everything it then believes, as text."""
+        """Receive these frames; return everything the bridge then believes, as text."""
         for datagram in data:
             self.wire.send(datagram)
         self.clock.advance(POLL_US)
@@ -89,7 +89,7 @@ def beliefs(thing: Any) -> Any:
 
 
 class Impostors:
-    """Hostile frames, and whole ones that say what the vehicle might say, in somebody else's name."""
+    """Yields hostile frames, and whole ones with plausible content in the name of another sender."""
 
     def __init__(self, seed: int) -> None:
         self._hostile = iter(Hostile(seed, SYSID))
@@ -141,7 +141,7 @@ def test_hostile_frames_do_not_change_what_is_believed(seed: int, said: list[lis
     assert twin.autopilot.armed
 
 
-def test_control_one_whole_frame_of_the_vehicle_is_believed(said: list[list[bytes]]) -> None:
+def test_negative_control_one_whole_frame_of_the_vehicle_is_believed(said: list[list[bytes]]) -> None:
     victim, twin = Listener(), Listener()
     for valid in said[:50]:
         assert victim.hear(valid) == twin.hear(valid)

@@ -1,4 +1,4 @@
-"""Whose a UDP port is: the vehicle's from its first heartbeat on, wherever it moves to, however others flood it."""
+"""Ownership of a UDP port: the vehicle's from its first heartbeat on, also after a move and under a flood."""
 
 from __future__ import annotations
 
@@ -82,19 +82,19 @@ def test_a_vehicle_is_followed_to_another_address_only_after_it_was_silent_at_th
     assert not latch.admits(VEHICLE, beat())
 
 
-def test_a_vehicle_that_speaks_is_not_followed_anywhere() -> None:
+def test_a_vehicle_that_sends_is_not_followed_to_another_address() -> None:
     latch = latched()
     polled(latch, 0, 10_000_000, speaks=VEHICLE)
     assert not latch.admits(ELSEWHERE, beat())
 
 
-def test_silence_while_nobody_listened_is_nobodys() -> None:
+def test_silence_without_a_poll_is_not_attributed() -> None:
     latch = latched()
     latch.poll(20_000_000)  # we slept
     assert not latch.admits(ELSEWHERE, beat())
 
 
-def test_a_given_address_is_the_vehicles_until_it_is_silent_and_for_good_where_nobody_else_may_speak() -> None:
+def test_a_given_address_is_the_vehicles_until_it_is_silent_and_for_good_where_no_other_sender_is_allowed() -> None:
     latch = Latch(heartbeat_of(SYSID), VEHICLE)
     latch.poll(0)
     assert not latch.admits(ELSEWHERE, beat())
@@ -133,7 +133,7 @@ def heard(link: UdpTransport, count: int, wait_s: float = 1.0) -> list[bytes]:
     return got
 
 
-def test_a_stranger_who_speaks_first_gets_neither_the_link_nor_an_answer(port: socket.socket) -> None:
+def test_a_stranger_that_sends_first_gets_neither_the_link_nor_an_answer(port: socket.socket) -> None:
     link = UdpTransport(port, None, heartbeat_of(SYSID))
     vehicle, stranger = speaker(), speaker()
     for data in (b"hello", beat(sysid=99), BROKEN, state()):
@@ -167,7 +167,7 @@ def test_the_kernel_keeps_strangers_out_of_the_buffer_until_the_vehicle_may_have
         sock.close()
 
 
-def test_a_vehicle_that_comes_back_on_another_port_is_heard_and_answered_there(port: socket.socket) -> None:
+def test_a_vehicle_that_comes_back_on_another_port_is_received_and_answered_there(port: socket.socket) -> None:
     link = UdpTransport(port, None, heartbeat_of(SYSID))
     before, after = speaker(), speaker()
     start_us = now()
@@ -187,14 +187,14 @@ def test_a_vehicle_that_comes_back_on_another_port_is_heard_and_answered_there(p
     after.close()
 
 
-def test_who_speaks_first_binds_the_interface_towards_the_vehicle() -> None:
+def test_a_link_that_sends_first_binds_the_interface_towards_the_vehicle() -> None:
     sock = bind_towards(("127.0.0.1", 14581))
     assert sock.getsockname()[0] == "127.0.0.1"
     sock.close()
 
 
 def flood(port: int, stop: Event, rate_hz: Any) -> None:
-    """As fast as it goes, from a port of its own; leaves behind how fast that was."""
+    """Send as fast as possible from a separate port; record the rate."""
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
     began, count = time.monotonic(), 0
     while not stop.is_set():
@@ -236,7 +236,7 @@ def test_a_flood_costs_the_tick_nothing_and_loses_nothing_of_the_vehicle(port: s
     assert worst_ms < 5.0
 
 
-def test_control_without_the_kernels_help_the_drain_is_bounded_but_frames_are_lost(
+def test_negative_control_without_the_kernels_help_the_drain_is_bounded_but_frames_are_lost(
     port: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(transport, "admit_only", lambda *_: None)

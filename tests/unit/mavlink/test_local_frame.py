@@ -1,4 +1,4 @@
-"""One swarm frame over vehicles that count from places of their own, and move those in flight."""
+"""One shared frame over vehicles with local origins of their own that move in flight."""
 
 from __future__ import annotations
 
@@ -108,7 +108,7 @@ def steps_m(placed: list[Array | None]) -> list[float]:
 
 
 @pytest.mark.parametrize("answered", [True, False], ids=["origin told again", "origin never told again"])
-def test_a_long_jump_of_the_estimate_moves_nobody_and_is_kept_clear_of(answered: bool) -> None:
+def test_a_long_jump_of_the_estimate_moves_no_vehicle_and_becomes_a_margin(answered: bool) -> None:
     vehicle = flying()
     before = vehicle.fly(0.02)
     placed = before + jumped(vehicle).fly(0.02)
@@ -175,7 +175,7 @@ def test_a_step_that_the_estimator_tells_of_is_bridged_however_small() -> None:
         assert (abs(float(after[2] - before[2])) < 0.01) is reset
 
 
-def test_a_margin_that_no_peer_would_believe_is_not_told() -> None:
+def test_a_margin_that_no_peer_would_accept_is_not_published() -> None:
     vehicle = jumped(flying(), UP * 100.0)
     vehicle.fly(20.0)
     assert vehicle.frame.margin_m == MAX_RADIUS_M

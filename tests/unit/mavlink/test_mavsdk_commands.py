@@ -1,4 +1,4 @@
-"""The slow path on MAVSDK, over the same frames as the tick's: whose answers are believed, in whose dialect it asks."""
+"""Command port on MAVSDK, over the same frames as the tick's: accepted answers, and the dialect of requests."""
 
 from __future__ import annotations
 

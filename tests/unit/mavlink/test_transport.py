@@ -1,4 +1,4 @@
-"""Byte links: what a URL may say, who owns a port, whom we answer, when a datagram came, where a frame ends."""
+"""Byte links: valid URLs, owners of ports, the address that is answered, arrival times, and ends of frames."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def client() -> socket.socket:
     return sock
 
 
-def test_the_first_sender_is_the_peer_and_nobody_else_is_heard_or_answered(bound: socket.socket) -> None:
+def test_the_first_sender_is_the_peer_and_no_other_is_received_or_answered(bound: socket.socket) -> None:
     link = UdpTransport(bound)
     vehicle, stranger = client(), client()
     link.send(b"to nobody")  # no peer yet: dropped
@@ -145,7 +145,7 @@ def test_udpout_talks_first_and_hears_the_answer() -> None:
     link.close()
 
 
-def test_who_speaks_first_does_so_from_the_same_port_at_every_start() -> None:
+def test_a_link_that_sends_first_uses_the_same_port_at_every_start() -> None:
     ports = []
     for _ in range(2):
         link = open_transport("udpout://127.0.0.1:14581")
@@ -185,7 +185,7 @@ def test_an_inherited_socket_is_used_as_it_is(bound: socket.socket) -> None:
     vehicle.close()
 
 
-def test_nobody_listening_is_not_an_error_of_the_tick() -> None:
+def test_a_missing_receiver_is_not_an_error_of_the_tick() -> None:
     gone = client()
     link = open_transport(f"udpout://127.0.0.1:{gone.getsockname()[1]}")
     gone.close()
@@ -231,7 +231,7 @@ def test_half_a_frame_waits_for_the_rest() -> None:
     assert cut_frames(buffer) == [good]
 
 
-def test_serial_hands_on_whole_frames() -> None:
+def test_serial_passes_on_whole_frames() -> None:
     master, slave = pty.openpty()
     tty.setraw(slave)
     link = SerialTransport(os.ttyname(slave), 57600)
@@ -376,7 +376,7 @@ def test_tcp_comes_back_a_second_after_the_other_end_has_gone() -> None:
     again.close()
 
 
-def test_tcp_that_nobody_listens_to_is_tried_again_and_never_blocks() -> None:
+def test_tcp_without_a_server_is_tried_again_and_never_blocks() -> None:
     server = Server()
     server.close()
     link = tcp_link(server.port)

@@ -57,7 +57,7 @@ def test_ages_stay_right_for_ten_minutes_of_drift(rate: float) -> None:
     assert clock.boots == 0
 
 
-def test_control_an_offset_without_a_rate_does_not_stay_right() -> None:
+def test_negative_control_an_offset_without_a_rate_does_not_stay_right() -> None:
     assert Link(VehicleClock(rate_limit=0.0), 0.99).run(60.0) > 5_000
     assert Link(VehicleClock(rate_limit=0.0), 0.99, asked=False).run(60.0) > 50_000
 

@@ -1,4 +1,4 @@
-"""What a link is asked for, once and again: rates, origin, parameters, also after a reboot; and what is refused."""
+"""Setup of a link: rates, origin and parameters, also after a reboot, and the refusals."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from swarmctl.mavlink.autopilot import Autopilot
 from swarmctl.mavlink.codec import Codec, frames
 from swarmctl.mavlink.commands import CodecCommands
 from swarmctl.mavlink.transport import pipe_pair
-from swarmctl.mavlink.vehicle_setup import Upkeep
+from swarmctl.mavlink.vehicle_setup import VehicleSetup
 
 HOME = GeoOrigin(47.397742, 8.545594, 489.4)
 PX4, ARDUCOPTER = 12, 3
@@ -27,7 +27,7 @@ COPTER_WITHOUT_AGENT = {"FS_GCS_ENABLE": 5, "FS_GCS_TIMEOUT": 2.0, "ATC_ANGLE_BO
 
 
 class Vehicle:
-    """A made-up autopilot at the far end: answers commands and parameters, streams what it was asked to."""
+    """A scripted autopilot at the far end: answers commands and parameters, streams the requested messages."""
 
     def __init__(self, autopilot: int = PX4, **params: float) -> None:
         defaults = {
@@ -45,7 +45,7 @@ class Vehicle:
         self.port = CodecCommands(self.pilot.send_frame, Codec(1, 191), 1, lambda: self.pilot.dialect)
         self.pilot.attach(self.port)
         self.setup: dict[str, int | float] = {}
-        self.upkeep = Upkeep(self.pilot, self.port, self.setup, 1, 50.0)
+        self.vehicle_setup = VehicleSetup(self.pilot, self.port, self.setup, 1, 50.0)
 
     def boot(self) -> None:
         self.booted_us = self.clock.now_us()
@@ -53,7 +53,7 @@ class Vehicle:
         self.asked: list[tuple[int, float]] = []
 
     def set_up(self, **setup: int | float) -> Vehicle:
-        self.upkeep = Upkeep(self.pilot, self.port, setup, 1, 50.0)
+        self.vehicle_setup = VehicleSetup(self.pilot, self.port, setup, 1, 50.0)
         return self
 
     @property
@@ -66,8 +66,8 @@ class Vehicle:
             self.pilot.poll(self.clock.now_us())
             self.port.step(self.clock.now_us())
             for result in self.port.results():
-                self.upkeep.took(result)
-            self.upkeep.step(self.clock.now_us())
+                self.vehicle_setup.took(result)
+            self.vehicle_setup.step(self.clock.now_us())
             self.clock.advance(20_000)
         return self
 
@@ -131,8 +131,8 @@ def rates(vehicle: Vehicle) -> set[int]:
 
 def test_px4_is_set_up_in_two_seconds_and_left_alone_then() -> None:
     vehicle = Vehicle(COM_OBL_RC_ACT=0).set_up(COM_OBL_RC_ACT=4).run(2.0)
-    assert vehicle.upkeep.ready
-    assert vehicle.upkeep.refusal == ""
+    assert vehicle.vehicle_setup.ready
+    assert vehicle.vehicle_setup.refusal == ""
     assert rates(vehicle) == {331, 83, 245, 436, 230, 30, 31, 33, 105}
     assert vehicle.params["COM_OBL_RC_ACT"] == vehicle.pilot.params["COM_OBL_RC_ACT"] == 4
     assert vehicle.pilot.hover_thrust_01 == pytest.approx(0.45)
@@ -144,8 +144,8 @@ def test_px4_is_set_up_in_two_seconds_and_left_alone_then() -> None:
 
 def test_arducopter_is_asked_for_every_message_the_bridge_needs() -> None:
     vehicle = Vehicle(ARDUCOPTER, GUID_OPTIONS=0).set_up(GUID_OPTIONS=8).run(30.0)  # unknown ones are met by silence
-    assert vehicle.upkeep.ready
-    assert vehicle.upkeep.refusal == ""
+    assert vehicle.vehicle_setup.ready
+    assert vehicle.vehicle_setup.refusal == ""
     assert rates(vehicle) == {1, 24, 31, 32, 33, 83, 245}
     assert vehicle.pilot.params["GUID_OPTIONS"] == 8.0
     assert vehicle.params["SYSID_MYGCS"] == 1, "its link-loss failsafe heeds the agent's heartbeats"
@@ -170,26 +170,26 @@ def test_arducopter_is_asked_for_every_message_the_bridge_needs() -> None:
 )
 def test_what_a_parameter_would_do_in_flight_is_refused_before_it(vehicle: Vehicle, why: str) -> None:
     vehicle.run(12.0)
-    assert vehicle.upkeep.ready
-    assert re.search(why, vehicle.upkeep.refusal)
+    assert vehicle.vehicle_setup.ready
+    assert re.search(why, vehicle.vehicle_setup.refusal)
 
 
 def test_an_offboard_loss_action_that_could_not_be_set_or_read_is_refused() -> None:
     stubborn = Vehicle(COM_OBL_RC_ACT=0)
     stubborn.read_only = True
     stubborn.set_up(COM_OBL_RC_ACT=4).run(4.0)
-    assert stubborn.upkeep.refusal == "COM_OBL_RC_ACT could not be set to 4: stays at 0"
+    assert stubborn.vehicle_setup.refusal == "COM_OBL_RC_ACT could not be set to 4: stays at 0"
     silent = Vehicle()
     del silent.params["COM_OBL_RC_ACT"]
     silent.set_up().run(6.0)
-    assert silent.upkeep.refusal.startswith("COM_OBL_RC_ACT can't be read")
+    assert silent.vehicle_setup.refusal.startswith("COM_OBL_RC_ACT can't be read")
     harmless = Vehicle().set_up(MPC_LAND_SPEED=0.5).run(6.0)
-    assert (harmless.upkeep.ready, harmless.upkeep.refusal) == (True, ""), "only what matters refuses"
+    assert (harmless.vehicle_setup.ready, harmless.vehicle_setup.refusal) == (True, ""), "only what matters refuses"
 
 
 def test_a_whole_number_in_the_configuration_is_set_in_the_type_that_the_vehicle_keeps() -> None:
     vehicle = Vehicle(COM_OF_LOSS_T=1.0, COM_OBL_RC_ACT=0).set_up(COM_OF_LOSS_T=10, COM_OBL_RC_ACT=4.0).run(4.0)
-    assert (vehicle.upkeep.ready, vehicle.upkeep.refusal) == (True, "")
+    assert (vehicle.vehicle_setup.ready, vehicle.vehicle_setup.refusal) == (True, "")
     assert (vehicle.params["COM_OF_LOSS_T"], vehicle.params["COM_OBL_RC_ACT"]) == (10.0, 4)
 
 
@@ -197,17 +197,17 @@ def test_nothing_is_armed_when_a_parameter_that_is_there_could_not_be_set() -> N
     vehicle = Vehicle(MPC_LAND_SPEED=0.7)
     vehicle.read_only = True
     vehicle.set_up(MPC_LAND_SPEED=0.5).run(4.0)
-    assert vehicle.upkeep.refusal == "MPC_LAND_SPEED could not be set to 0.5: stays at 0.7"
+    assert vehicle.vehicle_setup.refusal == "MPC_LAND_SPEED could not be set to 0.5: stays at 0.7"
 
 
 def test_px4_that_would_hover_for_ever_without_its_agent_is_refused() -> None:
-    assert "hover for ever" in Vehicle().set_up(NAV_DLL_ACT=0).run(4.0).upkeep.refusal
-    assert "COM_DL_LOSS_T = 60" in Vehicle().set_up(COM_DL_LOSS_T=60).run(4.0).upkeep.refusal
+    assert "hover for ever" in Vehicle().set_up(NAV_DLL_ACT=0).run(4.0).vehicle_setup.refusal
+    assert "COM_DL_LOSS_T = 60" in Vehicle().set_up(COM_DL_LOSS_T=60).run(4.0).vehicle_setup.refusal
     stubborn = Vehicle(NAV_DLL_ACT=0)
     stubborn.read_only = True
-    assert "NAV_DLL_ACT could not be set to 3" in stubborn.set_up().run(4.0).upkeep.refusal
+    assert "NAV_DLL_ACT could not be set to 3" in stubborn.set_up().run(4.0).vehicle_setup.refusal
     vehicle = Vehicle(NAV_DLL_ACT=0, COM_DL_LOSS_T=60).set_up().run(4.0)
-    assert (vehicle.params["NAV_DLL_ACT"], vehicle.params["COM_DL_LOSS_T"], vehicle.upkeep.refusal) == (3, 5, "")
+    assert (vehicle.params["NAV_DLL_ACT"], vehicle.params["COM_DL_LOSS_T"], vehicle.vehicle_setup.refusal) == (3, 5, "")
 
 
 @pytest.mark.parametrize(
@@ -223,20 +223,20 @@ def test_after_the_flight_parameters_are_what_they_were(
 ) -> None:
     vehicle = Vehicle(autopilot, **came_with).set_up(**wanted).run(30.0)
     assert wanted.items() <= vehicle.params.items()
-    assert not vehicle.upkeep.restored
-    vehicle.upkeep.restore()
+    assert not vehicle.vehicle_setup.restored
+    vehicle.vehicle_setup.restore()
     vehicle.run(3.0)
-    assert vehicle.upkeep.restored
+    assert vehicle.vehicle_setup.restored
     assert came_with.items() <= vehicle.params.items()
-    assert vehicle.upkeep.left_changed == {}
+    assert vehicle.vehicle_setup.left_changed == {}
 
 
 def test_a_parameter_that_could_not_be_set_back_is_named_with_its_value() -> None:
     vehicle = Vehicle(NAV_DLL_ACT=0).set_up(NAV_DLL_ACT=3).run(4.0)
     vehicle.read_only = True
-    vehicle.upkeep.restore()
+    vehicle.vehicle_setup.restore()
     vehicle.run(3.0)
-    assert (vehicle.upkeep.restored, vehicle.upkeep.left_changed) == (True, {"NAV_DLL_ACT": 0})
+    assert (vehicle.vehicle_setup.restored, vehicle.vehicle_setup.left_changed) == (True, {"NAV_DLL_ACT": 0})
 
 
 def test_after_a_reboot_everything_is_asked_for_again() -> None:
@@ -248,17 +248,17 @@ def test_after_a_reboot_everything_is_asked_for_again() -> None:
     while vehicle.pilot.clock.boots == 0:
         vehicle.run(0.02)
     assert vehicle.clock.now_us() - rebooted_us <= 600_000
-    assert not vehicle.upkeep.ready
+    assert not vehicle.vehicle_setup.ready
     assert vehicle.pilot.clock.boots == 1
     assert (vehicle.pilot.landed, vehicle.pilot.offset_ned_m) == (Landed.UNKNOWN, None)
     vehicle.run(3.0)
-    assert vehicle.upkeep.ready
+    assert vehicle.vehicle_setup.ready
     assert rates(vehicle) == {331, 83, 245, 436, 230, 30, 31, 33, 105}
     assert vehicle.params["COM_OBL_RC_ACT"] == 4
     assert vehicle.pilot.mode is FlightMode.HOLD
 
 
-def test_rates_that_were_lost_are_asked_for_again_but_a_silent_vehicle_is_not_shouted_at() -> None:
+def test_lost_rates_are_requested_again_but_not_from_a_silent_vehicle() -> None:
     vehicle = Vehicle().set_up().run(5.0)
     vehicle.talks = False
     vehicle.run(24.0)  # what was asked at the very beginning of the silence is asked four times
@@ -272,7 +272,7 @@ def test_rates_that_were_lost_are_asked_for_again_but_a_silent_vehicle_is_not_sh
     assert vehicle.pilot.clock.boots == 0
 
 
-def test_the_origin_is_asked_for_until_it_is_told() -> None:
+def test_the_origin_is_requested_until_it_is_reported() -> None:
     vehicle = Vehicle()
     vehicle.answers_origin = False
     vehicle.set_up().run(6.0)
@@ -285,7 +285,7 @@ def test_the_origin_is_asked_for_until_it_is_told() -> None:
     assert vehicle.asked == []
 
 
-def test_upkeep_asks_one_thing_at_a_time_and_only_when_nobody_else_does() -> None:
+def test_vehicle_setup_requests_one_thing_at_a_time_and_only_on_an_idle_port() -> None:
     vehicle = Vehicle().set_up()
     vehicle.run(0.1)
     vehicle.port.request(Command(Verb.LAND))

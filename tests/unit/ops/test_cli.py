@@ -13,10 +13,10 @@ from pathlib import Path
 import msgspec
 import pytest
 
+import swarmctl
 from swarmctl.bus.topics import ObstacleMessage
 from swarmctl.errors import ConfigError, MissionError, StartError
-from swarmctl.ops import cli
-from swarmctl.ops import operator as attach
+from swarmctl.ops import cli, operator
 
 Run = Callable[..., int]
 HEAVY = ("numpy", "scipy", "osqp", "zenoh", "rerun", "pyarrow", "pydantic", "mavsdk", "pymavlink", "psutil", "msgspec")
@@ -43,7 +43,7 @@ def nobody(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 def test_help_is_quick_and_imports_nothing_heavy() -> None:
     code = (
         "import sys; sys.argv = ['swarmctl', '--help']\n"
-        "import atexit; from swarmctl import cli\n"
+        "import atexit; from swarmctl.ops import cli\n"
         f"atexit.register(lambda: print('heavy:', [m for m in {HEAVY!r} if m in sys.modules]))\ncli.main()"
     )
     times_s = []  # of the processor: what a loaded machine adds by waiting is not ours
@@ -79,6 +79,33 @@ def test_every_verb_is_there_and_explains_itself(run: Run, capsys: pytest.Captur
 
 
 @pytest.mark.parametrize(
+    ("arguments", "unit"),
+    [
+        (("launch",), "Duration of the mission [s]"),
+        (("check",), "Time to listen to each vehicle [s]"),
+        (("fault",), "[deg from north]"),
+        (("obstacle", "add"), "Velocity, shared NED [m/s]"),
+    ],
+)
+def test_help_keeps_units_in_brackets(
+    run: Run, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, arguments: tuple[str, ...], unit: str
+) -> None:
+    monkeypatch.setenv("COLUMNS", "160")
+    assert run(*arguments, "--help") == 0
+    assert unit in " ".join(capsys.readouterr().out.split())
+
+
+def test_rtl_help_says_that_the_agent_flies_home(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("rtl", "--help") == 0
+    assert "own MPC, then land" in " ".join(capsys.readouterr().out.split())
+
+
+def test_version_is_printed(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("--version") == 0
+    assert capsys.readouterr().out == f"swarmctl {swarmctl.__version__}\n"
+
+
+@pytest.mark.parametrize(
     "arguments",
     [("lanch",), ("launch", "--agents", "x"), ("launch", "--nonsense"), ("agent",), ("launch", "a", "b"), ("replay",)],
 )
@@ -96,7 +123,7 @@ def test_expected_errors_are_words_and_their_exit_code(
     def fail(*_: object) -> None:
         raise error
 
-    monkeypatch.setattr(attach, "find_launch", fail)
+    monkeypatch.setattr(operator, "find_launch", fail)
     assert run("status") == code
     captured = capsys.readouterr()
     assert captured.err == f"{error}\n"
@@ -106,7 +133,7 @@ def test_unexpected_errors_keep_their_traceback(monkeypatch: pytest.MonkeyPatch)
     def fail(*_: object) -> None:
         raise ZeroDivisionError("bug")
 
-    monkeypatch.setattr(attach, "find_launch", fail)
+    monkeypatch.setattr(operator, "find_launch", fail)
     monkeypatch.setattr(sys, "argv", ["swarmctl", "status"])
     with pytest.raises(ZeroDivisionError, match="bug"):
         cli.main()
@@ -143,8 +170,8 @@ def test_options_override_sets_and_simulate_passes_everything_on(run: Run, monke
 
 def test_a_reader_that_goes_away_does_not_change_the_exit_code() -> None:
     code = (
-        "import sys; from swarmctl import cli, table\n"
-        "cli._run_app = lambda: table.PlainLines(sys.stdout).say('landed') or 4\ncli.main()"
+        "import sys; from swarmctl.ops import cli, status_table\n"
+        "cli._run_app = lambda: status_table.PlainLines(sys.stdout).say('landed') or 4\ncli.main()"
     )
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
     assert process.stdout is not None
@@ -153,15 +180,15 @@ def test_a_reader_that_goes_away_does_not_change_the_exit_code() -> None:
 
 
 def test_obstacles_are_read_strictly() -> None:
-    ball = attach.obstacle("1.5,0,-2", 0.5, 1.0, 3.0, "0,0,0.1")
+    ball = operator.obstacle("1.5,0,-2", 0.5, 1.0, 3.0, "0,0,0.1")
     assert ball == ObstacleMessage((1.5, 0.0, -2.0), 0.5, 1.0, 3.0, (0.0, 0.0, 0.1))
-    assert attach.obstacle("1.5,0,-2", 0.5, 1.0, 3.0, "0,0,0.1", column=True).column
+    assert operator.obstacle("1.5,0,-2", 0.5, 1.0, 3.0, "0,0,0.1", column=True).column
     with pytest.raises(ConfigError) as caught:
-        attach.obstacle("1,2", -1.0, float("nan"), 3.0, "0,inf,0")
+        operator.obstacle("1,2", -1.0, float("nan"), 3.0, "0,inf,0")
     assert len(caught.value.problems) == 4
-    assert attach.without((ball, ball), 1) == (ball,)
+    assert operator.without((ball, ball), 1) == (ball,)
     with pytest.raises(ConfigError, match="there are 1"):
-        attach.without((ball,), 1)
+        operator.without((ball,), 1)
 
 
 def test_the_registry_knows_live_launches_and_forgets_dead_ones(
@@ -171,17 +198,17 @@ def test_the_registry_knows_live_launches_and_forgets_dead_ones(
     folder.mkdir()
     monkeypatch.setenv("XDG_RUNTIME_DIR", "")
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    started_s, pid = attach.process_start_s()
-    launch = attach.RunningLaunch("run", "unixsock-stream//x", pid, started_s, 3, str(folder))
-    attach.announce(launch)
+    started_s, pid = operator.process_start_s()
+    launch = operator.RunningLaunch("run", "unixsock-stream//x", pid, started_s, 3, str(folder))
+    operator.announce(launch)
     assert registry.stat().st_mode & 0o777 == 0o700
-    assert attach.find_launch(None) == launch
-    assert attach.find_launch(folder) == launch
-    attach.announce(attach.RunningLaunch("reused pid", "unixsock-stream//x", pid, started_s - 60, 3, str(folder)))
+    assert operator.find_launch(None) == launch
+    assert operator.find_launch(folder) == launch
+    operator.announce(operator.RunningLaunch("reused pid", "unixsock-stream//x", pid, started_s - 60, 3, str(folder)))
     with pytest.raises(StartError):
-        attach.find_launch(folder)
+        operator.find_launch(folder)
     with pytest.raises(StartError):
-        attach.find_launch(None)
+        operator.find_launch(None)
     assert list(registry.iterdir()) == []
 
 
@@ -207,7 +234,7 @@ def squat_link(place: Path) -> None:
 @pytest.mark.parametrize("squat", [squat_open, squat_of_another, squat_file, squat_link])
 @pytest.mark.parametrize("at_launch", [True, False], ids=["runtime directory at launch", "none at launch"])
 @pytest.mark.parametrize("at_verb", [True, False], ids=["runtime directory at the verb", "none at the verb"])
-def test_a_launch_and_its_verbs_find_each_other_whoever_takes_the_name_first(
+def test_a_launch_and_its_verbs_find_each_other_although_another_user_takes_the_name(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path, squat: Callable[[Path], None], at_launch: bool, at_verb: bool
 ) -> None:
     temporary, runtime, folder = tmp_path / "tmp", tmp_path / "runtime", tmp_path / "run"
@@ -217,24 +244,24 @@ def test_a_launch_and_its_verbs_find_each_other_whoever_takes_the_name_first(
     if squat is squat_of_another and os.getuid() != 0:
         pytest.skip("only root can give a directory away")
     squat(temporary / f"swarmctl-{os.getuid()}")
-    started_s, pid = attach.process_start_s()
-    launch = attach.RunningLaunch("run", "unixsock-stream//x", pid, started_s, 3, str(folder))
-    forged = attach.RunningLaunch("forged", "unixsock-stream//evil", pid, started_s + 0.5, 3, str(folder))
+    started_s, pid = operator.process_start_s()
+    launch = operator.RunningLaunch("run", "unixsock-stream//x", pid, started_s, 3, str(folder))
+    forged = operator.RunningLaunch("forged", "unixsock-stream//evil", pid, started_s + 0.5, 3, str(folder))
     if squat is not squat_file:
         (temporary / f"swarmctl-{os.getuid()}" / "1.json").write_bytes(msgspec.json.encode(forged))
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime) if at_launch else "")
-    attach.announce(launch)
-    attach.announce(launch)
+    operator.announce(launch)
+    operator.announce(launch)
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime) if at_verb else "")
-    assert attach.find_launch(None) == launch
-    attach.withdraw()
+    assert operator.find_launch(None) == launch
+    operator.withdraw()
     if at_launch == at_verb:
         with pytest.raises(StartError):
-            attach.find_launch(None)
+            operator.find_launch(None)
     assert len(list(temporary.glob("swarmctl-*"))) == 2, "one more, not one each time"
 
 
-def test_a_runtime_directory_of_somebody_else_is_not_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_runtime_directory_of_another_user_is_not_used(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """As after `su` or `sudo -E`."""
     temporary, runtime, folder = tmp_path / "tmp", tmp_path / "runtime", tmp_path / "run"
     for place in (temporary, runtime, folder):
@@ -242,8 +269,8 @@ def test_a_runtime_directory_of_somebody_else_is_not_used(monkeypatch: pytest.Mo
     runtime.chmod(0o755)
     monkeypatch.setattr(tempfile, "tempdir", str(temporary))
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(runtime))
-    started_s, pid = attach.process_start_s()
-    launch = attach.RunningLaunch("run", "unixsock-stream//x", pid, started_s, 3, str(folder))
-    attach.announce(launch)
+    started_s, pid = operator.process_start_s()
+    launch = operator.RunningLaunch("run", "unixsock-stream//x", pid, started_s, 3, str(folder))
+    operator.announce(launch)
     assert list(runtime.iterdir()) == []
-    assert attach.find_launch(None) == launch
+    assert operator.find_launch(None) == launch

@@ -1,4 +1,4 @@
-"""`simulate` says its verdict whatever becomes of the disk and of the terminal."""
+"""`simulate` prints its result whatever happens to the disk and the terminal."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_a_full_disk_costs_the_files_and_not_the_verdict(tmp_path: Path) -> None
 
 
 def test_a_closed_terminal_lands_and_keeps_the_verdict(tmp_path: Path) -> None:
-    """The kernel and the shell both say so: the second SIGHUP is not somebody who asks again."""
+    """The kernel and the shell both send SIGHUP: the second one is no second request."""
     folder = tmp_path / "run"
     master, terminal = pty.openpty()
     command = [sys.executable, "-m", "sitl.simulate", *SHORT[:2], "--duration", "600", "--run-dir", str(folder)]

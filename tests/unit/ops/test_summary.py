@@ -1,4 +1,4 @@
-"""How a flight went is said whatever becomes of the disk it was recorded on."""
+"""The result of a flight is printed whatever happens to the disk it was recorded on."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ import pytest
 from swarmctl.config import Config, dump
 from tests.unit.telemetry.test_run_folder import write_run
 
-# What the launcher does when everybody has landed; `limit` is the largest file the system lets it write.
+# What the launcher does after all agents have landed; `limit` is the largest file the system lets it write.
 _SUM_UP = """
 import resource, sys
 from pathlib import Path
 from swarmctl.config import Config
-from swarmctl.ops.supervisor import Verdict
+from swarmctl.ops.supervisor import LaunchResult
 from swarmctl.ops.summary import sum_up
 directory, limit = Path(sys.argv[1]), int(sys.argv[2])
 if limit >= 0:
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
-verdict = Verdict(problems=["agent-1 was killed by SIGKILL", "agent-2 has been silent for 5 s"])
-violated = sum_up(Config(), directory, verdict, print)
-print("exit code", verdict.exit_code(violated))
+result = LaunchResult(problems=["agent-1 was killed by SIGKILL", "agent-2 has been silent for 5 s"])
+violated = sum_up(Config(), directory, result, print)
+print("exit code", result.exit_code(violated))
 """
 
 
@@ -44,8 +44,8 @@ def test_a_full_disk_costs_the_files_and_not_the_verdict(folder: Path) -> None:
     before = {path.name: path.read_bytes() for path in folder.iterdir()}
     lines = sum_up(folder, 0)
     assert lines[:2] == ["violation: agent-1 was killed by SIGKILL", "violation: agent-2 has been silent for 5 s"]
-    verdict, separation, *_ = (line for line in lines if not line.startswith("violation: "))
-    assert verdict.startswith("failed, summed mean tracking error")
+    result, separation, *_ = (line for line in lines if not line.startswith("violation: "))
+    assert result.startswith("failed, summed mean tracking error")
     assert separation.startswith("separation 1.039 m (required 0.850 m)")
     assert f"run folder {folder}" in lines
     assert "summary.json: File too large" in lines[-2]

@@ -125,7 +125,7 @@ def test_increments_limit_the_lateral_region_and_acceleration_the_vertical_one()
     assert terminal_region(*CASES["vertical"][:3], 4.905, 5.0, 0.02).level == pytest.approx(vertical.level / 4.0)
 
 
-def test_who_is_inside_stays_inside_within_the_bounds_and_comes_to_rest(case: Weights) -> None:
+def test_a_state_inside_stays_inside_within_the_bounds_and_comes_to_rest(case: Weights) -> None:
     _, _, _, accel_max, step_max, dt_s = case
     region = terminal_region(*case)
     shrink = np.random.default_rng([0, 0, 8]).uniform(0.0, 1.0, (400, 1)) ** (1.0 / 3.0)
@@ -259,7 +259,7 @@ def test_with_a_short_horizon_it_settles_within_bounds_and_without_the_region_it
 
 
 @pytest.mark.parametrize("control", [3, 6, 40])
-def test_how_far_the_plan_ends_outside_is_told(control: int) -> None:
+def test_the_distance_of_the_plans_end_from_the_region_is_reported(control: int) -> None:
     problem, region = mpc(VERTICAL, control, 40, QpParams()), region_of(VERTICAL)
     for start_m in (0.01, 0.3, 5.0, -20.0):
         solution = solve(problem, start_m, 0.0, 9.81)

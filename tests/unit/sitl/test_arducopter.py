@@ -1,4 +1,4 @@
-"""How the simulated ArduCopter flies: measured steps, thrust and climb-rate semantics, masks, timeouts, modes."""
+"""Flight of the simulated ArduCopter: measured steps, thrust and climb-rate semantics, masks, timeouts, modes."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_climb_rate_scales_with_its_parameter(parameter: str) -> None:
     assert abs(bench.climb_m_s) == pytest.approx(0.8, abs=0.05)
 
 
-def test_control_the_same_number_means_another_thing_with_the_option() -> None:
+def test_negative_control_the_same_number_means_another_thing_with_the_option() -> None:
     falls, holds = Bench(parameters=THRUST, **COARSE).airborne(20.0), Bench(**COARSE).airborne(20.0)
     for bench in (falls, holds):
         bench.run(1.5, {"thrust": 0.5})
@@ -207,7 +207,7 @@ def test_it_levels_after_the_timeout_stays_guided_and_drifts_on(
     assert bench.roll_deg < -8.5, "resumed setpoints are flown at once"
 
 
-def test_control_a_longer_timeout_keeps_the_tilt() -> None:
+def test_negative_control_a_longer_timeout_keeps_the_tilt() -> None:
     bench = Bench(parameters={"GUID_TIMEOUT": 30.0}, **COARSE).airborne(20.0)
     bench.run(0.5, {"roll_deg": 10.0})
     bench.run(5.0)

@@ -1,4 +1,4 @@
-"""ArduCopter's MAVLink face, row by row as measured on 4.6.3: acks, texts, heartbeats, streams, parameters, boot."""
+"""ArduCopter's MAVLink interface, as measured on 4.6.3: acks, texts, heartbeats, streams, parameters, boot."""
 
 from __future__ import annotations
 
@@ -203,7 +203,7 @@ def test_other_base_modes() -> None:
     assert of("HEARTBEAT", bench.run(1.1, {}))[-1].base_mode == 209, "an attitude is flown: no position controller"
 
 
-def test_a_mode_change_is_told_at_once_and_arming_waits_for_the_tick() -> None:
+def test_a_mode_change_is_sent_at_once_and_arming_waits_for_the_tick() -> None:
     bench = booted()
     bench.run(1.0 - bench.t_s % 1.0 + 0.2)
     bench.got.clear()

@@ -1,7 +1,8 @@
-"""The bench measures what it says: a real agent in a plausible crowd, and one problem for all solvers."""
+"""The bench measures a real agent among plausible neighbours, and one problem for all solvers."""
 
 from __future__ import annotations
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -59,6 +60,21 @@ def test_bad_usage_is_refused(arguments: list[str], capsys: pytest.CaptureFixtur
         bench.main(arguments)
     assert caught.value.code == 2
     assert arguments[0] in capsys.readouterr().err
+
+
+def test_a_solver_that_is_not_installed_is_left_out_and_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert bench.chosen_solvers([]) == (["osqp", "daqp"], "")
+    monkeypatch.setitem(sys.modules, "daqp", None)
+    solvers, left_out = bench.chosen_solvers([])
+    assert solvers == ["osqp"]
+    assert "daqp is left out" in left_out and "pip install 'swarmctl[daqp]'" in left_out
+    assert bench.chosen_solvers(["daqp", "daqp"]) == (["daqp"], ""), "what is asked for by name is refused, not dropped"
+
+
+def test_without_daqp_the_problems_are_timed_with_osqp(captured: Captured, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "daqp", None)
+    few = Captured(captured.config, captured.problems[:22], captured.tick_ms[:22])
+    assert list(measure_xy(few, slsqp=False).qp_ms) == ["osqp"]
 
 
 def test_a_folder_that_cannot_be_made_is_an_error_in_words(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The parts of a campaign that fly nothing: judging, intervals, layouts, the folder, what is refused."""
+"""The parts of a campaign that fly nothing: judging, intervals, layouts, the folder, and refusals."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from scipy.stats import binomtest
 
 from sitl.lockstep import Lockstep
-from sitl.studies.campaign.collision_monitor import Solid, Umpire
+from sitl.studies.campaign.collision_monitor import CollisionMonitor, Solid
 from sitl.studies.campaign.command import main
 from sitl.studies.campaign.events import Appearance
 from sitl.studies.campaign.factors import NOISES, PROTECTIONS
@@ -35,8 +35,8 @@ def row_of(trial: Trial, code: str = "this") -> Row:
     return dict.fromkeys(SCHEMA.names) | cell | {"seed": trial.seed, "code": code}
 
 
-def umpire(goals: np.ndarray | None = None) -> Umpire:
-    return Umpire(0.5, goals, 0.1, np.array([True, True]))
+def monitor(goals: np.ndarray | None = None) -> CollisionMonitor:
+    return CollisionMonitor(0.5, goals, 0.1, np.array([True, True]))
 
 
 @pytest.mark.parametrize(("hits", "trials"), [(0, 1), (1, 1), (0, 100), (3, 100), (50, 100), (100, 100), (7, 20)])
@@ -46,42 +46,42 @@ def test_intervals_are_those_of_scipy(hits: int, trials: int) -> None:
 
 
 def test_bodies_that_pass_between_two_samples_have_touched() -> None:
-    judge = umpire()
-    judge.see(0.0, np.array([[-1.0, 0.0, 0.0], [1.0, 0.1, 0.0]]), REST)
-    assert not judge.collided
-    judge.see(0.02, np.array([[1.0, 0.0, 0.0], [-1.0, 0.1, 0.0]]), REST)
-    assert judge.collided
-    assert judge.min_separation_m == pytest.approx(0.1)
+    watcher = monitor()
+    watcher.see(0.0, np.array([[-1.0, 0.0, 0.0], [1.0, 0.1, 0.0]]), REST)
+    assert not watcher.collided
+    watcher.see(0.02, np.array([[1.0, 0.0, 0.0], [-1.0, 0.1, 0.0]]), REST)
+    assert watcher.collided
+    assert watcher.min_separation_m == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize(("column", "collided"), [(True, True), (False, False)])
 def test_a_column_is_in_the_way_at_every_height(column: bool, collided: bool) -> None:
-    judge = umpire()
+    watcher = monitor()
     solid = Solid(np.array([0.0, 0.0, 5.0]), 0.3, column)
     for x in (-2.0, 2.0):  # 0.5 m beside the axis: the hull's 0.25 m and the column's 0.3 m meet
-        judge.see(x, np.array([[x, 0.5, 0.0], [x, 9.0, 0.0]]), REST, [solid])
-    assert judge.collided is collided
-    assert judge.min_separation_m > 8.0
+        watcher.see(x, np.array([[x, 0.5, 0.0], [x, 9.0, 0.0]]), REST, [solid])
+    assert watcher.collided is collided
+    assert watcher.min_separation_m > 8.0
 
 
-def test_who_leaves_again_has_not_arrived() -> None:
-    judge = umpire(np.zeros((2, 3)))
+def test_a_vehicle_that_leaves_again_has_not_arrived() -> None:
+    watcher = monitor(np.zeros((2, 3)))
     there = np.zeros((2, 3))
-    judge.see(1.0, there, REST)
-    assert judge.arrived_s == 1.0
-    judge.see(2.0, there + 0.2, REST)
-    assert judge.arrived_s == np.inf
-    judge.see(3.0, there, REST)
-    assert judge.arrived_s == 3.0
-    judge.see(4.0, there, REST + 0.5)
-    assert judge.arrived_s == np.inf, "passing through"
+    watcher.see(1.0, there, REST)
+    assert watcher.arrived_s == 1.0
+    watcher.see(2.0, there + 0.2, REST)
+    assert watcher.arrived_s == np.inf
+    watcher.see(3.0, there, REST)
+    assert watcher.arrived_s == 3.0
+    watcher.see(4.0, there, REST + 0.5)
+    assert watcher.arrived_s == np.inf, "passing through"
 
 
-def test_who_stands_still_is_told_from_who_creeps() -> None:
-    judge = umpire(np.zeros((2, 3)))
+def test_standing_still_is_distinguished_from_creeping() -> None:
+    watcher = monitor(np.zeros((2, 3)))
     for tick in range(200):
-        judge.see(0.02 * tick, np.array([[1.0, 0.0, 0.0], [0.05 * 0.02 * tick, 3.0, 0.0]]), REST)
-    assert judge.standing().tolist() == [True, False]
+        watcher.see(0.02 * tick, np.array([[1.0, 0.0, 0.0], [0.05 * 0.02 * tick, 3.0, 0.0]]), REST)
+    assert watcher.standing().tolist() == [True, False]
 
 
 @pytest.mark.parametrize(
@@ -89,7 +89,7 @@ def test_who_stands_still_is_told_from_who_creeps() -> None:
     [(4.0, 0.0, True), (3.0, 0.0, False), (3.0, 0.5, True)],
     ids=["clear", "on it", "passes"],
 )
-def test_what_stays_never_appears_where_somebody_is_to_arrive(goal_m: float, speed_m_s: float, appears: bool) -> None:
+def test_a_static_obstacle_never_appears_at_a_goal(goal_m: float, speed_m_s: float, appears: bool) -> None:
     """2.5 m before a vehicle that flies north; one metre is kept from it."""
     goals = np.array([[goal_m, 0.0, 0.0]])
     appearance = Appearance(0, 1.0, 2.5, 2.2, 0.5, 1.0, speed_m_s, 1, goals)
@@ -154,7 +154,7 @@ def broken(trial: Trial) -> Row:
     return row_of(trial)
 
 
-def test_a_trial_that_breaks_is_told_and_the_others_go_on() -> None:
+def test_a_trial_that_fails_is_reported_and_the_others_go_on() -> None:
     trials = [Trial(CELL, seed) for seed in (1, 2, 3)]
     results = dict(on_this_machine(trials, 1, broken))
     assert results[trials[1]] == "RuntimeError: no such luck"
@@ -182,7 +182,7 @@ def test_cells_that_cannot_be_flown_are_refused_first(
     assert not (tmp_path / "none").exists()
 
 
-def test_no_message_arrives_on_a_failed_bus() -> None:
+def test_a_partitioned_bus_delivers_nothing() -> None:
     now_us = 0
     hub = LocalHub(lambda: now_us)
     one, other = hub.attach(agent_name(0)), hub.attach(agent_name(1))

@@ -1,4 +1,4 @@
-"""The MAVLink face: addressing, streams, requests, parameters, texts, hostile bytes, local origins, determinism."""
+"""MAVLink interface: addressing, streams, requests, parameters, texts, hostile bytes, local origins, determinism."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def test_command_int_and_set_mode_are_understood() -> None:
     assert (ack.command, ack.result) == (176, 0)
 
 
-def test_heartbeats_keep_their_tick_whoever_talks() -> None:
+def test_heartbeats_keep_their_tick_under_any_traffic() -> None:
     client = Client()
     got = client.ask(mav.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
     assert not of("HEARTBEAT", got)

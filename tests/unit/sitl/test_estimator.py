@@ -1,4 +1,4 @@
-"""Errors of the estimates: as large as they claim, slow where they should be, seeded, and gone when exact."""
+"""Errors of the estimates: of the reported size, slow where they should be, seeded, and zero when exact."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_attitude_error_is_small_and_slow(gps: dict[str, Any]) -> None:
     assert rms(white) == pytest.approx(math.degrees(model.noise_attitude_rad), rel=0.1)
 
 
-def test_the_accuracy_told_is_the_error_made(gps: dict[str, Any]) -> None:
+def test_the_reported_accuracy_is_that_of_the_errors(gps: dict[str, Any]) -> None:
     horizontal_m, vertical_m = gps["accuracy"]
     assert rms(np.linalg.norm(gps["pos"][:, :, :2], axis=2)) == pytest.approx(horizontal_m, rel=0.3)
     assert rms(gps["pos"][:, :, 2]) == pytest.approx(vertical_m, rel=0.35)
@@ -105,7 +105,7 @@ def test_a_seed_repeats_and_another_does_not() -> None:
     assert not np.allclose(first["pos"], other["pos"])
 
 
-def test_control_exact_is_the_truth() -> None:
+def test_negative_control_exact_is_the_truth() -> None:
     flown = still("exact", vehicles=2, seconds=1)
     assert not flown["pos"].any()
     assert not flown["vel"].any()

@@ -1,4 +1,4 @@
-"""Faults: each does what it says while it lasts and nothing after, on its vehicle only; wrong ones are refused."""
+"""Faults: each has its effect while it lasts and none after, on its vehicle only; invalid ones are refused."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ class Wire:
         return
 
 
-def through(count: int = 1000, *, outwards: bool = True, seed: int = 1, **troubles: float) -> list[tuple[int, bytes]]:
-    """(step, datagram) of numbered datagrams, one a step, that come out of a troubled link."""
+def through(count: int = 1000, *, outwards: bool = True, seed: int = 1, **impaired: float) -> list[tuple[int, bytes]]:
+    """Return (step, datagram) of numbered datagrams, one per step, that leave an impaired link."""
     wire = Wire()
     link = LossyLink(wire, (seed,))
-    way = link.from_vehicle if outwards else link.to_vehicle
-    for key, value in troubles.items():
-        way.trouble(key, value)
+    direction = link.from_vehicle if outwards else link.to_vehicle
+    for key, value in impaired.items():
+        direction.set_impairment(key, value)
     out = []
     for k in range(count + 50):
         if not outwards and k < count:
@@ -67,7 +67,7 @@ def through(count: int = 1000, *, outwards: bool = True, seed: int = 1, **troubl
 
 
 @pytest.mark.parametrize("outwards", [True, False])
-def test_link_troubles(outwards: bool) -> None:
+def test_link_impairments(outwards: bool) -> None:
     plain = [(k, k.to_bytes(2, "big")) for k in range(1000)]
     assert through(outwards=outwards) == plain
     assert not through(outwards=outwards, loss_01=1.0)
@@ -85,7 +85,7 @@ def test_link_troubles(outwards: bool) -> None:
     assert sum(wrong) == pytest.approx(500, abs=60)
 
 
-def test_troubles_repeat_with_their_seed() -> None:
+def test_impairments_repeat_with_their_seed() -> None:
     assert through(loss_01=0.5, seed=3) == through(loss_01=0.5, seed=3)
     assert through(loss_01=0.5, seed=3) != through(loss_01=0.5, seed=4)
 
@@ -98,7 +98,7 @@ def test_every_kind_has_a_rule_and_an_effect() -> None:
 
 @pytest.fixture
 def flown() -> FlownWorld:
-    """Two vehicles that loiter, one to be spoilt."""
+    """Two vehicles that loiter; one gets the fault."""
     world = FlownWorld(2, preset="x500")
     world.take_off()
     world.step(2.0)
@@ -230,7 +230,7 @@ def test_a_newer_fault_of_a_kind_replaces_the_older(flown: FlownWorld) -> None:
     assert flown.world.physics.rotor_health_01[0, 0] == 1.0
 
 
-def test_scheduled_faults_happen_at_their_time_and_are_told() -> None:
+def test_scheduled_faults_happen_at_their_time_and_are_logged() -> None:
     faults = [
         {"kind": "motor", "at_s": 0.5, "value": 0.5, "for_s": 0.25},
         {"kind": "link_delay", "at_s": 0.2, "vehicle": 1, "value": 50.0},

@@ -158,7 +158,7 @@ ORDERS: dict[str, Callable[[], Any]] = {
 
 
 @pytest.mark.parametrize("place", PLACES)
-def test_control_one_valid_order_among_them_is_noticed(place: str) -> None:
+def test_negative_control_one_valid_order_among_them_is_noticed(place: str) -> None:
     victim, twin = Vehicle().go(place), Vehicle().go(place)
     order = victim.codec.encode(ORDERS[place]())
     stream = itertools.chain(itertools.islice(Hostile(9, 1), 500), [order], Hostile(10, 1))
@@ -166,7 +166,7 @@ def test_control_one_valid_order_among_them_is_noticed(place: str) -> None:
         attack(victim, twin, stream, 2000)
 
 
-def test_control_a_queue_that_grows_is_found() -> None:
+def test_negative_control_a_queue_that_grows_is_found() -> None:
     vehicle = Vehicle()
     for _ in range(QUEUE_LIMIT + 1):
         vehicle.link.send(b"\xfd")

@@ -1,4 +1,4 @@
-"""Two links of one vehicle, open ports, and what a reboot leaves of either."""
+"""Two links of one vehicle, open ports, and the effect of a reboot on either."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_heartbeats_of_clients_are_forwarded_and_acks_are_not() -> None:
     assert not bench.pilot.armed
 
 
-def test_a_parameter_set_on_one_link_is_told_on_the_other() -> None:
+def test_a_parameter_set_on_one_link_is_sent_on_the_other() -> None:
     bench = Bench(gcs=True)
     bench.send(mav.MAVLink_param_set_message(1, 1, b"COM_OF_LOSS_T", 0.5, REAL32))
     bench.run(0.02)
@@ -77,7 +77,7 @@ def test_the_parameter_list_begins_with_its_hash() -> None:
     assert len(bench.said(VALUE)) < 40
 
 
-def test_an_open_port_hears_everybody_and_answers_the_first() -> None:
+def test_an_open_port_receives_from_every_sender_and_answers_the_first() -> None:
     nobody, first, second = (bind_udp("127.0.0.1", 0) for _ in range(3))
     for sock in (nobody, first, second):
         sock.settimeout(1.0)

@@ -1,4 +1,4 @@
-"""Missions: transfer, what is refused, how they are flown; geofences, battery, link and position failsafes."""
+"""Missions: transfer, refusals, flight; geofences, battery, link and position failsafes."""
 
 from __future__ import annotations
 

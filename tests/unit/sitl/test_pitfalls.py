@@ -1,4 +1,4 @@
-"""What a client of PX4 trips over, as the simulated one has it too; figures are those of PX4 1.18 in its simulator."""
+"""Pitfalls for clients of PX4, present in the simulated one too; figures are those of PX4 1.18 in its simulator."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ CURRENT_MODE, ESTIMATOR_STATUS, SYS_STATUS, HEARTBEAT = 436, 230, 1, 0
 PREARM = 0x10000000
 
 
-def test_the_mode_is_told_twice_a_second_however_often_it_is_asked_for() -> None:
+def test_the_mode_is_sent_twice_a_second_whatever_the_requests() -> None:
     bench = Bench()
     assert bench.command(511, CURRENT_MODE, 10_000) == Result.ACCEPTED
     bench.forget()
@@ -25,7 +25,7 @@ def test_the_mode_is_told_twice_a_second_however_often_it_is_asked_for() -> None
     assert len(bench.said(CURRENT_MODE)) == 8
 
 
-def test_a_change_of_the_mode_is_told_at_once() -> None:
+def test_a_change_of_the_mode_is_sent_at_once() -> None:
     bench = Bench()
     bench.command(511, CURRENT_MODE, 10_000)
     bench.run(0.3)

@@ -1,4 +1,4 @@
-"""The batched plant against thesis (1.18) written out by hand, and against physics that needs no model."""
+"""The batched plant against thesis (1.18) written out by hand, and against model-independent physics."""
 
 from __future__ import annotations
 

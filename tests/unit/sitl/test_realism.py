@@ -11,7 +11,7 @@ from sitl.lockstep import Lockstep, sitl_params
 from swarmctl.config import Config, dump, load
 from swarmctl.core.simulated import RealismParams
 from swarmctl.errors import ConfigError
-from swarmctl.ops.processes import Site, sitl_command
+from swarmctl.ops.processes import RunContext, sitl_command
 
 OUTFIT = (
     "sitl.wind.mean_ned_m_s=[3.6,0,0.5]",
@@ -43,12 +43,12 @@ def test_lockstep_flies_what_was_configured(config: Config) -> None:
 
 
 def test_a_launch_hands_everything_to_its_simulator(config: Config, tmp_path: Path) -> None:
-    site = Site("run", f"unixsock-stream/{tmp_path}/bus.sock", tmp_path)
-    argv = sitl_command(config, site, (1, 2, 3)).argv
+    context = RunContext("run", f"unixsock-stream/{tmp_path}/bus.sock", tmp_path)
+    argv = sitl_command(config, context, (1, 2, 3)).argv
     options = _parser().parse_args(list(argv[3:]))
     assert _realism(options) == config.sitl.realism()
     assert options.control == tmp_path / "sitl.sock"
-    plain = sitl_command(load(None), site, (1, 2, 3)).argv
+    plain = sitl_command(load(None), context, (1, 2, 3)).argv
     assert not [item for item in plain if item.startswith("--set")]
     assert _realism(_parser().parse_args(list(plain[3:]))) == RealismParams()
 

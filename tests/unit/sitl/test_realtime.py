@@ -34,33 +34,33 @@ class SteppedWorld:
         self._stop.wanted = len(self.times_us) >= self._steps
 
 
-def flown(steps: int, stall_at: int = -1, stall_s: float = 0.0) -> tuple[realtime.Tally, np.ndarray[Any, Any]]:
+def flown(steps: int, stall_at: int = -1, stall_s: float = 0.0) -> tuple[realtime.LoopStatistics, np.ndarray[Any, Any]]:
     stop = realtime.StopRequest()
     world = SteppedWorld(stop, steps, stall_at, stall_s)
-    tally = realtime.fly(world, stop, None)  # type: ignore[arg-type]
-    return tally, np.diff(world.times_us)
+    statistics = realtime.fly(world, stop, None)  # type: ignore[arg-type]
+    return statistics, np.diff(world.times_us)
 
 
 def test_deadlines_are_absolute() -> None:
     started = time.monotonic()
-    tally, gaps_us = flown(100)
-    assert tally.steps == 100
+    statistics, gaps_us = flown(100)
+    assert statistics.steps == 100
     assert time.monotonic() - started > 0.39
-    if tally.stalls == 0:
+    if statistics.stalls == 0:
         assert set(gaps_us.tolist()) == {4000}
 
 
 def test_a_short_delay_is_caught_up() -> None:
-    tally, gaps_us = flown(60, stall_at=10, stall_s=0.08)
-    assert tally.late > 0
-    if tally.stalls == 0:
+    statistics, gaps_us = flown(60, stall_at=10, stall_s=0.08)
+    assert statistics.late > 0
+    if statistics.stalls == 0:
         assert set(gaps_us.tolist()) == {4000}
 
 
 def test_a_long_stall_is_given_up_and_counted() -> None:
-    tally, gaps_us = flown(60, stall_at=10, stall_s=0.4)
-    assert tally.stalls >= 1
-    assert tally.lost_us > 300_000
+    statistics, gaps_us = flown(60, stall_at=10, stall_s=0.4)
+    assert statistics.stalls >= 1
+    assert statistics.lost_us > 300_000
     assert gaps_us.max() > 300_000  # stamps keep up with the clock
 
 

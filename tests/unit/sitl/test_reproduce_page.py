@@ -18,7 +18,7 @@ from sitl.studies.thesis.figures import (
     FLIGHTS,
     SWARMS,
     Extra,
-    Flight,
+    FlightName,
     IndexPoint,
     body_rates_rad_s,
     body_velocity_m_s,
@@ -39,10 +39,10 @@ RESULTS = {
     *range(90, 94),
 }  # figures of the thesis that show a flight; the others are diagrams
 OBSTACLE = Sphere((9.5, 5.5, -2.3), 1.0, 1.75)
-SECONDS: Mapping[Flight, float] = {"open_loop": 10, "pid_steps": 90, "pid_slow": 125.66, "mpc_slow": 125.66}
+SECONDS: Mapping[FlightName, float] = {"open_loop": 10, "pid_steps": 90, "pid_slow": 125.66, "mpc_slow": 125.66}
 
 
-def line_trace(name: str, flight: Flight, seconds: float = 10.0, full: bool = False) -> Trace:
+def line_trace(name: str, flight: FlightName, seconds: float = 10.0, full: bool = False) -> Trace:
     """A noisy flight along the line of the obstacle experiment, agents beside each other."""
     agents = 3 if flight in SWARMS else 1
     t_s = np.arange(0, seconds, 0.02)
@@ -81,7 +81,7 @@ def all_traces() -> dict[str, Sequence[Trace]]:
 ROWS = [
     Row("slow PID, MSE x", 0.0020, 0.0022, 0.0025, "plant", "m2"),
     Row("fast MPC, MSE y", 0.0, 6e-6, None, "plant", "m2", "printed as 0.0000"),
-    Row("circle, index at 0.90 m", 2.19, 2.38, 2.19, "full", "m", "R < 1 & so on", least=1.559),
+    Row("circle, index at 0.90 m", 2.19, 2.38, 2.19, "full", "m", "R < 1 & so on", lower_bound=1.559),
     Row("wall time", None, float("nan"), 600.0, "plant", "s"),
 ]
 
@@ -205,12 +205,12 @@ def test_an_unknown_flight_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("flight", ["open_loop", "mpc_fast", "circle", "obstacle"])
-def test_a_flight_that_never_began_is_drawn_empty(tmp_path: Path, flight: Flight) -> None:
+def test_a_flight_that_never_began_is_drawn_empty(tmp_path: Path, flight: FlightName) -> None:
     text = write_page(tmp_path, [], {flight: [line_trace("never", flight, seconds=0.0)]}).read_text(encoding="utf-8")
     parsed(text)
 
 
-def test_torques_the_full_path_does_not_have() -> None:
+def test_torques_the_full_mavlink_loop_does_not_have() -> None:
     (figure,) = (figure for figure in FIGURES if figure.number == 68)
     plant, full = line_trace("plant", "mpc_slow"), line_trace("full", "mpc_slow", full=True)
     alone = draw(figure, [full])
@@ -304,7 +304,7 @@ def test_body_rates_and_velocity_are_those_of_the_rotation() -> None:
         ("wall time", None),
     ],
 )
-def test_rows_are_grouped_by_what_their_names_speak_of(name: str, flight: Flight | None) -> None:
+def test_rows_are_grouped_by_what_their_names_speak_of(name: str, flight: FlightName | None) -> None:
     assert flight_of(name) == flight
 
 

@@ -115,7 +115,7 @@ def test_load_sags_the_voltage() -> None:
     assert stiff.volts[0] - battery.volts[0] == pytest.approx(0.1 * battery.amperes[0], rel=0.01)
 
 
-def test_control_without_a_model_nothing_is_drawn() -> None:
+def test_negative_control_without_a_model_nothing_is_drawn() -> None:
     battery = Battery(BatteryParams(), X500, 1)
     battery.advance(1000.0, np.full((4, 1), 5.0))
     assert battery.charge_01[0] == 1.0

@@ -35,11 +35,11 @@ class Clocked:
 def test_simulated_time_runs_at_its_speed(speed: float) -> None:
     stop = realtime.StopRequest()
     world: Any = Clocked(stop, round(75 * speed))
-    tally = realtime.fly(world, stop, None, speed=speed)
+    statistics = realtime.fly(world, stop, None, speed=speed)
     wall_s = (world.rows[-1][0] - world.rows[0][0]) * 1e-6
     sim_s = (world.rows[-1][1] - world.rows[0][1]) * 1e-6
-    assert {b[1] - a[1] for a, b in zip(world.rows, world.rows[1:], strict=False)} == {4000} or tally.stalls
-    if not tally.stalls:
+    assert {b[1] - a[1] for a, b in zip(world.rows, world.rows[1:], strict=False)} == {4000} or statistics.stalls
+    if not statistics.stalls:
         assert sim_s / wall_s == pytest.approx(speed, rel=0.15)
 
 
@@ -138,9 +138,9 @@ def gated(flown: FlownWorld, every_s: float, count: int, *, gate: bool) -> int:
     shifted: Any = Shifted()
     gatekeeper = realtime.Gate(shifted) if gate else None
     client.start()
-    tally = realtime.fly(shifted, stop, None, speed=1.0, gate=gatekeeper)
+    statistics = realtime.fly(shifted, stop, None, speed=1.0, gate=gatekeeper)
     client.join()
-    return tally.steps
+    return statistics.steps
 
 
 def test_physics_waits_for_a_slow_client() -> None:
@@ -172,7 +172,7 @@ def test_a_silent_client_is_waited_for_once_only(monkeypatch: pytest.MonkeyPatch
     assert time.monotonic() - began >= 0.2  # and is waited for again
 
 
-def test_nobody_in_offboard_is_not_waited_for() -> None:
+def test_without_a_vehicle_in_offboard_the_physics_does_not_wait() -> None:
     flown = offboard_world()
     gate = realtime.Gate(flown.world)
     began = time.monotonic()

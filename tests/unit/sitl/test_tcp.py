@@ -59,7 +59,7 @@ def test_without_a_client_frames_are_dropped_and_the_next_client_starts_afresh(s
         assert client.recv(100) == FRAME, "and nothing from before"
 
 
-def test_a_client_that_does_not_read_loses_whole_frames_and_blocks_nobody(server: TcpServerTransport) -> None:
+def test_a_client_that_does_not_read_loses_whole_frames_and_blocks_no_other(server: TcpServerTransport) -> None:
     with client_of(server) as client:
         client.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         began, size = time.monotonic(), 0

@@ -1,4 +1,4 @@
-"""The table of what is reproduced: every row that was asked for, by its published figure and its limit."""
+"""The table of the reproduction: every required row, with its published figure and its limit."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from sitl.studies.thesis.experiments import FULL_JOBS, PLANT_JOBS, Job
 from sitl.studies.thesis.figures import FLIGHTS, SWARMS
 from sitl.studies.thesis.page import flight_of
 from sitl.studies.thesis.trace import Row, Sphere, Trace
-from swarmctl.built_in_configs import shipped_config
+from swarmctl.built_in_configs import built_in_config
 from swarmctl.config import load
 from swarmctl.errors import EXIT_USAGE, ConfigError
 
@@ -65,7 +65,7 @@ CIRCLES: list[Wanted] = [
     )
 ]
 SETTLED: list[Wanted] = [
-    (f"circle {kind}, Table 19, 3 x 0.3 m, index after 10 s over the least possible", None, 1.05)
+    (f"circle {kind}, Table 19, 3 x 0.3 m, index after 10 s over the theoretical lower bound", None, 1.05)
     for kind in ("dmpc", "dmpc3")
 ]
 OBSTACLE: list[Wanted] = [
@@ -86,7 +86,7 @@ BETTER: list[Wanted] = [
     ("obstacle, index, dmpc3 over dmpc", None, 1.0),
 ]
 FULL: list[Wanted] = [
-    (f"{name}, full path, index differs from the plant path by", None, 0.05)
+    (f"{name}, full MAVLink loop, index differs from model only by", None, 0.05)
     for name in (
         *(f"pid_{speed} {preset}" for speed in ("slow", "fast") for preset in ("published", "retuned")),
         *(f"mpc_{speed} {preset}" for speed in ("slow", "fast") for preset in ("published", "improved")),
@@ -97,7 +97,7 @@ FULL: list[Wanted] = [
 
 
 def fake(job: Job, apart_m: float = 1.0, off_m: float = 1.0) -> Trace:
-    """A flight nobody flew: 12 s, agents `off_m` above a reference at rest and `apart_m` from each other."""
+    """A synthetic flight: 12 s, agents `off_m` above a reference at rest and `apart_m` from each other."""
     agents = 3 if job.flight in SWARMS else 1
     t_s = np.asarray(np.arange(600) * 0.02, np.float64)
     nothing = np.zeros((600, agents, 3))
@@ -129,7 +129,7 @@ def test_what_was_asked_for_is_there(
     row = table[name]
     assert row.published == published
     assert row.limit == (None if limit is None else pytest.approx(limit, rel=1e-12))
-    assert row.path == ("full" if ", full path" in name else "plant")
+    assert row.path == ("full" if ", full MAVLink loop" in name else "plant")
 
 
 def test_nothing_else_is_asked_for(table: dict[str, Row]) -> None:
@@ -169,17 +169,20 @@ def test_a_flight_alone_makes_only_rows_of_its_own_path(job: Job) -> None:
         ("MPC slow, Table 11, improved, steady RMSE", 1.0),
         ("circle dmpc, Table 19, 2 x 0.3 m, index", 3.0),
         ("circle dmpc, Table 19, 3 x 0.3 m, closer than the radius by", 0.0),
-        ("circle dmpc, Table 19, 3 x 0.3 m, index after 10 s over the least possible", 3.0 / (math.sqrt(3.0) * 0.9)),
+        (
+            "circle dmpc, Table 19, 3 x 0.3 m, index after 10 s over the theoretical lower bound",
+            3.0 / (math.sqrt(3.0) * 0.9),
+        ),
         ("obstacle dmpc3, inside the keep-out by", 0.0),
         ("circle, 3 x 0.3 m, index, dmpc3 over dmpc", 1.0),
-        ("mpc_fast improved, full path, index differs from the plant path by", 0.0),
+        ("mpc_fast improved, full MAVLink loop, index differs from model only by", 0.0),
     ],
 )
 def test_rows_show_their_figure(table: dict[str, Row], name: str, ours: float) -> None:
     assert table[name].ours == pytest.approx(ours, abs=1e-12)
 
 
-def test_distances_that_were_not_kept_are_told() -> None:
+def test_distances_that_were_not_kept_are_reported() -> None:
     near = {job.name: fake(job, apart_m=0.85, off_m=-3.5) for job in JOBS if job.flight in SWARMS}
     found = {row.name: row for row in thesis.rows(near)}
     assert found["circle dmpc, Table 19, 3 x 0.3 m, closer than the radius by"].ours == pytest.approx(0.05)
@@ -195,16 +198,16 @@ def test_a_ratio_is_of_dmpc3_over_dmpc_and_of_full_over_plant() -> None:
     flown = {
         name: fake(jobs[name]),
         name.replace("dmpc", "dmpc3"): fake(jobs[name.replace("dmpc", "dmpc3")], off_m=0.8),
-        f"{name}, full path": fake(jobs[f"{name}, full path"], off_m=0.9),
+        f"{name}, full MAVLink loop": fake(jobs[f"{name}, full MAVLink loop"], off_m=0.9),
     }
     found = {row.name: row.ours for row in thesis.rows(flown)}
     assert found["circle, 3 x 0.3 m, index, dmpc3 over dmpc"] == pytest.approx(0.8)
-    assert found[f"{name}, full path, index differs from the plant path by"] == pytest.approx(0.1)
+    assert found[f"{name}, full MAVLink loop, index differs from model only by"] == pytest.approx(0.1)
 
 
 @pytest.mark.parametrize("job", JOBS, ids=lambda job: str(job.name))
 def test_every_job_names_a_config_that_is_there_and_is_of_its_flight(job: Job) -> None:
-    config = load(shipped_config(job.config), job.overrides)
+    config = load(built_in_config(job.config), job.overrides)
     assert config.swarm.agents == (3 if job.flight in SWARMS else 1)
     assert bool(config.obstacles) is (job.flight == "obstacle")
     kinds = {"open_loop": "open_loop", "pid": "pid", "mpc": "mpc"}
@@ -214,7 +217,7 @@ def test_every_job_names_a_config_that_is_there_and_is_of_its_flight(job: Job) -
 
 @pytest.mark.parametrize("flight", [flight for flight in FLIGHTS if flight.endswith(("_slow", "_fast"))])
 def test_what_is_improved_flies_the_published_mission(flight: str) -> None:
-    published, improved = (load(shipped_config(f"{kind}_4_{flight}")) for kind in ("thesis", "improved"))
+    published, improved = (load(built_in_config(f"{kind}_4_{flight}")) for kind in ("thesis", "improved"))
     assert improved.mission == published.mission
     assert improved.starts_ned_m() == published.starts_ned_m()
 
@@ -228,7 +231,7 @@ def test_what_is_improved_flies_the_published_mission(flight: str) -> None:
     ],
 )
 def test_improved_swarms_fly_the_published_mission_and_keep_no_less(published: str, improved: str) -> None:
-    before, after = load(shipped_config(published)), load(shipped_config(improved))
+    before, after = load(built_in_config(published)), load(built_in_config(improved))
     assert after.mission == before.mission
     assert after.starts_ned_m() == before.starts_ned_m()
     assert after.separation.radius_m >= before.separation.radius_m
@@ -240,13 +243,13 @@ def test_improved_swarms_fly_the_published_mission_and_keep_no_less(published: s
 
 def test_a_config_that_is_not_there_is_refused_with_those_that_are() -> None:
     with pytest.raises(ConfigError, match=r"known are .*thesis_5_circle"):
-        shipped_config("thesis_7")
+        built_in_config("thesis_7")
 
 
 @pytest.mark.parametrize("factor", thesis.RADII)
 def test_radii_are_flown_at_what_they_are_called(factor: float) -> None:
     (job,) = (job for job in PLANT_JOBS if job.name == f"circle dmpc {factor:g} x 0.3 m")
-    config = load(shipped_config(job.config), job.overrides)
+    config = load(built_in_config(job.config), job.overrides)
     assert config.separation.radius_m == pytest.approx(0.3 * factor)
     assert config.separation.certify_slack_m <= 0.11 * config.separation.radius_m + 1e-9
 
@@ -254,16 +257,16 @@ def test_radii_are_flown_at_what_they_are_called(factor: float) -> None:
 def test_a_flight_at_true_distance_is_wider_by_what_was_missing() -> None:
     (job,) = (job for job in PLANT_JOBS if job.name == "circle dmpc 2 x 0.3 m")
     wider = thesis.wider(job, fake(job, apart_m=0.58))
-    config = load(shipped_config(wider.config), wider.overrides)
+    config = load(built_in_config(wider.config), wider.overrides)
     assert config.separation.radius_m == pytest.approx(0.62)
     row = rows_of([wider])["circle dmpc, Table 19, 2 x 0.3 m, index at equal true distance"]
     assert row.limit is None
     kept = thesis.wider(job, fake(job, apart_m=0.61))
-    assert load(shipped_config(kept.config), kept.overrides).separation.radius_m == pytest.approx(0.6)
+    assert load(built_in_config(kept.config), kept.overrides).separation.radius_m == pytest.approx(0.6)
 
 
-def test_least_index_is_that_of_an_equilateral_triangle() -> None:
-    assert thesis.least_index_m(0.9) == pytest.approx(3 * 0.9 / math.sqrt(3.0))  # circumradius of each corner
+def test_lower_bound_of_the_index_is_an_equilateral_triangle() -> None:
+    assert thesis.lower_bound_index_m(0.9) == pytest.approx(3 * 0.9 / math.sqrt(3.0))  # circumradius of each corner
     corners = 0.9 / math.sqrt(3.0) * np.exp(2j * np.pi * np.arange(3) / 3)
     off = np.stack([corners.real, corners.imag, np.zeros(3)], axis=1)
     job = PLANT_JOBS[-1]
@@ -271,7 +274,7 @@ def test_least_index_is_that_of_an_equilateral_triangle() -> None:
     trace.pos_ned_m[:] = trace.ref_pos_ned_m[:, :1] + off
     trace.ref_pos_ned_m[:] = trace.ref_pos_ned_m[:, :1]
     assert score.separation_m(trace) == pytest.approx(0.9)
-    assert score.index_m(trace) == pytest.approx(thesis.least_index_m(0.9))
+    assert score.index_m(trace) == pytest.approx(thesis.lower_bound_index_m(0.9))
 
 
 # -- which flights ----------------------------------------------------------------------------------------------------

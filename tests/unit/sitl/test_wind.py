@@ -1,4 +1,4 @@
-"""Wind: MIL-F-8785C's numbers, what it does to a vehicle, and that still air is still."""
+"""Wind: MIL-F-8785C's numbers, the effect on a vehicle, and still air."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_a_gust_is_one_minus_cosine() -> None:
     assert not east[round(3.02 / DT_S) :].any()
 
 
-def test_control_still_air_is_still() -> None:
+def test_negative_control_still_air_is_still() -> None:
     assert Air(WindParams(), 3, DT_S, 1).still
     assert not blown({}, 3.0, 1.0).any()
 

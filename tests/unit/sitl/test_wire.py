@@ -46,7 +46,7 @@ def test_seeds_follow_from_the_definitions(number: int) -> None:
 
 
 def test_the_same_method_gives_the_seed_of_a_known_message() -> None:
-    """Control for the seeds above."""
+    """Negative control for the seeds above."""
     crc = crc16.mcrf4xx(b"PING ")
     for field in ("uint64_t time_usec ", "uint32_t seq ", "uint8_t target_system ", "uint8_t target_component "):
         crc = crc16.mcrf4xx(field.encode(), crc)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.core.types import Mode, Phase, PlanStatus
-from swarmctl.telemetry.plain import to_json
+from swarmctl.telemetry.json_safe import to_json
 from swarmctl.telemetry.referee import ObstacleRule, Rules, RunData, judge
 
 UTC0_US = 1_780_000_000_000_000

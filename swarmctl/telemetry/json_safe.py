@@ -9,22 +9,22 @@ from typing import Any
 import numpy as np
 
 
-def plain(value: Any) -> Any:
+def json_safe(value: Any) -> Any:
     """The same value made of dict, list, str, int, float, bool and None; non-finite floats become None."""
     if value is None or isinstance(value, (str, bool)):
         return value
     if isinstance(value, np.generic):
-        return plain(value.item())
+        return json_safe(value.item())
     if isinstance(value, int):
         return int(value)  # also enums
     if isinstance(value, float):
         return value if math.isfinite(value) else None
     if isinstance(value, dict):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): json_safe(item) for key, item in value.items()}
     if isinstance(value, np.ndarray):
-        return plain(value.tolist())
+        return json_safe(value.tolist())
     if isinstance(value, (list, tuple, set, frozenset)):
-        return [plain(item) for item in value]
+        return [json_safe(item) for item in value]
     return str(value)
 
 
@@ -41,4 +41,4 @@ def finite(value: Any) -> float | None:
 
 def to_json(value: Any, indent: int | None = None) -> str:
     """JSON text of any value; never fails, never writes NaN."""
-    return json.dumps(plain(value), indent=indent, allow_nan=False, ensure_ascii=False)
+    return json.dumps(json_safe(value), indent=indent, allow_nan=False, ensure_ascii=False)

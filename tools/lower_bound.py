@@ -1,11 +1,11 @@
-"""The least errors that any controller can reach on the thesis' trajectories: optimal control of its own model.
+"""Theoretical lower bounds of the errors on the thesis' trajectories: optimal control of its own model.
 
     pip install 'swarmctl[bounds]'
-    python tools/least_possible.py
+    python tools/lower_bound.py
 
-The `least` figures of `swarmctl reproduce` come from here. Rigid body as a point under thrust, tilt following its
+They are the `least` figures of `swarmctl reproduce`. The model is a point mass under thrust, tilt following its
 setpoint with the attitude loop's lag, no drag, the bounds of Table 10; from the origin at rest, and with the
-reference's velocity. One of mean distance, MSE x and MSE z is minimised at a time over the first 1.8 s (after that the
+reference's velocity. Mean distance, MSE x and MSE z are minimised one at a time over the first 1.8 s (after that the
 error can be held at zero) and related to the whole flight.
 """
 
@@ -24,7 +24,7 @@ TRAJECTORIES = {"slow": (0.15, -0.1, 125.66), "fast": (0.5, -1.0, 37.7)}  # rad/
 
 
 def least(what: str, speed: str, matched: bool, thrust_min_n: float) -> float:
-    """Least mean distance [m] ("mean") or MSE [m2] ("x", "z") of one trajectory."""
+    """Return the lower bound of the mean distance [m] ("mean") or MSE [m2] ("x", "z") of one trajectory."""
     omega, climb, duration_s = TRAJECTORIES[speed]
     t_s = np.arange(STEPS) * STEP_S
     reference = np.stack([0.5 * np.cos(omega * t_s), 0.5 * np.sin(omega * t_s), -1.0 + climb * t_s], axis=1)

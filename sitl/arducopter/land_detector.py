@@ -1,18 +1,18 @@
-"""When an ArduCopter has landed, may lift off, and disarms itself."""
+"""Landing detection, lift-off and automatic disarming of an ArduCopter."""
 
 from __future__ import annotations
 
 from sitl.arducopter.parameters import CopterParameters
 from sitl.plant.sensors import Estimate
 
-LANDED_AFTER_US = 1_000_000  # continuous ground contact at low throttle
-LANDED_THROTTLE = 0.5  # of hover
+LANDED_AFTER_US = 1_000_000  # time of continuous ground contact at low throttle
+LANDED_THROTTLE = 0.5  # share of hover throttle
 ARMING_DELAY_US = 2_000_000  # before motors spin up
-TAKEOFF_SLEW_1_S = 0.5  # throttle of NAV_TAKEOFF once they have: TKOFF_SLEW_TIME of 2 s
-LIFTS_AT = 0.95  # of hover
+TAKEOFF_SLEW_1_S = 0.5  # throttle rate of NAV_TAKEOFF after the spin-up: TKOFF_SLEW_TIME of 2 s
+LIFTS_AT = 0.95  # share of hover throttle
 
 
-class Ground:
+class LandDetector:
     """Landing detector of one vehicle.
 
     Args:
@@ -31,21 +31,21 @@ class Ground:
         self._everywhere_air = everywhere_air
         self.landed = not everywhere_air
         self._contact_us: int | None = None
-        self._quiet_us = 0  # since when nothing has been asked of it on the ground
+        self._quiet_us = 0  # since when nothing has been requested on the ground
         self._armed_us = 0
-        self._rising_us: int | None = None  # since when motors spin up for a take-off
+        self._rising_us: int | None = None  # begin of the spin-up for a take-off
 
     def armed_at(self, now_us: int) -> None:
-        """The motors have been armed."""
+        """Note that the motors have been armed."""
         self._armed_us = self._quiet_us = now_us
         self._rising_us = None
 
     def stay(self) -> None:
-        """No take-off is asked for any more."""
+        """Cancel a requested take-off."""
         self._rising_us = None
 
     def watch(self, estimate: Estimate, throttle_01: float, armed: bool, now_us: int) -> None:
-        """One tick of the detector."""
+        """Run one tick of the detector."""
         if self._everywhere_air:
             return
         if not armed:
@@ -60,14 +60,14 @@ class Ground:
             self.landed, self._quiet_us, self._rising_us = True, now_us, None
 
     def takeoff_throttle_01(self, now_us: int) -> float:
-        """Of a NAV_TAKEOFF that is still on the ground: 0 while motors spin up, then rising."""
+        """Return the throttle of a NAV_TAKEOFF on the ground: 0 while motors spin up, then rising."""
         if self._rising_us is None:
             return 0.0
         since_s = (now_us - self._rising_us) * 1e-6 - self._parameters.real("MOT_SPOOL_TIME")
         return max(0.0, since_s * TAKEOFF_SLEW_1_S)
 
     def lifts_off(self, now_us: int, *, slowly: bool) -> bool:
-        """A take-off is asked for: whether the motors have spun up for it. True once, then `landed` is over.
+        """Request a take-off; return whether the motors have spun up for it. True once, which also ends `landed`.
 
         `slowly`: NAV_TAKEOFF raises the throttle first; a setpoint is flown as it is.
         """
@@ -82,7 +82,7 @@ class Ground:
         return True
 
     def disarms(self, at_once: bool, now_us: int) -> bool:
-        """Whether it is time to disarm: after DISARM_DELAY on the ground, or where the mode ends there."""
+        """Return whether to disarm: after DISARM_DELAY on the ground, or at once where the mode ends there."""
         if not self.landed:
             return False
         delay_s = self._parameters.real("DISARM_DELAY")
