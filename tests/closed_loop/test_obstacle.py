@@ -51,5 +51,7 @@ def test_it_is_known_only_within_the_visibility_distance(flight: Flight) -> None
 
 
 def test_control_unseen_it_is_hit(fly: Fly) -> None:
-    blind = fly("obstacles.0.visibility_m=0.1", "mission.duration_s=6", config=PUBLISHED)  # hit after 4.4 s
+    blind = fly(
+        "obstacles.0.visibility_m=0.1", "mission.duration_s=6", config=PUBLISHED, until=mission_is_over
+    )  # hit after 4.4 s
     assert clearance_m(blind) < 1.0
