@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from swarmctl.core.types import Landed, Mode, Phase, PlanStatus
-from tests.closed_loop.conftest import Flight, Fly
+from tests.closed_loop.conftest import Flight, Fly, mission_is_over
 
 
 def test_whole_mission_is_flown_and_landed(circle: Flight) -> None:
@@ -35,6 +35,10 @@ def test_no_plan_fails(circle: Flight) -> None:
         assert circle.modes(agent, Phase.TRACK) == {Mode.TRACKING}
 
 
+def test_the_safety_filter_never_acts(circle: Flight) -> None:
+    assert not any(circle.ticks(agent)["safety_filter_acted"].any() for agent in range(3))
+
+
 def test_vehicles_come_down_a_metre_apart(circle: Flight) -> None:
     down = circle.pos_ned_m[-1]
     starts = np.array(circle.config.starts_ned_m())
@@ -42,18 +46,19 @@ def test_vehicles_come_down_a_metre_apart(circle: Flight) -> None:
 
 
 def test_negative_control_agents_that_ignore_each_other_collide(fly: Fly) -> None:
-    alone = fly("controller.kind='mpc'", "agent.barrier.enabled=false", "mission.duration_s=5")
+    alone = fly("controller.kind='mpc'", "agent.barrier.enabled=false", "mission.duration_s=5", until=mission_is_over)
     assert alone.separation_m() < 0.3
 
 
 def test_a_wrong_mass_costs_no_altitude(fly: Fly) -> None:
-    heavy = fly("sitl.mass_scale=1.25", "swarm.agents=1", "mission.duration_s=15")
+    heavy = fly("sitl.mass_scale=1.25", "swarm.agents=1", "mission.duration_s=15", until=mission_is_over)
     ticks, error = heavy.tracked(0)
     assert np.abs(error[ticks["mission_t_s"] > 10, 2]).max() < 0.01
 
 
 def test_negative_control_without_the_observer_a_wrong_mass_does(fly: Fly) -> None:
-    heavy = fly("sitl.mass_scale=1.25", "swarm.agents=1", "mission.duration_s=15", "agent.disturbance.enabled=false")
+    off = ("agent.disturbance.enabled=false",)
+    heavy = fly("sitl.mass_scale=1.25", "swarm.agents=1", "mission.duration_s=15", *off, until=mission_is_over)
     ticks, error = heavy.tracked(0)
     assert np.abs(error[ticks["mission_t_s"] > 10, 2]).mean() > 0.05
 
@@ -63,7 +68,7 @@ def test_thrust_stays_calm_with_half_a_tick_of_latency_but_not_under_the_equalit
     fly: Fly, terminal: str, calm: bool
 ) -> None:
     late = ("sitl.link_latency_ms=10", f"controller.mpc.terminal_z={terminal}", "swarm.agents=2")
-    flight = fly("mission.duration_s=12", *late)
+    flight = fly("mission.duration_s=12", *late, until=mission_is_over)
     for agent in range(2):
         ticks = flight.ticks(agent)
         spread_01 = float(ticks["setpoint_thrust_01"][ticks["mission_t_s"] > 8.0].std())
@@ -71,6 +76,6 @@ def test_thrust_stays_calm_with_half_a_tick_of_latency_but_not_under_the_equalit
 
 
 def test_without_peers_the_reference_is_met(fly: Fly) -> None:
-    lone = fly("swarm.agents=1", "mission.duration_s=15")
+    lone = fly("swarm.agents=1", "mission.duration_s=15", until=mission_is_over)
     ticks, error = lone.tracked(0)
     assert np.linalg.norm(error[ticks["mission_t_s"] > 10], axis=1).max() < 0.01

@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import pytest
 
-from tests.closed_loop.conftest import Flight, Fly, fly_now
+from tests.closed_loop.conftest import Flight, Fly, fly_now, mission_is_over
 
-SHORT = ("mission.duration_s=3", "bus.loss_01=0.2", "bus.delay_ms=30")
+SHORT = ("mission.duration_s=3", "sitl.start=air", "bus.loss_01=0.2", "bus.delay_ms=30")
 
 
 @pytest.fixture(scope="module")
 def first() -> Flight:
-    return fly_now(*SHORT, "seed=7")
+    return fly_now(*SHORT, "seed=7", until=mission_is_over)
 
 
 def test_same_seed_same_bytes_in_any_order(first: Flight, fly: Fly) -> None:
-    again = fly(*SHORT, "seed=7", order=[2, 0, 1])
+    again = fly(*SHORT, "seed=7", order=[2, 0, 1], until=mission_is_over)
     assert first.lockstep.truth.tobytes() == again.lockstep.truth.tobytes()
 
 
 def test_negative_control_another_seed_loses_other_messages(first: Flight, fly: Fly) -> None:
-    other = fly(*SHORT, "seed=8")
+    other = fly(*SHORT, "seed=8", until=mission_is_over)
     assert first.lockstep.truth.tobytes() != other.lockstep.truth.tobytes()

@@ -34,6 +34,11 @@ def test_a_dead_agent_lands_and_the_others_keep_clear(fly: Fly, victim: int, at_
     assert flight.problems == [f"agent {victim} died"], "the others finish"
 
 
+def has_landed(running: Lockstep) -> bool:
+    """The vehicle of the agent that died is down."""
+    return running.agents[0] is None and running.world.truth_rows()[0]["landed"] == Landed.ON_GROUND
+
+
 CLUSTER = ("mission.circle.radius_m=0.0", "mission.circle.climb_ned_m_s=0.0", "mission.duration_s=12")
 
 
@@ -42,7 +47,7 @@ def test_negative_control_a_dead_agent_that_is_forgotten_is_closed_in_on(
 ) -> None:
     """Three wait around one point; the one that dies sinks in its place, which the others would take."""
     died = {8.0: lambda running: running.kill(0)}
-    remembered = fly(*CLUSTER, at=died).separation_m(only=0)
+    remembered = fly(*CLUSTER, at=died, until=has_landed).separation_m(only=0)
     remember = PeerPaths.latest
 
     def forget(self: PeerPaths) -> tuple[PredictedPath, ...]:
@@ -51,7 +56,7 @@ def test_negative_control_a_dead_agent_that_is_forgotten_is_closed_in_on(
         return tuple(path for path in paths if newest - path.t0_utc_us < 200_000)
 
     monkeypatch.setattr(PeerPaths, "latest", forget)
-    forgotten = fly(*CLUSTER, at=died).separation_m(only=0)
+    forgotten = fly(*CLUSTER, at=died, until=has_landed).separation_m(only=0)
     assert forgotten < 0.85 <= remembered
 
 

@@ -117,7 +117,7 @@ def asleep_past_the_loss() -> Watched:
     flight.run.frozen.add(0)
 
     def send(data: bytes) -> None:
-        if 0 not in flight.run.frozen or len(ours._inbox) < 150:
+        if 0 not in flight.run.frozen or len(ours._inbox) < 75:
             PipeTransport.send(vehicles, data)
 
     vehicles.send = send  # type: ignore[method-assign]

@@ -53,5 +53,7 @@ def test_the_obstacle_is_known_only_within_the_visibility_distance(flight: Fligh
 
 
 def test_negative_control_unseen_it_is_hit(fly: Fly) -> None:
-    blind = fly("obstacles.0.visibility_m=0.1", "mission.duration_s=6", config=PUBLISHED)  # hit after 4.4 s
+    blind = fly(
+        "obstacles.0.visibility_m=0.1", "mission.duration_s=6", config=PUBLISHED, until=mission_is_over
+    )  # hit after 4.4 s
     assert clearance_m(blind) < 1.0

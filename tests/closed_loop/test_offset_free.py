@@ -28,7 +28,7 @@ WIND = ("sitl.wind.mean_ned_m_s=[8,0,0]",)
 GUSTS = ("sitl.wind.gust_ned_m_s=[2,1,0]", "sitl.wind.gust_at_s=12", "sitl.wind.gust_for_s=2")
 EDDIES = ("sitl.wind.turbulence_m_s=3",)
 CURVE = ("sitl.thrust_curve_01=0.3",)
-STATE_STALE = ("agent.disturbance.limit_m_s2=0.01",)
+UNOBSERVED = ("agent.disturbance.limit_m_s2=0.01",)
 
 
 class Errors(NamedTuple):
@@ -75,7 +75,7 @@ def test_at_rest_no_error_remains() -> None:
 @pytest.mark.parametrize(
     ("without", "at_least_m"),
     [
-        (STATE_STALE, 1.0),
+        (UNOBSERVED, 1.0),
         (("agent.disturbance.limit_m_s2=4",), 0.4),  # 8 m/s are 8 m/s2 at 1 1/s of drag
         (("agent.state_filter.enabled=false",), 0.2),  # the plain observer mistakes drag for a rotating wind
         (("controller.mpc.u_max=0.45", "vehicle_model.tilt_max_rad=0.47"), 1.0),

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from tests.closed_loop.conftest import Flight, Fly, fly_now
+from tests.closed_loop.conftest import Flight, Fly, fly_now, mission_is_over
 
 DURATION_S = 10.0
 MISSION = f"mission.duration_s={DURATION_S}"
@@ -67,5 +67,5 @@ def test_positions_diverge_slowly(osqp: Flight, daqp: Flight) -> None:
 
 
 def test_negative_control_a_millimetre_at_the_start_parts_them_as_much(daqp: Flight, fly: Fly) -> None:
-    nudged = fly(MISSION, DAQP, NUDGED)
+    nudged = fly(MISSION, DAQP, NUDGED, until=mission_is_over)
     assert apart_m(daqp, nudged).max() > 0.1  # measured 0.5; 1.1 by a millimetre the other way

@@ -40,6 +40,8 @@ class SeparationParams(Params):
     brake_m_s2: float = Field(3.0, gt=0, le=50)  # assumed braking of a peer beyond its prediction
     lost_after_s: float = Field(0.5, gt=0, le=60)  # a path this old is kept clear of at every height
     gate_m: float = Field(3.0, gt=0, le=1000)  # rows farther than this from being active are left out
+    approach_01: float = Field(0.0, ge=0, le=1)  # plans keep this share more of what two are still to come closer
+    approach_max_m: float = Field(0.15, ge=0, le=10)
     stop_m_s2: float = Field(1.0, gt=0, le=50)  # braking that plans leave room for beyond their horizon
     relax_01: float = Field(0.9, gt=0, le=1)  # share of the reachable displacement a row may ask for
     right_of_way_rad: float = Field(0.35, ge=0, le=1.2)  # largest turn of head-on normals among peers
@@ -208,7 +210,8 @@ def half_spaces(
     vertical_01 = np.array([k.vertical_01 for k in keep_outs])[:, None]
     apart[:, :, 2] *= vertical_01
     below_m = apart[:, :, 2] if axes == 2 else np.zeros(apart.shape[:2])
-    needed = np.sqrt(np.maximum(radius[:, None] ** 2 - below_m**2, 0.0))  # (keep-outs, Hp)
+    kept_m = radius[:, None] + (_approach_m(keep_outs, guess_ned_m[0], apart, params) if params.approach_01 else 0.0)
+    needed = np.sqrt(np.maximum(kept_m**2 - below_m**2, 0.0))  # (keep-outs, Hp)
     apart, others = apart[:, :, :axes], others[:, :, :axes]
     distance = np.sqrt(np.einsum("skc,skc->sk", apart, apart))
     side = np.zeros((len(keep_outs), 1, axes))
@@ -235,6 +238,29 @@ def half_spaces(
     stop_s[squeezed] /= np.maximum(np.linalg.norm(normal[squeezed, -1], axis=1), _TINY_M)  # braking is scaled likewise
     stop_offset = offset[:, -1] + stop_s * np.einsum("sc,sc->s", normal[:, -1], ends)
     return HalfSpaces(normal, np.where(idle, -np.inf, offset), stop_s, np.where(idle[:, -1], -np.inf, stop_offset))
+
+
+def _approach_m(keep_outs: Sequence[KeepOut], here_ned_m: Array, apart: Array, params: SeparationParams) -> Array:
+    """Return the distance (keep-outs, Hp) kept beyond the constraint's from peers that come closer than they are now.
+
+    Prediction errors grow with the relative motion still to be flown: tilt is answered with a few per cent less and
+    accelerations bend the estimate. The margin shrinks on the way and is zero in a formation.
+
+    Args:
+        keep_outs: peers and obstacles.
+        here_ned_m: (3,) own position at the first point.
+        apart: (keep-outs, Hp, 3) from them to the guess, heights as they count.
+        params: share and limit.
+    """
+    now_m = np.array([_apart_m(k, here_ned_m) for k in keep_outs])[:, None]
+    closing_m = np.maximum(now_m - np.sqrt(np.einsum("skc,skc->sk", apart, apart)), 0.0)
+    closing_m[[k.priority_id < 0 for k in keep_outs]] = 0.0
+    return np.asarray(np.minimum(params.approach_01 * closing_m, params.approach_max_m))
+
+
+def _apart_m(keep_out: KeepOut, pos_ned_m: Array) -> float:
+    towards = pos_ned_m - keep_out.pos_ned_m[0]
+    return math.hypot(towards[0], towards[1], towards[2] * keep_out.vertical_01)
 
 
 def _with_right_of_way(normal: Array, distance: Array, needed: Array, to_goal: Array, angle_rad: Array) -> Array:
