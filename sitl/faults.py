@@ -69,7 +69,9 @@ def _mass(world: FaultTarget, vehicle: int, fault: FaultParams, now_us: int) -> 
 def _gust(world: FaultTarget, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
     on = np.zeros(world.physics.plant.state.shape[1])
     on[vehicle] = 1.0
-    gust = Gust(fault.amount * _towards(fault).reshape(3, 1), now_us * 1e-6, fault.for_s, on)
+    gust = Gust(
+        peak_ned_m_s=fault.amount * _towards(fault).reshape(3, 1), from_s=now_us * 1e-6, for_s=fault.for_s, on=on
+    )
     world.physics.air.gusts.append(gust)
     return lambda: None  # a gust ends by itself
 

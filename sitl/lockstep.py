@@ -41,7 +41,7 @@ _TRUTH_EVERY_US = 20_000
 _OBSTACLES_EVERY_US = 1_000_000
 
 
-@dataclass
+@dataclass(kw_only=True)
 class FlightLog:
     """Records of one agent, in memory and, if there is one, in a run folder."""
 
@@ -117,7 +117,7 @@ class Lockstep:
         self.links = [pipe_pair(self.clock.now_us, latency_us) for _ in range(agents)]  # (agent's, vehicle's) ends
         self.world = SitlWorld(sitl_params(config), [vehicle for _, vehicle in self.links])
         self.hub = LocalHub(self.clock.now_us, config.seed, round(config.bus.delay_ms * 1000), config.bus.loss_01)
-        self.logs = [FlightLog(directory, i, self.clock) for i in range(agents)]
+        self.logs = [FlightLog(directory=directory, agent=i, clock=self.clock) for i in range(agents)]
         self.fault_events: list[dict[str, Any]] = []
         self.world.faults.on_event = self._on_fault
         self._operator = self.hub.attach(topics.OPERATOR)

@@ -34,7 +34,7 @@ GATE_PATIENCE_US = 1_000_000
 _GATE_POLL_S = 1e-4
 
 
-@dataclass
+@dataclass(kw_only=True)
 class LoopStatistics:
     """Timing counters of the loop."""
 

@@ -52,7 +52,12 @@ def simulate(config: Config, directory: Path) -> int:
     speed_factor = flight.clock.now_us() * 1e-6 / wall_s
     shown = () if stop.count else tuple(problems)
     unwritten = _write_rows(flight, directory)
-    finished = finish_run(directory, config.rules("lockstep"), Outcome(outcome, shown, speed_factor), flight.recorded())
+    finished = finish_run(
+        directory,
+        config.rules("lockstep"),
+        Outcome(outcome=outcome, problems=shown, speed_factor=speed_factor),
+        flight.recorded(),
+    )
     summary, unwritten = finished.summary, (*unwritten, *finished.unwritten)
     if not unwritten:
         _write_recording(config, directory)

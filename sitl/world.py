@@ -58,7 +58,7 @@ class Rebooting(Protocol):
         """Restart as after power-up; `now_us` is on the clock of the simulation."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SitlParams:
     """Parameters of a simulation. `spawn_ned_m` (N, 3) is in the shared frame, whose origin the next three give."""
 
@@ -318,10 +318,10 @@ class SitlWorld:
 
         params = self.params
         start = Start(
-            self.origins[vehicle],
-            lambda: self.estimator.of(vehicle, self._now_us - (self._boot_us or 0)),
-            round(params.ekf_ready_s * 1e6),
-            params.start == "air",
+            origin=self.origins[vehicle],
+            estimate=lambda: self.estimator.of(vehicle, self._now_us - (self._boot_us or 0)),
+            ekf_ready_us=round(params.ekf_ready_s * 1e6),
+            airborne=params.start == "air",
         )
         links = [link, *self._gcs_links[vehicle : vehicle + 1]]
         pilot, interfaces = arducopter_vehicle(params.sysid_base + vehicle, links, self.plant, vehicle, start)
@@ -339,7 +339,14 @@ class SitlWorld:
                 return cached[0]
             estimate = pilot.boot.local(self.estimator.of(vehicle, now_us))
             rotors = tuple((plant.rotor_force_n[:, vehicle] * rotor_scale).tolist())
-            made = Report(estimate, pilot, pilot.boot.origin or origin, rotors, self.imu.of(vehicle), now_us)
+            made = Report(
+                estimate=estimate,
+                autopilot=pilot,
+                origin=pilot.boot.origin or origin,
+                rotor_01=rotors,
+                force_frd_m_s2=self.imu.of(vehicle),
+                simulation_us=now_us,
+            )
             cached[:] = [made]
             return made
 

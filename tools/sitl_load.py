@@ -44,7 +44,7 @@ HOVER_01 = 0.492
 LIMITS = {32: {"missed_percent": 1.0, "latency_p99_ms": 5.0}, 3: {"cpu_percent": 15.0}}
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Measured:
     """Results of one run."""
 

@@ -308,7 +308,7 @@ class ArduCopter:
             return
         if self._land_detector.landed and not self._lifts_off(now_us):
             self.throttle_in_01 = self._land_detector.takeoff_throttle_01(now_us) if self._takes_off() else 0.0
-            self.output = Command(IDLE.q_nb, self.throttle_in_01) if self.throttle_in_01 else IDLE
+            self.output = Command(q_nb=IDLE.q_nb, thrust_01=self.throttle_in_01) if self.throttle_in_01 else IDLE
             return
         self._put_out(*self._fliers[self.mode](estimate, dt_s))
 
@@ -352,7 +352,7 @@ class ArduCopter:
         boost = 1.0
         if self.parameters.integer("ATC_ANGLE_BOOST"):
             boost = 1.0 / max(0.1, 1.0 - 2.0 * float(q_nb[1] ** 2 + q_nb[2] ** 2))
-        self.output = Command(q_nb, max(0.0, min(1.0, throttle_01 * boost)))
+        self.output = Command(q_nb=q_nb, thrust_01=max(0.0, min(1.0, throttle_01 * boost)))
 
     # --- modes: attitude and throttle of this tick ---
 
@@ -396,7 +396,7 @@ class ArduCopter:
         if self._setpoints.stale(self._now_us):
             if self._setpoints.target.thrust_01 is not None and self._estimate is not None:
                 self._navigator.engage(self._estimate)
-            self._setpoints.target = Target(self._level())
+            self._setpoints.target = Target(q_nb=self._level())
         return self._setpoints.target
 
     def _return(self, estimate: Estimate, dt_s: float) -> tuple[Array, float]:

@@ -36,7 +36,7 @@ TEXT_CHARS = 50
 Params = tuple[float, float, float, float, float, float, float]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Start:
     """Initial conditions of a vehicle."""
 
@@ -334,7 +334,12 @@ def arducopter_vehicle(
 
     def report() -> CopterReport:
         rotors = tuple((plant.rotor_force_n[:, vehicle] * rotor_scale).tolist())
-        return CopterReport(pilot.clock.local(start.estimate()), pilot, pilot.clock.origin or start.origin, rotors)
+        return CopterReport(
+            estimate=pilot.clock.local(start.estimate()),
+            pilot=pilot,
+            origin=pilot.clock.origin or start.origin,
+            rotor_01=rotors,
+        )
 
     step_us = round(plant.dt_s * 1e6)
     return pilot, [ArduCopterEndpoint(sysid, link, pilot, report, step_us) for link in links]

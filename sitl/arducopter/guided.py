@@ -28,7 +28,7 @@ class Guided(enum.Enum):
     ANGLE = "angle"  # the attitude of the setpoints
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Target:
     """Flown target: an attitude that turns at body rates, with a thrust or, if that is None, at a climb rate."""
 
@@ -97,7 +97,7 @@ class Setpoints:
         rate = _STILL if ignored_rates else (float(rates[0]), float(rates[1]), float(rates[2]))
         if not all(math.isfinite(r) for r in rate):
             return "not_finite"
-        self.target = self._with_thrust(Target(attitude / math.sqrt(square), rate), thrust)
+        self.target = self._with_thrust(Target(q_nb=attitude / math.sqrt(square), rate_frd_rad_s=rate), thrust)
         self._accepted_us = now_us
         return ""
 

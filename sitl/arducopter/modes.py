@@ -70,7 +70,7 @@ class CopterState(enum.IntEnum):
     CRITICAL = 5
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class BootTimes:
     """Times of the boot steps after start [us]; in the measured order and proportions, with wiped parameters."""
 
@@ -82,7 +82,8 @@ class BootTimes:
     @classmethod
     def armable_after(cls, armable_us: int) -> BootTimes:
         """Return the measured boot (1.05, 2.45, 20.0, 23.7 s), scaled to be armable at `armable_us`."""
-        return cls(*(round(armable_us * at_s / 23.7) for at_s in (1.05, 2.45, 20.0, 23.7)))
+        heartbeat_us, initialised_us, origin_us = (round(armable_us * at_s / 23.7) for at_s in (1.05, 2.45, 20.0))
+        return cls(heartbeat_us=heartbeat_us, initialised_us=initialised_us, origin_us=origin_us, armable_us=armable_us)
 
 
 _CONSISTENT_AFTER = 0.5  # share of the boot time: only the order of these texts was measured

@@ -120,11 +120,11 @@ class CopterParameters:
         """Return a parameter by name; raises `UnknownParameterError`."""
         if name not in self._values:
             raise UnknownParameterError(name)
-        return WireValue(name, float(self._values[name]), DEFAULTS[name][0], INDEX_NOT_TOLD)
+        return WireValue(name=name, value=float(self._values[name]), kind=DEFAULTS[name][0], index=INDEX_NOT_TOLD)
 
     def by_index(self, index: int) -> WireValue:
         """Return a parameter by index; raises `UnknownParameterError` outside the table."""
         if not 0 <= index < len(self._names):
             raise UnknownParameterError(str(index))
         name = self._names[index]
-        return WireValue(name, float(self._values[name]), DEFAULTS[name][0], index)
+        return WireValue(name=name, value=float(self._values[name]), kind=DEFAULTS[name][0], index=index)

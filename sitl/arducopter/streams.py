@@ -31,7 +31,7 @@ _VERSION = 0x040603FF
 _GIT_HASH = [*b"92b0cd78"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class CopterReport:
     """Everything a message can be built from, at one instant."""
 

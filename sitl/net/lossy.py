@@ -18,7 +18,7 @@ _SET_ATTITUDE_TARGET = 82
 _NOTHING = (0.0,) * 5
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Impairments:
     """Impairments of one link direction; probabilities are per datagram."""
 

@@ -49,7 +49,7 @@ class AttitudeLoop(Protocol):
         """Write torques (3, N) [N m] to `out`; `live` (N,) is 1.0 in free flight and 0.0 for idle vehicles."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PidGains:
     """PID gains of roll, pitch, yaw; error in rad, output in N m."""
 
@@ -60,10 +60,16 @@ class PidGains:
 
 
 THESIS_GAINS = {
-    "swarm": PidGains((0.05, 0.05, 0.005), (1e-4, 1e-4, 1e-4), (0.15, 0.15, 0.05)),  # section 4.3
-    "single": PidGains((0.15, 0.05, 0.005), (1e-4, 1e-4, 1e-4), (0.3, 0.25, 0.01)),  # chapter 3
-    "pid_step": PidGains((0.9, 0.6, 1.5), (0.01, 0.001, 0.001), (0.1, 0.1, 0.65), on_measurement=True),  # chapter 2
-    "pid_trajectory": PidGains((0.2, 0.4, 0.01), (0.0, 1e-4, 0.0), (0.1, 0.1, 0.001)),
+    "swarm": PidGains(
+        proportional=(0.05, 0.05, 0.005), integral=(1e-4, 1e-4, 1e-4), derivative=(0.15, 0.15, 0.05)
+    ),  # section 4.3
+    "single": PidGains(
+        proportional=(0.15, 0.05, 0.005), integral=(1e-4, 1e-4, 1e-4), derivative=(0.3, 0.25, 0.01)
+    ),  # chapter 3
+    "pid_step": PidGains(
+        proportional=(0.9, 0.6, 1.5), integral=(0.01, 0.001, 0.001), derivative=(0.1, 0.1, 0.65), on_measurement=True
+    ),  # chapter 2
+    "pid_trajectory": PidGains(proportional=(0.2, 0.4, 0.01), integral=(0.0, 1e-4, 0.0), derivative=(0.1, 0.1, 0.001)),
 }
 THESIS_SAMPLE_S = 0.02
 
@@ -122,7 +128,7 @@ class ThesisAttitude:
         self.rates.overrule(sensed.rate_frd_rad_s, live, out)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class CascadeGains:
     """Gains of one airframe's loops; roll, pitch, yaw."""
 

@@ -24,7 +24,7 @@ _LOST_M_S2 = 0.05  # acceleration that a tilt error of 0.3 deg causes in an unco
 EXACT_ACCURACY_M = (0.01, 0.01)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ErrorModel:
     """Slow errors: root mean square and correlation time, NED per axis.
 
@@ -50,7 +50,18 @@ class ErrorModel:
         return math.hypot(north, east), down
 
 
-_PERFECT = ErrorModel((0.0,) * 3, 1.0, (0.0,) * 3, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0, (0.0, 0.0))  # carries faults only
+_PERFECT = ErrorModel(
+    position_m=(0.0,) * 3,
+    position_tau_s=1.0,
+    velocity_m_s=(0.0,) * 3,
+    velocity_tau_s=1.0,
+    tilt_rad=0.0,
+    tilt_tau_s=1.0,
+    noise_position_m=0.0,
+    noise_velocity_m_s=0.0,
+    noise_attitude_rad=0.0,
+    latency_s=(0.0, 0.0),
+)  # carries faults only
 
 ESTIMATORS: dict[str, ErrorModel | None] = {
     "exact": None,
@@ -166,17 +177,17 @@ class Estimator:
         if lost_s:
             accuracy_m = math.hypot(accuracy_m[0], 0.5 * _LOST_M_S2 * lost_s * lost_s), accuracy_m[1]
         return Estimate(
-            t_us,
-            row[0:3],
-            row[3:6],
-            row[9:13],
-            row[13:16],
-            row[6:9],
-            row[16:19],
-            self._on_ground[vehicle],
-            accuracy_m,
-            not self._lost[vehicle],
-            self.power[vehicle],
+            t_us=t_us,
+            pos_ned_m=row[0:3],
+            vel_ned_m_s=row[3:6],
+            q_nb=row[9:13],
+            euler_rad=row[13:16],
+            rate_frd_rad_s=row[6:9],
+            down_axis_ned=row[16:19],
+            on_ground=self._on_ground[vehicle],
+            pos_accuracy_m=accuracy_m,
+            gps_ok=not self._lost[vehicle],
+            battery=self.power[vehicle],
         )
 
     # --- faults ---

@@ -21,7 +21,7 @@ _SEMI_MAJOR_M = 6378137.0
 _ECCENTRICITY2 = 6.69437999014e-3  # WGS-84
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LocalOrigin:
     """Origin of one vehicle's local frame."""
 
@@ -49,12 +49,12 @@ def local_origin(spawn_ned_m: Array, shared: GeoOrigin) -> LocalOrigin:
     meridian_m = prime_m * (1 - _ECCENTRICITY2) / (1 - _ECCENTRICITY2 * sine * sine)
     e7_rad = math.radians(1e-7)
     return LocalOrigin(
-        lat_e7,
-        lon_e7,
-        alt_mm,
-        np.array([float(c) for c in offset]),
-        e7_rad * (meridian_m + alt_mm / 1e3),
-        e7_rad * (prime_m + alt_mm / 1e3) * max(1e-6, math.sqrt(1 - sine * sine)),
+        lat_e7=lat_e7,
+        lon_e7=lon_e7,
+        alt_mm=alt_mm,
+        offset_ned_m=np.array([float(c) for c in offset]),
+        metres_per_e7_north=e7_rad * (meridian_m + alt_mm / 1e3),
+        metres_per_e7_east=e7_rad * (prime_m + alt_mm / 1e3) * max(1e-6, math.sqrt(1 - sine * sine)),
     )
 
 
@@ -69,7 +69,7 @@ class Power(NamedTuple):
 FULL = Power(1.0, 16.2, -1.0)  # as PX4's SIH reports its simulated pack
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
     """State of one vehicle as its autopilot estimates it, local NED."""
 

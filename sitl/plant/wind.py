@@ -21,7 +21,7 @@ _BLOCK = 64
 _PURPOSE = 2
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Gust:
     """A gust with its peak (3, 1) NED [m/s] at half its length, on some vehicles (N,)."""
 
@@ -56,7 +56,9 @@ class Air:
         self.gusts: list[Gust] = []
         if any(params.gust_ned_m_s):
             peak = np.array(params.gust_ned_m_s).reshape(3, 1)
-            self.gusts.append(Gust(peak, params.gust_at_s, params.gust_for_s, np.ones(vehicles)))
+            self.gusts.append(
+                Gust(peak_ned_m_s=peak, from_s=params.gust_at_s, for_s=params.gust_for_s, on=np.ones(vehicles))
+            )
         self._rngs = [np.random.default_rng([seed, i, _PURPOSE]) for i in range(vehicles)]
         self._block = np.zeros((0, 5, vehicles))
         self._drawn = 0

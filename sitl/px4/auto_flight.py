@@ -148,7 +148,7 @@ class AutoFlight:
         if self._takeoff_z_m is None:
             self._takeoff_z_m = target_z_m
         if estimate.on_ground and since_s < RAMP_S:
-            return Command(IDLE.q_nb, self._navigator.hover_01 * since_s / RAMP_S)
+            return Command(q_nb=IDLE.q_nb, thrust_01=self._navigator.hover_01 * since_s / RAMP_S)
         if estimate.pos_ned_m[2] <= self._takeoff_z_m + TAKEOFF_REACHED_M:
             self.done, self.phase = True, Phase.CRUISE
             climbed = estimate.pos_ned_m[2] > self._takeoff_z_m - 1.0  # false when it started above it

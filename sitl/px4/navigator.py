@@ -32,7 +32,7 @@ _NAN = math.nan
 Triple = tuple[float, float, float]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Command:
     """Command to one vehicle's attitude loop: attitude or body rates, and collective thrust.
 
@@ -53,7 +53,7 @@ class Command:
     loose: bool = False
 
 
-IDLE = Command(np.array([1.0, 0.0, 0.0, 0.0]), 0.0, loose=True)
+IDLE = Command(q_nb=np.array([1.0, 0.0, 0.0, 0.0]), thrust_01=0.0, loose=True)
 
 
 class Navigator:
@@ -190,7 +190,9 @@ class Navigator:
         thrust = self.hover_01 * (1.0 - acc_d / GRAVITY_M_S2) / cos_tilt
         ceiling = self._parameters.real("MPC_THR_MAX")
         floor = min(self._parameters.real("MPC_THR_MIN"), ceiling) if not estimate.on_ground else THRUST_MIN_01
-        return Command(quat_from_body_z(down, self._yaw_rad), max(0.0, min(1.0, ceiling, max(floor, thrust))))
+        return Command(
+            q_nb=quat_from_body_z(down, self._yaw_rad), thrust_01=max(0.0, min(1.0, ceiling, max(floor, thrust)))
+        )
 
 
 def _limited(north: float, east: float, limit: float) -> tuple[float, float]:

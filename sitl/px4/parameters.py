@@ -81,7 +81,7 @@ HASH_INDEX = 65535
 UINT32 = 5
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class WireValue:
     """A parameter as PARAM_VALUE carries it."""
 
@@ -151,8 +151,8 @@ class Parameters:
         name = self._names[index]
         value = self._values[name]
         if isinstance(value, int):
-            return WireValue(name, int_to_wire(value), INT32, index)
-        return WireValue(name, value, REAL32, index)
+            return WireValue(name=name, value=int_to_wire(value), kind=INT32, index=index)
+        return WireValue(name=name, value=value, kind=REAL32, index=index)
 
     def checksum(self) -> WireValue:
         """Return `_HASH_CHECK`: a client that knows it can skip the list."""
@@ -161,7 +161,7 @@ class Parameters:
             wire = self.by_name(name)
             crc = zlib.crc32(name.encode() + _FLOAT.pack(wire.value), crc)
         value: float = _FLOAT.unpack(struct.pack("<I", crc))[0]
-        return WireValue(HASH_NAME, value, UINT32, HASH_INDEX)
+        return WireValue(name=HASH_NAME, value=value, kind=UINT32, index=HASH_INDEX)
 
     def set_from_wire(self, name: str, value: float, kind: int) -> WireValue:
         """Apply a PARAM_SET and return the stored value; a non-finite float is not stored.

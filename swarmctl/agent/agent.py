@@ -128,7 +128,16 @@ class Agent:
             clock,
             sink,
         )
-        self.timing = TickTiming(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        self.timing = TickTiming(
+            sense_ms=0.0,
+            setup_ms=0.0,
+            commitment_ms=0.0,
+            spaces_ms=0.0,
+            solve_ms=0.0,
+            certify_ms=0.0,
+            barrier_ms=0.0,
+            send_ms=0.0,
+        )
         self._commitment_ns = 0  # time spent on coordination in the last tick
         self._gaps = self._jumps = 0  # setpoint gaps and estimate jumps already reported
         self._announced: tuple[Phase, Mode, FlightMode] | None = None
@@ -202,15 +211,15 @@ class Agent:
         sent_ns = self._stopwatch_ns()
         times = NO_TIMES if planning.plan is None else planning.plan.times
         self.timing = TickTiming(
-            (sensed_ns - began_ns) * 1e-6,
-            (planned_ns - sensed_ns - self._commitment_ns) * 1e-6
+            sense_ms=(sensed_ns - began_ns) * 1e-6,
+            setup_ms=(planned_ns - sensed_ns - self._commitment_ns) * 1e-6
             - (times.spaces_us + times.solve_us + times.certify_us) * 1e-3,
-            self._commitment_ns * 1e-6,
-            times.spaces_us * 1e-3,
-            times.solve_us * 1e-3,
-            times.certify_us * 1e-3,
-            self._safety_filter.took_ms,
-            (sent_ns - planned_ns) * 1e-6 - self._safety_filter.took_ms,
+            commitment_ms=self._commitment_ns * 1e-6,
+            spaces_ms=times.spaces_us * 1e-3,
+            solve_ms=times.solve_us * 1e-3,
+            certify_ms=times.certify_us * 1e-3,
+            barrier_ms=self._safety_filter.took_ms,
+            send_ms=(sent_ns - planned_ns) * 1e-6 - self._safety_filter.took_ms,
         )
         self._share(state, flown)
         self._advance(now_us, state)
@@ -222,7 +231,9 @@ class Agent:
             now_us,
             state,
             planning,
-            ControlOutput(self._decision.mode, flown, setpoint, self._safety_filter.acts),
+            ControlOutput(
+                mode=self._decision.mode, flown=flown, setpoint=setpoint, safety_filter_acted=self._safety_filter.acts
+            ),
             self._state_machine,
             self._observer.estimate,
             deadline_misses,
@@ -280,7 +291,7 @@ class Agent:
         if state is None or not self._fresh(now_us, state):
             if self._coordination is not None:  # the autopilot flies the vehicle, on stale setpoints or by its failsafe
                 self._coordination.idle(self._clock.utc_us(), state)
-            return PlanningResult(None, None, None, [])
+            return PlanningResult(start=None, plan=None, reference=None, keep_outs=[])
         estimate = self._observer.estimate
         act_us = now_us + self._predictor.delay_us
         if self._state_machine.had_control:
@@ -290,7 +301,13 @@ class Agent:
         else:
             self._virtual_control = np.array([0.0, 0.0, GRAVITY_M_S2])
             cos_tilt = float(body_z_ned(state.q_nb)[2])
-            start = Start(act_us, state.pos_ned_m, state.vel_ned_m_s, cos_tilt, self._virtual_control)
+            start = Start(
+                t_us=act_us,
+                pos_ned_m=state.pos_ned_m,
+                vel_ned_m_s=state.vel_ned_m_s,
+                cos_tilt=cos_tilt,
+                virtual_control=self._virtual_control,
+            )
         steps, dt_us = self._controller.steps, self._controller.dt_us
         keep_outs = self._world_model.keep_outs(
             state.pos_ned_m, self._utc(act_us), dt_us, steps, self._state_machine.phase
@@ -302,14 +319,22 @@ class Agent:
         reference, now_ref = self._reference_selector.reference(now_us, self._clock.utc_us(), ahead_s)
         committed = self._coordinated(now_us, state, flies)
         if not flies:
-            return PlanningResult(start, None, now_ref, keep_outs)
+            return PlanningResult(start=start, plan=None, reference=now_ref, keep_outs=keep_outs)
         if committed is not None:
             reference = committed
         guess = self._plan_buffer.guess_ned_m(act_us)
         controller = self._controller if self._state_machine.phase is Phase.TRACK else self._transit
         kept = tuple(keep_outs) if committed is None else ()  # a committed trajectory keeps clear of them already
-        plan = controller.plan(Problem(start, reference, estimate.disturbance_ned_m_s2, kept, guess))
-        return PlanningResult(start, plan, now_ref, keep_outs)
+        plan = controller.plan(
+            Problem(
+                start=start,
+                reference=reference,
+                disturbance_ned_m_s2=estimate.disturbance_ned_m_s2,
+                keep_outs=kept,
+                guess_ned_m=guess,
+            )
+        )
+        return PlanningResult(start=start, plan=plan, reference=now_ref, keep_outs=keep_outs)
 
     def _coordinated(self, now_us: int, state: VehicleState, flies: bool) -> Reference | None:
         """Return the committed trajectory over the horizon from when the setpoint acts; None if there is none."""
@@ -356,18 +381,18 @@ class Agent:
         good = self._plan_buffer.plan
         delay_us = self._predictor.delay_us
         health = Health(
-            _NO_TIME_US if state is None else max(0, now_us - state.t_us),
-            state is not None and state.armed,
-            FlightMode.UNKNOWN if state is None else state.mode,
-            Landed.UNKNOWN if state is None else state.landed,
-            state is not None and state.failsafe,
-            PlanStatus.NONE if plan is None else plan.status,
-            _NO_TIME_US if good is None else now_us + delay_us - good.t0_us,
-            0 if self._certified_us is None else now_us - self._certified_us,
-            0.0 if state is None else math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s)),
-            self._state_machine.phase,
-            self._state_machine.had_control,
-            self._state_machine.pilot_override,
+            state_age_us=_NO_TIME_US if state is None else max(0, now_us - state.t_us),
+            armed=state is not None and state.armed,
+            mode=FlightMode.UNKNOWN if state is None else state.mode,
+            landed=Landed.UNKNOWN if state is None else state.landed,
+            autopilot_failsafe=state is not None and state.failsafe,
+            plan_status=PlanStatus.NONE if plan is None else plan.status,
+            last_good_plan_age_us=_NO_TIME_US if good is None else now_us + delay_us - good.t0_us,
+            planless_us=0 if self._certified_us is None else now_us - self._certified_us,
+            speed_m_s=0.0 if state is None else math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s)),
+            phase=self._state_machine.phase,
+            had_control=self._state_machine.had_control,
+            pilot_override=self._state_machine.pilot_override,
         )
         self._decision = decide(health, self._setup.params.failsafe)
 
@@ -425,15 +450,15 @@ class Agent:
         before = self._state_machine.phase, self._state_machine.had_control
         utc_us, dialect = self._clock.utc_us(), self._autopilot.dialect
         inputs = PhaseInputs(
-            now_us,
-            utc_us,
-            state,
-            self._vehicle_setup.ready,
-            self._autopilot.armable,
-            self._commands.busy,
-            self._decision.mode,
-            self._coordination is None and self._world_model.has_unresponsive_peer(utc_us),
-            self._world_model.peers(),
+            now_us=now_us,
+            utc_us=utc_us,
+            state=state,
+            prepared=self._vehicle_setup.ready,
+            armable=self._autopilot.armable,
+            busy=self._commands.busy,
+            mode=self._decision.mode,
+            unresponsive_peer=self._coordination is None and self._world_model.has_unresponsive_peer(utc_us),
+            peers=self._world_model.peers(),
             others_ned_m=self._world_model.others_ned_m(utc_us),
             arm_in=None if dialect is None else dialect.arm_in,
             boots=self._autopilot.clock.boots,
@@ -496,12 +521,28 @@ class Agent:
         margin_m = min(MAX_RADIUS_M, self._autopilot.frame.margin_m + self._overload.margin_m)
         if flown is not None:
             t0_us, dt_us, pos = self._utc(flown.t0_us), flown.dt_us, flown.pos_ned_m
-            return PredictedPath(setup.agent, setup.boot_id, seq, t0_us, dt_us, margin_m, pos)
+            return PredictedPath(
+                agent=setup.agent,
+                boot_id=setup.boot_id,
+                seq=seq,
+                t0_utc_us=t0_us,
+                dt_us=dt_us,
+                radius_m=margin_m,
+                pos_ned_m=pos,
+            )
         act_us, dt_us = self._clock.now_us() + self._predictor.delay_us, self._controller.dt_us
         grid = np.arange(self._controller.steps + 1, dtype=np.float64)
         ahead_s = grid * (dt_us * 1e-6) + (act_us - state.t_us) * 1e-6
         pos = predict_constant_velocity(state, ahead_s, setup.separation.brake_m_s2)
-        return PredictedPath(setup.agent, setup.boot_id, seq, self._utc(act_us), dt_us, margin_m, pos)
+        return PredictedPath(
+            agent=setup.agent,
+            boot_id=setup.boot_id,
+            seq=seq,
+            t0_utc_us=self._utc(act_us),
+            dt_us=dt_us,
+            radius_m=margin_m,
+            pos_ned_m=pos,
+        )
 
     def _fresh(self, now_us: int, state: VehicleState) -> bool:
         return now_us - state.t_us <= self._setup.params.failsafe.state_max_age_s * 1e6

@@ -50,15 +50,15 @@ def make_agent(
     commands = slow_path(autopilot, codec)
     autopilot.attach(commands)
     setup = AgentSetup(
-        agent,
-        boot_id,
-        sysid,
-        config.agent,
-        config.mission,
-        np.array(config.starts_ned_m()),
-        config.controller,
-        config.separation,
-        config.model_of(agent),
-        min(max(1, len(config.obstacles)), config.separation.max_obstacles),
+        agent=agent,
+        boot_id=boot_id,
+        sysid=sysid,
+        params=config.agent,
+        mission=config.mission,
+        starts_ned_m=np.array(config.starts_ned_m()),
+        controller=config.controller,
+        separation=config.separation,
+        vehicle_model=config.model_of(agent),
+        max_obstacles=min(max(1, len(config.obstacles)), config.separation.max_obstacles),
     )
     return Agent(setup, autopilot, commands, bus, clock, sink, stopwatch_ns)

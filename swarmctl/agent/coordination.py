@@ -98,11 +98,13 @@ class Coordination:
         self._world_model.peer_commitments = {agent: known[agent].followed for agent in taking_part}
         partners = {agent: known[agent] for agent in taking_part}
         others = self._others(utc_us, state, phase, taking_part)
-        commitments.evade(Situation(utc_us, utc_us, desired, partners, others))
+        commitments.evade(Situation(utc_us=utc_us, begin_us=utc_us, desired=desired, peers=partners, others=others))
         if commitments.is_due(utc_us):
             begin_us = utc_us + commitments.lead_us
             others = self._others(begin_us, state, phase, taking_part)
-            commitments.propose(Situation(utc_us, begin_us, desired, known, others))
+            commitments.propose(
+                Situation(utc_us=utc_us, begin_us=begin_us, desired=desired, peers=known, others=others)
+            )
         self._watch(float(np.linalg.norm(state.pos_ned_m - self.follow(np.array([utc_us]))[0][0])))
 
     def idle(self, utc_us: int, state: VehicleState | None) -> None:
@@ -124,14 +126,14 @@ class Coordination:
             return
         self._seq += 1
         message = TrajectoryMessage(
-            self._agent,
-            self._boot_id,
-            self._seq,
-            utc_us,
-            self._is_committed,
-            self._commitments.committed,
-            self._commitments.proposal,
-            self._peer_trajectories.acknowledgements(),
+            agent=self._agent,
+            boot_id=self._boot_id,
+            seq=self._seq,
+            sent_utc_us=utc_us,
+            is_committed=self._is_committed,
+            committed=self._commitments.committed,
+            proposal=self._commitments.proposal,
+            acknowledged=self._peer_trajectories.acknowledgements(),
         )
         self._bus.publish(topics.TRAJECTORY, encode_trajectory_message(message))
 
@@ -165,7 +167,17 @@ class Coordination:
     def _ends(self, message: TrajectoryMessage) -> list[KeepOut]:
         p = self._separation
         ends = [np.tile(trajectory.pos_ned_m[-1], (2, 1)) for trajectory in message.followed]
-        return [KeepOut(end, p.planned_m, committed_m(p), False, message.agent, p.downwash) for end in ends]
+        return [
+            KeepOut(
+                pos_ned_m=end,
+                radius_m=p.planned_m,
+                hard_min_distance_m=committed_m(p),
+                any_height=False,
+                priority_id=message.agent,
+                downwash=p.downwash,
+            )
+            for end in ends
+        ]
 
     def _others(self, t0_utc_us: int, state: VehicleState, phase: Phase, taking_part: set[int]) -> list[KeepOut]:
         """Return keep-outs of obstacles and of peers that do not take part, on the planner's grid from `t0_utc_us` on.

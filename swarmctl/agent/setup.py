@@ -40,7 +40,7 @@ class AgentParams(Params):
     )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class AgentSetup:
     """Everything one agent needs before it starts."""
 

@@ -43,7 +43,7 @@ class TickSink(Protocol):
     def event(self, name: str, t_us: int, utc_us: int, **fields: Any) -> None: ...
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PlanningResult:
     """Result of the planning part of a tick; all but `keep_outs` is None while the own state is stale."""
 
@@ -53,7 +53,7 @@ class PlanningResult:
     keep_outs: list[KeepOut]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ControlOutput:
     """Output of a tick: mode, flown plan and setpoint sent."""
 
@@ -63,7 +63,7 @@ class ControlOutput:
     safety_filter_acted: bool = False
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TickTiming:
     """Durations of the parts of a tick [ms]."""
 

@@ -193,7 +193,7 @@ class WorldModel:
         for agent, trajectories in self.peer_commitments.items():
             share_01 = 0.5 if self._flies_itself(agent) else 1.0
             for pos, vel in (trajectory.at(act_utc_us + ahead_s * 1e6) for trajectory in trajectories):
-                found.append(Body(pos, vel, p.body_m + margin_m, share_01))
+                found.append(Body(pos_ned_m=pos, vel_ned_m_s=vel, apart_m=p.body_m + margin_m, share_01=share_01))
         for path in self.paths.latest():
             if path.agent in self.peer_commitments:
                 continue

@@ -83,7 +83,7 @@ class ReceivedMessage(NamedTuple):
     payload: bytes
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Stream:
     """The newest message of a sequence of messages that continue one another."""
 
@@ -186,4 +186,10 @@ class SenderVerifier:
 
 
 def _new_stream(received: ReceivedMessage, utc_us: int) -> _Stream:
-    return _Stream(received.boot_id, received.seq, received.sent_utc_us, utc_us, received.sent_utc_us)
+    return _Stream(
+        boot_id=received.boot_id,
+        seq=received.seq,
+        sent_utc_us=received.sent_utc_us,
+        received_utc_us=utc_us,
+        began_utc_us=received.sent_utc_us,
+    )

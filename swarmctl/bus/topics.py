@@ -19,7 +19,7 @@ import numpy as np
 from swarmctl.core.types import MAX_RADIUS_M, FlightMode, Mode, Obstacle, Phase, PredictedPath
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Topic:
     """Describes one stream of an agent, or of the operator, on the bus."""
 
@@ -29,12 +29,12 @@ class Topic:
     reliable: bool
 
 
-PATH = Topic("path", ring=4, max_bytes=4096, reliable=False)
-STATUS = Topic("status", ring=4, max_bytes=16_384, reliable=False)
-TICK = Topic("tick", ring=256, max_bytes=4096, reliable=False)
-COMMAND = Topic("command", ring=64, max_bytes=1024, reliable=True)
-OBSTACLES = Topic("obstacles", ring=4, max_bytes=65_536, reliable=True)
-TRAJECTORY = Topic("trajectory", ring=4, max_bytes=131_072, reliable=False)  # each one replaces all earlier ones
+PATH = Topic(name="path", ring=4, max_bytes=4096, reliable=False)
+STATUS = Topic(name="status", ring=4, max_bytes=16_384, reliable=False)
+TICK = Topic(name="tick", ring=256, max_bytes=4096, reliable=False)
+COMMAND = Topic(name="command", ring=64, max_bytes=1024, reliable=True)
+OBSTACLES = Topic(name="obstacles", ring=4, max_bytes=65_536, reliable=True)
+TRAJECTORY = Topic(name="trajectory", ring=4, max_bytes=131_072, reliable=False)  # each one replaces all earlier ones
 TOPICS = (PATH, STATUS, TICK, COMMAND, OBSTACLES, TRAJECTORY)
 
 TOO_LONG = b""  # replaces a message that is too long; every decoder refuses it
@@ -88,7 +88,9 @@ def decode_path(payload: bytes) -> PredictedPath | None:
     points = np.frombuffer(payload, "<f4", 3 * count, header_len).reshape(count, 3).astype(np.float64)
     if not (np.isfinite(points).all() and math.isfinite(radius_m) and 0.0 <= radius_m <= MAX_RADIUS_M):
         return None
-    return PredictedPath(agent, boot_id, seq, t0_utc_us, dt_us, radius_m, points)
+    return PredictedPath(
+        agent=agent, boot_id=boot_id, seq=seq, t0_utc_us=t0_utc_us, dt_us=dt_us, radius_m=radius_m, pos_ned_m=points
+    )
 
 
 class StatusMessage(msgspec.Struct, frozen=True):
@@ -137,7 +139,14 @@ class ObstacleMessage(msgspec.Struct, frozen=True):
     def obstacle(self) -> Obstacle:
         """Return the obstacle as a core type."""
         center, vel = np.array(self.center_ned_m), np.array(self.vel_ned_m_s)
-        return Obstacle(center, self.radius_m, self.keep_out_m, self.visibility_m, vel, self.column)
+        return Obstacle(
+            center_ned_m=center,
+            radius_m=self.radius_m,
+            keep_out_m=self.keep_out_m,
+            visibility_m=self.visibility_m,
+            vel_ned_m_s=vel,
+            column=self.column,
+        )
 
 
 class ObstaclesMessage(msgspec.Struct, frozen=True):

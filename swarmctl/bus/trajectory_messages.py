@@ -72,7 +72,7 @@ def decode_trajectory_message(payload: bytes, memory: Memory | None = None) -> T
         if flags & _HAS_PROPOSAL:
             number, made_utc_us = _PROPOSAL.unpack_from(payload, at)
             trajectory, at = _decode_trajectory(payload, at + _PROPOSAL.size, known, sent)
-            proposal = Proposal(number, made_utc_us, agent, trajectory)
+            proposal = Proposal(number=number, made_utc_us=made_utc_us, agent=agent, trajectory=trajectory)
         if len(payload) != at + count * _ACKNOWLEDGEMENT.size:
             return None
         acknowledged = dict(_ACKNOWLEDGEMENT.iter_unpack(payload[at:]))
@@ -80,7 +80,14 @@ def decode_trajectory_message(payload: bytes, memory: Memory | None = None) -> T
             memory.clear()
             memory.update(sent)
         return TrajectoryMessage(
-            agent, boot_id, seq, sent_utc_us, bool(flags & _IS_COMMITTED), committed, proposal, acknowledged
+            agent=agent,
+            boot_id=boot_id,
+            seq=seq,
+            sent_utc_us=sent_utc_us,
+            is_committed=bool(flags & _IS_COMMITTED),
+            committed=committed,
+            proposal=proposal,
+            acknowledged=acknowledged,
         )
     except (struct.error, ValueError):
         return None
@@ -109,7 +116,9 @@ def _decode_trajectory(payload: bytes, at: int, known: Memory, sent: Memory) -> 
     points: Array = np.frombuffer(payload, "<f4", 6 * count, at).reshape(count, 6).astype(np.float64)
     if not np.isfinite(points).all():
         raise ValueError("not finite")
-    sent[body] = Trajectory(t0_utc_us, dt_us, points[:, :3].copy(), points[:, 3:].copy())
+    sent[body] = Trajectory(
+        t0_utc_us=t0_utc_us, dt_us=dt_us, pos_ned_m=points[:, :3].copy(), vel_ned_m_s=points[:, 3:].copy()
+    )
     return sent[body], end
 
 

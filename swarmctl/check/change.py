@@ -9,7 +9,7 @@ from swarmctl.check.finding import Finding, Verdict
 from swarmctl.check.parameters import Number
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Change:
     """One parameter that was to be changed."""
 
@@ -34,7 +34,15 @@ class Change:
         """Return the finding for a change that was not made."""
         found = "not told" if self.after is None else f"{self.after:g}"
         advice = f"--apply did not set it: {self._why()}"
-        return Finding(self.agent, f"apply {self.name}", Verdict.FIX, found, f"{self.wanted:g}", advice, 98)
+        return Finding(
+            agent=self.agent,
+            topic=f"apply {self.name}",
+            verdict=Verdict.FIX,
+            found=found,
+            wanted=f"{self.wanted:g}",
+            advice=advice,
+            weight=98,
+        )
 
     def _why(self) -> str:
         return self.refused or "the autopilot kept its own value"

@@ -17,7 +17,7 @@ class Verdict(enum.IntEnum):
     FIX = 2  # the vehicle can't fly, or not safely
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
     """One line of a check."""
 

@@ -13,7 +13,7 @@ from swarmctl.core.types import FlightMode, Landed
 Ned = tuple[float, float, float]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Parameter:
     """One parameter as the autopilot stores it; `value` is None when it does not exist or was not answered."""
 
@@ -23,7 +23,7 @@ class Parameter:
     refused: bool = False  # the autopilot has reported that it does not exist
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RoundTrip:
     """Round-trip times of the answered requests."""
 
@@ -42,7 +42,7 @@ class VehicleTime:
     sigma_ppm: float  # standard error of the drift
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LinkFacts:
     """Statistics of one link over the time it was listened to."""
 
@@ -59,7 +59,7 @@ class LinkFacts:
     time: VehicleTime | None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Version:
     """Firmware and board from AUTOPILOT_VERSION."""
 
@@ -95,7 +95,7 @@ class Gps:
     pos_horiz_m: float | None  # reported by the receiver
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Sensors:
     """Sensor bits (MAV_SYS_STATUS_SENSOR) and battery from SYS_STATUS."""
 
@@ -106,7 +106,7 @@ class Sensors:
     battery_01: float | None
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleFacts:
     """Everything known about one vehicle of the configuration."""
 

@@ -71,7 +71,9 @@ def round_trip(answers: Sequence[Answer], by: str) -> RoundTrip | None:
     if not answers:
         return None
     took_ms = np.array([a.arrived_us - a.sent_us for a in answers]) * 1e-3  # (answers,)
-    return RoundTrip(float(np.percentile(took_ms, 50)), float(np.percentile(took_ms, 99)), len(answers), by)
+    return RoundTrip(
+        p50_ms=float(np.percentile(took_ms, 50)), p99_ms=float(np.percentile(took_ms, 99)), answers=len(answers), by=by
+    )
 
 
 def vehicle_time(answers: Sequence[Answer]) -> VehicleTime | None:

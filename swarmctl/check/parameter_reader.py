@@ -24,7 +24,7 @@ _AT_ONCE = 6  # few, for slow serial links
 _DOES_NOT_EXIST = 1  # MAV_PARAM_ERROR
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Setting:
     value: float | int
     tries: int = 0
@@ -59,11 +59,11 @@ class ParameterReader:
 
     def facts(self) -> dict[str, Parameter]:
         """Return all requested parameters; those that were never answered have no value."""
-        return {name: self.values.get(name, Parameter(name, None)) for name in self._names}
+        return {name: self.values.get(name, Parameter(name=name, value=None)) for name in self._names}
 
     def set_all(self, values: Mapping[str, float | int]) -> None:
         """Queue values to be set, each in the type it was read with."""
-        self._settings |= {name: _Setting(value) for name, value in values.items() if name in self.values}
+        self._settings |= {name: _Setting(value=value) for name, value in values.items() if name in self.values}
 
     def step(self, now_us: int, may_change: bool) -> list[Any]:
         """Return the messages to send now."""
@@ -95,13 +95,13 @@ class ParameterReader:
             if not math.isfinite(value):
                 return  # not an answer to a request
             whole = message.param_type < _REAL32
-            self.values[name] = Parameter(name, int(value) if whole else value, message.param_type)
+            self.values[name] = Parameter(name=name, value=int(value) if whole else value, kind=message.param_type)
             self._confirm(name)
         elif kind == "PARAM_ERROR":
             name = _text(message.param_id)
             self._settings.pop(name, None)
             if message.error == _DOES_NOT_EXIST and name in self._tries:
-                self.values[name] = Parameter(name, None, refused=True)
+                self.values[name] = Parameter(name=name, value=None, refused=True)
 
     def _confirm(self, name: str) -> None:
         setting = self._settings.get(name)
@@ -125,7 +125,11 @@ class ParameterReader:
             return [self._read(name)]
         kind = self.values[name].kind
         number = round(setting.value)
-        asked = Command(Verb.PARAM_INT, number=number) if kind < _REAL32 else Command(Verb.PARAM_FLOAT, setting.value)
+        asked = (
+            Command(verb=Verb.PARAM_INT, number=number)
+            if kind < _REAL32
+            else Command(verb=Verb.PARAM_FLOAT, value=setting.value)
+        )
         wire, _ = self._dialect.to_wire(asked)
         return [mavlink.MAVLink_param_set_message(*self._target, name.encode(), wire, kind)]
 

@@ -26,7 +26,7 @@ _LAND_WITHOUT_STATION = 5  # FS_GCS_ENABLE
 _WEIGHT_WANTED, _WEIGHT_TABLE = 60, 50
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Opinion:
     """An assessment of one value of one parameter."""
 
@@ -49,7 +49,7 @@ class Row:
 
 
 def _ok(wanted: str) -> Opinion:
-    return Opinion(Verdict.OK, wanted)
+    return Opinion(verdict=Verdict.OK, wanted=wanted)
 
 
 # --- PX4 ---
@@ -59,23 +59,29 @@ def _offboard_loss(value: float, facts: VehicleFacts, config: Config) -> Opinion
     if value in (4, 5):
         return _ok("4 land, 5 hold")
     meet = "the way home is not kept clear of the others"
-    return Opinion(Verdict.NOTE, "4 land, 5 hold", f"when setpoints stop the vehicle returns, and {meet}; 4 lands")
+    return Opinion(
+        verdict=Verdict.NOTE,
+        wanted="4 land, 5 hold",
+        advice=f"when setpoints stop the vehicle returns, and {meet}; 4 lands",
+    )
 
 
 def _offboard_timeout(value: float, facts: VehicleFacts, config: Config) -> Opinion:
     wanted = "0.2 to 1.0 s"
     if value > 1.0:
         why = "for that long the last attitude is flown when setpoints stop"
-        return Opinion(Verdict.FIX, wanted, f"{why}; set 1.0", 1.0)
+        return Opinion(verdict=Verdict.FIX, wanted=wanted, advice=f"{why}; set 1.0", to_set=1.0)
     if value < 0.2:
-        return Opinion(Verdict.FIX, wanted, "a few late setpoints would end offboard; set 0.5", 0.5)
+        return Opinion(
+            verdict=Verdict.FIX, wanted=wanted, advice="a few late setpoints would end offboard; set 0.5", to_set=0.5
+        )
     return _ok(wanted)
 
 
 def _forward_setpoints(value: float, facts: VehicleFacts, config: Config) -> Opinion:
     if value == 1:
         return _ok("1")
-    return Opinion(Verdict.FIX, "1", "setpoints over MAVLink are not flown; set 1", 1)
+    return Opinion(verdict=Verdict.FIX, wanted="1", advice="setpoints over MAVLink are not flown; set 1", to_set=1)
 
 
 def _radio_exception(value: float, facts: VehicleFacts, config: Config) -> Opinion:
@@ -89,11 +95,11 @@ def _radio_exception(value: float, facts: VehicleFacts, config: Config) -> Opini
     action = facts.number("NAV_RCL_ACT")
     told = "" if action is None else f" (NAV_RCL_ACT = {action:g})"
     return Opinion(
-        Verdict.FIX,
-        "bit 2, offboard",
-        f"a radio is expected (COM_RC_IN_MODE = {source:g}) and none is there: its loss ends offboard{told}; "
+        verdict=Verdict.FIX,
+        wanted="bit 2, offboard",
+        advice=f"a radio is expected (COM_RC_IN_MODE = {source:g}) and none is there: its loss ends offboard{told}; "
         "switch it on, or except offboard",
-        int(value) | _OFFBOARD_EXCEPTED,
+        to_set=int(value) | _OFFBOARD_EXCEPTED,
     )
 
 
@@ -104,7 +110,9 @@ def _radio_source(value: float, facts: VehicleFacts, config: Config) -> Opinion:
 def _thrust_model(value: float, facts: VehicleFacts, config: Config) -> Opinion:
     if value == 0 and facts.version is not None and facts.version.has_usb:  # simulators have no such circuit
         return Opinion(
-            Verdict.NOTE, "0.2 to 0.5", "thrust is taken as linear, real propellers are not: calibrate it to hover well"
+            verdict=Verdict.NOTE,
+            wanted="0.2 to 0.5",
+            advice="thrust is taken as linear, real propellers are not: calibrate it to hover well",
         )
     return _ok("0 simulated, 0.2 to 0.5 real")
 
@@ -114,13 +122,21 @@ def _hover(value: float, facts: VehicleFacts, config: Config) -> Opinion:
     wanted = f"vehicle_model.hover_thrust_01 = {ours:g}"
     if abs(value - ours) <= _HOVER_APART_01:
         return _ok(wanted)
-    return Opinion(Verdict.NOTE, wanted, f"first guesses differ; set vehicle_model.hover_thrust_01 = {value:g}")
+    return Opinion(
+        verdict=Verdict.NOTE,
+        wanted=wanted,
+        advice=f"first guesses differ; set vehicle_model.hover_thrust_01 = {value:g}",
+    )
 
 
 def _own_sysid(value: float, facts: VehicleFacts, config: Config) -> Opinion:
     if value == facts.sysid:
         return _ok(f"{facts.wanted_sysid}")
-    return Opinion(Verdict.FIX, f"{facts.wanted_sysid}", "it still speaks as another one; reboot the autopilot")
+    return Opinion(
+        verdict=Verdict.FIX,
+        wanted=f"{facts.wanted_sysid}",
+        advice="it still speaks as another one; reboot the autopilot",
+    )
 
 
 # --- ArduCopter ---
@@ -130,7 +146,7 @@ def _guided_options(value: float, facts: VehicleFacts, config: Config) -> Opinio
     if int(value) & 8:
         return _ok("bit 3, thrust as thrust")
     advice = "thrust would be flown as a climb rate; set bit 3"
-    return Opinion(Verdict.FIX, "bit 3, thrust as thrust", advice, int(value) | 8)
+    return Opinion(verdict=Verdict.FIX, wanted="bit 3, thrust as thrust", advice=advice, to_set=int(value) | 8)
 
 
 def _guided_timeout(value: float, facts: VehicleFacts, config: Config) -> Opinion:
@@ -138,32 +154,45 @@ def _guided_timeout(value: float, facts: VehicleFacts, config: Config) -> Opinio
     if 0 < value <= _GUIDED_SILENCE_S:
         return _ok(wanted)
     why = "for that long the last attitude is flown when setpoints stop"
-    return Opinion(Verdict.NOTE, wanted, f"{why}; set {_GUIDED_SILENCE_S:g}", _GUIDED_SILENCE_S)
+    return Opinion(
+        verdict=Verdict.NOTE, wanted=wanted, advice=f"{why}; set {_GUIDED_SILENCE_S:g}", to_set=_GUIDED_SILENCE_S
+    )
 
 
 def _ground_station_failsafe(value: float, facts: VehicleFacts, config: Config) -> Opinion:
     if value == _LAND_WITHOUT_STATION:
         return _ok("5, land")
-    return Opinion(Verdict.FIX, "5, land", "without its agent it would drift on for ever", _LAND_WITHOUT_STATION)
+    return Opinion(
+        verdict=Verdict.FIX,
+        wanted="5, land",
+        advice="without its agent it would drift on for ever",
+        to_set=_LAND_WITHOUT_STATION,
+    )
 
 
 def _throttle_failsafe(value: float, facts: VehicleFacts, config: Config) -> Opinion:
     radio = facts.sensors is not None and bool(facts.sensors.present & facts.sensors.healthy & RC_RECEIVER)
     if value == 0 or radio:
         return _ok("0, or a radio")
-    return Opinion(Verdict.NOTE, "0, or a radio", "no radio is seen: arming is refused, or its loss ends GUIDED")
+    return Opinion(
+        verdict=Verdict.NOTE,
+        wanted="0, or a radio",
+        advice="no radio is seen: arming is refused, or its loss ends GUIDED",
+    )
 
 
 def _ekf_failsafe(value: float, facts: VehicleFacts, config: Config) -> Opinion:
     if value in (1, 3):
         return _ok("1 or 3, land")
-    return Opinion(Verdict.NOTE, "1 or 3, land", "a diverging estimator does not land the vehicle")
+    return Opinion(
+        verdict=Verdict.NOTE, wanted="1 or 3, land", advice="a diverging estimator does not land the vehicle"
+    )
 
 
 def _arming_check(value: float, facts: VehicleFacts, config: Config) -> Opinion:
     if value != 0:
         return _ok("1, all")
-    return Opinion(Verdict.NOTE, "1, all", "nothing is checked before arming")
+    return Opinion(verdict=Verdict.NOTE, wanted="1, all", advice="nothing is checked before arming")
 
 
 def _angle_max(value: float, facts: VehicleFacts, config: Config) -> Opinion:
@@ -172,7 +201,11 @@ def _angle_max(value: float, facts: VehicleFacts, config: Config) -> Opinion:
     if value >= least - 1:
         return _ok(wanted)
     lower = math.floor(math.radians(value / 100) * 100) / 100
-    return Opinion(Verdict.NOTE, wanted, f"the autopilot clips; set vehicle_model.tilt_max_rad = {lower:g} or raise it")
+    return Opinion(
+        verdict=Verdict.NOTE,
+        wanted=wanted,
+        advice=f"the autopilot clips; set vehicle_model.tilt_max_rad = {lower:g} or raise it",
+    )
 
 
 ROWS: dict[str, tuple[Row, ...]] = {
@@ -255,12 +288,12 @@ def _opinion(name: str, facts: VehicleFacts, config: Config, rule: Rule | None, 
         return _ok("set by the agent for its flight")
     if value is None:
         if rule is not None:
-            return Opinion(Verdict.FIX, "readable", rule.problem(None))
-        return Opinion(Verdict.NOTE, "", "this autopilot does not tell it: not judged")
+            return Opinion(verdict=Verdict.FIX, wanted="readable", advice=rule.problem(None))
+        return Opinion(verdict=Verdict.NOTE, wanted="", advice="this autopilot does not tell it: not judged")
     judged = None if row is None else row.judge(value, facts, config)
     broken = "" if rule is None else rule.problem(value)
     if judged is None:
-        return Opinion(Verdict.FIX, "", broken) if broken else _ok("")
+        return Opinion(verdict=Verdict.FIX, wanted="", advice=broken) if broken else _ok("")
     return replace(judged, verdict=Verdict.FIX, advice=broken) if broken else judged
 
 
@@ -269,13 +302,18 @@ def _as_configured(name: str, facts: VehicleFacts, config: Config, rule: Rule | 
     wanted = f"{want:g} (agent.autopilot_params)"
     broken = "" if rule is None else rule.problem(want)
     if broken:
-        return Opinion(Verdict.FIX, wanted, f"the configuration asks for it: {broken}")
+        return Opinion(verdict=Verdict.FIX, wanted=wanted, advice=f"the configuration asks for it: {broken}")
     if value is None:
         advice = f"this autopilot has no such parameter; remove agent.autopilot_params.{name}"
-        return Opinion(Verdict.NOTE if rule is None else Verdict.FIX, wanted, advice)
+        return Opinion(verdict=Verdict.NOTE if rule is None else Verdict.FIX, wanted=wanted, advice=advice)
     if math.isclose(value, want, rel_tol=1e-6, abs_tol=1e-9):
         return _ok(wanted)
-    return Opinion(Verdict.NOTE, wanted, f"the agent sets it for its flight; --apply sets {want:g} for good", want)
+    return Opinion(
+        verdict=Verdict.NOTE,
+        wanted=wanted,
+        advice=f"the agent sets it for its flight; --apply sets {want:g} for good",
+        to_set=want,
+    )
 
 
 def _finding(facts: VehicleFacts, name: str, opinion: Opinion) -> Finding:
@@ -284,4 +322,12 @@ def _finding(facts: VehicleFacts, name: str, opinion: Opinion) -> Finding:
     found = "not told" if value is None else f"{value:g}"
     why = next((row.why for row in ROWS[facts.autopilot] if row.name == name), "")
     wanted = ": ".join(filter(None, (opinion.wanted, why)))
-    return Finding(facts.agent, name, opinion.verdict, found, wanted, opinion.advice, weight)
+    return Finding(
+        agent=facts.agent,
+        topic=name,
+        verdict=opinion.verdict,
+        found=found,
+        wanted=wanted,
+        advice=opinion.advice,
+        weight=weight,
+    )

@@ -29,8 +29,20 @@ _UNKNOWN_8, _UNKNOWN_16 = 255, 65535
 
 def unreached(agent: int, url: str, wanted_sysid: int, why: str) -> VehicleFacts:
     """Return the facts of a vehicle whose link could not be opened."""
-    link = LinkFacts(0.0, {}, 0.0, 0.0, 0.0, 0, 0, (), 0, None, None)
-    return VehicleFacts(agent, url, wanted_sysid, why, link)
+    link = LinkFacts(
+        listened_s=0.0,
+        rates_hz={},
+        frames_s=0.0,
+        bytes_s=0.0,
+        lost_01=0.0,
+        mavlink1=0,
+        mavlink2=0,
+        autopilots=(),
+        senders=0,
+        round_trip=None,
+        time=None,
+    )
+    return VehicleFacts(agent=agent, url=url, wanted_sysid=wanted_sysid, unreachable=why, link=link)
 
 
 def facts_of(
@@ -47,7 +59,7 @@ def facts_of(
     link = _link(scan, scan.listened_s(now_us))
     beat = scan.message("HEARTBEAT")
     if beat is None:
-        return VehicleFacts(agent, url, wanted_sysid, _silence(scan), link)
+        return VehicleFacts(agent=agent, url=url, wanted_sysid=wanted_sysid, unreachable=_silence(scan), link=link)
     dialect = DIALECTS.get(beat.autopilot)
     pos, origin, told = _place(scan, shared)
     return VehicleFacts(
@@ -111,13 +123,13 @@ def _version(message: Any | None) -> Version | None:
     uid = bytes(message.uid2).rstrip(b"\0").hex() or "0"
     capabilities = message.capabilities
     return Version(
-        (flight >> 24 & 0xFF, flight >> 16 & 0xFF, flight >> 8 & 0xFF),
-        stage,
-        readable.strip("0") and readable,
-        message.board_version,
-        uid,
-        True if capabilities & _BYTEWISE else False if capabilities & _C_CAST else None,
-        message.vendor_id,
+        firmware=(flight >> 24 & 0xFF, flight >> 16 & 0xFF, flight >> 8 & 0xFF),
+        stage=stage,
+        git=readable.strip("0") and readable,
+        board=message.board_version,
+        uid=uid,
+        bytewise=True if capabilities & _BYTEWISE else False if capabilities & _C_CAST else None,
+        vendor=message.vendor_id,
     )
 
 
@@ -131,11 +143,11 @@ def _sensors(message: Any | None) -> Sensors | None:
     if message is None:
         return None
     return Sensors(
-        message.onboard_control_sensors_present,
-        message.onboard_control_sensors_enabled,
-        message.onboard_control_sensors_health,
-        None if message.voltage_battery in (0, _UNKNOWN_16) else message.voltage_battery * 1e-3,
-        None if message.battery_remaining < 0 else message.battery_remaining * 1e-2,
+        present=message.onboard_control_sensors_present,
+        enabled=message.onboard_control_sensors_enabled,
+        healthy=message.onboard_control_sensors_health,
+        battery_v=None if message.voltage_battery in (0, _UNKNOWN_16) else message.voltage_battery * 1e-3,
+        battery_01=None if message.battery_remaining < 0 else message.battery_remaining * 1e-2,
     )
 
 

@@ -38,7 +38,14 @@ def standing(vehicles: Sequence[VehicleFacts]) -> list[Finding]:
     """Return a finding for each vehicle that may not be flown now: armed, in the air, or of unknown state."""
     advice = "another program flies it, or has left it armed: land and disarm it first"
     return [
-        Finding(facts.agent, "to fly", FIX, "armed" if facts.armed else facts.landed.name.lower(), "on ground", advice)
+        Finding(
+            agent=facts.agent,
+            topic="to fly",
+            verdict=FIX,
+            found="armed" if facts.armed else facts.landed.name.lower(),
+            wanted="on ground",
+            advice=advice,
+        )
         for facts in vehicles
         if facts.armed or facts.landed is not Landed.ON_GROUND
     ]
@@ -58,7 +65,17 @@ def _start(facts: VehicleFacts, config: Config) -> list[Finding]:
 
     def line(verdict: Verdict, advice: str = "", weight: int = 0) -> list[Finding]:
         found = f"{away_m:.2f} m beside it, {climb_m:+.2f} m below"
-        return [Finding(facts.agent, "start", verdict, found, _place(start), advice, weight)]
+        return [
+            Finding(
+                agent=facts.agent,
+                topic="start",
+                verdict=verdict,
+                found=found,
+                wanted=_place(start),
+                advice=advice,
+                weight=weight,
+            )
+        ]
 
     if facts.landed is Landed.ON_GROUND and climb_m < _CLIMB_LEAST_M:
         advice = (
@@ -81,10 +98,30 @@ def _duplicates(vehicles: Sequence[VehicleFacts], config: Config) -> list[Findin
     for a, b in itertools.combinations([v for v in vehicles if v.reached], 2):
         if a.sysid == b.sysid:
             advice = f"agents {a.agent} and {b.agent} would command the same id: give each autopilot its own"
-            lines.append(Finding(SWARM, "system ids", FIX, f"{a.sysid} twice", "all different", advice, 96))
+            lines.append(
+                Finding(
+                    agent=SWARM,
+                    topic="system ids",
+                    verdict=FIX,
+                    found=f"{a.sysid} twice",
+                    wanted="all different",
+                    advice=advice,
+                    weight=96,
+                )
+            )
         elif a.version and b.version and a.version.uid == b.version.uid and a.version.has_usb:
             advice = f"agents {a.agent} and {b.agent} are connected to the same board"
-            lines.append(Finding(SWARM, "system ids", FIX, f"uid {a.version.uid} twice", "all different", advice, 96))
+            lines.append(
+                Finding(
+                    agent=SWARM,
+                    topic="system ids",
+                    verdict=FIX,
+                    found=f"uid {a.version.uid} twice",
+                    wanted="all different",
+                    advice=advice,
+                    weight=96,
+                )
+            )
     return lines
 
 
@@ -94,7 +131,15 @@ def _origins(vehicles: Sequence[VehicleFacts], config: Config) -> list[Finding]:
     if len(known) < 2:
         return []
     spread_m = max(math.dist(a, b) for a, b in itertools.combinations(known, 2))
-    return [Finding(SWARM, "origins", OK, f"up to {spread_m:.2f} m apart", "any; agents convert")]
+    return [
+        Finding(
+            agent=SWARM,
+            topic="origins",
+            verdict=OK,
+            found=f"up to {spread_m:.2f} m apart",
+            wanted="any; agents convert",
+        )
+    ]
 
 
 def _apart(vehicles: Sequence[VehicleFacts], config: Config) -> list[Finding]:
@@ -107,16 +152,18 @@ def _apart(vehicles: Sequence[VehicleFacts], config: Config) -> list[Finding]:
     close = sorted(pair for pair in pairs if pair[0] < radius_m)
     wanted = f"separation.radius_m = {radius_m:g}"
     if not close:
-        return [Finding(SWARM, "distances", OK, f"least {min(pairs)[0]:.2f} m", wanted)]
+        return [
+            Finding(agent=SWARM, topic="distances", verdict=OK, found=f"least {min(pairs)[0]:.2f} m", wanted=wanted)
+        ]
     return [
         Finding(
-            SWARM,
-            "distances",
-            FIX,
-            f"agents {i} and {j}: {away_m:.2f} m",
-            wanted,
-            f"vehicles of agents {i} and {j} stand closer than they may fly; move them apart",
-            80,
+            agent=SWARM,
+            topic="distances",
+            verdict=FIX,
+            found=f"agents {i} and {j}: {away_m:.2f} m",
+            wanted=wanted,
+            advice=f"vehicles of agents {i} and {j} stand closer than they may fly; move them apart",
+            weight=80,
         )
         for away_m, i, j in close
     ]
@@ -134,11 +181,21 @@ def _radius(vehicles: Sequence[VehicleFacts], config: Config) -> list[Finding]:
         f"{least_m:.2f} m: body {separation.body_m:g}, tracking {separation.tracking_m:g}, estimator {max(told):.2f}"
     )
     if separation.radius_m >= least_m:
-        return [Finding(SWARM, "radius", OK, found, wanted)]
+        return [Finding(agent=SWARM, topic="radius", verdict=OK, found=found, wanted=wanted)]
     advice = f"bodies may touch where estimates say they are apart: set separation.radius_m = {least_m:.2f}"
     if separation.allow_small_radius:
-        return [Finding(SWARM, "radius", NOTE, found, wanted, advice, 9)]
-    return [Finding(SWARM, "radius", FIX, found, wanted, f"{advice}; agents refuse to arm", 79)]
+        return [Finding(agent=SWARM, topic="radius", verdict=NOTE, found=found, wanted=wanted, advice=advice, weight=9)]
+    return [
+        Finding(
+            agent=SWARM,
+            topic="radius",
+            verdict=FIX,
+            found=found,
+            wanted=wanted,
+            advice=f"{advice}; agents refuse to arm",
+            weight=79,
+        )
+    ]
 
 
 def _swapped(vehicles: Sequence[VehicleFacts], config: Config) -> list[Finding]:
@@ -151,7 +208,17 @@ def _swapped(vehicles: Sequence[VehicleFacts], config: Config) -> list[Finding]:
         crossed_m = math.dist(p[:2], starts[j][:2]) + math.dist(q[:2], starts[i][:2])
         if crossed_m + _SWAPPED_BY_M < straight_m:
             advice = f"vehicles of agents {i} and {j} stand nearer to each other's start: change their order, or place"
-            lines.append(Finding(SWARM, "order", NOTE, f"agents {i} and {j}", "each nearest its own start", advice, 6))
+            lines.append(
+                Finding(
+                    agent=SWARM,
+                    topic="order",
+                    verdict=NOTE,
+                    found=f"agents {i} and {j}",
+                    wanted="each nearest its own start",
+                    advice=advice,
+                    weight=6,
+                )
+            )
     return lines
 
 

@@ -67,12 +67,28 @@ def _unreached(facts: VehicleFacts) -> Finding:
         advice += f" {_LATCH}"
     if facts.link.mavlink1 or facts.link.mavlink2:
         advice = f"something sends to {facts.url}, but no autopilot: check the address and the routing"
-    return Finding(facts.agent, "link", FIX, facts.unreachable, "an autopilot's heartbeat", advice, 100)
+    return Finding(
+        agent=facts.agent,
+        topic="link",
+        verdict=FIX,
+        found=facts.unreachable,
+        wanted="an autopilot's heartbeat",
+        advice=advice,
+        weight=100,
+    )
 
 
 def _autopilot(facts: VehicleFacts, config: Config) -> Finding:
     def line(verdict: Verdict, found: str, advice: str = "", weight: int = 0) -> Finding:
-        return Finding(facts.agent, "autopilot", verdict, found, "PX4 or ArduCopter", advice, weight)
+        return Finding(
+            agent=facts.agent,
+            topic="autopilot",
+            verdict=verdict,
+            found=found,
+            wanted="PX4 or ArduCopter",
+            advice=advice,
+            weight=weight,
+        )
 
     if not facts.autopilot:
         return line(FIX, f"MAV_AUTOPILOT {facts.autopilot_number}", "swarmctl flies PX4 and ArduCopter", 95)
@@ -95,15 +111,27 @@ def _autopilot(facts: VehicleFacts, config: Config) -> Finding:
 def _board(facts: VehicleFacts, config: Config) -> Finding | None:
     if facts.version is None:
         return None
-    return Finding(facts.agent, "board", OK, f"{facts.version.board}, uid {facts.version.uid}")
+    return Finding(
+        agent=facts.agent, topic="board", verdict=OK, found=f"{facts.version.board}, uid {facts.version.uid}"
+    )
 
 
 def _sysid(facts: VehicleFacts, config: Config) -> Finding:
     if facts.sysid == facts.wanted_sysid:
-        return Finding(facts.agent, "system id", OK, f"{facts.sysid}", f"{facts.wanted_sysid}")
+        return Finding(
+            agent=facts.agent, topic="system id", verdict=OK, found=f"{facts.sysid}", wanted=f"{facts.wanted_sysid}"
+        )
     name = "SYSID_THISMAV" if facts.autopilot == "ArduCopter" else "MAV_SYS_ID"
     advice = f"set {name} = {facts.wanted_sysid} and reboot, or correct the configuration: an agent ignores all others"
-    return Finding(facts.agent, "system id", FIX, f"{facts.sysid}", f"{facts.wanted_sysid}", advice, 92)
+    return Finding(
+        agent=facts.agent,
+        topic="system id",
+        verdict=FIX,
+        found=f"{facts.sysid}",
+        wanted=f"{facts.wanted_sysid}",
+        advice=advice,
+        weight=92,
+    )
 
 
 def _link(facts: VehicleFacts, config: Config) -> Finding:
@@ -111,7 +139,15 @@ def _link(facts: VehicleFacts, config: Config) -> Finding:
     found = f"{link.frames_s:.0f} frames/s, {link.bytes_s / 1e3:.1f} kB/s"
 
     def line(verdict: Verdict, told: str, advice: str = "", weight: int = 0) -> Finding:
-        return Finding(facts.agent, "link", verdict, told, "one autopilot, MAVLink 2", advice, weight)
+        return Finding(
+            agent=facts.agent,
+            topic="link",
+            verdict=verdict,
+            found=told,
+            wanted="one autopilot, MAVLink 2",
+            advice=advice,
+            weight=weight,
+        )
 
     if not link.mavlink2:
         name = "SERIALx_PROTOCOL = 2" if facts.autopilot == "ArduCopter" else "MAV_PROTO_VER = 2"
@@ -130,7 +166,15 @@ def _state(facts: VehicleFacts, config: Config) -> Finding:
     found = ", ".join(words)
 
     def line(verdict: Verdict, advice: str = "", weight: int = 0) -> Finding:
-        return Finding(facts.agent, "state", verdict, found, "disarmed, on ground", advice, weight)
+        return Finding(
+            agent=facts.agent,
+            topic="state",
+            verdict=verdict,
+            found=found,
+            wanted="disarmed, on ground",
+            advice=advice,
+            weight=weight,
+        )
 
     if facts.system_status >= _CRITICAL:
         return line(FIX, f"the autopilot reports a failsafe or emergency (MAV_STATE {facts.system_status})", 99)
@@ -145,7 +189,15 @@ def _sensors(facts: VehicleFacts, config: Config) -> Finding:
     sensors = facts.sensors
 
     def line(verdict: Verdict, found: str, advice: str = "", weight: int = 0) -> Finding:
-        return Finding(facts.agent, "sensors", verdict, found, "healthy, ready to arm", advice, weight)
+        return Finding(
+            agent=facts.agent,
+            topic="sensors",
+            verdict=verdict,
+            found=found,
+            wanted="healthy, ready to arm",
+            advice=advice,
+            weight=weight,
+        )
 
     if sensors is None:
         return line(NOTE, "not told", "SYS_STATUS does not come; the agent asks for it")
@@ -164,7 +216,15 @@ def _battery(facts: VehicleFacts, config: Config) -> Finding:
     left_01 = facts.sensors.battery_01 if facts.sensors else None
 
     def line(verdict: Verdict, found: str, advice: str = "", weight: int = 0) -> Finding:
-        return Finding(facts.agent, "battery", verdict, found, f"over {_BATTERY_LOW_01:.0%}", advice, weight)
+        return Finding(
+            agent=facts.agent,
+            topic="battery",
+            verdict=verdict,
+            found=found,
+            wanted=f"over {_BATTERY_LOW_01:.0%}",
+            advice=advice,
+            weight=weight,
+        )
 
     told = "" if volts is None else f"{volts:.1f} V"
     if left_01 is None:
@@ -185,7 +245,15 @@ def _estimator(facts: VehicleFacts, config: Config) -> Finding:
     found = ", ".join(filter(None, (told, fix)))
 
     def line(verdict: Verdict, what: str, advice: str = "", weight: int = 0) -> Finding:
-        return Finding(facts.agent, "estimator", verdict, what or "not told", "all estimates", advice, weight)
+        return Finding(
+            agent=facts.agent,
+            topic="estimator",
+            verdict=verdict,
+            found=what or "not told",
+            wanted="all estimates",
+            advice=advice,
+            weight=weight,
+        )
 
     if estimator is not None:
         missing = [name for bit, name in _ESTIMATES.items() if not estimator.flags >> bit & 1]
@@ -205,7 +273,15 @@ def _place(facts: VehicleFacts, config: Config) -> Finding:
     origin = facts.origin_ned_m
 
     def line(verdict: Verdict, found: str, advice: str = "", weight: int = 0) -> Finding:
-        return Finding(facts.agent, "origin", verdict, found, "near swarm.origin_*", advice, weight)
+        return Finding(
+            agent=facts.agent,
+            topic="origin",
+            verdict=verdict,
+            found=found,
+            wanted="near swarm.origin_*",
+            advice=advice,
+            weight=weight,
+        )
 
     if origin is None:
         advice = "it tells neither GPS_GLOBAL_ORIGIN nor a global position: it can't be placed among the others"
@@ -240,15 +316,25 @@ def _rates(facts: VehicleFacts, config: Config) -> Finding | None:
                 f"{planned / 1e3:.1f} kB/s would be sent over a link for {most / 1e3:.1f}: raise the baud rate, "
                 "lower agent.state_machine.state_rate_hz, or stop other streams"
             )
-            return Finding(facts.agent, "state rate", FIX, found, wanted, advice, 68)
-    return Finding(facts.agent, "state rate", OK, found, wanted)
+            return Finding(
+                agent=facts.agent, topic="state rate", verdict=FIX, found=found, wanted=wanted, advice=advice, weight=68
+            )
+    return Finding(agent=facts.agent, topic="state rate", verdict=OK, found=found, wanted=wanted)
 
 
 def _loss(facts: VehicleFacts, config: Config) -> Finding:
     lost_01 = facts.link.lost_01
     verdict = FIX if lost_01 > _LOSS_FIX_01 else NOTE if lost_01 > _LOSS_NOTE_01 else OK
     advice = "" if verdict is OK else "frames are lost on the way: antennas, baud rate, or too much is sent"
-    return Finding(facts.agent, "loss", verdict, f"{lost_01:.1%}", f"under {_LOSS_NOTE_01:.0%}", advice, 67)
+    return Finding(
+        agent=facts.agent,
+        topic="loss",
+        verdict=verdict,
+        found=f"{lost_01:.1%}",
+        wanted=f"under {_LOSS_NOTE_01:.0%}",
+        advice=advice,
+        weight=67,
+    )
 
 
 def _latency(facts: VehicleFacts, config: Config) -> Finding:
@@ -257,7 +343,15 @@ def _latency(facts: VehicleFacts, config: Config) -> Finding:
     oldest_ms = config.agent.failsafe.state_max_age_s * 1e3
 
     def line(verdict: Verdict, found: str, advice: str = "", weight: int = 0) -> Finding:
-        return Finding(facts.agent, "round trip", verdict, found, f"p50 under {2 * tick_ms:.0f} ms", advice, weight)
+        return Finding(
+            agent=facts.agent,
+            topic="round trip",
+            verdict=verdict,
+            found=found,
+            wanted=f"p50 under {2 * tick_ms:.0f} ms",
+            advice=advice,
+            weight=weight,
+        )
 
     if trip is None:
         return line(NOTE, "no answer", "it answers neither TIMESYNC nor PING: the link's delay is not known")
@@ -279,7 +373,15 @@ def _clock(facts: VehicleFacts, config: Config) -> Finding | None:
     found = f"offset {time.offset_s:+.3f} s, drift {time.drift_ppm:+.0f}{spread} ppm"
     verdict = FIX if sure_ppm > _DRIFT_FIX_PPM else NOTE if sure_ppm > _DRIFT_NOTE_PPM else OK
     advice = "" if verdict is OK else "its clock runs off; a simulator short of CPU does so: give it more, or fly fewer"
-    return Finding(facts.agent, "clock", verdict, found, f"under {_DRIFT_NOTE_PPM:.0f} ppm", advice, 55)
+    return Finding(
+        agent=facts.agent,
+        topic="clock",
+        verdict=verdict,
+        found=found,
+        wanted=f"under {_DRIFT_NOTE_PPM:.0f} ppm",
+        advice=advice,
+        weight=55,
+    )
 
 
 _ROWS: tuple[Callable[[VehicleFacts, Config], Finding | None], ...] = (

@@ -89,7 +89,19 @@ class _OpenLoop:
         pos = start.pos_ned_m + t_s * start.vel_ned_m_s
         vel = np.tile(start.vel_ned_m_s, (self.steps + 1, 1))
         nothing = np.zeros((self.steps, 3))
-        return Plan(PlanStatus.OK, start.t_us, self.dt_us, pos, vel, nothing, NO_TIMES, 0, 0.0, 0.0, 0.0)
+        return Plan(
+            status=PlanStatus.OK,
+            t0_us=start.t_us,
+            dt_us=self.dt_us,
+            pos_ned_m=pos,
+            vel_ned_m_s=vel,
+            virtual_control=nothing,
+            times=NO_TIMES,
+            iterations=0,
+            slack_m=0.0,
+            residual_m=0.0,
+            terminal_gap_m=0.0,
+        )
 
     def reset(self) -> None:
         return

@@ -51,4 +51,16 @@ def brake_and_hold_plan(
         accel[:2] = disturbance_ned_m_s2[:2] - thrust * acts
         pos[k + 1] = pos[k] + dt_s * vel[k] + 0.5 * dt_s * dt_s * accel
         vel[k + 1] = vel[k] + dt_s * accel
-    return Plan(PlanStatus.NONE, start.t_us, dt_us, pos, vel, virtual_control, NO_TIMES, 0, 0.0, 0.0, 0.0)
+    return Plan(
+        status=PlanStatus.NONE,
+        t0_us=start.t_us,
+        dt_us=dt_us,
+        pos_ned_m=pos,
+        vel_ned_m_s=vel,
+        virtual_control=virtual_control,
+        times=NO_TIMES,
+        iterations=0,
+        slack_m=0.0,
+        residual_m=0.0,
+        terminal_gap_m=0.0,
+    )

@@ -96,9 +96,17 @@ class Predictor:
         left_us = max(0, until_us - t_us)
         pos, vel, tilt, rate = self._advance(pos, vel, tilt, rate, current, disturbance_ned_m_s2, left_us)
         if self._lag is None:
-            return Start(until_us, pos, vel, float(down[2]), held)
+            return Start(t_us=until_us, pos_ned_m=pos, vel_ned_m_s=vel, cos_tilt=float(down[2]), virtual_control=held)
         cos_tilt = math.sqrt(max(0.0, 1.0 - float(tilt @ tilt)))
-        return Start(until_us, pos, vel, cos_tilt, held, tilt, rate)
+        return Start(
+            t_us=until_us,
+            pos_ned_m=pos,
+            vel_ned_m_s=vel,
+            cos_tilt=cos_tilt,
+            virtual_control=held,
+            tilt=tilt,
+            tilt_rate_1_s=rate,
+        )
 
     def _advance(
         self,

@@ -78,7 +78,19 @@ class PidController:
         pos = start.pos_ned_m + t_s * start.vel_ned_m_s
         vel = np.tile(start.vel_ned_m_s, (p.path_steps + 1, 1))
         held = np.tile(virtual_control, (p.path_steps, 1))
-        return Plan(PlanStatus.OK, start.t_us, self.dt_us, pos, vel, held, NO_TIMES, 0, 0.0, 0.0, 0.0)
+        return Plan(
+            status=PlanStatus.OK,
+            t0_us=start.t_us,
+            dt_us=self.dt_us,
+            pos_ned_m=pos,
+            vel_ned_m_s=vel,
+            virtual_control=held,
+            times=NO_TIMES,
+            iterations=0,
+            slack_m=0.0,
+            residual_m=0.0,
+            terminal_gap_m=0.0,
+        )
 
     def _ahead(self, reference: Reference) -> Array:
         """Return pitch, roll and thrust over mass (3,) for the reference's acceleration (linearised at hover)."""

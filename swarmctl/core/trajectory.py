@@ -16,7 +16,7 @@ Times = NDArray[Any]  # UTC [us], integer or float
 _STOPPED_M_S = 1e-3
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Trajectory:
     """Holds positions and velocities at equal steps from `t0_utc_us` on; at rest before and after them."""
 
@@ -88,7 +88,9 @@ def interpolate(polylines: Sequence[Array], k: Array) -> Array:
 
 def resting(pos_ned_m: Array, t_utc_us: int, dt_us: int) -> Trajectory:
     """Return the trajectory that rests at a position (3,)."""
-    return Trajectory(t_utc_us, dt_us, np.tile(pos_ned_m, (2, 1)), np.zeros((2, 3)))
+    return Trajectory(
+        t0_utc_us=t_utc_us, dt_us=dt_us, pos_ned_m=np.tile(pos_ned_m, (2, 1)), vel_ned_m_s=np.zeros((2, 3))
+    )
 
 
 def stopping(pos_ned_m: Array, vel_ned_m_s: Array, t_utc_us: int, dt_us: int, brake_m_s2: float) -> Trajectory:
@@ -99,7 +101,12 @@ def stopping(pos_ned_m: Array, vel_ned_m_s: Array, t_utc_us: int, dt_us: int, br
 def ending_at_rest(t0_utc_us: int, dt_us: int, pos_ned_m: Array, vel_ned_m_s: Array, brake_m_s2: float) -> Trajectory:
     """Return a plan, positions and velocities (K+1, 3), continued by braking from its last velocity."""
     pos, vel = _brake(pos_ned_m[-1], vel_ned_m_s[-1], dt_us * 1e-6, brake_m_s2)
-    return Trajectory(t0_utc_us, dt_us, np.vstack([pos_ned_m, pos]), np.vstack([vel_ned_m_s, vel]))
+    return Trajectory(
+        t0_utc_us=t0_utc_us,
+        dt_us=dt_us,
+        pos_ned_m=np.vstack([pos_ned_m, pos]),
+        vel_ned_m_s=np.vstack([vel_ned_m_s, vel]),
+    )
 
 
 def joined(first: Trajectory, then: Trajectory, from_utc_us: int) -> Trajectory:
@@ -109,7 +116,12 @@ def joined(first: Trajectory, then: Trajectory, from_utc_us: int) -> Trajectory:
         return then
     times = then.t0_utc_us - np.arange(missing, 0, -1) * then.dt_us
     pos, vel = first.sample(times)
-    return Trajectory(int(times[0]), then.dt_us, np.vstack([pos, then.pos_ned_m]), np.vstack([vel, then.vel_ned_m_s]))
+    return Trajectory(
+        t0_utc_us=int(times[0]),
+        dt_us=then.dt_us,
+        pos_ned_m=np.vstack([pos, then.pos_ned_m]),
+        vel_ned_m_s=np.vstack([vel, then.vel_ned_m_s]),
+    )
 
 
 def _brake(pos_ned_m: Array, vel_ned_m_s: Array, dt_s: float, brake_m_s2: float) -> tuple[Array, Array]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from swarmctl.core.trajectory import Trajectory
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Proposal:
     """Holds a trajectory to which an agent wants to commit."""
 
@@ -23,7 +23,7 @@ class Proposal:
         return self.made_utc_us, self.agent
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TrajectoryMessage:
     """Holds the committed trajectory, proposal and acknowledgements of one agent."""
 

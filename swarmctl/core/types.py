@@ -87,7 +87,7 @@ class Verb(enum.Enum):
     PARAM_GET = "param_get"  # name
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Command:
     """Holds one request to an autopilot."""
 
@@ -116,7 +116,7 @@ class GeoOrigin:
     alt_m: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleState:
     """Holds the newest estimate of the own vehicle, in the shared frame."""
 
@@ -131,7 +131,7 @@ class VehicleState:
     failsafe: bool  # the autopilot reports a failsafe (MAV_STATE_CRITICAL)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PredictedPath:
     """Holds predicted positions of one agent, as sent over the bus."""
 
@@ -144,7 +144,7 @@ class PredictedPath:
     pos_ned_m: Array  # (N+1, 3)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Obstacle:
     """Describes a sphere or an upright column to avoid, visible only from closer than `visibility_m`."""
 
@@ -170,7 +170,7 @@ class Reference:
     yaw_rad: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PlanTimes:
     """Holds measured times of planning, which have no influence."""
 
@@ -180,10 +180,10 @@ class PlanTimes:
     spaces_us: float = 0.0  # half-spaces
 
 
-NO_TIMES = PlanTimes(0.0, 0.0, 0.0)
+NO_TIMES = PlanTimes(setup_us=0.0, solve_us=0.0, certify_us=0.0)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Plan:
     """Holds the result of one MPC step: the predicted motion and the virtual controls that produce it."""
 
@@ -225,7 +225,7 @@ class AttitudeSetpoint:
         return ""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Health:
     """Holds the inputs of the failsafe; ages are -1 before the first sample."""
 
@@ -243,7 +243,7 @@ class Health:
     pilot_override: bool  # a pilot or the autopilot timing over, until an operator resumes
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TickRecord:
     """Holds the recorded values of one tick; `core.records` encodes them."""
 

@@ -311,7 +311,17 @@ class Autopilot:
             return None
         pos, vel, q_nb, rate = self._placed[1], sample.vel_ned_m_s, sample.q_nb, sample.rate_frd_rad_s
         mode, failsafe = self.watch.show(now_us)
-        return VehicleState(sample.t_us, pos, vel, q_nb, rate, self.armed, mode, self.landed, failsafe)
+        return VehicleState(
+            t_us=sample.t_us,
+            pos_ned_m=pos,
+            vel_ned_m_s=vel,
+            q_nb=q_nb,
+            rate_frd_rad_s=rate,
+            armed=self.armed,
+            mode=mode,
+            landed=self.landed,
+            failsafe=failsafe,
+        )
 
     def _forget(self) -> None:
         """Discard everything the vehicle has reported: it has rebooted, or was never received."""

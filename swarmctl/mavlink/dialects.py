@@ -46,7 +46,7 @@ class Rule:
         return "" if self.holds(value) else f"{self.name} = {value:g}: {self.otherwise}"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Dialect:
     """The differences between autopilots."""
 
@@ -79,7 +79,7 @@ class Dialect:
     def steps(self, command: Command) -> tuple[Command, ...]:
         """Return the commands that make up one request."""
         if command.verb is Verb.TAKEOFF and self.takeoff_parameter:
-            return Command(Verb.PARAM_FLOAT, value=command.value, name=self.takeoff_parameter), command
+            return Command(verb=Verb.PARAM_FLOAT, value=command.value, name=self.takeoff_parameter), command
         return (command,)
 
     def long_command(self, command: Command) -> LongCommand | None:

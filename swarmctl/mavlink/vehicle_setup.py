@@ -127,8 +127,8 @@ class VehicleSetup:
         if self._dialect.heeds_parameter:
             self._setup[self._dialect.heeds_parameter] = self._sysid
         self._watched_us, self._samples = now_us, autopilot.samples
-        origin = [Command(Verb.MESSAGE, number=GPS_GLOBAL_ORIGIN)]
-        reads = [Command(Verb.PARAM_GET, name=n) for n in dict.fromkeys((*self._setup, *self._dialect.to_read()))]
+        origin = [Command(verb=Verb.MESSAGE, number=GPS_GLOBAL_ORIGIN)]
+        reads = [Command(verb=Verb.PARAM_GET, name=n) for n in dict.fromkeys((*self._setup, *self._dialect.to_read()))]
         self._todo = deque(self._rates(self._dialect) + origin + reads)
 
     def _compare(self) -> None:
@@ -143,14 +143,16 @@ class VehicleSetup:
                 self._todo.append(self._setting(name, value))
 
     def _rates(self, dialect: Dialect) -> list[Command]:
-        state = [Command(Verb.RATE, self._rate_hz, number) for number in dialect.state]
-        return state + [Command(Verb.RATE, rate_hz, number) for number, rate_hz in dialect.rates_hz.items()]
+        state = [Command(verb=Verb.RATE, value=self._rate_hz, number=number) for number in dialect.state]
+        return state + [
+            Command(verb=Verb.RATE, value=rate_hz, number=number) for number, rate_hz in dialect.rates_hz.items()
+        ]
 
     def _setting(self, name: str, value: float) -> Command:
         """Return the request for a value in the type in which the vehicle stores it."""
         if name in self._autopilot.whole_params and float(value).is_integer():
-            return Command(Verb.PARAM_INT, number=int(value), name=name)
-        return Command(Verb.PARAM_FLOAT, value=float(value), name=name)
+            return Command(verb=Verb.PARAM_INT, number=int(value), name=name)
+        return Command(verb=Verb.PARAM_FLOAT, value=float(value), name=name)
 
     def _origin(self, now_us: int) -> Command | None:
         frame = self._autopilot.frame
@@ -158,7 +160,7 @@ class VehicleSetup:
         if not frame.wants_origin or now_us - self._origin_us < every_us:
             return None
         self._origin_us = now_us
-        return Command(Verb.MESSAGE, number=GPS_GLOBAL_ORIGIN)
+        return Command(verb=Verb.MESSAGE, number=GPS_GLOBAL_ORIGIN)
 
     def _watch(self, now_us: int) -> None:
         """Request the rates again when the vehicle sends, but its state comes at less than half the rate."""

@@ -155,7 +155,10 @@ def check(
 
     if write is not None and not identify:
         raise ConfigError("--write", ["there is nothing to write without --identify"])
-    asked, options = load(config, _overrides(agents, None, None, sets)), CheckOptions(apply, seconds, json)
+    asked, options = (
+        load(config, _overrides(agents, None, None, sets)),
+        CheckOptions(apply=apply, seconds=seconds, json=json),
+    )
     if not identify:
         return check_vehicles(asked, options)
     from swarmctl.ops.identify import IdentifyOptions, check_and_identify
@@ -400,7 +403,7 @@ def _has_display() -> bool:
 def _show(statuses: dict[int, StatusMessage], agents: range) -> None:
     from swarmctl.ops.status_table import AgentView, print_statuses
 
-    print_statuses([AgentView(number, statuses.get(number)) for number in agents])
+    print_statuses([AgentView(agent=number, status=statuses.get(number)) for number in agents])
 
 
 def _show_obstacles(message: ObstaclesMessage) -> None:

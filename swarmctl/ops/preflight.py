@@ -33,7 +33,7 @@ _NEEDED = {
 _NEEDED_TO_VIEW = {"rerun-sdk": (0, 41)}
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ReservedPorts:
     """Ports that the preflight has bound for the launch."""
 
@@ -73,7 +73,7 @@ def inspect(config: Config) -> ReservedPorts:
             "choose another or set telemetry.enabled = false"
         )
     ports = tuple(sock.getsockname()[1] for sock in sockets[:count])
-    reserved = ReservedPorts(sockets[:count], ports, view_port, sockets[count:])
+    reserved = ReservedPorts(sockets=sockets[:count], ports=ports, view_port=view_port, vehicle_sockets=sockets[count:])
     if problems:
         reserved.release()
         raise StartError("\n".join(problems))

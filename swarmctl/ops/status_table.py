@@ -25,7 +25,7 @@ _LINE = 2000  # longest printed line
 _COLUMNS = ("agent", "phase", "mode", "error m", "separation m", "tick p99 ms", "missed", "staleness ms", "alert")
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class AgentView:
     """The launcher's view of one agent."""
 

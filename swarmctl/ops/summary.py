@@ -26,7 +26,9 @@ def sum_up(config: Config, directory: Path, result: LaunchResult, say: Callable[
 
     try:
         rules = _rules(config, result)
-        summary, unwritten = finish_run(directory, rules, Outcome(result.outcome, tuple(result.problems)))
+        summary, unwritten = finish_run(
+            directory, rules, Outcome(outcome=result.outcome, problems=tuple(result.problems))
+        )
     except Exception as error:
         known = {"outcome": result.outcome, "violations": list(result.problems)}
         for line in (*violation_lines(known), *summary_lines(known, directory)):

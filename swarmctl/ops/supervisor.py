@@ -77,7 +77,7 @@ class Services:
         raise NotImplementedError
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class LaunchResult:
     """The result of a launch, collected during the flight."""
 
@@ -122,7 +122,7 @@ class FlightSupervisor:
         self._bus: Bus = services.bus
         self._display = display
         self._result = LaunchResult()
-        self._views = [AgentView(agent) for agent in range(config.swarm.agents)]
+        self._views = [AgentView(agent=agent) for agent in range(config.swarm.agents)]
         self._configured = first_obstacles(o.model_dump() for o in config.obstacles)
         self._obstacles = self._configured
         self._obstacles_said_s = 0.0

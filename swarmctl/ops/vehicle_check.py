@@ -40,7 +40,7 @@ _APPLY_S = 15.0
 _STOP_S = 5.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class CheckOptions:
     """Options of the check that are not part of the configuration."""
 
@@ -73,7 +73,7 @@ def check(config: Config, options: CheckOptions) -> int:
     return code
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Link:
     """The opened link of one vehicle, or why it can't be opened."""
 
@@ -143,7 +143,7 @@ def _changed(before: VehicleFacts, now: VehicleFacts, name: str, wanted: Number,
         refused = "it was armed, or fell silent, meanwhile"
     was = before.number(name)
     assert was is not None  # `changes` leaves out unknown values
-    return Change(before.agent, name, was, wanted, now.number(name), refused)
+    return Change(agent=before.agent, name=name, before=was, wanted=wanted, after=now.number(name), refused=refused)
 
 
 # --- vehicle links ---
@@ -166,8 +166,8 @@ def _open(url: str) -> _Link:
     try:
         listener, there = open_listener(url)
     except StartError as error:
-        return _Link(url, None, NOWHERE, str(error))
-    return _Link(url, listener, there)
+        return _Link(url=url, listener=None, there=NOWHERE, problem=str(error))
+    return _Link(url=url, listener=listener, there=there)
 
 
 def _close(links: Sequence[_Link]) -> None:
@@ -182,7 +182,8 @@ def _simulator(config: Config) -> Iterator[_VehicleLinks]:
     sockets = claim_ports(config.swarm.agents)
     ports = [sock.getsockname()[1] for sock in sockets]
     links = [
-        _Link(f"built-in simulator, port {p}", UdpListener(s), NOWHERE) for s, p in zip(sockets, ports, strict=True)
+        _Link(url=f"built-in simulator, port {p}", listener=UdpListener(s), there=NOWHERE)
+        for s, p in zip(sockets, ports, strict=True)
     ]
     directory = Path(tempfile.mkdtemp(prefix="swarm-check-"))
     children: list[Child] = []

@@ -30,7 +30,7 @@ def _near(values: Array) -> Array:
     return np.where(np.abs(values) < _MAX_DRAWN, values, np.nan)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Line:
     """One curve; NaN and values too large to draw interrupt it."""
 
@@ -48,7 +48,7 @@ class Line:
         object.__setattr__(self, "y", _near(self.y))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class SpaceLine:
     """One path in space; NaN interrupts it."""
 
@@ -102,7 +102,7 @@ class Circle(NamedTuple):
     radius: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Axis:
     """Maps [low, high] to [first, last] pixels."""
 
@@ -144,8 +144,9 @@ def time_chart(
         windows: shaded parts, clipped to the plot.
     """
     low, high = _value_range([line.y for line in lines], [limit.value for limit in limits], from_zero, ceiling)
-    x = _Axis(*_widened(*x_range), _LEFT, WIDTH - _RIGHT)
-    y = _Axis(low, high, height - _BOTTOM, _TOP)
+    left, right = _widened(*x_range)
+    x = _Axis(low=left, high=right, first=_LEFT, last=WIDTH - _RIGHT)
+    y = _Axis(low=low, high=high, first=height - _BOTTOM, last=_TOP)
     behind = ""
     if band is not None:
         left, right = x.px(np.clip(np.array(band), x.low, x.high))
@@ -168,8 +169,8 @@ def top_view(title: str, lines: Sequence[Line], circles: Sequence[Circle], point
     scale = min(wide / (x_high - x_low), 420 / (y_high - y_low))
     height = max(160.0, (y_high - y_low) * scale + _TOP + _BOTTOM)
     extra_x, extra_y = wide / scale - (x_high - x_low), (height - _TOP - _BOTTOM) / scale - (y_high - y_low)
-    x = _Axis(x_low - extra_x / 2, x_high + extra_x / 2, _LEFT, WIDTH - _RIGHT)
-    y = _Axis(y_low - extra_y / 2, y_high + extra_y / 2, height - _BOTTOM, _TOP)
+    x = _Axis(low=x_low - extra_x / 2, high=x_high + extra_x / 2, first=_LEFT, last=WIDTH - _RIGHT)
+    y = _Axis(low=y_low - extra_y / 2, high=y_high + extra_y / 2, first=height - _BOTTOM, last=_TOP)
     parts = [_grid(x, y)]
     for circle in circles:
         cx, cy = float(x.px(np.array(circle.x))), float(y.px(np.array(circle.y)))
@@ -276,7 +277,8 @@ class _Oblique:
 
 def state_bars(title: str, rows: Sequence[tuple[str, Sequence[Span]]], x_range: tuple[float, float]) -> str:
     """Return a figure with one bar for each row, coloured by state."""
-    x = _Axis(*_widened(*x_range), _LEFT + 40, WIDTH - _RIGHT)
+    left, right = _widened(*x_range)
+    x = _Axis(low=left, high=right, first=_LEFT + 40, last=WIDTH - _RIGHT)
     parts, names = [], {}
     for number, (label, spans) in enumerate(rows):
         top = _TOP + 18 * number
@@ -291,7 +293,7 @@ def state_bars(title: str, rows: Sequence[tuple[str, Sequence[Span]]], x_range: 
                 f"<title>{html.escape(span.name)} {span.start:.1f} to {span.end:.1f} s</title></rect>"
             )
     height = _TOP + 18 * len(rows) + _BOTTOM
-    y = _Axis(0.0, 1.0, height - _BOTTOM, _TOP)
+    y = _Axis(low=0.0, high=1.0, first=height - _BOTTOM, last=_TOP)
     parts.append(_ticks_below(x, y))
     legend = "".join(_key(name, color, "") for name, color in names.items())
     drawing = f'<svg viewBox="0 0 {WIDTH} {height}" role="img">{"".join(parts)}</svg>'

@@ -44,7 +44,7 @@ class ObstacleRule(NamedTuple):
     column: bool = False
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Rules:
     """Limits by which a run is judged."""
 

@@ -112,11 +112,17 @@ class _Page:
             rows = tracking_rows(self._run.ticks[agent])
             if len(rows) and agent == self._agents[0]:
                 ref = rows["ref_pos_ned_m"]
-                lines.append(Line(ref[:, 1], ref[:, 0], css(REFERENCE_RGB), "reference", "4 4", 2.0))
+                lines.append(
+                    Line(x=ref[:, 1], y=ref[:, 0], color=css(REFERENCE_RGB), label="reference", dash="4 4", width=2.0)
+                )
         for agent in self._agents:
             rows = flight_rows(self._run.ticks[agent])
             pos_ned_m = true_positions(rows, self._run.truth, agent)
-            lines.append(Line(pos_ned_m[:, 1], pos_ned_m[:, 0], css(agent_rgb(agent)), f"agent {agent}", width=1.6))
+            lines.append(
+                Line(
+                    x=pos_ned_m[:, 1], y=pos_ned_m[:, 0], color=css(agent_rgb(agent)), label=f"agent {agent}", width=1.6
+                )
+            )
         rules = self._rules.obstacles if self._rules else ()
         circles = [Circle(rule.center_ned_m[1], rule.center_ned_m[0], rule.keep_out_m) for rule in rules]
         return top_view("From above: north up, east right [m]", lines, circles, self._points)
@@ -141,7 +147,14 @@ class _Page:
                 rows = tracking_rows(self._run.ticks[agent])
                 shown.setdefault(np.round(rows["ref_pos_ned_m"][-1:, k], 1).tobytes(), (agent, rows))
             lines += [
-                Line(self._seconds(rows), rows["ref_pos_ned_m"][:, k], "#334155", "reference", "4 3", 1.1)
+                Line(
+                    x=self._seconds(rows),
+                    y=rows["ref_pos_ned_m"][:, k],
+                    color="#334155",
+                    label="reference",
+                    dash="4 3",
+                    width=1.1,
+                )
                 for _, rows in shown.values()
                 if len(rows)
             ][:4]
@@ -179,10 +192,10 @@ class _Page:
         return f'<div class="card scroll"><table>{head}{"".join(rows)}</table>{more}</div>'
 
     def _line(self, agent: int, rows: NDArray[np.void], values: Array, label: str) -> Line:
-        return Line(self._seconds(rows), values, css(agent_rgb(agent)), label)
+        return Line(x=self._seconds(rows), y=values, color=css(agent_rgb(agent)), label=label)
 
     def _setpoint(self, rows: NDArray[np.void], values: Array, label: str) -> Line:
-        return Line(self._seconds(rows), values, "#334155", label, "3 3", 1.0)
+        return Line(x=self._seconds(rows), y=values, color="#334155", label=label, dash="3 3", width=1.0)
 
     def _tracking_error(self) -> str:
         lines, errors = [], []
@@ -190,11 +203,13 @@ class _Page:
             error = track_error(self._run.ticks[agent], self._run.truth, agent)
             if len(error.mission_t_s):
                 errors.append(error)
-                lines.append(Line(error.mission_t_s, error.distance_m, css(agent_rgb(agent)), f"agent {agent}"))
+                lines.append(
+                    Line(x=error.mission_t_s, y=error.distance_m, color=css(agent_rgb(agent)), label=f"agent {agent}")
+                )
         if len(errors) > 1:
             longest = max(errors, key=lambda error: len(error.mission_t_s)).mission_t_s
             sums = [np.interp(longest, e.mission_t_s, e.distance_m, np.nan, np.nan) for e in errors]
-            lines.append(Line(longest, np.sum(sums, axis=0), css(SUM_RGB), "sum", width=1.8))
+            lines.append(Line(x=longest, y=np.sum(sums, axis=0), color=css(SUM_RGB), label="sum", width=1.8))
         return self._chart("Distance to the reference [m]", lines, from_zero=True)
 
     def _separation(self) -> str:
@@ -207,7 +222,15 @@ class _Page:
                 apart_m = np.linalg.norm(pos[:, i + 1 :] - pos[:, i : i + 1], axis=2)
                 least_m = np.fmin(least_m, np.fmin.reduce(apart_m, axis=1))
             least_m[~np.isfinite(least_m)] = np.nan
-            lines = [Line((self._tracks.t_us - self._start_us) / 1e6, least_m, "#0f766e", "nearest pair", width=1.6)]
+            lines = [
+                Line(
+                    x=(self._tracks.t_us - self._start_us) / 1e6,
+                    y=least_m,
+                    color="#0f766e",
+                    label="nearest pair",
+                    width=1.6,
+                )
+            ]
         limit = Limit(required_m, f"required {required_m:g} m")
         return self._chart("Smallest distance between two agents [m]", lines, limits=[limit], from_zero=True)
 
@@ -218,10 +241,10 @@ class _Page:
             rows = rows if always else rows[rows["iterations"] > 0]
             lines.append(
                 Line(
-                    self._seconds(rows),
-                    np.asarray(rows[name], np.float64),
-                    css(agent_rgb(agent)),
-                    f"agent {agent}",
+                    x=self._seconds(rows),
+                    y=np.asarray(rows[name], np.float64),
+                    color=css(agent_rgb(agent)),
+                    label=f"agent {agent}",
                     width=1.0,
                     opacity=0.8,
                 )

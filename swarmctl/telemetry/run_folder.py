@@ -76,7 +76,7 @@ def _claim(base: Path) -> Path:
     return base
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Outcome:
     """End of a run as seen by the launcher or by lockstep."""
 
@@ -128,7 +128,9 @@ def report_run(directory: Path, rules: Rules) -> Path:
     """
     summary = read_summary(directory)
     if summary is None:
-        finished = finish_run(directory, rules, Outcome("failed", ("the launcher did not finish this run",)))
+        finished = finish_run(
+            directory, rules, Outcome(outcome="failed", problems=("the launcher did not finish this run",))
+        )
         if finished.unwritten:
             raise StartError(f"{directory}: can't be written: {'; '.join(finished.unwritten)}")
         return directory / REPORT

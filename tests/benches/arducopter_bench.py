@@ -42,7 +42,11 @@ class Bench:
         ground_end, self._gcs_link = pipe_pair(self.clock.now_us)
         settings = {"preset": "arducopter", "physics_hz": 250, **sitl}
         params = SitlParams(
-            1, np.array([SPAWN_NED_M]), ekf_ready_s=ekf_ready_s, autopilot_kind="arducopter", **settings
+            vehicles=1,
+            spawn_ned_m=np.array([SPAWN_NED_M]),
+            ekf_ready_s=ekf_ready_s,
+            autopilot_kind="arducopter",
+            **settings,
         )
         self.world = SitlWorld(params, [vehicle_end], [ground_end] if gcs else [])
         pilot = self.world.autopilots[0]

@@ -35,7 +35,8 @@ class FlownWorld:
         self.clients = [client for client, _ in pairs]
         outfit = RealismParams.model_validate(realism or {})
         self.world = SitlWorld(
-            SitlParams(vehicles, line_of_spawns(vehicles), realism=outfit, **params), [end for _, end in pairs]
+            SitlParams(vehicles=vehicles, spawn_ned_m=line_of_spawns(vehicles), realism=outfit, **params),
+            [end for _, end in pairs],
         )
         self._codec = Codec(255, 190)
 

@@ -27,7 +27,7 @@ SIGNATURE_BYTES = 13
 ADDRESS_FIELDS = ("target_system", "target")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Shape:
     """What the wire needs to know of a message."""
 
@@ -46,7 +46,7 @@ def _shape(cls: Any) -> Shape:
             target_at = at
         at += sizes.get(by_name[name], 8) * max(1, length)
     assert at == cls.unpacker.size, (cls.msgname, at)
-    return Shape(cls.id, cls.crc_extra, at, target_at)
+    return Shape(number=cls.id, crc_extra=cls.crc_extra, size=at, target_at=target_at)
 
 
 SHAPES = tuple(_shape(cls) for _, cls in sorted(mav.mavlink_map.items()))

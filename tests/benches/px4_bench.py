@@ -46,7 +46,9 @@ class Bench:
         self.clock = SimClock()
         vehicle_end, self.link = pipe_pair(self.clock.now_us)
         vehicle_gcs_end, self.gcs_link = pipe_pair(self.clock.now_us)
-        sitl = SitlParams(1, np.array([SPAWN_NED_M]), preset=preset, ekf_ready_s=ekf_ready_s, **params)
+        sitl = SitlParams(
+            vehicles=1, spawn_ned_m=np.array([SPAWN_NED_M]), preset=preset, ekf_ready_s=ekf_ready_s, **params
+        )
         self.world = SitlWorld(sitl, [vehicle_end], [vehicle_gcs_end] if gcs else [])
         pilot, endpoint = self.world.autopilots[0], self.world.endpoints[0]
         assert isinstance(pilot, Autopilot)

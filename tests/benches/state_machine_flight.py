@@ -61,7 +61,15 @@ class Flight:
             return None
         q_nb = np.array([1.0, 0.0, 0.0, 0.0])
         return VehicleState(
-            self.now_us, self.pos, self.vel, q_nb, np.zeros(3), self.armed, self.flight_mode, self.landed, self.failsafe
+            t_us=self.now_us,
+            pos_ned_m=self.pos,
+            vel_ned_m_s=self.vel,
+            q_nb=q_nb,
+            rate_frd_rad_s=np.zeros(3),
+            armed=self.armed,
+            mode=self.flight_mode,
+            landed=self.landed,
+            failsafe=self.failsafe,
         )
 
     def step(self) -> list[Command]:

@@ -88,7 +88,12 @@ def test_the_report_has_every_cell_with_its_exact_interval(quick: Path) -> None:
 
 def test_scenario_events_happen_in_flight() -> None:
     """The bus of two agents is partitioned for 2 s: plans get stale, and both reach their goals."""
-    trial = Trial(Cell("partition", 2, 0.0, 0.0, "exact", 0.0, "default"), 1)
+    trial = Trial(
+        Cell(
+            scenario="partition", agents=2, delay_ms=0.0, loss=0.0, noise="exact", wind_m_s=0.0, protections="default"
+        ),
+        1,
+    )
     flight = TrialFlight(trial, layout_of("partition", 1, 2))
     flight.run()
     assert flight.row(None)["outcome"] == "arrived"

@@ -125,7 +125,11 @@ def break_solver(running: Lockstep, agent: int, lasts_s: float) -> None:
 
 
 def _solve_from(running: Lockstep, from_s: float, solve: Callable[..., QpSolution], *values: object) -> QpSolution:
-    return solve(*values) if running.clock.now_us() * 1e-6 >= from_s else QpSolution(None, False, "broken", 0)
+    return (
+        solve(*values)
+        if running.clock.now_us() * 1e-6 >= from_s
+        else QpSolution(x=None, exact=False, status="broken", iterations=0)
+    )
 
 
 @pytest.mark.parametrize(

@@ -61,7 +61,9 @@ def forge_paths(running: Lockstep) -> None:
     for agent in range(AGENTS):
         away = np.tile([60.0, 20.0 * agent, -2.0], (26, 1))
         for boot, seq in ((STRANGER, 1), (running.config.seed * 1000 + agent, LAST)):
-            path = PredictedPath(agent, boot, seq, at_us, 100_000, 0.0, away)
+            path = PredictedPath(
+                agent=agent, boot_id=boot, seq=seq, t0_utc_us=at_us, dt_us=100_000, radius_m=0.0, pos_ned_m=away
+            )
             say(running, topics.PATH, topics.encode_path(path), agent)
 
 
@@ -104,7 +106,16 @@ def test_forged_paths_change_nothing_and_are_reported(fly: Fly, twin: Flight) ->
 
 def newest_wins(self: SenderVerifier, received: ReceivedMessage, utc_us: int) -> str:
     """What was believed before there were claims."""
-    known, stream = self._accepted, _Stream(received.boot_id, received.seq, received.sent_utc_us, utc_us, utc_us)
+    known, stream = (
+        self._accepted,
+        _Stream(
+            boot_id=received.boot_id,
+            seq=received.seq,
+            sent_utc_us=received.sent_utc_us,
+            received_utc_us=utc_us,
+            began_utc_us=utc_us,
+        ),
+    )
     if known is not None and (received.boot_id, received.seq) < (known.boot_id, known.seq):
         return "replayed"
     self._accepted = stream

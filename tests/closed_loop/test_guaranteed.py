@@ -30,7 +30,9 @@ def events(flight: TrialFlight, name: str) -> list[dict[str, object]]:
 
 
 def test_late_and_lost_messages_cost_time_and_no_distance() -> None:
-    flight = flown(Cell("swap", 4, 300.0, 0.3, "exact", 0.0, "guaranteed"))
+    flight = flown(
+        Cell(scenario="swap", agents=4, delay_ms=300.0, loss=0.3, noise="exact", wind_m_s=0.0, protections="guaranteed")
+    )
     row = flight.row(None)
     assert row["outcome"] == "arrived"
     assert row["min_separation_m"] >= COMMITTED_M
@@ -47,23 +49,61 @@ def test_late_and_lost_messages_cost_time_and_no_distance() -> None:
 )
 def test_agents_that_meet_give_way_by_rule_before_all_stand(traffic_rule: str, within_s: float, bound_m: float) -> None:
     """Late plans that end in stops lock in the middle of a swap, and to get out of that takes as long again."""
-    row = flown(Cell("swap", 6, 100.0, 0.0, "exact", 0.0, "guaranteed", traffic_rule)).row(None)
+    row = flown(
+        Cell(
+            scenario="swap",
+            agents=6,
+            delay_ms=100.0,
+            loss=0.0,
+            noise="exact",
+            wind_m_s=0.0,
+            protections="guaranteed",
+            sets=traffic_rule,
+        )
+    ).row(None)
     assert row["min_separation_m"] >= bound_m
     assert (row["flight_time_s"] < within_s) is (traffic_rule == "")
 
 
 def test_agents_fly_around_where_a_lost_peer_was_committed_to_end() -> None:
     """If recovery did not see it, an agent would stand for good between that place and the lost peer's last path."""
-    assert flown(Cell("death", 6, 100.0, 0.0, "exact", 0.0, "guaranteed"), 3).row(None)["outcome"] == "arrived"
+    assert (
+        flown(
+            Cell(
+                scenario="death",
+                agents=6,
+                delay_ms=100.0,
+                loss=0.0,
+                noise="exact",
+                wind_m_s=0.0,
+                protections="guaranteed",
+            ),
+            3,
+        ).row(None)["outcome"]
+        == "arrived"
+    )
 
 
 def test_negative_control_agents_that_see_nobody_touch() -> None:
-    assert flown(Cell("swap", 4, 300.0, 0.3, "exact", 0.0, "off")).row(None)["min_separation_m"] < TOUCH_M
+    assert (
+        flown(
+            Cell(scenario="swap", agents=4, delay_ms=300.0, loss=0.3, noise="exact", wind_m_s=0.0, protections="off")
+        ).row(None)["min_separation_m"]
+        < TOUCH_M
+    )
 
 
 def committed_in_the_dark(sees: type[Coordination] = Coordination) -> int:
     """How many trajectories are committed from 1.6 s to 2 s after the bus has fallen apart."""
-    flight = TrialFlight(Trial(Cell("swap", 4, 0.0, 0.0, "exact", 0.0, "guaranteed"), 1), layout_of("swap", 1, 4))
+    flight = TrialFlight(
+        Trial(
+            Cell(
+                scenario="swap", agents=4, delay_ms=0.0, loss=0.0, noise="exact", wind_m_s=0.0, protections="guaranteed"
+            ),
+            1,
+        ),
+        layout_of("swap", 1, 4),
+    )
     step, counts = flight.lockstep.step, []
     began_us: list[int] = []
 
@@ -97,7 +137,18 @@ def test_negative_control_taking_stale_peers_for_lost_commits_against_alive_peer
 @pytest.mark.parametrize(("body_m", "told"), [(0.48, False), (0.8, True)])
 def test_a_tracking_violation_is_reported(body_m: float, told: bool) -> None:
     """The error may be half of the committed distance beyond touching bodies; the safety filter deflects large ones."""
-    flight = flown(Cell("swap", 2, 0.0, 0.0, "exact", 0.0, "guaranteed", f"separation.body_m={body_m}"))
+    flight = flown(
+        Cell(
+            scenario="swap",
+            agents=2,
+            delay_ms=0.0,
+            loss=0.0,
+            noise="exact",
+            wind_m_s=0.0,
+            protections="guaranteed",
+            sets=f"separation.body_m={body_m}",
+        )
+    )
     assert flight.row(None)["outcome"] == "arrived"
     off = events(flight, "tracking_violation")
     assert bool(off) is told

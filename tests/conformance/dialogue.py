@@ -32,7 +32,7 @@ class Deviation(AssertionError):  # noqa: N818 - what the sheet calls it
     """The vehicle does not do what the row says."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Arrived:
     """A frame from the vehicle; decoded on first access."""
 
@@ -158,7 +158,7 @@ class Dialogue:
             self.sysid = frame[5]
             self._codecs.clear()
         own = frame[5] == (self.sysid or frame[5]) and frame[6] == AUTOPILOT_COMPONENT
-        arrived = Arrived(t_s, number, self._arrivals, frame, self._reader)
+        arrived = Arrived(t_s=t_s, number=number, order=self._arrivals, frame=frame, codec=self._reader)
         self._log.setdefault((link, number, own), []).append(arrived)
         self._arrivals += 1
 

@@ -75,7 +75,7 @@ class InProcess:
         self.links: dict[str, Transport] = {name: ours for name, (_, ours) in pairs.items()}
         ready_s = EKF_READY_S if booting else 0.1
         params = SitlParams(
-            1, np.zeros((1, 3)), preset="x500", ekf_ready_s=ready_s, reject_bad_setpoints=False
+            vehicles=1, spawn_ned_m=np.zeros((1, 3)), preset="x500", ekf_ready_s=ready_s, reject_bad_setpoints=False
         )  # the sheet's PX4 validates nothing
         self.world = SitlWorld(params, [pairs[OFFBOARD_LINK][0]], [pairs[GCS_LINK][0]])
 

@@ -87,9 +87,9 @@ class Player:
         if not partner.simulated:
             self._come_to_rest(stay_up=row.start in (v.State.LOITER, v.State.OFFBOARD))
         for number, interval_us in {**(SLOW_US if partner.simulated else {}), **FAST_US}.items():
-            self._judge.judge(v.Command(v.SET_INTERVAL, (number, interval_us), within_s=0.5))
+            self._judge.judge(v.Command(number=v.SET_INTERVAL, params=(number, interval_us), within_s=0.5))
         for number in NOT_READ_ON_GCS if partner.simulated else ():
-            self._judge.judge(v.Command(v.SET_INTERVAL, (number, -1), link=v.GCS_LINK))
+            self._judge.judge(v.Command(number=v.SET_INTERVAL, params=(number, -1), link=v.GCS_LINK))
         self.dialogue.set_mark()
         if not self._armed():
             self._judge.judge(v.sees("SYS_STATUS", 60.0, onboard_control_sensors_health=Bits(PREARM_BIT)))
@@ -141,7 +141,7 @@ class Player:
         if self.dialogue.partner.simulated or name in self._original:
             return
         read = v.message("PARAM_REQUEST_READ", target_system=v.OWN, target_component=1, param_id=name, param_index=-1)
-        self._judge.judge(v.Send(read))
+        self._judge.judge(v.Send(what=read))
         self._judge.judge(v.sees("PARAM_VALUE", 1.0, param_id=name))
         values = [a.message for a in self.dialogue.since_mark("PARAM_VALUE", v.OFFBOARD_LINK)]
         found = next(m.param_value for m in values if m is not None and m.param_id == name)

@@ -31,10 +31,10 @@ VALUES, RESPONSE = "4 values", "6"
 
 VALUE_ROWS = (
     Row(
-        "ATTITUDE_TARGET echoes q and thrust, type_mask 0",
-        VALUES,
-        State.OFFBOARD,
-        (
+        name="ATTITUDE_TARGET echoes q and thrust, type_mask 0",
+        section=VALUES,
+        start=State.OFFBOARD,
+        steps=(
             Stream(setpoint(0.5, about("roll", 5.0))),
             sees(
                 "ATTITUDE_TARGET", 0.05, type_mask=0, thrust=near(0.5, 1e-6), q=Each((0.9990482, near(0.0436194, 1e-6)))
@@ -42,10 +42,10 @@ VALUE_ROWS = (
         ),
     ),
     Row(
-        "thrust 1.5 is echoed, motors at their limit",
-        VALUES,
-        State.OFFBOARD,
-        (
+        name="thrust 1.5 is echoed, motors at their limit",
+        section=VALUES,
+        start=State.OFFBOARD,
+        steps=(
             Stream(setpoint(1.5)),
             sees("ATTITUDE_TARGET", 0.1, thrust=near(1.5, 1e-6)),
             sees("SERVO_OUTPUT_RAW", 0.5, servo1_raw=Between(1900, 2000), servo3_raw=Between(1900, 2000)),
@@ -54,10 +54,10 @@ VALUE_ROWS = (
         ),
     ),
     Row(
-        "thrust -0.5 is echoed as 0.5, motors idle",
-        VALUES,
-        State.OFFBOARD,
-        (
+        name="thrust -0.5 is echoed as 0.5, motors idle",
+        section=VALUES,
+        start=State.OFFBOARD,
+        steps=(
             Stream(setpoint(-0.5)),
             sees("ATTITUDE_TARGET", 0.1, thrust=near(0.5, 1e-6)),
             sees("SERVO_OUTPUT_RAW", 0.5, servo1_raw=Between(1000, 1010)),
@@ -66,10 +66,10 @@ VALUE_ROWS = (
         ),
     ),
     Row(
-        "thrust NaN turns the motors off while armed, the next good one on",
-        VALUES,
-        State.OFFBOARD,
-        (
+        name="thrust NaN turns the motors off while armed, the next good one on",
+        section=VALUES,
+        start=State.OFFBOARD,
+        steps=(
             Stream(setpoint(NAN)),
             sees("SERVO_OUTPUT_RAW", 0.3, servo1_raw=900),
             Stream(setpoint(HOVER_01)),
@@ -78,10 +78,10 @@ VALUE_ROWS = (
         ),
     ),
     Row(
-        "a quaternion of norm 2 is flown as its unit one",
-        VALUES,
-        State.OFFBOARD,
-        (
+        name="a quaternion of norm 2 is flown as its unit one",
+        section=VALUES,
+        start=State.OFFBOARD,
+        steps=(
             Stream(setpoint(HOVER_01, tuple(2 * c for c in about("roll", 8.0))), 100.0),
             Wait(1.0),
             always("ATTITUDE", 0.3, 20, roll=near(math.radians(8.0), 0.035)),
@@ -89,12 +89,12 @@ VALUE_ROWS = (
     ),
     *(
         Row(
-            f"one setpoint with q {name} poisons the attitude controller: nothing is followed, in LOITER neither",
-            VALUES,
-            State.OFFBOARD,
-            (
+            name=f"one setpoint with q {name} poisons the attitude controller: nothing is followed, in LOITER neither",
+            section=VALUES,
+            start=State.OFFBOARD,
+            steps=(
                 Stop(),
-                Send(setpoint(HOVER_01, q)),
+                Send(what=setpoint(HOVER_01, q)),
                 Wait(0.1),
                 tilted(20.0),
                 Moves("roll_highest_deg", Between(-180.0, 14.0), 1.2),
@@ -110,19 +110,24 @@ VALUE_ROWS = (
     ),
     *(
         Row(
-            f"a setpoint with q {name} does no harm when a good one follows at once",
-            VALUES,
-            State.OFFBOARD,
-            (Send(setpoint(HOVER_01, q)), tilted(20.0), Moves("roll_highest_deg", Between(18.0, 23.0), 1.2)),
+            name=f"a setpoint with q {name} does no harm when a good one follows at once",
+            section=VALUES,
+            start=State.OFFBOARD,
+            steps=(Send(what=setpoint(HOVER_01, q)), tilted(20.0), Moves("roll_highest_deg", Between(18.0, 23.0), 1.2)),
             spoils=True,
         )
         for name, q in (("zero", (0.0, 0.0, 0.0, 0.0)), ("NaN", (NAN, NAN, NAN, NAN)))
     ),
     Row(
-        "60 degrees are followed",
-        VALUES,
-        State.OFFBOARD,
-        (tilted(60.0), Moves("highest_tilt_deg", Between(57.0, 70.0), 0.9), Stream(setpoint(HOVER_01)), Wait(1.0)),
+        name="60 degrees are followed",
+        section=VALUES,
+        start=State.OFFBOARD,
+        steps=(
+            tilted(60.0),
+            Moves("highest_tilt_deg", Between(57.0, 70.0), 0.9),
+            Stream(setpoint(HOVER_01)),
+            Wait(1.0),
+        ),
     ),
 )
 
@@ -131,10 +136,10 @@ def step_response(axis: str, angle_deg: float, bounds: dict[str, Between], highe
     target = round(angle_deg)
     thrust_01 = HOVER_01 if axis == "yaw" else HOVER_01 / math.cos(math.radians(angle_deg))
     return Row(
-        f"{axis} step of {target} deg",
-        RESPONSE,
-        State.OFFBOARD,
-        (
+        name=f"{axis} step of {target} deg",
+        section=RESPONSE,
+        start=State.OFFBOARD,
+        steps=(
             Stream(setpoint(thrust_01, about(axis, angle_deg)), 100.0),
             *(Moves(f"{axis}_{target}_t{share}_s", wanted, for_s) for share, wanted in bounds.items()),
             Moves(f"{axis}_highest_deg", highest, for_s),
@@ -145,10 +150,10 @@ def step_response(axis: str, angle_deg: float, bounds: dict[str, Between], highe
 RESPONSE_ROWS = (
     *(
         Row(
-            f"thrust {thrust_01} accelerates downwards by {acc_m_s2:+.2f} m/s2",
-            RESPONSE,
-            State.LOITER,
-            (
+            name=f"thrust {thrust_01} accelerates downwards by {acc_m_s2:+.2f} m/s2",
+            section=RESPONSE,
+            start=State.LOITER,
+            steps=(
                 Stream(setpoint(HOVER_01), 100.0),
                 go(6),
                 Wait(0.2),
@@ -169,16 +174,16 @@ RESPONSE_ROWS = (
     step_response("roll", 30.0, {"63": Between(0.28, 0.34), "90": Between(0.43, 0.52)}, Between(28.8, 31.0), 1.0),
     step_response("yaw", 20.0, {"50": Between(0.50, 0.63), "90": Between(0.73, 0.86)}, Between(24.5, 26.8), 1.5),
     Row(
-        "hover thrust in LOITER",
-        RESPONSE,
-        State.LOITER,
-        (Wait(1.0), Mark(), Moves("mean_thrust_01", near(0.489, 0.006), 1.0)),
+        name="hover thrust in LOITER",
+        section=RESPONSE,
+        start=State.LOITER,
+        steps=(Wait(1.0), Mark(), Moves("mean_thrust_01", near(0.489, 0.006), 1.0)),
     ),
     Row(
-        "attitude-only take-off: 0.15 m up 0.7 s after arming, spool-up not waited for",
-        RESPONSE,
-        State.ARMABLE,
-        (
+        name="attitude-only take-off: 0.15 m up 0.7 s after arming, spool-up not waited for",
+        section=RESPONSE,
+        start=State.ARMABLE,
+        steps=(
             Stream(setpoint(0.6)),
             go(6),
             Wait(0.1),

@@ -46,7 +46,7 @@ ACCEPTED_MISSION, NO_SPACE = 0, 4
 FENCE_KIND, INCLUSION = 1, 5001
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Item:
     """A mission item: command, place over home, and what it needs."""
 
@@ -60,15 +60,15 @@ class Item:
 
 
 UP_OVER_AND_LAND = (
-    Item(TAKEOFF, up_m=3.0),
-    Item(WAYPOINT, LAT_E7 + NORTH_8_M, up_m=4.0),
-    Item(LAND, LAT_E7 + NORTH_8_M),
+    Item(command=TAKEOFF, up_m=3.0),
+    Item(command=WAYPOINT, lat_e7=LAT_E7 + NORTH_8_M, up_m=4.0),
+    Item(command=LAND, lat_e7=LAT_E7 + NORTH_8_M),
 )
-AROUND = (Item(WAYPOINT, LAT_E7 + NORTH_8_M, up_m=6.0), Item(WAYPOINT, up_m=6.0))
+AROUND = (Item(command=WAYPOINT, lat_e7=LAT_E7 + NORTH_8_M, up_m=6.0), Item(command=WAYPOINT, up_m=6.0))
 
 
 def addressed(name: str, **fields: object) -> Send:
-    return Send(message(name, target_system=OWN, target_component=1, **fields))
+    return Send(what=message(name, target_system=OWN, target_component=1, **fields))
 
 
 def item(seq: int, what: Item) -> Send:
@@ -120,24 +120,29 @@ def clear(kind: int = 0) -> tuple[Step, ...]:
 
 TRANSFER_ROWS = (
     Row(
-        "a mission goes up and comes down as it was",
-        TRANSFER,
-        State.ARMABLE,
-        (*upload(UP_OVER_AND_LAND), *download(UP_OVER_AND_LAND), *clear()),
+        name="a mission goes up and comes down as it was",
+        section=TRANSFER,
+        start=State.ARMABLE,
+        steps=(*upload(UP_OVER_AND_LAND), *download(UP_OVER_AND_LAND), *clear()),
     ),
-    Row("an empty vehicle has no mission", TRANSFER, State.ARMABLE, (*clear(), *download(()))),
-    Row("a mission of nothing clears", TRANSFER, State.ARMABLE, (*upload(AROUND), *upload(()), *download(()))),
+    Row(name="an empty vehicle has no mission", section=TRANSFER, start=State.ARMABLE, steps=(*clear(), *download(()))),
     Row(
-        "MISSION_CURRENT counts what is there",
-        TRANSFER,
-        State.ARMABLE,
-        (*upload(AROUND), Mark(), sees("MISSION_CURRENT", 1.2, seq=0, total=2), *clear()),
+        name="a mission of nothing clears",
+        section=TRANSFER,
+        start=State.ARMABLE,
+        steps=(*upload(AROUND), *upload(()), *download(())),
     ),
     Row(
-        "an item that was lost is asked for again",
-        TRANSFER,
-        State.ARMABLE,
-        (
+        name="MISSION_CURRENT counts what is there",
+        section=TRANSFER,
+        start=State.ARMABLE,
+        steps=(*upload(AROUND), Mark(), sees("MISSION_CURRENT", 1.2, seq=0, total=2), *clear()),
+    ),
+    Row(
+        name="an item that was lost is asked for again",
+        section=TRANSFER,
+        start=State.ARMABLE,
+        steps=(
             addressed("MISSION_COUNT", count=1),
             sees("MISSION_REQUEST_INT", seq=0),
             Wait(0.1),
@@ -149,16 +154,16 @@ TRANSFER_ROWS = (
         ),
     ),
     Row(
-        "more items than there is room for",
-        TRANSFER,
-        State.ARMABLE,
-        (addressed("MISSION_COUNT", count=65000), sees("MISSION_ACK", type=NO_SPACE), *download(())),
+        name="more items than there is room for",
+        section=TRANSFER,
+        start=State.ARMABLE,
+        steps=(addressed("MISSION_COUNT", count=65000), sees("MISSION_ACK", type=NO_SPACE), *download(())),
     ),
     Row(
-        "an item that is not there is asked for in vain",
-        TRANSFER,
-        State.ARMABLE,
-        (
+        name="an item that is not there is asked for in vain",
+        section=TRANSFER,
+        start=State.ARMABLE,
+        steps=(
             *clear(),
             addressed("MISSION_REQUEST_INT", seq=7),
             never("MISSION_ITEM_INT"),
@@ -166,21 +171,21 @@ TRANSFER_ROWS = (
         ),
     ),
     Row(
-        "a mission for another system is not taken",
-        TRANSFER,
-        State.ARMABLE,
-        (
+        name="a mission for another system is not taken",
+        section=TRANSFER,
+        start=State.ARMABLE,
+        steps=(
             *clear(),
-            Send(message("MISSION_COUNT", target_system=77, target_component=1, count=1)),
+            Send(what=message("MISSION_COUNT", target_system=77, target_component=1, count=1)),
             never("MISSION_REQUEST_INT"),
             *download(()),
         ),
     ),
     Row(
-        "MISSION mode is refused without one, armed",
-        TRANSFER,
-        State.ARMED,
-        (
+        name="MISSION mode is refused without one, armed",
+        section=TRANSFER,
+        start=State.ARMED,
+        steps=(
             *clear(),
             refused_mode(4, 4),
             unavailable("Mission"),
@@ -191,13 +196,13 @@ TRANSFER_ROWS = (
 
 RUN_ROWS = (
     Row(
-        "a mission of take-off, waypoint and landing flies and ends disarmed",
-        RUN,
-        State.ARMABLE,
-        (
+        name="a mission of take-off, waypoint and landing flies and ends disarmed",
+        section=RUN,
+        start=State.ARMABLE,
+        steps=(
             *upload(UP_OVER_AND_LAND),
             Wait(1.0),  # it is examined
-            Command(MISSION_START, (0.0, 0.0)),
+            Command(number=MISSION_START, params=(0.0, 0.0)),
             heartbeat(base_mode=157, custom_mode=M_MISSION, system_status=4),
             sees("MISSION_ITEM_REACHED", 15.0, seq=0),
             sees("MISSION_CURRENT", 16.0, seq=1),
@@ -206,14 +211,14 @@ RUN_ROWS = (
             sees("HEARTBEAT", 45.0, after_s=10.0, base_mode=29),
             *clear(),
         ),
-        {"NAV_ACC_RAD": 2.0},
+        params={"NAV_ACC_RAD": 2.0},
     ),
     Row(
-        "MISSION from LOITER, left by HOLD, taken up again where it was",
-        RUN,
-        State.LOITER,
-        (
-            *upload((*AROUND, Item(RTL, 0, 0, 0.0, frame=FRAME_MISSION))),
+        name="MISSION from LOITER, left by HOLD, taken up again where it was",
+        section=RUN,
+        start=State.LOITER,
+        steps=(
+            *upload((*AROUND, Item(command=RTL, lat_e7=0, lon_e7=0, up_m=0.0, frame=FRAME_MISSION))),
             Wait(1.0),  # it is examined
             go(4, 4),
             mode(M_MISSION),
@@ -226,14 +231,18 @@ RUN_ROWS = (
             sees("MISSION_ITEM_REACHED", 20.0, seq=Between(1, 2)),  # a return has no place to reach
             *clear(),
         ),
-        {"NAV_ACC_RAD": 2.0},
+        params={"NAV_ACC_RAD": 2.0},
     ),
     Row(
-        "DO_REPOSITION flies there in LOITER",
-        RUN,
-        State.LOITER,
-        (
-            Command(REPOSITION, (-1.0, 1.0, 0.0, NAN, float(LAT_E7 + NORTH_8_M), float(LON_E7), 495.4), as_int=True),
+        name="DO_REPOSITION flies there in LOITER",
+        section=RUN,
+        start=State.LOITER,
+        steps=(
+            Command(
+                number=REPOSITION,
+                params=(-1.0, 1.0, 0.0, NAN, float(LAT_E7 + NORTH_8_M), float(LON_E7), 495.4),
+                as_int=True,
+            ),
             mode(M_LOITER),
             sees("LOCAL_POSITION_NED", 15.0, x=near(8.0, 0.8), y=near(0.0, 0.8), z=near(-6.0, 0.8)),
         ),
@@ -242,44 +251,44 @@ RUN_ROWS = (
 
 FENCE_ROWS = (
     Row(
-        "height fence with Hold: OFFBOARD is left",
-        FENCE,
-        State.OFFBOARD,
-        (
+        name="height fence with Hold: OFFBOARD is left",
+        section=FENCE,
+        start=State.OFFBOARD,
+        steps=(
             Stream(setpoint(0.6)),
             sees("CURRENT_MODE", 6.0, custom_mode=M_LOITER),
             sees("HEARTBEAT", 7.5, custom_mode=M_LOITER, system_status=5),
         ),
-        {"GF_ACTION": 2, "GF_MAX_VER_DIST": 9.0},
+        params={"GF_ACTION": 2, "GF_MAX_VER_DIST": 9.0},
     ),
     Row(
-        "height fence with Return",
-        FENCE,
-        State.OFFBOARD,
-        (Stream(setpoint(0.6)), sees("CURRENT_MODE", 13.0, custom_mode=M_RTL)),
-        {"GF_ACTION": 3, "GF_MAX_VER_DIST": 9.0},
+        name="height fence with Return",
+        section=FENCE,
+        start=State.OFFBOARD,
+        steps=(Stream(setpoint(0.6)), sees("CURRENT_MODE", 13.0, custom_mode=M_RTL)),
+        params={"GF_ACTION": 3, "GF_MAX_VER_DIST": 9.0},
     ),
     Row(
-        "height fence that only warns",
-        FENCE,
-        State.OFFBOARD,
-        (
+        name="height fence that only warns",
+        section=FENCE,
+        start=State.OFFBOARD,
+        steps=(
             Stream(setpoint(0.6)),
             Wait(4.0),
             Stream(setpoint(HOVER_01)),
             always("CURRENT_MODE", 1.5, 2, custom_mode=M_OFFBOARD),
             Moves("height_m", Between(9.0, 30.0), 1.5),
         ),
-        {"GF_ACTION": 1, "GF_MAX_VER_DIST": 9.0},
+        params={"GF_ACTION": 1, "GF_MAX_VER_DIST": 9.0},
     ),
     Row(
-        "a fence goes up by the mission protocol",
-        FENCE,
-        State.ARMABLE,
-        (
+        name="a fence goes up by the mission protocol",
+        section=FENCE,
+        start=State.ARMABLE,
+        steps=(
             *upload(
                 tuple(
-                    Item(INCLUSION, LAT_E7 + n, LON_E7 + e, 0.0, 4.0, FENCE_KIND)
+                    Item(command=INCLUSION, lat_e7=LAT_E7 + n, lon_e7=LON_E7 + e, up_m=0.0, param1=4.0, kind=FENCE_KIND)
                     for n, e in ((-9000, -9000), (9000, -9000), (9000, 9000), (-9000, 9000))
                 ),
                 FENCE_KIND,
@@ -295,29 +304,29 @@ FENCE_ROWS = (
 
 BATTERY_ROWS = (
     Row(
-        "a critical battery lands, after a while in Hold",
-        BATTERY,
-        State.LOITER,
-        (
+        name="a critical battery lands, after a while in Hold",
+        section=BATTERY,
+        start=State.LOITER,
+        steps=(
             SetParam("BAT_LOW_THR", 3.0),
             SetParam("BAT_CRIT_THR", 2.0),
             Mark(),
             sees("BATTERY_STATUS", 3.0, charge_state=3),
-            Turns(M_LAND, 3.0, 8.0),
+            Turns(value=M_LAND, low_s=3.0, high_s=8.0),
             sees("HEARTBEAT", 9.5, custom_mode=M_LAND, system_status=5),
         ),
-        {"COM_LOW_BAT_ACT": 2},
+        params={"COM_LOW_BAT_ACT": 2},
     ),
     Row(
-        "a critical battery only warns unless told otherwise",
-        BATTERY,
-        State.LOITER,
-        (
+        name="a critical battery only warns unless told otherwise",
+        section=BATTERY,
+        start=State.LOITER,
+        steps=(
             SetParam("BAT_LOW_THR", 3.0),
             SetParam("BAT_CRIT_THR", 2.0),
             always("CURRENT_MODE", 7.0, 13, custom_mode=M_LOITER),
         ),
-        {"COM_LOW_BAT_ACT": 0},
+        params={"COM_LOW_BAT_ACT": 0},
     ),
 )
 

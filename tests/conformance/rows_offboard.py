@@ -38,7 +38,7 @@ from tests.conformance.vocabulary import (
 ENTRY, LOSS, MASKS = "4 entry", "4 loss", "4 type_mask"
 CHECK_S = 0.115  # the loss is looked for about every 100 ms
 RETURN_S = 0.06  # 22-47 ms measured
-LOST_TEXT = Says("Failsafe activated\t", CRITICAL)
+LOST_TEXT = Says(text="Failsafe activated\t", severity=CRITICAL)
 
 
 def about(axis: str, angle_deg: float) -> tuple[float, float, float, float]:
@@ -57,63 +57,65 @@ def tilted(angle_deg: float) -> Stream:
 
 def lost(after_s: float, to: int, checked_s: float = CHECK_S) -> tuple[Step, ...]:
     """The stream ends and the mode changes when it is due."""
-    return Stop(), Turns(to, after_s + 0.005, after_s + checked_s)
+    return Stop(), Turns(value=to, low_s=after_s + 0.005, high_s=after_s + checked_s)
 
 
 ENTRY_ROWS = (
     Row(
-        "OFFBOARD is accepted disarmed without a stream, and arming is refused then",
-        ENTRY,
-        State.ARMABLE,
-        (go(6), mode(M_OFFBOARD), arm(TEMPORARILY_REJECTED)),
+        name="OFFBOARD is accepted disarmed without a stream, and arming is refused then",
+        section=ENTRY,
+        start=State.ARMABLE,
+        steps=(go(6), mode(M_OFFBOARD), arm(TEMPORARILY_REJECTED)),
     ),
     *(
         Row(
-            f"{count} setpoint{'s' * (count > 1)} {gap_s * 1e3:g} ms ahead are enough to enter armed",
-            ENTRY,
-            State.ARMED,
-            (Send(setpoint(), count, 0.02), Wait(gap_s), go(6), mode(M_OFFBOARD)),
+            name=f"{count} setpoint{'s' * (count > 1)} {gap_s * 1e3:g} ms ahead are enough to enter armed",
+            section=ENTRY,
+            start=State.ARMED,
+            steps=(Send(what=setpoint(), times=count, every_s=0.02), Wait(gap_s), go(6), mode(M_OFFBOARD)),
         )
         for count, gap_s in ((1, 0.005), (1, 0.5), (2, 0.1), (5, 0.02))
     ),
     Row(
-        "a setpoint older than COM_OF_LOSS_T is not enough",
-        ENTRY,
-        State.ARMED,
-        (Send(setpoint()), Wait(1.3), go(6, ack=TEMPORARILY_REJECTED), mode(M_LOITER)),
+        name="a setpoint older than COM_OF_LOSS_T is not enough",
+        section=ENTRY,
+        start=State.ARMED,
+        steps=(Send(what=setpoint()), Wait(1.3), go(6, ack=TEMPORARILY_REJECTED), mode(M_LOITER)),
     ),
     Row(
-        "1.0 Hz holds OFFBOARD",
-        ENTRY,
-        State.OFFBOARD,
-        (Stream(setpoint(HOVER_01), 1.0), always("CURRENT_MODE", 5.0, 9, custom_mode=M_OFFBOARD)),
+        name="1.0 Hz holds OFFBOARD",
+        section=ENTRY,
+        start=State.OFFBOARD,
+        steps=(Stream(setpoint(HOVER_01), 1.0), always("CURRENT_MODE", 5.0, 9, custom_mode=M_OFFBOARD)),
     ),
     Row(
-        "2 Hz holds OFFBOARD",
-        ENTRY,
-        State.OFFBOARD,
-        (Stream(setpoint(HOVER_01), 2.0), always("CURRENT_MODE", 3.0, 5, custom_mode=M_OFFBOARD)),
+        name="2 Hz holds OFFBOARD",
+        section=ENTRY,
+        start=State.OFFBOARD,
+        steps=(Stream(setpoint(HOVER_01), 2.0), always("CURRENT_MODE", 3.0, 5, custom_mode=M_OFFBOARD)),
     ),
     Row(
-        "0.9 Hz loses OFFBOARD",
-        ENTRY,
-        State.OFFBOARD,
-        (Stream(setpoint(HOVER_01), 0.9), sees("CURRENT_MODE", 6.0, custom_mode=Other(M_OFFBOARD))),
+        name="0.9 Hz loses OFFBOARD",
+        section=ENTRY,
+        start=State.OFFBOARD,
+        steps=(Stream(setpoint(HOVER_01), 0.9), sees("CURRENT_MODE", 6.0, custom_mode=Other(M_OFFBOARD))),
     ),
     Row(
-        "no ground station and no radio for 13 s is no failsafe",
-        ENTRY,
-        State.OFFBOARD,
-        (always("CURRENT_MODE", 13.0, 25, custom_mode=M_OFFBOARD), heartbeat(system_status=4)),
+        name="no ground station and no radio for 13 s is no failsafe",
+        section=ENTRY,
+        start=State.OFFBOARD,
+        steps=(always("CURRENT_MODE", 13.0, 25, custom_mode=M_OFFBOARD), heartbeat(system_status=4)),
     ),
     *(
         Row(
-            f"a stream to {who} {'flies' if flies else 'is dropped: OFFBOARD times out'}",
-            ENTRY,
-            State.OFFBOARD,
-            (
+            name=f"a stream to {who} {'flies' if flies else 'is dropped: OFFBOARD times out'}",
+            section=ENTRY,
+            start=State.OFFBOARD,
+            steps=(
                 Stream(setpoint(HOVER_01, target=target)),
-                always("CURRENT_MODE", 2.0, 3, custom_mode=M_OFFBOARD) if flies else Turns(M_RTL, 0.95, 1.2),
+                always("CURRENT_MODE", 2.0, 3, custom_mode=M_OFFBOARD)
+                if flies
+                else Turns(value=M_RTL, low_s=0.95, high_s=1.2),
             ),
         )
         for who, target, flies in (
@@ -124,16 +126,16 @@ ENTRY_ROWS = (
         )
     ),
     Row(
-        "OFFBOARD then arm",
-        ENTRY,
-        State.ARMABLE,
-        (Stream(setpoint()), go(6), Wait(0.1), arm(), heartbeat(base_mode=145, custom_mode=M_OFFBOARD)),
+        name="OFFBOARD then arm",
+        section=ENTRY,
+        start=State.ARMABLE,
+        steps=(Stream(setpoint()), go(6), Wait(0.1), arm(), heartbeat(base_mode=145, custom_mode=M_OFFBOARD)),
     ),
     Row(
-        "arm then OFFBOARD",
-        ENTRY,
-        State.ARMED,
-        (Stream(setpoint()), go(6), heartbeat(base_mode=145, custom_mode=M_OFFBOARD)),
+        name="arm then OFFBOARD",
+        section=ENTRY,
+        start=State.ARMED,
+        steps=(Stream(setpoint()), go(6), heartbeat(base_mode=145, custom_mode=M_OFFBOARD)),
     ),
 )
 
@@ -150,76 +152,82 @@ LOSS_ACTIONS = {
 LOSS_ROWS = (
     *(
         Row(
-            f"stream stops, COM_OBL_RC_ACT {action} {name}",
-            LOSS,
-            State.OFFBOARD,
-            (
+            name=f"stream stops, COM_OBL_RC_ACT {action} {name}",
+            section=LOSS,
+            start=State.OFFBOARD,
+            steps=(
                 *lost(1.0, to),
                 sees("CURRENT_MODE", custom_mode=to, intended_custom_mode=M_OFFBOARD, within_s=1.3),
-                Says("Failsafe activated\t", CRITICAL, 1.4),
+                Says(text="Failsafe activated\t", severity=CRITICAL, within_s=1.4),
                 sees("HEARTBEAT", 2.3, base_mode=157, custom_mode=to, system_status=5),
             ),
-            {"COM_OBL_RC_ACT": action},
+            params={"COM_OBL_RC_ACT": action},
         )
         for action, (name, to) in LOSS_ACTIONS.items()
     ),
     *(
-        Row(f"COM_OF_LOSS_T {limit_s}", LOSS, State.OFFBOARD, lost(limit_s, M_RTL), {"COM_OF_LOSS_T": limit_s})
+        Row(
+            name=f"COM_OF_LOSS_T {limit_s}",
+            section=LOSS,
+            start=State.OFFBOARD,
+            steps=lost(limit_s, M_RTL),
+            params={"COM_OF_LOSS_T": limit_s},
+        )
         for limit_s in (0.5, 0.2, 0.1, 0.05)
     ),
     Row(
-        "COM_OF_LOSS_T 0.2 with Hold",
-        LOSS,
-        State.OFFBOARD,
-        lost(0.2, M_LOITER),
-        {"COM_OF_LOSS_T": 0.2, "COM_OBL_RC_ACT": 5},
+        name="COM_OF_LOSS_T 0.2 with Hold",
+        section=LOSS,
+        start=State.OFFBOARD,
+        steps=lost(0.2, M_LOITER),
+        params={"COM_OF_LOSS_T": 0.2, "COM_OBL_RC_ACT": 5},
     ),
     Row(
-        "Hold keeps the height",
-        LOSS,
-        State.OFFBOARD,
-        (*lost(1.0, M_LOITER), Wait(1.0), Mark(), Moves("height_change_m", Between(0.0, 0.3), 3.0)),
-        {"COM_OBL_RC_ACT": 5},
+        name="Hold keeps the height",
+        section=LOSS,
+        start=State.OFFBOARD,
+        steps=(*lost(1.0, M_LOITER), Wait(1.0), Mark(), Moves("height_change_m", Between(0.0, 0.3), 3.0)),
+        params={"COM_OBL_RC_ACT": 5},
     ),
     Row(
-        "RTL above home descends at once",
-        LOSS,
-        State.OFFBOARD,
-        (*lost(1.0, M_RTL), Wait(1.5), Mark(), Moves("height_change_m", Between(0.8, 4.0), 2.0)),
+        name="RTL above home descends at once",
+        section=LOSS,
+        start=State.OFFBOARD,
+        steps=(*lost(1.0, M_RTL), Wait(1.5), Mark(), Moves("height_change_m", Between(0.8, 4.0), 2.0)),
     ),
     Row(
-        "COM_OBL_RC_ACT 6 Terminate: motors off, mode stays, commands rejected",
-        LOSS,
-        State.OFFBOARD,
-        (
+        name="COM_OBL_RC_ACT 6 Terminate: motors off, mode stays, commands rejected",
+        section=LOSS,
+        start=State.OFFBOARD,
+        steps=(
             Stop(),
-            Says("Failsafe activated\t", CRITICAL, 1.5),
+            Says(text="Failsafe activated\t", severity=CRITICAL, within_s=1.5),
             sees("SERVO_OUTPUT_RAW", 1.5, after_s=1.0, servo1_raw=900, servo4_raw=900),
             sees("HEARTBEAT", 2.5, custom_mode=M_OFFBOARD, system_status=8),
             go(4, 3, ack=TEMPORARILY_REJECTED),
         ),
-        {"COM_OBL_RC_ACT": 6},
+        params={"COM_OBL_RC_ACT": 6},
         real_px4="a reduced build says so and flies on",
         spoils=True,
     ),
     Row(
-        "COM_OBL_RC_ACT 7 Disarm: disarmed in the air, mode stays",
-        LOSS,
-        State.OFFBOARD,
-        (
+        name="COM_OBL_RC_ACT 7 Disarm: disarmed in the air, mode stays",
+        section=LOSS,
+        start=State.OFFBOARD,
+        steps=(
             Stop(),
-            Says("Disarmed by failsafe\t", 6, 1.5),
+            Says(text="Disarmed by failsafe\t", severity=6, within_s=1.5),
             sees("SERVO_OUTPUT_RAW", 1.5, after_s=1.0, servo1_raw=900, servo4_raw=900),
             sees("HEARTBEAT", 2.5, base_mode=17, custom_mode=M_OFFBOARD),
         ),
-        {"COM_OBL_RC_ACT": 7},
+        params={"COM_OBL_RC_ACT": 7},
         spoils=True,
     ),
     Row(
-        "until the timeout the last setpoint is flown",
-        LOSS,
-        State.OFFBOARD,
-        (
+        name="until the timeout the last setpoint is flown",
+        section=LOSS,
+        start=State.OFFBOARD,
+        steps=(
             tilted(8.0),
             Wait(1.0),
             Stop(),
@@ -230,31 +238,36 @@ LOSS_ROWS = (
     ),
     *(
         Row(
-            f"OFFBOARD comes back by itself, {wait_s:g} s into {name}",
-            LOSS,
-            State.OFFBOARD,
-            (*lost(1.0, to), Wait(wait_s), Stream(setpoint(HOVER_01)), Turns(M_OFFBOARD, 0.0, RETURN_S)),
-            {"COM_OBL_RC_ACT": action},
+            name=f"OFFBOARD comes back by itself, {wait_s:g} s into {name}",
+            section=LOSS,
+            start=State.OFFBOARD,
+            steps=(
+                *lost(1.0, to),
+                Wait(wait_s),
+                Stream(setpoint(HOVER_01)),
+                Turns(value=M_OFFBOARD, low_s=0.0, high_s=RETURN_S),
+            ),
+            params={"COM_OBL_RC_ACT": action},
         )
         for action, name, to, wait_s in ((0, "RTL", M_RTL, 1.0), (4, "LAND", M_LAND, 1.0), (5, "LOITER", M_LOITER, 7.0))
     ),
     Row(
-        "a return ends the failsafe",
-        LOSS,
-        State.OFFBOARD,
-        (
+        name="a return ends the failsafe",
+        section=LOSS,
+        start=State.OFFBOARD,
+        steps=(
             *lost(1.0, M_LOITER),
             Stream(setpoint(HOVER_01)),
-            Turns(M_OFFBOARD, 0.0, RETURN_S),
+            Turns(value=M_OFFBOARD, low_s=0.0, high_s=RETURN_S),
             heartbeat(base_mode=145, custom_mode=M_OFFBOARD, system_status=4),
         ),
-        {"COM_OBL_RC_ACT": 5},
+        params={"COM_OBL_RC_ACT": 5},
     ),
     Row(
-        "commanding another mode cancels the return",
-        LOSS,
-        State.OFFBOARD,
-        (
+        name="commanding another mode cancels the return",
+        section=LOSS,
+        start=State.OFFBOARD,
+        steps=(
             *lost(1.0, M_RTL),
             go(4, 3),
             mode(M_LOITER, M_LOITER),
@@ -263,16 +276,20 @@ LOSS_ROWS = (
         ),
     ),
     Row(
-        "commanding HOLD while streaming leaves OFFBOARD for good",
-        LOSS,
-        State.OFFBOARD,
-        (go(4, 3), Turns(M_LOITER, 0.0, 0.1), always("CURRENT_MODE", 1.0, 1, custom_mode=M_LOITER)),
+        name="commanding HOLD while streaming leaves OFFBOARD for good",
+        section=LOSS,
+        start=State.OFFBOARD,
+        steps=(
+            go(4, 3),
+            Turns(value=M_LOITER, low_s=0.0, high_s=0.1),
+            always("CURRENT_MODE", 1.0, 1, custom_mode=M_LOITER),
+        ),
     ),
     Row(
-        "disarming on the ground stays in OFFBOARD",
-        LOSS,
-        State.GROUND_OFFBOARD,
-        (disarm(), always("HEARTBEAT", 2.2, 2, base_mode=17)),
+        name="disarming on the ground stays in OFFBOARD",
+        section=LOSS,
+        start=State.GROUND_OFFBOARD,
+        steps=(disarm(), always("HEARTBEAT", 2.2, 2, base_mode=17)),
     ),
 )
 
@@ -281,19 +298,19 @@ IGNORED_MASKS = (129, 130, 131, 135, 192, 64, 71)
 MASK_ROWS = (
     *(
         Row(
-            f"type_mask {mask} counts as a stream",
-            MASKS,
-            State.ARMED,
-            (Stream(setpoint(mask=mask)), Wait(0.1), go(6), mode(M_OFFBOARD)),
+            name=f"type_mask {mask} counts as a stream",
+            section=MASKS,
+            start=State.ARMED,
+            steps=(Stream(setpoint(mask=mask)), Wait(0.1), go(6), mode(M_OFFBOARD)),
         )
         for mask in FLOWN_MASKS
     ),
     *(
         Row(
-            f"type_mask {mask} counts as no stream",
-            MASKS,
-            State.ARMED,
-            (
+            name=f"type_mask {mask} counts as no stream",
+            section=MASKS,
+            start=State.ARMED,
+            steps=(
                 Stream(setpoint(mask=mask)),
                 Wait(0.1),
                 go(6, ack=TEMPORARILY_REJECTED),
@@ -303,16 +320,16 @@ MASK_ROWS = (
         for mask in IGNORED_MASKS
     ),
     Row(
-        "type_mask 32 ignores thrust: without thrust_body it falls",
-        MASKS,
-        State.OFFBOARD,
-        (Stream(setpoint(HOVER_01, mask=39)), Moves("acceleration_down_m_s2", Between(6.0, 10.0), 0.75)),
+        name="type_mask 32 ignores thrust: without thrust_body it falls",
+        section=MASKS,
+        start=State.OFFBOARD,
+        steps=(Stream(setpoint(HOVER_01, mask=39)), Moves("acceleration_down_m_s2", Between(6.0, 10.0), 0.75)),
     ),
     Row(
-        "type_mask 128 flies rates",
-        MASKS,
-        State.OFFBOARD,
-        (
+        name="type_mask 128 flies rates",
+        section=MASKS,
+        start=State.OFFBOARD,
+        steps=(
             Stream(setpoint(HOVER_01, mask=128, rates_rad_s=(0.0, 0.0, 0.5)), 100.0),
             sees("ATTITUDE", 1.5, yawspeed=near(0.5, 0.1)),
         ),

@@ -26,12 +26,16 @@ MICRODEGREES = 30.0  # of 1e-7 deg, 0.33 m: the measured origin was 0.12 m off t
 
 
 def read(name: str = "", index: int = -1) -> Send:
-    return Send(message("PARAM_REQUEST_READ", target_system=OWN, target_component=1, param_id=name, param_index=index))
+    return Send(
+        what=message("PARAM_REQUEST_READ", target_system=OWN, target_component=1, param_id=name, param_index=index)
+    )
 
 
 def write(name: str, value: float, kind: int) -> Send:
     return Send(
-        message("PARAM_SET", target_system=OWN, target_component=1, param_id=name, param_value=value, param_type=kind)
+        what=message(
+            "PARAM_SET", target_system=OWN, target_component=1, param_id=name, param_value=value, param_type=kind
+        )
     )
 
 
@@ -44,7 +48,10 @@ def has(name: str, value: int | float) -> tuple[Step, ...]:
 
 def defaults(title: str, **values: int | float) -> Row:
     return Row(
-        f"defaults: {title}", PARAMS, State.ARMABLE, tuple(step for n, v in values.items() for step in has(n, v))
+        name=f"defaults: {title}",
+        section=PARAMS,
+        start=State.ARMABLE,
+        steps=tuple(step for n, v in values.items() for step in has(n, v)),
     )
 
 
@@ -106,63 +113,68 @@ PARAM_ROWS = (
         IMU_INTEG_RATE=250,
     ),
     Row(
-        "integers travel bytewise, there and back",
-        PARAMS,
-        State.ARMABLE,
-        (SetParam("COM_OBL_RC_ACT", 5), *has("COM_OBL_RC_ACT", 5), SetParam("COM_OBL_RC_ACT", 0)),
+        name="integers travel bytewise, there and back",
+        section=PARAMS,
+        start=State.ARMABLE,
+        steps=(SetParam("COM_OBL_RC_ACT", 5), *has("COM_OBL_RC_ACT", 5), SetParam("COM_OBL_RC_ACT", 0)),
     ),
     Row(
-        "a value out of range is accepted",
-        PARAMS,
-        State.ARMABLE,
-        (SetParam("COM_OF_LOSS_T", 100.0), *has("COM_OF_LOSS_T", 100.0), SetParam("COM_OF_LOSS_T", 1.0)),
+        name="a value out of range is accepted",
+        section=PARAMS,
+        start=State.ARMABLE,
+        steps=(SetParam("COM_OF_LOSS_T", 100.0), *has("COM_OF_LOSS_T", 100.0), SetParam("COM_OF_LOSS_T", 1.0)),
     ),
-    Row("reading an unknown name", PARAMS, State.ARMABLE, (read("NO_SUCH_PARAM"), *refused("NO_SUCH_PARAM", 1))),
     Row(
-        "writing an unknown name",
-        PARAMS,
-        State.ARMABLE,
-        (write("NO_SUCH_PARAM", 1.0, REAL32), *refused("NO_SUCH_PARAM", 1)),
+        name="reading an unknown name",
+        section=PARAMS,
+        start=State.ARMABLE,
+        steps=(read("NO_SUCH_PARAM"), *refused("NO_SUCH_PARAM", 1)),
+    ),
+    Row(
+        name="writing an unknown name",
+        section=PARAMS,
+        start=State.ARMABLE,
+        steps=(write("NO_SUCH_PARAM", 1.0, REAL32), *refused("NO_SUCH_PARAM", 1)),
     ),
     *(
         Row(
-            f"writing {name} with the wrong type",
-            PARAMS,
-            State.ARMABLE,
-            (write(name, 0.25, kind), *refused(name, 7), *has(name, default)),
+            name=f"writing {name} with the wrong type",
+            section=PARAMS,
+            start=State.ARMABLE,
+            steps=(write(name, 0.25, kind), *refused(name, 7), *has(name, default)),
         )
         for name, kind, default in (("COM_OF_LOSS_T", INT32, 1.0), ("COM_OBL_RC_ACT", REAL32, 0))
     ),
     Row(
-        "the list is whole and has _HASH_CHECK",
-        PARAMS,
-        State.ARMABLE,
-        (
-            Send(message("PARAM_REQUEST_LIST", target_system=OWN, target_component=1)),
+        name="the list is whole and has _HASH_CHECK",
+        section=PARAMS,
+        start=State.ARMABLE,
+        steps=(
+            Send(what=message("PARAM_REQUEST_LIST", target_system=OWN, target_component=1)),
             sees("PARAM_VALUE", 2.0, param_index=0),
             sees("PARAM_VALUE", 2.0, param_id="MAV_SYS_ID", param_type=INT32),
             sees("PARAM_VALUE", 2.0, param_id="_HASH_CHECK", param_type=5, param_index=65535),
         ),
     ),
     Row(
-        "_HASH_CHECK alone",
-        PARAMS,
-        State.ARMABLE,
-        (read("_HASH_CHECK"), sees("PARAM_VALUE", 0.2, param_id="_HASH_CHECK", param_type=5)),
+        name="_HASH_CHECK alone",
+        section=PARAMS,
+        start=State.ARMABLE,
+        steps=(read("_HASH_CHECK"), sees("PARAM_VALUE", 0.2, param_id="_HASH_CHECK", param_type=5)),
     ),
     Row(
-        "by index",
-        PARAMS,
-        State.ARMABLE,
-        (read(index=3), sees("PARAM_VALUE", 0.2, param_index=3, param_count=Between(30, 3000))),
+        name="by index",
+        section=PARAMS,
+        start=State.ARMABLE,
+        steps=(read(index=3), sees("PARAM_VALUE", 0.2, param_index=3, param_count=Between(30, 3000))),
     ),
     Row(
-        "parameters of another system are not ours to set",
-        PARAMS,
-        State.ARMABLE,
-        (
+        name="parameters of another system are not ours to set",
+        section=PARAMS,
+        start=State.ARMABLE,
+        steps=(
             Send(
-                message(
+                what=message(
                     "PARAM_SET",
                     target_system=77,
                     target_component=1,
@@ -179,11 +191,11 @@ PARAM_ROWS = (
 
 ORIGIN_ROWS = (
     Row(
-        "GPS_GLOBAL_ORIGIN on request, the default place",
-        ORIGIN,
-        State.ARMABLE,
-        (
-            Command(REQUEST_MESSAGE, (49,)),
+        name="GPS_GLOBAL_ORIGIN on request, the default place",
+        section=ORIGIN,
+        start=State.ARMABLE,
+        steps=(
+            Command(number=REQUEST_MESSAGE, params=(49,)),
             sees(
                 "GPS_GLOBAL_ORIGIN",
                 0.2,
@@ -194,17 +206,21 @@ ORIGIN_ROWS = (
         ),
     ),
     Row(
-        "GPS_GLOBAL_ORIGIN is not streamed",
-        ORIGIN,
-        State.ARMABLE,
-        (never("GPS_GLOBAL_ORIGIN", 3.0), Command(REQUEST_MESSAGE, (49,)), sees("GPS_GLOBAL_ORIGIN", 0.2)),
+        name="GPS_GLOBAL_ORIGIN is not streamed",
+        section=ORIGIN,
+        start=State.ARMABLE,
+        steps=(
+            never("GPS_GLOBAL_ORIGIN", 3.0),
+            Command(number=REQUEST_MESSAGE, params=(49,)),
+            sees("GPS_GLOBAL_ORIGIN", 0.2),
+        ),
     ),
     Row(
-        "HOME_POSITION is where it was armed",
-        ORIGIN,
-        State.ARMED,
-        (
-            Command(REQUEST_MESSAGE, (242,)),
+        name="HOME_POSITION is where it was armed",
+        section=ORIGIN,
+        start=State.ARMED,
+        steps=(
+            Command(number=REQUEST_MESSAGE, params=(242,)),
             sees(
                 "HOME_POSITION",
                 0.2,
@@ -218,16 +234,16 @@ ORIGIN_ROWS = (
         ),
     ),
     Row(
-        "GLOBAL_POSITION_INT is relative to home",
-        ORIGIN,
-        State.ARMED,
-        (sees("GLOBAL_POSITION_INT", 0.3, lat=near(LAT_E7, MICRODEGREES), relative_alt=near(0, 300)),),
+        name="GLOBAL_POSITION_INT is relative to home",
+        section=ORIGIN,
+        start=State.ARMED,
+        steps=(sees("GLOBAL_POSITION_INT", 0.3, lat=near(LAT_E7, MICRODEGREES), relative_alt=near(0, 300)),),
     ),
     Row(
-        "it is at its own origin when it starts",
-        ORIGIN,
-        State.ARMABLE,
-        (sees("LOCAL_POSITION_NED", 0.3, x=near(0.0, 0.5), y=near(0.0, 0.5), z=near(0.0, 0.5)),),
+        name="it is at its own origin when it starts",
+        section=ORIGIN,
+        start=State.ARMABLE,
+        steps=(sees("LOCAL_POSITION_NED", 0.3, x=near(0.0, 0.5), y=near(0.0, 0.5), z=near(0.0, 0.5)),),
     ),
 )
 

@@ -114,7 +114,7 @@ def test_a_wrong_default_rate_is_seen() -> None:
     partner = InProcess()
     dialogue = Dialogue(partner)
     dialogue.run_until(lambda: bool(dialogue.sysid), 2.0)
-    command = v.Command(v.SET_INTERVAL, (30, 11_000))
+    command = v.Command(number=v.SET_INTERVAL, params=(30, 11_000))
     dialogue.send(command_message(command))
     dialogue.run(1.0)
     before = dialogue.counts()

@@ -247,16 +247,16 @@ def everything_said() -> dict[int, bytes]:
     dialogue = Dialogue(partner)
     player = Player(dialogue)
     row = v.Row(
-        "everything",
-        "",
-        v.State.LOITER,
-        (
+        name="everything",
+        section="",
+        start=v.State.LOITER,
+        steps=(
             *upload(AROUND),
             *download(AROUND),
-            v.Command(v.ARM_DISARM, (5.0,), v.NO_ACK),
-            v.Send(v.message("PARAM_REQUEST_READ", target_system=v.OWN, target_component=1, param_id="NO_SUCH")),
-            v.Send(v.message("PING", time_usec=7, seq=9)),
-            *(v.Command(v.REQUEST_MESSAGE, (number,)) for number in (49, 148, 242, 31, 85)),
+            v.Command(number=v.ARM_DISARM, params=(5.0,), ack=v.NO_ACK),
+            v.Send(what=v.message("PARAM_REQUEST_READ", target_system=v.OWN, target_component=1, param_id="NO_SUCH")),
+            v.Send(what=v.message("PING", time_usec=7, seq=9)),
+            *(v.Command(number=v.REQUEST_MESSAGE, params=(number,)) for number in (49, 148, 242, 31, 85)),
             v.go(4, 4),
             v.sees("MISSION_ITEM_REACHED", 20.0),
         ),

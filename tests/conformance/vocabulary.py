@@ -89,7 +89,7 @@ def setpoint(
     )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Send:
     """Send a message, and look at what comes from now on."""
 
@@ -99,7 +99,7 @@ class Send:
     link: str = OFFBOARD_LINK
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Command:
     """Send a command; the answer must be this ack, from that vehicle alone, to us; or NO_ACK."""
 
@@ -114,15 +114,15 @@ class Command:
 
 def go(main: int, sub: int = 0, ack: int = ACCEPTED, flag: int = 1) -> Command:
     """DO_SET_MODE."""
-    return Command(SET_MODE, (flag, main, sub), ack)
+    return Command(number=SET_MODE, params=(flag, main, sub), ack=ack)
 
 
 def arm(ack: int = ACCEPTED) -> Command:
-    return Command(ARM_DISARM, (1.0,), ack)
+    return Command(number=ARM_DISARM, params=(1.0,), ack=ack)
 
 
 def disarm(ack: int = ACCEPTED, magic: float = 0.0) -> Command:
-    return Command(ARM_DISARM, (0.0, magic), ack)
+    return Command(number=ARM_DISARM, params=(0.0, magic), ack=ack)
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +169,7 @@ class Mark:
 # --- steps: what must come back, since the last thing sent ---
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Sees:
     """At least one message with these fields."""
 
@@ -182,14 +182,14 @@ class Sees:
 
 
 def sees(name: str | int, within_s: float = 0.5, *, link: str = OFFBOARD_LINK, after_s: float = 0.0, **f: Any) -> Sees:
-    return Sees(name, f, within_s, link, after_s)
+    return Sees(name=name, fields=f, within_s=within_s, link=link, not_before_s=after_s)
 
 
 def forwarded(name: str, within_s: float, link: str, **fields: Any) -> Sees:
-    return Sees(name, fields, within_s, link, forwarded=True)
+    return Sees(name=name, fields=fields, within_s=within_s, link=link, forwarded=True)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Never:
     """No message with these fields for that long; from the last thing sent."""
 
@@ -200,10 +200,10 @@ class Never:
 
 
 def never(name: str | int, for_s: float = 0.3, *, link: str = OFFBOARD_LINK, **fields: Any) -> Never:
-    return Never(name, fields, for_s, link)
+    return Never(name=name, fields=fields, for_s=for_s, link=link)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Always:
     """From now on for that long every message of a kind has these fields, and there are that many."""
 
@@ -215,10 +215,10 @@ class Always:
 
 
 def always(name: str, for_s: float, at_least: int = 1, *, link: str = OFFBOARD_LINK, **fields: Any) -> Always:
-    return Always(name, fields, for_s, at_least, link)
+    return Always(name=name, fields=fields, for_s=for_s, at_least=at_least, link=link)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Says:
     """A STATUSTEXT, verbatim, or matching a pattern. The tab of texts that are also an event is part of it."""
 
@@ -235,7 +235,7 @@ class SaysNothing:
     for_s: float = 0.5
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Turns:
     """A field of a fast message takes this value, not before `low_s` and not after `high_s`."""
 
@@ -262,7 +262,7 @@ class At:
     since_start_s: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Passes:
     """A field takes these values one after the other, from when it first has the first of them."""
 
@@ -272,7 +272,7 @@ class Passes:
     within_s: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Rate:
     """A message comes that often, from now on."""
 
@@ -328,15 +328,17 @@ EXPECTATIONS = (
 
 def heartbeat(within_s: float = 1.2, **fields: Any) -> Sees:
     """The state as HEARTBEAT shows it, up to a second late."""
-    return Sees("HEARTBEAT", fields, within_s)
+    return Sees(name="HEARTBEAT", fields=fields, within_s=within_s)
 
 
 def mode(value: int, intended: int | None = None, within_s: float = 0.6) -> Sees:
     """The mode as CURRENT_MODE shows it: twice a second, and at once on a change."""
-    return Sees("CURRENT_MODE", {"custom_mode": value, "intended_custom_mode": intended or value}, within_s)
+    return Sees(
+        name="CURRENT_MODE", fields={"custom_mode": value, "intended_custom_mode": intended or value}, within_s=within_s
+    )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
     """One row of the sheet.
 

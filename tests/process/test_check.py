@@ -111,7 +111,10 @@ def run_check(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Check:
         text += "".join(f'[[vehicles]]\nsysid={sysid}\nurl="udpin://127.0.0.1:{port}"\n' for sysid, port in vehicles)
         path = tmp_path / "check.toml"
         path.write_text(text + more)
-        code = check(load(path), CheckOptions(apply, QUICK_S, tmp_path / "check.json", 1.5, to_fly))
+        code = check(
+            load(path),
+            CheckOptions(apply=apply, seconds=QUICK_S, json=tmp_path / "check.json", connect_s=1.5, to_fly=to_fly),
+        )
         return code, json.loads((tmp_path / "check.json").read_text()), capsys.readouterr().out
 
     return run

@@ -96,7 +96,20 @@ def listener(join: Callable[..., ZenohBus]) -> Listener:  # noqa: F811
 
 def forge(bus: ZenohBus, boot_id: int, seq: int) -> None:
     away = np.tile([60.0, 0.0, -2.0], (5, 1))
-    bus.publish(PATH, encode_path(PredictedPath(1, boot_id, seq, now_us() + 40_000, 100_000, 0.0, away)))
+    bus.publish(
+        PATH,
+        encode_path(
+            PredictedPath(
+                agent=1,
+                boot_id=boot_id,
+                seq=seq,
+                t0_utc_us=now_us() + 40_000,
+                dt_us=100_000,
+                radius_m=0.0,
+                pos_ned_m=away,
+            )
+        ),
+    )
 
 
 def test_a_restarted_peer_is_believed_with_its_first_words(

@@ -23,7 +23,7 @@ STOP_S = 5.0
 PARAMETER_FILES = ("copter.parm", "../../../Tools/autotest/default_params/copter.parm")  # beside it; of a source tree
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Start:
     """Place at which one vehicle is to be started."""
 
@@ -35,7 +35,7 @@ class Start:
     parameters: Mapping[str, float]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Kind:
     """One autopilot: default place, ports, and how a vehicle is started.
 
@@ -69,7 +69,14 @@ class Kind:
     def place(self, index: int, count: int, folder: Path, parameters: Mapping[str, float] | None = None) -> Start:
         """Return the place of the vehicle of that index among so many."""
         lat_deg = self.origin.lat_deg + math.degrees(north_m(index, count) / EARTH_RADIUS_M)
-        return Start(index, folder, lat_deg, self.origin.lon_deg, self.origin.alt_m, parameters or {})
+        return Start(
+            index=index,
+            folder=folder,
+            lat_deg=lat_deg,
+            lon_deg=self.origin.lon_deg,
+            alt_m=self.origin.alt_m,
+            parameters=parameters or {},
+        )
 
     def shell_line(self, start: Start) -> list[str]:
         """Return the shell line that starts it, from any folder and any environment."""
@@ -113,15 +120,21 @@ def _parameter_file(binary: Path) -> Path:
 
 
 PX4 = Kind(
-    "SWARMCTL_PX4",
-    GeoOrigin(47.397742, 8.545594, 489.4),
-    (14540, 14580, 18570, 14280, 13030, 19450, 19410),
-    1,
-    _px4_command,
-    _px4_environment,
-    "px4_lock-{}",
+    variable="SWARMCTL_PX4",
+    origin=GeoOrigin(47.397742, 8.545594, 489.4),
+    ports=(14540, 14580, 18570, 14280, 13030, 19450, 19410),
+    spread=1,
+    command=_px4_command,
+    environment=_px4_environment,
+    lock_name="px4_lock-{}",
 )
-ARDUCOPTER = Kind("SWARMCTL_ARDUCOPTER", GeoOrigin(-35.363262, 149.165237, 584.0), (14550,), 10, _arducopter_command)
+ARDUCOPTER = Kind(
+    variable="SWARMCTL_ARDUCOPTER",
+    origin=GeoOrigin(-35.363262, 149.165237, 584.0),
+    ports=(14550,),
+    spread=10,
+    command=_arducopter_command,
+)
 
 
 def north_m(index: int, count: int) -> float:

@@ -49,7 +49,7 @@ class Truth:
     q_nb: tuple[float, ...]
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Seen:
     """Samples of one vehicle. Times are of the monotonic clock."""
 

@@ -93,7 +93,7 @@ class OffboardStream:
         yaw_rate = math.nan if type_mask & NO_YAW_RATE else rates[2]
         if not has_attitude:
             asked = rates[0], rates[1], yaw_rate
-            self.command = Command(IDLE.q_nb, thrust, rate_frd_rad_s=asked, stopped=stopped)
+            self.command = Command(q_nb=IDLE.q_nb, thrust_01=thrust, rate_frd_rad_s=asked, stopped=stopped)
             self.echo = _LEVEL, abs(thrust_01), asked
             return
         size = math.sqrt(sum(c * c for c in q_nb))
@@ -101,7 +101,7 @@ class OffboardStream:
         loose = self.poisoned or self._bad
         q_unit = IDLE.q_nb if loose else np.array(q_nb, dtype=np.float64) / size
         feed = _feed(type_mask, rates)
-        self.command = Command(q_unit, thrust, feed_frd_rad_s=feed, stopped=stopped, loose=loose)
+        self.command = Command(q_nb=q_unit, thrust_01=thrust, feed_frd_rad_s=feed, stopped=stopped, loose=loose)
         self.echo = q_nb, abs(thrust_01), _NO_RATES
 
     def flown(self) -> None:

@@ -33,7 +33,7 @@ _PWM_OFF, _PWM_IDLE, _PWM_SPAN = 900, 1000, 1000
 _INT32 = 2**31 - 1
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class LinkCounts:
     """Traffic counters of one link."""
 
@@ -45,7 +45,7 @@ class LinkCounts:
     pings: int = 0
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Report:
     """Everything a message can be built from, at one instant."""
 

@@ -59,7 +59,7 @@ _ENDLESS_S = 3600.0
 _BUSY_LOAD = 0.7  # one-minute load average
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class BenchRow:
     """One line of `bench.json`."""
 
@@ -120,7 +120,15 @@ def measure_commitments(
 
 
 def _swap_config(solver: str, agents: int) -> Config:
-    cell = Cell("symmetric", agents, 0.0, 0.0, "exact", 0.0, "guaranteed")
+    cell = Cell(
+        scenario="symmetric",
+        agents=agents,
+        delay_ms=0.0,
+        loss=0.0,
+        noise="exact",
+        wind_m_s=0.0,
+        protections="guaranteed",
+    )
     extra = (f"controller.mpc.qp.solver='{solver}'", f"mission.duration_s={_ENDLESS_S}")
     return config_of(cell, 1, layout_of(cell.scenario, 1, agents), agents, extra)
 
@@ -164,7 +172,9 @@ def xy_rows(times: XyTimes) -> list[BenchRow]:
 
 
 def _row(name: str, solver: str, neighbours: int, times: Times) -> BenchRow:
-    return BenchRow(name, solver, neighbours, round(times.p50_ms, 4), round(times.p99_ms, 4))
+    return BenchRow(
+        name=name, solver=solver, neighbours=neighbours, p50_ms=round(times.p50_ms, 4), p99_ms=round(times.p99_ms, 4)
+    )
 
 
 def bench(

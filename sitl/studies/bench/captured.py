@@ -161,7 +161,7 @@ def times_of(took_ms: Sequence[float] | Array) -> Times:
     return Times(float(p50_ms), float(p99_ms))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Baseline:
     """Answers of SLSQP to the counted problems, as the thesis poses them."""
 
@@ -193,7 +193,7 @@ class Baseline:
         return float(self.kept.mean())
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class XyTimes:
     """Processor time of each solver for the x-y problem with two neighbours and an obstacle."""
 
@@ -242,8 +242,8 @@ def measure_xy(
                 baseline.solve(mpc.nonlinear(problem, plan))
             on_problem()
     counted = {name: np.array(took[_WARM_UP:]) for name, took in qp_ms.items()}
-    found = [b.counted() for b in baselines] if slsqp else [None, None]
-    return XyTimes(times_of(captured.tick_ms), counted, *found)
+    fmincon, gradients = [b.counted() for b in baselines] if slsqp else [None, None]
+    return XyTimes(tick=times_of(captured.tick_ms), qp_ms=counted, fmincon=fmincon, gradients=gradients)
 
 
 def tapped(config: Config, solver: str) -> TappedMpc:
@@ -271,8 +271,8 @@ class _Running:
     def counted(self) -> Baseline:
         answers = self._answers[_WARM_UP:]
         return Baseline(
-            np.array(self._took_ms[_WARM_UP:]),
-            np.array([a.solved for a in answers]),
-            np.array([a.at_limit for a in answers]),
-            np.array([a.shortfall_m < KEPT_M for a in answers]),
+            took_ms=np.array(self._took_ms[_WARM_UP:]),
+            solved=np.array([a.solved for a in answers]),
+            at_limit=np.array([a.at_limit for a in answers]),
+            kept=np.array([a.shortfall_m < KEPT_M for a in answers]),
         )

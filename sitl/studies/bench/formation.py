@@ -188,7 +188,15 @@ class Formation:
         paths = self.neighbours.positions_ned_m(ahead_s + began_s if began_s >= 0.0 else 0.0 * ahead_s)
         self._seq += 1
         for i, (bus, path) in enumerate(zip(self._buses, paths, strict=True)):
-            message = PredictedPath(i + 1, 1, self._seq, utc_us + delay_us, dt_us, 0.0, path)
+            message = PredictedPath(
+                agent=i + 1,
+                boot_id=1,
+                seq=self._seq,
+                t0_utc_us=utc_us + delay_us,
+                dt_us=dt_us,
+                radius_m=0.0,
+                pos_ned_m=path,
+            )
             bus.publish(topics.PATH, topics.encode_path(message))
             if now_us % _STATUS_EVERY_US == 0:
                 bus.publish(topics.STATUS, topics.encode_message(self._status(i + 1, began_s >= 0.0)))

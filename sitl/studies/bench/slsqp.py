@@ -30,7 +30,7 @@ _SOLVED, _LIMIT = 0, 9  # SLSQP's exit modes
 _LEAST_M = 1e-9
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class NonlinearAnswer:
     """Answer of SLSQP. Neither solved nor at its limit: it reports that the constraints can't be satisfied."""
 
@@ -138,7 +138,12 @@ class NonlinearXy:
         )
         moves, mode = np.asarray(result.x), int(result.status)
         return NonlinearAnswer(
-            moves, float(result.fun), mode == _SOLVED, mode == _LIMIT, int(result.nit), self.shortfall_m(moves)
+            moves=moves,
+            cost=float(result.fun),
+            solved=mode == _SOLVED,
+            at_limit=mode == _LIMIT,
+            iterations=int(result.nit),
+            shortfall_m=self.shortfall_m(moves),
         )
 
     def cost(self, moves: Array) -> float:

@@ -26,14 +26,65 @@ def timing_rows(bar: Progress) -> list[Row]:
     kept = f"{fmincon.solved_01:.0%} of {found.problems} problems have a solution to it; the ratio is of those"
     slower = f"{kept}; OSQP is first order and takes some 140 iterations, DAQP's active set a few"
     rows = [
-        Row(f"{_PROBLEM}, OSQP, median", None, osqp.p50_ms, 0.5, "plant", ms),
-        Row(f"{_PROBLEM}, OSQP, 99th percentile", None, osqp.p99_ms, 1.5, "plant", ms),
-        Row(f"{_PROBLEM}, SLSQP in place of fmincon, median", None, fmincon.times.p50_ms, None, "plant", ms, kept),
-        Row(f"{_PROBLEM}, OSQP over SLSQP", None, 1.0 / found.speed_up(), 1.0 / _FASTER, "plant", "1", slower),
-        Row("whole tick, 2 neighbours and 1 obstacle, median", None, found.tick.p50_ms, 1.5, "full", ms),
+        Row(name=f"{_PROBLEM}, OSQP, median", published=None, ours=osqp.p50_ms, limit=0.5, path="plant", unit=ms),
+        Row(
+            name=f"{_PROBLEM}, OSQP, 99th percentile",
+            published=None,
+            ours=osqp.p99_ms,
+            limit=1.5,
+            path="plant",
+            unit=ms,
+        ),
+        Row(
+            name=f"{_PROBLEM}, SLSQP in place of fmincon, median",
+            published=None,
+            ours=fmincon.times.p50_ms,
+            limit=None,
+            path="plant",
+            unit=ms,
+            note=kept,
+        ),
+        Row(
+            name=f"{_PROBLEM}, OSQP over SLSQP",
+            published=None,
+            ours=1.0 / found.speed_up(),
+            limit=1.0 / _FASTER,
+            path="plant",
+            unit="1",
+            note=slower,
+        ),
+        Row(
+            name="whole tick, 2 neighbours and 1 obstacle, median",
+            published=None,
+            ours=found.tick.p50_ms,
+            limit=1.5,
+            path="full",
+            unit=ms,
+        ),
     ]
     if "daqp" in found.qp_ms:  # an optional package
         ratio = 1.0 / found.speed_up("daqp")
-        rows.insert(2, Row(f"{_PROBLEM}, DAQP, median", None, found.qp("daqp").p50_ms, None, "plant", ms))
-        rows.insert(5, Row(f"{_PROBLEM}, DAQP over SLSQP", None, ratio, 1.0 / _FASTER, "plant", "1", kept))
+        rows.insert(
+            2,
+            Row(
+                name=f"{_PROBLEM}, DAQP, median",
+                published=None,
+                ours=found.qp("daqp").p50_ms,
+                limit=None,
+                path="plant",
+                unit=ms,
+            ),
+        )
+        rows.insert(
+            5,
+            Row(
+                name=f"{_PROBLEM}, DAQP over SLSQP",
+                published=None,
+                ours=ratio,
+                limit=1.0 / _FASTER,
+                path="plant",
+                unit="1",
+                note=kept,
+            ),
+        )
     return rows

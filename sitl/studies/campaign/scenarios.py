@@ -41,7 +41,7 @@ SMALL = Size(
 )
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Layout:
     """One drawn instance of a scenario."""
 
@@ -57,7 +57,7 @@ class Layout:
     lost: frozenset[int] = frozenset()  # agents that are not expected to arrive
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Scenario:
     """A row of the table."""
 
@@ -95,7 +95,7 @@ def _circle(rng: np.random.Generator, agents: int) -> Layout:
     line = np.zeros((agents, 3))
     line[:, 0] = np.arange(agents) - (agents - 1) / 2
     line[:, :2] += rng.uniform(-_JITTER_M, _JITTER_M, (agents, 2))
-    return Layout(THESIS, line, ("mission.kind=circle",), limit_s=25.0)
+    return Layout(size=THESIS, starts_ned_m=line, settings=("mission.kind=circle",), limit_s=25.0)
 
 
 def _swap(rng: np.random.Generator, agents: int, jitter_m: float = _JITTER_M) -> Layout:
@@ -104,7 +104,7 @@ def _swap(rng: np.random.Generator, agents: int, jitter_m: float = _JITTER_M) ->
     starts = exact.copy()
     starts[:, :2] += rng.uniform(-jitter_m, jitter_m, (agents, 2))
     goals = -starts
-    return Layout(THESIS, starts, _go(goals), limit_s=40.0, goals_ned_m=goals)
+    return Layout(size=THESIS, starts_ned_m=starts, settings=_go(goals), limit_s=40.0, goals_ned_m=goals)
 
 
 def _symmetric(rng: np.random.Generator, agents: int) -> Layout:
@@ -115,14 +115,28 @@ def _random(rng: np.random.Generator, agents: int) -> Layout:
     low, high = np.array([-1.5, -1.5, -2.2]), np.array([1.5, 1.5, -0.2])
     starts = scattered(rng, agents, low, high, 0.5)
     goals = far_goals(rng, starts, low, high, 0.5, 1.0)
-    return Layout(SMALL, starts, _go(goals, _SMALL_M_S, _SMALL_M_S2), 30.0, goals, arrive_m=0.1)
+    return Layout(
+        size=SMALL,
+        starts_ned_m=starts,
+        settings=_go(goals, _SMALL_M_S, _SMALL_M_S2),
+        limit_s=30.0,
+        goals_ned_m=goals,
+        arrive_m=0.1,
+    )
 
 
 def _same_goal(rng: np.random.Generator, agents: int) -> Layout:
     starts = ring(agents, max(4.0, 0.7 * THESIS.radius_m / math.sin(math.pi / max(agents, 2))), 0.0)
     starts[:, :2] += rng.uniform(-0.2, 0.2, (agents, 2))
     goal = np.zeros((1, 3))
-    return Layout(THESIS, starts, _go(goal), 30.0, np.repeat(goal, agents, axis=0), settles=True)
+    return Layout(
+        size=THESIS,
+        starts_ned_m=starts,
+        settings=_go(goal),
+        limit_s=30.0,
+        goals_ned_m=np.repeat(goal, agents, axis=0),
+        settles=True,
+    )
 
 
 def _forest(rng: np.random.Generator, agents: int) -> Layout:
@@ -131,7 +145,7 @@ def _forest(rng: np.random.Generator, agents: int) -> Layout:
     starts[:, 2] = -1.0
     goals = starts * [-1.0, -1.0, 1.0]
     settings = (*_go(goals, _SMALL_M_S, _SMALL_M_S2), _columns(axes, _COLUMN_M, SMALL))
-    return Layout(SMALL, starts, settings, 60.0, goals, arrive_m=0.1)
+    return Layout(size=SMALL, starts_ned_m=starts, settings=settings, limit_s=60.0, goals_ned_m=goals, arrive_m=0.1)
 
 
 def _maze(rng: np.random.Generator, agents: int) -> Layout:
@@ -142,7 +156,7 @@ def _maze(rng: np.random.Generator, agents: int) -> Layout:
     other_way = np.arange(agents) % 2 == 1
     starts[other_way], goals[other_way] = goals[other_way].copy(), starts[other_way].copy()
     settings = (*_go(goals, _SMALL_M_S, _SMALL_M_S2), _columns(posts, _POST_RADIUS_M, SMALL))
-    return Layout(SMALL, starts, settings, 60.0, goals, arrive_m=0.1)
+    return Layout(size=SMALL, starts_ned_m=starts, settings=settings, limit_s=60.0, goals_ned_m=goals, arrive_m=0.1)
 
 
 def _with(layout: Layout, event: ScenarioEvent, **changes: object) -> Layout:
@@ -190,18 +204,24 @@ def _partition(rng: np.random.Generator, agents: int) -> Layout:
 
 
 SCENARIOS: dict[str, Scenario] = {
-    "circle": Scenario("the thesis' climbing circle, one reference for all", _circle, (3,)),
-    "swap": Scenario("every agent to the opposite side of a circle, starts 5 cm off", _swap, (6, 10), needs=2),
-    "symmetric": Scenario("the same from a perfect polygon", _symmetric, (6, 10), needs=2),
-    "random": Scenario("random transitions in 3 x 3 x 2 m, small vehicles", _random, (4, 10, 20), alone=True),
-    "same_goal": Scenario("all agents to one point", _same_goal, (3, 6, 10)),
-    "forest": Scenario("swap through 20 columns, small vehicles", _forest, (10,), needs=2),
-    "maze": Scenario("both ways through four rows of walls, small vehicles", _maze, (10,)),
-    "sudden_static": Scenario("an obstacle appears in the middle of a swap", _sudden_static, (6,), needs=2),
-    "sudden_moving": Scenario("one crosses the swap at 0.5 to 1 m/s", _sudden_moving, (6,), needs=2),
-    "uncooperative": Scenario("one agent of a swap avoids nothing", _uncooperative, (6,), needs=2),
-    "death": Scenario("one agent of a swap dies on the way", _death, (6,), needs=2),
-    "partition": Scenario("the bus delivers nothing for 2 s of a swap", _partition, (6, 10), needs=2),
+    "circle": Scenario(title="the thesis' climbing circle, one reference for all", draw=_circle, agents=(3,)),
+    "swap": Scenario(
+        title="every agent to the opposite side of a circle, starts 5 cm off", draw=_swap, agents=(6, 10), needs=2
+    ),
+    "symmetric": Scenario(title="the same from a perfect polygon", draw=_symmetric, agents=(6, 10), needs=2),
+    "random": Scenario(
+        title="random transitions in 3 x 3 x 2 m, small vehicles", draw=_random, agents=(4, 10, 20), alone=True
+    ),
+    "same_goal": Scenario(title="all agents to one point", draw=_same_goal, agents=(3, 6, 10)),
+    "forest": Scenario(title="swap through 20 columns, small vehicles", draw=_forest, agents=(10,), needs=2),
+    "maze": Scenario(title="both ways through four rows of walls, small vehicles", draw=_maze, agents=(10,)),
+    "sudden_static": Scenario(
+        title="an obstacle appears in the middle of a swap", draw=_sudden_static, agents=(6,), needs=2
+    ),
+    "sudden_moving": Scenario(title="one crosses the swap at 0.5 to 1 m/s", draw=_sudden_moving, agents=(6,), needs=2),
+    "uncooperative": Scenario(title="one agent of a swap avoids nothing", draw=_uncooperative, agents=(6,), needs=2),
+    "death": Scenario(title="one agent of a swap dies on the way", draw=_death, agents=(6,), needs=2),
+    "partition": Scenario(title="the bus delivers nothing for 2 s of a swap", draw=_partition, agents=(6, 10), needs=2),
 }
 
 

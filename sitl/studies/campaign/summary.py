@@ -28,7 +28,7 @@ class Share:
         return clopper_pearson(self.hits, self.trials)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class CellSummary:
     """One line of the report; None where nothing was measured."""
 
@@ -61,20 +61,20 @@ def _summary(cell: Cell, rows: Sequence[Row]) -> CellSummary:
     ratios = _ratios(rows, "flight_time_s", "unconstrained_time_s")
     sums = _ratios([row for row in rows if row["arrived"]], "goal_sum_m", "least_sum_m")
     return CellSummary(
-        cell,
-        _count(rows, "collided"),
-        _count(rows, "arrived"),
-        _count(rows, "deadlocked"),
-        _least(rows, "min_separation_m"),
-        _least(rows, "min_clearance_m"),
-        median(times) if times else None,
-        max(times, default=None),
-        median(ratios) if ratios else None,
-        max(sums, default=None),
-        fmean(row["plans_failed"] for row in rows),
-        fmean(row["commits_refused"] or 0 for row in rows),
-        fmean(row["safety_filter_acted"] for row in rows),
-        fmean(row["cpu_s"] for row in rows),
+        cell=cell,
+        collided=_count(rows, "collided"),
+        arrived=_count(rows, "arrived"),
+        deadlocked=_count(rows, "deadlocked"),
+        min_separation_m=_least(rows, "min_separation_m"),
+        min_clearance_m=_least(rows, "min_clearance_m"),
+        time_median_s=median(times) if times else None,
+        time_max_s=max(times, default=None),
+        time_relative=median(ratios) if ratios else None,
+        sum_relative=max(sums, default=None),
+        plans_failed=fmean(row["plans_failed"] for row in rows),
+        commits_refused=fmean(row["commits_refused"] or 0 for row in rows),
+        safety_filter_acted=fmean(row["safety_filter_acted"] for row in rows),
+        cpu_s=fmean(row["cpu_s"] for row in rows),
     )
 
 

@@ -10,7 +10,7 @@ from typing import Any
 import pyarrow as pa
 
 
-@dataclass(frozen=True, slots=True, order=True)
+@dataclass(frozen=True, slots=True, order=True, kw_only=True)
 class Cell:
     """One combination of conditions, flown with many seeds."""
 
@@ -82,7 +82,16 @@ def cells(
     """Every combination, in order."""
     axes = (scenarios, agents, delays_ms, losses, noises, winds_m_s, protections)
     for scenario, count, delay_ms, loss, noise, wind_m_s, protection in itertools.product(*axes):
-        yield Cell(scenario, count, delay_ms, loss, noise, wind_m_s, protection, sets)
+        yield Cell(
+            scenario=scenario,
+            agents=count,
+            delay_ms=delay_ms,
+            loss=loss,
+            noise=noise,
+            wind_m_s=wind_m_s,
+            protections=protection,
+            sets=sets,
+        )
 
 
 def cell_of(row: Row) -> Cell:

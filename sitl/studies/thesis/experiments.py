@@ -20,7 +20,7 @@ _CERTIFIED_01 = 0.11  # share of the radius: certificate slack when the radius i
 Flown = Mapping[str, Trace]  # by job name
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Job:
     """One flight of the table."""
 
@@ -33,7 +33,7 @@ class Job:
     radius_m: float | None = None  # constraint radius, where a row depends on it
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Asked:
     """One row of `reproduce.json` that is computed from one flight."""
 
@@ -70,32 +70,34 @@ def radius_name(kind: str, factor: float) -> str:
 def _single(speed: str) -> Iterator[Job]:
     pid: FlightName = "pid_slow" if speed == "slow" else "pid_fast"
     mpc: FlightName = "mpc_slow" if speed == "slow" else "mpc_fast"
-    yield Job(pid, f"{pid} published", f"thesis_4_{pid}")
-    yield Job(pid, f"{pid} retuned", f"improved_4_{pid}")
-    yield Job(mpc, f"{mpc} published", f"thesis_4_{mpc}")
-    yield Job(mpc, f"{mpc} published, matched start", f"thesis_4_{mpc}", matched_velocity=True)
-    yield Job(mpc, f"{mpc} improved", f"improved_4_{mpc}")
-    yield Job(mpc, f"{mpc} improved, matched start", f"improved_4_{mpc}", matched_velocity=True)
+    yield Job(flight=pid, name=f"{pid} published", config=f"thesis_4_{pid}")
+    yield Job(flight=pid, name=f"{pid} retuned", config=f"improved_4_{pid}")
+    yield Job(flight=mpc, name=f"{mpc} published", config=f"thesis_4_{mpc}")
+    yield Job(flight=mpc, name=f"{mpc} published, matched start", config=f"thesis_4_{mpc}", matched_velocity=True)
+    yield Job(flight=mpc, name=f"{mpc} improved", config=f"improved_4_{mpc}")
+    yield Job(flight=mpc, name=f"{mpc} improved, matched start", config=f"improved_4_{mpc}", matched_velocity=True)
 
 
 def _plant_jobs() -> Iterator[Job]:
-    yield Job("open_loop", "open_loop", "thesis_1_open_loop")
-    yield Job("pid_step", "pid_step", "thesis_2_pid_step")
-    yield Job("pid_steps", "pid_steps", "thesis_3_pid_steps")
+    yield Job(flight="open_loop", name="open_loop", config="thesis_1_open_loop")
+    yield Job(flight="pid_step", name="pid_step", config="thesis_2_pid_step")
+    yield Job(flight="pid_steps", name="pid_steps", config="thesis_3_pid_steps")
     yield from _single("slow")
     yield from _single("fast")
     for factor in RADII:
         yield _circle("dmpc", factor, "thesis_5_circle")
     for factor in RADII:
         yield _circle("dmpc3", factor, "improved_5_circle_dmpc3")
-    yield Job("obstacle", "obstacle published", "thesis_6_obstacle")
-    yield Job("obstacle", "obstacle improved", "improved_6_obstacle")
-    yield Job("obstacle", "obstacle dmpc3", "improved_6_obstacle_dmpc3")
+    yield Job(flight="obstacle", name="obstacle published", config="thesis_6_obstacle")
+    yield Job(flight="obstacle", name="obstacle improved", config="improved_6_obstacle")
+    yield Job(flight="obstacle", name="obstacle dmpc3", config="improved_6_obstacle_dmpc3")
 
 
 def _circle(kind: str, factor: float, config: str) -> Job:
     radius_m = factor * SAFE_RADIUS_M
-    return Job("circle", radius_name(kind, factor), config, overrides=at_radius(radius_m), radius_m=radius_m)
+    return Job(
+        flight="circle", name=radius_name(kind, factor), config=config, overrides=at_radius(radius_m), radius_m=radius_m
+    )
 
 
 PLANT_JOBS: tuple[Job, ...] = tuple(_plant_jobs())
@@ -125,7 +127,16 @@ def rows(flown: Flown) -> list[Row]:
 
 def _row(asked: Asked, trace: Trace) -> Row:
     ours = asked.figure(trace)
-    return Row(asked.name, asked.published, ours, asked.limit, trace.path, asked.unit, asked.note, asked.lower_bound)
+    return Row(
+        name=asked.name,
+        published=asked.published,
+        ours=ours,
+        limit=asked.limit,
+        path=trace.path,
+        unit=asked.unit,
+        note=asked.note,
+        lower_bound=asked.lower_bound,
+    )
 
 
 def _mse(axis: int) -> Callable[[Trace], float]:
@@ -142,12 +153,26 @@ def _tables_5_6() -> Iterator[Asked]:
     for table, (speed, (mean_m, mse_m2, retuned_m)) in zip((5, 6), _PID_TABLES.items(), strict=True):
         key, text = f"pid_{speed}", f"PID {speed}, Table {table}"
         job = f"{key} published"
-        yield Asked(f"{text}, mean distance", job, score.mean_distance_m, "m", mean_m, 1.2 * mean_m, "published gains")
+        yield Asked(
+            name=f"{text}, mean distance",
+            job=job,
+            figure=score.mean_distance_m,
+            unit="m",
+            published=mean_m,
+            limit=1.2 * mean_m,
+            note="published gains",
+        )
         for axis, letter in enumerate("xyz"):
-            yield Asked(f"{text}, MSE {letter}", job, _mse(axis), "m2", mse_m2[axis])
+            yield Asked(name=f"{text}, MSE {letter}", job=job, figure=_mse(axis), unit="m2", published=mse_m2[axis])
         note = "the same cascade retuned, with the reference's acceleration fed forward"
         yield Asked(
-            f"{text}, retuned, mean distance", f"{key} retuned", score.mean_distance_m, "m", mean_m, retuned_m, note
+            name=f"{text}, retuned, mean distance",
+            job=f"{key} retuned",
+            figure=score.mean_distance_m,
+            unit="m",
+            published=mean_m,
+            limit=retuned_m,
+            note=note,
         )
 
 
@@ -186,19 +211,63 @@ def _tables_11_12() -> Iterator[Asked]:
             job, asked = f"{key} published{suffix}", suffix if speed == "fast" else not suffix
             limit = 1.6 * mean_m if asked else None
             figure = score.mean_distance_m
-            yield Asked(f"{text}{suffix}, mean distance", job, figure, "m", mean_m, limit, note, bound[0])
+            yield Asked(
+                name=f"{text}{suffix}, mean distance",
+                job=job,
+                figure=figure,
+                unit="m",
+                published=mean_m,
+                limit=limit,
+                note=note,
+                lower_bound=bound[0],
+            )
             for axis, letter in enumerate("xyz"):
                 low = {0: bound[1], 2: bound[2]}.get(axis)
-                yield Asked(f"{text}{suffix}, MSE {letter}", job, _mse(axis), "m2", mse_m2[axis], None, "", low)
+                yield Asked(
+                    name=f"{text}{suffix}, MSE {letter}",
+                    job=job,
+                    figure=_mse(axis),
+                    unit="m2",
+                    published=mse_m2[axis],
+                    limit=None,
+                    note="",
+                    lower_bound=low,
+                )
         for suffix, note, bound in starts:
             job, ours = f"{key} improved{suffix}", f"{text}, improved{suffix}"
             limit = limits[0] if suffix else None
-            yield Asked(f"{ours}, mean distance", job, score.mean_distance_m, "m", mean_m, limit, note, bound[0])
+            yield Asked(
+                name=f"{ours}, mean distance",
+                job=job,
+                figure=score.mean_distance_m,
+                unit="m",
+                published=mean_m,
+                limit=limit,
+                note=note,
+                lower_bound=bound[0],
+            )
             for axis, letter, at in ((0, "x", 1), (2, "z", 2)):
                 limit = limits[at] if suffix else None
-                yield Asked(f"{ours}, MSE {letter}", job, _mse(axis), "m2", mse_m2[axis], limit, "", bound[at])
+                yield Asked(
+                    name=f"{ours}, MSE {letter}",
+                    job=job,
+                    figure=_mse(axis),
+                    unit="m2",
+                    published=mse_m2[axis],
+                    limit=limit,
+                    note="",
+                    lower_bound=bound[at],
+                )
             note = "largest of the axes, after 10 s"
-            yield Asked(f"{ours}, steady RMSE", job, score.steady_rmse_m, "m", None, 0.0005, note)
+            yield Asked(
+                name=f"{ours}, steady RMSE",
+                job=job,
+                figure=score.steady_rmse_m,
+                unit="m",
+                published=None,
+                limit=0.0005,
+                note=note,
+            )
 
 
 def _short_of(radius_m: float) -> Callable[[Trace], float]:
@@ -220,13 +289,38 @@ def _table_19() -> Iterator[Asked]:
             published = TABLE_19_M.get(factor)
             note = _TABLE_19_NOTE + ("; published: collision constraint violated" if factor == 2.0 else "")
             bound_m = lower_bound_index_m(radius_m)
-            yield Asked(f"{text}, index", job, score.index_m, "m", published, _INDEX_LIMIT_M[factor], note, bound_m)
+            yield Asked(
+                name=f"{text}, index",
+                job=job,
+                figure=score.index_m,
+                unit="m",
+                published=published,
+                limit=_INDEX_LIMIT_M[factor],
+                note=note,
+                lower_bound=bound_m,
+            )
             note = "constraint radius minus the smallest true distance"
-            yield Asked(f"{text}, closer than the radius by", job, _short_of(radius_m), "m", None, _CLOSER_M, note, 0.0)
+            yield Asked(
+                name=f"{text}, closer than the radius by",
+                job=job,
+                figure=_short_of(radius_m),
+                unit="m",
+                published=None,
+                limit=_CLOSER_M,
+                note=note,
+                lower_bound=0.0,
+            )
             settled = _settled_over_bound(radius_m)
             limit = 1.05 if factor == 3.0 else None
             yield Asked(
-                f"{text}, index after 10 s over the theoretical lower bound", job, settled, "1", None, limit, "", 1.0
+                name=f"{text}, index after 10 s over the theoretical lower bound",
+                job=job,
+                figure=settled,
+                unit="1",
+                published=None,
+                limit=limit,
+                note="",
+                lower_bound=1.0,
             )
 
 
@@ -237,20 +331,38 @@ def _obstacle() -> Iterator[Asked]:
     for kind, preset, limit in (("dmpc", "published", None), ("dmpc", "improved", 2.60), ("dmpc3", "dmpc3", 2.60)):
         job, text = f"obstacle {preset}", f"obstacle {kind}" + ("" if preset == kind else f", {preset}")
         held = 0.0 if limit else None
-        yield Asked(f"{text}, index", job, score.index_m, "m", 2.88, limit, "", lower_bound_index_m(_APART_M))
+        yield Asked(
+            name=f"{text}, index",
+            job=job,
+            figure=score.index_m,
+            unit="m",
+            published=2.88,
+            limit=limit,
+            note="",
+            lower_bound=lower_bound_index_m(_APART_M),
+        )
         note = "1.75 m minus the smallest distance to the centre"
         yield Asked(
-            f"{text}, inside the keep-out by",
-            job,
-            lambda t: max(0.0, _OBSTACLE_M - score.clearance_m(t)),
-            "m",
-            None,
-            held,
-            note,
-            0.0,
+            name=f"{text}, inside the keep-out by",
+            job=job,
+            figure=lambda t: max(0.0, _OBSTACLE_M - score.clearance_m(t)),
+            unit="m",
+            published=None,
+            limit=held,
+            note=note,
+            lower_bound=0.0,
         )
         note = "0.9 m minus the smallest true distance"
-        yield Asked(f"{text}, closer to each other by", job, _short_of(_APART_M), "m", None, held, note, 0.0)
+        yield Asked(
+            name=f"{text}, closer to each other by",
+            job=job,
+            figure=_short_of(_APART_M),
+            unit="m",
+            published=None,
+            limit=held,
+            note=note,
+            lower_bound=0.0,
+        )
 
 
 def _true_distance_rows(flown: Flown) -> Iterator[Row]:
@@ -261,7 +373,16 @@ def _true_distance_rows(flown: Flown) -> Iterator[Row]:
             note = f"smallest true distance {apart_m:.4f} m, the constraint being wider by what was missing"
             name = f"circle dmpc, Table 19, {factor:g} x 0.3 m, index at equal true distance"
             bound_m = lower_bound_index_m(factor * SAFE_RADIUS_M)
-            yield Row(name, TABLE_19_M.get(factor), score.index_m(trace), None, "plant", "m", note, bound_m)
+            yield Row(
+                name=name,
+                published=TABLE_19_M.get(factor),
+                ours=score.index_m(trace),
+                limit=None,
+                path="plant",
+                unit="m",
+                note=note,
+                lower_bound=bound_m,
+            )
 
 
 def _dmpc3_rows(flown: Flown) -> Iterator[Row]:
@@ -276,7 +397,14 @@ def _dmpc3_rows(flown: Flown) -> Iterator[Row]:
     pairs.append(("obstacle, index", "obstacle improved", "obstacle dmpc3", score.index_m))
     for name, one, other, figure in pairs:
         if one in flown and other in flown:
-            yield Row(f"{name}, dmpc3 over dmpc", None, figure(flown[other]) / figure(flown[one]), 1.0, "plant", "1")
+            yield Row(
+                name=f"{name}, dmpc3 over dmpc",
+                published=None,
+                ours=figure(flown[other]) / figure(flown[one]),
+                limit=1.0,
+                path="plant",
+                unit="1",
+            )
 
 
 def _full_rows(flown: Flown) -> Iterator[Row]:
@@ -286,7 +414,22 @@ def _full_rows(flown: Flown) -> Iterator[Row]:
         if trace is None or job.flight in ("open_loop", "pid_step", "pid_steps"):
             continue
         ours = score.index_m(trace)
-        yield Row(f"{job.name}, index", None, ours, None, "full", "m", "for one vehicle: its mean distance")
+        yield Row(
+            name=f"{job.name}, index",
+            published=None,
+            ours=ours,
+            limit=None,
+            path="full",
+            unit="m",
+            note="for one vehicle: its mean distance",
+        )
         if plant is not None:
             apart = abs(ours / score.index_m(plant) - 1.0)
-            yield Row(f"{job.name}, index differs from model only by", None, apart, 0.05, "full", "1")
+            yield Row(
+                name=f"{job.name}, index differs from model only by",
+                published=None,
+                ours=apart,
+                limit=0.05,
+                path="full",
+                unit="1",
+            )

@@ -57,7 +57,7 @@ _REFERENCE = "#334155"
 _PUBLISHED = "#b45309"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Figure:
     """One figure of the thesis."""
 
@@ -71,7 +71,7 @@ class Figure:
         return f"Figure {self.number}: {self.caption}"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class IndexPoint:
     """One constraint radius of Table 19."""
 
@@ -97,7 +97,10 @@ class Extra:
 
 
 def _run_of(first: int, flight: FlightName, drawn: Sequence[Drawn], by: str) -> tuple[Figure, ...]:
-    return tuple(Figure(first + k, f"{_QUANTITIES[what]}, {by}", flight, what) for k, what in enumerate(drawn))
+    return tuple(
+        Figure(number=first + k, caption=f"{_QUANTITIES[what]}, {by}", flight=flight, drawn=what)
+        for k, what in enumerate(drawn)
+    )
 
 
 _TEN: tuple[Drawn, ...] = (*_AXES, *_ANGLES, "thrust", *_TORQUES)
@@ -178,7 +181,7 @@ def separation_chart(
 ) -> str:
     """Draw the smallest distance of two agents over time, with the constraint radius of every trace."""
     colors = [css(agent_rgb(k)) for k in range(len(traces))]
-    lines = [Line(t.t_s, nearest_pair_m(t), c, t.name) for t, c in zip(traces, colors, strict=True)]
+    lines = [Line(x=t.t_s, y=nearest_pair_m(t), color=c, label=t.name) for t, c in zip(traces, colors, strict=True)]
     radii = {separation_m.get(trace.name, separation_m.get(flight)) for trace in traces}
     limits = [Limit(r, f"constraint radius {r:g} m") for r in sorted(r for r in radii if r is not None)]
     title = "Smallest distance between two agents [m]"
@@ -190,7 +193,7 @@ def error_chart(flight: FlightName, traces: Sequence[Trace], separation_m: Mappi
     lines = []
     for k, trace in enumerate(traces):
         sum_m = np.linalg.norm(trace.pos_ned_m - trace.ref_pos_ned_m, axis=2).sum(axis=1)
-        lines.append(Line(trace.t_s, sum_m, css(agent_rgb(k)), f"{trace.name}, mean {_mean(sum_m)} m"))
+        lines.append(Line(x=trace.t_s, y=sum_m, color=css(agent_rgb(k)), label=f"{trace.name}, mean {_mean(sum_m)} m"))
     radius_m = separation_m.get(traces[0].name, separation_m.get(flight))
     limits = []
     if radius_m is not None and traces[0].pos_ned_m.shape[1] == 3:
@@ -207,10 +210,15 @@ def obstacle_chart(traces: Sequence[Trace], points: int) -> str:
     for k, trace in enumerate(traces):
         away_m = np.linalg.norm(trace.pos_ned_m - center_ned_m, axis=2)  # (T, N)
         if k == 0:
-            lines += [Line(trace.t_s, away_m[:, i], css(agent_rgb(i)), f"agent {i}") for i in range(away_m.shape[1])]
+            lines += [
+                Line(x=trace.t_s, y=away_m[:, i], color=css(agent_rgb(i)), label=f"agent {i}")
+                for i in range(away_m.shape[1])
+            ]
         else:
             color = css(agent_rgb(traces[0].pos_ned_m.shape[1] + k - 1))
-            lines.append(Line(trace.t_s, np.fmin.reduce(away_m, axis=1), color, f"nearest, {trace.name}"))
+            lines.append(
+                Line(x=trace.t_s, y=np.fmin.reduce(away_m, axis=1), color=color, label=f"nearest, {trace.name}")
+            )
     limits = [Limit(sphere.keep_out_m, f"constraint radius {sphere.keep_out_m:g} m")]
     title = "Distance to the centre of the obstacle [m]"
     return time_chart(title, lines, _seconds(traces), limits=limits, points=points, from_zero=True, height=300)
@@ -219,11 +227,11 @@ def obstacle_chart(traces: Sequence[Trace], points: int) -> str:
 def above_chart(trace: Trace, points: int) -> str:
     """Draw agents, reference and obstacles from above; circles are the keep-out and the obstacle."""
     lines = [
-        Line(trace.pos_ned_m[:, i, 1], trace.pos_ned_m[:, i, 0], css(agent_rgb(i)), f"agent {i}")
+        Line(x=trace.pos_ned_m[:, i, 1], y=trace.pos_ned_m[:, i, 0], color=css(agent_rgb(i)), label=f"agent {i}")
         for i in range(trace.pos_ned_m.shape[1])
     ]
     ref = trace.ref_pos_ned_m[:, 0]
-    lines.append(Line(ref[:, 1], ref[:, 0], _REFERENCE, "reference", "4 3", 1.1))
+    lines.append(Line(x=ref[:, 1], y=ref[:, 0], color=_REFERENCE, label="reference", dash="4 3", width=1.1))
     circles = [
         Circle(sphere.center_ned_m[1], sphere.center_ned_m[0], radius_m)
         for sphere in trace.obstacles
@@ -241,7 +249,16 @@ def index_chart(index: Sequence[IndexPoint]) -> str:
         ours = sorted((p.radius_m, p.ours_m) for p in index if p.series == name and p.ours_m is not None)
         lines.append(_marked(ours, css(agent_rgb(k)), name))
     lines.append(_marked(published, _PUBLISHED, "published, Table 19"))
-    lines.append(Line(radii, math.sqrt(3) * radii, css(LIMIT_RGB), "theoretical lower bound, sqrt(3) r", "5 4", 1.2))
+    lines.append(
+        Line(
+            x=radii,
+            y=math.sqrt(3) * radii,
+            color=css(LIMIT_RGB),
+            label="theoretical lower bound, sqrt(3) r",
+            dash="5 4",
+            width=1.2,
+        )
+    )
     shown = (float(radii[0]) - 0.03, float(radii[-1]) + 0.03)
     title = "Tracking index [m] over constraint radius [m], three periods of the circle"
     return time_chart(title, lines, shown, from_zero=True, height=240)
@@ -249,7 +266,7 @@ def index_chart(index: Sequence[IndexPoint]) -> str:
 
 def _marked(pairs: Sequence[tuple[float, float]], color: str, label: str) -> Line:
     values = np.array(pairs, np.float64).reshape(-1, 2)
-    return Line(values[:, 0], values[:, 1], color, label, marks=True)
+    return Line(x=values[:, 0], y=values[:, 1], color=color, label=label, marks=True)
 
 
 def _mean(values: Array) -> str:
@@ -268,20 +285,27 @@ def _single_lines(figure: Figure, traces: Sequence[Trace]) -> list[Line]:
         values = _response(trace, figure.drawn, 0)
         if np.isfinite(values).any():
             label = trace.name if len(traces) > 1 else "response"
-            lines.append(Line(trace.t_s, values, css(agent_rgb(k)), label, width=1.4 if k else 1.9))
+            lines.append(Line(x=trace.t_s, y=values, color=css(agent_rgb(k)), label=label, width=1.4 if k else 1.9))
     asked = _asked(traces[0], figure.drawn)
     if asked is not None and np.isfinite(asked).any():
         word = "reference" if figure.drawn in _AXES else "setpoint"
         own = f" of {traces[0].name}" if word == "setpoint" and len(traces) > 1 else ""
-        lines.append(Line(traces[0].t_s, asked, _REFERENCE, word + own, "4 3", 1.1))
+        lines.append(Line(x=traces[0].t_s, y=asked, color=_REFERENCE, label=word + own, dash="4 3", width=1.1))
     return lines
 
 
 def _swarm_lines(figure: Figure, trace: Trace) -> list[Line]:
     agents = range(trace.pos_ned_m.shape[1])
-    lines = [Line(trace.t_s, _response(trace, figure.drawn, i), css(agent_rgb(i)), f"agent {i}") for i in agents]
+    lines = [
+        Line(x=trace.t_s, y=_response(trace, figure.drawn, i), color=css(agent_rgb(i)), label=f"agent {i}")
+        for i in agents
+    ]
     asked = _asked(trace, figure.drawn)
-    return lines if asked is None else [*lines, Line(trace.t_s, asked, _REFERENCE, "reference", "4 3", 1.1)]
+    return (
+        lines
+        if asked is None
+        else [*lines, Line(x=trace.t_s, y=asked, color=_REFERENCE, label="reference", dash="4 3", width=1.1)]
+    )
 
 
 def _response(trace: Trace, drawn: Drawn, agent: int) -> Array:
@@ -328,8 +352,13 @@ def _space(figure: Figure, traces: Sequence[Trace], points: int) -> str:
         shown = [(f"agent {i}", first.pos_ned_m[:, i]) for i in range(first.pos_ned_m.shape[1])]
     else:
         shown = [(trace.name if len(traces) > 1 else "response", trace.pos_ned_m[:, 0]) for trace in traces]
-    lines = [SpaceLine(pos_ned_m, css(agent_rgb(k)), name, width=1.6) for k, (name, pos_ned_m) in enumerate(shown)]
-    lines.append(SpaceLine(first.ref_pos_ned_m[:, 0], _REFERENCE, "reference", "4 3", 1.1))
+    lines = [
+        SpaceLine(pos_ned_m=pos_ned_m, color=css(agent_rgb(k)), label=name, width=1.6)
+        for k, (name, pos_ned_m) in enumerate(shown)
+    ]
+    lines.append(
+        SpaceLine(pos_ned_m=first.ref_pos_ned_m[:, 0], color=_REFERENCE, label="reference", dash="4 3", width=1.1)
+    )
     balls = []
     for sphere in first.obstacles:
         balls.append(Ball(sphere.center_ned_m, sphere.radius_m, "obstacle"))
@@ -352,12 +381,12 @@ def _states(figure: Figure, traces: Sequence[Trace], points: int) -> str:
     for panel, (title, names) in enumerate(panels):
         lines = [
             Line(
-                trace.t_s,
-                states[n][panel][:, k],
-                css(agent_rgb(k)),
-                "" if n else name,
-                "4 3" if n else "",
-                1.6 - 0.2 * k,
+                x=trace.t_s,
+                y=states[n][panel][:, k],
+                color=css(agent_rgb(k)),
+                label="" if n else name,
+                dash="4 3" if n else "",
+                width=1.6 - 0.2 * k,
             )
             for n, trace in enumerate(traces)
             for k, name in enumerate(names.split())

@@ -45,19 +45,19 @@ def fly_over_mavlink(name: str, config: Config) -> Trace:
         return np.stack([rows[field][:steps] for rows in ticks], axis=1).astype(np.float64)
 
     return Trace(
-        name,
-        "full",
-        np.asarray(ticks[0]["mission_t_s"][:steps], np.float64),
-        true["pos_ned_m"],
-        true["vel_ned_m_s"],
-        _euler(true["q_nb"]),
-        of_ticks("ref_pos_ned_m"),
-        _euler(of_ticks("setpoint_q_nb")),
-        of_ticks("setpoint_thrust_01") * PRESETS[config.sitl.preset].thrust_max_n,
-        np.full((steps, agents, 3), np.nan),
-        sum(int((rows["plan_status"] != PlanStatus.OK).sum()) for rows in ticks),
-        None,
-        tuple(Sphere(o.center_ned_m, o.radius_m, o.keep_out_m) for o in config.obstacles),
+        name=name,
+        path="full",
+        t_s=np.asarray(ticks[0]["mission_t_s"][:steps], np.float64),
+        pos_ned_m=true["pos_ned_m"],
+        vel_ned_m_s=true["vel_ned_m_s"],
+        euler_rad=_euler(true["q_nb"]),
+        ref_pos_ned_m=of_ticks("ref_pos_ned_m"),
+        euler_ref_rad=_euler(of_ticks("setpoint_q_nb")),
+        thrust_n=of_ticks("setpoint_thrust_01") * PRESETS[config.sitl.preset].thrust_max_n,
+        torque_n_m=np.full((steps, agents, 3), np.nan),
+        failed=sum(int((rows["plan_status"] != PlanStatus.OK).sum()) for rows in ticks),
+        terminal_missed=None,
+        obstacles=tuple(Sphere(o.center_ned_m, o.radius_m, o.keep_out_m) for o in config.obstacles),
     )
 
 

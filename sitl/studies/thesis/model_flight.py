@@ -75,10 +75,18 @@ class Pilot:
     def prime(self, state: VehicleState) -> None:
         """Plan to stay and share the plan, as an agent does before the mission, so that errors begin at zero."""
         act_us = state.t_us + self._predictor.delay_us
-        start = Start(act_us - self._dt_us, state.pos_ned_m, state.vel_ned_m_s, 1.0, self._virtual_control)
+        start = Start(
+            t_us=act_us - self._dt_us,
+            pos_ned_m=state.pos_ned_m,
+            vel_ned_m_s=state.vel_ned_m_s,
+            cos_tilt=1.0,
+            virtual_control=self._virtual_control,
+        )
         points, yaw_rad = self._controller.longest + 1, self._config.mission.yaw_rad
         stay = Reference(np.tile(state.pos_ned_m, (points, 1)), np.zeros((points, 3)), yaw_rad)
-        plan = self._controller.plan(Problem(start, stay, np.zeros(3), (), None))
+        plan = self._controller.plan(
+            Problem(start=start, reference=stay, disturbance_ned_m_s2=np.zeros(3), keep_outs=(), guess_ned_m=None)
+        )
         self.path = self._path(self._flown(plan, start, ()))
 
     def step(self, state: VehicleState, peers: list[PredictedPath]) -> AttitudeSetpoint:
@@ -89,11 +97,11 @@ class Pilot:
         keep_outs = self._keep_outs(state.pos_ned_m, act_us, peers)
         plan = self._controller.plan(
             Problem(
-                start,
-                self._horizon(act_us),
-                estimate.disturbance_ned_m_s2,
-                keep_outs,
-                self._plan_buffer.guess_ned_m(act_us),
+                start=start,
+                reference=self._horizon(act_us),
+                disturbance_ned_m_s2=estimate.disturbance_ned_m_s2,
+                keep_outs=keep_outs,
+                guess_ned_m=self._plan_buffer.guess_ned_m(act_us),
             )
         )
         self.terminal_missed += plan.terminal_gap_m > _TERMINAL_MET_M
@@ -138,7 +146,15 @@ class Pilot:
         return stop() if good is None or start.t_us - good.t0_us > self._replay_us else good
 
     def _path(self, plan: Plan) -> PredictedPath:
-        return PredictedPath(self._agent, 1, 1, plan.t0_us, plan.dt_us, 0.0, plan.pos_ned_m)
+        return PredictedPath(
+            agent=self._agent,
+            boot_id=1,
+            seq=1,
+            t0_utc_us=plan.t0_us,
+            dt_us=plan.dt_us,
+            radius_m=0.0,
+            pos_ned_m=plan.pos_ned_m,
+        )
 
 
 def fly_on_plant(name: str, config: Config, *, matched_velocity: bool = False) -> Trace:
@@ -180,31 +196,31 @@ def fly_on_plant(name: str, config: Config, *, matched_velocity: bool = False) -
         thrust_n[k], log["torque"][k] = wrench[0], wrench[1:].T
         plant.step(plant.mixer.allocate(wrench))
     return Trace(
-        name,
-        "plant",
-        np.asarray(np.arange(steps) * THESIS_SAMPLE_S, np.float64),
-        log["pos"],
-        log["vel"],
-        log["euler"],
-        log["ref"],
-        log["euler_ref"],
-        thrust_n,
-        log["torque"],
-        sum(pilot.failed for pilot in pilots),
-        sum(pilot.terminal_missed for pilot in pilots),
-        tuple(Sphere(o.center_ned_m, o.radius_m, o.keep_out_m) for o in config.obstacles),
+        name=name,
+        path="plant",
+        t_s=np.asarray(np.arange(steps) * THESIS_SAMPLE_S, np.float64),
+        pos_ned_m=log["pos"],
+        vel_ned_m_s=log["vel"],
+        euler_rad=log["euler"],
+        ref_pos_ned_m=log["ref"],
+        euler_ref_rad=log["euler_ref"],
+        thrust_n=thrust_n,
+        torque_n_m=log["torque"],
+        failed=sum(pilot.failed for pilot in pilots),
+        terminal_missed=sum(pilot.terminal_missed for pilot in pilots),
+        obstacles=tuple(Sphere(o.center_ned_m, o.radius_m, o.keep_out_m) for o in config.obstacles),
     )
 
 
 def _state(plant: Plant, i: int, t_us: int) -> VehicleState:
     return VehicleState(
-        t_us,
-        plant.pos_ned_m[:, i].copy(),
-        plant.vel_ned_m_s[:, i].copy(),
-        plant.q_nb[:, i].copy(),
-        plant.rate_frd_rad_s[:, i].copy(),
-        True,
-        FlightMode.EXTERNAL,
-        Landed.IN_AIR,
-        False,
+        t_us=t_us,
+        pos_ned_m=plant.pos_ned_m[:, i].copy(),
+        vel_ned_m_s=plant.vel_ned_m_s[:, i].copy(),
+        q_nb=plant.q_nb[:, i].copy(),
+        rate_frd_rad_s=plant.rate_frd_rad_s[:, i].copy(),
+        armed=True,
+        mode=FlightMode.EXTERNAL,
+        landed=Landed.IN_AIR,
+        failsafe=False,
     )

@@ -110,7 +110,12 @@ def index_points(flown: dict[str, Trace]) -> Iterator[IndexPoint]:
             trace = flown.get(thesis.radius_name(kind, factor))
             if trace is not None:
                 radius_m = factor * thesis.SAFE_RADIUS_M
-                yield IndexPoint(radius_m, score.index_m(trace), thesis.TABLE_19_M.get(factor), kind)
+                yield IndexPoint(
+                    radius_m=radius_m,
+                    ours_m=score.index_m(trace),
+                    published_m=thesis.TABLE_19_M.get(factor),
+                    series=kind,
+                )
 
 
 def show(rows: Sequence[Row], console: Console) -> None:

@@ -21,7 +21,7 @@ class Sphere:
     keep_out_m: float
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Trace:
     """One flight from mission start to mission end, true states at every tick of 0.02 s.
 
@@ -44,7 +44,7 @@ class Trace:
     obstacles: tuple[Sphere, ...] = ()
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Row:
     """One line of `reproduce.json`; lower is better in every row."""
 

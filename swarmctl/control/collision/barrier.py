@@ -56,7 +56,7 @@ class BarrierParams(Params):
     slew_1_s: float = Field(2.5, gt=0, le=50)  # of (u_x, u_y); faster attitude changes would saturate rotors
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Body:
     """Describes one thing not to touch, at the time the command acts."""
 
@@ -99,13 +99,13 @@ def body_of_peer(
     if at >= last:
         a, b = points[last - 1].tolist(), points[last].tolist()
         pos, vel = _braked(b, tuple((q - p) / dt_s for p, q in zip(a, b, strict=True)), (at - last) * dt_s, brake_m_s2)
-        return Body(pos, vel, grown_m, share_01)
+        return Body(pos_ned_m=pos, vel_ned_m_s=vel, apart_m=grown_m, share_01=share_01)
     low = max(0, int(at))
     a, b = points[low].tolist(), points[low + 1].tolist()
     part = at - low
     pos = tuple(p + part * (q - p) for p, q in zip(a, b, strict=True))
     vel = tuple((q - p) / dt_s for p, q in zip(a, b, strict=True))
-    return Body(pos, vel, grown_m, share_01)
+    return Body(pos_ned_m=pos, vel_ned_m_s=vel, apart_m=grown_m, share_01=share_01)
 
 
 def _braked(pos: Vector, vel: Vector, t_s: float, brake_m_s2: float) -> tuple[Vector, Vector]:
@@ -119,7 +119,14 @@ def body_of_obstacle(obstacle: Obstacle, ahead_s: float, apart_m: float) -> Body
     """Return an obstacle `ahead_s` from now, at constant velocity; `apart_m` is from its surface to the own centre."""
     vel = obstacle.vel_ned_m_s.tolist()
     pos = tuple(p + ahead_s * v for p, v in zip(obstacle.center_ned_m.tolist(), vel, strict=True))
-    return Body(pos, tuple(vel), obstacle.radius_m + apart_m, 1.0, obstacle.column, True)
+    return Body(
+        pos_ned_m=pos,
+        vel_ned_m_s=tuple(vel),
+        apart_m=obstacle.radius_m + apart_m,
+        share_01=1.0,
+        column=obstacle.column,
+        solid=True,
+    )
 
 
 class Barrier:
@@ -257,7 +264,7 @@ class Barrier:
         return rows
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Responses:
     """Holds displacement and velocity after a fixed time, due to unit initial values and a unit acceleration."""
 
@@ -269,8 +276,16 @@ class _Responses:
 
 
 def _responses(lag: Lag | None, drag_1_s: float, for_s: float) -> _Responses:
-    starts = ((0, 0, 0, 1, 0), (0, 0, 0, 0, 1), (1, 0, 0, 0, 0), (0, 1, 0, 0, 0), (0, 0, 1, 0, 0))
-    return _Responses(*(_moved(lag, drag_1_s, for_s, *map(float, s)) for s in starts))
+    def after(*start: float) -> tuple[float, float]:
+        return _moved(lag, drag_1_s, for_s, *start)
+
+    return _Responses(
+        of_velocity=after(0.0, 0.0, 0.0, 1.0, 0.0),
+        of_accel=after(0.0, 0.0, 0.0, 0.0, 1.0),
+        of_tilt=after(1.0, 0.0, 0.0, 0.0, 0.0),
+        of_rate=after(0.0, 1.0, 0.0, 0.0, 0.0),
+        of_command=after(0.0, 0.0, 1.0, 0.0, 0.0),
+    )
 
 
 def _moved(

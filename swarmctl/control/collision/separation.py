@@ -56,7 +56,7 @@ class SeparationParams(Params):
         return self.radius_m + self.tracking_m
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class KeepOut:
     """Describes one thing to keep clear of, at the times of the own prediction."""
 
@@ -157,12 +157,12 @@ def keep_out_of_peer(
     margin_m = 0.0 if parked else min(0.5 * params.age_accel_m_s2 * age_s * age_s, params.age_margin_max_m)
     radius_m = params.planned_m + path.radius_m + margin_m
     return KeepOut(
-        align(path, t0_utc_us, dt_us, steps, params.brake_m_s2) if points is None else points,
-        radius_m,
-        params.radius_m + path.radius_m - params.certify_slack_m,
-        landing or (age_s > params.lost_after_s and not parked),
-        path.agent,
-        params.downwash,
+        pos_ned_m=align(path, t0_utc_us, dt_us, steps, params.brake_m_s2) if points is None else points,
+        radius_m=radius_m,
+        hard_min_distance_m=params.radius_m + path.radius_m - params.certify_slack_m,
+        any_height=landing or (age_s > params.lost_after_s and not parked),
+        priority_id=path.agent,
+        downwash=params.downwash,
     )
 
 
@@ -170,7 +170,13 @@ def keep_out_of_obstacle(obstacle: Obstacle, dt_us: int, steps: int, params: Sep
     """Return the keep-out of a visible obstacle, predicted at constant velocity."""
     t_s = np.arange(steps + 1) * (dt_us * 1e-6)
     pos = obstacle.center_ned_m + t_s[:, None] * obstacle.vel_ned_m_s
-    return KeepOut(pos, obstacle.keep_out_m, obstacle.keep_out_m - params.certify_slack_m, obstacle.column, -1)
+    return KeepOut(
+        pos_ned_m=pos,
+        radius_m=obstacle.keep_out_m,
+        hard_min_distance_m=obstacle.keep_out_m - params.certify_slack_m,
+        any_height=obstacle.column,
+        priority_id=-1,
+    )
 
 
 def visible(obstacles: Sequence[Obstacle], pos_ned_m: Array) -> list[Obstacle]:
@@ -237,7 +243,12 @@ def half_spaces(
     squeezed = np.array([k.downwash > 1.0 and not k.any_height for k in keep_outs])
     stop_s[squeezed] /= np.maximum(np.linalg.norm(normal[squeezed, -1], axis=1), _TINY_M)  # braking is scaled likewise
     stop_offset = offset[:, -1] + stop_s * np.einsum("sc,sc->s", normal[:, -1], ends)
-    return HalfSpaces(normal, np.where(idle, -np.inf, offset), stop_s, np.where(idle[:, -1], -np.inf, stop_offset))
+    return HalfSpaces(
+        normal=normal,
+        offset_m=np.where(idle, -np.inf, offset),
+        stop_s=stop_s,
+        stop_offset_m=np.where(idle[:, -1], -np.inf, stop_offset),
+    )
 
 
 def _approach_m(keep_outs: Sequence[KeepOut], here_ned_m: Array, apart: Array, params: SeparationParams) -> Array:

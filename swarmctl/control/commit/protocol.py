@@ -62,7 +62,7 @@ _EVASION_DELAY_S = 0.2  # braking this much after the lead must still be clear, 
 _TICK_S = 0.04  # sending and receiving take at least this long
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class CommitCounts:
     """Counts proposals by what became of them, since the start of the agent."""
 
@@ -192,7 +192,7 @@ class Commitments:
             self.counts.unplanned += 1
             return
         self._number = max(self._number + 1, now.utc_us)  # above all numbers used before a restart
-        self.proposal = Proposal(self._number, now.utc_us, self._agent, trajectory)
+        self.proposal = Proposal(number=self._number, made_utc_us=now.utc_us, agent=self._agent, trajectory=trajectory)
         self._cleared = {id(known): known for known in now.followed}
         self.counts.proposed += 1
 

@@ -59,7 +59,7 @@ class DesiredReference:
     follows_path: bool = False  # starts here, clear of obstacles: linearise around it
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Situation:
     """Collects the inputs of one plan.
 
@@ -183,13 +183,21 @@ class TrajectoryPlanner:
         pos, vel = committed.sample(now.begin_us + ahead_us)
         thrust = np.array([0.0, 0.0, GRAVITY_M_S2]) - committed.acceleration(now.begin_us)
         size = float(np.sqrt(thrust @ thrust))
-        start = Start(now.begin_us, pos[0], vel[0], 1.0, np.array([thrust[0] / size, thrust[1] / size, size]))
+        start = Start(
+            t_us=now.begin_us,
+            pos_ned_m=pos[0],
+            vel_ned_m_s=vel[0],
+            cos_tilt=1.0,
+            virtual_control=np.array([thrust[0] / size, thrust[1] / size, size]),
+        )
         wanted = Reference(*now.desired.reference(1e-6 * (ahead_us + (now.begin_us - now.utc_us))), 0.0)
         guess = wanted.pos_ned_m + (pos[0] - wanted.pos_ned_m[0]) if now.desired.follows_path else pos
         agents = [message.agent for message in now.peers.values() for _ in message.followed]
         keep_outs = self._keep_outs(now.followed, agents, now.begin_us, steps)
         kept = (*keep_outs, *(_first_steps(other, steps) for other in now.others))
-        plan = self._mpc.plan(Problem(start, wanted, np.zeros(3), kept, guess))
+        plan = self._mpc.plan(
+            Problem(start=start, reference=wanted, disturbance_ned_m_s2=np.zeros(3), keep_outs=kept, guess_ned_m=guess)
+        )
         return None if plan.status is PlanStatus.SOLVER_FAILED else plan
 
     def _clear(self, committed: Trajectory, plan: Plan | None, now: Situation) -> Trajectory | None:
@@ -236,7 +244,14 @@ class TrajectoryPlanner:
         hard_min_distance_m = committed_m(p) + spare_m
         where = positions_at(trajectories, t0_utc_us + np.arange(steps + 1) * self.dt_us)
         return [
-            KeepOut(points, p.planned_m, hard_min_distance_m, False, agent, p.downwash)
+            KeepOut(
+                pos_ned_m=points,
+                radius_m=p.planned_m,
+                hard_min_distance_m=hard_min_distance_m,
+                any_height=False,
+                priority_id=agent,
+                downwash=p.downwash,
+            )
             for points, agent in zip(where, agents, strict=True)
         ]
 

@@ -53,7 +53,7 @@ class Figure:
         return f"{self.value:.4g} ({self.low:.4g} to {self.high:.4g})"
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Identified:
     """Identified parameters of one vehicle."""
 
@@ -69,7 +69,7 @@ class Identified:
         return VehicleModelParams.model_validate({**before.model_dump(), **figures})
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class FlightSegment:
     """Setpoints sent and states measured, each at its own times [s] from a common zero."""
 
@@ -105,12 +105,12 @@ def longest_segment(ticks: NDArray[np.void]) -> FlightSegment | str:
     if float(np.sqrt(np.mean(np.var(sent_down, axis=0)))) < _MIN_TILT_RMS:
         return "it hardly tilted: nothing can be told from this flight"
     return FlightSegment(
-        t_s,
-        sent_down,
-        rows["setpoint_thrust_01"].astype(np.float64),
-        seen_s[new],
-        _down(rows["q_nb"][new].astype(np.float64)),
-        np.array(rows["pos_ned_m"][new]),
+        sent_s=t_s,
+        sent_down=sent_down,
+        sent_thrust_01=rows["setpoint_thrust_01"].astype(np.float64),
+        seen_s=seen_s[new],
+        seen_down=_down(rows["q_nb"][new].astype(np.float64)),
+        seen_pos_ned_m=np.array(rows["pos_ned_m"][new]),
     )
 
 
@@ -123,7 +123,9 @@ def identify(flight: FlightSegment) -> Identified | str:
     inverse_hover, thrust_01, pos, down = _fit_vertical(flight)
     hover = Figure(*(1.0 / k for k in (inverse_hover.value, inverse_hover.high, inverse_hover.low)))
     drag = _fit_drag(thrust_01, pos, down, inverse_hover.value)
-    found = Identified(delay, natural, damping, drag, hover)
+    found = Identified(
+        delay_s=delay, attitude_rad_s=natural, attitude_damping=damping, drag_1_s=drag, hover_thrust_01=hover
+    )
     if not all(math.isfinite(f.low) and math.isfinite(f.high) for f in (*attitude, drag, hover)):
         return "the flight is too short for intervals"
     if not 0.05 < hover.value < 0.95:

@@ -14,7 +14,7 @@ from swarmctl.core.types import Array
 Terminal = Literal["none", "position", "position_velocity", "region"]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Axis:
     """Holds weights and bounds of one axis (thesis Tables 9, 10, 17, 21)."""
 
@@ -35,7 +35,7 @@ class Axis:
         return max(abs(self.u_min), abs(self.u_max))
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Horizon:
     """Holds lengths and sample time of the prediction, and computes motion under drag over it: p'' = a - drag p'."""
 
@@ -77,7 +77,7 @@ class Horizon:
         return np.where(acted, own + gained * (1.0 - left) / drag, 0.0), np.where(acted, gained * left, 0.0)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Penalties:
     """Holds exact (linear) and quadratic weights of softened constraints.
 
@@ -91,7 +91,7 @@ class Penalties:
     slack_quadratic: float = 20000.0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class HalfSpaces:
     """Holds rows `normal[s, k] . p_k >= offset[s, k]` for keep-outs s and steps k = 1..Hp; offset -inf disables a row.
 
@@ -106,7 +106,7 @@ class HalfSpaces:
     stop_offset_m: Array  # (keep-outs,)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class AxesProblem:
     """Holds the data of one receding-horizon step: initial state, gains, drift and reference."""
 
@@ -121,7 +121,7 @@ class AxesProblem:
     realised_1_s: Array | None = None  # (axes,) rate of `realised`; None for 0
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class AxesSolution:
     """Holds the predicted motion of the axes; with `solved` False it is the free response.
 

@@ -210,16 +210,16 @@ class CondensedMpc:
             end[2] += gain_m_s2[-1, i] * float(self._acted[i, -1] @ moves[:, i])
             gap_m = max(gap_m, region.outside_m(end))
         return AxesSolution(
-            solution.x is not None,
-            solution.status,
-            solution.iterations,
-            u_prev + self._hold @ moves,
-            pos,
-            vel,
-            slack_m,
-            residual_m,
-            gap_m,
-            solve_us,
+            solved=solution.x is not None,
+            status=solution.status,
+            iterations=solution.iterations,
+            u=u_prev + self._hold @ moves,
+            pos_m=pos,
+            vel_m_s=vel,
+            slack_m=slack_m,
+            residual_m=residual_m,
+            terminal_gap_m=gap_m,
+            solve_us=solve_us,
         )
 
     def first_row(self) -> int:

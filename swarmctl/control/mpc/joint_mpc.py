@@ -84,15 +84,17 @@ class JointMpc:
 
     def _solve(self, problem: Problem, thrust_m_s2: Array, spaces: HalfSpaces | None) -> AxesSolution:
         steps, start, reference = self.steps, problem.start, problem.reference
+        realised, realised_1_s = self._acting(problem)
         asked = AxesProblem(
-            start.pos_ned_m,
-            start.vel_ned_m_s,
-            start.virtual_control,
-            np.column_stack([-thrust_m_s2, -thrust_m_s2, np.full(steps, -start.cos_tilt)]),
-            self._drift(problem),
-            reference.pos_ned_m[1 : steps + 1],
-            reference.vel_ned_m_s[1 : steps + 1],
-            *self._acting(problem),
+            pos_m=start.pos_ned_m,
+            vel_m_s=start.vel_ned_m_s,
+            u_prev=start.virtual_control,
+            gain_m_s2=np.column_stack([-thrust_m_s2, -thrust_m_s2, np.full(steps, -start.cos_tilt)]),
+            drift_m_s2=self._drift(problem),
+            ref_pos_m=reference.pos_ned_m[1 : steps + 1],
+            ref_vel_m_s=reference.vel_ned_m_s[1 : steps + 1],
+            realised=realised,
+            realised_1_s=realised_1_s,
         )
         return self._mpc.solve(asked, spaces)
 

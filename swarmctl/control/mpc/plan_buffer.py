@@ -39,5 +39,13 @@ class PlanBuffer:
 
     def positions_ned_m(self, plan: Plan, t0_us: int) -> Array:
         """Return positions (steps+1, 3) NED [m] of any plan from `t0_us` on."""
-        path = PredictedPath(self._agent, 0, 0, plan.t0_us, plan.dt_us, 0.0, plan.pos_ned_m)
+        path = PredictedPath(
+            agent=self._agent,
+            boot_id=0,
+            seq=0,
+            t0_utc_us=plan.t0_us,
+            dt_us=plan.dt_us,
+            radius_m=0.0,
+            pos_ned_m=plan.pos_ned_m,
+        )
         return align(path, t0_us, self._dt_us, self._steps, self._brake_m_s2)

@@ -10,7 +10,7 @@ from swarmctl.control.collision.separation import KeepOut
 from swarmctl.core.types import Array, Reference
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Start:
     """Holds the initial state of a plan: the own state, predicted to when its first setpoint acts."""
 
@@ -23,7 +23,7 @@ class Start:
     tilt_rate_1_s: Array = field(default_factory=lambda: np.zeros(2))  # (2,) rate of `tilt`
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Problem:
     """Holds the problem of one tick."""
 

@@ -54,7 +54,7 @@ class QpParams(Params):
         return solver
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class QpSolution:
     """Holds the result of a solve: `x` is None without one, and an unfinished iterate to be judged unless `exact`."""
 
@@ -64,7 +64,9 @@ class QpSolution:
     iterations: int
 
 
-NOT_FINITE = QpSolution(None, False, "not finite", 0)  # such values would spoil the next warm start
+NOT_FINITE = QpSolution(
+    x=None, exact=False, status="not finite", iterations=0
+)  # such values would spoil the next warm start
 
 
 class QpSolver(Protocol):
@@ -137,7 +139,12 @@ class OsqpSolver:
         if not finite:
             self._solver = None  # the next solve is a cold start
         usable = finite and status in _USABLE
-        return QpSolution(x if usable else None, status == _SOLVED, str(result.info.status), int(result.info.iter))
+        return QpSolution(
+            x=x if usable else None,
+            exact=status == _SOLVED,
+            status=str(result.info.status),
+            iterations=int(result.info.iter),
+        )
 
 
 def pattern_index(pattern: NDArray[np.bool_], upper: bool = False) -> tuple[NDArray[np.intp], NDArray[np.intp]]:

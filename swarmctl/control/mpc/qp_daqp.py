@@ -74,10 +74,10 @@ class DaqpSolver:
         if flag != _OPTIMAL or not np.isfinite(x).all():
             self._model = None  # the next solve is a cold start
             failed = _failed(flag)
-            return QpSolution(None, False, failed.status, int(info["iterations"]))
+            return QpSolution(x=None, exact=False, status=failed.status, iterations=int(info["iterations"]))
         self._model = model
-        return QpSolution(x, True, _STATUS[_OPTIMAL], int(info["iterations"]))
+        return QpSolution(x=x, exact=True, status=_STATUS[_OPTIMAL], iterations=int(info["iterations"]))
 
 
 def _failed(flag: int) -> QpSolution:
-    return QpSolution(None, False, _STATUS.get(int(flag), f"exit flag {flag}"), 0)
+    return QpSolution(x=None, exact=False, status=_STATUS.get(int(flag), f"exit flag {flag}"), iterations=0)

@@ -63,7 +63,17 @@ class MpcParams(Params):
         """Return the z axis: its input is thrust over mass, realised at once."""
         w = self.z
         least, most, step = self.thrust_min_m_s2, self.thrust_max_m_s2, self.dthrust_max_m_s2
-        return Axis(w.q_pos, w.q_vel, w.r, least, most, step, GRAVITY_M_S2, 1.0, self.terminal_z)
+        return Axis(
+            q_pos=w.q_pos,
+            q_vel=w.q_vel,
+            r=w.r,
+            u_min=least,
+            u_max=most,
+            du_max=step,
+            u_rest=GRAVITY_M_S2,
+            gain_m_s2=1.0,
+            terminal=self.terminal_z,
+        )
 
     def horizontal(self, vehicle: VehicleModelParams) -> tuple[Axis, Axis]:
         """Return the x and y axes: their inputs are u_x and u_y, which the attitude follows."""
@@ -71,11 +81,28 @@ class MpcParams(Params):
 
     def _lateral(self, w: AxisWeights, vehicle: VehicleModelParams) -> Axis:
         u, du = min(self.u_max, vehicle.u_max()), self.du_max
-        return Axis(w.q_pos, w.q_vel, w.r, -u, u, du, 0.0, GRAVITY_M_S2, self.terminal_xy, vehicle.lag())
+        return Axis(
+            q_pos=w.q_pos,
+            q_vel=w.q_vel,
+            r=w.r,
+            u_min=-u,
+            u_max=u,
+            du_max=du,
+            u_rest=0.0,
+            gain_m_s2=GRAVITY_M_S2,
+            terminal=self.terminal_xy,
+            lag=vehicle.lag(),
+        )
 
     def horizon(self, control: int, prediction: int, vehicle: VehicleModelParams) -> Horizon:
         """Return the horizon with `control` and `prediction` steps, under the vehicle's drag."""
-        return Horizon(control, prediction, self.dt_s, self.discretisation == "euler", vehicle.drag_1_s)
+        return Horizon(
+            control=control,
+            prediction=prediction,
+            dt_s=self.dt_s,
+            euler=self.discretisation == "euler",
+            drag_1_s=vehicle.drag_1_s,
+        )
 
 
 class SwarmMpc:
@@ -137,15 +164,15 @@ class SwarmMpc:
     ) -> Plan:
         start, steps, count = problem.start, self.steps, min(self.steps, len(up.pos_m))
         asked = AxesProblem(
-            start.pos_ned_m[:2],
-            start.vel_ned_m_s[:2],
-            start.virtual_control[:2],
-            np.repeat(-self._thrust_ahead(up)[:, None], 2, axis=1),
-            problem.disturbance_ned_m_s2[:2],
-            problem.reference.pos_ned_m[1 : steps + 1, :2],
-            problem.reference.vel_ned_m_s[1 : steps + 1, :2],
-            start.tilt,
-            start.tilt_rate_1_s,
+            pos_m=start.pos_ned_m[:2],
+            vel_m_s=start.vel_ned_m_s[:2],
+            u_prev=start.virtual_control[:2],
+            gain_m_s2=np.repeat(-self._thrust_ahead(up)[:, None], 2, axis=1),
+            drift_m_s2=problem.disturbance_ned_m_s2[:2],
+            ref_pos_m=problem.reference.pos_ned_m[1 : steps + 1, :2],
+            ref_vel_m_s=problem.reference.vel_ned_m_s[1 : steps + 1, :2],
+            realised=start.tilt,
+            realised_1_s=start.tilt_rate_1_s,
         )
         across = (self._xy_alone if spaces is None else self._xy).solve(asked, spaces)
         pos, vel = np.empty((steps, 3)), np.zeros((steps, 3))
@@ -165,13 +192,13 @@ class SwarmMpc:
     def _solve_z(self, problem: Problem) -> AxesSolution:
         steps, start, reference = self._params.horizon_z, problem.start, problem.reference
         asked = AxesProblem(
-            start.pos_ned_m[2:],
-            start.vel_ned_m_s[2:],
-            start.virtual_control[2:],
-            np.full((steps, 1), -start.cos_tilt),
-            GRAVITY_M_S2 + problem.disturbance_ned_m_s2[2:],
-            reference.pos_ned_m[1 : steps + 1, 2:],
-            reference.vel_ned_m_s[1 : steps + 1, 2:],
+            pos_m=start.pos_ned_m[2:],
+            vel_m_s=start.vel_ned_m_s[2:],
+            u_prev=start.virtual_control[2:],
+            gain_m_s2=np.full((steps, 1), -start.cos_tilt),
+            drift_m_s2=GRAVITY_M_S2 + problem.disturbance_ned_m_s2[2:],
+            ref_pos_m=reference.pos_ned_m[1 : steps + 1, 2:],
+            ref_vel_m_s=reference.vel_ned_m_s[1 : steps + 1, 2:],
         )
         return self._z.solve(asked)
 
@@ -283,15 +310,20 @@ def judged(
     solve_us = sum(s.solve_us for s in solutions)
     certify_us = (stopwatch_ns() - solved_ns) * 1e-3
     return Plan(
-        status,
-        start.t_us,
-        dt_us,
-        pos,
-        np.concatenate([start.vel_ned_m_s[None], vel_ned_m_s]),
-        virtual_control,
-        PlanTimes((solved_ns - began_ns) * 1e-3 - solve_us - spaces_us, solve_us, certify_us, spaces_us),
-        sum(s.iterations for s in solutions),
-        max(s.slack_m for s in solutions),
-        residual_m,
-        max(s.terminal_gap_m for s in solutions),
+        status=status,
+        t0_us=start.t_us,
+        dt_us=dt_us,
+        pos_ned_m=pos,
+        vel_ned_m_s=np.concatenate([start.vel_ned_m_s[None], vel_ned_m_s]),
+        virtual_control=virtual_control,
+        times=PlanTimes(
+            setup_us=(solved_ns - began_ns) * 1e-3 - solve_us - spaces_us,
+            solve_us=solve_us,
+            certify_us=certify_us,
+            spaces_us=spaces_us,
+        ),
+        iterations=sum(s.iterations for s in solutions),
+        slack_m=max(s.slack_m for s in solutions),
+        residual_m=residual_m,
+        terminal_gap_m=max(s.terminal_gap_m for s in solutions),
     )

@@ -32,7 +32,7 @@ from scipy.linalg import solve_discrete_are
 from swarmctl.core.types import Array
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TerminalRegion:
     """Describes the set {e: e' P e <= alpha} of errors e = (position [m], velocity [m/s], acceleration [m/s2])."""
 
@@ -72,4 +72,4 @@ def terminal_region(
     inverse = np.linalg.inv(p)
     level = min(daccel_max_m_s2**2 / float(gain @ inverse @ gain), accel_max_m_s2**2 / float(inverse[2, 2]))
     p = 0.5 * (p + p.T)
-    return TerminalRegion(p, p - np.diag([q_pos, q_vel, 0.0]), gain, level)
+    return TerminalRegion(cost_to_go=p, beyond=p - np.diag([q_pos, q_vel, 0.0]), gain=gain, level=level)

@@ -18,7 +18,7 @@ class PeerInputs:
     alive: bool
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class PhaseInputs:
     """Everything the state machine's step depends on."""
 

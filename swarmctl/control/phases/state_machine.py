@@ -278,7 +278,7 @@ class MissionStateMachine:
             return []
         stays = state.mode is FlightMode.EXTERNAL and inputs.arm_in is None and not inputs.armable
         if stays and not state.armed and self._may_request(inputs):
-            return [Command(Verb.HOLD)]  # PX4 stays in OFFBOARD after a landing, where it can't be armed
+            return [Command(verb=Verb.HOLD)]  # PX4 stays in OFFBOARD after a landing, where it can't be armed
         return []
 
     def _start_blocker(self, inputs: PhaseInputs, state: VehicleState) -> str:
@@ -312,9 +312,9 @@ class MissionStateMachine:
         if not self._may_request(inputs):
             return []
         if inputs.arm_in not in (None, state.mode):
-            return [Command(Verb.EXTERNAL)]
+            return [Command(verb=Verb.EXTERNAL)]
         self.arming.request()
-        return [Command(Verb.ARM)]
+        return [Command(verb=Verb.ARM)]
 
     def _takeoff(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
         height_m = self._ground_z_m - float(self._start_ned_m[2])
@@ -334,14 +334,16 @@ class MissionStateMachine:
             and state.landed is Landed.ON_GROUND
             and self._may_request(inputs, _SPIN_UP_US)
         ):
-            return [Command(Verb.TAKEOFF, height_m)]
+            return [Command(verb=Verb.TAKEOFF, value=height_m)]
         return []
 
     def _goto_start(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
         if not self.had_control:
             if self._trajectory is None:
                 self._trajectory = (
-                    QuinticTrajectory(state.pos_ned_m, np.zeros(3), state.pos_ned_m, 1.0),
+                    QuinticTrajectory(
+                        from_ned_m=state.pos_ned_m, vel_ned_m_s=np.zeros(3), to_ned_m=state.pos_ned_m, travel_s=1.0
+                    ),
                     inputs.now_us,
                 )
             return self._request_control(inputs, state)
@@ -359,7 +361,7 @@ class MissionStateMachine:
         if not self._may_take_control and _is_under_other_control(state):
             self._override(TAKEN_OVER)
             return []
-        return [Command(Verb.EXTERNAL)] if self._may_request(inputs) else []
+        return [Command(verb=Verb.EXTERNAL)] if self._may_request(inputs) else []
 
     def _ready(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
         if any(not p.alive or p.phase >= Phase.GOTO_LAND for p in inputs.peers.values()):
@@ -406,7 +408,7 @@ class MissionStateMachine:
             if state.mode is not FlightMode.EXTERNAL:
                 self._enter(Phase.DONE, inputs.now_us)
                 return []
-            return [Command(Verb.HOLD)] if self._may_request(inputs) else []
+            return [Command(verb=Verb.HOLD)] if self._may_request(inputs) else []
         if self._is_down(inputs, state):
             self._enter(Phase.DONE, inputs.now_us)
             return []
@@ -419,7 +421,7 @@ class MissionStateMachine:
             return []
         if not self._may_request(inputs):
             return []
-        return [Command(Verb.DISARM if state.landed is Landed.ON_GROUND else Verb.LAND)]
+        return [Command(verb=Verb.DISARM if state.landed is Landed.ON_GROUND else Verb.LAND)]
 
     @staticmethod
     def _at(state: VehicleState, target: Array, within_m: float, slower_m_s: float) -> bool:

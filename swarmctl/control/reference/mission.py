@@ -165,7 +165,12 @@ class MissionReference:
         return _held(np.array(self._params.steps.rows), t_s), np.zeros((len(t_s), 3))
 
     def _swap(self, t_s: Array) -> tuple[Array, Array]:
-        trajectory = QuinticTrajectory(self._start, np.zeros(3), self._opposite, self._params.swap.travel_s)
+        trajectory = QuinticTrajectory(
+            from_ned_m=self._start,
+            vel_ned_m_s=np.zeros(3),
+            to_ned_m=self._opposite,
+            travel_s=self._params.swap.travel_s,
+        )
         return trajectory.sample(t_s)
 
     def _goto(self, t_s: Array) -> tuple[Array, Array]:
@@ -218,7 +223,7 @@ def _goal_flights(params: GotoParams, starts_ned_m: Array, apart_m: float) -> li
     return flights
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class QuinticTrajectory:
     """A quintic polynomial from a position and velocity to rest at a target, continuous in acceleration."""
 
@@ -248,11 +253,11 @@ def quintic_to(pos: Array, vel: Array, target: Array, speed_m_s: float, accel_m_
     distance = math.dist(pos, target)
     initial = math.sqrt(float(vel @ vel))
     travel_s = max(1.875 * distance / speed_m_s, math.sqrt(5.77 * distance / accel_m_s2), 3.0 * initial / accel_m_s2)
-    return QuinticTrajectory(pos, vel, target, max(travel_s, 0.5))
+    return QuinticTrajectory(from_ned_m=pos, vel_ned_m_s=vel, to_ned_m=target, travel_s=max(travel_s, 0.5))
 
 
 def brake_to_rest(pos: Array, vel: Array, accel_m_s2: float) -> QuinticTrajectory:
     """Return a `QuinticTrajectory` that stops straight ahead, about as soon as `accel_m_s2` allows."""
     speed = math.sqrt(float(vel @ vel))
     travel_s = max(0.5, 2.0 * speed / accel_m_s2)
-    return QuinticTrajectory(pos, vel, pos + 0.5 * travel_s * vel, travel_s)
+    return QuinticTrajectory(from_ned_m=pos, vel_ned_m_s=vel, to_ned_m=pos + 0.5 * travel_s * vel, travel_s=travel_s)

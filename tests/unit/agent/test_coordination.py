@@ -59,7 +59,17 @@ class Bench:
         """Hovers here."""
         north = np.array([1.0, 0.0, 0.0, 0.0])
         still, now_us = np.zeros(3), self.clock.now_us()
-        return VehicleState(now_us, HERE, still, north, still, True, FlightMode.EXTERNAL, Landed.IN_AIR, False)
+        return VehicleState(
+            t_us=now_us,
+            pos_ned_m=HERE,
+            vel_ned_m_s=still,
+            q_nb=north,
+            rate_frd_rad_s=still,
+            armed=True,
+            mode=FlightMode.EXTERNAL,
+            landed=Landed.IN_AIR,
+            failsafe=False,
+        )
 
     def fly(self, seconds: float, each: Callable[[], None] = lambda: None) -> None:
         for _ in range(round(seconds / 0.02)):
@@ -83,11 +93,26 @@ class Bench:
             message = decode_trajectory_message(payload)
             if message is not None and message.proposal is not None:
                 acknowledged = {0: message.proposal.number}
-        path = PredictedPath(1, 1, self.seq, utc_us, 20_000, 0.0, np.tile(path_at, (41, 1)))
+        path = PredictedPath(
+            agent=1,
+            boot_id=1,
+            seq=self.seq,
+            t0_utc_us=utc_us,
+            dt_us=20_000,
+            radius_m=0.0,
+            pos_ned_m=np.tile(path_at, (41, 1)),
+        )
         self.peer.publish(topics.PATH, topics.encode_path(path))
         if not silent:
             message = TrajectoryMessage(
-                1, 1, self.seq, utc_us, True, resting(PLACE, utc_us, 100_000), None, acknowledged
+                agent=1,
+                boot_id=1,
+                seq=self.seq,
+                sent_utc_us=utc_us,
+                is_committed=True,
+                committed=resting(PLACE, utc_us, 100_000),
+                proposal=None,
+                acknowledged=acknowledged,
             )
             self.peer.publish(topics.TRAJECTORY, encode_trajectory_message(message))
 

@@ -44,7 +44,15 @@ class Bench:
 
     def say_path(self, boot_id: int = 1) -> None:
         self.seq += 1
-        path = PredictedPath(1, boot_id, self.seq, self.clock.utc_us(), TICK_US, 0.0, np.tile(HERE, (5, 1)))
+        path = PredictedPath(
+            agent=1,
+            boot_id=boot_id,
+            seq=self.seq,
+            t0_utc_us=self.clock.utc_us(),
+            dt_us=TICK_US,
+            radius_m=0.0,
+            pos_ned_m=np.tile(HERE, (5, 1)),
+        )
         self.peer.publish(topics.PATH, topics.encode_path(path))
 
     def say_status(self, **fields: Any) -> None:
@@ -116,7 +124,15 @@ def test_a_peer_refused_for_long_counts_as_bus_loss_and_is_avoided_at_any_height
         bench.tick()
         bench.seq += 1
         ahead = bench.clock.utc_us() + 600_000
-        path = PredictedPath(1, 1, bench.seq, ahead, TICK_US, 0.0, np.tile(HERE, (5, 1)))
+        path = PredictedPath(
+            agent=1,
+            boot_id=1,
+            seq=bench.seq,
+            t0_utc_us=ahead,
+            dt_us=TICK_US,
+            radius_m=0.0,
+            pos_ned_m=np.tile(HERE, (5, 1)),
+        )
         bench.peer.publish(topics.PATH, topics.encode_path(path))
     utc_us = bench.clock.utc_us()
     assert bench.world_model.has_unresponsive_peer(utc_us)

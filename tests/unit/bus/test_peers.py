@@ -16,7 +16,17 @@ NOW_US = 1_700_000_000_000_000
 
 
 def payload(agent: int = 1, boot_id: int = 7, seq: int = 1, t0_utc_us: int = NOW_US) -> bytes:
-    return encode_path(PredictedPath(agent, boot_id, seq, t0_utc_us, 100_000, 0.0, np.zeros((5, 3))))
+    return encode_path(
+        PredictedPath(
+            agent=agent,
+            boot_id=boot_id,
+            seq=seq,
+            t0_utc_us=t0_utc_us,
+            dt_us=100_000,
+            radius_m=0.0,
+            pos_ned_m=np.zeros((5, 3)),
+        )
+    )
 
 
 class Store:

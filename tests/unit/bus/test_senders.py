@@ -18,7 +18,7 @@ TRUE, REBORN, FORGED = 70, 3, 999
 LAST = 2**32 - 1
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Bench:
     """One agent that receives a message of agent-1 every tick, unless that is silent."""
 

@@ -46,7 +46,9 @@ STATUS = topics.StatusMessage(
 
 
 def path(points: np.ndarray = POINTS, dt_us: int = 20_000, radius_m: float = 0.5) -> PredictedPath:
-    return PredictedPath(4, 0xFFFFFFFF, 123_456, UTC_US, dt_us, radius_m, points)
+    return PredictedPath(
+        agent=4, boot_id=0xFFFFFFFF, seq=123_456, t0_utc_us=UTC_US, dt_us=dt_us, radius_m=radius_m, pos_ned_m=points
+    )
 
 
 def test_a_path_survives_encoding() -> None:
@@ -252,11 +254,24 @@ def test_lists_and_numbers_from_outside_are_bounded() -> None:
 
 
 def test_the_longest_good_message_of_every_topic_fits() -> None:
-    path = PredictedPath(0, 0, 0, 0, 1, 0.0, np.zeros((topics.MAX_POINTS, 3)))
+    path = PredictedPath(
+        agent=0, boot_id=0, seq=0, t0_utc_us=0, dt_us=1, radius_m=0.0, pos_ned_m=np.zeros((topics.MAX_POINTS, 3))
+    )
     assert len(topics.encode_path(path)) <= topics.PATH.max_bytes
-    trajectory = Trajectory(0, 1, np.zeros((MAX_POINTS, 3)), np.zeros((MAX_POINTS, 3)))
+    trajectory = Trajectory(
+        t0_utc_us=0, dt_us=1, pos_ned_m=np.zeros((MAX_POINTS, 3)), vel_ned_m_s=np.zeros((MAX_POINTS, 3))
+    )
     acknowledged = dict.fromkeys(range(MAX_ACKNOWLEDGED), 2**60)
-    message = TrajectoryMessage(0, 0, 0, 0, True, trajectory, Proposal(1, 0, 0, trajectory), acknowledged)
+    message = TrajectoryMessage(
+        agent=0,
+        boot_id=0,
+        seq=0,
+        sent_utc_us=0,
+        is_committed=True,
+        committed=trajectory,
+        proposal=Proposal(number=1, made_utc_us=0, agent=0, trajectory=trajectory),
+        acknowledged=acknowledged,
+    )
     assert len(encode_trajectory_message(message)) <= topics.TRAJECTORY.max_bytes
     assert TICK_DTYPE.itemsize + 12 * topics.MAX_POINTS <= topics.TICK.max_bytes
     status = msgspec.structs.replace(STATUS, outcome="x" * 4000, active_alert="\u20ac" * 4000)

@@ -23,9 +23,18 @@ def trajectory(shift_m: float = 0.0) -> Trajectory:
 
 
 def message(seq: int = 1, agent: int = 2, boot_id: int = 9, propose: bool = True) -> TrajectoryMessage:
-    proposal = Proposal(77, UTC_US + 5, agent, trajectory(0.5)) if propose else None
+    proposal = Proposal(number=77, made_utc_us=UTC_US + 5, agent=agent, trajectory=trajectory(0.5)) if propose else None
     sent_utc_us = UTC_US + 20_000 * seq
-    return TrajectoryMessage(agent, boot_id, seq, sent_utc_us, True, trajectory(), proposal, {0: 5, 1: UTC_US})
+    return TrajectoryMessage(
+        agent=agent,
+        boot_id=boot_id,
+        seq=seq,
+        sent_utc_us=sent_utc_us,
+        is_committed=True,
+        committed=trajectory(),
+        proposal=proposal,
+        acknowledged={0: 5, 1: UTC_US},
+    )
 
 
 @pytest.mark.parametrize("propose", [True, False])

@@ -72,14 +72,17 @@ LINK = LinkFacts(
     mavlink2=1300,
     autopilots=(1,),
     senders=1,
-    round_trip=RoundTrip(2.0, 9.0, 60, "TIMESYNC"),
+    round_trip=RoundTrip(p50_ms=2.0, p99_ms=9.0, answers=60, by="TIMESYNC"),
     time=VehicleTime(-12.0, 40.0, 30.0),
 )
 
 
 def parameters(values: dict[str, float | int], **changed: float | int | None) -> dict[str, Parameter]:
     merged: dict[str, Any] = {**values, **changed}
-    return {name: Parameter(name, value, 6 if isinstance(value, int) else 9) for name, value in merged.items()}
+    return {
+        name: Parameter(name=name, value=value, kind=6 if isinstance(value, int) else 9)
+        for name, value in merged.items()
+    }
 
 
 HEALTHY = VehicleFacts(
@@ -91,12 +94,14 @@ HEALTHY = VehicleFacts(
     sysid=1,
     autopilot="PX4",
     autopilot_number=12,
-    version=Version((1, 18, 0), "beta", "83c4f4e5", 1, "0", True),
+    version=Version(firmware=(1, 18, 0), stage="beta", git="83c4f4e5", board=1, uid="0", bytewise=True),
     mode=FlightMode.HOLD,
     custom_mode=0x03040000,
     landed=Landed.ON_GROUND,
     system_status=3,
-    sensors=Sensors(ALL_SENSORS, ALL_SENSORS | RC_RECEIVER, 0x1320C83F, 16.2, 1.0),
+    sensors=Sensors(
+        present=ALL_SENSORS, enabled=ALL_SENSORS | RC_RECEIVER, healthy=0x1320C83F, battery_v=16.2, battery_01=1.0
+    ),
     estimator=Estimator(1023, 0.1, 0.2),
     gps=Gps(3, 10, 0.9),
     pos_ned_m=(0.0, 0.0, 0.0),
@@ -108,7 +113,7 @@ COPTER = dataclasses.replace(
     HEALTHY,
     autopilot="ArduCopter",
     autopilot_number=3,
-    version=Version((4, 6, 3), "release", "92b0cd78", 1, "0", None),
+    version=Version(firmware=(4, 6, 3), stage="release", git="92b0cd78", board=1, uid="0", bytewise=None),
     parameters=parameters(COPTER_VALUES),
 )
 SECOND = dataclasses.replace(
@@ -156,24 +161,85 @@ def test_a_healthy_copter_has_nothing_to_fix(config: Config) -> None:
 
 
 SECOND_OK = changed(SECOND, link_autopilots=(2,), parameters=parameters(PX4_VALUES, MAV_SYS_ID=2))
-_RADIO = Sensors(ALL_SENSORS | RC_RECEIVER, ALL_SENSORS | RC_RECEIVER, 0x1320C83F | RC_RECEIVER, 16.2, 1.0)
+_RADIO = Sensors(
+    present=ALL_SENSORS | RC_RECEIVER,
+    enabled=ALL_SENSORS | RC_RECEIVER,
+    healthy=0x1320C83F | RC_RECEIVER,
+    battery_v=16.2,
+    battery_01=1.0,
+)
 
 # topic, what is changed in a healthy PX4 vehicle, verdict, a word of the advice
 PX4_CASES: list[tuple[str, dict[str, Any], Verdict, str]] = [
     ("autopilot", {"autopilot": "", "autopilot_number": 4}, FIX, "flies PX4 and ArduCopter"),
-    ("autopilot", {"version": Version((1, 14, 0), "release", "", 1, "0", True)}, NOTE, "measured on 1.18"),
-    ("autopilot", {"version": Version((1, 18, 0), "beta", "", 1, "0", False)}, FIX, "encodes integer"),
+    (
+        "autopilot",
+        {"version": Version(firmware=(1, 14, 0), stage="release", git="", board=1, uid="0", bytewise=True)},
+        NOTE,
+        "measured on 1.18",
+    ),
+    (
+        "autopilot",
+        {"version": Version(firmware=(1, 18, 0), stage="beta", git="", board=1, uid="0", bytewise=False)},
+        FIX,
+        "encodes integer",
+    ),
     ("autopilot", {"version": None}, NOTE, "version"),
     ("system id", {"sysid": 7}, FIX, "MAV_SYS_ID = 1"),
     ("state", {"armed": True}, NOTE, "not changed"),
     ("state", {"armed": True, "mode": FlightMode.EXTERNAL}, NOTE, "another program flies"),
     ("state", {"system_status": 5}, FIX, "failsafe"),
     ("sensors", {"sensors": None}, NOTE, "SYS_STATUS"),
-    ("sensors", {"sensors": Sensors(ALL_SENSORS, ALL_SENSORS, 0x1320C83F & ~4, 16.2, 1.0)}, FIX, "calibrate"),
-    ("sensors", {"sensors": Sensors(ALL_SENSORS, ALL_SENSORS, 0x0320C83F, 16.2, 1.0)}, FIX, "refused in HOLD"),
-    ("battery", {"sensors": Sensors(ALL_SENSORS, ALL_SENSORS, 0x1320C83F, 14.0, 0.1)}, FIX, "charge"),
-    ("battery", {"sensors": Sensors(ALL_SENSORS, ALL_SENSORS, 0x1320C83F, 15.0, 0.4)}, NOTE, "short flight"),
-    ("battery", {"sensors": Sensors(ALL_SENSORS, ALL_SENSORS, 0x1320C83F, None, None)}, NOTE, "not known"),
+    (
+        "sensors",
+        {
+            "sensors": Sensors(
+                present=ALL_SENSORS, enabled=ALL_SENSORS, healthy=0x1320C83F & ~4, battery_v=16.2, battery_01=1.0
+            )
+        },
+        FIX,
+        "calibrate",
+    ),
+    (
+        "sensors",
+        {
+            "sensors": Sensors(
+                present=ALL_SENSORS, enabled=ALL_SENSORS, healthy=0x0320C83F, battery_v=16.2, battery_01=1.0
+            )
+        },
+        FIX,
+        "refused in HOLD",
+    ),
+    (
+        "battery",
+        {
+            "sensors": Sensors(
+                present=ALL_SENSORS, enabled=ALL_SENSORS, healthy=0x1320C83F, battery_v=14.0, battery_01=0.1
+            )
+        },
+        FIX,
+        "charge",
+    ),
+    (
+        "battery",
+        {
+            "sensors": Sensors(
+                present=ALL_SENSORS, enabled=ALL_SENSORS, healthy=0x1320C83F, battery_v=15.0, battery_01=0.4
+            )
+        },
+        NOTE,
+        "short flight",
+    ),
+    (
+        "battery",
+        {
+            "sensors": Sensors(
+                present=ALL_SENSORS, enabled=ALL_SENSORS, healthy=0x1320C83F, battery_v=None, battery_01=None
+            )
+        },
+        NOTE,
+        "not known",
+    ),
     ("estimator", {"estimator": Estimator(1023 & ~16, 0.3, 0.4)}, FIX, "position source"),
     ("estimator", {"estimator": Estimator(1023 | 1024, 0.3, 0.4)}, FIX, "distrusts"),
     ("estimator", {"estimator": None, "gps": Gps(2, 4, 9.0)}, FIX, "3-D fix"),
@@ -188,8 +254,13 @@ PX4_CASES: list[tuple[str, dict[str, Any], Verdict, str]] = [
     ("loss", {"link_lost_01": 0.02}, NOTE, "lost on the way"),
     ("loss", {"link_lost_01": 0.2}, FIX, "lost on the way"),
     ("round trip", {"link_round_trip": None}, NOTE, "neither"),
-    ("round trip", {"link_round_trip": RoundTrip(90.0, 120.0, 60, "PING")}, NOTE, "0.045 s"),
-    ("round trip", {"link_round_trip": RoundTrip(90.0, 900.0, 60, "PING")}, FIX, "state_max_age_s"),
+    ("round trip", {"link_round_trip": RoundTrip(p50_ms=90.0, p99_ms=120.0, answers=60, by="PING")}, NOTE, "0.045 s"),
+    (
+        "round trip",
+        {"link_round_trip": RoundTrip(p50_ms=90.0, p99_ms=900.0, answers=60, by="PING")},
+        FIX,
+        "state_max_age_s",
+    ),
     ("clock", {"link_time": VehicleTime(0.0, -30000.0, 100.0)}, NOTE, "short of CPU"),
     ("clock", {"link_time": VehicleTime(0.0, 60000.0, 100.0)}, FIX, "short of CPU"),
     ("start", {"pos_ned_m": (0.0, 0.0, -1.8)}, FIX, "origin_alt_m"),
@@ -205,7 +276,16 @@ PX4_CASES: list[tuple[str, dict[str, Any], Verdict, str]] = [
     ("NAV_DLL_ACT", {"parameters": parameters(PX4_VALUES, NAV_DLL_ACT=None)}, FIX, "can't be read"),
     ("MPC_THR_HOVER", {"parameters": parameters(PX4_VALUES, MPC_THR_HOVER=0.3)}, NOTE, "hover_thrust_01 = 0.3"),
     ("MAV_SYS_ID", {"parameters": parameters(PX4_VALUES, MAV_SYS_ID=9)}, FIX, "reboot"),
-    ("THR_MDL_FAC", {"version": Version((1, 18, 0), "release", "", 50, "3a91", True, 0x3185)}, NOTE, "calibrate"),
+    (
+        "THR_MDL_FAC",
+        {
+            "version": Version(
+                firmware=(1, 18, 0), stage="release", git="", board=50, uid="3a91", bytewise=True, vendor=0x3185
+            )
+        },
+        NOTE,
+        "calibrate",
+    ),
 ]
 COPTER_CASES: list[tuple[str, dict[str, Any], Verdict, str]] = [
     ("GUID_OPTIONS", {"parameters": parameters(COPTER_VALUES, GUID_OPTIONS=0)}, FIX, "climb rate"),
@@ -310,7 +390,7 @@ def test_a_parameter_of_another_kind_of_autopilot_is_only_a_note(config: Config)
 
 
 def test_one_board_under_two_urls_is_found_and_two_simulators_are_not_one_board(config: Config) -> None:
-    same = Version((1, 18, 0), "release", "", 50, "3a91", True, 0x3185)
+    same = Version(firmware=(1, 18, 0), stage="release", git="", board=50, uid="3a91", bytewise=True, vendor=0x3185)
     lines = findings([changed(HEALTHY, version=same), changed(SECOND_OK, version=same)], config)
     assert "same board" in line_of(lines, "system ids", SWARM).advice
     assert not [line for line in findings([HEALTHY, SECOND_OK], config) if line.topic == "system ids"]
@@ -319,7 +399,7 @@ def test_one_board_under_two_urls_is_found_and_two_simulators_are_not_one_board(
 @pytest.mark.parametrize("uid", ["0", "01", "02"])
 def test_a_simulator_is_not_told_to_calibrate_whatever_its_uid(config: Config, uid: str) -> None:
     """PX4's simulator has its instance for a uid, and two hosts may fly the same instance."""
-    simulated = Version((1, 18, 0), "beta", "83c4f4e5", 1, uid, True)
+    simulated = Version(firmware=(1, 18, 0), stage="beta", git="83c4f4e5", board=1, uid=uid, bytewise=True)
     lines = findings([changed(HEALTHY, version=simulated), changed(SECOND_OK, version=simulated)], config)
     assert worst_first(lines) == []
 
@@ -400,12 +480,15 @@ def test_only_known_names_are_asked_for_and_each_once(config: Config) -> None:
 
 
 def test_a_change_that_was_not_done_is_to_fix() -> None:
-    done, kept = Change(0, "A", 0, 4, 4, ""), Change(0, "A", 0, 4, 0, "")
+    done, kept = (
+        Change(agent=0, name="A", before=0, wanted=4, after=4, refused=""),
+        Change(agent=0, name="A", before=0, wanted=4, after=0, refused=""),
+    )
     assert done.done and "0 -> 4" in done.in_words()
     assert not kept.done and "not changed to 4" in kept.in_words()
-    assert Change(0, "A", 0.1, 0.2, 0.2 + 1e-9, "").done
+    assert Change(agent=0, name="A", before=0.1, wanted=0.2, after=0.2 + 1e-9, refused="").done
     assert kept.finding().verdict is FIX
-    assert "it is armed" in Change(0, "A", 0, 4, 0, "it is armed").in_words()
+    assert "it is armed" in Change(agent=0, name="A", before=0, wanted=4, after=0, refused="it is armed").in_words()
 
 
 def test_the_json_is_json_and_the_table_one_line_a_row(
@@ -413,7 +496,7 @@ def test_the_json_is_json_and_the_table_one_line_a_row(
 ) -> None:
     facts = changed(HEALTHY, link_time=VehicleTime(1.0, 0.0, math.inf))
     lines = findings([facts], config)
-    change = Change(0, "COM_OBL_RC_ACT", 0, 4, 4, "")
+    change = Change(agent=0, name="COM_OBL_RC_ACT", before=0, wanted=4, after=4, refused="")
     tree = json.loads(as_json([facts], lines, [change], 0))
     assert tree["vehicles"][0]["link"]["time"]["sigma_ppm"] is None
     assert tree["vehicles"][0]["mode"] == "HOLD"
@@ -427,8 +510,17 @@ def test_the_json_is_json_and_the_table_one_line_a_row(
 
 def test_what_a_vehicle_says_steers_no_terminal(config: Config, capsys: pytest.CaptureFixture[str]) -> None:
     hostile = "\x1b]0;owned\x07\x9b2J\u202e\r\nDONE"
-    facts = changed(HEALTHY, version=Version((1, 18, 0), "beta", hostile, 1, hostile, True))
-    print_check([facts], [*findings([facts], config), Finding(0, "x", FIX, hostile, hostile, hostile)], [])
+    facts = changed(
+        HEALTHY, version=Version(firmware=(1, 18, 0), stage="beta", git=hostile, board=1, uid=hostile, bytewise=True)
+    )
+    print_check(
+        [facts],
+        [
+            *findings([facts], config),
+            Finding(agent=0, topic="x", verdict=FIX, found=hostile, wanted=hostile, advice=hostile),
+        ],
+        [],
+    )
     shown = capsys.readouterr().out
     assert "DONE" in shown
     assert all(c.isprintable() or c in "\n\t" for c in shown)

@@ -151,7 +151,7 @@ def test_plain_lines_speak_on_changes_only() -> None:
     stream = io.StringIO()
     display = open_display(stream)
     assert isinstance(display, PlainLines)
-    view = AgentView(0)
+    view = AgentView(agent=0)
     display.show([view])
     view.status = status(Phase.ARM)
     display.show([view])
@@ -176,17 +176,17 @@ def test_a_lost_terminal_does_not_end_the_flight() -> None:
 
 
 def test_table_cells() -> None:
-    assert status_cells(AgentView(0, status())) == (
+    assert status_cells(AgentView(agent=0, status=status())) == (
         *("agent-0", "TRACK", "TRACKING", "0.123", "1.25", "2.0", "3/100", "20"),
         "",
     )
-    assert status_cells(AgentView(0, status(99, -1.0)))[1:5] == ("99", "TRACKING", "0.123", "-")
-    assert status_cells(AgentView(1))[-1] == "not heard yet"
+    assert status_cells(AgentView(agent=0, status=status(99, -1.0)))[1:5] == ("99", "TRACKING", "0.123", "-")
+    assert status_cells(AgentView(agent=1))[-1] == "not heard yet"
 
 
 def test_what_an_agent_says_is_shown_as_it_is() -> None:
     stream = io.StringIO()
-    view = AgentView(0, status(active_alert="refused [/bold] [red]"))
+    view = AgentView(agent=0, status=status(active_alert="refused [/bold] [red]"))
     Console(file=stream, width=200).print(status_table([view]))
     assert "refused [/bold] [red]" in stream.getvalue()
 
@@ -197,10 +197,12 @@ def test_an_agents_text_controls_no_terminal(capsys: pytest.CaptureFixture[str])
     stream = io.StringIO()
     lines = PlainLines(stream)
     lines.say(hostile)
-    lines.show([AgentView(0, status(active_alert=hostile))])
-    Console(file=stream, width=200).print(status_table([AgentView(0, status(active_alert=hostile), note="")]))
+    lines.show([AgentView(agent=0, status=status(active_alert=hostile))])
+    Console(file=stream, width=200).print(
+        status_table([AgentView(agent=0, status=status(active_alert=hostile), note="")])
+    )
     LiveTable(Console(file=stream, force_terminal=False)).say(hostile)
-    print_statuses([AgentView(0, status(active_alert=hostile))])
+    print_statuses([AgentView(agent=0, status=status(active_alert=hostile))])
     print(operator.as_json({0: status(active_alert=hostile)}))
     shown = stream.getvalue() + capsys.readouterr().out
     assert "DONE" in shown

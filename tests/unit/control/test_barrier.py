@@ -26,7 +26,7 @@ def filtered(barrier: Barrier, virtual_control: Array, start: Start, bodies: lis
 
 
 def start(pos: Array, vel: Array, held: Array = HOVER) -> Start:
-    return Start(0, pos, vel, 1.0, held)
+    return Start(t_us=0, pos_ned_m=pos, vel_ned_m_s=vel, cos_tilt=1.0, virtual_control=held)
 
 
 def fly_at_goals(
@@ -44,15 +44,18 @@ def fly_at_goals(
     for k in range(round(for_s / DT_S)):
         moved = [
             Body(
-                tuple((np.array(o.pos_ned_m) + k * DT_S * np.array(o.vel_ned_m_s)).tolist()),
-                o.vel_ned_m_s,
-                o.apart_m,
-                o.share_01,
-                o.column,
+                pos_ned_m=tuple((np.array(o.pos_ned_m) + k * DT_S * np.array(o.vel_ned_m_s)).tolist()),
+                vel_ned_m_s=o.vel_ned_m_s,
+                apart_m=o.apart_m,
+                share_01=o.share_01,
+                column=o.column,
             )
             for o in others or []
         ]
-        bodies = [Body(tuple(p.tolist()), tuple(v.tolist()), APART_M, 0.5) for p, v in zip(pos, vel, strict=True)]
+        bodies = [
+            Body(pos_ned_m=tuple(p.tolist()), vel_ned_m_s=tuple(v.tolist()), apart_m=APART_M, share_01=0.5)
+            for p, v in zip(pos, vel, strict=True)
+        ]
         commands = []
         for i, barrier in enumerate(barriers):
             pull = np.clip(2.0 * (goals[i] - pos[i]) - 2.0 * vel[i], -2.0, 2.0)
@@ -97,7 +100,15 @@ def test_negative_control_without_it_they_do(count: int) -> None:
 @pytest.mark.parametrize("speed_m_s", [0.0, 1.0])
 def test_against_an_obstacle_the_vehicle_brakes_alone(column: bool, speed_m_s: float) -> None:
     """The obstacle may approach as well: only the own braking counts."""
-    obstacle = [Body((3.0, 0.1, 0.0), (-speed_m_s, 0.0, 0.0), 1.24 + PARAMS.margin_m, 1.0, column)]
+    obstacle = [
+        Body(
+            pos_ned_m=(3.0, 0.1, 0.0),
+            vel_ned_m_s=(-speed_m_s, 0.0, 0.0),
+            apart_m=1.24 + PARAMS.margin_m,
+            share_01=1.0,
+            column=column,
+        )
+    ]
     pos, vel, goal = np.zeros((1, 3)), np.array([[1.5, 0.0, 0.0]]), np.array([[6.0, 0.0, 0.0]])
     assert fly_at_goals(pos, vel, goal, PARAMS, obstacle, 2.0)[1] >= 1.24
     assert fly_at_goals(pos, vel, goal, None, obstacle, 2.0)[1] < 0.8
@@ -106,13 +117,19 @@ def test_against_an_obstacle_the_vehicle_brakes_alone(column: bool, speed_m_s: f
 def test_both_of_a_pair_brake_and_one_alone_brakes_all_of_it() -> None:
     barrier = Barrier(PARAMS.model_copy(update={"slew_1_s": 50.0}), MODEL, DT_S)
     here = start(np.zeros(3), np.array([1.5, 0.0, 0.0]))
-    other = [Body((1.3, 0.0, 0.0), (-1.5, 0.0, 0.0), APART_M, share) for share in (0.5, 1.0)]
+    other = [
+        Body(pos_ned_m=(1.3, 0.0, 0.0), vel_ned_m_s=(-1.5, 0.0, 0.0), apart_m=APART_M, share_01=share)
+        for share in (0.5, 1.0)
+    ]
     half, whole = (filtered(barrier, HOVER, here, [body]) for body in other)
     assert half is not None
     assert whole is not None
     assert 0.15 < half[0] < whole[0]
     mirrored = filtered(
-        barrier, HOVER, start(np.zeros(3), -here.vel_ned_m_s), [Body((-1.3, 0.0, 0.0), (1.5, 0.0, 0.0), APART_M, 0.5)]
+        barrier,
+        HOVER,
+        start(np.zeros(3), -here.vel_ned_m_s),
+        [Body(pos_ned_m=(-1.3, 0.0, 0.0), vel_ned_m_s=(1.5, 0.0, 0.0), apart_m=APART_M, share_01=0.5)],
     )
     assert mirrored is not None
     np.testing.assert_allclose(mirrored, half * [-1.0, 1.0, 1.0], atol=1e-12)
@@ -131,7 +148,12 @@ def test_both_of_a_pair_brake_and_one_alone_brakes_all_of_it() -> None:
 def test_the_filter_does_not_act_on_agents_that_keep_apart(pos: tuple[float, ...], vel: tuple[float, ...]) -> None:
     barrier = Barrier(PARAMS, MODEL, DT_S)
     assert (
-        filtered(barrier, np.array([0.2, 0.1, 9.9]), start(np.zeros(3), np.zeros(3)), [Body(pos, vel, APART_M, 0.5)])
+        filtered(
+            barrier,
+            np.array([0.2, 0.1, 9.9]),
+            start(np.zeros(3), np.zeros(3)),
+            [Body(pos_ned_m=pos, vel_ned_m_s=vel, apart_m=APART_M, share_01=0.5)],
+        )
         is None
     )
     assert filtered(barrier, HOVER, start(np.zeros(3), np.zeros(3)), []) is None
@@ -147,10 +169,10 @@ def test_commands_stay_within_the_airframe_bounds() -> None:
         wanted = held + np.array([*rng.uniform(-0.04, 0.04, 2), rng.uniform(-1.0, 1.0)])
         bodies = [
             Body(
-                tuple(rng.normal(scale=0.5, size=3).tolist()),
-                tuple(rng.normal(scale=2.0, size=3).tolist()),
-                APART_M,
-                1.0,
+                pos_ned_m=tuple(rng.normal(scale=0.5, size=3).tolist()),
+                vel_ned_m_s=tuple(rng.normal(scale=2.0, size=3).tolist()),
+                apart_m=APART_M,
+                share_01=1.0,
             )
             for _ in range(5)
         ]
@@ -171,7 +193,7 @@ def test_coincident_bodies_part_along_their_relative_velocity() -> None:
         barrier,
         HOVER,
         start(np.zeros(3), np.array([1.0, 0.0, 0.0])),
-        [Body((0.0,) * 3, (-1.0, 0.0, 0.0), APART_M, 0.5)],
+        [Body(pos_ned_m=(0.0,) * 3, vel_ned_m_s=(-1.0, 0.0, 0.0), apart_m=APART_M, share_01=0.5)],
     )
     assert found is not None
     assert found[0] > 0.0
@@ -181,7 +203,15 @@ def test_coincident_bodies_part_along_their_relative_velocity() -> None:
 
 
 def path(t0_us: int, vel: tuple[float, float, float] = (1.0, 0.0, 0.0), points: int = 41) -> PredictedPath:
-    return PredictedPath(1, 1, 1, t0_us, 20_000, 0.0, np.arange(points)[:, None] * 0.02 * np.array(vel))
+    return PredictedPath(
+        agent=1,
+        boot_id=1,
+        seq=1,
+        t0_utc_us=t0_us,
+        dt_us=20_000,
+        radius_m=0.0,
+        pos_ned_m=np.arange(points)[:, None] * 0.02 * np.array(vel),
+    )
 
 
 def body(known: PredictedPath, act_us: int, ahead_s: float = 0.0, filters: bool = True) -> Body:
@@ -214,7 +244,14 @@ def test_a_stale_peer_is_where_plans_assume_it(vel: tuple[float, float, float], 
 
 
 def test_an_obstacle_moves_on() -> None:
-    ball = Obstacle(np.array([1.0, 2.0, 3.0]), 0.5, 1.0, 3.0, np.array([0.0, -1.0, 0.0]), column=True)
+    ball = Obstacle(
+        center_ned_m=np.array([1.0, 2.0, 3.0]),
+        radius_m=0.5,
+        keep_out_m=1.0,
+        visibility_m=3.0,
+        vel_ned_m_s=np.array([0.0, -1.0, 0.0]),
+        column=True,
+    )
     found = body_of_obstacle(ball, 0.2, 0.29)
     assert found.pos_ned_m == pytest.approx((1.0, 1.8, 3.0))
     assert found.apart_m == pytest.approx(0.79)
@@ -223,7 +260,7 @@ def test_an_obstacle_moves_on() -> None:
 
 def test_downwash_demands_more_distance_vertically_than_horizontally() -> None:
     sinking = start(np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, 0.5]))
-    below = [Body((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), APART_M, 0.5)]
+    below = [Body(pos_ned_m=(0.0, 0.0, 0.0), vel_ned_m_s=(0.0, 0.0, 0.0), apart_m=APART_M, share_01=0.5)]
     assert filtered(Barrier(PARAMS, MODEL, DT_S), HOVER, sinking, below) is None
     found = filtered(Barrier(PARAMS, MODEL, DT_S, downwash=2.0), HOVER, sinking, below)
     assert found is not None

@@ -27,7 +27,7 @@ SEPARATION = SeparationParams(radius_m=0.9)
 HARD_MIN_M = SEPARATION.radius_m - SEPARATION.certify_slack_m
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Network:
     """A network with seeded delays and losses, and an outage."""
 
@@ -80,11 +80,20 @@ class Crowd:
             if agent.is_due(self.now_us):
                 begin_us = self.now_us + agent.lead_us
                 desired = DesiredReference(partial(self.wanted, i))
-                agent.propose(Situation(self.now_us, begin_us, desired, self.known[i], ()))
+                agent.propose(
+                    Situation(utc_us=self.now_us, begin_us=begin_us, desired=desired, peers=self.known[i], others=())
+                )
         for i, agent in enumerate(self.agents):
             assert agent.committed is not None
             message = TrajectoryMessage(
-                i, 1, self.seq, self.now_us, True, agent.committed, agent.proposal, self.acknowledged(i)
+                agent=i,
+                boot_id=1,
+                seq=self.seq,
+                sent_utc_us=self.now_us,
+                is_committed=True,
+                committed=agent.committed,
+                proposal=agent.proposal,
+                acknowledged=self.acknowledged(i),
             )
             for j in ids:
                 if j != i:
@@ -118,9 +127,9 @@ class Crowd:
 
 NETWORKS = {
     "ideal": Network(),
-    "300 ms": Network((300_000, 300_000)),
-    "0 to 400 ms, out of order, 30 % lost": Network((0, 400_000), 0.3),
-    "2 s of silence": Network((20_000, 60_000), 0.1, (1_500_000, 3_500_000)),
+    "300 ms": Network(delay_us=(300_000, 300_000)),
+    "0 to 400 ms, out of order, 30 % lost": Network(delay_us=(0, 400_000), loss_01=0.3),
+    "2 s of silence": Network(delay_us=(20_000, 60_000), loss_01=0.1, dark_us=(1_500_000, 3_500_000)),
 }
 
 
@@ -143,11 +152,11 @@ class Careless(Crowd):
 
 
 def test_negative_control_commitments_without_acknowledgements_conflict() -> None:
-    assert Careless(4, Network((300_000, 300_000))).run(6.0) < HARD_MIN_M - 0.1
+    assert Careless(4, Network(delay_us=(300_000, 300_000))).run(6.0) < HARD_MIN_M - 0.1
 
 
 def test_without_messages_all_agents_come_to_rest_and_stay_apart() -> None:
-    crowd = Crowd(4, Network((20_000, 20_000), dark_us=(1_500_000, 10**9)))
+    crowd = Crowd(4, Network(delay_us=(20_000, 20_000), dark_us=(1_500_000, 10**9)))
     crowd.run(1.6)
     committed = crowd.committed
     crowd.run(4.0)  # 2 s of plan and the braking after it
@@ -158,7 +167,7 @@ def test_without_messages_all_agents_come_to_rest_and_stay_apart() -> None:
 
 
 def test_of_two_proposals_in_conflict_the_earlier_one_is_flown() -> None:
-    crowd = Crowd(2, Network((100_000, 100_000)))
+    crowd = Crowd(2, Network(delay_us=(100_000, 100_000)))
     crowd.run(6.0)
     assert all(agent.counts.committed > 3 for agent in crowd.agents)
     assert sum(agent.counts.withdrawn for agent in crowd.agents) > 0
@@ -181,17 +190,38 @@ def meeting() -> tuple[Commitments, Commitments]:
 
 def message_of(agent: Commitments, number: int) -> dict[int, TrajectoryMessage]:
     assert agent.committed is not None
-    return {number: TrajectoryMessage(number, 1, 1, UTC_US, True, agent.committed, agent.proposal, {})}
+    return {
+        number: TrajectoryMessage(
+            agent=number,
+            boot_id=1,
+            seq=1,
+            sent_utc_us=UTC_US,
+            is_committed=True,
+            committed=agent.committed,
+            proposal=agent.proposal,
+            acknowledged={},
+        )
+    }
 
 
 def wall(x_m: float, agent: Commitments) -> KeepOut:
-    return KeepOut(np.tile([x_m, 0.0, -2.0], (agent.steps + 1, 1)), 0.9, 0.8, False, -1)
+    return KeepOut(
+        pos_ned_m=np.tile([x_m, 0.0, -2.0], (agent.steps + 1, 1)),
+        radius_m=0.9,
+        hard_min_distance_m=0.8,
+        any_height=False,
+        priority_id=-1,
+    )
 
 
 def test_an_evasion_is_found_by_the_peer_it_conflicts_with() -> None:
     first, second = meeting()
     assert second.conflicting_peers(UTC_US, message_of(first, 0)) == set()
-    first.evade(Situation(UTC_US, UTC_US, DesiredReference(at_goal), {}, [wall(1.6, first)]))
+    first.evade(
+        Situation(
+            utc_us=UTC_US, begin_us=UTC_US, desired=DesiredReference(at_goal), peers={}, others=[wall(1.6, first)]
+        )
+    )
     assert first.counts.evaded == 1, "before a wall there is no time for acknowledgements"
     assert second.conflicting_peers(UTC_US, message_of(first, 0)) == {0}
     assert second.conflicting_peers(UTC_US, message_of(first, 0)) == {0}, "as long as it does"
@@ -199,7 +229,11 @@ def test_an_evasion_is_found_by_the_peer_it_conflicts_with() -> None:
 
 def test_a_wall_that_leaves_time_for_acknowledgements_triggers_no_evasion() -> None:
     first, _ = meeting()
-    first.evade(Situation(UTC_US, UTC_US, DesiredReference(at_goal), {}, [wall(2.6, first)]))
+    first.evade(
+        Situation(
+            utc_us=UTC_US, begin_us=UTC_US, desired=DesiredReference(at_goal), peers={}, others=[wall(2.6, first)]
+        )
+    )
     assert first.counts.evaded == 0
 
 
@@ -209,7 +243,15 @@ def test_an_agent_at_rest_evades_what_approaches() -> None:
     agent.begin(np.array([0.0, 0.0, -2.0]), np.zeros(3), UTC_US)
     times_s = 0.1 * np.arange(agent.steps + 1)
     coming = np.stack([2.5 - 1.0 * times_s, 0.3 + 0.0 * times_s, -2.0 + 0.0 * times_s], axis=1)
-    agent.evade(Situation(UTC_US, UTC_US, DesiredReference(at_goal), {}, [KeepOut(coming, 0.9, 0.8, False, 1)]))
+    agent.evade(
+        Situation(
+            utc_us=UTC_US,
+            begin_us=UTC_US,
+            desired=DesiredReference(at_goal),
+            peers={},
+            others=[KeepOut(pos_ned_m=coming, radius_m=0.9, hard_min_distance_m=0.8, any_height=False, priority_id=1)],
+        )
+    )
     assert agent.counts.evaded == 1
     assert agent.committed is not None
     apart = agent.committed.sample(UTC_US + times_s * 1e6)[0] - coming
@@ -223,12 +265,31 @@ def test_an_agent_that_is_enclosed_evades_upwards(column: bool, passes_m: float)
     agent.begin(np.array([0.0, 0.0, -2.0]), np.zeros(3), UTC_US)
     sides = [[0.0, 0.9, -2.0], [0.0, -0.9, -2.0], [-0.9, 0.0, -2.0]]
     peers = {
-        i: TrajectoryMessage(i, 1, 1, UTC_US, True, resting(np.array(side), UTC_US, 100_000), None, {})
+        i: TrajectoryMessage(
+            agent=i,
+            boot_id=1,
+            seq=1,
+            sent_utc_us=UTC_US,
+            is_committed=True,
+            committed=resting(np.array(side), UTC_US, 100_000),
+            proposal=None,
+            acknowledged={},
+        )
         for i, side in enumerate(sides, start=1)
     }
     times_s = 0.1 * np.arange(agent.steps + 1)
     coming = np.stack([3.5 - 1.0 * times_s, 0.0 * times_s, -2.0 + 0.0 * times_s], axis=1)
-    agent.evade(Situation(UTC_US, UTC_US, DesiredReference(at_goal), peers, [KeepOut(coming, 1.0, 0.9, column, -1)]))
+    agent.evade(
+        Situation(
+            utc_us=UTC_US,
+            begin_us=UTC_US,
+            desired=DesiredReference(at_goal),
+            peers=peers,
+            others=[
+                KeepOut(pos_ned_m=coming, radius_m=1.0, hard_min_distance_m=0.9, any_height=column, priority_id=-1)
+            ],
+        )
+    )
     assert agent.committed is not None
     pos = agent.committed.sample(UTC_US + times_s * 1e6)[0]
     apart = np.linalg.norm((pos - coming)[:, : 2 if column else 3], axis=1)
@@ -257,9 +318,26 @@ def test_plans_along_a_path_are_linearised_around_it(follows_path: bool, passes:
     to_north = quintic_to(np.array([0.0, 0.0, -2.0]), np.zeros(3), np.array([0.1, 0.9, -2.0]), 1.0, 1.0)
     agent.committed = ending_at_rest(UTC_US, 100_000, *to_north.sample(np.arange(0.0, 2.1, 0.1)), 1.5)
     posts = [np.array([0.8, y_m, -2.0]) for y_m in (0.3, 0.6, 0.9, 1.2)]
-    wall = [KeepOut(np.tile(post, (agent.steps + 1, 1)), 0.375, 0.275, True, -1) for post in posts]
+    wall = [
+        KeepOut(
+            pos_ned_m=np.tile(post, (agent.steps + 1, 1)),
+            radius_m=0.375,
+            hard_min_distance_m=0.275,
+            any_height=True,
+            priority_id=-1,
+        )
+        for post in posts
+    ]
     path = along(np.array([[0.0, 0.0], [0.8, -0.4], [3.0, -0.4]]))
-    agent.propose(Situation(UTC_US, UTC_US + agent.lead_us, DesiredReference(path, follows_path), {}, wall))
+    agent.propose(
+        Situation(
+            utc_us=UTC_US,
+            begin_us=UTC_US + agent.lead_us,
+            desired=DesiredReference(path, follows_path),
+            peers={},
+            others=wall,
+        )
+    )
     assert agent.proposal is not None
     assert bool(agent.proposal.trajectory.pos_ned_m[-1, 0] > 1.0) is passes, "behind the wall"
 
@@ -274,9 +352,26 @@ def test_a_path_from_rest_begins_at_the_own_speed(runs_up: bool, monkeypatch: py
     here = np.array([2.716, 2.764, -2.0])
     agent.begin(here, np.zeros(3), UTC_US)
     posts = [np.array([3.0, y_m, -2.0]) for y_m in (2.802, 2.502, 2.202)]
-    wall = [KeepOut(np.tile(post, (agent.steps + 1, 1)), 0.375, 0.275, True, -1) for post in posts]
+    wall = [
+        KeepOut(
+            pos_ned_m=np.tile(post, (agent.steps + 1, 1)),
+            radius_m=0.375,
+            hard_min_distance_m=0.275,
+            any_height=True,
+            priority_id=-1,
+        )
+        for post in posts
+    ]
     path = along(np.array([here[:2], [2.77, 3.14], [3.21, 3.25], [4.19, 3.06]]))
-    agent.propose(Situation(UTC_US, UTC_US + agent.lead_us, DesiredReference(path, follows_path=True), {}, wall))
+    agent.propose(
+        Situation(
+            utc_us=UTC_US,
+            begin_us=UTC_US + agent.lead_us,
+            desired=DesiredReference(path, follows_path=True),
+            peers={},
+            others=wall,
+        )
+    )
     assert (agent.proposal is not None) is runs_up
     if agent.proposal is not None:
         assert agent.proposal.trajectory.pos_ned_m[-1, 0] > 3.4, "behind the wall"
@@ -285,7 +380,11 @@ def test_a_path_from_rest_begins_at_the_own_speed(runs_up: bool, monkeypatch: py
 def proposing() -> tuple[Commitments, Proposal]:
     agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), SEPARATION, 2, lambda: 0)
     agent.begin(np.array([0.0, 0.0, -2.0]), np.zeros(3), UTC_US)
-    agent.propose(Situation(UTC_US, UTC_US + agent.lead_us, DesiredReference(at_goal), {}, ()))
+    agent.propose(
+        Situation(
+            utc_us=UTC_US, begin_us=UTC_US + agent.lead_us, desired=DesiredReference(at_goal), peers={}, others=()
+        )
+    )
     assert agent.proposal is not None
     return agent, agent.proposal
 
@@ -293,7 +392,14 @@ def proposing() -> tuple[Commitments, Proposal]:
 def acknowledging(number: int) -> dict[int, TrajectoryMessage]:
     return {
         1: TrajectoryMessage(
-            1, 1, 1, UTC_US, True, resting(np.array([9.0, 0.0, 0.0]), UTC_US, 100_000), None, {0: number}
+            agent=1,
+            boot_id=1,
+            seq=1,
+            sent_utc_us=UTC_US,
+            is_committed=True,
+            committed=resting(np.array([9.0, 0.0, 0.0]), UTC_US, 100_000),
+            proposal=None,
+            acknowledged={0: number},
         )
     }
 
@@ -318,20 +424,24 @@ def test_commitments_that_are_too_close_already_do_not_creep_closer() -> None:
     for k in range(10):
         x_m = HARD_MIN_M - 0.01 - 0.005 * k
         nearer = np.array([[x_m, 0.0, 0.0], [x_m - 0.005, 0.0, 0.0]])
-        assert agent._planner.conflicts(Trajectory(UTC_US, 100_000, nearer, np.zeros((2, 3))), UTC_US, [other])
+        assert agent._planner.conflicts(
+            Trajectory(t0_utc_us=UTC_US, dt_us=100_000, pos_ned_m=nearer, vel_ned_m_s=np.zeros((2, 3))), UTC_US, [other]
+        )
         assert not agent._planner.conflicts(
-            Trajectory(UTC_US, 100_000, nearer[::-1], np.zeros((2, 3))), UTC_US, [other]
+            Trajectory(t0_utc_us=UTC_US, dt_us=100_000, pos_ned_m=nearer[::-1], vel_ned_m_s=np.zeros((2, 3))),
+            UTC_US,
+            [other],
         )
 
 
 def test_what_is_not_a_number_conflicts() -> None:
     agent, _ = proposing()
-    bad = Trajectory(UTC_US, 100_000, np.full((2, 3), np.nan), np.zeros((2, 3)))
+    bad = Trajectory(t0_utc_us=UTC_US, dt_us=100_000, pos_ned_m=np.full((2, 3), np.nan), vel_ned_m_s=np.zeros((2, 3)))
     assert agent._planner.conflicts(bad, UTC_US, [resting(np.zeros(3), UTC_US, 100_000)])
 
 
 def test_a_slow_network_lengthens_the_lead_and_a_fast_one_shortens_it_again() -> None:
-    crowd = Crowd(2, Network((250_000, 250_000)))
+    crowd = Crowd(2, Network(delay_us=(250_000, 250_000)))
     before_us = crowd.agents[0].lead_us
     crowd.run(4.0)
     slow_us = crowd.agents[0].lead_us

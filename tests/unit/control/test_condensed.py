@@ -71,7 +71,17 @@ def solve_one(
     one = np.ones((steps, 1))
     gains = np.array(np.broadcast_to(gain, steps))[:, None]
     here, now, held_u, pushed = (np.array([x]) for x in (pos, vel, u_prev, drift))
-    return problem.solve(AxesProblem(here, now, held_u, gains, pushed, ref * one, ref_vel * one))
+    return problem.solve(
+        AxesProblem(
+            pos_m=here,
+            vel_m_s=now,
+            u_prev=held_u,
+            gain_m_s2=gains,
+            drift_m_s2=pushed,
+            ref_pos_m=ref * one,
+            ref_vel_m_s=ref_vel * one,
+        )
+    )
 
 
 @pytest.mark.parametrize("euler", [False, True])
@@ -93,7 +103,17 @@ def test_prediction_follows_a_gain_that_is_another_at_every_step_and_axis(euler:
     gains = np.stack([VARYING, np.linspace(-3.0, -20.0, 40)], axis=1)
     pos, vel, u_prev, drift = np.array([0.3, -1.0]), np.array([-0.4, 0.2]), np.array([0.02, -0.15]), [0.5, -0.2]
     reference = np.tile([1.0, 0.5], (40, 1))
-    solution = problem.solve(AxesProblem(pos, vel, u_prev, gains, np.array(drift), reference, 0.0 * reference))
+    solution = problem.solve(
+        AxesProblem(
+            pos_m=pos,
+            vel_m_s=vel,
+            u_prev=u_prev,
+            gain_m_s2=gains,
+            drift_m_s2=np.array(drift),
+            ref_pos_m=reference,
+            ref_vel_m_s=0.0 * reference,
+        )
+    )
     assert np.abs(np.diff(solution.u, axis=0)).max() > 0.01  # it does something
     for i in range(2):
         p, v = simulate(pos[i], vel[i], solution.u[:, i], gains[:, i], drift[i], 0.02, euler)
@@ -203,7 +223,10 @@ def dense(
 def wall(normal: tuple[float, float], offset_m: float, steps: int, stop_s: float = 0.0) -> HalfSpaces:
     unit = np.array(normal) / math.hypot(*normal)
     return HalfSpaces(
-        np.tile(unit, (1, steps, 1)), np.full((1, steps), offset_m), np.array([stop_s]), np.array([offset_m])
+        normal=np.tile(unit, (1, steps, 1)),
+        offset_m=np.full((1, steps), offset_m),
+        stop_s=np.array([stop_s]),
+        stop_offset_m=np.array([offset_m]),
     )
 
 
@@ -225,8 +248,16 @@ def test_half_spaces_against_a_dense_solver(
     problem = mpc(AXIS, replace(AXIS, q_pos=1.0), horizon=horizon, max_keep_outs=2)
     pos, vel, u_prev, ref = np.array([0.0, 0.0]), np.array([0.2, 0.1]), np.array([0.01, -0.02]), np.array([0.5, 0.3])
     spaces = wall(normal, offset_m, 25, stop_s)
-    tick = (pos, vel, u_prev, np.stack([gain, gain], axis=1), np.zeros(2), np.tile(ref, (25, 1)), np.zeros((25, 2)))
-    ours = problem.solve(AxesProblem(*tick), spaces)
+    tick = AxesProblem(
+        pos_m=pos,
+        vel_m_s=vel,
+        u_prev=u_prev,
+        gain_m_s2=np.stack([gain, gain], axis=1),
+        drift_m_s2=np.zeros(2),
+        ref_pos_m=np.tile(ref, (25, 1)),
+        ref_vel_m_s=np.zeros((25, 2)),
+    )
+    ours = problem.solve(tick, spaces)
     u, p, _ = dense(problem, pos, vel, u_prev, gain, ref, spaces, problem._checked)
     np.testing.assert_allclose(ours.pos_m, p, atol=5e-4)
     np.testing.assert_allclose(ours.u, u, atol=3e-3)
@@ -235,7 +266,7 @@ def test_half_spaces_against_a_dense_solver(
     unit = spaces.normal[0, 0]
     assert ((ours.pos_m @ unit)[problem._checked] >= offset_m - 1e-3).all()
     assert unit @ (ours.pos_m[-1] + stop_s * ours.vel_m_s[-1]) >= offset_m - 1e-3
-    free = problem.solve(AxesProblem(*tick))
+    free = problem.solve(tick)
     active = bool(np.abs(free.pos_m - ours.pos_m).max() > 0.005)
     assert active == (offset_m > -1.0)  # the constraint mattered, and left no trace in the next solve
 
@@ -251,8 +282,19 @@ def test_rows_that_cannot_be_met_give_slack_and_not_failure() -> None:
     problem = mpc(AXIS, AXIS, max_keep_outs=2, qp=QpParams())
     still, origin = np.zeros((40, 2)), np.zeros(2)
     north, south = wall((1.0, 0.0), 0.1, 40), wall((-1.0, 0.0), 0.1, 40)  # north of 0.1 m and south of -0.1 m
-    both = HalfSpaces(*(np.concatenate([getattr(w, name) for w in (north, south)]) for name in FIELDS))
-    solution = problem.solve(AxesProblem(origin, origin, origin, same_gain(40, 2), origin, still, still), both)
+    both = HalfSpaces(**{name: np.concatenate([getattr(w, name) for w in (north, south)]) for name in FIELDS})
+    solution = problem.solve(
+        AxesProblem(
+            pos_m=origin,
+            vel_m_s=origin,
+            u_prev=origin,
+            gain_m_s2=same_gain(40, 2),
+            drift_m_s2=origin,
+            ref_pos_m=still,
+            ref_vel_m_s=still,
+        ),
+        both,
+    )
     assert solution.solved
     assert solution.slack_m == pytest.approx(0.1, abs=0.02)  # each gives way by half of what is asked
     assert solution.residual_m < 0.02
@@ -265,7 +307,16 @@ def test_no_reference_is_worth_any_slack_where_the_rows_can_be_met(ref_m: float)
     origin, reference = np.zeros(2), np.tile([ref_m, 0.0], (40, 1))
     spaces = wall((-1.0, 0.0), -0.1, 40)  # stay south of 0.1 m
     solution = problem.solve(
-        AxesProblem(origin, origin, origin, same_gain(40, 2), origin, reference, 0.0 * reference), spaces
+        AxesProblem(
+            pos_m=origin,
+            vel_m_s=origin,
+            u_prev=origin,
+            gain_m_s2=same_gain(40, 2),
+            drift_m_s2=origin,
+            ref_pos_m=reference,
+            ref_vel_m_s=0.0 * reference,
+        ),
+        spaces,
     )
     assert solution.slack_m < 0.005
     assert solution.pos_m[-1, 0] < 0.1 + 0.02
@@ -275,7 +326,18 @@ def test_relaxed_rows_ask_for_no_more_than_can_be_reached() -> None:
     problem = mpc(AXIS, AXIS, max_keep_outs=1, relax_01=0.9, qp=QpParams())
     still, origin = np.zeros((40, 2)), np.zeros(2)
     spaces = wall((1.0, 0.0), 2.0, 40)
-    solution = problem.solve(AxesProblem(origin, origin, origin, same_gain(40, 2), origin, still, still), spaces)
+    solution = problem.solve(
+        AxesProblem(
+            pos_m=origin,
+            vel_m_s=origin,
+            u_prev=origin,
+            gain_m_s2=same_gain(40, 2),
+            drift_m_s2=origin,
+            ref_pos_m=still,
+            ref_vel_m_s=still,
+        ),
+        spaces,
+    )
     assert solution.slack_m < 0.02
     reach, _ = simulate(0.0, 0.0, np.clip(-0.05 * np.arange(1, 41), -0.2, None), GAIN, 0.0, 0.02, False)
     assert solution.pos_m[-1, 0] >= 0.9 * reach[-1] - 0.02
@@ -296,14 +358,32 @@ def test_a_terminal_condition_that_can_be_met_is_met() -> None:
 
 
 # input bounds and du of z are the thesis' 20 and 5 N for 1 kg; control / prediction as in its tables
-VERTICAL = Axis(2.0, 0.05, 0.01, 0.0, 20.0, 5.0, 9.81, 1.0, "position_velocity")
+VERTICAL = Axis(
+    q_pos=2.0,
+    q_vel=0.05,
+    r=0.01,
+    u_min=0.0,
+    u_max=20.0,
+    du_max=5.0,
+    u_rest=9.81,
+    gain_m_s2=1.0,
+    terminal="position_velocity",
+)
 ENDS = {
-    "z": (VERTICAL, Horizon(3, 40, 0.02, False), 0),
-    "z euler": (VERTICAL, Horizon(3, 30, 0.02, True), 0),
-    "z six moves": (VERTICAL, Horizon(6, 40, 0.02, False), 0),
-    "x position": (replace(AXIS, terminal="position"), Horizon(6, 20, 0.02, True), 0),
-    "x rest": (replace(AXIS, terminal="position_velocity"), Horizon(6, 40, 0.02, False), 0),
-    "x rest, keep-outs": (replace(AXIS, terminal="position_velocity"), Horizon(6, 20, 0.02, False), 2),
+    "z": (VERTICAL, Horizon(control=3, prediction=40, dt_s=0.02, euler=False), 0),
+    "z euler": (VERTICAL, Horizon(control=3, prediction=30, dt_s=0.02, euler=True), 0),
+    "z six moves": (VERTICAL, Horizon(control=6, prediction=40, dt_s=0.02, euler=False), 0),
+    "x position": (replace(AXIS, terminal="position"), Horizon(control=6, prediction=20, dt_s=0.02, euler=True), 0),
+    "x rest": (
+        replace(AXIS, terminal="position_velocity"),
+        Horizon(control=6, prediction=40, dt_s=0.02, euler=False),
+        0,
+    ),
+    "x rest, keep-outs": (
+        replace(AXIS, terminal="position_velocity"),
+        Horizon(control=6, prediction=20, dt_s=0.02, euler=False),
+        2,
+    ),
 }
 
 
@@ -393,7 +473,7 @@ def test_one_that_cannot_be_met_is_softened_and_reported() -> None:
 def test_the_first_input_towards_an_end_out_of_reach_is_the_optimal_one(
     terminal: Literal["position", "position_velocity"],
 ) -> None:
-    axis, horizon = replace(VERTICAL, terminal=terminal), Horizon(3, 40, 0.02, False)
+    axis, horizon = replace(VERTICAL, terminal=terminal), Horizon(control=3, prediction=40, dt_s=0.02, euler=False)
     for ref in (-5.0, -10.0, 5.0):
         both = [mpc(axis, horizon=horizon, qp=qp) for qp in (QpParams(), QpParams(solver="daqp"))]
         flown, exact = (solve_one(problem, 0.0, 0.0, 9.81, ref, 9.81, -1.0) for problem in both)
@@ -425,7 +505,7 @@ def test_a_failure_from_a_warm_start_is_tried_again_from_scratch(monkeypatch: py
     problem = (np.ones(1), -np.ones(1), np.ones(1), -np.ones(1), np.ones(1))  # minimum of x^2 / 2 - x is at 1
     assert solver.solve(*problem).exact
     genuine = solver._run
-    answers = [QpSolution(None, False, "primal infeasible", 10)]
+    answers = [QpSolution(x=None, exact=False, status="primal infeasible", iterations=10)]
     monkeypatch.setattr(solver, "_run", lambda: answers.pop() if answers else genuine())
     again = solver.solve(*problem)
     assert again.exact

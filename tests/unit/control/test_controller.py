@@ -40,12 +40,22 @@ def hover(controller: Controller, offset: tuple[float, ...] = (0.0, 0.0, 0.0), *
     """At rest at HERE, asked to be `offset` from it; exactly as much reference as the controller says it needs."""
     points = controller.longest + 1
     reference = Reference(np.tile(HERE + offset, (points, 1)), np.zeros((points, 3)), 0.0)
-    start = Start(7_000_000, HERE, np.zeros(3), 1.0, np.array([0.0, 0.0, G]))
-    return Problem(start, reference, np.zeros(3), keep_outs, None)
+    start = Start(
+        t_us=7_000_000, pos_ned_m=HERE, vel_ned_m_s=np.zeros(3), cos_tilt=1.0, virtual_control=np.array([0.0, 0.0, G])
+    )
+    return Problem(
+        start=start, reference=reference, disturbance_ned_m_s2=np.zeros(3), keep_outs=keep_outs, guess_ned_m=None
+    )
 
 
 def near(controller: Controller, place: Array) -> KeepOut:
-    return KeepOut(np.tile(place, (controller.steps + 1, 1)), 0.9, 0.8, False, 1)
+    return KeepOut(
+        pos_ned_m=np.tile(place, (controller.steps + 1, 1)),
+        radius_m=0.9,
+        hard_min_distance_m=0.8,
+        any_height=False,
+        priority_id=1,
+    )
 
 
 def check(controller: Controller, plan: Plan) -> None:

@@ -19,7 +19,9 @@ HERE = np.array([0.0, 0.0, -2.0])
 def keep_out(north_m: float, east_m: float = 0.0, priority_id: int = 1, ends_m: float = 0.0) -> KeepOut:
     """A peer (an obstacle with `priority_id` -1) that plans to move `ends_m` north over the horizon."""
     path = np.linspace([north_m, east_m, -2.0], [north_m + ends_m, east_m, -2.0], 41)
-    return KeepOut(path, 0.9, 0.8, priority_id < 0, priority_id)
+    return KeepOut(
+        pos_ned_m=path, radius_m=0.9, hard_min_distance_m=0.8, any_height=priority_id < 0, priority_id=priority_id
+    )
 
 
 def reference(offsets_s: Array) -> tuple[Array, Array]:
@@ -95,7 +97,15 @@ def test_a_blocking_peer_is_avoided_although_it_moves_now() -> None:
 
 def test_a_wall_is_avoided_at_the_first_level_until_the_reference_is_reached() -> None:
     posts = tuple(
-        Obstacle(np.array([1.5, east, 0.0]), 0.3, 0.9, 3.0, np.zeros(3), column=True) for east in (-0.6, 0.0, 0.6)
+        Obstacle(
+            center_ned_m=np.array([1.5, east, 0.0]),
+            radius_m=0.3,
+            keep_out_m=0.9,
+            visibility_m=3.0,
+            vel_ned_m_s=np.zeros(3),
+            column=True,
+        )
+        for east in (-0.6, 0.0, 0.6)
     )
     recovery = DeadlockRecovery(PARAMS, 0, 0.9)
     stood(recovery, 1.6, [keep_out(1.0, priority_id=-1)], posts)
@@ -112,7 +122,9 @@ def test_a_wall_is_avoided_at_the_first_level_until_the_reference_is_reached() -
 
 
 def test_a_sphere_below_is_not_avoided() -> None:
-    ball = Obstacle(np.array([1.5, 0.0, 0.0]), 0.3, 0.9, 3.0, np.zeros(3))
+    ball = Obstacle(
+        center_ned_m=np.array([1.5, 0.0, 0.0]), radius_m=0.3, keep_out_m=0.9, visibility_m=3.0, vel_ned_m_s=np.zeros(3)
+    )
     recovery = DeadlockRecovery(PARAMS, 0, 0.9)
     stood(recovery, 1.6, [keep_out(1.0, priority_id=-1)], (ball,))
     assert aside_m(recovery) < 0.1

@@ -17,7 +17,17 @@ DT_US = 20_000
 
 
 def sample(t_us: int, vel: Array, q_nb: Array = LEVEL) -> VehicleState:
-    return VehicleState(t_us, np.zeros(3), vel, q_nb, np.zeros(3), True, FlightMode.EXTERNAL, Landed.IN_AIR, False)
+    return VehicleState(
+        t_us=t_us,
+        pos_ned_m=np.zeros(3),
+        vel_ned_m_s=vel,
+        q_nb=q_nb,
+        rate_frd_rad_s=np.zeros(3),
+        armed=True,
+        mode=FlightMode.EXTERNAL,
+        landed=Landed.IN_AIR,
+        failsafe=False,
+    )
 
 
 def observe(

@@ -22,7 +22,13 @@ NO_WIND = np.zeros(3)
 def start(
     vel: tuple[float, ...], pos: tuple[float, ...] = (0.0, 0.0, -5.0), tilt: tuple[float, ...] = (0.0, 0.0)
 ) -> Start:
-    return Start(1_000_000, np.array(pos), np.array(vel), 1.0, np.array([*tilt, 9.81]))
+    return Start(
+        t_us=1_000_000,
+        pos_ned_m=np.array(pos),
+        vel_ned_m_s=np.array(vel),
+        cos_tilt=1.0,
+        virtual_control=np.array([*tilt, 9.81]),
+    )
 
 
 def brake(
@@ -113,7 +119,15 @@ def flown(
     pos, v, tilt, rate, commanded = np.zeros(3), np.array(vel), np.zeros(2), np.zeros(2), np.zeros(2)
     path, speeds = [], []
     for _ in range(round(seconds / DT_S)):
-        begin = Start(0, pos, v, 1.0, np.array([*commanded, 9.81]), tilt, rate)
+        begin = Start(
+            t_us=0,
+            pos_ned_m=pos,
+            vel_ned_m_s=v,
+            cos_tilt=1.0,
+            virtual_control=np.array([*commanded, 9.81]),
+            tilt=tilt,
+            tilt_rate_1_s=rate,
+        )
         virtual_control = brake_and_hold_plan(begin, at, NO_WIND, believed, DT_US, 2).virtual_control[0]
         ends = [true.advance(float(tilt[i]), float(rate[i]), float(virtual_control[i]), DT_S) for i in (0, 1)]
         tilt, rate = np.array([e[0] for e in ends]), np.array([e[1] for e in ends])
@@ -140,7 +154,14 @@ def test_the_damping_for_a_vehicle_without_lag_would_swing_a_slow_one() -> None:
 
 
 def test_the_published_path_is_the_one_a_lagging_vehicle_flies() -> None:
-    begin = Start(0, np.zeros(3), np.array([2.0, -1.0, 0.0]), 1.0, np.array([0.1, 0.0, 9.81]), np.array([0.1, 0.0]))
+    begin = Start(
+        t_us=0,
+        pos_ned_m=np.zeros(3),
+        vel_ned_m_s=np.array([2.0, -1.0, 0.0]),
+        cos_tilt=1.0,
+        virtual_control=np.array([0.1, 0.0, 9.81]),
+        tilt=np.array([0.1, 0.0]),
+    )
     plan = brake_and_hold_plan(begin, None, NO_WIND, LAG, DT_US, STEPS)
     pos, vel, tilt, rate = np.zeros(3), np.array([2.0, -1.0, 0.0]), np.array([0.1, 0.0]), np.zeros(2)
     for k, virtual_control in enumerate(plan.virtual_control):

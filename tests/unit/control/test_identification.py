@@ -184,7 +184,18 @@ def configured(tmp_path: Path, text: str) -> Config:
 
 
 LISTED = "swarm.agents = 1\nsitl.enabled = false\n[vehicle_model]\ntilt_max_rad = 0.7\n"
-FOUND = Identified(*(Figure(v, 0.9 * v, 1.1 * v) for v in (0.0712, 9.123, 0.9, 0.61, 0.4242)))
+FOUND = Identified(
+    **{
+        name: Figure(value, 0.9 * value, 1.1 * value)
+        for name, value in {
+            "delay_s": 0.0712,
+            "attitude_rad_s": 9.123,
+            "attitude_damping": 0.9,
+            "drag_1_s": 0.61,
+            "hover_thrust_01": 0.4242,
+        }.items()
+    }
+)
 
 
 def test_the_table_is_a_configuration_that_flies_what_was_found(tmp_path: Path) -> None:

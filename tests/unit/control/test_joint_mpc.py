@@ -39,7 +39,13 @@ def problem(
     """Go to `goal`, metres from HERE, and be at rest there."""
     reference = Reference(np.tile(HERE + np.array(goal), (61, 1)), np.zeros((61, 3)), 0.0)
     return Problem(
-        Start(0, pos, np.array(vel), 1.0, np.array(virtual_control)), reference, np.array(wind), tuple(keep_outs), guess
+        start=Start(
+            t_us=0, pos_ned_m=pos, vel_ned_m_s=np.array(vel), cos_tilt=1.0, virtual_control=np.array(virtual_control)
+        ),
+        reference=reference,
+        disturbance_ned_m_s2=np.array(wind),
+        keep_outs=tuple(keep_outs),
+        guess_ned_m=guess,
     )
 
 
@@ -52,7 +58,13 @@ def joint(max_keep_outs: int = 4, separation: SeparationParams | None = None, **
 
 def ball(offset: Point, any_height: bool = False, priority_id: int = -1) -> KeepOut:
     """Return a keep-out of 0.9 m (hard minimum 0.8 m) at `offset` from HERE; an obstacle unless it has an id."""
-    return KeepOut(np.tile(HERE + np.array(offset), (41, 1)), 0.9, 0.8, any_height, priority_id)
+    return KeepOut(
+        pos_ned_m=np.tile(HERE + np.array(offset), (41, 1)),
+        radius_m=0.9,
+        hard_min_distance_m=0.8,
+        any_height=any_height,
+        priority_id=priority_id,
+    )
 
 
 def distances(path: Array, keep_out: KeepOut) -> Array:
@@ -169,7 +181,13 @@ class Flight:
 
 def _lasting(keep_out: KeepOut, points: int) -> KeepOut:
     still = np.tile(keep_out.pos_ned_m[0], (points, 1))
-    return KeepOut(still, keep_out.radius_m, keep_out.hard_min_distance_m, keep_out.any_height, keep_out.priority_id)
+    return KeepOut(
+        pos_ned_m=still,
+        radius_m=keep_out.radius_m,
+        hard_min_distance_m=keep_out.hard_min_distance_m,
+        any_height=keep_out.any_height,
+        priority_id=keep_out.priority_id,
+    )
 
 
 def fly(mpc: JointMpc | SwarmMpc, goal: Point, keep_outs: Sequence[KeepOut], ticks: int = 350) -> Flight:
@@ -267,11 +285,26 @@ def mirrored(asked: Problem, by: Array) -> Problem:
     start, reference = asked.start, asked.reference
     rest = np.array([0.0, 0.0, G])
     return Problem(
-        Start(0, turned(start.pos_ned_m), by @ start.vel_ned_m_s, 1.0, rest + by @ (start.virtual_control - rest)),
-        Reference(turned(reference.pos_ned_m), reference.vel_ned_m_s @ by.T, 0.0),
-        by @ asked.disturbance_ned_m_s2,
-        tuple(KeepOut(turned(k.pos_ned_m), 0.9, 0.8, k.any_height, k.priority_id) for k in asked.keep_outs),
-        None if asked.guess_ned_m is None else turned(asked.guess_ned_m),
+        start=Start(
+            t_us=0,
+            pos_ned_m=turned(start.pos_ned_m),
+            vel_ned_m_s=by @ start.vel_ned_m_s,
+            cos_tilt=1.0,
+            virtual_control=rest + by @ (start.virtual_control - rest),
+        ),
+        reference=Reference(turned(reference.pos_ned_m), reference.vel_ned_m_s @ by.T, 0.0),
+        disturbance_ned_m_s2=by @ asked.disturbance_ned_m_s2,
+        keep_outs=tuple(
+            KeepOut(
+                pos_ned_m=turned(k.pos_ned_m),
+                radius_m=0.9,
+                hard_min_distance_m=0.8,
+                any_height=k.any_height,
+                priority_id=k.priority_id,
+            )
+            for k in asked.keep_outs
+        ),
+        guess_ned_m=None if asked.guess_ned_m is None else turned(asked.guess_ned_m),
     )
 
 

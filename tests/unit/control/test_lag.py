@@ -74,7 +74,18 @@ def test_without_a_lag_the_command_acts_at_once() -> None:
 
 
 def axis(lag: Lag | None) -> Axis:
-    return Axis(1.5, 0.5, 0.01, -0.5, 0.5, 0.1, 0.0, 9.81, "none", lag)
+    return Axis(
+        q_pos=1.5,
+        q_vel=0.5,
+        r=0.01,
+        u_min=-0.5,
+        u_max=0.5,
+        du_max=0.1,
+        u_rest=0.0,
+        gain_m_s2=9.81,
+        terminal="none",
+        lag=lag,
+    )
 
 
 def planner(lag: Lag | None, drag_1_s: float) -> CondensedMpc:
@@ -88,7 +99,15 @@ def test_the_plan_is_the_motion_of_a_body_with_lag_and_drag(lag: Lag | None, dra
     """To within what a mean acceleration per step leaves out."""
     one, steps = np.ones(1), np.ones((30, 1))
     asked = AxesProblem(
-        0.4 * one, -0.8 * one, 0.1 * one, -9.81 * steps, 0.6 * one, 2.0 * steps, 0.0 * steps, -0.05 * one, 0.4 * one
+        pos_m=0.4 * one,
+        vel_m_s=-0.8 * one,
+        u_prev=0.1 * one,
+        gain_m_s2=-9.81 * steps,
+        drift_m_s2=0.6 * one,
+        ref_pos_m=2.0 * steps,
+        ref_vel_m_s=0.0 * steps,
+        realised=-0.05 * one,
+        realised_1_s=0.4 * one,
     )
     plan = planner(lag, drag_1_s).solve(asked)
     assert plan.solved and np.ptp(plan.u) > 0.1
@@ -108,7 +127,15 @@ def test_the_plan_is_the_motion_of_a_body_with_lag_and_drag(lag: Lag | None, dra
 def test_a_lag_left_out_of_the_prediction_is_seen() -> None:
     """The control of the test above: the same commands, without the lag, end somewhere else."""
     one, steps = np.ones(1), np.ones((30, 1))
-    asked = AxesProblem(0.0 * one, 0.0 * one, 0.0 * one, -9.81 * steps, 0.0 * one, 2.0 * steps, 0.0 * steps)
+    asked = AxesProblem(
+        pos_m=0.0 * one,
+        vel_m_s=0.0 * one,
+        u_prev=0.0 * one,
+        gain_m_s2=-9.81 * steps,
+        drift_m_s2=0.0 * one,
+        ref_pos_m=2.0 * steps,
+        ref_vel_m_s=0.0 * steps,
+    )
     with_lag, without = planner(LAGS[0], 0.0), planner(None, 0.0)
     plan = with_lag.solve(asked)
     pos, _ = without.motion(np.zeros(1), np.zeros(1), -9.81 * plan.u)

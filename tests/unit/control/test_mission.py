@@ -136,14 +136,14 @@ def derivatives(trajectory: QuinticTrajectory) -> tuple[Array, Array, Array]:
 
 
 def test_a_glide_begins_as_it_is_and_ends_at_rest_on_its_target() -> None:
-    trajectory = QuinticTrajectory(FROM, VEL, TO, 5.0)
+    trajectory = QuinticTrajectory(from_ned_m=FROM, vel_ned_m_s=VEL, to_ned_m=TO, travel_s=5.0)
     pos, vel = trajectory.sample(np.array([0.0, 5.0, 60.0]))
     np.testing.assert_allclose(pos, [FROM, TO, TO], atol=1e-12)
     np.testing.assert_allclose(vel, [VEL, np.zeros(3), np.zeros(3)], atol=1e-12)
 
 
 def test_a_glide_is_continuous_in_velocity_and_acceleration() -> None:
-    said, velocity, accel = derivatives(QuinticTrajectory(FROM, VEL, TO, 5.0))
+    said, velocity, accel = derivatives(QuinticTrajectory(from_ned_m=FROM, vel_ned_m_s=VEL, to_ned_m=TO, travel_s=5.0))
     np.testing.assert_allclose(said, velocity, atol=1e-6)
     assert np.abs(np.diff(said, axis=0)).max() < 0.02  # 3.6 ms apart: no jump
     assert np.abs(np.diff(accel, axis=0)).max() < 0.05
@@ -153,7 +153,7 @@ def test_a_glide_is_continuous_in_velocity_and_acceleration() -> None:
 
 def test_a_glide_halfway_by_hand() -> None:
     # s = 1/2: blend 1/2, coast 1/2 - 6/8 + 8/16 - 3/32 = 5/32; slopes 1.875 and 1 - 18/4 + 32/8 - 15/16 = -7/16
-    pos, vel = QuinticTrajectory(FROM, VEL, TO, 4.0).sample(np.array([2.0]))
+    pos, vel = QuinticTrajectory(from_ned_m=FROM, vel_ned_m_s=VEL, to_ned_m=TO, travel_s=4.0).sample(np.array([2.0]))
     np.testing.assert_allclose(pos[0], 0.5 * (FROM + TO) + 5 / 32 * 4.0 * VEL)
     np.testing.assert_allclose(vel[0], 1.875 * (TO - FROM) / 4.0 - 7 / 16 * VEL)
 

@@ -24,7 +24,13 @@ HERE = np.array([1.0, 2.0, -3.0])
 def start(
     pos: Array = HERE, vel: tuple[float, ...] = (0.0, 0.0, 0.0), virtual_control: tuple[float, ...] = (0.0, 0.0, G)
 ) -> Start:
-    return Start(5_000_000, pos, np.array(vel), 1.0, np.array(virtual_control))
+    return Start(
+        t_us=5_000_000,
+        pos_ned_m=pos,
+        vel_ned_m_s=np.array(vel),
+        cos_tilt=1.0,
+        virtual_control=np.array(virtual_control),
+    )
 
 
 def reference(offset: tuple[float, ...] = (0.0, 0.0, 0.0)) -> Reference:
@@ -37,7 +43,13 @@ def problem(
     wind: tuple[float, ...] = (0.0, 0.0, 0.0),
     begin: Start | None = None,
 ) -> Problem:
-    return Problem(begin or start(), reference(offset), np.array(wind), keep_outs, None)
+    return Problem(
+        start=begin or start(),
+        reference=reference(offset),
+        disturbance_ned_m_s2=np.array(wind),
+        keep_outs=keep_outs,
+        guess_ned_m=None,
+    )
 
 
 def plan_to(
@@ -52,7 +64,13 @@ def plan_to(
 
 
 def fixed(place: Array, allowed_m: float = 0.8, steps: int = 40) -> KeepOut:
-    return KeepOut(np.tile(place, (steps + 1, 1)), allowed_m + 0.1, allowed_m, False, 1)
+    return KeepOut(
+        pos_ned_m=np.tile(place, (steps + 1, 1)),
+        radius_m=allowed_m + 0.1,
+        hard_min_distance_m=allowed_m,
+        any_height=False,
+        priority_id=1,
+    )
 
 
 @pytest.mark.parametrize(("axis", "sign"), [(0, 1.0), (0, -1.0), (1, 1.0), (1, -1.0)])
@@ -84,7 +102,9 @@ def test_a_vehicle_at_its_reference_hovers() -> None:
 
 def test_a_tilted_vehicle_needs_more_thrust_to_hover() -> None:
     # (3.11): z'' = g - (f/m) c with c frozen; held at c = 0.9 the equilibrium is g / 0.9
-    begin = Start(0, HERE, np.zeros(3), 0.9, np.array([0.0, 0.0, G / 0.9]))
+    begin = Start(
+        t_us=0, pos_ned_m=HERE, vel_ned_m_s=np.zeros(3), cos_tilt=0.9, virtual_control=np.array([0.0, 0.0, G / 0.9])
+    )
     plan = plan_to((0.0, 0.0, 0.0), begin=begin)
     np.testing.assert_allclose(plan.virtual_control[:, 2], G / 0.9, atol=5e-3)
 
@@ -117,7 +137,9 @@ def test_a_far_reference_is_planned_for_within_the_bounds_of_thrust(down_m: floa
 @pytest.mark.parametrize("ahead", ["planned", "held"])
 def test_the_planned_path_is_the_motion_of_its_own_virtual_controls(ahead: str, cos_tilt: float) -> None:
     wind, vel = np.array([0.3, -0.2, 0.1]), np.array([0.2, 0.1, 0.3])
-    begin = Start(0, HERE, vel, cos_tilt, np.array([0.05, 0.0, 8.0]))
+    begin = Start(
+        t_us=0, pos_ned_m=HERE, vel_ned_m_s=vel, cos_tilt=cos_tilt, virtual_control=np.array([0.05, 0.0, 8.0])
+    )
     plan = plan_to((0.5, -0.3, -0.4), begin=begin, wind=tuple(wind), thrust_ahead=ahead)
     assert (
         np.ptp(plan.virtual_control[:, 2]) > 1.0
@@ -173,7 +195,18 @@ def test_a_solver_that_breaks_down_is_a_status_and_not_an_exception() -> None:
 
 def solution(residual_m: float, solved: bool = True) -> AxesSolution:
     two = np.zeros((40, 2))
-    return AxesSolution(solved, "", 1, two, np.tile(HERE[:2], (40, 1)), two, 0.0, residual_m, 0.0, 0.0)
+    return AxesSolution(
+        solved=solved,
+        status="",
+        iterations=1,
+        u=two,
+        pos_m=np.tile(HERE[:2], (40, 1)),
+        vel_m_s=two,
+        slack_m=0.0,
+        residual_m=residual_m,
+        terminal_gap_m=0.0,
+        solve_us=0.0,
+    )
 
 
 @pytest.mark.parametrize(
@@ -250,12 +283,23 @@ def test_falling_without_thrust_is_planned_and_not_an_exception(ahead: str, term
 
 
 def test_on_its_side_a_vehicle_gets_a_plan_and_not_an_exception() -> None:
-    plan = plan_to((0.0, 0.0, -0.1), begin=Start(0, HERE, np.zeros(3), 0.0, np.array([0.0, 0.0, G])))
+    plan = plan_to(
+        (0.0, 0.0, -0.1),
+        begin=Start(
+            t_us=0, pos_ned_m=HERE, vel_ned_m_s=np.zeros(3), cos_tilt=0.0, virtual_control=np.array([0.0, 0.0, G])
+        ),
+    )
     assert np.isfinite(plan.pos_ned_m).all()
 
 
 def wide(place: Array, radius_m: float, any_height: bool = False) -> KeepOut:
-    return KeepOut(np.tile(place, (41, 1)), radius_m, radius_m - 0.1, any_height, 1)
+    return KeepOut(
+        pos_ned_m=np.tile(place, (41, 1)),
+        radius_m=radius_m,
+        hard_min_distance_m=radius_m - 0.1,
+        any_height=any_height,
+        priority_id=1,
+    )
 
 
 @pytest.mark.parametrize(
@@ -296,7 +340,15 @@ def test_from_rest_peers_beyond_the_gate_are_avoided(kind: Literal["dmpc", "dmpc
     params = ControllerParams(kind=kind, mpc=MpcParams(dt_s=0.05, control_xy=20, u_max=0.75))
     mpc = make_controller(params, VehicleModelParams(), SeparationParams(radius_m=1.6), 1, 2, lambda: 0)
     keep_outs = tuple(
-        KeepOut(path, 1.6, 1.55, False, priority_id) for path, priority_id in zip(peers, (0, 2), strict=True)
+        KeepOut(pos_ned_m=path, radius_m=1.6, hard_min_distance_m=1.55, any_height=False, priority_id=priority_id)
+        for path, priority_id in zip(peers, (0, 2), strict=True)
     )
     at_rest = start(np.array([0.45, -0.13, -2.5]))
-    assert mpc.plan(Problem(at_rest, along, np.zeros(3), keep_outs, None)).status is PlanStatus.OK
+    assert (
+        mpc.plan(
+            Problem(
+                start=at_rest, reference=along, disturbance_ned_m_s2=np.zeros(3), keep_outs=keep_outs, guess_ned_m=None
+            )
+        ).status
+        is PlanStatus.OK
+    )

@@ -20,7 +20,19 @@ def plan_at(t0_us: int, north_m: Array, status: PlanStatus = PlanStatus.OK) -> P
     """Return a plan that moves north at height 2 m."""
     pos = np.column_stack([north_m, np.zeros(len(north_m)), np.full(len(north_m), -2.0)])
     held = np.tile([0.0, 0.0, 9.81], (len(north_m) - 1, 1))
-    return Plan(status, t0_us, DT_US, pos, np.zeros_like(pos), held, NO_TIMES, 0, 0.0, 0.0, 0.0)
+    return Plan(
+        status=status,
+        t0_us=t0_us,
+        dt_us=DT_US,
+        pos_ned_m=pos,
+        vel_ned_m_s=np.zeros_like(pos),
+        virtual_control=held,
+        times=NO_TIMES,
+        iterations=0,
+        slack_m=0.0,
+        residual_m=0.0,
+        terminal_gap_m=0.0,
+    )
 
 
 def moving(t0_us: int = 0, speed_m_s: float = 2.0, begin_m: float = 0.0, status: PlanStatus = PlanStatus.OK) -> Plan:
@@ -29,13 +41,23 @@ def moving(t0_us: int = 0, speed_m_s: float = 2.0, begin_m: float = 0.0, status:
 
 
 def start_at(t_us: int) -> Start:
-    return Start(t_us, np.array([0.0, 0.0, -2.0]), np.zeros(3), 1.0, np.array([0.0, 0.0, 9.81]))
+    return Start(
+        t_us=t_us,
+        pos_ned_m=np.array([0.0, 0.0, -2.0]),
+        vel_ned_m_s=np.zeros(3),
+        cos_tilt=1.0,
+        virtual_control=np.array([0.0, 0.0, 9.81]),
+    )
 
 
 def wall(north_m: float, hard_min_distance_m: float = 0.8) -> KeepOut:
     """Something that stands at height 2 m."""
     return KeepOut(
-        np.tile([north_m, 0.0, -2.0], (STEPS + 1, 1)), hard_min_distance_m + 0.1, hard_min_distance_m, False, 1
+        pos_ned_m=np.tile([north_m, 0.0, -2.0], (STEPS + 1, 1)),
+        radius_m=hard_min_distance_m + 0.1,
+        hard_min_distance_m=hard_min_distance_m,
+        any_height=False,
+        priority_id=1,
     )
 
 

@@ -98,7 +98,15 @@ def level_and(north_m_s2: float, east_m_s2: float) -> Array:
 def state(t_us: int, pos: tuple[float, ...], vel: tuple[float, ...]) -> VehicleState:
     level = np.array([1.0, 0.0, 0.0, 0.0])
     return VehicleState(
-        t_us, np.array(pos), np.array(vel), level, np.zeros(3), True, FlightMode.EXTERNAL, Landed.IN_AIR, False
+        t_us=t_us,
+        pos_ned_m=np.array(pos),
+        vel_ned_m_s=np.array(vel),
+        q_nb=level,
+        rate_frd_rad_s=np.zeros(3),
+        armed=True,
+        mode=FlightMode.EXTERNAL,
+        landed=Landed.IN_AIR,
+        failsafe=False,
     )
 
 

@@ -27,7 +27,17 @@ def make(**params: Any) -> StateFilter:
 
 def sample(t_us: int, pos: Array, vel: Array, q_nb: Array | None = None) -> VehicleState:
     level = np.array([1.0, 0.0, 0.0, 0.0]) if q_nb is None else q_nb
-    return VehicleState(t_us, pos, vel, level, np.zeros(3), True, FlightMode.EXTERNAL, Landed.IN_AIR, False)
+    return VehicleState(
+        t_us=t_us,
+        pos_ned_m=pos,
+        vel_ned_m_s=vel,
+        q_nb=level,
+        rate_frd_rad_s=np.zeros(3),
+        armed=True,
+        mode=FlightMode.EXTERNAL,
+        landed=Landed.IN_AIR,
+        failsafe=False,
+    )
 
 
 class World:

@@ -110,7 +110,7 @@ def test_takeoff_height_is_from_the_ground_it_stands_on() -> None:
     flight.pos = np.array([1.0, 0.0, 0.5])
     flight.until(Phase.TAKEOFF)
     (command,) = flight.step()
-    assert command == Command(Verb.TAKEOFF, 3.5)
+    assert command == Command(verb=Verb.TAKEOFF, value=3.5)
 
 
 def test_takeoff_is_over_when_it_hovers_at_its_height() -> None:

@@ -59,13 +59,13 @@ def bytewise(number: int) -> float:
 @pytest.mark.parametrize(
     ("command", "number", "params"),
     [
-        (Command(Verb.ARM), 400, (1.0,)),
-        (Command(Verb.DISARM), 400, (0.0,)),
-        (Command(Verb.EXTERNAL), 176, (1.0, 6.0, 0.0)),
-        (Command(Verb.HOLD), 176, (1.0, 4.0, 3.0)),
-        (Command(Verb.RATE, 50.0, 331), 511, (331.0, 20_000.0)),
-        (Command(Verb.RATE, 0.0, 331), 511, (331.0, -1.0)),  # off
-        (Command(Verb.MESSAGE, number=49), 512, (49.0,)),
+        (Command(verb=Verb.ARM), 400, (1.0,)),
+        (Command(verb=Verb.DISARM), 400, (0.0,)),
+        (Command(verb=Verb.EXTERNAL), 176, (1.0, 6.0, 0.0)),
+        (Command(verb=Verb.HOLD), 176, (1.0, 4.0, 3.0)),
+        (Command(verb=Verb.RATE, value=50.0, number=331), 511, (331.0, 20_000.0)),
+        (Command(verb=Verb.RATE, value=0.0, number=331), 511, (331.0, -1.0)),  # off
+        (Command(verb=Verb.MESSAGE, number=49), 512, (49.0,)),
     ],
 )
 def test_what_is_asked_of_px4(command: Command, number: int, params: tuple[float, ...]) -> None:
@@ -77,12 +77,12 @@ def test_what_is_asked_of_px4(command: Command, number: int, params: tuple[float
 @pytest.mark.parametrize(
     ("command", "number", "params"),
     [
-        (Command(Verb.EXTERNAL), 176, (1.0, 4.0, 0.0)),  # GUIDED
-        (Command(Verb.HOLD), 176, (1.0, 5.0, 0.0)),  # LOITER
-        (Command(Verb.LAND), 176, (1.0, 9.0)),
-        (Command(Verb.TAKEOFF, 2.5), 22, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2.5)),
-        (Command(Verb.ARM), 400, (1.0,)),
-        (Command(Verb.RATE, 50.0, 32), 511, (32.0, 20_000.0)),
+        (Command(verb=Verb.EXTERNAL), 176, (1.0, 4.0, 0.0)),  # GUIDED
+        (Command(verb=Verb.HOLD), 176, (1.0, 5.0, 0.0)),  # LOITER
+        (Command(verb=Verb.LAND), 176, (1.0, 9.0)),
+        (Command(verb=Verb.TAKEOFF, value=2.5), 22, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2.5)),
+        (Command(verb=Verb.ARM), 400, (1.0,)),
+        (Command(verb=Verb.RATE, value=50.0, number=32), 511, (32.0, 20_000.0)),
     ],
 )
 def test_what_is_asked_of_arducopter(command: Command, number: int, params: tuple[float, ...]) -> None:
@@ -93,7 +93,7 @@ def test_what_is_asked_of_arducopter(command: Command, number: int, params: tupl
 
 @pytest.mark.parametrize("verb", [Verb.TAKEOFF, Verb.LAND])
 def test_takeoff_and_land_happen_where_the_vehicle_is(verb: Verb) -> None:
-    asked = PX4.long_command(Command(verb, 3.0))
+    asked = PX4.long_command(Command(verb=verb, value=3.0))
     assert asked is not None
     assert asked.command == {Verb.TAKEOFF: 22, Verb.LAND: 21}[verb]
     assert len(asked.params) == 7
@@ -102,30 +102,30 @@ def test_takeoff_and_land_happen_where_the_vehicle_is(verb: Verb) -> None:
 
 def test_arming_is_never_forced() -> None:
     for verb, spoken in itertools.product((Verb.ARM, Verb.DISARM), (PX4, ARDUCOPTER)):
-        asked = spoken.long_command(Command(verb))
+        asked = spoken.long_command(Command(verb=verb))
         assert asked is not None
         assert 21196.0 not in asked.params
 
 
 def test_asked_four_times_every_half_second_then_no_answer() -> None:
     bench = Bench()
-    bench.port.request(Command(Verb.ARM))
+    bench.port.request(Command(verb=Verb.ARM))
     assert bench.port.busy
     sent = bench.run(0.5)
     assert [(m.command, m.confirmation, m.target_system, m.target_component) for m in sent] == [(400, 0, 5, 1)]
     assert [m.confirmation for m in bench.run(1.5)] == [1, 2, 3]
     assert bench.port.busy
     assert bench.run(0.5) == []
-    assert bench.port.results() == [CommandResult(Command(Verb.ARM), False, "no answer")]
+    assert bench.port.results() == [CommandResult(Command(verb=Verb.ARM), False, "no answer")]
     assert not bench.port.busy
     assert bench.port.results() == []
 
 
 def test_an_acknowledgement_ends_the_asking() -> None:
     bench = Bench()
-    bench.port.request(Command(Verb.ARM))
+    bench.port.request(Command(verb=Verb.ARM))
     bench.run(0.1)
-    assert bench.hear(ack(400)) == [CommandResult(Command(Verb.ARM), True, "result 0")]
+    assert bench.hear(ack(400)) == [CommandResult(Command(verb=Verb.ARM), True, "result 0")]
     assert bench.run(3.0) == []
     assert not bench.port.busy
 
@@ -133,7 +133,7 @@ def test_an_acknowledgement_ends_the_asking() -> None:
 @pytest.mark.parametrize("result", [1, 2, 3, 4])
 def test_a_refusal_is_a_result_with_its_code_and_is_not_asked_again(result: int) -> None:
     bench = Bench()
-    bench.port.request(Command(Verb.ARM))
+    bench.port.request(Command(verb=Verb.ARM))
     bench.run(0.1)
     (answer,) = bench.hear(ack(400, result))
     assert (answer.ok, answer.text) == (False, f"result {result}")
@@ -142,7 +142,7 @@ def test_a_refusal_is_a_result_with_its_code_and_is_not_asked_again(result: int)
 
 def test_in_progress_is_not_an_answer_yet() -> None:
     bench = Bench()
-    bench.port.request(Command(Verb.LAND))
+    bench.port.request(Command(verb=Verb.LAND))
     bench.run(0.1)
     assert bench.hear(ack(21, 5)) == []
     assert bench.hear(ack(21, 0))[0].ok
@@ -151,7 +151,7 @@ def test_in_progress_is_not_an_answer_yet() -> None:
 def test_the_answer_to_something_else_is_not_ours() -> None:
     bench = Bench()
     assert bench.hear(ack(400)) == []
-    bench.port.request(Command(Verb.EXTERNAL))
+    bench.port.request(Command(verb=Verb.EXTERNAL))
     bench.run(0.1)
     assert bench.hear(ack(400)) == []
     assert bench.hear(param_value("MIS_TAKEOFF_ALT", 3.0)) == []
@@ -160,8 +160,8 @@ def test_the_answer_to_something_else_is_not_ours() -> None:
 
 def test_one_after_the_other() -> None:
     bench = Bench()
-    bench.port.request(Command(Verb.ARM))
-    bench.port.request(Command(Verb.HOLD))
+    bench.port.request(Command(verb=Verb.ARM))
+    bench.port.request(Command(verb=Verb.HOLD))
     assert [m.command for m in bench.run(0.4)] == [400]
     bench.hear(ack(400))
     assert bench.port.busy
@@ -170,7 +170,7 @@ def test_one_after_the_other() -> None:
 
 def test_takeoff_height_goes_into_the_parameter_before_the_command() -> None:
     bench = Bench()
-    bench.port.request(Command(Verb.TAKEOFF, 3.1))
+    bench.port.request(Command(verb=Verb.TAKEOFF, value=3.1))
     (message,) = bench.run(0.2)
     assert (message.get_type(), message.param_id, message.param_type) == ("PARAM_SET", "MIS_TAKEOFF_ALT", 9)
     assert message.param_value == struct.unpack("<f", struct.pack("<f", 3.1))[0]
@@ -181,7 +181,7 @@ def test_takeoff_height_goes_into_the_parameter_before_the_command() -> None:
 
 def test_takeoff_is_not_asked_for_when_its_height_was_not_taken() -> None:
     bench = Bench()
-    bench.port.request(Command(Verb.TAKEOFF, 3.1))
+    bench.port.request(Command(verb=Verb.TAKEOFF, value=3.1))
     bench.run(0.1)
     results = bench.hear(param_value("MIS_TAKEOFF_ALT", 2.5))
     assert [(r.command.verb, r.ok) for r in results] == [(Verb.PARAM_FLOAT, False), (Verb.TAKEOFF, False)]
@@ -190,14 +190,14 @@ def test_takeoff_is_not_asked_for_when_its_height_was_not_taken() -> None:
 
 def test_arducopter_takes_off_with_the_height_in_the_command() -> None:
     bench = Bench(ARDUCOPTER)
-    bench.port.request(Command(Verb.TAKEOFF, 3.0))
+    bench.port.request(Command(verb=Verb.TAKEOFF, value=3.0))
     (message,) = bench.run(0.2)
     assert (message.command, message.param7) == (22, 3.0)
 
 
 def test_nothing_is_asked_in_the_wrong_language() -> None:
     bench = Bench(None)
-    bench.port.request(Command(Verb.EXTERNAL))
+    bench.port.request(Command(verb=Verb.EXTERNAL))
     assert bench.run(5.0) == []
     assert bench.port.busy
     bench.dialect = ARDUCOPTER
@@ -207,7 +207,7 @@ def test_nothing_is_asked_in_the_wrong_language() -> None:
 
 def test_integers_travel_as_floats_to_arducopter_and_are_read_so() -> None:
     bench = Bench(ARDUCOPTER)
-    bench.port.request(Command(Verb.PARAM_INT, number=8, name="GUID_OPTIONS"))
+    bench.port.request(Command(verb=Verb.PARAM_INT, number=8, name="GUID_OPTIONS"))
     (message,) = bench.run(0.1)
     assert (message.param_id, message.param_value) == ("GUID_OPTIONS", 8.0)
     assert bench.hear(param_value("GUID_OPTIONS", 8.0, 6))[0].ok
@@ -218,7 +218,7 @@ def test_integers_travel_as_floats_to_arducopter_and_are_read_so() -> None:
 
 def test_a_parameter_is_read_by_its_name() -> None:
     bench = Bench()
-    bench.port.request(Command(Verb.PARAM_GET, name="MPC_THR_HOVER"))
+    bench.port.request(Command(verb=Verb.PARAM_GET, name="MPC_THR_HOVER"))
     (message,) = bench.run(0.1)
     kind = message.get_type(), message.param_id, message.param_index, message.target_system
     assert kind == ("PARAM_REQUEST_READ", "MPC_THR_HOVER", -1, 5)
@@ -229,7 +229,7 @@ def test_a_parameter_is_read_by_its_name() -> None:
 @pytest.mark.parametrize("number", [4, 0, -1, 2**31 - 1, -(2**31)])
 def test_integer_parameters_travel_bytewise(number: int) -> None:
     bench = Bench()
-    bench.port.request(Command(Verb.PARAM_INT, number=number, name="COM_OBL_RC_ACT"))
+    bench.port.request(Command(verb=Verb.PARAM_INT, number=number, name="COM_OBL_RC_ACT"))
     bench.run(0.02)
     frame = bench.out[-1]
     assert frame[7:10] == (23).to_bytes(3, "little")
@@ -244,21 +244,21 @@ def test_integer_parameters_travel_bytewise(number: int) -> None:
 
 def test_an_integer_that_the_vehicle_did_not_take_is_not_set() -> None:
     bench = Bench()
-    bench.port.request(Command(Verb.PARAM_INT, number=4, name="COM_OBL_RC_ACT"))
+    bench.port.request(Command(verb=Verb.PARAM_INT, number=4, name="COM_OBL_RC_ACT"))
     bench.run(0.1)
     assert not any(r.ok for r in bench.hear(param_value("COM_OBL_RC_ACT", bytewise(0), 6)))
 
 
 def test_a_float_that_the_vehicle_did_not_take_is_not_set() -> None:
     bench = Bench()
-    bench.port.request(Command(Verb.PARAM_FLOAT, value=0.5, name="MPC_LAND_SPEED"))
+    bench.port.request(Command(verb=Verb.PARAM_FLOAT, value=0.5, name="MPC_LAND_SPEED"))
     bench.run(0.1)
     assert not any(r.ok for r in bench.hear(param_value("MPC_LAND_SPEED", 0.7)))
 
 
 def test_a_parameter_that_does_not_exist_is_refused_at_once() -> None:
     bench = Bench()
-    bench.port.request(Command(Verb.PARAM_FLOAT, value=0.5, name="NO_SUCH"))
+    bench.port.request(Command(verb=Verb.PARAM_FLOAT, value=0.5, name="NO_SUCH"))
     bench.run(0.1)
     (answer,) = bench.hear(dialect.MAVLink_param_error_message(5, 191, b"NO_SUCH", -1, 1))
     assert (answer.ok, answer.text) == (False, "parameter error 1")
@@ -266,7 +266,7 @@ def test_a_parameter_that_does_not_exist_is_refused_at_once() -> None:
 
 def test_a_ground_station_beats_once_a_second_whatever_happens() -> None:
     bench = Bench()
-    bench.port.request(Command(Verb.ARM))
+    bench.port.request(Command(verb=Verb.ARM))
     bench.run(10.0)
     beats = [f for f in bench.out if f[7:10] == b"\x00\x00\x00"]
     assert len(beats) == 10

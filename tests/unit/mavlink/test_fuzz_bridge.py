@@ -32,7 +32,9 @@ def flight() -> list[list[bytes]]:
     """What a vehicle says in each 20 ms of a take-off: the valid frames of the dialogue."""
     clock = SimClock()
     vehicle_end, ours = pipe_pair(clock.now_us)
-    world = SitlWorld(SitlParams(1, np.zeros((1, 3)), preset="x500", ekf_ready_s=0.1), [vehicle_end])
+    world = SitlWorld(
+        SitlParams(vehicles=1, spawn_ned_m=np.zeros((1, 3)), preset="x500", ekf_ready_s=0.1), [vehicle_end]
+    )
     codec = Codec(1, 191)
     said: list[list[bytes]] = []
     for tick in range(round(FLIGHT_S * 1e6 / POLL_US)):

@@ -63,16 +63,20 @@ def bench() -> Iterator[Bench]:
 
 def test_answers_are_the_autopilots_own(bench: Bench) -> None:
     mode, rate, nonsense = bench.ask(
-        Command(Verb.EXTERNAL), Command(Verb.RATE, 20.0, 31), Command(Verb.RATE, 5.0, 9999)
+        Command(verb=Verb.EXTERNAL),
+        Command(verb=Verb.RATE, value=20.0, number=31),
+        Command(verb=Verb.RATE, value=5.0, number=9999),
     )
     assert (mode.ok, rate.ok) == (True, True)
-    assert nonsense == CommandResult(Command(Verb.RATE, 5.0, 9999), False, "result 2"), "any answer is MAVSDK's success"
+    assert nonsense == CommandResult(Command(verb=Verb.RATE, value=5.0, number=9999), False, "result 2"), (
+        "any answer is MAVSDK's success"
+    )
     assert bench.pilot.mode is FlightMode.EXTERNAL, "GUIDED, not PX4's OFFBOARD"
 
 
 def test_parameters_are_what_the_autopilot_stores(bench: Bench) -> None:
     set_it, read = bench.ask(
-        Command(Verb.PARAM_INT, number=8, name="GUID_OPTIONS"), Command(Verb.PARAM_GET, name="GUID_OPTIONS")
+        Command(verb=Verb.PARAM_INT, number=8, name="GUID_OPTIONS"), Command(verb=Verb.PARAM_GET, name="GUID_OPTIONS")
     )
     assert (set_it.ok, set_it.text, read.text) == (True, "set", "8")
     assert bench.pilot.params["GUID_OPTIONS"] == 8.0

@@ -288,6 +288,6 @@ def test_the_origin_is_requested_until_it_is_reported() -> None:
 def test_vehicle_setup_requests_one_thing_at_a_time_and_only_on_an_idle_port() -> None:
     vehicle = Vehicle().set_up()
     vehicle.run(0.1)
-    vehicle.port.request(Command(Verb.LAND))
+    vehicle.port.request(Command(verb=Verb.LAND))
     vehicle.run(0.2)
     assert (21, 0.0) in [(command, 0.0) for command, _ in vehicle.asked[-6:]]

@@ -18,8 +18,12 @@ from swarmctl.core.types import Array
 EXACT = QpParams(solver="daqp")
 DT_S = 0.02
 GAIN = -9.81
-LATERAL = Axis(1.5, 0.5, 0.01, -0.2, 0.2, 0.05, 0.0, 9.81, "region")
-VERTICAL = Axis(2.0, 0.05, 0.01, 0.0, 20.0, 5.0, 9.81, 1.0, "region")
+LATERAL = Axis(
+    q_pos=1.5, q_vel=0.5, r=0.01, u_min=-0.2, u_max=0.2, du_max=0.05, u_rest=0.0, gain_m_s2=9.81, terminal="region"
+)
+VERTICAL = Axis(
+    q_pos=2.0, q_vel=0.05, r=0.01, u_min=0.0, u_max=20.0, du_max=5.0, u_rest=9.81, gain_m_s2=1.0, terminal="region"
+)
 WIDE = replace(LATERAL, u_min=-50.0, u_max=50.0, du_max=50.0)  # no bound is ever active
 Weights = tuple[float, float, float, float, float, float]
 CASES: dict[str, Weights] = {  # q_pos, q_vel, r, largest acceleration and increment [m/s2], step [s]
@@ -162,7 +166,15 @@ def test_outside_is_measured_in_metres_of_position(case: Weights) -> None:
 
 
 def mpc(axis: Axis, control: int, prediction: int, qp: QpParams) -> CondensedMpc:
-    return CondensedMpc((axis,), Horizon(control, prediction, DT_S, False), 0, 1.0, Penalties(), qp, lambda: 0)
+    return CondensedMpc(
+        (axis,),
+        Horizon(control=control, prediction=prediction, dt_s=DT_S, euler=False),
+        0,
+        1.0,
+        Penalties(),
+        qp,
+        lambda: 0,
+    )
 
 
 def region_of(axis: Axis) -> TerminalRegion:
@@ -176,7 +188,15 @@ def solve(problem: CondensedMpc, pos: float, vel: float, u: float) -> AxesSoluti
     gain, still = -axis.gain_m_s2, np.zeros((steps, 1))
     drift = np.array([-gain * axis.u_rest])
     return problem.solve(
-        AxesProblem(np.array([pos]), np.array([vel]), np.array([u]), still + gain, drift, still, still)
+        AxesProblem(
+            pos_m=np.array([pos]),
+            vel_m_s=np.array([vel]),
+            u_prev=np.array([u]),
+            gain_m_s2=still + gain,
+            drift_m_s2=drift,
+            ref_pos_m=still,
+            ref_vel_m_s=still,
+        )
     )
 
 
@@ -284,7 +304,17 @@ def test_from_where_a_plan_ends_inside_the_regulator_keeps_the_bounds_of_the_inp
     rest, still, ended_inside = 9.81 + wind_m_s2, np.zeros((2, 1)), 0
     for error in boundary(region, 400, 5) * 0.97:
         u = np.array([np.clip(rest - error[2], 0.0, 20.0)])
-        plan = problem.solve(AxesProblem(error[:1], error[1:2], u, still - 1.0, np.array([rest]), still, still))
+        plan = problem.solve(
+            AxesProblem(
+                pos_m=error[:1],
+                vel_m_s=error[1:2],
+                u_prev=u,
+                gain_m_s2=still - 1.0,
+                drift_m_s2=np.array([rest]),
+                ref_pos_m=still,
+                ref_vel_m_s=still,
+            )
+        )
         if plan.terminal_gap_m > 0.0:
             continue
         ended_inside += 1

@@ -26,7 +26,7 @@ from swarmctl.bus.peers import LEASE_US, LocalHub, agent_name
 from swarmctl.config import load
 from swarmctl.errors import ConfigError, StartError
 
-CELL = Cell("swap", 3, 0.0, 0.0, "exact", 0.0, "default")
+CELL = Cell(scenario="swap", agents=3, delay_ms=0.0, loss=0.0, noise="exact", wind_m_s=0.0, protections="default")
 REST = np.zeros((2, 3))
 
 
@@ -103,7 +103,15 @@ def test_a_static_obstacle_never_appears_at_a_goal(goal_m: float, speed_m_s: flo
 def test_every_scenario_is_a_valid_configuration(scenario: str) -> None:
     agents = max(SCENARIOS[scenario].agents)
     for seed, noise, protections in ((1, "exact", "default"), (2, "external", "off")):
-        cell = Cell(scenario, agents, 50.0, 0.1, noise, 8.0, protections)
+        cell = Cell(
+            scenario=scenario,
+            agents=agents,
+            delay_ms=50.0,
+            loss=0.1,
+            noise=noise,
+            wind_m_s=8.0,
+            protections=protections,
+        )
         layout = layout_of(scenario, seed, agents)
         config = config_of(cell, seed, layout, agents)
         assert config.sitl.start == "air"
@@ -116,7 +124,9 @@ def test_every_scenario_is_a_valid_configuration(scenario: str) -> None:
 
 @pytest.mark.parametrize("protections", PROTECTIONS)
 def test_a_seed_draws_the_same_layout_under_all_conditions(protections: str) -> None:
-    cell = Cell("random", 6, 0.0, 0.0, "exact", 0.0, protections)
+    cell = Cell(
+        scenario="random", agents=6, delay_ms=0.0, loss=0.0, noise="exact", wind_m_s=0.0, protections=protections
+    )
     drawn = [layout_of("random", seed, 6) for seed in (5, 5, 6)]
     assert np.array_equal(drawn[0].starts_ned_m, drawn[1].starts_ned_m)
     assert not np.array_equal(drawn[0].starts_ned_m, drawn[2].starts_ned_m)
@@ -125,7 +135,15 @@ def test_a_seed_draws_the_same_layout_under_all_conditions(protections: str) -> 
 
 def test_radii_grow_with_the_noise() -> None:
     layout = layout_of("swap", 1, 3)
-    radii = [config_of(Cell("swap", 3, 0, 0, n, 0, "default"), 1, layout, 3).separation.radius_m for n in NOISES]
+    radii = [
+        config_of(
+            Cell(scenario="swap", agents=3, delay_ms=0, loss=0, noise=n, wind_m_s=0, protections="default"),
+            1,
+            layout,
+            3,
+        ).separation.radius_m
+        for n in NOISES
+    ]
     assert radii == pytest.approx([0.9, 0.9, 1.19])
 
 

@@ -34,7 +34,7 @@ class Client:
         pairs = [pipe_pair(self.clock.now_us) for _ in range(vehicles)]
         self.links = [client_end for _, client_end in pairs]
         spawns = params.pop("spawn_ned_m", line_of_spawns(vehicles))
-        sitl_params = SitlParams(vehicles, spawns, ekf_ready_s=ekf_ready_s, **params)
+        sitl_params = SitlParams(vehicles=vehicles, spawn_ned_m=spawns, ekf_ready_s=ekf_ready_s, **params)
         self.world = SitlWorld(sitl_params, [vehicle_end for vehicle_end, _ in pairs])
         self.codec = Codec(1, 191)
         self.run(run_s)
@@ -363,7 +363,7 @@ def flight(seed: int, reverse: bool = False) -> bytes:
     """Bytes of a short flight of two vehicles, and of everything they sent."""
     clock = SimClock()
     pairs = [pipe_pair(clock.now_us) for _ in range(2)]
-    world = SitlWorld(SitlParams(2, line_of_spawns(2), seed=seed), [p[0] for p in pairs])
+    world = SitlWorld(SitlParams(vehicles=2, spawn_ned_m=line_of_spawns(2), seed=seed), [p[0] for p in pairs])
     codec = Codec(1, 191)
     out = b""
     for k in range(600):

@@ -25,7 +25,10 @@ def still(estimator: str, seed: int = 1, vehicles: int = VEHICLES, seconds: floa
     clock = SimClock()
     ends = [pipe_pair(clock.now_us)[0] for _ in range(vehicles)]
     world = SitlWorld(
-        SitlParams(vehicles, line_of_spawns(vehicles), estimator=estimator, seed=seed, physics_hz=HZ), ends
+        SitlParams(
+            vehicles=vehicles, spawn_ned_m=line_of_spawns(vehicles), estimator=estimator, seed=seed, physics_hz=HZ
+        ),
+        ends,
     )
     kept = []
     for k in range(round(seconds * HZ)):
@@ -114,7 +117,7 @@ def test_negative_control_exact_is_the_truth() -> None:
 
 def test_samples_are_as_old_as_the_model_says() -> None:
     clock = SimClock()
-    params = SitlParams(8, line_of_spawns(8), estimator="gps", start="air")
+    params = SitlParams(vehicles=8, spawn_ned_m=line_of_spawns(8), estimator="gps", start="air")
     world = SitlWorld(params, [pipe_pair(clock.now_us)[0] for _ in range(8)])
     world.plant.held[:] = False
     world.plant.state[7] = 1000.0  # m/s north: 1 mm of error is 1 us of age
@@ -163,5 +166,5 @@ def test_a_loitering_vehicle_wanders_as_its_estimate_does() -> None:
 
 def test_an_unknown_model_is_refused() -> None:
     with pytest.raises(ConfigError, match="estimator = 'perfect': allowed: exact, gps, external"):
-        SitlParams(1, line_of_spawns(1), estimator="perfect")
+        SitlParams(vehicles=1, spawn_ned_m=line_of_spawns(1), estimator="perfect")
     assert set(ESTIMATORS) == {"exact", "gps", "external"}

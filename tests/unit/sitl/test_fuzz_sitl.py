@@ -35,7 +35,9 @@ class Vehicle:
     def __init__(self) -> None:
         self.clock = SimClock()
         vehicle_end, self.link = pipe_pair(self.clock.now_us)
-        self.world = SitlWorld(SitlParams(1, np.zeros((1, 3)), preset="x500", ekf_ready_s=0.1, seed=5), [vehicle_end])
+        self.world = SitlWorld(
+            SitlParams(vehicles=1, spawn_ned_m=np.zeros((1, 3)), preset="x500", ekf_ready_s=0.1, seed=5), [vehicle_end]
+        )
         self.codec = Codec(1, 191)
         self.stream_thrust_01: float | None = None
         self.heard: list[bytes] = []

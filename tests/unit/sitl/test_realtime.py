@@ -23,7 +23,7 @@ class SteppedWorld:
     """Stands in for a world: counts steps, stalls where told, and stops the loop."""
 
     def __init__(self, stop: realtime.StopRequest, steps: int, stall_at: int = -1, stall_s: float = 0.0) -> None:
-        self.params = SitlParams(1, line_of_spawns(1))
+        self.params = SitlParams(vehicles=1, spawn_ned_m=line_of_spawns(1))
         self.times_us: list[int] = []
         self._stop, self._steps, self._stall_at, self._stall_s = stop, steps, stall_at, stall_s
 
@@ -67,7 +67,7 @@ def test_a_long_stall_is_given_up_and_counted() -> None:
 def test_truth_file_is_an_array(tmp_path: Path) -> None:
     clock = SimClock()
     vehicle_end, _ = pipe_pair(clock.now_us)
-    world = SitlWorld(SitlParams(1, line_of_spawns(1)), [vehicle_end])
+    world = SitlWorld(SitlParams(vehicles=1, spawn_ned_m=line_of_spawns(1)), [vehicle_end])
     truth = realtime.TruthFile(tmp_path / "truth.bin")
     for k in range(500):
         clock.advance(4000)
@@ -91,7 +91,7 @@ def test_a_full_disk_does_not_stop_the_flight() -> None:
         pytest.skip("no /dev/full here")
     clock = SimClock()
     vehicle_end, _ = pipe_pair(clock.now_us)
-    world = SitlWorld(SitlParams(1, line_of_spawns(1)), [vehicle_end])
+    world = SitlWorld(SitlParams(vehicles=1, spawn_ned_m=line_of_spawns(1)), [vehicle_end])
     truth = realtime.TruthFile(Path("/dev/full"))
     for _ in range(20):
         clock.advance(1_000_000)

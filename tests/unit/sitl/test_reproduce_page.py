@@ -79,10 +79,21 @@ def all_traces() -> dict[str, Sequence[Trace]]:
 
 
 ROWS = [
-    Row("slow PID, MSE x", 0.0020, 0.0022, 0.0025, "plant", "m2"),
-    Row("fast MPC, MSE y", 0.0, 6e-6, None, "plant", "m2", "printed as 0.0000"),
-    Row("circle, index at 0.90 m", 2.19, 2.38, 2.19, "full", "m", "R < 1 & so on", lower_bound=1.559),
-    Row("wall time", None, float("nan"), 600.0, "plant", "s"),
+    Row(name="slow PID, MSE x", published=0.0020, ours=0.0022, limit=0.0025, path="plant", unit="m2"),
+    Row(
+        name="fast MPC, MSE y", published=0.0, ours=6e-6, limit=None, path="plant", unit="m2", note="printed as 0.0000"
+    ),
+    Row(
+        name="circle, index at 0.90 m",
+        published=2.19,
+        ours=2.38,
+        limit=2.19,
+        path="full",
+        unit="m",
+        note="R < 1 & so on",
+        lower_bound=1.559,
+    ),
+    Row(name="wall time", published=None, ours=float("nan"), limit=600.0, path="plant", unit="s"),
 ]
 
 
@@ -120,7 +131,11 @@ def parsed(text: str) -> Strict:
 def page(tmp_path_factory: pytest.TempPathFactory) -> str:
     """A page of everything."""
     directory = tmp_path_factory.mktemp("reproduce")
-    index = [IndexPoint(0.9, 2.38, 2.19), IndexPoint(0.6, 1.95), IndexPoint(0.9, 2.1, 2.19, "improved")]
+    index = [
+        IndexPoint(radius_m=0.9, ours_m=2.38, published_m=2.19),
+        IndexPoint(radius_m=0.6, ours_m=1.95),
+        IndexPoint(radius_m=0.9, ours_m=2.1, published_m=2.19, series="improved"),
+    ]
     path = write_page(directory, ROWS, all_traces(), Extra({"circle": 0.9, "obstacle": 0.9}, index, ["a < b"]))
     assert path == directory / "report.html"
     assert path.stat().st_size < 3e6
@@ -275,7 +290,13 @@ def test_every_constraint_radius_is_a_limit() -> None:
 
 
 def test_index_points_without_a_published_value() -> None:
-    drawing = index_chart([IndexPoint(0.9, 2.38, 2.19), IndexPoint(0.6, 1.95), IndexPoint(0.3, None)])
+    drawing = index_chart(
+        [
+            IndexPoint(radius_m=0.9, ours_m=2.38, published_m=2.19),
+            IndexPoint(radius_m=0.6, ours_m=1.95),
+            IndexPoint(radius_m=0.3, ours_m=None),
+        ]
+    )
     assert drawing.count('r="3.5"') == 3
 
 
@@ -309,10 +330,10 @@ def test_rows_are_grouped_by_what_their_names_speak_of(name: str, flight: Flight
 
 
 def test_ratio() -> None:
-    assert ratio(Row("a", 2.0, 3.0, None, "plant", "m")) == 1.5
-    assert ratio(Row("a", None, 3.0, None, "plant", "m")) is None
-    assert ratio(Row("a", 0.0, 3.0, None, "plant", "m")) is None
-    assert ratio(Row("a", 2.0, float("nan"), None, "plant", "m")) is None
+    assert ratio(Row(name="a", published=2.0, ours=3.0, limit=None, path="plant", unit="m")) == 1.5
+    assert ratio(Row(name="a", published=None, ours=3.0, limit=None, path="plant", unit="m")) is None
+    assert ratio(Row(name="a", published=0.0, ours=3.0, limit=None, path="plant", unit="m")) is None
+    assert ratio(Row(name="a", published=2.0, ours=float("nan"), limit=None, path="plant", unit="m")) is None
 
 
 def test_json_has_finite_numbers_only(tmp_path: Path) -> None:

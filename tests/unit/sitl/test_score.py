@@ -22,19 +22,19 @@ def trace_of(off_ned_m: Array, obstacles: Sequence[Sphere] = ()) -> Trace:
     nothing = np.zeros((ticks, agents, 3))
     reference = nothing + REFERENCE_NED_M
     return Trace(
-        "by hand",
-        "plant",
-        np.asarray(np.arange(ticks) * DT_S, np.float64),
-        reference + off_ned_m,
-        nothing,
-        nothing,
-        reference,
-        nothing,
-        np.zeros((ticks, agents)),
-        nothing,
-        0,
-        0,
-        tuple(obstacles),
+        name="by hand",
+        path="plant",
+        t_s=np.asarray(np.arange(ticks) * DT_S, np.float64),
+        pos_ned_m=reference + off_ned_m,
+        vel_ned_m_s=nothing,
+        euler_rad=nothing,
+        ref_pos_ned_m=reference,
+        euler_ref_rad=nothing,
+        thrust_n=np.zeros((ticks, agents)),
+        torque_n_m=nothing,
+        failed=0,
+        terminal_missed=0,
+        obstacles=tuple(obstacles),
     )
 
 
@@ -139,4 +139,4 @@ def test_without_obstacles_clearance_is_infinite() -> None:
     ("ours", "limit", "met"), [(1.0, 1.0, True), (1.001, 1.0, False), (5.0, None, None), (math.nan, 1.0, False)]
 )
 def test_a_limit_is_kept_up_to_equality_and_never_by_no_number(ours: float, limit: float | None, met: bool) -> None:
-    assert Row("row", None, ours, limit, "plant", "m").met is met
+    assert Row(name="row", published=None, ours=ours, limit=limit, path="plant", unit="m").met is met

@@ -106,7 +106,21 @@ def fake(job: Job, apart_m: float = 1.0, off_m: float = 1.0) -> Trace:
     spheres = (Sphere((0.0, 0.0, 5.0), 1.0, 1.75),) if job.flight == "obstacle" else ()
     thrust = np.zeros((600, agents))
     ref = nothing + np.array([1.0, 0.0, 0.0]) * (apart_m * np.arange(agents))[None, :, None]
-    return Trace(job.name, job.path, t_s, pos, nothing, nothing, ref, nothing, thrust, nothing, 0, 0, spheres)
+    return Trace(
+        name=job.name,
+        path=job.path,
+        t_s=t_s,
+        pos_ned_m=pos,
+        vel_ned_m_s=nothing,
+        euler_rad=nothing,
+        ref_pos_ned_m=ref,
+        euler_ref_rad=nothing,
+        thrust_n=thrust,
+        torque_n_m=nothing,
+        failed=0,
+        terminal_missed=0,
+        obstacles=spheres,
+    )
 
 
 def rows_of(jobs: Sequence[Job]) -> dict[str, Row]:

@@ -22,7 +22,7 @@ def point(drawing: str, color: str) -> tuple[float, float]:
 
 
 def to(*end_ned_m: float, color: str, label: str = "path") -> SpaceLine:
-    return SpaceLine(np.array([[0.0, 0.0, 0.0], end_ned_m]), color, label)
+    return SpaceLine(pos_ned_m=np.array([[0.0, 0.0, 0.0], end_ned_m]), color=color, label=label)
 
 
 def test_space_view_keeps_up_up_north_left_and_east_right() -> None:
@@ -50,7 +50,7 @@ def test_a_ball_is_drawn_round_and_at_its_place() -> None:
 
 
 def test_only_the_near_side_is_drawn_over_a_ball() -> None:
-    through = SpaceLine(np.column_stack([np.linspace(-4, 4, 81), np.zeros(81), np.zeros(81)]), "#p")
+    through = SpaceLine(pos_ned_m=np.column_stack([np.linspace(-4, 4, 81), np.zeros(81), np.zeros(81)]), color="#p")
     drawing = space_view("through", [through], [Ball((0.0, 0.0, 0.0), 1.0, "obstacle")])
     before, after = drawing.split('<circle class="obstacle"')
     (all_of_it,) = re.findall(r'd="([^"]*)" stroke="#p"', before)
@@ -61,14 +61,14 @@ def test_only_the_near_side_is_drawn_over_a_ball() -> None:
 
 def test_a_tall_path_states_its_scale_of_heights() -> None:
     t = np.linspace(0, 37.7, 400)
-    spiral = SpaceLine(np.column_stack([0.5 * np.cos(t), 0.5 * np.sin(t), -1 - t]), "#s")
+    spiral = SpaceLine(pos_ned_m=np.column_stack([0.5 * np.cos(t), 0.5 * np.sin(t), -1 - t]), color="#s")
     assert re.search(r"z down \[m\], scale x 0\.0\d+<", space_view("spiral", [spiral]))
     assert "z down [m]<" in space_view("ball", [spiral], [Ball((0.0, 0.0, -10.0), 1.0, "obstacle")])
 
 
 @pytest.mark.parametrize("rows", [0, 1])
 def test_space_view_of_nothing(rows: int) -> None:
-    drawing = space_view("nothing", [SpaceLine(np.zeros((rows, 3)), "#z", "nothing")])
+    drawing = space_view("nothing", [SpaceLine(pos_ned_m=np.zeros((rows, 3)), color="#z", label="nothing")])
     assert "nan" not in drawing
 
 
@@ -76,14 +76,14 @@ def test_gaps_break_a_path_in_space() -> None:
     pos_ned_m = np.zeros((9, 3))
     pos_ned_m[:, 0] = np.arange(9)
     pos_ned_m[4] = np.nan
-    drawing = space_view("gap", [SpaceLine(pos_ned_m, "#g")])
+    drawing = space_view("gap", [SpaceLine(pos_ned_m=pos_ned_m, color="#g")])
     (path,) = re.findall(r'd="([^"]*)" stroke="#g"', drawing)
     assert path.count("M") == 2
     assert "nan" not in drawing
 
 
 def test_a_window_is_cut_where_it_leaves_the_chart() -> None:
-    line = Line(np.array([0.0, 10.0]), np.array([0.0, 10.0]), "#l")
+    line = Line(x=np.array([0.0, 10.0]), y=np.array([0.0, 10.0]), color="#l")
     drawing = time_chart("window", [line], (0.0, 10.0), windows=[Window(4.0, 6.0, 4.0, 99.0, "obstacle")])
     found = re.search(r'<rect class="obstacle" x="([\d.]+)" y="([\d.]+)" width="([\d.]+)" height="([\d.]+)"/>', drawing)
     assert found is not None
@@ -96,5 +96,5 @@ def test_a_window_is_cut_where_it_leaves_the_chart() -> None:
 
 
 def test_marks_are_on_the_known_points() -> None:
-    line = Line(np.array([0.3, 0.6, 0.9]), np.array([1.0, np.nan, 2.0]), "#m", marks=True)
+    line = Line(x=np.array([0.3, 0.6, 0.9]), y=np.array([1.0, np.nan, 2.0]), color="#m", marks=True)
     assert time_chart("marks", [line], (0.0, 1.0)).count('r="3.5"') == 2

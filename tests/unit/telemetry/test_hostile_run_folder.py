@@ -30,7 +30,7 @@ def folder(tmp_path: Path) -> Path:
     directory.mkdir()
     write_run(directory, 3, 6.0)
     (directory / "config.toml").write_text(dump(Config()))
-    finish_run(directory, RULES, Outcome("completed"))
+    finish_run(directory, RULES, Outcome(outcome="completed"))
     return directory
 
 

@@ -49,7 +49,7 @@ APART = {0: ticks(20, (1.0, 0.0, 0.0)), 1: ticks(20, (0.0, 0.0, 2.0))}
 
 
 def test_summed_mean_tracking_error_is_the_sum_of_mean_distances() -> None:
-    tracking = judge(run(APART), Rules(2, 0.5), "completed")["tracking"]
+    tracking = judge(run(APART), Rules(agents=2, required_separation_m=0.5), "completed")["tracking"]
     assert tracking["index_m"] == pytest.approx(1.0 + 2.0)
     assert tracking["agents"][0]["mse_m2"] == pytest.approx([1.0, 0.0, 0.0])
     assert tracking["agents"][1]["mean_distance_m"] == pytest.approx(2.0)
@@ -60,7 +60,9 @@ def test_summed_mean_tracking_error_is_the_sum_of_mean_distances() -> None:
 def test_mean_and_rmse_of_a_changing_error() -> None:
     pos = np.zeros((101, 3))
     pos[:, 1] = np.where(np.arange(101) % 2 == 0, 3.0, 1.0)  # 51 times 3 m, 50 times 1 m
-    row = judge(run({0: ticks(2, pos)}), Rules(1, 0.5), "completed")["tracking"]["agents"][0]
+    row = judge(run({0: ticks(2, pos)}), Rules(agents=1, required_separation_m=0.5), "completed")["tracking"]["agents"][
+        0
+    ]
     assert row["mean_distance_m"] == pytest.approx((51 * 3 + 50) / 101)
     assert row["mse_m2"][1] == pytest.approx((51 * 9 + 50) / 101)
     assert row["rmse_m"] == pytest.approx(math.sqrt((51 * 9 + 50) / 101))
@@ -70,20 +72,29 @@ def test_summed_mean_tracking_error_counts_only_common_time() -> None:
     late = ticks(20, (2.0, 0.0, 0.0))
     late["pos_ned_m"][late["mission_t_s"] > 10.0] = (100.0, 0.0, 0.0)
     both = {0: late, 1: ticks(10, (0.0, 1.0, 0.0))}
-    assert judge(run(both), Rules(2, 0.5), "failed")["tracking"]["index_m"] == pytest.approx(3.0)
+    assert judge(run(both), Rules(agents=2, required_separation_m=0.5), "failed")["tracking"][
+        "index_m"
+    ] == pytest.approx(3.0)
 
 
 def test_summed_mean_tracking_error_is_unknown_when_an_agent_never_tracked() -> None:
-    assert judge(run({0: APART[0]}), Rules(2, 0.5), "failed")["tracking"]["index_m"] is None
+    assert (
+        judge(run({0: APART[0]}), Rules(agents=2, required_separation_m=0.5), "failed")["tracking"]["index_m"] is None
+    )
 
 
 def test_steady_figures_leave_out_the_first_ten_seconds() -> None:
     rows = ticks(20, (5.0, 0.0, 0.0))
     rows["pos_ned_m"][rows["mission_t_s"] >= 10.0] = (0.1, 0.0, 0.0)
-    tracking = judge(run({0: rows}), Rules(1, 0.5), "completed")["tracking"]
+    tracking = judge(run({0: rows}), Rules(agents=1, required_separation_m=0.5), "completed")["tracking"]
     assert tracking["agents"][0]["steady_rmse_m"] == pytest.approx(0.1)
     assert tracking["index_after_10s_m"] == pytest.approx(0.1)
-    assert judge(run({0: ticks(5, (5.0, 0, 0))}), Rules(1, 0.5), "completed")["tracking"]["index_after_10s_m"] is None
+    assert (
+        judge(run({0: ticks(5, (5.0, 0, 0))}), Rules(agents=1, required_separation_m=0.5), "completed")["tracking"][
+            "index_after_10s_m"
+        ]
+        is None
+    )
 
 
 def test_truth_wins_over_reports_and_is_interpolated() -> None:
@@ -91,7 +102,9 @@ def test_truth_wins_over_reports_and_is_interpolated() -> None:
     moving = np.column_stack([t_s, np.full_like(t_s, 0.25), 0 * t_s])  # 1 m/s north, 0.25 m east of the reference
     rows = ticks(10, (9.0, 9.0, 9.0))
     rows["ref_pos_ned_m"][:, 0] = rows["mission_t_s"]
-    row = judge(run({0: rows}, truth(0, t_s, moving)), Rules(1, 0.5), "completed")["tracking"]["agents"][0]
+    row = judge(run({0: rows}, truth(0, t_s, moving)), Rules(agents=1, required_separation_m=0.5), "completed")[
+        "tracking"
+    ]["agents"][0]
     assert row["mse_m2"] == pytest.approx([0.0, 0.0625, 0.0], abs=1e-9)
 
 
@@ -104,7 +117,7 @@ def closing(least_m: float) -> RunData:
 
 
 def test_separation_names_value_limit_pair_and_time() -> None:
-    summary = judge(closing(0.61), Rules(2, 0.85), "completed")
+    summary = judge(closing(0.61), Rules(agents=2, required_separation_m=0.85), "completed")
     assert summary["separation"]["min_m"] == pytest.approx(0.61)
     assert summary["separation"]["min_pair"] == [0, 1]
     assert summary["separation"]["min_at_s"] == pytest.approx(5.0)
@@ -115,16 +128,18 @@ def test_separation_names_value_limit_pair_and_time() -> None:
 def test_separation_with_scaled_heights_is_reported_beside_the_true_one() -> None:
     t_s = np.arange(0, 5.001, 0.01)
     low, high = truth(0, t_s, (0.0, 0.0, 0.0)), truth(1, t_s, (0.3, 0.0, -1.6))
-    found = judge(run(APART, low, high), Rules(2, 0.85, downwash=2.0), "completed")["separation"]
+    found = judge(run(APART, low, high), Rules(agents=2, required_separation_m=0.85, downwash=2.0), "completed")[
+        "separation"
+    ]
     assert found["min_m"] == pytest.approx(math.hypot(0.3, 1.6))
     assert found["scaled_min_m"] == pytest.approx(math.hypot(0.3, 0.8))
-    same = judge(run(APART, low, high), Rules(2, 0.85), "completed")["separation"]
+    same = judge(run(APART, low, high), Rules(agents=2, required_separation_m=0.85), "completed")["separation"]
     assert same["scaled_min_m"] == pytest.approx(same["min_m"])
 
 
 @pytest.mark.parametrize(("least_m", "limit_m", "outcome"), [(0.86, 0.85, "completed"), (0.84, 0.85, "failed")])
 def test_separation_decides_the_outcome(least_m: float, limit_m: float, outcome: str) -> None:
-    assert judge(closing(least_m), Rules(2, limit_m), "completed")["outcome"] == outcome
+    assert judge(closing(least_m), Rules(agents=2, required_separation_m=limit_m), "completed")["outcome"] == outcome
 
 
 def test_separation_counts_from_first_arming_to_the_very_end() -> None:
@@ -132,9 +147,11 @@ def test_separation_counts_from_first_arming_to_the_very_end() -> None:
     near = np.column_stack([np.where(t_s < 1.0, 0.1, 1.0), 0 * t_s, 0 * t_s])
     armed = (t_s >= 0.999).astype(int)
     touching_before = run({}, truth(0, t_s, (0, 0, 0), armed), truth(1, t_s, near, armed))
-    assert judge(touching_before, Rules(2, 0.5), "completed")["violations"] == []
+    assert judge(touching_before, Rules(agents=2, required_separation_m=0.5), "completed")["violations"] == []
     disarmed_after = run({}, truth(0, t_s, (0, 0, 0), t_s < 0.05), truth(1, t_s, near[::-1], 0))
-    assert judge(disarmed_after, Rules(2, 0.5), "completed")["separation"]["min_m"] == pytest.approx(0.1)
+    assert judge(disarmed_after, Rules(agents=2, required_separation_m=0.5), "completed")["separation"][
+        "min_m"
+    ] == pytest.approx(0.1)
 
 
 def test_reports_of_two_hosts_are_joined_by_utc() -> None:
@@ -142,12 +159,14 @@ def test_reports_of_two_hosts_are_joined_by_utc() -> None:
     second["t_us"] += 77_000_000  # another host's monotonic clock
     second["utc_us"] += 7_000  # and ticks between the first one's
     second["pos_ned_m"][:, 0] = 1.0 + 0.01 * second["mission_t_s"]
-    separation = judge(run({0: first, 1: second}), Rules(2, 0.5), "completed")["separation"]
+    separation = judge(run({0: first, 1: second}), Rules(agents=2, required_separation_m=0.5), "completed")[
+        "separation"
+    ]
     assert separation["min_m"] == pytest.approx(1.0, abs=1e-3)
 
 
 def test_positions_that_were_never_recorded_are_no_pass() -> None:
-    summary = judge(run({0: APART[0]}), Rules(2, 0.85), "completed")
+    summary = judge(run({0: APART[0]}), Rules(agents=2, required_separation_m=0.85), "completed")
     assert summary["separation"]["min_m"] is None
     assert summary["outcome"] == "failed"
     assert "can't be judged" in summary["violations"][0]
@@ -155,7 +174,12 @@ def test_positions_that_were_never_recorded_are_no_pass() -> None:
 
 @pytest.mark.parametrize(("margin_m", "violated"), [(0.05, True), (0.3, False)])
 def test_obstacle_clearance_allows_its_margin_only(margin_m: float, violated: bool) -> None:
-    rules = Rules(1, 0.5, (ObstacleRule((1.5, 0.0, 0.0), 1.75),), margin_m)
+    rules = Rules(
+        agents=1,
+        required_separation_m=0.5,
+        obstacles=(ObstacleRule((1.5, 0.0, 0.0), 1.75),),
+        obstacle_margin_m=margin_m,
+    )
     summary = judge(run({0: ticks(5, (0.0, 0.0, 0.0))}), rules, "completed")
     assert summary["obstacles"] == {"min_clearance_m": 1.5, "required_m": 1.75 - margin_m}
     assert (summary["outcome"] == "failed") == violated
@@ -164,14 +188,16 @@ def test_obstacle_clearance_allows_its_margin_only(margin_m: float, violated: bo
 
 @pytest.mark.parametrize(("column", "clearance_m"), [(True, 1.5), (False, 2.5)])
 def test_height_does_not_count_beside_a_column(column: bool, clearance_m: float) -> None:
-    rules = Rules(1, 0.5, (ObstacleRule((1.5, 0.0, 2.0), 1.75, column=column),))
+    rules = Rules(agents=1, required_separation_m=0.5, obstacles=(ObstacleRule((1.5, 0.0, 2.0), 1.75, column=column),))
     summary = judge(run({0: ticks(5, (0.0, 0.0, 0.0))}), rules, "completed")
     assert summary["obstacles"]["min_clearance_m"] == pytest.approx(clearance_m)
     assert (summary["outcome"] == "failed") == column
 
 
 def test_moving_obstacle_is_met_where_it_is_at_the_time() -> None:
-    rules = Rules(1, 0.5, (ObstacleRule((10.0, 0.0, 0.0), 1.0, (-1.0, 0.0, 0.0)),))
+    rules = Rules(
+        agents=1, required_separation_m=0.5, obstacles=(ObstacleRule((10.0, 0.0, 0.0), 1.0, (-1.0, 0.0, 0.0)),)
+    )
     assert judge(run({0: ticks(5, (0, 0, 0))}), rules, "completed")["obstacles"]["min_clearance_m"] == pytest.approx(
         5.0
     )
@@ -182,9 +208,18 @@ def test_obstacle_set_in_flight_counts_from_then_on() -> None:
     rows = ticks(10, (0.0, 0.0, 0.0))
     rows["pos_ned_m"][rows["mission_t_s"] >= 4.0] = (50.0, 0.0, 0.0)
     since_us = UTC0_US + START_US + 5_000_000
-    rules = Rules(1, 0.5, (ObstacleRule((0.0, 0.0, 0.0), 1.0, (0.0, 0.0, 0.0), since_us),))
+    rules = Rules(
+        agents=1, required_separation_m=0.5, obstacles=(ObstacleRule((0.0, 0.0, 0.0), 1.0, (0.0, 0.0, 0.0), since_us),)
+    )
     assert judge(run({0: rows}), rules, "completed")["outcome"] == "completed"
-    assert judge(run({0: rows}), Rules(1, 0.5, (ObstacleRule((0, 0, 0), 1.0),)), "completed")["outcome"] == "failed"
+    assert (
+        judge(
+            run({0: rows}),
+            Rules(agents=1, required_separation_m=0.5, obstacles=(ObstacleRule((0, 0, 0), 1.0),)),
+            "completed",
+        )["outcome"]
+        == "failed"
+    )
 
 
 def test_timing_counts_flight_ticks_and_deadline_misses() -> None:
@@ -194,19 +229,29 @@ def test_timing_counts_flight_ticks_and_deadline_misses() -> None:
     rows["tick_ms"] = 4.0
     rows["tick_ms"][60] = 9.0
     rows["solve_ms"][70], rows["iterations"][70] = 99.0, 0  # nothing was solved in this tick
-    summary = judge(run({0: rows}), Rules(1, 0.5, deadline_misses_01=0.2), "completed", speed_factor=8.0)
+    summary = judge(
+        run({0: rows}),
+        Rules(agents=1, required_separation_m=0.5, deadline_misses_01=0.2),
+        "completed",
+        speed_factor=8.0,
+    )
     timing = summary["timing"]
     assert (timing["ticks"], timing["late_ticks"], timing["speed_factor"]) == (91, 30, 8.0)
     assert timing["tick_ms"] == {"p50": 4.0, "p99": pytest.approx(4.5), "max": 9.0}
     assert timing["solve_ms"]["max"] == 2.0
     assert summary["violations"] == ["deadline misses 33.0% above 20.0% (30 of 91 due)"]
-    assert judge(run({0: rows}), Rules(1, 0.5, deadline_misses_01=0.4), "completed")["violations"] == []
+    assert (
+        judge(run({0: rows}), Rules(agents=1, required_separation_m=0.5, deadline_misses_01=0.4), "completed")[
+            "violations"
+        ]
+        == []
+    )
 
 
 def test_ticks_that_were_skipped_were_due() -> None:
     rows = ticks(2, (0.0, 0.0, 0.0))  # 101 ticks
     rows["deadline_misses"] = 3 * np.arange(101)  # each of them late, and two skipped before it
-    summary = judge(run({0: rows}), Rules(1, 0.5, deadline_misses_01=0.2), "completed")
+    summary = judge(run({0: rows}), Rules(agents=1, required_separation_m=0.5, deadline_misses_01=0.2), "completed")
     assert (summary["timing"]["ticks"], summary["timing"]["due_ticks"]) == (101, 301)
     assert summary["violations"] == ["deadline misses 99.7% above 20.0% (300 of 301 due)"]
 
@@ -223,21 +268,21 @@ def vanishing(heard: bool) -> RunData:
 
 
 def test_a_vanished_vehicle_is_named_and_not_judged_by_its_last_position() -> None:
-    summary = judge(vanishing(heard=False), Rules(2, 0.85), "failed")
+    summary = judge(vanishing(heard=False), Rules(agents=2, required_separation_m=0.85), "failed")
     assert summary["separation"]["min_m"] == pytest.approx(5.4)  # at 5 s, the last that is known
     assert summary["violations"] == [
         "agent 0 did not know where its armed vehicle was for 14.5 s, from 5.5 s on: its separation can't be judged"
     ]
-    assert judge(vanishing(heard=True), Rules(2, 0.85), "failed")["separation"]["min_m"] == pytest.approx(
-        3.83, abs=0.02
-    )
+    assert judge(vanishing(heard=True), Rules(agents=2, required_separation_m=0.85), "failed")["separation"][
+        "min_m"
+    ] == pytest.approx(3.83, abs=0.02)
 
 
 def test_a_reported_state_counts_at_its_own_time() -> None:
     delayed, still = ticks(10, (0.0, 0.0, 0.0)), ticks(10, (10.0, 0.0, 0.0))
     delayed["state_age_ms"] = 200.0
     delayed["pos_ned_m"][:, 0] = delayed["mission_t_s"] - 0.2  # 1 m/s north, reported 200 ms later
-    pair = judge(run({0: delayed, 1: still}), Rules(2, 0.1), "failed")["separation"]
+    pair = judge(run({0: delayed, 1: still}), Rules(agents=2, required_separation_m=0.1), "failed")["separation"]
     assert pair["min_m"] == pytest.approx(0.2, abs=0.03)
     assert pair["min_at_s"] == pytest.approx(9.8, abs=0.03)
 
@@ -245,7 +290,9 @@ def test_a_reported_state_counts_at_its_own_time() -> None:
 def test_clocks_of_different_years_have_no_common_instants() -> None:
     other = ticks(10, (5.0, 0.0, 0.0))
     other["utc_us"] -= UTC0_US
-    summary = judge(run({0: ticks(10, (0.0, 0.0, 0.0)), 1: other}), Rules(2, 0.5), "completed")
+    summary = judge(
+        run({0: ticks(10, (0.0, 0.0, 0.0)), 1: other}), Rules(agents=2, required_separation_m=0.5), "completed"
+    )
     assert "can't be judged" in summary["violations"][0]
 
 
@@ -256,7 +303,9 @@ def test_solver_failures_count_while_the_agent_has_control() -> None:
     rows["residual_m"] = 1e-4
     rows["residual_m"][0] = 7.0  # refused, never flown
     rows["safety_filter_acted"][5:8] = 1
-    solver = judge(run({0: rows}), Rules(1, 0.5, solver_name="daqp"), "completed")["solver"]
+    solver = judge(run({0: rows}), Rules(agents=1, required_separation_m=0.5, solver_name="daqp"), "completed")[
+        "solver"
+    ]
     assert solver == {
         "name": "daqp",
         "failed": 2,
@@ -273,7 +322,7 @@ def test_refused_messages_are_summed_over_each_agents_last_summary() -> None:
         {"source": "agent-1", "event": "bus_summary", "rejected": {"stale": 4}},
         {"source": "agent-1", "event": "other", "rejected": {"stale": 100}},
     ]
-    comms = judge(run(APART, events=events), Rules(2, 0.5), "completed")["comms"]
+    comms = judge(run(APART, events=events), Rules(agents=2, required_separation_m=0.5), "completed")["comms"]
     assert comms["path_age_ms"] == {"p50": 30.0, "p99": 30.0}
     assert comms["rejected"] == {"identity": 1, "stale": 7}
 
@@ -292,7 +341,7 @@ def refused(by: int, reason: str, count: int, sender: str = "agent-1", topic: st
 def test_forged_messages_are_a_violation_and_network_faults_are_not() -> None:
     network = [refused(0, "late", 4000), refused(0, "replayed", 900), refused(0, "unconfirmed", 70)]
     clumsy = [refused(0, "malformed", 50), refused(0, "stale_order", 3, "operator", "command")]
-    summary = judge(run(APART, events=network + clumsy), Rules(2, 0.5), "completed")
+    summary = judge(run(APART, events=network + clumsy), Rules(agents=2, required_separation_m=0.5), "completed")
     assert (summary["outcome"], summary["violations"]) == ("completed", [])
     forged = [
         refused(0, "boot", 1),
@@ -300,7 +349,9 @@ def test_forged_messages_are_a_violation_and_network_faults_are_not() -> None:
         refused(0, "boot", 2),
         refused(0, "sequence", 1, topic="status"),
     ]
-    summary = judge(run(APART, events=network + clumsy + forged), Rules(2, 0.5), "completed")
+    summary = judge(
+        run(APART, events=network + clumsy + forged), Rules(agents=2, required_separation_m=0.5), "completed"
+    )
     assert summary["outcome"] == "failed"
     assert summary["violations"] == [
         "messages in the name of agent-1 were refused (path boot 5, status sequence 1) by agent-0, agent-2"
@@ -312,10 +363,10 @@ def test_the_peer_unheard_for_longest_is_named() -> None:
         return {"source": f"agent-{by}", "event": "unheard", "agent": agent, "utc_us": round(at_s * 1e6), **fields}
 
     ended = [row(0, 1, 10.0, begins=True), row(0, 1, 12.0, begins=False, lasted_s=2.5)]
-    comms = judge(run(APART, events=ended), Rules(2, 0.5), "completed")["comms"]
+    comms = judge(run(APART, events=ended), Rules(agents=2, required_separation_m=0.5), "completed")["comms"]
     assert comms["unheard"] == {"count": 1, "longest_s": 2.5, "agent": 1, "by": "agent-0"}
     lasting = [row(1, 0, 11.0, begins=True), {"event": "state", "utc_us": 52_000_000}]
-    comms = judge(run(APART, events=ended + lasting), Rules(2, 0.5), "completed")["comms"]
+    comms = judge(run(APART, events=ended + lasting), Rules(agents=2, required_separation_m=0.5), "completed")["comms"]
     assert comms["unheard"] == {"count": 2, "longest_s": 41.0, "agent": 0, "by": "agent-1"}
 
 
@@ -329,7 +380,7 @@ def test_the_peer_unheard_for_longest_is_named() -> None:
     ],
 )
 def test_outcome(outcome: str, problems: tuple[str, ...], judged: str) -> None:
-    summary = judge(run(APART), Rules(2, 0.5), outcome, problems)
+    summary = judge(run(APART), Rules(agents=2, required_separation_m=0.5), outcome, problems)
     assert summary["outcome"] == judged
     assert summary["violations"] == list(problems)
 
@@ -337,29 +388,37 @@ def test_outcome(outcome: str, problems: tuple[str, ...], judged: str) -> None:
 def test_deadlocks_are_counted() -> None:
     noted = [("begins", True), ("lasted_s", 2.5), ("begins", True)]
     events = [{"event": "deadlock", "source": "agent-0", name: value} for name, value in noted]
-    summary = judge(run(APART, events=[{"event": "state"}, *events]), Rules(2, 0.5), "completed")
+    summary = judge(
+        run(APART, events=[{"event": "state"}, *events]), Rules(agents=2, required_separation_m=0.5), "completed"
+    )
     assert summary["deadlocks"] == {"count": 2, "longest_s": 2.5, "unresolved": 1}
-    assert judge(run(APART), Rules(2, 0.5), "completed")["deadlocks"]["count"] == 0
+    assert judge(run(APART), Rules(agents=2, required_separation_m=0.5), "completed")["deadlocks"]["count"] == 0
 
 
 def test_mission_cut_short_is_no_pass() -> None:
-    assert judge(run(APART), Rules(2, 0.5, duration_s=20.5), "completed")["outcome"] == "completed"
-    summary = judge(run(APART), Rules(2, 0.5, duration_s=38.0), "completed")
+    assert (
+        judge(run(APART), Rules(agents=2, required_separation_m=0.5, duration_s=20.5), "completed")["outcome"]
+        == "completed"
+    )
+    summary = judge(run(APART), Rules(agents=2, required_separation_m=0.5, duration_s=38.0), "completed")
     assert summary["violations"][0] == "mission time 20.0 s of agent 0 below 38 s"
-    assert judge(run(APART), Rules(2, 0.5, duration_s=38.0), "interrupted")["violations"] == []
+    assert (
+        judge(run(APART), Rules(agents=2, required_separation_m=0.5, duration_s=38.0), "interrupted")["violations"]
+        == []
+    )
 
 
 def test_diverged_truth_is_no_pass() -> None:
     t_s = np.arange(0, 1, 0.1)
     broken = np.where(t_s[:, None] > 0.5, np.nan, np.zeros((10, 3)))
-    summary = judge(run({}, truth(0, t_s, broken)), Rules(1, 0.5), "completed")
+    summary = judge(run({}, truth(0, t_s, broken)), Rules(agents=1, required_separation_m=0.5), "completed")
     assert summary["outcome"] == "failed"
     assert "not a number" in summary["violations"][0]
 
 
 @pytest.mark.parametrize("data", [run({}), run({0: ticks(0, (0, 0, 0))[:0]}), run(APART)], ids=["none", "empty", "run"])
 def test_summary_holds_no_nan_and_every_contract_key(data: RunData) -> None:
-    summary = judge(data, Rules(2, 0.85), "interrupted")
+    summary = judge(data, Rules(agents=2, required_separation_m=0.85), "interrupted")
 
     def refuse(constant: str) -> None:
         raise AssertionError(constant)

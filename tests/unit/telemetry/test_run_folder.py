@@ -61,7 +61,7 @@ def write_run(directory: Path, agents: int, seconds: float) -> None:
     (directory / "config.toml").write_text('name = "x<y"\n')
 
 
-RULES = Rules(3, 0.85, (ObstacleRule((20.0, 20.0, -2.0), 1.75),))
+RULES = Rules(agents=3, required_separation_m=0.85, obstacles=(ObstacleRule((20.0, 20.0, -2.0), 1.75),))
 
 
 def test_launches_in_the_same_second_get_folders_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -117,7 +117,7 @@ def test_a_missing_folder_is_refused_with_a_reason(tmp_path: Path) -> None:
 def test_finished_run_is_complete_and_may_be_finished_again(tmp_path: Path) -> None:
     write_run(tmp_path, 3, 20.0)
     own = ({"utc_us": UTC_US - 1, "t_us": -1, "source": "launch", "event": "started"},)
-    summary, unwritten = finish_run(tmp_path, RULES, Outcome("completed", events=own))
+    summary, unwritten = finish_run(tmp_path, RULES, Outcome(outcome="completed", events=own))
     assert unwritten == ()
     assert summary["outcome"] == "completed", summary["violations"]
     assert summary["tracking"]["index_m"] == pytest.approx(3 * 0.6)
@@ -127,7 +127,7 @@ def test_finished_run_is_complete_and_may_be_finished_again(tmp_path: Path) -> N
     assert names == parquets | {"truth.bin", "config.toml", "events.jsonl", "summary.json", "report.html"}
     sources = [json.loads(line)["source"] for line in (tmp_path / "events.jsonl").read_text().splitlines()]
     assert sources == ["launch", "agent-0", "agent-1", "agent-2"]
-    assert finish_run(tmp_path, RULES, Outcome("completed", events=own)) == (summary, ())
+    assert finish_run(tmp_path, RULES, Outcome(outcome="completed", events=own)) == (summary, ())
     assert len((tmp_path / "events.jsonl").read_text().splitlines()) == 4
     assert json.loads((tmp_path / "summary.json").read_text()) == summary
 
@@ -170,8 +170,8 @@ class _Page(HTMLParser):
 @pytest.mark.parametrize(("agents", "seconds"), [(3, 60.0), (12, 40.0), (1, 3.5)])
 def test_report_is_small_well_formed_and_self_contained(tmp_path: Path, agents: int, seconds: float) -> None:
     write_run(tmp_path, agents, seconds)
-    rules = Rules(agents, 0.3, (ObstacleRule((20.0, 20.0, -2.0), 1.75),))
-    finish_run(tmp_path, rules, Outcome("completed", ("one <script>alert(1)</script> problem",)))
+    rules = Rules(agents=agents, required_separation_m=0.3, obstacles=(ObstacleRule((20.0, 20.0, -2.0), 1.75),))
+    finish_run(tmp_path, rules, Outcome(outcome="completed", problems=("one <script>alert(1)</script> problem",)))
     text = (tmp_path / "report.html").read_text()
     page = _Page()
     page.feed(text)
@@ -187,7 +187,7 @@ def test_report_is_small_well_formed_and_self_contained(tmp_path: Path, agents: 
 
 
 def test_report_of_an_empty_run(tmp_path: Path) -> None:
-    finish_run(tmp_path, RULES, Outcome("failed", ("no vehicle",)))
+    finish_run(tmp_path, RULES, Outcome(outcome="failed", problems=("no vehicle",)))
     assert "no vehicle" in (tmp_path / "report.html").read_text()
 
 
