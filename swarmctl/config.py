@@ -33,6 +33,16 @@ from swarmctl.toml_text import toml_text
 
 MAX_AGENTS = 100
 _PAIRS_SHOWN = 3
+_RENAMED = {  # keys of versions before 0.2
+    "agent.commit.bias_rad": "agent.commit.right_of_way_rad",
+    "agent.commit.share_01": "agent.commit.tilt_fraction_01",
+    "agent.detour": "agent.deadlock",
+    "agent.sequence": "agent.state_machine",
+    "limits.late_ticks_01": "limits.deadline_misses_01",
+    "mission.goto.standoff": "mission.goto.goal_assignment",
+    "separation.bias_obstacle_rad": "separation.right_of_way_obstacle_rad",
+    "separation.bias_rad": "separation.right_of_way_rad",
+}
 _PLACES_SHOWN = 3
 _PROBLEMS_SHOWN = 30
 
@@ -224,7 +234,9 @@ def _explain(error: dict[str, Any]) -> str:
 
 
 def _hint(location: Sequence[str]) -> str:
-    """Suggest a correction for an unknown key: the same word in another section, or a similar one in this section."""
+    """Suggest a correction for an unknown key: its new name, its word in another section, or a similar one in this."""
+    if renamed := _RENAMED.get(".".join(location)):
+        return f"did you mean {renamed!r}?"
     elsewhere = [key for key in _all_keys(Config, "") if key.rpartition(".")[2] == location[-1]]
     if elsewhere:
         return f"did you mean {' or '.join(map(repr, elsewhere[:_PLACES_SHOWN]))}?"

@@ -37,7 +37,7 @@ class ReferenceSelector:
         known: Sequence[KeepOut],
         landmarks: Callable[[], Sequence[Obstacle]],
     ) -> Deadlock | None:
-        """Check progress and plan a detour if there is none; returns a deadlock only in the tick it begins.
+        """Check progress and plan a detour if there is none; returns the deadlock that the agent is in.
 
         Args:
             now_us, utc_us: monotonic time and UTC.
@@ -74,7 +74,6 @@ class ReferenceSelector:
         reported, self._reported = self._reported, self._recovery.deadlock
         if reported is None and self._reported is not None:
             self._note("deadlock", begins=True, by=self._reported.by)
-            return self._reported
         if reported is not None and self._reported is None:
             self._note("deadlock", begins=False, lasted_s=(now_us - reported.since_us) * 1e-6)
-        return None
+        return self._reported

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarmctl.bus.topics import MAX_OBSTACLES
-from swarmctl.config import Config, dump, load
+from swarmctl.config import _RENAMED, Config, _all_keys, dump, load
 from swarmctl.errors import EXIT_USAGE, ConfigError
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.toml"))
@@ -299,3 +299,12 @@ def test_obstacles_that_agents_would_refuse_are_refused(tmp_path: Path) -> None:
         path.write_text(text)
         with pytest.raises(ConfigError, match=problem):
             load(path)
+
+
+@pytest.mark.parametrize(("old", "new"), sorted(_RENAMED.items()))
+def test_a_key_that_was_renamed_is_refused_with_its_new_name(old: str, new: str) -> None:
+    section = {"agent.detour", "agent.sequence"} & {old}
+    with pytest.raises(ConfigError) as error:
+        load(None, [f"{old}.enabled=1" if section else f"{old}=1"])
+    assert f"did you mean {new!r}?" in str(error.value)
+    assert new in set(_all_keys(Config, ""))
