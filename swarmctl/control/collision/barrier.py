@@ -51,7 +51,7 @@ class BarrierParams(Params):
     brake_m_s2: float = Field(4.0, gt=0, le=20)  # level braking of one vehicle; the rest of its thrust is reserve
     near_1_s: float = Field(6.0, gt=0, le=50)  # k: approach speed allowed per metre left, close by
     gain_1_s: float = Field(6.0, gt=0, le=50)  # how fast the allowed approach speed may be reached
-    react_s: float = Field(0.045, ge=0, le=1)  # time the approach continues while the airframe slew_bounds to brake
+    react_s: float = Field(0.045, ge=0, le=1)  # time the approach continues while the airframe tilts to brake
     escape_m_s: float = Field(0.5, ge=0, le=10)  # separating speed asked for when closer than allowed
     slew_1_s: float = Field(2.5, gt=0, le=50)  # of (u_x, u_y); faster attitude changes would saturate rotors
 
