@@ -36,9 +36,10 @@ def rows_in(directory: Path) -> list[Row]:
 
 @pytest.fixture(scope="module")
 def quick(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The campaign shown in README.md."""
+    """The campaign shown in README.md or docs/."""
     out = tmp_path_factory.mktemp("campaign")
-    (line,) = (line for line in (ROOT / "README.md").read_text().splitlines() if line.startswith(SHOWN))
+    pages = [ROOT / "README.md", *(ROOT / "docs").glob("*.md")]
+    (line,) = (line for page in pages for line in page.read_text().splitlines() if line.startswith(SHOWN))
     command = [sys.executable, *shlex.split(line)[1:], "--out", str(out)]
     assert subprocess.run(command, cwd=ROOT, check=False).returncode == 0
     return out

@@ -1,4 +1,4 @@
-"""Every command README.md shows is run as it stands, shortened only by `--duration` and kept off the screen.
+"""Every command of README.md and docs/ is run as it stands, shortened only by `--duration` and kept off the screen.
 
 The launch that is shown with a configuration is the whole mission of test_launch.py.
 """
@@ -24,7 +24,11 @@ from swarmctl.core.types import Landed
 pytestmark = pytest.mark.process
 
 ROOT = Path(__file__).parents[2]
-SHOWN = [line.strip() for line in (ROOT / "README.md").read_text().splitlines() if line.startswith("    ")]
+RUN_ELSEWHERE = ("configuration.md", "real_autopilots.md")  # the latter shows how to run tests with your own builds
+PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").glob("*.md") if p.name not in RUN_ELSEWHERE)]
+FENCED = re.compile(r"^```.*?^```$", re.DOTALL | re.MULTILINE)
+LINES = [line for page in PAGES for line in FENCED.sub("", page.read_text()).splitlines()]
+SHOWN = [line.strip() for line in LINES if line.startswith("    ")]
 BIN = Path(sys.executable).parent
 WHILE_FLYING = ("status", "hold", "resume", "obstacle", "fault", "land")
 AFTERWARDS = ("report", "replay")
@@ -71,6 +75,9 @@ def test_nothing_is_shown_that_is_not_run() -> None:
         + shown(CAMPAIGN)
     )
     assert sorted(run_here) == sorted(SHOWN)
+    assert len(set(SHOWN)) == len(SHOWN), "shown once, so that it is run once"
+    fenced = "\n".join(block for page in PAGES for block in FENCED.findall(page.read_text()))
+    assert not re.search(r"^\s*(swarmctl|python3?) ", fenced, re.MULTILINE), "commands are indented, not fenced"
 
 
 def test_the_two_set_up_lines_install_what_they_use() -> None:

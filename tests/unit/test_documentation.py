@@ -1,13 +1,72 @@
-"""Tests that the documentation follows the code."""
+"""Tests that the documentation follows the code: generated pages, quoted files and modules, links."""
 
 from __future__ import annotations
 
+import importlib.util
+import re
 import runpy
 from pathlib import Path
 
+import pytest
+
+from sitl.studies.campaign.trials import SCHEMA
+from swarmctl.config import SitlParams
+from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
+
 ROOT = Path(__file__).parents[2]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+QUOTED = re.compile(r"`([^`\s]+)`")
+FOLDERS = ("swarmctl/", "sitl/", "tests/", "tools/", "configs/", "docs/")
 
 
 def test_the_page_of_the_configuration_is_what_the_script_writes() -> None:
     written = runpy.run_path(str(ROOT / "tools" / "configuration_page.py"))["page"]()
     assert (ROOT / "docs" / "configuration.md").read_text() == written, "run python tools/configuration_page.py"
+
+
+def test_every_recorded_column_is_described() -> None:
+    recorded = {*(TICK_DTYPE.names or ()), *(TRUTH_DTYPE.names or ()), *SCHEMA.names}
+    assert recorded - described() == set()
+
+
+def test_every_event_is_described() -> None:
+    code = "".join(path.read_text() for path in (ROOT / "swarmctl").rglob("*.py"))
+    events = re.findall(r"\b(?:_note|_say|_fail|log\.write|recorder\.event)\(\s*\"(\w+)\"", code)
+    assert len(events) > 30
+    assert set(events) - described() == set()
+
+
+def described() -> set[str]:
+    """Return the names in the first column of the tables of data formats."""
+    page = (ROOT / "docs" / "data_formats.md").read_text()
+    return {name for row in re.findall(r"^\| (`.*?) \|", page, re.MULTILINE) for name in QUOTED.findall(row)}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_quoted_files_and_modules_exist(page: Path) -> None:
+    missing = [name for name in QUOTED.findall(page.read_text()) if is_ours(name) and not exists(name)]
+    assert missing == []
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_to_files(page: Path) -> None:
+    links = re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text())
+    assert [link for link in links if "://" not in link and not (page.parent / link).exists()] == []
+
+
+def is_ours(name: str) -> bool:
+    return name.endswith(".py") or name.startswith(FOLDERS) or re.match(r"(swarmctl|sitl)\.[a-z]", name) is not None
+
+
+def exists(name: str) -> bool:
+    """Return whether a path, pattern or dotted module of the tree exists; a name without a folder may be anywhere."""
+    if re.match(r"(swarmctl|sitl)(\.\w+)+$", name) and not name.endswith(".py"):
+        return is_module(name) or name.removeprefix("sitl.").partition(".")[0] in SitlParams.model_fields
+    return any(ROOT.glob(name.rstrip("/"))) or ("/" not in name and any(ROOT.glob(f"*/**/{name}")))
+
+
+def is_module(name: str) -> bool:
+    try:
+        return importlib.util.find_spec(name) is not None
+    except ModuleNotFoundError:
+        return False
