@@ -50,7 +50,7 @@ _PROBLEMS_SHOWN = 30
 class SwarmParams(Params):
     """Size of the swarm and origin of its frame."""
 
-    agents: int = Field(3, ge=1, le=MAX_AGENTS)
+    agents: int = Field(3, ge=1, le=MAX_AGENTS)  # overridden by --agents
     origin_lat_deg: float = Field(47.397742, ge=-90, le=90)  # shared origin of all positions in the configuration
     origin_lon_deg: float = Field(8.545594, ge=-180, le=180)
     origin_alt_m: float = Field(489.4, ge=-500, le=9000)  # above mean sea level
@@ -59,17 +59,17 @@ class SwarmParams(Params):
 class StartParams(Params):
     """Positions at which agents wait for the mission to begin: a line, or `positions_ned_m` if given."""
 
-    positions_ned_m: tuple[Vec3, ...] = Field((), strict=False)
-    center_ned_m: Vec3 = (0.0, 0.0, 0.0)
-    direction_ned: Vec3 = (1.0, 0.0, 0.0)
-    spacing_m: float = Field(1.0, gt=0, le=100)
+    positions_ned_m: tuple[Vec3, ...] = Field((), strict=False)  # one for each agent
+    center_ned_m: Vec3 = (0.0, 0.0, 0.0)  # centre of the line
+    direction_ned: Vec3 = (1.0, 0.0, 0.0)  # direction of the line, of any length
+    spacing_m: float = Field(1.0, gt=0, le=100)  # distance of neighbours on the line
 
 
 class VehicleParams(Params):
     """Address of one autopilot and, optionally, a model of its vehicle."""
 
-    sysid: int = Field(ge=1, le=255)
-    url: str
+    sysid: int = Field(ge=1, le=255)  # MAVLink system id, different for each vehicle
+    url: str  # udpin://, udpout://, tcp:// or serial://
     model: VehicleModelParams | None = None  # replaces the whole section vehicle_model for this vehicle
 
 
@@ -77,7 +77,7 @@ class SitlParams(RealismParams):
     """The built-in simulator that launch starts; disabled to fly other vehicles."""
 
     enabled: bool = True
-    preset: Literal["thesis", "x500", "crazyflie", "arducopter"] = "thesis"
+    preset: Literal["thesis", "x500", "crazyflie", "arducopter"] = "thesis"  # airframe
     attitude_gains: Literal["swarm", "single", "pid_step", "pid_trajectory"] = "swarm"  # for the thesis airframe only
     ground_z_m: float = Field(2.0, ge=-1000, le=1000)  # height of the ground below the shared origin, NED z
     start: Literal["ground", "air"] = "ground"  # air: vehicles begin at their start positions, without ground (thesis)
@@ -109,24 +109,24 @@ class TelemetryParams(Params):
 
     enabled: bool = True
     port: int = Field(9877, ge=1, le=65535)  # loopback, not the default of rerun; the next free one if taken
-    rate_hz: float = Field(10.0, gt=0, le=50)
+    rate_hz: float = Field(10.0, gt=0, le=50)  # updates of the view per agent
 
 
 class ObstacleParams(Params):
     """A sphere, or a vertical column of any height, visible to agents only from closer than `visibility_m`."""
 
     center_ned_m: Vec3
-    column: bool = False
-    radius_m: float = Field(1.0, gt=0, le=1000)
+    column: bool = False  # true: of any height
+    radius_m: float = Field(1.0, gt=0, le=1000)  # the obstacle itself, which the safety filter keeps clear of
     keep_out_m: float = Field(1.75, gt=0, le=1000)  # constraint radius from the centre, thesis 1 + 2.5 x 0.3
-    visibility_m: float = Field(3.0, gt=0, le=10000)
+    visibility_m: float = Field(3.0, gt=0, le=10000)  # agents farther from the centre do not see it
     vel_ned_m_s: Vec3 = (0.0, 0.0, 0.0)
 
 
 class LimitParams(Params):
     """Limits beyond which the referee counts a violation."""
 
-    min_separation_m: float = Field(0.85, ge=0, le=100)
+    min_separation_m: float = Field(0.85, ge=0, le=100)  # distance of two centres, of true states where there are any
     obstacle_margin_m: float = Field(0.05, ge=0, le=10)  # allowed intrusion into keep_out_m
     deadline_misses_01: float = Field(0.2, ge=0, le=1)  # largest fraction of deadlines missed
 
@@ -134,8 +134,8 @@ class LimitParams(Params):
 class Config(Params):
     """Configuration of a whole run."""
 
-    name: str = Field("swarm", pattern=r"^[A-Za-z0-9_-]{1,40}$")
-    seed: int = Field(1, ge=0, le=2**31 - 1)
+    name: str = Field("swarm", pattern=r"^[A-Za-z0-9_-]{1,40}$")  # part of the run folder's name
+    seed: int = Field(1, ge=0, le=2**31 - 1)  # seeds every random stream
     swarm: SwarmParams = SwarmParams()
     start: StartParams = StartParams()
     mission: MissionParams = MissionParams()

@@ -25,8 +25,8 @@ from swarmctl.core.types import Array
 class AgentParams(Params):
     """Parameters of an agent that belong neither to the controller nor to the vehicle model."""
 
-    rate_hz: float = Field(50.0, ge=10, le=200)
-    connect_timeout_s: float = Field(15.0, gt=0, le=600)
+    rate_hz: float = Field(50.0, ge=10, le=200)  # rate of ticks, and so of setpoints
+    connect_timeout_s: float = Field(15.0, gt=0, le=600)  # longest wait for the first heartbeat and position
     state_machine: StateMachineParams = StateMachineParams()
     failsafe: FailsafeParams = FailsafeParams()
     overload: OverloadParams = OverloadParams()

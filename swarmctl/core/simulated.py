@@ -85,7 +85,7 @@ class FaultParams(Params):
     kind: FaultKind
     at_s: float = Field(0.0, ge=0, le=86400)  # after the simulator's start
     vehicle: int = Field(EVERY_VEHICLE, ge=EVERY_VEHICLE, le=99)  # -1: all
-    value: float | None = None  # see FAULTS
+    value: float | None = None  # size, in the unit of the kind; see FAULTS
     for_s: float = Field(0.0, ge=0, le=86400)  # 0: to the end
     rotor: int = Field(0, ge=0, le=3)  # motor
     direction: Literal["both", "to_vehicle", "from_vehicle"] = "both"  # link_*

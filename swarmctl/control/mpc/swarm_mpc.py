@@ -32,21 +32,21 @@ RESIDUAL_LIMIT_M = 0.05  # a solution that violates a constraint by more is refu
 class AxisWeights(Params):
     """Sets the quadratic weights of one axis."""
 
-    q_pos: float = Field(gt=0, le=1e4)
-    q_vel: float = Field(ge=0, le=1e4)
-    r: float = Field(gt=0, le=1e4)
+    q_pos: float = Field(gt=0, le=1e4)  # weight of the position error
+    q_vel: float = Field(ge=0, le=1e4)  # weight of the velocity error
+    r: float = Field(gt=0, le=1e4)  # weight of input changes
 
 
 class MpcParams(Params):
     """Sets horizons, weights and bounds; defaults are those of thesis section 4.3 except for the end and the r of z."""
 
-    dt_s: float = Field(0.02, gt=0.001, le=0.5)
+    dt_s: float = Field(0.02, gt=0.001, le=0.5)  # time between two points of a plan
     discretisation: Literal["zoh", "euler"] = "zoh"  # euler is the thesis' (3.6)
     thrust_ahead: Literal["held", "planned"] = "held"  # x-y uses the thrust of now (thesis) or of the z plan
-    control_z: int = Field(3, ge=1, le=50)
-    horizon_z: int = Field(40, ge=2, le=200)
+    control_z: int = Field(3, ge=1, le=50)  # free input changes, in steps
+    horizon_z: int = Field(40, ge=2, le=200)  # predicted steps
     control_xy: int = Field(6, ge=1, le=50)  # and of dmpc3, for all three axes
-    horizon_xy: int = Field(40, ge=2, le=200)
+    horizon_xy: int = Field(40, ge=2, le=200)  # predicted steps, also those of a shared path
     z: AxisWeights = AxisWeights(q_pos=2.0, q_vel=0.05, r=1.0)  # thesis r 0.01 leaves x-y no thrust in fast climbs
     x: AxisWeights = AxisWeights(q_pos=1.5, q_vel=0.5, r=0.01)
     y: AxisWeights = AxisWeights(q_pos=1.5, q_vel=0.5, r=0.01)

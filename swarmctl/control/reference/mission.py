@@ -30,7 +30,7 @@ class CircleParams(Params):
 
     center_ned_m: Vec3 = (0.0, 0.0, -1.0)
     radius_m: float = Field(5.0, ge=0, le=1000)
-    omega_rad_s: float = Field(0.5, ge=-10, le=10)
+    omega_rad_s: float = Field(0.5, ge=-10, le=10)  # positive is clockwise seen from above
     climb_ned_m_s: float = Field(-0.1, ge=-20, le=20)  # negative is up
 
 
@@ -58,7 +58,7 @@ class GotoParams(Params):
 
     goals_ned_m: tuple[Vec3, ...] = Field((), strict=False)  # one for each agent, or a single one for all
     speed_m_s: float = Field(2.0, gt=0, le=20)  # approximate peak
-    accel_m_s2: float = Field(1.2, gt=0, le=20)
+    accel_m_s2: float = Field(1.2, gt=0, le=20)  # approximate peak
     goal_assignment: bool = True  # replace goals that are too close by places around them
 
 
@@ -66,9 +66,9 @@ class IdentifyParams(Params):
     """Describes steps about the own start, to and fro along each axis, as `swarmctl check --identify` flies them."""
 
     step_m: float = Field(2.0, gt=0.1, le=20)  # north, south, east, west
-    climb_m: float = Field(0.5, ge=0, le=20)
+    climb_m: float = Field(0.5, ge=0, le=20)  # step up and back
     hold_s: float = Field(2.5, ge=0.5, le=30)  # before the next step
-    repeats: int = Field(2, ge=1, le=20)
+    repeats: int = Field(2, ge=1, le=20)  # number of times all steps are flown
     distance_max_m: float = Field(5.0, gt=0.1, le=100)  # beyond it the vehicle stops and lands
     speed_max_m_s: float = Field(5.0, gt=0.1, le=30)  # likewise
 
@@ -87,8 +87,8 @@ class MissionParams(Params):
     """Sets what is flown between start and landing."""
 
     kind: Literal["hover", "circle", "line", "steps", "swap", "goto", "identify"] = "circle"
-    duration_s: float = Field(37.7, gt=0, le=36000)
-    yaw_rad: float = Field(0.0, ge=-3.1416, le=3.1416)
+    duration_s: float = Field(37.7, gt=0, le=36000)  # tracked time, without transits; overridden by --duration
+    yaw_rad: float = Field(0.0, ge=-3.1416, le=3.1416)  # heading of every vehicle, clockwise from north
     circle: CircleParams = CircleParams()
     line: LineParams = LineParams()
     steps: StepsParams = StepsParams()
