@@ -243,7 +243,7 @@ def half_spaces(
 def _approach_m(keep_outs: Sequence[KeepOut], here_ned_m: Array, apart: Array, params: SeparationParams) -> Array:
     """Return the distance (slots, Hp) kept beyond the constraint's from peers that come closer than they are now.
 
-    Prediction errors grow with the relative motion that is still to be flown: tilt is answered with a few per cent less,
+    Prediction errors grow with the relative motion still to be flown: tilt is answered with a few per cent less and
     accelerations bend the estimate. The margin shrinks on the way and is zero in a formation.
 
     Args:
