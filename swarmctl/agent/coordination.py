@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -15,7 +15,7 @@ from swarmctl.control.collision.separation import KeepOut, SeparationParams
 from swarmctl.control.commit.protocol import CommitCounts, Commitments
 from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference, Situation, committed_m
 from swarmctl.control.mpc.swarm_mpc import MpcParams
-from swarmctl.core.trajectory import Times
+from swarmctl.core.trajectory import Times, Trajectory
 from swarmctl.core.trajectory_message import TrajectoryMessage
 from swarmctl.core.types import Array, Phase, VehicleState
 
@@ -37,10 +37,15 @@ class Coordination:
             `tracking_violation` when the vehicle leaves its committed trajectory by more than `tracking_m` plus half of
             the committed distance beyond touching bodies, and when it is back; and `commitments` with all counts when
             the autopilot or a pilot takes over.
+
+    Attributes:
+        committed_peers: by agent number, the trajectories that each peer relied on may follow.
+        lost_peer_keep_outs: keep-outs at the ends of lost peers' committed trajectories.
     """
 
     def __init__(
         self,
+        *,
         agent: int,
         boot_id: int,
         peers: list[int],
@@ -65,7 +70,8 @@ class Coordination:
         self._absent_since_us: dict[int, int] = {}
         self._on_bus_since_us: int | None = None
         self._conflicting: set[int] = set()
-        self.lost_peer_keep_outs: list[KeepOut] = []  # at the ends of lost peers' trajectories
+        self.committed_peers: Mapping[int, Sequence[Trajectory]] = {}
+        self.lost_peer_keep_outs: list[KeepOut] = []
 
     @property
     def counts(self) -> CommitCounts:
@@ -95,7 +101,7 @@ class Coordination:
         lost_peers = [agent for agent in known.keys() - alive_peers if agent in committed]
         self.lost_peer_keep_outs = [keep_out for agent in lost_peers for keep_out in self._ends(known[agent])]
         taking_part = {a for a in alive_peers - absent - conflicting - deviating if a in committed}
-        self._world_model.peer_commitments = {agent: known[agent].followed for agent in taking_part}
+        self.committed_peers = {agent: known[agent].followed for agent in taking_part}
         partners = {agent: known[agent] for agent in taking_part}
         others = self._others(utc_us, state, phase, taking_part)
         commitments.evade(Situation(utc_us=utc_us, begin_us=utc_us, desired=desired, peers=partners, others=others))
@@ -111,7 +117,7 @@ class Coordination:
         """Commit nothing while a pilot or the autopilot flies, or the state is stale; peers are still acknowledged."""
         if self._is_committed:
             self._is_committed = False
-            self._world_model.peer_commitments, self.lost_peer_keep_outs = {}, []
+            self.committed_peers, self.lost_peer_keep_outs = {}, []
             self._note("commitments", **asdict(self.counts), worst_tracking_m=self._worst_m)
         self._commitments.end(None if state is None else state.pos_ned_m, utc_us)
 
