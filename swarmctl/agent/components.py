@@ -100,12 +100,13 @@ def make_safety_filter(setup: AgentSetup, world_model: WorldModel, note: Note, s
 
 def make_state_machine(setup: AgentSetup) -> MissionStateMachine:
     """Return the state machine of the agent's mission."""
-    reference = MissionReference(setup.mission, setup.starts_ned_m, setup.agent, setup.separation.planned_m)
+    budget = setup.separation.budget
+    reference = MissionReference(setup.mission, setup.starts_ned_m, setup.agent, budget.planned_m)
     return MissionStateMachine(
         setup.params.state_machine,
         setup.agent,
         len(setup.peers),
-        setup.separation.radius_m,
+        budget.landing_m(setup.params.state_machine.apart_m),
         setup.starts_ned_m[setup.agent],
         setup.mission.duration_s,
         reference,

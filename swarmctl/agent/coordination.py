@@ -13,7 +13,7 @@ from swarmctl.bus.peers import Bus, agent_name
 from swarmctl.bus.trajectory_messages import PeerTrajectories, encode_trajectory_message
 from swarmctl.control.collision.separation import KeepOut, SeparationParams
 from swarmctl.control.commit.protocol import CommitCounts, Commitments
-from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference, Situation, committed_m
+from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference, Situation
 from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.core.trajectory import Times, Trajectory
 from swarmctl.core.trajectory_message import TrajectoryMessage
@@ -65,7 +65,7 @@ class Coordination:
         self._peer_trajectories, self._peers = PeerTrajectories(peers, rate_hz, refusals, attendance), frozenset(peers)
         self._note, self._seq, self._separation = note, 0, separation
         self._is_committed = False
-        self._allowed_m = separation.tracking_m + 0.5 * (committed_m(separation) - separation.body_m)
+        self._allowed_m = separation.budget.tracking_allowance_m
         self._is_violating, self._worst_m = False, 0.0
         self._absent_since_us: dict[int, int] = {}
         self._on_bus_since_us: int | None = None
@@ -171,16 +171,16 @@ class Coordination:
         return committing - {a for a, since_us in self._absent_since_us.items() if utc_us - since_us >= _LOST_AFTER_US}
 
     def _ends(self, message: TrajectoryMessage) -> list[KeepOut]:
-        p = self._separation
+        budget = self._separation.budget
         ends = [np.tile(trajectory.pos_ned_m[-1], (2, 1)) for trajectory in message.followed]
         return [
             KeepOut(
                 pos_ned_m=end,
-                radius_m=p.planned_m,
-                hard_min_distance_m=committed_m(p),
+                radius_m=budget.planned_m,
+                hard_min_distance_m=budget.committed_m,
                 any_height=False,
                 priority_id=message.agent,
-                downwash=p.downwash,
+                downwash=self._separation.downwash,
             )
             for end in ends
         ]
@@ -192,6 +192,5 @@ class Coordination:
         """
         steps, dt_us = self._commitments.steps, self._commitments.dt_us
         found = self._world_model.keep_outs(state.pos_ned_m, t0_utc_us, dt_us, steps, phase, taking_part)
-        # by which planned and hard minimum distance differ
-        spent_m = self._separation.tracking_m + self._separation.certify_slack_m
+        spent_m = self._separation.budget.planned_beyond_certified_m
         return [replace(k, hard_min_distance_m=max(k.hard_min_distance_m, k.radius_m - spent_m)) for k in found]

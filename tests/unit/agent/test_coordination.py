@@ -198,8 +198,8 @@ def test_the_certificate_against_a_stale_peer_has_all_of_its_margin(bench: Bench
     utc_us, params = bench.clock.utc_us(), SeparationParams()
     (kept,) = bench.coordination._others(utc_us, bench.state, Phase.TRACK, set())
     (control,) = bench.world_model.keep_outs(HERE, utc_us, 100_000, 5, Phase.TRACK)
-    assert control.hard_min_distance_m == params.radius_m - params.certify_slack_m, "which would not grow with age"
-    assert kept.hard_min_distance_m > params.planned_m + 0.5
+    assert control.hard_min_distance_m == params.budget.certified_m, "which would not grow with age"
+    assert kept.hard_min_distance_m > params.budget.planned_m + 0.5
 
 
 def test_an_agent_without_a_state_commits_nothing(bench: Bench) -> None:
