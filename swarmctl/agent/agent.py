@@ -178,7 +178,7 @@ class Agent:
 
     @property
     def commits_refused(self) -> int | None:
-        """Number of proposals withdrawn or expired; None unless separation is guaranteed."""
+        """Number of proposals withdrawn or expired; None if separation works without proposals."""
         return self._separation.commits_refused
 
     def ask(self, verb: str, now_us: int) -> None:
