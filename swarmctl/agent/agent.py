@@ -16,12 +16,13 @@ import numpy as np
 from swarmctl.agent.alerts import Alerts
 from swarmctl.agent.components import (
     make_controllers,
-    make_coordination,
     make_estimator,
     make_safety_filter,
+    make_separation_policy,
     make_state_machine,
 )
 from swarmctl.agent.reference_selector import ReferenceSelector
+from swarmctl.agent.separation_policy import SeparationDirective, SeparationInputs
 from swarmctl.agent.setup import AgentSetup
 from swarmctl.agent.telemetry_publisher import ControlOutput, PlanningResult, TelemetryPublisher, TickSink, TickTiming
 from swarmctl.agent.world_model import FLOWN_BY_AGENT, WorldModel
@@ -53,7 +54,6 @@ from swarmctl.core.types import (
     Plan,
     PlanStatus,
     PredictedPath,
-    Reference,
     TickRecord,
     VehicleState,
 )
@@ -103,7 +103,8 @@ class Agent:
         self._world_model = WorldModel(
             setup.agent, setup.peers, setup.separation, bus, setup.params.rate_hz, self._note
         )
-        self._coordination = make_coordination(setup, self._world_model, bus, self._note, stopwatch_ns)
+        self._separation = make_separation_policy(setup, self._world_model, bus, self._note, stopwatch_ns)
+        self._directive = SeparationDirective()  # of the newest tick
         self._controller, self._transit = make_controllers(setup, stopwatch_ns)
         self._observer = make_estimator(setup)
         self._predictor = Predictor(setup.vehicle_model)
@@ -121,7 +122,7 @@ class Agent:
             setup.agent,
             setup.boot_id,
             setup.sysid,
-            setup.uses_commitments,
+            self._separation.uses_commitments,
             autopilot,
             self._world_model.paths,
             bus,
@@ -138,7 +139,6 @@ class Agent:
             barrier_ms=0.0,
             send_ms=0.0,
         )
-        self._commitment_ns = 0  # time spent on coordination in the last tick
         self._gaps = self._jumps = 0  # setpoint gaps and estimate jumps already reported
         self._announced: tuple[Phase, Mode, FlightMode] | None = None
         self._alerts = Alerts()
@@ -178,9 +178,8 @@ class Agent:
 
     @property
     def commits_refused(self) -> int | None:
-        """Number of proposals withdrawn or expired; None unless separation is guaranteed."""
-        counts = None if self._coordination is None else self._coordination.counts
-        return None if counts is None else counts.withdrawn + counts.expired
+        """Number of proposals withdrawn or expired; None if separation works without proposals."""
+        return self._separation.commits_refused
 
     def ask(self, verb: str, now_us: int) -> None:
         """Apply an operator's command: hold, resume, land or rtl."""
@@ -212,9 +211,9 @@ class Agent:
         times = NO_TIMES if planning.plan is None else planning.plan.times
         self.timing = TickTiming(
             sense_ms=(sensed_ns - began_ns) * 1e-6,
-            setup_ms=(planned_ns - sensed_ns - self._commitment_ns) * 1e-6
+            setup_ms=(planned_ns - sensed_ns - self._directive.took_ns) * 1e-6
             - (times.spaces_us + times.solve_us + times.certify_us) * 1e-3,
-            commitment_ms=self._commitment_ns * 1e-6,
+            commitment_ms=self._directive.took_ns * 1e-6,
             spaces_ms=times.spaces_us * 1e-3,
             solve_ms=times.solve_us * 1e-3,
             certify_ms=times.certify_us * 1e-3,
@@ -254,8 +253,7 @@ class Agent:
     def _listen(self, now_us: int) -> None:
         for verb in self._world_model.listen(self._clock.utc_us()):
             self.ask(verb, now_us)
-        if self._coordination is not None:
-            self._coordination.receive(self._clock.utc_us())
+        self._separation.receive(self._clock.utc_us())
 
     def _sense(self, now_us: int) -> VehicleState | None:
         state = self._autopilot.poll(now_us)
@@ -287,10 +285,9 @@ class Agent:
     # -- plan ---------------------------------------------------------------------------------------------------------
 
     def _plan(self, now_us: int, state: VehicleState | None) -> PlanningResult:
-        self._commitment_ns = 0
         if state is None or not self._fresh(now_us, state):
-            if self._coordination is not None:  # the autopilot flies the vehicle, on stale setpoints or by its failsafe
-                self._coordination.idle(self._clock.utc_us(), state)
+            # the autopilot flies the vehicle, on stale setpoints or by its failsafe
+            self._directive = self._separation.idle(self._clock.utc_us(), state, ())
             return PlanningResult(start=None, plan=None, reference=None, keep_outs=[])
         estimate = self._observer.estimate
         act_us = now_us + self._predictor.delay_us
@@ -317,46 +314,46 @@ class Agent:
         grid = np.arange(self._controller.longest + 1, dtype=np.float64)
         ahead_s = self._predictor.delay_us * 1e-6 + dt_us * 1e-6 * grid
         reference, now_ref = self._reference_selector.reference(now_us, self._clock.utc_us(), ahead_s)
-        committed = self._coordinated(now_us, state, flies)
+        directive = self._directive = self._separate(now_us, state, keep_outs, flies)
         if not flies:
             return PlanningResult(start=start, plan=None, reference=now_ref, keep_outs=keep_outs)
-        if committed is not None:
-            reference = committed
+        if directive.reference is not None:
+            reference = directive.reference
         guess = self._plan_buffer.guess_ned_m(act_us)
         controller = self._controller if self._state_machine.phase is Phase.TRACK else self._transit
-        kept = tuple(keep_outs) if committed is None else ()  # a committed trajectory keeps clear of them already
         plan = controller.plan(
             Problem(
                 start=start,
                 reference=reference,
                 disturbance_ned_m_s2=estimate.disturbance_ned_m_s2,
-                keep_outs=kept,
+                keep_outs=directive.keep_outs,
                 guess_ned_m=guess,
             )
         )
         return PlanningResult(start=start, plan=plan, reference=now_ref, keep_outs=keep_outs)
 
-    def _coordinated(self, now_us: int, state: VehicleState, flies: bool) -> Reference | None:
-        """Return the committed trajectory over the horizon from when the setpoint acts; None if there is none."""
-        if self._coordination is None:
-            return None
-        utc_us, began_ns = self._clock.utc_us(), self._stopwatch_ns()
+    def _separate(self, now_us: int, state: VehicleState, keep_outs: list[KeepOut], flies: bool) -> SeparationDirective:
+        """Return this tick's directive; its reference begins where the setpoint acts."""
+        utc_us = self._clock.utc_us()
         if not (flies and self._state_machine.had_control) or self._decision.mode in _DEVIATING_MODES:
-            self._coordination.idle(utc_us, state)
-            return None
-        self._coordination.step(
-            utc_us, state, self._state_machine.phase, self._reference_selector.desired(now_us, utc_us)
-        )
-        self._commitment_ns = self._stopwatch_ns() - began_ns
+            return self._separation.idle(utc_us, state, keep_outs)
         act_us = utc_us + self._predictor.delay_us
-        pos, vel = self._coordination.follow(act_us + np.arange(self._controller.longest + 1) * self._controller.dt_us)
-        return Reference(pos, vel, self._setup.mission.yaw_rad)
+        return self._separation.step(
+            SeparationInputs(
+                utc_us=utc_us,
+                state=state,
+                phase=self._state_machine.phase,
+                desired=self._reference_selector.desired(now_us, utc_us),
+                horizon_utc_us=act_us + np.arange(self._controller.longest + 1) * self._controller.dt_us,
+                keep_outs=keep_outs,
+            )
+        )
 
     def _detect_deadlock(self, now_us: int, state: VehicleState, keep_outs: list[KeepOut], flies: bool) -> None:
         if not (flies and self._state_machine.had_control):
             self._reference_selector.reset(now_us)
             return
-        known = [*keep_outs, *(self._coordination.lost_peer_keep_outs if self._coordination else ())]
+        known = [*keep_outs, *self._directive.lost_peer_keep_outs]
         landmarks = self._world_model.landmarks
         deadlock = self._reference_selector.update(now_us, self._clock.utc_us(), state.pos_ned_m, known, landmarks)
         if deadlock is not None:
@@ -428,7 +425,13 @@ class Agent:
         step = min(max(0, (act_us - flown.t0_us) // flown.dt_us), len(flown.virtual_control) - 1)
         estimate, flies = self._observer.estimate, self._decision.mode in FLOWN_BY_AGENT
         virtual_control = self._safety_filter.keep_apart(
-            now_us, self._utc(act_us), flown.virtual_control[step], start, estimate, flies
+            now_us,
+            self._utc(act_us),
+            flown.virtual_control[step],
+            start,
+            estimate,
+            flies,
+            self._directive.committed_peers,
         )
         yaw_rad, hover_01 = self._setup.mission.yaw_rad, estimate.hover_thrust_01
         setpoint = setpoint_of(virtual_control, yaw_rad, hover_01, now_us, self._setup.vehicle_model)
@@ -457,7 +460,7 @@ class Agent:
             armable=self._autopilot.armable,
             busy=self._commands.busy,
             mode=self._decision.mode,
-            unresponsive_peer=self._coordination is None and self._world_model.has_unresponsive_peer(utc_us),
+            unresponsive_peer=self._directive.unresponsive_peer,
             peers=self._world_model.peers(),
             others_ned_m=self._world_model.others_ned_m(utc_us),
             arm_in=None if dialect is None else dialect.arm_in,
@@ -513,8 +516,7 @@ class Agent:
     def _share(self, state: VehicleState | None, flown: Plan | None) -> None:
         if state is not None:
             self._bus.publish(topics.PATH, topics.encode_path(self._path(state, flown)))
-        if self._coordination is not None:
-            self._coordination.publish(self._clock.utc_us())
+        self._separation.publish(self._clock.utc_us())
 
     def _path(self, state: VehicleState, flown: Plan | None) -> PredictedPath:
         setup, seq = self._setup, self._publisher.seq

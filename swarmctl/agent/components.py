@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 from swarmctl.agent.coordination import Coordination
 from swarmctl.agent.safety_filter import SafetyFilter
+from swarmctl.agent.separation_policy import BestEffort, Guaranteed, SeparationPolicy
 from swarmctl.agent.setup import AgentSetup
 from swarmctl.agent.world_model import WorldModel
 from swarmctl.bus.peers import Bus
 from swarmctl.control.commit.trajectory_planner import following
-from swarmctl.control.controller import Controller, make_controller
+from swarmctl.control.controller import Controller, ControllerParams, make_controller
 from swarmctl.control.estimation.disturbance import DisturbanceObserver
 from swarmctl.control.estimation.state_filter import StateFilter
 from swarmctl.control.phases.state_machine import MissionStateMachine
@@ -20,40 +22,65 @@ Note = Callable[..., None]
 Stopwatch = Callable[[], int]  # returns a running time [ns]
 
 
+def _best_effort(
+    setup: AgentSetup, world_model: WorldModel, bus: Bus, note: Note, stopwatch_ns: Stopwatch
+) -> SeparationPolicy:
+    return BestEffort(world_model)
+
+
+def _guaranteed(
+    setup: AgentSetup, world_model: WorldModel, bus: Bus, note: Note, stopwatch_ns: Stopwatch
+) -> SeparationPolicy:
+    coordination = Coordination(
+        agent=setup.agent,
+        boot_id=setup.boot_id,
+        peers=setup.peers,
+        params=setup.params.commit,
+        mpc=setup.controller.mpc,
+        separation=setup.separation,
+        max_keep_outs=setup.max_keep_outs,
+        world_model=world_model,
+        bus=bus,
+        note=note,
+        stopwatch_ns=stopwatch_ns,
+        rate_hz=setup.params.rate_hz,
+    )
+    return Guaranteed(coordination, setup.mission.yaw_rad, stopwatch_ns)
+
+
+def _following(setup: AgentSetup) -> ControllerParams:
+    return setup.controller.model_copy(update={"mpc": following(setup.controller.mpc, setup.params.commit)})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SeparationMode:
+    """A row of the table of separation modes: the policy, and the controller that suits it."""
+
+    policy: Callable[[AgentSetup, WorldModel, Bus, Note, Stopwatch], SeparationPolicy]
+    controller: Callable[[AgentSetup], ControllerParams]
+
+
+SEPARATION_MODES = {  # by `separation.mode`
+    "best_effort": SeparationMode(policy=_best_effort, controller=lambda setup: setup.controller),
+    "guaranteed": SeparationMode(policy=_guaranteed, controller=_following),
+}
+
+
+def make_separation_policy(
+    setup: AgentSetup, world_model: WorldModel, bus: Bus, note: Note, stopwatch_ns: Stopwatch
+) -> SeparationPolicy:
+    """Return the policy that keeps the agent apart from its peers."""
+    return SEPARATION_MODES[setup.separation.mode].policy(setup, world_model, bus, note, stopwatch_ns)
+
+
 def make_controllers(setup: AgentSetup, stopwatch_ns: Stopwatch) -> tuple[Controller, Controller]:
     """Return the controller for the mission and the one for the transits to the start and to the landing place."""
-    params, rest = (
-        setup.controller,
-        (setup.vehicle_model, setup.separation, setup.agent, setup.max_keep_outs, stopwatch_ns),
-    )
-    if setup.uses_commitments:
-        params = params.model_copy(update={"mpc": following(params.mpc, setup.params.commit)})
+    params = SEPARATION_MODES[setup.separation.mode].controller(setup)
+    rest = setup.vehicle_model, setup.separation, setup.agent, setup.max_keep_outs, stopwatch_ns
     mission = make_controller(params, *rest)
     if params.kind != "open_loop":
         return mission, mission
     return mission, make_controller(params.model_copy(update={"kind": "dmpc"}), *rest)  # open loop ignores references
-
-
-def make_coordination(
-    setup: AgentSetup, world_model: WorldModel, bus: Bus, note: Note, stopwatch_ns: Stopwatch
-) -> Coordination | None:
-    """Return the coordination protocol; None unless separation is guaranteed."""
-    if not setup.uses_commitments:
-        return None
-    return Coordination(
-        setup.agent,
-        setup.boot_id,
-        setup.peers,
-        setup.params.commit,
-        setup.controller.mpc,
-        setup.separation,
-        setup.max_keep_outs,
-        world_model,
-        bus,
-        note,
-        stopwatch_ns,
-        setup.params.rate_hz,
-    )
 
 
 def make_estimator(setup: AgentSetup) -> DisturbanceObserver | StateFilter:
@@ -73,12 +100,13 @@ def make_safety_filter(setup: AgentSetup, world_model: WorldModel, note: Note, s
 
 def make_state_machine(setup: AgentSetup) -> MissionStateMachine:
     """Return the state machine of the agent's mission."""
-    reference = MissionReference(setup.mission, setup.starts_ned_m, setup.agent, setup.separation.planned_m)
+    budget = setup.separation.budget
+    reference = MissionReference(setup.mission, setup.starts_ned_m, setup.agent, budget.planned_m)
     return MissionStateMachine(
         setup.params.state_machine,
         setup.agent,
         len(setup.peers),
-        setup.separation.radius_m,
+        budget.landing_m(setup.params.state_machine.apart_m),
         setup.starts_ned_m[setup.agent],
         setup.mission.duration_s,
         reference,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -13,9 +13,9 @@ from swarmctl.bus.peers import Bus, agent_name
 from swarmctl.bus.trajectory_messages import PeerTrajectories, encode_trajectory_message
 from swarmctl.control.collision.separation import KeepOut, SeparationParams
 from swarmctl.control.commit.protocol import CommitCounts, Commitments
-from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference, Situation, committed_m
+from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference, Situation
 from swarmctl.control.mpc.swarm_mpc import MpcParams
-from swarmctl.core.trajectory import Times
+from swarmctl.core.trajectory import Times, Trajectory
 from swarmctl.core.trajectory_message import TrajectoryMessage
 from swarmctl.core.types import Array, Phase, VehicleState
 
@@ -37,10 +37,15 @@ class Coordination:
             `tracking_violation` when the vehicle leaves its committed trajectory by more than `tracking_m` plus half of
             the committed distance beyond touching bodies, and when it is back; and `commitments` with all counts when
             the autopilot or a pilot takes over.
+
+    Attributes:
+        committed_peers: by agent number, the trajectories that each peer relied on may follow.
+        lost_peer_keep_outs: keep-outs at the ends of lost peers' committed trajectories.
     """
 
     def __init__(
         self,
+        *,
         agent: int,
         boot_id: int,
         peers: list[int],
@@ -60,12 +65,13 @@ class Coordination:
         self._peer_trajectories, self._peers = PeerTrajectories(peers, rate_hz, refusals, attendance), frozenset(peers)
         self._note, self._seq, self._separation = note, 0, separation
         self._is_committed = False
-        self._allowed_m = separation.tracking_m + 0.5 * (committed_m(separation) - separation.body_m)
+        self._allowed_m = separation.budget.tracking_allowance_m
         self._is_violating, self._worst_m = False, 0.0
         self._absent_since_us: dict[int, int] = {}
         self._on_bus_since_us: int | None = None
         self._conflicting: set[int] = set()
-        self.lost_peer_keep_outs: list[KeepOut] = []  # at the ends of lost peers' trajectories
+        self.committed_peers: Mapping[int, Sequence[Trajectory]] = {}
+        self.lost_peer_keep_outs: list[KeepOut] = []
 
     @property
     def counts(self) -> CommitCounts:
@@ -95,7 +101,7 @@ class Coordination:
         lost_peers = [agent for agent in known.keys() - alive_peers if agent in committed]
         self.lost_peer_keep_outs = [keep_out for agent in lost_peers for keep_out in self._ends(known[agent])]
         taking_part = {a for a in alive_peers - absent - conflicting - deviating if a in committed}
-        self._world_model.peer_commitments = {agent: known[agent].followed for agent in taking_part}
+        self.committed_peers = {agent: known[agent].followed for agent in taking_part}
         partners = {agent: known[agent] for agent in taking_part}
         others = self._others(utc_us, state, phase, taking_part)
         commitments.evade(Situation(utc_us=utc_us, begin_us=utc_us, desired=desired, peers=partners, others=others))
@@ -111,7 +117,7 @@ class Coordination:
         """Commit nothing while a pilot or the autopilot flies, or the state is stale; peers are still acknowledged."""
         if self._is_committed:
             self._is_committed = False
-            self._world_model.peer_commitments, self.lost_peer_keep_outs = {}, []
+            self.committed_peers, self.lost_peer_keep_outs = {}, []
             self._note("commitments", **asdict(self.counts), worst_tracking_m=self._worst_m)
         self._commitments.end(None if state is None else state.pos_ned_m, utc_us)
 
@@ -165,16 +171,16 @@ class Coordination:
         return committing - {a for a, since_us in self._absent_since_us.items() if utc_us - since_us >= _LOST_AFTER_US}
 
     def _ends(self, message: TrajectoryMessage) -> list[KeepOut]:
-        p = self._separation
+        budget = self._separation.budget
         ends = [np.tile(trajectory.pos_ned_m[-1], (2, 1)) for trajectory in message.followed]
         return [
             KeepOut(
                 pos_ned_m=end,
-                radius_m=p.planned_m,
-                hard_min_distance_m=committed_m(p),
+                radius_m=budget.planned_m,
+                hard_min_distance_m=budget.committed_m,
                 any_height=False,
                 priority_id=message.agent,
-                downwash=p.downwash,
+                downwash=self._separation.downwash,
             )
             for end in ends
         ]
@@ -186,6 +192,5 @@ class Coordination:
         """
         steps, dt_us = self._commitments.steps, self._commitments.dt_us
         found = self._world_model.keep_outs(state.pos_ned_m, t0_utc_us, dt_us, steps, phase, taking_part)
-        # by which planned and hard minimum distance differ
-        spent_m = self._separation.tracking_m + self._separation.certify_slack_m
+        spent_m = self._separation.budget.planned_beyond_certified_m
         return [replace(k, hard_min_distance_m=max(k.hard_min_distance_m, k.radius_m - spent_m)) for k in found]

@@ -26,7 +26,7 @@ class ReferenceSelector:
 
     def __init__(self, setup: AgentSetup, state_machine: MissionStateMachine, note: Callable[..., None]) -> None:
         self._state_machine, self._note, self._yaw_rad = state_machine, note, setup.mission.yaw_rad
-        self._recovery = DeadlockRecovery(setup.params.deadlock, setup.agent, setup.separation.radius_m)
+        self._recovery = DeadlockRecovery(setup.params.deadlock, setup.agent, setup.separation.budget.radius_m)
         self._reported: Deadlock | None = None
 
     def update(

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 
 from swarmctl.agent.world_model import WorldModel
 from swarmctl.control.collision.barrier import Barrier, BarrierParams
 from swarmctl.control.estimation.disturbance import Estimate
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.problem import Start
+from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.types import Array
 
 _QUIET_US = 500_000  # without a change of the input, after which an encounter counts as over
@@ -43,9 +44,19 @@ class SafetyFilter:
         self.acts, self.took_ms = False, 0.0  # in the newest tick
 
     def keep_apart(
-        self, now_us: int, act_utc_us: int, virtual_control: Array, start: Start, estimate: Estimate, flies: bool
+        self,
+        now_us: int,
+        act_utc_us: int,
+        virtual_control: Array,
+        start: Start,
+        estimate: Estimate,
+        flies: bool,
+        committed_peers: Mapping[int, Sequence[Trajectory]],
     ) -> Array:
-        """Return the virtual controls (3,) to fly from `act_utc_us` on; unchanged ones unless the agent `flies`."""
+        """Return the virtual controls (3,) to fly from `act_utc_us` on; unchanged ones unless the agent `flies`.
+
+        Peers in `committed_peers` are placed on the trajectories they have committed to, others on their paths.
+        """
         began_ns, changed = self._stopwatch_ns(), None
         if self._params.enabled and flies:
             changed = self._barrier.filtered(
@@ -53,7 +64,9 @@ class SafetyFilter:
                 start,
                 estimate.disturbance_ned_m_s2,
                 estimate.hover_thrust_01,
-                self._world_model.bodies(start.pos_ned_m, act_utc_us, self._barrier.ahead_s, self._params.margin_m),
+                self._world_model.bodies(
+                    start.pos_ned_m, act_utc_us, self._barrier.ahead_s, self._params.margin_m, committed_peers
+                ),
             )
         self._count(now_us, changed is not None)
         self.took_ms = (self._stopwatch_ns() - began_ns) * 1e-6

@@ -64,8 +64,3 @@ class AgentSetup:
     def max_keep_outs(self) -> int:
         """Largest number of neighbours and obstacles that get constraint rows in one MPC problem."""
         return min(len(self.peers), self.separation.max_neighbours) + self.max_obstacles
-
-    @property
-    def uses_commitments(self) -> bool:
-        """Whether the agent flies only trajectories it has committed to."""
-        return self.separation.mode == "guaranteed"

@@ -62,7 +62,6 @@ class WorldModel:
         self._obstacles: tuple[Obstacle, ...] = ()
         self._obstacles_version: int | None = None
         self._seen: dict[int, Obstacle] = {}  # obstacles that have been visible, by identity
-        self.peer_commitments: Mapping[int, Sequence[Trajectory]] = {}  # what peers that have committed may follow
 
     def listen(self, utc_us: int) -> list[str]:
         """Process everything that has arrived; returns the operator's verbs for this agent."""
@@ -177,7 +176,14 @@ class WorldModel:
         """Return obstacles at rest that have been visible so far."""
         return [o for o in self._seen.values() if not o.vel_ned_m_s.any()]
 
-    def bodies(self, pos_ned_m: Array, act_utc_us: int, ahead_s: float, margin_m: float) -> list[Body]:
+    def bodies(
+        self,
+        pos_ned_m: Array,
+        act_utc_us: int,
+        ahead_s: float,
+        margin_m: float,
+        committed_peers: Mapping[int, Sequence[Trajectory]],
+    ) -> list[Body]:
         """Return the bodies not to touch `ahead_s` after `act_utc_us`: peers, and obstacles visible from `pos_ned_m`.
 
         A peer that has committed to trajectories is placed on them, however old its message; others on their path.
@@ -187,21 +193,23 @@ class WorldModel:
             act_utc_us: UTC at which the setpoint acts.
             ahead_s: time from then to the instant the bodies are valid for.
             margin_m: distance added to the size of every body.
+            committed_peers: trajectories that peers have committed to, by agent number.
         """
-        p, fresh_us = self._params, act_utc_us - round(self._params.lost_after_s * 1e6)
-        found: list[Body] = []
-        for agent, trajectories in self.peer_commitments.items():
+        budget, fresh_us = self._params.budget, act_utc_us - round(self._params.lost_after_s * 1e6)
+        found, committed_apart_m = list[Body](), budget.barrier_m(margin_m)
+        for agent, trajectories in committed_peers.items():
             share_01 = 0.5 if self._flies_itself(agent) else 1.0
             for pos, vel in (trajectory.at(act_utc_us + ahead_s * 1e6) for trajectory in trajectories):
-                found.append(Body(pos_ned_m=pos, vel_ned_m_s=vel, apart_m=p.body_m + margin_m, share_01=share_01))
+                found.append(Body(pos_ned_m=pos, vel_ned_m_s=vel, apart_m=committed_apart_m, share_01=share_01))
         for path in self.paths.latest():
-            if path.agent in self.peer_commitments:
+            if path.agent in committed_peers:
                 continue
             filters = self._flies_itself(path.agent) and path.t0_utc_us >= fresh_us
-            growth_m_s2 = 0.0 if self._phase(path.agent) is Phase.DONE else p.age_accel_m_s2
-            grows = (p.body_m + margin_m, growth_m_s2, p.age_margin_max_m)
-            found.append(body_of_peer(path, act_utc_us, ahead_s, *grows, filters, p.brake_m_s2))
-        apart_m = 0.5 * p.body_m + margin_m
+            age_s = max(0.0, (act_utc_us - path.t0_utc_us) * 1e-6)
+            age_margin_m = budget.age_margin_m(age_s, parked=self._phase(path.agent) is Phase.DONE)
+            apart_m = budget.barrier_peer_m(margin_m, path.radius_m, age_margin_m)
+            found.append(body_of_peer(path, act_utc_us, ahead_s, apart_m, filters, self._params.brake_m_s2))
+        apart_m = budget.barrier_obstacle_m(margin_m)
         return found + [body_of_obstacle(o, ahead_s, apart_m) for o in visible(self._obstacles, pos_ned_m)]
 
     def uses_commitments(self, agent: int) -> bool:

@@ -11,7 +11,6 @@ from swarmctl.check.link_facts import Ned, VehicleFacts
 from swarmctl.check.parameters import parameter_findings
 from swarmctl.check.vehicle import vehicle_findings
 from swarmctl.config import Config
-from swarmctl.control.collision.separation import required_radius_m
 from swarmctl.core.types import Landed
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, EXIT_START
 
@@ -175,7 +174,7 @@ def _radius(vehicles: Sequence[VehicleFacts], config: Config) -> list[Finding]:
     if len(vehicles) < 2 or not told:
         return []
     separation = config.separation
-    least_m = math.ceil(required_radius_m(separation, max(told)) * 100) / 100
+    least_m = math.ceil(separation.budget.required_m(max(told)) * 100) / 100
     found = f"separation.radius_m = {separation.radius_m:g}"
     wanted = (
         f"{least_m:.2f} m: body {separation.body_m:g}, tracking {separation.tracking_m:g}, estimator {max(told):.2f}"

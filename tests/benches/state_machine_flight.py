@@ -24,9 +24,8 @@ class Flight:
 
     def __init__(self, peers: int = 1, **params: Any) -> None:
         mission = MissionReference(MissionParams(kind="line"), START[None, :], 0)
-        self.state_machine = MissionStateMachine(
-            StateMachineParams(**params), 0, peers, RADIUS_M, START, DURATION_S, mission
-        )
+        told = StateMachineParams(**params)
+        self.state_machine = MissionStateMachine(told, 0, peers, RADIUS_M + told.apart_m, START, DURATION_S, mission)
         self.now_us = 0
         self.pos, self.vel = np.array([1.0, 0.0, 0.0]), np.zeros(3)
         self.armed, self.flight_mode, self.landed = False, FlightMode.HOLD, ON_GROUND

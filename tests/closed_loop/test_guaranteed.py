@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Set
+from collections.abc import Sequence, Set
 
 import pytest
 
@@ -11,9 +11,13 @@ from sitl.studies.campaign.flight import TrialFlight
 from sitl.studies.campaign.scenarios import layout_of
 from sitl.studies.campaign.trials import Cell, Trial
 from swarmctl.agent.coordination import Coordination
+from swarmctl.agent.separation_policy import Guaranteed
 from swarmctl.bus.peers import agent_name
 from swarmctl.config import load
-from swarmctl.core.types import Phase
+from swarmctl.control.collision.barrier import Barrier, BarrierParams, Body
+from swarmctl.control.collision.separation import SeparationParams
+from swarmctl.control.mpc.problem import Start
+from swarmctl.core.types import Array, Phase
 
 COMMITTED_M = 0.8
 TOUCH_M = 0.48
@@ -112,8 +116,8 @@ def committed_in_the_dark(sees: type[Coordination] = Coordination) -> int:
         if flight._tracking() and not began_us:
             began_us.append(flight.lockstep.clock.now_us())
             flight.lockstep.hub.fail()
-        coordinations = [agent._coordination for agent in flight._agents if agent is not None]
-        counts.append(sum(c.counts.committed for c in coordinations if c is not None))
+        policies = [agent._separation for agent in flight._agents if agent is not None]
+        counts.append(sum(p.coordination.counts.committed for p in policies if isinstance(p, Guaranteed)))
 
     while not began_us or flight.lockstep.clock.now_us() < began_us[0] + 2_000_000:
         watched()
@@ -181,3 +185,34 @@ def test_a_tick_with_a_stale_state_commits_nothing_and_spends_no_time_on_it() ->
         flight.step()
     assert agent.timing.commitment_ms == 0.0
     assert agent.timing.setup_ms >= 0.0
+
+
+@pytest.mark.parametrize("mode", ["guaranteed", "best_effort"])
+def test_the_safety_filter_places_peers_on_their_committed_trajectories(
+    mode: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A commitment holds however old its message is; control: a path's margin grows with the age the bus gives it."""
+    flight = Lockstep(load(None, ["swarm.agents=2", "sitl.start=air", f"separation.mode={mode}", "bus.delay_ms=60"]))
+    seen_m: list[float] = []
+    filtered = Barrier.filtered
+
+    def watched(
+        self: Barrier,
+        virtual_control: Array,
+        start: Start,
+        disturbance_ned_m_s2: Array,
+        hover_thrust_01: float,
+        bodies: Sequence[Body],
+    ) -> Array | None:
+        seen_m.extend(body.apart_m for body in bodies)
+        return filtered(self, virtual_control, start, disturbance_ned_m_s2, hover_thrust_01, bodies)
+
+    monkeypatch.setattr(Barrier, "filtered", watched)
+    while not flight.logs[0].rows or flight.logs[0].rows[-1]["phase"][0] != Phase.TRACK:
+        flight.step()
+    seen_m.clear()
+    for _ in range(25):
+        flight.step()
+    least_m = SeparationParams().body_m + BarrierParams().margin_m
+    assert len(seen_m) > 5
+    assert all(apart_m == least_m for apart_m in seen_m) is (mode == "guaranteed")

@@ -18,7 +18,6 @@ from sitl.studies.campaign.scenarios import SCENARIOS, Layout, layout_of, settin
 from sitl.studies.campaign.source import code_id
 from sitl.studies.campaign.trials import Cell, Row, Trial
 from swarmctl.config import Config, load
-from swarmctl.control.collision.separation import required_radius_m
 from swarmctl.core.types import Array, Phase, PlanStatus
 
 PHYSICS_HZ = 100  # thesis and crazyflie behave as at 250 Hz: a 3.3 m transition ends within 2 cm and 0.1 s of it
@@ -65,7 +64,7 @@ def config_of(cell: Cell, seed: int, layout: Layout, agents: int, extra: Sequenc
             *extra,
         ],
     )
-    needed_m = required_radius_m(config.separation, noise.accuracy_m)
+    needed_m = config.separation.budget.required_m(noise.accuracy_m)
     if config.separation.radius_m >= needed_m:
         return config
     wider = config.separation.model_copy(update={"radius_m": math.ceil(needed_m * 100.0) / 100.0})

@@ -57,7 +57,7 @@ class Pilot:
         hover_01 = PRESETS["thesis"].mass_kg * GRAVITY_M_S2 / PRESETS["thesis"].thrust_max_n
         self._observer = DisturbanceObserver(config.agent.disturbance, hover_01)
         starts = np.array(config.starts_ned_m())
-        self._reference = MissionReference(config.mission, starts, agent, config.separation.planned_m)
+        self._reference = MissionReference(config.mission, starts, agent, config.separation.budget.planned_m)
         self._virtual_control = np.array([0.0, 0.0, GRAVITY_M_S2])
         self._thrust_01 = hover_01
         brake_m_s2 = config.separation.brake_m_s2

@@ -73,8 +73,6 @@ def body_of_peer(
     act_utc_us: int,
     ahead_s: float,
     apart_m: float,
-    growth_m_s2: float,
-    growth_max_m: float,
     filters: bool,
     brake_m_s2: float,
 ) -> Body:
@@ -84,28 +82,24 @@ def body_of_peer(
         path: positions; beyond its end the peer is assumed to brake.
         act_utc_us: UTC at which the own command arrives at the vehicle.
         ahead_s: time after that at which the command takes effect.
-        apart_m: distance of two centres that touch, plus the margin.
-        growth_m_s2: acceleration off its path that the peer may have had since.
-        growth_max_m: limit of the distance that follows from it.
+        apart_m: distance of centres to keep, with all margins.
         filters: whether the peer takes its half.
         brake_m_s2: assumed braking, the same as in plans: no plan avoids what only the filter sees.
     """
-    age_s = max(0.0, (act_utc_us - path.t0_utc_us) * 1e-6)
     points, dt_s = path.pos_ned_m, path.dt_us * 1e-6
     at = ((act_utc_us - path.t0_utc_us) * 1e-6 + ahead_s) / dt_s
     last = len(points) - 1
-    grown_m = apart_m + path.radius_m + min(0.5 * growth_m_s2 * age_s * age_s, growth_max_m)
     share_01 = 0.5 if filters else 1.0
     if at >= last:
         a, b = points[last - 1].tolist(), points[last].tolist()
         pos, vel = _braked(b, tuple((q - p) / dt_s for p, q in zip(a, b, strict=True)), (at - last) * dt_s, brake_m_s2)
-        return Body(pos_ned_m=pos, vel_ned_m_s=vel, apart_m=grown_m, share_01=share_01)
+        return Body(pos_ned_m=pos, vel_ned_m_s=vel, apart_m=apart_m, share_01=share_01)
     low = max(0, int(at))
     a, b = points[low].tolist(), points[low + 1].tolist()
     part = at - low
     pos = tuple(p + part * (q - p) for p, q in zip(a, b, strict=True))
     vel = tuple((q - p) / dt_s for p, q in zip(a, b, strict=True))
-    return Body(pos_ned_m=pos, vel_ned_m_s=vel, apart_m=grown_m, share_01=share_01)
+    return Body(pos_ned_m=pos, vel_ned_m_s=vel, apart_m=apart_m, share_01=share_01)
 
 
 def _braked(pos: Vector, vel: Vector, t_s: float, brake_m_s2: float) -> tuple[Vector, Vector]:

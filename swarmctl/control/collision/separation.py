@@ -16,6 +16,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
+from swarmctl.control.collision.budget import SeparationBudget
 from swarmctl.control.mpc.axes import HalfSpaces
 from swarmctl.core.params import Params
 from swarmctl.core.trajectory import interpolate
@@ -51,9 +52,16 @@ class SeparationParams(Params):
     max_obstacles: int = Field(6, ge=1, le=50)  # the nearest get rows; all visible ones are certified against
 
     @property
-    def planned_m(self) -> float:
-        """Return the distance that plans keep [m]."""
-        return self.radius_m + self.tracking_m
+    def budget(self) -> SeparationBudget:
+        """Return all distances that follow from these parameters."""
+        return SeparationBudget(
+            body_m=self.body_m,
+            tracking_m=self.tracking_m,
+            radius_m=self.radius_m,
+            certify_slack_m=self.certify_slack_m,
+            age_accel_m_s2=self.age_accel_m_s2,
+            age_margin_max_m=self.age_margin_max_m,
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -78,18 +86,9 @@ class KeepOut:
         return math.dist(self.pos_ned_m[0, :axes], pos_ned_m[:axes])
 
 
-def required_radius_m(params: SeparationParams, accuracy_m: float) -> float:
-    """Return the distance of estimated positions [m] at which true bodies stay apart.
-
-    It adds body, tracking error, and twice the rms difference of two independent horizontal errors of rms `accuracy_m`
-    each. At 0.9 m and default GPS, 6 of 16 flights of real autopilots came closer than 0.6 m in truth.
-    """
-    return params.body_m + params.tracking_m + 2.0 * math.sqrt(2.0) * accuracy_m
-
-
 def radius_problem(params: SeparationParams, accuracy_m: float) -> str:
     """Say why the radius is too small for this accuracy, and what to do; "" when it is large enough or allowed."""
-    needed_m = required_radius_m(params, accuracy_m)
+    needed_m = params.budget.required_m(accuracy_m)
     if params.allow_small_radius or params.radius_m >= needed_m:
         return ""
     return (
@@ -154,12 +153,11 @@ def keep_out_of_peer(
         points: result of `align`, if it is known already.
     """
     age_s = max(0.0, (t0_utc_us - path.t0_utc_us) * 1e-6)
-    margin_m = 0.0 if parked else min(0.5 * params.age_accel_m_s2 * age_s * age_s, params.age_margin_max_m)
-    radius_m = params.planned_m + path.radius_m + margin_m
+    budget = params.budget
     return KeepOut(
         pos_ned_m=align(path, t0_utc_us, dt_us, steps, params.brake_m_s2) if points is None else points,
-        radius_m=radius_m,
-        hard_min_distance_m=params.radius_m + path.radius_m - params.certify_slack_m,
+        radius_m=budget.planned_peer_m(path.radius_m, budget.age_margin_m(age_s, parked)),
+        hard_min_distance_m=budget.certified_peer_m(path.radius_m),
         any_height=landing or (age_s > params.lost_after_s and not parked),
         priority_id=path.agent,
         downwash=params.downwash,
@@ -173,7 +171,7 @@ def keep_out_of_obstacle(obstacle: Obstacle, dt_us: int, steps: int, params: Sep
     return KeepOut(
         pos_ned_m=pos,
         radius_m=obstacle.keep_out_m,
-        hard_min_distance_m=obstacle.keep_out_m - params.certify_slack_m,
+        hard_min_distance_m=params.budget.certified_obstacle_m(obstacle.keep_out_m),
         any_height=obstacle.column,
         priority_id=-1,
     )

@@ -30,7 +30,6 @@ _RUN_UP_M_S2 = 0.8  # acceleration along a path up to its own speed
 _BRAKING_TAIL_S = 2.0  # part of the final braking that is checked against keep-outs
 _APPROACH_TOLERANCE_M = 0.001  # approach allowed to trajectories that are too close already
 _INTERPOLATION_MARGIN_M = 0.01  # kept by proposals on top: they are checked as straight lines between points
-_MAX_SLACK_01 = 1.0 / 3.0  # share of the distance beyond touching bodies that slack may use up
 
 
 class CommitParams(Params):
@@ -240,17 +239,17 @@ class TrajectoryPlanner:
     ) -> list[KeepOut]:
         if not trajectories:
             return []
-        p = self._separation
-        hard_min_distance_m = committed_m(p) + spare_m
+        budget = self._separation.budget
+        hard_min_distance_m = budget.committed_m + spare_m
         where = positions_at(trajectories, t0_utc_us + np.arange(steps + 1) * self.dt_us)
         return [
             KeepOut(
                 pos_ned_m=points,
-                radius_m=p.planned_m,
+                radius_m=budget.planned_m,
                 hard_min_distance_m=hard_min_distance_m,
                 any_height=False,
                 priority_id=agent,
-                downwash=p.downwash,
+                downwash=self._separation.downwash,
             )
             for points, agent in zip(where, agents, strict=True)
         ]
@@ -259,12 +258,6 @@ class TrajectoryPlanner:
 def following(mpc: MpcParams, params: CommitParams) -> MpcParams:
     """Return controller parameters for tracking commitments: z is stiffer than for a desired reference."""
     return mpc.model_copy(update={"z": params.follow_z})
-
-
-def committed_m(params: SeparationParams) -> float:
-    """Return the hard minimum distance between two committed trajectories [m]."""
-    slack_m = min(params.certify_slack_m, _MAX_SLACK_01 * max(0.0, params.radius_m - params.body_m))
-    return params.radius_m - slack_m
 
 
 def _with_run_up(desired: DesiredReference, speed_m_s: float) -> DesiredReference:

@@ -60,7 +60,7 @@ class MissionStateMachine:
         params: speeds, tolerances and timeouts.
         agent: index of this agent.
         peers: number of the other agents.
-        radius_m: separation that agents keep.
+        landing_m: level distance to others at which it may land in place.
         start_ned_m: (3,) start position, also the landing place.
         duration_s: duration of the tracked mission.
         reference: reference of the tracked mission.
@@ -82,13 +82,13 @@ class MissionStateMachine:
         params: StateMachineParams,
         agent: int,
         peers: int,
-        radius_m: float,
+        landing_m: float,
         start_ned_m: Array,
         duration_s: float,
         reference: MissionReference,
     ) -> None:
         self._params, self._agent, self._expected = params, agent, peers
-        self._apart_m = radius_m + params.apart_m
+        self._apart_m = landing_m
         self._start_ned_m, self._duration_us, self._reference = start_ned_m, round(duration_s * 1e6), reference
         self.phase = Phase.CONNECT
         self.ready_utc_us = 0

@@ -39,18 +39,18 @@ class Bench:
         separation = SeparationParams()
         self.world_model = WorldModel(0, [1], separation, self.bus, RATE_HZ, lambda *_, **__: None)
         self.coordination = Coordination(
-            0,
-            1,
-            [1],
-            CommitParams(),
-            MpcParams(),
-            separation,
-            2,
-            self.world_model,
-            self.bus,
-            lambda name, **fields: self.told.append((name, fields)),
-            lambda: 0,
-            RATE_HZ,
+            agent=0,
+            boot_id=1,
+            peers=[1],
+            params=CommitParams(),
+            mpc=MpcParams(),
+            separation=separation,
+            max_keep_outs=2,
+            world_model=self.world_model,
+            bus=self.bus,
+            note=lambda name, **fields: self.told.append((name, fields)),
+            stopwatch_ns=lambda: 0,
+            rate_hz=RATE_HZ,
         )
         self.seq = 0
 
@@ -142,7 +142,7 @@ def test_a_peer_is_lost_only_after_it_has_been_absent_for_some_ticks(bench: Benc
     bench.alive.discard(PEER)
     bench.fly(0.08)
     assert bench.committed == before, "tokens vanish one by one"
-    assert bench.world_model.peer_commitments == {}, "but its commitment is no longer relied on"
+    assert bench.coordination.committed_peers == {}, "but its commitment is no longer relied on"
     bench.fly(1.0)
     assert bench.committed > before
 
@@ -174,11 +174,11 @@ def test_an_agent_back_on_the_bus_takes_no_peer_for_lost_at_first(bench: Bench) 
 
 def test_a_deviating_peer_is_where_its_path_says(bench: Bench) -> None:
     bench.fly(0.5, each=bench.send)
-    assert set(bench.world_model.peer_commitments) == {1}
+    assert set(bench.coordination.committed_peers) == {1}
     aside = PLACE + np.array([0.0, 0.5, 0.0])
     bench.fly(0.5, each=lambda: bench.send(aside))
-    assert bench.world_model.peer_commitments == {}
-    (body,) = bench.world_model.bodies(HERE, bench.clock.utc_us(), 0.0, 0.0)
+    assert bench.coordination.committed_peers == {}
+    (body,) = bench.world_model.bodies(HERE, bench.clock.utc_us(), 0.0, 0.0, bench.coordination.committed_peers)
     assert body.pos_ned_m == pytest.approx(tuple(aside))
 
 
@@ -186,9 +186,9 @@ def test_the_margin_of_a_committed_peer_does_not_grow_with_age(bench: Bench) -> 
     bench.fly(0.5, each=bench.send)
     bench.fly(1.0)
     utc_us, apart_m = bench.clock.utc_us(), SeparationParams().body_m
-    assert {body.apart_m for body in bench.world_model.bodies(HERE, utc_us, 0.0, 0.0)} == {apart_m}
-    bench.world_model.peer_commitments = {}
-    (control,) = bench.world_model.bodies(HERE, utc_us, 0.0, 0.0)
+    bodies = bench.world_model.bodies(HERE, utc_us, 0.0, 0.0, bench.coordination.committed_peers)
+    assert {body.apart_m for body in bodies} == {apart_m}
+    (control,) = bench.world_model.bodies(HERE, utc_us, 0.0, 0.0, {})
     assert control.apart_m > apart_m + 0.9, "a path as old may have been left by a metre"
 
 
@@ -198,8 +198,8 @@ def test_the_certificate_against_a_stale_peer_has_all_of_its_margin(bench: Bench
     utc_us, params = bench.clock.utc_us(), SeparationParams()
     (kept,) = bench.coordination._others(utc_us, bench.state, Phase.TRACK, set())
     (control,) = bench.world_model.keep_outs(HERE, utc_us, 100_000, 5, Phase.TRACK)
-    assert control.hard_min_distance_m == params.radius_m - params.certify_slack_m, "which would not grow with age"
-    assert kept.hard_min_distance_m > params.planned_m + 0.5
+    assert control.hard_min_distance_m == params.budget.certified_m, "which would not grow with age"
+    assert kept.hard_min_distance_m > params.budget.planned_m + 0.5
 
 
 def test_an_agent_without_a_state_commits_nothing(bench: Bench) -> None:

@@ -96,7 +96,7 @@ def test_the_largest_list_of_obstacles_costs_a_fraction_of_a_tick() -> None:
     for _ in range(20):
         began_s = time.perf_counter()
         bench.world_model.keep_outs(HERE, bench.clock.utc_us(), 100_000, 25, Phase.TRACK)
-        bench.world_model.bodies(HERE, bench.clock.utc_us(), 0.1, 0.1)
+        bench.world_model.bodies(HERE, bench.clock.utc_us(), 0.1, 0.1, {})
         took_ms.append((time.perf_counter() - began_s) * 1e3)
     assert min(took_ms) < 3.0, "of 20"
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from swarmctl.control.collision.barrier import Barrier, BarrierParams, Body, body_of_obstacle, body_of_peer
-from swarmctl.control.collision.separation import align
+from swarmctl.control.collision.separation import SeparationParams, align
 from swarmctl.control.model import VehicleModelParams, acceleration
 from swarmctl.control.mpc.problem import Start
 from swarmctl.core.frames import GRAVITY_M_S2
@@ -18,6 +18,7 @@ from swarmctl.core.types import Array, Obstacle, PredictedPath
 PARAMS, MODEL = BarrierParams(), VehicleModelParams()
 DT_S, BODY_M, STILL = 0.02, 0.48, np.zeros(3)
 APART_M = BODY_M + PARAMS.margin_m
+BUDGET = SeparationParams(body_m=BODY_M).budget
 HOVER = np.array([0.0, 0.0, GRAVITY_M_S2])
 
 
@@ -215,7 +216,9 @@ def path(t0_us: int, vel: tuple[float, float, float] = (1.0, 0.0, 0.0), points: 
 
 
 def body(known: PredictedPath, act_us: int, ahead_s: float = 0.0, filters: bool = True) -> Body:
-    return body_of_peer(known, act_us, ahead_s, APART_M, 4.0, 1.0, filters, 2.0)
+    age_margin_m = BUDGET.age_margin_m(max(0.0, (act_us - known.t0_utc_us) * 1e-6), parked=False)
+    apart_m = BUDGET.barrier_peer_m(PARAMS.margin_m, known.radius_m, age_margin_m)
+    return body_of_peer(known, act_us, ahead_s, apart_m, filters, 2.0)
 
 
 def test_a_peer_is_predicted_to_when_the_command_takes_effect() -> None:

@@ -19,7 +19,6 @@ from swarmctl.control.collision.separation import (
     keep_out_of_obstacle,
     keep_out_of_peer,
     radius_problem,
-    required_radius_m,
     visible,
 )
 from swarmctl.control.mpc.axes import HalfSpaces
@@ -530,11 +529,11 @@ def test_in_space_a_climb_counts_as_progress() -> None:
 
 def test_the_required_radius_covers_bodies_tracking_and_two_position_errors() -> None:
     params = SeparationParams(radius_m=0.9, body_m=0.48, tracking_m=0.05)
-    assert required_radius_m(params, 0.0) == pytest.approx(0.53)
-    assert 1.2 < required_radius_m(params, 0.28) < 1.5  # of an autopilot on plain GPS, as flights of them suggest
+    assert params.budget.required_m(0.0) == pytest.approx(0.53)
+    assert 1.2 < params.budget.required_m(0.28) < 1.5  # of an autopilot on plain GPS, as flights of them suggest
     rng, accuracy_m = np.random.default_rng(2), 0.28
     errors = rng.normal(scale=accuracy_m / math.sqrt(2.0), size=(100_000, 2, 2))
-    apart = required_radius_m(params, accuracy_m) - 0.05 - np.linalg.norm(errors[:, 0] - errors[:, 1], axis=1)
+    apart = params.budget.required_m(accuracy_m) - 0.05 - np.linalg.norm(errors[:, 0] - errors[:, 1], axis=1)
     assert (apart < params.body_m).mean() < 0.03
 
 
