@@ -107,12 +107,12 @@ def test_after_a_bad_plan_the_last_good_one_is_kept_where_it_is_free(buffer: Pla
 
 
 @pytest.mark.parametrize("status", BAD)
-def test_it_is_dropped_when_braking_comes_less_close(replay: PlanBuffer, status: PlanStatus) -> None:
+def test_a_plan_is_dropped_when_braking_comes_less_close(buffer: PlanBuffer, status: PlanStatus) -> None:
     """The plan flies through the wall at 2 m; braking stays 1.8 m away from it."""
-    replay.take(moving(), start_at(0), [], rest)
-    replay.take(moving(100_000, status=status), start_at(100_000), [wall(2.0)], rest)
-    assert replay.plan is None
-    assert replay.guess_ned_m(100_000) is None
+    buffer.take(moving(), start_at(0), [], rest)
+    buffer.take(moving(100_000, status=status), start_at(100_000), [wall(2.0)], rest)
+    assert buffer.plan is None
+    assert buffer.guess_ned_m(100_000) is None
 
 
 @pytest.mark.parametrize(("braking_to_m", "kept"), [(0.85, True), (0.54, True), (0.53, False), (0.1, False)])

@@ -34,7 +34,16 @@ seq = 0
 while True:
     seq += 1
     t0_us = time.time_ns() // 1000 + 40_000
-    bus.publish(PATH, encode_path(PredictedPath(1, int(sys.argv[2]), seq, t0_us, 100_000, 0.0, np.zeros((5, 3)))))
+    path = PredictedPath(
+        agent=1,
+        boot_id=int(sys.argv[2]),
+        seq=seq,
+        t0_utc_us=t0_us,
+        dt_us=100_000,
+        radius_m=0.0,
+        pos_ned_m=np.zeros((5, 3)),
+    )
+    bus.publish(PATH, encode_path(path))
     time.sleep(0.02)
 """
 
