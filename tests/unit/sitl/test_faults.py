@@ -19,7 +19,7 @@ from sitl.fault_socket import ControlSocket, handle
 from sitl.net.lossy import LossyLink
 from swarmctl.core.simulated import FAULTS, FaultParams
 from swarmctl.errors import ConfigError, StartError
-from swarmctl.mavlink.codec import message_id
+from swarmctl.mavlink.framing import message_id
 from swarmctl.mavlink.transport import Datagram
 from swarmctl.ops.fault import inject, parse_fault
 from swarmctl.ops.operator import RunningLaunch
