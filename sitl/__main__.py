@@ -12,6 +12,7 @@ import argparse
 import gc
 import json
 import math
+import signal
 import socket
 import sys
 from collections.abc import Callable
@@ -220,14 +221,14 @@ def _run(options: argparse.Namespace) -> int:
     from sitl.fault_socket import ControlSocket
     from sitl.world import SitlWorld
     from swarmctl.errors import ConfigError
+    from swarmctl.process_lifetime import StopRequest
 
     params = _params(options)
     count = params.vehicles
     if options.remote_ports and len(options.remote_ports) != count:
         given = ",".join(str(p) for p in options.remote_ports)
         raise ConfigError("sitl", [f"remote-ports = {given}: allowed: one port for each of {count} vehicles"])
-    stop = realtime.StopRequest()
-    stop.install()
+    stop = StopRequest(signal.SIGINT, signal.SIGTERM)
     truth = realtime.TruthFile(options.truth) if options.truth else None
     links, places = _tcp_links(options) if options.tcp_port else _udp_links(options)
     gcs_links, gcs_place = _gcs_links(options)
