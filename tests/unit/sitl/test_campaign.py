@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +23,7 @@ from sitl.studies.campaign.worker_pool import on_cluster, on_this_machine
 from swarmctl.bus import topics
 from swarmctl.bus.peers import LEASE_US, LocalHub, agent_name
 from swarmctl.config import load
+from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.errors import ConfigError, StartError
 
 CELL = Cell(scenario="swap", agents=3, delay_ms=0.0, loss=0.0, noise="exact", wind_m_s=0.0, protections="default")
@@ -116,8 +116,7 @@ def test_every_scenario_is_a_valid_configuration(scenario: str) -> None:
         config = config_of(cell, seed, layout, agents)
         assert config.sitl.start == "air"
         assert config.bus.delay_ms == 50.0
-        apart = [np.linalg.norm(a - b) for a, b in itertools.combinations(layout.starts_ned_m, 2)]
-        assert min(apart) >= config.separation.radius_m
+        assert closest_pair_m(np.array([layout.starts_ned_m]))[0] >= config.separation.radius_m
         if scenario == "forest":
             assert all(o.keep_out_m - config.separation.certify_slack_m > o.radius_m + 0.075 for o in config.obstacles)
 
