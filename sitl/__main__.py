@@ -222,6 +222,7 @@ def _run(options: argparse.Namespace) -> int:
     from sitl.world import SitlWorld
     from swarmctl.errors import ConfigError
     from swarmctl.process_lifetime import StopRequest
+    from swarmctl.telemetry.event_log import EventLog
 
     params = _params(options)
     count = params.vehicles
@@ -236,7 +237,10 @@ def _run(options: argparse.Namespace) -> int:
     if options.speed != 1.0:
         world.scale_timeouts(options.speed)
     if options.events:
-        world.faults.on_event = realtime.EventFile(options.events).write
+        log = EventLog(options.events, "sitl")
+        world.faults.on_event = lambda name, since_boot_us, fields: log.write(
+            name, since_boot_us=since_boot_us, **fields
+        )
     for i, place in enumerate(places):
         x, y, z = params.spawn_ned_m[i]
         print(f"vehicle sysid={params.sysid_base + i} {place} spawn={x:g},{y:g},{z:g}")

@@ -7,20 +7,19 @@ time may run faster than the wall clock; with a gate it waits for its clients.
 
 from __future__ import annotations
 
-import contextlib
-import json
 import socket
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 from sitl.fault_socket import ControlSocket
 from sitl.world import SitlWorld
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.mavlink.transport import bind_udp
 from swarmctl.process_lifetime import StopRequest
+from swarmctl.wall_clock import monotonic_us
 
 HOST = "127.0.0.1"
 STALL_US = 200_000
@@ -74,24 +73,6 @@ class TruthFile:
         except OSError as error:
             self._broken = self._broken or error
         return f"truth file: {self._broken}" if self._broken else ""
-
-
-def monotonic_us() -> int:
-    """Return CLOCK_MONOTONIC [us], which is comparable between processes of this host."""
-    return time.monotonic_ns() // 1000
-
-
-class EventFile:
-    """Writes faults at begin and end, one JSON object per line; a full disk loses events, never the flight."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def write(self, name: str, since_boot_us: int, fields: dict[str, Any]) -> None:
-        """Append one event."""
-        stamp = {"utc_us": time.time_ns() // 1000, "t_us": monotonic_us(), "source": "sitl", "event": name}
-        with contextlib.suppress(OSError), self._path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps({**stamp, "since_boot_us": since_boot_us, **fields}) + "\n")
 
 
 class Gate:

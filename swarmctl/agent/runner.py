@@ -28,36 +28,11 @@ from swarmctl.mavlink.mavsdk_commands import MavsdkCommands
 from swarmctl.mavlink.transport import open_transport
 from swarmctl.process_lifetime import StopRequest
 from swarmctl.telemetry.recorder import Recorder
+from swarmctl.wall_clock import WallClock
 
 _LOOPBACK = "127.0.0.1"
-_UTC_SLEW_01 = 0.01  # largest correction of UTC per elapsed time
 _LINGER_S = 1.0  # time the process lives on after its end, so that peers receive the last status
 _VEHICLE_LOST_S = 15.0  # time without any vehicle state after which the process gives up
-
-
-class WallClock:
-    """Reads the host's clocks. UTC steps are slewed, so that in flight time neither jumps nor runs backwards."""
-
-    def __init__(self) -> None:
-        self._read_ns = time.monotonic_ns()
-        self._offset_ns = time.time_ns() - self._read_ns
-
-    def now_us(self) -> int:
-        return time.monotonic_ns() // 1000
-
-    def utc_us(self) -> int:
-        now_ns = time.monotonic_ns()
-        most_ns = int((now_ns - self._read_ns) * _UTC_SLEW_01)
-        off_ns = time.time_ns() - now_ns - self._offset_ns
-        self._offset_ns += min(most_ns, max(-most_ns, off_ns))
-        self._read_ns = now_ns
-        return (now_ns + self._offset_ns) // 1000
-
-    def sleep_until(self, t_us: int) -> None:
-        """Return at monotonic time `t_us`, or at once when it has passed."""
-        left_us = t_us - self.now_us()
-        if left_us > 0:
-            time.sleep(left_us * 1e-6)
 
 
 class Pace:

@@ -15,11 +15,12 @@ from typing import Any, NamedTuple
 from pymavlink.dialects.v20 import development as mavlink
 
 from swarmctl.check.link_statistics import Answer, FrameStatistics
-from swarmctl.check.listener import NOWHERE, Address, Listener, ReceivedDatagram, monotonic_us
+from swarmctl.check.listener import NOWHERE, Address, Listener, ReceivedDatagram
 from swarmctl.check.parameter_reader import ParameterReader
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.dialects import DIALECTS, Dialect
 from swarmctl.mavlink.framing import frames
+from swarmctl.wall_clock import monotonic_us
 
 SCANNER_COMPID = 192  # MAV_COMP_ID_ONBOARD_COMPUTER2: keeps sequence numbers apart from those of a flying agent
 AUTOPILOT_COMPID = 1

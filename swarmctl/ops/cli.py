@@ -103,8 +103,9 @@ def launch(
     from swarmctl.config import load
     from swarmctl.ops.launch import LaunchOptions
     from swarmctl.ops.launch import launch as fly
+    from swarmctl.telemetry.recordings import has_display
 
-    options = LaunchOptions(run_dir, _has_display() if view is None else view)
+    options = LaunchOptions(run_dir, has_display() if view is None else view)
     return fly(load(config, _overrides(agents, duration, seed, sets)), options)
 
 
@@ -394,10 +395,6 @@ def _overrides(agents: int | None, duration: float | None, seed: int | None, set
     """Return the options as `--set` items, the named ones last so that they take precedence."""
     named = (("swarm.agents", agents), ("mission.duration_s", duration), ("seed", seed))
     return [*(sets or ()), *(f"{key}={value}" for key, value in named if value is not None)]
-
-
-def _has_display() -> bool:
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def _show(statuses: dict[int, StatusMessage], agents: range) -> None:

@@ -35,8 +35,9 @@ from swarmctl.ops.processes import (
 )
 from swarmctl.ops.status_table import Display, open_display
 from swarmctl.ops.summary import sum_up
-from swarmctl.ops.supervisor import EventLog, FlightSupervisor, Services
+from swarmctl.ops.supervisor import FlightSupervisor, Services
 from swarmctl.process_lifetime import StopRequest
+from swarmctl.telemetry.event_log import EventLog
 
 _BUS_S = 20.0  # timeout for the router to answer
 _BUS_TRY_MS = 500
@@ -105,7 +106,7 @@ class Launcher(Services):
         self._reserved = reserved
         self._display = display
         self.context = RunContext(run_name(config.name), f"{SCHEME}{self._socket_dir}/bus.sock", directory)
-        self.log = EventLog(directory / "launch.events.jsonl")
+        self.log = EventLog(directory / "launch.events.jsonl", "launch")
         self.children: dict[str, Child] = {}
 
     def start(self) -> None:

@@ -18,7 +18,7 @@ from pathlib import Path
 from swarmctl.bus.zenoh_bus import SCHEME
 from swarmctl.check.change import Change
 from swarmctl.check.link_facts import VehicleFacts
-from swarmctl.check.listener import NOWHERE, Address, Listener, UdpListener, monotonic_us, open_listener
+from swarmctl.check.listener import NOWHERE, Address, Listener, UdpListener, open_listener
 from swarmctl.check.parameters import Number, changes, names_to_read, unchangeable
 from swarmctl.check.scan_facts import facts_of, unreached
 from swarmctl.check.scanner import VehicleScan, run_scans
@@ -30,6 +30,7 @@ from swarmctl.errors import StartError
 from swarmctl.ops.preflight import claim_ports
 from swarmctl.ops.processes import Child, RunContext, end_all, run_name, sitl_command
 from swarmctl.process_lifetime import StopRequest
+from swarmctl.wall_clock import monotonic_us
 
 _CONNECT_S = 5.0  # heartbeats come once a second
 _SIMULATOR_S = 20.0  # to start on a busy machine

@@ -9,10 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from swarmctl.agent.runner import Pace, WallClock, _check_vehicle_silence
+from swarmctl.agent.runner import Pace, _check_vehicle_silence
 from swarmctl.config import load
 from swarmctl.errors import MissionError, StartError
 from swarmctl.process_lifetime import StopRequest
+from swarmctl.wall_clock import WallClock
 
 MS = 1_000
 

@@ -75,7 +75,7 @@ def test_every_problem_at_once_and_nothing_kept(monkeypatch: pytest.MonkeyPatch)
         return found
 
     monkeypatch.setattr(importlib.metadata, "version", version)
-    monkeypatch.setattr(preflight, "_free_view_port", lambda _: 0)
+    monkeypatch.setattr(preflight, "free_view_ports", lambda _: iter(()))
     with pytest.raises(StartError) as caught:
         preflight.inspect(load(None, ["telemetry.port=9876"]))
     lines = str(caught.value).splitlines()

@@ -16,6 +16,7 @@ from pymavlink.dialects.v20 import development as mav
 
 from sitl import realtime
 from swarmctl.process_lifetime import StopRequest
+from swarmctl.wall_clock import monotonic_us
 from tests.benches.flown_world import OFFBOARD, FlownWorld
 
 
@@ -28,7 +29,7 @@ class Clocked:
         self._stop, self._steps = stop, steps
 
     def step(self, now_us: int) -> None:
-        self.rows.append((realtime.monotonic_us(), now_us))
+        self.rows.append((monotonic_us(), now_us))
         if len(self.rows) >= self._steps:
             self._stop.ask()
 
@@ -116,7 +117,7 @@ def gated(flown: FlownWorld, every_s: float, count: int, *, gate: bool) -> int:
     client = Client(flown, every_s, count, stop)
     world: Any = flown.world
     # continue the world's own clock from its newest step
-    base_us, start_us = flown.clock.now_us(), realtime.monotonic_us()
+    base_us, start_us = flown.clock.now_us(), monotonic_us()
 
     class Shifted:
         """The same world on the wall clock's time axis."""
