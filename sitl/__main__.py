@@ -131,6 +131,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--wind", dest="mean_wind", type=_wind, metavar="N,E,D", help="mean wind, m/s NED; see also --set")
     add("--turbulence", type=_real(0, 30), metavar="M/S", help="Dryden: wind at 6 m height; light is 7.7")
     add("--set", action="append", default=[], dest="sets", metavar="KEY=VALUE", help=_SET_HELP)
+    add("--realism-json", metavar="JSON", help="all of wind, battery, rotors and faults, as a launch gives them")
     add("--control", type=Path, metavar="SOCKET", help="take faults here; see swarmctl fault")
     add("--events", type=Path, metavar="FILE", help="append faults as JSON lines")
     add("--stats", type=Path, metavar="FILE", help="write what the loop has done at the end, as JSON")
@@ -195,6 +196,8 @@ def _realism(options: argparse.Namespace) -> RealismParams:
     """Return wind, battery, rotors and faults, parsed and refused as in the configuration of a run."""
     from swarmctl.core.simulated import RealismParams
 
+    if options.realism_json:
+        return RealismParams.model_validate_json(options.realism_json)
     sets = [f"wind.mean_ned_m_s={list(options.mean_wind)}"] if options.mean_wind else []
     sets += [f"wind.turbulence_m_s={options.turbulence!r}"] if options.turbulence is not None else []
     sets += options.sets
