@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.stats import binomtest
 
 from sitl.lockstep import Lockstep
 from sitl.studies.campaign.collision_monitor import CollisionMonitor, Solid
@@ -14,7 +13,6 @@ from sitl.studies.campaign.command import main
 from sitl.studies.campaign.events import Appearance
 from sitl.studies.campaign.factors import NOISES, PROTECTIONS
 from sitl.studies.campaign.flight import config_of
-from sitl.studies.campaign.intervals import clopper_pearson
 from sitl.studies.campaign.layouts import least_sum_m
 from sitl.studies.campaign.scenarios import SCENARIOS, layout_of
 from sitl.studies.campaign.store import Store
@@ -37,12 +35,6 @@ def row_of(trial: Trial, code: str = "this") -> Row:
 
 def monitor(goals: np.ndarray | None = None) -> CollisionMonitor:
     return CollisionMonitor(0.5, goals, 0.1, np.array([True, True]))
-
-
-@pytest.mark.parametrize(("hits", "trials"), [(0, 1), (1, 1), (0, 100), (3, 100), (50, 100), (100, 100), (7, 20)])
-def test_intervals_are_those_of_scipy(hits: int, trials: int) -> None:
-    exact = binomtest(hits, trials).proportion_ci(0.95, method="exact")
-    assert clopper_pearson(hits, trials) == pytest.approx((exact.low, exact.high), abs=1e-9)
 
 
 def test_bodies_that_pass_between_two_samples_have_touched() -> None:
