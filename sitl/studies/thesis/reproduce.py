@@ -159,11 +159,13 @@ def _make(directory: Path) -> None:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="swarmctl reproduce", description=__doc__.splitlines()[0])
-    parser.add_argument("--only", action="append", default=[], metavar="FLIGHT")
-    parser.add_argument("--plant", action="store_true")
-    parser.add_argument("--full", action="store_true")
-    parser.add_argument("--out", type=Path, metavar="DIR")
-    parser.add_argument("--jobs", type=int, metavar="N", default=min(8, len(os.sched_getaffinity(0))))
+    add = parser.add_argument
+    add("--only", action="append", default=[], metavar="FLIGHT", help="one experiment; repeatable")
+    add("--plant", action="store_true", help="fly the model only, as the thesis did")
+    add("--full", action="store_true", help="fly the full MAVLink loop only")
+    add("--out", type=Path, metavar="DIR", help="folder to write; default runs/<UTC>-reproduce")
+    processes = min(8, len(os.sched_getaffinity(0)))
+    add("--jobs", type=int, metavar="N", default=processes, help="processes; default: one per processor, at most 8")
     return parser
 
 
