@@ -12,6 +12,7 @@ import argparse
 import gc
 import json
 import math
+import signal
 import socket
 import sys
 from collections.abc import Callable
@@ -130,6 +131,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--wind", dest="mean_wind", type=_wind, metavar="N,E,D", help="mean wind, m/s NED; see also --set")
     add("--turbulence", type=_real(0, 30), metavar="M/S", help="Dryden: wind at 6 m height; light is 7.7")
     add("--set", action="append", default=[], dest="sets", metavar="KEY=VALUE", help=_SET_HELP)
+    add("--realism-json", metavar="JSON", help="all of wind, battery, rotors and faults, as a launch gives them")
     add("--control", type=Path, metavar="SOCKET", help="take faults here; see swarmctl fault")
     add("--events", type=Path, metavar="FILE", help="append faults as JSON lines")
     add("--stats", type=Path, metavar="FILE", help="write what the loop has done at the end, as JSON")
@@ -194,6 +196,8 @@ def _realism(options: argparse.Namespace) -> RealismParams:
     """Return wind, battery, rotors and faults, parsed and refused as in the configuration of a run."""
     from swarmctl.core.simulated import RealismParams
 
+    if options.realism_json:
+        return RealismParams.model_validate_json(options.realism_json)
     sets = [f"wind.mean_ned_m_s={list(options.mean_wind)}"] if options.mean_wind else []
     sets += [f"wind.turbulence_m_s={options.turbulence!r}"] if options.turbulence is not None else []
     sets += options.sets
@@ -220,14 +224,15 @@ def _run(options: argparse.Namespace) -> int:
     from sitl.fault_socket import ControlSocket
     from sitl.world import SitlWorld
     from swarmctl.errors import ConfigError
+    from swarmctl.process_lifetime import StopRequest
+    from swarmctl.telemetry.event_log import EventLog
 
     params = _params(options)
     count = params.vehicles
     if options.remote_ports and len(options.remote_ports) != count:
         given = ",".join(str(p) for p in options.remote_ports)
         raise ConfigError("sitl", [f"remote-ports = {given}: allowed: one port for each of {count} vehicles"])
-    stop = realtime.StopRequest()
-    stop.install()
+    stop = StopRequest(signal.SIGINT, signal.SIGTERM)
     truth = realtime.TruthFile(options.truth) if options.truth else None
     links, places = _tcp_links(options) if options.tcp_port else _udp_links(options)
     gcs_links, gcs_place = _gcs_links(options)
@@ -235,7 +240,10 @@ def _run(options: argparse.Namespace) -> int:
     if options.speed != 1.0:
         world.scale_timeouts(options.speed)
     if options.events:
-        world.faults.on_event = realtime.EventFile(options.events).write
+        log = EventLog(options.events, "sitl")
+        world.faults.on_event = lambda name, since_boot_us, fields: log.write(
+            name, since_boot_us=since_boot_us, **fields
+        )
     for i, place in enumerate(places):
         x, y, z = params.spawn_ned_m[i]
         print(f"vehicle sysid={params.sysid_base + i} {place} spawn={x:g},{y:g},{z:g}")

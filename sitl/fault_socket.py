@@ -15,6 +15,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from sitl.world import SitlWorld
+from swarmctl.core.params import explained
 from swarmctl.core.simulated import FaultParams
 from swarmctl.errors import ConfigError
 from swarmctl.process_lifetime import remove_socket
@@ -79,7 +80,7 @@ def handle(request: bytes, world: SitlWorld) -> dict[str, Any]:
     try:
         fault = FaultParams.model_validate(wanted)
     except ValidationError as error:
-        return _refused([_explain(dict(e)) for e in error.errors()])
+        return _refused(explained(error))
     problems = list(world.can(fault))
     if problems:
         return _refused(problems)
@@ -89,8 +90,3 @@ def handle(request: bytes, world: SitlWorld) -> dict[str, Any]:
 
 def _refused(problems: list[str]) -> dict[str, Any]:
     return {"ok": False, "problems": problems}
-
-
-def _explain(error: dict[str, Any]) -> str:
-    key = ".".join(str(part) for part in error["loc"]) or "fault"
-    return f"{key} = {error.get('input')!r}: {error['msg'].lower()}"

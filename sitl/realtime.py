@@ -7,21 +7,19 @@ time may run faster than the wall clock; with a gate it waits for its clients.
 
 from __future__ import annotations
 
-import contextlib
-import json
-import signal
 import socket
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
-from typing import Any, BinaryIO
+from typing import BinaryIO
 
 from sitl.fault_socket import ControlSocket
 from sitl.world import SitlWorld
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.mavlink.transport import bind_udp
+from swarmctl.process_lifetime import StopRequest
+from swarmctl.wall_clock import monotonic_us
 
 HOST = "127.0.0.1"
 STALL_US = 200_000
@@ -77,39 +75,6 @@ class TruthFile:
         return f"truth file: {self._broken}" if self._broken else ""
 
 
-class StopRequest:
-    """Records that SIGINT or SIGTERM has arrived."""
-
-    def __init__(self) -> None:
-        self.wanted = False
-
-    def install(self) -> None:
-        """Handle both signals for the rest of the process."""
-        signal.signal(signal.SIGINT, self._on_signal)
-        signal.signal(signal.SIGTERM, self._on_signal)
-
-    def _on_signal(self, _number: int, _frame: FrameType | None) -> None:
-        self.wanted = True
-
-
-def monotonic_us() -> int:
-    """Return CLOCK_MONOTONIC [us], which is comparable between processes of this host."""
-    return time.monotonic_ns() // 1000
-
-
-class EventFile:
-    """Writes faults at begin and end, one JSON object per line; a full disk loses events, never the flight."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def write(self, name: str, since_boot_us: int, fields: dict[str, Any]) -> None:
-        """Append one event."""
-        stamp = {"utc_us": time.time_ns() // 1000, "t_us": monotonic_us(), "source": "sitl", "event": name}
-        with contextlib.suppress(OSError), self._path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps({**stamp, "since_boot_us": since_boot_us, **fields}) + "\n")
-
-
 class Gate:
     """Holds the physics every `GATE_US` until each vehicle in OFFBOARD has received a new setpoint.
 
@@ -125,7 +90,7 @@ class Gate:
     def wait(self, stop: StopRequest, now_us: int) -> None:
         """Wait until all clients have sent."""
         deadline_us = monotonic_us() + GATE_PATIENCE_US
-        while not stop.wanted:
+        while not stop.is_set():
             counts = self._world.setpoint_counts()
             fresh = {i for i, count in enumerate(counts) if count > self._seen[i]}
             self._given_up -= fresh
@@ -164,7 +129,7 @@ def fly(
     gate_every, control_every = round(GATE_US / period_us), max(1, round(CONTROL_US * speed / period_us))
     start_us = sim_start_us = monotonic_us()
     count = 0
-    while not stop.wanted:
+    while not stop.is_set():
         sim_us = sim_start_us + round(count * period_us)
         behind_us = monotonic_us() - (start_us + round(count * period_us / speed))
         if behind_us < 0:

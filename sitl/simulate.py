@@ -13,7 +13,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 from rich.progress import Progress
@@ -24,6 +23,7 @@ from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, exit_code_o
 from swarmctl.files import replace_bytes, replace_text, write_each
 from swarmctl.ops.status_table import PlainLines
 from swarmctl.ops.summary import summary_lines, unwritten_line, violation_lines
+from swarmctl.process_lifetime import StopRequest
 from swarmctl.telemetry.recordings import RECORDING, open_viewer, optimize_recording, simulated_recording
 from swarmctl.telemetry.run_files import load_run
 from swarmctl.telemetry.run_folder import Outcome, create_run_folder, finish_run
@@ -33,7 +33,7 @@ def simulate(config: Config, directory: Path) -> int:
     """Fly `config` in lockstep into the run folder `directory` and return the exit code."""
     replace_text(directory / "config.toml", dump(config))
     flight = Lockstep(config, directory)
-    stop = _Interrupt()
+    stop = StopRequest(signal.SIGINT, signal.SIGTERM, signal.SIGHUP, raise_at=2)  # the first request lands
     began_s = time.perf_counter()
     with _progress(config) as advance:
 
@@ -108,29 +108,6 @@ def _write_recording(config: Config, directory: Path) -> None:
         [obstacle.model_dump() for obstacle in config.obstacles],
     )
     optimize_recording(directory)
-
-
-class _Interrupt:
-    """Counts stop requests: the first Ctrl-C lands, the second ends at once; a closed terminal is the first only."""
-
-    def __init__(self) -> None:
-        self.count = 0
-        self._open = False
-        for signum in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
-            if signal.getsignal(signum) != signal.SIG_IGN:
-                signal.signal(signum, self._ask)
-
-    def take(self) -> bool:
-        asked, self._open = self._open, False
-        return asked
-
-    def _ask(self, signum: int, frame: FrameType | None) -> None:
-        if signum == signal.SIGHUP and self.count:
-            return
-        self.count += 1
-        self._open = True
-        if self.count > 1:
-            raise KeyboardInterrupt
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any, Literal
 
+import tomli_w
 from pydantic import Field, ValidationError
 
 from swarmctl.agent.setup import AgentParams
@@ -29,7 +30,6 @@ from swarmctl.errors import ConfigError
 from swarmctl.mavlink.parameter_names import parameter_problems
 from swarmctl.mavlink.transport import Endpoint, parse_url
 from swarmctl.telemetry.referee import ObstacleRule, Rules
-from swarmctl.toml_text import toml_text
 
 MAX_AGENTS = 100
 _PAIRS_SHOWN = 3
@@ -216,7 +216,7 @@ def load(path: Path | None, overrides: Sequence[str] = ()) -> Config:
 
 def dump(config: Config) -> str:
     """Return the resolved configuration as TOML, which `load` reads back to the same tree."""
-    return toml_text(config.model_dump())
+    return tomli_w.dumps(config.model_dump(exclude_none=True))
 
 
 def _explain(error: dict[str, Any]) -> str:

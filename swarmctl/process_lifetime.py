@@ -28,6 +28,12 @@ def die_with_parent(signum: int = signal.SIGTERM) -> None:
         os.kill(os.getpid(), signum)
 
 
+def serve_parent() -> None:
+    """Prepare a worker process: it ignores Ctrl-C, which the parent handles, and dies with the parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    die_with_parent(signal.SIGKILL)
+
+
 def remove_socket(path: Path) -> None:
     """Delete a Unix socket and its lock, and their directory if it is then empty."""
     for name in (path, path.with_name(path.name + ".lock")):
@@ -37,33 +43,66 @@ def remove_socket(path: Path) -> None:
 
 
 class StopRequest:
-    """A stop flag set by signals, for which the interrupted thread can wait.
+    """Counts requests to stop, made by signals or by `ask`; the interrupted thread can wait for one.
+
+    A closing terminal sends SIGHUP more than once, from the kernel and from the shell: SIGHUP is never a second
+    request, and is left ignored under `nohup`. SIGINT is handled in the background too, where shells ignore it. As a
+    context, it restores the handlers that are still its own.
 
     It is no `threading.Event`, because a signal handler that runs while its thread holds the event's lock deadlocks.
+
+    Args:
+        signums: the signals that ask.
+        raise_at: the number of the signal's request that raises KeyboardInterrupt; 0 is none.
     """
 
-    def __init__(self, *signums: int) -> None:
+    def __init__(self, *signums: int, raise_at: int = 0) -> None:
         self._read_fd, self._write_fd = os.pipe()
         os.set_blocking(self._write_fd, False)
-        self._wanted = False
-        for signum in signums:
-            signal.signal(signum, self._ask)
+        self._raise_at = raise_at
+        self.count = 0
+        self._taken = 0
+        under_nohup = signal.getsignal(signal.SIGHUP) == signal.SIG_IGN
+        heard = [signum for signum in signums if signum != signal.SIGHUP or not under_nohup]
+        self._before = {signum: signal.signal(signum, self._note) for signum in heard}
+
+    def __enter__(self) -> StopRequest:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for signum, handler in self._before.items():
+            if signal.getsignal(signum) == self._note:
+                signal.signal(signum, handler)
+        self.close()
+
+    def ask(self) -> None:
+        """Request a stop, as a signal does."""
+        self.count += 1
+        if self.count == 1:
+            os.write(self._write_fd, b".")
 
     def is_set(self) -> bool:
-        return self._wanted
+        return self.count > 0
+
+    def take(self) -> bool:
+        """Return whether there is a request that has not been taken yet, and take it."""
+        taken, self._taken = self._taken, self.count
+        return self._taken > taken
 
     def wait(self, timeout_s: float) -> bool:
         """Wait for at most `timeout_s`; returns whether a stop has been requested."""
-        if not self._wanted:
+        if not self.count:
             select.select([self._read_fd], [], [], max(0.0, timeout_s))
-        return self._wanted
+        return self.count > 0
 
     def close(self) -> None:
         """Close both descriptors; the signal handlers stay installed."""
         for fd in (self._read_fd, self._write_fd):
             os.close(fd)
 
-    def _ask(self, signum: int, frame: FrameType | None) -> None:
-        if not self._wanted:
-            self._wanted = True
-            os.write(self._write_fd, b".")
+    def _note(self, signum: int, frame: FrameType | None) -> None:
+        if signum == signal.SIGHUP and self.count:
+            return
+        self.ask()
+        if self.count == self._raise_at:
+            raise KeyboardInterrupt

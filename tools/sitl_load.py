@@ -31,7 +31,8 @@ import numpy as np
 import psutil
 from pymavlink.dialects.v20 import development as mav
 
-from swarmctl.mavlink.codec import Codec, frames, message_id
+from swarmctl.mavlink.codec import Codec
+from swarmctl.mavlink.framing import frames, message_id
 
 HOST = "127.0.0.1"
 LOCAL_PORT = 24580

@@ -27,7 +27,8 @@ from pathlib import Path
 
 import psutil
 
-from swarmctl.mavlink.codec import Codec, frames
+from swarmctl.mavlink.codec import Codec
+from swarmctl.mavlink.framing import frames
 from swarmctl.ops.preflight import claim_ports
 
 PHASES = ("CONNECT", "STANDBY", "ARM", "TAKEOFF", "GOTO_START", "READY", "TRACK", "HOLD", "GOTO_LAND", "LAND")

@@ -18,12 +18,12 @@ from sitl.arducopter.autopilot import FORCE_ARM, FORCE_DISARM, ArduCopter
 from sitl.arducopter.navigator import CopterNavigator
 from sitl.arducopter.parameters import CopterParameters
 from sitl.arducopter.streams import ALL_GROUPS, STREAMS, CopterReport, Intervals
-from sitl.net.wire import frames
 from sitl.plant.sensors import Estimate, LocalOrigin
 from sitl.plant.vehicle import Plant
 from sitl.px4.modes import Result, Severity
 from sitl.px4.parameters import UnknownParameterError, WireValue
 from swarmctl.mavlink.codec import Codec
+from swarmctl.mavlink.framing import frames
 from swarmctl.mavlink.transport import Transport
 
 COMPONENT = 1
@@ -130,7 +130,7 @@ class ArduCopterEndpoint:
         self._at(now_us)
         for datagram in self.transport.receive(transport_now_us):
             self._waited_us = max(0, min(self._step_us, transport_now_us - datagram.t_us))
-            for frame in frames(datagram.data):
+            for frame in frames(datagram.data, version_1=True):
                 self._on_frame(frame)
 
     def send_due(self, now_us: int) -> None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from swarmctl.mavlink.codec import frames, message_id
+from swarmctl.mavlink.framing import frames, message_id
 from swarmctl.mavlink.transport import Datagram, Transport
 
 _OVERTAKEN_US = 100_000  # longest time that a datagram waits for another to overtake it

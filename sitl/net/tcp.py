@@ -8,7 +8,8 @@ from __future__ import annotations
 import socket
 
 from swarmctl.errors import StartError
-from swarmctl.mavlink.transport import Datagram, cut_frames
+from swarmctl.mavlink.framing import cut_frames
+from swarmctl.mavlink.transport import Datagram
 
 PORT_STEP = 10
 _READ = 4096

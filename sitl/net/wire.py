@@ -1,4 +1,4 @@
-"""MAVLink frames of the simulator: packed directly from tuples, and cut out of received bytes.
+"""MAVLink frames of the simulator, packed directly from tuples.
 
 A dialect object takes 5-40 us to pack, a tuple about 2: one core has to carry 25,000 messages a second. PX4 sends eight
 messages that the dialect module lacks; they are defined here. `tests/unit/sitl/test_wire.py` compares all with
@@ -8,15 +8,13 @@ pymavlink.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 from fastcrc import crc16
 from pymavlink.dialects.v20 import development as mav
 
-MAGIC_V1, MAGIC_V2 = 0xFE, 0xFD
+_MAGIC_V2 = 0xFD
 _HEADER = struct.Struct("<BBBBBBBHB")
-_SIGNED = 1
 
 
 class Kind(NamedTuple):
@@ -131,7 +129,7 @@ class FrameWriter:
         number = kind.number
         body = (
             _HEADER.pack(
-                MAGIC_V2,
+                _MAGIC_V2,
                 len(payload),
                 0,
                 0,
@@ -146,21 +144,3 @@ class FrameWriter:
         self.sequence = (self.sequence + 1) & 0xFF
         checksum = crc16.mcrf4xx(body[1:] + bytes((kind.crc_extra,)))
         return body + checksum.to_bytes(2, "little")
-
-
-def frames(datagram: bytes) -> Iterator[bytes]:
-    """Yield the MAVLink 2 and 1 frames of a datagram; other bytes are skipped, a truncated frame ends it."""
-    start, size = 0, len(datagram)
-    while start + 8 <= size:
-        magic = datagram[start]
-        if magic == MAGIC_V2 and start + 12 <= size:
-            end = start + 12 + datagram[start + 1] + (13 if datagram[start + 2] & _SIGNED else 0)
-        elif magic == MAGIC_V1:
-            end = start + 8 + datagram[start + 1]
-        else:
-            start += 1
-            continue
-        if end > size:
-            return
-        yield datagram[start:end]
-        start = end

@@ -11,7 +11,6 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from types import FrameType
 
 from swarmctl.agent.agent import Agent
 from swarmctl.agent.assembly import make_agent
@@ -27,37 +26,13 @@ from swarmctl.mavlink.codec import Codec, heartbeat_of
 from swarmctl.mavlink.commands import CommandPort
 from swarmctl.mavlink.mavsdk_commands import MavsdkCommands
 from swarmctl.mavlink.transport import open_transport
+from swarmctl.process_lifetime import StopRequest
 from swarmctl.telemetry.recorder import Recorder
+from swarmctl.wall_clock import WallClock
 
 _LOOPBACK = "127.0.0.1"
-_UTC_SLEW_01 = 0.01  # largest correction of UTC per elapsed time
 _LINGER_S = 1.0  # time the process lives on after its end, so that peers receive the last status
 _VEHICLE_LOST_S = 15.0  # time without any vehicle state after which the process gives up
-
-
-class WallClock:
-    """Reads the host's clocks. UTC steps are slewed, so that in flight time neither jumps nor runs backwards."""
-
-    def __init__(self) -> None:
-        self._read_ns = time.monotonic_ns()
-        self._offset_ns = time.time_ns() - self._read_ns
-
-    def now_us(self) -> int:
-        return time.monotonic_ns() // 1000
-
-    def utc_us(self) -> int:
-        now_ns = time.monotonic_ns()
-        most_ns = int((now_ns - self._read_ns) * _UTC_SLEW_01)
-        off_ns = time.time_ns() - now_ns - self._offset_ns
-        self._offset_ns += min(most_ns, max(-most_ns, off_ns))
-        self._read_ns = now_ns
-        return (now_ns + self._offset_ns) // 1000
-
-    def sleep_until(self, t_us: int) -> None:
-        """Return at monotonic time `t_us`, or at once when it has passed."""
-        left_us = t_us - self.now_us()
-        if left_us > 0:
-            time.sleep(left_us * 1e-6)
 
 
 class Pace:
@@ -109,7 +84,9 @@ def run_agent(process: AgentProcess) -> int:
     config = load(process.config_path)
     if not 0 <= agent < config.swarm.agents:
         raise StartError(f"--id {agent}: allowed: 0..{config.swarm.agents - 1} (swarm.agents)")
-    stop = _StopRequest(asked=process.only_land)
+    stop = StopRequest(signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
+    if process.only_land:
+        stop.ask()
     clock = WallClock()
     url = config.vehicles[agent].url if config.vehicles else ""
     is_vehicle = heartbeat_of(config.sysids()[agent])
@@ -163,7 +140,7 @@ def _join(process: AgentProcess, config: Config, clock: WallClock) -> Bus:
     return ZenohBus(process.bus, process.run, me, listen, config.bus.lease_ms)
 
 
-def _loop(agent: Agent, config: Config, clock: WallClock, stop: _StopRequest, vehicle: str, only_land: bool) -> int:
+def _loop(agent: Agent, config: Config, clock: WallClock, stop: StopRequest, vehicle: str, only_land: bool) -> int:
     gc.collect()
     gc.freeze()  # keep objects of the start-up out of collections during flight
     pace = Pace(round(1e6 / config.agent.rate_hz), clock.now_us())
@@ -204,19 +181,3 @@ def _exit_code(agent: Agent) -> int:
     if agent.outcome == OPERATOR_STOP:
         return EXIT_INTERRUPTED
     return EXIT_MISSION if agent.has_armed else EXIT_START
-
-
-class _StopRequest:
-    """Holds a request to land after SIGINT, SIGTERM or SIGHUP (terminal closed) until the loop takes it, once."""
-
-    def __init__(self, asked: bool) -> None:
-        self._asked = asked
-        for signum in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
-            signal.signal(signum, self._ask)
-
-    def take(self) -> bool:
-        asked, self._asked = self._asked, False
-        return asked
-
-    def _ask(self, signum: int, frame: FrameType | None) -> None:
-        self._asked = True

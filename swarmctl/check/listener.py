@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import socket
-import time
 from typing import NamedTuple, Protocol
 
 from swarmctl.mavlink.transport import Transport, bind_towards, bind_udp, open_transport, parse_url, resolve
+from swarmctl.wall_clock import monotonic_us
 
 Address = tuple[str, int]
 NOWHERE: Address = ("", 0)
@@ -41,11 +41,6 @@ class Listener(Protocol):
 
     def close(self) -> None:
         """Release the port."""
-
-
-def monotonic_us() -> int:
-    """Return the monotonic time [us], the clock of all times in a check."""
-    return time.monotonic_ns() // 1000
 
 
 def open_listener(url: str) -> tuple[Listener, Address]:

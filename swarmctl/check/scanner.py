@@ -9,16 +9,18 @@ from __future__ import annotations
 import math
 import selectors
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from pymavlink.dialects.v20 import development as mavlink
 
 from swarmctl.check.link_statistics import Answer, FrameStatistics
-from swarmctl.check.listener import NOWHERE, Address, Listener, ReceivedDatagram, monotonic_us
+from swarmctl.check.listener import NOWHERE, Address, Listener, ReceivedDatagram
 from swarmctl.check.parameter_reader import ParameterReader
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.dialects import DIALECTS, Dialect
+from swarmctl.mavlink.framing import frames
+from swarmctl.wall_clock import monotonic_us
 
 SCANNER_COMPID = 192  # MAV_COMP_ID_ONBOARD_COMPUTER2: keeps sequence numbers apart from those of a flying agent
 AUTOPILOT_COMPID = 1
@@ -184,7 +186,7 @@ class VehicleScan:
     # --- reception ---
 
     def _take(self, heard: ReceivedDatagram) -> None:
-        for frame in frames_of_any_version(heard.data):
+        for frame in frames(heard.data, version_1=True):
             if frame[0] == mavlink.PROTOCOL_MARKER_V1:
                 sysid, compid, seq = frame[3], frame[4], frame[2]
             else:
@@ -246,22 +248,6 @@ class VehicleScan:
         sent_us = self._timesyncs.pop(message.ts1, None) if message.tc1 else None
         if sent_us is not None:
             self.answers["TIMESYNC"].append(Answer(sent_us, t_us, message.tc1 * 1e-3))
-
-
-def frames_of_any_version(datagram: bytes) -> Iterator[bytes]:
-    """Yield the MAVLink 1 and 2 frames of a datagram; the rest is dropped at the first byte that fits no frame."""
-    start = 0
-    while start + 8 <= len(datagram):
-        if datagram[start] == mavlink.PROTOCOL_MARKER_V1:
-            end = start + 8 + datagram[start + 1]
-        elif datagram[start] == mavlink.PROTOCOL_MARKER_V2 and start + 12 <= len(datagram):
-            end = start + 12 + datagram[start + 1] + (13 if datagram[start + 2] & 1 else 0)
-        else:
-            return
-        if end > len(datagram):
-            return
-        yield datagram[start:end]
-        start = end
 
 
 def run_scans(scans: Sequence[VehicleScan], connect_s: float, longest_s: float, ended: Callable[[], bool]) -> None:

@@ -1,7 +1,7 @@
 """The two clocks of a process behind one protocol, which is passed in as an argument.
 
 Monotonic microseconds (`now_us`) are for deadlines and ages inside this process; disciplined UTC microseconds
-(`utc_us`) are for everything that leaves it. The wall-clock implementation lives in `swarmctl.agent.runner`.
+(`utc_us`) are for everything that leaves it. The wall-clock implementation lives in `swarmctl.wall_clock`.
 """
 
 from __future__ import annotations

@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from swarmctl.core.types import Array
 
 Times = NDArray[Any]  # UTC [us], integer or float
-_STOPPED_M_S = 1e-3
+_STOPPED_M_S = 1e-3  # a slower plan is not continued by braking
+_AT_REST_M_S = 1e-6  # a slower velocity has no direction
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -124,12 +125,22 @@ def joined(first: Trajectory, then: Trajectory, from_utc_us: int) -> Trajectory:
     )
 
 
+def braking_displacement(vel_ned_m_s: Array, t_s: Array, brake_m_s2: float) -> Array:
+    """Return displacements (K, 3) NED [m] at times (K,) after the begin of braking to rest from a velocity (3,)."""
+    speed = math.sqrt(float(vel_ned_m_s @ vel_ned_m_s))
+    if speed < _AT_REST_M_S:
+        return np.zeros((len(t_s), 3))
+    t_s = np.minimum(np.maximum(t_s, 0.0), speed / brake_m_s2)
+    travelled_m = speed * t_s - 0.5 * brake_m_s2 * t_s * t_s
+    return np.asarray(travelled_m[:, None] * (vel_ned_m_s / speed))
+
+
 def _brake(pos_ned_m: Array, vel_ned_m_s: Array, dt_s: float, brake_m_s2: float) -> tuple[Array, Array]:
     """Return positions and velocities of braking, (L, 3) each, L >= 1, after the given point; the last is at rest."""
     speed = math.sqrt(float(vel_ned_m_s @ vel_ned_m_s))
     if speed < _STOPPED_M_S:
         return pos_ned_m[None].copy(), np.zeros((1, 3))
     stop_s = speed / brake_m_s2
-    t_s = np.minimum(dt_s * np.arange(1, math.ceil(stop_s / dt_s) + 2), stop_s)[:, None]
-    unit = vel_ned_m_s / speed
-    return pos_ned_m + (speed * t_s - 0.5 * brake_m_s2 * t_s * t_s) * unit, (speed - brake_m_s2 * t_s) * unit
+    t_s = np.minimum(dt_s * np.arange(1, math.ceil(stop_s / dt_s) + 2), stop_s)
+    velocities = (speed - brake_m_s2 * t_s)[:, None] * (vel_ned_m_s / speed)
+    return pos_ned_m + braking_displacement(vel_ned_m_s, t_s, brake_m_s2), velocities

@@ -16,9 +16,10 @@ from pymavlink.dialects.v20 import development as mavlink
 
 from swarmctl.core.frames import rotate_to_ned
 from swarmctl.core.types import Array, AttitudeSetpoint, FlightMode, GeoOrigin, Landed, VehicleState
-from swarmctl.mavlink.codec import Codec, frames
+from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.commands import CommandPort
 from swarmctl.mavlink.dialects import DIALECTS, LAST_INTEGER_TYPE, Dialect
+from swarmctl.mavlink.framing import frames
 from swarmctl.mavlink.local_frame import LocalFrame
 from swarmctl.mavlink.mode_watch import ModeWatch
 from swarmctl.mavlink.transport import Transport

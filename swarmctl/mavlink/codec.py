@@ -6,33 +6,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 from pymavlink.dialects.v20 import development as dialect
 
-MAVLINK2_MAGIC = 0xFD
-_HEADER = 10
-_CHECKSUM = 2
-_SIGNATURE = 13
+from swarmctl.mavlink.framing import frames, message_id
+
 _AUTOPILOT_COMPID = 1
-
-
-def frames(datagram: bytes) -> Iterator[bytes]:
-    """Yield the frames of a datagram; the rest is dropped at the first byte that fits no frame."""
-    start = 0
-    while start + _HEADER + _CHECKSUM <= len(datagram) and datagram[start] == MAVLINK2_MAGIC:
-        signed = _SIGNATURE if datagram[start + 2] & 1 else 0
-        end = start + _HEADER + datagram[start + 1] + _CHECKSUM + signed
-        if end > len(datagram):
-            return
-        yield datagram[start:end]
-        start = end
-
-
-def message_id(frame: bytes) -> int:
-    """Return the message id of a frame that `frames` yielded."""
-    return int.from_bytes(frame[7:10], "little")
 
 
 def heartbeat_of(sysid: int) -> Callable[[bytes], bool]:

@@ -1,7 +1,7 @@
 """Byte links to a vehicle: UDP, TCP, serial, and an in-memory pipe for lockstep. None of them blocks.
 
-A transport moves datagrams and stamps their arrival. It knows nothing of MAVLink except the end of a frame in a byte
-stream. Broken streams are reopened without limit: a lost vehicle is judged elsewhere.
+A transport moves datagrams and stamps their arrival; of MAVLink it only cuts streams into frames. Broken streams are
+reopened without limit: a lost vehicle is judged elsewhere.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 from swarmctl.errors import StartError
+from swarmctl.mavlink.framing import cut_frames
 from swarmctl.mavlink.latch import Address, IsVehicle, Latch, admit_only, anybody
 
 _MAX_DATAGRAM = 2048
@@ -339,24 +340,6 @@ class SerialTransport:
             with contextlib.suppress(OSError):
                 self._port = self._open_port()
                 self._lost = False
-
-
-def cut_frames(buffer: bytearray) -> list[bytes]:
-    """Remove and return all complete MAVLink 2 frames at the front of `buffer`; junk before a start byte is dropped."""
-    frames: list[bytes] = []
-    while True:
-        start = buffer.find(0xFD)
-        if start < 0:
-            buffer.clear()
-            return frames
-        del buffer[:start]
-        if len(buffer) < 3:
-            return frames
-        length = 12 + buffer[1] + (13 if buffer[2] & 1 else 0)
-        if len(buffer) < length:
-            return frames
-        frames.append(bytes(buffer[:length]))
-        del buffer[:length]
 
 
 class PipeTransport:

@@ -45,6 +45,8 @@ View = Annotated[bool | None, typer.Option("--view/--no-view", help="Open the vi
 RunningDir = Annotated[Path | None, typer.Option("--run-dir", help="Run folder of the launch; default: the newest.")]
 OneAgent = Annotated[int | None, typer.Option("--agent", help="Address one agent; default: all.")]
 Folder = Annotated[Path, typer.Argument(help="Run folder.")]
+# The verb's module declares the options, and answers --help.
+_PASS_ON = {"ignore_unknown_options": True, "allow_extra_args": True, "help_option_names": []}
 
 
 def main() -> None:
@@ -103,8 +105,9 @@ def launch(
     from swarmctl.config import load
     from swarmctl.ops.launch import LaunchOptions
     from swarmctl.ops.launch import launch as fly
+    from swarmctl.telemetry.recordings import has_display
 
-    options = LaunchOptions(run_dir, _has_display() if view is None else view)
+    options = LaunchOptions(run_dir, has_display() if view is None else view)
     return fly(load(config, _overrides(agents, duration, seed, sets)), options)
 
 
@@ -334,46 +337,16 @@ def report(folder: Folder) -> int:
     return EXIT_OK
 
 
-@app.command()
-def reproduce(
-    only: Annotated[
-        list[str] | None, typer.Option("--only", metavar="FLIGHT", help="One experiment; repeatable.")
-    ] = None,
-    plant: Annotated[bool, typer.Option("--plant", help="Fly the model only, as the thesis did.")] = False,
-    full: Annotated[bool, typer.Option("--full", help="Fly the full MAVLink loop only.")] = False,
-    out: Annotated[Path | None, typer.Option("--out", help="Folder to write; default runs/<UTC>-reproduce.")] = None,
-    jobs: Annotated[
-        int | None, typer.Option("--jobs", metavar="N", help="Worker processes; default: one per processor, at most 8.")
-    ] = None,
-) -> NoReturn:
+@app.command(context_settings=_PASS_ON)
+def reproduce(context: typer.Context) -> NoReturn:
     """Reproduce the six experiments of the thesis. Writes each result beside the published figure."""
-    arguments = [f"--only={name}" for name in only or ()]
-    arguments += [flag for flag, given in (("--plant", plant), ("--full", full)) if given]
-    arguments += [] if out is None else [f"--out={out}"]
-    arguments += [] if jobs is None else [f"--jobs={jobs}"]
-    _become("sitl.studies.thesis.reproduce", arguments)
+    _become("sitl.studies.thesis.reproduce", context.args)
 
 
-@app.command()
-def bench(
-    out: Annotated[
-        Path | None, typer.Option("--out", help="Folder of bench.json; default: the working directory.")
-    ] = None,
-    neighbours: Annotated[
-        str | None, typer.Option("--neighbours", metavar="N,N,..", help="Neighbour counts, 0 to 99.")
-    ] = None,
-    solver: Annotated[
-        list[str] | None, typer.Option("--solver", help="osqp or daqp; repeatable; default: all installed.")
-    ] = None,
-    ticks: Annotated[int | None, typer.Option("--ticks", metavar="N", help="Measured ticks per case.")] = None,
-    slsqp: Annotated[bool | None, typer.Option("--slsqp/--no-slsqp", help="Measure the nonlinear baseline.")] = None,
-) -> NoReturn:
+@app.command(context_settings=_PASS_ON)
+def bench(context: typer.Context) -> NoReturn:
     """Measure the tick of one agent, part by part. Covers 0 to 30 neighbours and each installed solver."""
-    arguments = [f"--solver={name}" for name in solver or ()]
-    for name, value in (("--out", out), ("--neighbours", neighbours), ("--ticks", ticks)):
-        arguments += [] if value is None else [f"{name}={value}"]
-    arguments += [] if slsqp is None else ["--slsqp" if slsqp else "--no-slsqp"]
-    _become("sitl.studies.bench.bench", arguments)
+    _become("sitl.studies.bench.bench", context.args)
 
 
 def _become(module: str, arguments: list[str]) -> NoReturn:
@@ -394,10 +367,6 @@ def _overrides(agents: int | None, duration: float | None, seed: int | None, set
     """Return the options as `--set` items, the named ones last so that they take precedence."""
     named = (("swarm.agents", agents), ("mission.duration_s", duration), ("seed", seed))
     return [*(sets or ()), *(f"{key}={value}" for key, value in named if value is not None)]
-
-
-def _has_display() -> bool:
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def _show(statuses: dict[int, StatusMessage], agents: range) -> None:

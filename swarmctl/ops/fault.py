@@ -16,6 +16,7 @@ from typing import Any
 from pydantic import ValidationError
 
 from swarmctl.config import load
+from swarmctl.core.params import explained
 from swarmctl.core.simulated import FAULTS, FaultParams
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.ops.operator import RunningLaunch
@@ -36,7 +37,7 @@ def parse_fault(wanted: Mapping[str, Any], vehicles: int) -> FaultParams:
     try:
         fault = FaultParams.model_validate(given)
     except ValidationError as error:
-        problems = [_explain(dict(e)) for e in error.errors()]
+        problems = [_as_option(problem) for problem in explained(error)]
         raise ConfigError("fault", [*problems, *_missed(given, vehicles, problems)]) from error
     problems = [_as_option(problem) for problem in fault.problems(vehicles)]
     if problems:
@@ -79,13 +80,6 @@ def _ask(path: Path, request: dict[str, Any]) -> dict[str, Any]:
         except (OSError, ValueError) as error:
             raise StartError(f"fault: the simulator does not answer ({error}); see: swarmctl status") from error
     return answer if isinstance(answer, dict) else {}
-
-
-def _explain(error: dict[str, Any]) -> str:
-    key = ".".join(str(part) for part in error["loc"])
-    if key == "kind":
-        return f"KIND {error.get('input')!r}: allowed: {', '.join(FAULTS)}"
-    return _as_option(f"{key} = {error.get('input')!r}: {error['msg'].lower()}")
 
 
 def _missed(given: dict[str, Any], vehicles: int, found: list[str]) -> Iterator[str]:

@@ -11,6 +11,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import tomli_w
+
 from swarmctl.bus.peers import agent_name
 from swarmctl.config import Config
 from swarmctl.control.estimation.identification import Figure, Identified, identify, longest_segment
@@ -18,7 +20,6 @@ from swarmctl.control.model import VehicleModelParams
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, StartError
 from swarmctl.ops.launch import LaunchOptions, launch
 from swarmctl.ops.vehicle_check import CheckOptions, check
-from swarmctl.toml_text import toml_value
 
 _UNITS = {
     "delay_s": "s",
@@ -116,7 +117,7 @@ def table(config: Config, models: Mapping[int, Identified], date: str) -> str:
     for agent, found in models.items():
         if config.vehicles:
             vehicle = config.vehicles[agent]
-            text += ["[[vehicles]]", f"sysid = {vehicle.sysid}", f"url = {toml_value(vehicle.url)}", ""]
+            text += ["[[vehicles]]", f"sysid = {vehicle.sysid}", tomli_w.dumps({"url": vehicle.url}).rstrip(), ""]
         text += [f"[{'vehicles.model' if config.vehicles else 'vehicle_model'}]"]
         text += _model_lines(found, config.model_of(agent))
         if not config.vehicles:
@@ -130,7 +131,7 @@ def _model_lines(found: Identified, before: VehicleModelParams) -> Sequence[str]
     for name, value in found.model(before).model_dump().items():
         figure = getattr(found, name, None)
         interval = "" if figure is None else f"  # {figure.low:.3g} to {figure.high:.3g}"
-        shown.append(f"{name} = {toml_value(value)}{interval}")
+        shown.append(f"{tomli_w.dumps({name: value}).rstrip()}{interval}")
     return shown
 
 

@@ -12,8 +12,6 @@ import tempfile
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
-from types import FrameType
-from typing import Any
 
 from swarmctl.bus.peers import agent_name
 from swarmctl.bus.topics import OBSTACLES, OPERATOR, STATUS
@@ -37,7 +35,9 @@ from swarmctl.ops.processes import (
 )
 from swarmctl.ops.status_table import Display, open_display
 from swarmctl.ops.summary import sum_up
-from swarmctl.ops.supervisor import EventLog, FlightSupervisor, Services
+from swarmctl.ops.supervisor import FlightSupervisor, Services
+from swarmctl.process_lifetime import StopRequest
+from swarmctl.telemetry.event_log import EventLog
 
 _BUS_S = 20.0  # timeout for the router to answer
 _BUS_TRY_MS = 500
@@ -54,41 +54,13 @@ class LaunchOptions:
     view: bool = False  # open the viewer window
 
 
-class Interrupts:
-    """Counts SIGINT, SIGTERM and the first SIGHUP instead of raising.
-
-    A closing terminal sends SIGHUP more than once, from the kernel and from the shell. That is no second request, and
-    must not kill vehicles that are landing. SIGHUP is ignored under `nohup`, and after the flight, where it would lose
-    the result.
-    """
-
-    _SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-
-    def __init__(self) -> None:
-        self.count = 0
-        self._before: dict[int, Any] = {}
-
-    def __enter__(self) -> Interrupts:
-        ignored = (signal.SIGHUP,) if signal.getsignal(signal.SIGHUP) == signal.SIG_IGN else ()
-        heard = [signum for signum in self._SIGNALS if signum not in ignored]  # SIGINT is handled in the background too
-        self._before = {signum: signal.signal(signum, self._note) for signum in heard}
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for signum, handler in self._before.items():
-            signal.signal(signum, signal.SIG_IGN if signum == signal.SIGHUP else handler)
-
-    def _note(self, signum: int, frame: FrameType | None) -> None:
-        self.count = max(self.count, 1) if signum == signal.SIGHUP else self.count + 1
-
-
 def launch(config: Config, options: LaunchOptions) -> int:
     """Fly a configuration and return the exit code.
 
     Raises:
         ConfigError, StartError: it was refused, or did not come up; nothing is left running.
     """
-    with Interrupts() as interrupts:
+    with StopRequest(signal.SIGINT, signal.SIGTERM, signal.SIGHUP) as stop:
         reserved = inspect(config)
         try:
             directory = _run_folder(config, options)
@@ -100,11 +72,12 @@ def launch(config: Config, options: LaunchOptions) -> int:
         grace_s = _LAND_S  # after a failure from here on, agents still get time to land
         try:
             services.start()
-            result = FlightSupervisor(config, services, display).fly(lambda: interrupts.count)
+            result = FlightSupervisor(config, services, display).fly(lambda: stop.count)
             grace_s = 0.0  # every agent has ended
         finally:
             services.stop(grace_s)
             display.close()
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a terminal that closes now must not lose the result
     # From here on Ctrl-C acts as usual: nothing is left to land.
     violated = sum_up(config, directory, result, display.say)
     return result.exit_code(violated)
@@ -133,7 +106,7 @@ class Launcher(Services):
         self._reserved = reserved
         self._display = display
         self.context = RunContext(run_name(config.name), f"{SCHEME}{self._socket_dir}/bus.sock", directory)
-        self.log = EventLog(directory / "launch.events.jsonl")
+        self.log = EventLog(directory / "launch.events.jsonl", "launch")
         self.children: dict[str, Child] = {}
 
     def start(self) -> None:

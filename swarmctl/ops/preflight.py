@@ -17,9 +17,9 @@ from pathlib import Path
 from swarmctl.config import Config
 from swarmctl.errors import StartError
 from swarmctl.mavlink.transport import bind_udp, parse_url
+from swarmctl.telemetry.view_ports import PORTS_TRIED, free_view_ports
 
 LOOPBACK = "127.0.0.1"
-_VIEW_PORTS_TRIED = 50
 _NEEDED = {
     "numpy": (2, 2),
     "scipy": (1, 14),
@@ -66,10 +66,10 @@ def inspect(config: Config) -> ReservedPorts:
             problems.append(str(error))
     else:
         problems += _vehicle_problems(config)
-    view_port = _free_view_port(config.telemetry.port) if config.telemetry.enabled else 0
+    view_port = next(free_view_ports(config.telemetry.port), 0) if config.telemetry.enabled else 0
     if config.telemetry.enabled and not view_port:
         problems.append(
-            f"telemetry.port = {config.telemetry.port}: it and the {_VIEW_PORTS_TRIED - 1} after it are taken; "
+            f"telemetry.port = {config.telemetry.port}: it and the {PORTS_TRIED - 1} after it are taken; "
             "choose another or set telemetry.enabled = false"
         )
     ports = tuple(sock.getsockname()[1] for sock in sockets[:count])
@@ -127,17 +127,3 @@ def _vehicle_problems(config: Config) -> Iterator[str]:
                 socket.getaddrinfo(endpoint.where, endpoint.number, socket.AF_INET, socket.SOCK_DGRAM)
             except OSError as error:
                 yield f"{key}: {endpoint.where} has no address: {error}; check the host"
-
-
-def _free_view_port(first: int) -> int:
-    """Return the first TCP port from `first` on without a listener; 0 when all are taken."""
-    for port in range(first, min(first + _VIEW_PORTS_TRIED, 65536)):
-        with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as sock:
-            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            try:
-                sock.bind((LOOPBACK, port))
-                sock.listen(1)
-            except OSError:
-                continue
-            return port
-    return 0

@@ -29,7 +29,6 @@ from swarmctl.control.reference.mission import MissionReference
 from swarmctl.core.simulated import RealismParams
 from swarmctl.errors import StartError
 from swarmctl.process_lifetime import PARENT_ENV
-from swarmctl.toml_text import toml_value
 
 ROUTER = "router"
 SITL = "sitl"
@@ -124,10 +123,9 @@ def sitl_command(
 
 
 def _realism(sitl: SitlParams) -> tuple[str, ...]:
-    """Return the simulator's `--set` items for every realism parameter that differs from its default."""
-    defaults = RealismParams().model_dump()
-    wanted = sitl.realism().model_dump()
-    return tuple(f"--set={key}={toml_value(wanted[key])}" for key in wanted if wanted[key] != defaults[key])
+    """Return the simulator's option for realism parameters that differ from their defaults."""
+    wanted = sitl.realism()
+    return () if wanted == RealismParams() else ("--realism-json", wanted.model_dump_json())
 
 
 def control_socket(endpoint: str) -> Path:

@@ -6,13 +6,10 @@ others go on; only without an essential process (router, simulator) all agents l
 
 from __future__ import annotations
 
-import contextlib
-import json
 import signal
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any
 
 from swarmctl.bus.orders import EVERYBODY, orders
@@ -34,6 +31,7 @@ from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START
 from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, RunContext, kill_all
 from swarmctl.ops.recovery import RECOVERY_S, Recovery
 from swarmctl.ops.status_table import AgentView, Display, name_of
+from swarmctl.telemetry.event_log import EventLog
 
 _STEP_S = 0.05
 _HEARD_S = 60.0  # timeout for every agent to appear on the bus
@@ -45,19 +43,6 @@ _LAND_REPEAT_S = 0.5
 _LAND_OBEYED_S = 10.0
 _OBSTACLES_REPEAT_S = 1.0
 _AFTER_DEATH_S = 3.0  # the simulator must outlive a dead agent until its vehicle has landed
-
-
-class EventLog:
-    """Writes `launch.events.jsonl` of the run folder; a full disk loses events, never the flight."""
-
-    def __init__(self, path: Path) -> None:
-        self._path = path
-
-    def write(self, event: str, **fields: Any) -> None:
-        """Append one row with both clocks."""
-        now = {"utc_us": time.time_ns() // 1000, "t_us": time.monotonic_ns() // 1000, "source": "launch"}
-        with contextlib.suppress(OSError), self._path.open("a", encoding="utf-8") as file:
-            file.write(json.dumps({**now, "event": event, **fields}) + "\n")
 
 
 class Services:

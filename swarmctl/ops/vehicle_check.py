@@ -14,12 +14,11 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from types import FrameType
 
 from swarmctl.bus.zenoh_bus import SCHEME
 from swarmctl.check.change import Change
 from swarmctl.check.link_facts import VehicleFacts
-from swarmctl.check.listener import NOWHERE, Address, Listener, UdpListener, monotonic_us, open_listener
+from swarmctl.check.listener import NOWHERE, Address, Listener, UdpListener, open_listener
 from swarmctl.check.parameters import Number, changes, names_to_read, unchangeable
 from swarmctl.check.scan_facts import facts_of, unreached
 from swarmctl.check.scanner import VehicleScan, run_scans
@@ -30,6 +29,8 @@ from swarmctl.core.types import GeoOrigin
 from swarmctl.errors import StartError
 from swarmctl.ops.preflight import claim_ports
 from swarmctl.ops.processes import Child, RunContext, end_all, run_name, sitl_command
+from swarmctl.process_lifetime import StopRequest
+from swarmctl.wall_clock import monotonic_us
 
 _CONNECT_S = 5.0  # heartbeats come once a second
 _SIMULATOR_S = 20.0  # to start on a busy machine
@@ -57,7 +58,8 @@ def check(config: Config, options: CheckOptions) -> int:
     Raises:
         StartError: the built-in simulator does not come up, or the JSON file can't be written.
     """
-    with _interruptible(), _vehicle_links(config, options) as opened:
+    ended_cleanly = StopRequest(signal.SIGTERM, signal.SIGHUP, raise_at=1)  # so that started processes are ended
+    with ended_cleanly, _vehicle_links(config, options) as opened:
         vehicles, changed = _scan(config, options, opened)
     lines = findings(vehicles, config) + [change.finding() for change in changed if not change.done]
     if options.to_fly:
@@ -195,22 +197,3 @@ def _simulator(config: Config) -> Iterator[_VehicleLinks]:
         end_all(children, _STOP_S)
         _close(links)
         shutil.rmtree(directory, ignore_errors=True)
-
-
-@contextlib.contextmanager
-def _interruptible() -> Iterator[None]:
-    """Handle the first SIGTERM or SIGHUP as Ctrl-C and ignore later ones, so that started processes are ended."""
-    signums = (signal.SIGTERM, signal.SIGHUP)
-
-    def interrupt(signum: int, frame: FrameType | None) -> None:
-        for each in signums:
-            signal.signal(each, signal.SIG_IGN)
-        raise KeyboardInterrupt
-
-    before = [signal.signal(each, interrupt) for each in signums]
-    try:
-        yield
-    finally:
-        for each, handler in zip(signums, before, strict=True):
-            if signal.getsignal(each) is interrupt:
-                signal.signal(each, handler)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.types import Array
 from swarmctl.telemetry.tracks import interpolate
 
@@ -42,7 +43,7 @@ class SeparationFeed:
         if len(live) < 2 or not len(grid_us):
             return np.zeros(0, np.int64), np.zeros(0)
         at = [interpolate(grid_us, self._t_us[agent], self._pos_ned_m[agent], _GAP_US) for agent in live]
-        least_m = _least_distance_m(np.stack(at, axis=1))
+        least_m = closest_pair_m(np.stack(at, axis=1))
         self._next_us = int(grid_us[-1]) + _GRID_US
         self._forget(self._next_us - _GAP_US)
         known = np.isfinite(least_m)
@@ -53,13 +54,3 @@ class SeparationFeed:
             first = int(np.searchsorted(t_us, before_us))
             first = min(first, max(0, len(t_us) - 1))  # the newest sample stays, because it decides who is live
             self._t_us[agent], self._pos_ned_m[agent] = t_us[first:], self._pos_ned_m[agent][first:]
-
-
-def _least_distance_m(pos_ned_m: Array) -> Array:
-    """Return the smallest pairwise distance (G,) of positions (G, n, 3); NaN where no pair is known."""
-    least_m = np.full(len(pos_ned_m), np.inf)
-    for i in range(pos_ned_m.shape[1] - 1):
-        apart_m = np.linalg.norm(pos_ned_m[:, i + 1 :] - pos_ned_m[:, i : i + 1], axis=2)
-        least_m = np.fmin(least_m, np.fmin.reduce(apart_m, axis=1))
-    least_m[~np.isfinite(least_m)] = np.nan
-    return least_m

@@ -11,7 +11,6 @@ import argparse
 import json
 import os
 import signal
-import socket
 import sys
 import threading
 import time
@@ -26,10 +25,9 @@ from swarmctl.files import replace_text
 from swarmctl.process_lifetime import StopRequest, die_with_parent
 from swarmctl.telemetry.obstacles import MovingObstacle, read_obstacles
 from swarmctl.telemetry.recordings import APPLICATION, RECORDING, has_display, open_viewer
+from swarmctl.telemetry.view_ports import HOST, PORTS_TRIED, free_view_ports
 
 URL_FILE = "viewer.url"
-_HOST = "127.0.0.1"
-_PORTS_TRIED = 50
 _SERVER_MEMORY = "512MiB"  # history for viewers that connect late
 _EXIT_TIMEOUT_S = 4.0  # longest time from SIGTERM to the exit, whatever hangs
 _FLUSH_TIMEOUT_S = 2.0
@@ -175,14 +173,12 @@ def _serve(run: str, directory: Path, port: int) -> tuple[Any, str]:
     rec.set_log_time_enabled(False)
     path = directory / RECORDING
     writable = _takes_data(path)
-    for candidate in range(port, min(port + _PORTS_TRIED, 65536)):
-        if not _is_free(candidate):
-            continue
-        server = rr.GrpcServerSink(_HOST, candidate, server_memory_limit=_SERVER_MEMORY, newest_first=True)
+    for candidate in free_view_ports(port):
+        server = rr.GrpcServerSink(HOST, candidate, server_memory_limit=_SERVER_MEMORY, newest_first=True)
         rec.set_sinks(server, *([rr.FileSink(str(path), write_footer=False)] if writable else []))
         if _is_ours(candidate):
-            return rec, f"rerun+http://{_HOST}:{candidate}/proxy"
-    raise StartError(f"no free port in {port}..{port + _PORTS_TRIED - 1} on {_HOST}. Set telemetry.port")
+            return rec, f"rerun+http://{HOST}:{candidate}/proxy"
+    raise StartError(f"no free port in {port}..{port + PORTS_TRIED - 1} on {HOST}. Set telemetry.port")
 
 
 def _takes_data(path: Path) -> bool:
@@ -194,16 +190,6 @@ def _takes_data(path: Path) -> bool:
     except OSError as error:
         print(f"viewer: no recording, live view only: {error}", file=sys.stderr, flush=True)
         return False
-
-
-def _is_free(port: int) -> bool:
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((_HOST, port))
-        except OSError:
-            return False
-    return True
 
 
 def _is_ours(port: int, timeout_s: float = 2.0) -> bool:

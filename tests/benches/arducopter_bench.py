@@ -14,7 +14,7 @@ from sitl.world import SitlParams, SitlWorld
 from swarmctl.core.clock import SimClock
 from swarmctl.core.frames import quat_from_euler
 from swarmctl.core.types import Landed
-from swarmctl.mavlink.codec import frames
+from swarmctl.mavlink.framing import frames
 from swarmctl.mavlink.transport import pipe_pair
 
 STABILIZE, ALT_HOLD, GUIDED, LOITER, RTL, LAND, BRAKE = 0, 2, 4, 5, 6, 9, 17

@@ -13,7 +13,8 @@ from sitl.world import SitlParams, SitlWorld, line_of_spawns
 from swarmctl.core.clock import SimClock
 from swarmctl.core.frames import quat_from_euler
 from swarmctl.core.simulated import RealismParams
-from swarmctl.mavlink.codec import Codec, frames, message_id
+from swarmctl.mavlink.codec import Codec
+from swarmctl.mavlink.framing import frames, message_id
 from swarmctl.mavlink.transport import pipe_pair
 
 NAN = math.nan

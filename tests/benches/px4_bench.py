@@ -14,7 +14,8 @@ from sitl.px4.link.endpoint import Endpoint
 from sitl.px4.modes import Px4Mode, Result
 from sitl.world import SitlParams, SitlWorld
 from swarmctl.core.clock import SimClock
-from swarmctl.mavlink.codec import Codec, frames, message_id
+from swarmctl.mavlink.codec import Codec
+from swarmctl.mavlink.framing import frames, message_id
 from swarmctl.mavlink.transport import pipe_pair
 
 NAN = math.nan

@@ -6,7 +6,6 @@ A claim about a flight must also hold for starts shifted by a millimetre, or it 
 
 from __future__ import annotations
 
-import itertools
 import json
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -22,6 +21,7 @@ import sitl.lockstep
 from sitl.lockstep import Lockstep
 from sitl.world import SitlParams
 from swarmctl.config import Config, load
+from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.types import Array, Mode, Phase
 
 ROOT = Path(__file__).parents[2]
@@ -79,9 +79,9 @@ class Flight:
     def separation_m(self, only: int | None = None) -> float:
         """Return the smallest true distance of any two vehicles at any time, on the ground and in the air."""
         pos = self.pos_ned_m
-        pairs = itertools.combinations(range(pos.shape[1]), 2)
-        chosen = [(i, j) for i, j in pairs if only is None or only in (i, j)]
-        return float(min(np.linalg.norm(pos[:, i] - pos[:, j], axis=1).min() for i, j in chosen))
+        if only is None:
+            return float(closest_pair_m(pos).min())
+        return float(np.linalg.norm(np.delete(pos, only, axis=1) - pos[:, [only]], axis=2).min())
 
     def modes(self, agent: int, phase: Phase | None = None) -> set[Mode]:
         ticks = self.ticks(agent)

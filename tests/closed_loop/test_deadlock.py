@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 from typing import Any
@@ -15,6 +14,7 @@ from sitl.studies.campaign.layouts import least_sum_m, ring
 from sitl.studies.campaign.scenarios import layout_of
 from swarmctl.config import load
 from swarmctl.control.reference import mission
+from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.types import Array
 from tests.closed_loop.conftest import nudged
 
@@ -60,8 +60,7 @@ class Flown:
 
     @property
     def separation_m(self) -> float:
-        pairs = itertools.combinations(range(self.pos_ned_m.shape[1]), 2)
-        return float(min(np.linalg.norm(self.pos_ned_m[:, i] - self.pos_ned_m[:, j], axis=1).min() for i, j in pairs))
+        return float(closest_pair_m(self.pos_ned_m).min())
 
     @property
     def moved_m(self) -> float:

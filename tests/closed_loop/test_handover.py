@@ -18,7 +18,8 @@ from swarmctl.control.phases import state_machine
 from swarmctl.control.phases.state_machine import REBOOTED, TAKEN_OVER, MissionStateMachine
 from swarmctl.core.types import FlightMode, Phase, VehicleState
 from swarmctl.mavlink import mode_watch
-from swarmctl.mavlink.codec import Codec, frames, message_id
+from swarmctl.mavlink.codec import Codec
+from swarmctl.mavlink.framing import frames, message_id
 from swarmctl.mavlink.transport import PipeTransport
 from tests.closed_loop.conftest import Fly, mission_t_s
 

@@ -16,7 +16,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import development as mav
 
-from swarmctl.mavlink.codec import Codec, frames, message_id
+from swarmctl.mavlink.codec import Codec
+from swarmctl.mavlink.framing import frames, message_id
 from tests.conformance import vocabulary as v
 from tests.conformance.partners import Partner
 

@@ -21,7 +21,8 @@ import pymavlink.dialects.v20 as dialects
 import pytest
 from pymavlink.dialects.v20 import development as mav
 
-from swarmctl.mavlink.codec import Codec, message_id
+from swarmctl.mavlink.codec import Codec
+from swarmctl.mavlink.framing import message_id
 from tests.conformance import vocabulary as v
 from tests.conformance.dialogue import Dialogue
 from tests.conformance.partners import InProcess

@@ -17,7 +17,8 @@ import pytest
 from pymavlink.dialects.v20 import development as mav
 
 from swarmctl.core.records import TRUTH_DTYPE
-from swarmctl.mavlink.codec import Codec, frames
+from swarmctl.mavlink.codec import Codec
+from swarmctl.mavlink.framing import frames
 
 pytestmark = pytest.mark.process
 

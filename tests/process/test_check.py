@@ -20,7 +20,8 @@ from pymavlink.dialects.v20 import development as mavlink
 
 from swarmctl.config import load
 from swarmctl.errors import StartError
-from swarmctl.mavlink.codec import Codec, frames
+from swarmctl.mavlink.codec import Codec
+from swarmctl.mavlink.framing import frames
 from swarmctl.ops.vehicle_check import CheckOptions, check
 
 pytestmark = pytest.mark.process

@@ -31,7 +31,8 @@ from swarmctl.core.types import FlightMode, Landed, Mode, Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START
 from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, Command, RunContext, kill_all
 from swarmctl.ops.status_table import AgentView
-from swarmctl.ops.supervisor import EventLog, FlightSupervisor, LaunchResult, Services
+from swarmctl.ops.supervisor import FlightSupervisor, LaunchResult, Services
+from swarmctl.telemetry.event_log import EventLog
 
 pytestmark = pytest.mark.process
 
@@ -60,7 +61,7 @@ class ScriptedServices(Services):
     """Services made of scripted processes; it is also the display, which the flight calls once in every step."""
 
     def __init__(self, directory: Path, agents: Sequence[str], others: dict[str, str] | None = None) -> None:
-        self.log = EventLog(directory / "launch.events.jsonl")
+        self.log = EventLog(directory / "launch.events.jsonl", "launch")
         self.context = RunContext("run", "unixsock-stream//nowhere", directory)
         scripts = {agent_name(i): script for i, script in enumerate(agents)} | (others or {ROUTER: FLIES_LONG})
         self.children = {

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from pymavlink.dialects.v20 import development as mav
 
 from swarmctl.core.types import GeoOrigin
-from swarmctl.mavlink.codec import Codec, frames, message_id
-from swarmctl.mavlink.transport import cut_frames
+from swarmctl.mavlink.codec import Codec
+from swarmctl.mavlink.framing import cut_frames, frames, message_id
 from tests.real import priority
 from tests.real.autopilots import ARDUCOPTER, Fleet
 

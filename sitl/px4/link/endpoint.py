@@ -13,7 +13,7 @@ from typing import Any
 
 from pymavlink.dialects.v20 import development as mav
 
-from sitl.net.wire import KINDS, FrameWriter, Kind, frames
+from sitl.net.wire import KINDS, FrameWriter, Kind
 from sitl.px4.autopilot import Autopilot
 from sitl.px4.link.commands import Commands, Params
 from sitl.px4.link.missions import MissionLink
@@ -23,6 +23,7 @@ from sitl.px4.link.streams import LinkCounts, Report
 from sitl.px4.link.streams_health import STREAMS
 from sitl.px4.modes import MODE_NAMES, STANDARD_MODES, Result, Severity
 from swarmctl.mavlink.codec import Codec
+from swarmctl.mavlink.framing import frames
 from swarmctl.mavlink.transport import Transport
 
 COMPONENT = 1
@@ -116,7 +117,7 @@ class Endpoint:
         for datagram in arrived:
             self._waited_us = max(0, min(self._step_us, transport_now_us - datagram.t_us))
             self._counts.received_bytes += len(datagram.data)
-            for frame in frames(datagram.data):
+            for frame in frames(datagram.data, version_1=True):
                 self._on_frame(frame)
         self._autopilot.stream.flown()
 

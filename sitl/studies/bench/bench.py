@@ -275,8 +275,8 @@ def _ticks(text: str) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="swarmctl bench", description=__doc__.splitlines()[0])
-    parser.add_argument("--out", metavar="DIR", type=Path, default=Path(), help="where bench.json goes")
-    parser.add_argument("--neighbours", metavar="K,K", type=_counts, default=list(NEIGHBOURS))
+    parser.add_argument("--out", metavar="DIR", type=Path, default=Path(), help="folder of bench.json; default: here")
+    parser.add_argument("--neighbours", metavar="K,K", type=_counts, default=list(NEIGHBOURS), help="counts, 0 to 99")
     parser.add_argument("--solver", action="append", choices=SOLVERS, help="repeatable; default: all installed")
     parser.add_argument("--ticks", metavar="N", type=_ticks, default=300, help="measured for each solver and scenario")
     parser.add_argument("--slsqp", action=argparse.BooleanOptionalAction, default=True, help="the nonlinear baseline")

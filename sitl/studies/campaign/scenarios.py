@@ -17,7 +17,6 @@ import numpy as np
 from sitl.studies.campaign.events import Appearance, Death, Partition, ScenarioEvent
 from sitl.studies.campaign.layouts import far_goals, forest, ring, scattered, walls
 from swarmctl.core.types import Array
-from swarmctl.toml_text import toml_value
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,14 +79,14 @@ _SWAP_S = (1.5, 3.5)  # mission time at which all vehicles are on the way to the
 def _go(goals: Array, speed_m_s: float = _SPEED_M_S, accel_m_s2: float = _ACCEL_M_S2) -> tuple[str, ...]:
     return (
         "mission.kind=goto",
-        f"mission.goto={{goals_ned_m={toml_value(goals.tolist())},speed_m_s={speed_m_s},accel_m_s2={accel_m_s2}}}",
+        f"mission.goto={{goals_ned_m={goals.tolist()},speed_m_s={speed_m_s},accel_m_s2={accel_m_s2}}}",
     )
 
 
 def _columns(axes: Array, radius_m: float, size: Size) -> str:
     keep_out_m = radius_m + 0.5 * size.body_m + _HULL_MARGIN_M
     entry = f"column=true,radius_m={radius_m},keep_out_m={keep_out_m:.3f},visibility_m=2.0"
-    items = ",".join(f"{{center_ned_m={toml_value(axis)},{entry}}}" for axis in axes.tolist())
+    items = ",".join(f"{{center_ned_m={axis},{entry}}}" for axis in axes.tolist())
     return f"obstacles=[{items}]"
 
 
@@ -237,7 +236,7 @@ def settings_of(layout: Layout, agents: int) -> Sequence[str]:
     return (
         *size.settings,
         f"swarm.agents={agents}",
-        f"start.positions_ned_m={toml_value(layout.starts_ned_m.tolist())}",
+        f"start.positions_ned_m={layout.starts_ned_m.tolist()}",
         f"separation.radius_m={size.radius_m}",
         f"separation.body_m={size.body_m}",
         f"separation.max_neighbours={min(max(agents - 1, 1), _NEIGHBOURS)}",

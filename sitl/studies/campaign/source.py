@@ -11,7 +11,6 @@ _PAGES = {
     "page.py",
     "store.py",
     "worker_pool.py",
-    "intervals.py",
     "summary.py",
     "command.py",
 }  # modules of this package that do not affect a flight

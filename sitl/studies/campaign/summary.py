@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import fmean, median
 
-from sitl.studies.campaign.intervals import Interval, clopper_pearson
 from sitl.studies.campaign.trials import Cell, Row, cell_of
 
 
@@ -23,9 +22,14 @@ class Share:
         return self.hits / self.trials if self.trials else 0.0
 
     @property
-    def interval(self) -> Interval:
-        """Exact 95 % interval."""
-        return clopper_pearson(self.hits, self.trials)
+    def interval(self) -> tuple[float, float]:
+        """Exact 95 % interval (Clopper and Pearson); 0..1 without trials."""
+        from scipy.stats import binomtest  # imports for a second, needed by reports only
+
+        if not self.trials:
+            return 0.0, 1.0
+        low, high = binomtest(self.hits, self.trials).proportion_ci(0.95, method="exact")
+        return float(low), float(high)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

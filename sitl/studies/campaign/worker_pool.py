@@ -5,7 +5,6 @@ Every process has one thread, because a flight is single-threaded and numpy's th
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
@@ -14,7 +13,7 @@ from typing import Any
 
 from sitl.studies.campaign.trials import Row, Trial
 from swarmctl.errors import StartError
-from swarmctl.process_lifetime import die_with_parent
+from swarmctl.process_lifetime import serve_parent
 
 Fly = Callable[[Trial], Row]
 
@@ -37,7 +36,7 @@ def on_this_machine(
     if jobs == 1:
         yield from ((trial, _flown(fly, trial)) for trial in trials)
         return
-    pool = ProcessPoolExecutor(jobs, get_context("spawn"), _begin)
+    pool = ProcessPoolExecutor(jobs, get_context("spawn"), serve_parent)
     try:
         todo = iter(trials)
         flying: dict[Future[Row | str], Trial] = {}
@@ -81,12 +80,6 @@ def on_cluster(
         futures: dict[Any, Trial] = {client.submit(_flown, fly, trial, pure=False): trial for trial in trials}
         for future in as_completed(futures):
             yield futures[future], _result(future)
-
-
-def _begin() -> None:
-    """Prepare a child process: it ignores Ctrl-C, which the parent handles, and dies with the parent."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    die_with_parent(signal.SIGKILL)
 
 
 def _flown(fly: Fly, trial: Trial) -> Row | str:

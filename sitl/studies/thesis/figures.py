@@ -15,6 +15,7 @@ from typing import Literal
 import numpy as np
 
 from sitl.studies.thesis.trace import Array, Trace
+from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.telemetry.charts import Ball, Circle, Limit, Line, SpaceLine, Window, space_view, time_chart, top_view
 from swarmctl.telemetry.palette import LIMIT_RGB, SUM_RGB, agent_rgb, css
 
@@ -167,21 +168,14 @@ def body_velocity_m_s(trace: Trace, agent: int = 0) -> Array:
     return np.asarray(np.einsum("ijt,tj->ti", to_body, trace.vel_ned_m_s[:, agent]))
 
 
-def nearest_pair_m(trace: Trace) -> Array:
-    """Return the smallest distance of two agents at every tick (T,) [m], NaN where unknown or alone."""
-    pos = trace.pos_ned_m  # (T, N, 3)
-    first, second = np.triu_indices(pos.shape[1], k=1)
-    if not len(first):
-        return np.full(len(pos), np.nan)
-    return np.asarray(np.fmin.reduce(np.linalg.norm(pos[:, first] - pos[:, second], axis=2), axis=1))
-
-
 def separation_chart(
     flight: FlightName, traces: Sequence[Trace], separation_m: Mapping[str, float], points: int
 ) -> str:
     """Draw the smallest distance of two agents over time, with the constraint radius of every trace."""
     colors = [css(agent_rgb(k)) for k in range(len(traces))]
-    lines = [Line(x=t.t_s, y=nearest_pair_m(t), color=c, label=t.name) for t, c in zip(traces, colors, strict=True)]
+    lines = [
+        Line(x=t.t_s, y=closest_pair_m(t.pos_ned_m), color=c, label=t.name) for t, c in zip(traces, colors, strict=True)
+    ]
     radii = {separation_m.get(trace.name, separation_m.get(flight)) for trace in traces}
     limits = [Limit(r, f"constraint radius {r:g} m") for r in sorted(r for r in radii if r is not None)]
     title = "Smallest distance between two agents [m]"

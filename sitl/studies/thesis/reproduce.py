@@ -10,7 +10,6 @@ from __future__ import annotations
 import argparse
 import multiprocessing
 import os
-import signal
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -33,7 +32,7 @@ from sitl.studies.thesis.trace import Row, Trace
 from swarmctl.built_in_configs import built_in_config
 from swarmctl.config import load
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, ConfigError, StartError, exit_code_of
-from swarmctl.process_lifetime import die_with_parent
+from swarmctl.process_lifetime import serve_parent
 from swarmctl.telemetry.run_folder import create_run_folder
 
 TIMING = "timing"  # name of the timing rows for `--only`
@@ -64,18 +63,13 @@ def fly_all(jobs: Sequence[Job], processes: int, bar: Progress) -> tuple[dict[st
     failed: dict[str, str] = {}
     task = bar.add_task("flying", total=len(jobs))
     longest_first = sorted(jobs, key=lambda job: job.flight != "circle")
-    with multiprocessing.get_context("spawn").Pool(processes, _prepare_worker) as pool:
+    with multiprocessing.get_context("spawn").Pool(processes, serve_parent) as pool:
         for job, traces, why in pool.imap_unordered(fly_job, longest_first):
             bar.update(task, advance=1, description=job.name)
             flown.update({trace.name: trace for trace in traces})
             if why:
                 failed[job.name] = why
     return flown, failed
-
-
-def _prepare_worker() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C
-    die_with_parent(signal.SIGKILL)
 
 
 def chosen(only: Sequence[str], plant: bool, full: bool) -> list[Job]:
@@ -165,11 +159,13 @@ def _make(directory: Path) -> None:
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="swarmctl reproduce", description=__doc__.splitlines()[0])
-    parser.add_argument("--only", action="append", default=[], metavar="FLIGHT")
-    parser.add_argument("--plant", action="store_true")
-    parser.add_argument("--full", action="store_true")
-    parser.add_argument("--out", type=Path, metavar="DIR")
-    parser.add_argument("--jobs", type=int, metavar="N", default=min(8, len(os.sched_getaffinity(0))))
+    add = parser.add_argument
+    add("--only", action="append", default=[], metavar="FLIGHT", help="one experiment; repeatable")
+    add("--plant", action="store_true", help="fly the model only, as the thesis did")
+    add("--full", action="store_true", help="fly the full MAVLink loop only")
+    add("--out", type=Path, metavar="DIR", help="folder to write; default runs/<UTC>-reproduce")
+    processes = min(8, len(os.sched_getaffinity(0)))
+    add("--jobs", type=int, metavar="N", default=processes, help="processes; default: one per processor, at most 8")
     return parser
 
 

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 
 import numpy as np
 
 from sitl.studies.thesis.trace import Array, Trace
+from swarmctl.core.closest_pair import closest_pair_m
 
 STEADY_AFTER_S = 10.0
 
@@ -35,9 +35,7 @@ def index_m(trace: Trace, after_s: float = 0.0) -> float:
 
 def separation_m(trace: Trace) -> float:
     """Return the smallest distance of two agents at any step; infinite for one agent."""
-    pairs = itertools.combinations(range(trace.pos_ned_m.shape[1]), 2)
-    pos = trace.pos_ned_m
-    return min((float(np.linalg.norm(pos[:, i] - pos[:, j], axis=1).min()) for i, j in pairs), default=math.inf)
+    return float(np.fmin.reduce(closest_pair_m(trace.pos_ned_m), initial=math.inf))
 
 
 def clearance_m(trace: Trace) -> float:

@@ -19,7 +19,7 @@ from pydantic import Field
 from swarmctl.control.collision.budget import SeparationBudget
 from swarmctl.control.mpc.axes import HalfSpaces
 from swarmctl.core.params import Params
-from swarmctl.core.trajectory import interpolate
+from swarmctl.core.trajectory import braking_displacement, interpolate
 from swarmctl.core.types import Array, Obstacle, PredictedPath
 
 _TINY_M = 1e-6
@@ -117,19 +117,10 @@ def aligned(paths: Sequence[PredictedPath], t0_utc_us: int, dt_us: int, steps: i
     beyond = k - lasts
     for i, path in enumerate(paths):
         if beyond[i, -1] > 0.0:
-            _brake(found[i], path, beyond[i] * (path.dt_us * 1e-6), brake_m_s2)
+            dt_s = path.dt_us * 1e-6
+            last_vel = (path.pos_ned_m[-1] - path.pos_ned_m[-2]) / dt_s  # (3,)
+            found[i] += braking_displacement(last_vel, beyond[i] * dt_s, brake_m_s2)
     return found
-
-
-def _brake(found_ned_m: Array, path: PredictedPath, beyond_s: Array, brake_m_s2: float) -> None:
-    """Advance positions (steps+1, 3) in place by the braking distance beyond the path's end."""
-    vel = (path.pos_ned_m[-1] - path.pos_ned_m[-2]) / (path.dt_us * 1e-6)  # (3,)
-    speed = math.sqrt(float(vel @ vel))
-    if speed < _TINY_M:
-        return
-    t_s = np.minimum(np.maximum(beyond_s, 0.0), speed / brake_m_s2)
-    travelled = speed * t_s - 0.5 * brake_m_s2 * t_s * t_s
-    found_ned_m += travelled[:, None] * (vel / speed)
 
 
 def keep_out_of_peer(

@@ -19,7 +19,6 @@ from swarmctl.core.types import FlightMode, Landed, Mode, Phase
 from swarmctl.errors import ConfigError, StartError, SwarmError
 from swarmctl.ops import operator, preflight
 from swarmctl.ops.fault import inject, parse_fault
-from swarmctl.ops.launch import Interrupts
 from swarmctl.ops.processes import RunContext, agent_commands, sitl_command, viewer_command
 from swarmctl.ops.status_table import (
     AgentView,
@@ -32,6 +31,7 @@ from swarmctl.ops.status_table import (
 )
 from swarmctl.ops.summary import summary_lines, violation_lines
 from swarmctl.ops.supervisor import why_it_failed
+from swarmctl.process_lifetime import StopRequest
 
 
 def test_vehicle_ports_are_held_and_are_not_those_every_simulator_sends_to() -> None:
@@ -75,7 +75,7 @@ def test_every_problem_at_once_and_nothing_kept(monkeypatch: pytest.MonkeyPatch)
         return found
 
     monkeypatch.setattr(importlib.metadata, "version", version)
-    monkeypatch.setattr(preflight, "_free_view_port", lambda _: 0)
+    monkeypatch.setattr(preflight, "free_view_ports", lambda _: iter(()))
     with pytest.raises(StartError) as caught:
         preflight.inspect(load(None, ["telemetry.port=9876"]))
     lines = str(caught.value).splitlines()
@@ -251,12 +251,12 @@ def test_a_hangup_is_one_request_and_none_under_nohup() -> None:
     """SIGHUP comes from the kernel and again from the shell; a second Ctrl-C is still a second one."""
     before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     try:
-        with Interrupts() as interrupts:
+        with StopRequest(signal.SIGINT, signal.SIGHUP) as interrupts:
             for signum, count in ((signal.SIGHUP, 1), (signal.SIGHUP, 1), (signal.SIGINT, 2), (signal.SIGHUP, 2)):
                 signal.raise_signal(signum)
                 assert interrupts.count == count
-        signal.raise_signal(signal.SIGHUP)  # while the run is judged
-        with Interrupts() as interrupts:  # from here on ignored, as nohup begins
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup begins
+        with StopRequest(signal.SIGINT, signal.SIGHUP) as interrupts:
             signal.raise_signal(signal.SIGHUP)
             assert interrupts.count == 0
     finally:

@@ -19,14 +19,15 @@ from swarmctl.check.link_statistics import Answer, FrameStatistics, round_trip, 
 from swarmctl.check.listener import NOWHERE, Address, ReceivedDatagram, UdpListener, open_listener
 from swarmctl.check.parameters import names_to_read
 from swarmctl.check.scan_facts import facts_of
-from swarmctl.check.scanner import ASKED, SCANNER_COMPID, VehicleScan, frames_of_any_version
+from swarmctl.check.scanner import ASKED, SCANNER_COMPID, VehicleScan
 from swarmctl.check.swarm import exit_code, findings
 from swarmctl.check.table import as_json
 from swarmctl.config import load
 from swarmctl.core.types import FlightMode, GeoOrigin, Landed
 from swarmctl.errors import StartError
-from swarmctl.mavlink.codec import Codec, frames
+from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.dialects import DIALECTS, Dialect
+from swarmctl.mavlink.framing import frames
 
 SHARED = GeoOrigin(47.397742, 8.545594, 489.4)
 VEHICLE, STRANGER = ("10.0.0.1", 14580), ("10.0.0.9", 4000)
@@ -284,7 +285,7 @@ def test_mavlink_1_is_recognised(listener: ScriptedListener) -> None:
     scan.step(listener.now_us)
     facts = facts_of(scan, 0, "udpin://0.0.0.0:14540", 1, SHARED, listener.now_us)
     assert (facts.link.mavlink1, facts.link.mavlink2, facts.sysid, facts.unreachable) == (1, 0, 1, "")
-    assert list(frames_of_any_version(beat + vehicle.codec.encode(mavlink.MAVLink_ping_message(0, 0, 0, 0)) + b"x"))
+    assert list(frames(beat + vehicle.codec.encode(mavlink.MAVLink_ping_message(0, 0, 0, 0)) + b"x", version_1=True))
 
 
 def test_an_unsupported_autopilot_is_reported_without_parameters(listener: ScriptedListener) -> None:

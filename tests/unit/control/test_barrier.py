@@ -12,6 +12,7 @@ from swarmctl.control.collision.barrier import Barrier, BarrierParams, Body, bod
 from swarmctl.control.collision.separation import SeparationParams, align
 from swarmctl.control.model import VehicleModelParams, acceleration
 from swarmctl.control.mpc.problem import Start
+from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.types import Array, Obstacle, PredictedPath
 
@@ -68,8 +69,7 @@ def fly_at_goals(
         held = np.array(commands)
         accel = np.array([acceleration(c) for c in commands])
         pos, vel = pos + DT_S * vel + 0.5 * DT_S**2 * accel, vel + DT_S * accel
-        for a, b in itertools.combinations(pos, 2):
-            least = min(least, math.dist(a, b))
+        least = float(np.fmin(least, closest_pair_m(pos[None])[0]))
         for p, o in itertools.product(pos, moved):
             axes = 2 if o.column else 3
             beside = min(beside, math.dist(p[:axes], o.pos_ned_m[:axes]))

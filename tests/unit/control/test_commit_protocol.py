@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import random
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -17,6 +16,7 @@ from swarmctl.control.commit.protocol import Commitments
 from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference, Situation
 from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.control.reference.mission import quintic_to
+from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.trajectory import Trajectory, ending_at_rest, resting
 from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
 from swarmctl.core.types import Array, Sampled
@@ -109,8 +109,7 @@ class Crowd:
         followed = [agent.committed for agent in self.agents if agent.committed is not None]
         end_us = max(self.now_us, *(trajectory.end_utc_us for trajectory in followed))
         times = np.arange(self.now_us, end_us + 50_001, 50_000)
-        paths = [trajectory.sample(times)[0] for trajectory in followed]
-        return min(float(np.linalg.norm(a - b, axis=1).min()) for a, b in itertools.combinations(paths, 2))
+        return float(closest_pair_m(np.stack([each.sample(times)[0] for each in followed], axis=1)).min())
 
     def run(self, seconds: float) -> float:
         """Run for some time and return the smallest distance between commitments [m]."""

@@ -11,7 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import development as dialect
 
-from swarmctl.mavlink.codec import Codec, frames, message_id
+from swarmctl.mavlink.codec import Codec
+from swarmctl.mavlink.framing import frames, message_id
 
 CRC_EXTRA = {0: 50, 76: 152, 82: 49, 331: 91}  # of common.xml, by message id
 

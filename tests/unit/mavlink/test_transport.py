@@ -13,13 +13,13 @@ import pytest
 
 from swarmctl.core.clock import SimClock
 from swarmctl.errors import StartError
+from swarmctl.mavlink.framing import cut_frames
 from swarmctl.mavlink.transport import (
     Endpoint,
     SerialTransport,
     TcpTransport,
     UdpTransport,
     bind_udp,
-    cut_frames,
     open_transport,
     parse_url,
     pipe_pair,

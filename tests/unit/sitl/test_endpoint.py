@@ -19,7 +19,8 @@ from sitl.world import SitlParams, SitlWorld, line_of_spawns
 from swarmctl.core.clock import SimClock
 from swarmctl.core.types import GeoOrigin
 from swarmctl.errors import ConfigError
-from swarmctl.mavlink.codec import Codec, frames
+from swarmctl.mavlink.codec import Codec
+from swarmctl.mavlink.framing import frames
 from swarmctl.mavlink.transport import pipe_pair
 
 ORIGIN = GeoOrigin(47.397742, 8.545594, 489.4)

@@ -19,7 +19,7 @@ from sitl.fault_socket import ControlSocket, handle
 from sitl.net.lossy import LossyLink
 from swarmctl.core.simulated import FAULTS, FaultParams
 from swarmctl.errors import ConfigError, StartError
-from swarmctl.mavlink.codec import message_id
+from swarmctl.mavlink.framing import message_id
 from swarmctl.mavlink.transport import Datagram
 from swarmctl.ops.fault import inject, parse_fault
 from swarmctl.ops.operator import RunningLaunch
@@ -256,7 +256,10 @@ def test_a_world_refuses_faults_of_vehicles_it_lacks() -> None:
 @pytest.mark.parametrize(
     ("wanted", "complaints"),
     [
-        ({"kind": "meteor", "vehicle": 9}, ["KIND 'meteor': allowed: gps_loss, ", "--vehicle = 9: allowed: 0 to 2"]),
+        (
+            {"kind": "meteor", "vehicle": 9},
+            ["KIND = 'meteor': input should be 'gps_loss', ", "--vehicle = 9: allowed: 0 to 2"],
+        ),
         ({"kind": "motor", "value": 7.0, "vehicle": 3}, ["--vehicle = 3", "--value = 7.0: allowed for motor: 0 to 1"]),
         ({"kind": "motor", "value": 7.0, "for_s": -1.0}, ["--for = -1.0", "--value = 7.0"]),
         ({"kind": "motor", "rotor": 4}, ["--rotor = 4"]),

@@ -13,7 +13,8 @@ from pymavlink.dialects.v20 import development as mav
 
 from sitl.world import SitlParams, SitlWorld
 from swarmctl.core.clock import SimClock
-from swarmctl.mavlink.codec import Codec, frames
+from swarmctl.mavlink.codec import Codec
+from swarmctl.mavlink.framing import frames
 from swarmctl.mavlink.transport import pipe_pair
 from tests.benches.hostile import Hostile
 

@@ -17,12 +17,13 @@ from swarmctl.core.clock import SimClock
 from swarmctl.core.records import TRUTH_DTYPE
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.mavlink.transport import pipe_pair
+from swarmctl.process_lifetime import StopRequest
 
 
 class SteppedWorld:
     """Stands in for a world: counts steps, stalls where told, and stops the loop."""
 
-    def __init__(self, stop: realtime.StopRequest, steps: int, stall_at: int = -1, stall_s: float = 0.0) -> None:
+    def __init__(self, stop: StopRequest, steps: int, stall_at: int = -1, stall_s: float = 0.0) -> None:
         self.params = SitlParams(vehicles=1, spawn_ned_m=line_of_spawns(1))
         self.times_us: list[int] = []
         self._stop, self._steps, self._stall_at, self._stall_s = stop, steps, stall_at, stall_s
@@ -31,11 +32,12 @@ class SteppedWorld:
         self.times_us.append(now_us)
         if len(self.times_us) == self._stall_at:
             time.sleep(self._stall_s)
-        self._stop.wanted = len(self.times_us) >= self._steps
+        if len(self.times_us) >= self._steps:
+            self._stop.ask()
 
 
 def flown(steps: int, stall_at: int = -1, stall_s: float = 0.0) -> tuple[realtime.LoopStatistics, np.ndarray[Any, Any]]:
-    stop = realtime.StopRequest()
+    stop = StopRequest()
     world = SteppedWorld(stop, steps, stall_at, stall_s)
     statistics = realtime.fly(world, stop, None)  # type: ignore[arg-type]
     return statistics, np.diff(world.times_us)

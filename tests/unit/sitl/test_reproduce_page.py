@@ -24,11 +24,11 @@ from sitl.studies.thesis.figures import (
     body_velocity_m_s,
     draw,
     index_chart,
-    nearest_pair_m,
     separation_chart,
 )
 from sitl.studies.thesis.page import flight_of, ratio, write_json, write_page
 from sitl.studies.thesis.trace import Row, Sphere, Trace
+from swarmctl.core.closest_pair import closest_pair_m
 
 RESULTS = {
     5,
@@ -274,12 +274,11 @@ def test_swarm_figures_show_the_agents_of_the_first_trace() -> None:
 
 
 def test_nearest_pair() -> None:
-    trace = line_trace("pair", "circle")
     pos_ned_m = np.array(
         [[[0.0, 0.0, 0.0], [3.0, 4.0, 0.0], [0.0, 0.0, -1.0]], [[0.0, 0.0, 0.0], [0.0, 2.0, 0.0], [np.nan] * 3]]
     )
-    assert nearest_pair_m(replace(trace, pos_ned_m=pos_ned_m)) == pytest.approx([1.0, 2.0])
-    assert np.isnan(nearest_pair_m(line_trace("alone", "pid_step"))).all()
+    assert closest_pair_m(pos_ned_m) == pytest.approx([1.0, 2.0])
+    assert np.isnan(closest_pair_m(line_trace("alone", "pid_step").pos_ned_m)).all()
 
 
 def test_every_constraint_radius_is_a_limit() -> None:

@@ -15,25 +15,28 @@ import pytest
 from pymavlink.dialects.v20 import development as mav
 
 from sitl import realtime
+from swarmctl.process_lifetime import StopRequest
+from swarmctl.wall_clock import monotonic_us
 from tests.benches.flown_world import OFFBOARD, FlownWorld
 
 
 class Clocked:
     """A world that notes when it is stepped, on both clocks, and stops after `steps`."""
 
-    def __init__(self, stop: realtime.StopRequest, steps: int) -> None:
+    def __init__(self, stop: StopRequest, steps: int) -> None:
         self.params = FlownWorld(1).world.params
         self.rows: list[tuple[int, int]] = []
         self._stop, self._steps = stop, steps
 
     def step(self, now_us: int) -> None:
-        self.rows.append((realtime.monotonic_us(), now_us))
-        self._stop.wanted = len(self.rows) >= self._steps
+        self.rows.append((monotonic_us(), now_us))
+        if len(self.rows) >= self._steps:
+            self._stop.ask()
 
 
 @pytest.mark.parametrize("speed", [0.5, 5.0])
 def test_simulated_time_runs_at_its_speed(speed: float) -> None:
-    stop = realtime.StopRequest()
+    stop = StopRequest()
     world: Any = Clocked(stop, round(75 * speed))
     statistics = realtime.fly(world, stop, None, speed=speed)
     wall_s = (world.rows[-1][0] - world.rows[0][0]) * 1e-6
@@ -93,7 +96,7 @@ def offboard_world(preset: str = "x500") -> FlownWorld:
 class Client(threading.Thread):
     """Streams setpoints to a world that runs in another thread, as slowly as told."""
 
-    def __init__(self, flown: FlownWorld, every_s: float, count: int, stop: realtime.StopRequest) -> None:
+    def __init__(self, flown: FlownWorld, every_s: float, count: int, stop: StopRequest) -> None:
         super().__init__()
         self._flown, self._every_s, self._count, self._stop_request = flown, every_s, count, stop
 
@@ -102,19 +105,19 @@ class Client(threading.Thread):
             for vehicle in (0, 1):
                 self._flown.setpoint(vehicle, (0.0, 0.0, 0.0), 0.49)
             time.sleep(self._every_s)
-        self._stop_request.wanted = True
+        self._stop_request.ask()
 
 
 def gated(flown: FlownWorld, every_s: float, count: int, *, gate: bool) -> int:
     """Physics steps made while a client sends `count` setpoints."""
     flown.fly_offboard((0.0, 0.0, 0.0), 0.49)
     assert flown.world.offboard_vehicles() == {0, 1}
-    stop = realtime.StopRequest()
+    stop = StopRequest()
     flown.clock.advance(1_000_000_000)  # nothing in the pipe may be late
     client = Client(flown, every_s, count, stop)
     world: Any = flown.world
     # continue the world's own clock from its newest step
-    base_us, start_us = flown.clock.now_us(), realtime.monotonic_us()
+    base_us, start_us = flown.clock.now_us(), monotonic_us()
 
     class Shifted:
         """The same world on the wall clock's time axis."""
@@ -156,7 +159,7 @@ def test_a_silent_client_is_waited_for_once_only(monkeypatch: pytest.MonkeyPatch
     flown = offboard_world()
     flown.fly_offboard((0.0, 0.0, 0.0), 0.49)
     flown.step(0.02)
-    gate, stop = realtime.Gate(flown.world), realtime.StopRequest()
+    gate, stop = realtime.Gate(flown.world), StopRequest()
     waits_s = []
     for _ in range(3):
         began = time.monotonic()
@@ -176,7 +179,7 @@ def test_without_a_vehicle_in_offboard_the_physics_does_not_wait() -> None:
     flown = offboard_world()
     gate = realtime.Gate(flown.world)
     began = time.monotonic()
-    gate.wait(realtime.StopRequest(), flown.clock.now_us())
+    gate.wait(StopRequest(), flown.clock.now_us())
     assert time.monotonic() - began < 0.1
     flown.command(0, mav.MAV_CMD_DO_SET_MODE, *OFFBOARD)  # without a setpoint it is refused
     flown.step(0.1)

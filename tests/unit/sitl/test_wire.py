@@ -9,10 +9,11 @@ import pytest
 from fastcrc import crc16
 from pymavlink.dialects.v20 import development as mav
 
-from sitl.net.wire import KINDS, LACKING, FrameWriter, frames
+from sitl.net.wire import KINDS, LACKING, FrameWriter
 from sitl.px4.link.schedule import GCS_HZ, OFFBOARD_HZ
 from sitl.px4.link.streams_health import STREAMS
 from swarmctl.mavlink.codec import Codec
+from swarmctl.mavlink.framing import frames
 from tests.benches.px4_bench import Bench, taken_off
 
 
@@ -57,7 +58,7 @@ def test_frames_of_both_versions_are_found_in_junk() -> None:
     second = Codec(1, 1).encode(mav.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3))
     first = mav.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3).pack(mav.MAVLink(None, 1, 1), force_mavlink1=True)
     assert first[0] == 0xFE
-    assert list(frames(b"\x00\x11" + second + b"\x55" + first + second[:5])) == [second, first]
+    assert list(frames(b"\x00\x11" + second + b"\x55" + first + second[:5], version_1=True)) == [second, first]
 
 
 def test_a_first_version_frame_is_obeyed() -> None:

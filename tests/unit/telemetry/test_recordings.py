@@ -97,6 +97,8 @@ def test_mesh_is_a_sound_glb_of_a_small_quadrotor() -> None:
     document = json.loads(glb[20 : 20 + json_length])
     blob = glb[28 + json_length :]
     assert len(blob) == document["buffers"][0]["byteLength"]
+    colors = [material["pbrMetallicRoughness"]["baseColorFactor"][:3] for material in document["materials"]]
+    assert colors.count(pytest.approx([(c / 255) ** 2.2 for c in agent_rgb(0)], abs=1e-5)) == 2
     assert len(glb) < 60_000
     corners = []
     for primitive in document["meshes"][0]["primitives"]:

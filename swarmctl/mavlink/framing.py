@@ -1,0 +1,47 @@
+"""Frame boundaries of MAVLink in received bytes. Checksums are not verified here."""
+
+from __future__ import annotations
+
+import re
+
+_START_2 = re.compile(b"\xfd")
+_START_1_OR_2 = re.compile(b"[\xfd\xfe]")
+_VERSION_2 = 0xFD
+_FIRST_BYTES = 3  # they tell the length of a frame
+_AROUND_1, _AROUND_2, _SIGNATURE = 8, 12, 13  # bytes of header and checksum by version, and of a signature
+_SIGNED = 1
+
+
+def cut_frames(buffer: bytearray, version_1: bool = False) -> list[bytes]:
+    """Remove and return all complete MAVLink 2 frames at the front of `buffer`; junk before a start byte is dropped.
+
+    With `version_1`, MAVLink 1 frames are returned too; otherwise they are junk.
+    """
+    start_byte = _START_1_OR_2 if version_1 else _START_2
+    found: list[bytes] = []
+    while True:
+        start = start_byte.search(buffer)
+        if start is None:
+            buffer.clear()
+            return found
+        del buffer[: start.start()]
+        if len(buffer) < _FIRST_BYTES:
+            return found
+        if buffer[0] == _VERSION_2:
+            length = _AROUND_2 + buffer[1] + (_SIGNATURE if buffer[2] & _SIGNED else 0)
+        else:
+            length = _AROUND_1 + buffer[1]
+        if len(buffer) < length:
+            return found
+        found.append(bytes(buffer[:length]))
+        del buffer[:length]
+
+
+def frames(datagram: bytes, version_1: bool = False) -> list[bytes]:
+    """Return the frames of a datagram as `cut_frames` does; a truncated frame ends it."""
+    return cut_frames(bytearray(datagram), version_1)
+
+
+def message_id(frame: bytes) -> int:
+    """Return the message id of a MAVLink 2 frame."""
+    return int.from_bytes(frame[7:10], "little")

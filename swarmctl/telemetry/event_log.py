@@ -1,0 +1,24 @@
+"""Events of one process as JSON lines in the run folder, stamped with both clocks."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+from swarmctl.wall_clock import monotonic_us
+
+
+class EventLog:
+    """Appends events of one source to a file; a full disk loses events, never the flight."""
+
+    def __init__(self, path: Path, source: str) -> None:
+        self._path, self._source = path, source
+
+    def write(self, event: str, **fields: Any) -> None:
+        """Append one row with both clocks."""
+        stamp = {"utc_us": time.time_ns() // 1000, "t_us": monotonic_us(), "source": self._source, "event": event}
+        with contextlib.suppress(OSError), self._path.open("a", encoding="utf-8") as file:
+            file.write(json.dumps({**stamp, **fields}) + "\n")

@@ -1,0 +1,37 @@
+"""The host's clocks: monotonic time, comparable between processes of one host, and UTC whose steps are slewed."""
+
+from __future__ import annotations
+
+import time
+
+_UTC_SLEW_01 = 0.01  # largest correction of UTC per elapsed time
+
+
+def monotonic_us() -> int:
+    """Return CLOCK_MONOTONIC [us], which is comparable between processes of this host."""
+    return time.monotonic_ns() // 1000
+
+
+class WallClock:
+    """Reads the host's clocks. UTC steps are slewed, so that in flight time neither jumps nor runs backwards."""
+
+    def __init__(self) -> None:
+        self._read_ns = time.monotonic_ns()
+        self._offset_ns = time.time_ns() - self._read_ns
+
+    def now_us(self) -> int:
+        return monotonic_us()
+
+    def utc_us(self) -> int:
+        now_ns = time.monotonic_ns()
+        most_ns = int((now_ns - self._read_ns) * _UTC_SLEW_01)
+        off_ns = time.time_ns() - now_ns - self._offset_ns
+        self._offset_ns += min(most_ns, max(-most_ns, off_ns))
+        self._read_ns = now_ns
+        return (now_ns + self._offset_ns) // 1000
+
+    def sleep_until(self, t_us: int) -> None:
+        """Return at monotonic time `t_us`, or at once when it has passed."""
+        left_us = t_us - self.now_us()
+        if left_us > 0:
+            time.sleep(left_us * 1e-6)
