@@ -19,12 +19,12 @@ from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
+import tomli_w
 from pydantic.fields import FieldInfo
 
 from swarmctl.config import Config
 from swarmctl.core.params import Params
 from swarmctl.core.simulated import FAULTS
-from swarmctl.toml_text import toml_text
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "configuration.md"
@@ -149,7 +149,9 @@ def _value(value: Any) -> str:
     """Return a value as TOML."""
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{key} = {_value(item)}" for key, item in value.items()) + " }"
-    return toml_text({"key": value}).strip().removeprefix("key = ")
+    if isinstance(value, (list, tuple)):
+        return "[" + ", ".join(map(_value, value)) + "]"
+    return tomli_w.dumps({"key": value}).strip().removeprefix("key = ")
 
 
 def _bare(annotation: Any) -> Any:
