@@ -15,7 +15,6 @@ _ALERT_LIFETIME_US = 2_000_000  # time an alert stays visible after its cause ha
 class Alert:
     """One cause that needs the operator's attention."""
 
-    cause: str
     text: str
     since_us: int
 
@@ -30,7 +29,7 @@ class Alerts:
     def put(self, cause: str, text: str, now_us: int) -> bool:
         """Raise or refresh the alert of a cause; returns whether it is new. The text may change while it lasts."""
         before = self._active.get(cause)
-        self._active[cause] = Alert(cause, text, now_us if before is None else before.since_us)
+        self._active[cause] = Alert(text, now_us if before is None else before.since_us)
         self._raised_us[cause] = now_us
         return before is None
 

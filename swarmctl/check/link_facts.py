@@ -83,7 +83,6 @@ class Estimator:
 
     flags: int
     pos_horiz_m: float | None  # 1 sigma
-    pos_vert_m: float | None
 
 
 @dataclass(frozen=True, slots=True)

@@ -154,7 +154,7 @@ def _sensors(message: Any | None) -> Sensors | None:
 def _estimator(message: Any | None) -> Estimator | None:
     if message is None:
         return None
-    return Estimator(message.flags, _told(message.pos_horiz_accuracy), _told(message.pos_vert_accuracy))
+    return Estimator(message.flags, _told(message.pos_horiz_accuracy))
 
 
 def _told(value: float) -> float | None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import socket
 import subprocess
 import sys
 import time
@@ -12,24 +11,20 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from tests.benches.free_ports import free_ports
+
 ROOT = Path(__file__).resolve().parents[2]
 SPEED = 4  # simulated seconds a second: what clients wait for is flight
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @contextmanager
 def simulator(preset: str = "x500", speed: float = SPEED, port: int | None = None) -> Iterator[int]:
     """Yields the port it sends to, free if none is given, and checks its clean end."""
-    port = free_port() if port is None else port
+    port = free_ports(1)[0] if port is None else port
     process = subprocess.Popen(
         [
             *(sys.executable, "-m", "sitl", "--vehicles", "1", "--preset", preset, "--speed", str(speed)),
-            *("--ekf-ready", "0.2", "--remote-ports", str(port), "--local-port", str(free_port())),
+            *("--ekf-ready", "0.2", "--remote-ports", str(port), "--local-port", str(free_ports(1)[0])),
         ],
         cwd=ROOT,
         env={**os.environ, "PYTHONPATH": str(ROOT)},

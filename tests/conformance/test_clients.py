@@ -23,12 +23,13 @@ from pymavlink.dialects.v20 import development as mav
 
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import message_id
+from tests.benches.free_ports import free_ports
 from tests.conformance import vocabulary as v
 from tests.conformance.dialogue import Dialogue
 from tests.conformance.partners import InProcess
 from tests.conformance.player import Player
 from tests.conformance.rows_missions import AROUND, download, upload
-from tests.conformance.simulator_process import free_port, simulator, wait_for
+from tests.conformance.simulator_process import simulator, wait_for
 
 DEFINITIONS = str(Path(dialects.__file__).with_name("development.xml"))
 TAKEOFF_ALTITUDE_M = 1.5
@@ -46,7 +47,7 @@ def test_mavsdk_grpc_walk() -> None:
 async def fly_with_grpc(port: int) -> None:
     from mavsdk_grpc import System  # starts a server process of its own
 
-    vehicle = System(port=free_port())
+    vehicle = System(port=free_ports(1)[0])
     try:
         await vehicle.connect(system_address=f"udpin://127.0.0.1:{port}")
         async for state in vehicle.core.connection_state():
@@ -286,7 +287,7 @@ def differences(message: Any, theirs: dict[str, Any]) -> list[str]:
 def test_libmav_reads_every_message_as_we_do() -> None:
     frames = everything_said()
     assert len(frames) > 30
-    codec, port = Codec(255, 1), free_port()
+    codec, port = Codec(255, 1), free_ports(1)[0]
     with lib_mav(port) as client, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.sendto(frames[mav.MAVLINK_MSG_ID_HEARTBEAT], ("127.0.0.1", port))
         client.connect()
@@ -309,7 +310,7 @@ def test_libmav_reads_every_message_as_we_do() -> None:
 
 @pytest.mark.process
 def test_libmav_flies() -> None:
-    port = free_port()
+    port = free_ports(1)[0]
     with lib_mav(port) as client, simulator(port=port):  # who sends ends first
         client.connect()
         wait_for(lambda: any(number == mav.MAVLINK_MSG_ID_ODOMETRY for number, _ in client.decoded), 3.0, "a position")

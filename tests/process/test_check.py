@@ -23,23 +23,13 @@ from swarmctl.errors import StartError
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames
 from swarmctl.ops.vehicle_check import CheckOptions, check
+from tests.benches.free_ports import free_ports
 
 pytestmark = pytest.mark.process
 
 ROOT = Path(__file__).resolve().parents[2]
 ENV = {**os.environ, "PYTHONPATH": str(ROOT)}
 QUICK_S = 1.0
-
-
-def free_ports(count: int) -> list[int]:
-    """Free a moment ago; nothing else on this machine asks for them by number."""
-    sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
-    for sock in sockets:
-        sock.bind(("127.0.0.1", 0))
-    ports = [int(sock.getsockname()[1]) for sock in sockets]
-    for sock in sockets:
-        sock.close()
-    return ports
 
 
 class Simulator:

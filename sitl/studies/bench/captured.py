@@ -167,7 +167,6 @@ class Baseline:
 
     took_ms: Array  # (problems,)
     solved: Mask  # (problems,) reported as solved
-    at_limit: Mask  # (problems,) reached the iteration limit
     kept: Mask  # (problems,) whether its answer keeps every true distance
 
     @property
@@ -178,15 +177,6 @@ class Baseline:
     @property
     def solved_01(self) -> float:
         return float(self.solved.mean())
-
-    @property
-    def at_limit_01(self) -> float:
-        return float(self.at_limit.mean())
-
-    @property
-    def infeasible_01(self) -> float:
-        """Share of problems for which it reports that the constraints can't be satisfied."""
-        return float((~self.solved & ~self.at_limit).mean())
 
     @property
     def kept_01(self) -> float:
@@ -273,6 +263,5 @@ class _Running:
         return Baseline(
             took_ms=np.array(self._took_ms[_WARM_UP:]),
             solved=np.array([a.solved for a in answers]),
-            at_limit=np.array([a.at_limit for a in answers]),
             kept=np.array([a.shortfall_m < KEPT_M for a in answers]),
         )

@@ -26,7 +26,7 @@ from swarmctl.core.types import Array
 FTOL = 1e-6  # fmincon's tolerances; of the thesis' own cost
 MAX_ITERATIONS = 400  # fmincon's own limit
 KEPT_M = 1e-6  # fmincon's tolerance of a constraint
-_SOLVED, _LIMIT = 0, 9  # SLSQP's exit modes
+_SOLVED = 0  # SLSQP's exit mode
 _LEAST_M = 1e-9
 
 
@@ -37,7 +37,6 @@ class NonlinearAnswer:
     moves: Array  # (2 Hc,) increments of u_x, then of u_y
     cost: float
     solved: bool
-    at_limit: bool
     iterations: int
     shortfall_m: float  # largest violation of a distance
 
@@ -141,7 +140,6 @@ class NonlinearXy:
             moves=moves,
             cost=float(result.fun),
             solved=mode == _SOLVED,
-            at_limit=mode == _LIMIT,
             iterations=int(result.nit),
             shortfall_m=self.shortfall_m(moves),
         )

@@ -102,7 +102,7 @@ HEALTHY = VehicleFacts(
     sensors=Sensors(
         present=ALL_SENSORS, enabled=ALL_SENSORS | RC_RECEIVER, healthy=0x1320C83F, battery_v=16.2, battery_01=1.0
     ),
-    estimator=Estimator(1023, 0.1, 0.2),
+    estimator=Estimator(1023, 0.1),
     gps=Gps(3, 10, 0.9),
     pos_ned_m=(0.0, 0.0, 0.0),
     origin_ned_m=(0.1, 0.0, 0.0),
@@ -240,8 +240,8 @@ PX4_CASES: list[tuple[str, dict[str, Any], Verdict, str]] = [
         NOTE,
         "not known",
     ),
-    ("estimator", {"estimator": Estimator(1023 & ~16, 0.3, 0.4)}, FIX, "position source"),
-    ("estimator", {"estimator": Estimator(1023 | 1024, 0.3, 0.4)}, FIX, "distrusts"),
+    ("estimator", {"estimator": Estimator(1023 & ~16, 0.3)}, FIX, "position source"),
+    ("estimator", {"estimator": Estimator(1023 | 1024, 0.3)}, FIX, "distrusts"),
     ("estimator", {"estimator": None, "gps": Gps(2, 4, 9.0)}, FIX, "3-D fix"),
     ("estimator", {"estimator": None, "gps": Gps(3, 10, None)}, NOTE, "how accurate"),
     ("origin", {"origin_ned_m": None}, FIX, "can't be placed"),
@@ -371,7 +371,7 @@ def test_swarm_rows(config: Config, topic: str, second: dict[str, Any], verdict:
 
 
 def test_the_radius_has_to_cover_body_tracking_and_estimator(config: Config) -> None:
-    vague = changed(SECOND_OK, estimator=Estimator(1023, 0.3, 0.4))
+    vague = changed(SECOND_OK, estimator=Estimator(1023, 0.3))
     told = config.model_copy(update={"separation": config.separation.model_copy(update={"allow_small_radius": True})})
     lines = [
         line_of(findings(vehicles, given), "radius", SWARM)

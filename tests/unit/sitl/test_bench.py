@@ -242,7 +242,7 @@ def test_the_qp_is_much_faster_than_the_nonlinear_problem(captured: Captured) ->
     assert times.problems == 40
     fmincon, gradients = times.fmincon, times.gradients
     assert fmincon is not None and gradients is not None
-    assert fmincon.solved_01 + fmincon.infeasible_01 + fmincon.at_limit_01 == pytest.approx(1.0)
+    assert 0.0 < fmincon.solved_01 <= 1.0
     assert fmincon.kept_01 > 0.5 and gradients.kept_01 > 0.5
     assert times.speed_up() > 3.0  # measured 11
     assert times.speed_up("daqp") > 10.0  # measured 60
