@@ -53,7 +53,8 @@ class StopRequest:
 
     Args:
         signums: the signals that ask.
-        raise_at: the number of the signal's request that raises KeyboardInterrupt; 0 is none.
+        raise_at: the number of the signal's request that raises KeyboardInterrupt, after which the signals are ignored
+            for good; 0 is none.
     """
 
     def __init__(self, *signums: int, raise_at: int = 0) -> None:
@@ -105,4 +106,6 @@ class StopRequest:
             return
         self.ask()
         if self.count == self._raise_at:
+            for each in self._before:  # whoever cleans up after the interrupt is not interrupted again
+                signal.signal(each, signal.SIG_IGN)
             raise KeyboardInterrupt
