@@ -1,5 +1,7 @@
 """Stops a launch in every phase, in every way, and checks that every vehicle left armed is named.
 
+Where one agent is killed that is asked of its vehicle only: the others fly on, and hold for as long as they are told.
+
     python tools/stop_matrix.py --cells sigint:ARM,kill-agent:TAKEOFF
     python tools/stop_matrix.py --config configs/px4_udp.toml --witness-port 14550
 
@@ -37,6 +39,7 @@ SIGNALS = {"sigint": signal.SIGINT, "sigterm": signal.SIGTERM, "sighup": signal.
 SAFE_S = 60.0  # after the stop every vehicle is disarmed, or named
 START_S = 120.0
 AGENTS = 2
+KILLED_AGENT = 1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -46,6 +49,10 @@ class Cell:
     stop: str
     phase: str
     after_s: float = 0.0
+
+    def concerns(self, sysid: int) -> bool:
+        """Return whether that vehicle must be disarmed in the end."""
+        return self.stop != "kill-agent" or sysid == KILLED_AGENT + 1
 
     def __str__(self) -> str:
         return f"{self.stop}:{self.phase}" + (f"+{self.after_s:.2f}" if self.after_s else "")
@@ -94,6 +101,7 @@ def vehicles(config: Path | None, folder: Path, witness_port: int) -> Iterator[P
         return
     ports = free_ports(AGENTS)
     lines = ['name = "stops"', "[swarm]", f"agents = {AGENTS}", "[mission]", "duration_s = 6.0"]
+    lines += ["[start]", "center_ned_m = [2.0, 0.0, 0.0]"]  # far enough for GOTO_START to be seen
     lines += ["[sitl]", "enabled = false", "[telemetry]", "enabled = false"]
     for i, port in enumerate(ports):
         lines += ["[[vehicles]]", f"sysid = {i + 1}", f'url = "udpin://127.0.0.1:{port}"']
@@ -136,7 +144,7 @@ def stop(cell: Cell, launch: subprocess.Popen[bytes], run_dir: Path) -> None:
     elif cell.stop == "land":
         verb(run_dir, "land")
     else:
-        words = "--id 1 " if cell.stop == "kill-agent" else "--router"
+        words = f"--id {KILLED_AGENT} " if cell.stop == "kill-agent" else "--router"
         child_of(psutil.Process(launch.pid), words).kill()
 
 
@@ -169,7 +177,8 @@ def _fly(cell: Cell, path: Path, folder: Path, witness: Witness) -> tuple[bool, 
                 break
             time.sleep(0.05)
         witness.listen()
-        took_s, left = time.monotonic() - stopped_s, sorted(i for i, armed in witness.armed.items() if armed)
+        took_s = time.monotonic() - stopped_s
+        left = sorted(i for i, armed in witness.armed.items() if armed and cell.concerns(i))
         said = log.read_text(errors="replace")
         named = launch.poll() == 4 and all(f"vehicle {i} " in said for i in left)
         heeded = launch.poll() != 0 or cell.phase in ("GOTO_LAND", "LAND")  # it did not fly on to the end
