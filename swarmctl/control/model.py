@@ -28,8 +28,8 @@ class VehicleModelParams(Params):
     drag_1_s: float = Field(0.0, ge=0, le=10)  # linear drag over mass
     hover_thrust_01: float = Field(0.5, gt=0.05, lt=0.95)  # initial value; estimated in flight
     thrust_min_01: float = Field(0.05, ge=0, lt=1)  # keeps motors turning
-    thrust_max_01: float = Field(1.0, gt=0, le=1)
-    tilt_max_rad: float = Field(0.6, gt=0, lt=1.5)
+    thrust_max_01: float = Field(1.0, gt=0, le=1)  # largest thrust that is asked for
+    tilt_max_rad: float = Field(0.6, gt=0, lt=1.5)  # largest tilt that is asked for, by every controller and protection
 
     def lag(self) -> Lag | None:
         """Return the lag of the attitude behind its setpoints; None if it follows at once."""

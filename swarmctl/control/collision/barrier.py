@@ -46,7 +46,7 @@ _FARTHEST_M_S2 = 40.0  # rows that ask for less than minus this are met by any a
 class BarrierParams(Params):
     """When the safety filter acts, and how hard."""
 
-    enabled: bool = True
+    enabled: bool = True  # false: setpoints of the controller are sent unfiltered
     margin_m: float = Field(0.05, ge=0, le=10)  # distance kept beyond touching bodies
     brake_m_s2: float = Field(4.0, gt=0, le=20)  # level braking of one vehicle; the rest of its thrust is reserve
     near_1_s: float = Field(6.0, gt=0, le=50)  # k: approach speed allowed per metre left, close by

@@ -37,12 +37,12 @@ class SeparationParams(Params):
     allow_small_radius: bool = False  # fly although radius_m is below what body, tracking and estimator need
     certify_slack_m: float = Field(0.1, ge=0, le=10)  # a plan closer than radius minus this is never flown
     age_accel_m_s2: float = Field(4.0, ge=0, le=50)  # margin a t^2 / 2 with the age of a path
-    age_margin_max_m: float = Field(1.0, ge=0, le=50)
+    age_margin_max_m: float = Field(1.0, ge=0, le=50)  # largest such margin
     brake_m_s2: float = Field(3.0, gt=0, le=50)  # assumed braking of a peer beyond its prediction
     lost_after_s: float = Field(0.5, gt=0, le=60)  # a path this old is kept clear of at every height
     gate_m: float = Field(3.0, gt=0, le=1000)  # rows farther than this from being active are left out
     approach_01: float = Field(0.0, ge=0, le=1)  # plans keep this share more of what two are still to come closer
-    approach_max_m: float = Field(0.15, ge=0, le=10)
+    approach_max_m: float = Field(0.15, ge=0, le=10)  # largest distance added by `approach_01`
     stop_m_s2: float = Field(1.0, gt=0, le=50)  # braking that plans leave room for beyond their horizon
     relax_01: float = Field(0.9, gt=0, le=1)  # share of the reachable displacement a row may ask for
     right_of_way_rad: float = Field(0.35, ge=0, le=1.2)  # largest turn of head-on normals among peers

@@ -35,16 +35,16 @@ _INTERPOLATION_MARGIN_M = 0.01  # kept by proposals on top: they are checked as 
 class CommitParams(Params):
     """Sets up planning with `separation.mode = "guaranteed"`."""
 
-    dt_s: float = Field(0.1, ge=0.05, le=0.5)
+    dt_s: float = Field(0.1, ge=0.05, le=0.5)  # time between two points of a trajectory
     horizon: int = Field(20, ge=5, le=60)  # steps before the final braking
-    moves: int = Field(8, ge=2, le=40)
+    moves: int = Field(8, ge=2, le=40)  # control horizon: steps after which the input is constant
     brake_m_s2: float = Field(1.5, ge=0.5, le=10)  # deceleration of the final braking
     tilt_fraction_01: float = Field(
         0.8, gt=0, le=1
     )  # share of the controller's tilt that plans may use; the rest is for tracking
     period_s: float = Field(0.1, ge=0, le=2)  # least time between two plans
     lead_min_s: float = Field(0.06, ge=0.02, le=2)  # least time from proposing to flying
-    lead_max_s: float = Field(1.5, ge=0.1, le=5)
+    lead_max_s: float = Field(1.5, ge=0.1, le=5)  # longest such lead, however late the others answer
     right_of_way_rad: float = Field(1.0, ge=0, le=1.2)  # overrides `separation`: plans with stops lock sooner
     stuck_m: float = Field(1.0, gt=0, le=10)  # overrides `separation`: agents that meet turn while they still move
     follow_z: AxisWeights = AxisWeights(q_pos=20.0, q_vel=0.5, r=0.05)  # tracks commitments to the centimetre

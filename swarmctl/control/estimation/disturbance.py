@@ -20,8 +20,8 @@ from swarmctl.core.types import Array, VehicleState
 class DisturbanceParams(Params):
     """Bandwidths and limits of the estimators."""
 
-    enabled: bool = True
-    bandwidth_rad_s: float = Field(2.0, gt=0, le=50)
+    enabled: bool = True  # false: plans assume the nominal model
+    bandwidth_rad_s: float = Field(2.0, gt=0, le=50)  # of the disturbance observer
     limit_m_s2: float = Field(15.0, gt=0, le=50)  # 8 m/s of wind and a gust on 1 1/s of drag are 12
     hover_time_s: float = Field(2.0, gt=0, le=600)  # time constant of the hover-thrust estimate
 

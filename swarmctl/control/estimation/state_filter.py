@@ -33,7 +33,7 @@ _FIRST_M_S2 = 1.0  # one sigma of the disturbance when the agent takes control
 class StateFilterParams(Params):
     """Noise model, one sigma each, of an autopilot's estimate; the filter is off for exact states."""
 
-    enabled: bool = False
+    enabled: bool = False  # true: filter reported states; for estimates with noise
     pos_m: float = Field(0.02, gt=0, le=10)  # noise of a reported position
     vel_m_s: float = Field(0.05, gt=0, le=10)  # noise of a reported velocity
     bias_m_s: float = Field(0.2, ge=0, le=10)  # wandering bias of a reported velocity

@@ -17,7 +17,7 @@ from swarmctl.core.params import Params
 class OverloadParams(Params):
     """Thresholds on the fraction of deadlines missed within `window_s`."""
 
-    window_s: float = Field(2.0, gt=0, le=60)
+    window_s: float = Field(2.0, gt=0, le=60)  # time over which missed deadlines are counted
     widen_01: float = Field(0.15, gt=0, le=1)  # above this fraction distances grow
     margin_max_m: float = Field(0.2, ge=0, le=10)  # growth of distances at `hold_01`
     hold_01: float = Field(0.4, gt=0, le=1)  # from this fraction on the agent comes to rest
