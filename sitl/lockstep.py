@@ -27,7 +27,7 @@ from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.config import Config
 from swarmctl.core.clock import SimClock
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE, tick_row
-from swarmctl.core.types import TickRecord
+from swarmctl.core.tick_record import TickRecord
 from swarmctl.kernels import why_not_repeatable
 from swarmctl.mavlink.autopilot import Autopilot
 from swarmctl.mavlink.codec import Codec

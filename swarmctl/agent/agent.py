@@ -24,7 +24,7 @@ from swarmctl.agent.components import (
 from swarmctl.agent.reference_selector import ReferenceSelector
 from swarmctl.agent.separation_policy import SeparationDirective, SeparationInputs
 from swarmctl.agent.setup import AgentSetup
-from swarmctl.agent.telemetry_publisher import ControlOutput, PlanningResult, TelemetryPublisher, TickSink, TickTiming
+from swarmctl.agent.telemetry_publisher import ControlOutput, PlanningResult, TelemetryPublisher, TickSink
 from swarmctl.agent.world_model import FLOWN_BY_AGENT, WorldModel
 from swarmctl.bus import topics
 from swarmctl.bus.peers import Bus
@@ -41,6 +41,7 @@ from swarmctl.control.phases.overload import Level, Overload
 from swarmctl.control.setpoint import setpoint_of
 from swarmctl.core.clock import Clock
 from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned
+from swarmctl.core.tick_record import TickRecord, TickTiming
 from swarmctl.core.types import (
     MAX_RADIUS_M,
     NO_TIMES,
@@ -54,7 +55,6 @@ from swarmctl.core.types import (
     Plan,
     PlanStatus,
     PredictedPath,
-    TickRecord,
     VehicleState,
 )
 from swarmctl.mavlink.autopilot import Autopilot

@@ -153,7 +153,7 @@ def _loop(agent: Agent, config: Config, clock: WallClock, stop: StopRequest, veh
         if stop.take():
             agent.ask("land", now_us)
         record = agent.tick(now_us, pace.missed)
-        pace.done(now_us + round(record.tick_ms * 1000), clock.now_us())
+        pace.done(now_us + round(record.timing.tick_ms * 1000), clock.now_us())
         if record.mode is not Mode.STATE_STALE:
             seen_us, ever_seen = now_us, True
         _check_vehicle_silence(now_us - seen_us, ever_seen, config, vehicle)

@@ -39,9 +39,9 @@ from sitl.studies.bench.formation import Formation, formation_config
 from sitl.studies.campaign.flight import config_of
 from sitl.studies.campaign.scenarios import layout_of
 from sitl.studies.campaign.trials import Cell
-from swarmctl.agent.telemetry_publisher import TickTiming
 from swarmctl.config import Config
 from swarmctl.control.mpc.qp import SOLVERS, installed_solvers
+from swarmctl.core.tick_record import TickTiming
 from swarmctl.core.types import Array, Phase
 from swarmctl.errors import EXIT_OK, ConfigError, MissionError, exit_code_of
 from swarmctl.files import replace_text

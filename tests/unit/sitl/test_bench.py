@@ -122,7 +122,8 @@ def test_the_agent_flies_pressed_against_its_neighbours(neighbours: int, pillar:
         assert 0.88 < flown.record.nearest_peer_m < 0.95, "at the distance that is kept: active constraints"
         if pillar:
             assert 5.15 < flown.record.nearest_obstacle_m < 5.3
-    assert float(np.linalg.norm(flown.record.vel_ned_m_s)) == pytest.approx(SPEED_M_S, rel=0.6)
+    assert flown.record.state is not None
+    assert float(np.linalg.norm(flown.record.state.vel_ned_m_s)) == pytest.approx(SPEED_M_S, rel=0.6)
 
 
 def test_captured_problems_have_two_neighbours_and_an_obstacle(captured: Captured) -> None:
