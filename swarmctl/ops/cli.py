@@ -355,13 +355,13 @@ def report(folder: Folder) -> int:
 @app.command(context_settings=_PASS_ON)
 def reproduce(context: typer.Context) -> NoReturn:
     """Reproduce the six experiments of the thesis. Writes each result beside the published figure."""
-    _become("sitl.studies.thesis.reproduce", context.args)
+    _become("sitl.studies.thesis.command", context.args)
 
 
 @app.command(context_settings=_PASS_ON)
 def bench(context: typer.Context) -> NoReturn:
     """Measure the tick of one agent, part by part. Covers 0 to 30 neighbours and each installed solver."""
-    _become("sitl.studies.bench.bench", context.args)
+    _become("sitl.studies.bench.command", context.args)
 
 
 def _become(module: str, arguments: list[str]) -> NoReturn:

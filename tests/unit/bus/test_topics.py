@@ -220,14 +220,14 @@ def test_arguments_of_an_order_arrive_in_bounds_or_not_at_all(monkeypatch: pytes
 
 
 def test_verbs_without_arguments_take_none() -> None:
-    for verb in OPERATOR_VERBS:
+    for verb in ("hold", "resume", "land", "rtl"):
         body = {"verb": verb, "agent": -1, "utc_us": 1}
         assert decode_command(msgspec.json.encode(body)) is not None, "of an operator before there were arguments"
         assert decode_command(msgspec.json.encode(body | {"arguments": {"height_m": 1.0}})) is None
 
 
 @pytest.mark.parametrize("verb", ["disarm", "kill", "", "LAND"])
-def test_only_the_four_verbs_of_the_operator_are_known(verb: str) -> None:
+def test_only_verbs_of_the_operator_are_known(verb: str) -> None:
     assert decode_command(msgspec.json.encode({"verb": verb, "agent": -1, "utc_us": 1})) is None
 
 

@@ -32,5 +32,5 @@ def test_hold_is_obeyed_while_tracking_only() -> None:
 
 def test_what_is_no_order_is_named() -> None:
     assert order_problem("hold", {}) == ""
-    assert order_problem("fly", {}) == "'fly' is no verb; known are hold, resume, land, rtl"
+    assert order_problem("fly", {}) == f"'fly' is no verb; known are {', '.join(OPERATOR_VERBS)}"
     assert order_problem("hold", {"height_m": 1.0}) == "hold takes no arguments"

@@ -15,7 +15,9 @@ import pytest
 import typer
 
 import swarmctl
+from sitl.studies.bench import command
 from swarmctl.bus.topics import ObstacleMessage
+from swarmctl.control.mpc.qp import SOLVERS
 from swarmctl.core.operator_verbs import OperatorVerb, Order, VerbArgument
 from swarmctl.errors import ConfigError, MissionError, StartError
 from swarmctl.ops import cli, operator
@@ -56,6 +58,29 @@ def test_help_is_quick_and_imports_nothing_heavy() -> None:
         times_s.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
         assert "heavy: []" in answer.stdout
     assert min(times_s) < 0.4
+
+
+@pytest.mark.parametrize(
+    ("module", "options"),
+    [
+        ("sitl.studies.thesis.command", ("--only", "--plant", "--full", "--out", "--jobs")),
+        ("sitl.studies.bench.command", ("--out", "--neighbours", "--solver", "--ticks", "--slsqp", "--no-slsqp")),
+    ],
+)
+def test_help_of_studies_names_every_option_and_imports_nothing_heavy(module: str, options: tuple[str, ...]) -> None:
+    code = f"""if True:
+        import atexit, runpy, sys
+        heavy = lambda: [name for name in ("sitl.lockstep", *{HEAVY!r}, "rich") if name in sys.modules]
+        atexit.register(lambda: print("heavy:", heavy()))
+        sys.argv = ["x", "--help"]
+        runpy.run_module({module!r}, run_name="__main__")"""
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert "heavy: []" in answer.stdout
+    assert [option for option in options if option not in answer.stdout] == []
+
+
+def test_the_solvers_of_bench_are_those_there_are() -> None:
+    assert command.SOLVERS == SOLVERS
 
 
 def test_every_verb_is_there_and_explains_itself(run: Run, capsys: pytest.CaptureFixture[str]) -> None:

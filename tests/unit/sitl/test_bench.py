@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from sitl.studies.bench import bench, formation
+from sitl.studies.bench import bench, command, formation
 from sitl.studies.bench.captured import Captured, capture, circle_with_obstacle, measure_xy, tapped
 from sitl.studies.bench.formation import Formation, Neighbours, formation_config, places_m
 from sitl.studies.bench.slsqp import KEPT_M, NonlinearXy
@@ -57,7 +57,7 @@ def test_a_tick_without_a_plan_is_no_figure(monkeypatch: pytest.MonkeyPatch) -> 
 )
 def test_bad_usage_is_refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
-        bench.main(arguments)
+        command.main(arguments)
     assert caught.value.code == 2
     assert arguments[0] in capsys.readouterr().err
 
