@@ -146,7 +146,8 @@ def _in_time(path: Path, rows: NDArray[np.void], clocks: tuple[str, ...]) -> NDA
     """Return `rows` after a check that each clock spans no more than the longest run."""
     for clock in clocks:
         if len(rows) and int(rows[clock].max()) - int(rows[clock].min()) > MAX_RUN_US:
-            raise _damaged(path, f"damaged: {clock} spans more than {MAX_RUN_US / 3.6e9:.0f} hours")
+            why = f"{clock} spans more than {MAX_RUN_US / 3.6e9:.0f} hours"
+            raise _damaged(path, f"damaged, or raw rows of another version (this is {__version__}): {why}")
     return rows
 
 

@@ -132,6 +132,17 @@ def test_what_an_older_recording_lacks_is_no_zero(tmp_path: Path) -> None:
         read_parquet(path)
 
 
+@pytest.mark.parametrize("more", ["<f4", "u1", "<f8"])
+def test_raw_rows_of_another_layout_are_refused(tmp_path: Path, more: str) -> None:
+    rows, _ = flight(0, 1, 6.0)
+    other = np.zeros(len(rows), np.dtype([*((name, rows.dtype[name]) for name in rows.dtype.names or ()), ("x", more)]))
+    for name in rows.dtype.names or ():
+        other[name] = rows[name]
+    other.tofile(tmp_path / "agent-0.ticks")
+    with pytest.raises(ConfigError, match="or raw rows of another version"):
+        load_run(tmp_path)
+
+
 # Columns of the first recordings: what was added later must be readable without.
 FIRST = {"t_us", "utc_us", "seq", "mission_t_s", "phase", "mode", "flight_mode", "armed", "state_age_ms", "pos_ned_m"}
 FIRST |= {"vel_ned_m_s", "q_nb", "ref_pos_ned_m", "setpoint_q_nb", "setpoint_thrust_01", "hover_thrust_01", "peers"}
