@@ -27,7 +27,7 @@ from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.config import Config
 from swarmctl.core.clock import SimClock
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE, tick_row
-from swarmctl.core.types import TickRecord
+from swarmctl.core.tick_record import TickRecord
 from swarmctl.kernels import why_not_repeatable
 from swarmctl.mavlink.autopilot import Autopilot
 from swarmctl.mavlink.codec import Codec
@@ -174,9 +174,9 @@ class Lockstep:
         self.agents[index] = None
         self.hub.detach(agent_name(index))
 
-    def command(self, verb: Any, agent: int = -1) -> None:
-        """Send an operator's command, as a verb does."""
-        message = topics.CommandMessage(verb, agent, self.clock.utc_us())
+    def command(self, verb: str, agent: int = -1, **arguments: float) -> None:
+        """Send an operator's order, as a verb does."""
+        message = topics.CommandMessage(verb, agent, self.clock.utc_us(), arguments)
         self._operator.publish(topics.COMMAND, topics.encode_message(message))
 
     def set_obstacles(self, obstacles: Sequence[topics.ObstacleMessage]) -> None:

@@ -24,7 +24,7 @@ from swarmctl.agent.components import (
 from swarmctl.agent.reference_selector import ReferenceSelector
 from swarmctl.agent.separation_policy import SeparationDirective, SeparationInputs
 from swarmctl.agent.setup import AgentSetup
-from swarmctl.agent.telemetry_publisher import ControlOutput, PlanningResult, TelemetryPublisher, TickSink, TickTiming
+from swarmctl.agent.telemetry_publisher import ControlOutput, PlanningResult, TelemetryPublisher, TickSink
 from swarmctl.agent.world_model import FLOWN_BY_AGENT, WorldModel
 from swarmctl.bus import topics
 from swarmctl.bus.peers import Bus
@@ -41,6 +41,8 @@ from swarmctl.control.phases.overload import Level, Overload
 from swarmctl.control.setpoint import setpoint_of
 from swarmctl.core.clock import Clock
 from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned
+from swarmctl.core.operator_verbs import Order
+from swarmctl.core.tick_record import TickRecord, TickTiming
 from swarmctl.core.types import (
     MAX_RADIUS_M,
     NO_TIMES,
@@ -54,7 +56,6 @@ from swarmctl.core.types import (
     Plan,
     PlanStatus,
     PredictedPath,
-    TickRecord,
     VehicleState,
 )
 from swarmctl.mavlink.autopilot import Autopilot
@@ -181,10 +182,10 @@ class Agent:
         """Number of proposals withdrawn or expired; None if separation works without proposals."""
         return self._separation.commits_refused
 
-    def ask(self, verb: str, now_us: int) -> None:
-        """Apply an operator's command: hold, resume, land or rtl."""
-        self._state_machine.operator(verb, now_us, self._clock.utc_us(), self._autopilot.poll(now_us))
-        self._note("operator", verb=verb)
+    def ask(self, order: Order, now_us: int) -> None:
+        """Apply an operator's order."""
+        self._state_machine.operator(order, now_us, self._clock.utc_us(), self._autopilot.poll(now_us))
+        self._note("operator", verb=order.verb, **order.arguments)
 
     def tick(self, now_us: int, deadline_misses: int) -> TickRecord:
         """Run one control step at monotonic time `now_us`.
@@ -251,8 +252,8 @@ class Agent:
     # -- receive, sense -----------------------------------------------------------------------------------------------
 
     def _listen(self, now_us: int) -> None:
-        for verb in self._world_model.listen(self._clock.utc_us()):
-            self.ask(verb, now_us)
+        for order in self._world_model.listen(self._clock.utc_us()):
+            self.ask(order, now_us)
         self._separation.receive(self._clock.utc_us())
 
     def _sense(self, now_us: int) -> VehicleState | None:

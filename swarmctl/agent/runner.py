@@ -19,6 +19,7 @@ from swarmctl.bus.peers import Bus, LocalHub, agent_name
 from swarmctl.bus.zenoh_bus import NO_BUS, ZenohBus
 from swarmctl.config import Config, load
 from swarmctl.control.phases.state_machine import OPERATOR_STOP
+from swarmctl.core.operator_verbs import Order
 from swarmctl.core.types import Mode
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, MissionError, StartError
 from swarmctl.mavlink.autopilot import Autopilot
@@ -151,9 +152,9 @@ def _loop(agent: Agent, config: Config, clock: WallClock, stop: StopRequest, veh
         clock.sleep_until(pace.due_us)
         now_us = clock.now_us()
         if stop.take():
-            agent.ask("land", now_us)
+            agent.ask(Order("land"), now_us)
         record = agent.tick(now_us, pace.missed)
-        pace.done(now_us + round(record.tick_ms * 1000), clock.now_us())
+        pace.done(now_us + round(record.timing.tick_ms * 1000), clock.now_us())
         if record.mode is not Mode.STATE_STALE:
             seen_us, ever_seen = now_us, True
         _check_vehicle_silence(now_us - seen_us, ever_seen, config, vehicle)

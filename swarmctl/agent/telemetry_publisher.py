@@ -17,22 +17,12 @@ from swarmctl.control.mpc.problem import Start
 from swarmctl.control.phases.state_machine import MissionStateMachine
 from swarmctl.core.clock import Clock
 from swarmctl.core.records import pack_tick
-from swarmctl.core.types import (
-    AttitudeSetpoint,
-    Mode,
-    Plan,
-    PlanStatus,
-    Reference,
-    TickRecord,
-    VehicleState,
-)
+from swarmctl.core.tick_record import TickRecord, TickTiming
+from swarmctl.core.types import AttitudeSetpoint, Mode, Plan, Reference, VehicleState
 from swarmctl.mavlink.autopilot import Autopilot
 
 _STATUS_EVERY_US = 200_000
 _RECENT_TICKS = 250
-_NAN3 = np.full(3, math.nan)
-_NAN4 = np.full(4, math.nan)
-_NO_PLAN = np.empty((0, 3))
 
 
 class TickSink(Protocol):
@@ -61,26 +51,6 @@ class ControlOutput:
     flown: Plan | None
     setpoint: AttitudeSetpoint | None
     safety_filter_acted: bool = False
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class TickTiming:
-    """Durations of the parts of a tick [ms]."""
-
-    sense_ms: float  # receiving included
-    setup_ms: float  # prediction, reference, keep-outs, matrices
-    commitment_ms: float  # receiving, checking and planning commitments; 0 in best effort
-    spaces_ms: float  # half-spaces
-    solve_ms: float  # inside the QP solver
-    certify_ms: float
-    barrier_ms: float  # the safety filter
-    send_ms: float  # failsafe decision included
-
-    @property
-    def tick_ms(self) -> float:
-        """Duration from receiving to sending the setpoint."""
-        planned_ms = self.setup_ms + self.spaces_ms + self.solve_ms + self.certify_ms
-        return self.sense_ms + self.commitment_ms + planned_ms + self.barrier_ms + self.send_ms
 
 
 class TelemetryPublisher:
@@ -149,7 +119,6 @@ class TelemetryPublisher:
         timing: TickTiming,
     ) -> TickRecord:
         utc_us = self._clock.utc_us()
-        plan, setpoint = planning.plan, output.setpoint
         peers, obstacles, age_ms = self._distances(planning, utc_us)
         return TickRecord(
             t_us=now_us,
@@ -160,13 +129,11 @@ class TelemetryPublisher:
             mode=output.mode,
             flight_mode=self._autopilot.mode,
             armed=self._autopilot.armed,
-            state_age_ms=math.nan if state is None else (now_us - state.t_us) * 1e-3,
-            pos_ned_m=_NAN3 if state is None else state.pos_ned_m,
-            vel_ned_m_s=_NAN3 if state is None else state.vel_ned_m_s,
-            q_nb=_NAN4 if state is None else state.q_nb,
-            ref_pos_ned_m=_NAN3 if planning.reference is None else planning.reference.pos_ned_m[0],
-            setpoint_q_nb=_NAN4 if setpoint is None else setpoint.q_nb,
-            setpoint_thrust_01=math.nan if setpoint is None else setpoint.thrust_01,
+            state=state,
+            reference=planning.reference,
+            plan=planning.plan,
+            flown=output.flown,
+            setpoint=output.setpoint,
             hover_thrust_01=estimate.hover_thrust_01,
             disturbance_ned_m_s2=estimate.disturbance_ned_m_s2,
             nearest_peer_m=min(peers, default=math.inf),
@@ -174,15 +141,9 @@ class TelemetryPublisher:
             plan_staleness_ms=age_ms,
             peers=len(peers),
             rejected=self._paths.refusals.total,
-            plan_status=PlanStatus.NONE if plan is None else plan.status,
-            slack_m=0.0 if plan is None else plan.slack_m,
-            residual_m=0.0 if plan is None else plan.residual_m,
-            iterations=0 if plan is None else plan.iterations,
-            solve_ms=timing.solve_ms,
-            tick_ms=timing.tick_ms,
             deadline_misses=deadline_misses,
-            plan_pos_ned_m=_NO_PLAN if output.flown is None else output.flown.pos_ned_m,
             safety_filter_acted=output.safety_filter_acted,
+            timing=timing,
         )
 
     def _distances(self, planning: PlanningResult, utc_us: int) -> tuple[list[float], list[float], float]:
@@ -199,7 +160,10 @@ class TelemetryPublisher:
         return peers, obstacles, max(ages_ms, default=math.nan)
 
     def _status(self, record: TickRecord, state_machine: MissionStateMachine) -> topics.StatusMessage:
-        error = record.pos_ned_m - record.ref_pos_ned_m
+        state, reference, error_m = record.state, record.reference, math.nan
+        if state is not None and reference is not None:
+            error = state.pos_ned_m - reference.pos_ned_m[0]
+            error_m = math.sqrt(float(error @ error))
         return topics.StatusMessage(
             agent=self._agent,
             boot_id=self._boot_id,
@@ -211,7 +175,7 @@ class TelemetryPublisher:
             landed=int(self._autopilot.landed),
             ready_utc_us=state_machine.ready_utc_us,
             outcome=state_machine.outcome,
-            position_error_m=_finite(math.sqrt(float(error @ error))),
+            position_error_m=_finite(error_m),
             separation_m=_finite(record.nearest_peer_m),
             tick_p99_ms=float(np.percentile(self._recent_ms, 99)),
             ticks=record.seq,

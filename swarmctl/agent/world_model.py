@@ -20,6 +20,7 @@ from swarmctl.control.collision.separation import (
     visible,
 )
 from swarmctl.control.phases.inputs import PeerInputs
+from swarmctl.core.operator_verbs import Order
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.trajectory_message import TrajectoryMessage
 from swarmctl.core.types import Array, Mode, Obstacle, Phase
@@ -63,8 +64,8 @@ class WorldModel:
         self._obstacles_version: int | None = None
         self._seen: dict[int, Obstacle] = {}  # obstacles that have been visible, by identity
 
-    def listen(self, utc_us: int) -> list[str]:
-        """Process everything that has arrived; returns the operator's verbs for this agent."""
+    def listen(self, utc_us: int) -> list[Order]:
+        """Process everything that has arrived; returns the operator's orders to this agent."""
         self.attendance.update(utc_us)
         for sender, payload in self._bus.receive(topics.PATH):
             self.paths.offer(sender, payload, utc_us)
@@ -72,10 +73,10 @@ class WorldModel:
             self._take_status(sender, payload, utc_us)
         for sender, payload in self._bus.receive(topics.OBSTACLES):
             self._take_obstacles(sender, payload, utc_us)
-        verbs = [self._orders.take(*received, utc_us) for received in self._bus.receive(topics.COMMAND)]
+        orders = [self._orders.take(*received, utc_us) for received in self._bus.receive(topics.COMMAND)]
         self.refusals.report(utc_us)
         self._watch_unheard(utc_us)
-        return [verb for verb in verbs if verb is not None]
+        return [order for order in orders if order is not None]
 
     def _take_status(self, sender: str, payload: bytes, utc_us: int) -> None:
         status = topics.decode_status(payload)

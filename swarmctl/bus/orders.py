@@ -3,25 +3,23 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Literal
 
 from swarmctl.bus.refusals import FUTURE_ORDER, MALFORMED, REPLAYED, STALE_ORDER, SUPERSEDED_ORDER, Refusals
 from swarmctl.bus.topics import COMMAND, CommandMessage, decode_command, encode_message
+from swarmctl.core.operator_verbs import OPERATOR_VERBS, Order
 
 VALID_US = 2_000_000  # from its stamp on
 MAX_LEAD_US = 500_000  # a stamp further in the future comes from another clock
 _SAME_CLOCK_US = 500_000
 EVERYBODY = -1
 
-Verb = Literal["hold", "resume", "land", "rtl"]
-
 
 class Orders:
     """Filters the orders to one agent, so that each is obeyed once, however often it is repeated.
 
     An order is valid for `VALID_US`: an older one may have been meant for another flight. Of two orders the one with
-    the later stamp counts, in whatever order they arrive, so a repeated `hold` does not undo a `resume`. Only `land` is
-    obeyed whatever came before it: a stamp a little in the future must not delay it.
+    the later stamp counts, in whatever sequence they arrive, so a repeated `hold` does not undo a `resume`. Only `land`
+    is obeyed whatever came before it.
 
     Args:
         agent: own index.
@@ -32,38 +30,39 @@ class Orders:
         self._agent, self._refusals = agent, refusals
         self._newest: CommandMessage | None = None  # newest one obeyed
 
-    def take(self, sender: str, payload: bytes, utc_us: int) -> Verb | None:
-        """Return the verb if it is for this agent and to be obeyed now, otherwise None."""
-        order = decode_command(payload)
-        if order is not None and order.agent not in (EVERYBODY, self._agent):
+    def take(self, sender: str, payload: bytes, utc_us: int) -> Order | None:
+        """Return the order if it is for this agent and to be obeyed now, otherwise None."""
+        message = decode_command(payload)
+        if message is not None and message.agent not in (EVERYBODY, self._agent):
             return None
-        reason = MALFORMED if order is None else self._refusal(order, utc_us)
-        if reason or order is None:
+        reason = MALFORMED if message is None else self._refusal(message, utc_us)
+        if reason or message is None:
             self._refusals.add(sender, COMMAND.name, reason, utc_us)
             return None
-        if self._newest is None or order.utc_us > self._newest.utc_us:
-            self._newest = order
-        return order.verb
+        if self._newest is None or message.utc_us > self._newest.utc_us:
+            self._newest = message
+        return message.order
 
-    def _refusal(self, order: CommandMessage, utc_us: int) -> str:
-        if utc_us - order.utc_us > VALID_US:
+    def _refusal(self, message: CommandMessage, utc_us: int) -> str:
+        if utc_us - message.utc_us > VALID_US:
             return STALE_ORDER
-        if order.utc_us - utc_us > MAX_LEAD_US:
+        if message.utc_us - utc_us > MAX_LEAD_US:
             return FUTURE_ORDER
-        if self._newest is None or order.utc_us > self._newest.utc_us:
+        if self._newest is None or message.utc_us > self._newest.utc_us:
             return ""
-        if order == self._newest:
+        if message == self._newest:
             return REPLAYED
-        return "" if order.verb == "land" else SUPERSEDED_ORDER
+        return "" if OPERATOR_VERBS[message.verb].never_superseded else SUPERSEDED_ORDER
 
 
-def orders(verb: Verb, agent: int, utc_us: int, clocks_us: Iterable[int]) -> list[bytes]:
-    """Return messages that ask for a verb now: one stamped by the own clock, and one by every clock that differs.
+def order_messages(order: Order, agent: int, utc_us: int, clocks_us: Iterable[int]) -> list[bytes]:
+    """Return messages that give an order now: one stamped by the own clock, and one by every clock that differs.
 
     Agents follow a step of UTC slowly, so in flight their clock and the operator's may be far apart. One message
     always bears the own stamp, so that a forged status cannot make an order invalid.
 
     Args:
+        order: what is asked.
         agent: number of the agent asked, or `EVERYBODY`.
         utc_us: own clock.
         clocks_us: clocks of the agents asked, by their statuses.
@@ -72,4 +71,5 @@ def orders(verb: Verb, agent: int, utc_us: int, clocks_us: Iterable[int]) -> lis
     for clock_us in sorted(clocks_us):
         if all(abs(clock_us - known_us) > _SAME_CLOCK_US for known_us in stamps_us):
             stamps_us.append(clock_us)
-    return [encode_message(CommandMessage(verb, agent, stamp_us)) for stamp_us in stamps_us]
+    messages = [CommandMessage(order.verb, agent, stamp_us, dict(order.arguments)) for stamp_us in stamps_us]
+    return [encode_message(message) for message in messages]

@@ -11,11 +11,12 @@ import math
 import struct
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, TypeVar
 
 import msgspec
 import numpy as np
 
+from swarmctl.core.operator_verbs import Order, order_problem
 from swarmctl.core.types import MAX_RADIUS_M, FlightMode, Mode, Obstacle, Phase, PredictedPath
 
 
@@ -52,6 +53,7 @@ MAX_OBSTACLE_M = 10_000.0  # limit of every length and coordinate
 MAX_VERSION_STEP = 64  # largest step of the list's version; an extreme one would lock out all later ones
 Length = Annotated[float, msgspec.Meta(gt=0.0, le=MAX_OBSTACLE_M)]
 Coordinate = Annotated[float, msgspec.Meta(ge=-MAX_OBSTACLE_M, le=MAX_OBSTACLE_M)]
+Word = Annotated[str, msgspec.Meta(max_length=32)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
 
 
@@ -119,11 +121,17 @@ class StatusMessage(msgspec.Struct, frozen=True):
 
 
 class CommandMessage(msgspec.Struct, frozen=True):
-    """Holds an operator's request to one agent or to all (`agent` -1)."""
+    """Holds an operator's order to one agent or to all (`agent` -1); verbs and arguments are `core.operator_verbs`."""
 
-    verb: Literal["hold", "resume", "land", "rtl"]
+    verb: Word
     agent: int
     utc_us: Count  # time of the request, by the clock of the agents asked
+    arguments: Annotated[dict[Word, float], msgspec.Meta(max_length=8)] = {}
+
+    @property
+    def order(self) -> Order:
+        """The order itself, without addressee and time."""
+        return Order(self.verb, self.arguments)
 
 
 class ObstacleMessage(msgspec.Struct, frozen=True):
@@ -176,8 +184,9 @@ def decode_status(payload: bytes) -> StatusMessage | None:
 
 
 def decode_command(payload: bytes) -> CommandMessage | None:
-    """Decode an operator's request; None if it is malformed or out of bounds."""
-    return _decode(payload, _COMMAND_DECODER)
+    """Decode an operator's request; None if it is malformed, no known verb, or an argument is out of bounds."""
+    message = _decode(payload, _COMMAND_DECODER)
+    return None if message is None or order_problem(message.verb, message.arguments) else message
 
 
 def decode_obstacles(payload: bytes) -> ObstaclesMessage | None:

@@ -1,7 +1,7 @@
-"""The byte layout of per-tick records: one table serves the bus, the run files and every reader.
+"""The byte layout of per-tick records, on the bus and in run files.
 
-`TICK_DTYPE` holds one tick of an agent, `TRUTH_DTYPE` one true state of a simulated vehicle. Both are little-endian and
-of fixed size, so a file of them is an array.
+`TICK_DTYPE` holds the columns of one tick of an agent, `TRUTH_DTYPE` one true state of a simulated vehicle. Both are
+little-endian and of fixed size, so a file of them is an array.
 """
 
 from __future__ import annotations
@@ -11,42 +11,10 @@ import struct
 import numpy as np
 from numpy.typing import NDArray
 
-from swarmctl.core.types import Array, TickRecord
+from swarmctl.core.tick_record import COLUMNS, TickRecord
+from swarmctl.core.types import Array
 
-TICK_DTYPE = np.dtype(
-    [
-        ("t_us", "<i8"),
-        ("utc_us", "<i8"),
-        ("seq", "<u4"),
-        ("mission_t_s", "<f8"),
-        ("phase", "u1"),
-        ("mode", "u1"),
-        ("flight_mode", "u1"),
-        ("armed", "u1"),
-        ("state_age_ms", "<f4"),
-        ("pos_ned_m", "<f8", (3,)),
-        ("vel_ned_m_s", "<f8", (3,)),
-        ("q_nb", "<f4", (4,)),
-        ("ref_pos_ned_m", "<f8", (3,)),
-        ("setpoint_q_nb", "<f4", (4,)),
-        ("setpoint_thrust_01", "<f4"),
-        ("hover_thrust_01", "<f4"),
-        ("disturbance_ned_m_s2", "<f4", (3,)),
-        ("nearest_peer_m", "<f4"),
-        ("nearest_obstacle_m", "<f4"),
-        ("plan_staleness_ms", "<f4"),
-        ("peers", "<u2"),
-        ("rejected", "<u4"),
-        ("plan_status", "u1"),
-        ("slack_m", "<f4"),
-        ("residual_m", "<f4"),
-        ("iterations", "<u4"),
-        ("solve_ms", "<f4"),
-        ("tick_ms", "<f4"),
-        ("deadline_misses", "<u4"),
-        ("safety_filter_acted", "u1"),
-    ]
-)
+TICK_DTYPE = np.dtype([(column.name, column.dtype, (column.size,) if column.size else ()) for column in COLUMNS])
 
 TRUTH_DTYPE = np.dtype(
     [
@@ -62,19 +30,20 @@ TRUTH_DTYPE = np.dtype(
 )
 
 _PLAN_HEADER = struct.Struct("<H")
-_TICK_FIELDS = TICK_DTYPE.names or ()
+_NO_PLAN = np.empty((0, 3))
 
 
 def tick_row(record: TickRecord) -> NDArray[np.void]:
     """Return one record as a (1,) structured array of `TICK_DTYPE`."""
     row = np.zeros(1, TICK_DTYPE)
-    row[0] = tuple(getattr(record, name) for name in _TICK_FIELDS)
+    row[0] = tuple(column.recorded(record) for column in COLUMNS)
     return row
 
 
 def pack_tick(record: TickRecord) -> bytes:
-    """Encode a record for the bus: a fixed row, the number of plan points (u16), and the points as float32."""
-    plan = np.ascontiguousarray(record.plan_pos_ned_m, dtype="<f4")
+    """Encode a record for the bus: a fixed row, the number of points of the flown plan (u16), the points as float32."""
+    pos_ned_m = _NO_PLAN if record.flown is None else record.flown.pos_ned_m
+    plan = np.ascontiguousarray(pos_ned_m, dtype="<f4")
     return tick_row(record).tobytes() + _PLAN_HEADER.pack(len(plan)) + plan.tobytes()
 
 

@@ -5,15 +5,18 @@ Heavy modules are imported inside the verb that needs them, so that `--help` ans
 
 from __future__ import annotations
 
+import inspect
 import os
 import signal
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
 from swarmctl import __version__
+from swarmctl.core.operator_verbs import OPERATOR_VERBS, OperatorVerb, Order
 from swarmctl.core.text import printable_lines
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, ConfigError, SwarmError
 
@@ -216,28 +219,40 @@ def status(
     return EXIT_OK
 
 
-@app.command()
-def hold(run_dir: RunningDir = None, agent: OneAgent = None) -> int:
-    """Brake and hold position."""
-    return _command("hold", run_dir, agent)
+def _give(order: Order, run_dir: Path | None, agent: int | None) -> int:
+    from swarmctl.ops import operator
+
+    launch = operator.find_launch(run_dir)
+    _show(operator.command(launch, order, agent), range(launch.agents) if agent is None else range(agent, agent + 1))
+    return EXIT_OK
 
 
-@app.command()
-def resume(run_dir: RunningDir = None, agent: OneAgent = None) -> int:
-    """Resume the mission after `hold`."""
-    return _command("resume", run_dir, agent)
+def add_operator_verb(
+    to: typer.Typer, name: str, verb: OperatorVerb, give: Callable[[Order, Path | None, int | None], int] = _give
+) -> None:
+    """Add a verb of the operator, with a required option for each of its arguments.
+
+    Args:
+        to: command line to extend.
+        name, verb: entry of `OPERATOR_VERBS`.
+        give: gives the order to the launch of a run folder, to one agent or to all; returns the exit code.
+    """
+
+    def run(run_dir: RunningDir = None, agent: OneAgent = None, **arguments: float) -> int:
+        return give(Order(name, arguments), run_dir, agent)
+
+    parameters = list(inspect.signature(run, eval_str=True).parameters.values())[:2]
+    for argument in verb.arguments:
+        option = typer.Option(argument.option, min=argument.least, max=argument.most, help=argument.help)
+        kind = inspect.Parameter.KEYWORD_ONLY
+        parameters.append(inspect.Parameter(argument.name, kind, annotation=Annotated[float, option]))
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # typer derives options from it
+    to.command(name, help=verb.help)(run)
 
 
-@app.command()
-def land(run_dir: RunningDir = None, agent: OneAgent = None) -> int:
-    """Separate, then land."""
-    return _command("land", run_dir, agent)
-
-
-@app.command()
-def rtl(run_dir: RunningDir = None, agent: OneAgent = None) -> int:
-    """Fly back to the start under the agent's own MPC, then land. The autopilot's return mode is not used."""
-    return _command("rtl", run_dir, agent)
+for _name, _verb in OPERATOR_VERBS.items():
+    add_operator_verb(app, _name, _verb)
 
 
 @app.command()
@@ -340,27 +355,19 @@ def report(folder: Folder) -> int:
 @app.command(context_settings=_PASS_ON)
 def reproduce(context: typer.Context) -> NoReturn:
     """Reproduce the six experiments of the thesis. Writes each result beside the published figure."""
-    _become("sitl.studies.thesis.reproduce", context.args)
+    _become("sitl.studies.thesis.command", context.args)
 
 
 @app.command(context_settings=_PASS_ON)
 def bench(context: typer.Context) -> NoReturn:
     """Measure the tick of one agent, part by part. Covers 0 to 30 neighbours and each installed solver."""
-    _become("sitl.studies.bench.bench", context.args)
+    _become("sitl.studies.bench.command", context.args)
 
 
 def _become(module: str, arguments: list[str]) -> NoReturn:
     """Replace this process by a module of the simulator, which the bridge never imports."""
     sys.stdout.flush()
     os.execv(sys.executable, [sys.executable, "-m", module, *arguments])
-
-
-def _command(verb: str, run_dir: Path | None, agent: int | None) -> int:
-    from swarmctl.ops import operator
-
-    launch = operator.find_launch(run_dir)
-    _show(operator.command(launch, verb, agent), range(launch.agents) if agent is None else range(agent, agent + 1))
-    return EXIT_OK
 
 
 def _overrides(agents: int | None, duration: float | None, seed: int | None, sets: list[str] | None) -> list[str]:

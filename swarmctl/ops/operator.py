@@ -22,7 +22,7 @@ from pathlib import Path
 import msgspec
 import psutil
 
-from swarmctl.bus.orders import EVERYBODY, Verb, orders
+from swarmctl.bus.orders import EVERYBODY, order_messages
 from swarmctl.bus.peers import agent_name
 from swarmctl.bus.topics import (
     COMMAND,
@@ -39,6 +39,7 @@ from swarmctl.bus.topics import (
     encode_message,
 )
 from swarmctl.bus.zenoh_bus import ZenohBus
+from swarmctl.core.operator_verbs import Order
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import read_file, replace_bytes
 
@@ -134,8 +135,8 @@ def read_statuses(launch: RunningLaunch) -> dict[int, StatusMessage]:
         return _statuses(bus, range(launch.agents), _ANSWER_S)
 
 
-def command(launch: RunningLaunch, verb: str, agent: int | None) -> dict[int, StatusMessage]:
-    """Send a verb to one agent or to all, and return the statuses of the addressed ones a second later.
+def command(launch: RunningLaunch, order: Order, agent: int | None) -> dict[int, StatusMessage]:
+    """Send an order to one agent or to all, and return the statuses of the addressed ones a second later.
 
     Raises:
         StartError: there is no such agent, or none of the addressed agents is on the bus.
@@ -146,13 +147,13 @@ def command(launch: RunningLaunch, verb: str, agent: int | None) -> dict[int, St
     with _joined(launch) as bus:
         ahead_us: dict[int, int] = {}
         if not _statuses(bus, asked, _ANSWER_S, ahead_us):
-            raise StartError(f"{verb}: no agent asked is on the bus; see: swarmctl status")
+            raise StartError(f"{order.verb}: no agent asked is on the bus; see: swarmctl status")
         now_us = time.time_ns() // 1000
         clocks_us = [now_us + us for us in ahead_us.values()]
-        said = orders(msgspec.convert(verb, Verb), EVERYBODY if agent is None else agent, now_us, clocks_us)
+        messages = order_messages(order, EVERYBODY if agent is None else agent, now_us, clocks_us)
         for _ in range(5):
-            for order in said:
-                bus.publish(COMMAND, order)
+            for message in messages:
+                bus.publish(COMMAND, message)
             time.sleep(_REPEAT_S)
         bus.receive(STATUS)
         return _statuses(bus, asked, 1.0)

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
-from swarmctl.bus.orders import EVERYBODY, orders
+from swarmctl.bus.orders import EVERYBODY, order_messages
 from swarmctl.bus.peers import Bus, agent_name
 from swarmctl.bus.topics import (
     COMMAND,
@@ -26,6 +26,7 @@ from swarmctl.bus.topics import (
     first_obstacles,
 )
 from swarmctl.config import Config
+from swarmctl.core.operator_verbs import Order
 from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START
 from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, RunContext, kill_all
@@ -276,7 +277,7 @@ class FlightSupervisor:
             clocks_us = [
                 view.status.utc_us + round((now_s - view.heard_s) * 1e6) for view in deaf if view.status is not None
             ]
-            for order in orders("land", EVERYBODY, time.time_ns() // 1000, clocks_us):
+            for order in order_messages(Order("land"), EVERYBODY, time.time_ns() // 1000, clocks_us):
                 self._bus.publish(COMMAND, order)
         for view in deaf:
             child = self._services.children[agent_name(view.agent)]

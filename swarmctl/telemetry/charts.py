@@ -403,7 +403,8 @@ def _value_range(
     low, high = (min(known), max(known)) if known else (0.0, 1.0)
     if ceiling is not None:
         high = min(high, ceiling)
-    low = 0.0 if from_zero else low
+    if from_zero:
+        low, high = 0.0, high if high > 0.0 else 1.0
     low, high = _widened(low, high)
     room = 0.06 * (high - low)
     return (low if from_zero else low - room), high + room

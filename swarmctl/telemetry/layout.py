@@ -7,6 +7,8 @@ from typing import Any, NamedTuple
 import rerun as rr
 import rerun.blueprint as rrb
 
+from swarmctl.core.tick_record import CURVES
+
 TIMELINE = "flight_time"
 _PLOT_S = 20.0  # sliding window of the plots
 _TRAIL_S = 12.0  # length of the trails behind vehicles
@@ -58,9 +60,7 @@ def _swarm_plots() -> Any:
     return rrb.Vertical(
         _plot("/plot/track_err", "Distance to the reference [m]"),
         _plot("/plot/separation", "Smallest separation and its limit [m]"),
-        _plot("/plot/solve_ms", "Solve time [ms]"),
-        _plot("/plot/tick_ms", "Tick time, listen to send [ms]"),
-        _plot("/plot/deadline_misses", "Deadline misses so far"),
+        *(_plot(f"/plot/{name}", curve.title) for name, curve in CURVES.items()),
         name="Swarm",
     )
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from swarmctl.core.records import TICK_DTYPE, tick_row
-from swarmctl.core.types import TickRecord
+from swarmctl.core.tick_record import TickRecord
 from swarmctl.telemetry.json_safe import to_json
 
 _FLUSH_TIMEOUT_S = 0.25

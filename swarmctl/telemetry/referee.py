@@ -15,6 +15,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from swarmctl import __version__
 from swarmctl.core.types import Array, Mode, PlanStatus
 from swarmctl.telemetry.hearing import refused_peers, unheard
 from swarmctl.telemetry.json_safe import finite, json_safe
@@ -100,6 +101,7 @@ def judge(
     summary = {
         "outcome": "failed" if outcome == "completed" and violations else outcome,
         "violations": violations,
+        "version": __version__,
         "agents": rules.agents,
         "duration_s": max(tracked_s.values(), default=0.0),
         "mode": rules.mode,

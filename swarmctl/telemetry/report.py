@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from swarmctl.core.tick_record import CURVES, Curve
 from swarmctl.core.types import Array, Mode, Phase
 from swarmctl.files import replace_text
 from swarmctl.telemetry.attitude import roll_pitch_rad
@@ -49,12 +50,13 @@ def write_report(
     page = _Page(run, summary, rules)
     title = html.escape(directory.resolve().name)
     outcome = html.escape(str(summary["outcome"]))
+    version = html.escape(str(summary["version"] or "of unknown version"))
     body = "".join(
         [
             f'<h1>{title}<span class="badge {outcome}">{outcome}</span></h1>',
             f"<p class=sub>{summary['agents']} agents, {html.escape(str(summary['mode']))}, "
             f"{_figure(summary['duration_s'], 's', 1)} of mission time. Times count from mission start; "
-            "the shaded band is the mission.</p>",
+            f"the shaded band is the mission. Judged by swarmctl {version}.</p>",
             _violations(summary),
             '<div class=cards><div class="card wide">',
             _summary_table(summary, rules),
@@ -97,7 +99,7 @@ class _Page:
         missions = [self._seconds(rows[[0, -1]]) for rows in map(tracking_rows, run.ticks.values()) if len(rows)]
         self._band = (min(m[0] for m in missions), max(m[1] for m in missions)) if missions else None
         self._agents = sorted(agent for agent in run.ticks if agent < agents)
-        lines = 11 * len(self._agents) + 6 * min(_DETAILED_AGENTS, len(self._agents)) + 8
+        lines = (9 + len(CURVES)) * len(self._agents) + 6 * min(_DETAILED_AGENTS, len(self._agents)) + 8
         self._points = int(np.clip(_ALL_POINTS // lines, 40, 600))
 
     def _seconds(self, rows: NDArray[np.void]) -> Array:
@@ -130,8 +132,7 @@ class _Page:
     def flight(self) -> Iterator[str]:
         yield self._tracking_error()
         yield self._separation()
-        yield self._times("tick_ms", "Tick time, listen to send [ms]", always=True)
-        yield self._times("solve_ms", "Solve time [ms]", always=False)
+        yield from (self._curve(name, curve) for name, curve in CURVES.items())
         yield state_bars("Phase of the mission", self._spans("phase", Phase, PHASE_RGB), self._range)
         yield state_bars("What the agent did", self._spans("mode", Mode, MODE_RGB), self._range)
 
@@ -234,11 +235,11 @@ class _Page:
         limit = Limit(required_m, f"required {required_m:g} m")
         return self._chart("Smallest distance between two agents [m]", lines, limits=[limit], from_zero=True)
 
-    def _times(self, name: str, title: str, always: bool) -> str:
+    def _curve(self, name: str, curve: Curve) -> str:
         lines, peaks = [], []
         for agent in self._agents:
             rows = flight_rows(self._run.ticks[agent])
-            rows = rows if always else rows[rows["iterations"] > 0]
+            rows = rows if curve.where is None else rows[curve.where(rows)]
             lines.append(
                 Line(
                     x=self._seconds(rows),
@@ -250,7 +251,8 @@ class _Page:
                 )
             )
             peaks += [float(np.nanpercentile(rows[name], 99.9))] if np.isfinite(rows[name]).any() else []
-        return self._chart(title, lines, from_zero=True, ceiling=1.5 * max(peaks) if peaks else None)
+        ceiling = 1.5 * max(peaks) if peaks and not curve.is_count else None
+        return self._chart(curve.title, lines, from_zero=True, ceiling=ceiling)
 
     def _spans(self, name: str, kind: Any, colors: Mapping[str, tuple[int, int, int]]) -> list[tuple[str, list[Span]]]:
         result = []

@@ -8,6 +8,7 @@ regular file of bounded size and expected content is refused with a reason.
 from __future__ import annotations
 
 import json
+import math
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -16,7 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from swarmctl import __version__
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
+from swarmctl.core.tick_record import COLUMNS, Column
 from swarmctl.errors import ConfigError
 from swarmctl.files import read_file, replaced
 from swarmctl.telemetry.referee import RunData
@@ -28,6 +31,7 @@ SUMMARY = "summary.json"
 TRUTH = "truth.bin"
 CONFIG = "config.toml"
 RECORDING = "telemetry.rrd"
+VERSION_KEY = "swarmctl_version"  # of the metadata of Parquet
 AGENT_FILE = re.compile(r"^agent-(\d{1,3})\.(ticks|parquet)$")
 
 _MAX_ROWS_BYTES = 2**31  # a day of one agent, about the memory of a laptop
@@ -36,7 +40,6 @@ _MAX_TEXT_BYTES = 2**24
 _MAX_ROWS = _MAX_ROWS_BYTES // TICK_DTYPE.itemsize
 _MAX_EVENT_DEPTH = 8  # largest nesting of an event; written events nest twice
 _INT64 = range(-(2**63), 2**63)
-_AXES = {3: ("x", "y", "z"), 4: ("w", "x", "y", "z")}
 
 
 def load_run(directory: Path) -> RunData:
@@ -143,7 +146,8 @@ def _in_time(path: Path, rows: NDArray[np.void], clocks: tuple[str, ...]) -> NDA
     """Return `rows` after a check that each clock spans no more than the longest run."""
     for clock in clocks:
         if len(rows) and int(rows[clock].max()) - int(rows[clock].min()) > MAX_RUN_US:
-            raise _damaged(path, f"damaged: {clock} spans more than {MAX_RUN_US / 3.6e9:.0f} hours")
+            why = f"{clock} spans more than {MAX_RUN_US / 3.6e9:.0f} hours"
+            raise _damaged(path, f"damaged, or raw rows of another version (this is {__version__}): {why}")
     return rows
 
 
@@ -152,27 +156,28 @@ def _damaged(path: Path, problem: str) -> ConfigError:
 
 
 def write_parquet(path: Path, rows: NDArray[np.void]) -> None:
-    """Write structured rows as Parquet; `pos_ned_m` becomes `pos_ned_m_x`, `_y`, `_z`, quaternions `_w` to `_z`."""
+    """Write rows of `TICK_DTYPE` as Parquet, one column for each component, with units and meanings as metadata."""
     import pyarrow as pa  # imported here to keep it out of agent processes
     import pyarrow.parquet as pq
 
-    columns: dict[str, Any] = {}
-    for name in rows.dtype.names or ():
-        shape = rows.dtype[name].shape
-        if shape:
-            for k, axis in enumerate(_AXES[shape[0]]):
-                columns[f"{name}_{axis}"] = pa.array(np.ascontiguousarray(rows[name][:, k]))
-        else:
-            columns[name] = pa.array(np.ascontiguousarray(rows[name]))
+    fields, arrays = [], []
+    for column in COLUMNS:
+        values = rows[column.name].reshape(len(rows), -1)  # (T, components)
+        for k, part in enumerate(column.parts):
+            arrays.append(pa.array(np.ascontiguousarray(values[:, k])))
+            metadata = {"unit": column.unit, "description": column.text, "entity": column.entity}
+            fields.append(pa.field(part, arrays[-1].type, metadata=metadata))
+    schema = pa.schema(fields, metadata={VERSION_KEY: __version__})
     with replaced(path) as file:
-        pq.write_table(pa.table(columns), file, compression="zstd")
+        pq.write_table(pa.Table.from_arrays(arrays, schema=schema), file, compression="zstd")
 
 
 def read_parquet(path: Path) -> NDArray[np.void]:
-    """Read ticks written by `write_parquet`; unknown columns are ignored, missing ones are zero.
+    """Read ticks written by this or an older version; unknown columns are ignored, missing ones are NaN.
 
     Raises:
-        ConfigError: the file is no Parquet, has too many rows, or a column holds no numbers.
+        ConfigError: the file is no Parquet, has too many rows, a column holds no numbers, or an integer column is
+            missing for which `core.tick_record` states no number.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
@@ -188,18 +193,35 @@ def read_parquet(path: Path) -> NDArray[np.void]:
 
 def _tick_rows(file: Any) -> NDArray[np.void]:
     known = set(file.schema_arrow.names)
-    columns = {name: columns for name, columns in _columns().items() if known.issuperset(columns)}
-    table = file.read(columns=[column for of_field in columns.values() for column in of_field])
+    stored = {column.name: _stored_parts(column, known) for column in COLUMNS}
+    table = file.read(columns=[part for parts in stored.values() for part in parts])
     rows = np.zeros(table.num_rows, TICK_DTYPE)
-    for name, of_field in columns.items():
-        values = [table.column(column).to_numpy() for column in of_field]
+    for column in COLUMNS:
+        values = [table.column(part).to_numpy() for part in stored[column.name]]
         if any(value.dtype.kind not in "iufb" for value in values):
-            raise ValueError(f"column {name} holds no numbers")
-        rows[name] = values[0] if len(values) == 1 else np.column_stack(values)
+            raise ValueError(f"column {column.name} holds no numbers")
+        if values:
+            rows[column.name] = np.column_stack(values) if column.size else values[0]
+        else:
+            rows[column.name] = _absent(column, file)
     return rows
 
 
-def _columns() -> dict[str, list[str]]:
-    """Return the Parquet columns of every field of a tick."""
-    shapes = {name: TICK_DTYPE[name].shape for name in TICK_DTYPE.names or ()}
-    return {name: [f"{name}_{axis}" for axis in _AXES[s[0]]] if s else [name] for name, s in shapes.items()}
+def _stored_parts(column: Column, known: set[str]) -> list[str]:
+    """Return the Parquet columns of a value by its present or former name; empty if the file has neither."""
+    former = [part.replace(column.name, column.formerly, 1) for part in column.parts]
+    return next((parts for parts in (column.parts, former) if known.issuperset(parts)), [])
+
+
+def _absent(column: Column, file: Any) -> float:
+    """Return the number that stands for a value that was not recorded.
+
+    Raises:
+        ValueError: there is none.
+    """
+    if column.absent is not None:
+        return column.absent
+    if TICK_DTYPE[column.name].base.kind == "f":
+        return math.nan
+    by = (file.schema_arrow.metadata or {}).get(VERSION_KEY.encode(), b"an unknown version").decode(errors="replace")
+    raise ValueError(f"column {column.name} is missing (written by swarmctl {by}, this is {__version__})")

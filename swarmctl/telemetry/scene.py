@@ -12,6 +12,8 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
+from swarmctl import __version__
+from swarmctl.core.tick_record import CURVES
 from swarmctl.core.types import Array, Mode, Phase, PlanStatus
 from swarmctl.telemetry.attitude import roll_pitch_rad
 from swarmctl.telemetry.layout import TIMELINE, SceneBounds, layout
@@ -68,6 +70,7 @@ class Scene:
     def begin(self) -> None:
         """Send the blueprint and all static entities; must be the first call on a new stream."""
         self._rec.send_blueprint(layout(self._agents, self._bounds), make_active=True, make_default=True)
+        self._rec.send_property("swarmctl", rr.AnyValues(version=__version__))
         self._static("world", rr.ViewCoordinates.FRD)
         self._static("world/reference", rr.Points3D.from_fields(colors=[REFERENCE_RGB], radii=[0.09]))
         self._static(
@@ -91,10 +94,10 @@ class Scene:
         self._static(f"world/agent/{agent}/safety", sphere)
         self._static(f"world/trail/{agent}", rr.LineStrips3D.from_fields(colors=[rgb], radii=[0.018]))
         self._static(f"world/plan/{agent}", rr.LineStrips3D.from_fields(colors=[(255, 255, 255, 190)], radii=[0.014]))
-        for plot in ("track_err", "solve_ms", "tick_ms"):
-            self._static(f"plot/{plot}/{agent}", rr.SeriesLines(names=[name], colors=[rgb]))
-        step = rr.SeriesLines(names=[name], colors=[rgb], interpolation_mode="StepAfter")
-        self._static(f"plot/deadline_misses/{agent}", step)
+        self._static(f"plot/track_err/{agent}", rr.SeriesLines(names=[name], colors=[rgb]))
+        for plot, curve in CURVES.items():
+            mode = "StepAfter" if curve.is_count else "Linear"
+            self._static(f"plot/{plot}/{agent}", rr.SeriesLines(names=[name], colors=[rgb], interpolation_mode=mode))
         for plot, names in (("roll", "measured"), ("pitch", "measured"), ("thrust", "hover estimate")):
             lines = rr.SeriesLines(names=["setpoint", names], colors=[(148, 163, 184), rgb])
             self._static(f"plot/att/{agent}/{plot}", lines)
@@ -186,10 +189,10 @@ class Scene:
         tracking = rows["phase"] == Phase.TRACK
         error_m = np.linalg.norm(rows["pos_ned_m"] - rows["ref_pos_ned_m"], axis=1)
         self._scalars(f"plot/track_err/{agent}", t_us[tracking], error_m[tracking])
-        solved = rows["iterations"] > 0
-        self._scalars(f"plot/solve_ms/{agent}", t_us[solved], rows["solve_ms"][solved])
-        self._scalars(f"plot/tick_ms/{agent}", t_us, rows["tick_ms"])
-        self._scalars(f"plot/deadline_misses/{agent}", t_us[-1:], rows["deadline_misses"][-1:])
+        for name, curve in CURVES.items():
+            shown = np.ones(len(rows), bool) if curve.where is None else curve.where(rows)
+            newest = slice(-1, None) if curve.is_count else slice(None)
+            self._scalars(f"plot/{name}/{agent}", t_us[shown][newest], rows[name][shown][newest])
         asked_deg, had_deg = (np.degrees(roll_pitch_rad(rows[name])) for name in ("setpoint_q_nb", "q_nb"))
         pairs = {
             "roll": np.column_stack([asked_deg[:, 0], had_deg[:, 0]]),

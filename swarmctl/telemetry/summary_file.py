@@ -81,7 +81,8 @@ class _Summary(msgspec.Struct):
     solver: _Solver
     comms: _Comms
     duration_s: _Figure | None = None
-    deadlocks: _Deadlocks = msgspec.field(default_factory=_Deadlocks)  # missing in older folders
+    version: str = ""  # missing in older folders, as is the next
+    deadlocks: _Deadlocks = msgspec.field(default_factory=_Deadlocks)
 
 
 def decode_summary(content: bytes) -> dict[str, Any]:

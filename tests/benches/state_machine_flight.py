@@ -9,6 +9,7 @@ import numpy as np
 from swarmctl.control.phases.inputs import PeerInputs, PhaseInputs
 from swarmctl.control.phases.state_machine import MissionStateMachine, StateMachineParams
 from swarmctl.control.reference.mission import MissionParams, MissionReference
+from swarmctl.core.operator_verbs import Order
 from swarmctl.core.types import Command, FlightMode, Landed, Mode, Phase, VehicleState, Verb
 
 UTC0_US = 1_700_000_000_000_000
@@ -101,7 +102,7 @@ class Flight:
         self.peers[1] = PeerInputs(phase, ready_utc_us, alive)
 
     def ask(self, verb: str) -> None:
-        self.state_machine.operator(verb, self.now_us, self.utc_us, self.state)
+        self.state_machine.operator(Order(verb), self.now_us, self.utc_us, self.state)
 
     def until(self, phase: Phase) -> Flight:
         """Continue without faults until a phase is reached."""

@@ -13,7 +13,6 @@ import pytest
 
 from sitl.lockstep import Lockstep
 from swarmctl.bus import topics
-from swarmctl.bus.orders import Verb
 from swarmctl.bus.peers import agent_name
 from swarmctl.bus.senders import ReceivedMessage, SenderVerifier, _Stream
 from swarmctl.bus.trajectory_messages import decode_trajectory_message, encode_trajectory_message
@@ -187,7 +186,7 @@ def test_commands_with_old_or_future_stamps_are_refused_and_the_last_one_counts(
     """The commands are a `land` stamped 1970, one stamped in an hour, and a `hold` repeated after its resume."""
     speeds_m_s: list[float] = []
 
-    def order(running: Lockstep, verb: Verb, at_us: int) -> None:
+    def order(running: Lockstep, verb: str, at_us: int) -> None:
         message = topics.CommandMessage(verb, -1, at_us)
         running.hub.carry(topics.OPERATOR, topics.COMMAND, topics.encode_message(message))
 

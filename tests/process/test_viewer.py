@@ -21,6 +21,7 @@ import pytest
 import zenoh
 
 from swarmctl.core.records import TICK_DTYPE
+from swarmctl.core.tick_record import COLUMNS
 from swarmctl.core.types import Mode, Phase, PlanStatus
 from swarmctl.telemetry.recordings import optimize_recording, viewer_binary
 
@@ -145,9 +146,8 @@ def scalars(rows: list[Any]) -> list[list[float]]:
 
 def expected_entities() -> set[str]:
     each = ["world/agent/{}", "world/agent/{}/body", "world/agent/{}/safety", "world/trail/{}", "world/plan/{}"]
-    each += ["plot/track_err/{}", "plot/solve_ms/{}", "plot/tick_ms/{}", "plot/deadline_misses/{}"]
-    each += ["plot/att/{}/roll", "plot/att/{}/pitch", "plot/att/{}/thrust"]
-    each += ["state/{}/phase", "state/{}/mode", "events/agent-{}"]
+    each += ["plot/track_err/{}", "plot/att/{}/pitch", "events/agent-{}"]
+    each += [column.entity for column in COLUMNS if column.entity]
     shared = {"world", "world/reference", "world/reference_trail", "world/obstacles/body", "world/obstacles/keep_out"}
     shared |= {"plot/separation/min", "plot/separation/limit"}
     return {"/" + path for path in shared | {path.format(i) for path in each for i in range(AGENTS)}}

@@ -24,6 +24,13 @@ def test_the_page_of_the_configuration_is_what_the_script_writes() -> None:
     assert (ROOT / "docs" / "configuration.md").read_text() == written, "run python tools/configuration_page.py"
 
 
+def test_the_table_of_columns_is_what_the_script_writes() -> None:
+    text = (ROOT / "docs" / "data_formats.md").read_text()
+    written = runpy.run_path(str(ROOT / "tools" / "recorded_columns.py"))["page"](text)
+    assert text == written, "run python tools/recorded_columns.py"
+    assert "| `pos_ned_m` | float64 x 3 | m | reported position | `world/agent/<i>` |\n" in text
+
+
 def test_every_recorded_column_is_described() -> None:
     recorded = {*(TICK_DTYPE.names or ()), *(TRUTH_DTYPE.names or ()), *SCHEMA.names}
     assert recorded - described() == set()

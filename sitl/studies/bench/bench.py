@@ -1,6 +1,6 @@
 """The `bench` verb: measures the duration of an agent's tick, split into parts, for growing swarms and each QP solver.
 
-`python -m sitl.studies.bench.bench [--out DIR] [--neighbours 0,1,2] [--solver osqp] [--ticks N] [--no-slsqp]`
+Its options are in `command`.
 
 One real agent among neighbours that are paths on the bus (see `formation`), no process, no socket: what is measured is
 the work of a tick. Solvers take turns tick by tick, so that their ratios are fair on a busy machine. Ticks are timed by
@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import sys
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, astuple, dataclass
 from functools import partial
@@ -39,16 +38,14 @@ from sitl.studies.bench.formation import Formation, formation_config
 from sitl.studies.campaign.flight import config_of
 from sitl.studies.campaign.scenarios import layout_of
 from sitl.studies.campaign.trials import Cell
-from swarmctl.agent.telemetry_publisher import TickTiming
 from swarmctl.config import Config
 from swarmctl.control.mpc.qp import SOLVERS, installed_solvers
+from swarmctl.core.tick_record import TickTiming
 from swarmctl.core.types import Array, Phase
-from swarmctl.errors import EXIT_OK, ConfigError, MissionError, exit_code_of
+from swarmctl.errors import EXIT_OK, ConfigError, MissionError
 from swarmctl.files import replace_text
 
 PARTS = ("sense", "setup", "commitment", "spaces", "solve", "certify", "barrier", "send", "tick")
-NEIGHBOURS = (0, 1, 2, 4, 8, 16, 30)
-MAX_NEIGHBOURS = 99
 _BESIDE_PILLAR = 2  # neighbours in the scenario with an obstacle
 _WARM_UP_S = 5.0  # mission time for catching up with the circle
 _READY_WITHIN_TICKS = 1500
@@ -257,38 +254,8 @@ def write(rows: Sequence[BenchRow], directory: Path) -> Path:
     return path
 
 
-def _counts(text: str) -> list[int]:
-    try:
-        counts = [int(part) for part in text.split(",")]
-    except ValueError:
-        counts = [-1]
-    if not all(0 <= count <= MAX_NEIGHBOURS for count in counts):
-        raise argparse.ArgumentTypeError(f"{text!r}: give numbers from 0 to {MAX_NEIGHBOURS}, such as 0,2,8")
-    return list(dict.fromkeys(counts))
-
-
-def _ticks(text: str) -> int:
-    if not text.isdigit() or not 1 <= int(text) <= 100_000:
-        raise argparse.ArgumentTypeError(f"{text!r}: allowed: 1 to 100000")
-    return int(text)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="swarmctl bench", description=__doc__.splitlines()[0])
-    parser.add_argument("--out", metavar="DIR", type=Path, default=Path(), help="folder of bench.json; default: here")
-    parser.add_argument("--neighbours", metavar="K,K", type=_counts, default=list(NEIGHBOURS), help="counts, 0 to 99")
-    parser.add_argument("--solver", action="append", choices=SOLVERS, help="repeatable; default: all installed")
-    parser.add_argument("--ticks", metavar="N", type=_ticks, default=300, help="measured for each solver and scenario")
-    parser.add_argument("--slsqp", action=argparse.BooleanOptionalAction, default=True, help="the nonlinear baseline")
-    return parser
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run the verb and return the process exit code."""
-    return exit_code_of(partial(_run, _parser().parse_args(arguments)))
-
-
-def _run(options: argparse.Namespace) -> int:
+def run(options: argparse.Namespace) -> int:
+    """Measure what the command line asks for, show and write it; return the exit code."""
     console = Console()
     note = busy_note(os.getloadavg()[0], os.cpu_count() or 1)
     solvers, left_out = chosen_solvers(options.solver or ())
@@ -300,7 +267,3 @@ def _run(options: argparse.Namespace) -> int:
         console.print(note)
     console.print(str(write(rows, options.out)))
     return EXIT_OK
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -17,12 +17,12 @@ import numpy as np
 from sitl.lockstep import obstacles_message, sitl_params
 from sitl.world import SitlWorld
 from swarmctl.agent.assembly import make_agent
-from swarmctl.agent.telemetry_publisher import TickTiming
 from swarmctl.bus import topics
 from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.config import Config, load
 from swarmctl.core.clock import SimClock
-from swarmctl.core.types import Array, Phase, PlanStatus, PredictedPath, TickRecord
+from swarmctl.core.tick_record import TickRecord, TickTiming
+from swarmctl.core.types import Array, Phase, PlanStatus, PredictedPath
 from swarmctl.mavlink.autopilot import Autopilot
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.commands import CodecCommands
@@ -169,7 +169,8 @@ class Formation:
     @property
     def planned(self) -> bool:
         """Whether the newest tick had a plan that may be flown."""
-        return self.record.plan_status is PlanStatus.OK
+        plan = self.record.plan
+        return plan is not None and plan.status is PlanStatus.OK
 
     def step(self) -> None:
         """Publish the neighbours' messages, tick the agent, and step the physics to the next tick."""

@@ -1,19 +1,16 @@
 """The `reproduce` verb: flies the six experiments of the thesis and writes the results beside the published ones.
 
-`python -m sitl.studies.thesis.reproduce [--only FLIGHT]... [--plant] [--full] [--out DIR] [--jobs N]`
-
-Flights are independent and shared out over processes; timing is measured afterwards, alone.
+Its options are in `command`. Flights are independent and shared out over processes; timing is measured afterwards,
+alone.
 """
 
 from __future__ import annotations
 
 import argparse
 import multiprocessing
-import os
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -31,7 +28,7 @@ from sitl.studies.thesis.page import write_json, write_page
 from sitl.studies.thesis.trace import Row, Trace
 from swarmctl.built_in_configs import built_in_config
 from swarmctl.config import load
-from swarmctl.errors import EXIT_MISSION, EXIT_OK, ConfigError, StartError, exit_code_of
+from swarmctl.errors import EXIT_MISSION, EXIT_OK, ConfigError, StartError
 from swarmctl.process_lifetime import serve_parent
 from swarmctl.telemetry.run_folder import create_run_folder
 
@@ -157,31 +154,15 @@ def _make(directory: Path) -> None:
         raise StartError(f"{directory} can't be made: {error}. Choose another with --out") from error
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="swarmctl reproduce", description=__doc__.splitlines()[0])
-    add = parser.add_argument
-    add("--only", action="append", default=[], metavar="FLIGHT", help="one experiment; repeatable")
-    add("--plant", action="store_true", help="fly the model only, as the thesis did")
-    add("--full", action="store_true", help="fly the full MAVLink loop only")
-    add("--out", type=Path, metavar="DIR", help="folder to write; default runs/<UTC>-reproduce")
-    processes = min(8, len(os.sched_getaffinity(0)))
-    add("--jobs", type=int, metavar="N", default=processes, help="processes; default: one per processor, at most 8")
-    return parser
+def run(options: argparse.Namespace) -> int:
+    """Fly what the command line asks for; return the exit code.
 
-
-def main(arguments: list[str] | None = None) -> int:
-    """Run the verb and return the process exit code."""
-    return exit_code_of(partial(_run, _parser().parse_args(arguments)))
-
-
-def _run(options: argparse.Namespace) -> int:
+    Raises:
+        ConfigError: a flight is not known, or no process is left to fly.
+    """
     if options.jobs < 1:
         raise ConfigError("--jobs", [f"{options.jobs}: at least 1 process flies"])
     chosen(options.only, options.plant, options.full)
     directory = options.out or create_run_folder(None, "reproduce", time.time_ns() // 1000)
     _make(directory)
     return reproduce(options.only, options.plant, options.full, directory, options.jobs)
-
-
-if __name__ == "__main__":
-    sys.exit(main())

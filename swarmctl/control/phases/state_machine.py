@@ -1,7 +1,7 @@
 """State machine of one agent's mission: the requests to the autopilot and the reference to follow in each phase.
 
 Pure. Agents agree on the start of the mission without a leader: each publishes when it became ready, and all start one
-second after the latest of these times. The operator's commands (hold, resume, land, rtl) are applied here too. A
+second after the latest of these times. The operator's orders (`core.operator_verbs`) are applied here too. A
 vehicle found in the air at start-up is handed back in the air, in the autopilot's hold.
 
 Autopilots do not know each other. Before one takes over, the agent therefore comes to rest and moves away from others
@@ -21,6 +21,7 @@ from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.control.phases.overload import Level
 from swarmctl.control.reference.landing_places import landing_place_ned_m, nearest_in_plane_m
 from swarmctl.control.reference.mission import MissionReference, QuinticTrajectory, brake_to_rest, quintic_to
+from swarmctl.core.operator_verbs import OPERATOR_VERBS, Order
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Command, FlightMode, Landed, Mode, Phase, VehicleState, Verb
 
@@ -125,6 +126,7 @@ class MissionStateMachine:
             Phase.GOTO_LAND: self._goto_land,
             Phase.LAND: self._land,
         }
+        self._order_handlers = {"hold": self._hold, "resume": self._resume}  # stops are in `_apply_stop`
 
     @property
     def finished(self) -> bool:
@@ -191,25 +193,30 @@ class MissionStateMachine:
             return math.nan
         return (utc_us - self.begin_utc_us) * 1e-6
 
-    def operator(self, verb: str, now_us: int, utc_us: int, state: VehicleState | None) -> None:
-        """Apply an operator's command: hold, resume, land or rtl.
+    def operator(self, order: Order, now_us: int, utc_us: int, state: VehicleState | None) -> None:
+        """Apply an operator's order.
 
         A stop (land, rtl) is kept until a vehicle state is known to begin it from, so it is lost in no phase.
         """
-        if verb in ("land", "rtl"):
-            self._stop_verb = verb
+        verb = OPERATOR_VERBS[order.verb]
+        if verb.is_stop:
+            self._stop_verb = order.verb
         if state is None or self.phase in (Phase.LAND, Phase.DONE):
             return
         self._apply_stop(now_us, state)
-        if verb == "hold" and self.phase is Phase.TRACK:
-            self.held = True
-            self._trajectory = (self._stop_trajectory(state), now_us)
-        elif verb == "resume":
-            if self.held or self.pilot_override:
-                self._rejoin_mission(now_us, utc_us, state)
-            self.held = False
-            if self.pilot_override:
-                self.pilot_override, self.outcome, self._may_take_control = False, self._outcome_before, True
+        if not verb.is_stop and self.phase.name in verb.phases:
+            self._order_handlers[order.verb](order, now_us, utc_us, state)
+
+    def _hold(self, order: Order, now_us: int, utc_us: int, state: VehicleState) -> None:
+        self.held = True
+        self._trajectory = (self._stop_trajectory(state), now_us)
+
+    def _resume(self, order: Order, now_us: int, utc_us: int, state: VehicleState) -> None:
+        if self.held or self.pilot_override:
+            self._rejoin_mission(now_us, utc_us, state)
+        self.held = False
+        if self.pilot_override:
+            self.pilot_override, self.outcome, self._may_take_control = False, self._outcome_before, True
 
     def _override(self, why: str) -> None:
         self.pilot_override, self.had_control, self._may_take_control = True, False, False

@@ -40,7 +40,7 @@ class Bench:
 
     def tick(self) -> list[str]:
         self.clock.advance(TICK_US)
-        return list(self.world_model.listen(self.clock.utc_us()))
+        return [order.verb for order in self.world_model.listen(self.clock.utc_us())]
 
     def say_path(self, boot_id: int = 1) -> None:
         self.seq += 1

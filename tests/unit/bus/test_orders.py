@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 
-from swarmctl.bus.orders import EVERYBODY, MAX_LEAD_US, VALID_US, Orders, Verb, orders
+from swarmctl.bus.orders import EVERYBODY, MAX_LEAD_US, VALID_US, Orders, order_messages
 from swarmctl.bus.refusals import Refusals
 from swarmctl.bus.topics import OPERATOR, CommandMessage, decode_command, encode_message
+from swarmctl.core.operator_verbs import Order
 
 NOW_US = 1_700_000_000_000_000
 
@@ -18,12 +19,13 @@ class Agent3:
         self.refusals = Refusals(lambda *_, **__: None)
         self.orders = Orders(3, self.refusals)
 
-    def obeys(self, verb: Verb, stamp_us: int, now_us: int = NOW_US, agent: int = EVERYBODY) -> bool:
-        return self.orders.take(OPERATOR, encode_message(CommandMessage(verb, agent, stamp_us)), now_us) == verb
+    def obeys(self, verb: str, stamp_us: int, now_us: int = NOW_US, agent: int = EVERYBODY) -> bool:
+        payload = encode_message(CommandMessage(verb, agent, stamp_us))
+        return self.orders.take(OPERATOR, payload, now_us) == Order(verb)
 
 
 @pytest.mark.parametrize("verb", ["hold", "resume", "land", "rtl"])
-def test_an_order_is_valid_for_two_seconds(verb: Verb) -> None:
+def test_an_order_is_valid_for_two_seconds(verb: str) -> None:
     for stamp_us, reason in (
         (0, "stale_order"),
         (NOW_US - VALID_US - 1, "stale_order"),
@@ -72,13 +74,14 @@ def test_orders_to_other_agents_are_ignored() -> None:
 @pytest.mark.parametrize("step_us", [0, 400_000, 3_600_000_000, -3_600_000_000])
 def test_agents_that_have_not_followed_a_step_of_utc_yet_obey_all_the_same(step_us: int) -> None:
     operators_us, agents_us = NOW_US + step_us, [NOW_US, NOW_US + 1000, NOW_US - 1000]
-    messages = orders("land", EVERYBODY, operators_us, agents_us)
+    messages = order_messages(Order("land"), EVERYBODY, operators_us, agents_us)
     assert len(messages) == (1 if abs(step_us) < 500_000 else 2)
     for now_us in agents_us:
         agent = Orders(0, Refusals(lambda *_, **__: None))
-        assert "land" in [agent.take(OPERATOR, payload, now_us) for payload in messages]
+        assert Order("land") in [agent.take(OPERATOR, payload, now_us) for payload in messages]
 
 
 def test_a_forged_clock_makes_no_order_invalid() -> None:
-    stamps_us = [c.utc_us for c in map(decode_command, orders("land", 0, NOW_US, [0, 2**62])) if c is not None]
+    payloads = order_messages(Order("land"), 0, NOW_US, [0, 2**62])
+    stamps_us = [message.utc_us for message in map(decode_command, payloads) if message is not None]
     assert stamps_us == [NOW_US, 0, 2**62]

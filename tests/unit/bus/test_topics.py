@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from swarmctl.bus import topics
 from swarmctl.bus.topics import decode_command, decode_obstacles, decode_path, decode_status, encode_message
 from swarmctl.bus.trajectory_messages import MAX_ACKNOWLEDGED, MAX_POINTS, encode_trajectory_message
+from swarmctl.core.operator_verbs import OPERATOR_VERBS, OperatorVerb, Order, VerbArgument
 from swarmctl.core.records import TICK_DTYPE
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
@@ -188,8 +189,45 @@ def test_messages_survive_encoding() -> None:
     assert decode_obstacles(encode_message(obstacles)) == obstacles
 
 
+CLIMB = OperatorVerb(
+    help="Climb.",
+    phases=frozenset({"TRACK"}),
+    arguments=(
+        VerbArgument(name="height_m", option="--height", help="Height [m].", least=0.5, most=20.0),
+        VerbArgument(name="speed_m_s", option="--speed", help="Speed [m/s].", least=0.0, most=3.0),
+    ),
+)
+
+
+def climb(arguments: object) -> bytes:
+    return msgspec.json.encode({"verb": "climb", "agent": -1, "utc_us": 1, "arguments": arguments})
+
+
+def test_arguments_of_an_order_arrive_in_bounds_or_not_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(OPERATOR_VERBS, "climb", CLIMB)
+    message = decode_command(climb({"height_m": 20, "speed_m_s": 0.0}))
+    assert message is not None
+    assert message.order == Order("climb", {"height_m": 20.0, "speed_m_s": 0.0})
+    assert decode_command(encode_message(message)) == message
+    refused: list[object] = [{}, None, [], {"height_m": 2.0}, {"height_m": 2.0, "speed_m_s": 1.0, "yaw_rad": 0.0}]
+    refused += [{"height_m": value, "speed_m_s": 1.0} for value in (0.49, 20.1, 1e308, "2", True, None, [2.0])]
+    for arguments in refused:
+        assert decode_command(climb(arguments)) is None, arguments
+    for text in (b"1e999", b"NaN", b"-1e400"):
+        assert decode_command(climb({"height_m": 7, "speed_m_s": 1.0}).replace(b"7", text)) is None
+    assert decode_command(climb({f"k{k}": 0.0 for k in range(9)})) is None
+    assert decode_command(climb({"k" * 33: 0.0})) is None
+
+
+def test_verbs_without_arguments_take_none() -> None:
+    for verb in ("hold", "resume", "land", "rtl"):
+        body = {"verb": verb, "agent": -1, "utc_us": 1}
+        assert decode_command(msgspec.json.encode(body)) is not None, "of an operator before there were arguments"
+        assert decode_command(msgspec.json.encode(body | {"arguments": {"height_m": 1.0}})) is None
+
+
 @pytest.mark.parametrize("verb", ["disarm", "kill", "", "LAND"])
-def test_only_the_four_verbs_of_the_operator_are_known(verb: str) -> None:
+def test_only_verbs_of_the_operator_are_known(verb: str) -> None:
     assert decode_command(msgspec.json.encode({"verb": verb, "agent": -1, "utc_us": 1})) is None
 
 

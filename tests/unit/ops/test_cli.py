@@ -12,9 +12,13 @@ from pathlib import Path
 
 import msgspec
 import pytest
+import typer
 
 import swarmctl
+from sitl.studies.bench import command
 from swarmctl.bus.topics import ObstacleMessage
+from swarmctl.control.mpc.qp import SOLVERS
+from swarmctl.core.operator_verbs import OperatorVerb, Order, VerbArgument
 from swarmctl.errors import ConfigError, MissionError, StartError
 from swarmctl.ops import cli, operator
 
@@ -54,6 +58,29 @@ def test_help_is_quick_and_imports_nothing_heavy() -> None:
         times_s.append(after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime)
         assert "heavy: []" in answer.stdout
     assert min(times_s) < 0.4
+
+
+@pytest.mark.parametrize(
+    ("module", "options"),
+    [
+        ("sitl.studies.thesis.command", ("--only", "--plant", "--full", "--out", "--jobs")),
+        ("sitl.studies.bench.command", ("--out", "--neighbours", "--solver", "--ticks", "--slsqp", "--no-slsqp")),
+    ],
+)
+def test_help_of_studies_names_every_option_and_imports_nothing_heavy(module: str, options: tuple[str, ...]) -> None:
+    code = f"""if True:
+        import atexit, runpy, sys
+        heavy = lambda: [name for name in ("sitl.lockstep", *{HEAVY!r}, "rich") if name in sys.modules]
+        atexit.register(lambda: print("heavy:", heavy()))
+        sys.argv = ["x", "--help"]
+        runpy.run_module({module!r}, run_name="__main__")"""
+    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=60)
+    assert "heavy: []" in answer.stdout
+    assert [option for option in options if option not in answer.stdout] == []
+
+
+def test_the_solvers_of_bench_are_those_there_are() -> None:
+    assert command.SOLVERS == SOLVERS
 
 
 def test_every_verb_is_there_and_explains_itself(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
@@ -98,6 +125,32 @@ def test_help_keeps_units_in_brackets(
 def test_rtl_help_says_that_the_agent_flies_home(run: Run, capsys: pytest.CaptureFixture[str]) -> None:
     assert run("rtl", "--help") == 0
     assert "own MPC, then land" in " ".join(capsys.readouterr().out.split())
+
+
+def test_a_verb_of_the_operator_has_an_option_for_each_argument(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    given: list[tuple[Order, Path | None, int | None]] = []
+
+    def give(order: Order, run_dir: Path | None, agent: int | None) -> int:
+        given.append((order, run_dir, agent))
+        return 7
+
+    app = typer.Typer(rich_markup_mode=None)
+    height = VerbArgument(name="height_m", option="--height", help="Height [m].", least=0.5, most=20.0)
+    for name, arguments in (("climb", (height,)), ("hold", ())):
+        cli.add_operator_verb(app, name, OperatorVerb(help="Do.", phases=frozenset(), arguments=arguments), give)
+    assert app(["climb", "--height", "2.5", "--agent", "1", "--run-dir", "r"], standalone_mode=False) == 7
+    assert app(["hold"], standalone_mode=False) == 7
+    assert given == [(Order("climb", {"height_m": 2.5}), Path("r"), 1), (Order("hold"), None, None)]
+    for wrong in (["climb"], ["climb", "--height", "20.5"], ["climb", "--height", "x"], ["hold", "--height", "1"]):
+        with pytest.raises(SystemExit) as ended:
+            app(wrong)
+        assert ended.value.code == 2
+    assert len(given) == 2
+    capsys.readouterr()
+    app(["climb", "--help"], standalone_mode=False)
+    assert "Height [m]." in capsys.readouterr().out
 
 
 def test_version_is_printed(run: Run, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from sitl.studies.bench import bench, formation
+from sitl.studies.bench import bench, command, formation
 from sitl.studies.bench.captured import Captured, capture, circle_with_obstacle, measure_xy, tapped
 from sitl.studies.bench.formation import Formation, Neighbours, formation_config, places_m
 from sitl.studies.bench.slsqp import KEPT_M, NonlinearXy
@@ -57,7 +57,7 @@ def test_a_tick_without_a_plan_is_no_figure(monkeypatch: pytest.MonkeyPatch) -> 
 )
 def test_bad_usage_is_refused(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as caught:
-        bench.main(arguments)
+        command.main(arguments)
     assert caught.value.code == 2
     assert arguments[0] in capsys.readouterr().err
 
@@ -122,7 +122,8 @@ def test_the_agent_flies_pressed_against_its_neighbours(neighbours: int, pillar:
         assert 0.88 < flown.record.nearest_peer_m < 0.95, "at the distance that is kept: active constraints"
         if pillar:
             assert 5.15 < flown.record.nearest_obstacle_m < 5.3
-    assert float(np.linalg.norm(flown.record.vel_ned_m_s)) == pytest.approx(SPEED_M_S, rel=0.6)
+    assert flown.record.state is not None
+    assert float(np.linalg.norm(flown.record.state.vel_ned_m_s)) == pytest.approx(SPEED_M_S, rel=0.6)
 
 
 def test_captured_problems_have_two_neighbours_and_an_obstacle(captured: Captured) -> None:

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from sitl.studies.thesis import command, reproduce, score
 from sitl.studies.thesis import experiments as thesis
-from sitl.studies.thesis import reproduce, score
 from sitl.studies.thesis.experiments import FULL_JOBS, PLANT_JOBS, Job
 from sitl.studies.thesis.figures import FLIGHTS, SWARMS
 from sitl.studies.thesis.page import flight_of
@@ -336,6 +336,6 @@ def test_bad_usage_is_2_and_leaves_nothing(
     arguments: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    assert reproduce.main(arguments) == EXIT_USAGE
+    assert command.main(arguments) == EXIT_USAGE
     assert arguments[-1].split("=")[-1] in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []

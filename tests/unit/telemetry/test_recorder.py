@@ -14,47 +14,15 @@ import numpy as np
 import pytest
 
 from swarmctl.core.records import TICK_DTYPE
-from swarmctl.core.types import FlightMode, Mode, Phase, PlanStatus, TickRecord
+from swarmctl.core.tick_record import TickRecord
 from swarmctl.telemetry import recorder as recorder_module
 from swarmctl.telemetry.recorder import Recorder
 from swarmctl.telemetry.run_files import load_run, read_rows
+from tests.benches.tick_records import tick_record
 
 
 def record(seq: int) -> TickRecord:
-    zero = np.zeros(3)
-    level = np.array([1.0, 0.0, 0.0, 0.0])
-    return TickRecord(
-        t_us=seq * 20_000,
-        utc_us=1_780_000_000_000_000 + seq * 20_000,
-        seq=seq,
-        mission_t_s=float("nan"),
-        phase=Phase.TRACK,
-        mode=Mode.TRACKING,
-        flight_mode=FlightMode.EXTERNAL,
-        armed=True,
-        state_age_ms=4.0,
-        pos_ned_m=np.array([1.0, 2.0, 3.0]),
-        vel_ned_m_s=zero,
-        q_nb=level,
-        ref_pos_ned_m=zero,
-        setpoint_q_nb=level,
-        setpoint_thrust_01=0.5,
-        hover_thrust_01=0.5,
-        disturbance_ned_m_s2=zero,
-        nearest_peer_m=float("inf"),
-        nearest_obstacle_m=float("inf"),
-        plan_staleness_ms=float("nan"),
-        peers=0,
-        rejected=0,
-        plan_status=PlanStatus.OK,
-        slack_m=0.0,
-        residual_m=0.0,
-        iterations=25,
-        solve_ms=1.0,
-        tick_ms=2.0,
-        deadline_misses=0,
-        plan_pos_ned_m=np.zeros((26, 3)),
-    )
+    return tick_record(t_us=seq * 20_000, utc_us=1_780_000_000_000_000 + seq * 20_000, seq=seq)
 
 
 def test_round_trip(tmp_path: Path) -> None:
@@ -67,7 +35,7 @@ def test_round_trip(tmp_path: Path) -> None:
     assert recorder.lost == 0
     rows = load_run(tmp_path).ticks[2]
     assert rows["seq"].tolist() == list(range(100))
-    assert rows["pos_ned_m"][7].tolist() == [1.0, 2.0, 3.0]
+    assert rows["pos_ned_m"][7].tolist() == [1.1, -2.2, -3.3]
     stamp = (1_780_000_000_000_000).to_bytes(8, "big")
     assert (tmp_path / "agent-2.tlog").read_bytes() == stamp + b"\xfdframe"
     (event,) = [json.loads(line) for line in (tmp_path / "agent-2.events.jsonl").read_text().splitlines()]

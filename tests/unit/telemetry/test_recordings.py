@@ -13,8 +13,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from swarmctl import __version__
 from swarmctl.core.frames import euler_from_quat, quat_from_euler
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
+from swarmctl.core.tick_record import COLUMNS
 from swarmctl.core.types import Mode, Phase
 from swarmctl.errors import StartError
 from swarmctl.telemetry.attitude import roll_pitch_rad
@@ -50,13 +52,20 @@ def test_offline_recording_holds_the_run_and_can_be_packed(tmp_path: Path) -> No
     assert optimize_recording(tmp_path)
     rows: dict[str, int] = {}
     distances: list[float] = []
+    versions: list[list[str]] = []
     for chunk in RrdReader(str(path)).stream():
         batch: Any = chunk.to_record_batch()
         rows[str(chunk.entity_path)] = rows.get(str(chunk.entity_path), 0) + batch.num_rows
+        if str(chunk.entity_path) == "/__properties/swarmctl":
+            versions += batch.column("version").to_pylist()
         if str(chunk.entity_path) == "/plot/separation/min" and not chunk.is_static:
             distances += [value[0] for value in batch.column("Scalars:scalars").to_pylist()]
     assert rows["/world/agent/0"] == rows["/world/agent/1"] == 120
     assert "/world/obstacles/body" in rows
+    shown = {f"/{column.entity.format(agent)}" for column in COLUMNS if column.entity for agent in range(2)}
+    assert len(shown) > 10
+    assert shown - rows.keys() == set()
+    assert versions == [[__version__]]
     assert len(distances) == 120
     assert set(distances) == {1.0}
 

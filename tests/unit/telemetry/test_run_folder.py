@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from html.parser import HTMLParser
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 from numpy.typing import NDArray
 
+from swarmctl import __version__
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
+from swarmctl.core.tick_record import COLUMNS
 from swarmctl.core.types import Mode, Phase
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.telemetry.charts import thin
@@ -97,6 +101,72 @@ def test_parquet_gives_back_every_column(tmp_path: Path) -> None:
         np.testing.assert_array_equal(again[name], rows[name], err_msg=name)
 
 
+def test_parquet_says_unit_meaning_and_version(tmp_path: Path) -> None:
+    write_parquet(tmp_path / "agent-1.parquet", flight(1, 3, 6.0)[0])
+    schema = pq.read_schema(tmp_path / "agent-1.parquet")
+    assert schema.metadata[b"swarmctl_version"].decode() == __version__
+    told = schema.field("ref_pos_ned_m_y").metadata
+    assert told == {b"unit": b"m", b"description": b"the mission's reference now", b"entity": b"world/reference"}
+    assert [field.name for field in schema] == [part for column in COLUMNS for part in column.parts]
+    assert all(field.metadata[b"description"] for field in schema)
+
+
+def rewrite(path: Path, keep: Callable[[str], str]) -> None:
+    """Rename the columns of a recording; those that `keep` gives no name are left out."""
+    table = pq.read_table(path)
+    names = {name: keep(name) for name in table.column_names if keep(name)}
+    renamed = table.select(list(names)).rename_columns(list(names.values()))
+    pq.write_table(renamed.replace_schema_metadata(table.schema.metadata), path)
+
+
+def test_what_an_older_recording_lacks_is_no_zero(tmp_path: Path) -> None:
+    path, (rows, _) = tmp_path / "agent-1.parquet", flight(1, 3, 6.0)
+    write_parquet(path, rows)
+    rewrite(path, lambda name: "" if name.startswith(("vel_ned_m_s", "solve_ms")) else name)
+    old = read_parquet(path)
+    assert np.isnan(old["vel_ned_m_s"]).all()
+    assert np.isnan(old["solve_ms"]).all()
+    np.testing.assert_array_equal(old["pos_ned_m"], rows["pos_ned_m"])
+    rewrite(path, lambda name: "" if name == "phase" else name)
+    with pytest.raises(ConfigError, match=f"column phase is missing .written by swarmctl {__version__}"):
+        read_parquet(path)
+
+
+@pytest.mark.parametrize("more", ["<f4", "u1", "<f8"])
+def test_raw_rows_of_another_layout_are_refused(tmp_path: Path, more: str) -> None:
+    rows, _ = flight(0, 1, 6.0)
+    other = np.zeros(len(rows), np.dtype([*((name, rows.dtype[name]) for name in rows.dtype.names or ()), ("x", more)]))
+    for name in rows.dtype.names or ():
+        other[name] = rows[name]
+    other.tofile(tmp_path / "agent-0.ticks")
+    with pytest.raises(ConfigError, match="or raw rows of another version"):
+        load_run(tmp_path)
+
+
+# Columns of the first recordings: what was added later must be readable without.
+FIRST = {"t_us", "utc_us", "seq", "mission_t_s", "phase", "mode", "flight_mode", "armed", "state_age_ms", "pos_ned_m"}
+FIRST |= {"vel_ned_m_s", "q_nb", "ref_pos_ned_m", "setpoint_q_nb", "setpoint_thrust_01", "hover_thrust_01", "peers"}
+FIRST |= {"disturbance_ned_m_s2", "nearest_peer_m", "nearest_obstacle_m", "path_age_ms", "rejected", "plan_status"}
+FIRST |= {"slack_m", "residual_m", "iterations", "solve_ms", "tick_ms", "late_ticks"}
+
+
+def test_the_first_recordings_stay_readable(tmp_path: Path) -> None:
+    path, (rows, _) = tmp_path / "agent-1.parquet", flight(1, 3, 6.0)
+    rows["deadline_misses"] = np.arange(len(rows))
+    rows["safety_filter_acted"] = 1
+    write_parquet(path, rows)
+    old_names = {column.name: column.formerly or column.name for column in COLUMNS}
+    first = {p: p.replace(c.name, old_names[c.name]) for c in COLUMNS for p in c.parts if old_names[c.name] in FIRST}
+    rewrite(path, lambda name: first.get(name, ""))
+    old = read_parquet(path)
+    for column in COLUMNS:
+        if old_names[column.name] in FIRST:
+            np.testing.assert_array_equal(old[column.name], rows[column.name], err_msg=column.name)
+        elif column.absent is None:
+            assert np.isnan(old[column.name]).all(), column.name
+    assert not old["safety_filter_acted"].any(), "they were flown without the filter"
+
+
 def test_partial_rows_and_lines_are_ignored(tmp_path: Path) -> None:
     write_run(tmp_path, 2, 5.0)
     whole = load_run(tmp_path)
@@ -120,6 +190,7 @@ def test_finished_run_is_complete_and_may_be_finished_again(tmp_path: Path) -> N
     summary, unwritten = finish_run(tmp_path, RULES, Outcome(outcome="completed", events=own))
     assert unwritten == ()
     assert summary["outcome"] == "completed", summary["violations"]
+    assert summary["version"] == __version__
     assert summary["tracking"]["index_m"] == pytest.approx(3 * 0.6)
     assert summary["separation"]["min_m"] == pytest.approx(0.6 * np.sqrt(3))
     names = {path.name for path in tmp_path.iterdir()}
@@ -184,6 +255,20 @@ def test_report_is_small_well_formed_and_self_contained(tmp_path: Path, agents: 
     assert "one <script>alert(1)</script> problem" in page.text
     assert 'name = "x<y"' in page.text
     assert page.tags.count("svg") >= 10
+    assert f"Judged by swarmctl {__version__}." in page.text
+
+
+def test_report_tells_the_version_that_judged_the_run(tmp_path: Path) -> None:
+    write_run(tmp_path, 3, 6.0)
+    summary, _ = finish_run(tmp_path, RULES, Outcome(outcome="completed"))
+    for version, told in (
+        ("0.0.7<b>", "Judged by swarmctl 0.0.7&lt;b&gt;."),
+        (None, "Judged by swarmctl of unknown version."),
+    ):
+        stored = {key: value for key, value in summary.items() if key != "version"}
+        stored |= {} if version is None else {"version": version}
+        (tmp_path / "summary.json").write_text(json.dumps(stored))
+        assert told in report_run(tmp_path, RULES).read_text()
 
 
 def test_report_of_an_empty_run(tmp_path: Path) -> None:

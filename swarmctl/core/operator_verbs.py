@@ -1,0 +1,71 @@
+"""The operator's verbs that agents obey, in one table.
+
+A row becomes a verb of the command line with its options (`swarmctl.ops.cli`), an order that may be on the bus with its
+arguments in bounds (`swarmctl.bus.topics`), and an entry of the handlers in `control.phases.state_machine`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VerbArgument:
+    """Describes one number that an order carries, from `least` to `most`."""
+
+    name: str  # in messages, with the unit: height_m
+    option: str  # on the command line: --height
+    help: str
+    least: float
+    most: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OperatorVerb:
+    """Describes one verb; outside of `phases` an agent ignores it."""
+
+    help: str
+    phases: frozenset[str]  # names of `Phase`, because the command line must not wait for numpy
+    arguments: tuple[VerbArgument, ...] = ()
+    is_stop: bool = False  # kept until a vehicle state is known to begin it from
+    never_superseded: bool = False  # obeyed though a newer order came before it
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """Holds one order: a verb of `OPERATOR_VERBS` and its arguments by name."""
+
+    verb: str
+    arguments: Mapping[str, float] = field(default_factory=dict)
+
+
+_BEFORE_LANDING = frozenset({"CONNECT", "STANDBY", "ARM", "TAKEOFF", "GOTO_START", "READY", "TRACK", "GOTO_LAND"})
+
+OPERATOR_VERBS = {
+    "hold": OperatorVerb(help="Brake and hold position.", phases=frozenset({"TRACK"})),
+    "resume": OperatorVerb(help="Resume the mission after `hold`.", phases=_BEFORE_LANDING),
+    "land": OperatorVerb(
+        help="Separate, then land.", phases=_BEFORE_LANDING, is_stop=True, never_superseded=True
+    ),  # a stamp a little in the future must not delay a landing
+    "rtl": OperatorVerb(
+        help="Fly back to the start under the agent's own MPC, then land. The autopilot's return mode is not used.",
+        phases=_BEFORE_LANDING,
+        is_stop=True,
+    ),
+}
+
+
+def order_problem(verb: str, arguments: Mapping[str, float]) -> str:
+    """Return why this is no order, or ""."""
+    known = OPERATOR_VERBS.get(verb)
+    if known is None:
+        return f"{verb!r} is no verb; known are {', '.join(OPERATOR_VERBS)}"
+    if arguments.keys() != {argument.name for argument in known.arguments}:
+        return f"{verb} takes {', '.join(argument.name for argument in known.arguments) or 'no arguments'}"
+    for argument in known.arguments:
+        value = arguments[argument.name]
+        if not (math.isfinite(value) and argument.least <= value <= argument.most):
+            return f"{argument.name} {value:g}: allowed: {argument.least:g} to {argument.most:g}"
+    return ""
