@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.world import SitlParams, SitlWorld
+from sitl.world import SitlWorld
 from swarmctl.agent.agent import Agent
 from swarmctl.agent.assembly import make_agent
 from swarmctl.bus import topics
@@ -115,7 +115,7 @@ class Lockstep:
             raise ValueError(f"sitl.physics_hz: {config.sitl.physics_hz} must be a multiple of agent.rate_hz")
         latency_us = round(config.sitl.link_latency_ms * 1000)
         self.links = [pipe_pair(self.clock.now_us, latency_us) for _ in range(agents)]  # (agent's, vehicle's) ends
-        self.world = SitlWorld(sitl_params(config), [vehicle for _, vehicle in self.links])
+        self.world = SitlWorld(config.simulator(), [vehicle for _, vehicle in self.links])
         self.hub = LocalHub(self.clock.now_us, config.seed, round(config.bus.delay_ms * 1000), config.bus.loss_01)
         self.logs = [FlightLog(directory=directory, agent=i, clock=self.clock) for i in range(agents)]
         self.fault_events: list[dict[str, Any]] = []
@@ -220,31 +220,6 @@ class Lockstep:
 def write_events(path: Path, events: Sequence[dict[str, Any]]) -> None:
     """Write one JSON object per line, as live processes log them."""
     path.write_bytes(b"".join(msgspec.json.encode(event) + b"\n" for event in events))
-
-
-def sitl_params(config: Config) -> SitlParams:
-    """Return the simulator parameters of a configuration."""
-    spawn = np.array(config.starts_ned_m())
-    if config.sitl.start == "ground":
-        spawn[:, 2] = config.sitl.ground_z_m
-    return SitlParams(
-        vehicles=config.swarm.agents,
-        spawn_ned_m=spawn,
-        preset=config.sitl.preset,
-        attitude_gains=config.sitl.attitude_gains,
-        origin_lat_deg=config.swarm.origin_lat_deg,
-        origin_lon_deg=config.swarm.origin_lon_deg,
-        origin_alt_m=config.swarm.origin_alt_m,
-        seed=config.seed,
-        physics_hz=config.sitl.physics_hz,
-        mass_scale=config.sitl.mass_scale,
-        start=config.sitl.start,
-        ekf_ready_s=config.sitl.ekf_ready_s,
-        estimator=config.sitl.estimator,
-        autopilot_kind=config.sitl.autopilot_kind,
-        reject_bad_setpoints=config.sitl.reject_bad_setpoints,
-        realism=config.sitl.realism(),
-    )
 
 
 def obstacles_message(config: Config) -> topics.ObstaclesMessage:

@@ -10,7 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarmctl.bus.topics import MAX_OBSTACLES
-from swarmctl.config import _RENAMED, Config, _all_keys, dump, load
+from swarmctl.config import _RENAMED, Config, dump, load
+from swarmctl.config_problems import all_keys
 from swarmctl.errors import EXIT_USAGE, ConfigError
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.toml"))
@@ -307,4 +308,4 @@ def test_a_key_that_was_renamed_is_refused_with_its_new_name(old: str, new: str)
     with pytest.raises(ConfigError) as error:
         load(None, [f"{old}.enabled=1" if section else f"{old}=1"])
     assert f"did you mean {new!r}?" in str(error.value)
-    assert new in set(_all_keys(Config, ""))
+    assert new in set(all_keys(Config, ""))
