@@ -26,6 +26,7 @@ from swarmctl.bus import topics
 from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.config import Config
 from swarmctl.core.clock import SimClock
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE, tick_row
 from swarmctl.core.types import TickRecord
 from swarmctl.kernels import why_not_repeatable
@@ -129,7 +130,7 @@ class Lockstep:
         self._steps = 0
         self._order = list(order) if order is not None else list(range(agents))
         self._truth: list[NDArray[np.void]] = []
-        self._obstacles = obstacles_message(config)
+        self._obstacles = topics.ObstaclesMessage(1, config.obstacles)
 
     def _on_fault(self, name: str, t_us: int, fields: dict[str, Any]) -> None:
         stamp = {"utc_us": self.clock.utc_us(), "t_us": self.clock.now_us(), "source": "sitl", "event": name}
@@ -179,7 +180,7 @@ class Lockstep:
         message = topics.CommandMessage(verb, agent, self.clock.utc_us())
         self._operator.publish(topics.COMMAND, topics.encode_message(message))
 
-    def set_obstacles(self, obstacles: Sequence[topics.ObstacleMessage]) -> None:
+    def set_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
         """Replace the obstacle list, as an operator's verb does."""
         self._obstacles = topics.ObstaclesMessage(self._obstacles.version + 1, tuple(obstacles))
         self._operator.publish(topics.OBSTACLES, topics.encode_message(self._obstacles))
@@ -220,8 +221,3 @@ class Lockstep:
 def write_events(path: Path, events: Sequence[dict[str, Any]]) -> None:
     """Write one JSON object per line, as live processes log them."""
     path.write_bytes(b"".join(msgspec.json.encode(event) + b"\n" for event in events))
-
-
-def obstacles_message(config: Config) -> topics.ObstaclesMessage:
-    """Return the message that publishes the configured obstacles."""
-    return topics.first_obstacles(o.model_dump() for o in config.obstacles)

@@ -16,19 +16,20 @@ import tomli_w
 from pydantic import Field
 
 from swarmctl.agent.setup import AgentParams
-from swarmctl.bus.topics import MAX_OBSTACLE_M, MAX_OBSTACLES
+from swarmctl.bus.topics import MAX_OBSTACLES
 from swarmctl.config_problems import validated
 from swarmctl.config_source import override, read_tree
 from swarmctl.control.collision.separation import SeparationParams, radius_problem
 from swarmctl.control.controller import ControllerParams
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.reference.mission import MissionParams
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.params import Params, Vec3
 from swarmctl.errors import ConfigError
 from swarmctl.mavlink.parameter_names import parameter_problems
 from swarmctl.mavlink.transport import Endpoint, parse_url
 from swarmctl.simulator_config import MAX_VEHICLES, OriginParams, SimulatorConfig, SimulatorParams
-from swarmctl.telemetry.referee import ObstacleRule, Rules
+from swarmctl.telemetry.referee import Rules
 
 MAX_AGENTS = MAX_VEHICLES
 _PAIRS_SHOWN = 3
@@ -91,17 +92,6 @@ class TelemetryParams(Params):
     rate_hz: float = Field(10.0, gt=0, le=50)  # updates of the view per agent
 
 
-class ObstacleParams(Params):
-    """A sphere, or a vertical column of any height, visible to agents only from closer than `visibility_m`."""
-
-    center_ned_m: Vec3
-    column: bool = False  # true: of any height
-    radius_m: float = Field(1.0, gt=0, le=1000)  # the obstacle itself, which the safety filter keeps clear of
-    keep_out_m: float = Field(1.75, gt=0, le=1000)  # constraint radius from the centre, thesis 1 + 2.5 x 0.3
-    visibility_m: float = Field(3.0, gt=0, le=10000)  # agents farther from the centre do not see it
-    vel_ned_m_s: Vec3 = (0.0, 0.0, 0.0)
-
-
 class LimitParams(Params):
     """Limits beyond which the referee counts a violation."""
 
@@ -126,7 +116,7 @@ class Config(Params):
     sitl: SitlParams = SitlParams()
     bus: BusParams = BusParams()
     telemetry: TelemetryParams = TelemetryParams()
-    obstacles: tuple[ObstacleParams, ...] = Field((), strict=False)
+    obstacles: tuple[Obstacle, ...] = Field((), strict=False)
     limits: LimitParams = LimitParams()
 
     def starts_ned_m(self) -> tuple[tuple[float, float, float], ...]:
@@ -169,9 +159,7 @@ class Config(Params):
         return Rules(
             agents=self.swarm.agents,
             required_separation_m=self.limits.min_separation_m,
-            obstacles=tuple(
-                ObstacleRule(o.center_ned_m, o.keep_out_m, o.vel_ned_m_s, column=o.column) for o in self.obstacles
-            ),
+            obstacles=dict.fromkeys(self.obstacles),
             obstacle_margin_m=self.limits.obstacle_margin_m,
             deadline_misses_01=self.limits.deadline_misses_01,
             mode=mode,
@@ -222,7 +210,8 @@ def _whole(config: Config) -> Iterator[str]:
         except ConfigError as error:
             yield from (f"sitl.{problem}" for problem in error.problems)
     yield from _vehicle_problems(config)
-    yield from _obstacle_problems(config)
+    if len(config.obstacles) > MAX_OBSTACLES:
+        yield f"obstacles: {len(config.obstacles)} are listed, agents keep {MAX_OBSTACLES} at most"
     yield from parameter_problems(config.agent.autopilot_params)
     if config.sitl.speed != 1.0:
         yield (
@@ -237,17 +226,6 @@ def _whole(config: Config) -> Iterator[str]:
             f"limits.min_separation_m = {config.limits.min_separation_m}: larger than separation.radius_m = "
             f"{config.separation.radius_m}; agents would be judged by more than they keep. Lower it or raise the radius"
         )
-
-
-def _obstacle_problems(config: Config) -> Iterator[str]:
-    """Yield problems with obstacles that agents would refuse as messages."""
-    if len(config.obstacles) > MAX_OBSTACLES:
-        yield f"obstacles: {len(config.obstacles)} are listed, agents keep {MAX_OBSTACLES} at most"
-        return
-    for number, obstacle in enumerate(config.obstacles):
-        for key, vector in (("center_ned_m", obstacle.center_ned_m), ("vel_ned_m_s", obstacle.vel_ned_m_s)):
-            if max(map(abs, vector)) > MAX_OBSTACLE_M:
-                yield f"obstacles.{number}.{key} = {vector}: every number must be within {MAX_OBSTACLE_M:g}"
 
 
 def _starts_apart(config: Config) -> Iterator[str]:

@@ -7,7 +7,6 @@ Every child has its own session, so that Ctrl-C in the terminal reaches the laun
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import secrets
 import signal
@@ -23,6 +22,7 @@ import numpy as np
 import psutil
 
 from swarmctl.bus.peers import agent_name
+from swarmctl.bus.topics import ObstaclesMessage, encode_message
 from swarmctl.bus.zenoh_bus import socket_file
 from swarmctl.config import Config
 from swarmctl.control.reference.mission import MissionReference
@@ -118,8 +118,8 @@ def viewer_command(config: Config, context: RunContext, port: int, view: bool) -
     argv += ("--look-at", *(f"{c:.3f}" for c in center), "--extent", f"{extent_m:.3f}")
     argv += ("--rate-hz", f"{config.telemetry.rate_hz!r}", "--separation", f"{config.separation.radius_m!r}")
     argv += ("--limit", f"{config.limits.min_separation_m!r}")
-    obstacles = [obstacle.model_dump() for obstacle in config.obstacles]
-    argv += ("--obstacles-json", json.dumps(obstacles), "--die-with-parent")
+    obstacles = encode_message(ObstaclesMessage(1, config.obstacles)).decode()
+    argv += ("--obstacles-json", obstacles, "--die-with-parent")
     return Command(VIEWER, argv + (("--view",) if view else ()))
 
 

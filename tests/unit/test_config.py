@@ -294,8 +294,11 @@ def test_obstacles_that_agents_would_refuse_are_refused(tmp_path: Path) -> None:
     for text, problem in (
         (ball * (MAX_OBSTACLES + 1), f"obstacles: 65 are listed, agents keep {MAX_OBSTACLES} at most"),
         (ball * 20_000, f"obstacles: 20000 are listed, agents keep {MAX_OBSTACLES} at most"),
-        (ball.replace("-3", "-30000.0"), r"obstacles.0.center_ned_m .* within 10000"),
-        (ball + "vel_ned_m_s = [0.0, 1e5, 0.0]\n", r"obstacles.0.vel_ned_m_s .* within 10000"),
+        (ball.replace("-3", "-30000.0"), r"obstacles.0.center_ned_m.2 = -30000.0: .* greater than or equal to -10000"),
+        (
+            ball + "vel_ned_m_s = [0.0, 1e5, 0.0]\n",
+            r"obstacles.0.vel_ned_m_s.1 = 100000.0: .* or equal to 10000",
+        ),
     ):
         path.write_text(text)
         with pytest.raises(ConfigError, match=problem):

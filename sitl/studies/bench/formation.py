@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from sitl.lockstep import obstacles_message
 from sitl.world import SitlWorld
 from swarmctl.agent.assembly import make_agent
 from swarmctl.agent.telemetry_publisher import TickTiming
@@ -201,7 +200,9 @@ class Formation:
             if now_us % _STATUS_EVERY_US == 0:
                 bus.publish(topics.STATUS, topics.encode_message(self._status(i + 1, began_s >= 0.0)))
         if now_us % _OBSTACLES_EVERY_US == 0:
-            self._operator.publish(topics.OBSTACLES, topics.encode_message(obstacles_message(self._config)))
+            self._operator.publish(
+                topics.OBSTACLES, topics.encode_message(topics.ObstaclesMessage(1, self._config.obstacles))
+            )
 
     def _status(self, agent: int, tracking: bool) -> topics.StatusMessage:
         phase = Phase.TRACK if tracking else Phase.READY

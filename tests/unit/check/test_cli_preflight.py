@@ -143,7 +143,7 @@ def test_command_lines_say_what_the_configuration_says(tmp_path: Path) -> None:
         sock.close()
     viewer = viewer_command(config, context, 9876, view=False).argv
     assert "--view" not in viewer
-    assert viewer[viewer.index("--obstacles-json") + 1] == "[]"
+    assert viewer[viewer.index("--obstacles-json") + 1] == '{"version":1,"obstacles":[]}'
 
 
 def status(phase: int = Phase.TRACK, separation_m: float = 1.25, active_alert: str = "") -> StatusMessage:
