@@ -147,7 +147,7 @@ class OriginParams(Params):
     """Describes the origin of the shared NED frame."""
 
     origin_lat_deg: float = Field(47.397742, ge=-89.9, le=89.9)  # shared origin of all positions in the configuration
-    origin_lon_deg: float = Field(8.545594, ge=-180, le=180)
+    origin_lon_deg: float = Field(8.545594, ge=-180, le=180)  # longitude of the same point
     origin_alt_m: float = Field(489.4, ge=-500, le=9000)  # above mean sea level
 
 
