@@ -4,6 +4,9 @@ Vehicle i listens on 127.0.0.1:(local-port + i) and sends to 127.0.0.1:(port + i
 then on it sends to that sender only, but obeys every sender, as PX4 does. With `--remote-ports` it obeys only those.
 With `--gcs-port` each vehicle has a second link to a ground station there, from 127.0.0.1:(18570 + i). With
 `--tcp-port` it serves one client on TCP (tcp-port + 10 i) instead, as ArduCopter's own simulator does.
+
+Every single-valued key of `SimulatorConfig` is an option; `--set` reaches the others. Both are read and refused as
+`--set` of a run's configuration is.
 """
 
 from __future__ import annotations
@@ -11,27 +14,26 @@ from __future__ import annotations
 import argparse
 import gc
 import json
-import math
 import signal
 import socket
 import sys
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, NoReturn
+from typing import TYPE_CHECKING, Any, NoReturn, get_args
 
-from sitl.plant.attitude import THESIS_GAINS
-from swarmctl.errors import EXIT_OK, EXIT_USAGE, SwarmError
+from swarmctl.config_problems import validated
+from swarmctl.config_source import override
+from swarmctl.errors import EXIT_OK, EXIT_USAGE, ConfigError, SwarmError
+from swarmctl.simulator_config import SimulatorConfig
 
 if TYPE_CHECKING:
     from sitl.realtime import LoopStatistics
-    from sitl.world import SitlParams, SitlWorld
-    from swarmctl.core.simulated import RealismParams
+    from sitl.world import SitlWorld
     from swarmctl.mavlink.transport import Transport
 
 
-_SET_HELP = "wind, battery, rotors, faults as under [sitl] of a configuration, such as wind.turbulence_m_s=5"
-
+_SET_HELP = "a key of [sitl] of a configuration, such as wind.turbulence_m_s=5, or spawn_ned_m=[[0, 1, 0]]"
 GCS_LOCAL_PORT = 18570  # of the first vehicle, as in PX4
 
 
@@ -53,41 +55,6 @@ def _integer(low: int, high: int) -> Callable[[str], int]:
     return parse
 
 
-def _real(low: float, high: float) -> Callable[[str], float]:
-    def parse(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            value = math.nan
-        if not low <= value <= high:
-            raise argparse.ArgumentTypeError(f"{text!r}: allowed: a number {low:g} to {high:g}")
-        return value
-
-    return parse
-
-
-def _triple(text: str, form: str) -> tuple[float, float, float]:
-    try:
-        a, b, c = (float(part) for part in text.split(","))
-    except ValueError as error:
-        raise argparse.ArgumentTypeError(f"{text!r}: allowed: {form}") from error
-    if not all(math.isfinite(v) for v in (a, b, c)):
-        raise argparse.ArgumentTypeError(f"{text!r}: allowed: finite numbers, as {form}")
-    return a, b, c
-
-
-def _origin(text: str) -> tuple[float, float, float]:
-    return _triple(text, "LAT,LON,ALT in degrees and metres")
-
-
-def _wind(text: str) -> tuple[float, float, float]:
-    return _triple(text, "N,E,D in m/s")
-
-
-def _spawns(text: str) -> list[tuple[float, float, float]]:
-    return [_triple(part, '"x,y,z;x,y,z" in NED metres, one for each vehicle') for part in text.split(";")]
-
-
 def _ports(text: str) -> list[int]:
     parse = _integer(1, 65535)
     return [parse(part) for part in text.split(",")]
@@ -98,40 +65,19 @@ def _parser() -> argparse.ArgumentParser:
         prog="python -m sitl", description="PX4-like (or ArduCopter-like) multirotor simulator on loopback."
     )
     add = parser.add_argument
-    add("--vehicles", type=_integer(1, 100), default=3, metavar="N")
-    add(
-        "--preset",
-        choices=("thesis", "x500", "crazyflie", "arducopter"),
-        default="thesis",
-        help="airframe and attitude loop",
-    )
-    add("--attitude-gains", choices=tuple(THESIS_GAINS), default="swarm", help="attitude PIDs of the thesis airframe")
-    add("--estimator", choices=("exact", "gps", "external"), default="exact", help="errors of the vehicles' estimates")
-    add("--autopilot", choices=("px4", "arducopter"), default="px4", help="autopilot that the vehicles imitate")
-    add("--spawn", type=_spawns, metavar='"x,y,z;..."', help="NED metres; default: a line along x, 1 m apart")
-    add("--origin", type=_origin, default=(47.397742, 8.545594, 489.4), metavar="LAT,LON,ALT", help="shared origin")
+    for key in _option_keys():
+        add("--" + key.replace("_", "-"), dest=f"key.{key}", metavar="X", help=_option_help(key))
+    add("--set", action="append", default=[], dest="sets", metavar="KEY=VALUE", help=_SET_HELP)
+    add("--config-json", default="{}", metavar="JSON", help="all keys, as a launch gives them")
     add("--port", type=_integer(1, 65535), default=14540, help="first vehicle sends here until it receives")
     add("--local-port", type=_integer(1, 65535), default=14580, help="first vehicle listens here")
     add("--local-fds", type=_ports, metavar="FD,...", help="inherited, bound UDP sockets instead, one for each vehicle")
-    add("--gcs-port", type=_integer(0, 65535), default=0, help="second link of every vehicle to here; 0: none")
-    add("--accept-bad-setpoints", action="store_true", help="NaN and zero quaternions do what they do to PX4 1.18")
     add("--remote-ports", type=_ports, default=[], metavar="P0,P1,..", help="fixed destinations instead of --port")
     add(
         "--tcp-port", type=_integer(1, 65535), metavar="P", help="serve TCP on P, P+10, .. instead of UDP: 5760 as SITL"
     )
-    add("--seed", type=_integer(0, 2**31 - 1), default=1)
-    add("--physics-hz", type=_integer(50, 1000), default=250)
-    add("--mass-scale", type=_real(0.3, 1.9), default=1.0, help="true mass over the airframe's nominal one")
-    add("--start", choices=("ground", "air"), default="ground", help="air: clamped at the spawn pose until OFFBOARD")
     add("--truth", type=Path, metavar="FILE", help="append true states, 50 Hz, raw TRUTH_DTYPE rows")
-    add("--sysid-base", type=_integer(1, 255), default=1)
-    add("--ekf-ready", type=_real(0, 60), default=1.0, metavar="S", help="armable this long after start; PX4 takes 4")
-    add("--speed", type=_real(0.1, 100), default=1.0, metavar="X", help="simulated over wall time; timeouts stay wall")
     add("--lockstep", action="store_true", help="physics waits for a setpoint every 20 ms of each vehicle in OFFBOARD")
-    add("--wind", dest="mean_wind", type=_wind, metavar="N,E,D", help="mean wind, m/s NED; see also --set")
-    add("--turbulence", type=_real(0, 30), metavar="M/S", help="Dryden: wind at 6 m height; light is 7.7")
-    add("--set", action="append", default=[], dest="sets", metavar="KEY=VALUE", help=_SET_HELP)
-    add("--realism-json", metavar="JSON", help="all of wind, battery, rotors and faults, as a launch gives them")
     add("--control", type=Path, metavar="SOCKET", help="take faults here; see swarmctl fault")
     add("--events", type=Path, metavar="FILE", help="append faults as JSON lines")
     add("--stats", type=Path, metavar="FILE", help="write what the loop has done at the end, as JSON")
@@ -139,20 +85,21 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _joined(arguments: list[str]) -> list[str]:
-    """Join `--spawn -1,0,0` to `--spawn=-1,0,0`: argparse takes a value that begins with a minus for an option."""
-    joined: list[str] = []
-    for argument in arguments:
-        if joined and joined[-1] in ("--spawn", "--origin", "--wind"):
-            joined[-1] += f"={argument}"
-        else:
-            joined.append(argument)
-    return joined
+def _option_keys() -> list[str]:
+    """Return the keys of a simulation that have one value."""
+    fields = SimulatorConfig.model_fields
+    return [key for key, field in fields.items() if isinstance(field.default, (bool, int, float, str))]
+
+
+def _option_help(key: str) -> str:
+    field = SimulatorConfig.model_fields[key]
+    allowed = " | ".join(map(str, get_args(field.annotation)))
+    return f"{allowed + '; ' if allowed else ''}default {str(field.default).lower()}"
 
 
 def main(arguments: list[str] | None = None) -> int:
     """Run the simulator and return the process exit code."""
-    options = _parser().parse_args(_joined(sys.argv[1:] if arguments is None else arguments))
+    options = _parser().parse_args(arguments)
     if options.die_with_parent:
         from swarmctl.process_lifetime import die_with_parent
 
@@ -164,89 +111,50 @@ def main(arguments: list[str] | None = None) -> int:
         return error.exit_code
 
 
-def _params(options: argparse.Namespace) -> SitlParams:
-    import numpy as np
+def _config(options: argparse.Namespace) -> SimulatorConfig:
+    """Return the simulation that the command line describes.
 
-    from sitl.world import SitlParams, line_of_spawns
-
-    spawns = np.array(options.spawn) if options.spawn else line_of_spawns(options.vehicles)
-    lat_deg, lon_deg, alt_m = options.origin
-    return SitlParams(
-        vehicles=options.vehicles,
-        spawn_ned_m=spawns,
-        preset=options.preset,
-        attitude_gains=options.attitude_gains,
-        origin_lat_deg=lat_deg,
-        origin_lon_deg=lon_deg,
-        origin_alt_m=alt_m,
-        seed=options.seed,
-        physics_hz=options.physics_hz,
-        mass_scale=options.mass_scale,
-        start=options.start,
-        ekf_ready_s=options.ekf_ready,
-        sysid_base=options.sysid_base,
-        estimator=options.estimator,
-        autopilot_kind=options.autopilot,
-        realism=_realism(options),
-        reject_bad_setpoints=not options.accept_bad_setpoints,
-    )
-
-
-def _realism(options: argparse.Namespace) -> RealismParams:
-    """Return wind, battery, rotors and faults, parsed and refused as in the configuration of a run."""
-    from swarmctl.core.simulated import RealismParams
-
-    if options.realism_json:
-        return RealismParams.model_validate_json(options.realism_json)
-    sets = [f"wind.mean_ned_m_s={list(options.mean_wind)}"] if options.mean_wind else []
-    sets += [f"wind.turbulence_m_s={options.turbulence!r}"] if options.turbulence is not None else []
-    sets += options.sets
-    if not sets:
-        return RealismParams()
-    from swarmctl.config import load
-
-    known = RealismParams.model_fields
-    strange = [f"set {item}: allowed: keys of {', '.join(known)}" for item in sets if _section(item) not in known]
-    if strange:
-        from swarmctl.errors import ConfigError
-
-        raise ConfigError("sitl", strange)
-    prefixed = [f"swarm.agents={options.vehicles}", *(f"sitl.{item}" for item in sets)]
-    return load(None, prefixed).sitl.realism()
-
-
-def _section(item: str) -> str:
-    return item.partition("=")[0].partition(".")[0].strip()
+    Raises:
+        ConfigError: it is impossible; lists all problems.
+    """
+    try:
+        tree: dict[str, Any] = json.loads(options.config_json)
+    except ValueError as error:
+        raise ConfigError("sitl", [f"config-json: {error}"]) from error
+    given = {key: getattr(options, f"key.{key}") for key in _option_keys()}
+    items = [f"{key}={text}" for key, text in given.items() if text is not None]
+    problems = [problem for item in (*items, *options.sets) for problem in override(tree, item)]
+    if problems:
+        raise ConfigError("sitl", problems)
+    return validated(SimulatorConfig, tree, "sitl")
 
 
 def _run(options: argparse.Namespace) -> int:
     from sitl import realtime
     from sitl.fault_socket import ControlSocket
     from sitl.world import SitlWorld
-    from swarmctl.errors import ConfigError
     from swarmctl.process_lifetime import StopRequest
     from swarmctl.telemetry.event_log import EventLog
 
-    params = _params(options)
-    count = params.vehicles
+    config = _config(options)
+    count = config.vehicles
     if options.remote_ports and len(options.remote_ports) != count:
         given = ",".join(str(p) for p in options.remote_ports)
         raise ConfigError("sitl", [f"remote-ports = {given}: allowed: one port for each of {count} vehicles"])
     stop = StopRequest(signal.SIGINT, signal.SIGTERM)
     truth = realtime.TruthFile(options.truth) if options.truth else None
-    links, places = _tcp_links(options) if options.tcp_port else _udp_links(options)
-    gcs_links, gcs_place = _gcs_links(options)
-    world = SitlWorld(params, links, gcs_links)
-    if options.speed != 1.0:
-        world.scale_timeouts(options.speed)
+    links, places = _tcp_links(options.tcp_port, count) if options.tcp_port else _udp_links(options, count)
+    gcs_links, gcs_place = _gcs_links(config)
+    world = SitlWorld(config, links, gcs_links)
+    if config.speed != 1.0:
+        world.scale_timeouts(config.speed)
     if options.events:
         log = EventLog(options.events, "sitl")
         world.faults.on_event = lambda name, since_boot_us, fields: log.write(
             name, since_boot_us=since_boot_us, **fields
         )
-    for i, place in enumerate(places):
-        x, y, z = params.spawn_ned_m[i]
-        print(f"vehicle sysid={params.sysid_base + i} {place} spawn={x:g},{y:g},{z:g}")
+    for i, (place, (x, y, z)) in enumerate(zip(places, config.spawns_ned_m(), strict=True)):
+        print(f"vehicle sysid={config.sysid_base + i} {place} spawn={x:g},{y:g},{z:g}")
     if gcs_place:
         print(gcs_place)
     sys.stdout.flush()
@@ -255,7 +163,7 @@ def _run(options: argparse.Namespace) -> int:
     try:
         gc.freeze()  # the garbage collector need not traverse start-up objects in flight
         gate = realtime.Gate(world) if options.lockstep else None
-        statistics = realtime.fly(world, stop, truth, speed=options.speed, control=control, gate=gate)
+        statistics = realtime.fly(world, stop, truth, speed=config.speed, control=control, gate=gate)
     finally:
         if control is not None:
             control.close()
@@ -268,15 +176,13 @@ def _run(options: argparse.Namespace) -> int:
     return EXIT_OK
 
 
-def _udp_links(options: argparse.Namespace) -> tuple[list[Transport], list[str]]:
+def _udp_links(options: argparse.Namespace, count: int) -> tuple[list[Transport], list[str]]:
     """Return the links of all vehicles, and their addresses."""
     from sitl import realtime
     from sitl.net.ports import OpenPort
-    from swarmctl.errors import ConfigError
     from swarmctl.mavlink.latch import nobody
     from swarmctl.mavlink.transport import UdpTransport
 
-    count = options.vehicles
     if options.local_fds and len(options.local_fds) != count:
         given = ",".join(str(fd) for fd in options.local_fds)
         raise ConfigError("sitl", [f"local-fds = {given}: allowed: one socket for each of {count} vehicles"])
@@ -298,27 +204,26 @@ def _udp_links(options: argparse.Namespace) -> tuple[list[Transport], list[str]]
     return [OpenPort(s, (realtime.HOST, r)) for s, r in pairs], places
 
 
-def _gcs_links(options: argparse.Namespace) -> tuple[list[Transport], str]:
+def _gcs_links(config: SimulatorConfig) -> tuple[list[Transport], str]:
     """Return the links to a ground station, and their addresses; none without a port for it."""
     from sitl import realtime
     from sitl.net.ports import OpenPort
-    from swarmctl.errors import ConfigError
 
-    if not options.gcs_port:
+    if not config.gcs_port:
         return [], ""
-    if options.autopilot != "px4":
-        raise ConfigError("sitl", [f"gcs-port = {options.gcs_port}: allowed: with --autopilot px4 only"])
-    sockets, _ = realtime.bind_range(GCS_LOCAL_PORT, options.vehicles)
+    if config.autopilot_kind != "px4":
+        raise ConfigError("sitl", [f"gcs_port = {config.gcs_port}: allowed: with autopilot_kind = px4 only"])
+    sockets, _ = realtime.bind_range(GCS_LOCAL_PORT, config.vehicles)
     first, last = sockets[0].getsockname()[1], sockets[-1].getsockname()[1]
-    place = f"ground station link: local={first}..{last} remote={options.gcs_port}"
-    return [OpenPort(s, (realtime.HOST, options.gcs_port)) for s in sockets], place
+    place = f"ground station link: local={first}..{last} remote={config.gcs_port}"
+    return [OpenPort(s, (realtime.HOST, config.gcs_port)) for s in sockets], place
 
 
-def _tcp_links(options: argparse.Namespace) -> tuple[list[Transport], list[str]]:
+def _tcp_links(port: int, count: int) -> tuple[list[Transport], list[str]]:
     from sitl.net.tcp import serve_tcp
     from sitl.realtime import HOST
 
-    servers = serve_tcp(HOST, options.tcp_port, options.vehicles)
+    servers = serve_tcp(HOST, port, count)
     return list(servers), [f"tcp={server.port}" for server in servers]
 
 

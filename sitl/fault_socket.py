@@ -16,9 +16,9 @@ from pydantic import ValidationError
 
 from sitl.world import SitlWorld
 from swarmctl.core.params import explained
-from swarmctl.core.simulated import FaultParams
 from swarmctl.errors import ConfigError
 from swarmctl.process_lifetime import remove_socket
+from swarmctl.simulator_config import FaultParams
 
 _LARGEST = 8192
 

@@ -16,7 +16,7 @@ from sitl.plant.estimator import Estimator
 from sitl.plant.physics import Physics
 from sitl.plant.vehicle import Array
 from sitl.plant.wind import Gust
-from swarmctl.core.simulated import EVERY_VEHICLE, FaultParams
+from swarmctl.simulator_config import EVERY_VEHICLE, FaultParams
 
 Undo = Callable[[], None]
 _NEVER_US = 1 << 62

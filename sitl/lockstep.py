@@ -19,13 +19,14 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from sitl.world import SitlParams, SitlWorld
+from sitl.world import SitlWorld
 from swarmctl.agent.agent import Agent
 from swarmctl.agent.assembly import make_agent
 from swarmctl.bus import topics
 from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.config import Config
 from swarmctl.core.clock import SimClock
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE, tick_row
 from swarmctl.core.tick_record import TickRecord
 from swarmctl.kernels import why_not_repeatable
@@ -115,7 +116,7 @@ class Lockstep:
             raise ValueError(f"sitl.physics_hz: {config.sitl.physics_hz} must be a multiple of agent.rate_hz")
         latency_us = round(config.sitl.link_latency_ms * 1000)
         self.links = [pipe_pair(self.clock.now_us, latency_us) for _ in range(agents)]  # (agent's, vehicle's) ends
-        self.world = SitlWorld(sitl_params(config), [vehicle for _, vehicle in self.links])
+        self.world = SitlWorld(config.simulator(), [vehicle for _, vehicle in self.links])
         self.hub = LocalHub(self.clock.now_us, config.seed, round(config.bus.delay_ms * 1000), config.bus.loss_01)
         self.logs = [FlightLog(directory=directory, agent=i, clock=self.clock) for i in range(agents)]
         self.fault_events: list[dict[str, Any]] = []
@@ -129,7 +130,7 @@ class Lockstep:
         self._steps = 0
         self._order = list(order) if order is not None else list(range(agents))
         self._truth: list[NDArray[np.void]] = []
-        self._obstacles = obstacles_message(config)
+        self._obstacles = topics.ObstaclesMessage(1, config.obstacles)
 
     def _on_fault(self, name: str, t_us: int, fields: dict[str, Any]) -> None:
         stamp = {"utc_us": self.clock.utc_us(), "t_us": self.clock.now_us(), "source": "sitl", "event": name}
@@ -179,7 +180,7 @@ class Lockstep:
         message = topics.CommandMessage(verb, agent, self.clock.utc_us(), arguments)
         self._operator.publish(topics.COMMAND, topics.encode_message(message))
 
-    def set_obstacles(self, obstacles: Sequence[topics.ObstacleMessage]) -> None:
+    def set_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
         """Replace the obstacle list, as an operator's verb does."""
         self._obstacles = topics.ObstaclesMessage(self._obstacles.version + 1, tuple(obstacles))
         self._operator.publish(topics.OBSTACLES, topics.encode_message(self._obstacles))
@@ -220,33 +221,3 @@ class Lockstep:
 def write_events(path: Path, events: Sequence[dict[str, Any]]) -> None:
     """Write one JSON object per line, as live processes log them."""
     path.write_bytes(b"".join(msgspec.json.encode(event) + b"\n" for event in events))
-
-
-def sitl_params(config: Config) -> SitlParams:
-    """Return the simulator parameters of a configuration."""
-    spawn = np.array(config.starts_ned_m())
-    if config.sitl.start == "ground":
-        spawn[:, 2] = config.sitl.ground_z_m
-    return SitlParams(
-        vehicles=config.swarm.agents,
-        spawn_ned_m=spawn,
-        preset=config.sitl.preset,
-        attitude_gains=config.sitl.attitude_gains,
-        origin_lat_deg=config.swarm.origin_lat_deg,
-        origin_lon_deg=config.swarm.origin_lon_deg,
-        origin_alt_m=config.swarm.origin_alt_m,
-        seed=config.seed,
-        physics_hz=config.sitl.physics_hz,
-        mass_scale=config.sitl.mass_scale,
-        start=config.sitl.start,
-        ekf_ready_s=config.sitl.ekf_ready_s,
-        estimator=config.sitl.estimator,
-        autopilot_kind=config.sitl.autopilot_kind,
-        reject_bad_setpoints=config.sitl.reject_bad_setpoints,
-        realism=config.sitl.realism(),
-    )
-
-
-def obstacles_message(config: Config) -> topics.ObstaclesMessage:
-    """Return the message that publishes the configured obstacles."""
-    return topics.first_obstacles(o.model_dump() for o in config.obstacles)

@@ -105,7 +105,7 @@ def _write_recording(config: Config, directory: Path) -> None:
         config.swarm.agents,
         config.separation.radius_m,
         config.limits.min_separation_m,
-        [obstacle.model_dump() for obstacle in config.obstacles],
+        config.obstacles,
     )
     optimize_recording(directory)
 

@@ -7,8 +7,7 @@ the same bytes give the same flight. Setpoints that have arrived by then act in 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
-from typing import Literal, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +15,12 @@ from numpy.typing import NDArray
 from sitl.faults import Faults
 from sitl.net.lossy import LossyLink
 from sitl.plant.airframes import PRESETS
-from sitl.plant.attitude import THESIS_GAINS, attitude_loop
+from sitl.plant.attitude import attitude_loop
 from sitl.plant.estimator import ESTIMATORS, Estimator
 from sitl.plant.imu import Imu
 from sitl.plant.physics import Physics, outfitted
 from sitl.plant.sensors import FULL, local_origin
-from sitl.plant.vehicle import Array, Plant
+from sitl.plant.vehicle import Plant
 from sitl.px4.autopilot import Autopilot
 from sitl.px4.link.endpoint import Endpoint
 from sitl.px4.link.schedule import GCS_HZ
@@ -30,15 +29,14 @@ from sitl.px4.navigator import IDLE, Navigator
 from sitl.px4.parameters import Parameters
 from sitl.vehicle_parts import Commander, MavlinkInterface
 from swarmctl.core.records import TRUTH_DTYPE
-from swarmctl.core.simulated import FaultParams, RealismParams
 from swarmctl.core.types import FlightMode, GeoOrigin
 from swarmctl.errors import ConfigError
 from swarmctl.mavlink.transport import Transport
+from swarmctl.simulator_config import FaultParams, SimulatorConfig
 
 AUTOPILOT_HZ = 50
 _SCALED_TIMEOUTS = ("COM_OF_LOSS_T", "COM_DL_LOSS_T", "COM_RC_LOSS_T")
 _LINK_PURPOSE, _GCS_LINK_PURPOSE = 3, 4  # purposes of random streams, beside run seed and vehicle
-MAX_VEHICLES = 100
 
 
 @runtime_checkable
@@ -58,72 +56,6 @@ class Rebooting(Protocol):
         """Restart as after power-up; `now_us` is on the clock of the simulation."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class SitlParams:
-    """Parameters of a simulation. `spawn_ned_m` (N, 3) is in the shared frame, whose origin the next three give."""
-
-    vehicles: int
-    spawn_ned_m: Array
-    preset: str = "thesis"
-    attitude_gains: str = "swarm"  # a key of sitl.plant.attitude.THESIS_GAINS
-    origin_lat_deg: float = 47.397742
-    origin_lon_deg: float = 8.545594
-    origin_alt_m: float = 489.4
-    seed: int = 1
-    physics_hz: int = 250
-    mass_scale: float = 1.0
-    start: Literal["ground", "air"] = "ground"
-    ekf_ready_s: float = 1.0  # PX4 takes 4 s
-    sysid_base: int = 1
-    estimator: str = "exact"  # a key of sitl.plant.estimator.ESTIMATORS
-    autopilot_kind: Literal["px4", "arducopter"] = "px4"
-    realism: RealismParams = field(default_factory=RealismParams)
-    reject_bad_setpoints: bool = True  # False: NaN and zero quaternions have the same effect as in PX4 1.18
-
-    def __post_init__(self) -> None:
-        problems = list(self._problems())
-        if problems:
-            raise ConfigError("sitl", problems)
-
-    def _problems(self) -> Iterator[str]:
-        ranges: tuple[tuple[str, float, float, float], ...] = (
-            ("vehicles", self.vehicles, 1, MAX_VEHICLES),
-            ("origin_lat_deg", self.origin_lat_deg, -89.9, 89.9),
-            ("origin_lon_deg", self.origin_lon_deg, -180, 180),
-            ("origin_alt_m", self.origin_alt_m, -500, 9000),
-            ("seed", self.seed, 0, 2**31 - 1),
-            ("physics_hz", self.physics_hz, 50, 1000),
-            ("mass_scale", self.mass_scale, 0.3, 1.9),
-            ("ekf_ready_s", self.ekf_ready_s, 0, 60),
-            ("sysid_base", self.sysid_base, 1, 256 - self.vehicles),
-        )
-        for key, value, low, high in ranges:
-            if not low <= value <= high:
-                yield f"{key} = {value}: allowed: {low} to {high}"
-        if self.preset not in PRESETS:
-            yield f"preset = {self.preset!r}: allowed: {', '.join(PRESETS)}"
-        if self.attitude_gains not in THESIS_GAINS:
-            yield f"attitude_gains = {self.attitude_gains!r}: allowed: {', '.join(THESIS_GAINS)}"
-        if self.estimator not in ESTIMATORS:
-            yield f"estimator = {self.estimator!r}: allowed: {', '.join(ESTIMATORS)}"
-        if self.autopilot_kind not in ("px4", "arducopter"):
-            yield f"autopilot_kind = {self.autopilot_kind!r}: allowed: px4, arducopter"
-        yield from self.realism.fault_problems(self.vehicles)
-        if self.start not in ("ground", "air"):
-            yield f"start = {self.start!r}: allowed: ground, air"
-        if self.spawn_ned_m.shape != (self.vehicles, 3):
-            yield f"spawn = {len(self.spawn_ned_m)} positions: allowed: one x,y,z for each of {self.vehicles} vehicles"
-        elif not (np.isfinite(self.spawn_ned_m).all() and np.abs(self.spawn_ned_m).max(initial=0) <= 1e5):
-            yield f"spawn = {self.spawn_ned_m.tolist()}: allowed: -100000 to 100000 m"
-
-
-def line_of_spawns(vehicles: int) -> Array:
-    """Return default spawn positions (N, 3): along x, 1 m apart, centred, on z = 0."""
-    spawns = np.zeros((vehicles, 3))
-    spawns[:, 0] = np.arange(vehicles) - (vehicles - 1) / 2
-    return spawns
-
-
 class SitlWorld:
     """The simulation. `transports` are the vehicle ends of the links, in vehicle order.
 
@@ -132,7 +64,7 @@ class SitlWorld:
 
     def __init__(
         self,
-        params: SitlParams,
+        params: SimulatorConfig,
         transports: Sequence[Transport],
         gcs_transports: Sequence[Transport] = (),
     ) -> None:
@@ -140,27 +72,26 @@ class SitlWorld:
             raise ValueError(f"transports: {len(transports)} and {len(gcs_transports)} for {params.vehicles} vehicles")
         self.params = params
         count, dt_s = params.vehicles, 1.0 / params.physics_hz
-        preset = outfitted(PRESETS[params.preset], params.realism)
+        preset = outfitted(PRESETS[params.preset], params)
         shared = GeoOrigin(params.origin_lat_deg, params.origin_lon_deg, params.origin_alt_m)
-        self.origins = [local_origin(spawn, shared) for spawn in params.spawn_ned_m]
+        spawns_ned_m = np.array(params.spawns_ned_m())  # (N, 3)
+        self.origins = [local_origin(spawn, shared) for spawn in spawns_ned_m]
         self._offset_ned_m = np.array([origin.offset_ned_m for origin in self.origins])  # (N, 3)
         airborne = params.start == "air"
         self.plant = Plant(
             preset,
-            params.spawn_ned_m - self._offset_ned_m,  # local: the spawn itself is exact, its origin is rounded
+            spawns_ned_m - self._offset_ned_m,  # local: the spawn itself is exact, its origin is rounded
             dt_s,
             ground=not airborne,
             mass_scale=params.mass_scale,
-            thrust_curve_01=params.realism.thrust_curve_01,
-            ground_effect=params.realism.ground_effect,
+            thrust_curve_01=params.thrust_curve_01,
+            ground_effect=params.ground_effect,
         )
         self.plant.held[:] = airborne
         self.estimator = Estimator(ESTIMATORS[params.estimator], self.plant, params.seed)
         self.attitude = attitude_loop(preset, count, dt_s, params.attitude_gains)
         self._autopilot_every = max(1, round(params.physics_hz / AUTOPILOT_HZ))
-        self.physics = Physics(
-            self.plant, self.attitude, self.estimator, params.realism, params.seed, self._autopilot_every
-        )
+        self.physics = Physics(self.plant, self.attitude, self.estimator, params, params.seed, self._autopilot_every)
         self.autopilots: list[Commander] = []
         self.endpoints: list[MavlinkInterface] = []
         self._links = [LossyLink(link, (params.seed, i, _LINK_PURPOSE)) for i, link in enumerate(transports)]
@@ -182,10 +113,10 @@ class SitlWorld:
         self._boot_us: int | None = None
         self._now_us = 0
         self._steps = 0
-        problems = [problem for fault in params.realism.faults for problem in self.can(fault)]
+        problems = [problem for fault in params.faults for problem in self.can(fault)]
         if problems:
             raise ConfigError("sitl", problems)
-        self.faults = Faults(self, params.realism.faults, count)
+        self.faults = Faults(self, params.faults, count)
 
     def step(self, now_us: int) -> None:
         """Do one physics step that ends at `now_us` (monotonic); then send everything due, stamped with it."""

@@ -6,32 +6,32 @@ and writes the resolved copy. It opens no sockets and starts nothing.
 
 from __future__ import annotations
 
-import difflib
 import itertools
 import math
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 import tomli_w
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from swarmctl.agent.setup import AgentParams
-from swarmctl.bus.topics import MAX_OBSTACLE_M, MAX_OBSTACLES
-from swarmctl.config_source import override, read_tree, shown
+from swarmctl.bus.topics import MAX_OBSTACLES
+from swarmctl.config_problems import validated
+from swarmctl.config_source import override, read_tree
 from swarmctl.control.collision.separation import SeparationParams, radius_problem
 from swarmctl.control.controller import ControllerParams
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.reference.mission import MissionParams
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.params import Params, Vec3
-from swarmctl.core.simulated import RealismParams
-from swarmctl.core.text import printable
 from swarmctl.errors import ConfigError
 from swarmctl.mavlink.parameter_names import parameter_problems
 from swarmctl.mavlink.transport import Endpoint, parse_url
-from swarmctl.telemetry.referee import ObstacleRule, Rules
+from swarmctl.simulator_config import MAX_VEHICLES, OriginParams, SimulatorConfig, SimulatorParams
+from swarmctl.telemetry.referee import Rules
 
-MAX_AGENTS = 100
+MAX_AGENTS = MAX_VEHICLES
 _PAIRS_SHOWN = 3
 _RENAMED = {  # keys of versions before 0.2
     "agent.commit.bias_rad": "agent.commit.right_of_way_rad",
@@ -43,17 +43,12 @@ _RENAMED = {  # keys of versions before 0.2
     "separation.bias_obstacle_rad": "separation.right_of_way_obstacle_rad",
     "separation.bias_rad": "separation.right_of_way_rad",
 }
-_PLACES_SHOWN = 3
-_PROBLEMS_SHOWN = 30
 
 
-class SwarmParams(Params):
+class SwarmParams(OriginParams):
     """Size of the swarm and origin of its frame."""
 
     agents: int = Field(3, ge=1, le=MAX_AGENTS)  # overridden by --agents
-    origin_lat_deg: float = Field(47.397742, ge=-90, le=90)  # shared origin of all positions in the configuration
-    origin_lon_deg: float = Field(8.545594, ge=-180, le=180)  # longitude of the same point
-    origin_alt_m: float = Field(489.4, ge=-500, le=9000)  # above mean sea level
 
 
 class StartParams(Params):
@@ -73,27 +68,12 @@ class VehicleParams(Params):
     model: VehicleModelParams | None = None  # replaces the whole section vehicle_model for this vehicle
 
 
-class SitlParams(RealismParams):
+class SitlParams(SimulatorParams):
     """The built-in simulator that launch starts; disabled to fly other vehicles."""
 
     enabled: bool = True
-    preset: Literal["thesis", "x500", "crazyflie", "arducopter"] = "thesis"  # airframe
-    attitude_gains: Literal["swarm", "single", "pid_step", "pid_trajectory"] = "swarm"  # for the thesis airframe only
     ground_z_m: float = Field(2.0, ge=-1000, le=1000)  # height of the ground below the shared origin, NED z
-    start: Literal["ground", "air"] = "ground"  # air: vehicles begin at their start positions, without ground (thesis)
-    ekf_ready_s: float = Field(1.0, ge=0, le=60)  # from power-up until arming is possible; 4 in PX4
-    mass_scale: float = Field(1.0, ge=0.3, le=1.9)  # true mass over the preset's, unknown to the bridge
-    estimator: Literal["exact", "gps", "external"] = "exact"  # error model of the autopilots' estimates
-    autopilot_kind: Literal["px4", "arducopter"] = "px4"  # autopilot whose MAVLink interface is simulated
     link_latency_ms: float = Field(0.0, ge=0, le=1000)  # lockstep only
-    physics_hz: int = Field(250, ge=50, le=1000)
-    gcs_port: int = Field(0, ge=0, le=65535)  # ground station, with a second link to every vehicle; 0: none
-    reject_bad_setpoints: bool = True  # false: NaN and zero quaternions have the effects they have on PX4 1.18
-    speed: float = Field(1.0, gt=0, le=100)  # simulated over wall time; agents require 1
-
-    def realism(self) -> RealismParams:
-        """Return the realism parameters of the simulated physics."""
-        return RealismParams(**{key: getattr(self, key) for key in RealismParams.model_fields})
 
 
 class BusParams(Params):
@@ -110,17 +90,6 @@ class TelemetryParams(Params):
     enabled: bool = True
     port: int = Field(9877, ge=1, le=65535)  # loopback, not the default of rerun; the next free one if taken
     rate_hz: float = Field(10.0, gt=0, le=50)  # updates of the view per agent
-
-
-class ObstacleParams(Params):
-    """A sphere, or a vertical column of any height, visible to agents only from closer than `visibility_m`."""
-
-    center_ned_m: Vec3
-    column: bool = False  # true: of any height
-    radius_m: float = Field(1.0, gt=0, le=1000)  # the obstacle itself, which the safety filter keeps clear of
-    keep_out_m: float = Field(1.75, gt=0, le=1000)  # constraint radius from the centre, thesis 1 + 2.5 x 0.3
-    visibility_m: float = Field(3.0, gt=0, le=10000)  # agents farther from the centre do not see it
-    vel_ned_m_s: Vec3 = (0.0, 0.0, 0.0)
 
 
 class LimitParams(Params):
@@ -147,7 +116,7 @@ class Config(Params):
     sitl: SitlParams = SitlParams()
     bus: BusParams = BusParams()
     telemetry: TelemetryParams = TelemetryParams()
-    obstacles: tuple[ObstacleParams, ...] = Field((), strict=False)
+    obstacles: tuple[Obstacle, ...] = Field((), strict=False)
     limits: LimitParams = LimitParams()
 
     def starts_ned_m(self) -> tuple[tuple[float, float, float], ...]:
@@ -171,14 +140,26 @@ class Config(Params):
         own = self.vehicles[agent].model if self.vehicles else None
         return own or self.vehicle_model
 
+    def simulator(self) -> SimulatorConfig:
+        """Return what the simulator of this run is told.
+
+        Raises:
+            ConfigError: it can't be simulated.
+        """
+        spawns_ned_m = self.starts_ned_m()
+        if self.sitl.start == "ground":
+            spawns_ned_m = tuple((x, y, self.sitl.ground_z_m) for x, y, _ in spawns_ned_m)
+        keys = {key: getattr(self.sitl, key) for key in SimulatorParams.model_fields}
+        keys |= {key: getattr(self.swarm, key) for key in OriginParams.model_fields}
+        keys |= {"vehicles": self.swarm.agents, "spawn_ned_m": spawns_ned_m, "seed": self.seed}
+        return validated(SimulatorConfig, keys, "sitl")
+
     def rules(self, mode: Literal["realtime", "lockstep"] = "realtime") -> Rules:
         """Return the rules by which the referee judges this run."""
         return Rules(
             agents=self.swarm.agents,
             required_separation_m=self.limits.min_separation_m,
-            obstacles=tuple(
-                ObstacleRule(o.center_ned_m, o.keep_out_m, o.vel_ned_m_s, column=o.column) for o in self.obstacles
-            ),
+            obstacles=dict.fromkeys(self.obstacles),
             obstacle_margin_m=self.limits.obstacle_margin_m,
             deadline_misses_01=self.limits.deadline_misses_01,
             mode=mode,
@@ -202,12 +183,7 @@ def load(path: Path | None, overrides: Sequence[str] = ()) -> Config:
     problems = [p for item in overrides for p in override(tree, item)]
     if problems:
         raise ConfigError(source, problems)
-    try:
-        config = Config.model_validate(tree)
-    except ValidationError as error:
-        problems = [_explain(dict(e)) for e in error.errors(include_url=False)[:_PROBLEMS_SHOWN]]
-        hidden = error.error_count() - len(problems)
-        raise ConfigError(source, [*problems, *([f"and {hidden} more problems"] if hidden else [])]) from error
+    config = validated(Config, tree, source, _RENAMED)
     problems = list(_whole(config))
     if problems:
         raise ConfigError(source, problems)
@@ -217,78 +193,6 @@ def load(path: Path | None, overrides: Sequence[str] = ()) -> Config:
 def dump(config: Config) -> str:
     """Return the resolved configuration as TOML, which `load` reads back to the same tree."""
     return tomli_w.dumps(config.model_dump(exclude_none=True))
-
-
-def _explain(error: dict[str, Any]) -> str:
-    """Return one line with key, value, allowed range and fix."""
-    location = [str(part) for part in error["loc"]]
-    key = printable(".".join(location), 100)
-    value = shown(error.get("input"))
-    if error["type"] == "extra_forbidden":
-        return f"{key} = {value}: unknown key; {_hint(location)}"
-    if error["type"] == "missing":
-        return f"{key}: missing; add it"
-    if error["type"] == "finite_number":
-        return f"{key} = {value}: not a finite number; give a real one{_range_of(location)}"
-    return f"{key} = {value}: {error['msg'].lower()}{_range_of(location)}"
-
-
-def _hint(location: Sequence[str]) -> str:
-    """Suggest a correction for an unknown key: its new name, its word in another section, or a similar one in this."""
-    if renamed := _RENAMED.get(".".join(location)):
-        return f"did you mean {renamed!r}?"
-    elsewhere = [key for key in _all_keys(Config, "") if key.rpartition(".")[2] == location[-1]]
-    if elsewhere:
-        return f"did you mean {' or '.join(map(repr, elsewhere[:_PLACES_SHOWN]))}?"
-    known = _keys_at(location[:-1])
-    close = difflib.get_close_matches(location[-1], known, 1)
-    return f"did you mean {close[0]!r}?" if close else f"known here: {', '.join(sorted(known))}"
-
-
-def _all_keys(model: Any, prefix: str) -> Iterator[str]:
-    for name, field in model.model_fields.items():
-        yield f"{prefix}{name}"
-        inner = _model_of(field.annotation)
-        if inner is not None:
-            yield from _all_keys(inner, f"{prefix}{name}.")
-
-
-def _field_at(location: Sequence[str]) -> Any:
-    model: Any = Config
-    field: Any = None
-    for part in location:
-        if part.isdigit():
-            continue
-        field = getattr(model, "model_fields", {}).get(part)
-        if field is None:
-            return None
-        model = _model_of(field.annotation)
-    return field
-
-
-def _model_of(annotation: Any) -> Any:
-    if isinstance(annotation, type) and issubclass(annotation, Params):
-        return annotation
-    for argument in getattr(annotation, "__args__", ()):
-        found = _model_of(argument)
-        if found is not None:
-            return found
-    return None
-
-
-def _keys_at(location: Sequence[str]) -> list[str]:
-    model = Config if not location else _model_of(getattr(_field_at(location), "annotation", None))
-    return list(getattr(model, "model_fields", {}))
-
-
-def _range_of(location: Sequence[str]) -> str:
-    field = _field_at(location)
-    bounds: dict[str, Any] = {}
-    for rule in getattr(field, "metadata", ()):
-        bounds.update({n: getattr(rule, n) for n in ("ge", "gt", "le", "lt") if getattr(rule, n, None) is not None})
-    signs = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
-    text = " and ".join(f"{signs[name]} {bound}" for name, bound in bounds.items())
-    return f"; allowed: {text}" if text else ""
 
 
 def _whole(config: Config) -> Iterator[str]:
@@ -301,15 +205,19 @@ def _whole(config: Config) -> Iterator[str]:
         yield "start.direction_ned = (0, 0, 0): give the line of start positions a direction"
     elif not (listed and listed < agents):
         yield from _starts_apart(config)
+        try:
+            config.simulator()
+        except ConfigError as error:
+            yield from (f"sitl.{problem}" for problem in error.problems)
     yield from _vehicle_problems(config)
-    yield from _obstacle_problems(config)
+    if len(config.obstacles) > MAX_OBSTACLES:
+        yield f"obstacles: {len(config.obstacles)} are listed, agents keep {MAX_OBSTACLES} at most"
     yield from parameter_problems(config.agent.autopilot_params)
     if config.sitl.speed != 1.0:
         yield (
             f"sitl.speed = {config.sitl.speed}: agents fly on wall time and can't follow; leave it at 1. Faster than "
             "real time: swarmctl simulate, or python -m sitl --speed with clients of your own"
         )
-    yield from (f"sitl.{problem}" for problem in config.sitl.fault_problems(agents))
     yield from config.mission.problems(agents)
     if agents > 1 and (problem := radius_problem(config.separation, 0.0)):
         yield problem
@@ -318,17 +226,6 @@ def _whole(config: Config) -> Iterator[str]:
             f"limits.min_separation_m = {config.limits.min_separation_m}: larger than separation.radius_m = "
             f"{config.separation.radius_m}; agents would be judged by more than they keep. Lower it or raise the radius"
         )
-
-
-def _obstacle_problems(config: Config) -> Iterator[str]:
-    """Yield problems with obstacles that agents would refuse as messages."""
-    if len(config.obstacles) > MAX_OBSTACLES:
-        yield f"obstacles: {len(config.obstacles)} are listed, agents keep {MAX_OBSTACLES} at most"
-        return
-    for number, obstacle in enumerate(config.obstacles):
-        for key, vector in (("center_ned_m", obstacle.center_ned_m), ("vel_ned_m_s", obstacle.vel_ned_m_s)):
-            if max(map(abs, vector)) > MAX_OBSTACLE_M:
-                yield f"obstacles.{number}.{key} = {vector}: every number must be within {MAX_OBSTACLE_M:g}"
 
 
 def _starts_apart(config: Config) -> Iterator[str]:

@@ -24,7 +24,7 @@ from pydantic.fields import FieldInfo
 
 from swarmctl.config import Config
 from swarmctl.core.params import Params
-from swarmctl.core.simulated import FAULTS
+from swarmctl.simulator_config import FAULTS
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "configuration.md"

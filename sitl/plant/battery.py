@@ -12,7 +12,7 @@ import numpy as np
 
 from sitl.plant.airframes import Preset
 from sitl.plant.vehicle import Array
-from swarmctl.core.simulated import BatteryParams
+from swarmctl.simulator_config import BatteryParams
 
 _AIR_KG_M3 = 1.225
 _EFFICIENCY = 0.55

@@ -16,7 +16,7 @@ from sitl.plant.estimator import Estimator
 from sitl.plant.sensors import Power
 from sitl.plant.vehicle import Array, Plant
 from sitl.plant.wind import Air
-from swarmctl.core.simulated import RealismParams
+from swarmctl.simulator_config import SimulatorParams
 
 
 class Physics:
@@ -31,14 +31,14 @@ class Physics:
         plant: Plant,
         attitude: AttitudeLoop,
         estimator: Estimator,
-        realism: RealismParams,
+        params: SimulatorParams,
         seed: int,
         slow_every: int,
     ) -> None:
         count = plant.state.shape[1]
         self.plant, self.attitude, self.estimator = plant, attitude, estimator
-        self.air = Air(realism.wind, count, slow_every * plant.dt_s, seed)
-        self.battery = Battery(realism.battery, plant.preset, count)
+        self.air = Air(params.wind, count, slow_every * plant.dt_s, seed)
+        self.battery = Battery(params.battery, plant.preset, count)
         self.rotor_health_01 = np.ones((4, count))
         self._slow_every = slow_every
         self._steps = 0
@@ -100,8 +100,8 @@ class Physics:
         self.estimator.power = [Power(*row) for row in rows]
 
 
-def outfitted(preset: Preset, realism: RealismParams) -> Preset:
+def outfitted(preset: Preset, params: SimulatorParams) -> Preset:
     """Return the airframe with the requested rotor lag and drag."""
-    drag = tuple(k * realism.drag_scale for k in preset.drag_n_s_m)
-    tau_s = preset.motor_tau_s if realism.motor_tau_s is None else realism.motor_tau_s
+    drag = tuple(k * params.drag_scale for k in preset.drag_n_s_m)
+    tau_s = preset.motor_tau_s if params.motor_tau_s is None else params.motor_tau_s
     return replace(preset, drag_n_s_m=(drag[0], drag[1], drag[2]), motor_tau_s=tau_s)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sitl.plant.vehicle import Array
-from swarmctl.core.simulated import WindParams
+from swarmctl.simulator_config import WindParams
 
 _FOOT_M = 0.3048
 _LOWEST_FT, _HIGHEST_FT = 10.0, 1000.0  # validity of the low-altitude forms

@@ -12,7 +12,8 @@ from swarmctl.control.collision.separation import KeepOut
 from swarmctl.control.commit.trajectory_planner import DesiredReference
 from swarmctl.control.phases.state_machine import MissionStateMachine
 from swarmctl.control.reference.deadlock import Deadlock, DeadlockRecovery
-from swarmctl.core.types import Array, Obstacle, Reference, Sampled
+from swarmctl.core.obstacle import Obstacle
+from swarmctl.core.types import Array, Reference, Sampled
 
 
 class ReferenceSelector:

@@ -20,10 +20,11 @@ from swarmctl.control.collision.separation import (
     visible,
 )
 from swarmctl.control.phases.inputs import PeerInputs
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import Order
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.trajectory_message import TrajectoryMessage
-from swarmctl.core.types import Array, Mode, Obstacle, Phase
+from swarmctl.core.types import Array, Mode, Phase
 
 _RECENT_PATH_US = 300_000  # largest age of a path that is compared with commitments
 _READY_LEAD_US = 1_000_000  # largest lead of a peer's clock over ours
@@ -102,7 +103,7 @@ class WorldModel:
             self.refusals.add(sender, topics.OBSTACLES.name, MALFORMED, utc_us)
         elif message.replaces(known):
             self._obstacles_version = message.version
-            self._obstacles, self._seen = tuple(o.obstacle() for o in message.obstacles), {}
+            self._obstacles, self._seen = message.obstacles, {}
         elif known is not None and message.version > known:
             self.refusals.add(sender, topics.OBSTACLES.name, SEQUENCE, utc_us)
 
@@ -175,7 +176,7 @@ class WorldModel:
 
     def landmarks(self) -> list[Obstacle]:
         """Return obstacles at rest that have been visible so far."""
-        return [o for o in self._seen.values() if not o.vel_ned_m_s.any()]
+        return [o for o in self._seen.values() if not o.moves]
 
     def bodies(
         self,

@@ -9,15 +9,15 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar
 
 import msgspec
 import numpy as np
 
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import Order, order_problem
-from swarmctl.core.types import MAX_RADIUS_M, FlightMode, Mode, Obstacle, Phase, PredictedPath
+from swarmctl.core.types import MAX_RADIUS_M, FlightMode, Mode, Phase, PredictedPath
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,10 +49,8 @@ _MAGIC = b"SP"
 _Message = TypeVar("_Message")
 
 MAX_OBSTACLES = 64  # each visible one takes 20 us of a tick of 20 ms; 6000 took 130 ms
-MAX_OBSTACLE_M = 10_000.0  # limit of every length and coordinate
+_OBSTACLE_KEYS = {"center_ned_m", "radius_m", "keep_out_m", "visibility_m"}  # no message may leave these out
 MAX_VERSION_STEP = 64  # largest step of the list's version; an extreme one would lock out all later ones
-Length = Annotated[float, msgspec.Meta(gt=0.0, le=MAX_OBSTACLE_M)]
-Coordinate = Annotated[float, msgspec.Meta(ge=-MAX_OBSTACLE_M, le=MAX_OBSTACLE_M)]
 Word = Annotated[str, msgspec.Meta(max_length=32)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
 
@@ -134,48 +132,20 @@ class CommandMessage(msgspec.Struct, frozen=True):
         return Order(self.verb, self.arguments)
 
 
-class ObstacleMessage(msgspec.Struct, frozen=True):
-    """Describes one obstacle, a sphere or a column of any height, in shared NED [m]."""
-
-    center_ned_m: tuple[Coordinate, Coordinate, Coordinate]
-    radius_m: Length
-    keep_out_m: Length
-    visibility_m: Length
-    vel_ned_m_s: tuple[Coordinate, Coordinate, Coordinate] = (0.0, 0.0, 0.0)
-    column: bool = False
-
-    def obstacle(self) -> Obstacle:
-        """Return the obstacle as a core type."""
-        center, vel = np.array(self.center_ned_m), np.array(self.vel_ned_m_s)
-        return Obstacle(
-            center_ned_m=center,
-            radius_m=self.radius_m,
-            keep_out_m=self.keep_out_m,
-            visibility_m=self.visibility_m,
-            vel_ned_m_s=vel,
-            column=self.column,
-        )
-
-
 class ObstaclesMessage(msgspec.Struct, frozen=True):
     """Holds the whole list of obstacles; a higher `version` replaces a lower one."""
 
     version: Count
-    obstacles: Annotated[tuple[ObstacleMessage, ...], msgspec.Meta(max_length=MAX_OBSTACLES)]
+    obstacles: Annotated[tuple[Obstacle, ...], msgspec.Meta(max_length=MAX_OBSTACLES)]
 
     def replaces(self, version: int | None) -> bool:
         """Tell whether the list is newer than the known version (None: no list), by at most `MAX_VERSION_STEP`."""
         return version is None or 0 < self.version - version <= MAX_VERSION_STEP
 
 
-def first_obstacles(items: Iterable[Mapping[str, Any]]) -> ObstaclesMessage:
-    """Return version 1 of the list, with items as configured."""
-    return ObstaclesMessage(1, tuple(ObstacleMessage(**item) for item in items))
-
-
 def encode_message(message: msgspec.Struct) -> bytes:
     """Encode a message as JSON."""
-    return msgspec.json.encode(message)
+    return msgspec.json.encode(message, enc_hook=lambda obstacle: obstacle.model_dump())
 
 
 def decode_status(payload: bytes) -> StatusMessage | None:
@@ -194,9 +164,21 @@ def decode_obstacles(payload: bytes) -> ObstaclesMessage | None:
     return _decode(payload, _OBSTACLES_DECODER)
 
 
+def _obstacle(kind: type, item: Any) -> Obstacle:
+    """Return the obstacle that a message describes.
+
+    Raises:
+        ValueError: a key is missing or unknown, or a value out of bounds.
+    """
+    obstacle = Obstacle.model_validate(item)
+    if missing := _OBSTACLE_KEYS - obstacle.model_fields_set:
+        raise ValueError(f"missing: {missing}")
+    return obstacle
+
+
 _STATUS_DECODER = msgspec.json.Decoder(StatusMessage)
 _COMMAND_DECODER = msgspec.json.Decoder(CommandMessage)
-_OBSTACLES_DECODER = msgspec.json.Decoder(ObstaclesMessage)
+_OBSTACLES_DECODER = msgspec.json.Decoder(ObstaclesMessage, dec_hook=_obstacle)
 
 
 def _decode(payload: bytes, decoder: msgspec.json.Decoder[_Message]) -> _Message | None:

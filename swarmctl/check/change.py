@@ -5,8 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from swarmctl.check.finding import Finding, Verdict
+from swarmctl.check.finding import Finding
 from swarmctl.check.parameters import Number
+from swarmctl.core.verdict import Verdict
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

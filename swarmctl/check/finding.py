@@ -2,19 +2,12 @@
 
 from __future__ import annotations
 
-import enum
 from collections.abc import Iterable
 from dataclasses import dataclass
 
+from swarmctl.core.verdict import Verdict
+
 SWARM = -1  # agent of a finding about all vehicles together
-
-
-class Verdict(enum.IntEnum):
-    """Severity of a finding; that of a check is the largest of its findings."""
-
-    OK = 0
-    NOTE = 1  # worth knowing; the vehicle can fly
-    FIX = 2  # the vehicle can't fly, or not safely
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -14,7 +14,7 @@ from pymavlink.dialects.v20 import development as mavlink
 
 from swarmctl.check.link_facts import Parameter
 from swarmctl.core.types import Command, Verb
-from swarmctl.mavlink.dialects import Dialect
+from swarmctl.mavlink.dialects.dialect import Dialect
 
 _REAL32 = mavlink.MAV_PARAM_TYPE_REAL32
 _ASK_US = 400_000

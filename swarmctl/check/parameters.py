@@ -1,249 +1,40 @@
-"""Parameters that matter for flying by setpoints, with the wanted value and the reason: one table per autopilot.
+"""Parameters that matter for flying by setpoints: what is wanted of each, why, and what `--apply` changes.
 
-Wanted values come from, in this order, `agent.autopilot_params`, the rules of the dialect, and these tables. `--apply`
-changes only those with a value `to_set`.
+Wanted values come from, in this order, `agent.autopilot_params`, and the rules and checks of the autopilot's dialect.
+`--apply` changes only those with a value `to_set`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
-from swarmctl.check.finding import Finding, Verdict
+from swarmctl.check.finding import Finding
 from swarmctl.check.link_facts import VehicleFacts
 from swarmctl.config import Config
 from swarmctl.core.types import Landed
-from swarmctl.mavlink.dialects import DIALECTS, Dialect, Rule
+from swarmctl.core.verdict import Verdict
+from swarmctl.mavlink.dialects.dialect import Dialect, Rule
+from swarmctl.mavlink.dialects.parameter_check import Opinion, ParameterCheck, ParameterContext, ok
+from swarmctl.mavlink.dialects.registry import DIALECTS
 
 Number = float | int
 RC_RECEIVER = 1 << 16  # MAV_SYS_STATUS_SENSOR_RC_RECEIVER
-_OFFBOARD_EXCEPTED = 4  # COM_RCL_EXCEPT bit 2
-_STICKS_NOT_BY_RADIO = (1, 4)  # COM_RC_IN_MODE: joystick only, disabled
-_HOVER_APART_01 = 0.1
-_GUIDED_SILENCE_S = 1.0
-_LAND_WITHOUT_STATION = 5  # FS_GCS_ENABLE
 _WEIGHT_WANTED, _WEIGHT_TABLE = 60, 50
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Opinion:
-    """An assessment of one value of one parameter."""
-
-    verdict: Verdict
-    wanted: str
-    advice: str = ""
-    to_set: Number | None = None
-
-
-_Judge = Callable[[float, VehicleFacts, Config], Opinion]
-
-
-@dataclass(frozen=True, slots=True)
-class Row:
-    """One parameter and the rule that assesses its value."""
-
-    name: str
-    why: str  # why it matters
-    judge: _Judge
-
-
-def _ok(wanted: str) -> Opinion:
-    return Opinion(verdict=Verdict.OK, wanted=wanted)
-
-
-# --- PX4 ---
-
-
-def _offboard_loss(value: float, facts: VehicleFacts, config: Config) -> Opinion:
-    if value in (4, 5):
-        return _ok("4 land, 5 hold")
-    meet = "the way home is not kept clear of the others"
-    return Opinion(
-        verdict=Verdict.NOTE,
-        wanted="4 land, 5 hold",
-        advice=f"when setpoints stop the vehicle returns, and {meet}; 4 lands",
-    )
-
-
-def _offboard_timeout(value: float, facts: VehicleFacts, config: Config) -> Opinion:
-    wanted = "0.2 to 1.0 s"
-    if value > 1.0:
-        why = "for that long the last attitude is flown when setpoints stop"
-        return Opinion(verdict=Verdict.FIX, wanted=wanted, advice=f"{why}; set 1.0", to_set=1.0)
-    if value < 0.2:
-        return Opinion(
-            verdict=Verdict.FIX, wanted=wanted, advice="a few late setpoints would end offboard; set 0.5", to_set=0.5
-        )
-    return _ok(wanted)
-
-
-def _forward_setpoints(value: float, facts: VehicleFacts, config: Config) -> Opinion:
-    if value == 1:
-        return _ok("1")
-    return Opinion(verdict=Verdict.FIX, wanted="1", advice="setpoints over MAVLink are not flown; set 1", to_set=1)
-
-
-def _radio_exception(value: float, facts: VehicleFacts, config: Config) -> Opinion:
-    source = facts.number("COM_RC_IN_MODE")
-    if source is None or source in _STICKS_NOT_BY_RADIO:
-        return _ok("any, no radio is expected")
-    if facts.sensors is not None and facts.sensors.present & facts.sensors.healthy & RC_RECEIVER:
-        return _ok("any, the radio is there")
-    if int(value) & _OFFBOARD_EXCEPTED:
-        return _ok("bit 2, offboard")
-    action = facts.number("NAV_RCL_ACT")
-    told = "" if action is None else f" (NAV_RCL_ACT = {action:g})"
-    return Opinion(
-        verdict=Verdict.FIX,
-        wanted="bit 2, offboard",
-        advice=f"a radio is expected (COM_RC_IN_MODE = {source:g}) and none is there: its loss ends offboard{told}; "
-        "switch it on, or except offboard",
-        to_set=int(value) | _OFFBOARD_EXCEPTED,
-    )
-
-
-def _radio_source(value: float, facts: VehicleFacts, config: Config) -> Opinion:
-    return _ok("as the pilot flies; 4 without any")
-
-
-def _thrust_model(value: float, facts: VehicleFacts, config: Config) -> Opinion:
-    if value == 0 and facts.version is not None and facts.version.has_usb:  # simulators have no such circuit
-        return Opinion(
-            verdict=Verdict.NOTE,
-            wanted="0.2 to 0.5",
-            advice="thrust is taken as linear, real propellers are not: calibrate it to hover well",
-        )
-    return _ok("0 simulated, 0.2 to 0.5 real")
-
-
-def _hover(value: float, facts: VehicleFacts, config: Config) -> Opinion:
-    ours = config.vehicle_model.hover_thrust_01
-    wanted = f"vehicle_model.hover_thrust_01 = {ours:g}"
-    if abs(value - ours) <= _HOVER_APART_01:
-        return _ok(wanted)
-    return Opinion(
-        verdict=Verdict.NOTE,
-        wanted=wanted,
-        advice=f"first guesses differ; set vehicle_model.hover_thrust_01 = {value:g}",
-    )
-
-
-def _own_sysid(value: float, facts: VehicleFacts, config: Config) -> Opinion:
-    if value == facts.sysid:
-        return _ok(f"{facts.wanted_sysid}")
-    return Opinion(
-        verdict=Verdict.FIX,
-        wanted=f"{facts.wanted_sysid}",
-        advice="it still speaks as another one; reboot the autopilot",
-    )
-
-
-# --- ArduCopter ---
-
-
-def _guided_options(value: float, facts: VehicleFacts, config: Config) -> Opinion:
-    if int(value) & 8:
-        return _ok("bit 3, thrust as thrust")
-    advice = "thrust would be flown as a climb rate; set bit 3"
-    return Opinion(verdict=Verdict.FIX, wanted="bit 3, thrust as thrust", advice=advice, to_set=int(value) | 8)
-
-
-def _guided_timeout(value: float, facts: VehicleFacts, config: Config) -> Opinion:
-    wanted = f"at most {_GUIDED_SILENCE_S:g} s"
-    if 0 < value <= _GUIDED_SILENCE_S:
-        return _ok(wanted)
-    why = "for that long the last attitude is flown when setpoints stop"
-    return Opinion(
-        verdict=Verdict.NOTE, wanted=wanted, advice=f"{why}; set {_GUIDED_SILENCE_S:g}", to_set=_GUIDED_SILENCE_S
-    )
-
-
-def _ground_station_failsafe(value: float, facts: VehicleFacts, config: Config) -> Opinion:
-    if value == _LAND_WITHOUT_STATION:
-        return _ok("5, land")
-    return Opinion(
-        verdict=Verdict.FIX,
-        wanted="5, land",
-        advice="without its agent it would drift on for ever",
-        to_set=_LAND_WITHOUT_STATION,
-    )
-
-
-def _throttle_failsafe(value: float, facts: VehicleFacts, config: Config) -> Opinion:
-    radio = facts.sensors is not None and bool(facts.sensors.present & facts.sensors.healthy & RC_RECEIVER)
-    if value == 0 or radio:
-        return _ok("0, or a radio")
-    return Opinion(
-        verdict=Verdict.NOTE,
-        wanted="0, or a radio",
-        advice="no radio is seen: arming is refused, or its loss ends GUIDED",
-    )
-
-
-def _ekf_failsafe(value: float, facts: VehicleFacts, config: Config) -> Opinion:
-    if value in (1, 3):
-        return _ok("1 or 3, land")
-    return Opinion(
-        verdict=Verdict.NOTE, wanted="1 or 3, land", advice="a diverging estimator does not land the vehicle"
-    )
-
-
-def _arming_check(value: float, facts: VehicleFacts, config: Config) -> Opinion:
-    if value != 0:
-        return _ok("1, all")
-    return Opinion(verdict=Verdict.NOTE, wanted="1, all", advice="nothing is checked before arming")
-
-
-def _angle_max(value: float, facts: VehicleFacts, config: Config) -> Opinion:
-    least = math.degrees(config.vehicle_model.tilt_max_rad) * 100
-    wanted = f"at least {least:.0f} (vehicle_model.tilt_max_rad)"
-    if value >= least - 1:
-        return _ok(wanted)
-    lower = math.floor(math.radians(value / 100) * 100) / 100
-    return Opinion(
-        verdict=Verdict.NOTE,
-        wanted=wanted,
-        advice=f"the autopilot clips; set vehicle_model.tilt_max_rad = {lower:g} or raise it",
-    )
-
-
-ROWS: dict[str, tuple[Row, ...]] = {
-    "PX4": (
-        Row("COM_OBL_RC_ACT", "what happens when setpoints stop", _offboard_loss),
-        Row("COM_OF_LOSS_T", "how long the last attitude is flown when setpoints stop", _offboard_timeout),
-        Row("MAV_FWDEXTSP", "whether setpoints are flown", _forward_setpoints),
-        Row("COM_RCL_EXCEPT", "whether a lost radio ends offboard", _radio_exception),
-        Row("COM_RC_IN_MODE", "where sticks come from", _radio_source),
-        Row("MPC_THR_HOVER", "what hovers", _hover),
-        Row("THR_MDL_FAC", "how thrust becomes motor speed", _thrust_model),
-        Row("MAV_SYS_ID", "its system id after the next boot", _own_sysid),
-    ),
-    "ArduCopter": (
-        Row("GUID_OPTIONS", "what thrust means", _guided_options),
-        Row("GUID_TIMEOUT", "how long the last attitude is flown when setpoints stop", _guided_timeout),
-        Row("FS_GCS_ENABLE", "what happens when the agent's heartbeats stop", _ground_station_failsafe),
-        Row("FS_THR_ENABLE", "whether a lost radio ends GUIDED", _throttle_failsafe),
-        Row("FS_EKF_ACTION", "what happens when the estimator diverges", _ekf_failsafe),
-        Row("ARMING_CHECK", "what is checked before arming", _arming_check),
-        Row("ANGLE_MAX", "how far it tilts", _angle_max),
-        Row("MOT_THST_HOVER", "what hovers", _hover),
-        Row("SYSID_THISMAV", "its system id after the next boot", _own_sysid),
-    ),
-}
-_ALSO_READ = {"PX4": ("NAV_RCL_ACT",), "ArduCopter": ()}  # parameters that rows refer to
 
 
 def names_to_read(dialect: Dialect, config: Config) -> tuple[str, ...]:
     """Return the names of the parameters to read from an autopilot."""
-    rows = (row.name for row in ROWS[dialect.name])
-    names = (*config.agent.autopilot_params, *dialect.to_read(), *rows, *_ALSO_READ[dialect.name])
+    checked = (check.name for check in dialect.checks)
+    names = (*config.agent.autopilot_params, *dialect.to_read(), *checked, *dialect.also_read)
     return tuple(dict.fromkeys(names))
 
 
 def parameter_findings(facts: VehicleFacts, config: Config) -> list[Finding]:
     """Return one finding per wanted or assessed parameter; none for an unsupported autopilot."""
-    return [_finding(facts, name, opinion) for name, opinion in _opinions(facts, config).items()]
+    dialect = DIALECTS.get(facts.autopilot_number)
+    why = {check.name: check.why for check in dialect.checks} if dialect is not None else {}
+    return [_finding(facts, name, opinion, why.get(name, "")) for name, opinion in _opinions(facts, config).items()]
 
 
 def unchangeable(facts: VehicleFacts) -> str:
@@ -273,27 +64,43 @@ def _opinions(facts: VehicleFacts, config: Config) -> dict[str, Opinion]:
     if dialect is None or facts.parameters is None:
         return {}
     rules = {rule.name: rule for rule in dialect.rules}
-    rows = {row.name: row for row in ROWS[dialect.name]}
-    wanted = config.agent.autopilot_params
-    return {
-        name: _opinion(name, facts, config, rules.get(name), rows.get(name)) for name in {**wanted, **rules, **rows}
-    }
+    checks = {check.name: check for check in dialect.checks}
+    wanted, seen = config.agent.autopilot_params, _context(facts, config)
+
+    def opinion(name: str) -> Opinion:
+        value = facts.number(name)
+        if name in wanted:
+            return _as_configured(name, facts, config, rules.get(name))
+        if value is not None and name in dialect.given:
+            return ok("set by the agent for its flight")
+        return _opinion(value, seen, rules.get(name), checks.get(name))
+
+    return {name: opinion(name) for name in {**wanted, **rules, **checks}}
 
 
-def _opinion(name: str, facts: VehicleFacts, config: Config, rule: Rule | None, row: Row | None) -> Opinion:
-    value = facts.number(name)
-    if name in config.agent.autopilot_params:
-        return _as_configured(name, facts, config, rule)
-    if value is not None and name in DIALECTS[facts.autopilot_number].given:
-        return _ok("set by the agent for its flight")
+def _context(facts: VehicleFacts, config: Config) -> ParameterContext:
+    """Return what the checks of a dialect may depend on."""
+    sensors, version, model = facts.sensors, facts.version, config.vehicle_model
+    return ParameterContext(
+        number=facts.number,
+        has_radio=sensors is not None and bool(sensors.present & sensors.healthy & RC_RECEIVER),
+        is_board=version is not None and version.has_usb,  # simulators have no such circuit
+        sysid=facts.sysid,
+        wanted_sysid=facts.wanted_sysid,
+        hover_thrust_01=model.hover_thrust_01,
+        tilt_max_rad=model.tilt_max_rad,
+    )
+
+
+def _opinion(value: float | None, seen: ParameterContext, rule: Rule | None, check: ParameterCheck | None) -> Opinion:
     if value is None:
         if rule is not None:
             return Opinion(verdict=Verdict.FIX, wanted="readable", advice=rule.problem(None))
         return Opinion(verdict=Verdict.NOTE, wanted="", advice="this autopilot does not tell it: not judged")
-    judged = None if row is None else row.judge(value, facts, config)
+    judged = None if check is None else check.judge(value, seen)
     broken = "" if rule is None else rule.problem(value)
     if judged is None:
-        return Opinion(verdict=Verdict.FIX, wanted="", advice=broken) if broken else _ok("")
+        return Opinion(verdict=Verdict.FIX, wanted="", advice=broken) if broken else ok("")
     return replace(judged, verdict=Verdict.FIX, advice=broken) if broken else judged
 
 
@@ -307,7 +114,7 @@ def _as_configured(name: str, facts: VehicleFacts, config: Config, rule: Rule | 
         advice = f"this autopilot has no such parameter; remove agent.autopilot_params.{name}"
         return Opinion(verdict=Verdict.NOTE if rule is None else Verdict.FIX, wanted=wanted, advice=advice)
     if math.isclose(value, want, rel_tol=1e-6, abs_tol=1e-9):
-        return _ok(wanted)
+        return ok(wanted)
     return Opinion(
         verdict=Verdict.NOTE,
         wanted=wanted,
@@ -316,11 +123,10 @@ def _as_configured(name: str, facts: VehicleFacts, config: Config, rule: Rule | 
     )
 
 
-def _finding(facts: VehicleFacts, name: str, opinion: Opinion) -> Finding:
+def _finding(facts: VehicleFacts, name: str, opinion: Opinion, why: str) -> Finding:
     value = facts.number(name)
     weight = _WEIGHT_WANTED if "autopilot_params" in opinion.wanted else _WEIGHT_TABLE
     found = "not told" if value is None else f"{value:g}"
-    why = next((row.why for row in ROWS[facts.autopilot] if row.name == name), "")
     wanted = ": ".join(filter(None, (opinion.wanted, why)))
     return Finding(
         agent=facts.agent,

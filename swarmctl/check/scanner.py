@@ -18,7 +18,8 @@ from swarmctl.check.link_statistics import Answer, FrameStatistics
 from swarmctl.check.listener import NOWHERE, Address, Listener, ReceivedDatagram
 from swarmctl.check.parameter_reader import ParameterReader
 from swarmctl.mavlink.codec import Codec
-from swarmctl.mavlink.dialects import DIALECTS, Dialect
+from swarmctl.mavlink.dialects.dialect import Dialect
+from swarmctl.mavlink.dialects.registry import DIALECTS
 from swarmctl.mavlink.framing import frames
 from swarmctl.wall_clock import monotonic_us
 

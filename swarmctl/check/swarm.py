@@ -6,12 +6,13 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 
-from swarmctl.check.finding import SWARM, Finding, Verdict
+from swarmctl.check.finding import SWARM, Finding
 from swarmctl.check.link_facts import Ned, VehicleFacts
 from swarmctl.check.parameters import parameter_findings
 from swarmctl.check.vehicle import vehicle_findings
 from swarmctl.config import Config
 from swarmctl.core.types import Landed
+from swarmctl.core.verdict import Verdict
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, EXIT_START
 
 OK, NOTE, FIX = Verdict.OK, Verdict.NOTE, Verdict.FIX

@@ -15,9 +15,10 @@ from rich.text import Text
 
 from swarmctl.bus.peers import agent_name
 from swarmctl.check.change import Change
-from swarmctl.check.finding import SWARM, Finding, Verdict, worst_first
+from swarmctl.check.finding import SWARM, Finding, worst_first
 from swarmctl.check.link_facts import VehicleFacts
 from swarmctl.core.text import printable
+from swarmctl.core.verdict import Verdict
 
 _LINE = 2000  # characters of one line of the list
 _COLUMNS = ("vehicle", "what", "found", "wanted", "verdict")

@@ -5,15 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-from swarmctl.check.finding import Finding, Verdict
+from swarmctl.check.finding import Finding
 from swarmctl.check.link_facts import VehicleFacts
 from swarmctl.config import Config
 from swarmctl.core.types import FlightMode
-from swarmctl.mavlink.dialects import DIALECTS
+from swarmctl.core.verdict import Verdict
+from swarmctl.mavlink.dialects.registry import DIALECTS
 from swarmctl.mavlink.transport import parse_url
 
 OK, NOTE, FIX = Verdict.OK, Verdict.NOTE, Verdict.FIX
-_KNOWN_VERSIONS = {"PX4": (1, 18), "ArduCopter": (4, 6)}  # versions whose behaviour was measured
+_AUTOPILOTS = [dialect.name for dialect in DIALECTS.values()]
 _CRITICAL = 5  # MAV_STATE
 _SENSOR_BITS = {
     0: "gyro",
@@ -85,24 +86,24 @@ def _autopilot(facts: VehicleFacts, config: Config) -> Finding:
             topic="autopilot",
             verdict=verdict,
             found=found,
-            wanted="PX4 or ArduCopter",
+            wanted=" or ".join(_AUTOPILOTS),
             advice=advice,
             weight=weight,
         )
 
-    if not facts.autopilot:
-        return line(FIX, f"MAV_AUTOPILOT {facts.autopilot_number}", "swarmctl flies PX4 and ArduCopter", 95)
+    dialect = DIALECTS.get(facts.autopilot_number)
+    if dialect is None:
+        return line(FIX, f"MAV_AUTOPILOT {facts.autopilot_number}", f"swarmctl flies {' and '.join(_AUTOPILOTS)}", 95)
     version = facts.version
     if version is None:
         return line(NOTE, facts.autopilot, "it does not tell its version (AUTOPILOT_VERSION)")
     number = ".".join(map(str, version.firmware))
     found = " ".join(filter(None, (facts.autopilot, number, version.stage, version.git[:8])))
-    dialect = DIALECTS[facts.autopilot_number]
     if version.bytewise is not None and version.bytewise is not dialect.integers_bytewise:
         return line(
             FIX, found, "it encodes integer parameters otherwise than its kind does; values can't be trusted", 93
         )
-    known = _KNOWN_VERSIONS[facts.autopilot]
+    known = dialect.measured_version
     if version.firmware[:2] != known:
         return line(NOTE, found, f"behaviour was measured on {known[0]}.{known[1]}; fly it alone first")
     return line(OK, found)
@@ -121,7 +122,8 @@ def _sysid(facts: VehicleFacts, config: Config) -> Finding:
         return Finding(
             agent=facts.agent, topic="system id", verdict=OK, found=f"{facts.sysid}", wanted=f"{facts.wanted_sysid}"
         )
-    name = "SYSID_THISMAV" if facts.autopilot == "ArduCopter" else "MAV_SYS_ID"
+    dialect = DIALECTS.get(facts.autopilot_number)
+    name = "its system id" if dialect is None else dialect.sysid_parameter
     advice = f"set {name} = {facts.wanted_sysid} and reboot, or correct the configuration: an agent ignores all others"
     return Finding(
         agent=facts.agent,
@@ -150,8 +152,9 @@ def _link(facts: VehicleFacts, config: Config) -> Finding:
         )
 
     if not link.mavlink2:
-        name = "SERIALx_PROTOCOL = 2" if facts.autopilot == "ArduCopter" else "MAV_PROTO_VER = 2"
-        return line(FIX, "MAVLink 1 only", f"agents speak MAVLink 2: set {name}", 94)
+        dialect = DIALECTS.get(facts.autopilot_number)
+        cure = "" if dialect is None else f": set {dialect.mavlink2_setting}"
+        return line(FIX, "MAVLink 1 only", f"agents speak MAVLink 2{cure}", 94)
     if len(link.autopilots) > 1:
         ids = ", ".join(map(str, link.autopilots))
         return line(FIX, f"autopilots {ids}", "every vehicle needs a link of its own; give the others another port", 91)

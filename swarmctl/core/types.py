@@ -144,23 +144,6 @@ class PredictedPath:
     pos_ned_m: Array  # (N+1, 3)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Obstacle:
-    """Describes a sphere or an upright column to avoid, visible only from closer than `visibility_m`."""
-
-    center_ned_m: Array  # (3,)
-    radius_m: float  # physical radius
-    keep_out_m: float  # constraint radius, measured from the centre
-    visibility_m: float
-    vel_ned_m_s: Array  # (3,)
-    column: bool = False  # unbounded in height
-
-    def distance_m(self, pos_ned_m: Array) -> float:
-        """Return the distance [m] of a position (3,) from the centre, or from the axis of a column."""
-        axes = 2 if self.column else 3
-        return math.dist(self.center_ned_m[:axes], pos_ned_m[:axes])
-
-
 @dataclass(frozen=True, slots=True)
 class Reference:
     """Holds the desired motion over the horizon."""

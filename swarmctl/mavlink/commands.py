@@ -16,7 +16,7 @@ from pymavlink.dialects.v20 import development as mavlink
 
 from swarmctl.core.types import Command, Verb
 from swarmctl.mavlink.codec import Codec
-from swarmctl.mavlink.dialects import Dialect
+from swarmctl.mavlink.dialects.dialect import Dialect
 
 OWN_COMPID = 191  # MAV_COMP_ID_ONBOARD_COMPUTER, beside the vehicle's own system id
 _RETRY_US = 500_000

@@ -25,7 +25,7 @@ from mavsdk.plugins.mavlink_direct.mavlink_direct import MavlinkMessage
 from swarmctl.core.types import Command, Verb
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.commands import OWN_COMPID, CodecCommands, CommandResult
-from swarmctl.mavlink.dialects import Dialect, LongCommand
+from swarmctl.mavlink.dialects.dialect import Dialect, LongCommand
 
 _PARAMETERS = (Verb.PARAM_INT, Verb.PARAM_FLOAT, Verb.PARAM_GET)
 _DISCOVERY_S = 5.0

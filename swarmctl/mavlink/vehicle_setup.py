@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from swarmctl.core.types import Command, Verb
 from swarmctl.mavlink.autopilot import Autopilot
 from swarmctl.mavlink.commands import CommandPort, CommandResult
-from swarmctl.mavlink.dialects import GPS_GLOBAL_ORIGIN, Dialect
+from swarmctl.mavlink.dialects.dialect import GPS_GLOBAL_ORIGIN, Dialect
 
 _ORIGIN_EVERY_US = 1_000_000
 _ORIGIN_SOON_US = 200_000  # positions do not fit: there is no state until the origin is reported

@@ -17,10 +17,10 @@ from pydantic import ValidationError
 
 from swarmctl.config import load
 from swarmctl.core.params import explained
-from swarmctl.core.simulated import FAULTS, FaultParams
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.ops.operator import RunningLaunch
 from swarmctl.ops.processes import control_socket
+from swarmctl.simulator_config import FAULTS, FaultParams
 
 _ANSWER_S = 3.0
 _LARGEST = 8192

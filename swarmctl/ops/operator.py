@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import contextlib
 import json
-import math
 import os
 import stat
 import tempfile
@@ -21,17 +20,16 @@ from pathlib import Path
 
 import msgspec
 import psutil
+from pydantic import ValidationError
 
 from swarmctl.bus.orders import EVERYBODY, order_messages
 from swarmctl.bus.peers import agent_name
 from swarmctl.bus.topics import (
     COMMAND,
-    MAX_OBSTACLE_M,
     MAX_OBSTACLES,
     OBSTACLES,
     OPERATOR,
     STATUS,
-    ObstacleMessage,
     ObstaclesMessage,
     StatusMessage,
     decode_obstacles,
@@ -39,6 +37,7 @@ from swarmctl.bus.topics import (
     encode_message,
 )
 from swarmctl.bus.zenoh_bus import ZenohBus
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import Order
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import read_file, replace_bytes
@@ -170,7 +169,7 @@ def read_obstacles(launch: RunningLaunch) -> ObstaclesMessage:
 
 
 def change_obstacles(
-    launch: RunningLaunch, change: Callable[[tuple[ObstacleMessage, ...]], tuple[ObstacleMessage, ...]]
+    launch: RunningLaunch, change: Callable[[tuple[Obstacle, ...]], tuple[Obstacle, ...]]
 ) -> ObstaclesMessage:
     """Replace the obstacle list by `change(list)` and wait until the launch repeats the new one."""
     with _joined(launch) as bus:
@@ -182,9 +181,18 @@ def change_obstacles(
         return _obstacles(bus, new.version, encode_message(new))
 
 
+_OPTIONS = {  # of `obstacle add`, by key
+    "center_ned_m": "--center",
+    "radius_m": "--radius",
+    "keep_out_m": "--keep-out",
+    "visibility_m": "--visibility",
+    "vel_ned_m_s": "--velocity",
+}
+
+
 def obstacle(
     center: str, radius_m: float, keep_out_m: float, visibility_m: float, velocity: str, column: bool = False
-) -> ObstacleMessage:
+) -> Obstacle:
     """Return the obstacle that a command line describes; vectors are `north,east,down`, shared frame.
 
     Raises:
@@ -192,16 +200,18 @@ def obstacle(
     """
     problems: list[str] = []
     vectors = [_vector(key, text, problems) for key, text in (("--center", center), ("--velocity", velocity))]
-    lengths = {"--radius": radius_m, "--keep-out": keep_out_m, "--visibility": visibility_m}
-    for key, value_m in lengths.items():
-        if not 0.0 < value_m < MAX_OBSTACLE_M:
-            problems.append(f"{key} {value_m}: must be > 0 and < {MAX_OBSTACLE_M:.0f} m")
+    values = {"radius_m": radius_m, "keep_out_m": keep_out_m, "visibility_m": visibility_m, "column": column}
+    try:
+        described = Obstacle.model_validate(values | {"center_ned_m": vectors[0], "vel_ned_m_s": vectors[1]})
+    except ValidationError as error:
+        problems += [f"{_OPTIONS[str(e['loc'][0])]} {e['input']}: {e['msg'].lower()}" for e in error.errors()]
+        raise ConfigError("obstacle", problems) from error
     if problems:
         raise ConfigError("obstacle", problems)
-    return ObstacleMessage(vectors[0], radius_m, keep_out_m, visibility_m, vectors[1], column)
+    return described
 
 
-def without(known: tuple[ObstacleMessage, ...], number: int) -> tuple[ObstacleMessage, ...]:
+def without(known: tuple[Obstacle, ...], number: int) -> tuple[Obstacle, ...]:
     """Return the list without the member of index `number`.
 
     Raises:
@@ -218,8 +228,6 @@ def _vector(key: str, text: str, problems: list[str]) -> tuple[float, float, flo
     except ValueError:
         problems.append(f"{key} {text!r}: write three numbers, north,east,down, for example 1.5,0,-2")
         return (0.0, 0.0, 0.0)
-    if not all(math.isfinite(c) and abs(c) < MAX_OBSTACLE_M for c in (north, east, down)):
-        problems.append(f"{key} {text!r}: every number must be finite and within {MAX_OBSTACLE_M:.0f}")
     return (north, east, down)
 
 

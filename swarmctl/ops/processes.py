@@ -7,7 +7,6 @@ Every child has its own session, so that Ctrl-C in the terminal reaches the laun
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import secrets
 import signal
@@ -23,10 +22,10 @@ import numpy as np
 import psutil
 
 from swarmctl.bus.peers import agent_name
+from swarmctl.bus.topics import ObstaclesMessage, encode_message
 from swarmctl.bus.zenoh_bus import socket_file
-from swarmctl.config import Config, SitlParams
+from swarmctl.config import Config
 from swarmctl.control.reference.mission import MissionReference
-from swarmctl.core.simulated import RealismParams
 from swarmctl.errors import StartError
 from swarmctl.process_lifetime import PARENT_ENV
 
@@ -96,36 +95,14 @@ def sitl_command(
     config: Config, context: RunContext, ports: Sequence[int], sockets: Sequence[socket.socket] = ()
 ) -> Command:
     """Return the command of the built-in simulator, which sends from `sockets`, or own ports, to loopback `ports`."""
-    sitl, swarm = config.sitl, config.swarm
-    starts = config.starts_ned_m()
-    if sitl.start == "ground":
-        starts = tuple((x, y, sitl.ground_z_m) for x, y, _ in starts)
-    argv = _python("-m", "sitl", "--vehicles", f"{swarm.agents}", "--preset", sitl.preset)
-    argv += ("--attitude-gains", sitl.attitude_gains, "--estimator", sitl.estimator)
-    argv += ("--autopilot", sitl.autopilot_kind, "--ekf-ready", f"{sitl.ekf_ready_s!r}")
-    argv += ("--gcs-port", f"{sitl.gcs_port}") if sitl.gcs_port else ()
-    argv += () if sitl.reject_bad_setpoints else ("--accept-bad-setpoints",)
-    argv += ("--spawn=" + ";".join(",".join(repr(c) for c in start) for start in starts),)
-    argv += (f"--origin={swarm.origin_lat_deg!r},{swarm.origin_lon_deg!r},{swarm.origin_alt_m!r}",)
-    argv += ("--remote-ports", ",".join(str(port) for port in ports), "--seed", f"{config.seed}")
+    argv = _python("-m", "sitl", "--config-json", config.simulator().model_dump_json(exclude_defaults=True))
+    argv += ("--remote-ports", ",".join(str(port) for port in ports))
     fds = tuple(sock.fileno() for sock in sockets)
     argv += ("--local-fds", ",".join(map(str, fds))) if fds else ()
-    argv += ("--physics-hz", f"{sitl.physics_hz}", "--mass-scale", f"{sitl.mass_scale!r}", "--start", sitl.start)
-    argv += _realism(sitl)
-    argv += (
-        "--control",
-        f"{control_socket(context.endpoint)}",
-        "--events",
-        f"{context.directory / 'sitl.events.jsonl'}",
-    )
+    argv += ("--control", f"{control_socket(context.endpoint)}")
+    argv += ("--events", f"{context.directory / 'sitl.events.jsonl'}")
     argv += ("--truth", f"{context.directory / 'truth.bin'}", "--die-with-parent")
     return Command(SITL, argv, fds)
-
-
-def _realism(sitl: SitlParams) -> tuple[str, ...]:
-    """Return the simulator's option for realism parameters that differ from their defaults."""
-    wanted = sitl.realism()
-    return () if wanted == RealismParams() else ("--realism-json", wanted.model_dump_json())
 
 
 def control_socket(endpoint: str) -> Path:
@@ -141,8 +118,8 @@ def viewer_command(config: Config, context: RunContext, port: int, view: bool) -
     argv += ("--look-at", *(f"{c:.3f}" for c in center), "--extent", f"{extent_m:.3f}")
     argv += ("--rate-hz", f"{config.telemetry.rate_hz!r}", "--separation", f"{config.separation.radius_m!r}")
     argv += ("--limit", f"{config.limits.min_separation_m!r}")
-    obstacles = [obstacle.model_dump() for obstacle in config.obstacles]
-    argv += ("--obstacles-json", json.dumps(obstacles), "--die-with-parent")
+    obstacles = encode_message(ObstaclesMessage(1, config.obstacles)).decode()
+    argv += ("--obstacles-json", obstacles, "--die-with-parent")
     return Command(VIEWER, argv + (("--view",) if view else ()))
 
 

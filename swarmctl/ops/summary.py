@@ -70,16 +70,8 @@ def rewrite_report(directory: Path) -> Path:
 
 def _rules(config: Config, result: LaunchResult) -> Rules:
     """Return the limits of the configuration, with obstacles as an operator left them."""
-    from swarmctl.telemetry.referee import ObstacleRule
-
     rules = config.rules()
-    if result.obstacles is None:
-        return rules
-    changed = tuple(
-        ObstacleRule(item.center_ned_m, item.keep_out_m, item.vel_ned_m_s, since_us, item.column)
-        for item, since_us in result.obstacles.items()
-    )
-    return replace(rules, obstacles=changed)
+    return rules if result.obstacles is None else replace(rules, obstacles=result.obstacles)
 
 
 def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...]:

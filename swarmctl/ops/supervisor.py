@@ -18,14 +18,13 @@ from swarmctl.bus.topics import (
     COMMAND,
     OBSTACLES,
     STATUS,
-    ObstacleMessage,
     ObstaclesMessage,
     decode_obstacles,
     decode_status,
     encode_message,
-    first_obstacles,
 )
 from swarmctl.config import Config
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import Order
 from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START
@@ -72,7 +71,7 @@ class LaunchResult:
     has_armed: bool = False  # an agent has requested arming
     left: tuple[str, ...] = ()  # vehicles that may still be armed or in the air, in words
     interrupted: bool = False
-    obstacles: dict[ObstacleMessage, int | None] | None = None  # obstacle -> since when [us UTC]; None: as configured
+    obstacles: dict[Obstacle, int | None] | None = None  # obstacle -> since when [us UTC]; None: as configured
 
     @property
     def outcome(self) -> str:
@@ -109,7 +108,7 @@ class FlightSupervisor:
         self._display = display
         self._result = LaunchResult()
         self._views = [AgentView(agent=agent) for agent in range(config.swarm.agents)]
-        self._configured = first_obstacles(o.model_dump() for o in config.obstacles)
+        self._configured = ObstaclesMessage(1, config.obstacles)
         self._obstacles = self._configured
         self._obstacles_said_s = 0.0
         self._started_s = time.monotonic()

@@ -87,19 +87,11 @@ class Window(NamedTuple):
 
 
 class Ball(NamedTuple):
-    """A sphere in the oblique view, in metres."""
+    """A sphere in the view from above and in the oblique one, in metres."""
 
     center_ned_m: tuple[float, float, float]
     radius_m: float
     style: Literal["obstacle", "keepout"]
-
-
-class Circle(NamedTuple):
-    """A circle in the plane of the top view, in metres."""
-
-    x: float
-    y: float
-    radius: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -160,10 +152,14 @@ def time_chart(
     return _figure(title, lines, f'<svg viewBox="0 0 {WIDTH} {height}" role="img">{body}</svg>')
 
 
-def top_view(title: str, lines: Sequence[Line], circles: Sequence[Circle], points: int = 600) -> str:
+def top_view(title: str, lines: Sequence[Line], balls: Sequence[Ball], points: int = 600) -> str:
     """Return a figure seen from above with equal scales; x is to the right, y up."""
-    xs = [line.x for line in lines] + [np.array([c.x - c.radius, c.x + c.radius]) for c in circles]
-    ys = [line.y for line in lines] + [np.array([c.y - c.radius, c.y + c.radius]) for c in circles]
+    xs = [line.x for line in lines] + [
+        np.array([b.center_ned_m[1] - b.radius_m, b.center_ned_m[1] + b.radius_m]) for b in balls
+    ]
+    ys = [line.y for line in lines] + [
+        np.array([b.center_ned_m[0] - b.radius_m, b.center_ned_m[0] + b.radius_m]) for b in balls
+    ]
     (x_low, x_high), (y_low, y_high) = _value_range(xs), _value_range(ys)
     wide = WIDTH - _LEFT - _RIGHT
     scale = min(wide / (x_high - x_low), 420 / (y_high - y_low))
@@ -172,9 +168,9 @@ def top_view(title: str, lines: Sequence[Line], circles: Sequence[Circle], point
     x = _Axis(low=x_low - extra_x / 2, high=x_high + extra_x / 2, first=_LEFT, last=WIDTH - _RIGHT)
     y = _Axis(low=y_low - extra_y / 2, high=y_high + extra_y / 2, first=height - _BOTTOM, last=_TOP)
     parts = [_grid(x, y)]
-    for circle in circles:
-        cx, cy = float(x.px(np.array(circle.x))), float(y.px(np.array(circle.y)))
-        parts.append(f'<circle class="obstacle" cx="{cx:.1f}" cy="{cy:.1f}" r="{circle.radius * scale:.1f}"/>')
+    for ball in balls:
+        cx, cy = float(x.px(np.array(ball.center_ned_m[1]))), float(y.px(np.array(ball.center_ned_m[0])))
+        parts.append(f'<circle class="obstacle" cx="{cx:.1f}" cy="{cy:.1f}" r="{ball.radius_m * scale:.1f}"/>')
     for line in lines:
         kept = (
             np.unique(np.linspace(0, max(0, len(line.x) - 1), points).astype(int)) if len(line.x) else np.zeros(0, int)

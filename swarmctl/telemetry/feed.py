@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 
 from swarmctl.bus import topics
 from swarmctl.bus.peers import Bus, agent_name
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.records import unpack_tick
 from swarmctl.core.types import Array
-from swarmctl.telemetry.obstacles import MovingObstacle
 
 
 class Batch(NamedTuple):
@@ -66,21 +66,16 @@ class Feed:
             self._epoch_us = min(int(samples[0][0]["utc_us"][0]) for samples in arrived.values())
         return [batch for agent, samples in arrived.items() for batch in self._batch(agent, samples)]
 
-    def take_obstacles(self) -> list[MovingObstacle] | None:
+    def take_obstacles(self) -> tuple[Obstacle, ...] | None:
         """Return the operator's newest list of obstacles; None when there is no newer one."""
-        newest: list[MovingObstacle] | None = None
+        newest: tuple[Obstacle, ...] | None = None
         for _, payload in self._bus.receive(topics.OBSTACLES):
             message = topics.decode_obstacles(payload)
             if message is None:
                 self.malformed += 1
             elif message.version > self._version:
                 self._version = message.version
-                newest = [
-                    MovingObstacle(
-                        np.array(o.center_ned_m), o.radius_m, o.keep_out_m, np.array(o.vel_ned_m_s), o.column
-                    )
-                    for o in message.obstacles
-                ]
+                newest = message.obstacles
         return newest
 
     def _batch(self, agent: int, samples: list[tuple[NDArray[np.void], Array]]) -> list[Batch]:

@@ -8,11 +8,12 @@ import time
 import uuid
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.errors import StartError
 from swarmctl.files import replaced_by_program
 from swarmctl.telemetry.referee import RunData
@@ -103,7 +104,7 @@ def simulated_recording(
     agents: int,
     separation_m: float,
     limit_m: float,
-    obstacles: Sequence[dict[str, Any]] = (),
+    obstacles: Sequence[Obstacle] = (),
 ) -> Path:
     """Write `telemetry.rrd` of a finished run from its recorded ticks, which contain no predicted paths.
 
@@ -113,11 +114,10 @@ def simulated_recording(
         agents: size of the swarm.
         separation_m: separation that agents keep.
         limit_m: distance below which the referee sees a violation.
-        obstacles: as in the configuration: center_ned_m, radius_m, keep_out_m, vel_ned_m_s.
+        obstacles: of the configuration.
     """
     import rerun as rr
 
-    from swarmctl.telemetry.obstacles import read_obstacles
     from swarmctl.telemetry.scene import Scene
 
     path = directory / RECORDING
@@ -128,14 +128,13 @@ def simulated_recording(
     scene = Scene(rec, agents, separation_m, limit_m, _bounds(flown))
     scene.begin()
     epoch_us = min((int(rows["utc_us"][0]) for rows in flown.values()), default=0)
-    drawn = read_obstacles(list(obstacles)) or []
-    scene.obstacles(drawn, 0, 0.0)
+    scene.obstacles(obstacles, 0, 0.0)
     for first in range(0, max(map(len, flown.values()), default=0), _CHUNK_TICKS):
         for agent, rows in flown.items():
             chunk = rows[first : first + _CHUNK_TICKS]
             scene.ticks(agent, chunk["utc_us"] - epoch_us, chunk, None)
-        if any(obstacle.moves for obstacle in drawn):
-            scene.obstacles(drawn, first * 20_000, first * 0.02)
+        if any(obstacle.moves for obstacle in obstacles):
+            scene.obstacles(obstacles, first * 20_000, first * 0.02)
         scene.plots()
     rec.flush(timeout_sec=30)
     rec.disconnect()

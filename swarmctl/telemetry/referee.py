@@ -9,13 +9,14 @@ from __future__ import annotations
 import itertools
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from dataclasses import dataclass, field
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl import __version__
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Array, Mode, PlanStatus
 from swarmctl.telemetry.hearing import refused_peers, unheard
 from swarmctl.telemetry.json_safe import finite, json_safe
@@ -35,23 +36,13 @@ _MAX_LISTED = 10  # largest number of violations of one kind listed in full
 _DURATION_SLACK_S = 1.0  # mission time that may be missing at the end of a completed run
 
 
-class ObstacleRule(NamedTuple):
-    """A sphere, or a column of any height, that vehicles must not enter."""
-
-    center_ned_m: Sequence[float]  # (3,) when it becomes effective
-    keep_out_m: float  # radius around the centre
-    vel_ned_m_s: Sequence[float] = (0.0, 0.0, 0.0)
-    since_utc_us: int | None = None  # when an operator set it; None: effective throughout, centre as at mission start
-    column: bool = False
-
-
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rules:
     """Limits by which a run is judged."""
 
     agents: int
     required_separation_m: float
-    obstacles: tuple[ObstacleRule, ...] = ()
+    obstacles: Mapping[Obstacle, int | None] = field(default_factory=dict)  # since when, UTC [us]; None: always
     obstacle_margin_m: float = 0.05  # allowed intrusion into keep_out_m
     deadline_misses_01: float = 0.2  # largest fraction of due ticks, flown or skipped, that may miss their deadline
     solver_name: str = "osqp"
@@ -178,15 +169,15 @@ def _judge_obstacles(tracks: Tracks, rules: Rules, clock: _MissionClock) -> tupl
     """Return distance and required distance to the centre (axis of a column) of the obstacle with the least margin."""
     worst: tuple[float, float] | None = None  # (distance, required) with the least margin
     violations = []
-    for number, rule in enumerate(rules.obstacles):
-        required_m = rule.keep_out_m - rules.obstacle_margin_m
-        since_us = clock.start_us if rule.since_utc_us is None else rule.since_utc_us - clock.utc_offset_us
+    for number, (obstacle, since_utc_us) in enumerate(rules.obstacles.items()):
+        required_m = obstacle.keep_out_m - rules.obstacle_margin_m
+        since_us = clock.start_us if since_utc_us is None else since_utc_us - clock.utc_offset_us
         elapsed_s = (tracks.t_us - since_us) / 1e6
-        center_ned_m = np.asarray(rule.center_ned_m) + elapsed_s[:, None] * np.asarray(rule.vel_ned_m_s)  # (T, 3)
-        counts = np.ones(len(elapsed_s), bool) if rule.since_utc_us is None else elapsed_s >= 0.0
+        center_ned_m = obstacle.center_after(elapsed_s[:, None])  # (T, 3)
+        counts = np.ones(len(elapsed_s), bool) if since_utc_us is None else elapsed_s >= 0.0
         for agent in range(rules.agents):
             apart_m = tracks.pos_ned_m[:, agent] - center_ned_m
-            distance_m = np.linalg.norm(apart_m[:, : 2 if rule.column else 3], axis=1)
+            distance_m = np.linalg.norm(apart_m[:, : obstacle.axes], axis=1)
             distance_m[~counts] = np.nan
             if not np.isfinite(distance_m).any():
                 continue

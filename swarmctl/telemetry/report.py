@@ -15,7 +15,7 @@ from swarmctl.core.tick_record import CURVES, Curve
 from swarmctl.core.types import Array, Mode, Phase
 from swarmctl.files import replace_text
 from swarmctl.telemetry.attitude import roll_pitch_rad
-from swarmctl.telemetry.charts import Circle, Limit, Line, Span, state_bars, time_chart, top_view
+from swarmctl.telemetry.charts import Ball, Limit, Line, Span, state_bars, time_chart, top_view
 from swarmctl.telemetry.palette import MODE_RGB, PHASE_RGB, REFERENCE_RGB, SUM_RGB, agent_rgb, css
 from swarmctl.telemetry.referee import Rules, RunData
 from swarmctl.telemetry.report_style import STYLE
@@ -125,9 +125,9 @@ class _Page:
                     x=pos_ned_m[:, 1], y=pos_ned_m[:, 0], color=css(agent_rgb(agent)), label=f"agent {agent}", width=1.6
                 )
             )
-        rules = self._rules.obstacles if self._rules else ()
-        circles = [Circle(rule.center_ned_m[1], rule.center_ned_m[0], rule.keep_out_m) for rule in rules]
-        return top_view("From above: north up, east right [m]", lines, circles, self._points)
+        obstacles = self._rules.obstacles if self._rules else ()
+        balls = [Ball(obstacle.center_ned_m, obstacle.keep_out_m, "keepout") for obstacle in obstacles]
+        return top_view("From above: north up, east right [m]", lines, balls, self._points)
 
     def flight(self) -> Iterator[str]:
         yield self._tracking_error()

@@ -13,11 +13,11 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from swarmctl import __version__
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.tick_record import CURVES
 from swarmctl.core.types import Array, Mode, Phase, PlanStatus
 from swarmctl.telemetry.attitude import roll_pitch_rad
 from swarmctl.telemetry.layout import TIMELINE, SceneBounds, layout
-from swarmctl.telemetry.obstacles import MovingObstacle
 from swarmctl.telemetry.palette import LIMIT_RGB, MODE_RGB, PHASE_RGB, REFERENCE_RGB, agent_rgb
 from swarmctl.telemetry.quad_mesh import quad_glb
 from swarmctl.telemetry.separation_feed import SeparationFeed
@@ -104,7 +104,7 @@ class Scene:
         for kind, colors in (("phase", PHASE_RGB), ("mode", MODE_RGB)):
             self._static(f"state/{agent}/{kind}", _state_style(colors))
 
-    def obstacles(self, obstacles: Sequence[MovingObstacle], t_us: int, elapsed_s: float) -> None:
+    def obstacles(self, obstacles: Sequence[Obstacle], t_us: int, elapsed_s: float) -> None:
         """Replace the drawn obstacles from `t_us` on; `elapsed_s` is the time since the obstacles were set."""
         self._rec.set_time(TIMELINE, duration=np.timedelta64(t_us, "us"))
         for path, radii_m, mode, alpha in (

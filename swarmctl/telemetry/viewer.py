@@ -8,22 +8,22 @@ it was started by hand); it ignores Ctrl-C.
 from __future__ import annotations
 
 import argparse
-import json
 import os
 import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import psutil
 
+from swarmctl.bus.topics import decode_obstacles
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.errors import EXIT_OK, EXIT_USAGE, StartError, SwarmError
 from swarmctl.files import replace_text
 from swarmctl.process_lifetime import StopRequest, die_with_parent
-from swarmctl.telemetry.obstacles import MovingObstacle, read_obstacles
 from swarmctl.telemetry.recordings import APPLICATION, RECORDING, has_display, open_viewer
 from swarmctl.telemetry.view_ports import HOST, PORTS_TRIED, free_view_ports
 
@@ -42,12 +42,12 @@ def main(arguments: list[str] | None = None) -> int:
     stop = StopRequest(signal.SIGTERM, signal.SIGHUP)
     if options.die_with_parent:
         die_with_parent(signal.SIGTERM)
-    obstacles = read_obstacles(_listed(options.obstacles_json))
-    if obstacles is None:
-        print("viewer: --obstacles-json: give a JSON list of obstacles", file=sys.stderr)
+    message = decode_obstacles(options.obstacles_json.encode())
+    if message is None:
+        print("viewer: --obstacles-json: give a message of obstacles, as on the bus", file=sys.stderr)
         return EXIT_USAGE
     try:
-        return _run(options, obstacles, stop)
+        return _run(options, message.obstacles, stop)
     except SwarmError as error:
         print(f"viewer: {error}", file=sys.stderr)
         return error.exit_code
@@ -63,7 +63,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--rate-hz", type=float, default=10.0, help="batches a second")
     parser.add_argument("--separation", type=float, default=0.9, help="distance agents keep [m]")
     parser.add_argument("--limit", type=float, help="distance that is a violation [m]; default: --separation")
-    parser.add_argument("--obstacles-json", default="[]")
+    parser.add_argument("--obstacles-json", default='{"version": 0, "obstacles": []}')
     parser.add_argument("--look-at", type=float, nargs=3, default=(0.0, 0.0, -2.0), help="middle of the scene, NED [m]")
     parser.add_argument("--extent", type=float, default=6.0, help="from there to the edge of the scene [m]")
     parser.add_argument("--view", action="store_true", help="open the native viewer when there is a display")
@@ -71,14 +71,7 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _listed(text: str) -> object:
-    try:
-        return json.loads(text)
-    except json.JSONDecodeError:
-        return None
-
-
-def _run(options: argparse.Namespace, obstacles: list[MovingObstacle], stop: StopRequest) -> int:
+def _run(options: argparse.Namespace, obstacles: Sequence[Obstacle], stop: StopRequest) -> int:
     from swarmctl.bus.zenoh_bus import ZenohBus
     from swarmctl.telemetry.feed import Feed, listens_to
     from swarmctl.telemetry.layout import SceneBounds
@@ -104,7 +97,7 @@ def _run(options: argparse.Namespace, obstacles: list[MovingObstacle], stop: Sto
 class Pump:
     """Draws everything that has arrived, at a fixed rate."""
 
-    def __init__(self, feed: Any, scene: Any, obstacles: list[MovingObstacle]) -> None:
+    def __init__(self, feed: Any, scene: Any, obstacles: Sequence[Obstacle]) -> None:
         self._feed = feed
         self._scene = scene
         self._obstacles = obstacles

@@ -10,12 +10,13 @@ from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as mav
 
 from sitl.arducopter.autopilot import ArduCopter
-from sitl.world import SitlParams, SitlWorld
+from sitl.world import SitlWorld
 from swarmctl.core.clock import SimClock
 from swarmctl.core.frames import quat_from_euler
 from swarmctl.core.types import Landed
 from swarmctl.mavlink.framing import frames
 from swarmctl.mavlink.transport import pipe_pair
+from swarmctl.simulator_config import SimulatorConfig
 
 STABILIZE, ALT_HOLD, GUIDED, LOITER, RTL, LAND, BRAKE = 0, 2, 4, 5, 6, 9, 17
 ACCEPTED, DENIED, UNSUPPORTED, FAILED = 0, 2, 3, 4
@@ -41,9 +42,9 @@ class Bench:
         vehicle_end, self.link = pipe_pair(self.clock.now_us)
         ground_end, self._gcs_link = pipe_pair(self.clock.now_us)
         settings = {"preset": "arducopter", "physics_hz": 250, **sitl}
-        params = SitlParams(
+        params = SimulatorConfig(
             vehicles=1,
-            spawn_ned_m=np.array([SPAWN_NED_M]),
+            spawn_ned_m=[SPAWN_NED_M],
             ekf_ready_s=ekf_ready_s,
             autopilot_kind="arducopter",
             **settings,

@@ -9,13 +9,13 @@ from typing import Any
 import numpy as np
 from pymavlink.dialects.v20 import development as mav
 
-from sitl.world import SitlParams, SitlWorld, line_of_spawns
+from sitl.world import SitlWorld
 from swarmctl.core.clock import SimClock
 from swarmctl.core.frames import quat_from_euler
-from swarmctl.core.simulated import RealismParams
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames, message_id
 from swarmctl.mavlink.transport import pipe_pair
+from swarmctl.simulator_config import SimulatorConfig
 
 NAN = math.nan
 LOITER, OFFBOARD = (1, 4, 3), (1, 6, 0)
@@ -27,18 +27,15 @@ class FlownWorld:
     Args:
         vehicles: how many, 1 m apart.
         realism: of the world.
-        params: further ones of `SitlParams`.
+        params: further ones of `SimulatorConfig`.
     """
 
     def __init__(self, vehicles: int = 1, realism: dict[str, Any] | None = None, **params: Any) -> None:
         self.clock = SimClock()
         pairs = [pipe_pair(self.clock.now_us) for _ in range(vehicles)]
         self.clients = [client for client, _ in pairs]
-        outfit = RealismParams.model_validate(realism or {})
-        self.world = SitlWorld(
-            SitlParams(vehicles=vehicles, spawn_ned_m=line_of_spawns(vehicles), realism=outfit, **params),
-            [end for _, end in pairs],
-        )
+        config = SimulatorConfig(vehicles=vehicles, **(realism or {}), **params)
+        self.world = SitlWorld(config, [end for _, end in pairs])
         self._codec = Codec(255, 190)
 
     def step(self, seconds: float, every: Any = None) -> None:

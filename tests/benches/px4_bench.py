@@ -12,11 +12,12 @@ from pymavlink.dialects.v20 import development as mav
 from sitl.px4.autopilot import Autopilot
 from sitl.px4.link.endpoint import Endpoint
 from sitl.px4.modes import Px4Mode, Result
-from sitl.world import SitlParams, SitlWorld
+from sitl.world import SitlWorld
 from swarmctl.core.clock import SimClock
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames, message_id
 from swarmctl.mavlink.transport import pipe_pair
+from swarmctl.simulator_config import SimulatorConfig
 
 NAN = math.nan
 LEVEL = [1.0, 0.0, 0.0, 0.0]
@@ -36,7 +37,7 @@ class Bench:
 
     def __init__(
         self,
-        preset: str = "thesis",
+        preset: Any = "thesis",
         wait_s: float = 0.2,
         ekf_ready_s: float = 0.1,
         *,
@@ -47,9 +48,7 @@ class Bench:
         self.clock = SimClock()
         vehicle_end, self.link = pipe_pair(self.clock.now_us)
         vehicle_gcs_end, self.gcs_link = pipe_pair(self.clock.now_us)
-        sitl = SitlParams(
-            vehicles=1, spawn_ned_m=np.array([SPAWN_NED_M]), preset=preset, ekf_ready_s=ekf_ready_s, **params
-        )
+        sitl = SimulatorConfig(vehicles=1, spawn_ned_m=[SPAWN_NED_M], preset=preset, ekf_ready_s=ekf_ready_s, **params)
         self.world = SitlWorld(sitl, [vehicle_end], [vehicle_gcs_end] if gcs else [])
         pilot, endpoint = self.world.autopilots[0], self.world.endpoints[0]
         assert isinstance(pilot, Autopilot)
@@ -141,7 +140,7 @@ class Bench:
         return self
 
 
-def taken_off(preset: str = "thesis", **kwargs: Any) -> Bench:
+def taken_off(preset: Any = "thesis", **kwargs: Any) -> Bench:
     bench = Bench(preset, **COARSE, **kwargs)
     assert bench.command(22, *[NAN] * 7) == Result.ACCEPTED
     assert bench.arm() == Result.ACCEPTED

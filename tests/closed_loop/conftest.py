@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,12 +17,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-import sitl.lockstep
 from sitl.lockstep import Lockstep
-from sitl.world import SitlParams
 from swarmctl.config import Config, load
 from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.types import Array, Mode, Phase
+from swarmctl.simulator_config import SimulatorConfig
 
 ROOT = Path(__file__).parents[2]
 _NUDGE_M = 1e-3
@@ -150,14 +149,15 @@ def mission_is_over(lockstep: Lockstep) -> bool:
 @pytest.fixture(scope="session", autouse=True)
 def nudged_starts(request: pytest.FixtureRequest) -> Iterator[None]:
     """Shift the vehicles of every flight by up to a millimetre, by the seed of `--nudged`."""
-    seed, as_configured = int(request.config.getoption("--nudged")), sitl.lockstep.sitl_params
+    seed, as_configured = int(request.config.getoption("--nudged")), Config.simulator
 
-    def elsewhere(config: Config) -> SitlParams:
-        params = as_configured(config)
-        return replace(params, spawn_ned_m=nudged(params.spawn_ned_m, seed))
+    def elsewhere(config: Config) -> SimulatorConfig:
+        simulator = as_configured(config)
+        spawns_ned_m = nudged(np.array(simulator.spawn_ned_m), seed)
+        return simulator.model_copy(update={"spawn_ned_m": tuple(map(tuple, spawns_ned_m.tolist()))})
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(sitl.lockstep, "sitl_params", elsewhere)
+        patch.setattr(Config, "simulator", elsewhere)
         yield
 
 

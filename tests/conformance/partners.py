@@ -10,11 +10,10 @@ import time
 from collections.abc import Callable
 from typing import Protocol
 
-import numpy as np
-
-from sitl.world import SitlParams, SitlWorld
+from sitl.world import SitlWorld
 from swarmctl.core.clock import SimClock
 from swarmctl.mavlink.transport import Datagram, Transport, open_transport, pipe_pair
+from swarmctl.simulator_config import SimulatorConfig
 from tests.conformance.vocabulary import GCS_LINK, OFFBOARD_LINK
 
 EKF_READY_S = 4.0  # as measured on PX4
@@ -74,8 +73,8 @@ class InProcess:
         pairs = {name: pipe_pair(self._clock.now_us) for name in (OFFBOARD_LINK, GCS_LINK)}
         self.links: dict[str, Transport] = {name: ours for name, (_, ours) in pairs.items()}
         ready_s = EKF_READY_S if booting else 0.1
-        params = SitlParams(
-            vehicles=1, spawn_ned_m=np.zeros((1, 3)), preset="x500", ekf_ready_s=ready_s, reject_bad_setpoints=False
+        params = SimulatorConfig(
+            vehicles=1, preset="x500", ekf_ready_s=ready_s, reject_bad_setpoints=False
         )  # the sheet's PX4 validates nothing
         self.world = SitlWorld(params, [pairs[OFFBOARD_LINK][0]], [pairs[GCS_LINK][0]])
 

@@ -24,7 +24,7 @@ def simulator(preset: str = "x500", speed: float = SPEED, port: int | None = Non
     process = subprocess.Popen(
         [
             *(sys.executable, "-m", "sitl", "--vehicles", "1", "--preset", preset, "--speed", str(speed)),
-            *("--ekf-ready", "0.2", "--remote-ports", str(port), "--local-port", str(free_ports(1)[0])),
+            *("--ekf-ready-s", "0.2", "--remote-ports", str(port), "--local-port", str(free_ports(1)[0])),
         ],
         cwd=ROOT,
         env={**os.environ, "PYTHONPATH": str(ROOT)},

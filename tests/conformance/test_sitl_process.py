@@ -81,7 +81,7 @@ def test_a_second_simulator_takes_the_next_ports() -> None:
 
 
 def test_the_first_sender_is_the_only_one_answered_and_obeyed() -> None:
-    process, [(local, _)] = start("--vehicles", "1", "--ekf-ready", "0.2")
+    process, [(local, _)] = start("--vehicles", "1", "--ekf-ready-s", "0.2")
     codec = Codec(1, 191)
     arm = codec.encode(mav.MAVLink_command_long_message(1, 1, 400, 0, 1, *[0.0] * 6))
     beat = codec.encode(mav.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))

@@ -39,12 +39,12 @@ class Simulator:
         self.ports = free_ports(vehicles)
         arguments = ["--vehicles", f"{vehicles}", "--remote-ports", ",".join(map(str, self.ports))]
         arguments += [
-            "--ekf-ready",
+            "--ekf-ready-s",
             "0.2",
             "--local-port",
             f"{free_ports(1)[0]}",
             "--die-with-parent",
-            "--autopilot",
+            "--autopilot-kind",
             autopilot,
         ]
         self.process = subprocess.Popen(

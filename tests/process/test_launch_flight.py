@@ -19,7 +19,6 @@ from swarmctl.bus.topics import (
     OBSTACLES,
     OPERATOR,
     STATUS,
-    ObstacleMessage,
     ObstaclesMessage,
     StatusMessage,
     decode_command,
@@ -27,6 +26,7 @@ from swarmctl.bus.topics import (
     encode_message,
 )
 from swarmctl.config import load
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START
 from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, Command, RunContext, kill_all
@@ -333,7 +333,7 @@ def test_landed_by_an_operator_is_an_interrupted_flight(tmp_path: Path) -> None:
 
 def test_obstacles_of_an_operator_are_adopted_and_repeated(tmp_path: Path) -> None:
     scene = ScriptedServices(tmp_path, [ends(0, 2.0)])
-    ball = ObstacleMessage((1.0, 2.0, -3.0), 0.5, 1.0, 3.0)
+    ball = Obstacle(center_ned_m=(1.0, 2.0, -3.0), radius_m=0.5, keep_out_m=1.0)
     repeated: list[int] = []
 
     def set_ball() -> None:

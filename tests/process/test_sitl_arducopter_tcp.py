@@ -1,4 +1,4 @@
-"""`python -m sitl --autopilot arducopter --tcp-port P`: real vehicles behind real TCP sockets."""
+"""`python -m sitl --autopilot-kind arducopter --tcp-port P`: real vehicles behind real TCP sockets."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from pymavlink import mavutil
 pytestmark = pytest.mark.process
 ROOT = Path(__file__).resolve().parents[2]
 ENV = {**os.environ, "PYTHONPATH": str(ROOT)}
-ARGUMENTS = "--vehicles 2 --autopilot arducopter --preset arducopter --ekf-ready 0.2 --die-with-parent --tcp-port"
+ARGUMENTS = "--vehicles 2 --autopilot-kind arducopter --preset arducopter --ekf-ready 0.2 --die-with-parent --tcp-port"
 
 
 @pytest.fixture(scope="module")

@@ -98,7 +98,8 @@ def endpoint() -> Iterator[str]:
 def viewer(endpoint: str, directory: Path, *more: str) -> Iterator[subprocess.Popen[str]]:
     directory.mkdir(exist_ok=True)
     command = [sys.executable, "-m", "swarmctl.telemetry.viewer", "--run", RUN, "--bus", endpoint]
-    command += ["--agents", str(AGENTS), "--run-dir", str(directory), "--obstacles-json", json.dumps([OBSTACLE]), *more]
+    first = json.dumps({"version": 1, "obstacles": [OBSTACLE]})
+    command += ["--agents", str(AGENTS), "--run-dir", str(directory), "--obstacles-json", first, *more]
     with (directory / "viewer.log").open("wb") as log:
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True)
     try:

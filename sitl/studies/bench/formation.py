@@ -9,12 +9,10 @@ from __future__ import annotations
 
 import math
 import time
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from sitl.lockstep import obstacles_message, sitl_params
 from sitl.world import SitlWorld
 from swarmctl.agent.assembly import make_agent
 from swarmctl.bus import topics
@@ -123,8 +121,9 @@ class Formation:
         self._tick_us = round(1e6 / config.agent.rate_hz)
         self._physics_us = round(1e6 / config.sitl.physics_hz)
         near, far = pipe_pair(self.clock.now_us, 0)
-        params = sitl_params(config)
-        self._world = SitlWorld(replace(params, vehicles=1, spawn_ned_m=params.spawn_ned_m[:1]), [far])
+        swarm = config.simulator()
+        alone = swarm.model_copy(update={"vehicles": 1, "spawn_ned_m": swarm.spawn_ned_m[:1]})
+        self._world = SitlWorld(alone, [far])
         hub = LocalHub(self.clock.now_us, config.seed)
         count = config.swarm.agents - 1
         places = column_m(count + 1) if config.obstacles else places_m(count + 1)
@@ -202,7 +201,9 @@ class Formation:
             if now_us % _STATUS_EVERY_US == 0:
                 bus.publish(topics.STATUS, topics.encode_message(self._status(i + 1, began_s >= 0.0)))
         if now_us % _OBSTACLES_EVERY_US == 0:
-            self._operator.publish(topics.OBSTACLES, topics.encode_message(obstacles_message(self._config)))
+            self._operator.publish(
+                topics.OBSTACLES, topics.encode_message(topics.ObstaclesMessage(1, self._config.obstacles))
+            )
 
     def _status(self, agent: int, tracking: bool) -> topics.StatusMessage:
         phase = Phase.TRACK if tracking else Phase.READY

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Array
 
 Mask = NDArray[np.bool_]
@@ -19,15 +19,6 @@ Mask = NDArray[np.bool_]
 _ARRIVED_M_S = 0.2  # a faster vehicle passes through
 _STILL_M = 0.1  # a vehicle that moves less than this ...
 _STILL_S = 3.0  # ... in this time stands still
-
-
-@dataclass(frozen=True, slots=True)
-class Solid:
-    """A sphere or a vertical column at one instant."""
-
-    center_ned_m: Array  # (3,)
-    radius_m: float
-    column: bool
 
 
 class CollisionMonitor:
@@ -43,27 +34,27 @@ class CollisionMonitor:
     def __init__(self, body_m: float, goals_ned_m: Array | None, arrive_m: float, expected: Mask) -> None:
         self._body_m, self._goals, self._arrive_m, self._expected = body_m, goals_ned_m, arrive_m, expected
         self._pairs = np.triu_indices(len(expected), 1)
-        self._before: tuple[Array, tuple[Solid, ...]] | None = None
+        self._before: tuple[Array, tuple[Obstacle, ...]] | None = None
         self._since_s = np.full(len(expected), math.inf)  # time of each final arrival; inf: not arrived
         self._trail: list[tuple[float, Array]] = []
         self.min_separation_m = math.inf
         self.min_clearance_m = math.inf  # of a hull from a surface
 
-    def see(self, t_s: float, pos_ned_m: Array, vel_ned_m_s: Array, solids: Sequence[Solid] = ()) -> None:
+    def see(self, t_s: float, pos_ned_m: Array, vel_ned_m_s: Array, obstacles: Sequence[Obstacle] = ()) -> None:
         """Take one sample of every vehicle (N, 3) and obstacle; a new number of obstacles restarts the comparison."""
-        before_pos, before_solids = self._before or (pos_ned_m, tuple(solids))
+        before_pos, before_obstacles = self._before or (pos_ned_m, tuple(obstacles))
         i, j = self._pairs
         if len(i):
             apart = closest_m((before_pos[i] - before_pos[j]), (pos_ned_m[i] - pos_ned_m[j]))
             self.min_separation_m = min(self.min_separation_m, float(apart.min()))
-        if len(before_solids) != len(solids):
-            before_solids = tuple(solids)
-        for was, now in zip(before_solids, solids, strict=True):
-            axes = 2 if now.column else 3
-            apart = closest_m((before_pos - was.center_ned_m)[:, :axes], (pos_ned_m - now.center_ned_m)[:, :axes])
+        if len(before_obstacles) != len(obstacles):
+            before_obstacles = tuple(obstacles)
+        for was, now in zip(before_obstacles, obstacles, strict=True):
+            moved = (before_pos - was.center_ned_m)[:, : now.axes], (pos_ned_m - now.center_ned_m)[:, : now.axes]
+            apart = closest_m(*moved)
             clearance_m = float(apart.min()) - now.radius_m - 0.5 * self._body_m
             self.min_clearance_m = min(self.min_clearance_m, clearance_m)
-        self._before = (pos_ned_m, tuple(solids))
+        self._before = (pos_ned_m, tuple(obstacles))
         self._note_arrivals(t_s, pos_ned_m, vel_ned_m_s)
         if not self._trail or t_s - self._trail[-1][0] >= 0.1:
             self._trail.append((t_s, pos_ned_m))

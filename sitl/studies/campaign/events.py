@@ -9,8 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from sitl.lockstep import Lockstep
-from sitl.studies.campaign.collision_monitor import Solid
-from swarmctl.bus import topics
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Array
 
 _TOLD_EVERY_S = 0.1  # of a moving obstacle: messages carry no time, so it is repeated
@@ -22,8 +21,8 @@ class ScenarioEvent(Protocol):
     def step(self, lockstep: Lockstep, t_s: float, pos_ned_m: Array, vel_ned_m_s: Array) -> None:
         """Act when due; called every tick with the mission time and the true states (N, 3)."""
 
-    def solids(self, t_s: float) -> Sequence[Solid]:
-        """Return the solids of this event now, beside the configured obstacles."""
+    def obstacles(self, t_s: float) -> Sequence[Obstacle]:
+        """Return the obstacles of this event now, beside the configured obstacles."""
 
 
 class Death:
@@ -37,7 +36,7 @@ class Death:
             self._done = True
             lockstep.kill(self._agent)
 
-    def solids(self, t_s: float) -> Sequence[Solid]:
+    def obstacles(self, t_s: float) -> Sequence[Obstacle]:
         return ()
 
 
@@ -52,7 +51,7 @@ class Partition:
             _, falls = self._due.pop(0)
             (lockstep.hub.fail if falls else lockstep.hub.recover)()
 
-    def solids(self, t_s: float) -> Sequence[Solid]:
+    def obstacles(self, t_s: float) -> Sequence[Obstacle]:
         return ()
 
 
@@ -98,24 +97,27 @@ class Appearance:
             self._appear(t_s, pos_ned_m, vel_ned_m_s)
         if self._from is None:
             return
-        since_s, _, vel = self._from
+        since_s = self._from[0]
         if self._speed_m_s and (t_s - since_s) * self._speed_m_s > 2.0 * self._ahead_m:
             self._from, self._gone = None, True
             lockstep.set_obstacles(())
         elif t_s - self._told_s >= (_TOLD_EVERY_S if self._speed_m_s else math.inf):
             self._told_s = t_s
-            center, to = self._center(t_s).tolist(), vel.tolist()
-            lockstep.set_obstacles(
-                [topics.ObstacleMessage(tuple(center), self._radius_m, self._keep_out_m, _SEEN_M, tuple(to))]
-            )
+            lockstep.set_obstacles(self.obstacles(t_s))
 
-    def solids(self, t_s: float) -> Sequence[Solid]:
-        return () if self._from is None else (Solid(self._center(t_s), self._radius_m, False),)
-
-    def _center(self, t_s: float) -> Array:
-        assert self._from is not None
+    def obstacles(self, t_s: float) -> Sequence[Obstacle]:
+        if self._from is None:
+            return ()
         since_s, where, vel = self._from
-        return where + (t_s - since_s) * vel
+        center = (where + (t_s - since_s) * vel).tolist()
+        appeared = Obstacle(
+            center_ned_m=center,
+            vel_ned_m_s=vel.tolist(),
+            radius_m=self._radius_m,
+            keep_out_m=self._keep_out_m,
+            visibility_m=_SEEN_M,
+        )
+        return (appeared,)
 
     def _appear(self, t_s: float, pos_ned_m: Array, vel_ned_m_s: Array) -> None:
         speed = float(np.linalg.norm(vel_ned_m_s[self._victim]))

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from sitl.lockstep import Lockstep
-from sitl.studies.campaign.collision_monitor import CollisionMonitor, Solid
+from sitl.studies.campaign.collision_monitor import CollisionMonitor
 from sitl.studies.campaign.factors import NOISES, PROTECTIONS, UNCOOPERATIVE, wind_settings
 from sitl.studies.campaign.layouts import least_sum_m
 from sitl.studies.campaign.scenarios import SCENARIOS, Layout, layout_of, settings_of
@@ -84,7 +84,6 @@ class TrialFlight:
         expected = np.array([i not in layout.lost for i in range(agents)])
         arrive_m = math.inf if layout.settles else layout.arrive_m + NOISES[cell.noise].arrive_m
         self.monitor = CollisionMonitor(config.separation.body_m, layout.goals_ned_m, arrive_m, expected)
-        self._fixed = tuple(Solid(np.array(o.center_ned_m), o.radius_m, o.column) for o in config.obstacles)
         self._begin_s = math.nan
         self._resting_since_s = math.inf
         self._contact_s = math.inf
@@ -105,8 +104,8 @@ class TrialFlight:
             if t_s >= 0.0:
                 for event in self._layout.events:
                     event.step(lockstep, t_s, pos, vel)
-            solids = [s for event in self._layout.events for s in event.solids(t_s)]
-            self.monitor.see(now_s, pos, vel, (*self._fixed, *solids))
+            appeared = [o for event in self._layout.events for o in event.obstacles(t_s)]
+            self.monitor.see(now_s, pos, vel, (*lockstep.config.obstacles, *appeared))
             slow = t_s > _REST_S and np.linalg.norm(vel, axis=1).max() < _REST_M_S
             self._resting_since_s = min(self._resting_since_s, now_s) if slow else math.inf
             if self.monitor.collided:

@@ -16,7 +16,7 @@ import numpy as np
 
 from sitl.studies.thesis.trace import Array, Trace
 from swarmctl.core.closest_pair import closest_pair_m
-from swarmctl.telemetry.charts import Ball, Circle, Limit, Line, SpaceLine, Window, space_view, time_chart, top_view
+from swarmctl.telemetry.charts import Ball, Limit, Line, SpaceLine, Window, space_view, time_chart, top_view
 from swarmctl.telemetry.palette import LIMIT_RGB, SUM_RGB, agent_rgb, css
 
 FlightName = Literal[
@@ -198,8 +198,8 @@ def error_chart(flight: FlightName, traces: Sequence[Trace], separation_m: Mappi
 
 def obstacle_chart(traces: Sequence[Trace], points: int) -> str:
     """Draw the distance to the first obstacle's centre: all agents of the first trace, the nearest of the others."""
-    sphere = traces[0].obstacles[0]
-    center_ned_m = np.array(sphere.center_ned_m)
+    obstacle = traces[0].obstacles[0]
+    center_ned_m = np.array(obstacle.center_ned_m)
     lines = []
     for k, trace in enumerate(traces):
         away_m = np.linalg.norm(trace.pos_ned_m - center_ned_m, axis=2)  # (T, N)
@@ -213,7 +213,7 @@ def obstacle_chart(traces: Sequence[Trace], points: int) -> str:
             lines.append(
                 Line(x=trace.t_s, y=np.fmin.reduce(away_m, axis=1), color=color, label=f"nearest, {trace.name}")
             )
-    limits = [Limit(sphere.keep_out_m, f"constraint radius {sphere.keep_out_m:g} m")]
+    limits = [Limit(obstacle.keep_out_m, f"constraint radius {obstacle.keep_out_m:g} m")]
     title = "Distance to the centre of the obstacle [m]"
     return time_chart(title, lines, _seconds(traces), limits=limits, points=points, from_zero=True, height=300)
 
@@ -226,12 +226,7 @@ def above_chart(trace: Trace, points: int) -> str:
     ]
     ref = trace.ref_pos_ned_m[:, 0]
     lines.append(Line(x=ref[:, 1], y=ref[:, 0], color=_REFERENCE, label="reference", dash="4 3", width=1.1))
-    circles = [
-        Circle(sphere.center_ned_m[1], sphere.center_ned_m[0], radius_m)
-        for sphere in trace.obstacles
-        for radius_m in (sphere.keep_out_m, sphere.radius_m)
-    ]
-    return top_view("From above: north up, east right [m]", lines, circles, points)
+    return top_view("From above: north up, east right [m]", lines, _balls(trace), points)
 
 
 def index_chart(index: Sequence[IndexPoint]) -> str:
@@ -325,12 +320,12 @@ def _asked(trace: Trace, drawn: Drawn) -> Array | None:
 def _windows(trace: Trace, axis: int) -> list[Window]:
     """Return the extent of every obstacle on one axis while the reference is inside it."""
     found = []
-    for sphere in trace.obstacles:
-        away_m = np.linalg.norm(trace.ref_pos_ned_m[:, 0] - np.array(sphere.center_ned_m), axis=1)
-        center = sphere.center_ned_m[axis]
+    for obstacle in trace.obstacles:
+        away_m = np.linalg.norm(trace.ref_pos_ned_m[:, 0] - np.array(obstacle.center_ned_m), axis=1)
+        center = obstacle.center_ned_m[axis]
         sizes: tuple[tuple[float, Literal["keepout", "obstacle"]], ...] = (
-            (sphere.keep_out_m, "keepout"),
-            (sphere.radius_m, "obstacle"),
+            (obstacle.keep_out_m, "keepout"),
+            (obstacle.radius_m, "obstacle"),
         )
         for radius_m, style in sizes:
             inside_s = trace.t_s[away_m < radius_m]
@@ -353,11 +348,16 @@ def _space(figure: Figure, traces: Sequence[Trace], points: int) -> str:
     lines.append(
         SpaceLine(pos_ned_m=first.ref_pos_ned_m[:, 0], color=_REFERENCE, label="reference", dash="4 3", width=1.1)
     )
+    return space_view(figure.title, lines, _balls(first), points)
+
+
+def _balls(trace: Trace) -> list[Ball]:
+    """Return what is drawn of the obstacles: each itself, and its keep-out."""
     balls = []
-    for sphere in first.obstacles:
-        balls.append(Ball(sphere.center_ned_m, sphere.radius_m, "obstacle"))
-        balls.append(Ball(sphere.center_ned_m, sphere.keep_out_m, "keepout"))
-    return space_view(figure.title, lines, balls, points)
+    for obstacle in trace.obstacles:
+        balls.append(Ball(obstacle.center_ned_m, obstacle.radius_m, "obstacle"))
+        balls.append(Ball(obstacle.center_ned_m, obstacle.keep_out_m, "keepout"))
+    return balls
 
 
 def _states(figure: Figure, traces: Sequence[Trace], points: int) -> str:

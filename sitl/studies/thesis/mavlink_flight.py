@@ -12,7 +12,7 @@ import numpy as np
 from sitl.lockstep import Lockstep
 from sitl.plant.airframes import PRESETS
 from sitl.plant.attitude import THESIS_SAMPLE_S
-from sitl.studies.thesis.trace import Array, Sphere, Trace
+from sitl.studies.thesis.trace import Array, Trace
 from swarmctl.config import Config
 from swarmctl.core.frames import euler_from_quat
 from swarmctl.core.types import PlanStatus
@@ -57,7 +57,7 @@ def fly_over_mavlink(name: str, config: Config) -> Trace:
         torque_n_m=np.full((steps, agents, 3), np.nan),
         failed=sum(int((rows["plan_status"] != PlanStatus.OK).sum()) for rows in ticks),
         terminal_missed=None,
-        obstacles=tuple(Sphere(o.center_ned_m, o.radius_m, o.keep_out_m) for o in config.obstacles),
+        obstacles=config.obstacles,
     )
 
 

@@ -12,11 +12,10 @@ from functools import partial
 
 import numpy as np
 
-from sitl.lockstep import obstacles_message
 from sitl.plant.airframes import PRESETS
 from sitl.plant.attitude import THESIS_GAINS, THESIS_SAMPLE_S, ThesisAttitude
 from sitl.plant.vehicle import Plant
-from sitl.studies.thesis.trace import Array, Sphere, Trace
+from sitl.studies.thesis.trace import Array, Trace
 from swarmctl.config import Config
 from swarmctl.control.collision.separation import KeepOut, keep_out_of_obstacle, keep_out_of_peer, visible
 from swarmctl.control.controller import make_controller
@@ -63,7 +62,7 @@ class Pilot:
         brake_m_s2 = config.separation.brake_m_s2
         self._plan_buffer = PlanBuffer(agent, self._dt_us, self._steps, brake_m_s2)
         self._replay_us = round(config.agent.failsafe.replay_s * 1e6)
-        self._obstacles = tuple(o.obstacle() for o in obstacles_message(config).obstacles)
+        self._obstacles = config.obstacles
         self.path: PredictedPath | None = None
         self.failed = 0
         self.terminal_missed = 0
@@ -208,7 +207,7 @@ def fly_on_plant(name: str, config: Config, *, matched_velocity: bool = False) -
         torque_n_m=log["torque"],
         failed=sum(pilot.failed for pilot in pilots),
         terminal_missed=sum(pilot.terminal_missed for pilot in pilots),
-        obstacles=tuple(Sphere(o.center_ned_m, o.radius_m, o.keep_out_m) for o in config.obstacles),
+        obstacles=config.obstacles,
     )
 
 

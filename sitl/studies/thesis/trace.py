@@ -8,17 +8,10 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from swarmctl.core.obstacle import Obstacle
+
 Array = NDArray[np.float64]
 Path = Literal["plant", "full"]  # plant: model only; full: full MAVLink loop
-
-
-@dataclass(frozen=True, slots=True)
-class Sphere:
-    """An obstacle with limited visibility."""
-
-    center_ned_m: tuple[float, float, float]
-    radius_m: float
-    keep_out_m: float
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -41,7 +34,7 @@ class Trace:
     torque_n_m: Array  # (T, N, 3)
     failed: int  # plans that could not be flown
     terminal_missed: int | None  # plans whose terminal condition was not met; None where it was not recorded
-    obstacles: tuple[Sphere, ...] = ()
+    obstacles: tuple[Obstacle, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -33,8 +33,9 @@ from swarmctl.control.lag import Lag
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.problem import Start
 from swarmctl.core.frames import GRAVITY_M_S2
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.params import Params
-from swarmctl.core.types import Array, Obstacle, PredictedPath
+from swarmctl.core.types import Array, PredictedPath
 
 _TINY = 1e-6
 _SLACK_WEIGHT = 100.0  # a larger one would trade all of the thrust for a trace of distance
@@ -111,11 +112,11 @@ def _braked(pos: Vector, vel: Vector, t_s: float, brake_m_s2: float) -> tuple[Ve
 
 def body_of_obstacle(obstacle: Obstacle, ahead_s: float, apart_m: float) -> Body:
     """Return an obstacle `ahead_s` from now, at constant velocity; `apart_m` is from its surface to the own centre."""
-    vel = obstacle.vel_ned_m_s.tolist()
-    pos = tuple(p + ahead_s * v for p, v in zip(obstacle.center_ned_m.tolist(), vel, strict=True))
+    vel = obstacle.vel_ned_m_s
+    pos = tuple(p + ahead_s * v for p, v in zip(obstacle.center_ned_m, vel, strict=True))
     return Body(
         pos_ned_m=pos,
-        vel_ned_m_s=tuple(vel),
+        vel_ned_m_s=vel,
         apart_m=obstacle.radius_m + apart_m,
         share_01=1.0,
         column=obstacle.column,

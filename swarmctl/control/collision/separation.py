@@ -18,9 +18,10 @@ from pydantic import Field
 
 from swarmctl.control.collision.budget import SeparationBudget
 from swarmctl.control.mpc.axes import HalfSpaces
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.params import Params
 from swarmctl.core.trajectory import braking_displacement, interpolate
-from swarmctl.core.types import Array, Obstacle, PredictedPath
+from swarmctl.core.types import Array, PredictedPath
 
 _TINY_M = 1e-6
 _APPROACH_TOLERANCE_M = 0.02  # approach allowed to a keep-out that is violated already
@@ -158,9 +159,8 @@ def keep_out_of_peer(
 def keep_out_of_obstacle(obstacle: Obstacle, dt_us: int, steps: int, params: SeparationParams) -> KeepOut:
     """Return the keep-out of a visible obstacle, predicted at constant velocity."""
     t_s = np.arange(steps + 1) * (dt_us * 1e-6)
-    pos = obstacle.center_ned_m + t_s[:, None] * obstacle.vel_ned_m_s
     return KeepOut(
-        pos_ned_m=pos,
+        pos_ned_m=obstacle.center_after(t_s[:, None]),
         radius_m=obstacle.keep_out_m,
         hard_min_distance_m=params.budget.certified_obstacle_m(obstacle.keep_out_m),
         any_height=obstacle.column,

@@ -24,8 +24,9 @@ from pydantic import Field
 
 from swarmctl.control.collision.separation import KeepOut
 from swarmctl.control.reference.shortest_path import Polyline, shortest_path
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.params import Params
-from swarmctl.core.types import Array, Obstacle, Sampled
+from swarmctl.core.types import Array, Sampled
 
 _REPLAN_US = 500_000
 _REPLACE_01 = 0.85  # a new path replaces the old one when its length is below this share
@@ -211,9 +212,9 @@ class DeadlockRecovery:
 
 def _disc(obstacle: Obstacle, height_z_m: float) -> tuple[float, float, float]:
     """Return the section (north, east, radius) of an obstacle at a height; radius 0 when it does not reach there."""
-    below_m = 0.0 if obstacle.column else float(obstacle.center_ned_m[2]) - height_z_m
+    below_m = 0.0 if obstacle.column else obstacle.center_ned_m[2] - height_z_m
     radius_m = math.sqrt(max(obstacle.keep_out_m**2 - below_m**2, 0.0))
-    return float(obstacle.center_ned_m[0]), float(obstacle.center_ned_m[1]), radius_m + _MARGIN_M * (radius_m > 0.0)
+    return obstacle.center_ned_m[0], obstacle.center_ned_m[1], radius_m + _MARGIN_M * (radius_m > 0.0)
 
 
 def _blocks(keep_out: KeepOut, pos_ned_m: Array, to_reference: Array, near_m: float) -> bool:

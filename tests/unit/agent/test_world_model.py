@@ -15,10 +15,11 @@ from swarmctl.bus import topics
 from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.core.clock import SimClock
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Phase, PredictedPath
 from tests.unit.bus.test_topics import STATUS
 
-BALL = topics.ObstacleMessage((5.0, 0.0, -2.0), 0.5, 1.0, 100.0)
+BALL = Obstacle(center_ned_m=(5.0, 0.0, -2.0), radius_m=0.5, keep_out_m=1.0, visibility_m=100.0)
 HERE = np.array([0.0, 0.0, -2.0])
 TICK_US = 20_000
 

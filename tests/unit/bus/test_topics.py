@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from swarmctl.bus import topics
 from swarmctl.bus.topics import decode_command, decode_obstacles, decode_path, decode_status, encode_message
 from swarmctl.bus.trajectory_messages import MAX_ACKNOWLEDGED, MAX_POINTS, encode_trajectory_message
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import OPERATOR_VERBS, OperatorVerb, Order, VerbArgument
 from swarmctl.core.records import TICK_DTYPE
 from swarmctl.core.trajectory import Trajectory
@@ -184,7 +185,9 @@ def test_messages_survive_encoding() -> None:
     assert decode_status(encode_message(STATUS)) == STATUS
     command = topics.CommandMessage("rtl", -1, UTC_US)
     assert decode_command(encode_message(command)) == command
-    obstacle = topics.ObstacleMessage((9.5, 5.5, -2.3), 1.0, 1.75, 3.0, (0.0, -0.5, 0.0))
+    obstacle = Obstacle(
+        center_ned_m=(9.5, 5.5, -2.3), radius_m=1.0, keep_out_m=1.75, visibility_m=3.0, vel_ned_m_s=(0.0, -0.5, 0.0)
+    )
     obstacles = topics.ObstaclesMessage(3, (obstacle, obstacle))
     assert decode_obstacles(encode_message(obstacles)) == obstacles
 
@@ -259,6 +262,14 @@ def test_obstacles_that_make_no_sense_are_refused(fields: dict[str, object]) -> 
     assert decode_obstacles(obstacles(**fields)) is None
 
 
+@pytest.mark.parametrize("key", ["center_ned_m", "radius_m", "keep_out_m", "visibility_m"])
+def test_no_size_of_an_obstacle_is_made_up_for_its_sender(key: str) -> None:
+    item = msgspec.json.decode(obstacles())["obstacles"][0]
+    del item[key]
+    assert decode_obstacles(msgspec.json.encode({"version": 1, "obstacles": [item]})) is None
+    assert decode_obstacles(obstacles(height_m=3.0)) is None, "an unknown key"
+
+
 def test_numbers_beyond_a_double_are_refused() -> None:
     assert decode_obstacles(obstacles().replace(b"1.75", b"1e999")) is None
     assert decode_obstacles(obstacles().replace(b"1.75", b"NaN")) is None
@@ -272,7 +283,7 @@ def test_every_topic_has_its_own_name_and_few_old_paths_are_kept() -> None:
 
 
 def test_lists_and_numbers_from_outside_are_bounded() -> None:
-    ball = topics.ObstacleMessage((9.5, 5.5, -2.3), 1.0, 1.75, 3.0)
+    ball = Obstacle(center_ned_m=(9.5, 5.5, -2.3))
     most = topics.ObstaclesMessage(1, (ball,) * topics.MAX_OBSTACLES)
     assert decode_obstacles(encode_message(most)) == most
     assert len(encode_message(most)) <= topics.OBSTACLES.max_bytes

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from swarmctl.check.change import Change
-from swarmctl.check.finding import SWARM, Finding, Verdict, worst_first
+from swarmctl.check.finding import SWARM, Finding, worst_first
 from swarmctl.check.link_facts import (
     Estimator,
     Gps,
@@ -24,13 +24,18 @@ from swarmctl.check.link_facts import (
     VehicleTime,
     Version,
 )
-from swarmctl.check.parameters import RC_RECEIVER, ROWS, changes, names_to_read, unchangeable
+from swarmctl.check.parameters import RC_RECEIVER, changes, names_to_read, unchangeable
 from swarmctl.check.scan_facts import unreached
 from swarmctl.check.swarm import exit_code, findings, standing
 from swarmctl.check.table import as_json, print_check
 from swarmctl.config import Config, load
 from swarmctl.core.types import FlightMode, Landed
-from swarmctl.mavlink.dialects import ARDUCOPTER, PX4
+from swarmctl.core.verdict import Verdict
+from swarmctl.mavlink.dialects.arducopter import ARDUCOPTER
+from swarmctl.mavlink.dialects.dialect import LAND, ODOMETRY, Dialect, LongCommand, Rule
+from swarmctl.mavlink.dialects.parameter_check import Opinion, ParameterCheck
+from swarmctl.mavlink.dialects.px4 import PX4
+from swarmctl.mavlink.dialects.registry import DIALECTS
 
 OK, NOTE, FIX = Verdict.OK, Verdict.NOTE, Verdict.FIX
 URLS = ("udpin://127.0.0.1:14540", "udpin://127.0.0.1:14541")
@@ -171,7 +176,7 @@ _RADIO = Sensors(
 
 # topic, what is changed in a healthy PX4 vehicle, verdict, a word of the advice
 PX4_CASES: list[tuple[str, dict[str, Any], Verdict, str]] = [
-    ("autopilot", {"autopilot": "", "autopilot_number": 4}, FIX, "flies PX4 and ArduCopter"),
+    ("autopilot", {"autopilot": "", "autopilot_number": 4}, FIX, "flies ArduCopter and PX4"),
     (
         "autopilot",
         {"version": Version(firmware=(1, 14, 0), stage="release", git="", board=1, uid="0", bytewise=True)},
@@ -330,7 +335,7 @@ def test_arducopter_rows(config: Config, topic: str, fields: dict[str, Any], ver
 def test_every_judged_parameter_has_a_case() -> None:
     tested = {topic for topic, *_ in (*PX4_CASES, *COPTER_CASES)}
     shown_only = {"COM_RC_IN_MODE"}
-    assert {row.name for rows in ROWS.values() for row in rows} - tested == shown_only
+    assert {check.name for dialect in (PX4, ARDUCOPTER) for check in dialect.checks} - tested == shown_only
 
 
 def test_a_radio_that_is_there_or_not_needed_is_no_finding(config: Config) -> None:
@@ -474,9 +479,60 @@ def test_which_vehicles_parameters_may_be_changed(fields: dict[str, Any], word: 
 def test_only_known_names_are_asked_for_and_each_once(config: Config) -> None:
     names = names_to_read(PX4, config)
     assert len(set(names)) == len(names)
-    assert {row.name for row in ROWS["PX4"]} <= set(names)
+    assert {check.name for check in PX4.checks} <= set(names)
     assert set(ARDUCOPTER.to_read()) <= set(names_to_read(ARDUCOPTER, config))
     assert all(len(name) <= 16 for name in names)
+
+
+MINIMAL: dict[str, Any] = {
+    "name": "Third",
+    "number": 99,
+    "measured_version": (1, 0),
+    "sysid_parameter": "ID",
+    "mavlink2_setting": "PROTO = 2",
+    "modes": {7: FlightMode.HOLD},
+    "external": (1.0,),
+    "hold": (2.0,),
+    "land": LongCommand(LAND, ()),
+    "takeoff_parameter": "",
+    "arm_in": None,
+    "integers_bytewise": False,
+    "state": (ODOMETRY,),
+    "rates_hz": {},
+    "rules": (Rule("RULED", lambda value: value == 1, "set 1"),),
+    "given": {"GIVEN": 1},
+    "hover_parameter": "HOVER",
+    "thrust_parameters": (),
+    "horizontal_accuracy": "GPS_RAW_INT",
+    "checks": (ParameterCheck("CHECKED", "why", lambda value, seen: Opinion(verdict=NOTE, wanted="2", advice="two")),),
+    "also_read": (),
+    "loss_parameter": "LOSS",
+}
+
+
+def test_a_new_dialect_needs_nothing_but_itself(config: Config, monkeypatch: pytest.MonkeyPatch) -> None:
+    dialect = Dialect(**MINIMAL)
+    values: dict[str, float | int] = {"RULED": 0, "CHECKED": 1, "GIVEN": 0}
+    third = changed(COPTER, autopilot="Third", autopilot_number=99, parameters=parameters(values))
+    assert "swarmctl flies" in line_of(findings([third], with_params(config)), "autopilot").advice, "not yet"
+    monkeypatch.setitem(DIALECTS, 99, dialect)
+    assert names_to_read(dialect, with_params(config)) == ("RULED", "HOVER", "CHECKED")
+    found = findings([third], with_params(config))
+    assert "1.0" in line_of(found, "autopilot").advice
+    assert line_of(found, "RULED").verdict is FIX
+    assert (line_of(found, "CHECKED").advice, line_of(found, "CHECKED").wanted) == ("two", "2: why")
+    assert "set ID" in line_of(findings([changed(third, sysid=9)], config), "system id").advice
+    assert "PROTO = 2" in line_of(findings([changed(third, link_mavlink2=0)], config), "link").advice
+
+
+@pytest.mark.parametrize("missing", MINIMAL)
+def test_an_incomplete_dialect_is_refused(missing: str) -> None:
+    with pytest.raises(TypeError, match=missing):
+        Dialect(**{key: value for key, value in MINIMAL.items() if key != missing})
+
+
+def test_every_module_of_an_autopilot_is_a_dialect_of_its_own() -> None:
+    assert dict(DIALECTS) == {12: PX4, 3: ARDUCOPTER}
 
 
 def test_a_change_that_was_not_done_is_to_fix() -> None:

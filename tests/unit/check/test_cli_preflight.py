@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.metadata
 import io
+import json
 import re
 import signal
 import socket
@@ -120,10 +121,13 @@ def test_command_lines_say_what_the_configuration_says(tmp_path: Path) -> None:
     config = load(None, ["swarm.agents=2", "start.spacing_m=1.5", "sitl.mass_scale=1.2", "seed=9"])
     context = RunContext("run", "unixsock-stream//tmp/x/bus.sock", tmp_path)
     sitl = sitl_command(config, context, (14540, 14541)).argv
-    assert "--spawn=-0.75,0.0,2.0;0.75,0.0,2.0" in sitl, "on the ground"
+    told = json.loads(sitl[sitl.index("--config-json") + 1])
+    assert told == {"vehicles": 2, "spawn_ned_m": [[-0.75, 0, 2], [0.75, 0, 2]], "mass_scale": 1.2, "seed": 9}, (
+        "on the ground"
+    )
     assert sitl[sitl.index("--remote-ports") + 1] == "14540,14541"
-    air = sitl_command(load(None, ["swarm.agents=1", "sitl.start='air'"]), context, (1,)).argv
-    assert "--spawn=0.0,0.0,0.0" in air
+    air = load(None, ["swarm.agents=1", "sitl.start='air'"]).simulator()
+    assert air.spawn_ned_m == ((0.0, 0.0, 0.0),)
     held = preflight.claim_ports(2)
     agents = agent_commands(config, context, held)
     assert [command.name for command in agents] == ["agent-0", "agent-1"]
@@ -139,7 +143,7 @@ def test_command_lines_say_what_the_configuration_says(tmp_path: Path) -> None:
         sock.close()
     viewer = viewer_command(config, context, 9876, view=False).argv
     assert "--view" not in viewer
-    assert viewer[viewer.index("--obstacles-json") + 1] == "[]"
+    assert viewer[viewer.index("--obstacles-json") + 1] == '{"version":1,"obstacles":[]}'
 
 
 def status(phase: int = Phase.TRACK, separation_m: float = 1.25, active_alert: str = "") -> StatusMessage:

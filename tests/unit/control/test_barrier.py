@@ -14,7 +14,8 @@ from swarmctl.control.model import VehicleModelParams, acceleration
 from swarmctl.control.mpc.problem import Start
 from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.frames import GRAVITY_M_S2
-from swarmctl.core.types import Array, Obstacle, PredictedPath
+from swarmctl.core.obstacle import Obstacle
+from swarmctl.core.types import Array, PredictedPath
 
 PARAMS, MODEL = BarrierParams(), VehicleModelParams()
 DT_S, BODY_M, STILL = 0.02, 0.48, np.zeros(3)
@@ -248,11 +249,11 @@ def test_a_stale_peer_is_where_plans_assume_it(vel: tuple[float, float, float], 
 
 def test_an_obstacle_moves_on() -> None:
     ball = Obstacle(
-        center_ned_m=np.array([1.0, 2.0, 3.0]),
+        center_ned_m=(1.0, 2.0, 3.0),
         radius_m=0.5,
         keep_out_m=1.0,
         visibility_m=3.0,
-        vel_ned_m_s=np.array([0.0, -1.0, 0.0]),
+        vel_ned_m_s=(0.0, -1.0, 0.0),
         column=True,
     )
     found = body_of_obstacle(ball, 0.2, 0.29)

@@ -9,7 +9,8 @@ import pytest
 
 from swarmctl.control.collision.separation import KeepOut
 from swarmctl.control.reference.deadlock import DeadlockParams, DeadlockRecovery, ProgressMonitor
-from swarmctl.core.types import Array, Obstacle
+from swarmctl.core.obstacle import Obstacle
+from swarmctl.core.types import Array
 
 PARAMS = DeadlockParams(behind_m=0.2, moved_m=0.2, patience_s=1.5, near_m=0.4, speed_m_s=1.0)
 WANTED = np.array([5.0, 0.0, -2.0])
@@ -98,11 +99,11 @@ def test_a_blocking_peer_is_avoided_although_it_moves_now() -> None:
 def test_a_wall_is_avoided_at_the_first_level_until_the_reference_is_reached() -> None:
     posts = tuple(
         Obstacle(
-            center_ned_m=np.array([1.5, east, 0.0]),
+            center_ned_m=(1.5, east, 0.0),
             radius_m=0.3,
             keep_out_m=0.9,
             visibility_m=3.0,
-            vel_ned_m_s=np.zeros(3),
+            vel_ned_m_s=(0.0, 0.0, 0.0),
             column=True,
         )
         for east in (-0.6, 0.0, 0.6)
@@ -123,7 +124,7 @@ def test_a_wall_is_avoided_at_the_first_level_until_the_reference_is_reached() -
 
 def test_a_sphere_below_is_not_avoided() -> None:
     ball = Obstacle(
-        center_ned_m=np.array([1.5, 0.0, 0.0]), radius_m=0.3, keep_out_m=0.9, visibility_m=3.0, vel_ned_m_s=np.zeros(3)
+        center_ned_m=(1.5, 0.0, 0.0), radius_m=0.3, keep_out_m=0.9, visibility_m=3.0, vel_ned_m_s=(0.0, 0.0, 0.0)
     )
     recovery = DeadlockRecovery(PARAMS, 0, 0.9)
     stood(recovery, 1.6, [keep_out(1.0, priority_id=-1)], (ball,))

@@ -22,7 +22,8 @@ from swarmctl.control.collision.separation import (
     visible,
 )
 from swarmctl.control.mpc.axes import HalfSpaces
-from swarmctl.core.types import Array, Obstacle, PredictedPath
+from swarmctl.core.obstacle import Obstacle
+from swarmctl.core.types import Array, PredictedPath
 
 UTC_US = 1_700_000_000_000_000
 DT_US = 100_000
@@ -96,11 +97,11 @@ def test_the_keep_out_of_a_landed_peer_does_not_grow() -> None:
 
 def test_a_moving_obstacle_has_constant_velocity_and_limited_visibility() -> None:
     obstacle = Obstacle(
-        center_ned_m=np.array([5.0, 0.0, -2.0]),
+        center_ned_m=(5.0, 0.0, -2.0),
         radius_m=1.0,
         keep_out_m=1.75,
         visibility_m=3.0,
-        vel_ned_m_s=np.array([-1.0, 0.5, 0.0]),
+        vel_ned_m_s=(-1.0, 0.5, 0.0),
     )
     keep_out = keep_out_of_obstacle(obstacle, 200_000, 2, PARAMS)
     np.testing.assert_allclose(keep_out.pos_ned_m, [[5.0, 0.0, -2.0], [4.8, 0.1, -2.0], [4.6, 0.2, -2.0]])
@@ -136,11 +137,11 @@ def test_margin_is_true_distance_minus_hard_minimum_distance() -> None:
 
 def test_a_column_is_seen_and_kept_clear_of_at_every_height() -> None:
     column = Obstacle(
-        center_ned_m=np.array([5.0, 0.0, -2.0]),
+        center_ned_m=(5.0, 0.0, -2.0),
         radius_m=1.0,
         keep_out_m=1.75,
         visibility_m=3.0,
-        vel_ned_m_s=np.zeros(3),
+        vel_ned_m_s=(0.0, 0.0, 0.0),
         column=True,
     )
     assert visible([column], np.array([2.001, 0.0, 30.0])) == [column]
@@ -149,7 +150,7 @@ def test_a_column_is_seen_and_kept_clear_of_at_every_height() -> None:
     assert keep_out.distance_m(np.array([2.0, 0.0, 30.0])) == pytest.approx(3.0)
     high_above = np.linspace([3.0, 0.0, -20.0], [4.0, 0.0, -20.0], STEPS + 1)
     assert certify(high_above, [keep_out], 0) == pytest.approx(1.0 - 1.65)
-    sphere = keep_out_of_obstacle(replace(column, column=False), DT_US, STEPS, PARAMS)
+    sphere = keep_out_of_obstacle(column.model_copy(update={"column": False}), DT_US, STEPS, PARAMS)
     assert certify(high_above, [sphere], 0) > 10.0
 
 
@@ -271,7 +272,9 @@ def test_downwash_applies_to_peers_and_not_to_obstacles() -> None:
         agent=1, boot_id=1, seq=1, t0_utc_us=0, dt_us=DT_US, radius_m=0.0, pos_ned_m=still((0.0, 0.0, 0.0))
     )
     assert keep_out_of_peer(path, 0, DT_US, STEPS, params).downwash == 2.0
-    ball = Obstacle(center_ned_m=np.zeros(3), radius_m=1.0, keep_out_m=1.75, visibility_m=3.0, vel_ned_m_s=np.zeros(3))
+    ball = Obstacle(
+        center_ned_m=(0.0, 0.0, 0.0), radius_m=1.0, keep_out_m=1.75, visibility_m=3.0, vel_ned_m_s=(0.0, 0.0, 0.0)
+    )
     assert keep_out_of_obstacle(ball, DT_US, STEPS, params).downwash == 1.0
 
 

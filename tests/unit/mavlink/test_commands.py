@@ -13,7 +13,9 @@ from pymavlink.dialects.v20 import development as dialect
 from swarmctl.core.types import Command, Verb
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.commands import CodecCommands, CommandResult
-from swarmctl.mavlink.dialects import ARDUCOPTER, PX4, Dialect
+from swarmctl.mavlink.dialects.arducopter import ARDUCOPTER
+from swarmctl.mavlink.dialects.dialect import Dialect
+from swarmctl.mavlink.dialects.px4 import PX4
 
 SECOND = 1_000_000
 

@@ -11,12 +11,13 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import development as mav
 
-from sitl.world import SitlParams, SitlWorld
+from sitl.world import SitlWorld
 from swarmctl.core.clock import SimClock
 from swarmctl.core.types import GeoOrigin
 from swarmctl.mavlink.autopilot import Autopilot
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.transport import PipeTransport, pipe_pair
+from swarmctl.simulator_config import SimulatorConfig
 from tests.benches.hostile import POISON, Hostile, frame_of
 
 FRAMES = 50_000
@@ -32,9 +33,7 @@ def flight() -> list[list[bytes]]:
     """What a vehicle says in each 20 ms of a take-off: the valid frames of the dialogue."""
     clock = SimClock()
     vehicle_end, ours = pipe_pair(clock.now_us)
-    world = SitlWorld(
-        SitlParams(vehicles=1, spawn_ned_m=np.zeros((1, 3)), preset="x500", ekf_ready_s=0.1), [vehicle_end]
-    )
+    world = SitlWorld(SimulatorConfig(vehicles=1, preset="x500", ekf_ready_s=0.1), [vehicle_end])
     codec = Codec(1, 191)
     said: list[list[bytes]] = []
     for tick in range(round(FLIGHT_S * 1e6 / POLL_US)):

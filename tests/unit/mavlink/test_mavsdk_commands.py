@@ -5,10 +5,9 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 
-import numpy as np
 import pytest
 
-from sitl.world import SitlParams, SitlWorld
+from sitl.world import SitlWorld
 from swarmctl.core.clock import SimClock
 from swarmctl.core.types import Command, FlightMode, GeoOrigin, Verb
 from swarmctl.mavlink.autopilot import Autopilot
@@ -16,6 +15,7 @@ from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.commands import OWN_COMPID, CommandResult
 from swarmctl.mavlink.mavsdk_commands import MavsdkCommands
 from swarmctl.mavlink.transport import pipe_pair
+from swarmctl.simulator_config import SimulatorConfig
 
 
 class Bench:
@@ -24,7 +24,7 @@ class Bench:
     def __init__(self) -> None:
         self.clock = SimClock()
         ours, vehicles = pipe_pair(self.clock.now_us)
-        params = SitlParams(vehicles=1, spawn_ned_m=np.zeros((1, 3)), autopilot_kind="arducopter")
+        params = SimulatorConfig(vehicles=1, autopilot_kind="arducopter")
         self.world = SitlWorld(params, [vehicles])
         origin = GeoOrigin(params.origin_lat_deg, params.origin_lon_deg, params.origin_alt_m)
         self.pilot = Autopilot(ours, Codec(1, OWN_COMPID), 1, origin, lambda frame: None)

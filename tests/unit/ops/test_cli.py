@@ -16,8 +16,8 @@ import typer
 
 import swarmctl
 from sitl.studies.bench import command
-from swarmctl.bus.topics import ObstacleMessage
 from swarmctl.control.mpc.qp import SOLVERS
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import OperatorVerb, Order, VerbArgument
 from swarmctl.errors import ConfigError, MissionError, StartError
 from swarmctl.ops import cli, operator
@@ -234,11 +234,18 @@ def test_a_reader_that_goes_away_does_not_change_the_exit_code() -> None:
 
 def test_obstacles_are_read_strictly() -> None:
     ball = operator.obstacle("1.5,0,-2", 0.5, 1.0, 3.0, "0,0,0.1")
-    assert ball == ObstacleMessage((1.5, 0.0, -2.0), 0.5, 1.0, 3.0, (0.0, 0.0, 0.1))
+    assert ball == Obstacle(
+        center_ned_m=(1.5, 0.0, -2.0), radius_m=0.5, keep_out_m=1.0, visibility_m=3.0, vel_ned_m_s=(0.0, 0.0, 0.1)
+    )
     assert operator.obstacle("1.5,0,-2", 0.5, 1.0, 3.0, "0,0,0.1", column=True).column
     with pytest.raises(ConfigError) as caught:
         operator.obstacle("1,2", -1.0, float("nan"), 3.0, "0,inf,0")
-    assert len(caught.value.problems) == 4
+    assert [problem.split()[0] for problem in caught.value.problems] == [
+        "--center",
+        "--radius",
+        "--keep-out",
+        "--velocity",
+    ]
     assert operator.without((ball, ball), 1) == (ball,)
     with pytest.raises(ConfigError, match="there are 1"):
         operator.without((ball,), 1)

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sitl.lockstep import Lockstep
-from sitl.studies.campaign.collision_monitor import CollisionMonitor, Solid
+from sitl.studies.campaign.collision_monitor import CollisionMonitor
 from sitl.studies.campaign.command import main
 from sitl.studies.campaign.events import Appearance
 from sitl.studies.campaign.factors import NOISES, PROTECTIONS
@@ -22,6 +22,7 @@ from swarmctl.bus import topics
 from swarmctl.bus.peers import LEASE_US, LocalHub, agent_name
 from swarmctl.config import load
 from swarmctl.core.closest_pair import closest_pair_m
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.errors import ConfigError, StartError
 
 CELL = Cell(scenario="swap", agents=3, delay_ms=0.0, loss=0.0, noise="exact", wind_m_s=0.0, protections="default")
@@ -49,7 +50,7 @@ def test_bodies_that_pass_between_two_samples_have_touched() -> None:
 @pytest.mark.parametrize(("column", "collided"), [(True, True), (False, False)])
 def test_a_column_is_in_the_way_at_every_height(column: bool, collided: bool) -> None:
     watcher = monitor()
-    solid = Solid(np.array([0.0, 0.0, 5.0]), 0.3, column)
+    solid = Obstacle(center_ned_m=(0.0, 0.0, 5.0), radius_m=0.3, column=column)
     for x in (-2.0, 2.0):  # 0.5 m beside the axis: the hull's 0.25 m and the column's 0.3 m meet
         watcher.see(x, np.array([[x, 0.5, 0.0], [x, 9.0, 0.0]]), REST, [solid])
     assert watcher.collided is collided
@@ -88,7 +89,7 @@ def test_a_static_obstacle_never_appears_at_a_goal(goal_m: float, speed_m_s: flo
     lockstep = Lockstep(load(None, ["swarm.agents=1"]))
     for t_s in (0.9, 1.1):
         appearance.step(lockstep, t_s, np.zeros((1, 3)), np.array([[2.0, 0.0, 0.0]]))
-        assert bool(appearance.solids(t_s)) is (appears and t_s > 1.0)
+        assert bool(appearance.obstacles(t_s)) is (appears and t_s > 1.0)
 
 
 @pytest.mark.parametrize("scenario", SCENARIOS)

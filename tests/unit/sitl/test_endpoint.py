@@ -15,13 +15,15 @@ from sitl.plant.sensors import local_origin
 from sitl.px4.link.schedule import OFFBOARD_HZ, Schedule
 from sitl.px4.link.streams_health import STREAMS
 from sitl.px4.parameters import DEFAULTS, INT32, REAL32, Parameters, int_from_wire, int_to_wire
-from sitl.world import SitlParams, SitlWorld, line_of_spawns
+from sitl.world import SitlWorld
+from swarmctl.config_problems import validated
 from swarmctl.core.clock import SimClock
 from swarmctl.core.types import GeoOrigin
 from swarmctl.errors import ConfigError
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames
 from swarmctl.mavlink.transport import pipe_pair
+from swarmctl.simulator_config import SimulatorConfig
 
 ORIGIN = GeoOrigin(47.397742, 8.545594, 489.4)
 NAN = math.nan
@@ -34,9 +36,8 @@ class Client:
         self.clock = SimClock()
         pairs = [pipe_pair(self.clock.now_us) for _ in range(vehicles)]
         self.links = [client_end for _, client_end in pairs]
-        spawns = params.pop("spawn_ned_m", line_of_spawns(vehicles))
-        sitl_params = SitlParams(vehicles=vehicles, spawn_ned_m=spawns, ekf_ready_s=ekf_ready_s, **params)
-        self.world = SitlWorld(sitl_params, [vehicle_end for vehicle_end, _ in pairs])
+        config = SimulatorConfig(vehicles=vehicles, ekf_ready_s=ekf_ready_s, **params)
+        self.world = SitlWorld(config, [vehicle_end for vehicle_end, _ in pairs])
         self.codec = Codec(1, 191)
         self.run(run_s)
 
@@ -326,7 +327,7 @@ def test_origin_converts_back_to_the_true_position(spawn: tuple[float, float, fl
         "origin_lon_deg": origin.lon_deg,
         "origin_alt_m": origin.alt_m,
     }
-    client = Client(spawn_ned_m=np.array([spawn]), run_s=0.004, ekf_ready_s=0.05, **place)
+    client = Client(spawn_ned_m=[spawn], run_s=0.004, ekf_ready_s=0.05, **place)
     got = client.run(0.2)
     (sent,) = of("GPS_GLOBAL_ORIGIN", got)
     local = of("ODOMETRY", got)[-1]
@@ -364,7 +365,7 @@ def flight(seed: int, reverse: bool = False) -> bytes:
     """Bytes of a short flight of two vehicles, and of everything they sent."""
     clock = SimClock()
     pairs = [pipe_pair(clock.now_us) for _ in range(2)]
-    world = SitlWorld(SitlParams(vehicles=2, spawn_ned_m=line_of_spawns(2), seed=seed), [p[0] for p in pairs])
+    world = SitlWorld(SimulatorConfig(vehicles=2, seed=seed), [p[0] for p in pairs])
     codec = Codec(1, 191)
     out = b""
     for k in range(600):
@@ -390,7 +391,7 @@ def test_the_same_bytes_give_the_same_flight() -> None:
 
 
 def test_truth_rows_are_in_the_shared_frame() -> None:
-    rows = Client(vehicles=3, spawn_ned_m=np.array([[0, 0, 1.0], [5, 0, 1], [0, 7, 1]])).world.truth_rows()
+    rows = Client(vehicles=3, spawn_ned_m=[[0, 0, 1], [5, 0, 1], [0, 7, 1]]).world.truth_rows()
     np.testing.assert_allclose(rows["pos_ned_m"], [[0, 0, 1], [5, 0, 1], [0, 7, 1]], atol=1e-9)
     assert rows["vehicle"].tolist() == [0, 1, 2]
     assert rows["t_us"].tolist() == [200_000] * 3
@@ -406,12 +407,13 @@ def test_truth_rows_are_in_the_shared_frame() -> None:
         ({"mass_scale": 3.0}, "mass_scale"),
         ({"ekf_ready_s": -1.0}, "ekf_ready_s"),
         ({"sysid_base": 255}, "sysid_base"),
-        ({"spawn_ned_m": np.zeros((1, 3))}, "spawn"),
-        ({"spawn_ned_m": np.full((2, 3), NAN)}, "spawn"),
+        ({"spawn_ned_m": [[0, 0, 0]]}, "spawn_ned_m: 1 positions"),
+        ({"spawn_ned_m": [[NAN, 0, 0], [0, 0, 0]]}, "spawn_ned_m.0.0"),
+        ({"spawn_ned_m": [[1e6, 0, 0], [0, 0, 0]]}, "spawn_ned_m.0.0"),
         ({"start": "orbit"}, "start"),
+        ({"faults": [{"kind": "motor", "vehicle": 2}]}, "faults.0.vehicle"),
     ],
 )
 def test_impossible_worlds_are_refused(change: dict[str, Any], key: str) -> None:
-    arguments: dict[str, Any] = {"vehicles": 2, "spawn_ned_m": line_of_spawns(2), **change}
-    with pytest.raises(ConfigError, match=key):
-        SitlParams(**arguments)
+    with pytest.raises(ConfigError, match=f"sitl: {key}"):
+        validated(SimulatorConfig, {"vehicles": 2, **change}, "sitl")

@@ -17,13 +17,13 @@ from pymavlink.dialects.v20 import development as mav
 
 from sitl.fault_socket import ControlSocket, handle
 from sitl.net.lossy import LossyLink
-from swarmctl.core.simulated import FAULTS, FaultParams
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.mavlink.framing import message_id
 from swarmctl.mavlink.transport import Datagram
 from swarmctl.ops.fault import inject, parse_fault
 from swarmctl.ops.operator import RunningLaunch
 from swarmctl.process_lifetime import remove_socket
+from swarmctl.simulator_config import FAULTS, FaultParams
 from tests.benches.flown_world import FlownWorld
 
 STEP_US = 4000

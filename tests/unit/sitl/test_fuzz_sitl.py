@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 from pymavlink.dialects.v20 import development as mav
 
-from sitl.world import SitlParams, SitlWorld
+from sitl.world import SitlWorld
 from swarmctl.core.clock import SimClock
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames
 from swarmctl.mavlink.transport import pipe_pair
+from swarmctl.simulator_config import SimulatorConfig
 from tests.benches.hostile import Hostile
 
 FRAMES = 200_000
@@ -36,9 +37,7 @@ class Vehicle:
     def __init__(self) -> None:
         self.clock = SimClock()
         vehicle_end, self.link = pipe_pair(self.clock.now_us)
-        self.world = SitlWorld(
-            SitlParams(vehicles=1, spawn_ned_m=np.zeros((1, 3)), preset="x500", ekf_ready_s=0.1, seed=5), [vehicle_end]
-        )
+        self.world = SitlWorld(SimulatorConfig(vehicles=1, preset="x500", ekf_ready_s=0.1, seed=5), [vehicle_end])
         self.codec = Codec(1, 191)
         self.stream_thrust_01: float | None = None
         self.heard: list[bytes] = []

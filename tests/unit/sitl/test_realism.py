@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
-from sitl.__main__ import _parser, _realism, main
-from sitl.lockstep import Lockstep, sitl_params
+from sitl.__main__ import _config, _parser, main
+from sitl.lockstep import Lockstep
+from sitl.plant.airframes import PRESETS
+from sitl.plant.attitude import THESIS_GAINS
+from sitl.plant.estimator import ESTIMATORS
 from swarmctl.config import Config, dump, load
-from swarmctl.core.simulated import RealismParams
 from swarmctl.errors import ConfigError
 from swarmctl.ops.processes import RunContext, sitl_command
+from swarmctl.simulator_config import SimulatorConfig, SimulatorParams
 
 OUTFIT = (
     "sitl.wind.mean_ned_m_s=[3.6,0,0.5]",
@@ -36,27 +40,34 @@ def test_a_resolved_configuration_reads_back_the_same(config: Config, tmp_path: 
 
 
 def test_lockstep_flies_what_was_configured(config: Config) -> None:
-    realism = sitl_params(config).realism
-    assert realism == config.sitl.realism()
-    assert realism.faults[0].value == 0.7
-    assert sitl_params(load(None)).realism == RealismParams()
+    params = Lockstep(config).world.params
+    assert {key: getattr(params, key) for key in SimulatorParams.model_fields} == {
+        key: getattr(config.sitl, key) for key in SimulatorParams.model_fields
+    }
+    assert (params.faults[0].value, params.drag_scale) == (0.7, 0.5)
 
 
 def test_a_launch_hands_everything_to_its_simulator(config: Config, tmp_path: Path) -> None:
     context = RunContext("run", f"unixsock-stream/{tmp_path}/bus.sock", tmp_path)
     argv = sitl_command(config, context, (1, 2, 3)).argv
     options = _parser().parse_args(list(argv[3:]))
-    assert _realism(options) == config.sitl.realism()
+    assert _config(options) == config.simulator() == Lockstep(config).world.params
     assert options.control == tmp_path / "sitl.sock"
-    plain = sitl_command(load(None), context, (1, 2, 3)).argv
-    assert not [item for item in plain if item.startswith("--set")]
-    assert _realism(_parser().parse_args(list(plain[3:]))) == RealismParams()
 
 
 def test_flags_and_sets_say_the_same() -> None:
-    flags = _parser().parse_args(["--wind=1,2,0", "--turbulence", "5"])
-    sets = _parser().parse_args(["--set", "wind.mean_ned_m_s=[1,2,0]", "--set", "wind.turbulence_m_s=5"])
-    assert _realism(flags) == _realism(sets) != RealismParams()
+    flags = _parser().parse_args(["--drag-scale", "0.5", "--ground-effect", "true", "--preset", "x500"])
+    sets = _parser().parse_args(["--set", "drag_scale=0.5", "--set", "ground_effect=true", "--set", "preset=x500"])
+    assert _config(flags) == _config(sets) == SimulatorConfig(drag_scale=0.5, ground_effect=True, preset="x500")
+
+
+def test_every_choice_of_the_configuration_exists_in_the_simulator() -> None:
+    def choices(key: str) -> tuple[str, ...]:
+        return get_args(SimulatorParams.model_fields[key].annotation)
+
+    assert choices("preset") == tuple(PRESETS)
+    assert choices("attitude_gains") == tuple(THESIS_GAINS)
+    assert choices("estimator") == tuple(ESTIMATORS)
 
 
 def test_faults_of_a_configuration_happen_in_lockstep_and_are_logged(config: Config) -> None:
@@ -85,7 +96,13 @@ def test_wrong_faults_are_refused(item: str, complaint: str) -> None:
 
 @pytest.mark.parametrize(
     "arguments",
-    [["--set", "preset=x500"], ["--set", "wind.speed=3"], ["--wind", "1,2"], ["--speed", "0"], ["--turbulence", "99"]],
+    [
+        ["--set", "preset=y"],
+        ["--set", "wind.speed=3"],
+        ["--set", "spawn_ned_m"],
+        ["--speed", "0"],
+        ["--drag-scale", "99"],
+    ],
 )
 def test_wrong_arguments_are_one_clear_line(arguments: list[str], capsys: pytest.CaptureFixture[str]) -> None:
     try:

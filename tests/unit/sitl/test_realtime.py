@@ -12,19 +12,20 @@ import pytest
 
 from sitl import realtime
 from sitl.__main__ import main
-from sitl.world import SitlParams, SitlWorld, line_of_spawns
+from sitl.world import SitlWorld
 from swarmctl.core.clock import SimClock
 from swarmctl.core.records import TRUTH_DTYPE
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.mavlink.transport import pipe_pair
 from swarmctl.process_lifetime import StopRequest
+from swarmctl.simulator_config import SimulatorConfig
 
 
 class SteppedWorld:
     """Stands in for a world: counts steps, stalls where told, and stops the loop."""
 
     def __init__(self, stop: StopRequest, steps: int, stall_at: int = -1, stall_s: float = 0.0) -> None:
-        self.params = SitlParams(vehicles=1, spawn_ned_m=line_of_spawns(1))
+        self.params = SimulatorConfig(vehicles=1)
         self.times_us: list[int] = []
         self._stop, self._steps, self._stall_at, self._stall_s = stop, steps, stall_at, stall_s
 
@@ -69,7 +70,7 @@ def test_a_long_stall_is_given_up_and_counted() -> None:
 def test_truth_file_is_an_array(tmp_path: Path) -> None:
     clock = SimClock()
     vehicle_end, _ = pipe_pair(clock.now_us)
-    world = SitlWorld(SitlParams(vehicles=1, spawn_ned_m=line_of_spawns(1)), [vehicle_end])
+    world = SitlWorld(SimulatorConfig(vehicles=1), [vehicle_end])
     truth = realtime.TruthFile(tmp_path / "truth.bin")
     for k in range(500):
         clock.advance(4000)
@@ -93,7 +94,7 @@ def test_a_full_disk_does_not_stop_the_flight() -> None:
         pytest.skip("no /dev/full here")
     clock = SimClock()
     vehicle_end, _ = pipe_pair(clock.now_us)
-    world = SitlWorld(SitlParams(vehicles=1, spawn_ned_m=line_of_spawns(1)), [vehicle_end])
+    world = SitlWorld(SimulatorConfig(vehicles=1), [vehicle_end])
     truth = realtime.TruthFile(Path("/dev/full"))
     for _ in range(20):
         clock.advance(1_000_000)
@@ -123,15 +124,17 @@ def test_the_end_of_the_port_range_is_refused() -> None:
         ["--vehicles", "0"],
         ["--vehicles", "many"],
         ["--preset", "glider"],
-        ["--spawn", "1,2"],
-        ["--spawn", "1,2,nan"],
-        ["--spawn", "0,0,0"],
-        ["--origin", "1000,0,0"],
+        ["--set", "spawn_ned_m=[[1,2]]"],
+        ["--set", "spawn_ned_m=[[1,2,nan]]"],
+        ["--set", "spawn_ned_m=[[0,0,0]]"],
+        ["--origin-lat-deg", "1000"],
+        ["--config-json", "{"],
+        ["--config-json", "[]"],
         ["--physics-hz", "10"],
         ["--mass-scale", "nan"],
         ["--port", "70000"],
         ["--remote-ports", "14540,14541"],
-        ["--ekf-ready", "-1"],
+        ["--ekf-ready-s", "-1"],
         ["--sysid-base", "254"],
         ["--start", "orbit"],
         ["--truth", "/proc/none/truth.bin"],

@@ -27,8 +27,9 @@ from sitl.studies.thesis.figures import (
     separation_chart,
 )
 from sitl.studies.thesis.page import flight_of, ratio, write_json, write_page
-from sitl.studies.thesis.trace import Row, Sphere, Trace
+from sitl.studies.thesis.trace import Row, Trace
 from swarmctl.core.closest_pair import closest_pair_m
+from swarmctl.core.obstacle import Obstacle
 
 RESULTS = {
     5,
@@ -38,7 +39,7 @@ RESULTS = {
     *range(85, 89),
     *range(90, 94),
 }  # figures of the thesis that show a flight; the others are diagrams
-OBSTACLE = Sphere((9.5, 5.5, -2.3), 1.0, 1.75)
+OBSTACLE = Obstacle(center_ned_m=(9.5, 5.5, -2.3))
 SECONDS: Mapping[FlightName, float] = {"open_loop": 10, "pid_steps": 90, "pid_slow": 125.66, "mpc_slow": 125.66}
 
 

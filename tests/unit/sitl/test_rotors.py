@@ -12,7 +12,7 @@ from sitl.plant.battery import Battery
 from sitl.plant.physics import outfitted
 from sitl.plant.vehicle import Plant
 from swarmctl.core.frames import GRAVITY_M_S2
-from swarmctl.core.simulated import BatteryParams, RealismParams
+from swarmctl.simulator_config import BatteryParams, SimulatorParams
 from tests.benches.flown_world import FlownWorld
 
 X500 = PRESETS["x500"]
@@ -51,14 +51,14 @@ def test_hover_thrust_knows_the_curve() -> None:
 
 def test_motor_lag_is_what_was_asked_for() -> None:
     for tau_s in (0.02, 0.1):
-        plant = Plant(outfitted(X500, RealismParams(motor_tau_s=tau_s)), np.zeros((1, 3)), DT_S, ground=False)
+        plant = Plant(outfitted(X500, SimulatorParams(motor_tau_s=tau_s)), np.zeros((1, 3)), DT_S, ground=False)
         for _ in range(round(tau_s / DT_S)):
             plant.step(np.ones((4, 1)))
         assert plant.rotor_force_n[0, 0] == pytest.approx(1 - math.exp(-1), rel=0.02)
-    at_once = Plant(outfitted(X500, RealismParams(motor_tau_s=0.0)), np.zeros((1, 3)), DT_S, ground=False)
+    at_once = Plant(outfitted(X500, SimulatorParams(motor_tau_s=0.0)), np.zeros((1, 3)), DT_S, ground=False)
     at_once.step(np.ones((4, 1)))
     assert at_once.rotor_force_n[0, 0] == 1.0
-    assert outfitted(X500, RealismParams()) == X500
+    assert outfitted(X500, SimulatorParams()) == X500
 
 
 def test_ground_effect_is_cheeseman_and_bennetts() -> None:

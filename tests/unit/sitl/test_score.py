@@ -10,13 +10,14 @@ import numpy as np
 import pytest
 
 from sitl.studies.thesis import score
-from sitl.studies.thesis.trace import Array, Row, Sphere, Trace
+from sitl.studies.thesis.trace import Array, Row, Trace
+from swarmctl.core.obstacle import Obstacle
 
 DT_S = 0.02
 REFERENCE_NED_M = np.array([10.0, -20.0, -5.0])  # far off zero: a figure of positions would show
 
 
-def trace_of(off_ned_m: Array, obstacles: Sequence[Sphere] = ()) -> Trace:
+def trace_of(off_ned_m: Array, obstacles: Sequence[Obstacle] = ()) -> Trace:
     """A flight whose agents are `off_ned_m` (T, N, 3) away from a reference that stands still."""
     ticks, agents, _ = off_ned_m.shape
     nothing = np.zeros((ticks, agents, 3))
@@ -126,9 +127,9 @@ def test_clearance_is_of_the_nearest_agent_to_the_centre_of_the_nearest_obstacle
     assert score.clearance_m(replace(trace, obstacles=tuple(spheres[1:]))) == pytest.approx(100.0)
 
 
-def at_offset(off_ned_m: tuple[float, float, float]) -> Sphere:
+def at_offset(off_ned_m: tuple[float, float, float]) -> Obstacle:
     north, east, down = REFERENCE_NED_M + np.array(off_ned_m)
-    return Sphere((float(north), float(east), float(down)), 1.0, 1.75)
+    return Obstacle(center_ned_m=(float(north), float(east), float(down)))
 
 
 def test_without_obstacles_clearance_is_infinite() -> None:

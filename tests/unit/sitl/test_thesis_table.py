@@ -14,9 +14,10 @@ from sitl.studies.thesis import experiments as thesis
 from sitl.studies.thesis.experiments import FULL_JOBS, PLANT_JOBS, Job
 from sitl.studies.thesis.figures import FLIGHTS, SWARMS
 from sitl.studies.thesis.page import flight_of
-from sitl.studies.thesis.trace import Row, Sphere, Trace
+from sitl.studies.thesis.trace import Row, Trace
 from swarmctl.built_in_configs import built_in_config
 from swarmctl.config import load
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.errors import EXIT_USAGE, ConfigError
 
 JOBS = (*PLANT_JOBS, *FULL_JOBS)
@@ -103,7 +104,7 @@ def fake(job: Job, apart_m: float = 1.0, off_m: float = 1.0) -> Trace:
     nothing = np.zeros((600, agents, 3))
     pos = nothing + np.array([0.0, 0.0, -off_m])
     pos[:, :, 0] += apart_m * np.arange(agents)
-    spheres = (Sphere((0.0, 0.0, 5.0), 1.0, 1.75),) if job.flight == "obstacle" else ()
+    spheres = (Obstacle(center_ned_m=(0.0, 0.0, 5.0)),) if job.flight == "obstacle" else ()
     thrust = np.zeros((600, agents))
     ref = nothing + np.array([1.0, 0.0, 0.0]) * (apart_m * np.arange(agents))[None, :, None]
     return Trace(

@@ -9,8 +9,8 @@ import pytest
 
 from sitl.plant.wind import Air
 from swarmctl.config import load
-from swarmctl.core.simulated import WindParams
 from swarmctl.errors import ConfigError
+from swarmctl.simulator_config import WindParams
 from tests.benches.flown_world import FlownWorld
 
 FOOT_M = 0.3048

@@ -15,13 +15,13 @@ from numpy.typing import NDArray
 
 from swarmctl import __version__
 from swarmctl.core.frames import euler_from_quat, quat_from_euler
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.core.tick_record import COLUMNS
 from swarmctl.core.types import Mode, Phase
 from swarmctl.errors import StartError
 from swarmctl.telemetry.attitude import roll_pitch_rad
 from swarmctl.telemetry.feed import AgentClock
-from swarmctl.telemetry.obstacles import read_obstacles
 from swarmctl.telemetry.palette import MODE_RGB, PHASE_RGB, agent_rgb
 from swarmctl.telemetry.quad_mesh import quad_glb
 from swarmctl.telemetry.recordings import open_viewer, optimize_recording, simulated_recording
@@ -47,7 +47,7 @@ def test_offline_recording_holds_the_run_and_can_be_packed(tmp_path: Path) -> No
     from rerun.chunk import RrdReader
 
     run = RunData({0: flown(0), 1: flown(1)}, NO_TRUTH, [])
-    obstacle = {"center_ned_m": (5.0, 0.0, 0.0), "radius_m": 1.0, "keep_out_m": 1.75, "vel_ned_m_s": (0.0, 0.0, 0.0)}
+    obstacle = Obstacle(center_ned_m=(5.0, 0.0, 0.0))
     path = simulated_recording(tmp_path, run, 2, 0.9, 0.85, [obstacle])
     assert optimize_recording(tmp_path)
     rows: dict[str, int] = {}
@@ -166,21 +166,6 @@ def test_clock_of_an_agent_ignores_utc_steps_counts_gaps_and_survives_a_restart(
     assert t_us.tolist() == [1010, 1030]
     assert newer.all()
     assert clock.lost == 2
-
-
-@pytest.mark.parametrize(
-    "listed",
-    [
-        None,
-        "x",
-        [1],
-        [{}],
-        [{"center_ned_m": [1, 2], "radius_m": 1, "keep_out_m": 2}],
-        [{"center_ned_m": [1, 2, float("nan")], "radius_m": 1, "keep_out_m": 2}],
-    ],
-)
-def test_malformed_obstacles_are_refused(listed: object) -> None:
-    assert read_obstacles(listed) is None
 
 
 def test_roll_and_pitch_of_many_agree_with_those_of_one() -> None:

@@ -10,10 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.core.types import Mode, Phase, PlanStatus
 from swarmctl.telemetry.json_safe import to_json
-from swarmctl.telemetry.referee import ObstacleRule, Rules, RunData, judge
+from swarmctl.telemetry.referee import Rules, RunData, judge
 
 UTC0_US = 1_780_000_000_000_000
 START_US = 1_000_000  # monotonic time of mission start
@@ -177,7 +178,7 @@ def test_obstacle_clearance_allows_its_margin_only(margin_m: float, violated: bo
     rules = Rules(
         agents=1,
         required_separation_m=0.5,
-        obstacles=(ObstacleRule((1.5, 0.0, 0.0), 1.75),),
+        obstacles={Obstacle(center_ned_m=(1.5, 0.0, 0.0)): None},
         obstacle_margin_m=margin_m,
     )
     summary = judge(run({0: ticks(5, (0.0, 0.0, 0.0))}), rules, "completed")
@@ -188,16 +189,16 @@ def test_obstacle_clearance_allows_its_margin_only(margin_m: float, violated: bo
 
 @pytest.mark.parametrize(("column", "clearance_m"), [(True, 1.5), (False, 2.5)])
 def test_height_does_not_count_beside_a_column(column: bool, clearance_m: float) -> None:
-    rules = Rules(agents=1, required_separation_m=0.5, obstacles=(ObstacleRule((1.5, 0.0, 2.0), 1.75, column=column),))
+    ball = Obstacle(center_ned_m=(1.5, 0.0, 2.0), column=column)
+    rules = Rules(agents=1, required_separation_m=0.5, obstacles={ball: None})
     summary = judge(run({0: ticks(5, (0.0, 0.0, 0.0))}), rules, "completed")
     assert summary["obstacles"]["min_clearance_m"] == pytest.approx(clearance_m)
     assert (summary["outcome"] == "failed") == column
 
 
 def test_moving_obstacle_is_met_where_it_is_at_the_time() -> None:
-    rules = Rules(
-        agents=1, required_separation_m=0.5, obstacles=(ObstacleRule((10.0, 0.0, 0.0), 1.0, (-1.0, 0.0, 0.0)),)
-    )
+    ball = Obstacle(center_ned_m=(10.0, 0.0, 0.0), keep_out_m=1.0, vel_ned_m_s=(-1.0, 0.0, 0.0))
+    rules = Rules(agents=1, required_separation_m=0.5, obstacles={ball: None})
     assert judge(run({0: ticks(5, (0, 0, 0))}), rules, "completed")["obstacles"]["min_clearance_m"] == pytest.approx(
         5.0
     )
@@ -207,15 +208,14 @@ def test_moving_obstacle_is_met_where_it_is_at_the_time() -> None:
 def test_obstacle_set_in_flight_counts_from_then_on() -> None:
     rows = ticks(10, (0.0, 0.0, 0.0))
     rows["pos_ned_m"][rows["mission_t_s"] >= 4.0] = (50.0, 0.0, 0.0)
+    ball = Obstacle(center_ned_m=(0.0, 0.0, 0.0), keep_out_m=1.0)
     since_us = UTC0_US + START_US + 5_000_000
-    rules = Rules(
-        agents=1, required_separation_m=0.5, obstacles=(ObstacleRule((0.0, 0.0, 0.0), 1.0, (0.0, 0.0, 0.0), since_us),)
-    )
+    rules = Rules(agents=1, required_separation_m=0.5, obstacles={ball: since_us})
     assert judge(run({0: rows}), rules, "completed")["outcome"] == "completed"
     assert (
         judge(
             run({0: rows}),
-            Rules(agents=1, required_separation_m=0.5, obstacles=(ObstacleRule((0, 0, 0), 1.0),)),
+            Rules(agents=1, required_separation_m=0.5, obstacles={ball: None}),
             "completed",
         )["outcome"]
         == "failed"

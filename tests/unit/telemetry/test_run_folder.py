@@ -14,12 +14,13 @@ import pytest
 from numpy.typing import NDArray
 
 from swarmctl import __version__
+from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.core.tick_record import COLUMNS
 from swarmctl.core.types import Mode, Phase
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.telemetry.charts import thin
-from swarmctl.telemetry.referee import ObstacleRule, Rules
+from swarmctl.telemetry.referee import Rules
 from swarmctl.telemetry.run_files import load_run, read_parquet, write_parquet
 from swarmctl.telemetry.run_folder import Outcome, create_run_folder, finish_run, report_run
 
@@ -65,7 +66,7 @@ def write_run(directory: Path, agents: int, seconds: float) -> None:
     (directory / "config.toml").write_text('name = "x<y"\n')
 
 
-RULES = Rules(agents=3, required_separation_m=0.85, obstacles=(ObstacleRule((20.0, 20.0, -2.0), 1.75),))
+RULES = Rules(agents=3, required_separation_m=0.85, obstacles={Obstacle(center_ned_m=(20.0, 20.0, -2.0)): None})
 
 
 def test_launches_in_the_same_second_get_folders_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -241,7 +242,11 @@ class _Page(HTMLParser):
 @pytest.mark.parametrize(("agents", "seconds"), [(3, 60.0), (12, 40.0), (1, 3.5)])
 def test_report_is_small_well_formed_and_self_contained(tmp_path: Path, agents: int, seconds: float) -> None:
     write_run(tmp_path, agents, seconds)
-    rules = Rules(agents=agents, required_separation_m=0.3, obstacles=(ObstacleRule((20.0, 20.0, -2.0), 1.75),))
+    rules = Rules(
+        agents=agents,
+        required_separation_m=0.3,
+        obstacles={Obstacle(center_ned_m=(20.0, 20.0, -2.0)): None},
+    )
     finish_run(tmp_path, rules, Outcome(outcome="completed", problems=("one <script>alert(1)</script> problem",)))
     text = (tmp_path / "report.html").read_text()
     page = _Page()

@@ -1,6 +1,6 @@
-"""Dialects of PX4 and ArduCopter: one table each of all their differences, selected by the HEARTBEAT.
+"""What a dialect is: everything in which an autopilot differs from others, selected by its HEARTBEAT.
 
-Figures and rules are measured or read in their sources. Commands are COMMAND_LONG unless they are parameters.
+Each module of this package beside holds the one of an autopilot. Commands are COMMAND_LONG unless they are parameters.
 """
 
 from __future__ import annotations
@@ -11,11 +11,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from swarmctl.core.types import Command, FlightMode, Verb
+from swarmctl.mavlink.dialects.parameter_check import ParameterCheck
 
 _INT32, _REAL32 = 6, 9  # MAV_PARAM_TYPE
-_CUSTOM_MODE = 1.0  # DO_SET_MODE p1: MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+CUSTOM_MODE = 1.0  # DO_SET_MODE p1: MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
 LAST_INTEGER_TYPE = 8  # MAV_PARAM_TYPE_INT64; larger types are floats
-_ARM, _TAKEOFF, _LAND, _SET_MODE, _INTERVAL, _REQUEST = 400, 22, 21, 176, 511, 512
+_ARM, _TAKEOFF, LAND, SET_MODE, _INTERVAL, _REQUEST = 400, 22, 21, 176, 511, 512  # MAV_CMD
 _NAN = math.nan
 
 SYS_STATUS, GPS_RAW_INT, ATTITUDE, ATTITUDE_QUATERNION, LOCAL_POSITION_NED, GLOBAL_POSITION_INT = 1, 24, 30, 31, 32, 33
@@ -48,9 +49,13 @@ class Rule:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Dialect:
-    """The differences between autopilots."""
+    """The differences between autopilots: a field without a default is one that nothing can be assumed for."""
 
     name: str
+    number: int  # MAV_AUTOPILOT, as in HEARTBEAT.autopilot
+    measured_version: tuple[int, int]  # version whose behaviour was measured
+    sysid_parameter: str  # parameter of the system id
+    mavlink2_setting: str  # what makes it send MAVLink 2
     modes: Mapping[int, FlightMode]  # HEARTBEAT.custom_mode -> mode; an unlisted mode is flown by a pilot
     external: tuple[float, ...]  # DO_SET_MODE p2, p3 of the mode that follows setpoints
     hold: tuple[float, ...]
@@ -65,6 +70,8 @@ class Dialect:
     hover_parameter: str
     thrust_parameters: tuple[str, ...]  # read and recorded: they define the meaning of thrust
     horizontal_accuracy: str  # message that reports it
+    checks: tuple[ParameterCheck, ...]  # what a check before the flight thinks of its parameters
+    also_read: tuple[str, ...]  # parameters that these checks refer to
     loss_parameter: str  # parameter of the setpoint timeout [s]
     heeds_parameter: str = ""  # system id whose heartbeats its link-loss failsafe counts; "": any
 
@@ -73,7 +80,7 @@ class Dialect:
         return self.modes.get(custom_mode, FlightMode.MANUAL)
 
     def to_read(self) -> tuple[str, ...]:
-        """Return the names of the parameters to read before flight."""
+        """Return the names of the parameters that an agent reads before flight."""
         return tuple(dict.fromkeys([*(r.name for r in self.rules), self.hover_parameter, *self.thrust_parameters]))
 
     def steps(self, command: Command) -> tuple[Command, ...]:
@@ -90,8 +97,8 @@ class Dialect:
             Verb.ARM: LongCommand(_ARM, (1.0,)),
             Verb.DISARM: LongCommand(_ARM, (0.0,)),
             Verb.TAKEOFF: LongCommand(_TAKEOFF, height),
-            Verb.EXTERNAL: LongCommand(_SET_MODE, (_CUSTOM_MODE, *self.external)),
-            Verb.HOLD: LongCommand(_SET_MODE, (_CUSTOM_MODE, *self.hold)),
+            Verb.EXTERNAL: LongCommand(SET_MODE, (CUSTOM_MODE, *self.external)),
+            Verb.HOLD: LongCommand(SET_MODE, (CUSTOM_MODE, *self.hold)),
             Verb.LAND: self.land,
             Verb.RATE: LongCommand(_INTERVAL, (float(command.number), interval_us)),
             Verb.MESSAGE: LongCommand(_REQUEST, (float(command.number),)),
@@ -111,119 +118,3 @@ class Dialect:
         if self.integers_bytewise and kind <= LAST_INTEGER_TYPE:
             return float(struct.unpack("<i", struct.pack("<f", value))[0])
         return value
-
-
-def _px4(main: int, sub: int = 0) -> int:
-    return main << 16 | sub << 24
-
-
-PX4 = Dialect(
-    name="PX4",
-    modes={
-        _px4(4, 2): FlightMode.TAKEOFF,
-        _px4(4, 3): FlightMode.HOLD,
-        _px4(4, 4): FlightMode.MISSION,
-        _px4(4, 5): FlightMode.RTL,
-        _px4(4, 6): FlightMode.LAND,
-        _px4(6): FlightMode.EXTERNAL,
-    },
-    external=(6.0, 0.0),
-    hold=(4.0, 3.0),
-    land=LongCommand(_LAND, (_NAN,) * 7),
-    takeoff_parameter="MIS_TAKEOFF_ALT",
-    arm_in=None,
-    integers_bytewise=True,
-    state=(ODOMETRY,),
-    rates_hz={
-        ATTITUDE_TARGET: 5.0,
-        EXTENDED_SYS_STATE: 10.0,
-        CURRENT_MODE: 50.0,  # interval at which PX4 looks for a change; it is sent at 2 Hz and on change
-        ESTIMATOR_STATUS: 1.0,
-        ATTITUDE: 2.0,  # these four default to 50 to 100 Hz, half of all decoded frames, and are not used
-        ATTITUDE_QUATERNION: 2.0,
-        HIGHRES_IMU: 2.0,
-        GLOBAL_POSITION_INT: 2.0,
-    },
-    rules=(
-        Rule(
-            "COM_OBL_RC_ACT",
-            lambda v: 0 <= v <= 5,
-            "motors would stop in the air when setpoints do; set agent.autopilot_params.COM_OBL_RC_ACT = 4 (land)",
-        ),
-        Rule(
-            "NAV_DLL_ACT",
-            lambda v: v in (2, 3),
-            "a vehicle whose agent dies before OFFBOARD would hover for ever; "
-            "set agent.autopilot_params.NAV_DLL_ACT = 3 (land)",
-        ),
-        Rule(
-            "COM_DL_LOSS_T",
-            lambda v: 0 < v <= 30,
-            "so long a vehicle whose agent died before OFFBOARD hovers; set agent.autopilot_params.COM_DL_LOSS_T = 5",
-        ),
-    ),
-    given={"NAV_DLL_ACT": 3, "COM_DL_LOSS_T": 5},  # land when the agent's heartbeats stop before OFFBOARD
-    hover_parameter="MPC_THR_HOVER",
-    thrust_parameters=("THR_MDL_FAC", "MPC_THR_MIN", "MPC_THR_MAX"),
-    horizontal_accuracy="ESTIMATOR_STATUS",
-    loss_parameter="COM_OF_LOSS_T",
-)
-ARDUCOPTER = Dialect(
-    name="ArduCopter",
-    modes={
-        3: FlightMode.MISSION,
-        4: FlightMode.EXTERNAL,
-        5: FlightMode.HOLD,
-        6: FlightMode.RTL,
-        9: FlightMode.LAND,
-        21: FlightMode.RTL,  # SMART_RTL
-    },
-    external=(4.0, 0.0),
-    hold=(5.0, 0.0),
-    land=LongCommand(_SET_MODE, (_CUSTOM_MODE, 9.0)),
-    takeoff_parameter="",
-    arm_in=FlightMode.EXTERNAL,
-    integers_bytewise=False,
-    state=(LOCAL_POSITION_NED, ATTITUDE_QUATERNION),
-    rates_hz={
-        SYS_STATUS: 5.0,
-        EXTENDED_SYS_STATE: 10.0,
-        ATTITUDE_TARGET: 5.0,
-        GPS_RAW_INT: 1.0,
-        GLOBAL_POSITION_INT: 2.0,
-    },
-    rules=(
-        Rule(
-            "GUID_OPTIONS",
-            lambda v: bool(int(v) & 8),
-            "thrust would be flown as a climb rate; set agent.autopilot_params.GUID_OPTIONS = 8 (bit 3)",
-        ),
-        Rule(
-            "GUID_TIMEOUT",
-            lambda v: 0.0 < v <= 5.0,
-            "so long the last attitude is flown when setpoints stop; set agent.autopilot_params.GUID_TIMEOUT = 1.0",
-        ),
-        Rule(
-            "FS_GCS_ENABLE",
-            lambda v: v == 5,
-            "without its agent it would drift on for ever; set agent.autopilot_params.FS_GCS_ENABLE = 5 (land)",
-        ),
-        Rule(
-            "FS_GCS_TIMEOUT",
-            lambda v: 0.0 < v <= 5.0,
-            "so long it drifts before it lands without its agent; set agent.autopilot_params.FS_GCS_TIMEOUT = 2.0",
-        ),
-        Rule(
-            "ATC_ANGLE_BOOST",
-            lambda v: v == 0,
-            "thrust is planned for the tilt already; set agent.autopilot_params.ATC_ANGLE_BOOST = 0",
-        ),
-    ),
-    given={},
-    hover_parameter="MOT_THST_HOVER",
-    thrust_parameters=("MOT_THST_EXPO", "MOT_SPIN_ARM", "MOT_SPIN_MIN", "MOT_SPIN_MAX"),
-    horizontal_accuracy="GPS_RAW_INT",  # its EKF reports test ratios, not metres
-    loss_parameter="GUID_TIMEOUT",
-    heeds_parameter="SYSID_MYGCS",
-)
-DIALECTS: Mapping[int, Dialect] = {12: PX4, 3: ARDUCOPTER}  # by HEARTBEAT.autopilot

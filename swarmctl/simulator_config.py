@@ -1,7 +1,12 @@
-"""Parameters of realism in simulated flights: wind, battery, rotors, ground effect, faults.
+"""The configuration of the simulator, declared once: `[sitl]` of a run's configuration, and what its process is told.
 
-The configuration of a run (`[sitl.wind]`, `[[sitl.faults]]`, ...) and the simulator share them. Everything is off by
-default. The module holds data only: the physics is in `sitl`.
+It is declared in the bridge and not in `sitl`, because a launch validates it and hands it over, and the bridge never
+imports the simulator. `SimulatorParams` holds the keys; `SimulatorConfig` adds what the rest of a run decides. A launch
+gives the latter to `python -m sitl` as JSON, lockstep gives it to the simulated world as it is, and the options of
+`python -m sitl` are made from its fields. So a new key is one line here, and its effect where `sitl` computes it: every
+part of the simulator can read `SitlWorld.params`.
+
+The module holds data only. What goes wrong outside (wind, battery, faults, ...) is off by default.
 """
 
 from __future__ import annotations
@@ -9,9 +14,12 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Annotated, Literal, NamedTuple
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
-from swarmctl.core.params import Params
+from swarmctl.core.params import Params, Vec3
+from swarmctl.errors import ConfigError
+
+MAX_VEHICLES = 100
 
 EVERY_VEHICLE = -1
 _Speed = Annotated[float, Field(ge=-40, le=40)]
@@ -112,8 +120,8 @@ class FaultParams(Params):
             yield f"for_s = {self.for_s}: {self.kind} happens at once; leave it out"
 
 
-class RealismParams(Params):
-    """Collects all parameters of realism, and those of the rotors."""
+class SimulatorParams(Params):
+    """Collects the keys that reach the simulated vehicles, whoever starts the simulator."""
 
     wind: WindParams = WindParams()
     battery: BatteryParams = BatteryParams()
@@ -122,8 +130,55 @@ class RealismParams(Params):
     motor_tau_s: float | None = Field(None, ge=0, le=0.5)  # lag of the rotors; None: that of the airframe
     drag_scale: float = Field(1.0, ge=0, le=10)  # factor on the airframe's drag; 0: none
     ground_effect: bool = False
+    preset: Literal["thesis", "x500", "crazyflie", "arducopter"] = "thesis"  # airframe
+    attitude_gains: Literal["swarm", "single", "pid_step", "pid_trajectory"] = "swarm"  # for the thesis airframe only
+    start: Literal["ground", "air"] = "ground"  # air: vehicles begin at their start positions, without ground (thesis)
+    ekf_ready_s: float = Field(1.0, ge=0, le=60)  # from power-up until arming is possible; 4 in PX4
+    mass_scale: float = Field(1.0, ge=0.3, le=1.9)  # true mass over the preset's, unknown to the bridge
+    estimator: Literal["exact", "gps", "external"] = "exact"  # error model of the autopilots' estimates
+    autopilot_kind: Literal["px4", "arducopter"] = "px4"  # autopilot whose MAVLink interface is simulated
+    physics_hz: int = Field(250, ge=50, le=1000)
+    gcs_port: int = Field(0, ge=0, le=65535)  # ground station, with a second link to every vehicle; 0: none
+    reject_bad_setpoints: bool = True  # false: NaN and zero quaternions have the effects they have on PX4 1.18
+    speed: float = Field(1.0, gt=0, le=100)  # simulated over wall time; agents require 1
 
-    def fault_problems(self, vehicles: int) -> Iterator[str]:
-        """Yield problems of the faults that involve several keys."""
+
+class OriginParams(Params):
+    """Describes the origin of the shared NED frame."""
+
+    origin_lat_deg: float = Field(47.397742, ge=-89.9, le=89.9)  # shared origin of all positions in the configuration
+    origin_lon_deg: float = Field(8.545594, ge=-180, le=180)  # longitude of the same point
+    origin_alt_m: float = Field(489.4, ge=-500, le=9000)  # above mean sea level
+
+
+_Coordinate = Annotated[float, Field(ge=-1e5, le=1e5)]
+_Spawn = Annotated[tuple[_Coordinate, _Coordinate, _Coordinate], Field(strict=False)]
+
+
+class SimulatorConfig(SimulatorParams, OriginParams):
+    """Describes a whole simulation. An impossible one is refused with a `ConfigError` that lists the problems."""
+
+    vehicles: int = Field(3, ge=1, le=MAX_VEHICLES)
+    spawn_ned_m: tuple[_Spawn, ...] = Field((), strict=False)  # shared frame, one each; empty: along x, 1 m apart
+    seed: int = Field(1, ge=0, le=2**31 - 1)
+    sysid_base: int = Field(1, ge=1, le=255)  # MAVLink system id of the first vehicle
+
+    @model_validator(mode="after")
+    def _is_possible(self) -> SimulatorConfig:
+        if problems := list(self._problems()):
+            raise ConfigError("sitl", problems)
+        return self
+
+    def _problems(self) -> Iterator[str]:
+        """Yield what the keys do not allow together."""
+        if self.sysid_base + self.vehicles > 256:
+            yield f"sysid_base = {self.sysid_base}: allowed: 1 to {256 - self.vehicles} for {self.vehicles} vehicles"
+        if len(self.spawn_ned_m) not in (0, self.vehicles):
+            yield f"spawn_ned_m: {len(self.spawn_ned_m)} positions; allowed: one for each of {self.vehicles} vehicles"
         for number, fault in enumerate(self.faults):
-            yield from (f"faults.{number}.{problem}" for problem in fault.problems(vehicles))
+            yield from (f"faults.{number}.{problem}" for problem in fault.problems(self.vehicles))
+
+    def spawns_ned_m(self) -> tuple[Vec3, ...]:
+        """Return the position at which each vehicle begins, shared NED [m]."""
+        middle = (self.vehicles - 1) / 2
+        return self.spawn_ned_m or tuple((i - middle, 0.0, 0.0) for i in range(self.vehicles))

@@ -1,0 +1,46 @@
+"""An obstacle, declared once: in the configuration, on the bus, and wherever one is avoided, judged or drawn."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from swarmctl.core.params import Params
+from swarmctl.core.types import Array
+
+MAX_OBSTACLE_M = 10_000.0  # limit of every coordinate
+_Coordinate = Annotated[float, Field(ge=-MAX_OBSTACLE_M, le=MAX_OBSTACLE_M)]
+_Vector = Annotated[tuple[_Coordinate, _Coordinate, _Coordinate], Field(strict=False)]
+
+
+class Obstacle(Params):
+    """A sphere, or a vertical column of any height, visible to agents only from closer than `visibility_m`."""
+
+    center_ned_m: _Vector
+    column: bool = False  # true: of any height
+    radius_m: float = Field(1.0, gt=0, le=1000)  # the obstacle itself, which the safety filter keeps clear of
+    keep_out_m: float = Field(1.75, gt=0, le=1000)  # constraint radius from the centre, thesis 1 + 2.5 x 0.3
+    visibility_m: float = Field(3.0, gt=0, le=10000)  # agents farther from the centre do not see it
+    vel_ned_m_s: _Vector = (0.0, 0.0, 0.0)
+
+    @property
+    def axes(self) -> int:
+        """Number of leading axes along which a distance from it counts: a column has no height."""
+        return 2 if self.column else 3
+
+    @property
+    def moves(self) -> bool:
+        return any(self.vel_ned_m_s)
+
+    def distance_m(self, pos_ned_m: Array | Sequence[float]) -> float:
+        """Return the distance [m] of a position (3,) from the centre, or from the axis of a column."""
+        return math.dist(self.center_ned_m[: self.axes], pos_ned_m[: self.axes])
+
+    def center_after(self, elapsed_s: float | NDArray[np.floating]) -> Array:
+        """Return the centre NED [m] after a time, (3,), or (T, 3) after times (T, 1), at constant velocity."""
+        return np.array(self.center_ned_m) + elapsed_s * np.array(self.vel_ned_m_s)
