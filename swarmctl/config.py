@@ -27,6 +27,7 @@ from swarmctl.core.params import Params, Vec3
 from swarmctl.core.simulated import RealismParams
 from swarmctl.core.text import printable
 from swarmctl.errors import ConfigError
+from swarmctl.mavlink.geofence import GeofenceParams
 from swarmctl.mavlink.parameter_names import parameter_problems
 from swarmctl.mavlink.transport import Endpoint, parse_url
 from swarmctl.telemetry.referee import ObstacleRule, Rules
@@ -144,6 +145,7 @@ class Config(Params):
     vehicle_model: VehicleModelParams = VehicleModelParams()
     agent: AgentParams = AgentParams()
     vehicles: tuple[VehicleParams, ...] = Field((), strict=False)
+    geofence: GeofenceParams = GeofenceParams()
     sitl: SitlParams = SitlParams()
     bus: BusParams = BusParams()
     telemetry: TelemetryParams = TelemetryParams()
@@ -301,6 +303,7 @@ def _whole(config: Config) -> Iterator[str]:
         yield "start.direction_ned = (0, 0, 0): give the line of start positions a direction"
     elif not (listed and listed < agents):
         yield from _starts_apart(config)
+        yield from config.geofence.problems(config.starts_ned_m())
     yield from _vehicle_problems(config)
     yield from _obstacle_problems(config)
     yield from parameter_problems(config.agent.autopilot_params)

@@ -23,6 +23,7 @@ _STICKS_NOT_BY_RADIO = (1, 4)  # COM_RC_IN_MODE: joystick only, disabled
 _HOVER_APART_01 = 0.1
 _GUIDED_SILENCE_S = 1.0
 _LAND_WITHOUT_STATION = 5  # FS_GCS_ENABLE
+_FENCE_ACTIONS = (2, 5)  # GF_ACTION
 _WEIGHT_WANTED, _WEIGHT_TABLE = 60, 50
 
 
@@ -129,6 +130,13 @@ def _hover(value: float, facts: VehicleFacts, config: Config) -> Opinion:
     )
 
 
+def _fence_action(value: float, facts: VehicleFacts, config: Config) -> Opinion:
+    if value in _FENCE_ACTIONS:
+        return _ok("2 hold, 5 land")
+    advice = "at the fence it would warn only, return through the others, or stop its motors; set 2"
+    return Opinion(verdict=Verdict.FIX, wanted="2 hold, 5 land", advice=advice, to_set=2)
+
+
 def _own_sysid(value: float, facts: VehicleFacts, config: Config) -> Opinion:
     if value == facts.sysid:
         return _ok(f"{facts.wanted_sysid}")
@@ -231,14 +239,19 @@ ROWS: dict[str, tuple[Row, ...]] = {
         Row("SYSID_THISMAV", "its system id after the next boot", _own_sysid),
     ),
 }
+_FENCE_ROWS = {"PX4": (Row("GF_ACTION", "what happens at the geofence", _fence_action),)}
 _ALSO_READ = {"PX4": ("NAV_RCL_ACT",), "ArduCopter": ()}  # parameters that rows refer to
 
 
 def names_to_read(dialect: Dialect, config: Config) -> tuple[str, ...]:
     """Return the names of the parameters to read from an autopilot."""
-    rows = (row.name for row in ROWS[dialect.name])
+    rows = (row.name for row in _rows(dialect.name, config))
     names = (*config.agent.autopilot_params, *dialect.to_read(), *rows, *_ALSO_READ[dialect.name])
     return tuple(dict.fromkeys(names))
+
+
+def _rows(autopilot: str, config: Config) -> tuple[Row, ...]:
+    return (*ROWS[autopilot], *(_FENCE_ROWS.get(autopilot, ()) if config.geofence.corners_ne_m else ()))
 
 
 def parameter_findings(facts: VehicleFacts, config: Config) -> list[Finding]:
@@ -273,7 +286,7 @@ def _opinions(facts: VehicleFacts, config: Config) -> dict[str, Opinion]:
     if dialect is None or facts.parameters is None:
         return {}
     rules = {rule.name: rule for rule in dialect.rules}
-    rows = {row.name: row for row in ROWS[dialect.name]}
+    rows = {row.name: row for row in _rows(dialect.name, config)}
     wanted = config.agent.autopilot_params
     return {
         name: _opinion(name, facts, config, rules.get(name), rows.get(name)) for name in {**wanted, **rules, **rows}
@@ -320,7 +333,9 @@ def _finding(facts: VehicleFacts, name: str, opinion: Opinion) -> Finding:
     value = facts.number(name)
     weight = _WEIGHT_WANTED if "autopilot_params" in opinion.wanted else _WEIGHT_TABLE
     found = "not told" if value is None else f"{value:g}"
-    why = next((row.why for row in ROWS[facts.autopilot] if row.name == name), "")
+    why = next(
+        (row.why for row in (*ROWS[facts.autopilot], *_FENCE_ROWS.get(facts.autopilot, ())) if row.name == name), ""
+    )
     wanted = ": ".join(filter(None, (opinion.wanted, why)))
     return Finding(
         agent=facts.agent,
