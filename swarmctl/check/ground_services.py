@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from mavsdk import Configuration, Mavsdk
+from mavsdk.autopilot import Autopilot
 from mavsdk.exceptions import MavsdkError
 from mavsdk.logging import log_subscribe, log_unsubscribe
 from mavsdk.plugins.events import Events, LogLevel
@@ -34,6 +35,7 @@ from swarmctl.mavlink.codec import Codec
 from swarmctl.wall_clock import monotonic_us
 
 T = TypeVar("T")
+_SERVED = (Autopilot.PX4, Autopilot.ARDUPILOT)  # before it knows which, MAVSDK packs integers as PX4 does
 _OWN_SYSID = 255  # a ground station's; the scans speak as companions
 _DISCOVERY_S = 4.0  # a heartbeat comes once a second
 _CHECKS_S = 8.0  # to download what the numbers of the checks mean, the first time
@@ -170,7 +172,8 @@ class GroundServices:
         until_s = time.monotonic() + _DISCOVERY_S
         while time.monotonic() < until_s and not all(self._vehicles.get(agent) for agent in agents):
             self._pump()
-            systems = {system.get_system_id(): system for system in self._sdk.get_systems() if system.has_autopilot()}
+            known = [system for system in self._sdk.get_systems() if system.autopilot_type() in _SERVED]
+            systems = {system.get_system_id(): system for system in known}
             for agent in agents:
                 scan = self._scans[agent]
                 if agent not in self._vehicles and scan.sysid in systems:

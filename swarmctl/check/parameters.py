@@ -333,9 +333,8 @@ def _finding(facts: VehicleFacts, name: str, opinion: Opinion) -> Finding:
     value = facts.number(name)
     weight = _WEIGHT_WANTED if "autopilot_params" in opinion.wanted else _WEIGHT_TABLE
     found = "not told" if value is None else f"{value:g}"
-    why = next(
-        (row.why for row in (*ROWS[facts.autopilot], *_FENCE_ROWS.get(facts.autopilot, ())) if row.name == name), ""
-    )
+    rows = (*ROWS[facts.autopilot], *_FENCE_ROWS.get(facts.autopilot, ()))
+    why = next((row.why for row in rows if row.name == name), "")
     wanted = ": ".join(filter(None, (opinion.wanted, why)))
     return Finding(
         agent=facts.agent,

@@ -194,9 +194,9 @@ def test_a_geofence_is_uploaded_only_on_request_and_read_back(copter: Simulator,
         code, found, printed = run_check(vehicle, more=FENCE)
         assert (code, verdict(found, "geofence")) == (4, "FIX")
         assert "geofence: 0 corners. --apply uploads it" in printed
-        code, found, _ = run_check(vehicle, more=FENCE, apply=True)
+        code, found, printed = run_check(vehicle, more=FENCE, apply=True)
         assert (code, verdict(found, "geofence")) == (0, "OK")
-        code, found, _ = run_check(vehicle, more=FENCE)  # without --apply nothing could have been mended
+        code, found, printed = run_check(vehicle, more=FENCE)  # without --apply nothing could have been mended
         assert (code, verdict(found, "geofence")) == (0, "OK")
         code, found, printed = run_check(vehicle, more=FENCE.replace("[[20.0", "[[21.0"))
         assert (code, verdict(found, "geofence")) == (4, "FIX")
@@ -221,8 +221,8 @@ def test_the_simulator_tells_no_arming_checks_and_nobody_waits_for_them(
 
 def test_an_arducopter_is_asked_and_set_in_its_own_encoding(copter: Simulator, run_check: Check) -> None:
     wanted = "[agent.autopilot_params]\nGUID_OPTIONS=8\nFS_GCS_ENABLE=5\nFS_GCS_TIMEOUT=2.0\nATC_ANGLE_BOOST=0\n"
-    code, found, _ = run_check((1, copter.ports[0]), apply=True, more=wanted)
-    assert code == 0
+    code, found, printed = run_check((1, copter.ports[0]), apply=True, more=wanted)
+    assert code == 0, printed
     assert found["vehicles"][0]["autopilot"] == "ArduCopter"
     assert ("GUID_OPTIONS", 0, 8, True) in [(c["name"], c["before"], c["after"], c["done"]) for c in found["changes"]]
     assert all(c["done"] for c in found["changes"])
