@@ -30,9 +30,6 @@ from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE, tick_row
 from swarmctl.core.tick_record import TickRecord
 from swarmctl.kernels import why_not_repeatable
-from swarmctl.mavlink.autopilot import Autopilot
-from swarmctl.mavlink.codec import Codec
-from swarmctl.mavlink.commands import CodecCommands
 from swarmctl.mavlink.transport import pipe_pair
 from swarmctl.telemetry.json_safe import json_safe
 from swarmctl.telemetry.referee import RunData
@@ -139,15 +136,18 @@ class Lockstep:
     def _agent(self, index: int, transport: Any) -> Agent:
         log = self.logs[index]
         bus = self.hub.attach(agent_name(index))
-
-        def slow_path(autopilot: Autopilot, codec: Codec) -> CodecCommands:
-            sysid = self.config.sysids()[index]
-            return CodecCommands(autopilot.send_frame, codec, sysid, lambda: autopilot.dialect)
-
         boot_id = self.config.seed * 1000 + index
         config = self._own.get(index, self.config)
         return make_agent(
-            config, index, boot_id, transport, bus, self.clock, log, log.frame, slow_path, time.perf_counter_ns
+            config,
+            index,
+            boot_id,
+            transport,
+            bus=bus,
+            clock=self.clock,
+            sink=log,
+            on_frame=log.frame,
+            stopwatch_ns=time.perf_counter_ns,
         )
 
     def step(self) -> None:

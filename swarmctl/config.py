@@ -26,6 +26,7 @@ from swarmctl.control.reference.mission import MissionParams
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.params import Params, Vec3
 from swarmctl.errors import ConfigError
+from swarmctl.mavlink.geofence import GeofenceParams
 from swarmctl.mavlink.parameter_names import parameter_problems
 from swarmctl.mavlink.transport import Endpoint, parse_url
 from swarmctl.simulator_config import MAX_VEHICLES, OriginParams, SimulatorConfig, SimulatorParams
@@ -113,6 +114,7 @@ class Config(Params):
     vehicle_model: VehicleModelParams = VehicleModelParams()
     agent: AgentParams = AgentParams()
     vehicles: tuple[VehicleParams, ...] = Field((), strict=False)
+    geofence: GeofenceParams = GeofenceParams()
     sitl: SitlParams = SitlParams()
     bus: BusParams = BusParams()
     telemetry: TelemetryParams = TelemetryParams()
@@ -205,6 +207,7 @@ def _whole(config: Config) -> Iterator[str]:
         yield "start.direction_ned = (0, 0, 0): give the line of start positions a direction"
     elif not (listed and listed < agents):
         yield from _starts_apart(config)
+        yield from config.geofence.problems(config.starts_ned_m())
         try:
             config.simulator()
         except ConfigError as error:

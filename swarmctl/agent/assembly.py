@@ -24,11 +24,11 @@ def make_agent(
     agent: int,
     boot_id: int,
     transport: Transport,
+    *,
     bus: Bus,
     clock: Clock,
     sink: TickSink,
     on_frame: Callable[[bytes], None],
-    slow_path: Callable[[Autopilot, Codec], CommandPort],
     stopwatch_ns: Callable[[], int],
 ) -> Agent:
     """Build an agent and connect it to its vehicle, its peers and its recorder.
@@ -39,7 +39,6 @@ def make_agent(
         boot_id: differs between restarts of the same agent.
         transport, bus, clock, sink: see `Agent`.
         on_frame: called with every MAVLink frame sent or received.
-        slow_path: builds the command executor for the vehicle.
         stopwatch_ns: measures the tick [ns].
     """
     sysid = config.sysids()[agent]
@@ -47,7 +46,7 @@ def make_agent(
     codec = Codec(sysid, OWN_COMPID)
     origin = GeoOrigin(swarm.origin_lat_deg, swarm.origin_lon_deg, swarm.origin_alt_m)
     autopilot = Autopilot(transport, codec, sysid, origin, on_frame)
-    commands = slow_path(autopilot, codec)
+    commands = CommandPort(autopilot.send_frame, codec, sysid, lambda: autopilot.dialect)
     autopilot.attach(commands)
     setup = AgentSetup(
         agent=agent,

@@ -22,10 +22,7 @@ from swarmctl.control.phases.state_machine import OPERATOR_STOP
 from swarmctl.core.operator_verbs import Order
 from swarmctl.core.types import Mode
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, MissionError, StartError
-from swarmctl.mavlink.autopilot import Autopilot
-from swarmctl.mavlink.codec import Codec, heartbeat_of
-from swarmctl.mavlink.commands import CommandPort
-from swarmctl.mavlink.mavsdk_commands import MavsdkCommands
+from swarmctl.mavlink.codec import heartbeat_of
 from swarmctl.mavlink.transport import open_transport
 from swarmctl.process_lifetime import StopRequest
 from swarmctl.telemetry.recorder import Recorder
@@ -95,31 +92,23 @@ def run_agent(process: AgentProcess) -> int:
     transport = open_transport(url or f"udpin://{_LOOPBACK}:14540", process.fd, is_vehicle, remote)
     recorder = Recorder(process.run_dir, agent)
     link = _join(process, config, clock)
-    slow: list[CommandPort] = []
-
-    def slow_path(autopilot: Autopilot, codec: Codec) -> CommandPort:
-        slow.append(MavsdkCommands(autopilot.send_frame, codec.sysid, lambda: autopilot.dialect))
-        return slow[0]
-
     boot_id = (clock.utc_us() // 1000) & 0xFFFFFFFF
     flown = make_agent(
         config,
         agent,
         boot_id,
         transport,
-        link,
-        clock,
-        recorder,
-        lambda frame: recorder.frame(clock.utc_us(), frame),
-        slow_path,
-        time.perf_counter_ns,
+        bus=link,
+        clock=clock,
+        sink=recorder,
+        on_frame=lambda frame: recorder.frame(clock.utc_us(), frame),
+        stopwatch_ns=time.perf_counter_ns,
     )
     try:
         vehicle = url or f"inherited socket of sysid {config.sysids()[agent]}"
         return _loop(flown, config, clock, stop, vehicle, process.only_land)
     finally:
         recorder.event("bus_summary", clock.now_us(), clock.utc_us(), rejected=flown.rejected, lost=recorder.lost)
-        slow[0].close()
         link.close()
         transport.close()
         recorder.close()

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from swarmctl.core.types import FlightMode, Landed
 
 Ned = tuple[float, float, float]
+LatLon = tuple[float, float]  # latitude, longitude [deg]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -19,7 +20,6 @@ class Parameter:
 
     name: str
     value: float | int | None
-    kind: int = 0  # MAV_PARAM_TYPE
     refused: bool = False  # the autopilot has reported that it does not exist
 
 
@@ -105,6 +105,32 @@ class Sensors:
     battery_01: float | None
 
 
+@dataclass(frozen=True, slots=True)
+class ArmingProblem:
+    """One line of the autopilot's own arming checks in its current mode."""
+
+    text: str
+    blocks: bool  # arming is refused because of it
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FenceFacts:
+    """The geofence that a vehicle stores."""
+
+    corners_deg: tuple[LatLon, ...] = ()  # of its first polygon to stay in; empty: none
+    others: int = 0  # number of further areas
+    problem: str = ""  # why it is not known, or could not be uploaded
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class VehicleLog:
+    """One log that a vehicle stores."""
+
+    number: int
+    date: str  # as the vehicle tells it, UTC
+    size_bytes: int
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VehicleFacts:
     """Everything known about one vehicle of the configuration."""
@@ -130,6 +156,9 @@ class VehicleFacts:
     origin_ned_m: Ned | None = None  # origin of the local frame, in the shared frame
     origin_told: bool = False  # reported by GPS_GLOBAL_ORIGIN; else computed from the global position
     parameters: Mapping[str, Parameter] | None = None
+    has_metadata: bool = False  # it serves component information, which the texts of its arming checks are in
+    arming_problems: tuple[ArmingProblem, ...] | None = None
+    fence: FenceFacts | None = None  # None: not asked for, because no fence is configured
 
     @property
     def pos_accuracy_m(self) -> float | None:

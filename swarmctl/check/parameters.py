@@ -25,16 +25,24 @@ _WEIGHT_WANTED, _WEIGHT_TABLE = 60, 50
 
 def names_to_read(dialect: Dialect, config: Config) -> tuple[str, ...]:
     """Return the names of the parameters to read from an autopilot."""
-    checked = (check.name for check in dialect.checks)
-    names = (*config.agent.autopilot_params, *dialect.to_read(), *checked, *dialect.also_read)
+    names = (*config.agent.autopilot_params, *dialect.to_read(), *_checks(dialect, config), *dialect.also_read)
     return tuple(dict.fromkeys(names))
+
+
+def _checks(dialect: Dialect, config: Config) -> dict[str, ParameterCheck]:
+    """Return the checks that a configuration needs, by parameter."""
+    checks = (*dialect.checks, *(dialect.fence_checks if config.geofence.corners_ne_m else ()))
+    return {check.name: check for check in checks}
 
 
 def parameter_findings(facts: VehicleFacts, config: Config) -> list[Finding]:
     """Return one finding per wanted or assessed parameter; none for an unsupported autopilot."""
     dialect = DIALECTS.get(facts.autopilot_number)
-    why = {check.name: check.why for check in dialect.checks} if dialect is not None else {}
-    return [_finding(facts, name, opinion, why.get(name, "")) for name, opinion in _opinions(facts, config).items()]
+    checks = _checks(dialect, config) if dialect is not None else {}
+    return [
+        _finding(facts, name, opinion, checks[name].why if name in checks else "")
+        for name, opinion in _opinions(facts, config).items()
+    ]
 
 
 def unchangeable(facts: VehicleFacts) -> str:
@@ -64,7 +72,7 @@ def _opinions(facts: VehicleFacts, config: Config) -> dict[str, Opinion]:
     if dialect is None or facts.parameters is None:
         return {}
     rules = {rule.name: rule for rule in dialect.rules}
-    checks = {check.name: check for check in dialect.checks}
+    checks = _checks(dialect, config)
     wanted, seen = config.agent.autopilot_params, _context(facts, config)
 
     def opinion(name: str) -> Opinion:

@@ -84,6 +84,7 @@ def facts_of(
         origin_ned_m=origin,
         origin_told=told,
         parameters={} if scan.parameters is None else scan.parameters.facts(),
+        has_metadata=scan.has_metadata,
     )
 
 

@@ -1,7 +1,6 @@
 """Scans one vehicle: sends requests and collects the answers without arming or changing any mode, rate or parameter.
 
-A scan sends its heartbeat, TIMESYNC, PING, requests for single messages and parameter reads. Only `set_parameters`
-changes a vehicle; it stops by itself when the vehicle is or becomes armed.
+A scan sends its heartbeat, TIMESYNC, PING, requests for single messages and parameter reads.
 """
 
 from __future__ import annotations
@@ -9,7 +8,7 @@ from __future__ import annotations
 import math
 import selectors
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from pymavlink.dialects.v20 import development as mavlink
@@ -20,7 +19,7 @@ from swarmctl.check.parameter_reader import ParameterReader
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.dialects.dialect import Dialect
 from swarmctl.mavlink.dialects.registry import DIALECTS
-from swarmctl.mavlink.framing import frames
+from swarmctl.mavlink.framing import frames, message_id
 from swarmctl.wall_clock import monotonic_us
 
 SCANNER_COMPID = 192  # MAV_COMP_ID_ONBOARD_COMPUTER2: keeps sequence numbers apart from those of a flying agent
@@ -34,6 +33,7 @@ _PREARM = 1 << 28  # MAV_SYS_STATUS_PREARM_CHECK
 _FRESH_US = 2_500_000  # an older heartbeat does not show the armed state
 _POLL_S = 0.005
 _ONCE = (mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION, mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)
+_COMPONENT_METADATA = 397  # not in pymavlink's dialect: only that it comes is known
 ASKED = (  # messages that are requested when they do not arrive by themselves
     *_ONCE,
     mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE,
@@ -62,6 +62,9 @@ class VehicleScan:
         names_of: returns the parameters to read, by dialect.
         seconds: time to listen after the first heartbeat.
         patience_s: additional time for a vehicle that is not ready to arm yet.
+
+    Attributes:
+        tap: also called with every datagram of the vehicle.
     """
 
     def __init__(
@@ -74,10 +77,12 @@ class VehicleScan:
         patience_s: float = 0.0,
     ) -> None:
         self.listener = listener
+        self.tap: Callable[[bytes], None] | None = None
         self.sysid = 0  # system id of the scanned vehicle; 0 before its first heartbeat
         self.began_us: int | None = None
         self.mavlink1 = self.mavlink2 = 0
         self.senders: set[Address] = set()
+        self.has_metadata = False  # it serves component information
         self.newest: dict[tuple[int, str], Newest] = {}
         self.statistics: dict[int, FrameStatistics] = {}
         self.answers: dict[str, list[Answer]] = {"TIMESYNC": [], "PING": []}
@@ -134,6 +139,8 @@ class VehicleScan:
     def step(self, now_us: int) -> None:
         """Take in what has arrived, and send the requests that are due."""
         for heard in self.listener.receive():
+            if self.tap is not None and heard.sender == self._there:
+                self.tap(heard.data)
             self._take(heard)
         if self._there == NOWHERE:
             return
@@ -151,29 +158,30 @@ class VehicleScan:
         if self._due("requests", now_us, _REQUEST_US):
             self._request_missing(now_us)
         if self.parameters is not None:
-            for message in self.parameters.step(now_us, self.may_change(now_us)):
+            for message in self.parameters.step(now_us):
                 self._send(message)
 
-    def set_parameters(self, values: Mapping[str, float | int]) -> None:
-        """Set parameters one after the other and read each back, only while the vehicle reports that it is disarmed."""
-        assert self.parameters is not None
-        self.parameters.set_all(values)
+    def forward(self, frame: bytes) -> None:
+        """Send a frame of somebody else, who is fed by `tap`, to the vehicle."""
+        self.listener.send(frame, self._there)
 
     def _request_missing(self, now_us: int) -> None:
+        if not self.has_metadata:
+            self._request(_COMPONENT_METADATA)
         for number in ASKED:
             known = self.newest.get((self.sysid, mavlink.mavlink_map[number].msgname))
             if known is not None and (number in _ONCE or now_us - known.t_us < _STALE_US):
                 self._asked.pop(number, None)
-                continue
-            if self._asked.get(number, 0) >= _REQUESTS:
-                continue
-            self._asked[number] = self._asked.get(number, 0) + 1
-            params = (float(number), *[0.0] * 6)
-            self._send(
-                mavlink.MAVLink_command_long_message(
-                    self.sysid, AUTOPILOT_COMPID, mavlink.MAV_CMD_REQUEST_MESSAGE, 0, *params
-                )
-            )
+            else:
+                self._request(number)
+
+    def _request(self, number: int) -> None:
+        """Request a message, unless it was requested so often without an answer."""
+        if self._asked.get(number, 0) >= _REQUESTS:
+            return
+        self._asked[number] = self._asked.get(number, 0) + 1
+        params, request = (float(number), *[0.0] * 6), mavlink.MAV_CMD_REQUEST_MESSAGE
+        self._send(mavlink.MAVLink_command_long_message(self.sysid, AUTOPILOT_COMPID, request, 0, *params))
 
     def _due(self, what: str, now_us: int, every_us: int) -> bool:
         if now_us < self._due_us.get(what, 0):
@@ -200,7 +208,9 @@ class VehicleScan:
             self._count(frame, heard.sender)
             statistics = self.statistics.setdefault(sysid, FrameStatistics())
             statistics.frame(seq, len(frame))
-            if message is not None:
+            if message is None:
+                self.has_metadata |= sysid == self.sysid and message_id(frame) == _COMPONENT_METADATA
+            else:
                 statistics.message(message.get_type(), heard.t_us)
                 self._message(sysid, message, heard)
 

@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from swarmctl.check.finding import SWARM, Finding
 from swarmctl.check.link_facts import Ned, VehicleFacts
 from swarmctl.check.parameters import parameter_findings
+from swarmctl.check.services import service_findings
 from swarmctl.check.vehicle import vehicle_findings
 from swarmctl.config import Config
 from swarmctl.core.types import Landed
@@ -52,7 +53,7 @@ def standing(vehicles: Sequence[VehicleFacts]) -> list[Finding]:
 
 
 def _own(facts: VehicleFacts, config: Config) -> list[Finding]:
-    return [*_start(facts, config), *parameter_findings(facts, config)]
+    return [*_start(facts, config), *service_findings(facts, config), *parameter_findings(facts, config)]
 
 
 def _start(facts: VehicleFacts, config: Config) -> list[Finding]:

@@ -24,4 +24,5 @@ def explained(refused: ValidationError) -> list[str]:
     ]
 
 
+Vec2 = Annotated[tuple[float, float], Field(strict=False)]  # not strict: TOML arrays are lists
 Vec3 = Annotated[tuple[float, float, float], Field(strict=False)]  # not strict: TOML arrays are lists

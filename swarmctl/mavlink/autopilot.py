@@ -222,7 +222,7 @@ class Autopilot:
         if handler is not None:
             handler(message, arrived_us)
         if self._slow is not None and message.get_msgId() not in _FAST:
-            self._slow.frame(frame, message)
+            self._slow.frame(message)
 
     def _heartbeat(self, message: Any, arrived_us: int) -> None:
         dialect = DIALECTS.get(message.autopilot)

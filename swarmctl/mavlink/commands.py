@@ -1,7 +1,7 @@
 """Command port: arming, modes, parameters and message rates, requested now and answered later.
 
-One table of MAVLink commands serves both executors: `CodecCommands` here (lockstep, and links without MAVSDK) and
-`MavsdkCommands`, which runs MAVSDK over the same socket. The tick never waits for either.
+It is the same in real flight and in lockstep, and runs within the tick: it sends nothing while the tick hangs, and the
+tick never waits for an answer.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import struct
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 from pymavlink.dialects.v20 import development as mavlink
 
@@ -35,31 +35,8 @@ class CommandResult:
     text: str
 
 
-class CommandPort(Protocol):
-    """Executes commands one after the other, in the background of the tick."""
-
-    @property
-    def busy(self) -> bool:
-        """Whether a command is still unanswered."""
-
-    def request(self, command: Command) -> None:
-        """Queue a command."""
-
-    def results(self) -> list[CommandResult]:
-        """Return the results since the last call."""
-
-    def frame(self, frame: bytes, message: Any) -> None:
-        """Take a frame of the vehicle; every message except the fast state messages is passed here."""
-
-    def step(self, now_us: int) -> None:
-        """Advance the queue; called once per tick."""
-
-    def close(self) -> None:
-        """Release all resources."""
-
-
-class CodecCommands:
-    """Executes commands with the codec, repeats them until acknowledged, and sends the agent's heartbeat.
+class CommandPort:
+    """Executes commands one after the other, repeats each until acknowledged, and sends the agent's heartbeat.
 
     The heartbeat is that of a ground station. PX4 counts only those for its data-link failsafe, which lands a vehicle
     whose agent dies before OFFBOARD, and sends its texts only to them.
@@ -90,23 +67,27 @@ class CodecCommands:
 
     @property
     def busy(self) -> bool:
+        """Whether a command is still unanswered."""
         return bool(self._steps or self._asked)
 
     def request(self, command: Command) -> None:
+        """Queue a command."""
         self._asked.append(command)
 
     def results(self) -> list[CommandResult]:
+        """Return the results since the last call."""
         done, self._results = self._results, []
         return done
 
-    def frame(self, frame: bytes, message: Any) -> None:
+    def frame(self, message: Any) -> None:
+        """Take a message of the vehicle; every one except the fast state messages is passed here."""
         if not self._steps or self._spoken is None:
             return
         current = self._steps[0]
         kind = message.get_type()
         if kind == "COMMAND_ACK":
             asked = self._spoken.long_command(current)
-            if asked is None or asked.command != message.command:
+            if asked is None or asked.command != message.command or not self._is_ours(message):
                 return
             if message.result == _IN_PROGRESS:
                 self._tries = 0
@@ -118,6 +99,7 @@ class CodecCommands:
             self._finish(False, f"parameter error {message.error}")
 
     def step(self, now_us: int) -> None:
+        """Send what is due: a heartbeat, and the open command if it was not answered; called once per tick."""
         if now_us >= self._heartbeat_us:
             self._heartbeat_us = now_us + _HEARTBEAT_US
             beat = mavlink.MAVLink_heartbeat_message(_GROUND_STATION, _NO_AUTOPILOT, 0, 0, _ACTIVE, 3)
@@ -137,9 +119,9 @@ class CodecCommands:
             assert self._spoken is not None
             self._send(self._codec.encode(self._message(self._steps[0], self._spoken)))
 
-    def close(self) -> None:
-        self._asked.clear()
-        self._steps.clear()
+    def _is_ours(self, message: Any) -> bool:
+        """Whether an acknowledgement answers this component, or, as from older autopilots, names nobody."""
+        return message.target_system in (0, self._codec.sysid) and message.target_component in (0, self._codec.compid)
 
     def _compare(self, current: Command, dialect: Dialect, message: Any) -> None:
         told = dialect.from_wire(message.param_value, message.param_type)

@@ -352,6 +352,22 @@ def report(folder: Folder) -> int:
     return EXIT_OK
 
 
+@app.command()
+def bundle(
+    folder: Folder,
+    output: Annotated[
+        Path | None, typer.Option("--output", metavar="FILE", help="Archive to write; default: beside the folder.")
+    ] = None,
+    logs: Annotated[int, typer.Option("--logs", min=0, help="Newest logs to download from each vehicle.")] = 1,
+) -> int:
+    """Pack a run for support: its folder, versions, and logs of the disarmed vehicles that are reached."""
+    from swarmctl.ops.bundle import BundleOptions
+    from swarmctl.ops.bundle import bundle as pack
+
+    print(pack(BundleOptions(folder=folder, output=output, logs=logs)))
+    return EXIT_OK
+
+
 @app.command(context_settings=_PASS_ON)
 def reproduce(context: typer.Context) -> NoReturn:
     """Reproduce the six experiments of the thesis. Writes each result beside the published figure."""

@@ -25,7 +25,6 @@ _NEEDED = {
     "scipy": (1, 14),
     "osqp": (1, 1),
     "pymavlink": (2, 4),
-    "mavsdk": (4, 1),
     "eclipse-zenoh": (1, 10),
     "msgspec": (0, 19),
     "pyarrow": (18,),

@@ -183,10 +183,46 @@ def test_a_wrong_parameter_is_found_applied_and_then_nothing_is_left(simulators:
     assert "2 of 2 vehicles reached, nothing to fix" in printed
 
 
+FENCE = "[geofence]\ncorners_ne_m=[[20.0,20.0],[20.0,-20.0],[-20.0,-20.0],[-20.0,20.0]]\n"
+
+
+def test_a_geofence_is_uploaded_only_on_request_and_read_back(copter: Simulator, run_check: Check) -> None:
+    own = Simulator(1)  # it stays with the vehicle
+    try:
+        own.wait_until_up()
+        vehicle = (1, own.ports[0])
+        code, found, printed = run_check(vehicle, more=FENCE)
+        assert (code, verdict(found, "geofence")) == (4, "FIX")
+        assert "geofence: 0 corners. --apply uploads it" in printed
+        code, found, printed = run_check(vehicle, more=FENCE, apply=True)
+        assert (code, verdict(found, "geofence")) == (0, "OK")
+        code, found, printed = run_check(vehicle, more=FENCE)  # without --apply nothing could have been mended
+        assert (code, verdict(found, "geofence")) == (0, "OK")
+        code, found, printed = run_check(vehicle, more=FENCE.replace("[[20.0", "[[21.0"))
+        assert (code, verdict(found, "geofence")) == (4, "FIX")
+        assert "4 corners, not the same" in printed
+        _, found, _ = run_check(vehicle)
+        assert not any(line["topic"] in ("geofence", "GF_ACTION") for line in found["findings"]), "off by default"
+    finally:
+        own.stop()
+    _, found, _ = run_check((1, copter.ports[0]), more=FENCE, apply=True)
+    assert verdict(found, "geofence") == "NOTE", "it is PX4's"
+
+
+def test_the_simulator_tells_no_arming_checks_and_nobody_waits_for_them(
+    simulators: Simulators, run_check: Check
+) -> None:
+    begun_s = time.monotonic()
+    _, found, _ = run_check((1, simulators[0].ports[0]))
+    assert time.monotonic() - begun_s < 5.0
+    [line] = [line for line in found["findings"] if line["topic"] == "arming checks"]
+    assert (line["verdict"], line["found"]) == ("OK", "not told by this autopilot; see sensors")
+
+
 def test_an_arducopter_is_asked_and_set_in_its_own_encoding(copter: Simulator, run_check: Check) -> None:
     wanted = "[agent.autopilot_params]\nGUID_OPTIONS=8\nFS_GCS_ENABLE=5\nFS_GCS_TIMEOUT=2.0\nATC_ANGLE_BOOST=0\n"
-    code, found, _ = run_check((1, copter.ports[0]), apply=True, more=wanted)
-    assert code == 0
+    code, found, printed = run_check((1, copter.ports[0]), apply=True, more=wanted)
+    assert code == 0, printed
     assert found["vehicles"][0]["autopilot"] == "ArduCopter"
     assert ("GUID_OPTIONS", 0, 8, True) in [(c["name"], c["before"], c["after"], c["done"]) for c in found["changes"]]
     assert all(c["done"] for c in found["changes"])

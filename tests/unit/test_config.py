@@ -65,6 +65,11 @@ def test_defaults_are_the_thesis_circle_with_three_agents() -> None:
         ("swarm=3", ("swarm = 3",)),
         ("limits.min_separation_m=2.0", ("limits.min_separation_m = 2.0", "separation.radius_m")),
         ("start.spacing_m=0.5", ("agents 0 and 1", "0.50 m apart", "start.spacing_m")),
+        ("geofence.corners_ne_m=[[9.0, 9.0], [9.0, -9.0]]", ("geofence.corners_ne_m", "2 corners", "3 or more")),
+        (
+            "geofence.corners_ne_m=[[0.5, 9.0], [0.5, -9.0], [-9.0, 0.0]]",
+            ("geofence.corners_ne_m", "agents [2]", "outside"),
+        ),
         ("start.direction_ned=[0.0, 0.0, 0.0]", ("start.direction_ned", "direction")),
         ("start.positions_ned_m=[[0.0, 0.0, -1.0]]", ("start.positions_ned_m", "1 positions", "swarm.agents = 3")),
         ("start.center_ned_m=[0.0, 0.0, 1.9]", ("agent 0", "ground", "sitl.ground_z_m")),

@@ -21,9 +21,6 @@ from swarmctl.config import Config, load
 from swarmctl.core.clock import SimClock
 from swarmctl.core.tick_record import TickRecord, TickTiming
 from swarmctl.core.types import Array, Phase, PlanStatus, PredictedPath
-from swarmctl.mavlink.autopilot import Autopilot
-from swarmctl.mavlink.codec import Codec
-from swarmctl.mavlink.commands import CodecCommands
 from swarmctl.mavlink.transport import pipe_pair
 
 SPACING_M = 1.0  # distance of places; 0.9 m is kept
@@ -136,17 +133,12 @@ class Formation:
             0,
             1,
             near,
-            hub.attach(agent_name(0)),
-            self.clock,
-            self._sink,
-            lambda frame: None,
-            self._slow_path,
-            time.perf_counter_ns,
+            bus=hub.attach(agent_name(0)),
+            clock=self.clock,
+            sink=self._sink,
+            on_frame=lambda frame: None,
+            stopwatch_ns=time.perf_counter_ns,
         )
-
-    @staticmethod
-    def _slow_path(autopilot: Autopilot, codec: Codec) -> CodecCommands:
-        return CodecCommands(autopilot.send_frame, codec, 1, lambda: autopilot.dialect)
 
     @property
     def mission_t_s(self) -> float:

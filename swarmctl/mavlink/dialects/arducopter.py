@@ -169,6 +169,8 @@ ARDUCOPTER = Dialect(
         ParameterCheck("SYSID_THISMAV", "its system id after the next boot", judge_own_sysid),
     ),
     also_read=(),
+    fence_checks=(),
+    log_suffix=".bin",
     loss_parameter="GUID_TIMEOUT",
     heeds_parameter="SYSID_MYGCS",
 )

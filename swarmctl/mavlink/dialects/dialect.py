@@ -72,6 +72,8 @@ class Dialect:
     horizontal_accuracy: str  # message that reports it
     checks: tuple[ParameterCheck, ...]  # what a check before the flight thinks of its parameters
     also_read: tuple[str, ...]  # parameters that these checks refer to
+    fence_checks: tuple[ParameterCheck, ...]  # what it thinks besides with a geofence; empty: none is uploaded to it
+    log_suffix: str  # of the logs that it writes itself
     loss_parameter: str  # parameter of the setpoint timeout [s]
     heeds_parameter: str = ""  # system id whose heartbeats its link-loss failsafe counts; "": any
 

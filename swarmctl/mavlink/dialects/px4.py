@@ -32,6 +32,7 @@ from swarmctl.mavlink.dialects.parameter_check import (
 
 _OFFBOARD_EXCEPTED = 4  # COM_RCL_EXCEPT bit 2
 _STICKS_NOT_BY_RADIO = (1, 4)  # COM_RC_IN_MODE: joystick only, disabled
+_FENCE_ACTIONS = (2, 5)  # GF_ACTION
 
 
 def _offboard_loss(value: float, seen: ParameterContext) -> Opinion:
@@ -94,6 +95,13 @@ def _thrust_model(value: float, seen: ParameterContext) -> Opinion:
             advice="thrust is taken as linear, real propellers are not: calibrate it to hover well",
         )
     return ok("0 simulated, 0.2 to 0.5 real")
+
+
+def _fence_action(value: float, seen: ParameterContext) -> Opinion:
+    if value in _FENCE_ACTIONS:
+        return ok("2 hold, 5 land")
+    advice = "at the fence it would warn only, return through the others, or stop its motors; set 2"
+    return Opinion(verdict=Verdict.FIX, wanted="2 hold, 5 land", advice=advice, to_set=2)
 
 
 def _mode(main: int, sub: int = 0) -> int:
@@ -164,5 +172,7 @@ PX4 = Dialect(
         ParameterCheck("MAV_SYS_ID", "its system id after the next boot", judge_own_sysid),
     ),
     also_read=("NAV_RCL_ACT",),
+    fence_checks=(ParameterCheck("GF_ACTION", "what happens at the geofence", _fence_action),),
+    log_suffix=".ulg",
     loss_parameter="COM_OF_LOSS_T",
 )

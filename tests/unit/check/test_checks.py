@@ -14,7 +14,9 @@ import pytest
 from swarmctl.check.change import Change
 from swarmctl.check.finding import SWARM, Finding, worst_first
 from swarmctl.check.link_facts import (
+    ArmingProblem,
     Estimator,
+    FenceFacts,
     Gps,
     LinkFacts,
     Parameter,
@@ -26,6 +28,7 @@ from swarmctl.check.link_facts import (
 )
 from swarmctl.check.parameters import RC_RECEIVER, changes, names_to_read, unchangeable
 from swarmctl.check.scan_facts import unreached
+from swarmctl.check.services import corners_deg
 from swarmctl.check.swarm import exit_code, findings, standing
 from swarmctl.check.table import as_json, print_check
 from swarmctl.config import Config, load
@@ -84,10 +87,7 @@ LINK = LinkFacts(
 
 def parameters(values: dict[str, float | int], **changed: float | int | None) -> dict[str, Parameter]:
     merged: dict[str, Any] = {**values, **changed}
-    return {
-        name: Parameter(name=name, value=value, kind=6 if isinstance(value, int) else 9)
-        for name, value in merged.items()
-    }
+    return {name: Parameter(name=name, value=value) for name, value in merged.items()}
 
 
 HEALTHY = VehicleFacts(
@@ -158,6 +158,66 @@ def test_a_healthy_pair_has_nothing_to_fix_and_nothing_to_know(config: Config) -
     lines = findings([HEALTHY, SECOND_OK], config)
     assert worst_first(lines) == []
     assert exit_code([HEALTHY, SECOND_OK], lines) == 0
+
+
+@pytest.mark.parametrize(
+    ("told", "verdict", "word"),
+    [
+        ({}, Verdict.OK, "not told by this autopilot"),
+        ({"has_metadata": True}, Verdict.NOTE, "not told"),
+        ({"arming_problems": ()}, Verdict.OK, "no problem"),
+        ({"arming_problems": (ArmingProblem("No sticks", False),)}, Verdict.NOTE, "No sticks"),
+        (
+            {"arming_problems": (ArmingProblem("No sticks", False), ArmingProblem("Compass 0 uncalibrated", True))},
+            Verdict.FIX,
+            "Compass 0 uncalibrated",
+        ),
+    ],
+)
+def test_the_autopilots_own_arming_checks(config: Config, told: dict[str, Any], verdict: Verdict, word: str) -> None:
+    line = line_of(findings([changed(HEALTHY, **told)], config), "arming checks")
+    assert line.verdict is verdict
+    assert word in line.found
+    assert ("No sticks" in line.found) is (word == "No sticks"), "what blocks is not hidden among warnings"
+
+
+SQUARE_NE_M = [[20.0, 20.0], [20.0, -20.0], [-20.0, -20.0], [-20.0, 20.0]]
+
+
+def fenced(corners_ne_m: list[list[float]] = SQUARE_NE_M) -> Config:
+    return load(None, ["sitl.enabled=true", f"geofence.corners_ne_m={corners_ne_m}"])
+
+
+def test_the_corners_are_north_and_east_of_the_shared_origin() -> None:
+    (lat, lon), (_, west), *_ = corners_deg(fenced())
+    assert (lat - 47.397742) * 111_180 == pytest.approx(20.0, abs=0.05)
+    assert (lon - 8.545594) * 111_320 * math.cos(math.radians(lat)) == pytest.approx(20.0, abs=0.1)
+    assert west < 8.545594 < lon
+
+
+@pytest.mark.parametrize("of", ["same", "rounded", "none", "moved", "more", "refused", "not asked"])
+def test_a_geofence_is_exactly_the_configured_one(of: str) -> None:
+    config = fenced()
+    corners = corners_deg(config)
+    fence = {
+        "same": FenceFacts(corners_deg=corners),
+        "rounded": FenceFacts(corners_deg=tuple((round(lat, 7), round(lon, 7)) for lat, lon in corners)),
+        "none": FenceFacts(),
+        "moved": FenceFacts(corners_deg=((corners[0][0] + 1e-5, corners[0][1]), *corners[1:])),
+        "more": FenceFacts(corners_deg=corners, others=1),
+        "refused": FenceFacts(problem="timeout"),
+        "not asked": None,
+    }[of]
+    line = line_of(findings([changed(HEALTHY, fence=fence)], config), "geofence")
+    assert line.verdict is (Verdict.OK if of in ("same", "rounded") else Verdict.FIX)
+
+
+@pytest.mark.parametrize(("action", "verdict"), [(0, "FIX"), (1, "FIX"), (2, "OK"), (3, "FIX"), (4, "FIX"), (5, "OK")])
+def test_at_a_configured_geofence_the_vehicle_holds_or_lands(action: int, verdict: str) -> None:
+    facts = changed(HEALTHY, parameters=parameters(PX4_VALUES, GF_ACTION=action))
+    assert line_of(findings([facts], fenced()), "GF_ACTION").verdict.name == verdict
+    assert changes(facts, fenced()).get("GF_ACTION") == (None if verdict == "OK" else 2)
+    assert not [line for line in findings([facts], load(None)) if line.topic == "GF_ACTION"], "without one nobody cares"
 
 
 def test_a_healthy_copter_has_nothing_to_fix(config: Config) -> None:

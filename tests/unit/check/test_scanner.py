@@ -67,7 +67,6 @@ class Vehicle:
         self.listener, self.sysid, self.autopilot, self.mode = listener, sysid, autopilot, mode
         self.armed = False
         self.values: dict[str, tuple[int, float | int]] = {}  # name -> kind, value
-        self.keeps = False  # its own values, whatever it is told
         self.silent_about: set[str] = set()
         self.health = 0  # of SYS_STATUS, which it sends only when asked; 0: never
         self.codec = Codec(sysid, 1)
@@ -95,8 +94,6 @@ class Vehicle:
                 self.say(mavlink.MAVLink_sys_status_message(1, 1, self.health, 0, 0, 0, -1, 0, 0, 0, 0, 0, 0))
             elif kind == "PARAM_REQUEST_READ":
                 self._param(message.param_id)
-            elif kind == "PARAM_SET":
-                self._set(message)
 
     def _param(self, name: str) -> None:
         if name in self.silent_about:
@@ -110,15 +107,6 @@ class Vehicle:
         if kind != 9 and self.autopilot == PX4:
             wire = struct.unpack("<f", struct.pack("<i", int(value)))[0]
         self.say(mavlink.MAVLink_param_value_message(name.encode(), wire, kind, len(self.values), 0))
-
-    def _set(self, message: Any) -> None:
-        name, kind, value = message.param_id, message.param_type, message.param_value
-        assert kind == self.values[name][0]
-        if not self.keeps:
-            if kind != 9 and self.autopilot == PX4:
-                value = struct.unpack("<i", struct.pack("<f", value))[0]
-            self.values[name] = (kind, value)
-        self._param(name)
 
 
 def names(*wanted: str) -> Callable[[Dialect], Sequence[str]]:
@@ -350,67 +338,48 @@ def raw_frame(sysid: int, compid: int, kind: int, payload: bytes) -> bytes:
     return b"\xfd" + body + int(crc).to_bytes(2, "little")
 
 
-# --- setting ---
-
-
-@pytest.mark.parametrize("autopilot", [PX4, COPTER])
-def test_parameters_are_set_in_the_autopilots_encoding_and_read_back(
-    listener: ScriptedListener, autopilot: int
-) -> None:
-    vehicle = Vehicle(listener, autopilot=autopilot, mode=GUIDED)
-    vehicle.values = {"AN_INT": (6, 1), "A_SMALL": (2, 3), "A_REAL": (9, 3.0)}
-    scan = VehicleScan(listener, NOWHERE, 1, names("AN_INT", "A_SMALL", "A_REAL"), 1.0)
-    before = run(scan, vehicle, 1.5).parameters or {}
-    assert {name: p.value for name, p in before.items()} == {"AN_INT": 1, "A_SMALL": 3, "A_REAL": 3.0}
-    scan.set_parameters({"AN_INT": 70000, "A_REAL": 1.5})
-    after = run(scan, vehicle, 1.5).parameters or {}
-    assert {name: p.value for name, p in after.items()} == {"AN_INT": 70000, "A_SMALL": 3, "A_REAL": 1.5}
-    sets = [m.param_id for m, _ in listener.sent if m.get_type() == "PARAM_SET"]
-    assert sets == ["AN_INT", "A_REAL"]
-
-
-def test_what_the_autopilot_keeps_is_what_counts(listener: ScriptedListener) -> None:
+def test_values_are_read_again_on_request_and_unknown_until_then(listener: ScriptedListener) -> None:
     vehicle = Vehicle(listener)
-    vehicle.values, vehicle.keeps = {"AN_INT": (6, 1)}, True
-    scan = VehicleScan(listener, NOWHERE, 1, names("AN_INT"), 1.0)
-    run(scan, vehicle, 1.5)
-    scan.set_parameters({"AN_INT": 4})
-    facts = run(scan, vehicle, 1.5)
-    assert facts.number("AN_INT") == 1
+    vehicle.values = {"AN_INT": (6, 1), "A_REAL": (9, 3.0)}
+    scan = VehicleScan(listener, NOWHERE, 1, names("AN_INT", "A_REAL"), 1.0)
+    assert run(scan, vehicle, 1.5).number("AN_INT") == 1
+    vehicle.values["AN_INT"] = (6, 4)
+    assert run(scan, vehicle, 1.5).number("AN_INT") == 1
+    assert scan.parameters is not None
+    scan.parameters.read_again(["AN_INT"])
+    assert scan.parameters.facts()["AN_INT"].value is None
+    assert not scan.finished(listener.now_us)
+    assert run(scan, vehicle, 1.5).number("AN_INT") == 4
     assert scan.finished(listener.now_us)
+    reads = [m.param_id for m, _ in listener.sent if m.get_type() == "PARAM_REQUEST_READ"]
+    assert sorted(reads) == ["AN_INT", "AN_INT", "A_REAL"]
+
+
+def test_the_tap_gets_what_the_vehicle_sends_and_forwards_to_it_alone(listener: ScriptedListener) -> None:
+    vehicle, tapped = Vehicle(listener), list[bytes]()
+    scan = VehicleScan(listener, NOWHERE, 1, names(), 1.0)
+    run(scan, vehicle, 1.5)
+    scan.tap = tapped.append
+    vehicle.say(mavlink.MAVLink_statustext_message(6, b"from a stranger"), STRANGER)
+    vehicle.say(mavlink.MAVLink_statustext_message(6, b"from the vehicle"))
+    scan.step(listener.now_us)
+    assert len(tapped) == 1 and b"from the vehicle" in tapped[0]
+    scan.forward(Codec(255, 192).encode(mavlink.MAVLink_param_request_list_message(1, 1)))
+    message, to = listener.sent[-1]
+    assert (message.get_type(), to) == ("PARAM_REQUEST_LIST", VEHICLE)
 
 
 @pytest.mark.parametrize("why", ["armed", "silent", "another"])
-def test_nothing_is_set_on_a_vehicle_that_is_armed_silent_or_another(listener: ScriptedListener, why: str) -> None:
+def test_nothing_may_be_changed_on_a_vehicle_that_is_armed_silent_or_another(
+    listener: ScriptedListener, why: str
+) -> None:
     vehicle = Vehicle(listener, sysid=4 if why == "another" else 1)
-    vehicle.values = {"AN_INT": (6, 1)}
-    scan = VehicleScan(listener, NOWHERE, 1, names("AN_INT"), 1.0)
+    scan = VehicleScan(listener, NOWHERE, 1, names(), 1.0)
     run(scan, vehicle, 1.5)
-    if why == "silent":
-        run(scan, vehicle, 3.0, beating=False)
-    if why == "armed":
-        vehicle.armed = True
-        vehicle.beat()
-        scan.step(listener.now_us)
-    scan.set_parameters({"AN_INT": 4})
-    run(scan, vehicle, 1.0, beating=False)
-    assert not [m for m, _ in listener.sent if m.get_type() == "PARAM_SET"]
-    assert scan.parameters is not None and scan.parameters.interrupted
-    assert scan.finished(listener.now_us)
-
-
-def test_setting_stops_when_the_vehicle_is_armed_meanwhile(listener: ScriptedListener) -> None:
-    vehicle = Vehicle(listener)
-    vehicle.values = {"A_FIRST": (6, 1), "A_SECOND": (6, 1)}
-    scan = VehicleScan(listener, NOWHERE, 1, names("A_FIRST", "A_SECOND"), 1.0)
-    run(scan, vehicle, 1.5)
-    vehicle.silent_about = {"A_FIRST"}
-    scan.set_parameters({"A_FIRST": 2, "A_SECOND": 2})
-    run(scan, vehicle, 0.1, beating=False)
-    vehicle.armed = True
-    run(scan, vehicle, 5.0)
-    assert {m.param_id for m, _ in listener.sent if m.get_type() == "PARAM_SET"} == {"A_FIRST"}
-    assert vehicle.values["A_SECOND"] == (6, 1)
+    assert scan.may_change(listener.now_us) is (why != "another")
+    vehicle.armed = why == "armed"
+    run(scan, vehicle, 3.0, beating=why != "silent")
+    assert not scan.may_change(listener.now_us)
 
 
 # --- counting ---

@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import development as dialect
 
 from swarmctl.core.types import Command, Verb
 from swarmctl.mavlink.codec import Codec
-from swarmctl.mavlink.commands import CodecCommands, CommandResult
+from swarmctl.mavlink.commands import CommandPort, CommandResult
 from swarmctl.mavlink.dialects.arducopter import ARDUCOPTER
 from swarmctl.mavlink.dialects.dialect import Dialect
 from swarmctl.mavlink.dialects.px4 import PX4
@@ -21,12 +21,12 @@ SECOND = 1_000_000
 
 
 class Bench:
-    """`CodecCommands`, its clock, and what it sends."""
+    """`CommandPort`, its clock, and what it sends."""
 
     def __init__(self, dialect: Dialect | None = PX4) -> None:
         self.out: list[bytes] = []
         self.dialect = dialect
-        self.port = CodecCommands(self.out.append, Codec(5, 191), 5, lambda: self.dialect)
+        self.port = CommandPort(self.out.append, Codec(5, 191), 5, lambda: self.dialect)
         self.now_us = 0
 
     def run(self, seconds: float) -> list[Any]:
@@ -41,12 +41,12 @@ class Bench:
     def hear(self, message: Any) -> list[CommandResult]:
         codec = Codec(5, 1)
         frame = codec.encode(message)
-        self.port.frame(frame, codec.decode(frame))
+        self.port.frame(codec.decode(frame))
         return self.port.results()
 
 
-def ack(command: int, result: int = 0) -> Any:
-    return dialect.MAVLink_command_ack_message(command, result)
+def ack(command: int, result: int = 0, target: tuple[int, int] = (5, 191)) -> Any:
+    return dialect.MAVLink_command_ack_message(command, result, 0, 0, *target)
 
 
 def param_value(name: str, value: float, kind: int = 9) -> Any:
@@ -158,6 +158,14 @@ def test_the_answer_to_something_else_is_not_ours() -> None:
     assert bench.hear(ack(400)) == []
     assert bench.hear(param_value("MIS_TAKEOFF_ALT", 3.0)) == []
     assert bench.port.busy
+
+
+@pytest.mark.parametrize(("target", "ours"), [((5, 191), True), ((0, 0), True), ((255, 190), False), ((5, 190), False)])
+def test_an_acknowledgement_counts_only_for_whom_it_names(target: tuple[int, int], ours: bool) -> None:
+    bench = Bench()
+    bench.port.request(Command(verb=Verb.ARM))
+    bench.run(0.1)
+    assert bool(bench.hear(ack(400, 0, target))) is ours, "a ground station asks the same vehicle to arm"
 
 
 def test_one_after_the_other() -> None:

@@ -13,7 +13,7 @@ from swarmctl.core.clock import SimClock
 from swarmctl.core.types import Command, FlightMode, GeoOrigin, Landed, Verb
 from swarmctl.mavlink.autopilot import Autopilot
 from swarmctl.mavlink.codec import Codec
-from swarmctl.mavlink.commands import CodecCommands
+from swarmctl.mavlink.commands import CommandPort
 from swarmctl.mavlink.framing import frames
 from swarmctl.mavlink.transport import pipe_pair
 from swarmctl.mavlink.vehicle_setup import VehicleSetup
@@ -43,7 +43,7 @@ class Vehicle:
         self.talks = self.answers_origin = True
         self.boot()
         self.pilot = Autopilot(self.ours, Codec(1, 191), 1, HOME, lambda frame: None)
-        self.port = CodecCommands(self.pilot.send_frame, Codec(1, 191), 1, lambda: self.pilot.dialect)
+        self.port = CommandPort(self.pilot.send_frame, Codec(1, 191), 1, lambda: self.pilot.dialect)
         self.pilot.attach(self.port)
         self.setup: dict[str, int | float] = {}
         self.vehicle_setup = VehicleSetup(self.pilot, self.port, self.setup, 1, 50.0)

@@ -97,6 +97,7 @@ def test_every_verb_is_there_and_explains_itself(run: Run, capsys: pytest.Captur
         "view",
         "replay",
         "report",
+        "bundle",
     ]
     for verb in [*verbs, "obstacle"]:
         assert run(verb, "--help") == 0
