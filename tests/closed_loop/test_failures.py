@@ -120,7 +120,7 @@ def break_solver(running: Lockstep, agent: int, lasts_s: float) -> None:
     flown = running.agents[agent]
     assert flown is not None
     planner = flown._controller._mpc  # type: ignore[attr-defined]
-    for solver in (planner._xy._solver, planner._xy_alone._solver):
+    for solver in (planner._xy.session.solver, planner._xy_alone.session.solver):
         solver.solve = partial(_solve_from, running, until_s, solver.solve)
 
 

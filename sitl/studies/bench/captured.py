@@ -143,7 +143,7 @@ class TappedMpc(SwarmMpc):
     def nonlinear(self, problem: Problem, plan: Plan) -> NonlinearXy:
         """Return the x-y problem of the last plan as the thesis poses it; same z, same thrust."""
         assert self._asked is not None
-        xy = self._xy
+        xy = self._xy.prediction
         return NonlinearXy(xy.axes, xy.horizon, self._asked, problem.keep_outs, plan.pos_ned_m[1:, 2])
 
 

@@ -76,10 +76,11 @@ class JointMpc:
         found = replace(found, solve_us=first.solve_us + found.solve_us, iterations=first.iterations + found.iterations)
         thrust = found.u[:, 2:]
         tilt, rate = self._acting(problem)
-        acting = self._mpc.realised(found.u, tilt, rate)
+        ahead = self._mpc.prediction
+        acting = ahead.realised(found.u, tilt, rate)
         along = np.column_stack([acting[:, :2], np.full(steps, start.cos_tilt)])  # (steps, 3)
-        pos, vel = self._mpc.motion(start.pos_ned_m, start.vel_ned_m_s, self._drift(problem) - thrust * along)
-        first_row, stopwatch_ns = self._mpc.first_row(), self._stopwatch_ns
+        pos, vel = ahead.motion(start.pos_ned_m, start.vel_ned_m_s, self._drift(problem) - thrust * along)
+        first_row, stopwatch_ns = ahead.first_row(), self._stopwatch_ns
         return judged(problem, pos, vel, found.u, (found,), first_row, self.dt_us, began_ns, spaces_us, stopwatch_ns)
 
     def _solve(self, problem: Problem, thrust_m_s2: Array, spaces: HalfSpaces | None) -> AxesSolution:

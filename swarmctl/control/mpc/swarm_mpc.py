@@ -184,7 +184,7 @@ class SwarmMpc:
             up.u[:count],
         )
         pos[count:, 2], virtual_control[count:, 2] = up.pos_m[-1, 0], up.u[-1, 0]
-        first, stopwatch_ns = self._xy.first_row(), self._stopwatch_ns
+        first, stopwatch_ns = self._xy.prediction.first_row(), self._stopwatch_ns
         return judged(
             problem, pos, vel, virtual_control, (up, across), first, self.dt_us, began_ns, spaces_us, stopwatch_ns
         )
