@@ -68,6 +68,10 @@ class JointMpc:
         near = partial(near_half_spaces, problem, guess, 3, self._max_keep_outs, self._params.dt_s, self._priority_id)
         return planned(near, partial(self._plan, problem, began_ns), self._separation, self._stopwatch_ns)
 
+    def reset(self) -> None:
+        """Keep all: only a warm start outlasts a tick."""
+        return
+
     def _plan(self, problem: Problem, began_ns: int, spaces: HalfSpaces | None, spaces_us: float) -> Plan:
         start, steps = problem.start, self.steps
         held = max(_MIN_THRUST_M_S2, float(start.virtual_control[2]))

@@ -159,6 +159,10 @@ class SwarmMpc:
         near = partial(near_half_spaces, problem, guess, 2, self._max_keep_outs, self._params.dt_s, self._priority_id)
         return planned(near, partial(self._plan, problem, up, began_ns), self._separation, self._stopwatch_ns)
 
+    def reset(self) -> None:
+        """Keep all: only a warm start outlasts a tick."""
+        return
+
     def _plan(
         self, problem: Problem, up: AxesSolution, began_ns: int, spaces: HalfSpaces | None, spaces_us: float
     ) -> Plan:
