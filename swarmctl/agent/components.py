@@ -12,7 +12,8 @@ from swarmctl.agent.setup import AgentSetup
 from swarmctl.agent.world_model import WorldModel
 from swarmctl.bus.peers import Bus
 from swarmctl.control.commit.trajectory_planner import following
-from swarmctl.control.controller import Controller, ControllerParams, make_controller
+from swarmctl.control.controller import ControllerParams, make_controller
+from swarmctl.control.controller_kind import Controller
 from swarmctl.control.estimation.disturbance import DisturbanceObserver
 from swarmctl.control.estimation.state_filter import StateFilter
 from swarmctl.control.phases.state_machine import MissionStateMachine
@@ -78,9 +79,9 @@ def make_controllers(setup: AgentSetup, stopwatch_ns: Stopwatch) -> tuple[Contro
     params = SEPARATION_MODES[setup.separation.mode].controller(setup)
     rest = setup.vehicle_model, setup.separation, setup.agent, setup.max_keep_outs, stopwatch_ns
     mission = make_controller(params, *rest)
-    if params.kind != "open_loop":
+    if params.follows_reference:
         return mission, mission
-    return mission, make_controller(params.model_copy(update={"kind": "dmpc"}), *rest)  # open loop ignores references
+    return mission, make_controller(params.model_copy(update={"kind": "dmpc"}), *rest)
 
 
 def make_estimator(setup: AgentSetup) -> DisturbanceObserver | StateFilter:

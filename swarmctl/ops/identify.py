@@ -17,6 +17,7 @@ from swarmctl.bus.peers import agent_name
 from swarmctl.config import Config
 from swarmctl.control.estimation.identification import Figure, Identified, identify, longest_segment
 from swarmctl.control.model import VehicleModelParams
+from swarmctl.control.reference.mission import IdentifyParams
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, StartError
 from swarmctl.ops.launch import LaunchOptions, launch
 from swarmctl.ops.vehicle_check import CheckOptions, check
@@ -52,7 +53,7 @@ def check_and_identify(config: Config, options: IdentifyOptions) -> int:
     if code != EXIT_OK:
         print("not flown: something is to fix first")
         return code
-    steps = config.mission.identify
+    steps = config.mission.section(IdentifyParams)
     print(
         f"flying now: up to the start, then {steps.duration_s:.0f} s of steps of {steps.step_m:g} m about it, and back "
         "down. Ctrl-C lands"
@@ -76,7 +77,7 @@ def check_and_identify(config: Config, options: IdentifyOptions) -> int:
 def identification(config: Config) -> Config:
     """Return the configuration of the identification flight."""
     mission = config.mission.model_copy(
-        update={"kind": "identify", "duration_s": config.mission.identify.duration_s, "yaw_rad": 0.0}
+        update={"kind": "identify", "duration_s": config.mission.section(IdentifyParams).duration_s, "yaw_rad": 0.0}
     )
     telemetry = config.telemetry.model_copy(update={"enabled": False})
     return Config.model_validate(

@@ -13,6 +13,7 @@ from sitl.lockstep import Lockstep
 from swarmctl.bus.peers import PeerPaths
 from swarmctl.control.mpc import swarm_mpc as mpc
 from swarmctl.control.mpc.qp import QpSolution
+from swarmctl.control.mpc.swarm_mpc import SwarmMpc
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase, PredictedPath
 from swarmctl.mavlink.codec import Codec
 from tests.closed_loop.conftest import Fly
@@ -119,9 +120,10 @@ def break_solver(running: Lockstep, agent: int, lasts_s: float) -> None:
     until_s = running.clock.now_us() * 1e-6 + lasts_s
     flown = running.agents[agent]
     assert flown is not None
-    planner = flown._controller._mpc  # type: ignore[attr-defined]
-    for solver in (planner._xy._solver, planner._xy_alone._solver):
-        solver.solve = partial(_solve_from, running, until_s, solver.solve)
+    planner = flown._controller
+    assert isinstance(planner, SwarmMpc)
+    for solver in (planner._xy.session.solver, planner._xy_alone.session.solver):
+        solver.solve = partial(_solve_from, running, until_s, solver.solve)  # type: ignore[method-assign]
 
 
 def _solve_from(running: Lockstep, from_s: float, solve: Callable[..., QpSolution], *values: object) -> QpSolution:

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from swarmctl.bus.topics import MAX_OBSTACLES
 from swarmctl.config import _RENAMED, Config, dump, load
 from swarmctl.config_problems import all_keys
+from swarmctl.control.reference.mission import CircleParams
 from swarmctl.errors import EXIT_USAGE, ConfigError
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.toml"))
@@ -217,7 +218,7 @@ def test_overrides_reach_sections_lists_and_new_sections(tmp_path: Path) -> None
     path = vehicles(tmp_path, "udpin://127.0.0.1:14540", "udpin://127.0.0.1:14541")
     config = load(path, ["vehicles.1.sysid=42", "mission.circle.radius_m=2.5", "name=mine", "seed=7", "seed=8"])
     assert config.sysids() == (1, 42)
-    assert config.mission.circle.radius_m == 2.5
+    assert config.mission.section(CircleParams).radius_m == 2.5
     assert (config.name, config.seed) == ("mine", 8)
 
 

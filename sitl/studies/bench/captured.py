@@ -27,7 +27,7 @@ from sitl.lockstep import Lockstep
 from sitl.studies.bench.slsqp import KEPT_M, NonlinearAnswer, NonlinearXy
 from swarmctl.config import Config, load
 from swarmctl.control.collision.separation import SeparationParams
-from swarmctl.control.controller import Controller
+from swarmctl.control.controller_kind import Controller
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, HalfSpaces
 from swarmctl.control.mpc.problem import Problem
@@ -143,7 +143,7 @@ class TappedMpc(SwarmMpc):
     def nonlinear(self, problem: Problem, plan: Plan) -> NonlinearXy:
         """Return the x-y problem of the last plan as the thesis poses it; same z, same thrust."""
         assert self._asked is not None
-        xy = self._xy
+        xy = self._xy.prediction
         return NonlinearXy(xy.axes, xy.horizon, self._asked, problem.keep_outs, plan.pos_ned_m[1:, 2])
 
 

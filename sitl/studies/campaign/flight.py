@@ -18,6 +18,7 @@ from sitl.studies.campaign.scenarios import SCENARIOS, Layout, layout_of, settin
 from sitl.studies.campaign.source import code_id
 from sitl.studies.campaign.trials import Cell, Row, Trial
 from swarmctl.config import Config, load
+from swarmctl.control.reference.mission import GotoParams
 from swarmctl.core.types import Array, Phase, PlanStatus
 
 PHYSICS_HZ = 100  # thesis and crazyflie behave as at 250 Hz: a 3.3 m transition ends within 2 cm and 0.1 s of it
@@ -213,7 +214,8 @@ def _alone_s(trial: Trial, layout: Layout) -> float | None:
     far = int(np.linalg.norm(layout.goals_ned_m - layout.starts_ned_m, axis=1).argmax())
     goal: Array = layout.goals_ned_m[far : far + 1]
     speeds = tuple(s for s in layout.settings if not s.startswith(("mission.goto=", "obstacles=")))
-    goto = config_of(trial.cell, trial.seed, layout, len(layout.starts_ned_m)).mission.goto
+    mission = config_of(trial.cell, trial.seed, layout, len(layout.starts_ned_m)).mission
+    goto = mission.section(GotoParams)
     lone = replace(
         layout,
         starts_ned_m=layout.starts_ned_m[far : far + 1],

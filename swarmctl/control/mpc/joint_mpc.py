@@ -68,6 +68,10 @@ class JointMpc:
         near = partial(near_half_spaces, problem, guess, 3, self._max_keep_outs, self._params.dt_s, self._priority_id)
         return planned(near, partial(self._plan, problem, began_ns), self._separation, self._stopwatch_ns)
 
+    def reset(self) -> None:
+        """Keep all: only a warm start outlasts a tick."""
+        return
+
     def _plan(self, problem: Problem, began_ns: int, spaces: HalfSpaces | None, spaces_us: float) -> Plan:
         start, steps = problem.start, self.steps
         held = max(_MIN_THRUST_M_S2, float(start.virtual_control[2]))
@@ -76,10 +80,11 @@ class JointMpc:
         found = replace(found, solve_us=first.solve_us + found.solve_us, iterations=first.iterations + found.iterations)
         thrust = found.u[:, 2:]
         tilt, rate = self._acting(problem)
-        acting = self._mpc.realised(found.u, tilt, rate)
+        ahead = self._mpc.prediction
+        acting = ahead.realised(found.u, tilt, rate)
         along = np.column_stack([acting[:, :2], np.full(steps, start.cos_tilt)])  # (steps, 3)
-        pos, vel = self._mpc.motion(start.pos_ned_m, start.vel_ned_m_s, self._drift(problem) - thrust * along)
-        first_row, stopwatch_ns = self._mpc.first_row(), self._stopwatch_ns
+        pos, vel = ahead.motion(start.pos_ned_m, start.vel_ned_m_s, self._drift(problem) - thrust * along)
+        first_row, stopwatch_ns = ahead.first_row(), self._stopwatch_ns
         return judged(problem, pos, vel, found.u, (found,), first_row, self.dt_us, began_ns, spaces_us, stopwatch_ns)
 
     def _solve(self, problem: Problem, thrust_m_s2: Array, spaces: HalfSpaces | None) -> AxesSolution:

@@ -159,6 +159,10 @@ class SwarmMpc:
         near = partial(near_half_spaces, problem, guess, 2, self._max_keep_outs, self._params.dt_s, self._priority_id)
         return planned(near, partial(self._plan, problem, up, began_ns), self._separation, self._stopwatch_ns)
 
+    def reset(self) -> None:
+        """Keep all: only a warm start outlasts a tick."""
+        return
+
     def _plan(
         self, problem: Problem, up: AxesSolution, began_ns: int, spaces: HalfSpaces | None, spaces_us: float
     ) -> Plan:
@@ -184,7 +188,7 @@ class SwarmMpc:
             up.u[:count],
         )
         pos[count:, 2], virtual_control[count:, 2] = up.pos_m[-1, 0], up.u[-1, 0]
-        first, stopwatch_ns = self._xy.first_row(), self._stopwatch_ns
+        first, stopwatch_ns = self._xy.prediction.first_row(), self._stopwatch_ns
         return judged(
             problem, pos, vel, virtual_control, (up, across), first, self.dt_us, began_ns, spaces_us, stopwatch_ns
         )

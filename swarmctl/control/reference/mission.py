@@ -1,21 +1,23 @@
 """Mission references: position and velocity at a given mission time, shared by all agents unless each has its own.
 
-They are pure functions of time; the flight before and after (to the start, to the landing place) is a
-`QuinticTrajectory`.
+A kind of mission is the class of its parameters, which also says what is flown: one class with the decorator
+`mission_kind`, nothing else. References are pure functions of time; the flight before and after (to the start, to the
+landing place) is a `QuinticTrajectory`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from abc import abstractmethod
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, TypeVar
 
 import numpy as np
 from pydantic import Field
 
 from swarmctl.control.reference.goal_assignment import assigned_goals_ned_m
-from swarmctl.core.params import Params, Vec3
+from swarmctl.core.params import Params, Vec3, with_sections
 from swarmctl.core.types import Array
 
 _STEP_DIRECTIONS = np.array(
@@ -23,9 +25,66 @@ _STEP_DIRECTIONS = np.array(
 )
 OUTER_DELAY_S_M = 0.5  # delay of arrival per metre that a place is farther out
 Waypoint = Annotated[tuple[float, float, float, float], Field(strict=False)]
+Sampled = Callable[[Array], tuple[Array, Array]]  # positions and velocities (K, 3) NED at times (K,) >= 0 [s]
 
 
-class CircleParams(Params):
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Place:
+    """Holds what a mission is told about the agent that flies it."""
+
+    starts_ned_m: Array  # (agents, 3)
+    agent: int  # own index
+    apart_m: float  # distance that agents keep, for goals that several share
+
+    @property
+    def start_ned_m(self) -> Array:
+        """Return the own start position (3,)."""
+        start: Array = self.starts_ned_m[self.agent]
+        return start
+
+
+class MissionKind(Params):
+    """Base of the parameters of one kind of mission; a kind without any has no section in the configuration."""
+
+    @abstractmethod
+    def reference(self, place: Place) -> Sampled:
+        """Return the reference of one agent as a function of mission time."""
+
+    def problems(self, agents: int) -> Iterator[str]:
+        """Yield problems that involve several keys, if this kind is flown."""
+        yield from ()
+
+    def excess(self, start_ned_m: Array, pos_ned_m: Array, vel_ned_m_s: Array) -> str:
+        """Say why the flight must end, or ""."""
+        return ""
+
+
+M = TypeVar("M", bound=MissionKind)
+MISSIONS: dict[str, type[MissionKind]] = {}  # by the value of `mission.kind`
+
+
+def mission_kind(name: str) -> Callable[[type[M]], type[M]]:
+    """Return a decorator that makes a kind of mission known as `name`, also the name of its section."""
+
+    def registered(kind: type[M]) -> type[M]:
+        assert name not in MISSIONS
+        MISSIONS[name] = kind
+        return kind
+
+    return registered
+
+
+@mission_kind("hover")
+class HoverParams(MissionKind):
+    """Lets every agent stay at its start."""
+
+    def reference(self, place: Place) -> Sampled:
+        start = place.start_ned_m
+        return lambda t_s: (np.tile(start, (len(t_s), 1)), np.zeros((len(t_s), 3)))
+
+
+@mission_kind("circle")
+class CircleParams(MissionKind):
     """Describes a climbing circle `center + (r cos wt, r sin wt, climb t)` (thesis 4.3; tracking sets have r 0.5)."""
 
     center_ned_m: Vec3 = (0.0, 0.0, -1.0)
@@ -33,27 +92,66 @@ class CircleParams(Params):
     omega_rad_s: float = Field(0.5, ge=-10, le=10)  # positive is clockwise seen from above
     climb_ned_m_s: float = Field(-0.1, ge=-20, le=20)  # negative is up
 
+    def reference(self, place: Place) -> Sampled:
+        return self._sample
 
-class LineParams(Params):
+    def _sample(self, t_s: Array) -> tuple[Array, Array]:
+        angle = self.omega_rad_s * t_s
+        cos, sin = np.cos(angle), np.sin(angle)
+        around = np.stack([self.radius_m * cos, self.radius_m * sin, self.climb_ned_m_s * t_s], axis=1)
+        speed = self.radius_m * self.omega_rad_s
+        vel = np.stack([-speed * sin, speed * cos, np.full(len(t_s), self.climb_ned_m_s)], axis=1)
+        return around + np.array(self.center_ned_m), vel
+
+
+@mission_kind("line")
+class LineParams(MissionKind):
     """Describes a straight line at constant velocity (thesis 4.4)."""
 
     origin_ned_m: Vec3 = (2.0, 2.0, -2.0)
     velocity_ned_m_s: Vec3 = (1.5, 0.7, -0.1)
 
+    def reference(self, place: Place) -> Sampled:
+        origin, velocity = np.array(self.origin_ned_m), np.array(self.velocity_ned_m_s)
+        return lambda t_s: (origin + t_s[:, None] * velocity, np.tile(velocity, (len(t_s), 1)))
 
-class StepsParams(Params):
+
+@mission_kind("steps")
+class StepsParams(MissionKind):
     """Describes piecewise constant positions: rows of `[from_s, x, y, z]` in order of time (thesis 2.4)."""
 
     rows: tuple[Waypoint, ...] = Field(((0.0, 1.0, 1.0, -1.0),), strict=False)
 
+    def reference(self, place: Place) -> Sampled:
+        rows = np.array(self.rows)
+        return lambda t_s: (_held(rows, t_s), np.zeros((len(t_s), 3)))
 
-class SwapParams(Params):
+    def problems(self, agents: int) -> Iterator[str]:
+        times = [row[0] for row in self.rows]
+        if not times or times != sorted(times):
+            yield f"mission.steps.rows: times {times} must be given, in increasing order"
+
+
+@mission_kind("swap")
+class SwapParams(MissionKind):
     """Lets every agent fly smoothly to the point opposite its start, in `travel_s`."""
 
     travel_s: float = Field(8.0, gt=0, le=600)
 
+    def reference(self, place: Place) -> Sampled:
+        start = place.start_ned_m
+        opposite = 2.0 * place.starts_ned_m.mean(axis=0) - start
+        return QuinticTrajectory(
+            from_ned_m=start, vel_ned_m_s=np.zeros(3), to_ned_m=opposite, travel_s=self.travel_s
+        ).sample
 
-class GotoParams(Params):
+    def problems(self, agents: int) -> Iterator[str]:
+        if agents < 2:
+            yield f"mission.kind = 'swap' with swarm.agents = {agents}: a swap needs at least 2"
+
+
+@mission_kind("goto")
+class GotoParams(MissionKind):
     """Lets every agent fly smoothly to its goal and stay there, or around a goal that several share."""
 
     goals_ned_m: tuple[Vec3, ...] = Field((), strict=False)  # one for each agent, or a single one for all
@@ -61,8 +159,17 @@ class GotoParams(Params):
     accel_m_s2: float = Field(1.2, gt=0, le=20)  # approximate peak
     goal_assignment: bool = True  # replace goals that are too close by places around them
 
+    def reference(self, place: Place) -> Sampled:
+        return _goal_flights(self, place.starts_ned_m, place.apart_m)[place.agent].sample
 
-class IdentifyParams(Params):
+    def problems(self, agents: int) -> Iterator[str]:
+        goals = len(self.goals_ned_m)
+        if goals not in (1, agents):
+            yield f"mission.goto.goals_ned_m: {goals} goals for swarm.agents = {agents}; list one each, or one for all"
+
+
+@mission_kind("identify")
+class IdentifyParams(MissionKind):
     """Describes steps about the own start, to and fro along each axis, as `swarmctl check --identify` flies them."""
 
     step_m: float = Field(2.0, gt=0.1, le=20)  # north, south, east, west
@@ -82,36 +189,49 @@ class IdentifyParams(Params):
         places = np.tile(_STEP_DIRECTIONS, (self.repeats, 1)) * (self.step_m, self.step_m, self.climb_m)
         return np.column_stack([self.hold_s * np.arange(1, len(places) + 1), places])
 
+    def reference(self, place: Place) -> Sampled:
+        start, rows = place.start_ned_m, np.concatenate([np.zeros((1, 4)), self.rows()])
+        return lambda t_s: (start + _held(rows, t_s), np.zeros((len(t_s), 3)))
 
+    def problems(self, agents: int) -> Iterator[str]:
+        if self.distance_max_m < 1.5 * self.step_m:
+            yield (
+                f"mission.identify.distance_max_m = {self.distance_max_m}: less than 1.5 times step_m = "
+                f"{self.step_m}; an overshoot would end the flight. Raise it or lower step_m"
+            )
+
+    def excess(self, start_ned_m: Array, pos_ned_m: Array, vel_ned_m_s: Array) -> str:
+        """Say why an identification flight must end, or "": its vehicle is flown with a model that may be wrong."""
+        away_m, speed_m_s = math.dist(pos_ned_m, start_ned_m), math.hypot(*vel_ned_m_s)
+        if away_m > self.distance_max_m:
+            return f"{away_m:.1f} m from its start; mission.identify.distance_max_m is {self.distance_max_m:g}"
+        if speed_m_s > self.speed_max_m_s:
+            return f"{speed_m_s:.1f} m/s fast; mission.identify.speed_max_m_s is {self.speed_max_m_s:g}"
+        return ""
+
+
+if TYPE_CHECKING:
+    MissionName = str
+else:
+    MissionName = Literal[tuple(MISSIONS)]
+
+
+@with_sections({name: kind for name, kind in MISSIONS.items() if kind.model_fields})
 class MissionParams(Params):
     """Sets what is flown between start and landing."""
 
-    kind: Literal["hover", "circle", "line", "steps", "swap", "goto", "identify"] = "circle"
+    kind: MissionName = "circle"
     duration_s: float = Field(37.7, gt=0, le=36000)  # tracked time, without transits; overridden by --duration
     yaw_rad: float = Field(0.0, ge=-3.1416, le=3.1416)  # heading of every vehicle, clockwise from north
-    circle: CircleParams = CircleParams()
-    line: LineParams = LineParams()
-    steps: StepsParams = StepsParams()
-    swap: SwapParams = SwapParams()
-    goto: GotoParams = GotoParams()
-    identify: IdentifyParams = IdentifyParams()
+
+    def flown(self) -> MissionKind:
+        """Return the parameters of the kind that is flown."""
+        kind = MISSIONS[self.kind]
+        return self.section(kind) if kind.model_fields else kind()
 
     def problems(self, agents: int) -> Iterator[str]:
         """Yield problems that involve several keys."""
-        times = [row[0] for row in self.steps.rows]
-        if self.kind == "steps" and (not times or times != sorted(times)):
-            yield f"mission.steps.rows: times {times} must be given, in increasing order"
-        if self.kind == "swap" and agents < 2:
-            yield f"mission.kind = 'swap' with swarm.agents = {agents}: a swap needs at least 2"
-        own = self.identify
-        if self.kind == "identify" and own.distance_max_m < 1.5 * own.step_m:
-            yield (
-                f"mission.identify.distance_max_m = {own.distance_max_m}: less than 1.5 times step_m = {own.step_m}; "
-                "an overshoot would end the flight. Raise it or lower step_m"
-            )
-        goals = len(self.goto.goals_ned_m)
-        if self.kind == "goto" and goals not in (1, agents):
-            yield f"mission.goto.goals_ned_m: {goals} goals for swarm.agents = {agents}; list one each, or one for all"
+        return self.flown().problems(agents)
 
 
 class MissionReference:
@@ -125,71 +245,18 @@ class MissionReference:
     """
 
     def __init__(self, params: MissionParams, starts_ned_m: Array, agent: int, apart_m: float = 0.0) -> None:
-        self._params = params
-        self._start = starts_ned_m[agent]
-        self._opposite = 2.0 * starts_ned_m.mean(axis=0) - self._start
-        if params.kind == "goto":
-            self._flight = _goal_flights(params.goto, starts_ned_m, apart_m)[agent]
+        self._mission, self._start_ned_m = params.flown(), starts_ned_m[agent]
+        self._sampled = self._mission.reference(Place(starts_ned_m=starts_ned_m, agent=agent, apart_m=apart_m))
 
     def sample(self, t_s: Array) -> tuple[Array, Array]:
         """Return positions and velocities, (K, 3) NED each, at mission times `t_s` (K,); at rest before 0."""
-        shapes = {
-            "hover": self._hover,
-            "circle": self._circle,
-            "line": self._line,
-            "steps": self._steps,
-            "swap": self._swap,
-            "goto": self._goto,
-            "identify": self._identify,
-        }
-        pos, vel = shapes[self._params.kind](np.maximum(t_s, 0.0))
+        pos, vel = self._sampled(np.maximum(t_s, 0.0))
         vel[t_s < 0.0] = 0.0
         return pos, vel
 
-    def _hover(self, t_s: Array) -> tuple[Array, Array]:
-        return np.tile(self._start, (len(t_s), 1)), np.zeros((len(t_s), 3))
-
-    def _circle(self, t_s: Array) -> tuple[Array, Array]:
-        c = self._params.circle
-        angle = c.omega_rad_s * t_s
-        cos, sin = np.cos(angle), np.sin(angle)
-        pos = np.stack([c.radius_m * cos, c.radius_m * sin, c.climb_ned_m_s * t_s], axis=1) + np.array(c.center_ned_m)
-        speed = c.radius_m * c.omega_rad_s
-        return pos, np.stack([-speed * sin, speed * cos, np.full(len(t_s), c.climb_ned_m_s)], axis=1)
-
-    def _line(self, t_s: Array) -> tuple[Array, Array]:
-        velocity = np.array(self._params.line.velocity_ned_m_s)
-        return np.array(self._params.line.origin_ned_m) + t_s[:, None] * velocity, np.tile(velocity, (len(t_s), 1))
-
-    def _steps(self, t_s: Array) -> tuple[Array, Array]:
-        return _held(np.array(self._params.steps.rows), t_s), np.zeros((len(t_s), 3))
-
-    def _swap(self, t_s: Array) -> tuple[Array, Array]:
-        trajectory = QuinticTrajectory(
-            from_ned_m=self._start,
-            vel_ned_m_s=np.zeros(3),
-            to_ned_m=self._opposite,
-            travel_s=self._params.swap.travel_s,
-        )
-        return trajectory.sample(t_s)
-
-    def _goto(self, t_s: Array) -> tuple[Array, Array]:
-        return self._flight.sample(t_s)
-
-    def _identify(self, t_s: Array) -> tuple[Array, Array]:
-        rows = np.concatenate([np.zeros((1, 4)), self._params.identify.rows()])
-        return self._start + _held(rows, t_s), np.zeros((len(t_s), 3))
-
     def excess(self, pos_ned_m: Array, vel_ned_m_s: Array) -> str:
-        """Say why an identification flight must end, or "": its vehicle is flown with a model that may be wrong."""
-        if self._params.kind != "identify":
-            return ""
-        p, away_m, speed_m_s = self._params.identify, math.dist(pos_ned_m, self._start), math.hypot(*vel_ned_m_s)
-        if away_m > p.distance_max_m:
-            return f"{away_m:.1f} m from its start; mission.identify.distance_max_m is {p.distance_max_m:g}"
-        if speed_m_s > p.speed_max_m_s:
-            return f"{speed_m_s:.1f} m/s fast; mission.identify.speed_max_m_s is {p.speed_max_m_s:g}"
-        return ""
+        """Say why the flight must end at this position and velocity (3,) NED, or ""."""
+        return self._mission.excess(self._start_ned_m, pos_ned_m, vel_ned_m_s)
 
 
 def _held(rows: Array, t_s: Array) -> Array:

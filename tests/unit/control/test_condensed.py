@@ -14,7 +14,8 @@ from scipy import optimize
 
 from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, Axis, HalfSpaces, Horizon, Penalties
 from swarmctl.control.mpc.condensed import CondensedMpc
-from swarmctl.control.mpc.qp import OsqpSolver, QpParams, QpSolution
+from swarmctl.control.mpc.qp import QpParams, QpSolution
+from swarmctl.control.mpc.qp_osqp import OsqpSolver
 from swarmctl.core.types import Array
 
 EXACT = QpParams(eps=1e-8, eps_relative=1e-8, max_iterations=20_000)
@@ -67,7 +68,7 @@ def solve_one(
     gain: float | Array = GAIN,
     ref_vel: float = 0.0,
 ) -> AxesSolution:
-    steps = problem.horizon.prediction
+    steps = problem.prediction.horizon.prediction
     one = np.ones((steps, 1))
     gains = np.array(np.broadcast_to(gain, steps))[:, None]
     here, now, held_u, pushed = (np.array([x]) for x in (pos, vel, u_prev, drift))
@@ -178,7 +179,7 @@ def dense(
     rows: NDArray[np.intp],
 ) -> tuple[Array, Array, Array]:
     """Hard-constrained optimum by SLSQP on simulated motion: inputs, positions, velocities (Hp, 2)."""
-    horizon, axes = problem.horizon, problem.axes
+    horizon, axes = problem.prediction.horizon, problem.prediction.axes
     hc, hp = horizon.control, horizon.prediction
 
     def motion(moves: Array) -> tuple[Array, Array, Array]:
@@ -258,13 +259,13 @@ def test_half_spaces_against_a_dense_solver(
         ref_vel_m_s=np.zeros((25, 2)),
     )
     ours = problem.solve(tick, spaces)
-    u, p, _ = dense(problem, pos, vel, u_prev, gain, ref, spaces, problem._checked)
+    u, p, _ = dense(problem, pos, vel, u_prev, gain, ref, spaces, problem.half_spaces.checked)
     np.testing.assert_allclose(ours.pos_m, p, atol=5e-4)
     np.testing.assert_allclose(ours.u, u, atol=3e-3)
     assert ours.slack_m < 1e-3
     assert ours.residual_m < 1e-3
     unit = spaces.normal[0, 0]
-    assert ((ours.pos_m @ unit)[problem._checked] >= offset_m - 1e-3).all()
+    assert ((ours.pos_m @ unit)[problem.half_spaces.checked] >= offset_m - 1e-3).all()
     assert unit @ (ours.pos_m[-1] + stop_s * ours.vel_m_s[-1]) >= offset_m - 1e-3
     free = problem.solve(tick)
     active = bool(np.abs(free.pos_m - ours.pos_m).max() > 0.005)
@@ -273,9 +274,9 @@ def test_half_spaces_against_a_dense_solver(
 
 def test_rows_are_at_the_end_of_the_horizon_and_none_before_it_can_be_influenced() -> None:
     problem = mpc(AXIS, AXIS, max_keep_outs=1)
-    assert problem._checked[-1] == 39
-    assert problem._checked[0] >= 6
-    assert np.diff(problem._checked).max() * HORIZON.dt_s <= 0.081  # between samples the certificate looks
+    assert problem.half_spaces.checked[-1] == 39
+    assert problem.half_spaces.checked[0] >= 6
+    assert np.diff(problem.half_spaces.checked).max() * HORIZON.dt_s <= 0.081  # between samples the certificate looks
 
 
 def test_rows_that_cannot_be_met_give_slack_and_not_failure() -> None:
@@ -341,7 +342,7 @@ def test_relaxed_rows_ask_for_no_more_than_can_be_reached() -> None:
     assert solution.slack_m < 0.02
     reach, _ = simulate(0.0, 0.0, np.clip(-0.05 * np.arange(1, 41), -0.2, None), GAIN, 0.0, 0.02, False)
     assert solution.pos_m[-1, 0] >= 0.9 * reach[-1] - 0.02
-    assert (solution.pos_m[problem._checked, 0] >= 0.9 * reach[problem._checked] - 0.02).all()
+    assert (solution.pos_m[problem.half_spaces.checked, 0] >= 0.9 * reach[problem.half_spaces.checked] - 0.02).all()
 
 
 # -- terminal conditions ----------------------------------------------------------------------------------------------

@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from swarmctl.control.collision.separation import KeepOut, SeparationParams
-from swarmctl.control.controller import Controller, ControllerParams, make_controller
+from swarmctl.control.controller import CONTROLLERS, ControllerParams, make_controller
+from swarmctl.control.controller_kind import Controller
+from swarmctl.control.controllers.pid import PidParams
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.control.mpc.swarm_mpc import MpcParams
-from swarmctl.control.pid import PidParams
 from swarmctl.core.types import Array, Plan, PlanStatus, Reference
 
 G = 9.81
@@ -70,7 +71,14 @@ def check(controller: Controller, plan: Plan) -> None:
 
 
 def test_the_kinds_are_those_tested_here() -> None:
-    assert set(KINDS) == set(get_args(Kind))
+    assert set(KINDS) == set(get_args(Kind)) == set(CONTROLLERS)
+
+
+def test_every_section_with_parameters_belongs_to_a_kind() -> None:
+    assert {kind.section: kind.params for kind in CONTROLLERS.values()} == {
+        name: type(value) for name, value in ControllerParams() if name != "kind"
+    }
+    assert [name for name, kind in CONTROLLERS.items() if not kind.follows_reference] == ["open_loop"]
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -80,7 +80,7 @@ def rest_s(references: list[MissionReference]) -> list[float]:
 
 def test_inner_places_are_reached_first() -> None:
     starts = 5.0 * np.stack([np.cos(np.arange(7.0)), np.sin(np.arange(7.0)), 0.0 * np.arange(7.0)], axis=1)
-    mission = MissionParams(kind="goto", goto=GotoParams(goals_ned_m=((0.0, 0.0, 0.0),)))
+    mission = MissionParams.model_validate({"kind": "goto", "goto": {"goals_ned_m": [[0.0, 0.0, 0.0]]}})
     flown = [MissionReference(mission, starts, agent, APART_M) for agent in range(7)]
     ends_m = [float(np.linalg.norm(r.sample(np.array([60.0]))[0][0])) for r in flown]
     first, *others = [t_s for _, t_s in sorted(zip(ends_m, rest_s(flown), strict=True))]
@@ -90,12 +90,14 @@ def test_inner_places_are_reached_first() -> None:
 
 def test_all_agents_compute_the_same_places() -> None:
     starts = np.array([[4.0, 0.0, -1.0], [-1.0, 1.7, -1.0], [-2.0, -3.4, -2.0]])
-    mission = MissionParams(kind="goto", goto=GotoParams(goals_ned_m=((0.0, 0.0, -1.0),)))
+    mission = MissionParams.model_validate({"kind": "goto", "goto": {"goals_ned_m": [[0.0, 0.0, -1.0]]}})
     flown = [MissionReference(mission, starts, agent, APART_M) for agent in range(3)]
     ends = np.array([reference.sample(np.array([60.0]))[0][0] for reference in flown])
     np.testing.assert_allclose(ends, assigned_goals_ned_m(starts, np.tile([0.0, 0.0, -1.0], (3, 1)), APART_M)[0])
     assert max(rest_s(flown)) - min(rest_s(flown)) < 0.05, "three places are equally far"
-    alone = mission.model_copy(update={"goto": mission.goto.model_copy(update={"goal_assignment": False})})
+    alone = mission.model_copy(
+        update={"goto": mission.section(GotoParams).model_copy(update={"goal_assignment": False})}
+    )
     np.testing.assert_array_equal(
         MissionReference(alone, starts, 1, APART_M).sample(np.array([60.0]))[0][0], [0, 0, -1]
     )

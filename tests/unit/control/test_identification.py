@@ -17,7 +17,7 @@ from swarmctl.config import Config, load
 from swarmctl.control.estimation.identification import Figure, FlightSegment, Identified, identify, longest_segment
 from swarmctl.control.lag import Lag
 from swarmctl.control.model import VehicleModelParams
-from swarmctl.control.reference.mission import MissionParams, MissionReference
+from swarmctl.control.reference.mission import IdentifyParams, MissionParams, MissionReference
 from swarmctl.core.frames import GRAVITY_M_S2, quat_from_body_z
 from swarmctl.core.records import TICK_DTYPE
 from swarmctl.core.types import Array, Phase
@@ -152,7 +152,7 @@ def sampled(mission: MissionReference, until_s: float) -> Array:
 
 
 def test_steps_begin_and_end_on_the_own_start_and_go_both_ways() -> None:
-    params = MissionParams.model_validate({"kind": "identify"}).identify
+    params = IdentifyParams()
     places = sampled(reference(), params.duration_s) - (5.0, 0.0, -3.0)
     assert np.all(places[[0, -1]] == 0.0)
     assert places.min(axis=0) == pytest.approx((-params.step_m, -params.step_m, -params.climb_m))
@@ -216,5 +216,6 @@ def test_the_simulators_table_is_the_model_of_all(tmp_path: Path) -> None:
 def test_an_identification_flies_the_same_vehicles_in_another_mission() -> None:
     config = Config()
     flight = identification(config)
-    assert (flight.mission.kind, flight.mission.duration_s) == ("identify", config.mission.identify.duration_s)
+    steps = config.mission.section(IdentifyParams)
+    assert (flight.mission.kind, flight.mission.duration_s) == ("identify", steps.duration_s)
     assert flight.model_copy(update={"mission": config.mission, "telemetry": config.telemetry}) == config

@@ -138,12 +138,12 @@ def test_a_lag_left_out_of_the_prediction_is_seen() -> None:
     )
     with_lag, without = planner(LAGS[0], 0.0), planner(None, 0.0)
     plan = with_lag.solve(asked)
-    pos, _ = without.motion(np.zeros(1), np.zeros(1), -9.81 * plan.u)
+    pos, _ = without.prediction.motion(np.zeros(1), np.zeros(1), -9.81 * plan.u)
     assert abs(float(pos[-1, 0] - plan.pos_m[-1, 0])) > 0.3
 
 
 def test_rows_begin_where_moves_behind_the_lag_can_matter() -> None:
-    without, with_lag = planner(None, 0.0).first_row() * DT_S, planner(LAGS[0], 0.0).first_row() * DT_S
+    without, with_lag = (planner(lag, 0.0).prediction.first_row() * DT_S for lag in (None, LAGS[0]))
     assert 0.10 <= without <= 0.20
     assert 0.30 <= with_lag <= 0.45  # with 80 ms of dead time before it: about 0.4 s
     assert with_lag - without == pytest.approx(LAGS[0].ramp_delay_s, abs=DT_S)

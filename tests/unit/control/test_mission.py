@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, get_args
 
 import numpy as np
 import pytest
 
 from swarmctl.control.reference.mission import (
-    GotoParams,
+    MISSIONS,
     MissionParams,
     MissionReference,
     QuinticTrajectory,
@@ -112,8 +112,24 @@ def test_missions_that_make_no_sense_are_refused() -> None:
     assert "increasing" in next(iter(backwards.problems(3)))
     assert "at least 2" in next(iter(MissionParams(kind="swap").problems(1)))
     for goals, refused in ((0, True), (1, False), (2, True), (3, False)):
-        goto = GotoParams(goals_ned_m=((0.0, 0.0, -2.0),) * goals)
-        assert [f"{goals} goals" in p for p in MissionParams(kind="goto", goto=goto).problems(3)] == [True] * refused
+        mission = MissionParams.model_validate({"kind": "goto", "goto": {"goals_ned_m": [[0.0, 0.0, -2.0]] * goals}})
+        assert [f"{goals} goals" in p for p in mission.problems(3)] == [True] * refused
+
+
+def test_every_kind_declares_itself_once() -> None:
+    assert get_args(MissionParams.model_fields["kind"].annotation) == tuple(MISSIONS)
+    own = {"kind", "duration_s", "yaw_rad"}
+    assert set(MissionParams.model_fields) - own == set(MISSIONS) - {"hover"}, (
+        "a kind without parameters has no section"
+    )
+    for name, kind in MISSIONS.items():
+        mission = MissionParams(kind=name)
+        assert type(mission.flown()) is kind
+        if name != "goto":  # which has no goals by default
+            assert list(mission.problems(3)) == []
+        pos, vel = MissionReference(mission, STARTS, 1).sample(np.array([-1.0, 0.0, 3.0]))
+        assert pos.shape == vel.shape == (3, 3)
+        assert (vel[0] == 0.0).all()
 
 
 # -- quintic trajectories ----------------------------------------------------------------------------------------------

@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from typing import get_args
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from swarmctl.config import load
-from swarmctl.control.mpc.qp import INFINITY, OsqpSolver, QpParams, is_finite, make_solver, pattern_index
+from swarmctl.control.mpc.qp import INFINITY, SOLVERS, QpParams, is_finite, pattern_index
 from swarmctl.control.mpc.qp_daqp import DaqpSolver
+from swarmctl.control.mpc.qp_osqp import OsqpSolver
+from swarmctl.control.mpc.solvers import MAKERS, make_solver
 from swarmctl.core.types import Array
 from swarmctl.errors import ConfigError
 
@@ -150,6 +153,11 @@ def test_a_hessian_singular_in_floating_point_is_no_failure() -> None:
     solution = DaqpSolver(p, a, QpParams()).solve(hessian, -bounds, bounds, -bounds, bounds)
     assert solution.exact and solution.x is not None
     assert solution.x.sum() == pytest.approx(1.0, abs=1e-3)
+
+
+def test_every_name_that_can_be_configured_has_a_solver() -> None:
+    choices = get_args(QpParams.model_fields["solver"].annotation)
+    assert [*choices] == [*SOLVERS] == [*MAKERS]
 
 
 def test_osqp_is_the_default() -> None:

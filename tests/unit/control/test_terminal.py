@@ -184,7 +184,7 @@ def region_of(axis: Axis) -> TerminalRegion:
 
 def solve(problem: CondensedMpc, pos: float, vel: float, u: float) -> AxesSolution:
     """Towards rest at 0; gravity acts where hovering takes an input."""
-    axis, steps = problem.axes[0], problem.horizon.prediction
+    axis, steps = problem.prediction.axes[0], problem.prediction.horizon.prediction
     gain, still = -axis.gain_m_s2, np.zeros((steps, 1))
     drift = np.array([-gain * axis.u_rest])
     return problem.solve(
@@ -202,7 +202,7 @@ def solve(problem: CondensedMpc, pos: float, vel: float, u: float) -> AxesSoluti
 
 def first_increment(problem: CondensedMpc, error: Array) -> float:
     """Of the acceleration [m/s2]."""
-    axis = problem.axes[0]
+    axis = problem.prediction.axes[0]
     u = axis.u_rest - float(error[2]) / axis.gain_m_s2
     return -axis.gain_m_s2 * float(solve(problem, float(error[0]), float(error[1]), u).u[0, 0] - u)
 

@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
+from swarmctl.control.controller_kind import ControllerKind
 from swarmctl.control.mpc.problem import Problem
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.params import Params, Vec3
@@ -53,6 +54,11 @@ class PidController:
     @property
     def steps(self) -> int:
         """Return the number of steps of a plan."""
+        return self._params.path_steps
+
+    @property
+    def longest(self) -> int:
+        """Return the number of steps of reference that a problem has to hold."""
         return self._params.path_steps
 
     def reset(self) -> None:
@@ -97,3 +103,6 @@ class PidController:
         accel = (reference.vel_ned_m_s[1] - reference.vel_ned_m_s[0]) / self._params.dt_s
         north, east, down = (self._params.accel_feed_forward * float(a) for a in accel)
         return np.array([-north / GRAVITY_M_S2, east / GRAVITY_M_S2, -down])
+
+
+PID = ControllerKind(name="pid", section="pid", params=PidParams, make=lambda params, _: PidController(params))

@@ -1,0 +1,59 @@
+"""What a controller is to the agent, and what the module of one declares about it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Generic, Protocol, TypeVar
+
+from swarmctl.control.collision.separation import SeparationParams
+from swarmctl.control.model import VehicleModelParams
+from swarmctl.control.mpc.problem import Problem
+from swarmctl.core.params import Params
+from swarmctl.core.types import Plan
+
+P = TypeVar("P", bound=Params)
+
+
+class Controller(Protocol):
+    """Plans one tick; failure is a value, `Plan.status`."""
+
+    @property
+    def dt_us(self) -> int:
+        """Return the time between plan points [us]."""
+
+    @property
+    def steps(self) -> int:
+        """Return the number of steps of a plan, N."""
+
+    @property
+    def longest(self) -> int:
+        """Return the number of steps of reference that a problem has to hold."""
+
+    def plan(self, problem: Problem) -> Plan:
+        """Return a plan from `problem.start` on. Never raises for a problem without a solution."""
+
+    def reset(self) -> None:
+        """Forget the past, after a handover."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControllerSetup:
+    """Holds what a controller is told beside its own parameters."""
+
+    vehicle: VehicleModelParams
+    separation: SeparationParams
+    agent: int
+    max_keep_outs: int  # at once
+    stopwatch_ns: Callable[[], int]  # measures and has no influence
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ControllerKind(Generic[P]):
+    """Declares a controller that a configuration can choose, once in its module in `swarmctl/control/controllers/`."""
+
+    name: str  # value of `controller.kind`
+    section: str  # name of the section of the configuration with its parameters, which several may share
+    params: type[P]
+    make: Callable[[P, ControllerSetup], Controller]
+    follows_reference: bool = True  # false: another one flies to the start and to the landing place

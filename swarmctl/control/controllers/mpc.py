@@ -1,0 +1,23 @@
+"""The thesis' MPC of a single vehicle, which keeps clear of nothing."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from swarmctl.control.controller_kind import ControllerKind, ControllerSetup
+from swarmctl.control.mpc.problem import Problem
+from swarmctl.control.mpc.swarm_mpc import MpcParams, SwarmMpc
+from swarmctl.core.types import Plan
+
+
+class SingleMpc(SwarmMpc):
+    """Plans as if there were no keep-outs."""
+
+    def __init__(self, params: MpcParams, setup: ControllerSetup) -> None:
+        super().__init__(params, setup.vehicle, setup.separation, setup.agent, 0, setup.stopwatch_ns)
+
+    def plan(self, problem: Problem) -> Plan:
+        return super().plan(replace(problem, keep_outs=()))
+
+
+MPC = ControllerKind(name="mpc", section="mpc", params=MpcParams, make=SingleMpc)

@@ -1,0 +1,44 @@
+"""No control at all, as a baseline."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from swarmctl.control.controller_kind import ControllerKind, ControllerSetup
+from swarmctl.control.mpc.problem import Problem
+from swarmctl.control.mpc.swarm_mpc import MpcParams
+from swarmctl.core.types import NO_TIMES, Plan, PlanStatus
+
+
+class OpenLoop:
+    """Commands zero input (thesis 1.6): level attitude and no thrust, whatever the state."""
+
+    def __init__(self, params: MpcParams, _: ControllerSetup) -> None:
+        self.dt_us, self.steps = round(params.dt_s * 1e6), params.horizon_xy
+        self.longest = self.steps
+
+    def plan(self, problem: Problem) -> Plan:
+        start = problem.start
+        t_s = np.arange(self.steps + 1)[:, None] * (self.dt_us * 1e-6)
+        pos = start.pos_ned_m + t_s * start.vel_ned_m_s
+        vel = np.tile(start.vel_ned_m_s, (self.steps + 1, 1))
+        nothing = np.zeros((self.steps, 3))
+        return Plan(
+            status=PlanStatus.OK,
+            t0_us=start.t_us,
+            dt_us=self.dt_us,
+            pos_ned_m=pos,
+            vel_ned_m_s=vel,
+            virtual_control=nothing,
+            times=NO_TIMES,
+            iterations=0,
+            slack_m=0.0,
+            residual_m=0.0,
+            terminal_gap_m=0.0,
+        )
+
+    def reset(self) -> None:
+        return
+
+
+OPEN_LOOP = ControllerKind(name="open_loop", section="mpc", params=MpcParams, make=OpenLoop, follows_reference=False)

@@ -1,0 +1,209 @@
+"""The constraints of a condensed MPC, each a block of rows: bounds, softened terminal conditions, half-spaces.
+
+A new constraint is one class here and one line in `swarmctl.control.mpc.condensed`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarmctl.control.mpc.axes import HalfSpaces, Penalties
+from swarmctl.control.mpc.prediction import Forecast, Prediction
+from swarmctl.control.mpc.program import ConstraintBlock, Rows
+from swarmctl.control.mpc.qp import INFINITY, QpSolution
+from swarmctl.core.types import Array
+
+_SLACK_SCALE_M = 0.1  # unit of slack variables, so that they are about 1 like all others
+_REACHABLE_01 = 0.998  # share of the reachable displacement that replaces an end out of reach
+_ROW_SPACING_S = 0.08  # closer rows are nearly parallel, which slows a first-order solver down
+_TERMINAL_CURVATURE = 1e-3  # keeps the Hessian positive definite; the exact penalty is the slope
+
+
+class IncrementBounds(ConstraintBlock):
+    """Bounds every scaled increment by -1 and 1."""
+
+    def __init__(self, prediction: Prediction) -> None:
+        super().__init__(np.eye(len(prediction.axes) * prediction.horizon.control, dtype=bool))
+
+    def prepare(self, rows: Rows) -> None:
+        rows.moves[:] = np.eye(len(rows.moves))
+        rows.lower[:], rows.upper[:] = -1.0, 1.0
+
+    def fill(self, rows: Rows, forecast: Forecast) -> None:
+        return
+
+
+class InputBounds(ConstraintBlock):
+    """Bounds every input, the held one plus the increments up to its step, in units of the largest input."""
+
+    def __init__(self, prediction: Prediction) -> None:
+        self._prediction = prediction
+        super().__init__(np.kron(np.eye(len(prediction.axes)), np.tri(prediction.horizon.control)).astype(bool))
+
+    def prepare(self, rows: Rows) -> None:
+        for i, axis in enumerate(self._prediction.axes):
+            own = self._prediction.columns(i)
+            rows.moves[own, own] = np.tri(self._prediction.horizon.control) * axis.du_max / axis.u_scale
+
+    def fill(self, rows: Rows, forecast: Forecast) -> None:
+        for i, axis in enumerate(self._prediction.axes):
+            own, held = self._prediction.columns(i), forecast.u_prev[i]
+            rows.lower[own] = (axis.u_min - held) / axis.u_scale
+            rows.upper[own] = (axis.u_max - held) / axis.u_scale
+
+
+class TerminalConditions(ConstraintBlock):
+    """Asks for the reference's position, or position and velocity, at the end of the horizon.
+
+    Conditions are equalities `gap = 0` with two rows and a slack each, which is fixed at 0 until they are softened.
+    """
+
+    def __init__(self, prediction: Prediction, penalties: Penalties, cost_scale: float) -> None:
+        self._prediction, self._over = prediction, penalties.over_terminal
+        self._slope_floor = penalties.floor * _SLACK_SCALE_M * cost_scale
+        ends = [a.terminal for a in prediction.axes]
+        self._ends = [(i, "pos") for i, end in enumerate(ends) if end in ("position", "position_velocity")]
+        self._ends += [(i, "vel") for i, end in enumerate(ends) if end == "position_velocity"]
+        self.every = np.arange(len(self._ends))  # conditions
+        self.velocities = np.array([j for j, (_, what) in enumerate(self._ends) if what == "vel"], dtype=int)
+        self._of_axis = {
+            i: np.array([j for j, (k, _) in enumerate(self._ends) if k == i])
+            for i in sorted({i for i, _ in self._ends})
+        }
+        uses = np.zeros((2 * len(self._ends), len(ends) * prediction.horizon.control), bool)
+        for j, (i, _) in enumerate(self._ends):
+            uses[2 * j : 2 * j + 2, prediction.columns(i)] = True
+        slacks = np.kron(np.eye(len(self._ends)), np.array([[_SLACK_SCALE_M], [-_SLACK_SCALE_M]]))
+        super().__init__(uses, slacks, _TERMINAL_CURVATURE)
+
+    def fill(self, rows: Rows, forecast: Forecast) -> None:
+        """Write equalities; an end that bounded increments can't reach is replaced by the farthest that they can."""
+        out_of_reach = set[int]()
+        for j, (i, what) in enumerate(self._ends):
+            response = (forecast.pos_response if what == "pos" else forecast.vel_response)[i, -1]
+            both = slice(2 * j, 2 * j + 2)
+            rows.moves[both, self._prediction.columns(i)] = self._prediction.axes[i].du_max * response
+            asked = self._wanted(j, forecast)
+            extremes = self._prediction.extremes(i, forecast.u_prev)
+            least, most = sorted(float(response @ increments) for increments in extremes)
+            rows.lower[both], rows.upper[both] = -INFINITY, INFINITY
+            if i in out_of_reach:
+                continue  # its end velocity then does not matter
+            if not least <= asked <= most:
+                out_of_reach.add(i)
+                asked = _REACHABLE_01 * (most if asked > most else least)
+            rows.lower[both] = rows.upper[both] = asked
+        rows.slack_max[:], rows.slack_slope[:] = 0.0, self._slope_floor
+
+    def _wanted(self, j: int, forecast: Forecast) -> float:
+        """Return by how much increments have to move the end of a condition."""
+        i, what = self._ends[j]
+        return float(-(forecast.pos_error_m if what == "pos" else forecast.vel_error_m_s)[-1, i])
+
+    def soften(self, rows: Rows, which: NDArray[np.intp]) -> None:
+        """Replace conditions `which` by `gap + slack >= 0` and `gap - slack <= 0` with free slacks.
+
+        The multipliers that balance the slope g of the cost along the rows R, (R R')^-1 R g, scale the weights that
+        make the penalties exact.
+        """
+        for i, own in self._of_axis.items():
+            columns = self._prediction.columns(i)
+            along = rows.moves[2 * own, columns]  # (own, Hc)
+            multiplier = np.abs(np.linalg.lstsq(along.T, rows.slope[columns], rcond=1e-9)[0])
+            rows.slack_slope[own] = self._slope_floor + self._over * multiplier * _SLACK_SCALE_M
+        rows.upper[2 * which], rows.lower[2 * which + 1] = INFINITY, -INFINITY
+        rows.slack_max[which] = INFINITY
+
+    def give_up(self, rows: Rows) -> None:
+        """Soften all conditions at no cost."""
+        self.soften(rows, self.every)
+        rows.slack_slope[:] = 0.0
+
+    def gap(self, rows: Rows, forecast: Forecast, flown: Array) -> float:
+        """Return the largest gap [m or m/s] that the variables `flown` (columns,) leave."""
+        if not self._ends:
+            return 0.0
+        wanted = np.array([self._wanted(j, forecast) for j in range(len(self._ends))])
+        moved = rows.moves[::2] @ flown[: rows.moves.shape[1]]
+        return float(np.abs(moved - wanted).max(initial=0.0))
+
+
+class KeepOutHalfSpaces(ConstraintBlock):
+    """Keeps positions within half-spaces `n . p_k >= b_k`, softened by one slack for each keep-out.
+
+    Args:
+        prediction: the motion.
+        max_keep_outs: largest number of half-space families (neighbours and obstacles).
+        relax_01: rows ask for at most this share of what the bounded increments can reach, so that rows inside the
+            dead time are never infeasible and never push agents away (1 asks for all).
+        penalties, cost_scale: weights of slacks.
+    """
+
+    def __init__(
+        self, prediction: Prediction, max_keep_outs: int, relax_01: float, penalties: Penalties, cost_scale: float
+    ) -> None:
+        self._prediction, self._relax_01, self._max_keep_outs = prediction, relax_01, max_keep_outs
+        self._over, self._slope_floor = penalties.over, penalties.floor * _SLACK_SCALE_M * cost_scale
+        axes, horizon, first = prediction.axes, prediction.horizon, prediction.first_row()
+        stride = max(1, round(_ROW_SPACING_S / horizon.dt_s))
+        self.checked = np.arange(horizon.prediction - 1, first - 1, -stride)[::-1]  # 0-based steps that get rows
+        step_m_s2 = max(a.du_max * a.gain_m_s2 for a in axes)
+        response = (prediction.pos_of_accel @ prediction.acted[0])[self.checked].max(axis=1) * step_m_s2
+        response = np.append(response, response[-1])  # the stopping row
+        self._row_scale = 1.0 / np.maximum(response, 0.01)  # rows of about unit size suit a first-order solver
+        uses = np.ones((max_keep_outs * len(response), len(axes) * horizon.control), bool)
+        slacks = np.kron(np.eye(max_keep_outs), (_SLACK_SCALE_M * self._row_scale)[:, None])
+        curvature = 2 * penalties.slack_quadratic * _SLACK_SCALE_M**2 * cost_scale
+        super().__init__(uses, slacks, curvature)
+
+    def fill(self, rows: Rows, forecast: Forecast) -> None:
+        """Write the rows of half-spaces; without any they are disabled."""
+        if not self._max_keep_outs:
+            return
+        rows.lower[:] = -INFINITY
+        steepest = float(np.abs(rows.slope).max()) * self._row_scale[-1]  # per metre of the last row
+        rows.slack_slope[:] = self._slope_floor + self._over * steepest * _SLACK_SCALE_M
+        spaces = forecast.half_spaces
+        if spaces is None or len(spaces.normal) == 0:
+            return
+        normal = np.concatenate([spaces.normal[:, self.checked], spaces.normal[:, -1:]], axis=1)
+        offset = np.concatenate([spaces.offset_m[:, self.checked], spaces.stop_offset_m[:, None]], axis=1)
+        reach = self._fill_coefficients(rows, forecast, spaces, normal)
+        free = np.empty((*offset.shape, len(self._prediction.axes)))
+        free[:, :-1] = forecast.free_pos_m[self.checked]
+        free[:, -1] = forecast.free_pos_m[-1] + spaces.stop_s[:, None] * forecast.free_vel_m_s[-1]
+        wanted = offset - np.einsum("ska,ska->sk", normal, free)
+        lower = np.minimum(wanted, self._relax_01 * reach) * self._row_scale
+        rows.lower[: offset.size] = np.where(np.isfinite(offset), lower, -INFINITY).ravel()
+
+    def _fill_coefficients(self, rows: Rows, forecast: Forecast, spaces: HalfSpaces, normal: Array) -> Array:
+        """Write coefficients, and return the largest value [m] of each row that bounded increments allow.
+
+        Both `normal` (used, checks, axes) and the result (used, checks) are for checked steps and the stopping row.
+        """
+        used, checks = normal.shape[:2]
+        block = rows.moves[: used * checks].reshape(used, checks, -1)  # a view
+        reach = np.zeros((used, checks))
+        for i, axis in enumerate(self._prediction.axes):
+            pos, vel = forecast.pos_response[i], forecast.vel_response[i]
+            push = np.empty((used, checks, self._prediction.horizon.control))  # metres of each row per unit increment
+            push[:, :-1] = pos[self.checked]
+            push[:, -1] = pos[-1] + spaces.stop_s[:, None] * vel[-1]
+            push *= normal[:, :, i, None]
+            block[:, :, self._prediction.columns(i)] = (axis.du_max * self._row_scale)[None, :, None] * push
+            rise, fall = self._prediction.extremes(i, forecast.u_prev)
+            reach += np.maximum(push @ rise, push @ fall)
+        return reach
+
+    def residual_m(self, rows: Rows, flown: Array) -> float:
+        if not self._max_keep_outs:
+            return 0.0
+        shortfall = rows.lower - rows.coefficients @ flown
+        return float((shortfall / np.tile(self._row_scale, self._max_keep_outs)).max(initial=0.0))
+
+    @staticmethod
+    def slack_m(rows: Rows, solution: QpSolution) -> float:
+        """Return the largest slack [m] of a solution, 0 without one."""
+        x = solution.x
+        return 0.0 if x is None else float(x[rows.slack_columns].max(initial=0.0)) * _SLACK_SCALE_M

@@ -1,0 +1,25 @@
+"""The QP solvers by the names that a configuration uses."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from swarmctl.control.mpc.qp import QpParams, QpSolver
+from swarmctl.control.mpc.qp_osqp import OsqpSolver
+
+Mask = NDArray[np.bool_]
+
+
+def _daqp(hessian: Mask, rows: Mask, params: QpParams) -> QpSolver:
+    from swarmctl.control.mpc.qp_daqp import DaqpSolver  # an optional package
+
+    return DaqpSolver(hessian, rows, params)
+
+
+MAKERS = {"osqp": OsqpSolver, "daqp": _daqp}  # the same names as `qp.SOLVERS`
+
+
+def make_solver(p_pattern: Mask, a_pattern: Mask, params: QpParams) -> QpSolver:
+    """Return the solver that the configuration asks for, for Hessians (n, n) and rows (m, n) of these patterns."""
+    return MAKERS[params.solver](p_pattern, a_pattern, params)
