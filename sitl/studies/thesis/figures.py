@@ -6,17 +6,31 @@ the full MAVLink loop) and are drawn beside it. Swarm figures show the agents of
 
 from __future__ import annotations
 
-import html
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
+from markupsafe import Markup
+from scipy.spatial.transform import Rotation
 
 from sitl.studies.thesis.trace import Array, Trace
 from swarmctl.core.closest_pair import closest_pair_m
-from swarmctl.telemetry.charts import Ball, Limit, Line, SpaceLine, Window, space_view, time_chart, top_view
+from swarmctl.telemetry.charts import (
+    REFERENCE_STYLE,
+    Ball,
+    Limit,
+    Line,
+    SpaceLine,
+    Window,
+    agent_line,
+    reference_line,
+    space_view,
+    time_chart,
+    top_view,
+)
+from swarmctl.telemetry.pages import render
 from swarmctl.telemetry.palette import LIMIT_RGB, SUM_RGB, agent_rgb, css
 
 FlightName = Literal[
@@ -54,7 +68,6 @@ _QUANTITIES: dict[Drawn, str] = {
 _AXES: tuple[Drawn, ...] = ("x", "y", "z")
 _ANGLES: tuple[Drawn, ...] = ("roll", "pitch", "yaw")
 _TORQUES: tuple[Drawn, ...] = ("torque_x", "torque_y", "torque_z")
-_REFERENCE = "#334155"
 _PUBLISHED = "#b45309"
 
 
@@ -120,8 +133,8 @@ FIGURES: tuple[Figure, ...] = (
 )
 
 
-def draw(figure: Figure, traces: Sequence[Trace], points: int = 300) -> str:
-    """Return one figure of the thesis as HTML.
+def draw(figure: Figure, traces: Sequence[Trace], points: int = 300) -> Markup:
+    """Return the content of one figure of the thesis.
 
     Args:
         figure: entry of the table.
@@ -132,7 +145,7 @@ def draw(figure: Figure, traces: Sequence[Trace], points: int = 300) -> str:
         return _states(figure, traces, points)
     if figure.drawn == "space":
         return _space(figure, traces, points)
-    lines = _swarm_lines(figure, traces[0]) if figure.flight in SWARMS else _single_lines(figure, traces)
+    lines = _lines(figure, traces)
     windows = _windows(traces[0], _AXES.index(figure.drawn)) if figure.drawn in _AXES else []
     title = figure.title if lines else f"{figure.title} (not recorded)"
     return time_chart(title, lines, _seconds(traces), points=points, windows=windows, height=200)
@@ -156,80 +169,71 @@ def body_rates_rad_s(trace: Trace, agent: int = 0) -> Array:
 
 def body_velocity_m_s(trace: Trace, agent: int = 0) -> Array:
     """Return the body FRD velocity u, v, w (T, 3) [m/s]: the NED velocity turned by the ZYX angles."""
-    sr, sp, sy = np.sin(trace.euler_rad[:, agent]).T
-    cr, cp, cy = np.cos(trace.euler_rad[:, agent]).T
-    to_body = np.array(
-        [
-            [cp * cy, cp * sy, -sp],
-            [sr * sp * cy - cr * sy, sr * sp * sy + cr * cy, sr * cp],
-            [cr * sp * cy + sr * sy, cr * sp * sy - sr * cy, cr * cp],
-        ]
-    )  # (3, 3, T)
-    return np.asarray(np.einsum("ijt,tj->ti", to_body, trace.vel_ned_m_s[:, agent]))
+    to_ned = Rotation.from_euler("ZYX", trace.euler_rad[:, agent, ::-1])
+    return np.asarray(to_ned.apply(trace.vel_ned_m_s[:, agent], inverse=True))
 
 
 def separation_chart(
     flight: FlightName, traces: Sequence[Trace], separation_m: Mapping[str, float], points: int
-) -> str:
+) -> Markup:
     """Draw the smallest distance of two agents over time, with the constraint radius of every trace."""
-    colors = [css(agent_rgb(k)) for k in range(len(traces))]
-    lines = [
-        Line(x=t.t_s, y=closest_pair_m(t.pos_ned_m), color=c, label=t.name) for t, c in zip(traces, colors, strict=True)
-    ]
+    lines = [agent_line(k, trace.t_s, closest_pair_m(trace.pos_ned_m), trace.name) for k, trace in enumerate(traces)]
     radii = {separation_m.get(trace.name, separation_m.get(flight)) for trace in traces}
     limits = [Limit(r, f"constraint radius {r:g} m") for r in sorted(r for r in radii if r is not None)]
     title = "Smallest distance between two agents [m]"
-    return time_chart(title, lines, _seconds(traces), limits=limits, points=points, from_zero=True, height=300)
+    return _tall_chart(title, lines, traces, limits, points)
 
 
-def error_chart(flight: FlightName, traces: Sequence[Trace], separation_m: Mapping[str, float], points: int) -> str:
+def error_chart(flight: FlightName, traces: Sequence[Trace], separation_m: Mapping[str, float], points: int) -> Markup:
     """Draw the distance to the reference over time, summed over agents; its mean is the published index."""
     lines = []
     for k, trace in enumerate(traces):
         sum_m = np.linalg.norm(trace.pos_ned_m - trace.ref_pos_ned_m, axis=2).sum(axis=1)
-        lines.append(Line(x=trace.t_s, y=sum_m, color=css(agent_rgb(k)), label=f"{trace.name}, mean {_mean(sum_m)} m"))
+        lines.append(agent_line(k, trace.t_s, sum_m, f"{trace.name}, mean {_mean(sum_m)} m"))
     radius_m = separation_m.get(traces[0].name, separation_m.get(flight))
     limits = []
     if radius_m is not None and traces[0].pos_ned_m.shape[1] == 3:
         limits = [Limit(math.sqrt(3) * radius_m, "theoretical lower bound for three agents")]
     title = "Distances to the shared reference, sum [m]" if flight in SWARMS else "Distance to the reference [m]"
-    return time_chart(title, lines, _seconds(traces), limits=limits, points=points, from_zero=True, height=300)
+    return _tall_chart(title, lines, traces, limits, points)
 
 
-def obstacle_chart(traces: Sequence[Trace], points: int) -> str:
+def obstacle_chart(traces: Sequence[Trace], points: int) -> Markup:
     """Draw the distance to the first obstacle's centre: all agents of the first trace, the nearest of the others."""
     obstacle = traces[0].obstacles[0]
-    center_ned_m = np.array(obstacle.center_ned_m)
-    lines = []
-    for k, trace in enumerate(traces):
-        away_m = np.linalg.norm(trace.pos_ned_m - center_ned_m, axis=2)  # (T, N)
-        if k == 0:
-            lines += [
-                Line(x=trace.t_s, y=away_m[:, i], color=css(agent_rgb(i)), label=f"agent {i}")
-                for i in range(away_m.shape[1])
-            ]
-        else:
-            color = css(agent_rgb(traces[0].pos_ned_m.shape[1] + k - 1))
-            lines.append(
-                Line(x=trace.t_s, y=np.fmin.reduce(away_m, axis=1), color=color, label=f"nearest, {trace.name}")
-            )
+
+    def away_m(trace: Trace) -> Array:  # (T, N)
+        return np.asarray(np.linalg.norm(trace.pos_ned_m - np.array(obstacle.center_ned_m), axis=2))
+
+    lines = [agent_line(i, traces[0].t_s, own_m) for i, own_m in enumerate(away_m(traces[0]).T)]
+    for color, trace in enumerate(traces[1:], len(lines)):
+        lines.append(agent_line(color, trace.t_s, np.fmin.reduce(away_m(trace), axis=1), f"nearest, {trace.name}"))
     limits = [Limit(obstacle.keep_out_m, f"constraint radius {obstacle.keep_out_m:g} m")]
     title = "Distance to the centre of the obstacle [m]"
-    return time_chart(title, lines, _seconds(traces), limits=limits, points=points, from_zero=True, height=300)
+    return _tall_chart(title, lines, traces, limits, points)
 
 
-def above_chart(trace: Trace, points: int) -> str:
+def above_chart(trace: Trace, points: int) -> Markup:
     """Draw agents, reference and obstacles from above; circles are the keep-out and the obstacle."""
-    lines = [
-        Line(x=trace.pos_ned_m[:, i, 1], y=trace.pos_ned_m[:, i, 0], color=css(agent_rgb(i)), label=f"agent {i}")
-        for i in range(trace.pos_ned_m.shape[1])
+    agents = range(trace.pos_ned_m.shape[1])
+    lines = [agent_line(i, trace.pos_ned_m[:, i, 1], trace.pos_ned_m[:, i, 0]) for i in agents]
+    lines.append(reference_line(trace.ref_pos_ned_m[:, 0, 1], trace.ref_pos_ned_m[:, 0, 0]))
+    return top_view("From above: north up, east right [m]", lines, _balls(trace)[::-1], points)
+
+
+def _balls(trace: Trace) -> list[Ball]:
+    """Return every obstacle and its keep-out."""
+    return [
+        ball
+        for obstacle in trace.obstacles
+        for ball in (
+            Ball(obstacle.center_ned_m, obstacle.radius_m, "obstacle"),
+            Ball(obstacle.center_ned_m, obstacle.keep_out_m, "keepout"),
+        )
     ]
-    ref = trace.ref_pos_ned_m[:, 0]
-    lines.append(Line(x=ref[:, 1], y=ref[:, 0], color=_REFERENCE, label="reference", dash="4 3", width=1.1))
-    return top_view("From above: north up, east right [m]", lines, _balls(trace), points)
 
 
-def index_chart(index: Sequence[IndexPoint]) -> str:
+def index_chart(index: Sequence[IndexPoint]) -> Markup:
     """Draw the tracking index over the constraint radius: Table 19, ours, and the theoretical lower bound."""
     radii = np.array(sorted({point.radius_m for point in index}))
     published = sorted({(p.radius_m, p.published_m) for p in index if p.published_m is not None})
@@ -238,19 +242,17 @@ def index_chart(index: Sequence[IndexPoint]) -> str:
         ours = sorted((p.radius_m, p.ours_m) for p in index if p.series == name and p.ours_m is not None)
         lines.append(_marked(ours, css(agent_rgb(k)), name))
     lines.append(_marked(published, _PUBLISHED, "published, Table 19"))
-    lines.append(
-        Line(
-            x=radii,
-            y=math.sqrt(3) * radii,
-            color=css(LIMIT_RGB),
-            label="theoretical lower bound, sqrt(3) r",
-            dash="5 4",
-            width=1.2,
-        )
-    )
+    bound = "theoretical lower bound, sqrt(3) r"
+    lines.append(reference_line(radii, math.sqrt(3) * radii, bound, color=css(LIMIT_RGB), dash="5 4", width=1.2))
     shown = (float(radii[0]) - 0.03, float(radii[-1]) + 0.03)
     title = "Tracking index [m] over constraint radius [m], three periods of the circle"
     return time_chart(title, lines, shown, from_zero=True, height=240)
+
+
+def _tall_chart(
+    title: str, lines: Sequence[Line], traces: Sequence[Trace], limits: Sequence[Limit], points: int
+) -> Markup:
+    return time_chart(title, lines, _seconds(traces), limits=limits, points=points, from_zero=True, height=300)
 
 
 def _marked(pairs: Sequence[tuple[float, float]], color: str, label: str) -> Line:
@@ -267,34 +269,26 @@ def _seconds(traces: Sequence[Trace]) -> tuple[float, float]:
     return (min(ends), max(ends)) if ends else (0.0, 1.0)
 
 
-def _single_lines(figure: Figure, traces: Sequence[Trace]) -> list[Line]:
-    """Return the response of every trace, and the reference of the first one."""
-    lines = []
-    for k, trace in enumerate(traces):
-        values = _response(trace, figure.drawn, 0)
-        if np.isfinite(values).any():
-            label = trace.name if len(traces) > 1 else "response"
-            lines.append(Line(x=trace.t_s, y=values, color=css(agent_rgb(k)), label=label, width=1.4 if k else 1.9))
+def _flown(figure: Figure, traces: Sequence[Trace]) -> list[tuple[Trace, int, str]]:
+    """Return the flights a figure shows: trace, agent and label; of a swarm the agents of the first trace."""
+    if figure.flight in SWARMS:
+        return [(traces[0], i, f"agent {i}") for i in range(traces[0].pos_ned_m.shape[1])]
+    return [(trace, 0, trace.name if len(traces) > 1 else "response") for trace in traces]
+
+
+def _lines(figure: Figure, traces: Sequence[Trace]) -> list[Line]:
+    """Return what was flown, and the reference of the first trace."""
+    lines, swarm = [], figure.flight in SWARMS
+    for k, (trace, agent, label) in enumerate(_flown(figure, traces)):
+        values = _response(trace, figure.drawn, agent)
+        if swarm or np.isfinite(values).any():
+            lines.append(agent_line(k, trace.t_s, values, label, width=1.4 if k or swarm else 1.9))
     asked = _asked(traces[0], figure.drawn)
-    if asked is not None and np.isfinite(asked).any():
+    if asked is not None and (swarm or np.isfinite(asked).any()):
         word = "reference" if figure.drawn in _AXES else "setpoint"
         own = f" of {traces[0].name}" if word == "setpoint" and len(traces) > 1 else ""
-        lines.append(Line(x=traces[0].t_s, y=asked, color=_REFERENCE, label=word + own, dash="4 3", width=1.1))
+        lines.append(reference_line(traces[0].t_s, asked, word + own))
     return lines
-
-
-def _swarm_lines(figure: Figure, trace: Trace) -> list[Line]:
-    agents = range(trace.pos_ned_m.shape[1])
-    lines = [
-        Line(x=trace.t_s, y=_response(trace, figure.drawn, i), color=css(agent_rgb(i)), label=f"agent {i}")
-        for i in agents
-    ]
-    asked = _asked(trace, figure.drawn)
-    return (
-        lines
-        if asked is None
-        else [*lines, Line(x=trace.t_s, y=asked, color=_REFERENCE, label="reference", dash="4 3", width=1.1)]
-    )
 
 
 def _response(trace: Trace, drawn: Drawn, agent: int) -> Array:
@@ -320,47 +314,25 @@ def _asked(trace: Trace, drawn: Drawn) -> Array | None:
 def _windows(trace: Trace, axis: int) -> list[Window]:
     """Return the extent of every obstacle on one axis while the reference is inside it."""
     found = []
-    for obstacle in trace.obstacles:
-        away_m = np.linalg.norm(trace.ref_pos_ned_m[:, 0] - np.array(obstacle.center_ned_m), axis=1)
-        center = obstacle.center_ned_m[axis]
-        sizes: tuple[tuple[float, Literal["keepout", "obstacle"]], ...] = (
-            (obstacle.keep_out_m, "keepout"),
-            (obstacle.radius_m, "obstacle"),
-        )
-        for radius_m, style in sizes:
-            inside_s = trace.t_s[away_m < radius_m]
-            if len(inside_s):
-                start_s, end_s = float(inside_s[0]), float(inside_s[-1])
-                found.append(Window(start_s, end_s, center - radius_m, center + radius_m, style))
+    for ball in reversed(_balls(trace)):
+        away_m = np.linalg.norm(trace.ref_pos_ned_m[:, 0] - np.array(ball.center_ned_m), axis=1)
+        inside_s = trace.t_s[away_m < ball.radius_m]
+        if len(inside_s):
+            low_m, high_m = ball.center_ned_m[axis] - ball.radius_m, ball.center_ned_m[axis] + ball.radius_m
+            found.append(Window(float(inside_s[0]), float(inside_s[-1]), low_m, high_m, ball.style))
     return found
 
 
-def _space(figure: Figure, traces: Sequence[Trace], points: int) -> str:
-    first = traces[0]
-    if figure.flight in SWARMS:
-        shown = [(f"agent {i}", first.pos_ned_m[:, i]) for i in range(first.pos_ned_m.shape[1])]
-    else:
-        shown = [(trace.name if len(traces) > 1 else "response", trace.pos_ned_m[:, 0]) for trace in traces]
+def _space(figure: Figure, traces: Sequence[Trace], points: int) -> Markup:
     lines = [
-        SpaceLine(pos_ned_m=pos_ned_m, color=css(agent_rgb(k)), label=name, width=1.6)
-        for k, (name, pos_ned_m) in enumerate(shown)
+        SpaceLine(pos_ned_m=trace.pos_ned_m[:, agent], color=css(agent_rgb(k)), label=label, width=1.6)
+        for k, (trace, agent, label) in enumerate(_flown(figure, traces))
     ]
-    lines.append(
-        SpaceLine(pos_ned_m=first.ref_pos_ned_m[:, 0], color=_REFERENCE, label="reference", dash="4 3", width=1.1)
-    )
-    return space_view(figure.title, lines, _balls(first), points)
+    lines.append(SpaceLine(pos_ned_m=traces[0].ref_pos_ned_m[:, 0], label="reference", **REFERENCE_STYLE))
+    return space_view(figure.title, lines, _balls(traces[0]), points)
 
 
-def _balls(trace: Trace) -> list[Ball]:
-    """Return what is drawn of the obstacles: each itself, and its keep-out."""
-    balls = []
-    for obstacle in trace.obstacles:
-        balls.append(Ball(obstacle.center_ned_m, obstacle.radius_m, "obstacle"))
-        balls.append(Ball(obstacle.center_ned_m, obstacle.keep_out_m, "keepout"))
-    return balls
-
-
-def _states(figure: Figure, traces: Sequence[Trace], points: int) -> str:
+def _states(figure: Figure, traces: Sequence[Trace], points: int) -> Markup:
     """Draw four panels of three states; further traces are dashed."""
     panels: tuple[tuple[str, str], ...] = (
         ("angles [rad]", "phi theta psi"),
@@ -371,23 +343,22 @@ def _states(figure: Figure, traces: Sequence[Trace], points: int) -> str:
     states = [
         (t.euler_rad[:, 0], body_rates_rad_s(t), body_velocity_m_s(t), t.pos_ned_m[:, 0]) for t in traces
     ]  # each (T, 3)
-    drawings = []
+    panels_drawn = []
     for panel, (title, names) in enumerate(panels):
         lines = [
-            Line(
-                x=trace.t_s,
-                y=states[n][panel][:, k],
-                color=css(agent_rgb(k)),
-                label="" if n else name,
+            agent_line(
+                k,
+                trace.t_s,
+                states[n][panel][:, k],
+                "" if n else name,
                 dash="4 3" if n else "",
                 width=1.6 - 0.2 * k,
             )
             for n, trace in enumerate(traces)
             for k, name in enumerate(names.split())
         ]
-        drawings.append(time_chart(title, lines, _seconds(traces), points=points, height=130))
-    rest = f"; dashed: {html.escape(', '.join(t.name for t in traces[1:]))}" if len(traces) > 1 else ""
-    color = css(SUM_RGB)
-    note = f'<div class=legend style="color:{color}">the thesis says: only z and w move{rest}</div>'
-    inner = "".join(drawings)
-    return f"<figure><figcaption>{figure.title}</figcaption><div class=panels>{inner}</div>{note}</figure>"
+        panels_drawn.append(time_chart(title, lines, _seconds(traces), points=points, height=130))
+    others = ", ".join(trace.name for trace in traces[1:])
+    return render(
+        __package__, "states.html", title=figure.title, panels=panels_drawn, color=css(SUM_RGB), others=others
+    )

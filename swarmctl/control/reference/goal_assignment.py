@@ -20,7 +20,7 @@ _CENTRE_SAMPLES = 13  # candidate centres along each edge of a lattice triangle
 _ROTATIONS = 72
 _ITERATIONS = 30
 _FAIRNESS = 1e-4  # weight of the sum of squares, which breaks ties in favour of equal distances
-_TINY_M = 1e-6  # above rounding: all computers must choose alike
+_TINY_M, _TINY_M2 = 1e-6, 1e-6  # above rounding: all computers must choose alike
 
 
 def assigned_goals_ned_m(starts_ned_m: Array, goals_ned_m: Array, apart_m: float) -> tuple[Array, list[list[int]]]:
@@ -88,25 +88,19 @@ def _min_distance_m(some: Array, others: Array) -> float:
 def _assigned(starts: Array, places: Array) -> Array:
     """Return places (N, 2), rotated about the origin and permuted so that paths from `starts` (N, 2) are short.
 
-    No two agents would gain by an exchange, so paths flown in the same time cross as little as possible.
+    The sum of squares is the least of any permutation, so paths flown in the same time cross as little as possible.
+    Squares are whole multiples of _TINY_M2: rounding of the last digit decides no tie.
     """
+    from scipy.optimize import linear_sum_assignment  # imports for a second, needed only where agents share a goal
+
     best, least = places, math.inf
     for rotation in range(_ROTATIONS):
         angle = 2.0 * math.pi * rotation / _ROTATIONS
         c, s = math.cos(angle), math.sin(angle)
-        assigned = _exchanged(starts, places @ np.array([[c, s], [-s, c]]))
+        rotated = places @ np.array([[c, s], [-s, c]])
+        squares = ((starts[:, None] - rotated) ** 2).sum(axis=2)  # (N, N) of every agent to every place [m2]
+        assigned = rotated[linear_sum_assignment(np.rint(squares / _TINY_M2))[1]]
         total = float(((assigned - starts) ** 2).sum())
-        if total < least - _TINY_M:
+        if total < least - _TINY_M2:
             best, least = assigned, total
     return best
-
-
-def _exchanged(starts: Array, places: Array) -> Array:
-    places, settled = places.copy(), False
-    while not settled:
-        settled = True
-        for i, j in itertools.combinations(range(len(starts)), 2):
-            if float((starts[i] - starts[j]) @ (places[i] - places[j])) < -_TINY_M:
-                places[[i, j]] = places[[j, i]]
-                settled = False
-    return places

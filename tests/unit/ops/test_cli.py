@@ -80,7 +80,7 @@ def test_help_of_studies_names_every_option_and_imports_nothing_heavy(module: st
 
 
 def test_the_solvers_of_bench_are_those_there_are() -> None:
-    assert command.SOLVERS == tuple(SOLVERS)
+    assert tuple(SOLVERS) == command.SOLVERS
 
 
 def test_every_verb_is_there_and_explains_itself(run: Run, capsys: pytest.CaptureFixture[str]) -> None:

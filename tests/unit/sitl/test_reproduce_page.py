@@ -300,17 +300,24 @@ def test_index_points_without_a_published_value() -> None:
     assert drawing.count('r="3.5"') == 3
 
 
-def test_body_rates_and_velocity_are_those_of_the_rotation() -> None:
+def test_body_rates_are_those_of_the_rotation() -> None:
     t_s = np.arange(0, 2, 0.001)
     euler_rad = np.column_stack([0.3 * np.sin(2 * t_s), 0.2 + 0.4 * t_s, np.pi - 1.0 + 1.5 * t_s])
     euler_rad[:, 2] = (euler_rad[:, 2] + np.pi) % (2 * np.pi) - np.pi  # yaw goes once over the edge
-    vel_ned_m_s = np.column_stack([np.cos(t_s), 2 * t_s, -t_s])
     flown = line_trace("turn", "open_loop")
-    trace = replace(flown, t_s=t_s, euler_rad=euler_rad[:, None], vel_ned_m_s=vel_ned_m_s[:, None])
+    trace = replace(flown, t_s=t_s, euler_rad=euler_rad[:, None])
     to_ned = Rotation.from_euler("ZYX", euler_rad[:, ::-1])
     rates = (to_ned[:-2].inv() * to_ned[2:]).as_rotvec() / 0.002
     assert body_rates_rad_s(trace)[1:-1] == pytest.approx(rates, abs=1e-4)
-    assert body_velocity_m_s(trace) == pytest.approx(to_ned.inv().apply(vel_ned_m_s))
+
+
+def test_body_velocity_of_known_attitudes() -> None:
+    """Nose to the east and flown north; 30 deg nose up and flown north; 30 deg right wing down and sinking."""
+    euler_rad = np.radians([[[0.0, 0.0, 90.0]], [[0.0, 30.0, 0.0]], [[30.0, 0.0, 0.0]]])  # (T, 1, 3)
+    vel_ned_m_s = np.array([[[1.0, 0.0, 0.0]], [[1.0, 0.0, 0.0]], [[0.0, 0.0, 1.0]]])
+    trace = replace(line_trace("known", "open_loop"), euler_rad=euler_rad, vel_ned_m_s=vel_ned_m_s)
+    expected = [[0.0, -1.0, 0.0], [0.8660254, 0.0, 0.5], [0.0, 0.5, 0.8660254]]
+    np.testing.assert_allclose(body_velocity_m_s(trace), expected, atol=1e-7)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,123 @@
+"""Inline SVG: elements, axes with ticks, paths, dots, and the figure around a drawing. Lengths are pixels.
+
+All charts of all pages are made of these. Text and attributes are escaped; numbers are rounded to a tenth of a pixel.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from markupsafe import Markup
+
+from swarmctl.core.types import Array
+from swarmctl.telemetry.pages import render
+
+WIDTH_PX = 640
+LEFT_PX, RIGHT_PX, TOP_PX, BOTTOM_PX = 52, 12, 8, 24  # margins around the plot
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Stroke:
+    """How a curve is drawn, and its name in the legend."""
+
+    color: str
+    label: str = ""
+    dash: str = ""
+    width: float = 1.4
+    opacity: float = 1.0
+
+    def along(self, px: Array, py: Array) -> Markup:
+        """Return the path through points (T,) in pixels; NaN interrupts it."""
+        style = {"stroke": self.color, "stroke_width": f"{self.width:g}", "stroke_dasharray": self.dash}
+        return polyline(px, py, **style, opacity="" if self.opacity >= 1 else f"{self.opacity:g}")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Axis:
+    """Maps [low, high] to [first, last] pixels."""
+
+    low: float
+    high: float
+    first: float
+    last: float
+
+    def px(self, values: Array | float) -> Array:
+        """Return the pixels (...,) of values (...,)."""
+        scale = (self.last - self.first) / (self.high - self.low)
+        return self.first + (np.asarray(values, np.float64) - self.low) * scale
+
+    def clipped_px(self, values: Sequence[float]) -> list[float]:
+        """Return the pixels of values, those outside of the axis moved to its ends."""
+        return [float(px) for px in self.px(np.clip(np.array(values), self.low, self.high))]
+
+
+def element(name: str, /, *inside: str, **attributes: str | float) -> Markup:
+    """Return one element around what is inside; `text_anchor` is written `text-anchor`, an empty attribute left out."""
+    words = {
+        key.strip("_").replace("_", "-"): f"{value:.1f}" if isinstance(value, float) else value
+        for key, value in attributes.items()
+        if value != ""
+    }
+    opening = Markup("<{}").format(name) + Markup("").join(Markup(' {}="{}"').format(*word) for word in words.items())
+    return opening + (Markup(">{}</{}>").format(Markup("").join(inside), name) if inside else Markup("/>"))
+
+
+def polyline(px: Array, py: Array, **attributes: str | float) -> Markup:
+    """Return one path through points (T,); NaN interrupts it."""
+    known = np.flatnonzero(np.isfinite(px) & np.isfinite(py))
+    stretches = np.split(known, np.flatnonzero(np.diff(known) > 1) + 1) if len(known) else []
+    path = "".join(
+        "M" + "L".join(f"{x:.1f} {y:.1f}" for x, y in zip(px[part], py[part], strict=True)) for part in stretches
+    )
+    return element("path", d=path, **attributes) if path else Markup()
+
+
+def dot(px: float, py: float, radius: float, color: str) -> Markup:
+    """Return a filled dot."""
+    return element("circle", cx=px, cy=py, r=f"{radius:g}", fill=color)
+
+
+def tick(px: float, py: float, text: str, anchor: str) -> Markup:
+    """Return a small text whose `anchor` (start, middle, end) is at a point."""
+    return element("text", text, class_="tick", x=px, y=py, text_anchor=anchor)
+
+
+def grid(x: Axis, y: Axis) -> Markup:
+    """Return horizontal lines with their values, and the axis below with its own."""
+    parts = []
+    for value in round_numbers(y.low, y.high, 5):
+        py = float(y.px(value))
+        parts.append(element("path", class_="grid", d=f"M{x.first} {py:.1f}H{x.last}"))
+        parts.append(tick(x.first - 6, py + 3.5, f"{value:g}", "end"))
+    return Markup("").join([*parts, axis_below(x, y)])
+
+
+def axis_below(x: Axis, y: Axis) -> Markup:
+    """Return the horizontal axis with its ticks."""
+    line = element("path", class_="axis", d=f"M{x.first} {y.first:.1f}H{x.last}")
+    values = round_numbers(x.low, x.high, 8)
+    ticks = [tick(float(x.px(value)), float(y.first + 15), f"{value:g}", "middle") for value in values]
+    return Markup("").join([line, *ticks])
+
+
+def figure(title: str, height_px: float, parts: Iterable[str], legend: Iterable[Stroke]) -> Markup:
+    """Return the content of a `<figure>`: title, drawing and a legend of the strokes that have a name."""
+    drawing = element("svg", *parts, viewBox=f"0 0 {WIDTH_PX} {height_px:.0f}", role="img")
+    return render(__package__, "chart.html", title=title, drawing=drawing, legend=legend)
+
+
+def widened(low: float, high: float) -> tuple[float, float]:
+    """Return a range that is not empty."""
+    return (low, high) if high - low > 1e-9 * max(1.0, abs(low)) else (low - 0.5, high + 0.5)
+
+
+def round_numbers(low: float, high: float, count: int) -> list[float]:
+    """Return about `count` round numbers within [low, high]."""
+    raw = (high - low) / count
+    power = 10.0 ** math.floor(math.log10(raw))
+    step = next(power * m for m in (1, 2, 5, 10) if power * m >= raw)
+    first = math.ceil(low / step)
+    return [round(k * step, 10) for k in range(first, math.floor(high / step) + 1)]
