@@ -14,9 +14,18 @@ from tests.real.witness import Truth, Witness
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(900)]
 
-FED = {"EKF2_EV_CTRL": 3, "EKF2_GPS_CTRL": 0, "EKF2_HGT_REF": 3}  # horizontal and vertical position; height from it
+FED = {  # see docs/real_autopilots.md, "Positions from outside"
+    "EKF2_EV_CTRL": 3,
+    "EKF2_GPS_CTRL": 0,
+    "EKF2_HGT_REF": 3,
+    "EKF2_EVP_NOISE": 0.01,
+    "EKF2_DELAY_MAX": 40,
+    "EKF2_TAU_POS": 0.1,
+    "EKF2_TAU_VEL": 0.1,
+}
 NO_ALTITUDE = ("--set", "swarm.origin_alt_m=0")  # without GPS a PX4 takes its first height for 0 m above the sea
-ORIGIN_EVERY, ORIGIN_UNTIL = 25, 150  # samples
+ORIGIN_EVERY, ORIGIN_UNTIL = 25, 300  # samples
+SAMPLE_EVERY_US = 20_000
 NO_COVARIANCE = [math.nan] * 21
 
 
@@ -28,6 +37,7 @@ def feed(witness: Witness, index: int, truth: Truth) -> None:
             origin = PX4.origin
             place = round(origin.lat_deg * 1e7), round(origin.lon_deg * 1e7), 0
             witness.say(index, mav.MAVLink_set_gps_global_origin_message(index + 1, *place))
+            witness.ask_truth_every(index, SAMPLE_EVERY_US)
         return
     velocity, rates = truth.vel_ned_m_s, (math.nan,) * 3
     frame = mav.MAV_FRAME_LOCAL_NED

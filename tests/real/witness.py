@@ -154,6 +154,12 @@ class Witness:
         link = self._links[index if self._fleet.kind is ARDUCOPTER else 0]
         link.send(self._codec.encode(message), index)
 
+    def ask_truth_every(self, index: int, interval_us: int) -> None:
+        """Ask a PX4 for samples of its simulator's state at this interval on the link to its display."""
+        params = (mav.MAVLINK_MSG_ID_HIL_STATE_QUATERNION, interval_us, 0, 0, 0, 0, 0)
+        message = mav.MAVLink_command_long_message(index + 1, 1, mav.MAV_CMD_SET_MESSAGE_INTERVAL, 0, *params)
+        self._links[1 + index].send(self._codec.encode(message), index)
+
     def command(self, index: int, number: int, *params: float) -> None:
         padded = [*params, *[0.0] * (7 - len(params))]
         self.say(index, mav.MAVLink_command_long_message(index + 1, 1, number, 0, *padded))
