@@ -104,8 +104,8 @@ def _write_recording(config: Config, directory: Path) -> None:
         load_run(directory),
         config.swarm.agents,
         config.separation.radius_m,
-        config.limits.min_separation_m,
-        config.obstacles,
+        limit_m=config.limits.min_separation_m,
+        obstacles=config.obstacles,
     )
     optimize_recording(directory)
 

@@ -91,7 +91,9 @@ class SitlWorld:
         self.estimator = Estimator(ESTIMATORS[params.estimator], self.plant, params.seed)
         self.attitude = attitude_loop(preset, count, dt_s, params.attitude_gains)
         self._autopilot_every = max(1, round(params.physics_hz / AUTOPILOT_HZ))
-        self.physics = Physics(self.plant, self.attitude, self.estimator, params, params.seed, self._autopilot_every)
+        self.physics = Physics(
+            self.plant, self.attitude, self.estimator, params, seed=params.seed, slow_every=self._autopilot_every
+        )
         self.autopilots: list[Commander] = []
         self.endpoints: list[MavlinkInterface] = []
         self._links = [LossyLink(link, (params.seed, i, _LINK_PURPOSE)) for i, link in enumerate(transports)]
@@ -237,9 +239,9 @@ class SitlWorld:
         pilot.start_at(self.origins[vehicle])
         sysid, step_us = params.sysid_base + vehicle, round(self.plant.dt_s * 1e6)
         report = self._publisher(vehicle, pilot)
-        endpoint = Endpoint(sysid, link, pilot, report, step_us)
+        endpoint = Endpoint(sysid, link, pilot, report, step_us=step_us)
         if self._gcs_links:
-            ground = Endpoint(sysid, self._gcs_links[vehicle], pilot, report, step_us, GCS_HZ)
+            ground = Endpoint(sysid, self._gcs_links[vehicle], pilot, report, step_us=step_us, default_hz=GCS_HZ)
             self.gcs_endpoints.append(ground)
             endpoint.join(ground)
         return pilot, endpoint
@@ -255,7 +257,7 @@ class SitlWorld:
             airborne=params.start == "air",
         )
         links = [link, *self._gcs_links[vehicle : vehicle + 1]]
-        pilot, interfaces = arducopter_vehicle(params.sysid_base + vehicle, links, self.plant, vehicle, start)
+        pilot, interfaces = arducopter_vehicle(params.sysid_base + vehicle, links, self.plant, vehicle, start=start)
         self.gcs_endpoints.extend(interfaces[1:])
         return pilot, interfaces[0]
 

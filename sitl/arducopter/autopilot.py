@@ -168,12 +168,13 @@ class ArduCopter:
         q_nb: Sequence[float],
         rates: Sequence[float],
         thrust: float,
+        *,
         now_us: int,
     ) -> bool:
         """Take a SET_ATTITUDE_TARGET, see `Setpoints.take`; return whether it will be flown."""
         if self.mode != CopterMode.GUIDED:
             return self._refuse("not_guided")
-        refusal = self._setpoints.take(type_mask, q_nb, rates, thrust, self.target_q_nb, now_us)
+        refusal = self._setpoints.take(type_mask, q_nb, rates, thrust, flown=self.target_q_nb, now_us=now_us)
         if refusal:
             if refusal == SOME_RATES and self.guided is not Guided.STOP:
                 self._enter_guided(Guided.STOP)

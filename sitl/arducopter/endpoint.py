@@ -58,7 +58,7 @@ class ArduCopterEndpoint:
     """
 
     def __init__(
-        self, sysid: int, transport: Transport, pilot: ArduCopter, report: Callable[[], CopterReport], step_us: int
+        self, sysid: int, transport: Transport, pilot: ArduCopter, report: Callable[[], CopterReport], *, step_us: int
     ) -> None:
         self.sysid = sysid
         self.transport = transport
@@ -186,7 +186,7 @@ class ArduCopterEndpoint:
 
     def _on_attitude_target(self, m: Any) -> None:
         rates = (m.body_roll_rate, m.body_pitch_rate, m.body_yaw_rate)
-        self._pilot.on_setpoint(m.type_mask, m.q, rates, m.thrust, self._now_us)
+        self._pilot.on_setpoint(m.type_mask, m.q, rates, m.thrust, now_us=self._now_us)
 
     def _on_timesync(self, message: Any) -> None:
         if message.tc1 == 0:
@@ -324,7 +324,7 @@ def _whole(value: float) -> int | None:
 
 
 def arducopter_vehicle(
-    sysid: int, links: Sequence[Transport], plant: Plant, vehicle: int, start: Start
+    sysid: int, links: Sequence[Transport], plant: Plant, vehicle: int, *, start: Start
 ) -> tuple[ArduCopter, list[ArduCopterEndpoint]]:
     """Return the autopilot of one vehicle of a plant, and its MAVLink interface on each link."""
     parameters = CopterParameters(sysid)
@@ -342,4 +342,4 @@ def arducopter_vehicle(
         )
 
     step_us = round(plant.dt_s * 1e6)
-    return pilot, [ArduCopterEndpoint(sysid, link, pilot, report, step_us) for link in links]
+    return pilot, [ArduCopterEndpoint(sysid, link, pilot, report, step_us=step_us) for link in links]

@@ -70,6 +70,7 @@ class Setpoints:
         q_nb: Sequence[float],
         rates: Sequence[float],
         thrust: float,
+        *,
         flown: Array,
         now_us: int,
     ) -> str:

@@ -32,6 +32,7 @@ class Physics:
         attitude: AttitudeLoop,
         estimator: Estimator,
         params: SimulatorParams,
+        *,
         seed: int,
         slow_every: int,
     ) -> None:

@@ -113,14 +113,14 @@ class AutoFlight:
         self._navigator.face(yaw_rad)
 
     def fly(
-        self, mode: Px4Mode, estimate: Estimate, home_ned_m: Ned | None, armed_us: int, now_us: int, dt_s: float
+        self, mode: Px4Mode, estimate: Estimate, home_ned_m: Ned | None, armed_us: int, *, now_us: int, dt_s: float
     ) -> Command:
         """Return the command of this tick; `armed_us` is when the motors began to turn."""
         home = home_ned_m or estimate.pos_ned_m
         if mode == Px4Mode.AUTO_TAKEOFF:
-            return self._take_off(estimate, home, self._takeoff_alt(home), armed_us, now_us, dt_s)
+            return self._take_off(estimate, home, self._takeoff_alt(home), armed_us, now_us=now_us, dt_s=dt_s)
         if mode == Px4Mode.AUTO_MISSION:
-            return self._fly_mission(estimate, home, armed_us, now_us, dt_s)
+            return self._fly_mission(estimate, home, armed_us, now_us, dt_s=dt_s)
         if estimate.on_ground:
             return IDLE
         if mode == Px4Mode.AUTO_RTL:
@@ -139,7 +139,7 @@ class AutoFlight:
         return home[2] - self._parameters.real("MIS_TAKEOFF_ALT")
 
     def _take_off(
-        self, estimate: Estimate, home: Ned, target_z_m: float, armed_us: int, now_us: int, dt_s: float
+        self, estimate: Estimate, home: Ned, target_z_m: float, armed_us: int, *, now_us: int, dt_s: float
     ) -> Command:
         since_s = (now_us - armed_us) * 1e-6 - self._parameters.real("COM_SPOOLUP_TIME")
         if since_s < 0:
@@ -158,7 +158,7 @@ class AutoFlight:
             return self._navigator.hold(estimate, dt_s)
         ramp_s = self._parameters.real("MPC_TKO_RAMP_T")
         ramp_01 = min(1.0, (since_s - RAMP_S) / ramp_s) if ramp_s > 0 else 1.0
-        return self._navigator.climb_to(estimate, self._takeoff_z_m, home[2], max(0.1, ramp_01), dt_s)
+        return self._navigator.climb_to(estimate, self._takeoff_z_m, home[2], max(0.1, ramp_01), dt_s=dt_s)
 
     def _land(self, estimate: Estimate, home: Ned, dt_s: float, xy_m: Xy | None = None) -> Command:
         self.phase = Phase.LANDING
@@ -201,7 +201,7 @@ class AutoFlight:
 
     # --- missions ---
 
-    def _fly_mission(self, estimate: Estimate, home: Ned, armed_us: int, now_us: int, dt_s: float) -> Command:
+    def _fly_mission(self, estimate: Estimate, home: Ned, armed_us: int, now_us: int, *, dt_s: float) -> Command:
         store = self._store
         if self._seen_changes != store.changes:
             self.engage(Px4Mode.AUTO_MISSION, estimate, fresh=False)
@@ -210,7 +210,7 @@ class AutoFlight:
             return IDLE if estimate.on_ground else self._navigator.hold(estimate, dt_s)
         item = store.mission[store.current]
         if item.command == NAV_TAKEOFF or estimate.on_ground:
-            return self._fly_takeoff(item, estimate, home, armed_us, now_us, dt_s)
+            return self._fly_takeoff(item, estimate, home, armed_us, now_us=now_us, dt_s=dt_s)
         if item.command == NAV_RETURN:
             return self._return(estimate, home, dt_s)
         if item.command == NAV_DELAY:
@@ -227,7 +227,7 @@ class AutoFlight:
         return self._navigator.go_to(estimate, goal[:2], goal[2], dt_s)
 
     def _fly_takeoff(
-        self, item: Item, estimate: Estimate, home: Ned, armed_us: int, now_us: int, dt_s: float
+        self, item: Item, estimate: Estimate, home: Ned, armed_us: int, *, now_us: int, dt_s: float
     ) -> Command:
         """Fly NAV_TAKEOFF; a mission that begins on the ground with another item takes off first, too."""
         if item.command in (NAV_LAND, NAV_RETURN) and self.phase == Phase.LANDING:
@@ -236,7 +236,7 @@ class AutoFlight:
         target_z_m = self._place(item, home, estimate)[2]
         if item.command != NAV_TAKEOFF:
             target_z_m = home[2] - self._parameters.real("MIS_TAKEOFF_ALT")
-        command = self._take_off(estimate, home, target_z_m, armed_us, now_us, dt_s)
+        command = self._take_off(estimate, home, target_z_m, armed_us, now_us=now_us, dt_s=dt_s)
         if self.done:
             self.done, self._takeoff_z_m = False, None
             if item.command == NAV_TAKEOFF:

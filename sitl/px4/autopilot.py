@@ -202,10 +202,12 @@ class Autopilot:
 
     # --- the offboard stream ---
 
-    def on_setpoint(self, type_mask: int, q_nb: Sequence[float], rates: Triple, thrust_01: float, now_us: int) -> bool:
+    def on_setpoint(
+        self, type_mask: int, q_nb: Sequence[float], rates: Triple, thrust_01: float, *, now_us: int
+    ) -> bool:
         """Take a SET_ATTITUDE_TARGET addressed to this vehicle; return whether it counts as a stream."""
         flying = self.mode == Px4Mode.OFFBOARD
-        if not self.stream.take(type_mask, q_nb, rates, thrust_01, now_us, flying=flying):
+        if not self.stream.take(type_mask, q_nb, rates, thrust_01, now_us=now_us, flying=flying):
             return False
         if flying and self.armed and not self.terminated:
             self.released, self.output = True, self.stream.command
@@ -355,7 +357,7 @@ class Autopilot:
     def _fly_auto(self, estimate: Estimate, now_us: int, dt_s: float) -> Command:
         if not self.has_position and not estimate.on_ground:
             return self._navigator.descend_blind(estimate, dt_s)
-        command = self.flight.fly(self.mode, estimate, self.home_ned_m, self._armed_us, now_us, dt_s)
+        command = self.flight.fly(self.mode, estimate, self.home_ned_m, self._armed_us, now_us=now_us, dt_s=dt_s)
         if self.flight.done:
             self.flight.done = False
             self.mode = self.intended = self._resting_mode = Px4Mode.AUTO_LOITER

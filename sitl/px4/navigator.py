@@ -100,7 +100,9 @@ class Navigator:
             self._hold_z_m = estimate.pos_ned_m[2]
         return self._fly(estimate, self._speed_z(estimate, self._hold_z_m), dt_s)
 
-    def climb_to(self, estimate: Estimate, z_ned_m: float, ground_z_m: float, ramp_01: float, dt_s: float) -> Command:
+    def climb_to(
+        self, estimate: Estimate, z_ned_m: float, ground_z_m: float, ramp_01: float, *, dt_s: float
+    ) -> Command:
         """Take off to a height above the begin of the climb, slowly near the ground; `ramp_01` scales the speed."""
         if self._hold_xy_m is None:
             self._hold_xy_m = estimate.pos_ned_m[0], estimate.pos_ned_m[1]
@@ -133,7 +135,7 @@ class Navigator:
         sink = self._parameters.real("MPC_LAND_SPEED")
         self._speed_ned_m_s = 0.0, 0.0, sink
         acc_d = self._acc_down(estimate, sink, dt_s)
-        return self._aim(estimate, 0.0, 0.0, acc_d, dt_s)
+        return self._aim(estimate, 0.0, 0.0, acc_d, dt_s=dt_s)
 
     def _speed_z(self, estimate: Estimate, target_z_m: float | None) -> float:
         if target_z_m is None:
@@ -159,16 +161,16 @@ class Navigator:
         acc: list[float] = []
         for axis in (0, 1):
             error = wanted[axis] - estimate.vel_ned_m_s[axis]
-            acc.append(VEL_P_1_S * error + self._summed(estimate, axis, VEL_I_1_S2, 2.0, error, dt_s))
+            acc.append(VEL_P_1_S * error + self._summed(estimate, axis, VEL_I_1_S2, 2.0, error=error, dt_s=dt_s))
         acc_n, acc_e = _limited(acc[0], acc[1], ACC_MAX_M_S2)
-        return self._aim(estimate, acc_n, acc_e, self._acc_down(estimate, speed_z_m_s, dt_s), dt_s)
+        return self._aim(estimate, acc_n, acc_e, self._acc_down(estimate, speed_z_m_s, dt_s), dt_s=dt_s)
 
     def _acc_down(self, estimate: Estimate, speed_z_m_s: float, dt_s: float) -> float:
         error = speed_z_m_s - estimate.vel_ned_m_s[2]
-        summed = self._summed(estimate, 2, Z_VEL_I_1_S2, 3.0, error, dt_s)
+        summed = self._summed(estimate, 2, Z_VEL_I_1_S2, 3.0, error=error, dt_s=dt_s)
         return max(-ACC_UP_MAX_M_S2, min(ACC_DOWN_MAX_M_S2, Z_VEL_P_1_S * error + summed))
 
-    def _summed(self, estimate: Estimate, axis: int, gain: float, limit: float, error: float, dt_s: float) -> float:
+    def _summed(self, estimate: Estimate, axis: int, gain: float, limit: float, *, error: float, dt_s: float) -> float:
         """Return the velocity-error integral; frozen while the error is large, and on the ground except to take off."""
         leaving = axis == 2 and error < 0.0
         if (leaving or not estimate.on_ground) and abs(error) < 1.0:
@@ -176,7 +178,7 @@ class Navigator:
             self._integral_m_s2[axis] = max(-limit, min(limit, summed))
         return self._integral_m_s2[axis]
 
-    def _aim(self, estimate: Estimate, acc_n: float, acc_e: float, acc_d: float, dt_s: float) -> Command:
+    def _aim(self, estimate: Estimate, acc_n: float, acc_e: float, acc_d: float, *, dt_s: float) -> Command:
         if estimate.on_ground:
             acc_n = acc_e = 0.0
         step = JERK_MAX_M_S3 * dt_s

@@ -92,6 +92,7 @@ class Agent:
         autopilot: Autopilot,
         commands: CommandPort,
         bus: Bus,
+        *,
         clock: Clock,
         sink: TickSink,
         stopwatch_ns: Callable[[], int],
@@ -99,12 +100,16 @@ class Agent:
         self._setup, self._autopilot, self._commands = setup, autopilot, commands
         self._bus, self._clock, self._sink, self._stopwatch_ns = bus, clock, sink, stopwatch_ns
         self._vehicle_setup = VehicleSetup(
-            autopilot, commands, setup.params.autopilot_params, setup.sysid, setup.params.state_machine.state_rate_hz
+            autopilot,
+            commands,
+            setup.params.autopilot_params,
+            setup.sysid,
+            state_rate_hz=setup.params.state_machine.state_rate_hz,
         )
         self._world_model = WorldModel(
-            setup.agent, setup.peers, setup.separation, bus, setup.params.rate_hz, self._note
+            setup.agent, setup.peers, setup.separation, bus, rate_hz=setup.params.rate_hz, note=self._note
         )
-        self._separation = make_separation_policy(setup, self._world_model, bus, self._note, stopwatch_ns)
+        self._separation = make_separation_policy(setup, self._world_model, bus, self._note, stopwatch_ns=stopwatch_ns)
         self._directive = SeparationDirective()  # of the newest tick
         self._controller, self._transit = make_controllers(setup, stopwatch_ns)
         self._observer = make_estimator(setup)
@@ -124,11 +129,11 @@ class Agent:
             setup.boot_id,
             setup.sysid,
             self._separation.uses_commitments,
-            autopilot,
-            self._world_model.paths,
-            bus,
-            clock,
-            sink,
+            autopilot=autopilot,
+            paths=self._world_model.paths,
+            bus=bus,
+            clock=clock,
+            sink=sink,
         )
         self.timing = TickTiming(
             sense_ms=0.0,
@@ -234,10 +239,10 @@ class Agent:
             ControlOutput(
                 mode=self._decision.mode, flown=flown, setpoint=setpoint, safety_filter_acted=self._safety_filter.acts
             ),
-            self._state_machine,
-            self._observer.estimate,
-            deadline_misses,
-            self.timing,
+            state_machine=self._state_machine,
+            estimate=self._observer.estimate,
+            deadline_misses=deadline_misses,
+            timing=self.timing,
         )
 
     def _watch_deadlines(self, now_us: int, deadline_misses: int) -> None:
@@ -308,7 +313,7 @@ class Agent:
             )
         steps, dt_us = self._controller.steps, self._controller.dt_us
         keep_outs = self._world_model.keep_outs(
-            state.pos_ned_m, self._utc(act_us), dt_us, steps, self._state_machine.phase
+            state.pos_ned_m, self._utc(act_us), dt_us, steps, phase=self._state_machine.phase
         )
         flies = Phase.GOTO_START <= self._state_machine.phase <= Phase.GOTO_LAND
         self._detect_deadlock(now_us, state, keep_outs, flies)
@@ -356,7 +361,9 @@ class Agent:
             return
         known = [*keep_outs, *self._directive.lost_peer_keep_outs]
         landmarks = self._world_model.landmarks
-        deadlock = self._reference_selector.update(now_us, self._clock.utc_us(), state.pos_ned_m, known, landmarks)
+        deadlock = self._reference_selector.update(
+            now_us, self._clock.utc_us(), state.pos_ned_m, known, landmarks=landmarks
+        )
         if deadlock is not None:
             self._alerts.put("deadlock", f"deadlocked by {deadlock.names}", now_us)
 
@@ -398,7 +405,7 @@ class Agent:
         disturbance = self._observer.estimate.disturbance_ned_m_s2
         lag = self._setup.vehicle_model.lag()
         return brake_and_hold_plan(
-            start, self._hold_at, disturbance, lag, self._controller.dt_us, self._controller.steps
+            start, self._hold_at, disturbance, lag, dt_us=self._controller.dt_us, steps=self._controller.steps
         )
 
     def _flown(self, state: VehicleState | None, planning: PlanningResult) -> Plan | None:
@@ -430,12 +437,12 @@ class Agent:
             self._utc(act_us),
             flown.virtual_control[step],
             start,
-            estimate,
-            flies,
-            self._directive.committed_peers,
+            estimate=estimate,
+            flies=flies,
+            committed_peers=self._directive.committed_peers,
         )
         yaw_rad, hover_01 = self._setup.mission.yaw_rad, estimate.hover_thrust_01
-        setpoint = setpoint_of(virtual_control, yaw_rad, hover_01, now_us, self._setup.vehicle_model)
+        setpoint = setpoint_of(virtual_control, yaw_rad, hover_01, now_us, params=self._setup.vehicle_model)
         refused = self._autopilot.send(setpoint, self._clock.now_us())
         if refused:
             self._alerts.put("setpoint", f"setpoint refused: {refused}", now_us)

@@ -45,7 +45,7 @@ def make_agent(
     swarm = config.swarm
     codec = Codec(sysid, OWN_COMPID)
     origin = GeoOrigin(swarm.origin_lat_deg, swarm.origin_lon_deg, swarm.origin_alt_m)
-    autopilot = Autopilot(transport, codec, sysid, origin, on_frame)
+    autopilot = Autopilot(transport, codec, sysid, origin, on_frame=on_frame)
     commands = CommandPort(autopilot.send_frame, codec, sysid, lambda: autopilot.dialect)
     autopilot.attach(commands)
     setup = AgentSetup(
@@ -60,4 +60,4 @@ def make_agent(
         vehicle_model=config.model_of(agent),
         max_obstacles=min(max(1, len(config.obstacles)), config.separation.max_obstacles),
     )
-    return Agent(setup, autopilot, commands, bus, clock, sink, stopwatch_ns)
+    return Agent(setup, autopilot, commands, bus, clock=clock, sink=sink, stopwatch_ns=stopwatch_ns)

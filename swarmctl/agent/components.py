@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import Protocol
 
 from swarmctl.agent.coordination import Coordination
 from swarmctl.agent.safety_filter import SafetyFilter
@@ -24,13 +26,13 @@ Stopwatch = Callable[[], int]  # returns a running time [ns]
 
 
 def _best_effort(
-    setup: AgentSetup, world_model: WorldModel, bus: Bus, note: Note, stopwatch_ns: Stopwatch
+    setup: AgentSetup, world_model: WorldModel, bus: Bus, note: Note, *, stopwatch_ns: Stopwatch
 ) -> SeparationPolicy:
     return BestEffort(world_model)
 
 
 def _guaranteed(
-    setup: AgentSetup, world_model: WorldModel, bus: Bus, note: Note, stopwatch_ns: Stopwatch
+    setup: AgentSetup, world_model: WorldModel, bus: Bus, note: Note, *, stopwatch_ns: Stopwatch
 ) -> SeparationPolicy:
     coordination = Coordination(
         agent=setup.agent,
@@ -53,11 +55,19 @@ def _following(setup: AgentSetup) -> ControllerParams:
     return setup.controller.model_copy(update={"mpc": following(setup.controller.mpc, setup.params.commit)})
 
 
+class MakesPolicy(Protocol):
+    """Makes the policy of a separation mode."""
+
+    def __call__(
+        self, setup: AgentSetup, world_model: WorldModel, bus: Bus, note: Note, *, stopwatch_ns: Stopwatch
+    ) -> SeparationPolicy: ...
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SeparationMode:
     """A row of the table of separation modes: the policy, and the controller that suits it."""
 
-    policy: Callable[[AgentSetup, WorldModel, Bus, Note, Stopwatch], SeparationPolicy]
+    policy: MakesPolicy
     controller: Callable[[AgentSetup], ControllerParams]
 
 
@@ -68,20 +78,27 @@ SEPARATION_MODES = {  # by `separation.mode`
 
 
 def make_separation_policy(
-    setup: AgentSetup, world_model: WorldModel, bus: Bus, note: Note, stopwatch_ns: Stopwatch
+    setup: AgentSetup, world_model: WorldModel, bus: Bus, note: Note, *, stopwatch_ns: Stopwatch
 ) -> SeparationPolicy:
     """Return the policy that keeps the agent apart from its peers."""
-    return SEPARATION_MODES[setup.separation.mode].policy(setup, world_model, bus, note, stopwatch_ns)
+    return SEPARATION_MODES[setup.separation.mode].policy(setup, world_model, bus, note, stopwatch_ns=stopwatch_ns)
 
 
 def make_controllers(setup: AgentSetup, stopwatch_ns: Stopwatch) -> tuple[Controller, Controller]:
     """Return the controller for the mission and the one for the transits to the start and to the landing place."""
     params = SEPARATION_MODES[setup.separation.mode].controller(setup)
-    rest = setup.vehicle_model, setup.separation, setup.agent, setup.max_keep_outs, stopwatch_ns
-    mission = make_controller(params, *rest)
+    make = partial(
+        make_controller,
+        vehicle=setup.vehicle_model,
+        separation=setup.separation,
+        agent=setup.agent,
+        max_keep_outs=setup.max_keep_outs,
+        stopwatch_ns=stopwatch_ns,
+    )
+    mission = make(params)
     if params.follows_reference:
         return mission, mission
-    return mission, make_controller(params.model_copy(update={"kind": "dmpc"}), *rest)
+    return mission, make(params.model_copy(update={"kind": "dmpc"}))
 
 
 def make_estimator(setup: AgentSetup) -> DisturbanceObserver | StateFilter:
@@ -96,7 +113,15 @@ def make_safety_filter(setup: AgentSetup, world_model: WorldModel, note: Note, s
     """Return the safety filter that keeps the vehicle clear of the bodies around it."""
     dt_s = 1.0 / setup.params.rate_hz
     downwash = setup.separation.downwash
-    return SafetyFilter(setup.params.barrier, setup.vehicle_model, dt_s, world_model, downwash, note, stopwatch_ns)
+    return SafetyFilter(
+        setup.params.barrier,
+        setup.vehicle_model,
+        dt_s,
+        world_model,
+        downwash=downwash,
+        note=note,
+        stopwatch_ns=stopwatch_ns,
+    )
 
 
 def make_state_machine(setup: AgentSetup) -> MissionStateMachine:
@@ -108,7 +133,7 @@ def make_state_machine(setup: AgentSetup) -> MissionStateMachine:
         setup.agent,
         len(setup.peers),
         budget.landing_m(setup.params.state_machine.apart_m),
-        setup.starts_ned_m[setup.agent],
-        setup.mission.duration_s,
-        reference,
+        start_ned_m=setup.starts_ned_m[setup.agent],
+        duration_s=setup.mission.duration_s,
+        reference=reference,
     )

@@ -60,7 +60,9 @@ class Coordination:
         rate_hz: float,
     ) -> None:
         self._agent, self._boot_id, self._bus, self._world_model = agent, boot_id, bus, world_model
-        self._commitments = Commitments(agent, params, mpc, separation, max_keep_outs, stopwatch_ns)
+        self._commitments = Commitments(
+            agent, params, mpc, separation, max_keep_outs=max_keep_outs, stopwatch_ns=stopwatch_ns
+        )
         refusals, attendance = world_model.refusals, world_model.attendance
         self._peer_trajectories, self._peers = PeerTrajectories(peers, rate_hz, refusals, attendance), frozenset(peers)
         self._note, self._seq, self._separation = note, 0, separation
@@ -191,6 +193,6 @@ class Coordination:
         What a stale peer does is unknown, so its hard minimum distance includes all of the margin that grows with age.
         """
         steps, dt_us = self._commitments.steps, self._commitments.dt_us
-        found = self._world_model.keep_outs(state.pos_ned_m, t0_utc_us, dt_us, steps, phase, taking_part)
+        found = self._world_model.keep_outs(state.pos_ned_m, t0_utc_us, dt_us, steps, phase=phase, without=taking_part)
         spent_m = self._separation.budget.planned_beyond_certified_m
         return [replace(k, hard_min_distance_m=max(k.hard_min_distance_m, k.radius_m - spent_m)) for k in found]

@@ -36,6 +36,7 @@ class ReferenceSelector:
         utc_us: int,
         pos_ned_m: Array,
         known: Sequence[KeepOut],
+        *,
         landmarks: Callable[[], Sequence[Obstacle]],
     ) -> Deadlock | None:
         """Check progress and plan a detour if there is none; returns the deadlock that the agent is in.
@@ -46,7 +47,7 @@ class ReferenceSelector:
             known: regions to keep out of.
             landmarks: returns the obstacles seen so far, which a detour leads around.
         """
-        self._recovery.step(now_us, pos_ned_m, self._mission(now_us, utc_us), known, landmarks)
+        self._recovery.step(now_us, pos_ned_m, self._mission(now_us, utc_us), known, obstacles=landmarks)
         return self._report(now_us)
 
     def reset(self, now_us: int) -> None:

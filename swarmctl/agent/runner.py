@@ -106,7 +106,7 @@ def run_agent(process: AgentProcess) -> int:
     )
     try:
         vehicle = url or f"inherited socket of sysid {config.sysids()[agent]}"
-        return _loop(flown, config, clock, stop, vehicle, process.only_land)
+        return _loop(flown, config, clock, stop, vehicle=vehicle, only_land=process.only_land)
     finally:
         recorder.event("bus_summary", clock.now_us(), clock.utc_us(), rejected=flown.rejected, lost=recorder.lost)
         link.close()
@@ -127,10 +127,10 @@ def _join(process: AgentProcess, config: Config, clock: WallClock) -> Bus:
         topics.COMMAND: [topics.OPERATOR],
         topics.OBSTACLES: [topics.OPERATOR],
     }
-    return ZenohBus(process.bus, process.run, me, listen, config.bus.lease_ms)
+    return ZenohBus(process.bus, process.run, me, listen, lease_ms=config.bus.lease_ms)
 
 
-def _loop(agent: Agent, config: Config, clock: WallClock, stop: StopRequest, vehicle: str, only_land: bool) -> int:
+def _loop(agent: Agent, config: Config, clock: WallClock, stop: StopRequest, *, vehicle: str, only_land: bool) -> int:
     gc.collect()
     gc.freeze()  # keep objects of the start-up out of collections during flight
     pace = Pace(round(1e6 / config.agent.rate_hz), clock.now_us())

@@ -33,6 +33,7 @@ class SafetyFilter:
         vehicle: VehicleModelParams,
         dt_s: float,
         world_model: WorldModel,
+        *,
         downwash: float,
         note: Callable[..., None],
         stopwatch_ns: Callable[[], int],
@@ -49,6 +50,7 @@ class SafetyFilter:
         act_utc_us: int,
         virtual_control: Array,
         start: Start,
+        *,
         estimate: Estimate,
         flies: bool,
         committed_peers: Mapping[int, Sequence[Trajectory]],
@@ -64,8 +66,12 @@ class SafetyFilter:
                 start,
                 estimate.disturbance_ned_m_s2,
                 estimate.hover_thrust_01,
-                self._world_model.bodies(
-                    start.pos_ned_m, act_utc_us, self._barrier.ahead_s, self._params.margin_m, committed_peers
+                bodies=self._world_model.bodies(
+                    start.pos_ned_m,
+                    act_utc_us,
+                    self._barrier.ahead_s,
+                    self._params.margin_m,
+                    committed_peers=committed_peers,
                 ),
             )
         self._count(now_us, changed is not None)

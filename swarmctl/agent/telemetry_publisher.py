@@ -70,6 +70,7 @@ class TelemetryPublisher:
         boot_id: int,
         sysid: int,
         uses_commitments: bool,
+        *,
         autopilot: Autopilot,
         paths: PeerPaths,
         bus: Bus,
@@ -91,6 +92,7 @@ class TelemetryPublisher:
         state: VehicleState | None,
         planning: PlanningResult,
         output: ControlOutput,
+        *,
         state_machine: MissionStateMachine,
         estimate: Estimate,
         deadline_misses: int,
@@ -98,7 +100,16 @@ class TelemetryPublisher:
     ) -> TickRecord:
         """Record and publish one tick; the setpoint has been sent before."""
         self.seq += 1
-        record = self._record(now_us, state, planning, output, state_machine, estimate, deadline_misses, timing)
+        record = self._record(
+            now_us,
+            state,
+            planning,
+            output,
+            state_machine=state_machine,
+            estimate=estimate,
+            deadline_misses=deadline_misses,
+            timing=timing,
+        )
         self._recent_ms.append(timing.tick_ms)
         self._sink.tick(record)
         self._bus.publish(topics.TICK, pack_tick(record))
@@ -113,6 +124,7 @@ class TelemetryPublisher:
         state: VehicleState | None,
         planning: PlanningResult,
         output: ControlOutput,
+        *,
         state_machine: MissionStateMachine,
         estimate: Estimate,
         deadline_misses: int,

@@ -50,14 +50,19 @@ class WorldModel:
         peers: list[int],
         params: SeparationParams,
         bus: Bus,
+        *,
         rate_hz: float,
         note: Callable[..., None],
     ) -> None:
         self._agent, self._params, self._bus, self._note = agent, params, bus, note
         self.refusals, self.attendance = Refusals(note), Attendance(bus)
-        shared = rate_hz, self.refusals, self.attendance
-        self.paths = PeerPaths(peers, *shared)
-        self._verifiers = {peer: SenderVerifier(agent_name(peer), topics.STATUS.name, *shared) for peer in peers}
+        self.paths = PeerPaths(peers, rate_hz, self.refusals, self.attendance)
+        self._verifiers = {
+            peer: SenderVerifier(
+                agent_name(peer), topics.STATUS.name, rate_hz, self.refusals, attendance=self.attendance
+            )
+            for peer in peers
+        }
         self._orders = Orders(agent, self.refusals)
         self._unheard_since_us: dict[int, int] = {}
         self._status: dict[int, topics.StatusMessage] = {}
@@ -131,6 +136,7 @@ class WorldModel:
         t0_utc_us: int,
         dt_us: int,
         steps: int,
+        *,
         phase: Phase,
         without: Set[int] = frozenset(),
     ) -> list[KeepOut]:
@@ -144,14 +150,14 @@ class WorldModel:
             without: peers to leave out, because their committed trajectories are known.
         """
         paths = [path for path in self.paths.latest() if path.agent not in without]
-        places = aligned(paths, t0_utc_us, dt_us, steps, self._params.brake_m_s2) if paths else ()
+        places = aligned(paths, t0_utc_us, dt_us, steps, brake_m_s2=self._params.brake_m_s2) if paths else ()
         found = [
             keep_out_of_peer(
                 path,
                 t0_utc_us,
                 dt_us,
                 steps,
-                self._params,
+                params=self._params,
                 parked=self._phase(path.agent) is Phase.DONE,
                 landing=phase is Phase.GOTO_LAND or self._phase(path.agent) is Phase.LAND,
                 points=points,
@@ -184,6 +190,7 @@ class WorldModel:
         act_utc_us: int,
         ahead_s: float,
         margin_m: float,
+        *,
         committed_peers: Mapping[int, Sequence[Trajectory]],
     ) -> list[Body]:
         """Return the bodies not to touch `ahead_s` after `act_utc_us`: peers, and obstacles visible from `pos_ned_m`.
@@ -210,7 +217,9 @@ class WorldModel:
             age_s = max(0.0, (act_utc_us - path.t0_utc_us) * 1e-6)
             age_margin_m = budget.age_margin_m(age_s, parked=self._phase(path.agent) is Phase.DONE)
             apart_m = budget.barrier_peer_m(margin_m, path.radius_m, age_margin_m)
-            found.append(body_of_peer(path, act_utc_us, ahead_s, apart_m, filters, self._params.brake_m_s2))
+            found.append(
+                body_of_peer(path, act_utc_us, ahead_s, apart_m, filters=filters, brake_m_s2=self._params.brake_m_s2)
+            )
         apart_m = budget.barrier_obstacle_m(margin_m)
         return found + [body_of_obstacle(o, ahead_s, apart_m) for o in visible(self._obstacles, pos_ned_m)]
 
@@ -230,7 +239,7 @@ class WorldModel:
     def others_ned_m(self, utc_us: int) -> tuple[Array, ...]:
         """Return the present position (3,) of each peer by its newest path."""
         paths = self.paths.latest()
-        return tuple(aligned(paths, utc_us, 1, 0, self._params.brake_m_s2)[:, 0]) if paths else ()
+        return tuple(aligned(paths, utc_us, 1, 0, brake_m_s2=self._params.brake_m_s2)[:, 0]) if paths else ()
 
     def has_unresponsive_peer(self, utc_us: int) -> bool:
         """Return whether some peer is silent and not known to have died: it may be flying on, or our bus is lost.

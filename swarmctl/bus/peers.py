@@ -68,12 +68,13 @@ class PeerPaths:
         rate_hz: float,
         refusals: Refusals,
         attendance: Attendance,
+        *,
         max_age_us: int = MAX_AGE_US,
         max_lead_us: int = MAX_LEAD_US,
     ) -> None:
         names = {agent: agent_name(agent) for agent in peers}
         self._verifiers = {
-            a: SenderVerifier(name, PATH.name, rate_hz, refusals, attendance) for a, name in names.items()
+            a: SenderVerifier(name, PATH.name, rate_hz, refusals, attendance=attendance) for a, name in names.items()
         }
         self._max_age_us = max_age_us
         self._max_lead_us = max_lead_us

@@ -116,7 +116,7 @@ class SenderVerifier:
         attendance: presence of senders on the bus.
     """
 
-    def __init__(self, sender: str, topic: str, rate_hz: float, refusals: Refusals, attendance: Attendance) -> None:
+    def __init__(self, sender: str, topic: str, rate_hz: float, refusals: Refusals, *, attendance: Attendance) -> None:
         self._sender, self._topic, self._rate_hz = sender, topic, rate_hz
         self._refusals, self._attendance = refusals, attendance
         self._accepted: _Stream | None = None

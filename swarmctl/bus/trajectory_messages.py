@@ -133,7 +133,8 @@ class PeerTrajectories:
     def __init__(self, peers: Iterable[int], rate_hz: float, refusals: Refusals, attendance: Attendance) -> None:
         names = {agent: agent_name(agent) for agent in peers}
         self._verifiers = {
-            a: SenderVerifier(name, TRAJECTORY.name, rate_hz, refusals, attendance) for a, name in names.items()
+            a: SenderVerifier(name, TRAJECTORY.name, rate_hz, refusals, attendance=attendance)
+            for a, name in names.items()
         }
         self._refusals = refusals
         self._memory: dict[str, Memory] = {}

@@ -65,6 +65,7 @@ class ZenohBus:
         run: str,
         me: str,
         subscriptions: Mapping[Topic, Sequence[str]],
+        *,
         lease_ms: int = 1500,
         connect_timeout_ms: int = CONNECT_TIMEOUT_MS,
     ) -> None:

@@ -46,7 +46,7 @@ def unreached(agent: int, url: str, wanted_sysid: int, why: str) -> VehicleFacts
 
 
 def facts_of(
-    scan: VehicleScan, agent: int, url: str, wanted_sysid: int, shared: GeoOrigin, now_us: int
+    scan: VehicleScan, agent: int, url: str, wanted_sysid: int, *, shared: GeoOrigin, now_us: int
 ) -> VehicleFacts:
     """Return everything that a scan has received until `now_us`.
 

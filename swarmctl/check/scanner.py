@@ -73,6 +73,7 @@ class VehicleScan:
         there: Address,
         wanted_sysid: int,
         names_of: Callable[[Dialect], Sequence[str]],
+        *,
         seconds: float,
         patience_s: float = 0.0,
     ) -> None:

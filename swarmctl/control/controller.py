@@ -48,6 +48,7 @@ def make_controller(
     vehicle: VehicleModelParams,
     separation: SeparationParams,
     agent: int,
+    *,
     max_keep_outs: int,
     stopwatch_ns: Callable[[], int],
 ) -> Controller:

@@ -16,7 +16,7 @@ _TILT_RATE_1_S = 2.5  # of (u_x, u_y): faster attitude changes would saturate ro
 
 
 def brake_and_hold_plan(
-    start: Start, at_ned_m: Array | None, disturbance_ned_m_s2: Array, lag: Lag | None, dt_us: int, steps: int
+    start: Start, at_ned_m: Array | None, disturbance_ned_m_s2: Array, lag: Lag | None, *, dt_us: int, steps: int
 ) -> Plan:
     """Brake, or return to `at_ned_m` (3,) if given, like a critically damped spring of bounded acceleration.
 

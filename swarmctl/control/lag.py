@@ -68,13 +68,15 @@ def lag_response(lag: Lag | None, dt_s: float, steps: int) -> LagResponse:
     """Return the response over `steps` steps of `dt_s`; without a lag the command is realised at once."""
     if lag is None:
         return LagResponse(np.eye(steps), np.zeros(steps), np.zeros(steps))
-    of_tilt, of_rate_s, held = (_means(lag, *start, dt_s, steps) for start in ((1, 0, 0), (0, 1, 0), (0, 0, 1)))
+    of_tilt, of_rate_s, held = (
+        _means(lag, *start, dt_s=dt_s, steps=steps) for start in ((1, 0, 0), (0, 1, 0), (0, 0, 1))
+    )
     pulse = np.diff(held, prepend=0.0)
     since = np.subtract.outer(np.arange(steps), np.arange(steps))
     return LagResponse(np.where(since >= 0, pulse[np.maximum(since, 0)], 0.0), of_tilt, of_rate_s)
 
 
-def _means(lag: Lag, tilt: float, rate_1_s: float, command: float, dt_s: float, steps: int) -> Array:
+def _means(lag: Lag, tilt: float, rate_1_s: float, command: float, *, dt_s: float, steps: int) -> Array:
     means = np.empty(steps)
     for k in range(steps):
         tilt, rate_1_s, integral = lag.advance(tilt, rate_1_s, command, dt_s)

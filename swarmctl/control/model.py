@@ -89,12 +89,20 @@ class Predictor:
                 if start_us >= until_us:
                     break
                 pos, vel, tilt, rate = self._advance(
-                    pos, vel, tilt, rate, current, disturbance_ned_m_s2, start_us - t_us
+                    pos,
+                    vel,
+                    tilt,
+                    rate,
+                    command=current,
+                    disturbance_ned_m_s2=disturbance_ned_m_s2,
+                    for_us=start_us - t_us,
                 )
                 t_us = start_us
             current = virtual_control
         left_us = max(0, until_us - t_us)
-        pos, vel, tilt, rate = self._advance(pos, vel, tilt, rate, current, disturbance_ned_m_s2, left_us)
+        pos, vel, tilt, rate = self._advance(
+            pos, vel, tilt, rate, command=current, disturbance_ned_m_s2=disturbance_ned_m_s2, for_us=left_us
+        )
         if self._lag is None:
             return Start(t_us=until_us, pos_ned_m=pos, vel_ned_m_s=vel, cos_tilt=float(down[2]), virtual_control=held)
         cos_tilt = math.sqrt(max(0.0, 1.0 - float(tilt @ tilt)))
@@ -114,6 +122,7 @@ class Predictor:
         vel: Array,
         tilt: Array,
         rate: Array,
+        *,
         command: Array | None,
         disturbance_ned_m_s2: Array,
         for_us: int,
@@ -126,7 +135,7 @@ class Predictor:
             ends = [self._lag.advance(float(tilt[i]), float(rate[i]), float(command[i]), dt_s) for i in (0, 1)]
             tilt, rate = np.array([end[0] for end in ends]), np.array([end[1] for end in ends])
             flown = np.array([ends[0][2] / dt_s, ends[1][2] / dt_s, command[2]])
-        pos, vel = _moved(pos, vel, acceleration(flown) + disturbance_ned_m_s2, self._drag_1_s, dt_s)
+        pos, vel = _moved(pos, vel, acceleration(flown) + disturbance_ned_m_s2, self._drag_1_s, dt_s=dt_s)
         return pos, vel, tilt, rate
 
 
@@ -143,7 +152,7 @@ def acceleration(virtual_control: Array) -> Array:
     return np.array([-thrust * ux, -thrust * uy, GRAVITY_M_S2 - thrust * down])
 
 
-def _moved(pos: Array, vel: Array, accel: Array, drag_1_s: float, dt_s: float) -> tuple[Array, Array]:
+def _moved(pos: Array, vel: Array, accel: Array, drag_1_s: float, *, dt_s: float) -> tuple[Array, Array]:
     if drag_1_s == 0.0:
         return pos + vel * dt_s + (0.5 * dt_s * dt_s) * accel, vel + dt_s * accel
     kept = math.exp(-drag_1_s * dt_s)

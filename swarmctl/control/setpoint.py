@@ -14,7 +14,7 @@ VALID_US = 100_000  # a setpoint is stale after this time
 
 
 def setpoint_of(
-    virtual_control: Array, yaw_rad: float, hover_thrust_01: float, now_us: int, params: VehicleModelParams
+    virtual_control: Array, yaw_rad: float, hover_thrust_01: float, now_us: int, *, params: VehicleModelParams
 ) -> AttitudeSetpoint:
     """Return the attitude and thrust of virtual controls (3,): u_x, u_y, thrust over mass [m/s2].
 

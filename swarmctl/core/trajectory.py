@@ -94,12 +94,14 @@ def resting(pos_ned_m: Array, t_utc_us: int, dt_us: int) -> Trajectory:
     )
 
 
-def stopping(pos_ned_m: Array, vel_ned_m_s: Array, t_utc_us: int, dt_us: int, brake_m_s2: float) -> Trajectory:
+def stopping(pos_ned_m: Array, vel_ned_m_s: Array, t_utc_us: int, dt_us: int, *, brake_m_s2: float) -> Trajectory:
     """Return the trajectory that brakes from a position and velocity, (3,) each, at constant deceleration."""
-    return ending_at_rest(t_utc_us, dt_us, pos_ned_m[None], vel_ned_m_s[None], brake_m_s2)
+    return ending_at_rest(t_utc_us, dt_us, pos_ned_m[None], vel_ned_m_s[None], brake_m_s2=brake_m_s2)
 
 
-def ending_at_rest(t0_utc_us: int, dt_us: int, pos_ned_m: Array, vel_ned_m_s: Array, brake_m_s2: float) -> Trajectory:
+def ending_at_rest(
+    t0_utc_us: int, dt_us: int, pos_ned_m: Array, vel_ned_m_s: Array, *, brake_m_s2: float
+) -> Trajectory:
     """Return a plan, positions and velocities (K+1, 3), continued by braking from its last velocity."""
     pos, vel = _brake(pos_ned_m[-1], vel_ned_m_s[-1], dt_us * 1e-6, brake_m_s2)
     return Trajectory(

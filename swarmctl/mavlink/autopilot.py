@@ -92,6 +92,7 @@ class Autopilot:
         codec: Codec,
         sysid: int,
         shared: GeoOrigin,
+        *,
         on_frame: Callable[[bytes], None],
     ) -> None:
         self._transport, self._codec, self._sysid = transport, codec, sysid
@@ -266,7 +267,7 @@ class Autopilot:
             vel = rotate_to_ned(q_nb, vel)
         rate = np.array([message.rollspeed, message.pitchspeed, message.yawspeed])
         pos = np.array([message.x, message.y, message.z])
-        if self._take(message.time_usec, arrived_us, pos, vel, q_nb, rate):
+        if self._take(message.time_usec, arrived_us, pos, vel, q_nb=q_nb, rate=rate):
             self._was_reset |= self._reset_counter not in (None, message.reset_counter)
             self._reset_counter = message.reset_counter
 
@@ -280,9 +281,9 @@ class Autopilot:
         if self._attitude is None or (arrived_us - self._odometry_us < 500_000 and self._odometry_us):
             return
         pos, vel = np.array([message.x, message.y, message.z]), np.array([message.vx, message.vy, message.vz])
-        self._take(message.time_boot_ms * 1000, arrived_us, pos, vel, self._attitude[1], self._attitude[2])
+        self._take(message.time_boot_ms * 1000, arrived_us, pos, vel, q_nb=self._attitude[1], rate=self._attitude[2])
 
-    def _take(self, vehicle_us: int, arrived_us: int, pos: Array, vel: Array, q_nb: Array, rate: Array) -> bool:
+    def _take(self, vehicle_us: int, arrived_us: int, pos: Array, vel: Array, *, q_nb: Array, rate: Array) -> bool:
         """Keep a sample if it is valid and the newest; return whether it was kept."""
         norm = float(np.sqrt(q_nb @ q_nb))
         if not (np.isfinite(pos).all() and np.isfinite(vel).all() and np.isfinite(rate).all() and 0.9 < norm < 1.1):
@@ -307,7 +308,7 @@ class Autopilot:
     def _state(self, sample: _Sample, now_us: int) -> VehicleState | None:
         if self._placed is None or self._placed[0] is not sample:
             told, self._was_reset = self._was_reset, False
-            placed = self.frame.place(sample.vehicle_us, sample.pos_ned_m, sample.vel_ned_m_s, self.armed, told)
+            placed = self.frame.place(sample.vehicle_us, sample.pos_ned_m, sample.vel_ned_m_s, self.armed, reset=told)
             self._placed = None if placed is None else (sample, placed)
         if self._placed is None:
             return None
@@ -344,7 +345,8 @@ class Autopilot:
     def _global_position(self, message: Any, arrived_us: int) -> None:
         if self._sample is not None:
             place = _geodetic(message.lat, message.lon, message.alt)
-            self.frame.seen(place, message.time_boot_ms * 1000, self._sample[0], *self._sample[2:4])
+            local_us, _, pos, vel = self._sample[:4]
+            self.frame.seen(place, message.time_boot_ms * 1000, local_us, pos, vel_ned_m_s=vel)
 
     def _ask_the_time(self, now_us: int) -> None:
         if self.dialect is not None and now_us - self._sync_us >= _SYNC_EVERY_US:

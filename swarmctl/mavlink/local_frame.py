@@ -94,7 +94,7 @@ class LocalFrame:
             self.jumps += self._unexplained  # the frame is unchanged, so the estimate has jumped
             self._unexplained = False
 
-    def seen(self, place: GeoOrigin, t_us: int, local_us: int, pos_ned_m: Array, vel_ned_m_s: Array) -> None:
+    def seen(self, place: GeoOrigin, t_us: int, local_us: int, pos_ned_m: Array, *, vel_ned_m_s: Array) -> None:
         """Take a geodetic position at `t_us` beside the newest local one at `local_us`: the fallback for the origin."""
         if self.offset_ned_m is not None or abs(t_us - local_us) > _NEAR_US:
             return
@@ -103,7 +103,9 @@ class LocalFrame:
         if t_us - self._guessing_us > _FALLBACK_US and len(self._guesses) == _FALLBACK_POINTS:
             self.offset_ned_m = np.median(np.stack(self._guesses), axis=0)
 
-    def place(self, t_us: int, pos_ned_m: Array, vel_ned_m_s: Array, armed: bool, reset: bool = False) -> Array | None:
+    def place(
+        self, t_us: int, pos_ned_m: Array, vel_ned_m_s: Array, armed: bool, *, reset: bool = False
+    ) -> Array | None:
         """Return the shared position (3,) of a local one, or None while it can't be known.
 
         Args:
@@ -121,14 +123,14 @@ class LocalFrame:
             self._settle()
         elif self._last is not None and 0.0 <= since_s < _FORGET_S:
             self._draw_in(t_us, since_s)
-            self._fit(t_us, pos_ned_m, self._last[1] + self._last[2] * since_s, since_s, reset)
+            self._fit(t_us, pos_ned_m, self._last[1] + self._last[2] * since_s, since_s, reset=reset)
         elif self._moved_to is not None:
             self._take_origin()
         placed: Array = pos_ned_m + self.offset_ned_m + self.bridge_ned_m
         self._last = (t_us, placed, vel_ned_m_s)
         return placed
 
-    def _fit(self, t_us: int, pos_ned_m: Array, expected_ned_m: Array, since_s: float, reset: bool) -> None:
+    def _fit(self, t_us: int, pos_ned_m: Array, expected_ned_m: Array, since_s: float, *, reset: bool) -> None:
         """Apply the origin that brings a local position to its expected place; without one, bridge the difference."""
         assert self.offset_ned_m is not None
         step_m = _RESET_M if reset else _JUMP_M

@@ -45,6 +45,7 @@ class VehicleSetup:
         commands: CommandPort,
         setup: Mapping[str, int | float],
         sysid: int,
+        *,
         state_rate_hz: float,
     ) -> None:
         self._autopilot, self._commands = autopilot, commands

@@ -306,7 +306,7 @@ def obstacle_add(
     from swarmctl.ops import operator
 
     keep_out_m = radius + 0.75 if keep_out is None else keep_out
-    obstacle = operator.obstacle(center, radius, keep_out_m, visibility, velocity, column)
+    obstacle = operator.obstacle(center, radius, keep_out_m, visibility, velocity=velocity, column=column)
     launch = operator.find_launch(run_dir)
     _show_obstacles(operator.change_obstacles(launch, lambda known: (*known, obstacle)))
     return EXIT_OK

@@ -68,7 +68,7 @@ def launch(config: Config, options: LaunchOptions) -> int:
             reserved.release()
             raise
         display = open_display()
-        services = Launcher(config, options, reserved, directory, display)
+        services = Launcher(config, options, reserved, directory, display=display)
         grace_s = _LAND_S  # after a failure from here on, agents still get time to land
         try:
             services.start()
@@ -98,7 +98,7 @@ class Launcher(Services):
     """Starts the processes of one launch, and ends them."""
 
     def __init__(
-        self, config: Config, options: LaunchOptions, reserved: ReservedPorts, directory: Path, display: Display
+        self, config: Config, options: LaunchOptions, reserved: ReservedPorts, directory: Path, *, display: Display
     ) -> None:
         self._socket_dir = Path(tempfile.mkdtemp(prefix="swarm-"))  # mode 0700
         self._config = config
@@ -153,7 +153,8 @@ class Launcher(Services):
         directory.mkdir(exist_ok=True)
         context = RunContext(self.context.run, endpoint, directory)
         ends = self._reserved.sockets, self._reserved.vehicle_sockets
-        command = agent_commands(self._config, context, *ends, self.context.directory / "config.toml")[agent]
+        config_path = self.context.directory / "config.toml"
+        command = agent_commands(self._config, context, *ends, config_path=config_path)[agent]
         return Child(replace(command, argv=(*command.argv, "--only-land")), directory)
 
     def announce(self, view: str) -> None:
@@ -177,7 +178,12 @@ class Launcher(Services):
         while True:
             try:
                 return ZenohBus(
-                    self.context.endpoint, self.context.run, OPERATOR, listen, self._config.bus.lease_ms, _BUS_TRY_MS
+                    self.context.endpoint,
+                    self.context.run,
+                    OPERATOR,
+                    listen,
+                    lease_ms=self._config.bus.lease_ms,
+                    connect_timeout_ms=_BUS_TRY_MS,
                 )
             except StartError as error:
                 if router.poll() is not None:

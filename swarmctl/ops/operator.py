@@ -191,7 +191,7 @@ _OPTIONS = {  # of `obstacle add`, by key
 
 
 def obstacle(
-    center: str, radius_m: float, keep_out_m: float, visibility_m: float, velocity: str, column: bool = False
+    center: str, radius_m: float, keep_out_m: float, visibility_m: float, *, velocity: str, column: bool = False
 ) -> Obstacle:
     """Return the obstacle that a command line describes; vectors are `north,east,down`, shared frame.
 

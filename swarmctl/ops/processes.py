@@ -68,6 +68,7 @@ def agent_commands(
     context: RunContext,
     sockets: Sequence[socket.socket],
     vehicles: Sequence[socket.socket] = (),
+    *,
     config_path: Path | None = None,
 ) -> tuple[Command, ...]:
     """Return one agent command per vehicle.

@@ -84,7 +84,7 @@ def _scan(config: Config, options: CheckOptions, opened: VehicleLinks) -> tuple[
         raise StartError(f"built-in simulator {opened.simulator.how_it_ended()}")
     before = opened.facts(config, scans)
     wanted = {facts.agent: changes(facts, config) if options.apply else {} for facts in before}
-    served = _serve(config, options, before, wanted, scans)
+    served = _serve(config, options, before, wanted, scans=scans)
     if any(wanted.values()):
         for agent in served:
             if (reader := scans[agent].parameters) is not None:
@@ -97,7 +97,7 @@ def _scan(config: Config, options: CheckOptions, opened: VehicleLinks) -> tuple[
         for facts in opened.facts(config, scans)
     ]
     return after, [
-        _changed(was, now, name, value, served.get(was.agent))
+        _changed(was, now, name, value, served=served.get(was.agent))
         for was, now in zip(before, after, strict=True)
         for name, value in wanted[was.agent].items()
     ]
@@ -108,6 +108,7 @@ def _serve(
     options: CheckOptions,
     vehicles: Sequence[VehicleFacts],
     wanted: Mapping[int, Mapping[str, Number]],
+    *,
     scans: Mapping[int, VehicleScan],
 ) -> dict[int, _Served]:
     """Let MAVSDK serve the vehicles that need it, all at once, unless they are armed or in the air."""
@@ -137,7 +138,7 @@ def _job(
     return _Served(disarmed=disarmed, arming_problems=problems, fence=fence)
 
 
-def _changed(was: VehicleFacts, now: VehicleFacts, name: str, wanted: Number, served: _Served | None) -> Change:
+def _changed(was: VehicleFacts, now: VehicleFacts, name: str, wanted: Number, *, served: _Served | None) -> Change:
     refused = unchangeable(was)
     if not refused and served is None:
         refused = "it was not found again"

@@ -63,7 +63,9 @@ class VehicleLinks:
         """Return a scan for each agent whose link is open, which listens for so long after the first heartbeat."""
         sysids, names = config.sysids(), partial(names_to_read, config=config)
         return {
-            agent: VehicleScan(link.listener, link.there, sysids[agent], names, seconds, self.patience_s)
+            agent: VehicleScan(
+                link.listener, link.there, sysids[agent], names, seconds=seconds, patience_s=self.patience_s
+            )
             for agent, link in enumerate(self.links)
             if link.listener is not None
         }
@@ -73,7 +75,7 @@ class VehicleLinks:
         swarm, sysids, now_us = config.swarm, config.sysids(), monotonic_us()
         shared = GeoOrigin(swarm.origin_lat_deg, swarm.origin_lon_deg, swarm.origin_alt_m)
         return [
-            facts_of(scans[agent], agent, link.url, sysids[agent], shared, now_us)
+            facts_of(scans[agent], agent, link.url, sysids[agent], shared=shared, now_us=now_us)
             if agent in scans
             else unreached(agent, link.url, sysids[agent], link.problem)
             for agent, link in enumerate(self.links)

@@ -120,7 +120,9 @@ def time_chart(
     low, high = _value_range([line.y for line in lines], [limit.value for limit in limits], from_zero, ceiling)
     x, y = _axes(svg.widened(*x_range), (low, high), height)
     inside = [_window(window, x, y) for window in windows] + [_limit(limit, x, y) for limit in limits]
-    inside += [_curve(line, x, y, *thin(line.x, line.y, points)) for line in lines]
+    for line in lines:
+        kept_x, kept_y = thin(line.x, line.y, points)
+        inside.append(_curve(line, x, y, kept_x, y_values=kept_y))
     tall = y.first - svg.TOP_PX
     place = {"x": 0, "y": svg.TOP_PX, "width": svg.WIDTH_PX, "height": tall}
     clipped = element("svg", *inside, **place, viewBox=f"0 {svg.TOP_PX} {svg.WIDTH_PX} {tall}")
@@ -148,7 +150,7 @@ def top_view(title: str, lines: Sequence[Line], balls: Sequence[Ball], points: i
         parts.append(element("circle", class_="obstacle", **center, r=float(ball.radius_m * scale)))
     for line in lines:
         kept = _spread(len(line.x), points)
-        parts.append(_curve(line, x, y, line.x[kept], line.y[kept]))
+        parts.append(_curve(line, x, y, line.x[kept], y_values=line.y[kept]))
         if line.label and len(line.x) and np.isfinite(line.y[-1]):
             parts.append(dot(float(x.px(line.x[-1])), float(y.px(line.y[-1])), 4, line.color))
     return svg.figure(title, height, parts, lines)
@@ -223,10 +225,10 @@ class _Oblique:
         for z in svg.round_numbers(top, floor, 5):
             parts += [self._wire((n1, e0, z), (n1, e1, z), (n0, e1, z)), self._tick((n1, e0, z), z, "end", 3.5)]
         parts.append(self._wire((n1, e0, top), (n1, e0, floor), (n0, e0, floor), (n0, e1, floor), style="axis"))
-        parts.append(self._text(((n0 + n1) / 2, e0, floor), "x north [m]", "end", -26, 26))
-        parts.append(self._text((n0, (e0 + e1) / 2, floor), "y east [m]", "start", 26, 26))
+        parts.append(self._text(((n0 + n1) / 2, e0, floor), "x north [m]", "end", -26, below=26))
+        parts.append(self._text((n0, (e0 + e1) / 2, floor), "y east [m]", "start", 26, below=26))
         scaled = "" if self._heights == 1.0 else f", scale x {self._heights:g}"
-        parts.append(self._text((n1, e0, top), f"z down [m]{scaled}", "end", 10, -8))
+        parts.append(self._text((n1, e0, top), f"z down [m]{scaled}", "end", 10, below=-8))
         return Markup("").join(parts)
 
     def _wire(self, *corners_ned_m: tuple[float, float, float], style: str = "grid") -> Markup:
@@ -234,9 +236,11 @@ class _Oblique:
         return svg.polyline(px, py, class_=style)
 
     def _tick(self, at_ned_m: tuple[float, float, float], value: float, anchor: str, below: float = 13) -> Markup:
-        return self._text(at_ned_m, f"{value:g}", anchor, -5 if anchor == "end" else 5, below)
+        return self._text(at_ned_m, f"{value:g}", anchor, -5 if anchor == "end" else 5, below=below)
 
-    def _text(self, at_ned_m: tuple[float, float, float], text: str, anchor: str, right: float, below: float) -> Markup:
+    def _text(
+        self, at_ned_m: tuple[float, float, float], text: str, anchor: str, right: float, *, below: float
+    ) -> Markup:
         px, py = map(float, self.px(np.array(at_ned_m)))
         return svg.tick(px + right, py + below, text, anchor)
 
@@ -286,7 +290,7 @@ def _spread(count: int, points: int) -> NDArray[np.intp]:
     return np.unique(np.linspace(0, max(0, count - 1), min(points, count)).astype(np.intp))
 
 
-def _curve(line: Line, x: Axis, y: Axis, x_values: Array, y_values: Array) -> Markup:
+def _curve(line: Line, x: Axis, y: Axis, x_values: Array, *, y_values: Array) -> Markup:
     px, py = x.px(x_values), np.clip(y.px(y_values), -1e4, 1e4)
     shown = np.isfinite(px) & np.isfinite(py) & line.marks
     dots = [dot(a, b, 3.5, line.color) for a, b in zip(px[shown], py[shown], strict=True)]

@@ -103,6 +103,7 @@ def simulated_recording(
     run: RunData,
     agents: int,
     separation_m: float,
+    *,
     limit_m: float,
     obstacles: Sequence[Obstacle] = (),
 ) -> Path:
@@ -125,7 +126,7 @@ def simulated_recording(
     rec.set_log_time_enabled(False)
     rec.set_sinks(rr.FileSink(path))
     flown = {agent: rows for agent, rows in run.ticks.items() if agent < agents and len(rows)}
-    scene = Scene(rec, agents, separation_m, limit_m, _bounds(flown))
+    scene = Scene(rec, agents, separation_m, limit_m, bounds=_bounds(flown))
     scene.begin()
     epoch_us = min((int(rows["utc_us"][0]) for rows in flown.values()), default=0)
     scene.obstacles(obstacles, 0, 0.0)

@@ -65,6 +65,7 @@ def judge(
     rules: Rules,
     outcome: str,
     problems: Sequence[str] = (),
+    *,
     speed_factor: float | None = None,
     steady_after_s: float = 10.0,
 ) -> dict[str, Any]:

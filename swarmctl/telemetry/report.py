@@ -48,7 +48,7 @@ _EVENTS_LISTED = 400
 
 
 def write_report(
-    directory: Path, run: RunData, summary: Mapping[str, Any], config_text: str, rules: Rules | None = None
+    directory: Path, run: RunData, summary: Mapping[str, Any], config_text: str, *, rules: Rules | None = None
 ) -> Path:
     """Write the page of a judged run into its folder; returns its path.
 

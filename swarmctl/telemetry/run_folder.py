@@ -109,12 +109,12 @@ def finish_run(directory: Path, rules: Rules, outcome: Outcome, recorded: RunDat
     """
     run = load_run(directory) if recorded is None else recorded
     run.events[:] = _merged(run.events, outcome.events)
-    summary = judge(run, rules, outcome.outcome, outcome.problems, outcome.speed_factor)
+    summary = judge(run, rules, outcome.outcome, outcome.problems, speed_factor=outcome.speed_factor)
     writers: dict[str, Callable[[], object]] = {
         EVENTS: partial(_write_events, directory, run.events),
         SUMMARY: partial(replace_text, directory / SUMMARY, to_json(summary, indent=2) + "\n"),
         **{path.name: partial(_pack_ticks, path) for path in sorted(directory.glob("agent-*.ticks"))},
-        REPORT: lambda: write_report(directory, run, summary, read_text(directory / CONFIG), rules),
+        REPORT: lambda: write_report(directory, run, summary, read_text(directory / CONFIG), rules=rules),
     }
     return Finished(summary, write_each(writers))
 
@@ -138,7 +138,7 @@ def report_run(directory: Path, rules: Rules) -> Path:
         problem = f"of {summary['agents']} agents, but {CONFIG} is of {rules.agents}. Remove it to have the run judged"
         raise ConfigError(str(directory / SUMMARY), [problem])
     try:
-        return write_report(directory, load_run(directory), summary, read_text(directory / CONFIG), rules)
+        return write_report(directory, load_run(directory), summary, read_text(directory / CONFIG), rules=rules)
     except OSError as error:
         raise StartError(f"{directory / REPORT}: can't be written: {error.strerror or error}") from error
 

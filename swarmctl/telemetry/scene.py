@@ -55,7 +55,7 @@ class Scene:
     """
 
     def __init__(
-        self, rec: Any, agents: int, separation_m: float, limit_m: float, bounds: SceneBounds = _BOUNDS
+        self, rec: Any, agents: int, separation_m: float, limit_m: float, *, bounds: SceneBounds = _BOUNDS
     ) -> None:
         self._rec = rec
         self._agents = agents

@@ -84,7 +84,7 @@ def _run(options: argparse.Namespace, obstacles: Sequence[Obstacle], stop: StopR
     limit_m = options.separation if options.limit is None else options.limit
     north_m, east_m, down_m = options.look_at
     scene = Scene(
-        rec, options.agents, options.separation, limit_m, SceneBounds((north_m, east_m, down_m), options.extent)
+        rec, options.agents, options.separation, limit_m, bounds=SceneBounds((north_m, east_m, down_m), options.extent)
     )
     scene.begin()
     feed = Feed(bus, options.agents)

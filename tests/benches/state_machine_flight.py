@@ -26,7 +26,9 @@ class Flight:
     def __init__(self, peers: int = 1, **params: Any) -> None:
         mission = MissionReference(MissionParams(kind="line"), START[None, :], 0)
         told = StateMachineParams(**params)
-        self.state_machine = MissionStateMachine(told, 0, peers, RADIUS_M + told.apart_m, START, DURATION_S, mission)
+        self.state_machine = MissionStateMachine(
+            told, 0, peers, RADIUS_M + told.apart_m, start_ned_m=START, duration_s=DURATION_S, reference=mission
+        )
         self.now_us = 0
         self.pos, self.vel = np.array([1.0, 0.0, 0.0]), np.zeros(3)
         self.armed, self.flight_mode, self.landed = False, FlightMode.HOLD, ON_GROUND

@@ -202,10 +202,11 @@ def test_the_safety_filter_places_peers_on_their_committed_trajectories(
         start: Start,
         disturbance_ned_m_s2: Array,
         hover_thrust_01: float,
+        *,
         bodies: Sequence[Body],
     ) -> Array | None:
         seen_m.extend(body.apart_m for body in bodies)
-        return filtered(self, virtual_control, start, disturbance_ned_m_s2, hover_thrust_01, bodies)
+        return filtered(self, virtual_control, start, disturbance_ned_m_s2, hover_thrust_01, bodies=bodies)
 
     monkeypatch.setattr(Barrier, "filtered", watched)
     while not flight.logs[0].rows or flight.logs[0].rows[-1]["phase"][0] != Phase.TRACK:

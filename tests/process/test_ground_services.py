@@ -32,7 +32,7 @@ def scans() -> Iterator[dict[int, VehicleScan]]:
     try:
         simulator.wait_until_up()
         made = {
-            agent: VehicleScan(listener, there, agent + 1, lambda _: READ, 1.0)
+            agent: VehicleScan(listener, there, agent + 1, lambda _: READ, seconds=1.0)
             for agent, (listener, there) in enumerate(opened)
         }
         run_scans(list(made.values()), 20.0, 30.0, lambda: False)

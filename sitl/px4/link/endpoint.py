@@ -62,6 +62,7 @@ class Endpoint:
         transport: Transport,
         autopilot: Autopilot,
         report: Callable[[], Report],
+        *,
         step_us: int,
         default_hz: dict[int, float] | None = None,
     ) -> None:
@@ -202,7 +203,7 @@ class Endpoint:
 
     def _on_attitude_target(self, m: Any) -> None:
         rates = m.body_roll_rate, m.body_pitch_rate, m.body_yaw_rate
-        self._autopilot.on_setpoint(m.type_mask, m.q, rates, m.thrust, self._now_us)
+        self._autopilot.on_setpoint(m.type_mask, m.q, rates, m.thrust, now_us=self._now_us)
 
     def _on_timesync(self, message: Any) -> None:
         if message.tc1 == 0:

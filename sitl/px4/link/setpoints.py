@@ -57,8 +57,8 @@ class OffboardStream:
         q_nb: Sequence[float],
         rates: Triple,
         thrust_01: float,
-        now_us: int,
         *,
+        now_us: int,
         flying: bool,
     ) -> bool:
         """Take a setpoint addressed to this vehicle; return whether it counts as a stream.
@@ -84,10 +84,12 @@ class OffboardStream:
                 return self._refuse(complaint)
         self._last_us, self.seen = now_us, True
         if flying:
-            self._fly(type_mask, q_nb, rates, thrust_01, has_attitude)
+            self._fly(type_mask, q_nb, rates, thrust_01, has_attitude=has_attitude)
         return True
 
-    def _fly(self, type_mask: int, q_nb: Sequence[float], rates: Triple, thrust_01: float, has_attitude: bool) -> None:
+    def _fly(
+        self, type_mask: int, q_nb: Sequence[float], rates: Triple, thrust_01: float, *, has_attitude: bool
+    ) -> None:
         stopped = not math.isfinite(thrust_01)
         thrust = 0.0 if stopped else max(0.0, min(1.0, thrust_01))
         yaw_rate = math.nan if type_mask & NO_YAW_RATE else rates[2]

@@ -72,6 +72,7 @@ def measure_ticks(
     solvers: Sequence[str],
     ticks: int,
     pillar: bool = False,
+    *,
     on_tick: Callable[[], None] = lambda: None,
 ) -> dict[str, Array]:
     """Return the parts of `ticks` ticks, (ticks, 9) [ms] in the order of `PARTS`, by solver.
@@ -127,7 +128,7 @@ def _swap_config(solver: str, agents: int) -> Config:
         protections="guaranteed",
     )
     extra = (f"controller.mpc.qp.solver='{solver}'", f"mission.duration_s={_ENDLESS_S}")
-    return config_of(cell, 1, layout_of(cell.scenario, 1, agents), agents, extra)
+    return config_of(cell, 1, layout_of(cell.scenario, 1, agents), agents, extra=extra)
 
 
 def _tracks(crowd: Lockstep) -> bool:
@@ -175,7 +176,7 @@ def _row(name: str, solver: str, neighbours: int, times: Times) -> BenchRow:
 
 
 def bench(
-    neighbours: Sequence[int], solvers: Sequence[str], ticks: int, slsqp: bool, console: Console
+    neighbours: Sequence[int], solvers: Sequence[str], ticks: int, slsqp: bool, *, console: Console
 ) -> list[BenchRow]:
     """Run all measurements; shows progress on a terminal."""
     rows: list[BenchRow] = []
@@ -261,7 +262,7 @@ def run(options: argparse.Namespace) -> int:
     solvers, left_out = chosen_solvers(options.solver or ())
     if left_out:
         console.print(left_out, markup=False)
-    rows = bench(options.neighbours, solvers, options.ticks, options.slsqp, console)
+    rows = bench(options.neighbours, solvers, options.ticks, options.slsqp, console=console)
     show(rows, console)
     if note:
         console.print(note)

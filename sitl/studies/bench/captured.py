@@ -128,7 +128,7 @@ class TappedMpc(SwarmMpc):
         separation: SeparationParams,
         max_keep_outs: int = _MAX_KEEP_OUTS,
     ) -> None:
-        super().__init__(params, vehicle, separation, 0, max_keep_outs, time.thread_time_ns)
+        super().__init__(params, vehicle, separation, 0, max_keep_outs=max_keep_outs, stopwatch_ns=time.thread_time_ns)
         self._genuine = self._xy.solve
         self._xy.solve = self._watched  # type: ignore[method-assign]
         self.solve_ms = 0.0
@@ -144,7 +144,7 @@ class TappedMpc(SwarmMpc):
         """Return the x-y problem of the last plan as the thesis poses it; same z, same thrust."""
         assert self._asked is not None
         xy = self._xy.prediction
-        return NonlinearXy(xy.axes, xy.horizon, self._asked, problem.keep_outs, plan.pos_ned_m[1:, 2])
+        return NonlinearXy(xy.axes, xy.horizon, self._asked, problem.keep_outs, z_ned_m=plan.pos_ned_m[1:, 2])
 
 
 @dataclass(frozen=True, slots=True)

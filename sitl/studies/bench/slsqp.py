@@ -58,6 +58,7 @@ class NonlinearXy:
         horizon: Horizon,
         asked: AxesProblem,
         keep_outs: Sequence[KeepOut],
+        *,
         z_ned_m: Array,
     ) -> None:
         hp, self._hc = horizon.prediction, horizon.control

@@ -84,8 +84,16 @@ def _trials(options: argparse.Namespace) -> list[Trial]:
     found: list[Cell] = []
     for name in options.scenario:
         agents = options.agents or SCENARIOS[name].agents
-        axes = (options.delay, options.loss, options.noise, options.wind, options.protections)
-        found += cells([name], agents, *axes, sets=" ".join(options.sets))
+        found += cells(
+            [name],
+            agents,
+            options.delay,
+            options.loss,
+            noises=options.noise,
+            winds_m_s=options.wind,
+            protections=options.protections,
+            sets=" ".join(options.sets),
+        )
     problems: dict[str, None] = {}
     for cell in found:
         problems.update(dict.fromkeys(_problems(cell, options.first_seed)))

@@ -79,6 +79,7 @@ class Appearance:
         at_s: float,
         ahead_m: float,
         clear_m: float,
+        *,
         radius_m: float,
         keep_out_m: float,
         speed_m_s: float,

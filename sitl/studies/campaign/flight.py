@@ -41,7 +41,7 @@ def fly(trial: Trial) -> Row:
     return flight.row(alone_s) | {"cpu_s": time.process_time() - began_s, "code": code_id()}
 
 
-def config_of(cell: Cell, seed: int, layout: Layout, agents: int, extra: Sequence[str] = ()) -> Config:
+def config_of(cell: Cell, seed: int, layout: Layout, agents: int, *, extra: Sequence[str] = ()) -> Config:
     """Return the configuration of a trial.
 
     Raises:
@@ -79,7 +79,7 @@ class TrialFlight:
         cell, agents = trial.cell, len(layout.starts_ned_m)
         self._trial, self._layout = trial, layout
         config = config_of(cell, trial.seed, layout, agents)
-        blind = {i: config_of(cell, trial.seed, layout, agents, UNCOOPERATIVE) for i in layout.uncooperative}
+        blind = {i: config_of(cell, trial.seed, layout, agents, extra=UNCOOPERATIVE) for i in layout.uncooperative}
         self.lockstep = Lockstep(config, own=blind)
         self._agents = list(self.lockstep.agents)  # including those that will have died
         expected = np.array([i not in layout.lost for i in range(agents)])

@@ -18,7 +18,7 @@ def ring(agents: int, radius_m: float, turn_rad: float) -> Array:
     return np.stack([radius_m * np.cos(angle), radius_m * np.sin(angle), np.zeros(agents)], axis=1)
 
 
-def scattered(rng: np.random.Generator, count: int, low_m: Array, high_m: Array, apart_m: float) -> Array:
+def scattered(rng: np.random.Generator, count: int, low_m: Array, high_m: Array, *, apart_m: float) -> Array:
     """Return uniform points (count, D) of a box, drawn again until no two are closer than `apart_m`.
 
     Raises:
@@ -36,11 +36,11 @@ def scattered(rng: np.random.Generator, count: int, low_m: Array, high_m: Array,
 
 
 def far_goals(
-    rng: np.random.Generator, starts: Array, low_m: Array, high_m: Array, apart_m: float, way_m: float
+    rng: np.random.Generator, starts: Array, low_m: Array, high_m: Array, *, apart_m: float, way_m: float
 ) -> Array:
     """Return goals (N, 3), `apart_m` from each other and each at least `way_m` from its own start."""
     for _ in range(_RESTARTS):
-        goals = scattered(rng, len(starts), low_m, high_m, apart_m)
+        goals = scattered(rng, len(starts), low_m, high_m, apart_m=apart_m)
         for _ in range(_TRIES):
             goals = rng.permutation(goals)
             if np.linalg.norm(goals - starts, axis=1).min() >= way_m:
@@ -61,7 +61,7 @@ def forest(rng: np.random.Generator, columns: int, radius_m: float, apart_m: flo
 
 
 def walls(
-    rng: np.random.Generator, rows_x_m: Array, half_width_m: float, wall_m: tuple[float, float], gap_m: float
+    rng: np.random.Generator, rows_x_m: Array, half_width_m: float, wall_m: tuple[float, float], *, gap_m: float
 ) -> Array:
     """Return columns (M, 3), `_POST_M` apart, that form rows of walls across x with gaps between them.
 

@@ -112,8 +112,8 @@ def _symmetric(rng: np.random.Generator, agents: int) -> Layout:
 
 def _random(rng: np.random.Generator, agents: int) -> Layout:
     low, high = np.array([-1.5, -1.5, -2.2]), np.array([1.5, 1.5, -0.2])
-    starts = scattered(rng, agents, low, high, 0.5)
-    goals = far_goals(rng, starts, low, high, 0.5, 1.0)
+    starts = scattered(rng, agents, low, high, apart_m=0.5)
+    goals = far_goals(rng, starts, low, high, apart_m=0.5, way_m=1.0)
     return Layout(
         size=SMALL,
         starts_ned_m=starts,
@@ -148,7 +148,7 @@ def _forest(rng: np.random.Generator, agents: int) -> Layout:
 
 
 def _maze(rng: np.random.Generator, agents: int) -> Layout:
-    posts = walls(rng, np.array([-3.0, -1.0, 1.0, 3.0]), 4.0, (0.6, 1.2), 1.2)
+    posts = walls(rng, np.array([-3.0, -1.0, 1.0, 3.0]), 4.0, (0.6, 1.2), gap_m=1.2)
     width = np.linspace(-3.0, 3.0, agents)
     starts = np.stack([np.full(agents, -4.5), rng.permutation(width), np.full(agents, -1.0)], axis=1)
     goals = np.stack([np.full(agents, 4.5), rng.permutation(width), np.full(agents, -1.0)], axis=1)

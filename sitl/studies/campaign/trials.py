@@ -74,6 +74,7 @@ def cells(
     agents: Sequence[int],
     delays_ms: Sequence[float],
     losses: Sequence[float],
+    *,
     noises: Sequence[str],
     winds_m_s: Sequence[float],
     protections: Sequence[str],

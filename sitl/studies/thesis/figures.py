@@ -181,7 +181,7 @@ def separation_chart(
     radii = {separation_m.get(trace.name, separation_m.get(flight)) for trace in traces}
     limits = [Limit(r, f"constraint radius {r:g} m") for r in sorted(r for r in radii if r is not None)]
     title = "Smallest distance between two agents [m]"
-    return _tall_chart(title, lines, traces, limits, points)
+    return _tall_chart(title, lines, traces, limits, points=points)
 
 
 def error_chart(flight: FlightName, traces: Sequence[Trace], separation_m: Mapping[str, float], points: int) -> Markup:
@@ -195,7 +195,7 @@ def error_chart(flight: FlightName, traces: Sequence[Trace], separation_m: Mappi
     if radius_m is not None and traces[0].pos_ned_m.shape[1] == 3:
         limits = [Limit(math.sqrt(3) * radius_m, "theoretical lower bound for three agents")]
     title = "Distances to the shared reference, sum [m]" if flight in SWARMS else "Distance to the reference [m]"
-    return _tall_chart(title, lines, traces, limits, points)
+    return _tall_chart(title, lines, traces, limits, points=points)
 
 
 def obstacle_chart(traces: Sequence[Trace], points: int) -> Markup:
@@ -210,7 +210,7 @@ def obstacle_chart(traces: Sequence[Trace], points: int) -> Markup:
         lines.append(agent_line(color, trace.t_s, np.fmin.reduce(away_m(trace), axis=1), f"nearest, {trace.name}"))
     limits = [Limit(obstacle.keep_out_m, f"constraint radius {obstacle.keep_out_m:g} m")]
     title = "Distance to the centre of the obstacle [m]"
-    return _tall_chart(title, lines, traces, limits, points)
+    return _tall_chart(title, lines, traces, limits, points=points)
 
 
 def above_chart(trace: Trace, points: int) -> Markup:
@@ -250,7 +250,7 @@ def index_chart(index: Sequence[IndexPoint]) -> Markup:
 
 
 def _tall_chart(
-    title: str, lines: Sequence[Line], traces: Sequence[Trace], limits: Sequence[Limit], points: int
+    title: str, lines: Sequence[Line], traces: Sequence[Trace], limits: Sequence[Limit], *, points: int
 ) -> Markup:
     return time_chart(title, lines, _seconds(traces), limits=limits, points=points, from_zero=True, height=300)
 

@@ -49,7 +49,12 @@ class Pilot:
         self._config, self._agent = config, agent
         max_keep_outs = min(config.swarm.agents - 1, config.separation.max_neighbours) + len(config.obstacles)
         self._controller = make_controller(
-            config.controller, config.vehicle_model, config.separation, agent, max_keep_outs, time.perf_counter_ns
+            config.controller,
+            config.vehicle_model,
+            config.separation,
+            agent,
+            max_keep_outs=max_keep_outs,
+            stopwatch_ns=time.perf_counter_ns,
         )
         self._dt_us, self._steps = self._controller.dt_us, self._controller.steps
         self._predictor = Predictor(config.vehicle_model)
@@ -115,7 +120,7 @@ class Pilot:
             self._config.mission.yaw_rad,
             estimate.hover_thrust_01,
             now_us,
-            self._config.vehicle_model,
+            params=self._config.vehicle_model,
         )
         self._thrust_01 = setpoint.thrust_01
         return setpoint
@@ -130,13 +135,13 @@ class Pilot:
 
     def _keep_outs(self, pos_ned_m: Array, act_us: int, peers: list[PredictedPath]) -> tuple[KeepOut, ...]:
         params, dt_us, steps = self._config.separation, self._dt_us, self._steps
-        found = [keep_out_of_peer(path, act_us, dt_us, steps, params) for path in peers]
+        found = [keep_out_of_peer(path, act_us, dt_us, steps, params=params) for path in peers]
         seen = visible(self._obstacles, pos_ned_m)
         return (*found, *(keep_out_of_obstacle(o, dt_us, steps, params) for o in seen))
 
     def _flown(self, plan: Plan, start: Start, keep_outs: tuple[KeepOut, ...]) -> Plan:
         disturbance = self._observer.estimate.disturbance_ned_m_s2
-        stop = partial(brake_and_hold_plan, start, None, disturbance, None, self._dt_us, self._steps)
+        stop = partial(brake_and_hold_plan, start, None, disturbance, None, dt_us=self._dt_us, steps=self._steps)
         self._plan_buffer.take(plan, start, keep_outs, stop)
         if plan.status is PlanStatus.OK:
             return plan

@@ -125,7 +125,7 @@ def show(rows: Sequence[Row], console: Console) -> None:
     console.print(table)
 
 
-def reproduce(only: Sequence[str], plant: bool, full: bool, directory: Path, processes: int) -> int:
+def reproduce(only: Sequence[str], plant: bool, full: bool, directory: Path, *, processes: int) -> int:
     """Fly, evaluate and write; return the exit code."""
     console, began_s = Console(), time.perf_counter()
     jobs = chosen(only, plant, full)
@@ -165,4 +165,4 @@ def run(options: argparse.Namespace) -> int:
     chosen(options.only, options.plant, options.full)
     directory = options.out or create_run_folder(None, "reproduce", time.time_ns() // 1000)
     _make(directory)
-    return reproduce(options.only, options.plant, options.full, directory, options.jobs)
+    return reproduce(options.only, options.plant, options.full, directory, processes=options.jobs)

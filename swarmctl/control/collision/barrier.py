@@ -24,6 +24,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from pydantic import Field
@@ -74,6 +75,7 @@ def body_of_peer(
     act_utc_us: int,
     ahead_s: float,
     apart_m: float,
+    *,
     filters: bool,
     brake_m_s2: float,
 ) -> Body:
@@ -147,6 +149,7 @@ class Barrier:
         start: Start,
         disturbance_ned_m_s2: Array,
         hover_thrust_01: float,
+        *,
         bodies: Sequence[Body],
     ) -> Array | None:
         """Return the virtual_control controls (3,) to fly in place of `virtual_control`; None when those are safe.
@@ -271,20 +274,27 @@ class _Responses:
 
 
 def _responses(lag: Lag | None, drag_1_s: float, for_s: float) -> _Responses:
-    def after(*start: float) -> tuple[float, float]:
-        return _moved(lag, drag_1_s, for_s, *start)
+    after = partial(_moved, lag, drag_1_s, for_s)
 
     return _Responses(
-        of_velocity=after(0.0, 0.0, 0.0, 1.0, 0.0),
-        of_accel=after(0.0, 0.0, 0.0, 0.0, 1.0),
-        of_tilt=after(1.0, 0.0, 0.0, 0.0, 0.0),
-        of_rate=after(0.0, 1.0, 0.0, 0.0, 0.0),
-        of_command=after(0.0, 0.0, 1.0, 0.0, 0.0),
+        of_velocity=after(vel=1.0),
+        of_accel=after(accel=1.0),
+        of_tilt=after(tilt=1.0),
+        of_rate=after(rate=1.0),
+        of_command=after(command=1.0),
     )
 
 
 def _moved(
-    lag: Lag | None, drag_1_s: float, for_s: float, tilt: float, rate: float, command: float, vel: float, accel: float
+    lag: Lag | None,
+    drag_1_s: float,
+    for_s: float,
+    *,
+    tilt: float = 0.0,
+    rate: float = 0.0,
+    command: float = 0.0,
+    vel: float = 0.0,
+    accel: float = 0.0,
 ) -> tuple[float, float]:
     pos = 0.0
     if lag is None:

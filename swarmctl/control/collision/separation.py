@@ -99,12 +99,12 @@ def radius_problem(params: SeparationParams, accuracy_m: float) -> str:
     )
 
 
-def align(path: PredictedPath, t0_utc_us: int, dt_us: int, steps: int, brake_m_s2: float) -> Array:
+def align(path: PredictedPath, t0_utc_us: int, dt_us: int, steps: int, *, brake_m_s2: float) -> Array:
     """Return positions (steps+1, 3) of one peer at `t0_utc_us + k dt_us`; see `aligned`."""
-    return np.asarray(aligned([path], t0_utc_us, dt_us, steps, brake_m_s2)[0])
+    return np.asarray(aligned([path], t0_utc_us, dt_us, steps, brake_m_s2=brake_m_s2)[0])
 
 
-def aligned(paths: Sequence[PredictedPath], t0_utc_us: int, dt_us: int, steps: int, brake_m_s2: float) -> Array:
+def aligned(paths: Sequence[PredictedPath], t0_utc_us: int, dt_us: int, steps: int, *, brake_m_s2: float) -> Array:
     """Return positions (N, steps+1, 3) NED [m] of N peers at `t0_utc_us + k dt_us`.
 
     Paths are interpolated, then continued by braking to a stop. Times before the first point are extrapolated
@@ -129,6 +129,7 @@ def keep_out_of_peer(
     t0_utc_us: int,
     dt_us: int,
     steps: int,
+    *,
     params: SeparationParams,
     parked: bool = False,
     landing: bool = False,
@@ -147,7 +148,7 @@ def keep_out_of_peer(
     age_s = max(0.0, (t0_utc_us - path.t0_utc_us) * 1e-6)
     budget = params.budget
     return KeepOut(
-        pos_ned_m=align(path, t0_utc_us, dt_us, steps, params.brake_m_s2) if points is None else points,
+        pos_ned_m=align(path, t0_utc_us, dt_us, steps, brake_m_s2=params.brake_m_s2) if points is None else points,
         radius_m=budget.planned_peer_m(path.radius_m, budget.age_margin_m(age_s, parked)),
         hard_min_distance_m=budget.certified_peer_m(path.radius_m),
         any_height=landing or (age_s > params.lost_after_s and not parked),
@@ -178,6 +179,7 @@ def half_spaces(
     guess_ned_m: Array,
     goal_m: Array,
     vel_m_s: Array,
+    *,
     dt_s: float,
     own_priority_id: int,
     params: SeparationParams,
@@ -221,7 +223,7 @@ def half_spaces(
     angle_rad = np.full(distance.shape, params.right_of_way_rad * stuck)
     is_obstacle = np.array([k.priority_id < 0 for k in keep_outs])
     angle_rad[is_obstacle] = params.right_of_way_obstacle_rad * np.where(across[is_obstacle] > 0.0, -1.0, 1.0)
-    normal = _with_right_of_way(normal, distance, needed, to_goal, angle_rad)
+    normal = _with_right_of_way(normal, distance, needed, to_goal, angle_rad=angle_rad)
     if axes == 3:
         normal[:, :, 2] *= vertical_01  # back from scaled to true heights
     offset = np.einsum("skc,skc->sk", normal, others) + needed
@@ -263,7 +265,7 @@ def _apart_m(keep_out: KeepOut, pos_ned_m: Array) -> float:
     return math.hypot(towards[0], towards[1], towards[2] * keep_out.vertical_01)
 
 
-def _with_right_of_way(normal: Array, distance: Array, needed: Array, to_goal: Array, angle_rad: Array) -> Array:
+def _with_right_of_way(normal: Array, distance: Array, needed: Array, to_goal: Array, *, angle_rad: Array) -> Array:
     """Return normals (slots, Hp, axes), turned where they point against the goal, so that head-on agents pass.
 
     Peers follow one right-of-way rule: each turns normals clockwise seen from above (as NED yaw), so that two that meet

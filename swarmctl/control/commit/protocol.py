@@ -87,11 +87,14 @@ class Commitments:
         params: CommitParams,
         mpc: MpcParams,
         separation: SeparationParams,
+        *,
         max_keep_outs: int,
         stopwatch_ns: Callable[[], int],
     ) -> None:
         self._agent, self._params = agent, params
-        self._planner = TrajectoryPlanner(agent, params, mpc, separation, max_keep_outs, stopwatch_ns)
+        self._planner = TrajectoryPlanner(
+            agent, params, mpc, separation, max_keep_outs=max_keep_outs, stopwatch_ns=stopwatch_ns
+        )
         self._latencies_s: deque[float] = deque(maxlen=_LATENCIES)
         self._lead_s = params.lead_min_s
         self._number, self._next_us = 0, 0

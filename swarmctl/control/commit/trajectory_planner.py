@@ -100,6 +100,7 @@ class TrajectoryPlanner:
         params: CommitParams,
         mpc: MpcParams,
         separation: SeparationParams,
+        *,
         max_keep_outs: int,
         stopwatch_ns: Callable[[], int],
     ) -> None:
@@ -108,7 +109,12 @@ class TrajectoryPlanner:
             update={"right_of_way_rad": params.right_of_way_rad, "stuck_m": params.stuck_m}
         )
         self._mpc = SwarmMpc(
-            _planning(mpc, params), VehicleModelParams(delay_s=0.0), right_of_way, agent, max_keep_outs, stopwatch_ns
+            _planning(mpc, params),
+            VehicleModelParams(delay_s=0.0),
+            right_of_way,
+            agent,
+            max_keep_outs=max_keep_outs,
+            stopwatch_ns=stopwatch_ns,
         )
         self.dt_us = round(params.dt_s * 1e6)
         self.steps = self._mpc.steps + math.ceil(
@@ -150,7 +156,7 @@ class TrajectoryPlanner:
 
     def stopping_from(self, pos_ned_m: Array, vel_ned_m_s: Array, utc_us: int) -> Trajectory:
         """Return the trajectory that brakes straight ahead from a position (3,) and velocity (3,)."""
-        return stopping(pos_ned_m, vel_ned_m_s, utc_us, self.dt_us, self._params.brake_m_s2)
+        return stopping(pos_ned_m, vel_ned_m_s, utc_us, self.dt_us, brake_m_s2=self._params.brake_m_s2)
 
     def stopping_candidate(self, committed: Trajectory, brake_us: int, utc_us: int) -> Trajectory:
         """Return the committed trajectory from `utc_us` on, left for straight braking at `brake_us`."""
@@ -160,7 +166,9 @@ class TrajectoryPlanner:
     def _evasive_candidates(self, committed: Trajectory, now: Situation) -> Iterator[Trajectory]:
         plan = self._planned(committed, now)
         if plan is not None:
-            yield ending_at_rest(now.begin_us, self.dt_us, plan.pos_ned_m, plan.vel_ned_m_s, self._params.brake_m_s2)
+            yield ending_at_rest(
+                now.begin_us, self.dt_us, plan.pos_ned_m, plan.vel_ned_m_s, brake_m_s2=self._params.brake_m_s2
+            )
         yield self.stopping_candidate(committed, now.begin_us, now.utc_us)
         heights_m = [k.radius_m for k in now.others if not k.any_height]
         if heights_m:
@@ -170,11 +178,12 @@ class TrajectoryPlanner:
         """Return the committed trajectory, left at `begin_us` for a climb by `height_m` over where it would stop."""
         pos, vel = (found[0] for found in committed.sample(np.array([begin_us])))
         above = brake_to_rest(pos, vel, self._params.brake_m_s2).to_ned_m - [0.0, 0.0, height_m]
-        trajectory = quintic_to(pos, vel, above, _CLIMB_M_S, _CLIMB_M_S2)
+        trajectory = quintic_to(pos, vel, above, _CLIMB_M_S, accel_m_s2=_CLIMB_M_S2)
         ahead_s = self._params.dt_s * np.arange(
             math.ceil(trajectory.travel_s / self._params.dt_s) + 1, dtype=np.float64
         )
-        return ending_at_rest(begin_us, self.dt_us, *trajectory.sample(ahead_s), self._params.brake_m_s2)
+        pos_m, vel_m_s = trajectory.sample(ahead_s)
+        return ending_at_rest(begin_us, self.dt_us, pos_m, vel_m_s, brake_m_s2=self._params.brake_m_s2)
 
     def _planned(self, committed: Trajectory, now: Situation) -> Plan | None:
         steps = self._mpc.steps
@@ -207,7 +216,11 @@ class TrajectoryPlanner:
         for share in _BRAKE_POINTS_01:
             end = max(1, round(share * self._mpc.steps)) + 1
             braked = ending_at_rest(
-                now.begin_us, self.dt_us, plan.pos_ned_m[:end], plan.vel_ned_m_s[:end], self._params.brake_m_s2
+                now.begin_us,
+                self.dt_us,
+                plan.pos_ned_m[:end],
+                plan.vel_ned_m_s[:end],
+                brake_m_s2=self._params.brake_m_s2,
             )
             whole = joined(committed, braked, now.utc_us)
             if self.is_clear(whole, now) and not self.conflicts(whole, now.utc_us, known, _INTERPOLATION_MARGIN_M):
@@ -226,7 +239,7 @@ class TrajectoryPlanner:
         end_us = max(trajectory.end_utc_us, *(other.end_utc_us for other in known))
         steps = max(1, -(-(end_us - utc_us) // self.dt_us))
         own = trajectory.sample(utc_us + np.arange(steps + 1) * self.dt_us)[0]
-        kept = self._keep_outs(known, [0] * len(known), utc_us, steps, spare_m)
+        kept = self._keep_outs(known, [0] * len(known), utc_us, steps, spare_m=spare_m)
         return certify(own, kept, 0, _APPROACH_TOLERANCE_M)
 
     def _keep_outs(
@@ -235,6 +248,7 @@ class TrajectoryPlanner:
         agents: Sequence[int],
         t0_utc_us: int,
         steps: int,
+        *,
         spare_m: float = 0.0,
     ) -> list[KeepOut]:
         if not trajectories:

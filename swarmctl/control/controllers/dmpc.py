@@ -7,7 +7,14 @@ from swarmctl.control.mpc.swarm_mpc import MpcParams, SwarmMpc
 
 
 def _make(params: MpcParams, setup: ControllerSetup) -> SwarmMpc:
-    return SwarmMpc(params, setup.vehicle, setup.separation, setup.agent, setup.max_keep_outs, setup.stopwatch_ns)
+    return SwarmMpc(
+        params,
+        setup.vehicle,
+        setup.separation,
+        setup.agent,
+        max_keep_outs=setup.max_keep_outs,
+        stopwatch_ns=setup.stopwatch_ns,
+    )
 
 
 DMPC = ControllerKind(name="dmpc", section="mpc", params=MpcParams, make=_make)

@@ -8,7 +8,14 @@ from swarmctl.control.mpc.swarm_mpc import MpcParams
 
 
 def _make(params: MpcParams, setup: ControllerSetup) -> JointMpc:
-    return JointMpc(params, setup.vehicle, setup.separation, setup.agent, setup.max_keep_outs, setup.stopwatch_ns)
+    return JointMpc(
+        params,
+        setup.vehicle,
+        setup.separation,
+        setup.agent,
+        max_keep_outs=setup.max_keep_outs,
+        stopwatch_ns=setup.stopwatch_ns,
+    )
 
 
 DMPC3 = ControllerKind(name="dmpc3", section="mpc", params=MpcParams, make=_make)

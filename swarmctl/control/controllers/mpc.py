@@ -14,7 +14,9 @@ class SingleMpc(SwarmMpc):
     """Plans as if there were no keep-outs."""
 
     def __init__(self, params: MpcParams, setup: ControllerSetup) -> None:
-        super().__init__(params, setup.vehicle, setup.separation, setup.agent, 0, setup.stopwatch_ns)
+        super().__init__(
+            params, setup.vehicle, setup.separation, setup.agent, max_keep_outs=0, stopwatch_ns=setup.stopwatch_ns
+        )
 
     def plan(self, problem: Problem) -> Plan:
         return super().plan(replace(problem, keep_outs=()))

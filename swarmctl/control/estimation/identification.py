@@ -143,7 +143,7 @@ def _fit_attitude(flight: FlightSegment) -> tuple[Figure, Figure, Figure] | str:
 
     def residuals(parameters: Array) -> Array:
         delay_s, natural_rad_s, damping = (float(p) for p in parameters[:3])
-        followed = _followed(flight, delay_s, natural_rad_s, damping, at_s)
+        followed = _followed(flight, delay_s, natural_rad_s, damping, at_s=at_s)
         return np.asarray(followed + parameters[3:] - measured)  # (S, 2)
 
     least, most = np.array([*_LOWER_BOUNDS, -1.0, -1.0]), np.array([*_UPPER_BOUNDS, 1.0, 1.0])
@@ -158,7 +158,7 @@ def _fit_attitude(flight: FlightSegment) -> tuple[Figure, Figure, Figure] | str:
     return delay, natural, damping
 
 
-def _followed(flight: FlightSegment, delay_s: float, natural_rad_s: float, damping: float, at_s: Array) -> Array:
+def _followed(flight: FlightSegment, delay_s: float, natural_rad_s: float, damping: float, *, at_s: Array) -> Array:
     """Return the tilt (S, 2) at times `at_s` (S,) of a vehicle with these parameters."""
     from scipy.signal import lfilter  # slow to import, and not needed to fly
 

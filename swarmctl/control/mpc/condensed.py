@@ -42,6 +42,7 @@ class CondensedMpc:
         horizon: Horizon,
         max_keep_outs: int,
         relax_01: float,
+        *,
         penalties: Penalties,
         qp: QpParams,
         stopwatch_ns: Callable[[], int],
@@ -49,7 +50,9 @@ class CondensedMpc:
         self.prediction = Prediction(axes, horizon)
         self._cost = TrackingCost(self.prediction)
         self._ends = TerminalConditions(self.prediction, penalties, self._cost.scale)
-        self.half_spaces = KeepOutHalfSpaces(self.prediction, max_keep_outs, relax_01, penalties, self._cost.scale)
+        self.half_spaces = KeepOutHalfSpaces(
+            self.prediction, max_keep_outs, relax_01, penalties, cost_scale=self._cost.scale
+        )
         blocks = (
             IncrementBounds(self.prediction),
             InputBounds(self.prediction),

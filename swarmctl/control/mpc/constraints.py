@@ -141,7 +141,7 @@ class KeepOutHalfSpaces(ConstraintBlock):
     """
 
     def __init__(
-        self, prediction: Prediction, max_keep_outs: int, relax_01: float, penalties: Penalties, cost_scale: float
+        self, prediction: Prediction, max_keep_outs: int, relax_01: float, penalties: Penalties, *, cost_scale: float
     ) -> None:
         self._prediction, self._relax_01, self._max_keep_outs = prediction, relax_01, max_keep_outs
         self._over, self._slope_floor = penalties.over, penalties.floor * _SLACK_SCALE_M * cost_scale

@@ -38,6 +38,7 @@ class JointMpc:
         vehicle: VehicleModelParams,
         separation: SeparationParams,
         own_priority_id: int,
+        *,
         max_keep_outs: int,
         stopwatch_ns: Callable[[], int],
     ) -> None:
@@ -56,16 +57,24 @@ class JointMpc:
             params.horizon(params.control_xy, params.horizon_xy, vehicle),
             max_keep_outs,
             separation.relax_01,
-            Penalties(),
-            params.qp.model_copy(update={"eps": eps, "eps_relative": eps_relative}),
-            stopwatch_ns,
+            penalties=Penalties(),
+            qp=params.qp.model_copy(update={"eps": eps, "eps_relative": eps_relative}),
+            stopwatch_ns=stopwatch_ns,
         )
 
     def plan(self, problem: Problem) -> Plan:
         """Solve one step of distributed MPC. Infeasibility is a status, never an exception."""
         began_ns = self._stopwatch_ns()
         guess = first_guess(problem, self._params.dt_s, self.steps)
-        near = partial(near_half_spaces, problem, guess, 3, self._max_keep_outs, self._params.dt_s, self._priority_id)
+        near = partial(
+            near_half_spaces,
+            problem,
+            guess,
+            3,
+            self._max_keep_outs,
+            dt_s=self._params.dt_s,
+            own_priority_id=self._priority_id,
+        )
         return planned(near, partial(self._plan, problem, began_ns), self._separation, self._stopwatch_ns)
 
     def reset(self) -> None:
@@ -85,7 +94,18 @@ class JointMpc:
         along = np.column_stack([acting[:, :2], np.full(steps, start.cos_tilt)])  # (steps, 3)
         pos, vel = ahead.motion(start.pos_ned_m, start.vel_ned_m_s, self._drift(problem) - thrust * along)
         first_row, stopwatch_ns = ahead.first_row(), self._stopwatch_ns
-        return judged(problem, pos, vel, found.u, (found,), first_row, self.dt_us, began_ns, spaces_us, stopwatch_ns)
+        return judged(
+            problem,
+            pos,
+            vel,
+            found.u,
+            solutions=(found,),
+            from_step=first_row,
+            dt_us=self.dt_us,
+            began_ns=began_ns,
+            spaces_us=spaces_us,
+            stopwatch_ns=stopwatch_ns,
+        )
 
     def _solve(self, problem: Problem, thrust_m_s2: Array, spaces: HalfSpaces | None) -> AxesSolution:
         steps, start, reference = self.steps, problem.start, problem.reference

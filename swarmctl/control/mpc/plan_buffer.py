@@ -48,4 +48,4 @@ class PlanBuffer:
             radius_m=0.0,
             pos_ned_m=plan.pos_ned_m,
         )
-        return align(path, t0_us, self._dt_us, self._steps, self._brake_m_s2)
+        return align(path, t0_us, self._dt_us, self._steps, brake_m_s2=self._brake_m_s2)

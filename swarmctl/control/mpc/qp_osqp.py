@@ -43,16 +43,18 @@ class OsqpSolver:
         if not is_finite(p_values, q, a_values, lower, upper):
             return NOT_FINITE
         if self._solver is None:
-            return self._cold(p_values, q, a_values, lower, upper, 0)
+            return self._cold(p_values, q, a_values, lower, upper=upper, scaling=0)
         self._solver.update(Px=p_values, q=q, Ax=a_values, l=lower, u=upper)
         solution = self._run()
         if solution.exact:
             return solution
         # a warm start can end in false infeasibility or slow convergence: retry from scratch
-        again = self._cold(p_values, q, a_values, lower, upper, _RETRY_SCALINGS)
+        again = self._cold(p_values, q, a_values, lower, upper=upper, scaling=_RETRY_SCALINGS)
         return again if again.exact or solution.x is None else solution
 
-    def _cold(self, p_values: Array, q: Array, a_values: Array, lower: Array, upper: Array, scaling: int) -> QpSolution:
+    def _cold(
+        self, p_values: Array, q: Array, a_values: Array, lower: Array, *, upper: Array, scaling: int
+    ) -> QpSolution:
         p, a, params = self._p.copy(), self._a.copy(), self._params
         p.data, a.data = p_values.copy(), a_values.copy()
         self._solver = osqp.OSQP()

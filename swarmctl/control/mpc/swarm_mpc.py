@@ -114,6 +114,7 @@ class SwarmMpc:
         vehicle: VehicleModelParams,
         separation: SeparationParams,
         own_priority_id: int,
+        *,
         max_keep_outs: int,
         stopwatch_ns: Callable[[], int],
     ) -> None:
@@ -132,9 +133,9 @@ class SwarmMpc:
             params.horizon(params.control_z, params.horizon_z, vehicle),
             0,
             1.0,
-            Penalties(),
-            params.qp,
-            stopwatch_ns,
+            penalties=Penalties(),
+            qp=params.qp,
+            stopwatch_ns=stopwatch_ns,
         )
         self._xy, self._xy_alone = (  # without keep-outs the problem is small and solved exactly
             CondensedMpc(
@@ -142,9 +143,9 @@ class SwarmMpc:
                 params.horizon(params.control_xy, params.horizon_xy, vehicle),
                 room,
                 separation.relax_01,
-                Penalties(),
-                params.qp,
-                stopwatch_ns,
+                penalties=Penalties(),
+                qp=params.qp,
+                stopwatch_ns=stopwatch_ns,
             )
             for room in (max_keep_outs, 0)
         )
@@ -156,7 +157,15 @@ class SwarmMpc:
         guess = first_guess(problem, self._params.dt_s, self.steps)
         count = min(self.steps, len(up.pos_m))
         guess[1 : count + 1, 2] = up.pos_m[:count, 0]
-        near = partial(near_half_spaces, problem, guess, 2, self._max_keep_outs, self._params.dt_s, self._priority_id)
+        near = partial(
+            near_half_spaces,
+            problem,
+            guess,
+            2,
+            self._max_keep_outs,
+            dt_s=self._params.dt_s,
+            own_priority_id=self._priority_id,
+        )
         return planned(near, partial(self._plan, problem, up, began_ns), self._separation, self._stopwatch_ns)
 
     def reset(self) -> None:
@@ -164,7 +173,7 @@ class SwarmMpc:
         return
 
     def _plan(
-        self, problem: Problem, up: AxesSolution, began_ns: int, spaces: HalfSpaces | None, spaces_us: float
+        self, problem: Problem, up: AxesSolution, began_ns: int, spaces: HalfSpaces | None, *, spaces_us: float
     ) -> Plan:
         start, steps, count = problem.start, self.steps, min(self.steps, len(up.pos_m))
         asked = AxesProblem(
@@ -190,7 +199,16 @@ class SwarmMpc:
         pos[count:, 2], virtual_control[count:, 2] = up.pos_m[-1, 0], up.u[-1, 0]
         first, stopwatch_ns = self._xy.prediction.first_row(), self._stopwatch_ns
         return judged(
-            problem, pos, vel, virtual_control, (up, across), first, self.dt_us, began_ns, spaces_us, stopwatch_ns
+            problem,
+            pos,
+            vel,
+            virtual_control,
+            solutions=(up, across),
+            from_step=first,
+            dt_us=self.dt_us,
+            began_ns=began_ns,
+            spaces_us=spaces_us,
+            stopwatch_ns=stopwatch_ns,
         )
 
     def _solve_z(self, problem: Problem) -> AxesSolution:
@@ -236,6 +254,7 @@ def near_half_spaces(
     guess_ned_m: Array,
     axes: int,
     max_keep_outs: int,
+    *,
     dt_s: float,
     own_priority_id: int,
     params: SeparationParams,
@@ -243,7 +262,7 @@ def near_half_spaces(
     """Return half-spaces of the closest keep-outs around the guess (steps+1, 3), in the first `axes` axes."""
     steps, near = len(guess_ned_m) - 1, closest_keep_outs(problem.keep_outs, guess_ned_m, max_keep_outs)
     goal, vel = problem.reference.pos_ned_m[steps, :axes], problem.start.vel_ned_m_s[:axes]
-    return half_spaces(near, guess_ned_m, goal, vel, dt_s, own_priority_id, params)
+    return half_spaces(near, guess_ned_m, goal, vel, dt_s=dt_s, own_priority_id=own_priority_id, params=params)
 
 
 def planned(
@@ -280,6 +299,7 @@ def judged(
     pos_ned_m: Array,
     vel_ned_m_s: Array,
     virtual_control: Array,
+    *,
     solutions: Sequence[AxesSolution],
     from_step: int,
     dt_us: int,

@@ -55,7 +55,7 @@ def transition(dt_s: float) -> tuple[Array, Array]:
 
 
 def terminal_region(
-    q_pos: float, q_vel: float, r: float, accel_max_m_s2: float, daccel_max_m_s2: float, dt_s: float
+    q_pos: float, q_vel: float, r: float, accel_max_m_s2: float, *, daccel_max_m_s2: float, dt_s: float
 ) -> TerminalRegion:
     """Return the terminal region of one axis.
 

@@ -24,7 +24,12 @@ class TrackingCost:
         gain = axis.gain_m_s2
         room = min(axis.u_max - axis.u_rest, axis.u_rest - axis.u_min)
         return terminal_region(
-            axis.q_pos, axis.q_vel, axis.r / gain**2, gain * room, gain * axis.du_max, self._prediction.horizon.dt_s
+            axis.q_pos,
+            axis.q_vel,
+            axis.r / gain**2,
+            gain * room,
+            daccel_max_m_s2=gain * axis.du_max,
+            dt_s=self._prediction.horizon.dt_s,
         )
 
     def _largest(self) -> float:

@@ -84,6 +84,7 @@ class MissionStateMachine:
         agent: int,
         peers: int,
         landing_m: float,
+        *,
         start_ned_m: Array,
         duration_s: float,
         reference: MissionReference,
@@ -264,7 +265,7 @@ class MissionStateMachine:
             return
         pos, vel = self._reference.sample(np.array([(utc_us - self.begin_utc_us) * 1e-6]))
         p, offset, drift = self._params, state.pos_ned_m - pos[0], state.vel_ned_m_s - vel[0]
-        self._rejoin_offset = (quintic_to(offset, drift, np.zeros(3), p.speed_m_s, p.accel_m_s2), now_us)
+        self._rejoin_offset = (quintic_to(offset, drift, np.zeros(3), p.speed_m_s, accel_m_s2=p.accel_m_s2), now_us)
 
     def _stop_trajectory(self, state: VehicleState) -> QuinticTrajectory:
         return brake_to_rest(state.pos_ned_m, state.vel_ned_m_s, self._params.accel_m_s2)
@@ -469,7 +470,7 @@ class MissionStateMachine:
 
     def _trajectory_to(self, target_ned_m: Array, state: VehicleState) -> QuinticTrajectory:
         p = self._params
-        return quintic_to(state.pos_ned_m, state.vel_ned_m_s, target_ned_m, p.speed_m_s, p.accel_m_s2)
+        return quintic_to(state.pos_ned_m, state.vel_ned_m_s, target_ned_m, p.speed_m_s, accel_m_s2=p.accel_m_s2)
 
     def _go_home(self, now_us: int, state: VehicleState) -> None:
         self._trajectory, self._destination_ned_m = (self._trajectory_home(state), now_us), self._start_ned_m

@@ -133,6 +133,7 @@ class DeadlockRecovery:
         pos_ned_m: Array,
         reference: Sampled,
         keep_outs: Sequence[KeepOut],
+        *,
         obstacles: Callable[[], Sequence[Obstacle]],
     ) -> None:
         """Check progress, and plan a path while the agent is in recovery.

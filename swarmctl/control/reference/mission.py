@@ -279,7 +279,7 @@ def _goal_flights(params: GotoParams, starts_ned_m: Array, apart_m: float) -> li
     if params.goal_assignment:
         goals, groups = assigned_goals_ned_m(starts_ned_m, goals, apart_m)
     flights = [
-        quintic_to(start, np.zeros(3), goal, params.speed_m_s, params.accel_m_s2)
+        quintic_to(start, np.zeros(3), goal, params.speed_m_s, accel_m_s2=params.accel_m_s2)
         for start, goal in zip(starts_ned_m, goals, strict=True)
     ]
     for group in groups:
@@ -312,7 +312,7 @@ class QuinticTrajectory:
         return pos, vel
 
 
-def quintic_to(pos: Array, vel: Array, target: Array, speed_m_s: float, accel_m_s2: float) -> QuinticTrajectory:
+def quintic_to(pos: Array, vel: Array, target: Array, speed_m_s: float, *, accel_m_s2: float) -> QuinticTrajectory:
     """Return the fastest `QuinticTrajectory` whose peak speed and acceleration stay near the given ones.
 
     A quintic from rest peaks at 1.875 of its mean speed and at 5.77 distance / T^2.

@@ -61,7 +61,7 @@ class Polyline:
         return all(clear(a, b, discs) for a, b in itertools.pairwise(self.corners))
 
 
-def shortest_path(start: Array, goal: Array, discs: Array, cell_m: float, squeeze: float = 3.0) -> Polyline:
+def shortest_path(start: Array, goal: Array, discs: Array, cell_m: float, *, squeeze: float = 3.0) -> Polyline:
     """Return a short path from `start` (2,) to `goal` (2,) outside `discs`.
 
     Args:

@@ -37,7 +37,7 @@ class Bench:
         self.peer: LocalBus = hub.attach(PEER)
         self.alive = {agent_name(0), PEER}
         separation = SeparationParams()
-        self.world_model = WorldModel(0, [1], separation, self.bus, RATE_HZ, lambda *_, **__: None)
+        self.world_model = WorldModel(0, [1], separation, self.bus, rate_hz=RATE_HZ, note=lambda *_, **__: None)
         self.coordination = Coordination(
             agent=0,
             boot_id=1,
@@ -178,7 +178,9 @@ def test_a_deviating_peer_is_where_its_path_says(bench: Bench) -> None:
     aside = PLACE + np.array([0.0, 0.5, 0.0])
     bench.fly(0.5, each=lambda: bench.send(aside))
     assert bench.coordination.committed_peers == {}
-    (body,) = bench.world_model.bodies(HERE, bench.clock.utc_us(), 0.0, 0.0, bench.coordination.committed_peers)
+    (body,) = bench.world_model.bodies(
+        HERE, bench.clock.utc_us(), 0.0, 0.0, committed_peers=bench.coordination.committed_peers
+    )
     assert body.pos_ned_m == pytest.approx(tuple(aside))
 
 
@@ -186,9 +188,9 @@ def test_the_margin_of_a_committed_peer_does_not_grow_with_age(bench: Bench) -> 
     bench.fly(0.5, each=bench.send)
     bench.fly(1.0)
     utc_us, apart_m = bench.clock.utc_us(), SeparationParams().body_m
-    bodies = bench.world_model.bodies(HERE, utc_us, 0.0, 0.0, bench.coordination.committed_peers)
+    bodies = bench.world_model.bodies(HERE, utc_us, 0.0, 0.0, committed_peers=bench.coordination.committed_peers)
     assert {body.apart_m for body in bodies} == {apart_m}
-    (control,) = bench.world_model.bodies(HERE, utc_us, 0.0, 0.0, {})
+    (control,) = bench.world_model.bodies(HERE, utc_us, 0.0, 0.0, committed_peers={})
     assert control.apart_m > apart_m + 0.9, "a path as old may have been left by a metre"
 
 
@@ -197,7 +199,7 @@ def test_the_certificate_against_a_stale_peer_has_all_of_its_margin(bench: Bench
     bench.fly(1.0)
     utc_us, params = bench.clock.utc_us(), SeparationParams()
     (kept,) = bench.coordination._others(utc_us, bench.state, Phase.TRACK, set())
-    (control,) = bench.world_model.keep_outs(HERE, utc_us, 100_000, 5, Phase.TRACK)
+    (control,) = bench.world_model.keep_outs(HERE, utc_us, 100_000, 5, phase=Phase.TRACK)
     assert control.hard_min_distance_m == params.budget.certified_m, "which would not grow with age"
     assert kept.hard_min_distance_m > params.budget.planned_m + 0.5
 

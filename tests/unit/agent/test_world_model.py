@@ -37,7 +37,7 @@ class Bench:
         self.bus = self.hub.attach(agent_name(0))
         self.peer, self.operator = self.hub.attach(agent_name(1)), self.hub.attach(topics.OPERATOR)
         note = lambda name, **fields: self.events.append({"event": name, **fields})  # noqa: E731
-        self.world_model = WorldModel(0, [1, 2], SeparationParams(), self.bus, 50.0, note)
+        self.world_model = WorldModel(0, [1, 2], SeparationParams(), self.bus, rate_hz=50.0, note=note)
 
     def tick(self) -> list[str]:
         self.clock.advance(TICK_US)
@@ -68,7 +68,7 @@ class Bench:
 
     @property
     def seen(self) -> int:
-        return len(self.world_model.keep_outs(HERE, self.clock.utc_us(), 100_000, 25, Phase.TRACK))
+        return len(self.world_model.keep_outs(HERE, self.clock.utc_us(), 100_000, 25, phase=Phase.TRACK))
 
     @property
     def rejected(self) -> dict[str, int]:
@@ -96,8 +96,8 @@ def test_the_largest_list_of_obstacles_costs_a_fraction_of_a_tick() -> None:
     took_ms = []
     for _ in range(20):
         began_s = time.perf_counter()
-        bench.world_model.keep_outs(HERE, bench.clock.utc_us(), 100_000, 25, Phase.TRACK)
-        bench.world_model.bodies(HERE, bench.clock.utc_us(), 0.1, 0.1, {})
+        bench.world_model.keep_outs(HERE, bench.clock.utc_us(), 100_000, 25, phase=Phase.TRACK)
+        bench.world_model.bodies(HERE, bench.clock.utc_us(), 0.1, 0.1, committed_peers={})
         took_ms.append((time.perf_counter() - began_s) * 1e3)
     assert min(took_ms) < 3.0, "of 20"
 
@@ -137,7 +137,7 @@ def test_a_peer_refused_for_long_counts_as_bus_loss_and_is_avoided_at_any_height
         bench.peer.publish(topics.PATH, topics.encode_path(path))
     utc_us = bench.clock.utc_us()
     assert bench.world_model.has_unresponsive_peer(utc_us)
-    (kept,) = bench.world_model.keep_outs(HERE, utc_us, 100_000, 5, Phase.TRACK)
+    (kept,) = bench.world_model.keep_outs(HERE, utc_us, 100_000, 5, phase=Phase.TRACK)
     assert kept.any_height and kept.radius_m > SeparationParams().radius_m + 0.9
     assert bench.world_model.refusals.alert(utc_us) == "path of agent-1 refused: future"
     assert bench.unheard == [{"event": "unheard", "agent": 1, "begins": True}]

@@ -32,7 +32,7 @@ class Bench:
         self.refusals = Refusals(lambda _, **fields: self.told.append(fields))
         self.attendance = Attendance(self.hub.attach("agent-0"))
         self.token: LocalBus = self.hub.attach("agent-1")
-        self.verifier = SenderVerifier("agent-1", "path", RATE_HZ, self.refusals, self.attendance)
+        self.verifier = SenderVerifier("agent-1", "path", RATE_HZ, self.refusals, attendance=self.attendance)
 
     def ticks(self, count: int, boots: Iterable[int] = (TRUE,), late_us: int = 0) -> None:
         """Advance ticks, in each of which the given processes publish their next message."""

@@ -19,7 +19,7 @@ UTC_US = 1_700_000_000_000_000
 
 
 def trajectory(shift_m: float = 0.0) -> Trajectory:
-    return stopping(np.array([shift_m, 1.0, -2.0]), np.array([1.5, -0.5, 0.25]), UTC_US, 100_000, 1.5)
+    return stopping(np.array([shift_m, 1.0, -2.0]), np.array([1.5, -0.5, 0.25]), UTC_US, 100_000, brake_m_s2=1.5)
 
 
 def message(seq: int = 1, agent: int = 2, boot_id: int = 9, propose: bool = True) -> TrajectoryMessage:
@@ -149,7 +149,7 @@ def test_a_proposal_leaves_the_committed_trajectory_and_ends_at_rest() -> None:
     first = trajectory()
     branch_us = UTC_US + 237_000
     pos, vel = first.sample(branch_us + np.arange(5) * 100_000)
-    then = ending_at_rest(branch_us, 100_000, pos + np.linspace(0, 0.3, 5)[:, None], vel, 1.5)
+    then = ending_at_rest(branch_us, 100_000, pos + np.linspace(0, 0.3, 5)[:, None], vel, brake_m_s2=1.5)
     whole = joined(first, then, UTC_US + 120_000)
     early = np.arange(UTC_US + 120_000, branch_us, 5_000)
     np.testing.assert_allclose(whole.sample(early)[0], first.sample(early)[0], atol=1e-3)

@@ -123,7 +123,7 @@ def run(scan: VehicleScan, vehicle: Vehicle, seconds: float, beating: bool = Tru
         vehicle.answer()
         scan.step(listener.now_us)
         listener.now_us += STEP_US
-    return facts_of(scan, 0, "udpin://0.0.0.0:14540", 1, SHARED, listener.now_us)
+    return facts_of(scan, 0, "udpin://0.0.0.0:14540", 1, shared=SHARED, now_us=listener.now_us)
 
 
 @pytest.fixture
@@ -141,7 +141,7 @@ def test_asking_changes_nothing(listener: ScriptedListener, armed: bool) -> None
     vehicle = Vehicle(listener)
     vehicle.armed = armed
     vehicle.values = {"COM_OBL_RC_ACT": (6, 0)}
-    scan = VehicleScan(listener, NOWHERE, 1, names("COM_OBL_RC_ACT", "COM_NOT_THERE"), 2.0)
+    scan = VehicleScan(listener, NOWHERE, 1, names("COM_OBL_RC_ACT", "COM_NOT_THERE"), seconds=2.0)
     run(scan, vehicle, 3.0)
     kinds = {message.get_type() for message, _ in listener.sent}
     assert kinds == {"HEARTBEAT", "TIMESYNC", "PING", "COMMAND_LONG", "PARAM_REQUEST_READ"}
@@ -154,7 +154,7 @@ def test_asking_changes_nothing(listener: ScriptedListener, armed: bool) -> None
 
 def test_nothing_is_sent_before_an_autopilot_was_received(listener: ScriptedListener) -> None:
     vehicle = Vehicle(listener)
-    scan = VehicleScan(listener, NOWHERE, 1, names(), 1.0)
+    scan = VehicleScan(listener, NOWHERE, 1, names(), seconds=1.0)
     run(scan, vehicle, 1.5, beating=False)
     assert listener.sent == []
     assert not scan.heard
@@ -168,7 +168,7 @@ def test_nothing_is_sent_before_an_autopilot_was_received(listener: ScriptedList
 def test_facts_of_a_px4(listener: ScriptedListener) -> None:
     vehicle = Vehicle(listener)
     vehicle.values = {"COM_OBL_RC_ACT": (6, 4), "COM_OF_LOSS_T": (9, 0.5)}
-    scan = VehicleScan(listener, NOWHERE, 1, names("COM_OBL_RC_ACT", "COM_OF_LOSS_T", "COM_NOT_THERE"), 2.0)
+    scan = VehicleScan(listener, NOWHERE, 1, names("COM_OBL_RC_ACT", "COM_OF_LOSS_T", "COM_NOT_THERE"), seconds=2.0)
     vehicle.beat()
     version, none = 0x01120080, [0] * 8
     git = [0, 0, 0, 0x80, 0xE5, 0xF4, 0xC4, 0x83]
@@ -207,7 +207,7 @@ def test_a_place_without_an_origin_message_comes_from_the_global_position(listen
     vehicle.beat()
     vehicle.say(mavlink.MAVLink_global_position_int_message(0, 473977420, 85455940, 499400, 0, 0, 0, 0, 0))
     vehicle.say(mavlink.MAVLink_local_position_ned_message(0, 0.0, 0.0, -8.0, 0, 0, 0))
-    facts = run(VehicleScan(listener, NOWHERE, 1, names(), 1.0), vehicle, 1.5)
+    facts = run(VehicleScan(listener, NOWHERE, 1, names(), seconds=1.0), vehicle, 1.5)
     assert not facts.origin_told and facts.pos_ned_m is not None and facts.origin_ned_m is not None
     np.testing.assert_allclose(facts.pos_ned_m, (0.0, 0.0, -10.0), atol=0.02)
     np.testing.assert_allclose(facts.origin_ned_m, (0.0, 0.0, -2.0), atol=0.02)
@@ -215,7 +215,7 @@ def test_a_place_without_an_origin_message_comes_from_the_global_position(listen
 
 def test_what_is_missing_is_asked_for_a_few_times_and_no_more(listener: ScriptedListener) -> None:
     vehicle = Vehicle(listener)
-    run(VehicleScan(listener, NOWHERE, 1, names(), 1.0), vehicle, 8.0)
+    run(VehicleScan(listener, NOWHERE, 1, names(), seconds=1.0), vehicle, 8.0)
     asked = [m.param1 for m, _ in listener.sent if m.get_type() == "COMMAND_LONG"]
     assert asked.count(mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION) == 4
 
@@ -223,7 +223,7 @@ def test_what_is_missing_is_asked_for_a_few_times_and_no_more(listener: Scripted
 def test_a_vehicle_that_is_not_ready_is_waited_for_and_asked_again(listener: ScriptedListener) -> None:
     vehicle = Vehicle(listener, autopilot=COPTER, mode=GUIDED)
     vehicle.health = 1
-    scan = VehicleScan(listener, NOWHERE, 1, names(), 1.0, patience_s=4.0)
+    scan = VehicleScan(listener, NOWHERE, 1, names(), seconds=1.0, patience_s=4.0)
     run(scan, vehicle, 2.5)
     assert not scan.finished(listener.now_us)
     vehicle.health = 1 | 1 << 28
@@ -231,7 +231,7 @@ def test_a_vehicle_that_is_not_ready_is_waited_for_and_asked_again(listener: Scr
     assert scan.finished(listener.now_us)
     assert facts.sensors is not None and facts.sensors.healthy == vehicle.health
 
-    hopeless = VehicleScan(listener, NOWHERE, 1, names(), 1.0, patience_s=1.0)
+    hopeless = VehicleScan(listener, NOWHERE, 1, names(), seconds=1.0, patience_s=1.0)
     vehicle.health = 1
     run(hopeless, vehicle, 2.5)
     assert hopeless.finished(listener.now_us)
@@ -239,7 +239,7 @@ def test_a_vehicle_that_is_not_ready_is_waited_for_and_asked_again(listener: Scr
 
 def test_another_vehicle_is_reported_until_the_configured_one_sends(listener: ScriptedListener) -> None:
     other, wanted = Vehicle(listener, sysid=4), Vehicle(listener, sysid=1)
-    scan = VehicleScan(listener, NOWHERE, 1, names(), 1.0)
+    scan = VehicleScan(listener, NOWHERE, 1, names(), seconds=1.0)
     other.beat()
     assert run(scan, wanted, 0.2, beating=False).sysid == 4
     wanted.beat()
@@ -250,14 +250,14 @@ def test_another_vehicle_is_reported_until_the_configured_one_sends(listener: Sc
 def test_companions_and_ground_stations_are_not_vehicles(listener: ScriptedListener) -> None:
     vehicle = Vehicle(listener)
     vehicle.autopilot = 8
-    assert "no autopilot" in run(VehicleScan(listener, NOWHERE, 1, names(), 1.0), vehicle, 1.2).unreachable
+    assert "no autopilot" in run(VehicleScan(listener, NOWHERE, 1, names(), seconds=1.0), vehicle, 1.2).unreachable
     vehicle.say(mavlink.MAVLink_heartbeat_message(2, PX4, 29, HOLD, 3, 3), codec=Codec(1, 25))
-    assert run(VehicleScan(listener, NOWHERE, 1, names(), 1.0), vehicle, 0.1, beating=False).unreachable
+    assert run(VehicleScan(listener, NOWHERE, 1, names(), seconds=1.0), vehicle, 0.1, beating=False).unreachable
 
 
 def test_a_second_sender_is_counted_and_the_vehicle_answered(listener: ScriptedListener) -> None:
     vehicle = Vehicle(listener)
-    scan = VehicleScan(listener, NOWHERE, 1, names(), 1.0)
+    scan = VehicleScan(listener, NOWHERE, 1, names(), seconds=1.0)
     vehicle.beat()
     vehicle.beat(STRANGER)
     facts = run(scan, vehicle, 0.5, beating=False)
@@ -270,15 +270,15 @@ def test_mavlink_1_is_recognised(listener: ScriptedListener) -> None:
     packer = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     beat = mavlink.MAVLink_heartbeat_message(2, PX4, 29, HOLD, 3, 3).pack(packer, force_mavlink1=True)
     listener.inbox.append(ReceivedDatagram(listener.now_us, beat, VEHICLE))
-    scan = VehicleScan(listener, NOWHERE, 1, names(), 1.0)
+    scan = VehicleScan(listener, NOWHERE, 1, names(), seconds=1.0)
     scan.step(listener.now_us)
-    facts = facts_of(scan, 0, "udpin://0.0.0.0:14540", 1, SHARED, listener.now_us)
+    facts = facts_of(scan, 0, "udpin://0.0.0.0:14540", 1, shared=SHARED, now_us=listener.now_us)
     assert (facts.link.mavlink1, facts.link.mavlink2, facts.sysid, facts.unreachable) == (1, 0, 1, "")
     assert list(frames(beat + vehicle.codec.encode(mavlink.MAVLink_ping_message(0, 0, 0, 0)) + b"x", version_1=True))
 
 
 def test_an_unsupported_autopilot_is_reported_without_parameters(listener: ScriptedListener) -> None:
-    scan = VehicleScan(listener, NOWHERE, 1, names("X"), 1.0)
+    scan = VehicleScan(listener, NOWHERE, 1, names("X"), seconds=1.0)
     facts = run(scan, Vehicle(listener, autopilot=4), 1.5)
     assert (facts.unreachable, facts.autopilot, facts.autopilot_number, facts.parameters) == ("", "", 4, {})
     assert scan.finished(listener.now_us)
@@ -287,7 +287,7 @@ def test_an_unsupported_autopilot_is_reported_without_parameters(listener: Scrip
 def test_junk_is_survived(listener: ScriptedListener) -> None:
     rng = np.random.default_rng([7])
     vehicle = Vehicle(listener)
-    scan = VehicleScan(listener, NOWHERE, 1, names(), 1.0)
+    scan = VehicleScan(listener, NOWHERE, 1, names(), seconds=1.0)
     good = vehicle.codec.encode(mavlink.MAVLink_heartbeat_message(2, PX4, 29, HOLD, 3, 3))
     for _ in range(2000):
         frame = bytearray(good)
@@ -312,7 +312,7 @@ def test_whatever_an_autopilot_says_a_check_ends_in_words(listener: ScriptedList
     for autopilot in (PX4, COPTER):
         vehicle = Vehicle(listener, autopilot=autopilot)
         for _ in range(60):
-            scan = VehicleScan(listener, NOWHERE, 1, lambda dialect: names_to_read(dialect, config), 1.0)
+            scan = VehicleScan(listener, NOWHERE, 1, lambda dialect: names_to_read(dialect, config), seconds=1.0)
             vehicle.beat()
             read = names_to_read(DIALECTS[autopilot], config)
             for kind in kinds:
@@ -324,7 +324,7 @@ def test_whatever_an_autopilot_says_a_check_ends_in_words(listener: ScriptedList
                     payload[8:24] = str(rng.choice(np.array(read))).encode().ljust(16, b"\0")
                 listener.inbox.append(ReceivedDatagram(listener.now_us, raw_frame(1, 1, kind, bytes(payload)), VEHICLE))
             scan.step(listener.now_us)
-            facts = facts_of(scan, 0, "udpin://0.0.0.0:14540", 1, SHARED, listener.now_us + 10_000)
+            facts = facts_of(scan, 0, "udpin://0.0.0.0:14540", 1, shared=SHARED, now_us=listener.now_us + 10_000)
             assert facts.sysid == 1
             lines = findings([facts], config)
             assert as_json([facts], lines, [], exit_code([facts], lines))
@@ -341,7 +341,7 @@ def raw_frame(sysid: int, compid: int, kind: int, payload: bytes) -> bytes:
 def test_values_are_read_again_on_request_and_unknown_until_then(listener: ScriptedListener) -> None:
     vehicle = Vehicle(listener)
     vehicle.values = {"AN_INT": (6, 1), "A_REAL": (9, 3.0)}
-    scan = VehicleScan(listener, NOWHERE, 1, names("AN_INT", "A_REAL"), 1.0)
+    scan = VehicleScan(listener, NOWHERE, 1, names("AN_INT", "A_REAL"), seconds=1.0)
     assert run(scan, vehicle, 1.5).number("AN_INT") == 1
     vehicle.values["AN_INT"] = (6, 4)
     assert run(scan, vehicle, 1.5).number("AN_INT") == 1
@@ -357,7 +357,7 @@ def test_values_are_read_again_on_request_and_unknown_until_then(listener: Scrip
 
 def test_the_tap_gets_what_the_vehicle_sends_and_forwards_to_it_alone(listener: ScriptedListener) -> None:
     vehicle, tapped = Vehicle(listener), list[bytes]()
-    scan = VehicleScan(listener, NOWHERE, 1, names(), 1.0)
+    scan = VehicleScan(listener, NOWHERE, 1, names(), seconds=1.0)
     run(scan, vehicle, 1.5)
     scan.tap = tapped.append
     vehicle.say(mavlink.MAVLink_statustext_message(6, b"from a stranger"), STRANGER)
@@ -374,7 +374,7 @@ def test_nothing_may_be_changed_on_a_vehicle_that_is_armed_silent_or_another(
     listener: ScriptedListener, why: str
 ) -> None:
     vehicle = Vehicle(listener, sysid=4 if why == "another" else 1)
-    scan = VehicleScan(listener, NOWHERE, 1, names(), 1.0)
+    scan = VehicleScan(listener, NOWHERE, 1, names(), seconds=1.0)
     run(scan, vehicle, 1.5)
     assert scan.may_change(listener.now_us) is (why != "another")
     vehicle.armed = why == "armed"

@@ -25,7 +25,7 @@ HOVER = np.array([0.0, 0.0, GRAVITY_M_S2])
 
 
 def filtered(barrier: Barrier, virtual_control: Array, start: Start, bodies: list[Body]) -> Array | None:
-    return barrier.filtered(virtual_control, start, STILL, 0.5, bodies)
+    return barrier.filtered(virtual_control, start, STILL, 0.5, bodies=bodies)
 
 
 def start(pos: Array, vel: Array, held: Array = HOVER) -> Start:
@@ -219,7 +219,7 @@ def path(t0_us: int, vel: tuple[float, float, float] = (1.0, 0.0, 0.0), points: 
 def body(known: PredictedPath, act_us: int, ahead_s: float = 0.0, filters: bool = True) -> Body:
     age_margin_m = BUDGET.age_margin_m(max(0.0, (act_us - known.t0_utc_us) * 1e-6), parked=False)
     apart_m = BUDGET.barrier_peer_m(PARAMS.margin_m, known.radius_m, age_margin_m)
-    return body_of_peer(known, act_us, ahead_s, apart_m, filters, 2.0)
+    return body_of_peer(known, act_us, ahead_s, apart_m, filters=filters, brake_m_s2=2.0)
 
 
 def test_a_peer_is_predicted_to_when_the_command_takes_effect() -> None:
@@ -242,7 +242,7 @@ def test_a_stale_peer_is_where_plans_assume_it(vel: tuple[float, float, float], 
     """Otherwise an agent would stand before a peer that no plan sees, and no recovery would begin."""
     known = path(0, vel)
     found = body(known, age_us)
-    assert found.pos_ned_m == pytest.approx(align(known, age_us, 20_000, 1, 2.0)[0])
+    assert found.pos_ned_m == pytest.approx(align(known, age_us, 20_000, 1, brake_m_s2=2.0)[0])
     before, after = (np.array(body(known, age_us + by_us).pos_ned_m) for by_us in (-100, 100))
     assert found.vel_ned_m_s == pytest.approx((after - before) / 2e-4, abs=1e-3)
 

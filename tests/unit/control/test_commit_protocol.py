@@ -57,7 +57,10 @@ class Crowd:
         angle = 2.0 * np.pi * np.arange(count) / count
         self.starts = np.stack([3.0 * np.cos(angle), 3.0 * np.sin(angle), np.full(count, -2.0)], axis=1)
         self.agents = [
-            Commitments(i, CommitParams(), MpcParams(u_max=0.25), SEPARATION, count, lambda: 0) for i in range(count)
+            Commitments(
+                i, CommitParams(), MpcParams(u_max=0.25), SEPARATION, max_keep_outs=count, stopwatch_ns=lambda: 0
+            )
+            for i in range(count)
         ]
         self.known: list[dict[int, TrajectoryMessage]] = [{} for _ in range(count)]
         self.network, self.now_us, self.seq = network, UTC_US, 0
@@ -102,7 +105,7 @@ class Crowd:
     def wanted(self, agent: int, offsets_s: Array) -> tuple[Array, Array]:
         goal = self.starts[agent] * np.array([-1.0, -1.0, 1.0])
         t_s = (self.now_us - UTC_US) * 1e-6 + offsets_s
-        return quintic_to(self.starts[agent], np.zeros(3), goal, 1.5, 1.0).sample(t_s)
+        return quintic_to(self.starts[agent], np.zeros(3), goal, 1.5, accel_m_s2=1.0).sample(t_s)
 
     def committed_m(self) -> float:
         """Smallest distance, from now to their ends, of any two trajectories that are followed now."""
@@ -180,9 +183,11 @@ def meeting() -> tuple[Commitments, Commitments]:
     """Return two agents that fly one behind the other at 1.5 m/s, 1 m apart, each on its committed trajectory."""
     pair = []
     for i, x_m in enumerate((0.0, -1.0)):
-        agent = Commitments(i, CommitParams(), MpcParams(u_max=0.25), SEPARATION, 2, lambda: 0)
+        agent = Commitments(
+            i, CommitParams(), MpcParams(u_max=0.25), SEPARATION, max_keep_outs=2, stopwatch_ns=lambda: 0
+        )
         points = np.array([[x_m + 0.15 * k, 0.0, -2.0] for k in range(21)])
-        agent.committed = ending_at_rest(UTC_US, 100_000, points, np.tile([1.5, 0.0, 0.0], (21, 1)), 1.5)
+        agent.committed = ending_at_rest(UTC_US, 100_000, points, np.tile([1.5, 0.0, 0.0], (21, 1)), brake_m_s2=1.5)
         pair.append(agent)
     return pair[0], pair[1]
 
@@ -238,7 +243,7 @@ def test_a_wall_that_leaves_time_for_acknowledgements_triggers_no_evasion() -> N
 
 def test_an_agent_at_rest_evades_what_approaches() -> None:
     """A stop would change nothing: it rests already."""
-    agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), SEPARATION, 2, lambda: 0)
+    agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), SEPARATION, max_keep_outs=2, stopwatch_ns=lambda: 0)
     agent.begin(np.array([0.0, 0.0, -2.0]), np.zeros(3), UTC_US)
     times_s = 0.1 * np.arange(agent.steps + 1)
     coming = np.stack([2.5 - 1.0 * times_s, 0.3 + 0.0 * times_s, -2.0 + 0.0 * times_s], axis=1)
@@ -260,7 +265,7 @@ def test_an_agent_at_rest_evades_what_approaches() -> None:
 @pytest.mark.parametrize(("column", "passes_m"), [(False, 0.9), (True, 0.1)], ids=["ball", "control: column"])
 def test_an_agent_that_is_enclosed_evades_upwards(column: bool, passes_m: float) -> None:
     """Peers rest on the three other sides, so the only evasive trajectory is a climb."""
-    agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), SEPARATION, 5, lambda: 0)
+    agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), SEPARATION, max_keep_outs=5, stopwatch_ns=lambda: 0)
     agent.begin(np.array([0.0, 0.0, -2.0]), np.zeros(3), UTC_US)
     sides = [[0.0, 0.9, -2.0], [0.0, -0.9, -2.0], [-0.9, 0.0, -2.0]]
     peers = {
@@ -313,9 +318,9 @@ def along(corners: Array) -> Sampled:
 def test_plans_along_a_path_are_linearised_around_it(follows_path: bool, passes: bool) -> None:
     """The last plan leads north before a wall, the path south through a gap: rows of one exclude the other."""
     small = SeparationParams(radius_m=0.3, body_m=0.15)
-    agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), small, 5, lambda: 0)
-    to_north = quintic_to(np.array([0.0, 0.0, -2.0]), np.zeros(3), np.array([0.1, 0.9, -2.0]), 1.0, 1.0)
-    agent.committed = ending_at_rest(UTC_US, 100_000, *to_north.sample(np.arange(0.0, 2.1, 0.1)), 1.5)
+    agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), small, max_keep_outs=5, stopwatch_ns=lambda: 0)
+    to_north = quintic_to(np.array([0.0, 0.0, -2.0]), np.zeros(3), np.array([0.1, 0.9, -2.0]), 1.0, accel_m_s2=1.0)
+    agent.committed = ending_at_rest(UTC_US, 100_000, *to_north.sample(np.arange(0.0, 2.1, 0.1)), brake_m_s2=1.5)
     posts = [np.array([0.8, y_m, -2.0]) for y_m in (0.3, 0.6, 0.9, 1.2)]
     wall = [
         KeepOut(
@@ -347,7 +352,7 @@ def test_a_path_from_rest_begins_at_the_own_speed(runs_up: bool, monkeypatch: py
     if not runs_up:
         monkeypatch.setattr(trajectory_planner, "_with_run_up", lambda desired, speed_m_s: desired)
     small = SeparationParams(radius_m=0.3, body_m=0.15)
-    agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), small, 3, lambda: 0)
+    agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), small, max_keep_outs=3, stopwatch_ns=lambda: 0)
     here = np.array([2.716, 2.764, -2.0])
     agent.begin(here, np.zeros(3), UTC_US)
     posts = [np.array([3.0, y_m, -2.0]) for y_m in (2.802, 2.502, 2.202)]
@@ -377,7 +382,7 @@ def test_a_path_from_rest_begins_at_the_own_speed(runs_up: bool, monkeypatch: py
 
 
 def proposing() -> tuple[Commitments, Proposal]:
-    agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), SEPARATION, 2, lambda: 0)
+    agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), SEPARATION, max_keep_outs=2, stopwatch_ns=lambda: 0)
     agent.begin(np.array([0.0, 0.0, -2.0]), np.zeros(3), UTC_US)
     agent.propose(
         Situation(

@@ -30,7 +30,7 @@ FIELDS = ("normal", "offset_m", "stop_s", "stop_offset_m")
 def mpc(
     *axes: Axis, horizon: Horizon = HORIZON, max_keep_outs: int = 0, relax_01: float = 1.0, qp: QpParams = EXACT
 ) -> CondensedMpc:
-    return CondensedMpc(axes, horizon, max_keep_outs, relax_01, Penalties(), qp, lambda: 0)
+    return CondensedMpc(axes, horizon, max_keep_outs, relax_01, penalties=Penalties(), qp=qp, stopwatch_ns=lambda: 0)
 
 
 def same_gain(steps: int, axes: int) -> Array:

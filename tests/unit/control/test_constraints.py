@@ -122,7 +122,7 @@ def spaces(offset_m: float) -> HalfSpaces:
 @pytest.mark.parametrize("seed", range(5))
 def test_the_residual_of_half_spaces_is_the_depth_in_metres(seed: int) -> None:
     ahead, moves = prediction(), some_moves(seed)
-    block = KeepOutHalfSpaces(ahead, 2, 1.0, Penalties(), 1.0)
+    block = KeepOutHalfSpaces(ahead, 2, 1.0, Penalties(), cost_scale=1.0)
     step = forecast(ahead, spaces(0.05))
     pos, vel = flown(ahead, step, moves)
     along = np.append((pos @ (-np.sqrt(0.5) * np.ones(2)))[block.checked], 0.0)
@@ -164,7 +164,7 @@ class EndVelocity(ConstraintBlock):
 
 def solved(ahead: Prediction, step: Forecast, *more: ConstraintBlock) -> tuple[Program, Array]:
     cost = TrackingCost(ahead)
-    half_spaces = KeepOutHalfSpaces(ahead, 1, 1.0, Penalties(), cost.scale)
+    half_spaces = KeepOutHalfSpaces(ahead, 1, 1.0, Penalties(), cost_scale=cost.scale)
     program = Program(cost.pattern(), (IncrementBounds(ahead), InputBounds(ahead), half_spaces, *more))
     cost.fill(program.hessian, program.slope, step)
     program.fill(step)

@@ -32,8 +32,8 @@ def make(kind: Kind, max_keep_outs: int = 2, **params: Any) -> Controller:
         VehicleModelParams(),
         SeparationParams(),
         0,
-        max_keep_outs,
-        time.perf_counter_ns,
+        max_keep_outs=max_keep_outs,
+        stopwatch_ns=time.perf_counter_ns,
     )
 
 

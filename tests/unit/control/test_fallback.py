@@ -34,7 +34,7 @@ def start(
 def brake(
     vel: tuple[float, ...], at: Array | None = None, wind: Array = NO_WIND, tilt: tuple[float, ...] = (0.0, 0.0)
 ) -> Plan:
-    return brake_and_hold_plan(start(vel, tilt=tilt), at, wind, None, DT_US, STEPS)
+    return brake_and_hold_plan(start(vel, tilt=tilt), at, wind, None, dt_us=DT_US, steps=STEPS)
 
 
 @pytest.mark.parametrize("speed_m_s", [0.5, 1.0, 2.5, 5.0])
@@ -128,7 +128,7 @@ def flown(
             tilt=tilt,
             tilt_rate_1_s=rate,
         )
-        virtual_control = brake_and_hold_plan(begin, at, NO_WIND, believed, DT_US, 2).virtual_control[0]
+        virtual_control = brake_and_hold_plan(begin, at, NO_WIND, believed, dt_us=DT_US, steps=2).virtual_control[0]
         ends = [true.advance(float(tilt[i]), float(rate[i]), float(virtual_control[i]), DT_S) for i in (0, 1)]
         tilt, rate = np.array([e[0] for e in ends]), np.array([e[1] for e in ends])
         accel = acceleration(np.array([ends[0][2] / DT_S, ends[1][2] / DT_S, virtual_control[2]]))
@@ -162,7 +162,7 @@ def test_the_published_path_is_the_one_a_lagging_vehicle_flies() -> None:
         virtual_control=np.array([0.1, 0.0, 9.81]),
         tilt=np.array([0.1, 0.0]),
     )
-    plan = brake_and_hold_plan(begin, None, NO_WIND, LAG, DT_US, STEPS)
+    plan = brake_and_hold_plan(begin, None, NO_WIND, LAG, dt_us=DT_US, steps=STEPS)
     pos, vel, tilt, rate = np.zeros(3), np.array([2.0, -1.0, 0.0]), np.array([0.1, 0.0]), np.zeros(2)
     for k, virtual_control in enumerate(plan.virtual_control):
         ends = [LAG.advance(float(tilt[i]), float(rate[i]), float(virtual_control[i]), DT_S) for i in (0, 1)]

@@ -52,8 +52,17 @@ def problem(
 def joint(max_keep_outs: int = 4, separation: SeparationParams | None = None, **params: Any) -> JointMpc:
     params.setdefault("z", {"q_pos": 2.0, "q_vel": 0.05, "r": 0.01})  # as configs/improved_5_circle_dmpc3.toml
     return JointMpc(
-        MpcParams(**params), VehicleModelParams(), separation or SeparationParams(), 0, max_keep_outs, lambda: 0
+        MpcParams(**params),
+        VehicleModelParams(),
+        separation or SeparationParams(),
+        0,
+        max_keep_outs=max_keep_outs,
+        stopwatch_ns=lambda: 0,
     )
+
+
+def four_places(kind: type[JointMpc] | type[SwarmMpc], params: MpcParams) -> JointMpc | SwarmMpc:
+    return kind(params, VehicleModelParams(), SeparationParams(), 0, max_keep_outs=4, stopwatch_ns=lambda: 0)
 
 
 def ball(offset: Point, any_height: bool = False, priority_id: int = -1) -> KeepOut:
@@ -122,10 +131,7 @@ def test_with_nothing_near_it_plans_what_the_two_problems_of_the_thesis_do(
     terminal: Terminal, goal: tuple[float, float, float]
 ) -> None:
     same = MpcParams(control_z=6, horizon_z=40, terminal_z=terminal, qp=DAQP)  # as x-y, which dmpc3 takes for all
-    both = [
-        kind(same, VehicleModelParams(), SeparationParams(), 0, 4, lambda: 0).plan(problem(goal))
-        for kind in (JointMpc, SwarmMpc)
-    ]
+    both = [four_places(kind, same).plan(problem(goal)) for kind in (JointMpc, SwarmMpc)]
     assert both[0].status is both[1].status is PlanStatus.OK
     np.testing.assert_allclose(both[0].virtual_control, both[1].virtual_control, atol=1e-5)
     np.testing.assert_allclose(both[0].pos_ned_m, both[1].pos_ned_m, atol=1e-6)
@@ -135,10 +141,7 @@ def test_with_nothing_near_it_plans_what_the_two_problems_of_the_thesis_do(
 
 def test_a_little_climb_changes_little_sideways() -> None:
     same = MpcParams(control_z=6, horizon_z=40, terminal_z="none", qp=DAQP)
-    both = [
-        kind(same, VehicleModelParams(), SeparationParams(), 0, 4, lambda: 0).plan(problem((0.4, 0.0, -0.02)))
-        for kind in (JointMpc, SwarmMpc)
-    ]
+    both = [four_places(kind, same).plan(problem((0.4, 0.0, -0.02))) for kind in (JointMpc, SwarmMpc)]
     np.testing.assert_allclose(both[0].pos_ned_m, both[1].pos_ned_m, atol=5e-3)
 
 
@@ -229,7 +232,7 @@ def test_a_wall_is_passed_above_or_below_with_every_plan_certified(lower_m: floa
 
 def test_the_thesis_controller_cannot_pass_that_wall() -> None:
     flight = fly(
-        SwarmMpc(MpcParams(), VehicleModelParams(), SeparationParams(), 0, 4, lambda: 0),
+        SwarmMpc(MpcParams(), VehicleModelParams(), SeparationParams(), 0, max_keep_outs=4, stopwatch_ns=lambda: 0),
         (4.0, 0.0, 0.0),
         wall(0.2),
         ticks=200,
@@ -369,7 +372,12 @@ def test_it_comes_to_its_place_as_exactly_as_the_two_problems_do(goal: tuple[flo
     ends = []
     for kind in (JointMpc, SwarmMpc):
         params = MpcParams(terminal_z="none", qp=QpParams(solver=solver))  # type: ignore[arg-type]
-        path = fly(kind(params, VehicleModelParams(), SeparationParams(), 0, 4, lambda: 0), goal, (), ticks=200).path
+        path = fly(
+            four_places(kind, params),
+            goal,
+            (),
+            ticks=200,
+        ).path
         ends.append(float(np.linalg.norm(path[-25:] - HERE - goal, axis=1).mean()))
     assert ends[1] < 0.004
     assert ends[0] < 0.004

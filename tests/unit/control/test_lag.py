@@ -90,7 +90,7 @@ def axis(lag: Lag | None) -> Axis:
 
 def planner(lag: Lag | None, drag_1_s: float) -> CondensedMpc:
     horizon = Horizon(control=8, prediction=30, dt_s=DT_S, euler=False, drag_1_s=drag_1_s)
-    return CondensedMpc((axis(lag),), horizon, 0, 1.0, Penalties(), QpParams(), lambda: 0)
+    return CondensedMpc((axis(lag),), horizon, 0, 1.0, penalties=Penalties(), qp=QpParams(), stopwatch_ns=lambda: 0)
 
 
 @pytest.mark.parametrize("drag_1_s", [0.0, 1.0])

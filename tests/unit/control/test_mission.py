@@ -177,7 +177,7 @@ def test_a_glide_halfway_by_hand() -> None:
 @pytest.mark.parametrize("distance_m", [0.1, 1.0, 5.0, 200.0])
 def test_from_rest_a_glide_keeps_speed_and_acceleration(distance_m: float) -> None:
     target = np.array([0.6, 0.0, -0.8]) * distance_m
-    trajectory = quintic_to(np.zeros(3), np.zeros(3), target, 2.0, 1.2)
+    trajectory = quintic_to(np.zeros(3), np.zeros(3), target, 2.0, accel_m_s2=1.2)
     said, _, accel = derivatives(trajectory)
     assert np.linalg.norm(said, axis=1).max() <= 2.0 + 1e-6
     assert np.linalg.norm(accel, axis=1).max() <= 1.2 * 1.01
@@ -186,7 +186,7 @@ def test_from_rest_a_glide_keeps_speed_and_acceleration(distance_m: float) -> No
 
 
 def test_a_glide_that_must_turn_round_stays_near_its_acceleration() -> None:
-    trajectory = quintic_to(np.zeros(3), np.array([2.0, 0.0, 0.0]), np.array([-1.0, 0.0, 0.0]), 2.0, 1.2)
+    trajectory = quintic_to(np.zeros(3), np.array([2.0, 0.0, 0.0]), np.array([-1.0, 0.0, 0.0]), 2.0, accel_m_s2=1.2)
     _, _, accel = derivatives(trajectory)
     assert np.linalg.norm(accel, axis=1).max() < 1.6 * 1.2
 

@@ -47,30 +47,30 @@ def straight(speed_m_s: float, points: int = 6, dt_us: int = DT_US) -> Predicted
 
 def test_alignment_interpolates_between_points() -> None:
     curve = peer(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, -1.0], [3.0, 2.0, -1.0], [3.0, 6.0, -1.0]]))
-    aligned = align(curve, UTC_US + 25_000, 50_000, 3, 3.0)
+    aligned = align(curve, UTC_US + 25_000, 50_000, 3, brake_m_s2=3.0)
     np.testing.assert_allclose(aligned, [[0.25, 0.0, -0.25], [0.75, 0.0, -0.75], [1.5, 0.5, -1.0], [2.5, 1.5, -1.0]])
 
 
 def test_alignment_before_the_first_point_goes_back_along_the_first_segment() -> None:
-    aligned = align(straight(2.0), UTC_US - 150_000, DT_US, 2, 3.0)
+    aligned = align(straight(2.0), UTC_US - 150_000, DT_US, 2, brake_m_s2=3.0)
     np.testing.assert_allclose(aligned[:, 0], [-0.3, -0.1, 0.1], atol=1e-12)
 
 
 def test_beyond_its_end_a_peer_brakes_to_a_stop() -> None:
     # 3 m/s at the end (x = 1.5 at 0.5 s), brake 3 m/s2: stops 1 s later 1.5 m on
-    aligned = align(straight(3.0), UTC_US + 500_000, 250_000, 6, 3.0)
+    aligned = align(straight(3.0), UTC_US + 500_000, 250_000, 6, brake_m_s2=3.0)
     # 3 t - 1.5 t^2 at 0, .25, .5, .75, 1 s: 0, .65625, 1.125, 1.40625, 1.5, then at rest
     np.testing.assert_allclose(aligned[:, 0], [1.5, 2.15625, 2.625, 2.90625, 3.0, 3.0, 3.0], atol=1e-12)
     np.testing.assert_allclose(aligned[:, 2], -2.0)
 
 
 def test_a_path_one_hour_old_has_stopped() -> None:
-    aligned = align(straight(3.0), UTC_US + 3_600_000_000, DT_US, 2, 3.0)
+    aligned = align(straight(3.0), UTC_US + 3_600_000_000, DT_US, 2, brake_m_s2=3.0)
     np.testing.assert_allclose(aligned[:, 0], 3.0)
 
 
 def test_a_path_at_rest_is_not_extrapolated() -> None:
-    aligned = align(straight(0.0), UTC_US + 10_000_000, DT_US, 2, 3.0)
+    aligned = align(straight(0.0), UTC_US + 10_000_000, DT_US, 2, brake_m_s2=3.0)
     np.testing.assert_allclose(aligned, np.tile([0.0, 0.0, -2.0], (3, 1)))
 
 
@@ -83,14 +83,14 @@ def test_keep_out_grows_with_age_to_its_cap_and_a_lost_peer_is_a_cylinder(
 ) -> None:
     at_us = UTC_US + round(age_s * 1e6)
     path = peer(np.zeros((3, 3)), radius_m=0.25, agent=4)
-    keep_out = keep_out_of_peer(path, at_us, DT_US, STEPS, PARAMS)
+    keep_out = keep_out_of_peer(path, at_us, DT_US, STEPS, params=PARAMS)
     assert keep_out.radius_m == pytest.approx(0.9 + 0.25 + margin_m)
     assert keep_out.hard_min_distance_m == pytest.approx(0.9 + 0.25 - 0.1)
     assert (keep_out.any_height, keep_out.priority_id) == (any_height, 4)
 
 
 def test_the_keep_out_of_a_landed_peer_does_not_grow() -> None:
-    keep_out = keep_out_of_peer(peer(np.zeros((3, 3))), UTC_US + 600_000_000, DT_US, STEPS, PARAMS, parked=True)
+    keep_out = keep_out_of_peer(peer(np.zeros((3, 3))), UTC_US + 600_000_000, DT_US, STEPS, params=PARAMS, parked=True)
     assert keep_out.radius_m == pytest.approx(0.9)
     assert not keep_out.any_height
 
@@ -204,7 +204,9 @@ def spaces_of(
     guess: Array, *keep_outs: KeepOut, priority_id: int = 0, goal: tuple[float, float] = (0.0, 0.0)
 ) -> HalfSpaces:
     """Return half-spaces of an agent at rest."""
-    spaces = half_spaces(keep_outs, guess, np.array(goal), np.zeros(2), 0.1, priority_id, PARAMS)
+    spaces = half_spaces(
+        keep_outs, guess, np.array(goal), np.zeros(2), dt_s=0.1, own_priority_id=priority_id, params=PARAMS
+    )
     assert spaces is not None
     return spaces
 
@@ -271,7 +273,7 @@ def test_downwash_applies_to_peers_and_not_to_obstacles() -> None:
     path = PredictedPath(
         agent=1, boot_id=1, seq=1, t0_utc_us=0, dt_us=DT_US, radius_m=0.0, pos_ned_m=still((0.0, 0.0, 0.0))
     )
-    assert keep_out_of_peer(path, 0, DT_US, STEPS, params).downwash == 2.0
+    assert keep_out_of_peer(path, 0, DT_US, STEPS, params=params).downwash == 2.0
     ball = Obstacle(
         center_ned_m=(0.0, 0.0, 0.0), radius_m=1.0, keep_out_m=1.75, visibility_m=3.0, vel_ned_m_s=(0.0, 0.0, 0.0)
     )
@@ -281,7 +283,13 @@ def test_downwash_applies_to_peers_and_not_to_obstacles() -> None:
 def test_downwash_takes_as_long_to_stop_from_above() -> None:
     for keep_out in (fixed((0.0, 0.0, 0.0), 0.8), squeezed((0.0, 0.0, 0.0))):
         spaces = half_spaces(
-            [keep_out], still((0.0, 0.0, -3.0)), np.zeros(3), np.array([0.0, 0.0, 2.8]), 0.1, 0, PARAMS
+            [keep_out],
+            still((0.0, 0.0, -3.0)),
+            np.zeros(3),
+            np.array([0.0, 0.0, 2.8]),
+            dt_s=0.1,
+            own_priority_id=0,
+            params=PARAMS,
         )
         assert spaces is not None
         assert spaces.stop_s[0] == pytest.approx(2.8 / (2 * 1.4))
@@ -290,7 +298,10 @@ def test_downwash_takes_as_long_to_stop_from_above() -> None:
 def test_far_keep_outs_get_no_row() -> None:
     assert np.isneginf(spaces_of(still((4.0, 0.0, 0.0)), fixed((0.0, 0.0, 0.0), 0.8)).offset_m).all()
     assert np.isfinite(spaces_of(still((3.8, 0.0, 0.0)), fixed((0.0, 0.0, 0.0), 0.8)).offset_m).all()
-    assert half_spaces([], still((4.0, 0.0, 0.0)), np.zeros(2), np.zeros(2), 0.1, 0, PARAMS) is None
+    assert (
+        half_spaces([], still((4.0, 0.0, 0.0)), np.zeros(2), np.zeros(2), dt_s=0.1, own_priority_id=0, params=PARAMS)
+        is None
+    )
 
 
 @pytest.mark.parametrize("axes", [2, 3])
@@ -305,7 +316,7 @@ def test_plans_keep_more_from_a_peer_that_comes_closer_and_less_the_less_is_left
     goal = np.zeros(axes)
 
     def kept_m(guess: Array, keep_out: KeepOut, used: SeparationParams) -> Array:
-        spaces = half_spaces([keep_out], guess, goal, np.zeros(axes), 0.1, 0, used)
+        spaces = half_spaces([keep_out], guess, goal, np.zeros(axes), dt_s=0.1, own_priority_id=0, params=used)
         assert spaces is not None
         return np.asarray(-spaces.offset_m[0])
 
@@ -372,7 +383,9 @@ def test_obstacles_are_passed_on_the_side_the_agent_is_on(east_m: float, axes: i
     obstacle = KeepOut(
         pos_ned_m=still((2.0, 0.0, 0.0)), radius_m=0.9, hard_min_distance_m=0.8, any_height=False, priority_id=-1
     )
-    spaces = half_spaces([obstacle], moving, np.array([5.0, 0.0, 0.0][:axes]), np.zeros(axes), 0.1, 0, PARAMS)
+    spaces = half_spaces(
+        [obstacle], moving, np.array([5.0, 0.0, 0.0][:axes]), np.zeros(axes), dt_s=0.1, own_priority_id=0, params=PARAMS
+    )
     assert spaces is not None
     normal = spaces.normal[0]
     assert (np.sign(normal[:, 1]) == np.sign(east_m)).all()
@@ -383,12 +396,16 @@ def test_the_stopping_row_adds_the_braking_distance_only_when_closing() -> None:
     guess = still((-3.0, 0.0, 0.0))
     wall = [fixed((0.0, 0.0, 0.0), 0.8)]
     params = PARAMS.model_copy(update={"right_of_way_rad": 0.0, "right_of_way_obstacle_rad": 0.0})
-    closing = half_spaces(wall, guess, np.array([5.0, 0.0]), np.array([2.8, 0.0]), 0.1, 0, params)
+    closing = half_spaces(
+        wall, guess, np.array([5.0, 0.0]), np.array([2.8, 0.0]), dt_s=0.1, own_priority_id=0, params=params
+    )
     assert closing is not None
     # v / (2 a): p + v * v / (2 a) is where braking with a = 1.4 from 2.8 m/s ends
     assert closing.stop_s[0] == pytest.approx(2.8 / (2 * 1.4))
     assert closing.stop_offset_m[0] == pytest.approx(0.9)
-    opening = half_spaces(wall, guess, np.array([5.0, 0.0]), np.array([-2.8, 0.0]), 0.1, 0, params)
+    opening = half_spaces(
+        wall, guess, np.array([5.0, 0.0]), np.array([-2.8, 0.0]), dt_s=0.1, own_priority_id=0, params=params
+    )
     assert opening is not None
     assert opening.stop_s[0] == 0.0
 
@@ -402,7 +419,15 @@ def test_the_stopping_row_includes_the_motion_of_the_peer() -> None:
         priority_id=1,
     )  # 1 m/s south
     params = PARAMS.model_copy(update={"right_of_way_rad": 0.0, "right_of_way_obstacle_rad": 0.0})
-    spaces = half_spaces([other], still((-3.0, 0.0, 0.0)), np.array([5.0, 0.0]), np.array([1.8, 0.0]), 0.1, 0, params)
+    spaces = half_spaces(
+        [other],
+        still((-3.0, 0.0, 0.0)),
+        np.array([5.0, 0.0]),
+        np.array([1.8, 0.0]),
+        dt_s=0.1,
+        own_priority_id=0,
+        params=params,
+    )
     assert spaces is not None
     assert spaces.stop_s[0] == pytest.approx(2.8 / 2.8)  # closing speed 1.8 + 1.0
     # normal is south (-1, 0): other at its end -1 - 1 s * 1 m/s = -2 -> offset 2 + 0.9
@@ -416,7 +441,9 @@ def in_space(
     guess: Array, *keep_outs: KeepOut, priority_id: int = 0, goal: tuple[float, float, float] = (0.0, 0.0, 0.0)
 ) -> HalfSpaces:
     """Return half-spaces of an agent at rest."""
-    spaces = half_spaces(keep_outs, guess, np.array(goal), np.zeros(3), 0.1, priority_id, PARAMS)
+    spaces = half_spaces(
+        keep_outs, guess, np.array(goal), np.zeros(3), dt_s=0.1, own_priority_id=priority_id, params=PARAMS
+    )
     assert spaces is not None
     return spaces
 
@@ -437,7 +464,9 @@ def test_positions_within_a_half_space_are_at_least_the_radius_away(seed: int, a
         )
         for k in range(6)
     ]
-    spaces = half_spaces(keep_outs, guess, goal[:axes], rng.normal(0.0, 1.0, axes), 0.1, 1, PARAMS)
+    spaces = half_spaces(
+        keep_outs, guess, goal[:axes], rng.normal(0.0, 1.0, axes), dt_s=0.1, own_priority_id=1, params=PARAMS
+    )
     assert spaces is not None
     assert spaces.normal.shape == (6, STEPS, axes)
     np.testing.assert_allclose(np.linalg.norm(spaces.normal, axis=2), 1.0, atol=1e-12)
@@ -497,7 +526,13 @@ def test_in_space_coincident_centres_have_a_side(above_m: float, any_height: boo
 
 def test_in_space_the_stopping_row_includes_vertical_speed() -> None:
     sinking = half_spaces(
-        [fixed((0.0, 0.0, 0.0), 0.8)], still((0.0, 0.0, -3.0)), np.zeros(3), np.array([0.0, 0.0, 2.8]), 0.1, 0, PARAMS
+        [fixed((0.0, 0.0, 0.0), 0.8)],
+        still((0.0, 0.0, -3.0)),
+        np.zeros(3),
+        np.array([0.0, 0.0, 2.8]),
+        dt_s=0.1,
+        own_priority_id=0,
+        params=PARAMS,
     )
     assert sinking is not None
     assert sinking.stop_s[0] == pytest.approx(2.8 / (2 * 1.4))
@@ -554,6 +589,6 @@ def test_a_radius_that_is_too_small_is_refused_unless_allowed(
 
 
 def test_plans_keep_the_tracking_error_on_top_and_the_certificate_does_not() -> None:
-    keep_out = keep_out_of_peer(peer(np.zeros((3, 3))), UTC_US, DT_US, 2, SeparationParams(tracking_m=0.07))
+    keep_out = keep_out_of_peer(peer(np.zeros((3, 3))), UTC_US, DT_US, 2, params=SeparationParams(tracking_m=0.07))
     assert keep_out.radius_m == pytest.approx(0.97)
     assert keep_out.hard_min_distance_m == pytest.approx(0.8)

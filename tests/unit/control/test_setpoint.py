@@ -20,7 +20,7 @@ G = 9.81
 
 
 def test_level_at_hover_thrust() -> None:
-    setpoint = setpoint_of(np.array([0.0, 0.0, G]), 0.0, 0.42, 1_000, MODEL)
+    setpoint = setpoint_of(np.array([0.0, 0.0, G]), 0.0, 0.42, 1_000, params=MODEL)
     np.testing.assert_allclose(setpoint.q_nb, [1.0, 0.0, 0.0, 0.0])
     assert setpoint.thrust_01 == pytest.approx(0.42)
     assert setpoint.valid_until_us == 1_000 + VALID_US
@@ -39,7 +39,7 @@ def test_level_at_hover_thrust() -> None:
     ],
 )
 def test_attitudes_by_hand(u_x: float, u_y: float, yaw_deg: float, roll_deg: float, pitch_deg: float) -> None:
-    q_nb = setpoint_of(np.array([u_x, u_y, G]), math.radians(yaw_deg), 0.5, 0, MODEL).q_nb
+    q_nb = setpoint_of(np.array([u_x, u_y, G]), math.radians(yaw_deg), 0.5, 0, params=MODEL).q_nb
     roll, pitch, yaw = (math.degrees(a) for a in euler_from_quat(q_nb))
     assert [roll, pitch] == pytest.approx([roll_deg, pitch_deg], abs=1e-9)
     assert math.cos(math.radians(yaw - yaw_deg)) == pytest.approx(1.0)
@@ -47,14 +47,14 @@ def test_attitudes_by_hand(u_x: float, u_y: float, yaw_deg: float, roll_deg: flo
 
 @given(st.floats(-0.39, 0.39), st.floats(-0.39, 0.39), st.floats(-3.1, 3.1))
 def test_the_body_axis_of_the_attitude_is_what_was_asked(u_x: float, u_y: float, yaw: float) -> None:
-    q_nb = setpoint_of(np.array([u_x, u_y, G]), yaw, 0.5, 0, MODEL).q_nb
+    q_nb = setpoint_of(np.array([u_x, u_y, G]), yaw, 0.5, 0, params=MODEL).q_nb
     np.testing.assert_allclose(body_z_ned(q_nb), [u_x, u_y, math.sqrt(1 - u_x**2 - u_y**2)], atol=1e-9)
     assert math.cos(euler_from_quat(q_nb)[2] - yaw) == pytest.approx(1.0)
 
 
 @given(st.floats(-5.0, 5.0), st.floats(-5.0, 5.0))
 def test_tilt_is_limited_by_shortening_and_never_by_turning(u_x: float, u_y: float) -> None:
-    down = body_z_ned(setpoint_of(np.array([u_x, u_y, G]), 0.3, 0.5, 0, MODEL).q_nb)
+    down = body_z_ned(setpoint_of(np.array([u_x, u_y, G]), 0.3, 0.5, 0, params=MODEL).q_nb)
     assert math.acos(min(1.0, down[2])) <= 0.6 + 1e-6
     assert down[0] * u_y - down[1] * u_x == pytest.approx(0.0, abs=1e-6)
     assert down[0] * u_x + down[1] * u_y >= -1e-9
@@ -65,7 +65,7 @@ def test_tilt_is_limited_by_shortening_and_never_by_turning(u_x: float, u_y: flo
     [(G, 0.5, 0.5), (2 * G, 0.3, 0.6), (3 * G, 0.5, 1.0), (0.0, 0.5, 0.05), (-20.0, 0.5, 0.05), (G / 2, 0.6, 0.3)],
 )
 def test_thrust_is_linear_in_weights_and_bounded(specific_m_s2: float, hover_01: float, thrust_01: float) -> None:
-    setpoint = setpoint_of(np.array([0.0, 0.0, specific_m_s2]), 0.0, hover_01, 0, MODEL)
+    setpoint = setpoint_of(np.array([0.0, 0.0, specific_m_s2]), 0.0, hover_01, 0, params=MODEL)
     assert setpoint.thrust_01 == pytest.approx(thrust_01)
 
 
@@ -74,7 +74,7 @@ def test_thrust_is_linear_in_weights_and_bounded(specific_m_s2: float, hover_01:
 def test_nonsense_in_is_a_setpoint_that_is_refused(entry: int, bad: float) -> None:
     virtual_control = np.array([0.1, -0.1, G])
     virtual_control[entry] = bad
-    assert setpoint_of(virtual_control, 0.0, 0.5, 0, MODEL).problem(0)
+    assert setpoint_of(virtual_control, 0.0, 0.5, 0, params=MODEL).problem(0)
 
 
 def test_acceleration_of_virtual_controls_by_hand() -> None:

@@ -56,7 +56,7 @@ def test_the_path_leads_through_a_gap_in_a_wall() -> None:
 def test_a_doubtful_gap_is_avoided_at_a_higher_price() -> None:
     """The middle of this one is 2 cm inside the discs of both sides, as far as a free one can be from a grid point."""
     discs = np.vstack([wall(-2.48, -0.38), wall(0.38, 2.4)])
-    through, round_it = (shortest_path(START, GOAL, discs, 0.1, squeeze) for squeeze in (3.0, 27.0))
+    through, round_it = (shortest_path(START, GOAL, discs, 0.1, squeeze=squeeze) for squeeze in (3.0, 27.0))
     assert np.abs(through.corners[:, 1]).max() < 0.2
     assert np.abs(round_it.corners[:, 1]).max() > 2.4
 

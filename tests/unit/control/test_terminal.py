@@ -38,6 +38,10 @@ def case(request: pytest.FixtureRequest) -> Weights:
     return CASES[request.param]
 
 
+def region_of_case(case: Weights) -> TerminalRegion:
+    return terminal_region(*case[:4], daccel_max_m_s2=case[4], dt_s=case[5])
+
+
 def move(error: Array, increment: float, dt_s: float) -> Array:
     """One step of position, velocity and acceleration under an acceleration held over it; by hand."""
     pos, vel, accel = (float(x) for x in error)
@@ -67,7 +71,7 @@ def test_the_error_model_is_the_motion_under_a_held_acceleration() -> None:
 
 def test_cost_to_go_solves_the_riccati_equation(case: Weights) -> None:
     q_pos, q_vel, r, _, _, dt_s = case
-    region = terminal_region(*case)
+    region = region_of_case(case)
     p, k = region.cost_to_go, region.gain[None]
     a, b = transition(dt_s)
     scale = np.abs(p).max()
@@ -80,7 +84,7 @@ def test_cost_to_go_solves_the_riccati_equation(case: Weights) -> None:
 
 def test_cost_to_go_falls_by_the_stage_cost_and_is_the_sum_of_all_that_follow(case: Weights) -> None:
     q_pos, q_vel, r, _, _, dt_s = case
-    region = terminal_region(*case)
+    region = region_of_case(case)
     error = np.array([0.3, -0.2, 0.4])
     first, total = value(region, error), 0.0
     for _ in range(3000):
@@ -94,7 +98,7 @@ def test_cost_to_go_falls_by_the_stage_cost_and_is_the_sum_of_all_that_follow(ca
 
 def test_no_law_is_cheaper_than_the_cost_to_go(case: Weights) -> None:
     q_pos, q_vel, r, _, _, dt_s = case
-    region = terminal_region(*case)
+    region = region_of_case(case)
     rng = np.random.default_rng([0, 0, 3])
     for _ in range(50):  # Bellman: any increment now, the best afterwards
         error = rng.normal(size=3)
@@ -107,7 +111,7 @@ def test_no_law_is_cheaper_than_the_cost_to_go(case: Weights) -> None:
 
 def test_every_state_of_the_set_keeps_the_bounds_and_the_set_is_the_largest(case: Weights) -> None:
     _, _, _, accel_max, step_max, _ = case
-    region = terminal_region(*case)
+    region = region_of_case(case)
     states = boundary(region, 20_000, 1)
     steps, accels = np.abs(states @ region.gain) / step_max, np.abs(states[:, 2]) / accel_max
     assert max(steps.max(), accels.max()) <= 1.0 + 1e-9
@@ -122,16 +126,16 @@ def test_every_state_of_the_set_keeps_the_bounds_and_the_set_is_the_largest(case
 
 
 def test_increments_limit_the_lateral_region_and_acceleration_the_vertical_one() -> None:
-    lateral, vertical = terminal_region(*CASES["lateral"]), terminal_region(*CASES["vertical"])
-    more = terminal_region(*CASES["lateral"][:4], 2 * 0.4905, 0.02)
+    lateral, vertical = region_of_case(CASES["lateral"]), region_of_case(CASES["vertical"])
+    more = region_of_case((*CASES["lateral"][:4], 2 * 0.4905, 0.02))
     assert more.level == pytest.approx(4.0 * lateral.level)
-    assert terminal_region(*CASES["vertical"][:4], 10.0, 0.02).level == pytest.approx(vertical.level)
-    assert terminal_region(*CASES["vertical"][:3], 4.905, 5.0, 0.02).level == pytest.approx(vertical.level / 4.0)
+    assert region_of_case((*CASES["vertical"][:4], 10.0, 0.02)).level == pytest.approx(vertical.level)
+    assert region_of_case((*CASES["vertical"][:3], 4.905, 5.0, 0.02)).level == pytest.approx(vertical.level / 4.0)
 
 
 def test_a_state_inside_stays_inside_within_the_bounds_and_comes_to_rest(case: Weights) -> None:
     _, _, _, accel_max, step_max, dt_s = case
-    region = terminal_region(*case)
+    region = region_of_case(case)
     shrink = np.random.default_rng([0, 0, 8]).uniform(0.0, 1.0, (400, 1)) ** (1.0 / 3.0)
     states = np.concatenate([boundary(region, 400, 2) * shrink, boundary(region, 100, 3)])
     level = np.einsum("ni,ij,nj->n", states, region.cost_to_go, states)
@@ -149,7 +153,7 @@ def test_a_state_inside_stays_inside_within_the_bounds_and_comes_to_rest(case: W
 
 
 def test_outside_is_measured_in_metres_of_position(case: Weights) -> None:
-    region = terminal_region(*case)
+    region = region_of_case(case)
     edge_m = math.sqrt(region.level / float(region.cost_to_go[0, 0]))
     for sign in (1.0, -1.0):
         for beyond_m in (1e-4, 0.1, 7.0):
@@ -171,15 +175,17 @@ def mpc(axis: Axis, control: int, prediction: int, qp: QpParams) -> CondensedMpc
         Horizon(control=control, prediction=prediction, dt_s=DT_S, euler=False),
         0,
         1.0,
-        Penalties(),
-        qp,
-        lambda: 0,
+        penalties=Penalties(),
+        qp=qp,
+        stopwatch_ns=lambda: 0,
     )
 
 
 def region_of(axis: Axis) -> TerminalRegion:
     gain, room = axis.gain_m_s2, min(axis.u_max - axis.u_rest, axis.u_rest - axis.u_min)
-    return terminal_region(axis.q_pos, axis.q_vel, axis.r / gain**2, gain * room, gain * axis.du_max, DT_S)
+    return terminal_region(
+        axis.q_pos, axis.q_vel, axis.r / gain**2, gain * room, daccel_max_m_s2=gain * axis.du_max, dt_s=DT_S
+    )
 
 
 def solve(problem: CondensedMpc, pos: float, vel: float, u: float) -> AxesSolution:

@@ -34,7 +34,7 @@ class Bench:
         ours, self.vehicle = pipe_pair(self.clock.now_us)
         self.own_codec = Codec(sysid, 191)
         self.frames: list[bytes] = []
-        self.pilot = Autopilot(ours, self.own_codec, sysid, SHARED, self.frames.append)
+        self.pilot = Autopilot(ours, self.own_codec, sysid, SHARED, on_frame=self.frames.append)
         self.codec = Codec(sysid, 1)
 
     def say(self, message: Any, codec: Codec | None = None) -> None:

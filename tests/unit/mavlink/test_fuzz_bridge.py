@@ -58,7 +58,7 @@ class Listener:
         near_end, self.wire = pipe_pair(self.clock.now_us)
         self.recorded = 0
         origin = GeoOrigin(47.397742, 8.545594, 489.4)
-        self.autopilot = Autopilot(near_end, Codec(1, 191), SYSID, origin, self._count)
+        self.autopilot = Autopilot(near_end, Codec(1, 191), SYSID, origin, on_frame=self._count)
         self.transport: PipeTransport = near_end
 
     def _count(self, _: bytes) -> None:

@@ -168,7 +168,7 @@ def test_a_step_that_the_estimator_tells_of_is_bridged_however_small() -> None:
         jumped(vehicle, UP * 0.02)
         vehicle.t_us += STEP_US
         vehicle.true = vehicle.true + EAST * STEP_US * 1e-6
-        after = vehicle.frame.place(vehicle.t_us, vehicle.true - vehicle.origin, EAST, True, reset)
+        after = vehicle.frame.place(vehicle.t_us, vehicle.true - vehicle.origin, EAST, True, reset=reset)
         assert before is not None
         assert after is not None
         assert vehicle.frame.jumps == jumps
@@ -195,12 +195,14 @@ def test_without_gps_global_origin_it_is_worked_out_from_positions() -> None:
         vehicle.fly(0.02)
         if k % 5 == 0:
             place = at(*(vehicle.true + EAST * 0.03))  # 30 ms newer than the local one
-            vehicle.frame.seen(place, vehicle.t_us + 30_000, vehicle.t_us, vehicle.true - vehicle.origin, EAST)
+            vehicle.frame.seen(
+                place, vehicle.t_us + 30_000, vehicle.t_us, vehicle.true - vehicle.origin, vel_ned_m_s=EAST
+            )
     assert vehicle.error_m(vehicle.fly(0.1)) < 0.02
     stale = Vehicle()
     for _ in range(200):
         stale.fly(0.02)
-        stale.frame.seen(at(0.0, 0.0, 0.0), stale.t_us + 200_000, stale.t_us, stale.true, EAST)
+        stale.frame.seen(at(0.0, 0.0, 0.0), stale.t_us + 200_000, stale.t_us, stale.true, vel_ned_m_s=EAST)
     assert stale.frame.offset_ned_m is None, "positions of two moments tell nothing"
 
 

@@ -42,11 +42,11 @@ class Vehicle:
         self.read_only = False
         self.talks = self.answers_origin = True
         self.boot()
-        self.pilot = Autopilot(self.ours, Codec(1, 191), 1, HOME, lambda frame: None)
+        self.pilot = Autopilot(self.ours, Codec(1, 191), 1, HOME, on_frame=lambda frame: None)
         self.port = CommandPort(self.pilot.send_frame, Codec(1, 191), 1, lambda: self.pilot.dialect)
         self.pilot.attach(self.port)
         self.setup: dict[str, int | float] = {}
-        self.vehicle_setup = VehicleSetup(self.pilot, self.port, self.setup, 1, 50.0)
+        self.vehicle_setup = VehicleSetup(self.pilot, self.port, self.setup, 1, state_rate_hz=50.0)
 
     def boot(self) -> None:
         self.booted_us = self.clock.now_us()
@@ -54,7 +54,7 @@ class Vehicle:
         self.asked: list[tuple[int, float]] = []
 
     def set_up(self, **setup: int | float) -> Vehicle:
-        self.vehicle_setup = VehicleSetup(self.pilot, self.port, setup, 1, 50.0)
+        self.vehicle_setup = VehicleSetup(self.pilot, self.port, setup, 1, state_rate_hz=50.0)
         return self
 
     @property

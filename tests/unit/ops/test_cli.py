@@ -234,13 +234,13 @@ def test_a_reader_that_goes_away_does_not_change_the_exit_code() -> None:
 
 
 def test_obstacles_are_read_strictly() -> None:
-    ball = operator.obstacle("1.5,0,-2", 0.5, 1.0, 3.0, "0,0,0.1")
+    ball = operator.obstacle("1.5,0,-2", 0.5, 1.0, 3.0, velocity="0,0,0.1")
     assert ball == Obstacle(
         center_ned_m=(1.5, 0.0, -2.0), radius_m=0.5, keep_out_m=1.0, visibility_m=3.0, vel_ned_m_s=(0.0, 0.0, 0.1)
     )
-    assert operator.obstacle("1.5,0,-2", 0.5, 1.0, 3.0, "0,0,0.1", column=True).column
+    assert operator.obstacle("1.5,0,-2", 0.5, 1.0, 3.0, velocity="0,0,0.1", column=True).column
     with pytest.raises(ConfigError) as caught:
-        operator.obstacle("1,2", -1.0, float("nan"), 3.0, "0,inf,0")
+        operator.obstacle("1,2", -1.0, float("nan"), 3.0, velocity="0,inf,0")
     assert [problem.split()[0] for problem in caught.value.problems] == [
         "--center",
         "--radius",

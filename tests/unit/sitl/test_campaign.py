@@ -85,7 +85,9 @@ def test_standing_still_is_distinguished_from_creeping() -> None:
 def test_a_static_obstacle_never_appears_at_a_goal(goal_m: float, speed_m_s: float, appears: bool) -> None:
     """2.5 m before a vehicle that flies north; one metre is kept from it."""
     goals = np.array([[goal_m, 0.0, 0.0]])
-    appearance = Appearance(0, 1.0, 2.5, 2.2, 0.5, 1.0, speed_m_s, 1, goals)
+    appearance = Appearance(
+        0, 1.0, 2.5, 2.2, radius_m=0.5, keep_out_m=1.0, speed_m_s=speed_m_s, side=1, goals_ned_m=goals
+    )
     lockstep = Lockstep(load(None, ["swarm.agents=1"]))
     for t_s in (0.9, 1.1):
         appearance.step(lockstep, t_s, np.zeros((1, 3)), np.array([[2.0, 0.0, 0.0]]))
@@ -146,7 +148,9 @@ def test_the_least_sum_of_three_and_seven() -> None:
 
 def test_finished_runs_are_not_flown_again(tmp_path: Path) -> None:
     trials = [
-        Trial(cell, seed) for cell in cells(["swap"], [2, 3], [0, 50], [0], ["exact"], [0], ["off"]) for seed in (1, 2)
+        Trial(cell, seed)
+        for cell in cells(["swap"], [2, 3], [0, 50], [0], noises=["exact"], winds_m_s=[0], protections=["off"])
+        for seed in (1, 2)
     ]
     with Store(tmp_path, "this") as store:
         assert store.missing(trials) == trials

@@ -48,7 +48,7 @@ def test_offline_recording_holds_the_run_and_can_be_packed(tmp_path: Path) -> No
 
     run = RunData({0: flown(0), 1: flown(1)}, NO_TRUTH, [])
     obstacle = Obstacle(center_ned_m=(5.0, 0.0, 0.0))
-    path = simulated_recording(tmp_path, run, 2, 0.9, 0.85, [obstacle])
+    path = simulated_recording(tmp_path, run, 2, 0.9, limit_m=0.85, obstacles=[obstacle])
     assert optimize_recording(tmp_path)
     rows: dict[str, int] = {}
     distances: list[float] = []
@@ -79,7 +79,7 @@ def test_recording_that_cannot_be_packed_stays(tmp_path: Path) -> None:
 
 
 def test_recording_of_a_killed_viewer_is_repaired(tmp_path: Path) -> None:
-    path = simulated_recording(tmp_path, RunData({0: flown(0)}, NO_TRUTH, []), 1, 0.9, 0.85)
+    path = simulated_recording(tmp_path, RunData({0: flown(0)}, NO_TRUTH, []), 1, 0.9, limit_m=0.85)
     path.write_bytes(path.read_bytes()[:-30_000])
     assert optimize_recording(tmp_path)
     assert path.stat().st_size > 20_000
