@@ -11,6 +11,7 @@ from swarmctl.control.phases.state_machine import MissionStateMachine, StateMach
 from swarmctl.control.reference.mission import MissionParams, MissionReference
 from swarmctl.core.operator_verbs import Order
 from swarmctl.core.types import Command, FlightMode, Landed, Mode, Phase, VehicleState, Verb
+from tests import builders
 
 UTC0_US = 1_700_000_000_000_000
 START = np.array([1.0, 0.0, -3.0])
@@ -62,12 +63,11 @@ class Flight:
         if not self.seen:
             return None
         q_nb = np.array([1.0, 0.0, 0.0, 0.0])
-        return VehicleState(
+        return builders.vehicle_state(
             t_us=self.now_us,
             pos_ned_m=self.pos,
             vel_ned_m_s=self.vel,
             q_nb=q_nb,
-            rate_frd_rad_s=np.zeros(3),
             armed=self.armed,
             mode=self.flight_mode,
             landed=self.landed,

@@ -12,25 +12,19 @@ from swarmctl.core.types import (
     NO_TIMES,
     AttitudeSetpoint,
     FlightMode,
-    Landed,
     Mode,
     Phase,
     Plan,
     PlanStatus,
     Reference,
-    VehicleState,
 )
+from tests import builders
 
-STATE = VehicleState(
+STATE = builders.vehicle_state(
     t_us=8_999_999_995_501,
     pos_ned_m=np.array([1.1, -2.2, -3.3]),
     vel_ned_m_s=np.array([0.1, -0.2, 0.3]),
     q_nb=np.array([0.5, -0.5, 0.25, 0.75]),
-    rate_frd_rad_s=np.zeros(3),
-    armed=True,
-    mode=FlightMode.EXTERNAL,
-    landed=Landed.IN_AIR,
-    failsafe=False,
 )
 PLAN = Plan(
     status=PlanStatus.NOT_CERTIFIED,

@@ -16,8 +16,9 @@ from swarmctl.bus import topics
 from swarmctl.bus.peers import agent_name
 from swarmctl.bus.senders import ReceivedMessage, SenderVerifier, _Stream
 from swarmctl.bus.trajectory_messages import decode_trajectory_message, encode_trajectory_message
-from swarmctl.core.types import Mode, Phase, PredictedPath
+from swarmctl.core.types import Mode, Phase
 from swarmctl.telemetry.referee import RunData, judge
+from tests import builders
 from tests.closed_loop.conftest import Flight, Fly, fly_now, mission_t_s
 
 AGENTS, VICTIM, STRANGER = 4, 1, 999
@@ -60,9 +61,7 @@ def forge_paths(running: Lockstep) -> None:
     for agent in range(AGENTS):
         away = np.tile([60.0, 20.0 * agent, -2.0], (26, 1))
         for boot, seq in ((STRANGER, 1), (running.config.seed * 1000 + agent, LAST)):
-            path = PredictedPath(
-                agent=agent, boot_id=boot, seq=seq, t0_utc_us=at_us, dt_us=100_000, radius_m=0.0, pos_ned_m=away
-            )
+            path = builders.predicted_path(agent=agent, boot_id=boot, seq=seq, t0_utc_us=at_us, pos_ned_m=away)
             say(running, topics.PATH, topics.encode_path(path), agent)
 
 

@@ -16,7 +16,7 @@ from swarmctl.bus.refusals import Refusals
 from swarmctl.bus.senders import SILENCE_US, Attendance
 from swarmctl.bus.topics import PATH, encode_path
 from swarmctl.bus.zenoh_bus import ZenohBus
-from swarmctl.core.types import PredictedPath
+from tests import builders
 from tests.process.test_bus import WAIT_S, end, endpoint, join, start_router  # noqa: F401  (fixtures)
 
 pytestmark = pytest.mark.process
@@ -107,17 +107,7 @@ def forge(bus: ZenohBus, boot_id: int, seq: int) -> None:
     away = np.tile([60.0, 0.0, -2.0], (5, 1))
     bus.publish(
         PATH,
-        encode_path(
-            PredictedPath(
-                agent=1,
-                boot_id=boot_id,
-                seq=seq,
-                t0_utc_us=now_us() + 40_000,
-                dt_us=100_000,
-                radius_m=0.0,
-                pos_ned_m=away,
-            )
-        ),
+        encode_path(builders.predicted_path(boot_id=boot_id, seq=seq, t0_utc_us=now_us() + 40_000, pos_ned_m=away)),
     )
 
 

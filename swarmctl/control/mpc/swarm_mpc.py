@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -157,16 +156,22 @@ class SwarmMpc:
         guess = first_guess(problem, self._params.dt_s, self.steps)
         count = min(self.steps, len(up.pos_m))
         guess[1 : count + 1, 2] = up.pos_m[:count, 0]
-        near = partial(
-            near_half_spaces,
-            problem,
-            guess,
-            2,
-            self._max_keep_outs,
-            dt_s=self._params.dt_s,
-            own_priority_id=self._priority_id,
-        )
-        return planned(near, partial(self._plan, problem, up, began_ns), self._separation, self._stopwatch_ns)
+
+        def near(params: SeparationParams) -> HalfSpaces | None:
+            return near_half_spaces(
+                problem,
+                guess,
+                2,
+                self._max_keep_outs,
+                dt_s=self._params.dt_s,
+                own_priority_id=self._priority_id,
+                params=params,
+            )
+
+        def plan(spaces: HalfSpaces | None, spaces_us: float) -> Plan:
+            return self._plan(problem, up, began_ns, spaces, spaces_us=spaces_us)
+
+        return planned(near, plan, self._separation, self._stopwatch_ns)
 
     def reset(self) -> None:
         """Keep all: only a warm start outlasts a tick."""

@@ -18,8 +18,8 @@ from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredRefe
 from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.core.clock import SimClock
 from swarmctl.core.trajectory import resting
-from swarmctl.core.trajectory_message import TrajectoryMessage
-from swarmctl.core.types import Array, FlightMode, Landed, Phase, PredictedPath, VehicleState
+from swarmctl.core.types import Array, Phase, VehicleState
+from tests import builders
 
 PEER = agent_name(1)
 RATE_HZ = 50.0
@@ -59,17 +59,7 @@ class Bench:
         """Hovers here."""
         north = np.array([1.0, 0.0, 0.0, 0.0])
         still, now_us = np.zeros(3), self.clock.now_us()
-        return VehicleState(
-            t_us=now_us,
-            pos_ned_m=HERE,
-            vel_ned_m_s=still,
-            q_nb=north,
-            rate_frd_rad_s=still,
-            armed=True,
-            mode=FlightMode.EXTERNAL,
-            landed=Landed.IN_AIR,
-            failsafe=False,
-        )
+        return builders.vehicle_state(t_us=now_us, pos_ned_m=HERE, vel_ned_m_s=still, q_nb=north, rate_frd_rad_s=still)
 
     def fly(self, seconds: float, each: Callable[[], None] = lambda: None) -> None:
         for _ in range(round(seconds / 0.02)):
@@ -93,26 +83,13 @@ class Bench:
             message = decode_trajectory_message(payload)
             if message is not None and message.proposal is not None:
                 acknowledged = {0: message.proposal.number}
-        path = PredictedPath(
-            agent=1,
-            boot_id=1,
-            seq=self.seq,
-            t0_utc_us=utc_us,
-            dt_us=20_000,
-            radius_m=0.0,
-            pos_ned_m=np.tile(path_at, (41, 1)),
+        path = builders.predicted_path(
+            seq=self.seq, t0_utc_us=utc_us, dt_us=20_000, pos_ned_m=np.tile(path_at, (41, 1))
         )
         self.peer.publish(topics.PATH, topics.encode_path(path))
         if not silent:
-            message = TrajectoryMessage(
-                agent=1,
-                boot_id=1,
-                seq=self.seq,
-                sent_utc_us=utc_us,
-                is_committed=True,
-                committed=resting(PLACE, utc_us, 100_000),
-                proposal=None,
-                acknowledged=acknowledged,
+            message = builders.trajectory_message(
+                seq=self.seq, sent_utc_us=utc_us, committed=resting(PLACE, utc_us, 100_000), acknowledged=acknowledged
             )
             self.peer.publish(topics.TRAJECTORY, encode_trajectory_message(message))
 

@@ -10,15 +10,14 @@ import pytest
 from swarmctl.agent.components import SEPARATION_MODES
 from swarmctl.agent.separation_policy import BestEffort, Guaranteed, SeparationInputs, SeparationPolicy
 from swarmctl.bus.peers import LocalBus
-from swarmctl.control.collision.separation import KeepOut, SeparationParams
+from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.commit.trajectory_planner import DesiredReference
 from swarmctl.core.types import Phase
+from tests import builders
 from tests.unit.agent.test_coordination import HERE, PEER, PLACE, Bench
 
 YAW_RAD = 0.3
-KEEP_OUT = KeepOut(
-    pos_ned_m=np.tile(PLACE, (3, 1)), radius_m=0.9, hard_min_distance_m=0.8, any_height=False, priority_id=1
-)
+KEEP_OUT = builders.keep_out(pos_ned_m=np.tile(PLACE, (3, 1)))
 
 
 @pytest.fixture

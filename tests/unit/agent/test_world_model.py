@@ -16,7 +16,8 @@ from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.core.clock import SimClock
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.types import Phase, PredictedPath
+from swarmctl.core.types import Phase
+from tests import builders
 from tests.unit.bus.test_topics import STATUS
 
 BALL = Obstacle(center_ned_m=(5.0, 0.0, -2.0), radius_m=0.5, keep_out_m=1.0, visibility_m=100.0)
@@ -45,14 +46,8 @@ class Bench:
 
     def say_path(self, boot_id: int = 1) -> None:
         self.seq += 1
-        path = PredictedPath(
-            agent=1,
-            boot_id=boot_id,
-            seq=self.seq,
-            t0_utc_us=self.clock.utc_us(),
-            dt_us=TICK_US,
-            radius_m=0.0,
-            pos_ned_m=np.tile(HERE, (5, 1)),
+        path = builders.predicted_path(
+            boot_id=boot_id, seq=self.seq, t0_utc_us=self.clock.utc_us(), dt_us=TICK_US, pos_ned_m=np.tile(HERE, (5, 1))
         )
         self.peer.publish(topics.PATH, topics.encode_path(path))
 
@@ -125,15 +120,7 @@ def test_a_peer_refused_for_long_counts_as_bus_loss_and_is_avoided_at_any_height
         bench.tick()
         bench.seq += 1
         ahead = bench.clock.utc_us() + 600_000
-        path = PredictedPath(
-            agent=1,
-            boot_id=1,
-            seq=bench.seq,
-            t0_utc_us=ahead,
-            dt_us=TICK_US,
-            radius_m=0.0,
-            pos_ned_m=np.tile(HERE, (5, 1)),
-        )
+        path = builders.predicted_path(seq=bench.seq, t0_utc_us=ahead, dt_us=TICK_US, pos_ned_m=np.tile(HERE, (5, 1)))
         bench.peer.publish(topics.PATH, topics.encode_path(path))
     utc_us = bench.clock.utc_us()
     assert bench.world_model.has_unresponsive_peer(utc_us)

@@ -10,22 +10,14 @@ from swarmctl.bus.refusals import Refusals
 from swarmctl.bus.senders import Attendance
 from swarmctl.bus.topics import COMMAND, PATH, TICK, TOO_LONG, encode_path
 from swarmctl.core.clock import SimClock
-from swarmctl.core.types import PredictedPath
+from tests import builders
 
 NOW_US = 1_700_000_000_000_000
 
 
 def payload(agent: int = 1, boot_id: int = 7, seq: int = 1, t0_utc_us: int = NOW_US) -> bytes:
     return encode_path(
-        PredictedPath(
-            agent=agent,
-            boot_id=boot_id,
-            seq=seq,
-            t0_utc_us=t0_utc_us,
-            dt_us=100_000,
-            radius_m=0.0,
-            pos_ned_m=np.zeros((5, 3)),
-        )
+        builders.predicted_path(agent=agent, boot_id=boot_id, seq=seq, t0_utc_us=t0_utc_us, pos_ned_m=np.zeros((5, 3)))
     )
 
 

@@ -18,8 +18,9 @@ from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import OPERATOR_VERBS, OperatorVerb, Order, VerbArgument
 from swarmctl.core.records import TICK_DTYPE
 from swarmctl.core.trajectory import Trajectory
-from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
+from swarmctl.core.trajectory_message import Proposal
 from swarmctl.core.types import PredictedPath
+from tests import builders
 
 POINTS = np.array([[1.5, -2.25, -3.0], [1.625, -2.0, -3.5], [1.75, -1.75, -4.0]])
 UTC_US = 1_700_000_000_123_456
@@ -48,7 +49,7 @@ STATUS = topics.StatusMessage(
 
 
 def path(points: np.ndarray = POINTS, dt_us: int = 20_000, radius_m: float = 0.5) -> PredictedPath:
-    return PredictedPath(
+    return builders.predicted_path(
         agent=4, boot_id=0xFFFFFFFF, seq=123_456, t0_utc_us=UTC_US, dt_us=dt_us, radius_m=radius_m, pos_ned_m=points
     )
 
@@ -303,20 +304,16 @@ def test_lists_and_numbers_from_outside_are_bounded() -> None:
 
 
 def test_the_longest_good_message_of_every_topic_fits() -> None:
-    path = PredictedPath(
-        agent=0, boot_id=0, seq=0, t0_utc_us=0, dt_us=1, radius_m=0.0, pos_ned_m=np.zeros((topics.MAX_POINTS, 3))
-    )
+    path = builders.predicted_path(agent=0, boot_id=0, seq=0, dt_us=1, pos_ned_m=np.zeros((topics.MAX_POINTS, 3)))
     assert len(topics.encode_path(path)) <= topics.PATH.max_bytes
     trajectory = Trajectory(
         t0_utc_us=0, dt_us=1, pos_ned_m=np.zeros((MAX_POINTS, 3)), vel_ned_m_s=np.zeros((MAX_POINTS, 3))
     )
     acknowledged = dict.fromkeys(range(MAX_ACKNOWLEDGED), 2**60)
-    message = TrajectoryMessage(
+    message = builders.trajectory_message(
         agent=0,
         boot_id=0,
         seq=0,
-        sent_utc_us=0,
-        is_committed=True,
         committed=trajectory,
         proposal=Proposal(number=1, made_utc_us=0, agent=0, trajectory=trajectory),
         acknowledged=acknowledged,

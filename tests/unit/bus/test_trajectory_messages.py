@@ -14,6 +14,7 @@ from swarmctl.bus.trajectory_messages import PeerTrajectories, decode_trajectory
 from swarmctl.core.clock import SimClock
 from swarmctl.core.trajectory import Trajectory, ending_at_rest, joined, resting, stopping
 from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
+from tests import builders
 
 UTC_US = 1_700_000_000_000_000
 
@@ -25,12 +26,11 @@ def trajectory(shift_m: float = 0.0) -> Trajectory:
 def message(seq: int = 1, agent: int = 2, boot_id: int = 9, propose: bool = True) -> TrajectoryMessage:
     proposal = Proposal(number=77, made_utc_us=UTC_US + 5, agent=agent, trajectory=trajectory(0.5)) if propose else None
     sent_utc_us = UTC_US + 20_000 * seq
-    return TrajectoryMessage(
+    return builders.trajectory_message(
         agent=agent,
         boot_id=boot_id,
         seq=seq,
         sent_utc_us=sent_utc_us,
-        is_committed=True,
         committed=trajectory(),
         proposal=proposal,
         acknowledged={0: 5, 1: UTC_US},

@@ -16,6 +16,7 @@ from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Array, PredictedPath
+from tests import builders
 
 PARAMS, MODEL = BarrierParams(), VehicleModelParams()
 DT_S, BODY_M, STILL = 0.02, 0.48, np.zeros(3)
@@ -29,7 +30,7 @@ def filtered(barrier: Barrier, virtual_control: Array, start: Start, bodies: lis
 
 
 def start(pos: Array, vel: Array, held: Array = HOVER) -> Start:
-    return Start(t_us=0, pos_ned_m=pos, vel_ned_m_s=vel, cos_tilt=1.0, virtual_control=held)
+    return builders.start(pos_ned_m=pos, vel_ned_m_s=vel, virtual_control=held)
 
 
 def fly_at_goals(
@@ -205,14 +206,8 @@ def test_coincident_bodies_part_along_their_relative_velocity() -> None:
 
 
 def path(t0_us: int, vel: tuple[float, float, float] = (1.0, 0.0, 0.0), points: int = 41) -> PredictedPath:
-    return PredictedPath(
-        agent=1,
-        boot_id=1,
-        seq=1,
-        t0_utc_us=t0_us,
-        dt_us=20_000,
-        radius_m=0.0,
-        pos_ned_m=np.arange(points)[:, None] * 0.02 * np.array(vel),
+    return builders.predicted_path(
+        t0_utc_us=t0_us, dt_us=20_000, pos_ned_m=np.arange(points)[:, None] * 0.02 * np.array(vel)
     )
 
 

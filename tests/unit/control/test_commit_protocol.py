@@ -20,6 +20,7 @@ from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.trajectory import Trajectory, ending_at_rest, resting
 from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
 from swarmctl.core.types import Array, Sampled
+from tests import builders
 
 UTC_US = 1_700_000_000_000_000
 TICK_US = 40_000
@@ -88,12 +89,10 @@ class Crowd:
                 )
         for i, agent in enumerate(self.agents):
             assert agent.committed is not None
-            message = TrajectoryMessage(
+            message = builders.trajectory_message(
                 agent=i,
-                boot_id=1,
                 seq=self.seq,
                 sent_utc_us=self.now_us,
-                is_committed=True,
                 committed=agent.committed,
                 proposal=agent.proposal,
                 acknowledged=self.acknowledged(i),
@@ -195,27 +194,14 @@ def meeting() -> tuple[Commitments, Commitments]:
 def message_of(agent: Commitments, number: int) -> dict[int, TrajectoryMessage]:
     assert agent.committed is not None
     return {
-        number: TrajectoryMessage(
-            agent=number,
-            boot_id=1,
-            seq=1,
-            sent_utc_us=UTC_US,
-            is_committed=True,
-            committed=agent.committed,
-            proposal=agent.proposal,
-            acknowledged={},
+        number: builders.trajectory_message(
+            agent=number, sent_utc_us=UTC_US, committed=agent.committed, proposal=agent.proposal
         )
     }
 
 
 def wall(x_m: float, agent: Commitments) -> KeepOut:
-    return KeepOut(
-        pos_ned_m=np.tile([x_m, 0.0, -2.0], (agent.steps + 1, 1)),
-        radius_m=0.9,
-        hard_min_distance_m=0.8,
-        any_height=False,
-        priority_id=-1,
-    )
+    return builders.keep_out(pos_ned_m=np.tile([x_m, 0.0, -2.0], (agent.steps + 1, 1)), priority_id=-1)
 
 
 def test_an_evasion_is_found_by_the_peer_it_conflicts_with() -> None:
@@ -253,7 +239,7 @@ def test_an_agent_at_rest_evades_what_approaches() -> None:
             begin_us=UTC_US,
             desired=DesiredReference(at_goal),
             peers={},
-            others=[KeepOut(pos_ned_m=coming, radius_m=0.9, hard_min_distance_m=0.8, any_height=False, priority_id=1)],
+            others=[builders.keep_out(pos_ned_m=coming)],
         )
     )
     assert agent.counts.evaded == 1
@@ -269,16 +255,7 @@ def test_an_agent_that_is_enclosed_evades_upwards(column: bool, passes_m: float)
     agent.begin(np.array([0.0, 0.0, -2.0]), np.zeros(3), UTC_US)
     sides = [[0.0, 0.9, -2.0], [0.0, -0.9, -2.0], [-0.9, 0.0, -2.0]]
     peers = {
-        i: TrajectoryMessage(
-            agent=i,
-            boot_id=1,
-            seq=1,
-            sent_utc_us=UTC_US,
-            is_committed=True,
-            committed=resting(np.array(side), UTC_US, 100_000),
-            proposal=None,
-            acknowledged={},
-        )
+        i: builders.trajectory_message(agent=i, sent_utc_us=UTC_US, committed=resting(np.array(side), UTC_US, 100_000))
         for i, side in enumerate(sides, start=1)
     }
     times_s = 0.1 * np.arange(agent.steps + 1)
@@ -290,7 +267,9 @@ def test_an_agent_that_is_enclosed_evades_upwards(column: bool, passes_m: float)
             desired=DesiredReference(at_goal),
             peers=peers,
             others=[
-                KeepOut(pos_ned_m=coming, radius_m=1.0, hard_min_distance_m=0.9, any_height=column, priority_id=-1)
+                builders.keep_out(
+                    pos_ned_m=coming, radius_m=1.0, hard_min_distance_m=0.9, any_height=column, priority_id=-1
+                )
             ],
         )
     )
@@ -323,7 +302,7 @@ def test_plans_along_a_path_are_linearised_around_it(follows_path: bool, passes:
     agent.committed = ending_at_rest(UTC_US, 100_000, *to_north.sample(np.arange(0.0, 2.1, 0.1)), brake_m_s2=1.5)
     posts = [np.array([0.8, y_m, -2.0]) for y_m in (0.3, 0.6, 0.9, 1.2)]
     wall = [
-        KeepOut(
+        builders.keep_out(
             pos_ned_m=np.tile(post, (agent.steps + 1, 1)),
             radius_m=0.375,
             hard_min_distance_m=0.275,
@@ -357,7 +336,7 @@ def test_a_path_from_rest_begins_at_the_own_speed(runs_up: bool, monkeypatch: py
     agent.begin(here, np.zeros(3), UTC_US)
     posts = [np.array([3.0, y_m, -2.0]) for y_m in (2.802, 2.502, 2.202)]
     wall = [
-        KeepOut(
+        builders.keep_out(
             pos_ned_m=np.tile(post, (agent.steps + 1, 1)),
             radius_m=0.375,
             hard_min_distance_m=0.275,
@@ -395,15 +374,8 @@ def proposing() -> tuple[Commitments, Proposal]:
 
 def acknowledging(number: int) -> dict[int, TrajectoryMessage]:
     return {
-        1: TrajectoryMessage(
-            agent=1,
-            boot_id=1,
-            seq=1,
-            sent_utc_us=UTC_US,
-            is_committed=True,
-            committed=resting(np.array([9.0, 0.0, 0.0]), UTC_US, 100_000),
-            proposal=None,
-            acknowledged={0: number},
+        1: builders.trajectory_message(
+            sent_utc_us=UTC_US, committed=resting(np.array([9.0, 0.0, 0.0]), UTC_US, 100_000), acknowledged={0: number}
         )
     }
 

@@ -8,20 +8,13 @@ import numpy as np
 import pytest
 
 from swarmctl.control.estimation.constant_velocity import predict_constant_velocity
-from swarmctl.core.types import FlightMode, Landed, VehicleState
+from swarmctl.core.types import FlightMode
+from tests import builders
 
 BRAKE_M_S2 = 2.0
 AHEAD_S = np.arange(0.0, 3.01, 0.1)
-STATE = VehicleState(
-    t_us=0,
-    pos_ned_m=np.array([1.0, 2.0, -3.0]),
-    vel_ned_m_s=np.array([2.0, 0.0, 0.0]),
-    q_nb=np.array([1.0, 0.0, 0.0, 0.0]),
-    rate_frd_rad_s=np.zeros(3),
-    armed=True,
-    mode=FlightMode.MANUAL,
-    landed=Landed.IN_AIR,
-    failsafe=False,
+STATE = builders.vehicle_state(
+    pos_ned_m=np.array([1.0, 2.0, -3.0]), vel_ned_m_s=np.array([2.0, 0.0, 0.0]), mode=FlightMode.MANUAL
 )
 
 

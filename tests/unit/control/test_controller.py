@@ -15,9 +15,10 @@ from swarmctl.control.controller import CONTROLLERS, ControllerParams, make_cont
 from swarmctl.control.controller_kind import Controller
 from swarmctl.control.controllers.pid import PidParams
 from swarmctl.control.model import VehicleModelParams
-from swarmctl.control.mpc.problem import Problem, Start
+from swarmctl.control.mpc.problem import Problem
 from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.core.types import Array, Plan, PlanStatus, Reference
+from tests import builders
 
 G = 9.81
 HERE = np.array([1.0, 2.0, -3.0])
@@ -41,22 +42,14 @@ def hover(controller: Controller, offset: tuple[float, ...] = (0.0, 0.0, 0.0), *
     """At rest at HERE, asked to be `offset` from it; exactly as much reference as the controller says it needs."""
     points = controller.longest + 1
     reference = Reference(np.tile(HERE + offset, (points, 1)), np.zeros((points, 3)), 0.0)
-    start = Start(
-        t_us=7_000_000, pos_ned_m=HERE, vel_ned_m_s=np.zeros(3), cos_tilt=1.0, virtual_control=np.array([0.0, 0.0, G])
-    )
+    start = builders.start(t_us=7_000_000, pos_ned_m=HERE, virtual_control=np.array([0.0, 0.0, G]))
     return Problem(
         start=start, reference=reference, disturbance_ned_m_s2=np.zeros(3), keep_outs=keep_outs, guess_ned_m=None
     )
 
 
 def near(controller: Controller, place: Array) -> KeepOut:
-    return KeepOut(
-        pos_ned_m=np.tile(place, (controller.steps + 1, 1)),
-        radius_m=0.9,
-        hard_min_distance_m=0.8,
-        any_height=False,
-        priority_id=1,
-    )
+    return builders.keep_out(pos_ned_m=np.tile(place, (controller.steps + 1, 1)))
 
 
 def check(controller: Controller, plan: Plan) -> None:

@@ -11,6 +11,7 @@ from swarmctl.control.collision.separation import KeepOut
 from swarmctl.control.reference.deadlock import DeadlockParams, DeadlockRecovery, ProgressMonitor
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Array
+from tests import builders
 
 PARAMS = DeadlockParams(behind_m=0.2, moved_m=0.2, patience_s=1.5, near_m=0.4, speed_m_s=1.0)
 WANTED = np.array([5.0, 0.0, -2.0])
@@ -20,9 +21,7 @@ HERE = np.array([0.0, 0.0, -2.0])
 def keep_out(north_m: float, east_m: float = 0.0, priority_id: int = 1, ends_m: float = 0.0) -> KeepOut:
     """A peer (an obstacle with `priority_id` -1) that plans to move `ends_m` north over the horizon."""
     path = np.linspace([north_m, east_m, -2.0], [north_m + ends_m, east_m, -2.0], 41)
-    return KeepOut(
-        pos_ned_m=path, radius_m=0.9, hard_min_distance_m=0.8, any_height=priority_id < 0, priority_id=priority_id
-    )
+    return builders.keep_out(pos_ned_m=path, any_height=priority_id < 0, priority_id=priority_id)
 
 
 def reference(offsets_s: Array) -> tuple[Array, Array]:

@@ -9,7 +9,8 @@ import pytest
 
 from swarmctl.control.estimation.disturbance import DisturbanceObserver, DisturbanceParams
 from swarmctl.core.frames import quat_from_euler
-from swarmctl.core.types import Array, FlightMode, Landed, VehicleState
+from swarmctl.core.types import Array, VehicleState
+from tests import builders
 
 G = 9.81
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
@@ -17,17 +18,7 @@ DT_US = 20_000
 
 
 def sample(t_us: int, vel: Array, q_nb: Array = LEVEL) -> VehicleState:
-    return VehicleState(
-        t_us=t_us,
-        pos_ned_m=np.zeros(3),
-        vel_ned_m_s=vel,
-        q_nb=q_nb,
-        rate_frd_rad_s=np.zeros(3),
-        armed=True,
-        mode=FlightMode.EXTERNAL,
-        landed=Landed.IN_AIR,
-        failsafe=False,
-    )
+    return builders.vehicle_state(t_us=t_us, vel_ned_m_s=vel, q_nb=q_nb)
 
 
 def observe(

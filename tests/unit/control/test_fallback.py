@@ -12,6 +12,7 @@ from swarmctl.control.lag import Lag
 from swarmctl.control.model import acceleration
 from swarmctl.control.mpc.problem import Start
 from swarmctl.core.types import Array, Plan, PlanStatus
+from tests import builders
 
 DT_US = 20_000
 DT_S = 0.02
@@ -22,12 +23,8 @@ NO_WIND = np.zeros(3)
 def start(
     vel: tuple[float, ...], pos: tuple[float, ...] = (0.0, 0.0, -5.0), tilt: tuple[float, ...] = (0.0, 0.0)
 ) -> Start:
-    return Start(
-        t_us=1_000_000,
-        pos_ned_m=np.array(pos),
-        vel_ned_m_s=np.array(vel),
-        cos_tilt=1.0,
-        virtual_control=np.array([*tilt, 9.81]),
+    return builders.start(
+        t_us=1_000_000, pos_ned_m=np.array(pos), vel_ned_m_s=np.array(vel), virtual_control=np.array([*tilt, 9.81])
     )
 
 

@@ -14,10 +14,11 @@ from swarmctl.control.collision.separation import KeepOut, SeparationParams, cer
 from swarmctl.control.model import VehicleModelParams, acceleration
 from swarmctl.control.mpc.axes import Terminal
 from swarmctl.control.mpc.joint_mpc import JointMpc
-from swarmctl.control.mpc.problem import Problem, Start
+from swarmctl.control.mpc.problem import Problem
 from swarmctl.control.mpc.qp import QpParams
 from swarmctl.control.mpc.swarm_mpc import MpcParams, SwarmMpc
 from swarmctl.core.types import Array, Plan, PlanStatus, Reference
+from tests import builders
 
 G = 9.81
 HERE = np.array([1.0, 2.0, -10.0])
@@ -39,9 +40,7 @@ def problem(
     """Go to `goal`, metres from HERE, and be at rest there."""
     reference = Reference(np.tile(HERE + np.array(goal), (61, 1)), np.zeros((61, 3)), 0.0)
     return Problem(
-        start=Start(
-            t_us=0, pos_ned_m=pos, vel_ned_m_s=np.array(vel), cos_tilt=1.0, virtual_control=np.array(virtual_control)
-        ),
+        start=builders.start(pos_ned_m=pos, vel_ned_m_s=np.array(vel), virtual_control=np.array(virtual_control)),
         reference=reference,
         disturbance_ned_m_s2=np.array(wind),
         keep_outs=tuple(keep_outs),
@@ -67,12 +66,8 @@ def four_places(kind: type[JointMpc] | type[SwarmMpc], params: MpcParams) -> Joi
 
 def ball(offset: Point, any_height: bool = False, priority_id: int = -1) -> KeepOut:
     """Return a keep-out of 0.9 m (hard minimum 0.8 m) at `offset` from HERE; an obstacle unless it has an id."""
-    return KeepOut(
-        pos_ned_m=np.tile(HERE + np.array(offset), (41, 1)),
-        radius_m=0.9,
-        hard_min_distance_m=0.8,
-        any_height=any_height,
-        priority_id=priority_id,
+    return builders.keep_out(
+        pos_ned_m=np.tile(HERE + np.array(offset), (41, 1)), any_height=any_height, priority_id=priority_id
     )
 
 
@@ -184,7 +179,7 @@ class Flight:
 
 def _lasting(keep_out: KeepOut, points: int) -> KeepOut:
     still = np.tile(keep_out.pos_ned_m[0], (points, 1))
-    return KeepOut(
+    return builders.keep_out(
         pos_ned_m=still,
         radius_m=keep_out.radius_m,
         hard_min_distance_m=keep_out.hard_min_distance_m,
@@ -288,23 +283,15 @@ def mirrored(asked: Problem, by: Array) -> Problem:
     start, reference = asked.start, asked.reference
     rest = np.array([0.0, 0.0, G])
     return Problem(
-        start=Start(
-            t_us=0,
+        start=builders.start(
             pos_ned_m=turned(start.pos_ned_m),
             vel_ned_m_s=by @ start.vel_ned_m_s,
-            cos_tilt=1.0,
             virtual_control=rest + by @ (start.virtual_control - rest),
         ),
         reference=Reference(turned(reference.pos_ned_m), reference.vel_ned_m_s @ by.T, 0.0),
         disturbance_ned_m_s2=by @ asked.disturbance_ned_m_s2,
         keep_outs=tuple(
-            KeepOut(
-                pos_ned_m=turned(k.pos_ned_m),
-                radius_m=0.9,
-                hard_min_distance_m=0.8,
-                any_height=k.any_height,
-                priority_id=k.priority_id,
-            )
+            builders.keep_out(pos_ned_m=turned(k.pos_ned_m), any_height=k.any_height, priority_id=k.priority_id)
             for k in asked.keep_outs
         ),
         guess_ned_m=None if asked.guess_ned_m is None else turned(asked.guess_ned_m),

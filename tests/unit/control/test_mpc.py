@@ -16,6 +16,7 @@ from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.control.mpc.qp import QpParams
 from swarmctl.control.mpc.swarm_mpc import RESIDUAL_LIMIT_M, MpcParams, SwarmMpc, closest_keep_outs
 from swarmctl.core.types import Array, Plan, PlanStatus, Reference
+from tests import builders
 
 G = 9.81
 HERE = np.array([1.0, 2.0, -3.0])
@@ -24,12 +25,8 @@ HERE = np.array([1.0, 2.0, -3.0])
 def start(
     pos: Array = HERE, vel: tuple[float, ...] = (0.0, 0.0, 0.0), virtual_control: tuple[float, ...] = (0.0, 0.0, G)
 ) -> Start:
-    return Start(
-        t_us=5_000_000,
-        pos_ned_m=pos,
-        vel_ned_m_s=np.array(vel),
-        cos_tilt=1.0,
-        virtual_control=np.array(virtual_control),
+    return builders.start(
+        t_us=5_000_000, pos_ned_m=pos, vel_ned_m_s=np.array(vel), virtual_control=np.array(virtual_control)
     )
 
 
@@ -66,12 +63,8 @@ def plan_to(
 
 
 def fixed(place: Array, allowed_m: float = 0.8, steps: int = 40) -> KeepOut:
-    return KeepOut(
-        pos_ned_m=np.tile(place, (steps + 1, 1)),
-        radius_m=allowed_m + 0.1,
-        hard_min_distance_m=allowed_m,
-        any_height=False,
-        priority_id=1,
+    return builders.keep_out(
+        pos_ned_m=np.tile(place, (steps + 1, 1)), radius_m=allowed_m + 0.1, hard_min_distance_m=allowed_m
     )
 
 
@@ -104,9 +97,7 @@ def test_a_vehicle_at_its_reference_hovers() -> None:
 
 def test_a_tilted_vehicle_needs_more_thrust_to_hover() -> None:
     # (3.11): z'' = g - (f/m) c with c frozen; held at c = 0.9 the equilibrium is g / 0.9
-    begin = Start(
-        t_us=0, pos_ned_m=HERE, vel_ned_m_s=np.zeros(3), cos_tilt=0.9, virtual_control=np.array([0.0, 0.0, G / 0.9])
-    )
+    begin = builders.start(pos_ned_m=HERE, cos_tilt=0.9, virtual_control=np.array([0.0, 0.0, G / 0.9]))
     plan = plan_to((0.0, 0.0, 0.0), begin=begin)
     np.testing.assert_allclose(plan.virtual_control[:, 2], G / 0.9, atol=5e-3)
 
@@ -139,8 +130,8 @@ def test_a_far_reference_is_planned_for_within_the_bounds_of_thrust(down_m: floa
 @pytest.mark.parametrize("ahead", ["planned", "held"])
 def test_the_planned_path_is_the_motion_of_its_own_virtual_controls(ahead: str, cos_tilt: float) -> None:
     wind, vel = np.array([0.3, -0.2, 0.1]), np.array([0.2, 0.1, 0.3])
-    begin = Start(
-        t_us=0, pos_ned_m=HERE, vel_ned_m_s=vel, cos_tilt=cos_tilt, virtual_control=np.array([0.05, 0.0, 8.0])
+    begin = builders.start(
+        pos_ned_m=HERE, vel_ned_m_s=vel, cos_tilt=cos_tilt, virtual_control=np.array([0.05, 0.0, 8.0])
     )
     plan = plan_to((0.5, -0.3, -0.4), begin=begin, wind=tuple(wind), thrust_ahead=ahead)
     assert (
@@ -303,20 +294,14 @@ def test_falling_without_thrust_is_planned_and_not_an_exception(ahead: str, term
 def test_on_its_side_a_vehicle_gets_a_plan_and_not_an_exception() -> None:
     plan = plan_to(
         (0.0, 0.0, -0.1),
-        begin=Start(
-            t_us=0, pos_ned_m=HERE, vel_ned_m_s=np.zeros(3), cos_tilt=0.0, virtual_control=np.array([0.0, 0.0, G])
-        ),
+        begin=builders.start(pos_ned_m=HERE, cos_tilt=0.0, virtual_control=np.array([0.0, 0.0, G])),
     )
     assert np.isfinite(plan.pos_ned_m).all()
 
 
 def wide(place: Array, radius_m: float, any_height: bool = False) -> KeepOut:
-    return KeepOut(
-        pos_ned_m=np.tile(place, (41, 1)),
-        radius_m=radius_m,
-        hard_min_distance_m=radius_m - 0.1,
-        any_height=any_height,
-        priority_id=1,
+    return builders.keep_out(
+        pos_ned_m=np.tile(place, (41, 1)), radius_m=radius_m, hard_min_distance_m=radius_m - 0.1, any_height=any_height
     )
 
 
@@ -360,7 +345,7 @@ def test_from_rest_peers_beyond_the_gate_are_avoided(kind: Literal["dmpc", "dmpc
         params, VehicleModelParams(), SeparationParams(radius_m=1.6), 1, max_keep_outs=2, stopwatch_ns=lambda: 0
     )
     keep_outs = tuple(
-        KeepOut(pos_ned_m=path, radius_m=1.6, hard_min_distance_m=1.55, any_height=False, priority_id=priority_id)
+        builders.keep_out(pos_ned_m=path, radius_m=1.6, hard_min_distance_m=1.55, priority_id=priority_id)
         for path, priority_id in zip(peers, (0, 2), strict=True)
     )
     at_rest = start(np.array([0.45, -0.13, -2.5]))

@@ -9,6 +9,7 @@ from swarmctl.control.collision.separation import KeepOut
 from swarmctl.control.mpc.plan_buffer import PlanBuffer
 from swarmctl.control.mpc.problem import Start
 from swarmctl.core.types import NO_TIMES, Array, Plan, PlanStatus
+from tests import builders
 
 DT_US = 100_000
 STEPS = 10
@@ -41,23 +42,15 @@ def moving(t0_us: int = 0, speed_m_s: float = 2.0, begin_m: float = 0.0, status:
 
 
 def start_at(t_us: int) -> Start:
-    return Start(
-        t_us=t_us,
-        pos_ned_m=np.array([0.0, 0.0, -2.0]),
-        vel_ned_m_s=np.zeros(3),
-        cos_tilt=1.0,
-        virtual_control=np.array([0.0, 0.0, 9.81]),
-    )
+    return builders.start(t_us=t_us, pos_ned_m=np.array([0.0, 0.0, -2.0]))
 
 
 def wall(north_m: float, hard_min_distance_m: float = 0.8) -> KeepOut:
     """Something that stands at height 2 m."""
-    return KeepOut(
+    return builders.keep_out(
         pos_ned_m=np.tile([north_m, 0.0, -2.0], (STEPS + 1, 1)),
         radius_m=hard_min_distance_m + 0.1,
         hard_min_distance_m=hard_min_distance_m,
-        any_height=False,
-        priority_id=1,
     )
 
 

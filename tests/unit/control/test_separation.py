@@ -24,6 +24,7 @@ from swarmctl.control.collision.separation import (
 from swarmctl.control.mpc.axes import HalfSpaces
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Array, PredictedPath
+from tests import builders
 
 UTC_US = 1_700_000_000_000_000
 DT_US = 100_000
@@ -34,9 +35,7 @@ PARAMS = SeparationParams(
 
 
 def peer(points: Array, dt_us: int = DT_US, radius_m: float = 0.0, agent: int = 1) -> PredictedPath:
-    return PredictedPath(
-        agent=agent, boot_id=1, seq=1, t0_utc_us=UTC_US, dt_us=dt_us, radius_m=radius_m, pos_ned_m=points
-    )
+    return builders.predicted_path(agent=agent, t0_utc_us=UTC_US, dt_us=dt_us, radius_m=radius_m, pos_ned_m=points)
 
 
 def straight(speed_m_s: float, points: int = 6, dt_us: int = DT_US) -> PredictedPath:
@@ -115,12 +114,11 @@ def test_a_moving_obstacle_has_constant_velocity_and_limited_visibility() -> Non
 
 
 def fixed(place: tuple[float, float, float], allowed_m: float, any_height: bool = False, steps: int = STEPS) -> KeepOut:
-    return KeepOut(
+    return builders.keep_out(
         pos_ned_m=np.tile(place, (steps + 1, 1)),
         radius_m=allowed_m + 0.1,
         hard_min_distance_m=allowed_m,
         any_height=any_height,
-        priority_id=1,
     )
 
 
@@ -160,13 +158,7 @@ def test_a_path_that_jumps_over_an_obstacle_between_two_samples_is_caught() -> N
 
 
 def test_a_swap_of_places_between_two_samples_is_caught() -> None:
-    other = KeepOut(
-        pos_ned_m=line((10.0, 0.0, 0.0), (0.0, 0.0, 0.0), 5),
-        radius_m=0.9,
-        hard_min_distance_m=0.8,
-        any_height=False,
-        priority_id=1,
-    )
+    other = builders.keep_out(pos_ned_m=line((10.0, 0.0, 0.0), (0.0, 0.0, 0.0), 5))
     own = line((0.0, 0.0, 0.0), (10.0, 0.0, 0.0), 5)  # at no sample nearer than 2 m
     assert certify(own, [other], 0) == pytest.approx(-0.8)
 
@@ -270,9 +262,7 @@ def test_downwash_reaches_higher_than_wide(height_m: float, needed_m: float) -> 
 
 def test_downwash_applies_to_peers_and_not_to_obstacles() -> None:
     params = SeparationParams(downwash=2.0)
-    path = PredictedPath(
-        agent=1, boot_id=1, seq=1, t0_utc_us=0, dt_us=DT_US, radius_m=0.0, pos_ned_m=still((0.0, 0.0, 0.0))
-    )
+    path = builders.predicted_path(dt_us=DT_US, pos_ned_m=still((0.0, 0.0, 0.0)))
     assert keep_out_of_peer(path, 0, DT_US, STEPS, params=params).downwash == 2.0
     ball = Obstacle(
         center_ned_m=(0.0, 0.0, 0.0), radius_m=1.0, keep_out_m=1.75, visibility_m=3.0, vel_ned_m_s=(0.0, 0.0, 0.0)
@@ -333,8 +323,8 @@ def test_plans_keep_more_from_a_peer_that_comes_closer_and_less_the_less_is_left
 
 def test_coincident_agents_take_opposite_sides_by_their_ids() -> None:
     place = (1.0, 2.0, -2.0)
-    other_of_0 = KeepOut(pos_ned_m=still(place), radius_m=0.9, hard_min_distance_m=0.8, any_height=False, priority_id=1)
-    other_of_1 = KeepOut(pos_ned_m=still(place), radius_m=0.9, hard_min_distance_m=0.8, any_height=False, priority_id=0)
+    other_of_0 = builders.keep_out(pos_ned_m=still(place))
+    other_of_1 = builders.keep_out(pos_ned_m=still(place), priority_id=0)
     first = spaces_of(still(place), other_of_0, priority_id=0, goal=(1.0, 2.0))
     second = spaces_of(still(place), other_of_1, priority_id=1, goal=(1.0, 2.0))
     assert np.isfinite(first.normal).all()
@@ -348,13 +338,13 @@ def test_stuck_head_on_agents_turn_to_opposite_sides() -> None:
     north_bound, south_bound = still((0.0, 0.0, 0.0)), still((1.0, 0.0, 0.0))
     a = spaces_of(
         north_bound,
-        KeepOut(pos_ned_m=south_bound, radius_m=0.9, hard_min_distance_m=0.8, any_height=False, priority_id=1),
+        builders.keep_out(pos_ned_m=south_bound),
         priority_id=0,
         goal=(5.0, 0.0),
     )
     b = spaces_of(
         south_bound,
-        KeepOut(pos_ned_m=north_bound, radius_m=0.9, hard_min_distance_m=0.8, any_height=False, priority_id=0),
+        builders.keep_out(pos_ned_m=north_bound, priority_id=0),
         priority_id=1,
         goal=(-5.0, 0.0),
     )
@@ -364,14 +354,12 @@ def test_stuck_head_on_agents_turn_to_opposite_sides() -> None:
     moving = np.linspace((0.0, 0.0, 0.0), (1.0, 0.0, 0.0), STEPS + 1)  # makes progress: peers' normals stay
     c = spaces_of(
         moving,
-        KeepOut(
-            pos_ned_m=still((2.0, 0.0, 0.0)), radius_m=0.9, hard_min_distance_m=0.8, any_height=False, priority_id=1
-        ),
+        builders.keep_out(pos_ned_m=still((2.0, 0.0, 0.0))),
         goal=(5.0, 0.0),
     )
     np.testing.assert_allclose(c.normal[0, 0], [-1.0, 0.0], atol=1e-9)
-    obstacle = KeepOut(
-        pos_ned_m=still((2.0, 0.0, 0.0)), radius_m=0.9, hard_min_distance_m=0.8, any_height=False, priority_id=-1
+    obstacle = builders.keep_out(
+        pos_ned_m=still((2.0, 0.0, 0.0)), priority_id=-1
     )  # obstacles do not evade: always turned
     assert abs(spaces_of(moving, obstacle, goal=(5.0, 0.0)).normal[0, 0, 1]) > 0.3
 
@@ -380,9 +368,7 @@ def test_stuck_head_on_agents_turn_to_opposite_sides() -> None:
 @pytest.mark.parametrize("east_m", [0.05, -0.05])
 def test_obstacles_are_passed_on_the_side_the_agent_is_on(east_m: float, axes: int) -> None:
     moving = np.linspace((0.0, east_m, 0.0), (1.0, east_m, 0.0), STEPS + 1)
-    obstacle = KeepOut(
-        pos_ned_m=still((2.0, 0.0, 0.0)), radius_m=0.9, hard_min_distance_m=0.8, any_height=False, priority_id=-1
-    )
+    obstacle = builders.keep_out(pos_ned_m=still((2.0, 0.0, 0.0)), priority_id=-1)
     spaces = half_spaces(
         [obstacle], moving, np.array([5.0, 0.0, 0.0][:axes]), np.zeros(axes), dt_s=0.1, own_priority_id=0, params=PARAMS
     )
@@ -411,13 +397,7 @@ def test_the_stopping_row_adds_the_braking_distance_only_when_closing() -> None:
 
 
 def test_the_stopping_row_includes_the_motion_of_the_peer() -> None:
-    other = KeepOut(
-        pos_ned_m=line((0.0, 0.0, 0.0), (-1.0, 0.0, 0.0)),
-        radius_m=0.9,
-        hard_min_distance_m=0.8,
-        any_height=False,
-        priority_id=1,
-    )  # 1 m/s south
+    other = builders.keep_out(pos_ned_m=line((0.0, 0.0, 0.0), (-1.0, 0.0, 0.0)))  # 1 m/s south
     params = PARAMS.model_copy(update={"right_of_way_rad": 0.0, "right_of_way_obstacle_rad": 0.0})
     spaces = half_spaces(
         [other],
@@ -455,12 +435,12 @@ def test_positions_within_a_half_space_are_at_least_the_radius_away(seed: int, a
     guess = np.cumsum(rng.normal(0.0, 0.2, (STEPS + 1, 3)), axis=0)
     goal = rng.normal(0.0, 4.0, 3)
     keep_outs = [
-        KeepOut(
+        builders.keep_out(
             pos_ned_m=rng.normal(0.0, 1.0, 3) + np.cumsum(rng.normal(0.0, 0.1, (STEPS + 1, 3)), axis=0),
             radius_m=float(rng.uniform(0.3, 2.0)),
             hard_min_distance_m=0.1,
             any_height=bool(k % 2),
-            priority_id=int(rng.integers(-1, 3)),  # obstacles and peers of both ranks
+            priority_id=int(rng.integers(-1, 3)),
         )
         for k in range(6)
     ]
@@ -510,13 +490,7 @@ def test_in_space_coincident_centres_have_a_side(above_m: float, any_height: boo
     place = (1.0, 2.0, -2.0)
     over = still((1.0, 2.0, -2.0 - (above_m if any_height else 0.0)))  # straight above a cylinder is inside it too
     for priority_id, north in ((0, -1.0), (1, 1.0)):
-        other = KeepOut(
-            pos_ned_m=still(place),
-            radius_m=0.9,
-            hard_min_distance_m=0.8,
-            any_height=any_height,
-            priority_id=1 - priority_id,
-        )
+        other = builders.keep_out(pos_ned_m=still(place), any_height=any_height, priority_id=1 - priority_id)
         spaces = in_space(over, other, priority_id=priority_id, goal=(1.0, 2.0, -2.0))
         np.testing.assert_allclose(spaces.normal[0], np.tile([north, 0.0, 0.0], (STEPS, 1)))
         np.testing.assert_allclose(spaces.offset_m[0], north * 1.0 + 0.9)
@@ -537,26 +511,14 @@ def test_in_space_the_stopping_row_includes_vertical_speed() -> None:
     assert sinking is not None
     assert sinking.stop_s[0] == pytest.approx(2.8 / (2 * 1.4))
     assert sinking.stop_offset_m[0] == pytest.approx(0.9)
-    rising_other = KeepOut(
-        pos_ned_m=line((0.0, 0.0, 0.0), (0.0, 0.0, -1.0)),
-        radius_m=0.9,
-        hard_min_distance_m=0.8,
-        any_height=False,
-        priority_id=1,
-    )  # 1 m/s up
+    rising_other = builders.keep_out(pos_ned_m=line((0.0, 0.0, 0.0), (0.0, 0.0, -1.0)))  # 1 m/s up
     spaces = in_space(still((0.0, 0.0, -3.0)), rising_other)
     assert spaces.stop_s[0] == pytest.approx(1.0 / 2.8)
     assert spaces.stop_offset_m[0] == pytest.approx(1.0 + 0.9 + 1.0 / 2.8)  # -z: where it is then, and the radius
 
 
 def test_in_space_a_climb_counts_as_progress() -> None:
-    peer_ahead = KeepOut(
-        pos_ned_m=np.linspace((1.5, 0.0, -0.2), (1.5, 0.0, -2.2), STEPS + 1),
-        radius_m=0.9,
-        hard_min_distance_m=0.8,
-        any_height=False,
-        priority_id=1,
-    )
+    peer_ahead = builders.keep_out(pos_ned_m=np.linspace((1.5, 0.0, -0.2), (1.5, 0.0, -2.2), STEPS + 1))
     climbing = np.linspace((0.0, 0.0, 0.0), (0.05, 0.0, -2.0), STEPS + 1)  # 2 m, of which 5 cm are not up
     turned = in_space(climbing, peer_ahead, goal=(9.0, 0.0, -2.0)).normal[0, :, 1]
     np.testing.assert_allclose(turned, 0.0, atol=1e-9)

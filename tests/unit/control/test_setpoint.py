@@ -13,7 +13,8 @@ from hypothesis import strategies as st
 from swarmctl.control.model import Predictor, VehicleModelParams, acceleration, tilt_rate
 from swarmctl.control.setpoint import VALID_US, setpoint_of
 from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned, euler_from_quat, quat_from_body_z
-from swarmctl.core.types import Array, FlightMode, Landed, VehicleState
+from swarmctl.core.types import Array, VehicleState
+from tests import builders
 
 MODEL = VehicleModelParams()  # thrust 0.05..1, tilt 0.6 rad
 G = 9.81
@@ -97,17 +98,7 @@ def level_and(north_m_s2: float, east_m_s2: float) -> Array:
 
 def state(t_us: int, pos: tuple[float, ...], vel: tuple[float, ...]) -> VehicleState:
     level = np.array([1.0, 0.0, 0.0, 0.0])
-    return VehicleState(
-        t_us=t_us,
-        pos_ned_m=np.array(pos),
-        vel_ned_m_s=np.array(vel),
-        q_nb=level,
-        rate_frd_rad_s=np.zeros(3),
-        armed=True,
-        mode=FlightMode.EXTERNAL,
-        landed=Landed.IN_AIR,
-        failsafe=False,
-    )
+    return builders.vehicle_state(t_us=t_us, pos_ned_m=np.array(pos), vel_ned_m_s=np.array(vel), q_nb=level)
 
 
 def predicted(predictor: Predictor, now: VehicleState, until_us: int, wind: Array) -> tuple[Array, Array]:

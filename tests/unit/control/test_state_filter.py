@@ -13,7 +13,8 @@ from swarmctl.control.estimation.disturbance import DisturbanceParams
 from swarmctl.control.estimation.state_filter import StateFilter, StateFilterParams
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.core.frames import quat_from_body_z
-from swarmctl.core.types import Array, FlightMode, Landed, VehicleState
+from swarmctl.core.types import Array, VehicleState
+from tests import builders
 
 HOVER_01 = 0.5
 STEP_US = 20_000
@@ -27,17 +28,7 @@ def make(**params: Any) -> StateFilter:
 
 def sample(t_us: int, pos: Array, vel: Array, q_nb: Array | None = None) -> VehicleState:
     level = np.array([1.0, 0.0, 0.0, 0.0]) if q_nb is None else q_nb
-    return VehicleState(
-        t_us=t_us,
-        pos_ned_m=pos,
-        vel_ned_m_s=vel,
-        q_nb=level,
-        rate_frd_rad_s=np.zeros(3),
-        armed=True,
-        mode=FlightMode.EXTERNAL,
-        landed=Landed.IN_AIR,
-        failsafe=False,
-    )
+    return builders.vehicle_state(t_us=t_us, pos_ned_m=pos, vel_ned_m_s=vel, q_nb=level)
 
 
 class World:

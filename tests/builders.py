@@ -1,0 +1,131 @@
+"""Builders of the nouns that many tests need: a test states what it is about, and the rest is an ordinary case.
+
+A new field of a noun has its ordinary value here, so that no other test changes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from swarmctl.control.collision.separation import KeepOut
+from swarmctl.control.mpc.problem import Start
+from swarmctl.core.trajectory import Trajectory
+from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
+from swarmctl.core.types import Array, FlightMode, Landed, PredictedPath, VehicleState
+
+LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
+STILL = np.zeros(3)
+HOVERING = np.array([0.0, 0.0, 9.81])  # u_x, u_y, thrust over mass
+NOBODY: Mapping[int, int] = {}
+
+
+def vehicle_state(
+    *,
+    t_us: int = 0,
+    pos_ned_m: Array = STILL,
+    vel_ned_m_s: Array = STILL,
+    q_nb: Array = LEVEL,
+    rate_frd_rad_s: Array = STILL,
+    armed: bool = True,
+    mode: FlightMode = FlightMode.EXTERNAL,
+    landed: Landed = Landed.IN_AIR,
+    failsafe: bool = False,
+) -> VehicleState:
+    """Return the state of a vehicle: at rest at the origin, level, flying by setpoints."""
+    return VehicleState(
+        t_us=t_us,
+        pos_ned_m=pos_ned_m,
+        vel_ned_m_s=vel_ned_m_s,
+        q_nb=q_nb,
+        rate_frd_rad_s=rate_frd_rad_s,
+        armed=armed,
+        mode=mode,
+        landed=landed,
+        failsafe=failsafe,
+    )
+
+
+def predicted_path(
+    *,
+    pos_ned_m: Array,
+    agent: int = 1,
+    boot_id: int = 1,
+    seq: int = 1,
+    t0_utc_us: int = 0,
+    dt_us: int = 100_000,
+    radius_m: float = 0.0,
+) -> PredictedPath:
+    """Return the path of peer 1 through points (N+1, 3), 0.1 s apart, with no margin of its own."""
+    return PredictedPath(
+        agent=agent,
+        boot_id=boot_id,
+        seq=seq,
+        t0_utc_us=t0_utc_us,
+        dt_us=dt_us,
+        radius_m=radius_m,
+        pos_ned_m=pos_ned_m,
+    )
+
+
+def keep_out(
+    *,
+    pos_ned_m: Array,
+    radius_m: float = 0.9,
+    hard_min_distance_m: float = 0.8,
+    any_height: bool = False,
+    priority_id: int = 1,
+    downwash: float = 1.0,
+) -> KeepOut:
+    """Return a keep-out at points (Hp+1, 3): peer 1, by the distances of the default configuration."""
+    return KeepOut(
+        pos_ned_m=pos_ned_m,
+        radius_m=radius_m,
+        hard_min_distance_m=hard_min_distance_m,
+        any_height=any_height,
+        priority_id=priority_id,
+        downwash=downwash,
+    )
+
+
+def start(
+    *,
+    pos_ned_m: Array,
+    t_us: int = 0,
+    vel_ned_m_s: Array = STILL,
+    cos_tilt: float = 1.0,
+    virtual_control: Array = HOVERING,
+) -> Start:
+    """Return the initial state of a plan: at rest, level, hovering."""
+    return Start(
+        t_us=t_us,
+        pos_ned_m=pos_ned_m,
+        vel_ned_m_s=vel_ned_m_s,
+        cos_tilt=cos_tilt,
+        virtual_control=virtual_control,
+    )
+
+
+def trajectory_message(
+    *,
+    committed: Trajectory,
+    agent: int = 1,
+    boot_id: int = 1,
+    seq: int = 1,
+    sent_utc_us: int = 0,
+    is_committed: bool = True,
+    proposal: Proposal | None = None,
+    acknowledged: Mapping[int, int] = NOBODY,
+) -> TrajectoryMessage:
+    """Return the message of peer 1, which proposes nothing and has acknowledged nobody."""
+    return TrajectoryMessage(
+        agent=agent,
+        boot_id=boot_id,
+        seq=seq,
+        sent_utc_us=sent_utc_us,
+        is_committed=is_committed,
+        committed=committed,
+        proposal=proposal,
+        acknowledged=acknowledged,
+    )
