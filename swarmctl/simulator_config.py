@@ -33,7 +33,7 @@ class WindParams(Params):
     turbulence_m_s: float = Field(0.0, ge=0, le=30)  # wind at 6 m, sets the Dryden intensity; light is 7.7
     gust_ned_m_s: Wind3 = (0.0, 0.0, 0.0)  # peak of a 1-cosine gust
     gust_at_s: float = Field(0.0, ge=0, le=86400)  # after the simulator's start
-    gust_for_s: float = Field(2.0, ge=0.1, le=600)
+    gust_for_s: float = Field(2.0, ge=0.1, le=600)  # duration of the gust
 
 
 class BatteryParams(Params):
@@ -129,7 +129,7 @@ class SimulatorParams(Params):
     thrust_curve_01: float = Field(0.0, ge=0, le=1)  # k in force = (1 - k) u + k u^2 of a rotor's command u; 0 linear
     motor_tau_s: float | None = Field(None, ge=0, le=0.5)  # lag of the rotors; None: that of the airframe
     drag_scale: float = Field(1.0, ge=0, le=10)  # factor on the airframe's drag; 0: none
-    ground_effect: bool = False
+    ground_effect: bool = False  # more thrust close to the ground
     preset: Literal["thesis", "x500", "crazyflie", "arducopter"] = "thesis"  # airframe
     attitude_gains: Literal["swarm", "single", "pid_step", "pid_trajectory"] = "swarm"  # for the thesis airframe only
     start: Literal["ground", "air"] = "ground"  # air: vehicles begin at their start positions, without ground (thesis)
@@ -137,7 +137,7 @@ class SimulatorParams(Params):
     mass_scale: float = Field(1.0, ge=0.3, le=1.9)  # true mass over the preset's, unknown to the bridge
     estimator: Literal["exact", "gps", "external"] = "exact"  # error model of the autopilots' estimates
     autopilot_kind: Literal["px4", "arducopter"] = "px4"  # autopilot whose MAVLink interface is simulated
-    physics_hz: int = Field(250, ge=50, le=1000)
+    physics_hz: int = Field(250, ge=50, le=1000)  # integration steps per second
     gcs_port: int = Field(0, ge=0, le=65535)  # ground station, with a second link to every vehicle; 0: none
     reject_bad_setpoints: bool = True  # false: NaN and zero quaternions have the effects they have on PX4 1.18
     speed: float = Field(1.0, gt=0, le=100)  # simulated over wall time; agents require 1

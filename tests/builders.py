@@ -55,7 +55,7 @@ def predicted_path(
     seq: int = 1,
     t0_utc_us: int = 0,
     dt_us: int = 100_000,
-    radius_m: float = 0.0,
+    margin_m: float = 0.0,
 ) -> PredictedPath:
     """Return the path of peer 1 through points (N+1, 3), 0.1 s apart, with no margin of its own."""
     return PredictedPath(
@@ -64,7 +64,7 @@ def predicted_path(
         seq=seq,
         t0_utc_us=t0_utc_us,
         dt_us=dt_us,
-        radius_m=radius_m,
+        margin_m=margin_m,
         pos_ned_m=pos_ned_m,
     )
 

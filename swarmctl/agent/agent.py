@@ -44,7 +44,7 @@ from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned
 from swarmctl.core.operator_verbs import Order
 from swarmctl.core.tick_record import TickRecord, TickTiming
 from swarmctl.core.types import (
-    MAX_RADIUS_M,
+    MAX_MARGIN_M,
     NO_TIMES,
     Array,
     AttitudeSetpoint,
@@ -528,7 +528,7 @@ class Agent:
 
     def _path(self, state: VehicleState, flown: Plan | None) -> PredictedPath:
         setup, seq = self._setup, self._publisher.seq
-        margin_m = min(MAX_RADIUS_M, self._autopilot.frame.margin_m + self._overload.margin_m)
+        margin_m = min(MAX_MARGIN_M, self._autopilot.frame.margin_m + self._overload.margin_m)
         if flown is not None:
             t0_us, dt_us, pos = self._utc(flown.t0_us), flown.dt_us, flown.pos_ned_m
             return PredictedPath(
@@ -537,7 +537,7 @@ class Agent:
                 seq=seq,
                 t0_utc_us=t0_us,
                 dt_us=dt_us,
-                radius_m=margin_m,
+                margin_m=margin_m,
                 pos_ned_m=pos,
             )
         act_us, dt_us = self._clock.now_us() + self._predictor.delay_us, self._controller.dt_us
@@ -550,7 +550,7 @@ class Agent:
             seq=seq,
             t0_utc_us=self._utc(act_us),
             dt_us=dt_us,
-            radius_m=margin_m,
+            margin_m=margin_m,
             pos_ned_m=pos,
         )
 

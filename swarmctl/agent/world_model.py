@@ -216,7 +216,7 @@ class WorldModel:
             filters = self._flies_itself(path.agent) and path.t0_utc_us >= fresh_us
             age_s = max(0.0, (act_utc_us - path.t0_utc_us) * 1e-6)
             age_margin_m = budget.age_margin_m(age_s, parked=self._phase(path.agent) is Phase.DONE)
-            apart_m = budget.barrier_peer_m(margin_m, path.radius_m, age_margin_m)
+            apart_m = budget.barrier_peer_m(margin_m, path.margin_m, age_margin_m)
             found.append(
                 body_of_peer(path, act_utc_us, ahead_s, apart_m, filters=filters, brake_m_s2=self._params.brake_m_s2)
             )

@@ -17,7 +17,7 @@ import numpy as np
 
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import Order, order_problem
-from swarmctl.core.types import MAX_RADIUS_M, FlightMode, Mode, Phase, PredictedPath
+from swarmctl.core.types import MAX_MARGIN_M, FlightMode, Mode, Phase, PredictedPath
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,7 +67,7 @@ def encode_path(path: PredictedPath) -> bytes:
         path.seq,
         path.t0_utc_us,
         path.dt_us,
-        path.radius_m,
+        path.margin_m,
         len(points),
         _PATH_HEADER.size,
     )
@@ -78,7 +78,7 @@ def decode_path(payload: bytes) -> PredictedPath | None:
     """Decode a path; None unless magic, version, lengths and all numbers are valid."""
     if len(payload) < _PATH_HEADER.size:
         return None
-    magic, version, _, agent, boot_id, seq, t0_utc_us, dt_us, radius_m, count, header_len = _PATH_HEADER.unpack_from(
+    magic, version, _, agent, boot_id, seq, t0_utc_us, dt_us, margin_m, count, header_len = _PATH_HEADER.unpack_from(
         payload
     )
     if magic != _MAGIC or version != PATH_VERSION or header_len < _PATH_HEADER.size:
@@ -86,10 +86,10 @@ def decode_path(payload: bytes) -> PredictedPath | None:
     if not 2 <= count <= MAX_POINTS or dt_us <= 0 or len(payload) != header_len + 12 * count:
         return None
     points = np.frombuffer(payload, "<f4", 3 * count, header_len).reshape(count, 3).astype(np.float64)
-    if not (np.isfinite(points).all() and math.isfinite(radius_m) and 0.0 <= radius_m <= MAX_RADIUS_M):
+    if not (np.isfinite(points).all() and math.isfinite(margin_m) and 0.0 <= margin_m <= MAX_MARGIN_M):
         return None
     return PredictedPath(
-        agent=agent, boot_id=boot_id, seq=seq, t0_utc_us=t0_utc_us, dt_us=dt_us, radius_m=radius_m, pos_ned_m=points
+        agent=agent, boot_id=boot_id, seq=seq, t0_utc_us=t0_utc_us, dt_us=dt_us, margin_m=margin_m, pos_ned_m=points
     )
 
 

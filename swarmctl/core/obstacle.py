@@ -21,12 +21,12 @@ _Vector = Annotated[tuple[_Coordinate, _Coordinate, _Coordinate], Field(strict=F
 class Obstacle(Params):
     """A sphere, or a vertical column of any height, visible to agents only from closer than `visibility_m`."""
 
-    center_ned_m: _Vector
+    center_ned_m: _Vector  # when the launch starts, or when it is added
     column: bool = False  # true: of any height
     radius_m: float = Field(1.0, gt=0, le=1000)  # the obstacle itself, which the safety filter keeps clear of
     keep_out_m: float = Field(1.75, gt=0, le=1000)  # constraint radius from the centre, thesis 1 + 2.5 x 0.3
     visibility_m: float = Field(3.0, gt=0, le=10000)  # agents farther from the centre do not see it
-    vel_ned_m_s: _Vector = (0.0, 0.0, 0.0)
+    vel_ned_m_s: _Vector = (0.0, 0.0, 0.0)  # constant
 
     @property
     def axes(self) -> int:

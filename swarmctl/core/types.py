@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-MAX_RADIUS_M = 10.0  # limit of the radius in a path, so that one peer cannot ground all others
+MAX_MARGIN_M = 10.0  # limit of the margin in a path, so that one peer cannot ground all others
 Sampled = Callable[[Array], tuple[Array, Array]]  # offsets (K,) [s] from now -> positions, velocities, (K, 3) each
 
 
@@ -140,7 +140,7 @@ class PredictedPath:
     seq: int
     t0_utc_us: int  # time of the first point
     dt_us: int
-    radius_m: float  # margin on top of the swarm's constraint radius
+    margin_m: float  # what peers keep on top of the swarm's required separation
     pos_ned_m: Array  # (N+1, 3)
 
 

@@ -19,7 +19,7 @@ from collections import Counter, deque
 import numpy as np
 import pymap3d
 
-from swarmctl.core.types import MAX_RADIUS_M, Array, GeoOrigin
+from swarmctl.core.types import MAX_MARGIN_M, Array, GeoOrigin
 
 _SAME_M = 0.02  # resolution of GPS_GLOBAL_ORIGIN: 1e-7 degrees, 11 mm
 _JUMP_M = 0.3  # smaller steps are corrections of the estimator
@@ -155,7 +155,7 @@ class LocalFrame:
         if self._unexplained and t_us - self._jumped_us > _ASKED_US:  # no moved origin has been reported
             self._unexplained = False
             self.jumps += 1
-        wanted_m = min(self.jump_m, MAX_RADIUS_M) if left_m and not self._unexplained else 0.0
+        wanted_m = min(self.jump_m, MAX_MARGIN_M) if left_m and not self._unexplained else 0.0
         widest_m, least_m = self.margin_m + _WIDEN_M_S * since_s, self.margin_m - _NARROW_M_S * since_s
         self.margin_m = max(min(wanted_m, widest_m), least_m)
         if left_m and self.jump_m <= _SHORT_M and t_us - self._jumped_us > _STEADY_US:

@@ -40,7 +40,7 @@ while True:
         seq=seq,
         t0_utc_us=t0_us,
         dt_us=100_000,
-        radius_m=0.0,
+        margin_m=0.0,
         pos_ned_m=np.zeros((5, 3)),
     )
     bus.publish(PATH, encode_path(path))

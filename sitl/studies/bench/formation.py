@@ -186,7 +186,7 @@ class Formation:
                 seq=self._seq,
                 t0_utc_us=utc_us + delay_us,
                 dt_us=dt_us,
-                radius_m=0.0,
+                margin_m=0.0,
                 pos_ned_m=path,
             )
             bus.publish(topics.PATH, topics.encode_path(message))

@@ -156,7 +156,7 @@ class Pilot:
             seq=1,
             t0_utc_us=plan.t0_us,
             dt_us=plan.dt_us,
-            radius_m=0.0,
+            margin_m=0.0,
             pos_ned_m=plan.pos_ned_m,
         )
 

@@ -149,8 +149,8 @@ def keep_out_of_peer(
     budget = params.budget
     return KeepOut(
         pos_ned_m=align(path, t0_utc_us, dt_us, steps, brake_m_s2=params.brake_m_s2) if points is None else points,
-        radius_m=budget.planned_peer_m(path.radius_m, budget.age_margin_m(age_s, parked)),
-        hard_min_distance_m=budget.certified_peer_m(path.radius_m),
+        radius_m=budget.planned_peer_m(path.margin_m, budget.age_margin_m(age_s, parked)),
+        hard_min_distance_m=budget.certified_peer_m(path.margin_m),
         any_height=landing or (age_s > params.lost_after_s and not parked),
         priority_id=path.agent,
         downwash=params.downwash,

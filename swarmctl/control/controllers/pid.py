@@ -23,15 +23,15 @@ from swarmctl.core.types import NO_TIMES, Array, Plan, PlanStatus, Reference
 class PidParams(Params):
     """Sets gains (kP, kI, kD) in the thesis' signs; the defaults are its trajectory set."""
 
-    derivative: Literal["error", "measurement"] = "error"
+    derivative: Literal["error", "measurement"] = "error"  # what the derivative is taken of
     x: Vec3 = (-0.25, -0.001, -0.3)  # m -> rad of pitch
     y: Vec3 = (0.05, 0.0, 0.45)  # m -> rad of roll
     z: Vec3 = (-3.5, -0.001, -4.0)  # m -> m/s2 of thrust over mass
     accel_feed_forward: float = Field(0.0, ge=0, le=1.5)  # share of the reference's acceleration; thesis 0
-    tilt_max_rad: float = Field(0.5, gt=0, lt=1.5)
-    thrust_max_m_s2: float = Field(20.0, gt=9.9, le=100)
+    tilt_max_rad: float = Field(0.5, gt=0, lt=1.5)  # largest roll and pitch
+    thrust_max_m_s2: float = Field(20.0, gt=9.9, le=100)  # largest thrust over mass
     integral_max: float = Field(5.0, ge=0, le=1e3)  # m s
-    dt_s: float = Field(0.02, gt=0.001, le=0.5)
+    dt_s: float = Field(0.02, gt=0.001, le=0.5)  # time between two ticks
     path_steps: int = Field(40, ge=2, le=200)  # points of the shared path, at constant velocity
 
 

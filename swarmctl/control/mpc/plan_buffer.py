@@ -45,7 +45,7 @@ class PlanBuffer:
             seq=0,
             t0_utc_us=plan.t0_us,
             dt_us=plan.dt_us,
-            radius_m=0.0,
+            margin_m=0.0,
             pos_ned_m=plan.pos_ned_m,
         )
         return align(path, t0_us, self._dt_us, self._steps, brake_m_s2=self._brake_m_s2)

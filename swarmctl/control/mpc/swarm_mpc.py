@@ -50,12 +50,12 @@ class MpcParams(Params):
     x: AxisWeights = AxisWeights(q_pos=1.5, q_vel=0.5, r=0.01)
     y: AxisWeights = AxisWeights(q_pos=1.5, q_vel=0.5, r=0.01)
     thrust_min_m_s2: float = Field(0.0, ge=-20, le=9)  # thesis -20 (a rotor can't pull)
-    thrust_max_m_s2: float = Field(20.0, gt=9.9, le=100)
+    thrust_max_m_s2: float = Field(20.0, gt=9.9, le=100)  # largest thrust over mass
     dthrust_max_m_s2: float = Field(5.0, gt=0, le=100)  # per step
     u_max: float = Field(0.2, gt=0, lt=1)  # sine of the tilt, each axis
     du_max: float = Field(0.05, gt=0, lt=1)  # per step
     terminal_z: Terminal = "region"  # thesis: an equality, which limit-cycles with half a tick of delay
-    terminal_xy: Terminal = "none"
+    terminal_xy: Terminal = "none"  # the same for x-y
     qp: QpParams = QpParams()
 
     def vertical(self) -> Axis:

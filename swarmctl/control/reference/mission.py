@@ -87,8 +87,8 @@ class HoverParams(MissionKind):
 class CircleParams(MissionKind):
     """Describes a climbing circle `center + (r cos wt, r sin wt, climb t)` (thesis 4.3; tracking sets have r 0.5)."""
 
-    center_ned_m: Vec3 = (0.0, 0.0, -1.0)
-    radius_m: float = Field(5.0, ge=0, le=1000)
+    center_ned_m: Vec3 = (0.0, 0.0, -1.0)  # of the circle at mission start
+    radius_m: float = Field(5.0, ge=0, le=1000)  # of the circle
     omega_rad_s: float = Field(0.5, ge=-10, le=10)  # positive is clockwise seen from above
     climb_ned_m_s: float = Field(-0.1, ge=-20, le=20)  # negative is up
 
@@ -108,8 +108,8 @@ class CircleParams(MissionKind):
 class LineParams(MissionKind):
     """Describes a straight line at constant velocity (thesis 4.4)."""
 
-    origin_ned_m: Vec3 = (2.0, 2.0, -2.0)
-    velocity_ned_m_s: Vec3 = (1.5, 0.7, -0.1)
+    origin_ned_m: Vec3 = (2.0, 2.0, -2.0)  # position at mission start
+    velocity_ned_m_s: Vec3 = (1.5, 0.7, -0.1)  # along the line
 
     def reference(self, place: Place) -> Sampled:
         origin, velocity = np.array(self.origin_ned_m), np.array(self.velocity_ned_m_s)
@@ -120,7 +120,7 @@ class LineParams(MissionKind):
 class StepsParams(MissionKind):
     """Describes piecewise constant positions: rows of `[from_s, x, y, z]` in order of time (thesis 2.4)."""
 
-    rows: tuple[Waypoint, ...] = Field(((0.0, 1.0, 1.0, -1.0),), strict=False)
+    rows: tuple[Waypoint, ...] = Field(((0.0, 1.0, 1.0, -1.0),), strict=False)  # the first from 0 s on
 
     def reference(self, place: Place) -> Sampled:
         rows = np.array(self.rows)
@@ -136,7 +136,7 @@ class StepsParams(MissionKind):
 class SwapParams(MissionKind):
     """Lets every agent fly smoothly to the point opposite its start, in `travel_s`."""
 
-    travel_s: float = Field(8.0, gt=0, le=600)
+    travel_s: float = Field(8.0, gt=0, le=600)  # from one point to the other
 
     def reference(self, place: Place) -> Sampled:
         start = place.start_ned_m

@@ -48,9 +48,9 @@ STATUS = topics.StatusMessage(
 )
 
 
-def path(points: np.ndarray = POINTS, dt_us: int = 20_000, radius_m: float = 0.5) -> PredictedPath:
+def path(points: np.ndarray = POINTS, dt_us: int = 20_000, margin_m: float = 0.5) -> PredictedPath:
     return builders.predicted_path(
-        agent=4, boot_id=0xFFFFFFFF, seq=123_456, t0_utc_us=UTC_US, dt_us=dt_us, radius_m=radius_m, pos_ned_m=points
+        agent=4, boot_id=0xFFFFFFFF, seq=123_456, t0_utc_us=UTC_US, dt_us=dt_us, margin_m=margin_m, pos_ned_m=points
     )
 
 
@@ -58,7 +58,7 @@ def test_a_path_survives_encoding() -> None:
     decoded = decode_path(topics.encode_path(path()))
     assert decoded is not None
     assert (decoded.agent, decoded.boot_id, decoded.seq) == (4, 0xFFFFFFFF, 123_456)
-    assert (decoded.t0_utc_us, decoded.dt_us, decoded.radius_m) == (UTC_US, 20_000, 0.5)
+    assert (decoded.t0_utc_us, decoded.dt_us, decoded.margin_m) == (UTC_US, 20_000, 0.5)
     np.testing.assert_array_equal(decoded.pos_ned_m, POINTS)
     assert decoded.pos_ned_m.dtype == np.float64
 
@@ -140,8 +140,8 @@ def test_hostile_bodies_behind_a_good_beginning_give_a_sane_path_or_none(tail: b
     if decoded is not None:
         assert np.isfinite(decoded.pos_ned_m).all()
         assert decoded.dt_us > 0
-        assert math.isfinite(decoded.radius_m)
-        assert decoded.radius_m >= 0.0
+        assert math.isfinite(decoded.margin_m)
+        assert decoded.margin_m >= 0.0
 
 
 json_values = st.recursive(

@@ -213,7 +213,7 @@ def path(t0_us: int, vel: tuple[float, float, float] = (1.0, 0.0, 0.0), points: 
 
 def body(known: PredictedPath, act_us: int, ahead_s: float = 0.0, filters: bool = True) -> Body:
     age_margin_m = BUDGET.age_margin_m(max(0.0, (act_us - known.t0_utc_us) * 1e-6), parked=False)
-    apart_m = BUDGET.barrier_peer_m(PARAMS.margin_m, known.radius_m, age_margin_m)
+    apart_m = BUDGET.barrier_peer_m(PARAMS.margin_m, known.margin_m, age_margin_m)
     return body_of_peer(known, act_us, ahead_s, apart_m, filters=filters, brake_m_s2=2.0)
 
 

@@ -35,7 +35,7 @@ PARAMS = SeparationParams(
 
 
 def peer(points: Array, dt_us: int = DT_US, radius_m: float = 0.0, agent: int = 1) -> PredictedPath:
-    return builders.predicted_path(agent=agent, t0_utc_us=UTC_US, dt_us=dt_us, radius_m=radius_m, pos_ned_m=points)
+    return builders.predicted_path(agent=agent, t0_utc_us=UTC_US, dt_us=dt_us, margin_m=radius_m, pos_ned_m=points)
 
 
 def straight(speed_m_s: float, points: int = 6, dt_us: int = DT_US) -> PredictedPath:

@@ -8,7 +8,7 @@ import numpy as np
 import pymap3d
 import pytest
 
-from swarmctl.core.types import MAX_RADIUS_M, Array, GeoOrigin
+from swarmctl.core.types import MAX_MARGIN_M, Array, GeoOrigin
 from swarmctl.mavlink.local_frame import LocalFrame
 
 SHARED = GeoOrigin(47.397742, 8.545594, 489.4)
@@ -178,7 +178,7 @@ def test_a_step_that_the_estimator_tells_of_is_bridged_however_small() -> None:
 def test_a_margin_that_no_peer_would_accept_is_not_published() -> None:
     vehicle = jumped(flying(), UP * 100.0)
     vehicle.fly(20.0)
-    assert vehicle.frame.margin_m == MAX_RADIUS_M
+    assert vehicle.frame.margin_m == MAX_MARGIN_M
 
 
 def test_on_the_ground_an_estimator_may_settle() -> None:
