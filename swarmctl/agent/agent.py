@@ -27,6 +27,7 @@ from swarmctl.agent.setup import AgentSetup
 from swarmctl.agent.telemetry_publisher import ControlOutput, PlanningResult, TelemetryPublisher, TickSink
 from swarmctl.agent.world_model import FLOWN_BY_AGENT, WorldModel
 from swarmctl.bus import topics
+from swarmctl.bus.path_messages import encode_path
 from swarmctl.bus.peers import Bus
 from swarmctl.control.collision.separation import KeepOut, radius_problem
 from swarmctl.control.estimation.accuracy import AccuracyMonitor
@@ -523,7 +524,7 @@ class Agent:
 
     def _share(self, state: VehicleState | None, flown: Plan | None) -> None:
         if state is not None:
-            self._bus.publish(topics.PATH, topics.encode_path(self._path(state, flown)))
+            self._bus.publish(topics.PATH, encode_path(self._path(state, flown)))
         self._separation.publish(self._clock.utc_us())
 
     def _path(self, state: VehicleState, flown: Plan | None) -> PredictedPath:

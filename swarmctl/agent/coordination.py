@@ -9,8 +9,8 @@ import numpy as np
 
 from swarmctl.agent.world_model import WorldModel
 from swarmctl.bus import topics
+from swarmctl.bus.commitment_messages import PeerTrajectories, encode_trajectory_message
 from swarmctl.bus.peers import Bus, agent_name
-from swarmctl.bus.trajectory_messages import PeerTrajectories, encode_trajectory_message
 from swarmctl.control.collision.separation import KeepOut, SeparationParams
 from swarmctl.control.commit.protocol import CommitCounts, Commitments
 from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference, Situation

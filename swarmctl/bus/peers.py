@@ -14,9 +14,10 @@ from typing import NamedTuple, Protocol
 
 import numpy as np
 
+from swarmctl.bus.path_messages import decode_path
 from swarmctl.bus.refusals import FUTURE, IDENTITY, LATE, MALFORMED, UNKNOWN_PEER, Refusals
 from swarmctl.bus.senders import Attendance, ReceivedMessage, SenderVerifier
-from swarmctl.bus.topics import PATH, TOO_LONG, TOPICS, Topic, decode_path
+from swarmctl.bus.topics import PATH, TOO_LONG, TOPICS, Topic
 from swarmctl.core.types import PredictedPath
 
 MAX_AGE_US = 2_000_000

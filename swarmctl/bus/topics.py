@@ -1,23 +1,21 @@
 """Messages of the bus: one table of topics, and the layout of every message.
 
-Paths are a little-endian struct header and float32 points, ticks are `core.records` rows, the rest is msgspec JSON.
+Predicted paths are encoded in `path_messages.py`, commitments in `commitment_messages.py`, ticks are `core.records`
+rows; the rest is msgspec JSON, here.
 A bus delivers no message that is too long for its topic. Decoders check bounds and return None for anything that does
 not fit; they never raise.
 """
 
 from __future__ import annotations
 
-import math
-import struct
 from dataclasses import dataclass
 from typing import Annotated, Any, TypeVar
 
 import msgspec
-import numpy as np
 
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import Order, order_problem
-from swarmctl.core.types import MAX_MARGIN_M, FlightMode, Mode, Phase, PredictedPath
+from swarmctl.core.types import FlightMode, Mode, Phase
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -42,10 +40,6 @@ TOO_LONG = b""  # replaces a message that is too long; every decoder refuses it
 
 OPERATOR = "operator"  # sender name of the launcher and of operator verbs
 
-PATH_VERSION = 1
-MAX_POINTS = 250
-_PATH_HEADER = struct.Struct("<2sBBIIIqifBB2x")  # magic ver flags agent boot seq t0 dt radius n hdr_len
-_MAGIC = b"SP"
 _Message = TypeVar("_Message")
 
 MAX_OBSTACLES = 64  # each visible one takes 20 us of a tick of 20 ms; 6000 took 130 ms
@@ -53,44 +47,6 @@ _OBSTACLE_KEYS = {"center_ned_m", "radius_m", "keep_out_m", "visibility_m"}  # n
 MAX_VERSION_STEP = 64  # largest step of the list's version; an extreme one would lock out all later ones
 Word = Annotated[str, msgspec.Meta(max_length=32)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
-
-
-def encode_path(path: PredictedPath) -> bytes:
-    """Encode a predicted path."""
-    points = np.ascontiguousarray(path.pos_ned_m, dtype="<f4")
-    header = _PATH_HEADER.pack(
-        _MAGIC,
-        PATH_VERSION,
-        0,
-        path.agent,
-        path.boot_id,
-        path.seq,
-        path.t0_utc_us,
-        path.dt_us,
-        path.margin_m,
-        len(points),
-        _PATH_HEADER.size,
-    )
-    return header + points.tobytes()
-
-
-def decode_path(payload: bytes) -> PredictedPath | None:
-    """Decode a path; None unless magic, version, lengths and all numbers are valid."""
-    if len(payload) < _PATH_HEADER.size:
-        return None
-    magic, version, _, agent, boot_id, seq, t0_utc_us, dt_us, margin_m, count, header_len = _PATH_HEADER.unpack_from(
-        payload
-    )
-    if magic != _MAGIC or version != PATH_VERSION or header_len < _PATH_HEADER.size:
-        return None
-    if not 2 <= count <= MAX_POINTS or dt_us <= 0 or len(payload) != header_len + 12 * count:
-        return None
-    points = np.frombuffer(payload, "<f4", 3 * count, header_len).reshape(count, 3).astype(np.float64)
-    if not (np.isfinite(points).all() and math.isfinite(margin_m) and 0.0 <= margin_m <= MAX_MARGIN_M):
-        return None
-    return PredictedPath(
-        agent=agent, boot_id=boot_id, seq=seq, t0_utc_us=t0_utc_us, dt_us=dt_us, margin_m=margin_m, pos_ned_m=points
-    )
 
 
 class StatusMessage(msgspec.Struct, frozen=True):

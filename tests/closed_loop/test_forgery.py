@@ -13,9 +13,10 @@ import pytest
 
 from sitl.lockstep import Lockstep
 from swarmctl.bus import topics
+from swarmctl.bus.commitment_messages import decode_trajectory_message, encode_trajectory_message
+from swarmctl.bus.path_messages import encode_path
 from swarmctl.bus.peers import agent_name
 from swarmctl.bus.senders import ReceivedMessage, SenderVerifier, _Stream
-from swarmctl.bus.trajectory_messages import decode_trajectory_message, encode_trajectory_message
 from swarmctl.core.types import Mode, Phase
 from swarmctl.telemetry.referee import RunData, judge
 from tests import builders
@@ -62,7 +63,7 @@ def forge_paths(running: Lockstep) -> None:
         away = np.tile([60.0, 20.0 * agent, -2.0], (26, 1))
         for boot, seq in ((STRANGER, 1), (running.config.seed * 1000 + agent, LAST)):
             path = builders.predicted_path(agent=agent, boot_id=boot, seq=seq, t0_utc_us=at_us, pos_ned_m=away)
-            say(running, topics.PATH, topics.encode_path(path), agent)
+            say(running, topics.PATH, encode_path(path), agent)
 
 
 def overhear(heard: list[bytes], topic: topics.Topic) -> Callable[[Lockstep], None]:

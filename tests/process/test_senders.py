@@ -11,10 +11,11 @@ from collections.abc import Callable, Iterator
 import numpy as np
 import pytest
 
+from swarmctl.bus.path_messages import encode_path
 from swarmctl.bus.peers import PeerPaths, agent_name
 from swarmctl.bus.refusals import Refusals
 from swarmctl.bus.senders import SILENCE_US, Attendance
-from swarmctl.bus.topics import PATH, encode_path
+from swarmctl.bus.topics import PATH
 from swarmctl.bus.zenoh_bus import ZenohBus
 from tests import builders
 from tests.process.test_bus import WAIT_S, end, endpoint, join, start_router  # noqa: F401  (fixtures)
@@ -28,7 +29,8 @@ import sys, time
 import numpy as np
 from swarmctl.core.types import PredictedPath
 from swarmctl.bus.zenoh_bus import ZenohBus
-from swarmctl.bus.topics import PATH, encode_path
+from swarmctl.bus.path_messages import encode_path
+from swarmctl.bus.topics import PATH
 bus = ZenohBus(sys.argv[1], "run", "agent-1", {}, lease_ms=1000)
 seq = 0
 while True:

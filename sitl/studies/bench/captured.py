@@ -27,7 +27,7 @@ from sitl.lockstep import Lockstep
 from sitl.studies.bench.slsqp import KEPT_M, NonlinearAnswer, NonlinearXy
 from swarmctl.config import Config, load
 from swarmctl.control.collision.separation import SeparationParams
-from swarmctl.control.controller_kind import Controller
+from swarmctl.control.controllers.kind import Controller
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, HalfSpaces
 from swarmctl.control.mpc.problem import Problem

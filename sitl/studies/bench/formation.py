@@ -16,6 +16,7 @@ import numpy as np
 from sitl.world import SitlWorld
 from swarmctl.agent.assembly import make_agent
 from swarmctl.bus import topics
+from swarmctl.bus.path_messages import encode_path
 from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.config import Config, load
 from swarmctl.core.clock import SimClock
@@ -189,7 +190,7 @@ class Formation:
                 margin_m=0.0,
                 pos_ned_m=path,
             )
-            bus.publish(topics.PATH, topics.encode_path(message))
+            bus.publish(topics.PATH, encode_path(message))
             if now_us % _STATUS_EVERY_US == 0:
                 bus.publish(topics.STATUS, topics.encode_message(self._status(i + 1, began_s >= 0.0)))
         if now_us % _OBSTACLES_EVERY_US == 0:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from swarmctl.control.controller_kind import ControllerKind, ControllerSetup
+from swarmctl.control.controllers.kind import ControllerKind, ControllerSetup
 from swarmctl.control.mpc.swarm_mpc import MpcParams, SwarmMpc
 
 

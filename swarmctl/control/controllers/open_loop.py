@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from swarmctl.control.controller_kind import ControllerKind, ControllerSetup
+from swarmctl.control.controllers.kind import ControllerKind, ControllerSetup
 from swarmctl.control.mpc.problem import Problem
 from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.core.types import NO_TIMES, Plan, PlanStatus

@@ -13,7 +13,7 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from swarmctl.control.controller_kind import ControllerKind
+from swarmctl.control.controllers.kind import ControllerKind
 from swarmctl.control.mpc.problem import Problem
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.params import Params, Vec3

@@ -11,8 +11,9 @@ import pytest
 from swarmctl.agent.coordination import Coordination
 from swarmctl.agent.world_model import WorldModel
 from swarmctl.bus import topics
+from swarmctl.bus.commitment_messages import decode_trajectory_message, encode_trajectory_message
+from swarmctl.bus.path_messages import encode_path
 from swarmctl.bus.peers import LocalBus, LocalHub, agent_name
-from swarmctl.bus.trajectory_messages import decode_trajectory_message, encode_trajectory_message
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference
 from swarmctl.control.mpc.swarm_mpc import MpcParams
@@ -86,7 +87,7 @@ class Bench:
         path = builders.predicted_path(
             seq=self.seq, t0_utc_us=utc_us, dt_us=20_000, pos_ned_m=np.tile(path_at, (41, 1))
         )
-        self.peer.publish(topics.PATH, topics.encode_path(path))
+        self.peer.publish(topics.PATH, encode_path(path))
         if not silent:
             message = builders.trajectory_message(
                 seq=self.seq, sent_utc_us=utc_us, committed=resting(PLACE, utc_us, 100_000), acknowledged=acknowledged

@@ -12,6 +12,7 @@ import pytest
 
 from swarmctl.agent.world_model import WorldModel
 from swarmctl.bus import topics
+from swarmctl.bus.path_messages import encode_path
 from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.core.clock import SimClock
@@ -49,7 +50,7 @@ class Bench:
         path = builders.predicted_path(
             boot_id=boot_id, seq=self.seq, t0_utc_us=self.clock.utc_us(), dt_us=TICK_US, pos_ned_m=np.tile(HERE, (5, 1))
         )
-        self.peer.publish(topics.PATH, topics.encode_path(path))
+        self.peer.publish(topics.PATH, encode_path(path))
 
     def say_status(self, **fields: Any) -> None:
         said = msgspec.structs.replace(STATUS, agent=1, ticks=self.seq, ready_utc_us=0)
@@ -121,7 +122,7 @@ def test_a_peer_refused_for_long_counts_as_bus_loss_and_is_avoided_at_any_height
         bench.seq += 1
         ahead = bench.clock.utc_us() + 600_000
         path = builders.predicted_path(seq=bench.seq, t0_utc_us=ahead, dt_us=TICK_US, pos_ned_m=np.tile(HERE, (5, 1)))
-        bench.peer.publish(topics.PATH, topics.encode_path(path))
+        bench.peer.publish(topics.PATH, encode_path(path))
     utc_us = bench.clock.utc_us()
     assert bench.world_model.has_unresponsive_peer(utc_us)
     (kept,) = bench.world_model.keep_outs(HERE, utc_us, 100_000, 5, phase=Phase.TRACK)

@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from swarmctl.bus.path_messages import encode_path
 from swarmctl.bus.peers import LEASE_US, LocalBus, LocalHub, PeerPaths, agent_name
 from swarmctl.bus.refusals import Refusals
 from swarmctl.bus.senders import Attendance
-from swarmctl.bus.topics import COMMAND, PATH, TICK, TOO_LONG, encode_path
+from swarmctl.bus.topics import COMMAND, PATH, TICK, TOO_LONG
 from swarmctl.core.clock import SimClock
 from tests import builders
 

@@ -11,9 +11,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarmctl.bus import topics
-from swarmctl.bus.topics import decode_command, decode_obstacles, decode_path, decode_status, encode_message
-from swarmctl.bus.trajectory_messages import MAX_ACKNOWLEDGED, MAX_POINTS, encode_trajectory_message
+from swarmctl.bus import path_messages, topics
+from swarmctl.bus.commitment_messages import MAX_ACKNOWLEDGED, MAX_POINTS, encode_trajectory_message
+from swarmctl.bus.path_messages import decode_path, encode_path
+from swarmctl.bus.topics import decode_command, decode_obstacles, decode_status, encode_message
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import OPERATOR_VERBS, OperatorVerb, Order, VerbArgument
 from swarmctl.core.records import TICK_DTYPE
@@ -55,7 +56,7 @@ def path(points: np.ndarray = POINTS, dt_us: int = 20_000, margin_m: float = 0.5
 
 
 def test_a_path_survives_encoding() -> None:
-    decoded = decode_path(topics.encode_path(path()))
+    decoded = decode_path(encode_path(path()))
     assert decoded is not None
     assert (decoded.agent, decoded.boot_id, decoded.seq) == (4, 0xFFFFFFFF, 123_456)
     assert (decoded.t0_utc_us, decoded.dt_us, decoded.margin_m) == (UTC_US, 20_000, 0.5)
@@ -64,7 +65,7 @@ def test_a_path_survives_encoding() -> None:
 
 
 def test_bytes_of_a_path_parsed_by_hand() -> None:
-    payload = topics.encode_path(path())
+    payload = encode_path(path())
     assert payload[:4] == b"SP\x01\x00"
     assert struct.unpack_from("<III", payload, 4) == (4, 0xFFFFFFFF, 123_456)
     assert struct.unpack_from("<q", payload, 16) == (UTC_US,)
@@ -75,7 +76,7 @@ def test_bytes_of_a_path_parsed_by_hand() -> None:
 
 
 def changed(offset: int, code: str, value: float) -> bytes:
-    payload = bytearray(topics.encode_path(path()))
+    payload = bytearray(encode_path(path()))
     struct.pack_into(code, payload, offset, value)
     return bytes(payload)
 
@@ -90,9 +91,9 @@ def test_a_number_that_is_not_finite_is_refused(number: int, bad: float) -> None
     "payload",
     [
         b"",
-        topics.encode_path(path())[:35],
-        topics.encode_path(path())[:-1],
-        topics.encode_path(path()) + b"\x00",
+        encode_path(path())[:35],
+        encode_path(path())[:-1],
+        encode_path(path()) + b"\x00",
         changed(0, "<B", ord("X")),
         changed(2, "<B", 2),  # a version from the future
         changed(24, "<i", 0),  # dt
@@ -105,8 +106,8 @@ def test_a_number_that_is_not_finite_is_refused(number: int, bad: float) -> None
         changed(33, "<B", 35),  # header length
         changed(33, "<B", 0),
         changed(32, "<H", 4 | 24 << 8),  # four points from within the header: the length would fit
-        topics.encode_path(path(POINTS[:1])),
-        topics.encode_path(path(np.zeros((251, 3)))),
+        encode_path(path(POINTS[:1])),
+        encode_path(path(np.zeros((251, 3)))),
     ],
 )
 def test_malformed_paths_are_refused(payload: bytes) -> None:
@@ -115,7 +116,7 @@ def test_malformed_paths_are_refused(payload: bytes) -> None:
 
 @pytest.mark.parametrize("count", [2, 250])
 def test_limits_of_the_number_of_points_are_inclusive(count: int) -> None:
-    decoded = decode_path(topics.encode_path(path(np.full((count, 3), 1.0))))
+    decoded = decode_path(encode_path(path(np.full((count, 3), 1.0))))
     assert decoded is not None
     assert len(decoded.pos_ned_m) == count
 
@@ -135,7 +136,7 @@ def test_hostile_bytes_give_none(payload: bytes) -> None:
 
 @given(st.binary(min_size=68, max_size=68), st.integers(0, 40))
 def test_hostile_bodies_behind_a_good_beginning_give_a_sane_path_or_none(tail: bytes, keep: int) -> None:
-    good = topics.encode_path(path())
+    good = encode_path(path())
     decoded = decode_path(good[: 4 + keep] + tail[: len(good) - 4 - keep])
     if decoded is not None:
         assert np.isfinite(decoded.pos_ned_m).all()
@@ -304,8 +305,10 @@ def test_lists_and_numbers_from_outside_are_bounded() -> None:
 
 
 def test_the_longest_good_message_of_every_topic_fits() -> None:
-    path = builders.predicted_path(agent=0, boot_id=0, seq=0, dt_us=1, pos_ned_m=np.zeros((topics.MAX_POINTS, 3)))
-    assert len(topics.encode_path(path)) <= topics.PATH.max_bytes
+    path = builders.predicted_path(
+        agent=0, boot_id=0, seq=0, dt_us=1, pos_ned_m=np.zeros((path_messages.MAX_POINTS, 3))
+    )
+    assert len(encode_path(path)) <= topics.PATH.max_bytes
     trajectory = Trajectory(
         t0_utc_us=0, dt_us=1, pos_ned_m=np.zeros((MAX_POINTS, 3)), vel_ned_m_s=np.zeros((MAX_POINTS, 3))
     )
@@ -319,7 +322,7 @@ def test_the_longest_good_message_of_every_topic_fits() -> None:
         acknowledged=acknowledged,
     )
     assert len(encode_trajectory_message(message)) <= topics.TRAJECTORY.max_bytes
-    assert TICK_DTYPE.itemsize + 12 * topics.MAX_POINTS <= topics.TICK.max_bytes
+    assert TICK_DTYPE.itemsize + 12 * path_messages.MAX_POINTS <= topics.TICK.max_bytes
     status = msgspec.structs.replace(STATUS, outcome="x" * 4000, active_alert="\u20ac" * 4000)
     assert len(encode_message(status)) <= topics.STATUS.max_bytes
     assert len(encode_message(topics.CommandMessage("resume", -1, 2**62))) <= topics.COMMAND.max_bytes

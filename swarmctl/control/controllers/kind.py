@@ -50,7 +50,7 @@ class ControllerSetup:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ControllerKind(Generic[P]):
-    """Declares a controller that a configuration can choose, once in its module in `swarmctl/control/controllers/`."""
+    """Declares a controller that a configuration can choose, once in its module of this package."""
 
     name: str  # value of `controller.kind`
     section: str  # name of the section of the configuration with its parameters, which several may share

@@ -1,4 +1,7 @@
-"""The controllers that a configuration can choose from: all that modules of `control/controllers/` declare."""
+"""The controllers that a configuration can choose from: one for each that a module of this package declares.
+
+A module is found by being there, so that a new controller is one new file with a `ControllerKind` (`kind.py`).
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from swarmctl.control import controllers
 from swarmctl.control.collision.separation import SeparationParams
-from swarmctl.control.controller_kind import Controller, ControllerKind, ControllerSetup
+from swarmctl.control.controllers.kind import Controller, ControllerKind, ControllerSetup
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.core.params import Params, with_sections
@@ -17,9 +20,10 @@ from swarmctl.core.params import Params, with_sections
 
 def _declared() -> Iterator[ControllerKind[Any]]:
     """Yield every declaration, in the order of the modules' names."""
-    for module in pkgutil.iter_modules(controllers.__path__, f"{controllers.__name__}."):
-        found = vars(importlib.import_module(module.name)).values()
-        yield from (value for value in found if isinstance(value, ControllerKind))
+    for module in pkgutil.iter_modules(controllers.__path__):
+        if module.name != "registry":
+            found = vars(importlib.import_module(f"{controllers.__name__}.{module.name}")).values()
+            yield from (value for value in found if isinstance(value, ControllerKind))
 
 
 # by name; those that follow a reference come first

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from swarmctl.bus.commitment_messages import PeerTrajectories, decode_trajectory_message, encode_trajectory_message
 from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.bus.refusals import Refusals
 from swarmctl.bus.senders import Attendance
-from swarmctl.bus.trajectory_messages import PeerTrajectories, decode_trajectory_message, encode_trajectory_message
 from swarmctl.core.clock import SimClock
 from swarmctl.core.trajectory import Trajectory, ending_at_rest, joined, resting, stopping
 from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage

@@ -1,0 +1,56 @@
+"""Bytes of predicted paths: a little-endian struct header and float32 points.
+
+A field more is a new `PATH_VERSION`; receivers take the length of the header from the message.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+
+import numpy as np
+
+from swarmctl.core.types import MAX_MARGIN_M, PredictedPath
+
+PATH_VERSION = 1
+MAX_POINTS = 250
+_HEADER = struct.Struct(
+    "<2sBBIIIqifBB2x"
+)  # magic, version, flags, agent, boot, seq, t0, dt, margin, points, own length
+_MAGIC = b"SP"
+
+
+def encode_path(path: PredictedPath) -> bytes:
+    """Encode a predicted path."""
+    points = np.ascontiguousarray(path.pos_ned_m, dtype="<f4")
+    header = _HEADER.pack(
+        _MAGIC,
+        PATH_VERSION,
+        0,
+        path.agent,
+        path.boot_id,
+        path.seq,
+        path.t0_utc_us,
+        path.dt_us,
+        path.margin_m,
+        len(points),
+        _HEADER.size,
+    )
+    return header + points.tobytes()
+
+
+def decode_path(payload: bytes) -> PredictedPath | None:
+    """Decode a path; None unless magic, version, lengths and all numbers are valid."""
+    if len(payload) < _HEADER.size:
+        return None
+    magic, version, _, agent, boot_id, seq, t0_utc_us, dt_us, margin_m, count, header_len = _HEADER.unpack_from(payload)
+    if magic != _MAGIC or version != PATH_VERSION or header_len < _HEADER.size:
+        return None
+    if not 2 <= count <= MAX_POINTS or dt_us <= 0 or len(payload) != header_len + 12 * count:
+        return None
+    points = np.frombuffer(payload, "<f4", 3 * count, header_len).reshape(count, 3).astype(np.float64)
+    if not (np.isfinite(points).all() and math.isfinite(margin_m) and 0.0 <= margin_m <= MAX_MARGIN_M):
+        return None
+    return PredictedPath(
+        agent=agent, boot_id=boot_id, seq=seq, t0_utc_us=t0_utc_us, dt_us=dt_us, margin_m=margin_m, pos_ned_m=points
+    )
