@@ -179,17 +179,17 @@ def test_others_keep_clear_of_an_agent_without_a_solver(fly: Fly) -> None:
 
 def test_a_plan_that_would_come_too_close_is_not_flown(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
     """The QP has no half-spaces and the safety filter is off: only the certifier, which is separate code, remains."""
-    monkeypatch.setattr(mpc, "half_spaces", lambda *_: None)
+    monkeypatch.setattr(mpc, "half_spaces", lambda *_, **__: None)
     flight = fly("mission.duration_s=8", AIR, "agent.barrier.enabled=false")
     certified = flight.separation_m()
-    monkeypatch.setattr(mpc, "certify", lambda *_: 1.0)
+    monkeypatch.setattr(mpc, "certify", lambda *_, **__: 1.0)
     uncertified = fly("mission.duration_s=5", AIR, "agent.barrier.enabled=false").separation_m()
     assert uncertified < 0.3 < 0.6 < certified
 
 
 def test_ten_seconds_of_bus_silence(fly: Fly) -> None:
     def silence(running: Lockstep) -> None:
-        running.hub.carry = lambda *_: None  # type: ignore[method-assign]
+        running.hub.carry = lambda *_, **__: None  # type: ignore[method-assign]
 
     def speak(running: Lockstep) -> None:
         del running.hub.carry

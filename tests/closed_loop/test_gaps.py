@@ -65,7 +65,7 @@ def test_an_agent_stopped_for_a_third_of_a_second_continues_before_a_failsafe_ac
 def test_negative_control_who_waits_to_be_told_the_mode_loses_the_vehicle(
     fly: Fly, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(Autopilot, "_ask_for", lambda *_: None)
+    monkeypatch.setattr(Autopilot, "_ask_for", lambda *_, **__: None)
     flight = fly_stopped_for(fly, 0.32)
     assert is_overridden(flight)
 

@@ -169,7 +169,7 @@ def test_a_restarted_agent_leaves_control_to_an_active_failsafe() -> None:
 def test_negative_control_streaming_to_a_vehicle_that_is_not_ours_takes_it(monkeypatch: pytest.MonkeyPatch) -> None:
     def switch_off() -> None:
         monkeypatch.setattr(state_machine, "_is_under_other_control", lambda state: False)
-        monkeypatch.setattr(MissionStateMachine, "_request_control", lambda *_: [])  # streaming is enough
+        monkeypatch.setattr(MissionStateMachine, "_request_control", lambda *_, **__: [])  # streaming is enough
 
     flight = restarted_while_the_autopilot_flies_home(switch_off)
     assert flight.setpoints_us

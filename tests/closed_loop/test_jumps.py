@@ -46,7 +46,7 @@ def test_a_jump_of_the_estimate_keeps_distances_and_is_reported(fly: Fly) -> Non
 def test_negative_control_a_jump_that_is_believed_at_once_ends_in_a_collision(
     fly: Fly, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(LocalFrame, "_fit", lambda *_: None)
+    monkeypatch.setattr(LocalFrame, "_fit", lambda *_, **__: None)
     flight, _ = fly_with_a_jump(fly)
     assert flight.separation_m() < flight.config.separation.body_m
     assert "estimate_jumped" not in flight.event_names(0)

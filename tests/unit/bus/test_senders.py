@@ -95,7 +95,7 @@ def test_controls_without_these_rules_one_message_is_enough(monkeypatch: pytest.
         assert bench.offer(TRUE, LAST)
         bench.ticks(50)
         assert len(bench.accepted) == 51, "the true sender is locked out"
-    monkeypatch.setattr(SenderVerifier, "_is_confirmed", lambda *_: True)
+    monkeypatch.setattr(SenderVerifier, "_is_confirmed", lambda *_, **__: True)
     bench = Bench()
     bench.ticks(50)
     assert bench.offer(FORGED, 1)

@@ -215,7 +215,7 @@ def test_every_solver_status_is_checked(
     monkeypatch: pytest.MonkeyPatch, residual_m: float, solved: bool, status: PlanStatus
 ) -> None:
     mpc = SwarmMpc(MpcParams(), VehicleModelParams(), SeparationParams(), 0, max_keep_outs=2, stopwatch_ns=lambda: 0)
-    monkeypatch.setattr(mpc._xy_alone, "solve", lambda *_: solution(residual_m, solved))
+    monkeypatch.setattr(mpc._xy_alone, "solve", lambda *_, **__: solution(residual_m, solved))
     assert mpc.plan(problem()).status is status
 
 

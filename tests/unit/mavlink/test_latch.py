@@ -239,7 +239,7 @@ def test_a_flood_costs_the_tick_nothing_and_loses_nothing_of_the_vehicle(port: s
 def test_negative_control_without_the_kernels_help_the_drain_is_bounded_but_frames_are_lost(
     port: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(transport, "admit_only", lambda *_: None)
+    monkeypatch.setattr(transport, "admit_only", lambda *_, **__: None)
     link = UdpTransport(port, None, heartbeat_of(SYSID))
     worst_ms, sent, got, rate_hz = fly_through_flood(link, port.getsockname()[1], 2.0)
     print(f"flood {rate_hz:.0f}/s: worst drain {worst_ms:.2f} ms, {got} of {sent} frames")
