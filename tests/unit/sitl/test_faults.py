@@ -248,11 +248,6 @@ def test_scheduled_faults_happen_at_their_time_and_are_logged() -> None:
     ]
 
 
-def test_a_world_refuses_faults_of_vehicles_it_lacks() -> None:
-    with pytest.raises(ConfigError, match="vehicle = 5: allowed: 0 to 1"):
-        FlownWorld(2, realism={"faults": [{"kind": "gps_loss", "vehicle": 5}]})
-
-
 @pytest.mark.parametrize(
     ("wanted", "complaints"),
     [
