@@ -108,8 +108,8 @@ def test_a_reboot_is_silence_and_then_a_new_beginning() -> None:
     bench.run(0.45)
     bench.forget()
     bench.run(1.2)
-    assert not bench.heard
-    assert not bench.gcs_heard
+    assert not bench.received
+    assert not bench.gcs_received
     assert bench.command(400, 1) is None  # nobody listens
     bench.run(0.6)
     (beat, *_) = bench.said(BEAT)

@@ -71,9 +71,9 @@ def test_a_first_version_frame_is_obeyed() -> None:
 
 def test_every_default_message_goes_out_and_holds_sense() -> None:
     bench = Bench("x500", every_stream=True, wait_s=3.2)
-    assert set(bench.heard) >= set(OFFBOARD_HZ)
+    assert set(bench.received) >= set(OFFBOARD_HZ)
     for message in LACKING:
-        for frame in bench.heard[message]:
+        for frame in bench.received[message]:
             body = frame[:-2]
             seed = bytes([KINDS[message].crc_extra])
             assert crc16.mcrf4xx(body[1:] + seed).to_bytes(2, "little") == frame[-2:]
