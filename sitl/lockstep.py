@@ -86,7 +86,7 @@ class FlightLog:
 
 
 class Lockstep:
-    """Steps one flight.
+    """Steps the world and all agents of one flight, tick by tick.
 
     Args:
         config: the run.
@@ -118,7 +118,7 @@ class Lockstep:
         self.logs = [FlightLog(directory=directory, agent=i, clock=self.clock) for i in range(agents)]
         self.fault_events: list[dict[str, Any]] = []
         self.world.faults.on_event = self._on_fault
-        self._operator = self.hub.attach(topics.OPERATOR)
+        self._operator = self.hub.connect(topics.OPERATOR)
         self._own = dict(own or {})
         self.agents: list[Agent | None] = [self._agent(i, self.links[i][0]) for i in range(agents)]
         self.frozen: set[int] = set()  # agents whose process is stopped: alive on the bus, but not ticking
@@ -135,7 +135,7 @@ class Lockstep:
 
     def _agent(self, index: int, transport: Any) -> Agent:
         log = self.logs[index]
-        bus = self.hub.attach(agent_name(index))
+        bus = self.hub.connect(agent_name(index))
         boot_id = self.config.seed * 1000 + index
         config = self._own.get(index, self.config)
         return make_agent(

@@ -61,12 +61,12 @@ def simulate(config: Config, directory: Path) -> int:
     summary, unwritten = finished.summary, (*unwritten, *finished.unwritten)
     if not unwritten:
         _write_recording(config, directory)
-    say = PlainLines(sys.stdout).say  # to a terminal that may have been closed
+    print_line = PlainLines(sys.stdout).print_line  # to a terminal that may have been closed
     for line in (*violation_lines(summary), *summary_lines(summary, directory)):
-        say(line)
-    say(f"{speed_factor:.1f} x real time")
+        print_line(line)
+    print_line(f"{speed_factor:.1f} x real time")
     if unwritten:
-        say(unwritten_line(directory, unwritten))
+        print_line(unwritten_line(directory, unwritten))
     if stop.count:
         return EXIT_INTERRUPTED
     return EXIT_OK if summary["outcome"] == "completed" and not unwritten else EXIT_MISSION

@@ -63,7 +63,7 @@ class MavlinkInterface(Protocol):
 
     @property
     def transport(self) -> Transport:
-        """The link."""
+        """Return the link to the client."""
 
     @property
     def ignored(self) -> Counter[str]:

@@ -67,17 +67,17 @@ class Witness:
         self._sock.setblocking(False)
         self._codec = Codec(255, 190)
         self.armed: dict[int, bool] = {}
-        self.heard_s: dict[int, float] = {}
+        self.received_s: dict[int, float] = {}
         self.ever: set[int] = set()
 
-    def listen(self) -> None:
+    def receive(self) -> None:
         with contextlib.suppress(BlockingIOError):
             while True:
                 for frame in frames(self._sock.recv(4096)):
                     message = self._codec.decode(frame) if frame[7:10] == b"\0\0\0" and frame[6] == 1 else None
                     if message is not None:
                         self.armed[frame[5]] = bool(message.base_mode & 128)
-                        self.heard_s[frame[5]] = time.monotonic()
+                        self.received_s[frame[5]] = time.monotonic()
                         self.ever |= {frame[5]} if message.base_mode & 128 else set()
 
     def close(self) -> None:
@@ -171,12 +171,12 @@ def _fly(cell: Cell, path: Path, folder: Path, witness: Witness) -> tuple[bool, 
         stop(cell, launch, run_dir)
         stopped_s = time.monotonic()
         while time.monotonic() - stopped_s < SAFE_S:
-            witness.listen()
-            fresh = all(s > stopped_s + 2.0 for s in witness.heard_s.values()) and len(witness.heard_s) > 0
+            witness.receive()
+            fresh = all(s > stopped_s + 2.0 for s in witness.received_s.values()) and len(witness.received_s) > 0
             if launch.poll() is not None and fresh and not any(witness.armed.values()) and _alone(folder):
                 break
             time.sleep(0.05)
-        witness.listen()
+        witness.receive()
         took_s = time.monotonic() - stopped_s
         left = sorted(i for i, armed in witness.armed.items() if armed and cell.concerns(i))
         said = log.read_text(errors="replace")
@@ -201,7 +201,7 @@ def _alone(folder: Path) -> bool:
 def _reach(cell: Cell, run_dir: Path, launch: subprocess.Popen[bytes], witness: Witness) -> bool:
     deadline_s = time.monotonic() + START_S
     while (cell.phase if cell.phase != "HOLD" else "TRACK") not in phases(run_dir):
-        witness.listen()
+        witness.receive()
         if launch.poll() is not None or time.monotonic() > deadline_s:
             return False
         time.sleep(0.01)

@@ -155,7 +155,7 @@ class ArduCopter:
     def flight_mode(self) -> FlightMode:
         return FLIGHT_MODES.get(self.mode, FlightMode.MANUAL)
 
-    def say(self, severity: Severity, text: str) -> None:
+    def send_text(self, severity: Severity, text: str) -> None:
         """Queue a STATUSTEXT on every link."""
         for box in self._outboxes:
             box.append((severity, text))
@@ -205,13 +205,13 @@ class ArduCopter:
         if self.mode in NO_ARMING_IN:
             reasons = (*reasons, f"Arm: {self.mode.name} mode not armable")
         for reason in reasons:
-            self.say(Severity.CRITICAL, reason)
+            self.send_text(Severity.CRITICAL, reason)
         if reasons or self._estimate is None:
             return Result.FAILED
         self.armed = True
         self._land_detector.armed_at(now_us)
         self._set_home(self._estimate)
-        self.say(Severity.INFO, "Arming motors")
+        self.send_text(Severity.INFO, "Arming motors")
         self._engage()
         return Result.ACCEPTED
 
@@ -227,18 +227,18 @@ class ArduCopter:
     def _disarm(self) -> None:
         self.armed = self.failsafe = False
         self.output, self.throttle_in_01 = IDLE, 0.0
-        self.say(Severity.INFO, "Disarming motors")
+        self.send_text(Severity.INFO, "Disarming motors")
 
     def set_mode(self, number: int) -> Result:
         """Change the mode by command; while disarmed any mode can be set."""
         if number not in set(CopterMode):
             known = NOT_FLOWN_HERE.get(number)
             text = f"Mode change to {known} failed: init failed" if known else f"No such mode {number}"
-            self.say(Severity.WARNING, text)
+            self.send_text(Severity.WARNING, text)
             return Result.FAILED
         mode = CopterMode(number)
         if self.armed and mode in NEEDS_POSITION and not self.has_origin:
-            self.say(Severity.WARNING, f"Mode change to {mode.name} failed: requires position")
+            self.send_text(Severity.WARNING, f"Mode change to {mode.name} failed: requires position")
             return Result.FAILED
         if mode != self.mode:
             self._enter(mode)
@@ -263,12 +263,12 @@ class ArduCopter:
             self._enter_guided(Guided.TAKEOFF)
         return Result.ACCEPTED
 
-    def gcs_heard(self, now_us: int) -> None:
+    def on_gcs_heartbeat(self, now_us: int) -> None:
         """Take a HEARTBEAT from SYSID_MYGCS."""
         self._gcs_us = now_us
         if self.failsafe:
             self.failsafe = False
-            self.say(Severity.WARNING, "GCS Failsafe Cleared")
+            self.send_text(Severity.WARNING, "GCS Failsafe Cleared")
 
     def _enter(self, mode: CopterMode) -> None:
         self.mode = mode
@@ -319,7 +319,7 @@ class ArduCopter:
             self._enter(CopterMode.STABILIZE)
         if not self.has_origin and now_us >= self.boot.origin_us:
             self.has_origin = True
-            self.say(Severity.INFO, "EKF3 IMU0 origin set")
+            self.send_text(Severity.INFO, "EKF3 IMU0 origin set")
             self._set_home(estimate)
 
     def _set_home(self, estimate: Estimate) -> None:
@@ -332,7 +332,7 @@ class ArduCopter:
             return
         if now_us - self._gcs_us > self.parameters.real("FS_GCS_TIMEOUT") * 1e6:
             self.failsafe = True
-            self.say(Severity.WARNING, "GCS Failsafe")
+            self.send_text(Severity.WARNING, "GCS Failsafe")
             self._enter(CopterMode.LAND if action in (4, 5, 7) else CopterMode.RTL)
 
     def _lifts_off(self, now_us: int) -> bool:

@@ -182,7 +182,7 @@ class ArduCopterEndpoint:
 
     def _on_heartbeat(self, message: Any) -> None:
         if message.get_srcSystem() == self._pilot.parameters.integer("SYSID_MYGCS"):
-            self._pilot.gcs_heard(self._now_us)
+            self._pilot.on_gcs_heartbeat(self._now_us)
 
     def _on_attitude_target(self, m: Any) -> None:
         rates = (m.body_roll_rate, m.body_pitch_rate, m.body_yaw_rate)
@@ -238,7 +238,7 @@ class ArduCopterEndpoint:
     def _set_interval(self, params: Params) -> Result:
         message, interval_us = _whole(params[0]), _whole(params[1])
         if message is None or message not in STREAMS:
-            self._pilot.say(Severity.INFO, f"No ap_message for mavlink id ({message or 0})")
+            self._pilot.send_text(Severity.INFO, f"No ap_message for mavlink id ({message or 0})")
             return Result.DENIED
         if interval_us is None:
             return Result.DENIED

@@ -21,7 +21,7 @@ _STILL = (0.0, 0.0, 0.0)
 
 
 class Guided(enum.Enum):
-    """States of GUIDED."""
+    """Names what GUIDED flies at present."""
 
     STOP = "stop"  # brake and hold
     TAKEOFF = "takeoff"

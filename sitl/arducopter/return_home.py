@@ -16,7 +16,7 @@ Position = tuple[float, float, float]
 
 
 class ReturnStage(enum.Enum):
-    """Stages of RTL."""
+    """Names the stages of RTL, in the order in which they are flown."""
 
     CLIMB = "climb"
     RETURN = "return"

@@ -54,7 +54,7 @@ class LinkDirection:
         self._look()
 
     def offer(self, now_us: int, data: bytes) -> None:
-        """Enter one datagram."""
+        """Enter one datagram, which may be lost, delayed, repeated or damaged."""
         impairments, rng = self.impairments, self._rng
         if self._happens(impairments.loss_01):
             return

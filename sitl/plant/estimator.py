@@ -229,7 +229,7 @@ class Estimator:
         self._frozen[vehicle] = self.of(vehicle, t_us)
 
     def thaw(self, vehicle: int) -> None:
-        """Resume the estimate."""
+        """Resume an estimate that was frozen."""
         self._frozen.pop(vehicle, None)
 
     def lose_gps(self, vehicle: int) -> None:

@@ -58,9 +58,9 @@ class Physics:
         self.plant.step(self.plant.mixer.allocate(wrench))
         self.estimator.advance()
 
-    def set_rotor_health(self, vehicle: int, rotor: int, share_01: float) -> None:
+    def set_rotor_health(self, vehicle: int, rotor: int, health_01: float) -> None:
         """Limit a rotor to this share of its force."""
-        self.rotor_health_01[rotor, vehicle] = share_01
+        self.rotor_health_01[rotor, vehicle] = health_01
         self._share_force()
 
     def set_mass(self, vehicle: int, ratio: float) -> None:

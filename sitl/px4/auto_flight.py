@@ -60,14 +60,14 @@ class AutoFlight:
         parameters: Parameters,
         navigator: Navigator,
         store: Store,
-        say: Callable[[Severity, str], None],
+        send_text: Callable[[Severity, str], None],
     ) -> None:
         self.origin: LocalOrigin | None = None
         self.origin_alt_m = 0.0
         self._parameters = parameters
         self._navigator = navigator
         self._store = store
-        self._say = say
+        self._send_text = send_text
         self.reset()
 
     def reset(self) -> None:
@@ -94,7 +94,7 @@ class AutoFlight:
         self._navigator.engage(estimate, fresh=fresh)
         if mode == Px4Mode.AUTO_TAKEOFF and self.takeoff_alt_amsl_m is None:
             height_m = self._parameters.real("MIS_TAKEOFF_ALT")
-            self._say(Severity.INFO, f"Using default takeoff altitude: {height_m:.1f} m\t")
+            self._send_text(Severity.INFO, f"Using default takeoff altitude: {height_m:.1f} m\t")
         if mode == Px4Mode.AUTO_MISSION and self.mission_finished:
             self._store.current, self.mission_finished = 0, False
         self._seen_changes = self._store.changes
@@ -110,7 +110,7 @@ class AutoFlight:
     def reposition(self, goal_ned_m: Ned, yaw_rad: float) -> None:
         """Set the place to hold (DO_REPOSITION)."""
         self._goal_ned_m = goal_ned_m
-        self._navigator.face(yaw_rad)
+        self._navigator.set_yaw(yaw_rad)
 
     def fly(
         self, mode: Px4Mode, estimate: Estimate, home_ned_m: Ned | None, armed_us: int, *, now_us: int, dt_s: float
@@ -174,9 +174,9 @@ class AutoFlight:
             self._return_z_m = self._return_height(away_m, home, z_m)
             above_m = home[2] - self._return_z_m
             amsl_m = self.origin_alt_m - self._return_z_m
-            self._say(Severity.INFO, f"RTL: start return at {amsl_m:.0f} m ({above_m:.0f} m above destination)\t")
+            self._send_text(Severity.INFO, f"RTL: start return at {amsl_m:.0f} m ({above_m:.0f} m above destination)\t")
         if away_m < HOME_REACHED_M:
-            self._say(Severity.INFO, "RTL: land at destination\t")
+            self._send_text(Severity.INFO, "RTL: land at destination\t")
             return self._land(estimate, home, dt_s, home[:2])
         if self._climb_xy_m is None:
             self._climb_xy_m = x_m, y_m
@@ -216,7 +216,7 @@ class AutoFlight:
         if item.command == NAV_DELAY:
             return self._wait(item, estimate, now_us, dt_s)
         goal = self._place(item, home, estimate)
-        self._navigator.face(math.radians(item.params[3]) if item.command != NAV_LAND else math.nan)
+        self._navigator.set_yaw(math.radians(item.params[3]) if item.command != NAV_LAND else math.nan)
         if item.command == NAV_LAND:
             away_m = math.dist(goal[:2], estimate.pos_ned_m[:2])
             if self.phase == Phase.LANDING or away_m < self._parameters.real("NAV_ACC_RAD"):

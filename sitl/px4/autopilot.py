@@ -81,9 +81,9 @@ class Autopilot:
         self.texts: deque[tuple[Severity, str]] = deque(maxlen=64)
         self.store = Store()
         self.stream = OffboardStream(reject_bad=reject_bad_setpoints)
-        self.flight = AutoFlight(parameters, navigator, self.store, self.say)
-        self.watch = Watch(parameters, self.say)
-        self._land_detector = LandDetector(parameters, self.say, airborne=airborne)
+        self.flight = AutoFlight(parameters, navigator, self.store, self.send_text)
+        self.watch = Watch(parameters, self.send_text)
+        self._land_detector = LandDetector(parameters, self.send_text, airborne=airborne)
         self.released = not airborne
         self.position_ok = True
         self.boot = Boot(ekf_ready_us)
@@ -129,7 +129,7 @@ class Autopilot:
 
     # --- what others ask ---
 
-    def say(self, severity: Severity, text: str) -> None:
+    def send_text(self, severity: Severity, text: str) -> None:
         """Queue a STATUSTEXT."""
         self.texts.append((severity, text))
 
@@ -222,11 +222,11 @@ class Autopilot:
         if self.armed:
             return Result.ACCEPTED
         if not self.armable(now_us):
-            self.say(Severity.CRITICAL, _HEALTH_TEXT)
+            self.send_text(Severity.CRITICAL, _HEALTH_TEXT)
             if not self.ready(now_us):
-                self.say(Severity.CRITICAL, "Preflight Fail: no heading reference")
+                self.send_text(Severity.CRITICAL, "Preflight Fail: no heading reference")
             if self.terminated:
-                self.say(Severity.CRITICAL, "Preflight Fail: Flight termination active")
+                self.send_text(Severity.CRITICAL, "Preflight Fail: Flight termination active")
             return Result.TEMPORARILY_REJECTED
         self.armed, self._armed_us = True, now_us
         self._land_detector.arm(now_us)
@@ -236,9 +236,9 @@ class Autopilot:
             if self.has_position:
                 self.home_ned_m = self._estimate.pos_ned_m
             self.flight.engage(self.mode, self._estimate, fresh=True)
-        self.say(Severity.INFO, "Armed by external command\t")
+        self.send_text(Severity.INFO, "Armed by external command\t")
         began = datetime.datetime.fromtimestamp((self.boot_utc_us + now_us) // 1_000_000, datetime.UTC)
-        self.say(Severity.INFO, f"[logger] ./log/{began:%Y-%m-%d/%H_%M_%S}.ulg\t")
+        self.send_text(Severity.INFO, f"[logger] ./log/{began:%Y-%m-%d/%H_%M_%S}.ulg\t")
         if self.mode == Px4Mode.OFFBOARD and self.stream.command is not IDLE:
             self.released, self.output = True, self.stream.command
         return Result.ACCEPTED
@@ -248,7 +248,7 @@ class Autopilot:
         if not self.armed:
             return Result.ACCEPTED
         if self.landed != Landed.ON_GROUND and self.released and not force:
-            self.say(Severity.CRITICAL, "Disarming denied: not landed\t")
+            self.send_text(Severity.CRITICAL, "Disarming denied: not landed\t")
             return Result.TEMPORARILY_REJECTED
         self._disarm("Disarmed by external command\t")
         return Result.ACCEPTED
@@ -260,7 +260,7 @@ class Autopilot:
         self.output = self.stream.command = IDLE
         if not keep_mode:
             self.mode = self.intended = self._resting_mode
-        self.say(Severity.INFO, text)
+        self.send_text(Severity.INFO, text)
 
     def set_mode(
         self, mode: Px4Mode, now_us: int, takeoff_alt_amsl_m: float | None = None, *, tell: bool = True
@@ -274,7 +274,7 @@ class Autopilot:
         if self.armed and not self._can_enter(mode, now_us):
             if tell and now_us - self._refused_us > REFUSED_EVERY_US:
                 self._refused_us = now_us
-                self.say(Severity.CRITICAL, f"Switching to {MODE_NAMES[mode]} is currently not available\t")
+                self.send_text(Severity.CRITICAL, f"Switching to {MODE_NAMES[mode]} is currently not available\t")
             return Result.TEMPORARILY_REJECTED
         self.intended = mode
         if mode not in NOT_KEPT_AFTER_LANDING:
@@ -282,7 +282,7 @@ class Autopilot:
         if mode == Px4Mode.AUTO_TAKEOFF:
             self.flight.takeoff_alt_amsl_m = takeoff_alt_amsl_m
         if mode == Px4Mode.AUTO_LAND and self.armed:
-            self.say(Severity.INFO, "Landing at current position\t")
+            self.send_text(Severity.INFO, "Landing at current position\t")
         self._clear_failsafe()
         self._enter(mode)
         return Result.ACCEPTED
@@ -409,7 +409,7 @@ class Autopilot:
         if action in _ACTION_MODES:
             self._fail(cause, _ACTION_MODES[action])
             return
-        self.say(Severity.CRITICAL, "Failsafe activated\t")
+        self.send_text(Severity.CRITICAL, "Failsafe activated\t")
         if action == Action.TERMINATE:
             self.failsafe = True
             self._stop_for_good()
@@ -420,7 +420,7 @@ class Autopilot:
         """Fly `mode` until a mode is commanded, or until the cause has ended where PX4 then returns by itself."""
         self._delayed = self._resume_us = None
         if not self.failsafe or cause != self._cause:
-            self.say(Severity.CRITICAL, "Failsafe activated\t")
+            self.send_text(Severity.CRITICAL, "Failsafe activated\t")
         self.failsafe, self._cause = True, cause
         mode = mode if self.has_position or mode in FLIES_BLIND else Px4Mode.AUTO_LAND
         if mode != self.mode:

@@ -60,9 +60,9 @@ class Watch:
         fence_broken: it is on the wrong side of an active fence.
     """
 
-    def __init__(self, parameters: Parameters, say: Callable[[Severity, str], None]) -> None:
+    def __init__(self, parameters: Parameters, send_text: Callable[[Severity, str], None]) -> None:
         self._parameters = parameters
-        self._say = say
+        self._send_text = send_text
         self.reset()
 
     def reset(self) -> None:
@@ -77,7 +77,7 @@ class Watch:
         """Take a HEARTBEAT of type 6 from any link."""
         if self._gcs_lost:
             self._gcs_lost = False
-            self._say(Severity.INFO, "GCS connection regained\t")
+            self._send_text(Severity.INFO, "GCS connection regained\t")
         self._gcs_us = now_us
 
     def forget(self) -> None:
@@ -104,7 +104,7 @@ class Watch:
         broken = bool(breaches) and action > Action.NONE
         if broken and not self.fence_broken:
             for text in breaches:
-                self._say(Severity.CRITICAL, text)
+                self._send_text(Severity.CRITICAL, text)
         self.fence_broken = broken
         return action if broken else Action.NONE
 
@@ -115,7 +115,7 @@ class Watch:
         limits = (self._parameters.real(name) for name in ("BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR"))
         level = sum(battery_01 < limit for limit in limits) if math.isfinite(battery_01) else 0
         if level > self.battery_warning:
-            self._say(*BATTERY_TEXTS[level])
+            self._send_text(*BATTERY_TEXTS[level])
         self.battery_warning = max(level, self.battery_warning) if armed else level
         if self.battery_warning < 2:
             return Action.WARN if self.battery_warning else Action.NONE
@@ -127,7 +127,7 @@ class Watch:
         silent = self._gcs_us is None or now_us - self._gcs_us > limit_us
         if silent and self._gcs_us is not None and not self._gcs_lost:
             self._gcs_lost = True
-            self._say(Severity.INFO, "Connection to ground station lost\t")
+            self._send_text(Severity.INFO, "Connection to ground station lost\t")
         return _pick(_LINK_ACTIONS, self._parameters.integer("NAV_DLL_ACT"), Action.NONE) if silent else Action.NONE
 
 

@@ -18,9 +18,9 @@ class LandDetector:
         landed: MAV_LANDED_STATE.
     """
 
-    def __init__(self, parameters: Parameters, say: Callable[[Severity, str], None], *, airborne: bool) -> None:
+    def __init__(self, parameters: Parameters, send_text: Callable[[Severity, str], None], *, airborne: bool) -> None:
         self._parameters = parameters
-        self._say = say
+        self._send_text = send_text
         self._airborne = airborne
         self.reset()
 
@@ -43,7 +43,7 @@ class LandDetector:
         if not on_ground:
             self._contact_us = None
             if self.landed == Landed.ON_GROUND:
-                self._say(Severity.INFO, "Takeoff detected\t")
+                self._send_text(Severity.INFO, "Takeoff detected\t")
             self._flown = True
             self.landed = in_the_air
             return
@@ -51,7 +51,7 @@ class LandDetector:
             self._contact_us = now_us
         if self.landed != Landed.ON_GROUND and now_us - self._contact_us >= LANDED_AFTER_US:
             self.landed, self._landed_us = Landed.ON_GROUND, now_us
-            self._say(Severity.INFO, "Landing detected\t")
+            self._send_text(Severity.INFO, "Landing detected\t")
 
     def disarm_text(self, now_us: int) -> str:
         """Return why an armed vehicle should disarm now; empty while it need not."""

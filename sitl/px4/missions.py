@@ -32,7 +32,7 @@ _UNPLACED = frozenset({NAV_RETURN, NAV_DELAY, DO_JUMP, DO_CHANGE_SPEED})
 
 
 class MissionResult(enum.IntEnum):
-    """Values of MAV_MISSION_RESULT."""
+    """Lists the values of MAV_MISSION_RESULT that are sent."""
 
     ACCEPTED = 0
     ERROR = 1
@@ -67,7 +67,7 @@ class Item(NamedTuple):
 
 
 class Progress(NamedTuple):
-    """Content of MISSION_CURRENT."""
+    """Holds what MISSION_CURRENT says of a mission."""
 
     seq: int
     total: int
@@ -83,7 +83,7 @@ def local_xy_m(origin: LocalOrigin, lat_e7: float, lon_e7: float) -> tuple[float
     )
 
 
-def judge(kind: int, item: Item) -> MissionResult:
+def validate(kind: int, item: Item) -> MissionResult:
     """Return PX4's result for an item of this mission type."""
     if item.frame == _FRAME_MISSION:
         known = kind == MISSION and item.command in _UNPLACED
@@ -98,10 +98,10 @@ def judge(kind: int, item: Item) -> MissionResult:
         return MissionResult.INVALID_PARAM6_Y
     if not math.isfinite(item.z_m) and item.command not in _UNPLACED:
         return MissionResult.INVALID_PARAM7
-    return _judge_fence(item) if kind == FENCE else MissionResult.ACCEPTED
+    return _validate_fence(item) if kind == FENCE else MissionResult.ACCEPTED
 
 
-def _judge_fence(item: Item) -> MissionResult:
+def _validate_fence(item: Item) -> MissionResult:
     if item.command in (CIRCLE_IN, CIRCLE_OUT):
         return MissionResult.ACCEPTED if item.params[0] > 0 else MissionResult.INVALID_PARAM1
     return MissionResult.ACCEPTED if 3 <= item.params[0] <= CAPACITY[FENCE] else MissionResult.INVALID_PARAM1

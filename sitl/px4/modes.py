@@ -85,7 +85,7 @@ def base_mode(mode: Px4Mode, *, armed: bool, streamed: bool) -> int:
 
 
 class MavState(enum.IntEnum):
-    """Values of MAV_STATE."""
+    """Lists the values of MAV_STATE that are sent."""
 
     UNINIT = 0
     STANDBY = 3
@@ -95,7 +95,7 @@ class MavState(enum.IntEnum):
 
 
 class Result(enum.IntEnum):
-    """Values of MAV_RESULT."""
+    """Lists the values of MAV_RESULT that are sent."""
 
     ACCEPTED = 0
     TEMPORARILY_REJECTED = 1
@@ -105,7 +105,7 @@ class Result(enum.IntEnum):
 
 
 class Severity(enum.IntEnum):
-    """Values of MAV_SEVERITY."""
+    """Lists the values of MAV_SEVERITY that are sent."""
 
     EMERGENCY = 0
     CRITICAL = 2
@@ -114,7 +114,7 @@ class Severity(enum.IntEnum):
 
 
 class MissionState(enum.IntEnum):
-    """MISSION_STATE of MISSION_CURRENT."""
+    """Lists the values of MISSION_STATE that MISSION_CURRENT carries."""
 
     NO_MISSION = 1
     NOT_STARTED = 2

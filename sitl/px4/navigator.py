@@ -89,7 +89,7 @@ class Navigator:
         """Hold this height instead of the one where braking ends."""
         self._hold_z_m = z_ned_m
 
-    def face(self, yaw_rad: float) -> None:
+    def set_yaw(self, yaw_rad: float) -> None:
         """Turn the nose to a yaw; NaN leaves it."""
         if math.isfinite(yaw_rad):
             self._yaw_rad = yaw_rad

@@ -205,7 +205,7 @@ class Agent:
         """
         began_ns = self._stopwatch_ns()
         self._watch_deadlines(now_us, deadline_misses)
-        self._listen(now_us)
+        self._receive(now_us)
         state = self._sense(now_us)
         self._state_machine.begin_if_due(now_us, self._clock.utc_us())
         sensed_ns = self._stopwatch_ns()
@@ -218,14 +218,14 @@ class Agent:
         times = NO_TIMES if planning.plan is None else planning.plan.times
         self.timing = TickTiming(
             sense_ms=(sensed_ns - began_ns) * 1e-6,
-            setup_ms=(planned_ns - sensed_ns - self._directive.took_ns) * 1e-6
+            setup_ms=(planned_ns - sensed_ns - self._directive.duration_ns) * 1e-6
             - (times.spaces_us + times.solve_us + times.certify_us) * 1e-3,
-            commitment_ms=self._directive.took_ns * 1e-6,
+            commitment_ms=self._directive.duration_ns * 1e-6,
             spaces_ms=times.spaces_us * 1e-3,
             solve_ms=times.solve_us * 1e-3,
             certify_ms=times.certify_us * 1e-3,
-            barrier_ms=self._safety_filter.took_ms,
-            send_ms=(sent_ns - planned_ns) * 1e-6 - self._safety_filter.took_ms,
+            barrier_ms=self._safety_filter.duration_ms,
+            send_ms=(sent_ns - planned_ns) * 1e-6 - self._safety_filter.duration_ms,
         )
         self._share(state, flown)
         self._advance(now_us, state)
@@ -257,8 +257,8 @@ class Agent:
 
     # -- receive, sense -----------------------------------------------------------------------------------------------
 
-    def _listen(self, now_us: int) -> None:
-        for order in self._world_model.listen(self._clock.utc_us()):
+    def _receive(self, now_us: int) -> None:
+        for order in self._world_model.receive(self._clock.utc_us()):
             self.ask(order, now_us)
         self._separation.receive(self._clock.utc_us())
 
@@ -266,7 +266,7 @@ class Agent:
         state = self._autopilot.poll(now_us)
         self._commands.step(now_us)
         for result in self._commands.results():
-            self._vehicle_setup.took(result)
+            self._vehicle_setup.on_result(result)
             asked = f"{result.command.verb.value} {result.command.name}".rstrip()
             if result.ok:
                 self._alerts.clear(asked)
@@ -428,7 +428,7 @@ class Agent:
 
     def _act(self, now_us: int, flown: Plan | None, start: Start | None) -> AttitudeSetpoint | None:
         if flown is None or start is None:
-            self._safety_filter.rest(now_us)
+            self._safety_filter.skip(now_us)
             return None
         act_us = now_us + self._predictor.delay_us
         step = min(max(0, (act_us - flown.t0_us) // flown.dt_us), len(flown.virtual_control) - 1)

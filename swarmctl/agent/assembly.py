@@ -47,7 +47,7 @@ def make_agent(
     origin = GeoOrigin(swarm.origin_lat_deg, swarm.origin_lon_deg, swarm.origin_alt_m)
     autopilot = Autopilot(transport, codec, sysid, origin, on_frame=on_frame)
     commands = CommandPort(autopilot.send_frame, codec, sysid, lambda: autopilot.dialect)
-    autopilot.attach(commands)
+    autopilot.connect(commands)
     setup = AgentSetup(
         agent=agent,
         boot_id=boot_id,

@@ -63,8 +63,8 @@ class Coordination:
         self._commitments = Commitments(
             agent, params, mpc, separation, max_keep_outs=max_keep_outs, stopwatch_ns=stopwatch_ns
         )
-        refusals, attendance = world_model.refusals, world_model.attendance
-        self._peer_trajectories, self._peers = PeerTrajectories(peers, rate_hz, refusals, attendance), frozenset(peers)
+        refusals, presence = world_model.refusals, world_model.presence
+        self._peer_trajectories, self._peers = PeerTrajectories(peers, rate_hz, refusals, presence), frozenset(peers)
         self._note, self._seq, self._separation = note, 0, separation
         self._is_committed = False
         self._allowed_m = separation.budget.tracking_allowance_m
@@ -113,7 +113,7 @@ class Coordination:
             commitments.propose(
                 Situation(utc_us=utc_us, begin_us=begin_us, desired=desired, peers=known, others=others)
             )
-        self._watch(float(np.linalg.norm(state.pos_ned_m - self.follow(np.array([utc_us]))[0][0])))
+        self._watch(float(np.linalg.norm(state.pos_ned_m - self.sample_committed(np.array([utc_us]))[0][0])))
 
     def idle(self, utc_us: int, state: VehicleState | None) -> None:
         """Commit nothing while a pilot or the autopilot flies, or the state is stale; peers are still acknowledged."""
@@ -123,7 +123,7 @@ class Coordination:
             self._note("commitments", **asdict(self.counts), worst_tracking_m=self._worst_m)
         self._commitments.end(None if state is None else state.pos_ned_m, utc_us)
 
-    def follow(self, t_utc_us: Times) -> tuple[Array, Array]:
+    def sample_committed(self, t_utc_us: Times) -> tuple[Array, Array]:
         """Return committed positions and velocities, (M, 3) NED each, at times (M,)."""
         assert self._commitments.committed is not None
         return self._commitments.committed.sample(t_utc_us)
@@ -194,5 +194,5 @@ class Coordination:
         """
         steps, dt_us = self._commitments.steps, self._commitments.dt_us
         found = self._world_model.keep_outs(state.pos_ned_m, t0_utc_us, dt_us, steps, phase=phase, without=taking_part)
-        spent_m = self._separation.budget.planned_beyond_certified_m
+        spent_m = self._separation.budget.planned_beyond_hard_min_m
         return [replace(k, hard_min_distance_m=max(k.hard_min_distance_m, k.radius_m - spent_m)) for k in found]

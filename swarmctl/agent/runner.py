@@ -118,7 +118,7 @@ def _join(process: AgentProcess, config: Config, clock: WallClock) -> Bus:
     """Connect to the bus of the run, or to an empty local one when there is no router."""
     me = agent_name(process.agent)
     if process.bus == NO_BUS:
-        return LocalHub(clock.now_us).attach(me)
+        return LocalHub(clock.now_us).connect(me)
     peers = [agent_name(i) for i in range(config.swarm.agents) if i != process.agent]
     listen = {
         topics.PATH: peers,

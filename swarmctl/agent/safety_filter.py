@@ -42,7 +42,7 @@ class SafetyFilter:
         self._barrier = Barrier(params, vehicle, dt_s, downwash)
         self._stopwatch_ns = stopwatch_ns
         self._ticks, self._last_us = 0, 0
-        self.acts, self.took_ms = False, 0.0  # in the newest tick
+        self.acts, self.duration_ms = False, 0.0  # in the newest tick
 
     def keep_apart(
         self,
@@ -75,13 +75,13 @@ class SafetyFilter:
                 ),
             )
         self._count(now_us, changed is not None)
-        self.took_ms = (self._stopwatch_ns() - began_ns) * 1e-6
+        self.duration_ms = (self._stopwatch_ns() - began_ns) * 1e-6
         return virtual_control if changed is None else changed
 
-    def rest(self, now_us: int) -> None:
+    def skip(self, now_us: int) -> None:
         """Record a tick in which the agent sends no setpoint."""
         self._count(now_us, False)
-        self.took_ms = 0.0
+        self.duration_ms = 0.0
 
     def _count(self, now_us: int, acts: bool) -> None:
         self.acts = acts

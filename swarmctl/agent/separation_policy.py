@@ -39,7 +39,7 @@ class SeparationDirective:
     committed_peers: Mapping[int, Sequence[Trajectory]] = field(default_factory=dict)  # for the safety filter
     lost_peer_keep_outs: tuple[KeepOut, ...] = ()  # may deadlock an agent, as those of the world model
     unresponsive_peer: bool = False  # the mission has to wait for a peer that may be flying on unseen
-    took_ns: int = 0  # time spent on agreeing with peers
+    duration_ns: int = 0  # time spent on agreeing with peers
 
 
 class SeparationPolicy(Protocol):
@@ -130,13 +130,13 @@ class Guaranteed:
         """Agree with peers, then follow the committed trajectory, which keeps clear of all keep-outs already."""
         began_ns, coordination = self._stopwatch_ns(), self._coordination
         coordination.step(inputs.utc_us, inputs.state, inputs.phase, inputs.desired)
-        took_ns = self._stopwatch_ns() - began_ns
-        pos, vel = coordination.follow(inputs.horizon_utc_us)
+        duration_ns = self._stopwatch_ns() - began_ns
+        pos, vel = coordination.sample_committed(inputs.horizon_utc_us)
         return SeparationDirective(
             reference=Reference(pos, vel, self._yaw_rad),
             committed_peers=coordination.committed_peers,
             lost_peer_keep_outs=tuple(coordination.lost_peer_keep_outs),
-            took_ns=took_ns,
+            duration_ns=duration_ns,
         )
 
     def idle(self, utc_us: int, state: VehicleState | None, keep_outs: Sequence[KeepOut]) -> SeparationDirective:

@@ -9,7 +9,7 @@ from swarmctl.bus import topics
 from swarmctl.bus.orders import Orders
 from swarmctl.bus.peers import Bus, PeerPaths, agent_name
 from swarmctl.bus.refusals import FUTURE, IDENTITY, MALFORMED, SEQUENCE, UNKNOWN_PEER, Refusals
-from swarmctl.bus.senders import Attendance, ReceivedMessage, SenderVerifier
+from swarmctl.bus.senders import Presence, ReceivedMessage, SenderVerifier
 from swarmctl.control.collision.barrier import Body, body_of_obstacle, body_of_peer
 from swarmctl.control.collision.separation import (
     KeepOut,
@@ -40,7 +40,7 @@ class WorldModel:
         params: distances and ages.
         bus: source of messages, drained by `listen`.
         rate_hz: tick rate of every agent.
-        note: receives the events `refused` (see `Refusals`) and `unheard`: a peer on the bus has published no
+        note: receives the events `refused` (see `Refusals`) and `unresponsive`: a peer on the bus has published no
             accepted path for `lost_after_s`; also when that ends, with its duration.
     """
 
@@ -55,24 +55,22 @@ class WorldModel:
         note: Callable[..., None],
     ) -> None:
         self._agent, self._params, self._bus, self._note = agent, params, bus, note
-        self.refusals, self.attendance = Refusals(note), Attendance(bus)
-        self.paths = PeerPaths(peers, rate_hz, self.refusals, self.attendance)
+        self.refusals, self.presence = Refusals(note), Presence(bus)
+        self.paths = PeerPaths(peers, rate_hz, self.refusals, self.presence)
         self._verifiers = {
-            peer: SenderVerifier(
-                agent_name(peer), topics.STATUS.name, rate_hz, self.refusals, attendance=self.attendance
-            )
+            peer: SenderVerifier(agent_name(peer), topics.STATUS.name, rate_hz, self.refusals, presence=self.presence)
             for peer in peers
         }
         self._orders = Orders(agent, self.refusals)
-        self._unheard_since_us: dict[int, int] = {}
+        self._unresponsive_since_us: dict[int, int] = {}
         self._status: dict[int, topics.StatusMessage] = {}
         self._obstacles: tuple[Obstacle, ...] = ()
         self._obstacles_version: int | None = None
         self._seen: dict[int, Obstacle] = {}  # obstacles that have been visible, by identity
 
-    def listen(self, utc_us: int) -> list[Order]:
+    def receive(self, utc_us: int) -> list[Order]:
         """Process everything that has arrived; returns the operator's orders to this agent."""
-        self.attendance.update(utc_us)
+        self.presence.update(utc_us)
         for sender, payload in self._bus.receive(topics.PATH):
             self.paths.offer(sender, payload, utc_us)
         for sender, payload in self._bus.receive(topics.STATUS):
@@ -81,7 +79,7 @@ class WorldModel:
             self._take_obstacles(sender, payload, utc_us)
         orders = [self._orders.take(*received, utc_us) for received in self._bus.receive(topics.COMMAND)]
         self.refusals.report(utc_us)
-        self._watch_unheard(utc_us)
+        self._watch_unresponsive(utc_us)
         return [order for order in orders if order is not None]
 
     def _take_status(self, sender: str, payload: bytes, utc_us: int) -> None:
@@ -112,23 +110,23 @@ class WorldModel:
         elif known is not None and message.version > known:
             self.refusals.add(sender, topics.OBSTACLES.name, SEQUENCE, utc_us)
 
-    def _watch_unheard(self, utc_us: int) -> None:
+    def _watch_unresponsive(self, utc_us: int) -> None:
         """Report peers that are on the bus but whose paths have not been accepted for too long."""
         oldest_us = utc_us - round(self._params.lost_after_s * 1e6)
-        unheard = {
+        unresponsive = {
             path.agent: path.t0_utc_us
             for path in self.paths.latest()
             if path.t0_utc_us < oldest_us and self._is_there(path.agent) and self._phase(path.agent) is not Phase.DONE
         }
-        for agent in unheard.keys() - self._unheard_since_us.keys():
-            self._unheard_since_us[agent] = unheard[agent]
-            self._note("unheard", agent=agent, begins=True)
-        for agent in self._unheard_since_us.keys() - unheard.keys():
-            lasted_s = (utc_us - self._unheard_since_us.pop(agent)) * 1e-6
-            self._note("unheard", agent=agent, begins=False, lasted_s=lasted_s)
+        for agent in unresponsive.keys() - self._unresponsive_since_us.keys():
+            self._unresponsive_since_us[agent] = unresponsive[agent]
+            self._note("unresponsive", agent=agent, begins=True)
+        for agent in self._unresponsive_since_us.keys() - unresponsive.keys():
+            lasted_s = (utc_us - self._unresponsive_since_us.pop(agent)) * 1e-6
+            self._note("unresponsive", agent=agent, begins=False, lasted_s=lasted_s)
 
     def _is_there(self, agent: int) -> bool:
-        return self.attendance.since_us(agent_name(agent)) is not None
+        return self.presence.since_us(agent_name(agent)) is not None
 
     def keep_outs(
         self,
@@ -207,9 +205,11 @@ class WorldModel:
         budget, fresh_us = self._params.budget, act_utc_us - round(self._params.lost_after_s * 1e6)
         found, committed_apart_m = list[Body](), budget.barrier_m(margin_m)
         for agent, trajectories in committed_peers.items():
-            share_01 = 0.5 if self._flies_itself(agent) else 1.0
+            responsibility_01 = 0.5 if self._flies_itself(agent) else 1.0
             for pos, vel in (trajectory.at(act_utc_us + ahead_s * 1e6) for trajectory in trajectories):
-                found.append(Body(pos_ned_m=pos, vel_ned_m_s=vel, apart_m=committed_apart_m, share_01=share_01))
+                found.append(
+                    Body(pos_ned_m=pos, vel_ned_m_s=vel, apart_m=committed_apart_m, responsibility_01=responsibility_01)
+                )
         for path in self.paths.latest():
             if path.agent in committed_peers:
                 continue

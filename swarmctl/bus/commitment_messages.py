@@ -13,7 +13,7 @@ import numpy as np
 
 from swarmctl.bus.peers import MAX_LEAD_US, agent_name
 from swarmctl.bus.refusals import FUTURE, IDENTITY, MALFORMED, UNKNOWN_PEER, Refusals
-from swarmctl.bus.senders import Attendance, ReceivedMessage, SenderVerifier
+from swarmctl.bus.senders import Presence, ReceivedMessage, SenderVerifier
 from swarmctl.bus.topics import TRAJECTORY
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
@@ -127,14 +127,13 @@ class PeerTrajectories:
 
     Args:
         peers: numbers of the other agents.
-        rate_hz, refusals, attendance: see `SenderVerifier`.
+        rate_hz, refusals, presence: see `SenderVerifier`.
     """
 
-    def __init__(self, peers: Iterable[int], rate_hz: float, refusals: Refusals, attendance: Attendance) -> None:
+    def __init__(self, peers: Iterable[int], rate_hz: float, refusals: Refusals, presence: Presence) -> None:
         names = {agent: agent_name(agent) for agent in peers}
         self._verifiers = {
-            a: SenderVerifier(name, TRAJECTORY.name, rate_hz, refusals, attendance=attendance)
-            for a, name in names.items()
+            a: SenderVerifier(name, TRAJECTORY.name, rate_hz, refusals, presence=presence) for a, name in names.items()
         }
         self._refusals = refusals
         self._memory: dict[str, Memory] = {}

@@ -16,7 +16,7 @@ import numpy as np
 
 from swarmctl.bus.path_messages import decode_path
 from swarmctl.bus.refusals import FUTURE, IDENTITY, LATE, MALFORMED, UNKNOWN_PEER, Refusals
-from swarmctl.bus.senders import Attendance, ReceivedMessage, SenderVerifier
+from swarmctl.bus.senders import Presence, ReceivedMessage, SenderVerifier
 from swarmctl.bus.topics import PATH, TOO_LONG, TOPICS, Topic
 from swarmctl.core.types import PredictedPath
 
@@ -58,7 +58,7 @@ class PeerPaths:
 
     Args:
         peers: numbers of the other agents.
-        rate_hz, refusals, attendance: see `SenderVerifier`.
+        rate_hz, refusals, presence: see `SenderVerifier`.
         max_age_us: a path whose first point is older than this when it arrives is refused.
         max_lead_us: a path whose first point is further in the future than this is refused.
     """
@@ -68,14 +68,14 @@ class PeerPaths:
         peers: Iterable[int],
         rate_hz: float,
         refusals: Refusals,
-        attendance: Attendance,
+        presence: Presence,
         *,
         max_age_us: int = MAX_AGE_US,
         max_lead_us: int = MAX_LEAD_US,
     ) -> None:
         names = {agent: agent_name(agent) for agent in peers}
         self._verifiers = {
-            a: SenderVerifier(name, PATH.name, rate_hz, refusals, attendance=attendance) for a, name in names.items()
+            a: SenderVerifier(name, PATH.name, rate_hz, refusals, presence=presence) for a, name in names.items()
         }
         self._max_age_us = max_age_us
         self._max_lead_us = max_lead_us
@@ -158,15 +158,15 @@ class LocalHub:
         for sender, topic, payload in held:
             self.carry(sender, topic, payload)
 
-    def attach(self, name: str, subscriptions: Mapping[Topic, Sequence[str]] | None = None) -> LocalBus:
-        """Join as `name`.
+    def connect(self, name: str, subscriptions: Mapping[Topic, Sequence[str]] | None = None) -> LocalBus:
+        """Join the hub as `name` and return the bus of that participant.
 
         Args:
             name: sender name, free at the moment.
             subscriptions: senders to receive per topic; None receives all but the own messages.
         """
         if name in self._attached:
-            raise ValueError(f"{name!r} is attached already")
+            raise ValueError(f"{name!r} is connected already")
         bus = LocalBus(self, name, subscriptions)
         self._attached[name] = bus
         self._update_presence(joined=name)

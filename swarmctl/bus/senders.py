@@ -42,7 +42,7 @@ _MAX_CONTENTS = 64  # numbers of the accepted stream whose content is remembered
 
 
 class Arrivals(Protocol):
-    """The part of a bus that `Attendance` needs."""
+    """The part of a bus that `Presence` needs."""
 
     def alive(self) -> frozenset[str]:
         """Return senders that are attached now."""
@@ -51,7 +51,7 @@ class Arrivals(Protocol):
         """Return how often each sender has joined, counted since this one joined."""
 
 
-class Attendance:
+class Presence:
     """Tracks since when each sender has been on the bus without a break."""
 
     def __init__(self, bus: Arrivals) -> None:
@@ -113,12 +113,12 @@ class SenderVerifier:
         sender, topic: names under which refusals are counted.
         rate_hz: largest rate of its numbers.
         refusals: counts refused messages.
-        attendance: presence of senders on the bus.
+        presence: presence of senders on the bus.
     """
 
-    def __init__(self, sender: str, topic: str, rate_hz: float, refusals: Refusals, *, attendance: Attendance) -> None:
+    def __init__(self, sender: str, topic: str, rate_hz: float, refusals: Refusals, *, presence: Presence) -> None:
         self._sender, self._topic, self._rate_hz = sender, topic, rate_hz
-        self._refusals, self._attendance = refusals, attendance
+        self._refusals, self._presence = refusals, presence
         self._accepted: _Stream | None = None
         self._claims: list[_Stream] = []
         self._contents: dict[int, int] = {}  # checksums of accepted messages, by number
@@ -167,7 +167,7 @@ class SenderVerifier:
         return self._claims[-1]
 
     def _is_confirmed(self, claim: _Stream, accepted: _Stream, utc_us: int) -> bool:
-        since_us = self._attendance.since_us(self._sender)
+        since_us = self._presence.since_us(self._sender)
         if claim.count < CONFIRMATIONS or since_us is None:
             return False
         came_back = min(accepted.sent_utc_us, accepted.received_utc_us) < since_us

@@ -16,7 +16,7 @@ _CLOCK_ANSWERS, _CLOCK_SPAN_S = 8, 0.8  # fewer answers or a shorter span give n
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """One answered request."""
+    """Records when a request was sent and when its answer arrived, host clock."""
 
     sent_us: int
     arrived_us: int
@@ -70,9 +70,12 @@ def round_trip(answers: Sequence[Answer], by: str) -> RoundTrip | None:
     """Return median and 99th percentile of the answers, or None without any."""
     if not answers:
         return None
-    took_ms = np.array([a.arrived_us - a.sent_us for a in answers]) * 1e-3  # (answers,)
+    duration_ms = np.array([a.arrived_us - a.sent_us for a in answers]) * 1e-3  # (answers,)
     return RoundTrip(
-        p50_ms=float(np.percentile(took_ms, 50)), p99_ms=float(np.percentile(took_ms, 99)), answers=len(answers), by=by
+        p50_ms=float(np.percentile(duration_ms, 50)),
+        p99_ms=float(np.percentile(duration_ms, 99)),
+        answers=len(answers),
+        by=by,
     )
 
 

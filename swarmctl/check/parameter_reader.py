@@ -67,7 +67,7 @@ class ParameterReader:
             self._requested_us[name] = now_us
         return [self._read(name) for name in asked]
 
-    def hear(self, message: Any) -> None:
+    def receive(self, message: Any) -> None:
         """Take a PARAM_VALUE or PARAM_ERROR; ignore everything else."""
         kind = message.get_type()
         if kind == "PARAM_VALUE":

@@ -105,7 +105,7 @@ def _opinion(value: float | None, seen: ParameterContext, rule: Rule | None, che
         if rule is not None:
             return Opinion(verdict=Verdict.FIX, wanted="readable", advice=rule.problem(None))
         return Opinion(verdict=Verdict.NOTE, wanted="", advice="this autopilot does not tell it: not judged")
-    judged = None if check is None else check.judge(value, seen)
+    judged = None if check is None else check.assess(value, seen)
     broken = "" if rule is None else rule.problem(value)
     if judged is None:
         return Opinion(verdict=Verdict.FIX, wanted="", advice=broken) if broken else ok("")

@@ -99,7 +99,7 @@ class VehicleScan:
     # --- results ---
 
     @property
-    def heard(self) -> bool:
+    def found_autopilot(self) -> bool:
         """Whether an autopilot's heartbeat was received."""
         return self.began_us is not None
 
@@ -109,7 +109,7 @@ class VehicleScan:
     def finished(self, now_us: int) -> bool:
         """Whether it has listened for long enough and every parameter is read or given up."""
         least_s = self._seconds if self._ready() else self._seconds + self._patience_s
-        if not self.heard or self.listened_s(now_us) < least_s:
+        if not self.found_autopilot or self.listened_s(now_us) < least_s:
             return False
         return self.parameters is None or self.parameters.settled
 
@@ -147,7 +147,7 @@ class VehicleScan:
             return
         if self._due("heartbeat", now_us, _HEARTBEAT_US):
             self._send(mavlink.MAVLink_heartbeat_message(18, _NO_AUTOPILOT, 0, 0, 4, 3))
-        if not self.heard:
+        if not self.found_autopilot:
             return
         if self._due("timesync", now_us, _TIMESYNC_US):
             self._timesyncs[now_us * 1000] = monotonic_us()
@@ -238,7 +238,7 @@ class VehicleScan:
             if sent_us is not None:
                 self.answers["PING"].append(Answer(sent_us, heard.t_us, math.nan))
         elif self.parameters is not None:
-            self.parameters.hear(message)
+            self.parameters.receive(message)
 
     def _choose(self, sysid: int, autopilot: int, heard: ReceivedDatagram) -> None:
         """Select the first autopilot, until the configured one is received."""
@@ -275,7 +275,9 @@ def run_scans(scans: Sequence[VehicleScan], connect_s: float, longest_s: float, 
         while not ended():
             now_us = monotonic_us()
             waited_s = (now_us - began_us) * 1e-6
-            open_scans = [p for p in scans if not (p.finished(now_us) or (not p.heard and waited_s > connect_s))]
+            open_scans = [
+                p for p in scans if not (p.finished(now_us) or (not p.found_autopilot and waited_s > connect_s))
+            ]
             if not open_scans or waited_s > longest_s:
                 return
             for scan in scans:

@@ -25,7 +25,7 @@ _SWAPPED_BY_M = 0.5  # least saving that reports two vehicles as swapped
 def findings(vehicles: Sequence[VehicleFacts], config: Config) -> list[Finding]:
     """Return all findings: those of each vehicle in order, then those about all vehicles."""
     lines = [line for facts in vehicles for line in (*vehicle_findings(facts, config), *_own(facts, config))]
-    return lines + [line for judge in _SWARM_ROWS for line in judge(vehicles, config)]
+    return lines + [line for assess in _SWARM_ROWS for line in assess(vehicles, config)]
 
 
 def exit_code(vehicles: Sequence[VehicleFacts], lines: Sequence[Finding]) -> int:

@@ -59,7 +59,7 @@ def vehicle_findings(facts: VehicleFacts, config: Config) -> list[Finding]:
     """Return the finding of every row that applies; for an unreached vehicle only that."""
     if not facts.reached:
         return [_unreached(facts)]
-    return [line for judge in _ROWS if (line := judge(facts, config)) is not None]
+    return [line for assess in _ROWS if (line := assess(facts, config)) is not None]
 
 
 def _unreached(facts: VehicleFacts) -> Finding:

@@ -69,7 +69,7 @@ class Autopilot:
         hover_thrust_01: thrust with which the autopilot hovers by itself; until observed, the value of its parameter.
         pos_accuracy_m: reported horizontal accuracy, 1 sigma; None while unreported.
         samples: number of states received; two readings give the rate.
-        heard_us: arrival time of the last frame, host clock.
+        received_us: arrival time of the last frame, host clock.
         invalid: number of polls without a state although a sample existed, by reason.
         watch: the vehicle's flight mode and failsafe, and whether they are in doubt.
         gaps: number of setpoint gaps so long that the autopilot's failsafe may have acted unseen.
@@ -107,7 +107,7 @@ class Autopilot:
         self.texts: list[str] = []
         self.refused_setpoints = 0
         self.samples = 0
-        self.heard_us: int | None = None
+        self.received_us: int | None = None
         self.invalid: Counter[str] = Counter()
         self.gaps, self.gap_s = 0, 0.0
         self._departures = 0  # count of departures from the external mode at the newest setpoint
@@ -149,7 +149,7 @@ class Autopilot:
         """Origin (3,) of the local frame in the shared frame."""
         return self.frame.offset_ned_m
 
-    def attach(self, slow: CommandPort) -> None:
+    def connect(self, slow: CommandPort) -> None:
         """Pass every frame except the fast state messages to the command port `slow`."""
         self._slow = slow
 
@@ -214,8 +214,8 @@ class Autopilot:
         if message is None:
             return
         self._on_frame(frame)
-        self.watch.heard(arrived_us)
-        self.heard_us = arrived_us
+        self.watch.on_frame(arrived_us)
+        self.received_us = arrived_us
         kind = message.get_type()
         if kind not in _STATE and (boot_ms := getattr(message, "time_boot_ms", None)) is not None:
             self.clock.witness(kind, boot_ms * 1000, arrived_us)

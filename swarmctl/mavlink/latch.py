@@ -52,38 +52,38 @@ class Latch:
         self._is_vehicle = is_vehicle
         self.remote = remote
         self.strangers = self.moves = 0
-        self._heard_us: int | None = None  # last datagram of the vehicle, or begin of the wait for it
+        self._received_us: int | None = None  # last datagram of the vehicle, or begin of the wait for it
         self._polled_us: int | None = None
 
     @property
     def only(self) -> Address | None:
         """The only sender to receive from; None while any sender is possible."""
-        return None if self.remote is None or self._silent else self.remote
+        return None if self.remote is None or self._is_stale else self.remote
 
     def poll(self, now_us: int) -> None:
         """Judge silence; called before each drain of the port, because only a polled port can be silent."""
         slept = self._polled_us is None or now_us - self._polled_us > _SLEPT_US
         self._polled_us = now_us
-        if slept or self._heard_us is None:
-            self._heard_us = now_us
+        if slept or self._received_us is None:
+            self._received_us = now_us
 
     def admits(self, sender: Address, data: bytes) -> bool:
         """Return whether a datagram is the vehicle's."""
         if sender == self.remote:
-            self._heard_us = self._polled_us
+            self._received_us = self._polled_us
             return True
-        if (self.remote is not None and not self._silent) or not self._is_vehicle(data):
+        if (self.remote is not None and not self._is_stale) or not self._is_vehicle(data):
             self.strangers += 1
             return False
         self.moves += self.remote is not None
-        self.remote, self._heard_us = sender, self._polled_us
+        self.remote, self._received_us = sender, self._polled_us
         return True
 
     @property
-    def _silent(self) -> bool:
-        if self._polled_us is None or self._heard_us is None:
+    def _is_stale(self) -> bool:
+        if self._polled_us is None or self._received_us is None:
             return False
-        return self._polled_us - self._heard_us > _SILENT_US
+        return self._polled_us - self._received_us > _SILENT_US
 
 
 def admit_only(sock: socket.socket, sender: Address | None) -> None:

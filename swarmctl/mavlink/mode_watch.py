@@ -32,7 +32,7 @@ class ModeWatch:
         self._alarmed = False  # a failsafe that was not shown yet
         self._shown_us: int | None = None
         self._polled_us: int | None = None
-        self._heard_us: int | None = None
+        self._received_us: int | None = None
         self._requested_us: int | None = None
         self._doubt_us: int | None = None  # a mode report must be newer than this
 
@@ -49,11 +49,11 @@ class ModeWatch:
         if self._shown_us is not None and now_us > self._shown_us:
             self._left, self._alarmed, self._shown_us = None, False, None
 
-    def heard(self, arrived_us: int) -> None:
+    def on_frame(self, arrived_us: int) -> None:
         """Note the arrival of a frame of the vehicle."""
-        if self._heard_us is not None and arrived_us - self._heard_us > _GAP_US:
+        if self._received_us is not None and arrived_us - self._received_us > _GAP_US:
             self._doubt_us = arrived_us  # the link was silent: frames of that time are lost
-        self._heard_us = arrived_us
+        self._received_us = arrived_us
 
     def told(self, mode: FlightMode, arrived_us: int) -> None:
         """Take the mode of a HEARTBEAT or CURRENT_MODE."""

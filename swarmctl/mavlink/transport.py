@@ -235,7 +235,7 @@ class TcpTransport:
         self._remote = remote
         self._sock: socket.socket | None = None
         self._open_us: int | None = None  # begin of the last attempt
-        self._heard_us = 0
+        self._received_us = 0
         self._buffer = bytearray()
         self._rest = b""  # remainder of a frame that was sent in part
 
@@ -253,7 +253,7 @@ class TcpTransport:
             self._lose()
 
     def receive(self, now_us: int) -> list[Datagram]:
-        if self._sock is not None and now_us - self._heard_us > _LOST_AFTER_US:
+        if self._sock is not None and now_us - self._received_us > _LOST_AFTER_US:
             self._lose()  # a peer that vanished without FIN would block for a quarter of an hour
         if self._sock is None and (self._open_us is None or now_us - self._open_us >= _REOPEN_US):
             self._open(now_us)
@@ -263,7 +263,7 @@ class TcpTransport:
                 if not data:
                     self._lose()
                 self._buffer += data
-                self._heard_us = now_us
+                self._received_us = now_us
         except (BlockingIOError, InterruptedError):
             pass  # the socket is empty, or still connecting
         except OSError:
@@ -274,7 +274,7 @@ class TcpTransport:
         self._lose()
 
     def _open(self, now_us: int) -> None:
-        self._open_us = self._heard_us = now_us
+        self._open_us = self._received_us = now_us
         self._sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM)
         self._sock.setblocking(False)
         self._sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)

@@ -89,7 +89,7 @@ class VehicleSetup:
         self._todo = deque(reversed(self._before.values()))
         self._restoring = True
 
-    def took(self, result: CommandResult) -> None:
+    def on_result(self, result: CommandResult) -> None:
         """Take a result of the command port, whichever part requested it."""
         if result.command != self._open:
             return
@@ -168,10 +168,10 @@ class VehicleSetup:
         waited_us = now_us - self._watched_us
         if waited_us < self._watch_us:
             return
-        samples, heard_us = self._autopilot.samples - self._samples, self._autopilot.heard_us
+        samples, received_us = self._autopilot.samples - self._samples, self._autopilot.received_us
         self._watched_us, self._samples = now_us, self._autopilot.samples
         enough = samples >= _ENOUGH_01 * self._rate_hz * waited_us * 1e-6
-        silent = heard_us is None or now_us - heard_us > _SILENT_US
+        silent = received_us is None or now_us - received_us > _SILENT_US
         if enough or silent:
             self._watch_us = _WATCH_US
             return

@@ -79,7 +79,7 @@ def launch(config: Config, options: LaunchOptions) -> int:
             display.close()
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a terminal that closes now must not lose the result
     # From here on Ctrl-C acts as usual: nothing is left to land.
-    violated = sum_up(config, directory, result, display.say)
+    violated = sum_up(config, directory, result, display.print_line)
     return result.exit_code(violated)
 
 
@@ -127,7 +127,7 @@ class Launcher(Services):
             self._spawn(command)
         self.announce("")
         for line in _introduction(config, context, reserved):
-            self._display.say(line)
+            self._display.print_line(line)
         self.log.write("started", run=context.run, ports=list(reserved.ports))
 
     def stop(self, agents_grace_s: float) -> None:

@@ -69,5 +69,6 @@ class Recovery:
         armed = "armed" if status.armed else "not yet told to be armed"
         return (
             f"vehicle {self._sysids[view.agent]} (agent-{view.agent}) may be armed or in the air: it was {armed}, in "
-            f"{name_of(Phase, status.phase)}, {time.monotonic() - view.heard_s:.0f} s ago. Land and disarm it by hand"
+            f"{name_of(Phase, status.phase)}, {time.monotonic() - view.received_s:.0f} s ago. "
+            "Land and disarm it by hand"
         )

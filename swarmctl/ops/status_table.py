@@ -31,14 +31,14 @@ class AgentView:
 
     agent: int
     status: StatusMessage | None = None
-    heard_s: float = 0.0  # arrival of `status`, monotonic
+    received_s: float = 0.0  # arrival of `status`, monotonic
     note: str = ""  # the launcher's own observation: how it ended, that it is silent
 
 
 class Display(Protocol):
     """Output of a launch."""
 
-    def say(self, text: str) -> None:
+    def print_line(self, text: str) -> None:
         """Print one line that stays."""
 
     def show(self, agents: Sequence[AgentView]) -> None:
@@ -62,7 +62,7 @@ class LiveTable:
         self._live: Live | None = None
         self._shown_s = 0.0
 
-    def say(self, text: str) -> None:
+    def print_line(self, text: str) -> None:
         with contextlib.suppress(OSError):
             self._console.print(printable(text, _LINE), markup=False, soft_wrap=True)
 
@@ -92,7 +92,7 @@ class PlainLines:
         self._started_s = time.monotonic()
         self._last: dict[int, tuple[str, str]] = {}
 
-    def say(self, text: str) -> None:
+    def print_line(self, text: str) -> None:
         with contextlib.suppress(OSError):  # the pipe is closed; the flight goes on
             print(printable(text, _LINE), file=self._stream, flush=True)
 
@@ -104,7 +104,7 @@ class PlainLines:
             self._last[view.agent] = (phase, view.note)
             alert = view.note or (view.status.active_alert if view.status else "")
             elapsed_s = time.monotonic() - self._started_s
-            self.say(f"{elapsed_s:7.1f} s  {agent_name(view.agent)}  {phase}{'  ' + alert if alert else ''}")
+            self.print_line(f"{elapsed_s:7.1f} s  {agent_name(view.agent)}  {phase}{'  ' + alert if alert else ''}")
 
     def close(self) -> None:
         return
@@ -132,7 +132,7 @@ def status_cells(view: AgentView) -> tuple[str, ...]:
     """Return the cells of one agent, in the order of the columns."""
     status = view.status
     if status is None:
-        return (agent_name(view.agent), *[""] * (len(_COLUMNS) - 2), printable(view.note) or "not heard yet")
+        return (agent_name(view.agent), *[""] * (len(_COLUMNS) - 2), printable(view.note) or "no status yet")
     return (
         agent_name(view.agent),
         name_of(Phase, status.phase),

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from swarmctl.telemetry.referee import Rules
 
 
-def sum_up(config: Config, directory: Path, result: LaunchResult, say: Callable[[str], None]) -> bool:
+def sum_up(config: Config, directory: Path, result: LaunchResult, print_line: Callable[[str], None]) -> bool:
     """Finish the run folder and print the result; return whether the referee found a violation.
 
     A folder that can't be read or written is a problem of the run, and never loses the result.
@@ -32,15 +32,15 @@ def sum_up(config: Config, directory: Path, result: LaunchResult, say: Callable[
     except Exception as error:
         known = {"outcome": result.outcome, "violations": list(result.problems)}
         for line in (*violation_lines(known), *summary_lines(known, directory)):
-            say(line)
+            print_line(line)
         result.problems.append(f"summary: {error}")
-        say(f"the run can't be judged: {error!r}. What was recorded is in {directory}")
+        print_line(f"the run can't be judged: {error!r}. What was recorded is in {directory}")
         return False
     for line in (*violation_lines(summary), *summary_lines(summary, directory)):
-        say(line)
+        print_line(line)
     if unwritten:
         result.problems.append(f"run folder: {'; '.join(unwritten)}")
-        say(unwritten_line(directory, unwritten))
+        print_line(unwritten_line(directory, unwritten))
     optimize_recording(directory)
     return bool(summary.get("violations"))
 
@@ -97,15 +97,15 @@ def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...
         f"tick p50/p99/max {_ms(tick)} ms, solve p50/p99/max {_ms(solve)} ms",
         f"solver {_count(solver, 'name')}, failed {_count(solver, 'failed')}; "
         f"plan staleness p50/p99 {_ms(age, ('p50', 'p99'))} ms, {rejected} messages refused"
-        + _unheard(comms)
+        + _unresponsive(comms)
         + _deadlocks(summary),
         f"run folder {directory}",
     )
 
 
-def _unheard(comms: Mapping[str, Any]) -> str:
-    found = _section(comms, "unheard")
-    return f"; agent-{found['agent']} unheard for {found['longest_s']:.1f} s" if found.get("count") else ""
+def _unresponsive(comms: Mapping[str, Any]) -> str:
+    found = _section(comms, "unresponsive")
+    return f"; agent-{found['agent']} unresponsive for {found['longest_s']:.1f} s" if found.get("count") else ""
 
 
 def violation_lines(summary: Mapping[str, Any]) -> tuple[str, ...]:

@@ -34,7 +34,7 @@ from swarmctl.ops.status_table import AgentView, Display, name_of
 from swarmctl.telemetry.event_log import EventLog
 
 _STEP_S = 0.05
-_HEARD_S = 60.0  # timeout for every agent to appear on the bus
+_FIRST_STATUS_S = 60.0  # timeout for every agent to appear on the bus
 _VEHICLE_S = 90.0  # timeout for every agent to receive its vehicle
 _BEYOND_MISSION_S = 300.0  # for take-off, waiting and landing; a longer flight is ended
 _SILENCE_S = 5.0
@@ -127,14 +127,14 @@ class FlightSupervisor:
             interrupts: number of stop requests; the first lands all agents, the second kills all processes.
         """
         while interrupts() < 2:
-            self._hear()
+            self._receive()
             self._watch_essential_processes()
             self._watch_viewer()
             self._watch_agents()
             self._watch_time()
             if interrupts() and not self._result.interrupted:
                 self._result.interrupted = True
-                self._say("interrupted", "interrupted: landing; once more ends everything at once")
+                self._announce("interrupted", "interrupted: landing; once more ends everything at once")
                 self._land(_LAND_S)
             self._speak()
             self._display.show(self._views)
@@ -156,7 +156,7 @@ class FlightSupervisor:
             self._fail("vehicle_left", words)
         return self._result
 
-    def _hear(self) -> None:
+    def _receive(self) -> None:
         for sender, payload in self._bus.receive(STATUS):
             status = decode_status(payload)
             if status is None or not 0 <= status.agent < len(self._views) or sender != agent_name(status.agent):
@@ -164,7 +164,7 @@ class FlightSupervisor:
             view = self._views[status.agent]
             if view.status is None or view.status.phase != status.phase:
                 self._services.log.write("phase", agent=status.agent, phase=name_of(Phase, status.phase))
-            view.status, view.heard_s = status, time.monotonic()
+            view.status, view.received_s = status, time.monotonic()
             self._result.has_armed |= Phase.ARM <= status.phase < Phase.DONE
         for _, payload in self._bus.receive(OBSTACLES):
             message = decode_obstacles(payload)
@@ -177,7 +177,7 @@ class FlightSupervisor:
         now_us = time.time_ns() // 1000
         known = self._result.obstacles or dict.fromkeys(self._configured.obstacles)
         self._result.obstacles = {item: known.get(item, now_us) for item in message.obstacles}
-        self._say("obstacles", f"{len(message.obstacles)} obstacles, set by an operator", version=message.version)
+        self._announce("obstacles", f"{len(message.obstacles)} obstacles, set by an operator", version=message.version)
 
     def _watch_essential_processes(self) -> None:
         """Land all agents when the router or the simulator, without which the flight can't go on, has ended."""
@@ -196,17 +196,17 @@ class FlightSupervisor:
             return
         if child.poll() is not None:
             if self._is_first(VIEWER):
-                self._say(
+                self._announce(
                     "viewer_ended", f"view and recording stopped: viewer {child.how_it_ended()}; the flight goes on"
                 )
         elif "view address" not in self._reported:
             line = child.line_with("viewer rerun+")
             if line and self._is_first("view address"):
                 address = line.removeprefix("viewer ")
-                self._say("viewer_ready", f"view {address}", url=address)
+                self._announce("viewer_ready", f"view {address}", url=address)
                 self._services.announce(address)
         elif child.is_stopped() and self._is_first("viewer stopped"):
-            self._say("viewer_frozen", "viewer is frozen; the flight goes on")
+            self._announce("viewer_frozen", "viewer is frozen; the flight goes on")
 
     def _watch_agents(self) -> None:
         now_s = time.monotonic()
@@ -214,7 +214,7 @@ class FlightSupervisor:
             child = self._services.children[agent_name(view.agent)]
             code = child.poll()
             if code is None:
-                self._judge_silence(view, child, now_s)
+                self._check_responsive(view, child, now_s)
             elif self._is_first(f"{child.name} {child.pid} ended"):
                 self._note_end(view, child, code)
                 self._recover(view, code)
@@ -222,31 +222,35 @@ class FlightSupervisor:
     def _recover(self, view: AgentView, code: int) -> None:
         """Start another process that lands a vehicle which is not known to be down."""
         if self._recovery.is_on(view.agent) and code == EXIT_INTERRUPTED:
-            self._say("recovered", f"the vehicle of {agent_name(view.agent)} is on the ground and disarmed")
+            self._announce("recovered", f"the vehicle of {agent_name(view.agent)} is on the ground and disarmed")
         child = None if self._vehicles_lost else self._recovery.begin(view, code)
         if child is None:
             return
         self._services.children[agent_name(view.agent)] = child
-        view.note, view.heard_s = "recovering", time.monotonic()
-        self._say("recovering", f"landing the vehicle of {agent_name(view.agent)}, which may be armed or in the air")
+        view.note, view.received_s = "recovering", time.monotonic()
+        self._announce(
+            "recovering", f"landing the vehicle of {agent_name(view.agent)}, which may be armed or in the air"
+        )
         if self._land_ordered_s is not None:
             self._land_until_s = max(self._land_until_s, time.monotonic() + RECOVERY_S)
 
-    def _judge_silence(self, view: AgentView, child: Child, now_s: float) -> None:
+    def _check_responsive(self, view: AgentView, child: Child, now_s: float) -> None:
         waited_s = now_s - self._started_s
         if view.status is None:
-            if waited_s > _HEARD_S and self._is_first(f"{child.name} unheard"):
-                self._refuse(f"{child.name} is not on the bus after {_HEARD_S:.0f} s; see {child.log}")
+            if waited_s > _FIRST_STATUS_S and self._is_first(f"{child.name} unresponsive"):
+                self._refuse(f"{child.name} is not on the bus after {_FIRST_STATUS_S:.0f} s; see {child.log}")
         elif self._recovery.is_on(view.agent):
             if self._recovery.is_overdue(view.agent):
                 child.kill_all()
-        elif now_s - view.heard_s > _SILENCE_S:
+        elif now_s - view.received_s > _SILENCE_S:
             view.note = "silent"
             if self._is_first(f"{child.name} silent"):
-                self._fail("agent_silent", f"{child.name} has been silent for {_SILENCE_S:.0f} s; the others fly on")
+                self._fail(
+                    "agent_unresponsive", f"{child.name} has been silent for {_SILENCE_S:.0f} s; the others fly on"
+                )
         elif view.note:
             view.note = ""
-            self._say("agent_back", f"{child.name} is heard again")
+            self._announce("agent_back", f"{child.name} responds again")
         elif view.status.phase == Phase.CONNECT and waited_s > _VEHICLE_S and self._is_first(f"{child.name} vehicle"):
             url = self._config.vehicles[view.agent].url if self._config.vehicles else "the built-in SITL"
             self._refuse(
@@ -274,7 +278,7 @@ class FlightSupervisor:
         deaf = [view for view in running if view.status is None or view.status.phase < Phase.GOTO_LAND]
         if deaf:
             clocks_us = [
-                view.status.utc_us + round((now_s - view.heard_s) * 1e6) for view in deaf if view.status is not None
+                view.status.utc_us + round((now_s - view.received_s) * 1e6) for view in deaf if view.status is not None
             ]
             for order in order_messages(Order("land"), EVERYBODY, time.time_ns() // 1000, clocks_us):
                 self._bus.publish(COMMAND, order)
@@ -343,11 +347,11 @@ class FlightSupervisor:
 
     def _fail(self, event: str, problem: str) -> None:
         self._result.problems.append(problem)
-        self._say(event, problem)
+        self._announce(event, problem)
 
-    def _say(self, event: str, text: str, **fields: Any) -> None:
+    def _announce(self, event: str, text: str, **fields: Any) -> None:
         self._services.log.write(event, text=text, **fields)
-        self._display.say(text)
+        self._display.print_line(text)
 
     def _is_first(self, what: str) -> bool:
         if what in self._reported:

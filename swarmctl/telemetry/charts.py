@@ -149,7 +149,7 @@ def top_view(title: str, lines: Sequence[Line], balls: Sequence[Ball], points: i
         center = {"cx": float(x.px(ball.center_ned_m[1])), "cy": float(y.px(ball.center_ned_m[0]))}
         parts.append(element("circle", class_="obstacle", **center, r=float(ball.radius_m * scale)))
     for line in lines:
-        kept = _spread(len(line.x), points)
+        kept = _evenly_spaced(len(line.x), points)
         parts.append(_curve(line, x, y, line.x[kept], y_values=line.y[kept]))
         if line.label and len(line.x) and np.isfinite(line.y[-1]):
             parts.append(dot(float(x.px(line.x[-1])), float(y.px(line.y[-1])), 4, line.color))
@@ -167,7 +167,7 @@ def space_view(title: str, lines: Sequence[SpaceLine], balls: Sequence[Ball] = (
     view = _Oblique([_value_range([pos[:, k] for pos in spread]) for k in range(3)], may_stretch=not balls)
     drawn, nearer = [], []
     for line in lines:
-        pos_ned_m = line.pos_ned_m[_spread(len(line.pos_ned_m), points)]  # (K, 3)
+        pos_ned_m = line.pos_ned_m[_evenly_spaced(len(line.pos_ned_m), points)]  # (K, 3)
         px, py = view.px(pos_ned_m)
         drawn.append(line.along(px, py))
         if balls:
@@ -285,7 +285,7 @@ def _axes(x_range: tuple[float, float], y_range: tuple[float, float], height: fl
     return x, Axis(low=y_range[0], high=y_range[1], first=height - svg.BOTTOM_PX, last=svg.TOP_PX)
 
 
-def _spread(count: int, points: int) -> NDArray[np.intp]:
+def _evenly_spaced(count: int, points: int) -> NDArray[np.intp]:
     """Return at most `points` indices (K,), evenly spread over `count`."""
     return np.unique(np.linspace(0, max(0, count - 1), min(points, count)).astype(np.intp))
 

@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 from swarmctl import __version__
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Array, Mode, PlanStatus
-from swarmctl.telemetry.hearing import refused_peers, unheard
 from swarmctl.telemetry.json_safe import finite, json_safe
+from swarmctl.telemetry.reception import refused_peers, unresponsive
 from swarmctl.telemetry.tracks import (
     Tracks,
     flight_rows,
@@ -60,7 +60,7 @@ class RunData:
     events: list[dict[str, Any]]
 
 
-def judge(
+def evaluate(
     run: RunData,
     rules: Rules,
     outcome: str,
@@ -81,10 +81,10 @@ def judge(
     """
     tracks = merge_tracks(run.ticks, run.truth, rules.agents)
     clock = _MissionClock(run.ticks, tracks)
-    separation, apart = _judge_separation(tracks, rules, clock)
-    obstacles, clear = _judge_obstacles(tracks, rules, clock)
-    timing, punctual = _judge_timing(run.ticks, rules, speed_factor)
-    tracking, tracked_s = _judge_tracking(run, rules.agents, steady_after_s)
+    separation, apart = _evaluate_separation(tracks, rules, clock)
+    obstacles, clear = _evaluate_obstacles(tracks, rules, clock)
+    timing, punctual = _evaluate_timing(run.ticks, rules, speed_factor)
+    tracking, tracked_s = _evaluate_tracking(run, rules.agents, steady_after_s)
     unseen = [] if len(run.truth) else list(_unseen(run.ticks, rules.agents, clock))
     refused = _shorten(list(refused_peers(run.events)))
     violations = [*problems, *apart, *clear, *unseen, *punctual, *refused, *_not_a_number(run.truth)]
@@ -123,7 +123,7 @@ class _MissionClock:
         return (t_us - self.start_us) / 1e6
 
 
-def _judge_separation(tracks: Tracks, rules: Rules, clock: _MissionClock) -> tuple[dict[str, Any], list[str]]:
+def _evaluate_separation(tracks: Tracks, rules: Rules, clock: _MissionClock) -> tuple[dict[str, Any], list[str]]:
     """Find the smallest distance over all pairs and common instants, also with heights scaled by the downwash."""
     found: dict[str, Any] = {
         "min_m": None,
@@ -166,7 +166,9 @@ def _unseen(ticks: Mapping[int, NDArray[np.void]], agents: int, clock: _MissionC
             )
 
 
-def _judge_obstacles(tracks: Tracks, rules: Rules, clock: _MissionClock) -> tuple[dict[str, float | None], list[str]]:
+def _evaluate_obstacles(
+    tracks: Tracks, rules: Rules, clock: _MissionClock
+) -> tuple[dict[str, float | None], list[str]]:
     """Return distance and required distance to the centre (axis of a column) of the obstacle with the least margin."""
     worst: tuple[float, float] | None = None  # (distance, required) with the least margin
     violations = []
@@ -195,7 +197,7 @@ def _judge_obstacles(tracks: Tracks, rules: Rules, clock: _MissionClock) -> tupl
     return {"min_clearance_m": distance, "required_m": required}, _shorten(violations)
 
 
-def _judge_timing(
+def _evaluate_timing(
     ticks: Mapping[int, NDArray[np.void]], rules: Rules, speed_factor: float | None
 ) -> tuple[dict[str, Any], list[str]]:
     """Summarise tick times, solve times and deadline misses between arming and the end of landing."""
@@ -209,8 +211,8 @@ def _judge_timing(
         "ticks": total,
         "due_ticks": due,
         "late_ticks": late,
-        "tick_ms": _spread([rows["tick_ms"] for rows in flights]),
-        "solve_ms": _spread([rows["solve_ms"][rows["iterations"] > 0] for rows in flights]),
+        "tick_ms": _percentiles([rows["tick_ms"] for rows in flights]),
+        "solve_ms": _percentiles([rows["solve_ms"][rows["iterations"] > 0] for rows in flights]),
         "speed_factor": speed_factor,
     }
     if due and late > rules.deadline_misses_01 * due:
@@ -218,7 +220,7 @@ def _judge_timing(
     return timing, []
 
 
-def _judge_tracking(run: RunData, agents: int, steady_after_s: float) -> tuple[dict[str, Any], dict[int, float]]:
+def _evaluate_tracking(run: RunData, agents: int, steady_after_s: float) -> tuple[dict[str, Any], dict[int, float]]:
     """Return tracking errors and, for each agent, the mission time it tracked [s].
 
     The index of thesis Table 19 is the summed mean tracking error: the sum over agents of the distance to the shared
@@ -269,14 +271,14 @@ def _solver(ticks: Mapping[int, NDArray[np.void]], name: str) -> dict[str, Any]:
         "name": name,
         "failed": sum(int(np.isin(rows["plan_status"], _SOLVER_FAILED).sum()) for rows in charged),
         "not_certified": sum(int((rows["plan_status"] == PlanStatus.NOT_CERTIFIED).sum()) for rows in charged),
-        "max_residual_m": _spread(residuals)["max"],
+        "max_residual_m": _percentiles(residuals)["max"],
         "safety_filter_ticks": sum(int(rows["safety_filter_acted"].sum()) for rows in flights),
     }
 
 
 def _comms(run: RunData) -> dict[str, Any]:
-    """Summarise plan staleness, messages refused (last `bus_summary` of each agent) and unheard peers."""
-    ages = _spread([flight_rows(rows)["plan_staleness_ms"] for rows in run.ticks.values()])
+    """Summarise plan staleness, messages refused (last `bus_summary` of each agent) and unresponsive peers."""
+    ages = _percentiles([flight_rows(rows)["plan_staleness_ms"] for rows in run.ticks.values()])
     last = {event.get("source"): event for event in run.events if event.get("event") == "bus_summary"}
     rejected: Counter[str] = Counter()
     for event in last.values():
@@ -286,7 +288,7 @@ def _comms(run: RunData) -> dict[str, Any]:
     return {
         "path_age_ms": {"p50": ages["p50"], "p99": ages["p99"]},
         "rejected": dict(sorted(rejected.items())),
-        "unheard": unheard(run.events),
+        "unresponsive": unresponsive(run.events),
     }
 
 
@@ -303,7 +305,7 @@ def _commitments(events: Sequence[Mapping[str, Any]]) -> dict[str, Any] | None:
     last = {event.get("source"): event for event in events if event.get("event") == "commitments"}
     if not last:
         return None
-    names = ("proposed", "committed", "withdrawn", "expired", "unplanned", "evaded")
+    names = ("proposed", "committed", "withdrawn", "expired", "unplanned", "evasive")
     worst_m = max(finite(event.get("worst_tracking_m")) or 0.0 for event in last.values())
     off = sum(event.get("event") == "tracking_violation" and event.get("begins") is True for event in events)
     return {name: sum(int(finite(event.get(name)) or 0) for event in last.values()) for name in names} | {
@@ -325,7 +327,7 @@ def _cut_short(tracked_s: Mapping[int, float], rules: Rules) -> Iterator[str]:
             yield f"mission time {seconds:.1f} s of agent {agent} below {rules.duration_s:g} s"
 
 
-def _spread(parts: Sequence[Array]) -> dict[str, float | None]:
+def _percentiles(parts: Sequence[Array]) -> dict[str, float | None]:
     """Return median, 99th percentile and maximum of the finite values."""
     values = np.concatenate([np.asarray(part, np.float64) for part in parts]) if parts else np.zeros(0)
     values = values[np.isfinite(values)]

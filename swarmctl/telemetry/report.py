@@ -270,9 +270,12 @@ def _summary_rows(summary: Mapping[str, Any], rules: Rules | None) -> Iterator[_
     yield _Row("age of peers' paths, median / p99", f"{ages} ms")
     refused = ", ".join(f"{reason} {count}" for reason, count in comms["rejected"].items()) or "none"
     yield _Row("bus messages refused", refused)
-    if (unheard := comms.get("unheard") or {}).get("count"):
-        lasted = _figure(unheard["longest_s"], "s", 1)
-        yield _Row("peers there but unheard, the longest", f"{unheard['count']}, agent-{unheard['agent']} {lasted}")
+    if (unresponsive := comms.get("unresponsive") or {}).get("count"):
+        lasted = _figure(unresponsive["longest_s"], "s", 1)
+        yield _Row(
+            "peers there but unresponsive, the longest",
+            f"{unresponsive['count']}, agent-{unresponsive['agent']} {lasted}",
+        )
     if timing["speed_factor"] is not None:
         yield _Row("speed", f"{timing['speed_factor']:.1f} x real time")
 

@@ -14,7 +14,7 @@ from swarmctl.core.records import TICK_DTYPE
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import replace_text, write_each
 from swarmctl.telemetry.json_safe import to_json
-from swarmctl.telemetry.referee import Rules, RunData, judge
+from swarmctl.telemetry.referee import Rules, RunData, evaluate
 from swarmctl.telemetry.report import REPORT, write_report
 from swarmctl.telemetry.run_files import (
     AGENT_FILE,
@@ -109,7 +109,7 @@ def finish_run(directory: Path, rules: Rules, outcome: Outcome, recorded: RunDat
     """
     run = load_run(directory) if recorded is None else recorded
     run.events[:] = _merged(run.events, outcome.events)
-    summary = judge(run, rules, outcome.outcome, outcome.problems, speed_factor=outcome.speed_factor)
+    summary = evaluate(run, rules, outcome.outcome, outcome.problems, speed_factor=outcome.speed_factor)
     writers: dict[str, Callable[[], object]] = {
         EVENTS: partial(_write_events, directory, run.events),
         SUMMARY: partial(replace_text, directory / SUMMARY, to_json(summary, indent=2) + "\n"),

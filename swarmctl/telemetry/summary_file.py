@@ -11,7 +11,7 @@ _Figure = Annotated[float, msgspec.Meta(ge=-1e9, le=1e9)]  # range that can be p
 _Count = Annotated[int, msgspec.Meta(ge=0, lt=2**53)]
 
 
-class _Spread(msgspec.Struct):
+class _Percentiles(msgspec.Struct):
     p50: _Figure | None = None
     p99: _Figure | None = None
     max: _Figure | None = None
@@ -44,8 +44,8 @@ class _Obstacles(msgspec.Struct):
 class _Timing(msgspec.Struct):
     ticks: _Count
     late_ticks: _Count
-    tick_ms: _Spread
-    solve_ms: _Spread
+    tick_ms: _Percentiles
+    solve_ms: _Percentiles
     speed_factor: _Figure | None = None
     due_ticks: _Count = 0  # missing in older folders
 
@@ -59,7 +59,7 @@ class _Solver(msgspec.Struct):
 
 
 class _Comms(msgspec.Struct):
-    path_age_ms: _Spread
+    path_age_ms: _Percentiles
     rejected: dict[str, _Count]
 
 

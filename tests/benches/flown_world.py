@@ -81,15 +81,15 @@ class FlownWorld:
         for i in range(len(self.clients)):
             self.setpoint(i, euler_rad, thrust_01)
 
-    def heard(self, vehicle: int) -> list[bytes]:
+    def received(self, vehicle: int) -> list[bytes]:
         """Frames that have reached a client."""
         return [
             frame for datagram in self.clients[vehicle].receive(self.clock.now_us()) for frame in frames(datagram.data)
         ]
 
-    def heard_ids(self, vehicle: int) -> list[int]:
+    def received_ids(self, vehicle: int) -> list[int]:
         """Their message ids."""
-        return [message_id(frame) for frame in self.heard(vehicle)]
+        return [message_id(frame) for frame in self.received(vehicle)]
 
     @property
     def pos_ned_m(self) -> Any:

@@ -31,8 +31,8 @@ class Bench:
     """One vehicle on a pipe, and the client's end of it.
 
     Attributes:
-        heard: frames received on the offboard link since `forget`, by message id.
-        gcs_heard: the same of the ground station's link.
+        received: frames received on the offboard link since `forget`, by message id.
+        gcs_received: the same of the ground station's link.
     """
 
     def __init__(
@@ -56,8 +56,8 @@ class Bench:
         self.pilot, self.endpoint = pilot, endpoint
         self.hz = sitl.physics_hz
         self.codec, self.gcs_codec = Codec(1, 191), Codec(255, 190)
-        self.heard: defaultdict[int, list[bytes]] = defaultdict(list)
-        self.gcs_heard: defaultdict[int, list[bytes]] = defaultdict(list)
+        self.received: defaultdict[int, list[bytes]] = defaultdict(list)
+        self.gcs_received: defaultdict[int, list[bytes]] = defaultdict(list)
         for message in () if every_stream else (30, 31, 32, 33, 105):  # the busiest cost time
             self.endpoint.set_interval(message, -1)
         self.run(wait_s)
@@ -77,19 +77,19 @@ class Bench:
                 self.setpoint(q=q, thrust=thrust)
             self.clock.advance(1_000_000 // self.hz)
             self.world.step(self.clock.now_us())
-            for link, heard in ((self.link, self.heard), (self.gcs_link, self.gcs_heard)):
+            for link, received in ((self.link, self.received), (self.gcs_link, self.gcs_received)):
                 for datagram in link.receive(self.clock.now_us()):
                     for frame in frames(datagram.data):
-                        heard[message_id(frame)].append(frame)
+                        received[message_id(frame)].append(frame)
 
     def forget(self) -> None:
         """Discard everything received so far."""
-        self.heard.clear()
-        self.gcs_heard.clear()
+        self.received.clear()
+        self.gcs_received.clear()
 
     def said(self, message: int, *, gcs: bool = False) -> list[Any]:
         """Messages of one kind since `forget`."""
-        return [self.codec.decode(frame) for frame in (self.gcs_heard if gcs else self.heard)[message]]
+        return [self.codec.decode(frame) for frame in (self.gcs_received if gcs else self.received)[message]]
 
     def send(self, message: Any, *, gcs: bool = False) -> None:
         if gcs:
@@ -108,7 +108,7 @@ class Bench:
 
     def command(self, number: int, *params: float) -> int | None:
         """Result of a COMMAND_LONG, None when nothing was acknowledged within one step."""
-        self.heard[mav.MAVLINK_MSG_ID_COMMAND_ACK].clear()
+        self.received[mav.MAVLINK_MSG_ID_COMMAND_ACK].clear()
         padded = [*params, *[0.0] * (7 - len(params))]
         self.send(mav.MAVLink_command_long_message(1, 1, number, 0, *padded))
         self.run(0.004)

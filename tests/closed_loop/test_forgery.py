@@ -18,7 +18,7 @@ from swarmctl.bus.path_messages import encode_path
 from swarmctl.bus.peers import agent_name
 from swarmctl.bus.senders import ReceivedMessage, SenderVerifier, _Stream
 from swarmctl.core.types import Mode, Phase
-from swarmctl.telemetry.referee import RunData, judge
+from swarmctl.telemetry.referee import RunData, evaluate
 from tests import builders
 from tests.closed_loop.conftest import Flight, Fly, fly_now, mission_t_s
 
@@ -49,7 +49,7 @@ def summary(flight: Flight) -> dict[str, Any]:
     logs = flight.lockstep.logs
     events = [event for log in logs for event in log.events]
     data = RunData({log.agent: log.ticks for log in logs}, flight.lockstep.truth, events)
-    return judge(data, replace(flight.config.rules("lockstep"), duration_s=None), "completed")
+    return evaluate(data, replace(flight.config.rules("lockstep"), duration_s=None), "completed")
 
 
 def say(running: Lockstep, topic: topics.Topic, payload: bytes, name: int = VICTIM) -> None:
@@ -99,7 +99,7 @@ def test_forged_paths_change_nothing_and_are_reported(fly: Fly, twin: Flight) ->
         + ", ".join(f"agent-{j}" for j in range(AGENTS) if j != i)
         for i in range(AGENTS)
     ]
-    assert found["comms"]["unheard"]["count"] == 0
+    assert found["comms"]["unresponsive"]["count"] == 0
     assert summary(twin)["violations"] == []
 
 
@@ -125,7 +125,7 @@ def test_negative_control_where_the_newest_is_believed_they_meet(fly: Fly, monke
     monkeypatch.setattr(SenderVerifier, "_refusal", newest_wins)
     flight = swap(fly, at={FORGED_S: forge_paths})
     assert flight.separation_m() < 0.1
-    found = summary(flight)["comms"]["unheard"]
+    found = summary(flight)["comms"]["unresponsive"]
     assert found["longest_s"] > 1.0, "the silenced peer is named"
 
 

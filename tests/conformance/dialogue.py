@@ -93,9 +93,9 @@ class Dialogue:
         mark, mark_s: how much had come when the newest thing was sent, and when that was.
     """
 
-    def __init__(self, partner: Partner, *, silent: bool = False) -> None:
+    def __init__(self, partner: Partner, *, passive: bool = False) -> None:
         self.partner = partner
-        self._silent = silent
+        self._passive = passive
         self.begin()
 
     def begin(self) -> None:
@@ -104,7 +104,7 @@ class Dialogue:
         self._log: dict[tuple[str, int, bool], list[Arrived]] = {}  # by link, message, and whether it is the vehicle's
         self._arrivals = 0
         self.mark, self.mark_s = 0, self.partner.now_s()
-        self.muted: set[str] = set()
+        self.paused: set[str] = set()
         self.begun_s = self.mark_s
         self._beat_due_s = self.mark_s
         self._stream: v.Stream | None = None
@@ -129,10 +129,10 @@ class Dialogue:
     def pump(self) -> None:
         """Let a little time pass: send what is due, take what came."""
         now_s = self.partner.now_s()
-        if not self._silent and now_s >= self._beat_due_s:
+        if not self._passive and now_s >= self._beat_due_s:
             self._beat_due_s = now_s + HEARTBEAT_EVERY_S
             for link in self.partner.links:
-                if link not in self.muted:
+                if link not in self.paused:
                     kind = TYPE_GCS if link == self.text_link else TYPE_ONBOARD
                     self.transmit(mav.MAVLink_heartbeat_message(kind, NO_AUTOPILOT, 0, 0, 4, 3), link)
         if self._stream is not None and now_s >= self._stream_due_s - 1e-9:

@@ -11,7 +11,7 @@ from collections.abc import Callable
 from tests.conformance import vocabulary as v
 from tests.conformance.dialogue import Deviation, Dialogue, integer_value
 from tests.conformance.fields import Bits, near
-from tests.conformance.judge import Judge
+from tests.conformance.verifier import Verifier
 
 FAST_US = {436: 10_000, 245: 20_000, 83: 10_000, 36: 20_000}  # CURRENT_MODE, EXTENDED_SYS_STATE, ATTITUDE_TARGET, SERVO
 SLOW_US = {
@@ -34,7 +34,7 @@ class Player:
 
     def __init__(self, dialogue: Dialogue) -> None:
         self.dialogue = dialogue
-        self._judge = Judge(dialogue)
+        self._verifier = Verifier(dialogue)
         self._original: dict[str, int | float] = {}
         self._spoilt = False
 
@@ -52,7 +52,7 @@ class Player:
             try:
                 if isinstance(step, v.SetParam):
                     self._remember(step.name, step.value)
-                self._judge.judge(step)
+                self._verifier.verify(step)
             except Deviation as deviation:
                 raise Deviation(f"step {number} of {len(row.steps)}, {step}: {deviation}") from None
         self._spoilt = row.spoils
@@ -66,7 +66,7 @@ class Player:
             on_ground = row.start in (v.State.ARMED, v.State.GROUND_OFFBOARD)
             for name, value in {**(NO_AUTO_DISARM if on_ground else {}), **row.params}.items():
                 self._remember(name, value)
-                self._judge.judge(v.SetParam(name, value))
+                self._verifier.verify(v.SetParam(name, value))
             self._reach(row.start)
             self._wait_for_texts(row)
         except Deviation as deviation:
@@ -87,26 +87,26 @@ class Player:
         if not partner.simulated:
             self._come_to_rest(stay_up=row.start in (v.State.LOITER, v.State.OFFBOARD))
         for number, interval_us in {**(SLOW_US if partner.simulated else {}), **FAST_US}.items():
-            self._judge.judge(v.Command(number=v.SET_INTERVAL, params=(number, interval_us), within_s=0.5))
+            self._verifier.verify(v.Command(number=v.SET_INTERVAL, params=(number, interval_us), within_s=0.5))
         for number in NOT_READ_ON_GCS if partner.simulated else ():
-            self._judge.judge(v.Command(number=v.SET_INTERVAL, params=(number, -1), link=v.GCS_LINK))
+            self._verifier.verify(v.Command(number=v.SET_INTERVAL, params=(number, -1), link=v.GCS_LINK))
         self.dialogue.set_mark()
         if not self._armed():
-            self._judge.judge(v.sees("SYS_STATUS", 60.0, onboard_control_sensors_health=Bits(PREARM_BIT)))
+            self._verifier.verify(v.sees("SYS_STATUS", 60.0, onboard_control_sensors_health=Bits(PREARM_BIT)))
 
     def _come_to_rest(self, *, stay_up: bool) -> None:
         """By commands only: on the ground, or in LOITER where the next row flies and nothing speaks against it."""
         if self.dialogue.streaming:
             self.dialogue.stop()
             self.dialogue.run(STREAM_GONE_S)
-        self.dialogue.muted.clear()
+        self.dialogue.paused.clear()
         self.dialogue.set_mark()
-        self._judge.judge(v.sees("HEARTBEAT", 2.0))
+        self._verifier.verify(v.sees("HEARTBEAT", 2.0))
         if self._armed() and not (stay_up and not self._spoilt and self._aloft()):
             self._land_and_disarm()
         self._say(v.go(4, 3))
         for name, value in self._original.items():
-            self._judge.judge(v.SetParam(name, value))
+            self._verifier.verify(v.SetParam(name, value))
         self._original.clear()
 
     def _land_and_disarm(self) -> None:
@@ -117,7 +117,7 @@ class Player:
     def _say(self, command: v.Command) -> bool:
         """A command whose refusal is no deviation; whether it was accepted."""
         try:
-            self._judge.judge(command)
+            self._verifier.verify(command)
         except Deviation:
             return False
         return True
@@ -141,8 +141,8 @@ class Player:
         if self.dialogue.partner.simulated or name in self._original:
             return
         read = v.message("PARAM_REQUEST_READ", target_system=v.OWN, target_component=1, param_id=name, param_index=-1)
-        self._judge.judge(v.Send(what=read))
-        self._judge.judge(v.sees("PARAM_VALUE", 1.0, param_id=name))
+        self._verifier.verify(v.Send(what=read))
+        self._verifier.verify(v.sees("PARAM_VALUE", 1.0, param_id=name))
         values = [a.message for a in self.dialogue.since_mark("PARAM_VALUE", v.OFFBOARD_LINK)]
         found = next(m.param_value for m in values if m is not None and m.param_id == name)
         self._original[name] = integer_value(found) if isinstance(value, int) else found
@@ -153,28 +153,28 @@ class Player:
         if start is v.State.ARMABLE:
             return
         if start is v.State.ARMED:
-            self._judge.judge(v.arm())
+            self._verifier.verify(v.arm())
             return
         climbs = start is not v.State.GROUND_OFFBOARD
         if not (climbs and self._armed()):
-            self._judge.judge(v.Stream(v.setpoint(CLIMB_01 if climbs else 0.0)))
-            self._judge.judge(v.arm())
-            self._judge.judge(v.go(6))
+            self._verifier.verify(v.Stream(v.setpoint(CLIMB_01 if climbs else 0.0)))
+            self._verifier.verify(v.arm())
+            self._verifier.verify(v.go(6))
             if not climbs:
                 return
             self.dialogue.run(CLIMB_S)
-            self._judge.judge(v.Stream(v.setpoint(v.HOVER_01)))
+            self._verifier.verify(v.Stream(v.setpoint(v.HOVER_01)))
             self.dialogue.run(CALM_S)
             if start is v.State.OFFBOARD:
                 return
-            self._judge.judge(v.go(4, 3))
+            self._verifier.verify(v.go(4, 3))
             self.dialogue.stop()
         self.dialogue.set_mark()
         calm = near(0.0, CALM_M_S)
-        self._judge.judge(v.sees("LOCAL_POSITION_NED", 20.0, vx=calm, vy=calm, vz=calm))
+        self._verifier.verify(v.sees("LOCAL_POSITION_NED", 20.0, vx=calm, vy=calm, vz=calm))
         if start is v.State.OFFBOARD:
-            self._judge.judge(v.Stream(v.setpoint(v.HOVER_01)))
-            self._judge.judge(v.go(6))
+            self._verifier.verify(v.Stream(v.setpoint(v.HOVER_01)))
+            self._verifier.verify(v.go(6))
             self.dialogue.run(CALM_S)
 
     def _wait(self, met: Callable[[], bool], limit_s: float, what: str) -> None:

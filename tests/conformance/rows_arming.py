@@ -173,7 +173,14 @@ ARMING_ROWS = (
             Wait(1.0),
             Stop(),
             go(4, 6),
-            sees("HEARTBEAT", 25.0, base_mode=17, custom_mode=M_OFFBOARD),
+            sees("HEARTBEAT", 25.0, base_mode=17, custom_mode=M_OFFBOARD, system_status=0),
+            Mark(),
+            sees("SYS_STATUS", onboard_control_sensors_health=Bits(off=PREARM)),
+            arm(TEMPORARILY_REJECTED),
+            go(4, 3),
+            heartbeat(base_mode=29, system_status=3),
+            sees("SYS_STATUS", onboard_control_sensors_health=Bits(PREARM)),
+            arm(),
         ),
     ),
 )
@@ -201,6 +208,7 @@ REFUSAL_ROWS = (
         steps=(
             Command(number=ARM_DISARM, params=(5.0,), ack=NO_ACK),
             Says(text="Unsupported ARM_DISARM param: 5.000\t", severity=CRITICAL),
+            heartbeat(base_mode=29),
         ),
     ),
     *(

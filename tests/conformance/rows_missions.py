@@ -61,7 +61,7 @@ class Item:
 
 UP_OVER_AND_LAND = (
     Item(command=TAKEOFF, up_m=3.0),
-    Item(command=WAYPOINT, lat_e7=LAT_E7 + NORTH_8_M, up_m=4.0),
+    Item(command=WAYPOINT, lat_e7=LAT_E7 + NORTH_8_M, up_m=4.0, param1=1.0),
     Item(command=LAND, lat_e7=LAT_E7 + NORTH_8_M),
 )
 AROUND = (Item(command=WAYPOINT, lat_e7=LAT_E7 + NORTH_8_M, up_m=6.0), Item(command=WAYPOINT, up_m=6.0))
@@ -106,6 +106,7 @@ def download(items: tuple[Item, ...]) -> tuple[Step, ...]:
                 seq=seq,
                 command=what.command,
                 frame=FRAME_RELATIVE_INT,
+                param1=what.param1,
                 x=what.lat_e7,
                 y=what.lon_e7,
                 z=what.up_m,

@@ -37,7 +37,7 @@ from tests.conformance.vocabulary import (
 
 ENTRY, LOSS, MASKS = "4 entry", "4 loss", "4 type_mask"
 CHECK_S = 0.115  # the loss is looked for about every 100 ms
-RETURN_S = 0.06  # 22-47 ms measured
+RETURN_S = 0.048  # 22-47 ms measured
 LOST_TEXT = Says(text="Failsafe activated\t", severity=CRITICAL)
 
 
@@ -205,6 +205,8 @@ LOSS_ROWS = (
             sees("SERVO_OUTPUT_RAW", 1.5, after_s=1.0, servo1_raw=900, servo4_raw=900),
             sees("HEARTBEAT", 2.5, custom_mode=M_OFFBOARD, system_status=8),
             go(4, 3, ack=TEMPORARILY_REJECTED),
+            Stream(setpoint(HOVER_01)),
+            always("SERVO_OUTPUT_RAW", 1.0, 10, servo1_raw=900, servo4_raw=900),
         ),
         params={"COM_OBL_RC_ACT": 6},
         real_px4="a reduced build says so and flies on",
@@ -219,6 +221,8 @@ LOSS_ROWS = (
             Says(text="Disarmed by failsafe\t", severity=6, within_s=1.5),
             sees("SERVO_OUTPUT_RAW", 1.5, after_s=1.0, servo1_raw=900, servo4_raw=900),
             sees("HEARTBEAT", 2.5, base_mode=17, custom_mode=M_OFFBOARD),
+            Stream(setpoint(HOVER_01)),
+            always("SERVO_OUTPUT_RAW", 1.0, 10, servo1_raw=900, servo4_raw=900),
         ),
         params={"COM_OBL_RC_ACT": 7},
         spoils=True,
@@ -271,6 +275,7 @@ LOSS_ROWS = (
             *lost(1.0, M_RTL),
             go(4, 3),
             mode(M_LOITER, M_LOITER),
+            heartbeat(custom_mode=M_LOITER, system_status=4),
             Stream(setpoint(HOVER_01)),
             always("CURRENT_MODE", 1.0, 1, custom_mode=M_LOITER, intended_custom_mode=M_LOITER),
         ),

@@ -10,12 +10,12 @@ import pytest
 from swarmctl.mavlink.codec import Codec
 from tests.conformance import vocabulary as v
 from tests.conformance.dialogue import Deviation, Dialogue
-from tests.conformance.judge import command_message
 from tests.conformance.partners import InProcess, Tamper, TamperedLink
 from tests.conformance.player import Player
 from tests.conformance.rows import DEVIATIONS, ROWS
 from tests.conformance.rows_streams import STREAMS
 from tests.conformance.test_streams import WATCH_S, expected
+from tests.conformance.verifier import command_message
 
 BY_NAME = {row.name: row for row in ROWS}
 Change = Callable[[Any], Any]

@@ -28,7 +28,7 @@ def watched(pytestconfig: pytest.Config) -> Iterator[tuple[Partner, Counts]]:
     if url.startswith("udpout"):
         pytest.skip("udpout: it must be talked to before it sends here")
     partner: Partner = ByUrl(url, gcs_url, restart) if url else InProcess()
-    dialogue = Dialogue(partner, silent=True)
+    dialogue = Dialogue(partner, passive=True)
     dialogue.run(SETTLE_S if partner.simulated or restart else 0.5)
     before = dialogue.counts()
     start_s = partner.now_s()

@@ -147,11 +147,11 @@ class Stop:
 
 
 @dataclass(frozen=True, slots=True)
-class Mute:
+class PauseHeartbeats:
     """Stop or resume our own heartbeats on a link."""
 
     link: str
-    muted: bool = True
+    paused: bool = True
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,7 +297,7 @@ Step = (
     | SetParam
     | Stream
     | Stop
-    | Mute
+    | PauseHeartbeats
     | Wait
     | Mark
     | Sees

@@ -72,8 +72,8 @@ class ScriptedServices(Services):
             while "'up'" in scripts[name] and not child.line_with("up") and time.monotonic() < deadline_s:
                 time.sleep(0.01)
         self.hub = LocalHub(lambda: time.monotonic_ns() // 1000)
-        self.bus = self.hub.attach(OPERATOR)
-        self.agents = [self.hub.attach(agent_name(i)) for i in range(len(agents))]
+        self.bus = self.hub.connect(OPERATOR)
+        self.agents = [self.hub.connect(agent_name(i)) for i in range(len(agents))]
         self.directory = directory
         self.lands = ends(130, 0.5)  # what recovers a vehicle
         self.recovered: list[int] = []
@@ -95,13 +95,13 @@ class ScriptedServices(Services):
         self.recovered.append(agent)
         return Child(Command(agent_name(agent), (sys.executable, "-ESc", self.lands)), self.directory)
 
-    def hear_operators(self) -> None:
+    def join_as_operator(self) -> None:
         """Receive under its own name, which operators' commands use too."""
         self.hub.detach(OPERATOR)
         senders = [agent_name(i) for i in range(len(self.agents))]
-        self.bus = self.hub.attach(OPERATOR, {OBSTACLES: [OPERATOR], STATUS: senders})
+        self.bus = self.hub.connect(OPERATOR, {OBSTACLES: [OPERATOR], STATUS: senders})
 
-    def say(self, text: str) -> None:
+    def print_line(self, text: str) -> None:
         self.said.append(text)
 
     def close(self) -> None:
@@ -131,7 +131,7 @@ class ScriptedServices(Services):
     def kill(self, name: str) -> None:
         os.kill(self.children[name].pid, signal.SIGKILL)
 
-    def heard(self, *words: str) -> bool:
+    def printed(self, *words: str) -> bool:
         return any(all(word in line for word in words) for line in self.said)
 
 
@@ -155,9 +155,9 @@ def test_a_killed_agent_is_named_and_the_others_finish(tmp_path: Path) -> None:
     result = scene.fly()
     assert result.exit_code(violated=False) == EXIT_MISSION
     assert result.outcome == "failed"
-    assert scene.heard("agent-0", "SIGKILL")
+    assert scene.printed("agent-0", "SIGKILL")
     assert scene.recovered == [0]
-    assert scene.heard("the vehicle of agent-0", "disarmed")
+    assert scene.printed("the vehicle of agent-0", "disarmed")
     assert result.left == ()
     assert [scene.children[f"agent-{i}"].poll() for i in range(3)] == [130, 0, 0]
     assert "land" not in scene.orders
@@ -170,7 +170,7 @@ def test_a_vehicle_that_can_not_be_recovered_is_named(tmp_path: Path) -> None:
     result = scene.fly()
     assert scene.recovered == [0]
     assert len(result.left) == 1
-    assert scene.heard("vehicle 1", "may be armed", "TRACK", "by hand")
+    assert scene.printed("vehicle 1", "may be armed", "TRACK", "by hand")
     assert result.exit_code(violated=False) == EXIT_MISSION
 
 
@@ -220,7 +220,7 @@ def test_a_frozen_agent_is_given_up_when_the_others_have_finished(tmp_path: Path
     scene.act = freeze
     result = scene.fly()
     assert result.exit_code(violated=False) == EXIT_MISSION
-    assert scene.heard("agent-0", "silent")
+    assert scene.printed("agent-0", "silent")
     assert scene.children["agent-1"].poll() == 0
     assert scene.recovered == [0], "what is frozen is killed, and its vehicle landed"
     assert scene.children["agent-0"].poll() == 130
@@ -230,7 +230,7 @@ def test_one_failed_mission_fails_the_launch_and_says_why(tmp_path: Path) -> Non
     scene = ScriptedServices(tmp_path, [ends(4, 1.0), ends(0, 1.5)])
     result = scene.fly()
     assert result.exit_code(violated=False) == EXIT_MISSION
-    assert scene.heard("agent-0", "because")
+    assert scene.printed("agent-0", "because")
     assert scene.children["agent-1"].poll() == 0
 
 
@@ -239,7 +239,7 @@ def test_an_agent_that_can_not_start_lands_the_others(tmp_path: Path) -> None:
     scene.phase = Phase.STANDBY
     result = scene.fly()
     assert result.exit_code(violated=False) == EXIT_START
-    assert scene.heard("agent-1", "could not start", "because")
+    assert scene.printed("agent-1", "could not start", "because")
     assert scene.children["agent-0"].poll() == 130
 
 
@@ -302,7 +302,7 @@ def test_without_router_or_simulator_all_agents_land(tmp_path: Path, name: str) 
     result = scene.fly()
     assert result.exit_code(violated=False) == EXIT_MISSION
     assert len(result.problems) == 1
-    assert scene.heard(name, "SIGKILL")
+    assert scene.printed(name, "SIGKILL")
     assert [scene.children[f"agent-{i}"].poll() for i in range(2)] == [130, 130]
 
 
@@ -310,7 +310,7 @@ def test_a_simulator_that_refuses_to_start_is_a_failed_start(tmp_path: Path) -> 
     scene = ScriptedServices(tmp_path, [FLIES_LONG], {ROUTER: FLIES_LONG, SITL: ends(2, 0.0)})
     scene.silent.add(0)
     assert scene.fly().exit_code(violated=False) == EXIT_START
-    assert scene.heard("sitl", "because")
+    assert scene.printed("sitl", "because")
 
 
 @pytest.mark.parametrize("signum", [signal.SIGKILL, signal.SIGSTOP])
@@ -320,7 +320,7 @@ def test_without_its_viewer_the_flight_goes_on(tmp_path: Path, signum: signal.Si
     scene.act = lambda: os.kill(scene.children[VIEWER].pid, signum)
     result = scene.fly()
     assert result.exit_code(violated=False) == EXIT_OK
-    assert scene.heard("announced rerun+http://127.0.0.1:9876/proxy")
+    assert scene.printed("announced rerun+http://127.0.0.1:9876/proxy")
     assert sum("the flight goes on" in line for line in scene.said) == 1
 
 
@@ -348,7 +348,7 @@ def test_obstacles_of_an_operator_are_adopted_and_repeated(tmp_path: Path) -> No
         scene.act = collect
 
     scene.act = set_ball
-    scene.hear_operators()
+    scene.join_as_operator()
     result = scene.fly()
     assert repeated[-1] == 5
     assert result.obstacles is not None

@@ -14,7 +14,7 @@ import pytest
 from swarmctl.bus.path_messages import encode_path
 from swarmctl.bus.peers import PeerPaths, agent_name
 from swarmctl.bus.refusals import Refusals
-from swarmctl.bus.senders import SILENCE_US, Attendance
+from swarmctl.bus.senders import SILENCE_US, Presence
 from swarmctl.bus.topics import PATH
 from swarmctl.bus.zenoh_bus import ZenohBus
 from tests import builders
@@ -60,8 +60,8 @@ class Listener:
     def __init__(self, bus: ZenohBus) -> None:
         self._bus = bus
         self.refusals = Refusals(lambda *_, **__: None)
-        self.attendance = Attendance(bus)
-        self.paths = PeerPaths([1], 1 / TICK_S, self.refusals, self.attendance)
+        self.presence = Presence(bus)
+        self.paths = PeerPaths([1], 1 / TICK_S, self.refusals, self.presence)
         self.worst_age_s = 0.0
 
     def listen(self, seconds: float, until: Callable[[], bool] = lambda: False) -> bool:
@@ -71,7 +71,7 @@ class Listener:
         while time.monotonic() < deadline_s:
             if until():
                 return True
-            self.attendance.update(now_us())
+            self.presence.update(now_us())
             for sender, payload in self._bus.receive(PATH):
                 self.paths.offer(sender, payload, now_us())
             for path in self.paths.latest():

@@ -92,7 +92,7 @@ class Commands:
             return self._autopilot.arm(self._now_us)
         if params[0] == 0.0:
             return self._autopilot.disarm(force=params[1] == FORCE)
-        self._autopilot.say(Severity.CRITICAL, f"Unsupported ARM_DISARM param: {params[0]:.3f}\t")
+        self._autopilot.send_text(Severity.CRITICAL, f"Unsupported ARM_DISARM param: {params[0]:.3f}\t")
         return None
 
     def _set_mode(self, params: Params) -> Result:
@@ -107,7 +107,7 @@ class Commands:
         return self._enter(Px4Mode(mode))
 
     def _unsupported(self, what: str) -> Result:
-        self._autopilot.say(Severity.CRITICAL, f"Unsupported {what} mode\t")
+        self._autopilot.send_text(Severity.CRITICAL, f"Unsupported {what} mode\t")
         return Result.TEMPORARILY_REJECTED
 
     def _takeoff(self, params: Params) -> Result:
@@ -123,7 +123,7 @@ class Commands:
             return Result.TEMPORARILY_REJECTED
         if self._enter(Px4Mode.AUTO_MISSION) != Result.ACCEPTED or pilot.arm(self._now_us) != Result.ACCEPTED:
             name = MODE_NAMES[Px4Mode.AUTO_MISSION]
-            pilot.say(Severity.CRITICAL, f"Switching to {name} is currently not available\t")
+            pilot.send_text(Severity.CRITICAL, f"Switching to {name} is currently not available\t")
             return Result.TEMPORARILY_REJECTED
         pilot.store.jump(max(0, first))
         return Result.ACCEPTED

@@ -8,7 +8,7 @@ from pymavlink.dialects.v20 import development as mav
 
 from sitl.net.wire import KINDS
 from sitl.px4.link.parameters import Sender
-from sitl.px4.missions import ALL, CAPACITY, MISSION, Item, MissionResult, Store, judge
+from sitl.px4.missions import ALL, CAPACITY, MISSION, Item, MissionResult, Store, validate
 
 RETRY_US = 250_000
 TIMEOUT_US = 5_000_000
@@ -32,7 +32,7 @@ class MissionLink:
         self._wanted = 0  # items of the running upload; 0: none is running
         self._received: list[Item] = []
         self._partner = (0, 0)
-        self._heard_us = self._requested_us = 0
+        self._received_us = self._requested_us = 0
 
     # --- upload ---
 
@@ -51,7 +51,7 @@ class MissionLink:
             self._acknowledge(MissionResult.ACCEPTED, m.mission_type)
         else:
             self._kind, self._wanted, self._received = m.mission_type, m.count, []
-            self._partner, self._heard_us = self._link.sender, now_us
+            self._partner, self._received_us = self._link.sender, now_us
             self._request(now_us)
 
     def item(self, m: Any, now_us: int) -> None:
@@ -68,11 +68,11 @@ class MissionLink:
         scaled = whole or m.frame == _MISSION_FRAME
         x, y = (m.x, m.y) if scaled else (m.x * 1e7, m.y * 1e7)
         item = Item(m.frame, m.command, (m.param1, m.param2, m.param3, m.param4), int(x), int(y), m.z, m.autocontinue)
-        verdict = judge(self._kind, item)
+        verdict = validate(self._kind, item)
         if verdict != MissionResult.ACCEPTED:
             self._give_up(verdict)
             return
-        self._heard_us = now_us
+        self._received_us = now_us
         self._received.append(item)
         if len(self._received) < self._wanted:
             self._request(now_us)
@@ -85,7 +85,7 @@ class MissionLink:
         """Request a missing item again; give up after a silence."""
         if not self._wanted:
             return
-        if now_us - self._heard_us >= TIMEOUT_US:
+        if now_us - self._received_us >= TIMEOUT_US:
             self._wanted = 0
         elif now_us - self._requested_us >= RETRY_US:
             self._request(now_us)

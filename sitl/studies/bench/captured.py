@@ -155,9 +155,9 @@ class Times:
     p99_ms: float
 
 
-def times_of(took_ms: Sequence[float] | Array) -> Times:
+def times_of(duration_ms: Sequence[float] | Array) -> Times:
     """Return p50 and p99 of at least one duration [ms]."""
-    p50_ms, p99_ms = np.percentile(np.asarray(took_ms), (50, 99))
+    p50_ms, p99_ms = np.percentile(np.asarray(duration_ms), (50, 99))
     return Times(float(p50_ms), float(p99_ms))
 
 
@@ -165,14 +165,14 @@ def times_of(took_ms: Sequence[float] | Array) -> Times:
 class Baseline:
     """Answers of SLSQP to the counted problems, as the thesis poses them."""
 
-    took_ms: Array  # (problems,)
+    duration_ms: Array  # (problems,)
     solved: Mask  # (problems,) reported as solved
     kept: Mask  # (problems,) whether its answer keeps every true distance
 
     @property
     def times(self) -> Times:
         """Times of all problems, including those without a solution."""
-        return times_of(self.took_ms)
+        return times_of(self.duration_ms)
 
     @property
     def solved_01(self) -> float:
@@ -206,7 +206,7 @@ class XyTimes:
         if baseline is None or not baseline.solved.any():
             return float("nan")
         solved = baseline.solved
-        return float(np.median(baseline.took_ms[solved]) / np.median(self.qp_ms[solver][solved]))
+        return float(np.median(baseline.duration_ms[solved]) / np.median(self.qp_ms[solver][solved]))
 
 
 def measure_xy(
@@ -248,20 +248,20 @@ class _Running:
 
     def __init__(self, gradients: bool) -> None:
         self._gradients = gradients
-        self._took_ms: list[float] = []
+        self._duration_ms: list[float] = []
         self._answers: list[NonlinearAnswer] = []
 
     def solve(self, problem: NonlinearXy) -> None:
         guess = problem.shifted(self._answers[-1].moves) if self._answers else None
         began_ns = time.thread_time_ns()
         answer = problem.solve(guess, self._gradients)
-        self._took_ms.append((time.thread_time_ns() - began_ns) * 1e-6)
+        self._duration_ms.append((time.thread_time_ns() - began_ns) * 1e-6)
         self._answers.append(answer)
 
     def counted(self) -> Baseline:
         answers = self._answers[_WARM_UP:]
         return Baseline(
-            took_ms=np.array(self._took_ms[_WARM_UP:]),
+            duration_ms=np.array(self._duration_ms[_WARM_UP:]),
             solved=np.array([a.solved for a in answers]),
             kept=np.array([a.shortfall_m < KEPT_M for a in answers]),
         )

@@ -126,15 +126,15 @@ class Formation:
         count = config.swarm.agents - 1
         places = column_m(count + 1) if config.obstacles else places_m(count + 1)
         self.neighbours = Neighbours(places[1:], config.seed)
-        self._buses = [hub.attach(agent_name(i + 1), {}) for i in range(count)]
-        self._operator = hub.attach(topics.OPERATOR, {})
+        self._buses = [hub.connect(agent_name(i + 1), {}) for i in range(count)]
+        self._operator = hub.connect(topics.OPERATOR, {})
         self._seq = 0
         self.agent = make_agent(
             config,
             0,
             1,
             near,
-            bus=hub.attach(agent_name(0)),
+            bus=hub.connect(agent_name(0)),
             clock=self.clock,
             sink=self._sink,
             on_frame=lambda frame: None,

@@ -91,16 +91,16 @@ class Appearance:
         self._radius_m, self._keep_out_m, self._speed_m_s, self._side = radius_m, keep_out_m, speed_m_s, side
         self._from: tuple[float, Array, Array] | None = None  # begin time, place (3,), velocity (3,)
         self._told_s = -math.inf
-        self._gone = False
+        self._removed = False
 
     def step(self, lockstep: Lockstep, t_s: float, pos_ned_m: Array, vel_ned_m_s: Array) -> None:
-        if self._from is None and t_s >= self._at_s and not self._gone:
+        if self._from is None and t_s >= self._at_s and not self._removed:
             self._appear(t_s, pos_ned_m, vel_ned_m_s)
         if self._from is None:
             return
         since_s = self._from[0]
         if self._speed_m_s and (t_s - since_s) * self._speed_m_s > 2.0 * self._ahead_m:
-            self._from, self._gone = None, True
+            self._from, self._removed = None, True
             lockstep.set_obstacles(())
         elif t_s - self._told_s >= (_TOLD_EVERY_S if self._speed_m_s else math.inf):
             self._told_s = t_s

@@ -18,7 +18,7 @@ class Share:
 
     @property
     def share(self) -> float:
-        """Share, 0..1."""
+        """Return hits over trials, 0 to 1; 0 without a trial."""
         return self.hits / self.trials if self.trials else 0.0
 
     @property

@@ -26,7 +26,7 @@ class Cell:
 
 @dataclass(frozen=True, slots=True, order=True)
 class Trial:
-    """One flight."""
+    """Describes one flight of a campaign."""
 
     cell: Cell
     seed: int

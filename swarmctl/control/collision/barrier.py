@@ -65,7 +65,7 @@ class Body:
     pos_ned_m: Vector  # (3,)
     vel_ned_m_s: Vector  # (3,)
     apart_m: float  # distance of centres to keep
-    share_01: float  # share of the avoidance that is the own vehicle's
+    responsibility_01: float  # share of the avoidance that is the own vehicle's
     column: bool = False  # unbounded in height
     solid: bool = False  # has no downwash
 
@@ -92,17 +92,17 @@ def body_of_peer(
     points, dt_s = path.pos_ned_m, path.dt_us * 1e-6
     at = ((act_utc_us - path.t0_utc_us) * 1e-6 + ahead_s) / dt_s
     last = len(points) - 1
-    share_01 = 0.5 if filters else 1.0
+    responsibility_01 = 0.5 if filters else 1.0
     if at >= last:
         a, b = points[last - 1].tolist(), points[last].tolist()
         pos, vel = _braked(b, tuple((q - p) / dt_s for p, q in zip(a, b, strict=True)), (at - last) * dt_s, brake_m_s2)
-        return Body(pos_ned_m=pos, vel_ned_m_s=vel, apart_m=apart_m, share_01=share_01)
+        return Body(pos_ned_m=pos, vel_ned_m_s=vel, apart_m=apart_m, responsibility_01=responsibility_01)
     low = max(0, int(at))
     a, b = points[low].tolist(), points[low + 1].tolist()
     part = at - low
     pos = tuple(p + part * (q - p) for p, q in zip(a, b, strict=True))
     vel = tuple((q - p) / dt_s for p, q in zip(a, b, strict=True))
-    return Body(pos_ned_m=pos, vel_ned_m_s=vel, apart_m=apart_m, share_01=share_01)
+    return Body(pos_ned_m=pos, vel_ned_m_s=vel, apart_m=apart_m, responsibility_01=responsibility_01)
 
 
 def _braked(pos: Vector, vel: Vector, t_s: float, brake_m_s2: float) -> tuple[Vector, Vector]:
@@ -120,7 +120,7 @@ def body_of_obstacle(obstacle: Obstacle, ahead_s: float, apart_m: float) -> Body
         pos_ned_m=pos,
         vel_ned_m_s=vel,
         apart_m=obstacle.radius_m + apart_m,
-        share_01=1.0,
+        responsibility_01=1.0,
         column=obstacle.column,
         solid=True,
     )
@@ -220,7 +220,7 @@ class Barrier:
             nx, ny, nz = -u / size, -v / size, -w / size
         rate = nx * u + ny * v + nz * w
         react_s = p.react_s if rate < 0.0 else 0.0
-        left, brake = distance + react_s * rate - body.apart_m, p.brake_m_s2 / body.share_01
+        left, brake = distance + react_s * rate - body.apart_m, p.brake_m_s2 / body.responsibility_01
         bend = brake / p.near_1_s**2
         if left > bend:
             allowed = math.sqrt(2.0 * brake * (left - 0.5 * bend))
@@ -235,7 +235,7 @@ class Barrier:
         if need < -_FARTHEST_M_S2:
             return None
         nz *= down_01
-        return (-nx, -ny, -nz), body.share_01 * need - (nx * rest[0] + ny * rest[1] + nz * rest[2])
+        return (-nx, -ny, -nz), body.responsibility_01 * need - (nx * rest[0] + ny * rest[1] + nz * rest[2])
 
     def _slew_bounds(self, wanted: float, held: float) -> tuple[float, float]:
         """Return the least and largest u of an axis from the held one on; the wanted u is always within them."""

@@ -59,7 +59,7 @@ class SeparationBudget:
     # -- hard minimum distances of plans ------------------------------------------------------------------------------
 
     @property
-    def certified_m(self) -> float:
+    def hard_min_distance_m(self) -> float:
         """Return the hard minimum distance of a best-effort plan: one that comes closer is never flown."""
         return self.radius_m - self.certify_slack_m
 
@@ -94,7 +94,7 @@ class SeparationBudget:
         return self.planned_m + peer_margin_m + age_margin_m
 
     @property
-    def planned_beyond_certified_m(self) -> float:
+    def planned_beyond_hard_min_m(self) -> float:
         """Return by how much the distance of plans exceeds their hard minimum, before margins of age."""
         return self.tracking_m + self.certify_slack_m
 

@@ -71,7 +71,7 @@ class CommitCounts:
     withdrawn: int = 0
     expired: int = 0
     unplanned: int = 0
-    evaded: int = 0  # committed trajectory replaced without acknowledgement
+    evasive: int = 0  # committed trajectory replaced without acknowledgement
 
 
 class Commitments:
@@ -176,7 +176,7 @@ class Commitments:
         evasive_trajectory = self._planner.evasive_trajectory(self.committed, now)
         if evasive_trajectory is not None:
             self.committed, self.proposal = evasive_trajectory, None
-            self.counts.evaded += 1
+            self.counts.evasive += 1
 
     def is_due(self, utc_us: int) -> bool:
         """Tell whether there is no proposal and `period_s` has passed since the last attempt."""

@@ -23,7 +23,7 @@ _USABLE = frozenset(  # the last two statuses come with unfinished iterates
 
 
 class OsqpSolver:
-    """Solves with OSQP.
+    """Solves the QP of one tick with OSQP.
 
     Args:
         p_pattern: (n, n) boolean, upper triangle used.

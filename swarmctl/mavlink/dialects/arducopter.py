@@ -24,8 +24,8 @@ from swarmctl.mavlink.dialects.parameter_check import (
     Opinion,
     ParameterCheck,
     ParameterContext,
-    judge_hover,
-    judge_own_sysid,
+    assess_hover,
+    assess_own_sysid,
     ok,
 )
 
@@ -165,8 +165,8 @@ ARDUCOPTER = Dialect(
         ParameterCheck("FS_EKF_ACTION", "what happens when the estimator diverges", _ekf_failsafe),
         ParameterCheck("ARMING_CHECK", "what is checked before arming", _arming_check),
         ParameterCheck("ANGLE_MAX", "how far it tilts", _angle_max),
-        ParameterCheck("MOT_THST_HOVER", "what hovers", judge_hover),
-        ParameterCheck("SYSID_THISMAV", "its system id after the next boot", judge_own_sysid),
+        ParameterCheck("MOT_THST_HOVER", "what hovers", assess_hover),
+        ParameterCheck("SYSID_THISMAV", "its system id after the next boot", assess_own_sysid),
     ),
     also_read=(),
     fence_checks=(),

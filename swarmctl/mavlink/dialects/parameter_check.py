@@ -42,7 +42,7 @@ class ParameterCheck:
 
     name: str
     why: str  # why it matters
-    judge: Callable[[float, ParameterContext], Opinion]
+    assess: Callable[[float, ParameterContext], Opinion]
 
 
 def ok(wanted: str) -> Opinion:
@@ -50,7 +50,7 @@ def ok(wanted: str) -> Opinion:
     return Opinion(verdict=Verdict.OK, wanted=wanted)
 
 
-def judge_hover(value: float, seen: ParameterContext) -> Opinion:
+def assess_hover(value: float, seen: ParameterContext) -> Opinion:
     """Compare the autopilot's hover thrust with the configured one."""
     ours = seen.hover_thrust_01
     wanted = f"vehicle_model.hover_thrust_01 = {ours:g}"
@@ -63,7 +63,7 @@ def judge_hover(value: float, seen: ParameterContext) -> Opinion:
     )
 
 
-def judge_own_sysid(value: float, seen: ParameterContext) -> Opinion:
+def assess_own_sysid(value: float, seen: ParameterContext) -> Opinion:
     """Compare the stored system id with the one that the autopilot still uses."""
     if value == seen.sysid:
         return ok(f"{seen.wanted_sysid}")

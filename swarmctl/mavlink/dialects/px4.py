@@ -25,8 +25,8 @@ from swarmctl.mavlink.dialects.parameter_check import (
     Opinion,
     ParameterCheck,
     ParameterContext,
-    judge_hover,
-    judge_own_sysid,
+    assess_hover,
+    assess_own_sysid,
     ok,
 )
 
@@ -167,9 +167,9 @@ PX4 = Dialect(
         ParameterCheck("MAV_FWDEXTSP", "whether setpoints are flown", _forward_setpoints),
         ParameterCheck("COM_RCL_EXCEPT", "whether a lost radio ends offboard", _radio_exception),
         ParameterCheck("COM_RC_IN_MODE", "where sticks come from", _radio_source),
-        ParameterCheck("MPC_THR_HOVER", "what hovers", judge_hover),
+        ParameterCheck("MPC_THR_HOVER", "what hovers", assess_hover),
         ParameterCheck("THR_MDL_FAC", "how thrust becomes motor speed", _thrust_model),
-        ParameterCheck("MAV_SYS_ID", "its system id after the next boot", judge_own_sysid),
+        ParameterCheck("MAV_SYS_ID", "its system id after the next boot", assess_own_sysid),
     ),
     also_read=("NAV_RCL_ACT",),
     fence_checks=(ParameterCheck("GF_ACTION", "what happens at the geofence", _fence_action),),

@@ -34,8 +34,8 @@ class Bench:
     def __init__(self) -> None:
         self.clock, self.told = SimClock(), list[tuple[str, dict[str, Any]]]()
         hub = LocalHub(self.clock.now_us, 1)
-        self.bus = hub.attach(agent_name(0))
-        self.peer: LocalBus = hub.attach(PEER)
+        self.bus = hub.connect(agent_name(0))
+        self.peer: LocalBus = hub.connect(PEER)
         self.alive = {agent_name(0), PEER}
         separation = SeparationParams()
         self.world_model = WorldModel(0, [1], separation, self.bus, rate_hz=RATE_HZ, note=lambda *_, **__: None)
@@ -67,7 +67,7 @@ class Bench:
             self.clock.advance(20_000)
             each()
             utc_us = self.clock.utc_us()
-            self.world_model.listen(utc_us)
+            self.world_model.receive(utc_us)
             self.coordination.receive(utc_us)
             self.coordination.step(utc_us, self.state, Phase.TRACK, DesiredReference(self.wanted))
             self.coordination.publish(utc_us)
@@ -178,7 +178,7 @@ def test_the_certificate_against_a_stale_peer_has_all_of_its_margin(bench: Bench
     utc_us, params = bench.clock.utc_us(), SeparationParams()
     (kept,) = bench.coordination._others(utc_us, bench.state, Phase.TRACK, set())
     (control,) = bench.world_model.keep_outs(HERE, utc_us, 100_000, 5, phase=Phase.TRACK)
-    assert control.hard_min_distance_m == params.budget.certified_m, "which would not grow with age"
+    assert control.hard_min_distance_m == params.budget.hard_min_distance_m, "which would not grow with age"
     assert kept.hard_min_distance_m > params.budget.planned_m + 0.5
 
 

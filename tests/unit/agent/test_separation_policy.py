@@ -58,7 +58,7 @@ def test_best_effort_plans_along_the_desired_reference_around_all_keep_outs(benc
         assert directive.reference is None
         assert directive.keep_outs == (KEEP_OUT,)
         assert directive.committed_peers == {} and directive.lost_peer_keep_outs == ()
-        assert not directive.unresponsive_peer and directive.took_ns == 0
+        assert not directive.unresponsive_peer and directive.duration_ns == 0
     assert policy.commits_refused is None and not policy.uses_commitments
 
 
@@ -81,7 +81,7 @@ def test_guaranteed_follows_the_committed_trajectory_and_names_committed_peers(b
     assert directive.reference.yaw_rad == YAW_RAD
     assert directive.keep_outs == (), "the committed trajectory keeps clear of them"
     assert set(directive.committed_peers) == {1}
-    assert directive.took_ns == 7
+    assert directive.duration_ns == 7
     assert policy.commits_refused == 0 and policy.uses_commitments
 
 
@@ -100,4 +100,4 @@ def test_guaranteed_leaves_an_agent_that_does_not_fly_to_its_controller(bench: B
     assert directive.reference is None
     assert directive.keep_outs == (KEEP_OUT,)
     assert directive.committed_peers == {} and directive.lost_peer_keep_outs == ()
-    assert directive.took_ns == 0
+    assert directive.duration_ns == 0

@@ -1,4 +1,4 @@
-"""Tests of the world model: bounded input, checked senders, and reports of unheard peers."""
+"""Tests of the world model: bounded input, checked senders, and reports of unresponsive peers."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ class Bench:
 
     def __post_init__(self) -> None:
         self.hub = LocalHub(self.clock.now_us)
-        self.bus = self.hub.attach(agent_name(0))
-        self.peer, self.operator = self.hub.attach(agent_name(1)), self.hub.attach(topics.OPERATOR)
+        self.bus = self.hub.connect(agent_name(0))
+        self.peer, self.operator = self.hub.connect(agent_name(1)), self.hub.connect(topics.OPERATOR)
         note = lambda name, **fields: self.events.append({"event": name, **fields})  # noqa: E731
         self.world_model = WorldModel(0, [1, 2], SeparationParams(), self.bus, rate_hz=50.0, note=note)
 
     def tick(self) -> list[str]:
         self.clock.advance(TICK_US)
-        return [order.verb for order in self.world_model.listen(self.clock.utc_us())]
+        return [order.verb for order in self.world_model.receive(self.clock.utc_us())]
 
     def say_path(self, boot_id: int = 1) -> None:
         self.seq += 1
@@ -71,8 +71,8 @@ class Bench:
         return dict(self.world_model.refusals.by_reason)
 
     @property
-    def unheard(self) -> list[dict[str, Any]]:
-        return [row for row in self.events if row["event"] == "unheard"]
+    def unresponsive(self) -> list[dict[str, Any]]:
+        return [row for row in self.events if row["event"] == "unresponsive"]
 
 
 def test_a_list_of_too_many_obstacles_is_refused_and_reported() -> None:
@@ -89,13 +89,13 @@ def test_a_list_of_too_many_obstacles_is_refused_and_reported() -> None:
 def test_the_largest_list_of_obstacles_costs_a_fraction_of_a_tick() -> None:
     bench = Bench()
     bench.set_obstacles(topics.MAX_OBSTACLES, 1)
-    took_ms = []
+    duration_ms = []
     for _ in range(20):
         began_s = time.perf_counter()
         bench.world_model.keep_outs(HERE, bench.clock.utc_us(), 100_000, 25, phase=Phase.TRACK)
         bench.world_model.bodies(HERE, bench.clock.utc_us(), 0.1, 0.1, committed_peers={})
-        took_ms.append((time.perf_counter() - began_s) * 1e3)
-    assert min(took_ms) < 3.0, "of 20"
+        duration_ms.append((time.perf_counter() - began_s) * 1e3)
+    assert min(duration_ms) < 3.0, "of 20"
 
 
 def test_a_version_far_ahead_does_not_block_later_ones() -> None:
@@ -128,17 +128,17 @@ def test_a_peer_refused_for_long_counts_as_bus_loss_and_is_avoided_at_any_height
     (kept,) = bench.world_model.keep_outs(HERE, utc_us, 100_000, 5, phase=Phase.TRACK)
     assert kept.any_height and kept.radius_m > SeparationParams().radius_m + 0.9
     assert bench.world_model.refusals.alert(utc_us) == "path of agent-1 refused: future"
-    assert bench.unheard == [{"event": "unheard", "agent": 1, "begins": True}]
+    assert bench.unresponsive == [{"event": "unresponsive", "agent": 1, "begins": True}]
     assert [row["count"] for row in bench.events if row["event"] == "refused"] == [1, 51]
     bench.say_path()
     bench.tick()
     assert not bench.world_model.has_unresponsive_peer(bench.clock.utc_us())
-    assert bench.unheard[1]["begins"] is False
-    assert bench.unheard[1]["lasted_s"] == pytest.approx(2.0, abs=0.1)
+    assert bench.unresponsive[1]["begins"] is False
+    assert bench.unresponsive[1]["lasted_s"] == pytest.approx(2.0, abs=0.1)
 
 
 @pytest.mark.parametrize("why", ["gone", "done"])
-def test_a_peer_that_died_or_landed_is_not_reported_unheard(why: str) -> None:
+def test_a_peer_that_died_or_landed_is_not_reported_unresponsive(why: str) -> None:
     bench = Bench()
     bench.say_path()
     bench.say_status(phase=int(Phase.DONE if why == "done" else Phase.TRACK))
@@ -147,7 +147,7 @@ def test_a_peer_that_died_or_landed_is_not_reported_unheard(why: str) -> None:
         bench.peer.close()
     for _ in range(100):
         bench.tick()
-    assert bench.unheard == []
+    assert bench.unresponsive == []
 
 
 def test_statuses_are_accepted_like_paths_and_future_ready_times_refused() -> None:

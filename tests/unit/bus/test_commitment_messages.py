@@ -10,7 +10,7 @@ import pytest
 from swarmctl.bus.commitment_messages import PeerTrajectories, decode_trajectory_message, encode_trajectory_message
 from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.bus.refusals import Refusals
-from swarmctl.bus.senders import Attendance
+from swarmctl.bus.senders import Presence
 from swarmctl.core.clock import SimClock
 from swarmctl.core.trajectory import Trajectory, ending_at_rest, joined, resting, stopping
 from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
@@ -77,16 +77,16 @@ class Store:
     def __init__(self) -> None:
         self.clock = SimClock()
         self.hub = LocalHub(self.clock.now_us)
-        self.peer = self.hub.attach(agent_name(2))
-        self.attendance = Attendance(self.hub.attach(agent_name(1)))
+        self.peer = self.hub.connect(agent_name(2))
+        self.presence = Presence(self.hub.connect(agent_name(1)))
         self.refusals = Refusals(lambda *_, **__: None)
-        self.peers = PeerTrajectories([0, 2], 50.0, self.refusals, self.attendance)
+        self.peers = PeerTrajectories([0, 2], 50.0, self.refusals, self.presence)
         self.utc_us = UTC_US
 
     def offer(self, *sent: TrajectoryMessage, sender: str = agent_name(2)) -> None:
         for each in sent:
             self.utc_us += 20_000
-            self.attendance.update(self.utc_us)
+            self.presence.update(self.utc_us)
             self.peers.offer(sender, encode_trajectory_message(each), self.utc_us)
 
 
@@ -115,8 +115,8 @@ def test_a_restart_is_accepted_with_its_third_message_and_has_proposed_nothing_y
     store = Store()
     store.offer(message(seq=3))
     store.peer.close()
-    store.attendance.update(store.utc_us)
-    store.peer = store.hub.attach(agent_name(2))
+    store.presence.update(store.utc_us)
+    store.peer = store.hub.connect(agent_name(2))
     store.offer(
         *(replace(message(seq=seq, boot_id=3, propose=False), sent_utc_us=UTC_US + seq * 50_000) for seq in (4, 5, 6))
     )

@@ -8,7 +8,7 @@ import pytest
 from swarmctl.bus.path_messages import encode_path
 from swarmctl.bus.peers import LEASE_US, LocalBus, LocalHub, PeerPaths, agent_name
 from swarmctl.bus.refusals import Refusals
-from swarmctl.bus.senders import Attendance
+from swarmctl.bus.senders import Presence
 from swarmctl.bus.topics import COMMAND, PATH, TICK, TOO_LONG
 from swarmctl.core.clock import SimClock
 from tests import builders
@@ -27,12 +27,12 @@ class Store:
 
     def __init__(self) -> None:
         self.hub = LocalHub(lambda: 0)
-        self.attendance = Attendance(self.hub.attach("agent-0"))
+        self.presence = Presence(self.hub.connect("agent-0"))
         self.refusals = Refusals(lambda *_, **__: None)
-        self.paths = PeerPaths([1, 2], 50.0, self.refusals, self.attendance)
+        self.paths = PeerPaths([1, 2], 50.0, self.refusals, self.presence)
 
     def offer(self, message: bytes, sender: str = "agent-1", utc_us: int = NOW_US) -> None:
-        self.attendance.update(utc_us)
+        self.presence.update(utc_us)
         self.paths.offer(sender, message, utc_us)
 
     @property
@@ -108,7 +108,7 @@ def test_random_bytes_never_raise() -> None:
 def hub_of(names: list[str], delay_us: int = 0, loss_01: float = 0.0) -> tuple[SimClock, LocalHub, list[LocalBus]]:
     clock = SimClock()
     hub = LocalHub(clock.now_us, seed=5, delay_us=delay_us, loss_01=loss_01)
-    return clock, hub, [hub.attach(name) for name in names]
+    return clock, hub, [hub.connect(name) for name in names]
 
 
 def test_no_message_arrives_within_the_step_of_its_publication() -> None:
@@ -154,7 +154,7 @@ def test_ring_keeps_the_newest_per_sender_and_only_of_what_has_arrived() -> None
 
 def test_subscriptions_can_be_limited_to_neighbours() -> None:
     clock, hub, (a, b) = hub_of(["agent-0", "agent-1"])
-    c = hub.attach("agent-2", {PATH: ["agent-1"]})
+    c = hub.connect("agent-2", {PATH: ["agent-1"]})
     a.publish(PATH, b"a")
     b.publish(PATH, b"b")
     b.publish(TICK, b"t")
@@ -173,7 +173,7 @@ def test_a_detached_participant_is_cut_off_but_its_last_messages_arrive() -> Non
     assert b.receive(PATH) == [("agent-0", b"last")]
     assert a.receive(PATH) == []
     assert b.alive() == {"agent-1"}
-    again = hub.attach("agent-0")
+    again = hub.connect("agent-0")
     a.publish(PATH, b"ghost")
     a.close()
     again.publish(PATH, b"reborn")
@@ -185,14 +185,14 @@ def test_a_detached_participant_is_cut_off_but_its_last_messages_arrive() -> Non
 def test_a_name_can_be_taken_once() -> None:
     _, hub, _ = hub_of(["agent-0"])
     with pytest.raises(ValueError, match="agent-0"):
-        hub.attach("agent-0")
+        hub.connect("agent-0")
 
 
-def deliveries(order: list[int], attach_order: list[int]) -> dict[str, list[tuple[str, bytes]]]:
+def deliveries(order: list[int], connect_order: list[int]) -> dict[str, list[tuple[str, bytes]]]:
     """Return all messages received in 400 steps, with agents ticked and attached in the given orders."""
     clock = SimClock()
     hub = LocalHub(clock.now_us, seed=5, delay_us=40_000, loss_01=0.3)
-    buses = {i: hub.attach(agent_name(i)) for i in attach_order}
+    buses = {i: hub.connect(agent_name(i)) for i in connect_order}
     log: dict[str, list[tuple[str, bytes]]] = {agent_name(i): [] for i in order}
     for step in range(400):
         for i in order:
@@ -233,7 +233,7 @@ def test_leaving_and_rejoining_at_once_counts_as_a_second_arrival() -> None:
     assert dict(b.arrivals()) == {"agent-0": 1, "agent-1": 1}
     a.close()
     assert b.alive() == {"agent-1"}
-    hub.attach("agent-0")
+    hub.connect("agent-0")
     assert dict(b.arrivals()) == {"agent-0": 2, "agent-1": 1}
     assert b.alive() == {"agent-0", "agent-1"}
 
@@ -247,7 +247,7 @@ def test_a_failed_bus_reports_arrivals_and_departures_once_it_recovers(failed_us
     hub.fail()
     a.close()
     assert b.alive() == {"agent-0", "agent-1"}, "nobody can tell us"
-    hub.attach("agent-0")
+    hub.connect("agent-0")
     clock.advance(failed_us)
     assert dict(b.arrivals()) == before
     hub.recover()

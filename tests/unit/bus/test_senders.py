@@ -10,7 +10,7 @@ import pytest
 
 from swarmctl.bus.peers import LocalBus, LocalHub
 from swarmctl.bus.refusals import HARMLESS, Refusals
-from swarmctl.bus.senders import SILENCE_US, Attendance, ReceivedMessage, SenderVerifier, _Stream
+from swarmctl.bus.senders import SILENCE_US, Presence, ReceivedMessage, SenderVerifier, _Stream
 from swarmctl.core.clock import SimClock
 
 RATE_HZ, TICK_US = 50.0, 20_000
@@ -30,9 +30,9 @@ class Bench:
     def __post_init__(self) -> None:
         self.hub = LocalHub(self.clock.now_us)
         self.refusals = Refusals(lambda _, **fields: self.told.append(fields))
-        self.attendance = Attendance(self.hub.attach("agent-0"))
-        self.token: LocalBus = self.hub.attach("agent-1")
-        self.verifier = SenderVerifier("agent-1", "path", RATE_HZ, self.refusals, attendance=self.attendance)
+        self.presence = Presence(self.hub.connect("agent-0"))
+        self.token: LocalBus = self.hub.connect("agent-1")
+        self.verifier = SenderVerifier("agent-1", "path", RATE_HZ, self.refusals, presence=self.presence)
 
     def ticks(self, count: int, boots: Iterable[int] = (TRUE,), late_us: int = 0) -> None:
         """Advance ticks, in each of which the given processes publish their next message."""
@@ -41,11 +41,11 @@ class Bench:
             for boot_id in boots:
                 self.seq[boot_id] = self.seq.get(boot_id, 0) + 1
                 self.offer(boot_id, self.seq[boot_id], -late_us)
-            self.attendance.update(self.clock.utc_us())
+            self.presence.update(self.clock.utc_us())
 
     def offer(self, boot_id: int, seq: int, shift_us: int = 0, content: bytes = b"") -> bool:
         utc_us = self.clock.utc_us()
-        self.attendance.update(utc_us)
+        self.presence.update(utc_us)
         received = ReceivedMessage(boot_id, seq, utc_us + shift_us, content or f"{boot_id} {seq}".encode())
         if not self.verifier.accepts(received, utc_us):
             return False
@@ -54,11 +54,11 @@ class Bench:
 
     def leave(self) -> None:
         self.token.close()
-        self.attendance.update(self.clock.utc_us())
+        self.presence.update(self.clock.utc_us())
 
     def come(self) -> None:
-        self.token = self.hub.attach("agent-1")
-        self.attendance.update(self.clock.utc_us())
+        self.token = self.hub.connect("agent-1")
+        self.presence.update(self.clock.utc_us())
 
     def accepted_s(self, boot_id: int, since: int) -> float:
         """Return the time [s] from tick `since` until messages of a boot id are accepted."""
@@ -199,7 +199,7 @@ def test_a_lost_router_helps_no_forger_once_the_peer_has_published() -> None:
     bench.hub.fail()
     for _ in range(100):
         bench.clock.advance(TICK_US)
-        bench.attendance.update(bench.clock.utc_us())
+        bench.presence.update(bench.clock.utc_us())
     bench.hub.recover()
     bench.seq[TRUE] += 100
     bench.ticks(2)

@@ -567,6 +567,8 @@ MINIMAL: dict[str, Any] = {
     "checks": (ParameterCheck("CHECKED", "why", lambda value, seen: Opinion(verdict=NOTE, wanted="2", advice="two")),),
     "also_read": (),
     "loss_parameter": "LOSS",
+    "fence_checks": (),
+    "log_suffix": "",
 }
 
 

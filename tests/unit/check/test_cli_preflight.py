@@ -176,7 +176,7 @@ def test_a_lost_terminal_does_not_end_the_flight() -> None:
         def write(self, _: str) -> int:
             raise BrokenPipeError
 
-    PlainLines(Gone()).say("x")
+    PlainLines(Gone()).print_line("x")
 
 
 def test_table_cells() -> None:
@@ -185,7 +185,7 @@ def test_table_cells() -> None:
         "",
     )
     assert status_cells(AgentView(agent=0, status=status(99, -1.0)))[1:5] == ("99", "TRACKING", "0.123", "-")
-    assert status_cells(AgentView(agent=1))[-1] == "not heard yet"
+    assert status_cells(AgentView(agent=1))[-1] == "no status yet"
 
 
 def test_what_an_agent_says_is_shown_as_it_is() -> None:
@@ -200,12 +200,12 @@ def test_an_agents_text_controls_no_terminal(capsys: pytest.CaptureFixture[str])
     hostile = "\x1b]0;owned\x07\x9b2J\u202e\r\nDONE"
     stream = io.StringIO()
     lines = PlainLines(stream)
-    lines.say(hostile)
+    lines.print_line(hostile)
     lines.show([AgentView(agent=0, status=status(active_alert=hostile))])
     Console(file=stream, width=200).print(
         status_table([AgentView(agent=0, status=status(active_alert=hostile), note="")])
     )
-    LiveTable(Console(file=stream, force_terminal=False)).say(hostile)
+    LiveTable(Console(file=stream, force_terminal=False)).print_line(hostile)
     print_statuses([AgentView(agent=0, status=status(active_alert=hostile))])
     print(operator.as_json({0: status(active_alert=hostile)}))
     shown = stream.getvalue() + capsys.readouterr().out

@@ -157,7 +157,7 @@ def test_nothing_is_sent_before_an_autopilot_was_received(listener: ScriptedList
     scan = VehicleScan(listener, NOWHERE, 1, names(), seconds=1.0)
     run(scan, vehicle, 1.5, beating=False)
     assert listener.sent == []
-    assert not scan.heard
+    assert not scan.found_autopilot
     run(scan, vehicle, 1.5)
     assert {to for _, to in listener.sent} == {VEHICLE}
 
@@ -299,7 +299,7 @@ def test_junk_is_survived(listener: ScriptedListener) -> None:
         ReceivedDatagram(listener.now_us, data, STRANGER) for data in (b"", b"\xfd\xff", b"\xfe", bytes([0xFD] * 300))
     ]
     scan.step(listener.now_us)
-    assert not scan.heard
+    assert not scan.found_autopilot
 
 
 def test_whatever_an_autopilot_says_a_check_ends_in_words(listener: ScriptedListener) -> None:

@@ -51,13 +51,13 @@ def fly_at_goals(
                 pos_ned_m=tuple((np.array(o.pos_ned_m) + k * DT_S * np.array(o.vel_ned_m_s)).tolist()),
                 vel_ned_m_s=o.vel_ned_m_s,
                 apart_m=o.apart_m,
-                share_01=o.share_01,
+                responsibility_01=o.responsibility_01,
                 column=o.column,
             )
             for o in others or []
         ]
         bodies = [
-            Body(pos_ned_m=tuple(p.tolist()), vel_ned_m_s=tuple(v.tolist()), apart_m=APART_M, share_01=0.5)
+            Body(pos_ned_m=tuple(p.tolist()), vel_ned_m_s=tuple(v.tolist()), apart_m=APART_M, responsibility_01=0.5)
             for p, v in zip(pos, vel, strict=True)
         ]
         commands = []
@@ -108,7 +108,7 @@ def test_against_an_obstacle_the_vehicle_brakes_alone(column: bool, speed_m_s: f
             pos_ned_m=(3.0, 0.1, 0.0),
             vel_ned_m_s=(-speed_m_s, 0.0, 0.0),
             apart_m=1.24 + PARAMS.margin_m,
-            share_01=1.0,
+            responsibility_01=1.0,
             column=column,
         )
     ]
@@ -121,7 +121,7 @@ def test_both_of_a_pair_brake_and_one_alone_brakes_all_of_it() -> None:
     barrier = Barrier(PARAMS.model_copy(update={"slew_1_s": 50.0}), MODEL, DT_S)
     here = start(np.zeros(3), np.array([1.5, 0.0, 0.0]))
     other = [
-        Body(pos_ned_m=(1.3, 0.0, 0.0), vel_ned_m_s=(-1.5, 0.0, 0.0), apart_m=APART_M, share_01=share)
+        Body(pos_ned_m=(1.3, 0.0, 0.0), vel_ned_m_s=(-1.5, 0.0, 0.0), apart_m=APART_M, responsibility_01=share)
         for share in (0.5, 1.0)
     ]
     half, whole = (filtered(barrier, HOVER, here, [body]) for body in other)
@@ -132,7 +132,7 @@ def test_both_of_a_pair_brake_and_one_alone_brakes_all_of_it() -> None:
         barrier,
         HOVER,
         start(np.zeros(3), -here.vel_ned_m_s),
-        [Body(pos_ned_m=(-1.3, 0.0, 0.0), vel_ned_m_s=(1.5, 0.0, 0.0), apart_m=APART_M, share_01=0.5)],
+        [Body(pos_ned_m=(-1.3, 0.0, 0.0), vel_ned_m_s=(1.5, 0.0, 0.0), apart_m=APART_M, responsibility_01=0.5)],
     )
     assert mirrored is not None
     np.testing.assert_allclose(mirrored, half * [-1.0, 1.0, 1.0], atol=1e-12)
@@ -155,7 +155,7 @@ def test_the_filter_does_not_act_on_agents_that_keep_apart(pos: tuple[float, ...
             barrier,
             np.array([0.2, 0.1, 9.9]),
             start(np.zeros(3), np.zeros(3)),
-            [Body(pos_ned_m=pos, vel_ned_m_s=vel, apart_m=APART_M, share_01=0.5)],
+            [Body(pos_ned_m=pos, vel_ned_m_s=vel, apart_m=APART_M, responsibility_01=0.5)],
         )
         is None
     )
@@ -175,7 +175,7 @@ def test_commands_stay_within_the_airframe_bounds() -> None:
                 pos_ned_m=tuple(rng.normal(scale=0.5, size=3).tolist()),
                 vel_ned_m_s=tuple(rng.normal(scale=2.0, size=3).tolist()),
                 apart_m=APART_M,
-                share_01=1.0,
+                responsibility_01=1.0,
             )
             for _ in range(5)
         ]
@@ -196,7 +196,7 @@ def test_coincident_bodies_part_along_their_relative_velocity() -> None:
         barrier,
         HOVER,
         start(np.zeros(3), np.array([1.0, 0.0, 0.0])),
-        [Body(pos_ned_m=(0.0,) * 3, vel_ned_m_s=(-1.0, 0.0, 0.0), apart_m=APART_M, share_01=0.5)],
+        [Body(pos_ned_m=(0.0,) * 3, vel_ned_m_s=(-1.0, 0.0, 0.0), apart_m=APART_M, responsibility_01=0.5)],
     )
     assert found is not None
     assert found[0] > 0.0
@@ -222,7 +222,7 @@ def test_a_peer_is_predicted_to_when_the_command_takes_effect() -> None:
     assert found.pos_ned_m == pytest.approx((0.31, 0.0, 0.0))
     assert found.vel_ned_m_s == pytest.approx((1.0, 0.0, 0.0))
     assert found.apart_m == pytest.approx(APART_M + 0.02)
-    assert (found.share_01, body(path(0), 100_000, filters=False).share_01) == (0.5, 1.0)
+    assert (found.responsibility_01, body(path(0), 100_000, filters=False).responsibility_01) == (0.5, 1.0)
 
 
 def test_the_margin_of_a_stale_peer_grows_with_time() -> None:
@@ -254,12 +254,12 @@ def test_an_obstacle_moves_on() -> None:
     found = body_of_obstacle(ball, 0.2, 0.29)
     assert found.pos_ned_m == pytest.approx((1.0, 1.8, 3.0))
     assert found.apart_m == pytest.approx(0.79)
-    assert (found.share_01, found.column, found.solid) == (1.0, True, True)
+    assert (found.responsibility_01, found.column, found.solid) == (1.0, True, True)
 
 
 def test_downwash_demands_more_distance_vertically_than_horizontally() -> None:
     sinking = start(np.array([0.0, 0.0, -1.0]), np.array([0.0, 0.0, 0.5]))
-    below = [Body(pos_ned_m=(0.0, 0.0, 0.0), vel_ned_m_s=(0.0, 0.0, 0.0), apart_m=APART_M, share_01=0.5)]
+    below = [Body(pos_ned_m=(0.0, 0.0, 0.0), vel_ned_m_s=(0.0, 0.0, 0.0), apart_m=APART_M, responsibility_01=0.5)]
     assert filtered(Barrier(PARAMS, MODEL, DT_S), HOVER, sinking, below) is None
     found = filtered(Barrier(PARAMS, MODEL, DT_S, downwash=2.0), HOVER, sinking, below)
     assert found is not None

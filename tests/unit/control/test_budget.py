@@ -26,7 +26,7 @@ def in_order_m(params: SeparationParams) -> dict[str, float]:
     return {
         "body_m": budget.body_m,
         "barrier_m": budget.barrier_m(MARGIN_M),
-        "certified_m": budget.certified_m,
+        "hard_min_distance_m": budget.hard_min_distance_m,
         "committed_m": budget.committed_m,
         "radius_m": budget.radius_m,
         "planned_m": budget.planned_m,
@@ -60,9 +60,9 @@ def test_margins_of_a_peer_add_up_in_every_layer() -> None:
     budget = SeparationParams(tracking_m=0.05).budget
     assert budget.planned_peer_m(0.2, 0.3) == pytest.approx(budget.planned_m + 0.5)
     assert budget.barrier_peer_m(0.05, 0.2, 0.3) == pytest.approx(budget.barrier_m(0.05) + 0.5)
-    assert budget.certified_peer_m(0.2) == pytest.approx(budget.certified_m + 0.2)
+    assert budget.certified_peer_m(0.2) == pytest.approx(budget.hard_min_distance_m + 0.2)
     assert budget.certified_obstacle_m(1.0) == pytest.approx(0.9)
-    assert budget.planned_beyond_certified_m == pytest.approx(budget.planned_m - budget.certified_m)
+    assert budget.planned_beyond_hard_min_m == pytest.approx(budget.planned_m - budget.hard_min_distance_m)
     assert budget.barrier_obstacle_m(0.05) == pytest.approx(0.29)
 
 

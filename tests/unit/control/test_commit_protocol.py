@@ -212,7 +212,7 @@ def test_an_evasion_is_found_by_the_peer_it_conflicts_with() -> None:
             utc_us=UTC_US, begin_us=UTC_US, desired=DesiredReference(at_goal), peers={}, others=[wall(1.6, first)]
         )
     )
-    assert first.counts.evaded == 1, "before a wall there is no time for acknowledgements"
+    assert first.counts.evasive == 1, "before a wall there is no time for acknowledgements"
     assert second.conflicting_peers(UTC_US, message_of(first, 0)) == {0}
     assert second.conflicting_peers(UTC_US, message_of(first, 0)) == {0}, "as long as it does"
 
@@ -224,7 +224,7 @@ def test_a_wall_that_leaves_time_for_acknowledgements_triggers_no_evasion() -> N
             utc_us=UTC_US, begin_us=UTC_US, desired=DesiredReference(at_goal), peers={}, others=[wall(2.6, first)]
         )
     )
-    assert first.counts.evaded == 0
+    assert first.counts.evasive == 0
 
 
 def test_an_agent_at_rest_evades_what_approaches() -> None:
@@ -242,7 +242,7 @@ def test_an_agent_at_rest_evades_what_approaches() -> None:
             others=[builders.keep_out(pos_ned_m=coming)],
         )
     )
-    assert agent.counts.evaded == 1
+    assert agent.counts.evasive == 1
     assert agent.committed is not None
     apart = agent.committed.sample(UTC_US + times_s * 1e6)[0] - coming
     assert np.linalg.norm(apart, axis=1).min() > 0.5, "it would have been 0.3 m"

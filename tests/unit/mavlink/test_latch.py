@@ -213,18 +213,18 @@ def fly_through_flood(link: UdpTransport, port: int, seconds: float) -> tuple[fl
     assert heard(link, 1) == [beat()]
     flooder.start()
     time.sleep(0.3)
-    took_ms, sent, got = [], 0, 0
+    duration_ms, sent, got = [], 0, 0
     for k in range(round(seconds / 0.02)):
         for _ in range(2):
             sent += vehicle.sendto(state(k), ("127.0.0.1", port)) > 0
         time.sleep(0.02)
         began = time.thread_time()  # what the drain costs, not what else the machine does
         got += len(link.receive(now()))
-        took_ms.append((time.thread_time() - began) * 1e3)
+        duration_ms.append((time.thread_time() - began) * 1e3)
     stop.set()
     flooder.join(5.0)
     vehicle.close()
-    return max(took_ms), sent, got, float(rate_hz.value)
+    return max(duration_ms), sent, got, float(rate_hz.value)
 
 
 def test_a_flood_costs_the_tick_nothing_and_loses_nothing_of_the_vehicle(port: socket.socket) -> None:

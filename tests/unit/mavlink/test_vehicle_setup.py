@@ -44,7 +44,7 @@ class Vehicle:
         self.boot()
         self.pilot = Autopilot(self.ours, Codec(1, 191), 1, HOME, on_frame=lambda frame: None)
         self.port = CommandPort(self.pilot.send_frame, Codec(1, 191), 1, lambda: self.pilot.dialect)
-        self.pilot.attach(self.port)
+        self.pilot.connect(self.port)
         self.setup: dict[str, int | float] = {}
         self.vehicle_setup = VehicleSetup(self.pilot, self.port, self.setup, 1, state_rate_hz=50.0)
 
@@ -67,7 +67,7 @@ class Vehicle:
             self.pilot.poll(self.clock.now_us())
             self.port.step(self.clock.now_us())
             for result in self.port.results():
-                self.vehicle_setup.took(result)
+                self.vehicle_setup.on_result(result)
             self.vehicle_setup.step(self.clock.now_us())
             self.clock.advance(20_000)
         return self

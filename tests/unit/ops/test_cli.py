@@ -225,7 +225,7 @@ def test_options_override_sets_and_simulate_passes_everything_on(run: Run, monke
 def test_a_reader_that_goes_away_does_not_change_the_exit_code() -> None:
     code = (
         "import sys; from swarmctl.ops import cli, status_table\n"
-        "cli._run_app = lambda: status_table.PlainLines(sys.stdout).say('landed') or 4\ncli.main()"
+        "cli._run_app = lambda: status_table.PlainLines(sys.stdout).print_line('landed') or 4\ncli.main()"
     )
     process = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
     assert process.stdout is not None

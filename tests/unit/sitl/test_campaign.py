@@ -199,7 +199,7 @@ def test_cells_that_cannot_be_flown_are_refused_first(
 def test_a_partitioned_bus_delivers_nothing() -> None:
     now_us = 0
     hub = LocalHub(lambda: now_us)
-    one, other = hub.attach(agent_name(0)), hub.attach(agent_name(1))
+    one, other = hub.connect(agent_name(0)), hub.connect(agent_name(1))
     hub.fail()
     one.publish(topics.PATH, b"lost")
     one.publish(topics.COMMAND, b"kept")

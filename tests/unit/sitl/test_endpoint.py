@@ -13,8 +13,7 @@ from pymavlink.dialects.v20 import development as mav
 
 from sitl.plant.sensors import local_origin
 from sitl.px4.link.schedule import OFFBOARD_HZ, Schedule
-from sitl.px4.link.streams_health import STREAMS
-from sitl.px4.parameters import DEFAULTS, INT32, REAL32, Parameters, int_from_wire, int_to_wire
+from sitl.px4.parameters import int_from_wire, int_to_wire
 from sitl.world import SitlWorld
 from swarmctl.config_problems import validated
 from swarmctl.core.clock import SimClock
@@ -74,67 +73,17 @@ def result(messages: list[Any]) -> int | None:
 # --- addressing ---
 
 
-@pytest.mark.parametrize(("target", "answered"), [((1, 1), True), ((0, 0), True), ((1, 0), True), ((2, 1), False)])
-def test_only_the_addressed_answer(target: tuple[int, int], answered: bool) -> None:
-    assert (result(Client().command(400, 1, target=target)) is not None) == answered
-
-
-def test_another_component_is_ignored() -> None:
-    client = Client()
-    assert result(client.command(400, 1, target=(1, 250))) is None
-    assert not client.world.autopilots[0].armed
-
-
-def test_acks_go_to_the_sender() -> None:
-    (ack,) = of("COMMAND_ACK", Client().command(12345))
-    assert (ack.result, ack.target_system, ack.target_component) == (3, 1, 191)
-
-
-@pytest.mark.parametrize("command", [410, 520, 34, 31010])
-def test_unknown_commands_are_unsupported(command: int) -> None:
-    assert result(Client().command(command, NAN, NAN, NAN, NAN, NAN, NAN, NAN)) == 3
-
-
-def test_command_int_and_set_mode_are_understood() -> None:
-    client = Client()
-    arm = mav.MAVLink_command_int_message(1, 1, 0, 400, 0, 0, 1.0, 0, 0, 0, 0, 0, 0)
-    assert result(client.ask(arm)) == 0
-    (ack,) = of("COMMAND_ACK", client.ask(mav.MAVLink_set_mode_message(1, 1, 4 << 16 | 3 << 24)))
-    assert (ack.command, ack.result) == (176, 0)
-
-
 def test_heartbeats_keep_their_tick_under_any_traffic() -> None:
     client = Client()
     got = client.ask(mav.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
     assert not of("HEARTBEAT", got)
-    (beat,) = of("HEARTBEAT", client.run(1.0))
-    assert (beat.type, beat.autopilot, beat.base_mode, beat.custom_mode, beat.system_status) == (
-        2,
-        12,
-        29,
-        0x03040000,
-        3,
-    )
+    assert len(of("HEARTBEAT", client.run(1.0))) == 1
 
 
 # --- streams ---
 
 
-def test_default_rates_are_those_of_the_offboard_link() -> None:
-    got = Client().run(4.0)
-    for message in STREAMS.keys() & mav.mavlink_map.keys():
-        name = mav.mavlink_map[message].msgname
-        assert len(of(name, got)) == pytest.approx(4.0 * OFFBOARD_HZ.get(message, 0.0), abs=1.01), name
-
-
-@pytest.mark.parametrize(("interval_us", "per_second"), [(10000, 100), (20000, 50), (-1, 0), (0, 30), (1, 250)])
-def test_message_intervals(interval_us: int, per_second: int) -> None:
-    client = Client()
-    assert result(client.command(511, 331, interval_us)) == 0
-    assert len(of("ODOMETRY", client.run(2.0))) == pytest.approx(2 * per_second, abs=1)
-
-
-@pytest.mark.parametrize("params", [(9999, 10000), (NAN, 10000), (331, NAN), (math.inf, 1), (331, math.inf)])
+@pytest.mark.parametrize("params", [(NAN, 10000), (331, NAN), (math.inf, 1), (331, math.inf)])
 def test_impossible_intervals_fail(params: tuple[float, float]) -> None:
     assert result(Client().command(511, *params)) == 4
 
@@ -142,7 +91,8 @@ def test_impossible_intervals_fail(params: tuple[float, float]) -> None:
 def test_odometry_samples_lie_on_the_agents_grid() -> None:
     client = Client()
     client.command(511, 331, 20000)
-    assert {m.time_usec % 20000 for m in of("ODOMETRY", client.run(1.0))} == {0}
+    stamps_us = [m.time_usec for m in of("ODOMETRY", client.run(1.0))]
+    assert stamps_us == list(range(220_000, 1_220_000, 20_000))
 
 
 def test_a_late_schedule_sends_once_and_keeps_its_grid() -> None:
@@ -192,36 +142,9 @@ def test_health_shows_when_arming_would_be_accepted() -> None:
     assert ready.onboard_control_sensors_present == 0x0300C02F
 
 
-@pytest.mark.parametrize(("message", "name"), [(148, "AUTOPILOT_VERSION"), (242, "HOME_POSITION")])
-def test_requested_messages(message: int, name: str) -> None:
-    got = Client().command(512, message)
-    assert result(got) == 0
-    assert of(name, got)
-
-
-def test_timesync_and_ping_are_answered() -> None:
-    client = Client()
-    (sync,) = of("TIMESYNC", client.ask(mav.MAVLink_timesync_message(0, 4242)))
-    assert sync.ts1 == 4242
+def test_timesync_is_answered_with_the_time_of_its_arrival() -> None:
+    (sync,) = of("TIMESYNC", Client().ask(mav.MAVLink_timesync_message(0, 4242)))
     assert sync.tc1 == pytest.approx(0.204e9, abs=1e7)
-    assert not of("TIMESYNC", client.ask(mav.MAVLink_timesync_message(5, 4242)))
-    (ping,) = of("PING", client.ask(mav.MAVLink_ping_message(77, 3, 0, 0)))
-    assert (ping.seq, ping.target_system, ping.target_component) == (3, 1, 191)
-
-
-def test_texts_go_to_ground_stations_only() -> None:
-    companion = Client()
-    companion.ask(mav.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
-    assert not of("STATUSTEXT", companion.command(400, 1) + companion.run(0.5))
-    station = Client()
-    station.ask(mav.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3))
-    got = station.command(400, 5) + station.command(400, 1) + station.run(0.5)
-    texts = [m.text for m in of("STATUSTEXT", got)]
-    assert texts == [
-        "Unsupported ARM_DISARM param: 5.000\t",
-        "Armed by external command\t",
-        "[logger] ./log/2026-01-01/00_00_00.ulg\t",
-    ]
 
 
 def test_old_texts_are_dropped() -> None:
@@ -241,68 +164,11 @@ def test_integers_travel_bytewise() -> None:
         assert int_from_wire(int_to_wire(value)) == value
 
 
-def test_parameter_list_is_complete() -> None:
-    client = Client()
-    client.ask(mav.MAVLink_param_request_list_message(1, 1))
-    values = of("PARAM_VALUE", client.run(0.5))
-    assert {m.param_index for m in values} | {0, 1, 2, 3} == set(range(len(DEFAULTS)))
-    assert {m.param_count for m in values} == {len(DEFAULTS)}
-    sysid = next(m for m in values if m.param_id == "MAV_SYS_ID")
-    assert (int_from_wire(sysid.param_value), sysid.param_type) == (1, INT32)
-
-
-def test_parameters_are_set_and_read_back() -> None:
-    client = Client()
-    set_int = mav.MAVLink_param_set_message(1, 1, b"COM_OBL_RC_ACT", int_to_wire(4), INT32)
-    (value,) = of("PARAM_VALUE", client.ask(set_int))
-    assert int_from_wire(value.param_value) == 4
-    assert client.world.autopilots[0].parameters.integer("COM_OBL_RC_ACT") == 4
-    (value,) = of("PARAM_VALUE", client.ask(mav.MAVLink_param_request_read_message(1, 1, b"COM_OF_LOSS_T", -1)))
-    assert (value.param_value, value.param_type) == (1.0, REAL32)
-
-
-@pytest.mark.parametrize(
-    ("name", "kind", "error"), [(b"NO_SUCH", REAL32, 1), (b"COM_OF_LOSS_T", INT32, 7), (b"COM_OBL_RC_ACT", REAL32, 7)]
-)
-def test_bad_parameter_writes_are_refused(name: bytes, kind: int, error: int) -> None:
-    client = Client()
-    got = client.ask(mav.MAVLink_param_set_message(1, 1, name, 0.25, kind))
-    (refusal,) = of("PARAM_ERROR", got)
-    assert refusal.error == error
-    assert not of("PARAM_VALUE", got)
-    assert client.world.autopilots[0].parameters.real("COM_OF_LOSS_T") == 1.0
-
-
-def test_unknown_parameter_reads_are_refused() -> None:
-    client = Client()
-    for message in (
-        mav.MAVLink_param_request_read_message(1, 1, b"NO_SUCH", -1),
-        mav.MAVLink_param_request_read_message(1, 1, b"", 9999),
-    ):
-        assert of("PARAM_ERROR", client.ask(message))
-
-
-def test_non_finite_floats_are_not_stored() -> None:
-    table = Parameters(1)
-    assert table.set_from_wire("COM_OF_LOSS_T", NAN, REAL32).value == 1.0
+def test_an_index_beyond_the_parameters_is_refused() -> None:
+    assert of("PARAM_ERROR", Client().ask(mav.MAVLink_param_request_read_message(1, 1, b"", 9999)))
 
 
 # --- hostile bytes ---
-
-
-def test_junk_does_not_disturb_a_vehicle() -> None:
-    client = Client()
-    rng = np.random.default_rng([1, 0, 7])
-    good = client.codec.encode(mav.MAVLink_command_long_message(1, 1, 400, 0, 1, *[0.0] * 6))
-    for _ in range(300):
-        client.links[0].send(rng.integers(0, 256, int(rng.integers(0, 80)), dtype=np.uint8).tobytes())
-        broken = bytearray(good)
-        broken[int(rng.integers(0, len(good)))] ^= int(rng.integers(1, 256))
-        client.links[0].send(bytes(broken))
-        client.links[0].send(b"\xfd\xff")
-        client.run(0.004)
-    assert not client.world.autopilots[0].armed
-    assert result(client.command(400, 1)) == 0
 
 
 def test_every_command_survives_extreme_parameters() -> None:

@@ -10,9 +10,7 @@ import pytest
 
 from sitl.plant.estimator import ESTIMATORS, EXACT_ACCURACY_M
 from sitl.world import SitlWorld
-from swarmctl.config_problems import validated
 from swarmctl.core.clock import SimClock
-from swarmctl.errors import ConfigError
 from swarmctl.mavlink.transport import pipe_pair
 from swarmctl.simulator_config import SimulatorConfig
 from tests.benches.flown_world import FlownWorld
@@ -161,8 +159,3 @@ def test_a_loitering_vehicle_wanders_as_its_estimate_does() -> None:
         spread_m[estimator] = float(np.ptp(np.array(kept), axis=0).max())
     assert 0.1 < spread_m["gps"] < 1.5
     assert spread_m["exact"] < 0.02
-
-
-def test_an_unknown_model_is_refused() -> None:
-    with pytest.raises(ConfigError, match="estimator = 'perfect': input should be 'exact', 'gps' or 'external'"):
-        validated(SimulatorConfig, {"estimator": "perfect"}, "sitl")

@@ -40,7 +40,7 @@ class Vehicle:
         self.world = SitlWorld(SimulatorConfig(vehicles=1, preset="x500", ekf_ready_s=0.1, seed=5), [vehicle_end])
         self.codec = Codec(1, 191)
         self.stream_thrust_01: float | None = None
-        self.heard: list[bytes] = []
+        self.received: list[bytes] = []
 
     def step(self, hostile: Sequence[bytes] = ()) -> None:
         if self.stream_thrust_01 is not None and self.clock.now_us() % 20_000 == 0:
@@ -49,7 +49,7 @@ class Vehicle:
             self.link.send(data)
         self.clock.advance(STEP_US)
         self.world.step(self.clock.now_us())
-        self.heard = [d.data for d in self.link.receive(self.clock.now_us())]
+        self.received = [d.data for d in self.link.receive(self.clock.now_us())]
 
     def run(self, seconds: float) -> None:
         for _ in range(round(seconds * 1e6 / STEP_US)):
@@ -64,7 +64,7 @@ class Vehicle:
         answers: list[Any] = []
         for _ in range(3):
             self.step()
-            answers += [self.codec.decode(f) for data in self.heard for f in frames(data)]
+            answers += [self.codec.decode(f) for data in self.received for f in frames(data)]
         acks = [m.result for m in answers if m is not None and m.get_type() == "COMMAND_ACK" and m.command == command]
         return acks[0] if acks else None
 
@@ -140,7 +140,7 @@ def still_obeys(vehicle: Vehicle, place: str) -> None:
     vehicle.run(0.2)
     vehicle.say(mav.MAVLink_param_request_read_message(1, 1, b"COM_OF_LOSS_T", -1))
     vehicle.step()
-    answers = [vehicle.codec.decode(f) for data in vehicle.heard for f in frames(data)]
+    answers = [vehicle.codec.decode(f) for data in vehicle.received for f in frames(data)]
     assert [m.param_value for m in answers if m is not None and m.get_type() == "PARAM_VALUE"] == [1.0]
     if place == "ground":
         assert vehicle.order(400, 1.0) == 0

@@ -12,7 +12,7 @@ from sitl.net.ports import OpenPort
 from sitl.px4.modes import Px4Mode, Result
 from sitl.px4.parameters import REAL32
 from swarmctl.mavlink.transport import bind_udp
-from tests.benches.px4_bench import COARSE, NAN, SPAWN_NED_M, Bench
+from tests.benches.px4_bench import COARSE, SPAWN_NED_M, Bench
 
 BEAT, ACK, TEXT, VALUE = 0, 77, 253, 22
 GCS_BEAT = mav.MAVLink_heartbeat_message(mav.MAV_TYPE_GCS, 8, 0, 0, 4, 3)
@@ -33,22 +33,6 @@ def test_texts_go_to_the_link_that_hears_a_ground_station() -> None:
     bench.command(400, 0)
     bench.run(0.2)
     assert [m.text for m in bench.said(TEXT)][-1] == "Disarmed by external command\t"
-
-
-def test_heartbeats_of_clients_are_forwarded_and_acks_are_not() -> None:
-    bench = Bench(gcs=True)
-    bench.forget()
-    bench.send(GCS_BEAT, gcs=True)
-    bench.run(0.02)
-    assert [(m.get_srcSystem(), m.type) for m in bench.said(BEAT)] == [(255, mav.MAV_TYPE_GCS)]
-    assert bench.arm() == Result.ACCEPTED
-    assert not bench.said(ACK, gcs=True)
-    bench.send(mav.MAVLink_command_long_message(1, 1, 400, 0, *[0.0] * 7), gcs=True)
-    bench.forget()
-    bench.run(0.02)
-    assert [(m.result, m.target_system) for m in bench.said(ACK, gcs=True)] == [(Result.ACCEPTED, 255)]
-    assert not bench.said(ACK)
-    assert not bench.pilot.armed
 
 
 def test_a_parameter_set_on_one_link_is_sent_on_the_other() -> None:
@@ -124,8 +108,8 @@ def test_a_reboot_is_silence_and_then_a_new_beginning() -> None:
     bench.run(0.45)
     bench.forget()
     bench.run(1.2)
-    assert not bench.heard
-    assert not bench.gcs_heard
+    assert not bench.received
+    assert not bench.gcs_received
     assert bench.command(400, 1) is None  # nobody listens
     bench.run(0.6)
     (beat, *_) = bench.said(BEAT)
@@ -172,41 +156,15 @@ def test_the_local_frame_begins_where_it_boots() -> None:
     assert bench.said(mav.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN)[-1].latitude == after.lat_e7
 
 
-@pytest.mark.parametrize(
-    ("reject_bad", "alone_s", "poisoned"), [(True, 0.02, False), (False, 0.02, True), (False, 0.0, False)]
-)
-def test_one_bad_quaternion_poisons_until_reboot_unless_refused_or_followed_at_once(
-    reject_bad: bool, alone_s: float, poisoned: bool
-) -> None:
-    bench = Bench("x500", **COARSE, reject_bad_setpoints=reject_bad).in_offboard(height_m=3.0)
+def test_a_reboot_ends_the_poison_of_a_bad_quaternion() -> None:
+    bench = Bench("x500", **COARSE, reject_bad_setpoints=False).in_offboard()
     bench.setpoint(q=[0.0] * 4)
-    if alone_s:
-        bench.run(alone_s)
-    bench.run(0.1, 50)
-    bench.mode(4, 3)
-    wind = 3.0
-    bench.world.set_wind((wind, 0.0, 0.0))
-    bench.run(2.0)
-    held = abs(float(bench.world.truth_rows()[0]["vel_ned_m_s"][0])) < 0.6
-    assert held != poisoned  # no torque: it drifts with the wind, in LOITER too
-    bench.run(0.1)
+    bench.run(0.02)
+    assert bench.pilot.stream.poisoned
     bench.command(400, 0, 21196)
-    bench.run(6.0)
     assert bench.command(246, 1) == Result.ACCEPTED
     bench.run(2.5)
     assert not bench.pilot.stream.poisoned
-
-
-@pytest.mark.parametrize(("reject_bad", "stops"), [(True, False), (False, True)])
-def test_a_thrust_that_is_no_number_stops_the_motors_unless_refused(reject_bad: bool, stops: bool) -> None:
-    bench = Bench(reject_bad_setpoints=reject_bad).in_offboard(height_m=2.0)
-    bench.setpoint(thrust=NAN)
-    bench.run(0.02)
-    assert (float(bench.world.plant.rotor_force_n.sum()) == 0.0) == stops
-    assert bench.pilot.motors_on != stops
-    bench.run(0.04, 50)
-    assert bench.pilot.motors_on
-    assert float(bench.world.plant.rotor_force_n.sum()) > 5.0
 
 
 # --- body rates ---

@@ -67,32 +67,6 @@ def square(bench: Bench, half_m: float) -> list[Any]:
 # --- transfer ---
 
 
-def test_a_mission_comes_back_as_it_was_sent() -> None:
-    bench = Bench()
-    sent = [item(bench, 0, 22), item(bench, 1, 16, (12.0, -7.0), 9.0, (3.0, 0, 0, NAN)), item(bench, 2, 21)]
-    assert upload(bench, sent) == 0
-    bench.forget()
-    bench.send(mav.MAVLink_mission_request_list_message(1, 1, MISSION))
-    bench.run(0.01)
-    assert [m.count for m in bench.said(COUNT)] == [3]
-    for seq in range(3):
-        bench.send(mav.MAVLink_mission_request_int_message(1, 1, seq, MISSION))
-    bench.run(0.01)
-    for ours, theirs in zip(sent, bench.said(ITEM), strict=True):
-        assert (theirs.seq, theirs.command, theirs.x, theirs.y, theirs.z, theirs.param1) == (
-            ours.seq,
-            ours.command,
-            ours.x,
-            ours.y,
-            ours.z,
-            ours.param1,
-        )
-        assert theirs.frame == RELATIVE
-    bench.send(mav.MAVLink_mission_clear_all_message(1, 1, MISSION))
-    bench.run(0.01)
-    assert bench.pilot.store.mission == ()
-
-
 @pytest.mark.parametrize(
     ("change", "result"),
     [
@@ -124,14 +98,6 @@ def test_transfers_that_can_not_be() -> None:
         bench.send(message)
         bench.run(0.01)
         assert [m.type for m in bench.said(ACK)] == [result]
-
-
-def test_an_item_that_is_not_there_is_not_answered() -> None:
-    bench = Bench()
-    bench.forget()
-    bench.send(mav.MAVLink_mission_request_int_message(1, 1, 5, MISSION))
-    bench.run(0.3)
-    assert not bench.said(ACK)
 
 
 def test_an_upload_asks_again_and_gives_up() -> None:

@@ -6,48 +6,12 @@ from itertools import pairwise
 from typing import Any
 
 import pytest
-from pymavlink.dialects.v20 import development as mav
 
 from sitl.plant.estimator import ESTIMATORS, EXACT_ACCURACY_M
-from sitl.px4.modes import Px4Mode, Result
-from swarmctl.core.types import Landed
 from tests.benches.px4_bench import COARSE, Bench
 
 CURRENT_MODE, ESTIMATOR_STATUS, SYS_STATUS, HEARTBEAT = 436, 230, 1, 0
 PREARM = 0x10000000
-
-
-def test_the_mode_is_sent_twice_a_second_whatever_the_requests() -> None:
-    bench = Bench()
-    assert bench.command(511, CURRENT_MODE, 10_000) == Result.ACCEPTED
-    bench.forget()
-    bench.run(4.0)
-    assert len(bench.said(CURRENT_MODE)) == 8
-
-
-def test_a_change_of_the_mode_is_sent_at_once() -> None:
-    bench = Bench()
-    bench.command(511, CURRENT_MODE, 10_000)
-    bench.run(0.3)
-    bench.forget()
-    assert bench.mode(6) == Result.ACCEPTED
-    bench.run(0.03)
-    assert [m.custom_mode for m in bench.said(CURRENT_MODE)] == [Px4Mode.OFFBOARD]
-
-
-def test_after_a_silence_the_mode_stays_untold_for_up_to_half_a_second() -> None:
-    bench = Bench(ekf_ready_s=0.1).in_offboard(2.0)
-    bench.command(511, CURRENT_MODE, 10_000)
-    waited_s = []
-    for _ in range(10):
-        bench.forget()
-        steps = 0
-        while not bench.said(CURRENT_MODE):
-            bench.run(0.02, 50)
-            steps += 1
-        waited_s.append(steps * 0.02)
-        bench.run(0.06, 50)
-    assert max(waited_s) >= 0.4
 
 
 def claims(estimator: str, ekf_ready_s: float = 4.0, seconds: float = 12.0) -> list[Any]:
@@ -84,28 +48,3 @@ def test_a_rebooted_estimator_settles_again() -> None:
     bench.forget()
     bench.run(3.0)
     assert bench.said(ESTIMATOR_STATUS)[0].pos_horiz_accuracy > 10.0
-
-
-def test_after_landing_it_stays_disarmed_in_offboard_and_cannot_be_armed() -> None:
-    bench = Bench().in_offboard(2.0)
-    assert bench.mode(4, 6) == Result.ACCEPTED
-    bench.run(12.0)
-    bench.forget()
-    bench.run(1.2)
-    beat, health = bench.said(HEARTBEAT)[-1], bench.said(SYS_STATUS)[-1]
-    assert bench.pilot.landed is Landed.ON_GROUND
-    assert (beat.custom_mode, beat.base_mode, beat.system_status) == (Px4Mode.OFFBOARD, 17, 0)
-    assert not health.onboard_control_sensors_health & PREARM
-    assert bench.arm() == Result.TEMPORARILY_REJECTED
-
-
-def test_another_mode_makes_it_armable_again_after_landing() -> None:
-    bench = Bench().in_offboard(2.0)
-    bench.mode(4, 6)
-    bench.run(12.0)
-    assert bench.mode(4, 3) == Result.ACCEPTED
-    bench.forget()
-    bench.run(1.2)
-    assert bench.said(HEARTBEAT)[-1].system_status == mav.MAV_STATE_STANDBY
-    assert bench.said(SYS_STATUS)[-1].onboard_control_sensors_health & PREARM
-    assert bench.arm() == Result.ACCEPTED

@@ -8,8 +8,6 @@ import numpy as np
 import pytest
 
 from sitl.plant.wind import Air
-from swarmctl.config import load
-from swarmctl.errors import ConfigError
 from swarmctl.simulator_config import WindParams
 from tests.benches.flown_world import FlownWorld
 
@@ -90,27 +88,3 @@ def test_drag_off_leaves_nothing_to_blow_on() -> None:
     flown = FlownWorld(preset="x500", realism={"wind": {"mean_ned_m_s": (5.0, 0, 0)}, "drag_scale": 0.0})
     flown.take_off()
     assert flown.tilt_deg[0] < 0.2
-
-
-@pytest.mark.parametrize(
-    ("item", "complaint"),
-    [
-        ("wind.turbulence_m_s=31", "sitl.wind.turbulence_m_s = 31"),
-        ("wind.mean_ned_m_s=[50,0,0]", "sitl.wind.mean_ned_m_s.0 = 50"),
-        ("wind.gust_for_s=0", "sitl.wind.gust_for_s = 0"),
-        ("wind.turbulence=3", "did you mean 'turbulence_m_s'"),
-        ("battery.capacity_mah=-1", "sitl.battery.capacity_mah = -1"),
-        ("battery.charge_01=0", "sitl.battery.charge_01 = 0"),
-        ("thrust_curve_01=1.5", "sitl.thrust_curve_01 = 1.5"),
-        ("motor_tau_s=2", "sitl.motor_tau_s = 2"),
-        ("drag_scale=-1", "sitl.drag_scale = -1"),
-        ("estimator=perfect", "sitl.estimator = 'perfect'"),
-        ("autopilot_kind=inav", "sitl.autopilot_kind = 'inav'"),
-        ("speed=5", "agents fly on wall time"),
-        ("preset=glider", "sitl.preset = 'glider'"),
-    ],
-)
-def test_wrong_values_are_refused(item: str, complaint: str) -> None:
-    with pytest.raises(ConfigError, match="sitl") as refused:
-        load(None, [f"sitl.{item}"])
-    assert complaint in str(refused.value)

@@ -10,7 +10,7 @@ from fastcrc import crc16
 from pymavlink.dialects.v20 import development as mav
 
 from sitl.net.wire import KINDS, LACKING, FrameWriter
-from sitl.px4.link.schedule import GCS_HZ, OFFBOARD_HZ
+from sitl.px4.link.schedule import OFFBOARD_HZ
 from sitl.px4.link.streams_health import STREAMS
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames
@@ -70,12 +70,10 @@ def test_a_first_version_frame_is_obeyed() -> None:
 
 
 def test_every_default_message_goes_out_and_holds_sense() -> None:
-    bench = Bench("x500", every_stream=True, gcs=True, wait_s=3.2)
-    assert set(bench.heard) >= set(OFFBOARD_HZ)
-    for message, rate_hz in OFFBOARD_HZ.items():
-        assert len(bench.heard[message]) == pytest.approx(3.17 * rate_hz, abs=4.0), KINDS[message].name
+    bench = Bench("x500", every_stream=True, wait_s=3.2)
+    assert set(bench.received) >= set(OFFBOARD_HZ)
     for message in LACKING:
-        for frame in bench.heard[message]:
+        for frame in bench.received[message]:
             body = frame[:-2]
             seed = bytes([KINDS[message].crc_extra])
             assert crc16.mcrf4xx(body[1:] + seed).to_bytes(2, "little") == frame[-2:]
@@ -84,14 +82,8 @@ def test_every_default_message_goes_out_and_holds_sense() -> None:
     assert imu.abs_pressure == pytest.approx(955.9, abs=0.5)  # standard atmosphere at 489 m
     (pressure, *_) = bench.said(mav.MAVLINK_MSG_ID_SCALED_PRESSURE)
     assert pressure.press_abs == pytest.approx(imu.abs_pressure, abs=0.01)
-    (sync, *_) = bench.said(mav.MAVLINK_MSG_ID_TIMESYNC)
-    assert (sync.tc1, sync.ts1 > 0) == (0, True)
     (target, *_) = bench.said(mav.MAVLINK_MSG_ID_POSITION_TARGET_LOCAL_NED)
     assert math.isnan(target.x)
-    assert {frame[7] | frame[8] << 8 for frames_ in bench.gcs_heard.values() for frame in frames_} >= set(GCS_HZ) - {
-        4,
-        241,
-    }
 
 
 def test_what_sensors_feel_in_flight() -> None:

@@ -139,8 +139,8 @@ HOSTILE_EVENTS = [
     '{"event": "bus_summary", "source": "agent-0", "rejected": {"stale": NaN, "x": 1e999}}',
     '{"event": "\\ud800", "source": {"a": 1}, "utc_us": -9e18, "t_us": true}',
     '{"event": "<script>alert(1)</script>"}',
-    '{"event": "unheard", "source": "agent-0", "agent": 1, "begins": true, "utc_us": "now"}',
-    '{"event": "unheard", "source": "agent-0", "agent": 1, "begins": false, "lasted_s": "long", "utc_us": [1]}',
+    '{"event": "unresponsive", "source": "agent-0", "agent": 1, "begins": true, "utc_us": "now"}',
+    '{"event": "unresponsive", "source": "agent-0", "agent": 1, "begins": false, "lasted_s": "long", "utc_us": [1]}',
     '{"event": "refused", "source": "agent-0", "sender": {"a": 1}, "topic": [], "reason": null, "count": true}',
     "\x00\xff",
 ]

@@ -14,7 +14,7 @@ from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.core.types import Mode, Phase, PlanStatus
 from swarmctl.telemetry.json_safe import to_json
-from swarmctl.telemetry.referee import Rules, RunData, judge
+from swarmctl.telemetry.referee import Rules, RunData, evaluate
 
 UTC0_US = 1_780_000_000_000_000
 START_US = 1_000_000  # monotonic time of mission start
@@ -50,7 +50,7 @@ APART = {0: ticks(20, (1.0, 0.0, 0.0)), 1: ticks(20, (0.0, 0.0, 2.0))}
 
 
 def test_summed_mean_tracking_error_is_the_sum_of_mean_distances() -> None:
-    tracking = judge(run(APART), Rules(agents=2, required_separation_m=0.5), "completed")["tracking"]
+    tracking = evaluate(run(APART), Rules(agents=2, required_separation_m=0.5), "completed")["tracking"]
     assert tracking["index_m"] == pytest.approx(1.0 + 2.0)
     assert tracking["agents"][0]["mse_m2"] == pytest.approx([1.0, 0.0, 0.0])
     assert tracking["agents"][1]["mean_distance_m"] == pytest.approx(2.0)
@@ -61,9 +61,9 @@ def test_summed_mean_tracking_error_is_the_sum_of_mean_distances() -> None:
 def test_mean_and_rmse_of_a_changing_error() -> None:
     pos = np.zeros((101, 3))
     pos[:, 1] = np.where(np.arange(101) % 2 == 0, 3.0, 1.0)  # 51 times 3 m, 50 times 1 m
-    row = judge(run({0: ticks(2, pos)}), Rules(agents=1, required_separation_m=0.5), "completed")["tracking"]["agents"][
-        0
-    ]
+    row = evaluate(run({0: ticks(2, pos)}), Rules(agents=1, required_separation_m=0.5), "completed")["tracking"][
+        "agents"
+    ][0]
     assert row["mean_distance_m"] == pytest.approx((51 * 3 + 50) / 101)
     assert row["mse_m2"][1] == pytest.approx((51 * 9 + 50) / 101)
     assert row["rmse_m"] == pytest.approx(math.sqrt((51 * 9 + 50) / 101))
@@ -73,25 +73,26 @@ def test_summed_mean_tracking_error_counts_only_common_time() -> None:
     late = ticks(20, (2.0, 0.0, 0.0))
     late["pos_ned_m"][late["mission_t_s"] > 10.0] = (100.0, 0.0, 0.0)
     both = {0: late, 1: ticks(10, (0.0, 1.0, 0.0))}
-    assert judge(run(both), Rules(agents=2, required_separation_m=0.5), "failed")["tracking"][
+    assert evaluate(run(both), Rules(agents=2, required_separation_m=0.5), "failed")["tracking"][
         "index_m"
     ] == pytest.approx(3.0)
 
 
 def test_summed_mean_tracking_error_is_unknown_when_an_agent_never_tracked() -> None:
     assert (
-        judge(run({0: APART[0]}), Rules(agents=2, required_separation_m=0.5), "failed")["tracking"]["index_m"] is None
+        evaluate(run({0: APART[0]}), Rules(agents=2, required_separation_m=0.5), "failed")["tracking"]["index_m"]
+        is None
     )
 
 
 def test_steady_figures_leave_out_the_first_ten_seconds() -> None:
     rows = ticks(20, (5.0, 0.0, 0.0))
     rows["pos_ned_m"][rows["mission_t_s"] >= 10.0] = (0.1, 0.0, 0.0)
-    tracking = judge(run({0: rows}), Rules(agents=1, required_separation_m=0.5), "completed")["tracking"]
+    tracking = evaluate(run({0: rows}), Rules(agents=1, required_separation_m=0.5), "completed")["tracking"]
     assert tracking["agents"][0]["steady_rmse_m"] == pytest.approx(0.1)
     assert tracking["index_after_10s_m"] == pytest.approx(0.1)
     assert (
-        judge(run({0: ticks(5, (5.0, 0, 0))}), Rules(agents=1, required_separation_m=0.5), "completed")["tracking"][
+        evaluate(run({0: ticks(5, (5.0, 0, 0))}), Rules(agents=1, required_separation_m=0.5), "completed")["tracking"][
             "index_after_10s_m"
         ]
         is None
@@ -103,7 +104,7 @@ def test_truth_wins_over_reports_and_is_interpolated() -> None:
     moving = np.column_stack([t_s, np.full_like(t_s, 0.25), 0 * t_s])  # 1 m/s north, 0.25 m east of the reference
     rows = ticks(10, (9.0, 9.0, 9.0))
     rows["ref_pos_ned_m"][:, 0] = rows["mission_t_s"]
-    row = judge(run({0: rows}, truth(0, t_s, moving)), Rules(agents=1, required_separation_m=0.5), "completed")[
+    row = evaluate(run({0: rows}, truth(0, t_s, moving)), Rules(agents=1, required_separation_m=0.5), "completed")[
         "tracking"
     ]["agents"][0]
     assert row["mse_m2"] == pytest.approx([0.0, 0.0625, 0.0], abs=1e-9)
@@ -118,7 +119,7 @@ def closing(least_m: float) -> RunData:
 
 
 def test_separation_names_value_limit_pair_and_time() -> None:
-    summary = judge(closing(0.61), Rules(agents=2, required_separation_m=0.85), "completed")
+    summary = evaluate(closing(0.61), Rules(agents=2, required_separation_m=0.85), "completed")
     assert summary["separation"]["min_m"] == pytest.approx(0.61)
     assert summary["separation"]["min_pair"] == [0, 1]
     assert summary["separation"]["min_at_s"] == pytest.approx(5.0)
@@ -129,18 +130,18 @@ def test_separation_names_value_limit_pair_and_time() -> None:
 def test_separation_with_scaled_heights_is_reported_beside_the_true_one() -> None:
     t_s = np.arange(0, 5.001, 0.01)
     low, high = truth(0, t_s, (0.0, 0.0, 0.0)), truth(1, t_s, (0.3, 0.0, -1.6))
-    found = judge(run(APART, low, high), Rules(agents=2, required_separation_m=0.85, downwash=2.0), "completed")[
+    found = evaluate(run(APART, low, high), Rules(agents=2, required_separation_m=0.85, downwash=2.0), "completed")[
         "separation"
     ]
     assert found["min_m"] == pytest.approx(math.hypot(0.3, 1.6))
     assert found["scaled_min_m"] == pytest.approx(math.hypot(0.3, 0.8))
-    same = judge(run(APART, low, high), Rules(agents=2, required_separation_m=0.85), "completed")["separation"]
+    same = evaluate(run(APART, low, high), Rules(agents=2, required_separation_m=0.85), "completed")["separation"]
     assert same["scaled_min_m"] == pytest.approx(same["min_m"])
 
 
 @pytest.mark.parametrize(("least_m", "limit_m", "outcome"), [(0.86, 0.85, "completed"), (0.84, 0.85, "failed")])
 def test_separation_decides_the_outcome(least_m: float, limit_m: float, outcome: str) -> None:
-    assert judge(closing(least_m), Rules(agents=2, required_separation_m=limit_m), "completed")["outcome"] == outcome
+    assert evaluate(closing(least_m), Rules(agents=2, required_separation_m=limit_m), "completed")["outcome"] == outcome
 
 
 def test_separation_counts_from_first_arming_to_the_very_end() -> None:
@@ -148,9 +149,9 @@ def test_separation_counts_from_first_arming_to_the_very_end() -> None:
     near = np.column_stack([np.where(t_s < 1.0, 0.1, 1.0), 0 * t_s, 0 * t_s])
     armed = (t_s >= 0.999).astype(int)
     touching_before = run({}, truth(0, t_s, (0, 0, 0), armed), truth(1, t_s, near, armed))
-    assert judge(touching_before, Rules(agents=2, required_separation_m=0.5), "completed")["violations"] == []
+    assert evaluate(touching_before, Rules(agents=2, required_separation_m=0.5), "completed")["violations"] == []
     disarmed_after = run({}, truth(0, t_s, (0, 0, 0), t_s < 0.05), truth(1, t_s, near[::-1], 0))
-    assert judge(disarmed_after, Rules(agents=2, required_separation_m=0.5), "completed")["separation"][
+    assert evaluate(disarmed_after, Rules(agents=2, required_separation_m=0.5), "completed")["separation"][
         "min_m"
     ] == pytest.approx(0.1)
 
@@ -160,14 +161,14 @@ def test_reports_of_two_hosts_are_joined_by_utc() -> None:
     second["t_us"] += 77_000_000  # another host's monotonic clock
     second["utc_us"] += 7_000  # and ticks between the first one's
     second["pos_ned_m"][:, 0] = 1.0 + 0.01 * second["mission_t_s"]
-    separation = judge(run({0: first, 1: second}), Rules(agents=2, required_separation_m=0.5), "completed")[
+    separation = evaluate(run({0: first, 1: second}), Rules(agents=2, required_separation_m=0.5), "completed")[
         "separation"
     ]
     assert separation["min_m"] == pytest.approx(1.0, abs=1e-3)
 
 
 def test_positions_that_were_never_recorded_are_no_pass() -> None:
-    summary = judge(run({0: APART[0]}), Rules(agents=2, required_separation_m=0.85), "completed")
+    summary = evaluate(run({0: APART[0]}), Rules(agents=2, required_separation_m=0.85), "completed")
     assert summary["separation"]["min_m"] is None
     assert summary["outcome"] == "failed"
     assert "can't be judged" in summary["violations"][0]
@@ -181,7 +182,7 @@ def test_obstacle_clearance_allows_its_margin_only(margin_m: float, violated: bo
         obstacles={Obstacle(center_ned_m=(1.5, 0.0, 0.0)): None},
         obstacle_margin_m=margin_m,
     )
-    summary = judge(run({0: ticks(5, (0.0, 0.0, 0.0))}), rules, "completed")
+    summary = evaluate(run({0: ticks(5, (0.0, 0.0, 0.0))}), rules, "completed")
     assert summary["obstacles"] == {"min_clearance_m": 1.5, "required_m": 1.75 - margin_m}
     assert (summary["outcome"] == "failed") == violated
     assert any("between agent 0 and obstacle 0" in text for text in summary["violations"]) == violated
@@ -191,7 +192,7 @@ def test_obstacle_clearance_allows_its_margin_only(margin_m: float, violated: bo
 def test_height_does_not_count_beside_a_column(column: bool, clearance_m: float) -> None:
     ball = Obstacle(center_ned_m=(1.5, 0.0, 2.0), column=column)
     rules = Rules(agents=1, required_separation_m=0.5, obstacles={ball: None})
-    summary = judge(run({0: ticks(5, (0.0, 0.0, 0.0))}), rules, "completed")
+    summary = evaluate(run({0: ticks(5, (0.0, 0.0, 0.0))}), rules, "completed")
     assert summary["obstacles"]["min_clearance_m"] == pytest.approx(clearance_m)
     assert (summary["outcome"] == "failed") == column
 
@@ -199,10 +200,10 @@ def test_height_does_not_count_beside_a_column(column: bool, clearance_m: float)
 def test_moving_obstacle_is_met_where_it_is_at_the_time() -> None:
     ball = Obstacle(center_ned_m=(10.0, 0.0, 0.0), keep_out_m=1.0, vel_ned_m_s=(-1.0, 0.0, 0.0))
     rules = Rules(agents=1, required_separation_m=0.5, obstacles={ball: None})
-    assert judge(run({0: ticks(5, (0, 0, 0))}), rules, "completed")["obstacles"]["min_clearance_m"] == pytest.approx(
+    assert evaluate(run({0: ticks(5, (0, 0, 0))}), rules, "completed")["obstacles"]["min_clearance_m"] == pytest.approx(
         5.0
     )
-    assert judge(run({0: ticks(9.5, (0, 0, 0))}), rules, "completed")["outcome"] == "failed"
+    assert evaluate(run({0: ticks(9.5, (0, 0, 0))}), rules, "completed")["outcome"] == "failed"
 
 
 def test_obstacle_set_in_flight_counts_from_then_on() -> None:
@@ -211,9 +212,9 @@ def test_obstacle_set_in_flight_counts_from_then_on() -> None:
     ball = Obstacle(center_ned_m=(0.0, 0.0, 0.0), keep_out_m=1.0)
     since_us = UTC0_US + START_US + 5_000_000
     rules = Rules(agents=1, required_separation_m=0.5, obstacles={ball: since_us})
-    assert judge(run({0: rows}), rules, "completed")["outcome"] == "completed"
+    assert evaluate(run({0: rows}), rules, "completed")["outcome"] == "completed"
     assert (
-        judge(
+        evaluate(
             run({0: rows}),
             Rules(agents=1, required_separation_m=0.5, obstacles={ball: None}),
             "completed",
@@ -229,7 +230,7 @@ def test_timing_counts_flight_ticks_and_deadline_misses() -> None:
     rows["tick_ms"] = 4.0
     rows["tick_ms"][60] = 9.0
     rows["solve_ms"][70], rows["iterations"][70] = 99.0, 0  # nothing was solved in this tick
-    summary = judge(
+    summary = evaluate(
         run({0: rows}),
         Rules(agents=1, required_separation_m=0.5, deadline_misses_01=0.2),
         "completed",
@@ -241,7 +242,7 @@ def test_timing_counts_flight_ticks_and_deadline_misses() -> None:
     assert timing["solve_ms"]["max"] == 2.0
     assert summary["violations"] == ["deadline misses 33.0% above 20.0% (30 of 91 due)"]
     assert (
-        judge(run({0: rows}), Rules(agents=1, required_separation_m=0.5, deadline_misses_01=0.4), "completed")[
+        evaluate(run({0: rows}), Rules(agents=1, required_separation_m=0.5, deadline_misses_01=0.4), "completed")[
             "violations"
         ]
         == []
@@ -251,7 +252,7 @@ def test_timing_counts_flight_ticks_and_deadline_misses() -> None:
 def test_ticks_that_were_skipped_were_due() -> None:
     rows = ticks(2, (0.0, 0.0, 0.0))  # 101 ticks
     rows["deadline_misses"] = 3 * np.arange(101)  # each of them late, and two skipped before it
-    summary = judge(run({0: rows}), Rules(agents=1, required_separation_m=0.5, deadline_misses_01=0.2), "completed")
+    summary = evaluate(run({0: rows}), Rules(agents=1, required_separation_m=0.5, deadline_misses_01=0.2), "completed")
     assert (summary["timing"]["ticks"], summary["timing"]["due_ticks"]) == (101, 301)
     assert summary["violations"] == ["deadline misses 99.7% above 20.0% (300 of 301 due)"]
 
@@ -268,12 +269,12 @@ def vanishing(heard: bool) -> RunData:
 
 
 def test_a_vanished_vehicle_is_named_and_not_judged_by_its_last_position() -> None:
-    summary = judge(vanishing(heard=False), Rules(agents=2, required_separation_m=0.85), "failed")
+    summary = evaluate(vanishing(heard=False), Rules(agents=2, required_separation_m=0.85), "failed")
     assert summary["separation"]["min_m"] == pytest.approx(5.4)  # at 5 s, the last that is known
     assert summary["violations"] == [
         "agent 0 did not know where its armed vehicle was for 14.5 s, from 5.5 s on: its separation can't be judged"
     ]
-    assert judge(vanishing(heard=True), Rules(agents=2, required_separation_m=0.85), "failed")["separation"][
+    assert evaluate(vanishing(heard=True), Rules(agents=2, required_separation_m=0.85), "failed")["separation"][
         "min_m"
     ] == pytest.approx(3.83, abs=0.02)
 
@@ -282,7 +283,7 @@ def test_a_reported_state_counts_at_its_own_time() -> None:
     delayed, still = ticks(10, (0.0, 0.0, 0.0)), ticks(10, (10.0, 0.0, 0.0))
     delayed["state_age_ms"] = 200.0
     delayed["pos_ned_m"][:, 0] = delayed["mission_t_s"] - 0.2  # 1 m/s north, reported 200 ms later
-    pair = judge(run({0: delayed, 1: still}), Rules(agents=2, required_separation_m=0.1), "failed")["separation"]
+    pair = evaluate(run({0: delayed, 1: still}), Rules(agents=2, required_separation_m=0.1), "failed")["separation"]
     assert pair["min_m"] == pytest.approx(0.2, abs=0.03)
     assert pair["min_at_s"] == pytest.approx(9.8, abs=0.03)
 
@@ -290,7 +291,7 @@ def test_a_reported_state_counts_at_its_own_time() -> None:
 def test_clocks_of_different_years_have_no_common_instants() -> None:
     other = ticks(10, (5.0, 0.0, 0.0))
     other["utc_us"] -= UTC0_US
-    summary = judge(
+    summary = evaluate(
         run({0: ticks(10, (0.0, 0.0, 0.0)), 1: other}), Rules(agents=2, required_separation_m=0.5), "completed"
     )
     assert "can't be judged" in summary["violations"][0]
@@ -303,7 +304,7 @@ def test_solver_failures_count_while_the_agent_has_control() -> None:
     rows["residual_m"] = 1e-4
     rows["residual_m"][0] = 7.0  # refused, never flown
     rows["safety_filter_acted"][5:8] = 1
-    solver = judge(run({0: rows}), Rules(agents=1, required_separation_m=0.5, solver_name="daqp"), "completed")[
+    solver = evaluate(run({0: rows}), Rules(agents=1, required_separation_m=0.5, solver_name="daqp"), "completed")[
         "solver"
     ]
     assert solver == {
@@ -322,7 +323,7 @@ def test_refused_messages_are_summed_over_each_agents_last_summary() -> None:
         {"source": "agent-1", "event": "bus_summary", "rejected": {"stale": 4}},
         {"source": "agent-1", "event": "other", "rejected": {"stale": 100}},
     ]
-    comms = judge(run(APART, events=events), Rules(agents=2, required_separation_m=0.5), "completed")["comms"]
+    comms = evaluate(run(APART, events=events), Rules(agents=2, required_separation_m=0.5), "completed")["comms"]
     assert comms["path_age_ms"] == {"p50": 30.0, "p99": 30.0}
     assert comms["rejected"] == {"identity": 1, "stale": 7}
 
@@ -341,7 +342,7 @@ def refused(by: int, reason: str, count: int, sender: str = "agent-1", topic: st
 def test_forged_messages_are_a_violation_and_network_faults_are_not() -> None:
     network = [refused(0, "late", 4000), refused(0, "replayed", 900), refused(0, "unconfirmed", 70)]
     clumsy = [refused(0, "malformed", 50), refused(0, "stale_order", 3, "operator", "command")]
-    summary = judge(run(APART, events=network + clumsy), Rules(agents=2, required_separation_m=0.5), "completed")
+    summary = evaluate(run(APART, events=network + clumsy), Rules(agents=2, required_separation_m=0.5), "completed")
     assert (summary["outcome"], summary["violations"]) == ("completed", [])
     forged = [
         refused(0, "boot", 1),
@@ -349,7 +350,7 @@ def test_forged_messages_are_a_violation_and_network_faults_are_not() -> None:
         refused(0, "boot", 2),
         refused(0, "sequence", 1, topic="status"),
     ]
-    summary = judge(
+    summary = evaluate(
         run(APART, events=network + clumsy + forged), Rules(agents=2, required_separation_m=0.5), "completed"
     )
     assert summary["outcome"] == "failed"
@@ -358,16 +359,18 @@ def test_forged_messages_are_a_violation_and_network_faults_are_not() -> None:
     ]
 
 
-def test_the_peer_unheard_for_longest_is_named() -> None:
+def test_the_peer_unresponsive_for_longest_is_named() -> None:
     def row(by: int, agent: int, at_s: float, **fields: Any) -> dict[str, Any]:
-        return {"source": f"agent-{by}", "event": "unheard", "agent": agent, "utc_us": round(at_s * 1e6), **fields}
+        return {"source": f"agent-{by}", "event": "unresponsive", "agent": agent, "utc_us": round(at_s * 1e6), **fields}
 
     ended = [row(0, 1, 10.0, begins=True), row(0, 1, 12.0, begins=False, lasted_s=2.5)]
-    comms = judge(run(APART, events=ended), Rules(agents=2, required_separation_m=0.5), "completed")["comms"]
-    assert comms["unheard"] == {"count": 1, "longest_s": 2.5, "agent": 1, "by": "agent-0"}
+    comms = evaluate(run(APART, events=ended), Rules(agents=2, required_separation_m=0.5), "completed")["comms"]
+    assert comms["unresponsive"] == {"count": 1, "longest_s": 2.5, "agent": 1, "by": "agent-0"}
     lasting = [row(1, 0, 11.0, begins=True), {"event": "state", "utc_us": 52_000_000}]
-    comms = judge(run(APART, events=ended + lasting), Rules(agents=2, required_separation_m=0.5), "completed")["comms"]
-    assert comms["unheard"] == {"count": 2, "longest_s": 41.0, "agent": 0, "by": "agent-1"}
+    comms = evaluate(run(APART, events=ended + lasting), Rules(agents=2, required_separation_m=0.5), "completed")[
+        "comms"
+    ]
+    assert comms["unresponsive"] == {"count": 2, "longest_s": 41.0, "agent": 0, "by": "agent-1"}
 
 
 @pytest.mark.parametrize(
@@ -380,7 +383,7 @@ def test_the_peer_unheard_for_longest_is_named() -> None:
     ],
 )
 def test_outcome(outcome: str, problems: tuple[str, ...], judged: str) -> None:
-    summary = judge(run(APART), Rules(agents=2, required_separation_m=0.5), outcome, problems)
+    summary = evaluate(run(APART), Rules(agents=2, required_separation_m=0.5), outcome, problems)
     assert summary["outcome"] == judged
     assert summary["violations"] == list(problems)
 
@@ -388,22 +391,22 @@ def test_outcome(outcome: str, problems: tuple[str, ...], judged: str) -> None:
 def test_deadlocks_are_counted() -> None:
     noted = [("begins", True), ("lasted_s", 2.5), ("begins", True)]
     events = [{"event": "deadlock", "source": "agent-0", name: value} for name, value in noted]
-    summary = judge(
+    summary = evaluate(
         run(APART, events=[{"event": "state"}, *events]), Rules(agents=2, required_separation_m=0.5), "completed"
     )
     assert summary["deadlocks"] == {"count": 2, "longest_s": 2.5, "unresolved": 1}
-    assert judge(run(APART), Rules(agents=2, required_separation_m=0.5), "completed")["deadlocks"]["count"] == 0
+    assert evaluate(run(APART), Rules(agents=2, required_separation_m=0.5), "completed")["deadlocks"]["count"] == 0
 
 
 def test_mission_cut_short_is_no_pass() -> None:
     assert (
-        judge(run(APART), Rules(agents=2, required_separation_m=0.5, duration_s=20.5), "completed")["outcome"]
+        evaluate(run(APART), Rules(agents=2, required_separation_m=0.5, duration_s=20.5), "completed")["outcome"]
         == "completed"
     )
-    summary = judge(run(APART), Rules(agents=2, required_separation_m=0.5, duration_s=38.0), "completed")
+    summary = evaluate(run(APART), Rules(agents=2, required_separation_m=0.5, duration_s=38.0), "completed")
     assert summary["violations"][0] == "mission time 20.0 s of agent 0 below 38 s"
     assert (
-        judge(run(APART), Rules(agents=2, required_separation_m=0.5, duration_s=38.0), "interrupted")["violations"]
+        evaluate(run(APART), Rules(agents=2, required_separation_m=0.5, duration_s=38.0), "interrupted")["violations"]
         == []
     )
 
@@ -411,14 +414,14 @@ def test_mission_cut_short_is_no_pass() -> None:
 def test_diverged_truth_is_no_pass() -> None:
     t_s = np.arange(0, 1, 0.1)
     broken = np.where(t_s[:, None] > 0.5, np.nan, np.zeros((10, 3)))
-    summary = judge(run({}, truth(0, t_s, broken)), Rules(agents=1, required_separation_m=0.5), "completed")
+    summary = evaluate(run({}, truth(0, t_s, broken)), Rules(agents=1, required_separation_m=0.5), "completed")
     assert summary["outcome"] == "failed"
     assert "not a number" in summary["violations"][0]
 
 
 @pytest.mark.parametrize("data", [run({}), run({0: ticks(0, (0, 0, 0))[:0]}), run(APART)], ids=["none", "empty", "run"])
 def test_summary_holds_no_nan_and_every_contract_key(data: RunData) -> None:
-    summary = judge(data, Rules(agents=2, required_separation_m=0.85), "interrupted")
+    summary = evaluate(data, Rules(agents=2, required_separation_m=0.85), "interrupted")
 
     def refuse(constant: str) -> None:
         raise AssertionError(constant)
@@ -429,4 +432,4 @@ def test_summary_holds_no_nan_and_every_contract_key(data: RunData) -> None:
     assert set(again["obstacles"]) == {"min_clearance_m", "required_m"}
     assert set(again["timing"]) == {"ticks", "due_ticks", "late_ticks", "tick_ms", "solve_ms", "speed_factor"}
     assert set(again["solver"]) >= {"name", "failed", "max_residual_m"}
-    assert set(again["comms"]) == {"path_age_ms", "rejected", "unheard"}
+    assert set(again["comms"]) == {"path_age_ms", "rejected", "unresponsive"}

@@ -1,4 +1,4 @@
-"""Evaluates from events whether agents accepted each other's messages: refusals, and peers that went unheard."""
+"""Evaluates from events whether agents accepted each other's messages: refusals, and peers that went unresponsive."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ def refused_peers(events: Sequence[Mapping[str, Any]]) -> Iterator[str]:
         yield f"messages in the name of {sender} were refused ({kinds}) by {agents}"
 
 
-def unheard(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+def unresponsive(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
     """Return how often no path of a peer on the bus was accepted, and the longest time with both agents involved."""
     count, since_us = 0, dict[tuple[str, int], int]()
     worst: tuple[float, int | None, str | None] = (0.0, None, None)
     for event in events:
-        if event.get("event") != "unheard" or not isinstance(event.get("agent"), int):
+        if event.get("event") != "unresponsive" or not isinstance(event.get("agent"), int):
             continue
         source, agent = str(event.get("source")), event["agent"]
         if event.get("begins"):

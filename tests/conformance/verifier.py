@@ -32,7 +32,7 @@ def matches(message: Any, fields: Mapping[str, Any]) -> bool:
     return message is not None and all(fits(getattr(message, name), wanted) for name, wanted in fields.items())
 
 
-class Judge:
+class Verifier:
     """Steps against one dialogue."""
 
     def __init__(self, dialogue: Dialogue) -> None:
@@ -43,7 +43,7 @@ class Judge:
             v.SetParam: self._set_param,
             v.Stream: self._d.stream,
             v.Stop: lambda _: self._d.stop(),
-            v.Mute: lambda s: (self._d.muted.add if s.muted else self._d.muted.discard)(s.link),
+            v.PauseHeartbeats: lambda s: (self._d.paused.add if s.paused else self._d.paused.discard)(s.link),
             v.Wait: lambda s: self._d.run(s.seconds),
             v.Mark: lambda _: self._d.set_mark(),
             v.Sees: self._sees,
@@ -59,7 +59,7 @@ class Judge:
             v.Moves: self._moves,
         }
 
-    def judge(self, step: v.Step) -> None:
+    def verify(self, step: v.Step) -> None:
         """Raises `Deviation` when it is not met."""
         self._handlers[type(step)](step)
 
