@@ -566,6 +566,8 @@ MINIMAL: dict[str, Any] = {
     "horizontal_accuracy": "GPS_RAW_INT",
     "checks": (ParameterCheck("CHECKED", "why", lambda value, seen: Opinion(verdict=NOTE, wanted="2", advice="two")),),
     "also_read": (),
+    "fence_checks": (),
+    "log_suffix": ".log",
     "loss_parameter": "LOSS",
 }
 
