@@ -19,7 +19,7 @@ from sitl.studies.bench import command
 from swarmctl.control.mpc.qp import SOLVERS
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import OperatorVerb, Order, VerbArgument
-from swarmctl.errors import ConfigError, MissionError, StartError
+from swarmctl.errors import ConfigError, MissionError, StartError, exit_code_of
 from swarmctl.ops import cli, operator
 
 Run = Callable[..., int]
@@ -181,6 +181,19 @@ def test_expected_errors_are_words_and_their_exit_code(
     assert run("status") == code
     captured = capsys.readouterr()
     assert captured.err == f"{error}\n"
+
+
+def test_errors_control_no_terminal(run: Run, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    hostile = str(tmp_path / "\x1b]0;owned\x07\x9b2J\u202e")
+    assert run("land", "--run-dir", hostile) == 3
+
+    def study() -> int:
+        raise StartError(f"{hostile}: no such thing")
+
+    assert exit_code_of(study) == 3
+    said = capsys.readouterr().err
+    assert said.count(r"\x1b]0;owned\x07\x9b2J\u202e") == 2
+    assert all(c.isprintable() or c == "\n" for c in said)
 
 
 def test_unexpected_errors_keep_their_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
