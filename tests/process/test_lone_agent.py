@@ -1,0 +1,58 @@
+"""One agent as it is started on a companion computer: no launch and no bus, and a terminal that may close."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from swarmctl.core.records import TICK_DTYPE
+from swarmctl.core.types import Phase
+from swarmctl.errors import EXIT_INTERRUPTED
+from swarmctl.telemetry.run_files import read_rows
+from tests.process.test_check import ENV, ROOT, Pilot, Simulator
+
+pytestmark = [pytest.mark.process, pytest.mark.timeout(180)]
+
+CONFIG = """
+swarm.agents = 1
+start.center_ned_m = [0.0, 0.0, -1.0]
+mission.duration_s = 600.0
+sitl.enabled = false
+telemetry.enabled = false
+[[vehicles]]
+sysid = 1
+url = "udpin://127.0.0.1:{port}"
+"""
+
+
+def test_a_closed_terminal_lands_the_vehicle(tmp_path: Path) -> None:
+    """The kernel and the shell both send SIGHUP."""
+    simulator = Simulator(1)
+    simulator.wait_until_up()
+    [port] = simulator.ports
+    config = tmp_path / "lone.toml"
+    config.write_text(CONFIG.format(port=port))
+    command = [sys.executable, "-m", "swarmctl", "agent", "--config", str(config), "--id", "0"]
+    command += ["--run", "lone", "--bus", "none", "--run-dir", str(tmp_path)]
+    agent = subprocess.Popen(command, cwd=ROOT, env=ENV, stderr=subprocess.PIPE, text=True)
+    try:
+        deadline_s = time.monotonic() + 60.0
+        while read_rows(tmp_path / "agent-0.ticks", TICK_DTYPE)["phase"].max(initial=0) < Phase.GOTO_START:
+            assert agent.poll() is None and time.monotonic() < deadline_s
+            time.sleep(0.1)
+        for _ in range(2):
+            agent.send_signal(signal.SIGHUP)
+            time.sleep(0.02)
+        _, said = agent.communicate(timeout=60)
+        assert agent.returncode == EXIT_INTERRUPTED, said
+        assert read_rows(tmp_path / "agent-0.ticks", TICK_DTYPE)["phase"][-1] == Phase.DONE
+        with Pilot(port) as pilot:
+            assert not pilot.armed()
+    finally:
+        agent.kill()
+        simulator.stop()
