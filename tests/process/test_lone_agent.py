@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import signal
+import socket
 import subprocess
 import sys
 import time
 from pathlib import Path
 
 import pytest
+from pymavlink.dialects.v20 import development as mavlink
 
 from swarmctl.core.records import TICK_DTYPE
 from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED
+from swarmctl.mavlink.codec import Codec
 from swarmctl.telemetry.run_files import read_rows
 from tests.process.test_check import ENV, ROOT, Pilot, Simulator
 
@@ -30,17 +33,37 @@ url = "udpin://127.0.0.1:{port}"
 """
 
 
-def test_a_closed_terminal_lands_the_vehicle(tmp_path: Path) -> None:
-    """The kernel and the shell both send SIGHUP."""
+def until_heard(port: int) -> None:
+    """Send what is no vehicle of ours to a port, until its owner must have taken it in."""
+    beat = mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_PX4, 128, 0, 4, 3)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        stranger.connect(("127.0.0.1", port))
+        taken, deadline_s = 0, time.monotonic() + 30.0
+        while taken < 50 and time.monotonic() < deadline_s:
+            try:
+                stranger.send(b"hello")
+                stranger.send(Codec(2, 1).encode(beat))
+                taken += 1
+            except ConnectionRefusedError:
+                taken = 0  # nobody is there yet
+            time.sleep(0.02)
+    assert taken == 50
+
+
+def test_a_stranger_gets_no_link_and_a_closed_terminal_lands_the_vehicle(tmp_path: Path) -> None:
+    """A stranger sends first, another vehicle's heartbeats included; the kernel and the shell both send SIGHUP."""
     simulator = Simulator(1)
     simulator.wait_until_up()
     [port] = simulator.ports
+    simulator.process.send_signal(signal.SIGSTOP)
     config = tmp_path / "lone.toml"
     config.write_text(CONFIG.format(port=port))
     command = [sys.executable, "-m", "swarmctl", "agent", "--config", str(config), "--id", "0"]
     command += ["--run", "lone", "--bus", "none", "--run-dir", str(tmp_path)]
     agent = subprocess.Popen(command, cwd=ROOT, env=ENV, stderr=subprocess.PIPE, text=True)
     try:
+        until_heard(port)
+        simulator.process.send_signal(signal.SIGCONT)
         deadline_s = time.monotonic() + 60.0
         while read_rows(tmp_path / "agent-0.ticks", TICK_DTYPE)["phase"].max(initial=0) < Phase.GOTO_START:
             assert agent.poll() is None and time.monotonic() < deadline_s
@@ -55,4 +78,5 @@ def test_a_closed_terminal_lands_the_vehicle(tmp_path: Path) -> None:
             assert not pilot.armed()
     finally:
         agent.kill()
+        simulator.process.send_signal(signal.SIGCONT)
         simulator.stop()
