@@ -21,7 +21,8 @@ from swarmctl.control.reference.mission import IdentifyParams, MissionParams, Mi
 from swarmctl.core.frames import GRAVITY_M_S2, quat_from_body_z
 from swarmctl.core.records import TICK_DTYPE
 from swarmctl.core.types import Array, Phase
-from swarmctl.ops.identify import identification, table
+from swarmctl.errors import StartError
+from swarmctl.ops.identify import _write, identification, table
 
 TRUTH = VehicleModelParams(
     delay_s=0.072, attitude_rad_s=9.0, attitude_damping=0.9, drag_1_s=0.6, hover_thrust_01=0.42, tilt_max_rad=0.7
@@ -125,6 +126,18 @@ def grounded(ticks: NDArray[np.void]) -> NDArray[np.void]:
     return ticks
 
 
+def blind(ticks: NDArray[np.void]) -> NDArray[np.void]:
+    """Flown for more than 10 s, but seen for the first 8 s only."""
+    ticks = ticks[:510]
+    ticks["state_age_ms"][400:] += 20.0 * np.arange(110)
+    return ticks
+
+
+def rescaled(ticks: NDArray[np.void]) -> NDArray[np.void]:
+    ticks["setpoint_thrust_01"] /= TRUTH.hover_thrust_01
+    return ticks
+
+
 @pytest.mark.parametrize(
     ("spoil", "why"),
     [
@@ -132,6 +145,8 @@ def grounded(ticks: NDArray[np.void]) -> NDArray[np.void]:
         (of_peers, "does not follow setpoints"),
         (grounded, "no setpoints"),
         (lambda ticks: ticks[:400], "10 s are needed"),
+        (blind, "too short for intervals"),
+        (rescaled, "a hover thrust of 1.00 of full can't be"),
     ],
 )
 def test_a_flight_without_information_is_refused(spoil, why: str) -> None:  # type: ignore[no-untyped-def]
@@ -206,6 +221,13 @@ def test_the_table_is_a_configuration_that_flies_what_was_found(tmp_path: Path) 
     assert after.model_of(0) == FOUND.model(before.model_of(0))
     assert (after.model_of(0).attitude_rad_s, after.model_of(0).tilt_max_rad) == (9.12, 0.7)
     assert "hover_thrust_01 = 0.424  # 0.382 to 0.467" in text
+
+
+def test_a_file_that_has_come_into_being_during_the_flight_is_kept(tmp_path: Path) -> None:
+    (tmp_path / "here.toml").write_text("mine")
+    with pytest.raises(StartError, match="can't be written"):
+        _write(tmp_path / "here.toml", "text")
+    assert (tmp_path / "here.toml").read_text() == "mine"
 
 
 def test_the_simulators_table_is_the_model_of_all(tmp_path: Path) -> None:

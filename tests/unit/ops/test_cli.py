@@ -286,6 +286,30 @@ def test_the_registry_knows_live_launches_and_forgets_dead_ones(
     assert list(registry.iterdir()) == []
 
 
+def test_a_note_that_cannot_be_written_stops_neither_the_flight_nor_the_others(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    started_s, pid = operator.process_start_s()
+    launch = operator.RunningLaunch("run", "unixsock-stream//x", pid, started_s, 3, str(tmp_path / "gone"))
+    operator.announce(launch)
+    assert operator.find_launch(None) == launch
+
+
+@pytest.mark.timeout(20)
+def test_a_note_in_a_received_folder_that_is_none_is_no_launch(tmp_path: Path) -> None:
+    note = tmp_path / operator.LAUNCH_FILE
+    for content in (b"{", b"[]", b'{"run": 1}', b"\xff\xfe", b"[" * 100_000):
+        note.write_bytes(content)
+        with pytest.raises(StartError, match="no launch runs there"):
+            operator.find_launch(tmp_path)
+    note.unlink()
+    os.mkfifo(note)
+    with pytest.raises(StartError, match="no launch runs there"):
+        operator.find_launch(tmp_path)
+
+
 def squat_open(place: Path) -> None:
     place.mkdir()
     place.chmod(0o777)
@@ -298,6 +322,7 @@ def squat_of_another(place: Path) -> None:
 
 def squat_file(place: Path) -> None:
     place.write_text("")
+    place.chmod(0o600)
 
 
 def squat_link(place: Path) -> None:
