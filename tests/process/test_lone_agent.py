@@ -6,6 +6,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -33,25 +34,35 @@ url = "udpin://127.0.0.1:{port}"
 """
 
 
-def until_heard(port: int) -> None:
-    """Send what is no vehicle of ours to a port, until its owner must have taken it in."""
-    beat = mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_PX4, 128, 0, 4, 3)
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
-        stranger.connect(("127.0.0.1", port))
-        taken, deadline_s = 0, time.monotonic() + 30.0
-        while taken < 50 and time.monotonic() < deadline_s:
-            try:
-                stranger.send(b"hello")
-                stranger.send(Codec(2, 1).encode(beat))
-                taken += 1
-            except ConnectionRefusedError:
-                taken = 0  # nobody is there yet
-            time.sleep(0.02)
-    assert taken == 50
+class Stranger(threading.Thread):
+    """Sends what is no vehicle of ours to a port, for as long as the test lasts."""
+
+    def __init__(self, port: int) -> None:
+        super().__init__(daemon=True)
+        self._port, self._ended, self.heard = port, threading.Event(), threading.Event()
+
+    def run(self) -> None:
+        beat = mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_PX4, 128, 0, 4, 3)
+        codec, taken = Codec(2, 1), 0
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+            sock.connect(("127.0.0.1", self._port))
+            while not self._ended.wait(0.02):
+                try:
+                    sock.send(b"hello")
+                    sock.send(codec.encode(beat))
+                    taken += 1
+                except ConnectionRefusedError:
+                    taken = 0  # nobody is there yet
+                if taken == 50:
+                    self.heard.set()
+
+    def stop(self) -> None:
+        self._ended.set()
+        self.join(5.0)
 
 
 def test_a_stranger_gets_no_link_and_a_closed_terminal_lands_the_vehicle(tmp_path: Path) -> None:
-    """A stranger sends first, another vehicle's heartbeats included; the kernel and the shell both send SIGHUP."""
+    """A stranger sends first and all the time, another vehicle's heartbeats too; kernel and shell both send SIGHUP."""
     simulator = Simulator(1)
     simulator.wait_until_up()
     [port] = simulator.ports
@@ -60,9 +71,11 @@ def test_a_stranger_gets_no_link_and_a_closed_terminal_lands_the_vehicle(tmp_pat
     config.write_text(CONFIG.format(port=port))
     command = [sys.executable, "-m", "swarmctl", "agent", "--config", str(config), "--id", "0"]
     command += ["--run", "lone", "--bus", "none", "--run-dir", str(tmp_path)]
+    stranger = Stranger(port)
+    stranger.start()
     agent = subprocess.Popen(command, cwd=ROOT, env=ENV, stderr=subprocess.PIPE, text=True)
     try:
-        until_heard(port)
+        assert stranger.heard.wait(30.0)
         simulator.process.send_signal(signal.SIGCONT)
         deadline_s = time.monotonic() + 60.0
         while read_rows(tmp_path / "agent-0.ticks", TICK_DTYPE)["phase"].max(initial=0) < Phase.GOTO_START:
@@ -74,9 +87,11 @@ def test_a_stranger_gets_no_link_and_a_closed_terminal_lands_the_vehicle(tmp_pat
         _, said = agent.communicate(timeout=60)
         assert agent.returncode == EXIT_INTERRUPTED, said
         assert read_rows(tmp_path / "agent-0.ticks", TICK_DTYPE)["phase"][-1] == Phase.DONE
+        stranger.stop()
         with Pilot(port) as pilot:
             assert not pilot.armed()
     finally:
         agent.kill()
+        stranger.stop()
         simulator.process.send_signal(signal.SIGCONT)
         simulator.stop()

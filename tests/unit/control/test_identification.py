@@ -21,7 +21,7 @@ from swarmctl.control.reference.mission import IdentifyParams, MissionParams, Mi
 from swarmctl.core.frames import GRAVITY_M_S2, quat_from_body_z
 from swarmctl.core.records import TICK_DTYPE
 from swarmctl.core.types import Array, Phase
-from swarmctl.errors import StartError
+from swarmctl.errors import ConfigError, StartError
 from swarmctl.ops.identify import _write, identification, table
 
 TRUTH = VehicleModelParams(
@@ -187,6 +187,13 @@ def test_leaving_the_limits_ends_the_flight(pos: tuple[float, ...], vel: tuple[f
     assert (why in excess) if why else excess == ""
 
 
+def test_a_step_that_would_end_its_own_flight_is_refused() -> None:
+    step = ["mission.kind=identify", "mission.identify.step_m=2.0"]
+    assert load(None, [*step, "mission.identify.distance_max_m=3.0"]).mission.kind == "identify"
+    with pytest.raises(ConfigError, match=r"mission.identify.distance_max_m = 2.9: less than 1.5 times step_m"):
+        load(None, [*step, "mission.identify.distance_max_m=2.9"])
+
+
 def test_no_other_mission_ends_by_it() -> None:
     circle = MissionReference(MissionParams(), np.zeros((1, 3)), 0)
     assert circle.excess(np.full(3, 100.0), np.full(3, 100.0)) == ""
@@ -236,8 +243,11 @@ def test_the_simulators_table_is_the_model_of_all(tmp_path: Path) -> None:
 
 
 def test_an_identification_flies_the_same_vehicles_in_another_mission() -> None:
-    config = Config()
+    config = load(None, ["mission.yaw_rad=0.5"])
+    assert config.telemetry.enabled
     flight = identification(config)
+    assert flight.mission.yaw_rad == 0.0, "steps are north and east, and so are the axes that are fitted"
+    assert not flight.telemetry.enabled
     steps = config.mission.section(IdentifyParams)
     assert (flight.mission.kind, flight.mission.duration_s) == ("identify", steps.duration_s)
     assert flight.model_copy(update={"mission": config.mission, "telemetry": config.telemetry}) == config
