@@ -1,7 +1,9 @@
-"""The order of the tests: the longest first, so that no worker idles at the end."""
+"""The order of the tests, the longest first, so that no worker idles at the end; and what each begins with."""
 
 from __future__ import annotations
 
+import signal
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -9,6 +11,14 @@ import pytest
 import swarmctl  # noqa: F401  (before anything loads numpy)
 
 TESTS = Path(__file__).parent
+
+
+@pytest.fixture(autouse=True)
+def heard_hangup() -> Iterator[None]:
+    """Begin a test, and the processes it starts, as on a terminal: under `nohup` SIGHUP would stay ignored."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

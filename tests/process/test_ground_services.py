@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import select
 import tempfile
+import threading
 import time
 from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 from pymavlink.dialects.v20 import development as mavlink
 
@@ -16,7 +19,9 @@ from swarmctl.check.ground_services import GroundServices, GroundVehicle, open_s
 from swarmctl.check.listener import open_listener
 from swarmctl.check.scanner import VehicleScan, run_scans
 from swarmctl.mavlink.codec import Codec
+from swarmctl.mavlink.transport import bind_udp
 from swarmctl.wall_clock import monotonic_us
+from tests.benches.free_ports import free_ports
 from tests.process.test_check import Simulator
 
 pytestmark = pytest.mark.process
@@ -77,6 +82,58 @@ def test_nothing_more_is_set_once_the_vehicle_is_armed(scans: dict[int, VehicleS
         told = services.ask({0: job})
     assert told == {0: (True, False, "it was armed, or fell silent, meanwhile")}
     assert values(scan) == [4, 1.0, 2]
+
+
+class Relay(threading.Thread):
+    """A link that moves every corner on its way to the vehicle north, by 1e-4 degrees."""
+
+    def __init__(self, vehicle_port: int, our_port: int) -> None:
+        super().__init__(daemon=True)
+        self._theirs, self._ours = (bind_udp("127.0.0.1", port) for port in (vehicle_port, 0))
+        self._us, self._vehicle = ("127.0.0.1", our_port), ("127.0.0.1", 0)
+        self._codec, self._ended = Codec(1, 1), threading.Event()
+
+    def run(self) -> None:
+        while not self._ended.is_set():
+            for sock in select.select([self._theirs, self._ours], [], [], 0.1)[0]:
+                data, sender = sock.recvfrom(2048)
+                if sock is self._theirs:
+                    self._vehicle = sender
+                    self._ours.sendto(data, self._us)
+                else:
+                    self._theirs.sendto(self._changed(data), self._vehicle)
+
+    def _changed(self, data: bytes) -> bytes:
+        message = self._codec.decode(data)
+        if message is None or message.get_type() != "MISSION_ITEM_INT":
+            return data
+        message.x += 1000
+        return Codec(data[5], data[6]).encode(message)
+
+    def stop(self) -> None:
+        self._ended.set()
+        self.join(5.0)
+        for sock in (self._theirs, self._ours):
+            sock.close()
+
+
+def test_a_geofence_is_what_the_vehicle_stores_and_not_what_was_sent() -> None:
+    simulator, (our_port,) = Simulator(1), free_ports(1)
+    relay = Relay(simulator.ports[0], our_port)
+    listener, there = open_listener(f"udpin://127.0.0.1:{our_port}")
+    relay.start()
+    try:
+        scan = VehicleScan(listener, there, 1, lambda _: READ, seconds=1.0)
+        run_scans([scan], 20.0, 30.0, lambda: False)
+        corners = [(47.3, 8.5), (47.3, 8.6), (47.4, 8.6)]
+        with open_services({0: scan}) as services:
+            stored = services.ask({0: partial(GroundVehicle.upload_fence, corners_deg=corners)})[0]
+        assert (stored.problem, stored.others) == ("", 0)
+        assert np.array(stored.corners_deg) - corners == pytest.approx(np.array([(1e-4, 0.0)] * 3), abs=2e-7)
+    finally:
+        relay.stop()
+        listener.close()
+        simulator.stop()
 
 
 def test_what_the_simulator_does_not_speak_is_told_in_time(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import subprocess
@@ -11,10 +12,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pymavlink.dialects.v20 import development as mavlink
 
 from swarmctl.config import load
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.core.types import Landed, Phase
+from tests.process.test_check import Pilot, Simulator
 
 pytestmark = pytest.mark.process
 
@@ -83,6 +86,33 @@ def test_ctrl_c_lands_and_nothing_is_written(tmp_path: Path) -> None:
     assert flight.returncode == 130, said
     assert landed(tmp_path)
     assert not table.exists()
+
+
+def test_nothing_is_flown_while_somebody_else_flies_it(tmp_path: Path) -> None:
+    simulator = Simulator(1)
+    simulator.wait_until_up()
+    [port] = simulator.ports
+    try:
+        with Pilot(port) as pilot:
+            deadline_s = time.monotonic() + 10.0
+            while pilot.arm(True) != 0:
+                assert time.monotonic() < deadline_s
+            take_off = mavlink.MAVLink_command_long_message(1, 1, mavlink.MAV_CMD_NAV_TAKEOFF, 0, *[math.nan] * 7)
+            assert pilot.ask(take_off, "COMMAND_ACK").result == 0
+        config = tmp_path / "one.toml"
+        vehicle = f'[[vehicles]]\nsysid = 1\nurl = "udpin://127.0.0.1:{port}"\n'
+        config.write_text(f"swarm.agents = 1\nstart.center_ned_m = [0, 0, -2]\nsitl.enabled = false\n{vehicle}")
+        command = [sys.executable, "-m", "swarmctl", "check", str(config), "--identify", "--apply", "--seconds=1"]
+        env = {**os.environ, "PYTHONPATH": str(ROOT)}
+        done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, timeout=60, check=False)
+        assert done.returncode == 4, done.stdout
+        assert "another program flies it" in done.stdout
+        assert "not flown: something is to fix first" in done.stdout
+        assert not (tmp_path / "runs").exists()
+        with Pilot(port) as pilot:
+            assert pilot.armed()
+    finally:
+        simulator.stop()
 
 
 def test_nothing_is_flown_when_the_file_to_write_is_there_already(tmp_path: Path) -> None:

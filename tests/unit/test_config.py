@@ -259,6 +259,37 @@ def test_a_hostile_file_is_refused_in_one_short_printable_line(tmp_path: Path, t
     assert str(caught.value).isprintable()
 
 
+ESCAPES = "\x1b[2J\x9b\u202e" + "x" * 200
+
+
+@pytest.mark.parametrize(
+    "override",
+    [
+        f"{ESCAPES}.{'a.' * 50}a=1",
+        f"{ESCAPES}=1{'0' * 5000}",
+        f"{ESCAPES}=0x{'f' * 100}",
+        f"{ESCAPES}={'[' * 100}{']' * 100}",
+        f"seed.{ESCAPES}.x=1",
+        f"seed.{ESCAPES}=1",
+        f"{ESCAPES}=1",
+        f"swarm.{ESCAPES}=1",
+        ESCAPES,
+    ],
+    ids=["deep", "digits", "hexadecimal", "deep list", "inside a value", "no place", "section", "key", "no value"],
+)
+def test_a_hostile_key_is_shown_short_and_printable(tmp_path: Path, override: str) -> None:
+    (problem,) = refusals(file_with(tmp_path, "seed = 1\n"), override)
+    assert problem.isprintable()
+    assert len(problem.partition("known here:")[0]) < 300
+
+
+def test_the_name_of_a_file_controls_no_terminal(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load(tmp_path / "\x1b[2J\x9b\u202e.toml")
+    assert str(caught.value).isprintable()
+    assert r"\x1b[2J\x9b\u202e.toml" in str(caught.value)
+
+
 def test_the_number_of_reported_problems_is_bounded(tmp_path: Path) -> None:
     problems = refusals(file_with(tmp_path, "".join(f"key{i} = 1\n" for i in range(10_000))))
     assert len(problems) == 31

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import secrets
+import tracemalloc
 from pathlib import Path
 
 import pytest
@@ -24,6 +26,24 @@ def test_a_file_larger_than_asked_for_is_refused_before_it_is_read(tmp_path: Pat
         file.truncate(2**40)  # sparse: reading it would need 1 TB
     with pytest.raises(OSError, match="is larger than 1 MB"):
         read_file(path, 10**6)
+    with path.open("wb") as file:
+        file.truncate(20_000_001)
+    tracemalloc.start()
+    try:
+        with pytest.raises(OSError, match="is larger than 20 MB"):
+            read_file(path, 20_000_000)
+        _, most_bytes = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert most_bytes < 1_000_000, "it was read, and then refused"
+
+
+def test_a_file_that_holds_more_than_it_says_is_refused() -> None:
+    path = Path("/proc/self/status")  # a regular file of 0 bytes, as one that grows while it is read
+    assert path.stat().st_size == 0
+    with pytest.raises(OSError, match="is larger than"):
+        read_file(path, 10)
+    assert b"Name:" in read_file(path, 10**6)
 
 
 @pytest.mark.timeout(10)
@@ -57,6 +77,20 @@ def test_a_link_in_place_of_the_file_is_replaced_and_its_target_kept(tmp_path: P
         part.write_text("packed")
     assert path.read_text() == "packed"
     assert precious.read_text() == "mine"
+
+
+def test_a_link_at_the_name_of_the_new_file_is_not_written_through(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As if a neighbour had guessed the random part of the name."""
+    precious = tmp_path / "precious"
+    precious.write_text("mine")
+    monkeypatch.setattr(secrets, "token_hex", lambda size: "0" * 2 * size)
+    (tmp_path / f".report.html.{'0' * 16}.part").symlink_to(precious)
+    with pytest.raises(FileExistsError):
+        replace_text(tmp_path / "report.html", "page")
+    assert precious.read_text() == "mine"
+    assert not (tmp_path / "report.html").exists()
 
 
 def test_a_failed_write_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:

@@ -175,6 +175,11 @@ def test_a_status_under_a_foreign_or_unknown_name_is_refused() -> None:
     bench.tick()
     assert bench.world_model.peers() == {}
     assert bench.rejected == {"identity": 2, "malformed": 1}
+    stranger = bench.hub.connect(agent_name(7))
+    stranger.publish(topics.STATUS, topics.encode_message(msgspec.structs.replace(STATUS, agent=7, ready_utc_us=0)))
+    bench.tick()
+    assert bench.world_model.peers() == {}
+    assert bench.rejected == {"identity": 2, "malformed": 1, "unknown_peer": 1}
 
 
 def test_a_tick_processes_at_most_one_ring_of_messages_per_sender() -> None:

@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import math
+import struct
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from swarmctl.bus.commitment_messages import PeerTrajectories, decode_trajectory_message, encode_trajectory_message
+from swarmctl.bus.commitment_messages import (
+    MAX_ACKNOWLEDGED,
+    MAX_POINTS,
+    MAX_STEP_US,
+    PeerTrajectories,
+    decode_trajectory_message,
+    encode_trajectory_message,
+)
 from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.bus.refusals import Refusals
 from swarmctl.bus.senders import Presence
@@ -69,6 +78,51 @@ def test_truncated_lengthened_and_mutilated_messages_are_refused() -> None:
         found = decode_trajectory_message(bytes(bad))
         if found is not None:
             assert np.isfinite(found.committed.pos_ned_m).all()
+
+
+def flat(points: int) -> Trajectory:
+    zeros = np.zeros((points, 3))
+    return Trajectory(t0_utc_us=UTC_US, dt_us=100_000, pos_ned_m=zeros, vel_ned_m_s=zeros)
+
+
+FLAGS, STEP, POINTS = 3, 36, 44  # offsets of the header's flags, and of the step and the points of what is committed
+
+
+@pytest.mark.parametrize(
+    ("offset", "code", "value", "fits"),
+    [
+        (FLAGS, "<B", 3, True),
+        (FLAGS, "<B", 7, False),
+        (STEP, "<i", 1, True),
+        (STEP, "<i", MAX_STEP_US, True),
+        (STEP, "<i", 0, False),
+        (STEP, "<i", -100_000, False),
+        (STEP, "<i", MAX_STEP_US + 1, False),
+        (POINTS, "<f", 1e6, True),
+        *((POINTS + 4 * k, "<f", bad, False) for k in range(6) for bad in (math.nan, math.inf, -math.inf)),
+    ],
+)
+def test_a_number_out_of_bounds_is_refused(offset: int, code: str, value: float, fits: bool) -> None:
+    payload = bytearray(encode_trajectory_message(message()))
+    struct.pack_into(code, payload, offset, value)
+    assert (decode_trajectory_message(bytes(payload)) is not None) is fits
+
+
+@pytest.mark.parametrize(("points", "fits"), [(1, False), (2, True), (MAX_POINTS, True), (MAX_POINTS + 1, False)])
+def test_the_number_of_points_is_bounded(points: int, fits: bool) -> None:
+    for propose in (False, True):
+        sent = message(propose=propose)
+        if sent.proposal is None:
+            sent = replace(sent, committed=flat(points))
+        else:
+            sent = replace(sent, proposal=replace(sent.proposal, trajectory=flat(points)))
+        assert (decode_trajectory_message(encode_trajectory_message(sent)) is not None) is fits
+
+
+@pytest.mark.parametrize(("count", "fits"), [(MAX_ACKNOWLEDGED, True), (MAX_ACKNOWLEDGED + 1, False)])
+def test_the_number_of_acknowledgements_is_bounded(count: int, fits: bool) -> None:
+    sent = replace(message(), acknowledged=dict.fromkeys(range(count), 1))
+    assert (decode_trajectory_message(encode_trajectory_message(sent)) is not None) is fits
 
 
 class Store:

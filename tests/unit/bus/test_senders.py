@@ -268,7 +268,10 @@ def test_a_flood_of_boot_ids_takes_no_memory_and_changes_nothing() -> None:
     bench.ticks(10)
     for boot_id in range(1000, 3000):
         assert not bench.offer(boot_id, boot_id)
+        assert len(bench.verifier._claims) <= 4
     bench.ticks(10)
     assert len(bench.accepted) == 20
     assert len(bench.verifier._claims) == 0
     assert bench.accused == {"boot": 2000}
+    bench.ticks(200)
+    assert len(bench.verifier._contents) <= 64

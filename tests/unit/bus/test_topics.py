@@ -20,7 +20,7 @@ from swarmctl.core.operator_verbs import OPERATOR_VERBS, OperatorVerb, Order, Ve
 from swarmctl.core.records import TICK_DTYPE
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.trajectory_message import Proposal
-from swarmctl.core.types import PredictedPath
+from swarmctl.core.types import MAX_MARGIN_M, PredictedPath
 from tests import builders
 
 POINTS = np.array([[1.5, -2.25, -3.0], [1.625, -2.0, -3.5], [1.75, -1.75, -4.0]])
@@ -101,6 +101,7 @@ def test_a_number_that_is_not_finite_is_refused(number: int, bad: float) -> None
         changed(28, "<f", math.nan),  # radius
         changed(28, "<f", math.inf),
         changed(28, "<f", -0.5),
+        changed(28, "<f", MAX_MARGIN_M + 0.01),
         changed(32, "<B", 2),  # count
         changed(32, "<B", 4),
         changed(33, "<B", 35),  # header length
@@ -224,6 +225,25 @@ def test_arguments_of_an_order_arrive_in_bounds_or_not_at_all(monkeypatch: pytes
     assert decode_command(climb({"k" * 33: 0.0})) is None
 
 
+@pytest.mark.parametrize(
+    ("verb", "names", "fits"),
+    [
+        ("v" * 32, ["n" * 32], True),
+        ("v" * 33, [], False),
+        ("climb", ["n" * 33], False),
+        ("climb", [f"n{k}" for k in range(8)], True),
+        ("climb", [f"n{k}" for k in range(9)], False),
+    ],
+)
+def test_words_and_arguments_of_an_order_are_bounded_whatever_verbs_there_are(
+    monkeypatch: pytest.MonkeyPatch, verb: str, names: list[str], fits: bool
+) -> None:
+    arguments = tuple(VerbArgument(name=name, option="--x", help="x", least=0.0, most=1.0) for name in names)
+    monkeypatch.setitem(OPERATOR_VERBS, verb, OperatorVerb(help="x", phases=frozenset(), arguments=arguments))
+    body = {"verb": verb, "agent": -1, "utc_us": 1, "arguments": dict.fromkeys(names, 0.5)}
+    assert (decode_command(msgspec.json.encode(body)) is not None) is fits
+
+
 def test_verbs_without_arguments_take_none() -> None:
     for verb in ("hold", "resume", "land", "rtl"):
         body = {"verb": verb, "agent": -1, "utc_us": 1}
@@ -236,8 +256,11 @@ def test_only_verbs_of_the_operator_are_known(verb: str) -> None:
     assert decode_command(msgspec.json.encode({"verb": verb, "agent": -1, "utc_us": 1})) is None
 
 
-@pytest.mark.parametrize(("name", "value"), [("phase", 10), ("phase", -1), ("phase", 99)])
-def test_a_status_of_a_phase_that_does_not_exist_is_refused(name: str, value: int) -> None:
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [("phase", 10), ("phase", -1), ("mode", 99), ("mode", -1), ("flight_mode", 99), ("flight_mode", -1)],
+)
+def test_a_status_of_a_phase_or_mode_that_does_not_exist_is_refused(name: str, value: int) -> None:
     # the agent makes `Phase(status.phase)` of it within the tick
     assert decode_status(msgspec.json.encode(msgspec.to_builtins(STATUS) | {name: value})) is None
 

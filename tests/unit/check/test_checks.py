@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import json
 import math
 from collections.abc import Sequence
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from rich.console import Console
 
 from swarmctl.check.change import Change
 from swarmctl.check.finding import SWARM, Finding, worst_first
@@ -28,9 +30,9 @@ from swarmctl.check.link_facts import (
 )
 from swarmctl.check.parameters import RC_RECEIVER, changes, names_to_read, unchangeable
 from swarmctl.check.scan_facts import unreached
-from swarmctl.check.services import corners_deg
+from swarmctl.check.services import corners_deg, has_fence
 from swarmctl.check.swarm import exit_code, findings, standing
-from swarmctl.check.table import as_json, print_check
+from swarmctl.check.table import _drawn, as_json, print_check
 from swarmctl.config import Config, load
 from swarmctl.core.types import FlightMode, Landed
 from swarmctl.core.verdict import Verdict
@@ -195,7 +197,7 @@ def test_the_corners_are_north_and_east_of_the_shared_origin() -> None:
     assert west < 8.545594 < lon
 
 
-@pytest.mark.parametrize("of", ["same", "rounded", "none", "moved", "more", "refused", "not asked"])
+@pytest.mark.parametrize("of", ["same", "rounded", "none", "moved", "more", "refused", "doubtful", "not asked"])
 def test_a_geofence_is_exactly_the_configured_one(of: str) -> None:
     config = fenced()
     corners = corners_deg(config)
@@ -206,9 +208,11 @@ def test_a_geofence_is_exactly_the_configured_one(of: str) -> None:
         "moved": FenceFacts(corners_deg=((corners[0][0] + 1e-5, corners[0][1]), *corners[1:])),
         "more": FenceFacts(corners_deg=corners, others=1),
         "refused": FenceFacts(problem="timeout"),
+        "doubtful": FenceFacts(corners_deg=corners, problem="timeout"),
         "not asked": None,
     }[of]
     line = line_of(findings([changed(HEALTHY, fence=fence)], config), "geofence")
+    assert fence is None or has_fence(fence, config) is (of in ("same", "rounded"))
     assert line.verdict is (Verdict.OK if of in ("same", "rounded") else Verdict.FIX)
 
 
@@ -566,9 +570,9 @@ MINIMAL: dict[str, Any] = {
     "horizontal_accuracy": "GPS_RAW_INT",
     "checks": (ParameterCheck("CHECKED", "why", lambda value, seen: Opinion(verdict=NOTE, wanted="2", advice="two")),),
     "also_read": (),
-    "loss_parameter": "LOSS",
     "fence_checks": (),
-    "log_suffix": "",
+    "log_suffix": ".log",
+    "loss_parameter": "LOSS",
 }
 
 
@@ -643,6 +647,16 @@ def test_what_a_vehicle_says_steers_no_terminal(config: Config, capsys: pytest.C
     assert "DONE" in shown
     assert all(c.isprintable() or c in "\n\t" for c in shown)
     assert not any(line.startswith("DONE") for line in shown.splitlines())
+
+
+def test_what_a_vehicle_says_is_no_markup(capsys: pytest.CaptureFixture[str]) -> None:
+    said = "refused [/bold] [red]"
+    finding = Finding(agent=0, topic="x", verdict=FIX, found=said, wanted=said, advice=said)
+    print_check([], [finding], [])
+    assert capsys.readouterr().out.count(said) == 4, "the row has two, and the list below it two"
+    drawn = io.StringIO()
+    Console(file=drawn, width=200).print(_drawn([finding]))
+    assert drawn.getvalue().count(said) == 2
 
 
 @pytest.mark.parametrize(

@@ -193,6 +193,9 @@ def test_what_an_agent_says_is_shown_as_it_is() -> None:
     view = AgentView(agent=0, status=status(active_alert="refused [/bold] [red]"))
     Console(file=stream, width=200).print(status_table([view]))
     assert "refused [/bold] [red]" in stream.getvalue()
+    stream = io.StringIO()
+    LiveTable(Console(file=stream, width=200)).print_line("refused [/bold] [red]")
+    assert stream.getvalue() == "refused [/bold] [red]\n"
 
 
 def test_an_agents_text_controls_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
@@ -206,7 +209,7 @@ def test_an_agents_text_controls_no_terminal(capsys: pytest.CaptureFixture[str])
         status_table([AgentView(agent=0, status=status(active_alert=hostile), note="")])
     )
     LiveTable(Console(file=stream, force_terminal=False)).print_line(hostile)
-    print_statuses([AgentView(agent=0, status=status(active_alert=hostile))])
+    print_statuses([AgentView(agent=0, status=status(active_alert=hostile)), AgentView(agent=1, note=hostile)])
     print(operator.as_json({0: status(active_alert=hostile)}))
     shown = stream.getvalue() + capsys.readouterr().out
     assert "DONE" in shown
@@ -272,6 +275,8 @@ def test_every_violation_is_said() -> None:
     alone = {"outcome": "failed", "violations": ["a"]}
     assert violation_lines(alone) == ()
     assert summary_lines(alone, Path("runs/x"))[0].endswith("1 violation: a")
+    hostile = summary_lines({"outcome": "failed", "violations": ["b\x1b[2J"]}, Path("runs/x"))
+    assert hostile[0].endswith(r"1 violation: b\x1b[2J")
 
 
 def test_the_camera_is_given_numbers_argparse_does_not_take_for_options() -> None:

@@ -21,7 +21,8 @@ from swarmctl.control.reference.mission import IdentifyParams, MissionParams, Mi
 from swarmctl.core.frames import GRAVITY_M_S2, quat_from_body_z
 from swarmctl.core.records import TICK_DTYPE
 from swarmctl.core.types import Array, Phase
-from swarmctl.ops.identify import identification, table
+from swarmctl.errors import ConfigError, StartError
+from swarmctl.ops.identify import _write, identification, table
 
 TRUTH = VehicleModelParams(
     delay_s=0.072, attitude_rad_s=9.0, attitude_damping=0.9, drag_1_s=0.6, hover_thrust_01=0.42, tilt_max_rad=0.7
@@ -125,6 +126,18 @@ def grounded(ticks: NDArray[np.void]) -> NDArray[np.void]:
     return ticks
 
 
+def blind(ticks: NDArray[np.void]) -> NDArray[np.void]:
+    """Flown for more than 10 s, but seen for the first 8 s only."""
+    ticks = ticks[:510]
+    ticks["state_age_ms"][400:] += 20.0 * np.arange(110)
+    return ticks
+
+
+def rescaled(ticks: NDArray[np.void]) -> NDArray[np.void]:
+    ticks["setpoint_thrust_01"] /= TRUTH.hover_thrust_01
+    return ticks
+
+
 @pytest.mark.parametrize(
     ("spoil", "why"),
     [
@@ -132,6 +145,8 @@ def grounded(ticks: NDArray[np.void]) -> NDArray[np.void]:
         (of_peers, "does not follow setpoints"),
         (grounded, "no setpoints"),
         (lambda ticks: ticks[:400], "10 s are needed"),
+        (blind, "too short for intervals"),
+        (rescaled, "a hover thrust of 1.00 of full can't be"),
     ],
 )
 def test_a_flight_without_information_is_refused(spoil, why: str) -> None:  # type: ignore[no-untyped-def]
@@ -172,6 +187,13 @@ def test_leaving_the_limits_ends_the_flight(pos: tuple[float, ...], vel: tuple[f
     assert (why in excess) if why else excess == ""
 
 
+def test_a_step_that_would_end_its_own_flight_is_refused() -> None:
+    step = ["mission.kind=identify", "mission.identify.step_m=2.0"]
+    assert load(None, [*step, "mission.identify.distance_max_m=3.0"]).mission.kind == "identify"
+    with pytest.raises(ConfigError, match=r"mission.identify.distance_max_m = 2.9: less than 1.5 times step_m"):
+        load(None, [*step, "mission.identify.distance_max_m=2.9"])
+
+
 def test_no_other_mission_ends_by_it() -> None:
     circle = MissionReference(MissionParams(), np.zeros((1, 3)), 0)
     assert circle.excess(np.full(3, 100.0), np.full(3, 100.0)) == ""
@@ -208,14 +230,24 @@ def test_the_table_is_a_configuration_that_flies_what_was_found(tmp_path: Path) 
     assert "hover_thrust_01 = 0.424  # 0.382 to 0.467" in text
 
 
+def test_a_file_that_has_come_into_being_during_the_flight_is_kept(tmp_path: Path) -> None:
+    (tmp_path / "here.toml").write_text("mine")
+    with pytest.raises(StartError, match="can't be written"):
+        _write(tmp_path / "here.toml", "text")
+    assert (tmp_path / "here.toml").read_text() == "mine"
+
+
 def test_the_simulators_table_is_the_model_of_all(tmp_path: Path) -> None:
     after = configured(tmp_path, table(Config(), {0: FOUND, 1: FOUND}, "2026-01-01"))
     assert after.vehicle_model == FOUND.model(Config().vehicle_model)
 
 
 def test_an_identification_flies_the_same_vehicles_in_another_mission() -> None:
-    config = Config()
+    config = load(None, ["mission.yaw_rad=0.5"])
+    assert config.telemetry.enabled
     flight = identification(config)
+    assert flight.mission.yaw_rad == 0.0, "steps are north and east, and so are the axes that are fitted"
+    assert not flight.telemetry.enabled
     steps = config.mission.section(IdentifyParams)
     assert (flight.mission.kind, flight.mission.duration_s) == ("identify", steps.duration_s)
     assert flight.model_copy(update={"mission": config.mission, "telemetry": config.telemetry}) == config

@@ -203,6 +203,18 @@ def test_others_on_the_link_are_not_believed(sysid: int, compid: int) -> None:
     assert len(bench.frames) == frames
 
 
+@pytest.mark.parametrize(("counter", "shown_m"), [(0, 0.1), (1, 0.0)])
+def test_a_step_is_bridged_when_the_reset_counter_changes(counter: int, shown_m: float) -> None:
+    bench = Bench().ready()
+    bench.say(odometry())
+    bench.poll()
+    bench.clock.advance(20_000)
+    message = odometry(1_020_000, pos=(0.1, 0.0, 0.0))
+    message.reset_counter = counter
+    bench.say(message)
+    assert bench.poll().pos_ned_m[0] == pytest.approx(shown_m, abs=0.01)
+
+
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("field", ["pos", "vel", "rate", "q"])
 @pytest.mark.parametrize("axis", range(3))

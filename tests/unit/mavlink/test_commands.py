@@ -160,7 +160,13 @@ def test_the_answer_to_something_else_is_not_ours() -> None:
     assert bench.port.busy
 
 
-@pytest.mark.parametrize(("target", "ours"), [((5, 191), True), ((0, 0), True), ((255, 190), False), ((5, 190), False)])
+@pytest.mark.parametrize(
+    ("target", "ours"),
+    [
+        *(((5, 191), True), ((5, 0), True), ((0, 191), True), ((0, 0), True)),
+        *(((255, 190), False), ((5, 190), False), ((255, 191), False), ((255, 0), False), ((0, 190), False)),
+    ],
+)
 def test_an_acknowledgement_counts_only_for_whom_it_names(target: tuple[int, int], ours: bool) -> None:
     bench = Bench()
     bench.port.request(Command(verb=Verb.ARM))

@@ -39,6 +39,7 @@ NO_VEHICLE = {
     "bad checksum": BROKEN,
     "another system": beat(sysid=SYSID + 1),
     "companion of the vehicle": beat(compid=191, kind=18, autopilot=INVALID),
+    "companion that names an autopilot": beat(compid=191),
     "ground station with the vehicle's ids": beat(kind=6, autopilot=INVALID),
     "MAVLink 1": b"\xfe" + beat()[1:],
 }

@@ -121,6 +121,56 @@ def test_a_state_that_goes_back_alone_is_no_reboot_until_nothing_else_has_come_f
     assert link.clock.boots == 1
 
 
+def gone_back() -> Link:
+    link = Link(VehicleClock(), 1.0, asked=False)
+    link.run(10.0)
+    link.vehicle_us = 1_300_000.0
+    return link
+
+
+def test_one_frame_of_another_message_bears_out_no_reboot_and_two_do() -> None:
+    link = gone_back()
+    link.run(0.5)
+    for boots in (0, 1):
+        link.clock.witness("ATTITUDE", round(link.vehicle_us), round(link.now_us))
+        link.run(0.5)
+        assert link.clock.boots == boots
+
+
+def test_what_other_messages_told_before_bears_out_no_reboot() -> None:
+    link = gone_back()
+    for before_us in (2_000, 1_000):
+        link.clock.witness("ATTITUDE", round(link.vehicle_us) - before_us, round(link.now_us) - before_us)
+    link.run(2.9)
+    assert (link.clock.boots, link.unknown) == (0, 290)
+
+
+def test_other_messages_that_go_on_as_before_bear_out_no_reboot() -> None:
+    link = gone_back()
+    for k in range(1, 30):
+        link.run(0.1)
+        link.clock.witness("ATTITUDE", BOOTED_US + 10_000_000 + k * 100_000, round(link.now_us))
+    assert (link.clock.boots, link.unknown) == (0, 290)
+
+
+def test_stamps_that_agree_with_nothing_begin_no_clock() -> None:
+    link = Link(VehicleClock(), 1.0, asked=False)
+    link.run(10.0)
+    for k in range(100):
+        link.now_us += 20_000.0
+        assert link.clock.to_local(10**15 * (1 + k % 4) + 20_000 * k, round(link.now_us)) is None
+    assert link.clock.restarts == 0
+
+
+def test_four_stamps_of_another_time_begin_no_clock_and_the_fifth_does() -> None:
+    link = Link(VehicleClock(), 1.0, asked=False)
+    link.run(10.0)
+    for k in range(5):
+        link.now_us += 150_000.0
+        found_us = link.clock.to_local(10**15 + 150_000 * k, round(link.now_us))
+        assert (found_us is not None, link.clock.restarts) == (k == 4, int(k == 4))
+
+
 @pytest.mark.parametrize("off_us", [-60_000_000, -1_500_000, 100_000, 900_000, 5_000_000, 10**15])
 @pytest.mark.parametrize("every", [None, 2, 9])
 def test_stamps_in_past_or_future_among_good_ones_change_nothing(off_us: int, every: int | None) -> None:

@@ -19,7 +19,7 @@ from sitl.studies.bench import command
 from swarmctl.control.mpc.qp import SOLVERS
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import OperatorVerb, Order, VerbArgument
-from swarmctl.errors import ConfigError, MissionError, StartError
+from swarmctl.errors import ConfigError, MissionError, StartError, exit_code_of
 from swarmctl.ops import cli, operator
 
 Run = Callable[..., int]
@@ -183,6 +183,19 @@ def test_expected_errors_are_words_and_their_exit_code(
     assert captured.err == f"{error}\n"
 
 
+def test_errors_control_no_terminal(run: Run, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    hostile = str(tmp_path / "\x1b]0;owned\x07\x9b2J\u202e")
+    assert run("land", "--run-dir", hostile) == 3
+
+    def study() -> int:
+        raise StartError(f"{hostile}: no such thing")
+
+    assert exit_code_of(study) == 3
+    said = capsys.readouterr().err
+    assert said.count(r"\x1b]0;owned\x07\x9b2J\u202e") == 2
+    assert all(c.isprintable() or c == "\n" for c in said)
+
+
 def test_unexpected_errors_keep_their_traceback(monkeypatch: pytest.MonkeyPatch) -> None:
     def fail(*_: object) -> None:
         raise ZeroDivisionError("bug")
@@ -273,6 +286,30 @@ def test_the_registry_knows_live_launches_and_forgets_dead_ones(
     assert list(registry.iterdir()) == []
 
 
+def test_a_note_that_cannot_be_written_stops_neither_the_flight_nor_the_others(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    started_s, pid = operator.process_start_s()
+    launch = operator.RunningLaunch("run", "unixsock-stream//x", pid, started_s, 3, str(tmp_path / "gone"))
+    operator.announce(launch)
+    assert operator.find_launch(None) == launch
+
+
+@pytest.mark.timeout(20)
+def test_a_note_in_a_received_folder_that_is_none_is_no_launch(tmp_path: Path) -> None:
+    note = tmp_path / operator.LAUNCH_FILE
+    for content in (b"{", b"[]", b'{"run": 1}', b"\xff\xfe", b"[" * 100_000):
+        note.write_bytes(content)
+        with pytest.raises(StartError, match="no launch runs there"):
+            operator.find_launch(tmp_path)
+    note.unlink()
+    os.mkfifo(note)
+    with pytest.raises(StartError, match="no launch runs there"):
+        operator.find_launch(tmp_path)
+
+
 def squat_open(place: Path) -> None:
     place.mkdir()
     place.chmod(0o777)
@@ -285,6 +322,7 @@ def squat_of_another(place: Path) -> None:
 
 def squat_file(place: Path) -> None:
     place.write_text("")
+    place.chmod(0o600)
 
 
 def squat_link(place: Path) -> None:

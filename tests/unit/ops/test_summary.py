@@ -54,6 +54,26 @@ def test_a_full_disk_costs_the_files_and_not_the_verdict(folder: Path) -> None:
     assert {path.name: path.read_bytes() for path in folder.iterdir()} == before
 
 
+_REPORT = """
+import resource, sys
+from swarmctl.ops.cli import main
+resource.setrlimit(resource.RLIMIT_FSIZE, (0, 0))
+sys.argv = ["swarmctl", "report", sys.argv[1]]
+main()
+"""
+
+
+@pytest.mark.parametrize("finished", [True, False])
+def test_a_report_that_a_full_disk_does_not_take_is_an_error(folder: Path, finished: bool) -> None:
+    if finished:
+        sum_up(folder, -1)
+    command = [sys.executable, "-c", _REPORT, str(folder)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (done.returncode, done.stdout) == (3, "")
+    [line] = done.stderr.splitlines()
+    assert "report.html" in line and "File too large" in line
+
+
 def test_a_disk_that_fills_on_the_way_keeps_what_fits(folder: Path) -> None:
     lines = sum_up(folder, 30_000)  # the report does not fit
     assert "report.html" in lines[-2]

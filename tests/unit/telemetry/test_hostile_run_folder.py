@@ -45,6 +45,11 @@ def summary_with(directory: Path, **changes: Any) -> None:
     path.write_text(json.dumps({**json.loads(path.read_text()), **changes}))
 
 
+def summary_holding(directory: Path, section: str, **changes: Any) -> None:
+    summary = json.loads((directory / "summary.json").read_text())
+    summary_with(directory, **{section: {**summary[section], **changes}})
+
+
 def huge_number(directory: Path) -> None:
     text = (directory / "summary.json").read_text()
     (directory / "summary.json").write_text(text.replace('"agents": 3', f'"agents": 1{"0" * 5000}'))
@@ -55,6 +60,18 @@ def spread_of_times(directory: Path, name: str, dtype: np.dtype[np.void]) -> Non
     rows["t_us"] = [0, 2**62]
     rows["armed"] = 1
     rows.tofile(directory / name)
+
+
+def spread_of_utc(directory: Path) -> None:
+    rows = np.zeros(2, TICK_DTYPE)
+    rows["utc_us"] = [0, 2**62]
+    rows.tofile(directory / "agent-0.ticks")
+
+
+def too_many_rows(directory: Path) -> None:
+    """Repeated numbers need hardly any place in a file, and 0.5 kB each in memory."""
+    table = pa.table({"seq": pa.array(np.zeros(2**31 // TICK_DTYPE.itemsize + 1, np.uint8))})
+    pq.write_table(table, directory / "agent-0.parquet", compression="zstd")
 
 
 def text_column(directory: Path) -> None:
@@ -77,9 +94,12 @@ def device_as(name: str) -> Callable[[Path], None]:
     return make
 
 
-def sparse(directory: Path) -> None:
-    with (directory / "truth.bin").open("wb") as file:
-        file.truncate(2**40)
+def sparse_as(name: str) -> Callable[[Path], None]:
+    def make(directory: Path) -> None:
+        with (directory / name).open("wb") as file:
+            file.truncate(2**40)  # reading it would need 1 TB
+
+    return make
 
 
 _NAMES = ("config.toml", "summary.json", "events.jsonl", "agent-0.parquet", "agent-7.ticks", "truth.bin")
@@ -88,16 +108,30 @@ REFUSED: dict[str, tuple[Callable[[Path], Any], str]] = {
     "summary empty": (lambda d: (d / "summary.json").write_text(""), "summary.json"),
     "summary list": (lambda d: (d / "summary.json").write_text("[]"), "summary.json"),
     "summary without": (lambda d: (d / "summary.json").write_text('{"outcome": "failed"}'), "violations"),
+    "summary deep inside": (
+        lambda d: (d / "summary.json").write_text('{"x":' + "[" * 100_000 + "]" * 100_000 + "}"),
+        "summary.json",
+    ),
     "summary deep": (lambda d: (d / "summary.json").write_text("[" * 100_000), "summary.json"),
     "agents = 1e9": (lambda d: summary_with(d, agents=10**9), "of 1000000000 agents"),
     "agents of 5,000 digits": (huge_number, "summary.json"),
     "outcome of its own": (lambda d: summary_with(d, outcome='"><script>'), "outcome"),
+    "figure of 1e300": (lambda d: summary_holding(d, "separation", min_m=1e300), "min_m"),
+    "figure below -1e9": (lambda d: summary_holding(d, "tracking", index_m=-1e10), "index_m"),
+    "count below 0": (lambda d: summary_holding(d, "timing", ticks=-1), "ticks"),
+    "count of 2^60": (lambda d: summary_holding(d, "timing", late_ticks=2**60), "late_ticks"),
+    "tracked agent 1e9": (
+        lambda d: summary_holding(d, "tracking", agents=[{"id": 10**9, "mse_m2": [0.0, 0.0, 0.0]}]),
+        "id",
+    ),
     "Parquet of text": (text_column, "t_us holds no numbers"),
     "Parquet torn": (lambda d: (d / "agent-1.parquet").write_bytes(b"PAR1" + bytes(100) + b"PAR1"), "agent-1.parquet"),
     "Parquet of noise": (lambda d: (d / "agent-1.parquet").write_bytes(os.urandom(1000)), "agent-1.parquet"),
     "ticks of 10,000 years": (lambda d: spread_of_times(d, "agent-0.ticks", TICK_DTYPE), "spans more than 48 hours"),
     "truth of 10,000 years": (lambda d: spread_of_times(d, "truth.bin", TRUTH_DTYPE), "spans more than 48 hours"),
-    "truth of 1 TB": (sparse, "is larger than"),
+    "UTC of 10,000 years": (spread_of_utc, "spans more than 48 hours"),
+    "Parquet of too many rows": (too_many_rows, "rows, more than a day of one agent"),
+    **{f"{name} of 1 TB": (sparse_as(name), "is larger than") for name in _NAMES},
     **{f"pipe as {name}": (pipe_as(name), "is not a regular file") for name in _NAMES},
     **{f"device as {name}": (device_as(name), "is a symbolic link") for name in _NAMES},
 }

@@ -78,6 +78,18 @@ def test_recording_that_cannot_be_packed_stays(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["telemetry.rrd"]
 
 
+def test_recording_that_is_a_link_is_not_packed(tmp_path: Path) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "received").mkdir()
+    mine = simulated_recording(tmp_path / "mine", RunData({0: flown(0)}, NO_TRUTH, []), 1, 0.9, limit_m=0.85)
+    before = mine.read_bytes()
+    link = tmp_path / "received" / "telemetry.rrd"
+    link.symlink_to(mine)
+    assert not optimize_recording(tmp_path / "received")
+    assert link.is_symlink()
+    assert mine.read_bytes() == before
+
+
 def test_recording_of_a_killed_viewer_is_repaired(tmp_path: Path) -> None:
     path = simulated_recording(tmp_path, RunData({0: flown(0)}, NO_TRUTH, []), 1, 0.9, limit_m=0.85)
     path.write_bytes(path.read_bytes()[:-30_000])
