@@ -18,8 +18,7 @@ from sitl.plant.sensors import FULL, Estimate, Power
 from sitl.plant.vehicle import Array, Plant
 
 _BLOCK = 50  # steps of random numbers drawn at a time
-_WANDERS = 14  # slow: position 3, velocity 3, tilt 2; fast: position 3, velocity 3
-_DRAWS = _WANDERS + 9  # per step and vehicle; white noise on position, velocity and attitude
+_DRAWS = 17  # per step and vehicle: wander of position 3, velocity 3, tilt 2; white noise on each 3, 3, 3
 _PURPOSE = 1  # purpose of the random stream, beside run seed and vehicle
 _LOST_M_S2 = 0.05  # acceleration that a tilt error of 0.3 deg causes in an uncorrected position
 EXACT_ACCURACY_M = (0.01, 0.01)
@@ -27,21 +26,16 @@ EXACT_ACCURACY_M = (0.01, 0.01)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ErrorModel:
-    """Slow and fast errors: root mean square and correlation time, NED per axis.
+    """Slow errors: root mean square and correlation time, NED per axis.
 
     They are white noise behind two equal low-passes. A filter that integrates inertial data, as an autopilot's does,
-    has smooth errors, so that its position can still be differentiated. Slow ones are where the filter drifts between
-    fixes, fast ones (0.1 to 1.5 Hz) where it follows its accelerometers; a controller answers to the fast ones.
+    has smooth errors, so that its position can still be differentiated.
     """
 
     position_m: tuple[float, float, float]
     position_tau_s: float
     velocity_m_s: tuple[float, float, float]  # reported velocity against the derivative of the reported position
     velocity_tau_s: float
-    fast_position_m: tuple[float, float, float]
-    fast_position_tau_s: float
-    fast_velocity_m_s: tuple[float, float, float]
-    fast_velocity_tau_s: float
     tilt_rad: float  # roll and pitch each
     tilt_tau_s: float
     noise_position_m: float  # white, per axis and physics step
@@ -52,8 +46,7 @@ class ErrorModel:
     @property
     def accuracy_m(self) -> tuple[float, float]:
         """Accuracy [m], 1 sigma, horizontal (both axes together, as PX4 reports it) and vertical."""
-        pairs = zip(self.position_m, self.fast_position_m, strict=True)
-        north, east, down = (math.hypot(slow_m, fast_m, self.noise_position_m) for slow_m, fast_m in pairs)
+        north, east, down = (math.hypot(rms_m, self.noise_position_m) for rms_m in self.position_m)
         return math.hypot(north, east), down
 
 
@@ -62,10 +55,6 @@ _PERFECT = ErrorModel(
     position_tau_s=1.0,
     velocity_m_s=(0.0,) * 3,
     velocity_tau_s=1.0,
-    fast_position_m=(0.0,) * 3,
-    fast_position_tau_s=1.0,
-    fast_velocity_m_s=(0.0,) * 3,
-    fast_velocity_tau_s=1.0,
     tilt_rad=0.0,
     tilt_tau_s=1.0,
     noise_position_m=0.0,
@@ -77,34 +66,26 @@ _PERFECT = ErrorModel(
 ESTIMATORS: dict[str, ErrorModel | None] = {
     "exact": None,
     "gps": ErrorModel(  # PX4 1.18 with its default GPS: position 0.3-0.6 m off in space, velocity 0.1-0.3 m/s
-        position_m=(0.12, 0.25, 0.3),
-        position_tau_s=10.0,
-        velocity_m_s=(0.14, 0.3, 0.14),
-        velocity_tau_s=5.0,
-        fast_position_m=(0.03, 0.03, 0.02),
-        fast_position_tau_s=1.2,
-        fast_velocity_m_s=(0.03, 0.07, 0.045),
-        fast_velocity_tau_s=0.5,
+        position_m=(0.2, 0.2, 0.25),
+        position_tau_s=25.0,
+        velocity_m_s=(0.15, 0.15, 0.15),
+        velocity_tau_s=4.0,
         tilt_rad=math.radians(0.3),
         tilt_tau_s=20.0,
-        noise_position_m=0.0012,
-        noise_velocity_m_s=0.006,
+        noise_position_m=0.005,
+        noise_velocity_m_s=0.02,
         noise_attitude_rad=math.radians(0.1),
         latency_s=(0.010, 0.020),
     ),
-    "external": ErrorModel(  # fed at 50 Hz into a PX4 set up for it: position 2 cm off, velocity 0.05-0.1 m/s
-        position_m=(0.006, 0.015, 0.005),
-        position_tau_s=10.0,
-        velocity_m_s=(0.03, 0.03, 0.012),
-        velocity_tau_s=5.0,
-        fast_position_m=(0.005, 0.014, 0.011),
-        fast_position_tau_s=0.5,
-        fast_velocity_m_s=(0.025, 0.085, 0.055),
-        fast_velocity_tau_s=0.5,
+    "external": ErrorModel(  # position fed from outside into the same filter: 4 cm off in space, velocity 0.05-0.1 m/s
+        position_m=(0.023, 0.023, 0.023),
+        position_tau_s=25.0,
+        velocity_m_s=(0.055, 0.055, 0.055),
+        velocity_tau_s=4.0,
         tilt_rad=math.radians(0.3),
         tilt_tau_s=20.0,
-        noise_position_m=0.0012,
-        noise_velocity_m_s=0.006,
+        noise_position_m=0.005,
+        noise_velocity_m_s=0.02,
         noise_attitude_rad=math.radians(0.1),
         latency_s=(0.010, 0.020),
     ),
@@ -142,17 +123,15 @@ class Estimator:
     def _start(self, model: ErrorModel, plant: Plant, seed: int) -> None:
         count, dt_s = plant.state.shape[1], plant.dt_s
         self._rngs = [np.random.default_rng([seed, i, _PURPOSE]) for i in range(count)]
-        slow_s = model.position_tau_s, model.velocity_tau_s, model.tilt_tau_s
-        taus_s = np.repeat([*slow_s, model.fast_position_tau_s, model.fast_velocity_tau_s], (3, 3, 2, 3, 3))
-        slow = *model.position_m, *model.velocity_m_s, model.tilt_rad, model.tilt_rad
-        rms = np.array([*slow, *model.fast_position_m, *model.fast_velocity_m_s])
+        taus_s = np.repeat([model.position_tau_s, model.velocity_tau_s, model.tilt_tau_s], (3, 3, 2))
+        rms = np.array([*model.position_m, *model.velocity_m_s, model.tilt_rad, model.tilt_rad])
         self._keep = np.exp(-2.0 * dt_s / taus_s)[:, None]  # of each low-pass, with half the correlation time
         rough_rms = math.sqrt(2.0) * rms  # of the first stage: the second halves its variance
         self._drive = (rough_rms * np.sqrt(1.0 - np.exp(-4.0 * dt_s / taus_s)))[:, None]
         self._white_rms = np.repeat(
             [model.noise_position_m, model.noise_velocity_m_s, model.noise_attitude_rad], (3, 3, 3)
         )[:, None]
-        first = np.stack([rng.standard_normal((2, _WANDERS)) for rng in self._rngs], axis=2)  # (2, _WANDERS, N)
+        first = np.stack([rng.standard_normal((2, 8)) for rng in self._rngs], axis=2)  # (2, 8, N)
         self._wander = first[0] * rms[:, None]
         self._rough = self._wander + first[1] * rms[:, None]  # stationary variance and correlation of the two
         low_s, high_s = model.latency_s
@@ -178,9 +157,9 @@ class Estimator:
         self._drawn += 1
         self._lost_s += self._lost * self._plant.dt_s
         self._rough *= self._keep
-        self._rough += self._drive * draws[:_WANDERS]
+        self._rough += self._drive * draws[:8]
         self._wander += (1.0 - self._keep) * (self._rough - self._wander)
-        np.multiply(draws[_WANDERS:], self._white_rms, out=self._white)
+        np.multiply(draws[8:], self._white_rms, out=self._white)
         self._head = (self._head + 1) % len(self._history)
         self._history[self._head] = self._sample()
         self._tilt_quat()
@@ -275,7 +254,7 @@ class Estimator:
         rows = (self._head - self._lag_steps) % len(self._history)
         seen = self._history[rows, :, self._columns].T  # (13, N), each vehicle's own age
         reported = seen[:9].copy()
-        reported[:6] += self._wander[:6] + self._wander[8:] + self._white[:6]
+        reported[:6] += self._wander[:6] + self._white[:6]
         reported[:3] += self._jump_ned_m + self._drift_axis * (0.5 * _LOST_M_S2 * self._lost_s**2)
         reported[3:6] += self._drift_axis * (_LOST_M_S2 * self._lost_s)
         noise = self._white[6:]
