@@ -5,9 +5,7 @@ A module is found by being there, so that a new controller is one new file with 
 
 from __future__ import annotations
 
-import importlib
-import pkgutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Literal
 
 from swarmctl.control import controllers
@@ -15,19 +13,12 @@ from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.controllers.kind import Controller, ControllerKind, ControllerSetup
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.swarm_mpc import MpcParams
+from swarmctl.core.declared import declared
 from swarmctl.core.params import Params, with_sections
 
-
-def _declared() -> Iterator[ControllerKind[Any]]:
-    """Yield every declaration, in the order of the modules' names."""
-    for module in pkgutil.iter_modules(controllers.__path__):
-        if module.name != "registry":
-            found = vars(importlib.import_module(f"{controllers.__name__}.{module.name}")).values()
-            yield from (value for value in found if isinstance(value, ControllerKind))
-
-
+_KINDS: list[ControllerKind[Any]] = list(declared(controllers, ControllerKind))
 # by name; those that follow a reference come first
-CONTROLLERS = {kind.name: kind for kind in sorted(_declared(), key=lambda kind: not kind.follows_reference)}
+CONTROLLERS = {kind.name: kind for kind in sorted(_KINDS, key=lambda kind: not kind.follows_reference)}
 if TYPE_CHECKING:
     ControllerName = str
 else:
