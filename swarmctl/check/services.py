@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pymap3d
 
 from swarmctl.check.finding import Finding
@@ -16,7 +18,9 @@ _WEIGHT_ARMING, _WEIGHT_FENCE = 71, 66
 
 def service_findings(facts: VehicleFacts, config: Config) -> list[Finding]:
     """Return the findings about one vehicle; none for one that is not reached."""
-    return [*_arming(facts), *_fence(facts, config)] if facts.reached else []
+    if not facts.reached:
+        return []
+    return [_arming(facts), *([_fence(facts, config)] if config.geofence.corners_ne_m else [])]
 
 
 def corners_deg(config: Config) -> tuple[LatLon, ...]:
@@ -48,61 +52,43 @@ def has_fence(fence: FenceFacts, config: Config) -> bool:
     )
 
 
-def _arming(facts: VehicleFacts) -> list[Finding]:
-    def line(verdict: Verdict, found: str, advice: str = "") -> list[Finding]:
-        return [
-            Finding(
-                agent=facts.agent,
-                topic="arming checks",
-                verdict=verdict,
-                found=found,
-                wanted="no problem in the autopilot's own list",
-                advice=advice,
-                weight=_WEIGHT_ARMING,
-            )
-        ]
-
+def _arming(facts: VehicleFacts) -> Finding:
+    line = partial(
+        Finding,
+        agent=facts.agent,
+        topic="arming checks",
+        wanted="no problem in the autopilot's own list",
+        weight=_WEIGHT_ARMING,
+    )
     problems = facts.arming_problems
     if problems is None and facts.has_metadata and not facts.armed:
-        return line(Verdict.NOTE, "not told", "its component information did not come in time; see the sensors")
+        advice = "its component information did not come in time; see the sensors"
+        return line(verdict=Verdict.NOTE, found="not told", advice=advice)
     if problems is None:
-        return line(Verdict.OK, "not told by this autopilot; see sensors")
+        return line(verdict=Verdict.OK, found="not told by this autopilot; see sensors")
     if blocking := [problem.text for problem in problems if problem.blocks]:
-        return line(
-            Verdict.FIX, "; ".join(blocking), f"the autopilot refuses to arm in {facts.mode.name} because of it"
-        )
+        advice = f"the autopilot refuses to arm in {facts.mode.name} because of it"
+        return line(verdict=Verdict.FIX, found="; ".join(blocking), advice=advice)
     if problems:
         texts = "; ".join(problem.text for problem in problems)
-        return line(Verdict.NOTE, texts, "the autopilot warns of it, and arms all the same")
-    return line(Verdict.OK, "no problem")
+        return line(verdict=Verdict.NOTE, found=texts, advice="the autopilot warns of it, and arms all the same")
+    return line(verdict=Verdict.OK, found="no problem")
 
 
-def _fence(facts: VehicleFacts, config: Config) -> list[Finding]:
+def _fence(facts: VehicleFacts, config: Config) -> Finding:
     wanted = f"{len(config.geofence.corners_ne_m)} corners (geofence.corners_ne_m)"
-
-    def line(verdict: Verdict, found: str, advice: str = "") -> list[Finding]:
-        return [
-            Finding(
-                agent=facts.agent,
-                topic="geofence",
-                verdict=verdict,
-                found=found,
-                wanted=wanted,
-                advice=advice,
-                weight=_WEIGHT_FENCE,
-            )
-        ]
-
-    if not config.geofence.corners_ne_m:
-        return []
+    line = partial(Finding, agent=facts.agent, topic="geofence", wanted=wanted, weight=_WEIGHT_FENCE)
     if not wants_fence(facts, config):
-        return line(Verdict.NOTE, "not looked at", "no geofence is uploaded to this autopilot; give it one by hand")
+        advice = "no geofence is uploaded to this autopilot; give it one by hand"
+        return line(verdict=Verdict.NOTE, found="not looked at", advice=advice)
     fence = facts.fence
     if fence is None:
-        return line(Verdict.FIX, "not told", "nothing is asked of a vehicle that is armed or another one")
+        advice = "nothing is asked of a vehicle that is armed or another one"
+        return line(verdict=Verdict.FIX, found="not told", advice=advice)
     if fence.problem:
-        return line(Verdict.FIX, fence.problem, "the geofence can be neither read nor uploaded")
+        return line(verdict=Verdict.FIX, found=fence.problem, advice="the geofence can be neither read nor uploaded")
     found = f"{len(fence.corners_deg)} corners" + (f" and {fence.others} other areas" if fence.others else "")
     if has_fence(fence, config):
-        return line(Verdict.OK, f"{found}, the same")
-    return line(Verdict.FIX, f"{found}, not the same" if fence.corners_deg else found, "--apply uploads it")
+        return line(verdict=Verdict.OK, found=f"{found}, the same")
+    found += ", not the same" if fence.corners_deg else ""
+    return line(verdict=Verdict.FIX, found=found, advice="--apply uploads it")

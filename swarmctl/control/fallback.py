@@ -7,7 +7,7 @@ import numpy as np
 from swarmctl.control.lag import Lag
 from swarmctl.control.mpc.problem import Start
 from swarmctl.core.frames import GRAVITY_M_S2
-from swarmctl.core.types import NO_TIMES, Array, Plan, PlanStatus
+from swarmctl.core.types import Array, Plan, PlanStatus
 
 _DAMPING_1_S = 4.0
 _DAMPING_RAD = 0.5  # damping times lag: more would oscillate
@@ -58,9 +58,4 @@ def brake_and_hold_plan(
         pos_ned_m=pos,
         vel_ned_m_s=vel,
         virtual_control=virtual_control,
-        times=NO_TIMES,
-        iterations=0,
-        slack_m=0.0,
-        residual_m=0.0,
-        terminal_gap_m=0.0,
     )

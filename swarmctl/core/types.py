@@ -176,11 +176,11 @@ class Plan:
     pos_ned_m: Array  # (N+1, 3)
     vel_ned_m_s: Array  # (N+1, 3)
     virtual_control: Array  # (N, 3): virtual controls u_x, u_y [-] and thrust over mass [m/s2], held over each step
-    times: PlanTimes
-    iterations: int
-    slack_m: float  # largest separation slack used
-    residual_m: float  # largest primal residual, in metres of position
-    terminal_gap_m: float  # violation of the softened terminal condition
+    times: PlanTimes = NO_TIMES  # these five tell of a solver; a plan made without one has the defaults
+    iterations: int = 0
+    slack_m: float = 0.0  # largest separation slack used
+    residual_m: float = 0.0  # largest primal residual, in metres of position
+    terminal_gap_m: float = 0.0  # violation of the softened terminal condition
 
 
 @dataclass(frozen=True, slots=True)

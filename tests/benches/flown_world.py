@@ -13,7 +13,7 @@ from sitl.world import SitlWorld
 from swarmctl.core.clock import SimClock
 from swarmctl.core.frames import quat_from_euler
 from swarmctl.mavlink.codec import Codec
-from swarmctl.mavlink.framing import frames, message_id
+from swarmctl.mavlink.framing import frames
 from swarmctl.mavlink.transport import pipe_pair
 from swarmctl.simulator_config import SimulatorConfig
 
@@ -86,10 +86,6 @@ class FlownWorld:
         return [
             frame for datagram in self.clients[vehicle].receive(self.clock.now_us()) for frame in frames(datagram.data)
         ]
-
-    def received_ids(self, vehicle: int) -> list[int]:
-        """Their message ids."""
-        return [message_id(frame) for frame in self.received(vehicle)]
 
     @property
     def pos_ned_m(self) -> Any:

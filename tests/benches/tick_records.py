@@ -9,7 +9,6 @@ import numpy as np
 
 from swarmctl.core.tick_record import TickRecord, TickTiming
 from swarmctl.core.types import (
-    NO_TIMES,
     AttitudeSetpoint,
     FlightMode,
     Mode,
@@ -33,11 +32,9 @@ PLAN = Plan(
     pos_ned_m=np.arange(12.0).reshape(4, 3) - 2.5,
     vel_ned_m_s=np.zeros((4, 3)),
     virtual_control=np.zeros((3, 3)),
-    times=NO_TIMES,
     iterations=1_500,
     slack_m=0.03125,
     residual_m=0.015625,
-    terminal_gap_m=0.0,
 )
 TIMING = TickTiming(
     sense_ms=0.5,

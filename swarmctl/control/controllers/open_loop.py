@@ -7,7 +7,7 @@ import numpy as np
 from swarmctl.control.controllers.kind import ControllerKind, ControllerSetup
 from swarmctl.control.mpc.problem import Problem
 from swarmctl.control.mpc.swarm_mpc import MpcParams
-from swarmctl.core.types import NO_TIMES, Plan, PlanStatus
+from swarmctl.core.types import Plan, PlanStatus
 
 
 class OpenLoop:
@@ -19,22 +19,14 @@ class OpenLoop:
 
     def plan(self, problem: Problem) -> Plan:
         start = problem.start
-        t_s = np.arange(self.steps + 1)[:, None] * (self.dt_us * 1e-6)
-        pos = start.pos_ned_m + t_s * start.vel_ned_m_s
-        vel = np.tile(start.vel_ned_m_s, (self.steps + 1, 1))
-        nothing = np.zeros((self.steps, 3))
+        pos, vel = start.at_constant_velocity(self.steps, self.dt_us * 1e-6)
         return Plan(
             status=PlanStatus.OK,
             t0_us=start.t_us,
             dt_us=self.dt_us,
             pos_ned_m=pos,
             vel_ned_m_s=vel,
-            virtual_control=nothing,
-            times=NO_TIMES,
-            iterations=0,
-            slack_m=0.0,
-            residual_m=0.0,
-            terminal_gap_m=0.0,
+            virtual_control=np.zeros((self.steps, 3)),
         )
 
     def reset(self) -> None:

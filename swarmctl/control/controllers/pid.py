@@ -17,7 +17,7 @@ from swarmctl.control.controllers.kind import ControllerKind
 from swarmctl.control.mpc.problem import Problem
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.params import Params, Vec3
-from swarmctl.core.types import NO_TIMES, Array, Plan, PlanStatus, Reference
+from swarmctl.core.types import Array, Plan, PlanStatus, Reference
 
 
 class PidParams(Params):
@@ -80,22 +80,14 @@ class PidController:
         self._integral = np.where(winding, self._integral, integral)
         pitch, roll, thrust = float(out[0]), float(out[1]), GRAVITY_M_S2 + float(out[2])
         virtual_control = np.array([math.sin(pitch) * math.cos(roll), -math.sin(roll), thrust])
-        t_s = np.arange(p.path_steps + 1)[:, None] * p.dt_s
-        pos = start.pos_ned_m + t_s * start.vel_ned_m_s
-        vel = np.tile(start.vel_ned_m_s, (p.path_steps + 1, 1))
-        held = np.tile(virtual_control, (p.path_steps, 1))
+        pos, vel = start.at_constant_velocity(p.path_steps, p.dt_s)
         return Plan(
             status=PlanStatus.OK,
             t0_us=start.t_us,
             dt_us=self.dt_us,
             pos_ned_m=pos,
             vel_ned_m_s=vel,
-            virtual_control=held,
-            times=NO_TIMES,
-            iterations=0,
-            slack_m=0.0,
-            residual_m=0.0,
-            terminal_gap_m=0.0,
+            virtual_control=np.tile(virtual_control, (p.path_steps, 1)),
         )
 
     def _ahead(self, reference: Reference) -> Array:

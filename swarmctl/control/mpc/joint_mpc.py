@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -65,22 +66,16 @@ class JointMpc:
         """Solve one step of distributed MPC. Infeasibility is a status, never an exception."""
         began_ns = self._stopwatch_ns()
         guess = first_guess(problem, self._params.dt_s, self.steps)
-
-        def near(params: SeparationParams) -> HalfSpaces | None:
-            return near_half_spaces(
-                problem,
-                guess,
-                3,
-                self._max_keep_outs,
-                dt_s=self._params.dt_s,
-                own_priority_id=self._priority_id,
-                params=params,
-            )
-
-        def plan(spaces: HalfSpaces | None, spaces_us: float) -> Plan:
-            return self._plan(problem, began_ns, spaces, spaces_us)
-
-        return planned(near, plan, self._separation, self._stopwatch_ns)
+        near = partial(
+            near_half_spaces,
+            problem=problem,
+            guess_ned_m=guess,
+            axes=3,
+            max_keep_outs=self._max_keep_outs,
+            dt_s=self._params.dt_s,
+            own_priority_id=self._priority_id,
+        )
+        return planned(near, partial(self._plan, problem, began_ns), self._separation, self._stopwatch_ns)
 
     def reset(self) -> None:
         """Keep all: only a warm start outlasts a tick."""

@@ -22,6 +22,11 @@ class Start:
     tilt: Array = field(default_factory=lambda: np.zeros(2))  # (2,) realised u_x, u_y of a vehicle with a lag
     tilt_rate_1_s: Array = field(default_factory=lambda: np.zeros(2))  # (2,) rate of `tilt`
 
+    def at_constant_velocity(self, steps: int, dt_s: float) -> tuple[Array, Array]:
+        """Return positions and velocities (steps+1, 3) from the start on, without any acceleration."""
+        t_s = np.arange(steps + 1)[:, None] * dt_s
+        return self.pos_ned_m + t_s * self.vel_ned_m_s, np.tile(self.vel_ned_m_s, (steps + 1, 1))
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Problem:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -156,17 +157,15 @@ class SwarmMpc:
         guess = first_guess(problem, self._params.dt_s, self.steps)
         count = min(self.steps, len(up.pos_m))
         guess[1 : count + 1, 2] = up.pos_m[:count, 0]
-
-        def near(params: SeparationParams) -> HalfSpaces | None:
-            return near_half_spaces(
-                problem,
-                guess,
-                2,
-                self._max_keep_outs,
-                dt_s=self._params.dt_s,
-                own_priority_id=self._priority_id,
-                params=params,
-            )
+        near = partial(
+            near_half_spaces,
+            problem=problem,
+            guess_ned_m=guess,
+            axes=2,
+            max_keep_outs=self._max_keep_outs,
+            dt_s=self._params.dt_s,
+            own_priority_id=self._priority_id,
+        )
 
         def plan(spaces: HalfSpaces | None, spaces_us: float) -> Plan:
             return self._plan(problem, up, began_ns, spaces, spaces_us=spaces_us)
@@ -240,8 +239,7 @@ def first_guess(problem: Problem, dt_s: float, steps: int) -> Array:
     """Return positions (steps+1, 3) to linearise around: the previous prediction, or constant velocity."""
     if problem.guess_ned_m is not None:
         return problem.guess_ned_m.copy()
-    start, t_s = problem.start, np.arange(steps + 1)[:, None] * dt_s
-    return np.asarray(start.pos_ned_m + t_s * start.vel_ned_m_s)
+    return problem.start.at_constant_velocity(steps, dt_s)[0]
 
 
 def closest_keep_outs(keep_outs: Sequence[KeepOut], guess_ned_m: Array, max_keep_outs: int) -> list[KeepOut]:
@@ -255,14 +253,14 @@ def closest_keep_outs(keep_outs: Sequence[KeepOut], guess_ned_m: Array, max_keep
 
 
 def near_half_spaces(
+    params: SeparationParams,
+    *,
     problem: Problem,
     guess_ned_m: Array,
     axes: int,
     max_keep_outs: int,
-    *,
     dt_s: float,
     own_priority_id: int,
-    params: SeparationParams,
 ) -> HalfSpaces | None:
     """Return half-spaces of the closest keep-outs around the guess (steps+1, 3), in the first `axes` axes."""
     steps, near = len(guess_ned_m) - 1, closest_keep_outs(problem.keep_outs, guess_ned_m, max_keep_outs)

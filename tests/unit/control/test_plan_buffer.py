@@ -8,7 +8,7 @@ import pytest
 from swarmctl.control.collision.separation import KeepOut
 from swarmctl.control.mpc.plan_buffer import PlanBuffer
 from swarmctl.control.mpc.problem import Start
-from swarmctl.core.types import NO_TIMES, Array, Plan, PlanStatus
+from swarmctl.core.types import Array, Plan, PlanStatus
 from tests import builders
 
 DT_US = 100_000
@@ -28,11 +28,6 @@ def plan_at(t0_us: int, north_m: Array, status: PlanStatus = PlanStatus.OK) -> P
         pos_ned_m=pos,
         vel_ned_m_s=np.zeros_like(pos),
         virtual_control=held,
-        times=NO_TIMES,
-        iterations=0,
-        slack_m=0.0,
-        residual_m=0.0,
-        terminal_gap_m=0.0,
     )
 
 
