@@ -1,4 +1,4 @@
-"""The order of the tests, the longest first, so that no worker idles at the end; and what each begins with."""
+"""The order of the test files, the longest first, so that no worker idles at the end; and how each test begins."""
 
 from __future__ import annotations
 
@@ -11,6 +11,22 @@ import pytest
 import swarmctl  # noqa: F401  (before anything loads numpy)
 
 TESTS = Path(__file__).parent
+LONGEST = [  # over a minute each
+    "process/test_readme.py",
+    "closed_loop/test_failures.py",
+    "closed_loop/test_guaranteed.py",
+    "process/test_launch.py",
+    "closed_loop/test_deadlock.py",
+    "closed_loop/test_real_autopilot.py",
+    "closed_loop/test_swap.py",
+    "process/test_identify.py",
+    "closed_loop/test_forgery.py",
+    "closed_loop/test_identify.py",
+    "process/test_viewer.py",
+    "closed_loop/test_obstacle.py",
+    "closed_loop/test_processors.py",
+]
+FOLDERS = ["process", "closed_loop", "conformance", "unit"]
 
 
 @pytest.fixture(autouse=True)
@@ -27,14 +43,21 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Two workers begin with the first item and with the middle one.
+    """Order the files as workers take them, one at a time (`--dist loadfile --no-loadscope-reorder`).
 
-    One flies in real time, which leaves its processor half idle, while the other computes; short tests follow both.
+    The longest come first. A file that flies in real time leaves its processor half idle, while others compute.
     """
-    groups: dict[str, list[pytest.Item]] = {"process": [], "closed_loop": [], "": []}
-    for item in items:
-        folder = item.path.relative_to(TESTS).parts[0]
-        groups[folder if folder in groups else ""].append(item)
-    flown, computed, short = groups.values()
-    before = max(0, (len(items) + 1) // 2 - len(flown))
-    items[:] = flown + short[:before] + computed + short[before:]
+    files = {item.path: place(item.path) for item in items}
+    order = {path: number for number, path in enumerate(sorted(files, key=files.__getitem__))}
+    items.sort(key=lambda item: order[item.path])
+
+
+def place(path: Path) -> tuple[int, int, str]:
+    """Return where a file comes in the order: the named ones as listed, then folder by folder."""
+    name = path.relative_to(TESTS).as_posix()
+    folder = name.partition("/")[0]
+    return (
+        LONGEST.index(name) if name in LONGEST else len(LONGEST),
+        FOLDERS.index(folder) if folder in FOLDERS else len(FOLDERS),
+        name,
+    )

@@ -26,6 +26,7 @@ class AgentParams(Params):
     """Parameters of an agent that belong neither to the controller nor to the vehicle model."""
 
     rate_hz: float = Field(50.0, ge=10, le=200)  # rate of ticks, and so of setpoints
+    realtime: bool = True  # launch schedules what flies before other programs, if it may
     connect_timeout_s: float = Field(15.0, gt=0, le=600)  # longest wait for the first heartbeat and position
     state_machine: StateMachineParams = StateMachineParams()
     failsafe: FailsafeParams = FailsafeParams()

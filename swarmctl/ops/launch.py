@@ -32,6 +32,7 @@ from swarmctl.ops.processes import (
     run_name,
     sitl_command,
     viewer_command,
+    wants_realtime,
 )
 from swarmctl.ops.status_table import Display, open_display
 from swarmctl.ops.summary import sum_up
@@ -108,6 +109,7 @@ class Launcher(Services):
         self.context = RunContext(run_name(config.name), f"{SCHEME}{self._socket_dir}/bus.sock", directory)
         self.log = EventLog(directory / "launch.events.jsonl", "launch")
         self.children: dict[str, Child] = {}
+        self._realtime = wants_realtime(config)
 
     def start(self) -> None:
         """Start every process and join the bus; later failures are seen by the supervisor.
@@ -128,7 +130,7 @@ class Launcher(Services):
         self.announce("")
         for line in _introduction(config, context, reserved):
             self._display.print_line(line)
-        self.log.write("started", run=context.run, ports=list(reserved.ports))
+        self.log.write("started", run=context.run, ports=list(reserved.ports), realtime=self._realtime)
 
     def stop(self, agents_grace_s: float) -> None:
         """End every process, agents first and the router last, and remove all temporary files. Safe at any point."""
@@ -155,7 +157,7 @@ class Launcher(Services):
         ends = self._reserved.sockets, self._reserved.vehicle_sockets
         config_path = self.context.directory / "config.toml"
         command = agent_commands(self._config, context, *ends, config_path=config_path)[agent]
-        return Child(replace(command, argv=(*command.argv, "--only-land")), directory)
+        return self._started(replace(command, argv=(*command.argv, "--only-land")), directory)
 
     def announce(self, view: str) -> None:
         """Publish this launch to the operator's commands."""
@@ -168,7 +170,13 @@ class Launcher(Services):
         )
 
     def _spawn(self, command: Command) -> None:
-        self.children[command.name] = Child(command, self.context.directory)
+        self.children[command.name] = self._started(command, self.context.directory)
+
+    def _started(self, command: Command, directory: Path) -> Child:
+        child = Child(command, directory)
+        if self._realtime and command.in_control_loop:
+            self._realtime = child.request_realtime()
+        return child
 
     def _join_bus(self) -> ZenohBus:
         senders = [agent_name(agent) for agent in range(self._config.swarm.agents)]

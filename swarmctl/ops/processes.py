@@ -33,15 +33,18 @@ ROUTER = "router"
 SITL = "sitl"
 VIEWER = "viewer"
 _TAIL_BYTES = 4096
+_REALTIME_PRIORITY = 10  # above every program of normal priority, below the kernel's own threads at 50
+_AGENTS_PER_PROCESSOR = 3  # more at real-time priority could leave nothing for shells and the launcher itself
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """One process to start: its name, its command line, and the file descriptors it inherits."""
+    """One process to start: its name, its command line, the file descriptors it inherits, and whether others wait."""
 
     name: str
     argv: tuple[str, ...]
     fds: tuple[int, ...] = ()
+    in_control_loop: bool = True  # a delay of this process delays setpoints, predicted paths or vehicle states
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,6 +59,11 @@ class RunContext:
 def run_name(name: str) -> str:
     """Return a name for one run on the bus that is new every time."""
     return f"{name}-{secrets.token_hex(4)}"
+
+
+def wants_realtime(config: Config) -> bool:
+    """Return whether the flight is to have real-time priority and leaves the processors some time for others."""
+    return config.agent.realtime and config.swarm.agents <= _AGENTS_PER_PROCESSOR * len(os.sched_getaffinity(0))
 
 
 def router_command(endpoint: str) -> Command:
@@ -121,7 +129,7 @@ def viewer_command(config: Config, context: RunContext, port: int, view: bool) -
     argv += ("--limit", f"{config.limits.min_separation_m!r}")
     obstacles = encode_message(ObstaclesMessage(1, config.obstacles)).decode()
     argv += ("--obstacles-json", obstacles, "--die-with-parent")
-    return Command(VIEWER, argv + (("--view",) if view else ()))
+    return Command(VIEWER, argv + (("--view",) if view else ()), in_control_loop=False)
 
 
 def _scene_bounds(config: Config) -> tuple[tuple[float, ...], float]:
@@ -160,6 +168,17 @@ class Child:
             except OSError as error:
                 raise StartError(f"{command.name}: {command.argv[0]} can't be started: {error}") from error
         self.pid = self._process.pid
+
+    def request_realtime(self) -> bool:
+        """Schedule the process before all of normal priority (SCHED_RR); return False where that is not permitted.
+
+        It must have just been started: threads that it starts later inherit the priority.
+        """
+        try:
+            os.sched_setscheduler(self.pid, os.SCHED_RR, os.sched_param(_REALTIME_PRIORITY))
+        except OSError:
+            return False
+        return True
 
     def poll(self) -> int | None:
         """Return the exit code as a shell does (128 + signal), or None while running."""

@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from tests.benches.free_ports import free_ports
+from tests.benches.realtime import request_realtime
 
 ROOT = Path(__file__).resolve().parents[2]
 SPEED = 4  # simulated seconds a second: what clients wait for is flight
@@ -31,6 +32,7 @@ def simulator(preset: str = "x500", speed: float = SPEED, port: int | None = Non
         stdout=subprocess.PIPE,
         text=True,
     )
+    request_realtime(process.pid)
     try:
         yield port
         process.send_signal(signal.SIGTERM)

@@ -24,6 +24,7 @@ from pymavlink.dialects.v20 import development as mav
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import message_id
 from tests.benches.free_ports import free_ports
+from tests.benches.realtime import request_realtime
 from tests.conformance import vocabulary as v
 from tests.conformance.dialogue import Dialogue
 from tests.conformance.partners import InProcess
@@ -99,6 +100,7 @@ class Console:
             text=True,
             bufsize=1,
         )
+        request_realtime(self._process.pid)
         self._lines: queue.Queue[str] = queue.Queue()
         self.said: list[str] = []
         self._reader = threading.Thread(target=self._read, daemon=True)

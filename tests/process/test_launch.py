@@ -22,6 +22,7 @@ import psutil
 import pytest
 
 from swarmctl.core.types import Phase
+from tests.benches.realtime import request_realtime
 from tests.process.test_readme import ROOT, landed, shown
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
@@ -109,6 +110,19 @@ class Launched:
         return landed(self.run_dir)
 
 
+def policies(pid: int) -> set[int]:
+    """Scheduling policies of all threads of a process."""
+    return {os.sched_getscheduler(int(task.name)) for task in Path(f"/proc/{pid}/task").iterdir()}
+
+
+def may_run_in_realtime() -> bool:
+    """Whether this user may start processes at real-time priority."""
+    with subprocess.Popen(["sleep", "60"]) as process:
+        permitted = request_realtime(process.pid)
+        process.kill()
+    return permitted
+
+
 @pytest.fixture
 def start(tmp_path: Path) -> Iterator[Callable[..., Launched]]:
     launches: list[Launched] = []
@@ -133,6 +147,12 @@ def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Callable[..., La
     launched = start(*shlex.split(line)[2:], "--duration", "4", "--no-view")
     launched.until_phase("TRACK", 3)
     assert launched.verb("status").returncode == 0
+    (started,) = launched.events("started")
+    assert started["realtime"] == may_run_in_realtime()
+    policy = os.SCHED_RR if may_run_in_realtime() else os.SCHED_OTHER
+    for words in (["swarmctl.bus.zenoh_bus"], ["sitl"], *(["agent", "--id", str(i)] for i in range(3))):
+        assert policies(launched.pid_of(*words)) == {policy}, words
+    assert policies(launched.pid_of("swarmctl.telemetry.viewer")) == {os.SCHED_OTHER}, "it waits for those that fly"
     assert launched.end() == 0, launched.text()
     lines = launched.text().splitlines()
     assert "3 agents" in lines[0]
