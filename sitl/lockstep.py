@@ -23,6 +23,7 @@ from sitl.world import SitlWorld
 from swarmctl.agent.agent import Agent
 from swarmctl.agent.assembly import make_agent
 from swarmctl.bus import topics
+from swarmctl.bus.json_messages import CommandMessage, ObstaclesMessage, encode_message
 from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.config import Config
 from swarmctl.core.clock import SimClock
@@ -127,7 +128,7 @@ class Lockstep:
         self._steps = 0
         self._order = list(order) if order is not None else list(range(agents))
         self._truth: list[NDArray[np.void]] = []
-        self._obstacles = topics.ObstaclesMessage(1, config.obstacles)
+        self._obstacles = ObstaclesMessage(1, config.obstacles)
 
     def _on_fault(self, name: str, t_us: int, fields: dict[str, Any]) -> None:
         stamp = {"utc_us": self.clock.utc_us(), "t_us": self.clock.now_us(), "source": "sitl", "event": name}
@@ -154,7 +155,7 @@ class Lockstep:
         """Tick every agent once, then step the physics to the next tick."""
         now_us = self.clock.now_us()
         if now_us % _OBSTACLES_EVERY_US == 0:
-            self._operator.publish(topics.OBSTACLES, topics.encode_message(self._obstacles))
+            self._operator.publish(topics.OBSTACLES, encode_message(self._obstacles))
         for i in self._order:
             agent = self.agents[i]
             if agent is None or i in self.frozen:
@@ -177,13 +178,13 @@ class Lockstep:
 
     def command(self, verb: str, agent: int = -1, **arguments: float) -> None:
         """Send an operator's order, as a verb does."""
-        message = topics.CommandMessage(verb, agent, self.clock.utc_us(), arguments)
-        self._operator.publish(topics.COMMAND, topics.encode_message(message))
+        message = CommandMessage(verb, agent, self.clock.utc_us(), arguments)
+        self._operator.publish(topics.COMMAND, encode_message(message))
 
     def set_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
         """Replace the obstacle list, as an operator's verb does."""
-        self._obstacles = topics.ObstaclesMessage(self._obstacles.version + 1, tuple(obstacles))
-        self._operator.publish(topics.OBSTACLES, topics.encode_message(self._obstacles))
+        self._obstacles = ObstaclesMessage(self._obstacles.version + 1, tuple(obstacles))
+        self._operator.publish(topics.OBSTACLES, encode_message(self._obstacles))
 
     @property
     def finished(self) -> bool:

@@ -16,7 +16,7 @@ import tomli_w
 from pydantic import Field
 
 from swarmctl.agent.setup import AgentParams
-from swarmctl.bus.topics import MAX_OBSTACLES
+from swarmctl.bus.json_messages import MAX_OBSTACLES
 from swarmctl.config_problems import validated
 from swarmctl.config_source import override, read_tree
 from swarmctl.control.collision.separation import SeparationParams, radius_problem

@@ -10,6 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from swarmctl.bus import topics
+from swarmctl.bus.json_messages import StatusMessage, encode_message
 from swarmctl.bus.peers import Bus, PeerPaths
 from swarmctl.control.collision.separation import KeepOut
 from swarmctl.control.estimation.disturbance import Estimate
@@ -115,7 +116,7 @@ class TelemetryPublisher:
         self._bus.publish(topics.TICK, pack_tick(record))
         if now_us - self._status_us >= _STATUS_EVERY_US:
             self._status_us = now_us
-            self._bus.publish(topics.STATUS, topics.encode_message(self._status(record, state_machine)))
+            self._bus.publish(topics.STATUS, encode_message(self._status(record, state_machine)))
         return record
 
     def _record(
@@ -171,12 +172,12 @@ class TelemetryPublisher:
         ages_ms = [(act_utc_us - path.t0_utc_us) * 1e-3 for path in self._paths.latest()]
         return peers, obstacles, max(ages_ms, default=math.nan)
 
-    def _status(self, record: TickRecord, state_machine: MissionStateMachine) -> topics.StatusMessage:
+    def _status(self, record: TickRecord, state_machine: MissionStateMachine) -> StatusMessage:
         state, reference, error_m = record.state, record.reference, math.nan
         if state is not None and reference is not None:
             error = state.pos_ned_m - reference.pos_ned_m[0]
             error_m = math.sqrt(float(error @ error))
-        return topics.StatusMessage(
+        return StatusMessage(
             agent=self._agent,
             boot_id=self._boot_id,
             sysid=self._sysid,

@@ -6,6 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence, Set
 
 from swarmctl.bus import topics
+from swarmctl.bus.json_messages import StatusMessage, decode_obstacles, decode_status
 from swarmctl.bus.orders import Orders
 from swarmctl.bus.peers import Bus, PeerPaths, agent_name
 from swarmctl.bus.refusals import FUTURE, IDENTITY, MALFORMED, SEQUENCE, UNKNOWN_PEER, Refusals
@@ -63,7 +64,7 @@ class WorldModel:
         }
         self._orders = Orders(agent, self.refusals)
         self._unresponsive_since_us: dict[int, int] = {}
-        self._status: dict[int, topics.StatusMessage] = {}
+        self._status: dict[int, StatusMessage] = {}
         self._obstacles: tuple[Obstacle, ...] = ()
         self._obstacles_version: int | None = None
         self._seen: dict[int, Obstacle] = {}  # obstacles that have been visible, by identity
@@ -83,7 +84,7 @@ class WorldModel:
         return [order for order in orders if order is not None]
 
     def _take_status(self, sender: str, payload: bytes, utc_us: int) -> None:
-        status = topics.decode_status(payload)
+        status = decode_status(payload)
         reason = ""
         if status is None:
             reason = MALFORMED
@@ -101,7 +102,7 @@ class WorldModel:
             self._status[status.agent] = status
 
     def _take_obstacles(self, sender: str, payload: bytes, utc_us: int) -> None:
-        message, known = topics.decode_obstacles(payload), self._obstacles_version
+        message, known = decode_obstacles(payload), self._obstacles_version
         if message is None:
             self.refusals.add(sender, topics.OBSTACLES.name, MALFORMED, utc_us)
         elif message.replaces(known):

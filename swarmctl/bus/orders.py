@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
+from swarmctl.bus.json_messages import CommandMessage, decode_command, encode_message
 from swarmctl.bus.refusals import FUTURE_ORDER, MALFORMED, REPLAYED, STALE_ORDER, SUPERSEDED_ORDER, Refusals
-from swarmctl.bus.topics import COMMAND, CommandMessage, decode_command, encode_message
+from swarmctl.bus.topics import COMMAND
 from swarmctl.core.operator_verbs import OPERATOR_VERBS, Order
 
 VALID_US = 2_000_000  # from its stamp on

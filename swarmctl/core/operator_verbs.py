@@ -1,7 +1,7 @@
 """The operator's verbs that agents obey, in one table.
 
 A row becomes a verb of the command line with its options (`swarmctl.ops.cli`), an order that may be on the bus with its
-arguments in bounds (`swarmctl.bus.topics`), and an entry of the handlers in `control.phases.state_machine`.
+arguments in bounds (`swarmctl.bus.json_messages`), and an entry of the handlers in `control.phases.state_machine`.
 """
 
 from __future__ import annotations

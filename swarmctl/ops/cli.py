@@ -21,7 +21,7 @@ from swarmctl.core.text import printable_lines
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, ConfigError, SwarmError
 
 if TYPE_CHECKING:
-    from swarmctl.bus.topics import ObstaclesMessage, StatusMessage
+    from swarmctl.bus.json_messages import ObstaclesMessage, StatusMessage
 
 app = typer.Typer(
     no_args_is_help=True,

@@ -22,20 +22,17 @@ import msgspec
 import psutil
 from pydantic import ValidationError
 
-from swarmctl.bus.orders import EVERYBODY, order_messages
-from swarmctl.bus.peers import agent_name
-from swarmctl.bus.topics import (
-    COMMAND,
+from swarmctl.bus.json_messages import (
     MAX_OBSTACLES,
-    OBSTACLES,
-    OPERATOR,
-    STATUS,
     ObstaclesMessage,
     StatusMessage,
     decode_obstacles,
     decode_status,
     encode_message,
 )
+from swarmctl.bus.orders import EVERYBODY, order_messages
+from swarmctl.bus.peers import agent_name
+from swarmctl.bus.topics import COMMAND, OBSTACLES, OPERATOR, STATUS
 from swarmctl.bus.zenoh_bus import ZenohBus
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import Order

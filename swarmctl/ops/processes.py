@@ -21,8 +21,8 @@ from pathlib import Path
 import numpy as np
 import psutil
 
+from swarmctl.bus.json_messages import ObstaclesMessage, encode_message
 from swarmctl.bus.peers import agent_name
-from swarmctl.bus.topics import ObstaclesMessage, encode_message
 from swarmctl.bus.zenoh_bus import socket_file
 from swarmctl.config import Config
 from swarmctl.control.reference.mission import MissionReference

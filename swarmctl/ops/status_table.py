@@ -15,8 +15,8 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from swarmctl.bus.json_messages import StatusMessage
 from swarmctl.bus.peers import agent_name
-from swarmctl.bus.topics import StatusMessage
 from swarmctl.core.text import printable
 from swarmctl.core.types import Mode, Phase
 

@@ -12,17 +12,10 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
+from swarmctl.bus.json_messages import ObstaclesMessage, decode_obstacles, decode_status, encode_message
 from swarmctl.bus.orders import EVERYBODY, order_messages
 from swarmctl.bus.peers import Bus, agent_name
-from swarmctl.bus.topics import (
-    COMMAND,
-    OBSTACLES,
-    STATUS,
-    ObstaclesMessage,
-    decode_obstacles,
-    decode_status,
-    encode_message,
-)
+from swarmctl.bus.topics import COMMAND, OBSTACLES, STATUS
 from swarmctl.config import Config
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import Order

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl.bus import topics
+from swarmctl.bus.json_messages import decode_obstacles
 from swarmctl.bus.peers import Bus, agent_name
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.records import unpack_tick
@@ -70,7 +71,7 @@ class Feed:
         """Return the operator's newest list of obstacles; None when there is no newer one."""
         newest: tuple[Obstacle, ...] | None = None
         for _, payload in self._bus.receive(topics.OBSTACLES):
-            message = topics.decode_obstacles(payload)
+            message = decode_obstacles(payload)
             if message is None:
                 self.malformed += 1
             elif message.version > self._version:

@@ -19,7 +19,7 @@ from typing import Any
 
 import psutil
 
-from swarmctl.bus.topics import decode_obstacles
+from swarmctl.bus.json_messages import decode_obstacles
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.errors import EXIT_OK, EXIT_USAGE, StartError, SwarmError
 from swarmctl.files import replace_text

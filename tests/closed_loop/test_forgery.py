@@ -14,6 +14,7 @@ import pytest
 from sitl.lockstep import Lockstep
 from swarmctl.bus import topics
 from swarmctl.bus.commitment_messages import decode_trajectory_message, encode_trajectory_message
+from swarmctl.bus.json_messages import CommandMessage, decode_status, encode_message
 from swarmctl.bus.path_messages import encode_path
 from swarmctl.bus.peers import agent_name
 from swarmctl.bus.senders import ReceivedMessage, SenderVerifier, _Stream
@@ -133,7 +134,7 @@ def test_forged_statuses_have_no_effect(fly: Fly, twin: Flight) -> None:
     heard: list[bytes] = []
 
     def forge(running: Lockstep) -> None:
-        status = topics.decode_status(heard[-1])
+        status = decode_status(heard[-1])
         assert status is not None
         done = msgspec.structs.replace(status, phase=int(Phase.DONE), mode=int(Mode.IDLE), ready_utc_us=0)
         for lie in (
@@ -141,7 +142,7 @@ def test_forged_statuses_have_no_effect(fly: Fly, twin: Flight) -> None:
             msgspec.structs.replace(done, ticks=2**40),
             msgspec.structs.replace(status, ready_utc_us=2**60, ticks=status.ticks + 1),
         ):
-            say(running, topics.STATUS, topics.encode_message(lie))
+            say(running, topics.STATUS, encode_message(lie))
 
     flight = swap(fly, at={0.0: overhear(heard, topics.STATUS), FORGED_S: forge})
     np.testing.assert_array_equal(flight.pos_ned_m, twin.pos_ned_m)
@@ -187,8 +188,8 @@ def test_commands_with_old_or_future_stamps_are_refused_and_the_last_one_counts(
     speeds_m_s: list[float] = []
 
     def order(running: Lockstep, verb: str, at_us: int) -> None:
-        message = topics.CommandMessage(verb, -1, at_us)
-        running.hub.carry(topics.OPERATOR, topics.COMMAND, topics.encode_message(message))
+        message = CommandMessage(verb, -1, at_us)
+        running.hub.carry(topics.OPERATOR, topics.COMMAND, encode_message(message))
 
     def orders(running: Lockstep) -> None:
         now_us = running.clock.utc_us()

@@ -13,18 +13,9 @@ import pytest
 
 import swarmctl.ops.recovery
 import swarmctl.ops.supervisor
+from swarmctl.bus.json_messages import ObstaclesMessage, StatusMessage, decode_command, decode_obstacles, encode_message
 from swarmctl.bus.peers import LocalHub, agent_name
-from swarmctl.bus.topics import (
-    COMMAND,
-    OBSTACLES,
-    OPERATOR,
-    STATUS,
-    ObstaclesMessage,
-    StatusMessage,
-    decode_command,
-    decode_obstacles,
-    encode_message,
-)
+from swarmctl.bus.topics import COMMAND, OBSTACLES, OPERATOR, STATUS
 from swarmctl.config import load
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase

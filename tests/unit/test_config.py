@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarmctl.bus.topics import MAX_OBSTACLES
+from swarmctl.bus.json_messages import MAX_OBSTACLES
 from swarmctl.config import _RENAMED, Config, dump, load
 from swarmctl.config_problems import all_keys
 from swarmctl.control.reference.mission import CircleParams

@@ -16,6 +16,7 @@ import numpy as np
 from sitl.world import SitlWorld
 from swarmctl.agent.assembly import make_agent
 from swarmctl.bus import topics
+from swarmctl.bus.json_messages import ObstaclesMessage, StatusMessage, encode_message
 from swarmctl.bus.path_messages import encode_path
 from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.config import Config, load
@@ -192,15 +193,16 @@ class Formation:
             )
             bus.publish(topics.PATH, encode_path(message))
             if now_us % _STATUS_EVERY_US == 0:
-                bus.publish(topics.STATUS, topics.encode_message(self._status(i + 1, began_s >= 0.0)))
+                bus.publish(topics.STATUS, encode_message(self._status(i + 1, began_s >= 0.0)))
         if now_us % _OBSTACLES_EVERY_US == 0:
             self._operator.publish(
-                topics.OBSTACLES, topics.encode_message(topics.ObstaclesMessage(1, self._config.obstacles))
+                topics.OBSTACLES,
+                encode_message(ObstaclesMessage(1, self._config.obstacles)),
             )
 
-    def _status(self, agent: int, tracking: bool) -> topics.StatusMessage:
+    def _status(self, agent: int, tracking: bool) -> StatusMessage:
         phase = Phase.TRACK if tracking else Phase.READY
-        return topics.StatusMessage(
+        return StatusMessage(
             agent=agent,
             boot_id=1,
             sysid=agent + 1,

@@ -12,6 +12,7 @@ import pytest
 
 from swarmctl.agent.world_model import WorldModel
 from swarmctl.bus import topics
+from swarmctl.bus.json_messages import MAX_OBSTACLES, MAX_VERSION_STEP, ObstaclesMessage, encode_message
 from swarmctl.bus.path_messages import encode_path
 from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.control.collision.separation import SeparationParams
@@ -54,12 +55,10 @@ class Bench:
 
     def say_status(self, **fields: Any) -> None:
         said = msgspec.structs.replace(STATUS, agent=1, ticks=self.seq, ready_utc_us=0)
-        self.peer.publish(topics.STATUS, topics.encode_message(msgspec.structs.replace(said, **fields)))
+        self.peer.publish(topics.STATUS, encode_message(msgspec.structs.replace(said, **fields)))
 
     def set_obstacles(self, count: int, version: int) -> None:
-        self.operator.publish(
-            topics.OBSTACLES, topics.encode_message(topics.ObstaclesMessage(version, (BALL,) * count))
-        )
+        self.operator.publish(topics.OBSTACLES, encode_message(ObstaclesMessage(version, (BALL,) * count)))
         self.tick()
 
     @property
@@ -77,18 +76,18 @@ class Bench:
 
 def test_a_list_of_too_many_obstacles_is_refused_and_reported() -> None:
     bench = Bench()
-    bench.set_obstacles(topics.MAX_OBSTACLES, 1)
-    assert bench.seen == topics.MAX_OBSTACLES
-    for count in (topics.MAX_OBSTACLES + 1, 6000):  # the longer one is not even decoded
+    bench.set_obstacles(MAX_OBSTACLES, 1)
+    assert bench.seen == MAX_OBSTACLES
+    for count in (MAX_OBSTACLES + 1, 6000):  # the longer one is not even decoded
         bench.set_obstacles(count, 2)
-    assert bench.seen == topics.MAX_OBSTACLES
+    assert bench.seen == MAX_OBSTACLES
     assert bench.rejected == {"malformed": 2}
     assert bench.world_model.refusals.alert(bench.clock.utc_us()) == "obstacles of operator refused: malformed"
 
 
 def test_the_largest_list_of_obstacles_costs_a_fraction_of_a_tick() -> None:
     bench = Bench()
-    bench.set_obstacles(topics.MAX_OBSTACLES, 1)
+    bench.set_obstacles(MAX_OBSTACLES, 1)
     duration_ms = []
     for _ in range(20):
         began_s = time.perf_counter()
@@ -108,7 +107,7 @@ def test_a_version_far_ahead_does_not_block_later_ones() -> None:
     bench.set_obstacles(1, 8)
     bench.set_obstacles(1, 7)
     assert (bench.seen, bench.rejected) == (2, {"sequence": 1}), "what the launcher repeats is not refused, just known"
-    bench.set_obstacles(4, 8 + topics.MAX_VERSION_STEP)
+    bench.set_obstacles(4, 8 + MAX_VERSION_STEP)
     assert bench.seen == 4
 
 
@@ -170,13 +169,13 @@ def test_statuses_are_accepted_like_paths_and_future_ready_times_refused() -> No
 def test_a_status_under_a_foreign_or_unknown_name_is_refused() -> None:
     bench = Bench()
     bench.say_status(agent=2)
-    bench.operator.publish(topics.STATUS, topics.encode_message(STATUS))
+    bench.operator.publish(topics.STATUS, encode_message(STATUS))
     bench.peer.publish(topics.STATUS, b"?")
     bench.tick()
     assert bench.world_model.peers() == {}
     assert bench.rejected == {"identity": 2, "malformed": 1}
     stranger = bench.hub.connect(agent_name(7))
-    stranger.publish(topics.STATUS, topics.encode_message(msgspec.structs.replace(STATUS, agent=7, ready_utc_us=0)))
+    stranger.publish(topics.STATUS, encode_message(msgspec.structs.replace(STATUS, agent=7, ready_utc_us=0)))
     bench.tick()
     assert bench.world_model.peers() == {}
     assert bench.rejected == {"identity": 2, "malformed": 1, "unknown_peer": 1}

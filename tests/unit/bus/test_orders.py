@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import pytest
 
+from swarmctl.bus.json_messages import CommandMessage, decode_command, encode_message
 from swarmctl.bus.orders import EVERYBODY, MAX_LEAD_US, VALID_US, Orders, order_messages
 from swarmctl.bus.refusals import Refusals
-from swarmctl.bus.topics import OPERATOR, CommandMessage, decode_command, encode_message
+from swarmctl.bus.topics import OPERATOR
 from swarmctl.core.operator_verbs import Order
 
 NOW_US = 1_700_000_000_000_000

@@ -13,8 +13,17 @@ from hypothesis import strategies as st
 
 from swarmctl.bus import path_messages, topics
 from swarmctl.bus.commitment_messages import MAX_ACKNOWLEDGED, MAX_POINTS, encode_trajectory_message
+from swarmctl.bus.json_messages import (
+    MAX_OBSTACLES,
+    CommandMessage,
+    ObstaclesMessage,
+    StatusMessage,
+    decode_command,
+    decode_obstacles,
+    decode_status,
+    encode_message,
+)
 from swarmctl.bus.path_messages import decode_path, encode_path
-from swarmctl.bus.topics import decode_command, decode_obstacles, decode_status, encode_message
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import OPERATOR_VERBS, OperatorVerb, Order, VerbArgument
 from swarmctl.core.records import TICK_DTYPE
@@ -27,7 +36,7 @@ POINTS = np.array([[1.5, -2.25, -3.0], [1.625, -2.0, -3.5], [1.75, -1.75, -4.0]]
 UTC_US = 1_700_000_000_123_456
 ALL_DECODERS = (decode_path, decode_status, decode_command, decode_obstacles)
 
-STATUS = topics.StatusMessage(
+STATUS = StatusMessage(
     agent=2,
     boot_id=9,
     sysid=3,
@@ -186,12 +195,12 @@ def test_hostile_text_gives_none_and_never_raises(decode: object, payload: bytes
 
 def test_messages_survive_encoding() -> None:
     assert decode_status(encode_message(STATUS)) == STATUS
-    command = topics.CommandMessage("rtl", -1, UTC_US)
+    command = CommandMessage("rtl", -1, UTC_US)
     assert decode_command(encode_message(command)) == command
     obstacle = Obstacle(
         center_ned_m=(9.5, 5.5, -2.3), radius_m=1.0, keep_out_m=1.75, visibility_m=3.0, vel_ned_m_s=(0.0, -0.5, 0.0)
     )
-    obstacles = topics.ObstaclesMessage(3, (obstacle, obstacle))
+    obstacles = ObstaclesMessage(3, (obstacle, obstacle))
     assert decode_obstacles(encode_message(obstacles)) == obstacles
 
 
@@ -309,10 +318,10 @@ def test_every_topic_has_its_own_name_and_few_old_paths_are_kept() -> None:
 
 def test_lists_and_numbers_from_outside_are_bounded() -> None:
     ball = Obstacle(center_ned_m=(9.5, 5.5, -2.3))
-    most = topics.ObstaclesMessage(1, (ball,) * topics.MAX_OBSTACLES)
+    most = ObstaclesMessage(1, (ball,) * MAX_OBSTACLES)
     assert decode_obstacles(encode_message(most)) == most
     assert len(encode_message(most)) <= topics.OBSTACLES.max_bytes
-    assert decode_obstacles(encode_message(topics.ObstaclesMessage(1, (ball,) * (topics.MAX_OBSTACLES + 1)))) is None
+    assert decode_obstacles(encode_message(ObstaclesMessage(1, (ball,) * (MAX_OBSTACLES + 1)))) is None
     for fields in ({"center_ned_m": [0, 0, 1e5]}, {"vel_ned_m_s": [-1e5, 0, 0]}, {"keep_out_m": 1e5}):
         assert decode_obstacles(obstacles(**fields)) is None
     for name in ("agent", "boot_id", "ticks", "ready_utc_us", "utc_us"):
@@ -348,4 +357,4 @@ def test_the_longest_good_message_of_every_topic_fits() -> None:
     assert TICK_DTYPE.itemsize + 12 * path_messages.MAX_POINTS <= topics.TICK.max_bytes
     status = msgspec.structs.replace(STATUS, outcome="x" * 4000, active_alert="\u20ac" * 4000)
     assert len(encode_message(status)) <= topics.STATUS.max_bytes
-    assert len(encode_message(topics.CommandMessage("resume", -1, 2**62))) <= topics.COMMAND.max_bytes
+    assert len(encode_message(CommandMessage("resume", -1, 2**62))) <= topics.COMMAND.max_bytes

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from swarmctl.bus.topics import StatusMessage
+from swarmctl.bus.json_messages import StatusMessage
 from swarmctl.bus.zenoh_bus import SCHEME
 from swarmctl.config import Config, dump, load
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase

@@ -1,0 +1,117 @@
+"""Messages of the bus that are JSON: an agent's status, an operator's order, the list of obstacles.
+
+Decoders check bounds and return None for anything that does not fit; they never raise.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Any, TypeVar
+
+import msgspec
+
+from swarmctl.core.obstacle import Obstacle
+from swarmctl.core.operator_verbs import Order, order_problem
+from swarmctl.core.types import FlightMode, Mode, Phase
+
+_Message = TypeVar("_Message")
+
+MAX_OBSTACLES = 64  # each visible one takes 20 us of a tick of 20 ms; 6000 took 130 ms
+_OBSTACLE_KEYS = {"center_ned_m", "radius_m", "keep_out_m", "visibility_m"}  # no message may leave these out
+MAX_VERSION_STEP = 64  # largest step of the list's version; an extreme one would lock out all later ones
+Word = Annotated[str, msgspec.Meta(max_length=32)]
+Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
+
+
+class StatusMessage(msgspec.Struct, frozen=True):
+    """Holds the status an agent publishes five times a second; peers use `phase` and `ready_utc_us`."""
+
+    agent: Count
+    boot_id: Count
+    sysid: int
+    phase: Annotated[int, msgspec.Meta(ge=0, le=int(max(Phase)))]
+    mode: Annotated[int, msgspec.Meta(ge=0, le=int(max(Mode)))]
+    flight_mode: Annotated[int, msgspec.Meta(ge=0, le=int(max(FlightMode)))]
+    armed: bool
+    landed: int
+    ready_utc_us: Count  # time of reaching its start position, 0 before
+    outcome: str  # "" while flying, "completed", or why the mission failed
+    position_error_m: float
+    separation_m: float  # to the nearest peer now
+    tick_p99_ms: float
+    ticks: Count
+    deadline_misses: int
+    plan_staleness_ms: float
+    solver_failed: int
+    active_alert: str  # newest one, "" for none
+    uses_commitments: bool = False  # it flies committed trajectories only, see `control.commit`
+    utc_us: Count = 0  # time of sending, by the agent's clock
+
+
+class CommandMessage(msgspec.Struct, frozen=True):
+    """Holds an operator's order to one agent or to all (`agent` -1); verbs and arguments are `core.operator_verbs`."""
+
+    verb: Word
+    agent: int
+    utc_us: Count  # time of the request, by the clock of the agents asked
+    arguments: Annotated[dict[Word, float], msgspec.Meta(max_length=8)] = {}
+
+    @property
+    def order(self) -> Order:
+        """The order itself, without addressee and time."""
+        return Order(self.verb, self.arguments)
+
+
+class ObstaclesMessage(msgspec.Struct, frozen=True):
+    """Holds the whole list of obstacles; a higher `version` replaces a lower one."""
+
+    version: Count
+    obstacles: Annotated[tuple[Obstacle, ...], msgspec.Meta(max_length=MAX_OBSTACLES)]
+
+    def replaces(self, version: int | None) -> bool:
+        """Tell whether the list is newer than the known version (None: no list), by at most `MAX_VERSION_STEP`."""
+        return version is None or 0 < self.version - version <= MAX_VERSION_STEP
+
+
+def encode_message(message: msgspec.Struct) -> bytes:
+    """Encode a message as JSON."""
+    return msgspec.json.encode(message, enc_hook=lambda obstacle: obstacle.model_dump())
+
+
+def decode_status(payload: bytes) -> StatusMessage | None:
+    """Decode a status; None if it is malformed or out of bounds."""
+    return _decode(payload, _STATUS_DECODER)
+
+
+def decode_command(payload: bytes) -> CommandMessage | None:
+    """Decode an operator's request; None if it is malformed, no known verb, or an argument is out of bounds."""
+    message = _decode(payload, _COMMAND_DECODER)
+    return None if message is None or order_problem(message.verb, message.arguments) else message
+
+
+def decode_obstacles(payload: bytes) -> ObstaclesMessage | None:
+    """Decode a list of obstacles; None if it is malformed or out of bounds."""
+    return _decode(payload, _OBSTACLES_DECODER)
+
+
+def _obstacle(kind: type, item: Any) -> Obstacle:
+    """Return the obstacle that a message describes.
+
+    Raises:
+        ValueError: a key is missing or unknown, or a value out of bounds.
+    """
+    obstacle = Obstacle.model_validate(item)
+    if missing := _OBSTACLE_KEYS - obstacle.model_fields_set:
+        raise ValueError(f"missing: {missing}")
+    return obstacle
+
+
+_STATUS_DECODER = msgspec.json.Decoder(StatusMessage)
+_COMMAND_DECODER = msgspec.json.Decoder(CommandMessage)
+_OBSTACLES_DECODER = msgspec.json.Decoder(ObstaclesMessage, dec_hook=_obstacle)
+
+
+def _decode(payload: bytes, decoder: msgspec.json.Decoder[_Message]) -> _Message | None:
+    try:
+        return decoder.decode(payload)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
+        return None
