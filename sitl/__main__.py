@@ -134,7 +134,7 @@ def _run(options: argparse.Namespace) -> int:
     from sitl.fault_socket import ControlSocket
     from sitl.world import SitlWorld
     from swarmctl.process_lifetime import StopRequest
-    from swarmctl.telemetry.event_log import EventLog
+    from swarmctl.telemetry.recording.event_log import EventLog
 
     config = _config(options)
     count = config.vehicles

@@ -32,8 +32,8 @@ from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE, tick_row
 from swarmctl.core.tick_record import TickRecord
 from swarmctl.kernels import why_not_repeatable
 from swarmctl.mavlink.transport import pipe_pair
+from swarmctl.telemetry.evaluation.referee import RunData
 from swarmctl.telemetry.json_safe import json_safe
-from swarmctl.telemetry.referee import RunData
 
 _TAIL_S = 120.0  # time allowed before and after the mission
 _TRUTH_EVERY_US = 20_000

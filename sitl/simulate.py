@@ -24,9 +24,9 @@ from swarmctl.files import replace_bytes, replace_text, write_each
 from swarmctl.ops.status_table import PlainLines
 from swarmctl.ops.summary import summary_lines, unwritten_line, violation_lines
 from swarmctl.process_lifetime import StopRequest
-from swarmctl.telemetry.recordings import RECORDING, open_viewer, optimize_recording, simulated_recording
-from swarmctl.telemetry.run_files import load_run
-from swarmctl.telemetry.run_folder import Outcome, create_run_folder, finish_run
+from swarmctl.telemetry.recording.run_files import load_run
+from swarmctl.telemetry.recording.run_folder import Outcome, create_run_folder, finish_run
+from swarmctl.telemetry.view.recordings import RECORDING, open_viewer, optimize_recording, simulated_recording
 
 
 def simulate(config: Config, directory: Path) -> int:

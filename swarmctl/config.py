@@ -30,7 +30,7 @@ from swarmctl.mavlink.geofence import GeofenceParams
 from swarmctl.mavlink.parameter_names import parameter_problems
 from swarmctl.mavlink.transport import Endpoint, parse_url
 from swarmctl.simulator_config import MAX_VEHICLES, OriginParams, SimulatorConfig, SimulatorParams
-from swarmctl.telemetry.referee import Rules
+from swarmctl.telemetry.evaluation.referee import Rules
 
 MAX_AGENTS = MAX_VEHICLES
 _PAIRS_SHOWN = 3

@@ -14,8 +14,8 @@ from pathlib import Path
 
 from rerun.experimental import ViewerClient
 
-from swarmctl.telemetry.layout import TIMELINE
-from swarmctl.telemetry.recordings import viewer_binary
+from swarmctl.telemetry.view.layout import TIMELINE
+from swarmctl.telemetry.view.recordings import viewer_binary
 
 _LOAD_S = 30.0
 

@@ -25,7 +25,7 @@ from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START,
 from swarmctl.mavlink.codec import heartbeat_of
 from swarmctl.mavlink.transport import open_transport
 from swarmctl.process_lifetime import StopRequest
-from swarmctl.telemetry.recorder import Recorder
+from swarmctl.telemetry.recording.recorder import Recorder
 from swarmctl.wall_clock import WallClock
 
 _LOOPBACK = "127.0.0.1"

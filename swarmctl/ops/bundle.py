@@ -29,7 +29,7 @@ from swarmctl.files import replaced
 from swarmctl.mavlink.dialects.registry import DIALECTS
 from swarmctl.ops.vehicle_links import open_links
 from swarmctl.process_lifetime import StopRequest
-from swarmctl.telemetry.run_files import CONFIG, read_text, refuse_no_folder
+from swarmctl.telemetry.recording.run_files import CONFIG, read_text, refuse_no_folder
 
 if TYPE_CHECKING:
     from swarmctl.check.ground_services import GroundVehicle

@@ -108,7 +108,7 @@ def launch(
     from swarmctl.config import load
     from swarmctl.ops.launch import LaunchOptions
     from swarmctl.ops.launch import launch as fly
-    from swarmctl.telemetry.recordings import has_display
+    from swarmctl.telemetry.view.recordings import has_display
 
     options = LaunchOptions(run_dir, has_display() if view is None else view)
     return fly(load(config, _overrides(agents, duration, seed, sets)), options)
@@ -328,7 +328,7 @@ def obstacle_remove(
 def view(run_dir: RunningDir = None) -> int:
     """Open the live view of a running launch."""
     from swarmctl.ops import operator
-    from swarmctl.telemetry.recordings import open_viewer
+    from swarmctl.telemetry.view.recordings import open_viewer
 
     open_viewer(operator.view_address(operator.find_launch(run_dir)))
     return EXIT_OK
@@ -337,7 +337,7 @@ def view(run_dir: RunningDir = None) -> int:
 @app.command()
 def replay(folder: Folder) -> int:
     """Open the recording of a run."""
-    from swarmctl.telemetry.recordings import RECORDING, open_viewer
+    from swarmctl.telemetry.view.recordings import RECORDING, open_viewer
 
     open_viewer(str(folder / RECORDING))
     return EXIT_OK

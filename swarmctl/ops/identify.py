@@ -87,7 +87,7 @@ def identification(config: Config) -> Config:
 
 def identified(directory: Path, agents: int) -> dict[int, Identified | str]:
     """Return the identified model of each agent of a run folder, or why there is none."""
-    from swarmctl.telemetry.run_files import load_run  # heavy
+    from swarmctl.telemetry.recording.run_files import load_run  # heavy
 
     run = load_run(directory)
     found: dict[int, Identified | str] = {}
@@ -137,7 +137,7 @@ def _model_lines(found: Identified, before: VehicleModelParams) -> Sequence[str]
 
 
 def _run_folder(run_dir: Path | None) -> Path:
-    from swarmctl.telemetry.run_folder import create_run_folder  # heavy
+    from swarmctl.telemetry.recording.run_folder import create_run_folder  # heavy
 
     return create_run_folder(run_dir, "identify", time.time_ns() // 1000)
 

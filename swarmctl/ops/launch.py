@@ -38,7 +38,7 @@ from swarmctl.ops.status_table import Display, open_display
 from swarmctl.ops.summary import sum_up
 from swarmctl.ops.supervisor import FlightSupervisor, Services
 from swarmctl.process_lifetime import StopRequest
-from swarmctl.telemetry.event_log import EventLog
+from swarmctl.telemetry.recording.event_log import EventLog
 
 _BUS_S = 20.0  # timeout for the router to answer
 _BUS_TRY_MS = 500
@@ -85,7 +85,7 @@ def launch(config: Config, options: LaunchOptions) -> int:
 
 
 def _run_folder(config: Config, options: LaunchOptions) -> Path:
-    from swarmctl.telemetry.run_folder import create_run_folder  # heavy
+    from swarmctl.telemetry.recording.run_folder import create_run_folder  # heavy
 
     directory = create_run_folder(options.run_dir, config.name, time.time_ns() // 1000).resolve()
     try:

@@ -17,7 +17,7 @@ from pathlib import Path
 from swarmctl.config import Config
 from swarmctl.errors import StartError
 from swarmctl.mavlink.transport import bind_udp, parse_url
-from swarmctl.telemetry.view_ports import PORTS_TRIED, free_view_ports
+from swarmctl.telemetry.view.view_ports import PORTS_TRIED, free_view_ports
 
 LOOPBACK = "127.0.0.1"
 _NEEDED = {

@@ -121,7 +121,7 @@ def control_socket(endpoint: str) -> Path:
 
 def viewer_command(config: Config, context: RunContext, port: int, view: bool) -> Command:
     """Return the command of the viewer process, which owns rerun."""
-    argv = _python("-m", "swarmctl.telemetry.viewer", "--run", context.run, "--bus", context.endpoint)
+    argv = _python("-m", "swarmctl.telemetry.view.viewer", "--run", context.run, "--bus", context.endpoint)
     argv += ("--agents", f"{config.swarm.agents}", "--run-dir", f"{context.directory}", "--port", f"{port}")
     center, extent_m = _scene_bounds(config)
     argv += ("--look-at", *(f"{c:.3f}" for c in center), "--extent", f"{extent_m:.3f}")

@@ -13,7 +13,7 @@ from swarmctl.errors import ConfigError
 from swarmctl.ops.supervisor import LaunchResult
 
 if TYPE_CHECKING:
-    from swarmctl.telemetry.referee import Rules
+    from swarmctl.telemetry.evaluation.referee import Rules
 
 
 def sum_up(config: Config, directory: Path, result: LaunchResult, print_line: Callable[[str], None]) -> bool:
@@ -21,8 +21,8 @@ def sum_up(config: Config, directory: Path, result: LaunchResult, print_line: Ca
 
     A folder that can't be read or written is a problem of the run, and never loses the result.
     """
-    from swarmctl.telemetry.recordings import optimize_recording  # heavy
-    from swarmctl.telemetry.run_folder import Outcome, finish_run
+    from swarmctl.telemetry.recording.run_folder import Outcome, finish_run
+    from swarmctl.telemetry.view.recordings import optimize_recording  # heavy
 
     try:
         rules = _rules(config, result)
@@ -59,8 +59,8 @@ def rewrite_report(directory: Path) -> Path:
     Raises:
         ConfigError: it is no run folder.
     """
-    from swarmctl.telemetry.run_files import CONFIG, read_text, refuse_no_folder  # heavy
-    from swarmctl.telemetry.run_folder import report_run
+    from swarmctl.telemetry.recording.run_files import CONFIG, read_text, refuse_no_folder  # heavy
+    from swarmctl.telemetry.recording.run_folder import report_run
 
     refuse_no_folder(directory)
     if not read_text(directory / CONFIG):

@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import development as dialect
 from sitl.lockstep import Lockstep
 from swarmctl.bus.peers import PeerPaths
 from swarmctl.control.mpc import swarm_mpc as mpc
-from swarmctl.control.mpc.qp import QpSolution
+from swarmctl.control.mpc.solvers.qp import QpSolution
 from swarmctl.control.mpc.swarm_mpc import SwarmMpc
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase, PredictedPath
 from swarmctl.mavlink.codec import Codec

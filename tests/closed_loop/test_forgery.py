@@ -19,7 +19,7 @@ from swarmctl.bus.path_messages import encode_path
 from swarmctl.bus.peers import agent_name
 from swarmctl.bus.senders import ReceivedMessage, SenderVerifier, _Stream
 from swarmctl.core.types import Mode, Phase
-from swarmctl.telemetry.referee import RunData, evaluate
+from swarmctl.telemetry.evaluation.referee import RunData, evaluate
 from tests import builders
 from tests.closed_loop.conftest import Flight, Fly, fly_now, mission_t_s
 

@@ -152,7 +152,8 @@ def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Callable[..., La
     policy = os.SCHED_RR if may_run_in_realtime() else os.SCHED_OTHER
     for words in (["swarmctl.bus.zenoh_bus"], ["sitl"], *(["agent", "--id", str(i)] for i in range(3))):
         assert policies(launched.pid_of(*words)) == {policy}, words
-    assert policies(launched.pid_of("swarmctl.telemetry.viewer")) == {os.SCHED_OTHER}, "it waits for those that fly"
+    viewer = launched.pid_of("swarmctl.telemetry.view.viewer")
+    assert policies(viewer) == {os.SCHED_OTHER}, "it waits for those that fly"
     assert launched.end() == 0, launched.text()
     lines = launched.text().splitlines()
     assert "3 agents" in lines[0]
@@ -278,7 +279,7 @@ def test_without_router_or_simulator_the_launch_ends_as_failed(
 def test_the_flight_does_not_need_its_viewer(start: Callable[..., Launched]) -> None:
     launched = start("--agents", "2", *AIR, "--duration", "3", "--no-view")
     launched.until_phase("TRACK", 2)
-    os.kill(launched.pid_of("swarmctl.telemetry.viewer"), signal.SIGKILL)
+    os.kill(launched.pid_of("swarmctl.telemetry.view.viewer"), signal.SIGKILL)
     assert launched.end() == 0, launched.text()
     assert launched.text().count("the flight goes on") == 1
 

@@ -23,7 +23,7 @@ from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START
 from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, Command, RunContext, kill_all
 from swarmctl.ops.status_table import AgentView
 from swarmctl.ops.supervisor import FlightSupervisor, LaunchResult, Services
-from swarmctl.telemetry.event_log import EventLog
+from swarmctl.telemetry.recording.event_log import EventLog
 
 pytestmark = pytest.mark.process
 

@@ -17,7 +17,7 @@ from swarmctl.core.records import TICK_DTYPE
 from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED
 from swarmctl.mavlink.codec import Codec
-from swarmctl.telemetry.run_files import read_rows
+from swarmctl.telemetry.recording.run_files import read_rows
 from tests.process.test_check import ENV, ROOT, Pilot, Simulator
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(180)]

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from sitl.studies.bench.bench import PARTS
-from swarmctl.control.mpc.qp import SOLVERS
+from swarmctl.control.mpc.solvers.qp import SOLVERS
 from swarmctl.core.records import TRUTH_DTYPE
 from swarmctl.core.types import Landed
 

@@ -23,7 +23,7 @@ import zenoh
 from swarmctl.core.records import TICK_DTYPE
 from swarmctl.core.tick_record import COLUMNS
 from swarmctl.core.types import Mode, Phase, PlanStatus
-from swarmctl.telemetry.recordings import optimize_recording, viewer_binary
+from swarmctl.telemetry.view.recordings import optimize_recording, viewer_binary
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(120)]
 
@@ -97,7 +97,7 @@ def endpoint() -> Iterator[str]:
 @contextlib.contextmanager
 def viewer(endpoint: str, directory: Path, *more: str) -> Iterator[subprocess.Popen[str]]:
     directory.mkdir(exist_ok=True)
-    command = [sys.executable, "-m", "swarmctl.telemetry.viewer", "--run", RUN, "--bus", endpoint]
+    command = [sys.executable, "-m", "swarmctl.telemetry.view.viewer", "--run", RUN, "--bus", endpoint]
     first = json.dumps({"version": 1, "obstacles": [OBSTACLE]})
     command += ["--agents", str(AGENTS), "--run-dir", str(directory), "--obstacles-json", first, *more]
     with (directory / "viewer.log").open("wb") as log:
@@ -284,7 +284,7 @@ def test_stops_at_once_while_it_waits_for_a_router(tmp_path: Path) -> None:
 
 
 def test_ends_with_its_parent(endpoint: str, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "swarmctl.telemetry.viewer", "--run", RUN, "--bus", endpoint, "--agents", "1"]
+    command = [sys.executable, "-m", "swarmctl.telemetry.view.viewer", "--run", RUN, "--bus", endpoint, "--agents", "1"]
     command += ["--run-dir", str(tmp_path), "--die-with-parent"]
     code = f"import subprocess, time; print(subprocess.Popen({command!r}).pid, flush=True); time.sleep(60)"
     parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)

@@ -39,7 +39,7 @@ from sitl.studies.campaign.flight import config_of
 from sitl.studies.campaign.scenarios import layout_of
 from sitl.studies.campaign.trials import Cell
 from swarmctl.config import Config
-from swarmctl.control.mpc.qp import SOLVERS, installed_solvers
+from swarmctl.control.mpc.solvers.qp import SOLVERS, installed_solvers
 from swarmctl.core.tick_record import TickTiming
 from swarmctl.core.types import Array, Phase
 from swarmctl.errors import EXIT_OK, ConfigError, MissionError

@@ -31,7 +31,7 @@ from swarmctl.control.controllers.kind import Controller
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, HalfSpaces
 from swarmctl.control.mpc.problem import Problem
-from swarmctl.control.mpc.qp import QpParams, installed_solvers
+from swarmctl.control.mpc.solvers.qp import QpParams, installed_solvers
 from swarmctl.control.mpc.swarm_mpc import MpcParams, SwarmMpc
 from swarmctl.core.types import Array, Plan
 

@@ -11,8 +11,8 @@ from sitl.studies.campaign.scenarios import SCENARIOS
 from sitl.studies.campaign.summary import CellSummary, Share, summaries
 from sitl.studies.campaign.trials import Row, trial_of
 from swarmctl.files import replace_text
-from swarmctl.telemetry.pages import render
-from swarmctl.telemetry.svg import element
+from swarmctl.telemetry.report.pages import render
+from swarmctl.telemetry.report.svg import element
 
 REPORT = "report.html"
 _MAX_LISTED = 300

@@ -17,7 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from sitl.studies.thesis.trace import Array, Trace
 from swarmctl.core.closest_pair import closest_pair_m
-from swarmctl.telemetry.charts import (
+from swarmctl.telemetry.palette import LIMIT_RGB, SUM_RGB, agent_rgb, css
+from swarmctl.telemetry.report.charts import (
     REFERENCE_STYLE,
     Ball,
     Limit,
@@ -30,8 +31,7 @@ from swarmctl.telemetry.charts import (
     time_chart,
     top_view,
 )
-from swarmctl.telemetry.pages import render
-from swarmctl.telemetry.palette import LIMIT_RGB, SUM_RGB, agent_rgb, css
+from swarmctl.telemetry.report.pages import render
 
 FlightName = Literal[
     "open_loop", "pid_step", "pid_steps", "pid_slow", "pid_fast", "mpc_slow", "mpc_fast", "circle", "obstacle"

@@ -27,7 +27,7 @@ from sitl.studies.thesis.figures import (
 )
 from sitl.studies.thesis.trace import Row, Trace
 from swarmctl.files import replace_text
-from swarmctl.telemetry.pages import render
+from swarmctl.telemetry.report.pages import render
 
 REPORT = "report.html"
 ROWS = "reproduce.json"

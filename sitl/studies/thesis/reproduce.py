@@ -30,7 +30,7 @@ from swarmctl.built_in_configs import built_in_config
 from swarmctl.config import load
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, ConfigError, StartError
 from swarmctl.process_lifetime import serve_parent
-from swarmctl.telemetry.run_folder import create_run_folder
+from swarmctl.telemetry.recording.run_folder import create_run_folder
 
 TIMING = "timing"  # name of the timing rows for `--only`
 

@@ -16,8 +16,8 @@ from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, Axis, HalfSpace
 from swarmctl.control.mpc.constraints import IncrementBounds, InputBounds, KeepOutHalfSpaces, TerminalConditions
 from swarmctl.control.mpc.prediction import Forecast, Prediction
 from swarmctl.control.mpc.program import Program
-from swarmctl.control.mpc.qp import QpParams, QpSolution
 from swarmctl.control.mpc.session import Relaxation, SolverSession
+from swarmctl.control.mpc.solvers.qp import QpParams, QpSolution
 from swarmctl.control.mpc.tracking_cost import TrackingCost
 
 _SLACK_USED_M = 1e-3

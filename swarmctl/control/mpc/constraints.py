@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from swarmctl.control.mpc.axes import HalfSpaces, Penalties
 from swarmctl.control.mpc.prediction import Forecast, Prediction
 from swarmctl.control.mpc.program import ConstraintBlock, Rows
-from swarmctl.control.mpc.qp import INFINITY, QpSolution
+from swarmctl.control.mpc.solvers.qp import INFINITY, QpSolution
 from swarmctl.core.types import Array
 
 _SLACK_SCALE_M = 0.1  # unit of slack variables, so that they are about 1 like all others

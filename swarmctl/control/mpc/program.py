@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl.control.mpc.prediction import Forecast
-from swarmctl.control.mpc.qp import INFINITY, pattern_index
+from swarmctl.control.mpc.solvers.qp import INFINITY, pattern_index
 from swarmctl.core.types import Array
 
 Mask = NDArray[np.bool_]

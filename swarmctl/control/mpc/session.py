@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from swarmctl.control.mpc.program import Program
-from swarmctl.control.mpc.qp import QpParams, QpSolution
-from swarmctl.control.mpc.solvers import make_solver
+from swarmctl.control.mpc.solvers.qp import QpParams, QpSolution
+from swarmctl.control.mpc.solvers.registry import make_solver
 
 
 @dataclass(frozen=True, slots=True)

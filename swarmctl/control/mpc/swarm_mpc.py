@@ -21,7 +21,7 @@ from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, Axis, HalfSpaces, Horizon, Penalties, Terminal
 from swarmctl.control.mpc.condensed import CondensedMpc
 from swarmctl.control.mpc.problem import Problem
-from swarmctl.control.mpc.qp import QpParams
+from swarmctl.control.mpc.solvers.qp import QpParams
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Plan, PlanStatus, PlanTimes

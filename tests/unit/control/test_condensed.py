@@ -14,8 +14,8 @@ from scipy import optimize
 
 from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, Axis, HalfSpaces, Horizon, Penalties
 from swarmctl.control.mpc.condensed import CondensedMpc
-from swarmctl.control.mpc.qp import QpParams, QpSolution
-from swarmctl.control.mpc.qp_osqp import OsqpSolver
+from swarmctl.control.mpc.solvers.qp import QpParams, QpSolution
+from swarmctl.control.mpc.solvers.qp_osqp import OsqpSolver
 from swarmctl.core.types import Array
 
 EXACT = QpParams(eps=1e-8, eps_relative=1e-8, max_iterations=20_000)

@@ -11,8 +11,8 @@ from swarmctl.control.mpc.axes import AxesProblem, Axis, HalfSpaces, Horizon, Pe
 from swarmctl.control.mpc.constraints import IncrementBounds, InputBounds, KeepOutHalfSpaces, TerminalConditions
 from swarmctl.control.mpc.prediction import Forecast, Prediction
 from swarmctl.control.mpc.program import ConstraintBlock, Program, Rows
-from swarmctl.control.mpc.qp import INFINITY, QpParams, QpSolution
 from swarmctl.control.mpc.session import Relaxation, SolverSession
+from swarmctl.control.mpc.solvers.qp import INFINITY, QpParams, QpSolution
 from swarmctl.control.mpc.tracking_cost import TrackingCost
 from swarmctl.core.types import Array
 

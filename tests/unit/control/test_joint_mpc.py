@@ -15,7 +15,7 @@ from swarmctl.control.model import VehicleModelParams, acceleration
 from swarmctl.control.mpc.axes import Terminal
 from swarmctl.control.mpc.joint_mpc import JointMpc
 from swarmctl.control.mpc.problem import Problem
-from swarmctl.control.mpc.qp import QpParams
+from swarmctl.control.mpc.solvers.qp import QpParams
 from swarmctl.control.mpc.swarm_mpc import MpcParams, SwarmMpc
 from swarmctl.core.types import Array, Plan, PlanStatus, Reference
 from tests import builders

@@ -10,7 +10,7 @@ import pytest
 from swarmctl.control.lag import Lag, lag_response
 from swarmctl.control.mpc.axes import AxesProblem, Axis, Horizon, Penalties
 from swarmctl.control.mpc.condensed import CondensedMpc
-from swarmctl.control.mpc.qp import QpParams
+from swarmctl.control.mpc.solvers.qp import QpParams
 from swarmctl.core.types import Array
 
 LAGS = [Lag(9.5, 1.0), Lag(9.5, 0.5), Lag(25.0, 1.8)]

@@ -13,7 +13,7 @@ from swarmctl.control.controllers.registry import ControllerParams, make_control
 from swarmctl.control.model import VehicleModelParams, acceleration
 from swarmctl.control.mpc.axes import AxesSolution
 from swarmctl.control.mpc.problem import Problem, Start
-from swarmctl.control.mpc.qp import QpParams
+from swarmctl.control.mpc.solvers.qp import QpParams
 from swarmctl.control.mpc.swarm_mpc import RESIDUAL_LIMIT_M, MpcParams, SwarmMpc, closest_keep_outs
 from swarmctl.core.types import Array, Plan, PlanStatus, Reference
 from tests import builders

@@ -11,10 +11,10 @@ import pytest
 from numpy.typing import NDArray
 
 from swarmctl.config import load
-from swarmctl.control.mpc.qp import INFINITY, SOLVERS, QpParams, is_finite, pattern_index
-from swarmctl.control.mpc.qp_daqp import DaqpSolver
-from swarmctl.control.mpc.qp_osqp import OsqpSolver
-from swarmctl.control.mpc.solvers import MAKERS, make_solver
+from swarmctl.control.mpc.solvers.qp import INFINITY, SOLVERS, QpParams, is_finite, pattern_index
+from swarmctl.control.mpc.solvers.qp_daqp import DaqpSolver
+from swarmctl.control.mpc.solvers.qp_osqp import OsqpSolver
+from swarmctl.control.mpc.solvers.registry import MAKERS, make_solver
 from swarmctl.core.types import Array
 from swarmctl.errors import ConfigError
 

@@ -11,7 +11,7 @@ import pytest
 
 from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, Axis, Horizon, Penalties
 from swarmctl.control.mpc.condensed import CondensedMpc
-from swarmctl.control.mpc.qp import QpParams
+from swarmctl.control.mpc.solvers.qp import QpParams
 from swarmctl.control.mpc.terminal import TerminalRegion, terminal_region, transition
 from swarmctl.core.types import Array
 

@@ -16,7 +16,7 @@ import typer
 
 import swarmctl
 from sitl.studies.bench import command
-from swarmctl.control.mpc.qp import SOLVERS
+from swarmctl.control.mpc.solvers.qp import SOLVERS
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import OperatorVerb, Order, VerbArgument
 from swarmctl.errors import ConfigError, MissionError, StartError, exit_code_of

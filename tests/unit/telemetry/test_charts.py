@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from swarmctl.telemetry.charts import Ball, Line, SpaceLine, Window, space_view, time_chart
+from swarmctl.telemetry.report.charts import Ball, Line, SpaceLine, Window, space_view, time_chart
 
 Array = NDArray[np.float64]
 

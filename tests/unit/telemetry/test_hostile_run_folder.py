@@ -19,7 +19,7 @@ from swarmctl.config import Config, dump
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.errors import ConfigError
 from swarmctl.ops.summary import rewrite_report
-from swarmctl.telemetry.run_folder import Outcome, create_run_folder, finish_run
+from swarmctl.telemetry.recording.run_folder import Outcome, create_run_folder, finish_run
 from tests.unit.telemetry.test_run_folder import RULES, write_run
 
 

@@ -10,10 +10,10 @@ from jinja2 import UndefinedError
 from markupsafe import Markup
 
 from sitl.studies.campaign.page import write_page as write_campaign
-from swarmctl.telemetry.pages import render
-from swarmctl.telemetry.svg import Axis, Stroke, axis_below, element, figure, polyline
+from swarmctl.telemetry.report.pages import render
+from swarmctl.telemetry.report.svg import Axis, Stroke, axis_below, element, figure, polyline
 
-SHARED = "swarmctl.telemetry"
+SHARED = "swarmctl.telemetry.report"
 HOSTILE = "<script>\"'&"
 ESCAPED = "&lt;script&gt;&#34;&#39;&amp;"
 

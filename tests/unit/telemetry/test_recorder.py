@@ -15,9 +15,9 @@ import pytest
 
 from swarmctl.core.records import TICK_DTYPE
 from swarmctl.core.tick_record import TickRecord
-from swarmctl.telemetry import recorder as recorder_module
-from swarmctl.telemetry.recorder import Recorder
-from swarmctl.telemetry.run_files import load_run, read_rows
+from swarmctl.telemetry.recording import recorder as recorder_module
+from swarmctl.telemetry.recording.recorder import Recorder
+from swarmctl.telemetry.recording.run_files import load_run, read_rows
 from tests.benches.tick_records import tick_record
 
 
@@ -157,6 +157,6 @@ def test_partial_row_of_a_killed_agent_does_not_shift_later_rows(tmp_path: Path)
 
 
 def test_an_agent_does_not_load_pyarrow_or_rerun() -> None:
-    code = "import sys, swarmctl.telemetry.recorder; print({'pyarrow', 'rerun', 'zenoh'} & set(sys.modules))"
+    code = "import sys, swarmctl.telemetry.recording.recorder; print({'pyarrow', 'rerun', 'zenoh'} & set(sys.modules))"
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
     assert output.stdout.strip() == "set()"

@@ -20,13 +20,13 @@ from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.core.tick_record import COLUMNS
 from swarmctl.core.types import Mode, Phase
 from swarmctl.errors import StartError
-from swarmctl.telemetry.attitude import roll_pitch_rad
-from swarmctl.telemetry.feed import AgentClock
+from swarmctl.telemetry.evaluation.attitude import roll_pitch_rad
+from swarmctl.telemetry.evaluation.referee import RunData
 from swarmctl.telemetry.palette import MODE_RGB, PHASE_RGB, agent_rgb
-from swarmctl.telemetry.quad_mesh import quad_glb
-from swarmctl.telemetry.recordings import open_viewer, optimize_recording, simulated_recording
-from swarmctl.telemetry.referee import RunData
-from swarmctl.telemetry.separation_feed import SeparationFeed
+from swarmctl.telemetry.view.feed import AgentClock
+from swarmctl.telemetry.view.quad_mesh import quad_glb
+from swarmctl.telemetry.view.recordings import open_viewer, optimize_recording, simulated_recording
+from swarmctl.telemetry.view.separation_feed import SeparationFeed
 
 NO_TRUTH = np.zeros(0, TRUTH_DTYPE)
 
@@ -105,7 +105,7 @@ def test_opening_a_window_without_a_display_is_refused_with_a_reason(monkeypatch
 
 
 def test_recordings_can_be_imported_without_rerun() -> None:
-    modules = "swarmctl.telemetry.recordings, swarmctl.telemetry.run_folder"
+    modules = "swarmctl.telemetry.view.recordings, swarmctl.telemetry.recording.run_folder"
     code = f"import sys, {modules}; print({{'pyarrow', 'rerun', 'zenoh'}} & set(sys.modules))"
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
     assert output.stdout.strip() == "set()"

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.core.types import Mode, Phase, PlanStatus
+from swarmctl.telemetry.evaluation.referee import Rules, RunData, evaluate
 from swarmctl.telemetry.json_safe import to_json
-from swarmctl.telemetry.referee import Rules, RunData, evaluate
 
 UTC0_US = 1_780_000_000_000_000
 START_US = 1_000_000  # monotonic time of mission start

@@ -19,10 +19,10 @@ from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.core.tick_record import COLUMNS
 from swarmctl.core.types import Mode, Phase
 from swarmctl.errors import ConfigError, StartError
-from swarmctl.telemetry.charts import thin
-from swarmctl.telemetry.referee import Rules
-from swarmctl.telemetry.run_files import load_run, read_parquet, write_parquet
-from swarmctl.telemetry.run_folder import Outcome, create_run_folder, finish_run, report_run
+from swarmctl.telemetry.evaluation.referee import Rules
+from swarmctl.telemetry.recording.run_files import load_run, read_parquet, write_parquet
+from swarmctl.telemetry.recording.run_folder import Outcome, create_run_folder, finish_run, report_run
+from swarmctl.telemetry.report.charts import thin
 
 UTC_US = 1_780_000_000_000_000
 

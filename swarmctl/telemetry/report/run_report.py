@@ -16,8 +16,19 @@ from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.tick_record import CURVES, Curve
 from swarmctl.core.types import Array, Mode, Phase
 from swarmctl.files import replace_text
-from swarmctl.telemetry.attitude import roll_pitch_rad
-from swarmctl.telemetry.charts import (
+from swarmctl.telemetry.evaluation.attitude import roll_pitch_rad
+from swarmctl.telemetry.evaluation.referee import Rules, RunData
+from swarmctl.telemetry.evaluation.tracks import (
+    Tracks,
+    flight_rows,
+    merge_tracks,
+    mission_start_us,
+    track_error,
+    tracking_rows,
+    true_positions,
+)
+from swarmctl.telemetry.palette import MODE_RGB, PHASE_RGB, REFERENCE_RGB, SUM_RGB, agent_rgb, css
+from swarmctl.telemetry.report.charts import (
     Ball,
     Limit,
     Line,
@@ -28,18 +39,7 @@ from swarmctl.telemetry.charts import (
     time_chart,
     top_view,
 )
-from swarmctl.telemetry.pages import render
-from swarmctl.telemetry.palette import MODE_RGB, PHASE_RGB, REFERENCE_RGB, SUM_RGB, agent_rgb, css
-from swarmctl.telemetry.referee import Rules, RunData
-from swarmctl.telemetry.tracks import (
-    Tracks,
-    flight_rows,
-    merge_tracks,
-    mission_start_us,
-    track_error,
-    tracking_rows,
-    true_positions,
-)
+from swarmctl.telemetry.report.pages import render
 
 REPORT = "report.html"
 _ALL_POINTS = 42_000  # points of all lines together, 13 bytes each: keeps the page below 1 MB

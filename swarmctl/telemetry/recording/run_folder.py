@@ -13,10 +13,9 @@ from typing import Any, NamedTuple
 from swarmctl.core.records import TICK_DTYPE
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import replace_text, write_each
+from swarmctl.telemetry.evaluation.referee import Rules, RunData, evaluate
 from swarmctl.telemetry.json_safe import to_json
-from swarmctl.telemetry.referee import Rules, RunData, evaluate
-from swarmctl.telemetry.report import REPORT, write_report
-from swarmctl.telemetry.run_files import (
+from swarmctl.telemetry.recording.run_files import (
     AGENT_FILE,
     CONFIG,
     EVENTS,
@@ -30,6 +29,7 @@ from swarmctl.telemetry.run_files import (
     utc_us_of,
     write_parquet,
 )
+from swarmctl.telemetry.report.run_report import REPORT, write_report
 
 _LAUNCHES_PER_SECOND = 1000
 

@@ -11,7 +11,7 @@ from typing import Any
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-_SHARED = "swarmctl.telemetry"  # the package whose templates all others extend: page.html, chart.html, style.css
+_SHARED = "swarmctl.telemetry.report"  # the package whose templates all others extend: page.html, chart.html, style.css
 
 
 def render(package: str, template: str, /, **values: Any) -> Markup:

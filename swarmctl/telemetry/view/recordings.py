@@ -16,10 +16,10 @@ from numpy.typing import NDArray
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.errors import StartError
 from swarmctl.files import replaced_by_program
-from swarmctl.telemetry.referee import RunData
+from swarmctl.telemetry.evaluation.referee import RunData
 
 if TYPE_CHECKING:
-    from swarmctl.telemetry.layout import SceneBounds  # rerun takes a second to import
+    from swarmctl.telemetry.view.layout import SceneBounds  # rerun takes a second to import
 
 RECORDING = "telemetry.rrd"
 APPLICATION = "swarmctl"
@@ -119,7 +119,7 @@ def simulated_recording(
     """
     import rerun as rr
 
-    from swarmctl.telemetry.scene import Scene
+    from swarmctl.telemetry.view.scene import Scene
 
     path = directory / RECORDING
     rec = rr.RecordingStream(APPLICATION, recording_id=f"{directory.resolve().name}-{uuid.uuid4().hex[:8]}")
@@ -144,7 +144,7 @@ def simulated_recording(
 
 def _bounds(flown: Mapping[int, NDArray[np.void]]) -> SceneBounds:
     """Return bounds that contain every flown position."""
-    from swarmctl.telemetry.layout import SceneBounds
+    from swarmctl.telemetry.view.layout import SceneBounds
 
     pos_ned_m = np.concatenate([rows["pos_ned_m"] for rows in flown.values()]) if flown else np.zeros((1, 3))
     pos_ned_m = pos_ned_m[np.isfinite(pos_ned_m).all(axis=1)]

@@ -11,7 +11,7 @@ import osqp
 from numpy.typing import NDArray
 from scipy import sparse
 
-from swarmctl.control.mpc.qp import NOT_FINITE, QpParams, QpSolution, is_finite
+from swarmctl.control.mpc.solvers.qp import NOT_FINITE, QpParams, QpSolution, is_finite
 from swarmctl.core.types import Array
 
 _RETRY_SCALINGS = 10  # scaling passes of a retry: they help problems that converge slowly, and no others

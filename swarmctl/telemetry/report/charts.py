@@ -16,9 +16,9 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from swarmctl.core.types import Array
-from swarmctl.telemetry import svg
 from swarmctl.telemetry.palette import LIMIT_RGB, agent_rgb, css
-from swarmctl.telemetry.svg import Axis, Stroke, dot, element
+from swarmctl.telemetry.report import svg
+from swarmctl.telemetry.report.svg import Axis, Stroke, dot, element
 
 REFERENCE_STYLE: Mapping[str, Any] = {"color": "#334155", "dash": "4 3", "width": 1.1}
 _MAX_DRAWN = 1e9  # larger values come from damaged recordings and would flatten all other curves

@@ -1,8 +1,8 @@
 """The only process that uses rerun: reads ticks from the bus, serves a live view and writes `telemetry.rrd`.
 
-`python -m swarmctl.telemetry.viewer --run R --bus ENDPOINT --agents N --run-dir DIR`. It only serves, so it can't delay
-an agent; if it freezes or is killed, only the view is lost. The launcher ends it by SIGTERM (SIGHUP works as well when
-it was started by hand); it ignores Ctrl-C.
+`python -m swarmctl.telemetry.view.viewer --run R --bus ENDPOINT --agents N --run-dir DIR`. It only serves, so it can't
+delay an agent; if it freezes or is killed, only the view is lost. The launcher ends it by SIGTERM (SIGHUP works as well
+when it was started by hand); it ignores Ctrl-C.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from swarmctl.core.obstacle import Obstacle
 from swarmctl.errors import EXIT_OK, EXIT_USAGE, StartError, SwarmError
 from swarmctl.files import replace_text
 from swarmctl.process_lifetime import StopRequest, die_with_parent
-from swarmctl.telemetry.recordings import APPLICATION, RECORDING, has_display, open_viewer
-from swarmctl.telemetry.view_ports import HOST, PORTS_TRIED, free_view_ports
+from swarmctl.telemetry.view.recordings import APPLICATION, RECORDING, has_display, open_viewer
+from swarmctl.telemetry.view.view_ports import HOST, PORTS_TRIED, free_view_ports
 
 URL_FILE = "viewer.url"
 _SERVER_MEMORY = "512MiB"  # history for viewers that connect late
@@ -54,7 +54,9 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="swarmctl.telemetry.viewer", description=__doc__.split("\n", maxsplit=1)[0])
+    parser = argparse.ArgumentParser(
+        prog="swarmctl.telemetry.view.viewer", description=__doc__.split("\n", maxsplit=1)[0]
+    )
     parser.add_argument("--run", required=True, help="name of the run on the bus")
     parser.add_argument("--bus", required=True, help="Zenoh endpoint of the launcher's router")
     parser.add_argument("--agents", type=int, required=True)
@@ -73,9 +75,9 @@ def _parser() -> argparse.ArgumentParser:
 
 def _run(options: argparse.Namespace, obstacles: Sequence[Obstacle], stop: StopRequest) -> int:
     from swarmctl.bus.zenoh_bus import ZenohBus
-    from swarmctl.telemetry.feed import Feed, listens_to
-    from swarmctl.telemetry.layout import SceneBounds
-    from swarmctl.telemetry.scene import Scene
+    from swarmctl.telemetry.view.feed import Feed, listens_to
+    from swarmctl.telemetry.view.layout import SceneBounds
+    from swarmctl.telemetry.view.scene import Scene
 
     bus = _interruptible(lambda: ZenohBus(options.bus, options.run, "viewer", listens_to(options.agents)), stop)
     if bus is None:

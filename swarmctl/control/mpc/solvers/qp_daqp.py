@@ -9,7 +9,7 @@ import daqp
 import numpy as np
 from numpy.typing import NDArray
 
-from swarmctl.control.mpc.qp import INFINITY, NOT_FINITE, QpParams, QpSolution, is_finite, pattern_index
+from swarmctl.control.mpc.solvers.qp import INFINITY, NOT_FINITE, QpParams, QpSolution, is_finite, pattern_index
 from swarmctl.core.types import Array
 
 _UNBOUNDED = 1e30  # DAQP's value for a missing bound

@@ -22,9 +22,9 @@ from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.core.tick_record import COLUMNS, Column
 from swarmctl.errors import ConfigError
 from swarmctl.files import read_file, replaced
-from swarmctl.telemetry.referee import RunData
-from swarmctl.telemetry.summary_file import decode_summary
-from swarmctl.telemetry.tracks import MAX_RUN_US
+from swarmctl.telemetry.evaluation.referee import RunData
+from swarmctl.telemetry.evaluation.tracks import MAX_RUN_US
+from swarmctl.telemetry.recording.summary_file import decode_summary
 
 EVENTS = "events.jsonl"
 SUMMARY = "summary.json"

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.types import Array
-from swarmctl.telemetry.tracks import interpolate
+from swarmctl.telemetry.evaluation.tracks import interpolate
 
 _GRID_US = 20_000
 _GAP_US = 500_000

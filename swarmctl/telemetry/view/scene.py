@@ -16,11 +16,11 @@ from swarmctl import __version__
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.tick_record import CURVES
 from swarmctl.core.types import Array, Mode, Phase, PlanStatus
-from swarmctl.telemetry.attitude import roll_pitch_rad
-from swarmctl.telemetry.layout import TIMELINE, SceneBounds, layout
+from swarmctl.telemetry.evaluation.attitude import roll_pitch_rad
 from swarmctl.telemetry.palette import LIMIT_RGB, MODE_RGB, PHASE_RGB, REFERENCE_RGB, agent_rgb
-from swarmctl.telemetry.quad_mesh import quad_glb
-from swarmctl.telemetry.separation_feed import SeparationFeed
+from swarmctl.telemetry.view.layout import TIMELINE, SceneBounds, layout
+from swarmctl.telemetry.view.quad_mesh import quad_glb
+from swarmctl.telemetry.view.separation_feed import SeparationFeed
 
 _BOUNDS = SceneBounds()
 _REPEAT_US = 2_000_000  # period of repeated states, because the server's buffer drops rare data first

@@ -13,7 +13,7 @@ import numpy as np
 from markupsafe import Markup
 
 from swarmctl.core.types import Array
-from swarmctl.telemetry.pages import render
+from swarmctl.telemetry.report.pages import render
 
 WIDTH_PX = 640
 LEFT_PX, RIGHT_PX, TOP_PX, BOTTOM_PX = 52, 12, 8, 24  # margins around the plot

@@ -5,14 +5,14 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from swarmctl.control.mpc.qp import QpParams, QpSolver
-from swarmctl.control.mpc.qp_osqp import OsqpSolver
+from swarmctl.control.mpc.solvers.qp import QpParams, QpSolver
+from swarmctl.control.mpc.solvers.qp_osqp import OsqpSolver
 
 Mask = NDArray[np.bool_]
 
 
 def _daqp(hessian: Mask, rows: Mask, params: QpParams) -> QpSolver:
-    from swarmctl.control.mpc.qp_daqp import DaqpSolver  # an optional package
+    from swarmctl.control.mpc.solvers.qp_daqp import DaqpSolver  # an optional package
 
     return DaqpSolver(hessian, rows, params)
 

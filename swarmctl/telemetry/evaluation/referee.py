@@ -18,9 +18,8 @@ from numpy.typing import NDArray
 from swarmctl import __version__
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Array, Mode, PlanStatus
-from swarmctl.telemetry.json_safe import finite, json_safe
-from swarmctl.telemetry.reception import refused_peers, unresponsive
-from swarmctl.telemetry.tracks import (
+from swarmctl.telemetry.evaluation.reception import refused_peers, unresponsive
+from swarmctl.telemetry.evaluation.tracks import (
     Tracks,
     flight_rows,
     merge_tracks,
@@ -29,6 +28,7 @@ from swarmctl.telemetry.tracks import (
     unseen_spans,
     utc_offset_us,
 )
+from swarmctl.telemetry.json_safe import finite, json_safe
 
 _CONTROLLED = (Mode.TRACKING, Mode.REPLAY, Mode.BRAKE)
 _SOLVER_FAILED = (PlanStatus.SOLVER_FAILED, PlanStatus.RESIDUAL)
