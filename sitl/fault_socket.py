@@ -12,10 +12,8 @@ import socket
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from sitl.world import SitlWorld
-from swarmctl.core.params import explained
+from swarmctl.config_problems import validated
 from swarmctl.errors import ConfigError
 from swarmctl.process_lifetime import remove_socket
 from swarmctl.simulator_config import FaultParams
@@ -78,9 +76,9 @@ def handle(request: bytes, world: SitlWorld) -> dict[str, Any]:
     except (ValueError, TypeError, KeyError, RecursionError):
         return _refused(['not a request: send {"fault": {"kind": ...}} as JSON'])
     try:
-        fault = FaultParams.model_validate(wanted)
-    except ValidationError as error:
-        return _refused(explained(error))
+        fault = validated(FaultParams, wanted, "fault")
+    except ConfigError as error:
+        return _refused(list(error.problems))
     problems = list(world.can(fault))
     if problems:
         return _refused(problems)

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Annotated, Any, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
+from pydantic import BaseModel, ConfigDict, Field, create_model
 
 
 class Params(BaseModel):
@@ -34,14 +34,6 @@ def with_sections(sections: Mapping[str, type[Params]]) -> Callable[[type[P]], t
         )
 
     return extended
-
-
-def explained(refused: ValidationError) -> list[str]:
-    """Return one line for each wrong value: key, value and what is allowed."""
-    return [
-        f"{'.'.join(map(str, error['loc'])) or refused.title} = {error.get('input')!r}: {error['msg'].lower()}"
-        for error in refused.errors(include_url=False)
-    ]
 
 
 Vec2 = Annotated[tuple[float, float], Field(strict=False)]  # not strict: TOML arrays are lists

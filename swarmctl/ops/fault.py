@@ -13,10 +13,8 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from pydantic import ValidationError
-
 from swarmctl.config import load
-from swarmctl.core.params import explained
+from swarmctl.config_problems import validated
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.ops.operator import RunningLaunch
 from swarmctl.ops.processes import control_socket
@@ -35,9 +33,9 @@ def parse_fault(wanted: Mapping[str, Any], vehicles: int) -> FaultParams:
     """
     given = {key: value for key, value in wanted.items() if value is not None}
     try:
-        fault = FaultParams.model_validate(given)
-    except ValidationError as error:
-        problems = [_as_option(problem) for problem in explained(error)]
+        fault = validated(FaultParams, given, "fault")
+    except ConfigError as error:
+        problems = [_as_option(problem) for problem in error.problems]
         raise ConfigError("fault", [*problems, *_missed(given, vehicles, problems)]) from error
     problems = [_as_option(problem) for problem in fault.problems(vehicles)]
     if problems:
