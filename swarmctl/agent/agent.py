@@ -29,6 +29,7 @@ from swarmctl.agent.world_model import FLOWN_BY_AGENT, WorldModel
 from swarmctl.bus import topics
 from swarmctl.bus.path_messages import encode_path
 from swarmctl.bus.peers import Bus
+from swarmctl.control.collision.encounters import Encounters
 from swarmctl.control.collision.separation import KeepOut, radius_problem
 from swarmctl.control.estimation.accuracy import AccuracyMonitor
 from swarmctl.control.estimation.constant_velocity import predict_constant_velocity
@@ -123,6 +124,7 @@ class Agent:
         self._plan_buffer = PlanBuffer(
             setup.agent, self._controller.dt_us, self._controller.steps, setup.separation.brake_m_s2
         )
+        self._encounters = Encounters()
         self._certified_us: int | None = None
         self._hold_at: Array | None = None
         self._publisher = TelemetryPublisher(
@@ -313,9 +315,10 @@ class Agent:
                 virtual_control=self._virtual_control,
             )
         steps, dt_us = self._controller.steps, self._controller.dt_us
-        keep_outs = self._world_model.keep_outs(
+        near = self._world_model.keep_outs(
             state.pos_ned_m, self._utc(act_us), dt_us, steps, phase=self._state_machine.phase
         )
+        keep_outs = self._encounters.noted(near, start.pos_ned_m)
         flies = Phase.GOTO_START <= self._state_machine.phase <= Phase.GOTO_LAND
         self._detect_deadlock(now_us, state, keep_outs, flies)
         grid = np.arange(self._controller.longest + 1, dtype=np.float64)

@@ -24,7 +24,7 @@ from swarmctl.core.trajectory import braking_displacement, interpolate
 from swarmctl.core.types import Array, PredictedPath
 
 _TINY_M = 1e-6
-_APPROACH_TOLERANCE_M = 0.02  # approach allowed to a keep-out that is violated already
+_APPROACH_TOLERANCE_M = 0.02  # approach allowed in a whole encounter with a keep-out that is violated already
 
 
 class SeparationParams(Params):
@@ -75,11 +75,18 @@ class KeepOut:
     any_height: bool  # a vertical cylinder instead of a sphere
     priority_id: int  # agent number, -1 an obstacle; decides the side when centres coincide
     downwash: float = 1.0  # ratio of height to width of the ellipsoid; 1 is a sphere
+    key: int | None = None  # the same in all ticks; None: encounters with it are not remembered
+    entered_m: float | None = None  # distance at which the present violation began; None: with this tick
 
     @property
     def vertical_01(self) -> float:
         """Return the factor on vertical distances."""
         return 0.0 if self.any_height else 1.0 / self.downwash
+
+    def apart_m(self, pos_ned_m: Array) -> float:
+        """Return the distance [m] of a position (3,) from its centre now, by which it is violated or not."""
+        towards = pos_ned_m - self.pos_ned_m[0]
+        return math.hypot(towards[0], towards[1], towards[2] * self.vertical_01)
 
     def distance_m(self, pos_ned_m: Array) -> float:
         """Return the distance [m] of a position (3,) from its centre now; in the plane when it holds at any height."""
@@ -154,6 +161,7 @@ def keep_out_of_peer(
         any_height=landing or (age_s > params.lost_after_s and not parked),
         priority_id=path.agent,
         downwash=params.downwash,
+        key=path.agent,
     )
 
 
@@ -166,6 +174,7 @@ def keep_out_of_obstacle(obstacle: Obstacle, dt_us: int, steps: int, params: Sep
         hard_min_distance_m=params.budget.certified_obstacle_m(obstacle.keep_out_m),
         any_height=obstacle.column,
         priority_id=-1,
+        key=id(obstacle),
     )
 
 
@@ -254,15 +263,10 @@ def _approach_m(keep_outs: Sequence[KeepOut], here_ned_m: Array, apart: Array, p
         apart: (keep-outs, Hp, 3) from them to the guess, heights as they count.
         params: share and limit.
     """
-    now_m = np.array([_apart_m(k, here_ned_m) for k in keep_outs])[:, None]
+    now_m = np.array([k.apart_m(here_ned_m) for k in keep_outs])[:, None]
     closing_m = np.maximum(now_m - np.sqrt(np.einsum("skc,skc->sk", apart, apart)), 0.0)
     closing_m[[k.priority_id < 0 for k in keep_outs]] = 0.0
     return np.asarray(np.minimum(params.approach_01 * closing_m, params.approach_max_m))
-
-
-def _apart_m(keep_out: KeepOut, pos_ned_m: Array) -> float:
-    towards = pos_ned_m - keep_out.pos_ned_m[0]
-    return math.hypot(towards[0], towards[1], towards[2] * keep_out.vertical_01)
 
 
 def _with_right_of_way(normal: Array, distance: Array, needed: Array, to_goal: Array, *, angle_rad: Array) -> Array:
@@ -296,11 +300,12 @@ def certify(
         path_ned_m: (Hp+1, 3) own plan.
         keep_outs: keep-outs at the same times.
         from_step: first step that the plan can still change.
-        approach_m: how much closer a path may come to a keep-out that is violated already.
+        approach_m: how much closer than where it was entered a path may come to a keep-out that is violated already.
 
     Returns:
         The minimum over keep-outs of distance minus hard minimum distance. Where a keep-out is violated now already, a
-        path that does not come closer than now has margin 0. Infinite without keep-outs.
+        path has margin 0 that stays above where it was entered less `approach_m`, or comes no closer than it is now.
+        Infinite without keep-outs.
     """
     if not keep_outs:
         return math.inf
@@ -315,5 +320,7 @@ def certify(
     now = np.sqrt(np.einsum("mc,mc->m", apart[:, 0], apart[:, 0]))
     later = distance[:, min(from_step, distance.shape[1] - 1) :].min(axis=1)
     allowed = np.array([k.hard_min_distance_m for k in keep_outs])
-    margin = np.where((now < allowed) & (later >= now - approach_m), 0.0, later - allowed)
+    entered = [now_m if k.entered_m is None else k.entered_m for k, now_m in zip(keep_outs, now, strict=True)]
+    least = np.minimum(now, np.array(entered) - approach_m)
+    margin = np.where((now < allowed) & (later >= least - _TINY_M), 0.0, later - allowed)
     return float(margin.min())

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from swarmctl.control.collision.encounters import Encounters
 from swarmctl.control.collision.separation import (
     KeepOut,
     SeparationParams,
@@ -182,6 +183,40 @@ def test_from_inside_a_keep_out_a_plan_may_leave_but_not_approach() -> None:
     assert certify(line((0.5, 0.0, 0.0), (0.1, 0.0, 0.0)), keep_out, 0) == pytest.approx(-0.7)
     # the excuse is for that keep-out only
     assert certify(line((0.5, 0.0, 0.0), (3.0, 0.0, 0.0)), [*keep_out, fixed((3.0, 0.0, 0.0), 0.8)], 0) < 0.0
+
+
+def crept_m(encounters: Encounters | None) -> float:
+    """Distance to a keep-out of 0.8 m at rest after thirty ticks, each of which comes 1.9 cm closer if certified."""
+    apart_m, keep_out = 0.6, fixed((0.0, 0.0, 0.0), 0.8)
+    for _ in range(30):
+        here = np.array([apart_m, 0.0, 0.0])
+        (noted,) = [keep_out] if encounters is None else encounters.noted([replace(keep_out, key=1)], here)
+        if certify(line((apart_m, 0.0, 0.0), (apart_m - 0.019, 0.0, 0.0)), [noted], 0) >= 0.0:
+            apart_m -= 0.019
+    return apart_m
+
+
+def test_no_number_of_certified_plans_comes_two_centimetres_closer_in_one_encounter() -> None:
+    assert crept_m(Encounters()) >= 0.6 - 0.02 - 1e-6
+    assert crept_m(None) < 0.1, "control: measured tick by tick they arrive"
+
+
+def test_an_encounter_begins_again_once_the_keep_out_was_left() -> None:
+    encounters, keep_out = Encounters(), replace(fixed((0.0, 0.0, 0.0), 0.8), key=1)
+
+    def entered_m(apart_m: float) -> float | None:
+        return encounters.noted([keep_out], np.array([apart_m, 0.0, 0.0]))[0].entered_m
+
+    assert entered_m(0.9) is None
+    assert [entered_m(apart_m) for apart_m in (0.7, 0.6, 0.75)] == [0.7, 0.7, 0.7]
+    assert entered_m(0.8) is None
+    assert entered_m(0.5) == 0.5
+
+
+def test_whoever_has_come_too_close_already_must_open() -> None:
+    pushed = replace(fixed((0.0, 0.0, 0.0), 0.8), key=1, entered_m=0.7)  # by a peer or by wind, to 0.5 m
+    assert certify(line((0.5, 0.0, 0.0), (0.499, 0.0, 0.0)), [pushed], 0) < 0.0
+    assert certify(line((0.5, 0.0, 0.0), (0.6, 0.0, 0.0)), [pushed], 0) == 0.0
 
 
 def test_a_full_control_horizon_leaves_the_last_step_to_certify() -> None:
