@@ -210,13 +210,13 @@ class Lockstep:
                 found.append(f"agent {i}: {agent.outcome if agent.finished else 'did not finish'}")
         return found
 
-    def run(self, on_step: Callable[[Lockstep], None] | None = None) -> None:
-        """Fly until every agent has landed, or the time limit is reached."""
+    def run(self, on_step: Callable[[Lockstep], bool | None] | None = None) -> None:
+        """Fly until every agent has landed, the time limit is reached, or `on_step` returns True."""
         limit_us = round((self.config.mission.duration_s + _TAIL_S) * 1e6)
         while not self.finished and self.clock.now_us() < limit_us:
             self.step()
-            if on_step is not None:
-                on_step(self)
+            if on_step is not None and on_step(self):
+                return
 
 
 def write_events(path: Path, events: Sequence[dict[str, Any]]) -> None:

@@ -20,7 +20,7 @@ from swarmctl.bus.json_messages import MAX_OBSTACLES
 from swarmctl.config_problems import validated
 from swarmctl.config_source import override, read_tree
 from swarmctl.control.collision.separation import SeparationParams, radius_problem
-from swarmctl.control.controllers.registry import ControllerParams
+from swarmctl.control.controllers.discovery import ControllerParams
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.reference.mission import MissionParams
 from swarmctl.core.obstacle import Obstacle

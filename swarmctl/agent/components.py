@@ -14,8 +14,8 @@ from swarmctl.agent.setup import AgentSetup
 from swarmctl.agent.world_model import WorldModel
 from swarmctl.bus.peers import Bus
 from swarmctl.control.commit.trajectory_planner import following
+from swarmctl.control.controllers.discovery import ControllerParams, make_controller
 from swarmctl.control.controllers.kind import Controller
-from swarmctl.control.controllers.registry import ControllerParams, make_controller
 from swarmctl.control.estimation.disturbance import DisturbanceObserver
 from swarmctl.control.estimation.state_filter import StateFilter
 from swarmctl.control.phases.state_machine import MissionStateMachine

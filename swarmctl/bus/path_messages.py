@@ -1,6 +1,6 @@
 """Bytes of predicted paths: a little-endian struct header and float32 points.
 
-A field more is a new `PATH_VERSION`; receivers take the length of the header from the message.
+A field more in the header is a new `PATH_VERSION`, which receivers of another version refuse.
 """
 
 from __future__ import annotations

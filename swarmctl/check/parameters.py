@@ -15,8 +15,8 @@ from swarmctl.config import Config
 from swarmctl.core.types import Landed
 from swarmctl.core.verdict import Verdict
 from swarmctl.mavlink.dialects.dialect import Dialect, Rule
+from swarmctl.mavlink.dialects.discovery import DIALECTS
 from swarmctl.mavlink.dialects.parameter_check import Opinion, ParameterCheck, ParameterContext, ok
-from swarmctl.mavlink.dialects.registry import DIALECTS
 
 Number = float | int
 RC_RECEIVER = 1 << 16  # MAV_SYS_STATUS_SENSOR_RC_RECEIVER

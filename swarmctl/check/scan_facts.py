@@ -19,7 +19,7 @@ from swarmctl.check.link_facts import (
 from swarmctl.check.link_statistics import FrameStatistics, round_trip, vehicle_time
 from swarmctl.check.scanner import ARMED_FLAG, VehicleScan
 from swarmctl.core.types import FlightMode, GeoOrigin, Landed
-from swarmctl.mavlink.dialects.registry import DIALECTS
+from swarmctl.mavlink.dialects.discovery import DIALECTS
 
 _BYTEWISE, _C_CAST = 1 << 4, 1 << 17  # MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_*
 _ENOUGH_ANSWERS = 3

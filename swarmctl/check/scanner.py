@@ -18,7 +18,7 @@ from swarmctl.check.listener import NOWHERE, Address, Listener, ReceivedDatagram
 from swarmctl.check.parameter_reader import ParameterReader
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.dialects.dialect import Dialect
-from swarmctl.mavlink.dialects.registry import DIALECTS
+from swarmctl.mavlink.dialects.discovery import DIALECTS
 from swarmctl.mavlink.framing import frames, message_id
 from swarmctl.wall_clock import monotonic_us
 

@@ -10,7 +10,7 @@ from swarmctl.check.finding import Finding
 from swarmctl.check.link_facts import FenceFacts, LatLon, VehicleFacts
 from swarmctl.config import Config
 from swarmctl.core.verdict import Verdict
-from swarmctl.mavlink.dialects.registry import DIALECTS
+from swarmctl.mavlink.dialects.discovery import DIALECTS
 
 _SAME_DEG = 3e-7  # 3 cm; autopilots store 1e-7
 _WEIGHT_ARMING, _WEIGHT_FENCE = 71, 66

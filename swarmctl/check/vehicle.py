@@ -10,7 +10,7 @@ from swarmctl.check.link_facts import VehicleFacts
 from swarmctl.config import Config
 from swarmctl.core.types import FlightMode
 from swarmctl.core.verdict import Verdict
-from swarmctl.mavlink.dialects.registry import DIALECTS
+from swarmctl.mavlink.dialects.discovery import DIALECTS
 from swarmctl.mavlink.transport import parse_url
 
 OK, NOTE, FIX = Verdict.OK, Verdict.NOTE, Verdict.FIX

@@ -1,4 +1,4 @@
-"""Finds what the modules of a package declare, so that a registry is no list that somebody has to edit."""
+"""Finds what the modules of a package declare, so that nobody has to edit a list."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ T = TypeVar("T")
 def declared(package: ModuleType, kind: type[T]) -> Iterator[T]:
     """Yield every `kind` that a module of `package` holds, in the order of the modules' names.
 
-    The package's own `registry` is left out: it is what asks.
+    The package's own `discovery` is left out: it is what asks.
     """
     for found in pkgutil.iter_modules(package.__path__):
-        if found.name != "registry":
+        if found.name != "discovery":
             module = importlib.import_module(f"{package.__name__}.{found.name}")
             yield from (thing for thing in vars(module).values() if isinstance(thing, kind))

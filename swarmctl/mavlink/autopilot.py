@@ -19,7 +19,7 @@ from swarmctl.core.types import Array, AttitudeSetpoint, FlightMode, GeoOrigin, 
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.commands import CommandPort
 from swarmctl.mavlink.dialects.dialect import LAST_INTEGER_TYPE, Dialect
-from swarmctl.mavlink.dialects.registry import DIALECTS
+from swarmctl.mavlink.dialects.discovery import DIALECTS
 from swarmctl.mavlink.framing import frames
 from swarmctl.mavlink.local_frame import LocalFrame
 from swarmctl.mavlink.mode_watch import ModeWatch

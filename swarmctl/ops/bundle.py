@@ -26,7 +26,7 @@ from swarmctl.check.scanner import run_scans
 from swarmctl.config import Config, load
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import replaced
-from swarmctl.mavlink.dialects.registry import DIALECTS
+from swarmctl.mavlink.dialects.discovery import DIALECTS
 from swarmctl.ops.vehicle_links import open_links
 from swarmctl.process_lifetime import StopRequest
 from swarmctl.telemetry.recording.run_files import CONFIG, read_text, refuse_no_folder

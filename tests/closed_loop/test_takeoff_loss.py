@@ -10,8 +10,8 @@ from sitl.lockstep import Lockstep
 from swarmctl.config import load
 from swarmctl.core.types import FlightMode, Phase
 from swarmctl.mavlink import autopilot
+from swarmctl.mavlink.dialects.discovery import DIALECTS
 from swarmctl.mavlink.dialects.px4 import PX4
-from swarmctl.mavlink.dialects.registry import DIALECTS
 
 PHASES = [Phase.ARM, Phase.TAKEOFF]
 

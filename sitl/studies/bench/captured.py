@@ -96,13 +96,14 @@ def capture(config: Config, keep_outs: int = _MAX_KEEP_OUTS, most: int = 240) ->
         agent._controller = recordings[-1]  # only tracking is recorded, so `_transit` stays
     found: list[list[tuple[Problem, float]]] = [[] for _ in agents]
 
-    def on_step(_: Lockstep) -> None:
+    def enough(_: Lockstep) -> bool:
         for agent, recording, kept in zip(agents, recordings, found, strict=True):
             kept += [(p, agent.timing.tick_ms) for p in recording.problems if len(p.keep_outs) == keep_outs]
             recording.problems.clear()
+        return len(found[0]) >= most
 
     with settled_garbage():
-        flight.run(on_step)
+        flight.run(enough)
     together = [item for kept in found for item in kept][:most]
     return Captured(config, tuple(p for p, _ in together), np.array([ms for _, ms in together]))
 

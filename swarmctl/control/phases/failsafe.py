@@ -1,7 +1,8 @@
 """Maps `Health` to `Mode` by one table whose first matching row applies. Pure; all state is passed in.
 
 After a plan that must not be flown the modes are, in order: replay the shifted last certified plan while it is recent,
-brake, hold, land.
+brake, hold, land. While the vehicle's state is stale or the estimate lost (STATE_STALE) nothing is sent, so the vehicle
+does what its autopilot's own failsafe is set to by `agent.autopilot_params` (`swarmctl/agent/setup.py`): it lands.
 """
 
 from __future__ import annotations

@@ -38,9 +38,9 @@ from swarmctl.core.types import FlightMode, Landed
 from swarmctl.core.verdict import Verdict
 from swarmctl.mavlink.dialects.arducopter import ARDUCOPTER
 from swarmctl.mavlink.dialects.dialect import LAND, ODOMETRY, Dialect, LongCommand, Rule
+from swarmctl.mavlink.dialects.discovery import DIALECTS
 from swarmctl.mavlink.dialects.parameter_check import Opinion, ParameterCheck
 from swarmctl.mavlink.dialects.px4 import PX4
-from swarmctl.mavlink.dialects.registry import DIALECTS
 
 OK, NOTE, FIX = Verdict.OK, Verdict.NOTE, Verdict.FIX
 URLS = ("udpin://127.0.0.1:14540", "udpin://127.0.0.1:14541")

@@ -27,7 +27,7 @@ from swarmctl.core.types import FlightMode, GeoOrigin, Landed
 from swarmctl.errors import StartError
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.dialects.dialect import Dialect
-from swarmctl.mavlink.dialects.registry import DIALECTS
+from swarmctl.mavlink.dialects.discovery import DIALECTS
 from swarmctl.mavlink.framing import frames
 
 SHARED = GeoOrigin(47.397742, 8.545594, 489.4)

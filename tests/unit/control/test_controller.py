@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from swarmctl.control.collision.separation import KeepOut, SeparationParams
+from swarmctl.control.controllers.discovery import CONTROLLERS, ControllerParams, make_controller
 from swarmctl.control.controllers.kind import Controller
 from swarmctl.control.controllers.pid import PidParams
-from swarmctl.control.controllers.registry import CONTROLLERS, ControllerParams, make_controller
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.problem import Problem
 from swarmctl.control.mpc.swarm_mpc import MpcParams

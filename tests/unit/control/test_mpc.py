@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from swarmctl.control.collision.separation import KeepOut, SeparationParams, certify
-from swarmctl.control.controllers.registry import ControllerParams, make_controller
+from swarmctl.control.controllers.discovery import ControllerParams, make_controller
 from swarmctl.control.model import VehicleModelParams, acceleration
 from swarmctl.control.mpc.axes import AxesSolution
 from swarmctl.control.mpc.problem import Problem, Start
