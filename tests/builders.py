@@ -9,11 +9,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from swarmctl.bus.json_messages import StatusMessage
 from swarmctl.control.collision.separation import KeepOut
 from swarmctl.control.mpc.problem import Start
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
-from swarmctl.core.types import Array, FlightMode, Landed, PredictedPath, VehicleState
+from swarmctl.core.types import Array, FlightMode, Landed, Mode, Phase, PredictedPath, VehicleState
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
 STILL = np.zeros(3)
@@ -44,6 +45,40 @@ def vehicle_state(
         mode=mode,
         landed=landed,
         failsafe=failsafe,
+    )
+
+
+def status_message(
+    *,
+    agent: int = 0,
+    phase: int = Phase.TRACK,
+    position_error_m: float = 0.1,
+    separation_m: float = 1.0,
+    deadline_misses: int = 0,
+    active_alert: str = "",
+    utc_us: int = 0,
+) -> StatusMessage:
+    """Return the status of an agent that tracks its mission."""
+    return StatusMessage(
+        agent=agent,
+        boot_id=1,
+        sysid=agent + 1,
+        phase=phase,
+        mode=Mode.TRACKING,
+        flight_mode=FlightMode.EXTERNAL,
+        armed=True,
+        landed=Landed.IN_AIR,
+        ready_utc_us=0,
+        outcome="",
+        position_error_m=position_error_m,
+        separation_m=separation_m,
+        tick_p99_ms=2.0,
+        ticks=100,
+        deadline_misses=deadline_misses,
+        plan_staleness_ms=20.0,
+        solver_failed=0,
+        active_alert=active_alert,
+        utc_us=utc_us,
     )
 
 

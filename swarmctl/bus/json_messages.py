@@ -22,7 +22,7 @@ Word = Annotated[str, msgspec.Meta(max_length=32)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
 
 
-class StatusMessage(msgspec.Struct, frozen=True):
+class StatusMessage(msgspec.Struct, frozen=True, kw_only=True):
     """Holds the status an agent publishes five times a second; peers use `phase` and `ready_utc_us`."""
 
     agent: Count

@@ -18,7 +18,7 @@ import typer
 from swarmctl import __version__
 from swarmctl.core.operator_verbs import OPERATOR_VERBS, OperatorVerb, Order
 from swarmctl.core.text import printable_lines
-from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, ConfigError, SwarmError
+from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, ConfigError, MissionError, SwarmError
 
 if TYPE_CHECKING:
     from swarmctl.bus.json_messages import ObstaclesMessage, StatusMessage
@@ -223,7 +223,11 @@ def _give(order: Order, run_dir: Path | None, agent: int | None) -> int:
     from swarmctl.ops import operator
 
     launch = operator.find_launch(run_dir)
-    _show(operator.command(launch, order, agent), range(launch.agents) if agent is None else range(agent, agent + 1))
+    statuses = operator.command(launch, order, agent)
+    asked = range(launch.agents) if agent is None else range(agent, agent + 1)
+    _show(statuses, asked)
+    if ignored := operator.ignored_by(order, statuses, asked):
+        raise MissionError(f"{order.verb}: {'; '.join(ignored)}")
     return EXIT_OK
 
 

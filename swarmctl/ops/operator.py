@@ -14,7 +14,7 @@ import os
 import stat
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -35,7 +35,8 @@ from swarmctl.bus.peers import agent_name
 from swarmctl.bus.topics import COMMAND, OBSTACLES, OPERATOR, STATUS
 from swarmctl.bus.zenoh_bus import ZenohBus
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.operator_verbs import Order
+from swarmctl.core.operator_verbs import OPERATOR_VERBS, Order
+from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import read_file, replace_bytes
 
@@ -153,6 +154,22 @@ def command(launch: RunningLaunch, order: Order, agent: int | None) -> dict[int,
             time.sleep(_REPEAT_S)
         bus.receive(STATUS)
         return _statuses(bus, asked, 1.0)
+
+
+def ignored_by(order: Order, statuses: Mapping[int, StatusMessage], asked: Sequence[int]) -> list[str]:
+    """Return which of the agents asked have not obeyed, and why; `statuses` were received after the order."""
+    verb = OPERATOR_VERBS[order.verb]
+    found = []
+    for agent in asked:
+        if agent not in statuses:
+            found.append(f"{agent_name(agent)} does not answer")
+            continue
+        phase = Phase(statuses[agent].phase)
+        stopping = verb.is_stop and phase in (Phase.LAND, Phase.DONE)
+        if phase.name not in verb.phases and not stopping:
+            obeyed = ", ".join(possible.name for possible in Phase if possible.name in verb.phases)
+            found.append(f"{agent_name(agent)} is in {phase.name} and ignores it; it is obeyed in {obeyed}")
+    return found
 
 
 def read_obstacles(launch: RunningLaunch) -> ObstaclesMessage:

@@ -172,10 +172,12 @@ class Child:
     def request_realtime(self) -> bool:
         """Schedule the process before all of normal priority (SCHED_RR); return False where that is not permitted.
 
-        It must have just been started: threads that it starts later inherit the priority.
+        It must have just been started: threads that it starts later inherit the priority. A higher real-time priority
+        that the launcher was started with is kept.
         """
+        priority = max(_REALTIME_PRIORITY, os.sched_getparam(self.pid).sched_priority)
         try:
-            os.sched_setscheduler(self.pid, os.SCHED_RR, os.sched_param(_REALTIME_PRIORITY))
+            os.sched_setscheduler(self.pid, os.SCHED_RR, os.sched_param(priority))
         except OSError:
             return False
         return True

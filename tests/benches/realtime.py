@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import os
 
-PRIORITY = 1  # below the 10 of launched flights
+CLIENT_PRIORITY = 1  # below the 10 of launched flights
 
 
-def request_realtime(pid: int) -> bool:
-    """Schedule a process that has just started before those of normal priority; whether that is permitted."""
+def request_realtime(pid: int, priority: int = CLIENT_PRIORITY) -> bool:
+    """Schedule a process that has just started, or this thread (0), first; whether that is permitted."""
     try:
-        os.sched_setscheduler(pid, os.SCHED_RR, os.sched_param(PRIORITY))
+        os.sched_setscheduler(pid, os.SCHED_RR, os.sched_param(priority))
     except PermissionError:
         return False
     return True

@@ -301,6 +301,10 @@ def test_two_launches_at_once_beside_another_simulator(start: Callable[..., Laun
 
 def test_operator_verbs(start: Callable[..., Launched]) -> None:
     launched = start(*TWO, *AIR, "--duration", "120")
+    launched.until_phase("CONNECT", 2)
+    early = launched.verb("hold")  # the estimators need four seconds more
+    assert early.returncode == 4, early.stdout
+    assert re.search(r"hold: agent-0 is in (CONNECT|STANDBY) and ignores it; it is obeyed in TRACK", early.stderr)
     launched.until_phase("TRACK", 2)
     statuses = json.loads(launched.verb("status", "--json").stdout)
     assert [status["agent"] for status in statuses] == [0, 1]

@@ -13,17 +13,18 @@ import pytest
 
 import swarmctl.ops.recovery
 import swarmctl.ops.supervisor
-from swarmctl.bus.json_messages import ObstaclesMessage, StatusMessage, decode_command, decode_obstacles, encode_message
+from swarmctl.bus.json_messages import ObstaclesMessage, decode_command, decode_obstacles, encode_message
 from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.bus.topics import COMMAND, OBSTACLES, OPERATOR, STATUS
 from swarmctl.config import load
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.types import FlightMode, Landed, Mode, Phase
+from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START
 from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, Command, RunContext, kill_all
 from swarmctl.ops.status_table import AgentView
 from swarmctl.ops.supervisor import FlightSupervisor, LaunchResult, Services
 from swarmctl.telemetry.recording.event_log import EventLog
+from tests import builders
 
 pytestmark = pytest.mark.process
 
@@ -43,9 +44,7 @@ def ends(code: int, after_s: float = 0.3) -> str:
 
 
 def status_of(agent: int, phase: Phase, utc_us: int) -> bytes:
-    said = (Mode.TRACKING, FlightMode.EXTERNAL, True, Landed.IN_AIR, 0, "", 0.1, 1.0, 2.0, 9, 0, 5.0, 0, "", False)
-    message = StatusMessage(agent, 1, agent + 1, phase, *said, utc_us)
-    return encode_message(message)
+    return encode_message(builders.status_message(agent=agent, phase=phase, utc_us=utc_us))
 
 
 class ScriptedServices(Services):

@@ -13,7 +13,6 @@ import psutil
 import pytest
 
 from tests.process.test_launch import Launched
-from tests.real import priority
 from tests.real.autopilots import Fleet, Kind
 from tests.real.network import Network, own_network
 from tests.real.witness import Truth, Witness
@@ -23,7 +22,7 @@ class Inside(Launched):
     """A launch in a network."""
 
     def __init__(self, network: Network, run_dir: Path, temp: Path, *arguments: str) -> None:
-        self.prefix = (*network.prefix, *priority.prefix(priority.AGENTS))
+        self.prefix = network.prefix
         super().__init__(run_dir, temp, *arguments, "--no-view", "--set", "telemetry.enabled=false")
 
 

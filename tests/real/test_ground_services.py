@@ -13,7 +13,6 @@ from typing import Any
 import pytest
 
 from tests.process.test_readme import ROOT
-from tests.real import priority
 from tests.real.autopilots import PX4
 from tests.real.conftest import Field, Fielder
 
@@ -35,8 +34,7 @@ url = "udpin://127.0.0.1:14540"
 
 
 def swarmctl(here: Field, *arguments: str) -> subprocess.CompletedProcess[str]:
-    prefix = (*here.fleet.network.prefix, *priority.prefix(priority.AGENTS))
-    command = [*prefix, sys.executable, "-m", "swarmctl", *arguments]
+    command = [*here.fleet.network.prefix, sys.executable, "-m", "swarmctl", *arguments]
     return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=120)
 
 

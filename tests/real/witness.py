@@ -22,7 +22,7 @@ from pymavlink.dialects.v20 import development as mav
 from swarmctl.core.types import GeoOrigin
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import cut_frames, frames, message_id
-from tests.real import priority
+from tests.benches.realtime import request_realtime
 from tests.real.autopilots import ARDUCOPTER, Fleet
 
 ARMED_FLAG = 128
@@ -38,6 +38,7 @@ ASKED_US = {
     mav.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 1_000_000,
 }
 GRID_S = 0.04
+_FEED_PRIORITY = 12  # above launched agents, at 10: a late position is a wrong one
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,7 +207,7 @@ class Witness:
         return [UdpLink(14550, 18570), *(UdpLink(19410 + i, 19450) for i in each)]
 
     def _listen(self) -> None:
-        priority.raise_thread(priority.FEED)
+        request_realtime(0, _FEED_PRIORITY)
         asked_s = 0.0
         while not self._ending.is_set():
             now_s = time.monotonic()

@@ -16,7 +16,7 @@ from rich.console import Console
 from swarmctl.bus.json_messages import StatusMessage
 from swarmctl.bus.zenoh_bus import SCHEME
 from swarmctl.config import Config, dump, load
-from swarmctl.core.types import FlightMode, Landed, Mode, Phase
+from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, StartError, SwarmError
 from swarmctl.ops import operator, preflight
 from swarmctl.ops.fault import inject, parse_fault
@@ -33,6 +33,7 @@ from swarmctl.ops.status_table import (
 from swarmctl.ops.summary import summary_lines, violation_lines
 from swarmctl.ops.supervisor import why_it_failed
 from swarmctl.process_lifetime import StopRequest
+from tests import builders
 
 
 def test_vehicle_ports_are_held_and_are_not_those_every_simulator_sends_to() -> None:
@@ -147,8 +148,9 @@ def test_command_lines_say_what_the_configuration_says(tmp_path: Path) -> None:
 
 
 def status(phase: int = Phase.TRACK, separation_m: float = 1.25, active_alert: str = "") -> StatusMessage:
-    said = (Mode.TRACKING, FlightMode.EXTERNAL, True, Landed.IN_AIR, 0, "", 0.1234, separation_m, 2.0, 100, 3, 20.0, 0)
-    return StatusMessage(0, 1, 1, phase, *said, active_alert)
+    return builders.status_message(
+        phase=phase, position_error_m=0.1234, separation_m=separation_m, deadline_misses=3, active_alert=active_alert
+    )
 
 
 def test_plain_lines_speak_on_changes_only() -> None:

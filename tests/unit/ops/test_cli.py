@@ -19,8 +19,10 @@ from sitl.studies.bench import command
 from swarmctl.control.mpc.solvers.qp import SOLVERS
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import OperatorVerb, Order, VerbArgument
+from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, MissionError, StartError, exit_code_of
 from swarmctl.ops import cli, operator
+from tests import builders
 
 Run = Callable[..., int]
 HEAVY = ("numpy", "scipy", "osqp", "zenoh", "rerun", "pyarrow", "pydantic", "mavsdk", "pymavlink", "psutil", "msgspec")
@@ -373,3 +375,20 @@ def test_a_runtime_directory_of_another_user_is_not_used(monkeypatch: pytest.Mon
     operator.announce(launch)
     assert list(runtime.iterdir()) == []
     assert operator.find_launch(None) == launch
+
+
+@pytest.mark.parametrize(
+    ("verb", "phases", "ignored"),
+    [
+        ("hold", {0: Phase.TRACK, 1: Phase.TAKEOFF}, ["agent-1 is in TAKEOFF and ignores it; it is obeyed in TRACK"]),
+        ("hold", {0: Phase.TRACK}, ["agent-1 does not answer"]),
+        ("land", {0: Phase.CONNECT, 1: Phase.LAND}, []),
+        ("rtl", {0: Phase.TAKEOFF, 1: Phase.DONE}, []),
+        ("resume", {0: Phase.TRACK, 1: Phase.LAND}, ["agent-1 is in LAND and ignores it"]),
+    ],
+)
+def test_who_ignores_an_order_is_named(verb: str, phases: dict[int, Phase], ignored: list[str]) -> None:
+    statuses = {agent: builders.status_message(agent=agent, phase=phase) for agent, phase in phases.items()}
+    found = operator.ignored_by(Order(verb), statuses, range(2))
+    assert len(found) == len(ignored)
+    assert all(text.startswith(start) for text, start in zip(found, ignored, strict=True))
