@@ -63,6 +63,8 @@ def run_name(name: str) -> str:
 
 def wants_realtime(config: Config) -> bool:
     """Return whether the flight is to have real-time priority and leaves the processors some time for others."""
+    if sys.platform != "linux":
+        return False
     return config.agent.realtime and config.swarm.agents <= _AGENTS_PER_PROCESSOR * len(os.sched_getaffinity(0))
 
 
@@ -175,8 +177,8 @@ class Child:
         It must have just been started: threads that it starts later inherit the priority. A higher real-time priority
         that the launcher was started with is kept.
         """
-        priority = max(_REALTIME_PRIORITY, os.sched_getparam(self.pid).sched_priority)
         try:
+            priority = max(_REALTIME_PRIORITY, os.sched_getparam(self.pid).sched_priority)
             os.sched_setscheduler(self.pid, os.SCHED_RR, os.sched_param(priority))
         except OSError:
             return False
