@@ -34,7 +34,7 @@ SITL = "sitl"
 VIEWER = "viewer"
 _TAIL_BYTES = 4096
 _REALTIME_PRIORITY = 10  # above every program of normal priority, below the kernel's own threads at 50
-_AGENTS_PER_PROCESSOR = 3  # more at real-time priority could leave nothing for shells and the launcher itself
+_AGENTS_PER_PROCESSOR = 2  # more at real-time priority could leave nothing for shells and the launcher itself
 
 
 @dataclass(frozen=True, slots=True)

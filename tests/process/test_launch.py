@@ -21,7 +21,9 @@ from typing import Any
 import psutil
 import pytest
 
+from swarmctl.config import load
 from swarmctl.core.types import Phase
+from swarmctl.ops.processes import wants_realtime
 from tests.benches.realtime import request_realtime
 from tests.process.test_readme import ROOT, landed, shown
 
@@ -148,8 +150,9 @@ def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Callable[..., La
     launched.until_phase("TRACK", 3)
     assert launched.verb("status").returncode == 0
     (started,) = launched.events("started")
-    assert started["realtime"] == may_run_in_realtime()
-    policy = os.SCHED_RR if may_run_in_realtime() else os.SCHED_OTHER
+    realtime = may_run_in_realtime() and wants_realtime(load(None, ("swarm.agents=3",)))
+    assert started["realtime"] == realtime
+    policy = os.SCHED_RR if realtime else os.SCHED_OTHER
     for words in (["swarmctl.bus.zenoh_bus"], ["sitl"], *(["agent", "--id", str(i)] for i in range(3))):
         assert policies(launched.pid_of(*words)) == {policy}, words
     viewer = launched.pid_of("swarmctl.telemetry.view.viewer")

@@ -13,9 +13,9 @@ from swarmctl.ops.processes import wants_realtime
 @pytest.mark.parametrize(
     ("processors", "sets", "wanted"),
     [
-        (2, ("swarm.agents=6",), True),
-        (2, ("swarm.agents=7",), False),  # they could leave nothing for a shell
-        (1, ("swarm.agents=3",), True),
+        (2, ("swarm.agents=4",), True),
+        (2, ("swarm.agents=5",), False),  # they could leave nothing for a shell
+        (1, ("swarm.agents=2",), True),
         (8, ("swarm.agents=3", "agent.realtime=false"), False),
     ],
 )
