@@ -47,9 +47,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
     The longest come first. A file that flies in real time leaves its processor half idle, while others compute.
     """
-    files = {item.path: place(item.path) for item in items}
-    order = {path: number for number, path in enumerate(sorted(files, key=files.__getitem__))}
-    items.sort(key=lambda item: order[item.path])
+    items.sort(key=lambda item: place(item.path))
 
 
 def place(path: Path) -> tuple[int, int, str]:
