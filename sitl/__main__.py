@@ -81,6 +81,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--control", type=Path, metavar="SOCKET", help="take faults here; see swarmctl fault")
     add("--events", type=Path, metavar="FILE", help="append faults as JSON lines")
     add("--stats", type=Path, metavar="FILE", help="write what the loop has done at the end, as JSON")
+    realtime_help = "be scheduled before other programs, where that is permitted"
+    add("--realtime", action=argparse.BooleanOptionalAction, default=True, help=realtime_help)
     add("--die-with-parent", action="store_true", help="be killed when the starting process ends (Linux)")
     return parser
 
@@ -104,6 +106,10 @@ def main(arguments: list[str] | None = None) -> int:
         from swarmctl.process_lifetime import die_with_parent
 
         die_with_parent()
+    if options.realtime and not options.lockstep:
+        from swarmctl.process_priority import request_realtime
+
+        request_realtime()
     try:
         return _run(options)
     except SwarmError as error:

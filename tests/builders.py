@@ -78,6 +78,7 @@ def status_message(
         plan_staleness_ms=20.0,
         solver_failed=0,
         active_alert=active_alert,
+        uses_commitments=False,
         utc_us=utc_us,
     )
 

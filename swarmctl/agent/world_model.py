@@ -28,7 +28,7 @@ from swarmctl.core.trajectory_message import TrajectoryMessage
 from swarmctl.core.types import Array, Mode, Phase
 
 _RECENT_PATH_US = 300_000  # largest age of a path that is compared with commitments
-_READY_LEAD_US = 1_000_000  # largest lead of a peer's clock over ours
+_STATUS_LEAD_US = 1_000_000  # largest lead of a peer's clock over ours
 FLOWN_BY_AGENT = frozenset((Mode.TRACKING, Mode.REPLAY, Mode.BRAKE, Mode.HOLD))
 
 
@@ -92,12 +92,12 @@ class WorldModel:
             reason = IDENTITY
         elif status.agent not in self._verifiers:
             reason = UNKNOWN_PEER
-        elif status.ready_utc_us > utc_us + _READY_LEAD_US:
+        elif max(status.utc_us, status.ready_utc_us) > utc_us + _STATUS_LEAD_US:
             reason = FUTURE
         if reason or status is None:
             self.refusals.add(sender, topics.STATUS.name, reason, utc_us)
         elif self._verifiers[status.agent].accepts(
-            ReceivedMessage(status.boot_id, status.ticks, utc_us, payload), utc_us
+            ReceivedMessage(status.boot_id, status.ticks, status.utc_us, payload), utc_us
         ):
             self._status[status.agent] = status
 

@@ -43,8 +43,8 @@ class StatusMessage(msgspec.Struct, frozen=True, kw_only=True):
     plan_staleness_ms: float
     solver_failed: int
     active_alert: str  # newest one, "" for none
-    uses_commitments: bool = False  # it flies committed trajectories only, see `control.commit`
-    utc_us: Count = 0  # time of sending, by the agent's clock
+    uses_commitments: bool  # it flies committed trajectories only, see `control.commit`
+    utc_us: Count  # time of sending, by the agent's clock
 
 
 class CommandMessage(msgspec.Struct, frozen=True):

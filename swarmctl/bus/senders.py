@@ -79,7 +79,7 @@ class ReceivedMessage(NamedTuple):
 
     boot_id: int
     seq: int
-    sent_utc_us: int  # by its stamp, or the time of reception if it has none
+    sent_utc_us: int  # by its stamp
     payload: bytes
 
 

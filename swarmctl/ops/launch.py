@@ -38,6 +38,7 @@ from swarmctl.ops.status_table import Display, open_display
 from swarmctl.ops.summary import sum_up
 from swarmctl.ops.supervisor import FlightSupervisor, Services
 from swarmctl.process_lifetime import StopRequest
+from swarmctl.process_priority import request_realtime
 from swarmctl.telemetry.recording.event_log import EventLog
 
 _BUS_S = 20.0  # timeout for the router to answer
@@ -175,7 +176,7 @@ class Launcher(Services):
     def _started(self, command: Command, directory: Path) -> Child:
         child = Child(command, directory)
         if self._realtime and command.in_control_loop:
-            self._realtime = child.request_realtime()
+            self._realtime = request_realtime(child.pid)
         return child
 
     def _join_bus(self) -> ZenohBus:

@@ -33,7 +33,6 @@ ROUTER = "router"
 SITL = "sitl"
 VIEWER = "viewer"
 _TAIL_BYTES = 4096
-_REALTIME_PRIORITY = 10  # above every program of normal priority, below the kernel's own threads at 50
 _AGENTS_PER_PROCESSOR = 2  # more at real-time priority could leave nothing for shells and the launcher itself
 
 
@@ -113,6 +112,7 @@ def sitl_command(
     argv += ("--control", f"{control_socket(context.endpoint)}")
     argv += ("--events", f"{context.directory / 'sitl.events.jsonl'}")
     argv += ("--truth", f"{context.directory / 'truth.bin'}", "--die-with-parent")
+    argv += () if wants_realtime(config) else ("--no-realtime",)
     return Command(SITL, argv, fds)
 
 
@@ -170,19 +170,6 @@ class Child:
             except OSError as error:
                 raise StartError(f"{command.name}: {command.argv[0]} can't be started: {error}") from error
         self.pid = self._process.pid
-
-    def request_realtime(self) -> bool:
-        """Schedule the process before all of normal priority (SCHED_RR); return False where that is not permitted.
-
-        It must have just been started: threads that it starts later inherit the priority. A higher real-time priority
-        that the launcher was started with is kept.
-        """
-        try:
-            priority = max(_REALTIME_PRIORITY, os.sched_getparam(self.pid).sched_priority)
-            os.sched_setscheduler(self.pid, os.SCHED_RR, os.sched_param(priority))
-        except OSError:
-            return False
-        return True
 
     def poll(self) -> int | None:
         """Return the exit code as a shell does (128 + signal), or None while running."""

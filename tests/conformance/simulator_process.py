@@ -12,7 +12,6 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from tests.benches.free_ports import free_ports
-from tests.benches.realtime import request_realtime
 
 ROOT = Path(__file__).resolve().parents[2]
 SPEED = 4  # simulated seconds a second: what clients wait for is flight
@@ -32,7 +31,6 @@ def simulator(preset: str = "x500", speed: float = SPEED, port: int | None = Non
         stdout=subprocess.PIPE,
         text=True,
     )
-    request_realtime(process.pid)
     try:
         yield port
         process.send_signal(signal.SIGTERM)

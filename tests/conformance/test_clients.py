@@ -23,8 +23,8 @@ from pymavlink.dialects.v20 import development as mav
 
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import message_id
+from swarmctl.process_priority import request_realtime
 from tests.benches.free_ports import free_ports
-from tests.benches.realtime import request_realtime
 from tests.conformance import vocabulary as v
 from tests.conformance.dialogue import Dialogue
 from tests.conformance.partners import InProcess
@@ -100,7 +100,7 @@ class Console:
             text=True,
             bufsize=1,
         )
-        request_realtime(self._process.pid)
+        request_realtime(self._process.pid)  # a client without processor loses datagrams
         self._lines: queue.Queue[str] = queue.Queue()
         self.said: list[str] = []
         self._reader = threading.Thread(target=self._read, daemon=True)

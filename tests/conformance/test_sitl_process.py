@@ -19,6 +19,7 @@ from pymavlink.dialects.v20 import development as mav
 from swarmctl.core.records import TRUTH_DTYPE
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames
+from tests.benches.scheduling import may_run_in_realtime, policies
 
 pytestmark = pytest.mark.process
 
@@ -69,6 +70,14 @@ def test_a_signal_ends_it_cleanly_with_all_truth_written(tmp_path: Path, number:
     assert len(rows) >= 3 * 30
     assert rows["t_us"][-1] <= time.monotonic_ns() // 1000
     np.testing.assert_allclose(rows["pos_ned_m"][:3, 0], [-1.0, 0.0, 1.0], atol=1e-6)
+
+
+@pytest.mark.parametrize(("arguments", "wants"), [((), True), (("--no-realtime",), False), (("--lockstep",), False)])
+def test_other_programs_wait_for_the_vehicles(arguments: tuple[str, ...], wants: bool) -> None:
+    process, _ = start(*arguments)
+    scheduled = policies(process.pid)
+    stop(process)
+    assert scheduled == {os.SCHED_RR if wants and may_run_in_realtime() else os.SCHED_OTHER}
 
 
 def test_a_second_simulator_takes_the_next_ports() -> None:

@@ -24,7 +24,7 @@ import pytest
 from swarmctl.config import load
 from swarmctl.core.types import Phase
 from swarmctl.ops.processes import wants_realtime
-from tests.benches.realtime import request_realtime
+from tests.benches.scheduling import may_run_in_realtime, policies
 from tests.process.test_readme import ROOT, landed, shown
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
@@ -110,19 +110,6 @@ class Launched:
     def landed(self) -> dict[int, bool]:
         """Whether each vehicle ended on the ground, in truth."""
         return landed(self.run_dir)
-
-
-def policies(pid: int) -> set[int]:
-    """Scheduling policies of all threads of a process."""
-    return {os.sched_getscheduler(int(task.name)) for task in Path(f"/proc/{pid}/task").iterdir()}
-
-
-def may_run_in_realtime() -> bool:
-    """Whether this user may start processes at real-time priority."""
-    with subprocess.Popen(["sleep", "60"]) as process:
-        permitted = request_realtime(process.pid)
-        process.kill()
-    return permitted
 
 
 @pytest.fixture

@@ -22,7 +22,7 @@ from pymavlink.dialects.v20 import development as mav
 from swarmctl.core.types import GeoOrigin
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import cut_frames, frames, message_id
-from tests.benches.realtime import request_realtime
+from swarmctl.process_priority import request_realtime
 from tests.real.autopilots import ARDUCOPTER, Fleet
 
 ARMED_FLAG = 128

@@ -193,14 +193,14 @@ class Formation:
             )
             bus.publish(topics.PATH, encode_path(message))
             if now_us % _STATUS_EVERY_US == 0:
-                bus.publish(topics.STATUS, encode_message(self._status(i + 1, began_s >= 0.0)))
+                bus.publish(topics.STATUS, encode_message(self._status(i + 1, began_s >= 0.0, utc_us)))
         if now_us % _OBSTACLES_EVERY_US == 0:
             self._operator.publish(
                 topics.OBSTACLES,
                 encode_message(ObstaclesMessage(1, self._config.obstacles)),
             )
 
-    def _status(self, agent: int, tracking: bool) -> StatusMessage:
+    def _status(self, agent: int, tracking: bool, utc_us: int) -> StatusMessage:
         phase = Phase.TRACK if tracking else Phase.READY
         return StatusMessage(
             agent=agent,
@@ -216,9 +216,11 @@ class Formation:
             position_error_m=0.0,
             separation_m=0.0,
             tick_p99_ms=0.0,
-            ticks=0,
+            ticks=self._seq,
             deadline_misses=0,
             plan_staleness_ms=0.0,
             solver_failed=0,
             active_alert="",
+            uses_commitments=False,
+            utc_us=utc_us,
         )

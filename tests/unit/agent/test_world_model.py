@@ -54,7 +54,7 @@ class Bench:
         self.peer.publish(topics.PATH, encode_path(path))
 
     def say_status(self, **fields: Any) -> None:
-        said = msgspec.structs.replace(STATUS, agent=1, ticks=self.seq, ready_utc_us=0)
+        said = msgspec.structs.replace(STATUS, agent=1, ticks=self.seq, ready_utc_us=0, utc_us=self.clock.utc_us())
         self.peer.publish(topics.STATUS, encode_message(msgspec.structs.replace(said, **fields)))
 
     def set_obstacles(self, count: int, version: int) -> None:
@@ -164,6 +164,22 @@ def test_statuses_are_accepted_like_paths_and_future_ready_times_refused() -> No
     bench.tick()
     assert bench.world_model.peers()[1] == ready
     assert bench.rejected == {"unconfirmed": 2, "future": 1}
+
+
+def test_statuses_that_waited_for_a_late_receiver_are_no_forgeries() -> None:
+    """Three are read in one tick: more numbers than its time since the last reading allows."""
+    bench = Bench()
+    bench.say_status()
+    bench.tick()
+    for _ in range(3):
+        bench.seq += 11
+        bench.clock.advance(11 * TICK_US)
+        bench.say_status()
+    bench.tick()
+    bench.seq += 11
+    bench.say_status(ticks=bench.seq + 11)  # sent too early by its own stamp
+    bench.tick()
+    assert bench.rejected == {"unconfirmed": 1}
 
 
 def test_a_status_under_a_foreign_or_unknown_name_is_refused() -> None:

@@ -57,6 +57,8 @@ STATUS = StatusMessage(
     plan_staleness_ms=41.5,
     solver_failed=1,
     active_alert="plan residual",
+    uses_commitments=False,
+    utc_us=UTC_US,
 )
 
 
