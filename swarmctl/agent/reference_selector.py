@@ -56,9 +56,12 @@ class ReferenceSelector:
         self._report(now_us)
 
     def reference(self, now_us: int, utc_us: int, ahead_s: Array) -> tuple[Reference, Reference]:
-        """Return the reference at times `ahead_s` (N,) from now, (N, 3) each, and the mission's own one now, (1, 3)."""
+        """Return the reference at times `ahead_s` (N,) from now, (N, 3) each, and the mission's own one now, (1, 3).
+
+        The mission's own one is that which agents share, without the own place around it.
+        """
         pos, vel = self._state_machine.reference(utc_us, now_us, np.concatenate([[0.0], ahead_s]))
-        now_ref = Reference(pos[:1], vel[:1], self._yaw_rad)
+        now_ref = Reference(pos[:1] - self._state_machine.place_offset_ned_m, vel[:1], self._yaw_rad)
         if self._recovery.active:
             return Reference(*self._recovery.sample(ahead_s), self._yaw_rad), now_ref
         return Reference(pos[1:], vel[1:], self._yaw_rad), now_ref

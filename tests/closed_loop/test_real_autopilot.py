@@ -128,6 +128,38 @@ def test_three_vehicles_without_lag_and_dead_time_in_the_prediction_do_not() -> 
     assert true_m < 0.6
 
 
+IN_A_ROW = (
+    *("sitl.start=air", "mission.duration_s=16", "start.center_ned_m=[5, 0, -3]"),
+    *("start.direction_ned=[0, 1, 0]", "start.spacing_m=1"),  # along the motion
+)
+
+
+def wandered_m(flight: Lockstep) -> float:
+    """Return how far any vehicle was from its mean place beside the reference, from 6 s on [m]."""
+    worst_m = 0.0
+    for agent in range(3):
+        ticks = tracked(flight, agent)
+        late = ticks[ticks["mission_t_s"] >= 6.0]
+        beside = (late["pos_ned_m"] - late["ref_pos_ned_m"])[:, :2]
+        worst_m = max(worst_m, float(np.linalg.norm(beside - beside.mean(axis=0), axis=1).max()))
+    return worst_m
+
+
+def test_three_vehicles_keep_their_assigned_places_around_the_reference() -> None:
+    flight = fly(*IN_A_ROW, "mission.circle.goal_assignment=true")
+    summed_mean_error_m, reported_m, true_m = together(flight)
+    assert wandered_m(flight) <= 0.06
+    assert summed_mean_error_m <= 1.70, "three times 0.95 m / sqrt(3) is 1.645 m"
+    assert reported_m >= 0.90
+    assert true_m >= 0.88
+
+
+def test_three_vehicles_without_assigned_places_push_each_other_around_it() -> None:
+    flight = fly(*IN_A_ROW)
+    assert wandered_m(flight) > 0.12
+    assert together(flight)[1] < 0.89
+
+
 # -- separation radius and reported accuracy --------------------------------------------------------------------------
 
 

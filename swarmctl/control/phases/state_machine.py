@@ -170,7 +170,7 @@ class MissionStateMachine:
 
     def reference(self, utc_us: int, now_us: int, offsets_s: Array) -> tuple[Array, Array]:
         """Return reference positions and velocities, (K, 3) each, NED, at `offsets_s` (K,) from now."""
-        if self.phase is Phase.TRACK and not (self.held or self.paused) and self.begin_utc_us is not None:
+        if self._follows_mission and self.begin_utc_us is not None:
             pos, vel = self._reference.sample((utc_us - self.begin_utc_us) * 1e-6 + offsets_s)
             if self._rejoin_offset is not None:
                 trajectory, began_us = self._rejoin_offset
@@ -181,6 +181,15 @@ class MissionStateMachine:
             trajectory, began_us = self._trajectory
             return trajectory.sample((now_us - began_us) * 1e-6 + offsets_s)
         return np.tile(self._start_ned_m, (len(offsets_s), 1)), np.zeros((len(offsets_s), 3))
+
+    @property
+    def place_offset_ned_m(self) -> Array:
+        """Return by how much the present reference (3,) is beside the one that several agents share."""
+        return self._reference.offset_ned_m if self._follows_mission else np.zeros(3)
+
+    @property
+    def _follows_mission(self) -> bool:
+        return self.phase is Phase.TRACK and not (self.held or self.paused) and self.begin_utc_us is not None
 
     def begin_if_due(self, now_us: int, utc_us: int) -> None:
         """Enter TRACK on time. Called before planning, so that the first plan of the mission follows its reference."""

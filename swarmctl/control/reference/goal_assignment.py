@@ -1,9 +1,9 @@
-"""Goal assignment: agents sent to one point each get a place of their own around it.
+"""Goal assignment: agents sent to one point, at rest or moving, each get a place of their own around it.
 
-Without it they push for ever and stop wherever they block each other: of three agents one stops on the goal and two
-beside it, with a sum of distances 18 % above the least. The places are those points of a triangular lattice whose sum
-of distances to the goal is least. Every agent knows all starts and goals and computes the same places, so nothing has
-to be agreed in flight and no leader can be lost.
+Without it they push for ever and stay wherever they block each other: of three agents one ends on the goal and two
+beside it, with a sum of distances up to 18 % above the least, and which of the two it is may be chance. The places are
+those points of a triangular lattice whose sum of distances to the goal is least. Every agent knows all starts and goals
+and computes the same places, so nothing has to be agreed in flight and no leader can be lost.
 """
 
 from __future__ import annotations
@@ -23,13 +23,16 @@ _FAIRNESS = 1e-4  # weight of the sum of squares, which breaks ties in favour of
 _TINY_M, _TINY_M2 = 1e-6, 1e-6  # above rounding: all computers must choose alike
 
 
-def assigned_goals_ned_m(starts_ned_m: Array, goals_ned_m: Array, apart_m: float) -> tuple[Array, list[list[int]]]:
+def assigned_goals_ned_m(
+    starts_ned_m: Array, goals_ned_m: Array, apart_m: float, room: float = ROOM
+) -> tuple[Array, list[list[int]]]:
     """Return goals (N, 3) NED [m] that all agents can occupy at once, and the groups that share a goal.
 
     Args:
         starts_ned_m: (N, 3) start of each agent.
         goals_ned_m: (N, 3) requested goal of each agent.
         apart_m: distance that agents keep.
+        room: factor by which places are farther apart.
 
     Returns:
         Places at the height of the goal; an agent that shares none keeps its own. Groups of agent indices, sorted.
@@ -40,7 +43,7 @@ def assigned_goals_ned_m(starts_ned_m: Array, goals_ned_m: Array, apart_m: float
         for members in groups:
             if len(members) > 1:
                 center = goals_ned_m[members].mean(axis=0)
-                offsets = ROOM * apart_m * arrangement(len(members))
+                offsets = room * apart_m * arrangement(len(members))
                 places[members] = center
                 places[members, :2] += _assigned(starts_ned_m[members, :2] - center[:2], offsets)
     return places, groups

@@ -50,6 +50,10 @@ class MissionKind(Params):
     def reference(self, place: Place) -> Sampled:
         """Return the reference of one agent as a function of mission time."""
 
+    def offset_ned_m(self, place: Place) -> Array:
+        """Return what an agent adds to its reference (3,), because several share it."""
+        return np.zeros(3)
+
     def problems(self, agents: int) -> Iterator[str]:
         """Yield problems that involve several keys, if this kind is flown."""
         yield from ()
@@ -74,6 +78,23 @@ def mission_kind(name: str) -> Callable[[type[M]], type[M]]:
     return registered
 
 
+class SharedReference(MissionKind):
+    """Base of the parameters of a mission in which all agents have the same reference."""
+
+    goal_assignment: bool = False  # each agent follows a place of its own around the reference
+
+    def offset_ned_m(self, place: Place) -> Array:
+        """Return the agent's place around the reference: as near as the distances that agents keep allow."""
+        if not self.goal_assignment:
+            return np.zeros(3)
+        first = self.reference(place)(np.zeros(1))[0]
+        shared = np.tile(first, (len(place.starts_ned_m), 1))
+        offset: Array = (
+            assigned_goals_ned_m(place.starts_ned_m, shared, place.apart_m, room=1.0)[0][place.agent] - first[0]
+        )
+        return offset
+
+
 @mission_kind("hover")
 class HoverParams(MissionKind):
     """Lets every agent stay at its start."""
@@ -84,7 +105,7 @@ class HoverParams(MissionKind):
 
 
 @mission_kind("circle")
-class CircleParams(MissionKind):
+class CircleParams(SharedReference):
     """Describes a climbing circle `center + (r cos wt, r sin wt, climb t)` (thesis 4.3; tracking sets have r 0.5)."""
 
     center_ned_m: Vec3 = (0.0, 0.0, -1.0)  # of the circle at mission start
@@ -105,7 +126,7 @@ class CircleParams(MissionKind):
 
 
 @mission_kind("line")
-class LineParams(MissionKind):
+class LineParams(SharedReference):
     """Describes a straight line at constant velocity (thesis 4.4)."""
 
     origin_ned_m: Vec3 = (2.0, 2.0, -2.0)  # position at mission start
@@ -117,7 +138,7 @@ class LineParams(MissionKind):
 
 
 @mission_kind("steps")
-class StepsParams(MissionKind):
+class StepsParams(SharedReference):
     """Describes piecewise constant positions: rows of `[from_s, x, y, z]` in order of time (thesis 2.4)."""
 
     rows: tuple[Waypoint, ...] = Field(((0.0, 1.0, 1.0, -1.0),), strict=False)  # the first from 0 s on
@@ -242,17 +263,21 @@ class MissionReference:
         starts_ned_m: (agents, 3) start positions.
         agent: own index.
         apart_m: distance that agents keep, for goals that several share.
+
+    Attributes:
+        offset_ned_m: own place (3,) around a reference that several share; the error of tracking is that to the latter.
     """
 
     def __init__(self, params: MissionParams, starts_ned_m: Array, agent: int, apart_m: float = 0.0) -> None:
         self._mission, self._start_ned_m = params.flown(), starts_ned_m[agent]
-        self._sampled = self._mission.reference(Place(starts_ned_m=starts_ned_m, agent=agent, apart_m=apart_m))
+        place = Place(starts_ned_m=starts_ned_m, agent=agent, apart_m=apart_m)
+        self._sampled, self.offset_ned_m = self._mission.reference(place), self._mission.offset_ned_m(place)
 
     def sample(self, t_s: Array) -> tuple[Array, Array]:
         """Return positions and velocities, (K, 3) NED each, at mission times `t_s` (K,); at rest before 0."""
         pos, vel = self._sampled(np.maximum(t_s, 0.0))
         vel[t_s < 0.0] = 0.0
-        return pos, vel
+        return pos + self.offset_ned_m, vel
 
     def excess(self, pos_ned_m: Array, vel_ned_m_s: Array) -> str:
         """Say why the flight must end at this position and velocity (3,) NED, or ""."""

@@ -123,3 +123,20 @@ def test_all_agents_compute_the_same_places() -> None:
     np.testing.assert_array_equal(
         MissionReference(alone, starts, 1, APART_M).sample(np.array([60.0]))[0][0], [0, 0, -1]
     )
+
+
+@pytest.mark.parametrize("kind", ["circle", "line", "steps"])
+def test_each_agent_has_a_place_around_a_reference_that_moves(kind: str) -> None:
+    starts, times_s = np.array([[4.0, 0.0, -1.0], [-1.0, 1.7, -1.0], [-2.0, -3.4, -2.0]]), np.array([0.0, 3.0, 20.0])
+    shared = MissionReference(MissionParams.model_validate({"kind": kind}), starts, 0, APART_M)
+    np.testing.assert_array_equal(shared.offset_ned_m, np.zeros(3))
+    mission = MissionParams.model_validate({"kind": kind, kind: {"goal_assignment": True}})
+    own = [MissionReference(mission, starts, agent, APART_M) for agent in range(3)]
+    offsets = np.array([reference.offset_ned_m for reference in own])
+    assert closest_m(offsets) == pytest.approx(APART_M), "the distance that plans keep, and no more"
+    np.testing.assert_allclose(np.linalg.norm(offsets, axis=1), APART_M / math.sqrt(3.0), rtol=1e-6)
+    assert np.all(offsets[:, 2] == 0.0)
+    for reference in own:
+        pos, vel = reference.sample(times_s)
+        np.testing.assert_allclose(pos, shared.sample(times_s)[0] + reference.offset_ned_m)
+        np.testing.assert_array_equal(vel, shared.sample(times_s)[1])
