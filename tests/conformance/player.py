@@ -78,9 +78,8 @@ class Player:
         partner = self.dialogue.partner
         booting = row.start is v.State.BOOTING
         if partner.simulated or (partner.can_restart() and (row.needs_reboot or self._spoilt)):
-            partner.restart(booting)
+            partner.restart(booting)  # a real one keeps the parameters of the row before
             self.dialogue.begin()
-            self._original.clear()
         self._wait(lambda: bool(self.dialogue.sysid), 10.0, "no HEARTBEAT of component 1")
         if booting:
             return

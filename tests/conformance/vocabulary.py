@@ -230,7 +230,7 @@ class Says:
 
 @dataclass(frozen=True, slots=True)
 class SaysNothing:
-    """No STATUSTEXT for that long."""
+    """No STATUSTEXT for that long, but of the logger, which names its file whenever the disk has it."""
 
     for_s: float = 0.5
 
