@@ -23,6 +23,7 @@ from swarmctl.core.types import Array
 _STEP_DIRECTIONS = np.array(
     [(1, 0, 0), (0, 0, 0), (-1, 0, 0), (0, 0, 0), (0, 1, 0), (0, 0, 0), (0, -1, 0), (0, 0, 0), (0, 0, -1), (0, 0, 0)]
 )
+MOVING_ROOM = 1.02  # places round a moving reference are farther apart than plans keep: tracking errors differ
 OUTER_DELAY_S_M = 0.5  # delay of arrival per metre that a place is farther out
 Waypoint = Annotated[tuple[float, float, float, float], Field(strict=False)]
 Sampled = Callable[[Array], tuple[Array, Array]]  # positions and velocities (K, 3) NED at times (K,) >= 0 [s]
@@ -90,7 +91,7 @@ class SharedReference(MissionKind):
         first = self.reference(place)(np.zeros(1))[0]
         shared = np.tile(first, (len(place.starts_ned_m), 1))
         offset: Array = (
-            assigned_goals_ned_m(place.starts_ned_m, shared, place.apart_m, room=1.0)[0][place.agent] - first[0]
+            assigned_goals_ned_m(place.starts_ned_m, shared, place.apart_m, room=MOVING_ROOM)[0][place.agent] - first[0]
         )
         return offset
 

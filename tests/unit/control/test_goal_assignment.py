@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from sitl.studies.campaign.layouts import least_sum_m
 from swarmctl.control.reference.goal_assignment import ROOM, arrangement, assigned_goals_ned_m
-from swarmctl.control.reference.mission import OUTER_DELAY_S_M, GotoParams, MissionParams, MissionReference
+from swarmctl.control.reference.mission import MOVING_ROOM, OUTER_DELAY_S_M, GotoParams, MissionParams, MissionReference
 from swarmctl.core.types import Array
 
 APART_M = 0.9
@@ -133,8 +133,8 @@ def test_each_agent_has_a_place_around_a_reference_that_moves(kind: str) -> None
     mission = MissionParams.model_validate({"kind": kind, kind: {"goal_assignment": True}})
     own = [MissionReference(mission, starts, agent, APART_M) for agent in range(3)]
     offsets = np.array([reference.offset_ned_m for reference in own])
-    assert closest_m(offsets) == pytest.approx(APART_M), "the distance that plans keep, and no more"
-    np.testing.assert_allclose(np.linalg.norm(offsets, axis=1), APART_M / math.sqrt(3.0), rtol=1e-6)
+    assert closest_m(offsets) == pytest.approx(MOVING_ROOM * APART_M)
+    np.testing.assert_allclose(np.linalg.norm(offsets, axis=1), MOVING_ROOM * APART_M / math.sqrt(3.0), rtol=1e-6)
     assert np.all(offsets[:, 2] == 0.0)
     for reference in own:
         pos, vel = reference.sample(times_s)
