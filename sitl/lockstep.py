@@ -28,6 +28,7 @@ from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.config import Config
 from swarmctl.core.clock import SimClock
 from swarmctl.core.obstacle import Obstacle
+from swarmctl.core.operator_verbs import EXCLUDE
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE, tick_row
 from swarmctl.core.tick_record import TickRecord
 from swarmctl.kernels import why_not_repeatable
@@ -171,10 +172,17 @@ class Lockstep:
         if self.clock.now_us() % _TRUTH_EVERY_US == 0:
             self._truth.append(self.world.truth_rows())
 
-    def kill(self, index: int) -> None:
-        """End an agent's process: no more setpoints, and its bus session closes."""
+    def kill(self, index: int, *, vouched: bool = True) -> None:
+        """End an agent's process: no more setpoints, and its bus session closes.
+
+        Args:
+            index: agent.
+            vouched: tell the others, as a launcher does that sees the process end.
+        """
         self.agents[index] = None
         self.hub.detach(agent_name(index))
+        if vouched:
+            self.command(EXCLUDE, peer=index)
 
     def command(self, verb: str, agent: int = -1, **arguments: float) -> None:
         """Send an operator's order, as a verb does."""

@@ -13,7 +13,7 @@ from swarmctl.bus.json_messages import StatusMessage
 from swarmctl.control.collision.separation import KeepOut
 from swarmctl.control.mpc.problem import Start
 from swarmctl.core.trajectory import Trajectory
-from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
+from swarmctl.core.trajectory_message import Exclusions, Proposal, TrajectoryMessage
 from swarmctl.core.types import Array, FlightMode, Landed, Mode, Phase, PredictedPath, VehicleState
 
 LEVEL = np.array([1.0, 0.0, 0.0, 0.0])
@@ -153,6 +153,7 @@ def trajectory_message(
     is_committed: bool = True,
     proposal: Proposal | None = None,
     acknowledged: Mapping[int, int] = NOBODY,
+    exclusions: Exclusions | None = None,
 ) -> TrajectoryMessage:
     """Return the message of peer 1, which proposes nothing and has acknowledged nobody."""
     return TrajectoryMessage(
@@ -164,4 +165,5 @@ def trajectory_message(
         committed=committed,
         proposal=proposal,
         acknowledged=acknowledged,
+        exclusions=exclusions or Exclusions(),
     )

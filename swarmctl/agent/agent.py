@@ -43,7 +43,7 @@ from swarmctl.control.phases.overload import Level, Overload
 from swarmctl.control.setpoint import setpoint_of
 from swarmctl.core.clock import Clock
 from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned
-from swarmctl.core.operator_verbs import Order
+from swarmctl.core.operator_verbs import EXCLUDE, PEER, Order
 from swarmctl.core.tick_record import TickRecord, TickTiming
 from swarmctl.core.types import (
     MAX_MARGIN_M,
@@ -192,7 +192,10 @@ class Agent:
 
     def ask(self, order: Order, now_us: int) -> None:
         """Apply an operator's order."""
-        self._state_machine.operator(order, now_us, self._clock.utc_us(), self._autopilot.poll(now_us))
+        if order.verb == EXCLUDE:
+            self._world_model.exclude(int(order.arguments[PEER]))
+        else:
+            self._state_machine.operator(order, now_us, self._clock.utc_us(), self._autopilot.poll(now_us))
         self._note("operator", verb=order.verb, **order.arguments)
 
     def tick(self, now_us: int, deadline_misses: int) -> TickRecord:
@@ -473,6 +476,7 @@ class Agent:
             busy=self._commands.busy,
             mode=self._decision.mode,
             unresponsive_peer=self._directive.unresponsive_peer,
+            cut_off=self._directive.cut_off,
             peers=self._world_model.peers(),
             others_ned_m=self._world_model.others_ned_m(utc_us),
             arm_in=None if dialect is None else dialect.arm_in,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import asdict, replace
 
 import numpy as np
@@ -12,6 +12,7 @@ from swarmctl.bus import topics
 from swarmctl.bus.commitment_messages import PeerTrajectories, encode_trajectory_message
 from swarmctl.bus.peers import Bus, agent_name
 from swarmctl.control.collision.separation import KeepOut, SeparationParams
+from swarmctl.control.commit.membership import Membership
 from swarmctl.control.commit.protocol import CommitCounts, Commitments
 from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference, Situation
 from swarmctl.control.mpc.swarm_mpc import MpcParams
@@ -19,8 +20,8 @@ from swarmctl.core.trajectory import Times, Trajectory
 from swarmctl.core.trajectory_message import TrajectoryMessage
 from swarmctl.core.types import Array, Phase, VehicleState
 
-_LOST_AFTER_US = 100_000  # absence of a token after which its peer counts as lost
-_SETTLED_US = 2_000_000  # own presence on the bus after which absences of others count
+_SUSPECT_US = 3_000_000  # without a message, after which a peer is suspected: twice what a token outlives its process
+_CUT_OFF_US = 20_000_000  # at rest without the acknowledgements required, after which the agent lands where it is
 
 
 class Coordination:
@@ -35,12 +36,14 @@ class Coordination:
         rate_hz: tick rate of every agent.
         note: is told `conflicting_commitment` when a peer's committed trajectory comes too close to the own one;
             `tracking_violation` when the vehicle leaves its committed trajectory by more than `tracking_m` plus half of
-            the committed distance beyond touching bodies, and when it is back; and `commitments` with all counts when
-            the autopilot or a pilot takes over.
+            the committed distance beyond touching bodies, and when it is back; `membership` when the peers that are
+            suspected, promised to be excluded, or excluded change; and `commitments` with all counts when the autopilot
+            or a pilot takes over.
 
     Attributes:
         committed_peers: by agent number, the trajectories that each peer relied on may follow.
         lost_peer_keep_outs: keep-outs at the ends of lost peers' committed trajectories.
+        cut_off: why the agent has to land where it is: it waits for peers in vain, or they have excluded it; or "".
     """
 
     def __init__(
@@ -69,11 +72,13 @@ class Coordination:
         self._is_committed = False
         self._allowed_m = separation.budget.tracking_allowance_m
         self._is_violating, self._worst_m = False, 0.0
-        self._absent_since_us: dict[int, int] = {}
-        self._on_bus_since_us: int | None = None
+        self._membership = Membership(agent, peers)
+        self._membership_said: tuple[frozenset[int], ...] = (frozenset(),) * 3
+        self._begun_us: int | None = None
         self._conflicting: set[int] = set()
         self.committed_peers: Mapping[int, Sequence[Trajectory]] = {}
         self.lost_peer_keep_outs: list[KeepOut] = []
+        self.cut_off = ""
 
     @property
     def counts(self) -> CommitCounts:
@@ -81,28 +86,39 @@ class Coordination:
         return self._commitments.counts
 
     def receive(self, utc_us: int) -> None:
-        """Apply rule 1: take in every message that has arrived."""
+        """Apply rule 1: take in every message that has arrived, and what it says about silent peers."""
         for sender, payload in self._bus.receive(topics.TRAJECTORY):
             self._peer_trajectories.offer(sender, payload, utc_us)
+        peers, membership = self._peer_trajectories, self._membership
+        ended = {agent for agent in self._peers if self._world_model.has_ended(agent)}
+        suspected = {agent for agent in self._peers - ended if self._silence_us(agent, utc_us) > _SUSPECT_US}
+        told = {agent: message.exclusions for agent, message in peers.newest.items()}
+        membership.update(suspected, told, ended, votes=peers.heard_before_flight == self._peers)
+        said = (membership.exclusions.suspected, membership.exclusions.promised, membership.excluded)
+        if said != self._membership_said:
+            self._membership_said = said
+            suspected_, promised, excluded = (sorted(agents) for agents in said)
+            self._note("membership", suspected=suspected_, promised=promised, excluded=excluded)
 
     def step(self, utc_us: int, state: VehicleState, phase: Phase, desired: DesiredReference) -> None:
         """Apply rules 2 to 4 while this agent flies; `desired` is what it would follow alone."""
         commitments = self._commitments
         if not self._is_committed:
-            self._is_committed = True
+            self._is_committed, self._begun_us = True, utc_us
             commitments.begin(state.pos_ned_m, state.vel_ned_m_s, utc_us)
-        known, alive_peers = self._peer_trajectories.newest, self._alive_peers(utc_us)
-        commitments.update(utc_us, known, alive_peers)
+        known, required = self._peer_trajectories.newest, self._required_peers()
+        self.cut_off = self._why_cut_off(utc_us, required)
+        commitments.update(utc_us, known, required)
         conflicting = commitments.conflicting_peers(utc_us, known)
         if conflicting != self._conflicting:
             self._conflicting = conflicting
             self._note("conflicting_commitment", by=sorted(conflicting))
         deviating = self._world_model.deviating_peers(known, utc_us, self._allowed_m)
-        absent = self._absent_since_us.keys()  # perhaps lost: no longer trusted, still required to acknowledge
+        absent = self._absent()  # perhaps lost: no longer trusted, still required to acknowledge
         committed = {agent for agent, message in known.items() if message.is_committed}
-        lost_peers = [agent for agent in known.keys() - alive_peers if agent in committed]
+        lost_peers = [agent for agent in known.keys() - required if agent in committed]
         self.lost_peer_keep_outs = [keep_out for agent in lost_peers for keep_out in self._ends(known[agent])]
-        taking_part = {a for a in alive_peers - absent - conflicting - deviating if a in committed}
+        taking_part = {a for a in required - absent - conflicting - deviating if a in committed}
         self.committed_peers = {agent: known[agent].followed for agent in taking_part}
         partners = {agent: known[agent] for agent in taking_part}
         others = self._others(utc_us, state, phase, taking_part)
@@ -119,7 +135,7 @@ class Coordination:
         """Commit nothing while a pilot or the autopilot flies, or the state is stale; peers are still acknowledged."""
         if self._is_committed:
             self._is_committed = False
-            self.committed_peers, self.lost_peer_keep_outs = {}, []
+            self.committed_peers, self.lost_peer_keep_outs, self.cut_off = {}, [], ""
             self._note("commitments", **asdict(self.counts), worst_tracking_m=self._worst_m)
         self._commitments.end(None if state is None else state.pos_ned_m, utc_us)
 
@@ -141,7 +157,8 @@ class Coordination:
             is_committed=self._is_committed,
             committed=self._commitments.committed,
             proposal=self._commitments.proposal,
-            acknowledged=self._peer_trajectories.acknowledgements(),
+            acknowledged=self._peer_trajectories.acknowledgements(self._unacknowledged()),
+            exclusions=self._membership.exclusions,
         )
         self._bus.publish(topics.TRAJECTORY, encode_trajectory_message(message))
 
@@ -151,26 +168,35 @@ class Coordination:
             self._is_violating = not self._is_violating
             self._note("tracking_violation", begins=self._is_violating, error_m=error_m, allowed_m=self._allowed_m)
 
-    def _alive_peers(self, utc_us: int) -> frozenset[int]:
-        """Return peers that fly by commitments and have to acknowledge.
+    def _required_peers(self) -> frozenset[int]:
+        """Return peers that fly by commitments and have to acknowledge."""
+        return frozenset(
+            agent
+            for agent in self._peers - self._membership.excluded
+            if self._world_model.uses_commitments(agent) and not self._world_model.has_ended(agent)
+        )
 
-        A peer is lost when it has been off the bus for some ticks while this agent has been on it for seconds: tokens
-        vanish and come back one by one when a router is lost, and two agents that took each other for lost would both
-        commit.
-        """
+    def _unacknowledged(self) -> set[int]:
+        """Return peers whose proposals get no acknowledgement any more, because others may go on without theirs."""
+        ended = {agent for agent in self._peers if self._world_model.has_ended(agent)}
+        return ended | self._membership.exclusions.promised
+
+    def _absent(self) -> set[int]:
+        """Return peers whose liveliness token is not on the bus."""
         alive = self._bus.alive()
-        committing = frozenset(agent for agent in self._peers if self._world_model.uses_commitments(agent))
-        if agent_name(self._agent) not in alive:
-            self._on_bus_since_us = None
-            self._absent_since_us.clear()
-            return committing
-        if self._on_bus_since_us is None:
-            self._on_bus_since_us = utc_us
-        absent = {agent for agent in self._peers if agent_name(agent) not in alive}
-        self._absent_since_us = {agent: self._absent_since_us.get(agent, utc_us) for agent in absent}
-        if utc_us - self._on_bus_since_us < _SETTLED_US:
-            return committing
-        return committing - {a for a, since_us in self._absent_since_us.items() if utc_us - since_us >= _LOST_AFTER_US}
+        return {agent for agent in self._peers if agent_name(agent) not in alive}
+
+    def _silence_us(self, agent: int, utc_us: int) -> int:
+        """Return the time since the newest message of a peer; 0 for one that has never been heard."""
+        return utc_us - self._peer_trajectories.received_utc_us.get(agent, utc_us)
+
+    def _why_cut_off(self, utc_us: int, required: Set[int]) -> str:
+        told = {agent: message.exclusions for agent, message in self._peer_trajectories.newest.items()}
+        if by := self._membership.excluding(told):
+            return f"excluded by {_names(by)} after silence"
+        begun_us = utc_us if self._begun_us is None else self._begun_us
+        silent = [a for a in required if min(self._silence_us(a, utc_us), utc_us - begun_us) > _CUT_OFF_US]
+        return f"cut off from {_names(silent)}" if silent else ""
 
     def _ends(self, message: TrajectoryMessage) -> list[KeepOut]:
         budget = self._separation.budget
@@ -196,3 +222,7 @@ class Coordination:
         found = self._world_model.keep_outs(state.pos_ned_m, t0_utc_us, dt_us, steps, phase=phase, without=taking_part)
         spent_m = self._separation.budget.planned_beyond_hard_min_m
         return [replace(k, hard_min_distance_m=max(k.hard_min_distance_m, k.radius_m - spent_m)) for k in found]
+
+
+def _names(agents: Iterable[int]) -> str:
+    return ", ".join(map(agent_name, sorted(agents)))

@@ -1,7 +1,7 @@
 """How an agent keeps apart from its peers: a policy turns each tick into one directive that the tick obeys.
 
-`BestEffort` plans around the predicted paths of peers. `Guaranteed` follows trajectories that every alive peer has
-acknowledged. The tick doesn't know which of them is in force.
+`BestEffort` plans around the predicted paths of peers. `Guaranteed` follows trajectories that every
+participant has acknowledged. The tick doesn't know which of them is in force.
 """
 
 from __future__ import annotations
@@ -39,6 +39,7 @@ class SeparationDirective:
     committed_peers: Mapping[int, Sequence[Trajectory]] = field(default_factory=dict)  # for the safety filter
     lost_peer_keep_outs: tuple[KeepOut, ...] = ()  # may deadlock an agent, as those of the world model
     unresponsive_peer: bool = False  # the mission has to wait for a peer that may be flying on unseen
+    cut_off: str = ""  # why the mission has to end where the vehicle is, because peers don't answer
     duration_ns: int = 0  # time spent on agreeing with peers
 
 
@@ -136,6 +137,7 @@ class Guaranteed:
             reference=Reference(pos, vel, self._yaw_rad),
             committed_peers=coordination.committed_peers,
             lost_peer_keep_outs=tuple(coordination.lost_peer_keep_outs),
+            cut_off=coordination.cut_off,
             duration_ns=duration_ns,
         )
 

@@ -65,6 +65,7 @@ class WorldModel:
         self._orders = Orders(agent, self.refusals)
         self._unresponsive_since_us: dict[int, int] = {}
         self._status: dict[int, StatusMessage] = {}
+        self._vouched: dict[int, int | None] = {}  # boot id of each agent that somebody says has ended
         self._obstacles: tuple[Obstacle, ...] = ()
         self._obstacles_version: int | None = None
         self._seen: dict[int, Obstacle] = {}  # obstacles that have been visible, by identity
@@ -224,6 +225,23 @@ class WorldModel:
         apart_m = budget.barrier_obstacle_m(margin_m)
         return found + [body_of_obstacle(o, ahead_s, apart_m) for o in visible(self._obstacles, pos_ned_m)]
 
+    def exclude(self, agent: int) -> None:
+        """Believe that the process of a peer has ended; another process under its number takes part again."""
+        self._vouched[agent] = self._boot_id(agent)
+
+    def has_ended(self, agent: int) -> bool:
+        """Return whether there is evidence that a peer commits to nothing more.
+
+        Somebody vouches for the end of its process, or its vehicle was heard landed and disarmed. A missing liveliness
+        token is none: the peer may be cut off.
+        """
+        vouched = agent in self._vouched and self._vouched[agent] == self._boot_id(agent)
+        return vouched or self._phase(agent) is Phase.DONE
+
+    def _boot_id(self, agent: int) -> int | None:
+        status = self._status.get(agent)
+        return None if status is None else status.boot_id
+
     def uses_commitments(self, agent: int) -> bool:
         """Return whether a peer flies by commitments; true while its status is unknown."""
         status = self._status.get(agent)
@@ -245,13 +263,14 @@ class WorldModel:
     def has_unresponsive_peer(self, utc_us: int) -> bool:
         """Return whether some peer is silent and not known to have died: it may be flying on, or our bus is lost.
 
-        A peer whose liveliness token has gone while ours is present has died; its path has become a keep-out.
+        A peer whose liveliness token has gone while ours is present has died, as far as best effort can know; its path
+        has become a keep-out.
         """
         alive = self._bus.alive()
         connected = agent_name(self._agent) in alive
         oldest_us = utc_us - round(self._params.lost_after_s * 1e6)
         for path in self.paths.latest():
-            silent = path.t0_utc_us < oldest_us and self._phase(path.agent) is not Phase.DONE
+            silent = path.t0_utc_us < oldest_us and not self.has_ended(path.agent)
             if silent and (not connected or agent_name(path.agent) in alive):
                 return True
         return False

@@ -1,13 +1,14 @@
 """Trajectory messages of `swarmctl.control.commit.protocol`: their encoding, and the newest one of every peer.
 
-The layout is little-endian: a header, the committed trajectory, a proposal if there is one, and acknowledgements
-(agent, number). A trajectory is t0, step and count, then positions and velocities as float32.
+The layout is little-endian: a header, the committed trajectory, a proposal if there is one, acknowledgements (agent,
+number), and the numbers of agents that are suspected, then of those to be excluded. A trajectory is t0, step and count,
+then positions and velocities as float32.
 """
 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable
+from collections.abc import Iterable, Set
 
 import numpy as np
 
@@ -16,20 +17,21 @@ from swarmctl.bus.refusals import FUTURE, IDENTITY, MALFORMED, UNKNOWN_PEER, Ref
 from swarmctl.bus.senders import Presence, ReceivedMessage, SenderVerifier
 from swarmctl.bus.topics import TRAJECTORY
 from swarmctl.core.trajectory import Trajectory
-from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
+from swarmctl.core.trajectory_message import Exclusions, Proposal, TrajectoryMessage
 from swarmctl.core.types import Array
 
-TRAJECTORY_VERSION = 2
+TRAJECTORY_VERSION = 3
 MAX_POINTS = 2000
 MAX_STEP_US = 500_000
 MAX_BEGIN_US = 10_000_000  # from now; a trajectory that begins later comes from another clock
-MAX_ACKNOWLEDGED = 256
+MAX_PEERS = 256  # of each kind: acknowledged, suspected, promised
 _MAGIC = b"SI"
-_HEADER = struct.Struct("<2sBBIIIqH2x")  # magic version flags agent boot seq sent count
+_HEADER = struct.Struct("<2sBBIIIqHHH2x")  # magic version flags agent boot seq sent, counts of the three kinds
 _HAS_PROPOSAL, _IS_COMMITTED = 1, 2
 _PROPOSAL = struct.Struct("<Qq")  # number, time of proposal
 _TRAJECTORY = struct.Struct("<qiH2x")
 _ACKNOWLEDGEMENT = struct.Struct("<IQ")
+_AGENT = struct.Struct("<I")
 
 Memory = dict[bytes, Trajectory]  # decoded trajectories by their bytes
 
@@ -46,6 +48,8 @@ def encode_trajectory_message(message: TrajectoryMessage) -> bytes:
             message.seq,
             message.sent_utc_us,
             len(message.acknowledged),
+            len(message.exclusions.suspected),
+            len(message.exclusions.promised),
         ),
         _encode_trajectory(message.committed),
     ]
@@ -53,6 +57,8 @@ def encode_trajectory_message(message: TrajectoryMessage) -> bytes:
         parts.append(_PROPOSAL.pack(message.proposal.number, message.proposal.made_utc_us))
         parts.append(_encode_trajectory(message.proposal.trajectory))
     parts += [_ACKNOWLEDGEMENT.pack(agent, number) for agent, number in sorted(message.acknowledged.items())]
+    for agents in (message.exclusions.suspected, message.exclusions.promised):
+        parts += [_AGENT.pack(agent) for agent in sorted(agents)]
     return b"".join(parts)
 
 
@@ -63,9 +69,10 @@ def decode_trajectory_message(payload: bytes, memory: Memory | None = None) -> T
     which the protocol knows that it has checked it before.
     """
     try:
-        magic, version, flags, agent, boot_id, seq, sent_utc_us, count = _HEADER.unpack_from(payload)
-        if magic != _MAGIC or version != TRAJECTORY_VERSION or flags > 3 or count > MAX_ACKNOWLEDGED:
+        magic, version, flags, agent, boot_id, seq, sent_utc_us, *counts = _HEADER.unpack_from(payload)
+        if magic != _MAGIC or version != TRAJECTORY_VERSION or flags > 3 or max(counts) > MAX_PEERS:
             return None
+        acknowledgements, suspected, promised = counts
         known, sent = memory or {}, Memory()
         committed, at = _decode_trajectory(payload, _HEADER.size, known, sent)
         proposal = None
@@ -73,9 +80,12 @@ def decode_trajectory_message(payload: bytes, memory: Memory | None = None) -> T
             number, made_utc_us = _PROPOSAL.unpack_from(payload, at)
             trajectory, at = _decode_trajectory(payload, at + _PROPOSAL.size, known, sent)
             proposal = Proposal(number=number, made_utc_us=made_utc_us, agent=agent, trajectory=trajectory)
-        if len(payload) != at + count * _ACKNOWLEDGEMENT.size:
+        agents_at = at + acknowledgements * _ACKNOWLEDGEMENT.size
+        if len(payload) != agents_at + (suspected + promised) * _AGENT.size:
             return None
-        acknowledged = dict(_ACKNOWLEDGEMENT.iter_unpack(payload[at:]))
+        acknowledged = dict(_ACKNOWLEDGEMENT.iter_unpack(payload[at:agents_at]))
+        agents = [number for (number,) in _AGENT.iter_unpack(payload[agents_at:])]
+        exclusions = Exclusions(suspected=frozenset(agents[:suspected]), promised=frozenset(agents[suspected:]))
         if memory is not None:
             memory.clear()
             memory.update(sent)
@@ -88,6 +98,7 @@ def decode_trajectory_message(payload: bytes, memory: Memory | None = None) -> T
             committed=committed,
             proposal=proposal,
             acknowledged=acknowledged,
+            exclusions=exclusions,
         )
     except (struct.error, ValueError):
         return None
@@ -138,6 +149,8 @@ class PeerTrajectories:
         self._refusals = refusals
         self._memory: dict[str, Memory] = {}
         self.newest: dict[int, TrajectoryMessage] = {}
+        self.received_utc_us: dict[int, int] = {}  # when the newest message of each peer was accepted
+        self._first_committed: dict[int, bool] = {}  # whether each flew by commitments when it was first heard
 
     def offer(self, sender: str, payload: bytes, utc_us: int) -> None:
         """Check one message and keep it if it is accepted; the bus guarantees the name `sender`, `utc_us` is now."""
@@ -149,10 +162,17 @@ class PeerTrajectories:
         sent = ReceivedMessage(message.boot_id, message.seq, min(message.sent_utc_us, utc_us + MAX_LEAD_US), payload)
         if self._verifiers[message.agent].accepts(sent, utc_us):
             self.newest[message.agent], self._memory[sender] = message, memory
+            self.received_utc_us[message.agent] = utc_us
+            self._first_committed.setdefault(message.agent, message.is_committed)
 
-    def acknowledgements(self) -> dict[int, int]:
-        """Return the number of the current proposal of each peer that has one."""
-        return {agent: i.proposal.number for agent, i in self.newest.items() if i.proposal is not None}
+    def acknowledgements(self, without: Set[int]) -> dict[int, int]:
+        """Return the number of the current proposal of each peer that has one and is not in `without`."""
+        return {a: i.proposal.number for a, i in self.newest.items() if i.proposal is not None and a not in without}
+
+    @property
+    def heard_before_flight(self) -> frozenset[int]:
+        """Return peers that did not yet fly by commitments when they were first heard."""
+        return frozenset(agent for agent, committed in self._first_committed.items() if not committed)
 
     def _refusal(self, sender: str, message: TrajectoryMessage, utc_us: int) -> str:
         if sender != agent_name(message.agent):

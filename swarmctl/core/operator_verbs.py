@@ -1,7 +1,8 @@
 """The operator's verbs that agents obey, in one table.
 
 A row becomes a verb of the command line with its options (`swarmctl.ops.cli`), an order that may be on the bus with its
-arguments in bounds (`swarmctl.bus.json_messages`), and an entry of the handlers in `control.phases.state_machine`.
+arguments in bounds (`swarmctl.bus.json_messages`), and an entry of the handlers in `control.phases.state_machine`; but
+`exclude` is obeyed by the world model, because it is about a peer.
 """
 
 from __future__ import annotations
@@ -31,6 +32,7 @@ class OperatorVerb:
     arguments: tuple[VerbArgument, ...] = ()
     is_stop: bool = False  # kept until a vehicle state is known to begin it from
     never_superseded: bool = False  # obeyed though a newer order came before it
+    is_about_peer: bool = False  # the argument `PEER` names it; it need not answer itself
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +43,7 @@ class Order:
     arguments: Mapping[str, float] = field(default_factory=dict)
 
 
+EXCLUDE, PEER = "exclude", "peer"
 _BEFORE_LANDING = frozenset({"CONNECT", "STANDBY", "ARM", "TAKEOFF", "GOTO_START", "READY", "TRACK", "GOTO_LAND"})
 
 OPERATOR_VERBS = {
@@ -53,6 +56,15 @@ OPERATOR_VERBS = {
         help="Fly back to the start under the agent's own MPC, then land. The autopilot's return mode is not used.",
         phases=_BEFORE_LANDING,
         is_stop=True,
+    ),
+    EXCLUDE: OperatorVerb(
+        help="Vouch that an agent has ended: the others no longer wait for its answers, and keep clear of its place.",
+        phases=_BEFORE_LANDING | {"LAND"},
+        arguments=(
+            VerbArgument(name=PEER, option="--peer", help="Number of the agent that has ended.", least=0, most=254),
+        ),
+        never_superseded=True,
+        is_about_peer=True,
     ),
 }
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from swarmctl.core.trajectory import Trajectory
 
@@ -24,6 +24,14 @@ class Proposal:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Exclusions:
+    """Holds what an agent publishes about silent peers; the rules are in `swarmctl.control.commit.membership`."""
+
+    suspected: frozenset[int] = field(default_factory=frozenset)  # not heard for long
+    promised: frozenset[int] = field(default_factory=frozenset)  # to be excluded; they get no acknowledgement any more
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class TrajectoryMessage:
     """Holds the committed trajectory, proposal and acknowledgements of one agent."""
 
@@ -35,6 +43,7 @@ class TrajectoryMessage:
     committed: Trajectory
     proposal: Proposal | None
     acknowledged: Mapping[int, int]  # by peer: number of the proposal in its newest message
+    exclusions: Exclusions
 
     @property
     def trajectories(self) -> tuple[Trajectory, ...]:

@@ -35,7 +35,7 @@ from swarmctl.bus.peers import agent_name
 from swarmctl.bus.topics import COMMAND, OBSTACLES, OPERATOR, STATUS
 from swarmctl.bus.zenoh_bus import ZenohBus
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.operator_verbs import OPERATOR_VERBS, Order
+from swarmctl.core.operator_verbs import OPERATOR_VERBS, PEER, Order
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import read_file, replace_bytes
@@ -161,6 +161,8 @@ def ignored_by(order: Order, statuses: Mapping[int, StatusMessage], asked: Seque
     verb = OPERATOR_VERBS[order.verb]
     found = []
     for agent in asked:
+        if verb.is_about_peer and agent == order.arguments[PEER]:
+            continue
         if agent not in statuses:
             found.append(f"{agent_name(agent)} does not answer")
             continue

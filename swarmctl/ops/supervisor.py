@@ -18,7 +18,7 @@ from swarmctl.bus.peers import Bus, agent_name
 from swarmctl.bus.topics import COMMAND, OBSTACLES, STATUS
 from swarmctl.config import Config
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.operator_verbs import Order
+from swarmctl.core.operator_verbs import EXCLUDE, PEER, Order
 from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START
 from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, RunContext, kill_all
@@ -209,8 +209,22 @@ class FlightSupervisor:
             if code is None:
                 self._check_responsive(view, child, now_s)
             elif self._is_first(f"{child.name} {child.pid} ended"):
+                self._vouch_for_end(view.agent)
                 self._note_end(view, child, code)
                 self._recover(view, code)
+
+    def _vouch_for_end(self, agent: int) -> None:
+        """Tell the others that the process of an agent has ended, before another one is started in its place."""
+        self._order(Order(EXCLUDE, {PEER: agent}), [view for view in self._running() if view.agent != agent])
+
+    def _order(self, order: Order, views: list[AgentView]) -> None:
+        """Give an order to all agents, stamped by the clocks of these."""
+        now_s = time.monotonic()
+        clocks_us = [
+            view.status.utc_us + round((now_s - view.received_s) * 1e6) for view in views if view.status is not None
+        ]
+        for message in order_messages(order, EVERYBODY, time.time_ns() // 1000, clocks_us):
+            self._bus.publish(COMMAND, message)
 
     def _recover(self, view: AgentView, code: int) -> None:
         """Start another process that lands a vehicle which is not known to be down."""
@@ -263,18 +277,14 @@ class FlightSupervisor:
             self._bus.publish(OBSTACLES, encode_message(self._obstacles))
         if self._land_ordered_s is not None and now_s - self._land_said_s >= _LAND_REPEAT_S:
             self._land_said_s = now_s
-            self._repeat_land_order(now_s, now_s - self._land_ordered_s)
+            self._repeat_land_order(now_s - self._land_ordered_s)
 
-    def _repeat_land_order(self, now_s: float, since_s: float) -> None:
+    def _repeat_land_order(self, since_s: float) -> None:
         """Repeat the order on the bus, newly stamped, until every agent shows that it lands; later also by signal."""
         running = (view for view in self._running() if not self._recovery.is_on(view.agent))
         deaf = [view for view in running if view.status is None or view.status.phase < Phase.GOTO_LAND]
         if deaf:
-            clocks_us = [
-                view.status.utc_us + round((now_s - view.received_s) * 1e6) for view in deaf if view.status is not None
-            ]
-            for order in order_messages(Order("land"), EVERYBODY, time.time_ns() // 1000, clocks_us):
-                self._bus.publish(COMMAND, order)
+            self._order(Order("land"), deaf)
         for view in deaf:
             child = self._services.children[agent_name(view.agent)]
             if since_s > _LAND_OBEYED_S and self._is_first(f"{child.name} told by signal"):

@@ -131,10 +131,10 @@ def test_an_agent_off_the_bus_commits_nothing() -> None:
 def test_negative_control_taking_stale_peers_for_lost_commits_against_alive_peers(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def only_seen(self: Coordination, utc_us: int) -> Set[int]:
+    def only_seen(self: Coordination) -> Set[int]:
         return frozenset(agent for agent in self._peers if agent_name(agent) in self._bus.alive())
 
-    monkeypatch.setattr(Coordination, "_alive_peers", only_seen)
+    monkeypatch.setattr(Coordination, "_required_peers", only_seen)
     assert committed_in_the_dark() > 4
 
 

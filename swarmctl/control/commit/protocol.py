@@ -1,8 +1,8 @@
-"""Guaranteed separation: an agent flies only trajectories that every alive peer has acknowledged.
+"""Guaranteed separation: an agent flies only trajectories that every other participant has acknowledged.
 
 Every agent follows a *committed* trajectory, which ends at rest. To fly on, it makes a *proposal*: a trajectory that
 leaves the committed one a little later, keeps its distance to everything its peers are known to have committed to or
-to propose, and ends at rest again. It commits to the proposal only when every alive peer has acknowledged it. Each
+to propose, and ends at rest again. It commits to the proposal only when every participant has acknowledged it. Each
 agent sends all of this in one message a tick (committed trajectory, proposal, acknowledgements), and only the newest
 message counts.
 
@@ -11,7 +11,7 @@ Each tick applies these rules in this order:
 1. Receive the newest message of every peer.
 2. Withdraw the own proposal if it comes too close to a peer's committed trajectory, or to a peer's proposal that is
    *earlier* (by time of proposal, then agent number; both are in the messages, so both sides order them alike).
-3. Commit if all alive peers have acknowledged the proposal; withdraw it once the time has passed at which it leaves
+3. Commit if all participants have acknowledged the proposal; withdraw it once the time has passed at which it leaves
    the committed trajectory.
 4. Without a proposal, make one that is clear of everything known: peers' committed trajectories and their proposals.
 5. Publish the committed trajectory, the proposal, and the number of the proposal received from each peer.
@@ -36,8 +36,8 @@ The proof rests on these assumptions, each of which is watched in flight:
   commitment in conflict with its own (`conflicting_peers`), or a peer off its committed trajectory, keeps clear of that
   peer as of one that does not take part.
 - Every agent takes part. A vehicle that does not (a pilot flies it, its agent has died) is a keep-out of the
-  best-effort kind. A peer counts as lost only when its liveliness token is gone while the own token is present: an
-  agent that is off the bus commits nothing.
+  best-effort kind. A silent peer stays a participant; when one is left out is in `swarmctl.control.commit.membership`:
+  it takes evidence or a majority. The events `membership` and `operator` say who was, and on whose word.
 """
 
 from __future__ import annotations
@@ -116,13 +116,13 @@ class Commitments:
         if pos_ned_m is not None:
             self.committed = resting(pos_ned_m, utc_us, self._planner.dt_us)
 
-    def update(self, utc_us: int, peers: Mapping[int, TrajectoryMessage], alive_peers: Set[int]) -> None:
+    def update(self, utc_us: int, peers: Mapping[int, TrajectoryMessage], required: Set[int]) -> None:
         """Apply rules 2 and 3 to the own proposal.
 
         Args:
             utc_us: now.
             peers: newest message of each peer, lost ones included: their vehicles may have flown on for a while.
-            alive_peers: peers whose acknowledgement is required.
+            required: participants other than this agent, whose acknowledgement is required.
         """
         mine = self.proposal
         if mine is None:
@@ -140,7 +140,7 @@ class Commitments:
             self.counts.withdrawn += 1
             return
         self._cleared.update((id(trajectory), trajectory) for trajectory in new)
-        if all(agent in peers and peers[agent].acknowledged.get(self._agent) == mine.number for agent in alive_peers):
+        if all(agent in peers and peers[agent].acknowledged.get(self._agent) == mine.number for agent in required):
             self.committed, self.proposal = mine.trajectory, None
             self.counts.committed += 1
             self._latencies_s.append((utc_us - mine.made_utc_us) * 1e-6)

@@ -31,6 +31,7 @@ class PhaseInputs:
     mode: Mode  # last decision of the failsafe
     unresponsive_peer: bool  # no message for too long from a peer that may be flying
     peers: Mapping[int, PeerInputs]
+    cut_off: str = ""  # why the mission must end here, because peers don't answer
     others_ned_m: tuple[Array, ...] = ()  # present position (3,) of each peer
     arm_in: FlightMode | None = None  # flight mode required for arming; None: any
     boots: int = 0  # reboots of the autopilot so far

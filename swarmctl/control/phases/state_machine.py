@@ -158,6 +158,8 @@ class MissionStateMachine:
             self._give_up("no plan for too long", inputs, state)
         if inputs.overload is Level.LAND and self.phase < Phase.GOTO_LAND:
             self._give_up(OVERLOADED, inputs, state)
+        if inputs.cut_off and self.phase < Phase.GOTO_LAND:
+            self._give_up(inputs.cut_off, inputs, state)
         self._pause(inputs, state)
         if state.mode is FlightMode.EXTERNAL and Phase.GOTO_START <= self.phase < Phase.LAND:
             self._take_control(inputs, state)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from swarmctl.agent.coordination import Coordination
 from swarmctl.agent.world_model import WorldModel
 from swarmctl.bus import topics
 from swarmctl.bus.commitment_messages import decode_trajectory_message, encode_trajectory_message
+from swarmctl.bus.json_messages import encode_message
 from swarmctl.bus.path_messages import encode_path
 from swarmctl.bus.peers import LocalBus, LocalHub, agent_name
 from swarmctl.control.collision.separation import SeparationParams
@@ -19,6 +20,7 @@ from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredRefe
 from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.core.clock import SimClock
 from swarmctl.core.trajectory import resting
+from swarmctl.core.trajectory_message import Exclusions, Proposal
 from swarmctl.core.types import Array, Phase, VehicleState
 from tests import builders
 
@@ -54,6 +56,8 @@ class Bench:
             rate_hz=RATE_HZ,
         )
         self.seq = 0
+        self.proposes, self.exclusions = False, Exclusions()  # of the peer
+        self.acknowledged: Mapping[int, int] = {}  # by the agent, in the newest message that the peer has read
 
     @property
     def state(self) -> VehicleState:
@@ -82,15 +86,24 @@ class Bench:
         acknowledged = {}
         for _, payload in self.peer.receive(topics.TRAJECTORY):
             message = decode_trajectory_message(payload)
-            if message is not None and message.proposal is not None:
+            assert message is not None
+            self.acknowledged = message.acknowledged
+            if message.proposal is not None:
                 acknowledged = {0: message.proposal.number}
         path = builders.predicted_path(
             seq=self.seq, t0_utc_us=utc_us, dt_us=20_000, pos_ned_m=np.tile(path_at, (41, 1))
         )
         self.peer.publish(topics.PATH, encode_path(path))
         if not silent:
+            committed = resting(PLACE, utc_us, 100_000)
             message = builders.trajectory_message(
-                seq=self.seq, sent_utc_us=utc_us, committed=resting(PLACE, utc_us, 100_000), acknowledged=acknowledged
+                seq=self.seq,
+                sent_utc_us=utc_us,
+                is_committed=self.seq > 1,
+                committed=committed,
+                proposal=Proposal(number=5, made_utc_us=0, agent=1, trajectory=committed) if self.proposes else None,
+                acknowledged=acknowledged,
+                exclusions=self.exclusions,
             )
             self.peer.publish(topics.TRAJECTORY, encode_trajectory_message(message))
 
@@ -114,40 +127,71 @@ def test_a_peer_that_acknowledges_lets_us_fly_and_one_that_does_not_does_not(ben
     assert bench.committed == before
 
 
-def test_a_peer_is_lost_only_after_it_has_been_absent_for_some_ticks(bench: Bench) -> None:
-    bench.fly(2.5, each=bench.send)
+def test_a_missing_token_is_no_evidence_that_a_peer_has_died(bench: Bench) -> None:
+    bench.fly(1.0, each=bench.send)
     before = bench.committed
     bench.alive.discard(PEER)
-    bench.fly(0.08)
-    assert bench.committed == before, "tokens vanish one by one"
+    bench.fly(5.0)
+    assert bench.committed == before, "it may be cut off, and fly on without our acknowledgement"
     assert bench.coordination.committed_peers == {}, "but its commitment is no longer relied on"
+    bench.world_model.exclude(1)
+    bench.fly(0.5)
+    assert bench.committed > before, "somebody vouches that it has ended"
+
+
+def test_a_peer_that_was_heard_landed_and_disarmed_is_not_waited_for(bench: Bench) -> None:
+    bench.fly(1.0, each=bench.send)
+    before = bench.committed
     bench.fly(1.0)
+    assert bench.committed == before
+    done = builders.status_message(agent=1, phase=Phase.DONE, utc_us=bench.clock.utc_us())
+    bench.peer.publish(topics.STATUS, encode_message(done))
+    bench.fly(0.5)
     assert bench.committed > before
+
+
+def test_of_two_that_do_not_hear_each_other_none_excludes_the_other_and_both_land(bench: Bench) -> None:
+    bench.fly(1.0, each=bench.send)
+    before = bench.committed
+    bench.fly(19.0)
+    assert bench.coordination.cut_off == ""
+    assert ("membership", {"suspected": [1], "promised": [], "excluded": []}) in bench.told
+    bench.fly(2.0)
+    assert bench.coordination.cut_off == "cut off from agent-1"
+    assert bench.committed == before
+    bench.fly(0.1, each=bench.send)
+    assert bench.coordination.cut_off == "", "who is heard again is waited for again"
+    assert ("membership", {"suspected": [], "promised": [], "excluded": []}) in bench.told
+
+
+def test_an_excluded_agent_lands_where_it_is(bench: Bench) -> None:
+    bench.fly(1.0, each=bench.send)
+    bench.exclusions = Exclusions(promised=frozenset({0}))
+    bench.fly(0.1, each=bench.send)
+    assert bench.coordination.cut_off == "excluded by agent-1 after silence"
+
+
+def test_who_has_ended_gets_no_acknowledgement(bench: Bench) -> None:
+    """A false word about its end must not let two fly without each other's acknowledgement."""
+    bench.proposes = True
+    bench.fly(0.5, each=bench.send)
+    assert bench.acknowledged == {1: 5}
+    bench.world_model.exclude(1)
+    bench.fly(0.1, each=bench.send)
+    assert bench.acknowledged == {}
 
 
 def test_the_committed_end_of_a_lost_peer_is_a_keep_out(bench: Bench) -> None:
     """No commitment leads there any more, so an agent that is blocked has to look for a path around it."""
     bench.fly(2.5, each=bench.send)
     assert bench.coordination.lost_peer_keep_outs == []
-    bench.alive.discard(PEER)
+    bench.world_model.exclude(1)
     bench.fly(0.3)
     (left,) = bench.coordination.lost_peer_keep_outs
     assert left.priority_id == 1
     assert left.pos_ned_m[0] == pytest.approx(PLACE)
     bench.coordination.idle(bench.clock.utc_us(), None)
     assert bench.coordination.lost_peer_keep_outs == []
-
-
-def test_an_agent_back_on_the_bus_takes_no_peer_for_lost_at_first(bench: Bench) -> None:
-    bench.fly(2.5, each=bench.send)
-    before = bench.committed
-    bench.alive.clear()
-    bench.fly(3.0)
-    bench.alive.add(agent_name(0))
-    bench.fly(1.9)
-    assert bench.committed == before, "tokens come back one by one"
-    bench.fly(1.0)
-    assert bench.committed > before
 
 
 def test_a_deviating_peer_is_where_its_path_says(bench: Bench) -> None:

@@ -14,7 +14,7 @@ from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.commit.trajectory_planner import DesiredReference
 from swarmctl.core.types import Phase
 from tests import builders
-from tests.unit.agent.test_coordination import HERE, PEER, PLACE, Bench
+from tests.unit.agent.test_coordination import HERE, PLACE, Bench
 
 YAW_RAD = 0.3
 KEEP_OUT = builders.keep_out(pos_ned_m=np.tile(PLACE, (3, 1)))
@@ -87,11 +87,18 @@ def test_guaranteed_follows_the_committed_trajectory_and_names_committed_peers(b
 
 def test_guaranteed_names_the_keep_outs_of_lost_peers(bench: Bench) -> None:
     bench.fly(2.5, each=bench.send)
-    bench.alive.discard(PEER)
+    bench.world_model.exclude(1)
     bench.fly(0.3)
     directive = guaranteed(bench).step(inputs(bench))
     assert [keep_out.priority_id for keep_out in directive.lost_peer_keep_outs] == [1]
     assert directive.committed_peers == {}
+
+
+def test_guaranteed_names_why_an_agent_is_cut_off(bench: Bench) -> None:
+    bench.fly(0.5, each=bench.send)
+    assert guaranteed(bench).step(inputs(bench)).cut_off == ""
+    bench.fly(21.0)
+    assert guaranteed(bench).step(inputs(bench)).cut_off == "cut off from agent-1"
 
 
 def test_guaranteed_leaves_an_agent_that_does_not_fly_to_its_controller(bench: Bench) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from swarmctl.bus.commitment_messages import (
-    MAX_ACKNOWLEDGED,
+    MAX_PEERS,
     MAX_POINTS,
     MAX_STEP_US,
     PeerTrajectories,
@@ -22,7 +22,7 @@ from swarmctl.bus.refusals import Refusals
 from swarmctl.bus.senders import Presence
 from swarmctl.core.clock import SimClock
 from swarmctl.core.trajectory import Trajectory, ending_at_rest, joined, resting, stopping
-from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
+from swarmctl.core.trajectory_message import Exclusions, Proposal, TrajectoryMessage
 from tests import builders
 
 UTC_US = 1_700_000_000_000_000
@@ -43,6 +43,7 @@ def message(seq: int = 1, agent: int = 2, boot_id: int = 9, propose: bool = True
         committed=trajectory(),
         proposal=proposal,
         acknowledged={0: 5, 1: UTC_US},
+        exclusions=Exclusions(suspected=frozenset({1, 4}), promised=frozenset({4})),
     )
 
 
@@ -85,7 +86,7 @@ def flat(points: int) -> Trajectory:
     return Trajectory(t0_utc_us=UTC_US, dt_us=100_000, pos_ned_m=zeros, vel_ned_m_s=zeros)
 
 
-FLAGS, STEP, POINTS = 3, 36, 44  # offsets of the header's flags, and of the step and the points of what is committed
+FLAGS, STEP, POINTS = 3, 40, 48  # offsets of the header's flags, and of the step and the points of what is committed
 
 
 @pytest.mark.parametrize(
@@ -119,10 +120,13 @@ def test_the_number_of_points_is_bounded(points: int, fits: bool) -> None:
         assert (decode_trajectory_message(encode_trajectory_message(sent)) is not None) is fits
 
 
-@pytest.mark.parametrize(("count", "fits"), [(MAX_ACKNOWLEDGED, True), (MAX_ACKNOWLEDGED + 1, False)])
+@pytest.mark.parametrize(("count", "fits"), [(MAX_PEERS, True), (MAX_PEERS + 1, False)])
 def test_the_number_of_acknowledgements_is_bounded(count: int, fits: bool) -> None:
     sent = replace(message(), acknowledged=dict.fromkeys(range(count), 1))
     assert (decode_trajectory_message(encode_trajectory_message(sent)) is not None) is fits
+    for kind in ("suspected", "promised"):
+        sent = replace(message(), exclusions=Exclusions(**{kind: frozenset(range(count))}))
+        assert (decode_trajectory_message(encode_trajectory_message(sent)) is not None) is fits
 
 
 class Store:
@@ -152,7 +156,7 @@ def test_only_newer_messages_of_expected_peers_are_accepted() -> None:
     store.peers.offer(agent_name(2), b"nonsense", UTC_US)
     assert set(store.peers.newest) == {2} and store.peers.newest[2].seq == 3
     assert store.refusals.by_reason == {"replayed": 2, "identity": 1, "unknown_peer": 1, "malformed": 1}
-    assert store.peers.acknowledgements() == {2: 77}
+    assert store.peers.acknowledgements(frozenset()) == {2: 77}
 
 
 def test_one_forged_message_does_not_silence_its_peer() -> None:
@@ -175,7 +179,7 @@ def test_a_restart_is_accepted_with_its_third_message_and_has_proposed_nothing_y
         *(replace(message(seq=seq, boot_id=3, propose=False), sent_utc_us=UTC_US + seq * 50_000) for seq in (4, 5, 6))
     )
     assert store.peers.newest[2].boot_id == 3
-    assert store.peers.acknowledgements() == {}
+    assert store.peers.acknowledgements(frozenset()) == {}
 
 
 def test_a_trajectory_that_begins_in_the_far_future_is_refused() -> None:

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarmctl.bus import path_messages, topics
-from swarmctl.bus.commitment_messages import MAX_ACKNOWLEDGED, MAX_POINTS, encode_trajectory_message
+from swarmctl.bus.commitment_messages import MAX_PEERS, MAX_POINTS, encode_trajectory_message
 from swarmctl.bus.json_messages import (
     MAX_OBSTACLES,
     CommandMessage,
@@ -30,7 +30,7 @@ from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import OPERATOR_VERBS, OperatorVerb, Order, VerbArgument
 from swarmctl.core.records import TICK_DTYPE
 from swarmctl.core.trajectory import Trajectory
-from swarmctl.core.trajectory_message import Proposal
+from swarmctl.core.trajectory_message import Exclusions, Proposal
 from swarmctl.core.types import MAX_MARGIN_M, PredictedPath
 from tests import builders
 
@@ -348,7 +348,7 @@ def test_the_longest_good_message_of_every_topic_fits() -> None:
     trajectory = Trajectory(
         t0_utc_us=0, dt_us=1, pos_ned_m=np.zeros((MAX_POINTS, 3)), vel_ned_m_s=np.zeros((MAX_POINTS, 3))
     )
-    acknowledged = dict.fromkeys(range(MAX_ACKNOWLEDGED), 2**60)
+    acknowledged = dict.fromkeys(range(MAX_PEERS), 2**60)
     message = builders.trajectory_message(
         agent=0,
         boot_id=0,
@@ -356,6 +356,7 @@ def test_the_longest_good_message_of_every_topic_fits() -> None:
         committed=trajectory,
         proposal=Proposal(number=1, made_utc_us=0, agent=0, trajectory=trajectory),
         acknowledged=acknowledged,
+        exclusions=Exclusions(suspected=frozenset(range(MAX_PEERS)), promised=frozenset(range(MAX_PEERS))),
     )
     assert len(encode_trajectory_message(message)) <= topics.TRAJECTORY.max_bytes
     assert TICK_DTYPE.itemsize + 12 * path_messages.MAX_POINTS <= topics.TICK.max_bytes
