@@ -116,7 +116,7 @@ class Lockstep:
         latency_us = round(config.sitl.link_latency_ms * 1000)
         self.links = [pipe_pair(self.clock.now_us, latency_us) for _ in range(agents)]  # (agent's, vehicle's) ends
         self.world = SitlWorld(config.simulator(), [vehicle for _, vehicle in self.links])
-        self.hub = LocalHub(self.clock.now_us, config.seed, round(config.bus.delay_ms * 1000), config.bus.loss_01)
+        self.hub = _hub(config, self.clock)
         self.logs = [FlightLog(directory=directory, agent=i, clock=self.clock) for i in range(agents)]
         self.fault_events: list[dict[str, Any]] = []
         self.world.faults.on_event = self._on_fault
@@ -225,6 +225,19 @@ class Lockstep:
             self.step()
             if on_step is not None and on_step(self):
                 return
+
+
+def _hub(config: Config, clock: SimClock) -> LocalHub:
+    bus = config.bus
+    return LocalHub(
+        clock.now_us,
+        config.seed,
+        round(bus.delay_ms * 1000),
+        bus.loss_01,
+        burst_01=bus.burst_01,
+        burst_s=bus.burst_s,
+        jitter_us=round(bus.jitter_ms * 1000),
+    )
 
 
 def write_events(path: Path, events: Sequence[dict[str, Any]]) -> None:

@@ -83,6 +83,9 @@ class BusParams(Params):
     lease_ms: int = Field(1500, ge=500, le=10000)  # silence after which Zenoh closes a link
     delay_ms: float = Field(0.0, ge=0, le=5000)  # lockstep only, on top of one tick
     loss_01: float = Field(0.0, ge=0, le=1)  # lockstep only
+    burst_01: float = Field(0.0, ge=0, le=0.99)  # lockstep only, fraction of time in which a link loses everything
+    burst_s: float = Field(2.0, ge=0.01, le=600)  # lockstep only, mean length of such a bad period
+    jitter_ms: float = Field(0.0, ge=0, le=5000)  # lockstep only, largest extra delay; messages overtake each other
 
 
 class TelemetryParams(Params):

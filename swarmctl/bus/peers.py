@@ -7,13 +7,11 @@ is the bus of lockstep flights.
 
 from __future__ import annotations
 
-import zlib
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import NamedTuple, Protocol
 
-import numpy as np
-
+from swarmctl.bus.links import Impairments, Link
 from swarmctl.bus.path_messages import decode_path
 from swarmctl.bus.refusals import FUTURE, IDENTITY, LATE, MALFORMED, UNKNOWN_PEER, Refusals
 from swarmctl.bus.senders import Presence, ReceivedMessage, SenderVerifier
@@ -23,7 +21,6 @@ from swarmctl.core.types import PredictedPath
 MAX_AGE_US = 2_000_000
 MAX_LEAD_US = 500_000
 LEASE_US = 1_500_000  # time after which a failed `LocalHub` drops all tokens, as bus.lease_ms
-_LOSS_STREAM = 1  # key of the random stream of losses
 
 
 def agent_name(agent: int) -> str:
@@ -121,26 +118,37 @@ class _Message(NamedTuple):
 class LocalHub:
     """A bus in memory, on a simulated clock, for agents that tick one after another.
 
-    A message published at `t` arrives at `t + max(1, delay_us)`, so within one step no agent receives what another has
-    just published, and the order in which agents tick does not matter.
+    A message published at `t` arrives at `t + max(1, delay_us)` or later, so within one step no agent receives what
+    another has just published, and the order in which agents tick does not matter.
 
     Args:
         now_us: the simulated clock.
-        seed: seed of the losses.
-        delay_us: delay of every message.
-        loss_01: probability that one receiver misses one message of an unreliable topic.
+        seed: seed of all random impairments.
+        delay_us, loss_01, burst_01, burst_s, jitter_us: see `Impairments`.
     """
 
-    def __init__(self, now_us: Callable[[], int], seed: int = 0, delay_us: int = 0, loss_01: float = 0.0) -> None:
+    def __init__(
+        self,
+        now_us: Callable[[], int],
+        seed: int = 0,
+        delay_us: int = 0,
+        loss_01: float = 0.0,
+        *,
+        burst_01: float = 0.0,
+        burst_s: float = 2.0,
+        jitter_us: int = 0,
+    ) -> None:
         self._now_us = now_us
         self._seed = seed
-        self._travel_us = max(1, delay_us)
-        self._loss_01 = loss_01
+        self._began_us = now_us()
+        self._impairments = Impairments(
+            delay_us=delay_us, loss_01=loss_01, burst_01=burst_01, burst_s=burst_s, jitter_us=jitter_us
+        )
+        self._links: dict[tuple[str, str], Link] = {}
         self._attached: dict[str, LocalBus] = {}
         self._alive: frozenset[str] = frozenset()  # as last reported
         self._arrivals: Counter[str] = Counter()
         self._joined: set[str] = set()  # while it had failed
-        self._streams: dict[tuple[str, str], np.random.Generator] = {}
         self._failed_since_us: int | None = None
         self._held: list[tuple[str, Topic, bytes]] = []  # reliable messages published while it has failed
 
@@ -210,19 +218,18 @@ class LocalHub:
                 self._held.append((sender, topic, payload))
             return
         now_us = self._now_us()
-        message = _Message(now_us + self._travel_us, payload)
-        for bus in self._attached.values():
-            if bus.subscribes_to(topic, sender) and not self._is_lost(sender, bus.name, topic):
-                bus.accept(topic, sender, message, now_us)
+        for name, bus in self._attached.items():
+            if not bus.subscribes_to(topic, sender):
+                continue
+            arrival_us = self._link(sender, name).arrival_us(now_us, reliable=topic.reliable)
+            if arrival_us is not None:
+                bus.accept(topic, sender, _Message(arrival_us, payload), now_us)
 
-    def _is_lost(self, sender: str, receiver: str, topic: Topic) -> bool:
-        if topic.reliable or self._loss_01 <= 0.0:
-            return False
-        stream = self._streams.get((sender, receiver))
-        if stream is None:  # one stream for each link, so that draws depend on the sender's messages only
-            key = [self._seed, zlib.crc32(sender.encode()), zlib.crc32(receiver.encode()), _LOSS_STREAM]
-            stream = self._streams[(sender, receiver)] = np.random.default_rng(key)
-        return bool(stream.random() < self._loss_01)
+    def _link(self, sender: str, receiver: str) -> Link:
+        link = self._links.get((sender, receiver))
+        if link is None:
+            link = self._links[sender, receiver] = Link(self._impairments, self._seed, sender, receiver, self._began_us)
+        return link
 
 
 class LocalBus:
@@ -271,9 +278,12 @@ class LocalBus:
         return sender in self._subscriptions.get(topic, ())
 
     def accept(self, topic: Topic, sender: str, message: _Message, now_us: int) -> None:
-        """Queue a message under way."""
+        """Queue a message under way, in the order of arrival."""
         inbox = self._inboxes.setdefault(topic, {}).setdefault(sender, deque())
-        inbox.append(message)
+        place = len(inbox)
+        while place and inbox[place - 1].visible_us > message.visible_us:
+            place -= 1
+        inbox.insert(place, message)  # jitter reorders messages
         _trim(inbox, topic.ring, now_us)
 
 
