@@ -7,12 +7,14 @@ is the bus of lockstep flights.
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import NamedTuple, Protocol
 
 from swarmctl.bus.links import Impairments, Link
 from swarmctl.bus.path_messages import decode_path
+from swarmctl.bus.reachability import Reachability, TokenView
 from swarmctl.bus.refusals import FUTURE, IDENTITY, LATE, MALFORMED, UNKNOWN_PEER, Refusals
 from swarmctl.bus.senders import Presence, ReceivedMessage, SenderVerifier
 from swarmctl.bus.topics import PATH, TOO_LONG, TOPICS, Topic
@@ -20,7 +22,7 @@ from swarmctl.core.types import PredictedPath
 
 MAX_AGE_US = 2_000_000
 MAX_LEAD_US = 500_000
-LEASE_US = 1_500_000  # time after which a failed `LocalHub` drops all tokens, as bus.lease_ms
+LEASE_US = 1_500_000  # time after which a `LocalHub` drops tokens that can't be reached, as bus.lease_ms
 
 
 def agent_name(agent: int) -> str:
@@ -115,11 +117,20 @@ class _Message(NamedTuple):
     payload: bytes
 
 
+class _Held(NamedTuple):
+    """A reliable message that waits until it can pass."""
+
+    sender: str
+    topic: Topic
+    payload: bytes
+    only: frozenset[str] | None  # receivers that miss it; None: all that will be attached
+
+
 class LocalHub:
     """A bus in memory, on a simulated clock, for agents that tick one after another.
 
     A message published at `t` arrives at `t + max(1, delay_us)` or later, so within one step no agent receives what
-    another has just published, and the order in which agents tick does not matter.
+    another has just published, and the order in which agents tick does not matter. A message under way always arrives.
 
     Args:
         now_us: the simulated clock.
@@ -146,25 +157,43 @@ class LocalHub:
         )
         self._links: dict[tuple[str, str], Link] = {}
         self._attached: dict[str, LocalBus] = {}
-        self._alive: frozenset[str] = frozenset()  # as last reported
-        self._arrivals: Counter[str] = Counter()
-        self._joined: set[str] = set()  # while it had failed
-        self._failed_since_us: int | None = None
-        self._held: list[tuple[str, Topic, bytes]] = []  # reliable messages published while it has failed
+        self._views: dict[str, TokenView] = {}
+        self._reachability = Reachability()
+        self._held: list[_Held] = []
 
     def fail(self) -> None:
         """Stop delivery, as without a router. Reliable messages wait, the others are lost."""
-        self._failed_since_us = self._now_us()
-        self._joined = set()
+        self._reachability.failed = True
+        self._update_views()
 
     def recover(self) -> None:
         """Resume delivery; reliable messages that have waited are sent now."""
-        joined = set(self._attached) if self._has_lost_tokens() else self._joined & self._attached.keys()
-        held, self._held, self._failed_since_us = self._held, [], None
-        self._arrivals.update(joined)
-        self._alive = frozenset(self._attached)
-        for sender, topic, payload in held:
-            self.carry(sender, topic, payload)
+        self._reachability.failed = False
+        self._reconnect()
+
+    def split(self, groups: Iterable[frozenset[str]]) -> None:
+        """Separate groups of participants, as of a network in parts; a name in no group still reaches everybody.
+
+        Between groups reliable messages wait and the others are lost; tokens vanish after `LEASE_US`.
+
+        Raises:
+            ValueError: a name is in two groups.
+        """
+        self._reachability.split(groups)
+        self._reconnect()
+
+    def heal(self) -> None:
+        """Join the groups of a split; reliable messages that have waited are sent now."""
+        self.split(())
+
+    def cut(self, sender: str, receiver: str) -> None:
+        """Stop messages from one participant to another: reliable ones wait, the others are lost. Tokens stay."""
+        self._reachability.cut(sender, receiver)
+
+    def mend(self, sender: str, receiver: str) -> None:
+        """Undo a cut; reliable messages that have waited are sent now."""
+        self._reachability.mend(sender, receiver)
+        self._reconnect()
 
     def connect(self, name: str, subscriptions: Mapping[Topic, Sequence[str]] | None = None) -> LocalBus:
         """Join the hub as `name` and return the bus of that participant.
@@ -177,31 +206,26 @@ class LocalHub:
             raise ValueError(f"{name!r} is connected already")
         bus = LocalBus(self, name, subscriptions)
         self._attached[name] = bus
-        self._update_presence(joined=name)
+        self._views[name] = TokenView(LEASE_US)
+        self._update_views()
         return bus
 
     def detach(self, name: str) -> None:
         """Detach a participant: it sends and receives nothing more; its messages under way still arrive."""
         self._attached.pop(name, None)
-        self._update_presence()
+        self._views.pop(name, None)
+        self._update_views()
 
-    def alive(self) -> frozenset[str]:
-        """Return all participants; on a failed bus those of before, and none, not even the caller, after `LEASE_US`."""
-        return frozenset() if self._has_lost_tokens() else self._alive
+    def alive(self, observer: str) -> frozenset[str]:
+        """Return the participants whose tokens an attached one sees.
 
-    def arrivals(self) -> Mapping[str, int]:
-        """Return how often each has joined; all join once more after a failed bus had dropped them."""
-        return self._arrivals
+        One that it can't reach stays for `LEASE_US`; on a failed bus that is every one, the observer included.
+        """
+        return self._views[observer].alive(self._now_us())
 
-    def _has_lost_tokens(self) -> bool:
-        return self._failed_since_us is not None and self._now_us() - self._failed_since_us >= LEASE_US
-
-    def _update_presence(self, joined: str = "") -> None:
-        if self._failed_since_us is not None:
-            self._joined |= {joined} - {""}
-            return
-        self._alive = frozenset(self._attached)
-        self._arrivals.update([joined] if joined else [])
+    def arrivals(self, observer: str) -> Mapping[str, int]:
+        """Return how often an attached participant has seen each token appear, also again after it had vanished."""
+        return self._views[observer].arrivals()
 
     def now_us(self) -> int:
         """Return the simulated time [us]."""
@@ -211,25 +235,42 @@ class LocalHub:
         """Tell whether this very participant is attached, not another one of its name."""
         return self._attached.get(bus.name) is bus
 
-    def carry(self, sender: str, topic: Topic, payload: bytes) -> None:
-        """Send a message to every receiver that does not lose it."""
-        if self._failed_since_us is not None:
+    def carry(self, sender: str, topic: Topic, payload: bytes, only: frozenset[str] | None = None) -> None:
+        """Send a message to every receiver that does not lose it, or to those of `only`."""
+        if self._reachability.failed:
             if topic.reliable:
-                self._held.append((sender, topic, payload))
+                self._held.append(_Held(sender, topic, payload, only))
             return
-        now_us = self._now_us()
+        now_us, missed = self._now_us(), []
         for name, bus in self._attached.items():
-            if not bus.subscribes_to(topic, sender):
+            if (only is not None and name not in only) or not bus.subscribes_to(topic, sender):
+                continue
+            if not self._reachability.passes(sender, name):
+                missed.append(name)
                 continue
             arrival_us = self._link(sender, name).arrival_us(now_us, reliable=topic.reliable)
             if arrival_us is not None:
                 bus.accept(topic, sender, _Message(arrival_us, payload), now_us)
+        if missed and topic.reliable:
+            self._held.append(_Held(sender, topic, payload, frozenset(missed)))
 
     def _link(self, sender: str, receiver: str) -> Link:
         link = self._links.get((sender, receiver))
         if link is None:
             link = self._links[sender, receiver] = Link(self._impairments, self._seed, sender, receiver, self._began_us)
         return link
+
+    def _reconnect(self) -> None:
+        """Tell of the tokens that can be reached now, and send what has waited; what still can't pass waits on."""
+        self._update_views()
+        held, self._held = self._held, []
+        for message in held:
+            self.carry(*message)
+
+    def _update_views(self) -> None:
+        now_us = self._now_us()
+        for observer, view in self._views.items():
+            view.update(self._attached, partial(self._reachability.shows, observer=observer), now_us)
 
 
 class LocalBus:
@@ -262,10 +303,10 @@ class LocalBus:
         return [(sender, payload) for _, sender, payload in arrived]
 
     def alive(self) -> frozenset[str]:
-        return self._hub.alive()
+        return self._hub.alive(self.name) if self._hub.is_attached(self) else frozenset()
 
     def arrivals(self) -> Mapping[str, int]:
-        return self._hub.arrivals()
+        return self._hub.arrivals(self.name) if self._hub.is_attached(self) else {}
 
     def close(self) -> None:
         if self._hub.is_attached(self):
