@@ -26,7 +26,7 @@ from swarmctl.bus import topics
 from swarmctl.bus.json_messages import CommandMessage, ObstaclesMessage, encode_message
 from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.config import Config
-from swarmctl.core.clock import SimClock
+from swarmctl.core.clock import Clock, ClockError, OffsetClock, SimClock
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import EXCLUDE
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE, tick_row
@@ -47,7 +47,7 @@ class FlightLog:
 
     directory: Path | None
     agent: int
-    clock: SimClock
+    clock: Clock  # the agent's own
     rows: list[NDArray[np.void]] = field(default_factory=list)
     events: list[dict[str, Any]] = field(default_factory=list)
     _tlog: BinaryIO | None = None
@@ -95,6 +95,8 @@ class Lockstep:
         directory: folder for the agents' files; None keeps everything in memory.
         order: order of ticking agents within a step; has no effect on the result.
         own: configurations of agents that differ from the run's.
+        clocks: errors of the UTC of agents whose clocks are wrong. An agent stamps its messages and records with its
+            own; the operator, the simulator and everything on monotonic time are right.
     """
 
     def __init__(
@@ -103,6 +105,7 @@ class Lockstep:
         directory: Path | None = None,
         order: Sequence[int] | None = None,
         own: Mapping[int, Config] | None = None,
+        clocks: Mapping[int, ClockError] | None = None,
     ) -> None:
         if reason := why_not_repeatable():
             warnings.warn(f"this flight may differ from the same one elsewhere: {reason}", stacklevel=2)
@@ -117,7 +120,9 @@ class Lockstep:
         self.links = [pipe_pair(self.clock.now_us, latency_us) for _ in range(agents)]  # (agent's, vehicle's) ends
         self.world = SitlWorld(config.simulator(), [vehicle for _, vehicle in self.links])
         self.hub = _hub(config, self.clock)
-        self.logs = [FlightLog(directory=directory, agent=i, clock=self.clock) for i in range(agents)]
+        errors = clocks or {}
+        own_clocks = [OffsetClock(self.clock, errors[i]) if i in errors else self.clock for i in range(agents)]
+        self.logs = [FlightLog(directory=directory, agent=i, clock=own_clocks[i]) for i in range(agents)]
         self.fault_events: list[dict[str, Any]] = []
         self.world.faults.on_event = self._on_fault
         self._operator = self.hub.connect(topics.OPERATOR)
@@ -146,7 +151,7 @@ class Lockstep:
             boot_id,
             transport,
             bus=bus,
-            clock=self.clock,
+            clock=log.clock,
             sink=log,
             on_frame=log.frame,
             stopwatch_ns=time.perf_counter_ns,

@@ -6,6 +6,7 @@ Monotonic microseconds (`now_us`) are for deadlines and ages inside this process
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Protocol
 
 
@@ -37,3 +38,26 @@ class SimClock:
         if step_us <= 0:
             raise ValueError(f"step_us: {step_us} must be positive")
         self._now_us += step_us
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClockError:
+    """Error of a host's UTC."""
+
+    offset_us: int = 0  # ahead of true UTC at monotonic time 0
+    drift_ppm: float = 0.0  # gain on true UTC, > -1e6
+
+
+class OffsetClock:
+    """A clock whose UTC is wrong by `error`; its monotonic time is that of `clock`."""
+
+    def __init__(self, clock: Clock, error: ClockError) -> None:
+        self._clock = clock
+        self._error = error
+
+    def now_us(self) -> int:
+        return self._clock.now_us()
+
+    def utc_us(self) -> int:
+        drift_us = round(1e-6 * self._error.drift_ppm * self._clock.now_us())
+        return self._clock.utc_us() + self._error.offset_us + drift_us

@@ -36,8 +36,13 @@ def refused_peers(events: Sequence[Mapping[str, Any]]) -> Iterator[str]:
         yield f"messages in the name of {sender} were refused ({kinds}) by {agents}"
 
 
-def unresponsive(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return how often no path of a peer on the bus was accepted, and the longest time with both agents involved."""
+def unresponsive(events: Sequence[Mapping[str, Any]], time_field: str) -> dict[str, Any]:
+    """Return how often no path of a peer on the bus was accepted, and the longest time with both agents involved.
+
+    Args:
+        events: of all sources.
+        time_field: time of an event that all sources share, see `Tracks`.
+    """
     count, since_us = 0, dict[tuple[str, int], int]()
     worst: tuple[float, int | None, str | None] = (0.0, None, None)
     for event in events:
@@ -46,15 +51,15 @@ def unresponsive(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
         source, agent = str(event.get("source")), event["agent"]
         if event.get("begins"):
             count += 1
-            since_us[source, agent] = _utc_us(event)
+            since_us[source, agent] = _time_us(event, time_field)
         elif since_us.pop((source, agent), None) is not None:
             worst = max(worst, (finite(event.get("lasted_s")) or 0.0, agent, source), key=lambda item: item[0])
-    last_us = max(map(_utc_us, events), default=0)
+    last_us = max((_time_us(event, time_field) for event in events), default=0)
     for (source, agent), began_us in since_us.items():  # those that lasted to the end of the run
         worst = max(worst, ((last_us - began_us) * 1e-6, agent, source), key=lambda item: item[0])
     longest_s, agent_, by = worst
     return {"count": count, "longest_s": longest_s if count else None, "agent": agent_, "by": by}
 
 
-def _utc_us(event: Mapping[str, Any]) -> int:
-    return int(finite(event.get("utc_us")) or 0)
+def _time_us(event: Mapping[str, Any], time_field: str) -> int:
+    return int(finite(event.get(time_field)) or 0)

@@ -102,7 +102,7 @@ def evaluate(
         "obstacles": obstacles,
         "timing": timing,
         "solver": _solver(run.ticks, rules.solver_name),
-        "comms": _comms(run),
+        "comms": _comms(run, tracks.time_field),
         "deadlocks": _deadlocks(run.events),
         "commitments": _commitments(run.events),
     }
@@ -276,7 +276,7 @@ def _solver(ticks: Mapping[int, NDArray[np.void]], name: str) -> dict[str, Any]:
     }
 
 
-def _comms(run: RunData) -> dict[str, Any]:
+def _comms(run: RunData, time_field: str) -> dict[str, Any]:
     """Summarise plan staleness, messages refused (last `bus_summary` of each agent) and unresponsive peers."""
     ages = _percentiles([flight_rows(rows)["plan_staleness_ms"] for rows in run.ticks.values()])
     last = {event.get("source"): event for event in run.events if event.get("event") == "bus_summary"}
@@ -288,7 +288,7 @@ def _comms(run: RunData) -> dict[str, Any]:
     return {
         "path_age_ms": {"p50": ages["p50"], "p99": ages["p99"]},
         "rejected": dict(sorted(rejected.items())),
-        "unresponsive": unresponsive(run.events),
+        "unresponsive": unresponsive(run.events, time_field),
     }
 
 

@@ -373,6 +373,14 @@ def test_the_peer_unresponsive_for_longest_is_named() -> None:
     assert comms["unresponsive"] == {"count": 2, "longest_s": 41.0, "agent": 0, "by": "agent-1"}
 
 
+def test_with_true_states_an_unresponsive_peer_is_timed_on_their_clock() -> None:
+    row = {"source": "agent-0", "event": "unresponsive", "agent": 1, "utc_us": 90_000_000, "t_us": 11_000_000}
+    events = [row | {"begins": True}, {"event": "state", "utc_us": 40_000_000, "t_us": 52_000_000}]
+    recorded = run(APART, *(truth(i, [0.0, 1.0], np.zeros((2, 3))) for i in (0, 1)), events=events)
+    comms = evaluate(recorded, Rules(agents=2, required_separation_m=0.5), "completed")["comms"]
+    assert comms["unresponsive"]["longest_s"] == 41.0
+
+
 @pytest.mark.parametrize(
     ("outcome", "problems", "judged"),
     [

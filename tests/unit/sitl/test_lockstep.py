@@ -1,0 +1,87 @@
+"""What a lockstep flight is told beside its configuration: clocks of the agents that are wrong, and their records."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sitl.lockstep import Lockstep
+from swarmctl.config import load
+from swarmctl.core.clock import ClockError, OffsetClock, SimClock
+from swarmctl.telemetry.evaluation.referee import evaluate
+from swarmctl.telemetry.evaluation.tracks import mission_start_us, track_error, tracking_rows
+
+AHEAD_US = 200_000
+TWO = ("swarm.agents=2", "sitl.start=air", "mission.duration_s=3")
+
+
+def flown(clocks: dict[int, ClockError] | None = None, until_s: float = 8.0) -> Lockstep:
+    lockstep = Lockstep(load(None, TWO), clocks=clocks)
+    lockstep.run(lambda flight: flight.clock.now_us() >= until_s * 1e6)
+    return lockstep
+
+
+def offsets_us(lockstep: Lockstep, agent: int) -> list[int]:
+    """Return how far the agent's ticks are stamped ahead of true UTC."""
+    ticks, epoch_us = lockstep.logs[agent].ticks, SimClock().utc_us()
+    ahead_us: list[int] = (ticks["utc_us"] - ticks["t_us"] - epoch_us).tolist()
+    return ahead_us
+
+
+def test_a_wrong_clock_is_ahead_and_gains_while_its_monotonic_time_is_right() -> None:
+    true = SimClock()
+    clock = OffsetClock(true, ClockError(offset_us=-1000, drift_ppm=50.0))
+    assert (clock.now_us(), clock.utc_us()) == (0, true.utc_us() - 1000)
+    true.advance(100_000_000)
+    assert (clock.now_us(), clock.utc_us()) == (100_000_000, true.utc_us() - 1000 + 5000)
+
+
+@pytest.fixture(scope="module")
+def skewed() -> Lockstep:
+    return flown({1: ClockError(offset_us=AHEAD_US, drift_ppm=100.0)})
+
+
+def test_an_agent_stamps_its_ticks_and_events_with_its_own_clock(skewed: Lockstep) -> None:
+    assert set(offsets_us(skewed, 0)) == {0}
+    ahead_us = offsets_us(skewed, 1)
+    assert ahead_us[0] == AHEAD_US
+    assert ahead_us[-1] == pytest.approx(AHEAD_US + 100.0 * skewed.logs[1].ticks["t_us"][-1] * 1e-6, abs=1)
+    for agent, least_us in ((0, 0), (1, AHEAD_US)):
+        event = skewed.logs[agent].events[-1]
+        assert event["utc_us"] - event["t_us"] - SimClock().utc_us() == pytest.approx(least_us, abs=2000)
+
+
+def test_agents_begin_the_mission_at_the_same_time_of_their_own_clocks(skewed: Lockstep) -> None:
+    begin_us = {i: mission_start_us({i: skewed.logs[i].ticks}, "utc_us") for i in (0, 1)}
+    assert begin_us[0] is not None and begin_us[0] == begin_us[1]
+    first_us = [int(tracking_rows(log.ticks)["t_us"][0]) for log in skewed.logs]
+    assert first_us[0] - first_us[1] == pytest.approx(AHEAD_US, abs=20_000), "the one ahead begins earlier"
+
+
+def test_the_evaluation_compares_records_of_wrong_clocks_at_their_monotonic_time(skewed: Lockstep) -> None:
+    summary = evaluate(skewed.recorded(), skewed.config.rules("lockstep"), "interrupted")
+    pos = skewed.truth["pos_ned_m"].reshape(-1, 2, 3)
+    assert summary["separation"]["min_m"] == pytest.approx(float(np.linalg.norm(pos[:, 0] - pos[:, 1], axis=1).min()))
+    for agent, log in enumerate(skewed.logs):
+        rows = tracking_rows(log.ticks)
+        error_ned_m = track_error(rows, skewed.truth, agent).error_ned_m
+        assert np.linalg.norm(rows["vel_ned_m_s"], axis=1).max() > 1.0, "0.2 s would be seen"
+        assert np.allclose(error_ned_m, rows["pos_ned_m"] - rows["ref_pos_ned_m"], atol=1e-4)
+
+
+def test_errors_of_zero_leave_a_flight_as_it_is() -> None:
+    right, unset = flown({0: ClockError(), 1: ClockError()}, until_s=3.0), flown(until_s=3.0)
+    assert right.truth.tobytes() == unset.truth.tobytes()
+    assert right.logs[1].events == unset.logs[1].events
+
+
+def test_recorded_frames_are_stamped_with_the_own_clock(tmp_path: Path) -> None:
+    lockstep = Lockstep(load(None, TWO), tmp_path, clocks={1: ClockError(offset_us=AHEAD_US)})
+    for _ in range(100):
+        lockstep.step()
+    for log in lockstep.logs:
+        log.close()
+    first_us = [int.from_bytes((tmp_path / f"agent-{i}.tlog").read_bytes()[:8], "big") for i in (0, 1)]
+    assert first_us[1] - first_us[0] == AHEAD_US
