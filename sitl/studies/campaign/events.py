@@ -1,14 +1,15 @@
-"""Scenario events in the middle of a flight: an agent dies, the bus is partitioned, an obstacle appears."""
+"""Scenario events in the middle of a flight: agents die or stop, the bus fails or splits, an obstacle appears."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Protocol
 
 import numpy as np
 
 from sitl.lockstep import Lockstep
+from swarmctl.bus.peers import agent_name
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Array
 
@@ -40,19 +41,68 @@ class Death:
         return ()
 
 
-class Partition:
-    """No agent receives any other one for a while."""
+class _Episode:
+    """An event that begins at `at_s` of mission time and ends after `for_s`, never if that is infinite."""
 
     def __init__(self, at_s: float, for_s: float) -> None:
-        self._due = [(at_s, True), (at_s + for_s, False)]
+        self._due = [(at_s, self._begin), (at_s + for_s, self._end)]
 
     def step(self, lockstep: Lockstep, t_s: float, pos_ned_m: Array, vel_ned_m_s: Array) -> None:
         if self._due and t_s >= self._due[0][0]:
-            _, falls = self._due.pop(0)
-            (lockstep.hub.fail if falls else lockstep.hub.recover)()
+            _, act = self._due.pop(0)
+            act(lockstep)
 
     def obstacles(self, t_s: float) -> Sequence[Obstacle]:
         return ()
+
+    def _begin(self, lockstep: Lockstep) -> None:
+        raise NotImplementedError
+
+    def _end(self, lockstep: Lockstep) -> None:
+        raise NotImplementedError
+
+
+class Partition(_Episode):
+    """No agent receives any other one for a while."""
+
+    def _begin(self, lockstep: Lockstep) -> None:
+        lockstep.hub.fail()
+
+    def _end(self, lockstep: Lockstep) -> None:
+        lockstep.hub.recover()
+
+
+class Split(_Episode):
+    """Agents of different groups do not receive each other for a while; one in no group reaches everybody.
+
+    Args:
+        groups: agents of each.
+        at_s, for_s: see `_Episode`.
+    """
+
+    def __init__(self, groups: Sequence[Collection[int]], at_s: float, for_s: float) -> None:
+        super().__init__(at_s, for_s)
+        self._groups = [frozenset(map(agent_name, agents)) for agents in groups]
+
+    def _begin(self, lockstep: Lockstep) -> None:
+        lockstep.hub.split(self._groups)
+
+    def _end(self, lockstep: Lockstep) -> None:
+        lockstep.hub.heal()
+
+
+class Freeze(_Episode):
+    """An agent's process stops for a while: its token stays, but it neither receives nor sends anything."""
+
+    def __init__(self, agent: int, at_s: float, for_s: float) -> None:
+        super().__init__(at_s, for_s)
+        self._agent = agent
+
+    def _begin(self, lockstep: Lockstep) -> None:
+        lockstep.frozen.add(self._agent)
+
+    def _end(self, lockstep: Lockstep) -> None:
+        lockstep.frozen.discard(self._agent)
 
 
 class Appearance:
