@@ -23,7 +23,7 @@ from swarmctl.core.types import Array
 _STEP_DIRECTIONS = np.array(
     [(1, 0, 0), (0, 0, 0), (-1, 0, 0), (0, 0, 0), (0, 1, 0), (0, 0, 0), (0, -1, 0), (0, 0, 0), (0, 0, -1), (0, 0, 0)]
 )
-MOVING_ROOM = 1.02  # places round a moving reference are farther apart than plans keep: tracking errors differ
+MOVING_ROOM = 1.04  # places round a moving reference are farther apart than plans keep: tracking errors differ
 OUTER_DELAY_S_M = 0.5  # delay of arrival per metre that a place is farther out
 Waypoint = Annotated[tuple[float, float, float, float], Field(strict=False)]
 Sampled = Callable[[Array], tuple[Array, Array]]  # positions and velocities (K, 3) NED at times (K,) >= 0 [s]
