@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence, Set
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from sitl.lockstep import Lockstep
+from sitl.studies.campaign.events import Freeze, ScenarioEvent, Split
 from sitl.studies.campaign.flight import TrialFlight
 from sitl.studies.campaign.scenarios import layout_of
 from sitl.studies.campaign.trials import Cell, Trial
@@ -136,6 +140,54 @@ def test_negative_control_taking_stale_peers_for_lost_commits_against_alive_peer
 
     monkeypatch.setattr(Coordination, "_required_peers", only_seen)
     assert committed_in_the_dark() > 4
+
+
+def disturbed(event: ScenarioEvent, lost: Set[int] = frozenset(), limit_s: float = 12.0) -> TrialFlight:
+    """Four agents that swap; those in `lost` need not arrive, and nobody has to stay in the mission."""
+    cell = Cell(
+        scenario="swap", agents=4, delay_ms=50.0, loss=0.0, noise="exact", wind_m_s=0.0, protections="guaranteed"
+    )
+    layout = replace(layout_of("swap", 1, 4), events=(event,), limit_s=limit_s, lost=frozenset(lost))
+    flight = TrialFlight(Trial(cell, 1), layout)
+    flight.run()
+    return flight
+
+
+def halves(for_s: float = math.inf) -> Split:
+    """Half a second after the mission has begun, two and two no longer hear each other."""
+    return Split([frozenset({0, 1}), frozenset({2, 3})], 0.5, for_s)
+
+
+def test_two_halves_that_are_cut_off_from_each_other_both_come_to_rest() -> None:
+    flight = disturbed(halves())
+    assert flight.monitor.min_separation_m >= COMMITTED_M
+    assert np.linalg.norm(flight.lockstep.world.plant.vel_ned_m_s, axis=0).max() < 0.1
+    told = events(flight, "membership")
+    assert len(told) == 4 and all(len(e["suspected"]) == 2 and e["excluded"] == [] for e in told)  # type: ignore[arg-type]
+
+
+def test_halves_that_hear_each_other_again_in_time_go_on() -> None:
+    row = disturbed(halves(for_s=4.0), limit_s=20.0).row(None)
+    assert row["outcome"] == "arrived"
+    assert row["min_separation_m"] >= COMMITTED_M
+
+
+def test_negative_control_halves_that_take_missing_tokens_for_deaths_collide(monkeypatch: pytest.MonkeyPatch) -> None:
+    def only_seen(self: Coordination) -> Set[int]:
+        return frozenset(agent for agent in self._peers if agent_name(agent) in self._bus.alive())
+
+    monkeypatch.setattr(Coordination, "_required_peers", only_seen)
+    assert disturbed(halves()).monitor.collided
+
+
+def test_the_others_go_on_without_a_frozen_agent_once_they_agree() -> None:
+    """Its process is stopped: its token stays on the bus, and its autopilot lands the vehicle."""
+    flight = disturbed(Freeze(3, 1.5, math.inf), lost={3}, limit_s=25.0)
+    assert flight.row(None)["outcome"] == "arrived"
+    assert flight.monitor.min_separation_m >= TOUCH_M
+    excluded = [e for e in events(flight, "membership") if e["excluded"]]
+    assert {e["source"] for e in excluded} == {agent_name(i) for i in range(3)}
+    assert all(e["excluded"] == [3] for e in excluded)
 
 
 @pytest.mark.parametrize(("body_m", "told"), [(0.48, False), (0.8, True)])
