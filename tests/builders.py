@@ -154,6 +154,7 @@ def trajectory_message(
     proposal: Proposal | None = None,
     acknowledged: Mapping[int, int] = NOBODY,
     exclusions: Exclusions | None = None,
+    heard: Mapping[int, tuple[int, int]] | None = None,
 ) -> TrajectoryMessage:
     """Return the message of peer 1, which proposes nothing and has acknowledged nobody."""
     return TrajectoryMessage(
@@ -166,4 +167,5 @@ def trajectory_message(
         proposal=proposal,
         acknowledged=acknowledged,
         exclusions=exclusions or Exclusions(),
+        heard=heard or {},
     )

@@ -67,7 +67,10 @@ class Coordination:
             agent, params, mpc, separation, max_keep_outs=max_keep_outs, stopwatch_ns=stopwatch_ns
         )
         refusals, presence = world_model.refusals, world_model.presence
-        self._peer_trajectories, self._peers = PeerTrajectories(peers, rate_hz, refusals, presence), frozenset(peers)
+        self._peer_trajectories = PeerTrajectories(
+            peers, rate_hz, refusals, presence, agent=agent, clocks=world_model.clocks
+        )
+        self._peers = frozenset(peers)
         self._note, self._seq, self._separation = note, 0, separation
         self._is_committed = False
         self._allowed_m = separation.budget.tracking_allowance_m
@@ -159,6 +162,7 @@ class Coordination:
             proposal=self._commitments.proposal,
             acknowledged=self._peer_trajectories.acknowledgements(self._unacknowledged()),
             exclusions=self._membership.exclusions,
+            heard=self._peer_trajectories.heard(),
         )
         self._bus.publish(topics.TRAJECTORY, encode_trajectory_message(message))
 

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence, Set
 from swarmctl.bus import topics
 from swarmctl.bus.json_messages import StatusMessage, decode_obstacles, decode_status
 from swarmctl.bus.orders import Orders
+from swarmctl.bus.peer_clocks import PeerClocks
 from swarmctl.bus.peers import Bus, PeerPaths, agent_name
 from swarmctl.bus.refusals import FUTURE, IDENTITY, MALFORMED, SEQUENCE, UNKNOWN_PEER, Refusals
 from swarmctl.bus.senders import Presence, ReceivedMessage, SenderVerifier
@@ -57,7 +58,8 @@ class WorldModel:
     ) -> None:
         self._agent, self._params, self._bus, self._note = agent, params, bus, note
         self.refusals, self.presence = Refusals(note), Presence(bus)
-        self.paths = PeerPaths(peers, rate_hz, self.refusals, self.presence)
+        self.clocks = PeerClocks(peers, note)
+        self.paths = PeerPaths(peers, rate_hz, self.refusals, self.presence, clocks=self.clocks)
         self._verifiers = {
             peer: SenderVerifier(agent_name(peer), topics.STATUS.name, rate_hz, self.refusals, presence=self.presence)
             for peer in peers
@@ -93,7 +95,7 @@ class WorldModel:
             reason = IDENTITY
         elif status.agent not in self._verifiers:
             reason = UNKNOWN_PEER
-        elif max(status.utc_us, status.ready_utc_us) > utc_us + _STATUS_LEAD_US:
+        elif max(status.utc_us, status.ready_utc_us) - self.clocks.ahead_us(status.agent) > utc_us + _STATUS_LEAD_US:
             reason = FUTURE
         if reason or status is None:
             self.refusals.add(sender, topics.STATUS.name, reason, utc_us)
@@ -251,9 +253,13 @@ class WorldModel:
         """Return phase, ready time and liveliness of every peer that has published a status."""
         alive = self._bus.alive()
         return {
-            agent: PeerInputs(Phase(status.phase), status.ready_utc_us, agent_name(agent) in alive)
+            agent: PeerInputs(Phase(status.phase), self._ready_utc_us(status), agent_name(agent) in alive)
             for agent, status in self._status.items()
         }
+
+    def _ready_utc_us(self, status: StatusMessage) -> int:
+        """Return when a peer reached its start, by the own clock; 0 before."""
+        return status.ready_utc_us - self.clocks.ahead_us(status.agent) if status.ready_utc_us else 0
 
     def others_ned_m(self, utc_us: int) -> tuple[Array, ...]:
         """Return the present position (3,) of each peer by its newest path."""

@@ -1,8 +1,8 @@
 """Trajectory messages of `swarmctl.control.commit.protocol`: their encoding, and the newest one of every peer.
 
 The layout is little-endian: a header, the committed trajectory, a proposal if there is one, acknowledgements (agent,
-number), and the numbers of agents that are suspected, then of those to be excluded. A trajectory is t0, step and count,
-then positions and velocities as float32.
+number), what was heard (agent, stamp, arrival), and the numbers of agents that are suspected, then of those to be
+excluded. A trajectory is t0, step and count, then positions and velocities as float32.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from collections.abc import Iterable, Set
 
 import numpy as np
 
+from swarmctl.bus.peer_clocks import PeerClocks
 from swarmctl.bus.peers import MAX_LEAD_US, agent_name
 from swarmctl.bus.refusals import FUTURE, IDENTITY, MALFORMED, UNKNOWN_PEER, Refusals
 from swarmctl.bus.senders import Presence, ReceivedMessage, SenderVerifier
@@ -24,13 +25,14 @@ TRAJECTORY_VERSION = 3
 MAX_POINTS = 2000
 MAX_STEP_US = 500_000
 MAX_BEGIN_US = 10_000_000  # from now; a trajectory that begins later comes from another clock
-MAX_PEERS = 256  # of each kind: acknowledged, suspected, promised
+MAX_PEERS = 256  # of each kind: acknowledged, heard, suspected, promised
 _MAGIC = b"SI"
-_HEADER = struct.Struct("<2sBBIIIqHHH2x")  # magic version flags agent boot seq sent, counts of the three kinds
+_HEADER = struct.Struct("<2sBBIIIqHHHH")  # magic version flags agent boot seq sent, counts of the four kinds
 _HAS_PROPOSAL, _IS_COMMITTED = 1, 2
 _PROPOSAL = struct.Struct("<Qq")  # number, time of proposal
 _TRAJECTORY = struct.Struct("<qiH2x")
 _ACKNOWLEDGEMENT = struct.Struct("<IQ")
+_HEARD = struct.Struct("<Iqq")
 _AGENT = struct.Struct("<I")
 
 Memory = dict[bytes, Trajectory]  # decoded trajectories by their bytes
@@ -48,6 +50,7 @@ def encode_trajectory_message(message: TrajectoryMessage) -> bytes:
             message.seq,
             message.sent_utc_us,
             len(message.acknowledged),
+            len(message.heard),
             len(message.exclusions.suspected),
             len(message.exclusions.promised),
         ),
@@ -57,33 +60,38 @@ def encode_trajectory_message(message: TrajectoryMessage) -> bytes:
         parts.append(_PROPOSAL.pack(message.proposal.number, message.proposal.made_utc_us))
         parts.append(_encode_trajectory(message.proposal.trajectory))
     parts += [_ACKNOWLEDGEMENT.pack(agent, number) for agent, number in sorted(message.acknowledged.items())]
+    parts += [_HEARD.pack(agent, *stamps) for agent, stamps in sorted(message.heard.items())]
     for agents in (message.exclusions.suspected, message.exclusions.promised):
         parts += [_AGENT.pack(agent) for agent in sorted(agents)]
     return b"".join(parts)
 
 
-def decode_trajectory_message(payload: bytes, memory: Memory | None = None) -> TrajectoryMessage | None:
+def decode_trajectory_message(
+    payload: bytes, memory: Memory | None = None, ahead_us: int = 0
+) -> TrajectoryMessage | None:
     """Decode one message; None unless magic, version, lengths and all numbers are valid.
 
     `memory` holds the trajectories of the previous message: a trajectory that is repeated becomes the same object, by
-    which the protocol knows that it has checked it before.
+    which the protocol knows that it has checked it before. The sender's clock is `ahead_us` ahead of the own one, to
+    which its trajectories are converted; the memory must be of the same correction.
     """
     try:
         magic, version, flags, agent, boot_id, seq, sent_utc_us, *counts = _HEADER.unpack_from(payload)
         if magic != _MAGIC or version != TRAJECTORY_VERSION or flags > 3 or max(counts) > MAX_PEERS:
             return None
-        acknowledgements, suspected, promised = counts
+        acknowledgements, heard, suspected, promised = counts
         known, sent = memory or {}, Memory()
-        committed, at = _decode_trajectory(payload, _HEADER.size, known, sent)
+        committed, at = _decode_trajectory(payload, _HEADER.size, known, sent, ahead_us=ahead_us)
         proposal = None
         if flags & _HAS_PROPOSAL:
             number, made_utc_us = _PROPOSAL.unpack_from(payload, at)
-            trajectory, at = _decode_trajectory(payload, at + _PROPOSAL.size, known, sent)
+            trajectory, at = _decode_trajectory(payload, at + _PROPOSAL.size, known, sent, ahead_us=ahead_us)
             proposal = Proposal(number=number, made_utc_us=made_utc_us, agent=agent, trajectory=trajectory)
-        agents_at = at + acknowledgements * _ACKNOWLEDGEMENT.size
+        heard_at = at + acknowledgements * _ACKNOWLEDGEMENT.size
+        agents_at = heard_at + heard * _HEARD.size
         if len(payload) != agents_at + (suspected + promised) * _AGENT.size:
             return None
-        acknowledged = dict(_ACKNOWLEDGEMENT.iter_unpack(payload[at:agents_at]))
+        acknowledged = dict(_ACKNOWLEDGEMENT.iter_unpack(payload[at:heard_at]))
         agents = [number for (number,) in _AGENT.iter_unpack(payload[agents_at:])]
         exclusions = Exclusions(suspected=frozenset(agents[:suspected]), promised=frozenset(agents[suspected:]))
         if memory is not None:
@@ -99,6 +107,7 @@ def decode_trajectory_message(payload: bytes, memory: Memory | None = None) -> T
             proposal=proposal,
             acknowledged=acknowledged,
             exclusions=exclusions,
+            heard={a: (sent_, at_) for a, sent_, at_ in _HEARD.iter_unpack(payload[heard_at:agents_at])},
         )
     except (struct.error, ValueError):
         return None
@@ -109,7 +118,9 @@ def _encode_trajectory(trajectory: Trajectory) -> bytes:
     return _TRAJECTORY.pack(trajectory.t0_utc_us, trajectory.dt_us, len(points)) + points.tobytes()
 
 
-def _decode_trajectory(payload: bytes, at: int, known: Memory, sent: Memory) -> tuple[Trajectory, int]:
+def _decode_trajectory(
+    payload: bytes, at: int, known: Memory, sent: Memory, *, ahead_us: int
+) -> tuple[Trajectory, int]:
     """Return the trajectory encoded at offset `at`, and the offset of its end.
 
     Raises:
@@ -128,7 +139,7 @@ def _decode_trajectory(payload: bytes, at: int, known: Memory, sent: Memory) -> 
     if not np.isfinite(points).all():
         raise ValueError("not finite")
     sent[body] = Trajectory(
-        t0_utc_us=t0_utc_us, dt_us=dt_us, pos_ned_m=points[:, :3].copy(), vel_ned_m_s=points[:, 3:].copy()
+        t0_utc_us=t0_utc_us - ahead_us, dt_us=dt_us, pos_ned_m=points[:, :3].copy(), vel_ned_m_s=points[:, 3:].copy()
     )
     return sent[body], end
 
@@ -139,14 +150,26 @@ class PeerTrajectories:
     Args:
         peers: numbers of the other agents.
         rate_hz, refusals, presence: see `SenderVerifier`.
+        agent: own number, under which peers answer.
+        clocks: measured on the messages, by which trajectories are converted to the own clock.
     """
 
-    def __init__(self, peers: Iterable[int], rate_hz: float, refusals: Refusals, presence: Presence) -> None:
+    def __init__(
+        self,
+        peers: Iterable[int],
+        rate_hz: float,
+        refusals: Refusals,
+        presence: Presence,
+        *,
+        agent: int,
+        clocks: PeerClocks,
+    ) -> None:
         names = {agent: agent_name(agent) for agent in peers}
         self._verifiers = {
             a: SenderVerifier(name, TRAJECTORY.name, rate_hz, refusals, presence=presence) for a, name in names.items()
         }
-        self._refusals = refusals
+        self._refusals, self._agent, self._clocks = refusals, agent, clocks
+        self._numbers = {name: number for number, name in names.items()}
         self._memory: dict[str, Memory] = {}
         self.newest: dict[int, TrajectoryMessage] = {}
         self.received_utc_us: dict[int, int] = {}  # when the newest message of each peer was accepted
@@ -154,8 +177,8 @@ class PeerTrajectories:
 
     def offer(self, sender: str, payload: bytes, utc_us: int) -> None:
         """Check one message and keep it if it is accepted; the bus guarantees the name `sender`, `utc_us` is now."""
-        memory = dict(self._memory.get(sender, {}))
-        message = decode_trajectory_message(payload, memory)
+        memory, ahead_us = dict(self._memory.get(sender, {})), self._clocks.ahead_us(self._numbers.get(sender, -1))
+        message = decode_trajectory_message(payload, memory, ahead_us)
         if message is None or (reason := self._refusal(sender, message, utc_us)):
             self._refusals.add(sender, TRAJECTORY.name, MALFORMED if message is None else reason, utc_us)
             return
@@ -164,10 +187,22 @@ class PeerTrajectories:
             self.newest[message.agent], self._memory[sender] = message, memory
             self.received_utc_us[message.agent] = utc_us
             self._first_committed.setdefault(message.agent, message.is_committed)
+            self._measure(message, utc_us)
+            if self._clocks.ahead_us(message.agent) != ahead_us:
+                self._memory[sender] = {}
 
     def acknowledgements(self, without: Set[int]) -> dict[int, int]:
         """Return the number of the current proposal of each peer that has one and is not in `without`."""
         return {a: i.proposal.number for a, i in self.newest.items() if i.proposal is not None and a not in without}
+
+    def heard(self) -> dict[int, tuple[int, int]]:
+        """Return stamp and arrival of the newest message of each peer."""
+        return {agent: (i.sent_utc_us, self.received_utc_us[agent]) for agent, i in self.newest.items()}
+
+    def _measure(self, message: TrajectoryMessage, utc_us: int) -> None:
+        self._clocks.received(message.agent, message.sent_utc_us, utc_us)
+        if self._agent in message.heard:
+            self._clocks.answered(message.agent, *message.heard[self._agent], utc_us)
 
     @property
     def heard_before_flight(self) -> frozenset[int]:

@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple, Protocol
 
 from swarmctl.bus.links import Impairments, Link
 from swarmctl.bus.path_messages import decode_path
+from swarmctl.bus.peer_clocks import PeerClocks
 from swarmctl.bus.reachability import Reachability, TokenView
 from swarmctl.bus.refusals import FUTURE, IDENTITY, LATE, MALFORMED, UNKNOWN_PEER, Refusals
 from swarmctl.bus.senders import Presence, ReceivedMessage, SenderVerifier
@@ -60,6 +62,7 @@ class PeerPaths:
         rate_hz, refusals, presence: see `SenderVerifier`.
         max_age_us: a path whose first point is older than this when it arrives is refused.
         max_lead_us: a path whose first point is further in the future than this is refused.
+        clocks: by which paths are converted to the own clock; None takes all clocks for equal.
     """
 
     def __init__(
@@ -71,6 +74,7 @@ class PeerPaths:
         *,
         max_age_us: int = MAX_AGE_US,
         max_lead_us: int = MAX_LEAD_US,
+        clocks: PeerClocks | None = None,
     ) -> None:
         names = {agent: agent_name(agent) for agent in peers}
         self._verifiers = {
@@ -78,6 +82,7 @@ class PeerPaths:
         }
         self._max_age_us = max_age_us
         self._max_lead_us = max_lead_us
+        self._clocks = clocks
         self._newest: dict[int, PredictedPath] = {}
         self.refusals = refusals
 
@@ -89,7 +94,7 @@ class PeerPaths:
             payload: bytes as received.
             utc_us: now, disciplined UTC [us].
         """
-        path = decode_path(payload)
+        path = self._by_own_clock(decode_path(payload))
         if path is None or (reason := self._refusal(sender, path, utc_us)):
             self.refusals.add(sender, PATH.name, MALFORMED if path is None else reason, utc_us)
             return
@@ -97,6 +102,10 @@ class PeerPaths:
             ReceivedMessage(path.boot_id, path.seq, path.t0_utc_us, payload), utc_us
         ):
             self._newest[path.agent] = path
+
+    def _by_own_clock(self, path: PredictedPath | None) -> PredictedPath | None:
+        ahead_us = 0 if path is None or self._clocks is None else self._clocks.ahead_us(path.agent)
+        return path if path is None or not ahead_us else replace(path, t0_utc_us=path.t0_utc_us - ahead_us)
 
     def latest(self) -> tuple[PredictedPath, ...]:
         """Return the newest path of every peer, whatever its age, sorted by agent number."""

@@ -44,6 +44,7 @@ class TrajectoryMessage:
     proposal: Proposal | None
     acknowledged: Mapping[int, int]  # by peer: number of the proposal in its newest message
     exclusions: Exclusions
+    heard: Mapping[int, tuple[int, int]]  # by peer: stamp of its newest message, and when that arrived by the own clock
 
     @property
     def trajectories(self) -> tuple[Trajectory, ...]:

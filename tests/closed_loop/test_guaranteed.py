@@ -16,11 +16,13 @@ from sitl.studies.campaign.scenarios import layout_of
 from sitl.studies.campaign.trials import Cell, Trial
 from swarmctl.agent.coordination import Coordination
 from swarmctl.agent.separation_policy import Guaranteed
+from swarmctl.bus.peer_clocks import PeerClocks
 from swarmctl.bus.peers import agent_name
 from swarmctl.config import load
 from swarmctl.control.collision.barrier import Barrier, BarrierParams, Body
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.mpc.problem import Start
+from swarmctl.core.clock import ClockError
 from swarmctl.core.types import Array, Phase
 
 COMMITTED_M = 0.8
@@ -140,6 +142,33 @@ def test_negative_control_taking_stale_peers_for_lost_commits_against_alive_peer
 
     monkeypatch.setattr(Coordination, "_required_peers", only_seen)
     assert committed_in_the_dark() > 4
+
+
+def flown_by_clocks(ahead_ms: Sequence[float]) -> TrialFlight:
+    """Four agents that swap, each by a clock of its own that also drifts."""
+    cell = Cell(
+        scenario="swap", agents=4, delay_ms=50.0, loss=0.0, noise="exact", wind_m_s=0.0, protections="guaranteed"
+    )
+    clocks = {
+        agent: ClockError(offset_us=round(1000 * ms), drift_ppm=200.0 * (-1) ** agent)
+        for agent, ms in enumerate(ahead_ms)
+    }
+    flight = TrialFlight(Trial(cell, 2), layout_of("swap", 2, 4), clocks)
+    flight.run()
+    return flight
+
+
+def test_agents_whose_clocks_differ_by_a_second_keep_apart() -> None:
+    flight = flown_by_clocks((-500.0, 500.0, -500.0, 500.0))
+    row = flight.row(None)
+    assert row["outcome"] == "arrived"
+    assert row["min_separation_m"] >= COMMITTED_M
+    assert {e["agent"] for e in events(flight, "clock_offset") if e["source"] == agent_name(0)} == {1, 3}
+
+
+def test_negative_control_by_stamps_as_they_are_agents_touch(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(PeerClocks, "ahead_us", lambda self, agent: 0)
+    assert flown_by_clocks((-200.0, 200.0, -200.0, 200.0)).monitor.min_separation_m < TOUCH_M
 
 
 def disturbed(event: ScenarioEvent, lost: Set[int] = frozenset(), limit_s: float = 12.0) -> TrialFlight:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -19,6 +19,7 @@ from sitl.studies.campaign.source import code_id
 from sitl.studies.campaign.trials import Cell, Row, Trial
 from swarmctl.config import Config, load
 from swarmctl.control.reference.mission import GotoParams
+from swarmctl.core.clock import ClockError
 from swarmctl.core.types import Array, Phase, PlanStatus
 
 PHYSICS_HZ = 100  # thesis and crazyflie behave as at 250 Hz: a 3.3 m transition ends within 2 cm and 0.1 s of it
@@ -73,14 +74,14 @@ def config_of(cell: Cell, seed: int, layout: Layout, agents: int, *, extra: Sequ
 
 
 class TrialFlight:
-    """A lockstep flight with a collision monitor."""
+    """A lockstep flight with a collision monitor; `clocks` are the errors of agents' clocks."""
 
-    def __init__(self, trial: Trial, layout: Layout) -> None:
+    def __init__(self, trial: Trial, layout: Layout, clocks: Mapping[int, ClockError] | None = None) -> None:
         cell, agents = trial.cell, len(layout.starts_ned_m)
         self._trial, self._layout = trial, layout
         config = config_of(cell, trial.seed, layout, agents)
         blind = {i: config_of(cell, trial.seed, layout, agents, extra=UNCOOPERATIVE) for i in layout.uncooperative}
-        self.lockstep = Lockstep(config, own=blind)
+        self.lockstep = Lockstep(config, own=blind, clocks=clocks)
         self._agents = list(self.lockstep.agents)  # including those that will have died
         expected = np.array([i not in layout.lost for i in range(agents)])
         arrive_m = math.inf if layout.settles else layout.arrive_m + NOISES[cell.noise].arrive_m

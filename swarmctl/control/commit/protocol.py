@@ -27,8 +27,8 @@ ends where a message is later than the check.
 
 The proof rests on these assumptions, each of which is watched in flight:
 
-- Clocks agree: a clock offset of e seconds costs v e metres, which `separation.tracking_m` has to cover. Offsets of
-  vehicles' clocks are measured; clocks of hosts have to be synchronised.
+- Clocks agree: an offset of e seconds costs v e metres, which `separation.tracking_m` has to cover. Offsets of peers'
+  clocks are measured on these messages and corrected (`swarmctl.bus.peer_clocks`), to half a round trip.
 - Vehicles track what they are committed to: each may miss by half of the committed distance beyond touching bodies.
   The event `tracking_violation` reports larger errors, and `commitments` at the end the worst one of the flight.
 - Commitments are kept. A commitment changes without acknowledgement only where a vehicle first commits at speed, and

@@ -17,6 +17,7 @@ from swarmctl.bus.commitment_messages import (
     decode_trajectory_message,
     encode_trajectory_message,
 )
+from swarmctl.bus.peer_clocks import PeerClocks
 from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.bus.refusals import Refusals
 from swarmctl.bus.senders import Presence
@@ -44,6 +45,7 @@ def message(seq: int = 1, agent: int = 2, boot_id: int = 9, propose: bool = True
         proposal=proposal,
         acknowledged={0: 5, 1: UTC_US},
         exclusions=Exclusions(suspected=frozenset({1, 4}), promised=frozenset({4})),
+        heard={0: (UTC_US - 7, UTC_US - 3)},
     )
 
 
@@ -59,6 +61,7 @@ def test_a_decoded_message_is_what_was_encoded(propose: bool) -> None:
         True,
         sent.acknowledged,
     )
+    assert (decoded.exclusions, decoded.heard) == (sent.exclusions, sent.heard)
     assert decoded.sent_utc_us == UTC_US + 20_000
     np.testing.assert_allclose(decoded.committed.pos_ned_m, sent.committed.pos_ned_m, atol=1e-6)
     assert decoded.committed.t0_utc_us == UTC_US
@@ -138,7 +141,8 @@ class Store:
         self.peer = self.hub.connect(agent_name(2))
         self.presence = Presence(self.hub.connect(agent_name(1)))
         self.refusals = Refusals(lambda *_, **__: None)
-        self.peers = PeerTrajectories([0, 2], 50.0, self.refusals, self.presence)
+        self.clocks = PeerClocks([0, 2], lambda *_, **__: None)
+        self.peers = PeerTrajectories([0, 2], 50.0, self.refusals, self.presence, agent=1, clocks=self.clocks)
         self.utc_us = UTC_US
 
     def offer(self, *sent: TrajectoryMessage, sender: str = agent_name(2)) -> None:
@@ -235,3 +239,17 @@ def test_a_repeated_trajectory_is_the_same_object_again() -> None:
     assert after.proposal.trajectory is before.proposal.trajectory
     store.offer(replace(message(seq=3), committed=trajectory(1.0)))
     assert store.peers.newest[2].committed is not before.committed
+
+
+def test_trajectories_of_a_peer_with_another_clock_are_converted_to_ours() -> None:
+    store = Store()
+    ahead_us = 400_000
+    for seq in range(1, 6):
+        stamp_us = store.utc_us + 20_000 + ahead_us  # sent and received in one tick
+        answered = replace(message(seq=seq, propose=False), sent_utc_us=stamp_us, heard={1: (store.utc_us, stamp_us)})
+        store.offer(replace(answered, committed=replace(trajectory(), t0_utc_us=UTC_US + ahead_us)))
+    assert store.clocks.ahead_us(2) == pytest.approx(ahead_us, abs=20_000)
+    assert store.peers.newest[2].committed.t0_utc_us == UTC_US + ahead_us - store.clocks.ahead_us(2)
+    kept = store.peers.newest[2].committed
+    store.offer(replace(answered, seq=6, committed=replace(trajectory(), t0_utc_us=UTC_US + ahead_us)))
+    assert store.peers.newest[2].committed is kept, "by which the protocol knows that it has checked it"

@@ -1,0 +1,95 @@
+"""How far peers' clocks are ahead of the own one, measured on the stamps that their messages carry. Pure.
+
+A message that a peer stamped s, and that arrived at r by the own clock, was under way for a while: the peer is ahead by
+at least s - r. The peer also says when, by its clock, the newest own message arrived: it is ahead by at most that time
+less the own stamp. Both bounds hold whatever the delays are (the four timestamps of RFC 5905, as an interval instead of
+its midpoint); short delays make them tight. Bounds of the last seconds are kept, because clocks drift.
+
+What is applied is 0 as long as 0 is possible, and the middle of the interval when what was applied is not: equal clocks
+are never corrected. Its error is at most the width of the interval, which is a round trip.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+_WINDOW_US = 5_000_000  # bounds of this window and of the one before are kept
+_DRIFT_US = 2_000  # two clocks drift apart by less in two windows: 200 ppm
+_UNKNOWN_US = 1 << 62
+_REPORTED_US = 50_000  # corrections that differ by more from the last one reported are
+
+
+@dataclass(slots=True)
+class _Bounds:
+    """Lower and upper bound of how far a clock is ahead [us]."""
+
+    low_us: int = -_UNKNOWN_US
+    high_us: int = _UNKNOWN_US
+
+
+class _PeerClock:
+    """The clock of one peer."""
+
+    def __init__(self) -> None:
+        self._now, self._before = _Bounds(), _Bounds()
+        self._since_us = 0
+        self.ahead_us = self.reported_us = 0
+
+    def narrow(self, low_us: int, high_us: int, utc_us: int) -> None:
+        """Take in new bounds, and correct what is applied if it is impossible now."""
+        if utc_us - self._since_us >= _WINDOW_US:
+            self._now, self._before, self._since_us = _Bounds(), self._now, utc_us
+        self._now.low_us = max(self._now.low_us, low_us)
+        self._now.high_us = min(self._now.high_us, high_us)
+        low, high = self.interval_us
+        if low > high:  # a clock was set
+            self._now, self._before = _Bounds(low_us, high_us), _Bounds()
+            low, high = low_us, high_us
+        if not low <= self.ahead_us <= high and low > -_UNKNOWN_US and high < _UNKNOWN_US:
+            self.ahead_us = (low + high) // 2
+
+    @property
+    def interval_us(self) -> tuple[int, int]:
+        """Return the bounds by all that is kept."""
+        low = max(self._now.low_us, self._before.low_us - _DRIFT_US)
+        return low, min(self._now.high_us, self._before.high_us + _DRIFT_US)
+
+
+class PeerClocks:
+    """Measures the clocks of all peers.
+
+    Args:
+        peers: their numbers.
+        note: is told `clock_offset` with `agent`, `ahead_s` and the `error_s` it may have, when a correction changes.
+    """
+
+    def __init__(self, peers: Iterable[int], note: Callable[..., None]) -> None:
+        self._clocks = {agent: _PeerClock() for agent in peers}
+        self._note = note
+
+    def received(self, agent: int, sent_utc_us: int, utc_us: int) -> None:
+        """Take in a message that a peer stamped `sent_utc_us`, received now."""
+        self._narrow(agent, sent_utc_us - utc_us, _UNKNOWN_US, utc_us)
+
+    def answered(self, agent: int, sent_utc_us: int, received_utc_us: int, utc_us: int) -> None:
+        """Take in when a peer, by its clock, received the own message stamped `sent_utc_us`."""
+        self._narrow(agent, -_UNKNOWN_US, received_utc_us - sent_utc_us, utc_us)
+
+    def ahead_us(self, agent: int) -> int:
+        """Return how far a peer's clock is taken to be ahead: what its stamps are reduced by."""
+        clock = self._clocks.get(agent)
+        return 0 if clock is None else clock.ahead_us
+
+    def error_us(self, agent: int) -> int:
+        """Return the largest error that `ahead_us` may have; very large before both bounds are known."""
+        clock = self._clocks[agent]
+        low, high = clock.interval_us
+        return max(high - clock.ahead_us, clock.ahead_us - low)
+
+    def _narrow(self, agent: int, low_us: int, high_us: int, utc_us: int) -> None:
+        clock = self._clocks[agent]
+        clock.narrow(low_us, high_us, utc_us)
+        if abs(clock.ahead_us - clock.reported_us) > _REPORTED_US:
+            clock.reported_us = clock.ahead_us
+            self._note("clock_offset", agent=agent, ahead_s=clock.ahead_us / 1e6, error_s=self.error_us(agent) / 1e6)

@@ -1,0 +1,96 @@
+"""Offsets of clocks, as bounded by messages that take an unknown time."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+import pytest
+
+from swarmctl.bus.peer_clocks import PeerClocks
+
+UTC_US = 1_700_000_000_000_000
+SECOND_US = 1_000_000
+
+
+class Pair:
+    """The own clock, and a peer's that is ahead; messages cross with delays."""
+
+    def __init__(self, ahead_us: int = 0, drift_ppm: float = 0.0) -> None:
+        self.told: list[dict[str, Any]] = []
+        self.clocks = PeerClocks([1], lambda name, **fields: self.told.append({"event": name, **fields}))
+        self.now_us, self.ahead_us, self.drift_ppm = UTC_US, ahead_us, drift_ppm
+
+    @property
+    def true_us(self) -> int:
+        return self.ahead_us + round(self.drift_ppm * (self.now_us - UTC_US) * 1e-6)
+
+    def exchange(self, there_us: int, back_us: int) -> None:
+        """A message to the peer, and its answer."""
+        sent_us = self.now_us
+        self.now_us += there_us
+        arrived_us = self.now_us + self.true_us
+        stamp_us = self.now_us + self.true_us
+        self.now_us += back_us
+        self.clocks.received(1, stamp_us, self.now_us)
+        self.clocks.answered(1, sent_us, arrived_us, self.now_us)
+
+
+@pytest.mark.parametrize("ahead_us", [-500_000, -80_000, 0, 200_000, 7_000_000])
+@pytest.mark.parametrize("delays_us", [(20_000, 20_000), (10_000, 60_000), (50_000, 5_000)])
+def test_the_offset_is_within_the_bound_whatever_the_delays(ahead_us: int, delays_us: tuple[int, int]) -> None:
+    pair = Pair(ahead_us)
+    pair.exchange(*delays_us)
+    assert abs(pair.clocks.ahead_us(1) - ahead_us) <= pair.clocks.error_us(1) <= sum(delays_us)
+
+
+def test_equal_clocks_are_never_corrected_however_uneven_the_delays() -> None:
+    pair, draw = Pair(0), random.Random(1)
+    for _ in range(500):
+        pair.exchange(draw.randint(1_000, 300_000), draw.randint(1_000, 300_000))
+        assert pair.clocks.ahead_us(1) == 0
+    assert pair.told == []
+
+
+def test_short_delays_among_long_ones_make_it_tight() -> None:
+    pair, draw = Pair(200_000), random.Random(1)
+    for _ in range(50):
+        pair.exchange(draw.randint(10_000, 300_000), draw.randint(10_000, 300_000))
+    assert pair.clocks.error_us(1) < 60_000
+
+
+def test_a_drifting_clock_is_followed() -> None:
+    pair = Pair(300_000, drift_ppm=200.0)
+    for _ in range(3000):
+        pair.exchange(20_000, 20_000)
+        assert abs(pair.clocks.ahead_us(1) - pair.true_us) <= 45_000
+    assert pair.true_us > 300_000 + 20_000
+
+
+def test_a_clock_that_is_set_is_followed_at_once() -> None:
+    pair = Pair(0)
+    for _ in range(20):
+        pair.exchange(20_000, 20_000)
+    pair.ahead_us = -3 * SECOND_US
+    pair.exchange(20_000, 20_000)
+    pair.exchange(20_000, 20_000)
+    assert abs(pair.clocks.ahead_us(1) - pair.ahead_us) <= 40_000
+
+
+def test_an_unanswered_message_corrects_nothing() -> None:
+    """It may have been under way for long: an interval without an end has no middle."""
+    pair = Pair(0)
+    pair.clocks.received(1, UTC_US - SECOND_US, UTC_US)
+    assert pair.clocks.ahead_us(1) == 0
+    assert pair.clocks.error_us(1) > SECOND_US
+
+
+def test_a_correction_is_reported_once_with_its_error() -> None:
+    pair = Pair(200_000)
+    for _ in range(10):
+        pair.exchange(20_000, 20_000)
+    assert pair.told == [{"event": "clock_offset", "agent": 1, "ahead_s": 0.2, "error_s": 0.02}]
+
+
+def test_an_unknown_peer_is_taken_as_it_stamps() -> None:
+    assert Pair(0).clocks.ahead_us(9) == 0
