@@ -39,7 +39,7 @@ class Flight:
         self.others: tuple[np.ndarray, ...] = ()
         self.arm_in: FlightMode | None = None
         self.boots = 0
-        self.refusal = self.unsettled = ""
+        self.refusal = self.unsettled = self.cut_off = ""
         self.beat_us: int | None = None  # arrival of the HEARTBEAT that reported `armed`; None: one with every step
         self.busy = self.unresponsive_peer = False
         self.seen = True
@@ -90,6 +90,7 @@ class Flight:
             boots=self.boots,
             refusal=self.refusal,
             unsettled=self.unsettled,
+            cut_off=self.cut_off,
             armed_told_us=self.now_us if self.beat_us is None else self.beat_us,
         )
         self.state_machine.begin_if_due(inputs.now_us, inputs.utc_us)  # called before planning, as by the agent

@@ -149,7 +149,9 @@ def test_three_vehicles_keep_their_assigned_places_around_the_reference() -> Non
     flight = fly(*IN_A_ROW, "mission.circle.goal_assignment=true")
     summed_mean_error_m, reported_m, true_m = together(flight)
     assert wandered_m(flight) <= 0.06
-    assert summed_mean_error_m <= 1.75, "three times 1.04 times 0.95 m / sqrt(3) is 1.711 m"
+    assert 1.56 <= summed_mean_error_m <= 1.75, (
+        "to the shared reference: three times 1.04 times 0.95 m / sqrt(3) is 1.711 m"
+    )
     assert reported_m >= 0.90
     assert true_m >= 0.88
 

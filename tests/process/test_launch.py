@@ -56,13 +56,13 @@ class Launched:
     def text(self) -> str:
         return self.out.read_text()
 
-    def events(self, name: str) -> list[dict[str, Any]]:
+    def events(self, name: str, source: str = "launch") -> list[dict[str, Any]]:
         rows: list[dict[str, Any]] = []
         for file in ("launch.events.jsonl", "events.jsonl"):
             path = self.run_dir / file
             if path.exists():
                 rows += [json.loads(line) for line in path.read_text().splitlines() if line.endswith("}")]
-        return [row for row in rows if row["source"] == "launch" and row["event"] == name]
+        return [row for row in rows if row["source"] == source and row["event"] == name]
 
     def until_phase(self, phase: str, agents: int) -> None:
         """Wait until so many agents have entered a phase, or a later one: short phases fall between two statuses."""
@@ -189,6 +189,8 @@ def test_a_killed_agent_fails_the_launch_and_the_others_finish(start: Callable[.
     assert summary["separation"]["min_m"] >= 0.8
     assert launched.landed()[0]
     assert launched.landed()[2]
+    for agent in ("agent-0", "agent-2"):
+        assert 1 in [row["peer"] for row in launched.events("operator", agent)], "the launch has seen it end"
 
 
 def test_ctrl_c_lands_and_sums_up(start: Callable[..., Launched]) -> None:
@@ -312,6 +314,9 @@ def test_operator_verbs(start: Callable[..., Launched]) -> None:
     assert launched.verb("obstacle", "remove", "0").returncode == 2
     assert launched.verb("land", "--agent", "7").returncode == 3
     assert launched.verb("resume").returncode == 0
+    excluded = launched.verb("exclude", "--peer", "1")
+    assert excluded.returncode == 0, excluded.stderr
+    assert launched.verb("exclude", "--peer", "255").returncode == 2
     assert launched.verb("land").returncode == 0
     assert launched.end() == 130, launched.text()
 

@@ -203,3 +203,32 @@ def test_a_tick_processes_at_most_one_ring_of_messages_per_sender() -> None:
         bench.say_path(boot_id=bench.seq)
     bench.tick()
     assert bench.world_model.refusals.total + 1 == topics.PATH.ring
+
+
+def test_whose_end_is_vouched_for_has_ended_until_another_process_is_heard() -> None:
+    bench = Bench()
+    bench.say_path()
+    bench.say_status(phase=int(Phase.TRACK))
+    bench.tick()
+    assert not bench.world_model.has_ended(1)
+    bench.world_model.exclude(1)
+    for _ in range(150):  # it is silent
+        bench.tick()
+    assert bench.world_model.has_ended(1)
+    assert not bench.world_model.has_unresponsive_peer(bench.clock.utc_us()), "nobody waits for it"
+    for _ in range(3):
+        bench.seq += 1
+        bench.say_status(phase=int(Phase.TRACK), boot_id=STATUS.boot_id + 1)
+        bench.tick()
+    assert not bench.world_model.has_ended(1)
+
+
+def test_a_silent_peer_for_whom_nobody_vouches_has_not_ended() -> None:
+    bench = Bench()
+    bench.say_path()
+    bench.say_status(phase=int(Phase.TRACK))
+    bench.tick()
+    bench.peer.close()
+    for _ in range(150):
+        bench.tick()
+    assert not bench.world_model.has_ended(1)

@@ -149,3 +149,12 @@ def test_an_agent_waiting_for_the_beginning_goes_home_when_a_peer_gives_up(phase
     flight.run(0.3)
     assert flight.phase in (Phase.GOTO_LAND, Phase.LAND), "it stands on its landing place already"
     assert "gave up" in flight.state_machine.outcome
+
+
+@pytest.mark.parametrize("phase", [Phase.GOTO_START, Phase.READY, Phase.TRACK])
+def test_an_agent_that_is_cut_off_from_its_peers_lands_where_it_is(phase: Phase) -> None:
+    flight = Flight().until(phase)
+    flight.cut_off = "cut off from agent-1"
+    flight.run(0.2)
+    assert flight.phase >= Phase.GOTO_LAND
+    assert flight.state_machine.outcome == "cut off from agent-1"
