@@ -137,13 +137,17 @@ def test_a_geofence_is_what_the_vehicle_stores_and_not_what_was_sent() -> None:
 
 
 def test_what_the_simulator_does_not_speak_is_told_in_time(
-    scans: dict[int, VehicleScan], capfd: pytest.CaptureFixture[str]
+    scans: dict[int, VehicleScan],
+    capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
 ) -> None:
-    before, begun_s = set(Path(tempfile.gettempdir()).glob("*avsdk*")), time.monotonic()
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))  # where nobody else starts a MAVSDK
+    begun_s = time.monotonic()
     with open_services({0: scans[0]}) as services:
         assert services.ask({0: lambda vehicle: (vehicle.logs(), vehicle.arming_checks())}) == {0: (None, None)}
     assert time.monotonic() - begun_s < 25.0
-    assert set(Path(tempfile.gettempdir()).glob("swarm-mavsdk-*")) <= before
+    assert list(tmp_path.iterdir()) == []
     assert "TMPDIR" not in os.environ or Path(os.environ["TMPDIR"]).is_dir()
     assert "mavsdk" not in capfd.readouterr().out.lower(), "its lines would mix with the table"
 

@@ -18,6 +18,7 @@ from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.bus.topics import COMMAND, OBSTACLES, OPERATOR, STATUS
 from swarmctl.config import load
 from swarmctl.core.obstacle import Obstacle
+from swarmctl.core.operator_verbs import EXCLUDE, PEER
 from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START
 from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, Command, RunContext, kill_all
@@ -71,6 +72,7 @@ class ScriptedServices(Services):
         self.interrupts = 0
         self.silent: set[int] = set()
         self.orders: list[str] = []
+        self.vouched: set[int] = set()  # agents whose end the others were told
         self.stamped_us: list[tuple[int, int]] = []  # of each order, by how much it was stamped before we heard it
         self.behind_us = 0  # by how much the agents' clock is behind ours
         self.obeys = True
@@ -103,7 +105,8 @@ class ScriptedServices(Services):
             self.orders += [order.verb for order in orders]
             now_us = time.time_ns() // 1000
             self.stamped_us += [(order.utc_us, now_us - order.utc_us) for order in orders]
-            if orders and self.obeys and i not in self.silent:
+            self.vouched |= {int(order.arguments[PEER]) for order in orders if order.verb == EXCLUDE}
+            if any(order.verb == "land" for order in orders) and self.obeys and i not in self.silent:
                 self.children[agent_name(i)].signal(signal.SIGTERM)
             if i not in self.silent and self.children[agent_name(i)].poll() is None:
                 bus.publish(STATUS, status_of(i, self.phase, now_us - self.behind_us))
@@ -151,6 +154,7 @@ def test_a_killed_agent_is_named_and_the_others_finish(tmp_path: Path) -> None:
     assert result.left == ()
     assert [scene.children[f"agent-{i}"].poll() for i in range(3)] == [130, 0, 0]
     assert "land" not in scene.orders
+    assert 0 in scene.vouched, "the others need not wait for it"
 
 
 def test_a_vehicle_that_can_not_be_recovered_is_named(tmp_path: Path) -> None:
