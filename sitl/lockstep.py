@@ -24,6 +24,7 @@ from swarmctl.agent.agent import Agent
 from swarmctl.agent.assembly import make_agent
 from swarmctl.bus import topics
 from swarmctl.bus.json_messages import CommandMessage, ObstaclesMessage, encode_message
+from swarmctl.bus.links import Impairments
 from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.config import Config
 from swarmctl.core.clock import Clock, ClockError, OffsetClock, SimClock
@@ -177,17 +178,11 @@ class Lockstep:
         if self.clock.now_us() % _TRUTH_EVERY_US == 0:
             self._truth.append(self.world.truth_rows())
 
-    def kill(self, index: int, *, vouched: bool = True) -> None:
-        """End an agent's process: no more setpoints, and its bus session closes.
-
-        Args:
-            index: agent.
-            vouched: tell the others, as a launcher does that sees the process end.
-        """
+    def kill(self, index: int) -> None:
+        """End an agent's process: no more setpoints, its bus session closes, and the others are told as by a launch."""
         self.agents[index] = None
         self.hub.detach(agent_name(index))
-        if vouched:
-            self.command(EXCLUDE, peer=index)
+        self.command(EXCLUDE, peer=index)
 
     def command(self, verb: str, agent: int = -1, **arguments: float) -> None:
         """Send an operator's order, as a verb does."""
@@ -234,15 +229,14 @@ class Lockstep:
 
 def _hub(config: Config, clock: SimClock) -> LocalHub:
     bus = config.bus
-    return LocalHub(
-        clock.now_us,
-        config.seed,
-        round(bus.delay_ms * 1000),
-        bus.loss_01,
+    impairments = Impairments(
+        delay_us=round(bus.delay_ms * 1000),
+        loss_01=bus.loss_01,
         burst_01=bus.burst_01,
         burst_s=bus.burst_s,
         jitter_us=round(bus.jitter_ms * 1000),
     )
+    return LocalHub(clock.now_us, config.seed, impairments)
 
 
 def write_events(path: Path, events: Sequence[dict[str, Any]]) -> None:

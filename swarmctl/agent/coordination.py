@@ -76,6 +76,7 @@ class Coordination:
         self._allowed_m = separation.budget.tracking_allowance_m
         self._is_violating, self._worst_m = False, 0.0
         self._membership = Membership(agent, peers)
+        self._ended: frozenset[int] = frozenset()  # peers that take no part any more, by evidence
         self._membership_said: tuple[frozenset[int], ...] = (frozenset(),) * 3
         self._begun_us: int | None = None
         self._conflicting: set[int] = set()
@@ -92,11 +93,14 @@ class Coordination:
         """Apply rule 1: take in every message that has arrived, and what it says about silent peers."""
         for sender, payload in self._bus.receive(topics.TRAJECTORY):
             self._peer_trajectories.offer(sender, payload, utc_us)
+        self._update_membership(utc_us)
+
+    def _update_membership(self, utc_us: int) -> None:
         peers, membership = self._peer_trajectories, self._membership
-        ended = {agent for agent in self._peers if self._world_model.has_ended(agent)}
-        suspected = {agent for agent in self._peers - ended if self._silence_us(agent, utc_us) > _SUSPECT_US}
+        self._ended = frozenset(agent for agent in self._peers if self._world_model.has_ended(agent))
+        suspected = {agent for agent in self._peers - self._ended if self._silence_us(agent, utc_us) > _SUSPECT_US}
         told = {agent: message.exclusions for agent, message in peers.newest.items()}
-        membership.update(suspected, told, ended, votes=peers.heard_before_flight == self._peers)
+        membership.update(suspected, told, self._ended, votes=peers.heard_before_flight == self._peers)
         said = (membership.exclusions.suspected, membership.exclusions.promised, membership.excluded)
         if said != self._membership_said:
             self._membership_said = said
@@ -152,6 +156,7 @@ class Coordination:
         if self._commitments.committed is None:
             return
         self._seq += 1
+        exclusions = self._membership.exclusions
         message = TrajectoryMessage(
             agent=self._agent,
             boot_id=self._boot_id,
@@ -160,8 +165,8 @@ class Coordination:
             is_committed=self._is_committed,
             committed=self._commitments.committed,
             proposal=self._commitments.proposal,
-            acknowledged=self._peer_trajectories.acknowledgements(self._unacknowledged()),
-            exclusions=self._membership.exclusions,
+            acknowledged=self._peer_trajectories.acknowledgements(self._ended | exclusions.promised),
+            exclusions=exclusions,
             heard=self._peer_trajectories.heard(),
         )
         self._bus.publish(topics.TRAJECTORY, encode_trajectory_message(message))
@@ -174,16 +179,8 @@ class Coordination:
 
     def _required_peers(self) -> frozenset[int]:
         """Return peers that fly by commitments and have to acknowledge."""
-        return frozenset(
-            agent
-            for agent in self._peers - self._membership.excluded
-            if self._world_model.uses_commitments(agent) and not self._world_model.has_ended(agent)
-        )
-
-    def _unacknowledged(self) -> set[int]:
-        """Return peers whose proposals get no acknowledgement any more, because others may go on without theirs."""
-        ended = {agent for agent in self._peers if self._world_model.has_ended(agent)}
-        return ended | self._membership.exclusions.promised
+        participants = self._peers - self._membership.excluded - self._ended
+        return frozenset(agent for agent in participants if self._world_model.uses_commitments(agent))
 
     def _absent(self) -> set[int]:
         """Return peers whose liveliness token is not on the bus."""
@@ -195,8 +192,7 @@ class Coordination:
         return utc_us - self._peer_trajectories.received_utc_us.get(agent, utc_us)
 
     def _why_cut_off(self, utc_us: int, required: Set[int]) -> str:
-        told = {agent: message.exclusions for agent, message in self._peer_trajectories.newest.items()}
-        if by := self._membership.excluding(told):
+        if by := self._membership.excluded_by:
             return f"excluded by {_names(by)} after silence"
         begun_us = utc_us if self._begun_us is None else self._begun_us
         silent = [a for a in required if min(self._silence_us(a, utc_us), utc_us - begun_us) > _CUT_OFF_US]

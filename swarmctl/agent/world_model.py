@@ -9,9 +9,9 @@ from swarmctl.bus import topics
 from swarmctl.bus.json_messages import StatusMessage, decode_obstacles, decode_status
 from swarmctl.bus.orders import Orders
 from swarmctl.bus.peer_clocks import PeerClocks
-from swarmctl.bus.peers import Bus, PeerPaths, agent_name
+from swarmctl.bus.peers import Bus, PeerPaths, agent_name, peer_verifiers
 from swarmctl.bus.refusals import FUTURE, IDENTITY, MALFORMED, SEQUENCE, UNKNOWN_PEER, Refusals
-from swarmctl.bus.senders import Presence, ReceivedMessage, SenderVerifier
+from swarmctl.bus.senders import Presence, ReceivedMessage
 from swarmctl.control.collision.barrier import Body, body_of_obstacle, body_of_peer
 from swarmctl.control.collision.separation import (
     KeepOut,
@@ -60,10 +60,7 @@ class WorldModel:
         self.refusals, self.presence = Refusals(note), Presence(bus)
         self.clocks = PeerClocks(peers, note)
         self.paths = PeerPaths(peers, rate_hz, self.refusals, self.presence, clocks=self.clocks)
-        self._verifiers = {
-            peer: SenderVerifier(agent_name(peer), topics.STATUS.name, rate_hz, self.refusals, presence=self.presence)
-            for peer in peers
-        }
+        self._verifiers = peer_verifiers(peers, topics.STATUS, rate_hz, self.refusals, presence=self.presence)
         self._orders = Orders(agent, self.refusals)
         self._unresponsive_since_us: dict[int, int] = {}
         self._status: dict[int, StatusMessage] = {}

@@ -13,9 +13,9 @@ from collections.abc import Iterable, Set
 import numpy as np
 
 from swarmctl.bus.peer_clocks import PeerClocks
-from swarmctl.bus.peers import MAX_LEAD_US, agent_name
+from swarmctl.bus.peers import MAX_LEAD_US, agent_name, peer_verifiers
 from swarmctl.bus.refusals import FUTURE, IDENTITY, MALFORMED, UNKNOWN_PEER, Refusals
-from swarmctl.bus.senders import Presence, ReceivedMessage, SenderVerifier
+from swarmctl.bus.senders import Presence, ReceivedMessage
 from swarmctl.bus.topics import TRAJECTORY
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.trajectory_message import Exclusions, Proposal, TrajectoryMessage
@@ -164,16 +164,13 @@ class PeerTrajectories:
         agent: int,
         clocks: PeerClocks,
     ) -> None:
-        names = {agent: agent_name(agent) for agent in peers}
-        self._verifiers = {
-            a: SenderVerifier(name, TRAJECTORY.name, rate_hz, refusals, presence=presence) for a, name in names.items()
-        }
+        self._verifiers = peer_verifiers(peers, TRAJECTORY, rate_hz, refusals, presence=presence)
         self._refusals, self._agent, self._clocks = refusals, agent, clocks
-        self._numbers = {name: number for number, name in names.items()}
+        self._numbers = {agent_name(agent): agent for agent in self._verifiers}
         self._memory: dict[str, Memory] = {}
         self.newest: dict[int, TrajectoryMessage] = {}
         self.received_utc_us: dict[int, int] = {}  # when the newest message of each peer was accepted
-        self._first_committed: dict[int, bool] = {}  # whether each flew by commitments when it was first heard
+        self.heard_before_flight: set[int] = set()  # peers that did not fly by commitments when first heard
 
     def offer(self, sender: str, payload: bytes, utc_us: int) -> None:
         """Check one message and keep it if it is accepted; the bus guarantees the name `sender`, `utc_us` is now."""
@@ -184,9 +181,10 @@ class PeerTrajectories:
             return
         sent = ReceivedMessage(message.boot_id, message.seq, min(message.sent_utc_us, utc_us + MAX_LEAD_US), payload)
         if self._verifiers[message.agent].accepts(sent, utc_us):
+            if message.agent not in self.newest and not message.is_committed:
+                self.heard_before_flight.add(message.agent)
             self.newest[message.agent], self._memory[sender] = message, memory
             self.received_utc_us[message.agent] = utc_us
-            self._first_committed.setdefault(message.agent, message.is_committed)
             self._measure(message, utc_us)
             if self._clocks.ahead_us(message.agent) != ahead_us:
                 self._memory[sender] = {}
@@ -203,11 +201,6 @@ class PeerTrajectories:
         self._clocks.received(message.agent, message.sent_utc_us, utc_us)
         if self._agent in message.heard:
             self._clocks.answered(message.agent, *message.heard[self._agent], utc_us)
-
-    @property
-    def heard_before_flight(self) -> frozenset[int]:
-        """Return peers that did not yet fly by commitments when they were first heard."""
-        return frozenset(agent for agent, committed in self._first_committed.items() if not committed)
 
     def _refusal(self, sender: str, message: TrajectoryMessage, utc_us: int) -> str:
         if sender != agent_name(message.agent):

@@ -25,6 +25,9 @@ class Impairments:
     jitter_us: int = 0  # largest extra delay, drawn uniformly for each message and link
 
 
+PERFECT = Impairments()
+
+
 class Link:
     """The messages from one participant to another.
 

@@ -13,7 +13,7 @@ from dataclasses import replace
 from functools import partial
 from typing import NamedTuple, Protocol
 
-from swarmctl.bus.links import Impairments, Link
+from swarmctl.bus.links import PERFECT, Impairments, Link
 from swarmctl.bus.path_messages import decode_path
 from swarmctl.bus.peer_clocks import PeerClocks
 from swarmctl.bus.reachability import Reachability, TokenView
@@ -30,6 +30,13 @@ LEASE_US = 1_500_000  # time after which a `LocalHub` drops tokens that can't be
 def agent_name(agent: int) -> str:
     """Return the sender name of an agent on the bus."""
     return f"agent-{agent}"
+
+
+def peer_verifiers(
+    peers: Iterable[int], topic: Topic, rate_hz: float, refusals: Refusals, *, presence: Presence
+) -> dict[int, SenderVerifier]:
+    """Return a verifier of one topic for every peer; see `SenderVerifier`."""
+    return {peer: SenderVerifier(agent_name(peer), topic.name, rate_hz, refusals, presence=presence) for peer in peers}
 
 
 class Bus(Protocol):
@@ -76,10 +83,7 @@ class PeerPaths:
         max_lead_us: int = MAX_LEAD_US,
         clocks: PeerClocks | None = None,
     ) -> None:
-        names = {agent: agent_name(agent) for agent in peers}
-        self._verifiers = {
-            a: SenderVerifier(name, PATH.name, rate_hz, refusals, presence=presence) for a, name in names.items()
-        }
+        self._verifiers = peer_verifiers(peers, PATH, rate_hz, refusals, presence=presence)
         self._max_age_us = max_age_us
         self._max_lead_us = max_lead_us
         self._clocks = clocks
@@ -138,32 +142,25 @@ class _Held(NamedTuple):
 class LocalHub:
     """A bus in memory, on a simulated clock, for agents that tick one after another.
 
-    A message published at `t` arrives at `t + max(1, delay_us)` or later, so within one step no agent receives what
+    A message published at `t` arrives at `t + max(1, delay)` or later, so within one step no agent receives what
     another has just published, and the order in which agents tick does not matter. A message under way always arrives.
 
     Args:
         now_us: the simulated clock.
         seed: seed of all random impairments.
-        delay_us, loss_01, burst_01, burst_s, jitter_us: see `Impairments`.
+        impairments: of every link.
     """
 
     def __init__(
         self,
         now_us: Callable[[], int],
         seed: int = 0,
-        delay_us: int = 0,
-        loss_01: float = 0.0,
-        *,
-        burst_01: float = 0.0,
-        burst_s: float = 2.0,
-        jitter_us: int = 0,
+        impairments: Impairments = PERFECT,
     ) -> None:
         self._now_us = now_us
         self._seed = seed
         self._began_us = now_us()
-        self._impairments = Impairments(
-            delay_us=delay_us, loss_01=loss_01, burst_01=burst_01, burst_s=burst_s, jitter_us=jitter_us
-        )
+        self._impairments = impairments
         self._links: dict[tuple[str, str], Link] = {}
         self._attached: dict[str, LocalBus] = {}
         self._views: dict[str, TokenView] = {}

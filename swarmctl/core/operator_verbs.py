@@ -32,7 +32,6 @@ class OperatorVerb:
     arguments: tuple[VerbArgument, ...] = ()
     is_stop: bool = False  # kept until a vehicle state is known to begin it from
     never_superseded: bool = False  # obeyed though a newer order came before it
-    is_about_peer: bool = False  # the argument `PEER` names it; it need not answer itself
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,7 +63,6 @@ OPERATOR_VERBS = {
             VerbArgument(name=PEER, option="--peer", help="Number of the agent that has ended.", least=0, most=254),
         ),
         never_superseded=True,
-        is_about_peer=True,
     ),
 }
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from swarmctl.core.trajectory import Trajectory
 
@@ -27,8 +27,8 @@ class Proposal:
 class Exclusions:
     """Holds what an agent publishes about silent peers; the rules are in `swarmctl.control.commit.membership`."""
 
-    suspected: frozenset[int] = field(default_factory=frozenset)  # not heard for long
-    promised: frozenset[int] = field(default_factory=frozenset)  # to be excluded; they get no acknowledgement any more
+    suspected: frozenset[int] = frozenset()  # not heard for long
+    promised: frozenset[int] = frozenset()  # to be excluded; they get no acknowledgement any more
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -161,8 +161,8 @@ def ignored_by(order: Order, statuses: Mapping[int, StatusMessage], asked: Seque
     verb = OPERATOR_VERBS[order.verb]
     found = []
     for agent in asked:
-        if verb.is_about_peer and agent == order.arguments[PEER]:
-            continue
+        if agent == order.arguments.get(PEER):
+            continue  # it has ended
         if agent not in statuses:
             found.append(f"{agent_name(agent)} does not answer")
             continue

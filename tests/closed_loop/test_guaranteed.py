@@ -130,6 +130,11 @@ def committed_in_the_dark(sees: type[Coordination] = Coordination) -> int:
     return counts[-1] - counts[-21]
 
 
+def only_seen(self: Coordination) -> Set[int]:
+    """Return peers whose token is seen, as if the others had died."""
+    return frozenset(agent for agent in self._peers if agent_name(agent) in self._bus.alive())
+
+
 def test_an_agent_off_the_bus_commits_nothing() -> None:
     assert committed_in_the_dark() == 0
 
@@ -137,9 +142,6 @@ def test_an_agent_off_the_bus_commits_nothing() -> None:
 def test_negative_control_taking_stale_peers_for_lost_commits_against_alive_peers(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    def only_seen(self: Coordination) -> Set[int]:
-        return frozenset(agent for agent in self._peers if agent_name(agent) in self._bus.alive())
-
     monkeypatch.setattr(Coordination, "_required_peers", only_seen)
     assert committed_in_the_dark() > 4
 
@@ -202,9 +204,6 @@ def test_halves_that_hear_each_other_again_in_time_go_on() -> None:
 
 
 def test_negative_control_halves_that_take_missing_tokens_for_deaths_collide(monkeypatch: pytest.MonkeyPatch) -> None:
-    def only_seen(self: Coordination) -> Set[int]:
-        return frozenset(agent for agent in self._peers if agent_name(agent) in self._bus.alive())
-
     monkeypatch.setattr(Coordination, "_required_peers", only_seen)
     assert disturbed(halves()).monitor.collided
 

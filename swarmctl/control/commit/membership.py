@@ -43,12 +43,17 @@ class Membership:
     Args:
         agent: own number.
         peers: numbers of all other agents.
+
+    Attributes:
+        excluded: peers whose acknowledgement is no longer required.
+        excluded_by: peers that have promised to exclude this agent.
     """
 
     def __init__(self, agent: int, peers: Collection[int]) -> None:
         self._agent, self._peers = agent, frozenset(peers)
         self._promised = self._suspected = _NOBODY
         self.excluded: frozenset[int] = _NOBODY
+        self.excluded_by: list[int] = []
 
     @property
     def exclusions(self) -> Exclusions:
@@ -66,6 +71,7 @@ class Membership:
             ended: peers that take no part any more by evidence; they have no vote.
             votes: whether this agent has kept all its promises since the flight began.
         """
+        self.excluded_by = sorted(agent for agent, exclusions in told.items() if self._agent in exclusions.promised)
         if not votes:
             return
         self._suspected = frozenset(suspected)
@@ -74,15 +80,12 @@ class Membership:
             if agent not in self._promised and self._agent not in others:
                 self._promise(self._promised | others, ended)
         wanted = self._promised | self._suspected
-        if all(wanted <= told[i].suspected | told[i].promised for i in self._voters(wanted, ended) & told.keys()):
-            self._promise(wanted, ended, told)
+        voters = self._voters(wanted, ended)
+        if all(i in told and wanted <= told[i].suspected | told[i].promised for i in voters):
+            self._promise(wanted, ended)
         voters = self._voters(self._promised, ended)
         if self._is_majority(voters) and all(i in told and told[i].promised == self._promised for i in voters):
             self.excluded = self._promised
-
-    def excluding(self, told: Mapping[int, Exclusions]) -> list[int]:
-        """Return peers that have promised to exclude this agent."""
-        return sorted(agent for agent, exclusions in told.items() if self._agent in exclusions.promised)
 
     def _voters(self, without: Set[int], ended: Set[int]) -> frozenset[int]:
         return self._peers - without - ended
@@ -90,7 +93,6 @@ class Membership:
     def _is_majority(self, voters: Collection[int]) -> bool:
         return 2 * (len(voters) + 1) > len(self._peers) + 1
 
-    def _promise(self, wanted: frozenset[int], ended: Set[int], told: Mapping[int, Exclusions] | None = None) -> None:
-        voters = self._voters(wanted, ended)
-        if self._is_majority(voters) and (told is None or voters <= told.keys()):
+    def _promise(self, wanted: frozenset[int], ended: Set[int]) -> None:
+        if self._is_majority(self._voters(wanted, ended)):
             self._promised = wanted

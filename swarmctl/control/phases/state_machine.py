@@ -191,7 +191,7 @@ class MissionStateMachine:
 
     @property
     def _follows_mission(self) -> bool:
-        return self.phase is Phase.TRACK and not (self.held or self.paused) and self.begin_utc_us is not None
+        return self.phase is Phase.TRACK and not (self.held or self.paused)
 
     def begin_if_due(self, now_us: int, utc_us: int) -> None:
         """Enter TRACK on time. Called before planning, so that the first plan of the mission follows its reference."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from swarmctl.bus.links import Impairments
 from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.bus.topics import COMMAND, PATH, TICK, Topic
 from swarmctl.core.clock import SimClock
@@ -25,10 +26,17 @@ class Traffic:
     """
 
     def __init__(
-        self, steps: int, *, order: Sequence[int] = (0, 1), topic: Topic = PATH, every: int = 1, **impairments: Any
+        self,
+        steps: int,
+        *,
+        order: Sequence[int] = (0, 1),
+        topic: Topic = PATH,
+        every: int = 1,
+        seed: int = 5,
+        **impairments: Any,
     ) -> None:
         clock = SimClock()
-        hub = LocalHub(clock.now_us, **{"seed": 5, **impairments})
+        hub = LocalHub(clock.now_us, seed, Impairments(**impairments))
         buses = {i: hub.connect(agent_name(i)) for i in order}
         self.arrived: dict[tuple[str, str], list[tuple[int, int]]] = {
             (agent_name(i), agent_name(j)): [] for i, j in itertools.permutations(sorted(order), 2)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from swarmctl.bus.links import Impairments
 from swarmctl.bus.path_messages import encode_path
 from swarmctl.bus.peers import LEASE_US, LocalBus, LocalHub, PeerPaths, agent_name
 from swarmctl.bus.refusals import Refusals
@@ -107,7 +108,7 @@ def test_random_bytes_never_raise() -> None:
 
 def hub_of(names: list[str], delay_us: int = 0, loss_01: float = 0.0) -> tuple[SimClock, LocalHub, list[LocalBus]]:
     clock = SimClock()
-    hub = LocalHub(clock.now_us, seed=5, delay_us=delay_us, loss_01=loss_01)
+    hub = LocalHub(clock.now_us, 5, Impairments(delay_us=delay_us, loss_01=loss_01))
     return clock, hub, [hub.connect(name) for name in names]
 
 
@@ -191,7 +192,7 @@ def test_a_name_can_be_taken_once() -> None:
 def deliveries(order: list[int], connect_order: list[int]) -> dict[str, list[tuple[str, bytes]]]:
     """Return all messages received in 400 steps, with agents ticked and attached in the given orders."""
     clock = SimClock()
-    hub = LocalHub(clock.now_us, seed=5, delay_us=40_000, loss_01=0.3)
+    hub = LocalHub(clock.now_us, 5, Impairments(delay_us=40_000, loss_01=0.3))
     buses = {i: hub.connect(agent_name(i)) for i in connect_order}
     log: dict[str, list[tuple[str, bytes]]] = {agent_name(i): [] for i in order}
     for step in range(400):

@@ -5,11 +5,11 @@ from __future__ import annotations
 import pytest
 
 from swarmctl.control.phases.state_machine import MissionStateMachine
-from swarmctl.core.operator_verbs import OPERATOR_VERBS, order_problem
+from swarmctl.core.operator_verbs import EXCLUDE, OPERATOR_VERBS, order_problem
 from swarmctl.core.types import Phase
 from tests.benches.state_machine_flight import Flight
 
-ABOUT_THE_VEHICLE = [name for name, verb in OPERATOR_VERBS.items() if not verb.is_about_peer]
+ABOUT_THE_VEHICLE = [name for name in OPERATOR_VERBS if name != EXCLUDE]
 
 
 def test_every_verb_about_the_vehicle_is_a_stop_or_handled() -> None:
