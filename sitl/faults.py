@@ -15,7 +15,7 @@ from sitl.net.lossy import LinkDirection, LossyLink
 from sitl.plant.estimator import Estimator
 from sitl.plant.physics import Physics
 from sitl.plant.vehicle import Array
-from sitl.plant.wind import Gust
+from sitl.plant.wind import Gust, WindStep
 from swarmctl.simulator_config import EVERY_VEHICLE, FaultParams
 
 Undo = Callable[[], None]
@@ -67,13 +67,15 @@ def _mass(world: FaultTarget, vehicle: int, fault: FaultParams, now_us: int) -> 
 
 
 def _gust(world: FaultTarget, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
-    on = np.zeros(world.physics.plant.state.shape[1])
-    on[vehicle] = 1.0
-    gust = Gust(
-        peak_ned_m_s=fault.amount * _towards(fault).reshape(3, 1), from_s=now_us * 1e-6, for_s=fault.for_s, on=on
-    )
+    gust = Gust(peak_ned_m_s=_blown(world, vehicle, fault), from_s=now_us * 1e-6, for_s=fault.for_s)
     world.physics.air.gusts.append(gust)
     return lambda: None  # a gust ends by itself
+
+
+def _wind(world: FaultTarget, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
+    gusts, step = world.physics.air.gusts, WindStep(_blown(world, vehicle, fault))
+    gusts.append(step)
+    return lambda: gusts.remove(step)
 
 
 def _battery(world: FaultTarget, vehicle: int, fault: FaultParams, now_us: int) -> Undo:
@@ -111,11 +113,12 @@ _BEGIN: dict[str, Callable[[FaultTarget, int, FaultParams, int], Undo]] = {
     "link_reorder": _link("reorder_01"),
     "link_corrupt": _link("corrupt_01"),
     "gust": _gust,
+    "wind": _wind,
     "battery": _battery,
     "mass": _mass,
     "reboot": _reboot,
 }
-_ADD_UP = frozenset({"estimator_jump", "gust"})
+_ADD_UP = frozenset({"estimator_jump", "gust", "wind"})
 
 
 class Faults:
@@ -172,6 +175,13 @@ class Faults:
     def _tell(self, name: str, now_us: int, fault: FaultParams, vehicle: int) -> None:
         fields = {"kind": fault.kind, "vehicle": vehicle, "value": fault.amount, "for_s": fault.for_s}
         self.on_event(name, now_us, fields)
+
+
+def _blown(world: FaultTarget, vehicle: int, fault: FaultParams) -> Array:
+    """Return the velocity (3, N) NED [m/s] of a gust or step on one vehicle."""
+    velocity = np.zeros((3, world.physics.plant.state.shape[1]))
+    velocity[:, vehicle] = fault.amount * _towards(fault)
+    return velocity
 
 
 def _towards(fault: FaultParams) -> Array:

@@ -124,6 +124,13 @@ class Config(Params):
     obstacles: tuple[Obstacle, ...] = Field((), strict=False)
     limits: LimitParams = LimitParams()
 
+    @property
+    def drift_m(self) -> float:
+        """Return how far a gust of `separation.gust_m_s` blows the vehicle that it blows farthest."""
+        accel_m_s2 = self.controller.mpc.accel_max_m_s2
+        models = [self.vehicle_model, *(vehicle.model for vehicle in self.vehicles if vehicle.model is not None)]
+        return max(model.drift_m(self.separation.gust_m_s, accel_m_s2) for model in models)
+
     def starts_ned_m(self) -> tuple[tuple[float, float, float], ...]:
         """Return the start position of every agent, shared NED [m]."""
         if self.start.positions_ned_m:
@@ -225,8 +232,13 @@ def _whole(config: Config) -> Iterator[str]:
             "real time: swarmctl simulate, or python -m sitl --speed with clients of your own"
         )
     yield from config.mission.problems(agents)
-    if agents > 1 and (problem := radius_problem(config.separation, 0.0)):
+    if agents > 1 and (problem := radius_problem(config.separation, 0.0, config.drift_m)):
         yield problem
+    if config.separation.gust_m_s and not config.vehicle_model.drag_1_s:
+        yield (
+            f"separation.gust_m_s = {config.separation.gust_m_s:g}: what a gust does to a vehicle follows from its "
+            "drag; set vehicle_model.drag_1_s (swarmctl check --identify measures it)"
+        )
     if config.separation.radius_m < config.limits.min_separation_m:
         yield (
             f"limits.min_separation_m = {config.limits.min_separation_m}: larger than separation.radius_m = "

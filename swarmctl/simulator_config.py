@@ -64,6 +64,7 @@ FAULTS: dict[str, FaultRule] = {
     "link_reorder": FaultRule(0, 1, 1, "0..1 of the datagrams that the next one overtakes"),
     "link_corrupt": FaultRule(0, 1, 1, "0..1 of the datagrams in which a bit is turned"),
     "gust": FaultRule(-40, 40, None, "m/s, peak of a 1-cosine gust along towards_deg"),
+    "wind": FaultRule(-40, 40, None, "m/s, along towards_deg, from one instant to the next"),
     "battery": FaultRule(0, 1, None, "0..1 of the charge that is left"),
     "mass": FaultRule(0.3, 3, None, "mass over the mass at the start"),
     "reboot": FaultRule(0, 0, 0, "no value: the autopilot starts again"),
@@ -81,6 +82,7 @@ FaultKind = Literal[
     "link_reorder",
     "link_corrupt",
     "gust",
+    "wind",
     "battery",
     "mass",
     "reboot",
@@ -97,7 +99,7 @@ class FaultParams(Params):
     for_s: float = Field(0.0, ge=0, le=86400)  # 0: to the end
     rotor: int = Field(0, ge=0, le=3)  # motor
     direction: Literal["both", "to_vehicle", "from_vehicle"] = "both"  # link_*
-    towards_deg: float = Field(0.0, ge=-360, le=360)  # gust, estimator_jump: clockwise from north
+    towards_deg: float = Field(0.0, ge=-360, le=360)  # gust, wind, estimator_jump: clockwise from north
 
     @property
     def amount(self) -> float:

@@ -5,12 +5,13 @@ A new field of a noun has its ordinary value here, so that no other test changes
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from swarmctl.bus.json_messages import StatusMessage
 from swarmctl.control.collision.separation import KeepOut
+from swarmctl.control.commit.trajectory_planner import DesiredReference, Situation
 from swarmctl.control.mpc.problem import Start
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.trajectory_message import Exclusions, Proposal, TrajectoryMessage
@@ -143,6 +144,26 @@ def start(
     )
 
 
+def situation(
+    *,
+    desired: DesiredReference,
+    utc_us: int = 0,
+    begin_us: int = 0,
+    peers: Mapping[int, TrajectoryMessage] | None = None,
+    others: Sequence[KeepOut] = (),
+    disturbance_ned_m_s2: Array = STILL,
+) -> Situation:
+    """Return the inputs of a plan in calm air, among nobody."""
+    return Situation(
+        utc_us=utc_us,
+        begin_us=begin_us,
+        desired=desired,
+        peers=peers or {},
+        others=others,
+        disturbance_ned_m_s2=disturbance_ned_m_s2,
+    )
+
+
 def trajectory_message(
     *,
     committed: Trajectory,
@@ -151,6 +172,7 @@ def trajectory_message(
     seq: int = 1,
     sent_utc_us: int = 0,
     is_committed: bool = True,
+    tube_m: float = 0.0,
     proposal: Proposal | None = None,
     acknowledged: Mapping[int, int] = NOBODY,
     exclusions: Exclusions | None = None,
@@ -164,6 +186,7 @@ def trajectory_message(
         sent_utc_us=sent_utc_us,
         is_committed=is_committed,
         committed=committed,
+        tube_m=tube_m,
         proposal=proposal,
         acknowledged=acknowledged,
         exclusions=exclusions or Exclusions(),

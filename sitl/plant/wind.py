@@ -23,19 +23,37 @@ _PURPOSE = 2
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Gust:
-    """A gust with its peak (3, 1) NED [m/s] at half its length, on some vehicles (N,)."""
+    """A gust with its peak (3, N) NED [m/s] at half its length."""
 
     peak_ned_m_s: Array
     from_s: float
     for_s: float
-    on: Array
+
+    def over(self, t_s: float) -> bool:
+        """Return whether the gust has ended."""
+        return t_s > self.from_s + self.for_s
 
     def at(self, t_s: float) -> Array | None:
         """Return the velocity (3, N) [m/s]; None before and after."""
         x = (t_s - self.from_s) / self.for_s
         if not 0.0 <= x <= 1.0:
             return None
-        return 0.5 * (1.0 - math.cos(2.0 * math.pi * x)) * self.peak_ned_m_s * self.on
+        return 0.5 * (1.0 - math.cos(2.0 * math.pi * x)) * self.peak_ned_m_s
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class WindStep:
+    """A wind (3, N) NED [m/s] that blows from one instant to the next, until it is removed."""
+
+    velocity_ned_m_s: Array
+
+    def over(self, t_s: float) -> bool:
+        """Return False: only its removal ends it."""
+        return False
+
+    def at(self, t_s: float) -> Array:
+        """Return the velocity (3, N) [m/s]."""
+        return self.velocity_ned_m_s
 
 
 class Air:
@@ -53,12 +71,10 @@ class Air:
         self._intensity_m_s = params.turbulence_m_s
         self._dt_s = dt_s
         self._count = vehicles
-        self.gusts: list[Gust] = []
+        self.gusts: list[Gust | WindStep] = []
         if any(params.gust_ned_m_s):
-            peak = np.array(params.gust_ned_m_s).reshape(3, 1)
-            self.gusts.append(
-                Gust(peak_ned_m_s=peak, from_s=params.gust_at_s, for_s=params.gust_for_s, on=np.ones(vehicles))
-            )
+            peak = np.tile(np.array(params.gust_ned_m_s).reshape(3, 1), vehicles)
+            self.gusts.append(Gust(peak_ned_m_s=peak, from_s=params.gust_at_s, for_s=params.gust_for_s))
         self._rngs = [np.random.default_rng([seed, i, _PURPOSE]) for i in range(vehicles)]
         self._block = np.zeros((0, 5, vehicles))
         self._drawn = 0
@@ -78,7 +94,7 @@ class Air:
             speed = np.maximum(np.sqrt(np.sum(relative * relative, axis=0)), _SLOWEST_M_S)
             total += self._turbulence(height_m, speed)
         if self.gusts:
-            self.gusts = [gust for gust in self.gusts if t_s <= gust.from_s + gust.for_s]
+            self.gusts[:] = [gust for gust in self.gusts if not gust.over(t_s)]
             for gust in self.gusts:
                 blown = gust.at(t_s)
                 if blown is not None:

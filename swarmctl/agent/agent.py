@@ -66,7 +66,7 @@ from swarmctl.mavlink.vehicle_setup import VehicleSetup
 
 _NO_TIME_US = -1
 # modes in which the vehicle does not follow its committed trajectory
-_DEVIATING_MODES = (Mode.BRAKE, Mode.HOLD, Mode.LAND, Mode.PILOT_OVERRIDE, Mode.STATE_STALE)
+_DEVIATING_MODES = (Mode.BRAKE, Mode.HOLD, Mode.LAND, Mode.PILOT_OVERRIDE)
 _START_ALERT_DELAY_US = 3_000_000  # time on the ground after which the unmet condition is raised as an alert
 _RESTORE_TIMEOUT_US = 5_000_000  # longest wait for parameters to be restored before the process ends
 _AUTOPILOT_HOVER_MODES = (FlightMode.HOLD, FlightMode.EXTERNAL)  # ArduCopter takes off by itself in the latter
@@ -299,7 +299,7 @@ class Agent:
     def _plan(self, now_us: int, state: VehicleState | None) -> PlanningResult:
         if state is None or not self._fresh(now_us, state):
             # the autopilot flies the vehicle, on stale setpoints or by its failsafe
-            self._directive = self._separation.idle(self._clock.utc_us(), state, ())
+            self._directive = self._separation.wait(self._clock.utc_us(), state)
             return PlanningResult(start=None, plan=None, reference=None, keep_outs=[])
         estimate = self._observer.estimate
         act_us = now_us + self._predictor.delay_us
@@ -359,6 +359,7 @@ class Agent:
                 desired=self._reference_selector.desired(now_us, utc_us),
                 horizon_utc_us=act_us + np.arange(self._controller.longest + 1) * self._controller.dt_us,
                 keep_outs=keep_outs,
+                disturbance_ned_m_s2=self._observer.estimate.disturbance_ned_m_s2,
             )
         )
 
@@ -525,7 +526,9 @@ class Agent:
             return ""
         self._accuracy.update(now_us, self._autopilot.pos_accuracy_m)
         accuracy_m = self._accuracy.worst_m or 0.0  # if not reported, only body size and tracking error are checked
-        return self._accuracy.unsettled(now_us) or radius_problem(self._setup.separation, accuracy_m)
+        return self._accuracy.unsettled(now_us) or radius_problem(
+            self._setup.separation, accuracy_m, self._setup.drift_m
+        )
 
     # -- publish, record ----------------------------------------------------------------------------------------------
 
@@ -536,7 +539,8 @@ class Agent:
 
     def _path(self, state: VehicleState, flown: Plan | None) -> PredictedPath:
         setup, seq = self._setup, self._publisher.seq
-        margin_m = min(MAX_MARGIN_M, self._autopilot.frame.margin_m + self._overload.margin_m)
+        margins_m = self._autopilot.frame.margin_m, self._overload.margin_m, self._directive.margin_m
+        margin_m = min(MAX_MARGIN_M, sum(margins_m))
         if flown is not None:
             t0_us, dt_us, pos = self._utc(flown.t0_us), flown.dt_us, flown.pos_ned_m
             return PredictedPath(

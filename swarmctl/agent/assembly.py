@@ -59,5 +59,6 @@ def make_agent(
         separation=config.separation,
         vehicle_model=config.model_of(agent),
         max_obstacles=min(max(1, len(config.obstacles)), config.separation.max_obstacles),
+        drift_m=config.drift_m,
     )
     return Agent(setup, autopilot, commands, bus, clock=clock, sink=sink, stopwatch_ns=stopwatch_ns)

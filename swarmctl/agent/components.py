@@ -40,6 +40,7 @@ def _guaranteed(
         peers=setup.peers,
         params=setup.params.commit,
         mpc=setup.controller.mpc,
+        vehicle=setup.vehicle_model,
         separation=setup.separation,
         max_keep_outs=setup.max_keep_outs,
         world_model=world_model,

@@ -15,12 +15,16 @@ from swarmctl.control.collision.separation import KeepOut, SeparationParams
 from swarmctl.control.commit.membership import Membership
 from swarmctl.control.commit.protocol import CommitCounts, Commitments
 from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference, Situation
+from swarmctl.control.commit.tube import Grip, Tube
+from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.core.trajectory import Times, Trajectory
 from swarmctl.core.trajectory_message import TrajectoryMessage
 from swarmctl.core.types import Array, Phase, VehicleState
 
 _SUSPECT_US = 3_000_000  # without a message, after which a peer is suspected: twice what a token outlives its process
+_GAP_US = 1_000_000  # without a fresh state, after which nothing is committed any more
+_SAME_M = 1e-3  # tubes that differ by less are equal: messages round
 _CUT_OFF_US = 20_000_000  # at rest without the acknowledgements required, after which the agent lands where it is
 
 
@@ -30,15 +34,14 @@ class Coordination:
     Args:
         agent, boot_id: identity in the own messages.
         peers: numbers of the other agents.
-        params, mpc, separation, max_keep_outs, stopwatch_ns: see `Commitments`.
+        params, mpc, vehicle, separation, max_keep_outs, stopwatch_ns: see `Commitments`.
         world_model: paths, statuses and presence of peers, and obstacles.
         bus: is drained by `receive`.
         rate_hz: tick rate of every agent.
         note: is told `conflicting_commitment` when a peer's committed trajectory comes too close to the own one;
-            `tracking_violation` when the vehicle leaves its committed trajectory by more than `tracking_m` plus half of
-            the committed distance beyond touching bodies, and when it is back; `membership` when the peers that are
-            suspected, promised to be excluded, or excluded change; and `commitments` with all counts when the autopilot
-            or a pilot takes over.
+            `tracking_violation` when the vehicle leaves its tube, when that has another consequence, and when it is
+            held again; `membership` when the peers that are suspected, promised to be excluded, or excluded change;
+            and `commitments` with all counts when the autopilot or a pilot takes over.
 
     Attributes:
         committed_peers: by agent number, the trajectories that each peer relied on may follow.
@@ -54,6 +57,7 @@ class Coordination:
         peers: list[int],
         params: CommitParams,
         mpc: MpcParams,
+        vehicle: VehicleModelParams,
         separation: SeparationParams,
         max_keep_outs: int,
         world_model: WorldModel,
@@ -64,7 +68,7 @@ class Coordination:
     ) -> None:
         self._agent, self._boot_id, self._bus, self._world_model = agent, boot_id, bus, world_model
         self._commitments = Commitments(
-            agent, params, mpc, separation, max_keep_outs=max_keep_outs, stopwatch_ns=stopwatch_ns
+            agent, params, mpc, vehicle, separation, max_keep_outs=max_keep_outs, stopwatch_ns=stopwatch_ns
         )
         refusals, presence = world_model.refusals, world_model.presence
         self._peer_trajectories = PeerTrajectories(
@@ -73,12 +77,14 @@ class Coordination:
         self._peers = frozenset(peers)
         self._note, self._seq, self._separation = note, 0, separation
         self._is_committed = False
-        self._allowed_m = separation.budget.tracking_allowance_m
-        self._is_violating, self._worst_m = False, 0.0
+        self._tube_m = separation.budget.tube_m
+        self._tube = Tube(self._tube_m)
+        self._grip = Grip.HELD
         self._membership = Membership(agent, peers)
         self._ended: frozenset[int] = frozenset()  # peers that take no part any more, by evidence
         self._membership_said: tuple[frozenset[int], ...] = (frozenset(),) * 3
         self._begun_us: int | None = None
+        self._stepped_us = 0  # time of the newest tick in which the agent flew
         self._conflicting: set[int] = set()
         self.committed_peers: Mapping[int, Sequence[Trajectory]] = {}
         self.lost_peer_keep_outs: list[KeepOut] = []
@@ -107,12 +113,23 @@ class Coordination:
             suspected_, promised, excluded = (sorted(agents) for agents in said)
             self._note("membership", suspected=suspected_, promised=promised, excluded=excluded)
 
-    def step(self, utc_us: int, state: VehicleState, phase: Phase, desired: DesiredReference) -> None:
-        """Apply rules 2 to 4 while this agent flies; `desired` is what it would follow alone."""
+    def step(
+        self, utc_us: int, state: VehicleState, phase: Phase, desired: DesiredReference, *, disturbance_ned_m_s2: Array
+    ) -> None:
+        """Apply rules 2 to 4 while this agent flies.
+
+        Args:
+            utc_us: now.
+            state, phase: own vehicle and mission.
+            desired: motion that the agent would follow if it were alone.
+            disturbance_ned_m_s2: (3,) estimated acceleration by wind.
+        """
         commitments = self._commitments
         if not self._is_committed:
             self._is_committed, self._begun_us = True, utc_us
             commitments.begin(state.pos_ned_m, state.vel_ned_m_s, utc_us)
+        self._stepped_us = utc_us
+        self._watch(utc_us, state)
         known, required = self._peer_trajectories.newest, self._required_peers()
         self.cut_off = self._why_cut_off(utc_us, required)
         commitments.update(utc_us, known, required)
@@ -120,7 +137,8 @@ class Coordination:
         if conflicting != self._conflicting:
             self._conflicting = conflicting
             self._note("conflicting_commitment", by=sorted(conflicting))
-        deviating = self._world_model.deviating_peers(known, utc_us, self._allowed_m)
+        deviating = self._world_model.deviating_peers(known, utc_us, self._tube_m)
+        deviating |= {agent for agent, message in known.items() if message.tube_m > self._tube_m + _SAME_M}
         absent = self._absent()  # perhaps lost: no longer trusted, still required to acknowledge
         committed = {agent for agent, message in known.items() if message.is_committed}
         lost_peers = [agent for agent in known.keys() - required if agent in committed]
@@ -129,21 +147,35 @@ class Coordination:
         self.committed_peers = {agent: known[agent].followed for agent in taking_part}
         partners = {agent: known[agent] for agent in taking_part}
         others = self._others(utc_us, state, phase, taking_part)
-        commitments.evade(Situation(utc_us=utc_us, begin_us=utc_us, desired=desired, peers=partners, others=others))
-        if commitments.is_due(utc_us):
+        now = Situation(
+            utc_us=utc_us,
+            begin_us=utc_us,
+            desired=desired,
+            peers=partners,
+            others=others,
+            disturbance_ned_m_s2=disturbance_ned_m_s2,
+        )
+        commitments.evade(now)
+        if commitments.is_due(utc_us) and self._grip < Grip.STOPPED:
             begin_us = utc_us + commitments.lead_us
             others = self._others(begin_us, state, phase, taking_part)
-            commitments.propose(
-                Situation(utc_us=utc_us, begin_us=begin_us, desired=desired, peers=known, others=others)
-            )
-        self._watch(float(np.linalg.norm(state.pos_ned_m - self.sample_committed(np.array([utc_us]))[0][0])))
+            commitments.propose(replace(now, begin_us=begin_us, peers=known, others=others))
+
+    def wait(self, utc_us: int, state: VehicleState | None) -> None:
+        """Keep what is committed while the state is stale for a moment; longer is `idle`.
+
+        The vehicle flies on: to commit anew at speed after each gap would surprise peers. Whether it has stayed in its
+        tube is seen with the next state.
+        """
+        if not self._is_committed or utc_us - self._stepped_us > _GAP_US:
+            self.idle(utc_us, state)
 
     def idle(self, utc_us: int, state: VehicleState | None) -> None:
-        """Commit nothing while a pilot or the autopilot flies, or the state is stale; peers are still acknowledged."""
+        """Commit nothing while a pilot or the autopilot flies; peers are still acknowledged."""
         if self._is_committed:
             self._is_committed = False
             self.committed_peers, self.lost_peer_keep_outs, self.cut_off = {}, [], ""
-            self._note("commitments", **asdict(self.counts), worst_tracking_m=self._worst_m)
+            self._note("commitments", **asdict(self.counts), worst_tracking_m=self._tube.worst_m)
         self._commitments.end(None if state is None else state.pos_ned_m, utc_us)
 
     def sample_committed(self, t_utc_us: Times) -> tuple[Array, Array]:
@@ -164,6 +196,7 @@ class Coordination:
             sent_utc_us=utc_us,
             is_committed=self._is_committed,
             committed=self._commitments.committed,
+            tube_m=self._tube.radius_m,
             proposal=self._commitments.proposal,
             acknowledged=self._peer_trajectories.acknowledgements(self._ended | exclusions.promised),
             exclusions=exclusions,
@@ -171,11 +204,21 @@ class Coordination:
         )
         self._bus.publish(topics.TRAJECTORY, encode_trajectory_message(message))
 
-    def _watch(self, error_m: float) -> None:
-        self._worst_m = max(self._worst_m, error_m)
-        if (error_m > self._allowed_m) != self._is_violating:
-            self._is_violating = not self._is_violating
-            self._note("tracking_violation", begins=self._is_violating, error_m=error_m, allowed_m=self._allowed_m)
+    @property
+    def margin_m(self) -> float:
+        """Return by how much the own tube is wider than distances leave room for."""
+        return self._tube.radius_m - self._tube_m
+
+    def _watch(self, utc_us: int, state: VehicleState) -> None:
+        """Commit anew, from the measured state, when the vehicle has left its tube."""
+        pos, vel = (sampled[0] for sampled in self.sample_committed(np.array([utc_us])))
+        error_m = float(np.linalg.norm(state.pos_ned_m - pos))
+        if self._tube.update(utc_us, error_m, float(np.linalg.norm(state.vel_ned_m_s - vel))):
+            self._commitments.restart(state.pos_ned_m, state.vel_ned_m_s, utc_us)
+        before, self._grip = self._grip, self._tube.grip(utc_us)
+        if self._grip is not before:
+            is_off, grip = self._grip is not Grip.HELD, self._grip.name
+            self._note("tracking_violation", begins=is_off, error_m=error_m, allowed_m=self._tube_m, grip=grip)
 
     def _required_peers(self) -> frozenset[int]:
         """Return peers that fly by commitments and have to acknowledge."""
@@ -192,6 +235,8 @@ class Coordination:
         return utc_us - self._peer_trajectories.received_utc_us.get(agent, utc_us)
 
     def _why_cut_off(self, utc_us: int, required: Set[int]) -> str:
+        if self._grip is Grip.LOST:
+            return "it can't hold what it commits to"
         if by := self._membership.excluded_by:
             return f"excluded by {_names(by)} after silence"
         begun_us = utc_us if self._begun_us is None else self._begun_us

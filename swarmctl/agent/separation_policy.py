@@ -15,7 +15,7 @@ from swarmctl.agent.world_model import WorldModel
 from swarmctl.control.collision.separation import KeepOut
 from swarmctl.control.commit.trajectory_planner import DesiredReference
 from swarmctl.core.trajectory import Times, Trajectory
-from swarmctl.core.types import Phase, Reference, VehicleState
+from swarmctl.core.types import Array, Phase, Reference, VehicleState
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -28,6 +28,7 @@ class SeparationInputs:
     desired: DesiredReference  # motion the agent would follow if it were alone
     horizon_utc_us: Times  # (longest+1,) times of the controller's reference
     keep_outs: Sequence[KeepOut]  # of peers and obstacles, on the controller's grid
+    disturbance_ned_m_s2: Array  # (3,) estimated acceleration by wind
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,6 +41,7 @@ class SeparationDirective:
     lost_peer_keep_outs: tuple[KeepOut, ...] = ()  # may deadlock an agent, as those of the world model
     unresponsive_peer: bool = False  # the mission has to wait for a peer that may be flying on unseen
     cut_off: str = ""  # why the mission has to end where the vehicle is, because peers don't answer
+    margin_m: float = 0.0  # peers have to keep this much more, because the vehicle isn't flown as it was committed to
     duration_ns: int = 0  # time spent on agreeing with peers
 
 
@@ -61,7 +63,10 @@ class SeparationPolicy(Protocol):
         """Return the directive of a tick in which the agent flies its vehicle along its reference."""
 
     def idle(self, utc_us: int, state: VehicleState | None, keep_outs: Sequence[KeepOut]) -> SeparationDirective:
-        """Return the directive of a tick in which it does not: a pilot or a failsafe flies, or the state is stale."""
+        """Return the directive of a tick in which it does not: a pilot or a failsafe flies."""
+
+    def wait(self, utc_us: int, state: VehicleState | None) -> SeparationDirective:
+        """Return the directive of a tick whose newest state, if there is any, is stale."""
 
     def publish(self, utc_us: int) -> None:
         """Publish the messages that peers need for this policy."""
@@ -92,6 +97,10 @@ class BestEffort:
         return SeparationDirective(
             keep_outs=tuple(keep_outs), unresponsive_peer=self._world_model.has_unresponsive_peer(utc_us)
         )
+
+    def wait(self, utc_us: int, state: VehicleState | None) -> SeparationDirective:
+        """Ask for nothing: there is no plan."""
+        return self.idle(utc_us, state, ())
 
     def publish(self, utc_us: int) -> None:
         """Do nothing: the agent publishes its path in every mode."""
@@ -130,7 +139,13 @@ class Guaranteed:
     def step(self, inputs: SeparationInputs) -> SeparationDirective:
         """Agree with peers, then follow the committed trajectory, which keeps clear of all keep-outs already."""
         began_ns, coordination = self._stopwatch_ns(), self._coordination
-        coordination.step(inputs.utc_us, inputs.state, inputs.phase, inputs.desired)
+        coordination.step(
+            inputs.utc_us,
+            inputs.state,
+            inputs.phase,
+            inputs.desired,
+            disturbance_ned_m_s2=inputs.disturbance_ned_m_s2,
+        )
         duration_ns = self._stopwatch_ns() - began_ns
         pos, vel = coordination.sample_committed(inputs.horizon_utc_us)
         return SeparationDirective(
@@ -138,6 +153,7 @@ class Guaranteed:
             committed_peers=coordination.committed_peers,
             lost_peer_keep_outs=tuple(coordination.lost_peer_keep_outs),
             cut_off=coordination.cut_off,
+            margin_m=coordination.margin_m,
             duration_ns=duration_ns,
         )
 
@@ -145,6 +161,11 @@ class Guaranteed:
         """Commit nothing, and leave it to the controller to keep clear."""
         self._coordination.idle(utc_us, state)
         return SeparationDirective(keep_outs=tuple(keep_outs))
+
+    def wait(self, utc_us: int, state: VehicleState | None) -> SeparationDirective:
+        """Keep what is committed for a moment: the vehicle still flies it when the gap is short."""
+        self._coordination.wait(utc_us, state)
+        return SeparationDirective(margin_m=self._coordination.margin_m)
 
     def publish(self, utc_us: int) -> None:
         """Publish the committed trajectory, the proposal and the acknowledgements."""

@@ -55,6 +55,7 @@ class AgentSetup:
     separation: SeparationParams
     vehicle_model: VehicleModelParams
     max_obstacles: int
+    drift_m: float  # by a gust of `separation.gust_m_s`
 
     @property
     def peers(self) -> list[int]:

@@ -21,13 +21,14 @@ from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.trajectory_message import Exclusions, Proposal, TrajectoryMessage
 from swarmctl.core.types import Array
 
-TRAJECTORY_VERSION = 3
+TRAJECTORY_VERSION = 4
+MAX_TUBE_M = 100.0
 MAX_POINTS = 2000
 MAX_STEP_US = 500_000
 MAX_BEGIN_US = 10_000_000  # from now; a trajectory that begins later comes from another clock
 MAX_PEERS = 256  # of each kind: acknowledged, heard, suspected, promised
 _MAGIC = b"SI"
-_HEADER = struct.Struct("<2sBBIIIqHHHH")  # magic version flags agent boot seq sent, counts of the four kinds
+_HEADER = struct.Struct("<2sBBIIIqfHHHH")  # magic version flags agent boot seq sent tube, counts of the four kinds
 _HAS_PROPOSAL, _IS_COMMITTED = 1, 2
 _PROPOSAL = struct.Struct("<Qq")  # number, time of proposal
 _TRAJECTORY = struct.Struct("<qiH2x")
@@ -49,6 +50,7 @@ def encode_trajectory_message(message: TrajectoryMessage) -> bytes:
             message.boot_id,
             message.seq,
             message.sent_utc_us,
+            message.tube_m,
             len(message.acknowledged),
             len(message.heard),
             len(message.exclusions.suspected),
@@ -76,8 +78,10 @@ def decode_trajectory_message(
     which its trajectories are converted; the memory must be of the same correction.
     """
     try:
-        magic, version, flags, agent, boot_id, seq, sent_utc_us, *counts = _HEADER.unpack_from(payload)
+        magic, version, flags, agent, boot_id, seq, sent_utc_us, tube_m, *counts = _HEADER.unpack_from(payload)
         if magic != _MAGIC or version != TRAJECTORY_VERSION or flags > 3 or max(counts) > MAX_PEERS:
+            return None
+        if not 0.0 <= tube_m <= MAX_TUBE_M:
             return None
         acknowledgements, heard, suspected, promised = counts
         known, sent = memory or {}, Memory()
@@ -104,6 +108,7 @@ def decode_trajectory_message(
             sent_utc_us=sent_utc_us,
             is_committed=bool(flags & _IS_COMMITTED),
             committed=committed,
+            tube_m=tube_m,
             proposal=proposal,
             acknowledged=acknowledged,
             exclusions=exclusions,

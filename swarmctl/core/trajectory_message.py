@@ -41,6 +41,7 @@ class TrajectoryMessage:
     sent_utc_us: int
     is_committed: bool  # the agent follows `committed`; otherwise a pilot or the autopilot flies
     committed: Trajectory
+    tube_m: float  # bound within which the vehicle is flown around `committed`, or around `proposal` once that is
     proposal: Proposal | None
     acknowledged: Mapping[int, int]  # by peer: number of the proposal in its newest message
     exclusions: Exclusions

@@ -8,8 +8,10 @@ from pymavlink.dialects.v20 import development as dialect
 
 from sitl.lockstep import Lockstep
 from sitl.px4.link.endpoint import Endpoint
+from swarmctl.agent.coordination import Coordination
 from swarmctl.core.types import FlightMode, Mode, Phase
 from swarmctl.mavlink.autopilot import Autopilot
+from swarmctl.simulator_config import FaultParams
 from tests.closed_loop.conftest import Flight, Fly
 
 ALONE = ("swarm.agents=1", "sitl.start=air", "mission.duration_s=8")
@@ -74,3 +76,32 @@ def test_an_agent_stopped_for_longer_leaves_control_to_the_failsafe(fly: Fly) ->
     flight = fly_stopped_for(fly, 0.8)
     assert is_overridden(flight)
     assert np.isnan(flight.ticks(0)["setpoint_thrust_01"][-100:]).all()
+
+
+GUARANTEED = ("swarm.agents=3", "sitl.start=air", "separation.mode=guaranteed", "mission.duration_s=8")
+
+
+def times_abandoned(fly: Fly) -> int:
+    """Return how often an agent abandoned its commitment, while telemetry of its vehicle stopped twice for 0.35 s."""
+
+    def stop(running: Lockstep) -> None:
+        gap = FaultParams(kind="link_loss", vehicle=0, value=1.0, for_s=0.35, direction="from_vehicle")
+        running.world.faults.begin(gap, running.world.since_boot_us)
+
+    def over(running: Lockstep) -> bool:
+        return running.clock.now_us() > 10_500_000
+
+    flight = fly(*GUARANTEED, at={2.0: stop, 4.0: stop}, until=over)
+    assert Mode.STATE_STALE in flight.modes(0)
+    return flight.event_names(0).count("commitments")
+
+
+def test_a_short_telemetry_gap_keeps_what_is_committed(fly: Fly) -> None:
+    assert times_abandoned(fly) == 0
+
+
+def test_negative_control_an_agent_that_idles_in_a_gap_commits_anew_at_speed(
+    fly: Fly, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Coordination, "wait", Coordination.idle)
+    assert times_abandoned(fly) == 2

@@ -188,6 +188,18 @@ def test_duplicate_sysid_wrong_url_and_missing_vehicle_are_named(tmp_path: Path)
     assert any("70000" in p for p in refusals(vehicles(tmp_path, "udpin://127.0.0.1:70000", "udpin://127.0.0.1:1")))
 
 
+@pytest.mark.parametrize(
+    ("overrides", "said"),
+    [
+        (("separation.gust_m_s=4",), "set vehicle_model.drag_1_s"),
+        (("separation.gust_m_s=8", "vehicle_model.drag_1_s=1.0"), "gusts of 8 m/s"),
+    ],
+)
+def test_gusts_need_a_drag_and_room(overrides: tuple[str, ...], said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        load(None, [*overrides])
+
+
 def test_vehicles_beside_the_simulator_are_refused(tmp_path: Path) -> None:
     path = vehicles(tmp_path, "udpin://127.0.0.1:14540", "udpin://127.0.0.1:14541")
     (problem,) = refusals(path, "sitl.enabled=true")

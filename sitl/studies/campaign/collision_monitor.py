@@ -71,8 +71,8 @@ class CollisionMonitor:
 
     @property
     def arrived_s(self) -> float:
-        """Arrival time of the last expected vehicle; infinite when not all have arrived."""
-        return float(self._since_s[self._expected].max(initial=0.0))
+        """Arrival time of the last expected vehicle; infinite when not all have arrived, or none is expected."""
+        return float(self._since_s[self._expected].max()) if self._expected.any() else math.inf
 
     def standing(self) -> Mask:
         """Return the vehicles (N,) that have moved less than 0.1 m in the last 3 s; none before."""

@@ -11,6 +11,7 @@ again flies only what is missing there. `OUT/report.html` has every cell with ex
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
 import time
@@ -24,11 +25,12 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from sitl.studies.campaign.disturbances import DISTURBANCES, NONE
 from sitl.studies.campaign.factors import NOISES, PROTECTIONS
-from sitl.studies.campaign.flight import config_of
+from sitl.studies.campaign.flight import config_of, drawn
 from sitl.studies.campaign.page import share_text, write_page
 from sitl.studies.campaign.quick import QUICK
-from sitl.studies.campaign.scenarios import SCENARIOS, layout_of
+from sitl.studies.campaign.scenarios import AIRFRAMES, SCENARIOS
 from sitl.studies.campaign.source import code_id
 from sitl.studies.campaign.store import Store
 from sitl.studies.campaign.summary import summaries
@@ -92,6 +94,8 @@ def _trials(options: argparse.Namespace) -> list[Trial]:
             noises=options.noise,
             winds_m_s=options.wind,
             protections=options.protections,
+            airframes=options.airframe,
+            disturbances=options.disturbance,
             sets=" ".join(options.sets),
         )
     problems: dict[str, None] = {}
@@ -111,7 +115,7 @@ def _problems(cell: Cell, seed: int) -> Iterator[str]:
         yield f"--agents {cell.agents}: {cell.scenario} needs at least {least}"
         return
     try:
-        config_of(cell, seed, layout_of(cell.scenario, seed, cell.agents), cell.agents)
+        config_of(cell, seed, drawn(cell, seed), cell.agents)
     except ConfigError as error:
         yield from error.problems
     except ValueError as error:
@@ -144,7 +148,8 @@ def _print_table(rows: list[Row]) -> None:
     for s in summaries(rows):
         c = s.cell
         name = f"{c.scenario} {c.agents}, {c.delay_ms:g} ms, {100 * c.loss:g} %"
-        extras = [c.noise if c.noise != "exact" else "", f"wind {c.wind_m_s:g}" if c.wind_m_s else "", c.sets]
+        extras = [c.noise if c.noise != "exact" else "", f"wind {c.wind_m_s:g}" if c.wind_m_s else ""]
+        extras += [c.airframe if c.airframe != "own" else "", c.disturbance if c.disturbance != NONE else "", c.sets]
         table.add_row(
             ", ".join([name, *filter(None, extras), c.protections]),
             share_text(s.collided),
@@ -158,10 +163,14 @@ def _print_table(rows: list[Row]) -> None:
 
 def _parser() -> argparse.ArgumentParser:
     scenarios = "\n".join(f"  {name:15}{s.title}; agents {s.agents}" for name, s in SCENARIOS.items())
+    disturbances = "\n".join(
+        f"  {f'{name}:{d.strength:g}' if d.strength else name:15}{d.title}{f' ({d.unit})' if d.unit else ''}"
+        for name, d in DISTURBANCES.items()
+    )
     parser = argparse.ArgumentParser(
         prog="campaign",
         description=(__doc__ or "").rstrip(),
-        epilog=f"scenarios:\n{scenarios}\n\nLists are separated by commas.",
+        epilog=f"scenarios:\n{scenarios}\n\ndisturbances:\n{disturbances}\n\nLists are separated by commas.",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     add = parser.add_argument
@@ -172,6 +181,8 @@ def _parser() -> argparse.ArgumentParser:
     add("--noise", metavar="NAME,..", type=_names(NOISES), default=["exact"], help=", ".join(NOISES))
     add("--wind", metavar="M/S,..", type=_numbers(float, 0, 40), default=[0.0], help="mean, with turbulence of as much")
     add("--protections", metavar="NAME,..", type=_names(PROTECTIONS), default=["default"], help=", ".join(PROTECTIONS))
+    add("--airframe", metavar="NAME,..", type=_names(AIRFRAMES), default=["own"], help=", ".join(AIRFRAMES))
+    add("--disturbance", metavar="NAME[:STRENGTH],..", type=_disturbances, default=[NONE], help="as listed below")
     add("--set", metavar="KEY=VALUE", dest="sets", action="append", default=[], help="of the configuration, any number")
     add("--trials", metavar="N", type=int, default=20, help="seeds of every cell, default %(default)s")
     add("--first-seed", metavar="K", type=int, default=1)
@@ -181,6 +192,16 @@ def _parser() -> argparse.ArgumentParser:
     add("--mix", action="store_true", help="go on in a folder whose rows were flown by other sources")
     add("--quick", action="store_true", help="the subset that is tested with every change; leaves the axes above out")
     return parser
+
+
+def _disturbances(text: str) -> list[str]:
+    parsed = _names(DISTURBANCES)
+    for item in text.split(","):
+        name, colon, strength = item.partition(":")
+        parsed(name)
+        if colon:
+            _numbers(float, 0, math.inf)(strength)
+    return text.split(",")
 
 
 def _names(known: dict[str, Any]) -> Callable[[str], list[str]]:

@@ -12,6 +12,7 @@ from sitl.lockstep import Lockstep
 from swarmctl.bus.peers import agent_name
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Array
+from swarmctl.simulator_config import FaultParams
 
 _TOLD_EVERY_S = 0.1  # of a moving obstacle: messages carry no time, so it is repeated
 
@@ -91,6 +92,20 @@ class Split(_Episode):
         lockstep.hub.heal()
 
 
+class OneWayCut(_Episode):
+    """One agent no longer receives another one for a while, which still receives it."""
+
+    def __init__(self, sender: int, receiver: int, at_s: float, for_s: float) -> None:
+        super().__init__(at_s, for_s)
+        self._ends = agent_name(sender), agent_name(receiver)
+
+    def _begin(self, lockstep: Lockstep) -> None:
+        lockstep.hub.cut(*self._ends)
+
+    def _end(self, lockstep: Lockstep) -> None:
+        lockstep.hub.mend(*self._ends)
+
+
 class Freeze(_Episode):
     """An agent's process stops for a while: its token stays, but it neither receives nor sends anything."""
 
@@ -103,6 +118,17 @@ class Freeze(_Episode):
 
     def _end(self, lockstep: Lockstep) -> None:
         lockstep.frozen.discard(self._agent)
+
+
+class SimulatorFault(_Episode):
+    """A fault of the simulator, of the kinds in `swarmctl.simulator_config.FAULTS`; its `at_s` is not used."""
+
+    def __init__(self, fault: FaultParams, at_s: float) -> None:
+        super().__init__(at_s, math.inf)
+        self._fault = fault
+
+    def _begin(self, lockstep: Lockstep) -> None:
+        lockstep.world.faults.begin(self._fault, lockstep.world.since_boot_us)
 
 
 class Appearance:

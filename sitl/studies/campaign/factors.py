@@ -9,7 +9,7 @@ from dataclasses import dataclass
 class Noise:
     """An estimator of `sitl.plant.estimator`, and the margins for flying on it."""
 
-    accuracy_m: float  # rms per horizontal axis; radii grow to what it needs
+    accuracy_m: float  # rms per horizontal axis, as vehicles report it; radii grow to what it needs
     arrive_m: float  # added to the scenario's own, because positions are this uncertain
     settings: tuple[str, ...] = ()
 
@@ -29,9 +29,9 @@ PROTECTIONS: dict[str, tuple[str, ...]] = {
 UNCOOPERATIVE = (*PROTECTIONS["off"], "separation.mode=best_effort")  # makes no commitments either
 
 NOISES: dict[str, Noise] = {
-    "exact": Noise(0.0, 0.0),
+    "exact": Noise(0.01, 0.0),
     "external": Noise(0.04, 0.15, ("sitl.estimator=external", *_WANDERING)),
-    "gps": Noise(0.25, 0.85, ("sitl.estimator=gps", *_WANDERING)),
+    "gps": Noise(0.29, 0.85, ("sitl.estimator=gps", *_WANDERING)),
 }
 
 

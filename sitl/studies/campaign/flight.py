@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -12,14 +12,14 @@ import numpy as np
 
 from sitl.lockstep import Lockstep
 from sitl.studies.campaign.collision_monitor import CollisionMonitor
+from sitl.studies.campaign.disturbances import disturbed
 from sitl.studies.campaign.factors import NOISES, PROTECTIONS, UNCOOPERATIVE, wind_settings
 from sitl.studies.campaign.layouts import least_sum_m
-from sitl.studies.campaign.scenarios import SCENARIOS, Layout, layout_of, settings_of
+from sitl.studies.campaign.scenarios import AIRFRAMES, SCENARIOS, Layout, layout_of, settings_of
 from sitl.studies.campaign.source import code_id
 from sitl.studies.campaign.trials import Cell, Row, Trial
 from swarmctl.config import Config, load
 from swarmctl.control.reference.mission import GotoParams
-from swarmctl.core.clock import ClockError
 from swarmctl.core.types import Array, Phase, PlanStatus
 
 PHYSICS_HZ = 100  # thesis and crazyflie behave as at 250 Hz: a 3.3 m transition ends within 2 cm and 0.1 s of it
@@ -35,11 +35,22 @@ def fly(trial: Trial) -> Row:
     """Fly one trial and return its row, a pure function of the trial except `cpu_s`."""
     began_s = time.process_time()
     cell = trial.cell
-    layout = layout_of(cell.scenario, trial.seed, cell.agents)
+    layout = drawn(cell, trial.seed)
     flight = TrialFlight(trial, layout)
     flight.run()
     alone_s = _alone_s(trial, layout) if SCENARIOS[cell.scenario].alone else None
     return flight.row(alone_s) | {"cpu_s": time.process_time() - began_s, "code": code_id()}
+
+
+def drawn(cell: Cell, seed: int) -> Layout:
+    """Return the layout of a trial: the scenario's, with the cell's airframe and under its disturbance.
+
+    Raises:
+        ValueError: the cell can't be drawn.
+    """
+    layout = layout_of(cell.scenario, seed, cell.agents)
+    size = AIRFRAMES[cell.airframe]
+    return disturbed(layout if size is None else replace(layout, size=size), cell.disturbance, seed)
 
 
 def config_of(cell: Cell, seed: int, layout: Layout, agents: int, *, extra: Sequence[str] = ()) -> Config:
@@ -52,36 +63,36 @@ def config_of(cell: Cell, seed: int, layout: Layout, agents: int, *, extra: Sequ
     config = load(
         None,
         [
+            "sitl.start=air",
+            f"sitl.physics_hz={PHYSICS_HZ}",
             *settings_of(layout, agents),
             f"name={cell.scenario}",
             f"seed={seed}",
             f"bus.delay_ms={cell.delay_ms}",
             f"bus.loss_01={cell.loss}",
-            "sitl.start=air",
-            f"sitl.physics_hz={PHYSICS_HZ}",
             *noise.settings,
             *wind_settings(cell.wind_m_s),
             *PROTECTIONS[cell.protections],
             *cell.sets.split(),
             *extra,
+            "separation.allow_small_radius=true",  # until it is widened here
         ],
     )
-    needed_m = config.separation.budget.required_m(noise.accuracy_m)
-    if config.separation.radius_m >= needed_m:
-        return config
-    wider = config.separation.model_copy(update={"radius_m": math.ceil(needed_m * 100.0) / 100.0})
-    return config.model_copy(update={"separation": wider})
+    needed_m = config.separation.budget.required_m(noise.accuracy_m, config.drift_m)
+    radius_m = max(config.separation.radius_m, math.ceil(needed_m * 100.0) / 100.0)
+    separation = config.separation.model_copy(update={"radius_m": radius_m, "allow_small_radius": False})
+    return config.model_copy(update={"separation": separation})
 
 
 class TrialFlight:
-    """A lockstep flight with a collision monitor; `clocks` are the errors of agents' clocks."""
+    """A lockstep flight with a collision monitor."""
 
-    def __init__(self, trial: Trial, layout: Layout, clocks: Mapping[int, ClockError] | None = None) -> None:
+    def __init__(self, trial: Trial, layout: Layout) -> None:
         cell, agents = trial.cell, len(layout.starts_ned_m)
         self._trial, self._layout = trial, layout
         config = config_of(cell, trial.seed, layout, agents)
         blind = {i: config_of(cell, trial.seed, layout, agents, extra=UNCOOPERATIVE) for i in layout.uncooperative}
-        self.lockstep = Lockstep(config, own=blind, clocks=clocks)
+        self.lockstep = Lockstep(config, own=blind, clocks=layout.clocks)
         self._agents = list(self.lockstep.agents)  # including those that will have died
         expected = np.array([i not in layout.lost for i in range(agents)])
         arrive_m = math.inf if layout.settles else layout.arrive_m + NOISES[cell.noise].arrive_m
@@ -137,6 +148,8 @@ class TrialFlight:
             "flight_time_s": self._arrived_s() - self._begin_s if arrived else None,
             "noise": cell.noise,
             "wind_m_s": cell.wind_m_s,
+            "airframe": cell.airframe,
+            "disturbance": cell.disturbance,
             "sets": cell.sets,
             "deadlocked": stuck and not collided,
             "outcome": outcome,
@@ -197,7 +210,9 @@ class TrialFlight:
         """Return the agents that have left the mission unintentionally."""
         found = []
         for i, (agent, log) in enumerate(zip(self.lockstep.agents, self.lockstep.logs, strict=True)):
-            if agent is not None and int(log.rows[-1]["phase"][0]) != Phase.TRACK and not self._out_of_time:
+            if agent is None or i in self._layout.lost or self._out_of_time:
+                continue
+            if int(log.rows[-1]["phase"][0]) != Phase.TRACK:
                 found.append(f"agent {i}: {agent.outcome}")
         return tuple(found)
 

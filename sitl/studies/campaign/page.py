@@ -80,8 +80,8 @@ def again(row: Row) -> str:
     sets = "".join(f" --set {item}" for item in row["sets"].split())
     return (
         f"python tools/campaign.py --scenario {row['scenario']} --agents {row['agents']} --delay {row['delay_ms']:g} "
-        f"--loss {row['loss']:g} --noise {row['noise']} --wind {row['wind_m_s']:g} --protections {row['protections']}"
-        f"{sets} --first-seed {row['seed']} --trials 1"
+        f"--loss {row['loss']:g} --noise {row['noise']} --wind {row['wind_m_s']:g} --protections {row['protections']} "
+        f"--airframe {row['airframe']} --disturbance {row['disturbance']}{sets} --first-seed {row['seed']} --trials 1"
     )
 
 
@@ -93,6 +93,8 @@ _COLUMNS: tuple[_Column, ...] = (
     ("noise", lambda s: "" if s.cell.noise == "exact" else s.cell.noise),
     ("wind", lambda s: f"{s.cell.wind_m_s:g} m/s" if s.cell.wind_m_s else ""),
     ("protections", lambda s: s.cell.protections),
+    ("airframe", lambda s: "" if s.cell.airframe == "own" else s.cell.airframe),
+    ("disturbance", lambda s: "" if s.cell.disturbance == "none" else s.cell.disturbance),
     ("settings", lambda s: s.cell.sets),
     ("collided", lambda s: _share(s.collided, False)),
     ("arrived", lambda s: _share(s.arrived, True)),

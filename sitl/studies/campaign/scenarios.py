@@ -9,13 +9,14 @@ from __future__ import annotations
 
 import math
 import zlib
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from sitl.studies.campaign.events import Appearance, Death, Partition, ScenarioEvent
 from sitl.studies.campaign.layouts import far_goals, forest, ring, scattered, walls
+from swarmctl.core.clock import ClockError
 from swarmctl.core.types import Array
 
 
@@ -38,6 +39,23 @@ SMALL = Size(
         "vehicle_model={delay_s=0.04,attitude_rad_s=20.0,drag_1_s=0.25,hover_thrust_01=0.43}",
     ),
 )
+X500 = Size(
+    0.9,
+    0.65,
+    (
+        "sitl.preset=x500",
+        "sitl.physics_hz=250",
+        "separation.tracking_m=0.05",
+        "limits.min_separation_m=0.65",
+        "agent.state_filter={enabled=true,disturbance_m_s2=1.5}",
+        "agent.commit.tilt_fraction_01=0.9",
+        "controller.mpc={dt_s=0.05,horizon_xy=40,control_xy=15,thrust_max_m_s2=15.0,u_max=0.85,"
+        "z={q_pos=20.0,q_vel=0.05,r=1.0}}",
+        "vehicle_model={delay_s=0.08,attitude_rad_s=9.5,attitude_damping=1.0,drag_1_s=1.0,tilt_max_rad=1.05,"
+        "thrust_max_01=0.95,hover_thrust_01=0.49}",
+    ),
+)
+AIRFRAMES: dict[str, Size | None] = {"own": None, "x500": X500}  # instead of the scenario's own
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -54,6 +72,12 @@ class Layout:
     events: tuple[ScenarioEvent, ...] = ()
     uncooperative: frozenset[int] = frozenset()  # agents that avoid nothing
     lost: frozenset[int] = frozenset()  # agents that are not expected to arrive
+    clocks: Mapping[int, ClockError] = field(default_factory=dict)  # errors of agents' clocks
+
+    @property
+    def agents(self) -> int:
+        """Return the number of agents."""
+        return len(self.starts_ned_m)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

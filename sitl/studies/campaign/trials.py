@@ -21,6 +21,8 @@ class Cell:
     noise: str  # of sitl.studies.campaign.factors.NOISES
     wind_m_s: float  # steady, from the west, with Dryden turbulence of as much
     protections: str  # of sitl.studies.campaign.factors.PROTECTIONS
+    airframe: str = "own"  # of sitl.studies.campaign.scenarios.AIRFRAMES
+    disturbance: str = "none"  # of sitl.studies.campaign.disturbances.DISTURBANCES, perhaps with :strength
     sets: str = ""  # further key=value settings, separated by spaces
 
 
@@ -32,7 +34,18 @@ class Trial:
     seed: int
 
 
-CELL_FIELDS = ("scenario", "agents", "delay_ms", "loss", "noise", "wind_m_s", "protections", "sets")
+CELL_FIELDS = (
+    "scenario",
+    "agents",
+    "delay_ms",
+    "loss",
+    "noise",
+    "wind_m_s",
+    "protections",
+    "airframe",
+    "disturbance",
+    "sets",
+)
 
 # One row per run. Lengths and times are null where there is nothing to measure.
 SCHEMA = pa.schema(
@@ -49,6 +62,8 @@ SCHEMA = pa.schema(
         pa.field("flight_time_s", pa.float64()),  # from the begin of the mission to the last arrival
         pa.field("noise", pa.string()),
         pa.field("wind_m_s", pa.float64()),
+        pa.field("airframe", pa.string()),
+        pa.field("disturbance", pa.string()),
         pa.field("sets", pa.string()),
         pa.field("deadlocked", pa.bool_()),  # time ran out, and a vehicle that has not arrived stands still
         pa.field("outcome", pa.string()),  # arrived, collided, deadlocked, late, or what went wrong
@@ -78,11 +93,14 @@ def cells(
     noises: Sequence[str],
     winds_m_s: Sequence[float],
     protections: Sequence[str],
+    airframes: Sequence[str] = ("own",),
+    disturbances: Sequence[str] = ("none",),
     sets: str = "",
 ) -> Iterator[Cell]:
     """Every combination, in order."""
-    axes = (scenarios, agents, delays_ms, losses, noises, winds_m_s, protections)
-    for scenario, count, delay_ms, loss, noise, wind_m_s, protection in itertools.product(*axes):
+    axes = (scenarios, agents, delays_ms, losses, noises, winds_m_s, protections, airframes, disturbances)
+    for scenario, count, delay_ms, loss, noise, wind_m_s, *others in itertools.product(*axes):
+        protection, airframe, disturbance = others
         yield Cell(
             scenario=scenario,
             agents=count,
@@ -91,6 +109,8 @@ def cells(
             noise=noise,
             wind_m_s=wind_m_s,
             protections=protection,
+            airframe=airframe,
+            disturbance=disturbance,
             sets=sets,
         )
 

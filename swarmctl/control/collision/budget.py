@@ -48,13 +48,14 @@ class SeparationBudget:
 
     # -- before flight ------------------------------------------------------------------------------------------------
 
-    def required_m(self, accuracy_m: float) -> float:
+    def required_m(self, accuracy_m: float, drift_m: float = 0.0) -> float:
         """Return the least `radius_m` at which true bodies stay apart; a smaller one is refused before flight.
 
-        It adds body, tracking error, and twice the rms difference of two independent horizontal errors of rms
-        `accuracy_m` each. At 0.9 m and default GPS, 6 of 16 flights of real autopilots came closer than 0.6 m in truth.
+        It adds body, tracking error, twice the rms difference of two independent horizontal errors of rms
+        `accuracy_m` each, and the drift of both vehicles when gusts blow them towards each other. At 0.9 m and default
+        GPS, 6 of 16 flights of real autopilots came closer than 0.6 m in truth.
         """
-        return self.body_m + self.tracking_m + 2.0 * math.sqrt(2.0) * accuracy_m
+        return self.body_m + self.tracking_m + 2.0 * math.sqrt(2.0) * accuracy_m + 2.0 * drift_m
 
     # -- hard minimum distances of plans ------------------------------------------------------------------------------
 
@@ -78,9 +79,9 @@ class SeparationBudget:
         return self.radius_m - slack_m
 
     @property
-    def tracking_allowance_m(self) -> float:
-        """Return how far a vehicle may be off its committed trajectory before it counts as deviating."""
-        return self.tracking_m + 0.5 * (self.committed_m - self.body_m)
+    def tube_m(self) -> float:
+        """Return how far two vehicles may both be off their committed trajectories without touching."""
+        return 0.5 * (self.committed_m - self.body_m)
 
     # -- plans --------------------------------------------------------------------------------------------------------
 

@@ -34,6 +34,7 @@ class SeparationParams(Params):
     radius_m: float = Field(0.9, gt=0, le=100)  # centre to centre, thesis 3 x 0.3
     body_m: float = Field(0.48, gt=0, le=100)  # centres of two vehicles that touch; thesis: twice its arm of 0.24 m
     tracking_m: float = Field(0.0, ge=0, le=10)  # tracking error: plans keep this much more
+    gust_m_s: float = Field(0.0, ge=0, le=40)  # sudden change of wind that distances leave room for
     downwash: float = Field(1.0, ge=1, le=10)  # divides height differences among peers: 2 for x500-size rotors
     allow_small_radius: bool = False  # fly although radius_m is below what body, tracking and estimator need
     certify_slack_m: float = Field(0.1, ge=0, le=10)  # a plan closer than radius minus this is never flown
@@ -94,15 +95,22 @@ class KeepOut:
         return math.dist(self.pos_ned_m[0, :axes], pos_ned_m[:axes])
 
 
-def radius_problem(params: SeparationParams, accuracy_m: float) -> str:
-    """Say why the radius is too small for this accuracy, and what to do; "" when it is large enough or allowed."""
-    needed_m = params.budget.required_m(accuracy_m)
+def radius_problem(params: SeparationParams, accuracy_m: float, drift_m: float) -> str:
+    """Say why the radius is too small, and what to do; "" when it is large enough or allowed.
+
+    Args:
+        params: distances.
+        accuracy_m: rms error of the estimator per horizontal axis.
+        drift_m: how far a gust of `gust_m_s` blows a vehicle.
+    """
+    needed_m = params.budget.required_m(accuracy_m, drift_m)
     if params.allow_small_radius or params.radius_m >= needed_m:
         return ""
+    gust = f" and gusts of {params.gust_m_s:g} m/s, each {drift_m:.2f} m," if drift_m else ""
     return (
         f"separation.radius_m = {params.radius_m:g}: body {params.body_m:g} m, tracking {params.tracking_m:g} m and an "
-        f"estimator that is {accuracy_m:.2f} m off (rms) need {needed_m:.2f} m. Raise it, give the autopilot a better "
-        "position, or set separation.allow_small_radius = true"
+        f"estimator that is {accuracy_m:.2f} m off (rms){gust} need {needed_m:.2f} m. Raise it, give the autopilot a "
+        "better position, or set separation.allow_small_radius = true"
     )
 
 

@@ -29,10 +29,12 @@ The proof rests on these assumptions, each of which is watched in flight:
 
 - Clocks agree: an offset of e seconds costs v e metres, which `separation.tracking_m` has to cover. Offsets of peers'
   clocks are measured on these messages and corrected (`swarmctl.bus.peer_clocks`), to half a round trip.
-- Vehicles track what they are committed to: each may miss by half of the committed distance beyond touching bodies.
-  The event `tracking_violation` reports larger errors, and `commitments` at the end the worst one of the flight.
-- Commitments are kept. A commitment changes without acknowledgement only where a vehicle first commits at speed, and
-  by `evade`, before something that does not take part: around it, to a stop, or above it. An agent that finds a peer's
+- Vehicles stay in their tubes: each may miss what it is committed to by half of the committed distance beyond touching
+  bodies. `swarmctl.control.commit.tube` watches it; the event `tracking_violation` reports who leaves its tube, and
+  `commitments` at the end the worst error of the flight.
+- Commitments are kept. A commitment changes without acknowledgement only where a vehicle first commits at speed, where
+  it has left its tube, and by `evade`, before something that does not take part: around it, to a stop, or above it. An
+  agent that finds a peer's
   commitment in conflict with its own (`conflicting_peers`), or a peer off its committed trajectory, keeps clear of that
   peer as of one that does not take part.
 - Every agent takes part. A vehicle that does not (a pilot flies it, its agent has died) is a keep-out of the
@@ -50,6 +52,7 @@ import numpy as np
 
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.commit.trajectory_planner import CommitParams, Situation, TrajectoryPlanner
+from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.core.trajectory import Trajectory, resting
 from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
@@ -78,7 +81,7 @@ class Commitments:
     """Applies rules 2 to 4 for one agent; `swarmctl.agent.coordination` receives and publishes the messages.
 
     Args:
-        agent, params, mpc, separation, max_keep_outs, stopwatch_ns: see `TrajectoryPlanner`.
+        agent, params, mpc, vehicle, separation, max_keep_outs, stopwatch_ns: see `TrajectoryPlanner`.
     """
 
     def __init__(
@@ -86,6 +89,7 @@ class Commitments:
         agent: int,
         params: CommitParams,
         mpc: MpcParams,
+        vehicle: VehicleModelParams,
         separation: SeparationParams,
         *,
         max_keep_outs: int,
@@ -93,7 +97,7 @@ class Commitments:
     ) -> None:
         self._agent, self._params = agent, params
         self._planner = TrajectoryPlanner(
-            agent, params, mpc, separation, max_keep_outs=max_keep_outs, stopwatch_ns=stopwatch_ns
+            agent, params, mpc, vehicle, separation, max_keep_outs=max_keep_outs, stopwatch_ns=stopwatch_ns
         )
         self._latencies_s: deque[float] = deque(maxlen=_LATENCIES)
         self._lead_s = params.lead_min_s
@@ -109,6 +113,11 @@ class Commitments:
         """Commit to braking to rest from a position (3,) [m] and velocity (3,) [m/s], where the agent takes control."""
         self.committed = self._planner.stopping_from(pos_ned_m, vel_ned_m_s, utc_us)
         self.proposal = None
+
+    def restart(self, pos_ned_m: Array, vel_ned_m_s: Array, utc_us: int) -> None:
+        """Commit anew to braking to rest, without acknowledgement, where the vehicle has left its tube."""
+        self.begin(pos_ned_m, vel_ned_m_s, utc_us)
+        self.counts.evasive += 1
 
     def end(self, pos_ned_m: Array | None, utc_us: int) -> None:
         """Drop the proposal while a pilot or the autopilot flies, and commit to rest at the position (3,), if known."""

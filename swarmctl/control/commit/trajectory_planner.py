@@ -68,6 +68,7 @@ class Situation:
         desired: motion to approximate.
         peers: newest message of each peer that takes part, by agent number.
         others: keep-outs of obstacles and of peers that do not take part, on the planner's grid from `begin_us` on.
+        disturbance_ned_m_s2: (3,) estimated acceleration by wind, which leaves plans less authority.
     """
 
     utc_us: int
@@ -75,6 +76,7 @@ class Situation:
     desired: DesiredReference
     peers: Mapping[int, TrajectoryMessage]
     others: Sequence[KeepOut]
+    disturbance_ned_m_s2: Array
 
     @property
     def followed(self) -> list[Trajectory]:
@@ -89,6 +91,7 @@ class TrajectoryPlanner:
         agent: own number.
         params: parameters of planning.
         mpc: the controller's bounds and weights.
+        vehicle: its lag, drag and bounds; its dead time is the follower's matter.
         separation: distances to keep.
         max_keep_outs: number of neighbours and obstacles that get rows in the MPC.
         stopwatch_ns: see `CondensedMpc`.
@@ -99,18 +102,19 @@ class TrajectoryPlanner:
         agent: int,
         params: CommitParams,
         mpc: MpcParams,
+        vehicle: VehicleModelParams,
         separation: SeparationParams,
         *,
         max_keep_outs: int,
         stopwatch_ns: Callable[[], int],
     ) -> None:
-        self._params, self._separation = params, separation
+        self._params, self._separation, self._drag_1_s = params, separation, vehicle.drag_1_s
         right_of_way = separation.model_copy(
             update={"right_of_way_rad": params.right_of_way_rad, "stuck_m": params.stuck_m}
         )
         self._mpc = SwarmMpc(
             _planning(mpc, params),
-            VehicleModelParams(delay_s=0.0),
+            vehicle.model_copy(update={"attitude_rad_s": 0.0}),
             right_of_way,
             agent,
             max_keep_outs=max_keep_outs,
@@ -189,14 +193,13 @@ class TrajectoryPlanner:
         steps = self._mpc.steps
         ahead_us = np.arange(steps + 1, dtype=np.float64) * self.dt_us
         pos, vel = committed.sample(now.begin_us + ahead_us)
-        thrust = np.array([0.0, 0.0, GRAVITY_M_S2]) - committed.acceleration(now.begin_us)
-        size = float(np.sqrt(thrust @ thrust))
+        virtual_control = self._virtual_control(committed, now)
         start = Start(
             t_us=now.begin_us,
             pos_ned_m=pos[0],
             vel_ned_m_s=vel[0],
-            cos_tilt=1.0,
-            virtual_control=np.array([thrust[0] / size, thrust[1] / size, size]),
+            cos_tilt=math.sqrt(1.0 - float(virtual_control[:2] @ virtual_control[:2])),
+            virtual_control=virtual_control,
         )
         wanted = Reference(*now.desired.reference(1e-6 * (ahead_us + (now.begin_us - now.utc_us))), 0.0)
         guess = wanted.pos_ned_m + (pos[0] - wanted.pos_ned_m[0]) if now.desired.follows_path else pos
@@ -204,9 +207,23 @@ class TrajectoryPlanner:
         keep_outs = self._keep_outs(now.followed, agents, now.begin_us, steps)
         kept = (*keep_outs, *(_first_steps(other, steps) for other in now.others))
         plan = self._mpc.plan(
-            Problem(start=start, reference=wanted, disturbance_ned_m_s2=np.zeros(3), keep_outs=kept, guess_ned_m=guess)
+            Problem(
+                start=start,
+                reference=wanted,
+                disturbance_ned_m_s2=now.disturbance_ned_m_s2,
+                keep_outs=kept,
+                guess_ned_m=guess,
+            )
         )
         return None if plan.status is PlanStatus.SOLVER_FAILED else plan
+
+    def _virtual_control(self, committed: Trajectory, now: Situation) -> Array:
+        """Return the virtual controls (3,) that fly the committed trajectory when the plan begins."""
+        vel = committed.sample(np.array([now.begin_us]))[1][0]
+        pushed = now.disturbance_ned_m_s2 - self._drag_1_s * vel
+        thrust = np.array([0.0, 0.0, GRAVITY_M_S2]) + pushed - committed.acceleration(now.begin_us)
+        size = float(np.sqrt(thrust @ thrust))
+        return np.array([thrust[0] / size, thrust[1] / size, size])
 
     def _clear(self, committed: Trajectory, plan: Plan | None, now: Situation) -> Trajectory | None:
         """Return the longest part of a plan that is clear of everything known when followed by braking, or None."""
@@ -314,7 +331,7 @@ def _planning(mpc: MpcParams, params: CommitParams) -> MpcParams:
             "horizon_xy": params.horizon,
             "u_max": params.tilt_fraction_01 * mpc.u_max,
             "thrust_min_m_s2": max(mpc.thrust_min_m_s2, 0.7 * GRAVITY_M_S2),
-            "thrust_max_m_s2": min(mpc.thrust_max_m_s2, 1.3 * GRAVITY_M_S2),
+            "thrust_max_m_s2": min(mpc.thrust_max_m_s2, 1.4 * GRAVITY_M_S2),
             "terminal_z": "none",
             "terminal_xy": "none",
         }

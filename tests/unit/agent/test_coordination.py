@@ -17,6 +17,7 @@ from swarmctl.bus.path_messages import encode_path
 from swarmctl.bus.peers import LocalBus, LocalHub, agent_name
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference
+from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.core.clock import SimClock
 from swarmctl.core.trajectory import resting
@@ -47,6 +48,7 @@ class Bench:
             peers=[1],
             params=CommitParams(),
             mpc=MpcParams(),
+            vehicle=VehicleModelParams(),
             separation=separation,
             max_keep_outs=2,
             world_model=self.world_model,
@@ -73,7 +75,9 @@ class Bench:
             utc_us = self.clock.utc_us()
             self.world_model.receive(utc_us)
             self.coordination.receive(utc_us)
-            self.coordination.step(utc_us, self.state, Phase.TRACK, DesiredReference(self.wanted))
+            self.coordination.step(
+                utc_us, self.state, Phase.TRACK, DesiredReference(self.wanted), disturbance_ned_m_s2=np.zeros(3)
+            )
             self.coordination.publish(utc_us)
 
     def wanted(self, offsets_s: Array) -> tuple[Array, Array]:

@@ -36,6 +36,7 @@ def inputs(bench: Bench) -> SeparationInputs:
         desired=DesiredReference(bench.wanted),
         horizon_utc_us=utc_us + np.arange(6) * 100_000,
         keep_outs=[KEEP_OUT],
+        disturbance_ned_m_s2=np.zeros(3),
     )
 
 

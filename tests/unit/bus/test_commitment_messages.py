@@ -42,6 +42,7 @@ def message(seq: int = 1, agent: int = 2, boot_id: int = 9, propose: bool = True
         seq=seq,
         sent_utc_us=sent_utc_us,
         committed=trajectory(),
+        tube_m=0.25,
         proposal=proposal,
         acknowledged={0: 5, 1: UTC_US},
         exclusions=Exclusions(suspected=frozenset({1, 4}), promised=frozenset({4})),
@@ -63,6 +64,7 @@ def test_a_decoded_message_is_what_was_encoded(propose: bool) -> None:
     )
     assert (decoded.exclusions, decoded.heard) == (sent.exclusions, sent.heard)
     assert decoded.sent_utc_us == UTC_US + 20_000
+    assert decoded.tube_m == pytest.approx(0.25)
     np.testing.assert_allclose(decoded.committed.pos_ned_m, sent.committed.pos_ned_m, atol=1e-6)
     assert decoded.committed.t0_utc_us == UTC_US
     assert (decoded.proposal is not None) is propose
@@ -89,7 +91,7 @@ def flat(points: int) -> Trajectory:
     return Trajectory(t0_utc_us=UTC_US, dt_us=100_000, pos_ned_m=zeros, vel_ned_m_s=zeros)
 
 
-FLAGS, STEP, POINTS = 3, 40, 48  # offsets of the header's flags, and of the step and the points of what is committed
+FLAGS, TUBE, STEP, POINTS = 3, 24, 44, 52  # offsets: of the header's flags and tube, of the committed step and points
 
 
 @pytest.mark.parametrize(
@@ -97,6 +99,9 @@ FLAGS, STEP, POINTS = 3, 40, 48  # offsets of the header's flags, and of the ste
     [
         (FLAGS, "<B", 3, True),
         (FLAGS, "<B", 7, False),
+        (TUBE, "<f", 0.0, True),
+        (TUBE, "<f", 100.0, True),
+        *((TUBE, "<f", bad, False) for bad in (-0.1, 101.0, math.nan, math.inf)),
         (STEP, "<i", 1, True),
         (STEP, "<i", MAX_STEP_US, True),
         (STEP, "<i", 0, False),

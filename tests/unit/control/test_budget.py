@@ -52,7 +52,7 @@ def test_commitments_leave_room_for_tracking_however_large_the_slack_is() -> Non
     """Two thirds of the distance beyond touching bodies remain, a half of them for each of two vehicles."""
     budget = SeparationParams(radius_m=0.9, body_m=0.6, certify_slack_m=5.0).budget
     assert budget.committed_m == pytest.approx(0.8)
-    assert budget.tracking_allowance_m == pytest.approx(0.1)
+    assert budget.tube_m == pytest.approx(0.1)
     assert SeparationParams(radius_m=0.5, body_m=0.6).budget.committed_m == 0.5, "there is none to use up"
 
 

@@ -13,7 +13,8 @@ import pytest
 from swarmctl.control.collision.separation import KeepOut, SeparationParams
 from swarmctl.control.commit import trajectory_planner
 from swarmctl.control.commit.protocol import Commitments
-from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference, Situation
+from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference
+from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.control.reference.mission import quintic_to
 from swarmctl.core.closest_pair import closest_pair_m
@@ -26,6 +27,18 @@ UTC_US = 1_700_000_000_000_000
 TICK_US = 40_000
 SEPARATION = SeparationParams(radius_m=0.9)
 HARD_MIN_M = SEPARATION.radius_m - SEPARATION.certify_slack_m
+
+
+def committing(agent: int, *, max_keep_outs: int, separation: SeparationParams = SEPARATION) -> Commitments:
+    return Commitments(
+        agent,
+        CommitParams(),
+        MpcParams(u_max=0.25),
+        VehicleModelParams(),
+        separation,
+        max_keep_outs=max_keep_outs,
+        stopwatch_ns=lambda: 0,
+    )
 
 
 @dataclass(kw_only=True)
@@ -57,12 +70,7 @@ class Crowd:
     def __init__(self, count: int, network: Network) -> None:
         angle = 2.0 * np.pi * np.arange(count) / count
         self.starts = np.stack([3.0 * np.cos(angle), 3.0 * np.sin(angle), np.full(count, -2.0)], axis=1)
-        self.agents = [
-            Commitments(
-                i, CommitParams(), MpcParams(u_max=0.25), SEPARATION, max_keep_outs=count, stopwatch_ns=lambda: 0
-            )
-            for i in range(count)
-        ]
+        self.agents = [committing(i, max_keep_outs=count) for i in range(count)]
         self.known: list[dict[int, TrajectoryMessage]] = [{} for _ in range(count)]
         self.network, self.now_us, self.seq = network, UTC_US, 0
         for agent, start in zip(self.agents, self.starts, strict=True):
@@ -85,7 +93,9 @@ class Crowd:
                 begin_us = self.now_us + agent.lead_us
                 desired = DesiredReference(partial(self.wanted, i))
                 agent.propose(
-                    Situation(utc_us=self.now_us, begin_us=begin_us, desired=desired, peers=self.known[i], others=())
+                    builders.situation(
+                        utc_us=self.now_us, begin_us=begin_us, desired=desired, peers=self.known[i], others=()
+                    )
                 )
         for i, agent in enumerate(self.agents):
             assert agent.committed is not None
@@ -182,9 +192,7 @@ def meeting() -> tuple[Commitments, Commitments]:
     """Return two agents that fly one behind the other at 1.5 m/s, 1 m apart, each on its committed trajectory."""
     pair = []
     for i, x_m in enumerate((0.0, -1.0)):
-        agent = Commitments(
-            i, CommitParams(), MpcParams(u_max=0.25), SEPARATION, max_keep_outs=2, stopwatch_ns=lambda: 0
-        )
+        agent = committing(i, max_keep_outs=2)
         points = np.array([[x_m + 0.15 * k, 0.0, -2.0] for k in range(21)])
         agent.committed = ending_at_rest(UTC_US, 100_000, points, np.tile([1.5, 0.0, 0.0], (21, 1)), brake_m_s2=1.5)
         pair.append(agent)
@@ -208,9 +216,7 @@ def test_an_evasion_is_found_by_the_peer_it_conflicts_with() -> None:
     first, second = meeting()
     assert second.conflicting_peers(UTC_US, message_of(first, 0)) == set()
     first.evade(
-        Situation(
-            utc_us=UTC_US, begin_us=UTC_US, desired=DesiredReference(at_goal), peers={}, others=[wall(1.6, first)]
-        )
+        builders.situation(utc_us=UTC_US, begin_us=UTC_US, desired=DesiredReference(at_goal), others=[wall(1.6, first)])
     )
     assert first.counts.evasive == 1, "before a wall there is no time for acknowledgements"
     assert second.conflicting_peers(UTC_US, message_of(first, 0)) == {0}
@@ -220,21 +226,19 @@ def test_an_evasion_is_found_by_the_peer_it_conflicts_with() -> None:
 def test_a_wall_that_leaves_time_for_acknowledgements_triggers_no_evasion() -> None:
     first, _ = meeting()
     first.evade(
-        Situation(
-            utc_us=UTC_US, begin_us=UTC_US, desired=DesiredReference(at_goal), peers={}, others=[wall(2.6, first)]
-        )
+        builders.situation(utc_us=UTC_US, begin_us=UTC_US, desired=DesiredReference(at_goal), others=[wall(2.6, first)])
     )
     assert first.counts.evasive == 0
 
 
 def test_an_agent_at_rest_evades_what_approaches() -> None:
     """A stop would change nothing: it rests already."""
-    agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), SEPARATION, max_keep_outs=2, stopwatch_ns=lambda: 0)
+    agent = committing(0, max_keep_outs=2)
     agent.begin(np.array([0.0, 0.0, -2.0]), np.zeros(3), UTC_US)
     times_s = 0.1 * np.arange(agent.steps + 1)
     coming = np.stack([2.5 - 1.0 * times_s, 0.3 + 0.0 * times_s, -2.0 + 0.0 * times_s], axis=1)
     agent.evade(
-        Situation(
+        builders.situation(
             utc_us=UTC_US,
             begin_us=UTC_US,
             desired=DesiredReference(at_goal),
@@ -251,7 +255,7 @@ def test_an_agent_at_rest_evades_what_approaches() -> None:
 @pytest.mark.parametrize(("column", "passes_m"), [(False, 0.9), (True, 0.1)], ids=["ball", "control: column"])
 def test_an_agent_that_is_enclosed_evades_upwards(column: bool, passes_m: float) -> None:
     """Peers rest on the three other sides, so the only evasive trajectory is a climb."""
-    agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), SEPARATION, max_keep_outs=5, stopwatch_ns=lambda: 0)
+    agent = committing(0, max_keep_outs=5)
     agent.begin(np.array([0.0, 0.0, -2.0]), np.zeros(3), UTC_US)
     sides = [[0.0, 0.9, -2.0], [0.0, -0.9, -2.0], [-0.9, 0.0, -2.0]]
     peers = {
@@ -261,7 +265,7 @@ def test_an_agent_that_is_enclosed_evades_upwards(column: bool, passes_m: float)
     times_s = 0.1 * np.arange(agent.steps + 1)
     coming = np.stack([3.5 - 1.0 * times_s, 0.0 * times_s, -2.0 + 0.0 * times_s], axis=1)
     agent.evade(
-        Situation(
+        builders.situation(
             utc_us=UTC_US,
             begin_us=UTC_US,
             desired=DesiredReference(at_goal),
@@ -297,7 +301,7 @@ def along(corners: Array) -> Sampled:
 def test_plans_along_a_path_are_linearised_around_it(follows_path: bool, passes: bool) -> None:
     """The last plan leads north before a wall, the path south through a gap: rows of one exclude the other."""
     small = SeparationParams(radius_m=0.3, body_m=0.15)
-    agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), small, max_keep_outs=5, stopwatch_ns=lambda: 0)
+    agent = committing(0, max_keep_outs=5, separation=small)
     to_north = quintic_to(np.array([0.0, 0.0, -2.0]), np.zeros(3), np.array([0.1, 0.9, -2.0]), 1.0, accel_m_s2=1.0)
     agent.committed = ending_at_rest(UTC_US, 100_000, *to_north.sample(np.arange(0.0, 2.1, 0.1)), brake_m_s2=1.5)
     posts = [np.array([0.8, y_m, -2.0]) for y_m in (0.3, 0.6, 0.9, 1.2)]
@@ -313,7 +317,7 @@ def test_plans_along_a_path_are_linearised_around_it(follows_path: bool, passes:
     ]
     path = along(np.array([[0.0, 0.0], [0.8, -0.4], [3.0, -0.4]]))
     agent.propose(
-        Situation(
+        builders.situation(
             utc_us=UTC_US,
             begin_us=UTC_US + agent.lead_us,
             desired=DesiredReference(path, follows_path),
@@ -331,7 +335,7 @@ def test_a_path_from_rest_begins_at_the_own_speed(runs_up: bool, monkeypatch: py
     if not runs_up:
         monkeypatch.setattr(trajectory_planner, "_with_run_up", lambda desired, speed_m_s: desired)
     small = SeparationParams(radius_m=0.3, body_m=0.15)
-    agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), small, max_keep_outs=3, stopwatch_ns=lambda: 0)
+    agent = committing(0, max_keep_outs=3, separation=small)
     here = np.array([2.716, 2.764, -2.0])
     agent.begin(here, np.zeros(3), UTC_US)
     posts = [np.array([3.0, y_m, -2.0]) for y_m in (2.802, 2.502, 2.202)]
@@ -347,7 +351,7 @@ def test_a_path_from_rest_begins_at_the_own_speed(runs_up: bool, monkeypatch: py
     ]
     path = along(np.array([here[:2], [2.77, 3.14], [3.21, 3.25], [4.19, 3.06]]))
     agent.propose(
-        Situation(
+        builders.situation(
             utc_us=UTC_US,
             begin_us=UTC_US + agent.lead_us,
             desired=DesiredReference(path, follows_path=True),
@@ -361,10 +365,10 @@ def test_a_path_from_rest_begins_at_the_own_speed(runs_up: bool, monkeypatch: py
 
 
 def proposing() -> tuple[Commitments, Proposal]:
-    agent = Commitments(0, CommitParams(), MpcParams(u_max=0.25), SEPARATION, max_keep_outs=2, stopwatch_ns=lambda: 0)
+    agent = committing(0, max_keep_outs=2)
     agent.begin(np.array([0.0, 0.0, -2.0]), np.zeros(3), UTC_US)
     agent.propose(
-        Situation(
+        builders.situation(
             utc_us=UTC_US, begin_us=UTC_US + agent.lead_us, desired=DesiredReference(at_goal), peers={}, others=()
         )
     )

@@ -579,10 +579,17 @@ def test_the_required_radius_covers_bodies_tracking_and_two_position_errors() ->
 def test_a_radius_that_is_too_small_is_refused_unless_allowed(
     told: dict[str, Any], accuracy_m: float, refused: bool
 ) -> None:
-    problem = radius_problem(SeparationParams(**told), accuracy_m)
+    problem = radius_problem(SeparationParams(**told), accuracy_m, 0.0)
     assert bool(problem) is refused
     if refused:
         assert all(part in problem for part in ("separation.radius_m = 0.9", "1.27 m", "allow_small_radius"))
+
+
+def test_gusts_raise_the_radius_that_is_required() -> None:
+    params = SeparationParams(gust_m_s=8.0)
+    assert radius_problem(params, 0.0, 0.0) == ""
+    problem = radius_problem(params, 0.0, 1.0)
+    assert all(part in problem for part in ("gusts of 8 m/s, each 1.00 m,", "need 2.48 m"))
 
 
 def test_plans_keep_the_tracking_error_on_top_and_the_certificate_does_not() -> None:

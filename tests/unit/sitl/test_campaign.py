@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,10 @@ import pytest
 from sitl.lockstep import Lockstep
 from sitl.studies.campaign.collision_monitor import CollisionMonitor
 from sitl.studies.campaign.command import main
+from sitl.studies.campaign.disturbances import DISTURBANCES, NONE, disturbed
 from sitl.studies.campaign.events import Appearance
 from sitl.studies.campaign.factors import NOISES, PROTECTIONS
-from sitl.studies.campaign.flight import config_of
+from sitl.studies.campaign.flight import config_of, drawn
 from sitl.studies.campaign.layouts import least_sum_m
 from sitl.studies.campaign.scenarios import SCENARIOS, layout_of
 from sitl.studies.campaign.store import Store
@@ -26,6 +28,7 @@ from swarmctl.core.obstacle import Obstacle
 from swarmctl.errors import ConfigError, StartError
 
 CELL = Cell(scenario="swap", agents=3, delay_ms=0.0, loss=0.0, noise="exact", wind_m_s=0.0, protections="default")
+SWAP = replace(CELL, agents=6, protections="guaranteed")
 REST = np.zeros((2, 3))
 
 
@@ -121,10 +124,10 @@ def test_a_seed_draws_the_same_layout_under_all_conditions(protections: str) -> 
     cell = Cell(
         scenario="random", agents=6, delay_ms=0.0, loss=0.0, noise="exact", wind_m_s=0.0, protections=protections
     )
-    drawn = [layout_of("random", seed, 6) for seed in (5, 5, 6)]
-    assert np.array_equal(drawn[0].starts_ned_m, drawn[1].starts_ned_m)
-    assert not np.array_equal(drawn[0].starts_ned_m, drawn[2].starts_ned_m)
-    assert config_of(cell, 5, drawn[0], 6).starts_ned_m() == tuple(map(tuple, drawn[0].starts_ned_m.tolist()))
+    layouts = [layout_of("random", seed, 6) for seed in (5, 5, 6)]
+    assert np.array_equal(layouts[0].starts_ned_m, layouts[1].starts_ned_m)
+    assert not np.array_equal(layouts[0].starts_ned_m, layouts[2].starts_ned_m)
+    assert config_of(cell, 5, layouts[0], 6).starts_ned_m() == tuple(map(tuple, layouts[0].starts_ned_m.tolist()))
 
 
 def test_radii_grow_with_the_noise() -> None:
@@ -138,7 +141,36 @@ def test_radii_grow_with_the_noise() -> None:
         ).separation.radius_m
         for n in NOISES
     ]
-    assert radii == pytest.approx([0.9, 0.9, 1.19])
+    assert radii == pytest.approx([0.9, 0.9, 1.31])
+
+
+@pytest.mark.parametrize("disturbance", DISTURBANCES)
+def test_a_disturbance_is_drawn_apart_from_the_layout(disturbance: str) -> None:
+    calm = layout_of("swap", 3, 6)
+    windy = [disturbed(calm, disturbance, seed) for seed in (3, 3, 4)]
+    assert all(np.array_equal(layout.starts_ned_m, calm.starts_ned_m) for layout in windy)
+    assert (windy[0].settings, windy[0].clocks, windy[0].lost) == (windy[1].settings, windy[1].clocks, windy[1].lost)
+    told = [layout for layout in windy if layout.events or layout.clocks or layout.settings != calm.settings]
+    assert bool(told) is (disturbance != NONE)
+    cell = replace(SWAP, disturbance=disturbance)
+    assert config_of(cell, 3, drawn(cell, 3), 6).swarm.agents == 6
+
+
+def test_the_strength_of_a_disturbance_is_chosen() -> None:
+    clocks = {ms: disturbed(layout_of("swap", 1, 6), f"clocks:{ms}", 1).clocks for ms in (100, 1000)}
+    assert all(abs(error.offset_us) <= 100_000 for error in clocks[100].values())
+    assert [10 * e.offset_us for e in clocks[100].values()] == pytest.approx(
+        [e.offset_us for e in clocks[1000].values()], abs=10
+    )
+
+
+def test_another_airframe_and_its_gusts_take_more_room() -> None:
+    sets = {"": 0.9, "separation.gust_m_s=8": 3.39}
+    for text, radius_m in sets.items():
+        cell = replace(SWAP, airframe="x500", sets=text)
+        config = config_of(cell, 1, drawn(cell, 1), 6)
+        assert (config.sitl.preset, config.separation.body_m) == ("x500", 0.65)
+        assert config.separation.radius_m == pytest.approx(radius_m)
 
 
 def test_the_least_sum_of_three_and_seven() -> None:

@@ -180,6 +180,15 @@ def test_a_gust_pushes_and_passes(flown: FlownWorld) -> None:
     assert flown.world.physics.air.still
 
 
+def test_a_wind_blows_from_one_instant_to_the_next_and_on_one_vehicle_only(flown: FlownWorld) -> None:
+    begin(flown, kind="wind", value=8.0, towards_deg=90.0, for_s=1.0)
+    flown.step(0.01)
+    air = flown.world.physics.air.velocity_ned_m_s(0.0, np.full(2, 10.0), np.zeros((3, 2)))
+    np.testing.assert_allclose(air, [[0.0, 0.0], [8.0, 0.0], [0.0, 0.0]], atol=1e-12)
+    flown.step(1.1)
+    assert flown.world.physics.air.still
+
+
 def test_mass_and_battery(flown: FlownWorld) -> None:
     begin(flown, kind="mass", value=1.3, for_s=8.0)
     begin(flown, kind="battery", value=0.1)
