@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from sitl.lockstep import Lockstep
+from sitl.studies.campaign.collision_monitor import CollisionMonitor
 from sitl.studies.campaign.events import SimulatorFault
+from sitl.studies.campaign.flight import TrialFlight, drawn
+from sitl.studies.campaign.trials import Cell, Trial
 from swarmctl.config import load
+from swarmctl.control.commit.tube import Tube
 from swarmctl.core.types import Phase
 from swarmctl.simulator_config import FaultParams
 from tests.closed_loop.conftest import ROOT
@@ -38,3 +44,33 @@ def test_a_sudden_wind_blows_a_hovering_vehicle_no_farther_than_distances_leave_
     flight.run(blown)
     drifted_m = np.linalg.norm(np.array(places_m) - places_m[0], axis=1).max()
     assert 0.8 * config.drift_m < drifted_m <= config.drift_m
+
+
+def blown_farther_than_expected() -> CollisionMonitor:
+    """Six vehicles swap with room for gusts of 4 m/s; each is hit by a wind of 8 m/s of its own in the first 4 s."""
+    cell = Cell(
+        scenario="swap",
+        agents=6,
+        delay_ms=0.0,
+        loss=0.0,
+        noise="exact",
+        wind_m_s=0.0,
+        protections="guaranteed",
+        airframe="x500",
+        disturbance="steps:8",
+        sets="separation.gust_m_s=4",
+    )
+    flight = TrialFlight(Trial(cell, 2), replace(drawn(cell, 2), limit_s=8.0))
+    flight.run()
+    return flight.monitor
+
+
+def test_vehicles_that_are_blown_out_of_their_tubes_commit_anew_and_keep_apart() -> None:
+    assert blown_farther_than_expected().min_separation_m >= 0.85
+
+
+def test_negative_control_vehicles_that_chase_what_they_were_committed_to_touch(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(Tube, "update", lambda self, utc_us, error_m, error_m_s: False)
+    assert blown_farther_than_expected().collided
