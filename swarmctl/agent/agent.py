@@ -330,6 +330,8 @@ class Agent:
         directive = self._directive = self._separate(now_us, state, keep_outs, flies)
         if not flies:
             return PlanningResult(start=start, plan=None, reference=now_ref, keep_outs=keep_outs)
+        if directive.alert:
+            self._alerts.put("separation", directive.alert, now_us)
         if directive.reference is not None:
             reference = directive.reference
         guess = self._plan_buffer.guess_ned_m(act_us)

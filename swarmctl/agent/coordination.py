@@ -47,6 +47,7 @@ class Coordination:
         committed_peers: by agent number, the trajectories that each peer relied on may follow.
         lost_peer_keep_outs: keep-outs at the ends of lost peers' committed trajectories.
         cut_off: why the agent has to land where it is: it waits for peers in vain, or they have excluded it; or "".
+        alert: what keeps it from committing to anything new, or nearly; or "".
     """
 
     def __init__(
@@ -80,6 +81,7 @@ class Coordination:
         self._tube_m = separation.budget.tube_m
         self._tube = Tube(self._tube_m)
         self._grip = Grip.HELD
+        self._clock_error_max_us = 1e6 * params.clock_error_max_s
         self._membership = Membership(agent, peers)
         self._ended: frozenset[int] = frozenset()  # peers that take no part any more, by evidence
         self._membership_said: tuple[frozenset[int], ...] = (frozenset(),) * 3
@@ -88,7 +90,7 @@ class Coordination:
         self._conflicting: set[int] = set()
         self.committed_peers: Mapping[int, Sequence[Trajectory]] = {}
         self.lost_peer_keep_outs: list[KeepOut] = []
-        self.cut_off = ""
+        self.cut_off = self.alert = ""
 
     @property
     def counts(self) -> CommitCounts:
@@ -156,7 +158,9 @@ class Coordination:
             disturbance_ned_m_s2=disturbance_ned_m_s2,
         )
         commitments.evade(now)
-        if commitments.is_due(utc_us) and self._grip < Grip.STOPPED:
+        unsure = {a for a in required if self._world_model.clocks.error_us(a) > self._clock_error_max_us}
+        self.alert = self._why_slow(unsure)
+        if commitments.is_due(utc_us) and self._grip < Grip.STOPPED and not unsure:
             begin_us = utc_us + commitments.lead_us
             others = self._others(begin_us, state, phase, taking_part)
             commitments.propose(replace(now, begin_us=begin_us, peers=known, others=others))
@@ -174,7 +178,7 @@ class Coordination:
         """Commit nothing while a pilot or the autopilot flies; peers are still acknowledged."""
         if self._is_committed:
             self._is_committed = False
-            self.committed_peers, self.lost_peer_keep_outs, self.cut_off = {}, [], ""
+            self.committed_peers, self.lost_peer_keep_outs, self.cut_off, self.alert = {}, [], "", ""
             self._note("commitments", **asdict(self.counts), worst_tracking_m=self._tube.worst_m)
         self._commitments.end(None if state is None else state.pos_ned_m, utc_us)
 
@@ -233,6 +237,11 @@ class Coordination:
     def _silence_us(self, agent: int, utc_us: int) -> int:
         """Return the time since the newest message of a peer; 0 for one that has never been heard."""
         return utc_us - self._peer_trajectories.received_utc_us.get(agent, utc_us)
+
+    def _why_slow(self, unsure: Set[int]) -> str:
+        if self._grip > Grip.HELD:
+            return f"blown off what it had committed to: {self._grip.name.lower()}"
+        return f"the clock of {_names(unsure)} is not known well enough" if unsure else ""
 
     def _why_cut_off(self, utc_us: int, required: Set[int]) -> str:
         if self._grip is Grip.LOST:

@@ -41,6 +41,7 @@ class SeparationDirective:
     lost_peer_keep_outs: tuple[KeepOut, ...] = ()  # may deadlock an agent, as those of the world model
     unresponsive_peer: bool = False  # the mission has to wait for a peer that may be flying on unseen
     cut_off: str = ""  # why the mission has to end where the vehicle is, because peers don't answer
+    alert: str = ""  # what the operator has to know about it
     margin_m: float = 0.0  # peers have to keep this much more, because the vehicle isn't flown as it was committed to
     duration_ns: int = 0  # time spent on agreeing with peers
 
@@ -153,6 +154,7 @@ class Guaranteed:
             committed_peers=coordination.committed_peers,
             lost_peer_keep_outs=tuple(coordination.lost_peer_keep_outs),
             cut_off=coordination.cut_off,
+            alert=coordination.alert,
             margin_m=coordination.margin_m,
             duration_ns=duration_ns,
         )

@@ -45,6 +45,7 @@ class CommitParams(Params):
     period_s: float = Field(0.1, ge=0, le=2)  # least time between two plans
     lead_min_s: float = Field(0.06, ge=0.02, le=2)  # least time from proposing to flying
     lead_max_s: float = Field(1.5, ge=0.1, le=5)  # longest such lead, however late the others answer
+    clock_error_max_s: float = Field(1.0, ge=0.01, le=10)  # nothing is proposed while a peer's clock is known less well
     right_of_way_rad: float = Field(1.0, ge=0, le=1.2)  # overrides `separation`: plans with stops lock sooner
     stuck_m: float = Field(1.0, gt=0, le=10)  # overrides `separation`: agents that meet turn while they still move
     follow_z: AxisWeights = AxisWeights(q_pos=20.0, q_vel=0.5, r=0.05)  # tracks commitments to the centimetre

@@ -60,13 +60,18 @@ class Bench:
         self.seq = 0
         self.proposes, self.exclusions = False, Exclusions()  # of the peer
         self.acknowledged: Mapping[int, int] = {}  # by the agent, in the newest message that the peer has read
+        self.tube_m, self.ahead_us = 0.16, 0  # of the peer: its tube, and its clock, by which it stamps what it hears
+        self.heard: dict[int, tuple[int, int]] = {}  # by the peer
+        self.blown_m = np.zeros(3)  # off the place where the agent hovers
 
     @property
     def state(self) -> VehicleState:
         """Hovers here."""
         north = np.array([1.0, 0.0, 0.0, 0.0])
         still, now_us = np.zeros(3), self.clock.now_us()
-        return builders.vehicle_state(t_us=now_us, pos_ned_m=HERE, vel_ned_m_s=still, q_nb=north, rate_frd_rad_s=still)
+        return builders.vehicle_state(
+            t_us=now_us, pos_ned_m=HERE + self.blown_m, vel_ned_m_s=still, q_nb=north, rate_frd_rad_s=still
+        )
 
     def fly(self, seconds: float, each: Callable[[], None] = lambda: None) -> None:
         for _ in range(round(seconds / 0.02)):
@@ -92,6 +97,7 @@ class Bench:
             message = decode_trajectory_message(payload)
             assert message is not None
             self.acknowledged = message.acknowledged
+            self.heard = {0: (message.sent_utc_us, utc_us + self.ahead_us)}
             if message.proposal is not None:
                 acknowledged = {0: message.proposal.number}
         path = builders.predicted_path(
@@ -105,6 +111,8 @@ class Bench:
                 sent_utc_us=utc_us,
                 is_committed=self.seq > 1,
                 committed=committed,
+                tube_m=self.tube_m,
+                heard=self.heard,
                 proposal=Proposal(number=5, made_utc_us=0, agent=1, trajectory=committed) if self.proposes else None,
                 acknowledged=acknowledged,
                 exclusions=self.exclusions,
@@ -173,6 +181,39 @@ def test_an_excluded_agent_lands_where_it_is(bench: Bench) -> None:
     bench.exclusions = Exclusions(promised=frozenset({0}))
     bench.fly(0.1, each=bench.send)
     assert bench.coordination.cut_off == "excluded by agent-1 after silence"
+
+
+def test_nothing_is_proposed_while_the_clock_of_a_peer_is_not_known(bench: Bench) -> None:
+    bench.ahead_us = 1_500_000  # as late as an answer may seem to be, the two clocks may differ
+    bench.fly(1.0, each=bench.send)
+    assert bench.committed == 0
+    assert bench.coordination.alert == "the clock of agent-1 is not known well enough"
+
+
+def test_a_peer_that_has_widened_its_tube_is_kept_clear_of_by_its_path(bench: Bench) -> None:
+    bench.fly(1.0, each=bench.send)
+    assert 1 in bench.coordination.committed_peers
+    bench.tube_m = 0.5
+    bench.fly(0.1, each=bench.send)
+    assert bench.coordination.committed_peers == {}
+
+
+def test_a_vehicle_off_its_commitment_commits_anew_tells_peers_and_stops(bench: Bench) -> None:
+    bench.fly(1.0, each=bench.send)
+    assert (bench.coordination.margin_m, bench.coordination.alert) == (0.0, "")
+    for times in (1, 2, 3):
+        bench.blown_m = np.array([0.0, 0.2 * times, 0.0])
+        bench.fly(0.04, each=bench.send)
+        place, _ = bench.coordination.sample_committed(np.array([bench.clock.utc_us()]))
+        np.testing.assert_allclose(place[0], HERE + bench.blown_m, atol=0.05)
+    assert bench.coordination.alert == "blown off what it had committed to: stopped"
+    before = bench.coordination.counts.proposed
+    bench.fly(0.5, each=bench.send)
+    assert bench.coordination.counts.proposed == before
+    bench.fly(1.0, each=bench.send)
+    assert bench.coordination.counts.proposed > before, "it has stayed in its tube for a second"
+    grips = [fields["grip"] for name, fields in bench.told if name == "tracking_violation"]
+    assert grips == ["WIDENED", "STOPPED", "HELD"]
 
 
 def test_who_has_ended_gets_no_acknowledgement(bench: Bench) -> None:
