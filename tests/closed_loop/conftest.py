@@ -43,6 +43,11 @@ class Flight:
         return self.lockstep.problems()
 
     @property
+    def outcomes(self) -> set[str]:
+        """What became of the missions; those that are under way have none, "" in the set."""
+        return {agent.outcome for agent in self.lockstep.agents if agent is not None}
+
+    @property
     def t_s(self) -> NDArray[np.float64]:
         return np.asarray(self._truth["t_us"][:, 0] * 1e-6)
 
@@ -144,6 +149,11 @@ def mission_t_s(lockstep: Lockstep) -> float:
 def mission_is_over(lockstep: Lockstep) -> bool:
     """Return whether no agent is on its transit to the start or in the mission any more."""
     return all(len(log.rows) and log.rows[-1]["phase"][0] > Phase.TRACK for log in lockstep.logs)
+
+
+def closer_than(bound_m: float) -> Callable[[Lockstep], bool]:
+    """Return what ends a negative control: whether any two vehicles are closer at this moment."""
+    return lambda lockstep: bool(closest_pair_m(lockstep.world.truth_rows()["pos_ned_m"][np.newaxis])[0] < bound_m)
 
 
 @pytest.fixture(scope="session", autouse=True)

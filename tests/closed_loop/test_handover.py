@@ -21,7 +21,7 @@ from swarmctl.mavlink import mode_watch
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames, message_id
 from swarmctl.mavlink.transport import PipeTransport
-from tests.closed_loop.conftest import Fly, mission_t_s
+from tests.closed_loop.conftest import Fly, closer_than, mission_t_s
 
 SETPOINT = 82  # SET_ATTITUDE_TARGET
 SLEEP_S = 1.62  # the first tick afterwards receives a state but no mode
@@ -57,7 +57,7 @@ def test_negative_control_an_autopilot_that_lands_at_speed_among_others_comes_to
             self.outcome, self.phase, self._entered_us = "stopped", Phase.LAND, now_us
 
     monkeypatch.setattr(MissionStateMachine, "_apply_stop", land_at_once)
-    assert fly(*CROSSING, at=LAND_NOW).separation_m() < 0.75
+    assert fly(*CROSSING, at=LAND_NOW, until=closer_than(0.75)).separation_m() < 0.75
 
 
 # -- PX4 returns to OFFBOARD by itself when setpoints resume ----------------------------------------------------------
@@ -213,7 +213,8 @@ def test_arducopter_is_flown_in_its_own_dialect_until_a_pilot_chooses_another_mo
     flight.run.command("resume")
     flight.step_for(1.5)
     assert flight.setpoints_us
-    flight.step_for(25.0)
+    while not flight.agent.finished and flight.now_us < 90_000_000:
+        flight.run.step()
     assert (flight.agent.finished, flight.agent.outcome) == (True, "completed")
 
 

@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 
 from sitl.lockstep import Lockstep
 from swarmctl.mavlink.local_frame import LocalFrame
-from tests.closed_loop.conftest import Flight, Fly
+from tests.closed_loop.conftest import Flight, Fly, closer_than
 
 JUMP_M = 5.0
 AT_S = 4.0  # mission time of the jump
 WATCHED_S = 5.0
+BODY_M = 0.48
 
 
-def fly_with_a_jump(fly: Fly) -> tuple[Flight, float]:
+def fly_with_a_jump(fly: Fly, until: Callable[[Lockstep], bool] | None = None) -> tuple[Flight, float]:
     """The estimate of vehicle 0 jumps 5 m away from vehicle 1, through which it would fly to return."""
     jumped_us: list[int] = []
 
@@ -27,7 +30,7 @@ def fly_with_a_jump(fly: Fly) -> tuple[Flight, float]:
     def over(running: Lockstep) -> bool:
         return bool(jumped_us) and running.clock.now_us() - jumped_us[0] > WATCHED_S * 1e6
 
-    flight = fly("sitl.start=air", "mission.duration_s=20", at={AT_S: jump}, until=over)
+    flight = fly("sitl.start=air", "mission.duration_s=20", at={AT_S: jump}, until=until or over)
     return flight, jumped_us[0] * 1e-6
 
 
@@ -47,6 +50,7 @@ def test_negative_control_a_jump_that_is_believed_at_once_ends_in_a_collision(
     fly: Fly, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(LocalFrame, "_fit", lambda *_, **__: None)
-    flight, _ = fly_with_a_jump(fly)
-    assert flight.separation_m() < flight.config.separation.body_m
+    flight, _ = fly_with_a_jump(fly, until=closer_than(BODY_M))
+    assert flight.config.separation.body_m == BODY_M
+    assert flight.separation_m() < BODY_M
     assert "estimate_jumped" not in flight.event_names(0)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from sitl.lockstep import Lockstep
 from swarmctl.core.types import Mode, Phase
 from tests.closed_loop.conftest import Flight, Fly, fly_now, mission_is_over
 
@@ -53,7 +54,10 @@ def test_the_obstacle_is_known_only_within_the_visibility_distance(flight: Fligh
 
 
 def test_negative_control_unseen_it_is_hit(fly: Fly) -> None:
-    blind = fly(
-        "obstacles.0.visibility_m=0.1", "mission.duration_s=6", config=PUBLISHED, until=mission_is_over
-    )  # hit after 4.4 s
+    def is_hit(running: Lockstep) -> bool:
+        center = np.array(running.config.obstacles[0].center_ned_m)
+        apart_m = np.linalg.norm(running.world.truth_rows()["pos_ned_m"] - center, axis=1)
+        return bool(apart_m.min() < running.config.obstacles[0].radius_m)
+
+    blind = fly("obstacles.0.visibility_m=0.1", "sitl.start=air", config=PUBLISHED, until=is_hit)  # after 4.4 s
     assert clearance_m(blind) < 1.0

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import numpy as np
 import pytest
 
 from sitl.lockstep import Lockstep
-from tests.closed_loop.conftest import Flight, fly_now
+from tests.closed_loop.conftest import Flight, closer_than, fly_now
 
 SWAP = ("swarm.agents=4", "start={positions_ned_m=[[4,0,0],[0,4,0],[-4,0,0],[0,-4,0]]}", "sitl.start=air")
 UNPROTECTED = ("agent.overload.widen_01=1", "agent.overload.hold_01=1", "agent.overload.clear_01=1")
@@ -23,17 +24,20 @@ def one_tick_of(count: int) -> Callable[[Lockstep], None]:
     return begin
 
 
-def swapped(*more: str, until_s: float, at: dict[float, Callable[[Lockstep], None]], seed: int = 0) -> Flight:
-    def over(lockstep: Lockstep) -> bool:
-        return lockstep.finished or lockstep.clock.now_us() > until_s * 1e6
+def swapped(
+    *more: str, until: Callable[[Lockstep], bool], at: dict[float, Callable[[Lockstep], None]], seed: int = 0
+) -> Flight:
+    return fly_now(*SWAP, *more, config="swap8.toml", at=at, until=until, seed=seed)
 
-    return fly_now(*SWAP, *more, config="swap8.toml", at=at, until=over, seed=seed)
+
+def over(lockstep: Lockstep) -> bool:
+    return lockstep.finished or lockstep.clock.now_us() > 30e6
 
 
 @pytest.mark.parametrize(("seed", "above_m"), [(0, 1.5), (3, 1.1)])
 def test_agents_missing_nine_of_ten_deadlines_come_to_rest_far_apart_and_land(seed: int, above_m: float) -> None:
     """The worst of six starts, five of them shifted by a millimetre, is that of seed 3: 1.16 m."""
-    flight = swapped(until_s=30.0, at={0.5: one_tick_of(10)}, seed=seed)
+    flight = swapped(until=over, at={0.5: one_tick_of(10)}, seed=seed)
     assert flight.separation_m() > above_m
     assert {agent.outcome.split(":")[0] for agent in flight.lockstep.agents if agent} == {"overload"}
     levels = [e["level"] for e in flight.lockstep.logs[0].events if e["event"] == "overload"]
@@ -43,15 +47,19 @@ def test_agents_missing_nine_of_ten_deadlines_come_to_rest_far_apart_and_land(se
 @pytest.mark.parametrize(("seed", "below_m"), [(0, BODY_M), (1, 0.8)])
 def test_negative_control_without_the_reaction_they_come_too_close(seed: int, below_m: float) -> None:
     """Bodies touch from the start as configured; the worst of five shifted ones is that of seed 1: 0.75 m."""
-    flight = swapped(*UNPROTECTED, until_s=20.0, at={0.5: one_tick_of(10)}, seed=seed)
+    flight = swapped(*UNPROTECTED, until=closer_than(below_m), at={0.5: one_tick_of(10)}, seed=seed)
     assert flight.separation_m() < below_m
 
 
 def test_an_overload_that_passes_delays_the_mission_and_no_more() -> None:
-    flight = swapped(until_s=24.0, at={0.5: one_tick_of(10), 4.5: one_tick_of(1)})
+    """They arrive at the opposite side all the same."""
+
+    def arrived(lockstep: Lockstep) -> bool:
+        goals = -np.array(lockstep.config.starts_ned_m())[:, :2]
+        return bool(abs(lockstep.world.truth_rows()["pos_ned_m"][:, :2] - goals).max() < 0.3)
+
+    flight = swapped(until=arrived, at={0.5: one_tick_of(10), 4.5: one_tick_of(1)})
     assert flight.separation_m() > 0.85
     levels = [e["level"] for e in flight.lockstep.logs[0].events if e["event"] == "overload"]
     assert levels[:2] == ["WIDEN", "HOLD"]
     assert levels[-1] == "NONE"
-    goals = -flight.pos_ned_m[0, :, :2]
-    assert abs(flight.pos_ned_m[-1, :, :2] - goals).max() < 0.3, "they have arrived at the opposite side all the same"
