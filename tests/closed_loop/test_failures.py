@@ -14,11 +14,11 @@ from swarmctl.bus.peers import PeerPaths
 from swarmctl.control.mpc import swarm_mpc as mpc
 from swarmctl.control.mpc.solvers.qp import QpSolution
 from swarmctl.control.mpc.swarm_mpc import SwarmMpc
+from swarmctl.control.phases.state_machine import TAKEN_OVER
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase, PredictedPath
 from swarmctl.mavlink.codec import Codec
-from tests.closed_loop.conftest import Fly
+from tests.closed_loop.conftest import Fly, closer_than, mission_is_over
 
-MISSION = "mission.duration_s=14"
 AIR = "sitl.start=air"
 
 
@@ -29,7 +29,8 @@ def landed_by_itself(flight_truth: np.ndarray, agent: int, agents: int = 3) -> b
 
 @pytest.mark.parametrize(("victim", "at_s"), [(0, 5.0), (1, 8.0)])
 def test_a_dead_agent_lands_and_the_others_keep_clear(fly: Fly, victim: int, at_s: float) -> None:
-    flight = fly(MISSION, at={at_s: lambda running: running.kill(victim)})
+    """The mission goes on for three seconds, in which the others have left the dead one 7 m behind."""
+    flight = fly(f"mission.duration_s={at_s + 3.0}", at={at_s: lambda running: running.kill(victim)})
     assert landed_by_itself(flight.lockstep.truth, victim)
     assert flight.separation_m() >= 0.85
     assert flight.problems == [f"agent {victim} died"], "the others finish"
@@ -57,23 +58,25 @@ def test_negative_control_a_dead_agent_that_is_forgotten_is_closed_in_on(
         return tuple(path for path in paths if newest - path.t0_utc_us < 200_000)
 
     monkeypatch.setattr(PeerPaths, "latest", forget)
-    forgotten = fly(*CLUSTER, at=died, until=has_landed).separation_m(only=0)
+    forgotten = fly(*CLUSTER, at=died, until=closer_than(0.85)).separation_m(only=0)
     assert forgotten < 0.85 <= remembered
 
 
 def test_a_frozen_agent_is_landed_by_its_autopilot_and_never_retakes_control(fly: Fly) -> None:
     flight = fly(
-        MISSION,
+        "swarm.agents=2",
+        "mission.duration_s=9",
         at={4.0: lambda running: running.frozen.add(1), 7.0: lambda running: running.frozen.discard(1)},
+        until=mission_is_over,
     )
-    assert landed_by_itself(flight.lockstep.truth, 1)
+    assert landed_by_itself(flight.lockstep.truth, 1, 2)
     assert flight.separation_m() >= 0.85
     ticks = flight.ticks(1)
     after = ticks[ticks["t_us"] > ticks["t_us"][np.argmax(np.diff(ticks["t_us"]))]]
     assert Mode.PILOT_OVERRIDE in set(after["mode"])
     first = int(np.argmax(after["mode"] == Mode.PILOT_OVERRIDE))
     assert np.isnan(after["setpoint_thrust_01"][first:]).all(), "no setpoint after a pilot override"
-    assert flight.problems == ["agent 1: pilot or autopilot took over"]
+    assert [agent.outcome for agent in flight.lockstep.agents if agent] == ["completed", TAKEN_OVER]
 
 
 def take_over(running: Lockstep) -> None:
@@ -82,14 +85,14 @@ def take_over(running: Lockstep) -> None:
     running.links[2][0].send(frame)
 
 
-def others_have_landed(running: Lockstep) -> bool:
-    """The pilot keeps control of vehicle 2."""
+def others_are_done(running: Lockstep) -> bool:
+    """The pilot keeps control of vehicle 2; the others have come to rest beside it and are handed back."""
     return all(len(log.rows) and log.rows[-1]["phase"][0] == Phase.DONE for log in running.logs[:2])
 
 
 def test_a_pilot_override_is_respected(fly: Fly) -> None:
     landing = {8.0: take_over, 9.5: lambda running: running.command("land")}
-    flight = fly(MISSION, at=landing, until=others_have_landed)
+    flight = fly("mission.duration_s=14", AIR, at=landing, until=others_are_done)
     ticks = flight.ticks(2)
     overridden = ticks["mode"] == Mode.PILOT_OVERRIDE
     assert overridden.any()
@@ -106,8 +109,14 @@ def test_no_state_no_setpoints(fly: Fly) -> None:
 
     def deafen(running: Lockstep) -> None:
         running.links[0][1].send = lambda data: None  # type: ignore[method-assign]
+        deaf.append(running)
 
-    flight = fly(MISSION, "swarm.agents=1", "mission.duration_s=10", at={4.0: deafen})
+    def is_down(running: Lockstep) -> bool:
+        """The agent itself is never told."""
+        return bool(deaf) and landed_by_itself(running.world.truth_rows(), 0, 1)
+
+    deaf: list[Lockstep] = []
+    flight = fly("swarm.agents=1", "mission.duration_s=10", at={4.0: deafen}, until=is_down)
     ticks = flight.ticks(0)
     blind = ticks[(ticks["mode"] == Mode.STATE_STALE) & (ticks["phase"] >= Phase.TRACK)]
     assert len(blind) and np.isnan(blind["setpoint_thrust_01"]).all()
@@ -138,8 +147,8 @@ def _solve_from(running: Lockstep, from_s: float, solve: Callable[..., QpSolutio
     ("lasts_s", "reached"), [(0.3, Mode.REPLAY), (2.0, Mode.HOLD), (8.0, Mode.LAND)], ids=["replay", "hold", "land"]
 )
 def test_modes_after_a_solver_failure(fly: Fly, lasts_s: float, reached: Mode) -> None:
-    broken = {9.0: lambda running: break_solver(running, 0, lasts_s)}
-    flight = fly("mission.duration_s=18", "swarm.agents=1", at=broken)
+    broken = {3.0: lambda running: break_solver(running, 0, lasts_s)}
+    flight = fly("mission.duration_s=9", "swarm.agents=1", at=broken)
     ladder = [Mode.REPLAY, Mode.BRAKE, Mode.HOLD, Mode.LAND]
     seen = flight.modes(0)
     assert [mode for mode in ladder if mode in seen] == ladder[: ladder.index(reached) + 1]
@@ -169,9 +178,9 @@ def test_the_vehicle_of_a_dead_agent_keeps_its_attitude_for_half_a_second(
 def test_others_keep_clear_of_an_agent_without_a_solver(fly: Fly) -> None:
     """The agent replays its last plan, brakes, holds and finally lands."""
     broken = {
-        at_s: partial(break_solver, agent=0, lasts_s=lasts_s) for at_s, lasts_s in ((6.0, 0.3), (8.0, 2.0), (14.0, 8.0))
+        at_s: partial(break_solver, agent=0, lasts_s=lasts_s) for at_s, lasts_s in ((5.0, 0.3), (6.5, 2.0), (10.5, 8.0))
     }
-    flight = fly("mission.duration_s=20", at=broken)
+    flight = fly("mission.duration_s=16.5", at=broken)
     assert {Mode.REPLAY, Mode.BRAKE, Mode.HOLD, Mode.LAND} <= flight.modes(0)
     assert flight.separation_m() >= 0.85
     assert all(landed_by_itself(flight.lockstep.truth, agent) for agent in range(3))
@@ -180,10 +189,10 @@ def test_others_keep_clear_of_an_agent_without_a_solver(fly: Fly) -> None:
 def test_a_plan_that_would_come_too_close_is_not_flown(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
     """The QP has no half-spaces and the safety filter is off: only the certifier, which is separate code, remains."""
     monkeypatch.setattr(mpc, "half_spaces", lambda *_, **__: None)
-    flight = fly("mission.duration_s=8", AIR, "agent.barrier.enabled=false")
-    certified = flight.separation_m()
+    unfiltered = (AIR, "agent.barrier.enabled=false")
+    certified = fly("mission.duration_s=8", *unfiltered, until=mission_is_over).separation_m()
     monkeypatch.setattr(mpc, "certify", lambda *_, **__: 1.0)
-    uncertified = fly("mission.duration_s=5", AIR, "agent.barrier.enabled=false").separation_m()
+    uncertified = fly("mission.duration_s=5", *unfiltered, until=closer_than(0.3)).separation_m()
     assert uncertified < 0.3 < 0.6 < certified
 
 
@@ -194,12 +203,12 @@ def test_ten_seconds_of_bus_silence(fly: Fly) -> None:
     def speak(running: Lockstep) -> None:
         del running.hub.carry
 
-    flight = fly("mission.duration_s=20", AIR, at={5.0: silence, 15.0: speak})
+    flight = fly("mission.duration_s=20", AIR, at={5.0: silence, 15.0: speak}, until=mission_is_over)
     assert flight.separation_m() >= 0.80
 
 
 def test_late_and_lost_messages(fly: Fly) -> None:
-    flight = fly("bus.delay_ms=40", "bus.loss_01=0.2", MISSION)
+    flight = fly("bus.delay_ms=40", "bus.loss_01=0.2", "mission.duration_s=10")
     assert flight.problems == []
     assert flight.separation_m() >= 0.85
 
@@ -211,16 +220,17 @@ def test_operator_holds_resumes_and_lands(fly: Fly) -> None:
         speeds[len(speeds)] = float(np.linalg.norm(running.logs[0].rows[-1]["vel_ned_m_s"][0]))
 
     flight = fly(
+        "swarm.agents=2",
         "mission.duration_s=20",
         at={
-            4.0: lambda running: running.command("hold"),
-            8.0: speed,
-            8.1: lambda running: running.command("resume"),
-            14.0: speed,
-            14.1: lambda running: running.command("land"),
+            3.0: lambda running: running.command("hold"),
+            6.0: speed,
+            6.1: lambda running: running.command("resume"),
+            9.5: speed,
+            9.6: lambda running: running.command("land"),
         },
     )
     assert speeds[0] < 0.3 < 0.8 < speeds[1]
     assert flight.separation_m() >= 0.85
-    assert flight.problems == [f"agent {i}: stopped by the operator" for i in range(3)]
-    assert all(landed_by_itself(flight.lockstep.truth, i) for i in range(3))
+    assert flight.problems == [f"agent {i}: stopped by the operator" for i in range(2)]
+    assert all(landed_by_itself(flight.lockstep.truth, i, 2) for i in range(2))
