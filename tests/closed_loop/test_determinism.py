@@ -6,7 +6,7 @@ import pytest
 
 from tests.closed_loop.conftest import Flight, Fly, fly_now, mission_is_over
 
-SHORT = ("mission.duration_s=3", "sitl.start=air", "bus.loss_01=0.2", "bus.delay_ms=30")
+SHORT = ("mission.duration_s=2", "sitl.start=air", "bus.loss_01=0.2", "bus.delay_ms=30")
 
 
 @pytest.fixture(scope="module")

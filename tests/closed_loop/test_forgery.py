@@ -25,7 +25,7 @@ from tests.closed_loop.conftest import Flight, Fly, fly_now, mission_t_s
 
 AGENTS, VICTIM, STRANGER = 4, 1, 999
 LAST = 2**32 - 1
-CROSSED_S = 5.0  # the agents meet after 3 s
+CROSSED_S = 4.0  # the agents meet after 3 s
 FORGED_S = 2.0
 GUARANTEED = "separation.mode=guaranteed"
 SWAP = (
@@ -37,12 +37,10 @@ SWAP = (
 )
 
 
-def crossed(running: Lockstep) -> bool:
-    return mission_t_s(running) >= CROSSED_S
-
-
-def swap(fly: Fly, *overrides: str, at: dict[float, Callable[[Lockstep], None]] | None = None) -> Flight:
-    return fly(*SWAP, *overrides, config="swap8.toml", at=at, until=crossed)
+def swap(
+    fly: Fly, *overrides: str, at: dict[float, Callable[[Lockstep], None]] | None = None, until_s: float = CROSSED_S
+) -> Flight:
+    return fly(*SWAP, *overrides, config="swap8.toml", at=at, until=lambda running: mission_t_s(running) >= until_s)
 
 
 def summary(flight: Flight) -> dict[str, Any]:
@@ -124,7 +122,7 @@ def newest_wins(self: SenderVerifier, received: ReceivedMessage, utc_us: int) ->
 
 def test_negative_control_where_the_newest_is_believed_they_meet(fly: Fly, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(SenderVerifier, "_refusal", newest_wins)
-    flight = swap(fly, at={FORGED_S: forge_paths})
+    flight = swap(fly, at={FORGED_S: forge_paths}, until_s=5.0)
     assert flight.separation_m() < 0.1
     found = summary(flight)["comms"]["unresponsive"]
     assert found["longest_s"] > 1.0, "the silenced peer is named"
@@ -173,7 +171,7 @@ def test_forged_trajectories_break_no_commitment(fly: Fly) -> None:
 
 
 def test_permanent_forgery_is_reported_and_distances_are_kept(fly: Fly, twin: Flight) -> None:
-    flight = swap(fly, at={0.5 + 0.02 * i: forge_paths for i in range(200)})
+    flight = swap(fly, at={0.5 + 0.02 * i: forge_paths for i in range(170)})
     np.testing.assert_array_equal(flight.pos_ned_m, twin.pos_ned_m)
     assert len(summary(flight)["violations"]) == AGENTS
 
