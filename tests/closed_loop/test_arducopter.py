@@ -63,8 +63,11 @@ def test_negative_control_without_the_option_nothing_is_armed() -> None:
 
 
 def test_the_vehicle_of_a_dead_agent_lands_and_the_other_keeps_clear() -> None:
+    def is_down(running: Lockstep) -> bool:
+        return running.agents[0] is None and running.world.truth_rows()[0]["landed"] == Landed.ON_GROUND
+
     died = {4.0: lambda running: running.kill(0)}
-    flight = fly_now("swarm.agents=2", "mission.duration_s=10", config=CONFIG, at=died)
+    flight = fly_now("swarm.agents=2", "mission.duration_s=10", config=CONFIG, at=died, until=is_down)
     assert pilots(flight.lockstep)[0].flight_mode() is FlightMode.LAND
     assert flight.lockstep.truth[-2]["landed"] == Landed.ON_GROUND
     assert flight.separation_m() >= 0.85

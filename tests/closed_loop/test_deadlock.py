@@ -100,7 +100,7 @@ def test_the_deadlock_is_reported(met: Flown) -> None:
 
 def test_negative_control_without_the_rule_they_do_not_get_by() -> None:
     """They stand or push each other to and fro, which is the luck of a rounding; whether that is noticed as well."""
-    flown = Flown(ENDS, -ENDS, 14.0, corridor(), *SMALL, "mission.goto.speed_m_s=1.0", "agent.deadlock.enabled=false")
+    flown = Flown(ENDS, -ENDS, 13.0, corridor(), *SMALL, "mission.goto.speed_m_s=1.0", "agent.deadlock.enabled=false")
     assert flown.distance_m.min() > 1.0
 
 
@@ -109,7 +109,7 @@ TRIANGLE = ring(3, 3.0, 0.0)
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_three_sent_to_one_point_come_to_rest_round_it(seed: int) -> None:
-    flown = Flown(nudged(TRIANGLE, seed), np.zeros((1, 3)), 7.0)
+    flown = Flown(nudged(TRIANGLE, seed), np.zeros((1, 3)), 6.0)
     assert flown.distance_m.sum() < 1.1 * least_sum_m(3, 0.9)
     assert flown.moved_m < 0.02
     assert flown.separation_m > 0.85
@@ -118,7 +118,7 @@ def test_three_sent_to_one_point_come_to_rest_round_it(seed: int) -> None:
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_negative_control_without_places_of_their_own_they_push(seed: int) -> None:
     """Whether one gets to the middle or they circle round it is the luck of a rounding, but none comes to rest."""
-    flown = Flown(nudged(TRIANGLE, seed), np.zeros((1, 3)), 7.0, "mission.goto.goal_assignment=false")
+    flown = Flown(nudged(TRIANGLE, seed), np.zeros((1, 3)), 6.0, "mission.goto.goal_assignment=false")
     assert flown.moved_m > 0.1
 
 

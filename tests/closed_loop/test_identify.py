@@ -23,7 +23,7 @@ ALONE = ("swarm.agents=1", "sitl.estimator=gps", "start.center_ned_m=[0, 0, -3]"
 AIR = ("sitl.start=air", "agent.state_machine.arrive_m=1")
 UNKNOWN = ("vehicle_model.delay_s=0.06", "vehicle_model.attitude_rad_s=0", "vehicle_model.drag_1_s=0")
 STEPS = ("mission.kind=identify", "mission.identify.repeats=1", "mission.duration_s=27.5")
-CIRCLE = ("start.center_ned_m=[5, 0, -3]", "mission.circle.climb_ned_m_s=0", "mission.duration_s=20")
+CIRCLE = ("start.center_ned_m=[5, 0, -3]", "mission.circle.climb_ned_m_s=0", "mission.duration_s=17")
 
 
 def fly(*overrides: str, until: Phase = Phase.GOTO_LAND) -> Lockstep:
@@ -60,7 +60,7 @@ def circle_rmse_m(*overrides: str) -> float:
     """Return the error of the reported position from 10 s on [m]."""
     ticks = fly(*AIR, *CIRCLE, *overrides).logs[0].ticks
     late = ticks[(ticks["phase"] == Phase.TRACK) & (ticks["mission_t_s"] >= 10.0)]
-    assert len(late) > 450
+    assert len(late) > 330
     return float(np.sqrt(np.mean(np.sum((late["pos_ned_m"] - late["ref_pos_ned_m"]) ** 2, axis=1))))
 
 

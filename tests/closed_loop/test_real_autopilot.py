@@ -7,6 +7,7 @@ flights of real autopilots; each is tested once, and once more with the responsi
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from sitl.lockstep import Lockstep
 from swarmctl.config import load
 from swarmctl.core.types import Array, Phase, PlanStatus
+from tests.closed_loop.conftest import Flight, closer_than, mission_is_over
 
 CONFIG = Path(__file__).parents[2] / "configs" / "x500_circle.toml"
 WIND_NED_M_S = (3.6, 0.0, 0.0)
@@ -31,14 +33,16 @@ PLAIN = ("vehicle_model.attitude_rad_s=0", "vehicle_model.drag_1_s=0", "agent.st
 
 
 @functools.cache
-def fly(*overrides: str, wind_ned_m_s: tuple[float, float, float] | None = None) -> Lockstep:
-    """Fly until the mission is over."""
+def fly(
+    *overrides: str,
+    wind_ned_m_s: tuple[float, float, float] | None = None,
+    until: Callable[[Lockstep], bool] = mission_is_over,
+) -> Lockstep:
+    """Fly until the mission is over, or until another end."""
     flight = Lockstep(load(CONFIG, overrides))
     if wind_ned_m_s is not None:
         flight.world.set_wind(wind_ned_m_s)
-    while flight.clock.now_us() < 70e6 and not all(
-        len(log.rows) and log.rows[-1]["phase"][0] > Phase.TRACK for log in flight.logs
-    ):
+    while flight.clock.now_us() < 70e6 and not until(flight):
         flight.step()
     return flight
 
@@ -113,7 +117,8 @@ def together(flight: Lockstep) -> tuple[float, float, float]:
     )
 
 
-SWARM = ("sitl.start=air", "mission.duration_s=26")
+SWARM = ("sitl.start=air", "mission.duration_s=22.6")  # a period of the circle after the first 10 s
+TOO_CLOSE_M = 0.6
 
 
 def test_three_vehicles_keep_apart_and_close_to_the_reference() -> None:
@@ -124,8 +129,8 @@ def test_three_vehicles_keep_apart_and_close_to_the_reference() -> None:
 
 
 def test_three_vehicles_without_lag_and_dead_time_in_the_prediction_do_not() -> None:
-    _, _, true_m = together(fly(*SWARM, *PLAIN, "vehicle_model.delay_s=0", "mission.duration_s=11"))
-    assert true_m < 0.6
+    flight = fly(*SWARM, *PLAIN, "vehicle_model.delay_s=0", until=closer_than(TOO_CLOSE_M))
+    assert Flight(flight).separation_m() < TOO_CLOSE_M
 
 
 IN_A_ROW = (
@@ -157,7 +162,7 @@ def test_three_vehicles_keep_their_assigned_places_around_the_reference() -> Non
 
 
 def test_three_vehicles_without_assigned_places_push_each_other_around_it() -> None:
-    flight = fly(*IN_A_ROW)
+    flight = fly(*IN_A_ROW, "mission.duration_s=12")
     assert wandered_m(flight) > 0.12
     assert together(flight)[1] < 0.89
 
@@ -167,11 +172,13 @@ def test_three_vehicles_without_assigned_places_push_each_other_around_it() -> N
 
 def outcome(*overrides: str) -> tuple[str, bool]:
     """Return why the first agent ended, and whether any vehicle was ever armed."""
-    flight = Lockstep(load(CONFIG, (*overrides, "mission.duration_s=1", "agent.state_machine.start_timeout_s=25")))
-    while not flight.finished and flight.clock.now_us() < 30e6:
+    flight = Lockstep(load(CONFIG, (*overrides, "mission.duration_s=1", "agent.state_machine.start_timeout_s=12")))
+    armed = False
+    while not (flight.finished or armed) and flight.clock.now_us() < 30e6:
         flight.step()
+        armed = bool(flight.world.truth_rows()["armed"].any())
     assert flight.agents[0] is not None
-    return flight.agents[0].outcome, bool(flight.truth["armed"].any())
+    return flight.agents[0].outcome, armed
 
 
 def test_a_radius_below_what_the_estimator_claims_is_refused_before_arming() -> None:

@@ -17,7 +17,7 @@ PHASES = [Phase.ARM, Phase.TAKEOFF]
 
 
 def died_in(phase: Phase) -> Lockstep:
-    """Return a flight forty seconds after the only agent of the vehicle died in the given phase."""
+    """Return a flight after the only agent of the vehicle died in the given phase: disarmed, or forty seconds later."""
     flight = Lockstep(load(None, ["swarm.agents=1", "mission.duration_s=5"]))
     entered_us: int | None = None
     while entered_us is None or flight.clock.now_us() < entered_us + (2_000_000 if phase is Phase.TAKEOFF else 60_000):
@@ -27,8 +27,10 @@ def died_in(phase: Phase) -> Lockstep:
             entered_us = flight.clock.now_us()
     flight.kill(0)
     until_us = flight.clock.now_us() + 40_000_000
-    while flight.clock.now_us() < until_us:
+    armed = flight.world.truth_rows()["armed"]
+    while flight.clock.now_us() < until_us and (armed[0] or phase is Phase.ARM):
         flight.step()
+        armed = flight.world.truth_rows()["armed"]
     return flight
 
 
