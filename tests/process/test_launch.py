@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
 import json
 import os
 import re
@@ -14,7 +15,9 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +26,7 @@ import pytest
 
 from swarmctl.config import load
 from swarmctl.core.types import Phase
+from swarmctl.ops.cli import main
 from swarmctl.ops.processes import wants_realtime
 from tests.benches.scheduling import may_run_in_realtime, policies
 from tests.process.test_readme import ROOT, landed, shown
@@ -33,7 +37,7 @@ READY_S = 90.0
 END_S = 150.0
 TWO = ("--agents", "2", "--set", "telemetry.enabled=false")
 STAY = ("--set", "mission.kind=swap", "--set", "mission.swap.travel_s=600", "--set", "start.spacing_m=2")
-NEAR = (*STAY, "--set", "sitl.ground_z_m=1")  # nothing to reach, nothing in the way, and a short landing
+NEAR = (*STAY, "--set", "sitl.ground_z_m=0.5")  # nothing to reach, nothing in the way, and a short landing
 PATIENT = "agent.autopilot_params={COM_OBL_RC_ACT=4,COM_OF_LOSS_T=3}"  # where there is no ground no failsafe ever lands
 AIR = (*STAY, "--set", "sitl.start=air", "--set", PATIENT)  # neither taken off nor landed, where that is not asked
 
@@ -112,14 +116,19 @@ class Launched:
         return landed(self.run_dir)
 
 
+Start = Callable[..., Launched]
+
+
 @pytest.fixture
-def start(tmp_path: Path) -> Iterator[Callable[..., Launched]]:
+def start(tmp_path: Path) -> Iterator[Start]:
     launches: list[Launched] = []
+    number = itertools.count()
 
     def starter(*arguments: str) -> Launched:
         temp = Path(tempfile.mkdtemp(prefix="sw"))
-        launches.append(Launched(tmp_path / f"run{len(launches)}", temp, *arguments))
-        return launches[-1]
+        launched = Launched(tmp_path / f"run{next(number)}", temp, *arguments)
+        launches.append(launched)
+        return launched
 
     yield starter
     for launched in launches:
@@ -131,7 +140,15 @@ def start(tmp_path: Path) -> Iterator[Callable[..., Launched]]:
         shutil.rmtree(launched.temp, ignore_errors=True)
 
 
-def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Callable[..., Launched]) -> None:
+def at_once(flights: Sequence[Callable[[], object]]) -> None:
+    """Fly beside each other what mostly waits, and fail as the first that fails."""
+    with ThreadPoolExecutor(len(flights)) as pool:
+        flown = [pool.submit(flight) for flight in flights]
+    for flight in flown:
+        flight.result()
+
+
+def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Start) -> None:
     (line,) = shown(r"^swarmctl launch configs/thesis")
     launched = start(*shlex.split(line)[2:], "--duration", "4", "--no-view")
     launched.until_phase("TRACK", 3)
@@ -169,7 +186,7 @@ def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Callable[..., La
     assert int(received[1]) > 300, "the viewer saw the ticks"
 
 
-def test_a_killed_agent_fails_the_launch_and_the_others_finish(start: Callable[..., Launched]) -> None:
+def test_a_killed_agent_fails_the_launch_and_the_others_finish(start: Start) -> None:
     """In guaranteed mode a dead agent is not waited for, and the others still ask each other."""
     guaranteed = ("--set", "telemetry.enabled=false", "--set", "separation.mode=guaranteed")
     launched = start("--agents", "3", "--duration", "4", *NEAR, *guaranteed)
@@ -193,7 +210,7 @@ def test_a_killed_agent_fails_the_launch_and_the_others_finish(start: Callable[.
         assert 1 in [row["peer"] for row in launched.events("operator", agent)], "the launch has seen it end"
 
 
-def test_ctrl_c_lands_and_sums_up(start: Callable[..., Launched]) -> None:
+def ctrl_c_lands_and_sums_up(start: Start) -> None:
     launched = start(*TWO, *NEAR, "--duration", "60")
     launched.until_phase("TRACK", 2)
     launched.process.send_signal(signal.SIGINT)
@@ -203,7 +220,7 @@ def test_ctrl_c_lands_and_sums_up(start: Callable[..., Launched]) -> None:
     assert "interrupted, summed mean tracking error" in launched.text()
 
 
-def test_a_second_ctrl_c_ends_everything_at_once(start: Callable[..., Launched]) -> None:
+def a_second_ctrl_c_ends_everything_at_once(start: Start) -> None:
     launched = start("--agents", "2", *AIR, "--duration", "60", "--no-view")
     launched.until_phase("TRACK", 2)
     launched.process.send_signal(signal.SIGINT)
@@ -213,7 +230,7 @@ def test_a_second_ctrl_c_ends_everything_at_once(start: Callable[..., Launched])
     assert launched.summary()["outcome"] == "interrupted"
 
 
-def test_a_closed_terminal_lands_and_keeps_the_verdict(start: Callable[..., Launched]) -> None:
+def a_closed_terminal_lands_and_keeps_the_verdict(start: Start) -> None:
     """The kernel and the shell both send SIGHUP: that is one request, and after the flight none at all."""
     launched = start(*TWO, *NEAR, "--duration", "60")
     launched.until_phase("TRACK", 2)
@@ -231,18 +248,7 @@ def test_a_closed_terminal_lands_and_keeps_the_verdict(start: Callable[..., Laun
     assert "killed" not in launched.text()
 
 
-@pytest.mark.parametrize("when_s", [0.0, 0.3, 1.0, 2.0])
-def test_ctrl_c_during_start_leaves_nothing(start: Callable[..., Launched], when_s: float) -> None:
-    launched = start(*TWO, "--duration", "6")
-    while not (launched.run_dir / "config.toml").exists():
-        assert launched.process.poll() is None, launched.text()
-        time.sleep(0.01)
-    time.sleep(when_s)
-    launched.process.send_signal(signal.SIGINT)
-    assert launched.end() == 130, launched.text()
-
-
-def test_a_killed_launcher_leaves_nothing(start: Callable[..., Launched]) -> None:
+def a_killed_launcher_leaves_nothing(start: Start) -> None:
     launched = start("--agents", "2", *AIR, "--duration", "60", "--no-view")
     launched.until_phase("TRACK", 2)
     launched.process.kill()
@@ -255,33 +261,71 @@ def test_a_killed_launcher_leaves_nothing(start: Callable[..., Launched]) -> Non
     assert launched.leftovers() == []
 
 
-@pytest.mark.parametrize(("name", "where"), [("swarmctl.bus.zenoh_bus", NEAR), ("sitl", AIR)], ids=["bus", "sitl"])
-def test_without_router_or_simulator_the_launch_ends_as_failed(
-    start: Callable[..., Launched], name: str, where: tuple[str, ...]
-) -> None:
+def without_its_router_the_launch_lands_and_ends_as_failed(start: Start) -> None:
+    assert killed_part(start, "swarmctl.bus.zenoh_bus", *NEAR).landed() == {0: True, 1: True}
+
+
+def without_its_simulator_the_launch_ends_as_failed(start: Start) -> None:
+    killed_part(start, "sitl", *AIR)
+
+
+def killed_part(start: Start, name: str, *where: str) -> Launched:
     launched = start(*TWO, *where, "--duration", "60")
     launched.until_phase("TRACK", 2)
     os.kill(launched.pid_of(name), signal.SIGKILL)
     assert launched.end() == 4, launched.text()
     assert launched.summary()["outcome"] == "failed"
-    if name != "sitl":
-        assert launched.landed() == {0: True, 1: True}
+    return launched
 
 
-def test_the_flight_does_not_need_its_viewer(start: Callable[..., Launched]) -> None:
-    launched = start("--agents", "2", *AIR, "--duration", "3", "--no-view")
-    launched.until_phase("TRACK", 2)
-    os.kill(launched.pid_of("swarmctl.telemetry.view.viewer"), signal.SIGKILL)
-    assert launched.end() == 0, launched.text()
-    assert launched.text().count("the flight goes on") == 1
+@pytest.mark.parametrize(
+    "ends",
+    [
+        (
+            ctrl_c_lands_and_sums_up,
+            a_closed_terminal_lands_and_keeps_the_verdict,
+            without_its_router_the_launch_lands_and_ends_as_failed,
+        ),
+        (
+            a_second_ctrl_c_ends_everything_at_once,
+            a_killed_launcher_leaves_nothing,
+            without_its_simulator_the_launch_ends_as_failed,
+        ),
+    ],
+    ids=["on the ground", "in the air"],
+)
+def test_launches_that_end_before_their_time(start: Start, ends: Sequence[Callable[[Start], None]]) -> None:
+    at_once([partial(end, start) for end in ends])
 
 
-def test_two_launches_at_once_beside_another_simulator(start: Callable[..., Launched]) -> None:
-    """Every PX4-like simulator sends to 14540 and up until answered: neither launch takes the other's vehicles."""
+@pytest.mark.parametrize("when_s", [(0.0, 2.0), (0.3, 1.0)])
+def test_ctrl_c_during_start_leaves_nothing(start: Start, when_s: Sequence[float]) -> None:
+    at_once([partial(ctrl_c_during_start, start, after_s) for after_s in when_s])
+
+
+def ctrl_c_during_start(start: Start, when_s: float) -> None:
+    launched = start(*TWO, "--duration", "6")
+    while not (launched.run_dir / "config.toml").exists():
+        assert launched.process.poll() is None, launched.text()
+        time.sleep(0.01)
+    time.sleep(when_s)
+    launched.process.send_signal(signal.SIGINT)
+    assert launched.end() == 130, launched.text()
+
+
+def test_two_launches_at_once_beside_another_simulator(start: Start) -> None:
+    """Every PX4-like simulator sends to 14540 and up until answered: neither launch takes the other's vehicles.
+
+    The first loses its viewer, which its flight does not need.
+    """
     others = subprocess.Popen([sys.executable, "-m", "sitl", "--vehicles", "3"], stdout=subprocess.DEVNULL)
     try:
-        first, second = (start(*TWO, *AIR, "--duration", "2") for _ in range(2))
+        first = start("--agents", "2", *AIR, "--duration", "3", "--no-view")
+        second = start(*TWO, *AIR, "--duration", "2")
+        first.until_phase("TRACK", 2)
+        os.kill(first.pid_of("swarmctl.telemetry.view.viewer"), signal.SIGKILL)
         assert first.end() == 0, first.text()
+        assert first.text().count("the flight goes on") == 1
         assert second.end() == 0, second.text()
     finally:
         others.terminate()
@@ -291,60 +335,65 @@ def test_two_launches_at_once_beside_another_simulator(start: Callable[..., Laun
     assert one["run"] != other["run"]
 
 
-def test_operator_verbs(start: Callable[..., Launched]) -> None:
+def test_operator_verbs(start: Start, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """In this process, except for one: test_readme.py starts most of them as the programs they are."""
     launched = start(*TWO, *AIR, "--duration", "120")
+    monkeypatch.setattr(tempfile, "tempdir", str(launched.temp))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "")
+
+    def verb(*arguments: str) -> subprocess.CompletedProcess[str]:
+        monkeypatch.setattr(sys, "argv", ["swarmctl", *arguments])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        said = capsys.readouterr()
+        return subprocess.CompletedProcess(arguments, int(ended.value.code or 0), said.out, said.err)
+
     launched.until_phase("CONNECT", 2)
-    early = launched.verb("hold")  # the estimators need four seconds more
+    early = verb("hold")  # the estimators need four seconds more
     assert early.returncode == 4, early.stdout
     assert re.search(r"hold: agent-0 is in (CONNECT|STANDBY) and ignores it; it is obeyed in TRACK", early.stderr)
     launched.until_phase("TRACK", 2)
-    statuses = json.loads(launched.verb("status", "--json").stdout)
+    statuses = json.loads(verb("status", "--json").stdout)
     assert [status["agent"] for status in statuses] == [0, 1]
-    held = launched.verb("hold", "--agent", "1")
+    held = verb("hold", "--agent", "1")
     assert held.returncode == 0, held.stderr
     assert "agent-1" in held.stdout
     assert "agent-0" not in held.stdout
-    added = launched.verb(
-        "obstacle", "add", "--center", "-40,2.5,-9", "--radius", "0.5", "--run-dir", str(launched.run_dir)
-    )
+    where = ("--center", "-40,2.5,-9", "--radius", "0.5", "--run-dir", str(launched.run_dir))
+    added = verb("obstacle", "add", *where)
     assert added.returncode == 0, added.stderr
     assert "0: centre -40.00, 2.50, -9.00" in added.stdout
-    assert "1 obstacles" in launched.verb("obstacle", "list").stdout
-    assert "0 obstacles" in launched.verb("obstacle", "remove", "0").stdout
-    assert launched.verb("obstacle", "remove", "0").returncode == 2
-    assert launched.verb("land", "--agent", "7").returncode == 3
-    assert launched.verb("resume").returncode == 0
+    assert "1 obstacles" in verb("obstacle", "list").stdout
+    assert "0 obstacles" in verb("obstacle", "remove", "0").stdout
+    assert verb("obstacle", "remove", "0").returncode == 2
+    assert verb("land", "--agent", "7").returncode == 3
+    assert verb("resume").returncode == 0
     excluded = launched.verb("exclude", "--peer", "1")
     assert excluded.returncode == 0, excluded.stderr
-    assert launched.verb("exclude", "--peer", "255").returncode == 2
-    assert launched.verb("land").returncode == 0
+    assert verb("exclude", "--peer", "255").returncode == 2
+    assert verb("land").returncode == 0
     assert launched.end() == 130, launched.text()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "code", "words"),
-    [
-        (["--agents", "0"], 2, ["swarm.agents = 0", ">= 1"]),
-        (["--agents", "1000"], 2, ["swarm.agents = 1000", "<= 100"]),
-        (["--agents", "three"], 2, ["--agents"]),
-        (["--duration", "nan"], 2, ["mission.duration_s", "finite"]),
-        (["no/such/file.toml"], 2, ["no/such/file.toml", "no such file"]),
-        (["--set", "swarm.agnets=3"], 2, ["did you mean 'agents'"]),
-        (["--nonsense"], 2, ["--nonsense"]),
-    ],
-)
-def test_bad_usage_is_refused_before_anything_starts(
-    start: Callable[..., Launched], arguments: list[str], code: int, words: list[str]
-) -> None:
-    launched = start(*arguments)
-    assert launched.end(30.0) == code
-    assert "Traceback" not in launched.text()
-    for word in words:
-        assert word in launched.text()
-    assert not launched.run_dir.exists()
+def test_bad_usage_is_refused_before_anything_starts(start: Start) -> None:
+    wrong = [
+        (["--agents", "0"], ["swarm.agents = 0", ">= 1"]),
+        (["--agents", "1000"], ["swarm.agents = 1000", "<= 100"]),
+        (["--agents", "three"], ["--agents"]),
+        (["--duration", "nan"], ["mission.duration_s", "finite"]),
+        (["no/such/file.toml"], ["no/such/file.toml", "no such file"]),
+        (["--set", "swarm.agnets=3"], ["did you mean 'agents'"]),
+        (["--nonsense"], ["--nonsense"]),
+    ]
+    for launched, (_, words) in [(start(*arguments), (arguments, words)) for arguments, words in wrong]:
+        assert launched.end(30.0) == 2, launched.text()
+        assert "Traceback" not in launched.text()
+        for word in words:
+            assert word in launched.text()
+        assert not launched.run_dir.exists()
 
 
-def test_vehicle_links_that_can_not_work_are_all_named_at_once(start: Callable[..., Launched], tmp_path: Path) -> None:
+def test_vehicle_links_that_can_not_work_are_all_named_at_once(start: Start, tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
         port = taken.getsockname()[1]
