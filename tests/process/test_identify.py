@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from pymavlink.dialects.v20 import development as mavlink
 from swarmctl.config import load
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.core.types import Landed, Phase
+from tests.benches.at_once import at_once
 from tests.process.test_check import Pilot, Simulator
 
 pytestmark = pytest.mark.process
@@ -26,6 +28,7 @@ CONFIG = ROOT / "configs" / "x500_circle.toml"
 SHORT = (
     "swarm.agents=1",
     "start.center_ned_m=[0.0, 0.0, -2.0]",
+    "sitl.ground_z_m=-0.5",
     "mission.identify.repeats=1",
     "mission.identify.hold_s=1.5",
 )
@@ -34,7 +37,7 @@ SHORT = (
 def begin(directory: Path, *arguments: str) -> subprocess.Popen[str]:
     sets = [item for pair in SHORT for item in ("--set", pair)]
     return subprocess.Popen(
-        [sys.executable, "-m", "swarmctl", "check", str(CONFIG), "--identify", *sets, *arguments],
+        [sys.executable, "-m", "swarmctl", "check", str(CONFIG), "--identify", "--seconds=1", *sets, *arguments],
         cwd=directory,
         env={**os.environ, "PYTHONPATH": str(ROOT)},
         stdout=subprocess.PIPE,
@@ -56,7 +59,16 @@ def tracking(directory: Path) -> bool:
     return any(np.frombuffer(d, TICK_DTYPE, len(d) // size)["phase"].max(initial=0) == Phase.TRACK for d in rows)
 
 
-def test_what_was_flown_becomes_a_table_for_the_configuration(tmp_path: Path) -> None:
+def test_a_flight_becomes_a_table_and_an_interrupted_one_none(tmp_path: Path) -> None:
+    """Both are flown beside each other."""
+    folders = [tmp_path / name for name in ("whole", "interrupted")]
+    for folder in folders:
+        folder.mkdir()
+    flights = (what_was_flown_becomes_a_table_for_the_configuration, ctrl_c_lands_and_nothing_is_written)
+    at_once([partial(flight, folder) for flight, folder in zip(flights, folders, strict=True)])
+
+
+def what_was_flown_becomes_a_table_for_the_configuration(tmp_path: Path) -> None:
     table = tmp_path / "x500.toml"
     flight = begin(tmp_path, "--apply", "--write", str(table))
     said, _ = flight.communicate(timeout=170)
@@ -70,7 +82,7 @@ def test_what_was_flown_becomes_a_table_for_the_configuration(tmp_path: Path) ->
     assert table.read_text() in said
 
 
-def test_ctrl_c_lands_and_nothing_is_written(tmp_path: Path) -> None:
+def ctrl_c_lands_and_nothing_is_written(tmp_path: Path) -> None:
     table = tmp_path / "x500.toml"
     flight = begin(tmp_path, "--apply", "--write", str(table))
     try:

@@ -16,7 +16,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -28,8 +27,9 @@ from swarmctl.config import load
 from swarmctl.core.types import Phase
 from swarmctl.ops.cli import main
 from swarmctl.ops.processes import wants_realtime
+from tests.benches.at_once import at_once
 from tests.benches.scheduling import may_run_in_realtime, policies
-from tests.process.test_readme import ROOT, landed, shown
+from tests.process.test_readme import ROOT, landed, low, shown
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
 
@@ -140,17 +140,9 @@ def start(tmp_path: Path) -> Iterator[Start]:
         shutil.rmtree(launched.temp, ignore_errors=True)
 
 
-def at_once(flights: Sequence[Callable[[], object]]) -> None:
-    """Fly beside each other what mostly waits, and fail as the first that fails."""
-    with ThreadPoolExecutor(len(flights)) as pool:
-        flown = [pool.submit(flight) for flight in flights]
-    for flight in flown:
-        flight.result()
-
-
 def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Start) -> None:
     (line,) = shown(r"^swarmctl launch configs/thesis")
-    launched = start(*shlex.split(line)[2:], "--duration", "4", "--no-view")
+    launched = start(*shlex.split(line)[2:], "--duration", "4", low(line), "--no-view")
     launched.until_phase("TRACK", 3)
     assert launched.verb("status").returncode == 0
     (started,) = launched.events("started")

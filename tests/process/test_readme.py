@@ -1,16 +1,19 @@
-"""Every command of README.md and docs/ is run as it stands, shortened only by `--duration` and kept off the screen.
+"""Every command of README.md and docs/ is run as it stands, only shortened and kept off the screen.
 
-The launch that is shown with a configuration is the whole mission of test_launch.py.
+What flies is shortened by `--duration`, and by a ground no more than a metre below the start. The launch that is shown
+with a configuration is the whole mission of test_launch.py.
 """
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import re
 import shlex
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +23,7 @@ from sitl.studies.bench.bench import PARTS
 from swarmctl.control.mpc.solvers.qp import SOLVERS
 from swarmctl.core.records import TRUTH_DTYPE
 from swarmctl.core.types import Landed
+from tests.benches.at_once import at_once
 
 pytestmark = pytest.mark.process
 
@@ -30,7 +34,7 @@ FENCED = re.compile(r"^```.*?^```$", re.DOTALL | re.MULTILINE)
 LINES = [line for page in PAGES for line in FENCED.sub("", page.read_text()).splitlines()]
 SHOWN = [line.strip() for line in LINES if re.match(r"    (swarmctl|python3?) ", line)]
 BIN = Path(sys.executable).parent
-WHILE_FLYING = ("status", "hold", "resume", "obstacle", "fault", "land")
+WHILE_FLYING = (("status", "hold"), ("obstacle", "fault"), ("resume",), ("land",))  # beside each other, near the start
 AFTERWARDS = ("report", "replay")
 CAMPAIGN = r"^python tools/campaign\.py "  # is run by tests/closed_loop/test_campaign.py
 
@@ -56,6 +60,11 @@ def environment() -> dict[str, str]:
     return {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
 
 
+def low(line: str) -> str:
+    """Return the option that puts the ground 1 m below where a command's flight starts."""
+    return f"--set=sitl.ground_z_m={-1 if ' configs/' in line else 1}"
+
+
 def landed(directory: Path) -> dict[int, bool]:
     """Whether each vehicle of a run folder ended on the ground, in truth."""
     data = (directory / "truth.bin").read_bytes()
@@ -67,7 +76,8 @@ def landed(directory: Path) -> dict[int, bool]:
 
 
 def test_nothing_is_shown_that_is_not_run() -> None:
-    run_here = shown(r"^swarmctl (launch|simulate) ") + shown(rf"^swarmctl ({'|'.join(WHILE_FLYING + AFTERWARDS)})\b")
+    verbs = [*itertools.chain(*WHILE_FLYING), *AFTERWARDS]
+    run_here = shown(r"^swarmctl (launch|simulate) ") + shown(rf"^swarmctl ({'|'.join(verbs)})\b")
     run_here += (
         shown(r"^python -m sitl ")
         + shown(r"^python3 -m venv ")
@@ -92,7 +102,7 @@ def test_the_two_set_up_lines_install_what_they_use() -> None:
 
 @pytest.mark.parametrize("line", shown(r"^swarmctl simulate "))
 def test_simulations(line: str, tmp_path: Path) -> None:
-    done = run(line, "--duration", "2", "--run-dir", str(tmp_path / "run"))
+    done = run(line, "--duration", "2", low(line), "--run-dir", str(tmp_path / "run"))
     assert done.returncode == 0, done.stdout + done.stderr
     assert "x real time" in done.stdout
 
@@ -128,7 +138,7 @@ def test_a_launch_its_operator_and_what_is_left(tmp_path: Path) -> None:
     directory = tmp_path / "run"
     command, *arguments = shlex.split(line)
     flying = subprocess.Popen(
-        [str(BIN / command), *arguments, "--no-view", "--duration", "60", "--run-dir", str(directory)],
+        [str(BIN / command), *arguments, "--no-view", "--duration", "60", low(line), "--run-dir", str(directory)],
         cwd=ROOT,
         env=environment() | {"TMPDIR": str(tmp_path)} if len(str(tmp_path)) < 40 else environment(),
         stdout=subprocess.PIPE,
@@ -139,10 +149,8 @@ def test_a_launch_its_operator_and_what_is_left(tmp_path: Path) -> None:
         for said in flying.stdout:
             if "TRACK" in said:
                 break
-        for verb in WHILE_FLYING:
-            (order,) = shown(rf"^swarmctl {verb}\b")
-            done = run(order, "--run-dir", str(directory))
-            assert done.returncode == 0, f"{order}: {done.stdout}{done.stderr}"
+        for verbs in WHILE_FLYING:
+            at_once([partial(operate, verb, directory) for verb in verbs])
         rest = flying.stdout.read()
         assert flying.wait(100) == 130, rest
         assert landed(directory) == {0: True, 1: True, 2: True}
@@ -156,6 +164,12 @@ def test_a_launch_its_operator_and_what_is_left(tmp_path: Path) -> None:
     refused = run(replay.replace("runs/DIR", str(directory)))
     assert refused.returncode == 3
     assert "no display" in refused.stderr
+
+
+def operate(verb: str, directory: Path) -> None:
+    (order,) = shown(rf"^swarmctl {verb}\b")
+    done = run(order, "--run-dir", str(directory))
+    assert done.returncode == 0, f"{order}: {done.stdout}{done.stderr}"
 
 
 def test_vehicles_of_another_process(tmp_path: Path) -> None:
