@@ -214,7 +214,7 @@ def wall(lower_m: float, any_height: bool = False) -> list[KeepOut]:
 @pytest.mark.parametrize("lower_m", [0.2, -0.2, 0.02])
 def test_a_wall_is_passed_above_or_below_with_every_plan_certified(lower_m: float, terminal: str) -> None:
     keep_outs = wall(lower_m)
-    flight = fly(joint(terminal_z=terminal), (4.0, 0.0, 0.0), keep_outs)
+    flight = fly(joint(terminal_z=terminal), (4.0, 0.0, 0.0), keep_outs, ticks=250)
     assert all(plan.status is PlanStatus.OK for plan in flight.plans)
     assert min(certify(plan.pos_ned_m, keep_outs, 6) for plan in flight.plans) >= 0.0
     assert flight.arc_length_m(keep_outs) > 0.85  # true distances of what was flown; 0.9 asked, 0.8 certified

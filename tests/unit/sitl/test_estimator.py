@@ -14,6 +14,7 @@ from swarmctl.core.clock import SimClock
 from swarmctl.mavlink.transport import pipe_pair
 from swarmctl.simulator_config import SimulatorConfig
 from tests.benches.flown_world import FlownWorld
+from tests.benches.px4_bench import COARSE
 
 VEHICLES = 12
 SECONDS = 60
@@ -150,7 +151,7 @@ def test_a_loitering_vehicle_wanders_as_its_estimate_does() -> None:
     """It keeps its place in what it believes, so in truth it moves by the error: decimetres with GPS, none without."""
     spread_m = {}
     for estimator in ("gps", "exact"):
-        flown = FlownWorld(3, estimator=estimator, preset="x500", seed=2)
+        flown = FlownWorld(3, estimator=estimator, preset="x500", seed=2, **COARSE)
         flown.take_off()
         kept: list[Any] = []
         for _ in range(15):

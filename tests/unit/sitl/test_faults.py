@@ -25,6 +25,7 @@ from swarmctl.ops.operator import RunningLaunch
 from swarmctl.process_lifetime import remove_socket
 from swarmctl.simulator_config import FAULTS, FaultParams
 from tests.benches.flown_world import FlownWorld
+from tests.benches.px4_bench import COARSE
 
 STEP_US = 4000
 
@@ -99,7 +100,7 @@ def test_every_kind_has_a_rule_and_an_effect() -> None:
 @pytest.fixture
 def flown() -> FlownWorld:
     """Two vehicles that loiter; one gets the fault."""
-    world = FlownWorld(2, preset="x500")
+    world = FlownWorld(2, preset="x500", **COARSE)
     world.take_off()
     world.step(2.0)
     return world
