@@ -36,7 +36,8 @@ pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
 READY_S = 90.0
 END_S = 150.0
 TWO = ("--agents", "2", "--set", "telemetry.enabled=false")
-STAY = ("--set", "mission.kind=swap", "--set", "mission.swap.travel_s=600", "--set", "start.spacing_m=2")
+COARSE = ("--set", "sitl.physics_hz=100")  # no launch depends on the steps of the simulated physics
+STAY = (*COARSE, "--set", "mission.kind=swap", "--set", "mission.swap.travel_s=600", "--set", "start.spacing_m=2")
 NEAR = (*STAY, "--set", "sitl.ground_z_m=0.5")  # nothing to reach, nothing in the way, and a short landing
 PATIENT = "agent.autopilot_params={COM_OBL_RC_ACT=4,COM_OF_LOSS_T=3}"  # where there is no ground no failsafe ever lands
 AIR = (*STAY, "--set", "sitl.start=air", "--set", PATIENT)  # neither taken off nor landed, where that is not asked
@@ -310,7 +311,8 @@ def test_two_launches_at_once_beside_another_simulator(start: Start) -> None:
 
     The first loses its viewer, which its flight does not need.
     """
-    others = subprocess.Popen([sys.executable, "-m", "sitl", "--vehicles", "3"], stdout=subprocess.DEVNULL)
+    command = [sys.executable, "-m", "sitl", "--vehicles", "3", "--physics-hz", "100"]
+    others = subprocess.Popen(command, stdout=subprocess.DEVNULL)
     try:
         first = start("--agents", "2", *AIR, "--duration", "3", "--no-view")
         second = start(*TWO, *AIR, "--duration", "2")

@@ -190,7 +190,8 @@ def test_vehicles_of_another_process(tmp_path: Path) -> None:
         assert asked.returncode == 4, "the simulator's vehicles stand 1 m apart, the configuration keeps 1.5 m"
         assert "stand closer than they may fly" in asked.stdout
         assert "COM_OBL_RC_ACT: 0 -> 4" in asked.stdout
-        done = run(line, "--no-view", "--duration", "2", "--run-dir", str(tmp_path / "run"), *urls)
+        near = "--set=start.center_ned_m=[0,0,-1]"  # above the ground of those vehicles
+        done = run(line, "--no-view", "--duration", "2", near, "--run-dir", str(tmp_path / "run"), *urls)
         assert done.returncode == 0, done.stdout + done.stderr
     finally:
         vehicles.terminate()

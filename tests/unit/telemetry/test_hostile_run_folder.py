@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import subprocess
 import sys
 from collections.abc import Callable
@@ -23,15 +24,20 @@ from swarmctl.telemetry.recording.run_folder import Outcome, create_run_folder, 
 from tests.unit.telemetry.test_run_folder import RULES, write_run
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
+@pytest.fixture(scope="module")
+def unspoilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run of three agents without faults."""
-    directory = tmp_path / "run"
-    directory.mkdir()
+    directory = tmp_path_factory.mktemp("run")
     write_run(directory, 3, 6.0)
     (directory / "config.toml").write_text(dump(Config()))
     finish_run(directory, RULES, Outcome(outcome="completed"))
     return directory
+
+
+@pytest.fixture
+def folder(unspoilt: Path, tmp_path: Path) -> Path:
+    """A copy of it to spoil."""
+    return Path(shutil.copytree(unspoilt, tmp_path / "run"))
 
 
 def report(directory: Path) -> subprocess.CompletedProcess[str]:
