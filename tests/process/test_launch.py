@@ -36,7 +36,7 @@ pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
 READY_S = 90.0
 END_S = 150.0
 TWO = ("--agents", "2", "--set", "telemetry.enabled=false")
-COARSE = ("--set", "sitl.physics_hz=100")  # no launch depends on the steps of the simulated physics
+COARSE = ("--set", "sitl.physics_hz=100", "--set", "agent.rate_hz=25")  # how a launch ends depends on neither
 STAY = (*COARSE, "--set", "mission.kind=swap", "--set", "mission.swap.travel_s=600", "--set", "start.spacing_m=2")
 NEAR = (*STAY, "--set", "sitl.ground_z_m=0.5")  # nothing to reach, nothing in the way, and a short landing
 PATIENT = "agent.autopilot_params={COM_OBL_RC_ACT=4,COM_OF_LOSS_T=3}"  # where there is no ground no failsafe ever lands
@@ -181,7 +181,14 @@ def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Start) -> None:
 
 def test_a_killed_agent_fails_the_launch_and_the_others_finish(start: Start) -> None:
     """In guaranteed mode a dead agent is not waited for, and the others still ask each other."""
-    guaranteed = ("--set", "telemetry.enabled=false", "--set", "separation.mode=guaranteed")
+    guaranteed = (
+        "--set",
+        "telemetry.enabled=false",
+        "--set",
+        "separation.mode=guaranteed",
+        "--set",
+        "agent.rate_hz=50",
+    )
     launched = start("--agents", "3", "--duration", "4", *NEAR, *guaranteed)
     launched.until_phase("TRACK", 3)
     os.kill(launched.pid_of("agent", "--id", "1"), signal.SIGKILL)
