@@ -34,7 +34,7 @@ FENCED = re.compile(r"^```.*?^```$", re.DOTALL | re.MULTILINE)
 LINES = [line for page in PAGES for line in FENCED.sub("", page.read_text()).splitlines()]
 SHOWN = [line.strip() for line in LINES if re.match(r"    (swarmctl|python3?) ", line)]
 BIN = Path(sys.executable).parent
-WHILE_FLYING = (("status", "hold"), ("obstacle", "fault"), ("resume",), ("land",))  # beside each other, near the start
+WHILE_FLYING = (("status", "hold"), ("obstacle", "fault", "resume"), ("land",))  # beside each other, near the start
 AFTERWARDS = ("report", "replay")
 CAMPAIGN = r"^python tools/campaign\.py "  # is run by tests/closed_loop/test_campaign.py
 

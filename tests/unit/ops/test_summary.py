@@ -9,7 +9,8 @@ from pathlib import Path
 import pytest
 
 from swarmctl.config import Config, dump
-from tests.unit.telemetry.test_run_folder import write_run
+from swarmctl.telemetry.recording.run_folder import Outcome, finish_run
+from tests.unit.telemetry.test_run_folder import RULES, write_run
 
 # What the launcher does after all agents have landed; `limit` is the largest file the system lets it write.
 _SUM_UP = """
@@ -66,7 +67,7 @@ main()
 @pytest.mark.parametrize("finished", [True, False])
 def test_a_report_that_a_full_disk_does_not_take_is_an_error(folder: Path, finished: bool) -> None:
     if finished:
-        sum_up(folder, -1)
+        finish_run(folder, RULES, Outcome(outcome="completed"))
     command = [sys.executable, "-c", _REPORT, str(folder)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
     assert (done.returncode, done.stdout) == (3, "")
