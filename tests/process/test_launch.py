@@ -181,14 +181,7 @@ def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Start) -> None:
 
 def test_a_killed_agent_fails_the_launch_and_the_others_finish(start: Start) -> None:
     """In guaranteed mode a dead agent is not waited for, and the others still ask each other."""
-    guaranteed = (
-        "--set",
-        "telemetry.enabled=false",
-        "--set",
-        "separation.mode=guaranteed",
-        "--set",
-        "agent.rate_hz=50",
-    )
+    guaranteed = [f"--set={it}" for it in ("telemetry.enabled=false", "separation.mode=guaranteed", "agent.rate_hz=50")]
     launched = start("--agents", "3", "--duration", "4", *NEAR, *guaranteed)
     launched.until_phase("TRACK", 3)
     os.kill(launched.pid_of("agent", "--id", "1"), signal.SIGKILL)
