@@ -13,13 +13,16 @@ import swarmctl  # noqa: F401  (before anything loads numpy)
 TESTS = Path(__file__).parent
 LONGEST = [  # over a minute each
     "process/test_readme.py",
-    "closed_loop/test_failures.py",
     "closed_loop/test_guaranteed.py",
+    "closed_loop/test_failures.py",
     "process/test_launch.py",
     "closed_loop/test_deadlock.py",
     "closed_loop/test_real_autopilot.py",
+    "closed_loop/test_circle.py",
+    "closed_loop/test_campaign.py",
+    "closed_loop/test_solvers.py",
+    "closed_loop/test_gusts.py",
     "closed_loop/test_swap.py",
-    "process/test_identify.py",
     "closed_loop/test_forgery.py",
     "closed_loop/test_identify.py",
     "process/test_viewer.py",
