@@ -135,7 +135,26 @@ class Coordination:
         known, required = self._peer_trajectories.newest, self._required_peers()
         self.cut_off = self._why_cut_off(utc_us, required)
         commitments.update(utc_us, known, required)
-        conflicting = commitments.conflicting_peers(utc_us, known)
+        taking_part = self._taking_part(utc_us, known, required)
+        now = Situation(
+            utc_us=utc_us,
+            begin_us=utc_us,
+            desired=desired,
+            peers={agent: known[agent] for agent in taking_part},
+            others=self._others(utc_us, state, phase, taking_part),
+            disturbance_ned_m_s2=disturbance_ned_m_s2,
+        )
+        commitments.evade(now)
+        unsure = {a for a in required if self._world_model.clocks.error_us(a) > self._clock_error_max_us}
+        self.alert = self._why_slow(unsure)
+        if commitments.is_due(utc_us) and self._grip < Grip.STOPPED and not unsure:
+            begin_us = utc_us + commitments.lead_us
+            others = self._others(begin_us, state, phase, taking_part)
+            commitments.propose(replace(now, begin_us=begin_us, peers=known, others=others))
+
+    def _taking_part(self, utc_us: int, known: Mapping[int, TrajectoryMessage], required: Set[int]) -> set[int]:
+        """Return the peers whose commitments are relied on, and remember where lost ones end."""
+        conflicting = self._commitments.conflicting_peers(utc_us, known)
         if conflicting != self._conflicting:
             self._conflicting = conflicting
             self._note("conflicting_commitment", by=sorted(conflicting))
@@ -147,23 +166,7 @@ class Coordination:
         self.lost_peer_keep_outs = [keep_out for agent in lost_peers for keep_out in self._ends(known[agent])]
         taking_part = {a for a in required - absent - conflicting - deviating if a in committed}
         self.committed_peers = {agent: known[agent].followed for agent in taking_part}
-        partners = {agent: known[agent] for agent in taking_part}
-        others = self._others(utc_us, state, phase, taking_part)
-        now = Situation(
-            utc_us=utc_us,
-            begin_us=utc_us,
-            desired=desired,
-            peers=partners,
-            others=others,
-            disturbance_ned_m_s2=disturbance_ned_m_s2,
-        )
-        commitments.evade(now)
-        unsure = {a for a in required if self._world_model.clocks.error_us(a) > self._clock_error_max_us}
-        self.alert = self._why_slow(unsure)
-        if commitments.is_due(utc_us) and self._grip < Grip.STOPPED and not unsure:
-            begin_us = utc_us + commitments.lead_us
-            others = self._others(begin_us, state, phase, taking_part)
-            commitments.propose(replace(now, begin_us=begin_us, peers=known, others=others))
+        return taking_part
 
     def wait(self, utc_us: int, state: VehicleState | None) -> None:
         """Keep what is committed while the state is stale for a moment; longer is `idle`.

@@ -25,6 +25,7 @@ from swarmctl.core.types import Array, Plan, PlanStatus, Reference, Sampled
 
 _BRAKE_POINTS_01 = (1.0, 0.75, 0.5, 0.3, 0.15)  # shares of the plan after which braking is tried, latest first
 _MIN_GAIN_M = 0.02  # clearance an evasive trajectory has to gain over the committed one
+_LEAST_COS_TILT = 0.5  # at the start of a plan, as its bounds on tilt allow
 _CLIMB_M_S, _CLIMB_M_S2 = 2.0, 2.0
 _RUN_UP_M_S2 = 0.8  # acceleration along a path up to its own speed
 _BRAKING_TAIL_S = 2.0  # part of the final braking that is checked against keep-outs
@@ -92,7 +93,8 @@ class TrajectoryPlanner:
         agent: own number.
         params: parameters of planning.
         mpc: the controller's bounds and weights.
-        vehicle: its lag, drag and bounds; its dead time is the follower's matter.
+        vehicle: its drag and bounds. Lag and dead time are made up for by the follower, which looks ahead along the
+            committed trajectory; that changes no faster than the controller's inputs may.
         separation: distances to keep.
         max_keep_outs: number of neighbours and obstacles that get rows in the MPC.
         stopwatch_ns: see `CondensedMpc`.
@@ -199,7 +201,7 @@ class TrajectoryPlanner:
             t_us=now.begin_us,
             pos_ned_m=pos[0],
             vel_ned_m_s=vel[0],
-            cos_tilt=math.sqrt(1.0 - float(virtual_control[:2] @ virtual_control[:2])),
+            cos_tilt=max(_LEAST_COS_TILT, math.sqrt(1.0 - float(virtual_control[:2] @ virtual_control[:2]))),
             virtual_control=virtual_control,
         )
         wanted = Reference(*now.desired.reference(1e-6 * (ahead_us + (now.begin_us - now.utc_us))), 0.0)
