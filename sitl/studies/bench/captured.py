@@ -33,7 +33,7 @@ from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, HalfSpaces
 from swarmctl.control.mpc.problem import Problem
 from swarmctl.control.mpc.solvers.qp import QpParams, installed_solvers
 from swarmctl.control.mpc.swarm_mpc import MpcParams, SwarmMpc
-from swarmctl.core.types import Array, Plan
+from swarmctl.core.types import Array, Phase, Plan
 
 Mask = NDArray[np.bool_]
 _OBSTACLE = "obstacles=[{center_ned_m=[-5.0,-1.5,-1.8],radius_m=1.0,keep_out_m=1.75,visibility_m=3.0}]"
@@ -96,11 +96,11 @@ def capture(config: Config, keep_outs: int = _MAX_KEEP_OUTS, most: int = 240) ->
         agent._controller = recordings[-1]  # only tracking is recorded, so `_transit` stays
     found: list[list[tuple[Problem, float]]] = [[] for _ in agents]
 
-    def enough(_: Lockstep) -> bool:
+    def enough(flown: Lockstep) -> bool:
         for agent, recording, kept in zip(agents, recordings, found, strict=True):
             kept += [(p, agent.timing.tick_ms) for p in recording.problems if len(p.keep_outs) == keep_outs]
             recording.problems.clear()
-        return len(found[0]) >= most
+        return len(found[0]) >= most or all(log.rows[-1]["phase"][0] > Phase.TRACK for log in flown.logs)
 
     with settled_garbage():
         flight.run(enough)

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 from scipy import optimize
 
-from sitl import lockstep
 from sitl.studies.bench import bench, command, formation
 from sitl.studies.bench.captured import Captured, capture, circle_with_obstacle, measure_xy, tapped
 from sitl.studies.bench.formation import Formation, Neighbours, formation_config, places_m
@@ -30,10 +29,8 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="module")
 def captured() -> Captured:
-    """The problems of a flight that ends with its mission: of the way home none is recorded."""
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(lockstep, "_TAIL_S", 6.5)  # 5 to the start
-        return capture(circle_with_obstacle())
+    """The problems of a whole flight."""
+    return capture(circle_with_obstacle())
 
 
 @pytest.mark.usefixtures("quick")
