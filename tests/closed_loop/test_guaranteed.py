@@ -21,6 +21,7 @@ from swarmctl.bus.peers import agent_name
 from swarmctl.config import load
 from swarmctl.control.collision.barrier import Barrier, BarrierParams, Body
 from swarmctl.control.collision.separation import SeparationParams
+from swarmctl.control.commit import trajectory_planner
 from swarmctl.control.mpc.problem import Start
 from swarmctl.core.clock import ClockError
 from swarmctl.core.types import Array, Phase
@@ -242,9 +243,12 @@ def test_a_tracking_violation_is_reported(body_m: float, told: bool) -> None:
         assert float(str(off[0]["error_m"])) > float(str(off[0]["allowed_m"])) == pytest.approx(0.1 / 3)
 
 
-@pytest.mark.parametrize(("weights", "follows"), [("", True), ("{q_pos=2.0,q_vel=0.05,r=1.0}", False)])
-def test_the_committed_trajectory_is_tracked_in_height_too(weights: str, follows: bool) -> None:
+@pytest.mark.parametrize(("weights", "moves", "follows"), [("", 10, True), ("{q_pos=2.0,q_vel=0.05,r=1.0}", 3, False)])
+def test_the_committed_trajectory_is_tracked_in_height_too(
+    weights: str, moves: int, follows: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Into a climbing circle from rest; control: the thesis' soft z, which is good enough for a desired reference."""
+    monkeypatch.setattr(trajectory_planner, "_FOLLOWING_MOVES_Z", moves)
     sets = ["swarm.agents=1", "sitl.start=air", "separation.mode=guaranteed", "mission.duration_s=2.5"]
     sets += [f"agent.commit.follow_z={weights}"] * bool(weights)
     flight = Lockstep(load(None, sets))

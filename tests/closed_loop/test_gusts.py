@@ -47,7 +47,10 @@ def test_a_sudden_wind_blows_a_hovering_vehicle_no_farther_than_distances_leave_
 
 
 def blown_farther_than_expected() -> CollisionMonitor:
-    """Six vehicles swap with room for gusts of 4 m/s; each is hit by a wind of 8 m/s of its own in the first 4 s."""
+    """Six vehicles swap with room for gusts of 4 m/s; each is hit by a wind of 8 m/s of its own in the first 4 s.
+
+    That is more than is guaranteed: what is shown is that the reaction makes the difference in one flight, not in all.
+    """
     cell = Cell(
         scenario="swap",
         agents=6,
@@ -60,7 +63,7 @@ def blown_farther_than_expected() -> CollisionMonitor:
         disturbance="steps:8",
         sets="separation.gust_m_s=4",
     )
-    flight = TrialFlight(Trial(cell, 2), replace(drawn(cell, 2), limit_s=8.0))
+    flight = TrialFlight(Trial(cell, 1), replace(drawn(cell, 1), limit_s=8.0))
     flight.run()
     return flight.monitor
 

@@ -40,7 +40,7 @@ def test_a_vehicle_far_outside_has_to_commit_anew() -> None:
 def test_being_far_outside_again_and_again_has_growing_consequences() -> None:
     tube, grips = Tube(NOMINAL_M), []
     for k in range(40):
-        tube.update(k * TICK_US, 0.4, 1.0)
+        tube.update(k * TICK_US, 0.5, 1.0)
         grips.append(tube.grip(k * TICK_US))
     assert grips == [Grip.WIDENED] * 2 + [Grip.STOPPED] * 37 + [Grip.LOST]
 
@@ -48,7 +48,7 @@ def test_being_far_outside_again_and_again_has_growing_consequences() -> None:
 @pytest.mark.parametrize(("lost_times", "inside_s", "grip"), [(3, 0.5, Grip.STOPPED), (3, 1.1, Grip.HELD)])
 def test_a_stopped_vehicle_goes_on_after_a_second(lost_times: int, inside_s: float, grip: Grip) -> None:
     tube = Tube(NOMINAL_M)
-    flown(tube, [0.4] * lost_times)
+    flown(tube, [0.5] * lost_times)
     now_us = lost_times * TICK_US + round(1e6 * inside_s)
     tube.update(now_us, 0.0, 0.0)
     assert tube.grip(now_us) is grip
@@ -57,5 +57,5 @@ def test_a_stopped_vehicle_goes_on_after_a_second(lost_times: int, inside_s: flo
 def test_losses_long_ago_do_not_count() -> None:
     tube, times_us = Tube(NOMINAL_M), np.arange(8) * 6_000_000
     for t_us in times_us.tolist():
-        tube.update(t_us, 0.4, 1.0)
+        tube.update(t_us, 0.5, 1.0)
         assert tube.grip(t_us) is Grip.WIDENED, "at most two in any 10 s"
