@@ -2,10 +2,12 @@
 
 Two committed trajectories keep a distance that leaves each vehicle a *tube*: half of what lies beyond touching bodies.
 A vehicle that leaves its tube tells its peers a wider one, by which they plan, and which narrows again once it is back.
-A vehicle far outside no longer flies what it has committed to, and what follows depends on how often that happens:
+A vehicle that is blown away, or far outside, no longer flies what it has committed to. One that merely lags behind had
+better return: its commitment keeps clear of all others, a new one from beside it may not. What follows depends on how
+often a commitment is lost:
 
 1. *widen*: it commits anew, from the state that was measured, and goes on;
-2. *stop*: it proposes nothing until it has not been far outside for a while, and so rests where it stops;
+2. *stop*: it proposes nothing until it has lost none for a while, and so rests where it stops;
 3. *land*: it can't hold any trajectory, and lands where it is.
 """
 
@@ -18,10 +20,11 @@ from enum import IntEnum
 _WIDENED_S = 0.3  # time for which a deviation is expected to grow at its present speed
 _WIDEST_M = 2.0  # a wider tube would only stop everybody else
 _NARROWING_S = 1.0  # time constant with which a widened tube narrows
-_FAR_M = 0.15  # outside the tube: the vehicle will not be back soon
-_HELD_US = 1_000_000  # not far outside for this long: what is committed is held again
+_BLOWN_M, _BLOWN_M_S = 0.15, 1.0  # outside the tube, and moving away: gusts do that
+_FAR_M = 0.5  # outside the tube, however slowly; trackers of real autopilots lag by 0.27 m at most (PX4 1.18)
+_HELD_US = 1_000_000  # nothing lost for this long: what is committed is held again
 _WINDOW_US = 10_000_000
-_STOPS_AT, _LANDS_AT = 3, 40  # how often a vehicle has been far outside within that window
+_STOPS_AT, _LANDS_AT = 3, 40  # how often a commitment has been lost within that window
 
 
 class Grip(IntEnum):
@@ -54,7 +57,7 @@ class Tube:
         """Take in the deviation from the committed trajectory, of position and of velocity.
 
         Returns:
-            whether the vehicle is so far outside its tube that it has to commit anew.
+            whether the commitment is lost, so that the vehicle has to commit anew.
         """
         since_us = 0 if self._updated_us is None else utc_us - self._updated_us
         self._updated_us = utc_us
@@ -66,10 +69,10 @@ class Tube:
         if beyond_m > 0.0:
             widened_m = max(widened_m, min(_WIDEST_M, beyond_m + _WIDENED_S * error_m_s))
         self.radius_m = self._nominal_m + widened_m
-        is_far = beyond_m > _FAR_M
-        if is_far:
+        is_lost = beyond_m > _FAR_M or (beyond_m > _BLOWN_M and error_m_s > _BLOWN_M_S)
+        if is_lost:
             self._lost_us.append(utc_us)
-        return is_far
+        return is_lost
 
     def grip(self, utc_us: int) -> Grip:
         """Return how well the vehicle follows its commitments now."""

@@ -202,7 +202,7 @@ def test_a_vehicle_off_its_commitment_commits_anew_tells_peers_and_stops(bench: 
     bench.fly(1.0, each=bench.send)
     assert (bench.coordination.margin_m, bench.coordination.alert) == (0.0, "")
     for times in (1, 2, 3):
-        bench.blown_m = np.array([0.0, 0.5 * times, 0.0])
+        bench.blown_m = np.array([0.0, 0.8 * times, 0.0])
         bench.fly(0.04, each=bench.send)
         place, _ = bench.coordination.sample_committed(np.array([bench.clock.utc_us()]))
         np.testing.assert_allclose(place[0], HERE + bench.blown_m, atol=0.05)

@@ -33,14 +33,19 @@ def test_a_widened_tube_grows_with_the_speed_of_the_deviation_and_narrows_again(
     assert NOMINAL_M < tube.radius_m < NOMINAL_M + 0.05
 
 
-def test_a_vehicle_far_outside_has_to_commit_anew() -> None:
-    assert flown(Tube(NOMINAL_M), [0.1, 0.34, 0.36, 0.1]) == [False, False, True, False]
+@pytest.mark.parametrize(
+    ("speed_m_s", "lost"),
+    [(2.0, [False, False, True, True]), (0.5, [False, False, False, True])],
+    ids=["blown", "lags"],
+)
+def test_a_vehicle_that_is_blown_away_or_far_outside_commits_anew(speed_m_s: float, lost: list[bool]) -> None:
+    assert flown(Tube(NOMINAL_M), [0.1, 0.34, 0.36, 0.71], speed_m_s) == lost
 
 
 def test_being_far_outside_again_and_again_has_growing_consequences() -> None:
     tube, grips = Tube(NOMINAL_M), []
     for k in range(40):
-        tube.update(k * TICK_US, 0.5, 1.0)
+        tube.update(k * TICK_US, 0.8, 1.0)
         grips.append(tube.grip(k * TICK_US))
     assert grips == [Grip.WIDENED] * 2 + [Grip.STOPPED] * 37 + [Grip.LOST]
 
@@ -48,7 +53,7 @@ def test_being_far_outside_again_and_again_has_growing_consequences() -> None:
 @pytest.mark.parametrize(("lost_times", "inside_s", "grip"), [(3, 0.5, Grip.STOPPED), (3, 1.1, Grip.HELD)])
 def test_a_stopped_vehicle_goes_on_after_a_second(lost_times: int, inside_s: float, grip: Grip) -> None:
     tube = Tube(NOMINAL_M)
-    flown(tube, [0.5] * lost_times)
+    flown(tube, [0.8] * lost_times)
     now_us = lost_times * TICK_US + round(1e6 * inside_s)
     tube.update(now_us, 0.0, 0.0)
     assert tube.grip(now_us) is grip
@@ -57,5 +62,5 @@ def test_a_stopped_vehicle_goes_on_after_a_second(lost_times: int, inside_s: flo
 def test_losses_long_ago_do_not_count() -> None:
     tube, times_us = Tube(NOMINAL_M), np.arange(8) * 6_000_000
     for t_us in times_us.tolist():
-        tube.update(t_us, 0.5, 1.0)
+        tube.update(t_us, 0.8, 1.0)
         assert tube.grip(t_us) is Grip.WIDENED, "at most two in any 10 s"
