@@ -242,7 +242,7 @@ class Coordination:
         return utc_us - self._peer_trajectories.received_utc_us.get(agent, utc_us)
 
     def _why_slow(self, unsure: Set[int]) -> str:
-        if self._grip > Grip.HELD:
+        if self._grip > Grip.OUTSIDE:
             return f"blown off what it had committed to: {self._grip.name.lower()}"
         return f"the clock of {_names(unsure)} is not known well enough" if unsure else ""
 

@@ -31,9 +31,10 @@ class Grip(IntEnum):
     """How well a vehicle follows what it commits to."""
 
     HELD = 0
-    WIDENED = 1
-    STOPPED = 2
-    LOST = 3
+    OUTSIDE = 1  # of the tube, on the way back
+    WIDENED = 2
+    STOPPED = 3
+    LOST = 4
 
 
 class Tube:
@@ -51,6 +52,7 @@ class Tube:
         self._nominal_m = nominal_m
         self._lost_us: deque[int] = deque()
         self._updated_us: int | None = None
+        self._is_outside = False
         self.radius_m, self.worst_m = nominal_m, 0.0
 
     def update(self, utc_us: int, error_m: float, error_m_s: float) -> bool:
@@ -66,7 +68,8 @@ class Tube:
             self._lost_us.popleft()
         widened_m = (self.radius_m - self._nominal_m) * math.exp(-1e-6 * since_us / _NARROWING_S)
         beyond_m = error_m - self._nominal_m
-        if beyond_m > 0.0:
+        self._is_outside = beyond_m > 0.0
+        if self._is_outside:
             widened_m = max(widened_m, min(_WIDEST_M, beyond_m + _WIDENED_S * error_m_s))
         self.radius_m = self._nominal_m + widened_m
         is_lost = beyond_m > _FAR_M or (beyond_m > _BLOWN_M and error_m_s > _BLOWN_M_S)
@@ -76,10 +79,8 @@ class Tube:
 
     def grip(self, utc_us: int) -> Grip:
         """Return how well the vehicle follows its commitments now."""
-        if not self._lost_us:
-            return Grip.HELD
         if len(self._lost_us) >= _LANDS_AT:
             return Grip.LOST
-        if utc_us - self._lost_us[-1] >= _HELD_US:
-            return Grip.HELD
+        if not self._lost_us or utc_us - self._lost_us[-1] >= _HELD_US:
+            return Grip.OUTSIDE if self._is_outside else Grip.HELD
         return Grip.STOPPED if len(self._lost_us) >= _STOPS_AT else Grip.WIDENED

@@ -22,6 +22,15 @@ def test_a_vehicle_that_stays_inside_tells_the_nominal_tube() -> None:
     assert (tube.radius_m, tube.worst_m, tube.grip(4 * TICK_US)) == (NOMINAL_M, 0.2, Grip.HELD)
 
 
+def test_a_vehicle_outside_is_reported_until_it_is_back() -> None:
+    tube = Tube(NOMINAL_M)
+    grips = []
+    for k, error_m in enumerate((0.1, 0.3, 0.1)):
+        tube.update(k * TICK_US, error_m, 0.2)
+        grips.append(tube.grip(k * TICK_US))
+    assert grips == [Grip.HELD, Grip.OUTSIDE, Grip.HELD]
+
+
 def test_a_widened_tube_grows_with_the_speed_of_the_deviation_and_narrows_again() -> None:
     radii_m = []
     for speed_m_s in (0.5, 2.0, 100.0):
