@@ -217,7 +217,7 @@ class Coordination:
         return self._tube.radius_m - self._tube_m
 
     def _watch(self, utc_us: int, state: VehicleState) -> None:
-        """Commit anew, from the measured state, when the vehicle has left its tube."""
+        """Commit anew, from the measured state, when the commitment is lost; report how well it is held."""
         pos, vel = (sampled[0] for sampled in self.sample_committed(np.array([utc_us])))
         error_m = float(np.linalg.norm(state.pos_ned_m - pos))
         if self._tube.update(utc_us, error_m, float(np.linalg.norm(state.vel_ned_m_s - vel))):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from markupsafe import Markup
 
+from sitl.studies.campaign.disturbances import NONE
 from sitl.studies.campaign.scenarios import SCENARIOS
 from sitl.studies.campaign.summary import CellSummary, Share, summaries
 from sitl.studies.campaign.trials import Row, trial_of
@@ -94,7 +95,7 @@ _COLUMNS: tuple[_Column, ...] = (
     ("wind", lambda s: f"{s.cell.wind_m_s:g} m/s" if s.cell.wind_m_s else ""),
     ("protections", lambda s: s.cell.protections),
     ("airframe", lambda s: "" if s.cell.airframe == "own" else s.cell.airframe),
-    ("disturbance", lambda s: "" if s.cell.disturbance == "none" else s.cell.disturbance),
+    ("disturbance", lambda s: "" if s.cell.disturbance == NONE else s.cell.disturbance),
     ("settings", lambda s: s.cell.sets),
     ("collided", lambda s: _share(s.collided, False)),
     ("arrived", lambda s: _share(s.arrived, True)),

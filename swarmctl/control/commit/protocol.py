@@ -33,10 +33,9 @@ The proof rests on these assumptions, each of which is watched in flight:
   bodies. `swarmctl.control.commit.tube` watches it; the event `tracking_violation` reports who leaves its tube, and
   `commitments` at the end the worst error of the flight.
 - Commitments are kept. A commitment changes without acknowledgement only where a vehicle first commits at speed, where
-  it has left its tube, and by `evade`, before something that does not take part: around it, to a stop, or above it. An
-  agent that finds a peer's
-  commitment in conflict with its own (`conflicting_peers`), or a peer off its committed trajectory, keeps clear of that
-  peer as of one that does not take part.
+  it is blown far from its tube, and by `evade`, before something that does not take part: around it, to a stop, or
+  above it. An agent that finds a peer's commitment in conflict with its own (`conflicting_peers`), or a peer outside
+  its tube, keeps clear of that peer as of one that does not take part.
 - Every agent takes part. A vehicle that does not (a pilot flies it, its agent has died) is a keep-out of the
   best-effort kind. A silent peer stays a participant; when one is left out is in `swarmctl.control.commit.membership`:
   it takes evidence or a majority. The events `membership` and `operator` say who was, and on whose word.
@@ -115,7 +114,7 @@ class Commitments:
         self.proposal = None
 
     def restart(self, pos_ned_m: Array, vel_ned_m_s: Array, utc_us: int) -> None:
-        """Commit anew to braking to rest, without acknowledgement, where the vehicle has left its tube."""
+        """Commit anew to braking to rest, without acknowledgement, from where the commitment was lost (see `tube`)."""
         self.begin(pos_ned_m, vel_ned_m_s, utc_us)
         self.counts.evasive += 1
 
