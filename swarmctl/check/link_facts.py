@@ -50,7 +50,8 @@ class LinkFacts:
     rates_hz: Mapping[str, float]  # message name -> rate of arrival
     frames_s: float
     bytes_s: float
-    lost_01: float  # share of frames missing by their sequence numbers
+    lost_01: float  # share of frames lost on the way: missing by sequence number, and not dropped by this computer
+    dropped: int = 0  # datagrams that this computer was too busy to take
     mavlink1: int  # frames
     mavlink2: int
     autopilots: tuple[int, ...]  # system ids

@@ -61,9 +61,14 @@ class FrameStatistics:
             rates[name] = (count - 1) / span_s if count > 2 and span_s > 0 else count / max(listened_s, 1e-6)
         return rates
 
-    @property
-    def lost_01(self) -> float:
-        return self.lost / (self.lost + self.frames) if self.frames else 0.0
+    def lost_01(self, dropped: int) -> float:
+        """Return the share of frames lost on the way.
+
+        Args:
+            dropped: frames that reached this computer and were lost there.
+        """
+        lost = max(0, self.lost - dropped)
+        return lost / (lost + self.frames) if self.frames else 0.0
 
 
 def round_trip(answers: Sequence[Answer], by: str) -> RoundTrip | None:

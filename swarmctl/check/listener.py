@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import contextlib
 import socket
+import struct
+import sys
 from typing import NamedTuple, Protocol
 
 from swarmctl.mavlink.transport import Transport, bind_towards, bind_udp, open_transport, parse_url, resolve
@@ -17,6 +19,8 @@ Address = tuple[str, int]
 NOWHERE: Address = ("", 0)
 _MAX_DATAGRAM = 2048
 _DATAGRAMS_AT_ONCE = 200  # bounded, so that one flooded link does not starve the others
+_SO_RXQ_OVFL = 40  # Linux: each datagram comes with the number that found the queue full; not in Python's socket
+_COUNT = struct.Struct("@I")
 
 
 class ReceivedDatagram(NamedTuple):
@@ -28,7 +32,13 @@ class ReceivedDatagram(NamedTuple):
 
 
 class Listener(Protocol):
-    """Receives and sends on one vehicle's link without blocking."""
+    """Receives and sends on one vehicle's link without blocking.
+
+    Attributes:
+        dropped: datagrams that reached this computer and found its queue full, as far as the system tells.
+    """
+
+    dropped: int
 
     def receive(self) -> list[ReceivedDatagram]:
         """Return everything that has arrived since the last call."""
@@ -63,19 +73,25 @@ class UdpListener:
     """Listens on a bound UDP socket."""
 
     def __init__(self, sock: socket.socket) -> None:
+        self.dropped = 0
         self._sock = sock
         self._sock.setblocking(False)
+        if sys.platform == "linux":
+            self._sock.setsockopt(socket.SOL_SOCKET, _SO_RXQ_OVFL, 1)
 
     def receive(self) -> list[ReceivedDatagram]:
         heard: list[ReceivedDatagram] = []
         for _ in range(_DATAGRAMS_AT_ONCE):
             try:
-                data, sender = self._sock.recvfrom(_MAX_DATAGRAM)
+                data, ancillary, _, sender = self._sock.recvmsg(_MAX_DATAGRAM, socket.CMSG_SPACE(_COUNT.size))
             except ConnectionRefusedError:
                 continue  # ICMP port unreachable surfaces here once
             except OSError:
                 break
             heard.append(ReceivedDatagram(monotonic_us(), data, sender))
+            for level, kind, value in ancillary:
+                if level == socket.SOL_SOCKET and kind == _SO_RXQ_OVFL:
+                    [self.dropped] = _COUNT.unpack(value)
         return heard
 
     def send(self, data: bytes, to: Address) -> None:
@@ -93,6 +109,7 @@ class TransportListener:
     """Listens on a serial or TCP link, which has one other end."""
 
     def __init__(self, transport: Transport, there: Address) -> None:
+        self.dropped = 0
         self._transport, self._there = transport, there
 
     def receive(self) -> list[ReceivedDatagram]:

@@ -82,6 +82,7 @@ class VehicleScan:
         self.sysid = 0  # system id of the scanned vehicle; 0 before its first heartbeat
         self.began_us: int | None = None
         self.mavlink1 = self.mavlink2 = 0
+        self._datagrams = 0
         self.senders: set[Address] = set()
         self.has_metadata = False  # it serves component information
         self.newest: dict[tuple[int, str], Newest] = {}
@@ -112,6 +113,11 @@ class VehicleScan:
         if not self.found_autopilot or self.listened_s(now_us) < least_s:
             return False
         return self.parameters is None or self.parameters.settled
+
+    @property
+    def dropped_frames(self) -> int:
+        """Number of frames that this computer has dropped, at as many in a datagram as in those received."""
+        return round(self.listener.dropped * (self.mavlink1 + self.mavlink2) / max(1, self._datagrams))
 
     def message(self, name: str) -> Any | None:
         """Return the newest message of a type from the vehicle, or None."""
@@ -196,6 +202,7 @@ class VehicleScan:
     # --- reception ---
 
     def _take(self, heard: ReceivedDatagram) -> None:
+        self._datagrams += 1
         for frame in frames(heard.data, version_1=True):
             if frame[0] == mavlink.PROTOCOL_MARKER_V1:
                 sysid, compid, seq = frame[3], frame[4], frame[2]

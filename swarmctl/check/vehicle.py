@@ -326,14 +326,18 @@ def _rates(facts: VehicleFacts, config: Config) -> Finding | None:
 
 
 def _loss(facts: VehicleFacts, config: Config) -> Finding:
-    lost_01 = facts.link.lost_01
-    verdict = FIX if lost_01 > _LOSS_FIX_01 else NOTE if lost_01 > _LOSS_NOTE_01 else OK
-    advice = "" if verdict is OK else "frames are lost on the way: antennas, baud rate, or too much is sent"
+    lost_01, dropped = facts.link.lost_01, facts.link.dropped
+    if lost_01 > _LOSS_NOTE_01:
+        verdict = FIX if lost_01 > _LOSS_FIX_01 else NOTE
+        advice = "frames are lost on the way: antennas, baud rate, or too much is sent"
+    else:
+        verdict = NOTE if dropped else OK
+        advice = "this computer was too busy to take all that arrived: fly with less beside it" if dropped else ""
     return Finding(
         agent=facts.agent,
         topic="loss",
         verdict=verdict,
-        found=f"{lost_01:.1%}",
+        found=f"{lost_01:.1%}" + (f", {dropped} dropped here" if dropped else ""),
         wanted=f"under {_LOSS_NOTE_01:.0%}",
         advice=advice,
         weight=67,

@@ -24,7 +24,7 @@ from swarmctl.mavlink.latch import Address, IsVehicle, Latch, admit_only, anybod
 _MAX_DATAGRAM = 2048
 _CHUNK = 65536
 _DATAGRAMS_A_POLL, _BYTES_A_POLL = 600, 131_072  # limits of one tick; the rest waits for the next
-_BUFFER_BYTES = 1 << 20  # as much as the system allows, so that frames survive a pause of the agent
+_BUFFER_BYTES = 1 << 20  # as much as the system allows, so that frames survive a pause of the reader
 _SO_TIMESTAMPNS = 35  # Linux; socket.SO_TIMESTAMPNS is not exported before Python 3.13
 _TIMESPEC = struct.Struct("@qq")
 _URL = re.compile(r"^(?P<scheme>udpin|udpout|tcp|serial)://(?P<where>[^:]+):(?P<number>\d+)$")
@@ -124,6 +124,7 @@ def bind_udp(host: str, port: int) -> socket.socket:
         StartError: the port is taken or the host is not ours.
     """
     sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
     try:
         sock.bind((host, port))
     except (OSError, OverflowError) as error:
@@ -166,7 +167,6 @@ class UdpTransport:
     def __init__(self, sock: socket.socket, remote: Address | None = None, is_vehicle: IsVehicle = anybody) -> None:
         self._sock = sock
         self._sock.setblocking(False)
-        self._sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
         self.latch = Latch(is_vehicle, remote)
         self._admitted: Address | None = None  # sender that the kernel admits; None: every sender
         self._stamped = sys.platform == "linux"

@@ -322,6 +322,8 @@ PX4_CASES: list[tuple[str, dict[str, Any], Verdict, str]] = [
     ("state rate", {"url": "serial:///dev/ttyX:57600", "link_bytes_s": 3000.0}, FIX, "state_rate_hz"),
     ("loss", {"link_lost_01": 0.02}, NOTE, "lost on the way"),
     ("loss", {"link_lost_01": 0.2}, FIX, "lost on the way"),
+    ("loss", {"link_dropped": 40}, NOTE, "this computer was too busy"),
+    ("loss", {"link_lost_01": 0.2, "link_dropped": 40}, FIX, "lost on the way"),
     ("round trip", {"link_round_trip": None}, NOTE, "neither"),
     ("round trip", {"link_round_trip": RoundTrip(p50_ms=90.0, p99_ms=120.0, answers=60, by="PING")}, NOTE, "0.045 s"),
     (
