@@ -57,6 +57,7 @@ def status_message(
     separation_m: float = 1.0,
     deadline_misses: int = 0,
     active_alert: str = "",
+    held: bool = False,
     utc_us: int = 0,
 ) -> StatusMessage:
     """Return the status of an agent that tracks its mission."""
@@ -69,6 +70,7 @@ def status_message(
         flight_mode=FlightMode.EXTERNAL,
         armed=True,
         landed=Landed.IN_AIR,
+        held=held,
         ready_utc_us=0,
         outcome="",
         position_error_m=position_error_m,

@@ -191,12 +191,19 @@ class Agent:
         return self._separation.commits_refused
 
     def ask(self, order: Order, now_us: int) -> None:
-        """Apply an operator's order."""
+        """Obey an operator's order, or refuse it with a reason; the operator is answered either way."""
         if order.verb == EXCLUDE:
             self._world_model.exclude(int(order.arguments[PEER]))
+            refusal = ""
         else:
-            self._state_machine.operator(order, now_us, self._clock.utc_us(), self._autopilot.poll(now_us))
-        self._note("operator", verb=order.verb, **order.arguments)
+            state = self._autopilot.poll(now_us)
+            refusal = self._state_machine.operator(order, now_us, self._clock.utc_us(), state)
+        self._world_model.answer(order, refusal)
+        if refusal:
+            self._alerts.put("order", f"{order.verb} refused: {refusal}", now_us)
+            self._note("order_refused", verb=order.verb, reason=refusal, **order.arguments)
+        else:
+            self._note("operator", verb=order.verb, **order.arguments)
 
     def tick(self, now_us: int, deadline_misses: int) -> TickRecord:
         """Run one control step at monotonic time `now_us`.
@@ -265,6 +272,8 @@ class Agent:
     def _receive(self, now_us: int) -> None:
         for order in self._world_model.receive(self._clock.utc_us()):
             self.ask(order, now_us)
+        for answer in self._world_model.due_answers():
+            self._publisher.answer(answer)
         self._separation.receive(self._clock.utc_us())
 
     def _sense(self, now_us: int) -> VehicleState | None:

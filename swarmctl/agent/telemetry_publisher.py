@@ -10,13 +10,14 @@ from typing import Any, Protocol
 import numpy as np
 
 from swarmctl.bus import topics
-from swarmctl.bus.json_messages import StatusMessage, encode_message
+from swarmctl.bus.json_messages import MAX_REASON, AnswerMessage, StatusMessage, encode_message
 from swarmctl.bus.peers import Bus, PeerPaths
 from swarmctl.control.collision.separation import KeepOut
 from swarmctl.control.estimation.disturbance import Estimate
 from swarmctl.control.mpc.problem import Start
 from swarmctl.control.phases.state_machine import MissionStateMachine
 from swarmctl.core.clock import Clock
+from swarmctl.core.operator_verbs import Answer
 from swarmctl.core.records import pack_tick
 from swarmctl.core.tick_record import TickRecord, TickTiming
 from swarmctl.core.types import AttitudeSetpoint, Mode, Plan, Reference, VehicleState
@@ -119,6 +120,19 @@ class TelemetryPublisher:
             self._bus.publish(topics.STATUS, encode_message(self._status(record, state_machine)))
         return record
 
+    def answer(self, answer: Answer) -> None:
+        """Answer an operator's order."""
+        message = AnswerMessage(
+            agent=self._agent,
+            boot_id=self._boot_id,
+            verb=answer.verb,
+            number=answer.number,
+            accepted=answer.accepted,
+            reason=answer.reason[:MAX_REASON],
+            utc_us=self._clock.utc_us(),
+        )
+        self._bus.publish(topics.ANSWER, encode_message(message))
+
     def _record(
         self,
         now_us: int,
@@ -186,6 +200,7 @@ class TelemetryPublisher:
             flight_mode=int(record.flight_mode),
             armed=record.armed,
             landed=int(self._autopilot.landed),
+            held=state_machine.held,
             ready_utc_us=state_machine.ready_utc_us,
             outcome=state_machine.outcome,
             position_error_m=_finite(error_m),

@@ -11,6 +11,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+UNNUMBERED = 0  # number of an order that wants no answer
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VerbArgument:
@@ -25,7 +27,7 @@ class VerbArgument:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OperatorVerb:
-    """Describes one verb; outside of `phases` an agent ignores it."""
+    """Describes one verb; outside of `phases` an agent refuses it, and may for a reason of its own within them."""
 
     help: str
     phases: frozenset[str]  # names of `Phase`, because the command line must not wait for numpy
@@ -40,25 +42,42 @@ class Order:
 
     verb: str
     arguments: Mapping[str, float] = field(default_factory=dict)
+    number: int = UNNUMBERED  # the same in every repetition; answers name it
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """Holds what an agent answers to a numbered order."""
+
+    verb: str
+    number: int
+    accepted: bool
+    reason: str = ""  # why it is refused
 
 
 EXCLUDE, PEER = "exclude", "peer"
-_BEFORE_LANDING = frozenset({"CONNECT", "STANDBY", "ARM", "TAKEOFF", "GOTO_START", "READY", "TRACK", "GOTO_LAND"})
+_AIRBORNE = frozenset({"TAKEOFF", "GOTO_START", "READY", "TRACK", "GOTO_LAND"})  # the agent decides where it flies
+_NOT_LANDING = _AIRBORNE | {"CONNECT", "STANDBY", "ARM", "DONE"}
 
 OPERATOR_VERBS = {
-    "hold": OperatorVerb(help="Brake and hold position.", phases=frozenset({"TRACK"})),
-    "resume": OperatorVerb(help="Resume the mission after `hold`.", phases=_BEFORE_LANDING),
+    "hold": OperatorVerb(
+        help="Brake and hold position, also on the way up and to the landing place.", phases=_AIRBORNE
+    ),
+    "resume": OperatorVerb(
+        help="Go on after `hold`, and take the vehicle back after a pilot or its autopilot took over.",
+        phases=_AIRBORNE | {"ARM"},  # also of a vehicle found in the air under a pilot
+    ),
     "land": OperatorVerb(
-        help="Separate, then land.", phases=_BEFORE_LANDING, is_stop=True, never_superseded=True
+        help="Separate, then land.", phases=_NOT_LANDING | {"LAND"}, is_stop=True, never_superseded=True
     ),  # a stamp a little in the future must not delay a landing
     "rtl": OperatorVerb(
         help="Fly back to the start under the agent's own MPC, then land. The autopilot's return mode is not used.",
-        phases=_BEFORE_LANDING,
+        phases=_NOT_LANDING,
         is_stop=True,
     ),
     EXCLUDE: OperatorVerb(
         help="Vouch that an agent has ended: the others no longer wait for its answers, and keep clear of its place.",
-        phases=_BEFORE_LANDING | {"LAND"},
+        phases=_NOT_LANDING | {"LAND"},
         arguments=(
             VerbArgument(name=PEER, option="--peer", help="Number of the agent that has ended.", least=0, most=254),
         ),

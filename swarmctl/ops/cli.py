@@ -45,8 +45,14 @@ Set = Annotated[
 ]
 NewRunDir = Annotated[Path | None, typer.Option("--run-dir", help="Run folder to create; default runs/<UTC>-<name>.")]
 View = Annotated[bool | None, typer.Option("--view/--no-view", help="Open the viewer window.")]
-RunningDir = Annotated[Path | None, typer.Option("--run-dir", help="Run folder of the launch; default: the newest.")]
-OneAgent = Annotated[int | None, typer.Option("--agent", help="Address one agent; default: all.")]
+Run = Annotated[
+    str | None,
+    typer.Option(
+        "--run", "--run-dir", metavar="NAME|DIR", help="Launch to act on, by name or run folder; default: the only one."
+    ),
+]
+AskedAgents = Annotated[list[int] | None, typer.Argument(metavar="AGENT", help="Agents asked; default: all.")]
+MoreAgents = Annotated[list[int] | None, typer.Option("--agent", help="Agent asked, as an option; repeatable.")]
 Folder = Annotated[Path, typer.Argument(help="Run folder.")]
 # The verb's module declares the options, and answers --help.
 _PASS_ON = {"ignore_unknown_options": True, "allow_extra_args": True, "help_option_names": []}
@@ -207,52 +213,57 @@ def agent(
 
 @app.command()
 def status(
-    run_dir: RunningDir = None,
+    run: Run = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
 ) -> int:
     """Show the status of every agent of a running launch."""
     from swarmctl.ops import operator
 
-    launch = operator.find_launch(run_dir)
+    launch = operator.find_launch(run)
     statuses = operator.read_statuses(launch)
     print(operator.as_json(statuses)) if as_json else _show(statuses, range(launch.agents))
     return EXIT_OK
 
 
-def _give(order: Order, run_dir: Path | None, agent: int | None) -> int:
-    from swarmctl.ops import operator
+_ANSWERS = "Exit code 0: every agent asked has accepted; 4: one has refused, or has not answered in time, and is named."
 
-    launch = operator.find_launch(run_dir)
-    statuses = operator.command(launch, order, agent)
-    asked = range(launch.agents) if agent is None else range(agent, agent + 1)
-    _show(statuses, asked)
-    if ignored := operator.ignored_by(order, statuses, asked):
-        raise MissionError(f"{order.verb}: {'; '.join(ignored)}")
+
+def _give(order: Order, run: str | None, agents: list[int]) -> int:
+    from swarmctl.ops import operator
+    from swarmctl.ops.order_delivery import deliver
+
+    launch = operator.find_launch(run)
+    print(f"{order.verb}: {launch.run}")
+    replies = deliver(launch, order, agents)
+    for reply in replies:
+        print(reply.line)
+    if problems := [reply.problem for reply in replies if reply.problem]:
+        raise MissionError(f"{order.verb}: {'; '.join(problems)}")
     return EXIT_OK
 
 
 def add_operator_verb(
-    to: typer.Typer, name: str, verb: OperatorVerb, give: Callable[[Order, Path | None, int | None], int] = _give
+    to: typer.Typer, name: str, verb: OperatorVerb, give: Callable[[Order, str | None, list[int]], int] = _give
 ) -> None:
     """Add a verb of the operator, with a required option for each of its arguments.
 
     Args:
         to: command line to extend.
         name, verb: entry of `OPERATOR_VERBS`.
-        give: gives the order to the launch of a run folder, to one agent or to all; returns the exit code.
+        give: gives the order to a launch, to the agents named or to all; returns the exit code.
     """
 
-    def run(run_dir: RunningDir = None, agent: OneAgent = None, **arguments: float) -> int:
-        return give(Order(name, arguments), run_dir, agent)
+    def run(asked: AskedAgents = None, run: Run = None, agent: MoreAgents = None, **arguments: float) -> int:
+        return give(Order(name, arguments), run, [*(asked or ()), *(agent or ())])
 
-    parameters = list(inspect.signature(run, eval_str=True).parameters.values())[:2]
+    parameters = list(inspect.signature(run, eval_str=True).parameters.values())[:3]
     for argument in verb.arguments:
         option = typer.Option(argument.option, min=argument.least, max=argument.most, help=argument.help)
         kind = inspect.Parameter.KEYWORD_ONLY
         parameters.append(inspect.Parameter(argument.name, kind, annotation=Annotated[float, option]))
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # typer derives options from it
-    to.command(name, help=verb.help)(run)
+    to.command(name, help=f"{verb.help} {_ANSWERS}")(run)
 
 
 for _name, _verb in OPERATOR_VERBS.items():
@@ -270,13 +281,13 @@ def fault(
         str, typer.Option("--direction", help="Link direction: both, to_vehicle, from_vehicle.")
     ] = "both",
     towards: Annotated[float, typer.Option("--towards", help="Direction of a gust or jump [deg from north].")] = 0.0,
-    run_dir: RunningDir = None,
+    run: Run = None,
 ) -> int:
     """Inject a fault into the simulator of a running launch. Refused where real vehicles fly."""
     from swarmctl.ops import operator
     from swarmctl.ops.fault import inject, parse_fault
 
-    launch = operator.find_launch(run_dir)
+    launch = operator.find_launch(run)
     wanted = {"kind": kind, "vehicle": vehicle, "value": value, "for_s": for_s, "rotor": rotor}
     asked = parse_fault({**wanted, "direction": direction, "towards_deg": towards}, launch.agents)
     print(inject(launch, asked))
@@ -284,11 +295,11 @@ def fault(
 
 
 @obstacle_app.command("list")
-def obstacle_list(run_dir: RunningDir = None) -> int:
+def obstacle_list(run: Run = None) -> int:
     """List the obstacles that the agents know."""
     from swarmctl.ops import operator
 
-    _show_obstacles(operator.read_obstacles(operator.find_launch(run_dir)))
+    _show_obstacles(operator.read_obstacles(operator.find_launch(run)))
     return EXIT_OK
 
 
@@ -304,37 +315,37 @@ def obstacle_add(
     column: Annotated[
         bool, typer.Option("--column", help="A vertical column of unlimited height, not a sphere.")
     ] = False,
-    run_dir: RunningDir = None,
+    run: Run = None,
 ) -> int:
     """Add a sphere or a column to a running launch."""
     from swarmctl.ops import operator
 
     keep_out_m = radius + 0.75 if keep_out is None else keep_out
     obstacle = operator.obstacle(center, radius, keep_out_m, visibility, velocity=velocity, column=column)
-    launch = operator.find_launch(run_dir)
+    launch = operator.find_launch(run)
     _show_obstacles(operator.change_obstacles(launch, lambda known: (*known, obstacle)))
     return EXIT_OK
 
 
 @obstacle_app.command("remove")
 def obstacle_remove(
-    number: Annotated[int, typer.Argument(help="Index in `obstacle list`, from 0.")], run_dir: RunningDir = None
+    number: Annotated[int, typer.Argument(help="Index in `obstacle list`, from 0.")], run: Run = None
 ) -> int:
     """Remove an obstacle from a running launch."""
     from swarmctl.ops import operator
 
-    launch = operator.find_launch(run_dir)
+    launch = operator.find_launch(run)
     _show_obstacles(operator.change_obstacles(launch, lambda known: operator.without(known, number)))
     return EXIT_OK
 
 
 @app.command()
-def view(run_dir: RunningDir = None) -> int:
+def view(run: Run = None) -> int:
     """Open the live view of a running launch."""
     from swarmctl.ops import operator
     from swarmctl.telemetry.view.recordings import open_viewer
 
-    open_viewer(operator.view_address(operator.find_launch(run_dir)))
+    open_viewer(operator.view_address(operator.find_launch(run)))
     return EXIT_OK
 
 

@@ -345,14 +345,17 @@ def test_operator_verbs(start: Start, monkeypatch: pytest.MonkeyPatch, capsys: p
     launched.until_phase("CONNECT", 2)
     early = verb("hold")  # the estimators need four seconds more
     assert early.returncode == 4, early.stdout
-    assert re.search(r"hold: agent-0 is in (CONNECT|STANDBY) and ignores it; it is obeyed in TRACK", early.stderr)
+    refused = r"hold: agent-0 refuses: it is in (CONNECT|STANDBY|ARM); hold is obeyed in TAKEOFF, GOTO_START"
+    assert re.search(refused, early.stderr)
+    assert re.match(r"hold: \S+\nagent-0 refuses: .*\nagent-1 refuses: ", early.stdout), "the run, and a line for each"
     launched.until_phase("TRACK", 2)
     statuses = json.loads(verb("status", "--json").stdout)
     assert [status["agent"] for status in statuses] == [0, 1]
-    held = verb("hold", "--agent", "1")
+    held = verb("hold", "1")
     assert held.returncode == 0, held.stderr
-    assert "agent-1" in held.stdout
+    assert "agent-1 accepts, TRACK" in held.stdout
     assert "agent-0" not in held.stdout
+    assert [status["held"] for status in json.loads(verb("status", "--json").stdout)] == [False, True]
     where = ("--center", "-40,2.5,-9", "--radius", "0.5", "--run-dir", str(launched.run_dir))
     added = verb("obstacle", "add", *where)
     assert added.returncode == 0, added.stderr
@@ -365,7 +368,9 @@ def test_operator_verbs(start: Start, monkeypatch: pytest.MonkeyPatch, capsys: p
     excluded = launched.verb("exclude", "--peer", "1")
     assert excluded.returncode == 0, excluded.stderr
     assert verb("exclude", "--peer", "255").returncode == 2
-    assert verb("land").returncode == 0
+    landed = verb("land")
+    assert landed.returncode == 0, landed.stderr
+    assert re.search(r"agent-0 accepts, (GOTO_LAND|LAND)\nagent-1 accepts, (GOTO_LAND|LAND)\n", landed.stdout)
     assert launched.end() == 130, launched.text()
 
 

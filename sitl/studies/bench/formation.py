@@ -211,6 +211,7 @@ class Formation:
             flight_mode=7,
             armed=True,
             landed=2,
+            held=False,
             ready_utc_us=1,
             outcome="",
             position_error_m=0.0,

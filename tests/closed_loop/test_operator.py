@@ -1,0 +1,58 @@
+"""An operator's verbs fly: a climb that is held stops within a second, whichever autopilot climbs, and goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from sitl.lockstep import Lockstep
+from swarmctl.config import load
+from swarmctl.core.types import Phase
+from tests.closed_loop.conftest import ROOT
+
+ON_GROUND_ALONE = ("swarm.agents=1", "mission.duration_s=1")
+
+
+def fly_until(flight: Lockstep, reached: Callable[[], bool], seconds: float = 60.0) -> None:
+    end_us = flight.clock.now_us() + round(seconds * 1e6)
+    while not reached():
+        assert flight.clock.now_us() < end_us, "not reached in time"
+        flight.step()
+
+
+def fly_for(flight: Lockstep, seconds: float) -> None:
+    end_us = flight.clock.now_us() + round(seconds * 1e6)
+    fly_until(flight, lambda: flight.clock.now_us() >= end_us, seconds + 1.0)
+
+
+def phase(flight: Lockstep, agent: int = 0) -> Phase:
+    rows = flight.logs[agent].rows
+    return Phase(int(rows[-1]["phase"][0])) if rows else Phase.CONNECT
+
+
+def vehicle(flight: Lockstep, agent: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Return the true position and velocity of a vehicle, (3,) each, NED."""
+    row = flight.world.truth_rows()[agent]
+    return row["pos_ned_m"].copy(), row["vel_ned_m_s"].copy()
+
+
+@pytest.mark.parametrize("config", [None, "ardupilot_sitl.toml"], ids=["px4", "arducopter"])
+def test_a_hold_on_the_way_up_stops_the_climb_within_a_second_and_resume_flies_the_mission(config: str | None) -> None:
+    flight = Lockstep(load(None if config is None else ROOT / "configs" / config, ON_GROUND_ALONE))
+    ground_z_m = vehicle(flight)[0][2]
+    fly_until(flight, lambda: phase(flight) is Phase.TAKEOFF and vehicle(flight)[0][2] < ground_z_m - 1.0)
+    flight.command("hold")
+    climbing_m_s = -vehicle(flight)[1][2]
+    assert climbing_m_s > 0.5
+    fly_for(flight, 1.0)
+    held_at, vel = vehicle(flight)
+    assert np.linalg.norm(vel) < 0.3
+    fly_for(flight, 4.0)
+    pos, vel = vehicle(flight)
+    assert np.linalg.norm(pos - held_at) < 0.3
+    assert phase(flight) is Phase.TAKEOFF
+    flight.command("resume")
+    flight.run()
+    assert flight.problems() == []
