@@ -40,6 +40,7 @@ from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.control.phases.failsafe import FailsafeDecision, decide
 from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.control.phases.overload import Level, Overload
+from swarmctl.control.reference.heading import Heading
 from swarmctl.control.setpoint import setpoint_of
 from swarmctl.core.clock import Clock
 from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned
@@ -118,6 +119,7 @@ class Agent:
         self._predictor = Predictor(setup.vehicle_model)
         self._safety_filter = make_safety_filter(setup, self._world_model, self._note, stopwatch_ns)
         self._state_machine = make_state_machine(setup)
+        self._heading = Heading(setup.mission.yaw_rad)
         self._reference_selector = ReferenceSelector(setup, self._state_machine, self._note)
         self._decision = FailsafeDecision(Mode.IDLE, "")
         self._virtual_control = np.array([0.0, 0.0, GRAVITY_M_S2])
@@ -460,7 +462,7 @@ class Agent:
             flies=flies,
             committed_peers=self._directive.committed_peers,
         )
-        yaw_rad, hover_01 = self._setup.mission.yaw_rad, estimate.hover_thrust_01
+        yaw_rad, hover_01 = self._heading.at(now_us, self._state_machine.yaw_rad), estimate.hover_thrust_01
         setpoint = setpoint_of(virtual_control, yaw_rad, hover_01, now_us, params=self._setup.vehicle_model)
         refused = self._autopilot.send(setpoint, self._clock.now_us())
         if refused:

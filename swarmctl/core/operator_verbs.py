@@ -23,6 +23,7 @@ class VerbArgument:
     help: str
     least: float
     most: float
+    required: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -56,6 +57,10 @@ class Answer:
 
 
 EXCLUDE, PEER = "exclude", "peer"
+GOTO = "goto"
+POINT = ("north_m", "east_m", "down_m")  # arguments of `goto`, shared NED
+YAW, SPEED = "yaw_deg", "speed_m_s"  # and its optional ones
+_FAR_M = 100_000.0  # from the shared origin
 _AIRBORNE = frozenset({"TAKEOFF", "GOTO_START", "READY", "TRACK", "GOTO_LAND"})  # the agent decides where it flies
 _NOT_LANDING = _AIRBORNE | {"CONNECT", "STANDBY", "ARM", "DONE"}
 
@@ -75,6 +80,32 @@ OPERATOR_VERBS = {
         phases=_NOT_LANDING,
         is_stop=True,
     ),
+    GOTO: OperatorVerb(
+        help="Fly to a point under the agent's own planner, and hold there until `resume`.",
+        phases=frozenset({"GOTO_START", "READY", "TRACK"}),  # what is on its way to land stays so
+        arguments=(
+            *(
+                VerbArgument(name=name, option=f"--{name[:-2]}", help="[m]", least=-_FAR_M, most=_FAR_M)
+                for name in POINT
+            ),
+            VerbArgument(
+                name=YAW,
+                option="--yaw",
+                help="Heading there, clockwise from north [deg]; default: that of the mission.",
+                least=-360.0,
+                most=360.0,
+                required=False,
+            ),
+            VerbArgument(
+                name=SPEED,
+                option="--speed",
+                help="Peak speed [m/s]; default: agent.state_machine.speed_m_s.",
+                least=0.1,
+                most=20.0,
+                required=False,
+            ),
+        ),
+    ),
     EXCLUDE: OperatorVerb(
         help="Vouch that an agent has ended: the others no longer wait for its answers, and keep clear of its place.",
         phases=_NOT_LANDING | {"LAND"},
@@ -91,10 +122,11 @@ def order_problem(verb: str, arguments: Mapping[str, float]) -> str:
     known = OPERATOR_VERBS.get(verb)
     if known is None:
         return f"{verb!r} is no verb; known are {', '.join(OPERATOR_VERBS)}"
-    if arguments.keys() != {argument.name for argument in known.arguments}:
+    required = {argument.name for argument in known.arguments if argument.required}
+    if not required <= arguments.keys() <= {argument.name for argument in known.arguments}:
         return f"{verb} takes {', '.join(argument.name for argument in known.arguments) or 'no arguments'}"
     for argument in known.arguments:
-        value = arguments[argument.name]
+        value = arguments.get(argument.name, argument.least)
         if not (math.isfinite(value) and argument.least <= value <= argument.most):
             return f"{argument.name} {value:g}: allowed: {argument.least:g} to {argument.most:g}"
     return ""

@@ -11,12 +11,22 @@ import signal
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
 from swarmctl import __version__
-from swarmctl.core.operator_verbs import OPERATOR_VERBS, OperatorVerb, Order
+from swarmctl.core.operator_verbs import (
+    GOTO,
+    OPERATOR_VERBS,
+    POINT,
+    SPEED,
+    YAW,
+    OperatorVerb,
+    Order,
+    VerbArgument,
+    order_problem,
+)
 from swarmctl.core.text import printable_lines
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, ConfigError, MissionError, SwarmError
 
@@ -228,6 +238,15 @@ def status(
 _ANSWERS = "Exit code 0: every agent asked has accepted; 4: one has refused, or has not answered in time, and is named."
 
 
+def _option(argument: VerbArgument) -> Any:
+    """Return the option of the command line that carries one number of an order."""
+    return typer.Option(argument.option, min=argument.least, max=argument.most, help=argument.help)
+
+
+def _option_of(verb: str, name: str) -> Any:
+    return _option(next(argument for argument in OPERATOR_VERBS[verb].arguments if argument.name == name))
+
+
 def _give(order: Order, run: str | None, agents: list[int]) -> int:
     from swarmctl.ops import operator
     from swarmctl.ops.order_delivery import deliver
@@ -245,7 +264,7 @@ def _give(order: Order, run: str | None, agents: list[int]) -> int:
 def add_operator_verb(
     to: typer.Typer, name: str, verb: OperatorVerb, give: Callable[[Order, str | None, list[int]], int] = _give
 ) -> None:
-    """Add a verb of the operator, with a required option for each of its arguments.
+    """Add a verb of the operator, with an option for each of its arguments.
 
     Args:
         to: command line to extend.
@@ -253,21 +272,47 @@ def add_operator_verb(
         give: gives the order to a launch, to the agents named or to all; returns the exit code.
     """
 
-    def run(asked: AskedAgents = None, run: Run = None, agent: MoreAgents = None, **arguments: float) -> int:
-        return give(Order(name, arguments), run, [*(asked or ()), *(agent or ())])
+    def run(asked: AskedAgents = None, run: Run = None, agent: MoreAgents = None, **arguments: float | None) -> int:
+        given = {name: value for name, value in arguments.items() if value is not None}
+        return give(Order(name, given), run, [*(asked or ()), *(agent or ())])
 
     parameters = list(inspect.signature(run, eval_str=True).parameters.values())[:3]
     for argument in verb.arguments:
-        option = typer.Option(argument.option, min=argument.least, max=argument.most, help=argument.help)
+        default = inspect.Parameter.empty if argument.required else None
+        option = _option(argument)
+        annotation = Annotated[float, option] if argument.required else Annotated[float | None, option]
         kind = inspect.Parameter.KEYWORD_ONLY
-        parameters.append(inspect.Parameter(argument.name, kind, annotation=Annotated[float, option]))
+        parameters.append(inspect.Parameter(argument.name, kind, annotation=annotation, default=default))
     run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # typer derives options from it
     to.command(name, help=f"{verb.help} {_ANSWERS}")(run)
 
 
 for _name, _verb in OPERATOR_VERBS.items():
-    add_operator_verb(app, _name, _verb)
+    if _name != GOTO:  # its point is an argument by itself
+        add_operator_verb(app, _name, _verb)
+
+
+@app.command(
+    GOTO,
+    help=f"{OPERATOR_VERBS[GOTO].help} {_ANSWERS}",
+    context_settings={"ignore_unknown_options": True},  # a point may begin with a minus
+)
+def goto(
+    agent: Annotated[int, typer.Argument(metavar="AGENT", help="Agent asked.")],
+    point: Annotated[str, typer.Argument(metavar="N,E,D", help="Point, shared NED [m]; up is negative.")],
+    yaw: Annotated[float | None, _option_of(GOTO, YAW)] = None,
+    speed: Annotated[float | None, _option_of(GOTO, SPEED)] = None,
+    run: Run = None,
+) -> int:
+    from swarmctl.ops import operator
+
+    problems: list[str] = []
+    arguments = dict(zip(POINT, operator.vector("N,E,D", point, problems), strict=True))
+    arguments |= {name: value for name, value in ((YAW, yaw), (SPEED, speed)) if value is not None}
+    if problem := "".join(problems) or order_problem(GOTO, arguments):
+        raise ConfigError(GOTO, [problem])
+    return _give(Order(GOTO, arguments), run, [agent])
 
 
 @app.command()

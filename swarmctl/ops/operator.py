@@ -192,7 +192,7 @@ def obstacle(
         ConfigError: a number is missing, not finite or out of range.
     """
     problems: list[str] = []
-    vectors = [_vector(key, text, problems) for key, text in (("--center", center), ("--velocity", velocity))]
+    vectors = [vector(key, text, problems) for key, text in (("--center", center), ("--velocity", velocity))]
     values = {"radius_m": radius_m, "keep_out_m": keep_out_m, "visibility_m": visibility_m, "column": column}
     try:
         described = Obstacle.model_validate(values | {"center_ned_m": vectors[0], "vel_ned_m_s": vectors[1]})
@@ -215,7 +215,8 @@ def without(known: tuple[Obstacle, ...], number: int) -> tuple[Obstacle, ...]:
     return known[:number] + known[number + 1 :]
 
 
-def _vector(key: str, text: str, problems: list[str]) -> tuple[float, float, float]:
+def vector(key: str, text: str, problems: list[str]) -> tuple[float, float, float]:
+    """Return the vector that `north,east,down` describes; what is wrong with it is added to `problems`."""
     try:
         north, east, down = (float(part) for part in text.split(","))
     except ValueError:

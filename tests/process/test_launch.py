@@ -356,6 +356,12 @@ def test_operator_verbs(start: Start, monkeypatch: pytest.MonkeyPatch, capsys: p
     assert "agent-1 accepts, TRACK" in held.stdout
     assert "agent-0" not in held.stdout
     assert [status["held"] for status in json.loads(verb("status", "--json").stdout)] == [False, True]
+    sent = verb("goto", "0", "-2,0.5,-9", "--speed", "1")
+    assert sent.returncode == 0, sent.stderr
+    assert "agent-0 accepts, TRACK" in sent.stdout
+    buried = verb("goto", "0", "-2,0.5,500")
+    assert buried.returncode == 4
+    assert "goto: agent-0 refuses: down 500 m is too low" in buried.stderr
     where = ("--center", "-40,2.5,-9", "--radius", "0.5", "--run-dir", str(launched.run_dir))
     added = verb("obstacle", "add", *where)
     assert added.returncode == 0, added.stderr

@@ -19,10 +19,10 @@ from pydantic import Field
 from swarmctl.control.phases.arming import ArmingEvidence
 from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.control.phases.overload import Level
-from swarmctl.control.phases.refused_orders import OrderSituation, refusal_of
+from swarmctl.control.phases.refused_orders import Contains, OrderSituation, refusal_of
 from swarmctl.control.reference.landing_places import landing_place_ned_m, nearest_in_plane_m
 from swarmctl.control.reference.mission import MissionReference, QuinticTrajectory, brake_to_rest, quintic_to
-from swarmctl.core.operator_verbs import OPERATOR_VERBS, Order
+from swarmctl.core.operator_verbs import GOTO, OPERATOR_VERBS, POINT, SPEED, YAW, Order
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Command, FlightMode, Landed, Mode, Phase, VehicleState, Verb
 
@@ -31,6 +31,7 @@ _SPIN_UP_US = 6_000_000  # ArduCopter's rotors spin up for over 3 s, during whic
 _SETTLE_S = 2.0  # time after a stop trajectory in which the vehicle comes to rest
 _BEGIN_DELAY_US = 1_000_000  # from the last agent's readiness to mission time 0; several statuses are sent meanwhile
 _HOVER_LEARNING_US = 1_000_000  # hover flown by the autopilot itself, during which its hover thrust is learned
+_LEAST_HEIGHT_M = 0.5  # above the ground, of a point to go to
 _ROOM_MARGIN_M = 0.1  # the target lies beyond the required distance, because it is reached with a tolerance
 _PLAN_MODES = (Mode.TRACKING, Mode.REPLAY)
 _OWN_MODES = (FlightMode.HOLD, FlightMode.TAKEOFF, FlightMode.EXTERNAL)  # modes that follow from our own requests
@@ -66,6 +67,7 @@ class MissionStateMachine:
         start_ned_m: (3,) start position, also the landing place.
         duration_s: duration of the tracked mission.
         reference: reference of the tracked mission.
+        contains: whether a place lies in the area to fly in.
 
     Attributes:
         phase: current phase.
@@ -74,7 +76,8 @@ class MissionStateMachine:
         outcome: "completed", or why the mission was not; "" while it is under way.
         waits_for: unmet condition that keeps the vehicle on the ground, or "".
         had_control: the autopilot follows our setpoints and control has not been given back.
-        held: the operator has asked to hold.
+        held: the operator has asked to hold, or to go to a point.
+        yaw_rad: heading that the operator has asked for, None for the mission's.
         paused: the agent rests because the bus is lost or its processor is overloaded.
         pilot_override: pilot or autopilot took over; lasts until an operator resumes.
     """
@@ -89,9 +92,10 @@ class MissionStateMachine:
         start_ned_m: Array,
         duration_s: float,
         reference: MissionReference,
+        contains: Contains = lambda _: True,
     ) -> None:
         self._params, self._agent, self._expected = params, agent, peers
-        self._apart_m = landing_m
+        self._apart_m, self._contains = landing_m, contains
         self._start_ned_m, self._duration_us, self._reference = start_ned_m, round(duration_s * 1e6), reference
         self.phase = Phase.CONNECT
         self.ready_utc_us = 0
@@ -103,6 +107,8 @@ class MissionStateMachine:
         self.had_control = False
         self.held = False
         self._held_since_us = 0
+        self._held_at: tuple[Array, float] | None = None  # point of a `goto` (3,), and the speed to it
+        self.yaw_rad: float | None = None
         self._climb_cut_short = False  # a hold interrupted the take-off below its height
         self.paused = False
         self._destination_ned_m = start_ned_m  # end of the transit that a pause or a hold interrupts
@@ -130,7 +136,11 @@ class MissionStateMachine:
             Phase.GOTO_LAND: self._goto_land,
             Phase.LAND: self._land,
         }
-        self._order_handlers = {"hold": self._hold, "resume": self._resume}  # stops are in `_apply_stop`
+        self._order_handlers = {
+            "hold": self._hold,
+            "resume": self._resume,
+            GOTO: self._goto,
+        }  # stops are in `_apply_stop`
 
     @property
     def finished(self) -> bool:
@@ -224,6 +234,10 @@ class MissionStateMachine:
             pilot_override=self.pilot_override,
             other_control=state is not None and _is_under_other_control(state),
             lands_in_place=self._lands_in_place,
+            controls=self.had_control,
+            paused=self.paused,
+            lowest_m=self._lowest_m,
+            contains=self._contains,
         )
         if refusal := refusal_of(order, situation):
             return refusal
@@ -238,9 +252,32 @@ class MissionStateMachine:
 
     def _hold(self, order: Order, now_us: int, utc_us: int, state: VehicleState) -> None:
         self._interrupt(now_us, state)
+        self._held_at = self.yaw_rad = None
         if not self.held:
             self.held, self._held_since_us = True, now_us
             self._requested_us = now_us - _SPIN_UP_US  # on the way up the autopilot is asked at once
+
+    def _goto(self, order: Order, now_us: int, utc_us: int, state: VehicleState) -> None:
+        self._hold(order, now_us, utc_us, state)
+        target_ned_m = np.array([order.arguments[name] for name in POINT])
+        self._held_at = target_ned_m, order.arguments.get(SPEED, self._params.speed_m_s)
+        self.yaw_rad = math.radians(order.arguments[YAW]) if YAW in order.arguments else None
+        self._stay(now_us, state)
+
+    def _stay(self, now_us: int, state: VehicleState) -> None:
+        """Come to rest where a hold asks for it: here, or at a point."""
+        if self._held_at is None:
+            self._trajectory = (self._stop_trajectory(state), now_us)
+            return
+        target_ned_m, speed_m_s = self._held_at
+        accel_m_s2 = self._params.accel_m_s2
+        trajectory = quintic_to(state.pos_ned_m, state.vel_ned_m_s, target_ned_m, speed_m_s, accel_m_s2=accel_m_s2)
+        self._trajectory = (trajectory, now_us)
+
+    @property
+    def _lowest_m(self) -> float:
+        """Return the down coordinate that a point to go to may not be below: the ground's is known after a take-off."""
+        return float(self._start_ned_m[2]) if self._airborne else self._ground_z_m - _LEAST_HEIGHT_M
 
     def _interrupt(self, now_us: int, state: VehicleState) -> None:
         """Come to rest, and remember where a transit leads."""
@@ -269,6 +306,7 @@ class MissionStateMachine:
     def _release(self, now_us: int, state: VehicleState) -> None:
         """End a hold: timeouts have not run meanwhile."""
         self.held, self._requested_us = False, now_us - _SPIN_UP_US
+        self._held_at = self.yaw_rad = None
         self._climb_cut_short |= self.phase is Phase.TAKEOFF and state.landed is not Landed.ON_GROUND
         if self._first_tick_us is not None:
             self._first_tick_us += now_us - self._held_since_us
@@ -308,7 +346,7 @@ class MissionStateMachine:
         elif self.paused and not must_wait:
             self.paused = False
             if self.held:
-                self._trajectory = (self._stop_trajectory(state), inputs.now_us)
+                self._stay(inputs.now_us, state)
             else:
                 self._go_on(inputs.now_us, inputs.utc_us, state)
 
@@ -539,8 +577,9 @@ class MissionStateMachine:
         if self._climb_cut_short:
             target = np.array([*state.pos_ned_m[:2], self._start_ned_m[2]])
         self._destination_ned_m = target
-        trajectory = self._stop_trajectory(state) if self.held else self._trajectory_to(target, state)
-        self._trajectory = (trajectory, inputs.now_us)
+        self._trajectory = (self._trajectory_to(target, state), inputs.now_us)
+        if self.held:
+            self._stay(inputs.now_us, state)
 
     def _trajectory_home(self, state: VehicleState) -> QuinticTrajectory:
         return self._trajectory_to(self._start_ned_m, state)
@@ -571,6 +610,7 @@ class MissionStateMachine:
     def _enter(self, phase: Phase, now_us: int) -> None:
         self.phase = phase
         self.held &= phase < Phase.LAND
+        self.yaw_rad = self.yaw_rad if self.held else None
         self._entered_us = now_us
         self._requested_us = now_us - _SPIN_UP_US
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from swarmctl.control.phases.state_machine import OPERATOR_STOP, TAKEN_OVER, MissionStateMachine
-from swarmctl.core.operator_verbs import EXCLUDE, OPERATOR_VERBS, order_problem
-from swarmctl.core.types import FlightMode, Landed, Mode, Phase, Verb
+from swarmctl.core.operator_verbs import EXCLUDE, GOTO, OPERATOR_VERBS, order_problem
+from swarmctl.core.types import Array, FlightMode, Landed, Mode, Phase, Verb
 from tests.benches.state_machine_flight import IN_AIR, START, Flight, controlled, in_phase
 
 ABOUT_THE_VEHICLE = [name for name in OPERATOR_VERBS if name != EXCLUDE]
@@ -17,10 +17,10 @@ AIRBORNE = (Phase.TAKEOFF, Phase.GOTO_START, Phase.READY, Phase.TRACK, Phase.GOT
 LONG_S = 120.0  # past every timeout
 
 
-def place(flight: Flight, after_s: float = 60.0) -> np.ndarray:
+def place(flight: Flight, after_s: float = 60.0) -> Array:
     """Return the reference `after_s` from now."""
     pos, _ = flight.state_machine.reference(flight.utc_us, flight.now_us, np.array([after_s]))
-    return pos[0]
+    return pos.ravel()
 
 
 def is_held(flight: Flight) -> bool:
@@ -45,7 +45,22 @@ def ends(flight: Flight) -> bool:
     return flight.phase >= Phase.GOTO_LAND and flight.state_machine.outcome in (OPERATOR_STOP, "completed")
 
 
-EFFECTS: dict[str, Callable[[Flight], bool]] = {"hold": is_held, "resume": goes_on, "land": ends, "rtl": ends}
+def goes_there(flight: Flight) -> bool:
+    """Whether it is on its way to the point, and stays there past every timeout."""
+    flight.run(LONG_S)
+    return flight.state_machine.held and bool(np.allclose(place(flight), THERE))
+
+
+THERE = np.array([3.0, -2.0, -4.0])
+POINT = dict(zip(("north_m", "east_m", "down_m"), THERE.tolist(), strict=True))
+ARGUMENTS: dict[str, dict[str, float]] = {GOTO: POINT}
+EFFECTS: dict[str, Callable[[Flight], bool]] = {
+    "hold": is_held,
+    "resume": goes_on,
+    "land": ends,
+    "rtl": ends,
+    GOTO: goes_there,
+}
 
 
 @pytest.mark.parametrize("phase", Phase, ids=lambda phase: phase.name)
@@ -54,7 +69,7 @@ def test_each_verb_in_each_phase_has_its_effect_or_is_refused_with_a_reason(verb
     flight = in_phase(phase)
     machine = flight.state_machine
     before = machine.phase, machine.held, machine.outcome
-    refusal = flight.ask(verb)
+    refusal = flight.ask(verb, **ARGUMENTS.get(verb, {}))
     if phase.name in OPERATOR_VERBS[verb].phases:
         assert refusal == ""
         assert EFFECTS[verb](flight)
@@ -216,6 +231,79 @@ def test_the_time_of_a_hold_does_not_count_as_time_to_the_start() -> None:
     flight.ask("resume")
     flight.run(5.0)
     assert flight.phase in (Phase.GOTO_START, Phase.READY)
+
+
+@pytest.mark.parametrize("phase", [Phase.GOTO_START, Phase.READY, Phase.TRACK], ids=lambda phase: phase.name)
+def test_a_pause_on_the_way_to_a_point_goes_on_to_it_and_hold_stops_it(phase: Phase) -> None:
+    flight = controlled(phase)
+    assert flight.ask(GOTO, **POINT, speed_m_s=1.0, yaw_deg=90.0) == ""
+    assert flight.state_machine.yaw_rad == pytest.approx(np.pi / 2)
+    flight.unresponsive_peer = True
+    flight.run(0.5)
+    assert np.linalg.norm(place(flight) - flight.pos) < 1e-9
+    assert "rests" in flight.ask(GOTO, **POINT)
+    flight.unresponsive_peer = False
+    flight.run(0.5)
+    np.testing.assert_allclose(place(flight), THERE)
+    assert flight.ask("hold") == ""
+    assert np.linalg.norm(place(flight) - flight.pos) < 1e-9
+    flight.unresponsive_peer = True
+    flight.run(0.5)
+    flight.unresponsive_peer = False
+    flight.run(0.5)
+    assert np.linalg.norm(place(flight) - flight.pos) < 1e-9
+    assert flight.state_machine.yaw_rad is None
+
+
+def test_the_speed_of_a_goto_is_its_peak_speed() -> None:
+    flight = controlled(Phase.TRACK)
+    for speed_m_s in (0.5, 1.5):
+        flight.ask(GOTO, north_m=float(flight.pos[0]) + 30.0, east_m=0.0, down_m=-4.0, speed_m_s=speed_m_s)
+        _, vel = flight.state_machine.reference(flight.utc_us, flight.now_us, np.linspace(0.0, 150.0, 1000))
+        assert np.linalg.norm(vel, axis=1).max() == pytest.approx(speed_m_s, rel=0.02)
+
+
+@pytest.mark.parametrize("verb", ["land", "rtl"])
+def test_a_stop_ends_a_goto_and_none_begins_after_one(verb: str) -> None:
+    flight = controlled(Phase.TRACK)
+    flight.pos = START + np.array([2.0, 0.0, 0.0])
+    flight.ask(GOTO, **POINT, yaw_deg=10.0)
+    assert flight.ask(verb) == ""
+    assert flight.state_machine.yaw_rad is None
+    assert "GOTO_LAND" in flight.ask(GOTO, **POINT)
+
+
+def test_a_point_in_the_ground_or_a_way_out_of_the_fence_is_refused() -> None:
+    flight = controlled(Phase.TRACK)
+    assert "too low: -0.50 at most" in flight.ask(GOTO, **POINT | {"down_m": -0.4})
+    assert flight.ask(GOTO, **POINT | {"down_m": -0.6}) == ""
+    fenced = controlled(Phase.TRACK)
+    fenced.state_machine._contains = lambda at_ne_m: not 4.0 < at_ne_m[0] < 6.0  # the straight way north leaves it
+    assert fenced.ask(GOTO, **POINT | {"north_m": 3.9}) == ""
+    held_at = place(fenced)
+    for north_m in (5.0, 9.0):
+        assert "outside of the geofence" in fenced.ask(GOTO, **POINT | {"north_m": north_m})
+    np.testing.assert_allclose(place(fenced), held_at)
+
+
+def test_where_the_ground_is_unknown_nothing_lower_than_the_start_is_flown_to() -> None:
+    flight = controlled(Phase.TRACK)
+    flight.state_machine._airborne = True
+    assert "too low: -3.00 at most" in flight.ask(GOTO, **POINT | {"down_m": -2.9})
+
+
+def test_before_it_has_control_nothing_is_flown_to() -> None:
+    flight = Flight().until(Phase.GOTO_START)
+    assert flight.ask(GOTO, **POINT) == "its autopilot still flies it"
+
+
+def test_optional_arguments_may_be_left_out_and_no_others() -> None:
+    assert order_problem(GOTO, POINT) == ""
+    assert order_problem(GOTO, POINT | {"yaw_deg": 90.0, "speed_m_s": 2.0}) == ""
+    assert "allowed: 0.1 to 20" in order_problem(GOTO, POINT | {"speed_m_s": 0.0})
+    assert "goto takes north_m" in order_problem(GOTO, {"north_m": 1.0, "yaw_deg": 90.0})
+    assert "goto takes north_m" in order_problem(GOTO, POINT | {"height_m": 1.0})
+    assert "nan" in order_problem(GOTO, POINT | {"east_m": float("nan")})
 
 
 def test_what_is_no_order_is_named() -> None:
