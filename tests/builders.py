@@ -57,7 +57,10 @@ def status_message(
     separation_m: float = 1.0,
     deadline_misses: int = 0,
     active_alert: str = "",
+    alert_age_s: float = -1.0,
     held: bool = False,
+    control: str = "TRACKING",
+    altitude_m: float = 5.0,
     utc_us: int = 0,
 ) -> StatusMessage:
     """Return the status of an agent that tracks its mission."""
@@ -71,6 +74,14 @@ def status_message(
         armed=True,
         landed=Landed.IN_AIR,
         held=held,
+        control=control,
+        altitude_m=altitude_m,
+        ground_speed_m_s=1.5,
+        battery_01=0.75,
+        pos_accuracy_m=0.25,
+        gps_fix=3,
+        satellites=10,
+        link_age_ms=8.5,
         ready_utc_us=0,
         outcome="",
         position_error_m=position_error_m,
@@ -81,6 +92,7 @@ def status_message(
         plan_staleness_ms=20.0,
         solver_failed=0,
         active_alert=active_alert,
+        alert_age_s=alert_age_s,
         uses_commitments=False,
         utc_us=utc_us,
     )

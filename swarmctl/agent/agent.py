@@ -246,7 +246,7 @@ class Agent:
         refusals = self._world_model.refusals.alert(self._clock.utc_us())
         if refusals:
             self._alerts.put("bus", refusals, now_us)
-        self._publisher.active_alert = self._alerts.text(now_us)
+        self._publisher.active_alert = self._alerts.newest(now_us)
         return self._publisher.publish(
             now_us,
             state,

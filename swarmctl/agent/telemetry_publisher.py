@@ -9,6 +9,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from swarmctl.agent.alerts import Alert
 from swarmctl.bus import topics
 from swarmctl.bus.json_messages import MAX_REASON, AnswerMessage, StatusMessage, encode_message
 from swarmctl.bus.peers import Bus, PeerPaths
@@ -86,7 +87,7 @@ class TelemetryPublisher:
         self._status_us = -_STATUS_EVERY_US
         self.seq = 0
         self.failed_plans = 0
-        self.active_alert = ""
+        self.active_alert: Alert | None = None
 
     def publish(
         self,
@@ -188,6 +189,7 @@ class TelemetryPublisher:
 
     def _status(self, record: TickRecord, state_machine: MissionStateMachine) -> StatusMessage:
         state, reference, error_m = record.state, record.reference, math.nan
+        health, received_us, alert = self._autopilot.health, self._autopilot.received_us, self.active_alert
         if state is not None and reference is not None:
             error = state.pos_ned_m - reference.pos_ned_m[0]
             error_m = math.sqrt(float(error @ error))
@@ -201,6 +203,14 @@ class TelemetryPublisher:
             armed=record.armed,
             landed=int(self._autopilot.landed),
             held=state_machine.held,
+            control=state_machine.control_mode(record.mode),
+            altitude_m=0.0 if state is None else -float(state.pos_ned_m[2]),
+            ground_speed_m_s=-1.0 if state is None else math.hypot(*state.vel_ned_m_s[:2].tolist()),
+            battery_01=_known(health.battery_01),
+            pos_accuracy_m=_known(self._autopilot.pos_accuracy_m),
+            gps_fix=-1 if health.gps_fix is None else health.gps_fix,
+            satellites=-1 if health.satellites is None else health.satellites,
+            link_age_ms=-1.0 if received_us is None else (record.t_us - received_us) * 1e-3,
             ready_utc_us=state_machine.ready_utc_us,
             outcome=state_machine.outcome,
             position_error_m=_finite(error_m),
@@ -210,10 +220,16 @@ class TelemetryPublisher:
             deadline_misses=record.deadline_misses,
             plan_staleness_ms=_finite(record.plan_staleness_ms),
             solver_failed=self.failed_plans,
-            active_alert=self.active_alert,
+            active_alert="" if alert is None else alert.text,
+            alert_age_s=-1.0 if alert is None else (record.t_us - alert.since_us) * 1e-6,
             uses_commitments=self._uses_commitments,
             utc_us=record.utc_us,
         )
+
+
+def _known(value: float | None) -> float:
+    """Return the value, or -1 in place of None."""
+    return -1.0 if value is None else _finite(value)
 
 
 def _finite(value: float) -> float:

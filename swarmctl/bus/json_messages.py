@@ -35,6 +35,14 @@ class StatusMessage(msgspec.Struct, frozen=True, kw_only=True):
     armed: bool
     landed: int
     held: bool  # an operator holds it, and `resume` lets it go on
+    control: Word  # what it is doing: `control.phases.control_mode`
+    altitude_m: float  # above the shared origin, where there is a state: `ground_speed_m_s` is -1 without one
+    ground_speed_m_s: float
+    battery_01: float  # -1, here and below: unknown
+    pos_accuracy_m: float  # horizontal, 1 sigma, as its estimator reports it
+    gps_fix: int  # GPS_FIX_TYPE
+    satellites: int
+    link_age_ms: float  # since the newest message of the vehicle
     ready_utc_us: Count  # time of reaching its start position, 0 before
     outcome: str  # "" while flying, "completed", or why the mission failed
     position_error_m: float
@@ -45,6 +53,7 @@ class StatusMessage(msgspec.Struct, frozen=True, kw_only=True):
     plan_staleness_ms: float
     solver_failed: int
     active_alert: str  # newest one, "" for none
+    alert_age_s: float  # since it began
     uses_commitments: bool  # it flies committed trajectories only, see `control.commit`
     utc_us: Count  # time of sending, by the agent's clock
 

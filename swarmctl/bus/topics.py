@@ -20,7 +20,7 @@ class Topic:
 
 
 PATH = Topic(name="path", ring=4, max_bytes=4096, reliable=False)
-STATUS = Topic(name="status", ring=4, max_bytes=16_384, reliable=False)
+STATUS = Topic(name="status", ring=4, max_bytes=20_480, reliable=False)
 TICK = Topic(name="tick", ring=256, max_bytes=4096, reliable=False)
 COMMAND = Topic(name="command", ring=64, max_bytes=1024, reliable=True)
 ANSWER = Topic(name="answer", ring=16, max_bytes=4096, reliable=True)

@@ -5,10 +5,12 @@ Heavy modules are imported inside the verb that needs them, so that `--help` ans
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import os
 import signal
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NoReturn
@@ -32,6 +34,7 @@ from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, ConfigError, 
 
 if TYPE_CHECKING:
     from swarmctl.bus.json_messages import ObstaclesMessage, StatusMessage
+    from swarmctl.ops.operator import RunningLaunch
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -63,6 +66,7 @@ Run = Annotated[
 ]
 AskedAgents = Annotated[list[int] | None, typer.Argument(metavar="AGENT", help="Agents asked; default: all.")]
 MoreAgents = Annotated[list[int] | None, typer.Option("--agent", help="Agent asked, as an option; repeatable.")]
+_WATCH_S = 0.25
 Folder = Annotated[Path, typer.Argument(help="Run folder.")]
 # The verb's module declares the options, and answers --help.
 _PASS_ON = {"ignore_unknown_options": True, "allow_extra_args": True, "help_option_names": []}
@@ -224,15 +228,40 @@ def agent(
 @app.command()
 def status(
     run: Run = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON; with --watch one line at a time.")] = False,
+    watch: Annotated[bool, typer.Option("--watch", help="Go on until the launch ends, or Ctrl-C.")] = False,
 ) -> int:
     """Show the status of every agent of a running launch."""
     from swarmctl.ops import operator
 
     launch = operator.find_launch(run)
+    if watch:
+        with contextlib.suppress(KeyboardInterrupt):
+            _watch(launch, as_json)
+        return EXIT_OK
     statuses = operator.read_statuses(launch)
     print(operator.as_json(statuses)) if as_json else _show(statuses, range(launch.agents))
     return EXIT_OK
+
+
+def _watch(launch: RunningLaunch, as_json: bool) -> None:
+    """Show statuses until the launch ends: a live table, lines where there is no terminal, or lines of JSON."""
+    from swarmctl.ops import operator
+    from swarmctl.ops.status_table import AgentView, open_display
+
+    views = [AgentView(agent=agent) for agent in range(launch.agents)]
+    display = None if as_json else open_display()
+    try:
+        for statuses in operator.watch_statuses(launch, _WATCH_S):
+            for agent, status in statuses.items():
+                views[agent].status, views[agent].received_s = status, time.monotonic()
+            if display is not None:
+                display.show(views)
+            elif statuses:
+                print(operator.as_json(statuses, indent=None), flush=True)
+    finally:
+        if display is not None:
+            display.close()
 
 
 _ANSWERS = "Exit code 0: every agent asked has accepted; 4: one has refused, or has not answered in time, and is named."

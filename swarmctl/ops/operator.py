@@ -151,6 +151,14 @@ def read_statuses(launch: RunningLaunch) -> dict[int, StatusMessage]:
         return _statuses(bus, range(launch.agents), _ANSWER_S)
 
 
+def watch_statuses(launch: RunningLaunch, every_s: float) -> Iterator[dict[int, StatusMessage]]:
+    """Yield the statuses that have arrived since the last time, by agent, until the launch ends."""
+    with joined(launch) as bus:
+        while _runs(launch):
+            yield _statuses(bus, range(launch.agents), 0.0)
+            time.sleep(every_s)
+
+
 def read_obstacles(launch: RunningLaunch) -> ObstaclesMessage:
     """Return the obstacle list that the launch repeats.
 
@@ -242,12 +250,12 @@ def _statuses(bus: ZenohBus, agents: range, timeout_s: float) -> dict[int, Statu
     """Return the newest status of each of `agents`, once all have published one or the time is up."""
     heard: dict[int, StatusMessage] = {}
     deadline_s = time.monotonic() + timeout_s
-    while time.monotonic() < deadline_s:
+    while True:
         for sender, payload in bus.receive(STATUS):
             status = decode_status(payload)
             if status is not None and status.agent in agents and sender == agent_name(status.agent):
                 heard[status.agent] = status
-        if len(heard) == len(agents):
+        if len(heard) == len(agents) or time.monotonic() >= deadline_s:
             break
         time.sleep(0.02)
     return dict(sorted(heard.items()))
@@ -311,13 +319,16 @@ def _read(path: Path) -> RunningLaunch | None:
 
 def _runs(launch: RunningLaunch) -> bool:
     try:
-        return abs(psutil.Process(launch.pid).create_time() - launch.started_s) < _START_TOLERANCE_S
+        process = psutil.Process(launch.pid)
+        if process.status() == psutil.STATUS_ZOMBIE:  # it has ended, and its parent has not noticed yet
+            return False
+        return abs(process.create_time() - launch.started_s) < _START_TOLERANCE_S
     except (psutil.Error, ValueError):
         return False
 
 
-def as_json(statuses: dict[int, StatusMessage]) -> str:
-    """Return statuses as a JSON list with one object per agent."""
-    return json.dumps(
-        msgspec.to_builtins(list(statuses.values())), indent=2
-    )  # ASCII: an agent's text may contain anything
+def as_json(statuses: dict[int, StatusMessage], indent: int | None = 2) -> str:
+    """Return statuses as a JSON list with one object per agent; without `indent` in one line."""
+    return json.dumps(  # ASCII: an agent's text may contain anything
+        msgspec.to_builtins(list(statuses.values())), indent=indent
+    )

@@ -351,14 +351,23 @@ def test_operator_verbs(start: Start, monkeypatch: pytest.MonkeyPatch, capsys: p
     launched.until_phase("TRACK", 2)
     statuses = json.loads(verb("status", "--json").stdout)
     assert [status["agent"] for status in statuses] == [0, 1]
+    for status in statuses:
+        assert (status["control"], status["gps_fix"], status["satellites"]) == ("TRACKING", 3, 10)
+        assert 0.5 < status["battery_01"] <= 1.0
+        assert -1.0 < status["altitude_m"] < 5.0
+        assert status["ground_speed_m_s"] > 0.0
+        assert 0.0 < status["pos_accuracy_m"] < 5.0
+        assert 0.0 <= status["link_age_ms"] < 1000.0
     held = verb("hold", "1")
     assert held.returncode == 0, held.stderr
     assert "agent-1 accepts, TRACK" in held.stdout
     assert "agent-0" not in held.stdout
-    assert [status["held"] for status in json.loads(verb("status", "--json").stdout)] == [False, True]
+    statuses = json.loads(verb("status", "--json").stdout)
+    assert [(status["held"], status["control"]) for status in statuses] == [(False, "TRACKING"), (True, "HOLD")]
     sent = verb("goto", "0", "-2,0.5,-9", "--speed", "1")
     assert sent.returncode == 0, sent.stderr
     assert "agent-0 accepts, TRACK" in sent.stdout
+    assert json.loads(verb("status", "--json").stdout)[0]["control"] == "GOTO"
     buried = verb("goto", "0", "-2,0.5,500")
     assert buried.returncode == 4
     assert "goto: agent-0 refuses: down 500 m is too low" in buried.stderr
@@ -377,6 +386,10 @@ def test_operator_verbs(start: Start, monkeypatch: pytest.MonkeyPatch, capsys: p
     landed = verb("land")
     assert landed.returncode == 0, landed.stderr
     assert re.search(r"agent-0 accepts, (GOTO_LAND|LAND)\nagent-1 accepts, (GOTO_LAND|LAND)\n", landed.stdout)
+    watched = verb("status", "--watch", "--json")
+    assert watched.returncode == 0, "it ends with the launch"
+    seen = [status for line in watched.stdout.splitlines() for status in json.loads(line)]
+    assert {status["control"] for status in seen} & {"LANDING", "AUTO"}
     assert launched.end() == 130, launched.text()
 
 

@@ -17,6 +17,7 @@ import numpy as np
 from pydantic import Field
 
 from swarmctl.control.phases.arming import ArmingEvidence
+from swarmctl.control.phases.control_mode import control_mode
 from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.control.phases.overload import Level
 from swarmctl.control.phases.refused_orders import Contains, OrderSituation, refusal_of
@@ -210,6 +211,17 @@ class MissionStateMachine:
     def _may_fly_on(self) -> bool:
         """Return whether the agent is not on its way to land, or is held there for as long as the operator likes."""
         return self.phase < Phase.GOTO_LAND or (self.held and self.phase is Phase.GOTO_LAND)
+
+    def control_mode(self, mode: Mode) -> str:
+        """Return what the vehicle is doing, for the operator; `mode` is that of the tick."""
+        return control_mode(
+            self.phase,
+            Mode.PILOT_OVERRIDE if self.pilot_override and mode is not Mode.STATE_STALE else mode,
+            held=self.held,
+            goes_to_point=self.held and self._held_at is not None,
+            paused=self.paused,
+            lands_in_place=self._lands_in_place,
+        )
 
     def begin_if_due(self, now_us: int, utc_us: int) -> None:
         """Enter TRACK on time. Called before planning, so that the first plan of the mission follows its reference."""
