@@ -6,31 +6,19 @@ Heavy modules are imported inside the verb that needs them, so that `--help` ans
 from __future__ import annotations
 
 import contextlib
-import inspect
 import os
 import signal
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
 from swarmctl import __version__
-from swarmctl.core.operator_verbs import (
-    GOTO,
-    OPERATOR_VERBS,
-    POINT,
-    SPEED,
-    YAW,
-    OperatorVerb,
-    Order,
-    VerbArgument,
-    order_problem,
-)
 from swarmctl.core.text import printable_lines
-from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, ConfigError, MissionError, SwarmError
+from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, ConfigError, SwarmError
+from swarmctl.ops.order_verbs import Run, add_order_verbs
 
 if TYPE_CHECKING:
     from swarmctl.bus.json_messages import ObstaclesMessage, StatusMessage
@@ -58,14 +46,6 @@ Set = Annotated[
 ]
 NewRunDir = Annotated[Path | None, typer.Option("--run-dir", help="Run folder to create; default runs/<UTC>-<name>.")]
 View = Annotated[bool | None, typer.Option("--view/--no-view", help="Open the viewer window.")]
-Run = Annotated[
-    str | None,
-    typer.Option(
-        "--run", "--run-dir", metavar="NAME|DIR", help="Launch to act on, by name or run folder; default: the only one."
-    ),
-]
-AskedAgents = Annotated[list[int] | None, typer.Argument(metavar="AGENT", help="Agents asked; default: all.")]
-MoreAgents = Annotated[list[int] | None, typer.Option("--agent", help="Agent asked, as an option; repeatable.")]
 _WATCH_S = 0.25
 Folder = Annotated[Path, typer.Argument(help="Run folder.")]
 # The verb's module declares the options, and answers --help.
@@ -240,7 +220,10 @@ def status(
             _watch(launch, as_json)
         return EXIT_OK
     statuses = operator.read_statuses(launch)
-    print(operator.as_json(statuses)) if as_json else _show(statuses, range(launch.agents))
+    if as_json:
+        print(operator.as_json(statuses))
+    else:
+        _show(launch, statuses)
     return EXIT_OK
 
 
@@ -264,84 +247,7 @@ def _watch(launch: RunningLaunch, as_json: bool) -> None:
             display.close()
 
 
-_ANSWERS = "Exit code 0: every agent asked has accepted; 4: one has refused, or has not answered in time, and is named."
-
-
-def _option(argument: VerbArgument) -> Any:
-    """Return the option of the command line that carries one number of an order."""
-    return typer.Option(argument.option, min=argument.least, max=argument.most, help=argument.help)
-
-
-def _option_of(verb: str, name: str) -> Any:
-    return _option(next(argument for argument in OPERATOR_VERBS[verb].arguments if argument.name == name))
-
-
-def _give(order: Order, run: str | None, agents: list[int]) -> int:
-    from swarmctl.ops import operator
-    from swarmctl.ops.order_delivery import deliver
-
-    launch = operator.find_launch(run)
-    print(f"{order.verb}: {launch.run}")
-    replies = deliver(launch, order, agents)
-    for reply in replies:
-        print(reply.line)
-    if problems := [reply.problem for reply in replies if reply.problem]:
-        raise MissionError(f"{order.verb}: {'; '.join(problems)}")
-    return EXIT_OK
-
-
-def add_operator_verb(
-    to: typer.Typer, name: str, verb: OperatorVerb, give: Callable[[Order, str | None, list[int]], int] = _give
-) -> None:
-    """Add a verb of the operator, with an option for each of its arguments.
-
-    Args:
-        to: command line to extend.
-        name, verb: entry of `OPERATOR_VERBS`.
-        give: gives the order to a launch, to the agents named or to all; returns the exit code.
-    """
-
-    def run(asked: AskedAgents = None, run: Run = None, agent: MoreAgents = None, **arguments: float | None) -> int:
-        given = {name: value for name, value in arguments.items() if value is not None}
-        return give(Order(name, given), run, [*(asked or ()), *(agent or ())])
-
-    parameters = list(inspect.signature(run, eval_str=True).parameters.values())[:3]
-    for argument in verb.arguments:
-        default = inspect.Parameter.empty if argument.required else None
-        option = _option(argument)
-        annotation = Annotated[float, option] if argument.required else Annotated[float | None, option]
-        kind = inspect.Parameter.KEYWORD_ONLY
-        parameters.append(inspect.Parameter(argument.name, kind, annotation=annotation, default=default))
-    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # typer derives options from it
-    to.command(name, help=f"{verb.help} {_ANSWERS}")(run)
-
-
-for _name, _verb in OPERATOR_VERBS.items():
-    if _name != GOTO:  # its point is an argument by itself
-        add_operator_verb(app, _name, _verb)
-
-
-@app.command(
-    GOTO,
-    help=f"{OPERATOR_VERBS[GOTO].help} {_ANSWERS}",
-    context_settings={"ignore_unknown_options": True},  # a point may begin with a minus
-)
-def goto(
-    agent: Annotated[int, typer.Argument(metavar="AGENT", help="Agent asked.")],
-    point: Annotated[str, typer.Argument(metavar="N,E,D", help="Point, shared NED [m]; up is negative.")],
-    yaw: Annotated[float | None, _option_of(GOTO, YAW)] = None,
-    speed: Annotated[float | None, _option_of(GOTO, SPEED)] = None,
-    run: Run = None,
-) -> int:
-    from swarmctl.ops import operator
-
-    problems: list[str] = []
-    arguments = dict(zip(POINT, operator.vector("N,E,D", point, problems), strict=True))
-    arguments |= {name: value for name, value in ((YAW, yaw), (SPEED, speed)) if value is not None}
-    if problem := "".join(problems) or order_problem(GOTO, arguments):
-        raise ConfigError(GOTO, [problem])
-    return _give(Order(GOTO, arguments), run, [agent])
+add_order_verbs(app)
 
 
 @app.command()
@@ -364,7 +270,7 @@ def fault(
     launch = operator.find_launch(run)
     wanted = {"kind": kind, "vehicle": vehicle, "value": value, "for_s": for_s, "rotor": rotor}
     asked = parse_fault({**wanted, "direction": direction, "towards_deg": towards}, launch.agents)
-    print(inject(launch, asked))
+    print(f"fault: {launch.run}\n{inject(launch, asked)}")
     return EXIT_OK
 
 
@@ -373,7 +279,8 @@ def obstacle_list(run: Run = None) -> int:
     """List the obstacles that the agents know."""
     from swarmctl.ops import operator
 
-    _show_obstacles(operator.read_obstacles(operator.find_launch(run)))
+    launch = operator.find_launch(run)
+    _show_obstacles(launch, operator.read_obstacles(launch))
     return EXIT_OK
 
 
@@ -397,7 +304,7 @@ def obstacle_add(
     keep_out_m = radius + 0.75 if keep_out is None else keep_out
     obstacle = operator.obstacle(center, radius, keep_out_m, visibility, velocity=velocity, column=column)
     launch = operator.find_launch(run)
-    _show_obstacles(operator.change_obstacles(launch, lambda known: (*known, obstacle)))
+    _show_obstacles(launch, operator.change_obstacles(launch, lambda known: (*known, obstacle)))
     return EXIT_OK
 
 
@@ -409,7 +316,7 @@ def obstacle_remove(
     from swarmctl.ops import operator
 
     launch = operator.find_launch(run)
-    _show_obstacles(operator.change_obstacles(launch, lambda known: operator.without(known, number)))
+    _show_obstacles(launch, operator.change_obstacles(launch, lambda known: operator.without(known, number)))
     return EXIT_OK
 
 
@@ -481,13 +388,15 @@ def _overrides(agents: int | None, duration: float | None, seed: int | None, set
     return [*(sets or ()), *(f"{key}={value}" for key, value in named if value is not None)]
 
 
-def _show(statuses: dict[int, StatusMessage], agents: range) -> None:
+def _show(launch: RunningLaunch, statuses: dict[int, StatusMessage]) -> None:
     from swarmctl.ops.status_table import AgentView, print_statuses
 
-    print_statuses([AgentView(agent=number, status=statuses.get(number)) for number in agents])
+    print(f"status: {launch.run}", file=sys.stderr)  # rows alone on standard output
+    print_statuses([AgentView(agent=number, status=statuses.get(number)) for number in range(launch.agents)])
 
 
-def _show_obstacles(message: ObstaclesMessage) -> None:
+def _show_obstacles(launch: RunningLaunch, message: ObstaclesMessage) -> None:
+    print(f"obstacle: {launch.run}")
     print(f"version {message.version}, {len(message.obstacles)} obstacles, shared NED [m]")
     for number, item in enumerate(message.obstacles):
         center = ", ".join(f"{c:.2f}" for c in item.center_ned_m)

@@ -163,7 +163,7 @@ def status_table(agents: Sequence[AgentView], width: int = 80, height: int | Non
     columns = [column for column in COLUMNS if width >= _WIDE or not column.only_wide]
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
     for column in columns:
-        table.add_column(f"{column.title}\n{column.unit}", justify=column.justify, no_wrap=True)
+        table.add_column(f"{column.title}\n{column.unit}", justify=column.justify, min_width=column.width, no_wrap=True)
     for view in agents:
         table.add_row(*(Text(column.cell_of(view)) for column in columns))  # not markup: agents' texts may have "[...]"
     room = None if height is None else max(1, height - len(agents) - 4)
@@ -192,6 +192,7 @@ class Column:
     """Describes one column: its title, its unit below, and its cell of an agent that has published a status."""
 
     title: str
+    width: int  # at least, so that the live table does not jump
     cell: Callable[[AgentView, StatusMessage], str]
     unit: str = ""
     justify: Literal["left", "right"] = "right"
@@ -205,24 +206,39 @@ class Column:
 
 
 COLUMNS = (
-    Column(title="id", cell=lambda view, status: str(view.agent)),
-    Column(title="phase", cell=lambda view, status: name_of(Phase, status.phase), justify="left"),
-    Column(title="control", cell=lambda view, status: view.control, justify="left"),
-    Column(title="flight", unit="mode", cell=lambda view, s: name_of(FlightMode, s.flight_mode), justify="left"),
-    Column(title="arm", cell=lambda view, status: "yes" if status.armed else "no", justify="left"),
-    Column(title="alt", unit="m", cell=lambda view, s: "-" if s.ground_speed_m_s < 0 else _fits(s.altitude_m, 1, 5)),
-    Column(title="m/s", cell=lambda view, status: _number(status.ground_speed_m_s, 1, 4)),
-    Column(title="bat", unit="%", cell=lambda view, status: _number(100.0 * status.battery_01, 0, 3)),
-    Column(title="est", unit="m", cell=lambda view, status: _number(status.pos_accuracy_m, 2, 4)),
-    Column(title="link", unit="s", cell=lambda view, status: _link(view, status)),
-    Column(title="sep", unit="m", cell=lambda view, status: _number(status.separation_m, 2, 5)),
-    Column(title="error", unit="m", cell=lambda view, status: _number(status.position_error_m, 2, 5)),
-    Column(title="miss", cell=lambda view, status: _number(status.deadline_misses, 0, 5)),
-    Column(title="ticks", cell=lambda view, status: _number(status.ticks, 0, 7), only_wide=True),
-    Column(title="p99", unit="ms", cell=lambda view, status: _number(status.tick_p99_ms, 1, 5), only_wide=True),
-    Column(title="stale", unit="ms", cell=lambda v, status: _number(status.plan_staleness_ms, 0, 5), only_wide=True),
-    Column(title="gps", unit="sat", cell=lambda view, status: _gps(status), justify="left", only_wide=True),
+    Column(title="id", width=2, cell=lambda v, s: str(v.agent)),
+    Column(title="phase", width=10, cell=lambda v, s: name_of(Phase, s.phase), justify="left"),
+    Column(title="control", width=8, cell=lambda v, s: v.control, justify="left"),
+    Column(title="flight", width=8, unit="mode", cell=lambda v, s: name_of(FlightMode, s.flight_mode), justify="left"),
+    Column(title="arm", width=3, cell=lambda v, s: "yes" if s.armed else "no", justify="left"),
+    Column(
+        title="alt",
+        width=5,
+        unit="m",
+        cell=lambda v, s: _altitude(s),
+    ),
+    Column(title="m/s", width=4, cell=lambda v, s: _number(s.ground_speed_m_s, 1, 4)),
+    Column(title="bat", width=3, unit="%", cell=lambda v, s: _number(100.0 * s.battery_01, 0, 3)),
+    Column(title="est", width=4, unit="m", cell=lambda v, s: _number(s.pos_accuracy_m, 2, 4)),
+    Column(title="link", width=4, unit="s", cell=lambda v, s: _link(v, s)),
+    Column(title="sep", width=5, unit="m", cell=lambda v, s: _number(s.separation_m, 2, 5)),
+    Column(title="error", width=5, unit="m", cell=lambda v, s: _number(s.position_error_m, 2, 5)),
+    Column(title="miss", width=5, cell=lambda v, s: _number(s.deadline_misses, 0, 5)),
+    Column(title="ticks", width=7, cell=lambda v, s: _number(s.ticks, 0, 7), only_wide=True),
+    Column(title="p99", width=5, unit="ms", cell=lambda v, s: _number(s.tick_p99_ms, 1, 5), only_wide=True),
+    Column(
+        title="stale",
+        width=5,
+        unit="ms",
+        cell=lambda v, s: _number(s.plan_staleness_ms, 0, 5),
+        only_wide=True,
+    ),
+    Column(title="gps", width=7, unit="sat", cell=lambda v, s: _gps(s), justify="left", only_wide=True),
 )
+
+
+def _altitude(status: StatusMessage) -> str:
+    return "-" if status.ground_speed_m_s < 0 else _fits(status.altitude_m, 1, 5)
 
 
 def _link(view: AgentView, status: StatusMessage) -> str:

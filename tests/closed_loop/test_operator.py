@@ -64,6 +64,15 @@ def test_a_hold_on_the_way_up_stops_the_climb_within_a_second_and_resume_flies_t
     assert outcome(flight) == "completed"
 
 
+def test_the_fence_of_the_configuration_is_that_of_goto() -> None:
+    fence = "geofence.corners_ne_m=[[-20,-20],[20,-20],[20,20],[-20,20]]"
+    for settings, inside in (((), True), ((fence,), False)):
+        (agent,) = Lockstep(load(None, ("swarm.agents=1", *settings))).agents
+        assert agent is not None
+        assert agent._state_machine._contains((0.0, 19.0))
+        assert agent._state_machine._contains((0.0, 21.0)) is inside
+
+
 @pytest.mark.parametrize("mode", ["best_effort", "guaranteed"])
 def test_an_agent_goes_to_a_point_through_the_others_and_resume_continues_the_mission(mode: str) -> None:
     """Agent 0 crosses the place of agent 1, which hovers on the straight way between."""

@@ -140,6 +140,14 @@ def test_a_hold_on_the_way_up_is_asked_of_the_autopilot_at_once_and_ends_at_the_
     assert flight.at == "READY"
 
 
+def test_a_hold_just_after_another_request_does_not_wait_for_its_repetition() -> None:
+    flight = Flight().until(Phase.TAKEOFF)
+    assert flight.run(0.1) == [Verb.TAKEOFF]
+    flight.pos, flight.landed, flight.flight_mode = START + np.array([0.0, 0.0, 2.0]), IN_AIR, FlightMode.TAKEOFF
+    flight.ask("hold")
+    assert flight.run(0.1) == [Verb.HOLD]
+
+
 def test_a_hold_before_the_climb_keeps_it_on_the_ground() -> None:
     flight = Flight().until(Phase.TAKEOFF)
     flight.ask("hold")

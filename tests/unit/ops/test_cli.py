@@ -20,7 +20,7 @@ from swarmctl.control.mpc.solvers.qp import SOLVERS
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import OperatorVerb, Order, VerbArgument
 from swarmctl.errors import ConfigError, MissionError, StartError, exit_code_of
-from swarmctl.ops import cli, operator
+from swarmctl.ops import cli, operator, order_verbs
 
 Run = Callable[..., int]
 HEAVY = ("numpy", "scipy", "osqp", "zenoh", "rerun", "pyarrow", "pydantic", "mavsdk", "pymavlink", "psutil", "msgspec")
@@ -140,7 +140,9 @@ def test_a_verb_of_the_operator_has_an_option_for_each_argument(
     app = typer.Typer(rich_markup_mode=None)
     height = VerbArgument(name="height_m", option="--height", help="Height [m].", least=0.5, most=20.0)
     for name, arguments in (("climb", (height,)), ("hold", ())):
-        cli.add_operator_verb(app, name, OperatorVerb(help="Do.", phases=frozenset(), arguments=arguments), give)
+        order_verbs.add_operator_verb(
+            app, name, OperatorVerb(help="Do.", phases=frozenset(), arguments=arguments), give
+        )
     assert app(["climb", "--height", "2.5", "--agent", "1", "--run-dir", "r"], standalone_mode=False) == 7
     assert app(["hold"], standalone_mode=False) == 7
     assert app(["hold", "0", "2", "--agent", "1", "--run", "circle"], standalone_mode=False) == 7

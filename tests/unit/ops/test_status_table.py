@@ -82,11 +82,11 @@ def test_three_agents_in_ordinary_flight_look_so() -> None:
         AgentView(agent=i, status=status(i, held=i == 1, control="HOLD" if i == 1 else "TRACKING")) for i in range(3)
     ]
     assert [line.rstrip() for line in rendered(views, 80, 24)] == [
-        "id phase control  flight   arm alt m/s bat  est link  sep error miss",
-        "                  mode           m       %    m    s    m     m",
-        " 0 TRACK TRACKING EXTERNAL yes 5.0 1.5  75 0.25  0.0 1.00  0.10    0",
-        " 1 TRACK HOLD     EXTERNAL yes 5.0 1.5  75 0.25  0.0 1.00  0.10    0",
-        " 2 TRACK TRACKING EXTERNAL yes 5.0 1.5  75 0.25  0.0 1.00  0.10    0",
+        "id phase      control  flight   arm   alt  m/s bat  est link   sep error  miss",
+        "                       mode             m        %    m    s     m     m",
+        " 0 TRACK      TRACKING EXTERNAL yes   5.0  1.5  75 0.25  0.0  1.00  0.10     0",
+        " 1 TRACK      HOLD     EXTERNAL yes   5.0  1.5  75 0.25  0.0  1.00  0.10     0",
+        " 2 TRACK      TRACKING EXTERNAL yes   5.0  1.5  75 0.25  0.0  1.00  0.10     0",
     ]
 
 
