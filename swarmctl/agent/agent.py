@@ -192,8 +192,8 @@ class Agent:
         """Number of proposals withdrawn or expired; None if separation works without proposals."""
         return self._separation.commits_refused
 
-    def ask(self, order: Order, now_us: int) -> None:
-        """Obey an operator's order, or refuse it with a reason; the operator is answered either way."""
+    def ask(self, order: Order, now_us: int) -> str:
+        """Obey an operator's order, or return why it is refused; the operator is answered either way."""
         if order.verb == EXCLUDE:
             self._world_model.exclude(int(order.arguments[PEER]))
             refusal = ""
@@ -206,6 +206,7 @@ class Agent:
             self._note("order_refused", verb=order.verb, reason=refusal, **order.arguments)
         else:
             self._note("operator", verb=order.verb, **order.arguments)
+        return refusal
 
     def tick(self, now_us: int, deadline_misses: int) -> TickRecord:
         """Run one control step at monotonic time `now_us`.

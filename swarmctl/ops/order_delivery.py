@@ -132,12 +132,15 @@ def addressed(launch: RunningLaunch, order: Order, agents: Sequence[int]) -> lis
     """Return the agents an order is for: those named, or all but one that it says has ended.
 
     Raises:
-        StartError: there is no such agent.
+        StartError: there is no such agent, or none at all.
     """
     for agent in agents:
         if not 0 <= agent < launch.agents:
             raise StartError(f"agent {agent}: {launch.run} has agents 0 to {launch.agents - 1}")
-    return sorted(set(agents)) or [i for i in range(launch.agents) if i != order.arguments.get(PEER)]
+    asked = sorted(set(agents)) or [i for i in range(launch.agents) if i != order.arguments.get(PEER)]
+    if not asked:
+        raise StartError(f"{order.verb}: {launch.run} has no other agent that could be told")
+    return asked
 
 
 def deliver(launch: RunningLaunch, order: Order, agents: Sequence[int]) -> list[Reply]:

@@ -211,12 +211,7 @@ COLUMNS = (
     Column(title="control", width=8, cell=lambda v, s: v.control, justify="left"),
     Column(title="flight", width=8, unit="mode", cell=lambda v, s: name_of(FlightMode, s.flight_mode), justify="left"),
     Column(title="arm", width=3, cell=lambda v, s: "yes" if s.armed else "no", justify="left"),
-    Column(
-        title="alt",
-        width=5,
-        unit="m",
-        cell=lambda v, s: _altitude(s),
-    ),
+    Column(title="alt", width=5, unit="m", cell=lambda v, s: _altitude(s)),
     Column(title="m/s", width=4, cell=lambda v, s: _number(s.ground_speed_m_s, 1, 4)),
     Column(title="bat", width=3, unit="%", cell=lambda v, s: _number(100.0 * s.battery_01, 0, 3)),
     Column(title="est", width=4, unit="m", cell=lambda v, s: _number(s.pos_accuracy_m, 2, 4)),

@@ -155,6 +155,9 @@ def test_who_is_asked() -> None:
     assert addressed(LAUNCH, Order("hold"), []) == [0, 1, 2]
     assert addressed(LAUNCH, Order("hold"), [2, 0, 2]) == [0, 2]
     assert addressed(LAUNCH, Order("exclude", {PEER: 1.0}), []) == [0, 2], "it has ended"
+    alone = RunningLaunch("alone-1a", "unixsock-stream//x", 1, 0.0, 1, "runs/x")
+    with pytest.raises(StartError, match="no other agent"):
+        addressed(alone, Order("exclude", {PEER: 0.0}), [])
     for wrong in (-1, 3):
         with pytest.raises(StartError, match="agents 0 to 2"):
             addressed(LAUNCH, Order("hold"), [wrong])
