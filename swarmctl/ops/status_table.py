@@ -53,7 +53,8 @@ class AgentView:
         """Return what the vehicle is doing, as far as is known."""
         if self.status is None:
             return ""
-        return ControlMode.LOST if self.silent_s > _SILENT_S else printable(self.status.control, 8)
+        lost = self.silent_s > _SILENT_S and self.status.phase != Phase.DONE  # what is done may end
+        return ControlMode.LOST if lost else printable(self.status.control, 8)
 
     @property
     def alert(self) -> str:
@@ -128,7 +129,7 @@ class PlainLines:
     def show(self, agents: Sequence[AgentView]) -> None:
         for view in agents:
             phase = "" if view.status is None else name_of(Phase, view.status.phase)
-            control = view.control if view.control in _OPERATORS_MATTER else ""
+            control = view.control if view.control in _OPERATORS_MATTER and not view.note else ""
             if (phase, control, view.note) == self._last.get(view.agent, ("", "", "")):
                 continue
             self._last[view.agent] = (phase, control, view.note)

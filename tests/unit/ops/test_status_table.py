@@ -100,6 +100,8 @@ def test_what_is_unknown_is_a_dash_and_an_agent_without_a_status_has_its_number(
 def test_an_agent_that_is_silent_is_lost_and_its_link_ages() -> None:
     view = AgentView(agent=0, status=status(0, link_age_ms=100.0), received_s=time.monotonic() - 7.0)
     assert view.control == "LOST"
+    view.status = status(0, link_age_ms=100.0, phase=Phase.DONE, control="AUTO")
+    assert view.control == "AUTO", "its process has ended as it should"
     assert 7.0 <= float(status_cells(view)[9]) <= 8.0
 
 
@@ -139,10 +141,15 @@ def test_lines_say_when_an_agent_is_held_and_when_no_more() -> None:
     for control in ("TRACKING", "REPLAY", "HOLD", "HOLD", "TRACKING"):
         view.status = status(2, control=control)
         lines.show([view])
+    view.note = "dead"
+    for received_s in (time.monotonic(), time.monotonic() - 10.0):  # that nothing comes any more is no news
+        view.received_s = received_s
+        lines.show([view])
     assert [line.split("s  ")[1] for line in stream.getvalue().splitlines()] == [
         "agent-2  TRACK",
         "agent-2  TRACK  HOLD",
         "agent-2  TRACK",
+        "agent-2  TRACK  dead",
     ]
 
 
