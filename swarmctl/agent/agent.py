@@ -40,6 +40,7 @@ from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.control.phases.failsafe import FailsafeDecision, decide
 from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.control.phases.overload import Level, Overload
+from swarmctl.control.reference.heading import Heading
 from swarmctl.control.setpoint import setpoint_of
 from swarmctl.core.clock import Clock
 from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned
@@ -118,6 +119,7 @@ class Agent:
         self._predictor = Predictor(setup.vehicle_model)
         self._safety_filter = make_safety_filter(setup, self._world_model, self._note, stopwatch_ns)
         self._state_machine = make_state_machine(setup)
+        self._heading = Heading(setup.mission.yaw_rad)
         self._reference_selector = ReferenceSelector(setup, self._state_machine, self._note)
         self._decision = FailsafeDecision(Mode.IDLE, "")
         self._virtual_control = np.array([0.0, 0.0, GRAVITY_M_S2])
@@ -190,13 +192,21 @@ class Agent:
         """Number of proposals withdrawn or expired; None if separation works without proposals."""
         return self._separation.commits_refused
 
-    def ask(self, order: Order, now_us: int) -> None:
-        """Apply an operator's order."""
+    def ask(self, order: Order, now_us: int) -> str:
+        """Obey an operator's order, or return why it is refused; the operator is answered either way."""
         if order.verb == EXCLUDE:
             self._world_model.exclude(int(order.arguments[PEER]))
+            refusal = ""
         else:
-            self._state_machine.operator(order, now_us, self._clock.utc_us(), self._autopilot.poll(now_us))
-        self._note("operator", verb=order.verb, **order.arguments)
+            state = self._autopilot.poll(now_us)
+            refusal = self._state_machine.operator(order, now_us, self._clock.utc_us(), state)
+        self._world_model.answer(order, refusal)
+        if refusal:
+            self._alerts.put("order", f"{order.verb} refused: {refusal}", now_us)
+            self._note("order_refused", verb=order.verb, reason=refusal, **order.arguments)
+        else:
+            self._note("operator", verb=order.verb, **order.arguments)
+        return refusal
 
     def tick(self, now_us: int, deadline_misses: int) -> TickRecord:
         """Run one control step at monotonic time `now_us`.
@@ -237,7 +247,7 @@ class Agent:
         refusals = self._world_model.refusals.alert(self._clock.utc_us())
         if refusals:
             self._alerts.put("bus", refusals, now_us)
-        self._publisher.active_alert = self._alerts.text(now_us)
+        self._publisher.active_alert = self._alerts.newest(now_us)
         return self._publisher.publish(
             now_us,
             state,
@@ -265,6 +275,8 @@ class Agent:
     def _receive(self, now_us: int) -> None:
         for order in self._world_model.receive(self._clock.utc_us()):
             self.ask(order, now_us)
+        for answer in self._world_model.due_answers():
+            self._publisher.answer(answer)
         self._separation.receive(self._clock.utc_us())
 
     def _sense(self, now_us: int) -> VehicleState | None:
@@ -451,7 +463,7 @@ class Agent:
             flies=flies,
             committed_peers=self._directive.committed_peers,
         )
-        yaw_rad, hover_01 = self._setup.mission.yaw_rad, estimate.hover_thrust_01
+        yaw_rad, hover_01 = self._heading.at(now_us, self._state_machine.yaw_rad), estimate.hover_thrust_01
         setpoint = setpoint_of(virtual_control, yaw_rad, hover_01, now_us, params=self._setup.vehicle_model)
         refused = self._autopilot.send(setpoint, self._clock.now_us())
         if refused:

@@ -20,6 +20,7 @@ from swarmctl.control.estimation.disturbance import DisturbanceObserver
 from swarmctl.control.estimation.state_filter import StateFilter
 from swarmctl.control.phases.state_machine import MissionStateMachine
 from swarmctl.control.reference.mission import MissionReference
+from swarmctl.mavlink.geofence import is_inside
 
 Note = Callable[..., None]
 Stopwatch = Callable[[], int]  # returns a running time [ns]
@@ -137,4 +138,5 @@ def make_state_machine(setup: AgentSetup) -> MissionStateMachine:
         start_ned_m=setup.starts_ned_m[setup.agent],
         duration_s=setup.mission.duration_s,
         reference=reference,
+        contains=lambda at_ne_m: not setup.fence_ne_m or is_inside(at_ne_m, setup.fence_ne_m),
     )

@@ -9,6 +9,7 @@ import gc
 import signal
 import sys
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -30,6 +31,7 @@ from swarmctl.wall_clock import WallClock
 
 _LOOPBACK = "127.0.0.1"
 _LINGER_S = 1.0  # time the process lives on after its end, so that peers receive the last status
+_STOP_REPEAT_US = 1_000_000
 _VEHICLE_LOST_S = 15.0  # time without any vehicle state after which the process gives up
 
 
@@ -55,6 +57,25 @@ class Pace:
         skipped = max(0, (now_us - self.due_us) // self.period_us)
         self.missed += skipped
         self.due_us += skipped * self.period_us
+
+
+class StopOrder:
+    """Orders the landing that a signal asks for, again while it is refused: a pilot may give the vehicle back.
+
+    Args:
+        ask: gives an order at a time [us]; returns why it is refused, or "".
+    """
+
+    def __init__(self, ask: Callable[[Order, int], str]) -> None:
+        self._ask = ask
+        self._due_us: int | None = None
+
+    def step(self, stop: StopRequest, now_us: int) -> None:
+        """Give the order if it is due. Called once in every tick."""
+        if stop.take():
+            self._due_us = now_us
+        if self._due_us is not None and now_us >= self._due_us:
+            self._due_us = now_us + _STOP_REPEAT_US if self._ask(Order("land"), now_us) else None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -133,6 +154,7 @@ def _join(process: AgentProcess, config: Config, clock: WallClock) -> Bus:
 def _loop(agent: Agent, config: Config, clock: WallClock, stop: StopRequest, *, vehicle: str, only_land: bool) -> int:
     gc.collect()
     gc.freeze()  # keep objects of the start-up out of collections during flight
+    landing = StopOrder(agent.ask)
     pace = Pace(round(1e6 / config.agent.rate_hz), clock.now_us())
     seen_us = clock.now_us()
     ever_seen = False
@@ -140,8 +162,7 @@ def _loop(agent: Agent, config: Config, clock: WallClock, stop: StopRequest, *, 
     while True:
         clock.sleep_until(pace.due_us)
         now_us = clock.now_us()
-        if stop.take():
-            agent.ask(Order("land"), now_us)
+        landing.step(stop, now_us)
         record = agent.tick(now_us, pace.missed)
         pace.done(now_us + round(record.timing.tick_ms * 1000), clock.now_us())
         if record.mode is not Mode.STATE_STALE:

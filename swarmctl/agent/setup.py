@@ -55,6 +55,7 @@ class AgentSetup:
     separation: SeparationParams
     vehicle_model: VehicleModelParams
     max_obstacles: int
+    fence_ne_m: tuple[tuple[float, float], ...]  # corners of the geofence; none: no fence
     drift_m: float  # by a gust of `separation.gust_m_s`
 
     @property

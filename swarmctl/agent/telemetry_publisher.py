@@ -9,14 +9,16 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from swarmctl.agent.alerts import Alert
 from swarmctl.bus import topics
-from swarmctl.bus.json_messages import StatusMessage, encode_message
+from swarmctl.bus.json_messages import MAX_REASON, AnswerMessage, StatusMessage, encode_message
 from swarmctl.bus.peers import Bus, PeerPaths
 from swarmctl.control.collision.separation import KeepOut
 from swarmctl.control.estimation.disturbance import Estimate
 from swarmctl.control.mpc.problem import Start
 from swarmctl.control.phases.state_machine import MissionStateMachine
 from swarmctl.core.clock import Clock
+from swarmctl.core.operator_verbs import Answer
 from swarmctl.core.records import pack_tick
 from swarmctl.core.tick_record import TickRecord, TickTiming
 from swarmctl.core.types import AttitudeSetpoint, Mode, Plan, Reference, VehicleState
@@ -85,7 +87,7 @@ class TelemetryPublisher:
         self._status_us = -_STATUS_EVERY_US
         self.seq = 0
         self.failed_plans = 0
-        self.active_alert = ""
+        self.active_alert: Alert | None = None
 
     def publish(
         self,
@@ -118,6 +120,19 @@ class TelemetryPublisher:
             self._status_us = now_us
             self._bus.publish(topics.STATUS, encode_message(self._status(record, state_machine)))
         return record
+
+    def answer(self, answer: Answer) -> None:
+        """Answer an operator's order."""
+        message = AnswerMessage(
+            agent=self._agent,
+            boot_id=self._boot_id,
+            verb=answer.verb,
+            number=answer.number,
+            accepted=answer.accepted,
+            reason=answer.reason[:MAX_REASON],
+            utc_us=self._clock.utc_us(),
+        )
+        self._bus.publish(topics.ANSWER, encode_message(message))
 
     def _record(
         self,
@@ -174,6 +189,7 @@ class TelemetryPublisher:
 
     def _status(self, record: TickRecord, state_machine: MissionStateMachine) -> StatusMessage:
         state, reference, error_m = record.state, record.reference, math.nan
+        health, received_us, alert = self._autopilot.health, self._autopilot.received_us, self.active_alert
         if state is not None and reference is not None:
             error = state.pos_ned_m - reference.pos_ned_m[0]
             error_m = math.sqrt(float(error @ error))
@@ -186,6 +202,15 @@ class TelemetryPublisher:
             flight_mode=int(record.flight_mode),
             armed=record.armed,
             landed=int(self._autopilot.landed),
+            held=state_machine.held,
+            control=state_machine.control_mode(record.mode),
+            altitude_m=0.0 if state is None else -float(state.pos_ned_m[2]),
+            ground_speed_m_s=-1.0 if state is None else math.hypot(*state.vel_ned_m_s[:2].tolist()),
+            battery_01=_known(health.battery_01),
+            pos_accuracy_m=_known(self._autopilot.pos_accuracy_m),
+            gps_fix=-1 if health.gps_fix is None else health.gps_fix,
+            satellites=-1 if health.satellites is None else health.satellites,
+            link_age_ms=-1.0 if received_us is None else (record.t_us - received_us) * 1e-3,
             ready_utc_us=state_machine.ready_utc_us,
             outcome=state_machine.outcome,
             position_error_m=_finite(error_m),
@@ -195,10 +220,16 @@ class TelemetryPublisher:
             deadline_misses=record.deadline_misses,
             plan_staleness_ms=_finite(record.plan_staleness_ms),
             solver_failed=self.failed_plans,
-            active_alert=self.active_alert,
+            active_alert="" if alert is None else alert.text,
+            alert_age_s=-1.0 if alert is None else (record.t_us - alert.since_us) * 1e-6,
             uses_commitments=self._uses_commitments,
             utc_us=record.utc_us,
         )
+
+
+def _known(value: float | None) -> float:
+    """Return the value, or -1 in place of None."""
+    return -1.0 if value is None else _finite(value)
 
 
 def _finite(value: float) -> float:

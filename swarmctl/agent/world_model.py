@@ -23,7 +23,7 @@ from swarmctl.control.collision.separation import (
 )
 from swarmctl.control.phases.inputs import PeerInputs
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.operator_verbs import Order
+from swarmctl.core.operator_verbs import Answer, Order
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.trajectory_message import TrajectoryMessage
 from swarmctl.core.types import Array, Mode, Phase
@@ -82,6 +82,14 @@ class WorldModel:
         self.refusals.report(utc_us)
         self._watch_unresponsive(utc_us)
         return [order for order in orders if order is not None]
+
+    def answer(self, order: Order, refusal: str) -> None:
+        """Keep the agent's answer to an order: accepted, or why it is refused."""
+        self._orders.answer(order, refusal)
+
+    def due_answers(self) -> list[Answer]:
+        """Return the answers to operators' orders and their repetitions that are to be sent now."""
+        return self._orders.due_answers()
 
     def _take_status(self, sender: str, payload: bytes, utc_us: int) -> None:
         status = decode_status(payload)

@@ -1,4 +1,4 @@
-"""Messages of the bus that are JSON: an agent's status, an operator's order, the list of obstacles.
+"""Messages of the bus that are JSON: an agent's status, an operator's order, its answers, the list of obstacles.
 
 Decoders check bounds and return None for anything that does not fit; they never raise.
 """
@@ -10,7 +10,7 @@ from typing import Annotated, Any, TypeVar
 import msgspec
 
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.operator_verbs import Order, order_problem
+from swarmctl.core.operator_verbs import UNNUMBERED, Answer, Order, order_problem
 from swarmctl.core.types import FlightMode, Mode, Phase
 
 _Message = TypeVar("_Message")
@@ -18,6 +18,7 @@ _Message = TypeVar("_Message")
 MAX_OBSTACLES = 64  # each visible one takes 20 us of a tick of 20 ms; 6000 took 130 ms
 _OBSTACLE_KEYS = {"center_ned_m", "radius_m", "keep_out_m", "visibility_m"}  # no message may leave these out
 MAX_VERSION_STEP = 64  # largest step of the list's version; an extreme one would lock out all later ones
+MAX_REASON = 500  # longest reason of a refusal
 Word = Annotated[str, msgspec.Meta(max_length=32)]
 Count = Annotated[int, msgspec.Meta(ge=0, le=2**62)]
 
@@ -33,6 +34,15 @@ class StatusMessage(msgspec.Struct, frozen=True, kw_only=True):
     flight_mode: Annotated[int, msgspec.Meta(ge=0, le=int(max(FlightMode)))]
     armed: bool
     landed: int
+    held: bool  # an operator holds it, and `resume` lets it go on
+    control: Word  # what it is doing: `control.phases.control_mode`
+    altitude_m: float  # above the shared origin, where there is a state: `ground_speed_m_s` is -1 without one
+    ground_speed_m_s: float
+    battery_01: float  # -1, here and below: unknown
+    pos_accuracy_m: float  # horizontal, 1 sigma, as its estimator reports it
+    gps_fix: int  # GPS_FIX_TYPE
+    satellites: int
+    link_age_ms: float  # since the newest message of the vehicle
     ready_utc_us: Count  # time of reaching its start position, 0 before
     outcome: str  # "" while flying, "completed", or why the mission failed
     position_error_m: float
@@ -43,6 +53,7 @@ class StatusMessage(msgspec.Struct, frozen=True, kw_only=True):
     plan_staleness_ms: float
     solver_failed: int
     active_alert: str  # newest one, "" for none
+    alert_age_s: float  # since it began
     uses_commitments: bool  # it flies committed trajectories only, see `control.commit`
     utc_us: Count  # time of sending, by the agent's clock
 
@@ -54,11 +65,29 @@ class CommandMessage(msgspec.Struct, frozen=True):
     agent: int
     utc_us: Count  # time of the request, by the clock of the agents asked
     arguments: Annotated[dict[Word, float], msgspec.Meta(max_length=8)] = {}
+    number: Count = UNNUMBERED  # repetitions have the same, under newer stamps
 
     @property
     def order(self) -> Order:
         """The order itself, without addressee and time."""
-        return Order(self.verb, self.arguments)
+        return Order(self.verb, self.arguments, self.number)
+
+
+class AnswerMessage(msgspec.Struct, frozen=True, kw_only=True):
+    """Holds an agent's answer to a numbered order; it is repeated for every repetition of the order."""
+
+    agent: Count
+    boot_id: Count
+    verb: Word
+    number: Count
+    accepted: bool
+    reason: Annotated[str, msgspec.Meta(max_length=MAX_REASON)]  # why it is refused
+    utc_us: Count  # time of sending, by the agent's clock
+
+    @property
+    def answer(self) -> Answer:
+        """The answer itself, without sender and time."""
+        return Answer(self.verb, self.number, self.accepted, self.reason)
 
 
 class ObstaclesMessage(msgspec.Struct, frozen=True):
@@ -88,6 +117,11 @@ def decode_command(payload: bytes) -> CommandMessage | None:
     return None if message is None or order_problem(message.verb, message.arguments) else message
 
 
+def decode_answer(payload: bytes) -> AnswerMessage | None:
+    """Decode an agent's answer; None if it is malformed or out of bounds."""
+    return _decode(payload, _ANSWER_DECODER)
+
+
 def decode_obstacles(payload: bytes) -> ObstaclesMessage | None:
     """Decode a list of obstacles; None if it is malformed or out of bounds."""
     return _decode(payload, _OBSTACLES_DECODER)
@@ -107,6 +141,7 @@ def _obstacle(kind: type, item: Any) -> Obstacle:
 
 _STATUS_DECODER = msgspec.json.Decoder(StatusMessage)
 _COMMAND_DECODER = msgspec.json.Decoder(CommandMessage)
+_ANSWER_DECODER = msgspec.json.Decoder(AnswerMessage)
 _OBSTACLES_DECODER = msgspec.json.Decoder(ObstaclesMessage, dec_hook=_obstacle)
 
 

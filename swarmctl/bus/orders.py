@@ -1,17 +1,18 @@
-"""Operators' orders: their validity, which of several is obeyed, and whose clock stamps them. Pure."""
+"""An operator's order: its validity, which of several is obeyed, its answer, and which clock stamps it. Pure."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
 from swarmctl.bus.json_messages import CommandMessage, decode_command, encode_message
-from swarmctl.bus.refusals import FUTURE_ORDER, MALFORMED, REPLAYED, STALE_ORDER, SUPERSEDED_ORDER, Refusals
+from swarmctl.bus.refusals import FUTURE_ORDER, MALFORMED, REPLAYED, SEQUENCE, STALE_ORDER, SUPERSEDED_ORDER, Refusals
 from swarmctl.bus.topics import COMMAND
-from swarmctl.core.operator_verbs import OPERATOR_VERBS, Order
+from swarmctl.core.operator_verbs import OPERATOR_VERBS, UNNUMBERED, Answer, Order
 
 VALID_US = 2_000_000  # from its stamp on
 MAX_LEAD_US = 500_000  # a stamp further in the future comes from another clock
 _SAME_CLOCK_US = 500_000
+_REMEMBERED = 64  # newest numbered orders whose answers are repeated
 EVERYBODY = -1
 
 
@@ -20,7 +21,8 @@ class Orders:
 
     An order is valid for `VALID_US`: an older one may have been meant for another flight. Of two orders the one with
     the later stamp counts, in whatever sequence they arrive, so a repeated `hold` does not undo a `resume`. Only `land`
-    is obeyed whatever came before it.
+    is obeyed whatever came before it. A numbered order is answered, and its number marks what repeats it under newer
+    stamps, so a `hold` that is repeated for long does not undo a `resume` either.
 
     Args:
         agent: own index.
@@ -30,6 +32,9 @@ class Orders:
     def __init__(self, agent: int, refusals: Refusals) -> None:
         self._agent, self._refusals = agent, refusals
         self._newest: CommandMessage | None = None  # newest one obeyed
+        self._numbered: dict[int, Order] = {}  # those taken, by number
+        self._answers: dict[int, Answer] = {}  # by number
+        self._due: dict[int, Answer] = {}  # to be sent, by number
 
     def take(self, sender: str, payload: bytes, utc_us: int) -> Order | None:
         """Return the order if it is for this agent and to be obeyed now, otherwise None."""
@@ -39,16 +44,45 @@ class Orders:
         reason = MALFORMED if message is None else self._refusal(message, utc_us)
         if reason or message is None:
             self._refusals.add(sender, COMMAND.name, reason, utc_us)
+            if message is not None:
+                self._answer_again(message.order, reason)
             return None
         if self._newest is None or message.utc_us > self._newest.utc_us:
             self._newest = message
+        if message.number != UNNUMBERED:
+            self._numbered[message.number] = message.order
+            if len(self._numbered) > _REMEMBERED:
+                forgotten = next(iter(self._numbered))
+                del self._numbered[forgotten]
+                self._answers.pop(forgotten, None)
         return message.order
+
+    def answer(self, order: Order, refusal: str) -> None:
+        """Keep the answer to an order that was taken: accepted, or why it is refused."""
+        if order.number == UNNUMBERED:
+            return
+        self._answers[order.number] = self._due[order.number] = Answer(order.verb, order.number, not refusal, refusal)
+
+    def due_answers(self) -> list[Answer]:
+        """Return the answers to send now, each once for as many repetitions as have arrived since the last call."""
+        due, self._due = list(self._due.values()), {}
+        return due
+
+    def _answer_again(self, order: Order, reason: str) -> None:
+        if order.number == UNNUMBERED:
+            return
+        if reason == SUPERSEDED_ORDER:
+            self._due[order.number] = Answer(order.verb, order.number, False, "a newer order was obeyed")
+        elif reason == REPLAYED and order.number in self._answers:
+            self._due[order.number] = self._answers[order.number]
 
     def _refusal(self, message: CommandMessage, utc_us: int) -> str:
         if utc_us - message.utc_us > VALID_US:
             return STALE_ORDER
         if message.utc_us - utc_us > MAX_LEAD_US:
             return FUTURE_ORDER
+        if message.number in self._numbered:
+            return REPLAYED if self._numbered[message.number] == message.order else SEQUENCE
         if self._newest is None or message.utc_us > self._newest.utc_us:
             return ""
         if message == self._newest:
@@ -72,5 +106,6 @@ def order_messages(order: Order, agent: int, utc_us: int, clocks_us: Iterable[in
     for clock_us in sorted(clocks_us):
         if all(abs(clock_us - known_us) > _SAME_CLOCK_US for known_us in stamps_us):
             stamps_us.append(clock_us)
-    messages = [CommandMessage(order.verb, agent, stamp_us, dict(order.arguments)) for stamp_us in stamps_us]
+    arguments = dict(order.arguments)
+    messages = [CommandMessage(order.verb, agent, stamp_us, arguments, order.number) for stamp_us in stamps_us]
     return [encode_message(message) for message in messages]

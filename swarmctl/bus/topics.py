@@ -20,12 +20,13 @@ class Topic:
 
 
 PATH = Topic(name="path", ring=4, max_bytes=4096, reliable=False)
-STATUS = Topic(name="status", ring=4, max_bytes=16_384, reliable=False)
+STATUS = Topic(name="status", ring=4, max_bytes=20_480, reliable=False)
 TICK = Topic(name="tick", ring=256, max_bytes=4096, reliable=False)
 COMMAND = Topic(name="command", ring=64, max_bytes=1024, reliable=True)
+ANSWER = Topic(name="answer", ring=16, max_bytes=4096, reliable=True)
 OBSTACLES = Topic(name="obstacles", ring=4, max_bytes=65_536, reliable=True)
 TRAJECTORY = Topic(name="trajectory", ring=4, max_bytes=131_072, reliable=False)  # each one replaces all earlier ones
-TOPICS = (PATH, STATUS, TICK, COMMAND, OBSTACLES, TRAJECTORY)
+TOPICS = (PATH, STATUS, TICK, COMMAND, ANSWER, OBSTACLES, TRAJECTORY)
 
 TOO_LONG = b""  # replaces a message that is too long; every decoder refuses it
 

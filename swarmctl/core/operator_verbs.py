@@ -11,6 +11,8 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+UNNUMBERED = 0  # number of an order that wants no answer
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class VerbArgument:
@@ -21,11 +23,12 @@ class VerbArgument:
     help: str
     least: float
     most: float
+    required: bool = True
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class OperatorVerb:
-    """Describes one verb; outside of `phases` an agent ignores it."""
+    """Describes one verb; outside of `phases` an agent refuses it, and may for a reason of its own within them."""
 
     help: str
     phases: frozenset[str]  # names of `Phase`, because the command line must not wait for numpy
@@ -40,25 +43,72 @@ class Order:
 
     verb: str
     arguments: Mapping[str, float] = field(default_factory=dict)
+    number: int = UNNUMBERED  # the same in every repetition; answers name it
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """Holds what an agent answers to a numbered order."""
+
+    verb: str
+    number: int
+    accepted: bool
+    reason: str = ""  # why it is refused
 
 
 EXCLUDE, PEER = "exclude", "peer"
-_BEFORE_LANDING = frozenset({"CONNECT", "STANDBY", "ARM", "TAKEOFF", "GOTO_START", "READY", "TRACK", "GOTO_LAND"})
+GOTO = "goto"
+POINT = ("north_m", "east_m", "down_m")  # arguments of `goto`, shared NED
+YAW, SPEED = "yaw_deg", "speed_m_s"  # and its optional ones
+_FAR_M = 100_000.0  # from the shared origin
+_AIRBORNE = frozenset({"TAKEOFF", "GOTO_START", "READY", "TRACK", "GOTO_LAND"})  # the agent decides where it flies
+_NOT_LANDING = _AIRBORNE | {"CONNECT", "STANDBY", "ARM", "DONE"}
 
 OPERATOR_VERBS = {
-    "hold": OperatorVerb(help="Brake and hold position.", phases=frozenset({"TRACK"})),
-    "resume": OperatorVerb(help="Resume the mission after `hold`.", phases=_BEFORE_LANDING),
+    "hold": OperatorVerb(
+        help="Brake and hold position, also on the way up and to the landing place.", phases=_AIRBORNE
+    ),
+    "resume": OperatorVerb(
+        help="Go on after `hold`, and take the vehicle back after a pilot or its autopilot took over.",
+        phases=_AIRBORNE | {"ARM"},  # also of a vehicle found in the air under a pilot
+    ),
     "land": OperatorVerb(
-        help="Separate, then land.", phases=_BEFORE_LANDING, is_stop=True, never_superseded=True
+        help="Separate, then land.", phases=_NOT_LANDING | {"LAND"}, is_stop=True, never_superseded=True
     ),  # a stamp a little in the future must not delay a landing
     "rtl": OperatorVerb(
         help="Fly back to the start under the agent's own MPC, then land. The autopilot's return mode is not used.",
-        phases=_BEFORE_LANDING,
+        phases=_NOT_LANDING,
         is_stop=True,
+    ),
+    GOTO: OperatorVerb(
+        help="Fly to a point under the agent's own planner, and hold there until `resume`.",
+        phases=frozenset({"GOTO_START", "READY", "TRACK"}),  # what is on its way to land stays so
+        arguments=(
+            *(
+                VerbArgument(name=name, option=f"--{name[:-2]}", help="[m]", least=-_FAR_M, most=_FAR_M)
+                for name in POINT
+            ),
+            VerbArgument(
+                name=YAW,
+                option="--yaw",
+                help="Heading there, clockwise from north [deg]; default: that of the mission.",
+                least=-360.0,
+                most=360.0,
+                required=False,
+            ),
+            VerbArgument(
+                name=SPEED,
+                option="--speed",
+                help="Peak speed [m/s]; default: agent.state_machine.speed_m_s.",
+                least=0.1,
+                most=20.0,
+                required=False,
+            ),
+        ),
     ),
     EXCLUDE: OperatorVerb(
         help="Vouch that an agent has ended: the others no longer wait for its answers, and keep clear of its place.",
-        phases=_BEFORE_LANDING | {"LAND"},
+        phases=_NOT_LANDING | {"LAND"},
         arguments=(
             VerbArgument(name=PEER, option="--peer", help="Number of the agent that has ended.", least=0, most=254),
         ),
@@ -72,10 +122,11 @@ def order_problem(verb: str, arguments: Mapping[str, float]) -> str:
     known = OPERATOR_VERBS.get(verb)
     if known is None:
         return f"{verb!r} is no verb; known are {', '.join(OPERATOR_VERBS)}"
-    if arguments.keys() != {argument.name for argument in known.arguments}:
+    required = {argument.name for argument in known.arguments if argument.required}
+    if not required <= arguments.keys() <= {argument.name for argument in known.arguments}:
         return f"{verb} takes {', '.join(argument.name for argument in known.arguments) or 'no arguments'}"
     for argument in known.arguments:
-        value = arguments[argument.name]
+        value = arguments.get(argument.name, argument.least)
         if not (math.isfinite(value) and argument.least <= value <= argument.most):
             return f"{argument.name} {value:g}: allowed: {argument.least:g} to {argument.most:g}"
     return ""

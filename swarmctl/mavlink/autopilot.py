@@ -25,6 +25,7 @@ from swarmctl.mavlink.local_frame import LocalFrame
 from swarmctl.mavlink.mode_watch import ModeWatch
 from swarmctl.mavlink.transport import Transport
 from swarmctl.mavlink.vehicle_clock import VehicleClock
+from swarmctl.mavlink.vehicle_health import VehicleHealth
 
 _ATTITUDE_ONLY = 7  # type_mask that ignores body rates; with mask 0 rate and attitude setpoints would compete
 _ARMED_FLAG = 128
@@ -72,8 +73,8 @@ class Autopilot:
         received_us: arrival time of the last frame, host clock.
         invalid: number of polls without a state although a sample existed, by reason.
         watch: the vehicle's flight mode and failsafe, and whether they are in doubt.
-        gaps: number of setpoint gaps so long that the autopilot's failsafe may have acted unseen.
-        gap_s: length of the newest such gap.
+        gaps: number of setpoint gaps so long that the autopilot's failsafe may have acted unseen; `gap_s`: the newest.
+        health: battery and GPS.
     """
 
     params: dict[str, float]
@@ -102,11 +103,9 @@ class Autopilot:
         self.watch = ModeWatch()
         self._slow: CommandPort | None = None
         self.dialect: Dialect | None = None
-        self.armed = False
-        self.armed_told_us = -1
+        self.armed, self.armed_told_us = False, -1
         self.texts: list[str] = []
-        self.refused_setpoints = 0
-        self.samples = 0
+        self.refused_setpoints = self.samples = 0
         self.received_us: int | None = None
         self.invalid: Counter[str] = Counter()
         self.gaps, self.gap_s = 0, 0.0
@@ -246,6 +245,7 @@ class Autopilot:
 
     def _sys_status(self, message: Any, arrived_us: int) -> None:
         self.armable = bool(message.onboard_control_sensors_health & _PREARM)
+        self.health.sys_status(message)
 
     def _extended(self, message: Any, arrived_us: int) -> None:
         self.landed = Landed(message.landed_state) if message.landed_state <= Landed.LANDING else Landed.UNKNOWN
@@ -331,8 +331,7 @@ class Autopilot:
         self._sample = self._placed = self._attitude = self._reset_counter = None
         self._was_reset = False
         self._odometry_us = 0
-        self.landed = Landed.UNKNOWN
-        self.armable = False
+        self.landed, self.armable, self.health = Landed.UNKNOWN, False, VehicleHealth()
         self.params, self.whole_params = {}, set()
         self.hover_thrust_01 = self.pos_accuracy_m = None
         self.frame.forget()
@@ -364,6 +363,7 @@ class Autopilot:
 
     def _gps(self, message: Any, arrived_us: int) -> None:
         self._accuracy("GPS_RAW_INT", message.h_acc * 1e-3)
+        self.health.gps(message)
 
     def _accuracy(self, source: str, sigma_m: float) -> None:
         """Return an accuracy [m], or None for 0, which both messages use for unknown."""

@@ -5,23 +5,24 @@ Heavy modules are imported inside the verb that needs them, so that `--help` ans
 
 from __future__ import annotations
 
-import inspect
+import contextlib
 import os
 import signal
 import sys
-from collections.abc import Callable
+import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
 from swarmctl import __version__
-from swarmctl.core.operator_verbs import OPERATOR_VERBS, OperatorVerb, Order
 from swarmctl.core.text import printable_lines
-from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, ConfigError, MissionError, SwarmError
+from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, ConfigError, SwarmError
+from swarmctl.ops.order_verbs import Run, add_order_verbs
 
 if TYPE_CHECKING:
     from swarmctl.bus.json_messages import ObstaclesMessage, StatusMessage
+    from swarmctl.ops.operator import RunningLaunch
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -45,8 +46,7 @@ Set = Annotated[
 ]
 NewRunDir = Annotated[Path | None, typer.Option("--run-dir", help="Run folder to create; default runs/<UTC>-<name>.")]
 View = Annotated[bool | None, typer.Option("--view/--no-view", help="Open the viewer window.")]
-RunningDir = Annotated[Path | None, typer.Option("--run-dir", help="Run folder of the launch; default: the newest.")]
-OneAgent = Annotated[int | None, typer.Option("--agent", help="Address one agent; default: all.")]
+_WATCH_S = 0.25
 Folder = Annotated[Path, typer.Argument(help="Run folder.")]
 # The verb's module declares the options, and answers --help.
 _PASS_ON = {"ignore_unknown_options": True, "allow_extra_args": True, "help_option_names": []}
@@ -207,56 +207,47 @@ def agent(
 
 @app.command()
 def status(
-    run_dir: RunningDir = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    run: Run = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON; with --watch one line at a time.")] = False,
+    watch: Annotated[bool, typer.Option("--watch", help="Go on until the launch ends, or Ctrl-C.")] = False,
 ) -> int:
     """Show the status of every agent of a running launch."""
     from swarmctl.ops import operator
 
-    launch = operator.find_launch(run_dir)
+    launch = operator.find_launch(run)
+    if watch:
+        with contextlib.suppress(KeyboardInterrupt):
+            _watch(launch, as_json)
+        return EXIT_OK
     statuses = operator.read_statuses(launch)
-    print(operator.as_json(statuses)) if as_json else _show(statuses, range(launch.agents))
+    if as_json:
+        print(operator.as_json(statuses))
+    else:
+        _show(launch, statuses)
     return EXIT_OK
 
 
-def _give(order: Order, run_dir: Path | None, agent: int | None) -> int:
+def _watch(launch: RunningLaunch, as_json: bool) -> None:
+    """Show statuses until the launch ends: a live table, lines where there is no terminal, or lines of JSON."""
     from swarmctl.ops import operator
+    from swarmctl.ops.status_table import AgentView, open_display
 
-    launch = operator.find_launch(run_dir)
-    statuses = operator.command(launch, order, agent)
-    asked = range(launch.agents) if agent is None else range(agent, agent + 1)
-    _show(statuses, asked)
-    if ignored := operator.ignored_by(order, statuses, asked):
-        raise MissionError(f"{order.verb}: {'; '.join(ignored)}")
-    return EXIT_OK
-
-
-def add_operator_verb(
-    to: typer.Typer, name: str, verb: OperatorVerb, give: Callable[[Order, Path | None, int | None], int] = _give
-) -> None:
-    """Add a verb of the operator, with a required option for each of its arguments.
-
-    Args:
-        to: command line to extend.
-        name, verb: entry of `OPERATOR_VERBS`.
-        give: gives the order to the launch of a run folder, to one agent or to all; returns the exit code.
-    """
-
-    def run(run_dir: RunningDir = None, agent: OneAgent = None, **arguments: float) -> int:
-        return give(Order(name, arguments), run_dir, agent)
-
-    parameters = list(inspect.signature(run, eval_str=True).parameters.values())[:2]
-    for argument in verb.arguments:
-        option = typer.Option(argument.option, min=argument.least, max=argument.most, help=argument.help)
-        kind = inspect.Parameter.KEYWORD_ONLY
-        parameters.append(inspect.Parameter(argument.name, kind, annotation=Annotated[float, option]))
-    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
-    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # typer derives options from it
-    to.command(name, help=verb.help)(run)
+    views = [AgentView(agent=agent) for agent in range(launch.agents)]
+    display = None if as_json else open_display()
+    try:
+        for statuses in operator.watch_statuses(launch, _WATCH_S):
+            for agent, status in statuses.items():
+                views[agent].status, views[agent].received_s = status, time.monotonic()
+            if display is not None:
+                display.show(views)
+            elif statuses:
+                print(operator.as_json(statuses, indent=None), flush=True)
+    finally:
+        if display is not None:
+            display.close()
 
 
-for _name, _verb in OPERATOR_VERBS.items():
-    add_operator_verb(app, _name, _verb)
+add_order_verbs(app)
 
 
 @app.command()
@@ -270,25 +261,26 @@ def fault(
         str, typer.Option("--direction", help="Link direction: both, to_vehicle, from_vehicle.")
     ] = "both",
     towards: Annotated[float, typer.Option("--towards", help="Direction of a gust or jump [deg from north].")] = 0.0,
-    run_dir: RunningDir = None,
+    run: Run = None,
 ) -> int:
     """Inject a fault into the simulator of a running launch. Refused where real vehicles fly."""
     from swarmctl.ops import operator
     from swarmctl.ops.fault import inject, parse_fault
 
-    launch = operator.find_launch(run_dir)
+    launch = operator.find_launch(run)
     wanted = {"kind": kind, "vehicle": vehicle, "value": value, "for_s": for_s, "rotor": rotor}
     asked = parse_fault({**wanted, "direction": direction, "towards_deg": towards}, launch.agents)
-    print(inject(launch, asked))
+    print(f"fault: {launch.run}\n{inject(launch, asked)}")
     return EXIT_OK
 
 
 @obstacle_app.command("list")
-def obstacle_list(run_dir: RunningDir = None) -> int:
+def obstacle_list(run: Run = None) -> int:
     """List the obstacles that the agents know."""
     from swarmctl.ops import operator
 
-    _show_obstacles(operator.read_obstacles(operator.find_launch(run_dir)))
+    launch = operator.find_launch(run)
+    _show_obstacles(launch, operator.read_obstacles(launch))
     return EXIT_OK
 
 
@@ -304,37 +296,37 @@ def obstacle_add(
     column: Annotated[
         bool, typer.Option("--column", help="A vertical column of unlimited height, not a sphere.")
     ] = False,
-    run_dir: RunningDir = None,
+    run: Run = None,
 ) -> int:
     """Add a sphere or a column to a running launch."""
     from swarmctl.ops import operator
 
     keep_out_m = radius + 0.75 if keep_out is None else keep_out
     obstacle = operator.obstacle(center, radius, keep_out_m, visibility, velocity=velocity, column=column)
-    launch = operator.find_launch(run_dir)
-    _show_obstacles(operator.change_obstacles(launch, lambda known: (*known, obstacle)))
+    launch = operator.find_launch(run)
+    _show_obstacles(launch, operator.change_obstacles(launch, lambda known: (*known, obstacle)))
     return EXIT_OK
 
 
 @obstacle_app.command("remove")
 def obstacle_remove(
-    number: Annotated[int, typer.Argument(help="Index in `obstacle list`, from 0.")], run_dir: RunningDir = None
+    number: Annotated[int, typer.Argument(help="Index in `obstacle list`, from 0.")], run: Run = None
 ) -> int:
     """Remove an obstacle from a running launch."""
     from swarmctl.ops import operator
 
-    launch = operator.find_launch(run_dir)
-    _show_obstacles(operator.change_obstacles(launch, lambda known: operator.without(known, number)))
+    launch = operator.find_launch(run)
+    _show_obstacles(launch, operator.change_obstacles(launch, lambda known: operator.without(known, number)))
     return EXIT_OK
 
 
 @app.command()
-def view(run_dir: RunningDir = None) -> int:
+def view(run: Run = None) -> int:
     """Open the live view of a running launch."""
     from swarmctl.ops import operator
     from swarmctl.telemetry.view.recordings import open_viewer
 
-    open_viewer(operator.view_address(operator.find_launch(run_dir)))
+    open_viewer(operator.view_address(operator.find_launch(run)))
     return EXIT_OK
 
 
@@ -396,13 +388,15 @@ def _overrides(agents: int | None, duration: float | None, seed: int | None, set
     return [*(sets or ()), *(f"{key}={value}" for key, value in named if value is not None)]
 
 
-def _show(statuses: dict[int, StatusMessage], agents: range) -> None:
+def _show(launch: RunningLaunch, statuses: dict[int, StatusMessage]) -> None:
     from swarmctl.ops.status_table import AgentView, print_statuses
 
-    print_statuses([AgentView(agent=number, status=statuses.get(number)) for number in agents])
+    print(f"status: {launch.run}", file=sys.stderr)  # rows alone on standard output
+    print_statuses([AgentView(agent=number, status=statuses.get(number)) for number in range(launch.agents)])
 
 
-def _show_obstacles(message: ObstaclesMessage) -> None:
+def _show_obstacles(launch: RunningLaunch, message: ObstaclesMessage) -> None:
+    print(f"obstacle: {launch.run}")
     print(f"version {message.version}, {len(message.obstacles)} obstacles, shared NED [m]")
     for number, item in enumerate(message.obstacles):
         center = ", ".join(f"{c:.2f}" for c in item.center_ned_m)

@@ -14,7 +14,7 @@ import os
 import stat
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -30,13 +30,10 @@ from swarmctl.bus.json_messages import (
     decode_status,
     encode_message,
 )
-from swarmctl.bus.orders import EVERYBODY, order_messages
 from swarmctl.bus.peers import agent_name
-from swarmctl.bus.topics import COMMAND, OBSTACLES, OPERATOR, STATUS
+from swarmctl.bus.topics import ANSWER, OBSTACLES, OPERATOR, STATUS
 from swarmctl.bus.zenoh_bus import ZenohBus
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.operator_verbs import OPERATOR_VERBS, PEER, Order
-from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import read_file, replace_bytes
 
@@ -81,34 +78,56 @@ def process_start_s() -> tuple[float, int]:
     return psutil.Process().create_time(), os.getpid()
 
 
-def find_launch(run_dir: Path | None) -> RunningLaunch:
-    """Return the launch of a run folder, or the newest running launch of this user.
+def find_launch(run: str | None) -> RunningLaunch:
+    """Return the running launch that is chosen by its name or run folder, or the only one of this user.
 
     Raises:
         StartError: there is none.
+        ConfigError: there are several, and none of them is chosen.
     """
-    if run_dir is not None:
-        launch = _read(run_dir / LAUNCH_FILE)
+    if run is not None and (Path(run) / LAUNCH_FILE).exists():
+        launch = _read(Path(run) / LAUNCH_FILE)
         if launch is None or not _runs(launch):
-            raise StartError(f"--run-dir {run_dir}: no launch runs there. See what does with: swarmctl status")
+            raise StartError(f"--run {run}: no launch runs there. See what does with: swarmctl status")
         return launch
-    running: list[tuple[float, RunningLaunch]] = []
+    running = running_launches()
+    found = [launch for launch in running if run is None or launch.run.startswith(run)]
+    found = [launch for launch in found if launch.run == run] or found
+    if len(found) == 1:
+        return found[0]
+    if found:
+        names = "\n".join(f"  {launch.run}  {launch.agents} agents  {launch.run_dir}" for launch in found)
+        raise ConfigError("--run", [f"{len(found)} launches run, choose one by its name or folder:\n{names}"])
+    if run is not None:
+        known = ", ".join(launch.run for launch in running) or "none"
+        raise StartError(f"--run {run}: no launch runs there or has that name; running: {known}")
+    raise StartError("no launch runs. Start one with: swarmctl launch")
+
+
+def running_launches() -> list[RunningLaunch]:
+    """Return every running launch of this user, the newest first; notes of others are removed."""
+    running: dict[tuple[int, float], RunningLaunch] = {}
     for path in (path for registry in _registries() for path in registry.glob("*.json")):
         launch = _read(path)
         if launch is not None and _runs(launch):
-            running.append((launch.started_s, launch))
+            running[launch.pid, launch.started_s] = launch
         else:
             with contextlib.suppress(OSError):
                 path.unlink(missing_ok=True)
-    if not running:
-        raise StartError("no launch runs. Start one with: swarmctl launch")
-    return max(running, key=lambda item: item[0])[1]
+    return sorted(running.values(), key=lambda launch: launch.started_s, reverse=True)
 
 
 @contextmanager
-def _joined(launch: RunningLaunch) -> Iterator[ZenohBus]:
+def joined(launch: RunningLaunch) -> Iterator[ZenohBus]:
+    """Join the bus of a launch as its operator."""
     senders = [agent_name(agent) for agent in range(launch.agents)]
-    bus = ZenohBus(launch.bus, launch.run, OPERATOR, {STATUS: senders, OBSTACLES: [OPERATOR]}, connect_timeout_ms=3000)
+    bus = ZenohBus(
+        launch.bus,
+        launch.run,
+        OPERATOR,
+        {STATUS: senders, ANSWER: senders, OBSTACLES: [OPERATOR]},
+        connect_timeout_ms=3000,
+    )
     try:
         yield bus
     finally:
@@ -128,50 +147,16 @@ def view_address(launch: RunningLaunch) -> str:
 
 def read_statuses(launch: RunningLaunch) -> dict[int, StatusMessage]:
     """Return the newest status of every agent that publishes one in time, by agent."""
-    with _joined(launch) as bus:
+    with joined(launch) as bus:
         return _statuses(bus, range(launch.agents), _ANSWER_S)
 
 
-def command(launch: RunningLaunch, order: Order, agent: int | None) -> dict[int, StatusMessage]:
-    """Send an order to one agent or to all, and return the statuses of the addressed ones a second later.
-
-    Raises:
-        StartError: there is no such agent, or none of the addressed agents is on the bus.
-    """
-    if agent is not None and not 0 <= agent < launch.agents:
-        raise StartError(f"--agent {agent}: this launch has agents 0 to {launch.agents - 1}")
-    asked = range(launch.agents) if agent is None else range(agent, agent + 1)
-    with _joined(launch) as bus:
-        ahead_us: dict[int, int] = {}
-        if not _statuses(bus, asked, _ANSWER_S, ahead_us):
-            raise StartError(f"{order.verb}: no agent asked is on the bus; see: swarmctl status")
-        now_us = time.time_ns() // 1000
-        clocks_us = [now_us + us for us in ahead_us.values()]
-        messages = order_messages(order, EVERYBODY if agent is None else agent, now_us, clocks_us)
-        for _ in range(5):
-            for message in messages:
-                bus.publish(COMMAND, message)
-            time.sleep(_REPEAT_S)
-        bus.receive(STATUS)
-        return _statuses(bus, asked, 1.0)
-
-
-def ignored_by(order: Order, statuses: Mapping[int, StatusMessage], asked: Sequence[int]) -> list[str]:
-    """Return which of the agents asked have not obeyed, and why; `statuses` were received after the order."""
-    verb = OPERATOR_VERBS[order.verb]
-    found = []
-    for agent in asked:
-        if agent == order.arguments.get(PEER):
-            continue  # it has ended
-        if agent not in statuses:
-            found.append(f"{agent_name(agent)} does not answer")
-            continue
-        phase = Phase(statuses[agent].phase)
-        stopping = verb.is_stop and phase in (Phase.LAND, Phase.DONE)
-        if phase.name not in verb.phases and not stopping:
-            obeyed = ", ".join(possible.name for possible in Phase if possible.name in verb.phases)
-            found.append(f"{agent_name(agent)} is in {phase.name} and ignores it; it is obeyed in {obeyed}")
-    return found
+def watch_statuses(launch: RunningLaunch, every_s: float) -> Iterator[dict[int, StatusMessage]]:
+    """Yield the statuses that have arrived since the last time, by agent, until the launch ends."""
+    with joined(launch) as bus:
+        while _runs(launch):
+            yield _statuses(bus, range(launch.agents), 0.0)
+            time.sleep(every_s)
 
 
 def read_obstacles(launch: RunningLaunch) -> ObstaclesMessage:
@@ -180,7 +165,7 @@ def read_obstacles(launch: RunningLaunch) -> ObstaclesMessage:
     Raises:
         StartError: the launch does not answer in time.
     """
-    with _joined(launch) as bus:
+    with joined(launch) as bus:
         return _obstacles(bus, 0)
 
 
@@ -188,7 +173,7 @@ def change_obstacles(
     launch: RunningLaunch, change: Callable[[tuple[Obstacle, ...]], tuple[Obstacle, ...]]
 ) -> ObstaclesMessage:
     """Replace the obstacle list by `change(list)` and wait until the launch repeats the new one."""
-    with _joined(launch) as bus:
+    with joined(launch) as bus:
         old = _obstacles(bus, 0)
         changed = change(old.obstacles)
         if len(changed) > MAX_OBSTACLES:
@@ -215,7 +200,7 @@ def obstacle(
         ConfigError: a number is missing, not finite or out of range.
     """
     problems: list[str] = []
-    vectors = [_vector(key, text, problems) for key, text in (("--center", center), ("--velocity", velocity))]
+    vectors = [vector(key, text, problems) for key, text in (("--center", center), ("--velocity", velocity))]
     values = {"radius_m": radius_m, "keep_out_m": keep_out_m, "visibility_m": visibility_m, "column": column}
     try:
         described = Obstacle.model_validate(values | {"center_ned_m": vectors[0], "vel_ned_m_s": vectors[1]})
@@ -238,7 +223,8 @@ def without(known: tuple[Obstacle, ...], number: int) -> tuple[Obstacle, ...]:
     return known[:number] + known[number + 1 :]
 
 
-def _vector(key: str, text: str, problems: list[str]) -> tuple[float, float, float]:
+def vector(key: str, text: str, problems: list[str]) -> tuple[float, float, float]:
+    """Return the vector that `north,east,down` describes; what is wrong with it is added to `problems`."""
     try:
         north, east, down = (float(part) for part in text.split(","))
     except ValueError:
@@ -260,23 +246,16 @@ def _obstacles(bus: ZenohBus, least_version: int, say: bytes | None = None) -> O
     raise StartError(f"obstacle: the launch did not answer within {_ANSWER_S:.0f} s; see: swarmctl status")
 
 
-def _statuses(
-    bus: ZenohBus, agents: range, timeout_s: float, ahead_us: dict[int, int] | None = None
-) -> dict[int, StatusMessage]:
-    """Return the newest status of each of `agents`, once all have published one or the time is up.
-
-    `ahead_us` receives the offset of each agent's clock from ours [us].
-    """
+def _statuses(bus: ZenohBus, agents: range, timeout_s: float) -> dict[int, StatusMessage]:
+    """Return the newest status of each of `agents`, once all have published one or the time is up."""
     heard: dict[int, StatusMessage] = {}
     deadline_s = time.monotonic() + timeout_s
-    while time.monotonic() < deadline_s:
+    while True:
         for sender, payload in bus.receive(STATUS):
             status = decode_status(payload)
             if status is not None and status.agent in agents and sender == agent_name(status.agent):
                 heard[status.agent] = status
-                if ahead_us is not None:
-                    ahead_us[status.agent] = status.utc_us - time.time_ns() // 1000
-        if len(heard) == len(agents):
+        if len(heard) == len(agents) or time.monotonic() >= deadline_s:
             break
         time.sleep(0.02)
     return dict(sorted(heard.items()))
@@ -340,13 +319,16 @@ def _read(path: Path) -> RunningLaunch | None:
 
 def _runs(launch: RunningLaunch) -> bool:
     try:
-        return abs(psutil.Process(launch.pid).create_time() - launch.started_s) < _START_TOLERANCE_S
+        process = psutil.Process(launch.pid)
+        if process.status() == psutil.STATUS_ZOMBIE:  # it has ended, and its parent has not noticed yet
+            return False
+        return abs(process.create_time() - launch.started_s) < _START_TOLERANCE_S
     except (psutil.Error, ValueError):
         return False
 
 
-def as_json(statuses: dict[int, StatusMessage]) -> str:
-    """Return statuses as a JSON list with one object per agent."""
-    return json.dumps(
-        msgspec.to_builtins(list(statuses.values())), indent=2
-    )  # ASCII: an agent's text may contain anything
+def as_json(statuses: dict[int, StatusMessage], indent: int | None = 2) -> str:
+    """Return statuses as a JSON list with one object per agent; without `indent` in one line."""
+    return json.dumps(  # ASCII: an agent's text may contain anything
+        msgspec.to_builtins(list(statuses.values())), indent=indent
+    )

@@ -1,28 +1,37 @@
-"""Status display of a launch: a live table on a terminal, one line per change of phase elsewhere."""
+"""Status display of a launch: a live table on a terminal, one line per change elsewhere.
+
+The table fits 80 columns and 24 lines: a row of short cells for each agent, and below them the alerts, in whole words.
+A wider terminal has more columns.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import math
 import sys
+import textwrap
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol, TextIO
+from typing import Literal, Protocol, TextIO
 
-from rich.console import Console
+from rich.console import Console, Group
 from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
 from swarmctl.bus.json_messages import StatusMessage
 from swarmctl.bus.peers import agent_name
+from swarmctl.control.phases.control_mode import ControlMode
 from swarmctl.core.text import printable
-from swarmctl.core.types import Mode, Phase
+from swarmctl.core.types import FlightMode, Phase
 
 REFRESH_HZ = 4.0
 _LINE = 2000  # longest printed line
-_COLUMNS = ("agent", "phase", "mode", "error m", "separation m", "tick p99 ms", "missed", "staleness ms", "alert")
+_WIDE = 105  # columns of a terminal that has room for everything
+_SILENT_S = 2.0  # without a status for so long an agent is lost to the operator
+_OPERATORS_MATTER = ("HOLD", "GOTO", "WAIT", "PILOT", "LOST")  # control modes whose beginning and end are lines
+_FIX = {0: "no", 1: "no", 2: "2D", 3: "3D", 4: "DGPS", 5: "float", 6: "RTK"}  # GPS_FIX_TYPE
 
 
 @dataclass(slots=True, kw_only=True)
@@ -33,6 +42,27 @@ class AgentView:
     status: StatusMessage | None = None
     received_s: float = 0.0  # arrival of `status`, monotonic
     note: str = ""  # the launcher's own observation: how it ended, that it is silent
+
+    @property
+    def silent_s(self) -> float:
+        """Return for how long no status has arrived; 0 where arrivals are not noted."""
+        return max(0.0, time.monotonic() - self.received_s) if self.received_s else 0.0
+
+    @property
+    def control(self) -> str:
+        """Return what the vehicle is doing, as far as is known."""
+        if self.status is None:
+            return ""
+        lost = self.silent_s > _SILENT_S and self.status.phase != Phase.DONE  # what is done may end
+        return ControlMode.LOST if lost else printable(self.status.control, 8)
+
+    @property
+    def alert(self) -> str:
+        """Return the launcher's note, or the agent's active alert and since when."""
+        if self.note or self.status is None:
+            return printable(self.note) or "no status yet"
+        age = f" ({self.status.alert_age_s:.0f} s)" if self.status.alert_age_s >= 0.0 else ""
+        return f"{printable(self.status.active_alert)}{age}" if self.status.active_alert else ""
 
 
 class Display(Protocol):
@@ -75,7 +105,7 @@ class LiveTable:
             if self._live is None:
                 self._live = Live(console=self._console, auto_refresh=False)
                 self._live.start()
-            self._live.update(status_table(agents), refresh=True)
+            self._live.update(status_table(agents, *self._console.size), refresh=True)
 
     def close(self) -> None:
         live, self._live = self._live, None
@@ -85,12 +115,12 @@ class LiveTable:
 
 
 class PlainLines:
-    """Prints a line when an agent's phase or the launcher's note on it changes, for logs and pipes."""
+    """Prints a line when an agent's phase, a hold or loss of it, or the launcher's note on it changes, for logs."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
         self._started_s = time.monotonic()
-        self._last: dict[int, tuple[str, str]] = {}
+        self._last: dict[int, tuple[str, str, str]] = {}
 
     def print_line(self, text: str) -> None:
         with contextlib.suppress(OSError):  # the pipe is closed; the flight goes on
@@ -99,12 +129,14 @@ class PlainLines:
     def show(self, agents: Sequence[AgentView]) -> None:
         for view in agents:
             phase = "" if view.status is None else name_of(Phase, view.status.phase)
-            if (phase, view.note) == self._last.get(view.agent, ("", "")):
+            control = view.control if view.control in _OPERATORS_MATTER and not view.note else ""
+            if (phase, control, view.note) == self._last.get(view.agent, ("", "", "")):
                 continue
-            self._last[view.agent] = (phase, view.note)
+            self._last[view.agent] = (phase, control, view.note)
             alert = view.note or (view.status.active_alert if view.status else "")
             elapsed_s = time.monotonic() - self._started_s
-            self.print_line(f"{elapsed_s:7.1f} s  {agent_name(view.agent)}  {phase}{'  ' + alert if alert else ''}")
+            words = "  ".join(word for word in (agent_name(view.agent), phase, control, alert) if word)
+            self.print_line(f"{elapsed_s:7.1f} s  {words}")
 
     def close(self) -> None:
         return
@@ -114,39 +146,110 @@ def print_statuses(agents: Sequence[AgentView]) -> None:
     """Print the statuses once: a table on a terminal, one line per agent elsewhere."""
     console = Console(highlight=False)
     if console.is_terminal:
-        console.print(status_table(agents))
+        console.print(status_table(agents, console.width))
         return
-    for row in (_COLUMNS, *(status_cells(view) for view in agents)):
-        print("\t".join(row))
-
-
-def status_table(agents: Sequence[AgentView]) -> Table:
-    """Return the table with one row per agent."""
-    table = Table(*_COLUMNS)
+    print("\t".join([*(f"{column.title} {column.unit}".rstrip() for column in COLUMNS), "alert"]))
     for view in agents:
-        table.add_row(*map(Text, status_cells(view)))  # not markup: an agent's text may contain "[...]"
-    return table
+        print("\t".join(status_cells(view)))
+
+
+def status_table(agents: Sequence[AgentView], width: int = 80, height: int | None = None) -> Group:
+    """Return the table with one row per agent, and the alerts below it.
+
+    Args:
+        agents: what is known of each.
+        width: columns of the terminal.
+        height: its lines; None: as many as there are.
+    """
+    columns = [column for column in COLUMNS if width >= _WIDE or not column.only_wide]
+    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
+    for column in columns:
+        table.add_column(f"{column.title}\n{column.unit}", justify=column.justify, min_width=column.width, no_wrap=True)
+    for view in agents:
+        table.add_row(*(Text(column.cell_of(view)) for column in columns))  # not markup: agents' texts may have "[...]"
+    room = None if height is None else max(1, height - len(agents) - 4)
+    return Group(table, *(Text(line) for line in _alert_lines(agents, width, room)))
+
+
+def _alert_lines(agents: Sequence[AgentView], width: int, room: int | None) -> list[str]:
+    """Return the alerts, each in as many lines as it needs; those that do not fit are counted."""
+    alerts = [(view.agent, view.alert) for view in agents if view.alert]
+    lines: list[str] = []
+    for shown, (agent, alert) in enumerate(alerts):
+        more = textwrap.wrap(f"{agent:>2}: {alert}", width, subsequent_indent="    ")
+        if room is not None and len(lines) + len(more) > room - (shown < len(alerts) - 1):
+            return [*lines, f"{len(alerts) - shown} more alerts: swarmctl status"]
+        lines += more
+    return lines
 
 
 def status_cells(view: AgentView) -> tuple[str, ...]:
-    """Return the cells of one agent, in the order of the columns."""
-    status = view.status
-    if status is None:
-        return (agent_name(view.agent), *[""] * (len(_COLUMNS) - 2), printable(view.note) or "no status yet")
-    return (
-        agent_name(view.agent),
-        name_of(Phase, status.phase),
-        name_of(Mode, status.mode),
-        _number(status.position_error_m, 3),
-        _number(status.separation_m, 2),
-        _number(status.tick_p99_ms, 1),
-        f"{status.deadline_misses}/{status.ticks}",
-        _number(status.plan_staleness_ms, 0),
-        printable(view.note or status.active_alert),
-    )
+    """Return the cells of one agent, in the order of `COLUMNS`, and its alert."""
+    return (*(column.cell_of(view) for column in COLUMNS), view.alert)
 
 
-def name_of(kind: type[Phase] | type[Mode], number: int) -> str:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Column:
+    """Describes one column: its title, its unit below, and its cell of an agent that has published a status."""
+
+    title: str
+    width: int  # at least, so that the live table does not jump
+    cell: Callable[[AgentView, StatusMessage], str]
+    unit: str = ""
+    justify: Literal["left", "right"] = "right"
+    only_wide: bool = False
+
+    def cell_of(self, view: AgentView) -> str:
+        """Return the cell of an agent; without a status only its number is known."""
+        if view.status is None:
+            return str(view.agent) if self.title == "id" else ""
+        return self.cell(view, view.status)
+
+
+COLUMNS = (
+    Column(title="id", width=2, cell=lambda v, s: str(v.agent)),
+    Column(title="phase", width=10, cell=lambda v, s: name_of(Phase, s.phase), justify="left"),
+    Column(title="control", width=8, cell=lambda v, s: v.control, justify="left"),
+    Column(title="flight", width=8, unit="mode", cell=lambda v, s: name_of(FlightMode, s.flight_mode), justify="left"),
+    Column(title="arm", width=3, cell=lambda v, s: "yes" if s.armed else "no", justify="left"),
+    Column(title="alt", width=5, unit="m", cell=lambda v, s: _altitude(s)),
+    Column(title="m/s", width=4, cell=lambda v, s: _number(s.ground_speed_m_s, 1, 4)),
+    Column(title="bat", width=3, unit="%", cell=lambda v, s: _number(100.0 * s.battery_01, 0, 3)),
+    Column(title="est", width=4, unit="m", cell=lambda v, s: _number(s.pos_accuracy_m, 2, 4)),
+    Column(title="link", width=4, unit="s", cell=lambda v, s: _link(v, s)),
+    Column(title="sep", width=5, unit="m", cell=lambda v, s: _number(s.separation_m, 2, 5)),
+    Column(title="error", width=5, unit="m", cell=lambda v, s: _number(s.position_error_m, 2, 5)),
+    Column(title="miss", width=5, cell=lambda v, s: _number(s.deadline_misses, 0, 5)),
+    Column(title="ticks", width=7, cell=lambda v, s: _number(s.ticks, 0, 7), only_wide=True),
+    Column(title="p99", width=5, unit="ms", cell=lambda v, s: _number(s.tick_p99_ms, 1, 5), only_wide=True),
+    Column(
+        title="stale",
+        width=5,
+        unit="ms",
+        cell=lambda v, s: _number(s.plan_staleness_ms, 0, 5),
+        only_wide=True,
+    ),
+    Column(title="gps", width=7, unit="sat", cell=lambda v, s: _gps(s), justify="left", only_wide=True),
+)
+
+
+def _altitude(status: StatusMessage) -> str:
+    return "-" if status.ground_speed_m_s < 0 else _fits(status.altitude_m, 1, 5)
+
+
+def _link(view: AgentView, status: StatusMessage) -> str:
+    """Return the age of what is known of the vehicle [s]: of its newest message, and of the status that told it."""
+    return "-" if status.link_age_ms < 0 else _number(status.link_age_ms * 1e-3 + view.silent_s, 1, 4)
+
+
+def _gps(status: StatusMessage) -> str:
+    if status.gps_fix < 0:
+        return "-"
+    satellites = f" {status.satellites}" if status.satellites >= 0 else ""
+    return f"{_FIX.get(status.gps_fix, '3D')}{satellites}"
+
+
+def name_of(kind: type[Phase] | type[FlightMode], number: int) -> str:
     """Return the name of an enum value from the bus; an unknown one as a number."""
     try:
         return kind(number).name
@@ -154,6 +257,12 @@ def name_of(kind: type[Phase] | type[Mode], number: int) -> str:
         return str(number)
 
 
-def _number(value: float | None, digits: int) -> str:
+def _number(value: float, digits: int, width: int) -> str:
     """Format a quantity that can't be negative; a negative value means that there is none."""
-    return "-" if value is None or not math.isfinite(value) or value < 0 else f"{value:.{digits}f}"
+    return "-" if not math.isfinite(value) or value < 0 else _fits(value, digits, width)
+
+
+def _fits(value: float, digits: int, width: int) -> str:
+    """Format a number with as many digits as fit into `width` characters, never with a cut one."""
+    texts = (f"{value:.{places}f}" for places in range(digits, -1, -1))
+    return next((text for text in texts if len(text) <= width), f"{value:.0e}")

@@ -282,7 +282,9 @@ class FlightSupervisor:
     def _repeat_land_order(self, since_s: float) -> None:
         """Repeat the order on the bus, newly stamped, until every agent shows that it lands; later also by signal."""
         running = (view for view in self._running() if not self._recovery.is_on(view.agent))
-        deaf = [view for view in running if view.status is None or view.status.phase < Phase.GOTO_LAND]
+        deaf = [
+            view for view in running if view.status is None or view.status.phase < Phase.GOTO_LAND or view.status.held
+        ]
         if deaf:
             self._order(Order("land"), deaf)
         for view in deaf:

@@ -104,8 +104,9 @@ class Flight:
     def peer(self, phase: Phase, ready_utc_us: int = 0, alive: bool = True) -> None:
         self.peers[1] = PeerInputs(phase, ready_utc_us, alive)
 
-    def ask(self, verb: str) -> None:
-        self.state_machine.operator(Order(verb), self.now_us, self.utc_us, self.state)
+    def ask(self, verb: str, **arguments: float) -> str:
+        """Give an operator's order; return why it is refused, or ""."""
+        return self.state_machine.operator(Order(verb, arguments), self.now_us, self.utc_us, self.state)
 
     def until(self, phase: Phase) -> Flight:
         """Continue without faults until a phase is reached."""
@@ -143,6 +144,21 @@ def ready(peers: int = 1) -> Flight:
 
 
 CONTROLLED_PHASES = (Phase.GOTO_START, Phase.READY, Phase.TRACK, Phase.GOTO_LAND)
+
+
+def in_phase(phase: Phase) -> Flight:
+    """Return a flight in any phase, under the agent's control where that phase has it."""
+    if phase in CONTROLLED_PHASES:
+        return controlled(phase)
+    if phase < Phase.GOTO_START:
+        flight = Flight().until(phase)
+        if phase is Phase.TAKEOFF:
+            flight.pos, flight.landed = START + np.array([0.0, 0.0, 1.5]), IN_AIR  # half way up
+            flight.flight_mode = FlightMode.TAKEOFF
+        return flight
+    flight = controlled(Phase.GOTO_LAND)
+    flight.pos = START.copy()
+    return flight.until(phase)
 
 
 def controlled(phase: Phase) -> Flight:

@@ -345,14 +345,32 @@ def test_operator_verbs(start: Start, monkeypatch: pytest.MonkeyPatch, capsys: p
     launched.until_phase("CONNECT", 2)
     early = verb("hold")  # the estimators need four seconds more
     assert early.returncode == 4, early.stdout
-    assert re.search(r"hold: agent-0 is in (CONNECT|STANDBY) and ignores it; it is obeyed in TRACK", early.stderr)
+    refused = r"hold: agent-0 refuses: it is in (CONNECT|STANDBY|ARM); hold is obeyed in TAKEOFF, GOTO_START"
+    assert re.search(refused, early.stderr)
+    assert re.match(r"hold: \S+\nagent-0 refuses: .*\nagent-1 refuses: ", early.stdout), "the run, and a line for each"
     launched.until_phase("TRACK", 2)
     statuses = json.loads(verb("status", "--json").stdout)
     assert [status["agent"] for status in statuses] == [0, 1]
-    held = verb("hold", "--agent", "1")
+    for status in statuses:
+        assert (status["control"], status["gps_fix"], status["satellites"]) == ("TRACKING", 3, 10)
+        assert 0.5 < status["battery_01"] <= 1.0
+        assert -1.0 < status["altitude_m"] < 5.0
+        assert status["ground_speed_m_s"] > 0.0
+        assert 0.0 < status["pos_accuracy_m"] < 5.0
+        assert 0.0 <= status["link_age_ms"] < 1000.0
+    held = verb("hold", "1")
     assert held.returncode == 0, held.stderr
-    assert "agent-1" in held.stdout
+    assert "agent-1 accepts, TRACK" in held.stdout
     assert "agent-0" not in held.stdout
+    statuses = json.loads(verb("status", "--json").stdout)
+    assert [(status["held"], status["control"]) for status in statuses] == [(False, "TRACKING"), (True, "HOLD")]
+    sent = verb("goto", "0", "-2,0.5,-9", "--speed", "1")
+    assert sent.returncode == 0, sent.stderr
+    assert "agent-0 accepts, TRACK" in sent.stdout
+    assert json.loads(verb("status", "--json").stdout)[0]["control"] == "GOTO"
+    buried = verb("goto", "0", "-2,0.5,500")
+    assert buried.returncode == 4
+    assert "goto: agent-0 refuses: down 500 m is too low" in buried.stderr
     where = ("--center", "-40,2.5,-9", "--radius", "0.5", "--run-dir", str(launched.run_dir))
     added = verb("obstacle", "add", *where)
     assert added.returncode == 0, added.stderr
@@ -365,7 +383,13 @@ def test_operator_verbs(start: Start, monkeypatch: pytest.MonkeyPatch, capsys: p
     excluded = launched.verb("exclude", "--peer", "1")
     assert excluded.returncode == 0, excluded.stderr
     assert verb("exclude", "--peer", "255").returncode == 2
-    assert verb("land").returncode == 0
+    landed = verb("land")
+    assert landed.returncode == 0, landed.stderr
+    assert re.search(r"agent-0 accepts, (GOTO_LAND|LAND)\nagent-1 accepts, (GOTO_LAND|LAND)\n", landed.stdout)
+    watched = verb("status", "--watch", "--json")
+    assert watched.returncode == 0, "it ends with the launch"
+    seen = [status for line in watched.stdout.splitlines() for status in json.loads(line)]
+    assert {status["control"] for status in seen} & {"LANDING", "AUTO"}
     assert launched.end() == 130, launched.text()
 
 

@@ -44,8 +44,8 @@ def ends(code: int, after_s: float = 0.3) -> str:
     return LANDS_ON_SIGTERM + f"time.sleep({after_s}); print('because'); sys.exit({code})"
 
 
-def status_of(agent: int, phase: Phase, utc_us: int) -> bytes:
-    return encode_message(builders.status_message(agent=agent, phase=phase, utc_us=utc_us))
+def status_of(agent: int, phase: Phase, utc_us: int, held: bool = False) -> bytes:
+    return encode_message(builders.status_message(agent=agent, phase=phase, utc_us=utc_us, held=held))
 
 
 class ScriptedServices(Services):
@@ -77,6 +77,7 @@ class ScriptedServices(Services):
         self.behind_us = 0  # by how much the agents' clock is behind ours
         self.obeys = True
         self.phase = Phase.TRACK
+        self.held = False
         self.act: Callable[[], None] = lambda: None
         self.began_s = time.monotonic()
 
@@ -109,7 +110,7 @@ class ScriptedServices(Services):
             if any(order.verb == "land" for order in orders) and self.obeys and i not in self.silent:
                 self.children[agent_name(i)].signal(signal.SIGTERM)
             if i not in self.silent and self.children[agent_name(i)].poll() is None:
-                bus.publish(STATUS, status_of(i, self.phase, now_us - self.behind_us))
+                bus.publish(STATUS, status_of(i, self.phase, now_us - self.behind_us, self.held))
         if time.monotonic() - self.began_s > 0.3:
             act, self.act = self.act, lambda: None
             act()
@@ -251,6 +252,15 @@ def test_first_interrupt_lands_all_agents(tmp_path: Path) -> None:
     assert result.exit_code(violated=True) == EXIT_INTERRUPTED
     assert "land" in scene.orders
     assert [scene.children[f"agent-{i}"].poll() for i in range(2)] == [130, 130]
+
+
+def test_an_interrupt_lands_an_agent_that_an_operator_holds_on_its_way_back(tmp_path: Path) -> None:
+    scene = ScriptedServices(tmp_path, [FLIES_LONG])
+    scene.phase, scene.held = Phase.GOTO_LAND, True
+    scene.act = lambda: setattr(scene, "interrupts", 1)
+    result = scene.fly()
+    assert result.outcome == "interrupted"
+    assert "land" in scene.orders
 
 
 def test_an_agent_that_misses_the_order_gets_a_signal(tmp_path: Path) -> None:

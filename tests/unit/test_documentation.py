@@ -11,7 +11,9 @@ import pytest
 
 from sitl.studies.campaign.trials import SCHEMA
 from swarmctl.config import SitlParams
+from swarmctl.core.operator_verbs import OPERATOR_VERBS
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
+from swarmctl.core.types import Phase
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -41,6 +43,15 @@ def test_every_event_is_described() -> None:
     events = re.findall(r"\b(?:_note|_say|_fail|log\.write|recorder\.event)\(\s*\"(\w+)\"", code)
     assert len(events) > 30
     assert set(events) - described() == set()
+
+
+def test_the_table_of_orders_and_phases_is_that_of_the_code() -> None:
+    page = (ROOT / "docs" / "operating.md").read_text()
+    phases = [phase.name for phase in Phase]
+    assert f"| order | {' | '.join(phases)} |\n" in page
+    for name, verb in OPERATOR_VERBS.items():
+        obeyed = ["yes" if phase in verb.phases else "-" for phase in phases]
+        assert f"| `{name}` | {' | '.join(obeyed)} |\n" in page
 
 
 def described() -> set[str]:

@@ -17,11 +17,13 @@ import numpy as np
 from pydantic import Field
 
 from swarmctl.control.phases.arming import ArmingEvidence
+from swarmctl.control.phases.control_mode import control_mode
 from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.control.phases.overload import Level
+from swarmctl.control.phases.refused_orders import Contains, OrderSituation, refusal_of
 from swarmctl.control.reference.landing_places import landing_place_ned_m, nearest_in_plane_m
 from swarmctl.control.reference.mission import MissionReference, QuinticTrajectory, brake_to_rest, quintic_to
-from swarmctl.core.operator_verbs import OPERATOR_VERBS, Order
+from swarmctl.core.operator_verbs import GOTO, OPERATOR_VERBS, POINT, SPEED, YAW, Order
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Command, FlightMode, Landed, Mode, Phase, VehicleState, Verb
 
@@ -30,6 +32,7 @@ _SPIN_UP_US = 6_000_000  # ArduCopter's rotors spin up for over 3 s, during whic
 _SETTLE_S = 2.0  # time after a stop trajectory in which the vehicle comes to rest
 _BEGIN_DELAY_US = 1_000_000  # from the last agent's readiness to mission time 0; several statuses are sent meanwhile
 _HOVER_LEARNING_US = 1_000_000  # hover flown by the autopilot itself, during which its hover thrust is learned
+_LEAST_HEIGHT_M = 0.5  # above the ground, of a point to go to
 _ROOM_MARGIN_M = 0.1  # the target lies beyond the required distance, because it is reached with a tolerance
 _PLAN_MODES = (Mode.TRACKING, Mode.REPLAY)
 _OWN_MODES = (FlightMode.HOLD, FlightMode.TAKEOFF, FlightMode.EXTERNAL)  # modes that follow from our own requests
@@ -65,6 +68,7 @@ class MissionStateMachine:
         start_ned_m: (3,) start position, also the landing place.
         duration_s: duration of the tracked mission.
         reference: reference of the tracked mission.
+        contains: whether a place lies in the area to fly in.
 
     Attributes:
         phase: current phase.
@@ -73,7 +77,8 @@ class MissionStateMachine:
         outcome: "completed", or why the mission was not; "" while it is under way.
         waits_for: unmet condition that keeps the vehicle on the ground, or "".
         had_control: the autopilot follows our setpoints and control has not been given back.
-        held: the operator has asked to hold.
+        held: the operator has asked to hold, or to go to a point.
+        yaw_rad: heading that the operator has asked for, None for the mission's.
         paused: the agent rests because the bus is lost or its processor is overloaded.
         pilot_override: pilot or autopilot took over; lasts until an operator resumes.
     """
@@ -88,9 +93,10 @@ class MissionStateMachine:
         start_ned_m: Array,
         duration_s: float,
         reference: MissionReference,
+        contains: Contains = lambda _: True,
     ) -> None:
         self._params, self._agent, self._expected = params, agent, peers
-        self._apart_m = landing_m
+        self._apart_m, self._contains = landing_m, contains
         self._start_ned_m, self._duration_us, self._reference = start_ned_m, round(duration_s * 1e6), reference
         self.phase = Phase.CONNECT
         self.ready_utc_us = 0
@@ -101,8 +107,12 @@ class MissionStateMachine:
         self._stop_verb = ""  # land or rtl, from the command until the stop begins
         self.had_control = False
         self.held = False
+        self._held_since_us = 0
+        self._held_at: tuple[Array, float] | None = None  # point of a `goto` (3,), and the speed to it
+        self.yaw_rad: float | None = None
+        self._climb_cut_short = False  # a hold interrupted the take-off below its height
         self.paused = False
-        self._destination_ned_m = start_ned_m  # end of the transit that a pause interrupts
+        self._destination_ned_m = start_ned_m  # end of the transit that a pause or a hold interrupts
         self._trajectory: tuple[QuinticTrajectory, int] | None = None  # transit or stop, and its start time
         self._rejoin_offset: tuple[QuinticTrajectory, int] | None = None  # decaying offset to the mission's reference
         self._entered_us = 0
@@ -127,7 +137,11 @@ class MissionStateMachine:
             Phase.GOTO_LAND: self._goto_land,
             Phase.LAND: self._land,
         }
-        self._order_handlers = {"hold": self._hold, "resume": self._resume}  # stops are in `_apply_stop`
+        self._order_handlers = {
+            "hold": self._hold,
+            "resume": self._resume,
+            GOTO: self._goto,
+        }  # stops are in `_apply_stop`
 
     @property
     def finished(self) -> bool:
@@ -156,15 +170,15 @@ class MissionStateMachine:
             return []
         if inputs.mode is Mode.LAND and self.phase < Phase.LAND:
             self._give_up("no plan for too long", inputs, state)
-        if inputs.overload is Level.LAND and self.phase < Phase.GOTO_LAND:
+        if inputs.overload is Level.LAND and self._may_fly_on:
             self._give_up(OVERLOADED, inputs, state)
-        if inputs.cut_off and self.phase < Phase.GOTO_LAND:
+        if inputs.cut_off and self._may_fly_on:
             self._give_up(inputs.cut_off, inputs, state)
         self._pause(inputs, state)
         if state.mode is FlightMode.EXTERNAL and Phase.GOTO_START <= self.phase < Phase.LAND:
             self._take_control(inputs, state)
         patience_us = self._params.start_timeout_s * 1e6
-        if self.phase < Phase.TRACK and inputs.now_us - self._first_tick_us > patience_us:
+        if self.phase < Phase.TRACK and not self.held and inputs.now_us - self._first_tick_us > patience_us:
             cause = f"not tracking after {self._params.start_timeout_s:.0f} s ({self.phase.name})"
             self._give_up(f"{cause}: {self.waits_for}" if self.waits_for else cause, inputs, state)
         handler = self._steps.get(self.phase)
@@ -193,6 +207,22 @@ class MissionStateMachine:
     def _follows_mission(self) -> bool:
         return self.phase is Phase.TRACK and not (self.held or self.paused)
 
+    @property
+    def _may_fly_on(self) -> bool:
+        """Return whether the agent is not on its way to land, or is held there for as long as the operator likes."""
+        return self.phase < Phase.GOTO_LAND or (self.held and self.phase is Phase.GOTO_LAND)
+
+    def control_mode(self, mode: Mode) -> str:
+        """Return what the vehicle is doing, for the operator; `mode` is that of the tick."""
+        return control_mode(
+            self.phase,
+            Mode.PILOT_OVERRIDE if self.pilot_override and mode is not Mode.STATE_STALE else mode,
+            held=self.held,
+            goes_to_point=self.held and self._held_at is not None,
+            paused=self.paused,
+            lands_in_place=self._lands_in_place,
+        )
+
     def begin_if_due(self, now_us: int, utc_us: int) -> None:
         """Enter TRACK on time. Called before planning, so that the first plan of the mission follows its reference."""
         if self.phase is Phase.READY and self.begin_utc_us is not None and utc_us >= self.begin_utc_us:
@@ -205,30 +235,95 @@ class MissionStateMachine:
             return math.nan
         return (utc_us - self.begin_utc_us) * 1e-6
 
-    def operator(self, order: Order, now_us: int, utc_us: int, state: VehicleState | None) -> None:
-        """Apply an operator's order.
+    def operator(self, order: Order, now_us: int, utc_us: int, state: VehicleState | None) -> str:
+        """Apply an operator's order; return why it is refused, or "".
 
         A stop (land, rtl) is kept until a vehicle state is known to begin it from, so it is lost in no phase.
         """
-        verb = OPERATOR_VERBS[order.verb]
-        if verb.is_stop:
+        situation = OrderSituation(
+            phase=self.phase,
+            state=state,
+            pilot_override=self.pilot_override,
+            other_control=state is not None and _is_under_other_control(state),
+            lands_in_place=self._lands_in_place,
+            controls=self.had_control,
+            paused=self.paused,
+            lowest_m=self._lowest_m,
+            contains=self._contains,
+        )
+        if refusal := refusal_of(order, situation):
+            return refusal
+        if OPERATOR_VERBS[order.verb].is_stop:
             self._stop_verb = order.verb
-        if state is None or self.phase in (Phase.LAND, Phase.DONE):
-            return
+        if state is None:
+            return ""
         self._apply_stop(now_us, state)
-        if not verb.is_stop and self.phase.name in verb.phases:
+        if order.verb in self._order_handlers:
             self._order_handlers[order.verb](order, now_us, utc_us, state)
+        return ""
 
     def _hold(self, order: Order, now_us: int, utc_us: int, state: VehicleState) -> None:
-        self.held = True
-        self._trajectory = (self._stop_trajectory(state), now_us)
+        self._interrupt(now_us, state)
+        self._held_at = self.yaw_rad = None
+        if not self.held:
+            self.held, self._held_since_us = True, now_us
+            self._requested_us = now_us - _SPIN_UP_US  # on the way up the autopilot is asked at once
+
+    def _goto(self, order: Order, now_us: int, utc_us: int, state: VehicleState) -> None:
+        self._hold(order, now_us, utc_us, state)
+        target_ned_m = np.array([order.arguments[name] for name in POINT])
+        self._held_at = target_ned_m, order.arguments.get(SPEED, self._params.speed_m_s)
+        self.yaw_rad = math.radians(order.arguments[YAW]) if YAW in order.arguments else None
+        self._stay(now_us, state)
+
+    def _stay(self, now_us: int, state: VehicleState) -> None:
+        """Come to rest where a hold asks for it: here, or at a point."""
+        if self._held_at is None:
+            self._trajectory = (self._stop_trajectory(state), now_us)
+            return
+        target_ned_m, speed_m_s = self._held_at
+        accel_m_s2 = self._params.accel_m_s2
+        trajectory = quintic_to(state.pos_ned_m, state.vel_ned_m_s, target_ned_m, speed_m_s, accel_m_s2=accel_m_s2)
+        self._trajectory = (trajectory, now_us)
+
+    @property
+    def _lowest_m(self) -> float:
+        """Return the down coordinate that a point to go to may not be below: the ground's is known after a take-off."""
+        return float(self._start_ned_m[2]) if self._airborne else self._ground_z_m - _LEAST_HEIGHT_M
+
+    def _interrupt(self, now_us: int, state: VehicleState) -> None:
+        """Come to rest, and remember where a transit leads."""
+        if self._trajectory is not None and not (self.held or self.paused):
+            self._destination_ned_m = self._trajectory[0].to_ned_m
+        if self.had_control or self.phase > Phase.GOTO_START:  # before, the autopilot hovers
+            self._trajectory = (self._stop_trajectory(state), now_us)
+
+    def _go_on(self, now_us: int, utc_us: int, state: VehicleState) -> None:
+        """Go on with what was interrupted: the transit, or the mission."""
+        if self.phase in (Phase.GOTO_START, Phase.READY, Phase.GOTO_LAND):
+            self._trajectory = (self._trajectory_to(self._destination_ned_m, state), now_us)
+        else:
+            self._rejoin_mission(now_us, utc_us, state)
 
     def _resume(self, order: Order, now_us: int, utc_us: int, state: VehicleState) -> None:
-        if self.held or self.pilot_override:
+        if self.held:
+            self._release(now_us, state)
+            if not self.paused:
+                self._go_on(now_us, utc_us, state)
+        elif self.pilot_override:
             self._rejoin_mission(now_us, utc_us, state)
-        self.held = False
         if self.pilot_override:
             self.pilot_override, self.outcome, self._may_take_control = False, self._outcome_before, True
+
+    def _release(self, now_us: int, state: VehicleState) -> None:
+        """End a hold: timeouts have not run meanwhile."""
+        self.held, self._requested_us = False, now_us - _SPIN_UP_US
+        self._held_at = self.yaw_rad = None
+        self._climb_cut_short |= self.phase is Phase.TAKEOFF and state.landed is not Landed.ON_GROUND
+        if self._first_tick_us is not None:
+            self._first_tick_us += now_us - self._held_since_us
+        if self.phase is Phase.GOTO_LAND:
+            self._entered_us = now_us
 
     def _override(self, why: str) -> None:
         self.pilot_override, self.had_control, self._may_take_control = True, False, False
@@ -243,10 +338,10 @@ class MissionStateMachine:
         self.outcome = self.outcome or OPERATOR_STOP
         if self.phase < Phase.GOTO_START or self.pilot_override:
             self._enter(Phase.LAND, now_us)  # ends at once if the vehicle is known to be disarmed
-        elif self.phase < Phase.GOTO_LAND and verb == "rtl":
+        elif verb == "rtl" and self._may_fly_on:
             self._lands_in_place = False
             self._go_home(now_us, state)
-        elif verb == "land" and not self._lands_in_place:
+        elif verb == "land" and (self.held or not self._lands_in_place):
             self._stop_in_place(now_us, state)
 
     def _is_down(self, inputs: PhaseInputs, state: VehicleState) -> bool:
@@ -258,17 +353,14 @@ class MissionStateMachine:
         flying = self.had_control and Phase.GOTO_START <= self.phase <= Phase.GOTO_LAND
         must_wait = inputs.unresponsive_peer or inputs.overload >= Level.HOLD
         if must_wait and flying and not self.paused:
+            self._interrupt(inputs.now_us, state)
             self.paused = True
-            self._destination_ned_m = self._trajectory[0].to_ned_m if self._trajectory else self._start_ned_m
-            self._trajectory = (self._stop_trajectory(state), inputs.now_us)
         elif self.paused and not must_wait:
             self.paused = False
-            if self.phase in (Phase.GOTO_START, Phase.GOTO_LAND):
-                self._trajectory = (self._trajectory_to(self._destination_ned_m, state), inputs.now_us)
-            elif self.held:
-                self._trajectory = (self._stop_trajectory(state), inputs.now_us)
+            if self.held:
+                self._stay(inputs.now_us, state)
             else:
-                self._rejoin_mission(inputs.now_us, inputs.utc_us, state)
+                self._go_on(inputs.now_us, inputs.utc_us, state)
 
     def _rejoin_mission(self, now_us: int, utc_us: int, state: VehicleState) -> None:
         """Rejoin the mission's moving reference along a quintic offset: after a jump all agents would rush together."""
@@ -338,21 +430,27 @@ class MissionStateMachine:
     def _takeoff(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
         height_m = self._ground_z_m - float(self._start_ned_m[2])
         climbed_m = self._ground_z_m - float(state.pos_ned_m[2])
-        settled = abs(float(state.vel_ned_m_s[2])) < 0.3 and abs(climbed_m - height_m) < 0.4
+        settled = abs(float(state.vel_ned_m_s[2])) < 0.3 and (abs(climbed_m - height_m) < 0.4 or self._climb_cut_short)
         hovers = state.mode in (FlightMode.HOLD, inputs.arm_in) and state.landed is Landed.IN_AIR and settled
         self._hovering_us = (self._hovering_us or inputs.now_us) if hovers else None
         learned = inputs.arm_in is None or inputs.now_us - (self._hovering_us or inputs.now_us) >= _HOVER_LEARNING_US
-        if hovers and learned:
+        if hovers and learned and not self.held:
             self._enter(Phase.GOTO_START, inputs.now_us)
             return []
         if not state.armed:  # pilot or autopilot disarmed it: it is not armed again
             self._give_up("disarmed before take-off", inputs, state)
             return []
+        if self.held:
+            ours = state.mode is not FlightMode.HOLD and not _is_under_other_control(state)
+            return [Command(verb=Verb.HOLD)] if ours and self._may_request(inputs) else []
         if (
             state.mode is not FlightMode.TAKEOFF
             and state.landed is Landed.ON_GROUND
             and self._may_request(inputs, _SPIN_UP_US)
         ):
+            if state.mode is FlightMode.HOLD and inputs.arm_in is not None:  # where a hold has left it
+                self._requested_us = inputs.now_us - _SPIN_UP_US
+                return [Command(verb=Verb.EXTERNAL)]
             return [Command(verb=Verb.TAKEOFF, value=height_m)]
         return []
 
@@ -365,12 +463,22 @@ class MissionStateMachine:
                     ),
                     inputs.now_us,
                 )
-            return self._request_control(inputs, state)
+            return [] if self.held else self._request_control(inputs, state)
         p = self._params
-        if self._at(state, self._start_ned_m, p.arrive_m, p.arrive_m_s) and not self.paused:
+        if self.held or self.paused:
+            return []
+        if self._climb_cut_short and self._trajectory is not None:
+            self._finish_climb(inputs.now_us, state, self._trajectory[0].to_ned_m)
+        elif self._at(state, self._start_ned_m, p.arrive_m, p.arrive_m_s):
             self.ready_utc_us = inputs.utc_us
             self._enter(Phase.READY, inputs.now_us)
         return []
+
+    def _finish_climb(self, now_us: int, state: VehicleState, top_ned_m: Array) -> None:
+        """Go to the start once the vehicle has climbed to its height."""
+        if self._at(state, top_ned_m, self._params.arrive_m, math.inf):
+            self._climb_cut_short = False
+            self._trajectory = (self._trajectory_home(state), now_us)
 
     def _request_control(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
         """Request control from the autopilot's own hold; from any other mode only after an operator's `resume`.
@@ -383,7 +491,7 @@ class MissionStateMachine:
         return [Command(verb=Verb.EXTERNAL)] if self._may_request(inputs) else []
 
     def _ready(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
-        if any(not p.alive or p.phase >= Phase.GOTO_LAND for p in inputs.peers.values()):
+        if any(not p.alive or p.phase >= Phase.GOTO_LAND for p in inputs.peers.values()) and not self.held:
             self.outcome = "a peer gave up or was lost before the mission began"
             self._go_home(inputs.now_us, state)
             return []
@@ -410,6 +518,8 @@ class MissionStateMachine:
         return []
 
     def _goto_land(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
+        if self.held:
+            return []
         waited_us = inputs.now_us - self._entered_us
         if self._may_land(inputs, state):
             self._enter(Phase.LAND, inputs.now_us)
@@ -473,8 +583,15 @@ class MissionStateMachine:
         if self.had_control:
             return
         self.had_control = True
-        if self.phase is Phase.GOTO_START:
-            self._trajectory = (self._trajectory_home(state), inputs.now_us)
+        if self.phase is not Phase.GOTO_START:
+            return
+        target = self._start_ned_m
+        if self._climb_cut_short:
+            target = np.array([*state.pos_ned_m[:2], self._start_ned_m[2]])
+        self._destination_ned_m = target
+        self._trajectory = (self._trajectory_to(target, state), inputs.now_us)
+        if self.held:
+            self._stay(inputs.now_us, state)
 
     def _trajectory_home(self, state: VehicleState) -> QuinticTrajectory:
         return self._trajectory_to(self._start_ned_m, state)
@@ -504,6 +621,8 @@ class MissionStateMachine:
 
     def _enter(self, phase: Phase, now_us: int) -> None:
         self.phase = phase
+        self.held &= phase < Phase.LAND
+        self.yaw_rad = self.yaw_rad if self.held else None
         self._entered_us = now_us
         self._requested_us = now_us - _SPIN_UP_US
 

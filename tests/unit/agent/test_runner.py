@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 
-from swarmctl.agent.runner import Pace, _check_vehicle_silence
+from swarmctl.agent.runner import Pace, StopOrder, _check_vehicle_silence
 from swarmctl.config import load
+from swarmctl.core.operator_verbs import Order
 from swarmctl.errors import MissionError, StartError
 from swarmctl.process_lifetime import StopRequest
 from swarmctl.wall_clock import WallClock
@@ -54,6 +55,29 @@ def test_after_a_stall_one_tick_follows_and_not_a_burst() -> None:
     pace.done(508 * MS, 510 * MS)
     assert pace.due_us == 520 * MS  # and the next one waits for its time
     assert pace.missed == 25
+
+
+def test_a_stop_that_is_refused_is_asked_for_again_until_it_is_obeyed() -> None:
+    asked_us: list[int] = []
+    pilot_flies = True
+
+    def ask(order: Order, now_us: int) -> str:
+        assert order == Order("land")
+        asked_us.append(now_us)
+        return "a pilot has taken over" if pilot_flies else ""
+
+    with StopRequest(signal.SIGUSR1) as stop:
+        landing = StopOrder(ask)
+        landing.step(stop, 0)
+        assert asked_us == []
+        os.kill(os.getpid(), signal.SIGUSR1)
+        for tick in range(150):  # 3 s
+            landing.step(stop, 20 * MS * tick)
+        assert asked_us == [0, 1_000_000, 2_000_000]
+        pilot_flies = False
+        for tick in range(150, 400):
+            landing.step(stop, 20 * MS * tick)
+    assert asked_us == [0, 1_000_000, 2_000_000, 3_000_000]
 
 
 def test_sleeping_until_the_past_returns_and_until_the_future_waits() -> None:

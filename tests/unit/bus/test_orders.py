@@ -8,7 +8,7 @@ from swarmctl.bus.json_messages import CommandMessage, decode_command, encode_me
 from swarmctl.bus.orders import EVERYBODY, MAX_LEAD_US, VALID_US, Orders, order_messages
 from swarmctl.bus.refusals import Refusals
 from swarmctl.bus.topics import OPERATOR
-from swarmctl.core.operator_verbs import Order
+from swarmctl.core.operator_verbs import Answer, Order
 
 NOW_US = 1_700_000_000_000_000
 
@@ -86,3 +86,61 @@ def test_a_forged_clock_makes_no_order_invalid() -> None:
     payloads = order_messages(Order("land"), 0, NOW_US, [0, 2**62])
     stamps_us = [message.utc_us for message in map(decode_command, payloads) if message is not None]
     assert stamps_us == [NOW_US, 0, 2**62]
+
+
+NUMBER = 77
+
+
+def numbered(verb: str, stamp_us: int, number: int = NUMBER) -> bytes:
+    return encode_message(CommandMessage(verb, EVERYBODY, stamp_us, {}, number))
+
+
+def test_a_numbered_order_is_obeyed_once_under_newer_stamps_and_answered_every_time() -> None:
+    agent = Agent3()
+    order = agent.orders.take(OPERATOR, numbered("hold", NOW_US), NOW_US)
+    assert order == Order("hold", {}, NUMBER)
+    agent.orders.answer(order, "")
+    assert agent.orders.due_answers() == [Answer("hold", NUMBER, True)]
+    assert agent.obeys("resume", NOW_US + 300_000, NOW_US + 300_000)
+    for later_us in (400_000, 5_000_000):
+        assert agent.orders.take(OPERATOR, numbered("hold", NOW_US + later_us), NOW_US + later_us) is None
+        assert agent.orders.due_answers() == [Answer("hold", NUMBER, True)]
+    assert agent.orders.due_answers() == []
+    assert agent.refusals.alert(NOW_US + 5_000_000) == ""
+    assert agent.obeys("hold", NOW_US + 4_000_000, NOW_US + 5_000_000), "repetitions make no later order too old"
+
+
+def test_a_refusal_is_answered_with_its_reason_and_a_superseded_order_too() -> None:
+    agent = Agent3()
+    order = agent.orders.take(OPERATOR, numbered("hold", NOW_US), NOW_US)
+    assert order is not None
+    agent.orders.answer(order, "it is in STANDBY")
+    assert agent.orders.due_answers() == [Answer("hold", NUMBER, False, "it is in STANDBY")]
+    assert agent.orders.take(OPERATOR, numbered("rtl", NOW_US - 1, 78), NOW_US) is None
+    assert agent.orders.due_answers() == [Answer("rtl", 78, False, "a newer order was obeyed")]
+
+
+def test_neither_an_order_from_another_time_nor_one_without_a_number_is_answered() -> None:
+    agent = Agent3()
+    assert agent.orders.take(OPERATOR, numbered("hold", NOW_US - VALID_US - 1), NOW_US) is None
+    assert agent.obeys("hold", NOW_US)
+    agent.orders.answer(Order("hold"), "")
+    assert not agent.obeys("hold", NOW_US)
+    assert agent.orders.due_answers() == []
+
+
+def test_one_number_with_two_contents_is_refused() -> None:
+    agent = Agent3()
+    assert agent.orders.take(OPERATOR, numbered("hold", NOW_US), NOW_US) is not None
+    assert agent.orders.take(OPERATOR, numbered("land", NOW_US + 1), NOW_US) is None
+    assert agent.refusals.by_reason == {"sequence": 1}
+
+
+def test_many_numbered_orders_are_not_kept_for_ever() -> None:
+    agent = Agent3()
+    for number in range(1, 1000):
+        order = agent.orders.take(OPERATOR, numbered("hold", NOW_US + number, number), NOW_US)
+        assert order is not None
+        agent.orders.answer(order, "")
+        agent.orders.due_answers()
+    assert len(agent.orders._numbered) == len(agent.orders._answers) == 64

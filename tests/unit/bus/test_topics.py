@@ -17,9 +17,12 @@ from swarmctl.bus import path_messages, topics
 from swarmctl.bus.commitment_messages import MAX_PEERS, MAX_POINTS, encode_trajectory_message
 from swarmctl.bus.json_messages import (
     MAX_OBSTACLES,
+    MAX_REASON,
+    AnswerMessage,
     CommandMessage,
     ObstaclesMessage,
     StatusMessage,
+    decode_answer,
     decode_command,
     decode_obstacles,
     decode_status,
@@ -36,7 +39,7 @@ from tests import builders
 
 POINTS = np.array([[1.5, -2.25, -3.0], [1.625, -2.0, -3.5], [1.75, -1.75, -4.0]])
 UTC_US = 1_700_000_000_123_456
-ALL_DECODERS = (decode_path, decode_status, decode_command, decode_obstacles)
+ALL_DECODERS = (decode_path, decode_status, decode_command, decode_answer, decode_obstacles)
 
 STATUS = StatusMessage(
     agent=2,
@@ -47,6 +50,15 @@ STATUS = StatusMessage(
     flight_mode=7,
     armed=True,
     landed=2,
+    held=True,
+    control="TRACKING",
+    altitude_m=5.0,
+    ground_speed_m_s=1.5,
+    battery_01=0.75,
+    pos_accuracy_m=0.25,
+    gps_fix=3,
+    satellites=10,
+    link_age_ms=8.5,
     ready_utc_us=UTC_US,
     outcome="",
     position_error_m=0.25,
@@ -57,8 +69,12 @@ STATUS = StatusMessage(
     plan_staleness_ms=41.5,
     solver_failed=1,
     active_alert="plan residual",
+    alert_age_s=2.5,
     uses_commitments=False,
     utc_us=UTC_US,
+)
+ANSWER = AnswerMessage(
+    agent=2, boot_id=9, verb="hold", number=2**53, accepted=False, reason="it is in STANDBY", utc_us=UTC_US
 )
 
 
@@ -181,7 +197,7 @@ def test_a_status_with_one_hostile_field_is_none_or_well_typed(name: str, value:
             assert not isinstance(found, float) or math.isfinite(found)
 
 
-@pytest.mark.parametrize("decode", [decode_status, decode_command, decode_obstacles])
+@pytest.mark.parametrize("decode", [decode_status, decode_command, decode_answer, decode_obstacles])
 @pytest.mark.parametrize(
     "payload",
     [
@@ -199,8 +215,9 @@ def test_hostile_text_gives_none_and_never_raises(decode: object, payload: bytes
 
 def test_messages_survive_encoding() -> None:
     assert decode_status(encode_message(STATUS)) == STATUS
-    command = CommandMessage("rtl", -1, UTC_US)
-    assert decode_command(encode_message(command)) == command
+    for command in (CommandMessage("rtl", -1, UTC_US), CommandMessage("rtl", 2, UTC_US, {}, 2**62)):
+        assert decode_command(encode_message(command)) == command
+    assert decode_answer(encode_message(ANSWER)) == ANSWER
     obstacle = Obstacle(
         center_ned_m=(9.5, 5.5, -2.3), radius_m=1.0, keep_out_m=1.75, visibility_m=3.0, vel_ned_m_s=(0.0, -0.5, 0.0)
     )
@@ -362,7 +379,12 @@ def test_the_longest_good_message_of_every_topic_fits() -> None:
     assert TICK_DTYPE.itemsize + 12 * path_messages.MAX_POINTS <= topics.TICK.max_bytes
     status = msgspec.structs.replace(STATUS, outcome="x" * 4000, active_alert="\u20ac" * 4000)
     assert len(encode_message(status)) <= topics.STATUS.max_bytes
-    assert len(encode_message(CommandMessage("resume", -1, 2**62))) <= topics.COMMAND.max_bytes
+    assert len(encode_message(CommandMessage("resume", -1, 2**62, {}, 2**62))) <= topics.COMMAND.max_bytes
+    answer = msgspec.structs.replace(ANSWER, verb="\u20ac" * 32, reason="\U0001f6f8" * MAX_REASON)
+    assert decode_answer(encode_message(answer)) == answer
+    assert len(encode_message(answer)) <= topics.ANSWER.max_bytes
+    longer = msgspec.structs.replace(ANSWER, reason="x" * (MAX_REASON + 1))
+    assert decode_answer(encode_message(longer)) is None
 
 
 def test_the_table_of_topics_is_all_that_the_router_loads_of_messages() -> None:

@@ -183,10 +183,11 @@ def test_a_lost_terminal_does_not_end_the_flight() -> None:
 
 def test_table_cells() -> None:
     assert status_cells(AgentView(agent=0, status=status())) == (
-        *("agent-0", "TRACK", "TRACKING", "0.123", "1.25", "2.0", "3/100", "20"),
-        "",
+        *("0", "TRACK", "TRACKING", "EXTERNAL", "yes", "5.0", "1.5", "75", "0.25", "0.0", "1.25", "0.12", "3"),
+        *("100", "2.0", "20", "3D 10", ""),
     )
-    assert status_cells(AgentView(agent=0, status=status(99, -1.0)))[1:5] == ("99", "TRACKING", "0.123", "-")
+    unknown = status_cells(AgentView(agent=0, status=status(99, -1.0)))
+    assert (unknown[1], unknown[10]) == ("99", "-")
     assert status_cells(AgentView(agent=1))[-1] == "no status yet"
 
 

@@ -1,15 +1,81 @@
-"""Every verb of the operator has an effect in the state machine, and only in its phases."""
+"""The matrix of verbs and phases: each verb has its effect in its phases, and is refused with a reason in others."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
+import numpy as np
 import pytest
 
-from swarmctl.control.phases.state_machine import MissionStateMachine
-from swarmctl.core.operator_verbs import EXCLUDE, OPERATOR_VERBS, order_problem
-from swarmctl.core.types import Phase
-from tests.benches.state_machine_flight import Flight
+from swarmctl.control.phases.state_machine import OPERATOR_STOP, TAKEN_OVER, MissionStateMachine
+from swarmctl.core.operator_verbs import EXCLUDE, GOTO, OPERATOR_VERBS, order_problem
+from swarmctl.core.types import Array, FlightMode, Landed, Mode, Phase, Verb
+from tests.benches.state_machine_flight import IN_AIR, START, Flight, controlled, in_phase
 
 ABOUT_THE_VEHICLE = [name for name in OPERATOR_VERBS if name != EXCLUDE]
+AIRBORNE = (Phase.TAKEOFF, Phase.GOTO_START, Phase.READY, Phase.TRACK, Phase.GOTO_LAND)
+LONG_S = 120.0  # past every timeout
+
+
+def place(flight: Flight, after_s: float = 60.0) -> Array:
+    """Return the reference `after_s` from now."""
+    pos, _ = flight.state_machine.reference(flight.utc_us, flight.now_us, np.array([after_s]))
+    return pos.ravel()
+
+
+def is_held(flight: Flight) -> bool:
+    """Whether it stays in its phase and place past every timeout, and only the autopilot's hold is asked for."""
+    before, asked = flight.phase, set(flight.run(5.0))
+    allowed = {Verb.HOLD} if before is Phase.TAKEOFF else set()
+    if before is Phase.TAKEOFF:
+        flight.flight_mode = FlightMode.HOLD  # as asked
+    asked |= set(flight.run(LONG_S))
+    went_on = flight.phase is not before and (before, flight.phase) != (Phase.READY, Phase.TRACK)
+    rests = before is Phase.TAKEOFF or np.linalg.norm(place(flight) - flight.pos) < 1.0
+    return flight.state_machine.held and asked <= allowed and not went_on and bool(rests)
+
+
+def goes_on(flight: Flight) -> bool:
+    """Whether nothing holds it."""
+    return not flight.state_machine.held
+
+
+def ends(flight: Flight) -> bool:
+    """Whether it is on its way to land, or has landed."""
+    return flight.phase >= Phase.GOTO_LAND and flight.state_machine.outcome in (OPERATOR_STOP, "completed")
+
+
+def goes_there(flight: Flight) -> bool:
+    """Whether it is on its way to the point, and stays there past every timeout."""
+    flight.run(LONG_S)
+    return flight.state_machine.held and bool(np.allclose(place(flight), THERE))
+
+
+THERE = np.array([3.0, -2.0, -4.0])
+POINT = dict(zip(("north_m", "east_m", "down_m"), THERE.tolist(), strict=True))
+ARGUMENTS: dict[str, dict[str, float]] = {GOTO: POINT}
+EFFECTS: dict[str, Callable[[Flight], bool]] = {
+    "hold": is_held,
+    "resume": goes_on,
+    "land": ends,
+    "rtl": ends,
+    GOTO: goes_there,
+}
+
+
+@pytest.mark.parametrize("phase", Phase, ids=lambda phase: phase.name)
+@pytest.mark.parametrize("verb", ABOUT_THE_VEHICLE)
+def test_each_verb_in_each_phase_has_its_effect_or_is_refused_with_a_reason(verb: str, phase: Phase) -> None:
+    flight = in_phase(phase)
+    machine = flight.state_machine
+    before = machine.phase, machine.held, machine.outcome
+    refusal = flight.ask(verb, **ARGUMENTS.get(verb, {}))
+    if phase.name in OPERATOR_VERBS[verb].phases:
+        assert refusal == ""
+        assert EFFECTS[verb](flight)
+    else:
+        assert refusal.startswith(f"it is in {phase.name}; {verb} is obeyed in ")
+        assert (machine.phase, machine.held, machine.outcome) == before
 
 
 def test_every_verb_about_the_vehicle_is_a_stop_or_handled() -> None:
@@ -17,19 +83,235 @@ def test_every_verb_about_the_vehicle_is_a_stop_or_handled() -> None:
     assert {name for name in ABOUT_THE_VEHICLE if not OPERATOR_VERBS[name].is_stop} == machine._order_handlers.keys()
 
 
-@pytest.mark.parametrize("verb", ABOUT_THE_VEHICLE)
-def test_phases_of_a_verb_are_phases_and_nothing_interrupts_a_landing(verb: str) -> None:
-    phases = OPERATOR_VERBS[verb].phases
-    assert phases
-    assert phases <= {phase.name for phase in Phase if phase < Phase.LAND}
+def test_verbs_of_flight_are_obeyed_wherever_the_agent_decides_and_nothing_interrupts_a_landing() -> None:
+    names = {phase.name for phase in Phase}
+    for name in ABOUT_THE_VEHICLE:
+        assert OPERATOR_VERBS[name].phases <= names
+        assert "LAND" not in OPERATOR_VERBS[name].phases or name == "land"
+    for name in ("hold", "resume", "land", "rtl"):
+        assert {phase.name for phase in AIRBORNE} <= OPERATOR_VERBS[name].phases
 
 
-def test_hold_is_obeyed_while_tracking_only() -> None:
-    flight = Flight().until(Phase.READY)
+@pytest.mark.parametrize("phase", AIRBORNE, ids=lambda phase: phase.name)
+@pytest.mark.parametrize("verb", ["hold", "resume"])
+def test_without_a_vehicle_state_what_needs_one_is_refused(verb: str, phase: Phase) -> None:
+    flight = in_phase(phase)
+    flight.seen = False
+    assert flight.ask(verb) == "nothing is known of its vehicle now"
+
+
+@pytest.mark.parametrize("verb", ["hold", "land", "rtl"])
+def test_a_vehicle_that_its_pilot_flies_refuses_all_but_resume(verb: str) -> None:
+    flight = controlled(Phase.TRACK)
+    flight.failsafe_mode, flight.flight_mode = Mode.PILOT_OVERRIDE, FlightMode.MANUAL
+    flight.run(0.5)
+    assert "taken over" in flight.ask(verb)
+    assert (flight.phase, flight.state_machine.outcome) == (Phase.TRACK, TAKEN_OVER)
+    assert flight.ask("resume") == ""
+    assert not flight.state_machine.pilot_override
+
+
+def test_a_climb_that_a_pilot_flies_is_not_held() -> None:
+    flight = in_phase(Phase.TAKEOFF)
+    flight.flight_mode = FlightMode.MANUAL
+    assert flight.ask("hold") == "its pilot or autopilot flies it in MANUAL"
+    assert Verb.HOLD not in flight.run(3.0)
+
+
+def test_a_hold_on_the_way_up_is_asked_of_the_autopilot_at_once_and_ends_at_the_start() -> None:
+    flight = in_phase(Phase.TAKEOFF)
     flight.ask("hold")
-    assert not flight.state_machine.held
-    flight.until(Phase.TRACK).ask("hold")
+    assert flight.run(0.1) == [Verb.HOLD]
+    flight.flight_mode = FlightMode.HOLD
+    assert flight.run(LONG_S) == []
+    assert flight.at == "TAKEOFF"
+    assert flight.ask("resume") == ""
+    flight.run(0.2)
+    assert flight.at == "GOTO_START"
+    flight.flight_mode = FlightMode.EXTERNAL
+    flight.pos = START + np.array([2.0, 0.0, 1.5])
+    flight.run(0.1)
+    np.testing.assert_allclose(place(flight), START + np.array([2.0, 0.0, 0.0]), atol=1e-9)  # first up
+    flight.pos = START + np.array([2.0, 0.0, 0.0])
+    flight.run(0.2)
+    np.testing.assert_allclose(place(flight), START, atol=1e-9)
+    flight.pos = START.copy()
+    flight.run(0.1)
+    assert flight.at == "READY"
+
+
+def test_a_hold_just_after_another_request_does_not_wait_for_its_repetition() -> None:
+    flight = Flight().until(Phase.TAKEOFF)
+    assert flight.run(0.1) == [Verb.TAKEOFF]
+    flight.pos, flight.landed, flight.flight_mode = START + np.array([0.0, 0.0, 2.0]), IN_AIR, FlightMode.TAKEOFF
+    flight.ask("hold")
+    assert flight.run(0.1) == [Verb.HOLD]
+
+
+def test_a_hold_before_the_climb_keeps_it_on_the_ground() -> None:
+    flight = Flight().until(Phase.TAKEOFF)
+    flight.ask("hold")
+    assert Verb.TAKEOFF not in flight.run(LONG_S)
+    flight.ask("resume")
+    assert flight.run(0.1) == [Verb.TAKEOFF]
+    assert not flight.state_machine._climb_cut_short
+    guided = Flight()
+    guided.arm_in = FlightMode.EXTERNAL
+    guided.until(Phase.TAKEOFF)
+    guided.ask("hold")
+    guided.flight_mode = FlightMode.HOLD
+    guided.ask("resume")
+    assert guided.run(0.1) == [Verb.EXTERNAL], "ArduCopter takes off in GUIDED only"
+
+
+@pytest.mark.parametrize("phase", [Phase.GOTO_START, Phase.READY, Phase.GOTO_LAND], ids=lambda phase: phase.name)
+def test_resume_goes_on_to_where_the_transit_led(phase: Phase) -> None:
+    flight = controlled(phase)
+    if phase is not Phase.READY:
+        flight.pos = START + np.array([2.0, 0.0, 0.0])
+    flight.ask("hold")
+    assert np.linalg.norm(place(flight) - flight.pos) < 1e-9
+    flight.run(LONG_S)
+    flight.unresponsive_peer = True  # a pause during the hold ends at the same place
+    flight.run(0.3)
+    flight.unresponsive_peer = False
+    flight.run(0.3)
+    assert np.linalg.norm(place(flight) - flight.pos) < 1e-9
+    assert flight.ask("resume") == ""
+    if flight.phase is not Phase.TRACK:  # from READY the mission has begun meanwhile
+        np.testing.assert_allclose(place(flight), START, atol=1e-9)
+
+
+def test_a_hold_while_waiting_for_the_others_holds_when_the_mission_begins() -> None:
+    flight = controlled(Phase.READY)
+    flight.ask("hold")
+    flight.until(Phase.TRACK)
+    flight.run(3.0)
+    np.testing.assert_allclose(place(flight), START, atol=1e-9)
     assert flight.state_machine.held
+
+
+@pytest.mark.parametrize("verb", ["land", "rtl"])
+@pytest.mark.parametrize("phase", AIRBORNE, ids=lambda phase: phase.name)
+def test_a_stop_ends_a_hold_in_every_phase(phase: Phase, verb: str) -> None:
+    flight = in_phase(phase)
+    flight.ask("hold")
+    flight.run(1.0)
+    assert flight.ask(verb) == ""
+    assert not flight.state_machine.held
+    assert flight.phase >= Phase.GOTO_LAND
+
+
+def test_a_stop_is_sticky_held_and_resumed_it_goes_on_to_land() -> None:
+    flight = controlled(Phase.TRACK)
+    flight.ask("land")
+    flight.ask("hold")
+    flight.run(LONG_S)
+    assert flight.at == "GOTO_LAND"
+    assert "landing where it is" in flight.ask("rtl")
+    flight.ask("resume")
+    assert Verb.LAND in flight.run(10.0)
+
+
+def test_what_must_not_wait_ends_a_hold_on_the_way_to_land() -> None:
+    flight = controlled(Phase.GOTO_LAND)
+    flight.ask("hold")
+    flight.cut_off = "cut off from agent-1"
+    flight.run(0.2)
+    assert not flight.state_machine.held
+
+
+def test_a_stop_of_what_has_landed_is_done_already_but_not_of_what_was_handed_back_in_the_air() -> None:
+    flight = in_phase(Phase.DONE)
+    for verb in ("land", "rtl"):
+        assert flight.ask(verb) == ""
+    flight.landed = IN_AIR
+    for verb in ("land", "rtl"):
+        assert "in the air" in flight.ask(verb)
+
+
+def test_the_time_of_a_hold_does_not_count_as_time_to_the_start() -> None:
+    flight = Flight(start_timeout_s=20.0)
+    flight.until(Phase.TAKEOFF)
+    flight.pos, flight.landed, flight.flight_mode = START + np.array([0.0, 0.0, 1.0]), Landed.IN_AIR, FlightMode.HOLD
+    flight.ask("hold")
+    flight.run(LONG_S)
+    flight.ask("resume")
+    flight.run(5.0)
+    assert flight.phase in (Phase.GOTO_START, Phase.READY)
+
+
+@pytest.mark.parametrize("phase", [Phase.GOTO_START, Phase.READY, Phase.TRACK], ids=lambda phase: phase.name)
+def test_a_pause_on_the_way_to_a_point_goes_on_to_it_and_hold_stops_it(phase: Phase) -> None:
+    flight = controlled(phase)
+    assert flight.ask(GOTO, **POINT, speed_m_s=1.0, yaw_deg=90.0) == ""
+    assert flight.state_machine.yaw_rad == pytest.approx(np.pi / 2)
+    flight.unresponsive_peer = True
+    flight.run(0.5)
+    assert np.linalg.norm(place(flight) - flight.pos) < 1e-9
+    assert "rests" in flight.ask(GOTO, **POINT)
+    flight.unresponsive_peer = False
+    flight.run(0.5)
+    np.testing.assert_allclose(place(flight), THERE)
+    assert flight.ask("hold") == ""
+    assert np.linalg.norm(place(flight) - flight.pos) < 1e-9
+    flight.unresponsive_peer = True
+    flight.run(0.5)
+    flight.unresponsive_peer = False
+    flight.run(0.5)
+    assert np.linalg.norm(place(flight) - flight.pos) < 1e-9
+    assert flight.state_machine.yaw_rad is None
+
+
+def test_the_speed_of_a_goto_is_its_peak_speed() -> None:
+    flight = controlled(Phase.TRACK)
+    for speed_m_s in (0.5, 1.5):
+        flight.ask(GOTO, north_m=float(flight.pos[0]) + 30.0, east_m=0.0, down_m=-4.0, speed_m_s=speed_m_s)
+        _, vel = flight.state_machine.reference(flight.utc_us, flight.now_us, np.linspace(0.0, 150.0, 1000))
+        assert np.linalg.norm(vel, axis=1).max() == pytest.approx(speed_m_s, rel=0.02)
+
+
+@pytest.mark.parametrize("verb", ["land", "rtl"])
+def test_a_stop_ends_a_goto_and_none_begins_after_one(verb: str) -> None:
+    flight = controlled(Phase.TRACK)
+    flight.pos = START + np.array([2.0, 0.0, 0.0])
+    flight.ask(GOTO, **POINT, yaw_deg=10.0)
+    assert flight.ask(verb) == ""
+    assert flight.state_machine.yaw_rad is None
+    assert "GOTO_LAND" in flight.ask(GOTO, **POINT)
+
+
+def test_a_point_in_the_ground_or_a_way_out_of_the_fence_is_refused() -> None:
+    flight = controlled(Phase.TRACK)
+    assert "too low: -0.50 at most" in flight.ask(GOTO, **POINT | {"down_m": -0.4})
+    assert flight.ask(GOTO, **POINT | {"down_m": -0.6}) == ""
+    fenced = controlled(Phase.TRACK)
+    fenced.state_machine._contains = lambda at_ne_m: not 4.0 < at_ne_m[0] < 6.0  # the straight way north leaves it
+    assert fenced.ask(GOTO, **POINT | {"north_m": 3.9}) == ""
+    held_at = place(fenced)
+    for north_m in (5.0, 9.0):
+        assert "outside of the geofence" in fenced.ask(GOTO, **POINT | {"north_m": north_m})
+    np.testing.assert_allclose(place(fenced), held_at)
+
+
+def test_where_the_ground_is_unknown_nothing_lower_than_the_start_is_flown_to() -> None:
+    flight = controlled(Phase.TRACK)
+    flight.state_machine._airborne = True
+    assert "too low: -3.00 at most" in flight.ask(GOTO, **POINT | {"down_m": -2.9})
+
+
+def test_before_it_has_control_nothing_is_flown_to() -> None:
+    flight = Flight().until(Phase.GOTO_START)
+    assert flight.ask(GOTO, **POINT) == "its autopilot still flies it"
+
+
+def test_optional_arguments_may_be_left_out_and_no_others() -> None:
+    assert order_problem(GOTO, POINT) == ""
+    assert order_problem(GOTO, POINT | {"yaw_deg": 90.0, "speed_m_s": 2.0}) == ""
+    assert "allowed: 0.1 to 20" in order_problem(GOTO, POINT | {"speed_m_s": 0.0})
+    assert "goto takes north_m" in order_problem(GOTO, {"north_m": 1.0, "yaw_deg": 90.0})
+    assert "goto takes north_m" in order_problem(GOTO, POINT | {"height_m": 1.0})
+    assert "nan" in order_problem(GOTO, POINT | {"east_m": float("nan")})
 
 
 def test_what_is_no_order_is_named() -> None:

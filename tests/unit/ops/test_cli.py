@@ -19,10 +19,8 @@ from sitl.studies.bench import command
 from swarmctl.control.mpc.solvers.qp import SOLVERS
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import OperatorVerb, Order, VerbArgument
-from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, MissionError, StartError, exit_code_of
-from swarmctl.ops import cli, operator
-from tests import builders
+from swarmctl.ops import cli, operator, order_verbs
 
 Run = Callable[..., int]
 HEAVY = ("numpy", "scipy", "osqp", "zenoh", "rerun", "pyarrow", "pydantic", "mavsdk", "pymavlink", "psutil", "msgspec")
@@ -133,24 +131,31 @@ def test_rtl_help_says_that_the_agent_flies_home(run: Run, capsys: pytest.Captur
 def test_a_verb_of_the_operator_has_an_option_for_each_argument(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    given: list[tuple[Order, Path | None, int | None]] = []
+    given: list[tuple[Order, str | None, list[int]]] = []
 
-    def give(order: Order, run_dir: Path | None, agent: int | None) -> int:
-        given.append((order, run_dir, agent))
+    def give(order: Order, run: str | None, agents: list[int]) -> int:
+        given.append((order, run, agents))
         return 7
 
     app = typer.Typer(rich_markup_mode=None)
     height = VerbArgument(name="height_m", option="--height", help="Height [m].", least=0.5, most=20.0)
     for name, arguments in (("climb", (height,)), ("hold", ())):
-        cli.add_operator_verb(app, name, OperatorVerb(help="Do.", phases=frozenset(), arguments=arguments), give)
+        order_verbs.add_operator_verb(
+            app, name, OperatorVerb(help="Do.", phases=frozenset(), arguments=arguments), give
+        )
     assert app(["climb", "--height", "2.5", "--agent", "1", "--run-dir", "r"], standalone_mode=False) == 7
     assert app(["hold"], standalone_mode=False) == 7
-    assert given == [(Order("climb", {"height_m": 2.5}), Path("r"), 1), (Order("hold"), None, None)]
+    assert app(["hold", "0", "2", "--agent", "1", "--run", "circle"], standalone_mode=False) == 7
+    assert given == [
+        (Order("climb", {"height_m": 2.5}), "r", [1]),
+        (Order("hold"), None, []),
+        (Order("hold"), "circle", [0, 2, 1]),
+    ]
     for wrong in (["climb"], ["climb", "--height", "20.5"], ["climb", "--height", "x"], ["hold", "--height", "1"]):
         with pytest.raises(SystemExit) as ended:
             app(wrong)
         assert ended.value.code == 2
-    assert len(given) == 2
+    assert len(given) == 3
     capsys.readouterr()
     app(["climb", "--help"], standalone_mode=False)
     assert "Height [m]." in capsys.readouterr().out
@@ -279,10 +284,10 @@ def test_the_registry_knows_live_launches_and_forgets_dead_ones(
     operator.announce(launch)
     assert registry.stat().st_mode & 0o777 == 0o700
     assert operator.find_launch(None) == launch
-    assert operator.find_launch(folder) == launch
+    assert operator.find_launch(str(folder)) == launch
     operator.announce(operator.RunningLaunch("reused pid", "unixsock-stream//x", pid, started_s - 60, 3, str(folder)))
     with pytest.raises(StartError):
-        operator.find_launch(folder)
+        operator.find_launch(str(folder))
     with pytest.raises(StartError):
         operator.find_launch(None)
     assert list(registry.iterdir()) == []
@@ -305,11 +310,11 @@ def test_a_note_in_a_received_folder_that_is_none_is_no_launch(tmp_path: Path) -
     for content in (b"{", b"[]", b'{"run": 1}', b"\xff\xfe", b"[" * 100_000):
         note.write_bytes(content)
         with pytest.raises(StartError, match="no launch runs there"):
-            operator.find_launch(tmp_path)
+            operator.find_launch(str(tmp_path))
     note.unlink()
     os.mkfifo(note)
     with pytest.raises(StartError, match="no launch runs there"):
-        operator.find_launch(tmp_path)
+        operator.find_launch(str(tmp_path))
 
 
 def squat_open(place: Path) -> None:
@@ -377,18 +382,26 @@ def test_a_runtime_directory_of_another_user_is_not_used(monkeypatch: pytest.Mon
     assert operator.find_launch(None) == launch
 
 
-@pytest.mark.parametrize(
-    ("verb", "phases", "ignored"),
-    [
-        ("hold", {0: Phase.TRACK, 1: Phase.TAKEOFF}, ["agent-1 is in TAKEOFF and ignores it; it is obeyed in TRACK"]),
-        ("hold", {0: Phase.TRACK}, ["agent-1 does not answer"]),
-        ("land", {0: Phase.CONNECT, 1: Phase.LAND}, []),
-        ("rtl", {0: Phase.TAKEOFF, 1: Phase.DONE}, []),
-        ("resume", {0: Phase.TRACK, 1: Phase.LAND}, ["agent-1 is in LAND and ignores it"]),
-    ],
-)
-def test_who_ignores_an_order_is_named(verb: str, phases: dict[int, Phase], ignored: list[str]) -> None:
-    statuses = {agent: builders.status_message(agent=agent, phase=phase) for agent, phase in phases.items()}
-    found = operator.ignored_by(Order(verb), statuses, range(2))
-    assert len(found) == len(ignored)
-    assert all(text.startswith(start) for text, start in zip(found, ignored, strict=True))
+def test_with_several_launches_one_is_chosen_by_name_or_folder(
+    run: Run, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "")
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    started_s, pid = operator.process_start_s()
+    circle = operator.RunningLaunch("circle-1a", "unixsock-stream//x", pid, started_s, 3, str(tmp_path / "first"))
+    swap = operator.RunningLaunch("swap-2b", "unixsock-stream//y", os.getppid(), started_s, 6, str(tmp_path / "second"))
+    (tmp_path / "second").mkdir()
+    monkeypatch.setattr(operator, "_runs", lambda launch: launch.run != "dead")
+    for launch in (circle, swap):
+        operator.announce(launch)
+    assert operator.find_launch("circle") == circle
+    assert operator.find_launch("swap-2b") == swap
+    assert operator.find_launch(str(tmp_path / "second")) == swap
+    for arguments in (("hold",), ("status",), ("fault", "gust"), ("exclude", "--peer", "1"), ("obstacle", "list")):
+        assert run(*arguments) == 2, arguments
+        said = capsys.readouterr().err
+        assert "2 launches run" in said
+        assert "circle-1a  3 agents" in said
+        assert "swap-2b  6 agents" in said
+    with pytest.raises(StartError, match=r"running: .*circle-1a"):
+        operator.find_launch("line")

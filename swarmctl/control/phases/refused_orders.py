@@ -1,0 +1,73 @@
+"""Which operator's orders an agent refuses, and the reason it answers. Pure.
+
+An order that is not refused has its effect: `control.phases.state_machine` applies it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from swarmctl.core.operator_verbs import GOTO, OPERATOR_VERBS, POINT, Order
+from swarmctl.core.types import Landed, Phase, VehicleState
+
+Contains = Callable[[tuple[float, float]], bool]  # whether north and east [m] lie in the area to fly in
+_WAY_STEP_M = 1.0  # between points of a straight way that are checked
+_MOST_WAY_POINTS = 1000
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OrderSituation:
+    """Everything that decides whether an agent obeys an order."""
+
+    phase: Phase
+    state: VehicleState | None
+    pilot_override: bool  # pilot or autopilot took over
+    other_control: bool  # its flight mode is none that the agent has asked for
+    lands_in_place: bool  # it is landing where it came to rest
+    controls: bool  # the autopilot follows the agent's setpoints
+    paused: bool  # it rests because a peer is silent or deadlines are missed
+    lowest_m: float  # down coordinate that it may not go below
+    contains: Contains
+
+
+def refusal_of(order: Order, situation: OrderSituation) -> str:
+    """Return why an order is refused, or "" if it is obeyed.
+
+    A stop is obeyed before anything is known of the vehicle: it begins with the first state.
+    """
+    verb, phase = OPERATOR_VERBS[order.verb], situation.phase
+    if phase.name not in verb.phases:
+        obeyed = ", ".join(possible.name for possible in Phase if possible.name in verb.phases)
+        return f"it is in {phase.name}; {order.verb} is obeyed in {obeyed}"
+    if phase is Phase.DONE:
+        down = situation.state is not None and situation.state.landed is Landed.ON_GROUND
+        return "" if down else "its mission has ended and it was handed back in the air"
+    if situation.pilot_override and order.verb != "resume":
+        return "a pilot or its autopilot has taken over; take it back with: resume"
+    if verb.is_stop:
+        lands = phase is Phase.GOTO_LAND and situation.lands_in_place
+        return "it is landing where it is" if lands and order.verb == "rtl" else ""
+    if situation.state is None:
+        return "nothing is known of its vehicle now"
+    if phase is Phase.TAKEOFF and order.verb == "hold" and situation.other_control:
+        return f"its pilot or autopilot flies it in {situation.state.mode.name}"
+    return _goto_refusal(order, situation.state, situation) if order.verb == GOTO else ""
+
+
+def _goto_refusal(order: Order, state: VehicleState, situation: OrderSituation) -> str:
+    """Return why the agent does not fly to a point, or ""."""
+    if not situation.controls:
+        return "its autopilot still flies it"
+    if situation.paused:
+        return "it rests because a peer is silent or deadlines are missed"
+    target = np.array([order.arguments[name] for name in POINT])
+    if target[2] > situation.lowest_m:
+        return f"down {target[2]:g} m is too low: {situation.lowest_m:.2f} at most"
+    points = min(_MOST_WAY_POINTS, 2 + int(math.dist(state.pos_ned_m[:2], target[:2]) / _WAY_STEP_M))
+    way = np.linspace(target[:2], state.pos_ned_m[:2], points)
+    outside = [(float(north), float(east)) for north, east in way if not situation.contains((north, east))]
+    return "" if not outside else f"{outside[0][0]:.1f}, {outside[0][1]:.1f} on the way is outside of the geofence"

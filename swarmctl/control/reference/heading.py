@@ -1,0 +1,37 @@
+"""The heading of setpoints: the mission's, or one that an operator asks for, turned to at a bounded rate. Pure."""
+
+from __future__ import annotations
+
+import math
+
+_RATE_RAD_S = math.radians(45.0)  # slow beside the attitude loop, so that thrust keeps pointing where it is planned to
+
+
+class Heading:
+    """Turns from one heading to another the shorter way round.
+
+    Args:
+        mission_yaw_rad: heading of the mission, clockwise from north.
+    """
+
+    def __init__(self, mission_yaw_rad: float) -> None:
+        self._mission_yaw_rad = self._yaw_rad = mission_yaw_rad
+        self._then_us: int | None = None
+
+    def at(self, now_us: int, asked_yaw_rad: float | None) -> float:
+        """Return the heading of the setpoint of this tick.
+
+        Args:
+            now_us: monotonic time.
+            asked_yaw_rad: heading asked for; None: the mission's.
+        """
+        goal_rad = self._mission_yaw_rad if asked_yaw_rad is None else asked_yaw_rad
+        passed_s = 0.0 if self._then_us is None else (now_us - self._then_us) * 1e-6
+        self._then_us = now_us
+        step_rad = _RATE_RAD_S * min(passed_s, 0.1)  # after a gap the vehicle has not turned meanwhile
+        left_rad = math.remainder(goal_rad - self._yaw_rad, math.tau)
+        if abs(left_rad) <= step_rad:
+            self._yaw_rad = goal_rad
+        else:
+            self._yaw_rad = math.remainder(self._yaw_rad + math.copysign(step_rad, left_rad), math.tau)
+        return self._yaw_rad

@@ -1,0 +1,26 @@
+"""What a vehicle reports of its battery and its GPS, for the operator: nothing that flies depends on it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+_UNKNOWN_SATELLITES = 255
+
+
+@dataclass(slots=True)
+class VehicleHealth:
+    """Holds the newest reports; None before the first one, and for what the vehicle does not know."""
+
+    battery_01: float | None = None  # charge that remains
+    gps_fix: int | None = None  # GPS_FIX_TYPE: 3 is 3D, 0 no GPS
+    satellites: int | None = None
+
+    def sys_status(self, message: Any) -> None:
+        """Take a SYS_STATUS."""
+        self.battery_01 = message.battery_remaining * 0.01 if 0 <= message.battery_remaining <= 100 else None
+
+    def gps(self, message: Any) -> None:
+        """Take a GPS_RAW_INT."""
+        self.gps_fix = message.fix_type
+        self.satellites = None if message.satellites_visible == _UNKNOWN_SATELLITES else message.satellites_visible

@@ -1,0 +1,172 @@
+"""Delivery of an operator's order: repeated until every agent asked has answered, and a stop is seen to begin.
+
+An order is obeyed once, however often it is repeated: its number stays, only its stamp is new, so that it never becomes
+too old (`swarmctl.bus.orders`). What an agent has not answered in time is unknown, and is said so.
+"""
+
+from __future__ import annotations
+
+import secrets
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from swarmctl.bus.json_messages import StatusMessage, decode_answer, decode_status
+from swarmctl.bus.orders import EVERYBODY, order_messages
+from swarmctl.bus.peers import Bus, agent_name
+from swarmctl.bus.topics import ANSWER, COMMAND, STATUS
+from swarmctl.core.operator_verbs import OPERATOR_VERBS, PEER, Answer, Order
+from swarmctl.core.text import printable
+from swarmctl.core.types import Phase
+from swarmctl.errors import StartError
+from swarmctl.ops.operator import RunningLaunch, joined
+
+ANSWER_S = 5.0  # longest wait for answers, and for a stop to begin
+_REPEAT_S = 0.2
+_POLL_S = 0.02
+_MOST_MESSAGES = 32  # of one repetition, so that they fit into an agent's ring
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Reply:
+    """Describes what has become of an order to one agent."""
+
+    agent: int
+    verb: str
+    answer: Answer | None  # None: it was silent
+    phase: Phase | None = None  # by its newest status
+    stopping: bool = True  # false: a stop it has accepted is not seen to have begun
+
+    @property
+    def problem(self) -> str:
+        """Return why the order is not known to be obeyed, or ""."""
+        if self.answer is None:
+            return f"{agent_name(self.agent)} did not answer within {ANSWER_S:.0f} s"
+        if not self.answer.accepted:
+            return f"{agent_name(self.agent)} refuses: {printable(self.answer.reason)}"
+        if not self.stopping:
+            where = "" if self.phase is None else f"; it is in {self.phase.name}"
+            return f"{agent_name(self.agent)} accepts, but is not seen to {self.verb} within {ANSWER_S:.0f} s{where}"
+        return ""
+
+    @property
+    def line(self) -> str:
+        """Return one line for the operator."""
+        where = "" if self.phase is None else f", {self.phase.name}"
+        return self.problem or f"{agent_name(self.agent)} accepts{where}"
+
+
+class OrderDelivery:
+    """Keeps track of who has answered one order, and who is seen to obey it.
+
+    Args:
+        order: what is asked; it gets a number of its own.
+        agents: numbers of the agents asked.
+        everybody: whether these are all there are.
+    """
+
+    def __init__(self, order: Order, agents: Sequence[int], everybody: bool) -> None:
+        self._order = replace(order, number=secrets.randbits(53) | 1)
+        self._is_stop = OPERATOR_VERBS[order.verb].is_stop
+        self._agents, self._everybody = agents, everybody
+        self._answers: dict[int, Answer] = {}
+        self._statuses: dict[int, StatusMessage] = {}
+        self._ahead_us: dict[int, int] = {}  # of each agent's clock over ours
+
+    def receive(self, bus: Bus, utc_us: int) -> None:
+        """Take in the answers and statuses that have arrived."""
+        for sender, payload in bus.receive(STATUS):
+            status = decode_status(payload)
+            if status is not None and status.agent in self._agents and sender == agent_name(status.agent):
+                self._statuses[status.agent] = status
+                self._ahead_us[status.agent] = status.utc_us - utc_us
+        for sender, payload in bus.receive(ANSWER):
+            message = decode_answer(payload)
+            if message is None or message.agent not in self._agents or sender != agent_name(message.agent):
+                continue
+            if (message.number, message.verb) == (self._order.number, self._order.verb):
+                self._answers[message.agent] = message.answer
+
+    @property
+    def open(self) -> list[int]:
+        """Return the agents that the order has to be repeated to."""
+        return [agent for agent in self._agents if not self._is_settled(agent)]
+
+    def messages(self, utc_us: int) -> list[bytes]:
+        """Return one repetition of the order, stamped now, to the agents that have not answered it."""
+        asked = self.open
+        if self._everybody and len(asked) == len(self._agents):
+            return order_messages(self._order, EVERYBODY, utc_us, [utc_us + us for us in self._ahead_us.values()])
+        found: list[bytes] = []
+        for agent in asked:
+            clocks_us = [utc_us + self._ahead_us[agent]] if agent in self._ahead_us else []
+            found += order_messages(self._order, agent, utc_us, clocks_us)
+        return found[:_MOST_MESSAGES]
+
+    def replies(self) -> list[Reply]:
+        """Return what is known of each agent asked."""
+        return [
+            Reply(
+                agent=agent,
+                verb=self._order.verb,
+                answer=self._answers.get(agent),
+                phase=Phase(self._statuses[agent].phase) if agent in self._statuses else None,
+                stopping=self._is_stopping(agent),
+            )
+            for agent in self._agents
+        ]
+
+    def _is_settled(self, agent: int) -> bool:
+        answer = self._answers.get(agent)
+        return answer is not None and (not answer.accepted or self._is_stopping(agent))
+
+    def _is_stopping(self, agent: int) -> bool:
+        """Return whether the order is no stop, or the agent is seen to land or to be on its way there."""
+        status = self._statuses.get(agent)
+        if not self._is_stop:
+            return True
+        return status is not None and status.phase >= Phase.GOTO_LAND and not status.held
+
+
+def addressed(launch: RunningLaunch, order: Order, agents: Sequence[int]) -> list[int]:
+    """Return the agents an order is for: those named, or all but one that it says has ended.
+
+    Raises:
+        StartError: there is no such agent, or none at all.
+    """
+    for agent in agents:
+        if not 0 <= agent < launch.agents:
+            raise StartError(f"agent {agent}: {launch.run} has agents 0 to {launch.agents - 1}")
+    asked = sorted(set(agents)) or [i for i in range(launch.agents) if i != order.arguments.get(PEER)]
+    if not asked:
+        raise StartError(f"{order.verb}: {launch.run} has no other agent that could be told")
+    return asked
+
+
+def deliver(launch: RunningLaunch, order: Order, agents: Sequence[int]) -> list[Reply]:
+    """Give an order to agents of a launch, or to all; returns what each has answered, at the latest after `ANSWER_S`.
+
+    Raises:
+        StartError: there is no such agent, or the bus can't be joined.
+    """
+    asked = addressed(launch, order, agents)
+    delivery = OrderDelivery(order, asked, everybody=len(asked) == launch.agents)
+    with joined(launch) as bus:
+        began_s = repeated_s = time.monotonic()
+        while delivery.open and time.monotonic() - began_s < ANSWER_S:
+            if time.monotonic() >= repeated_s:
+                repeated_s = time.monotonic() + _REPEAT_S
+                for message in delivery.messages(time.time_ns() // 1000):
+                    bus.publish(COMMAND, message)
+            time.sleep(_POLL_S)
+            delivery.receive(bus, time.time_ns() // 1000)
+        _wait_for_phases(delivery, bus)
+    return delivery.replies()
+
+
+def _wait_for_phases(delivery: OrderDelivery, bus: Bus) -> None:
+    """Wait until every agent that has answered has published its phase too, at most two periods of the status."""
+    until_s = time.monotonic() + 0.5
+    while time.monotonic() < until_s and any(r.answer is not None and r.phase is None for r in delivery.replies()):
+        time.sleep(_POLL_S)
+        delivery.receive(bus, time.time_ns() // 1000)

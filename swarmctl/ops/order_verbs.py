@@ -1,0 +1,111 @@
+"""The verbs of the command line that are orders to agents, made from the table of the operator's verbs.
+
+Heavy modules are imported inside the verb that needs them, as in `swarmctl.ops.cli`.
+"""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import Annotated, Any
+
+import typer
+
+from swarmctl.core.operator_verbs import (
+    GOTO,
+    OPERATOR_VERBS,
+    POINT,
+    SPEED,
+    YAW,
+    OperatorVerb,
+    Order,
+    VerbArgument,
+    order_problem,
+)
+from swarmctl.errors import EXIT_OK, ConfigError, MissionError
+
+Run = Annotated[
+    str | None,
+    typer.Option(
+        "--run", "--run-dir", metavar="NAME|DIR", help="Launch to act on, by name or run folder; default: the only one."
+    ),
+]
+AskedAgents = Annotated[list[int] | None, typer.Argument(metavar="AGENT", help="Agents asked; default: all.")]
+MoreAgents = Annotated[list[int] | None, typer.Option("--agent", help="Agent asked, as an option; repeatable.")]
+_ANSWERS = "Exit code 0: every agent asked has accepted; 4: one has refused, or has not answered in time, and is named."
+
+
+def add_order_verbs(to: typer.Typer) -> None:
+    """Add every verb that is an order to agents to a command line."""
+    for name, verb in OPERATOR_VERBS.items():
+        if name != GOTO:  # its point is an argument by itself
+            add_operator_verb(to, name, verb)
+    minus = {"ignore_unknown_options": True}  # a point may begin with one
+    to.command(GOTO, help=f"{OPERATOR_VERBS[GOTO].help} {_ANSWERS}", context_settings=minus)(_goto)
+
+
+def _option(argument: VerbArgument) -> Any:
+    """Return the option of the command line that carries one number of an order."""
+    return typer.Option(argument.option, min=argument.least, max=argument.most, help=argument.help)
+
+
+def _option_of(verb: str, name: str) -> Any:
+    return _option(next(argument for argument in OPERATOR_VERBS[verb].arguments if argument.name == name))
+
+
+def _give(order: Order, run: str | None, agents: list[int]) -> int:
+    from swarmctl.ops import operator
+    from swarmctl.ops.order_delivery import deliver
+
+    launch = operator.find_launch(run)
+    print(f"{order.verb}: {launch.run}")
+    replies = deliver(launch, order, agents)
+    for reply in replies:
+        print(reply.line)
+    if problems := [reply.problem for reply in replies if reply.problem]:
+        raise MissionError(f"{order.verb}: {'; '.join(problems)}")
+    return EXIT_OK
+
+
+def add_operator_verb(
+    to: typer.Typer, name: str, verb: OperatorVerb, give: Callable[[Order, str | None, list[int]], int] = _give
+) -> None:
+    """Add a verb of the operator, with an option for each of its arguments.
+
+    Args:
+        to: command line to extend.
+        name, verb: entry of `OPERATOR_VERBS`.
+        give: gives the order to a launch, to the agents named or to all; returns the exit code.
+    """
+
+    def run(asked: AskedAgents = None, run: Run = None, agent: MoreAgents = None, **arguments: float | None) -> int:
+        given = {name: value for name, value in arguments.items() if value is not None}
+        return give(Order(name, given), run, [*(asked or ()), *(agent or ())])
+
+    parameters = list(inspect.signature(run, eval_str=True).parameters.values())[:3]
+    for argument in verb.arguments:
+        default = inspect.Parameter.empty if argument.required else None
+        option = _option(argument)
+        annotation = Annotated[float, option] if argument.required else Annotated[float | None, option]
+        kind = inspect.Parameter.KEYWORD_ONLY
+        parameters.append(inspect.Parameter(argument.name, kind, annotation=annotation, default=default))
+    run.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
+    run.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]  # typer derives options from it
+    to.command(name, help=f"{verb.help} {_ANSWERS}")(run)
+
+
+def _goto(
+    agent: Annotated[int, typer.Argument(metavar="AGENT", help="Agent asked.")],
+    point: Annotated[str, typer.Argument(metavar="N,E,D", help="Point, shared NED [m]; up is negative.")],
+    yaw: Annotated[float | None, _option_of(GOTO, YAW)] = None,
+    speed: Annotated[float | None, _option_of(GOTO, SPEED)] = None,
+    run: Run = None,
+) -> int:
+    from swarmctl.ops import operator
+
+    problems: list[str] = []
+    arguments = dict(zip(POINT, operator.vector("N,E,D", point, problems), strict=True))
+    arguments |= {name: value for name, value in ((YAW, yaw), (SPEED, speed)) if value is not None}
+    if problem := "".join(problems) or order_problem(GOTO, arguments):
+        raise ConfigError(GOTO, [problem])
+    return _give(Order(GOTO, arguments), run, [agent])

@@ -1,0 +1,97 @@
+"""An operator's verbs fly: a climb that is held stops within a second, whichever autopilot climbs, and goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from sitl.lockstep import Lockstep
+from swarmctl.config import load
+from swarmctl.core.types import Phase
+from tests.closed_loop.conftest import ROOT
+
+ON_GROUND_ALONE = ("swarm.agents=1", "mission.duration_s=1")
+
+
+def fly_until(flight: Lockstep, reached: Callable[[], bool], seconds: float = 60.0) -> None:
+    end_us = flight.clock.now_us() + round(seconds * 1e6)
+    while not reached():
+        assert flight.clock.now_us() < end_us, "not reached in time"
+        flight.step()
+
+
+def fly_for(flight: Lockstep, seconds: float) -> None:
+    end_us = flight.clock.now_us() + round(seconds * 1e6)
+    fly_until(flight, lambda: flight.clock.now_us() >= end_us, seconds + 1.0)
+
+
+def phase(flight: Lockstep, agent: int = 0) -> Phase:
+    rows = flight.logs[agent].rows
+    return Phase(int(rows[-1]["phase"][0])) if rows else Phase.CONNECT
+
+
+def vehicle(flight: Lockstep, agent: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """Return the true position and velocity of a vehicle, (3,) each, NED."""
+    row = flight.world.truth_rows()[agent]
+    return row["pos_ned_m"].copy(), row["vel_ned_m_s"].copy()
+
+
+def outcome(flight: Lockstep, agent: int = 0) -> str:
+    flown = flight.agents[agent]
+    assert flown is not None
+    return flown.outcome
+
+
+@pytest.mark.parametrize("config", [None, "ardupilot_sitl.toml"], ids=["px4", "arducopter"])
+def test_a_hold_on_the_way_up_stops_the_climb_within_a_second_and_resume_flies_the_mission(config: str | None) -> None:
+    flight = Lockstep(load(None if config is None else ROOT / "configs" / config, ON_GROUND_ALONE))
+    ground_z_m = vehicle(flight)[0][2]
+    fly_until(flight, lambda: phase(flight) is Phase.TAKEOFF and vehicle(flight)[0][2] < ground_z_m - 1.0)
+    flight.command("hold")
+    climbing_m_s = -vehicle(flight)[1][2]
+    assert climbing_m_s > 0.5
+    fly_for(flight, 1.0)
+    held_at, vel = vehicle(flight)
+    assert np.linalg.norm(vel) < 0.3
+    fly_for(flight, 4.0)
+    pos, vel = vehicle(flight)
+    assert np.linalg.norm(pos - held_at) < 0.3
+    assert phase(flight) is Phase.TAKEOFF
+    flight.command("resume")
+    fly_until(flight, lambda: phase(flight) > Phase.TRACK)
+    assert outcome(flight) == "completed"
+
+
+def test_the_fence_of_the_configuration_is_that_of_goto() -> None:
+    fence = "geofence.corners_ne_m=[[-20,-20],[20,-20],[20,20],[-20,20]]"
+    for settings, inside in (((), True), ((fence,), False)):
+        (agent,) = Lockstep(load(None, ("swarm.agents=1", *settings))).agents
+        assert agent is not None
+        assert agent._state_machine._contains((0.0, 19.0))
+        assert agent._state_machine._contains((0.0, 21.0)) is inside
+
+
+@pytest.mark.parametrize("mode", ["best_effort", "guaranteed"])
+def test_an_agent_goes_to_a_point_through_the_others_and_resume_continues_the_mission(mode: str) -> None:
+    """Agent 0 crosses the place of agent 1, which hovers on the straight way between."""
+    hover = ("mission.kind=hover", "mission.duration_s=7", "sitl.start=air", f"separation.mode={mode}")
+    starts = "start.positions_ned_m=[[0,0,-5],[2,0,-5]]"
+    flight = Lockstep(load(None, ("swarm.agents=2", starts, *hover)))
+    target = np.array([4.0, 0.0, -5.0])
+    fly_until(flight, lambda: phase(flight, 0) is phase(flight, 1) is Phase.TRACK)
+    flight.command("goto", 0, north_m=4.0, east_m=0.0, down_m=-5.0, speed_m_s=1.5, yaw_deg=90.0)
+    fly_until(flight, lambda: bool(np.linalg.norm(vehicle(flight)[0] - target) < 0.3))
+    fly_for(flight, 2.0)
+    assert np.linalg.norm(vehicle(flight)[0] - target) < 0.3, "it holds there"
+    assert np.linalg.norm(vehicle(flight)[1]) < 0.3
+    w, x, y, z = flight.world.truth_rows()[0]["q_nb"]
+    assert abs(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)) - np.pi / 2) < 0.1
+    fly_until(flight, lambda: phase(flight, 1) is not Phase.TRACK)
+    assert phase(flight) is Phase.TRACK, "what is held does not end with the mission"
+    flight.command("resume", 0)
+    fly_until(flight, lambda: phase(flight) > Phase.TRACK)
+    assert outcome(flight) == "completed"
+    pos = flight.truth.reshape(-1, 2)["pos_ned_m"]
+    assert np.linalg.norm(pos[:, 0] - pos[:, 1], axis=1).min() >= 0.85
