@@ -46,7 +46,11 @@ def test_one_flight_is_reproduced(tmp_path: Path) -> None:
     assert "Figure 45: " in page
     assert "Figure 11: " not in page
     assert str(out / "report.html") in done.stdout
+    assert "5 published figures: 2 beaten (1 with the thesis' values, the others tuned" in done.stdout
     assert "0 limits missed" in done.stdout
+    assert [row["differs"] != [] for row in rows] == [False] * 4 + [True]  # the last is tuned
+    for shown in (done.stdout, page):
+        assert "ours is less than the published figure" in " ".join(shown.split())
 
 
 def test_an_unknown_flight_is_2_with_those_that_are_known(tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ from sitl.studies.thesis.figures import (
     separation_chart,
 )
 from sitl.studies.thesis.trace import Row, Trace
+from sitl.studies.thesis.verdicts import MEANING, counted, counts_text, preset_differences, verdict_of
 from swarmctl.files import replace_text
 from swarmctl.telemetry.report.pages import render
 
@@ -75,7 +76,11 @@ def write_page(
         index_chart=index_chart(extra.index) if extra.index else None,
         flight_of=flight_of,
         ratio=ratio,
-        ratios=[value for value in map(ratio, rows) if value is not None],
+        counts=counted(rows),
+        counts_text=counts_text(counted(rows)),
+        meaning=MEANING,
+        verdict_of=verdict_of,
+        presets=preset_differences(rows),
         number=_number,
     )
     replace_text(path, page)
@@ -118,7 +123,19 @@ def _json_row(row: Row) -> dict[str, Any]:
     least = known.pop("least")
     note = "; ".join([*([row.note] if row.note else []), *broken])
     texts = {"path": row.path, "unit": row.unit, "note": note}
-    return {"name": row.name, **known, **texts, "ratio": ratio(row), "least": least, "met": row.met}
+    return {
+        "name": row.name,
+        **known,
+        **texts,
+        "ratio": ratio(row),
+        "least": least,
+        "least_source": row.bound_source,
+        "met": row.met,
+        "out_of_reach": row.out_of_reach,
+        "beside": row.beside,
+        "preset": row.preset,
+        "differs": list(row.differs),
+    }
 
 
 def _number(value: float | None) -> str:

@@ -20,14 +20,14 @@ from rich.table import Table
 from sitl.studies.bench.timing import timing_rows
 from sitl.studies.thesis import experiments as thesis
 from sitl.studies.thesis import score
-from sitl.studies.thesis.experiments import FULL_JOBS, PLANT_JOBS, Job
+from sitl.studies.thesis.experiments import FULL_JOBS, PLANT_JOBS, TUNED, Job
 from sitl.studies.thesis.figures import FLIGHTS, Extra, IndexPoint
 from sitl.studies.thesis.mavlink_flight import fly_over_mavlink
 from sitl.studies.thesis.model_flight import fly_on_plant
 from sitl.studies.thesis.page import write_json, write_page
-from sitl.studies.thesis.trace import Row, Trace
-from swarmctl.built_in_configs import built_in_config
-from swarmctl.config import load
+from sitl.studies.thesis.table import rows as rows_of
+from sitl.studies.thesis.trace import Beside, Row, Trace
+from sitl.studies.thesis.verdicts import MEANING, counted, counts_text, verdict_of
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, ConfigError, StartError
 from swarmctl.process_lifetime import serve_parent
 from swarmctl.telemetry.recording.run_folder import create_run_folder
@@ -37,7 +37,7 @@ TIMING = "timing"  # name of the timing rows for `--only`
 
 def fly(job: Job) -> Trace:
     """Fly one job."""
-    config = load(built_in_config(job.config), job.overrides)
+    config = job.loaded()
     if job.path == "plant":
         return fly_on_plant(job.name, config, matched_velocity=job.matched_velocity)
     return fly_over_mavlink(job.name, config)
@@ -96,7 +96,7 @@ def by_flight(jobs: Sequence[Job], flown: dict[str, Trace]) -> dict[str, list[Tr
 
 def index_points(flown: dict[str, Trace]) -> Iterator[IndexPoint]:
     """Yield the points of the index over the constraint radius (Table 19)."""
-    for kind in ("dmpc", "dmpc3"):
+    for kind in (f"dmpc {thesis.THESIS}", f"dmpc {TUNED}", f"dmpc3 {TUNED}"):
         for factor in thesis.RADII:
             trace = flown.get(thesis.radius_name(kind, factor))
             if trace is not None:
@@ -109,19 +109,33 @@ def index_points(flown: dict[str, Trace]) -> Iterator[IndexPoint]:
                 )
 
 
+_BESIDE: dict[Beside | None, str] = {
+    None: "",
+    "beaten": "[green]beaten",
+    "equal": "equal",
+    "worse": "[red]worse",
+    "too close": "[red]too close",
+}
+
+
 def show(rows: Sequence[Row], console: Console) -> None:
-    """Print the rows as a table."""
-    table = Table(show_edge=False)
+    """Print the rows as a table; its head says what the words mean."""
+    head = "\n".join(f"[bold]{word}[/]: {meaning}." for word, meaning in MEANING.items())
+    table = Table(title=head, title_justify="left", title_style="none", show_edge=False)
     table.add_column("row")
-    for name in ("published", "ours", "limit", "lower bound"):
+    for name in ("published", "ours"):
+        table.add_column(name, justify="right")
+    table.add_column("")
+    for name in ("limit", "lower bound"):
         table.add_column(name, justify="right")
     table.add_column("")
     for row in rows:
-        cells = [
+        published, ours, limit, bound = (
             "" if value is None else f"{value:.4g}" for value in (row.published, row.ours, row.limit, row.lower_bound)
-        ]
-        verdict = {None: "", True: "[green]met", False: "[red]missed"}[row.met]
-        table.add_row(row.name, *cells, verdict)
+        )
+        color = "[green]" if row.met else "[red]"
+        verdict = f"{color}{verdict_of(row)}" if row.limit is not None else ""
+        table.add_row(row.name, published, ours, _BESIDE[row.beside], limit, bound, verdict)
     console.print(table)
 
 
@@ -131,7 +145,7 @@ def reproduce(only: Sequence[str], plant: bool, full: bool, directory: Path, *, 
     jobs = chosen(only, plant, full)
     with Progress(console=console, transient=True, disable=not sys.stdout.isatty()) as bar:
         flown, failed = fly_all(jobs, processes, bar)
-        rows = thesis.rows(flown)
+        rows = rows_of(flown)
         if not only or TIMING in only:
             rows += timing_rows(bar)
     notes = [f"{name} did not complete: {why}" for name, why in failed.items()]
@@ -142,8 +156,7 @@ def reproduce(only: Sequence[str], plant: bool, full: bool, directory: Path, *, 
     show(rows, console)
     for note in notes:
         print(note, file=sys.stderr)
-    missed = sum(row.met is False for row in rows)
-    print(f"{len(rows)} rows, {missed} limits missed, {time.perf_counter() - began_s:.0f} s; {page}")
+    print(f"{counts_text(counted(rows))}; {time.perf_counter() - began_s:.0f} s; {page}")
     return EXIT_MISSION if failed else EXIT_OK
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from itertools import combinations
 
 import numpy as np
 
@@ -31,6 +32,12 @@ def steady_rmse_m(trace: Trace) -> float:
 def index_m(trace: Trace, after_s: float = 0.0) -> float:
     """Return the sum over agents of the mean distance to the shared reference (Table 19)."""
     return float(_distance_m(trace)[trace.t_s >= after_s].mean(axis=0).sum())
+
+
+def among_agents_m(trace: Trace) -> float:
+    """Return the sum of the mean distances of all pairs of agents: the other reading of "among the agents" (4.4)."""
+    pos, pairs = trace.pos_ned_m, combinations(range(trace.pos_ned_m.shape[1]), 2)
+    return float(sum(np.linalg.norm(pos[:, i] - pos[:, j], axis=1).mean() for i, j in pairs))
 
 
 def separation_m(trace: Trace) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,6 +13,9 @@ from swarmctl.core.obstacle import Obstacle
 
 Array = NDArray[np.float64]
 Path = Literal["plant", "full"]  # plant: model only; full: full MAVLink loop
+Beside = Literal["beaten", "equal", "worse", "too close"]  # see `verdicts.MEANING`
+
+SHORT_M = 0.01  # tolerated shortfall of a true distance from the constraint radius
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -49,8 +53,31 @@ class Row:
     unit: str
     note: str = ""
     lower_bound: float | None = None  # the theoretical lower bound, where it is known
+    bound_source: str = ""  # formula or command that gives the lower bound
+    decimals: int | None = None  # with which the published figure is printed; None: compared as it is
+    short_m: float = 0.0  # by how much the flight falls short of the distances that the published one keeps
+    matched_start: bool = False  # the flight begins with the reference's velocity instead of at rest
+    preset: str = ""  # what the flown values of the controller are called
+    differs: tuple[str, ...] = ()  # in what they differ from the thesis' values; none: they are the thesis'
 
     @property
     def met(self) -> bool | None:
         """Whether the limit is kept; None without a limit."""
         return None if self.limit is None else self.ours <= self.limit
+
+    @property
+    def out_of_reach(self) -> bool:
+        """Whether no controller can keep the limit: the lower bound is above it. Such a limit still is missed."""
+        return self.limit is not None and self.lower_bound is not None and self.lower_bound > self.limit
+
+    @property
+    def beside(self) -> Beside | None:
+        """How the row stands beside the published figure; None without one. A figure that is no number is worse."""
+        if self.published is None:
+            return None
+        ours = self.ours if self.decimals is None or not math.isfinite(self.ours) else round(self.ours, self.decimals)
+        if math.isclose(ours, self.published, rel_tol=1e-9, abs_tol=1e-12):
+            return "equal"
+        if not ours < self.published:
+            return "worse"
+        return "beaten" if self.short_m <= SHORT_M else "too close"

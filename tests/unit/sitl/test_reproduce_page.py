@@ -80,9 +80,26 @@ def all_traces() -> dict[str, Sequence[Trace]]:
 
 
 ROWS = [
-    Row(name="slow PID, MSE x", published=0.0020, ours=0.0022, limit=0.0025, path="plant", unit="m2"),
     Row(
-        name="fast MPC, MSE y", published=0.0, ours=6e-6, limit=None, path="plant", unit="m2", note="printed as 0.0000"
+        name="slow PID, MSE x",
+        published=0.0020,
+        ours=0.0022,
+        limit=0.0025,
+        path="plant",
+        unit="m2",
+        decimals=4,
+        preset="slow",
+        differs=("controller.pid.x 1 (thesis 2)",),
+    ),
+    Row(
+        name="fast MPC, MSE y",
+        published=0.0,
+        ours=6e-6,
+        limit=None,
+        path="plant",
+        unit="m2",
+        note="printed as 0.0000",
+        decimals=4,
     ),
     Row(
         name="circle, index at 0.90 m",
@@ -93,6 +110,8 @@ ROWS = [
         unit="m",
         note="R < 1 & so on",
         lower_bound=1.559,
+        bound_source="sqrt(3) r",
+        decimals=2,
     ),
     Row(name="wall time", published=None, ours=float("nan"), limit=600.0, path="plant", unit="s"),
 ]
@@ -191,7 +210,7 @@ def test_page_needs_nothing_from_outside(page: str) -> None:
 
 
 def test_page_judges_and_escapes(page: str) -> None:
-    assert "1 of 3" in page  # limits met: the slow PID; the index and the time without a number are missed
+    assert "1 of 3</b><span>limits met" in page  # the slow PID; the index and the time without a number are missed
     assert page.count('<span class="bad">missed</span>') == 2
     assert "R &lt; 1 &amp; so on" in page
     assert "a &lt; b" in page
@@ -351,7 +370,12 @@ def test_json_has_finite_numbers_only(tmp_path: Path) -> None:
         raise AssertionError(word)
 
     rows = json.loads(path.read_text(encoding="utf-8"), parse_constant=refuse)["rows"]
-    assert list(rows[0]) == ["name", "published", "ours", "limit", "path", "unit", "note", "ratio", "least", "met"]
+    contract = ["name", "published", "ours", "limit", "path", "unit", "note", "ratio", "least"]
+    assert list(rows[0])[: len(contract)] == contract
+    assert [row["beside"] for row in rows] == ["worse", "equal", "worse", None]
+    assert [row["out_of_reach"] for row in rows] == [False, False, False, False]
+    assert [row["preset"] for row in rows] == ["slow", "", "", ""]
+    assert rows[0]["differs"] == ["controller.pid.x 1 (thesis 2)"]
     assert rows[0]["ratio"] == pytest.approx(1.1)
     assert [row["met"] for row in rows] == [True, None, False, False]
     assert rows[1]["ratio"] is None
