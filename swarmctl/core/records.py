@@ -1,7 +1,7 @@
 """The byte layout of per-tick records, on the bus and in run files.
 
-`TICK_DTYPE` holds the columns of one tick of an agent, `TRUTH_DTYPE` one true state of a simulated vehicle. Both are
-little-endian and of fixed size, so a file of them is an array.
+`TICK_DTYPE` holds the columns of one tick of an agent, `TRUTH_DTYPE` those of one true state of a simulated vehicle,
+`TRUTH_COLUMNS`. Both are little-endian and of fixed size, so a file of them is an array.
 """
 
 from __future__ import annotations
@@ -11,23 +11,24 @@ import struct
 import numpy as np
 from numpy.typing import NDArray
 
+from swarmctl.core.stored_column import StoredColumn, dtype_of
 from swarmctl.core.tick_record import COLUMNS, TickRecord
-from swarmctl.core.types import Array
+from swarmctl.core.types import Array, FlightMode, Landed
 
-TICK_DTYPE = np.dtype([(column.name, column.dtype, (column.size,) if column.size else ()) for column in COLUMNS])
+TICK_DTYPE = dtype_of(COLUMNS)
 
-TRUTH_DTYPE = np.dtype(
-    [
-        ("t_us", "<i8"),  # monotonic clock of the simulator's host
-        ("vehicle", "<u2"),  # 0-based
-        ("pos_ned_m", "<f8", (3,)),  # shared frame, true
-        ("vel_ned_m_s", "<f8", (3,)),
-        ("q_nb", "<f4", (4,)),
-        ("armed", "u1"),
-        ("landed", "u1"),  # core.types.Landed
-        ("flight_mode", "u1"),  # core.types.FlightMode
-    ]
+_F4, _F8, _U1, _U2, _I8 = "<f4", "<f8", "u1", "<u2", "<i8"
+TRUTH_COLUMNS = (
+    StoredColumn(name="t_us", dtype=_I8, unit="us", text="monotonic clock of the simulator's host"),
+    StoredColumn(name="vehicle", dtype=_U2, text="number of the vehicle, from 0"),
+    StoredColumn(name="pos_ned_m", dtype=_F8, size=3, unit="m", text="true position, shared frame"),
+    StoredColumn(name="vel_ned_m_s", dtype=_F8, size=3, unit="m/s", text="true velocity"),
+    StoredColumn(name="q_nb", dtype=_F4, size=4, text="true attitude"),
+    StoredColumn(name="armed", dtype=_U1, text="1: armed"),
+    StoredColumn(name="landed", dtype=_U1, text="whether it is on the ground", names=Landed),
+    StoredColumn(name="flight_mode", dtype=_U1, text="the autopilot's mode", names=FlightMode),
 )
+TRUTH_DTYPE = dtype_of(TRUTH_COLUMNS)
 
 _PLAN_HEADER = struct.Struct("<H")
 _NO_PLAN = np.empty((0, 3))

@@ -21,8 +21,8 @@ import pytest
 
 from sitl.studies.bench.bench import PARTS
 from swarmctl.control.mpc.solvers.qp import SOLVERS
-from swarmctl.core.records import TRUTH_DTYPE
 from swarmctl.core.types import Landed
+from swarmctl.telemetry.recording.run_files import load_run
 from tests.benches.at_once import at_once
 
 pytestmark = pytest.mark.process
@@ -67,8 +67,7 @@ def low(line: str) -> str:
 
 def landed(directory: Path) -> dict[int, bool]:
     """Whether each vehicle of a run folder ended on the ground, in truth."""
-    data = (directory / "truth.bin").read_bytes()
-    truth = np.frombuffer(data, TRUTH_DTYPE, len(data) // TRUTH_DTYPE.itemsize)
+    truth = load_run(directory).truth
     return {
         int(v): bool(truth["landed"][truth["vehicle"] == v][-1] == Landed.ON_GROUND)
         for v in np.unique(truth["vehicle"])

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from swarmctl.core.records import TICK_DTYPE
+from swarmctl.core.records import TICK_DTYPE, TRUTH_COLUMNS, TRUTH_DTYPE
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import replace_text, write_each
 from swarmctl.telemetry.evaluation.referee import Rules, RunData, evaluate
@@ -19,6 +19,7 @@ from swarmctl.telemetry.recording.run_files import (
     AGENT_FILE,
     CONFIG,
     EVENTS,
+    PACKED_TRUTH,
     RECORDING,
     SUMMARY,
     TRUTH,
@@ -66,7 +67,7 @@ def _claim(base: Path) -> Path:
     taken = sorted(
         path.name
         for path in base.iterdir()
-        if path.name in (EVENTS, SUMMARY, TRUTH, RECORDING) or AGENT_FILE.match(path.name)
+        if path.name in (EVENTS, SUMMARY, TRUTH, PACKED_TRUTH, RECORDING) or AGENT_FILE.match(path.name)
     )
     links = sorted(path.name for path in base.iterdir() if path.is_symlink())
     if links:
@@ -114,6 +115,7 @@ def finish_run(directory: Path, rules: Rules, outcome: Outcome, recorded: RunDat
         EVENTS: partial(_write_events, directory, run.events),
         SUMMARY: partial(replace_text, directory / SUMMARY, to_json(summary, indent=2) + "\n"),
         **{path.name: partial(_pack_ticks, path) for path in sorted(directory.glob("agent-*.ticks"))},
+        **{path.name: partial(_pack_truth, path) for path in directory.glob(TRUTH)},
         REPORT: lambda: write_report(directory, run, summary, read_text(directory / CONFIG), rules=rules),
     }
     return Finished(summary, write_each(writers))
@@ -158,4 +160,10 @@ def _write_events(directory: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 def _pack_ticks(path: Path) -> None:
     """Replace a file of raw rows by Parquet."""
     write_parquet(path.with_suffix(".parquet"), read_rows(path, TICK_DTYPE))
+    path.unlink()
+
+
+def _pack_truth(path: Path) -> None:
+    """Replace the simulator's raw rows by Parquet."""
+    write_parquet(path.with_name(PACKED_TRUTH), read_rows(path, TRUTH_DTYPE), TRUTH_COLUMNS)
     path.unlink()
