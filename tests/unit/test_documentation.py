@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 
+import swarmctl
 from sitl.studies.campaign.trials import SCHEMA
 from swarmctl.config import SitlParams
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
@@ -68,8 +69,17 @@ def is_ours(name: str) -> bool:
 def exists(name: str) -> bool:
     """Return whether a path, pattern or dotted module of the tree exists; a name without a folder may be anywhere."""
     if re.match(r"(swarmctl|sitl)(\.\w+)+$", name) and not name.endswith(".py"):
-        return is_module(name) or name.removeprefix("sitl.").partition(".")[0] in SitlParams.model_fields
+        return (
+            is_module(name)
+            or is_for_scripts(name)
+            or name.removeprefix("sitl.").partition(".")[0] in SitlParams.model_fields
+        )
     return any(ROOT.glob(name.rstrip("/"))) or ("/" not in name and any(ROOT.glob(f"*/**/{name}")))
+
+
+def is_for_scripts(name: str) -> bool:
+    """Return whether this is a name that the package itself offers, as `swarmctl.load`."""
+    return name.removeprefix("swarmctl.") in dir(swarmctl)
 
 
 def is_module(name: str) -> bool:

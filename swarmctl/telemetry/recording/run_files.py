@@ -28,6 +28,7 @@ from swarmctl.files import read_file, replaced
 from swarmctl.telemetry.evaluation.referee import RunData
 from swarmctl.telemetry.evaluation.tracks import MAX_RUN_US
 from swarmctl.telemetry.recording.summary_file import decode_summary
+from swarmctl.telemetry.recording.tables import VERSION_KEY, plain_table
 
 EVENTS = "events.jsonl"
 SUMMARY = "summary.json"
@@ -35,7 +36,6 @@ TRUTH = "truth.bin"  # while the simulator flies
 PACKED_TRUTH = "truth.parquet"  # of a finished run
 CONFIG = "config.toml"
 RECORDING = "telemetry.rrd"
-VERSION_KEY = "swarmctl_version"  # of the metadata of Parquet
 AGENT_FILE = re.compile(r"^agent-(\d{1,3})\.(ticks|parquet)$")
 
 _MAX_ROWS_BYTES = 2**31  # a day of one agent, about the memory of a laptop
@@ -102,6 +102,17 @@ def read_summary(directory: Path) -> dict[str, Any] | None:
         raise _damaged(path, f"is no summary: {error}. Remove it, and the run is judged again") from error
 
 
+def refuse_other_swarm(directory: Path, summary: Mapping[str, Any], agents: int) -> None:
+    """Check that a summary is of as many agents as the configuration beside it.
+
+    Raises:
+        ConfigError: it is not.
+    """
+    if summary["agents"] != agents:
+        problem = f"of {summary['agents']} agents, but {CONFIG} is of {agents}. Remove it to have the run judged"
+        raise _damaged(directory / SUMMARY, problem)
+
+
 def read_events(directory: Path) -> list[dict[str, Any]]:
     """Return the events of all sources in a run folder, sorted by UTC, without duplicates and invalid lines."""
     lines: dict[bytes, None] = {}
@@ -161,29 +172,12 @@ def _damaged(path: Path, problem: str) -> ConfigError:
     return ConfigError(str(path), [problem])
 
 
-def table_schema(columns: Sequence[StoredColumn]) -> Any:
-    """Return the Arrow schema of rows: a field for each component, with unit, meaning and names as metadata."""
-    import pyarrow as pa  # imported here to keep it out of agent processes
-
-    fields = [
-        pa.field(part, pa.from_numpy_dtype(np.dtype(column.dtype)), metadata=column.metadata)
-        for column in columns
-        for part in column.parts
-    ]
-    return pa.schema(fields, metadata={VERSION_KEY: __version__})
-
-
 def write_parquet(path: Path, rows: NDArray[np.void], columns: Sequence[StoredColumn] = COLUMNS) -> None:
     """Write rows that `columns` describe as Parquet, one column for each component."""
-    import pyarrow as pa
-    import pyarrow.parquet as pq
+    import pyarrow.parquet as pq  # imported here to keep it out of agent processes
 
-    arrays = []
-    for column in columns:
-        values = rows[column.name].reshape(len(rows), len(column.parts))  # (T, components)
-        arrays += [pa.array(np.ascontiguousarray(values[:, k])) for k in range(len(column.parts))]
     with replaced(path) as file:
-        pq.write_table(pa.Table.from_arrays(arrays, schema=table_schema(columns)), file, compression="zstd")
+        pq.write_table(plain_table(rows, columns), file, compression="zstd")
 
 
 def read_parquet(path: Path, columns: Sequence[StoredColumn] = COLUMNS) -> NDArray[np.void]:

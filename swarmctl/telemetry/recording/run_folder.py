@@ -27,6 +27,7 @@ from swarmctl.telemetry.recording.run_files import (
     read_rows,
     read_summary,
     read_text,
+    refuse_other_swarm,
     utc_us_of,
     write_parquet,
 )
@@ -136,9 +137,7 @@ def report_run(directory: Path, rules: Rules) -> Path:
         if finished.unwritten:
             raise StartError(f"{directory}: can't be written: {'; '.join(finished.unwritten)}")
         return directory / REPORT
-    if summary["agents"] != rules.agents:
-        problem = f"of {summary['agents']} agents, but {CONFIG} is of {rules.agents}. Remove it to have the run judged"
-        raise ConfigError(str(directory / SUMMARY), [problem])
+    refuse_other_swarm(directory, summary, rules.agents)
     try:
         return write_report(directory, load_run(directory), summary, read_text(directory / CONFIG), rules=rules)
     except OSError as error:
