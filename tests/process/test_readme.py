@@ -20,6 +20,7 @@ import numpy as np
 import pytest
 
 from sitl.studies.bench.bench import PARTS
+from swarmctl.config import load
 from swarmctl.control.mpc.solvers.qp import SOLVERS
 from swarmctl.core.types import Landed
 from swarmctl.telemetry.recording.run_files import load_run
@@ -82,6 +83,7 @@ def test_nothing_is_shown_that_is_not_run() -> None:
         + shown(r"^python3 -m venv ")
         + shown(r"^swarmctl (reproduce|bench|check) ")
         + shown(CAMPAIGN)
+        + shown(r"^swarmctl config ")
     )
     assert sorted(run_here) == sorted(SHOWN)
     assert len(set(SHOWN)) == len(SHOWN), "shown once, so that it is run once"
@@ -104,6 +106,14 @@ def test_simulations(line: str, tmp_path: Path) -> None:
     done = run(line, "--duration", "2", low(line), "--run-dir", str(tmp_path / "run"))
     assert done.returncode == 0, done.stdout + done.stderr
     assert "x real time" in done.stdout
+
+
+def test_looking_up_and_beginning_a_configuration(tmp_path: Path) -> None:
+    show, init = shown(r"^swarmctl config ")
+    assert "sitl.wind.mean_ned_m_s = [0.0, 0.0, 0.0]  # velocity of the air" in run(show).stdout
+    path = tmp_path / "mine.toml"
+    assert run(init, "--output", str(path)).returncode == 0
+    assert load(path) == load(ROOT / "configs" / "x500_circle.toml")
 
 
 @pytest.mark.parametrize("line", shown(r"^swarmctl reproduce "))
