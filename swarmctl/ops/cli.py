@@ -19,6 +19,7 @@ from swarmctl import __version__
 from swarmctl.core.operator_verbs import OPERATOR_VERBS, OperatorVerb, Order
 from swarmctl.core.text import printable_lines
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, ConfigError, MissionError, SwarmError
+from swarmctl.ops.config_verbs import config_app
 
 if TYPE_CHECKING:
     from swarmctl.bus.json_messages import ObstaclesMessage, StatusMessage
@@ -34,7 +35,6 @@ obstacle_app = typer.Typer(
     no_args_is_help=True, rich_markup_mode=None, help="Change the obstacles of a running launch."
 )
 app.add_typer(obstacle_app, name="obstacle")
-config_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, help="Look up and begin configurations.")
 app.add_typer(config_app, name="config")
 
 ConfigPath = Annotated[Path | None, typer.Argument(help="TOML file; default: the circle of the thesis.")]
@@ -329,47 +329,6 @@ def obstacle_remove(
     return EXIT_OK
 
 
-@config_app.command("show")
-def config_show(
-    key: Annotated[str, typer.Argument(help="Key, section, or part of a key; default: all.")] = "",
-    config: Annotated[Path | None, typer.Option("--config", metavar="FILE", help="TOML file; default: none.")] = None,
-    sets: Set = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
-) -> int:
-    """Show keys with value, meaning, unit, range and default."""
-    from swarmctl.config import load
-    from swarmctl.ops import config_help
-
-    keys = config_help.shown_keys(load(config, sets or ()), key)
-    print(config_help.as_json(keys) if as_json else "\n".join(config_help.lines_of(keys)))
-    return EXIT_OK
-
-
-@config_app.command("schema")
-def config_schema() -> int:
-    """Print the JSON schema of configuration files, with which an editor completes and checks them."""
-    from swarmctl.ops import config_help
-
-    print(config_help.schema())
-    return EXIT_OK
-
-
-@config_app.command("init")
-def config_init(
-    name: Annotated[str, typer.Argument(help="Built-in configuration; defaults: every key; unknown: lists all.")],
-    output: Annotated[
-        Path | None, typer.Option("--output", metavar="FILE", help="File to create; default: NAME.toml here.")
-    ] = None,
-) -> int:
-    """Write a commented configuration to begin with."""
-    from swarmctl.ops import config_help
-
-    path = output or Path(f"{name}.toml")
-    config_help.write_new(path, config_help.initial_text(name))
-    print(path)
-    return EXIT_OK
-
-
 @app.command()
 def view(run_dir: RunningDir = None) -> int:
     """Open the live view of a running launch."""
@@ -424,6 +383,12 @@ def reproduce(context: typer.Context) -> NoReturn:
 def bench(context: typer.Context) -> NoReturn:
     """Measure the tick of one agent, part by part. Covers 0 to 30 neighbours and each installed solver."""
     _become("sitl.studies.bench.command", context.args)
+
+
+@app.command(context_settings=_PASS_ON)
+def sweep(context: typer.Context) -> NoReturn:
+    """Fly every combination of values in lockstep, on all processors. Writes a table and charts; can be resumed."""
+    _become("sitl.studies.sweep.command", context.args)
 
 
 def _become(module: str, arguments: list[str]) -> NoReturn:

@@ -11,6 +11,7 @@ import pytest
 
 import swarmctl
 from sitl.studies.campaign.trials import SCHEMA
+from sitl.studies.sweep.figures import schema_of
 from swarmctl.config import SitlParams
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
 
@@ -33,7 +34,7 @@ def test_the_table_of_columns_is_what_the_script_writes() -> None:
 
 
 def test_every_recorded_column_is_described() -> None:
-    recorded = {*(TICK_DTYPE.names or ()), *(TRUTH_DTYPE.names or ()), *SCHEMA.names}
+    recorded = {*(TICK_DTYPE.names or ()), *(TRUTH_DTYPE.names or ()), *SCHEMA.names, *schema_of([]).names}
     assert recorded - described() == set()
 
 

@@ -112,8 +112,15 @@ def sparse_as(name: str) -> Callable[[Path], None]:
     return make
 
 
-_NAMES = ("config.toml", "summary.json", "events.jsonl", "agent-0.parquet", "agent-7.ticks", "truth.bin")
-_NAMES += ("truth.parquet",)
+_NAMES = (
+    "config.toml",
+    "summary.json",
+    "events.jsonl",
+    "agent-0.parquet",
+    "agent-7.ticks",
+    "truth.bin",
+    "truth.parquet",
+)
 REFUSED: dict[str, tuple[Callable[[Path], Any], str]] = {
     "summary torn": (lambda d: (d / "summary.json").write_text('{"outcome": "comp'), "summary.json"),
     "summary empty": (lambda d: (d / "summary.json").write_text(""), "summary.json"),
