@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl.config import Config, load
-from swarmctl.core.records import TRUTH_COLUMNS
+from swarmctl.core.records import PLAN_COLUMNS, TRUTH_COLUMNS
 from swarmctl.core.tick_record import COLUMNS
 from swarmctl.errors import ConfigError
 from swarmctl.telemetry.evaluation.referee import RunData
 from swarmctl.telemetry.recording.run_files import (
     CONFIG,
     SUMMARY,
+    read_plans,
     read_summary,
     read_text,
     refuse_no_folder,
@@ -81,6 +82,18 @@ class Run:
         if agent not in self._data.ticks:
             raise KeyError(f"agent {agent} has recorded no ticks; those that have: {list(self.agents)}")
         return self._data.ticks[agent]
+
+    def plans(self, agent: int) -> pa.Table:
+        """Return the predicted paths of an agent, ten a second, one row for each point; no rows if none was recorded.
+
+        Raises:
+            ConfigError: their file has not the expected content.
+        """
+        return named_table(self.plan_rows(agent), PLAN_COLUMNS)
+
+    def plan_rows(self, agent: int) -> NDArray[np.void]:
+        """Return the same as a structured array (K,); rows of one `t_us` are one path."""
+        return read_plans(self.folder, agent)
 
     def true_states(self, vehicle: int | None = None) -> pa.Table:
         """Return the simulator's true states of one vehicle or of all, 50 a second; no rows without a simulator."""

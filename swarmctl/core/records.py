@@ -1,7 +1,8 @@
 """The byte layout of per-tick records, on the bus and in run files.
 
-`TICK_DTYPE` holds the columns of one tick of an agent, `TRUTH_DTYPE` those of one true state of a simulated vehicle,
-`TRUTH_COLUMNS`. Both are little-endian and of fixed size, so a file of them is an array.
+`TICK_DTYPE` holds the columns of one tick of an agent, `PLAN_DTYPE` those of one point of a predicted path,
+`TRUTH_DTYPE` those of one true state of a simulated vehicle. All are little-endian and of fixed size, so a file of them
+is an array.
 """
 
 from __future__ import annotations
@@ -30,6 +31,14 @@ TRUTH_COLUMNS = (
 )
 TRUTH_DTYPE = dtype_of(TRUTH_COLUMNS)
 
+PLAN_COLUMNS = (
+    StoredColumn(name="t_us", dtype=_I8, unit="us", text="monotonic time of the tick that flew the plan"),
+    StoredColumn(name="at_us", dtype=_I8, unit="us", text="monotonic time of this point of it"),
+    StoredColumn(name="pos_ned_m", dtype=_F4, size=3, unit="m", text="predicted position at that time"),
+)
+PLAN_DTYPE = dtype_of(PLAN_COLUMNS)
+_PLAN_EVERY = 5  # ticks: ten plans a second
+
 _PLAN_HEADER = struct.Struct("<H")
 _NO_PLAN = np.empty((0, 3))
 
@@ -39,6 +48,18 @@ def tick_row(record: TickRecord) -> NDArray[np.void]:
     row = np.zeros(1, TICK_DTYPE)
     row[0] = tuple(column.recorded(record) for column in COLUMNS)
     return row
+
+
+def plan_rows(record: TickRecord) -> NDArray[np.void]:
+    """Return the points of the flown plan as rows (M,) of `PLAN_DTYPE`; none in most ticks, and without a plan."""
+    plan = record.flown
+    if plan is None or record.seq % _PLAN_EVERY:
+        return np.zeros(0, PLAN_DTYPE)
+    rows = np.zeros(len(plan.pos_ned_m), PLAN_DTYPE)
+    rows["t_us"] = record.t_us
+    rows["at_us"] = plan.t0_us + plan.dt_us * np.arange(len(rows))
+    rows["pos_ned_m"] = plan.pos_ned_m
+    return rows
 
 
 def pack_tick(record: TickRecord) -> bytes:

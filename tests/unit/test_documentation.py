@@ -13,7 +13,7 @@ import swarmctl
 from sitl.studies.campaign.trials import SCHEMA
 from sitl.studies.sweep.figures import schema_of
 from swarmctl.config import SitlParams
-from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
+from swarmctl.core.records import PLAN_DTYPE, TICK_DTYPE, TRUTH_DTYPE
 
 ROOT = Path(__file__).parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -34,7 +34,13 @@ def test_the_table_of_columns_is_what_the_script_writes() -> None:
 
 
 def test_every_recorded_column_is_described() -> None:
-    recorded = {*(TICK_DTYPE.names or ()), *(TRUTH_DTYPE.names or ()), *SCHEMA.names, *schema_of([]).names}
+    recorded = {
+        *(TICK_DTYPE.names or ()),
+        *(TRUTH_DTYPE.names or ()),
+        *(PLAN_DTYPE.names or ()),
+        *SCHEMA.names,
+        *schema_of([]).names,
+    }
     assert recorded - described() == set()
 
 

@@ -1,9 +1,9 @@
 """Reads and writes the files of a run folder. A folder may come from another person, so its content is validated.
 
-Formats: `agent-<i>.ticks` and `truth.bin` are raw rows of `core.records`, as they are written in flight;
-`agent-<i>.parquet` and `truth.parquet` are the same tables with vectors expanded to one column per component. A partial
-last row, left by a killed process, is ignored. Anything but a regular file of bounded size and expected content is
-refused with a reason.
+Formats: `agent-<i>.ticks`, `agent-<i>.plans` and `truth.bin` are raw rows of `core.records`, as they are written in
+flight; `agent-<i>.parquet`, `agent-<i>.plans.parquet` and `truth.parquet` are the same tables with vectors expanded to
+one column per component. A partial last row, left by a killed process, is ignored. Anything but a regular file of
+bounded size and expected content is refused with a reason.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl import __version__
-from swarmctl.core.records import TICK_DTYPE, TRUTH_COLUMNS, TRUTH_DTYPE
+from swarmctl.core.records import PLAN_COLUMNS, PLAN_DTYPE, TICK_DTYPE, TRUTH_COLUMNS, TRUTH_DTYPE
 from swarmctl.core.stored_column import StoredColumn, dtype_of
 from swarmctl.core.tick_record import COLUMNS
 from swarmctl.errors import ConfigError
@@ -33,6 +33,7 @@ from swarmctl.telemetry.recording.tables import VERSION_KEY, plain_table
 EVENTS = "events.jsonl"
 SUMMARY = "summary.json"
 TRUTH = "truth.bin"  # while the simulator flies
+PACKED_PLANS = ".plans.parquet"  # of an agent in a finished run; while it flies, .plans
 PACKED_TRUTH = "truth.parquet"  # of a finished run
 CONFIG = "config.toml"
 RECORDING = "telemetry.rrd"
@@ -67,6 +68,19 @@ def _read_truth(directory: Path) -> NDArray[np.void]:
     if not os.path.lexists(raw) and os.path.lexists(packed):
         return _in_time(packed, read_parquet(packed, TRUTH_COLUMNS), ("t_us",))
     return _in_time(raw, read_rows(raw, TRUTH_DTYPE), ("t_us",))
+
+
+def read_plans(directory: Path, agent: int) -> NDArray[np.void]:
+    """Return the points of an agent's predicted paths, (K,) of `PLAN_DTYPE`; none if it has recorded none.
+
+    Raises:
+        ConfigError: the file has not the expected content.
+    """
+    raw = directory / f"agent-{agent}.plans"
+    packed = raw.with_suffix(PACKED_PLANS)
+    if not os.path.lexists(raw) and os.path.lexists(packed):
+        return _in_time(packed, read_parquet(packed, PLAN_COLUMNS), ("t_us", "at_us"))
+    return _in_time(raw, read_rows(raw, PLAN_DTYPE), ("t_us", "at_us"))
 
 
 def refuse_no_folder(directory: Path) -> None:

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from swarmctl.core.records import TICK_DTYPE, TRUTH_COLUMNS, TRUTH_DTYPE
+from swarmctl.core.records import PLAN_COLUMNS, PLAN_DTYPE, TICK_DTYPE, TRUTH_COLUMNS, TRUTH_DTYPE
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import replace_text, write_each
 from swarmctl.telemetry.evaluation.referee import Rules, RunData, evaluate
@@ -19,6 +19,7 @@ from swarmctl.telemetry.recording.run_files import (
     AGENT_FILE,
     CONFIG,
     EVENTS,
+    PACKED_PLANS,
     PACKED_TRUTH,
     RECORDING,
     SUMMARY,
@@ -116,6 +117,7 @@ def finish_run(directory: Path, rules: Rules, outcome: Outcome, recorded: RunDat
         EVENTS: partial(_write_events, directory, run.events),
         SUMMARY: partial(replace_text, directory / SUMMARY, to_json(summary, indent=2) + "\n"),
         **{path.name: partial(_pack_ticks, path) for path in sorted(directory.glob("agent-*.ticks"))},
+        **{path.name: partial(_pack_plans, path) for path in sorted(directory.glob("agent-*.plans"))},
         **{path.name: partial(_pack_truth, path) for path in directory.glob(TRUTH)},
         REPORT: lambda: write_report(directory, run, summary, read_text(directory / CONFIG), rules=rules),
     }
@@ -159,6 +161,12 @@ def _write_events(directory: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 def _pack_ticks(path: Path) -> None:
     """Replace a file of raw rows by Parquet."""
     write_parquet(path.with_suffix(".parquet"), read_rows(path, TICK_DTYPE))
+    path.unlink()
+
+
+def _pack_plans(path: Path) -> None:
+    """Replace the raw points of an agent's predicted paths by Parquet."""
+    write_parquet(path.with_suffix(PACKED_PLANS), read_rows(path, PLAN_DTYPE), PLAN_COLUMNS)
     path.unlink()
 
 

@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from swarmctl import __version__
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.records import TICK_DTYPE, TRUTH_COLUMNS, TRUTH_DTYPE
+from swarmctl.core.records import PLAN_DTYPE, TICK_DTYPE, TRUTH_COLUMNS, TRUTH_DTYPE
 from swarmctl.core.tick_record import COLUMNS
 from swarmctl.core.types import FlightMode, Mode, Phase, PlanStatus
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.telemetry.evaluation.referee import Rules
-from swarmctl.telemetry.recording.run_files import load_run, read_parquet, write_parquet
+from swarmctl.telemetry.recording.run_files import load_run, read_parquet, read_plans, write_parquet
 from swarmctl.telemetry.recording.run_folder import Outcome, create_run_folder, finish_run, report_run
 from swarmctl.telemetry.report.charts import thin
 
@@ -128,6 +128,25 @@ def test_true_states_become_parquet_with_units_and_names(tmp_path: Path) -> None
     assert [field.name for field in schema] == [part for column in TRUTH_COLUMNS for part in column.parts]
     assert schema.field("vel_ned_m_s_z").metadata[b"unit"] == b"m/s"
     assert json.loads(schema.field("landed").metadata[b"names"])["1"] == "ON_GROUND"
+
+
+def test_predicted_paths_become_parquet(tmp_path: Path) -> None:
+    write_run(tmp_path, 3, 6.0)
+    points = np.zeros(82, PLAN_DTYPE)
+    points["t_us"] = np.repeat([0, 100_000], 41)
+    points["at_us"] = points["t_us"] + np.tile(np.arange(41) * 50_000, 2)
+    points["pos_ned_m"] = np.arange(82 * 3).reshape(82, 3)
+    points.tofile(tmp_path / "agent-1.plans")
+    np.testing.assert_array_equal(read_plans(tmp_path, 1), points)
+    finish_run(tmp_path, RULES, Outcome(outcome="completed"))
+    assert not (tmp_path / "agent-1.plans").exists()
+    np.testing.assert_array_equal(read_plans(tmp_path, 1), points)
+    assert len(read_plans(tmp_path, 0)) == 0
+    assert sorted(load_run(tmp_path).ticks) == [0, 1, 2], "they are no ticks"
+    assert pq.read_schema(tmp_path / "agent-1.plans.parquet").field("pos_ned_m_z").metadata[b"unit"] == b"m"
+    (tmp_path / "agent-1.plans.parquet").write_bytes(b"PAR1")
+    with pytest.raises(ConfigError, match=r"agent-1.plans.parquet"):
+        read_plans(tmp_path, 1)
 
 
 def test_raw_true_states_replace_packed_ones(tmp_path: Path) -> None:
