@@ -17,6 +17,7 @@ from swarmctl.telemetry.report.pages import render
 
 REPORT = "report.html"
 _MAX_LINES = 20
+_ROOM_01 = 0.02  # of the axis beside the first and last value, for their dots
 
 
 def write_page(
@@ -66,14 +67,15 @@ def _chart(figure: Figure, axes: Sequence[Axis], across: int, found: Sequence[Co
         lines.append(agent_line(number, x, y, label=label, marks=True))
     words = "" if axis.is_number else " (" + ", ".join(f"{k}: {value}" for k, value in enumerate(axis.values)) + ")"
     unit = f" [{figure.unit}]" if figure.unit else ""
-    shown = (min(place.values()), max(place.values()))
+    low, high = min(place.values()), max(place.values())
+    shown = (low - _ROOM_01 * (high - low), high + _ROOM_01 * (high - low))
     return time_chart(f"{figure.text}{unit} over {axis.key}{words}", lines, shown)
 
 
 def _others(axes: Sequence[Axis], across: int, one: Combination) -> str:
-    """Return the values of the keys that are not on the horizontal axis, in words."""
-    pairs = [(axis.key, value) for k, (axis, value) in enumerate(zip(axes, one.values, strict=True)) if k != across]
-    return ", ".join(f"{key} = {cell_text(value)}" for key, value in pairs)
+    """Return the values of the keys that are not on the horizontal axis and have several, in words."""
+    swept = [k for k, axis in enumerate(axes) if k != across and len(axis.values) > 1]
+    return ", ".join(f"{axes[k].key} = {cell_text(one.values[k])}" for k in swept)
 
 
 def cell_text(value: float | str | None) -> str:

@@ -134,7 +134,7 @@ def test_rows_of_a_combination_are_summed_up_over_seeds() -> None:
 def test_the_table_has_units_and_the_page_every_combination(
     flown: list[Flight], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert run(tmp_path, RADIUS, KIND, "--seeds=3") == 4, "a flight has failed"
+    assert run(tmp_path, RADIUS, KIND, "--set=swarm.agents=3", "--seeds=3") == 4, "a flight has failed"
     table = capsys.readouterr().out
     assert "radius_m" in table and table.count("2/3") == 4
     schema = pq.read_schema(tmp_path / "rows.parquet")
@@ -143,6 +143,7 @@ def test_the_table_has_units_and_the_page_every_combination(
     assert page.count("<figure>") == len(FIGURES) - 1, "nothing is drawn of what nobody measured"
     assert "mission.kind = hover" in page and "mission.kind = circle" in page, "a line for each value of the other key"
     assert page.count("<tr><td>") == 4
+    assert "swarm.agents = 3" not in page, "a key with one value distinguishes no line"
 
 
 def test_a_flight_that_cannot_be_flown_is_told_and_flown_again(
