@@ -59,9 +59,10 @@ class FlightLog:
             self._tlog = (self.directory / f"agent-{self.agent}.tlog").open("wb")
 
     def tick(self, record: TickRecord) -> None:
-        self.rows.append(tick_row(record))
+        row = tick_row(record)
+        self.rows.append(row)
         if self.directory is not None:
-            self.plans.append(plan_rows(record).tobytes())
+            self.plans.append(plan_rows(row, record.flown).tobytes())
 
     def event(self, name: str, t_us: int, utc_us: int, **fields: Any) -> None:
         source = agent_name(self.agent)

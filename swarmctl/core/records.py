@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from swarmctl.core.stored_column import StoredColumn, dtype_of
 from swarmctl.core.tick_record import COLUMNS, TickRecord
-from swarmctl.core.types import Array, FlightMode, Landed
+from swarmctl.core.types import Array, FlightMode, Landed, Plan
 
 TICK_DTYPE = dtype_of(COLUMNS)
 
@@ -41,6 +41,7 @@ _PLAN_EVERY = 5  # ticks: ten plans a second
 
 _PLAN_HEADER = struct.Struct("<H")
 _NO_PLAN = np.empty((0, 3))
+_NO_POINTS = np.zeros(0, PLAN_DTYPE)
 
 
 def tick_row(record: TickRecord) -> NDArray[np.void]:
@@ -50,15 +51,19 @@ def tick_row(record: TickRecord) -> NDArray[np.void]:
     return row
 
 
-def plan_rows(record: TickRecord) -> NDArray[np.void]:
-    """Return the points of the flown plan as rows (M,) of `PLAN_DTYPE`; none in most ticks, and without a plan."""
-    plan = record.flown
-    if plan is None or record.seq % _PLAN_EVERY:
-        return np.zeros(0, PLAN_DTYPE)
-    rows = np.zeros(len(plan.pos_ned_m), PLAN_DTYPE)
-    rows["t_us"] = record.t_us
-    rows["at_us"] = plan.t0_us + plan.dt_us * np.arange(len(rows))
-    rows["pos_ned_m"] = plan.pos_ned_m
+def plan_rows(row: NDArray[np.void], flown: Plan | None) -> NDArray[np.void]:
+    """Return the points of the plan flown in a tick as rows (M,) of `PLAN_DTYPE`; none in most ticks.
+
+    Args:
+        row: the tick, a (1,) array of `TICK_DTYPE`.
+        flown: the plan, None without one.
+    """
+    if flown is None or row["seq"][0] % _PLAN_EVERY:
+        return _NO_POINTS
+    rows = np.zeros(len(flown.pos_ned_m), PLAN_DTYPE)
+    rows["t_us"] = row["t_us"]
+    rows["at_us"] = flown.t0_us + flown.dt_us * np.arange(len(rows))
+    rows["pos_ned_m"] = flown.pos_ned_m
     return rows
 
 

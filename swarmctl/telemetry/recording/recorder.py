@@ -55,10 +55,11 @@ class Recorder:
 
     def tick(self, record: TickRecord) -> None:
         """Record one tick."""
-        self._put(0, tick_row(record).tobytes())
-        plan = plan_rows(record)
-        if len(plan):
-            self._put(3, plan.tobytes())
+        row = tick_row(record)
+        self._put(0, row.tobytes())
+        points = plan_rows(row, record.flown)
+        if len(points):
+            self._put(3, points.tobytes())
 
     def frame(self, utc_us: int, frame: bytes) -> None:
         """Record one MAVLink frame, sent or received at `utc_us`."""
