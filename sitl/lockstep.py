@@ -30,7 +30,7 @@ from swarmctl.config import Config
 from swarmctl.core.clock import Clock, ClockError, OffsetClock, SimClock
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import EXCLUDE
-from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE, tick_row
+from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE, plan_rows, tick_row
 from swarmctl.core.tick_record import TickRecord
 from swarmctl.kernels import why_not_repeatable
 from swarmctl.mavlink.transport import pipe_pair
@@ -50,6 +50,7 @@ class FlightLog:
     agent: int
     clock: Clock  # the agent's own
     rows: list[NDArray[np.void]] = field(default_factory=list)
+    plans: list[bytes] = field(default_factory=list)  # predicted paths, only for a run folder
     events: list[dict[str, Any]] = field(default_factory=list)
     _tlog: BinaryIO | None = None
 
@@ -58,7 +59,10 @@ class FlightLog:
             self._tlog = (self.directory / f"agent-{self.agent}.tlog").open("wb")
 
     def tick(self, record: TickRecord) -> None:
-        self.rows.append(tick_row(record))
+        row = tick_row(record)
+        self.rows.append(row)
+        if self.directory is not None:
+            self.plans.append(plan_rows(row, record.flown).tobytes())
 
     def event(self, name: str, t_us: int, utc_us: int, **fields: Any) -> None:
         source = agent_name(self.agent)
@@ -85,6 +89,7 @@ class FlightLog:
         with suppress(OSError):
             self._tlog.close()
         (self.directory / f"agent-{self.agent}.ticks").write_bytes(self.ticks.tobytes())
+        (self.directory / f"agent-{self.agent}.plans").write_bytes(b"".join(self.plans))
         write_events(self.directory / f"agent-{self.agent}.events.jsonl", self.events)
 
 

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from types import MappingProxyType
+from typing import Any, Literal
 
 import tomli_w
 from pydantic import Field
@@ -18,7 +19,7 @@ from pydantic import Field
 from swarmctl.agent.setup import AgentParams
 from swarmctl.bus.json_messages import MAX_OBSTACLES
 from swarmctl.config_problems import validated
-from swarmctl.config_source import override, read_tree
+from swarmctl.config_source import override, read_tree, set_value
 from swarmctl.control.collision.separation import SeparationParams, radius_problem
 from swarmctl.control.controllers.discovery import ControllerParams
 from swarmctl.control.model import VehicleModelParams
@@ -33,6 +34,7 @@ from swarmctl.simulator_config import MAX_VEHICLES, OriginParams, SimulatorConfi
 from swarmctl.telemetry.evaluation.referee import Rules
 
 MAX_AGENTS = MAX_VEHICLES
+NO_VALUES: Mapping[str, Any] = MappingProxyType({})
 _PAIRS_SHOWN = 3
 _RENAMED = {  # keys of versions before 0.2
     "agent.commit.bias_rad": "agent.commit.right_of_way_rad",
@@ -180,12 +182,13 @@ class Config(Params):
         )
 
 
-def load(path: Path | None, overrides: Sequence[str] = ()) -> Config:
+def load(path: Path | None, overrides: Sequence[str] = (), values: Mapping[str, Any] = NO_VALUES) -> Config:
     """Read, override and check a configuration.
 
     Args:
         path: a TOML file; None for the defaults.
         overrides: `key.sub=value` items, values in TOML syntax (bare words are strings); list items by index.
+        values: values by dotted key, set after `overrides`.
 
     Raises:
         ConfigError: the configuration is invalid; lists all problems with key, value, allowed range and fix.
@@ -193,6 +196,7 @@ def load(path: Path | None, overrides: Sequence[str] = ()) -> Config:
     source = str(path) if path else "defaults"
     tree = read_tree(path)
     problems = [p for item in overrides for p in override(tree, item)]
+    problems += [p for key, value in values.items() for p in set_value(tree, key, value)]
     if problems:
         raise ConfigError(source, problems)
     config = validated(Config, tree, source, _RENAMED)

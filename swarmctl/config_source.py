@@ -56,19 +56,25 @@ def read_tree(path: Path | None) -> dict[str, Any]:
 def override(tree: dict[str, Any], item: str) -> list[str]:
     """Set `key.sub=value` in `tree`; returns the problems with it."""
     key, equals, text = item.partition("=")
-    parts = key.strip().split(".")
-    if not equals or not all(parts):
+    if not equals or not all(key.strip().split(".")):
         return [f"--set {shown(item)}: write it as key.sub=value"]
-    if len(parts) > _MAX_DEPTH:
-        return [f"--set {printable(key, _MAX_SHOWN)}: {len(parts)} sections inside each other; allowed: {_MAX_DEPTH}"]
     try:
         value = _value(text)
     except ValueError as error:
         return [f"--set {printable(key, _MAX_SHOWN)}: {error}"]
-    wrong = _place(tree, parts, value)
-    if wrong:
-        return [f"--set {printable(key, _MAX_SHOWN)}: {wrong}"]
-    return [f"--set {problem}" for problem in shape_problems({key: value})]
+    return [f"--set {problem}" for problem in set_value(tree, key, value)]
+
+
+def set_value(tree: dict[str, Any], key: str, value: Any) -> list[str]:
+    """Set the value of a dotted key in `tree`; returns the problems with it."""
+    parts, name = key.strip().split("."), printable(key, _MAX_SHOWN)
+    if not all(parts):
+        return [f"{shown(key)}: write it as key.sub"]
+    if len(parts) > _MAX_DEPTH:
+        return [f"{name}: {len(parts)} sections inside each other; allowed: {_MAX_DEPTH}"]
+    if wrong := _place(tree, parts, value):
+        return [f"{name}: {wrong}"]
+    return list(shape_problems({key: value}))
 
 
 def _place(tree: dict[str, Any], parts: list[str], value: Any) -> str:

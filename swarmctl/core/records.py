@@ -1,7 +1,8 @@
 """The byte layout of per-tick records, on the bus and in run files.
 
-`TICK_DTYPE` holds the columns of one tick of an agent, `TRUTH_DTYPE` one true state of a simulated vehicle. Both are
-little-endian and of fixed size, so a file of them is an array.
+`TICK_DTYPE` holds the columns of one tick of an agent, `PLAN_DTYPE` those of one point of a predicted path,
+`TRUTH_DTYPE` those of one true state of a simulated vehicle. All are little-endian and of fixed size, so a file of them
+is an array.
 """
 
 from __future__ import annotations
@@ -11,26 +12,36 @@ import struct
 import numpy as np
 from numpy.typing import NDArray
 
+from swarmctl.core.stored_column import StoredColumn, dtype_of
 from swarmctl.core.tick_record import COLUMNS, TickRecord
-from swarmctl.core.types import Array
+from swarmctl.core.types import Array, FlightMode, Landed, Plan
 
-TICK_DTYPE = np.dtype([(column.name, column.dtype, (column.size,) if column.size else ()) for column in COLUMNS])
+TICK_DTYPE = dtype_of(COLUMNS)
 
-TRUTH_DTYPE = np.dtype(
-    [
-        ("t_us", "<i8"),  # monotonic clock of the simulator's host
-        ("vehicle", "<u2"),  # 0-based
-        ("pos_ned_m", "<f8", (3,)),  # shared frame, true
-        ("vel_ned_m_s", "<f8", (3,)),
-        ("q_nb", "<f4", (4,)),
-        ("armed", "u1"),
-        ("landed", "u1"),  # core.types.Landed
-        ("flight_mode", "u1"),  # core.types.FlightMode
-    ]
+_F4, _F8, _U1, _U2, _I8 = "<f4", "<f8", "u1", "<u2", "<i8"
+TRUTH_COLUMNS = (
+    StoredColumn(name="t_us", dtype=_I8, unit="us", text="monotonic clock of the simulator's host"),
+    StoredColumn(name="vehicle", dtype=_U2, text="number of the vehicle, from 0"),
+    StoredColumn(name="pos_ned_m", dtype=_F8, size=3, unit="m", text="true position, shared frame"),
+    StoredColumn(name="vel_ned_m_s", dtype=_F8, size=3, unit="m/s", text="true velocity"),
+    StoredColumn(name="q_nb", dtype=_F4, size=4, text="true attitude"),
+    StoredColumn(name="armed", dtype=_U1, text="1: armed"),
+    StoredColumn(name="landed", dtype=_U1, text="whether it is on the ground", names=Landed),
+    StoredColumn(name="flight_mode", dtype=_U1, text="the autopilot's mode", names=FlightMode),
 )
+TRUTH_DTYPE = dtype_of(TRUTH_COLUMNS)
+
+PLAN_COLUMNS = (
+    StoredColumn(name="t_us", dtype=_I8, unit="us", text="monotonic time of the tick that flew the plan"),
+    StoredColumn(name="at_us", dtype=_I8, unit="us", text="monotonic time of this point of it"),
+    StoredColumn(name="pos_ned_m", dtype=_F4, size=3, unit="m", text="predicted position at that time"),
+)
+PLAN_DTYPE = dtype_of(PLAN_COLUMNS)
+_PLAN_EVERY = 5  # ticks: ten plans a second
 
 _PLAN_HEADER = struct.Struct("<H")
 _NO_PLAN = np.empty((0, 3))
+_NO_POINTS = np.zeros(0, PLAN_DTYPE)
 
 
 def tick_row(record: TickRecord) -> NDArray[np.void]:
@@ -38,6 +49,22 @@ def tick_row(record: TickRecord) -> NDArray[np.void]:
     row = np.zeros(1, TICK_DTYPE)
     row[0] = tuple(column.recorded(record) for column in COLUMNS)
     return row
+
+
+def plan_rows(row: NDArray[np.void], flown: Plan | None) -> NDArray[np.void]:
+    """Return the points of the plan flown in a tick as rows (M,) of `PLAN_DTYPE`; none in most ticks.
+
+    Args:
+        row: the tick, a (1,) array of `TICK_DTYPE`.
+        flown: the plan, None without one.
+    """
+    if flown is None or row["seq"][0] % _PLAN_EVERY:
+        return _NO_POINTS
+    rows = np.zeros(len(flown.pos_ned_m), PLAN_DTYPE)
+    rows["t_us"] = row["t_us"]
+    rows["at_us"] = flown.t0_us + flown.dt_us * np.arange(len(rows))
+    rows["pos_ned_m"] = flown.pos_ned_m
+    return rows
 
 
 def pack_tick(record: TickRecord) -> bytes:

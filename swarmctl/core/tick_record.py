@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from swarmctl.core.stored_column import StoredColumn
 from swarmctl.core.types import (
     Array,
     AttitudeSetpoint,
@@ -87,44 +88,23 @@ class Curve:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Column:
-    """Describes one recorded value.
+class Column(StoredColumn):
+    """Describes one recorded value of a tick.
 
     Attributes:
-        name: name of the field, and of its column or columns in Parquet.
-        dtype: numpy type of a component, little-endian.
-        text: meaning, for metadata and documentation.
         value: computes the value, a scalar or `size` components, from a record; None where there is none.
-        unit: in words of SI; "" for counts, flags and enumerations.
-        size: number of components, 3 for vectors and 4 for quaternions; 0 for a scalar.
         none: number recorded where `value` is None.
-        absent: number read from a recording that lacks the column. None: NaN for a floating-point column, while a
-            recording that lacks an integer column is refused.
-        formerly: name of the column in older recordings.
         view: the curve of a scalar, or the entity of the view that shows it, `{}` being the agent; "" if none does.
     """
 
-    name: str
-    dtype: str
-    text: str
     value: Callable[[TickRecord], Any]
-    unit: str = ""
-    size: int = 0
     none: float = math.nan
-    absent: int | None = None
-    formerly: str = ""
     view: Curve | str = ""
 
     @property
     def entity(self) -> str:
         """Entity of the view that shows the value, `{}` being the agent; "" if none does."""
         return f"plot/{self.name}/{{}}" if isinstance(self.view, Curve) else self.view
-
-    @property
-    def parts(self) -> list[str]:
-        """Names of the Parquet columns, one for each component."""
-        axes = {0: ("",), 3: ("_x", "_y", "_z"), 4: ("_w", "_x", "_y", "_z")}[self.size]
-        return [self.name + axis for axis in axes]
 
     def recorded(self, record: TickRecord) -> Any:
         """Return what is stored of a record: a scalar, or components (size,)."""
@@ -158,6 +138,7 @@ COLUMNS = (
         name="phase",
         dtype=_U1,
         text=f"phase of the mission, `Phase` {_TYPES}",
+        names=Phase,
         value=lambda tick: tick.phase,
         view="state/{}/phase",
     ),
@@ -165,6 +146,7 @@ COLUMNS = (
         name="mode",
         dtype=_U1,
         text=f"mode of the agent, `Mode` {_TYPES}",
+        names=Mode,
         value=lambda tick: tick.mode,
         view="state/{}/mode",
     ),
@@ -172,6 +154,7 @@ COLUMNS = (
         name="flight_mode",
         dtype=_U1,
         text=f"the autopilot's mode, `FlightMode` {_TYPES}",
+        names=FlightMode,
         value=lambda tick: tick.flight_mode,
     ),
     Column(name="armed", dtype=_U1, text="1: armed", value=lambda tick: tick.armed),
@@ -276,6 +259,7 @@ COLUMNS = (
         name="plan_status",
         dtype=_U1,
         text="0 ok, 1 solver failed, 2 residual too large, 3 not certified, 4 there was no plan",
+        names=PlanStatus,
         value=lambda tick: tick.plan and tick.plan.status,
         none=PlanStatus.NONE,
     ),

@@ -18,6 +18,7 @@ import typer
 from swarmctl import __version__
 from swarmctl.core.text import printable_lines
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, ConfigError, SwarmError
+from swarmctl.ops.config_verbs import config_app
 from swarmctl.ops.order_verbs import Run, add_order_verbs
 
 if TYPE_CHECKING:
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
 
 app = typer.Typer(
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,  # markup would take units such as [m] for tags and drop them
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -36,6 +36,7 @@ obstacle_app = typer.Typer(
     no_args_is_help=True, rich_markup_mode=None, help="Change the obstacles of a running launch."
 )
 app.add_typer(obstacle_app, name="obstacle")
+app.add_typer(config_app, name="config")
 
 ConfigPath = Annotated[Path | None, typer.Argument(help="TOML file; default: the circle of the thesis.")]
 Agents = Annotated[int | None, typer.Option("--agents", help="Number of agents; overrides swarm.agents.")]
@@ -374,6 +375,12 @@ def reproduce(context: typer.Context) -> NoReturn:
 def bench(context: typer.Context) -> NoReturn:
     """Measure the tick of one agent, part by part. Covers 0 to 30 neighbours and each installed solver."""
     _become("sitl.studies.bench.command", context.args)
+
+
+@app.command(context_settings=_PASS_ON)
+def sweep(context: typer.Context) -> NoReturn:
+    """Fly every combination of values in lockstep, on all processors. Writes a table and charts; can be resumed."""
+    _become("sitl.studies.sweep.command", context.args)
 
 
 def _become(module: str, arguments: list[str]) -> NoReturn:

@@ -16,8 +16,9 @@ import pytest
 from pymavlink.dialects.v20 import development as mavlink
 
 from swarmctl.config import load
-from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
+from swarmctl.core.records import TICK_DTYPE
 from swarmctl.core.types import Landed, Phase
+from swarmctl.telemetry.recording.run_files import load_run
 from tests.benches.at_once import at_once
 from tests.process.test_check import Pilot, Simulator
 
@@ -48,8 +49,7 @@ def begin(directory: Path, *arguments: str) -> subprocess.Popen[str]:
 
 def landed(directory: Path) -> bool:
     [run] = (directory / "runs").iterdir()
-    data = (run / "truth.bin").read_bytes()
-    last = np.frombuffer(data, TRUTH_DTYPE, len(data) // TRUTH_DTYPE.itemsize)[-1]
+    last = load_run(run).truth[-1]
     return bool(last["landed"] == Landed.ON_GROUND and not last["armed"])
 
 

@@ -168,7 +168,7 @@ def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Start) -> None:
     assert summary["separation"]["min_m"] >= summary["separation"]["required_m"]
     assert summary["tracking"]["index_m"] < 6.0, "three agents that stayed at the start would have 10"
     assert launched.landed() == {0: True, 1: True, 2: True}
-    for name in ("config.toml", "events.jsonl", "telemetry.rrd", "report.html", "truth.bin"):
+    for name in ("config.toml", "events.jsonl", "telemetry.rrd", "report.html", "truth.parquet"):
         assert (launched.run_dir / name).stat().st_size > 0, name
     for i in range(3):
         assert (launched.run_dir / f"agent-{i}.parquet").stat().st_size > 0

@@ -17,12 +17,14 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pyarrow.parquet as pq
 import pytest
 
 from sitl.studies.bench.bench import PARTS
+from swarmctl.config import load
 from swarmctl.control.mpc.solvers.qp import SOLVERS
-from swarmctl.core.records import TRUTH_DTYPE
 from swarmctl.core.types import Landed
+from swarmctl.telemetry.recording.run_files import load_run
 from tests.benches.at_once import at_once
 
 pytestmark = pytest.mark.process
@@ -67,8 +69,7 @@ def low(line: str) -> str:
 
 def landed(directory: Path) -> dict[int, bool]:
     """Whether each vehicle of a run folder ended on the ground, in truth."""
-    data = (directory / "truth.bin").read_bytes()
-    truth = np.frombuffer(data, TRUTH_DTYPE, len(data) // TRUTH_DTYPE.itemsize)
+    truth = load_run(directory).truth
     return {
         int(v): bool(truth["landed"][truth["vehicle"] == v][-1] == Landed.ON_GROUND)
         for v in np.unique(truth["vehicle"])
@@ -83,6 +84,8 @@ def test_nothing_is_shown_that_is_not_run() -> None:
         + shown(r"^python3 -m venv ")
         + shown(r"^swarmctl (reproduce|bench|check) ")
         + shown(CAMPAIGN)
+        + shown(r"^swarmctl config ")
+        + shown(r"^swarmctl sweep ")
     )
     assert sorted(run_here) == sorted(SHOWN)
     assert len(set(SHOWN)) == len(SHOWN), "shown once, so that it is run once"
@@ -105,6 +108,41 @@ def test_simulations(line: str, tmp_path: Path) -> None:
     done = run(line, "--duration", "2", low(line), "--run-dir", str(tmp_path / "run"))
     assert done.returncode == 0, done.stdout + done.stderr
     assert "x real time" in done.stdout
+
+
+def test_looking_up_and_beginning_a_configuration(tmp_path: Path) -> None:
+    show, init = shown(r"^swarmctl config ")
+    assert "sitl.wind.mean_ned_m_s = [0.0, 0.0, 0.0]  # velocity of the air" in run(show).stdout
+    path = tmp_path / "mine.toml"
+    assert run(init, "--output", str(path)).returncode == 0
+    assert load(path) == load(ROOT / "configs" / "x500_circle.toml")
+
+
+def test_a_sweep_has_a_row_for_each_combination_and_charts(tmp_path: Path) -> None:
+    (line,) = shown(r"^swarmctl sweep ")
+    shorter = (
+        "--set",
+        "mission.duration_s=1",
+        "--set",
+        "sitl.start=air",
+        "--jobs",
+        "1",
+        "--out",
+        str(tmp_path / "out"),
+    )
+    done = run(line, *shorter)
+    assert done.returncode == 0, done.stdout + done.stderr
+    rows = pq.read_table(tmp_path / "out" / "rows.parquet").to_pylist()
+    assert sorted((row["swarm.agents"], row["sitl.mass_scale"]) for row in rows) == [
+        (1, 1),
+        (1, 1.25),
+        (2, 1),
+        (2, 1.25),
+    ]
+    assert {row["outcome"] for row in rows} == {"completed"}
+    lone, pair = ([row["index_m"] for row in rows if row["swarm.agents"] == agents] for agents in (1, 2))
+    assert min(pair) > 1.5 * max(lone), "the sum over agents"
+    assert "<svg" in (tmp_path / "out" / "report.html").read_text()
 
 
 @pytest.mark.parametrize("line", shown(r"^swarmctl reproduce "))

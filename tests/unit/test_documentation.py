@@ -9,10 +9,12 @@ from pathlib import Path
 
 import pytest
 
+import swarmctl
 from sitl.studies.campaign.trials import SCHEMA
+from sitl.studies.sweep.figures import schema_of
 from swarmctl.config import SitlParams
 from swarmctl.core.operator_verbs import OPERATOR_VERBS
-from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
+from swarmctl.core.records import PLAN_DTYPE, TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.core.types import Phase
 
 ROOT = Path(__file__).parents[2]
@@ -34,7 +36,13 @@ def test_the_table_of_columns_is_what_the_script_writes() -> None:
 
 
 def test_every_recorded_column_is_described() -> None:
-    recorded = {*(TICK_DTYPE.names or ()), *(TRUTH_DTYPE.names or ()), *SCHEMA.names}
+    recorded = {
+        *(TICK_DTYPE.names or ()),
+        *(TRUTH_DTYPE.names or ()),
+        *(PLAN_DTYPE.names or ()),
+        *SCHEMA.names,
+        *schema_of([]).names,
+    }
     assert recorded - described() == set()
 
 
@@ -79,8 +87,17 @@ def is_ours(name: str) -> bool:
 def exists(name: str) -> bool:
     """Return whether a path, pattern or dotted module of the tree exists; a name without a folder may be anywhere."""
     if re.match(r"(swarmctl|sitl)(\.\w+)+$", name) and not name.endswith(".py"):
-        return is_module(name) or name.removeprefix("sitl.").partition(".")[0] in SitlParams.model_fields
+        return (
+            is_module(name)
+            or is_for_scripts(name)
+            or name.removeprefix("sitl.").partition(".")[0] in SitlParams.model_fields
+        )
     return any(ROOT.glob(name.rstrip("/"))) or ("/" not in name and any(ROOT.glob(f"*/**/{name}")))
+
+
+def is_for_scripts(name: str) -> bool:
+    """Return whether this is a name that the package itself offers, as `swarmctl.load`."""
+    return name.removeprefix("swarmctl.") in dir(swarmctl)
 
 
 def is_module(name: str) -> bool:

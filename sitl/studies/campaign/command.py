@@ -16,30 +16,28 @@ import os
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import closing
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
 from sitl.studies.campaign.disturbances import DISTURBANCES, NONE
 from sitl.studies.campaign.factors import NOISES, PROTECTIONS
 from sitl.studies.campaign.flight import config_of, drawn
 from sitl.studies.campaign.page import share_text, write_page
+from sitl.studies.campaign.progress import collect
 from sitl.studies.campaign.quick import QUICK
 from sitl.studies.campaign.scenarios import AIRFRAMES, SCENARIOS
 from sitl.studies.campaign.source import code_id
 from sitl.studies.campaign.store import Store
 from sitl.studies.campaign.summary import summaries
 from sitl.studies.campaign.trials import Cell, Row, Trial, cells, trial_of
-from sitl.studies.campaign.worker_pool import on_cluster, on_this_machine
+from sitl.studies.campaign.worker_pool import fly_trial, on_cluster, on_this_machine
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, ConfigError, exit_code_of
 
 MAX_AGENTS = 100
-_SAY_EVERY_S = 30.0  # interval of progress lines where there is no terminal
 _Value = TypeVar("_Value")
 
 
@@ -51,20 +49,15 @@ def main(arguments: list[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     trials = _trials(options)
-    began_s, errors = time.monotonic(), []
+    began_s = time.monotonic()
     with Store(options.out, code_id(), options.mix) as store:
         missing = store.missing(trials)
         print(f"{len(trials)} runs, {len(trials) - len(missing)} of them there already; {options.out}", flush=True)
         jobs = min(options.jobs, max(1, len(missing)))
-        flown = on_cluster(missing, options.dask) if options.dask else on_this_machine(missing, jobs)
-        count = 0
-        with closing(flown):
-            for trial, result in _shown(flown, len(missing)):
-                if isinstance(result, str):
-                    errors.append(f"{trial}: {result}")
-                    continue
-                count += 1
-                store.add(result)
+        flown = (
+            on_cluster(missing, options.dask, fly_trial) if options.dask else on_this_machine(missing, jobs, fly_trial)
+        )
+        count, errors = collect(flown, len(missing), store, noted=("collided", lambda row: bool(row["collided"])))
     hours = (time.monotonic() - began_s) / 3600.0
     report = write_page(options.out, store.rows, count / hours if count else None)
     asked = set(trials)
@@ -120,25 +113,6 @@ def _problems(cell: Cell, seed: int) -> Iterator[str]:
         yield from error.problems
     except ValueError as error:
         yield f"--scenario {cell.scenario} --agents {cell.agents}: {error}"
-
-
-def _shown(flown: Iterator[tuple[Trial, Any]], total: int) -> Iterator[tuple[Trial, Any]]:
-    """Yield the same items with a progress bar on a terminal, and a line now and then elsewhere."""
-    collided = done = 0
-    began_s = said_s = time.monotonic()
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, transient=True, disable=not sys.stdout.isatty()) as bar:
-        task = bar.add_task("flying", total=total)
-        for trial, result in flown:
-            yield trial, result
-            done += 1
-            collided += not isinstance(result, str) and result["collided"]
-            now_s = time.monotonic()
-            hourly = 3600.0 * done / max(now_s - began_s, 1e-3)
-            bar.update(task, advance=1, description=f"{collided} collided, {hourly:.0f} runs/h")
-            if bar.disable and now_s - said_s >= _SAY_EVERY_S:
-                said_s = now_s
-                print(f"{done}/{total} flown, {collided} collided, {hourly:.0f} runs/h", flush=True)
 
 
 def _print_table(rows: list[Row]) -> None:

@@ -7,13 +7,15 @@ from functools import cache
 from pathlib import Path
 
 _PACKAGES = ("sitl", "swarmctl")
+_STUDIES = ("campaign", "sweep")
 _PAGES = {
     "page.py",
+    "progress.py",
     "store.py",
     "worker_pool.py",
     "summary.py",
     "command.py",
-}  # modules of this package that do not affect a flight
+}  # modules of these studies that do not affect a flight
 
 
 @cache
@@ -22,7 +24,7 @@ def code_id() -> str:
     root = Path(__file__).parents[3]
     digest = hashlib.sha256()
     for path in sorted(path for package in _PACKAGES for path in (root / package).rglob("*.py")):
-        if path.parent.name == "campaign" and path.name in _PAGES:
+        if path.parent.name in _STUDIES and path.name in _PAGES:
             continue
         digest.update(str(path.relative_to(root)).encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:12]

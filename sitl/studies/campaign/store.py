@@ -1,11 +1,15 @@
-"""The folder of a campaign: `rows.parquet` with one row per finished run, replaced in one step as rows come in."""
+"""The folder of a campaign: `rows.parquet` with one row per finished run, replaced in one step as rows come in.
+
+`RowStore` keeps the rows of any study of many flights; `Store` those of a campaign.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from types import TracebackType
+from typing import Generic, Self, TypeVar
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -17,26 +21,32 @@ from swarmctl.files import read_file, replaced
 ROWS = "rows.parquet"
 _SAVE_EVERY_S = 1.0
 _MAX_BYTES = 2**31
+_Job = TypeVar("_Job")  # what is flown, and its result told from others by
 
 
-class Store:
-    """Rows of one campaign; a context manager that saves the rest when it ends.
+class RowStore(Generic[_Job]):
+    """Rows of many flights; a context manager that saves the rest when it ends.
 
     Args:
         directory: made when it is missing.
-        code: digest of the present sources.
+        code: digest of the present sources, a column of every row.
         mix: accept rows flown by other sources.
+        schema: columns of the rows.
+        job_of: the flight that a row is the result of.
 
     Raises:
         ConfigError: the folder holds something else, or rows of other sources.
     """
 
-    def __init__(self, directory: Path, code: str, mix: bool = False) -> None:
+    def __init__(
+        self, directory: Path, code: str, mix: bool = False, *, schema: pa.Schema, job_of: Callable[[Row], _Job]
+    ) -> None:
         self._path = directory / ROWS
+        self._schema, self._job_of = schema, job_of
         self.rows: list[Row] = []
         directory.mkdir(parents=True, exist_ok=True)
         if self._path.exists():
-            self.rows = _read(self._path)
+            self.rows = _read(self._path, schema.names)
         others = sorted({row["code"] for row in self.rows} - {code})
         if others and not mix:
             raise ConfigError(
@@ -46,10 +56,10 @@ class Store:
                     "or --mix to go on with both"
                 ],
             )
-        self._finished = {trial_of(row) for row in self.rows}
+        self._finished = {job_of(row) for row in self.rows}
         self._saved_s, self._saved_rows = time.monotonic(), len(self.rows)
 
-    def __enter__(self) -> Store:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(
@@ -57,14 +67,14 @@ class Store:
     ) -> None:
         self.save()
 
-    def missing(self, trials: Iterable[Trial]) -> list[Trial]:
-        """Return the trials not flown yet, in order, each once."""
-        return [trial for trial in dict.fromkeys(trials) if trial not in self._finished]
+    def missing(self, jobs: Iterable[_Job]) -> list[_Job]:
+        """Return the flights not flown yet, in order, each once."""
+        return [job for job in dict.fromkeys(jobs) if job not in self._finished]
 
     def add(self, row: Row) -> None:
         """Add a finished row; it is on disk within a second, or with the next one."""
         self.rows.append(row)
-        self._finished.add(trial_of(row))
+        self._finished.add(self._job_of(row))
         if time.monotonic() - self._saved_s >= _SAVE_EVERY_S:
             self.save()
 
@@ -74,16 +84,23 @@ class Store:
         if len(self.rows) == self._saved_rows:
             return
         with replaced(self._path) as file:
-            pq.write_table(pa.Table.from_pylist(self.rows, SCHEMA), file)
+            pq.write_table(pa.Table.from_pylist(self.rows, self._schema), file)
         self._saved_rows = len(self.rows)
 
 
-def _read(path: Path) -> list[Row]:
+class Store(RowStore[Trial]):
+    """Rows of one campaign."""
+
+    def __init__(self, directory: Path, code: str, mix: bool = False) -> None:
+        super().__init__(directory, code, mix, schema=SCHEMA, job_of=trial_of)
+
+
+def _read(path: Path, names: Sequence[str]) -> list[Row]:
     try:
         table = pq.read_table(pa.BufferReader(read_file(path, _MAX_BYTES)))
     except (OSError, pa.ArrowException) as error:
         raise ConfigError(str(path), [f"can't be read ({error}); give another --out"]) from error
-    if table.schema.names != SCHEMA.names:
+    if table.schema.names != names:
         raise ConfigError(str(path), ["has other columns than these sources write; give another --out"])
     rows: list[Row] = table.to_pylist()
     return rows

@@ -9,13 +9,13 @@ from collections.abc import Callable, Generator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
-from typing import Any
+from typing import Any, TypeVar
 
 from sitl.studies.campaign.trials import Row, Trial
 from swarmctl.errors import StartError
 from swarmctl.process_lifetime import serve_parent
 
-Fly = Callable[[Trial], Row]
+_Job = TypeVar("_Job")
 
 
 def fly_trial(trial: Trial) -> Row:
@@ -26,8 +26,8 @@ def fly_trial(trial: Trial) -> Row:
 
 
 def on_this_machine(
-    trials: Sequence[Trial], jobs: int, fly: Fly = fly_trial
-) -> Generator[tuple[Trial, Row | str], None, None]:
+    trials: Sequence[_Job], jobs: int, fly: Callable[[_Job], Row]
+) -> Generator[tuple[_Job, Row | str], None, None]:
     """Fly in `jobs` processes; yield each trial with its row, or with the error as text.
 
     Raises:
@@ -39,7 +39,7 @@ def on_this_machine(
     pool = ProcessPoolExecutor(jobs, get_context("spawn"), serve_parent)
     try:
         todo = iter(trials)
-        flying: dict[Future[Row | str], Trial] = {}
+        flying: dict[Future[Row | str], _Job] = {}
         while True:
             for trial in todo:
                 flying[pool.submit(_flown, fly, trial)] = trial
@@ -58,8 +58,8 @@ def on_this_machine(
 
 
 def on_cluster(
-    trials: Sequence[Trial], address: str, fly: Fly = fly_trial
-) -> Generator[tuple[Trial, Row | str], None, None]:
+    trials: Sequence[_Job], address: str, fly: Callable[[_Job], Row]
+) -> Generator[tuple[_Job, Row | str], None, None]:
     """Fly on the workers of the Dask scheduler at `HOST:PORT`.
 
     They need this package in the same version, and a thread each: `dask worker HOST:PORT --nthreads 1 --nworkers auto`.
@@ -77,12 +77,12 @@ def on_cluster(
     except (OSError, TimeoutError) as error:
         raise StartError(f"--dask {address}: no scheduler answers ({error}); start one with: dask scheduler") from error
     with client:
-        futures: dict[Any, Trial] = {client.submit(_flown, fly, trial, pure=False): trial for trial in trials}
+        futures: dict[Any, _Job] = {client.submit(_flown, fly, trial, pure=False): trial for trial in trials}
         for future in as_completed(futures):
             yield futures[future], _result(future)
 
 
-def _flown(fly: Fly, trial: Trial) -> Row | str:
+def _flown(fly: Callable[[_Job], Row], trial: _Job) -> Row | str:
     try:
         return fly(trial)
     except Exception as error:  # one broken trial must not end the campaign

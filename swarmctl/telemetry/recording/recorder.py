@@ -17,7 +17,7 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
-from swarmctl.core.records import TICK_DTYPE, tick_row
+from swarmctl.core.records import PLAN_DTYPE, TICK_DTYPE, plan_rows, tick_row
 from swarmctl.core.tick_record import TickRecord
 from swarmctl.telemetry.json_safe import to_json
 
@@ -28,10 +28,10 @@ _TLOG_STAMP = struct.Struct(">Q")
 
 
 class Recorder:
-    """Writes ticks, MAVLink frames and events of one agent to three files of a run folder.
+    """Writes ticks, predicted paths, MAVLink frames and events of one agent to four files of a run folder.
 
-    `agent-<i>.ticks` holds raw `TICK_DTYPE` rows, `agent-<i>.tlog` frames preceded by their UTC [us] (the format of
-    ground stations), `agent-<i>.events.jsonl` one JSON object on each line.
+    `agent-<i>.ticks` holds raw `TICK_DTYPE` rows, `agent-<i>.plans` raw `PLAN_DTYPE` rows, `agent-<i>.tlog` frames
+    after their UTC [us] (as ground stations write them), `agent-<i>.events.jsonl` one JSON object on each line.
     """
 
     def __init__(self, directory: Path, agent: int) -> None:
@@ -40,6 +40,7 @@ class Recorder:
             _RowFile(directory / f"{self._source}.ticks", TICK_DTYPE.itemsize),
             _RowFile(directory / f"{self._source}.tlog"),
             _RowFile(directory / f"{self._source}.events.jsonl"),
+            _RowFile(directory / f"{self._source}.plans", PLAN_DTYPE.itemsize),
         )
         self._queue: deque[tuple[int, bytes]] = deque()
         self._refused = 0  # written by the tick's thread
@@ -49,12 +50,16 @@ class Recorder:
 
     @property
     def lost(self) -> int:
-        """Number of rows dropped so far."""
+        """Number of rows dropped so far; a predicted path counts as one."""
         return self._refused + sum(file.lost for file in self._files)
 
     def tick(self, record: TickRecord) -> None:
         """Record one tick."""
-        self._put(0, tick_row(record).tobytes())
+        row = tick_row(record)
+        self._put(0, row.tobytes())
+        points = plan_rows(row, record.flown)
+        if len(points):
+            self._put(3, points.tobytes())
 
     def frame(self, utc_us: int, frame: bytes) -> None:
         """Record one MAVLink frame, sent or received at `utc_us`."""
@@ -86,7 +91,7 @@ class Recorder:
             file.close()
 
     def _drain(self) -> None:
-        batches: tuple[list[bytes], ...] = ([], [], [])
+        batches: tuple[list[bytes], ...] = ([], [], [], [])
         for _ in range(len(self._queue)):
             file, row = self._queue.popleft()
             batches[file].append(row)

@@ -1,16 +1,18 @@
 """Reads and writes the files of a run folder. A folder may come from another person, so its content is validated.
 
-Formats: `agent-<i>.ticks` and `truth.bin` are raw rows of `core.records`; `agent-<i>.parquet` is the same table with
-vectors expanded to one column per component. A partial last row, left by a killed process, is ignored. Anything but a
-regular file of bounded size and expected content is refused with a reason.
+Formats: `agent-<i>.ticks`, `agent-<i>.plans` and `truth.bin` are raw rows of `core.records`, as they are written in
+flight; `agent-<i>.parquet`, `agent-<i>.plans.parquet` and `truth.parquet` are the same tables with vectors expanded to
+one column per component. A partial last row, left by a killed process, is ignored. Anything but a regular file of
+bounded size and expected content is refused with a reason.
 """
 
 from __future__ import annotations
 
 import json
 import math
+import os
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,26 +20,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl import __version__
-from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
-from swarmctl.core.tick_record import COLUMNS, Column
+from swarmctl.core.records import PLAN_COLUMNS, PLAN_DTYPE, TICK_DTYPE, TRUTH_COLUMNS, TRUTH_DTYPE
+from swarmctl.core.stored_column import StoredColumn, dtype_of
+from swarmctl.core.tick_record import COLUMNS
 from swarmctl.errors import ConfigError
 from swarmctl.files import read_file, replaced
 from swarmctl.telemetry.evaluation.referee import RunData
 from swarmctl.telemetry.evaluation.tracks import MAX_RUN_US
 from swarmctl.telemetry.recording.summary_file import decode_summary
+from swarmctl.telemetry.recording.tables import VERSION_KEY, plain_table
 
 EVENTS = "events.jsonl"
 SUMMARY = "summary.json"
-TRUTH = "truth.bin"
+TRUTH = "truth.bin"  # while the simulator flies
+PACKED_PLANS = ".plans.parquet"  # of an agent in a finished run; while it flies, .plans
+PACKED_TRUTH = "truth.parquet"  # of a finished run
 CONFIG = "config.toml"
 RECORDING = "telemetry.rrd"
-VERSION_KEY = "swarmctl_version"  # of the metadata of Parquet
 AGENT_FILE = re.compile(r"^agent-(\d{1,3})\.(ticks|parquet)$")
 
 _MAX_ROWS_BYTES = 2**31  # a day of one agent, about the memory of a laptop
 _MAX_EVENTS_BYTES = 2**28
 _MAX_TEXT_BYTES = 2**24
-_MAX_ROWS = _MAX_ROWS_BYTES // TICK_DTYPE.itemsize
 _MAX_EVENT_DEPTH = 8  # largest nesting of an event; written events nest twice
 _INT64 = range(-(2**63), 2**63)
 
@@ -55,12 +59,28 @@ def load_run(directory: Path) -> RunData:
         if match:
             rows = read_rows(path, TICK_DTYPE) if match[2] == "ticks" else read_parquet(path)
             ticks[int(match[1])] = _in_time(path, rows, ("t_us", "utc_us"))
-    truth = directory / TRUTH
-    return RunData(
-        ticks=dict(sorted(ticks.items())),
-        truth=_in_time(truth, read_rows(truth, TRUTH_DTYPE), ("t_us",)),
-        events=read_events(directory),
-    )
+    return RunData(ticks=dict(sorted(ticks.items())), truth=_read_truth(directory), events=read_events(directory))
+
+
+def _read_truth(directory: Path) -> NDArray[np.void]:
+    """Return the true states of a run, (T * vehicles,) of `TRUTH_DTYPE`; none without a simulator."""
+    raw, packed = directory / TRUTH, directory / PACKED_TRUTH
+    if not os.path.lexists(raw) and os.path.lexists(packed):
+        return _in_time(packed, read_parquet(packed, TRUTH_COLUMNS), ("t_us",))
+    return _in_time(raw, read_rows(raw, TRUTH_DTYPE), ("t_us",))
+
+
+def read_plans(directory: Path, agent: int) -> NDArray[np.void]:
+    """Return the points of an agent's predicted paths, (K,) of `PLAN_DTYPE`; none if it has recorded none.
+
+    Raises:
+        ConfigError: the file has not the expected content.
+    """
+    raw = directory / f"agent-{agent}.plans"
+    packed = raw.with_suffix(PACKED_PLANS)
+    if not os.path.lexists(raw) and os.path.lexists(packed):
+        return _in_time(packed, read_parquet(packed, PLAN_COLUMNS), ("t_us", "at_us"))
+    return _in_time(raw, read_rows(raw, PLAN_DTYPE), ("t_us", "at_us"))
 
 
 def refuse_no_folder(directory: Path) -> None:
@@ -94,6 +114,17 @@ def read_summary(directory: Path) -> dict[str, Any] | None:
         return decode_summary(content)
     except ValueError as error:
         raise _damaged(path, f"is no summary: {error}. Remove it, and the run is judged again") from error
+
+
+def refuse_other_swarm(directory: Path, summary: Mapping[str, Any], agents: int) -> None:
+    """Check that a summary is of as many agents as the configuration beside it.
+
+    Raises:
+        ConfigError: it is not.
+    """
+    if summary["agents"] != agents:
+        problem = f"of {summary['agents']} agents, but {CONFIG} is of {agents}. Remove it to have the run judged"
+        raise _damaged(directory / SUMMARY, problem)
 
 
 def read_events(directory: Path) -> list[dict[str, Any]]:
@@ -155,48 +186,40 @@ def _damaged(path: Path, problem: str) -> ConfigError:
     return ConfigError(str(path), [problem])
 
 
-def write_parquet(path: Path, rows: NDArray[np.void]) -> None:
-    """Write rows of `TICK_DTYPE` as Parquet, one column for each component, with units and meanings as metadata."""
-    import pyarrow as pa  # imported here to keep it out of agent processes
-    import pyarrow.parquet as pq
+def write_parquet(path: Path, rows: NDArray[np.void], columns: Sequence[StoredColumn] = COLUMNS) -> None:
+    """Write rows that `columns` describe as Parquet, one column for each component."""
+    import pyarrow.parquet as pq  # imported here to keep it out of agent processes
 
-    fields, arrays = [], []
-    for column in COLUMNS:
-        values = rows[column.name].reshape(len(rows), -1)  # (T, components)
-        for k, part in enumerate(column.parts):
-            arrays.append(pa.array(np.ascontiguousarray(values[:, k])))
-            metadata = {"unit": column.unit, "description": column.text, "entity": column.entity}
-            fields.append(pa.field(part, arrays[-1].type, metadata=metadata))
-    schema = pa.schema(fields, metadata={VERSION_KEY: __version__})
     with replaced(path) as file:
-        pq.write_table(pa.Table.from_arrays(arrays, schema=schema), file, compression="zstd")
+        pq.write_table(plain_table(rows, columns), file, compression="zstd")
 
 
-def read_parquet(path: Path) -> NDArray[np.void]:
-    """Read ticks written by this or an older version; unknown columns are ignored, missing ones are NaN.
+def read_parquet(path: Path, columns: Sequence[StoredColumn] = COLUMNS) -> NDArray[np.void]:
+    """Read rows written by this or an older version; unknown columns are ignored, missing ones are NaN.
 
     Raises:
         ConfigError: the file is no Parquet, has too many rows, a column holds no numbers, or an integer column is
-            missing for which `core.tick_record` states no number.
+            missing for which its declaration states no number.
     """
     import pyarrow as pa
     import pyarrow.parquet as pq
 
+    most_rows = _MAX_ROWS_BYTES // dtype_of(columns).itemsize
     try:
         file = pq.ParquetFile(pa.BufferReader(_content(path, _MAX_ROWS_BYTES)))
-        if file.metadata.num_rows > _MAX_ROWS:
+        if file.metadata.num_rows > most_rows:
             raise _damaged(path, f"has {file.metadata.num_rows} rows, more than a day of one agent")
-        return _tick_rows(file)
+        return _stored_rows(file, columns)
     except (OSError, ValueError, pa.ArrowException) as error:  # a damaged file can raise any of these
-        raise _damaged(path, f"is no recording of ticks: {error}. Remove it to see the others") from error
+        raise _damaged(path, f"is no recording of ours: {error}. Remove it to see the others") from error
 
 
-def _tick_rows(file: Any) -> NDArray[np.void]:
+def _stored_rows(file: Any, columns: Sequence[StoredColumn]) -> NDArray[np.void]:
     known = set(file.schema_arrow.names)
-    stored = {column.name: _stored_parts(column, known) for column in COLUMNS}
+    stored = {column.name: _stored_parts(column, known) for column in columns}
     table = file.read(columns=[part for parts in stored.values() for part in parts])
-    rows = np.zeros(table.num_rows, TICK_DTYPE)
-    for column in COLUMNS:
+    rows = np.zeros(table.num_rows, dtype_of(columns))
+    for column in columns:
         values = [table.column(part).to_numpy() for part in stored[column.name]]
         if any(value.dtype.kind not in "iufb" for value in values):
             raise ValueError(f"column {column.name} holds no numbers")
@@ -207,13 +230,13 @@ def _tick_rows(file: Any) -> NDArray[np.void]:
     return rows
 
 
-def _stored_parts(column: Column, known: set[str]) -> list[str]:
+def _stored_parts(column: StoredColumn, known: set[str]) -> list[str]:
     """Return the Parquet columns of a value by its present or former name; empty if the file has neither."""
     former = [part.replace(column.name, column.formerly, 1) for part in column.parts]
     return next((parts for parts in (column.parts, former) if known.issuperset(parts)), [])
 
 
-def _absent(column: Column, file: Any) -> float:
+def _absent(column: StoredColumn, file: Any) -> float:
     """Return the number that stands for a value that was not recorded.
 
     Raises:
@@ -221,7 +244,7 @@ def _absent(column: Column, file: Any) -> float:
     """
     if column.absent is not None:
         return column.absent
-    if TICK_DTYPE[column.name].base.kind == "f":
+    if np.dtype(column.dtype).kind == "f":
         return math.nan
     by = (file.schema_arrow.metadata or {}).get(VERSION_KEY.encode(), b"an unknown version").decode(errors="replace")
     raise ValueError(f"column {column.name} is missing (written by swarmctl {by}, this is {__version__})")

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from swarmctl.core.records import TICK_DTYPE
+from swarmctl.core.records import PLAN_COLUMNS, PLAN_DTYPE, TICK_DTYPE, TRUTH_COLUMNS, TRUTH_DTYPE
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import replace_text, write_each
 from swarmctl.telemetry.evaluation.referee import Rules, RunData, evaluate
@@ -19,6 +19,8 @@ from swarmctl.telemetry.recording.run_files import (
     AGENT_FILE,
     CONFIG,
     EVENTS,
+    PACKED_PLANS,
+    PACKED_TRUTH,
     RECORDING,
     SUMMARY,
     TRUTH,
@@ -26,6 +28,7 @@ from swarmctl.telemetry.recording.run_files import (
     read_rows,
     read_summary,
     read_text,
+    refuse_other_swarm,
     utc_us_of,
     write_parquet,
 )
@@ -66,7 +69,7 @@ def _claim(base: Path) -> Path:
     taken = sorted(
         path.name
         for path in base.iterdir()
-        if path.name in (EVENTS, SUMMARY, TRUTH, RECORDING) or AGENT_FILE.match(path.name)
+        if path.name in (EVENTS, SUMMARY, TRUTH, PACKED_TRUTH, RECORDING) or AGENT_FILE.match(path.name)
     )
     links = sorted(path.name for path in base.iterdir() if path.is_symlink())
     if links:
@@ -114,6 +117,8 @@ def finish_run(directory: Path, rules: Rules, outcome: Outcome, recorded: RunDat
         EVENTS: partial(_write_events, directory, run.events),
         SUMMARY: partial(replace_text, directory / SUMMARY, to_json(summary, indent=2) + "\n"),
         **{path.name: partial(_pack_ticks, path) for path in sorted(directory.glob("agent-*.ticks"))},
+        **{path.name: partial(_pack_plans, path) for path in sorted(directory.glob("agent-*.plans"))},
+        **{path.name: partial(_pack_truth, path) for path in directory.glob(TRUTH)},
         REPORT: lambda: write_report(directory, run, summary, read_text(directory / CONFIG), rules=rules),
     }
     return Finished(summary, write_each(writers))
@@ -134,9 +139,7 @@ def report_run(directory: Path, rules: Rules) -> Path:
         if finished.unwritten:
             raise StartError(f"{directory}: can't be written: {'; '.join(finished.unwritten)}")
         return directory / REPORT
-    if summary["agents"] != rules.agents:
-        problem = f"of {summary['agents']} agents, but {CONFIG} is of {rules.agents}. Remove it to have the run judged"
-        raise ConfigError(str(directory / SUMMARY), [problem])
+    refuse_other_swarm(directory, summary, rules.agents)
     try:
         return write_report(directory, load_run(directory), summary, read_text(directory / CONFIG), rules=rules)
     except OSError as error:
@@ -158,4 +161,16 @@ def _write_events(directory: Path, rows: Sequence[Mapping[str, Any]]) -> None:
 def _pack_ticks(path: Path) -> None:
     """Replace a file of raw rows by Parquet."""
     write_parquet(path.with_suffix(".parquet"), read_rows(path, TICK_DTYPE))
+    path.unlink()
+
+
+def _pack_plans(path: Path) -> None:
+    """Replace the raw points of an agent's predicted paths by Parquet."""
+    write_parquet(path.with_suffix(PACKED_PLANS), read_rows(path, PLAN_DTYPE), PLAN_COLUMNS)
+    path.unlink()
+
+
+def _pack_truth(path: Path) -> None:
+    """Replace the simulator's raw rows by Parquet."""
+    write_parquet(path.with_name(PACKED_TRUTH), read_rows(path, TRUTH_DTYPE), TRUTH_COLUMNS)
     path.unlink()

@@ -209,7 +209,7 @@ def test_a_trial_that_fails_is_reported_and_the_others_go_on() -> None:
 
 def test_no_cluster_is_refused_in_words() -> None:
     with pytest.raises(StartError, match=r"--dask"):
-        list(on_cluster([Trial(CELL, 1)], "127.0.0.1:1"))
+        list(on_cluster([Trial(CELL, 1)], "127.0.0.1:1", broken))
 
 
 @pytest.mark.parametrize(

@@ -84,6 +84,10 @@ def text_column(directory: Path) -> None:
     pq.write_table(pa.table({"t_us": ["yesterday", "today"]}), directory / "agent-0.parquet")
 
 
+def truth_of_text(directory: Path) -> None:
+    pq.write_table(pa.table({"t_us": ["yesterday", "today"]}), directory / "truth.parquet")
+
+
 def pipe_as(name: str) -> Callable[[Path], None]:
     def make(directory: Path) -> None:
         (directory / name).unlink(missing_ok=True)
@@ -108,7 +112,15 @@ def sparse_as(name: str) -> Callable[[Path], None]:
     return make
 
 
-_NAMES = ("config.toml", "summary.json", "events.jsonl", "agent-0.parquet", "agent-7.ticks", "truth.bin")
+_NAMES = (
+    "config.toml",
+    "summary.json",
+    "events.jsonl",
+    "agent-0.parquet",
+    "agent-7.ticks",
+    "truth.bin",
+    "truth.parquet",
+)
 REFUSED: dict[str, tuple[Callable[[Path], Any], str]] = {
     "summary torn": (lambda d: (d / "summary.json").write_text('{"outcome": "comp'), "summary.json"),
     "summary empty": (lambda d: (d / "summary.json").write_text(""), "summary.json"),
@@ -131,6 +143,8 @@ REFUSED: dict[str, tuple[Callable[[Path], Any], str]] = {
         "id",
     ),
     "Parquet of text": (text_column, "t_us holds no numbers"),
+    "truth torn": (lambda d: (d / "truth.parquet").write_bytes(b"PAR1" + bytes(100) + b"PAR1"), "truth.parquet"),
+    "truth of text": (truth_of_text, "t_us holds no numbers"),
     "Parquet torn": (lambda d: (d / "agent-1.parquet").write_bytes(b"PAR1" + bytes(100) + b"PAR1"), "agent-1.parquet"),
     "Parquet of noise": (lambda d: (d / "agent-1.parquet").write_bytes(os.urandom(1000)), "agent-1.parquet"),
     "ticks of 10,000 years": (lambda d: spread_of_times(d, "agent-0.ticks", TICK_DTYPE), "spans more than 48 hours"),

@@ -17,7 +17,7 @@ from swarmctl.core.records import TICK_DTYPE
 from swarmctl.core.tick_record import TickRecord
 from swarmctl.telemetry.recording import recorder as recorder_module
 from swarmctl.telemetry.recording.recorder import Recorder
-from swarmctl.telemetry.recording.run_files import load_run, read_rows
+from swarmctl.telemetry.recording.run_files import load_run, read_plans, read_rows
 from tests.benches.tick_records import tick_record
 
 
@@ -36,6 +36,12 @@ def test_round_trip(tmp_path: Path) -> None:
     rows = load_run(tmp_path).ticks[2]
     assert rows["seq"].tolist() == list(range(100))
     assert rows["pos_ned_m"][7].tolist() == [1.1, -2.2, -3.3]
+    plan, points = record(0).flown, read_plans(tmp_path, 2)
+    assert plan is not None
+    assert np.unique(points["t_us"]).tolist() == [seq * 20_000 for seq in range(0, 100, 5)], "ten a second"
+    first = points[points["t_us"] == 0]
+    np.testing.assert_array_equal(first["pos_ned_m"], plan.pos_ned_m.astype(np.float32))
+    assert first["at_us"].tolist() == [plan.t0_us + step * plan.dt_us for step in range(len(plan.pos_ned_m))]
     stamp = (1_780_000_000_000_000).to_bytes(8, "big")
     assert (tmp_path / "agent-2.tlog").read_bytes() == stamp + b"\xfdframe"
     (event,) = [json.loads(line) for line in (tmp_path / "agent-2.events.jsonl").read_text().splitlines()]
@@ -64,7 +70,7 @@ def test_vanished_folder_is_counted(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "gone", 0)
     recorder.tick(record(0))
     recorder.close(5.0)
-    assert recorder.lost == 1
+    assert recorder.lost == 2, "the tick and its predicted path"
 
 
 def test_full_queue_drops_without_waiting(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -78,7 +84,7 @@ def test_full_queue_drops_without_waiting(tmp_path: Path, monkeypatch: pytest.Mo
     began_s = time.monotonic()
     for seq in range(500):
         recorder.tick(record(seq))
-    assert recorder.lost == 400, "a hundred fit, and no more is kept in memory"
+    assert recorder.lost == 500, "of 500 ticks and 100 plans a hundred fit, and no more is kept in memory"
     recorder.close(0.1)
     assert time.monotonic() - began_s < 1.0
     assert recorder.lost >= 500

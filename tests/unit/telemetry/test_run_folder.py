@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from swarmctl import __version__
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
+from swarmctl.core.records import PLAN_DTYPE, TICK_DTYPE, TRUTH_COLUMNS, TRUTH_DTYPE
 from swarmctl.core.tick_record import COLUMNS
-from swarmctl.core.types import Mode, Phase
+from swarmctl.core.types import FlightMode, Mode, Phase, PlanStatus
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.telemetry.evaluation.referee import Rules
-from swarmctl.telemetry.recording.run_files import load_run, read_parquet, write_parquet
+from swarmctl.telemetry.recording.run_files import load_run, read_parquet, read_plans, write_parquet
 from swarmctl.telemetry.recording.run_folder import Outcome, create_run_folder, finish_run, report_run
 from swarmctl.telemetry.report.charts import thin
 
@@ -110,6 +110,52 @@ def test_parquet_says_unit_meaning_and_version(tmp_path: Path) -> None:
     assert told == {b"unit": b"m", b"description": b"the mission's reference now", b"entity": b"world/reference"}
     assert [field.name for field in schema] == [part for column in COLUMNS for part in column.parts]
     assert all(field.metadata[b"description"] for field in schema)
+    named = {"phase": Phase, "mode": Mode, "flight_mode": FlightMode, "plan_status": PlanStatus}
+    for field in schema:
+        said = {b"unit", b"description", b"entity"} | ({b"names"} if field.name in named else set())
+        assert set(field.metadata) == said
+    for name, kind in named.items():
+        assert json.loads(schema.field(name).metadata[b"names"]) == {str(int(member)): member.name for member in kind}
+
+
+def test_true_states_become_parquet_with_units_and_names(tmp_path: Path) -> None:
+    write_run(tmp_path, 3, 6.0)
+    raw = load_run(tmp_path).truth
+    finish_run(tmp_path, RULES, Outcome(outcome="completed"))
+    assert not (tmp_path / "truth.bin").exists()
+    np.testing.assert_array_equal(load_run(tmp_path).truth, raw)
+    schema = pq.read_schema(tmp_path / "truth.parquet")
+    assert [field.name for field in schema] == [part for column in TRUTH_COLUMNS for part in column.parts]
+    assert schema.field("vel_ned_m_s_z").metadata[b"unit"] == b"m/s"
+    assert json.loads(schema.field("landed").metadata[b"names"])["1"] == "ON_GROUND"
+
+
+def test_predicted_paths_become_parquet(tmp_path: Path) -> None:
+    write_run(tmp_path, 3, 6.0)
+    points = np.zeros(82, PLAN_DTYPE)
+    points["t_us"] = np.repeat([0, 100_000], 41)
+    points["at_us"] = points["t_us"] + np.tile(np.arange(41) * 50_000, 2)
+    points["pos_ned_m"] = np.arange(82 * 3).reshape(82, 3)
+    points.tofile(tmp_path / "agent-1.plans")
+    np.testing.assert_array_equal(read_plans(tmp_path, 1), points)
+    finish_run(tmp_path, RULES, Outcome(outcome="completed"))
+    assert not (tmp_path / "agent-1.plans").exists()
+    np.testing.assert_array_equal(read_plans(tmp_path, 1), points)
+    assert len(read_plans(tmp_path, 0)) == 0
+    assert sorted(load_run(tmp_path).ticks) == [0, 1, 2], "they are no ticks"
+    assert pq.read_schema(tmp_path / "agent-1.plans.parquet").field("pos_ned_m_z").metadata[b"unit"] == b"m"
+    (tmp_path / "agent-1.plans.parquet").write_bytes(b"PAR1")
+    with pytest.raises(ConfigError, match=r"agent-1.plans.parquet"):
+        read_plans(tmp_path, 1)
+
+
+def test_raw_true_states_replace_packed_ones(tmp_path: Path) -> None:
+    """As raw ticks do: an unfinished packing leaves both."""
+    write_run(tmp_path, 3, 6.0)
+    raw = (tmp_path / "truth.bin").read_bytes()
+    finish_run(tmp_path, RULES, Outcome(outcome="completed"))
+    (tmp_path / "truth.bin").write_bytes(raw[: 4 * TRUTH_DTYPE.itemsize])
+    assert len(load_run(tmp_path).truth) == 4
 
 
 def rewrite(path: Path, keep: Callable[[str], str]) -> None:
@@ -196,7 +242,7 @@ def test_finished_run_is_complete_and_may_be_finished_again(tmp_path: Path) -> N
     assert summary["separation"]["min_m"] == pytest.approx(0.6 * np.sqrt(3))
     names = {path.name for path in tmp_path.iterdir()}
     parquets = {f"agent-{agent}.parquet" for agent in range(3)}
-    assert names == parquets | {"truth.bin", "config.toml", "events.jsonl", "summary.json", "report.html"}
+    assert names == parquets | {"truth.parquet", "config.toml", "events.jsonl", "summary.json", "report.html"}
     sources = [json.loads(line)["source"] for line in (tmp_path / "events.jsonl").read_text().splitlines()]
     assert sources == ["launch", "agent-0", "agent-1", "agent-2"]
     assert finish_run(tmp_path, RULES, Outcome(outcome="completed", events=own)) == (summary, ())

@@ -1,0 +1,122 @@
+"""The `sweep` verb: flies what is missing in a folder, and shows the combinations as a table and a page."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+from sitl.studies.campaign.progress import collect
+from sitl.studies.campaign.source import code_id
+from sitl.studies.campaign.store import ROWS, RowStore
+from sitl.studies.campaign.worker_pool import on_this_machine
+from sitl.studies.sweep.figures import SHOWN, Combination, Row, combinations, schema_of
+from sitl.studies.sweep.flight import FlySweep
+from sitl.studies.sweep.page import cell_text, write_page
+from sitl.studies.sweep.points import Axis, Flight, flights_of, parse_axes, problems_of
+from swarmctl.config import Config, dump, load
+from swarmctl.errors import EXIT_MISSION, EXIT_OK, ConfigError
+from swarmctl.files import replace_text
+
+BASE = "config.toml"  # in the folder: the configuration to which swept values are applied
+_SHOWN_CHANGES = 5
+_Key = tuple[tuple[float | str, ...], int]  # stored values of the axes, and the seed
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SweepOptions:
+    """Options of the verb."""
+
+    config: Path | None
+    sets: tuple[str, ...]
+    seeds: int
+    jobs: int
+    out: Path
+
+
+def sweep(options: SweepOptions) -> int:
+    """Fly the combinations that are missing; return 4 when one has failed or could not be flown.
+
+    Raises:
+        ConfigError: a combination is impossible, or the folder holds another sweep.
+        StartError: a process ended by itself.
+    """
+    base = load(options.config)
+    axes = parse_axes(options.sets)
+    flights = flights_of(axes, base.seed, options.seeds)
+    if problems := list(problems_of(flights, options.config)):
+        raise ConfigError("sweep", problems)
+    options.out.mkdir(parents=True, exist_ok=True)
+    _claim(options.out, base)
+    began_s, keyed = time.monotonic(), {_key(axes, flight): flight for flight in flights}
+    with RowStore(options.out, code_id(), schema=schema_of(axes), job_of=partial(_key_of_row, axes)) as store:
+        todo = [keyed[key] for key in store.missing(keyed)]
+        print(f"{len(flights)} flights, {len(flights) - len(todo)} of them there already; {options.out}", flush=True)
+        jobs = min(options.jobs, max(1, len(todo)))
+        flown = on_this_machine(todo, jobs, FlySweep(options.out / BASE, tuple(axes)))
+        count, errors = collect(flown, len(todo), store, noted=("failed", lambda row: row["outcome"] != "completed"))
+    rows = [row for row in store.rows if _key_of_row(axes, row) in keyed]
+    found = combinations(axes, rows)
+    report = write_page(options.out, axes, found, code_id(), config_text=dump(base))
+    _print_table(axes, found)
+    print(f"{count} flown in {time.monotonic() - began_s:.0f} s; {options.out / ROWS}, {report}")
+    for error in errors:
+        print(error, file=sys.stderr)
+    failed = errors or any(row["outcome"] != "completed" for row in rows)
+    return EXIT_MISSION if failed else EXIT_OK
+
+
+def _key(axes: Sequence[Axis], flight: Flight) -> _Key:
+    """Return by what a flight is told from others."""
+    values = (axis.stored(value) for axis, (_, value) in zip(axes, flight.settings, strict=True))
+    return tuple(values), flight.seed
+
+
+def _key_of_row(axes: Sequence[Axis], row: Row) -> _Key:
+    return tuple(row[axis.key] for axis in axes), row["seed"]
+
+
+def _claim(directory: Path, base: Config) -> None:
+    """Write the configuration of a new sweep, or check that it is the one whose rows are there.
+
+    Raises:
+        ConfigError: the folder holds a sweep of another configuration; says which keys differ.
+    """
+    path = directory / BASE
+    if not path.exists():
+        replace_text(path, dump(base))
+        return
+    before, now = (dict(_leaves(config.model_dump(), "")) for config in (load(path), base))
+    changed = [key for key in sorted({*before, *now}) if before.get(key) != now.get(key)]
+    if changed:
+        shown = ", ".join(f"{key} was {before.get(key)} and is {now.get(key)}" for key in changed[:_SHOWN_CHANGES])
+        more = f", and {len(changed) - _SHOWN_CHANGES} more" if len(changed) > _SHOWN_CHANGES else ""
+        raise ConfigError(str(path), [f"of another configuration: {shown}{more}. Give a new --out"])
+
+
+def _leaves(tree: Any, key: str) -> Iterator[tuple[str, Any]]:
+    """Yield every value of a tree by its dotted key."""
+    if isinstance(tree, dict):
+        for name, value in tree.items():
+            yield from _leaves(value, f"{key}.{name}" if key else name)
+    else:
+        yield key, tree
+
+
+def _print_table(axes: Sequence[Axis], found: Sequence[Combination]) -> None:
+    table = Table(box=None, pad_edge=False)
+    for axis in axes:
+        table.add_column(axis.key.rpartition(".")[2])
+    for name in ("completed", *SHOWN):
+        table.add_column(name, justify="right")
+    for one in found:
+        figures = [cell_text(one.figures[name]) for name in SHOWN]
+        table.add_row(*map(cell_text, one.values), f"{one.completed}/{one.flights}", *figures)
+    Console(width=None if sys.stdout.isatty() else 160, highlight=False).print(table)

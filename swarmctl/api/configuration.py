@@ -1,0 +1,39 @@
+"""Reads a configuration for scripts: the same file, checks and words of refusal as on the command line."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from swarmctl.config import NO_VALUES, Config
+from swarmctl.config import load as load_config
+
+__all__ = ["Config", "load"]
+
+
+def load(
+    path: str | Path | None = None,
+    set: Mapping[str, Any] = NO_VALUES,  # noqa: A002  (as the option is called)
+) -> Config:
+    """Return the checked configuration of a run, which is frozen.
+
+    Args:
+        path: a TOML file; None for the defaults, the circle of the thesis.
+        set: values by dotted key, for example `{"swarm.agents": 5, "mission.kind": "circle"}`; items of lists by index,
+            as in `"vehicles.0.url"`.
+
+    Raises:
+        ConfigError: it is invalid; lists all problems with key, value, allowed range and fix.
+    """
+    values = {key: _plain(value) for key, value in set.items()}
+    return load_config(None if path is None else Path(path), values=values)
+
+
+def _plain(value: Any) -> Any:
+    """Return an array or number of numpy as Python's own, which the strict checks of types expect."""
+    if hasattr(value, "tolist"):
+        return value.tolist()
+    if isinstance(value, (list, tuple)):
+        return [_plain(item) for item in value]
+    return str(value) if isinstance(value, Path) else value

@@ -1,0 +1,241 @@
+"""Flies a configuration from a script: `simulate` in lockstep, `launch` in real time. Both end with a `Run`.
+
+The flight is made by the verbs of the command line in processes of their own, because a flight needs signals, real-time
+priority and a simulator that the bridge never imports. So a script flies exactly what the command line flies.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+import msgspec
+
+from swarmctl.api.flight_process import FlightProcess
+from swarmctl.api.run import Run, load_run
+from swarmctl.config import Config, dump
+from swarmctl.core.operator_verbs import GOTO, POINT, SPEED, YAW, Order, order_problem
+from swarmctl.core.types import FlightMode, Mode, Phase
+from swarmctl.errors import ConfigError, MissionError, StartError
+from swarmctl.files import read_file, replace_text
+from swarmctl.ops.operator import LAUNCH_FILE, RunningLaunch, read_statuses
+from swarmctl.ops.order_delivery import deliver
+from swarmctl.telemetry.recording.run_files import CONFIG
+from swarmctl.telemetry.recording.run_folder import create_run_folder
+
+_READY_S = 120.0  # for the launch to have started every process
+_POLL_S = 0.1
+_MAX_NOTE_BYTES = 65_536
+Agents = int | Iterable[int] | None
+
+
+def simulate(config: Config | None = None, folder: str | Path | None = None) -> Run:
+    """Fly in lockstep, faster than real time, and return the recorded run. The same seed gives the same run.
+
+    Args:
+        config: what to fly; None for the defaults.
+        folder: run folder to create; None for `runs/<UTC>-<name>`.
+
+    Raises:
+        ConfigError, StartError: nothing was flown. A failed mission is no error: see `Run.outcome`.
+    """
+    flown = config or Config()
+    directory = _new_folder(flown, folder)
+    process = FlightProcess("simulate", directory, "sitl.simulate", str(directory / CONFIG), f"--run-dir={directory}")
+    process.wait()
+    process.refuse_no_flight()
+    return load_run(directory)
+
+
+def launch(config: Config | None = None, folder: str | Path | None = None, *, view: bool = False) -> Swarm:
+    """Start simulator, agents and bus, and fly in real time; with your own vehicles if the configuration says so.
+
+    Use it as a context: what still flies at its end is landed, and waited for. Returns once every process has started.
+
+    Args:
+        config: what to fly; None for the defaults.
+        folder: run folder to create; None for `runs/<UTC>-<name>`.
+        view: open the viewer window.
+
+    Raises:
+        ConfigError, StartError: it was refused or did not come up; nothing is left running.
+    """
+    flown = config or Config()
+    directory = _new_folder(flown, folder)
+    shown = "--view" if view else "--no-view"
+    arguments = ("swarmctl", "launch", str(directory / CONFIG), f"--run-dir={directory}", shown)
+    swarm = Swarm(flown, directory, FlightProcess("launch", directory, *arguments))
+    swarm.wait_for_start()
+    return swarm
+
+
+def _new_folder(config: Config, folder: str | Path | None) -> Path:
+    """Return a new run folder that holds the configuration."""
+    directory = create_run_folder(None if folder is None else Path(folder), config.name, time.time_ns() // 1000)
+    replace_text(directory / CONFIG, dump(config))
+    return directory.resolve()
+
+
+class Swarm:
+    """A launch that flies; its verbs are those of the command line.
+
+    Attributes:
+        config: what it flies.
+        folder: its run folder.
+    """
+
+    def __init__(self, config: Config, folder: Path, process: FlightProcess) -> None:
+        self.config = config
+        self.folder = folder
+        self._process = process
+
+    def __enter__(self) -> Swarm:
+        """Return the swarm itself."""
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """Land what still flies, and wait for the end; a second Ctrl-C ends everything at once."""
+        self._process.interrupt()
+        self._process.wait()
+
+    @property
+    def is_flying(self) -> bool:
+        """Whether the launch still runs."""
+        return self._process.is_running
+
+    def hold(self, agents: Agents = None) -> None:
+        """Brake and hold position; see `order`."""
+        self.order("hold", agents)
+
+    def resume(self, agents: Agents = None) -> None:
+        """Go on with the mission after `hold`; see `order`."""
+        self.order("resume", agents)
+
+    def land(self, agents: Agents = None) -> None:
+        """Separate, then land; see `order`."""
+        self.order("land", agents)
+
+    def rtl(self, agents: Agents = None) -> None:
+        """Fly back to the start, then land; see `order`."""
+        self.order("rtl", agents)
+
+    def goto(
+        self,
+        agent: int,
+        point_ned_m: Sequence[float],
+        *,
+        yaw_deg: float | None = None,
+        speed_m_s: float | None = None,
+    ) -> None:
+        """Fly one agent to a point, and hold there until `resume`; see `order`.
+
+        Args:
+            agent: its number.
+            point_ned_m: (3,) in the shared frame.
+            yaw_deg: heading there, clockwise from north; None for that of the mission.
+            speed_m_s: peak speed; None for `agent.state_machine.speed_m_s`.
+        """
+        asked = dict(zip(POINT, map(float, point_ned_m), strict=True))
+        chosen = {YAW: yaw_deg, SPEED: speed_m_s}
+        self.order(GOTO, agent, **asked, **{name: value for name, value in chosen.items() if value is not None})
+
+    def order(self, verb: str, agents: Agents = None, **arguments: float) -> None:
+        """Give an order of the operator, and return once every agent asked has accepted it, and begun a stop.
+
+        Args:
+            verb: one of `swarmctl.core.operator_verbs.OPERATOR_VERBS`.
+            agents: number of an agent, several numbers, or None for all.
+            arguments: those of the verb, by name with the unit.
+
+        Raises:
+            ConfigError: there is no such verb, or its arguments are others.
+            StartError: the launch has ended, or there is no such agent.
+            MissionError: an agent refuses it or is silent; says which and why.
+        """
+        if problem := order_problem(verb, arguments):
+            raise ConfigError("order", [problem])
+        self._refuse_ended(verb)
+        asked = [agents] if isinstance(agents, int) else list(agents or ())
+        replies = deliver(self._note(), Order(verb, arguments), asked)
+        if problems := [reply.problem for reply in replies if reply.problem]:
+            raise MissionError("\n".join(problems))
+
+    def status(self) -> dict[int, dict[str, Any]]:
+        """Return the newest status of every agent that answers, by agent; phase and modes are words.
+
+        Raises:
+            StartError: the launch has ended.
+        """
+        self._refuse_ended("status")
+        found = {}
+        for agent, status in read_statuses(self._note()).items():
+            names = {"phase": Phase(status.phase), "mode": Mode(status.mode)}
+            names["flight_mode"] = FlightMode(status.flight_mode)
+            found[agent] = msgspec.to_builtins(status) | {key: value.name for key, value in names.items()}
+        return found
+
+    def wait_for(self, phase: str, timeout_s: float = 120.0) -> None:
+        """Wait until every agent has reached a phase, for example "TRACK", or a later one.
+
+        Raises:
+            TimeoutError: not all of them have, after `timeout_s`.
+            StartError: the launch has ended before.
+        """
+        wanted, until_s = Phase[phase], time.monotonic() + timeout_s
+        while True:
+            phases = {agent: status["phase"] for agent, status in self.status().items()}
+            if len(phases) == self.config.swarm.agents and all(Phase[name] >= wanted for name in phases.values()):
+                return
+            if time.monotonic() > until_s:
+                raise TimeoutError(f"not all agents have reached {phase} after {timeout_s:g} s: {phases}")
+            time.sleep(_POLL_S)
+
+    def wait(self, timeout_s: float | None = None) -> Run:
+        """Wait until the mission has ended and every vehicle is down, and return the recorded run.
+
+        Raises:
+            TimeoutError: it still flies after `timeout_s`.
+            StartError: it did not come up.
+        """
+        self._process.wait(timeout_s)
+        return self.run
+
+    @property
+    def run(self) -> Run:
+        """The recorded run, once the launch has ended.
+
+        Raises:
+            StartError: it still flies, or did not come up.
+        """
+        if self.is_flying:
+            raise StartError(f"{self.folder.name} still flies; wait() for its end, or land()")
+        self._process.refuse_no_flight()
+        return load_run(self.folder)
+
+    def wait_for_start(self) -> None:
+        """Wait until every process of the launch has started.
+
+        Raises:
+            ConfigError, StartError: it was refused or did not come up; nothing is left running.
+        """
+        until_s = time.monotonic() + _READY_S
+        while not (self.folder / LAUNCH_FILE).exists():
+            if not self.is_flying:
+                self._process.refuse_no_flight()
+                return
+            if time.monotonic() > until_s:
+                self.__exit__(None, None, None)
+                raise StartError(f"{self.folder.name} did not start within {_READY_S:.0f} s; see its launch.log")
+            time.sleep(_POLL_S)
+
+    def _note(self) -> RunningLaunch:
+        return msgspec.json.decode(read_file(self.folder / LAUNCH_FILE, _MAX_NOTE_BYTES), type=RunningLaunch)
+
+    def _refuse_ended(self, verb: str) -> None:
+        if not self.is_flying:
+            raise StartError(f"{verb}: {self.folder.name} has ended")

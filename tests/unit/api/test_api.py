@@ -1,0 +1,155 @@
+"""The Python API without a flight: quick import, configurations, runs from folders, refusals."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import swarmctl
+from swarmctl.api.flight_process import FlightProcess
+from swarmctl.config import Config, dump
+from swarmctl.core.types import Phase
+from swarmctl.telemetry.recording.run_folder import Outcome, finish_run
+from tests.unit.ops.test_cli import HEAVY
+from tests.unit.telemetry.test_hostile_run_folder import REFUSED
+from tests.unit.telemetry.test_run_folder import RULES, write_run
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("run")
+    write_run(directory, 3, 6.0)
+    (directory / "config.toml").write_text(dump(Config()))
+    finish_run(directory, RULES, Outcome(outcome="completed"))
+    return directory
+
+
+@pytest.fixture
+def folder(finished: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(finished, tmp_path / "run"))
+
+
+def test_importing_the_package_imports_nothing_heavy_and_has_every_name() -> None:
+    code = f"import sys, swarmctl; print([m for m in {HEAVY!r} if m in sys.modules])\n"
+    code += "assert [getattr(swarmctl, name) for name in dir(swarmctl)]"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60, check=True)
+    assert done.stdout == "[]\n"
+    with pytest.raises(AttributeError, match="no attribute 'lanch'"):
+        _ = swarmctl.lanch  # type: ignore[attr-defined]
+
+
+def test_type_checkers_are_told_every_name() -> None:
+    declared = (Path(swarmctl.__file__).with_suffix(".pyi")).read_text()
+    assert all(f" import {name} as {name}\n" in declared for name in swarmctl._OWNERS)  # type: ignore[attr-defined]
+    assert Path(swarmctl.__file__).with_name("py.typed").exists()
+
+
+def test_values_are_set_as_python_has_them() -> None:
+    config = swarmctl.load(
+        set={"swarm.agents": 2, "start.center_ned_m": np.array([0.0, 1.0, -2.0]), "mission.duration_s": np.float64(5.0)}
+    )
+    assert (config.swarm.agents, config.start.center_ned_m) == (2, (0.0, 1.0, -2.0))
+    with pytest.raises(swarmctl.ConfigError) as caught:
+        swarmctl.load(set={"swarm.agents": 2.5, "swarm.agent": 1, "name": 3})
+    assert len(caught.value.problems) == 3
+    with pytest.raises(swarmctl.ConfigError, match="write it as key"):
+        swarmctl.load(set={"swarm..agents": 1})
+    with pytest.raises(swarmctl.ConfigError, match="no such file"):
+        swarmctl.load("nowhere.toml")
+
+
+def test_a_run_has_names_and_units(finished: Path) -> None:
+    run = swarmctl.load_run(str(finished))
+    assert (run.agents, run.outcome, run.violations) == ((0, 1, 2), "completed", [])
+    assert run.summary == json.loads((finished / "summary.json").read_text())
+    assert run.config == Config()
+    ticks, rows = run.ticks(1), run.tick_rows(1)
+    assert ticks["phase"].to_pylist() == [Phase(number).name for number in rows["phase"]]
+    assert ticks.schema.field("vel_ned_m_s_x").metadata[b"unit"] == b"m/s"
+    np.testing.assert_array_equal(ticks["pos_ned_m_z"].to_numpy(), rows["pos_ned_m"][:, 2])
+    assert len(run.true_rows()) == 3 * len(run.true_rows(2)) == 3 * run.true_states(2).num_rows
+    assert set(run.true_states()["landed"].to_pylist()) == {"UNKNOWN"}
+    assert [event["source"] for event in run.events] == ["agent-0", "agent-1", "agent-2"]
+    with pytest.raises(KeyError, match="agent 3 has recorded no ticks"):
+        run.ticks(3)
+
+
+def test_a_number_without_a_name_stays_a_number(folder: Path) -> None:
+    run = swarmctl.load_run(folder)
+    run.tick_rows(0)["mode"][5] = 77
+    assert run.ticks(0)["mode"][5].as_py() == "77"
+
+
+SPOILT = (  # one of each kind; tests/unit/telemetry/test_hostile_run_folder.py has all of them, with the same reader
+    "summary torn",
+    "agents = 1e9",
+    "Parquet torn",
+    "ticks of 10,000 years",
+    "truth torn",
+    "events.jsonl of 1 TB",
+    "pipe as config.toml",
+    "device as truth.parquet",
+)
+
+
+@pytest.mark.parametrize("spoil", [REFUSED[kind][0] for kind in SPOILT], ids=SPOILT)
+@pytest.mark.timeout(60)
+def test_a_spoilt_folder_is_refused_in_one_line(folder: Path, spoil: Callable[[Path], Any]) -> None:
+    spoil(folder)
+    with pytest.raises(swarmctl.ConfigError) as caught:
+        swarmctl.load_run(folder)
+    assert len(caught.value.problems) == 1
+    assert str(folder) in str(caught.value)
+
+
+def test_a_folder_that_is_not_finished_says_what_to_do(folder: Path, tmp_path: Path) -> None:
+    (folder / "summary.json").unlink()
+    with pytest.raises(swarmctl.ConfigError, match="swarmctl report"):
+        swarmctl.load_run(folder)
+    (folder / "config.toml").unlink()
+    with pytest.raises(swarmctl.ConfigError, match="is no run folder"):
+        swarmctl.load_run(folder)
+    with pytest.raises(swarmctl.ConfigError, match="no such run folder"):
+        swarmctl.load_run(tmp_path / "nowhere")
+
+
+def test_what_was_not_flown_raises_the_words_of_the_command_line(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(swarmctl.ConfigError, match="holds a run already"):
+        swarmctl.simulate(Config(), folder)
+    real = swarmctl.load(
+        set={"sitl.enabled": False, "swarm.agents": 1, "vehicles": [{"sysid": 1, "url": "serial:///dev/none:57600"}]}
+    )
+    with pytest.raises(swarmctl.StartError, match="/dev/none"):
+        swarmctl.launch(real, tmp_path / "new")
+
+
+def test_an_order_that_does_not_exist_or_comes_too_late_is_refused(tmp_path: Path) -> None:
+    process = FlightProcess("launch", tmp_path, "swarmctl", "--version")
+    process.wait(60)
+    swarm = swarmctl.Swarm(Config(), tmp_path, process)
+    with pytest.raises(swarmctl.ConfigError, match="known are hold"):
+        swarm.order("jump")
+    with pytest.raises(swarmctl.ConfigError, match="takes no arguments"):
+        swarm.order("hold", height_m=1.0)
+    with pytest.raises(swarmctl.StartError, match="has ended"):
+        swarm.hold()
+
+
+def test_waiting_has_an_end(tmp_path: Path) -> None:
+    process = FlightProcess("launch", tmp_path, "http.server", "--bind", "127.0.0.1", "0")
+    with pytest.raises(TimeoutError, match="still flies after"):
+        process.wait(0.2)
+    swarm = swarmctl.Swarm(Config(), tmp_path, process)
+    with pytest.raises(swarmctl.StartError, match="still flies"):
+        _ = swarm.run
+    with swarm:
+        pass
+    assert not swarm.is_flying, "the end of the block has asked it to land, and waited"
