@@ -47,7 +47,8 @@ def refusal_of(order: Order, situation: OrderSituation) -> str:
         down = situation.state is not None and situation.state.landed is Landed.ON_GROUND
         return "" if down else "its mission has ended and it was handed back in the air"
     if situation.pilot_override and order.verb != "resume":
-        return "a pilot or its autopilot has taken over; take it back with: resume"
+        flown = "" if situation.state is None else f" and flies it in {situation.state.mode.name}"
+        return f"a pilot or its autopilot has taken over{flown}; take it back with: resume"
     if verb.is_stop:
         lands = phase is Phase.GOTO_LAND and situation.lands_in_place
         return "it is landing where it is" if lands and order.verb == "rtl" else ""

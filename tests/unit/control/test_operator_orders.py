@@ -105,7 +105,7 @@ def test_a_vehicle_that_its_pilot_flies_refuses_all_but_resume(verb: str) -> Non
     flight = controlled(Phase.TRACK)
     flight.failsafe_mode, flight.flight_mode = Mode.PILOT_OVERRIDE, FlightMode.MANUAL
     flight.run(0.5)
-    assert "taken over" in flight.ask(verb)
+    assert "has taken over and flies it in MANUAL; take it back with: resume" in flight.ask(verb)
     assert (flight.phase, flight.state_machine.outcome) == (Phase.TRACK, TAKEN_OVER)
     assert flight.ask("resume") == ""
     assert not flight.state_machine.pilot_override
