@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
 import tomli_w
 from pydantic import Field
 
@@ -19,9 +20,11 @@ from swarmctl.agent.setup import AgentParams
 from swarmctl.bus.json_messages import MAX_OBSTACLES
 from swarmctl.config_problems import validated
 from swarmctl.config_source import override, read_tree
+from swarmctl.config_tables import read_tables
 from swarmctl.control.collision.separation import SeparationParams, radius_problem
 from swarmctl.control.controllers.discovery import ControllerParams
 from swarmctl.control.model import VehicleModelParams
+from swarmctl.control.reference.feasibility import FlightLimits, infeasible
 from swarmctl.control.reference.mission import MissionParams
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.params import Params, Vec3
@@ -193,10 +196,11 @@ def load(path: Path | None, overrides: Sequence[str] = ()) -> Config:
     source = str(path) if path else "defaults"
     tree = read_tree(path)
     problems = [p for item in overrides for p in override(tree, item)]
+    problems = problems or read_tables(tree, Path.cwd() if path is None else path.parent)
     if problems:
         raise ConfigError(source, problems)
     config = validated(Config, tree, source, _RENAMED)
-    problems = list(_whole(config))
+    problems = list(_whole(config)) or list(_infeasible(config))
     if problems:
         raise ConfigError(source, problems)
     return config
@@ -244,6 +248,19 @@ def _whole(config: Config) -> Iterator[str]:
             f"limits.min_separation_m = {config.limits.min_separation_m}: larger than separation.radius_m = "
             f"{config.separation.radius_m}; agents would be judged by more than they keep. Lower it or raise the radius"
         )
+
+
+def _infeasible(config: Config) -> Iterator[str]:
+    """Yield why the references of a configuration without other problems can't be flown."""
+    separation = config.separation
+    limits = FlightLimits(
+        duration_s=config.mission.duration_s,
+        apart_m=separation.radius_m,
+        downwash=separation.downwash,
+        ground_z_m=config.sitl.ground_z_m if config.sitl.enabled else None,
+    )
+    references = config.mission.references(np.array(config.starts_ned_m()), separation.budget.planned_m)
+    yield from infeasible(references, [config.model_of(i) for i in range(len(references))], limits)
 
 
 def _starts_apart(config: Config) -> Iterator[str]:

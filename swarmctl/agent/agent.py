@@ -451,7 +451,7 @@ class Agent:
             flies=flies,
             committed_peers=self._directive.committed_peers,
         )
-        yaw_rad, hover_01 = self._setup.mission.yaw_rad, estimate.hover_thrust_01
+        yaw_rad, hover_01 = self._reference_selector.turn(self._clock.utc_us()), estimate.hover_thrust_01
         setpoint = setpoint_of(virtual_control, yaw_rad, hover_01, now_us, params=self._setup.vehicle_model)
         refused = self._autopilot.send(setpoint, self._clock.now_us())
         if refused:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from functools import partial
 
@@ -13,7 +14,9 @@ from swarmctl.control.commit.trajectory_planner import DesiredReference
 from swarmctl.control.phases.state_machine import MissionStateMachine
 from swarmctl.control.reference.deadlock import Deadlock, DeadlockRecovery
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.types import Array, Reference, Sampled
+from swarmctl.core.types import Array, Phase, Reference, Sampled
+
+_YAW_RATE_RAD_S = 1.0  # fastest change of the heading between two references
 
 
 class ReferenceSelector:
@@ -29,6 +32,21 @@ class ReferenceSelector:
         self._state_machine, self._note, self._yaw_rad = state_machine, note, setup.mission.yaw_rad
         self._recovery = DeadlockRecovery(setup.params.deadlock, setup.agent, setup.separation.budget.radius_m)
         self._reported: Deadlock | None = None
+        self._ramp_rad_per_tick = _YAW_RATE_RAD_S / setup.params.rate_hz
+        self._initial_yaw_rad = self._yaw_rad
+
+    def turn(self, utc_us: int) -> float:
+        """Return the heading [rad] of this tick; called once in each, it turns no faster than a vehicle may.
+
+        While the mission is interrupted the heading stays, before and after it is that of the configuration.
+        """
+        wanted = self._state_machine.mission_yaw_rad(utc_us)
+        if wanted is None:
+            wanted = self._yaw_rad if self._state_machine.phase is Phase.TRACK else self._initial_yaw_rad
+        error_rad = math.remainder(wanted - self._yaw_rad, 2.0 * math.pi)
+        step_rad = max(-self._ramp_rad_per_tick, min(self._ramp_rad_per_tick, error_rad))
+        self._yaw_rad = wanted if step_rad == error_rad else self._yaw_rad + step_rad
+        return self._yaw_rad
 
     def update(
         self,
