@@ -27,11 +27,13 @@ from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.reference.feasibility import FlightLimits, infeasible
 from swarmctl.control.reference.mission import MissionParams
 from swarmctl.core.obstacle import Obstacle
+from swarmctl.core.own import OwnError
 from swarmctl.core.params import Params, Vec3
 from swarmctl.errors import ConfigError
 from swarmctl.mavlink.geofence import GeofenceParams
 from swarmctl.mavlink.parameter_names import parameter_problems
 from swarmctl.mavlink.transport import Endpoint, parse_url
+from swarmctl.own_modules import locate, make_importable, own_problems
 from swarmctl.simulator_config import MAX_VEHICLES, OriginParams, SimulatorConfig, SimulatorParams
 from swarmctl.telemetry.evaluation.referee import Rules
 
@@ -112,6 +114,7 @@ class Config(Params):
 
     name: str = Field("swarm", pattern=r"^[A-Za-z0-9_-]{1,40}$")  # part of the run folder's name
     seed: int = Field(1, ge=0, le=2**31 - 1)  # seeds every random stream
+    own_folder: str = ""  # of own modules; filled in, by default with the folder of this file
     swarm: SwarmParams = SwarmParams()
     start: StartParams = StartParams()
     mission: MissionParams = MissionParams()
@@ -196,10 +199,16 @@ def load(path: Path | None, overrides: Sequence[str] = ()) -> Config:
     source = str(path) if path else "defaults"
     tree = read_tree(path)
     problems = [p for item in overrides for p in override(tree, item)]
-    problems = problems or read_tables(tree, Path.cwd() if path is None else path.parent)
+    folder = Path.cwd() if path is None else path.parent
+    problems = problems or read_tables(tree, folder)
     if problems:
         raise ConfigError(source, problems)
+    locate(tree, folder)
     config = validated(Config, tree, source, _RENAMED)
+    make_importable(config.own_folder)
+    problems = list(own_problems(config.mission, config.controller, config.vehicle_model, config.separation))
+    if problems:
+        raise ConfigError(source, problems)
     problems = list(_whole(config)) or list(_infeasible(config))
     if problems:
         raise ConfigError(source, problems)
@@ -236,6 +245,8 @@ def _whole(config: Config) -> Iterator[str]:
             "real time: swarmctl simulate, or python -m sitl --speed with clients of your own"
         )
     yield from config.mission.problems(agents)
+    if config.controller.is_own and not config.agent.barrier.enabled:
+        yield "agent.barrier.enabled = false: an own controller flies behind the safety filter only; set it to true"
     if agents > 1 and (problem := radius_problem(config.separation, 0.0, config.drift_m)):
         yield problem
     if config.separation.gust_m_s and not config.vehicle_model.drag_1_s:
@@ -259,7 +270,11 @@ def _infeasible(config: Config) -> Iterator[str]:
         downwash=separation.downwash,
         ground_z_m=config.sitl.ground_z_m if config.sitl.enabled else None,
     )
-    references = config.mission.references(np.array(config.starts_ned_m()), separation.budget.planned_m)
+    try:
+        references = config.mission.references(np.array(config.starts_ned_m()), separation.budget.planned_m)
+    except OwnError as error:
+        yield f"mission.kind = {config.mission.kind!r}: {error}"
+        return
     yield from infeasible(references, [config.model_of(i) for i in range(len(references))], limits)
 
 

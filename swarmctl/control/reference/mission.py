@@ -7,17 +7,21 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from pydantic import Field
 
 from swarmctl.control.reference import kinds
-from swarmctl.control.reference.kind import MISSIONS, MissionKind, Place
+from swarmctl.control.reference.kind import MISSIONS, Heading, MissionKind, Place
+from swarmctl.control.reference.polynomial import through
 from swarmctl.core.declared import modules_of
+from swarmctl.core.own import BuiltInOrOwn, OwnError, own_class
 from swarmctl.core.params import Params, with_sections
-from swarmctl.core.types import Array
+from swarmctl.core.types import Array, Sampled
 
+GROUP = "swarmctl.missions"  # of entry points
+_ROW_S, _MAX_ROWS = 0.02, 100_000  # of the table that an own mission becomes
 _DIFFERENCE_S = 1e-3  # half the step of the difference of velocities that acceleration is
 
 _MODULES = tuple(modules_of(kinds))  # importing a module makes its kinds known
@@ -25,7 +29,7 @@ _KINDS = dict(sorted(MISSIONS.items()))
 if TYPE_CHECKING:
     MissionName = str
 else:
-    MissionName = Literal[tuple(_KINDS)]
+    MissionName = Annotated[str, BuiltInOrOwn(tuple(_KINDS), GROUP)]
 
 
 @with_sections({name: kind for name, kind in _KINDS.items() if kind.model_fields})
@@ -35,10 +39,24 @@ class MissionParams(Params):
     kind: MissionName = "circle"
     duration_s: float = Field(37.7, gt=0, le=36000)  # tracked time, without transits; overridden by --duration
     yaw_rad: float = Field(0.0, ge=-3.1416, le=3.1416)  # heading of every vehicle, clockwise from north
+    own: dict[str, Any] = Field({})  # parameters of an own kind
+
+    @property
+    def is_own(self) -> bool:
+        """Tell whether the kind is somebody else's."""
+        return self.kind not in _KINDS
 
     def flown(self) -> MissionKind:
-        """Return the parameters of the kind that is flown."""
-        kind = MISSIONS[self.kind]
+        """Return the parameters of the kind that is flown.
+
+        Raises:
+            OwnError: there is no such own kind.
+            ValidationError: its parameters are wrong.
+        """
+        if self.is_own:
+            found: type[MissionKind] = own_class(self.kind, GROUP, MissionKind)
+            return found.model_validate(self.own)
+        kind = _KINDS[self.kind]
         return self.section(kind) if kind.model_fields else kind()
 
     def problems(self, agents: int) -> Iterator[str]:
@@ -48,6 +66,28 @@ class MissionParams(Params):
     def references(self, starts_ned_m: Array, apart_m: float) -> list[MissionReference]:
         """Return the reference of every agent; see `MissionReference`."""
         return [MissionReference(self, starts_ned_m, agent, apart_m) for agent in range(len(starts_ned_m))]
+
+
+def _tabulated(mission: MissionKind, place: Place, params: MissionParams) -> tuple[Sampled, Heading | None, Array]:
+    """Return position and velocity, yaw and offset of an own mission, read off a table that is made now.
+
+    What is checked before a flight is thereby what is flown, and code of somebody else never runs in a tick.
+
+    Raises:
+        OwnError: it raises, or returns something else than positions and velocities.
+    """
+    t_s = np.linspace(0.0, params.duration_s, min(_MAX_ROWS, max(3, round(params.duration_s / _ROW_S) + 1)))
+    try:
+        pos, vel = (np.asarray(values, dtype=np.float64) for values in mission.reference(place)(t_s.copy()))
+        heading, offset = mission.heading(place), np.asarray(mission.offset_ned_m(place), dtype=np.float64)
+        yaw = np.zeros(len(t_s)) if heading is None else np.asarray(heading(t_s.copy()), dtype=np.float64)
+    except (Exception, SystemExit) as error:  # whatever it does
+        raise OwnError(f"{params.kind} raised {type(error).__name__}: {error}") from error
+    if pos.shape != (len(t_s), 3) or vel.shape != pos.shape or yaw.shape != t_s.shape or offset.shape != (3,):
+        shapes = f"{pos.shape} and {vel.shape}"
+        raise OwnError(f"{params.kind} returned positions and velocities of shape {shapes} for {len(t_s)} times")
+    turning = None if heading is None else lambda at_s: np.interp(at_s, t_s, np.unwrap(yaw))
+    return through(t_s, pos, vel, None).sample, turning, offset
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -76,8 +116,11 @@ class MissionReference:
     def __init__(self, params: MissionParams, starts_ned_m: Array, agent: int, apart_m: float = 0.0) -> None:
         self._mission, self._start_ned_m, self._yaw_rad = params.flown(), starts_ned_m[agent], params.yaw_rad
         place = Place(starts_ned_m=starts_ned_m, agent=agent, apart_m=apart_m)
-        self._sampled, self.offset_ned_m = self._mission.reference(place), self._mission.offset_ned_m(place)
-        self._heading = self._mission.heading(place)
+        if params.is_own:
+            self._sampled, self._heading, self.offset_ned_m = _tabulated(self._mission, place, params)
+        else:
+            self._sampled, self._heading = self._mission.reference(place), self._mission.heading(place)
+            self.offset_ned_m = self._mission.offset_ned_m(place)
 
     @property
     def jumps(self) -> bool:
