@@ -86,7 +86,7 @@ def test_controllers_that_fail_are_caught_and_vehicles_brought_to_rest(told: dic
         assert pilot.outcome.startswith(ended), "what is not asked any more ends the mission, and is named"
 
 
-@pytest.mark.parametrize(("name", "rmse_m"), [("own_pid", 0.1), ("own_lqr", 0.1), ("figure_8", 0.1)])
+@pytest.mark.parametrize(("name", "rmse_m"), [("own_pid", 0.1), ("own_lqr", 0.1), ("own_spiral", 0.05)])
 def test_every_example_flies(name: str, rmse_m: float) -> None:
     flight = fly_now("sitl.start=air", "mission.duration_s=2", config=f"examples/{name}.toml", until=mission_is_over)
     assert flight.outcomes == {"completed"}

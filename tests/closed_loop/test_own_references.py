@@ -47,7 +47,7 @@ def test_a_figure_8_from_a_file_is_flown(flown: Flight) -> None:
     ticks, error = flown.tracked(0)
     late = ticks["mission_t_s"] > 2.0
     rmse_m = float(np.sqrt(np.mean(np.sum(error[late] ** 2, axis=1))))
-    assert rmse_m <= 0.1
+    assert rmse_m <= 0.03
     assert np.ptp(flown.pos_ned_m[:, 0, 0]) >= 1.9 * LENGTH_M, "both loops"
     assert flown.modes(0, Phase.TRACK) == {Mode.TRACKING}
 
