@@ -247,6 +247,11 @@ def _whole(config: Config) -> Iterator[str]:
     yield from config.mission.problems(agents)
     if config.controller.is_own and not config.agent.barrier.enabled:
         yield "agent.barrier.enabled = false: an own controller flies behind the safety filter only; set it to true"
+    if config.controller.is_own and config.separation.mode == "guaranteed":
+        yield (
+            f"controller.kind = {config.controller.kind!r} with separation.mode = 'guaranteed': commitments are tracked"
+            " by built-in controllers; set separation.mode = 'best_effort'"
+        )
     if agents > 1 and (problem := radius_problem(config.separation, 0.0, config.drift_m)):
         yield problem
     if config.separation.gust_m_s and not config.vehicle_model.drag_1_s:

@@ -172,6 +172,7 @@ def test_own_modules_are_found_beside_the_configuration_also_from_the_run_folder
         (("controller.kind=dmpcc",), ("'dmpc'", "package.module:")),
         (("controller.own.kp=-1",), ("controller.own.kp = -1", "greater than")),
         (("controller.own.kq=1",), ("controller.own.kq = 1", "not permitted")),
+        (("separation.mode=guaranteed",), ("controller.kind = 'own_pid:Pid'", "best_effort")),
         (("agent.barrier.enabled=false",), ("agent.barrier.enabled = false", "set it to true")),
     ],
 )

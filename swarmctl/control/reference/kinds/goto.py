@@ -34,7 +34,7 @@ class GotoParams(MissionKind):
 
     def reference(self, place: Place) -> Sampled:
         starts = tuple(map(tuple, place.starts_ned_m.tolist()))
-        return _goal_flights(self, starts, place.apart_m)[place.agent].sample
+        return _goal_flights(self, starts, place.apart_m, OUTER_DELAY_S_M)[place.agent].sample
 
     def problems(self, agents: int) -> Iterator[str]:
         goals = len(self.goals_ned_m)
@@ -44,7 +44,7 @@ class GotoParams(MissionKind):
 
 @lru_cache(maxsize=8)  # the goals of all agents are assigned at once, and each is asked for
 def _goal_flights(
-    params: GotoParams, starts: tuple[tuple[float, ...], ...], apart_m: float
+    params: GotoParams, starts: tuple[tuple[float, ...], ...], apart_m: float, outer_delay_s_m: float
 ) -> tuple[QuinticTrajectory, ...]:
     """Return the flight of every agent; agents that share a goal arrive together, outer ones a little later.
 
@@ -65,5 +65,5 @@ def _goal_flights(
         slowest_s = max(flights[i].travel_s for i in group)
         from_center_m = np.linalg.norm(goals[group] - goals[group].mean(axis=0), axis=1)
         for i, outward_m in zip(group, from_center_m - from_center_m.min(), strict=True):
-            flights[i] = replace(flights[i], travel_s=slowest_s + OUTER_DELAY_S_M * outward_m)
+            flights[i] = replace(flights[i], travel_s=slowest_s + outer_delay_s_m * outward_m)
     return tuple(flights)
