@@ -13,6 +13,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
 
+import numpy as np
 import tomli_w
 from pydantic import Field
 
@@ -20,16 +21,20 @@ from swarmctl.agent.setup import AgentParams
 from swarmctl.bus.json_messages import MAX_OBSTACLES
 from swarmctl.config_problems import validated
 from swarmctl.config_source import override, read_tree, set_value
+from swarmctl.config_tables import read_tables
 from swarmctl.control.collision.separation import SeparationParams, radius_problem
 from swarmctl.control.controllers.discovery import ControllerParams
 from swarmctl.control.model import VehicleModelParams
+from swarmctl.control.reference.feasibility import FlightLimits, infeasible
 from swarmctl.control.reference.mission import MissionParams
 from swarmctl.core.obstacle import Obstacle
+from swarmctl.core.own import OwnError
 from swarmctl.core.params import Params, Vec3
 from swarmctl.errors import ConfigError
 from swarmctl.mavlink.geofence import GeofenceParams
 from swarmctl.mavlink.parameter_names import parameter_problems
 from swarmctl.mavlink.transport import Endpoint, parse_url
+from swarmctl.own_modules import locate, make_importable, own_problems
 from swarmctl.simulator_config import MAX_VEHICLES, OriginParams, SimulatorConfig, SimulatorParams
 from swarmctl.telemetry.evaluation.referee import Rules
 
@@ -111,6 +116,7 @@ class Config(Params):
 
     name: str = Field("swarm", pattern=r"^[A-Za-z0-9_-]{1,40}$")  # part of the run folder's name
     seed: int = Field(1, ge=0, le=2**31 - 1)  # seeds every random stream
+    own_folder: str = ""  # of own modules; filled in, by default with the folder of this file
     swarm: SwarmParams = SwarmParams()
     start: StartParams = StartParams()
     mission: MissionParams = MissionParams()
@@ -197,10 +203,17 @@ def load(path: Path | None, overrides: Sequence[str] = (), values: Mapping[str, 
     tree = read_tree(path)
     problems = [p for item in overrides for p in override(tree, item)]
     problems += [p for key, value in values.items() for p in set_value(tree, key, value)]
+    folder = Path.cwd() if path is None else path.parent
+    problems = problems or read_tables(tree, folder)
     if problems:
         raise ConfigError(source, problems)
+    locate(tree, folder)
     config = validated(Config, tree, source, _RENAMED)
-    problems = list(_whole(config))
+    make_importable(config.own_folder)
+    problems = list(own_problems(config.mission, config.controller, config.vehicle_model, config.separation))
+    if problems:
+        raise ConfigError(source, problems)
+    problems = list(_whole(config)) or list(_infeasible(config))
     if problems:
         raise ConfigError(source, problems)
     return config
@@ -236,6 +249,13 @@ def _whole(config: Config) -> Iterator[str]:
             "real time: swarmctl simulate, or python -m sitl --speed with clients of your own"
         )
     yield from config.mission.problems(agents)
+    if config.controller.is_own and not config.agent.barrier.enabled:
+        yield "agent.barrier.enabled = false: an own controller flies behind the safety filter only; set it to true"
+    if config.controller.is_own and config.separation.mode == "guaranteed":
+        yield (
+            f"controller.kind = {config.controller.kind!r} with separation.mode = 'guaranteed': commitments are tracked"
+            " by built-in controllers; set separation.mode = 'best_effort'"
+        )
     if agents > 1 and (problem := radius_problem(config.separation, 0.0, config.drift_m)):
         yield problem
     if config.separation.gust_m_s and not config.vehicle_model.drag_1_s:
@@ -248,6 +268,23 @@ def _whole(config: Config) -> Iterator[str]:
             f"limits.min_separation_m = {config.limits.min_separation_m}: larger than separation.radius_m = "
             f"{config.separation.radius_m}; agents would be judged by more than they keep. Lower it or raise the radius"
         )
+
+
+def _infeasible(config: Config) -> Iterator[str]:
+    """Yield why the references of a configuration without other problems can't be flown."""
+    separation = config.separation
+    limits = FlightLimits(
+        duration_s=config.mission.duration_s,
+        apart_m=separation.radius_m,
+        downwash=separation.downwash,
+        ground_z_m=config.sitl.ground_z_m if config.sitl.enabled else None,
+    )
+    try:
+        references = config.mission.references(np.array(config.starts_ned_m()), separation.budget.planned_m)
+    except OwnError as error:
+        yield f"mission.kind = {config.mission.kind!r}: {error}"
+        return
+    yield from infeasible(references, [config.model_of(i) for i in range(len(references))], limits)
 
 
 def _starts_apart(config: Config) -> Iterator[str]:

@@ -22,6 +22,7 @@ import tomli_w
 from pydantic.fields import FieldInfo
 
 from swarmctl.config import Config
+from swarmctl.core.own import BuiltInOrOwn
 from swarmctl.core.params import Params
 
 _SIGNS = (("ge", ">="), ("gt", ">"), ("le", "<="), ("lt", "<"))
@@ -105,6 +106,8 @@ def _key(path: str, model: type[Params], field: FieldInfo, given: Params | None)
 def _type_text(annotation: Any) -> str:
     """Return a type in words."""
     annotation = _bare(annotation)
+    if annotation is Any:
+        return "any value"
     origin, arguments = typing.get_origin(annotation), typing.get_args(annotation)
     if annotation in _WORDS:
         return _WORDS[annotation]
@@ -132,6 +135,9 @@ def _range_text(field: FieldInfo) -> str:
         for rule in rules
         if getattr(rule, name, None) is not None
     ]
+    names = [f"`{name}`" for rule in rules if isinstance(rule, BuiltInOrOwn) for name in rule.names]
+    if names:
+        return f"{', '.join(names)} or `package.module:Class`"
     patterns = [f"`{rule.pattern}`" for rule in rules if getattr(rule, "pattern", None)]
     return ", ".join(dict.fromkeys(bounds + patterns))
 

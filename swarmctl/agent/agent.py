@@ -21,6 +21,7 @@ from swarmctl.agent.components import (
     make_separation_policy,
     make_state_machine,
 )
+from swarmctl.agent.controller_watch import ControllerWatch
 from swarmctl.agent.reference_selector import ReferenceSelector
 from swarmctl.agent.separation_policy import SeparationDirective, SeparationInputs
 from swarmctl.agent.setup import AgentSetup
@@ -115,6 +116,7 @@ class Agent:
         self._separation = make_separation_policy(setup, self._world_model, bus, self._note, stopwatch_ns=stopwatch_ns)
         self._directive = SeparationDirective()  # of the newest tick
         self._controller, self._transit = make_controllers(setup, stopwatch_ns)
+        self._controller_watch = ControllerWatch(self._note)
         self._observer = make_estimator(setup)
         self._predictor = Predictor(setup.vehicle_model)
         self._safety_filter = make_safety_filter(setup, self._world_model, self._note, stopwatch_ns)
@@ -405,6 +407,8 @@ class Agent:
         elif plan is not None:
             self._publisher.failed_plans += 1
             self._alerts.put("plan", f"plan {plan.status.name.lower()}", now_us)
+        if failure := self._controller_watch.update(plan):
+            self._alerts.put("controller", failure, now_us)
         good = self._plan_buffer.plan
         delay_us = self._predictor.delay_us
         health = Health(
@@ -463,7 +467,8 @@ class Agent:
             flies=flies,
             committed_peers=self._directive.committed_peers,
         )
-        yaw_rad, hover_01 = self._heading.at(now_us, self._state_machine.yaw_rad), estimate.hover_thrust_01
+        yaw_rad = self._heading.at(now_us, self._reference_selector.heading_rad(self._clock.utc_us()))
+        hover_01 = estimate.hover_thrust_01
         setpoint = setpoint_of(virtual_control, yaw_rad, hover_01, now_us, params=self._setup.vehicle_model)
         refused = self._autopilot.send(setpoint, self._clock.now_us())
         if refused:
@@ -491,7 +496,7 @@ class Agent:
             busy=self._commands.busy,
             mode=self._decision.mode,
             unresponsive_peer=self._directive.unresponsive_peer,
-            cut_off=self._directive.cut_off,
+            cut_off=self._directive.cut_off or self._controller_watch.suspended,
             peers=self._world_model.peers(),
             others_ned_m=self._world_model.others_ned_m(utc_us),
             arm_in=None if dialect is None else dialect.arm_in,

@@ -13,7 +13,7 @@ from swarmctl.control.commit.trajectory_planner import DesiredReference
 from swarmctl.control.phases.state_machine import MissionStateMachine
 from swarmctl.control.reference.deadlock import Deadlock, DeadlockRecovery
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.types import Array, Reference, Sampled
+from swarmctl.core.types import Array, Phase, Reference, Sampled
 
 
 class ReferenceSelector:
@@ -29,6 +29,17 @@ class ReferenceSelector:
         self._state_machine, self._note, self._yaw_rad = state_machine, note, setup.mission.yaw_rad
         self._recovery = DeadlockRecovery(setup.params.deadlock, setup.agent, setup.separation.budget.radius_m)
         self._reported: Deadlock | None = None
+
+    def heading_rad(self, utc_us: int) -> float | None:
+        """Return the heading [rad] to turn to: the operator's, the mission's while it is followed, or that of the
+        configuration before and after it; None while the mission is interrupted: the present one.
+        """
+        asked_rad = self._state_machine.yaw_rad
+        if asked_rad is None:
+            asked_rad = self._state_machine.mission_yaw_rad(utc_us)
+        if asked_rad is None and self._state_machine.phase is not Phase.TRACK:
+            return self._yaw_rad
+        return asked_rad
 
     def update(
         self,

@@ -32,6 +32,7 @@ class VehicleModelParams(Params):
     thrust_min_01: float = Field(0.05, ge=0, lt=1)  # keeps motors turning
     thrust_max_01: float = Field(1.0, gt=0, le=1)  # largest thrust that is asked for
     tilt_max_rad: float = Field(0.6, gt=0, lt=1.5)  # largest tilt that is asked for, by every controller and protection
+    speed_max_m_s: float = Field(20.0, gt=0, le=100)  # a mission whose reference is faster is refused
 
     def lag(self) -> Lag | None:
         """Return the lag of the attitude behind its setpoints; None if it follows at once."""
@@ -40,6 +41,11 @@ class VehicleModelParams(Params):
     def u_max(self) -> float:
         """Return the largest horizontal part of the body's down axis."""
         return math.sin(self.tilt_max_rad)
+
+    def thrust_range_m_s2(self) -> tuple[float, float]:
+        """Return the least and the largest thrust over mass, by the hover thrust that is assumed at first."""
+        per_01 = GRAVITY_M_S2 / self.hover_thrust_01
+        return per_01 * self.thrust_min_01, per_01 * self.thrust_max_01
 
     def drift_m(self, gust_m_s: float, accel_max_m_s2: float) -> float:
         """Return how far a sudden wind blows a vehicle that hovers, until its controller has stopped it again.

@@ -181,6 +181,8 @@ class Plan:
     slack_m: float = 0.0  # largest separation slack used
     residual_m: float = 0.0  # largest primal residual, in metres of position
     terminal_gap_m: float = 0.0  # violation of the softened terminal condition
+    failure: str = ""  # why the controller that was to make it did not, and another one did
+    suspended: bool = False  # that controller is not asked any more
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from swarmctl.bus.peers import agent_name
 from swarmctl.config import Config
 from swarmctl.control.estimation.identification import Figure, Identified, identify, longest_segment
 from swarmctl.control.model import VehicleModelParams
-from swarmctl.control.reference.mission import IdentifyParams
+from swarmctl.control.reference.kinds.identify import IdentifyParams
 from swarmctl.errors import EXIT_MISSION, EXIT_OK, StartError
 from swarmctl.ops.launch import LaunchOptions, launch
 from swarmctl.ops.vehicle_check import CheckOptions, check

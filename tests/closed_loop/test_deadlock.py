@@ -13,7 +13,7 @@ from sitl.lockstep import Lockstep
 from sitl.studies.campaign.layouts import least_sum_m, ring
 from sitl.studies.campaign.scenarios import layout_of
 from swarmctl.config import load
-from swarmctl.control.reference import mission
+from swarmctl.control.reference.kinds import goto
 from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.types import Array
 from tests.closed_loop.conftest import nudged
@@ -124,13 +124,13 @@ def test_negative_control_without_places_of_their_own_they_push(seed: int) -> No
 
 @pytest.mark.parametrize(
     ("outer_delay_s_m", "settled"),
-    [(mission.OUTER_DELAY_S_M, True), (0.0, False)],
+    [(goto.OUTER_DELAY_S_M, True), (0.0, False)],
     ids=["", "control: all at the same time"],
 )
 def test_ten_sent_to_one_point_get_inside_before_the_ring_closes(
     outer_delay_s_m: float, settled: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(mission, "OUTER_DELAY_S_M", outer_delay_s_m)
+    monkeypatch.setattr(goto, "OUTER_DELAY_S_M", outer_delay_s_m)
     starts = layout_of("same_goal", 8, 10).starts_ned_m
     flown = Flown(starts, np.zeros((1, 3)), 6.5, "sitl.physics_hz=100")
     assert (flown.moved_m < 0.02) is settled

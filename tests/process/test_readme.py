@@ -204,6 +204,22 @@ def test_a_launch_its_operator_and_what_is_left(tmp_path: Path) -> None:
     assert "no display" in refused.stderr
 
 
+def test_own_reference_and_own_controller_are_launched(tmp_path: Path) -> None:
+    """The file is flown as it is shown, by one agent, and by a controller that each agent process has to find."""
+    (line,) = shown(r"^swarmctl launch configs/examples/")
+    directory = tmp_path / "run"
+    own = ("--set=controller.kind=own_pid:Pid", "--set=sitl.start=air", "--agents", "1", "--no-view")
+    done = run(line, *own, "--duration", "2", low(line), "--run-dir", str(directory))
+    assert done.returncode == 0, done.stdout + done.stderr
+    (directory / "config.toml").rename(tmp_path / "config.toml")
+    flown = load(tmp_path / "config.toml")
+    assert flown.controller.is_own and flown.mission.kind == "csv"
+    summary = json.loads((directory / "summary.json").read_text(encoding="utf-8"))
+    assert summary["tracking"]["agents"][0]["rmse_m"] < 0.1
+    events = "".join(path.read_text(encoding="utf-8") for path in directory.glob("*events.jsonl"))
+    assert '"TRACK"' in events and "controller_failed" not in events
+
+
 def operate(verb: str, directory: Path) -> None:
     (order,) = shown(rf"^swarmctl {verb}\b")
     done = run(order, "--run-dir", str(directory))

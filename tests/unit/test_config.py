@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from swarmctl.bus.json_messages import MAX_OBSTACLES
 from swarmctl.config import _RENAMED, Config, dump, load
 from swarmctl.config_problems import all_keys
-from swarmctl.control.reference.mission import CircleParams
+from swarmctl.control.reference.kinds.circle import CircleParams
 from swarmctl.errors import EXIT_USAGE, ConfigError
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.toml"))

@@ -19,7 +19,7 @@ from sitl.studies.campaign.scenarios import AIRFRAMES, SCENARIOS, Layout, layout
 from sitl.studies.campaign.source import code_id
 from sitl.studies.campaign.trials import Cell, Row, Trial
 from swarmctl.config import Config, load
-from swarmctl.control.reference.mission import GotoParams
+from swarmctl.control.reference.kinds.goto import GotoParams
 from swarmctl.core.types import Array, Phase, PlanStatus
 
 PHYSICS_HZ = 100  # thesis and crazyflie behave as at 250 Hz: a 3.3 m transition ends within 2 cm and 0.1 s of it

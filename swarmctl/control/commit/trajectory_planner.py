@@ -16,7 +16,7 @@ from swarmctl.control.collision.separation import KeepOut, SeparationParams, cer
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.control.mpc.swarm_mpc import AxisWeights, MpcParams, SwarmMpc
-from swarmctl.control.reference.mission import brake_to_rest, quintic_to
+from swarmctl.control.reference.quintic import brake_to_rest, quintic_to
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.params import Params
 from swarmctl.core.trajectory import Trajectory, ending_at_rest, joined, positions_at, stopping

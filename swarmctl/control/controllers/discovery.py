@@ -1,19 +1,25 @@
-"""The controllers that a configuration can choose from: one for each that a module of this package declares.
+"""The controllers that a configuration can choose from: those that modules of this package declare, and own ones.
 
-A module is found by being there, so that a new controller is one new file with a `ControllerKind` (`kind.py`).
+A module is found by being there, so that a new controller is one new file with a `ControllerKind` (`kind.py`). A
+controller of somebody else is named "package.module:Class" or offered by an installed package as an entry point.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
+
+from pydantic import Field
 
 from swarmctl.control import controllers
 from swarmctl.control.collision.separation import SeparationParams
+from swarmctl.control.controllers.guard import Guard
 from swarmctl.control.controllers.kind import Controller, ControllerKind, ControllerSetup
+from swarmctl.control.controllers.own import GROUP, OwnController
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.core.declared import declared
+from swarmctl.core.own import BuiltInOrOwn, OwnError, own_class
 from swarmctl.core.params import Params, with_sections
 
 _KINDS: list[ControllerKind[Any]] = list(declared(controllers, ControllerKind))
@@ -22,20 +28,27 @@ CONTROLLERS = {kind.name: kind for kind in sorted(_KINDS, key=lambda kind: not k
 if TYPE_CHECKING:
     ControllerName = str
 else:
-    ControllerName = Literal[tuple(CONTROLLERS)]
+    ControllerName = Annotated[str, BuiltInOrOwn(tuple(CONTROLLERS), GROUP)]
+_FALLBACK = "dmpc"  # flies where an own controller doesn't
 
 
 @with_sections({kind.section: kind.params for kind in CONTROLLERS.values() if kind.section != "mpc"})
 class ControllerParams(Params):
     """Selects the controller and holds the parameters of each."""
 
-    kind: ControllerName = "dmpc"
+    kind: ControllerName = "dmpc"  # an own one flies the mission, not transits and landings
+    own: dict[str, Any] = Field({})  # parameters of an own controller
     mpc: MpcParams = MpcParams()  # of all that plan; guaranteed separation plans with them under every controller
 
     @property
     def follows_reference(self) -> bool:
-        """Tell whether the controller can fly to a place."""
-        return CONTROLLERS[self.kind].follows_reference
+        """Tell whether the controller flies to the start and to the landing place too."""
+        return not self.is_own and CONTROLLERS[self.kind].follows_reference
+
+    @property
+    def is_own(self) -> bool:
+        """Tell whether the controller is somebody else's."""
+        return self.kind not in CONTROLLERS
 
 
 def make_controller(
@@ -48,7 +61,6 @@ def make_controller(
     stopwatch_ns: Callable[[], int],
 ) -> Controller:
     """Return the controller that a configuration asks for, with rows for `max_keep_outs` keep-outs at once."""
-    kind = CONTROLLERS[params.kind]
     setup = ControllerSetup(
         vehicle=vehicle,
         separation=separation,
@@ -56,4 +68,27 @@ def make_controller(
         max_keep_outs=max_keep_outs,
         stopwatch_ns=stopwatch_ns,
     )
+    if params.is_own:
+        fallback = _built_in(_FALLBACK, params, setup)
+        return Guard(params.kind, make_own(params, setup, fallback), fallback, setup)
+    return _built_in(params.kind, params, setup)
+
+
+def make_own(params: ControllerParams, setup: ControllerSetup, grid: Controller) -> OwnController:
+    """Return the own controller that a configuration asks for, on the time grid of another.
+
+    Raises:
+        OwnError: there is none, or it can't be made.
+        ValidationError: its parameters are wrong.
+    """
+    found: type[OwnController] = own_class(params.kind, GROUP, OwnController)
+    own_params = found.Params.model_validate(params.own)
+    try:
+        return found(own_params, setup, grid.dt_us * 1e-6, grid.steps)
+    except (Exception, SystemExit) as error:  # whatever it does when it is made
+        raise OwnError(f"{params.kind} can't be made: {type(error).__name__}: {error}") from error
+
+
+def _built_in(name: str, params: ControllerParams, setup: ControllerSetup) -> Controller:
+    kind = CONTROLLERS[name]
     return kind.make(getattr(params, kind.section), setup)

@@ -22,7 +22,8 @@ from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.control.phases.overload import Level
 from swarmctl.control.phases.refused_orders import Contains, OrderSituation, refusal_of
 from swarmctl.control.reference.landing_places import landing_place_ned_m, nearest_in_plane_m
-from swarmctl.control.reference.mission import MissionReference, QuinticTrajectory, brake_to_rest, quintic_to
+from swarmctl.control.reference.mission import MissionReference
+from swarmctl.control.reference.quintic import QuinticTrajectory, brake_to_rest, quintic_to
 from swarmctl.core.operator_verbs import GOTO, OPERATOR_VERBS, POINT, SPEED, YAW, Order
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Command, FlightMode, Landed, Mode, Phase, VehicleState, Verb
@@ -202,6 +203,12 @@ class MissionStateMachine:
     def place_offset_ned_m(self) -> Array:
         """Return by how much the present reference (3,) is beside the one that several agents share."""
         return self._reference.offset_ned_m if self._follows_mission else np.zeros(3)
+
+    def mission_yaw_rad(self, utc_us: int) -> float | None:
+        """Return the yaw of the mission's reference now; None while that is not followed."""
+        if not self._follows_mission or self.begin_utc_us is None:
+            return None
+        return float(self._reference.yaw_rad(np.array([(utc_us - self.begin_utc_us) * 1e-6]))[0])
 
     @property
     def _follows_mission(self) -> bool:

@@ -4,18 +4,18 @@ from __future__ import annotations
 
 import math
 
-_RATE_RAD_S = math.radians(45.0)  # slow beside the attitude loop, so that thrust keeps pointing where it is planned to
+_RATE_RAD_S = 1.0  # slow beside the attitude loop, so that thrust keeps pointing where it is planned to
 
 
 class Heading:
     """Turns from one heading to another the shorter way round.
 
     Args:
-        mission_yaw_rad: heading of the mission, clockwise from north.
+        first_yaw_rad: heading to begin with, clockwise from north.
     """
 
-    def __init__(self, mission_yaw_rad: float) -> None:
-        self._mission_yaw_rad = self._yaw_rad = mission_yaw_rad
+    def __init__(self, first_yaw_rad: float) -> None:
+        self._yaw_rad = first_yaw_rad
         self._then_us: int | None = None
 
     def at(self, now_us: int, asked_yaw_rad: float | None) -> float:
@@ -23,9 +23,9 @@ class Heading:
 
         Args:
             now_us: monotonic time.
-            asked_yaw_rad: heading asked for; None: the mission's.
+            asked_yaw_rad: heading to turn to; None: the present one.
         """
-        goal_rad = self._mission_yaw_rad if asked_yaw_rad is None else asked_yaw_rad
+        goal_rad = self._yaw_rad if asked_yaw_rad is None else asked_yaw_rad
         passed_s = 0.0 if self._then_us is None else (now_us - self._then_us) * 1e-6
         self._then_us = now_us
         step_rad = _RATE_RAD_S * min(passed_s, 0.1)  # after a gap the vehicle has not turned meanwhile

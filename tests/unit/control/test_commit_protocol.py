@@ -16,7 +16,7 @@ from swarmctl.control.commit.protocol import Commitments
 from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.swarm_mpc import MpcParams
-from swarmctl.control.reference.mission import quintic_to
+from swarmctl.control.reference.quintic import quintic_to
 from swarmctl.core.closest_pair import closest_pair_m
 from swarmctl.core.trajectory import Trajectory, ending_at_rest, resting
 from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage

@@ -11,7 +11,9 @@ from scipy.spatial.transform import Rotation
 
 from sitl.studies.campaign.layouts import least_sum_m
 from swarmctl.control.reference.goal_assignment import ROOM, arrangement, assigned_goals_ned_m
-from swarmctl.control.reference.mission import MOVING_ROOM, OUTER_DELAY_S_M, GotoParams, MissionParams, MissionReference
+from swarmctl.control.reference.kind import MOVING_ROOM
+from swarmctl.control.reference.kinds.goto import OUTER_DELAY_S_M, GotoParams
+from swarmctl.control.reference.mission import MissionParams, MissionReference
 from swarmctl.core.types import Array
 
 APART_M = 0.9

@@ -17,7 +17,8 @@ from swarmctl.config import Config, load
 from swarmctl.control.estimation.identification import Figure, FlightSegment, Identified, identify, longest_segment
 from swarmctl.control.lag import Lag
 from swarmctl.control.model import VehicleModelParams
-from swarmctl.control.reference.mission import IdentifyParams, MissionParams, MissionReference
+from swarmctl.control.reference.kinds.identify import IdentifyParams
+from swarmctl.control.reference.mission import MissionParams, MissionReference
 from swarmctl.core.frames import GRAVITY_M_S2, quat_from_body_z
 from swarmctl.core.records import TICK_DTYPE
 from swarmctl.core.types import Array, Phase

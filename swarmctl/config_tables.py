@@ -1,0 +1,83 @@
+"""Reads the CSV files that a configuration names into its tree, beside their names.
+
+A resolved configuration therefore holds what is flown: agents, reports and replays need no file but `config.toml`.
+"""
+
+from __future__ import annotations
+
+import csv
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from swarmctl.core.text import printable
+from swarmctl.files import read_file
+
+_MAX_BYTES = 1_000_000  # of one file
+_MAX_SHOWN = 80
+
+
+def read_tables(tree: dict[str, Any], folder: Path) -> list[str]:
+    """Fill in `mission.csv.tables` from `mission.csv.files`, unless it is there already; returns the problems.
+
+    Args:
+        tree: a configuration, whose form is checked later.
+        folder: folder that relative names are relative to.
+    """
+    mission = tree.get("mission")
+    section = mission.get("csv") if isinstance(mission, dict) else None
+    if not isinstance(section, dict) or "tables" in section:
+        return []
+    files = section.get("files")
+    if not isinstance(files, list) or not all(isinstance(name, str) for name in files):
+        return []  # refused with the other keys
+    tables, problems = [], []
+    for name in files:
+        table, problem = _table(folder / name)
+        tables.append(table)
+        problems += [f"mission.csv.files: {printable(name, _MAX_SHOWN)}: {problem}"] if problem else []
+    section["tables"] = tables
+    return problems
+
+
+def _table(path: Path) -> tuple[dict[str, Any], str]:
+    """Return the table of a file, and why it is none, or ""."""
+    try:
+        text = read_file(path, _MAX_BYTES, follow=True).decode("utf-8-sig")
+    except FileNotFoundError:
+        return {}, f"no such file ({path}); names are relative to the configuration's folder"
+    except OSError as error:
+        return {}, f"can't be read: {error.strerror}"
+    except UnicodeDecodeError:
+        return {}, "can't be read: it is not UTF-8 text"
+    lines = [(number, _cells(row)) for number, row in enumerate(csv.reader(text.splitlines()), 1)]
+    lines = [(number, cells) for number, cells in lines if cells and not cells[0].startswith("#")]
+    if not lines:
+        return {}, "is empty; its first line names the columns, for example t,x,y,z"
+    columns = [name.lower() for name in lines[0][1]]
+    rows = []
+    for number, cells in lines[1:]:
+        numbers = [_number(cell) for cell in cells]
+        if len(numbers) != len(columns):
+            return {}, f"line {number}: {len(numbers)} values for {len(columns)} columns"
+        for name, cell, value in zip(columns, cells, numbers, strict=True):
+            if value is None:
+                return {}, f"line {number}: {name} = {printable(cell, _MAX_SHOWN)!r} is not a finite number"
+        rows.append(numbers)
+    return {"columns": columns, "rows": rows}, ""
+
+
+def _cells(row: Sequence[str]) -> list[str]:
+    """Return the values of a line; an empty last one, after a comma at the end, does not count."""
+    cells = [cell.strip() for cell in row]
+    return cells[:-1] if cells and not cells[-1] else cells
+
+
+def _number(cell: str) -> float | None:
+    """Return the finite number that a text is, or None."""
+    try:
+        value = float(cell)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None

@@ -1,0 +1,166 @@
+"""What stands between a controller of somebody else and the vehicle; it can't be switched off.
+
+In every tick the own controller is asked for commands. They are flown only if they are finite, if the motion that they
+give the vehicle by its model, which is computed here, keeps clear of every keep-out, and if the vehicle can stop behind
+it. Otherwise the built-in controller plans this tick, by its own certificate. A controller that raises, returns
+something else than commands, or takes too long, again and again, is not asked any more, and the mission ends.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from swarmctl.control.collision.separation import KeepOut, SeparationParams, certify
+from swarmctl.control.controllers.kind import Controller, ControllerSetup
+from swarmctl.control.controllers.own import OwnController
+from swarmctl.control.mpc.problem import Problem, Start
+from swarmctl.control.rollout import ModelledVehicle
+from swarmctl.core.trajectory import braking_displacement
+from swarmctl.core.types import Array, Plan, PlanStatus, PlanTimes, Reference
+
+LATE_S = 0.05  # more than two ticks: setpoints have gaps
+LATE_IN_A_ROW = 3  # late plans after which a controller is not asked any more
+BAD_IN_A_ROW = 25  # likewise, without commands: half a second
+_TAIL_POINTS = 30  # of the braking behind a plan
+_MAX_SHOWN = 120  # characters of an exception
+
+
+class Guard:
+    """Flies an own controller behind a certificate, with another controller to fall back on.
+
+    Args:
+        name: what the configuration calls the controller.
+        own: the controller.
+        fallback: plans where its commands can't be flown; plans and problems are on its grid.
+        setup: what both were told.
+    """
+
+    def __init__(self, name: str, own: OwnController, fallback: Controller, setup: ControllerSetup) -> None:
+        self._name, self._own, self._fallback, self._setup = name, own, fallback, setup
+        self._suspended, self._bad, self._late = "", 0, 0
+
+    @property
+    def dt_us(self) -> int:
+        """Return the time between plan points [us]."""
+        return self._fallback.dt_us
+
+    @property
+    def steps(self) -> int:
+        """Return the number of steps of a plan."""
+        return self._fallback.steps
+
+    @property
+    def longest(self) -> int:
+        """Return the number of steps of reference that a problem has to hold."""
+        return self._fallback.longest
+
+    def reset(self) -> None:
+        """Let both forget the past, after a handover; what was suspended stays so."""
+        self._fallback.reset()
+        self._bad = self._late = 0
+        if not self._suspended:
+            self._called(lambda: self._own.reset())
+
+    def plan(self, problem: Problem) -> Plan:
+        """Return the own controller's plan, or that of the fallback with the reason."""
+        if self._suspended:
+            return self._instead(problem, self._suspended)
+        began_ns = self._setup.stopwatch_ns()
+        commands, failure = self._called(lambda: self._own.commands(_copied(problem)))
+        took_s = (self._setup.stopwatch_ns() - began_ns) * 1e-9
+        if not failure:
+            failure = self._malformed(commands)
+        self._count(failure, took_s)
+        if failure or self._suspended:
+            return self._instead(problem, self._suspended or failure)
+        plan = self._moved(problem, commands, took_s)
+        if problem.keep_outs and self._clearance_m(plan, problem.keep_outs) < 0.0:
+            return self._instead(problem, "plans too close to a peer or an obstacle")
+        return plan
+
+    def _called(self, call: Callable[[], Array | None]) -> tuple[Array, str]:
+        """Return what a call of the own controller returns, and what it raised, or ""."""
+        try:
+            return np.asarray(call(), dtype=np.float64), ""
+        except (Exception, SystemExit) as error:  # whatever it raises: the vehicle flies on
+            return np.empty(0), f"raised {type(error).__name__}: {error}"[:_MAX_SHOWN]
+
+    def _malformed(self, commands: Array) -> str:
+        if commands.shape != (self.steps, 3):
+            return f"returned commands of shape {commands.shape}, not {(self.steps, 3)}"
+        return "" if np.isfinite(commands).all() else "returned commands that are not finite"
+
+    def _count(self, failure: str, took_s: float) -> None:
+        """Suspend a controller that fails or is late again and again."""
+        self._bad = self._bad + 1 if failure else 0
+        self._late = self._late + 1 if took_s > LATE_S else 0
+        if self._late >= LATE_IN_A_ROW:
+            self._suspended = f"took {took_s * 1e3:.0f} ms for a plan"
+        elif self._bad >= BAD_IN_A_ROW:
+            self._suspended = failure
+
+    def _instead(self, problem: Problem, why: str) -> Plan:
+        plan = self._fallback.plan(problem)
+        return replace(plan, failure=f"controller {self._name} {why}", suspended=bool(self._suspended))
+
+    def _moved(self, problem: Problem, commands: Array, took_s: float) -> Plan:
+        """Return the plan of commands (N, 3): the motion that they give the vehicle by its model."""
+        vehicle = ModelledVehicle(problem.start, self._setup.vehicle, problem.disturbance_ned_m_s2)
+        pos, vel = np.empty((self.steps + 1, 3)), np.empty((self.steps + 1, 3))
+        pos[0], vel[0] = vehicle.pos_ned_m, vehicle.vel_ned_m_s
+        for k in range(self.steps):
+            vehicle.step(commands[k], self.dt_us * 1e-6)
+            pos[k + 1], vel[k + 1] = vehicle.pos_ned_m, vehicle.vel_ned_m_s
+        return Plan(
+            status=PlanStatus.OK,
+            t0_us=problem.start.t_us,
+            dt_us=self.dt_us,
+            pos_ned_m=pos,
+            vel_ned_m_s=vel,
+            virtual_control=np.array([vehicle.bounded(command) for command in commands]),
+            times=PlanTimes(setup_us=0.0, solve_us=took_s * 1e6, certify_us=0.0),
+        )
+
+    def _clearance_m(self, plan: Plan, keep_outs: Sequence[KeepOut]) -> float:
+        """Return the smallest margin [m] of a plan and of the braking behind it, as `certify` does.
+
+        It has to keep the distance that plans keep, not only the hard minimum: from closer the fallback would have to
+        use slack.
+        """
+        keep_outs = [replace(keep_out, hard_min_distance_m=keep_out.radius_m) for keep_out in keep_outs]
+        separation, dt_s = self._setup.separation, plan.dt_us * 1e-6
+        stop_s = float(np.linalg.norm(plan.vel_ned_m_s[-1])) / separation.brake_m_s2
+        tail_s = np.linspace(0.0, max(dt_s, stop_s), _TAIL_POINTS)
+        path = plan.pos_ned_m[-1] + braking_displacement(plan.vel_ned_m_s[-1], tail_s, separation.brake_m_s2)
+        behind = [_braking(keep_out, tail_s, dt_s, separation) for keep_out in keep_outs]
+        return min(certify(plan.pos_ned_m, keep_outs, 1), certify(path, behind, 1))
+
+
+def _braking(keep_out: KeepOut, tail_s: Array, dt_s: float, separation: SeparationParams) -> KeepOut:
+    """Return a keep-out behind the end of its positions, which are `dt_s` apart: it brakes."""
+    pos = keep_out.pos_ned_m
+    vel = (pos[-1] - pos[-2]) / dt_s
+    return replace(keep_out, pos_ned_m=pos[-1] + braking_displacement(vel, tail_s, separation.brake_m_s2))
+
+
+def _copied(problem: Problem) -> Problem:
+    """Return a problem with arrays of its own, so that what is judged can't be changed."""
+    start, reference, guess = problem.start, problem.reference, problem.guess_ned_m
+    return Problem(
+        start=Start(
+            t_us=start.t_us,
+            pos_ned_m=start.pos_ned_m.copy(),
+            vel_ned_m_s=start.vel_ned_m_s.copy(),
+            cos_tilt=start.cos_tilt,
+            virtual_control=start.virtual_control.copy(),
+            tilt=start.tilt.copy(),
+            tilt_rate_1_s=start.tilt_rate_1_s.copy(),
+        ),
+        reference=Reference(reference.pos_ned_m.copy(), reference.vel_ned_m_s.copy(), reference.yaw_rad),
+        disturbance_ned_m_s2=problem.disturbance_ned_m_s2.copy(),
+        keep_outs=tuple(replace(keep_out, pos_ned_m=keep_out.pos_ned_m.copy()) for keep_out in problem.keep_outs),
+        guess_ned_m=None if guess is None else guess.copy(),
+    )

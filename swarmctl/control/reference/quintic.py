@@ -1,0 +1,50 @@
+"""Quintic trajectories: transits, stops and the flights of missions to a place, smooth in acceleration."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from swarmctl.core.types import Array
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class QuinticTrajectory:
+    """A quintic polynomial from a position and velocity to rest at a target, continuous in acceleration."""
+
+    from_ned_m: Array  # (3,)
+    vel_ned_m_s: Array  # (3,)
+    to_ned_m: Array  # (3,)
+    travel_s: float
+
+    def sample(self, t_s: Array) -> tuple[Array, Array]:
+        """Return positions and velocities, (K, 3) each, at times `t_s` (K,) [s] since the start."""
+        s = np.clip(t_s / self.travel_s, 0.0, 1.0)[:, None]
+        delta, carry = self.to_ned_m - self.from_ned_m, self.vel_ned_m_s * self.travel_s
+        blend = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
+        coast = s - 6.0 * s**3 + 8.0 * s**4 - 3.0 * s**5
+        pos = self.from_ned_m + blend * delta + coast * carry
+        slope = 30.0 * s**2 * (1.0 - s) ** 2
+        coast_slope = 1.0 - 18.0 * s**2 + 32.0 * s**3 - 15.0 * s**4
+        vel = (slope * delta + coast_slope * carry) / self.travel_s
+        return pos, vel
+
+
+def quintic_to(pos: Array, vel: Array, target: Array, speed_m_s: float, *, accel_m_s2: float) -> QuinticTrajectory:
+    """Return the fastest `QuinticTrajectory` whose peak speed and acceleration stay near the given ones.
+
+    A quintic from rest peaks at 1.875 of its mean speed and at 5.77 distance / T^2.
+    """
+    distance = math.dist(pos, target)
+    initial = math.sqrt(float(vel @ vel))
+    travel_s = max(1.875 * distance / speed_m_s, math.sqrt(5.77 * distance / accel_m_s2), 3.0 * initial / accel_m_s2)
+    return QuinticTrajectory(from_ned_m=pos, vel_ned_m_s=vel, to_ned_m=target, travel_s=max(travel_s, 0.5))
+
+
+def brake_to_rest(pos: Array, vel: Array, accel_m_s2: float) -> QuinticTrajectory:
+    """Return a `QuinticTrajectory` that stops straight ahead, about as soon as `accel_m_s2` allows."""
+    speed = math.sqrt(float(vel @ vel))
+    travel_s = max(0.5, 2.0 * speed / accel_m_s2)
+    return QuinticTrajectory(from_ned_m=pos, vel_ned_m_s=vel, to_ned_m=pos + 0.5 * travel_s * vel, travel_s=travel_s)

@@ -1,0 +1,61 @@
+"""Finds classes that somebody else has written: by name, "package.module:Class", or offered by an installed package."""
+
+from __future__ import annotations
+
+import importlib
+import importlib.metadata
+import re
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import GetCoreSchemaHandler
+from pydantic_core import CoreSchema, PydanticCustomError, core_schema
+
+_NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
+
+
+class OwnError(Exception):
+    """A class that a configuration names can't be had; the text says why."""
+
+
+@dataclass(frozen=True, slots=True)
+class BuiltInOrOwn:
+    """Marks a text that is a built-in name, "package.module:Class", or an entry point of a group."""
+
+    names: tuple[str, ...]
+    group: str
+
+    def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
+        return core_schema.no_info_after_validator_function(self._checked, handler(source))
+
+    def _checked(self, name: str) -> str:
+        if name in self.names or _NAME.fullmatch(name) or name in _offered(self.group):
+            return name
+        known = ", ".join(f"'{known}'" for known in (*self.names, *_offered(self.group)))
+        raise PydanticCustomError("own", "input should be {known} or 'package.module:Class'", {"known": known})
+
+
+def own_class(name: str, group: str, base: type) -> Any:
+    """Return the class of a name that is not built in.
+
+    Args:
+        name: "package.module:Class", or the name of an entry point.
+        group: group of entry points.
+        base: what the class has to be derived from.
+
+    Raises:
+        OwnError: there is none, its module can't be imported, or it is something else.
+    """
+    module, _, attribute = _offered(group).get(name, name).partition(":")
+    try:
+        found = getattr(importlib.import_module(module), attribute, None)
+    except (Exception, SystemExit) as error:  # whatever the module does when it is imported
+        raise OwnError(f"{module} can't be imported: {type(error).__name__}: {error}") from error
+    if not isinstance(found, type) or not issubclass(found, base):
+        raise OwnError(f"{module} has no class {attribute} derived from {base.__module__}.{base.__name__}")
+    return found
+
+
+def _offered(group: str) -> dict[str, str]:
+    """Return the classes that installed packages offer, by the names of their entry points."""
+    return {point.name: point.value for point in importlib.metadata.entry_points(group=group)}

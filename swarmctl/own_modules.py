@@ -1,0 +1,70 @@
+"""Makes modules of the user importable, and refuses own missions and controllers that can't be flown.
+
+A configuration names its own ones, "package.module:Class", and this module says where they are: in the folder of the
+configuration's file, behind all that is installed. The resolved configuration holds that folder, so that the processes
+of a launch find the same modules.
+"""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+from pydantic import ValidationError
+
+from swarmctl.control.collision.separation import SeparationParams
+from swarmctl.control.controllers.discovery import ControllerParams, make_controller
+from swarmctl.control.model import VehicleModelParams
+from swarmctl.control.reference.mission import MissionParams
+from swarmctl.core.own import OwnError
+
+OWN_FOLDER = "own_folder"  # key of a configuration
+
+
+def locate(tree: dict[str, Any], folder: Path) -> None:
+    """Fill in the folder of own modules, if `tree` names any: its own value and `folder`, joined.
+
+    Args:
+        tree: a configuration, whose form is checked later.
+        folder: that of its file, or the current one.
+    """
+    given = tree.get(OWN_FOLDER, "")
+    kinds = [section.get("kind") for name in ("mission", "controller") if isinstance(section := tree.get(name), dict)]
+    if isinstance(given, str) and (given or any(isinstance(kind, str) and ":" in kind for kind in kinds)):
+        tree[OWN_FOLDER] = str((folder / given).resolve())
+
+
+def make_importable(folder: str) -> None:
+    """Let this process import from a folder; "" for none."""
+    if folder and folder not in sys.path:
+        sys.path.append(folder)
+
+
+def own_problems(
+    mission: MissionParams, controller: ControllerParams, vehicle: VehicleModelParams, separation: SeparationParams
+) -> Iterator[str]:
+    """Yield why own missions and controllers can't be had, made, or take their parameters."""
+    if mission.is_own:
+        yield from _problems("mission", mission.kind, mission.flown)
+    if controller.is_own:
+
+        def make() -> object:
+            return make_controller(
+                controller, vehicle, separation, 0, max_keep_outs=1, stopwatch_ns=time.perf_counter_ns
+            )
+
+        yield from _problems("controller", controller.kind, make)
+
+
+def _problems(section: str, name: str, make: Callable[[], object]) -> Iterator[str]:
+    try:
+        make()
+    except OwnError as error:
+        yield f"{section}.kind = {name!r}: {error}. Modules are looked for in the configuration's folder (own_folder)"
+    except ValidationError as error:
+        for item in error.errors(include_url=False):
+            key = ".".join(str(part) for part in item["loc"])
+            yield f"{section}.own.{key} = {item.get('input')!r}: {item['msg'].lower()}"

@@ -1,0 +1,98 @@
+"""Tests that a controller of somebody else flies, and that a bad one is caught without a collision.
+
+Two agents change places head-on. Each bad controller flies well until they approach each other.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sitl.lockstep import Lockstep
+from swarmctl.config import load
+from swarmctl.control.controllers.guard import Guard
+from swarmctl.core.types import Mode, Phase
+from tests.closed_loop.conftest import Flight, closer_than, fly_now, mission_is_over
+
+HEAD_ON = (
+    "swarm.agents=2",
+    "sitl.start=air",
+    "start.spacing_m=4",
+    "start.center_ned_m=[0, 0, -1]",
+    "mission.kind=swap",
+    "mission.swap.travel_s=4",
+    "mission.duration_s=5",
+)
+
+
+def named(controller: str) -> str:
+    return f"controller.kind=tests.benches.misbehaving:{controller}"
+
+
+def failures(flight: Flight, agent: int) -> list[str]:
+    return [event["why"] for event in flight.lockstep.logs[agent].events if "why" in event]
+
+
+def is_over_and_at_rest(lockstep: Lockstep) -> bool:
+    return mission_is_over(lockstep) and bool(np.abs(lockstep.world.truth_rows()["vel_ned_m_s"]).max() < 0.2)
+
+
+def test_a_controller_that_plans_through_a_peer_is_kept_from_it() -> None:
+    flight = fly_now(*HEAD_ON, named("Meddling"), until=mission_is_over)
+    assert flight.separation_m() >= 0.85
+    assert flight.outcomes == {"completed"}
+    for agent in range(2):
+        assert failures(flight, agent), "its commands were not flown all the time"
+        assert all("misbehaving:Meddling plans too close" in why for why in failures(flight, agent))
+        assert flight.modes(agent, Phase.TRACK) == {Mode.TRACKING}, "there always was a certified plan"
+
+
+def test_negative_control_without_guard_and_filter_it_flies_through(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Guard, "_clearance_m", lambda *_: np.inf)
+    config = load(None, [*HEAD_ON, named("Straight")])
+    unfiltered = config.agent.barrier.model_copy(update={"enabled": False})
+    config = config.model_copy(update={"agent": config.agent.model_copy(update={"barrier": unfiltered})})
+    flight, touched = Lockstep(config), closer_than(0.3)
+    while not touched(flight):
+        assert not flight.finished
+        flight.step()
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        {"Nan": "returned commands that are not finite", "Raising": "raised ZeroDivisionError: division by zero"},
+        {"Sleeping": "took 1", "Straight": "plans too close to a peer"},
+    ],
+    ids=["nan and raising", "sleeping"],
+)
+def test_controllers_that_fail_are_caught_and_vehicles_brought_to_rest(told: dict[str, str]) -> None:
+    configs = [load(None, [*HEAD_ON, named(controller)]) for controller in told]
+    lockstep, alerts = Lockstep(configs[0], own={1: configs[1]}), set()
+    while not is_over_and_at_rest(lockstep):
+        assert not lockstep.finished
+        lockstep.step()
+        alerts |= {raised.text for agent in lockstep.agents if agent and (raised := agent._publisher.active_alert)}
+    flight = Flight(lockstep)
+    assert flight.separation_m() >= 0.85
+    for agent, (controller, why) in enumerate(told.items()):
+        said = f"controller tests.benches.misbehaving:{controller} {why}"
+        assert any(said in alert for alert in alerts)
+        assert said in failures(flight, agent)[-1]
+        assert flight.modes(agent, Phase.TRACK) == {Mode.TRACKING}, "there always was a certified plan"
+        pilot = lockstep.agents[agent]
+        assert pilot is not None
+        ended = said if controller != "Straight" else "completed"
+        assert pilot.outcome.startswith(ended), "what is not asked any more ends the mission, and is named"
+
+
+@pytest.mark.parametrize(("name", "rmse_m"), [("own_pid", 0.1), ("own_lqr", 0.1), ("own_spiral", 0.05)])
+def test_every_example_flies(name: str, rmse_m: float) -> None:
+    short = ("sitl.start=air", "mission.duration_s=2", *(() if name == "own_pid" else ("swarm.agents=1",)))
+    flight = fly_now(*short, config=f"examples/{name}.toml", until=mission_is_over)
+    assert flight.outcomes == {"completed"}
+    for agent in range(flight.config.swarm.agents):
+        ticks, error = flight.tracked(agent)
+        late = ticks["mission_t_s"] > 1.0
+        assert float(np.sqrt(np.mean(np.sum(error[late] ** 2, axis=1)))) <= rmse_m
+        assert failures(flight, agent) == [], "it flies itself"

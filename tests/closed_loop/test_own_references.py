@@ -1,0 +1,72 @@
+"""Tests that references from files and through points are flown as they are written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from swarmctl.core.types import Mode, Phase
+from tests.closed_loop.conftest import Flight, Fly, fly_now, mission_is_over
+
+PERIOD_S, LENGTH_M, WIDTH_M = 12.0, 2.0, 1.0
+
+
+@pytest.fixture(scope="module")
+def figure_8(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write a figure-8 of twelve seconds whose heading follows its course, north east down, ten rows a second."""
+    t_s = np.arange(0.0, PERIOD_S + 0.05, 0.1)
+    w = 2.0 * np.pi / PERIOD_S
+    north, east = LENGTH_M * np.sin(w * t_s), WIDTH_M * np.sin(2.0 * w * t_s)
+    course = np.arctan2(2.0 * WIDTH_M * np.cos(2.0 * w * t_s), LENGTH_M * np.cos(w * t_s))
+    yaw = np.angle(np.exp(1j * course))  # jumps from pi to -pi
+    path = tmp_path_factory.mktemp("own") / "figure_8.csv"
+    rows = np.stack([t_s, north, east, np.full(len(t_s), -1.5), yaw], axis=1)
+    np.savetxt(path, rows, delimiter=",", header="t,x,y,z,yaw", comments="", fmt="%.5f")
+    return path
+
+
+def own(path: Path) -> tuple[str, ...]:
+    return (
+        "mission.kind=csv",
+        f"mission.csv.files=['{path}']",
+        f"mission.duration_s={PERIOD_S}",
+        "swarm.agents=1",
+        "start.center_ned_m=[0, 0, -1.5]",
+        "sitl.start=air",
+    )
+
+
+@pytest.fixture(scope="module")
+def flown(figure_8: Path) -> Flight:
+    return fly_now(*own(figure_8), until=mission_is_over)
+
+
+def test_a_figure_8_from_a_file_is_flown(flown: Flight) -> None:
+    ticks, error = flown.tracked(0)
+    late = ticks["mission_t_s"] > 2.0
+    rmse_m = float(np.sqrt(np.mean(np.sum(error[late] ** 2, axis=1))))
+    assert rmse_m <= 0.03
+    assert np.ptp(flown.pos_ned_m[:, 0, 0]) >= 1.9 * LENGTH_M, "both loops"
+    assert flown.modes(0, Phase.TRACK) == {Mode.TRACKING}
+
+
+def test_the_heading_follows_the_file(flown: Flight) -> None:
+    truth = flown.lockstep.truth
+    w, x, y, z = truth["q_nb"].T
+    yaw = np.unwrap(np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)))
+    assert np.abs(yaw - yaw[0]).max() > 2.0, "it turns with the course"
+
+
+def test_the_reference_is_that_of_the_file(flown: Flight, figure_8: Path) -> None:
+    ticks, _ = flown.tracked(0)
+    rows = np.loadtxt(figure_8, delimiter=",", skiprows=1)
+    at = [np.interp(ticks["mission_t_s"], rows[:, 0], rows[:, c + 1]) for c in range(3)]
+    assert np.abs(np.stack(at, axis=1) - ticks["ref_pos_ned_m"]).max() < 0.01
+
+
+def test_negative_control_a_controller_without_authority_does_not_fly_it(fly: Fly, figure_8: Path) -> None:
+    weak = fly(*own(figure_8), "controller.mpc.u_max=0.02", "mission.duration_s=5", until=mission_is_over)
+    ticks, error = weak.tracked(0)
+    assert float(np.sqrt(np.mean(np.sum(error[ticks["mission_t_s"] > 2.0] ** 2, axis=1)))) > 0.2

@@ -1,0 +1,55 @@
+"""Tests that CSV files are read once, into the configuration, and refused with the line that is wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from swarmctl.config import dump, load
+from swarmctl.errors import ConfigError
+
+GOOD = "# own flight\nT, X, Y, Z,\n0, 0, 0, -1,\n\n2, 1, 0, -1\n"
+
+
+def config_with(tmp_path: Path, content: bytes, name: str = "a.csv") -> Path:
+    (tmp_path / name).write_bytes(content)
+    path = tmp_path / "own.toml"
+    path.write_text(
+        '[swarm]\nagents = 1\n[mission]\nkind = "csv"\nduration_s = 1.0\n[mission.csv]\nfiles = ["a.csv"]\n'
+    )
+    return path
+
+
+def test_a_file_is_found_beside_the_configuration_and_recorded_with_it(tmp_path: Path) -> None:
+    path = config_with(tmp_path, GOOD.encode())
+    config = load(path)
+    resolved = tmp_path / "elsewhere" / "config.toml"
+    resolved.parent.mkdir()
+    resolved.write_text(dump(config))
+    (tmp_path / "a.csv").unlink()
+    assert load(resolved) == config, "a run folder needs no other file"
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "is empty"),
+        (b"t,x,y,z\n0,0,0,-1\n1,0,0\n", "line 3: 3 values for 4 columns"),
+        (b"t,x,y,z\n0,0,0,-1\n1,nan,0,-1\n", "line 3: x = 'nan'"),
+        (b"t,x,y,z\n0,0,0,-1\n1,one,0,-1\n", "line 3: x = 'one'"),
+        (b"\xff\xfe", "not UTF-8"),
+        (b"t,x,y,z\n" + b"0,0,0,-1\n" * 200_000, "larger than 1 MB"),
+        (b"time,x,y,z\n0,0,0,-1\n1,1,0,-1\n", "columns time,x,y,z"),
+    ],
+)
+def test_a_file_that_is_no_table_is_refused(tmp_path: Path, content: bytes, words: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load(config_with(tmp_path, content))
+    assert words in str(caught.value)
+    assert "a.csv" in str(caught.value)
+
+
+def test_a_missing_file_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"no such file .*b\.csv"):
+        load(config_with(tmp_path, GOOD.encode()), ["mission.csv.files=['b.csv']"])
