@@ -120,28 +120,15 @@ def test_looking_up_and_beginning_a_configuration(tmp_path: Path) -> None:
 
 def test_a_sweep_has_a_row_for_each_combination_and_charts(tmp_path: Path) -> None:
     (line,) = shown(r"^swarmctl sweep ")
-    shorter = (
-        "--set",
-        "mission.duration_s=1",
-        "--set",
-        "sitl.start=air",
-        "--jobs",
-        "1",
-        "--out",
-        str(tmp_path / "out"),
-    )
-    done = run(line, *shorter)
+    shorter = ("mission.duration_s=1", "sitl.start=air", "swarm.agents=1")
+    done = run(line, *(f"--set={item}" for item in shorter), "--jobs", "1", "--out", str(tmp_path / "out"))
     assert done.returncode == 0, done.stdout + done.stderr
     rows = pq.read_table(tmp_path / "out" / "rows.parquet").to_pylist()
-    assert sorted((row["swarm.agents"], row["sitl.mass_scale"]) for row in rows) == [
-        (1, 1),
-        (1, 1.25),
-        (2, 1),
-        (2, 1.25),
-    ]
+    index_m = {(row["sitl.mass_scale"], row["mission.circle.radius_m"]): row["index_m"] for row in rows}
+    assert sorted(index_m) == [(1, 3), (1, 5), (1.25, 3), (1.25, 5)]
     assert {row["outcome"] for row in rows} == {"completed"}
-    lone, pair = ([row["index_m"] for row in rows if row["swarm.agents"] == agents] for agents in (1, 2))
-    assert min(pair) > 1.5 * max(lone), "the sum over agents"
+    for mass_scale in (1, 1.25):
+        assert index_m[mass_scale, 5] > 1.3 * index_m[mass_scale, 3], "it begins in the centre of the circle"
     assert "<svg" in (tmp_path / "out" / "report.html").read_text()
 
 
