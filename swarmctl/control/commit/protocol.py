@@ -20,10 +20,17 @@ Each tick applies these rules in this order:
 to a and, not earlier, B to b. A has received a message of B that acknowledges a. If b was proposed before B sent it,
 the message carries b, as proposal or as committed: were b earlier, A would have withdrawn a (rule 2); were it later,
 B, which knew a when it sent that message, would have withdrawn b. If b was proposed after it, B knew a and kept clear
-of it (rule 4), for B forgets a only when A publishes that it has withdrawn it. So a and b do not conflict. Nothing is
-assumed of delay, loss, order or duplication: without messages no acknowledgement arrives, and every agent comes to
-rest where its committed trajectory ends. This replaces the delay check of RMADER (Kondo et al. 2023), whose guarantee
-ends where a message is later than the check.
+of it (rule 4), for B forgets a only when A publishes that it has withdrawn it, or when B is started again: then b needs
+an acknowledgement of A, which carries a. So a and b do not conflict. Nothing is assumed of delay, loss, order or
+duplication: without messages no acknowledgement arrives, and every agent comes to rest where its committed trajectory
+ends. This replaces the delay check of RMADER (Kondo et al. 2023), whose guarantee ends where a message is later than
+the check.
+
+The proof is checked: `tools/explore_protocol.py` drives this code, with symbols in place of trajectories, through every
+order and fate of messages among three agents. Of two that meet and propose once, with the third to answer, that is all
+there is: 2195 states, after at most 12 ticks of agents. With proposals of all three, again and again, exclusions and
+interrupted agents it is the first 100 000 states of each scope, 4 to 10 ticks. No two commitments conflict; without
+any one of the rules two do. The figures are in docs/safety_case.md.
 
 The proof rests on these assumptions, each of which is watched in flight:
 
