@@ -27,7 +27,7 @@ def main() -> int:
     """Print both tables."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--depth", type=int, default=6, help="ticks of agents, one after another (default: 6)")
-    parser.add_argument("--max-states", type=int, default=100_000, help="of each scope (default: 100000, 1 min in all)")
+    parser.add_argument("--max-states", type=int, default=100_000, help="of each scope (default: 100000)")
     parser.add_argument("--scope", choices=sorted(SCOPES), help="only this one (default: all)")
     parser.add_argument("--no-removed", action="store_true", help="leave out the second table")
     arguments = parser.parse_args()
