@@ -13,8 +13,8 @@ from swarmctl.bus.commitment_messages import PeerTrajectories, encode_trajectory
 from swarmctl.bus.peers import Bus, agent_name
 from swarmctl.control.collision.separation import KeepOut, SeparationParams
 from swarmctl.control.commit.membership import Membership
-from swarmctl.control.commit.protocol import CommitCounts, Commitments
-from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference, Situation
+from swarmctl.control.commit.protocol import CommitCounts, Commitments, acknowledgements
+from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference, Situation, TrajectoryPlanner
 from swarmctl.control.commit.tube import Grip, Tube
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.swarm_mpc import MpcParams
@@ -34,7 +34,7 @@ class Coordination:
     Args:
         agent, boot_id: identity in the own messages.
         peers: numbers of the other agents.
-        params, mpc, vehicle, separation, max_keep_outs, stopwatch_ns: see `Commitments`.
+        params, mpc, vehicle, separation, max_keep_outs, stopwatch_ns: see `TrajectoryPlanner`.
         world_model: paths, statuses and presence of peers, and obstacles.
         bus: is drained by `receive`.
         rate_hz: tick rate of every agent.
@@ -68,9 +68,10 @@ class Coordination:
         rate_hz: float,
     ) -> None:
         self._agent, self._boot_id, self._bus, self._world_model = agent, boot_id, bus, world_model
-        self._commitments = Commitments(
+        planner = TrajectoryPlanner(
             agent, params, mpc, vehicle, separation, max_keep_outs=max_keep_outs, stopwatch_ns=stopwatch_ns
         )
+        self._commitments = Commitments(agent, params, planner)
         refusals, presence = world_model.refusals, world_model.presence
         self._peer_trajectories = PeerTrajectories(
             peers, rate_hz, refusals, presence, agent=agent, clocks=world_model.clocks
@@ -205,7 +206,7 @@ class Coordination:
             committed=self._commitments.committed,
             tube_m=self._tube.radius_m,
             proposal=self._commitments.proposal,
-            acknowledged=self._peer_trajectories.acknowledgements(self._ended | exclusions.promised),
+            acknowledged=acknowledgements(self._peer_trajectories.newest, self._ended | exclusions.promised),
             exclusions=exclusions,
             heard=self._peer_trajectories.heard(),
         )

@@ -8,7 +8,7 @@ excluded. A trajectory is t0, step and count, then positions and velocities as f
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Set
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -193,10 +193,6 @@ class PeerTrajectories:
             self._measure(message, utc_us)
             if self._clocks.ahead_us(message.agent) != ahead_us:
                 self._memory[sender] = {}
-
-    def acknowledgements(self, without: Set[int]) -> dict[int, int]:
-        """Return the number of the current proposal of each peer that has one and is not in `without`."""
-        return {a: i.proposal.number for a, i in self.newest.items() if i.proposal is not None and a not in without}
 
     def heard(self) -> dict[int, tuple[int, int]]:
         """Return stamp and arrival of the newest message of each peer."""

@@ -21,6 +21,7 @@ from swarmctl.bus.peer_clocks import PeerClocks
 from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.bus.refusals import Refusals
 from swarmctl.bus.senders import Presence
+from swarmctl.control.commit.protocol import acknowledgements
 from swarmctl.core.clock import SimClock
 from swarmctl.core.trajectory import Trajectory, ending_at_rest, joined, resting, stopping
 from swarmctl.core.trajectory_message import Exclusions, Proposal, TrajectoryMessage
@@ -165,7 +166,7 @@ def test_only_newer_messages_of_expected_peers_are_accepted() -> None:
     store.peers.offer(agent_name(2), b"nonsense", UTC_US)
     assert set(store.peers.newest) == {2} and store.peers.newest[2].seq == 3
     assert store.refusals.by_reason == {"replayed": 2, "identity": 1, "unknown_peer": 1, "malformed": 1}
-    assert store.peers.acknowledgements(frozenset()) == {2: 77}
+    assert acknowledgements(store.peers.newest, frozenset()) == {2: 77}
 
 
 def test_one_forged_message_does_not_silence_its_peer() -> None:
@@ -188,7 +189,7 @@ def test_a_restart_is_accepted_with_its_third_message_and_has_proposed_nothing_y
         *(replace(message(seq=seq, boot_id=3, propose=False), sent_utc_us=UTC_US + seq * 50_000) for seq in (4, 5, 6))
     )
     assert store.peers.newest[2].boot_id == 3
-    assert store.peers.acknowledgements(frozenset()) == {}
+    assert acknowledgements(store.peers.newest, frozenset()) == {}
 
 
 def test_a_trajectory_that_begins_in_the_far_future_is_refused() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import partial
 
@@ -12,8 +11,8 @@ import pytest
 
 from swarmctl.control.collision.separation import KeepOut, SeparationParams
 from swarmctl.control.commit import trajectory_planner
-from swarmctl.control.commit.protocol import Commitments
-from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference
+from swarmctl.control.commit.protocol import Commitments, acknowledgements
+from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference, TrajectoryPlanner
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.control.reference.quintic import quintic_to
@@ -30,15 +29,17 @@ HARD_MIN_M = SEPARATION.radius_m - SEPARATION.certify_slack_m
 
 
 def committing(agent: int, *, max_keep_outs: int, separation: SeparationParams = SEPARATION) -> Commitments:
-    return Commitments(
+    params = CommitParams()
+    planner = TrajectoryPlanner(
         agent,
-        CommitParams(),
+        params,
         MpcParams(u_max=0.25),
         VehicleModelParams(),
         separation,
         max_keep_outs=max_keep_outs,
         stopwatch_ns=lambda: 0,
     )
+    return Commitments(agent, params, planner)
 
 
 @dataclass(kw_only=True)
@@ -76,9 +77,6 @@ class Crowd:
         for agent, start in zip(self.agents, self.starts, strict=True):
             agent.begin(start, np.zeros(3), UTC_US)
 
-    def acknowledged(self, agent: int) -> Mapping[int, int]:
-        return {a: i.proposal.number for a, i in self.known[agent].items() if i.proposal is not None}
-
     def step(self) -> None:
         self.now_us += TICK_US
         self.seq += 1
@@ -105,7 +103,7 @@ class Crowd:
                 sent_utc_us=self.now_us,
                 committed=agent.committed,
                 proposal=agent.proposal,
-                acknowledged=self.acknowledged(i),
+                acknowledged=acknowledgements(self.known[i], set()),
             )
             for j in ids:
                 if j != i:

@@ -10,39 +10,16 @@ from __future__ import annotations
 
 import itertools
 import random
-from collections.abc import Collection, Iterator, Mapping, Sequence, Set
+from collections.abc import Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass
 
 import pytest
 
+from sitl.studies.protocol.removed_rules import TakesBack, TrustsSuspicion, VotesWithoutMajority
 from swarmctl.control.commit.membership import Membership
 from swarmctl.core.trajectory_message import Exclusions
 
 NOBODY: frozenset[int] = frozenset()
-Told = Mapping[int, Exclusions]
-
-
-class VotesWithoutMajority(Membership):
-    """Two halves may each exclude the other."""
-
-    def _is_majority(self, voters: Collection[int]) -> bool:
-        return True
-
-
-class TakesBack(Membership):
-    """Forgets what it has promised, until it excludes."""
-
-    def update(self, suspected: Set[int], told: Told, ended: Set[int], *, votes: bool = True) -> None:
-        self._promised = self.excluded
-        super().update(suspected, told, ended, votes=votes)
-
-
-class TrustsSuspicion(Membership):
-    """Excludes as soon as all others suspect, before they have promised."""
-
-    def update(self, suspected: Set[int], told: Told, ended: Set[int], *, votes: bool = True) -> None:
-        super().update(suspected, told, ended, votes=votes)
-        self.excluded = self._promised
 
 
 @dataclass(frozen=True)
