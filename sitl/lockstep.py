@@ -30,8 +30,7 @@ from swarmctl.config import Config
 from swarmctl.core.clock import Clock, ClockError, OffsetClock, SimClock
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import EXCLUDE
-from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE, tick_row
-from swarmctl.core.tick_record import TickRecord
+from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.kernels import why_not_repeatable
 from swarmctl.mavlink.transport import pipe_pair
 from swarmctl.telemetry.evaluation.referee import RunData
@@ -57,8 +56,8 @@ class FlightLog:
         if self.directory is not None:
             self._tlog = (self.directory / f"agent-{self.agent}.tlog").open("wb")
 
-    def tick(self, record: TickRecord) -> None:
-        self.rows.append(tick_row(record))
+    def tick(self, row: NDArray[np.void]) -> None:
+        self.rows.append(row)
 
     def event(self, name: str, t_us: int, utc_us: int, **fields: Any) -> None:
         source = agent_name(self.agent)

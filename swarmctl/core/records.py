@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl.core.tick_record import COLUMNS, TickRecord
-from swarmctl.core.types import Array
+from swarmctl.core.types import Array, Plan
 
 TICK_DTYPE = np.dtype([(column.name, column.dtype, (column.size,) if column.size else ()) for column in COLUMNS])
 
@@ -40,11 +40,10 @@ def tick_row(record: TickRecord) -> NDArray[np.void]:
     return row
 
 
-def pack_tick(record: TickRecord) -> bytes:
-    """Encode a record for the bus: a fixed row, the number of points of the flown plan (u16), the points as float32."""
-    pos_ned_m = _NO_PLAN if record.flown is None else record.flown.pos_ned_m
-    plan = np.ascontiguousarray(pos_ned_m, dtype="<f4")
-    return tick_row(record).tobytes() + _PLAN_HEADER.pack(len(plan)) + plan.tobytes()
+def pack_tick(row: NDArray[np.void], flown: Plan | None) -> bytes:
+    """Encode a tick for the bus: its row, the number of points of the flown plan (u16), the points as float32."""
+    plan = np.ascontiguousarray(_NO_PLAN if flown is None else flown.pos_ned_m, dtype="<f4")
+    return row.tobytes() + _PLAN_HEADER.pack(len(plan)) + plan.tobytes()
 
 
 def unpack_tick(payload: bytes) -> tuple[NDArray[np.void], Array] | None:

@@ -17,8 +17,10 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
-from swarmctl.core.records import TICK_DTYPE, tick_row
-from swarmctl.core.tick_record import TickRecord
+import numpy as np
+from numpy.typing import NDArray
+
+from swarmctl.core.records import TICK_DTYPE
 from swarmctl.telemetry.json_safe import to_json
 
 _FLUSH_TIMEOUT_S = 0.25
@@ -52,9 +54,9 @@ class Recorder:
         """Number of rows dropped so far."""
         return self._refused + sum(file.lost for file in self._files)
 
-    def tick(self, record: TickRecord) -> None:
-        """Record one tick."""
-        self._put(0, tick_row(record).tobytes())
+    def tick(self, row: NDArray[np.void]) -> None:
+        """Record one tick, a (1,) array of `TICK_DTYPE`."""
+        self._put(0, row.tobytes())
 
     def frame(self, utc_us: int, frame: bytes) -> None:
         """Record one MAVLink frame, sent or received at `utc_us`."""

@@ -12,17 +12,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from swarmctl.core.records import TICK_DTYPE
-from swarmctl.core.tick_record import TickRecord
+from swarmctl.core.records import TICK_DTYPE, tick_row
 from swarmctl.telemetry.recording import recorder as recorder_module
 from swarmctl.telemetry.recording.recorder import Recorder
 from swarmctl.telemetry.recording.run_files import load_run, read_rows
 from tests.benches.tick_records import tick_record
 
 
-def record(seq: int) -> TickRecord:
-    return tick_record(t_us=seq * 20_000, utc_us=1_780_000_000_000_000 + seq * 20_000, seq=seq)
+def record(seq: int) -> NDArray[np.void]:
+    return tick_row(tick_record(t_us=seq * 20_000, utc_us=1_780_000_000_000_000 + seq * 20_000, seq=seq))
 
 
 def test_round_trip(tmp_path: Path) -> None:
