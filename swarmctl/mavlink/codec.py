@@ -1,7 +1,7 @@
 """MAVLink 2 codec that converts bytes and dialect messages, one datagram at a time. It knows no socket and no vehicle.
 
-`parse_buffer` is never used: as a stream parser it loses most good frames after two bytes of junk. Plain frames (MAVLink
-2, not signed, valid) are decoded here: to the same messages as by pymavlink's `decode`, in half of the time or less.
+`parse_buffer` is never used: as a stream parser it loses most good frames after two bytes of junk. Plain frames
+(MAVLink 2, not signed, valid) are decoded here: to the same messages as by pymavlink's `decode`, in half of its time.
 """
 
 from __future__ import annotations
