@@ -30,8 +30,8 @@ from swarmctl.config import Config
 from swarmctl.core.clock import Clock, ClockError, OffsetClock, SimClock
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import EXCLUDE
-from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE, plan_rows, tick_row
-from swarmctl.core.tick_record import TickRecord
+from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE, plan_rows
+from swarmctl.core.types import Plan
 from swarmctl.kernels import why_not_repeatable
 from swarmctl.mavlink.transport import pipe_pair
 from swarmctl.telemetry.evaluation.referee import RunData
@@ -58,11 +58,10 @@ class FlightLog:
         if self.directory is not None:
             self._tlog = (self.directory / f"agent-{self.agent}.tlog").open("wb")
 
-    def tick(self, record: TickRecord) -> None:
-        row = tick_row(record)
+    def tick(self, row: NDArray[np.void], flown: Plan | None) -> None:
         self.rows.append(row)
         if self.directory is not None:
-            self.plans.append(plan_rows(row, record.flown).tobytes())
+            self.plans.append(plan_rows(row, flown).tobytes())
 
     def event(self, name: str, t_us: int, utc_us: int, **fields: Any) -> None:
         source = agent_name(self.agent)

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from swarmctl.agent.alerts import Alert
 from swarmctl.bus import topics
@@ -19,7 +20,7 @@ from swarmctl.control.mpc.problem import Start
 from swarmctl.control.phases.state_machine import MissionStateMachine
 from swarmctl.core.clock import Clock
 from swarmctl.core.operator_verbs import Answer
-from swarmctl.core.records import pack_tick
+from swarmctl.core.records import pack_tick, tick_row
 from swarmctl.core.tick_record import TickRecord, TickTiming
 from swarmctl.core.types import AttitudeSetpoint, Mode, Plan, Reference, VehicleState
 from swarmctl.mavlink.autopilot import Autopilot
@@ -29,9 +30,10 @@ _RECENT_TICKS = 250
 
 
 class TickSink(Protocol):
-    """Destination of records and events; its methods never block."""
+    """Destination of ticks and events; its methods never block."""
 
-    def tick(self, record: TickRecord) -> None: ...
+    def tick(self, row: NDArray[np.void], flown: Plan | None) -> None:
+        """Take the row of a tick, a (1,) array of `core.records.TICK_DTYPE`."""
 
     def event(self, name: str, t_us: int, utc_us: int, **fields: Any) -> None: ...
 
@@ -114,8 +116,9 @@ class TelemetryPublisher:
             timing=timing,
         )
         self._recent_ms.append(timing.tick_ms)
-        self._sink.tick(record)
-        self._bus.publish(topics.TICK, pack_tick(record))
+        row = tick_row(record)
+        self._sink.tick(row, record.flown)
+        self._bus.publish(topics.TICK, pack_tick(row, record.flown))
         if now_us - self._status_us >= _STATUS_EVERY_US:
             self._status_us = now_us
             self._bus.publish(topics.STATUS, encode_message(self._status(record, state_machine)))

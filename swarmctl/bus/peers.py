@@ -326,7 +326,10 @@ class LocalBus:
 
     def accept(self, topic: Topic, sender: str, message: _Message, now_us: int) -> None:
         """Queue a message under way, in the order of arrival."""
-        inbox = self._inboxes.setdefault(topic, {}).setdefault(sender, deque())
+        inboxes = self._inboxes[topic]
+        inbox = inboxes.get(sender)
+        if inbox is None:
+            inbox = inboxes[sender] = deque()
         place = len(inbox)
         while place and inbox[place - 1].visible_us > message.visible_us:
             place -= 1

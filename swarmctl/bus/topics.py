@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)  # the table has one object a topic: keys by identity
 class Topic:
     """Describes one stream of an agent, or of the operator, on the bus."""
 

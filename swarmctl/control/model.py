@@ -169,13 +169,13 @@ class Predictor:
 
 def tilt_rate(state: VehicleState) -> Array:
     """Return the rate (2,) [1/s] of the horizontal part of the body's down axis."""
-    p, q, _ = (float(w) for w in state.rate_frd_rad_s)
+    p, q, _ = state.rate_frd_rad_s.tolist()
     return rotate_to_ned(state.q_nb, np.array([q, -p, 0.0]))[:2]
 
 
 def acceleration(virtual_control: Array) -> Array:
     """Return the acceleration (3,) NED [m/s2] of virtual_control controls (3,), gravity included (thesis 3.2)."""
-    ux, uy, thrust = (float(c) for c in virtual_control)
+    ux, uy, thrust = virtual_control.tolist()
     down = max(0.0, 1.0 - ux * ux - uy * uy) ** 0.5
     return np.array([-thrust * ux, -thrust * uy, GRAVITY_M_S2 - thrust * down])
 

@@ -21,7 +21,7 @@ def setpoint_of(
     The body down axis is (u_x, u_y, sqrt(1 - u_x^2 - u_y^2)): thesis (3.26) and (3.33) without their singularity. Tilt
     is limited by shortening (u_x, u_y). Thrust is linear in the autopilot's 0..1; `hover_thrust_01` holds the weight.
     """
-    ux, uy, specific = (float(c) for c in virtual_control)
+    ux, uy, specific = virtual_control.tolist()
     tilt = math.hypot(ux, uy)
     limit = math.sin(params.tilt_max_rad)
     if tilt > limit:

@@ -32,7 +32,7 @@ def quat_from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Array:
 
 def euler_from_quat(q_nb: Array) -> tuple[float, float, float]:
     """Return ZYX Euler angles (roll, pitch, yaw) [rad] of a unit quaternion (4,) wxyz."""
-    w, x, y, z = (float(c) for c in q_nb)
+    w, x, y, z = q_nb.tolist()
     roll_rad = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch_rad = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
     yaw_rad = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
@@ -41,7 +41,7 @@ def euler_from_quat(q_nb: Array) -> tuple[float, float, float]:
 
 def body_z_ned(q_nb: Array) -> Array:
     """Return the body down axis (3,) in NED: the thesis' (u_x, u_y, c_phi c_theta) of eqs. (3.16), (3.23)."""
-    w, x, y, z = (float(c) for c in q_nb)
+    w, x, y, z = q_nb.tolist()
     return np.array([2 * (x * z + w * y), 2 * (y * z - w * x), 1 - 2 * (x * x + y * y)])
 
 
@@ -51,7 +51,7 @@ def quat_from_body_z(down_ned: Array, yaw_rad: float) -> Array:
     It is the exact inverse of thesis eqs. (3.16) and (3.23), that is (3.26) and the consistent form of (3.33),
     `phi = -asin(u_y c_psi - u_x s_psi)`, without their singularity in the measured angles.
     """
-    ux, uy, uz = (float(c) for c in down_ned)
+    ux, uy, uz = down_ned.tolist()
     s, c = math.sin(yaw_rad), math.cos(yaw_rad)
     roll_rad = -math.asin(max(-1.0, min(1.0, uy * c - ux * s)))
     pitch_rad = math.atan2(ux * c + uy * s, uz)
@@ -60,8 +60,8 @@ def quat_from_body_z(down_ned: Array, yaw_rad: float) -> Array:
 
 def rotate_to_ned(q_nb: Array, vector_frd: Array) -> Array:
     """Rotate a body FRD vector (3,) into NED (3,)."""
-    w, x, y, z = (float(c) for c in q_nb)
-    vx, vy, vz = (float(c) for c in vector_frd)
+    w, x, y, z = q_nb.tolist()
+    vx, vy, vz = vector_frd.tolist()
     tx, ty, tz = 2 * (y * vz - z * vy), 2 * (z * vx - x * vz), 2 * (x * vy - y * vx)
     return np.array(
         [vx + w * tx + y * tz - z * ty, vy + w * ty + z * tx - x * tz, vz + w * tz + x * ty - y * tx],

@@ -67,11 +67,10 @@ def plan_rows(row: NDArray[np.void], flown: Plan | None) -> NDArray[np.void]:
     return rows
 
 
-def pack_tick(record: TickRecord) -> bytes:
-    """Encode a record for the bus: a fixed row, the number of points of the flown plan (u16), the points as float32."""
-    pos_ned_m = _NO_PLAN if record.flown is None else record.flown.pos_ned_m
-    plan = np.ascontiguousarray(pos_ned_m, dtype="<f4")
-    return tick_row(record).tobytes() + _PLAN_HEADER.pack(len(plan)) + plan.tobytes()
+def pack_tick(row: NDArray[np.void], flown: Plan | None) -> bytes:
+    """Encode a tick for the bus: its row, the number of points of the flown plan (u16), the points as float32."""
+    plan = np.ascontiguousarray(_NO_PLAN if flown is None else flown.pos_ned_m, dtype="<f4")
+    return row.tobytes() + _PLAN_HEADER.pack(len(plan)) + plan.tobytes()
 
 
 def unpack_tick(payload: bytes) -> tuple[NDArray[np.void], Array] | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from swarmctl.core.types import Array
 Times = NDArray[Any]  # UTC [us], integer or float
 _STOPPED_M_S = 1e-3  # a slower plan is not continued by braking
 _AT_REST_M_S = 1e-6  # a slower velocity has no direction
+_NOWHERE = np.zeros(3)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -34,11 +36,12 @@ class Trajectory:
     def sample(self, t_utc_us: Times) -> tuple[Array, Array]:
         """Return positions and velocities, (M, 3) NED each, at times (M,); cubic interpolation."""
         last, dt_s = len(self.pos_ned_m) - 1, self.dt_us * 1e-6
-        k = np.clip((np.asarray(t_utc_us, np.float64) - self.t0_utc_us) / self.dt_us, 0.0, last)
+        k = (np.asarray(t_utc_us, np.float64) - self.t0_utc_us) / self.dt_us
+        k = np.minimum(np.maximum(k, 0.0), last)
         low = np.minimum(k.astype(int), last - 1)
-        s = (k - low)[:, None]
-        p0, p1 = self.pos_ned_m[low], self.pos_ned_m[low + 1]
-        v0, v1 = self.vel_ned_m_s[low] * dt_s, self.vel_ned_m_s[low + 1] * dt_s
+        high, s = low + 1, (k - low)[:, None]
+        p0, p1 = self.pos_ned_m.take(low, axis=0), self.pos_ned_m.take(high, axis=0)
+        v0, v1 = self.vel_ned_m_s.take(low, axis=0) * dt_s, self.vel_ned_m_s.take(high, axis=0) * dt_s
         ends, rise = 2.0 * (p0 - p1) + v0 + v1, 3.0 * (p1 - p0) - 2.0 * v0 - v1
         pos = ((ends * s + rise) * s + v0) * s + p0
         vel = ((3.0 * ends * s + 2.0 * rise) * s + v0) / dt_s
@@ -79,12 +82,13 @@ def interpolate(polylines: Sequence[Array], k: Array) -> Array:
 
     Before the first point the first segment is extrapolated; after the last point the last point is returned.
     """
-    lasts = np.array([len(points) - 1 for points in polylines])[:, None]
-    firsts = np.cumsum(lasts + 1)[:, None] - lasts - 1  # (N, 1) index of each first point in the concatenation
+    counts = [len(points) for points in polylines]
+    lasts = np.array(counts)[:, None] - 1
     points = np.concatenate(polylines)
     low = np.minimum(np.maximum(np.floor(k).astype(np.int64), 0), lasts - 1)
-    begins = points[firsts + low]
-    return np.asarray(begins + (np.minimum(k, lasts) - low)[:, :, None] * (points[firsts + low + 1] - begins))
+    at = low + np.array([0, *accumulate(counts[:-1])])[:, None]  # in the concatenation
+    begins = points.take(at, axis=0)
+    return np.asarray(begins + (np.minimum(k, lasts) - low)[:, :, None] * (points.take(at + 1, axis=0) - begins))
 
 
 def resting(pos_ned_m: Array, t_utc_us: int, dt_us: int) -> Trajectory:
@@ -129,12 +133,22 @@ def joined(first: Trajectory, then: Trajectory, from_utc_us: int) -> Trajectory:
 
 def braking_displacement(vel_ned_m_s: Array, t_s: Array, brake_m_s2: float) -> Array:
     """Return displacements (K, 3) NED [m] at times (K,) after the begin of braking to rest from a velocity (3,)."""
-    speed = math.sqrt(float(vel_ned_m_s @ vel_ned_m_s))
-    if speed < _AT_REST_M_S:
-        return np.zeros((len(t_s), 3))
+    return np.asarray(braking_displacements([vel_ned_m_s], t_s[None], brake_m_s2)[0])
+
+
+def braking_displacements(velocities_ned_m_s: Sequence[Array], t_s: Array, brake_m_s2: float) -> Array:
+    """Return displacements (N, K, 3) NED [m] at times (N, K) after N velocities, (3,) each, begin to brake to rest."""
+    speeds = [math.sqrt(float(vel @ vel)) for vel in velocities_ned_m_s]
+    directions = np.array(
+        [
+            vel / speed if speed >= _AT_REST_M_S else _NOWHERE
+            for vel, speed in zip(velocities_ned_m_s, speeds, strict=True)
+        ]
+    )
+    speed = np.array(speeds)[:, None]
     t_s = np.minimum(np.maximum(t_s, 0.0), speed / brake_m_s2)
     travelled_m = speed * t_s - 0.5 * brake_m_s2 * t_s * t_s
-    return np.asarray(travelled_m[:, None] * (vel_ned_m_s / speed))
+    return np.asarray(travelled_m[:, :, None] * directions[:, None])
 
 
 def _brake(pos_ned_m: Array, vel_ned_m_s: Array, dt_s: float, brake_m_s2: float) -> tuple[Array, Array]:

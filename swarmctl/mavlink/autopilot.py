@@ -7,6 +7,7 @@ state, and therefore no setpoint is sent.
 
 from __future__ import annotations
 
+import math
 from collections import Counter, deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -182,7 +183,7 @@ class Autopilot:
         if refused:
             self.refused_setpoints += 1
             return refused
-        q = [float(c) for c in setpoint.q_nb]
+        q = setpoint.q_nb.tolist()
         message = mavlink.MAVLink_set_attitude_target_message(
             (now_us // 1000) & 0xFFFFFFFF, self._sysid, 1, _ATTITUDE_ONLY, q, 0.0, 0.0, 0.0, setpoint.thrust_01
         )
@@ -286,7 +287,7 @@ class Autopilot:
     def _take(self, vehicle_us: int, arrived_us: int, pos: Array, vel: Array, *, q_nb: Array, rate: Array) -> bool:
         """Keep a sample if it is valid and the newest; return whether it was kept."""
         norm = float(np.sqrt(q_nb @ q_nb))
-        if not (np.isfinite(pos).all() and np.isfinite(vel).all() and np.isfinite(rate).all() and 0.9 < norm < 1.1):
+        if not (all(map(math.isfinite, (*pos.tolist(), *vel.tolist(), *rate.tolist()))) and 0.9 < norm < 1.1):
             self._codec.refused["state not finite"] += 1
             return False
         t_us = self.clock.to_local(vehicle_us, arrived_us)

@@ -138,7 +138,8 @@ class VehicleClock:
         """
         if not self._asked or not self._spans():  # until the rate is known the line may be far too low
             return 0.0
-        left_us = min(self._offset_us + self.rate * x - y for x, y in self._asked)
+        offset_us, rate = self._offset_us, self.rate
+        left_us = min([offset_us + rate * x - y for x, y in self._asked])
         return 0.5 * max(0.0, left_us - _LOOP_US)
 
     def _line(self, vehicle_us: float) -> float:

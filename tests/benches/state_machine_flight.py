@@ -85,7 +85,7 @@ class Flight:
             mode=self.failsafe_mode,
             unresponsive_peer=self.unresponsive_peer,
             peers=self.peers,
-            others_ned_m=self.others,
+            others_ned_m=lambda: self.others,
             arm_in=self.arm_in,
             boots=self.boots,
             refusal=self.refusal,

@@ -12,6 +12,7 @@ import time
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sitl.world import SitlWorld
 from swarmctl.agent.assembly import make_agent
@@ -22,7 +23,7 @@ from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.config import Config, load
 from swarmctl.core.clock import SimClock
 from swarmctl.core.tick_record import TickRecord, TickTiming
-from swarmctl.core.types import Array, Phase, PlanStatus, PredictedPath
+from swarmctl.core.types import Array, Phase, Plan, PlanStatus, PredictedPath
 from swarmctl.mavlink.transport import pipe_pair
 
 SPACING_M = 1.0  # distance of places; 0.9 m is kept
@@ -98,14 +99,11 @@ def formation_config(solver: str, neighbours: int, pillar: bool) -> Config:
     return load(None, overrides)
 
 
-class _Newest:
-    """A recorder that keeps only the newest tick."""
+class _Nowhere:
+    """A recorder that keeps nothing."""
 
-    def __init__(self) -> None:
-        self.record: TickRecord | None = None
-
-    def tick(self, record: TickRecord) -> None:
-        self.record = record
+    def tick(self, row: NDArray[np.void], flown: Plan | None) -> None:
+        return
 
     def event(self, name: str, t_us: int, utc_us: int, **fields: Any) -> None:
         return
@@ -116,7 +114,8 @@ class Formation:
 
     def __init__(self, config: Config) -> None:
         self.clock = SimClock()
-        self._config, self._sink = config, _Newest()
+        self._config = config
+        self._newest: TickRecord | None = None
         self._tick_us = round(1e6 / config.agent.rate_hz)
         self._physics_us = round(1e6 / config.sitl.physics_hz)
         near, far = pipe_pair(self.clock.now_us, 0)
@@ -137,7 +136,7 @@ class Formation:
             near,
             bus=hub.connect(agent_name(0)),
             clock=self.clock,
-            sink=self._sink,
+            sink=_Nowhere(),
             on_frame=lambda frame: None,
             stopwatch_ns=time.perf_counter_ns,
         )
@@ -145,7 +144,7 @@ class Formation:
     @property
     def mission_t_s(self) -> float:
         """Mission time of the newest tick; -1 before the mission."""
-        record = self._sink.record
+        record = self._newest
         return -1.0 if record is None or not math.isfinite(record.mission_t_s) else record.mission_t_s
 
     @property
@@ -156,8 +155,8 @@ class Formation:
     @property
     def record(self) -> TickRecord:
         """Record of the newest tick."""
-        assert self._sink.record is not None
-        return self._sink.record
+        assert self._newest is not None
+        return self._newest
 
     @property
     def planned(self) -> bool:
@@ -168,7 +167,7 @@ class Formation:
     def step(self) -> None:
         """Publish the neighbours' messages, tick the agent, and step the physics to the next tick."""
         self._speak()
-        self.agent.tick(self.clock.now_us(), 0)
+        self._newest = self.agent.tick(self.clock.now_us(), 0)
         for _ in range(self._tick_us // self._physics_us):
             self.clock.advance(self._physics_us)
             self._world.step(self.clock.now_us())

@@ -20,7 +20,7 @@ from swarmctl.control.collision.budget import SeparationBudget
 from swarmctl.control.mpc.axes import HalfSpaces
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.params import Params
-from swarmctl.core.trajectory import braking_displacement, interpolate
+from swarmctl.core.trajectory import braking_displacements, interpolate
 from swarmctl.core.types import Array, PredictedPath
 
 _TINY_M = 1e-6
@@ -125,17 +125,18 @@ def aligned(paths: Sequence[PredictedPath], t0_utc_us: int, dt_us: int, steps: i
     Paths are interpolated, then continued by braking to a stop. Times before the first point are extrapolated
     backwards along the first segment.
     """
-    lasts = np.array([len(path.pos_ned_m) - 1 for path in paths])[:, None]
     since = np.array([(t0_utc_us - path.t0_utc_us) / path.dt_us for path in paths])[:, None]
     pace = np.array([dt_us / path.dt_us for path in paths])[:, None]
     k = since + np.arange(steps + 1) * pace  # (N, steps+1) in points
     found = interpolate([path.pos_ned_m for path in paths], k)
-    beyond = k - lasts
-    for i, path in enumerate(paths):
-        if beyond[i, -1] > 0.0:
-            dt_s = path.dt_us * 1e-6
-            last_vel = (path.pos_ned_m[-1] - path.pos_ned_m[-2]) / dt_s  # (3,)
-            found[i] += braking_displacement(last_vel, beyond[i] * dt_s, brake_m_s2)
+    beyond = k - np.array([len(path.pos_ned_m) - 1 for path in paths])[:, None]
+    ended = [i for i, last in enumerate(beyond[:, -1].tolist()) if last > 0.0]
+    if ended:
+        steps_s = [paths[i].dt_us * 1e-6 for i in ended]
+        last_vels = [
+            (paths[i].pos_ned_m[-1] - paths[i].pos_ned_m[-2]) / dt_s for i, dt_s in zip(ended, steps_s, strict=True)
+        ]
+        found[ended] += braking_displacements(last_vels, beyond[ended] * np.array(steps_s)[:, None], brake_m_s2)
     return found
 
 
@@ -249,7 +250,8 @@ def half_spaces(
     closing = -np.einsum("sc,sc->s", normal[:, -1], vel_m_s - ends)
     stop_s = np.maximum(closing, 0.0) / (2.0 * params.stop_m_s2)
     squeezed = np.array([k.downwash > 1.0 and not k.any_height for k in keep_outs])
-    stop_s[squeezed] /= np.maximum(np.linalg.norm(normal[squeezed, -1], axis=1), _TINY_M)  # braking is scaled likewise
+    if squeezed.any():  # braking is scaled likewise
+        stop_s[squeezed] /= np.maximum(np.linalg.norm(normal[squeezed, -1], axis=1), _TINY_M)
     stop_offset = offset[:, -1] + stop_s * np.einsum("sc,sc->s", normal[:, -1], ends)
     return HalfSpaces(
         normal=normal,
@@ -285,6 +287,8 @@ def _with_right_of_way(normal: Array, distance: Array, needed: Array, to_goal: A
     is the largest turn: full for obstacles, for peers only when the own plan is stuck, because turned normals would
     also keep a swarm that shares one goal from closing in evenly.
     """
+    if not angle_rad.any():
+        return normal
     span = np.sqrt(np.einsum("kc,kc->k", to_goal, to_goal))  # (Hp,)
     ahead = -np.einsum("skc,kc->sk", normal, to_goal) / np.maximum(span, _TINY_M)  # cosine: 1 is head-on
     weight = np.clip((ahead - 0.7) / 0.3, 0.0, 1.0) * (span > 0.75 * needed) * (distance < 2.0 * needed + 0.5)
@@ -320,9 +324,9 @@ def certify(
     others = np.stack([k.pos_ned_m for k in keep_outs])  # (m, Hp+1, 3)
     apart = path_ned_m - others
     apart[:, :, 2] *= np.array([k.vertical_01 for k in keep_outs])[:, None]
-    step = np.diff(apart, axis=1)
+    step = apart[:, 1:] - apart[:, :-1]
     length2 = np.maximum(np.einsum("mkc,mkc->mk", step, step), 1e-18)
-    nearest = np.clip(-np.einsum("mkc,mkc->mk", apart[:, :-1], step) / length2, 0.0, 1.0)
+    nearest = np.minimum(np.maximum(-np.einsum("mkc,mkc->mk", apart[:, :-1], step) / length2, 0.0), 1.0)
     closest = apart[:, :-1] + nearest[:, :, None] * step  # closest point of each relative segment to the origin
     distance = np.sqrt(np.einsum("mkc,mkc->mk", closest, closest))  # (m, Hp)
     now = np.sqrt(np.einsum("mc,mc->m", apart[:, 0], apart[:, 0]))

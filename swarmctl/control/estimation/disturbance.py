@@ -110,7 +110,7 @@ class DisturbanceObserver:
         self._velocity = predicted + min(1.0, 2.0 * pole * dt_s) * innovation
         disturbance = self._disturbance + dt_s * pole * pole * innovation
         limit = self._params.limit_m_s2
-        self._disturbance = np.clip(disturbance, -limit, limit)
+        self._disturbance = np.minimum(np.maximum(disturbance, -limit), limit)
         moved = self._hover.explain(float(self._disturbance[2]), thrust_01, dt_s)
         self._disturbance = self._disturbance - np.array([0.0, 0.0, moved])
         return self.estimate

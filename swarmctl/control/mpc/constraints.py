@@ -148,10 +148,12 @@ class KeepOutHalfSpaces(ConstraintBlock):
         axes, horizon, first = prediction.axes, prediction.horizon, prediction.first_row()
         stride = max(1, round(_ROW_SPACING_S / horizon.dt_s))
         self.checked = np.arange(horizon.prediction - 1, first - 1, -stride)[::-1]  # 0-based steps that get rows
+        self._steps = np.append(self.checked, horizon.prediction - 1)  # those of the rows; the last one looks beyond
         step_m_s2 = max(a.du_max * a.gain_m_s2 for a in axes)
         response = (prediction.pos_of_accel @ prediction.acted[0])[self.checked].max(axis=1) * step_m_s2
         response = np.append(response, response[-1])  # the stopping row
         self._row_scale = 1.0 / np.maximum(response, 0.01)  # rows of about unit size suit a first-order solver
+        self._scale = np.tile(self._row_scale, max_keep_outs)  # of all rows
         uses = np.ones((max_keep_outs * len(response), len(axes) * horizon.control), bool)
         slacks = np.kron(np.eye(max_keep_outs), (_SLACK_SCALE_M * self._row_scale)[:, None])
         curvature = 2 * penalties.slack_quadratic * _SLACK_SCALE_M**2 * cost_scale
@@ -167,12 +169,13 @@ class KeepOutHalfSpaces(ConstraintBlock):
         spaces = forecast.half_spaces
         if spaces is None or len(spaces.normal) == 0:
             return
-        normal = np.concatenate([spaces.normal[:, self.checked], spaces.normal[:, -1:]], axis=1)
-        offset = np.concatenate([spaces.offset_m[:, self.checked], spaces.stop_offset_m[:, None]], axis=1)
+        normal = spaces.normal.take(self._steps, axis=1)
+        offset = spaces.offset_m.take(self._steps, axis=1)
+        offset[:, -1] = spaces.stop_offset_m
         reach = self._fill_coefficients(rows, forecast, spaces, normal)
         free = np.empty((*offset.shape, len(self._prediction.axes)))
-        free[:, :-1] = forecast.free_pos_m[self.checked]
-        free[:, -1] = forecast.free_pos_m[-1] + spaces.stop_s[:, None] * forecast.free_vel_m_s[-1]
+        free[:] = forecast.free_pos_m.take(self._steps, axis=0)
+        free[:, -1] += spaces.stop_s[:, None] * forecast.free_vel_m_s[-1]
         wanted = offset - np.einsum("ska,ska->sk", normal, free)
         lower = np.minimum(wanted, self._relax_01 * reach) * self._row_scale
         rows.lower[: offset.size] = np.where(np.isfinite(offset), lower, -INFINITY).ravel()
@@ -188,8 +191,8 @@ class KeepOutHalfSpaces(ConstraintBlock):
         for i, axis in enumerate(self._prediction.axes):
             pos, vel = forecast.pos_response[i], forecast.vel_response[i]
             push = np.empty((used, checks, self._prediction.horizon.control))  # metres of each row per unit increment
-            push[:, :-1] = pos[self.checked]
-            push[:, -1] = pos[-1] + spaces.stop_s[:, None] * vel[-1]
+            push[:] = pos.take(self._steps, axis=0)
+            push[:, -1] += spaces.stop_s[:, None] * vel[-1]
             push *= normal[:, :, i, None]
             block[:, :, self._prediction.columns(i)] = (axis.du_max * self._row_scale)[None, :, None] * push
             rise, fall = self._prediction.extremes(i, forecast.u_prev)
@@ -200,7 +203,7 @@ class KeepOutHalfSpaces(ConstraintBlock):
         if not self._max_keep_outs:
             return 0.0
         shortfall = rows.lower - rows.coefficients @ flown
-        return float((shortfall / np.tile(self._row_scale, self._max_keep_outs)).max(initial=0.0))
+        return float((shortfall / self._scale).max(initial=0.0))
 
     @staticmethod
     def slack_m(rows: Rows, solution: QpSolution) -> float:

@@ -50,6 +50,8 @@ class Prediction:
         self.pos_of_accel, self.vel_of_accel = horizon.of_acceleration()  # (Hp, Hp) each
         self._pos_of_vel, self._vel_of_vel = horizon.of_velocity_s()
         self.hold = horizon.held()  # (Hp, Hc) inputs of a unit increment
+        self._ramps = [a.du_max * np.arange(horizon.control + 1) for a in axes]  # (Hc+1,) each, from the held input on
+        self._has_lag = any(a.lag is not None for a in axes)
         self._lags = [lag_response(a.lag, horizon.dt_s, horizon.prediction) for a in axes]
         self.acted = np.stack([lag.of_command @ self.hold for lag in self._lags])  # (axes, Hp, Hc) realised inputs
 
@@ -71,6 +73,9 @@ class Prediction:
         """
         acts = np.empty(u.shape)
         for i, lag in enumerate(self._lags):
+            if self.axes[i].lag is None:
+                acts[:, i] = u[:, i]
+                continue
             begins = u[0, i] if at_start is None else at_start[i]
             acts[:, i] = lag.of_command @ u[:, i] + begins * lag.of_tilt
             if rate_1_s is not None:
@@ -86,8 +91,11 @@ class Prediction:
         """Return the forecast of one receding-horizon step."""
         gain_m_s2, ref_vel_m_s = asked.gain_m_s2, asked.ref_vel_m_s
         u_prev = np.minimum(np.maximum(asked.u_prev, self.u_min), self.u_max)
-        held = np.broadcast_to(u_prev, gain_m_s2.shape)
-        accel = gain_m_s2 * self.realised(held, asked.realised, asked.realised_1_s) + asked.drift_m_s2  # (Hp, axes)
+        acts = u_prev  # (axes,), or (Hp, axes) with a lag
+        if self._has_lag:
+            held = np.broadcast_to(u_prev, gain_m_s2.shape)
+            acts = self.realised(held, asked.realised, asked.realised_1_s)
+        accel = gain_m_s2 * acts + asked.drift_m_s2  # (Hp, axes)
         free_pos, free_vel = self.motion(asked.pos_m, asked.vel_m_s, accel)
         driven = gain_m_s2.T[:, :, None] * self.acted  # (axes, Hp, Hc)
         pos_error, vel_error = free_pos - asked.ref_pos_m, free_vel - ref_vel_m_s
@@ -103,16 +111,15 @@ class Prediction:
             vel_response=self.vel_of_accel @ driven,
             pos_error_m=pos_error,
             vel_error_m_s=vel_error,
-            end_error=np.stack([pos_error[-1], vel_error[-1], surplus]),
+            end_error=np.array([pos_error[-1], vel_error[-1], surplus]),
         )
 
     def extremes(self, axis: int, u_prev: Array) -> tuple[Array, Array]:
         """Return increments (Hc,) of `axis` that raise, and that lower, its input as fast as the bounds allow."""
-        bounds, ramp = self.axes[axis], np.arange(1, self.horizon.control + 1)
-        rise = np.minimum(u_prev[axis] + bounds.du_max * ramp, bounds.u_max)
-        fall = np.maximum(u_prev[axis] - bounds.du_max * ramp, bounds.u_min)
-        before = np.full(1, u_prev[axis])
-        return rise - np.concatenate([before, rise[:-1]]), fall - np.concatenate([before, fall[:-1]])
+        bounds, held, ramp = self.axes[axis], u_prev[axis], self._ramps[axis]
+        rise = np.minimum(held + ramp, bounds.u_max)
+        fall = np.maximum(held - ramp, bounds.u_min)
+        return rise[1:] - rise[:-1], fall[1:] - fall[:-1]
 
     def increments(self, x: Array | None, u_prev: Array) -> Array:
         """Return increments (Hc, axes) of a solution, within both bounds exactly; zeros without a solution."""
@@ -121,5 +128,7 @@ class Prediction:
             return np.zeros((hc, n))
         wanted = x[: n * hc].reshape(n, hc).T * self.du_max
         wanted = np.minimum(np.maximum(wanted, -self.du_max), self.du_max)
-        inputs = np.minimum(np.maximum(u_prev + np.cumsum(wanted, axis=0), self.u_min), self.u_max)
-        return np.diff(inputs, axis=0, prepend=u_prev[None])
+        inputs = np.empty((n, hc + 1)).T  # the held one first; the layout decides how sums over increments are rounded
+        inputs[0] = u_prev
+        inputs[1:] = np.minimum(np.maximum(u_prev + wanted.cumsum(axis=0), self.u_min), self.u_max)
+        return np.asarray(inputs[1:] - inputs[:-1])

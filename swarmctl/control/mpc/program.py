@@ -77,8 +77,8 @@ class Program:
         self.hessian_pattern, self.pattern = np.eye(columns, dtype=bool), np.zeros((rows, columns), bool)
         self.hessian_pattern[:moves, :moves] = cost
         self.rows = dict(self._placed(sorted(blocks, key=lambda block: block.slacks.shape[1] > 0), moves, slacks))
-        self._hessian_index = pattern_index(self.hessian_pattern, upper=True)
-        self._index = pattern_index(self.pattern)
+        self._hessian_index = np.ravel_multi_index(pattern_index(self.hessian_pattern, upper=True), (columns, columns))
+        self._index = np.ravel_multi_index(pattern_index(self.pattern), (rows, columns))
 
     def _placed(
         self, blocks: Sequence[ConstraintBlock], moves: int, slacks: int
@@ -118,7 +118,7 @@ class Program:
 
     def matrices(self) -> tuple[Array, Array]:
         """Return the values of Hessian and coefficients in the order of `QpSolver.solve`."""
-        return self.hessian[self._hessian_index], self.coefficients[self._index]
+        return self.hessian.take(self._hessian_index), self.coefficients.take(self._index)
 
     def residual_m(self, flown: Array) -> float:
         """Return the largest violation [m] of any constraint by the variables `flown` (columns,)."""

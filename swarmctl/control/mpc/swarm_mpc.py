@@ -250,12 +250,14 @@ def first_guess(problem: Problem, dt_s: float, steps: int) -> Array:
 
 def closest_keep_outs(keep_outs: Sequence[KeepOut], guess_ned_m: Array, max_keep_outs: int) -> list[KeepOut]:
     """Return the `max_keep_outs` keep-outs that the guess (steps+1, 3) comes closest to."""
-
-    def gap_m(k: KeepOut) -> float:
-        apart = (guess_ned_m - k.pos_ned_m) * (1.0, 1.0, k.vertical_01)
-        return float(np.sqrt(np.min(np.sum(apart**2, axis=1)))) - k.radius_m
-
-    return sorted(keep_outs, key=gap_m)[:max_keep_outs]
+    if len(keep_outs) < 2:
+        return list(keep_outs)
+    apart = guess_ned_m - np.array([k.pos_ned_m for k in keep_outs])  # (keep-outs, steps+1, 3)
+    apart[:, :, 2] *= np.array([k.vertical_01 for k in keep_outs])[:, None]
+    closest_m = np.sqrt(np.sum(apart**2, axis=2).min(axis=1)).tolist()
+    gaps_m = [closest - k.radius_m for closest, k in zip(closest_m, keep_outs, strict=True)]
+    order = sorted(range(len(keep_outs)), key=gaps_m.__getitem__)
+    return [keep_outs[i] for i in order[:max_keep_outs]]
 
 
 def near_half_spaces(

@@ -61,14 +61,14 @@ class TrackingCost:
                 weighted = end.T @ self._regions[i].beyond
                 curvature += weighted @ end
                 pull += weighted @ forecast.end_error[:, i]
-            curvature[np.arange(hc), np.arange(hc)] += axis.r
+            curvature.reshape(-1)[:: hc + 1] += axis.r  # the diagonal
             hessian[own, own] = (2.0 * axis.du_max**2 * self.scale) * curvature
             slope[own] = (2.0 * axis.du_max * self.scale) * pull
 
     def _end_response(self, i: int, forecast: Forecast) -> Array:
         """Return position, velocity and acceleration (3, Hc) at the end, due to unit increments of axis `i`."""
         accel = forecast.asked.gain_m_s2[-1, i] * self._prediction.acted[i, -1]
-        return np.stack([forecast.pos_response[i, -1], forecast.vel_response[i, -1], accel])
+        return np.array([forecast.pos_response[i, -1], forecast.vel_response[i, -1], accel])
 
     def outside_m(self, forecast: Forecast, pos_m: Array, vel_m_s: Array, increments: Array) -> float:
         """Return how far [m] the end of a motion (Hp, axes) due to `increments` (Hc, axes) is outside its regions."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from swarmctl.control.phases.overload import Level
@@ -32,10 +32,10 @@ class PhaseInputs:
     unresponsive_peer: bool  # no message for too long from a peer that may be flying
     peers: Mapping[int, PeerInputs]
     cut_off: str = ""  # why the mission must end here, because peers don't answer
-    others_ned_m: tuple[Array, ...] = ()  # present position (3,) of each peer
+    others_ned_m: Callable[[], Sequence[Array]] = tuple  # returns the present position (3,) of each peer
     arm_in: FlightMode | None = None  # flight mode required for arming; None: any
     boots: int = 0  # reboots of the autopilot so far
-    refusal: str = ""  # reason why arming is refused for good
+    refusal: str = ""  # reason why arming is refused for good, up to ARM
     unsettled: str = ""  # reason why arming must wait
     overload: Level = Level.NONE  # response to missed deadlines
     armed_told_us: int = -1  # arrival time of the HEARTBEAT that reported `state.armed`

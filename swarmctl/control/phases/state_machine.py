@@ -578,13 +578,14 @@ class MissionStateMachine:
             return False
         if self._has_room(inputs, state):
             return self._at(state, state.pos_ned_m, math.inf, self._params.arrive_m_s)
-        room = landing_place_ned_m(state.pos_ned_m, inputs.others_ned_m, self._apart_m + _ROOM_MARGIN_M, self._agent)
+        others_ned_m, apart_m = inputs.others_ned_m(), self._apart_m + _ROOM_MARGIN_M
+        room = landing_place_ned_m(state.pos_ned_m, others_ned_m, apart_m, self._agent)
         self._trajectory = (self._trajectory_to(room, state), inputs.now_us)
         return False
 
     def _has_room(self, inputs: PhaseInputs, state: VehicleState) -> bool:
         """Return whether peers are far enough for a landing; always true without control, which could not change it."""
-        return not self.had_control or nearest_in_plane_m(state.pos_ned_m, inputs.others_ned_m) >= self._apart_m
+        return not self.had_control or nearest_in_plane_m(state.pos_ned_m, inputs.others_ned_m()) >= self._apart_m
 
     def _take_control(self, inputs: PhaseInputs, state: VehicleState) -> None:
         if self.had_control:

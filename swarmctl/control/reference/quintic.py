@@ -23,11 +23,12 @@ class QuinticTrajectory:
         """Return positions and velocities, (K, 3) each, at times `t_s` (K,) [s] since the start."""
         s = np.clip(t_s / self.travel_s, 0.0, 1.0)[:, None]
         delta, carry = self.to_ned_m - self.from_ned_m, self.vel_ned_m_s * self.travel_s
-        blend = s**3 * (10.0 - 15.0 * s + 6.0 * s**2)
-        coast = s - 6.0 * s**3 + 8.0 * s**4 - 3.0 * s**5
+        s2, s3, s4 = s**2, s**3, s**4
+        blend = s3 * (10.0 - 15.0 * s + 6.0 * s2)
+        coast = s - 6.0 * s3 + 8.0 * s4 - 3.0 * s**5
         pos = self.from_ned_m + blend * delta + coast * carry
-        slope = 30.0 * s**2 * (1.0 - s) ** 2
-        coast_slope = 1.0 - 18.0 * s**2 + 32.0 * s**3 - 15.0 * s**4
+        slope = 30.0 * s2 * (1.0 - s) ** 2
+        coast_slope = 1.0 - 18.0 * s2 + 32.0 * s3 - 15.0 * s4
         vel = (slope * delta + coast_slope * carry) / self.travel_s
         return pos, vel
 

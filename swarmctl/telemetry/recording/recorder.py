@@ -17,8 +17,11 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
-from swarmctl.core.records import PLAN_DTYPE, TICK_DTYPE, plan_rows, tick_row
-from swarmctl.core.tick_record import TickRecord
+import numpy as np
+from numpy.typing import NDArray
+
+from swarmctl.core.records import PLAN_DTYPE, TICK_DTYPE, plan_rows
+from swarmctl.core.types import Plan
 from swarmctl.telemetry.json_safe import to_json
 
 _FLUSH_TIMEOUT_S = 0.25
@@ -53,11 +56,10 @@ class Recorder:
         """Number of rows dropped so far; a predicted path counts as one."""
         return self._refused + sum(file.lost for file in self._files)
 
-    def tick(self, record: TickRecord) -> None:
-        """Record one tick."""
-        row = tick_row(record)
+    def tick(self, row: NDArray[np.void], flown: Plan | None) -> None:
+        """Record one tick, a (1,) array of `TICK_DTYPE`, and the plan that it flew."""
         self._put(0, row.tobytes())
-        points = plan_rows(row, record.flown)
+        points = plan_rows(row, flown)
         if len(points):
             self._put(3, points.tobytes())
 

@@ -65,8 +65,13 @@ UNKNOWN: dict[str, Any] = {
 TICK_BYTES = TICK_DTYPE.itemsize
 
 
+def packed(**changed: Any) -> bytes:
+    record = tick_record(**changed)
+    return pack_tick(tick_row(record), record.flown)
+
+
 def test_every_value_survives_the_bus() -> None:
-    unpacked = unpack_tick(pack_tick(tick_record()))
+    unpacked = unpack_tick(packed())
     assert unpacked is not None
     row, plan = unpacked
     for name, value in RECORDED.items():
@@ -91,7 +96,7 @@ def test_every_column_is_described_and_named_once() -> None:
 
 
 def test_bytes_are_little_endian_packed_and_of_fixed_place() -> None:
-    payload = pack_tick(tick_record())
+    payload = packed()
     assert struct.unpack_from("<qqI", payload) == (9_000_000_000_001, 1_700_000_000_000_002, 4_000_000_003)
     assert payload[28:32] == bytes([6, 3, 7, 1])  # phase TRACK, mode REPLAY, EXTERNAL, armed
     assert struct.unpack_from("<3d", payload, 36) == (1.1, -2.2, -3.3)
@@ -105,13 +110,13 @@ def test_bytes_are_little_endian_packed_and_of_fixed_place() -> None:
 
 
 def test_no_plan_is_an_empty_plan() -> None:
-    unpacked = unpack_tick(pack_tick(tick_record(flown=None)))
+    unpacked = unpack_tick(packed(flown=None))
     assert unpacked is not None
     assert unpacked[1].shape == (0, 3)
 
 
 def test_every_truncation_and_every_extra_byte_is_refused() -> None:
-    payload = pack_tick(tick_record())
+    payload = packed()
     for length in range(len(payload)):
         assert unpack_tick(payload[:length]) is None, length
     assert unpack_tick(payload + b"\x00") is None
@@ -119,7 +124,7 @@ def test_every_truncation_and_every_extra_byte_is_refused() -> None:
 
 @pytest.mark.parametrize("points", [0, 3, 5, 65_535])
 def test_a_count_that_does_not_fit_its_points_is_refused(points: int) -> None:
-    payload = bytearray(pack_tick(tick_record()))
+    payload = bytearray(packed())
     payload[TICK_BYTES : TICK_BYTES + 2] = struct.pack("<H", points)
     assert unpack_tick(bytes(payload)) is None
 

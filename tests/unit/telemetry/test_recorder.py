@@ -12,23 +12,26 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from swarmctl.core.records import TICK_DTYPE
-from swarmctl.core.tick_record import TickRecord
+from swarmctl.core.records import TICK_DTYPE, tick_row
+from swarmctl.core.types import Plan
 from swarmctl.telemetry.recording import recorder as recorder_module
 from swarmctl.telemetry.recording.recorder import Recorder
 from swarmctl.telemetry.recording.run_files import load_run, read_plans, read_rows
 from tests.benches.tick_records import tick_record
 
 
-def record(seq: int) -> TickRecord:
-    return tick_record(t_us=seq * 20_000, utc_us=1_780_000_000_000_000 + seq * 20_000, seq=seq)
+def told(seq: int) -> tuple[NDArray[np.void], Plan | None]:
+    """What a recorder is told of a tick."""
+    record = tick_record(t_us=seq * 20_000, utc_us=1_780_000_000_000_000 + seq * 20_000, seq=seq)
+    return tick_row(record), record.flown
 
 
 def test_round_trip(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path, 2)
     for seq in range(100):
-        recorder.tick(record(seq))
+        recorder.tick(*told(seq))
     recorder.frame(1_780_000_000_000_000, b"\xfdframe")
     recorder.event("plan_failed", 5, 6, status="max_iter", gap_m=float("nan"))
     recorder.close(5.0)
@@ -36,7 +39,7 @@ def test_round_trip(tmp_path: Path) -> None:
     rows = load_run(tmp_path).ticks[2]
     assert rows["seq"].tolist() == list(range(100))
     assert rows["pos_ned_m"][7].tolist() == [1.1, -2.2, -3.3]
-    plan, points = record(0).flown, read_plans(tmp_path, 2)
+    (_, plan), points = told(0), read_plans(tmp_path, 2)
     assert plan is not None
     assert np.unique(points["t_us"]).tolist() == [seq * 20_000 for seq in range(0, 100, 5)], "ten a second"
     first = points[points["t_us"] == 0]
@@ -59,7 +62,7 @@ def test_rows_lost_to_a_full_disk_are_counted_and_raise_nothing(tmp_path: Path) 
     (tmp_path / "agent-0.ticks").symlink_to("/dev/full")
     recorder = Recorder(tmp_path, 0)
     for seq in range(10):
-        recorder.tick(record(seq))
+        recorder.tick(*told(seq))
     recorder.event("still_here", 1, 2)
     recorder.close(5.0)
     assert recorder.lost == 10
@@ -68,7 +71,7 @@ def test_rows_lost_to_a_full_disk_are_counted_and_raise_nothing(tmp_path: Path) 
 
 def test_vanished_folder_is_counted(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "gone", 0)
-    recorder.tick(record(0))
+    recorder.tick(*told(0))
     recorder.close(5.0)
     assert recorder.lost == 2, "the tick and its predicted path"
 
@@ -77,13 +80,13 @@ def test_full_queue_drops_without_waiting(tmp_path: Path, monkeypatch: pytest.Mo
     os.mkfifo(tmp_path / "agent-0.ticks")  # opening it for writing blocks for ever: a disk that hangs
     monkeypatch.setattr(recorder_module, "_QUEUE", 100)
     recorder = Recorder(tmp_path, 0)
-    recorder.tick(record(0))
+    recorder.tick(*told(0))
     until_s = time.monotonic() + 10.0
     while recorder._queue and time.monotonic() < until_s:  # from then on the thread hangs with the first row
         time.sleep(0.01)
     began_s = time.monotonic()
     for seq in range(500):
-        recorder.tick(record(seq))
+        recorder.tick(*told(seq))
     assert recorder.lost == 500, "of 500 ticks and 100 plans a hundred fit, and no more is kept in memory"
     recorder.close(0.1)
     assert time.monotonic() - began_s < 1.0
@@ -92,11 +95,11 @@ def test_full_queue_drops_without_waiting(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_tick_costs_the_caller_little(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path, 0)
-    one = record(0)
+    one = told(0)
     costs_us = []
     for _ in range(2000):
         began_ns = time.perf_counter_ns()
-        recorder.tick(one)
+        recorder.tick(*one)
         costs_us.append((time.perf_counter_ns() - began_ns) / 1e3)
     recorder.close(5.0)
     assert np.median(costs_us) < 60.0, f"median {np.median(costs_us):.1f} us"
@@ -106,13 +109,13 @@ _CHILD = """
 import sys, time, resource
 from pathlib import Path
 sys.path.insert(0, {folder!r})
-from test_recorder import Recorder, record
+from test_recorder import Recorder, told
 limit = {limit}
 if limit:
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 recorder = Recorder(Path({directory!r}), 0)
 for seq in range({count}):
-    recorder.tick(record(seq))
+    recorder.tick(*told(seq))
     time.sleep({pause_s})
 recorder.close(5.0)
 print(recorder.lost, flush=True)
@@ -151,13 +154,13 @@ def test_killed_agent_loses_only_the_last_moments(tmp_path: Path) -> None:
 def test_partial_row_of_a_killed_agent_does_not_shift_later_rows(tmp_path: Path) -> None:
     path = tmp_path / "agent-0.ticks"
     recorder = Recorder(tmp_path, 0)
-    recorder.tick(record(0))
+    recorder.tick(*told(0))
     recorder.close(5.0)
     with path.open("ab") as file:
         file.write(b"\x01" * 57)
     assert load_run(tmp_path).ticks[0]["seq"].tolist() == [0]
     again = Recorder(tmp_path, 0)
-    again.tick(record(1))
+    again.tick(*told(1))
     again.close(5.0)
     assert load_run(tmp_path).ticks[0]["seq"].tolist() == [0, 1]
 
