@@ -142,3 +142,12 @@ def test_true_distance_falls_short_of_the_constraint_radius_by_less_than_a_centi
     overrides = (*thesis.at_radius(radius_m), "mission.duration_s=10", f"controller.kind={kind}")
     trace = on_plant("thesis_5_circle", *overrides)
     assert (radius_m - score.separation_m(trace) <= 0.01) is kept
+
+
+def test_below_the_bodies_the_full_loop_flies_points_as_the_model_does_without_the_safety_filter() -> None:
+    overrides = (*thesis.at_radius(thesis.SAFE_RADIUS_M), "mission.duration_s=4")
+    plant, full = on_plant("thesis_5_circle", *overrides), over_mavlink("thesis_5_circle", *overrides)
+    assert score.index_m(full) == pytest.approx(score.index_m(plant), rel=0.05)
+    assert score.separation_m(full) < thesis.BODY_M
+    filtered = over_mavlink("thesis_5_circle", *overrides, "agent.barrier.enabled=true")
+    assert score.separation_m(filtered) > thesis.BODY_M, "negative control: the filter keeps bodies apart"
