@@ -107,13 +107,14 @@ ARDUCOPTER = Dialect(
     modes={
         3: FlightMode.MISSION,
         4: FlightMode.EXTERNAL,
-        5: FlightMode.HOLD,
+        5: FlightMode.HOLD,  # LOITER
         6: FlightMode.RTL,
         9: FlightMode.LAND,
+        17: FlightMode.HOLD,  # BRAKE
         21: FlightMode.RTL,  # SMART_RTL
     },
     external=(4.0, 0.0),
-    hold=(5.0, 0.0),
+    hold=(17.0, 0.0),  # BRAKE; in LOITER a throttle stick that is down lands the vehicle
     land=LongCommand(SET_MODE, (CUSTOM_MODE, 9.0)),
     takeoff_parameter="",
     arm_in=FlightMode.EXTERNAL,

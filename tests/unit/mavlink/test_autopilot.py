@@ -293,6 +293,7 @@ def test_position_without_odometry_uses_the_newest_attitude_and_odometry_wins() 
         (3, 3, FlightMode.MISSION),  # AUTO
         (3, 4, FlightMode.EXTERNAL),  # GUIDED
         (3, 5, FlightMode.HOLD),  # LOITER
+        (3, 17, FlightMode.HOLD),  # BRAKE
         (3, 6, FlightMode.RTL),
         (3, 9, FlightMode.LAND),
         (3, 17, FlightMode.MANUAL),  # BRAKE

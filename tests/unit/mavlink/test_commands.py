@@ -80,7 +80,7 @@ def test_what_is_asked_of_px4(command: Command, number: int, params: tuple[float
     ("command", "number", "params"),
     [
         (Command(verb=Verb.EXTERNAL), 176, (1.0, 4.0, 0.0)),  # GUIDED
-        (Command(verb=Verb.HOLD), 176, (1.0, 5.0, 0.0)),  # LOITER
+        (Command(verb=Verb.HOLD), 176, (1.0, 17.0, 0.0)),  # BRAKE
         (Command(verb=Verb.LAND), 176, (1.0, 9.0)),
         (Command(verb=Verb.TAKEOFF, value=2.5), 22, (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 2.5)),
         (Command(verb=Verb.ARM), 400, (1.0,)),
