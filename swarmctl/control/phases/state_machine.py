@@ -4,8 +4,8 @@ Pure. Agents agree on the start of the mission without a leader: each publishes 
 second after the latest of these times. The operator's orders (`core.operator_verbs`) are applied here too. A
 vehicle found in the air at start-up is handed back in the air, in the autopilot's hold.
 
-Autopilots do not know each other. Before one takes over, the agent therefore comes to rest and moves away from others
-under its own plan. Only without a plan does the autopilot land the vehicle from where it is.
+The machine decides what happens when: the phase, who has control, the requests. Which trajectory is flown meanwhile is
+known to `Trajectories`, what holds or pauses the agent to `Interruptions`, and where it may land to `Landing`.
 """
 
 from __future__ import annotations
@@ -507,6 +507,7 @@ class MissionStateMachine:
         self._enter(Phase.GOTO_LAND, now_us)
 
     def _give_up(self, why: str, inputs: PhaseInputs, state: VehicleState) -> None:
+        """End the mission; only without a plan does the autopilot land the vehicle from where it is."""
         self.outcome = self.outcome or why
         if self.had_control and inputs.mode in _PLAN_MODES:
             self._stop_in_place(inputs.now_us, state)
