@@ -17,12 +17,12 @@ import numpy as np
 
 from swarmctl.control.phases.arming import ArmingEvidence
 from swarmctl.control.phases.control_mode import control_mode
+from swarmctl.control.phases.departure import Climb, unmet_start_condition
 from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.control.phases.interruptions import HoldPoint, Interruptions
 from swarmctl.control.phases.landing import Landing
 from swarmctl.control.phases.overload import Level
 from swarmctl.control.phases.refused_orders import Contains, OrderSituation, refusal_of
-from swarmctl.control.phases.start_conditions import unmet_start_condition
 from swarmctl.control.phases.state_machine_params import StateMachineParams
 from swarmctl.control.phases.trajectories import Trajectories, is_at
 from swarmctl.control.reference.mission import MissionReference
@@ -32,7 +32,6 @@ from swarmctl.core.types import Array, Command, FlightMode, Landed, Mode, Phase,
 _REQUEST_PERIOD_US = 1_000_000  # time between repetitions of a request
 _SPIN_UP_US = 6_000_000  # ArduCopter's rotors spin up for over 3 s, during which it refuses a second TAKEOFF
 _BEGIN_DELAY_US = 1_000_000  # from the last agent's readiness to mission time 0; several statuses are sent meanwhile
-_HOVER_LEARNING_US = 1_000_000  # hover flown by the autopilot itself, during which its hover thrust is learned
 _LEAST_HEIGHT_M = 0.5  # above the ground, of a point to go to
 _PLAN_MODES = (Mode.TRACKING, Mode.REPLAY)
 _OWN_MODES = (FlightMode.HOLD, FlightMode.TAKEOFF, FlightMode.EXTERNAL)  # modes that follow from our own requests
@@ -87,7 +86,7 @@ class MissionStateMachine:
         self.arming = ArmingEvidence()
         self._stop_verb = ""  # land or rtl, from the command until the stop begins
         self.had_control = False
-        self._climb_cut_short = False  # a hold interrupted the take-off below its height
+        self._climb = Climb(start_ned_m)
         self._trajectories = Trajectories(
             reference, start_ned_m, speed_m_s=params.speed_m_s, accel_m_s2=params.accel_m_s2
         )
@@ -98,8 +97,6 @@ class MissionStateMachine:
         self._requested_us = -_REQUEST_PERIOD_US
         self._boots = 0
         self.pilot_override = False
-        self._ground_z_m = 0.0
-        self._hovering_us: int | None = None
         self._airborne = False
         self._may_take_control = False  # an operator's resume permits taking control from any mode
         self._landing_seen = False
@@ -265,7 +262,7 @@ class MissionStateMachine:
     @property
     def _lowest_m(self) -> float:
         """Return the down coordinate that a point to go to may not be below: the ground's is known after a take-off."""
-        return float(self._start_ned_m[2]) if self._airborne else self._ground_z_m - _LEAST_HEIGHT_M
+        return float(self._start_ned_m[2]) if self._airborne else self._climb.ground_z_m - _LEAST_HEIGHT_M
 
     def _go_on(self, now_us: int, utc_us: int, state: VehicleState) -> None:
         """Go on with what was interrupted: the transit, or the mission."""
@@ -288,7 +285,8 @@ class MissionStateMachine:
         """End a hold: timeouts have not run meanwhile."""
         self._interruptions.end_hold()
         self._requested_us = now_us - _SPIN_UP_US
-        self._climb_cut_short |= self.phase is Phase.TAKEOFF and state.landed is not Landed.ON_GROUND
+        if self.phase is Phase.TAKEOFF and state.landed is not Landed.ON_GROUND:
+            self._climb.cut()
         if self._first_tick_us is not None:
             self._first_tick_us += now_us - self._interruptions.held_since_us
         if self.phase is Phase.GOTO_LAND:
@@ -337,7 +335,7 @@ class MissionStateMachine:
             return self._refuse("a peer gave up before take-off", inputs)
         self.waits_for = unmet_start_condition(inputs, state, self._expected)
         if not self.waits_for:
-            self._ground_z_m = float(state.pos_ned_m[2])
+            self._climb.begin(state)
             self._airborne = state.landed is Landed.IN_AIR
             self._enter(Phase.ARM, inputs.now_us)
             return []
@@ -369,13 +367,8 @@ class MissionStateMachine:
         return [Command(verb=Verb.ARM)]
 
     def _takeoff(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
-        height_m = self._ground_z_m - float(self._start_ned_m[2])
-        climbed_m = self._ground_z_m - float(state.pos_ned_m[2])
-        settled = abs(float(state.vel_ned_m_s[2])) < 0.3 and (abs(climbed_m - height_m) < 0.4 or self._climb_cut_short)
-        hovers = state.mode in (FlightMode.HOLD, inputs.arm_in) and state.landed is Landed.IN_AIR and settled
-        self._hovering_us = (self._hovering_us or inputs.now_us) if hovers else None
-        learned = inputs.arm_in is None or inputs.now_us - (self._hovering_us or inputs.now_us) >= _HOVER_LEARNING_US
-        if hovers and learned and not self.held:
+        climbed = self._climb.update(inputs, state)
+        if climbed and not self.held:
             self._enter(Phase.GOTO_START, inputs.now_us)
             return []
         if not state.armed:  # pilot or autopilot disarmed it: it is not armed again
@@ -392,7 +385,7 @@ class MissionStateMachine:
             if state.mode is FlightMode.HOLD and inputs.arm_in is not None:  # where a hold has left it
                 self._requested_us = inputs.now_us - _SPIN_UP_US
                 return [Command(verb=Verb.EXTERNAL)]
-            return [Command(verb=Verb.TAKEOFF, value=height_m)]
+            return [Command(verb=Verb.TAKEOFF, value=self._climb.height_m)]
         return []
 
     def _goto_start(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
@@ -402,7 +395,7 @@ class MissionStateMachine:
             return [] if self.held else self._request_control(inputs, state)
         if self._interruptions.active:
             return []
-        if self._climb_cut_short:
+        if self._climb.cut_short:
             self._finish_climb(inputs.now_us, state)
         elif is_at(state, self._start_ned_m, self._params.arrive_m, self._params.arrive_m_s):
             self.ready_utc_us = inputs.utc_us
@@ -411,9 +404,9 @@ class MissionStateMachine:
 
     def _finish_climb(self, now_us: int, state: VehicleState) -> None:
         """Go to the start once the vehicle has climbed to its height."""
-        climb = self._trajectories.current
-        if climb is not None and is_at(state, climb.trajectory.to_ned_m, self._params.arrive_m, math.inf):
-            self._climb_cut_short = False
+        rest = self._trajectories.current
+        if rest is not None and is_at(state, rest.trajectory.to_ned_m, self._params.arrive_m, math.inf):
+            self._climb.finish()
             self._trajectories.go_to(self._start_ned_m, now_us, state)
 
     def _request_control(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
@@ -493,10 +486,8 @@ class MissionStateMachine:
         self.had_control = True
         if self.phase is not Phase.GOTO_START:
             return
-        target = self._start_ned_m
-        if self._climb_cut_short:
-            target = np.array([*state.pos_ned_m[:2], self._start_ned_m[2]])
-        self._trajectories.go_to(target, inputs.now_us, state)
+        target_ned_m = self._climb.rest_ned_m(state) if self._climb.cut_short else self._start_ned_m
+        self._trajectories.go_to(target_ned_m, inputs.now_us, state)
         self._trajectories.keep_destination()
         if self.held:
             self._interruptions.stay(inputs.now_us, state)
