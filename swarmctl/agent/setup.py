@@ -15,7 +15,7 @@ from swarmctl.control.estimation.state_filter import StateFilterParams
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.phases.failsafe import FailsafeParams
 from swarmctl.control.phases.overload import OverloadParams
-from swarmctl.control.phases.state_machine import StateMachineParams
+from swarmctl.control.phases.state_machine_params import StateMachineParams
 from swarmctl.control.reference.deadlock import DeadlockParams
 from swarmctl.control.reference.mission import MissionParams
 from swarmctl.core.params import Params

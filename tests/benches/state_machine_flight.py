@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from swarmctl.control.phases.inputs import PeerInputs, PhaseInputs
-from swarmctl.control.phases.state_machine import MissionStateMachine, StateMachineParams
+from swarmctl.control.phases.state_machine import MissionStateMachine
+from swarmctl.control.phases.state_machine_params import StateMachineParams
 from swarmctl.control.reference.mission import MissionParams, MissionReference
 from swarmctl.core.operator_verbs import Order
 from swarmctl.core.types import Command, FlightMode, Landed, Mode, Phase, VehicleState, Verb

@@ -12,7 +12,7 @@ from swarmctl.config import load
 from swarmctl.control.collision.barrier import BarrierParams
 from swarmctl.control.collision.budget import SeparationBudget
 from swarmctl.control.collision.separation import SeparationParams
-from swarmctl.control.phases.state_machine import StateMachineParams
+from swarmctl.control.phases.state_machine_params import StateMachineParams
 
 ROOT = Path(__file__).parents[3]
 PAGE = (ROOT / "docs" / "separation.md").read_text()

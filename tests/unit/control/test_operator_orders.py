@@ -154,7 +154,7 @@ def test_a_hold_before_the_climb_keeps_it_on_the_ground() -> None:
     assert Verb.TAKEOFF not in flight.run(LONG_S)
     flight.ask("resume")
     assert flight.run(0.1) == [Verb.TAKEOFF]
-    assert not flight.state_machine._climb_cut_short
+    assert not flight.state_machine._climb.cut_short
     guided = Flight()
     guided.arm_in = FlightMode.EXTERNAL
     guided.until(Phase.TAKEOFF)

@@ -104,10 +104,10 @@ def test_land_on_the_way_home_lands_here_and_repeating_it_does_not_begin_again()
     flight.pos = START + np.array([4.0, 0.0, 0.0])
     flight.ask("rtl")
     flight.run(0.5)
-    target = flight.state_machine._destination_ned_m.copy()
+    target = flight.state_machine._trajectories.destination_ned_m.copy()
     flight.ask("land")
     flight.run(0.1)
-    here = flight.state_machine._destination_ned_m.copy()
+    here = flight.state_machine._trajectories.destination_ned_m.copy()
     assert (target == START).all()
     assert abs(here[0] - flight.pos[0]) < 0.5
     began_us = flight.state_machine._entered_us

@@ -1,0 +1,72 @@
+"""The way into the air: what must be met before a vehicle is armed, and the climb that its autopilot flies. Pure."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from swarmctl.control.phases.inputs import PhaseInputs
+from swarmctl.core.types import Array, FlightMode, Landed, Phase, VehicleState
+
+_HOVER_LEARNING_US = 1_000_000  # hover flown by the autopilot itself, during which its hover thrust is learned
+
+
+def unmet_start_condition(inputs: PhaseInputs, state: VehicleState, peers: int) -> str:
+    """Return the first condition for arming that is not met, or ""; `peers` is the number of the other agents."""
+    if state.landed not in (Landed.ON_GROUND, Landed.IN_AIR):
+        return "the autopilot to tell whether it has landed"
+    if not inputs.armable:
+        return f"the autopilot to be ready to arm (it is in {state.mode.name})"
+    if inputs.unsettled:
+        return inputs.unsettled
+    absent = peers - sum(p.phase >= Phase.STANDBY and p.alive for p in inputs.peers.values())
+    if absent:
+        return f"{absent} of {peers} peers to stand by"
+    return "the autopilot's answers" if inputs.busy else ""
+
+
+class Climb:
+    """Knows how high the autopilot has to climb from the ground, and when it has.
+
+    Args:
+        start_ned_m: (3,) start position; the climb ends at its height.
+
+    Attributes:
+        ground_z_m: down coordinate of the place that the vehicle stood on, 0 before it was armed.
+        cut_short: a hold interrupted the climb below its height.
+    """
+
+    def __init__(self, start_ned_m: Array) -> None:
+        self._start_z_m = float(start_ned_m[2])
+        self.ground_z_m = 0.0
+        self.cut_short = False
+        self._hovering_us: int | None = None  # since when the autopilot hovers
+
+    @property
+    def height_m(self) -> float:
+        """Return the height to climb to, above the ground."""
+        return self.ground_z_m - self._start_z_m
+
+    def begin(self, state: VehicleState) -> None:
+        """Note where the vehicle is before it is armed."""
+        self.ground_z_m = float(state.pos_ned_m[2])
+
+    def update(self, inputs: PhaseInputs, state: VehicleState) -> bool:
+        """Advance by one tick of the take-off; return whether the climb is over: the vehicle hovers, at its height."""
+        climbed_m = self.ground_z_m - float(state.pos_ned_m[2])
+        settled = abs(float(state.vel_ned_m_s[2])) < 0.3 and (abs(climbed_m - self.height_m) < 0.4 or self.cut_short)
+        hovers = state.mode in (FlightMode.HOLD, inputs.arm_in) and state.landed is Landed.IN_AIR and settled
+        self._hovering_us = (self._hovering_us or inputs.now_us) if hovers else None
+        learned = inputs.arm_in is None or inputs.now_us - (self._hovering_us or inputs.now_us) >= _HOVER_LEARNING_US
+        return hovers and learned
+
+    def cut(self) -> None:
+        """Note that the climb ends where the vehicle is now; the agent flies the rest of it."""
+        self.cut_short = True
+
+    def rest_ned_m(self, state: VehicleState) -> Array:
+        """Return the end (3,) of the rest of a climb that was cut short, straight above or below the vehicle."""
+        return np.array([*state.pos_ned_m[:2], self._start_z_m])
+
+    def finish(self) -> None:
+        """Note that the rest of the climb has been flown."""
+        self.cut_short = False

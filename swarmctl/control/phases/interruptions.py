@@ -1,0 +1,94 @@
+"""What interrupts a transit or the mission: the operator's hold and `goto`, and pauses. Pure.
+
+An agent may be held and paused at once: it goes on when neither is left.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from swarmctl.control.phases.trajectories import Trajectories
+from swarmctl.core.types import Array, VehicleState
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HoldPoint:
+    """The point of a `goto`."""
+
+    ned_m: Array  # (3,)
+    speed_m_s: float | None  # peak speed to it, None for that of transits
+    yaw_rad: float | None  # heading there and on the way, None for the mission's
+
+
+class Interruptions:
+    """Brings the agent to rest, where it is or at a point of the operator's.
+
+    Args:
+        trajectories: set to the stop or the way to the point.
+
+    Attributes:
+        held: the operator has asked to hold, or to go to a point.
+        held_since_us: monotonic time at which the last hold began.
+        yaw_rad: heading that the operator has asked for, None for the mission's.
+        paused: the agent rests because the bus is lost or its processor is overloaded.
+    """
+
+    def __init__(self, trajectories: Trajectories) -> None:
+        self._trajectories = trajectories
+        self.held = False
+        self.held_since_us = 0
+        self.yaw_rad: float | None = None
+        self.paused = False
+        self._point: HoldPoint | None = None
+
+    @property
+    def active(self) -> bool:
+        """Return whether anything interrupts the agent."""
+        return self.held or self.paused
+
+    @property
+    def goes_to_point(self) -> bool:
+        """Return whether the operator holds the agent at a point, or on the way there."""
+        return self.held and self._point is not None
+
+    def hold(self, now_us: int, state: VehicleState, *, brakes: bool) -> None:
+        """Hold where the vehicle is; it need not brake where the autopilot hovers."""
+        self._interrupt(now_us, state, brakes=brakes)
+        self._point = self.yaw_rad = None
+        if not self.held:
+            self.held, self.held_since_us = True, now_us
+
+    def move_hold(self, point: HoldPoint, now_us: int, state: VehicleState) -> None:
+        """Hold at a point from now on, instead of where the vehicle is."""
+        self._point, self.yaw_rad = point, point.yaw_rad
+        self.stay(now_us, state)
+
+    def stay(self, now_us: int, state: VehicleState) -> None:
+        """Come to rest where a hold asks for it: here, or at a point."""
+        if self._point is None:
+            self._trajectories.stop(now_us, state)
+        else:
+            self._trajectories.go_to(self._point.ned_m, now_us, state, self._point.speed_m_s)
+
+    def end_hold(self) -> None:
+        """End a hold, if there is one."""
+        self.held, self._point, self.yaw_rad = False, None, None
+
+    def update_pause(self, now_us: int, state: VehicleState, *, must_wait: bool, flies: bool) -> bool:
+        """Begin or end a pause; return whether the agent goes on with what was interrupted."""
+        if must_wait and flies and not self.paused:
+            self._interrupt(now_us, state, brakes=True)
+            self.paused = True
+        elif self.paused and not must_wait:
+            self.paused = False
+            if not self.held:
+                return True
+            self.stay(now_us, state)
+        return False
+
+    def _interrupt(self, now_us: int, state: VehicleState, *, brakes: bool) -> None:
+        """Come to rest, and remember where a transit leads."""
+        if not self.active:
+            self._trajectories.keep_destination()
+        if brakes:
+            self._trajectories.stop(now_us, state)

@@ -1,0 +1,89 @@
+"""Where an agent lands, and whether its autopilot may land it there yet. Pure.
+
+Autopilots do not know each other. Before one takes over, the agent therefore comes to rest and moves away from others
+under its own plan.
+"""
+
+from __future__ import annotations
+
+import math
+
+from swarmctl.control.phases.inputs import PhaseInputs
+from swarmctl.control.phases.state_machine_params import StateMachineParams
+from swarmctl.control.phases.trajectories import Trajectories, is_at
+from swarmctl.control.reference.landing_places import landing_place_ned_m, nearest_in_plane_m
+from swarmctl.core.types import Array, VehicleState
+
+_SETTLE_S = 2.0  # time after a stop trajectory in which the vehicle comes to rest
+_ROOM_MARGIN_M = 0.1  # the target lies beyond the required distance, because it is reached with a tolerance
+
+
+class Landing:
+    """Leads the agent to the start position, or to a free place near where it came to rest.
+
+    Args:
+        params: tolerances.
+        agent: index of this agent.
+        apart_m: level distance to others at which it may land in place.
+        start_ned_m: (3,) start position, the landing place unless the agent lands in place.
+        trajectories: set to the ways there.
+
+    Attributes:
+        in_place: the agent lands where it came to rest instead of at the start position.
+    """
+
+    def __init__(
+        self,
+        params: StateMachineParams,
+        agent: int,
+        apart_m: float,
+        *,
+        start_ned_m: Array,
+        trajectories: Trajectories,
+    ) -> None:
+        self._params, self._agent, self._apart_m = params, agent, apart_m
+        self._start_ned_m, self._trajectories = start_ned_m, trajectories
+        self.in_place = False
+
+    def go_home(self, now_us: int, state: VehicleState) -> None:
+        """Begin the way to the start position."""
+        self.in_place = False
+        self._trajectories.go_to(self._start_ned_m, now_us, state)
+        self._trajectories.keep_destination()
+
+    def stop_in_place(self, now_us: int, state: VehicleState) -> None:
+        """Begin to brake, to land where the vehicle comes to rest."""
+        self.in_place = True
+        self._trajectories.stop(now_us, state)
+        self._trajectories.keep_destination()
+
+    def is_reached(self, inputs: PhaseInputs, state: VehicleState, *, controls: bool, paused: bool) -> bool:
+        """Return whether the vehicle is at its landing place, or at rest with enough room.
+
+        A vehicle that lands in place and lacks room is sent to a free place first.
+        """
+        begun = self._trajectories.current
+        if begun is None:
+            return True
+        if not self.in_place:
+            target_ned_m = begun.trajectory.to_ned_m
+            return is_at(state, target_ned_m, self._params.land_m, self._params.land_m_s) and not paused
+        if inputs.now_us - begun.began_us <= (begun.trajectory.travel_s + _SETTLE_S) * 1e6:
+            return False
+        if self._has_room(inputs, state, controls=controls):
+            return self._is_at_rest(state)
+        others_ned_m, apart_m = inputs.others_ned_m(), self._apart_m + _ROOM_MARGIN_M
+        room_ned_m = landing_place_ned_m(state.pos_ned_m, others_ned_m, apart_m, self._agent)
+        self._trajectories.go_to(room_ned_m, inputs.now_us, state)
+        return False
+
+    def is_possible_here(self, inputs: PhaseInputs, state: VehicleState, *, controls: bool) -> bool:
+        """Return whether a vehicle that does not reach its landing place may land without another stop."""
+        return self.in_place or (self._is_at_rest(state) and self._has_room(inputs, state, controls=controls))
+
+    def _is_at_rest(self, state: VehicleState) -> bool:
+        return is_at(state, state.pos_ned_m, math.inf, self._params.arrive_m_s)
+
+    def _has_room(self, inputs: PhaseInputs, state: VehicleState, *, controls: bool) -> bool:
+        """Return whether peers are far enough for a landing; always true without control, which could not change it."""
+        return not controls or nearest_in_plane_m(state.pos_ned_m, inputs.others_ned_m()) >= self._apart_m

@@ -1,0 +1,98 @@
+"""The trajectories that an agent follows outside of its mission, and the way back to the mission's reference. Pure."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+
+from swarmctl.control.reference.mission import MissionReference
+from swarmctl.control.reference.quintic import QuinticTrajectory, brake_to_rest, quintic_to
+from swarmctl.core.types import Array, VehicleState
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BegunTrajectory:
+    """A trajectory and the monotonic time of its start."""
+
+    trajectory: QuinticTrajectory
+    began_us: int
+
+    def sample(self, now_us: int, offsets_s: Array) -> tuple[Array, Array]:
+        """Return positions and velocities, (K, 3) each, at `offsets_s` (K,) from now."""
+        return self.trajectory.sample((now_us - self.began_us) * 1e-6 + offsets_s)
+
+
+class Trajectories:
+    """Owns the transit or stop under way, its destination and the offset that decays to the mission's reference.
+
+    Args:
+        mission: reference of the tracked mission.
+        start_ned_m: (3,) start position; the reference until there is a trajectory.
+        speed_m_s: peak speed of a transit.
+        accel_m_s2: peak acceleration of transits and stops.
+
+    Attributes:
+        current: transit or stop that began last, None before the first.
+        destination_ned_m: (3,) end of the transit that a pause or a hold interrupts.
+    """
+
+    def __init__(self, mission: MissionReference, start_ned_m: Array, *, speed_m_s: float, accel_m_s2: float) -> None:
+        self._mission, self._start_ned_m = mission, start_ned_m
+        self._speed_m_s, self._accel_m_s2 = speed_m_s, accel_m_s2
+        self.current: BegunTrajectory | None = None
+        self.destination_ned_m = start_ned_m
+        self._rejoin_offset: BegunTrajectory | None = None  # decaying offset to the mission's reference
+
+    def reference(self, now_us: int, offsets_s: Array) -> tuple[Array, Array]:
+        """Return positions and velocities outside of the mission, (K, 3) each, at `offsets_s` (K,) from now."""
+        if self.current is not None:
+            return self.current.sample(now_us, offsets_s)
+        return np.tile(self._start_ned_m, (len(offsets_s), 1)), np.zeros((len(offsets_s), 3))
+
+    def mission_reference(self, mission_t_s: float, now_us: int, offsets_s: Array) -> tuple[Array, Array]:
+        """Return the mission's positions and velocities, (K, 3) each, with what is left of the offset to it."""
+        pos, vel = self._mission.sample(mission_t_s + offsets_s)
+        if self._rejoin_offset is not None:
+            offset, drift = self._rejoin_offset.sample(now_us, offsets_s)
+            pos, vel = pos + offset, vel + drift
+        return pos, vel
+
+    def stand(self, now_us: int, state: VehicleState) -> None:
+        """Begin to stay at the vehicle's place, as if it were at rest."""
+        here = QuinticTrajectory(
+            from_ned_m=state.pos_ned_m, vel_ned_m_s=np.zeros(3), to_ned_m=state.pos_ned_m, travel_s=1.0
+        )
+        self._begin(here, now_us)
+
+    def stop(self, now_us: int, state: VehicleState) -> None:
+        """Begin to brake to rest."""
+        self._begin(brake_to_rest(state.pos_ned_m, state.vel_ned_m_s, self._accel_m_s2), now_us)
+
+    def go_to(self, target_ned_m: Array, now_us: int, state: VehicleState, speed_m_s: float | None = None) -> None:
+        """Begin a transit to a target (3,), at the peak speed of transits or another one."""
+        speed_m_s = self._speed_m_s if speed_m_s is None else speed_m_s
+        transit = quintic_to(state.pos_ned_m, state.vel_ned_m_s, target_ned_m, speed_m_s, accel_m_s2=self._accel_m_s2)
+        self._begin(transit, now_us)
+
+    def keep_destination(self) -> None:
+        """Take the end of the present trajectory as the destination, which later stops don't change."""
+        if self.current is not None:
+            self.destination_ned_m = self.current.trajectory.to_ned_m
+
+    def rejoin_mission(self, mission_t_s: float, now_us: int, state: VehicleState) -> None:
+        """Rejoin the mission's moving reference along a quintic offset: after a jump all agents would rush together."""
+        pos, vel = self._mission.sample(np.array([mission_t_s]))
+        offset, drift = state.pos_ned_m - pos[0], state.vel_ned_m_s - vel[0]
+        way = quintic_to(offset, drift, np.zeros(3), self._speed_m_s, accel_m_s2=self._accel_m_s2)
+        self._rejoin_offset = BegunTrajectory(trajectory=way, began_us=now_us)
+
+    def _begin(self, trajectory: QuinticTrajectory, now_us: int) -> None:
+        self.current = BegunTrajectory(trajectory=trajectory, began_us=now_us)
+
+
+def is_at(state: VehicleState, target_ned_m: Array, within_m: float, slower_m_s: float) -> bool:
+    """Return whether a vehicle is near a target (3,) and slow enough."""
+    speed_m_s = math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s))
+    return math.dist(state.pos_ned_m, target_ned_m) < within_m and speed_m_s < slower_m_s
