@@ -219,6 +219,17 @@ def load(path: Path | None, overrides: Sequence[str] = (), values: Mapping[str, 
     return config
 
 
+def load_recorded(path: Path) -> Config:
+    """Read the resolved configuration of a recorded run, which may be somebody else's.
+
+    Nothing that it names is read or imported, and whether it can be flown is not judged: it was.
+
+    Raises:
+        ConfigError: a key is unknown, or a value has not its type or range.
+    """
+    return validated(Config, read_tree(path), str(path), _RENAMED)
+
+
 def dump(config: Config) -> str:
     """Return the resolved configuration as TOML, which `load` reads back to the same tree."""
     return tomli_w.dumps(config.model_dump(exclude_none=True))

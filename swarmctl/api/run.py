@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from swarmctl.config import Config, load
+from swarmctl.config import Config, load_recorded
 from swarmctl.core.records import PLAN_COLUMNS, TRUTH_COLUMNS
 from swarmctl.core.tick_record import COLUMNS
 from swarmctl.errors import ConfigError
@@ -119,7 +119,7 @@ def load_run(folder: str | Path) -> Run:
     if checked is None:
         problem = f"holds no {SUMMARY}: the run still flies, or was cut off. Then complete it: swarmctl report {folder}"
         raise ConfigError(str(folder), [problem])
-    config = load(folder / CONFIG)
+    config = load_recorded(folder / CONFIG)
     refuse_other_swarm(folder, checked, config.swarm.agents)
     summary = json.loads(read_text(folder / SUMMARY))  # all of it, while `checked` is what the report needs
     return Run(folder, config, summary, read_recording(folder))

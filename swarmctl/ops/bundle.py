@@ -23,7 +23,7 @@ from swarmctl.bus.peers import agent_name
 from swarmctl.check.link_facts import VehicleFacts
 from swarmctl.check.parameters import unchangeable
 from swarmctl.check.scanner import run_scans
-from swarmctl.config import Config, load
+from swarmctl.config import Config, load_recorded
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import replaced
 from swarmctl.mavlink.dialects.discovery import DIALECTS
@@ -63,7 +63,7 @@ def bundle(options: BundleOptions) -> Path:
     ended_cleanly = StopRequest(signal.SIGTERM, signal.SIGHUP, raise_at=1)
     try:
         with ended_cleanly, tempfile.TemporaryDirectory(prefix="swarm-bundle-") as scratch:
-            vehicles = _vehicles(load(folder / CONFIG), options, Path(scratch))
+            vehicles = _vehicles(load_recorded(folder / CONFIG), options, Path(scratch))
             with replaced(output) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
                 archive.writestr("versions.json", _json(_versions()))
                 archive.writestr("vehicles.json", _json(vehicles))

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from swarmctl.config import Config, load
+from swarmctl.config import Config, load_recorded
 from swarmctl.core.text import printable
 from swarmctl.errors import ConfigError
 from swarmctl.ops.supervisor import LaunchResult
@@ -65,7 +65,7 @@ def rewrite_report(directory: Path) -> Path:
     refuse_no_folder(directory)
     if not read_text(directory / CONFIG):
         raise ConfigError(str(directory), [f"is no run folder: it holds no {CONFIG}"])
-    return report_run(directory, load(directory / CONFIG).rules())
+    return report_run(directory, load_recorded(directory / CONFIG).rules())
 
 
 def _rules(config: Config, result: LaunchResult) -> Rules:

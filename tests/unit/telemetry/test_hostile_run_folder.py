@@ -16,7 +16,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from swarmctl.config import Config, dump
+from swarmctl.api.run import load_run
+from swarmctl.config import Config, dump, load
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.errors import ConfigError
 from swarmctl.ops.summary import rewrite_report
@@ -246,3 +247,21 @@ def test_noise_as_rows_is_reported_or_refused(folder: Path, seed: int) -> None:
     (folder / "summary.json").unlink()
     with np.errstate(all="ignore"):
         assert rewrite_report(folder).exists()
+
+
+@pytest.mark.parametrize("section", ["mission", "controller"])
+def test_what_a_received_configuration_names_is_neither_imported_nor_read(
+    folder: Path, section: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The control: to fly it, it is imported, because then somebody wants to fly it."""
+    module = f"planted_{section}"
+    monkeypatch.setattr(sys, "path", [*sys.path])
+    (folder / f"{module}.py").write_text(f"import pathlib; pathlib.Path({str(folder / 'ran')!r}).touch()")
+    named = Config.model_validate({section: {"kind": f"{module}:Planted"}, "own_folder": str(folder)})
+    (folder / "config.toml").write_text(dump(named))
+    rewrite_report(folder)
+    assert load_run(folder).config == named
+    assert not (folder / "ran").exists()
+    with pytest.raises(ConfigError, match="has no class Planted"):
+        load(folder / "config.toml")
+    assert (folder / "ran").exists()
