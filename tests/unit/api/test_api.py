@@ -6,6 +6,7 @@ import json
 import shutil
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -144,7 +145,11 @@ def test_an_order_that_does_not_exist_or_comes_too_late_is_refused(tmp_path: Pat
 
 
 def test_waiting_has_an_end(tmp_path: Path) -> None:
-    process = FlightProcess("launch", tmp_path, "http.server", "--bind", "127.0.0.1", "0")
+    process = FlightProcess("launch", tmp_path, "tests.benches.until_interrupted")
+    until_s = time.monotonic() + 20.0
+    while "running" not in (tmp_path / "launch.log").read_text():
+        assert time.monotonic() < until_s
+        time.sleep(0.02)
     with pytest.raises(TimeoutError, match="still flies after"):
         process.wait(0.2)
     swarm = swarmctl.Swarm(Config(), tmp_path, process)
