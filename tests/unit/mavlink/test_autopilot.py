@@ -296,7 +296,7 @@ def test_position_without_odometry_uses_the_newest_attitude_and_odometry_wins() 
         (3, 17, FlightMode.HOLD),  # BRAKE
         (3, 6, FlightMode.RTL),
         (3, 9, FlightMode.LAND),
-        (3, 17, FlightMode.MANUAL),  # BRAKE
+        (3, 16, FlightMode.MANUAL),  # POSHOLD
     ],
 )
 def test_modes_of_both_autopilots(autopilot: int, custom_mode: int, mode: FlightMode) -> None:
