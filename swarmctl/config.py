@@ -211,22 +211,26 @@ def load(path: Path | None, overrides: Sequence[str] = (), values: Mapping[str, 
     config = validated(Config, tree, source, _RENAMED)
     make_importable(config.own_folder)
     problems = list(own_problems(config.mission, config.controller, config.vehicle_model, config.separation))
-    if problems:
-        raise ConfigError(source, problems)
-    problems = list(_whole(config)) or list(_infeasible(config))
+    problems = problems or list(_whole(config)) or list(_infeasible(config))
     if problems:
         raise ConfigError(source, problems)
     return config
 
 
-def load_recorded(path: Path) -> Config:
-    """Read the resolved configuration of a recorded run, which may be somebody else's.
+def load_recorded(folder: Path) -> Config:
+    """Read the resolved configuration in a run folder, which may be somebody else's.
 
     Nothing that it names is read or imported, and whether it can be flown is not judged: it was.
 
     Raises:
-        ConfigError: a key is unknown, or a value has not its type or range.
+        ConfigError: it is no run folder, a key is unknown, or a value has not its type or range.
     """
+    from swarmctl.telemetry.recording.run_files import CONFIG, read_text, refuse_no_folder  # no agent needs it
+
+    refuse_no_folder(folder)
+    path = folder / CONFIG
+    if not read_text(path):
+        raise ConfigError(str(folder), [f"is no run folder: it holds no {CONFIG}"])
     return validated(Config, read_tree(path), str(path), _RENAMED)
 
 

@@ -15,12 +15,10 @@ from swarmctl.core.tick_record import COLUMNS
 from swarmctl.errors import ConfigError
 from swarmctl.telemetry.evaluation.referee import RunData
 from swarmctl.telemetry.recording.run_files import (
-    CONFIG,
     SUMMARY,
     read_plans,
     read_summary,
     read_text,
-    refuse_no_folder,
     refuse_other_swarm,
 )
 from swarmctl.telemetry.recording.run_files import load_run as read_recording
@@ -112,14 +110,11 @@ def load_run(folder: str | Path) -> Run:
         ConfigError: it is no run folder, the run has not ended, or a file in it has not the expected content.
     """
     folder = Path(folder)
-    refuse_no_folder(folder)
-    if not read_text(folder / CONFIG):
-        raise ConfigError(str(folder), [f"is no run folder: it holds no {CONFIG}"])
+    config = load_recorded(folder)
     checked = read_summary(folder)
     if checked is None:
         problem = f"holds no {SUMMARY}: the run still flies, or was cut off. Then complete it: swarmctl report {folder}"
         raise ConfigError(str(folder), [problem])
-    config = load_recorded(folder / CONFIG)
     refuse_other_swarm(folder, checked, config.swarm.agents)
     summary = json.loads(read_text(folder / SUMMARY))  # all of it, while `checked` is what the report needs
     return Run(folder, config, summary, read_recording(folder))

@@ -24,12 +24,11 @@ from swarmctl.check.link_facts import VehicleFacts
 from swarmctl.check.parameters import unchangeable
 from swarmctl.check.scanner import run_scans
 from swarmctl.config import Config, load_recorded
-from swarmctl.errors import ConfigError, StartError
+from swarmctl.errors import StartError
 from swarmctl.files import replaced
 from swarmctl.mavlink.dialects.discovery import DIALECTS
 from swarmctl.ops.vehicle_links import open_links
 from swarmctl.process_lifetime import StopRequest
-from swarmctl.telemetry.recording.run_files import CONFIG, read_text, refuse_no_folder
 
 if TYPE_CHECKING:
     from swarmctl.check.ground_services import GroundVehicle
@@ -55,15 +54,12 @@ def bundle(options: BundleOptions) -> Path:
         ConfigError: it is no run folder.
         StartError: the archive can't be written.
     """
-    folder = options.folder.resolve()
-    refuse_no_folder(folder)
-    if not read_text(folder / CONFIG):
-        raise ConfigError(str(options.folder), [f"is no run folder: it holds no {CONFIG}"])
+    config, folder = load_recorded(options.folder), options.folder.resolve()
     output = options.output or folder.with_name(f"{folder.name}.zip")
     ended_cleanly = StopRequest(signal.SIGTERM, signal.SIGHUP, raise_at=1)
     try:
         with ended_cleanly, tempfile.TemporaryDirectory(prefix="swarm-bundle-") as scratch:
-            vehicles = _vehicles(load_recorded(folder / CONFIG), options, Path(scratch))
+            vehicles = _vehicles(config, options, Path(scratch))
             with replaced(output) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
                 archive.writestr("versions.json", _json(_versions()))
                 archive.writestr("vehicles.json", _json(vehicles))

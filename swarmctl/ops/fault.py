@@ -52,7 +52,7 @@ def inject(launch: RunningLaunch, fault: FaultParams) -> str:
     """
     path = control_socket(launch.bus)
     if not path.exists():
-        if load_recorded(Path(launch.run_dir) / "config.toml").sitl.enabled:
+        if load_recorded(Path(launch.run_dir)).sitl.enabled:
             raise StartError(f"fault: the simulator of {launch.run} is not up yet, or has ended; see: swarmctl status")
         why = "this launch started no simulator; faults are for simulated vehicles, never for real ones"
         raise ConfigError("fault", [f"{launch.run}: {why}"])

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 from swarmctl.config import Config, load_recorded
 from swarmctl.core.text import printable
-from swarmctl.errors import ConfigError
 from swarmctl.ops.supervisor import LaunchResult
 
 if TYPE_CHECKING:
@@ -59,13 +58,9 @@ def rewrite_report(directory: Path) -> Path:
     Raises:
         ConfigError: it is no run folder.
     """
-    from swarmctl.telemetry.recording.run_files import CONFIG, read_text, refuse_no_folder  # heavy
-    from swarmctl.telemetry.recording.run_folder import report_run
+    from swarmctl.telemetry.recording.run_folder import report_run  # heavy
 
-    refuse_no_folder(directory)
-    if not read_text(directory / CONFIG):
-        raise ConfigError(str(directory), [f"is no run folder: it holds no {CONFIG}"])
-    return report_run(directory, load_recorded(directory / CONFIG).rules())
+    return report_run(directory, load_recorded(directory).rules())
 
 
 def _rules(config: Config, result: LaunchResult) -> Rules:
