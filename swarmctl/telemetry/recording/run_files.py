@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl import __version__
-from swarmctl.core.records import PLAN_COLUMNS, PLAN_DTYPE, TICK_DTYPE, TRUTH_COLUMNS, TRUTH_DTYPE
+from swarmctl.core.records import PLAN_COLUMNS, TICK_DTYPE, TRUTH_COLUMNS
 from swarmctl.core.stored_column import StoredColumn, dtype_of
 from swarmctl.core.tick_record import COLUMNS
 from swarmctl.errors import ConfigError
@@ -64,10 +64,7 @@ def load_run(directory: Path) -> RunData:
 
 def _read_truth(directory: Path) -> NDArray[np.void]:
     """Return the true states of a run, (T * vehicles,) of `TRUTH_DTYPE`; none without a simulator."""
-    raw, packed = directory / TRUTH, directory / PACKED_TRUTH
-    if not os.path.lexists(raw) and os.path.lexists(packed):
-        return _in_time(packed, read_parquet(packed, TRUTH_COLUMNS), ("t_us",))
-    return _in_time(raw, read_rows(raw, TRUTH_DTYPE), ("t_us",))
+    return _read_raw_or_packed(directory / TRUTH, directory / PACKED_TRUTH, TRUTH_COLUMNS, clocks=("t_us",))
 
 
 def read_plans(directory: Path, agent: int) -> NDArray[np.void]:
@@ -77,10 +74,16 @@ def read_plans(directory: Path, agent: int) -> NDArray[np.void]:
         ConfigError: the file has not the expected content.
     """
     raw = directory / f"agent-{agent}.plans"
-    packed = raw.with_suffix(PACKED_PLANS)
+    return _read_raw_or_packed(raw, raw.with_suffix(PACKED_PLANS), PLAN_COLUMNS, clocks=("t_us", "at_us"))
+
+
+def _read_raw_or_packed(
+    raw: Path, packed: Path, columns: Sequence[StoredColumn], *, clocks: tuple[str, ...]
+) -> NDArray[np.void]:
+    """Return the raw rows that a flight writes, or, once these are gone, those that the finished run has packed."""
     if not os.path.lexists(raw) and os.path.lexists(packed):
-        return _in_time(packed, read_parquet(packed, PLAN_COLUMNS), ("t_us", "at_us"))
-    return _in_time(raw, read_rows(raw, PLAN_DTYPE), ("t_us", "at_us"))
+        return _in_time(packed, read_parquet(packed, columns), clocks)
+    return _in_time(raw, read_rows(raw, dtype_of(columns)), clocks)
 
 
 def refuse_no_folder(directory: Path) -> None:
