@@ -41,8 +41,3 @@ class Alerts:
         """Return the active alert that began last, or None."""
         self._active = {c: a for c, a in self._active.items() if now_us - self._raised_us[c] <= _ALERT_LIFETIME_US}
         return max(self._active.values(), key=lambda alert: alert.since_us, default=None)
-
-    def text(self, now_us: int) -> str:
-        """Return the text of the active alert that began last, or ""."""
-        newest = self.newest(now_us)
-        return "" if newest is None else newest.text

@@ -38,8 +38,8 @@ from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import read_file, replace_bytes
 
 LAUNCH_FILE = "launch.json"
-_ANSWER_S = 5.0
-_REPEAT_S = 0.2
+ANSWER_S = 5.0  # longest wait for what is asked over the bus
+REPEAT_S = 0.2
 _START_TOLERANCE_S = 1.0
 _MAX_BYTES = 65_536  # size limit of a note
 
@@ -148,7 +148,7 @@ def view_address(launch: RunningLaunch) -> str:
 def read_statuses(launch: RunningLaunch) -> dict[int, StatusMessage]:
     """Return the newest status of every agent that publishes one in time, by agent."""
     with joined(launch) as bus:
-        return _statuses(bus, range(launch.agents), _ANSWER_S)
+        return _statuses(bus, range(launch.agents), ANSWER_S)
 
 
 def watch_statuses(launch: RunningLaunch, every_s: float) -> Iterator[dict[int, StatusMessage]]:
@@ -234,16 +234,16 @@ def vector(key: str, text: str, problems: list[str]) -> tuple[float, float, floa
 
 
 def _obstacles(bus: ZenohBus, least_version: int, say: bytes | None = None) -> ObstaclesMessage:
-    deadline_s = time.monotonic() + _ANSWER_S
+    deadline_s = time.monotonic() + ANSWER_S
     while time.monotonic() < deadline_s:
         if say is not None:
             bus.publish(OBSTACLES, say)
-        time.sleep(_REPEAT_S)
+        time.sleep(REPEAT_S)
         for _, payload in bus.receive(OBSTACLES):
             message = decode_obstacles(payload)
             if message is not None and message.version >= least_version:
                 return message
-    raise StartError(f"obstacle: the launch did not answer within {_ANSWER_S:.0f} s; see: swarmctl status")
+    raise StartError(f"obstacle: the launch did not answer within {ANSWER_S:.0f} s; see: swarmctl status")
 
 
 def _statuses(bus: ZenohBus, agents: range, timeout_s: float) -> dict[int, StatusMessage]:

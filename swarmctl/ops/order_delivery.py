@@ -19,10 +19,8 @@ from swarmctl.core.operator_verbs import OPERATOR_VERBS, PEER, Answer, Order
 from swarmctl.core.text import printable
 from swarmctl.core.types import Phase
 from swarmctl.errors import StartError
-from swarmctl.ops.operator import RunningLaunch, joined
+from swarmctl.ops.operator import ANSWER_S, REPEAT_S, RunningLaunch, joined
 
-ANSWER_S = 5.0  # longest wait for answers, and for a stop to begin
-_REPEAT_S = 0.2
 _POLL_S = 0.02
 _MOST_MESSAGES = 32  # of one repetition, so that they fit into an agent's ring
 
@@ -155,7 +153,7 @@ def deliver(launch: RunningLaunch, order: Order, agents: Sequence[int]) -> list[
         began_s = repeated_s = time.monotonic()
         while delivery.open and time.monotonic() - began_s < ANSWER_S:
             if time.monotonic() >= repeated_s:
-                repeated_s = time.monotonic() + _REPEAT_S
+                repeated_s = time.monotonic() + REPEAT_S
                 for message in delivery.messages(time.time_ns() // 1000):
                     bus.publish(COMMAND, message)
             time.sleep(_POLL_S)
