@@ -16,20 +16,17 @@ import pytest
 
 import swarmctl
 from swarmctl.api.flight_process import FlightProcess
-from swarmctl.config import Config, dump
+from swarmctl.config import Config
 from swarmctl.core.types import Phase
-from swarmctl.telemetry.recording.run_folder import Outcome, finish_run
 from tests.unit.ops.test_cli import HEAVY
 from tests.unit.telemetry.test_hostile_run_folder import REFUSED
-from tests.unit.telemetry.test_run_folder import RULES, write_run
+from tests.unit.telemetry.test_run_folder import write_finished_run
 
 
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
     directory = tmp_path_factory.mktemp("run")
-    write_run(directory, 3, 6.0)
-    (directory / "config.toml").write_text(dump(Config()))
-    finish_run(directory, RULES, Outcome(outcome="completed"))
+    write_finished_run(directory)
     return directory
 
 

@@ -21,17 +21,15 @@ from swarmctl.config import Config, dump, load
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.errors import ConfigError
 from swarmctl.ops.summary import rewrite_report
-from swarmctl.telemetry.recording.run_folder import Outcome, create_run_folder, finish_run
-from tests.unit.telemetry.test_run_folder import RULES, write_run
+from swarmctl.telemetry.recording.run_folder import create_run_folder
+from tests.unit.telemetry.test_run_folder import write_finished_run
 
 
 @pytest.fixture(scope="module")
 def unspoilt(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A finished run of three agents without faults."""
     directory = tmp_path_factory.mktemp("run")
-    write_run(directory, 3, 6.0)
-    (directory / "config.toml").write_text(dump(Config()))
-    finish_run(directory, RULES, Outcome(outcome="completed"))
+    write_finished_run(directory)
     return directory
 
 

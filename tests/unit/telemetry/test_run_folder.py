@@ -14,6 +14,7 @@ import pytest
 from numpy.typing import NDArray
 
 from swarmctl import __version__
+from swarmctl.config import Config, dump
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.records import PLAN_DTYPE, TICK_DTYPE, TRUTH_COLUMNS, TRUTH_DTYPE
 from swarmctl.core.tick_record import COLUMNS
@@ -64,6 +65,13 @@ def write_run(directory: Path, agents: int, seconds: float) -> None:
         (directory / f"agent-{agent}.events.jsonl").write_text(json.dumps(event) + "\n")
     np.concatenate(true).tofile(directory / "truth.bin")
     (directory / "config.toml").write_text('name = "x<y"\n')
+
+
+def write_finished_run(directory: Path) -> None:
+    """Write a finished run of three agents without faults."""
+    write_run(directory, 3, 6.0)
+    (directory / "config.toml").write_text(dump(Config()))
+    finish_run(directory, RULES, Outcome(outcome="completed"))
 
 
 RULES = Rules(agents=3, required_separation_m=0.85, obstacles={Obstacle(center_ned_m=(20.0, 20.0, -2.0)): None})
