@@ -106,10 +106,6 @@ def main(arguments: list[str] | None = None) -> int:
         from swarmctl.process_lifetime import die_with_parent
 
         die_with_parent()
-    if options.realtime and not options.lockstep:
-        from swarmctl.process_priority import request_realtime
-
-        request_realtime()
     try:
         return _run(options)
     except SwarmError as error:
@@ -140,6 +136,7 @@ def _run(options: argparse.Namespace) -> int:
     from sitl.fault_socket import ControlSocket
     from sitl.world import SitlWorld
     from swarmctl.process_lifetime import StopRequest
+    from swarmctl.process_priority import request_realtime
     from swarmctl.telemetry.recording.event_log import EventLog
 
     config = _config(options)
@@ -159,6 +156,8 @@ def _run(options: argparse.Namespace) -> int:
         world.faults.on_event = lambda name, since_boot_us, fields: log.write(
             name, since_boot_us=since_boot_us, **fields
         )
+    if options.realtime and not options.lockstep:
+        request_realtime()
     for i, (place, (x, y, z)) in enumerate(zip(places, config.spawns_ned_m(), strict=True)):
         print(f"vehicle sysid={config.sysid_base + i} {place} spawn={x:g},{y:g},{z:g}")
     if gcs_place:

@@ -26,6 +26,7 @@ from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START,
 from swarmctl.mavlink.codec import heartbeat_of
 from swarmctl.mavlink.transport import open_transport
 from swarmctl.process_lifetime import StopRequest
+from swarmctl.process_priority import request_realtime
 from swarmctl.telemetry.recording.recorder import Recorder
 from swarmctl.wall_clock import WallClock
 
@@ -90,6 +91,7 @@ class AgentProcess:
     fd: int | None = None  # bound UDP socket inherited from the launcher
     vehicle_port: int | None = None  # loopback port of the vehicle; None if unknown
     only_land: bool = False  # land and disarm the vehicle, whatever it is doing, then end
+    realtime: bool = False  # ask to be scheduled before other programs
 
 
 def run_agent(process: AgentProcess) -> int:
@@ -125,6 +127,9 @@ def run_agent(process: AgentProcess) -> int:
         on_frame=lambda frame: recorder.frame(clock.utc_us(), frame),
         stopwatch_ns=time.perf_counter_ns,
     )
+    if process.realtime:
+        granted, spent_s = request_realtime(), time.process_time()
+        recorder.event("realtime", clock.now_us(), clock.utc_us(), granted=granted, start_up_s=round(spent_s, 3))
     try:
         vehicle = url or f"inherited socket of sysid {config.sysids()[agent]}"
         return _loop(flown, config, clock, stop, vehicle=vehicle, only_land=process.only_land)

@@ -25,6 +25,7 @@ import zenoh
 from swarmctl.bus.topics import TOO_LONG, TOPICS, Topic
 from swarmctl.errors import StartError, SwarmError
 from swarmctl.process_lifetime import die_with_parent, remove_socket
+from swarmctl.process_priority import request_realtime
 
 SCHEME = "unixsock-stream/"
 NO_BUS = "none"  # endpoint of an agent without a bus
@@ -131,8 +132,12 @@ class ZenohBus:
         )
 
 
-def run_router(endpoint: str) -> None:
+def run_router(endpoint: str, realtime: bool = False) -> None:
     """Run the router until SIGTERM, which the caller has blocked, then remove the socket and its directory.
+
+    Args:
+        endpoint: a Unix socket in a private directory.
+        realtime: ask to be scheduled before other programs.
 
     Raises:
         StartError: the endpoint is not a Unix socket in a private directory, or another router holds it.
@@ -144,6 +149,8 @@ def run_router(endpoint: str) -> None:
         session = _open(settings)
     except zenoh.ZError as error:
         raise StartError(f"bus endpoint {endpoint!r}: can't be opened: {error}. Is another router using it?") from error
+    if realtime:
+        request_realtime()
     print(f"router ready {endpoint}", flush=True)
     signal.sigwait({signal.SIGTERM})
     _close_within(session, CLOSE_DEADLINE_S)
@@ -226,13 +233,16 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m swarmctl.bus.zenoh_bus", description="Router of one swarm's bus.")
     parser.add_argument("--router", required=True, metavar="ENDPOINT", help=f"{SCHEME}/DIR/bus.sock")
     parser.add_argument("--die-with-parent", action="store_true", help="end when the parent process ends")
+    parser.add_argument(
+        "--realtime", action=argparse.BooleanOptionalAction, default=False, help="be scheduled before other programs"
+    )
     arguments = parser.parse_args()
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})  # for sigwait; zenoh's threads inherit the mask
     if arguments.die_with_parent:
         die_with_parent(signal.SIGTERM)
     try:
-        run_router(arguments.router)
+        run_router(arguments.router, arguments.realtime)
     except SwarmError as error:
         print(error, file=sys.stderr)
         return error.exit_code

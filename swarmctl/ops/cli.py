@@ -185,6 +185,9 @@ def agent(
         int | None, typer.Option("--vehicle-port", help="Loopback port of the vehicle on that link.")
     ] = None,
     only_land: Annotated[bool, typer.Option("--only-land", help="Land and disarm the vehicle, then exit.")] = False,
+    realtime: Annotated[
+        bool, typer.Option(help="Be scheduled before other programs once it is ready, where that is permitted.")
+    ] = False,
 ) -> int:
     """Run one agent for one autopilot. `launch` starts agents; on a companion computer start it yourself."""
     from swarmctl.agent.runner import AgentProcess, run_agent
@@ -202,6 +205,7 @@ def agent(
             fd=fd,
             vehicle_port=vehicle_port,
             only_land=only_land,
+            realtime=realtime,
         )
     )
 

@@ -38,7 +38,7 @@ from swarmctl.ops.status_table import Display, open_display
 from swarmctl.ops.summary import sum_up
 from swarmctl.ops.supervisor import FlightSupervisor, Services
 from swarmctl.process_lifetime import StopRequest
-from swarmctl.process_priority import request_realtime
+from swarmctl.process_priority import is_realtime_permitted
 from swarmctl.telemetry.recording.event_log import EventLog
 
 _BUS_S = 20.0  # timeout for the router to answer
@@ -110,7 +110,6 @@ class Launcher(Services):
         self.context = RunContext(run_name(config.name), f"{SCHEME}{self._socket_dir}/bus.sock", directory)
         self.log = EventLog(directory / "launch.events.jsonl", "launch")
         self.children: dict[str, Child] = {}
-        self._realtime = wants_realtime(config)
 
     def start(self) -> None:
         """Start every process and join the bus; later failures are seen by the supervisor.
@@ -120,7 +119,7 @@ class Launcher(Services):
         """
         config, context, reserved = self._config, self.context, self._reserved
         socket_file(context.endpoint)
-        self._spawn(router_command(context.endpoint))
+        self._spawn(router_command(config, context.endpoint))
         self.bus = self._join_bus()
         if reserved.view_port:
             self._spawn(viewer_command(config, context, reserved.view_port, self._options.view))
@@ -131,7 +130,8 @@ class Launcher(Services):
         self.announce("")
         for line in _introduction(config, context, reserved):
             self._display.print_line(line)
-        self.log.write("started", run=context.run, ports=list(reserved.ports), realtime=self._realtime)
+        realtime = wants_realtime(config) and is_realtime_permitted()
+        self.log.write("started", run=context.run, ports=list(reserved.ports), realtime=realtime)
 
     def stop(self, agents_grace_s: float) -> None:
         """End every process, agents first and the router last, and remove all temporary files. Safe at any point."""
@@ -158,7 +158,7 @@ class Launcher(Services):
         ends = self._reserved.sockets, self._reserved.vehicle_sockets
         config_path = self.context.directory / "config.toml"
         command = agent_commands(self._config, context, *ends, config_path=config_path)[agent]
-        return self._started(replace(command, argv=(*command.argv, "--only-land")), directory)
+        return Child(replace(command, argv=(*command.argv, "--only-land")), directory)
 
     def announce(self, view: str) -> None:
         """Publish this launch to the operator's commands."""
@@ -171,13 +171,7 @@ class Launcher(Services):
         )
 
     def _spawn(self, command: Command) -> None:
-        self.children[command.name] = self._started(command, self.context.directory)
-
-    def _started(self, command: Command, directory: Path) -> Child:
-        child = Child(command, directory)
-        if self._realtime and command.in_control_loop:
-            self._realtime = request_realtime(child.pid)
-        return child
+        self.children[command.name] = Child(command, self.context.directory)
 
     def _join_bus(self) -> ZenohBus:
         senders = [agent_name(agent) for agent in range(self._config.swarm.agents)]

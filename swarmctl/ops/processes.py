@@ -38,12 +38,11 @@ _AGENTS_PER_PROCESSOR = 2  # more at real-time priority could leave nothing for 
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """One process to start: its name, its command line, the file descriptors it inherits, and whether others wait."""
+    """One process to start: its name, its command line, and the file descriptors it inherits."""
 
     name: str
     argv: tuple[str, ...]
     fds: tuple[int, ...] = ()
-    in_control_loop: bool = True  # a delay of this process delays setpoints, predicted paths or vehicle states
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,9 +66,10 @@ def wants_realtime(config: Config) -> bool:
     return config.agent.realtime and config.swarm.agents <= _AGENTS_PER_PROCESSOR * len(os.sched_getaffinity(0))
 
 
-def router_command(endpoint: str) -> Command:
+def router_command(config: Config, endpoint: str) -> Command:
     """Return the command of the bus router."""
-    return Command(ROUTER, _python("-m", "swarmctl.bus.zenoh_bus", "--router", endpoint, "--die-with-parent"))
+    argv = _python("-m", "swarmctl.bus.zenoh_bus", "--router", endpoint, "--die-with-parent", _priority_flag(config))
+    return Command(ROUTER, argv)
 
 
 def agent_commands(
@@ -97,6 +97,7 @@ def agent_commands(
         fds = (sockets[agent].fileno(),) if sockets else ()
         argv += ("--fd", f"{fds[0]}") if fds else ()
         argv += ("--vehicle-port", f"{vehicles[agent].getsockname()[1]}") if vehicles else ()
+        argv += (_priority_flag(config),)
         commands.append(Command(agent_name(agent), argv, fds))
     return tuple(commands)
 
@@ -111,8 +112,7 @@ def sitl_command(
     argv += ("--local-fds", ",".join(map(str, fds))) if fds else ()
     argv += ("--control", f"{control_socket(context.endpoint)}")
     argv += ("--events", f"{context.directory / 'sitl.events.jsonl'}")
-    argv += ("--truth", f"{context.directory / 'truth.bin'}", "--die-with-parent")
-    argv += () if wants_realtime(config) else ("--no-realtime",)
+    argv += ("--truth", f"{context.directory / 'truth.bin'}", "--die-with-parent", _priority_flag(config))
     return Command(SITL, argv, fds)
 
 
@@ -131,7 +131,7 @@ def viewer_command(config: Config, context: RunContext, port: int, view: bool) -
     argv += ("--limit", f"{config.limits.min_separation_m!r}")
     obstacles = encode_message(ObstaclesMessage(1, config.obstacles)).decode()
     argv += ("--obstacles-json", obstacles, "--die-with-parent")
-    return Command(VIEWER, argv + (("--view",) if view else ()), in_control_loop=False)
+    return Command(VIEWER, argv + (("--view",) if view else ()))
 
 
 def _scene_bounds(config: Config) -> tuple[tuple[float, ...], float]:
@@ -143,6 +143,11 @@ def _scene_bounds(config: Config) -> tuple[tuple[float, ...], float]:
     low, high = points.min(axis=0), points.max(axis=0)
     middle = 0.5 * (low + high)
     return tuple(float(c) for c in middle), max(2.0, float(np.max(high - low)) / 2 + config.separation.radius_m)
+
+
+def _priority_flag(config: Config) -> str:
+    """Return the flag of a process that delays setpoints, predicted paths or vehicle states when it has to wait."""
+    return "--realtime" if wants_realtime(config) else "--no-realtime"
 
 
 def _python(*arguments: str) -> tuple[str, ...]:

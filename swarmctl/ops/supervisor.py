@@ -208,7 +208,7 @@ class FlightSupervisor:
             code = child.poll()
             if code is None:
                 self._check_responsive(view, child, now_s)
-            elif self._is_first(f"{child.name} {child.pid} ended"):
+            elif self._is_first(_end_of(child)):
                 self._vouch_for_end(view.agent)
                 self._note_end(view, child, code)
                 self._recover(view, code)
@@ -296,6 +296,8 @@ class FlightSupervisor:
         """Return whether no agent is left to wait for. Silent agents are given up when no other one flies."""
         now_s = time.monotonic()
         running = self._running()
+        if any(_end_of(child) not in self._reported for child in self._agents() if child.poll() is not None):
+            return False  # it has ended since the agents were watched, and may say how the flight went
         if self._land_ordered_s is not None and now_s > self._land_until_s:
             for view in running:
                 if not self._recovery.is_on(view.agent):
@@ -364,5 +366,13 @@ class FlightSupervisor:
         self._reported.add(what)
         return True
 
+    def _agents(self) -> list[Child]:
+        return [self._services.children[agent_name(view.agent)] for view in self._views]
+
     def _running(self) -> list[AgentView]:
-        return [view for view in self._views if self._services.children[agent_name(view.agent)].poll() is None]
+        return [view for view, child in zip(self._views, self._agents(), strict=True) if child.poll() is None]
+
+
+def _end_of(child: Child) -> str:
+    """Return the words under which the end of this process is noted once."""
+    return f"{child.name} {child.pid} ended"

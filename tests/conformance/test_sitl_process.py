@@ -19,7 +19,8 @@ from pymavlink.dialects.v20 import development as mav
 from swarmctl.core.records import TRUTH_DTYPE
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames
-from tests.benches.scheduling import may_run_in_realtime, policies
+from swarmctl.process_priority import is_realtime_permitted
+from tests.benches.scheduling import policies
 
 pytestmark = pytest.mark.process
 
@@ -77,7 +78,7 @@ def test_other_programs_wait_for_the_vehicles(arguments: tuple[str, ...], wants:
     process, _ = start(*arguments)
     scheduled = policies(process.pid)
     stop(process)
-    assert scheduled == {os.SCHED_RR if wants and may_run_in_realtime() else os.SCHED_OTHER}
+    assert scheduled == {os.SCHED_RR if wants and is_realtime_permitted() else os.SCHED_OTHER}
 
 
 def test_a_second_simulator_takes_the_next_ports() -> None:

@@ -27,8 +27,9 @@ from swarmctl.config import load
 from swarmctl.core.types import Phase
 from swarmctl.ops.cli import main
 from swarmctl.ops.processes import wants_realtime
+from swarmctl.process_priority import is_realtime_permitted
 from tests.benches.at_once import at_once
-from tests.benches.scheduling import may_run_in_realtime, policies
+from tests.benches.scheduling import policies
 from tests.process.test_readme import ROOT, landed, low, shown
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
@@ -147,13 +148,17 @@ def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Start) -> None:
     launched.until_phase("TRACK", 3)
     assert launched.verb("status").returncode == 0
     (started,) = launched.events("started")
-    realtime = may_run_in_realtime() and wants_realtime(load(None, ("swarm.agents=3",)))
+    realtime = is_realtime_permitted() and wants_realtime(load(None, ("swarm.agents=3",)))
     assert started["realtime"] == realtime
     policy = os.SCHED_RR if realtime else os.SCHED_OTHER
     for words in (["swarmctl.bus.zenoh_bus"], ["sitl"], *(["agent", "--id", str(i)] for i in range(3))):
         assert policies(launched.pid_of(*words)) == {policy}, words
     viewer = launched.pid_of("swarmctl.telemetry.view.viewer")
     assert policies(viewer) == {os.SCHED_OTHER}, "it waits for those that fly"
+    for i in range(3 * realtime):
+        (asked,) = launched.events("realtime", f"agent-{i}")
+        assert asked["granted"]
+        assert asked["start_up_s"] > 0.3, "modules are loaded at normal priority: other swarms may be flying"
     assert launched.end() == 0, launched.text()
     lines = launched.text().splitlines()
     assert "3 agents" in lines[0]

@@ -143,6 +143,18 @@ def test_all_agents_finish(tmp_path: Path) -> None:
     assert result.exit_code(violated=True) == EXIT_MISSION
 
 
+def test_an_agent_that_ends_between_two_looks_still_says_how_it_ended(tmp_path: Path) -> None:
+    services = ScriptedServices(tmp_path, [ends(EXIT_INTERRUPTED)])
+    agent = services.children[agent_name(0)]
+
+    def end_unseen() -> None:  # `show` is called after the agents are watched and before the flight is judged
+        while agent.poll() is None:
+            time.sleep(0.01)
+
+    services.began_s, services.act = 0.0, end_unseen
+    assert services.fly().outcome == "interrupted"
+
+
 def test_a_killed_agent_is_named_and_the_others_finish(tmp_path: Path) -> None:
     scene = ScriptedServices(tmp_path, [FLIES_LONG, ends(0, 2.0), ends(0, 2.0)])
     scene.act = lambda: scene.kill("agent-0")

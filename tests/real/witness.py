@@ -22,7 +22,7 @@ from pymavlink.dialects.v20 import development as mav
 from swarmctl.core.types import GeoOrigin
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import cut_frames, frames, message_id
-from swarmctl.process_priority import request_realtime
+from swarmctl.process_priority import request_realtime_for_this_thread
 from tests.real.autopilots import ARDUCOPTER, Fleet
 
 ARMED_FLAG = 128
@@ -207,7 +207,7 @@ class Witness:
         return [UdpLink(14550, 18570), *(UdpLink(19410 + i, 19450) for i in each)]
 
     def _listen(self) -> None:
-        request_realtime(0, _FEED_PRIORITY)
+        request_realtime_for_this_thread(_FEED_PRIORITY)
         asked_s = 0.0
         while not self._ending.is_set():
             now_s = time.monotonic()
