@@ -155,11 +155,11 @@ def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Start) -> None:
         assert policies(launched.pid_of(*words)) == {policy}, words
     viewer = launched.pid_of("swarmctl.telemetry.view.viewer")
     assert policies(viewer) == {os.SCHED_OTHER}, "it waits for those that fly"
+    assert launched.end() == 0, launched.text()
     for i in range(3 * realtime):
         (asked,) = launched.events("realtime", f"agent-{i}")
         assert asked["granted"]
         assert asked["start_up_s"] > 0.3, "modules are loaded at normal priority: other swarms may be flying"
-    assert launched.end() == 0, launched.text()
     lines = launched.text().splitlines()
     assert "3 agents" in lines[0]
     assert "bus " in lines[1]
