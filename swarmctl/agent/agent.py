@@ -22,6 +22,7 @@ from swarmctl.agent.components import (
     make_state_machine,
 )
 from swarmctl.agent.controller_watch import ControllerWatch
+from swarmctl.agent.path_sharing import PathSharing
 from swarmctl.agent.reference_selector import ReferenceSelector
 from swarmctl.agent.separation_policy import SeparationDirective, SeparationInputs
 from swarmctl.agent.setup import AgentSetup
@@ -30,6 +31,7 @@ from swarmctl.agent.world_model import FLOWN_BY_AGENT, WorldModel
 from swarmctl.bus import topics
 from swarmctl.bus.path_messages import encode_path
 from swarmctl.bus.peers import Bus
+from swarmctl.bus.traffic import CountedBus
 from swarmctl.control.collision.encounters import Encounters
 from swarmctl.control.collision.separation import KeepOut, radius_problem
 from swarmctl.control.estimation.accuracy import AccuracyMonitor
@@ -102,7 +104,9 @@ class Agent:
         stopwatch_ns: Callable[[], int],
     ) -> None:
         self._setup, self._autopilot, self._commands = setup, autopilot, commands
-        self._bus, self._clock, self._sink, self._stopwatch_ns = bus, clock, sink, stopwatch_ns
+        bus = self._bus = CountedBus(bus)
+        self._clock, self._sink, self._stopwatch_ns = clock, sink, stopwatch_ns
+        self._path_sharing = PathSharing(setup.params.path_sharing, setup.separation)
         self._vehicle_setup = VehicleSetup(
             autopilot,
             commands,
@@ -188,6 +192,11 @@ class Agent:
     def rejected(self) -> dict[str, int]:
         """Number of bus messages refused so far, by reason."""
         return dict(self._world_model.refusals.by_reason)
+
+    @property
+    def sent(self) -> dict[str, dict[str, int]]:
+        """Number of `messages` and `bytes` published on the bus so far, by topic."""
+        return self._bus.sent
 
     @property
     def commits_refused(self) -> int | None:
@@ -552,8 +561,9 @@ class Agent:
     # -- publish, record ----------------------------------------------------------------------------------------------
 
     def _share(self, state: VehicleState | None, flown: Plan | None) -> None:
-        if state is not None:
-            self._bus.publish(topics.PATH, encode_path(self._path(state, flown)))
+        path = None if state is None else self._path_sharing.choose(self._path(state, flown))
+        if path is not None:
+            self._bus.publish(topics.PATH, encode_path(path))
         self._separation.publish(self._clock.utc_us())
 
     def _path(self, state: VehicleState, flown: Plan | None) -> PredictedPath:

@@ -134,7 +134,8 @@ def run_agent(process: AgentProcess) -> int:
         vehicle = url or f"inherited socket of sysid {config.sysids()[agent]}"
         return _loop(flown, config, clock, stop, vehicle=vehicle, only_land=process.only_land)
     finally:
-        recorder.event("bus_summary", clock.now_us(), clock.utc_us(), rejected=flown.rejected, lost=recorder.lost)
+        summary = {"sent": flown.sent, "rejected": flown.rejected, "lost": recorder.lost}
+        recorder.event("bus_summary", clock.now_us(), clock.utc_us(), **summary)
         link.close()
         transport.close()
         recorder.close()

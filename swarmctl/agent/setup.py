@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from pydantic import Field
 
+from swarmctl.agent.path_sharing import PathSharingParams
 from swarmctl.control.collision.barrier import BarrierParams
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.commit.trajectory_planner import CommitParams
@@ -28,6 +29,7 @@ class AgentParams(Params):
     rate_hz: float = Field(50.0, ge=10, le=200)  # rate of ticks, and so of setpoints
     realtime: bool = True  # launch schedules what flies before other programs, if it may
     connect_timeout_s: float = Field(15.0, gt=0, le=600)  # longest wait for the first heartbeat and position
+    path_sharing: PathSharingParams = PathSharingParams()
     state_machine: StateMachineParams = StateMachineParams()
     failsafe: FailsafeParams = FailsafeParams()
     overload: OverloadParams = OverloadParams()

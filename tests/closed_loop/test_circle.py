@@ -52,6 +52,19 @@ def test_negative_control_agents_that_ignore_each_other_collide(fly: Fly) -> Non
     assert alone.separation_m() < 0.3
 
 
+def test_paths_shared_by_event_cost_a_quarter_of_the_traffic_and_no_separation(circle: Flight, fly: Fly) -> None:
+    by_event = fly("agent.path_sharing.error_m=0.002", "sitl.start=air", "mission.duration_s=8", until=mission_is_over)
+    for agent, flown in zip(range(3), by_event.lockstep.agents, strict=True):
+        assert flown is not None
+        assert flown.sent["path"]["messages"] <= 0.4 * len(by_event.ticks(agent))
+    assert by_event.separation_m() >= 0.85
+    first_m = 0.0
+    for agent in range(3):
+        ticks, error = circle.tracked(agent)
+        first_m += float(np.linalg.norm(error[ticks["mission_t_s"] < 8.0], axis=1).mean())
+    assert by_event.summed_mean_error_m() <= 1.05 * first_m
+
+
 def test_a_wrong_mass_costs_no_altitude(fly: Fly) -> None:
     heavy = fly("sitl.mass_scale=1.25", *ALONE, until=mission_is_over)
     ticks, error = heavy.tracked(0)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -277,7 +277,7 @@ def _solver(ticks: Mapping[int, NDArray[np.void]], name: str) -> dict[str, Any]:
 
 
 def _comms(run: RunData, time_field: str) -> dict[str, Any]:
-    """Summarise plan staleness, messages refused (last `bus_summary` of each agent) and unresponsive peers."""
+    """Summarise plan staleness, messages sent and refused (last `bus_summary` of each agent), unresponsive peers."""
     ages = _percentiles([flight_rows(rows)["plan_staleness_ms"] for rows in run.ticks.values()])
     last = {event.get("source"): event for event in run.events if event.get("event") == "bus_summary"}
     rejected: Counter[str] = Counter()
@@ -287,9 +287,22 @@ def _comms(run: RunData, time_field: str) -> dict[str, Any]:
             rejected.update({str(reason): int(n) for reason, n in reasons.items() if finite(n) is not None})
     return {
         "path_age_ms": {"p50": ages["p50"], "p99": ages["p99"]},
+        "sent": _sent(last.values()),
         "rejected": dict(sorted(rejected.items())),
         "unresponsive": unresponsive(run.events, time_field),
     }
+
+
+def _sent(summaries: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, int]]:
+    """Return messages and bytes by topic, of all agents together."""
+    total: dict[str, Counter[str]] = {}
+    for summary in summaries:
+        topics = summary.get("sent")
+        for topic, counts in topics.items() if isinstance(topics, dict) else ():
+            if isinstance(counts, dict):
+                found = {key: int(counts[key]) for key in ("messages", "bytes") if finite(counts.get(key)) is not None}
+                total.setdefault(str(topic), Counter()).update(found)
+    return {topic: dict(counts) for topic, counts in sorted(total.items())}
 
 
 def _deadlocks(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -190,6 +190,8 @@ HOSTILE_EVENTS = [
     '{"event": "deadlock", "lasted_s": 1e999, "begins": true}',
     '{"event": "commitments", "source": "agent-0", "worst_tracking_m": "much", "proposed": [1]}',
     '{"event": "bus_summary", "source": "agent-0", "rejected": {"stale": NaN, "x": 1e999}}',
+    '{"event": "bus_summary", "source": "agent-0", "sent": {"path": {"messages": 1e999}, "tick": 3}}',
+    '{"event": "bus_summary", "source": "agent-1", "sent": ["path"]}',
     '{"event": "\\ud800", "source": {"a": 1}, "utc_us": -9e18, "t_us": true}',
     '{"event": "<script>alert(1)</script>"}',
     '{"event": "unresponsive", "source": "agent-0", "agent": 1, "begins": true, "utc_us": "now"}',
