@@ -1,8 +1,14 @@
-"""The order of the test files, the longest first, so that no worker idles at the end; and how each test begins."""
+"""The order of the test files, the longest first, so that no worker idles at the end; and how each test begins.
+
+Hundreds of processes import the program: it is compiled once, whatever the environment says of keeping that.
+"""
 
 from __future__ import annotations
 
+import compileall
+import os
 import signal
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -42,6 +48,16 @@ def heard_hangup() -> Iterator[None]:
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--nudged", metavar="SEED", default="0", help="fly tests/closed_loop from starts a millimetre off")
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Compile what the tests start, before there are workers; they and their processes inherit the environment."""
+    if hasattr(config, "workerinput"):
+        return
+    os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+    sys.dont_write_bytecode = False  # this is for the tests themselves, whose rewriting is slower still
+    for package in ("swarmctl", "sitl"):
+        compileall.compile_dir(TESTS.parent / package, quiet=2)
 
 
 @pytest.hookimpl(trylast=True)

@@ -258,6 +258,8 @@ class Plant:
             self._reweigh(self.mass_ratio)
         if self._wind_ned_m_s is not None:
             self._add_wind(self._wind_ned_m_s)
+        if self.held.all():
+            return  # nothing moves: of the state, only rotor forces change
         held = self.state[:, self.held].copy() if self.held.any() else None
         self._integrate()
         if held is not None:

@@ -13,7 +13,6 @@ from pathlib import Path
 import psutil
 import pyarrow.parquet as pq
 import pytest
-from scipy.stats import binomtest
 
 from sitl.studies.campaign.command import main
 from sitl.studies.campaign.flight import TrialFlight, fly
@@ -77,6 +76,8 @@ def test_a_finished_campaign_flies_nothing(quick: Path) -> None:
 
 
 def test_the_report_has_every_cell_with_its_exact_interval(quick: Path) -> None:
+    from scipy.stats import binomtest  # is slow to import, and every worker imports this module
+
     page = (quick / REPORT).read_text(encoding="utf-8")
     off = [row for row in rows_in(quick) if row["protections"] == "off"]
     hits = sum(row["collided"] for row in off)

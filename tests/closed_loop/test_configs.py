@@ -12,6 +12,7 @@ FLOWN_ELSEWHERE = {  # and for longer
     "thesis_6_obstacle": "obstacle",
     "improved_6_obstacle": "obstacle",
     "ardupilot_sitl": "arducopter",
+    "x500_circle": "real_autopilot",
 }
 FILES = sorted(path.name for path in (ROOT / "configs").glob("*.toml"))
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from tests.closed_loop.conftest import Flight, Fly, fly_now, mission_is_over
+from tests.closed_loop.conftest import COARSE, Flight, Fly, fly_now, mission_is_over
 
-SHORT = ("mission.duration_s=2", "sitl.start=air", "bus.loss_01=0.2", "bus.delay_ms=30")
+SHORT = (*COARSE, "mission.duration_s=2", "sitl.start=air", "bus.loss_01=0.2", "bus.delay_ms=30")
 
 
 @pytest.fixture(scope="module")

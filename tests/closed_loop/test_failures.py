@@ -17,7 +17,7 @@ from swarmctl.control.mpc.swarm_mpc import SwarmMpc
 from swarmctl.control.phases.state_machine import TAKEN_OVER
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase, PredictedPath
 from swarmctl.mavlink.codec import Codec
-from tests.closed_loop.conftest import Fly, closer_than, mission_is_over
+from tests.closed_loop.conftest import COARSE, Fly, closer_than, mission_is_over
 
 AIR = "sitl.start=air"
 
@@ -64,6 +64,7 @@ def test_negative_control_a_dead_agent_that_is_forgotten_is_closed_in_on(
 
 def test_a_frozen_agent_is_landed_by_its_autopilot_and_never_retakes_control(fly: Fly) -> None:
     flight = fly(
+        *COARSE,
         "swarm.agents=2",
         "mission.duration_s=9",
         at={4.0: lambda running: running.frozen.add(1), 7.0: lambda running: running.frozen.discard(1)},
@@ -148,7 +149,7 @@ def _solve_from(running: Lockstep, from_s: float, solve: Callable[..., QpSolutio
 )
 def test_modes_after_a_solver_failure(fly: Fly, lasts_s: float, reached: Mode) -> None:
     broken = {3.0: lambda running: break_solver(running, 0, lasts_s)}
-    flight = fly("mission.duration_s=9", "swarm.agents=1", at=broken)
+    flight = fly(*COARSE, "mission.duration_s=9", "swarm.agents=1", at=broken)
     ladder = [Mode.REPLAY, Mode.BRAKE, Mode.HOLD, Mode.LAND]
     seen = flight.modes(0)
     assert [mode for mode in ladder if mode in seen] == ladder[: ladder.index(reached) + 1]

@@ -21,7 +21,7 @@ from swarmctl.bus.senders import ReceivedMessage, SenderVerifier, _Stream
 from swarmctl.core.types import Mode, Phase
 from swarmctl.telemetry.evaluation.referee import RunData, evaluate
 from tests import builders
-from tests.closed_loop.conftest import Flight, Fly, fly_now, mission_t_s
+from tests.closed_loop.conftest import COARSE, Flight, Fly, fly_now, mission_t_s
 
 AGENTS, VICTIM, STRANGER = 4, 1, 999
 LAST = 2**32 - 1
@@ -29,6 +29,7 @@ CROSSED_S = 4.0  # the agents meet after 3 s
 FORGED_S = 2.0
 GUARANTEED = "separation.mode=guaranteed"
 SWAP = (
+    *COARSE,
     f"swarm.agents={AGENTS}",
     "start.positions_ned_m=[[3,0,0],[0,3,0],[-3,0,0],[0,-3,0]]",
     "mission.swap.travel_s=6",

@@ -26,6 +26,8 @@ from rich.table import Column, Table
 
 from sitl.lockstep import Lockstep
 from sitl.studies.bench.captured import (
+    MOST_PROBLEMS,
+    WARM_UP,
     Times,
     XyTimes,
     capture,
@@ -196,7 +198,7 @@ def bench(
         beside = measure_ticks(_BESIDE_PILLAR, solvers, ticks, pillar=True, on_tick=on_tick)
         rows += tick_rows(beside, _BESIDE_PILLAR, _OBSTACLE)
         bar.update(task, description="x-y problems of a flight")
-        captured = capture(circle_with_obstacle())
+        captured = capture(circle_with_obstacle(), most=min(MOST_PROBLEMS, WARM_UP + ticks))
         problem_task = bar.add_task("x-y problems", total=len(captured.problems))
         rows += xy_rows(measure_xy(captured, solvers, slsqp, lambda: bar.advance(problem_task)))
     return rows

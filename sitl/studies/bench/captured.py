@@ -38,7 +38,8 @@ from swarmctl.core.types import Array, Phase, Plan
 Mask = NDArray[np.bool_]
 _OBSTACLE = "obstacles=[{center_ned_m=[-5.0,-1.5,-1.8],radius_m=1.0,keep_out_m=1.75,visibility_m=3.0}]"
 _MISSION = "mission.duration_s=9.0"  # the obstacle is passed at about 7 s
-_WARM_UP = 20  # problems that are solved but not counted
+WARM_UP = 20  # problems that are solved but not counted
+MOST_PROBLEMS = 240
 _MAX_KEEP_OUTS = 3  # two neighbours, one obstacle
 
 
@@ -83,7 +84,7 @@ class Recording:
         self._controller.reset()
 
 
-def capture(config: Config, keep_outs: int = _MAX_KEEP_OUTS, most: int = 240) -> Captured:
+def capture(config: Config, keep_outs: int = _MAX_KEEP_OUTS, most: int = MOST_PROBLEMS) -> Captured:
     """Fly `config` in lockstep and keep up to `most` tracking problems with exactly `keep_outs` things to avoid.
 
     They are consecutive, agent after agent.
@@ -232,7 +233,7 @@ def measure_xy(
             for baseline in baselines:
                 baseline.solve(mpc.nonlinear(problem, plan))
             on_problem()
-    counted = {name: np.array(took[_WARM_UP:]) for name, took in qp_ms.items()}
+    counted = {name: np.array(took[WARM_UP:]) for name, took in qp_ms.items()}
     fmincon, gradients = [b.counted() for b in baselines] if slsqp else [None, None]
     return XyTimes(tick=times_of(captured.tick_ms), qp_ms=counted, fmincon=fmincon, gradients=gradients)
 
@@ -260,9 +261,9 @@ class _Running:
         self._answers.append(answer)
 
     def counted(self) -> Baseline:
-        answers = self._answers[_WARM_UP:]
+        answers = self._answers[WARM_UP:]
         return Baseline(
-            duration_ms=np.array(self._duration_ms[_WARM_UP:]),
+            duration_ms=np.array(self._duration_ms[WARM_UP:]),
             solved=np.array([a.solved for a in answers]),
             kept=np.array([a.shortfall_m < KEPT_M for a in answers]),
         )

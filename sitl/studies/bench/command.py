@@ -32,7 +32,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--out", metavar="DIR", type=Path, default=Path(), help="folder of bench.json; default: here")
     parser.add_argument("--neighbours", metavar="K,K", type=_counts, default=list(NEIGHBOURS), help="counts, 0 to 99")
     parser.add_argument("--solver", action="append", choices=SOLVERS, help="repeatable; default: all installed")
-    parser.add_argument("--ticks", metavar="N", type=_ticks, default=300, help="measured for each solver and scenario")
+    parser.add_argument("--ticks", metavar="N", type=_ticks, default=300, help="measured: ticks, and x-y problems")
     parser.add_argument("--slsqp", action=argparse.BooleanOptionalAction, default=True, help="the nonlinear baseline")
     return parser
 

@@ -22,9 +22,8 @@ SPEED_M_S = formation.RADIUS_M * formation.OMEGA_RAD_S
 
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without waiting until the agent has caught up, and with few problems."""
+    """Without waiting until the agent has caught up."""
     monkeypatch.setattr(bench, "_WARM_UP_S", 0.1)
-    monkeypatch.setattr(bench, "capture", lambda config: capture(config, most=22))
 
 
 @pytest.fixture(scope="module")
