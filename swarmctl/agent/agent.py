@@ -26,6 +26,7 @@ from swarmctl.agent.reference_selector import ReferenceSelector
 from swarmctl.agent.separation_policy import SeparationDirective, SeparationInputs
 from swarmctl.agent.setup import AgentSetup
 from swarmctl.agent.telemetry_publisher import ControlOutput, PlanningResult, TelemetryPublisher, TickSink
+from swarmctl.agent.volume_watch import VolumeWatch
 from swarmctl.agent.world_model import FLOWN_BY_AGENT, WorldModel
 from swarmctl.bus import topics
 from swarmctl.bus.path_messages import encode_path
@@ -117,6 +118,7 @@ class Agent:
         self._directive = SeparationDirective()  # of the newest tick
         self._controller, self._transit = make_controllers(setup, stopwatch_ns)
         self._controller_watch = ControllerWatch(self._note)
+        self._volume_watch = VolumeWatch(setup.volume, self._note)
         self._observer = make_estimator(setup)
         self._predictor = Predictor(setup.vehicle_model)
         self._safety_filter = make_safety_filter(setup, self._world_model, self._note, stopwatch_ns)
@@ -337,6 +339,8 @@ class Agent:
         )
         keep_outs = self._encounters.noted(near, start.pos_ned_m)
         flies = Phase.GOTO_START <= self._state_machine.phase <= Phase.GOTO_LAND
+        if outside := self._volume_watch.update(now_us, state, flies and self._state_machine.had_control):
+            self._alerts.put("volume", outside, now_us)
         self._detect_deadlock(now_us, state, keep_outs, flies)
         grid = np.arange(self._controller.longest + 1, dtype=np.float64)
         ahead_s = self._predictor.delay_us * 1e-6 + dt_us * 1e-6 * grid

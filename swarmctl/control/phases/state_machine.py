@@ -26,6 +26,7 @@ from swarmctl.control.phases.refused_orders import Contains, OrderSituation, ref
 from swarmctl.control.phases.state_machine_params import StateMachineParams
 from swarmctl.control.phases.trajectories import Trajectories, is_at
 from swarmctl.control.reference.mission import MissionReference
+from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.operator_verbs import GOTO, OPERATOR_VERBS, POINT, SPEED, YAW, Order
 from swarmctl.core.types import Array, Command, FlightMode, Landed, Mode, Phase, VehicleState, Verb
 
@@ -52,7 +53,8 @@ class MissionStateMachine:
         start_ned_m: (3,) start position, also the landing place.
         duration_s: duration of the tracked mission.
         reference: reference of the tracked mission.
-        contains: whether a place lies in the area to fly in.
+        contains: whether a place lies within the geofence.
+        volume: to stay in; None for none.
 
     Attributes:
         phase: current phase.
@@ -75,8 +77,9 @@ class MissionStateMachine:
         duration_s: float,
         reference: MissionReference,
         contains: Contains = lambda _: True,
+        volume: FlightVolume | None = None,
     ) -> None:
-        self._params, self._expected, self._contains = params, peers, contains
+        self._params, self._expected, self._contains, self._volume = params, peers, contains, volume
         self._start_ned_m, self._duration_us, self._reference = start_ned_m, round(duration_s * 1e6), reference
         self.phase = Phase.CONNECT
         self.ready_utc_us = 0
@@ -91,7 +94,9 @@ class MissionStateMachine:
             reference, start_ned_m, speed_m_s=params.speed_m_s, accel_m_s2=params.accel_m_s2
         )
         self._interruptions = Interruptions(self._trajectories)
-        self._landing = Landing(params, agent, landing_m, start_ned_m=start_ned_m, trajectories=self._trajectories)
+        self._landing = Landing(
+            params, agent, landing_m, start_ned_m=start_ned_m, trajectories=self._trajectories, volume=volume
+        )
         self._entered_us = 0
         self._first_tick_us: int | None = None
         self._requested_us = -_REQUEST_PERIOD_US
@@ -231,6 +236,7 @@ class MissionStateMachine:
             paused=self._interruptions.paused,
             lowest_m=self._lowest_m,
             contains=self._contains,
+            volume=self._volume,
         )
         if refusal := refusal_of(order, situation):
             return refusal
