@@ -262,6 +262,7 @@ def _whole(config: Config) -> Iterator[str]:
     if len(config.obstacles) > MAX_OBSTACLES:
         yield f"obstacles: {len(config.obstacles)} are listed, agents keep {MAX_OBSTACLES} at most"
     yield from parameter_problems(config.agent.autopilot_params)
+    yield from config.agent.failsafe.problems()
     if config.sitl.speed != 1.0:
         yield (
             f"sitl.speed = {config.sitl.speed}: agents fly on wall time and can't follow; leave it at 1. Faster than "

@@ -18,6 +18,7 @@ import numpy as np
 from swarmctl.control.phases.arming import ArmingEvidence
 from swarmctl.control.phases.control_mode import control_mode
 from swarmctl.control.phases.departure import Climb, unmet_start_condition
+from swarmctl.control.phases.failsafe import Response
 from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.control.phases.interruptions import HoldPoint, Interruptions
 from swarmctl.control.phases.landing import Landing
@@ -163,6 +164,7 @@ class MissionStateMachine:
             self._give_up(OVERLOADED, inputs, state)
         if inputs.cut_off and self._may_fly_on:
             self._give_up(inputs.cut_off, inputs, state)
+        self._escalate(inputs, state)
         self._pause(inputs, state)
         if state.mode is FlightMode.EXTERNAL and Phase.GOTO_START <= self.phase < Phase.LAND:
             self._take_control(inputs, state)
@@ -319,6 +321,17 @@ class MissionStateMachine:
     def _is_down(self, inputs: PhaseInputs, state: VehicleState) -> bool:
         """Return whether the vehicle is on the ground and known to be disarmed."""
         return state.landed is Landed.ON_GROUND and self.arming.is_disarmed(inputs, state)
+
+    def _escalate(self, inputs: PhaseInputs, state: VehicleState) -> None:
+        """Fly home, or land, as battery and link ask for; a vehicle on its way home lands where it is, if it has to."""
+        response, why = inputs.escalation.response, inputs.escalation.reason
+        flies_home = self.phase is Phase.GOTO_LAND and not self._landing.in_place
+        controls = self.had_control and inputs.mode in _PLAN_MODES
+        if response is Response.RTL and self._may_fly_on and controls:
+            self.outcome = self.outcome or f"{why}: flew back"
+            self._go_home(inputs.now_us, state)
+        elif (response >= Response.RTL and self._may_fly_on) or (response is Response.LAND and flies_home):
+            self._give_up(why, inputs, state)
 
     def _pause(self, inputs: PhaseInputs, state: VehicleState) -> None:
         """Come to rest while the bus is lost, because peers then assume braking, and while deadlines are missed."""

@@ -34,6 +34,7 @@ from swarmctl.check.services import corners_deg, has_fence
 from swarmctl.check.swarm import exit_code, findings, standing
 from swarmctl.check.table import _drawn, as_json, print_check
 from swarmctl.config import Config, load
+from swarmctl.control.phases.failsafe import FailsafeParams
 from swarmctl.core.flight_volume import VolumeParams
 from swarmctl.core.types import FlightMode, Landed
 from swarmctl.core.verdict import Verdict
@@ -454,6 +455,21 @@ def test_the_radius_has_to_cover_body_tracking_and_estimator(config: Config) -> 
     alone = load(None, ["swarm.agents=1"])
     single = changed(HEALTHY, estimator=vague.estimator)
     assert not [line for line in findings([single], alone) if line.topic == "radius"]
+
+
+def test_limits_of_battery_and_link_are_shown_and_the_return_is_one_of_them(config: Config) -> None:
+    lines = findings([HEALTHY, SECOND_OK], config)
+    assert line_of(lines, "battery").wanted == "over 50%, warns at 30%, returns at 20%, lands at 10%"
+    assert line_of(lines, "loss").wanted.endswith("warns at 20%")
+    strict = FailsafeParams(battery_warn_01=0.8, battery_rtl_01=0.7)
+    agent = config.agent.model_copy(update={"failsafe": strict})
+    low = changed(
+        HEALTHY,
+        sensors=Sensors(present=ALL_SENSORS, enabled=ALL_SENSORS, healthy=0x1320C83F, battery_v=15.6, battery_01=0.65),
+    )
+    assert line_of(findings([low, SECOND_OK], config), "battery").verdict is OK
+    within = config.model_copy(update={"agent": agent})
+    assert line_of(findings([low, SECOND_OK], within), "battery").verdict is FIX
 
 
 def test_the_flight_volume_is_shown_and_who_stands_beside_it_is_found(config: Config) -> None:
