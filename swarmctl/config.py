@@ -27,11 +27,12 @@ from swarmctl.control.controllers.discovery import ControllerParams
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.reference.feasibility import FlightLimits, infeasible
 from swarmctl.control.reference.mission import MissionParams
+from swarmctl.core.flight_volume import VolumeParams
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.own import OwnError
 from swarmctl.core.params import Params, Vec3
 from swarmctl.errors import ConfigError
-from swarmctl.mavlink.geofence import GeofenceParams
+from swarmctl.mavlink.geofence import GeofenceParams, is_inside
 from swarmctl.mavlink.parameter_names import parameter_problems
 from swarmctl.mavlink.transport import Endpoint, parse_url
 from swarmctl.own_modules import locate, make_importable, own_problems
@@ -125,6 +126,7 @@ class Config(Params):
     vehicle_model: VehicleModelParams = VehicleModelParams()
     agent: AgentParams = AgentParams()
     vehicles: tuple[VehicleParams, ...] = Field((), strict=False)
+    volume: VolumeParams = VolumeParams()
     geofence: GeofenceParams = GeofenceParams()
     sitl: SitlParams = SitlParams()
     bus: BusParams = BusParams()
@@ -185,6 +187,7 @@ class Config(Params):
             mode=mode,
             duration_s=self.mission.duration_s,
             downwash=self.separation.downwash,
+            volume=self.volume.flight_volume(),
         )
 
 
@@ -250,6 +253,7 @@ def _whole(config: Config) -> Iterator[str]:
     elif not (listed and listed < agents):
         yield from _starts_apart(config)
         yield from config.geofence.problems(config.starts_ned_m())
+        yield from _volume_problems(config)
         try:
             config.simulator()
         except ConfigError as error:
@@ -258,6 +262,7 @@ def _whole(config: Config) -> Iterator[str]:
     if len(config.obstacles) > MAX_OBSTACLES:
         yield f"obstacles: {len(config.obstacles)} are listed, agents keep {MAX_OBSTACLES} at most"
     yield from parameter_problems(config.agent.autopilot_params)
+    yield from config.agent.failsafe.problems()
     if config.sitl.speed != 1.0:
         yield (
             f"sitl.speed = {config.sitl.speed}: agents fly on wall time and can't follow; leave it at 1. Faster than "
@@ -285,6 +290,20 @@ def _whole(config: Config) -> Iterator[str]:
         )
 
 
+def _volume_problems(config: Config) -> Iterator[str]:
+    """Yield what does not go with the flight volume."""
+    corners, fence = config.volume.corners_ne_m, config.geofence.corners_ne_m
+    yield from config.volume.problems(config.starts_ned_m(), config.separation.tracking_m + config.drift_m)
+    if corners and not (config.controller.keeps_volume or config.separation.mode == "guaranteed"):
+        yield (
+            f"controller.kind = {config.controller.kind!r} with a volume: it does not plan, and would fly out of it; "
+            "use dmpc, dmpc3 or mpc"
+        )
+    beyond = [list(corner) for corner in corners if fence and not is_inside(corner, fence)]
+    if beyond:
+        yield f"volume.corners_ne_m: {beyond} are outside of geofence.corners_ne_m; move the corners or the fence"
+
+
 def _infeasible(config: Config) -> Iterator[str]:
     """Yield why the references of a configuration without other problems can't be flown."""
     separation = config.separation
@@ -293,6 +312,7 @@ def _infeasible(config: Config) -> Iterator[str]:
         apart_m=separation.radius_m,
         downwash=separation.downwash,
         ground_z_m=config.sitl.ground_z_m if config.sitl.enabled else None,
+        volume=config.volume.flight_volume(),
     )
     try:
         references = config.mission.references(np.array(config.starts_ned_m()), separation.budget.planned_m)

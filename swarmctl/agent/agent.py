@@ -27,6 +27,7 @@ from swarmctl.agent.reference_selector import ReferenceSelector
 from swarmctl.agent.separation_policy import SeparationDirective, SeparationInputs
 from swarmctl.agent.setup import AgentSetup
 from swarmctl.agent.telemetry_publisher import ControlOutput, PlanningResult, TelemetryPublisher, TickSink
+from swarmctl.agent.volume_watch import VolumeWatch
 from swarmctl.agent.world_model import FLOWN_BY_AGENT, WorldModel
 from swarmctl.bus import topics
 from swarmctl.bus.path_messages import encode_path
@@ -40,7 +41,8 @@ from swarmctl.control.fallback import brake_and_hold_plan
 from swarmctl.control.model import Predictor
 from swarmctl.control.mpc.plan_buffer import PlanBuffer
 from swarmctl.control.mpc.problem import Problem, Start
-from swarmctl.control.phases.failsafe import FailsafeDecision, decide
+from swarmctl.control.phases.endurance import Endurance
+from swarmctl.control.phases.failsafe import NOTHING_WORN, Escalation, FailsafeDecision, Response, decide, escalate
 from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.control.phases.overload import Level, Overload
 from swarmctl.control.reference.heading import Heading
@@ -121,6 +123,7 @@ class Agent:
         self._directive = SeparationDirective()  # of the newest tick
         self._controller, self._transit = make_controllers(setup, stopwatch_ns)
         self._controller_watch = ControllerWatch(self._note)
+        self._volume_watch = VolumeWatch(setup.volume, self._note)
         self._observer = make_estimator(setup)
         self._predictor = Predictor(setup.vehicle_model)
         self._safety_filter = make_safety_filter(setup, self._world_model, self._note, stopwatch_ns)
@@ -161,6 +164,7 @@ class Agent:
         self._alerts = Alerts()
         self._accuracy = AccuracyMonitor()
         self._standby_us = 0
+        self._endurance, self._escalation = Endurance(setup.params.failsafe.window_s), NOTHING_WORN
         self._overload = Overload(setup.params.overload, round(1e6 / setup.params.rate_hz))
         self._done_us: int | None = None
         self._last_state_us = _NO_TIME_US
@@ -346,6 +350,8 @@ class Agent:
         )
         keep_outs = self._encounters.noted(near, start.pos_ned_m)
         flies = Phase.GOTO_START <= self._state_machine.phase <= Phase.GOTO_LAND
+        if outside := self._volume_watch.update(now_us, state, flies and self._state_machine.had_control):
+            self._alerts.put("volume", outside, now_us)
         self._detect_deadlock(now_us, state, keep_outs, flies)
         grid = np.arange(self._controller.longest + 1, dtype=np.float64)
         ahead_s = self._predictor.delay_us * 1e-6 + dt_us * 1e-6 * grid
@@ -420,6 +426,8 @@ class Agent:
             self._alerts.put("controller", failure, now_us)
         good = self._plan_buffer.plan
         delay_us = self._predictor.delay_us
+        is_stale = state is not None and not self._fresh(now_us, state)
+        self._endurance.update(now_us, self._autopilot.health.battery_01, is_stale)
         health = Health(
             state_age_us=_NO_TIME_US if state is None else max(0, now_us - state.t_us),
             armed=state is not None and state.armed,
@@ -432,9 +440,19 @@ class Agent:
             speed_m_s=0.0 if state is None else math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s)),
             phase=self._state_machine.phase,
             had_control=self._state_machine.had_control,
+            battery_01=self._endurance.battery_01,
+            link_lost_01=self._endurance.link_lost_01,
             pilot_override=self._state_machine.pilot_override,
         )
         self._decision = decide(health, self._setup.params.failsafe)
+        self._report_escalation(now_us, escalate(health, self._setup.params.failsafe))
+
+    def _report_escalation(self, now_us: int, now: Escalation) -> None:
+        before, self._escalation = self._escalation, now
+        if now.response is not before.response:
+            self._note("escalation", response=now.response.name, reason=now.reason)
+        if now.response is not Response.NONE and self._state_machine.phase < Phase.DONE:
+            self._alerts.put("escalation", now.reason, now_us)
 
     def _brake_and_hold(self, start: Start) -> Plan:
         disturbance = self._observer.estimate.disturbance_ned_m_s2
@@ -513,6 +531,7 @@ class Agent:
             refusal=self._vehicle_setup.refusal if self._state_machine.phase <= Phase.ARM else "",
             unsettled=self._unsettled(now_us),
             overload=self._overload.level,
+            escalation=self._escalation,
             armed_told_us=self._autopilot.armed_told_us,
         )
         for command in self._state_machine.step(inputs):

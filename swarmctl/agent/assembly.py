@@ -59,6 +59,7 @@ def make_agent(
         separation=config.separation,
         vehicle_model=config.model_of(agent),
         max_obstacles=min(max(1, len(config.obstacles)), config.separation.max_obstacles),
+        volume=config.volume.flight_volume(),
         fence_ne_m=config.geofence.corners_ne_m,
         drift_m=config.drift_m,
     )

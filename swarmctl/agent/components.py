@@ -43,6 +43,7 @@ def _guaranteed(
         mpc=setup.controller.mpc,
         vehicle=setup.vehicle_model,
         separation=setup.separation,
+        volume=setup.volume,
         max_keep_outs=setup.max_keep_outs,
         world_model=world_model,
         bus=bus,
@@ -96,6 +97,7 @@ def make_controllers(setup: AgentSetup, stopwatch_ns: Stopwatch) -> tuple[Contro
         agent=setup.agent,
         max_keep_outs=setup.max_keep_outs,
         stopwatch_ns=stopwatch_ns,
+        volume=setup.volume,
     )
     mission = make(params)
     if params.follows_reference:
@@ -139,4 +141,5 @@ def make_state_machine(setup: AgentSetup) -> MissionStateMachine:
         duration_s=setup.mission.duration_s,
         reference=reference,
         contains=lambda at_ne_m: not setup.fence_ne_m or is_inside(at_ne_m, setup.fence_ne_m),
+        volume=setup.volume,
     )

@@ -18,6 +18,7 @@ from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredRefe
 from swarmctl.control.commit.tube import Grip, Tube
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.swarm_mpc import MpcParams
+from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.trajectory import Times, Trajectory
 from swarmctl.core.trajectory_message import TrajectoryMessage
 from swarmctl.core.types import Array, Phase, VehicleState
@@ -34,7 +35,7 @@ class Coordination:
     Args:
         agent, boot_id: identity in the own messages.
         peers: numbers of the other agents.
-        params, mpc, vehicle, separation, max_keep_outs, stopwatch_ns: see `TrajectoryPlanner`.
+        params, mpc, vehicle, separation, volume, max_keep_outs, stopwatch_ns: see `TrajectoryPlanner`.
         world_model: paths, statuses and presence of peers, and obstacles.
         bus: is drained by `receive`.
         rate_hz: tick rate of every agent.
@@ -60,6 +61,7 @@ class Coordination:
         mpc: MpcParams,
         vehicle: VehicleModelParams,
         separation: SeparationParams,
+        volume: FlightVolume | None,
         max_keep_outs: int,
         world_model: WorldModel,
         bus: Bus,
@@ -69,7 +71,14 @@ class Coordination:
     ) -> None:
         self._agent, self._boot_id, self._bus, self._world_model = agent, boot_id, bus, world_model
         planner = TrajectoryPlanner(
-            agent, params, mpc, vehicle, separation, max_keep_outs=max_keep_outs, stopwatch_ns=stopwatch_ns
+            agent,
+            params,
+            mpc,
+            vehicle,
+            separation,
+            max_keep_outs=max_keep_outs,
+            stopwatch_ns=stopwatch_ns,
+            volume=volume,
         )
         self._commitments = Commitments(agent, params, planner)
         refusals, presence = world_model.refusals, world_model.presence

@@ -27,7 +27,9 @@ class ReferenceSelector:
 
     def __init__(self, setup: AgentSetup, state_machine: MissionStateMachine, note: Callable[..., None]) -> None:
         self._state_machine, self._note, self._yaw_rad = state_machine, note, setup.mission.yaw_rad
-        self._recovery = DeadlockRecovery(setup.params.deadlock, setup.agent, setup.separation.budget.radius_m)
+        self._recovery = DeadlockRecovery(
+            setup.params.deadlock, setup.agent, setup.separation.budget.radius_m, setup.volume
+        )
         self._reported: Deadlock | None = None
 
     def heading_rad(self, utc_us: int) -> float | None:

@@ -19,6 +19,7 @@ from swarmctl.control.phases.overload import OverloadParams
 from swarmctl.control.phases.state_machine_params import StateMachineParams
 from swarmctl.control.reference.deadlock import DeadlockParams
 from swarmctl.control.reference.mission import MissionParams
+from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array
 
@@ -57,6 +58,7 @@ class AgentSetup:
     separation: SeparationParams
     vehicle_model: VehicleModelParams
     max_obstacles: int
+    volume: FlightVolume | None  # to stay in
     fence_ne_m: tuple[tuple[float, float], ...]  # corners of the geofence; none: no fence
     drift_m: float  # by a gust of `separation.gust_m_s`
 

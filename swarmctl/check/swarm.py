@@ -6,6 +6,8 @@ import itertools
 import math
 from collections.abc import Callable, Sequence
 
+import numpy as np
+
 from swarmctl.check.finding import SWARM, Finding
 from swarmctl.check.link_facts import Ned, VehicleFacts
 from swarmctl.check.parameters import parameter_findings
@@ -92,6 +94,39 @@ def _start(facts: VehicleFacts, config: Config) -> list[Finding]:
     if away_m > _FAR_M:
         return line(NOTE, "far from its start; is the way there free?", 6)
     return line(OK)
+
+
+def _volume(vehicles: Sequence[VehicleFacts], config: Config) -> list[Finding]:
+    """Show the flight volume, and compare with it where vehicles stand and how well they know it."""
+    volume = config.volume.flight_volume()
+    if volume is None:
+        return []
+    params, topic = config.volume, "volume"
+    north, east = (np.ptp([corner[axis] for corner in params.corners_ne_m]) for axis in (0, 1))
+    high_m = float(volume.offsets_m[-2:].sum()) * -1.0
+    wanted = f"{north:.1f} x {east:.1f} x {high_m:.1f} m, {volume.sides} sides; plans keep {params.margin_m:g} m inside"
+    lines = []
+    for facts in vehicles:
+        if facts.pos_ned_m is None:
+            continue
+        level = np.array([*facts.pos_ned_m[:2], config.starts_ned_m()[facts.agent][2]])
+        if (beyond_m := float(volume.beyond_m(level))) > 0.0:
+            advice = "its autopilot would climb beside the volume before the agent flies it in: move the vehicle"
+            found = f"{beyond_m:.1f} m beyond {volume.face(level)}"
+            lines.append(
+                Finding(
+                    agent=facts.agent, topic=topic, verdict=FIX, found=found, wanted="inside", advice=advice, weight=78
+                )
+            )
+    accuracy_m = max((v.pos_accuracy_m for v in vehicles if v.pos_accuracy_m is not None), default=0.0)
+    found = f"estimates {accuracy_m:.2f} m off" if accuracy_m else "not told how far estimates are off"
+    unsure = accuracy_m > params.margin_m
+    advice = f"true positions may leave it: set volume.margin_m = {accuracy_m:.2f} or more" if unsure else ""
+    verdict = NOTE if unsure else OK
+    return [
+        *lines,
+        Finding(agent=SWARM, topic=topic, verdict=verdict, found=found, wanted=wanted, advice=advice, weight=8),
+    ]
 
 
 def _duplicates(vehicles: Sequence[VehicleFacts], config: Config) -> list[Finding]:
@@ -232,5 +267,6 @@ _SWARM_ROWS: tuple[Callable[[Sequence[VehicleFacts], Config], list[Finding]], ..
     _origins,
     _apart,
     _radius,
+    _volume,
     _swapped,
 )

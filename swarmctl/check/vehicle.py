@@ -215,6 +215,9 @@ def _sensors(facts: VehicleFacts, config: Config) -> Finding:
 
 
 def _battery(facts: VehicleFacts, config: Config) -> Finding:
+    failsafe = config.agent.failsafe
+    low_01 = max(_BATTERY_LOW_01, failsafe.battery_warn_01)
+    empty_01 = max(_BATTERY_EMPTY_01, failsafe.battery_rtl_01)
     volts = facts.sensors.battery_v if facts.sensors else None
     left_01 = facts.sensors.battery_01 if facts.sensors else None
 
@@ -224,7 +227,7 @@ def _battery(facts: VehicleFacts, config: Config) -> Finding:
             topic="battery",
             verdict=verdict,
             found=found,
-            wanted=f"over {_BATTERY_LOW_01:.0%}",
+            wanted=", ".join([f"over {low_01:.0%}", *failsafe.acts("battery")]),
             advice=advice,
             weight=weight,
         )
@@ -233,9 +236,9 @@ def _battery(facts: VehicleFacts, config: Config) -> Finding:
     if left_01 is None:
         return line(NOTE, told or "not told", "its charge is not known; measure it")
     found = f"{told} {left_01:.0%}".strip()
-    if left_01 < _BATTERY_EMPTY_01:
+    if left_01 < empty_01:
         return line(FIX, found, "charge or change it", 65)
-    if left_01 < _BATTERY_LOW_01:
+    if left_01 < low_01:
         return line(NOTE, found, "enough for a short flight only", 5)
     return line(OK, found)
 
@@ -338,7 +341,7 @@ def _loss(facts: VehicleFacts, config: Config) -> Finding:
         topic="loss",
         verdict=verdict,
         found=f"{lost_01:.1%}" + (f", {dropped} dropped here" if dropped else ""),
-        wanted=f"under {_LOSS_NOTE_01:.0%}",
+        wanted=", ".join([f"under {_LOSS_NOTE_01:.0%}", *config.agent.failsafe.acts("link")]),
         advice=advice,
         weight=67,
     )

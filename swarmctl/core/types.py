@@ -225,4 +225,6 @@ class Health:
     speed_m_s: float
     phase: Phase
     had_control: bool  # the autopilot follows setpoints and has not been released
+    battery_01: float  # charge that remains; negative: unknown
+    link_lost_01: float  # share of the newest seconds in which the state was stale
     pilot_override: bool  # a pilot or the autopilot timing over, until an operator resumes

@@ -1,4 +1,4 @@
-"""What a vehicle reports of its battery and its GPS, for the operator: nothing that flies depends on it."""
+"""What a vehicle reports of its battery and its GPS: for the operator, and the charge for the failsafe."""
 
 from __future__ import annotations
 

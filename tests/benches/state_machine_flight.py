@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from swarmctl.control.phases.failsafe import NOTHING_WORN
 from swarmctl.control.phases.inputs import PeerInputs, PhaseInputs
 from swarmctl.control.phases.state_machine import MissionStateMachine
 from swarmctl.control.phases.state_machine_params import StateMachineParams
@@ -44,6 +45,7 @@ class Flight:
         self.beat_us: int | None = None  # arrival of the HEARTBEAT that reported `armed`; None: one with every step
         self.busy = self.unresponsive_peer = False
         self.seen = True
+        self.escalation = NOTHING_WORN
         self.peers = {k + 1: PeerInputs(Phase.STANDBY, 0, True) for k in range(peers)}
 
     @property
@@ -92,6 +94,7 @@ class Flight:
             refusal=self.refusal,
             unsettled=self.unsettled,
             cut_off=self.cut_off,
+            escalation=self.escalation,
             armed_told_us=self.now_us if self.beat_us is None else self.beat_us,
         )
         self.state_machine.begin_if_due(inputs.now_us, inputs.utc_us)  # called before planning, as by the agent

@@ -67,6 +67,7 @@ def test_defaults_are_the_thesis_circle_with_three_agents() -> None:
         ("limits.min_separation_m=2.0", ("limits.min_separation_m = 2.0", "separation.radius_m")),
         ("start.spacing_m=0.5", ("agents 0 and 1", "0.50 m apart", "start.spacing_m")),
         ("geofence.corners_ne_m=[[9.0, 9.0], [9.0, -9.0]]", ("geofence.corners_ne_m", "2 corners", "3 or more")),
+        ("volume.floor_z_m=1", ("volume.corners_ne_m: none", "a floor or a ceiling")),
         (
             "geofence.corners_ne_m=[[0.5, 9.0], [0.5, -9.0], [-9.0, 0.0]]",
             ("geofence.corners_ne_m", "agents [2]", "outside"),
@@ -361,3 +362,32 @@ def test_a_key_that_was_renamed_is_refused_with_its_new_name(old: str, new: str)
         load(None, [f"{old}.enabled=1" if section else f"{old}=1"])
     assert f"did you mean {new!r}?" in str(error.value)
     assert new in set(all_keys(Config, ""))
+
+
+BOX = ("volume.corners_ne_m=[[-6, -6], [6, -6], [6, 6], [-6, 6]]", "volume.floor_z_m=1", "volume.ceiling_z_m=-5")
+
+
+@pytest.mark.parametrize(
+    ("overrides", "words"),
+    [
+        (("start.center_ned_m=[5, 0, -1]",), ("start: agent 2", "0.30 m outside", "volume.margin_m = 0.3")),
+        (("start.center_ned_m=[0, 0, 0.8]",), ("start: agent 0", "floor")),
+        (("controller.kind=pid",), ("controller.kind = 'pid'", "use dmpc")),
+        (("separation.tracking_m=0.4", "separation.radius_m=1.2"), ("volume.margin_m = 0.3", "need 0.40 m")),
+        (
+            ("separation.gust_m_s=8", "vehicle_model.drag_1_s=1", "controller.mpc.u_max=0.8", "separation.radius_m=3"),
+            ("volume.margin_m = 0.3", "gusts", "need 0."),
+        ),
+        (("geofence.corners_ne_m=[[-9, -9], [5, -9], [5, 9], [-9, 9]]",), ("volume.corners_ne_m: [[6.0, -6.0]",)),
+    ],
+)
+def test_what_does_not_go_with_a_volume_is_refused(overrides: tuple[str, ...], words: tuple[str, ...]) -> None:
+    mission = ("mission.kind=hover", "swarm.agents=3", *BOX)
+    with pytest.raises(ConfigError) as refused:
+        load(None, [*mission, *overrides])
+    assert [word for word in words if word not in "; ".join(refused.value.problems)] == []
+    load(None, mission)  # negative control: the volume itself is none
+
+
+def test_commitments_keep_a_volume_whatever_tracks_them() -> None:
+    load(None, ["mission.kind=hover", *BOX, "controller.kind=pid", "separation.mode=guaranteed"])

@@ -17,6 +17,7 @@ from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.control.mpc.swarm_mpc import AxisWeights, MpcParams, SwarmMpc
 from swarmctl.control.reference.quintic import brake_to_rest, quintic_to
+from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.params import Params
 from swarmctl.core.trajectory import Trajectory, ending_at_rest, joined, positions_at, stopping
@@ -30,6 +31,9 @@ _CLIMB_M_S, _CLIMB_M_S2 = 2.0, 2.0
 _FOLLOWING_MOVES_Z = 10
 _RUN_UP_M_S2 = 0.8  # acceleration along a path up to its own speed
 _BRAKING_TAIL_S = 2.0  # part of the final braking that is checked against keep-outs
+_OUTWARD_TOLERANCE_M = (
+    0.01  # farther out of the flight volume allowed to proposals of a vehicle that is outside already
+)
 _APPROACH_TOLERANCE_M = 0.001  # approach allowed to trajectories that are too close already
 _INTERPOLATION_MARGIN_M = 0.01  # kept by proposals on top: they are checked as straight lines between points
 
@@ -99,6 +103,7 @@ class TrajectoryPlanner:
         separation: distances to keep.
         max_keep_outs: number of neighbours and obstacles that get rows in the MPC.
         stopwatch_ns: see `CondensedMpc`.
+        volume: to stay in; None for none.
     """
 
     def __init__(
@@ -111,7 +116,9 @@ class TrajectoryPlanner:
         *,
         max_keep_outs: int,
         stopwatch_ns: Callable[[], int],
+        volume: FlightVolume | None = None,
     ) -> None:
+        self._volume = volume
         self._params, self._separation, self._drag_1_s = params, separation, vehicle.drag_1_s
         right_of_way = separation.model_copy(
             update={"right_of_way_rad": params.right_of_way_rad, "stuck_m": params.stuck_m}
@@ -123,6 +130,7 @@ class TrajectoryPlanner:
             agent,
             max_keep_outs=max_keep_outs,
             stopwatch_ns=stopwatch_ns,
+            volume=volume,
         )
         self.dt_us = round(params.dt_s * 1e6)
         self.steps = self._mpc.steps + math.ceil(
@@ -141,17 +149,21 @@ class TrajectoryPlanner:
     def evasive_trajectory(self, committed: Trajectory, now: Situation) -> Trajectory | None:
         """Return a trajectory that keeps more distance to everything known than `committed`; None when none is found.
 
-        Candidates are the MPC's plan, a straight stop, and a climb over keep-outs that end at some height.
+        Candidates are the MPC's plan, a straight stop, and a climb over keep-outs that end at some height. One that
+        leaves the flight volume is taken only where none that stays in it is clear.
         """
         known = now.followed
 
         def margin_m(trajectory: Trajectory) -> float:
             return min(self._clearance_m(trajectory, now), self._margin_m(trajectory, now.utc_us, known))
 
-        best, best_m = None, margin_m(committed) + _MIN_GAIN_M
+        least_m = margin_m(committed) + _MIN_GAIN_M
+        best, best_order = None, (False, least_m)
         for candidate in self._evasive_candidates(committed, now):
-            if (found_m := margin_m(candidate)) > best_m:
-                best, best_m = candidate, found_m
+            found_m = margin_m(candidate)
+            order = (found_m >= 0.0 and self._stays_in_volume(candidate, committed, now.utc_us), found_m)
+            if found_m > least_m and order > best_order:
+                best, best_order = candidate, order
         return best
 
     def is_clear(self, trajectory: Trajectory, now: Situation) -> bool:
@@ -244,9 +256,21 @@ class TrajectoryPlanner:
                 brake_m_s2=self._params.brake_m_s2,
             )
             whole = joined(committed, braked, now.utc_us)
+            if not self._stays_in_volume(whole, committed, now.utc_us):
+                continue
             if self.is_clear(whole, now) and not self.conflicts(whole, now.utc_us, known, _INTERPOLATION_MARGIN_M):
                 return whole
         return None
+
+    def _stays_in_volume(self, trajectory: Trajectory, committed: Trajectory, utc_us: int) -> bool:
+        """Tell whether a trajectory stays in the flight volume, or goes no farther out of it than `committed` does."""
+        if self._volume is None:
+            return True
+        end_us = max(committed.end_utc_us, utc_us)
+        present = committed.sample(np.append(np.arange(utc_us, end_us, self.dt_us), end_us))[0]
+        normals, kept = self._volume.normals_ned.T, self._volume.certified_m
+        allowed = np.minimum(0.0, (present @ normals - kept).min(axis=0) - _OUTWARD_TOLERANCE_M)
+        return bool(((trajectory.pos_ned_m @ normals - kept).min(axis=0) >= allowed).all())
 
     def _clearance_m(self, trajectory: Trajectory, now: Situation) -> float:
         times = now.begin_us + np.arange(self.steps + 1) * self.dt_us

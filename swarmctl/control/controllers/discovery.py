@@ -19,6 +19,7 @@ from swarmctl.control.controllers.own import GROUP, OwnController
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.core.declared import declared
+from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.own import BuiltInOrOwn, OwnError, own_class
 from swarmctl.core.params import Params, with_sections
 
@@ -46,6 +47,11 @@ class ControllerParams(Params):
         return not self.is_own and CONTROLLERS[self.kind].follows_reference
 
     @property
+    def keeps_volume(self) -> bool:
+        """Tell whether plans of the controller stay in a flight volume; an own one's are certified to."""
+        return self.is_own or CONTROLLERS[self.kind].keeps_volume
+
+    @property
     def is_own(self) -> bool:
         """Tell whether the controller is somebody else's."""
         return self.kind not in CONTROLLERS
@@ -59,6 +65,7 @@ def make_controller(
     *,
     max_keep_outs: int,
     stopwatch_ns: Callable[[], int],
+    volume: FlightVolume | None = None,
 ) -> Controller:
     """Return the controller that a configuration asks for, with rows for `max_keep_outs` keep-outs at once."""
     setup = ControllerSetup(
@@ -67,6 +74,7 @@ def make_controller(
         agent=agent,
         max_keep_outs=max_keep_outs,
         stopwatch_ns=stopwatch_ns,
+        volume=volume,
     )
     if params.is_own:
         fallback = _built_in(_FALLBACK, params, setup)

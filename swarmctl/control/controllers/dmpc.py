@@ -14,6 +14,7 @@ def _make(params: MpcParams, setup: ControllerSetup) -> SwarmMpc:
         setup.agent,
         max_keep_outs=setup.max_keep_outs,
         stopwatch_ns=setup.stopwatch_ns,
+        volume=setup.volume,
     )
 
 

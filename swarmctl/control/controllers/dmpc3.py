@@ -15,6 +15,7 @@ def _make(params: MpcParams, setup: ControllerSetup) -> JointMpc:
         setup.agent,
         max_keep_outs=setup.max_keep_outs,
         stopwatch_ns=setup.stopwatch_ns,
+        volume=setup.volume,
     )
 
 

@@ -1,9 +1,10 @@
 """What stands between a controller of somebody else and the vehicle; it can't be switched off.
 
 In every tick the own controller is asked for commands. They are flown only if they are finite, if the motion that they
-give the vehicle by its model, which is computed here, keeps clear of every keep-out, and if the vehicle can stop behind
-it. Otherwise the built-in controller plans this tick, by its own certificate. A controller that raises, returns
-something else than commands, or takes too long, again and again, is not asked any more, and the mission ends.
+give the vehicle by its model, which is computed here, keeps clear of every keep-out and stays in the flight volume, and
+if the vehicle can stop behind it. Otherwise the built-in controller plans this tick, by its own certificate. A
+controller that raises, returns something else than commands, or takes too long, again and again, is not asked any more,
+and the mission ends.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from dataclasses import replace
 import numpy as np
 
 from swarmctl.control.collision.separation import KeepOut, SeparationParams, certify
+from swarmctl.control.collision.volume_certificate import volume_margin_m
 from swarmctl.control.controllers.kind import Controller, ControllerSetup
 from swarmctl.control.controllers.own import OwnController
 from swarmctl.control.mpc.problem import Problem, Start
@@ -79,6 +81,8 @@ class Guard:
         plan = self._moved(problem, commands, took_s)
         if problem.keep_outs and self._clearance_m(plan, problem.keep_outs) < 0.0:
             return self._instead(problem, "plans too close to a peer or an obstacle")
+        if volume_margin_m(self._setup.volume, plan.pos_ned_m, plan.vel_ned_m_s, 1) < 0.0:
+            return self._instead(problem, "plans to leave the flight volume")
         return plan
 
     def _called(self, call: Callable[[], Array | None]) -> tuple[Array, str]:

@@ -9,6 +9,7 @@ from typing import Generic, Protocol, TypeVar
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.problem import Problem
+from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.params import Params
 from swarmctl.core.types import Plan
 
@@ -45,6 +46,7 @@ class ControllerSetup:
     separation: SeparationParams
     agent: int
     max_keep_outs: int  # at once
+    volume: FlightVolume | None  # to stay in
     stopwatch_ns: Callable[[], int]  # measures and has no influence
 
 
@@ -56,4 +58,5 @@ class ControllerKind(Generic[P]):
     section: str  # name of the section of the configuration with its parameters, which several may share
     params: type[P]
     make: Callable[[P, ControllerSetup], Controller]
+    keeps_volume: bool = True  # false: it does not plan, and flies out of a flight volume
     follows_reference: bool = True  # false: another one flies to the start and to the landing place

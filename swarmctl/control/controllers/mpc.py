@@ -15,7 +15,13 @@ class SingleMpc(SwarmMpc):
 
     def __init__(self, params: MpcParams, setup: ControllerSetup) -> None:
         super().__init__(
-            params, setup.vehicle, setup.separation, setup.agent, max_keep_outs=0, stopwatch_ns=setup.stopwatch_ns
+            params,
+            setup.vehicle,
+            setup.separation,
+            setup.agent,
+            max_keep_outs=0,
+            stopwatch_ns=setup.stopwatch_ns,
+            volume=setup.volume,
         )
 
     def plan(self, problem: Problem) -> Plan:

@@ -33,4 +33,6 @@ class OpenLoop:
         return
 
 
-OPEN_LOOP = ControllerKind(name="open_loop", section="mpc", params=MpcParams, make=OpenLoop, follows_reference=False)
+OPEN_LOOP = ControllerKind(
+    name="open_loop", section="mpc", params=MpcParams, make=OpenLoop, keeps_volume=False, follows_reference=False
+)

@@ -97,4 +97,6 @@ class PidController:
         return np.array([-north / GRAVITY_M_S2, east / GRAVITY_M_S2, -down])
 
 
-PID = ControllerKind(name="pid", section="pid", params=PidParams, make=lambda params, _: PidController(params))
+PID = ControllerKind(
+    name="pid", section="pid", params=PidParams, make=lambda params, _: PidController(params), keeps_volume=False
+)

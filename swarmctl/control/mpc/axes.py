@@ -107,6 +107,15 @@ class HalfSpaces:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Faces:
+    """Holds faces that do not move: `normal . p >= offset`, with room to stop before them."""
+
+    normals: Array  # (faces, axes) of unit length, pointing inside
+    offsets_m: Array  # (faces,)
+    brakes_m_s2: Array  # (faces,) braking that room is left for
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class AxesProblem:
     """Holds the data of one receding-horizon step: initial state, gains, drift and reference."""
 

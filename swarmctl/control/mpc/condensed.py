@@ -12,10 +12,17 @@ from functools import partial
 
 import numpy as np
 
-from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, Axis, HalfSpaces, Horizon, Penalties
-from swarmctl.control.mpc.constraints import IncrementBounds, InputBounds, KeepOutHalfSpaces, TerminalConditions
+from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, Axis, Faces, HalfSpaces, Horizon, Penalties
+from swarmctl.control.mpc.constraints import (
+    IncrementBounds,
+    InputBounds,
+    KeepOutHalfSpaces,
+    TerminalConditions,
+    VolumeFaces,
+    slack_m,
+)
 from swarmctl.control.mpc.prediction import Forecast, Prediction
-from swarmctl.control.mpc.program import Program
+from swarmctl.control.mpc.program import ConstraintBlock, Program
 from swarmctl.control.mpc.session import Relaxation, SolverSession
 from swarmctl.control.mpc.solvers.qp import QpParams, QpSolution
 from swarmctl.control.mpc.tracking_cost import TrackingCost
@@ -34,6 +41,7 @@ class CondensedMpc:
         penalties: weights of softened constraints.
         qp: solver settings.
         stopwatch_ns: measures the solver and has no influence.
+        faces: to stay inside of; None for none.
     """
 
     def __init__(
@@ -46,6 +54,7 @@ class CondensedMpc:
         penalties: Penalties,
         qp: QpParams,
         stopwatch_ns: Callable[[], int],
+        faces: Faces | None = None,
     ) -> None:
         self.prediction = Prediction(axes, horizon)
         self._cost = TrackingCost(self.prediction)
@@ -53,14 +62,13 @@ class CondensedMpc:
         self.half_spaces = KeepOutHalfSpaces(
             self.prediction, max_keep_outs, relax_01, penalties, cost_scale=self._cost.scale
         )
-        blocks = (
-            IncrementBounds(self.prediction),
-            InputBounds(self.prediction),
-            self._ends,
-            self.half_spaces,
-        )
+        self._softened: list[ConstraintBlock] = [self.half_spaces]  # what ends give way to
+        if faces is not None:
+            scale = self._cost.scale
+            self._softened.append(VolumeFaces(self.prediction, faces, penalties, cost_scale=scale))
+        blocks = (IncrementBounds(self.prediction), InputBounds(self.prediction), self._ends, *self._softened)
         self._program = Program(self._cost.pattern(), blocks)
-        if max_keep_outs == 0:  # a small problem: tight tolerances cost less than polishing
+        if max_keep_outs == 0 and faces is None:  # a small problem: tight tolerances cost less than polishing
             qp = qp.model_copy(update={"polish": False, "eps": 0.01 * qp.eps, "eps_relative": 0.01 * qp.eps_relative})
         self.session = SolverSession(self._program, list(self._relaxations()), qp, stopwatch_ns)
 
@@ -71,10 +79,10 @@ class CondensedMpc:
             if len(softened):
                 yield Relaxation(lambda found: not found.exact, partial(ends.soften, rows[ends], softened))
         if len(ends.every):
-            yield Relaxation(lambda found: self._slack_m(found) > _SLACK_USED_M, partial(ends.give_up, rows[ends]))
+            yield Relaxation(self._uses_slack, partial(ends.give_up, rows[ends]))
 
-    def _slack_m(self, solution: QpSolution) -> float:
-        return self.half_spaces.slack_m(self._program.rows[self.half_spaces], solution)
+    def _uses_slack(self, solution: QpSolution) -> bool:
+        return any(slack_m(self._program.rows[block], solution) > _SLACK_USED_M for block in self._softened)
 
     def solve(self, asked: AxesProblem, half_spaces: HalfSpaces | None = None) -> AxesSolution:
         """Solve one receding-horizon step, with at most `max_keep_outs` families of half-spaces; None for none."""
@@ -103,7 +111,7 @@ class CondensedMpc:
             u=forecast.u_prev + ahead.hold @ increments,
             pos_m=pos_m,
             vel_m_s=vel_m_s,
-            slack_m=self._slack_m(solution),
+            slack_m=slack_m(self._program.rows[self.half_spaces], solution),
             residual_m=residual_m,
             terminal_gap_m=max(gap_m, self._cost.outside_m(forecast, pos_m, vel_m_s, increments)),
             solve_us=solve_us,

@@ -1,4 +1,4 @@
-"""The constraints of a condensed MPC, each a block of rows: bounds, softened terminal conditions, half-spaces.
+"""The constraints of a condensed MPC, each a block of rows: bounds, softened ends, half-spaces, faces of a volume.
 
 A new constraint is one class here and one line in `swarmctl.control.mpc.condensed`.
 """
@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from swarmctl.control.mpc.axes import HalfSpaces, Penalties
+from swarmctl.control.mpc.axes import Faces, HalfSpaces, Penalties
 from swarmctl.control.mpc.prediction import Forecast, Prediction
 from swarmctl.control.mpc.program import ConstraintBlock, Rows
 from swarmctl.control.mpc.solvers.qp import INFINITY, QpSolution
@@ -17,6 +17,11 @@ from swarmctl.core.types import Array
 _SLACK_SCALE_M = 0.1  # unit of slack variables, so that they are about 1 like all others
 _REACHABLE_01 = 0.998  # share of the reachable displacement that replaces an end out of reach
 _ROW_SPACING_S = 0.08  # closer rows are nearly parallel, which slows a first-order solver down
+_FACE_SPACING_S = 0.2  # likewise; a path can't bend much in between
+_USUAL_S = 1.0  # time that braking takes, for the scale of its rows
+_ASKED_01 = 0.97  # share of the reachable displacement that a face may ask for: with 0.9 plans put braking off
+_TANGENT_GAP_M = 0.05  # missed between tangents of the way to stop: less than a certificate allows
+_TANGENTS = np.array([-1.5, -0.5, 0.5, 1.5, 2.5])  # where they touch, in spacings from the present speed
 _TERMINAL_CURVATURE = 1e-3  # keeps the Hessian positive definite; the exact penalty is the slope
 
 
@@ -205,8 +210,85 @@ class KeepOutHalfSpaces(ConstraintBlock):
         shortfall = rows.lower - rows.coefficients @ flown
         return float((shortfall / self._scale).max(initial=0.0))
 
-    @staticmethod
-    def slack_m(rows: Rows, solution: QpSolution) -> float:
-        """Return the largest slack [m] of a solution, 0 without one."""
-        x = solution.x
-        return 0.0 if x is None else float(x[rows.slack_columns].max(initial=0.0)) * _SLACK_SCALE_M
+
+class VolumeFaces(ConstraintBlock):
+    """Keeps positions inside of faces `n . p_k >= b`, with room to stop before them, softened by one slack each.
+
+    From the end of the horizon, at speed v towards a face, braking with a takes v^2 / 2a. That is convex, so that its
+    tangents bound it from below: rows `n . p_N - (w / a) v <= ...` at speeds w around the present one, so close that
+    between them less than `_TANGENT_GAP_M` is missed.
+
+    Args:
+        prediction: the motion.
+        faces: n, b and a of each.
+        penalties, cost_scale: weights of slacks.
+    """
+
+    def __init__(
+        self,
+        prediction: Prediction,
+        faces: Faces,
+        penalties: Penalties,
+        *,
+        cost_scale: float,
+    ) -> None:
+        self._prediction, self._faces = prediction, faces
+        self._over, self._slope_floor = penalties.over, penalties.floor * _SLACK_SCALE_M * cost_scale
+        axes, first, last = prediction.axes, prediction.first_row(), prediction.horizon.prediction - 1
+        stride = max(1, round(_FACE_SPACING_S / prediction.horizon.dt_s))
+        positions, soon = np.arange(last, first - 1, -stride)[::-1], min(first + stride, last)
+        self._steps = np.concatenate([positions, np.repeat([soon, last], len(_TANGENTS))])  # of the rows of a face
+        self._stops = slice(len(positions), len(self._steps))  # rows with room to stop behind their step
+        step_m_s2 = max(a.du_max * a.gain_m_s2 for a in axes)
+        usual_s = np.zeros(len(self._steps))
+        usual_s[self._stops] = _USUAL_S
+        response = (prediction.pos_of_accel @ prediction.acted[0])[self._steps].max(axis=1)
+        response += usual_s * (prediction.vel_of_accel @ prediction.acted[0])[self._steps].max(axis=1)
+        self._scale = 1.0 / np.maximum(response * step_m_s2, 0.01)  # (rows of a face,) as in `KeepOutHalfSpaces`
+        self._steepest = float(self._scale[len(positions) - 1])  # increments per metre of the last position
+        uses = np.repeat(np.repeat(faces.normals != 0.0, len(self._steps), axis=0), prediction.horizon.control, axis=1)
+        slacks = np.kron(np.eye(len(faces.normals)), (_SLACK_SCALE_M * self._scale)[:, None])
+        super().__init__(uses, slacks, 2 * penalties.slack_quadratic * _SLACK_SCALE_M**2 * cost_scale)
+
+    def fill(self, rows: Rows, forecast: Forecast) -> None:
+        """Write the rows; those that no increments in bounds can violate are disabled."""
+        normals, brakes_m_s2 = self._faces.normals, self._faces.brakes_m_s2[:, None]
+        speeds = np.maximum(-(normals @ forecast.asked.vel_m_s), 0.0)  # towards each face
+        spacing = 2.0 * np.sqrt(2.0 * brakes_m_s2 * _TANGENT_GAP_M)
+        ahead_s = np.zeros((len(speeds), len(self._steps)))
+        tangents = np.tile(np.maximum(speeds[:, None] + spacing * _TANGENTS, 0.0), 2)
+        ahead_s[:, self._stops] = tangents / brakes_m_s2
+        pos_m = forecast.free_pos_m[self._steps] @ normals.T  # (rows of a face, faces)
+        vel_m_s = forecast.free_vel_m_s[self._steps] @ normals.T
+        wanted = self._faces.offsets_m[:, None] - (pos_m.T + ahead_s * vel_m_s.T) - 0.5 * brakes_m_s2 * ahead_s**2
+        least, most = self._fill_coefficients(rows, forecast, ahead_s)
+        lower = np.where(wanted > least, np.minimum(wanted, _ASKED_01 * most) * self._scale, -INFINITY)
+        rows.lower[:] = lower.ravel()
+        steepest = float(np.abs(rows.slope).max()) * self._steepest
+        rows.slack_slope[:] = self._slope_floor + self._over * steepest * _SLACK_SCALE_M
+
+    def _fill_coefficients(self, rows: Rows, forecast: Forecast, ahead_s: Array) -> tuple[Array, Array]:
+        """Write coefficients, and return the least and the largest value [m] (faces, rows) that bounds allow."""
+        faces, checks = ahead_s.shape
+        block = rows.moves.reshape(faces, checks, -1)  # a view
+        least, most = np.zeros((faces, checks)), np.zeros((faces, checks))
+        for i, axis in enumerate(self._prediction.axes):
+            pos, vel = forecast.pos_response[i][self._steps], forecast.vel_response[i][self._steps]
+            push = (pos + ahead_s[:, :, None] * vel) * self._faces.normals[
+                :, i, None, None
+            ]  # metres per unit increment
+            block[:, :, self._prediction.columns(i)] = axis.du_max * self._scale[None, :, None] * push
+            rise, fall = self._prediction.extremes(i, forecast.u_prev)
+            least += np.minimum(push @ rise, push @ fall)
+            most += np.maximum(push @ rise, push @ fall)
+        return least, most
+
+    def residual_m(self, rows: Rows, flown: Array) -> float:
+        shortfall = (rows.lower - rows.coefficients @ flown).reshape(-1, len(self._scale))
+        return float((shortfall / self._scale).max(initial=0.0))
+
+
+def slack_m(rows: Rows, solution: QpSolution) -> float:
+    """Return the largest slack [m] of a block in a solution, 0 without one."""
+    x = solution.x
+    return 0.0 if x is None else float(x[rows.slack_columns].max(initial=0.0)) * _SLACK_SCALE_M

@@ -19,7 +19,8 @@ from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, HalfSpaces, Penalties
 from swarmctl.control.mpc.condensed import CondensedMpc
 from swarmctl.control.mpc.problem import Problem
-from swarmctl.control.mpc.swarm_mpc import MpcParams, first_guess, judged, near_half_spaces, planned
+from swarmctl.control.mpc.swarm_mpc import MpcParams, faces_along, first_guess, judged, near_half_spaces, planned
+from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.types import Array, Plan
 
@@ -41,6 +42,7 @@ class JointMpc:
         *,
         max_keep_outs: int,
         stopwatch_ns: Callable[[], int],
+        volume: FlightVolume | None = None,
     ) -> None:
         self._params, self._separation, self._priority_id, self._max_keep_outs = (
             params,
@@ -48,7 +50,7 @@ class JointMpc:
             own_priority_id,
             max_keep_outs,
         )
-        self._stopwatch_ns = stopwatch_ns
+        self._stopwatch_ns, self._volume = stopwatch_ns, volume
         self.dt_us = round(params.dt_s * 1e6)
         self.steps = self.longest = params.horizon_xy
         eps, eps_relative = _TOLERANCE_01 * params.qp.eps, _TOLERANCE_01 * params.qp.eps_relative
@@ -60,6 +62,7 @@ class JointMpc:
             penalties=Penalties(),
             qp=params.qp.model_copy(update={"eps": eps, "eps_relative": eps_relative}),
             stopwatch_ns=stopwatch_ns,
+            faces=faces_along(volume, slice(0, 3)),
         )
 
     def plan(self, problem: Problem) -> Plan:
@@ -105,6 +108,7 @@ class JointMpc:
             began_ns=began_ns,
             spaces_us=spaces_us,
             stopwatch_ns=stopwatch_ns,
+            volume=self._volume,
         )
 
     def _solve(self, problem: Problem, thrust_m_s2: Array, spaces: HalfSpaces | None) -> AxesSolution:

@@ -3,7 +3,7 @@
 z'' = g - (f/m) c, with c = cos(phi) cos(theta) frozen at the current attitude (3.11); x'' = -(f/m) u_x and
 y'' = -(f/m) u_y with the thrust that the z problem has just chosen (3.18), (3.24). Thrust over mass is the z input, so
 the thesis' newtons for its 1 kg are m/s2 here. The z problem has no distance constraints. The disturbance estimate is
-a constant drift of each axis.
+a constant drift of each axis. Of a flight volume the z problem has floor and ceiling, the x-y problem the sides.
 """
 
 from __future__ import annotations
@@ -17,11 +17,13 @@ import numpy as np
 from pydantic import Field
 
 from swarmctl.control.collision.separation import KeepOut, SeparationParams, certify, half_spaces
+from swarmctl.control.collision.volume_certificate import volume_margin_m
 from swarmctl.control.model import VehicleModelParams
-from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, Axis, HalfSpaces, Horizon, Penalties, Terminal
+from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, Axis, Faces, HalfSpaces, Horizon, Penalties, Terminal
 from swarmctl.control.mpc.condensed import CondensedMpc
 from swarmctl.control.mpc.problem import Problem
 from swarmctl.control.mpc.solvers.qp import QpParams
+from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Plan, PlanStatus, PlanTimes
@@ -123,6 +125,7 @@ class SwarmMpc:
         *,
         max_keep_outs: int,
         stopwatch_ns: Callable[[], int],
+        volume: FlightVolume | None = None,
     ) -> None:
         self._params, self._separation, self._priority_id, self._max_keep_outs = (
             params,
@@ -130,7 +133,7 @@ class SwarmMpc:
             own_priority_id,
             max_keep_outs,
         )
-        self._stopwatch_ns = stopwatch_ns
+        self._stopwatch_ns, self._volume = stopwatch_ns, volume
         self.dt_us = round(params.dt_s * 1e6)
         self.steps = params.horizon_xy
         self.longest = max(params.horizon_xy, params.horizon_z)  # reference steps needed
@@ -142,6 +145,7 @@ class SwarmMpc:
             penalties=Penalties(),
             qp=params.qp,
             stopwatch_ns=stopwatch_ns,
+            faces=faces_along(volume, slice(2, 3)),
         )
         self._xy, self._xy_alone = (  # without keep-outs the problem is small and solved exactly
             CondensedMpc(
@@ -152,6 +156,7 @@ class SwarmMpc:
                 penalties=Penalties(),
                 qp=params.qp,
                 stopwatch_ns=stopwatch_ns,
+                faces=faces_along(volume, slice(0, 2)),
             )
             for room in (max_keep_outs, 0)
         )
@@ -219,6 +224,7 @@ class SwarmMpc:
             began_ns=began_ns,
             spaces_us=spaces_us,
             stopwatch_ns=stopwatch_ns,
+            volume=self._volume,
         )
 
     def _solve_z(self, problem: Problem) -> AxesSolution:
@@ -239,6 +245,15 @@ class SwarmMpc:
         if self._params.thrust_ahead == "held":
             return np.full(self.steps, up.u[0, 0])
         return np.asarray(up.u[np.minimum(np.arange(self.steps), len(up.u) - 1), 0])
+
+
+def faces_along(volume: FlightVolume | None, axes: slice) -> Faces | None:
+    """Return those faces of a volume that limit positions along `axes` of NED, as plans keep them; None without any."""
+    if volume is None:
+        return None
+    normals = volume.normals_ned[:, axes]
+    limits = normals.any(axis=1)
+    return Faces(normals=normals[limits], offsets_m=volume.planned_m[limits], brakes_m_s2=volume.brakes_m_s2[limits])
 
 
 def first_guess(problem: Problem, dt_s: float, steps: int) -> Array:
@@ -317,6 +332,7 @@ def judged(
     began_ns: int,
     spaces_us: float,
     stopwatch_ns: Callable[[], int],
+    volume: FlightVolume | None,
 ) -> Plan:
     """Return the plan with its status: whether it is solved, within the residual limit, and certified.
 
@@ -330,9 +346,11 @@ def judged(
         began_ns: stopwatch reading at the start of planning.
         spaces_us: time that half-spaces took.
         stopwatch_ns: see `CondensedMpc`.
+        volume: to stay in; None for none.
     """
     start = problem.start
     pos = np.concatenate([start.pos_ned_m[None], pos_ned_m])
+    vel = np.concatenate([start.vel_ned_m_s[None], vel_ned_m_s])
     residual_m = max(s.residual_m for s in solutions)
     solved_ns = stopwatch_ns()
     status = PlanStatus.OK
@@ -340,7 +358,7 @@ def judged(
         status = PlanStatus.SOLVER_FAILED
     elif residual_m > RESIDUAL_LIMIT_M:
         status = PlanStatus.RESIDUAL
-    elif certify(pos, problem.keep_outs, from_step) < 0.0:
+    elif min(certify(pos, problem.keep_outs, from_step), volume_margin_m(volume, pos, vel, from_step)) < 0.0:
         status = PlanStatus.NOT_CERTIFIED
     solve_us = sum(s.solve_us for s in solutions)
     certify_us = (stopwatch_ns() - solved_ns) * 1e-3
@@ -349,7 +367,7 @@ def judged(
         t0_us=start.t_us,
         dt_us=dt_us,
         pos_ned_m=pos,
-        vel_ned_m_s=np.concatenate([start.vel_ned_m_s[None], vel_ned_m_s]),
+        vel_ned_m_s=vel,
         virtual_control=virtual_control,
         times=PlanTimes(
             setup_us=(solved_ns - began_ns) * 1e-3 - solve_us - spaces_us,

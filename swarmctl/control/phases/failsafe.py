@@ -1,13 +1,19 @@
-"""Maps `Health` to `Mode` by one table whose first matching row applies. Pure; all state is passed in.
+"""Maps `Health` to `Mode` by one table whose first matching row applies, and to what becomes of the mission by another.
+
+Pure; all state is passed in.
 
 After a plan that must not be flown the modes are, in order: replay the shifted last certified plan while it is recent,
 brake, hold, land. While the vehicle's state is stale or the estimate lost (STATE_STALE) nothing is sent, so the vehicle
 does what its autopilot's own failsafe is set to by `agent.autopilot_params` (`swarmctl/agent/setup.py`): it lands.
+
+The mode is how this tick is flown. What wears out slowly leaves time for more: the second table escalates, from a
+warning to the way back to a landing in place, under the agent's own plan.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import enum
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from pydantic import Field
@@ -23,6 +29,28 @@ class FailsafeParams(Params):
     replay_s: float = Field(0.4, ge=0, le=5)  # longest replay of the last certified plan
     hold_s: float = Field(5.0, ge=0, le=600)  # longest hold without a plan; then land
     rest_speed_m_s: float = Field(0.2, gt=0, le=5)  # a faster vehicle brakes before it holds
+    battery_warn_01: float = Field(0.3, ge=0, le=1)  # an alert below this charge; 0, as in the next two: never
+    battery_rtl_01: float = Field(0.2, ge=0, le=1)  # back to the start below this charge, and nothing is armed
+    battery_land_01: float = Field(0.1, ge=0, le=1)  # landing in place below this charge
+    link_warn_01: float = Field(0.2, ge=0, le=1)  # an alert while its state is stale for more of the time
+    link_rtl_01: float = Field(1.0, ge=0, le=1)  # back to the start; 1, as in the next one: never
+    link_land_01: float = Field(1.0, ge=0, le=1)  # landing in place
+    window_s: float = Field(5.0, gt=0, le=60)  # charge counts as its highest in this time, the link as its share of it
+
+    def problems(self) -> Iterator[str]:
+        """Yield thresholds that do not escalate."""
+        for watched in _WATCHED:
+            limits = watched.limits(self)
+            order = [watched.sign * limit for limit in limits if limit != watched.never]
+            if order != sorted(order):
+                keys = ", ".join(f"{watched.name}_{response.name.lower()}_01" for response in _ESCALATION)
+                yield f"agent.failsafe: {keys} = {list(limits)}: do not escalate; put them in this order of severity"
+
+    def acts(self, name: str) -> list[str]:
+        """Return in words what the agent does, and from where on, as far as what is called `name` wears out."""
+        (watched,) = (row for row in _WATCHED if row.name == name)
+        limits = zip(_ESCALATION, watched.limits(self), strict=True)
+        return [f"{_SAID[response]} at {limit:.0%}" for response, limit in limits if limit != watched.never]
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,6 +59,71 @@ class FailsafeDecision:
 
     mode: Mode
     reason: str
+
+
+class Response(enum.IntEnum):
+    """What becomes of the mission, in increasing order."""
+
+    NONE = 0
+    WARN = 1
+    RTL = 2
+    LAND = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Escalation:
+    """The response to what wears out, and the reason for it."""
+
+    response: Response
+    reason: str
+
+
+NOTHING_WORN = Escalation(Response.NONE, "")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Watched:
+    """A row of the table of escalation: what is measured, and from where on it asks for each response."""
+
+    name: str
+    measure: Callable[[Health], float]  # 0..1, negative if unknown
+    limits: Callable[[FailsafeParams], tuple[float, float, float]]  # of WARN, RTL and LAND
+    sign: float  # 1 where more is worse, -1 where less is
+    never: float  # limit that switches a response off
+    said: str  # with {} for the percentage
+
+
+_SAID = {Response.WARN: "warns", Response.RTL: "returns", Response.LAND: "lands"}
+_ESCALATION = (Response.WARN, Response.RTL, Response.LAND)
+_WATCHED = (
+    _Watched(
+        name="battery",
+        measure=lambda health: health.battery_01,
+        limits=lambda p: (p.battery_warn_01, p.battery_rtl_01, p.battery_land_01),
+        sign=-1.0,
+        never=0.0,
+        said="battery at {} %",
+    ),
+    _Watched(
+        name="link",
+        measure=lambda health: health.link_lost_01,
+        limits=lambda p: (p.link_warn_01, p.link_rtl_01, p.link_land_01),
+        sign=1.0,
+        never=1.0,
+        said="no state of the vehicle in {} % of the time",
+    ),
+)
+
+
+def escalate(health: Health, params: FailsafeParams) -> Escalation:
+    """Return the strongest response that any row of the table asks for; of equal ones the first."""
+    found = NOTHING_WORN
+    for watched in _WATCHED:
+        value = watched.measure(health)
+        for response, limit in zip(_ESCALATION, watched.limits(params), strict=True):
+            if value >= 0.0 and watched.sign * (value - limit) > 0.0 and response > found.response:
+                found = Escalation(response, watched.said.format(round(100.0 * value)))
+    return found
 
 
 _FLYING = (Phase.GOTO_START, Phase.READY, Phase.TRACK, Phase.GOTO_LAND)

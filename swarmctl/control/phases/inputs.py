@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
+from swarmctl.control.phases.failsafe import NOTHING_WORN, Escalation
 from swarmctl.control.phases.overload import Level
 from swarmctl.core.types import Array, FlightMode, Mode, Phase, VehicleState
 
@@ -38,4 +39,5 @@ class PhaseInputs:
     refusal: str = ""  # reason why arming is refused for good, up to ARM
     unsettled: str = ""  # reason why arming must wait
     overload: Level = Level.NONE  # response to missed deadlines
+    escalation: Escalation = NOTHING_WORN  # response to what wears out: battery, link
     armed_told_us: int = -1  # arrival time of the HEARTBEAT that reported `state.armed`

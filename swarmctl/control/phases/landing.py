@@ -12,6 +12,7 @@ from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.control.phases.state_machine_params import StateMachineParams
 from swarmctl.control.phases.trajectories import Trajectories, is_at
 from swarmctl.control.reference.landing_places import landing_place_ned_m, nearest_in_plane_m
+from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.types import Array, VehicleState
 
 _SETTLE_S = 2.0  # time after a stop trajectory in which the vehicle comes to rest
@@ -27,6 +28,7 @@ class Landing:
         apart_m: level distance to others at which it may land in place.
         start_ned_m: (3,) start position, the landing place unless the agent lands in place.
         trajectories: set to the ways there.
+        volume: to stay in; None for none.
 
     Attributes:
         in_place: the agent lands where it came to rest instead of at the start position.
@@ -40,9 +42,10 @@ class Landing:
         *,
         start_ned_m: Array,
         trajectories: Trajectories,
+        volume: FlightVolume | None,
     ) -> None:
         self._params, self._agent, self._apart_m = params, agent, apart_m
-        self._start_ned_m, self._trajectories = start_ned_m, trajectories
+        self._start_ned_m, self._trajectories, self._volume = start_ned_m, trajectories, volume
         self.in_place = False
 
     def go_home(self, now_us: int, state: VehicleState) -> None:
@@ -73,7 +76,7 @@ class Landing:
         if self._has_room(inputs, state, controls=controls):
             return self._is_at_rest(state)
         others_ned_m, apart_m = inputs.others_ned_m(), self._apart_m + _ROOM_MARGIN_M
-        room_ned_m = landing_place_ned_m(state.pos_ned_m, others_ned_m, apart_m, self._agent)
+        room_ned_m = landing_place_ned_m(state.pos_ned_m, others_ned_m, apart_m, self._agent, self._volume)
         self._trajectories.go_to(room_ned_m, inputs.now_us, state)
         return False
 

@@ -11,10 +11,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.operator_verbs import GOTO, OPERATOR_VERBS, POINT, Order
 from swarmctl.core.types import Landed, Phase, VehicleState
 
-Contains = Callable[[tuple[float, float]], bool]  # whether north and east [m] lie in the area to fly in
+Contains = Callable[[tuple[float, float]], bool]  # whether north and east [m] lie within the geofence
 _WAY_STEP_M = 1.0  # between points of a straight way that are checked
 _MOST_WAY_POINTS = 1000
 
@@ -32,6 +33,7 @@ class OrderSituation:
     paused: bool  # it rests because a peer is silent or deadlines are missed
     lowest_m: float  # down coordinate that it may not go below
     contains: Contains
+    volume: FlightVolume | None  # that plans keep to
 
 
 def refusal_of(order: Order, situation: OrderSituation) -> str:
@@ -68,6 +70,8 @@ def _goto_refusal(order: Order, state: VehicleState, situation: OrderSituation) 
     target = np.array([order.arguments[name] for name in POINT])
     if target[2] > situation.lowest_m:
         return f"down {target[2]:g} m is too low: {situation.lowest_m:.2f} at most"
+    if situation.volume is not None and (refusal := situation.volume.refusal(target)):
+        return refusal
     points = min(_MOST_WAY_POINTS, 2 + int(math.dist(state.pos_ned_m[:2], target[:2]) / _WAY_STEP_M))
     way = np.linspace(target[:2], state.pos_ned_m[:2], points)
     outside = [(float(north), float(east)) for north, east in way if not situation.contains((north, east))]

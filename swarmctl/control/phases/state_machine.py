@@ -18,6 +18,7 @@ import numpy as np
 from swarmctl.control.phases.arming import ArmingEvidence
 from swarmctl.control.phases.control_mode import control_mode
 from swarmctl.control.phases.departure import Climb, unmet_start_condition
+from swarmctl.control.phases.failsafe import Response
 from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.control.phases.interruptions import HoldPoint, Interruptions
 from swarmctl.control.phases.landing import Landing
@@ -26,6 +27,7 @@ from swarmctl.control.phases.refused_orders import Contains, OrderSituation, ref
 from swarmctl.control.phases.state_machine_params import StateMachineParams
 from swarmctl.control.phases.trajectories import Trajectories, is_at
 from swarmctl.control.reference.mission import MissionReference
+from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.operator_verbs import GOTO, OPERATOR_VERBS, POINT, SPEED, YAW, Order
 from swarmctl.core.types import Array, Command, FlightMode, Landed, Mode, Phase, VehicleState, Verb
 
@@ -52,7 +54,8 @@ class MissionStateMachine:
         start_ned_m: (3,) start position, also the landing place.
         duration_s: duration of the tracked mission.
         reference: reference of the tracked mission.
-        contains: whether a place lies in the area to fly in.
+        contains: whether a place lies within the geofence.
+        volume: to stay in; None for none.
 
     Attributes:
         phase: current phase.
@@ -75,8 +78,9 @@ class MissionStateMachine:
         duration_s: float,
         reference: MissionReference,
         contains: Contains = lambda _: True,
+        volume: FlightVolume | None = None,
     ) -> None:
-        self._params, self._expected, self._contains = params, peers, contains
+        self._params, self._expected, self._contains, self._volume = params, peers, contains, volume
         self._start_ned_m, self._duration_us, self._reference = start_ned_m, round(duration_s * 1e6), reference
         self.phase = Phase.CONNECT
         self.ready_utc_us = 0
@@ -91,7 +95,9 @@ class MissionStateMachine:
             reference, start_ned_m, speed_m_s=params.speed_m_s, accel_m_s2=params.accel_m_s2
         )
         self._interruptions = Interruptions(self._trajectories)
-        self._landing = Landing(params, agent, landing_m, start_ned_m=start_ned_m, trajectories=self._trajectories)
+        self._landing = Landing(
+            params, agent, landing_m, start_ned_m=start_ned_m, trajectories=self._trajectories, volume=volume
+        )
         self._entered_us = 0
         self._first_tick_us: int | None = None
         self._requested_us = -_REQUEST_PERIOD_US
@@ -158,6 +164,7 @@ class MissionStateMachine:
             self._give_up(OVERLOADED, inputs, state)
         if inputs.cut_off and self._may_fly_on:
             self._give_up(inputs.cut_off, inputs, state)
+        self._escalate(inputs, state)
         self._pause(inputs, state)
         if state.mode is FlightMode.EXTERNAL and Phase.GOTO_START <= self.phase < Phase.LAND:
             self._take_control(inputs, state)
@@ -231,6 +238,7 @@ class MissionStateMachine:
             paused=self._interruptions.paused,
             lowest_m=self._lowest_m,
             contains=self._contains,
+            volume=self._volume,
         )
         if refusal := refusal_of(order, situation):
             return refusal
@@ -313,6 +321,17 @@ class MissionStateMachine:
     def _is_down(self, inputs: PhaseInputs, state: VehicleState) -> bool:
         """Return whether the vehicle is on the ground and known to be disarmed."""
         return state.landed is Landed.ON_GROUND and self.arming.is_disarmed(inputs, state)
+
+    def _escalate(self, inputs: PhaseInputs, state: VehicleState) -> None:
+        """Fly home, or land, as battery and link ask for; a vehicle on its way home lands where it is, if it has to."""
+        response, why = inputs.escalation.response, inputs.escalation.reason
+        flies_home = self.phase is Phase.GOTO_LAND and not self._landing.in_place
+        controls = self.had_control and inputs.mode in _PLAN_MODES
+        if response is Response.RTL and self._may_fly_on and controls:
+            self.outcome = self.outcome or f"{why}: flew back"
+            self._go_home(inputs.now_us, state)
+        elif (response >= Response.RTL and self._may_fly_on) or (response is Response.LAND and flies_home):
+            self._give_up(why, inputs, state)
 
     def _pause(self, inputs: PhaseInputs, state: VehicleState) -> None:
         """Come to rest while the bus is lost, because peers then assume braking, and while deadlines are missed."""

@@ -24,6 +24,7 @@ from pydantic import Field
 
 from swarmctl.control.collision.separation import KeepOut
 from swarmctl.control.reference.shortest_path import Polyline, shortest_path
+from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array, Sampled
@@ -103,9 +104,11 @@ class DeadlockRecovery:
         params: thresholds and speed.
         agent: own id.
         radius_m: distance that agents keep; it also sets the cell size of the path search.
+        volume: that paths stay in; None for none.
     """
 
-    def __init__(self, params: DeadlockParams, agent: int, radius_m: float) -> None:
+    def __init__(self, params: DeadlockParams, agent: int, radius_m: float, volume: FlightVolume | None = None) -> None:
+        self._sides = None if volume is None else volume.planned_sides
         self._params, self._agent, self._radius_m = params, agent, radius_m
         self._progress = ProgressMonitor(params)
         self._path: Polyline | None = None
@@ -190,7 +193,8 @@ class DeadlockRecovery:
     def _plan(self, anew: bool, keep_outs: Sequence[KeepOut], obstacles: Sequence[Obstacle]) -> None:
         discs = self._discs(keep_outs, obstacles)
         start, goal = self._pos_ned_m[:2], self._goal_ned_m[:2]
-        path = shortest_path(start, goal, discs, self._radius_m / 3.0, squeeze=_GAP_PRICE**self._escalation_level)
+        squeeze = _GAP_PRICE**self._escalation_level
+        path = shortest_path(start, goal, discs, self._radius_m / 3.0, squeeze=squeeze, sides=self._sides)
         if not anew and self._path is not None and math.dist(self._path.corners[-1], goal) < self._params.behind_m:
             remainder = self._path.remainder(start)
             if remainder.is_clear(discs) and path.length_m > _REPLACE_01 * remainder.length_m:

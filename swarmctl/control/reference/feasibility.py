@@ -1,4 +1,5 @@
-"""Checks before a flight whether references can be flown: finite, within the vehicles' limits, above ground, apart.
+"""Checks before a flight whether references can be flown: finite, within the vehicles' limits, above ground, in the
+flight volume, apart.
 
 Pure. A reference is sampled over the whole mission; what is refused is told with the first second at which it is wrong.
 """
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.reference.mission import MissionReference, Motion
+from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.frames import GRAVITY_M_S2
 from swarmctl.core.types import Array
 
@@ -21,6 +23,7 @@ _STEP_S = 0.02  # time between samples
 _MAX_SAMPLES = 200_000  # of all agents together; long missions of many are sampled more coarsely
 _JUMP_M = 0.02  # difference of positions that velocities need not explain
 _GROUND_M = 0.3  # least height of a reference: bodies have legs
+_OUTSIDE_M = 1e-6  # of the flight volume: rounding
 _SHOWN = 3  # problems
 
 
@@ -32,6 +35,7 @@ class FlightLimits:
     apart_m: float  # distance that references fixed in time keep
     downwash: float  # ratio of height to width of the ellipsoid that is kept free
     ground_z_m: float | None  # NED z of the ground; None where it is not known
+    volume: FlightVolume | None  # that plans keep to
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,6 +93,11 @@ def _rules(
         below = f"less than {_GROUND_M:g} m above the ground at sitl.ground_z_m = {limits.ground_z_m:g} (NED)"
         ground = f"the reference is at z = {{}} m, {below}"
         rules.append(_Rule(broken=low & finite, said=ground, values=pos[:, 2]))
+    if limits.volume is not None:
+        beyond = limits.volume.beyond_plans_m(pos)
+        kept = f"volume.margin_m = {limits.volume.params.margin_m:g}"
+        leaves = f"the reference is {{}} m outside of the flight volume less {kept}"
+        rules.append(_Rule(broken=(beyond > _OUTSIDE_M) & finite, said=leaves, values=beyond))
     if reference.jumps or not finite.all():
         return rules
     speed = np.linalg.norm(vel, axis=1)

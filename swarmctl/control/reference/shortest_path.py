@@ -18,7 +18,7 @@ from swarmctl.core.types import Array
 
 _CELLS = 60  # along the longer side
 _EDGE_CELLS = 0.7  # a cell this far inside a disc may still hold a free point
-_PRICE_INSIDE = 1000.0  # price of a metre farther inside
+_PRICE_INSIDE = 1000.0  # price of a metre farther inside, or outside of the sides
 _NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1))
 
 
@@ -61,7 +61,15 @@ class Polyline:
         return all(clear(a, b, discs) for a, b in itertools.pairwise(self.corners))
 
 
-def shortest_path(start: Array, goal: Array, discs: Array, cell_m: float, *, squeeze: float = 3.0) -> Polyline:
+def shortest_path(
+    start: Array,
+    goal: Array,
+    discs: Array,
+    cell_m: float,
+    *,
+    squeeze: float = 3.0,
+    sides: tuple[Array, Array] | None = None,
+) -> Polyline:
     """Return a short path from `start` (2,) to `goal` (2,) outside `discs`.
 
     Args:
@@ -69,6 +77,7 @@ def shortest_path(start: Array, goal: Array, discs: Array, cell_m: float, *, squ
         discs: (M, 3) north, east and radius [m].
         cell_m: least cell size of the grid; it grows with the area.
         squeeze: price of a metre through a gap that the grid cannot resolve.
+        sides: normals (S, 2) and offsets (S,) of half-planes `normal . point >= offset` to stay in; None for none.
     """
     if clear(start, goal, discs):
         return Polyline(np.stack([start, goal]))
@@ -78,6 +87,8 @@ def shortest_path(start: Array, goal: Array, discs: Array, cell_m: float, *, squ
         distance = np.hypot(points[:, 0] - x, points[:, 1] - y)
         price[distance < radius] = np.maximum(price[distance < radius], squeeze)
         price[distance < radius - _EDGE_CELLS * step_m] = _PRICE_INSIDE
+    if sides is not None:
+        price[(points @ sides[0].T < sides[1]).any(axis=1)] = _PRICE_INSIDE
     first = int(np.argmin(((points - start) ** 2).sum(axis=1)))
     last = int(np.argmin(((points - goal) ** 2).sum(axis=1)))
     _, before = dijkstra(_edges(price, shape, step_m), directed=False, indices=last, return_predecessors=True)

@@ -16,8 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarmctl import __version__
+from swarmctl.core.flight_volume import FlightVolume
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.types import Array, Mode, PlanStatus
+from swarmctl.core.types import Array, Mode, Phase, PlanStatus
 from swarmctl.telemetry.evaluation.reception import refused_peers, unresponsive
 from swarmctl.telemetry.evaluation.tracks import (
     Tracks,
@@ -48,6 +49,7 @@ class Rules:
     solver_name: str = "osqp"
     mode: Literal["realtime", "lockstep"] = "realtime"
     duration_s: float | None = None  # mission time that a completed run must have tracked
+    volume: FlightVolume | None = None  # that nobody may leave
     downwash: float = 1.0  # heights are divided by this in `scaled_min_m`, which is reported but not judged
 
 
@@ -83,11 +85,12 @@ def evaluate(
     clock = _MissionClock(run.ticks, tracks)
     separation, apart = _evaluate_separation(tracks, rules, clock)
     obstacles, clear = _evaluate_obstacles(tracks, rules, clock)
+    volume, inside = _evaluate_volume(run, tracks, rules, clock)
     timing, punctual = _evaluate_timing(run.ticks, rules, speed_factor)
     tracking, tracked_s = _evaluate_tracking(run, rules.agents, steady_after_s)
     unseen = [] if len(run.truth) else list(_unseen(run.ticks, rules.agents, clock))
     refused = _shorten(list(refused_peers(run.events)))
-    violations = [*problems, *apart, *clear, *unseen, *punctual, *refused, *_not_a_number(run.truth)]
+    violations = [*problems, *apart, *clear, *inside, *unseen, *punctual, *refused, *_not_a_number(run.truth)]
     if outcome == "completed":
         violations += _cut_short(tracked_s, rules)
     summary = {
@@ -100,6 +103,7 @@ def evaluate(
         "tracking": tracking,
         "separation": separation,
         "obstacles": obstacles,
+        "volume": volume,
         "timing": timing,
         "solver": _solver(run.ticks, rules.solver_name),
         "comms": _comms(run, tracks.time_field),
@@ -195,6 +199,34 @@ def _evaluate_obstacles(
                 )
     distance, required = worst or (None, None)
     return {"min_clearance_m": distance, "required_m": required}, _shorten(violations)
+
+
+def _evaluate_volume(
+    run: RunData, tracks: Tracks, rules: Rules, clock: _MissionClock
+) -> tuple[dict[str, Any] | None, list[str]]:
+    """Find how far inside of the volume everybody stayed, from standing at its start to its landing; None without one.
+
+    Before that autopilots climb from below the floor, and afterwards they land through it.
+    """
+    if rules.volume is None:
+        return None, []
+    least_m, violations = np.inf, []
+    for agent, rows in run.ticks.items():
+        flown_us = rows[tracks.time_field][(rows["phase"] >= Phase.READY) & (rows["phase"] <= Phase.GOTO_LAND)]
+        if agent >= rules.agents or not len(flown_us):
+            continue
+        during = (tracks.t_us >= flown_us[0]) & (tracks.t_us <= flown_us[-1])
+        beyond_m = rules.volume.beyond_m(tracks.pos_ned_m[during, agent])
+        if not np.isfinite(beyond_m).any():
+            continue
+        worst = int(np.nanargmax(beyond_m))
+        least_m = min(least_m, -float(beyond_m[worst]))
+        if beyond_m[worst] > 0.0:
+            at_s = clock.at_s(tracks.t_us[during][worst])
+            face = rules.volume.face(tracks.pos_ned_m[during, agent][worst])
+            left = f"{beyond_m[worst]:.3f} m outside of the flight volume ({face})"
+            violations.append(f"agent {agent} {left} at {at_s:.1f} s")
+    return {"least_inside_m": finite(least_m), "margin_m": rules.volume.params.margin_m}, _shorten(violations)
 
 
 def _evaluate_timing(

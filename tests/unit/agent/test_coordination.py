@@ -50,6 +50,7 @@ class Bench:
             mpc=MpcParams(),
             vehicle=VehicleModelParams(),
             separation=separation,
+            volume=None,
             max_keep_outs=2,
             world_model=self.world_model,
             bus=self.bus,

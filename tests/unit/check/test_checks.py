@@ -34,6 +34,8 @@ from swarmctl.check.services import corners_deg, has_fence
 from swarmctl.check.swarm import exit_code, findings, standing
 from swarmctl.check.table import _drawn, as_json, print_check
 from swarmctl.config import Config, load
+from swarmctl.control.phases.failsafe import FailsafeParams
+from swarmctl.core.flight_volume import VolumeParams
 from swarmctl.core.types import FlightMode, Landed
 from swarmctl.core.verdict import Verdict
 from swarmctl.mavlink.dialects.arducopter import ARDUCOPTER
@@ -453,6 +455,35 @@ def test_the_radius_has_to_cover_body_tracking_and_estimator(config: Config) -> 
     alone = load(None, ["swarm.agents=1"])
     single = changed(HEALTHY, estimator=vague.estimator)
     assert not [line for line in findings([single], alone) if line.topic == "radius"]
+
+
+def test_limits_of_battery_and_link_are_shown_and_the_return_is_one_of_them(config: Config) -> None:
+    lines = findings([HEALTHY, SECOND_OK], config)
+    assert line_of(lines, "battery").wanted == "over 50%, warns at 30%, returns at 20%, lands at 10%"
+    assert line_of(lines, "loss").wanted.endswith("warns at 20%")
+    strict = FailsafeParams(battery_warn_01=0.8, battery_rtl_01=0.7)
+    agent = config.agent.model_copy(update={"failsafe": strict})
+    low = changed(
+        HEALTHY,
+        sensors=Sensors(present=ALL_SENSORS, enabled=ALL_SENSORS, healthy=0x1320C83F, battery_v=15.6, battery_01=0.65),
+    )
+    assert line_of(findings([low, SECOND_OK], config), "battery").verdict is OK
+    within = config.model_copy(update={"agent": agent})
+    assert line_of(findings([low, SECOND_OK], within), "battery").verdict is FIX
+
+
+def test_the_flight_volume_is_shown_and_who_stands_beside_it_is_found(config: Config) -> None:
+    corners = ((-9.0, -9.0), (9.0, -9.0), (9.0, 9.0), (-9.0, 9.0))
+    volume = VolumeParams(corners_ne_m=corners, floor_z_m=-0.5, ceiling_z_m=-30.0)
+    within = config.model_copy(update={"volume": volume})
+    (shown,) = (line for line in findings([HEALTHY, SECOND], within) if line.topic == "volume")
+    assert (shown.agent, shown.verdict) == (SWARM, NOTE if shown.advice else OK)
+    assert "18.0 x 18.0 x 29.5 m" in shown.wanted
+    away = changed(SECOND, pos_ned_m=(0.0, 11.0, 0.0))
+    beside = line_of(findings([HEALTHY, away], within), "volume", 1)
+    assert beside.verdict is FIX
+    assert "2.0 m beyond side" in beside.found
+    assert not [line for line in findings([HEALTHY, away], config) if line.topic == "volume"]
 
 
 def test_a_parameter_of_another_kind_of_autopilot_is_only_a_note(config: Config) -> None:

@@ -7,8 +7,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from swarmctl.control.mpc.axes import AxesProblem, Axis, HalfSpaces, Horizon, Penalties, Terminal
-from swarmctl.control.mpc.constraints import IncrementBounds, InputBounds, KeepOutHalfSpaces, TerminalConditions
+from swarmctl.control.mpc.axes import AxesProblem, Axis, Faces, HalfSpaces, Horizon, Penalties, Terminal
+from swarmctl.control.mpc.constraints import (
+    IncrementBounds,
+    InputBounds,
+    KeepOutHalfSpaces,
+    TerminalConditions,
+    VolumeFaces,
+    slack_m,
+)
 from swarmctl.control.mpc.prediction import Forecast, Prediction
 from swarmctl.control.mpc.program import ConstraintBlock, Program, Rows
 from swarmctl.control.mpc.session import Relaxation, SolverSession
@@ -136,7 +143,7 @@ def test_the_residual_of_half_spaces_is_the_depth_in_metres(seed: int) -> None:
     assert relaxed or program.residual_m(without_slack) == pytest.approx(depth_m, abs=1e-9)
     given_way = np.concatenate([moves, [depth_m / 0.1, 0.0]])  # slacks are in units of 0.1 m
     assert program.residual_m(given_way) == pytest.approx(0.0, abs=1e-9)
-    assert block.slack_m(program.rows[block], QpSolution(x=given_way, exact=True, status="", iterations=1)) == (
+    assert slack_m(program.rows[block], QpSolution(x=given_way, exact=True, status="", iterations=1)) == (
         pytest.approx(depth_m)
     )
     program.fill(forecast(ahead))
@@ -196,6 +203,34 @@ def test_rows_are_those_without_slacks_then_bounds_of_slacks_then_those_with_sla
     np.testing.assert_array_equal(program.pattern[moves + 2 : moves + 4, moves:], np.eye(2, dtype=bool))
     np.testing.assert_array_equal(program.lower[moves + 2 : moves + 4], 0.0)
     assert np.shares_memory(program.rows[ends].moves, program.coefficients[moves + 4 :])
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_rows_of_a_face_are_violated_by_how_far_a_plan_or_its_stop_is_outside(seed: int) -> None:
+    """The face is that far away that no increments can be asked for more than they can reach."""
+    ahead, normals = prediction(), np.array([[0.8, -0.6]])
+    step, moves = forecast(ahead), some_moves(seed)
+    pos, vel = flown(ahead, step, moves)
+    inside, towards, brake_m_s2 = pos @ normals[0], np.maximum(0.0, -vel[-1] @ normals[0]), 1.5
+    stop_m = float(inside[-1] - towards**2 / (2.0 * brake_m_s2))
+    offset_m = min(float(inside.min()), stop_m) + 0.02
+    block = VolumeFaces(
+        ahead,
+        Faces(normals=normals, offsets_m=np.array([offset_m]), brakes_m_s2=np.array([brake_m_s2])),
+        Penalties(),
+        cost_scale=1.0,
+    )
+    rows = filled(ahead, block, step)
+    depth_m = block.residual_m(rows, np.append(moves, 0.0))
+    assert 0.02 - 0.06 <= depth_m - max(0.0, offset_m - stop_m) <= 0.02, "tangents miss less than their gap"
+    assert block.residual_m(rows, np.append(moves, 1.0)) == 0.0, "one unit of slack is 0.1 m"
+
+
+def test_faces_out_of_reach_are_disabled() -> None:
+    ahead = prediction()
+    far = Faces(normals=np.array([[1.0, 0.0]]), offsets_m=np.array([-50.0]), brakes_m_s2=np.array([1.5]))
+    rows = filled(ahead, VolumeFaces(ahead, far, Penalties(), cost_scale=1.0), forecast(ahead))
+    assert (rows.lower == -INFINITY).all()
 
 
 def test_a_session_relaxes_in_order_and_only_what_is_needed() -> None:

@@ -23,6 +23,8 @@ GOOD = Health(
     speed_m_s=1.0,
     phase=Phase.TRACK,
     had_control=True,
+    battery_01=1.0,
+    link_lost_01=0.0,
     pilot_override=False,
 )
 BAD_PLANS = [s for s in PlanStatus if s is not PlanStatus.OK]

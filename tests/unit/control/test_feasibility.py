@@ -26,6 +26,11 @@ def two(*lists: str) -> tuple[str, ...]:
     return ("swarm.agents=2", "mission.kind=waypoints", f"mission.waypoints.lists=[{', '.join(lists)}]")
 
 
+BOX = (
+    "volume.corners_ne_m=[[-4, -4], [6, -4], [6, 4], [-4, 4]]",
+    "volume.floor_z_m=1",
+    "volume.ceiling_z_m=-4",
+)
 CROSSING = ("[[-4, 0, -1], [4, 0, -1]]", "[[0, -4, -1], [0, 4, -1]]")
 TIMES = "times_s=[0.0, 8.0]"
 
@@ -39,6 +44,14 @@ TIMES = "times_s=[0.0, 8.0]"
         (
             ("mission.kind=helix", "mission.helix.height_m=6", "mission.helix.rise_s=2", "mission.helix.radius_m=0"),
             ("thrust over mass of", "thrust_max_01"),
+        ),
+        (  # from 2 m in the north on at 1 m/s; plans keep 0.3 m inside
+            (*BOX, LINE, "mission.line.velocity_ned_m_s=[1.0, 0, 0]"),
+            ("agent 0", "at 3.72 s", "0.02 m outside of the flight volume", "volume.margin_m = 0.3"),
+        ),
+        (
+            (*BOX, "mission.kind=steps", "mission.steps.rows=[[0.0, 0, 0, -1], [3.0, 5.8, 0, -1]]"),
+            ("agent 0", "at 3.00 s", "0.10 m outside of the flight volume"),
         ),
         (two(*(f"{{points_ned_m={p}, {TIMES}}}" for p in CROSSING)), ("agents 0 and 1", "m apart", "radius_m = 0.9")),
     ],
@@ -56,6 +69,7 @@ def test_what_can_not_be_flown_is_refused_with_the_second_and_the_value(
     [
         (),
         (LINE, "mission.line.velocity_ned_m_s=[19.0, 0, 0]"),
+        (*BOX, LINE, "mission.line.velocity_ned_m_s=[1.0, 0, 0]", "mission.duration_s=3.6"),  # ends inside
         (LINE, "mission.line.velocity_ned_m_s=[0, 0, 0.5]", "mission.duration_s=7"),  # ends before the ground
         ("mission.circle.omega_rad_s=1.1",),
         ("mission.kind=steps",),  # jumps on purpose

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from swarmctl.control.phases.state_machine import OPERATOR_STOP, TAKEN_OVER, MissionStateMachine
+from swarmctl.core.flight_volume import FlightVolume, VolumeParams
 from swarmctl.core.operator_verbs import EXCLUDE, GOTO, OPERATOR_VERBS, order_problem
 from swarmctl.core.types import Array, FlightMode, Landed, Mode, Phase, Verb
 from tests.benches.state_machine_flight import IN_AIR, START, Flight, controlled, in_phase
@@ -292,6 +293,19 @@ def test_a_point_in_the_ground_or_a_way_out_of_the_fence_is_refused() -> None:
     for north_m in (5.0, 9.0):
         assert "outside of the geofence" in fenced.ask(GOTO, **POINT | {"north_m": north_m})
     np.testing.assert_allclose(place(fenced), held_at)
+
+
+def test_a_point_outside_of_the_flight_volume_is_refused_with_its_reason() -> None:
+    flight = controlled(Phase.TRACK)
+    held_at = place(flight)
+    corners = ((-5.0, -5.0), (5.0, -5.0), (5.0, 5.0), (-5.0, 5.0))
+    flight.state_machine._volume = FlightVolume(VolumeParams(corners_ne_m=corners, floor_z_m=-1.0, ceiling_z_m=-6.0))
+    for changed, face in (({"north_m": 4.9}, "side"), ({"down_m": -8.0}, "ceiling"), ({"down_m": -1.2}, "floor")):
+        refusal = flight.ask(GOTO, **POINT | changed)
+        assert "outside of the flight volume less volume.margin_m = 0.3" in refusal
+        assert face in refusal
+    np.testing.assert_allclose(place(flight), held_at)
+    assert flight.ask(GOTO, **POINT | {"north_m": 4.6}) == ""
 
 
 def test_where_the_ground_is_unknown_nothing_lower_than_the_start_is_flown_to() -> None:

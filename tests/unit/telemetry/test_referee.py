@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from swarmctl.core.flight_volume import FlightVolume, VolumeParams
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.core.types import Mode, Phase, PlanStatus
@@ -204,6 +205,26 @@ def test_moving_obstacle_is_met_where_it_is_at_the_time() -> None:
         5.0
     )
     assert evaluate(run({0: ticks(9.5, (0, 0, 0))}), rules, "completed")["outcome"] == "failed"
+
+
+def test_whoever_leaves_the_flight_volume_is_named_from_its_start_to_its_landing() -> None:
+    corners = ((-2.0, -2.0), (2.0, -2.0), (2.0, 2.0), (-2.0, 2.0))
+    volume = FlightVolume(VolumeParams(corners_ne_m=corners, floor_z_m=1.0, ceiling_z_m=-3.0))
+    rules = Rules(agents=1, required_separation_m=0.5, volume=volume)
+    rows = ticks(20, (0.0, 0.0, -1.0))
+    rows["phase"][rows["mission_t_s"] < 5.0] = Phase.GOTO_START
+    rows["phase"][rows["mission_t_s"] > 15.0] = Phase.LAND
+    rows["pos_ned_m"][rows["phase"] != Phase.TRACK] = (0.0, 0.0, 2.0)  # below the floor, as every vehicle on the ground
+    summary = evaluate(run({0: rows}), rules, "completed")
+    assert summary["volume"] == {"least_inside_m": 2.0, "margin_m": 0.3}
+    assert summary["violations"] == []
+    rows["pos_ned_m"][rows["mission_t_s"] == 8.0] = (0.0, -2.25, -1.0)
+    summary = evaluate(run({0: rows}), rules, "completed")
+    assert summary["volume"]["least_inside_m"] == pytest.approx(-0.25)
+    assert summary["outcome"] == "failed"
+    assert "agent 0 0.250 m outside of the flight volume (side 0) at 8.0 s" in summary["violations"]
+    alone = Rules(agents=1, required_separation_m=0.5)
+    assert evaluate(run({0: rows}), alone, "completed")["volume"] is None
 
 
 def test_obstacle_set_in_flight_counts_from_then_on() -> None:
