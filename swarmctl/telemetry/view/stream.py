@@ -1,0 +1,58 @@
+"""Sends columns of values to one recording stream on the timeline of the flight."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from swarmctl.core.types import Array
+from swarmctl.telemetry.view.layout import TIMELINE
+
+Times = NDArray[np.int64]  # (T,) [us] on the timeline, increasing
+
+
+class Stream:
+    """Wraps a recording stream; each call is one chunk, which costs 3 kB before a recording is packed."""
+
+    def __init__(self, rec: Any) -> None:
+        self._rec = rec
+
+    def static(self, path: str, archetype: Any) -> None:
+        """Log what does not change with time."""
+        self._rec.log(path, archetype, static=True)
+
+    def now(self, path: str, t_us: int, archetype: Any) -> None:
+        """Log one archetype at one time."""
+        self._rec.set_time(TIMELINE, duration=np.timedelta64(t_us, "us"))
+        self._rec.log(path, archetype)
+        self._rec.reset_time()
+
+    def columns(self, path: str, t_us: Times, columns: Any) -> None:
+        """Send one row of `columns` for each time; nothing without times."""
+        if len(t_us):
+            when = rr.TimeColumn(
+                TIMELINE, duration=np.asarray(t_us).astype("timedelta64[us]").astype("timedelta64[ns]")
+            )
+            self._rec.send_columns(path, [when], columns)
+
+    def scalars(self, path: str, t_us: Times, values: NDArray[Any]) -> None:
+        """Send values (T,), or (T, k) of k curves; what is not finite interrupts a curve."""
+        finite = np.asarray(values, np.float64)
+        self.columns(path, t_us, rr.Scalars.columns(scalars=np.where(np.isfinite(finite), finite, np.nan)))
+
+    def strips(self, path: str, t_us: Times, strips: Sequence[Array]) -> None:
+        """Send one line (M, 3), NED, for each time."""
+        self.columns(path, t_us, rr.LineStrips3D.columns(strips=list(strips)))
+
+    def states(self, path: str, t_us: Times, names: Sequence[str]) -> None:
+        """Send states that begin at these times."""
+        self.columns(path, t_us, rr.StateChange.columns(state=list(names)))
+
+    def lines(self, source: str, t_us: Times, lines: Sequence[tuple[str, str]]) -> None:
+        """Send lines of the event view, each with its level."""
+        texts, levels = [f"{source.replace('-', ' ')}: {text}" for _, text in lines], [level for level, _ in lines]
+        self.columns(f"events/{source}", t_us, rr.TextLog.columns(text=texts, level=levels))
