@@ -9,7 +9,7 @@ import numpy as np
 from swarmctl.config import Config
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.core.types import Array
-from swarmctl.telemetry.view.viewed_flight import AgentBounds, ViewedFlight
+from swarmctl.telemetry.scene.viewed_flight import AgentBounds, ViewedFlight
 
 _POINTS = 200  # of each reference, to find the bounds of the scene
 _AT_REST_M_S = 0.01  # a reference that ends slower has a goal

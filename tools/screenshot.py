@@ -19,7 +19,7 @@ from typing import Any
 from PIL import Image
 from rerun.experimental import ViewerClient
 
-from swarmctl.telemetry.view.layout import TIMELINE
+from swarmctl.telemetry.scene.layout import TIMELINE
 from swarmctl.telemetry.view.recordings import viewer_binary
 
 _LOAD_S = 30.0

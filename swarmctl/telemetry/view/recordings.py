@@ -18,7 +18,7 @@ from swarmctl.core.types import Array
 from swarmctl.errors import StartError
 from swarmctl.files import replaced_by_program
 from swarmctl.telemetry.evaluation.referee import RunData
-from swarmctl.telemetry.view.viewed_flight import ViewedFlight
+from swarmctl.telemetry.scene.viewed_flight import ViewedFlight
 
 RECORDING = "telemetry.rrd"
 APPLICATION = "swarmctl"
@@ -111,7 +111,7 @@ def simulated_recording(
     """
     import rerun as rr
 
-    from swarmctl.telemetry.view.scene import Scene
+    from swarmctl.telemetry.scene.scene import Scene
 
     path = directory / RECORDING
     rec = rr.RecordingStream(APPLICATION, recording_id=f"{directory.resolve().name}-{uuid.uuid4().hex[:8]}")

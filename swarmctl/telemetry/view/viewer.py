@@ -23,9 +23,9 @@ from swarmctl.core.obstacle import Obstacle
 from swarmctl.errors import EXIT_OK, EXIT_USAGE, StartError, SwarmError
 from swarmctl.files import replace_text
 from swarmctl.process_lifetime import StopRequest, die_with_parent
+from swarmctl.telemetry.scene.viewed_flight import ViewedFlight
 from swarmctl.telemetry.view.recordings import APPLICATION, RECORDING, has_display, open_viewer
 from swarmctl.telemetry.view.view_ports import HOST, PORTS_TRIED, free_view_ports
-from swarmctl.telemetry.view.viewed_flight import ViewedFlight
 
 URL_FILE = "viewer.url"
 _SERVER_MEMORY = "512MiB"  # history for viewers that connect late
@@ -71,8 +71,8 @@ def _parser() -> argparse.ArgumentParser:
 
 def _run(options: argparse.Namespace, flight: ViewedFlight, stop: StopRequest) -> int:
     from swarmctl.bus.zenoh_bus import ZenohBus
+    from swarmctl.telemetry.scene.scene import Scene
     from swarmctl.telemetry.view.feed import Feed, listens_to
-    from swarmctl.telemetry.view.scene import Scene
 
     agents = len(flight.agents)
     bus = _interruptible(lambda: ZenohBus(options.bus, options.run, "viewer", listens_to(agents)), stop)

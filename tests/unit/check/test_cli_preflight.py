@@ -34,7 +34,7 @@ from swarmctl.ops.status_table import (
 from swarmctl.ops.summary import summary_lines, violation_lines
 from swarmctl.ops.supervisor import why_it_failed
 from swarmctl.process_lifetime import StopRequest
-from swarmctl.telemetry.view.viewed_flight import ViewedFlight
+from swarmctl.telemetry.scene.viewed_flight import ViewedFlight
 from tests import builders
 
 

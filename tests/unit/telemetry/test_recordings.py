@@ -23,11 +23,11 @@ from swarmctl.errors import StartError
 from swarmctl.telemetry.evaluation.attitude import roll_pitch_rad
 from swarmctl.telemetry.evaluation.referee import RunData
 from swarmctl.telemetry.palette import MODE_RGB, PHASE_RGB, agent_rgb
+from swarmctl.telemetry.scene.quad_mesh import quad_glb
+from swarmctl.telemetry.scene.separation_feed import SeparationFeed
+from swarmctl.telemetry.scene.viewed_flight import AgentBounds, ViewedFlight
 from swarmctl.telemetry.view.feed import AgentClock
-from swarmctl.telemetry.view.quad_mesh import quad_glb
 from swarmctl.telemetry.view.recordings import open_viewer, optimize_recording, simulated_recording
-from swarmctl.telemetry.view.separation_feed import SeparationFeed
-from swarmctl.telemetry.view.viewed_flight import AgentBounds, ViewedFlight
 
 NO_TRUTH = np.zeros(0, TRUTH_DTYPE)
 

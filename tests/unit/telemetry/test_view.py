@@ -15,10 +15,10 @@ from swarmctl.core.records import PLAN_DTYPE, TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.core.types import Mode, Phase, PlanStatus
 from swarmctl.telemetry.evaluation.referee import RunData
 from swarmctl.telemetry.palette import LIMIT_RGB, REFERENCE_RGB, agent_rgb
-from swarmctl.telemetry.view.curves import left_percent
+from swarmctl.telemetry.scene.curves import left_percent
+from swarmctl.telemetry.scene.states import status_table
+from swarmctl.telemetry.scene.viewed_flight import AgentBounds, ViewedFlight
 from swarmctl.telemetry.view.recordings import simulated_recording
-from swarmctl.telemetry.view.states import status_table
-from swarmctl.telemetry.view.viewed_flight import AgentBounds, ViewedFlight
 
 SECONDS = 3.0
 GOALS = ((9.0, 0.0, -2.0), None, (0.0, 8.0, -2.0))

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from swarmctl.core.types import Mode, Phase, PlanStatus
 from swarmctl.telemetry.palette import MODE_RGB, PHASE_RGB, PLAN_RGB
-from swarmctl.telemetry.view.stream import Stream, Times
+from swarmctl.telemetry.scene.stream import Stream, Times
 
 KINDS: Mapping[str, tuple[str, Any, Mapping[str, tuple[int, int, int]]]] = {  # of a bar: field, enumeration, colours
     "phase": ("phase", Phase, PHASE_RGB),

@@ -9,7 +9,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from swarmctl.core.tick_record import CURVES
-from swarmctl.telemetry.view.viewed_flight import ViewedFlight
+from swarmctl.telemetry.scene.viewed_flight import ViewedFlight
 
 TIMELINE = "flight_time"
 _PLOT_S = 20.0  # sliding window of the plots

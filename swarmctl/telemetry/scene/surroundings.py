@@ -8,8 +8,8 @@ import rerun as rr
 
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.telemetry.palette import LIMIT_RGB, NUMBER_RGB
-from swarmctl.telemetry.view.stream import Stream
-from swarmctl.telemetry.view.viewed_flight import ViewedFlight
+from swarmctl.telemetry.scene.stream import Stream
+from swarmctl.telemetry.scene.viewed_flight import ViewedFlight
 
 
 def draw_compass(stream: Stream, flight: ViewedFlight) -> None:

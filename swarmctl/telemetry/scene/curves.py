@@ -10,8 +10,8 @@ from swarmctl.core.tick_record import CURVES
 from swarmctl.core.types import Array, Phase
 from swarmctl.telemetry.evaluation.attitude import roll_pitch_rad
 from swarmctl.telemetry.palette import REFERENCE_RGB, SPARE_RGB, agent_rgb
-from swarmctl.telemetry.view.stream import Stream, Times
-from swarmctl.telemetry.view.viewed_flight import AgentBounds, ViewedFlight
+from swarmctl.telemetry.scene.stream import Stream, Times
+from swarmctl.telemetry.scene.viewed_flight import AgentBounds, ViewedFlight
 
 AXES = ("north", "east", "down")
 _EVERY = 5  # ticks, of curves that say nothing about a single one

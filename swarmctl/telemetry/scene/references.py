@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from swarmctl.core.types import Array, Phase
 from swarmctl.telemetry.palette import REFERENCE_RGB, agent_rgb
-from swarmctl.telemetry.view.stream import Stream, Times
-from swarmctl.telemetry.view.viewed_flight import ViewedFlight
+from swarmctl.telemetry.scene.stream import Stream, Times
+from swarmctl.telemetry.scene.viewed_flight import ViewedFlight
 
 _SAME_M = 0.2  # references that differ by less at the same mission time are drawn as one
 _RECENT_S = 1.5  # a reference that is older than another by more is not compared with it

@@ -10,7 +10,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from swarmctl.core.types import Array
-from swarmctl.telemetry.view.layout import TIMELINE
+from swarmctl.telemetry.scene.layout import TIMELINE
 
 Times = NDArray[np.int64]  # (T,) [us] on the timeline, increasing
 

@@ -16,15 +16,15 @@ from swarmctl import __version__
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.types import Array
 from swarmctl.telemetry.palette import LIMIT_RGB, NUMBER_RGB, agent_rgb, lighter
-from swarmctl.telemetry.view.curves import begin_curves, send_curves
-from swarmctl.telemetry.view.layout import layout
-from swarmctl.telemetry.view.quad_mesh import quad_glb
-from swarmctl.telemetry.view.references import References
-from swarmctl.telemetry.view.separation_feed import SeparationFeed
-from swarmctl.telemetry.view.states import TABLE, States, status_table
-from swarmctl.telemetry.view.stream import Stream, Times
-from swarmctl.telemetry.view.surroundings import draw_compass, draw_obstacles
-from swarmctl.telemetry.view.viewed_flight import ViewedFlight
+from swarmctl.telemetry.scene.curves import begin_curves, send_curves
+from swarmctl.telemetry.scene.layout import layout
+from swarmctl.telemetry.scene.quad_mesh import quad_glb
+from swarmctl.telemetry.scene.references import References
+from swarmctl.telemetry.scene.separation_feed import SeparationFeed
+from swarmctl.telemetry.scene.states import TABLE, States, status_table
+from swarmctl.telemetry.scene.stream import Stream, Times
+from swarmctl.telemetry.scene.surroundings import draw_compass, draw_obstacles
+from swarmctl.telemetry.scene.viewed_flight import ViewedFlight
 
 _NUMBER_ABOVE = 0.09  # height of a number above its vehicle, of the scene's extent
 _PLACE_TICKS = 2  # from one place of the camera that follows a vehicle to the next
