@@ -87,6 +87,7 @@ class Curve:
     page: Literal["swarm", "timing"] = "timing"  # of the view
     where: Callable[[NDArray[np.void]], NDArray[np.bool_]] | None = None  # rows (T,) to draw (T,); None: all
     is_count: bool = False  # it only grows: drawn in steps
+    worst: Literal["largest", "smallest"] = "largest"  # value among agents
     is_slow: bool = False  # in the view its newest value is enough
 
 
@@ -125,7 +126,7 @@ _SOLVE = Curve(title="Solve time [ms]", where=lambda rows: rows["iterations"] > 
 _TICK = Curve(title="Tick time, listen to send [ms]")
 _MISSES = Curve(title="Deadline misses so far", is_count=True, is_slow=True)
 _STALENESS = Curve(title="Plan staleness, oldest of the peers' [ms]", page="swarm")
-_BATTERY = Curve(title="Battery [0..1]", page="swarm", is_slow=True)
+_BATTERY = Curve(title="Battery [0..1]", page="swarm", worst="smallest", is_slow=True)
 _TYPES = "in `swarmctl/core/types.py`"
 
 COLUMNS = (
