@@ -25,7 +25,7 @@ from swarmctl.telemetry.view.recordings import viewer_binary
 _LOAD_S = 30.0
 _TOP_PX = 36  # menu and warnings of the viewer itself, cut off pictures that are 1920 pixels wide
 _BOTTOM_PX = 30
-_COLORS = 128
+_ATTEMPTS = 5  # to take a screenshot
 
 
 class Picture:
@@ -47,7 +47,7 @@ class Picture:
         """Return the whole window at a time of the flight, without the viewer's own bars."""
         self._viewer.set_time(TIMELINE, duration=seconds, play_state="paused")
         time.sleep(settle_s)
-        window = Image.open(io.BytesIO(self._viewer.take_screenshot())).convert("RGB")
+        window = self._shot()
         return window.crop((0, _TOP_PX, window.width, window.height - _BOTTOM_PX))
 
     def scene_at(self, seconds: float, settle_s: float, longest_px: int) -> Image.Image:
@@ -55,8 +55,14 @@ class Picture:
         self._viewer.set_time(TIMELINE, duration=seconds, play_state="paused")
         time.sleep(settle_s)
         scene = next(view for view in self._viewer.get_state().views if view.name == "Swarm, NED")
-        shot = self._viewer.take_screenshot(scene.view_id, max_size=longest_px)
-        return Image.open(io.BytesIO(shot)).convert("RGB")
+        return self._shot(scene.view_id, max_size=longest_px)
+
+    def _shot(self, *view: str, **options: int) -> Image.Image:
+        """Return a screenshot; a busy machine may take longer to paint it than the viewer waits."""
+        for _ in range(_ATTEMPTS - 1):
+            with contextlib.suppress(TimeoutError):
+                return Image.open(io.BytesIO(self._viewer.take_screenshot(*view, **options))).convert("RGB")
+        return Image.open(io.BytesIO(self._viewer.take_screenshot(*view, **options))).convert("RGB")
 
     def print_problems(self) -> None:
         """Print what the viewer could not draw, and its errors."""
@@ -86,7 +92,12 @@ def save_small(image: Image.Image, path: Path, width_px: int) -> None:
     """Write a picture for a page: scaled down, with a palette."""
     height_px = round(image.height * width_px / image.width)
     small = image.resize((width_px, height_px), Image.Resampling.LANCZOS)
-    small.quantize(_COLORS, dither=Image.Dither.NONE).save(path, optimize=True)
+    with_palette(small).save(path, optimize=True)
+
+
+def with_palette(image: Image.Image) -> Image.Image:
+    """Return a picture in 256 colours, thin lines in their own: a median cut would give most to the background."""
+    return image.quantize(256, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
 
 
 def main() -> None:

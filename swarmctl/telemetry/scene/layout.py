@@ -40,7 +40,7 @@ def layout(flight: ViewedFlight) -> Any:
 def _scene(flight: ViewedFlight) -> Any:
     north_m, east_m, down_m = flight.center_ned_m
     away_m = max(flight.extent_m, 2.0)
-    eye = (north_m - 1.0 * away_m, east_m - 0.9 * away_m, down_m - 1.0 * away_m)
+    eye = (north_m - 1.1 * away_m, east_m - 1.0 * away_m, down_m - 1.1 * away_m)
     camera = rrb.EyeControls3D(position=eye, look_target=flight.center_ned_m, eye_up=(0, 0, -1))
     return _space("Swarm, NED", flight, camera)
 

@@ -10,8 +10,8 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from swarmctl.core.types import Array, Phase
-from swarmctl.telemetry.palette import REFERENCE_RGB, agent_rgb
-from swarmctl.telemetry.scene.stream import Stream, Times
+from swarmctl.telemetry.palette import NUMBER_RGB, REFERENCE_RGB, agent_rgb
+from swarmctl.telemetry.scene.stream import Stream, Times, pieces
 from swarmctl.telemetry.scene.viewed_flight import ViewedFlight
 
 _SAME_M = 0.2  # references that differ by less at the same mission time are drawn as one
@@ -49,8 +49,10 @@ class References:
         goals = {k: bounds.goal_ned_m for k, bounds in enumerate(self._flight.agents) if bounds.goal_ned_m is not None}
         for first, agents in sharing({agent: np.array(goal) for agent, goal in goals.items()}).items():
             label = "goal" if len(agents) == len(self._flight.agents) else f"goal {', '.join(map(str, agents))}"
-            points = rr.Points3D([goals[first]], colors=[agent_rgb(first)], radii=[0.1], labels=[label])
+            points = rr.Points3D([goals[first]], colors=[agent_rgb(first)], radii=[0.1])
             self._stream.static(f"world/goal/{first}", points)
+            name = rr.Points3D([goals[first]], colors=[NUMBER_RGB], radii=[0.001], labels=[label], show_labels=True)
+            self._stream.static(f"world/goal/{first}/name", name)
 
     def take(self, agent: int, t_us: Times, rows: NDArray[np.void]) -> None:
         """Draw the references in rows (T,) of one agent at times `t_us` (T,), while it tracks them."""
@@ -72,9 +74,8 @@ class References:
         rgb = REFERENCE_RGB if agent in self._shares.values() else agent_rgb(agent)
         columns = rr.Points3D.columns(positions=pos_ned_m[every], colors=[rgb] * len(every))
         self._stream.columns(f"world/reference/{agent}", t_us[every], columns)
-        line = pos_ned_m if before is None else np.vstack([before.pos_ned_m, pos_ned_m])
-        if len(line) > 1:
-            self._stream.strips(f"world/reference_trail/{agent}", t_us[-1:], [line])
+        ends, lines = pieces(pos_ned_m, None if before is None else before.pos_ned_m, _EVERY)
+        self._stream.strips(f"world/reference_trail/{agent}", t_us[ends], lines)
 
     def _note_sharing(self, agent: int) -> bool:
         """Return whether an agent of a lower number has the same reference now, which is then noted."""

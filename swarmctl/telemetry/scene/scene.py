@@ -22,13 +22,13 @@ from swarmctl.telemetry.scene.quad_mesh import quad_glb
 from swarmctl.telemetry.scene.references import References
 from swarmctl.telemetry.scene.separation_feed import SeparationFeed
 from swarmctl.telemetry.scene.states import TABLE, States, status_table
-from swarmctl.telemetry.scene.stream import Stream, Times
+from swarmctl.telemetry.scene.stream import Stream, Times, pieces
 from swarmctl.telemetry.scene.surroundings import draw_compass, draw_obstacles
 from swarmctl.telemetry.scene.viewed_flight import ViewedFlight
 
 _NUMBER_ABOVE = 0.09  # height of a number above its vehicle, of the scene's extent
 _PLACE_TICKS = 2  # from one place of the camera that follows a vehicle to the next
-_PIECE_TICKS = 5  # of the trail: a recording that is played grows by them
+_PIECE_TICKS = 5  # of the trail
 
 
 class Scene:
@@ -147,15 +147,6 @@ class Scene:
         place = rr.Transform3D.columns(translation=pos_ned_m[::_PLACE_TICKS])  # a camera there does not turn
         self._stream.columns(f"world/place/{agent}", t_us[::_PLACE_TICKS], place)
         before = self._newest.get(agent)
-        points = pos_ned_m if before is None else np.vstack([before["pos_ned_m"], pos_ned_m])
-        first = len(points) - len(pos_ned_m)  # index of the point of the first row
-        ends = [k for k in pieces(len(rows)) if k + first > 0]
-        begins = [0, *(k + first for k in ends[:-1])]
-        lines = [points[begin : end + first + 1] for begin, end in zip(begins, ends, strict=False)]
+        ends, lines = pieces(pos_ned_m, None if before is None else before["pos_ned_m"], _PIECE_TICKS)
         self._stream.strips(f"world/trail/{agent}", t_us[ends], lines)
         self._references.take(agent, t_us, rows)
-
-
-def pieces(ticks: int) -> list[int]:
-    """Return the indices at which pieces of a batch of ticks end, the last one among them."""
-    return sorted({*range(_PIECE_TICKS - 1, ticks, _PIECE_TICKS), ticks - 1})

@@ -56,3 +56,23 @@ class Stream:
         """Send lines of the event view, each with its level."""
         texts, levels = [f"{source.replace('-', ' ')}: {text}" for _, text in lines], [level for level, _ in lines]
         self.columns(f"events/{source}", t_us, rr.TextLog.columns(text=texts, level=levels))
+
+
+def pieces(points_ned_m: Array, before_ned_m: Array | None, ticks: int) -> tuple[list[int], list[Array]]:
+    """Cut a line into pieces of some ticks, so that a recording that is played grows by them.
+
+    Args:
+        points_ned_m: the line (T, 3).
+        before_ned_m: end (3,) of what was drawn before it, where the first piece begins; None if nothing was.
+        ticks: points from one end of a piece to the next.
+
+    Returns:
+        the indices of the points at which pieces end, the last one among them, and the pieces, (M, 3) each.
+    """
+    ends = [*range((len(points_ned_m) - 1) % ticks, len(points_ned_m), ticks)]
+    if before_ned_m is None:
+        starts, line, shift = [0, *ends[:-1]], points_ned_m, 0
+    else:
+        starts, line, shift = [-1, *ends[:-1]], np.vstack([before_ned_m, points_ned_m]), 1
+    cut = {end: line[start + shift : end + shift + 1] for start, end in zip(starts, ends, strict=True) if end > start}
+    return list(cut), list(cut.values())

@@ -30,8 +30,8 @@ def draw_compass(stream: Stream, flight: ViewedFlight) -> None:
 def draw_obstacles(
     stream: Stream, obstacles: Sequence[Obstacle], t_us: int, elapsed_s: float, flight: ViewedFlight
 ) -> None:
-    """Draw obstacles at `t_us`, `elapsed_s` after they were set; columns end where the scene does."""
-    height_m = 2.0 * flight.extent_m
+    """Draw obstacles at `t_us`, `elapsed_s` after they were set; columns are drawn as high as half the scene."""
+    height_m = flight.extent_m
     balls, columns = [o for o in obstacles if not o.column], [o for o in obstacles if o.column]
     axes = [(*o.center_after(elapsed_s)[:2], flight.center_ned_m[2]) for o in columns]
     for path, what, mode, alpha in (

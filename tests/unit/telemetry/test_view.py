@@ -91,7 +91,7 @@ def test_a_reference_is_drawn_once_for_those_who_share_it_and_goes_with_the_miss
 
 
 def test_goals_are_named_by_their_agents(found: dict[str, list[dict[str, Any]]]) -> None:
-    shown = {agent: drawn(found, f"/world/goal/{agent}", "labels")[0][1] for agent in (0, 2)}
+    shown = {agent: drawn(found, f"/world/goal/{agent}/name", "labels")[0][1] for agent in (0, 2)}
     assert shown == {0: ["goal 0"], 2: ["goal 2"]}
     assert "/world/goal/1" not in found
     assert drawn(found, "/world/goal/2", "positions")[0][1] == [list(GOALS[2] or ())]
@@ -113,7 +113,7 @@ def test_margins_are_distances_beyond_those_that_are_kept(found: dict[str, list[
         assert obstacles_m == pytest.approx((10.0 - t_s) - t_s - 2.0, abs=1e-6), "a column that comes closer"
 
 
-def test_columns_end_where_the_scene_does(found: dict[str, list[dict[str, Any]]]) -> None:
+def test_columns_do_not_run_to_infinity(found: dict[str, list[dict[str, Any]]]) -> None:
     lengths = moving(found, "/world/columns/body", "lengths")
     assert max(length for _, values in lengths for length in values) < 10.0
     assert all(values == [] for _, values in moving(found, "/world/obstacles/body", "half_sizes"))
@@ -122,9 +122,12 @@ def test_columns_end_where_the_scene_does(found: dict[str, list[dict[str, Any]]]
 def test_trails_have_no_gaps_and_predicted_paths_are_drawn_when_they_were_flown(
     found: dict[str, list[dict[str, Any]]],
 ) -> None:
+    for trail in ("trail", "reference_trail"):
+        drawn_at = moving(found, f"/world/{trail}/0", "strips")
+        assert len(drawn_at) > 20
+        assert all(abs(strips[0][-1][0] - t_s) < 1e-6 for t_s, strips in drawn_at), "each ends where the vehicle is"
+        assert all(np.allclose(a[1][0][-1], b[1][0][0]) for a, b in itertools.pairwise(drawn_at))
     lines = [strips[0] for _, strips in moving(found, "/world/trail/0", "strips")]
-    assert len(lines) > 20
-    assert all(np.allclose(before[-1], after[0]) for before, after in itertools.pairwise(lines))
     assert (lines[0][0][0], lines[-1][-1][0]) == pytest.approx((0.0, SECONDS - 0.02))
     assert [t_s for t_s, _ in moving(found, "/world/plan/0", "strips")] == pytest.approx(0.1 * np.arange(20))
 
