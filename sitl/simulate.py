@@ -19,12 +19,13 @@ from rich.progress import Progress
 
 from sitl.lockstep import Lockstep, write_events
 from swarmctl.config import Config, dump, load
+from swarmctl.config_view import viewed_flight
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, exit_code_of
 from swarmctl.files import replace_bytes, replace_text, write_each
 from swarmctl.ops.status_table import PlainLines
 from swarmctl.ops.summary import summary_lines, unwritten_line, violation_lines
 from swarmctl.process_lifetime import StopRequest
-from swarmctl.telemetry.recording.run_files import load_run
+from swarmctl.telemetry.recording.run_files import load_run, read_plans
 from swarmctl.telemetry.recording.run_folder import Outcome, create_run_folder, finish_run
 from swarmctl.telemetry.view.recordings import RECORDING, open_viewer, optimize_recording, simulated_recording
 
@@ -100,14 +101,8 @@ def _write_rows(flight: Lockstep, directory: Path) -> tuple[str, ...]:
 
 
 def _write_recording(config: Config, directory: Path) -> None:
-    simulated_recording(
-        directory,
-        load_run(directory),
-        config.swarm.agents,
-        config.separation.radius_m,
-        limit_m=config.limits.min_separation_m,
-        obstacles=config.obstacles,
-    )
+    plans = {agent: read_plans(directory, agent) for agent in range(config.swarm.agents)}
+    simulated_recording(directory, load_run(directory), viewed_flight(config), plans)
     optimize_recording(directory)
 
 

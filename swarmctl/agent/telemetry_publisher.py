@@ -149,7 +149,7 @@ class TelemetryPublisher:
         deadline_misses: int,
         timing: TickTiming,
     ) -> TickRecord:
-        utc_us = self._clock.utc_us()
+        utc_us, battery_01 = self._clock.utc_us(), self._autopilot.health.battery_01
         peers, obstacles, age_ms = self._distances(planning, utc_us)
         return TickRecord(
             t_us=now_us,
@@ -174,6 +174,7 @@ class TelemetryPublisher:
             rejected=self._paths.refusals.total,
             deadline_misses=deadline_misses,
             safety_filter_acted=output.safety_filter_acted,
+            battery_01=math.nan if battery_01 is None else battery_01,
             timing=timing,
         )
 

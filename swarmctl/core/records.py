@@ -41,7 +41,7 @@ _PLAN_EVERY = 5  # ticks: ten plans a second
 
 _PLAN_HEADER = struct.Struct("<H")
 _NO_PLAN = np.empty((0, 3))
-_NO_POINTS = np.zeros(0, PLAN_DTYPE)
+NO_POINTS = np.zeros(0, PLAN_DTYPE)
 
 
 def tick_row(record: TickRecord) -> NDArray[np.void]:
@@ -59,7 +59,7 @@ def plan_rows(row: NDArray[np.void], flown: Plan | None) -> NDArray[np.void]:
         flown: the plan, None without one.
     """
     if flown is None or row["seq"][0] % _PLAN_EVERY:
-        return _NO_POINTS
+        return NO_POINTS
     rows = np.zeros(len(flown.pos_ned_m), PLAN_DTYPE)
     rows["t_us"] = row["t_us"]
     rows["at_us"] = flown.t0_us + flown.dt_us * np.arange(len(rows))

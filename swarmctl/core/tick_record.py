@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,6 +75,7 @@ class TickRecord:
     rejected: int
     deadline_misses: int
     safety_filter_acted: bool
+    battery_01: float  # charge that remains; NaN while unknown
     timing: TickTiming
 
 
@@ -83,8 +84,11 @@ class Curve:
     """Describes how a scalar is drawn over time, a line for each agent."""
 
     title: str  # with the unit
+    page: Literal["swarm", "timing"] = "timing"  # of the view
     where: Callable[[NDArray[np.void]], NDArray[np.bool_]] | None = None  # rows (T,) to draw (T,); None: all
-    is_count: bool = False  # it only grows: drawn in steps, and in the view by its newest value
+    is_count: bool = False  # it only grows: drawn in steps
+    worst: Literal["largest", "smallest"] = "largest"  # value among agents
+    is_slow: bool = False  # in the view its newest value is enough
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -120,7 +124,9 @@ _ROLL = "plot/att/{}/roll"
 _THRUST = "plot/att/{}/thrust"
 _SOLVE = Curve(title="Solve time [ms]", where=lambda rows: rows["iterations"] > 0)
 _TICK = Curve(title="Tick time, listen to send [ms]")
-_MISSES = Curve(title="Deadline misses so far", is_count=True)
+_MISSES = Curve(title="Deadline misses so far", is_count=True, is_slow=True)
+_STALENESS = Curve(title="Plan staleness, oldest of the peers' [ms]", page="swarm")
+_BATTERY = Curve(title="Battery [0..1]", page="swarm", worst="smallest", is_slow=True)
 _TYPES = "in `swarmctl/core/types.py`"
 
 COLUMNS = (
@@ -197,7 +203,7 @@ COLUMNS = (
         unit="m",
         text="the mission's reference now",
         value=lambda tick: tick.reference and tick.reference.pos_ned_m[0],
-        view="world/reference",
+        view="world/reference/{}",
     ),
     Column(
         name="setpoint_q_nb",
@@ -252,6 +258,7 @@ COLUMNS = (
         text="age of the oldest of the peers' newest paths; NaN without peers",
         value=lambda tick: tick.plan_staleness_ms,
         formerly="path_age_ms",
+        view=_STALENESS,
     ),
     Column(name="peers", dtype=_U2, text="number of paths in use", value=lambda tick: tick.peers),
     Column(name="rejected", dtype=_U4, text="number of bus messages refused so far", value=lambda tick: tick.rejected),
@@ -262,6 +269,7 @@ COLUMNS = (
         names=PlanStatus,
         value=lambda tick: tick.plan and tick.plan.status,
         none=PlanStatus.NONE,
+        view="state/{}/plan",
     ),
     Column(
         name="slack_m",
@@ -317,6 +325,14 @@ COLUMNS = (
         value=lambda tick: tick.safety_filter_acted,
         formerly="barrier_acted",
         absent=0,  # what lacks it was flown without the filter
+    ),
+    Column(
+        name="battery_01",
+        dtype=_F4,
+        unit="0..1",
+        text="charge of the battery that remains, as the autopilot reports it; NaN while unknown",
+        value=lambda tick: tick.battery_01,
+        view=_BATTERY,
     ),
 )
 CURVES = {column.name: column.view for column in COLUMNS if isinstance(column.view, Curve)}

@@ -19,6 +19,7 @@ from swarmctl import __version__
 from swarmctl.core.text import printable_lines
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, ConfigError, SwarmError
 from swarmctl.ops.config_verbs import config_app
+from swarmctl.ops.folder_verbs import add_folder_verbs
 from swarmctl.ops.order_verbs import Run, add_order_verbs
 
 if TYPE_CHECKING:
@@ -48,7 +49,6 @@ Set = Annotated[
 NewRunDir = Annotated[Path | None, typer.Option("--run-dir", help="Run folder to create; default runs/<UTC>-<name>.")]
 View = Annotated[bool | None, typer.Option("--view/--no-view", help="Open the viewer window.")]
 _WATCH_S = 0.25
-Folder = Annotated[Path, typer.Argument(help="Run folder.")]
 # The verb's module declares the options, and answers --help.
 _PASS_ON = {"ignore_unknown_options": True, "allow_extra_args": True, "help_option_names": []}
 
@@ -335,38 +335,7 @@ def view(run: Run = None) -> int:
     return EXIT_OK
 
 
-@app.command()
-def replay(folder: Folder) -> int:
-    """Open the recording of a run."""
-    from swarmctl.telemetry.view.recordings import RECORDING, open_viewer
-
-    open_viewer(str(folder / RECORDING))
-    return EXIT_OK
-
-
-@app.command()
-def report(folder: Folder) -> int:
-    """Write the report of a run again. Completes a run that was cut off."""
-    from swarmctl.ops.summary import rewrite_report
-
-    print(rewrite_report(folder))
-    return EXIT_OK
-
-
-@app.command()
-def bundle(
-    folder: Folder,
-    output: Annotated[
-        Path | None, typer.Option("--output", metavar="FILE", help="Archive to write; default: beside the folder.")
-    ] = None,
-    logs: Annotated[int, typer.Option("--logs", min=0, help="Newest logs to download from each vehicle.")] = 1,
-) -> int:
-    """Pack a run for support: its folder, versions, and logs of the disarmed vehicles that are reached."""
-    from swarmctl.ops.bundle import BundleOptions
-    from swarmctl.ops.bundle import bundle as pack
-
-    print(pack(BundleOptions(folder=folder, output=output, logs=logs)))
-    return EXIT_OK
+add_folder_verbs(app)
 
 
 @app.command(context_settings=_PASS_ON)

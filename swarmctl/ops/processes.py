@@ -18,14 +18,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import psutil
 
-from swarmctl.bus.json_messages import ObstaclesMessage, encode_message
 from swarmctl.bus.peers import agent_name
 from swarmctl.bus.zenoh_bus import socket_file
 from swarmctl.config import Config
-from swarmctl.control.reference.mission import MissionReference
+from swarmctl.config_view import viewed_flight
 from swarmctl.errors import StartError
 from swarmctl.process_lifetime import PARENT_ENV
 
@@ -124,25 +122,9 @@ def control_socket(endpoint: str) -> Path:
 def viewer_command(config: Config, context: RunContext, port: int, view: bool) -> Command:
     """Return the command of the viewer process, which owns rerun."""
     argv = _python("-m", "swarmctl.telemetry.view.viewer", "--run", context.run, "--bus", context.endpoint)
-    argv += ("--agents", f"{config.swarm.agents}", "--run-dir", f"{context.directory}", "--port", f"{port}")
-    center, extent_m = _scene_bounds(config)
-    argv += ("--look-at", *(f"{c:.3f}" for c in center), "--extent", f"{extent_m:.3f}")
-    argv += ("--rate-hz", f"{config.telemetry.rate_hz!r}", "--separation", f"{config.separation.radius_m!r}")
-    argv += ("--limit", f"{config.limits.min_separation_m!r}")
-    obstacles = encode_message(ObstaclesMessage(1, config.obstacles)).decode()
-    argv += ("--obstacles-json", obstacles, "--die-with-parent")
+    argv += ("--flight", viewed_flight(config).model_dump_json(), "--run-dir", f"{context.directory}")
+    argv += ("--port", f"{port}", "--rate-hz", f"{config.telemetry.rate_hz!r}", "--die-with-parent")
     return Command(VIEWER, argv + (("--view",) if view else ()))
-
-
-def _scene_bounds(config: Config) -> tuple[tuple[float, ...], float]:
-    """Return the centre (3,) and half size [m] of the box round all starts and the reference, for the camera."""
-    starts = np.array(config.starts_ned_m())
-    times_s = np.linspace(0.0, config.mission.duration_s, 200)
-    flown = [MissionReference(config.mission, starts, agent).sample(times_s)[0] for agent in range(len(starts))]
-    points = np.concatenate([starts, *flown])
-    low, high = points.min(axis=0), points.max(axis=0)
-    middle = 0.5 * (low + high)
-    return tuple(float(c) for c in middle), max(2.0, float(np.max(high - low)) / 2 + config.separation.radius_m)
 
 
 def _priority_flag(config: Config) -> str:

@@ -63,6 +63,30 @@ def rewrite_report(directory: Path) -> Path:
     return report_run(directory, load_recorded(directory).rules())
 
 
+def write_figures(directory: Path) -> Path:
+    """Write every figure of a run folder as an SVG file and return the folder they are in.
+
+    Raises:
+        ConfigError: it is no folder of a finished run.
+    """
+    from swarmctl.telemetry.recording.run_folder import write_run_figures  # heavy
+
+    return write_run_figures(directory, load_recorded(directory).rules())
+
+
+def compare(directories: Sequence[Path], output: Path | None) -> Path:
+    """Write a page that sets run folders beside each other and return it; by default it is beside the last of them.
+
+    Raises:
+        ConfigError: one is no folder of a finished run.
+    """
+    from swarmctl.telemetry.recording.run_folder import compare_runs  # heavy
+
+    runs = [(directory, load_recorded(directory).rules()) for directory in directories]
+    names = "-against-".join(directory.resolve().name for directory in directories)
+    return compare_runs(output or directories[-1].resolve().parent / f"{names}.html", runs)
+
+
 def _rules(config: Config, result: LaunchResult) -> Rules:
     """Return the limits of the configuration, with obstacles as an operator left them."""
     rules = config.rules()

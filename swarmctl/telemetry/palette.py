@@ -4,22 +4,34 @@ from __future__ import annotations
 
 import colorsys
 
-_AGENTS = (
+_AGENTS = (  # any two are at least 0.11 apart in OKLab, also from the red of limits and the grey of references
     (59, 130, 246),  # blue
     (245, 158, 11),  # amber
     (16, 185, 129),  # emerald
     (217, 70, 239),  # fuchsia
-    (6, 182, 212),  # cyan
-    (132, 204, 22),  # lime
-    (139, 92, 246),  # violet
-    (234, 88, 12),  # orange
-    (20, 184, 166),  # teal
-    (202, 138, 4),  # ochre
+    (180, 90, 105),  # garnet
+    (225, 165, 210),  # orchid
+    (15, 195, 255),  # sky
+    (135, 120, 0),  # olive
+    (255, 0, 150),  # pink
+    (0, 150, 0),  # green
+    (0, 210, 0),  # lime
+    (180, 135, 255),  # lavender
+    (165, 165, 0),  # mustard
+    (150, 75, 255),  # violet
+    (165, 195, 150),  # sage
+    (255, 120, 135),  # coral
+    (195, 135, 90),  # copper
+    (150, 105, 180),  # plum
+    (255, 120, 240),  # rose
+    (30, 135, 105),  # pine
 )
 
 LIMIT_RGB = (239, 68, 68)  # limits, obstacles and violations; used by no agent
 REFERENCE_RGB = (148, 163, 184)
 SUM_RGB = (100, 116, 139)
+NUMBER_RGB = (241, 245, 249)  # texts in the dark scene
+SPARE_RGB = ((45, 212, 191), (226, 232, 240))  # second and third curve beside an agent's own
 
 PHASE_RGB = {
     "CONNECT": (71, 85, 105),
@@ -46,6 +58,14 @@ MODE_RGB = {
     "STATE_STALE": (220, 38, 38),
 }
 
+PLAN_RGB = {
+    "OK": (34, 160, 90),
+    "SOLVER_FAILED": (220, 38, 38),
+    "RESIDUAL": (249, 115, 22),
+    "NOT_CERTIFIED": (234, 179, 8),
+    "NONE": (71, 85, 105),
+}
+
 
 def agent_rgb(agent: int) -> tuple[int, int, int]:
     """Return the colour of an agent, (r, g, b) in 0..255; beyond the table hues advance by the golden ratio."""
@@ -53,6 +73,12 @@ def agent_rgb(agent: int) -> tuple[int, int, int]:
         return _AGENTS[agent]
     r, g, b = colorsys.hsv_to_rgb((0.61803398875 * agent) % 1.0, 0.65, 0.85)
     return round(r * 255), round(g * 255), round(b * 255)
+
+
+def lighter(rgb: tuple[int, int, int]) -> tuple[int, int, int]:
+    """Return a colour half way to white."""
+    r, g, b = ((255 + part) // 2 for part in rgb)
+    return r, g, b
 
 
 def css(rgb: tuple[int, int, int]) -> str:

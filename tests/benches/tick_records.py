@@ -73,6 +73,7 @@ def tick_record(**changes: Any) -> TickRecord:
         "rejected": 70_000,
         "deadline_misses": 65_537,
         "safety_filter_acted": True,
+        "battery_01": 0.875,
         "timing": TIMING,
     }
     return TickRecord(**(fields | changes))

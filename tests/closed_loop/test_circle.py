@@ -41,6 +41,12 @@ def test_the_safety_filter_never_acts(circle: Flight) -> None:
     assert not any(circle.ticks(agent)["safety_filter_acted"].any() for agent in range(3))
 
 
+def test_the_charge_that_autopilots_report_is_recorded(circle: Flight) -> None:
+    for agent in range(3):
+        ticks, _ = circle.tracked(agent)
+        assert ((ticks["battery_01"] > 0.5) & (ticks["battery_01"] <= 1.0)).all()
+
+
 def test_vehicles_come_down_a_metre_apart(circle: Flight) -> None:
     down = circle.pos_ned_m[-1]
     starts = np.array(circle.config.starts_ned_m())

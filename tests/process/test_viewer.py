@@ -98,8 +98,8 @@ def endpoint() -> Iterator[str]:
 def viewer(endpoint: str, directory: Path, *more: str) -> Iterator[subprocess.Popen[str]]:
     directory.mkdir(exist_ok=True)
     command = [sys.executable, "-m", "swarmctl.telemetry.view.viewer", "--run", RUN, "--bus", endpoint]
-    first = json.dumps({"version": 1, "obstacles": [OBSTACLE]})
-    command += ["--agents", str(AGENTS), "--run-dir", str(directory), "--obstacles-json", first, *more]
+    flight = json.dumps({"agents": [{}] * AGENTS, "obstacles": [OBSTACLE]})
+    command += ["--flight", flight, "--run-dir", str(directory), *more]
     with (directory / "viewer.log").open("wb") as log:
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=log, text=True)
     try:
@@ -147,9 +147,10 @@ def scalars(rows: list[Any]) -> list[list[float]]:
 
 def expected_entities() -> set[str]:
     each = ["world/agent/{}", "world/agent/{}/body", "world/agent/{}/safety", "world/trail/{}", "world/plan/{}"]
-    each += ["plot/track_err/{}", "plot/att/{}/pitch", "events/agent-{}"]
+    each += ["plot/track_err/{}", "plot/att/{}/pitch", "plot/margin/{}", "plot/left/{}", "plot/pos/{}/north"]
+    each += ["events/agent-{}", "world/agent/{}/number"]
     each += [column.entity for column in COLUMNS if column.entity]
-    shared = {"world", "world/reference", "world/reference_trail", "world/obstacles/body", "world/obstacles/keep_out"}
+    shared = {"world", "world/compass", "world/obstacles/body", "world/obstacles/keep_out", "status"}
     shared |= {"plot/separation/min", "plot/separation/limit"}
     return {"/" + path for path in shared | {path.format(i) for path in each for i in range(AGENTS)}}
 
@@ -284,8 +285,8 @@ def test_stops_at_once_while_it_waits_for_a_router(tmp_path: Path) -> None:
 
 
 def test_ends_with_its_parent(endpoint: str, tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "swarmctl.telemetry.view.viewer", "--run", RUN, "--bus", endpoint, "--agents", "1"]
-    command += ["--run-dir", str(tmp_path), "--die-with-parent"]
+    command = [sys.executable, "-m", "swarmctl.telemetry.view.viewer", "--run", RUN, "--bus", endpoint]
+    command += ["--flight", json.dumps({"agents": [{}]}), "--run-dir", str(tmp_path), "--die-with-parent"]
     code = f"import subprocess, time; print(subprocess.Popen({command!r}).pid, flush=True); time.sleep(60)"
     parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
     assert parent.stdout is not None

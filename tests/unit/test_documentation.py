@@ -76,6 +76,17 @@ def test_quoted_files_and_modules_exist(page: Path) -> None:
     assert missing == []
 
 
+def test_what_troubleshooting_quotes_is_said_by_the_code() -> None:
+    code = "".join(path.read_text() for folder in ("swarmctl", "sitl") for path in (ROOT / folder).rglob("*.py"))
+    said = re.sub(r"\{[^{}]*\}", "...", re.sub(r'"\s*\n\s*f?"', "", code))  # literals on several lines are one
+    rows = re.findall(r"^\| (`.*?`.*?) \|", (ROOT / "docs" / "troubleshooting.md").read_text(), re.MULTILINE)
+    quoted = [text for row in rows for text in re.findall(r"`([^`]+)`", row)]
+    assert len(quoted) > 30
+    parts = {part.strip(" ().") for text in quoted for part in re.split(r"\.\.\.", text)}
+    unsaid = {part for part in parts if len(part) > 3 and part not in said}
+    assert unsaid == set(), "texts of the program have changed: follow them in docs/troubleshooting.md"
+
+
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 def test_links_lead_to_files(page: Path) -> None:
     links = re.findall(r"\]\(([^)#\s]+)[^)]*\)", page.read_text())

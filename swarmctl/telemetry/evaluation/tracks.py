@@ -16,6 +16,8 @@ from swarmctl.core.types import Array, Phase
 _GRID_US = 20_000
 _GAP_US = 500_000  # no interpolation between reported positions farther apart in time
 _STALE_MS = _GAP_US / 1e3  # an agent that receives nothing keeps recording the last known position
+_SAME_M = 0.05  # references closer than this are the same
+_DIFFERENT_01 = 0.02  # fraction of the mission in which they may be apart all the same: at their steps
 MAX_RUN_US = 48 * 3_600_000_000  # longest run; clocks farther apart belong to different runs
 
 
@@ -146,6 +148,31 @@ def true_positions(rows: NDArray[np.void], truth: NDArray[np.void], agent: int) 
         return np.where(heard[:, None], rows["pos_ned_m"], np.nan)
     own = truth[truth["vehicle"] == agent]
     return interpolate(rows["t_us"], own["t_us"], own["pos_ned_m"], _GAP_US)
+
+
+def shared_references(ticks: Mapping[int, NDArray[np.void]]) -> dict[int, list[int]]:
+    """Return the agents that have flown the same reference, by the lowest number among them.
+
+    Agents tick at different instants: references are compared at the same mission times.
+    """
+    found: dict[int, list[int]] = {}
+    flown = {agent: tracking_rows(rows) for agent, rows in sorted(ticks.items())}
+    for agent, rows in flown.items():
+        if len(rows):
+            same = (other for other in found if _apart_01(rows, flown[other]) < _DIFFERENT_01)
+            found.setdefault(next(same, agent), []).append(agent)
+    return found
+
+
+def _apart_01(rows: NDArray[np.void], others: NDArray[np.void]) -> float:
+    """Return the fraction of the mission time of both agents in which their references are apart."""
+    times_s, others_s = rows["mission_t_s"], others["mission_t_s"]
+    both = (times_s >= others_s[0]) & (times_s <= others_s[-1])
+    if not both.any():
+        return 1.0
+    theirs = [np.interp(times_s[both], others_s, others["ref_pos_ned_m"][:, k]) for k in range(3)]
+    apart_m = np.linalg.norm(rows["ref_pos_ned_m"][both] - np.column_stack(theirs), axis=1)
+    return float(np.mean(apart_m > _SAME_M))
 
 
 def track_error(rows: NDArray[np.void], truth: NDArray[np.void], agent: int) -> TrackError:

@@ -32,7 +32,8 @@ from swarmctl.telemetry.recording.run_files import (
     utc_us_of,
     write_parquet,
 )
-from swarmctl.telemetry.report.run_report import REPORT, write_report
+from swarmctl.telemetry.report.comparison import JudgedRun, write_comparison
+from swarmctl.telemetry.report.run_report import FIGURES, REPORT, write_figures, write_report
 
 _LAUNCHES_PER_SECOND = 1000
 
@@ -131,19 +132,62 @@ def report_run(directory: Path, rules: Rules) -> Path:
         ConfigError: a file in the folder has not the expected content.
         StartError: the folder can't be written to.
     """
-    summary = read_summary(directory)
-    if summary is None:
+    if read_summary(directory) is None:
         finished = finish_run(
             directory, rules, Outcome(outcome="failed", problems=("the launcher did not finish this run",))
         )
         if finished.unwritten:
             raise StartError(f"{directory}: can't be written: {'; '.join(finished.unwritten)}")
         return directory / REPORT
-    refuse_other_swarm(directory, summary, rules.agents)
+    judged = read_judged(directory, rules)
     try:
-        return write_report(directory, load_run(directory), summary, read_text(directory / CONFIG), rules=rules)
+        return write_report(directory, judged.run, judged.summary, judged.config_text, rules=rules)
     except OSError as error:
         raise StartError(f"{directory / REPORT}: can't be written: {error.strerror or error}") from error
+
+
+def write_run_figures(directory: Path, rules: Rules) -> Path:
+    """Write every figure of a finished run as an SVG file; returns their folder.
+
+    Raises:
+        ConfigError: the run is not finished, or a file in the folder has not the expected content.
+        StartError: the folder can't be written to.
+    """
+    judged = read_judged(directory, rules)
+    if (directory / FIGURES).is_symlink():
+        raise ConfigError(str(directory / FIGURES), ["is a symbolic link. Remove it"])
+    try:
+        return write_figures(directory, judged.run, judged.summary, rules=rules)
+    except OSError as error:
+        raise StartError(f"{directory / FIGURES}: can't be written: {error.strerror or error}") from error
+
+
+def compare_runs(path: Path, runs: Sequence[tuple[Path, Rules]]) -> Path:
+    """Write a page that sets finished runs beside each other to `path`, and return it.
+
+    Raises:
+        ConfigError: a run is not finished, or a file of it has not the expected content.
+        StartError: the page can't be written.
+    """
+    judged = [read_judged(directory, rules) for directory, rules in runs]
+    try:
+        return write_comparison(path, judged)
+    except OSError as error:
+        raise StartError(f"{path}: can't be written: {error.strerror or error}") from error
+
+
+def read_judged(directory: Path, rules: Rules) -> JudgedRun:
+    """Return a finished run with its summary.
+
+    Raises:
+        ConfigError: it is not finished, or a file in the folder has not the expected content.
+    """
+    summary = read_summary(directory)
+    if summary is None:
+        raise ConfigError(str(directory), [f"holds no {SUMMARY}. Complete the run: swarmctl report {directory}"])
+    refuse_other_swarm(directory, summary, rules.agents)
+    config_text = read_text(directory / CONFIG)
+    return JudgedRun(directory.resolve().name, load_run(directory), summary, rules, config_text)
 
 
 def _merged(*sources: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:

@@ -16,12 +16,13 @@ from markupsafe import Markup
 from numpy.typing import NDArray
 
 from swarmctl.core.types import Array
-from swarmctl.telemetry.palette import LIMIT_RGB, agent_rgb, css
+from swarmctl.telemetry.palette import agent_rgb, css
 from swarmctl.telemetry.report import svg
-from swarmctl.telemetry.report.svg import Axis, Stroke, dot, element
+from swarmctl.telemetry.report.svg import Axis, Figure, Stroke, dot, element
 
-REFERENCE_STYLE: Mapping[str, Any] = {"color": "#334155", "dash": "4 3", "width": 1.1}
+REFERENCE_STYLE: Mapping[str, Any] = {"color": "var(--reference)", "dash": "4 3", "width": 1.1}
 _MAX_DRAWN = 1e9  # larger values come from damaged recordings and would flatten all other curves
+_BAR_PX = 21  # from one bar to the next
 _LOOK_RAD, _DOWN_RAD = math.radians(35), math.radians(24)  # direction of the oblique view: east of north, and down
 
 
@@ -32,6 +33,7 @@ class Line(Stroke):
     x: Array  # (T,)
     y: Array  # (T,)
     marks: bool = False  # draw a dot on every point
+    end: str = ""  # name at its end, in a view from above
 
     def __post_init__(self) -> None:
         for name in ("x", "y"):
@@ -90,6 +92,14 @@ class Ball(NamedTuple):
     style: Literal["obstacle", "keepout"]
 
 
+class Goal(NamedTuple):
+    """A place where a reference comes to rest, in the view from above."""
+
+    pos_ned_m: Array  # (3,)
+    label: str
+    color: str
+
+
 def time_chart(
     title: str,
     lines: Sequence[Line],
@@ -102,7 +112,7 @@ def time_chart(
     from_zero: bool = False,
     ceiling: float | None = None,
     windows: Sequence[Window] = (),
-) -> Markup:
+) -> Figure:
     """Return a chart over time.
 
     Args:
@@ -133,7 +143,9 @@ def time_chart(
     return svg.figure(title, height, [behind, svg.grid(x, y), clipped], lines)
 
 
-def top_view(title: str, lines: Sequence[Line], balls: Sequence[Ball], points: int = 600) -> Markup:
+def top_view(
+    title: str, lines: Sequence[Line], balls: Sequence[Ball], points: int = 600, *, goals: Sequence[Goal] = ()
+) -> Figure:
     """Return a view from above with equal scales; x of the lines is to the right (east), y up (north)."""
     edges = [(np.array(ball.center_ned_m), np.array([-ball.radius_m, ball.radius_m])) for ball in balls]
     x_low, x_high = _value_range([line.x for line in lines] + [center[1] + edge for center, edge in edges])
@@ -151,12 +163,18 @@ def top_view(title: str, lines: Sequence[Line], balls: Sequence[Ball], points: i
     for line in lines:
         kept = _evenly_spaced(len(line.x), points)
         parts.append(_curve(line, x, y, line.x[kept], y_values=line.y[kept]))
-        if line.label and len(line.x) and np.isfinite(line.y[-1]):
-            parts.append(dot(float(x.px(line.x[-1])), float(y.px(line.y[-1])), 4, line.color))
+        if line.label and not line.dash and len(line.x) and np.isfinite(line.y[-1]):
+            at = float(x.px(line.x[-1])), float(y.px(line.y[-1]))
+            parts.append(dot(*at, 4, line.color))
+            parts += [svg.tick(at[0] + 7, at[1] - 8, line.end, "start")] if line.end else []
+    for goal in goals:
+        cx, cy = float(x.px(goal.pos_ned_m[1])), float(y.px(goal.pos_ned_m[0]))
+        ring = element("circle", cx=cx, cy=cy, r="7", fill="none", stroke=goal.color, stroke_width="2")
+        parts += [ring, svg.tick(cx + 11, cy + 10, goal.label, "start")]
     return svg.figure(title, height, parts, lines)
 
 
-def space_view(title: str, lines: Sequence[SpaceLine], balls: Sequence[Ball] = (), points: int = 600) -> Markup:
+def space_view(title: str, lines: Sequence[SpaceLine], balls: Sequence[Ball] = (), points: int = 600) -> Figure:
     """Return a view from the south-west and above; north is to the left, east to the right.
 
     Scales are equal, so that balls are round. Without balls, paths far taller or flatter than wide are drawn with
@@ -236,7 +254,7 @@ class _Oblique:
         return svg.polyline(px, py, class_=style)
 
     def _tick(self, at_ned_m: tuple[float, float, float], value: float, anchor: str, below: float = 13) -> Markup:
-        return self._text(at_ned_m, f"{value:g}", anchor, -5 if anchor == "end" else 5, below=below)
+        return self._text(at_ned_m, f"{value:g}", anchor, -5 if anchor == "end" else 5, below=below - 3.5)
 
     def _text(
         self, at_ned_m: tuple[float, float, float], text: str, anchor: str, right: float, *, below: float
@@ -245,21 +263,21 @@ class _Oblique:
         return svg.tick(px + right, py + below, text, anchor)
 
 
-def state_bars(title: str, rows: Sequence[tuple[str, Sequence[Span]]], x_range: tuple[float, float]) -> Markup:
+def state_bars(title: str, rows: Sequence[tuple[str, Sequence[Span]]], x_range: tuple[float, float]) -> Figure:
     """Return one bar for each row, coloured by state."""
     low, high = svg.widened(*x_range)
     x = Axis(low=low, high=high, first=svg.LEFT_PX + 40, last=svg.WIDTH_PX - svg.RIGHT_PX)
     parts, states = [], {}
     for number, (label, spans) in enumerate(rows):
-        top = svg.TOP_PX + 18 * number
-        parts.append(svg.tick(svg.LEFT_PX + 34, top + 10, label, "end"))
+        top = svg.TOP_PX + _BAR_PX * number
+        parts.append(svg.tick(svg.LEFT_PX + 34, top + 8, label, "end"))
         for span in spans:
             left, right = map(float, x.px(np.array([span.start, span.end])))
             states[span.name] = Stroke(color=span.color, label=span.name)
             words = element("title", f"{span.name} {span.start:.1f} to {span.end:.1f} s")
-            place = {"x": left, "y": top, "width": max(0.6, right - left), "height": 13}
+            place = {"x": left, "y": top, "width": max(0.6, right - left), "height": 16}
             parts.append(element("rect", words, **place, fill=span.color))
-    height = svg.TOP_PX + 18 * len(rows) + svg.BOTTOM_PX
+    height = svg.TOP_PX + _BAR_PX * len(rows) + svg.BOTTOM_PX
     parts.append(svg.axis_below(x, Axis(low=0.0, high=1.0, first=height - svg.BOTTOM_PX, last=svg.TOP_PX)))
     return svg.figure(title, height, parts, states.values())
 
@@ -304,10 +322,10 @@ def _window(window: Window, x: Axis, y: Axis) -> Markup:
 
 
 def _limit(limit: Limit, x: Axis, y: Axis) -> Markup:
-    py, color = float(y.px(limit.value)), css(LIMIT_RGB)
-    line = element("path", d=f"M{x.first} {py:.1f}H{x.last}", stroke=color, stroke_width="1.2", stroke_dasharray="5 4")
-    place = {"x": x.last - 4, "y": py + 12}
-    name = element("text", limit.label, **place, class_="tick", style=f"fill:{color}", text_anchor="end")
+    py = float(y.px(limit.value))
+    place = {"d": f"M{x.first} {py:.1f}H{x.last}", "stroke_width": "1.2", "stroke_dasharray": "5 4"}
+    line = element("path", class_="limit", **place)
+    name = element("text", limit.label, x=x.last - 4, y=py, dy="1.1em", class_="tick name", text_anchor="end")
     return Markup("").join([line, name])
 
 

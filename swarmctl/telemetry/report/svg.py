@@ -16,7 +16,8 @@ from swarmctl.core.types import Array
 from swarmctl.telemetry.report.pages import render
 
 WIDTH_PX = 640
-LEFT_PX, RIGHT_PX, TOP_PX, BOTTOM_PX = 52, 12, 8, 24  # margins around the plot
+LEFT_PX, RIGHT_PX, TOP_PX, BOTTOM_PX = 62, 12, 8, 30  # margins around the plot: texts grow on narrow screens
+_LEGEND_PX, _CHARACTER_PX = 18, 6.5  # of a figure as a file: height of a row of its legend, width of a character
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,32 +82,71 @@ def dot(px: float, py: float, radius: float, color: str) -> Markup:
 
 
 def tick(px: float, py: float, text: str, anchor: str) -> Markup:
-    """Return a small text whose `anchor` (start, middle, end) is at a point."""
-    return element("text", text, class_="tick", x=px, y=py, text_anchor=anchor)
+    """Return a small text whose `anchor` (start, middle, end), half way up, is at a point."""
+    return element("text", text, class_="tick", x=px, y=py, dy=".32em", text_anchor=anchor)
 
 
 def grid(x: Axis, y: Axis) -> Markup:
     """Return horizontal lines with their values, and the axis below with its own."""
     parts = []
-    for value in round_numbers(y.low, y.high, 5):
+    for value in round_numbers(y.low, y.high, 4):
         py = float(y.px(value))
         parts.append(element("path", class_="grid", d=f"M{x.first} {py:.1f}H{x.last}"))
-        parts.append(tick(x.first - 6, py + 3.5, f"{value:g}", "end"))
+        parts.append(tick(x.first - 6, py, f"{value:g}", "end"))
     return Markup("").join([*parts, axis_below(x, y)])
 
 
 def axis_below(x: Axis, y: Axis) -> Markup:
     """Return the horizontal axis with its ticks."""
     line = element("path", class_="axis", d=f"M{x.first} {y.first:.1f}H{x.last}")
-    values = round_numbers(x.low, x.high, 8)
-    ticks = [tick(float(x.px(value)), float(y.first + 15), f"{value:g}", "middle") for value in values]
+    values = round_numbers(x.low, x.high, 7)
+    ticks = [tick(float(x.px(value)), float(y.first + 16), f"{value:g}", "middle") for value in values]
     return Markup("").join([line, *ticks])
 
 
-def figure(title: str, height_px: float, parts: Iterable[str], legend: Iterable[Stroke]) -> Markup:
-    """Return the content of a `<figure>`: title, drawing and a legend of the strokes that have a name."""
-    drawing = element("svg", *parts, viewBox=f"0 0 {WIDTH_PX} {height_px:.0f}", role="img")
-    return render(__package__, "chart.html", title=title, drawing=drawing, legend=legend)
+class Figure(Markup):
+    """The content of a `<figure>`: title, drawing and legend. It is also a drawing that can be kept as a file."""
+
+    heading: str
+    _drawing: Markup
+    _height_px: float
+    _legend: Sequence[Stroke]
+
+    def as_file(self) -> str:
+        """Return a whole SVG document, in light colours, with title and legend."""
+        keys, rows = _legend_keys(self._legend, self._height_px + 2 * _LEGEND_PX)
+        height_px = self._height_px + _LEGEND_PX * (1.5 + rows)
+        return render(
+            __package__,
+            "figure.svg",
+            title=self.heading,
+            drawing=self._drawing,
+            keys=keys,
+            width_px=WIDTH_PX,
+            height_px=height_px,
+        )
+
+
+def figure(title: str, height_px: float, parts: Iterable[str], legend: Iterable[Stroke]) -> Figure:
+    """Return a figure with a legend of the strokes that have a name."""
+    inside, named = Markup("").join(parts), [key for key in legend if key.label]
+    drawing = element("svg", inside, viewBox=f"0 0 {WIDTH_PX} {height_px:.0f}", role="img")
+    drawn = Figure(render(__package__, "chart.html", title=title, drawing=drawing, legend=named))
+    drawn.heading, drawn._drawing, drawn._height_px, drawn._legend = title, inside, height_px, named
+    return drawn
+
+
+def _legend_keys(legend: Sequence[Stroke], top_px: float) -> tuple[Markup, int]:
+    """Return line and name of every stroke, in rows from `top_px` down, and the number of rows."""
+    keys, px, row = [], float(LEFT_PX), 0
+    for key in legend:
+        width_px = 38 + _CHARACTER_PX * len(key.label)
+        if px + width_px > WIDTH_PX and px > LEFT_PX:
+            px, row = float(LEFT_PX), row + 1
+        py = top_px + _LEGEND_PX * row
+        keys += [key.along(np.array([px, px + 18]), np.array([py, py])), tick(px + 23, py, key.label, "start")]
+        px += width_px
+    return Markup("").join(keys), row + 1 if legend else 0
 
 
 def widened(low: float, high: float) -> tuple[float, float]:

@@ -6,26 +6,26 @@ import os
 import subprocess
 import time
 import uuid
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
 
-from swarmctl.core.obstacle import Obstacle
+from swarmctl.core.records import NO_POINTS
+from swarmctl.core.types import Array
 from swarmctl.errors import StartError
 from swarmctl.files import replaced_by_program
 from swarmctl.telemetry.evaluation.referee import RunData
-
-if TYPE_CHECKING:
-    from swarmctl.telemetry.view.layout import SceneBounds  # rerun takes a second to import
+from swarmctl.telemetry.scene.viewed_flight import ViewedFlight
 
 RECORDING = "telemetry.rrd"
 APPLICATION = "swarmctl"
 _MIN_RECORDING_BYTES = 4096  # a smaller packed recording contains no entity and is rejected
 _CHUNK_TICKS = 50  # ticks of an agent sent at once: one second
 _VIEWER_PORT_OPTIONS = ("--bind", "127.0.0.1", "--port", "auto")  # the default port would loop data back to our server
+NO_PLANS: Mapping[int, NDArray[np.void]] = MappingProxyType({})
 _WINDOW_MEMORY = "2GB"  # the viewer's own default is 75 % of the machine
 
 
@@ -99,57 +99,57 @@ def _packed(source: Path, packed: Path, timeout_s: float) -> bool:
 
 
 def simulated_recording(
-    directory: Path,
-    run: RunData,
-    agents: int,
-    separation_m: float,
-    *,
-    limit_m: float,
-    obstacles: Sequence[Obstacle] = (),
+    directory: Path, run: RunData, flight: ViewedFlight, plans: Mapping[int, NDArray[np.void]] = NO_PLANS
 ) -> Path:
-    """Write `telemetry.rrd` of a finished run from its recorded ticks, which contain no predicted paths.
+    """Write `telemetry.rrd` of a finished run from what it has recorded.
 
     Args:
         directory: the run folder.
         run: the recorded run.
-        agents: size of the swarm.
-        separation_m: separation that agents keep.
-        limit_m: distance below which the referee sees a violation.
-        obstacles: of the configuration.
+        flight: what is shown; its bounds are replaced by those of what was flown.
+        plans: predicted paths of each agent, rows of `PLAN_DTYPE`.
     """
     import rerun as rr
 
-    from swarmctl.telemetry.view.scene import Scene
+    from swarmctl.telemetry.scene.scene import Scene
 
     path = directory / RECORDING
     rec = rr.RecordingStream(APPLICATION, recording_id=f"{directory.resolve().name}-{uuid.uuid4().hex[:8]}")
     rec.set_log_time_enabled(False)
     rec.set_sinks(rr.FileSink(path))
-    flown = {agent: rows for agent, rows in run.ticks.items() if agent < agents and len(rows)}
-    scene = Scene(rec, agents, separation_m, limit_m, bounds=_bounds(flown))
+    flown = {agent: rows for agent, rows in run.ticks.items() if agent < len(flight.agents) and len(rows)}
+    scene = Scene(rec, _fitted(flight, flown))
     scene.begin()
     epoch_us = min((int(rows["utc_us"][0]) for rows in flown.values()), default=0)
-    scene.obstacles(obstacles, 0, 0.0)
+    scene.obstacles(flight.obstacles, 0, 0.0)
     for first in range(0, max(map(len, flown.values()), default=0), _CHUNK_TICKS):
         for agent, rows in flown.items():
             chunk = rows[first : first + _CHUNK_TICKS]
-            scene.ticks(agent, chunk["utc_us"] - epoch_us, chunk, None)
-        if any(obstacle.moves for obstacle in obstacles):
-            scene.obstacles(obstacles, first * 20_000, first * 0.02)
+            scene.ticks(agent, chunk["utc_us"] - epoch_us, chunk)
+        if any(obstacle.moves for obstacle in flight.obstacles):
+            scene.obstacles(flight.obstacles, first * 20_000, first * 0.02)
         scene.plots()
+    for agent, rows in flown.items():
+        offset_us = int(rows["utc_us"][0] - rows["t_us"][0]) - epoch_us
+        t_us, paths_ned_m = _paths(plans.get(agent, NO_POINTS))
+        scene.plans(agent, t_us + offset_us, paths_ned_m)
     rec.flush(timeout_sec=30)
     rec.disconnect()
     return path
 
 
-def _bounds(flown: Mapping[int, NDArray[np.void]]) -> SceneBounds:
-    """Return bounds that contain every flown position."""
-    from swarmctl.telemetry.view.layout import SceneBounds
+def _paths(points: NDArray[np.void]) -> tuple[NDArray[np.int64], list[Array]]:
+    """Return the times (P,) at which predicted paths were flown, and the paths, (M, 3) each."""
+    t_us, begins = np.unique(points["t_us"], return_index=True)
+    return t_us, np.split(points["pos_ned_m"].astype(np.float64), begins[1:]) if len(t_us) else []
 
-    pos_ned_m = np.concatenate([rows["pos_ned_m"] for rows in flown.values()]) if flown else np.zeros((1, 3))
+
+def _fitted(flight: ViewedFlight, flown: Mapping[int, NDArray[np.void]]) -> ViewedFlight:
+    """Return the flight with bounds that contain every flown position."""
+    pos_ned_m = np.concatenate([rows["pos_ned_m"] for rows in flown.values()]) if flown else np.zeros((0, 3))
     pos_ned_m = pos_ned_m[np.isfinite(pos_ned_m).all(axis=1)]
     if not len(pos_ned_m):
-        return SceneBounds()
+        return flight
     low, high = pos_ned_m.min(axis=0), pos_ned_m.max(axis=0)
-    north_m, east_m, down_m = ((low + high) / 2).tolist()
-    return SceneBounds((north_m, east_m, down_m), float((high - low).max() / 2) + 1.0)
+    middle, extent_m = tuple(((low + high) / 2).tolist()), float((high - low).max() / 2) + 1.0
+    return flight.model_copy(update={"center_ned_m": middle, "extent_m": extent_m})

@@ -1,8 +1,8 @@
 """The only process that uses rerun: reads ticks from the bus, serves a live view and writes `telemetry.rrd`.
 
-`python -m swarmctl.telemetry.view.viewer --run R --bus ENDPOINT --agents N --run-dir DIR`. It only serves, so it can't
-delay an agent; if it freezes or is killed, only the view is lost. The launcher ends it by SIGTERM (SIGHUP works as well
-when it was started by hand); it ignores Ctrl-C.
+`python -m swarmctl.telemetry.view.viewer --run R --bus ENDPOINT --flight JSON --run-dir DIR`. It only serves, so it
+can't delay an agent; if it freezes or is killed, only the view is lost. The launcher ends it by SIGTERM (SIGHUP works
+as well when it was started by hand); it ignores Ctrl-C.
 """
 
 from __future__ import annotations
@@ -19,11 +19,11 @@ from typing import Any
 
 import psutil
 
-from swarmctl.bus.json_messages import decode_obstacles
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.errors import EXIT_OK, EXIT_USAGE, StartError, SwarmError
 from swarmctl.files import replace_text
 from swarmctl.process_lifetime import StopRequest, die_with_parent
+from swarmctl.telemetry.scene.viewed_flight import ViewedFlight
 from swarmctl.telemetry.view.recordings import APPLICATION, RECORDING, has_display, open_viewer
 from swarmctl.telemetry.view.view_ports import HOST, PORTS_TRIED, free_view_ports
 
@@ -42,12 +42,13 @@ def main(arguments: list[str] | None = None) -> int:
     stop = StopRequest(signal.SIGTERM, signal.SIGHUP)
     if options.die_with_parent:
         die_with_parent(signal.SIGTERM)
-    message = decode_obstacles(options.obstacles_json.encode())
-    if message is None:
-        print("viewer: --obstacles-json: give a message of obstacles, as on the bus", file=sys.stderr)
+    try:
+        flight = ViewedFlight.model_validate_json(options.flight)
+    except ValueError as error:
+        print(f"viewer: --flight: {error}", file=sys.stderr)
         return EXIT_USAGE
     try:
-        return _run(options, message.obstacles, stop)
+        return _run(options, flight, stop)
     except SwarmError as error:
         print(f"viewer: {error}", file=sys.stderr)
         return error.exit_code
@@ -59,39 +60,30 @@ def _parser() -> argparse.ArgumentParser:
     )
     parser.add_argument("--run", required=True, help="name of the run on the bus")
     parser.add_argument("--bus", required=True, help="Zenoh endpoint of the launcher's router")
-    parser.add_argument("--agents", type=int, required=True)
+    parser.add_argument("--flight", required=True, help="what is shown: a `ViewedFlight` as JSON")
     parser.add_argument("--run-dir", type=Path, required=True, help="folder for telemetry.rrd and viewer.url")
     parser.add_argument("--port", type=int, default=9876, help="loopback; the next free one when it is taken")
     parser.add_argument("--rate-hz", type=float, default=10.0, help="batches a second")
-    parser.add_argument("--separation", type=float, default=0.9, help="distance agents keep [m]")
-    parser.add_argument("--limit", type=float, help="distance that is a violation [m]; default: --separation")
-    parser.add_argument("--obstacles-json", default='{"version": 0, "obstacles": []}')
-    parser.add_argument("--look-at", type=float, nargs=3, default=(0.0, 0.0, -2.0), help="middle of the scene, NED [m]")
-    parser.add_argument("--extent", type=float, default=6.0, help="from there to the edge of the scene [m]")
     parser.add_argument("--view", action="store_true", help="open the native viewer when there is a display")
     parser.add_argument("--die-with-parent", action="store_true")
     return parser
 
 
-def _run(options: argparse.Namespace, obstacles: Sequence[Obstacle], stop: StopRequest) -> int:
+def _run(options: argparse.Namespace, flight: ViewedFlight, stop: StopRequest) -> int:
     from swarmctl.bus.zenoh_bus import ZenohBus
+    from swarmctl.telemetry.scene.scene import Scene
     from swarmctl.telemetry.view.feed import Feed, listens_to
-    from swarmctl.telemetry.view.layout import SceneBounds
-    from swarmctl.telemetry.view.scene import Scene
 
-    bus = _interruptible(lambda: ZenohBus(options.bus, options.run, "viewer", listens_to(options.agents)), stop)
+    agents = len(flight.agents)
+    bus = _interruptible(lambda: ZenohBus(options.bus, options.run, "viewer", listens_to(agents)), stop)
     if bus is None:
         return EXIT_OK
     rec, url = _serve(options.run, options.run_dir, options.port)
-    limit_m = options.separation if options.limit is None else options.limit
-    north_m, east_m, down_m = options.look_at
-    scene = Scene(
-        rec, options.agents, options.separation, limit_m, bounds=SceneBounds((north_m, east_m, down_m), options.extent)
-    )
+    scene = Scene(rec, flight)
     scene.begin()
-    feed = Feed(bus, options.agents)
+    feed = Feed(bus, agents)
     _announce(options, url)
-    Pump(feed, scene, obstacles).run(1.0 / options.rate_hz, stop)
+    Pump(feed, scene, flight.obstacles).run(1.0 / options.rate_hz, stop)
     _end(rec, bus, f"telemetry lost={feed.lost} received={feed.received} malformed={feed.malformed}")
     return EXIT_OK
 

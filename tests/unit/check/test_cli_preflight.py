@@ -5,17 +5,18 @@ from __future__ import annotations
 import importlib.metadata
 import io
 import json
-import re
 import signal
 import socket
 from pathlib import Path
 
+import numpy as np
 import pytest
 from rich.console import Console
 
 from swarmctl.bus.json_messages import StatusMessage
 from swarmctl.bus.zenoh_bus import SCHEME
 from swarmctl.config import Config, dump, load
+from swarmctl.config_view import viewed_flight
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, StartError, SwarmError
 from swarmctl.ops import operator, preflight
@@ -33,6 +34,7 @@ from swarmctl.ops.status_table import (
 from swarmctl.ops.summary import summary_lines, violation_lines
 from swarmctl.ops.supervisor import why_it_failed
 from swarmctl.process_lifetime import StopRequest
+from swarmctl.telemetry.scene.viewed_flight import ViewedFlight
 from tests import builders
 
 
@@ -144,7 +146,9 @@ def test_command_lines_say_what_the_configuration_says(tmp_path: Path) -> None:
         sock.close()
     viewer = viewer_command(config, context, 9876, view=False).argv
     assert "--view" not in viewer
-    assert viewer[viewer.index("--obstacles-json") + 1] == '{"version":1,"obstacles":[]}'
+    shown = ViewedFlight.model_validate_json(viewer[viewer.index("--flight") + 1])
+    assert shown == viewed_flight(config)
+    assert len(shown.agents) == config.swarm.agents
 
 
 def status(phase: int = Phase.TRACK, separation_m: float = 1.25, active_alert: str = "") -> StatusMessage:
@@ -282,10 +286,12 @@ def test_every_violation_is_said() -> None:
     assert hostile[0].endswith(r"1 violation: b\x1b[2J")
 
 
-def test_the_camera_is_given_numbers_argparse_does_not_take_for_options() -> None:
-    """`-5e-05` would be an option to argparse; the circle's middle is such a number."""
-    config = load(None)
-    argv = viewer_command(config, RunContext("run", "endpoint", Path("dir")), 9877, view=False).argv
-    at = argv.index("--look-at")
-    assert all(re.fullmatch(r"-?\d+\.\d+", number) for number in argv[at + 1 : at + 4])
-    assert float(argv[argv.index("--extent") + 1]) > 5.0
+def test_the_view_is_told_of_goals_where_references_come_to_rest() -> None:
+    circle = viewed_flight(load(None))
+    assert {bounds.goal_ned_m for bounds in circle.agents} == {None}
+    assert 5.0 < circle.extent_m < 7.0
+    goals = ((4.0, 0.0, -2.0), (0.0, 4.0, -2.0))
+    there = ["swarm.agents=2", "mission.kind=goto", f"mission.goto.goals_ned_m={[list(goal) for goal in goals]}"]
+    shown = viewed_flight(load(None, [*there, "vehicle_model.tilt_max_rad=0.3"]))
+    assert np.allclose([bounds.goal_ned_m for bounds in shown.agents if bounds.goal_ned_m], goals)
+    assert {bounds.tilt_max_rad for bounds in shown.agents} == {0.3}

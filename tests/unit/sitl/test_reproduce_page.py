@@ -271,7 +271,7 @@ def test_the_reference_leads_through_the_box_of_the_obstacle() -> None:
     for number in (90, 91):
         (figure,) = (figure for figure in FIGURES if figure.number == number)
         drawing = draw(figure, [trace], points=5000)
-        (reference,) = re.findall(r'd="M([^"]*)" stroke="#334155"', drawing)
+        (reference,) = re.findall(r'd="M([^"]*)" stroke="var\(--reference\)"', drawing)
         curve = np.array([pair.split() for pair in reference.split("L")], np.float64)
         for style in ("obstacle", "keepout"):
             box = re.search(rf'class="{style}" x="([\d.]+)" y="([\d.]+)" width="([\d.]+)" height="([\d.]+)"', drawing)

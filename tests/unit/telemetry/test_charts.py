@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from swarmctl.telemetry.report import svg
 from swarmctl.telemetry.report.charts import Ball, Line, SpaceLine, Window, space_view, time_chart
 
 Array = NDArray[np.float64]
@@ -88,11 +89,11 @@ def test_a_window_is_cut_where_it_leaves_the_chart() -> None:
     found = re.search(r'<rect class="obstacle" x="([\d.]+)" y="([\d.]+)" width="([\d.]+)" height="([\d.]+)"/>', drawing)
     assert found is not None
     x, y, width, height = (float(value) for value in found.groups())
-    wide = 640 - 52 - 12
-    assert x == pytest.approx(52 + 0.4 * wide, abs=0.1)
+    wide = 640 - svg.LEFT_PX - svg.RIGHT_PX
+    assert x == pytest.approx(svg.LEFT_PX + 0.4 * wide, abs=0.1)
     assert width == pytest.approx(0.2 * wide, abs=0.1)
     assert y == 8.0
-    assert 0 < height < 170 - 8 - 24
+    assert 0 < height < 170 - svg.TOP_PX - svg.BOTTOM_PX
 
 
 def test_marks_are_on_the_known_points() -> None:

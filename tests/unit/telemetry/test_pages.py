@@ -34,7 +34,7 @@ def test_another_package_extends_the_shared_page(tmp_path: Path) -> None:
     page = write_campaign(directory, []).read_text(encoding="utf-8")
     assert page.startswith("<!doctype html>\n<html lang=en>\n<head>")
     assert f"<title>Campaign {ESCAPED}</title>" in page
-    assert ":root { color-scheme: light }" in page
+    assert ":root { color-scheme: light dark }" in page
     assert page.endswith("</html>\n")
 
 
@@ -60,5 +60,5 @@ def test_ticks_stand_at_round_numbers_below_their_value() -> None:
     x = Axis(low=-0.1, high=10.1, first=50, last=50 + 102)
     drawn = axis_below(x, Axis(low=0.0, high=1.0, first=80, last=0))
     assert drawn.startswith('<path class="axis" d="M50 80.0H152"/>')
-    assert '<text class="tick" x="51.0" y="95.0" text-anchor="middle">0</text>' in drawn
-    assert '<text class="tick" x="151.0" y="95.0" text-anchor="middle">10</text>' in drawn
+    assert '<text class="tick" x="51.0" y="96.0" dy=".32em" text-anchor="middle">0</text>' in drawn
+    assert '<text class="tick" x="151.0" y="96.0" dy=".32em" text-anchor="middle">10</text>' in drawn

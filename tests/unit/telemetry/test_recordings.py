@@ -23,10 +23,11 @@ from swarmctl.errors import StartError
 from swarmctl.telemetry.evaluation.attitude import roll_pitch_rad
 from swarmctl.telemetry.evaluation.referee import RunData
 from swarmctl.telemetry.palette import MODE_RGB, PHASE_RGB, agent_rgb
+from swarmctl.telemetry.scene.quad_mesh import quad_glb
+from swarmctl.telemetry.scene.separation_feed import SeparationFeed
+from swarmctl.telemetry.scene.viewed_flight import AgentBounds, ViewedFlight
 from swarmctl.telemetry.view.feed import AgentClock
-from swarmctl.telemetry.view.quad_mesh import quad_glb
 from swarmctl.telemetry.view.recordings import open_viewer, optimize_recording, simulated_recording
-from swarmctl.telemetry.view.separation_feed import SeparationFeed
 
 NO_TRUTH = np.zeros(0, TRUTH_DTYPE)
 
@@ -43,12 +44,16 @@ def flown(agent: int, count: int = 120) -> NDArray[np.void]:
     return rows
 
 
+def viewed(agents: int, **more: Any) -> ViewedFlight:
+    return ViewedFlight(agents=(AgentBounds(),) * agents, **more)
+
+
 def test_offline_recording_holds_the_run_and_can_be_packed(tmp_path: Path) -> None:
     from rerun.chunk import RrdReader
 
     run = RunData({0: flown(0), 1: flown(1)}, NO_TRUTH, [])
     obstacle = Obstacle(center_ned_m=(5.0, 0.0, 0.0))
-    path = simulated_recording(tmp_path, run, 2, 0.9, limit_m=0.85, obstacles=[obstacle])
+    path = simulated_recording(tmp_path, run, viewed(2, obstacles=(obstacle,)))
     assert optimize_recording(tmp_path)
     rows: dict[str, int] = {}
     distances: list[float] = []
@@ -81,7 +86,7 @@ def test_recording_that_cannot_be_packed_stays(tmp_path: Path) -> None:
 def test_recording_that_is_a_link_is_not_packed(tmp_path: Path) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "received").mkdir()
-    mine = simulated_recording(tmp_path / "mine", RunData({0: flown(0)}, NO_TRUTH, []), 1, 0.9, limit_m=0.85)
+    mine = simulated_recording(tmp_path / "mine", RunData({0: flown(0)}, NO_TRUTH, []), viewed(1))
     before = mine.read_bytes()
     link = tmp_path / "received" / "telemetry.rrd"
     link.symlink_to(mine)
@@ -91,7 +96,7 @@ def test_recording_that_is_a_link_is_not_packed(tmp_path: Path) -> None:
 
 
 def test_recording_of_a_killed_viewer_is_repaired(tmp_path: Path) -> None:
-    path = simulated_recording(tmp_path, RunData({0: flown(0)}, NO_TRUTH, []), 1, 0.9, limit_m=0.85)
+    path = simulated_recording(tmp_path, RunData({0: flown(0)}, NO_TRUTH, []), viewed(1))
     path.write_bytes(path.read_bytes()[:-30_000])
     assert optimize_recording(tmp_path)
     assert path.stat().st_size > 20_000

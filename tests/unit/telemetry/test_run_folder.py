@@ -115,7 +115,7 @@ def test_parquet_says_unit_meaning_and_version(tmp_path: Path) -> None:
     schema = pq.read_schema(tmp_path / "agent-1.parquet")
     assert schema.metadata[b"swarmctl_version"].decode() == __version__
     told = schema.field("ref_pos_ned_m_y").metadata
-    assert told == {b"unit": b"m", b"description": b"the mission's reference now", b"entity": b"world/reference"}
+    assert told == {b"unit": b"m", b"description": b"the mission's reference now", b"entity": b"world/reference/{}"}
     assert [field.name for field in schema] == [part for column in COLUMNS for part in column.parts]
     assert all(field.metadata[b"description"] for field in schema)
     named = {"phase": Phase, "mode": Mode, "flight_mode": FlightMode, "plan_status": PlanStatus}

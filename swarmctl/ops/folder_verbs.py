@@ -1,0 +1,69 @@
+"""The verbs that are given run folders: replay, report, bundle."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from swarmctl.errors import EXIT_OK, ConfigError
+
+Folder = Annotated[Path, typer.Argument(help="Run folder.")]
+
+
+def add_folder_verbs(app: typer.Typer) -> None:
+    """Add the verbs to the command line."""
+    for verb in (replay, report, bundle):
+        app.command()(verb)
+
+
+def replay(folder: Folder) -> int:
+    """Open the recording of a run."""
+    from swarmctl.telemetry.view.recordings import RECORDING, open_viewer
+
+    open_viewer(str(folder / RECORDING))
+    return EXIT_OK
+
+
+def report(
+    folders: Annotated[list[Path], typer.Argument(help="Run folder, or several to compare.")],
+    figures: Annotated[
+        bool, typer.Option("--figures", help="Also write every figure as an SVG file into figures/ of the folder.")
+    ] = False,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            "--output", metavar="FILE", help="Page to write when runs are compared; default: beside the last."
+        ),
+    ] = None,
+) -> int:
+    """Write the report of a run again, and complete a run that was cut off; set several runs beside each other."""
+    from swarmctl.ops.summary import compare, rewrite_report, write_figures
+
+    if len(folders) > 1:
+        if figures:
+            raise ConfigError("--figures", ["the figures of one run are written at a time; give one run folder"])
+        print(compare(folders, output))
+        return EXIT_OK
+    if output is not None:
+        raise ConfigError("--output", ["only a page that compares runs is written elsewhere; give several folders"])
+    print(rewrite_report(folders[0]))
+    if figures:
+        print(write_figures(folders[0]))
+    return EXIT_OK
+
+
+def bundle(
+    folder: Folder,
+    output: Annotated[
+        Path | None, typer.Option("--output", metavar="FILE", help="Archive to write; default: beside the folder.")
+    ] = None,
+    logs: Annotated[int, typer.Option("--logs", min=0, help="Newest logs to download from each vehicle.")] = 1,
+) -> int:
+    """Pack a run for support: its folder, versions, and logs of the disarmed vehicles that are reached."""
+    from swarmctl.ops.bundle import BundleOptions
+    from swarmctl.ops.bundle import bundle as pack
+
+    print(pack(BundleOptions(folder=folder, output=output, logs=logs)))
+    return EXIT_OK

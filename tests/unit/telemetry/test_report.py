@@ -1,0 +1,175 @@
+"""Tests of what reports show: references and goals of each agent, narrow and dark screens, files, runs compared."""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from swarmctl.config import Config, dump, load_recorded
+from swarmctl.core.types import Phase
+from swarmctl.errors import ConfigError
+from swarmctl.ops.folder_verbs import report
+from swarmctl.telemetry.evaluation.tracks import shared_references
+from swarmctl.telemetry.palette import agent_rgb, css
+from swarmctl.telemetry.recording.run_files import load_run
+from swarmctl.telemetry.recording.run_folder import Outcome, finish_run
+from swarmctl.telemetry.report import svg
+from swarmctl.telemetry.report.comparison import differences
+from tests.unit.telemetry.test_run_folder import flight, write_run
+
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+def finish(directory: Path, seconds: float = 6.0, goals: bool = False, **keys: object) -> Path:
+    """Write a finished run of three agents; with `goals` each has a reference that ends at a place of its own."""
+    directory.mkdir()
+    write_run(directory, 3, seconds)
+    if goals:
+        for agent in range(3):
+            own_goal(agent, seconds).tofile(directory / f"agent-{agent}.ticks")
+    config = Config(**keys)  # type: ignore[arg-type]
+    (directory / "config.toml").write_text(dump(config))
+    finish_run(directory, config.rules(), Outcome(outcome="completed"))
+    return directory
+
+
+def own_goal(agent: int, seconds: float) -> NDArray[np.void]:
+    rows, _ = flight(agent, 3, seconds)
+    tracking = rows["phase"] == Phase.TRACK
+    rows["ref_pos_ned_m"][tracking] = (3.0 * agent, -2.0, -1.0)
+    rows["ref_pos_ned_m"][tracking, 1] += np.linspace(-1.0, 0.0, tracking.sum()).clip(max=-0.2)
+    return rows
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return finish(tmp_path_factory.mktemp("runs") / "first", goals=True)
+
+
+@pytest.fixture(scope="module")
+def shared(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return finish(tmp_path_factory.mktemp("runs") / "second", seconds=7.0, seed=5)
+
+
+def figures(page: str) -> dict[str, str]:
+    """Return the figures of a page by their titles."""
+    parts = re.findall(r"<figure[^>]*><figcaption>(.*?)</figcaption>(.*?)</figure>", page, re.DOTALL)
+    return dict(parts)
+
+
+def dashed(figure: str) -> list[str]:
+    return re.findall(r'<path d="[^"]+" stroke="([^"]+)" [^>]*stroke-dasharray', figure)
+
+
+def test_every_agent_has_its_own_reference_and_goal(folder: Path) -> None:
+    drawn = figures((folder / "report.html").read_text())
+    colors = [css(agent_rgb(agent)) for agent in range(3)]
+    for title in ("From above: north up, east right [m]", "x north [m]", "y east [m]", "z down [m]"):
+        assert dashed(drawn[title]) == colors, title
+    above = drawn["From above: north up, east right [m]"]
+    assert re.findall(r">(goal[^<]*)</text>", above) == ["goal 0", "goal 1", "goal 2"]
+    assert re.findall(r'<circle [^>]*fill="none" stroke="([^"]+)"', above) == colors
+
+
+def test_a_reference_that_all_share_is_drawn_once_and_one_that_moves_on_is_no_goal(shared: Path) -> None:
+    drawn = figures((shared / "report.html").read_text())
+    for title in ("From above: north up, east right [m]", "x north [m]"):
+        assert dashed(drawn[title]) == ["var(--reference)"], title
+    assert "goal" not in drawn["From above: north up, east right [m]"]
+
+
+def test_references_are_compared_at_the_same_mission_times() -> None:
+    late = flight(1, 3, 6.0)[0][7:]
+    late["mission_t_s"] += 0.007
+    late["ref_pos_ned_m"][:, 0] += 0.01
+    away = flight(2, 3, 6.0)[0]
+    away["ref_pos_ned_m"][-80:, 2] -= 1.0  # parts from the others at the end only
+    assert shared_references({0: flight(0, 3, 6.0)[0], 1: late, 2: away}) == {0: [0, 1], 2: [2]}
+
+
+def test_every_colour_of_a_page_is_known_by_day_and_in_the_dark(folder: Path) -> None:
+    page = (folder / "report.html").read_text()
+    light, dark = page.split("@media (prefers-color-scheme: dark)", 1)
+    used = set(re.findall(r"var\((--[a-z-]+)\)", page))
+    assert len(used) > 10
+    for sheet in (light, dark.split("} }", 1)[0]):
+        assert used - set(re.findall(r"(--[a-z-]+):", sheet)) == set()
+    assert "color-scheme: light dark" in page
+
+
+def test_axes_can_be_read_on_a_phone(folder: Path) -> None:
+    page = (folder / "report.html").read_text()
+    base_px = float(re.findall(r"\.tick \{ font: (\d+)px", page)[0])
+    rules = [
+        (float(w), float(px)) for w, px in re.findall(r"max-width: (\d+)px\) \{ \.tick \{ font-size: (\d+)px", page)
+    ]
+    for width_px in range(280, 641):  # of the figure; a drawing is scaled to it
+        size_px = [base_px, *(px for most_px, px in rules if width_px <= most_px)][-1] * width_px / svg.WIDTH_PX
+        assert size_px >= 10.0, width_px
+    widest_px = 0.6 * max(px for _, px in rules) * len("-0.5")
+    assert widest_px < svg.LEFT_PX, "the largest text has room beside the axis"
+
+
+def test_every_figure_is_written_as_a_drawing_of_its_own(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    report([folder], figures=True)
+    assert capsys.readouterr().out.split() == [str(folder / "report.html"), str(folder / "figures")]
+    titles = [title.split(" [")[0] for title in figures((folder / "report.html").read_text())]
+    files = sorted((folder / "figures").glob("*.svg"))
+    assert len(files) == len(titles) > 10
+    for path, title in zip(files, titles, strict=True):
+        drawing = ET.parse(path).getroot()
+        assert drawing.tag == f"{SVG}svg"
+        texts = ["".join(text.itertext()) for text in drawing.iter(f"{SVG}text")]
+        assert texts[0].startswith(title)
+    named = (folder / "figures" / "02-distance-to-the-reference.svg").read_text()
+    assert all(f">agent {agent}</text>" in named for agent in range(3)), "the legend"
+    assert set(re.findall(r"var\((--[a-z-]+)\)", named)) <= set(re.findall(r"(--[a-z-]+):", named))
+
+
+def test_figures_are_not_written_through_a_link(tmp_path: Path) -> None:
+    folder, elsewhere = finish(tmp_path / "run"), tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    (folder / "figures").symlink_to(elsewhere)
+    with pytest.raises(ConfigError, match="is a symbolic link"):
+        report([folder], figures=True)
+    assert list(elsewhere.iterdir()) == []
+
+
+def test_runs_are_set_beside_each_other(folder: Path, shared: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    report([folder, shared])
+    path = shared.parent / "first-against-second.html"
+    assert capsys.readouterr().out.strip() == str(path)
+    page = path.read_text()
+    assert re.search(r"<td>seed</td><td>1</td><td>5</td>", page)
+    drawn = figures(page)
+    for title in ("Distances to the reference, summed over agents [m]", "Smallest distance between two agents [m]"):
+        assert [css(agent_rgb(k)) in drawn[title] for k in range(2)] == [True, True]
+    assert page.count("From above: north up, east right [m]") == 2
+    (cells,) = re.findall(r"<td>summed mean tracking error</td>(.*?)</tr>", page)
+    first, second, change = re.findall(r"<td class=n>(.*?)</td>", cells)
+    expected = float(second.split()[0]) / float(first.split()[0]) - 1.0
+    assert float(change.rstrip("%")) / 100 == pytest.approx(expected, abs=0.002)
+
+
+def test_only_what_differs_in_the_configuration_is_listed() -> None:
+    texts = ["a = 1\n[b]\nc = [1, 2]\nd = 'x'\n", "a = 1\n[b]\nc = [1, 3]\nd = 'x'\ne = true\n"]
+    assert list(differences(texts)) == [("b.c", ["[1, 2]", "[1, 3]"]), ("b.e", ["", "True"])]
+
+
+def test_what_can_not_be_compared_is_refused(folder: Path, tmp_path: Path) -> None:
+    cut_off = tmp_path / "cut"
+    cut_off.mkdir()
+    write_run(cut_off, 3, 4.0)
+    (cut_off / "config.toml").write_text(dump(load_recorded(folder)))
+    assert load_run(cut_off).ticks
+    with pytest.raises(ConfigError, match=rf"Complete the run: swarmctl report {cut_off}"):
+        report([folder, cut_off])
+    with pytest.raises(ConfigError, match="one run folder"):
+        report([folder, folder], figures=True)
+    with pytest.raises(ConfigError, match="several folders"):
+        report([folder], output=tmp_path / "page.html")
