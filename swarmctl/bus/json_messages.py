@@ -1,6 +1,7 @@
 """Messages of the bus that are JSON: an agent's status, an operator's order, its answers, the list of obstacles.
 
-Decoders check bounds and return None for anything that does not fit; they never raise.
+Decoders check bounds and return None for anything that does not fit; they never raise. Text of others is made
+printable here, so that no log, table or alert holds a control character of theirs.
 """
 
 from __future__ import annotations
@@ -11,9 +12,11 @@ import msgspec
 
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import UNNUMBERED, Answer, Order, order_problem
+from swarmctl.core.text import printable
 from swarmctl.core.types import FlightMode, Mode, Phase
 
 _Message = TypeVar("_Message")
+_Struct = TypeVar("_Struct", bound=msgspec.Struct)
 
 MAX_OBSTACLES = 64  # each visible one takes 20 us of a tick of 20 ms; 6000 took 130 ms
 _OBSTACLE_KEYS = {"center_ned_m", "radius_m", "keep_out_m", "visibility_m"}  # no message may leave these out
@@ -108,7 +111,7 @@ def encode_message(message: msgspec.Struct) -> bytes:
 
 def decode_status(payload: bytes) -> StatusMessage | None:
     """Decode a status; None if it is malformed or out of bounds."""
-    return _decode(payload, _STATUS_DECODER)
+    return _printable(_decode(payload, _STATUS_DECODER), "control", "outcome", "active_alert")
 
 
 def decode_command(payload: bytes) -> CommandMessage | None:
@@ -119,7 +122,7 @@ def decode_command(payload: bytes) -> CommandMessage | None:
 
 def decode_answer(payload: bytes) -> AnswerMessage | None:
     """Decode an agent's answer; None if it is malformed or out of bounds."""
-    return _decode(payload, _ANSWER_DECODER)
+    return _printable(_decode(payload, _ANSWER_DECODER), "verb", "reason")
 
 
 def decode_obstacles(payload: bytes) -> ObstaclesMessage | None:
@@ -143,6 +146,14 @@ _STATUS_DECODER = msgspec.json.Decoder(StatusMessage)
 _COMMAND_DECODER = msgspec.json.Decoder(CommandMessage)
 _ANSWER_DECODER = msgspec.json.Decoder(AnswerMessage)
 _OBSTACLES_DECODER = msgspec.json.Decoder(ObstaclesMessage, dec_hook=_obstacle)
+
+
+def _printable(message: _Struct | None, *texts: str) -> _Struct | None:
+    """Return a message with its texts made printable."""
+    said = {name: getattr(message, name) for name in texts if message is not None}
+    if message is None or all(text.isprintable() for text in said.values()):
+        return message
+    return msgspec.structs.replace(message, **{name: printable(text) for name, text in said.items()})
 
 
 def _decode(payload: bytes, decoder: msgspec.json.Decoder[_Message]) -> _Message | None:

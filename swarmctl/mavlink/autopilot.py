@@ -16,6 +16,7 @@ import numpy as np
 from pymavlink.dialects.v20 import development as mavlink
 
 from swarmctl.core.frames import rotate_to_ned
+from swarmctl.core.text import printable
 from swarmctl.core.types import Array, AttitudeSetpoint, FlightMode, GeoOrigin, Landed, VehicleState
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.commands import CommandPort
@@ -253,7 +254,7 @@ class Autopilot:
 
     def _statustext(self, message: Any, arrived_us: int) -> None:
         text = message.text.rstrip("\t\x00") if isinstance(message.text, str) else str(message.text)
-        self.texts = [*self.texts[-19:], text]
+        self.texts = [*self.texts[-19:], printable(text)]
 
     # -- state --------------------------------------------------------------------------------------------------------
 

@@ -21,6 +21,7 @@ from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import EXCLUDE, PEER, Order
 from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START
+from swarmctl.ops.order_delivery import numbered
 from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, RunContext, kill_all
 from swarmctl.ops.recovery import RECOVERY_S, Recovery
 from swarmctl.ops.status_table import AgentView, Display, name_of
@@ -218,12 +219,12 @@ class FlightSupervisor:
         self._order(Order(EXCLUDE, {PEER: agent}), [view for view in self._running() if view.agent != agent])
 
     def _order(self, order: Order, views: list[AgentView]) -> None:
-        """Give an order to all agents, stamped by the clocks of these."""
+        """Give an order to all agents, stamped by the clocks of these. A repetition is another order, obeyed anew."""
         now_s = time.monotonic()
         clocks_us = [
             view.status.utc_us + round((now_s - view.received_s) * 1e6) for view in views if view.status is not None
         ]
-        for message in order_messages(order, EVERYBODY, time.time_ns() // 1000, clocks_us):
+        for message in order_messages(numbered(order), EVERYBODY, time.time_ns() // 1000, clocks_us):
             self._bus.publish(COMMAND, message)
 
     def _recover(self, view: AgentView, code: int) -> None:

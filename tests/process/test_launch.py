@@ -378,7 +378,10 @@ def test_operator_verbs(start: Start, monkeypatch: pytest.MonkeyPatch, capsys: p
     assert "1 obstacles" in verb("obstacle", "list").stdout
     assert "0 obstacles" in verb("obstacle", "remove", "0").stdout
     assert verb("obstacle", "remove", "0").returncode == 2
-    assert verb("land", "--agent", "7").returncode == 3
+    nobody = verb("hold", "7", "0", "9")
+    assert nobody.returncode == 2
+    assert re.findall(r"^hold: there is no agent \d; \S+ has agents 0 to 1$", nobody.stderr, re.MULTILINE)
+    assert verb("exclude", "--peer", "2").returncode == 2
     assert verb("resume").returncode == 0
     excluded = launched.verb("exclude", "--peer", "1")
     assert excluded.returncode == 0, excluded.stderr

@@ -14,7 +14,9 @@ import pytest
 import swarmctl.ops.recovery
 import swarmctl.ops.supervisor
 from swarmctl.bus.json_messages import ObstaclesMessage, decode_command, decode_obstacles, encode_message
+from swarmctl.bus.orders import Orders
 from swarmctl.bus.peers import LocalHub, agent_name
+from swarmctl.bus.refusals import Refusals
 from swarmctl.bus.topics import COMMAND, OBSTACLES, OPERATOR, STATUS
 from swarmctl.config import load
 from swarmctl.core.obstacle import Obstacle
@@ -73,6 +75,7 @@ class ScriptedServices(Services):
         self.silent: set[int] = set()
         self.orders: list[str] = []
         self.vouched: set[int] = set()  # agents whose end the others were told
+        self.heard: list[tuple[int, bytes]] = []  # orders as the first agent has received them, and when
         self.stamped_us: list[tuple[int, int]] = []  # of each order, by how much it was stamped before we heard it
         self.behind_us = 0  # by how much the agents' clock is behind ours
         self.obeys = True
@@ -102,9 +105,11 @@ class ScriptedServices(Services):
 
     def show(self, agents: Sequence[AgentView]) -> None:
         for i, bus in enumerate(self.agents):
-            orders = [order for _, payload in bus.receive(COMMAND) if (order := decode_command(payload))]
-            self.orders += [order.verb for order in orders]
             now_us = time.time_ns() // 1000
+            received = [payload for _, payload in bus.receive(COMMAND)]
+            self.heard += [(now_us, payload) for payload in received if i == 0]
+            orders = [order for order in map(decode_command, received) if order]
+            self.orders += [order.verb for order in orders]
             self.stamped_us += [(order.utc_us, now_us - order.utc_us) for order in orders]
             self.vouched |= {int(order.arguments[PEER]) for order in orders if order.verb == EXCLUDE}
             if any(order.verb == "land" for order in orders) and self.obeys and i not in self.silent:
@@ -282,6 +287,15 @@ def test_agents_whose_clock_is_an_hour_behind_are_ordered_to_land_by_their_own(t
     scene.fly()
     ages_us = {round(age_us, -6) for _, age_us in scene.stamped_us}
     assert ages_us == {0, 3_600_000_000}
+    refusals = Refusals(lambda *_, **__: None)
+    orders, behind_us, verbs = Orders(0, refusals), scene.behind_us, []
+    for heard_us, payload in scene.heard:
+        order = orders.take(OPERATOR, payload, heard_us - behind_us)
+        orders.refuse_misdated(heard_us - behind_us)
+        verbs += [order.verb] if order else []
+        assert refusals.alert(heard_us - behind_us) == "", "the copy by our clock is no forgery"
+    assert len(verbs) > 2, "each repetition is obeyed anew"
+    assert set(verbs) == {"land"}
 
 
 def test_second_interrupt_kills_at_once(tmp_path: Path) -> None:

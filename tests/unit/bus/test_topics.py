@@ -392,3 +392,17 @@ def test_the_table_of_topics_is_all_that_the_router_loads_of_messages() -> None:
     code = "import sys, swarmctl.bus.zenoh_bus; print({'pydantic', 'numpy', 'msgspec'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
+
+
+HOSTILE = "\x1b]0;owned\x07\x9b2J\u202e"
+
+
+def test_text_of_others_controls_no_terminal() -> None:
+    status = msgspec.structs.replace(STATUS, outcome=HOSTILE, active_alert=HOSTILE, control="\x9b2J")
+    received = decode_status(encode_message(status))
+    assert received is not None
+    assert received.outcome == received.active_alert == r"\x1b]0;owned\x07\x9b2J\u202e"
+    assert received.control == r"\x9b2J"
+    answer = decode_answer(encode_message(msgspec.structs.replace(ANSWER, reason=HOSTILE)))
+    assert answer is not None
+    assert answer.reason == received.outcome
