@@ -36,7 +36,7 @@ from swarmctl.mavlink.parameter_names import parameter_problems
 from swarmctl.mavlink.transport import Endpoint, parse_url
 from swarmctl.own_modules import locate, make_importable, own_problems
 from swarmctl.simulator_config import MAX_VEHICLES, OriginParams, SimulatorConfig, SimulatorParams
-from swarmctl.telemetry.evaluation.referee import Rules
+from swarmctl.telemetry.evaluation.referee import JudgedObstacle, Rules
 
 MAX_AGENTS = MAX_VEHICLES
 NO_VALUES: Mapping[str, Any] = MappingProxyType({})
@@ -179,7 +179,7 @@ class Config(Params):
         return Rules(
             agents=self.swarm.agents,
             required_separation_m=self.limits.min_separation_m,
-            obstacles=dict.fromkeys(self.obstacles),
+            obstacles=tuple(JudgedObstacle(number=i, obstacle=o) for i, o in enumerate(self.obstacles)),
             obstacle_margin_m=self.limits.obstacle_margin_m,
             deadline_misses_01=self.limits.deadline_misses_01,
             mode=mode,

@@ -6,6 +6,7 @@ printable here, so that no log, table or alert holds a control character of thei
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated, Any, TypeVar
 
 import msgspec
@@ -93,15 +94,38 @@ class AnswerMessage(msgspec.Struct, frozen=True, kw_only=True):
         return Answer(self.verb, self.number, self.accepted, self.reason)
 
 
-class ObstaclesMessage(msgspec.Struct, frozen=True):
+class ListedObstacle(msgspec.Struct, frozen=True, kw_only=True):
+    """Holds one obstacle of the list under its number, which no other one has before or after it."""
+
+    number: Count
+    since_utc_us: Count  # when its centre was at `center_ned_m`, by the launch's clock
+    obstacle: Obstacle
+
+    def at(self, utc_us: int) -> Obstacle:
+        """Return the obstacle as it is at a time: moved on, if it moves."""
+        return self.obstacle.moved((utc_us - self.since_utc_us) * 1e-6)
+
+
+class ObstaclesMessage(msgspec.Struct, frozen=True, kw_only=True):
     """Holds the whole list of obstacles; a higher `version` replaces a lower one."""
 
     version: Count
-    obstacles: Annotated[tuple[Obstacle, ...], msgspec.Meta(max_length=MAX_OBSTACLES)]
+    utc_us: Count  # time of sending, by the launch's clock
+    next_number: Count  # of the next obstacle that is added
+    obstacles: Annotated[tuple[ListedObstacle, ...], msgspec.Meta(max_length=MAX_OBSTACLES)]
 
     def replaces(self, version: int | None) -> bool:
         """Tell whether the list is newer than the known version (None: no list), by at most `MAX_VERSION_STEP`."""
         return version is None or 0 < self.version - version <= MAX_VERSION_STEP
+
+
+def first_list(obstacles: Iterable[Obstacle], utc_us: int, version: int = 1) -> ObstaclesMessage:
+    """Return the list of obstacles that are at their centres now, numbered from 0."""
+    listed = tuple(
+        ListedObstacle(number=number, since_utc_us=utc_us, obstacle=obstacle)
+        for number, obstacle in enumerate(obstacles)
+    )
+    return ObstaclesMessage(version=version, utc_us=utc_us, next_number=len(listed), obstacles=listed)
 
 
 def encode_message(message: msgspec.Struct) -> bytes:
@@ -126,8 +150,12 @@ def decode_answer(payload: bytes) -> AnswerMessage | None:
 
 
 def decode_obstacles(payload: bytes) -> ObstaclesMessage | None:
-    """Decode a list of obstacles; None if it is malformed or out of bounds."""
-    return _decode(payload, _OBSTACLES_DECODER)
+    """Decode a list of obstacles; None if it is malformed or out of bounds, or two have one number."""
+    message = _decode(payload, _OBSTACLES_DECODER)
+    numbers = [] if message is None else [item.number for item in message.obstacles]
+    if message is None or len(set(numbers)) < len(numbers) or max(numbers, default=-1) >= message.next_number:
+        return None
+    return message
 
 
 def _obstacle(kind: type, item: Any) -> Obstacle:

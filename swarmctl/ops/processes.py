@@ -21,7 +21,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from swarmctl.bus.json_messages import ObstaclesMessage, encode_message
+from swarmctl.bus.json_messages import encode_message, first_list
 from swarmctl.bus.peers import agent_name
 from swarmctl.bus.zenoh_bus import socket_file
 from swarmctl.config import Config
@@ -130,7 +130,7 @@ def viewer_command(config: Config, context: RunContext, port: int, view: bool) -
     argv += ("--look-at", *(f"{c:.3f}" for c in center), "--extent", f"{extent_m:.3f}")
     argv += ("--rate-hz", f"{config.telemetry.rate_hz!r}", "--separation", f"{config.separation.radius_m!r}")
     argv += ("--limit", f"{config.limits.min_separation_m!r}")
-    obstacles = encode_message(ObstaclesMessage(1, config.obstacles)).decode()
+    obstacles = encode_message(first_list(config.obstacles, time.time_ns() // 1000)).decode()
     argv += ("--obstacles-json", obstacles, "--die-with-parent")
     return Command(VIEWER, argv + (("--view",) if view else ()), in_control_loop=False)
 

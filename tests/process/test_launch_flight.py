@@ -13,7 +13,7 @@ import pytest
 
 import swarmctl.ops.recovery
 import swarmctl.ops.supervisor
-from swarmctl.bus.json_messages import ObstaclesMessage, decode_command, decode_obstacles, encode_message
+from swarmctl.bus.json_messages import decode_command, decode_obstacles, encode_message, first_list
 from swarmctl.bus.orders import Orders
 from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.bus.refusals import Refusals
@@ -352,23 +352,27 @@ def test_landed_by_an_operator_is_an_interrupted_flight(tmp_path: Path) -> None:
 def test_obstacles_of_an_operator_are_adopted_and_repeated(tmp_path: Path) -> None:
     scene = ScriptedServices(tmp_path, [ends(0, 2.0)])
     ball = Obstacle(center_ned_m=(1.0, 2.0, -3.0), radius_m=0.5, keep_out_m=1.0)
+    column = ball.model_copy(update={"column": True})
+    began_us = time.time_ns() // 1000
     repeated: list[int] = []
+    sent = [first_list((ball, ball), began_us, 5), first_list((column,), began_us, 6)]
 
-    def set_ball() -> None:
-        scene.hub.carry(OPERATOR, OBSTACLES, encode_message(ObstaclesMessage(5, (ball,))))
-        scene.act = collect
-
-    def collect() -> None:
+    def carry() -> None:
+        if sent and (not repeated or repeated[-1] == 5):
+            scene.hub.carry(OPERATOR, OBSTACLES, encode_message(sent.pop(0)))
         for _, payload in scene.agents[0].receive(OBSTACLES):
             message = decode_obstacles(payload)
             assert message is not None
             repeated.append(message.version)
-        scene.act = collect
+        scene.act = carry
 
-    scene.act = set_ball
+    scene.act = carry
     scene.join_as_operator()
     result = scene.fly()
-    assert repeated[-1] == 5
+    assert repeated[-1] == 6
     assert result.obstacles is not None
-    assert list(result.obstacles) == [ball]
-    assert all(since_us is not None for since_us in result.obstacles.values())
+    assert [(judged.number, judged.obstacle) for judged in result.obstacles] == [(0, ball), (1, ball), (0, column)]
+    assert [judged.until_utc_us is None for judged in result.obstacles] == [False, False, True], (
+        "what is gone was there"
+    )
+    assert all(judged.since_utc_us == began_us for judged in result.obstacles)

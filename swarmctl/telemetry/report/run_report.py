@@ -130,7 +130,7 @@ class _Charts:
             rows = flight_rows(self._run.ticks[agent])
             pos_ned_m = true_positions(rows, self._run.truth, agent)
             lines.append(agent_line(agent, pos_ned_m[:, 1], pos_ned_m[:, 0], width=1.6))
-        obstacles = self._rules.obstacles if self._rules else ()
+        obstacles = [judged.obstacle for judged in self._rules.obstacles] if self._rules else []
         balls = [Ball(obstacle.center_ned_m, obstacle.keep_out_m, "keepout") for obstacle in obstacles]
         return top_view("From above: north up, east right [m]", lines, balls, self._points)
 

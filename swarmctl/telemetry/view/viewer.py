@@ -19,7 +19,7 @@ from typing import Any
 
 import psutil
 
-from swarmctl.bus.json_messages import decode_obstacles
+from swarmctl.bus.json_messages import decode_obstacles, encode_message, first_list
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.errors import EXIT_OK, EXIT_USAGE, StartError, SwarmError
 from swarmctl.files import replace_text
@@ -47,7 +47,7 @@ def main(arguments: list[str] | None = None) -> int:
         print("viewer: --obstacles-json: give a message of obstacles, as on the bus", file=sys.stderr)
         return EXIT_USAGE
     try:
-        return _run(options, message.obstacles, stop)
+        return _run(options, tuple(item.at(message.utc_us) for item in message.obstacles), stop)
     except SwarmError as error:
         print(f"viewer: {error}", file=sys.stderr)
         return error.exit_code
@@ -65,7 +65,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--rate-hz", type=float, default=10.0, help="batches a second")
     parser.add_argument("--separation", type=float, default=0.9, help="distance agents keep [m]")
     parser.add_argument("--limit", type=float, help="distance that is a violation [m]; default: --separation")
-    parser.add_argument("--obstacles-json", default='{"version": 0, "obstacles": []}')
+    parser.add_argument("--obstacles-json", default=encode_message(first_list((), 0, version=0)).decode())
     parser.add_argument("--look-at", type=float, nargs=3, default=(0.0, 0.0, -2.0), help="middle of the scene, NED [m]")
     parser.add_argument("--extent", type=float, default=6.0, help="from there to the edge of the scene [m]")
     parser.add_argument("--view", action="store_true", help="open the native viewer when there is a display")

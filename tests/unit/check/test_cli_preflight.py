@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from rich.console import Console
 
-from swarmctl.bus.json_messages import StatusMessage
+from swarmctl.bus.json_messages import StatusMessage, decode_obstacles
 from swarmctl.bus.zenoh_bus import SCHEME
 from swarmctl.config import Config, dump, load
 from swarmctl.core.types import Phase
@@ -144,7 +144,9 @@ def test_command_lines_say_what_the_configuration_says(tmp_path: Path) -> None:
         sock.close()
     viewer = viewer_command(config, context, 9876, view=False).argv
     assert "--view" not in viewer
-    assert viewer[viewer.index("--obstacles-json") + 1] == '{"version":1,"obstacles":[]}'
+    obstacles = decode_obstacles(viewer[viewer.index("--obstacles-json") + 1].encode())
+    assert obstacles is not None
+    assert (obstacles.version, obstacles.obstacles) == (1, ())
 
 
 def status(phase: int = Phase.TRACK, separation_m: float = 1.25, active_alert: str = "") -> StatusMessage:

@@ -29,7 +29,8 @@ def test_real_time_priority_is_wanted_where_processors_suffice(
 
 
 def test_the_last_words_of_a_process_control_no_terminal(tmp_path: Path) -> None:
-    child = Child(Command("x", (sys.executable, "-Sc", "print('\\x1b]0;owned\\x07\\n'); raise SystemExit(4)")), tmp_path)
+    script = "print('\\x1b]0;owned\\x07\\n'); raise SystemExit(4)"
+    child = Child(Command("x", (sys.executable, "-Sc", script)), tmp_path)
     assert child.wait(60.0)
     assert child.how_it_ended() == r"ended with exit code 4: \x1b]0;owned\x07"
     assert child.line_with("owned") == r"\x1b]0;owned\x07"
