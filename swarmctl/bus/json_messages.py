@@ -48,6 +48,8 @@ class StatusMessage(msgspec.Struct, frozen=True, kw_only=True):
     satellites: int
     link_age_ms: float  # since the newest message of the vehicle
     ready_utc_us: Count  # time of reaching its start position, 0 before
+    mission_t_s: float  # mission time, -1 outside of the mission
+    ends_in_s: float  # until the mission, or what precedes or follows it, ends by itself; -1: it does not
     outcome: str  # "" while flying, "completed", or why the mission failed
     position_error_m: float
     separation_m: float  # to the nearest peer now

@@ -192,6 +192,11 @@ class Autopilot:
         self.send_frame(self._codec.encode(message))
         return ""
 
+    @property
+    def setpoint_loss_s(self) -> float | None:
+        """Return the time without setpoints after which the autopilot takes over; None until it has told."""
+        return None if self.dialect is None else self.params.get(self.dialect.loss_parameter)
+
     def close(self) -> None:
         self._transport.close()
 
@@ -202,7 +207,7 @@ class Autopilot:
         """
         last_us, stayed = self._setpoint_us, self._departures == self.watch.departures
         self._setpoint_us, self._departures = now_us, self.watch.departures
-        loss_s = None if self.dialect is None else self.params.get(self.dialect.loss_parameter)
+        loss_s = self.setpoint_loss_s
         if last_us is not None and stayed and loss_s is not None and now_us - last_us > loss_s * 1e6:
             self.gaps, self.gap_s = self.gaps + 1, (now_us - last_us) * 1e-6
 

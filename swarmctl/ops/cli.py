@@ -232,7 +232,7 @@ def _watch(launch: RunningLaunch, as_json: bool) -> None:
     from swarmctl.ops.status_table import AgentView, open_display
 
     views = [AgentView(agent=agent) for agent in range(launch.agents)]
-    display = None if as_json else open_display()
+    display = None if as_json else open_display(run=launch.run)
     try:
         for statuses in operator.watch_statuses(launch, _WATCH_S):
             for agent, status in statuses.items():
@@ -351,4 +351,5 @@ def _show(launch: RunningLaunch, statuses: dict[int, StatusMessage]) -> None:
     from swarmctl.ops.status_table import AgentView, print_statuses
 
     print(f"status: {launch.run}", file=sys.stderr)  # rows alone on standard output
-    print_statuses([AgentView(agent=number, status=statuses.get(number)) for number in range(launch.agents)])
+    views = [AgentView(agent=number, status=statuses.get(number)) for number in range(launch.agents)]
+    print_statuses(views, launch.run)

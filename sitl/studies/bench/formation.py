@@ -220,6 +220,8 @@ class Formation:
             satellites=10,
             link_age_ms=8.5,
             ready_utc_us=1,
+            mission_t_s=-1.0,
+            ends_in_s=-1.0,
             outcome="",
             position_error_m=0.0,
             separation_m=0.0,

@@ -38,4 +38,5 @@ class PhaseInputs:
     refusal: str = ""  # reason why arming is refused for good, up to ARM
     unsettled: str = ""  # reason why arming must wait
     overload: Level = Level.NONE  # response to missed deadlines
+    setpoints_stopped: str = ""  # by missed deadlines a moment ago, in words
     armed_told_us: int = -1  # arrival time of the HEARTBEAT that reported `state.armed`

@@ -33,6 +33,7 @@ from swarmctl.telemetry.json_safe import finite, json_safe
 
 _CONTROLLED = (Mode.TRACKING, Mode.REPLAY, Mode.BRAKE)
 _SOLVER_FAILED = (PlanStatus.SOLVER_FAILED, PlanStatus.RESIDUAL)
+SUMMED_ERROR = "distances of all agents to their reference, added up; mean over the mission"  # what `index_m` is
 _MAX_LISTED = 10  # largest number of violations of one kind listed in full
 _DURATION_SLACK_S = 1.0  # mission time that may be missing at the end of a completed run
 

@@ -17,7 +17,7 @@ from swarmctl.core.tick_record import CURVES, Curve
 from swarmctl.core.types import Array, Mode, Phase
 from swarmctl.files import replace_text
 from swarmctl.telemetry.evaluation.attitude import roll_pitch_rad
-from swarmctl.telemetry.evaluation.referee import Rules, RunData
+from swarmctl.telemetry.evaluation.referee import SUMMED_ERROR, Rules, RunData
 from swarmctl.telemetry.evaluation.tracks import (
     Tracks,
     flight_rows,
@@ -254,7 +254,7 @@ def _summary_rows(summary: Mapping[str, Any], rules: Rules | None) -> Iterator[_
     good = None if share is None or most is None else share <= most
     late = f"{timing['late_ticks']} of {due}"
     yield _Row("deadline misses", late, "" if most is None else f"{most:.0%}", good)
-    yield _Row("summed mean tracking error", _figure(summary["tracking"]["index_m"], "m", 3))
+    yield _Row(f"summed mean tracking error ({SUMMED_ERROR})", _figure(summary["tracking"]["index_m"], "m", 3))
     yield _Row("the same after 10 s", _figure(summary["tracking"]["index_after_10s_m"], "m", 3))
     for name, key in (("tick time", "tick_ms"), ("solve time", "solve_ms")):
         values = " / ".join(_figure(timing[key][part], "", 2) for part in ("p50", "p99", "max"))
