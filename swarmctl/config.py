@@ -20,6 +20,7 @@ from pydantic import Field
 from swarmctl.agent.setup import AgentParams
 from swarmctl.bus.json_messages import MAX_OBSTACLES
 from swarmctl.config_problems import validated
+from swarmctl.config_shows import read_show
 from swarmctl.config_source import override, read_tree, set_value
 from swarmctl.config_tables import read_tables
 from swarmctl.control.collision.separation import SeparationParams, radius_problem
@@ -204,7 +205,7 @@ def load(path: Path | None, overrides: Sequence[str] = (), values: Mapping[str, 
     problems = [p for item in overrides for p in override(tree, item)]
     problems += [p for key, value in values.items() for p in set_value(tree, key, value)]
     folder = Path.cwd() if path is None else path.parent
-    problems = problems or read_tables(tree, folder)
+    problems = problems or read_tables(tree, folder) + read_show(tree, folder)
     if problems:
         raise ConfigError(source, problems)
     locate(tree, folder)
