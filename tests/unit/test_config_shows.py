@@ -25,7 +25,7 @@ HOVERING: list[Any] = [[0.0, [0.0, 20.0, 2.0]]]
 FAR: list[Any] = [
     [1.0, [0.0, 20.0, 2.0]],
     [9.0, [0.0, 24.0, 2.0], None],
-]  # no control points, in both ways that there are
+]  # no control points, said twice
 
 
 def drone(points: Any, **more: Any) -> dict[str, Any]:
@@ -100,7 +100,9 @@ def test_before_its_take_off_a_drone_waits_where_it_begins(tmp_path: Path) -> No
 
 
 def test_trajectories_that_come_too_close_are_refused_before_the_flight(tmp_path: Path) -> None:
-    beside = lambda place: [place[0], place[1] + 0.4, place[2]]  # noqa: E731
+    def beside(place: list[float]) -> list[float]:
+        return [place[0], place[1] + 0.4, place[2]]
+
     near = [[t, beside(place), [beside(control) for control in controls]] for t, place, controls in CURVED]
     with pytest.raises(ConfigError, match=r"agents 0 and 1: at 0.00 s the references are 0.40 m apart"):
         load(config_with(tmp_path, {"show.json": show_of(drone(CURVED), drone(near))}))

@@ -123,12 +123,19 @@ def evaluate(
 
 
 class _MissionClock:
-    """Converts instants to mission time if there is a mission, otherwise to time since the first arming."""
+    """Converts instants to mission time if there is a mission, otherwise to time since the first arming.
+
+    Attributes:
+        start_us: that instant.
+        first_us: the first tick of any agent, at which configured obstacles are at their centres.
+    """
 
     def __init__(self, ticks: Mapping[int, NDArray[np.void]], tracks: Tracks) -> None:
-        self.first_us = float(tracks.t_us[0]) if len(tracks.t_us) else 0.0
+        armed_us = float(tracks.t_us[0]) if len(tracks.t_us) else 0.0
         start_us = mission_start_us(ticks, tracks.time_field)
-        self.start_us = self.first_us if start_us is None else start_us
+        self.start_us = armed_us if start_us is None else start_us
+        firsts_us = [float(rows[tracks.time_field][0]) for rows in ticks.values() if len(rows)]
+        self.first_us = min(firsts_us, default=armed_us)
         self.utc_offset_us = 0.0 if tracks.time_field == "utc_us" else utc_offset_us(ticks)
 
     def at_s(self, t_us: float) -> float:

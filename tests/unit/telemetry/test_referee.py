@@ -224,6 +224,20 @@ def test_obstacle_set_in_flight_counts_from_then_on() -> None:
     )
 
 
+def test_a_configured_obstacle_moves_from_the_first_tick_on_not_from_arming_or_the_mission() -> None:
+    ball = Obstacle(center_ned_m=(12.0, 0.0, 0.0), keep_out_m=1.0, vel_ned_m_s=(-1.0, 0.0, 0.0))
+    rows = ticks(9.5, (0.0, 0.0, 0.0))
+    before = rows[:150].copy()  # 3 s on the ground
+    before["t_us"], before["utc_us"] = before["t_us"] - 3_000_000, before["utc_us"] - 3_000_000
+    before["mission_t_s"], before["armed"] = np.nan, 0
+    rules = Rules(agents=1, required_separation_m=0.5, obstacles=(JudgedObstacle(number=0, obstacle=ball),))
+    clearance = [
+        evaluate(run({0: flown}), rules, "completed")["obstacles"]["min_clearance_m"]
+        for flown in (rows, np.concatenate([before, rows]))
+    ]
+    assert clearance == pytest.approx([2.5, 0.0], abs=0.05)
+
+
 def test_an_obstacle_that_was_removed_counts_until_then() -> None:
     ball = Obstacle(center_ned_m=(10.0, 0.0, 0.0), keep_out_m=1.0, vel_ned_m_s=(-1.0, 0.0, 0.0))
     rows = ticks(20, (0.0, 0.0, 0.0))
