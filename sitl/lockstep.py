@@ -23,7 +23,7 @@ from sitl.world import SitlWorld
 from swarmctl.agent.agent import Agent
 from swarmctl.agent.assembly import make_agent
 from swarmctl.bus import topics
-from swarmctl.bus.json_messages import CommandMessage, ObstaclesMessage, encode_message
+from swarmctl.bus.json_messages import CommandMessage, encode_message, first_list
 from swarmctl.bus.links import Impairments
 from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.config import Config
@@ -139,7 +139,7 @@ class Lockstep:
         self._steps = 0
         self._order = list(order) if order is not None else list(range(agents))
         self._truth: list[NDArray[np.void]] = []
-        self._obstacles = ObstaclesMessage(1, config.obstacles)
+        self._obstacles = first_list(config.obstacles, self.clock.utc_us())
 
     def _on_fault(self, name: str, t_us: int, fields: dict[str, Any]) -> None:
         stamp = {"utc_us": self.clock.utc_us(), "t_us": self.clock.now_us(), "source": "sitl", "event": name}
@@ -194,8 +194,8 @@ class Lockstep:
         self._operator.publish(topics.COMMAND, encode_message(message))
 
     def set_obstacles(self, obstacles: Sequence[Obstacle]) -> None:
-        """Replace the obstacle list, as an operator's verb does."""
-        self._obstacles = ObstaclesMessage(self._obstacles.version + 1, tuple(obstacles))
+        """Replace the obstacle list by obstacles that are at their centres now, as an operator's verb does."""
+        self._obstacles = first_list(obstacles, self.clock.utc_us(), self._obstacles.version + 1)
         self._operator.publish(topics.OBSTACLES, encode_message(self._obstacles))
 
     @property

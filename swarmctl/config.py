@@ -20,6 +20,7 @@ from pydantic import Field
 from swarmctl.agent.setup import AgentParams
 from swarmctl.bus.json_messages import MAX_OBSTACLES
 from swarmctl.config_problems import validated
+from swarmctl.config_shows import read_show
 from swarmctl.config_source import override, read_tree, set_value
 from swarmctl.config_tables import read_tables
 from swarmctl.control.collision.separation import SeparationParams, radius_problem
@@ -37,7 +38,7 @@ from swarmctl.mavlink.parameter_names import parameter_problems
 from swarmctl.mavlink.transport import Endpoint, parse_url
 from swarmctl.own_modules import locate, make_importable, own_problems
 from swarmctl.simulator_config import MAX_VEHICLES, OriginParams, SimulatorConfig, SimulatorParams
-from swarmctl.telemetry.evaluation.referee import Rules
+from swarmctl.telemetry.evaluation.referee import JudgedObstacle, Rules
 
 MAX_AGENTS = MAX_VEHICLES
 NO_VALUES: Mapping[str, Any] = MappingProxyType({})
@@ -181,7 +182,7 @@ class Config(Params):
         return Rules(
             agents=self.swarm.agents,
             required_separation_m=self.limits.min_separation_m,
-            obstacles=dict.fromkeys(self.obstacles),
+            obstacles=tuple(JudgedObstacle(number=i, obstacle=o) for i, o in enumerate(self.obstacles)),
             obstacle_margin_m=self.limits.obstacle_margin_m,
             deadline_misses_01=self.limits.deadline_misses_01,
             mode=mode,
@@ -207,7 +208,7 @@ def load(path: Path | None, overrides: Sequence[str] = (), values: Mapping[str, 
     problems = [p for item in overrides for p in override(tree, item)]
     problems += [p for key, value in values.items() for p in set_value(tree, key, value)]
     folder = Path.cwd() if path is None else path.parent
-    problems = problems or read_tables(tree, folder)
+    problems = problems or read_tables(tree, folder) + read_show(tree, folder)
     if problems:
         raise ConfigError(source, problems)
     locate(tree, folder)

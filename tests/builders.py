@@ -83,6 +83,8 @@ def status_message(
         satellites=10,
         link_age_ms=8.5,
         ready_utc_us=0,
+        mission_t_s=12.3,
+        ends_in_s=25.4,
         outcome="",
         position_error_m=position_error_m,
         separation_m=separation_m,

@@ -44,7 +44,7 @@ from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.control.phases.endurance import Endurance
 from swarmctl.control.phases.failsafe import NOTHING_WORN, Escalation, FailsafeDecision, Response, decide, escalate
 from swarmctl.control.phases.inputs import PhaseInputs
-from swarmctl.control.phases.overload import Level, Overload
+from swarmctl.control.phases.overload import Level, Overload, SetpointStops
 from swarmctl.control.reference.heading import Heading
 from swarmctl.control.setpoint import setpoint_of
 from swarmctl.core.clock import Clock
@@ -71,6 +71,7 @@ from swarmctl.mavlink.commands import CommandPort
 from swarmctl.mavlink.vehicle_setup import VehicleSetup
 
 _NO_TIME_US = -1
+_SETPOINT_LOSS_S = 0.5  # time without setpoints after which an autopilot takes over, until it has told its own
 # modes in which the vehicle does not follow its committed trajectory
 _DEVIATING_MODES = (Mode.BRAKE, Mode.HOLD, Mode.LAND, Mode.PILOT_OVERRIDE)
 _START_ALERT_DELAY_US = 3_000_000  # time on the ground after which the unmet condition is raised as an alert
@@ -166,6 +167,7 @@ class Agent:
         self._standby_us = 0
         self._endurance, self._escalation = Endurance(setup.params.failsafe.window_s), NOTHING_WORN
         self._overload = Overload(setup.params.overload, round(1e6 / setup.params.rate_hz))
+        self._stops = SetpointStops(round(1e6 / setup.params.rate_hz))
         self._done_us: int | None = None
         self._last_state_us = _NO_TIME_US
         self._thrust_01 = setup.vehicle_model.hover_thrust_01
@@ -279,6 +281,8 @@ class Agent:
     def _watch_deadlines(self, now_us: int, deadline_misses: int) -> None:
         before = self._overload.level
         self._overload.update(now_us, deadline_misses)
+        loss_s = self._autopilot.setpoint_loss_s
+        self._stops.update(now_us, deadline_misses, _SETPOINT_LOSS_S if loss_s is None else loss_s)
         level = self._overload.level
         if level is not Level.NONE:
             self._alerts.put("overload", self._overload.text(), now_us)
@@ -504,9 +508,10 @@ class Agent:
             return None
         if self._autopilot.gaps != self._gaps:
             self._gaps, gap_s = self._autopilot.gaps, self._autopilot.gap_s
-            text = f"setpoints had stopped for {gap_s:.2f} s: the autopilot's failsafe may have acted"
-            self._alerts.put("gap", text, now_us)
+            stopped = self._stops.text(now_us) or f"setpoints had stopped for {gap_s:.2f} s"
+            self._alerts.put("gap", f"{stopped}: the autopilot's failsafe may have acted", now_us)
             self._note("setpoint_gap", seconds=gap_s)
+        self._stops.sent(now_us)
         self._virtual_control, self._thrust_01 = virtual_control, setpoint.thrust_01
         self._predictor.sent(now_us, virtual_control)
         return setpoint
@@ -532,10 +537,13 @@ class Agent:
             unsettled=self._unsettled(now_us),
             overload=self._overload.level,
             escalation=self._escalation,
+            setpoints_stopped=self._stops.text(now_us),
             armed_told_us=self._autopilot.armed_told_us,
         )
         for command in self._state_machine.step(inputs):
             self._commands.request(command)
+        if self._state_machine.pilot_override:
+            self._alerts.put("override", self._state_machine.outcome, now_us)
         self._report_start_blocker(now_us)
         self._restore_parameters(now_us)
         self._vehicle_setup.step(now_us)

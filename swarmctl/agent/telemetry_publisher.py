@@ -216,6 +216,8 @@ class TelemetryPublisher:
             satellites=-1 if health.satellites is None else health.satellites,
             link_age_ms=-1.0 if received_us is None else (record.t_us - received_us) * 1e-3,
             ready_utc_us=state_machine.ready_utc_us,
+            mission_t_s=_finite(record.mission_t_s),
+            ends_in_s=_finite(state_machine.ends_in_s(record.t_us, record.utc_us)),
             outcome=state_machine.outcome,
             position_error_m=_finite(error_m),
             separation_m=_finite(record.nearest_peer_m),

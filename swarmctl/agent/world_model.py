@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence, Set
 
 from swarmctl.bus import topics
-from swarmctl.bus.json_messages import StatusMessage, decode_obstacles, decode_status
+from swarmctl.bus.json_messages import ListedObstacle, StatusMessage, decode_obstacles, decode_status
 from swarmctl.bus.orders import Orders
 from swarmctl.bus.peer_clocks import PeerClocks
 from swarmctl.bus.peers import Bus, PeerPaths, agent_name, peer_verifiers
@@ -19,7 +19,6 @@ from swarmctl.control.collision.separation import (
     aligned,
     keep_out_of_obstacle,
     keep_out_of_peer,
-    visible,
 )
 from swarmctl.control.phases.inputs import PeerInputs
 from swarmctl.core.obstacle import Obstacle
@@ -65,9 +64,9 @@ class WorldModel:
         self._unresponsive_since_us: dict[int, int] = {}
         self._status: dict[int, StatusMessage] = {}
         self._vouched: dict[int, int | None] = {}  # boot id of each agent that somebody says has ended
-        self._obstacles: tuple[Obstacle, ...] = ()
+        self._obstacles: tuple[ListedObstacle, ...] = ()
         self._obstacles_version: int | None = None
-        self._seen: dict[int, Obstacle] = {}  # obstacles that have been visible, by identity
+        self._seen: dict[int, Obstacle] = {}  # obstacles that have been visible, by number
 
     def receive(self, utc_us: int) -> list[Order]:
         """Process everything that has arrived; returns the operator's orders to this agent."""
@@ -79,6 +78,7 @@ class WorldModel:
         for sender, payload in self._bus.receive(topics.OBSTACLES):
             self._take_obstacles(sender, payload, utc_us)
         orders = [self._orders.take(*received, utc_us) for received in self._bus.receive(topics.COMMAND)]
+        self._orders.refuse_misdated(utc_us)
         self.refusals.report(utc_us)
         self._watch_unresponsive(utc_us)
         return [order for order in orders if order is not None]
@@ -115,7 +115,9 @@ class WorldModel:
             self.refusals.add(sender, topics.OBSTACLES.name, MALFORMED, utc_us)
         elif message.replaces(known):
             self._obstacles_version = message.version
-            self._obstacles, self._seen = message.obstacles, {}
+            unchanged = set(self._obstacles) & set(message.obstacles)
+            self._seen = {item.number: item.obstacle for item in unchanged if item.number in self._seen}
+            self._obstacles = message.obstacles
         elif known is not None and message.version > known:
             self.refusals.add(sender, topics.OBSTACLES.name, SEQUENCE, utc_us)
 
@@ -171,9 +173,14 @@ class WorldModel:
             )
             for path, points in zip(paths, places, strict=True)
         ]
-        seen = visible(self._obstacles, pos_ned_m)
-        self._seen.update((id(o), o) for o in seen)
-        return found + [keep_out_of_obstacle(o, dt_us, steps, self._params) for o in seen]
+        seen = self._visible(pos_ned_m, t0_utc_us)
+        self._seen.update(seen)
+        return found + [keep_out_of_obstacle(o, dt_us, steps, self._params, number=n) for n, o in seen.items()]
+
+    def _visible(self, pos_ned_m: Array, utc_us: int) -> dict[int, Obstacle]:
+        """Return the obstacles that are visible from a position (3,), as they are at a time, by number."""
+        there = {item.number: item.at(utc_us) for item in self._obstacles}
+        return {number: o for number, o in there.items() if o.distance_m(pos_ned_m) < o.visibility_m}
 
     def deviating_peers(self, messages: Mapping[int, TrajectoryMessage], utc_us: int, allowed_m: float) -> set[int]:
         """Return peers whose recent path deviates by more than `allowed_m` from all trajectories they committed to."""
@@ -230,7 +237,8 @@ class WorldModel:
                 body_of_peer(path, act_utc_us, ahead_s, apart_m, filters=filters, brake_m_s2=self._params.brake_m_s2)
             )
         apart_m = budget.barrier_obstacle_m(margin_m)
-        return found + [body_of_obstacle(o, ahead_s, apart_m) for o in visible(self._obstacles, pos_ned_m)]
+        seen = self._visible(pos_ned_m, act_utc_us)
+        return found + [body_of_obstacle(o, ahead_s, apart_m) for o in seen.values()]
 
     def exclude(self, agent: int) -> None:
         """Believe that the process of a peer has ended; another process under its number takes part again."""

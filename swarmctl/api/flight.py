@@ -153,8 +153,8 @@ class Swarm:
             arguments: those of the verb, by name with the unit.
 
         Raises:
-            ConfigError: there is no such verb, or its arguments are others.
-            StartError: the launch has ended, or there is no such agent.
+            ConfigError: there is no such verb or agent, or its arguments are others.
+            StartError: the launch has ended.
             MissionError: an agent refuses it or is silent; says which and why.
         """
         if problem := order_problem(verb, arguments):

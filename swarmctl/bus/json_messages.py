@@ -1,19 +1,23 @@
 """Messages of the bus that are JSON: an agent's status, an operator's order, its answers, the list of obstacles.
 
-Decoders check bounds and return None for anything that does not fit; they never raise.
+Decoders check bounds and return None for anything that does not fit; they never raise. Text of others is made
+printable here, so that no log, table or alert holds a control character of theirs.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Annotated, Any, TypeVar
 
 import msgspec
 
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import UNNUMBERED, Answer, Order, order_problem
+from swarmctl.core.text import printable
 from swarmctl.core.types import FlightMode, Mode, Phase
 
 _Message = TypeVar("_Message")
+_Struct = TypeVar("_Struct", bound=msgspec.Struct)
 
 MAX_OBSTACLES = 64  # each visible one takes 20 us of a tick of 20 ms; 6000 took 130 ms
 _OBSTACLE_KEYS = {"center_ned_m", "radius_m", "keep_out_m", "visibility_m"}  # no message may leave these out
@@ -44,6 +48,8 @@ class StatusMessage(msgspec.Struct, frozen=True, kw_only=True):
     satellites: int
     link_age_ms: float  # since the newest message of the vehicle
     ready_utc_us: Count  # time of reaching its start position, 0 before
+    mission_t_s: float  # mission time, -1 outside of the mission
+    ends_in_s: float  # until the mission, or what precedes or follows it, ends by itself; -1: it does not
     outcome: str  # "" while flying, "completed", or why the mission failed
     position_error_m: float
     separation_m: float  # to the nearest peer now
@@ -90,15 +96,38 @@ class AnswerMessage(msgspec.Struct, frozen=True, kw_only=True):
         return Answer(self.verb, self.number, self.accepted, self.reason)
 
 
-class ObstaclesMessage(msgspec.Struct, frozen=True):
+class ListedObstacle(msgspec.Struct, frozen=True, kw_only=True):
+    """Holds one obstacle of the list under its number, which no other one has before or after it."""
+
+    number: Count
+    since_utc_us: Count  # when its centre was at `center_ned_m`, by the launch's clock
+    obstacle: Obstacle
+
+    def at(self, utc_us: int) -> Obstacle:
+        """Return the obstacle as it is at a time: moved on, if it moves."""
+        return self.obstacle.moved((utc_us - self.since_utc_us) * 1e-6)
+
+
+class ObstaclesMessage(msgspec.Struct, frozen=True, kw_only=True):
     """Holds the whole list of obstacles; a higher `version` replaces a lower one."""
 
     version: Count
-    obstacles: Annotated[tuple[Obstacle, ...], msgspec.Meta(max_length=MAX_OBSTACLES)]
+    utc_us: Count  # time of sending, by the launch's clock
+    next_number: Count  # of the next obstacle that is added
+    obstacles: Annotated[tuple[ListedObstacle, ...], msgspec.Meta(max_length=MAX_OBSTACLES)]
 
     def replaces(self, version: int | None) -> bool:
         """Tell whether the list is newer than the known version (None: no list), by at most `MAX_VERSION_STEP`."""
         return version is None or 0 < self.version - version <= MAX_VERSION_STEP
+
+
+def first_list(obstacles: Iterable[Obstacle], utc_us: int, version: int = 1) -> ObstaclesMessage:
+    """Return the list of obstacles that are at their centres now, numbered from 0."""
+    listed = tuple(
+        ListedObstacle(number=number, since_utc_us=utc_us, obstacle=obstacle)
+        for number, obstacle in enumerate(obstacles)
+    )
+    return ObstaclesMessage(version=version, utc_us=utc_us, next_number=len(listed), obstacles=listed)
 
 
 def encode_message(message: msgspec.Struct) -> bytes:
@@ -108,7 +137,7 @@ def encode_message(message: msgspec.Struct) -> bytes:
 
 def decode_status(payload: bytes) -> StatusMessage | None:
     """Decode a status; None if it is malformed or out of bounds."""
-    return _decode(payload, _STATUS_DECODER)
+    return _printable(_decode(payload, _STATUS_DECODER), "control", "outcome", "active_alert")
 
 
 def decode_command(payload: bytes) -> CommandMessage | None:
@@ -119,12 +148,16 @@ def decode_command(payload: bytes) -> CommandMessage | None:
 
 def decode_answer(payload: bytes) -> AnswerMessage | None:
     """Decode an agent's answer; None if it is malformed or out of bounds."""
-    return _decode(payload, _ANSWER_DECODER)
+    return _printable(_decode(payload, _ANSWER_DECODER), "verb", "reason")
 
 
 def decode_obstacles(payload: bytes) -> ObstaclesMessage | None:
-    """Decode a list of obstacles; None if it is malformed or out of bounds."""
-    return _decode(payload, _OBSTACLES_DECODER)
+    """Decode a list of obstacles; None if it is malformed or out of bounds, or two have one number."""
+    message = _decode(payload, _OBSTACLES_DECODER)
+    numbers = [] if message is None else [item.number for item in message.obstacles]
+    if message is None or len(set(numbers)) < len(numbers) or max(numbers, default=-1) >= message.next_number:
+        return None
+    return message
 
 
 def _obstacle(kind: type, item: Any) -> Obstacle:
@@ -143,6 +176,14 @@ _STATUS_DECODER = msgspec.json.Decoder(StatusMessage)
 _COMMAND_DECODER = msgspec.json.Decoder(CommandMessage)
 _ANSWER_DECODER = msgspec.json.Decoder(AnswerMessage)
 _OBSTACLES_DECODER = msgspec.json.Decoder(ObstaclesMessage, dec_hook=_obstacle)
+
+
+def _printable(message: _Struct | None, *texts: str) -> _Struct | None:
+    """Return a message with its texts made printable."""
+    said = {name: getattr(message, name) for name in texts if message is not None}
+    if message is None or all(text.isprintable() for text in said.values()):
+        return message
+    return msgspec.structs.replace(message, **{name: printable(text) for name, text in said.items()})
 
 
 def _decode(payload: bytes, decoder: msgspec.json.Decoder[_Message]) -> _Message | None:

@@ -41,6 +41,13 @@ class Obstacle(Params):
         """Return the distance [m] of a position (3,) from the centre, or from the axis of a column."""
         return math.dist(self.center_ned_m[: self.axes], pos_ned_m[: self.axes])
 
+    def moved(self, elapsed_s: float) -> Obstacle:
+        """Return the obstacle as it is after a time: at another centre if it moves."""
+        if not self.moves:
+            return self
+        centre = tuple(self.center_after(elapsed_s).tolist())
+        return self.model_copy(update={"center_ned_m": centre})
+
     def center_after(self, elapsed_s: float | NDArray[np.floating]) -> Array:
         """Return the centre NED [m] after a time, (3,), or (T, 3) after times (T, 1), at constant velocity."""
         return np.array(self.center_ned_m) + elapsed_s * np.array(self.vel_ned_m_s)

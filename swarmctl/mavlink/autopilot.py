@@ -16,6 +16,7 @@ import numpy as np
 from pymavlink.dialects.v20 import development as mavlink
 
 from swarmctl.core.frames import rotate_to_ned
+from swarmctl.core.text import printable
 from swarmctl.core.types import Array, AttitudeSetpoint, FlightMode, GeoOrigin, Landed, VehicleState
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.commands import CommandPort
@@ -191,6 +192,11 @@ class Autopilot:
         self.send_frame(self._codec.encode(message))
         return ""
 
+    @property
+    def setpoint_loss_s(self) -> float | None:
+        """Return the time without setpoints after which the autopilot takes over; None until it has told."""
+        return None if self.dialect is None else self.params.get(self.dialect.loss_parameter)
+
     def close(self) -> None:
         self._transport.close()
 
@@ -201,7 +207,7 @@ class Autopilot:
         """
         last_us, stayed = self._setpoint_us, self._departures == self.watch.departures
         self._setpoint_us, self._departures = now_us, self.watch.departures
-        loss_s = None if self.dialect is None else self.params.get(self.dialect.loss_parameter)
+        loss_s = self.setpoint_loss_s
         if last_us is not None and stayed and loss_s is not None and now_us - last_us > loss_s * 1e6:
             self.gaps, self.gap_s = self.gaps + 1, (now_us - last_us) * 1e-6
 
@@ -253,7 +259,7 @@ class Autopilot:
 
     def _statustext(self, message: Any, arrived_us: int) -> None:
         text = message.text.rstrip("\t\x00") if isinstance(message.text, str) else str(message.text)
-        self.texts = [*self.texts[-19:], text]
+        self.texts = [*self.texts[-19:], printable(text)]
 
     # -- state --------------------------------------------------------------------------------------------------------
 

@@ -18,12 +18,13 @@ import typer
 from swarmctl import __version__
 from swarmctl.core.text import printable_lines
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, ConfigError, SwarmError
-from swarmctl.ops.config_verbs import config_app
-from swarmctl.ops.folder_verbs import add_folder_verbs
-from swarmctl.ops.order_verbs import Run, add_order_verbs
+from swarmctl.ops.verbs.configuration import config_app
+from swarmctl.ops.verbs.folders import add_folder_verbs
+from swarmctl.ops.verbs.obstacles import obstacle_app
+from swarmctl.ops.verbs.orders import Run, add_order_verbs
 
 if TYPE_CHECKING:
-    from swarmctl.bus.json_messages import ObstaclesMessage, StatusMessage
+    from swarmctl.bus.json_messages import StatusMessage
     from swarmctl.ops.operator import RunningLaunch
 
 app = typer.Typer(
@@ -32,9 +33,6 @@ app = typer.Typer(
     rich_markup_mode=None,  # markup would take units such as [m] for tags and drop them
     context_settings={"help_option_names": ["-h", "--help"]},
     help="Fly a swarm of quadrotors with one distributed-MPC agent beside every autopilot.",
-)
-obstacle_app = typer.Typer(
-    no_args_is_help=True, rich_markup_mode=None, help="Change the obstacles of a running launch."
 )
 app.add_typer(obstacle_app, name="obstacle")
 app.add_typer(config_app, name="config")
@@ -238,7 +236,7 @@ def _watch(launch: RunningLaunch, as_json: bool) -> None:
     from swarmctl.ops.status_table import AgentView, open_display
 
     views = [AgentView(agent=agent) for agent in range(launch.agents)]
-    display = None if as_json else open_display()
+    display = None if as_json else open_display(run=launch.run)
     try:
         for statuses in operator.watch_statuses(launch, _WATCH_S):
             for agent, status in statuses.items():
@@ -276,52 +274,6 @@ def fault(
     wanted = {"kind": kind, "vehicle": vehicle, "value": value, "for_s": for_s, "rotor": rotor}
     asked = parse_fault({**wanted, "direction": direction, "towards_deg": towards}, launch.agents)
     print(f"fault: {launch.run}\n{inject(launch, asked)}")
-    return EXIT_OK
-
-
-@obstacle_app.command("list")
-def obstacle_list(run: Run = None) -> int:
-    """List the obstacles that the agents know."""
-    from swarmctl.ops import operator
-
-    launch = operator.find_launch(run)
-    _show_obstacles(launch, operator.read_obstacles(launch))
-    return EXIT_OK
-
-
-@obstacle_app.command("add")
-def obstacle_add(
-    center: Annotated[str, typer.Option("--center", metavar="N,E,D", help="Centre, shared NED [m].")],
-    radius: Annotated[float, typer.Option("--radius", help="Physical radius [m].")] = 1.0,
-    keep_out: Annotated[
-        float | None, typer.Option("--keep-out", help="Keep-out radius [m]; default: radius + 0.75.")
-    ] = None,
-    visibility: Annotated[float, typer.Option("--visibility", help="Range at which agents see it [m].")] = 3.0,
-    velocity: Annotated[str, typer.Option("--velocity", metavar="N,E,D", help="Velocity, shared NED [m/s].")] = "0,0,0",
-    column: Annotated[
-        bool, typer.Option("--column", help="A vertical column of unlimited height, not a sphere.")
-    ] = False,
-    run: Run = None,
-) -> int:
-    """Add a sphere or a column to a running launch."""
-    from swarmctl.ops import operator
-
-    keep_out_m = radius + 0.75 if keep_out is None else keep_out
-    obstacle = operator.obstacle(center, radius, keep_out_m, visibility, velocity=velocity, column=column)
-    launch = operator.find_launch(run)
-    _show_obstacles(launch, operator.change_obstacles(launch, lambda known: (*known, obstacle)))
-    return EXIT_OK
-
-
-@obstacle_app.command("remove")
-def obstacle_remove(
-    number: Annotated[int, typer.Argument(help="Index in `obstacle list`, from 0.")], run: Run = None
-) -> int:
-    """Remove an obstacle from a running launch."""
-    from swarmctl.ops import operator
-
-    launch = operator.find_launch(run)
-    _show_obstacles(launch, operator.change_obstacles(launch, lambda known: operator.without(known, number)))
     return EXIT_OK
 
 
@@ -372,15 +324,5 @@ def _show(launch: RunningLaunch, statuses: dict[int, StatusMessage]) -> None:
     from swarmctl.ops.status_table import AgentView, print_statuses
 
     print(f"status: {launch.run}", file=sys.stderr)  # rows alone on standard output
-    print_statuses([AgentView(agent=number, status=statuses.get(number)) for number in range(launch.agents)])
-
-
-def _show_obstacles(launch: RunningLaunch, message: ObstaclesMessage) -> None:
-    print(f"obstacle: {launch.run}")
-    print(f"version {message.version}, {len(message.obstacles)} obstacles, shared NED [m]")
-    for number, item in enumerate(message.obstacles):
-        center = ", ".join(f"{c:.2f}" for c in item.center_ned_m)
-        print(
-            f"{number}: {'column' if item.column else 'centre'} {center}  radius {item.radius_m}  "
-            f"keep-out {item.keep_out_m}  seen {item.visibility_m}"
-        )
+    views = [AgentView(agent=number, status=statuses.get(number)) for number in range(launch.agents)]
+    print_statuses(views, launch.run)

@@ -69,8 +69,9 @@ def launch(config: Config, options: LaunchOptions) -> int:
         except BaseException:
             reserved.release()
             raise
-        display = open_display()
-        services = Launcher(config, options, reserved, directory, display=display)
+        run = run_name(config.name)
+        display = open_display(run=run)
+        services = Launcher(config, options, reserved, directory, run=run, display=display)
         grace_s = _LAND_S  # after a failure from here on, agents still get time to land
         try:
             services.start()
@@ -100,14 +101,21 @@ class Launcher(Services):
     """Starts the processes of one launch, and ends them."""
 
     def __init__(
-        self, config: Config, options: LaunchOptions, reserved: ReservedPorts, directory: Path, *, display: Display
+        self,
+        config: Config,
+        options: LaunchOptions,
+        reserved: ReservedPorts,
+        directory: Path,
+        *,
+        run: str,
+        display: Display,
     ) -> None:
         self._socket_dir = Path(tempfile.mkdtemp(prefix="swarm-"))  # mode 0700
         self._config = config
         self._options = options
         self._reserved = reserved
         self._display = display
-        self.context = RunContext(run_name(config.name), f"{SCHEME}{self._socket_dir}/bus.sock", directory)
+        self.context = RunContext(run, f"{SCHEME}{self._socket_dir}/bus.sock", directory)
         self.log = EventLog(directory / "launch.events.jsonl", "launch")
         self.children: dict[str, Child] = {}
 

@@ -14,26 +14,17 @@ import os
 import stat
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import msgspec
 import psutil
-from pydantic import ValidationError
 
-from swarmctl.bus.json_messages import (
-    MAX_OBSTACLES,
-    ObstaclesMessage,
-    StatusMessage,
-    decode_obstacles,
-    decode_status,
-    encode_message,
-)
+from swarmctl.bus.json_messages import StatusMessage, decode_status
 from swarmctl.bus.peers import agent_name
 from swarmctl.bus.topics import ANSWER, OBSTACLES, OPERATOR, STATUS
 from swarmctl.bus.zenoh_bus import ZenohBus
-from swarmctl.core.obstacle import Obstacle
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import read_file, replace_bytes
 
@@ -159,70 +150,6 @@ def watch_statuses(launch: RunningLaunch, every_s: float) -> Iterator[dict[int, 
             time.sleep(every_s)
 
 
-def read_obstacles(launch: RunningLaunch) -> ObstaclesMessage:
-    """Return the obstacle list that the launch repeats.
-
-    Raises:
-        StartError: the launch does not answer in time.
-    """
-    with joined(launch) as bus:
-        return _obstacles(bus, 0)
-
-
-def change_obstacles(
-    launch: RunningLaunch, change: Callable[[tuple[Obstacle, ...]], tuple[Obstacle, ...]]
-) -> ObstaclesMessage:
-    """Replace the obstacle list by `change(list)` and wait until the launch repeats the new one."""
-    with joined(launch) as bus:
-        old = _obstacles(bus, 0)
-        changed = change(old.obstacles)
-        if len(changed) > MAX_OBSTACLES:
-            raise ConfigError("obstacle", [f"add: there are {len(old.obstacles)}, agents keep {MAX_OBSTACLES} at most"])
-        new = ObstaclesMessage(old.version + 1, changed)
-        return _obstacles(bus, new.version, encode_message(new))
-
-
-_OPTIONS = {  # of `obstacle add`, by key
-    "center_ned_m": "--center",
-    "radius_m": "--radius",
-    "keep_out_m": "--keep-out",
-    "visibility_m": "--visibility",
-    "vel_ned_m_s": "--velocity",
-}
-
-
-def obstacle(
-    center: str, radius_m: float, keep_out_m: float, visibility_m: float, *, velocity: str, column: bool = False
-) -> Obstacle:
-    """Return the obstacle that a command line describes; vectors are `north,east,down`, shared frame.
-
-    Raises:
-        ConfigError: a number is missing, not finite or out of range.
-    """
-    problems: list[str] = []
-    vectors = [vector(key, text, problems) for key, text in (("--center", center), ("--velocity", velocity))]
-    values = {"radius_m": radius_m, "keep_out_m": keep_out_m, "visibility_m": visibility_m, "column": column}
-    try:
-        described = Obstacle.model_validate(values | {"center_ned_m": vectors[0], "vel_ned_m_s": vectors[1]})
-    except ValidationError as error:
-        problems += [f"{_OPTIONS[str(e['loc'][0])]} {e['input']}: {e['msg'].lower()}" for e in error.errors()]
-        raise ConfigError("obstacle", problems) from error
-    if problems:
-        raise ConfigError("obstacle", problems)
-    return described
-
-
-def without(known: tuple[Obstacle, ...], number: int) -> tuple[Obstacle, ...]:
-    """Return the list without the member of index `number`.
-
-    Raises:
-        ConfigError: there is no such index.
-    """
-    if not 0 <= number < len(known):
-        raise ConfigError("obstacle", [f"remove {number}: there are {len(known)}, counted from 0; see: obstacle list"])
-    return known[:number] + known[number + 1 :]
-
-
 def vector(key: str, text: str, problems: list[str]) -> tuple[float, float, float]:
     """Return the vector that `north,east,down` describes; what is wrong with it is added to `problems`."""
     try:
@@ -231,19 +158,6 @@ def vector(key: str, text: str, problems: list[str]) -> tuple[float, float, floa
         problems.append(f"{key} {text!r}: write three numbers, north,east,down, for example 1.5,0,-2")
         return (0.0, 0.0, 0.0)
     return (north, east, down)
-
-
-def _obstacles(bus: ZenohBus, least_version: int, say: bytes | None = None) -> ObstaclesMessage:
-    deadline_s = time.monotonic() + ANSWER_S
-    while time.monotonic() < deadline_s:
-        if say is not None:
-            bus.publish(OBSTACLES, say)
-        time.sleep(REPEAT_S)
-        for _, payload in bus.receive(OBSTACLES):
-            message = decode_obstacles(payload)
-            if message is not None and message.version >= least_version:
-                return message
-    raise StartError(f"obstacle: the launch did not answer within {ANSWER_S:.0f} s; see: swarmctl status")
 
 
 def _statuses(bus: ZenohBus, agents: range, timeout_s: float) -> dict[int, StatusMessage]:

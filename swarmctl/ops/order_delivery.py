@@ -18,7 +18,7 @@ from swarmctl.bus.topics import ANSWER, COMMAND, STATUS
 from swarmctl.core.operator_verbs import OPERATOR_VERBS, PEER, Answer, Order
 from swarmctl.core.text import printable
 from swarmctl.core.types import Phase
-from swarmctl.errors import StartError
+from swarmctl.errors import ConfigError, StartError
 from swarmctl.ops.operator import ANSWER_S, REPEAT_S, RunningLaunch, joined
 
 _POLL_S = 0.02
@@ -54,6 +54,11 @@ class Reply:
         return self.problem or f"{agent_name(self.agent)} accepts{where}"
 
 
+def numbered(order: Order) -> Order:
+    """Return an order under a number of its own, by which its copies by several clocks are known to be one order."""
+    return replace(order, number=secrets.randbits(53) | 1)
+
+
 class OrderDelivery:
     """Keeps track of who has answered one order, and who is seen to obey it.
 
@@ -64,7 +69,7 @@ class OrderDelivery:
     """
 
     def __init__(self, order: Order, agents: Sequence[int], everybody: bool) -> None:
-        self._order = replace(order, number=secrets.randbits(53) | 1)
+        self._order = numbered(order)
         self._is_stop = OPERATOR_VERBS[order.verb].is_stop
         self._agents, self._everybody = agents, everybody
         self._answers: dict[int, Answer] = {}
@@ -130,11 +135,14 @@ def addressed(launch: RunningLaunch, order: Order, agents: Sequence[int]) -> lis
     """Return the agents an order is for: those named, or all but one that it says has ended.
 
     Raises:
-        StartError: there is no such agent, or none at all.
+        ConfigError: there is no such agent.
+        StartError: there is nobody to be told.
     """
-    for agent in agents:
-        if not 0 <= agent < launch.agents:
-            raise StartError(f"agent {agent}: {launch.run} has agents 0 to {launch.agents - 1}")
+    named = [*agents, *(int(number) for name, number in order.arguments.items() if name == PEER)]
+    unknown = [agent for agent in dict.fromkeys(named) if not 0 <= agent < launch.agents]
+    if unknown:
+        known = "agent 0 only" if launch.agents == 1 else f"agents 0 to {launch.agents - 1}"
+        raise ConfigError(order.verb, [f"there is no agent {agent}; {launch.run} has {known}" for agent in unknown])
     asked = sorted(set(agents)) or [i for i in range(launch.agents) if i != order.arguments.get(PEER)]
     if not asked:
         raise StartError(f"{order.verb}: {launch.run} has no other agent that could be told")
@@ -145,7 +153,8 @@ def deliver(launch: RunningLaunch, order: Order, agents: Sequence[int]) -> list[
     """Give an order to agents of a launch, or to all; returns what each has answered, at the latest after `ANSWER_S`.
 
     Raises:
-        StartError: there is no such agent, or the bus can't be joined.
+        ConfigError: there is no such agent.
+        StartError: the bus can't be joined.
     """
     asked = addressed(launch, order, agents)
     delivery = OrderDelivery(order, asked, everybody=len(asked) == launch.agents)

@@ -24,6 +24,7 @@ from swarmctl.bus.peers import agent_name
 from swarmctl.bus.zenoh_bus import socket_file
 from swarmctl.config import Config
 from swarmctl.config_view import viewed_flight
+from swarmctl.core.text import printable
 from swarmctl.errors import StartError
 from swarmctl.process_lifetime import PARENT_ENV
 
@@ -202,14 +203,14 @@ class Child:
     def last_line(self) -> str:
         """Return the last line of its log that is not empty."""
         lines = [line.strip() for line in self._tail().splitlines() if line.strip()]
-        return lines[-1] if lines else ""
+        return printable(lines[-1]) if lines else ""
 
     def line_with(self, text: str) -> str:
         """Return the first line of its log that contains `text`, or ""."""
         with contextlib.suppress(OSError):
             for line in self.log.read_text(encoding="utf-8", errors="replace").splitlines():
                 if text in line:
-                    return line.strip()
+                    return printable(line.strip())
         return ""
 
     def _tail(self) -> str:

@@ -28,9 +28,9 @@ from swarmctl.core.types import FlightMode, Phase
 
 REFRESH_HZ = 4.0
 _LINE = 2000  # longest printed line
-_WIDE = 105  # columns of a terminal that has room for everything
+_WIDE = 117  # columns of a terminal that has room for everything
 _SILENT_S = 2.0  # without a status for so long an agent is lost to the operator
-_OPERATORS_MATTER = ("HOLD", "GOTO", "WAIT", "PILOT", "LOST")  # control modes whose beginning and end are lines
+_OPERATORS_MATTER = ("HOLD", "GOTO", "WAIT", "PILOT", "FAILSAFE", "LOST")  # whose beginning and end are lines
 _FIX = {0: "no", 1: "no", 2: "2D", 3: "3D", 4: "DGPS", 5: "float", 6: "RTK"}  # GPS_FIX_TYPE
 
 
@@ -78,17 +78,17 @@ class Display(Protocol):
         """Leave the last state on the screen."""
 
 
-def open_display(stream: TextIO | None = None) -> Display:
-    """Return a live table when `stream` (default: standard output) is a terminal, plain lines otherwise."""
+def open_display(stream: TextIO | None = None, run: str = "") -> Display:
+    """Return a live table of a run when `stream` (default: standard output) is a terminal, plain lines otherwise."""
     console = Console(file=stream or sys.stdout, highlight=False)
-    return LiveTable(console) if console.is_terminal else PlainLines(stream or sys.stdout)
+    return LiveTable(console, run) if console.is_terminal else PlainLines(stream or sys.stdout)
 
 
 class LiveTable:
     """Redraws a table in place and prints lines above it. A lost terminal does not stop the flight."""
 
-    def __init__(self, console: Console) -> None:
-        self._console = console
+    def __init__(self, console: Console, run: str = "") -> None:
+        self._console, self._run = console, run
         self._live: Live | None = None
         self._shown_s = 0.0
 
@@ -105,7 +105,7 @@ class LiveTable:
             if self._live is None:
                 self._live = Live(console=self._console, auto_refresh=False)
                 self._live.start()
-            self._live.update(status_table(agents, *self._console.size), refresh=True)
+            self._live.update(status_table(agents, *self._console.size, run=self._run), refresh=True)
 
     def close(self) -> None:
         live, self._live = self._live, None
@@ -142,24 +142,43 @@ class PlainLines:
         return
 
 
-def print_statuses(agents: Sequence[AgentView]) -> None:
-    """Print the statuses once: a table on a terminal, one line per agent elsewhere."""
+def print_statuses(agents: Sequence[AgentView], run: str = "") -> None:
+    """Print the statuses of a run once: a table on a terminal, one line per agent elsewhere."""
     console = Console(highlight=False)
     if console.is_terminal:
-        console.print(status_table(agents, console.width))
+        console.print(status_table(agents, console.width, run=run))
         return
     print("\t".join([*(f"{column.title} {column.unit}".rstrip() for column in COLUMNS), "alert"]))
     for view in agents:
         print("\t".join(status_cells(view)))
 
 
-def status_table(agents: Sequence[AgentView], width: int = 80, height: int | None = None) -> Group:
-    """Return the table with one row per agent, and the alerts below it.
+def headline(agents: Sequence[AgentView]) -> str:
+    """Return the mission clock, and what ends when."""
+    known = [view.status for view in agents if view.status is not None]
+    phases, numbers = [status.phase for status in known], [status.agent for status in known if status.held]
+    ends_s = [status.ends_in_s for status in known if status.ends_in_s >= 0.0]
+    held = f"; without an end: {', '.join(map(str, numbers))} (held)" if numbers else ""
+    if not known:
+        return "no status yet"
+    if Phase.TRACK in phases:
+        clock_s = max(status.mission_t_s for status in known)
+        return f"mission {clock_s:.0f} s" + (f", ends in {max(ends_s):.0f} s" if ends_s else "") + held
+    if min(phases) < Phase.TRACK:
+        waits = f"mission not begun, {phases.count(Phase.READY)} of {len(agents)} agents ready"
+        return waits + (f", given up in {min(ends_s):.0f} s" if ends_s else "") + held
+    landing = f", latest landing in {max(ends_s):.0f} s" if ends_s else ""
+    return ("mission over" if min(phases) == Phase.DONE else f"mission over, landing{landing}") + held
+
+
+def status_table(agents: Sequence[AgentView], width: int = 80, height: int | None = None, *, run: str = "") -> Group:
+    """Return the mission clock, the table with one row per agent, and the alerts below it.
 
     Args:
         agents: what is known of each.
         width: columns of the terminal.
         height: its lines; None: as many as there are.
+        run: name of the run, if it is to be shown.
     """
     columns = [column for column in COLUMNS if width >= _WIDE or not column.only_wide]
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
@@ -167,8 +186,9 @@ def status_table(agents: Sequence[AgentView], width: int = 80, height: int | Non
         table.add_column(f"{column.title}\n{column.unit}", justify=column.justify, min_width=column.width, no_wrap=True)
     for view in agents:
         table.add_row(*(Text(column.cell_of(view)) for column in columns))  # not markup: agents' texts may have "[...]"
-    room = None if height is None else max(1, height - len(agents) - 4)
-    return Group(table, *(Text(line) for line in _alert_lines(agents, width, room)))
+    room = None if height is None else max(1, height - len(agents) - 5)
+    title = Text(": ".join(word for word in (run, headline(agents)) if word), no_wrap=True, overflow="ellipsis")
+    return Group(title, table, *(Text(line) for line in _alert_lines(agents, width, room)))
 
 
 def _alert_lines(agents: Sequence[AgentView], width: int, room: int | None) -> list[str]:
@@ -229,6 +249,8 @@ COLUMNS = (
         cell=lambda v, s: _number(s.plan_staleness_ms, 0, 5),
         only_wide=True,
     ),
+    Column(title="clock", width=5, unit="s", cell=lambda v, s: _number(s.mission_t_s, 0, 5), only_wide=True),
+    Column(title="ends", width=5, unit="s", cell=lambda v, s: _number(s.ends_in_s, 0, 5), only_wide=True),
     Column(title="gps", width=7, unit="sat", cell=lambda v, s: _gps(s), justify="left", only_wide=True),
 )
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from swarmctl.config import Config, load_recorded
 from swarmctl.core.text import printable
 from swarmctl.ops.supervisor import LaunchResult
+from swarmctl.telemetry.evaluation.referee import SUMMED_ERROR
 
 if TYPE_CHECKING:
     from swarmctl.telemetry.evaluation.referee import Rules
@@ -100,7 +101,8 @@ def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...
     timing, solver, comms = (_section(summary, name) for name in ("timing", "solver", "comms"))
     tick, solve, age = _section(timing, "tick_ms"), _section(timing, "solve_ms"), _section(comms, "path_age_ms")
     rejected = sum(_section(comms, "rejected").values())
-    outcome = f"{summary.get('outcome')}, summed mean tracking error {_m(_section(summary, 'tracking').get('index_m'))}"
+    error = f"summed mean tracking error {_m(_section(summary, 'tracking').get('index_m'))}"
+    outcome = f"{summary.get('outcome')}, {error} ({SUMMED_ERROR})"
     if len(violations) == 1:
         outcome += f"; 1 violation: {printable(violations[0])}"
     elif violations:

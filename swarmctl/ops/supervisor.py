@@ -9,21 +9,24 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
-from swarmctl.bus.json_messages import ObstaclesMessage, decode_obstacles, decode_status, encode_message
+import msgspec
+
+from swarmctl.bus.json_messages import ObstaclesMessage, decode_obstacles, decode_status, encode_message, first_list
 from swarmctl.bus.orders import EVERYBODY, order_messages
 from swarmctl.bus.peers import Bus, agent_name
 from swarmctl.bus.topics import COMMAND, OBSTACLES, STATUS
 from swarmctl.config import Config
-from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import EXCLUDE, PEER, Order
 from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START
+from swarmctl.ops.order_delivery import numbered
 from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, RunContext, kill_all
 from swarmctl.ops.recovery import RECOVERY_S, Recovery
 from swarmctl.ops.status_table import AgentView, Display, name_of
+from swarmctl.telemetry.evaluation.referee import JudgedObstacle
 from swarmctl.telemetry.recording.event_log import EventLog
 
 _STEP_S = 0.05
@@ -64,7 +67,7 @@ class LaunchResult:
     has_armed: bool = False  # an agent has requested arming
     left: tuple[str, ...] = ()  # vehicles that may still be armed or in the air, in words
     interrupted: bool = False
-    obstacles: dict[Obstacle, int | None] | None = None  # obstacle -> since when [us UTC]; None: as configured
+    obstacles: tuple[JudgedObstacle, ...] | None = None  # all there were; None: as configured
 
     @property
     def outcome(self) -> str:
@@ -89,6 +92,17 @@ def why_it_failed(outcome: str, last_line: str) -> str:
     return (outcome if outcome != "completed" else "") or last_line or "no reason given"
 
 
+def _judged(known: tuple[JudgedObstacle, ...], message: ObstaclesMessage, utc_us: int) -> tuple[JudgedObstacle, ...]:
+    """Return all obstacles there were: those known that a list lacks are there until now, those it adds are new."""
+    listed = [
+        JudgedObstacle(number=item.number, obstacle=item.obstacle, since_utc_us=item.since_utc_us)
+        for item in message.obstacles
+    ]
+    there = set(listed)
+    kept = [j if j in there or j.until_utc_us is not None else replace(j, until_utc_us=utc_us) for j in known]
+    return (*kept, *(judged for judged in listed if judged not in kept))
+
+
 class FlightSupervisor:
     """Watches one launch until every agent has ended or has been given up."""
 
@@ -101,8 +115,8 @@ class FlightSupervisor:
         self._display = display
         self._result = LaunchResult()
         self._views = [AgentView(agent=agent) for agent in range(config.swarm.agents)]
-        self._configured = ObstaclesMessage(1, config.obstacles)
-        self._obstacles = self._configured
+        self._obstacles = first_list(config.obstacles, time.time_ns() // 1000)
+        self._result.obstacles = _judged((), self._obstacles, 0)
         self._obstacles_said_s = 0.0
         self._started_s = time.monotonic()
         self._reported: set[str] = set()
@@ -165,11 +179,9 @@ class FlightSupervisor:
                 self._adopt(message)
 
     def _adopt(self, message: ObstaclesMessage) -> None:
-        """Adopt an operator's obstacle list: repeat it, and judge its new obstacles from now on."""
+        """Adopt an operator's obstacle list: repeat it, judge what is new from now on and what is gone until now."""
+        self._result.obstacles = _judged(self._result.obstacles or (), message, time.time_ns() // 1000)
         self._obstacles, self._obstacles_said_s = message, 0.0
-        now_us = time.time_ns() // 1000
-        known = self._result.obstacles or dict.fromkeys(self._configured.obstacles)
-        self._result.obstacles = {item: known.get(item, now_us) for item in message.obstacles}
         self._announce("obstacles", f"{len(message.obstacles)} obstacles, set by an operator", version=message.version)
 
     def _watch_essential_processes(self) -> None:
@@ -218,12 +230,12 @@ class FlightSupervisor:
         self._order(Order(EXCLUDE, {PEER: agent}), [view for view in self._running() if view.agent != agent])
 
     def _order(self, order: Order, views: list[AgentView]) -> None:
-        """Give an order to all agents, stamped by the clocks of these."""
+        """Give an order to all agents, stamped by the clocks of these. A repetition is another order, obeyed anew."""
         now_s = time.monotonic()
         clocks_us = [
             view.status.utc_us + round((now_s - view.received_s) * 1e6) for view in views if view.status is not None
         ]
-        for message in order_messages(order, EVERYBODY, time.time_ns() // 1000, clocks_us):
+        for message in order_messages(numbered(order), EVERYBODY, time.time_ns() // 1000, clocks_us):
             self._bus.publish(COMMAND, message)
 
     def _recover(self, view: AgentView, code: int) -> None:
@@ -274,7 +286,8 @@ class FlightSupervisor:
         now_s = time.monotonic()
         if now_s - self._obstacles_said_s >= _OBSTACLES_REPEAT_S:
             self._obstacles_said_s = now_s
-            self._bus.publish(OBSTACLES, encode_message(self._obstacles))
+            told = msgspec.structs.replace(self._obstacles, utc_us=time.time_ns() // 1000)
+            self._bus.publish(OBSTACLES, encode_message(told))
         if self._land_ordered_s is not None and now_s - self._land_said_s >= _LAND_REPEAT_S:
             self._land_said_s = now_s
             self._repeat_land_order(now_s - self._land_ordered_s)

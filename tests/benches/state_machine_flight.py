@@ -44,6 +44,7 @@ class Flight:
         self.refusal = self.unsettled = self.cut_off = ""
         self.beat_us: int | None = None  # arrival of the HEARTBEAT that reported `armed`; None: one with every step
         self.busy = self.unresponsive_peer = False
+        self.setpoints_stopped = ""
         self.seen = True
         self.escalation = NOTHING_WORN
         self.peers = {k + 1: PeerInputs(Phase.STANDBY, 0, True) for k in range(peers)}
@@ -79,6 +80,7 @@ class Flight:
 
     def step(self) -> list[Command]:
         inputs = PhaseInputs(
+            setpoints_stopped=self.setpoints_stopped,
             now_us=self.now_us,
             utc_us=self.utc_us,
             state=self.state,

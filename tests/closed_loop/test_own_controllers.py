@@ -11,8 +11,10 @@ import pytest
 from sitl.lockstep import Lockstep
 from swarmctl.config import load
 from swarmctl.control.controllers.guard import Guard
+from swarmctl.control.reference.kinds.goto import GotoParams
 from swarmctl.core.types import Mode, Phase
-from tests.closed_loop.conftest import Flight, closer_than, fly_now, mission_is_over
+from swarmctl.errors import ConfigError
+from tests.closed_loop.conftest import ROOT, Flight, closer_than, fly_now, mission_is_over
 
 HEAD_ON = (
     "swarm.agents=2",
@@ -96,3 +98,27 @@ def test_every_example_flies(name: str, rmse_m: float) -> None:
         late = ticks["mission_t_s"] > 1.0
         assert float(np.sqrt(np.mean(np.sum(error[late] ** 2, axis=1)))) <= rmse_m
         assert failures(flight, agent) == [], "it flies itself"
+
+
+SWAPPED = "mission.own.formations=[{slots_ned_m=[[2.0,1.0,-3.0],[2.0,-1.0,-3.0]]}]"  # agent 0 waits on the other side
+
+
+def test_a_formation_is_changed_by_the_assignment_of_least_squares() -> None:
+    short = ("swarm.agents=2", "sitl.start=air", "mission.duration_s=4.5", "mission.own.stay_s=0.5")
+    sets = (*short, "mission.own.change_s=3.0", SWAPPED)
+    flight = fly_now(*sets, config="examples/own_formation.toml", until=mission_is_over)
+    assert flight.outcomes == {"completed"}
+    assert flight.separation_m() >= 1.9, "side by side"
+    for agent, slot in enumerate(([2.0, -1.0, -3.0], [2.0, 1.0, -3.0])):
+        ticks, _ = flight.tracked(agent)
+        assert ticks["pos_ned_m"][-1] == pytest.approx(slot, abs=0.05)
+    with pytest.raises(ConfigError, match=r"agents 0 and 1: at .* the references are"):
+        fly_now(*sets, "mission.own.assigned=false", config="examples/own_formation.toml", until=mission_is_over)
+    with pytest.raises(ConfigError, match=r"agents 0 and 3: at 4\.54 s the references are 0\.85 m apart"):
+        load(ROOT / "configs" / "examples/own_formation.toml", ["mission.own.assigned=false"])
+
+
+def test_six_agents_with_goals_and_obstacles_of_their_own_are_in_one_file() -> None:
+    config = load(ROOT / "configs" / "examples/six_goals.toml")
+    assert len(set(config.mission.section(GotoParams).goals_ned_m)) == config.swarm.agents == 6
+    assert [obstacle.column for obstacle in config.obstacles] == [True, False, False]

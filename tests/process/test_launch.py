@@ -334,7 +334,9 @@ def test_two_launches_at_once_beside_another_simulator(start: Start) -> None:
     assert one["run"] != other["run"]
 
 
-def test_operator_verbs(start: Start, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_operator_verbs(
+    start: Start, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     """In this process, except for one: test_readme.py starts most of them as the programs they are."""
     launched = start(*TWO, *AIR, "--duration", "120")
     monkeypatch.setattr(tempfile, "tempdir", str(launched.temp))
@@ -379,11 +381,26 @@ def test_operator_verbs(start: Start, monkeypatch: pytest.MonkeyPatch, capsys: p
     where = ("--center", "-40,2.5,-9", "--radius", "0.5", "--run-dir", str(launched.run_dir))
     added = verb("obstacle", "add", *where)
     assert added.returncode == 0, added.stderr
-    assert "0: centre -40.00, 2.50, -9.00" in added.stdout
-    assert "1 obstacles" in verb("obstacle", "list").stdout
-    assert "0 obstacles" in verb("obstacle", "remove", "0").stdout
-    assert verb("obstacle", "remove", "0").returncode == 2
-    assert verb("land", "--agent", "7").returncode == 3
+    assert "0: sphere at -40.00, 2.50, -9.00  radius 0.5  keep-out 1.25  seen from 3  at rest" in added.stdout
+    file = tmp_path / "obstacles.toml"
+    file.write_text("[[obstacles]]\ncenter_ned_m = [-40.0, 9.0, -9.0]\n")
+    assert "1: sphere at -40.00, 9.00, -9.00" in verb("obstacle", "load", str(file)).stdout
+    moved = verb("obstacle", "move", "0", "--velocity", "-1,0,0")
+    assert moved.returncode == 0, moved.stderr
+    assert "velocity -1.00, 0.00, 0.00 m/s" in moved.stdout
+    there = json.loads(verb("obstacle", "list", "--json").stdout)
+    assert [item["number"] for item in there] == [0, 1]
+    assert there[0]["center_ned_m"][0] < -40.0 and there[1]["center_ned_m"][0] == -40.0, "one of them moves"
+    assert "2 obstacles" in verb("obstacle", "save", str(tmp_path / "saved.toml")).stdout
+    assert "1: sphere at" in verb("obstacle", "remove", "0").stdout
+    unknown = verb("obstacle", "remove", "0", "7")
+    assert unknown.returncode == 2
+    assert unknown.stderr.count("those there are: 1") == 2
+    assert "0 obstacles" in verb("obstacle", "remove", "1").stdout
+    nobody = verb("hold", "7", "0", "9")
+    assert nobody.returncode == 2
+    assert re.findall(r"^hold: there is no agent \d; \S+ has agents 0 to 1$", nobody.stderr, re.MULTILINE)
+    assert verb("exclude", "--peer", "2").returncode == 2
     assert verb("resume").returncode == 0
     excluded = launched.verb("exclude", "--peer", "1")
     assert excluded.returncode == 0, excluded.stderr

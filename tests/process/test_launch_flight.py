@@ -13,8 +13,10 @@ import pytest
 
 import swarmctl.ops.recovery
 import swarmctl.ops.supervisor
-from swarmctl.bus.json_messages import ObstaclesMessage, decode_command, decode_obstacles, encode_message
+from swarmctl.bus.json_messages import decode_command, decode_obstacles, encode_message, first_list
+from swarmctl.bus.orders import Orders
 from swarmctl.bus.peers import LocalHub, agent_name
+from swarmctl.bus.refusals import Refusals
 from swarmctl.bus.topics import COMMAND, OBSTACLES, OPERATOR, STATUS
 from swarmctl.config import load
 from swarmctl.core.obstacle import Obstacle
@@ -73,6 +75,7 @@ class ScriptedServices(Services):
         self.silent: set[int] = set()
         self.orders: list[str] = []
         self.vouched: set[int] = set()  # agents whose end the others were told
+        self.heard: list[tuple[int, bytes]] = []  # orders as the first agent has received them, and when
         self.stamped_us: list[tuple[int, int]] = []  # of each order, by how much it was stamped before we heard it
         self.behind_us = 0  # by how much the agents' clock is behind ours
         self.obeys = True
@@ -102,9 +105,11 @@ class ScriptedServices(Services):
 
     def show(self, agents: Sequence[AgentView]) -> None:
         for i, bus in enumerate(self.agents):
-            orders = [order for _, payload in bus.receive(COMMAND) if (order := decode_command(payload))]
-            self.orders += [order.verb for order in orders]
             now_us = time.time_ns() // 1000
+            received = [payload for _, payload in bus.receive(COMMAND)]
+            self.heard += [(now_us, payload) for payload in received if i == 0]
+            orders = [order for order in map(decode_command, received) if order]
+            self.orders += [order.verb for order in orders]
             self.stamped_us += [(order.utc_us, now_us - order.utc_us) for order in orders]
             self.vouched |= {int(order.arguments[PEER]) for order in orders if order.verb == EXCLUDE}
             if any(order.verb == "land" for order in orders) and self.obeys and i not in self.silent:
@@ -294,6 +299,15 @@ def test_agents_whose_clock_is_an_hour_behind_are_ordered_to_land_by_their_own(t
     scene.fly()
     ages_us = {round(age_us, -6) for _, age_us in scene.stamped_us}
     assert ages_us == {0, 3_600_000_000}
+    refusals = Refusals(lambda *_, **__: None)
+    orders, behind_us, verbs = Orders(0, refusals), scene.behind_us, []
+    for heard_us, payload in scene.heard:
+        order = orders.take(OPERATOR, payload, heard_us - behind_us)
+        orders.refuse_misdated(heard_us - behind_us)
+        verbs += [order.verb] if order else []
+        assert refusals.alert(heard_us - behind_us) == "", "the copy by our clock is no forgery"
+    assert len(verbs) > 2, "each repetition is obeyed anew"
+    assert set(verbs) == {"land"}
 
 
 def test_second_interrupt_kills_at_once(tmp_path: Path) -> None:
@@ -350,23 +364,27 @@ def test_landed_by_an_operator_is_an_interrupted_flight(tmp_path: Path) -> None:
 def test_obstacles_of_an_operator_are_adopted_and_repeated(tmp_path: Path) -> None:
     scene = ScriptedServices(tmp_path, [ends(0, 2.0)])
     ball = Obstacle(center_ned_m=(1.0, 2.0, -3.0), radius_m=0.5, keep_out_m=1.0)
+    column = ball.model_copy(update={"column": True})
+    began_us = time.time_ns() // 1000
     repeated: list[int] = []
+    sent = [first_list((ball, ball), began_us, 5), first_list((column,), began_us, 6)]
 
-    def set_ball() -> None:
-        scene.hub.carry(OPERATOR, OBSTACLES, encode_message(ObstaclesMessage(5, (ball,))))
-        scene.act = collect
-
-    def collect() -> None:
+    def carry() -> None:
+        if sent and (not repeated or repeated[-1] == 5):
+            scene.hub.carry(OPERATOR, OBSTACLES, encode_message(sent.pop(0)))
         for _, payload in scene.agents[0].receive(OBSTACLES):
             message = decode_obstacles(payload)
             assert message is not None
             repeated.append(message.version)
-        scene.act = collect
+        scene.act = carry
 
-    scene.act = set_ball
+    scene.act = carry
     scene.join_as_operator()
     result = scene.fly()
-    assert repeated[-1] == 5
+    assert repeated[-1] == 6
     assert result.obstacles is not None
-    assert list(result.obstacles) == [ball]
-    assert all(since_us is not None for since_us in result.obstacles.values())
+    assert [(judged.number, judged.obstacle) for judged in result.obstacles] == [(0, ball), (1, ball), (0, column)]
+    assert [judged.until_utc_us is None for judged in result.obstacles] == [False, False, True], (
+        "what is gone was there"
+    )
+    assert all(judged.since_utc_us == began_us for judged in result.obstacles)

@@ -16,10 +16,18 @@ pytestmark = pytest.mark.process
 ROOT = Path(__file__).parents[2]
 CODE = re.findall(r"^```python\n(.*?)^```$", (ROOT / "docs" / "python_api.md").read_text(), re.DOTALL | re.MULTILINE)
 LAUNCHED = {"swarm.agents": 1, "telemetry.enabled": False, "sitl.ground_z_m": 1.0}  # long enough to be held
+EXAMPLE = f"""\
+    import sys
+
+    sys.path.append({str(ROOT / "configs" / "examples")!r})
+    import steer_swarm
+    steer_swarm.climb_in_turn(swarm, range(1))
+"""
 SHORTER = {  # what flies is shortened, and the launch has nobody to look at it
     '"swarm.agents": 3': '"swarm.agents": 1, "sitl.start": "air"',
     '"mission.duration_s": 20.0': '"mission.duration_s": 3.0',
     "launch(config": f"launch(swarmctl.load(set={LAUNCHED})",
+    "    swarm.resume()\n": f"    swarm.resume()\n{EXAMPLE}",  # configs/examples/steer_swarm.py steers the same launch
 }
 
 
@@ -51,11 +59,13 @@ def test_what_the_page_shows_is_true(flown: tuple[Path, list[str]]) -> None:
     assert count > 25, "3 s of mission, ten a second, and the way there"
     assert 0.5 < ahead_s < 3.0
     assert said[-1] == "interrupted", "it was landed before the end of its mission"
+    assert "agent 0 is at 1.5 m" in said
 
 
 def test_an_order_was_obeyed_by_the_vehicle_and_the_launch_has_ended(flown: tuple[Path, list[str]]) -> None:
     run = swarmctl.load_run(flown[0] / "runs" / "second")
     obeyed = [event["verb"] for event in run.events if event["event"] == "operator"]
-    assert obeyed[:4] == ["hold", "goto", "resume", "land"]
+    steered = ["hold", "goto", "resume"]
+    assert obeyed[:7] == [*steered, *steered, "land"], "by the page, and by the example"
     assert run.true_states(0)["landed"][-1].as_py() == "ON_GROUND"
     assert run.ticks(0)["phase"][-1].as_py() == "DONE"

@@ -94,6 +94,13 @@ def endpoint() -> Iterator[str]:
         router.close()
 
 
+def obstacles_message(version: int, obstacles: list[dict[str, Any]] | str) -> str:
+    listed: Any = obstacles
+    if isinstance(obstacles, list):
+        listed = [{"number": i, "since_utc_us": 0, "obstacle": obstacle} for i, obstacle in enumerate(obstacles)]
+    return json.dumps({"version": version, "utc_us": 0, "next_number": 9, "obstacles": listed})
+
+
 @contextlib.contextmanager
 def viewer(endpoint: str, directory: Path, *more: str) -> Iterator[subprocess.Popen[str]]:
     directory.mkdir(exist_ok=True)
@@ -194,7 +201,7 @@ def test_obstacles_of_the_operator_replace_the_first_ones(endpoint: str, tmp_pat
         swarm.fly(0.3)
         other = OBSTACLE | {"center_ned_m": [1.0, 1.0, -9.0]}
         for version, listed in ((2, [other, OBSTACLE]), (1, []), (3, "nonsense")):
-            message = json.dumps({"version": version, "obstacles": listed})
+            message = obstacles_message(version, listed)
             swarm.session.put(f"swarm/{RUN}/operator/obstacles", message)
             swarm.fly(0.3)
         finish(process)

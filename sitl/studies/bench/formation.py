@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sitl.world import SitlWorld
 from swarmctl.agent.assembly import make_agent
 from swarmctl.bus import topics
-from swarmctl.bus.json_messages import ObstaclesMessage, StatusMessage, encode_message
+from swarmctl.bus.json_messages import StatusMessage, encode_message, first_list
 from swarmctl.bus.path_messages import encode_path
 from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.config import Config, load
@@ -196,7 +196,7 @@ class Formation:
         if now_us % _OBSTACLES_EVERY_US == 0:
             self._operator.publish(
                 topics.OBSTACLES,
-                encode_message(ObstaclesMessage(1, self._config.obstacles)),
+                encode_message(first_list(self._config.obstacles, utc_us)),
             )
 
     def _status(self, agent: int, tracking: bool, utc_us: int) -> StatusMessage:
@@ -220,6 +220,8 @@ class Formation:
             satellites=10,
             link_age_ms=8.5,
             ready_utc_us=1,
+            mission_t_s=-1.0,
+            ends_in_s=-1.0,
             outcome="",
             position_error_m=0.0,
             separation_m=0.0,

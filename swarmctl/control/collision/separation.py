@@ -174,8 +174,17 @@ def keep_out_of_peer(
     )
 
 
-def keep_out_of_obstacle(obstacle: Obstacle, dt_us: int, steps: int, params: SeparationParams) -> KeepOut:
-    """Return the keep-out of a visible obstacle, predicted at constant velocity."""
+def keep_out_of_obstacle(
+    obstacle: Obstacle, dt_us: int, steps: int, params: SeparationParams, *, number: int | None = None
+) -> KeepOut:
+    """Return the keep-out of a visible obstacle, predicted at constant velocity.
+
+    Args:
+        obstacle: as it is at the first point.
+        dt_us, steps: time grid of the plan.
+        params: distances.
+        number: the same in all ticks; None: encounters with it are not remembered.
+    """
     t_s = np.arange(steps + 1) * (dt_us * 1e-6)
     return KeepOut(
         pos_ned_m=obstacle.center_after(t_s[:, None]),
@@ -183,7 +192,7 @@ def keep_out_of_obstacle(obstacle: Obstacle, dt_us: int, steps: int, params: Sep
         hard_min_distance_m=params.budget.certified_obstacle_m(obstacle.keep_out_m),
         any_height=obstacle.column,
         priority_id=-1,
-        key=id(obstacle),
+        key=None if number is None else -1 - number,  # peers have the others
     )
 
 

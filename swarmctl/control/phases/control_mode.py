@@ -12,6 +12,7 @@ class ControlMode(enum.StrEnum):
 
     LOST = "LOST"  # no vehicle state that is new enough
     PILOT = "PILOT"  # its pilot or its autopilot has taken over
+    FAILSAFE = "FAILSAFE"  # its autopilot has, because our setpoints had stopped
     AUTO = "AUTO"  # its autopilot flies it at the agent's request, or it stands
     HOLD = "HOLD"  # an operator holds it
     GOTO = "GOTO"  # at a point of the operator's, or on the way there
@@ -21,12 +22,20 @@ class ControlMode(enum.StrEnum):
 
 
 def control_mode(
-    phase: Phase, mode: Mode, *, held: bool, goes_to_point: bool, paused: bool, lands_in_place: bool
+    phase: Phase,
+    mode: Mode,
+    *,
+    held: bool,
+    goes_to_point: bool,
+    paused: bool,
+    lands_in_place: bool,
+    setpoints_stopped: bool = False,
 ) -> str:
     """Return the control mode: the first row that applies."""
     rows = (
         (phase is Phase.CONNECT, ControlMode.AUTO),  # it was not seen yet
         (mode is Mode.STATE_STALE, ControlMode.LOST),
+        (mode is Mode.PILOT_OVERRIDE and setpoints_stopped, ControlMode.FAILSAFE),
         (mode is Mode.PILOT_OVERRIDE, ControlMode.PILOT),
         (phase is Phase.LAND or mode is Mode.LAND, ControlMode.LANDING),
         (mode in (Mode.REPLAY, Mode.BRAKE, Mode.HOLD), mode.name),

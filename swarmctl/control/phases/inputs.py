@@ -40,4 +40,5 @@ class PhaseInputs:
     unsettled: str = ""  # reason why arming must wait
     overload: Level = Level.NONE  # response to missed deadlines
     escalation: Escalation = NOTHING_WORN  # response to what wears out: battery, link
+    setpoints_stopped: str = ""  # by missed deadlines a moment ago, in words
     armed_told_us: int = -1  # arrival time of the HEARTBEAT that reported `state.armed`

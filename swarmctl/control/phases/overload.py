@@ -13,6 +13,9 @@ from pydantic import Field
 
 from swarmctl.core.params import Params
 
+_LOST_PART = 0.5  # of the time without setpoints that missed deadlines must explain
+_TOLD_WITHIN_US = 3_000_000  # a HEARTBEAT a second tells the mode, and some are lost
+
 
 class OverloadParams(Params):
     """Thresholds on the fraction of deadlines missed within `window_s`."""
@@ -32,6 +35,51 @@ class Level(enum.IntEnum):
     WIDEN = 1
     HOLD = 2
     LAND = 3
+
+
+class SetpointStops:
+    """Tells when setpoints stopped because deadlines were missed: the autopilot takes the vehicle back then.
+
+    Without this an overload looks like a pilot's takeover. A stop is remembered for as long as an autopilot may take to
+    tell its new mode.
+
+    Args:
+        period_us: period of the ticks.
+    """
+
+    def __init__(self, period_us: int) -> None:
+        self._period_us = period_us
+        self._ticked_us: int | None = None
+        self._sent_us: int | None = None
+        self._missed = self._missed_at_sent = 0
+        self._text, self._until_us = "", 0
+
+    def update(self, now_us: int, missed: int, loss_s: float) -> None:
+        """Begin a tick.
+
+        Args:
+            now_us: monotonic time.
+            missed: deadlines missed so far; those since the last tick may not be counted yet.
+            loss_s: time without setpoints after which the autopilot takes over.
+        """
+        skipped = 0 if self._ticked_us is None else max(0, (now_us - self._ticked_us) // self._period_us - 1)
+        self._ticked_us, self._missed = now_us, missed
+        if self._sent_us is None:
+            return
+        stopped_us = now_us - self._sent_us
+        lost = max(missed - self._missed_at_sent, skipped)
+        if stopped_us > loss_s * 1e6 and lost * self._period_us > _LOST_PART * stopped_us:
+            counts = f"{lost} deadline misses, {self._missed_at_sent + lost} since the start"
+            self._text = f"overload: setpoints stopped {stopped_us * 1e-6:.1f} s ({counts})"
+            self._until_us = now_us + _TOLD_WITHIN_US
+
+    def sent(self, now_us: int) -> None:
+        """Note that a setpoint has left in the tick of this time."""
+        self._sent_us, self._missed_at_sent = now_us, self._missed
+
+    def text(self, now_us: int) -> str:
+        """Return what has stopped the setpoints, and for how long, or ""."""
+        return self._text if now_us < self._until_us else ""
 
 
 class Overload:

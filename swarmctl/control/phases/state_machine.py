@@ -107,6 +107,7 @@ class MissionStateMachine:
         self._may_take_control = False  # an operator's resume permits taking control from any mode
         self._landing_seen = False
         self._outcome_before = ""  # outcome before the override, restored by resume
+        self._setpoints_stopped = False  # which the override has followed from
         self._steps: dict[Phase, Callable[[PhaseInputs, VehicleState], list[Command]]] = {
             Phase.STANDBY: self._standby,
             Phase.ARM: self._arm,
@@ -153,7 +154,7 @@ class MissionStateMachine:
             self._enter(Phase.STANDBY, inputs.now_us)
             return self._refuse(inputs.refusal, inputs) if inputs.refusal else []
         if inputs.mode is Mode.PILOT_OVERRIDE and not self.pilot_override:
-            self._override(TAKEN_OVER)
+            self._take_over(inputs)
         if self.pilot_override:
             if self._is_down(inputs, state):
                 self._enter(Phase.DONE, inputs.now_us)
@@ -210,6 +211,7 @@ class MissionStateMachine:
             goes_to_point=self._interruptions.goes_to_point,
             paused=self._interruptions.paused,
             lands_in_place=self._landing.in_place,
+            setpoints_stopped=self._setpoints_stopped,
         )
 
     def begin_if_due(self, now_us: int, utc_us: int) -> None:
@@ -222,6 +224,16 @@ class MissionStateMachine:
         if self.phase is not Phase.TRACK or self.begin_utc_us is None:
             return math.nan
         return (utc_us - self.begin_utc_us) * 1e-6
+
+    def ends_in_s(self, now_us: int, utc_us: int) -> float:
+        """Return when the mission, or what precedes or follows it, ends by itself [s]; NaN: it does not."""
+        if self.held or self.pilot_override or self._first_tick_us is None:
+            return math.nan
+        if self.phase < Phase.TRACK:
+            return self._params.start_timeout_s - (now_us - self._first_tick_us) * 1e-6
+        if self.phase is Phase.GOTO_LAND:
+            return self._params.land_timeout_s - (now_us - self._entered_us) * 1e-6
+        return self._duration_us * 1e-6 - self.mission_t_s(utc_us)
 
     def operator(self, order: Order, now_us: int, utc_us: int, state: VehicleState | None) -> str:
         """Apply an operator's order; return why it is refused, or "".
@@ -300,8 +312,15 @@ class MissionStateMachine:
         if self.phase is Phase.GOTO_LAND:
             self._entered_us = now_us
 
+    def _take_over(self, inputs: PhaseInputs) -> None:
+        """Leave the vehicle to who has taken it: its autopilot, if setpoints have stopped."""
+        stopped = inputs.setpoints_stopped
+        self._override(f"{stopped}: the autopilot took over" if stopped else TAKEN_OVER)
+        self._setpoints_stopped = bool(stopped)
+
     def _override(self, why: str) -> None:
         self.pilot_override, self.had_control, self._may_take_control = True, False, False
+        self._setpoints_stopped = False
         self._outcome_before = self.outcome
         self.outcome = why
 
@@ -434,7 +453,7 @@ class MissionStateMachine:
         No setpoints may be sent meanwhile: PX4 returns to OFFBOARD by itself when they reappear after a failsafe.
         """
         if not self._may_take_control and _is_under_other_control(state):
-            self._override(TAKEN_OVER)
+            self._take_over(inputs)
             return []
         return [Command(verb=Verb.EXTERNAL)] if self._may_request(inputs) else []
 

@@ -7,9 +7,10 @@ content of `summary.json`; a figure that can't be known is None.
 from __future__ import annotations
 
 import itertools
+import math
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -33,8 +34,19 @@ from swarmctl.telemetry.json_safe import finite, json_safe
 
 _CONTROLLED = (Mode.TRACKING, Mode.REPLAY, Mode.BRAKE)
 _SOLVER_FAILED = (PlanStatus.SOLVER_FAILED, PlanStatus.RESIDUAL)
+SUMMED_ERROR = "distances of all agents to their reference, added up; mean over the mission"  # what `index_m` is
 _MAX_LISTED = 10  # largest number of violations of one kind listed in full
 _DURATION_SLACK_S = 1.0  # mission time that may be missing at the end of a completed run
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class JudgedObstacle:
+    """Describes an obstacle and the time in which it was there."""
+
+    number: int  # as operators know it
+    obstacle: Obstacle
+    since_utc_us: int | None = None  # when it was at its centre; None: at the beginning of what was recorded
+    until_utc_us: int | None = None  # when it was removed or changed; None: it never was
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,7 +55,7 @@ class Rules:
 
     agents: int
     required_separation_m: float
-    obstacles: Mapping[Obstacle, int | None] = field(default_factory=dict)  # since when, UTC [us]; None: always
+    obstacles: tuple[JudgedObstacle, ...] = ()
     obstacle_margin_m: float = 0.05  # allowed intrusion into keep_out_m
     deadline_misses_01: float = 0.2  # largest fraction of due ticks, flown or skipped, that may miss their deadline
     solver_name: str = "osqp"
@@ -115,12 +127,19 @@ def evaluate(
 
 
 class _MissionClock:
-    """Converts instants to mission time if there is a mission, otherwise to time since the first arming."""
+    """Converts instants to mission time if there is a mission, otherwise to time since the first arming.
+
+    Attributes:
+        start_us: that instant.
+        first_us: the first tick of any agent, at which configured obstacles are at their centres.
+    """
 
     def __init__(self, ticks: Mapping[int, NDArray[np.void]], tracks: Tracks) -> None:
-        first_us = float(tracks.t_us[0]) if len(tracks.t_us) else 0.0
+        armed_us = float(tracks.t_us[0]) if len(tracks.t_us) else 0.0
         start_us = mission_start_us(ticks, tracks.time_field)
-        self.start_us = first_us if start_us is None else start_us
+        self.start_us = armed_us if start_us is None else start_us
+        firsts_us = [float(rows[tracks.time_field][0]) for rows in ticks.values() if len(rows)]
+        self.first_us = min(firsts_us, default=armed_us)
         self.utc_offset_us = 0.0 if tracks.time_field == "utc_us" else utc_offset_us(ticks)
 
     def at_s(self, t_us: float) -> float:
@@ -176,12 +195,14 @@ def _evaluate_obstacles(
     """Return distance and required distance to the centre (axis of a column) of the obstacle with the least margin."""
     worst: tuple[float, float] | None = None  # (distance, required) with the least margin
     violations = []
-    for number, (obstacle, since_utc_us) in enumerate(rules.obstacles.items()):
+    for judged in rules.obstacles:
+        obstacle, until_utc_us = judged.obstacle, judged.until_utc_us
         required_m = obstacle.keep_out_m - rules.obstacle_margin_m
-        since_us = clock.start_us if since_utc_us is None else since_utc_us - clock.utc_offset_us
+        since_us = clock.first_us if judged.since_utc_us is None else judged.since_utc_us - clock.utc_offset_us
         elapsed_s = (tracks.t_us - since_us) / 1e6
         center_ned_m = obstacle.center_after(elapsed_s[:, None])  # (T, 3)
-        counts = np.ones(len(elapsed_s), bool) if since_utc_us is None else elapsed_s >= 0.0
+        gone_us = math.inf if until_utc_us is None else until_utc_us - clock.utc_offset_us
+        counts = (elapsed_s >= 0.0) & (tracks.t_us <= gone_us)
         for agent in range(rules.agents):
             apart_m = tracks.pos_ned_m[:, agent] - center_ned_m
             distance_m = np.linalg.norm(apart_m[:, : obstacle.axes], axis=1)
@@ -195,7 +216,7 @@ def _evaluate_obstacles(
             if least_m < required_m:
                 violations.append(
                     f"obstacle clearance {least_m:.3f} m below {required_m:g} m "
-                    f"between agent {agent} and obstacle {number} at {clock.at_s(tracks.t_us[nearest]):.1f} s"
+                    f"between agent {agent} and obstacle {judged.number} at {clock.at_s(tracks.t_us[nearest]):.1f} s"
                 )
     distance, required = worst or (None, None)
     return {"min_clearance_m": distance, "required_m": required}, _shorten(violations)

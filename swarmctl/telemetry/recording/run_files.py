@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from swarmctl import __version__
 from swarmctl.core.records import PLAN_COLUMNS, TICK_DTYPE, TRUTH_COLUMNS
 from swarmctl.core.stored_column import StoredColumn, dtype_of
+from swarmctl.core.text import printable
 from swarmctl.core.tick_record import COLUMNS
 from swarmctl.errors import ConfigError
 from swarmctl.files import read_file, replaced
@@ -150,7 +151,18 @@ def _event(line: bytes) -> dict[str, Any] | None:
         row = json.loads(line.decode("utf-8", errors="replace"))
     except (ValueError, RecursionError):
         return None
-    return row if isinstance(row, dict) and _is_sane(row) else None
+    return _printable(row) if isinstance(row, dict) and _is_sane(row) else None
+
+
+def _printable(value: Any) -> Any:
+    """Return a value of JSON with all its text printable, whoever has written the file."""
+    if isinstance(value, str):
+        return value if value.isprintable() else printable(value)
+    if isinstance(value, list):
+        return [_printable(item) for item in value]
+    if isinstance(value, dict):
+        return {_printable(key): _printable(item) for key, item in value.items()}
+    return value
 
 
 def _is_sane(row: dict[str, Any]) -> bool:

@@ -87,7 +87,7 @@ class RunCharts:
             if np.ptp(last, axis=0).max() < _AT_REST_M:
                 name = "goal" if self._is_shared else f"goal {', '.join(map(str, group))}"
                 goals.append(Goal(last[-1], name, self._color_of(agent)))
-        obstacles = self._rules.obstacles if self._rules else ()
+        obstacles = [judged.obstacle for judged in self._rules.obstacles] if self._rules else []
         balls = [Ball(obstacle.center_ned_m, obstacle.keep_out_m, "keepout") for obstacle in obstacles]
         return top_view("From above: north up, east right [m]", lines, balls, self._points, goals=goals)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from swarmctl.files import replace_text
-from swarmctl.telemetry.evaluation.referee import Rules, RunData
+from swarmctl.telemetry.evaluation.referee import SUMMED_ERROR, Rules, RunData
 from swarmctl.telemetry.palette import agent_rgb, css
 from swarmctl.telemetry.report.pages import render
 from swarmctl.telemetry.report.run_charts import RunCharts
@@ -101,7 +101,8 @@ def summary_rows(summary: Mapping[str, Any], rules: Rules | None) -> Iterator[Su
     late = f"{timing['late_ticks']} of {due}"
     limit = "" if most is None else f"{most:.0%}"
     yield SummaryRow("deadline misses", late, limit, good, timing["late_ticks"])
-    for name, key in (("summed mean tracking error", "index_m"), ("the same after 10 s", "index_after_10s_m")):
+    named = (f"summed mean tracking error ({SUMMED_ERROR})", "index_m"), ("the same after 10 s", "index_after_10s_m")
+    for name, key in named:
         error_m = summary["tracking"][key]
         yield SummaryRow(name, _figure(error_m, "m", 3), number=error_m)
     for name, key in (("tick time", "tick_ms"), ("solve time", "solve_ms")):

@@ -68,7 +68,7 @@ class Feed:
         return [batch for agent, samples in arrived.items() for batch in self._batch(agent, samples)]
 
     def take_obstacles(self) -> tuple[Obstacle, ...] | None:
-        """Return the operator's newest list of obstacles; None when there is no newer one."""
+        """Return the operator's newest list of obstacles, as they are now; None when there is no newer one."""
         newest: tuple[Obstacle, ...] | None = None
         for _, payload in self._bus.receive(topics.OBSTACLES):
             message = decode_obstacles(payload)
@@ -76,7 +76,7 @@ class Feed:
                 self.malformed += 1
             elif message.version > self._version:
                 self._version = message.version
-                newest = message.obstacles
+                newest = tuple(item.at(message.utc_us) for item in message.obstacles)
         return newest
 
     def _batch(self, agent: int, samples: list[tuple[NDArray[np.void], Array]]) -> list[Batch]:

@@ -12,7 +12,7 @@ import pytest
 
 from swarmctl.agent.world_model import WorldModel
 from swarmctl.bus import topics
-from swarmctl.bus.json_messages import MAX_OBSTACLES, MAX_VERSION_STEP, ObstaclesMessage, encode_message
+from swarmctl.bus.json_messages import MAX_OBSTACLES, MAX_VERSION_STEP, encode_message, first_list
 from swarmctl.bus.path_messages import encode_path
 from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.control.collision.separation import SeparationParams
@@ -58,7 +58,9 @@ class Bench:
         self.peer.publish(topics.STATUS, encode_message(msgspec.structs.replace(said, **fields)))
 
     def set_obstacles(self, count: int, version: int) -> None:
-        self.operator.publish(topics.OBSTACLES, encode_message(ObstaclesMessage(version, (BALL,) * count)))
+        self.operator.publish(
+            topics.OBSTACLES, encode_message(first_list((BALL,) * count, self.clock.utc_us(), version))
+        )
         self.tick()
 
     @property
@@ -232,3 +234,45 @@ def test_a_silent_peer_for_whom_nobody_vouches_has_not_ended() -> None:
     for _ in range(150):
         bench.tick()
     assert not bench.world_model.has_ended(1)
+
+
+def test_a_moving_obstacle_is_avoided_where_it_is_now_not_where_it_was_when_it_was_added() -> None:
+    bench = Bench()
+    train = BALL.model_copy(update={"center_ned_m": (30.0, 0.0, -2.0), "vel_ned_m_s": (-2.0, 0.0, 0.0)})
+    near = train.model_copy(update={"visibility_m": 15.0})
+    message = first_list((train, near), bench.clock.utc_us())
+    bench.operator.publish(topics.OBSTACLES, encode_message(message))
+    bench.tick()
+    assert bench.seen == 1, "the other one is too far to be seen"
+    for _ in range(500):  # 10 s
+        bench.tick()
+    now_us = bench.clock.utc_us()
+    for keep_out in bench.world_model.keep_outs(HERE, now_us, 100_000, 25, phase=Phase.TRACK):
+        assert keep_out.pos_ned_m[0] == pytest.approx([10.0, 0.0, -2.0], abs=0.05)
+        assert keep_out.pos_ned_m[25] == pytest.approx([5.0, 0.0, -2.0], abs=0.05), "2.5 s ahead"
+    bodies = bench.world_model.bodies(HERE, now_us, 0.5, 0.1, committed_peers={})
+    assert [body.pos_ned_m[0] for body in bodies] == pytest.approx([9.0, 9.0], abs=0.05)
+
+
+def test_obstacles_that_were_seen_stay_known_when_another_is_added() -> None:
+    bench = Bench()
+    bench.set_obstacles(1, 1)
+    assert bench.seen == 1
+    known = first_list((BALL,), bench.clock.utc_us() - TICK_US)
+    far = BALL.model_copy(update={"center_ned_m": (500.0, 0.0, 0.0)})
+    more = msgspec.structs.replace(first_list((BALL, far), known.utc_us, 2), next_number=2)
+    bench.operator.publish(topics.OBSTACLES, encode_message(more))
+    bench.tick()
+    assert bench.world_model.landmarks() == [BALL]
+    bench.set_obstacles(0, 3)
+    assert bench.world_model.landmarks() == []
+
+
+def test_an_encounter_is_remembered_by_the_obstacles_number_apart_from_peers() -> None:
+    bench = Bench()
+    bench.say_path()
+    bench.set_obstacles(2, 1)
+    ticks = [bench.world_model.keep_outs(HERE, bench.clock.utc_us(), 100_000, 25, phase=Phase.TRACK) for _ in range(2)]
+    keys = [[keep_out.key for keep_out in keep_outs] for keep_outs in ticks]
+    assert keys[0] == keys[1]
+    assert len(set(keys[0])) == 3

@@ -144,3 +144,44 @@ def test_many_numbered_orders_are_not_kept_for_ever() -> None:
         agent.orders.answer(order, "")
         agent.orders.due_answers()
     assert len(agent.orders._numbered) == len(agent.orders._answers) == 64
+
+
+def far_copies(operators_us: int, agents_us: int, number: int = NUMBER) -> list[bytes]:
+    """The copies of one order by the clocks of operator and agent, in the order in which they are sent."""
+    return order_messages(Order("hold", {}, number), EVERYBODY, operators_us, [agents_us])
+
+
+@pytest.mark.parametrize("step_us", [600_000, 3_600_000_000, -3_600_000_000])
+def test_the_copy_by_an_operators_other_clock_alarms_nobody(step_us: int) -> None:
+    agent = Agent3()
+    obeyed = []
+    for later_us in range(0, 5_000_000, 200_000):
+        copies = far_copies(NOW_US + step_us + later_us, NOW_US + later_us)
+        copies = copies[:1] if later_us == 0 else copies  # before the operator has heard the agent's clock
+        obeyed += [agent.orders.take(OPERATOR, payload, NOW_US + later_us) for payload in copies]
+        agent.orders.refuse_misdated(NOW_US + later_us)
+        assert agent.refusals.alert(NOW_US + later_us) == "", later_us
+    assert [order for order in obeyed if order is not None] == [Order("hold", {}, NUMBER)]
+    assert set(agent.refusals.by_reason) == {"replayed"}, "counted all the same"
+
+
+@pytest.mark.parametrize(("step_us", "reason"), [(600_000, "future_order"), (-3_600_000_000, "stale_order")])
+def test_an_order_of_another_time_that_no_copy_explains_alarms_after_two_seconds(step_us: int, reason: str) -> None:
+    agent = Agent3()
+    (copy,) = order_messages(Order("hold", {}, NUMBER), EVERYBODY, NOW_US + step_us, [])
+    for _ in range(3):
+        assert agent.orders.take(OPERATOR, copy, NOW_US) is None
+    agent.orders.refuse_misdated(NOW_US + VALID_US)
+    assert agent.refusals.total == 0
+    agent.orders.refuse_misdated(NOW_US + VALID_US + 1)
+    assert agent.refusals.by_reason == {reason: 3}
+    assert agent.refusals.alert(NOW_US + VALID_US + 1) == f"command of operator refused: {reason}"
+    assert agent.orders.take(OPERATOR, numbered("land", NOW_US + 1), NOW_US) is not None, "it was never obeyed"
+
+
+def test_many_orders_of_another_time_are_not_kept_for_ever() -> None:
+    agent = Agent3()
+    for number in range(1, 1000):
+        agent.orders.take(OPERATOR, numbered("hold", 0, number), NOW_US)
+    assert agent.refusals.by_reason == {"stale_order": 999 - 64}
+    assert len(agent.orders._misdated) == 64

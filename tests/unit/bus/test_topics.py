@@ -20,13 +20,13 @@ from swarmctl.bus.json_messages import (
     MAX_REASON,
     AnswerMessage,
     CommandMessage,
-    ObstaclesMessage,
     StatusMessage,
     decode_answer,
     decode_command,
     decode_obstacles,
     decode_status,
     encode_message,
+    first_list,
 )
 from swarmctl.bus.path_messages import decode_path, encode_path
 from swarmctl.core.obstacle import Obstacle
@@ -60,6 +60,8 @@ STATUS = StatusMessage(
     satellites=10,
     link_age_ms=8.5,
     ready_utc_us=UTC_US,
+    mission_t_s=12.5,
+    ends_in_s=25.25,
     outcome="",
     position_error_m=0.25,
     separation_m=-1.0,
@@ -221,7 +223,7 @@ def test_messages_survive_encoding() -> None:
     obstacle = Obstacle(
         center_ned_m=(9.5, 5.5, -2.3), radius_m=1.0, keep_out_m=1.75, visibility_m=3.0, vel_ned_m_s=(0.0, -0.5, 0.0)
     )
-    obstacles = ObstaclesMessage(3, (obstacle, obstacle))
+    obstacles = first_list((obstacle, obstacle), UTC_US, version=3)
     assert decode_obstacles(encode_message(obstacles)) == obstacles
 
 
@@ -297,7 +299,8 @@ def test_a_status_of_a_phase_or_mode_that_does_not_exist_is_refused(name: str, v
 
 def obstacles(**fields: object) -> bytes:
     good = {"center_ned_m": [0, 0, 0], "radius_m": 1.0, "keep_out_m": 1.75, "visibility_m": 3.0}
-    return msgspec.json.encode({"version": 1, "obstacles": [good | fields]})
+    listed = {"number": 0, "since_utc_us": UTC_US, "obstacle": good | fields}
+    return msgspec.json.encode({"version": 1, "utc_us": UTC_US, "next_number": 1, "obstacles": [listed]})
 
 
 @pytest.mark.parametrize(
@@ -319,9 +322,9 @@ def test_obstacles_that_make_no_sense_are_refused(fields: dict[str, object]) -> 
 
 @pytest.mark.parametrize("key", ["center_ned_m", "radius_m", "keep_out_m", "visibility_m"])
 def test_no_size_of_an_obstacle_is_made_up_for_its_sender(key: str) -> None:
-    item = msgspec.json.decode(obstacles())["obstacles"][0]
-    del item[key]
-    assert decode_obstacles(msgspec.json.encode({"version": 1, "obstacles": [item]})) is None
+    message = msgspec.json.decode(obstacles())
+    del message["obstacles"][0]["obstacle"][key]
+    assert decode_obstacles(msgspec.json.encode(message)) is None
     assert decode_obstacles(obstacles(height_m=3.0)) is None, "an unknown key"
 
 
@@ -339,10 +342,10 @@ def test_every_topic_has_its_own_name_and_few_old_paths_are_kept() -> None:
 
 def test_lists_and_numbers_from_outside_are_bounded() -> None:
     ball = Obstacle(center_ned_m=(9.5, 5.5, -2.3))
-    most = ObstaclesMessage(1, (ball,) * MAX_OBSTACLES)
+    most = first_list((ball,) * MAX_OBSTACLES, UTC_US)
     assert decode_obstacles(encode_message(most)) == most
     assert len(encode_message(most)) <= topics.OBSTACLES.max_bytes
-    assert decode_obstacles(encode_message(ObstaclesMessage(1, (ball,) * (MAX_OBSTACLES + 1)))) is None
+    assert decode_obstacles(encode_message(first_list((ball,) * (MAX_OBSTACLES + 1), UTC_US))) is None
     for fields in ({"center_ned_m": [0, 0, 1e5]}, {"vel_ned_m_s": [-1e5, 0, 0]}, {"keep_out_m": 1e5}):
         assert decode_obstacles(obstacles(**fields)) is None
     for name in ("agent", "boot_id", "ticks", "ready_utc_us", "utc_us"):
@@ -392,3 +395,32 @@ def test_the_table_of_topics_is_all_that_the_router_loads_of_messages() -> None:
     code = "import sys, swarmctl.bus.zenoh_bus; print({'pydantic', 'numpy', 'msgspec'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
+
+
+HOSTILE = "\x1b]0;owned\x07\x9b2J\u202e"
+
+
+def test_text_of_others_controls_no_terminal() -> None:
+    status = msgspec.structs.replace(STATUS, outcome=HOSTILE, active_alert=HOSTILE, control="\x9b2J")
+    received = decode_status(encode_message(status))
+    assert received is not None
+    assert received.outcome == received.active_alert == r"\x1b]0;owned\x07\x9b2J\u202e"
+    assert received.control == r"\x9b2J"
+    answer = decode_answer(encode_message(msgspec.structs.replace(ANSWER, reason=HOSTILE)))
+    assert answer is not None
+    assert answer.reason == received.outcome
+
+
+def test_two_obstacles_of_one_number_are_refused() -> None:
+    good = first_list((Obstacle(center_ned_m=(9.5, 5.5, -2.3)),) * 2, UTC_US)
+    for number in (0, 2):  # twice, and one that a later one would get
+        last = msgspec.structs.replace(good.obstacles[1], number=number)
+        wrong = msgspec.structs.replace(good, obstacles=(good.obstacles[0], last))
+        assert decode_obstacles(encode_message(wrong)) is None
+
+
+def test_an_obstacle_is_listed_where_it_is_at_the_time() -> None:
+    (item,) = first_list([Obstacle(center_ned_m=(1.0, 2.0, -3.0), vel_ned_m_s=(0.5, 0.0, -0.1))], UTC_US).obstacles
+    assert item.at(UTC_US + 4_000_000).center_ned_m == pytest.approx((3.0, 2.0, -3.4))
+    still = first_list([Obstacle(center_ned_m=(1.0, 2.0, -3.0))], UTC_US).obstacles[0]
+    assert still.at(0) is still.obstacle

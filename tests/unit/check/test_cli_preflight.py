@@ -188,7 +188,7 @@ def test_a_lost_terminal_does_not_end_the_flight() -> None:
 def test_table_cells() -> None:
     assert status_cells(AgentView(agent=0, status=status())) == (
         *("0", "TRACK", "TRACKING", "EXTERNAL", "yes", "5.0", "1.5", "75", "0.25", "0.0", "1.25", "0.12", "3"),
-        *("100", "2.0", "20", "3D 10", ""),
+        *("100", "2.0", "20", "12", "25", "3D 10", ""),
     )
     unknown = status_cells(AgentView(agent=0, status=status(99, -1.0)))
     assert (unknown[1], unknown[10]) == ("99", "-")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -332,3 +333,17 @@ def test_what_is_no_order_is_named() -> None:
     assert order_problem("hold", {}) == ""
     assert order_problem("fly", {}) == f"'fly' is no verb; known are {', '.join(OPERATOR_VERBS)}"
     assert order_problem("hold", {"height_m": 1.0}) == "hold takes no arguments"
+
+
+def test_it_is_known_when_the_mission_or_what_precedes_it_ends_unless_it_is_held() -> None:
+    flight = controlled(Phase.TRACK)
+    machine = flight.state_machine
+    left_s = machine.ends_in_s(flight.now_us, flight.utc_us)
+    assert left_s == pytest.approx(machine._duration_us * 1e-6 - machine.mission_t_s(flight.utc_us))
+    flight.run(1.0)
+    assert machine.ends_in_s(flight.now_us, flight.utc_us) == pytest.approx(left_s - 1.0)
+    flight.ask("hold")
+    assert math.isnan(machine.ends_in_s(flight.now_us, flight.utc_us))
+    flight = controlled(Phase.GOTO_START)
+    patience_s = flight.state_machine._params.start_timeout_s
+    assert 0.0 < flight.state_machine.ends_in_s(flight.now_us, flight.utc_us) < patience_s

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from swarmctl.control.phases.overload import Level, Overload, OverloadParams
+from swarmctl.control.phases.overload import Level, Overload, OverloadParams, SetpointStops
 
 PERIOD_US = 20_000
 
@@ -57,3 +57,42 @@ def test_deadlines_missed_before_the_first_update_do_not_count() -> None:
     overload = Overload(OverloadParams(), PERIOD_US)
     overload.update(1_000_000, 500)
     assert overload.level is Level.NONE
+
+
+def stops_after(ticks_s: list[float], missed: list[int] | None = None, sends: bool = True) -> tuple[SetpointStops, int]:
+    """Fly for a second, sending; then tick at these times after it, with deadlines counted as missed."""
+    stops, now_us = SetpointStops(PERIOD_US), 0
+    for _ in range(50):
+        now_us += PERIOD_US
+        stops.update(now_us, 7, 0.5)
+        stops.sent(now_us)
+    for at_s, count in zip(ticks_s, missed or [7] * len(ticks_s), strict=True):
+        now_us = 1_000_000 + round(at_s * 1e6)
+        stops.update(now_us, count, 0.5)
+        if sends:
+            stops.sent(now_us)
+    return stops, now_us
+
+
+def test_a_process_that_stood_still_is_told_with_its_numbers() -> None:
+    stops, now_us = stops_after([0.6])  # the loop counts those missed in its sleep a tick later
+    assert stops.text(now_us) == "overload: setpoints stopped 0.6 s (29 deadline misses, 36 since the start)"
+    stops, now_us = stops_after([0.6, 0.62, 0.64], [7, 36, 36])
+    assert stops.text(now_us), "autopilots tell their mode twice a second"
+    assert stops.text(now_us + 3_000_000) == ""
+
+
+def test_ticks_that_are_late_and_send_nothing_are_an_overload_too() -> None:
+    late_s = [0.1 * k for k in range(1, 7)]  # on states too old to be flown, for example
+    stops, now_us = stops_after(late_s, [7 + 4 * k for k in range(1, 7)], sends=False)
+    assert stops.text(now_us) == "overload: setpoints stopped 0.6 s (24 deadline misses, 31 since the start)"
+
+
+@pytest.mark.parametrize(
+    ("ticks_s", "sends"),
+    [([0.4], True), ([0.02 * k for k in range(1, 100)], False), ([0.02 * k for k in range(1, 100)], True)],
+    ids=["shorter than the failsafe waits", "nothing to send, on time", "as usual"],
+)
+def test_a_pilot_who_takes_over_is_no_overload(ticks_s: list[float], sends: bool) -> None:
+    stops, now_us = stops_after(ticks_s, sends=sends)
+    assert stops.text(now_us) == ""

@@ -94,6 +94,7 @@ def _own(controller: Controller) -> OwnController:
         (lambda own, problem: None, "shape ()"),
         (lambda own, problem: "level", "raised ValueError"),
         (lambda own, problem: 1 / 0, "raised ZeroDivisionError"),
+        (lambda own, problem: (_ for _ in ()).throw(OSError("\x1b]0;owned")), r"raised OSError: \x1b]0;owned"),
         (lambda own, problem: exit(3), "raised SystemExit"),
     ],
 )
@@ -102,7 +103,7 @@ def test_what_is_no_command_is_replaced_and_after_half_a_second_not_asked_for(an
     for tick in range(BAD_IN_A_ROW):
         plan = controller.plan(hover(controller))
         assert plan.status is PlanStatus.OK and np.isfinite(plan.virtual_control).all()
-        assert f"{__name__}:Scripted" in plan.failure and why in plan.failure
+        assert f"{__name__}:Scripted" in plan.failure and why in plan.failure and plan.failure.isprintable()
         assert plan.suspended == (tick == BAD_IN_A_ROW - 1)
     Scripted.answer = level
     assert controller.plan(hover(controller)).suspended, "it is not asked any more"

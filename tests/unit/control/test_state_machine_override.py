@@ -38,6 +38,25 @@ def test_after_a_pilot_override_nothing_is_requested(phase: Phase) -> None:
     assert (flight.phase, flight.state_machine.outcome) == (Phase.DONE, "pilot or autopilot took over")
 
 
+STOPPED = "overload: setpoints stopped 0.5 s (26 deadline misses, 2078 since the start)"
+
+
+@pytest.mark.parametrize(("stopped", "control"), [(STOPPED, "FAILSAFE"), ("", "PILOT")])
+def test_a_takeover_after_setpoints_stopped_is_called_overload(stopped: str, control: str) -> None:
+    flight = controlled(Phase.TRACK)
+    flight.setpoints_stopped = stopped
+    flight.failsafe_mode, flight.flight_mode = Mode.PILOT_OVERRIDE, FlightMode.HOLD
+    flight.run(0.1)
+    told = f"{STOPPED}: the autopilot took over" if stopped else "pilot or autopilot took over"
+    assert flight.state_machine.outcome == told
+    assert flight.state_machine.control_mode(Mode.PILOT_OVERRIDE) == control
+    flight.setpoints_stopped, flight.failsafe_mode = "", Mode.PRIMING
+    flight.run(10.0)
+    assert flight.state_machine.outcome == told, "for as long as it lasts"
+    flight.ask("resume")
+    assert flight.state_machine.outcome == ""
+
+
 @pytest.mark.parametrize("flown", [FlightMode.HOLD, FlightMode.MANUAL], ids=["by the autopilot", "by the pilot"])
 def test_only_the_operator_resumes_and_then_offboard_is_requested(flown: FlightMode) -> None:
     flight = controlled(Phase.TRACK)

@@ -20,7 +20,8 @@ from swarmctl.control.mpc.solvers.qp import SOLVERS
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import OperatorVerb, Order, VerbArgument
 from swarmctl.errors import ConfigError, MissionError, StartError, exit_code_of
-from swarmctl.ops import cli, operator, order_verbs
+from swarmctl.ops import cli, obstacle_list, operator
+from swarmctl.ops.verbs import orders
 
 Run = Callable[..., int]
 HEAVY = ("numpy", "scipy", "osqp", "zenoh", "rerun", "pyarrow", "pydantic", "mavsdk", "pymavlink", "psutil", "msgspec")
@@ -102,7 +103,7 @@ def test_every_verb_is_there_and_explains_itself(run: Run, capsys: pytest.Captur
     for verb in [*verbs, "obstacle"]:
         assert run(verb, "--help") == 0
         assert f"{verb} " in capsys.readouterr().out
-    for verb in ("add", "remove", "list"):
+    for verb in ("add", "move", "remove", "list", "load", "save"):
         assert run("obstacle", verb, "--help") == 0
 
 
@@ -140,9 +141,7 @@ def test_a_verb_of_the_operator_has_an_option_for_each_argument(
     app = typer.Typer(rich_markup_mode=None)
     height = VerbArgument(name="height_m", option="--height", help="Height [m].", least=0.5, most=20.0)
     for name, arguments in (("climb", (height,)), ("hold", ())):
-        order_verbs.add_operator_verb(
-            app, name, OperatorVerb(help="Do.", phases=frozenset(), arguments=arguments), give
-        )
+        orders.add_operator_verb(app, name, OperatorVerb(help="Do.", phases=frozenset(), arguments=arguments), give)
     assert app(["climb", "--height", "2.5", "--agent", "1", "--run-dir", "r"], standalone_mode=False) == 7
     assert app(["hold"], standalone_mode=False) == 7
     assert app(["hold", "0", "2", "--agent", "1", "--run", "circle"], standalone_mode=False) == 7
@@ -254,22 +253,19 @@ def test_a_reader_that_goes_away_does_not_change_the_exit_code() -> None:
 
 
 def test_obstacles_are_read_strictly() -> None:
-    ball = operator.obstacle("1.5,0,-2", 0.5, 1.0, 3.0, velocity="0,0,0.1")
+    ball = obstacle_list.obstacle("1.5,0,-2", 0.5, 1.0, 3.0, velocity="0,0,0.1")
     assert ball == Obstacle(
         center_ned_m=(1.5, 0.0, -2.0), radius_m=0.5, keep_out_m=1.0, visibility_m=3.0, vel_ned_m_s=(0.0, 0.0, 0.1)
     )
-    assert operator.obstacle("1.5,0,-2", 0.5, 1.0, 3.0, velocity="0,0,0.1", column=True).column
+    assert obstacle_list.obstacle("1.5,0,-2", 0.5, 1.0, 3.0, velocity="0,0,0.1", column=True).column
     with pytest.raises(ConfigError) as caught:
-        operator.obstacle("1,2", -1.0, float("nan"), 3.0, velocity="0,inf,0")
+        obstacle_list.obstacle("1,2", -1.0, float("nan"), 3.0, velocity="0,inf,0")
     assert [problem.split()[0] for problem in caught.value.problems] == [
         "--center",
         "--radius",
         "--keep-out",
         "--velocity",
     ]
-    assert operator.without((ball, ball), 1) == (ball,)
-    with pytest.raises(ConfigError, match="there are 1"):
-        operator.without((ball,), 1)
 
 
 def test_the_registry_knows_live_launches_and_forgets_dead_ones(

@@ -13,7 +13,7 @@ from swarmctl.bus.refusals import Refusals
 from swarmctl.bus.topics import ANSWER, COMMAND, OPERATOR, STATUS
 from swarmctl.core.operator_verbs import PEER, Order
 from swarmctl.core.types import Phase
-from swarmctl.errors import StartError
+from swarmctl.errors import ConfigError, StartError
 from swarmctl.ops.operator import RunningLaunch
 from swarmctl.ops.order_delivery import OrderDelivery, Reply, addressed
 from tests import builders
@@ -159,8 +159,15 @@ def test_who_is_asked() -> None:
     with pytest.raises(StartError, match="no other agent"):
         addressed(alone, Order("exclude", {PEER: 0.0}), [])
     for wrong in (-1, 3):
-        with pytest.raises(StartError, match="agents 0 to 2"):
-            addressed(LAUNCH, Order("hold"), [wrong])
+        with pytest.raises(ConfigError, match=f"hold: there is no agent {wrong}; circle-1a has agents 0 to 2"):
+            addressed(LAUNCH, Order("hold"), [0, wrong])
+    with pytest.raises(ConfigError, match="there is no agent 9; circle-1a has agents 0 to 2"):
+        addressed(LAUNCH, Order("exclude", {PEER: 9.0}), [])
+    with pytest.raises(ConfigError, match="there is no agent 1; alone-1a has agent 0 only"):
+        addressed(alone, Order("hold"), [1])
+    with pytest.raises(ConfigError) as caught:
+        addressed(LAUNCH, Order("hold"), [7, 1, 9, 7])
+    assert len(caught.value.problems) == 2, "each once"
 
 
 def test_a_repetition_to_many_fits_into_the_ring_of_each_agent() -> None:

@@ -1,13 +1,15 @@
-"""Which launches ask for real-time priority; what they get is in `tests/process/test_launch.py`."""
+"""Which launches ask for real-time priority, and what is read of a process's output."""
 
 from __future__ import annotations
 
 import os
+import sys
+from pathlib import Path
 
 import pytest
 
 from swarmctl.config import load
-from swarmctl.ops.processes import wants_realtime
+from swarmctl.ops.processes import Child, Command, wants_realtime
 
 
 @pytest.mark.parametrize(
@@ -24,3 +26,11 @@ def test_real_time_priority_is_wanted_where_processors_suffice(
 ) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(processors)))
     assert wants_realtime(load(None, sets)) is wanted
+
+
+def test_the_last_words_of_a_process_control_no_terminal(tmp_path: Path) -> None:
+    script = "print('\\x1b]0;owned\\x07\\n'); raise SystemExit(4)"
+    child = Child(Command("x", (sys.executable, "-Sc", script)), tmp_path)
+    assert child.wait(60.0)
+    assert child.how_it_ended() == r"ended with exit code 4: \x1b]0;owned\x07"
+    assert child.line_with("owned") == r"\x1b]0;owned\x07"

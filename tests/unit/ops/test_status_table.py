@@ -13,7 +13,7 @@ from rich.console import Console
 from swarmctl.bus.json_messages import StatusMessage
 from swarmctl.control.phases.control_mode import ControlMode, control_mode
 from swarmctl.core.types import FlightMode, Mode, Phase
-from swarmctl.ops.status_table import COLUMNS, AgentView, LiveTable, PlainLines, status_cells, status_table
+from swarmctl.ops.status_table import COLUMNS, AgentView, LiveTable, PlainLines, headline, status_cells, status_table
 from tests import builders
 
 ALERT = "plan not_certified: 0.71 m to agent-11, where 0.85 m are required (separation.radius_m)"
@@ -37,6 +37,8 @@ def fleet(agents: int) -> list[AgentView]:
         "separation_m": 12_345.678,
         "position_error_m": 12_345.678,
         "deadline_misses": 123_456,
+        "mission_t_s": 12_345.6,
+        "ends_in_s": 12_345.6,
         "ticks": 12_345_678,
         "tick_p99_ms": 12_345.6,
         "plan_staleness_ms": 1_234_567.8,
@@ -54,34 +56,34 @@ def rendered(agents: Sequence[AgentView], width: int, height: int | None) -> lis
     return stream.getvalue().splitlines()
 
 
-@pytest.mark.parametrize("width", [80, 104, 105, 160])
+@pytest.mark.parametrize("width", [80, 116, 117, 160])
 @pytest.mark.parametrize("agents", [3, 12])
 def test_no_word_is_cut_and_agent_numbers_are_readable(agents: int, width: int) -> None:
     lines = rendered(fleet(agents), width, 24)
     assert len(lines) <= 23, "one line is the prompt's"
     assert max(map(len, lines)) <= width
     assert "…" not in "".join(lines)
-    columns = [column for column in COLUMNS if width >= 105 or not column.only_wide]
-    assert lines[0].split() == [column.title for column in columns]
+    columns = [column for column in COLUMNS if width >= 117 or not column.only_wide]
+    assert lines[1].split() == [column.title for column in columns]
     for i in range(agents):
         cells = [column.cell_of(fleet(agents)[i]) for column in columns]
-        assert lines[2 + i].split() == [word for cell in cells for word in cell.split()], "each cell is whole"
-    below = " ".join(line.strip() for line in lines[2 + agents :])
+        assert lines[3 + i].split() == [word for cell in cells for word in cell.split()], "each cell is whole"
+    below = " ".join(line.strip() for line in lines[3 + agents :])
     assert f" 1: {ALERT} (12 s)" in f" {below}"
     if (agents, width) == (12, 80):
         assert "more alerts: swarmctl status" in below
 
 
 def test_without_a_limit_of_height_every_alert_is_there() -> None:
-    below = " ".join(line.strip() for line in rendered(fleet(12), 80, None)[14:])
+    below = " ".join(line.strip() for line in rendered(fleet(12), 80, None)[15:])
     assert [f"{i}: {ALERT}" in below for i in range(12)] == [bool(i % 2) for i in range(12)]
 
 
 def test_three_agents_in_ordinary_flight_look_so() -> None:
-    views = [
-        AgentView(agent=i, status=status(i, held=i == 1, control="HOLD" if i == 1 else "TRACKING")) for i in range(3)
-    ]
+    held = {"held": True, "control": "HOLD", "ends_in_s": -1.0}
+    views = [AgentView(agent=i, status=status(i, **held if i == 1 else {})) for i in range(3)]
     assert [line.rstrip() for line in rendered(views, 80, 24)] == [
+        "mission 12 s, ends in 25 s; without an end: 1 (held)",
         "id phase      control  flight   arm   alt  m/s bat  est link   sep error  miss",
         "                       mode             m        %    m    s     m     m",
         " 0 TRACK      TRACKING EXTERNAL yes   5.0  1.5  75 0.25  0.0  1.00  0.10     0",
@@ -93,7 +95,7 @@ def test_three_agents_in_ordinary_flight_look_so() -> None:
 def test_what_is_unknown_is_a_dash_and_an_agent_without_a_status_has_its_number() -> None:
     nothing = dict.fromkeys(("ground_speed_m_s", "battery_01", "pos_accuracy_m", "link_age_ms", "separation_m"), -1.0)
     cells = status_cells(AgentView(agent=7, status=status(7, **nothing, gps_fix=-1)))
-    assert [cells[5], cells[6], cells[7], cells[8], cells[9], cells[10], cells[16]] == ["-"] * 7
+    assert [cells[5], cells[6], cells[7], cells[8], cells[9], cells[10], cells[18]] == ["-"] * 7
     assert status_cells(AgentView(agent=11))[0] == "11"
 
 
@@ -114,6 +116,7 @@ def test_an_agent_that_is_silent_is_lost_and_its_link_ages() -> None:
         (Phase.TRACK, Mode.TRACKING, "paused", "WAIT"),
         (Phase.TRACK, Mode.REPLAY, "held", "REPLAY"),
         (Phase.TRACK, Mode.PILOT_OVERRIDE, "held", "PILOT"),
+        (Phase.TRACK, Mode.PILOT_OVERRIDE, "held setpoints_stopped", "FAILSAFE"),
         (Phase.TRACK, Mode.STATE_STALE, "held", "LOST"),
         (Phase.CONNECT, Mode.STATE_STALE, "", "AUTO"),
         (Phase.TAKEOFF, Mode.IDLE, "", "AUTO"),
@@ -126,7 +129,8 @@ def test_an_agent_that_is_silent_is_lost_and_its_link_ages() -> None:
     ],
 )
 def test_the_control_mode_is_what_the_vehicle_does(phase: Phase, mode: Mode, flags: str, shown: str) -> None:
-    asked = {name: name in flags.split() for name in ("held", "goes_to_point", "paused", "lands_in_place")}
+    names = ("held", "goes_to_point", "paused", "lands_in_place", "setpoints_stopped")
+    asked = {name: name in flags.split() for name in names}
     assert control_mode(phase, mode, **asked) == shown
 
 
@@ -160,3 +164,30 @@ def test_the_live_table_fits_the_terminal_it_is_on() -> None:
     table.close()
     assert "more alerts" in stream.getvalue()
     assert "…" not in stream.getvalue()
+
+
+AFTER = {"mission_t_s": -1.0}
+
+
+@pytest.mark.parametrize(
+    ("phases", "fields", "shown"),
+    [
+        ((Phase.STANDBY, Phase.READY), {**AFTER, "ends_in_s": 9.4}, "not begun, 1 of 2 agents ready, given up in 9 s"),
+        ((Phase.READY, Phase.TRACK), {"ends_in_s": 25.4}, "12 s, ends in 25 s"),
+        ((Phase.TRACK, Phase.TRACK), {"ends_in_s": -1.0, "held": True}, "12 s; without an end: 0, 1 (held)"),
+        ((Phase.GOTO_LAND, Phase.LAND), {**AFTER, "ends_in_s": 60.0}, "over, landing, latest landing in 60 s"),
+        ((Phase.DONE, Phase.DONE), {**AFTER, "ends_in_s": -1.0}, "over"),
+    ],
+)
+def test_the_headline_says_the_mission_clock_and_what_ends_when(
+    phases: tuple[Phase, Phase], fields: dict[str, object], shown: str
+) -> None:
+    views = [AgentView(agent=i, status=status(i, phase=phase, **fields)) for i, phase in enumerate(phases)]
+    assert headline(views) == f"mission {shown}"
+    assert headline([AgentView(agent=0)]) == "no status yet"
+
+
+def test_the_name_of_the_run_stands_before_the_clock() -> None:
+    stream = io.StringIO()
+    Console(file=stream, width=80).print(status_table([AgentView(agent=0, status=status(0))], 80, run="circle-1a"))
+    assert stream.getvalue().startswith("circle-1a: mission 12 s, ends in 25 s\n")

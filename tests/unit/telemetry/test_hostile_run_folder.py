@@ -265,3 +265,16 @@ def test_what_a_received_configuration_names_is_neither_imported_nor_read(
     with pytest.raises(ConfigError, match="has no class Planted"):
         load(folder / "config.toml")
     assert (folder / "ran").exists()
+
+
+def test_events_of_somebody_else_control_no_terminal(folder: Path) -> None:
+    hostile = "\x1b]0;owned\x07\x9b2J\u202e"
+    row = {"utc_us": 1, "t_us": 1, "source": "launch", "event": "agent_failed", hostile: [{"text": hostile}]}
+    (folder / "launch.events.jsonl").write_text(json.dumps(row, ensure_ascii=False) + "\n", encoding="utf-8")
+    (found,) = (event for event in load_run(folder).events if event["utc_us"] == 1)
+    shown = r"\x1b]0;owned\x07\x9b2J\u202e"
+    assert found[shown] == [{"text": shown}]
+    (folder / "summary.json").unlink()
+    assert report(folder).returncode == 0, "it is finished once more"
+    written = (folder / "events.jsonl").read_text(encoding="utf-8")
+    assert all(character.isprintable() or character == "\n" for character in written)

@@ -14,7 +14,7 @@ from swarmctl.core.flight_volume import FlightVolume, VolumeParams
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE
 from swarmctl.core.types import Mode, Phase, PlanStatus
-from swarmctl.telemetry.evaluation.referee import Rules, RunData, evaluate
+from swarmctl.telemetry.evaluation.referee import JudgedObstacle, Rules, RunData, evaluate
 from swarmctl.telemetry.json_safe import to_json
 
 UTC0_US = 1_780_000_000_000_000
@@ -180,7 +180,7 @@ def test_obstacle_clearance_allows_its_margin_only(margin_m: float, violated: bo
     rules = Rules(
         agents=1,
         required_separation_m=0.5,
-        obstacles={Obstacle(center_ned_m=(1.5, 0.0, 0.0)): None},
+        obstacles=(JudgedObstacle(number=0, obstacle=Obstacle(center_ned_m=(1.5, 0.0, 0.0))),),
         obstacle_margin_m=margin_m,
     )
     summary = evaluate(run({0: ticks(5, (0.0, 0.0, 0.0))}), rules, "completed")
@@ -192,7 +192,7 @@ def test_obstacle_clearance_allows_its_margin_only(margin_m: float, violated: bo
 @pytest.mark.parametrize(("column", "clearance_m"), [(True, 1.5), (False, 2.5)])
 def test_height_does_not_count_beside_a_column(column: bool, clearance_m: float) -> None:
     ball = Obstacle(center_ned_m=(1.5, 0.0, 2.0), column=column)
-    rules = Rules(agents=1, required_separation_m=0.5, obstacles={ball: None})
+    rules = Rules(agents=1, required_separation_m=0.5, obstacles=(JudgedObstacle(number=0, obstacle=ball),))
     summary = evaluate(run({0: ticks(5, (0.0, 0.0, 0.0))}), rules, "completed")
     assert summary["obstacles"]["min_clearance_m"] == pytest.approx(clearance_m)
     assert (summary["outcome"] == "failed") == column
@@ -200,7 +200,7 @@ def test_height_does_not_count_beside_a_column(column: bool, clearance_m: float)
 
 def test_moving_obstacle_is_met_where_it_is_at_the_time() -> None:
     ball = Obstacle(center_ned_m=(10.0, 0.0, 0.0), keep_out_m=1.0, vel_ned_m_s=(-1.0, 0.0, 0.0))
-    rules = Rules(agents=1, required_separation_m=0.5, obstacles={ball: None})
+    rules = Rules(agents=1, required_separation_m=0.5, obstacles=(JudgedObstacle(number=0, obstacle=ball),))
     assert evaluate(run({0: ticks(5, (0, 0, 0))}), rules, "completed")["obstacles"]["min_clearance_m"] == pytest.approx(
         5.0
     )
@@ -232,16 +232,42 @@ def test_obstacle_set_in_flight_counts_from_then_on() -> None:
     rows["pos_ned_m"][rows["mission_t_s"] >= 4.0] = (50.0, 0.0, 0.0)
     ball = Obstacle(center_ned_m=(0.0, 0.0, 0.0), keep_out_m=1.0)
     since_us = UTC0_US + START_US + 5_000_000
-    rules = Rules(agents=1, required_separation_m=0.5, obstacles={ball: since_us})
+    judged = JudgedObstacle(number=3, obstacle=ball, since_utc_us=since_us)
+    rules = Rules(agents=1, required_separation_m=0.5, obstacles=(judged,))
     assert evaluate(run({0: rows}), rules, "completed")["outcome"] == "completed"
     assert (
         evaluate(
             run({0: rows}),
-            Rules(agents=1, required_separation_m=0.5, obstacles={ball: None}),
+            Rules(agents=1, required_separation_m=0.5, obstacles=(JudgedObstacle(number=0, obstacle=ball),)),
             "completed",
         )["outcome"]
         == "failed"
     )
+
+
+def test_a_configured_obstacle_moves_from_the_first_tick_on_not_from_arming_or_the_mission() -> None:
+    ball = Obstacle(center_ned_m=(12.0, 0.0, 0.0), keep_out_m=1.0, vel_ned_m_s=(-1.0, 0.0, 0.0))
+    rows = ticks(9.5, (0.0, 0.0, 0.0))
+    before = rows[:150].copy()  # 3 s on the ground
+    before["t_us"], before["utc_us"] = before["t_us"] - 3_000_000, before["utc_us"] - 3_000_000
+    before["mission_t_s"], before["armed"] = np.nan, 0
+    rules = Rules(agents=1, required_separation_m=0.5, obstacles=(JudgedObstacle(number=0, obstacle=ball),))
+    clearance = [
+        evaluate(run({0: flown}), rules, "completed")["obstacles"]["min_clearance_m"]
+        for flown in (rows, np.concatenate([before, rows]))
+    ]
+    assert clearance == pytest.approx([2.5, 0.0], abs=0.05)
+
+
+def test_an_obstacle_that_was_removed_counts_until_then() -> None:
+    ball = Obstacle(center_ned_m=(10.0, 0.0, 0.0), keep_out_m=1.0, vel_ned_m_s=(-1.0, 0.0, 0.0))
+    rows = ticks(20, (0.0, 0.0, 0.0))
+    began_us = UTC0_US + START_US
+    for until_s, violated in ((8.0, False), (9.5, True), (15.0, True)):
+        until_us = began_us + round(until_s * 1e6)
+        judged = JudgedObstacle(number=7, obstacle=ball, since_utc_us=began_us, until_utc_us=until_us)
+        summary = evaluate(run({0: rows}), Rules(agents=1, required_separation_m=0.5, obstacles=(judged,)), "completed")
+        assert any("agent 0 and obstacle 7" in text for text in summary["violations"]) is violated, until_s
 
 
 def test_timing_counts_flight_ticks_and_deadline_misses() -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from swarmctl.config import Config, dump, load_recorded
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError
-from swarmctl.ops.folder_verbs import report
+from swarmctl.ops.verbs.folders import report
 from swarmctl.telemetry.evaluation.tracks import shared_references
 from swarmctl.telemetry.palette import agent_rgb, css
 from swarmctl.telemetry.recording.run_files import load_run

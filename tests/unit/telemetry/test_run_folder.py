@@ -20,7 +20,7 @@ from swarmctl.core.records import PLAN_DTYPE, TICK_DTYPE, TRUTH_COLUMNS, TRUTH_D
 from swarmctl.core.tick_record import COLUMNS
 from swarmctl.core.types import FlightMode, Mode, Phase, PlanStatus
 from swarmctl.errors import ConfigError, StartError
-from swarmctl.telemetry.evaluation.referee import Rules
+from swarmctl.telemetry.evaluation.referee import JudgedObstacle, Rules
 from swarmctl.telemetry.recording.run_files import load_run, read_parquet, read_plans, write_parquet
 from swarmctl.telemetry.recording.run_folder import Outcome, create_run_folder, finish_run, report_run
 from swarmctl.telemetry.report.charts import thin
@@ -74,7 +74,8 @@ def write_finished_run(directory: Path) -> None:
     finish_run(directory, RULES, Outcome(outcome="completed"))
 
 
-RULES = Rules(agents=3, required_separation_m=0.85, obstacles={Obstacle(center_ned_m=(20.0, 20.0, -2.0)): None})
+FAR_BALL = JudgedObstacle(number=0, obstacle=Obstacle(center_ned_m=(20.0, 20.0, -2.0)))
+RULES = Rules(agents=3, required_separation_m=0.85, obstacles=(FAR_BALL,))
 
 
 def test_launches_in_the_same_second_get_folders_of_their_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -299,7 +300,7 @@ def test_report_is_small_well_formed_and_self_contained(tmp_path: Path, agents: 
     rules = Rules(
         agents=agents,
         required_separation_m=0.3,
-        obstacles={Obstacle(center_ned_m=(20.0, 20.0, -2.0)): None},
+        obstacles=(FAR_BALL,),
     )
     finish_run(tmp_path, rules, Outcome(outcome="completed", problems=("one <script>alert(1)</script> problem",)))
     text = (tmp_path / "report.html").read_text()

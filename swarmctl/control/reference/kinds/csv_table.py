@@ -22,11 +22,13 @@ POLYNOMIAL_COLUMNS = ("duration", *(f"{axis}^{k}" for axis in ("x", "y", "z", "y
 _POWERS = 8
 Row = Annotated[tuple[float, ...], Field(strict=False)]
 Frame = Literal["ned", "enu", "nwu"]
-_TO_NED = {  # north, east, down from x, y, z; and yaw clockwise from north from sign and offset
-    "ned": (np.eye(3), 1.0, 0.0),
-    "enu": (np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]), -1.0, np.pi / 2.0),
-    "nwu": (np.diag([1.0, -1.0, -1.0]), -1.0, 0.0),
+FRAMES_TO_NED = {  # north, east, down from x, y, z
+    "ned": np.eye(3),
+    "enu": np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]),
+    "nwu": np.diag([1.0, -1.0, -1.0]),
 }
+# sign and offset of a yaw clockwise from north
+_YAWS_TO_NED = {"ned": (1.0, 0.0), "enu": (-1.0, np.pi / 2.0), "nwu": (-1.0, 0.0)}
 
 
 class Table(Params):
@@ -57,7 +59,7 @@ class CsvParams(SharedReference):
         return len(self.tables) > 1 or self.from_start
 
     def reference(self, place: Place) -> Sampled:
-        flight, (turn, _, _) = self._flight(place), _TO_NED[self.frame]
+        flight, turn = self._flight(place), FRAMES_TO_NED[self.frame]
         origin = place.start_ned_m if self.from_start else np.zeros(3)
 
         def sampled(t_s: Array) -> tuple[Array, Array]:
@@ -67,7 +69,7 @@ class CsvParams(SharedReference):
         return sampled
 
     def heading(self, place: Place) -> Heading | None:
-        flight, (_, sign, offset_rad) = self._flight(place), _TO_NED[self.frame]
+        flight, (sign, offset_rad) = self._flight(place), _YAWS_TO_NED[self.frame]
         if flight.coefficients.shape[2] < 4:
             return None
         return lambda t_s: sign * flight.sample(t_s)[0][:, 3] + offset_rad

@@ -1,0 +1,133 @@
+"""The verbs of `swarmctl obstacle`, which change the obstacles of a running launch.
+
+Heavy modules are imported inside of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from swarmctl.errors import EXIT_OK
+from swarmctl.ops.verbs.orders import Run
+
+if TYPE_CHECKING:
+    from swarmctl.bus.json_messages import ListedObstacle, ObstaclesMessage
+
+obstacle_app = typer.Typer(
+    no_args_is_help=True, rich_markup_mode=None, help="Change the obstacles of a running launch."
+)
+Number = Annotated[int, typer.Argument(help="Number of the obstacle, as `obstacle list` shows it; it never changes.")]
+File = Annotated[Path, typer.Argument(metavar="FILE", help="TOML file of [[obstacles]] tables, as in configurations.")]
+
+
+@obstacle_app.command("list")
+def obstacle_list(run: Run = None, as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False) -> int:
+    """List the obstacles that the agents know: number, place now, sizes, velocity."""
+    from swarmctl.ops import obstacle_list, operator
+
+    launch = operator.find_launch(run)
+    known = obstacle_list.read_obstacles(launch)
+    if as_json:
+        print(obstacle_list.as_json(known))
+    else:
+        _show(launch.run, known)
+    return EXIT_OK
+
+
+@obstacle_app.command("add")
+def obstacle_add(
+    center: Annotated[str, typer.Option("--center", metavar="N,E,D", help="Centre, shared NED [m].")],
+    radius: Annotated[float, typer.Option("--radius", help="Physical radius [m].")] = 1.0,
+    keep_out: Annotated[
+        float | None, typer.Option("--keep-out", help="Keep-out radius [m]; default: radius + 0.75.")
+    ] = None,
+    visibility: Annotated[float, typer.Option("--visibility", help="Range at which agents see it [m].")] = 3.0,
+    velocity: Annotated[str, typer.Option("--velocity", metavar="N,E,D", help="Velocity, shared NED [m/s].")] = "0,0,0",
+    column: Annotated[
+        bool, typer.Option("--column", help="A vertical column of unlimited height, not a sphere.")
+    ] = False,
+    run: Run = None,
+) -> int:
+    """Add a sphere or a column to a running launch."""
+    from swarmctl.ops import obstacle_list
+
+    keep_out_m = radius + 0.75 if keep_out is None else keep_out
+    obstacle = obstacle_list.obstacle(center, radius, keep_out_m, visibility, velocity=velocity, column=column)
+    return _change(run, lambda known: obstacle_list.added(known, [obstacle]))
+
+
+@obstacle_app.command("move")
+def obstacle_move(
+    number: Number,
+    center: Annotated[
+        str | None, typer.Option("--center", metavar="N,E,D", help="New centre, shared NED [m]; default: where it is.")
+    ] = None,
+    velocity: Annotated[
+        str | None, typer.Option("--velocity", metavar="N,E,D", help="New velocity [m/s]; default: as it moves.")
+    ] = None,
+    run: Run = None,
+) -> int:
+    """Put an obstacle elsewhere at once, or give it another velocity. Its number and sizes stay."""
+    from swarmctl.ops import obstacle_list
+
+    return _change(run, lambda known: obstacle_list.moved(known, number, center, velocity))
+
+
+@obstacle_app.command("remove")
+def obstacle_remove(
+    numbers: Annotated[list[int], typer.Argument(metavar="NUMBER...", help="Numbers in `obstacle list`.")],
+    run: Run = None,
+) -> int:
+    """Remove obstacles from a running launch. The numbers of the others stay."""
+    from swarmctl.ops import obstacle_list
+
+    return _change(run, lambda known: obstacle_list.removed(known, numbers))
+
+
+@obstacle_app.command("load")
+def obstacle_load(
+    file: File,
+    replace: Annotated[bool, typer.Option("--replace", help="Remove all others; default: add to them.")] = False,
+    run: Run = None,
+) -> int:
+    """Add the obstacles of a file to a running launch, at the places that it says."""
+    from swarmctl.ops import obstacle_list
+
+    obstacles = obstacle_list.read_file(file)
+
+    def change(known: ObstaclesMessage) -> Sequence[ListedObstacle]:
+        listed = obstacle_list.added(known, obstacles)
+        return listed[len(known.obstacles) :] if replace else listed
+
+    return _change(run, change)
+
+
+@obstacle_app.command("save")
+def obstacle_save(
+    file: Annotated[Path, typer.Argument(metavar="FILE", help="TOML file to create.")], run: Run = None
+) -> int:
+    """Write the obstacles of a running launch, as they are now, to a file that `load` and configurations take."""
+    from swarmctl.ops import obstacle_list, operator
+
+    known = obstacle_list.read_obstacles(operator.find_launch(run))
+    obstacle_list.write_file(file, known)
+    print(f"{len(known.obstacles)} obstacles: {file}")
+    return EXIT_OK
+
+
+def _change(run: str | None, change: Callable[[ObstaclesMessage], Sequence[ListedObstacle]]) -> int:
+    from swarmctl.ops import obstacle_list, operator
+
+    launch = operator.find_launch(run)
+    _show(launch.run, obstacle_list.change_obstacles(launch, change))
+    return EXIT_OK
+
+
+def _show(run: str, known: ObstaclesMessage) -> None:
+    from swarmctl.ops.obstacle_list import lines_of
+
+    print("\n".join([f"obstacle: {run}", *lines_of(known)]))
