@@ -49,6 +49,7 @@ def simulate(config: Config, directory: Path) -> int:
     for log, agent in zip(flight.logs, flight.agents, strict=True):
         if agent is not None:
             log.event("bus_summary", log.clock.now_us(), log.clock.utc_us(), rejected=agent.rejected, lost=0)
+            log.event("link_summary", log.clock.now_us(), log.clock.utc_us(), refused=agent.refused_frames)
     speed_factor = flight.clock.now_us() * 1e-6 / wall_s
     shown = () if stop.count else tuple(problems)
     unwritten = _write_rows(flight, directory)

@@ -10,6 +10,7 @@ import signal
 import sys
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -24,8 +25,13 @@ from swarmctl.core.operator_verbs import Order
 from swarmctl.core.types import Mode
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, MissionError, StartError
 from swarmctl.mavlink.codec import heartbeat_of
-from swarmctl.mavlink.transport import open_transport
+from swarmctl.mavlink.commands import OWN_COMPID
+from swarmctl.mavlink.signing.channel import AGENT_LINK, SigningChannel
+from swarmctl.mavlink.signing.recognition import SignedRecognition
+from swarmctl.mavlink.signing.stamp_file import kept_channel
+from swarmctl.mavlink.transport import Transport, open_transport
 from swarmctl.process_lifetime import StopRequest
+from swarmctl.signing_keys import read_own_key
 from swarmctl.telemetry.recording.recorder import Recorder
 from swarmctl.wall_clock import WallClock
 
@@ -100,17 +106,24 @@ def run_agent(process: AgentProcess) -> int:
         ConfigError: the configuration is not valid.
     """
     agent = process.agent
-    config = load(process.config_path)
+    config = load(process.config_path, only_agent=agent)
     if not 0 <= agent < config.swarm.agents:
         raise StartError(f"--id {agent}: allowed: 0..{config.swarm.agents - 1} (swarm.agents)")
     stop = StopRequest(signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
     if process.only_land:
         stop.ask()
     clock = WallClock()
+    key = read_own_key(config.mavlink.signing_keys, agent)
+    with nullcontext() if key is None else kept_channel(key, AGENT_LINK, clock.utc_us) as signing:
+        return _fly(process, config, clock, stop, signing)
+
+
+def _fly(
+    process: AgentProcess, config: Config, clock: WallClock, stop: StopRequest, signing: SigningChannel | None
+) -> int:
+    agent = process.agent
     url = config.vehicles[agent].url if config.vehicles else ""
-    is_vehicle = heartbeat_of(config.sysids()[agent])
-    remote = None if process.vehicle_port is None else (_LOOPBACK, process.vehicle_port)
-    transport = open_transport(url or f"udpin://{_LOOPBACK}:14540", process.fd, is_vehicle, remote)
+    transport = _open_link(process, config, clock, signing)
     recorder = Recorder(process.run_dir, agent)
     link = _join(process, config, clock)
     boot_id = (clock.utc_us() // 1000) & 0xFFFFFFFF
@@ -124,15 +137,28 @@ def run_agent(process: AgentProcess) -> int:
         sink=recorder,
         on_frame=lambda frame: recorder.frame(clock.utc_us(), frame),
         stopwatch_ns=time.perf_counter_ns,
+        signing=signing,
     )
     try:
         vehicle = url or f"inherited socket of sysid {config.sysids()[agent]}"
         return _loop(flown, config, clock, stop, vehicle=vehicle, only_land=process.only_land)
     finally:
         recorder.event("bus_summary", clock.now_us(), clock.utc_us(), rejected=flown.rejected, lost=recorder.lost)
+        recorder.event("link_summary", clock.now_us(), clock.utc_us(), refused=flown.refused_frames)
         link.close()
         transport.close()
         recorder.close()
+
+
+def _open_link(process: AgentProcess, config: Config, clock: WallClock, signing: SigningChannel | None) -> Transport:
+    """Open the link to the vehicle, which belongs to the sender of its HEARTBEAT, a signed one where there is a key."""
+    url = config.vehicles[process.agent].url if config.vehicles else f"udpin://{_LOOPBACK}:14540"
+    sysid = config.sysids()[process.agent]
+    remote = None if process.vehicle_port is None else (_LOOPBACK, process.vehicle_port)
+    if signing is None:
+        return open_transport(url, process.fd, heartbeat_of(sysid), remote)
+    vehicle = SignedRecognition(signing, sysid, OWN_COMPID, clock.utc_us)
+    return open_transport(url, process.fd, vehicle.is_vehicle, remote, greeting=vehicle.greeting)
 
 
 def _join(process: AgentProcess, config: Config, clock: WallClock) -> Bus:
@@ -167,7 +193,7 @@ def _loop(agent: Agent, config: Config, clock: WallClock, stop: StopRequest, *, 
         pace.done(now_us + round(record.timing.tick_ms * 1000), clock.now_us())
         if record.mode is not Mode.STATE_STALE:
             seen_us, ever_seen = now_us, True
-        _check_vehicle_silence(now_us - seen_us, ever_seen, config, vehicle)
+        _check_vehicle_silence(now_us - seen_us, ever_seen, config, f"{vehicle}{_refused(agent)}")
         if agent.done if only_land else agent.finished:
             finished_us = finished_us or now_us
             if now_us - finished_us > _LINGER_S * 1e6:
@@ -183,6 +209,11 @@ def _check_vehicle_silence(silent_us: int, ever_seen: bool, config: Config, vehi
         )
     if ever_seen and silent_us > _VEHICLE_LOST_S * 1e6:
         raise MissionError(f"vehicle at {vehicle}: silent for {_VEHICLE_LOST_S:.0f} s, given up")
+
+
+def _refused(agent: Agent) -> str:
+    counts = ", ".join(f"{count} {reason}" for reason, count in agent.refused_frames.items())
+    return f" ({counts} frames refused: see mavlink.signing_keys)" if counts else ""
 
 
 def _exit_code(agent: Agent) -> int:

@@ -24,6 +24,7 @@ from swarmctl.mavlink.dialects.discovery import DIALECTS
 from swarmctl.mavlink.framing import frames
 from swarmctl.mavlink.local_frame import LocalFrame
 from swarmctl.mavlink.mode_watch import ModeWatch
+from swarmctl.mavlink.signing.refusals import FrameRefusals
 from swarmctl.mavlink.transport import Transport
 from swarmctl.mavlink.vehicle_clock import VehicleClock
 from swarmctl.mavlink.vehicle_health import VehicleHealth
@@ -61,6 +62,7 @@ class Autopilot:
         sysid: the vehicle's system id; everything else is ignored.
         shared: origin of the shared frame.
         on_frame: called with every frame received or sent, for recording.
+        refusals: counts what a signed link has refused.
 
     Attributes:
         clock: the vehicle's clock; `clock.boots` counts its reboots.
@@ -96,8 +98,10 @@ class Autopilot:
         shared: GeoOrigin,
         *,
         on_frame: Callable[[bytes], None],
+        refusals: FrameRefusals | None = None,
     ) -> None:
         self._transport, self._codec, self._sysid = transport, codec, sysid
+        self.refusals = refusals or FrameRefusals()
         self._on_frame = on_frame
         self.clock = VehicleClock()
         self.frame = LocalFrame(shared)

@@ -18,7 +18,7 @@ from pymavlink.dialects.v20 import development as dialect
 
 from swarmctl.mavlink.framing import frames, message_id
 
-_AUTOPILOT_COMPID = 1
+AUTOPILOT_COMPID = 1  # MAV_COMP_ID_AUTOPILOT1
 _VERSION_2, _PLAIN = 0xFD, 0  # first byte of a frame; incompatibility flags of one that is not signed
 _HEADER_BYTES, _CHECKSUM_BYTES = 10, 2
 
@@ -59,11 +59,11 @@ def heartbeat_of(sysid: int) -> Callable[[bytes], bool]:
 
     Ground stations and companions send HEARTBEAT too, some with a vehicle's system id; they name no autopilot type.
     """
-    codec = Codec(sysid, _AUTOPILOT_COMPID)
+    codec = Codec(sysid, AUTOPILOT_COMPID)
 
     def beats(datagram: bytes) -> bool:
         for frame in frames(datagram):
-            if message_id(frame) != dialect.MAVLINK_MSG_ID_HEARTBEAT or frame[5:7] != bytes([sysid, _AUTOPILOT_COMPID]):
+            if message_id(frame) != dialect.MAVLINK_MSG_ID_HEARTBEAT or frame[5:7] != bytes([sysid, AUTOPILOT_COMPID]):
                 continue
             message = codec.decode(frame)
             if message is not None and message.autopilot != dialect.MAV_AUTOPILOT_INVALID:

@@ -277,19 +277,25 @@ def _solver(ticks: Mapping[int, NDArray[np.void]], name: str) -> dict[str, Any]:
 
 
 def _comms(run: RunData, time_field: str) -> dict[str, Any]:
-    """Summarise plan staleness, messages refused (last `bus_summary` of each agent) and unresponsive peers."""
+    """Summarise plan staleness, messages and MAVLink frames refused, and unresponsive peers."""
     ages = _percentiles([flight_rows(rows)["plan_staleness_ms"] for rows in run.ticks.values()])
-    last = {event.get("source"): event for event in run.events if event.get("event") == "bus_summary"}
-    rejected: Counter[str] = Counter()
-    for event in last.values():
-        reasons = event.get("rejected")
-        if isinstance(reasons, dict):
-            rejected.update({str(reason): int(n) for reason, n in reasons.items() if finite(n) is not None})
     return {
         "path_age_ms": {"p50": ages["p50"], "p99": ages["p99"]},
-        "rejected": dict(sorted(rejected.items())),
+        "rejected": _refused(run.events, "bus_summary", "rejected"),
+        "refused_frames": _refused(run.events, "link_summary", "refused"),
         "unresponsive": unresponsive(run.events, time_field),
     }
+
+
+def _refused(events: Sequence[Mapping[str, Any]], name: str, field: str) -> dict[str, int]:
+    """Add up the counts by reason in the last event of a name from each source."""
+    last = {event.get("source"): event for event in events if event.get("event") == name}
+    refused: Counter[str] = Counter()
+    for event in last.values():
+        reasons = event.get(field)
+        if isinstance(reasons, dict):
+            refused.update({str(reason): int(n) for reason, n in reasons.items() if finite(n) is not None})
+    return dict(sorted(refused.items()))
 
 
 def _deadlocks(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
