@@ -28,6 +28,7 @@ from swarmctl.mavlink.codec import heartbeat_of
 from swarmctl.mavlink.commands import OWN_COMPID
 from swarmctl.mavlink.signing.channel import AGENT_LINK, SigningChannel
 from swarmctl.mavlink.signing.recognition import SignedRecognition
+from swarmctl.mavlink.signing.refusals import in_words
 from swarmctl.mavlink.signing.stamp_file import kept_channel
 from swarmctl.mavlink.transport import Transport, open_transport
 from swarmctl.process_lifetime import StopRequest
@@ -212,7 +213,7 @@ def _check_vehicle_silence(silent_us: int, ever_seen: bool, config: Config, vehi
 
 
 def _refused(agent: Agent) -> str:
-    counts = ", ".join(f"{count} {reason}" for reason, count in agent.refused_frames.items())
+    counts = in_words(agent.refused_frames)
     return f" ({counts} frames refused: see mavlink.signing_keys)" if counts else ""
 
 

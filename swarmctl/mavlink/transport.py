@@ -217,7 +217,7 @@ class UdpTransport:
             if latch.admits(sender, data):
                 arrived.append(Datagram(self._arrival_us(ancillary, now_us), data))
                 left -= len(data)
-            elif latch.only is None and (greeting := self._greeting()):
+            elif latch.only is None and (greeting := self._greeting(data)):
                 with contextlib.suppress(OSError):
                     self._sock.sendto(greeting, sender)
             if left < 0:

@@ -19,6 +19,7 @@ from swarmctl import __version__
 from swarmctl.core.text import printable_lines
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, ConfigError, SwarmError
 from swarmctl.ops.config_verbs import config_app
+from swarmctl.ops.key_verbs import keys_app
 from swarmctl.ops.order_verbs import Run, add_order_verbs
 
 if TYPE_CHECKING:
@@ -37,6 +38,7 @@ obstacle_app = typer.Typer(
 )
 app.add_typer(obstacle_app, name="obstacle")
 app.add_typer(config_app, name="config")
+app.add_typer(keys_app, name="keys")
 
 ConfigPath = Annotated[Path | None, typer.Argument(help="TOML file; default: the circle of the thesis.")]
 Agents = Annotated[int | None, typer.Option("--agents", help="Number of agents; overrides swarm.agents.")]

@@ -68,8 +68,12 @@ class SigningChannel:
         """Return a frame as it is to be sent; what can't be signed, as of MAVLink 1, is returned as it is."""
         if not is_plain(frame):
             return frame
+        return sign(frame, self._key, self._link_id, self.next_stamp())
+
+    def next_stamp(self) -> int:
+        """Return a time stamp newer than every one before."""
         self._sent = min(MOST_STAMP, max(self._sent + 1, stamp_at(self._utc_us())))
-        return sign(frame, self._key, self._link_id, self._sent)
+        return self._sent
 
     def fault(self, frame: bytes) -> str:
         """Return why a frame would not be taken now, or "". Changes nothing."""

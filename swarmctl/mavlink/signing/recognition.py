@@ -36,29 +36,30 @@ class SignedRecognition:
         self._ids = bytes((sysid, AUTOPILOT_COMPID))
         self._beats = heartbeat_of(sysid)
         self._codec = Codec(sysid, compid)
-        self._is_owed = False  # the newest datagram was authentic, but too old
         self._greeted_us: int | None = None
 
     def is_vehicle(self, datagram: bytes) -> bool:
         """Return whether a datagram holds a valid HEARTBEAT of the vehicle's autopilot that the channel would take."""
-        self._is_owed = False
-        for frame in frames(datagram):
-            if message_id(frame) != dialect.MAVLINK_MSG_ID_HEARTBEAT or frame[5:7] != self._ids:
-                continue
+        for frame in self._claimed(datagram):
             fault = self._channel.fault(frame)
             if not fault and self._beats(strip(frame)):
                 return True
-            self._is_owed |= fault in (OLD, REPLAYED)
             if fault:
                 self._channel.refuse(fault)
         return False
 
-    def greeting(self) -> bytes:
-        """Return what to answer the sender of the newest datagram, or b""."""
+    def greeting(self, datagram: bytes) -> bytes:
+        """Return what to answer the sender of a datagram that was refused, or b""."""
         now_us = self._utc_us()
-        is_due = self._greeted_us is None or now_us - self._greeted_us >= _GREETING_PERIOD_US
-        if not (self._is_owed and is_due):
+        if self._greeted_us is not None and now_us - self._greeted_us < _GREETING_PERIOD_US:
             return b""
-        self._is_owed, self._greeted_us = False, now_us
+        if not any(self._channel.fault(frame) in (OLD, REPLAYED) for frame in self._claimed(datagram)):
+            return b""
+        self._greeted_us = now_us
         beat = dialect.MAVLink_heartbeat_message(_ONBOARD, _NO_AUTOPILOT, 0, 0, _ACTIVE, 3)
         return self._channel.sign(self._codec.encode(beat))
+
+    def _claimed(self, datagram: bytes) -> list[bytes]:
+        """Return the frames of a datagram that say to be a HEARTBEAT of the vehicle."""
+        beat = dialect.MAVLINK_MSG_ID_HEARTBEAT
+        return [frame for frame in frames(datagram) if message_id(frame) == beat and frame[5:7] == self._ids]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 UNSIGNED = "unsigned"
 WRONG_SIGNATURE = "wrong signature"  # another key, or changed on the way
@@ -14,6 +14,11 @@ FUTURE = "future"
 HARMLESS = frozenset((OLD, REPLAYED))  # caused by reboots and networks alone
 _EVENT_PERIOD_US = 1_000_000
 _ALERT_HOLD_US = 5_000_000  # time an alert is shown after the last refusal
+
+
+def in_words(counts: Mapping[str, int]) -> str:
+    """Return counts by reason as text, or ""."""
+    return ", ".join(f"{count} {reason}" for reason, count in counts.items())
 
 
 class FrameRefusals:
@@ -43,7 +48,3 @@ class FrameRefusals:
             if count > self._reported[reason]:
                 note("frames_refused", reason=reason, count=count)
         self._reported, self._reported_us = self.by_reason.copy(), utc_us
-
-    def in_words(self) -> str:
-        """Return the counts as text, or ""."""
-        return ", ".join(f"{count} {reason}" for reason, count in self.by_reason.items())

@@ -24,7 +24,7 @@ from swarmctl.mavlink.latch import anybody
 from swarmctl.mavlink.signing import channel as channels
 from swarmctl.mavlink.signing.channel import AGENT_LINK, SigningChannel, Stamps
 from swarmctl.mavlink.signing.recognition import SignedRecognition
-from swarmctl.mavlink.signing.refusals import FUTURE, OLD, REPLAYED, UNSIGNED, WRONG_SIGNATURE
+from swarmctl.mavlink.signing.refusals import FUTURE, OLD, REPLAYED, UNSIGNED, WRONG_SIGNATURE, in_words
 from swarmctl.mavlink.signing.signature import (
     STAMPS_PER_S,
     SigningKey,
@@ -369,7 +369,7 @@ def test_refusals_that_networks_cause_alone_raise_no_alert_and_all_are_reported_
     assert [name for name, _ in told] == ["frames_refused"] * 4
     assert told[0][1] == {"reason": REPLAYED, "count": 1}
     assert told[-1][1]["reason"] == UNSIGNED
-    assert refusals.in_words() == f"1 {REPLAYED}, {refusals.by_reason[UNSIGNED]} {UNSIGNED}"
+    assert in_words(refusals.by_reason) == f"1 {REPLAYED}, {refusals.by_reason[UNSIGNED]} {UNSIGNED}"
 
 
 # -- whose the port is, on real sockets -------------------------------------------------------------------------------
