@@ -73,6 +73,13 @@ def heartbeat_of(sysid: int) -> Callable[[bytes], bool]:
     return beats
 
 
+def is_damaged(frame: bytes) -> bool:
+    """Return whether the checksum of a frame of MAVLink 2 is wrong, as after noise; not known of unknown messages."""
+    layout, end = _layout(message_id(frame)), _HEADER_BYTES + frame[1]
+    checksum = int.from_bytes(frame[end : end + _CHECKSUM_BYTES], "little")
+    return layout is not None and bool(mcrf4xx(frame[1:end] + layout.seed) != checksum)
+
+
 class Codec:
     """Packs messages as one component, and decodes frames; counts what it refuses."""
 

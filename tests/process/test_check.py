@@ -328,8 +328,8 @@ def test_a_vehicle_is_given_a_key_and_from_then_on_checked_and_set_over_signed_f
         simulator.wait_until_up()
         path = tmp_path / "swarm.toml"
         path.write_text(
-            '[sitl]\nenabled = false\n[mavlink]\nsigning_keys = ["0.key"]\n[swarm]\nagents = 1\n[[vehicles]]\nsysid = 1\n'
-            f'url = "udpin://127.0.0.1:{simulator.ports[0]}"\n'
+            '[sitl]\nenabled = false\n[mavlink]\nsigning_keys = ["0.key"]\n[swarm]\nagents = 1\n'
+            f'[[vehicles]]\nsysid = 1\nurl = "udpin://127.0.0.1:{simulator.ports[0]}"\n'
         )
         config = load(path)
         assert check(config, CheckOptions(seconds=QUICK_S, connect_s=2.0)) == 3, "it does not sign yet"

@@ -11,7 +11,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
-from swarmctl.mavlink.signing.refusals import FUTURE, OLD, REPLAYED, UNSIGNED, WRONG_SIGNATURE, FrameRefusals
+from swarmctl.mavlink.codec import is_damaged
+from swarmctl.mavlink.signing.refusals import DAMAGED, FUTURE, OLD, REPLAYED, UNSIGNED, WRONG_SIGNATURE, FrameRefusals
 from swarmctl.mavlink.signing.signature import (
     MOST_STAMP,
     STAMPS_PER_S,
@@ -80,7 +81,7 @@ class SigningChannel:
         if not is_signed(frame):
             return UNSIGNED
         if not is_authentic(frame, self._key):
-            return WRONG_SIGNATURE
+            return DAMAGED if is_damaged(frame) else WRONG_SIGNATURE
         stream, stamp = origin(frame)
         if stamp <= self._began:
             return OLD

@@ -6,12 +6,13 @@ from collections import Counter
 from collections.abc import Callable, Mapping
 
 UNSIGNED = "unsigned"
-WRONG_SIGNATURE = "wrong signature"  # another key, or changed on the way
+WRONG_SIGNATURE = "wrong signature"  # another key, or changed by somebody
+DAMAGED = "damaged"  # by noise: its checksum is wrong, too
 OLD = "old"  # perhaps from before this program has started
 REPLAYED = "replayed"  # not newer than the newest frame of its sender
 FUTURE = "future"
 
-HARMLESS = frozenset((OLD, REPLAYED))  # caused by reboots and networks alone
+HARMLESS = frozenset((DAMAGED, OLD, REPLAYED))  # caused by reboots, links and networks alone
 _EVENT_PERIOD_US = 1_000_000
 _ALERT_HOLD_US = 5_000_000  # time an alert is shown after the last refusal
 

@@ -24,7 +24,7 @@ from swarmctl.mavlink.latch import anybody
 from swarmctl.mavlink.signing import channel as channels
 from swarmctl.mavlink.signing.channel import AGENT_LINK, SigningChannel, Stamps
 from swarmctl.mavlink.signing.recognition import SignedRecognition
-from swarmctl.mavlink.signing.refusals import FUTURE, OLD, REPLAYED, UNSIGNED, WRONG_SIGNATURE, in_words
+from swarmctl.mavlink.signing.refusals import DAMAGED, FUTURE, OLD, REPLAYED, UNSIGNED, WRONG_SIGNATURE, in_words
 from swarmctl.mavlink.signing.signature import (
     STAMPS_PER_S,
     SigningKey,
@@ -200,10 +200,11 @@ INTRUDERS = {
     "signature cut off": Intruder(lambda v, sent: strip(v.frame()), UNSIGNED, "signatures are asked for"),
     "wrong key": Intruder(lambda v, sent: _later(OTHER_SECRET).frame(), WRONG_SIGNATURE, "the key counts"),
     "signature of zeros": Intruder(lambda v, sent: v.frame()[:-6] + bytes(6), WRONG_SIGNATURE, "the key counts"),
-    "payload changed": Intruder(lambda v, sent: _changed(v.frame(), 12), WRONG_SIGNATURE, "the key counts"),
-    "sender changed": Intruder(
-        lambda v, sent: _changed(_later(sysid=SYSID ^ 1).frame(), 5), WRONG_SIGNATURE, "the key counts"
+    "damaged": Intruder(lambda v, sent: _changed(v.frame(), 12), DAMAGED, "the key counts"),
+    "payload of one, signature of another": Intruder(
+        lambda v, sent: v.frame(beat(ARMED))[:-13] + v.frame()[-13:], WRONG_SIGNATURE, "the key counts"
     ),
+    "sender changed": Intruder(lambda v, sent: _changed(_later(sysid=SYSID ^ 1).frame(), 5), DAMAGED, "the key counts"),
     "time stamp changed": Intruder(lambda v, sent: _changed(_later().frame(), -12), WRONG_SIGNATURE, "the key counts"),
     "link changed": Intruder(lambda v, sent: _changed(_later().frame(), -13), WRONG_SIGNATURE, "the key counts"),
     "largest time stamp, wrong key": Intruder(
@@ -356,7 +357,8 @@ def test_a_forged_heartbeat_changes_neither_mode_nor_armed_state(signed: bool) -
 
 def test_refusals_that_networks_cause_alone_raise_no_alert_and_all_are_reported_once_a_second() -> None:
     bench, told = Bench(), []
-    attacked("replayed", bench)
+    for name in ("replayed", "recorded before the start", "damaged"):
+        attacked(name, bench)
     refusals = bench.channel.refusals
     assert refusals.alert(UTC_US) == ""
 
@@ -366,10 +368,9 @@ def test_refusals_that_networks_cause_alone_raise_no_alert_and_all_are_reported_
     for utc_us in range(UTC_US, UTC_US + 3_000_000, 20_000):
         bench.taken(plain())
         refusals.report(utc_us, note)
-    assert [name for name, _ in told] == ["frames_refused"] * 4
-    assert told[0][1] == {"reason": REPLAYED, "count": 1}
-    assert told[-1][1]["reason"] == UNSIGNED
-    assert in_words(refusals.by_reason) == f"1 {REPLAYED}, {refusals.by_reason[UNSIGNED]} {UNSIGNED}"
+    assert [name for name, _ in told] == ["frames_refused"] * 6
+    assert [fields["reason"] for _, fields in told] == [REPLAYED, OLD, DAMAGED, UNSIGNED, UNSIGNED, UNSIGNED]
+    assert in_words({REPLAYED: 1, UNSIGNED: 2}) == "1 replayed, 2 unsigned"
 
 
 # -- whose the port is, on real sockets -------------------------------------------------------------------------------
