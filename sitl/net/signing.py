@@ -43,7 +43,6 @@ class Setup(Enum):
     ACCEPTED = auto()
     DISABLED = auto()
     ARMED = auto()  # refused, because the vehicle is armed
-    BLANK = auto()  # refused, because an unsigned one must not remove a key
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,8 +65,7 @@ PX4_RULES = SigningRules(
     texts={
         Setup.ACCEPTED: (Severity.INFO, "MAVLink signing key accepted"),
         Setup.DISABLED: (Severity.INFO, "MAVLink signing disabled"),
-        Setup.ARMED: (Severity.CRITICAL, "MAVLink signing: rejected while armed"),
-        Setup.BLANK: (Severity.CRITICAL, "MAVLink signing: blank key rejected"),
+        Setup.ARMED: (Severity.WARNING, "MAVLink signing: rejected while armed"),
     },
 )
 ARDUCOPTER_RULES = SigningRules(
@@ -100,18 +98,16 @@ class VehicleSigning:
     _streams: dict[Stream, int] = field(default_factory=dict)
     _booted_us: int = 0
 
-    def set_up(self, secret: bytes, stamp: int, *, signed: bool) -> None:
+    def set_up(self, secret: bytes, stamp: int) -> None:
         """Handle a SETUP_SIGNING with this key and time stamp; zeros remove the key."""
-        outcome = self._set_up(secret, stamp, signed)
+        outcome = self._set_up(secret, stamp)
         if outcome in self.rules.texts:
             self.tell(*self.rules.texts[outcome])
 
-    def _set_up(self, secret: bytes, stamp: int, signed: bool) -> Setup:
+    def _set_up(self, secret: bytes, stamp: int) -> Setup:
         if self.armed():
             return Setup.ARMED
         if stamp == 0 and not any(secret):
-            if self.key is not None and not signed:
-                return Setup.BLANK
             self.key = None
             return Setup.DISABLED
         self.key, self._stored = SigningKey(secret), stamp
@@ -196,10 +192,10 @@ class SigningLink:
             taken = self._signing.taken(frame)
             kept.append(taken)
             if taken and taken[0] != _MAGIC_V1 and taken[7:10] == _SETUP_ID:
-                self._set_up(self._codec.decode(taken), signed=is_signed(frame))
+                self._set_up(self._codec.decode(taken))
         return b"".join(kept)
 
-    def _set_up(self, message: Any, *, signed: bool) -> None:
+    def _set_up(self, message: Any) -> None:
         if message is None or message.target_system not in (0, self._codec.sysid):
             return
-        self._signing.set_up(bytes(message.secret_key), message.initial_timestamp, signed=signed)
+        self._signing.set_up(bytes(message.secret_key), message.initial_timestamp)

@@ -40,6 +40,8 @@ _FAST = frozenset({mavlink.MAVLINK_MSG_ID_ODOMETRY})  # messages that the comman
 _SYNC_EVERY_US = 200_000
 _OWN_FLIGHT_US = 1_000_000  # after this long without setpoints the autopilot flies by itself, whatever its mode
 _HOVER_M_S = 0.2
+_FARTHEST_M, _FASTEST_M_S, _FASTEST_RAD_S = 1e5, 500.0, 200.0  # of a state that can be a quadrotor's, on each axis
+_MOST_PARAMETERS = 5000  # an autopilot has some 1500
 
 
 class _Sample(NamedTuple):
@@ -294,6 +296,9 @@ class Autopilot:
         if not (all(map(math.isfinite, (*pos.tolist(), *vel.tolist(), *rate.tolist()))) and 0.9 < norm < 1.1):
             self._codec.refused["state not finite"] += 1
             return False
+        if not _is_plausible(pos, vel, rate):
+            self._codec.refused["state not plausible"] += 1
+            return False
         t_us = self.clock.to_local(vehicle_us, arrived_us)
         if t_us is None:
             self._codec.refused["stamp not believed"] += 1
@@ -381,6 +386,9 @@ class Autopilot:
         value = self.dialect.from_wire(message.param_value, message.param_type)
         if not np.isfinite(value):
             return
+        if len(self.params) >= _MOST_PARAMETERS and message.param_id not in self.params:
+            self._codec.refused["too many parameters"] += 1
+            return
         self.params[message.param_id] = value
         if message.param_type <= LAST_INTEGER_TYPE:
             self.whole_params.add(message.param_id)
@@ -397,6 +405,12 @@ class Autopilot:
             return self.mode is FlightMode.HOLD
         own = self._setpoint_us is None or now_us - self._setpoint_us > _OWN_FLIGHT_US
         return own and abs(float(self._sample.vel_ned_m_s[2])) < _HOVER_M_S
+
+
+def _is_plausible(pos: Array, vel: Array, rate: Array) -> bool:
+    """Return whether a finite position, velocity and rate (3,) can be those of a quadrotor."""
+    bounds = ((pos, _FARTHEST_M), (vel, _FASTEST_M_S), (rate, _FASTEST_RAD_S))
+    return all(max(map(abs, values.tolist())) <= most for values, most in bounds)
 
 
 def _geodetic(lat_e7: int, lon_e7: int, alt_mm: int) -> GeoOrigin:

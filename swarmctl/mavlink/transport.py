@@ -246,7 +246,7 @@ class TcpTransport:
     """A TCP client (ArduPilot listens on 5760) that cuts frames out of the byte stream.
 
     It connects while the tick runs, and again a second after the other end has gone. Frames that do not fit into the
-    socket buffer are dropped whole.
+    socket buffer are dropped whole. One call reads a bounded amount, so that a flood can't stall the tick.
     """
 
     def __init__(self, remote: tuple[str, int]) -> None:
@@ -276,11 +276,13 @@ class TcpTransport:
         if self._sock is None and (self._open_us is None or now_us - self._open_us >= _REOPEN_US):
             self._open(now_us)
         try:
-            while self._sock is not None:
+            left = _BYTES_A_POLL
+            while self._sock is not None and left > 0:
                 data = self._sock.recv(_CHUNK)
                 if not data:
                     self._lose()
                 self._buffer += data
+                left -= len(data)
                 self._received_us = now_us
         except (BlockingIOError, InterruptedError):
             pass  # the socket is empty, or still connecting

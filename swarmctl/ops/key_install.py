@@ -65,7 +65,7 @@ class Installation:
         self._listener, self._there, self._sysid = listener, there, sysid
         self._channel, self._key, self._old_keys = channel, key, old_keys
         self._codec = Codec(sysid, SCANNER_COMPID)
-        self._armed: bool | None = None  # None: unknown
+        self._armed: bool | None = None  # None: unknown, also of a vehicle whose key is
         self._signer: SigningKey | None = None  # key with which the vehicle signs now
         self._is_foreign = False  # it signs with a key that is not known here
         self._newest = 0  # its newest time stamp
@@ -109,6 +109,7 @@ class Installation:
             self._signer = next((key for key in (self._key, *self._old_keys) if is_authentic(frame, key)), None)
             self._is_foreign = self._signer is None
             if self._is_foreign:
+                self._armed = None
                 return
             self._newest = max(self._newest, origin(frame)[1])
             self.done = self._signer is self._key and self._channel.take(frame) is not None
@@ -120,7 +121,7 @@ class Installation:
         """Send a heartbeat, and the key if the vehicle is disarmed and has not got it."""
         beat = mavlink.MAVLink_heartbeat_message(_ONBOARD, _NO_AUTOPILOT, 0, 0, _ACTIVE, 3)
         self._send(beat)
-        if self._armed is not False or self._is_foreign or self._signer is self._key:
+        if self._armed is not False or self._signer is self._key:
             return
         self._requests += 1
         stamp = max(self._channel.stamps().sent, self._newest)
