@@ -6,6 +6,7 @@ Each row of `INTRUDERS` names the protection that stands against it; with that o
 from __future__ import annotations
 
 import contextlib
+import random
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -295,6 +296,19 @@ def test_negative_control_a_time_stamp_taken_before_the_signature_is_checked_shu
     assert attacked("largest time stamp, wrong key", bench) == ([], False)
 
 
+def test_no_damage_to_a_signed_frame_gets_through_or_raises() -> None:
+    bench, rng = Bench(), random.Random(7)
+    good = [Partner(stamp=START + 100 + i).frame(message) for i, message in enumerate(MESSAGES)]
+    for _ in range(3000):
+        frame = bytearray(rng.choice(good))
+        for _ in range(rng.randint(1, 4)):
+            frame[rng.randrange(len(frame))] ^= rng.randint(1, 255)
+        if bytes(frame) in good:
+            continue
+        assert not bench.taken(bytes(frame), rng.randbytes(rng.randint(0, 40)))
+    assert len(bench.taken(*good)) == len(good), "and none of it shuts the vehicle out"
+
+
 def test_other_senders_are_neither_taken_nor_counted() -> None:
     bench = Bench()
     assert not bench.taken(Partner(sysid=SYSID + 1).frame(), Partner(compid=191).frame(), plain(sysid=255))
@@ -394,11 +408,11 @@ class Port:
         for sock in (self.vehicle, self.stranger):
             sock.settimeout(5.0)
 
-    def said(self, who: Any, *sent: bytes) -> list[bytes]:
+    def said(self, who: Any, *sent: bytes, at_us: int | None = None) -> list[bytes]:
         """Return what the agent takes of these datagrams; loopback keeps their order."""
         for datagram in sent:
             who.sendto(datagram, self.sock.getsockname())
-        return [datagram.data for datagram in self.link.receive(now_us())]
+        return [datagram.data for datagram in self.link.receive(now_us() if at_us is None else at_us)]
 
     def answered(self, who: Any) -> bytes:
         who.setblocking(False)
@@ -454,6 +468,24 @@ def test_negative_control_recognition_of_plain_heartbeats_gives_a_stranger_the_p
     port.udp.latch._is_vehicle = heartbeat_of(SYSID)
     port.said(port.stranger, plain())
     assert port.udp.latch.remote == port.stranger.getsockname()
+
+
+def test_a_silent_vehicle_is_followed_to_another_port_by_its_signed_heartbeat_alone(port: Port) -> None:
+    vehicle, began_us = Partner(), now_us()
+    heard = vehicle.frame()
+    assert port.said(port.vehicle, heard, at_us=began_us)
+    for after_us in range(0, 3_400_000, 200_000):
+        port.said(port.vehicle, at_us=began_us + after_us)
+    for name in STRANGERS:
+        assert not port.said(port.stranger, STRANGERS[name](), at_us=began_us + 3_400_000), name
+    assert not port.said(port.stranger, heard, at_us=began_us + 3_400_000), "replayed"
+    assert port.udp.latch.remote == port.vehicle.getsockname()
+    moved = bind_udp("127.0.0.1", 0)
+    vehicle.mav.signing.timestamp += 100
+    newer = vehicle.frame()
+    assert port.said(moved, newer, at_us=began_us + 3_400_000) == [strip(newer)]
+    assert port.udp.latch.remote == moved.getsockname()
+    moved.close()
 
 
 def test_a_vehicle_whose_time_stamps_are_of_long_ago_is_greeted_and_then_recognised(port: Port) -> None:
