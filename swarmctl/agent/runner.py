@@ -9,10 +9,11 @@ import gc
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 from swarmctl.agent.agent import Agent
 from swarmctl.agent.assembly import make_agent
@@ -39,6 +40,7 @@ from swarmctl.wall_clock import WallClock
 _LOOPBACK = "127.0.0.1"
 _LINGER_S = 1.0  # time the process lives on after its end, so that peers receive the last status
 _STOP_REPEAT_US = 1_000_000
+NOTHING_REFUSED: Mapping[str, int] = MappingProxyType({})
 _VEHICLE_LOST_S = 15.0  # time without any vehicle state after which the process gives up
 
 
@@ -194,27 +196,25 @@ def _loop(agent: Agent, config: Config, clock: WallClock, stop: StopRequest, *, 
         pace.done(now_us + round(record.timing.tick_ms * 1000), clock.now_us())
         if record.mode is not Mode.STATE_STALE:
             seen_us, ever_seen = now_us, True
-        _check_vehicle_silence(now_us - seen_us, ever_seen, config, f"{vehicle}{_refused(agent)}")
+        _check_vehicle_silence(now_us - seen_us, ever_seen, config, vehicle, agent.refused_frames)
         if agent.done if only_land else agent.finished:
             finished_us = finished_us or now_us
             if now_us - finished_us > _LINGER_S * 1e6:
                 return _exit_code(agent)
 
 
-def _check_vehicle_silence(silent_us: int, ever_seen: bool, config: Config, vehicle: str) -> None:
+def _check_vehicle_silence(
+    silent_us: int, ever_seen: bool, config: Config, vehicle: str, refused: Mapping[str, int] = NOTHING_REFUSED
+) -> None:
+    seen = f"; frames refused: {in_words(refused)}; see mavlink.signing_keys" if refused else ""
     if not ever_seen and silent_us > config.agent.connect_timeout_s * 1e6:
         raise StartError(
-            f"vehicle at {vehicle}: no heartbeat and position within {config.agent.connect_timeout_s:.0f} s. "
+            f"vehicle at {vehicle}: no heartbeat and position within {config.agent.connect_timeout_s:.0f} s{seen}. "
             "Is it running, sending to this port, and is its MAV_SYS_ID the configured sysid? "
             "PX4 answers only the first program that has ever spoken to it: end that one, or restart PX4"
         )
     if ever_seen and silent_us > _VEHICLE_LOST_S * 1e6:
-        raise MissionError(f"vehicle at {vehicle}: silent for {_VEHICLE_LOST_S:.0f} s, given up")
-
-
-def _refused(agent: Agent) -> str:
-    counts = in_words(agent.refused_frames)
-    return f" ({counts} frames refused: see mavlink.signing_keys)" if counts else ""
+        raise MissionError(f"vehicle at {vehicle}: silent for {_VEHICLE_LOST_S:.0f} s, given up{seen}")
 
 
 def _exit_code(agent: Agent) -> int:

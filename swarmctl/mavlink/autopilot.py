@@ -7,7 +7,6 @@ state, and therefore no setpoint is sent.
 
 from __future__ import annotations
 
-import math
 from collections import Counter, deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -24,6 +23,7 @@ from swarmctl.mavlink.dialects.discovery import DIALECTS
 from swarmctl.mavlink.framing import frames
 from swarmctl.mavlink.local_frame import LocalFrame
 from swarmctl.mavlink.mode_watch import ModeWatch
+from swarmctl.mavlink.plausibility import state_problem
 from swarmctl.mavlink.signing.refusals import FrameRefusals
 from swarmctl.mavlink.transport import Transport
 from swarmctl.mavlink.vehicle_clock import VehicleClock
@@ -40,7 +40,6 @@ _FAST = frozenset({mavlink.MAVLINK_MSG_ID_ODOMETRY})  # messages that the comman
 _SYNC_EVERY_US = 200_000
 _OWN_FLIGHT_US = 1_000_000  # after this long without setpoints the autopilot flies by itself, whatever its mode
 _HOVER_M_S = 0.2
-_FARTHEST_M, _FASTEST_M_S, _FASTEST_RAD_S = 1e5, 500.0, 200.0  # of a state that can be a quadrotor's, on each axis
 _MOST_PARAMETERS = 5000  # an autopilot has some 1500
 
 
@@ -293,11 +292,8 @@ class Autopilot:
     def _take(self, vehicle_us: int, arrived_us: int, pos: Array, vel: Array, *, q_nb: Array, rate: Array) -> bool:
         """Keep a sample if it is valid and the newest; return whether it was kept."""
         norm = float(np.sqrt(q_nb @ q_nb))
-        if not (all(map(math.isfinite, (*pos.tolist(), *vel.tolist(), *rate.tolist()))) and 0.9 < norm < 1.1):
-            self._codec.refused["state not finite"] += 1
-            return False
-        if not _is_plausible(pos, vel, rate):
-            self._codec.refused["state not plausible"] += 1
+        if problem := state_problem(pos, vel, rate, norm):
+            self._codec.refused[problem] += 1
             return False
         t_us = self.clock.to_local(vehicle_us, arrived_us)
         if t_us is None:
@@ -405,12 +401,6 @@ class Autopilot:
             return self.mode is FlightMode.HOLD
         own = self._setpoint_us is None or now_us - self._setpoint_us > _OWN_FLIGHT_US
         return own and abs(float(self._sample.vel_ned_m_s[2])) < _HOVER_M_S
-
-
-def _is_plausible(pos: Array, vel: Array, rate: Array) -> bool:
-    """Return whether a finite position, velocity and rate (3,) can be those of a quadrotor."""
-    bounds = ((pos, _FARTHEST_M), (vel, _FASTEST_M_S), (rate, _FASTEST_RAD_S))
-    return all(max(map(abs, values.tolist())) <= most for values, most in bounds)
 
 
 def _geodetic(lat_e7: int, lon_e7: int, alt_mm: int) -> GeoOrigin:
