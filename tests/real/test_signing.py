@@ -40,5 +40,6 @@ def test_a_vehicle_is_flown_with_its_key_once_it_has_it(field: Fielder, tmp_path
     assert installed.returncode == 0, installed.stdout + installed.stderr
     launched = flown(here, *config, "--duration", "5")
     assert set(launched.summary()["comms"]["refused_frames"]) <= HARMLESS
-    plain = here.launch(*config[: -len(signed)])
-    assert plain.end(END_S) == 3, "without the key it is not answered"
+    if kind is PX4:  # ArduCopter goes on to take unsigned frames on its first port, which this is
+        plain = here.launch(*config[: -len(signed)])
+        assert plain.end(END_S) == 3, "without the key it is not answered"

@@ -18,7 +18,7 @@ from swarmctl.simulator_config import SimulatorConfig
 SECRET, NEXT_SECRET = bytes(range(32)), bytes(range(1, 33))
 START = 1_000_000 * STAMPS_PER_S
 VERSION = (mav.MAV_CMD_REQUEST_MESSAGE, mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION)
-STEP_US = 4000
+STEP_US = 20_000
 
 
 class Ground:
@@ -27,7 +27,7 @@ class Ground:
     def __init__(self, kind: Literal["px4", "arducopter"] = "px4", secret: bytes | None = None) -> None:
         self.clock = SimClock()
         self.end, far = pipe_pair(self.clock.now_us)
-        config = SimulatorConfig(vehicles=1, autopilot_kind=kind, preset="x500", ekf_ready_s=0.1)
+        config = SimulatorConfig(vehicles=1, autopilot_kind=kind, preset="x500", ekf_ready_s=0.1, physics_hz=50)
         self.world = SitlWorld(config, [far], keys=[SigningKey(secret)] if secret else [])
         self.mav = mav.MAVLink(None, srcSystem=255, srcComponent=190)
         self.mav.signing.timestamp, self.mav.signing.link_id = START, 3
