@@ -137,6 +137,7 @@ def _run(options: argparse.Namespace) -> int:
     from sitl.world import SitlWorld
     from swarmctl.process_lifetime import StopRequest
     from swarmctl.process_priority import request_realtime
+    from swarmctl.signing_keys import read_keys
     from swarmctl.telemetry.recording.event_log import EventLog
 
     config = _config(options)
@@ -148,7 +149,7 @@ def _run(options: argparse.Namespace) -> int:
     truth = realtime.TruthFile(options.truth) if options.truth else None
     links, places = _tcp_links(options.tcp_port, count) if options.tcp_port else _udp_links(options, count)
     gcs_links, gcs_place = _gcs_links(config)
-    world = SitlWorld(config, links, gcs_links)
+    world = SitlWorld(config, links, gcs_links, read_keys(config.signing_keys, count))
     if config.speed != 1.0:
         world.scale_timeouts(config.speed)
     if options.events:
@@ -234,7 +235,7 @@ def _tcp_links(port: int, count: int) -> tuple[list[Transport], list[str]]:
 
 def _summary(world: SitlWorld, statistics: LoopStatistics) -> str:
     seconds = statistics.steps / world.params.physics_hz
-    ignored = sum(sum(e.ignored.values()) for e in world.endpoints)
+    ignored = sum(sum(e.ignored.values()) for e in world.endpoints) + sum(s.refused.total() for s in world.signing)
     refused = sum(sum(p.refused.values()) for p in world.autopilots)
     return (
         f"sitl: {seconds:.1f} s in {statistics.steps} steps, {statistics.late} late, {statistics.stalls} stalls "

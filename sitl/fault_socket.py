@@ -19,6 +19,7 @@ from swarmctl.process_lifetime import remove_socket
 from swarmctl.simulator_config import FaultParams
 
 _LARGEST = 8192
+_REQUESTS_A_POLL = 20
 
 
 class ControlSocket:
@@ -48,8 +49,8 @@ class ControlSocket:
         self._socket.setblocking(False)
 
     def poll(self, world: SitlWorld) -> None:
-        """Answer every request that has arrived."""
-        while True:
+        """Answer the requests that have arrived, a bounded number at once."""
+        for _ in range(_REQUESTS_A_POLL):
             try:
                 request, sender = self._socket.recvfrom(_LARGEST)
             except OSError:

@@ -33,7 +33,9 @@ from swarmctl.core.operator_verbs import EXCLUDE
 from swarmctl.core.records import TICK_DTYPE, TRUTH_DTYPE, plan_rows
 from swarmctl.core.types import Plan
 from swarmctl.kernels import why_not_repeatable
+from swarmctl.mavlink.signing.channel import AGENT_LINK, SigningChannel
 from swarmctl.mavlink.transport import pipe_pair
+from swarmctl.signing_keys import read_keys
 from swarmctl.telemetry.evaluation.referee import RunData
 from swarmctl.telemetry.json_safe import json_safe
 
@@ -123,7 +125,8 @@ class Lockstep:
             raise ValueError(f"sitl.physics_hz: {config.sitl.physics_hz} must be a multiple of agent.rate_hz")
         latency_us = round(config.sitl.link_latency_ms * 1000)
         self.links = [pipe_pair(self.clock.now_us, latency_us) for _ in range(agents)]  # (agent's, vehicle's) ends
-        self.world = SitlWorld(config.simulator(), [vehicle for _, vehicle in self.links])
+        self._keys = read_keys(config.mavlink.signing_keys, agents)
+        self.world = SitlWorld(config.simulator(), [vehicle for _, vehicle in self.links], keys=self._keys)
         self.hub = _hub(config, self.clock)
         errors = clocks or {}
         own_clocks = [OffsetClock(self.clock, errors[i]) if i in errors else self.clock for i in range(agents)]
@@ -150,6 +153,7 @@ class Lockstep:
         bus = self.hub.connect(agent_name(index))
         boot_id = self.config.seed * 1000 + index
         config = self._own.get(index, self.config)
+        key = self._keys[index]
         return make_agent(
             config,
             index,
@@ -160,6 +164,7 @@ class Lockstep:
             sink=log,
             on_frame=log.frame,
             stopwatch_ns=time.perf_counter_ns,
+            signing=None if key is None else SigningChannel(key, AGENT_LINK, log.clock.utc_us),
         )
 
     def step(self) -> None:

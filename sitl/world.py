@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from sitl.faults import Faults
 from sitl.net.lossy import LossyLink
+from sitl.net.signing import ARDUCOPTER_RULES, PX4_RULES, SigningLink, VehicleSigning
 from sitl.plant.airframes import PRESETS
 from sitl.plant.attitude import attitude_loop
 from sitl.plant.estimator import ESTIMATORS, Estimator
@@ -31,6 +32,7 @@ from sitl.vehicle_parts import Commander, MavlinkInterface
 from swarmctl.core.records import TRUTH_DTYPE
 from swarmctl.core.types import FlightMode, GeoOrigin
 from swarmctl.errors import ConfigError
+from swarmctl.mavlink.signing.signature import SigningKey
 from swarmctl.mavlink.transport import Transport
 from swarmctl.simulator_config import FaultParams, SimulatorConfig
 
@@ -59,7 +61,8 @@ class Rebooting(Protocol):
 class SitlWorld:
     """The simulation. `transports` are the vehicle ends of the links, in vehicle order.
 
-    `gcs_transports` are those of a second link per vehicle, to a ground station, as in PX4.
+    `gcs_transports` are those of a second link per vehicle, to a ground station, as in PX4. `keys` are those of
+    vehicles that sign from the start; empty: none does, until it is set up.
     """
 
     def __init__(
@@ -67,6 +70,7 @@ class SitlWorld:
         params: SimulatorConfig,
         transports: Sequence[Transport],
         gcs_transports: Sequence[Transport] = (),
+        keys: Sequence[SigningKey | None] = (),
     ) -> None:
         if len(transports) != params.vehicles or len(gcs_transports) not in (0, params.vehicles):
             raise ValueError(f"transports: {len(transports)} and {len(gcs_transports)} for {params.vehicles} vehicles")
@@ -101,10 +105,12 @@ class SitlWorld:
         self._gcs_links = [
             LossyLink(link, (params.seed, i, _GCS_LINK_PURPOSE)) for i, link in enumerate(gcs_transports)
         ]
+        self.signing: list[VehicleSigning] = []
+        self._keys = keys
         self.imu = Imu(self.plant, self._autopilot_every * dt_s)
         build = self._arducopter if params.autopilot_kind == "arducopter" else self._px4
-        for i, transport in enumerate(self._links):
-            pilot, endpoint = build(i, transport)
+        for i in range(count):
+            pilot, endpoint = build(i)
             self.autopilots.append(pilot)
             self.endpoints.append(endpoint)
         self._metered = [pilot if isinstance(pilot, Metered) else None for pilot in self.autopilots]
@@ -225,7 +231,14 @@ class SitlWorld:
         np.logical_and(self._powered, ~self.plant.contact, out=self._live, casting="unsafe")
         self._live *= ~self.plant.held
 
-    def _px4(self, vehicle: int, link: Transport) -> tuple[Commander, MavlinkInterface]:
+    def _signed(self, vehicle: int, signing: VehicleSigning) -> list[SigningLink]:
+        """Return the links of a vehicle with its signatures."""
+        self.signing.append(signing)
+        signing.key = self._keys[vehicle] if self._keys else None
+        sysid = self.params.sysid_base + vehicle
+        return [SigningLink(link, signing, number, sysid) for number, link in enumerate(self.links_of(vehicle))]
+
+    def _px4(self, vehicle: int) -> tuple[Commander, MavlinkInterface]:
         params, table = self.params, Parameters(self.params.sysid_base + vehicle)
         navigator = Navigator(table, self.plant.hover_thrust_01)
         airborne = params.start == "air"
@@ -239,15 +252,23 @@ class SitlWorld:
         pilot.start_at(self.origins[vehicle])
         sysid, step_us = params.sysid_base + vehicle, round(self.plant.dt_s * 1e6)
         report = self._publisher(vehicle, pilot)
-        endpoint = Endpoint(sysid, link, pilot, report, step_us=step_us)
+        signing = VehicleSigning(
+            rules=PX4_RULES, armed=lambda: pilot.armed, boot_us=lambda: pilot.boot.at_us, tell=pilot.send_text
+        )
+        links = self._signed(vehicle, signing)
+        endpoint = Endpoint(sysid, links[0], pilot, report, step_us=step_us)
         if self._gcs_links:
-            ground = Endpoint(sysid, self._gcs_links[vehicle], pilot, report, step_us=step_us, default_hz=GCS_HZ)
+            ground = Endpoint(sysid, links[1], pilot, report, step_us=step_us, default_hz=GCS_HZ)
             self.gcs_endpoints.append(ground)
             endpoint.join(ground)
         return pilot, endpoint
 
-    def _arducopter(self, vehicle: int, link: Transport) -> tuple[Commander, MavlinkInterface]:
-        from sitl.arducopter.endpoint import Start, arducopter_vehicle  # imports a second dialect module: 20 MB
+    def _arducopter(self, vehicle: int) -> tuple[Commander, MavlinkInterface]:
+        from sitl.arducopter.endpoint import (  # imports a second dialect module: 20 MB
+            Start,
+            arducopter_links,
+            arducopter_pilot,
+        )
 
         params = self.params
         start = Start(
@@ -256,8 +277,12 @@ class SitlWorld:
             ekf_ready_us=round(params.ekf_ready_s * 1e6),
             airborne=params.start == "air",
         )
-        links = [link, *self._gcs_links[vehicle : vehicle + 1]]
-        pilot, interfaces = arducopter_vehicle(params.sysid_base + vehicle, links, self.plant, vehicle, start=start)
+        sysid = params.sysid_base + vehicle
+        pilot = arducopter_pilot(sysid, self.plant, start)
+        signing = VehicleSigning(
+            rules=ARDUCOPTER_RULES, armed=lambda: pilot.armed, boot_us=lambda: pilot.clock.at_us, tell=pilot.send_text
+        )
+        interfaces = arducopter_links(sysid, self._signed(vehicle, signing), pilot, self.plant, vehicle, start=start)
         self.gcs_endpoints.extend(interfaces[1:])
         return pilot, interfaces[0]
 

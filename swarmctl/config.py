@@ -37,6 +37,7 @@ from swarmctl.mavlink.geofence import GeofenceParams, is_inside
 from swarmctl.mavlink.parameter_names import parameter_problems
 from swarmctl.mavlink.transport import Endpoint, parse_url
 from swarmctl.own_modules import locate, make_importable, own_problems
+from swarmctl.signing_keys import key_problems, locate_keys
 from swarmctl.simulator_config import MAX_VEHICLES, OriginParams, SimulatorConfig, SimulatorParams
 from swarmctl.telemetry.evaluation.referee import JudgedObstacle, Rules
 
@@ -76,6 +77,12 @@ class VehicleParams(Params):
     sysid: int = Field(ge=1, le=255)  # MAVLink system id, different for each vehicle
     url: str  # udpin://, udpout://, tcp:// or serial://
     model: VehicleModelParams | None = None  # replaces the whole section vehicle_model for this vehicle
+
+
+class MavlinkParams(Params):
+    """Parameters of the MAVLink links to the vehicles."""
+
+    signing_keys: tuple[str, ...] = Field((), strict=False)  # key file of each vehicle in turn; none: nothing is signed
 
 
 class SitlParams(SimulatorParams):
@@ -128,6 +135,7 @@ class Config(Params):
     agent: AgentParams = AgentParams()
     vehicles: tuple[VehicleParams, ...] = Field((), strict=False)
     volume: VolumeParams = VolumeParams()
+    mavlink: MavlinkParams = MavlinkParams()
     geofence: GeofenceParams = GeofenceParams()
     sitl: SitlParams = SitlParams()
     bus: BusParams = BusParams()
@@ -175,6 +183,8 @@ class Config(Params):
         keys = {key: getattr(self.sitl, key) for key in SimulatorParams.model_fields}
         keys |= {key: getattr(self.swarm, key) for key in OriginParams.model_fields}
         keys |= {"vehicles": self.swarm.agents, "spawn_ned_m": spawns_ned_m, "seed": self.seed}
+        signed = self.mavlink.signing_keys[: self.swarm.agents]
+        keys |= {"signing_keys": signed if len(signed) == self.swarm.agents else ()}  # too few are refused elsewhere
         return validated(SimulatorConfig, keys, "sitl")
 
     def rules(self, mode: Literal["realtime", "lockstep"] = "realtime") -> Rules:
@@ -192,13 +202,20 @@ class Config(Params):
         )
 
 
-def load(path: Path | None, overrides: Sequence[str] = (), values: Mapping[str, Any] = NO_VALUES) -> Config:
+def load(
+    path: Path | None,
+    overrides: Sequence[str] = (),
+    values: Mapping[str, Any] = NO_VALUES,
+    *,
+    only_agent: int | None = None,
+) -> Config:
     """Read, override and check a configuration.
 
     Args:
         path: a TOML file; None for the defaults.
         overrides: `key.sub=value` items, values in TOML syntax (bare words are strings); list items by index.
         values: values by dotted key, set after `overrides`.
+        only_agent: the only agent that is to run on this computer, which has its vehicle's signing key; None: all.
 
     Raises:
         ConfigError: the configuration is invalid; lists all problems with key, value, allowed range and fix.
@@ -212,10 +229,11 @@ def load(path: Path | None, overrides: Sequence[str] = (), values: Mapping[str, 
     if problems:
         raise ConfigError(source, problems)
     locate(tree, folder)
+    locate_keys(tree, folder)
     config = validated(Config, tree, source, _RENAMED)
     make_importable(config.own_folder)
     problems = list(own_problems(config.mission, config.controller, config.vehicle_model, config.separation))
-    problems = problems or list(_whole(config)) or list(_infeasible(config))
+    problems = problems or list(_whole(config, only_agent)) or list(_infeasible(config))
     if problems:
         raise ConfigError(source, problems)
     return config
@@ -243,8 +261,8 @@ def dump(config: Config) -> str:
     return tomli_w.dumps(config.model_dump(exclude_none=True))
 
 
-def _whole(config: Config) -> Iterator[str]:
-    """Yield problems between keys and sections."""
+def _whole(config: Config, only_agent: int | None) -> Iterator[str]:
+    """Yield problems between keys and sections, and of files."""
     agents = config.swarm.agents
     listed = len(config.start.positions_ned_m)
     if listed and listed < agents:
@@ -260,6 +278,7 @@ def _whole(config: Config) -> Iterator[str]:
         except ConfigError as error:
             yield from (f"sitl.{problem}" for problem in error.problems)
     yield from _vehicle_problems(config)
+    yield from key_problems(config.mavlink.signing_keys, agents, only_agent)
     if len(config.obstacles) > MAX_OBSTACLES:
         yield f"obstacles: {len(config.obstacles)} are listed, agents keep {MAX_OBSTACLES} at most"
     yield from parameter_problems(config.agent.autopilot_params)

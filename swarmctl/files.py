@@ -20,17 +20,18 @@ from typing import BinaryIO
 _CREATE_FLAGS = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
 
 
-def read_file(path: Path, most_bytes: int, follow: bool = False) -> bytes:
+def read_file(path: Path, most_bytes: int, follow: bool = False, private: bool = False) -> bytes:
     """Return the content of a regular file.
 
     Args:
         path: path of the file.
         most_bytes: largest size; a larger file is refused before it is read.
         follow: whether `path` itself may be a symbolic link.
+        private: whether a file that anybody but this user may read or write is refused.
 
     Raises:
         FileNotFoundError: the file does not exist.
-        OSError: it is not a regular file, is larger, or can't be read; `strerror` says which.
+        OSError: it is not a regular file, is larger, not private, or can't be read; `strerror` says which.
     """
     flags = os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | (0 if follow else os.O_NOFOLLOW)  # opening a pipe would block
     try:
@@ -43,11 +44,40 @@ def read_file(path: Path, most_bytes: int, follow: bool = False) -> bytes:
     if not stat.S_ISREG(status.st_mode):
         os.close(fd)
         raise OSError(errno.EINVAL, "is not a regular file", str(path))
+    if private and (wrong := _why_not_private(status)):
+        os.close(fd)
+        raise OSError(errno.EPERM, wrong, str(path))
     with os.fdopen(fd, "rb") as file:
         content = file.read(most_bytes + 1) if status.st_size <= most_bytes else b""
         if status.st_size > most_bytes or len(content) > most_bytes:
             raise OSError(errno.EFBIG, f"is larger than {most_bytes / 1e6:g} MB", str(path))
         return content
+
+
+def _why_not_private(status: os.stat_result) -> str:
+    """Return why others may read or write a file, or ""."""
+    if status.st_uid != os.geteuid():
+        return "belongs to another user"
+    if stat.S_IMODE(status.st_mode) & 0o077:
+        return f"has mode {stat.S_IMODE(status.st_mode):04o}, so that others may read or write it; chmod 600 it"
+    return ""
+
+
+def create_private(path: Path, content: bytes) -> None:
+    """Write a new file that only this user may read.
+
+    Raises:
+        OSError: the file exists, or the disk refuses; nothing is left of it.
+    """
+    fd = os.open(path, _CREATE_FLAGS, 0o600)
+    try:
+        with os.fdopen(fd, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(fd)
+    except BaseException:
+        path.unlink(missing_ok=True)
+        raise
 
 
 @contextmanager

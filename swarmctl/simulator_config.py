@@ -164,6 +164,7 @@ class SimulatorConfig(SimulatorParams, OriginParams):
     spawn_ned_m: tuple[_Spawn, ...] = Field((), strict=False)  # shared frame, one each; empty: along x, 1 m apart
     seed: int = Field(1, ge=0, le=2**31 - 1)
     sysid_base: int = Field(1, ge=1, le=255)  # MAVLink system id of the first vehicle
+    signing_keys: tuple[str, ...] = Field((), strict=False)  # key files, one each; none: vehicles sign once set up
 
     @model_validator(mode="after")
     def _is_possible(self) -> SimulatorConfig:
@@ -177,6 +178,8 @@ class SimulatorConfig(SimulatorParams, OriginParams):
             yield f"sysid_base = {self.sysid_base}: allowed: 1 to {256 - self.vehicles} for {self.vehicles} vehicles"
         if len(self.spawn_ned_m) not in (0, self.vehicles):
             yield f"spawn_ned_m: {len(self.spawn_ned_m)} positions; allowed: one for each of {self.vehicles} vehicles"
+        if len(self.signing_keys) not in (0, self.vehicles):
+            yield f"signing_keys: {len(self.signing_keys)} files; allowed: one for each of {self.vehicles} vehicles"
         for number, fault in enumerate(self.faults):
             yield from (f"faults.{number}.{problem}" for problem in fault.problems(self.vehicles))
 

@@ -323,13 +323,17 @@ def _whole(value: float) -> int | None:
     return int(value) if math.isfinite(value) else None
 
 
-def arducopter_vehicle(
-    sysid: int, links: Sequence[Transport], plant: Plant, vehicle: int, *, start: Start
-) -> tuple[ArduCopter, list[ArduCopterEndpoint]]:
-    """Return the autopilot of one vehicle of a plant, and its MAVLink interface on each link."""
+def arducopter_pilot(sysid: int, plant: Plant, start: Start) -> ArduCopter:
+    """Return the autopilot of one vehicle of a plant."""
     parameters = CopterParameters(sysid)
     navigator = CopterNavigator(parameters, plant.hover_thrust_01)
-    pilot = ArduCopter(parameters, navigator, start.origin, ekf_ready_us=start.ekf_ready_us, airborne=start.airborne)
+    return ArduCopter(parameters, navigator, start.origin, ekf_ready_us=start.ekf_ready_us, airborne=start.airborne)
+
+
+def arducopter_links(
+    sysid: int, links: Sequence[Transport], pilot: ArduCopter, plant: Plant, vehicle: int, *, start: Start
+) -> list[ArduCopterEndpoint]:
+    """Return the MAVLink interface of an autopilot on each of its links."""
     rotor_scale = 1.0 / plant.preset.rotor_force_max_n
 
     def report() -> CopterReport:
@@ -342,4 +346,4 @@ def arducopter_vehicle(
         )
 
     step_us = round(plant.dt_s * 1e6)
-    return pilot, [ArduCopterEndpoint(sysid, link, pilot, report, step_us=step_us) for link in links]
+    return [ArduCopterEndpoint(sysid, link, pilot, report, step_us=step_us) for link in links]

@@ -7,6 +7,7 @@ import socket
 from swarmctl.mavlink.transport import Datagram
 
 _MAX_DATAGRAM = 2048
+_DATAGRAMS_A_POLL = 600  # the rest waits for the next, so that a flood can't stop the simulation
 
 
 class OpenPort:
@@ -34,16 +35,17 @@ class OpenPort:
             return
 
     def receive(self, now_us: int) -> list[Datagram]:
-        """Return everything that has arrived since the last call."""
+        """Return what has arrived since the last call, up to a limit."""
         arrived: list[Datagram] = []
-        while True:
+        for _ in range(_DATAGRAMS_A_POLL):
             try:
                 data, sender = self._sock.recvfrom(_MAX_DATAGRAM)
             except OSError:
-                return arrived
+                break
             if not self._latched:
                 self._remote, self._latched = sender, True
             arrived.append(Datagram(now_us, data))
+        return arrived
 
     def close(self) -> None:
         """Release the port."""

@@ -13,6 +13,7 @@ from swarmctl.mavlink.transport import Datagram
 
 PORT_STEP = 10
 _READ = 4096
+_READS_A_POLL = 32  # the rest waits for the next, so that a flood can't stop the simulation
 _BACKLOG_BYTES = 1 << 16  # a client that does not read loses whole frames beyond this
 
 
@@ -48,7 +49,9 @@ class TcpServerTransport:
     def receive(self, now_us: int) -> list[Datagram]:
         if self._client is None:
             self._accept()
-        while self._client is not None:
+        for _ in range(_READS_A_POLL):
+            if self._client is None:
+                break
             try:
                 data = self._client.recv(_READ)
             except BlockingIOError:

@@ -109,6 +109,7 @@ class Severity(enum.IntEnum):
 
     EMERGENCY = 0
     CRITICAL = 2
+    ERROR = 3
     WARNING = 4
     INFO = 6
 

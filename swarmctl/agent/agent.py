@@ -205,6 +205,11 @@ class Agent:
         return self._bus.sent
 
     @property
+    def refused_frames(self) -> dict[str, int]:
+        """Number of the vehicle's MAVLink frames refused so far, by reason."""
+        return dict(self._autopilot.refusals.by_reason)
+
+    @property
     def commits_refused(self) -> int | None:
         """Number of proposals withdrawn or expired; None if separation works without proposals."""
         return self._separation.commits_refused
@@ -264,6 +269,7 @@ class Agent:
         refusals = self._world_model.refusals.alert(self._clock.utc_us())
         if refusals:
             self._alerts.put("bus", refusals, now_us)
+        self._watch_signatures(now_us)
         self._publisher.active_alert = self._alerts.newest(now_us)
         return self._publisher.publish(
             now_us,
@@ -277,6 +283,13 @@ class Agent:
             deadline_misses=deadline_misses,
             timing=self.timing,
         )
+
+    def _watch_signatures(self, now_us: int) -> None:
+        """Report the vehicle's frames that were refused."""
+        refusals, utc_us = self._autopilot.refusals, self._clock.utc_us()
+        refusals.report(utc_us, self._note)
+        if text := refusals.alert(utc_us):
+            self._alerts.put("signing", text, now_us)
 
     def _watch_deadlines(self, now_us: int, deadline_misses: int) -> None:
         before = self._overload.level

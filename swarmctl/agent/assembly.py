@@ -14,8 +14,10 @@ from swarmctl.config import Config
 from swarmctl.core.clock import Clock
 from swarmctl.core.types import GeoOrigin
 from swarmctl.mavlink.autopilot import Autopilot
-from swarmctl.mavlink.codec import Codec
+from swarmctl.mavlink.codec import AUTOPILOT_COMPID, Codec
 from swarmctl.mavlink.commands import OWN_COMPID, CommandPort
+from swarmctl.mavlink.signing.channel import SigningChannel
+from swarmctl.mavlink.signing.signed_transport import SignedTransport
 from swarmctl.mavlink.transport import Transport
 
 
@@ -30,6 +32,7 @@ def make_agent(
     sink: TickSink,
     on_frame: Callable[[bytes], None],
     stopwatch_ns: Callable[[], int],
+    signing: SigningChannel | None = None,
 ) -> Agent:
     """Build an agent and connect it to its vehicle, its peers and its recorder.
 
@@ -40,12 +43,15 @@ def make_agent(
         transport, bus, clock, sink: see `Agent`.
         on_frame: called with every MAVLink frame sent or received.
         stopwatch_ns: measures the tick [ns].
+        signing: signs and verifies the frames of the link; None: they are plain.
     """
     sysid = config.sysids()[agent]
     swarm = config.swarm
     codec = Codec(sysid, OWN_COMPID)
     origin = GeoOrigin(swarm.origin_lat_deg, swarm.origin_lon_deg, swarm.origin_alt_m)
-    autopilot = Autopilot(transport, codec, sysid, origin, on_frame=on_frame)
+    link = transport if signing is None else SignedTransport(transport, signing, sysid, AUTOPILOT_COMPID)
+    refusals = None if signing is None else signing.refusals
+    autopilot = Autopilot(link, codec, sysid, origin, on_frame=on_frame, refusals=refusals)
     commands = CommandPort(autopilot.send_frame, codec, sysid, lambda: autopilot.dialect)
     autopilot.connect(commands)
     setup = AgentSetup(

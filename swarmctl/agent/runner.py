@@ -9,9 +9,11 @@ import gc
 import signal
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 
 from swarmctl.agent.agent import Agent
 from swarmctl.agent.assembly import make_agent
@@ -24,15 +26,22 @@ from swarmctl.core.operator_verbs import Order
 from swarmctl.core.types import Mode
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, MissionError, StartError
 from swarmctl.mavlink.codec import heartbeat_of
-from swarmctl.mavlink.transport import open_transport
+from swarmctl.mavlink.commands import OWN_COMPID
+from swarmctl.mavlink.signing.channel import AGENT_LINK, SigningChannel
+from swarmctl.mavlink.signing.recognition import SignedRecognition
+from swarmctl.mavlink.signing.refusals import in_words
+from swarmctl.mavlink.signing.stamp_file import kept_channel
+from swarmctl.mavlink.transport import Transport, open_transport
 from swarmctl.process_lifetime import StopRequest
 from swarmctl.process_priority import request_realtime
+from swarmctl.signing_keys import read_own_key
 from swarmctl.telemetry.recording.recorder import Recorder
 from swarmctl.wall_clock import WallClock
 
 _LOOPBACK = "127.0.0.1"
 _LINGER_S = 1.0  # time the process lives on after its end, so that peers receive the last status
 _STOP_REPEAT_US = 1_000_000
+NOTHING_REFUSED: Mapping[str, int] = MappingProxyType({})
 _VEHICLE_LOST_S = 15.0  # time without any vehicle state after which the process gives up
 
 
@@ -102,17 +111,24 @@ def run_agent(process: AgentProcess) -> int:
         ConfigError: the configuration is not valid.
     """
     agent = process.agent
-    config = load(process.config_path)
+    config = load(process.config_path, only_agent=agent)
     if not 0 <= agent < config.swarm.agents:
         raise StartError(f"--id {agent}: allowed: 0..{config.swarm.agents - 1} (swarm.agents)")
     stop = StopRequest(signal.SIGTERM, signal.SIGINT, signal.SIGHUP)
     if process.only_land:
         stop.ask()
     clock = WallClock()
+    key = read_own_key(config.mavlink.signing_keys, agent)
+    with nullcontext() if key is None else kept_channel(key, AGENT_LINK, clock.utc_us) as signing:
+        return _fly(process, config, clock, stop, signing)
+
+
+def _fly(
+    process: AgentProcess, config: Config, clock: WallClock, stop: StopRequest, signing: SigningChannel | None
+) -> int:
+    agent = process.agent
     url = config.vehicles[agent].url if config.vehicles else ""
-    is_vehicle = heartbeat_of(config.sysids()[agent])
-    remote = None if process.vehicle_port is None else (_LOOPBACK, process.vehicle_port)
-    transport = open_transport(url or f"udpin://{_LOOPBACK}:14540", process.fd, is_vehicle, remote)
+    transport = _open_link(process, config, clock, signing)
     recorder = Recorder(process.run_dir, agent)
     link = _join(process, config, clock)
     boot_id = (clock.utc_us() // 1000) & 0xFFFFFFFF
@@ -126,6 +142,7 @@ def run_agent(process: AgentProcess) -> int:
         sink=recorder,
         on_frame=lambda frame: recorder.frame(clock.utc_us(), frame),
         stopwatch_ns=time.perf_counter_ns,
+        signing=signing,
     )
     if process.realtime:
         granted, spent_s = request_realtime(), time.process_time()
@@ -136,9 +153,21 @@ def run_agent(process: AgentProcess) -> int:
     finally:
         summary = {"sent": flown.sent, "rejected": flown.rejected, "lost": recorder.lost}
         recorder.event("bus_summary", clock.now_us(), clock.utc_us(), **summary)
+        recorder.event("link_summary", clock.now_us(), clock.utc_us(), refused=flown.refused_frames)
         link.close()
         transport.close()
         recorder.close()
+
+
+def _open_link(process: AgentProcess, config: Config, clock: WallClock, signing: SigningChannel | None) -> Transport:
+    """Open the link to the vehicle, which belongs to the sender of its HEARTBEAT, a signed one where there is a key."""
+    url = config.vehicles[process.agent].url if config.vehicles else f"udpin://{_LOOPBACK}:14540"
+    sysid = config.sysids()[process.agent]
+    remote = None if process.vehicle_port is None else (_LOOPBACK, process.vehicle_port)
+    if signing is None:
+        return open_transport(url, process.fd, heartbeat_of(sysid), remote)
+    vehicle = SignedRecognition(signing, sysid, OWN_COMPID, clock.utc_us)
+    return open_transport(url, process.fd, vehicle.is_vehicle, remote, greeting=vehicle.greeting)
 
 
 def _join(process: AgentProcess, config: Config, clock: WallClock) -> Bus:
@@ -173,22 +202,25 @@ def _loop(agent: Agent, config: Config, clock: WallClock, stop: StopRequest, *, 
         pace.done(now_us + round(record.timing.tick_ms * 1000), clock.now_us())
         if record.mode is not Mode.STATE_STALE:
             seen_us, ever_seen = now_us, True
-        _check_vehicle_silence(now_us - seen_us, ever_seen, config, vehicle)
+        _check_vehicle_silence(now_us - seen_us, ever_seen, config, vehicle, agent.refused_frames)
         if agent.done if only_land else agent.finished:
             finished_us = finished_us or now_us
             if now_us - finished_us > _LINGER_S * 1e6:
                 return _exit_code(agent)
 
 
-def _check_vehicle_silence(silent_us: int, ever_seen: bool, config: Config, vehicle: str) -> None:
+def _check_vehicle_silence(
+    silent_us: int, ever_seen: bool, config: Config, vehicle: str, refused: Mapping[str, int] = NOTHING_REFUSED
+) -> None:
+    seen = f"; frames refused: {in_words(refused)}; see mavlink.signing_keys" if refused else ""
     if not ever_seen and silent_us > config.agent.connect_timeout_s * 1e6:
         raise StartError(
-            f"vehicle at {vehicle}: no heartbeat and position within {config.agent.connect_timeout_s:.0f} s. "
+            f"vehicle at {vehicle}: no heartbeat and position within {config.agent.connect_timeout_s:.0f} s{seen}. "
             "Is it running, sending to this port, and is its MAV_SYS_ID the configured sysid? "
             "PX4 answers only the first program that has ever spoken to it: end that one, or restart PX4"
         )
     if ever_seen and silent_us > _VEHICLE_LOST_S * 1e6:
-        raise MissionError(f"vehicle at {vehicle}: silent for {_VEHICLE_LOST_S:.0f} s, given up")
+        raise MissionError(f"vehicle at {vehicle}: silent for {_VEHICLE_LOST_S:.0f} s, given up{seen}")
 
 
 def _exit_code(agent: Agent) -> int:

@@ -52,6 +52,7 @@ class LinkFacts:
     bytes_s: float
     lost_01: float  # share of frames lost on the way: missing by sequence number, and not dropped by this computer
     dropped: int = 0  # datagrams that this computer was too busy to take
+    refused: Mapping[str, int] | None = None  # frames not taken, by reason; None: the link is not signed
     mavlink1: int  # frames
     mavlink2: int
     autopilots: tuple[int, ...]  # system ids

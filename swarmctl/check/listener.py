@@ -10,6 +10,7 @@ import contextlib
 import socket
 import struct
 import sys
+from collections.abc import Mapping
 from typing import NamedTuple, Protocol
 
 from swarmctl.mavlink.transport import Transport, bind_towards, bind_udp, open_transport, parse_url, resolve
@@ -36,9 +37,14 @@ class Listener(Protocol):
 
     Attributes:
         dropped: datagrams that reached this computer and found its queue full, as far as the system tells.
+        refused: frames not taken on a signed link, by reason; None: the link is not signed.
     """
 
-    dropped: int
+    @property
+    def dropped(self) -> int: ...
+
+    @property
+    def refused(self) -> Mapping[str, int] | None: ...
 
     def receive(self) -> list[ReceivedDatagram]:
         """Return everything that has arrived since the last call."""
@@ -71,6 +77,8 @@ def open_listener(url: str) -> tuple[Listener, Address]:
 
 class UdpListener:
     """Listens on a bound UDP socket."""
+
+    refused = None
 
     def __init__(self, sock: socket.socket) -> None:
         self.dropped = 0
@@ -107,6 +115,8 @@ class UdpListener:
 
 class TransportListener:
     """Listens on a serial or TCP link, which has one other end."""
+
+    refused = None
 
     def __init__(self, transport: Transport, there: Address) -> None:
         self.dropped = 0

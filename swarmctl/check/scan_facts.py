@@ -20,6 +20,7 @@ from swarmctl.check.link_statistics import FrameStatistics, round_trip, vehicle_
 from swarmctl.check.scanner import ARMED_FLAG, VehicleScan
 from swarmctl.core.types import FlightMode, GeoOrigin, Landed
 from swarmctl.mavlink.dialects.discovery import DIALECTS
+from swarmctl.mavlink.signing.refusals import in_words
 
 _BYTEWISE, _C_CAST = 1 << 4, 1 << 17  # MAV_PROTOCOL_CAPABILITY_PARAM_ENCODE_*
 _ENOUGH_ANSWERS = 3
@@ -90,7 +91,8 @@ def facts_of(
 
 def _silence(scan: VehicleScan) -> str:
     if not scan.senders:
-        return "nothing is heard"
+        refused = in_words(scan.listener.refused or {})
+        return f"frames are refused: {refused}" if refused else "nothing is heard"
     return "frames are heard, but no autopilot's heartbeat"
 
 
@@ -105,6 +107,7 @@ def _link(scan: VehicleScan, listened_s: float) -> LinkFacts:
         bytes_s=statistics.bytes / span_s,
         lost_01=statistics.lost_01(scan.dropped_frames),
         dropped=scan.listener.dropped,
+        refused=scan.listener.refused,
         mavlink1=scan.mavlink1,
         mavlink2=scan.mavlink2,
         autopilots=scan.autopilots(),

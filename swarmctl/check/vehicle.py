@@ -11,6 +11,7 @@ from swarmctl.config import Config
 from swarmctl.core.types import FlightMode
 from swarmctl.core.verdict import Verdict
 from swarmctl.mavlink.dialects.discovery import DIALECTS
+from swarmctl.mavlink.signing.refusals import HARMLESS, in_words
 from swarmctl.mavlink.transport import parse_url
 
 OK, NOTE, FIX = Verdict.OK, Verdict.NOTE, Verdict.FIX
@@ -49,6 +50,10 @@ _LATCH = (
     "PX4 sends only to its first sender, for good: if that was another program, restart PX4, "
     "or use the port of that program"
 )
+_NO_KEY = (
+    "the vehicle does not sign with its key in mavlink.signing_keys (swarmctl keys install), or its clock is more than "
+    "a minute ahead of this computer's"
+)
 _BITS_A_BYTE = 10  # with start and stop bit
 _MESSAGE_BYTES = {"ODOMETRY": 244, "LOCAL_POSITION_NED": 40, "ATTITUDE_QUATERNION": 44}
 _SMALL_MESSAGE_BYTES = 40
@@ -68,6 +73,8 @@ def _unreached(facts: VehicleFacts) -> Finding:
         advice += f" {_LATCH}"
     if facts.link.mavlink1 or facts.link.mavlink2:
         advice = f"something sends to {facts.url}, but no autopilot: check the address and the routing"
+    if facts.link.refused:
+        advice = _NO_KEY
     return Finding(
         agent=facts.agent,
         topic="link",
@@ -394,6 +401,21 @@ def _clock(facts: VehicleFacts, config: Config) -> Finding | None:
     )
 
 
+def _signing(facts: VehicleFacts, config: Config) -> Finding | None:
+    if facts.link.refused is None:
+        return None
+    found = {reason: count for reason, count in facts.link.refused.items() if reason not in HARMLESS}
+    return Finding(
+        agent=facts.agent,
+        topic="signing",
+        verdict=NOTE if found else OK,
+        found=f"signed, {in_words(found)} refused" if found else "signed",
+        wanted="all signed with one key",
+        advice="somebody else sends to this link, or a part of the vehicle does not sign" if found else "",
+        weight=40,
+    )
+
+
 _ROWS: tuple[Callable[[VehicleFacts, Config], Finding | None], ...] = (
     _autopilot,
     _board,
@@ -404,6 +426,7 @@ _ROWS: tuple[Callable[[VehicleFacts, Config], Finding | None], ...] = (
     _estimator,
     _place,
     _link,
+    _signing,
     _rates,
     _loss,
     _latency,

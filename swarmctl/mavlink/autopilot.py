@@ -7,7 +7,6 @@ state, and therefore no setpoint is sent.
 
 from __future__ import annotations
 
-import math
 from collections import Counter, deque
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -25,6 +24,8 @@ from swarmctl.mavlink.dialects.discovery import DIALECTS
 from swarmctl.mavlink.framing import frames
 from swarmctl.mavlink.local_frame import LocalFrame
 from swarmctl.mavlink.mode_watch import ModeWatch
+from swarmctl.mavlink.plausibility import state_problem
+from swarmctl.mavlink.signing.refusals import FrameRefusals
 from swarmctl.mavlink.transport import Transport
 from swarmctl.mavlink.vehicle_clock import VehicleClock
 from swarmctl.mavlink.vehicle_health import VehicleHealth
@@ -40,6 +41,7 @@ _FAST = frozenset({mavlink.MAVLINK_MSG_ID_ODOMETRY})  # messages that the comman
 _SYNC_EVERY_US = 200_000
 _OWN_FLIGHT_US = 1_000_000  # after this long without setpoints the autopilot flies by itself, whatever its mode
 _HOVER_M_S = 0.2
+_MOST_PARAMETERS = 5000  # an autopilot has some 1500
 
 
 class _Sample(NamedTuple):
@@ -62,6 +64,7 @@ class Autopilot:
         sysid: the vehicle's system id; everything else is ignored.
         shared: origin of the shared frame.
         on_frame: called with every frame received or sent, for recording.
+        refusals: counts what a signed link has refused.
 
     Attributes:
         clock: the vehicle's clock; `clock.boots` counts its reboots.
@@ -97,8 +100,10 @@ class Autopilot:
         shared: GeoOrigin,
         *,
         on_frame: Callable[[bytes], None],
+        refusals: FrameRefusals | None = None,
     ) -> None:
         self._transport, self._codec, self._sysid = transport, codec, sysid
+        self.refusals = refusals or FrameRefusals()
         self._on_frame = on_frame
         self.clock = VehicleClock()
         self.frame = LocalFrame(shared)
@@ -293,8 +298,8 @@ class Autopilot:
     def _take(self, vehicle_us: int, arrived_us: int, pos: Array, vel: Array, *, q_nb: Array, rate: Array) -> bool:
         """Keep a sample if it is valid and the newest; return whether it was kept."""
         norm = float(np.sqrt(q_nb @ q_nb))
-        if not (all(map(math.isfinite, (*pos.tolist(), *vel.tolist(), *rate.tolist()))) and 0.9 < norm < 1.1):
-            self._codec.refused["state not finite"] += 1
+        if problem := state_problem(pos, vel, rate, norm):
+            self._codec.refused[problem] += 1
             return False
         t_us = self.clock.to_local(vehicle_us, arrived_us)
         if t_us is None:
@@ -382,6 +387,9 @@ class Autopilot:
             return
         value = self.dialect.from_wire(message.param_value, message.param_type)
         if not np.isfinite(value):
+            return
+        if len(self.params) >= _MOST_PARAMETERS and message.param_id not in self.params:
+            self._codec.refused["too many parameters"] += 1
             return
         self.params[message.param_id] = value
         if message.param_type <= LAST_INTEGER_TYPE:

@@ -18,7 +18,7 @@ from pymavlink.dialects.v20 import development as dialect
 
 from swarmctl.mavlink.framing import frames, message_id
 
-_AUTOPILOT_COMPID = 1
+AUTOPILOT_COMPID = 1  # MAV_COMP_ID_AUTOPILOT1
 _VERSION_2, _PLAIN = 0xFD, 0  # first byte of a frame; incompatibility flags of one that is not signed
 _HEADER_BYTES, _CHECKSUM_BYTES = 10, 2
 
@@ -59,11 +59,11 @@ def heartbeat_of(sysid: int) -> Callable[[bytes], bool]:
 
     Ground stations and companions send HEARTBEAT too, some with a vehicle's system id; they name no autopilot type.
     """
-    codec = Codec(sysid, _AUTOPILOT_COMPID)
+    codec = Codec(sysid, AUTOPILOT_COMPID)
 
     def beats(datagram: bytes) -> bool:
         for frame in frames(datagram):
-            if message_id(frame) != dialect.MAVLINK_MSG_ID_HEARTBEAT or frame[5:7] != bytes([sysid, _AUTOPILOT_COMPID]):
+            if message_id(frame) != dialect.MAVLINK_MSG_ID_HEARTBEAT or frame[5:7] != bytes([sysid, AUTOPILOT_COMPID]):
                 continue
             message = codec.decode(frame)
             if message is not None and message.autopilot != dialect.MAV_AUTOPILOT_INVALID:
@@ -71,6 +71,13 @@ def heartbeat_of(sysid: int) -> Callable[[bytes], bool]:
         return False
 
     return beats
+
+
+def is_damaged(frame: bytes) -> bool:
+    """Return whether the checksum of a frame of MAVLink 2 is wrong, as after noise; not known of unknown messages."""
+    layout, end = _layout(message_id(frame)), _HEADER_BYTES + frame[1]
+    checksum = int.from_bytes(frame[end : end + _CHECKSUM_BYTES], "little")
+    return layout is not None and bool(mcrf4xx(frame[1:end] + layout.seed) != checksum)
 
 
 class Codec:

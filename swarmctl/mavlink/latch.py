@@ -15,6 +15,7 @@ from collections.abc import Callable
 
 Address = tuple[str, int]
 IsVehicle = Callable[[bytes], bool]  # whether a datagram shows that its sender is the vehicle
+Greeting = Callable[[bytes], bytes]  # what to answer the sender of a datagram that is not known to be the vehicle's
 
 _SILENT_US = 3_000_000  # after this silence the vehicle may send from another address
 _SLEPT_US = 500_000  # after this long without a poll, silence can't be attributed
@@ -33,6 +34,11 @@ def anybody(data: bytes) -> bool:
 def nobody(data: bytes) -> bool:
     """Accept no other sender than the given one, however long it is silent."""
     return False
+
+
+def silence(data: bytes) -> bytes:
+    """Answer nothing."""
+    return b""
 
 
 class Latch:

@@ -19,7 +19,7 @@ from typing import Any, NamedTuple, Protocol
 
 from swarmctl.errors import StartError
 from swarmctl.mavlink.framing import cut_frames
-from swarmctl.mavlink.latch import Address, IsVehicle, Latch, admit_only, anybody
+from swarmctl.mavlink.latch import Address, Greeting, IsVehicle, Latch, admit_only, anybody, silence
 
 _MAX_DATAGRAM = 2048
 _CHUNK = 65536
@@ -80,7 +80,12 @@ def parse_url(url: str) -> Endpoint:
 
 
 def open_transport(
-    url: str, inherited_fd: int | None = None, is_vehicle: IsVehicle = anybody, remote: Address | None = None
+    url: str,
+    inherited_fd: int | None = None,
+    is_vehicle: IsVehicle = anybody,
+    remote: Address | None = None,
+    *,
+    greeting: Greeting = silence,
 ) -> Transport:
     """Open the link that a URL names.
 
@@ -90,6 +95,7 @@ def open_transport(
             take it between the check and the flight.
         is_vehicle: whether a datagram shows that its sender is the vehicle; the first sender of one owns the port.
         remote: known address of the other end of an inherited socket.
+        greeting: what a sender is answered who is not the vehicle, while the port has no owner.
 
     Raises:
         StartError: the port is taken, the host has no address, or the device does not exist.
@@ -98,11 +104,13 @@ def open_transport(
     if endpoint.scheme == "serial":
         return SerialTransport(endpoint.where, endpoint.number)
     if inherited_fd is not None:
-        return UdpTransport(socket.socket(fileno=inherited_fd), remote, is_vehicle)
+        return UdpTransport(socket.socket(fileno=inherited_fd), remote, is_vehicle, greeting)
     if endpoint.scheme == "udpin":
-        return UdpTransport(bind_udp(endpoint.where, endpoint.number), None, is_vehicle)
+        return UdpTransport(bind_udp(endpoint.where, endpoint.number), None, is_vehicle, greeting)
     there = resolve(endpoint.where), endpoint.number
-    return TcpTransport(there) if endpoint.scheme == "tcp" else UdpTransport(bind_towards(there), there, is_vehicle)
+    if endpoint.scheme == "tcp":
+        return TcpTransport(there)
+    return UdpTransport(bind_towards(there), there, is_vehicle, greeting)
 
 
 def resolve(host: str) -> str:
@@ -164,9 +172,16 @@ class UdpTransport:
     knows the arrival time of each sample. One call reads a bounded amount, so that a flood can't stall the tick.
     """
 
-    def __init__(self, sock: socket.socket, remote: Address | None = None, is_vehicle: IsVehicle = anybody) -> None:
+    def __init__(
+        self,
+        sock: socket.socket,
+        remote: Address | None = None,
+        is_vehicle: IsVehicle = anybody,
+        greeting: Greeting = silence,
+    ) -> None:
         self._sock = sock
         self._sock.setblocking(False)
+        self._greeting = greeting
         self.latch = Latch(is_vehicle, remote)
         self._admitted: Address | None = None  # sender that the kernel admits; None: every sender
         self._stamped = sys.platform == "linux"
@@ -202,6 +217,9 @@ class UdpTransport:
             if latch.admits(sender, data):
                 arrived.append(Datagram(self._arrival_us(ancillary, now_us), data))
                 left -= len(data)
+            elif latch.only is None and (greeting := self._greeting(data)):
+                with contextlib.suppress(OSError):
+                    self._sock.sendto(greeting, sender)
             if left < 0:
                 break
         self._admit(latch.only)
@@ -228,7 +246,7 @@ class TcpTransport:
     """A TCP client (ArduPilot listens on 5760) that cuts frames out of the byte stream.
 
     It connects while the tick runs, and again a second after the other end has gone. Frames that do not fit into the
-    socket buffer are dropped whole.
+    socket buffer are dropped whole. One call reads a bounded amount, so that a flood can't stall the tick.
     """
 
     def __init__(self, remote: tuple[str, int]) -> None:
@@ -258,11 +276,13 @@ class TcpTransport:
         if self._sock is None and (self._open_us is None or now_us - self._open_us >= _REOPEN_US):
             self._open(now_us)
         try:
-            while self._sock is not None:
+            left = _BYTES_A_POLL
+            while self._sock is not None and left > 0:
                 data = self._sock.recv(_CHUNK)
                 if not data:
                     self._lose()
                 self._buffer += data
+                left -= len(data)
                 self._received_us = now_us
         except (BlockingIOError, InterruptedError):
             pass  # the socket is empty, or still connecting

@@ -23,7 +23,7 @@ from swarmctl.bus.peers import agent_name
 from swarmctl.check.link_facts import VehicleFacts
 from swarmctl.check.parameters import unchangeable
 from swarmctl.check.scanner import run_scans
-from swarmctl.config import Config, load_recorded
+from swarmctl.config import Config, MavlinkParams, load_recorded
 from swarmctl.errors import StartError
 from swarmctl.files import replaced
 from swarmctl.mavlink.dialects.discovery import DIALECTS
@@ -55,6 +55,7 @@ def bundle(options: BundleOptions) -> Path:
         StartError: the archive can't be written.
     """
     config, folder = load_recorded(options.folder), options.folder.resolve()
+    config = config.model_copy(update={"mavlink": MavlinkParams()})  # what a received folder names is not read
     output = options.output or folder.with_name(f"{folder.name}.zip")
     ended_cleanly = StopRequest(signal.SIGTERM, signal.SIGHUP, raise_at=1)
     try:

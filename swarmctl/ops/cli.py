@@ -20,6 +20,7 @@ from swarmctl.core.text import printable_lines
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, ConfigError, SwarmError
 from swarmctl.ops.verbs.configuration import config_app
 from swarmctl.ops.verbs.folders import add_folder_verbs
+from swarmctl.ops.verbs.keys import keys_app
 from swarmctl.ops.verbs.obstacles import obstacle_app
 from swarmctl.ops.verbs.orders import Run, add_order_verbs
 
@@ -36,6 +37,7 @@ app = typer.Typer(
 )
 app.add_typer(obstacle_app, name="obstacle")
 app.add_typer(config_app, name="config")
+app.add_typer(keys_app, name="keys")
 
 ConfigPath = Annotated[Path | None, typer.Argument(help="TOML file; default: the circle of the thesis.")]
 Agents = Annotated[int | None, typer.Option("--agents", help="Number of agents; overrides swarm.agents.")]

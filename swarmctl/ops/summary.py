@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from swarmctl.config import Config, load_recorded
 from swarmctl.core.text import printable
+from swarmctl.mavlink.signing.refusals import HARMLESS
 from swarmctl.ops.supervisor import LaunchResult
 from swarmctl.telemetry.evaluation.referee import SUMMED_ERROR
 
@@ -118,10 +119,16 @@ def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...
         f"tick p50/p99/max {_ms(tick)} ms, solve p50/p99/max {_ms(solve)} ms",
         f"solver {_count(solver, 'name')}, failed {_count(solver, 'failed')}; "
         f"plan staleness p50/p99 {_ms(age, ('p50', 'p99'))} ms, {rejected} messages refused"
+        + _refused_frames(comms)
         + _unresponsive(comms)
         + _deadlocks(summary),
         f"run folder {directory}",
     )
+
+
+def _refused_frames(comms: Mapping[str, Any]) -> str:
+    count = sum(n for reason, n in _section(comms, "refused_frames").items() if reason not in HARMLESS)
+    return f", {count} MAVLink frames refused" if count else ""
 
 
 def _unresponsive(comms: Mapping[str, Any]) -> str:

@@ -9,7 +9,7 @@ import contextlib
 import shutil
 import tempfile
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -18,13 +18,18 @@ from swarmctl.check.link_facts import VehicleFacts
 from swarmctl.check.listener import NOWHERE, Address, Listener, UdpListener, open_listener
 from swarmctl.check.parameters import names_to_read
 from swarmctl.check.scan_facts import facts_of, unreached
-from swarmctl.check.scanner import VehicleScan
+from swarmctl.check.scanner import SCANNER_COMPID, VehicleScan
+from swarmctl.check.signed_listener import SignedListener
 from swarmctl.config import Config
 from swarmctl.core.types import GeoOrigin
 from swarmctl.errors import StartError
+from swarmctl.mavlink.signing.channel import CHECK_LINK, SigningChannel
+from swarmctl.mavlink.signing.recognition import SignedRecognition
+from swarmctl.mavlink.signing.stamp_file import kept_channel
 from swarmctl.ops.preflight import claim_ports
 from swarmctl.ops.processes import Child, RunContext, end_all, run_name, sitl_command
-from swarmctl.wall_clock import monotonic_us
+from swarmctl.signing_keys import read_keys
+from swarmctl.wall_clock import WallClock, monotonic_us
 
 _SIMULATOR_S = 20.0  # to start on a busy machine
 _PATIENCE_S = 3.0  # for a vehicle that is not ready yet
@@ -85,15 +90,32 @@ class VehicleLinks:
 @contextlib.contextmanager
 def open_links(config: Config, connect_s: float) -> Iterator[VehicleLinks]:
     """Open the links, with `connect_s` as the time to wait for a heartbeat, and close them afterwards."""
-    if config.sitl.enabled:
-        with _simulator(config) as opened:
-            yield opened
-        return
+    keys = read_keys(config.mavlink.signing_keys, config.swarm.agents)
+    with contextlib.ExitStack() as kept:
+        clock = WallClock()
+        channels = [
+            None if key is None else kept.enter_context(kept_channel(key, CHECK_LINK, clock.utc_us)) for key in keys
+        ]
+        opened = kept.enter_context(_simulator(config) if config.sitl.enabled else _vehicles(config, connect_s))
+        links = zip(opened.links, channels, config.sysids(), strict=True)
+        yield replace(opened, links=[_signed(link, channel, sysid, clock) for link, channel, sysid in links])
+
+
+@contextlib.contextmanager
+def _vehicles(config: Config, connect_s: float) -> Iterator[VehicleLinks]:
     links = [_open(vehicle.url) for vehicle in config.vehicles[: config.swarm.agents]]
     try:
         yield VehicleLinks(links, connect_s)
     finally:
         _close(links)
+
+
+def _signed(link: Link, channel: SigningChannel | None, sysid: int, clock: WallClock) -> Link:
+    """Return a link whose frames are signed and verified where there is a key."""
+    if channel is None or link.listener is None:
+        return link
+    vehicle = SignedRecognition(channel, sysid, SCANNER_COMPID, clock.utc_us)
+    return replace(link, listener=SignedListener(link.listener, channel, vehicle))
 
 
 def _open(url: str) -> Link:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -22,6 +23,8 @@ from swarmctl.config import load
 from swarmctl.errors import StartError
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.framing import frames
+from swarmctl.mavlink.signing.key_file import write_new_key
+from swarmctl.ops.key_install import install
 from swarmctl.ops.vehicle_check import CheckOptions, check
 from tests.benches.free_ports import free_ports
 
@@ -312,3 +315,31 @@ def test_a_json_file_that_can_not_be_written_is_refused(tmp_path: Path) -> None:
     path.write_text(f'[swarm]\nagents=1\n[sitl]\nenabled=false\n[[vehicles]]\nsysid=1\nurl="{url}"\n')
     with pytest.raises(StartError, match="can't be written"):
         check(load(path), CheckOptions(json=tmp_path / "nowhere" / "check.json", connect_s=0.1))
+
+
+def test_a_vehicle_is_given_a_key_and_from_then_on_checked_and_set_over_signed_frames_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """MAVSDK, which can't sign, sets the parameters: its frames are signed on the way, and the answers verified."""
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    write_new_key(tmp_path / "0.key")
+    simulator = Simulator(1)
+    try:
+        simulator.wait_until_up()
+        path = tmp_path / "swarm.toml"
+        path.write_text(
+            '[sitl]\nenabled = false\n[mavlink]\nsigning_keys = ["0.key"]\n[swarm]\nagents = 1\n'
+            f'[[vehicles]]\nsysid = 1\nurl = "udpin://127.0.0.1:{simulator.ports[0]}"\n'
+        )
+        config = load(path)
+        assert check(config, CheckOptions(seconds=QUICK_S, connect_s=2.0)) == 3, "it does not sign yet"
+        assert "frames are refused" in capsys.readouterr().out
+        assert install(config, ()) == 0
+        check(config, CheckOptions(apply=True, seconds=QUICK_S, connect_s=10.0))
+        said = capsys.readouterr().out
+        assert "COM_OF_LOSS_T: 1 -> 0.5" in said
+        assert re.search(r"agent-0\s+signing\s+signed\s", said)
+        check(load(path, ["mavlink.signing_keys=[]"]), CheckOptions(seconds=QUICK_S, connect_s=2.0))
+        assert "it answers neither TIMESYNC nor PING" in capsys.readouterr().out, "without the key it takes nothing"
+    finally:
+        simulator.stop()

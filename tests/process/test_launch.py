@@ -25,6 +25,8 @@ import pytest
 
 from swarmctl.config import load
 from swarmctl.core.types import Phase
+from swarmctl.mavlink.signing.key_file import write_new_key
+from swarmctl.mavlink.signing.refusals import OLD, REPLAYED
 from swarmctl.ops.cli import main
 from swarmctl.ops.processes import wants_realtime
 from swarmctl.process_priority import is_realtime_permitted
@@ -52,7 +54,7 @@ class Launched:
     def __init__(self, run_dir: Path, temp: Path, *arguments: str) -> None:
         self.run_dir = run_dir
         self.temp = temp
-        self.env = {**os.environ, "TMPDIR": str(temp), "XDG_RUNTIME_DIR": ""}
+        self.env = {**os.environ, "TMPDIR": str(temp), "XDG_RUNTIME_DIR": "", "XDG_STATE_HOME": str(temp / "state")}
         self.env.pop("DISPLAY", None)
         self.out = run_dir.with_suffix(".out")
         command = [*self.prefix, sys.executable, "-m", "swarmctl", "launch", *arguments, "--run-dir", str(run_dir)]
@@ -184,10 +186,16 @@ def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Start) -> None:
     assert int(received[1]) > 300, "the viewer saw the ticks"
 
 
-def test_a_killed_agent_fails_the_launch_and_the_others_finish(start: Start) -> None:
-    """In guaranteed mode a dead agent is not waited for, and the others still ask each other."""
-    guaranteed = [f"--set={it}" for it in ("telemetry.enabled=false", "separation.mode=guaranteed", "agent.rate_hz=50")]
-    launched = start("--agents", "3", "--duration", "4", *NEAR, *guaranteed)
+def test_a_killed_agent_fails_the_launch_and_the_others_finish(start: Start, tmp_path: Path) -> None:
+    """In guaranteed mode a dead agent is not waited for, and the others still ask each other.
+
+    All links are signed: the agent that lands the vehicle of the dead one goes on from its time stamps.
+    """
+    files = [tmp_path / f"{agent}.key" for agent in range(3)]
+    keys = [write_new_key(path) for path in files]
+    signed = f"mavlink.signing_keys={[str(path) for path in files]}"
+    wanted = ("telemetry.enabled=false", "separation.mode=guaranteed", "agent.rate_hz=50", signed)
+    launched = start("--agents", "3", "--duration", "4", *NEAR, *(f"--set={it}" for it in wanted))
     launched.until_phase("TRACK", 3)
     os.kill(launched.pid_of("agent", "--id", "1"), signal.SIGKILL)
     assert launched.end() == 4, launched.text()
@@ -204,6 +212,13 @@ def test_a_killed_agent_fails_the_launch_and_the_others_finish(start: Start) -> 
     assert summary["separation"]["min_m"] >= 0.8
     assert launched.landed()[0]
     assert launched.landed()[2]
+    assert set(summary["comms"]["refused_frames"]) <= {OLD, REPLAYED}, "of before the vehicle has heard its agent"
+    assert files[0].name in (launched.run_dir / "config.toml").read_text()
+    for path in (launched.temp / "state", launched.run_dir):
+        for file in (found for found in path.rglob("*") if found.is_file()):
+            content = file.read_bytes()
+            assert not any(key.secret in content or key.secret.hex().encode() in content for key in keys), file
+    assert len(list((launched.temp / "state" / "swarmctl" / "signing").iterdir())) == 3
     for agent in ("agent-0", "agent-2"):
         assert 1 in [row["peer"] for row in launched.events("operator", agent)], "the launch has seen it end"
 

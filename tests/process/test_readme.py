@@ -85,7 +85,7 @@ def test_nothing_is_shown_that_is_not_run() -> None:
         + shown(r"^python3 -m venv ")
         + shown(r"^swarmctl (reproduce|bench|check) ")
         + shown(CAMPAIGN)
-        + shown(r"^swarmctl config ")
+        + shown(r"^swarmctl (config|keys) ")
         + shown(r"^swarmctl sweep ")
     )
     assert sorted(run_here) == sorted(SHOWN)
@@ -117,6 +117,16 @@ def test_looking_up_and_beginning_a_configuration(tmp_path: Path) -> None:
     path = tmp_path / "mine.toml"
     assert run(init, "--output", str(path)).returncode == 0
     assert load(path) == load(ROOT / "configs" / "x500_circle.toml")
+
+
+def test_new_keys(tmp_path: Path) -> None:
+    (line,) = shown(r"^swarmctl keys ")
+    *command, alpha, bravo, charlie = shlex.split(line)
+    files = [tmp_path / name for name in (alpha, bravo, charlie)]
+    assert run(shlex.join([*command, *map(str, files)])).returncode == 0
+    assert len({path.read_text() for path in files}) == 3
+    config = load(None, ("swarm.agents=3", f"mavlink.signing_keys={[str(path) for path in files]}"))
+    assert config.mavlink.signing_keys == tuple(map(str, files))
 
 
 def test_a_sweep_has_a_row_for_each_combination_and_charts(tmp_path: Path) -> None:

@@ -14,6 +14,7 @@ from swarmctl.config import _RENAMED, Config, dump, load
 from swarmctl.config_problems import all_keys
 from swarmctl.control.reference.kinds.circle import CircleParams
 from swarmctl.errors import EXIT_USAGE, ConfigError
+from swarmctl.mavlink.signing.key_file import write_new_key
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.toml"))
 
@@ -329,6 +330,30 @@ def test_numbers_survive_exactly(duration_s: float, seed: int) -> None:
     config = load(None, [f"mission.duration_s={duration_s}", f"seed={seed}"])
     assert config.mission.duration_s == duration_s
     assert f"seed = {seed}\n" in dump(config)
+
+
+def test_key_files_are_checked_with_all_other_keys_and_only_their_names_are_kept(tmp_path: Path) -> None:
+    keys = [write_new_key(tmp_path / f"{i}.key") for i in range(3)]
+    path = tmp_path / "swarm.toml"
+    path.write_text('[mavlink]\nsigning_keys = ["0.key", "1.key", "2.key"]\n')
+    config = load(path)
+    assert config.mavlink.signing_keys == tuple(str(tmp_path / f"{i}.key") for i in range(3))
+    assert config.simulator().signing_keys == config.mavlink.signing_keys
+    assert not any(key.secret.hex() in dump(config) for key in keys)
+    elsewhere = tmp_path / "run" / "config.toml"
+    elsewhere.parent.mkdir()
+    elsewhere.write_text(dump(config))
+    assert load(elsewhere) == config
+    (tmp_path / "0.key").chmod(0o640)
+    (tmp_path / "1.key").unlink()
+    with pytest.raises(ConfigError) as refused:
+        load(path, ["limits.min_separation_m=5"])
+    said = "\n".join(refused.value.problems)
+    assert len(refused.value.problems) == 3
+    for word in ("mavlink.signing_keys.0", "has mode 0640", "mavlink.signing_keys.1", "No such file", "limits.min"):
+        assert word in said
+    assert load(path, only_agent=2) == config, "the companion of one vehicle has its key alone"
+    assert load(None, ["mavlink.signing_keys=[]"]).simulator().signing_keys == ()
 
 
 def test_start_line_is_centred_and_spaced() -> None:

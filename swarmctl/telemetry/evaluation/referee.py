@@ -330,32 +330,41 @@ def _solver(ticks: Mapping[int, NDArray[np.void]], name: str) -> dict[str, Any]:
 
 
 def _comms(run: RunData, time_field: str) -> dict[str, Any]:
-    """Summarise plan staleness, messages sent and refused (last `bus_summary` of each agent), unresponsive peers."""
+    """Summarise plan staleness, messages sent, messages and MAVLink frames refused, and unresponsive peers."""
     ages = _percentiles([flight_rows(rows)["plan_staleness_ms"] for rows in run.ticks.values()])
-    last = {event.get("source"): event for event in run.events if event.get("event") == "bus_summary"}
-    rejected: Counter[str] = Counter()
-    for event in last.values():
-        reasons = event.get("rejected")
-        if isinstance(reasons, dict):
-            rejected.update({str(reason): int(n) for reason, n in reasons.items() if finite(n) is not None})
     return {
         "path_age_ms": {"p50": ages["p50"], "p99": ages["p99"]},
-        "sent": _sent(last.values()),
-        "rejected": dict(sorted(rejected.items())),
+        "sent": _sent(run.events),
+        "rejected": _refused(run.events, "bus_summary", "rejected"),
+        "refused_frames": _refused(run.events, "link_summary", "refused"),
         "unresponsive": unresponsive(run.events, time_field),
     }
 
 
-def _sent(summaries: Iterable[Mapping[str, Any]]) -> dict[str, dict[str, int]]:
-    """Return messages and bytes by topic, of all agents together."""
+def _last_of_each_source(events: Sequence[Mapping[str, Any]], name: str) -> Iterable[Mapping[str, Any]]:
+    return {event.get("source"): event for event in events if event.get("event") == name}.values()
+
+
+def _sent(events: Sequence[Mapping[str, Any]]) -> dict[str, dict[str, int]]:
+    """Add up messages and bytes by topic in the last summary of each agent."""
     total: dict[str, Counter[str]] = {}
-    for summary in summaries:
+    for summary in _last_of_each_source(events, "bus_summary"):
         topics = summary.get("sent")
         for topic, counts in topics.items() if isinstance(topics, dict) else ():
             if isinstance(counts, dict):
                 found = {key: int(counts[key]) for key in ("messages", "bytes") if finite(counts.get(key)) is not None}
                 total.setdefault(str(topic), Counter()).update(found)
     return {topic: dict(counts) for topic, counts in sorted(total.items())}
+
+
+def _refused(events: Sequence[Mapping[str, Any]], name: str, field: str) -> dict[str, int]:
+    """Add up the counts by reason in the last event of a name from each source."""
+    refused: Counter[str] = Counter()
+    for event in _last_of_each_source(events, name):
+        reasons = event.get(field)
+        if isinstance(reasons, dict):
+            refused.update({str(reason): int(n) for reason, n in reasons.items() if finite(n) is not None})
+    return dict(sorted(refused.items()))
 
 
 def _deadlocks(events: Sequence[Mapping[str, Any]]) -> dict[str, Any]:

@@ -97,6 +97,8 @@ def test_a_vehicle_never_seen_is_a_start_error_and_a_lost_one_a_mission_error() 
     _check_vehicle_silence(15_000_000, True, config, "udpin://x")
     with pytest.raises(MissionError, match="udpin://x"):
         _check_vehicle_silence(15_000_001, True, config, "udpin://x")
+    with pytest.raises(StartError, match="frames refused: 3 unsigned;"):
+        _check_vehicle_silence(5_000_001, False, config, "udpin://x", {"unsigned": 3})
 
 
 @pytest.mark.parametrize("signum", [signal.SIGTERM, signal.SIGINT, signal.SIGHUP])

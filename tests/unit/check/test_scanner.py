@@ -41,6 +41,8 @@ STEP_US = 10_000
 class ScriptedListener:
     """A link whose other end is a function: frames sent to it are answered by what it returns."""
 
+    refused = None
+
     def __init__(self) -> None:
         self.dropped = 0
         self.inbox: list[ReceivedDatagram] = []

@@ -235,6 +235,30 @@ def test_a_state_that_is_not_finite_is_refused_and_counted(field: str, axis: int
     assert bench.own_codec.refused["state not finite"] == 1
 
 
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize(("field", "most"), [("pos", 1e5), ("vel", 500.0), ("rate", 200.0)])
+def test_a_state_that_is_no_quadrotors_is_refused(field: str, most: float, axis: int) -> None:
+    bench = Bench().ready()
+    for stamp_us, value in ((1_000_000, 0.0), (2_000_000, -1.001 * most), (3_000_000, 1e30)):
+        values = [0.0, 0.0, 0.0]
+        values[axis] = value
+        bench.say(odometry(stamp_us, **{field: tuple(values)}))  # type: ignore[arg-type]
+    state = bench.poll()
+    assert max(map(abs, (*state.pos_ned_m, *state.vel_ned_m_s, *state.rate_frd_rad_s))) < 0.1
+    assert bench.own_codec.refused["state not plausible"] == 2
+
+
+def test_parameters_of_made_up_names_fill_no_memory() -> None:
+    bench = Bench().ready()
+    for number in range(5100):
+        bench.say(dialect.MAVLink_param_value_message(f"P{number}".encode(), 1.0, 9, 1, 0))
+    bench.say(dialect.MAVLink_param_value_message(b"P7", 2.0, 9, 1, 0))
+    bench.poll()
+    assert len(bench.pilot.params) == 5000
+    assert bench.pilot.params["P7"] == 2.0, "a known one still changes"
+    assert bench.own_codec.refused["too many parameters"] == 100
+
+
 @pytest.mark.parametrize("q", [(0.0, 0.0, 0.0, 0.0), (0.5, 0.0, 0.0, 0.0), (2.0, 0.0, 0.0, 0.0)])
 def test_an_attitude_far_from_unit_length_is_refused(q: tuple[float, ...]) -> None:
     bench = Bench().ready()

@@ -8,6 +8,7 @@ import socket
 import time
 import tty
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 
@@ -420,6 +421,31 @@ def test_tcp_into_a_full_buffer_drops_whole_frames() -> None:
     assert set(got) <= {*sent, frame(b"last")}, "none was torn"
     link.close()
     server.close()
+
+
+def test_tcp_reads_a_bounded_amount_at_once_so_that_a_flood_does_not_stall_the_tick() -> None:
+    link = tcp_link(1)
+
+    class Flood:
+        """A connection whose other end never stops sending."""
+
+        reads = 0
+
+        def recv(self, size: int) -> bytes:
+            self.reads += 1
+            assert self.reads < 1000, "it is read without end"
+            return frame(b"x" * 200) * (size // 212)
+
+        def close(self) -> None:
+            return
+
+    flood: Any = Flood()
+    link._sock = flood
+    got = link.receive(0)
+    assert 500 < len(got) < 2000
+    assert len(link._buffer) < 300, "what was read is cut, and none of it kept"
+    assert link.receive(1), "the next call goes on"
+    link.close()
 
 
 def test_pipe_delays_by_its_latency_in_both_directions() -> None:

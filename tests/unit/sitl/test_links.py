@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import math
 import socket
+from pathlib import Path
+from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import development as mav
 
+from sitl.fault_socket import ControlSocket
 from sitl.net.ports import OpenPort
+from sitl.net.tcp import serve_tcp
 from sitl.px4.modes import Px4Mode, Result
 from sitl.px4.parameters import REAL32
 from swarmctl.mavlink.transport import bind_udp
+from tests.benches.free_ports import free_ports
 from tests.benches.px4_bench import COARSE, SPAWN_NED_M, Bench
 
 BEAT, ACK, TEXT, VALUE = 0, 77, 253, 22
@@ -83,6 +88,45 @@ def test_an_open_port_receives_from_every_sender_and_answers_the_first() -> None
     port.close()
     for sock in (nobody, first, second):
         sock.close()
+
+
+class Flood:
+    """A socket whose other end never stops sending."""
+
+    def __init__(self, data: bytes = b"x") -> None:
+        self.data, self.reads = data, 0
+
+    def recvfrom(self, size: int) -> tuple[bytes, tuple[str, int]]:
+        return self.recv(size), ("127.0.0.1", 9)
+
+    def recv(self, size: int) -> bytes:
+        self.reads += 1
+        assert self.reads < 5000, "it is read without end"
+        return self.data
+
+    def sendto(self, data: bytes, to: object) -> None:
+        return
+
+    def close(self) -> None:
+        return
+
+
+def test_a_flood_does_not_stop_the_simulation(tmp_path: Path) -> None:
+    flood: Any = Flood()
+    port = OpenPort(bind_udp("127.0.0.1", 0), ("127.0.0.1", 9))
+    port._sock.close()
+    port._sock = flood
+    assert 100 < len(port.receive(0)) < 1000
+    assert port.receive(1), "the rest is taken by the next"
+    [server] = serve_tcp("127.0.0.1", free_ports(1)[0], 1)
+    server._client = Flood(b"x" * 4096)  # type: ignore[assignment]
+    server.receive(0)
+    server.close()
+    control = ControlSocket(tmp_path / "control.sock")
+    control._socket.close()
+    control._socket = Flood(b"no request")  # type: ignore[assignment]
+    control.poll(Bench().world)
+    control.close()
 
 
 def test_a_closed_peer_does_not_stop_a_port() -> None:

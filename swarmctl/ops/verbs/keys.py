@@ -1,0 +1,49 @@
+"""The verbs of `swarmctl keys`, which make signing keys and give them to vehicles; heavy modules load inside them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from swarmctl.errors import EXIT_OK, ConfigError
+
+keys_app = typer.Typer(
+    no_args_is_help=True, rich_markup_mode=None, help="Make MAVLink signing keys and give them to vehicles."
+)
+
+
+@keys_app.command("new")
+def keys_new(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Files to create, one for each vehicle.")],
+) -> int:
+    """Write new random keys, each to a new file that only you can read."""
+    from swarmctl.mavlink.signing.key_file import write_new_key
+
+    problems = []
+    for path in files:
+        try:
+            print(f"{path}: key {write_new_key(path).fingerprint}")
+        except OSError as error:
+            problems.append(f"{path}: {error.strerror}")
+    if problems:
+        raise ConfigError("keys new", problems)
+    return EXIT_OK
+
+
+@keys_app.command("install")
+def keys_install(
+    config: Annotated[Path, typer.Argument(help="Configuration with mavlink.signing_keys and vehicles.")],
+    old: Annotated[
+        list[Path] | None, typer.Option("--old", metavar="FILE", help="Key that a vehicle has now; repeatable.")
+    ] = None,
+    sets: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a configuration key; repeatable.")
+    ] = None,
+) -> int:
+    """Give every disarmed vehicle its key, in clear text: over a cable or a network that nobody else is on."""
+    from swarmctl.config import load
+    from swarmctl.ops.key_install import install
+
+    return install(load(config, sets or ()), old or ())

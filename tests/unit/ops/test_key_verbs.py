@@ -1,0 +1,67 @@
+"""`swarmctl keys`: new keys in private files, and what is refused before any vehicle is spoken to."""
+
+from __future__ import annotations
+
+import stat
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from swarmctl.mavlink.signing.key_file import read_key
+from swarmctl.ops import cli
+
+Run = Callable[..., int]
+VEHICLE = '[sitl]\nenabled = false\n[swarm]\nagents = 1\n[[vehicles]]\nsysid = 1\nurl = "udpin://127.0.0.1:9"\n'
+
+
+@pytest.fixture
+def run(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Run:
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+
+    def runner(*arguments: str) -> int:
+        monkeypatch.setattr(sys, "argv", ["swarmctl", *arguments])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        return int(ended.value.code or 0)
+
+    return runner
+
+
+def test_new_keys_are_named_by_their_fingerprints_alone(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    files = [tmp_path / "0.key", tmp_path / "1.key"]
+    assert run("keys", "new", *map(str, files)) == 0
+    keys = [read_key(path) for path in files]
+    said = capsys.readouterr().out
+    assert said.splitlines() == [f"{path}: key {key.fingerprint}" for path, key in zip(files, keys, strict=True)]
+    assert not any(key.secret.hex() in said for key in keys)
+    assert all(stat.S_IMODE(path.stat().st_mode) == 0o600 for path in files)
+    assert run("keys", "new", str(files[0]), str(tmp_path / "2.key"), str(tmp_path / "no" / "folder")) == 2
+    refused = capsys.readouterr().err
+    assert "0.key: File exists" in refused
+    assert "folder: No such file" in refused, "all at once"
+    assert read_key(files[0]).secret == keys[0].secret
+    assert (tmp_path / "2.key").exists()
+
+
+def test_installing_without_keys_vehicles_or_a_readable_old_key_is_refused(
+    run: Run, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = tmp_path / "swarm.toml"
+    config.write_text(VEHICLE)
+    assert run("keys", "install", str(config)) == 2
+    assert "swarmctl keys new" in capsys.readouterr().err
+    assert run("keys", "new", str(tmp_path / "0.key")) == 0
+    config.write_text(VEHICLE + '[mavlink]\nsigning_keys = ["0.key"]\n')
+    assert run("keys", "install", str(config), "--old", str(tmp_path / "lost.key")) == 2
+    assert "lost.key" in capsys.readouterr().err
+    config.write_text('[swarm]\nagents = 1\n[mavlink]\nsigning_keys = ["0.key"]\n')
+    assert run("keys", "install", str(config)) == 2
+    assert "built-in simulator" in capsys.readouterr().err
+    (tmp_path / "0.key").chmod(0o644)
+    config.write_text(VEHICLE + '[mavlink]\nsigning_keys = ["0.key"]\n')
+    assert run("keys", "install", str(config)) == 2
+    assert "has mode 0644" in capsys.readouterr().err
