@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import asdict, replace
 
@@ -14,7 +15,13 @@ from swarmctl.bus.peers import Bus, agent_name
 from swarmctl.control.collision.separation import KeepOut, SeparationParams
 from swarmctl.control.commit.membership import Membership
 from swarmctl.control.commit.protocol import CommitCounts, Commitments, acknowledgements
-from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference, Situation, TrajectoryPlanner
+from swarmctl.control.commit.trajectory_planner import (
+    CommitParams,
+    DesiredReference,
+    Situation,
+    TrajectoryPlanner,
+    slowed,
+)
 from swarmctl.control.commit.tube import Grip, Tube
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.swarm_mpc import MpcParams
@@ -98,6 +105,11 @@ class Coordination:
         """Return the counts of proposals so far."""
         return self._commitments.counts
 
+    @property
+    def worst_tracking_m(self) -> float:
+        """Return how far the vehicle has been off what it had committed to, at most."""
+        return self._tube.worst_m
+
     def receive(self, utc_us: int) -> None:
         """Apply rule 1: take in every message that has arrived, and what it says about silent peers."""
         for sender, payload in self._bus.receive(topics.TRAJECTORY):
@@ -131,16 +143,17 @@ class Coordination:
         if not self._is_committed:
             self._is_committed, self._begun_us = True, utc_us
             commitments.begin(state.pos_ned_m, state.vel_ned_m_s, utc_us)
-        self._stepped_us = utc_us
-        self._watch(utc_us, state)
+        since_us, self._stepped_us = utc_us - self._stepped_us, utc_us
+        self._watch(utc_us, since_us, state)
         known, required = self._peer_trajectories.newest, self._required_peers()
         self.cut_off = self._why_cut_off(utc_us, required)
         commitments.update(utc_us, known, required)
         taking_part = self._taking_part(utc_us, known, required)
+        begin_us = utc_us + commitments.lead_us
         now = Situation(
             utc_us=utc_us,
             begin_us=utc_us,
-            desired=desired,
+            desired=self._paced(desired, begin_us),
             peers={agent: known[agent] for agent in taking_part},
             others=self._others(utc_us, state, phase, taking_part),
             disturbance_ned_m_s2=disturbance_ned_m_s2,
@@ -149,7 +162,6 @@ class Coordination:
         unsure = {a for a in required if self._world_model.clocks.error_us(a) > self._clock_error_max_us}
         self.alert = self._why_slow(unsure)
         if commitments.is_due(utc_us) and self._grip < Grip.STOPPED and not unsure:
-            begin_us = utc_us + commitments.lead_us
             others = self._others(begin_us, state, phase, taking_part)
             commitments.propose(replace(now, begin_us=begin_us, peers=known, others=others))
 
@@ -183,13 +195,13 @@ class Coordination:
         if self._is_committed:
             self._is_committed = False
             self.committed_peers, self.lost_peer_keep_outs, self.cut_off, self.alert = {}, [], "", ""
-            self._note("commitments", **asdict(self.counts), worst_tracking_m=self._tube.worst_m)
+            self._note("commitments", **asdict(self.counts), worst_tracking_m=self.worst_tracking_m)
         self._commitments.end(None if state is None else state.pos_ned_m, utc_us)
 
     def sample_committed(self, t_utc_us: Times) -> tuple[Array, Array]:
-        """Return committed positions and velocities, (M, 3) NED each, at times (M,)."""
-        assert self._commitments.committed is not None
-        return self._commitments.committed.sample(t_utc_us)
+        """Return the positions and velocities, (M, 3) NED each, to fly at times (M,)."""
+        assert self._commitments.flown is not None
+        return self._commitments.flown.sample(t_utc_us)
 
     def publish(self, utc_us: int) -> None:
         """Apply rule 5: publish the own message, once there is a committed trajectory."""
@@ -217,12 +229,24 @@ class Coordination:
         """Return by how much the own tube is wider than distances leave room for."""
         return self._tube.radius_m - self._tube_m
 
-    def _watch(self, utc_us: int, state: VehicleState) -> None:
+    def _paced(self, desired: DesiredReference, begin_us: int) -> DesiredReference:
+        """Return the desired motion, or a slower one from where the next plan begins while the tube is left far."""
+        if self._tube.pace_01 == 1.0:
+            return desired
+        assert self._commitments.flown is not None
+        return slowed(desired, np.array(self._commitments.flown.at(begin_us)[0]), self._tube.pace_01)
+
+    def _watch(self, utc_us: int, since_us: int, state: VehicleState) -> None:
         """Commit anew, from the measured state, when the commitment is lost; report how well it is held."""
-        pos, vel = (sampled[0] for sampled in self.sample_committed(np.array([utc_us])))
+        commitments = self._commitments
+        commitments.wait_for(state.pos_ned_m, utc_us, since_us, self._tube_m)
+        assert commitments.committed is not None and commitments.flown is not None
+        pos, vel = map(np.array, commitments.committed.at(utc_us))
         error_m = float(np.linalg.norm(state.pos_ned_m - pos))
-        if self._tube.update(utc_us, error_m, float(np.linalg.norm(state.vel_ned_m_s - vel))):
-            self._commitments.restart(state.pos_ned_m, state.vel_ned_m_s, utc_us)
+        error_m_s = float(np.linalg.norm(state.vel_ned_m_s - vel))
+        late_m = math.dist(pos, commitments.flown.at(utc_us)[0])
+        if self._tube.update(utc_us, error_m, error_m_s, late_m):
+            commitments.restart(state.pos_ned_m, state.vel_ned_m_s, utc_us)
         before, self._grip = self._grip, self._tube.grip(utc_us)
         if self._grip is not before:
             is_off, grip = self._grip is not Grip.HELD, self._grip.name

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate
 from typing import Any
 
@@ -114,6 +114,11 @@ def ending_at_rest(
         pos_ned_m=np.vstack([pos_ned_m, pos]),
         vel_ned_m_s=np.vstack([vel_ned_m_s, vel]),
     )
+
+
+def delayed(trajectory: Trajectory, by_us: int) -> Trajectory:
+    """Return the same motion, so much later; the same object for 0."""
+    return replace(trajectory, t0_utc_us=trajectory.t0_utc_us + by_us) if by_us else trajectory
 
 
 def joined(first: Trajectory, then: Trajectory, from_utc_us: int) -> Trajectory:

@@ -14,6 +14,7 @@ from sitl.studies.campaign.events import Freeze, ScenarioEvent, Split
 from sitl.studies.campaign.flight import TrialFlight
 from sitl.studies.campaign.scenarios import layout_of
 from sitl.studies.campaign.trials import Cell, Trial
+from swarmctl.agent import coordination
 from swarmctl.agent.coordination import Coordination
 from swarmctl.agent.separation_policy import Guaranteed
 from swarmctl.bus.peer_clocks import PeerClocks
@@ -22,9 +23,11 @@ from swarmctl.config import load
 from swarmctl.control.collision.barrier import Barrier, BarrierParams, Body
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.commit import trajectory_planner
+from swarmctl.control.commit.protocol import Commitments
 from swarmctl.control.mpc.problem import Start
 from swarmctl.core.clock import ClockError
 from swarmctl.core.types import Array, Phase
+from tests.closed_loop.conftest import ROOT
 
 COMMITTED_M = 0.8
 TOUCH_M = 0.48
@@ -218,6 +221,60 @@ def test_the_others_go_on_without_a_frozen_agent_once_they_agree() -> None:
     excluded = [e for e in events(flight, "membership") if e["excluded"]]
     assert {e["source"] for e in excluded} == {agent_name(i) for i in range(3)}
     assert all(e["excluded"] == [3] for e in excluded)
+
+
+class HeldUp:
+    """One x500 on a circle at 2.5 m/s whose world stands still for a while, again and again, while time goes on.
+
+    So it is with simulators, and with an agent, that get too little of a processor: for 1.4 s the world gets 70 % of
+    the time, in pieces, and the agent executes every other tick.
+    """
+
+    BEGINS_S, LASTS_S, AFTERWARDS_S = 3.0, 1.4, 1.0
+
+    def __init__(self) -> None:
+        sets = ["swarm.agents=1", "sitl.start=air", "sitl.estimator=exact", "separation.mode=guaranteed"]
+        self.flight = Lockstep(load(ROOT / "configs" / "x500_circle.toml", sets))
+        self._world_step, self._lost_us, self._began_us = self.flight.world.step, 0, 0
+        self.flight.world.step = self._step  # type: ignore[method-assign]
+
+    def _since_s(self) -> float:
+        return (self.flight.clock.now_us() - self._began_us) * 1e-6 - self.BEGINS_S if self._began_us else -math.inf
+
+    def _step(self, now_us: int) -> None:
+        since_s = self._since_s()
+        if 0.0 < since_s < self.LASTS_S and since_s % 0.233 < 0.07:
+            self._lost_us += 1_000_000 // self.flight.config.sitl.physics_hz
+        else:
+            self._world_step(now_us - self._lost_us)
+
+    def fly(self) -> tuple[float, float]:
+        """Return how far it was off what it had committed to [m], and how fast it was afterwards [m/s]."""
+        flight, fastest_m_s = self.flight, 0.0
+        while (since_s := self._since_s()) < self.LASTS_S + self.AFTERWARDS_S:
+            flight.starved = {0: 2} if 0.0 < since_s < self.LASTS_S else {}
+            flight.step()
+            if not self._began_us and flight.logs[0].rows and flight.logs[0].rows[-1]["phase"][0] == Phase.TRACK:
+                self._began_us = flight.clock.now_us()
+            if since_s > self.LASTS_S:
+                fastest_m_s = max(fastest_m_s, float(np.linalg.norm(flight.world.plant.vel_ned_m_s[:, 0])))
+        (agent,) = flight.agents
+        assert agent is not None and isinstance(agent._separation, Guaranteed)
+        return agent._separation.coordination.worst_tracking_m, fastest_m_s
+
+
+def test_a_vehicle_that_is_held_up_slows_and_does_not_chase_what_it_had_committed_to() -> None:
+    off_m, fastest_m_s = HeldUp().fly()
+    assert off_m < 0.3
+    assert fastest_m_s < 1.5
+
+
+def test_negative_control_commitments_that_go_on_in_time_are_chased(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Commitments, "wait_for", lambda self, *_: None)
+    monkeypatch.setattr(coordination, "slowed", lambda desired, *_: desired)
+    off_m, fastest_m_s = HeldUp().fly()
+    assert off_m > 0.4
+    assert fastest_m_s > 2.3
 
 
 @pytest.mark.parametrize(("body_m", "told"), [(0.48, False), (0.8, True)])

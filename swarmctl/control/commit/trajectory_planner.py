@@ -298,6 +298,16 @@ def following(mpc: MpcParams, params: CommitParams) -> MpcParams:
     return mpc.model_copy(update={"z": params.follow_z, "control_z": max(mpc.control_z, _FOLLOWING_MOVES_Z)})
 
 
+def slowed(desired: DesiredReference, from_ned_m: Array, pace_01: float) -> DesiredReference:
+    """Return a motion between standing at a place (3,), for a pace of 0, and the desired one, for a pace of 1."""
+
+    def reference(offsets_s: Array) -> tuple[Array, Array]:
+        pos, vel = desired.reference(offsets_s)
+        return from_ned_m + pace_01 * (pos - from_ned_m), pace_01 * vel
+
+    return DesiredReference(reference, desired.follows_path)
+
+
 def _with_run_up(desired: DesiredReference, speed_m_s: float) -> DesiredReference:
     """Return the same path, entered at the agent's own speed and accelerated along.
 

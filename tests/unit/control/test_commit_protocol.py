@@ -428,3 +428,50 @@ def test_a_slow_network_lengthens_the_lead_and_a_fast_one_shortens_it_again() ->
     assert before_us < 0.3 * slow_us
     assert slow_us > 450_000
     assert crowd.agents[0].lead_us < 0.5 * slow_us
+
+
+def on_the_way() -> Commitments:
+    """Return an agent that has committed to 1.5 m/s northwards, for 2 s and the braking after them."""
+    agent = committing(0, max_keep_outs=1)
+    points = np.array([[0.15 * k, 0.0, -2.0] for k in range(21)])
+    agent.committed = ending_at_rest(UTC_US, 100_000, points, np.tile([1.5, 0.0, 0.0], (21, 1)), brake_m_s2=1.5)
+    return agent
+
+
+def flown_m(agent: Commitments, utc_us: int) -> float:
+    assert agent.flown is not None
+    return agent.flown.at(utc_us)[0][0]
+
+
+def test_what_is_flown_waits_for_a_vehicle_that_lags_and_is_not_made_up_for() -> None:
+    agent, now_us, north_m = on_the_way(), UTC_US + 400_000, 0.3
+    committed, ahead_m = agent.committed, []
+    for k in range(50):
+        now_us += 20_000
+        north_m += 0.03 * (k >= 20)  # it stands for a while, then flies as fast as it was committed to
+        agent.wait_for(np.array([north_m, 0.0, -2.0]), now_us, 20_000, 0.1)
+        ahead_m.append(flown_m(agent, now_us) - north_m)
+    assert ahead_m[:20] == pytest.approx([0.3] * 20, abs=1e-6), "it stands where it was, and never goes back"
+    assert ahead_m[-1] == pytest.approx(0.1, abs=0.01)
+    assert agent.committed is committed, "peers rely on it"
+
+
+def test_a_vehicle_that_lags_within_what_is_allowed_is_not_waited_for() -> None:
+    agent = on_the_way()
+    agent.wait_for(np.array([0.55, 0.3, -2.0]), UTC_US + 400_000, 20_000, 0.1)
+    assert agent.flown is agent.committed
+
+
+def test_a_late_agent_proposes_from_where_it_is_and_is_on_time_once_that_is_committed() -> None:
+    agent, now_us = on_the_way(), UTC_US + 400_000
+    agent.wait_for(np.array([0.0, 0.0, -2.0]), now_us, 200_000, 0.0)
+    assert flown_m(agent, now_us) == pytest.approx(0.3)
+    begin_us = now_us + agent.lead_us
+    where_m = flown_m(agent, begin_us)
+    agent.propose(builders.situation(utc_us=now_us, begin_us=begin_us, desired=DesiredReference(at_goal)))
+    agent.wait_for(np.array([0.0, 0.0, -2.0]), now_us + 20_000, 20_000, 0.0)
+    agent.update(now_us + 20_000, {}, set())
+    assert agent.counts.committed == 1
+    assert agent.committed is not None
+    assert agent.committed.at(begin_us)[0][0] == pytest.approx(where_m, abs=1e-3)
+    assert flown_m(agent, begin_us) == pytest.approx(where_m - 0.03, abs=2e-3), "20 ms were lost in the meantime"
