@@ -12,6 +12,7 @@ from swarmctl.agent.world_model import WorldModel
 from swarmctl.bus import topics
 from swarmctl.bus.commitment_messages import PeerTrajectories, encode_trajectory_message
 from swarmctl.bus.peers import Bus, agent_name
+from swarmctl.control.collision.encounters import Encounters
 from swarmctl.control.collision.separation import KeepOut, SeparationParams
 from swarmctl.control.commit.membership import Membership
 from swarmctl.control.commit.protocol import CommitCounts, Commitments, acknowledgements
@@ -89,6 +90,7 @@ class Coordination:
         self._tube_m = separation.budget.tube_m
         self._tube = Tube(self._tube_m)
         self._grip = Grip.HELD
+        self._entered_now, self._entered_ahead = Encounters(), Encounters()  # where a plan begins now, or ahead
         self._clock_error_max_us = 1e6 * params.clock_error_max_s
         self._membership = Membership(agent, peers)
         self._ended: frozenset[int] = frozenset()  # peers that take no part any more, by evidence
@@ -155,14 +157,14 @@ class Coordination:
             begin_us=utc_us,
             desired=self._paced(desired, begin_us),
             peers={agent: known[agent] for agent in taking_part},
-            others=self._others(utc_us, state, phase, taking_part),
+            others=self._others(utc_us, state, phase, taking_part, self._entered_now),
             disturbance_ned_m_s2=disturbance_ned_m_s2,
         )
         commitments.evade(now)
         unsure = {a for a in required if self._world_model.clocks.error_us(a) > self._clock_error_max_us}
         self.alert = self._why_slow(unsure)
         if commitments.is_due(utc_us) and self._grip < Grip.STOPPED and not unsure:
-            others = self._others(begin_us, state, phase, taking_part)
+            others = self._others(begin_us, state, phase, taking_part, self._entered_ahead)
             commitments.propose(replace(now, begin_us=begin_us, peers=known, others=others))
 
     def _taking_part(self, utc_us: int, known: Mapping[int, TrajectoryMessage], required: Set[int]) -> set[int]:
@@ -295,15 +297,20 @@ class Coordination:
             for end in ends
         ]
 
-    def _others(self, t0_utc_us: int, state: VehicleState, phase: Phase, taking_part: set[int]) -> list[KeepOut]:
+    def _others(
+        self, t0_utc_us: int, state: VehicleState, phase: Phase, taking_part: set[int], encounters: Encounters
+    ) -> list[KeepOut]:
         """Return keep-outs of obstacles and of peers that do not take part, on the planner's grid from `t0_utc_us` on.
 
         What a stale peer does is unknown, so its hard minimum distance includes all of the margin that grows with age.
+        Those that are too close already say since which distance, so that plan by plan none comes closer.
         """
+        assert self._commitments.flown is not None
         steps, dt_us = self._commitments.steps, self._commitments.dt_us
         found = self._world_model.keep_outs(state.pos_ned_m, t0_utc_us, dt_us, steps, phase=phase, without=taking_part)
         spent_m = self._separation.budget.planned_beyond_hard_min_m
-        return [replace(k, hard_min_distance_m=max(k.hard_min_distance_m, k.radius_m - spent_m)) for k in found]
+        aged = [replace(k, hard_min_distance_m=max(k.hard_min_distance_m, k.radius_m - spent_m)) for k in found]
+        return encounters.noted(aged, np.array(self._commitments.flown.at(t0_utc_us)[0]))
 
 
 def _names(agents: Iterable[int]) -> str:
