@@ -34,8 +34,12 @@ any one of the rules two do. The figures are in docs/safety_case.md.
 
 The proof rests on these assumptions, each of which is watched in flight:
 
-- Clocks agree: an offset of e seconds costs v e metres, which `separation.tracking_m` has to cover. Offsets of peers'
-  clocks are measured on these messages and corrected (`swarmctl.bus.peer_clocks`), to half a round trip.
+- Clocks are known to within an error, which is measured: offsets of peers' clocks are taken from these messages and
+  corrected (`swarmctl.bus.peer_clocks`), and the error that is left, a round trip at most, goes with every trajectory
+  received. From one that is flown at speed v by a clock known to e, rules 2 and 4 keep v e more, and so does the safety
+  filter (`Trajectory.spread_m`): of each pair of trajectories that the proof speaks of, one agent has checked the other
+  one's, with room for all that it does not know of the other's clock. Beyond `agent.commit.clock_error_max_s` nothing
+  new is proposed.
 - Vehicles stay in their tubes: each may miss what it is committed to by half of the committed distance beyond touching
   bodies. `swarmctl.control.commit.tube` watches it; the event `tracking_violation` reports who leaves its tube, and
   `commitments` at the end the worst error of the flight. A vehicle that lags does not chase its commitment: it is flown
@@ -61,7 +65,7 @@ from typing import Protocol
 import numpy as np
 
 from swarmctl.control.commit.trajectory_planner import CommitParams, Situation
-from swarmctl.core.trajectory import Trajectory, delayed, resting
+from swarmctl.core.trajectory import Trajectory, by_exact_clock, delayed, resting
 from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
 from swarmctl.core.types import Array
 
@@ -199,18 +203,21 @@ class Commitments:
             self._set_lead(_LEAD_FACTOR * float(np.percentile(self._latencies_s, _PERCENTILE)) + _TICK_S)
 
     def conflicting_peers(self, utc_us: int, peers: Mapping[int, TrajectoryMessage]) -> set[int]:
-        """Return peers whose committed trajectory conflicts with the own one, because one of the two had to evade."""
+        """Return peers whose committed trajectory conflicts with the own one, because one of the two had to evade.
+
+        The error of clocks is left aside: who has committed last has left room for it, by what was known then.
+        """
         if self.committed is None:
             return set()
         commitments = {agent: message.committed for agent, message in peers.items() if message.is_committed}
         if self._compatible_with is not self.committed:
             self._compatible, self._compatible_with = {}, self.committed
         new = [t for t in commitments.values() if id(t) not in self._compatible]
-        if new and not self._planner.conflicts(self.committed, utc_us, new):
+        if new and not self._planner.conflicts(self.committed, utc_us, list(map(by_exact_clock, new))):
             self._compatible.update((id(t), t) for t in new)
             new = []
         unsure = {agent: t for agent, t in commitments.items() if any(t is other for other in new)}
-        return {agent for agent, t in unsure.items() if self._planner.conflicts(self.committed, utc_us, [t])}
+        return {a for a, t in unsure.items() if self._planner.conflicts(self.committed, utc_us, [by_exact_clock(t)])}
 
     def evade(self, now: Situation) -> None:
         """Replace the committed trajectory without acknowledgement, where waiting for one would be too late.

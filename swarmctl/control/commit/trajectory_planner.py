@@ -275,18 +275,18 @@ class TrajectoryPlanner:
         if not trajectories:
             return []
         budget = self._separation.budget
-        hard_min_distance_m = budget.committed_m + spare_m
+        spreads_m = [trajectory.spread_m(t0_utc_us) for trajectory in trajectories]
         where = positions_at(trajectories, t0_utc_us + np.arange(steps + 1) * self.dt_us)
         return [
             KeepOut(
                 pos_ned_m=points,
-                radius_m=budget.planned_m,
-                hard_min_distance_m=hard_min_distance_m,
+                radius_m=budget.planned_m + spread_m,
+                hard_min_distance_m=budget.committed_m + spread_m + spare_m,
                 any_height=False,
                 priority_id=agent,
                 downwash=self._separation.downwash,
             )
-            for points, agent in zip(where, agents, strict=True)
+            for points, agent, spread_m in zip(where, agents, spreads_m, strict=True)
         ]
 
 
