@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from dataclasses import asdict, replace
 
@@ -11,10 +12,17 @@ from swarmctl.agent.world_model import WorldModel
 from swarmctl.bus import topics
 from swarmctl.bus.commitment_messages import PeerTrajectories, encode_trajectory_message
 from swarmctl.bus.peers import Bus, agent_name
+from swarmctl.control.collision.encounters import Encounters
 from swarmctl.control.collision.separation import KeepOut, SeparationParams
 from swarmctl.control.commit.membership import Membership
 from swarmctl.control.commit.protocol import CommitCounts, Commitments, acknowledgements
-from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference, Situation, TrajectoryPlanner
+from swarmctl.control.commit.trajectory_planner import (
+    CommitParams,
+    DesiredReference,
+    Situation,
+    TrajectoryPlanner,
+    slowed,
+)
 from swarmctl.control.commit.tube import Grip, Tube
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.swarm_mpc import MpcParams
@@ -91,6 +99,7 @@ class Coordination:
         self._tube_m = separation.budget.tube_m
         self._tube = Tube(self._tube_m)
         self._grip = Grip.HELD
+        self._entered_now, self._entered_ahead = Encounters(), Encounters()  # where a plan begins now, or ahead
         self._clock_error_max_us = 1e6 * params.clock_error_max_s
         self._membership = Membership(agent, peers)
         self._ended: frozenset[int] = frozenset()  # peers that take no part any more, by evidence
@@ -106,6 +115,11 @@ class Coordination:
     def counts(self) -> CommitCounts:
         """Return the counts of proposals so far."""
         return self._commitments.counts
+
+    @property
+    def worst_tracking_m(self) -> float:
+        """Return how far the vehicle has been off what it had committed to, at most."""
+        return self._tube.worst_m
 
     def receive(self, utc_us: int) -> None:
         """Apply rule 1: take in every message that has arrived, and what it says about silent peers."""
@@ -140,26 +154,26 @@ class Coordination:
         if not self._is_committed:
             self._is_committed, self._begun_us = True, utc_us
             commitments.begin(state.pos_ned_m, state.vel_ned_m_s, utc_us)
-        self._stepped_us = utc_us
-        self._watch(utc_us, state)
+        since_us, self._stepped_us = utc_us - self._stepped_us, utc_us
+        self._watch(utc_us, since_us, state)
         known, required = self._peer_trajectories.newest, self._required_peers()
         self.cut_off = self._why_cut_off(utc_us, required)
         commitments.update(utc_us, known, required)
         taking_part = self._taking_part(utc_us, known, required)
+        begin_us = utc_us + commitments.lead_us
         now = Situation(
             utc_us=utc_us,
             begin_us=utc_us,
-            desired=desired,
+            desired=self._paced(desired, begin_us),
             peers={agent: known[agent] for agent in taking_part},
-            others=self._others(utc_us, state, phase, taking_part),
+            others=self._others(utc_us, state, phase, taking_part, self._entered_now),
             disturbance_ned_m_s2=disturbance_ned_m_s2,
         )
         commitments.evade(now)
         unsure = {a for a in required if self._world_model.clocks.error_us(a) > self._clock_error_max_us}
         self.alert = self._why_slow(unsure)
         if commitments.is_due(utc_us) and self._grip < Grip.STOPPED and not unsure:
-            begin_us = utc_us + commitments.lead_us
-            others = self._others(begin_us, state, phase, taking_part)
+            others = self._others(begin_us, state, phase, taking_part, self._entered_ahead)
             commitments.propose(replace(now, begin_us=begin_us, peers=known, others=others))
 
     def _taking_part(self, utc_us: int, known: Mapping[int, TrajectoryMessage], required: Set[int]) -> set[int]:
@@ -192,13 +206,13 @@ class Coordination:
         if self._is_committed:
             self._is_committed = False
             self.committed_peers, self.lost_peer_keep_outs, self.cut_off, self.alert = {}, [], "", ""
-            self._note("commitments", **asdict(self.counts), worst_tracking_m=self._tube.worst_m)
+            self._note("commitments", **asdict(self.counts), worst_tracking_m=self.worst_tracking_m)
         self._commitments.end(None if state is None else state.pos_ned_m, utc_us)
 
     def sample_committed(self, t_utc_us: Times) -> tuple[Array, Array]:
-        """Return committed positions and velocities, (M, 3) NED each, at times (M,)."""
-        assert self._commitments.committed is not None
-        return self._commitments.committed.sample(t_utc_us)
+        """Return the positions and velocities, (M, 3) NED each, to fly at times (M,)."""
+        assert self._commitments.flown is not None
+        return self._commitments.flown.sample(t_utc_us)
 
     def publish(self, utc_us: int) -> None:
         """Apply rule 5: publish the own message, once there is a committed trajectory."""
@@ -226,12 +240,24 @@ class Coordination:
         """Return by how much the own tube is wider than distances leave room for."""
         return self._tube.radius_m - self._tube_m
 
-    def _watch(self, utc_us: int, state: VehicleState) -> None:
+    def _paced(self, desired: DesiredReference, begin_us: int) -> DesiredReference:
+        """Return the desired motion, or a slower one from where the next plan begins while the tube is left far."""
+        if self._tube.pace_01 == 1.0:
+            return desired
+        assert self._commitments.flown is not None
+        return slowed(desired, np.array(self._commitments.flown.at(begin_us)[0]), self._tube.pace_01)
+
+    def _watch(self, utc_us: int, since_us: int, state: VehicleState) -> None:
         """Commit anew, from the measured state, when the commitment is lost; report how well it is held."""
-        pos, vel = (sampled[0] for sampled in self.sample_committed(np.array([utc_us])))
+        commitments = self._commitments
+        commitments.wait_for(state.pos_ned_m, utc_us, since_us, self._tube_m)
+        assert commitments.committed is not None and commitments.flown is not None
+        pos, vel = map(np.array, commitments.committed.at(utc_us))
         error_m = float(np.linalg.norm(state.pos_ned_m - pos))
-        if self._tube.update(utc_us, error_m, float(np.linalg.norm(state.vel_ned_m_s - vel))):
-            self._commitments.restart(state.pos_ned_m, state.vel_ned_m_s, utc_us)
+        error_m_s = float(np.linalg.norm(state.vel_ned_m_s - vel))
+        late_m = math.dist(pos, commitments.flown.at(utc_us)[0])
+        if self._tube.update(utc_us, error_m, error_m_s, late_m):
+            commitments.restart(state.pos_ned_m, state.vel_ned_m_s, utc_us)
         before, self._grip = self._grip, self._tube.grip(utc_us)
         if self._grip is not before:
             is_off, grip = self._grip is not Grip.HELD, self._grip.name
@@ -280,15 +306,20 @@ class Coordination:
             for end in ends
         ]
 
-    def _others(self, t0_utc_us: int, state: VehicleState, phase: Phase, taking_part: set[int]) -> list[KeepOut]:
+    def _others(
+        self, t0_utc_us: int, state: VehicleState, phase: Phase, taking_part: set[int], encounters: Encounters
+    ) -> list[KeepOut]:
         """Return keep-outs of obstacles and of peers that do not take part, on the planner's grid from `t0_utc_us` on.
 
         What a stale peer does is unknown, so its hard minimum distance includes all of the margin that grows with age.
+        Those that are too close already say since which distance, so that plan by plan none comes closer.
         """
+        assert self._commitments.flown is not None
         steps, dt_us = self._commitments.steps, self._commitments.dt_us
         found = self._world_model.keep_outs(state.pos_ned_m, t0_utc_us, dt_us, steps, phase=phase, without=taking_part)
         spent_m = self._separation.budget.planned_beyond_hard_min_m
-        return [replace(k, hard_min_distance_m=max(k.hard_min_distance_m, k.radius_m - spent_m)) for k in found]
+        aged = [replace(k, hard_min_distance_m=max(k.hard_min_distance_m, k.radius_m - spent_m)) for k in found]
+        return encounters.noted(aged, np.array(self._commitments.flown.at(t0_utc_us)[0]))
 
 
 def _names(agents: Iterable[int]) -> str:

@@ -222,10 +222,10 @@ class WorldModel:
         found, committed_apart_m = list[Body](), budget.barrier_m(margin_m)
         for agent, trajectories in committed_peers.items():
             responsibility_01 = 0.5 if self._flies_itself(agent) else 1.0
+            spread_s = 1e-6 * self.clocks.spread_us(agent)
             for pos, vel in (trajectory.at(act_utc_us + ahead_s * 1e6) for trajectory in trajectories):
-                found.append(
-                    Body(pos_ned_m=pos, vel_ned_m_s=vel, apart_m=committed_apart_m, responsibility_01=responsibility_01)
-                )
+                apart_m = committed_apart_m + spread_s * math.hypot(*vel)
+                found.append(Body(pos_ned_m=pos, vel_ned_m_s=vel, apart_m=apart_m, responsibility_01=responsibility_01))
         for path in self.paths.latest():
             if path.agent in committed_peers:
                 continue

@@ -26,6 +26,8 @@ MAX_TUBE_M = 100.0
 MAX_POINTS = 2000
 MAX_STEP_US = 500_000
 MAX_BEGIN_US = 10_000_000  # from now; a trajectory that begins later comes from another clock
+MAX_CLOCK_ERROR_US = 10_000_000  # a clock known less well is known as badly; nothing is committed then
+_BETTER_01 = 0.5  # share of the error of a clock at which trajectories are decoded anew
 MAX_PEERS = 256  # of each kind: acknowledged, heard, suspected, promised
 _MAGIC = b"SI"
 _HEADER = struct.Struct("<2sBBIIIqfHHHH")  # magic version flags agent boot seq sent tube, counts of the four kinds
@@ -69,13 +71,13 @@ def encode_trajectory_message(message: TrajectoryMessage) -> bytes:
 
 
 def decode_trajectory_message(
-    payload: bytes, memory: Memory | None = None, ahead_us: int = 0
+    payload: bytes, memory: Memory | None = None, ahead_us: int = 0, error_us: int = 0
 ) -> TrajectoryMessage | None:
     """Decode one message; None unless magic, version, lengths and all numbers are valid.
 
     `memory` holds the trajectories of the previous message: a trajectory that is repeated becomes the same object, by
     which the protocol knows that it has checked it before. The sender's clock is `ahead_us` ahead of the own one, to
-    which its trajectories are converted; the memory must be of the same correction.
+    which its trajectories are converted, give or take `error_us`; the memory must be of the same correction.
     """
     try:
         magic, version, flags, agent, boot_id, seq, sent_utc_us, tube_m, *counts = _HEADER.unpack_from(payload)
@@ -85,11 +87,12 @@ def decode_trajectory_message(
             return None
         acknowledgements, heard, suspected, promised = counts
         known, sent = memory or {}, Memory()
-        committed, at = _decode_trajectory(payload, _HEADER.size, known, sent, ahead_us=ahead_us)
+        clock = (ahead_us, error_us)
+        committed, at = _decode_trajectory(payload, _HEADER.size, known, sent, clock)
         proposal = None
         if flags & _HAS_PROPOSAL:
             number, made_utc_us = _PROPOSAL.unpack_from(payload, at)
-            trajectory, at = _decode_trajectory(payload, at + _PROPOSAL.size, known, sent, ahead_us=ahead_us)
+            trajectory, at = _decode_trajectory(payload, at + _PROPOSAL.size, known, sent, clock)
             proposal = Proposal(number=number, made_utc_us=made_utc_us, agent=agent, trajectory=trajectory)
         heard_at = at + acknowledgements * _ACKNOWLEDGEMENT.size
         agents_at = heard_at + heard * _HEARD.size
@@ -124,9 +127,14 @@ def _encode_trajectory(trajectory: Trajectory) -> bytes:
 
 
 def _decode_trajectory(
-    payload: bytes, at: int, known: Memory, sent: Memory, *, ahead_us: int
+    payload: bytes, at: int, known: Memory, sent: Memory, clock: tuple[int, int]
 ) -> tuple[Trajectory, int]:
     """Return the trajectory encoded at offset `at`, and the offset of its end.
+
+    Args:
+        payload, at: bytes of a message.
+        known, sent: trajectories of the previous message, and of this one.
+        clock: how far the sender's is ahead, and the error of that [us].
 
     Raises:
         ValueError, struct.error: the bytes are no trajectory.
@@ -143,8 +151,13 @@ def _decode_trajectory(
     points: Array = np.frombuffer(payload, "<f4", 6 * count, at).reshape(count, 6).astype(np.float64)
     if not np.isfinite(points).all():
         raise ValueError("not finite")
+    ahead_us, error_us = clock
     sent[body] = Trajectory(
-        t0_utc_us=t0_utc_us - ahead_us, dt_us=dt_us, pos_ned_m=points[:, :3].copy(), vel_ned_m_s=points[:, 3:].copy()
+        t0_utc_us=t0_utc_us - ahead_us,
+        dt_us=dt_us,
+        pos_ned_m=points[:, :3].copy(),
+        vel_ned_m_s=points[:, 3:].copy(),
+        clock_error_us=error_us,
     )
     return sent[body], end
 
@@ -173,14 +186,17 @@ class PeerTrajectories:
         self._refusals, self._agent, self._clocks = refusals, agent, clocks
         self._numbers = {agent_name(agent): agent for agent in self._verifiers}
         self._memory: dict[str, Memory] = {}
+        self._used_error_us: dict[str, int] = {}  # of the clock of each peer, since its trajectories were decoded anew
         self.newest: dict[int, TrajectoryMessage] = {}
         self.received_utc_us: dict[int, int] = {}  # when the newest message of each peer was accepted
         self.heard_before_flight: set[int] = set()  # peers that did not fly by commitments when first heard
 
     def offer(self, sender: str, payload: bytes, utc_us: int) -> None:
         """Check one message and keep it if it is accepted; the bus guarantees the name `sender`, `utc_us` is now."""
-        memory, ahead_us = dict(self._memory.get(sender, {})), self._clocks.ahead_us(self._numbers.get(sender, -1))
-        message = decode_trajectory_message(payload, memory, ahead_us)
+        number = self._numbers.get(sender, -1)
+        memory, ahead_us = dict(self._memory.get(sender, {})), self._clocks.ahead_us(number)
+        error_us = min(self._clocks.error_us(number), MAX_CLOCK_ERROR_US) if number in self._verifiers else 0
+        message = decode_trajectory_message(payload, memory, ahead_us, error_us)
         if message is None or (reason := self._refusal(sender, message, utc_us)):
             self._refusals.add(sender, TRAJECTORY.name, MALFORMED if message is None else reason, utc_us)
             return
@@ -191,8 +207,12 @@ class PeerTrajectories:
             self.newest[message.agent], self._memory[sender] = message, memory
             self.received_utc_us[message.agent] = utc_us
             self._measure(message, utc_us)
-            if self._clocks.ahead_us(message.agent) != ahead_us:
+            is_better = self._clocks.error_us(message.agent) < _BETTER_01 * self._used_error_us.get(sender, error_us)
+            if self._clocks.ahead_us(message.agent) != ahead_us or is_better:
                 self._memory[sender] = {}
+                self._used_error_us.pop(sender, None)
+            else:
+                self._used_error_us.setdefault(sender, error_us)
 
     def heard(self) -> dict[int, tuple[int, int]]:
         """Return stamp and arrival of the newest message of each peer."""

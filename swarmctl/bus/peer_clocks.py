@@ -17,6 +17,7 @@ from dataclasses import dataclass
 _WINDOW_US = 5_000_000  # bounds of this window and of the one before are kept
 _DRIFT_US = 2_000  # two clocks drift apart by less in two windows: 200 ppm
 _UNKNOWN_US = 1 << 62
+_UNMEASURED_US = 1 << 61  # bounds beyond are none
 _REPORTED_US = 50_000  # corrections that differ by more from the last one reported are
 
 
@@ -86,6 +87,13 @@ class PeerClocks:
         clock = self._clocks[agent]
         low, high = clock.interval_us
         return max(high - clock.ahead_us, clock.ahead_us - low)
+
+    def spread_us(self, agent: int) -> int:
+        """Return the error to leave room for; 0 while the clock is not measured and so taken for equal."""
+        clock = self._clocks.get(agent)
+        if clock is None or max(map(abs, clock.interval_us)) >= _UNMEASURED_US:
+            return 0
+        return self.error_us(agent)
 
     def _narrow(self, agent: int, low_us: int, high_us: int, utc_us: int) -> None:
         clock = self._clocks[agent]

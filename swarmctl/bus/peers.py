@@ -7,11 +7,14 @@ is the bus of lockstep flights.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import NamedTuple, Protocol
+
+import numpy as np
 
 from swarmctl.bus.links import PERFECT, Impairments, Link
 from swarmctl.bus.path_messages import decode_path
@@ -20,7 +23,7 @@ from swarmctl.bus.reachability import Reachability, TokenView
 from swarmctl.bus.refusals import FUTURE, IDENTITY, LATE, MALFORMED, UNKNOWN_PEER, Refusals
 from swarmctl.bus.senders import Presence, ReceivedMessage, SenderVerifier
 from swarmctl.bus.topics import PATH, TOO_LONG, TOPICS, Topic
-from swarmctl.core.types import PredictedPath
+from swarmctl.core.types import MAX_MARGIN_M, PredictedPath
 
 MAX_AGE_US = 2_000_000
 MAX_LEAD_US = 500_000
@@ -108,8 +111,16 @@ class PeerPaths:
             self._newest[path.agent] = path
 
     def _by_own_clock(self, path: PredictedPath | None) -> PredictedPath | None:
-        ahead_us = 0 if path is None or self._clocks is None else self._clocks.ahead_us(path.agent)
-        return path if path is None or not ahead_us else replace(path, t0_utc_us=path.t0_utc_us - ahead_us)
+        """Return the path at times of the own clock, with room for the error that is left of the peer's."""
+        if path is None or self._clocks is None:
+            return path
+        ahead_us, spread_us = self._clocks.ahead_us(path.agent), self._clocks.spread_us(path.agent)
+        if not ahead_us and not spread_us:
+            return path
+        steps_m = np.diff(path.pos_ned_m, axis=0)
+        fastest_m_us = math.sqrt(float(np.einsum("kc,kc->k", steps_m, steps_m).max())) / path.dt_us
+        margin_m = min(MAX_MARGIN_M, path.margin_m + spread_us * fastest_m_us)
+        return replace(path, t0_utc_us=path.t0_utc_us - ahead_us, margin_m=margin_m)
 
     def latest(self) -> tuple[PredictedPath, ...]:
         """Return the newest path of every peer, whatever its age, sorted by agent number."""

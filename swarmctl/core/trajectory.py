@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate
 from typing import Any
 
@@ -27,6 +27,7 @@ class Trajectory:
     dt_us: int
     pos_ned_m: Array  # (K+1, 3)
     vel_ned_m_s: Array  # (K+1, 3); the last is zero
+    clock_error_us: int = 0  # by which it may be flown earlier or later: its sender's clock is known no better
 
     @property
     def end_utc_us(self) -> int:
@@ -62,6 +63,14 @@ class Trajectory:
             pos.append(((a * s + b) * s + dt_s * v0) * s + p0)
             vel.append((3.0 * a * s + 2.0 * b) * s / dt_s + v0)
         return tuple(pos), tuple(vel)
+
+    def spread_m(self, from_utc_us: int) -> float:
+        """Return how far off, at most, the error of the clock may put the vehicle from a time on [m]."""
+        if not self.clock_error_us:
+            return 0.0
+        since = (from_utc_us - self.clock_error_us - self.t0_utc_us) // self.dt_us
+        vel = self.vel_ned_m_s[min(max(0, since), len(self.vel_ned_m_s) - 1) :]
+        return 1e-6 * self.clock_error_us * math.sqrt(float(np.einsum("kc,kc->k", vel, vel).max()))
 
     def acceleration(self, t_utc_us: float) -> Array:
         """Return the acceleration (3,) NED [m/s2] at a time, by central difference of velocities."""
@@ -114,6 +123,16 @@ def ending_at_rest(
         pos_ned_m=np.vstack([pos_ned_m, pos]),
         vel_ned_m_s=np.vstack([vel_ned_m_s, vel]),
     )
+
+
+def by_exact_clock(trajectory: Trajectory) -> Trajectory:
+    """Return the same motion as if the clock of its sender were known exactly; the same object if it is."""
+    return replace(trajectory, clock_error_us=0) if trajectory.clock_error_us else trajectory
+
+
+def delayed(trajectory: Trajectory, by_us: int) -> Trajectory:
+    """Return the same motion, so much later; the same object for 0."""
+    return replace(trajectory, t0_utc_us=trajectory.t0_utc_us + by_us) if by_us else trajectory
 
 
 def joined(first: Trajectory, then: Trajectory, from_utc_us: int) -> Trajectory:

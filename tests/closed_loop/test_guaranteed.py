@@ -14,6 +14,7 @@ from sitl.studies.campaign.events import Freeze, ScenarioEvent, Split
 from sitl.studies.campaign.flight import TrialFlight
 from sitl.studies.campaign.scenarios import layout_of
 from sitl.studies.campaign.trials import Cell, Trial
+from swarmctl.agent import coordination
 from swarmctl.agent.coordination import Coordination
 from swarmctl.agent.separation_policy import Guaranteed
 from swarmctl.bus.peer_clocks import PeerClocks
@@ -22,9 +23,11 @@ from swarmctl.config import load
 from swarmctl.control.collision.barrier import Barrier, BarrierParams, Body
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.commit import trajectory_planner
+from swarmctl.control.commit.protocol import Commitments
 from swarmctl.control.mpc.problem import Start
 from swarmctl.core.clock import ClockError
 from swarmctl.core.types import Array, Phase
+from tests.closed_loop.conftest import ROOT
 
 COMMITTED_M = 0.8
 TOUCH_M = 0.48
@@ -52,14 +55,14 @@ def test_late_and_lost_messages_cost_time_and_no_distance() -> None:
 
 
 @pytest.mark.parametrize(
-    ("traffic_rule", "within_s", "bound_m"),
+    ("traffic_rule", "bound_m"),
     [
-        ("", 11.0, COMMITTED_M),
-        ("agent.commit.right_of_way_rad=0.35 agent.commit.stuck_m=0.1", 14.0, COMMITTED_M - 0.03),
+        ("", COMMITTED_M),
+        ("agent.commit.right_of_way_rad=0.35 agent.commit.stuck_m=0.1", COMMITTED_M - 0.03),
     ],
     ids=["right of way early", "control: only after standing"],
 )
-def test_agents_that_meet_give_way_by_rule_before_all_stand(traffic_rule: str, within_s: float, bound_m: float) -> None:
+def test_agents_that_meet_give_way_by_rule_before_all_stand(traffic_rule: str, bound_m: float) -> None:
     """Late plans that end in stops lock in the middle of a swap, and to get out of that takes as long again."""
     row = flown(
         Cell(
@@ -74,7 +77,7 @@ def test_agents_that_meet_give_way_by_rule_before_all_stand(traffic_rule: str, w
         )
     ).row(None)
     assert row["min_separation_m"] >= bound_m
-    assert (row["flight_time_s"] < within_s) is (traffic_rule == "")
+    assert (row["flight_time_s"] < 11.0) is (traffic_rule == "")
 
 
 def test_agents_fly_around_where_a_lost_peer_was_committed_to_end() -> None:
@@ -220,6 +223,60 @@ def test_the_others_go_on_without_a_frozen_agent_once_they_agree() -> None:
     assert all(e["excluded"] == [3] for e in excluded)
 
 
+class HeldUp:
+    """One x500 on a circle at 2.5 m/s whose world stands still for a while, again and again, while time goes on.
+
+    So it is with simulators, and with an agent, that get too little of a processor: for 1.4 s the world gets 70 % of
+    the time, in pieces, and the agent executes every other tick.
+    """
+
+    BEGINS_S, LASTS_S, AFTERWARDS_S = 3.0, 1.4, 1.0
+
+    def __init__(self) -> None:
+        sets = ["swarm.agents=1", "sitl.start=air", "sitl.estimator=exact", "separation.mode=guaranteed"]
+        self.flight = Lockstep(load(ROOT / "configs" / "x500_circle.toml", sets))
+        self._world_step, self._lost_us, self._began_us = self.flight.world.step, 0, 0
+        self.flight.world.step = self._step  # type: ignore[method-assign]
+
+    def _since_s(self) -> float:
+        return (self.flight.clock.now_us() - self._began_us) * 1e-6 - self.BEGINS_S if self._began_us else -math.inf
+
+    def _step(self, now_us: int) -> None:
+        since_s = self._since_s()
+        if 0.0 < since_s < self.LASTS_S and since_s % 0.233 < 0.07:
+            self._lost_us += 1_000_000 // self.flight.config.sitl.physics_hz
+        else:
+            self._world_step(now_us - self._lost_us)
+
+    def fly(self) -> tuple[float, float]:
+        """Return how far it was off what it had committed to [m], and how fast it was afterwards [m/s]."""
+        flight, fastest_m_s = self.flight, 0.0
+        while (since_s := self._since_s()) < self.LASTS_S + self.AFTERWARDS_S:
+            flight.starved = {0: 2} if 0.0 < since_s < self.LASTS_S else {}
+            flight.step()
+            if not self._began_us and flight.logs[0].rows and flight.logs[0].rows[-1]["phase"][0] == Phase.TRACK:
+                self._began_us = flight.clock.now_us()
+            if since_s > self.LASTS_S:
+                fastest_m_s = max(fastest_m_s, float(np.linalg.norm(flight.world.plant.vel_ned_m_s[:, 0])))
+        (agent,) = flight.agents
+        assert agent is not None and isinstance(agent._separation, Guaranteed)
+        return agent._separation.coordination.worst_tracking_m, fastest_m_s
+
+
+def test_a_vehicle_that_is_held_up_slows_and_does_not_chase_what_it_had_committed_to() -> None:
+    off_m, fastest_m_s = HeldUp().fly()
+    assert off_m < 0.3
+    assert fastest_m_s < 1.5
+
+
+def test_negative_control_commitments_that_go_on_in_time_are_chased(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Commitments, "wait_for", lambda self, *_: None)
+    monkeypatch.setattr(coordination, "slowed", lambda desired, *_: desired)
+    off_m, fastest_m_s = HeldUp().fly()
+    assert off_m > 0.4
+    assert fastest_m_s > 2.3
+
+
 @pytest.mark.parametrize(("body_m", "told"), [(0.48, False), (0.8, True)])
 def test_a_tracking_violation_is_reported(body_m: float, told: bool) -> None:
     """The error may be half of the committed distance beyond touching bodies; the safety filter deflects large ones."""
@@ -276,10 +333,15 @@ def test_a_tick_with_a_stale_state_commits_nothing_and_spends_no_time_on_it() ->
 def test_the_safety_filter_places_peers_on_their_committed_trajectories(
     mode: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A commitment holds however old its message is; control: a path's margin grows with the age the bus gives it."""
+    """A commitment holds however old its message is, but for the error of the clock, which is a round trip at most.
+
+    Control: a path's margin grows with the age the bus gives it.
+    """
     flight = Lockstep(load(None, ["swarm.agents=2", "sitl.start=air", f"separation.mode={mode}", "bus.delay_ms=60"]))
     seen_m: list[float] = []
     filtered = Barrier.filtered
+
+    round_trip_s = 0.0
 
     def watched(
         self: Barrier,
@@ -290,15 +352,20 @@ def test_the_safety_filter_places_peers_on_their_committed_trajectories(
         *,
         bodies: Sequence[Body],
     ) -> Array | None:
-        seen_m.extend(body.apart_m for body in bodies)
+        seen_m.extend(body.apart_m - round_trip_s * math.hypot(*body.vel_ned_m_s) for body in bodies)
         return filtered(self, virtual_control, start, disturbance_ned_m_s2, hover_thrust_01, bodies=bodies)
 
     monkeypatch.setattr(Barrier, "filtered", watched)
     while not flight.logs[0].rows or flight.logs[0].rows[-1]["phase"][0] != Phase.TRACK:
         flight.step()
     seen_m.clear()
+    if mode == "guaranteed":
+        (agent, _) = flight.agents
+        assert agent is not None
+        round_trip_s = 1e-6 * agent._world_model.clocks.spread_us(1)
+        assert 0.06 <= round_trip_s <= 0.16, "the delay there and back, and ticks"
     for _ in range(25):
         flight.step()
     least_m = SeparationParams().body_m + BarrierParams().margin_m
     assert len(seen_m) > 5
-    assert all(apart_m == least_m for apart_m in seen_m) is (mode == "guaranteed")
+    assert (seen_m == pytest.approx([least_m] * len(seen_m))) is (mode == "guaranteed")

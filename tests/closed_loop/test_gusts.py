@@ -13,6 +13,7 @@ from sitl.studies.campaign.events import SimulatorFault
 from sitl.studies.campaign.flight import TrialFlight, drawn
 from sitl.studies.campaign.trials import Cell, Trial
 from swarmctl.config import load
+from swarmctl.control.commit.protocol import Commitments
 from swarmctl.control.commit.tube import Tube
 from swarmctl.core.types import Phase
 from swarmctl.simulator_config import FaultParams
@@ -75,5 +76,6 @@ def test_vehicles_that_are_blown_out_of_their_tubes_commit_anew_and_keep_apart()
 def test_negative_control_vehicles_that_chase_what_they_were_committed_to_touch(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(Tube, "update", lambda self, utc_us, error_m, error_m_s: False)
+    monkeypatch.setattr(Tube, "update", lambda self, *_: False)
+    monkeypatch.setattr(Commitments, "wait_for", lambda self, *_: None)
     assert blown_farther_than_expected().collided

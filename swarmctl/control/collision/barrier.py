@@ -14,6 +14,9 @@ M. Egerstedt 2015; L. Wang, A. Ames, M. Egerstedt 2017). Against what does not f
 or one that its autopilot flies) the own vehicle takes all of it. The command is the acceleration nearest to the wanted
 one within all half-planes and the airframe's bounds; if there is none, the one of least slack.
 
+Two that fly past each other part, but only as long as both fly straight on. That counts fully from d = a / k^2 on, and
+not at all where they are too close already: there the command itself has to part them, by `escape_m_s` at most.
+
 Guarantee: bodies that are apart stay apart, as long as both of a pair brake with `brake_m_s2`, `margin_m` covers the
 errors of positions, velocities and the prediction over dead time and lag, and h >= 0 to begin with. Several neighbours
 at once may ask for more than the airframe has; then the largest slack is minimal.
@@ -229,7 +232,9 @@ class Barrier:
             allowed, slope = p.near_1_s * left, p.near_1_s
             if allowed < -p.escape_m_s:
                 allowed, slope = -p.escape_m_s, 0.0
-        transverse = (speed2 - rate * rate) / max(distance, 0.5 * body.apart_m)  # r'' due to the transverse velocity
+        straight_01 = min(1.0, max(0.0, left / bend))
+        # r'' due to the transverse velocity
+        transverse = straight_01 * (speed2 - rate * rate) / max(distance, 0.5 * body.apart_m)
         # least r'' that keeps h' >= -gain h
         need = -(slope * rate + p.gain_1_s * (rate + allowed)) / (1.0 + slope * react_s) - transverse
         if need < -_FARTHEST_M_S2:

@@ -34,11 +34,18 @@ any one of the rules two do. The figures are in docs/safety_case.md.
 
 The proof rests on these assumptions, each of which is watched in flight:
 
-- Clocks agree: an offset of e seconds costs v e metres, which `separation.tracking_m` has to cover. Offsets of peers'
-  clocks are measured on these messages and corrected (`swarmctl.bus.peer_clocks`), to half a round trip.
+- Clocks are known to within an error, which is measured: offsets of peers' clocks are taken from these messages and
+  corrected (`swarmctl.bus.peer_clocks`), and the error that is left, a round trip at most, goes with every trajectory
+  received. From one that is flown at speed v by a clock known to e, rules 2 and 4 keep v e more, and so does the safety
+  filter (`Trajectory.spread_m`): of each pair of trajectories that the proof speaks of, one agent has checked the other
+  one's, with room for all that it does not know of the other's clock. Beyond `agent.commit.clock_error_max_s` nothing
+  new is proposed.
 - Vehicles stay in their tubes: each may miss what it is committed to by half of the committed distance beyond touching
   bodies. `swarmctl.control.commit.tube` watches it; the event `tracking_violation` reports who leaves its tube, and
-  `commitments` at the end the worst error of the flight.
+  `commitments` at the end the worst error of the flight. A vehicle that lags does not chase its commitment: it is flown
+  later along the same places (`Commitments.wait_for`), and proposes from there. To the proof a proposal is any
+  trajectory, whatever it leaves; until that is committed, the vehicle is outside the tube that its peers had been told
+  of, and they keep clear of it as of one that does not take part.
 - Commitments are kept. A commitment changes without acknowledgement only where a vehicle first commits at speed, where
   it is blown far from its tube, and by `evade`, before something that does not take part: around it, to a stop, or
   above it. An agent that finds a peer's commitment in conflict with its own (`conflicting_peers`), or a peer outside
@@ -58,7 +65,7 @@ from typing import Protocol
 import numpy as np
 
 from swarmctl.control.commit.trajectory_planner import CommitParams, Situation
-from swarmctl.core.trajectory import Trajectory, resting
+from swarmctl.core.trajectory import Trajectory, by_exact_clock, delayed, resting
 from swarmctl.core.trajectory_message import Proposal, TrajectoryMessage
 from swarmctl.core.types import Array
 
@@ -67,6 +74,7 @@ _PERCENTILE = 90.0
 _LEAD_FACTOR = 1.2  # the lead is this many times that percentile of the time acknowledgements take
 _EVASION_DELAY_S = 0.2  # braking this much after the lead must still be clear, otherwise the agent evades
 _TICK_S = 0.04  # sending and receiving take at least this long
+_NO_LAG_M_S = 0.1  # a slower trajectory is not waited on: it is at rest soon
 
 
 @dataclass(slots=True, kw_only=True)
@@ -123,6 +131,7 @@ class Commitments:
         self._latencies_s: deque[float] = deque(maxlen=_LATENCIES)
         self._lead_s = params.lead_min_s
         self._number, self._next_us = 0, 0
+        self._late_us, self._proposed_late_us = 0, 0  # of the vehicle on what is committed, now and when it proposed
         self._cleared: dict[int, Trajectory] = {}  # by identity: known not to conflict with the own proposal
         self._compatible: dict[int, Trajectory] = {}  # by identity: known not to conflict with `_compatible_with`
         self._compatible_with: Trajectory | None = None
@@ -132,8 +141,7 @@ class Commitments:
 
     def begin(self, pos_ned_m: Array, vel_ned_m_s: Array, utc_us: int) -> None:
         """Commit to braking to rest from a position (3,) [m] and velocity (3,) [m/s], where the agent takes control."""
-        self.committed = self._planner.stopping_from(pos_ned_m, vel_ned_m_s, utc_us)
-        self.proposal = None
+        self._replace(self._planner.stopping_from(pos_ned_m, vel_ned_m_s, utc_us))
 
     def restart(self, pos_ned_m: Array, vel_ned_m_s: Array, utc_us: int) -> None:
         """Commit anew to braking to rest, without acknowledgement, from where the commitment was lost (see `tube`)."""
@@ -144,7 +152,24 @@ class Commitments:
         """Drop the proposal while a pilot or the autopilot flies, and commit to rest at the position (3,), if known."""
         self.proposal = None
         if pos_ned_m is not None:
-            self.committed = resting(pos_ned_m, utc_us, self._planner.dt_us)
+            self._replace(resting(pos_ned_m, utc_us, self._planner.dt_us))
+
+    def wait_for(self, pos_ned_m: Array, utc_us: int, since_us: int, allowed_m: float) -> None:
+        """Hold back what is flown while it is more than `allowed_m` ahead of the vehicle at (3,), at most to a stand.
+
+        Args:
+            pos_ned_m, utc_us: where the vehicle is now.
+            since_us: time since the last call, of which some may be lost.
+            allowed_m: how far behind it may be.
+        """
+        assert self.flown is not None
+        place, vel = map(np.array, self.flown.at(utc_us))
+        speed_m_s = float(np.linalg.norm(vel))
+        if speed_m_s < _NO_LAG_M_S:
+            return
+        behind_m = float((place - pos_ned_m) @ vel) / speed_m_s
+        if behind_m > allowed_m:
+            self._late_us += min(since_us, round(1e6 * (behind_m - allowed_m) / speed_m_s))
 
     def update(self, utc_us: int, peers: Mapping[int, TrajectoryMessage], required: Set[int]) -> None:
         """Apply rules 2 and 3 to the own proposal.
@@ -172,23 +197,27 @@ class Commitments:
         self._cleared.update((id(trajectory), trajectory) for trajectory in new)
         if all(agent in peers and peers[agent].acknowledged.get(self._agent) == mine.number for agent in required):
             self.committed, self.proposal = mine.trajectory, None
+            self._late_us -= self._proposed_late_us
             self.counts.committed += 1
             self._latencies_s.append((utc_us - mine.made_utc_us) * 1e-6)
             self._set_lead(_LEAD_FACTOR * float(np.percentile(self._latencies_s, _PERCENTILE)) + _TICK_S)
 
     def conflicting_peers(self, utc_us: int, peers: Mapping[int, TrajectoryMessage]) -> set[int]:
-        """Return peers whose committed trajectory conflicts with the own one, because one of the two had to evade."""
+        """Return peers whose committed trajectory conflicts with the own one, because one of the two had to evade.
+
+        The error of clocks is left aside: who has committed last has left room for it, by what was known then.
+        """
         if self.committed is None:
             return set()
         commitments = {agent: message.committed for agent, message in peers.items() if message.is_committed}
         if self._compatible_with is not self.committed:
             self._compatible, self._compatible_with = {}, self.committed
         new = [t for t in commitments.values() if id(t) not in self._compatible]
-        if new and not self._planner.conflicts(self.committed, utc_us, new):
+        if new and not self._planner.conflicts(self.committed, utc_us, list(map(by_exact_clock, new))):
             self._compatible.update((id(t), t) for t in new)
             new = []
         unsure = {agent: t for agent, t in commitments.items() if any(t is other for other in new)}
-        return {agent for agent, t in unsure.items() if self._planner.conflicts(self.committed, utc_us, [t])}
+        return {a for a, t in unsure.items() if self._planner.conflicts(self.committed, utc_us, [by_exact_clock(t)])}
 
     def evade(self, now: Situation) -> None:
         """Replace the committed trajectory without acknowledgement, where waiting for one would be too late.
@@ -198,14 +227,15 @@ class Commitments:
         Args:
             now: a plan that begins at once, and keep-outs from now on.
         """
-        if self.committed is None or not now.others or self._planner.is_clear(self.committed, now):
+        flown = self.flown
+        if flown is None or not now.others or self._planner.is_clear(flown, now):
             return
         later_us = now.utc_us + self.lead_us + round(_EVASION_DELAY_S * 1e6)
-        if self._planner.is_clear(self._planner.stopping_candidate(self.committed, later_us, now.utc_us), now):
+        if self._planner.is_clear(self._planner.stopping_candidate(flown, later_us, now.utc_us), now):
             return
-        evasive_trajectory = self._planner.evasive_trajectory(self.committed, now)
+        evasive_trajectory = self._planner.evasive_trajectory(flown, now)
         if evasive_trajectory is not None:
-            self.committed, self.proposal = evasive_trajectory, None
+            self._replace(evasive_trajectory)
             self.counts.evasive += 1
 
     def is_due(self, utc_us: int) -> bool:
@@ -218,16 +248,22 @@ class Commitments:
         Args:
             now: a plan that begins `lead_us` from now; peers as given to `update`.
         """
-        assert self.committed is not None
+        assert self.flown is not None
         self._next_us = now.utc_us + round(self._params.period_s * 1e6)
-        trajectory = self._planner.proposal(self.committed, now)
+        trajectory = self._planner.proposal(self.flown, now)
         if trajectory is None:
             self.counts.unplanned += 1
             return
         self._number = max(self._number + 1, now.utc_us)  # above all numbers used before a restart
         self.proposal = Proposal(number=self._number, made_utc_us=now.utc_us, agent=self._agent, trajectory=trajectory)
         self._cleared = {id(known): known for known in now.followed}
+        self._proposed_late_us = self._late_us
         self.counts.proposed += 1
+
+    @property
+    def flown(self) -> Trajectory | None:
+        """Return what the vehicle is flown along: what is committed, later by as much as has been waited for it."""
+        return None if self.committed is None else delayed(self.committed, self._late_us)
 
     @property
     def lead_us(self) -> int:
@@ -243,6 +279,10 @@ class Commitments:
     def dt_us(self) -> int:
         """Return the step of that grid [us]."""
         return self._planner.dt_us
+
+    def _replace(self, committed: Trajectory) -> None:
+        self.committed, self.proposal = committed, None
+        self._late_us = 0
 
     def _set_lead(self, lead_s: float) -> None:
         self._lead_s = min(self._params.lead_max_s, max(self._params.lead_min_s, lead_s))

@@ -299,18 +299,18 @@ class TrajectoryPlanner:
         if not trajectories:
             return []
         budget = self._separation.budget
-        hard_min_distance_m = budget.committed_m + spare_m
+        spreads_m = [trajectory.spread_m(t0_utc_us) for trajectory in trajectories]
         where = positions_at(trajectories, t0_utc_us + np.arange(steps + 1) * self.dt_us)
         return [
             KeepOut(
                 pos_ned_m=points,
-                radius_m=budget.planned_m,
-                hard_min_distance_m=hard_min_distance_m,
+                radius_m=budget.planned_m + spread_m,
+                hard_min_distance_m=budget.committed_m + spread_m + spare_m,
                 any_height=False,
                 priority_id=agent,
                 downwash=self._separation.downwash,
             )
-            for points, agent in zip(where, agents, strict=True)
+            for points, agent, spread_m in zip(where, agents, spreads_m, strict=True)
         ]
 
 
@@ -320,6 +320,16 @@ def following(mpc: MpcParams, params: CommitParams) -> MpcParams:
     With the three moves of the thesis, heights of a commitment that begins to climb are missed by 0.16 m.
     """
     return mpc.model_copy(update={"z": params.follow_z, "control_z": max(mpc.control_z, _FOLLOWING_MOVES_Z)})
+
+
+def slowed(desired: DesiredReference, from_ned_m: Array, pace_01: float) -> DesiredReference:
+    """Return a motion between standing at a place (3,), for a pace of 0, and the desired one, for a pace of 1."""
+
+    def reference(offsets_s: Array) -> tuple[Array, Array]:
+        pos, vel = desired.reference(offsets_s)
+        return from_ned_m + pace_01 * (pos - from_ned_m), pace_01 * vel
+
+    return DesiredReference(reference, desired.follows_path)
 
 
 def _with_run_up(desired: DesiredReference, speed_m_s: float) -> DesiredReference:

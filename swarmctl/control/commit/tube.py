@@ -2,8 +2,12 @@
 
 Two committed trajectories keep a distance that leaves each vehicle a *tube*: half of what lies beyond touching bodies.
 A vehicle that leaves its tube tells its peers a wider one, by which they plan, and which narrows again once it is back.
-A vehicle that is blown away, or far outside, no longer flies what it has committed to. One that merely lags behind had
-better return: its commitment keeps clear of all others, a new one from beside it may not. What follows depends on how
+It also *slows*: it plans to go on at a share of its pace that is the less the farther outside it is, down to standing,
+and that it regains little by little. A vehicle that merely lags need not hurry, because what is flown waits for it
+(`Commitments.wait_for`): it is on its way to the places it has committed to.
+
+A vehicle that is blown away, or far outside, no longer flies what it has committed to. One that is less far had better
+return: its commitment keeps clear of all others, a new one from beside it may not. What follows depends on how
 often a commitment is lost:
 
 1. *widen*: it commits anew, from the state that was measured, and goes on;
@@ -22,6 +26,8 @@ _WIDEST_M = 2.0  # a wider tube would only stop everybody else
 _NARROWING_S = 1.0  # time constant with which a widened tube narrows
 _BLOWN_M, _BLOWN_M_S = 0.15, 1.0  # outside the tube, and moving away: gusts do that
 _FAR_M = 0.5  # outside the tube, however slowly; trackers of real autopilots lag by 0.27 m at most (PX4 1.18)
+_SLOWS_M, _STANDS_M = 0.05, 0.15  # outside the tube: where it begins to plan to be slower, and plans to stand
+_REGAINED_S = 2.0  # time in which it then goes from rest to its full pace again
 _HELD_US = 1_000_000  # nothing lost for this long: what is committed is held again
 _WINDOW_US = 10_000_000
 _STOPS_AT, _LANDS_AT = 3, 40  # how often a commitment has been lost within that window
@@ -31,7 +37,7 @@ class Grip(IntEnum):
     """How well a vehicle follows what it commits to."""
 
     HELD = 0
-    OUTSIDE = 1  # of the tube, on the way back
+    OUTSIDE = 1  # of the tube, slower, on the way back
     WIDENED = 2
     STOPPED = 3
     LOST = 4
@@ -46,6 +52,7 @@ class Tube:
     Attributes:
         radius_m: what peers are told, `nominal_m` or more.
         worst_m: largest deviation so far.
+        pace_01: share of its speed at which it may plan to go on.
     """
 
     def __init__(self, nominal_m: float) -> None:
@@ -53,10 +60,15 @@ class Tube:
         self._lost_us: deque[int] = deque()
         self._updated_us: int | None = None
         self._is_outside = False
-        self.radius_m, self.worst_m = nominal_m, 0.0
+        self.radius_m, self.worst_m, self.pace_01 = nominal_m, 0.0, 1.0
 
-    def update(self, utc_us: int, error_m: float, error_m_s: float) -> bool:
+    def update(self, utc_us: int, error_m: float, error_m_s: float, late_m: float = 0.0) -> bool:
         """Take in the deviation from the committed trajectory, of position and of velocity.
+
+        Args:
+            utc_us: now.
+            error_m, error_m_s: deviations.
+            late_m: how far behind the committed trajectory the vehicle is flown along it, because it lags.
 
         Returns:
             whether the commitment is lost, so that the vehicle has to commit anew.
@@ -72,7 +84,9 @@ class Tube:
         if self._is_outside:
             widened_m = max(widened_m, min(_WIDEST_M, beyond_m + _WIDENED_S * error_m_s))
         self.radius_m = self._nominal_m + widened_m
-        is_lost = beyond_m > _FAR_M or (beyond_m > _BLOWN_M and error_m_s > _BLOWN_M_S)
+        regained_01 = self.pace_01 + 1e-6 * since_us / _REGAINED_S
+        self.pace_01 = max(0.0, min(1.0, regained_01, (_STANDS_M - beyond_m) / (_STANDS_M - _SLOWS_M)))
+        is_lost = beyond_m > _FAR_M or (beyond_m - late_m > _BLOWN_M and error_m_s > _BLOWN_M_S)
         if is_lost:
             self._lost_us.append(utc_us)
         return is_lost

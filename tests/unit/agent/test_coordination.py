@@ -15,6 +15,7 @@ from swarmctl.bus.commitment_messages import decode_trajectory_message, encode_t
 from swarmctl.bus.json_messages import encode_message
 from swarmctl.bus.path_messages import encode_path
 from swarmctl.bus.peers import LocalBus, LocalHub, agent_name
+from swarmctl.control.collision.encounters import Encounters
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference
 from swarmctl.control.model import VehicleModelParams
@@ -266,10 +267,28 @@ def test_the_certificate_against_a_stale_peer_has_all_of_its_margin(bench: Bench
     bench.fly(0.5, each=bench.send)
     bench.fly(1.0)
     utc_us, params = bench.clock.utc_us(), SeparationParams()
-    (kept,) = bench.coordination._others(utc_us, bench.state, Phase.TRACK, set())
+    (kept,) = bench.coordination._others(utc_us, bench.state, Phase.TRACK, set(), Encounters())
     (control,) = bench.world_model.keep_outs(HERE, utc_us, 100_000, 5, phase=Phase.TRACK)
     assert control.hard_min_distance_m == params.budget.hard_min_distance_m, "which would not grow with age"
     assert kept.hard_min_distance_m > params.budget.planned_m + 0.5
+
+
+def test_an_encounter_with_who_does_not_take_part_is_measured_from_where_it_began(bench: Bench) -> None:
+    """Plan by plan, each 2 cm closer than the one before, an agent would come as close as it wants."""
+    bench.tube_m = 0.5  # the peer is where its path says
+
+    def came_m(north_m: float) -> float | None:
+        bench.fly(0.1, each=lambda: bench.send(HERE + np.array([north_m, 0.0, 0.0])))
+        encounters = bench.coordination._entered_now
+        (kept,) = bench.coordination._others(bench.clock.utc_us(), bench.state, Phase.TRACK, set(), encounters)
+        return kept.entered_m
+
+    bench.fly(0.2, each=bench.send)
+    assert came_m(3.0) is None
+    entered_m = came_m(0.75)
+    assert entered_m == pytest.approx(0.75, abs=0.02)
+    assert came_m(0.70) == entered_m
+    assert came_m(0.60) == entered_m
 
 
 def test_an_agent_without_a_state_commits_nothing(bench: Bench) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from swarmctl.bus.commitment_messages import (
+    MAX_CLOCK_ERROR_US,
     MAX_PEERS,
     MAX_POINTS,
     MAX_STEP_US,
@@ -259,3 +260,24 @@ def test_trajectories_of_a_peer_with_another_clock_are_converted_to_ours() -> No
     kept = store.peers.newest[2].committed
     store.offer(replace(answered, seq=6, committed=replace(trajectory(), t0_utc_us=UTC_US + ahead_us)))
     assert store.peers.newest[2].committed is kept, "by which the protocol knows that it has checked it"
+
+
+def test_trajectories_say_how_well_the_clock_of_their_sender_is_known() -> None:
+    store = Store()
+    store.offer(message(seq=1, propose=False))
+    assert store.peers.newest[2].committed.clock_error_us == MAX_CLOCK_ERROR_US
+    for seq in range(2, 6):
+        stamp_us = store.utc_us + 20_000
+        store.offer(replace(message(seq=seq), sent_utc_us=stamp_us, heard={1: (store.utc_us, stamp_us)}))
+    for received in store.peers.newest[2].trajectories:
+        assert received.clock_error_us == store.clocks.error_us(2) <= 20_000
+
+
+@pytest.mark.parametrize(("after_s", "spread_m"), [(0.0, 0.075), (1.0, 0.075), (3.1, 0.0)])
+def test_an_error_of_the_clock_is_worth_as_much_as_the_vehicle_moves_in_it(after_s: float, spread_m: float) -> None:
+    moving = np.tile([0.0, 1.5, 0.0], (21, 1))
+    points = np.cumsum(moving, axis=0) * 0.1
+    flown = ending_at_rest(UTC_US, 100_000, points, moving, brake_m_s2=1.5)
+    assert flown.spread_m(UTC_US) == 0.0
+    by_wrong_clock = replace(flown, clock_error_us=50_000)
+    assert by_wrong_clock.spread_m(UTC_US + round(1e6 * after_s)) == pytest.approx(spread_m, abs=0.008)

@@ -94,3 +94,13 @@ def test_a_correction_is_reported_once_with_its_error() -> None:
 
 def test_an_unknown_peer_is_taken_as_it_stamps() -> None:
     assert Pair(0).clocks.ahead_us(9) == 0
+
+
+def test_no_room_is_left_for_a_clock_that_is_not_measured() -> None:
+    """Without trajectory messages, in best effort, clocks are taken for equal."""
+    pair = Pair(0)
+    pair.clocks.received(1, UTC_US, UTC_US + 20_000)
+    assert pair.clocks.spread_us(1) == 0
+    pair.exchange(20_000, 30_000)
+    assert pair.clocks.spread_us(1) == pair.clocks.error_us(1) > 0
+    assert pair.clocks.spread_us(9) == 0

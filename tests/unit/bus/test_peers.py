@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from swarmctl.bus.links import Impairments
 from swarmctl.bus.path_messages import encode_path
+from swarmctl.bus.peer_clocks import PeerClocks
 from swarmctl.bus.peers import LEASE_US, LocalBus, LocalHub, PeerPaths, agent_name
 from swarmctl.bus.refusals import Refusals
 from swarmctl.bus.senders import Presence
@@ -56,6 +59,19 @@ def test_newest_path_of_every_peer_is_kept_by_agent_number() -> None:
     store.offer(payload(agent=1, seq=2))
     assert store.kept == [(1, 7, 2), (2, 7, 4)]
     assert not store.refusals.total
+
+
+def test_a_path_gets_room_for_the_error_of_its_clock() -> None:
+    store, clocks = Store(), PeerClocks([1, 2], lambda *_, **__: None)
+    store.paths = PeerPaths([1, 2], 50.0, store.refusals, store.presence, clocks=clocks)
+    moving = np.arange(5)[:, None] * [0.03, 0.04, 0.0]  # at 2.5 m/s
+    path = builders.predicted_path(agent=1, seq=1, t0_utc_us=NOW_US, dt_us=20_000, pos_ned_m=moving)
+    store.offer(encode_path(path))
+    assert store.paths.latest()[0].margin_m == path.margin_m, "not measured"
+    clocks.received(1, NOW_US, NOW_US + 30_000)
+    clocks.answered(1, NOW_US, NOW_US + 30_000, NOW_US + 40_000)
+    store.offer(encode_path(replace(path, seq=2)))
+    assert store.paths.latest()[0].margin_m == pytest.approx(path.margin_m + 0.03 * 2.5, rel=1e-3)
 
 
 def test_the_path_of_a_stale_peer_is_kept() -> None:

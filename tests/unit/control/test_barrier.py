@@ -162,6 +162,32 @@ def test_the_filter_does_not_act_on_agents_that_keep_apart(pos: tuple[float, ...
     assert filtered(barrier, HOVER, start(np.zeros(3), np.zeros(3)), []) is None
 
 
+@pytest.mark.parametrize(("distance_m", "acts"), [(APART_M - 0.1, True), (APART_M + 0.3, False)])
+def test_flying_past_does_not_count_as_parting_where_two_are_too_close(distance_m: float, acts: bool) -> None:
+    here = start(np.zeros(3), np.zeros(3))
+    passing = Body(
+        pos_ned_m=(distance_m, 0.0, 0.0), vel_ned_m_s=(0.0, 3.0, 0.0), apart_m=APART_M, responsibility_01=0.5
+    )
+    found = filtered(Barrier(PARAMS, MODEL, DT_S), HOVER, here, [passing])
+    assert (found is not None) is acts
+    if found is not None:
+        assert acceleration(found)[0] < -0.3, "away from it"
+
+
+def test_a_vehicle_gets_away_from_one_that_is_too_close_and_does_not_fly_past_as_told() -> None:
+    """A peer is told to fly past at 3 m/s, by what it has committed to, but hangs where it is."""
+    barrier, pos, vel, held = Barrier(PARAMS, MODEL, DT_S), np.zeros(3), np.zeros(3), HOVER
+    peer = Body(
+        pos_ned_m=(APART_M - 0.1, 0.0, 0.0), vel_ned_m_s=(0.0, 3.0, 0.0), apart_m=APART_M, responsibility_01=0.5
+    )
+    for _ in range(50):
+        found = filtered(barrier, HOVER, start(pos, vel, held), [peer])
+        held = HOVER if found is None else found
+        accel = acceleration(held)
+        pos, vel = pos + DT_S * vel + 0.5 * DT_S**2 * accel, vel + DT_S * accel
+    assert math.dist(pos, peer.pos_ned_m) > APART_M
+
+
 def test_commands_stay_within_the_airframe_bounds() -> None:
     """Even without a feasible command, tilt, slew and thrust stay within bounds and finite."""
     rng = np.random.default_rng(3)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import random
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 
 import numpy as np
@@ -84,15 +84,16 @@ class Crowd:
         for i in ids:
             for message in self.network.arrived(self.now_us, i):
                 if message.agent not in self.known[i] or message.seq > self.known[i][message.agent].seq:
-                    self.known[i][message.agent] = message
+                    self.known[i][message.agent] = self.received(message)
         for i, agent in enumerate(self.agents):
-            agent.update(self.now_us, self.known[i], set(ids) - {i})
-            if agent.is_due(self.now_us):
-                begin_us = self.now_us + agent.lead_us
+            now_us = self.clock_us(i)
+            agent.update(now_us, self.known[i], set(ids) - {i})
+            if agent.is_due(now_us):
+                begin_us = now_us + agent.lead_us
                 desired = DesiredReference(partial(self.wanted, i))
                 agent.propose(
                     builders.situation(
-                        utc_us=self.now_us, begin_us=begin_us, desired=desired, peers=self.known[i], others=()
+                        utc_us=now_us, begin_us=begin_us, desired=desired, peers=self.known[i], others=()
                     )
                 )
         for i, agent in enumerate(self.agents):
@@ -109,6 +110,14 @@ class Crowd:
                 if j != i:
                     self.network.send(self.now_us, j, message)
 
+    def clock_us(self, agent: int) -> int:
+        """UTC by the clock of an agent."""
+        return self.now_us
+
+    def received(self, message: TrajectoryMessage) -> TrajectoryMessage:
+        """Return a message as it is decoded."""
+        return message
+
     def wanted(self, agent: int, offsets_s: Array) -> tuple[Array, Array]:
         goal = self.starts[agent] * np.array([-1.0, -1.0, 1.0])
         t_s = (self.now_us - UTC_US) * 1e-6 + offsets_s
@@ -116,10 +125,11 @@ class Crowd:
 
     def committed_m(self) -> float:
         """Smallest distance, from now to their ends, of any two trajectories that are followed now."""
-        followed = [agent.committed for agent in self.agents if agent.committed is not None]
-        end_us = max(self.now_us, *(trajectory.end_utc_us for trajectory in followed))
-        times = np.arange(self.now_us, end_us + 50_001, 50_000)
-        return float(closest_pair_m(np.stack([each.sample(times)[0] for each in followed], axis=1)).min())
+        followed = {i: agent.committed for i, agent in enumerate(self.agents) if agent.committed is not None}
+        end_us = max(self.now_us, *(trajectory.end_utc_us for trajectory in followed.values()))
+        ahead_us = np.arange(0, end_us - self.now_us + 50_001, 50_000)
+        places = [each.sample(self.clock_us(i) + ahead_us)[0] for i, each in followed.items()]
+        return float(closest_pair_m(np.stack(places, axis=1)).min())
 
     def run(self, seconds: float) -> float:
         """Run for some time and return the smallest distance between commitments [m]."""
@@ -146,6 +156,41 @@ NETWORKS = {
 def test_commitments_keep_the_hard_minimum_distance(network: Network) -> None:
     crowd = Crowd(4, network)
     assert crowd.run(6.0) >= HARD_MIN_M - 1e-3
+    assert crowd.committed >= 8, "they do move"
+
+
+class ByTheirOwnClocks(Crowd):
+    """Agents whose clocks differ, and who take them for equal, give or take an error.
+
+    Args:
+        ahead_us: by which the clock of each is ahead.
+        error_us: to which each knows the clocks of the others.
+    """
+
+    def __init__(self, ahead_us: list[int], error_us: int) -> None:
+        super().__init__(len(ahead_us), Network(delay_us=(20_000, 20_000)))
+        self._ahead_us, self._error_us = ahead_us, error_us
+        self._seen: dict[int, tuple[Trajectory, Trajectory]] = {}  # as sent, and as received; by the former's identity
+
+    def clock_us(self, agent: int) -> int:
+        return self.now_us + self._ahead_us[agent]
+
+    def received(self, message: TrajectoryMessage) -> TrajectoryMessage:
+        proposal = message.proposal
+        if proposal is not None:
+            proposal = replace(proposal, trajectory=self._as_received(proposal.trajectory))
+        return replace(message, committed=self._as_received(message.committed), proposal=proposal)
+
+    def _as_received(self, sent: Trajectory) -> Trajectory:
+        return self._seen.setdefault(id(sent), (sent, replace(sent, clock_error_us=self._error_us)))[1]
+
+
+@pytest.mark.parametrize(("error_us", "kept"), [(150_000, True), (0, False)], ids=["", "control: no margin"])
+def test_commitments_keep_apart_by_clocks_that_differ_within_their_error(error_us: int, kept: bool) -> None:
+    crowd = ByTheirOwnClocks([0, 150_000, 0, 150_000], error_us)
+    least_m = crowd.run(5.0)
+    assert (least_m >= HARD_MIN_M - 1e-3) is kept
+    assert (least_m < HARD_MIN_M - 0.05) is not kept
     assert crowd.committed >= 8, "they do move"
 
 
@@ -428,3 +473,50 @@ def test_a_slow_network_lengthens_the_lead_and_a_fast_one_shortens_it_again() ->
     assert before_us < 0.3 * slow_us
     assert slow_us > 450_000
     assert crowd.agents[0].lead_us < 0.5 * slow_us
+
+
+def on_the_way() -> Commitments:
+    """Return an agent that has committed to 1.5 m/s northwards, for 2 s and the braking after them."""
+    agent = committing(0, max_keep_outs=1)
+    points = np.array([[0.15 * k, 0.0, -2.0] for k in range(21)])
+    agent.committed = ending_at_rest(UTC_US, 100_000, points, np.tile([1.5, 0.0, 0.0], (21, 1)), brake_m_s2=1.5)
+    return agent
+
+
+def flown_m(agent: Commitments, utc_us: int) -> float:
+    assert agent.flown is not None
+    return agent.flown.at(utc_us)[0][0]
+
+
+def test_what_is_flown_waits_for_a_vehicle_that_lags_and_is_not_made_up_for() -> None:
+    agent, now_us, north_m = on_the_way(), UTC_US + 400_000, 0.3
+    committed, ahead_m = agent.committed, []
+    for k in range(50):
+        now_us += 20_000
+        north_m += 0.03 * (k >= 20)  # it stands for a while, then flies as fast as it was committed to
+        agent.wait_for(np.array([north_m, 0.0, -2.0]), now_us, 20_000, 0.1)
+        ahead_m.append(flown_m(agent, now_us) - north_m)
+    assert ahead_m[:20] == pytest.approx([0.3] * 20, abs=1e-6), "it stands where it was, and never goes back"
+    assert ahead_m[-1] == pytest.approx(0.1, abs=0.01)
+    assert agent.committed is committed, "peers rely on it"
+
+
+def test_a_vehicle_that_lags_within_what_is_allowed_is_not_waited_for() -> None:
+    agent = on_the_way()
+    agent.wait_for(np.array([0.55, 0.3, -2.0]), UTC_US + 400_000, 20_000, 0.1)
+    assert agent.flown is agent.committed
+
+
+def test_a_late_agent_proposes_from_where_it_is_and_is_on_time_once_that_is_committed() -> None:
+    agent, now_us = on_the_way(), UTC_US + 400_000
+    agent.wait_for(np.array([0.0, 0.0, -2.0]), now_us, 200_000, 0.0)
+    assert flown_m(agent, now_us) == pytest.approx(0.3)
+    begin_us = now_us + agent.lead_us
+    where_m = flown_m(agent, begin_us)
+    agent.propose(builders.situation(utc_us=now_us, begin_us=begin_us, desired=DesiredReference(at_goal)))
+    agent.wait_for(np.array([0.0, 0.0, -2.0]), now_us + 20_000, 20_000, 0.0)
+    agent.update(now_us + 20_000, {}, set())
+    assert agent.counts.committed == 1
+    assert agent.committed is not None
+    assert agent.committed.at(begin_us)[0][0] == pytest.approx(where_m, abs=1e-3)
+    assert flown_m(agent, begin_us) == pytest.approx(where_m - 0.03, abs=2e-3), "20 ms were lost in the meantime"

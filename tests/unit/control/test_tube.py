@@ -51,6 +51,37 @@ def test_a_vehicle_that_is_blown_away_or_far_outside_commits_anew(speed_m_s: flo
     assert flown(Tube(NOMINAL_M), [0.1, 0.34, 0.36, 0.71], speed_m_s) == lost
 
 
+def test_a_vehicle_that_merely_lags_has_not_lost_its_commitment() -> None:
+    tube = Tube(NOMINAL_M)
+    assert not tube.update(0, 0.6, 1.5, late_m=0.3)
+    assert tube.radius_m > 0.6, "but peers are told"
+    assert tube.update(TICK_US, 0.6, 1.5), "aside it would be blown away"
+    assert tube.update(2 * TICK_US, 0.8, 1.5, late_m=0.5), (
+        "who can't commit to anything slower for that long has to stop"
+    )
+
+
+@pytest.mark.parametrize(
+    ("outside_m", "pace_01"), [(-0.1, 1.0), (0.05, 1.0), (0.1, 0.5), (0.15, 0.0), (0.4, 0.0)], ids=str
+)
+def test_outside_its_tube_a_vehicle_plans_to_be_slower_and_then_to_stand(outside_m: float, pace_01: float) -> None:
+    tube = Tube(NOMINAL_M)
+    tube.update(0, NOMINAL_M + outside_m, 0.1)
+    assert tube.pace_01 == pytest.approx(pace_01)
+
+
+def test_a_vehicle_that_is_back_gains_pace_little_by_little() -> None:
+    tube = Tube(NOMINAL_M)
+    tube.update(0, NOMINAL_M + 0.2, 0.1)
+    paces = []
+    for k in range(1, 121):
+        tube.update(k * TICK_US, 0.0, 0.0)
+        paces.append(tube.pace_01)
+    assert paces[0] == pytest.approx(0.01)
+    assert paces[49] == pytest.approx(0.5)
+    assert paces[-1] == 1.0
+
+
 def test_being_far_outside_again_and_again_has_growing_consequences() -> None:
     tube, grips = Tube(NOMINAL_M), []
     for k in range(40):
