@@ -9,7 +9,7 @@ import pytest
 
 from sitl.lockstep import Lockstep
 from swarmctl.config import load
-from tests.closed_loop.conftest import ROOT, Flight, Fly, mission_is_over
+from tests.closed_loop.conftest import COARSE, ROOT, Flight, Fly, mission_is_over
 
 NO_ROWS = ("mission.kind=swap", "sitl.start=air", "controller.kind=mpc", "mission.duration_s=7")
 OFF = "agent.barrier.enabled=false"
@@ -74,7 +74,7 @@ def test_negative_control_of_a_lag_that_it_is_not_told_of_they_touch() -> None:
 
 
 def test_it_leaves_an_ordinary_flight_alone_bit_by_bit(fly: Fly) -> None:
-    short = ("sitl.start=air", "mission.duration_s=2")
+    short = (*COARSE, "sitl.start=air", "mission.duration_s=2")
     with_it, without = fly(*short, until=mission_is_over), fly(*short, OFF, until=mission_is_over)
     assert not any(safety_filter_ticks(with_it))
     assert with_it.lockstep.truth.tobytes() == without.lockstep.truth.tobytes()
