@@ -222,9 +222,9 @@ def test_own_reference_and_own_controller_are_launched(tmp_path: Path) -> None:
 
 
 def operate(verb: str, directory: Path) -> None:
-    for order in shown(rf"^swarmctl {verb}\b"):
-        done = run(order, "--run-dir", str(directory))
-        assert done.returncode == 0, f"{order}: {done.stdout}{done.stderr}"
+    (order,) = shown(rf"^swarmctl {verb}\b")
+    done = run(order, "--run-dir", str(directory))
+    assert done.returncode == 0, f"{order}: {done.stdout}{done.stderr}"
 
 
 def test_vehicles_of_another_process(tmp_path: Path) -> None:
