@@ -156,7 +156,8 @@ def main() -> None:
         rows.append(row)
         with options.file.open("a") as file:
             file.write(json.dumps(row) + "\n")
-    body_m, least_m = Config().separation.body_m, Config().limits.min_separation_m
+    given = load(options.config)
+    body_m, least_m = given.separation.body_m, given.limits.min_separation_m
     separation_m = [row["min_separation_m"] for row in rows]
     print(
         f"{len(rows)} flights, wind {options.wind:g} m/s: {sum(m < body_m for m in separation_m)} collisions, "

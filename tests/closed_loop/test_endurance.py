@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from swarmctl.core.types import Mode, Phase
-from tests.closed_loop.conftest import Flight, fly_now
+from tests.closed_loop.conftest import Flight, fly_now, mission_is_over
 
 PAIR = (
     "swarm.agents=2",
@@ -16,7 +16,7 @@ PAIR = (
     "mission.kind=line",
     "mission.line.velocity_ned_m_s=[0.0, 0.6, 0.0]",
     "mission.line.goal_assignment=true",
-    "mission.duration_s=8",
+    "mission.duration_s=5",
     "agent.failsafe.window_s=1",
     "sitl.battery.capacity_mah=3000",
 )
@@ -24,8 +24,8 @@ PAIR = (
 
 def drained(charge_01: float, *overrides: str) -> Flight:
     """Fly a pair; in the first seconds of the mission the battery of vehicle 0 is down to a charge."""
-    drain = f"sitl.faults=[{{kind='battery', vehicle=0, value={charge_01}, at_s=8.0}}]"
-    return fly_now(*PAIR, drain, *overrides)
+    drain = f"sitl.faults=[{{kind='battery', vehicle=0, value={charge_01}, at_s=6.0}}]"
+    return fly_now(*PAIR, drain, *overrides, until=None if not overrides else mission_is_over)
 
 
 def responses(flight: Flight, agent: int) -> list[str]:
@@ -52,6 +52,6 @@ def test_a_low_battery_brings_the_vehicle_back_under_its_own_plan(low: Flight) -
 
 
 def test_negative_control_with_the_actions_off_it_flies_on() -> None:
-    flight = drained(0.15, "agent.failsafe.battery_rtl_01=0", "agent.failsafe.battery_land_01=0")
+    flight = drained(0.15, "agent.failsafe.battery_rtl_01=0", "agent.failsafe.battery_land_01=0", "swarm.agents=1")
     assert flight.outcomes == {"completed"}
     assert responses(flight, 0) == ["WARN"]

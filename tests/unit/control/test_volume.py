@@ -10,6 +10,7 @@ from swarmctl.control.collision.volume_certificate import volume_margin_m
 from swarmctl.control.commit.trajectory_planner import CommitParams, DesiredReference, TrajectoryPlanner
 from swarmctl.control.controllers.discovery import ControllerParams, make_controller
 from swarmctl.control.controllers.kind import Controller
+from swarmctl.control.controllers.own import OwnController
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc import swarm_mpc
 from swarmctl.control.mpc.problem import Problem, Start
@@ -165,6 +166,33 @@ def test_the_certificate_refuses_what_rows_have_missed(monkeypatch: pytest.Monke
     assert PlanStatus.NOT_CERTIFIED not in flown(controller(), OUTSIDE[0], seconds=3.0)[1]
 
 
+class Northward(OwnController):
+    """Tilts to the north, whatever comes."""
+
+    def commands(self, problem: Problem) -> Array:
+        return np.tile([-0.1, 0.0, GRAVITY_M_S2], (self.steps, 1))
+
+
+@pytest.mark.parametrize(
+    ("volume", "north_m", "is_flown"), [(VOLUME, 0.0, True), (VOLUME, 4.1, False), (None, 4.1, True)]
+)
+def test_an_own_controller_that_plans_to_leave_is_not_flown(
+    volume: FlightVolume | None, north_m: float, is_flown: bool
+) -> None:
+    flies = controller(f"{__name__}:Northward", volume)
+    here, points = np.array([north_m, 0.0, -2.0]), flies.longest + 1
+    plan = flies.plan(
+        Problem(
+            start=builders.start(t_us=0, pos_ned_m=here),
+            reference=Reference(np.tile(here, (points, 1)), np.zeros((points, 3)), 0.0),
+            disturbance_ned_m_s2=np.zeros(3),
+            keep_outs=(),
+            guess_ned_m=None,
+        )
+    )
+    assert plan.failure == ("" if is_flown else f"controller {__name__}:Northward plans to leave the flight volume")
+
+
 # -- guaranteed separation --------------------------------------------------------------------------------------------
 
 
@@ -203,6 +231,13 @@ def test_commitments_stay_inside(goal: tuple[float, ...]) -> None:
     assert float(VOLUME.beyond_m(after.pos_ned_m[-1])) >= -KEPT_M - 0.4, "it goes as far as it may"
 
 
+def test_proposals_that_rows_have_let_out_are_not_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(swarm_mpc, "faces_along", lambda volume, axes: None)
+    begin = resting(np.array([0.0, 0.0, -2.0]), UTC_US, 100_000)
+    after = committed_to(planner(), OUTSIDE[0], begin, 30)
+    assert float(VOLUME.beyond_m(after.pos_ned_m).max()) <= -CERTIFIED_M + 1e-6
+
+
 def test_negative_control_without_a_volume_commitments_lead_out() -> None:
     begin = resting(np.array([0.0, 0.0, -2.0]), UTC_US, 100_000)
     after = committed_to(planner(None), OUTSIDE[0], begin, 30)
@@ -238,9 +273,9 @@ def test_an_evasion_stays_inside_only_where_one_that_does_is_clear(
 
 def test_a_detour_does_not_lead_out_of_the_sides() -> None:
     """The shorter way round a disc near a side is outside."""
-    start, goal, discs = np.array([-3.0, 3.0]), np.array([3.0, 3.0]), np.array([[0.0, 2.6, 1.0]])
+    start, goal, discs = np.array([-3.0, 3.4]), np.array([3.0, 3.4]), np.array([[0.0, 3.0, 1.0]])
     free = shortest_path(start, goal, discs, 0.3)
-    assert free.corners[:, 1].max() > VOLUME.planned_m[1:2].max(initial=3.7) - 0.5
+    assert free.corners[:, 1].max() > 4.0 - KEPT_M
     kept = shortest_path(start, goal, discs, 0.3, sides=VOLUME.planned_sides)
     heights = np.full((len(kept.corners), 1), -2.0)
     assert float(VOLUME.beyond_plans_m(np.hstack([kept.corners, heights])).max()) <= 0.0
