@@ -150,7 +150,7 @@ def test_runs_are_set_beside_each_other(folder: Path, shared: Path, capsys: pyte
     for title in ("Distances to the reference, summed over agents [m]", "Smallest distance between two agents [m]"):
         assert [css(agent_rgb(k)) in drawn[title] for k in range(2)] == [True, True]
     assert page.count("From above: north up, east right [m]") == 2
-    (cells,) = re.findall(r"<td>summed mean tracking error</td>(.*?)</tr>", page)
+    (cells,) = re.findall(r"<td>summed mean tracking error[^<]*</td>(.*?)</tr>", page)
     first, second, change = re.findall(r"<td class=n>(.*?)</td>", cells)
     expected = float(second.split()[0]) / float(first.split()[0]) - 1.0
     assert float(change.rstrip("%")) / 100 == pytest.approx(expected, abs=0.002)
