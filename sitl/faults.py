@@ -122,16 +122,16 @@ _ADD_UP = frozenset({"estimator_jump", "gust", "wind"})
 
 
 class Faults:
-    """Begins and ends the faults of one world.
+    """Begins and ends the faults of one world, whose vehicles are numbered from `first` on in faults and events.
 
     Attributes:
         on_event: called at every begin and end with name, time since boot [us] and fields.
     """
 
-    def __init__(self, world: FaultTarget, scheduled: Iterable[FaultParams], vehicles: int) -> None:
+    def __init__(self, world: FaultTarget, scheduled: Iterable[FaultParams], vehicles: int, first: int = 0) -> None:
         self.on_event: Callable[[str, int, dict[str, Any]], None] = lambda name, t_us, fields: None
         self._world = world
-        self._vehicles = vehicles
+        self._vehicles, self._first = vehicles, first
         self._waiting = sorted(scheduled, key=lambda fault: fault.at_s)
         self._running: dict[tuple[Any, ...], tuple[int, FaultParams, int, Undo]] = {}
         self._next_us = self._earliest_us()
@@ -155,7 +155,7 @@ class Faults:
         self._next_us = self._earliest_us()
 
     def _begin(self, fault: FaultParams, now_us: int) -> None:
-        for vehicle in range(self._vehicles) if fault.vehicle == EVERY_VEHICLE else (fault.vehicle,):
+        for vehicle in range(self._vehicles) if fault.vehicle == EVERY_VEHICLE else (fault.vehicle - self._first,):
             key: tuple[Any, ...] = (fault.kind, vehicle, fault.rotor, fault.direction)
             if fault.kind in _ADD_UP:
                 key = (*key, now_us, len(self._running))
@@ -173,7 +173,7 @@ class Faults:
         return min(ends + starts, default=_NEVER_US)
 
     def _tell(self, name: str, now_us: int, fault: FaultParams, vehicle: int) -> None:
-        fields = {"kind": fault.kind, "vehicle": vehicle, "value": fault.amount, "for_s": fault.for_s}
+        fields = {"kind": fault.kind, "vehicle": self._first + vehicle, "value": fault.amount, "for_s": fault.for_s}
         self.on_event(name, now_us, fields)
 
 

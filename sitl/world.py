@@ -124,7 +124,7 @@ class SitlWorld:
         problems = [problem for fault in params.faults for problem in self.can(fault)]
         if problems:
             raise ConfigError("sitl", problems)
-        self.faults = Faults(self, params.faults, count)
+        self.faults = Faults(self, params.faults, count, params.first_vehicle)
 
     def step(self, now_us: int) -> None:
         """Do one physics step that ends at `now_us` (monotonic); then send everything due, stamped with it."""
@@ -202,7 +202,7 @@ class SitlWorld:
         """Return true states (N,) of `TRUTH_DTYPE`, shared frame."""
         rows = np.zeros(self.params.vehicles, TRUTH_DTYPE)
         rows["t_us"] = self._now_us
-        rows["vehicle"] = np.arange(self.params.vehicles)
+        rows["vehicle"] = np.arange(self.params.vehicles) + self.params.first_vehicle
         rows["pos_ned_m"] = self.plant.pos_ned_m.T + self._offset_ned_m
         rows["vel_ned_m_s"] = self.plant.vel_ned_m_s.T
         rows["q_nb"] = self.plant.q_nb.T

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any, Literal
@@ -19,6 +19,7 @@ from pydantic import Field
 
 from swarmctl.agent.setup import AgentParams
 from swarmctl.bus.json_messages import MAX_OBSTACLES
+from swarmctl.bus.network.hosts import HostParams, host_problems
 from swarmctl.config_problems import validated
 from swarmctl.config_shows import read_show
 from swarmctl.config_source import override, read_tree, set_value
@@ -37,8 +38,8 @@ from swarmctl.mavlink.geofence import GeofenceParams, is_inside
 from swarmctl.mavlink.parameter_names import parameter_problems
 from swarmctl.mavlink.transport import Endpoint, parse_url
 from swarmctl.own_modules import locate, make_importable, own_problems
-from swarmctl.signing_keys import key_problems, locate_keys
-from swarmctl.simulator_config import MAX_VEHICLES, OriginParams, SimulatorConfig, SimulatorParams
+from swarmctl.signing_keys import key_problems, locate_identities, locate_keys
+from swarmctl.simulator_config import EVERY_VEHICLE, MAX_VEHICLES, OriginParams, SimulatorConfig, SimulatorParams
 from swarmctl.telemetry.evaluation.referee import JudgedObstacle, Rules
 
 MAX_AGENTS = MAX_VEHICLES
@@ -96,6 +97,7 @@ class SitlParams(SimulatorParams):
 class BusParams(Params):
     """Parameters of the Zenoh bus, and the seeded faults of the lockstep bus."""
 
+    identities: str = ""  # folder written by swarmctl keys init; needed by swarmctl host and station only
     lease_ms: int = Field(1500, ge=500, le=10000)  # silence after which Zenoh closes a link
     delay_ms: float = Field(0.0, ge=0, le=5000)  # lockstep only, on top of one tick
     loss_01: float = Field(0.0, ge=0, le=1)  # lockstep only
@@ -134,6 +136,7 @@ class Config(Params):
     vehicle_model: VehicleModelParams = VehicleModelParams()
     agent: AgentParams = AgentParams()
     vehicles: tuple[VehicleParams, ...] = Field((), strict=False)
+    hosts: tuple[HostParams, ...] = Field((), strict=False)
     volume: VolumeParams = VolumeParams()
     mavlink: MavlinkParams = MavlinkParams()
     geofence: GeofenceParams = GeofenceParams()
@@ -171,20 +174,29 @@ class Config(Params):
         own = self.vehicles[agent].model if self.vehicles else None
         return own or self.vehicle_model
 
-    def simulator(self) -> SimulatorConfig:
+    def simulator(self, agents: Sequence[int] = ()) -> SimulatorConfig:
         """Return what the simulator of this run is told.
+
+        Args:
+            agents: numbers, one after the other, of those whose vehicles are simulated; none given: all.
 
         Raises:
             ConfigError: it can't be simulated.
         """
-        spawns_ned_m = self.starts_ned_m()
+        first, count = (agents[0], len(agents)) if agents else (0, self.swarm.agents)
+        own = slice(first, first + count)
+        spawns_ned_m = self.starts_ned_m()[own]
         if self.sitl.start == "ground":
             spawns_ned_m = tuple((x, y, self.sitl.ground_z_m) for x, y, _ in spawns_ned_m)
         keys = {key: getattr(self.sitl, key) for key in SimulatorParams.model_fields}
         keys |= {key: getattr(self.swarm, key) for key in OriginParams.model_fields}
-        keys |= {"vehicles": self.swarm.agents, "spawn_ned_m": spawns_ned_m, "seed": self.seed}
-        signed = self.mavlink.signing_keys[: self.swarm.agents]
-        keys |= {"signing_keys": signed if len(signed) == self.swarm.agents else ()}  # too few are refused elsewhere
+        keys |= {"vehicles": count, "spawn_ned_m": spawns_ned_m, "seed": self.seed}
+        keys |= {"first_vehicle": first, "sysid_base": first + 1}
+        signed = self.mavlink.signing_keys[own]
+        keys |= {"signing_keys": signed if len(signed) == count else ()}  # too few are refused elsewhere
+        if agents:  # of one computer; the others simulate theirs
+            here = (EVERY_VEHICLE, *agents)
+            keys |= {"faults": tuple(fault for fault in self.sitl.faults if fault.vehicle in here)}
         return validated(SimulatorConfig, keys, "sitl")
 
     def rules(self, mode: Literal["realtime", "lockstep"] = "realtime") -> Rules:
@@ -207,7 +219,7 @@ def load(
     overrides: Sequence[str] = (),
     values: Mapping[str, Any] = NO_VALUES,
     *,
-    only_agent: int | None = None,
+    only_agents: Collection[int] | None = None,
 ) -> Config:
     """Read, override and check a configuration.
 
@@ -215,7 +227,7 @@ def load(
         path: a TOML file; None for the defaults.
         overrides: `key.sub=value` items, values in TOML syntax (bare words are strings); list items by index.
         values: values by dotted key, set after `overrides`.
-        only_agent: the only agent that is to run on this computer, which has its vehicle's signing key; None: all.
+        only_agents: the agents that are to run on this computer, which has their vehicles' signing keys; None: all.
 
     Raises:
         ConfigError: the configuration is invalid; lists all problems with key, value, allowed range and fix.
@@ -230,10 +242,11 @@ def load(
         raise ConfigError(source, problems)
     locate(tree, folder)
     locate_keys(tree, folder)
+    locate_identities(tree, folder)
     config = validated(Config, tree, source, _RENAMED)
     make_importable(config.own_folder)
     problems = list(own_problems(config.mission, config.controller, config.vehicle_model, config.separation))
-    problems = problems or list(_whole(config, only_agent)) or list(_infeasible(config))
+    problems = problems or list(_whole(config, only_agents)) or list(_infeasible(config))
     if problems:
         raise ConfigError(source, problems)
     return config
@@ -261,7 +274,7 @@ def dump(config: Config) -> str:
     return tomli_w.dumps(config.model_dump(exclude_none=True))
 
 
-def _whole(config: Config, only_agent: int | None) -> Iterator[str]:
+def _whole(config: Config, only_agents: Collection[int] | None) -> Iterator[str]:
     """Yield problems between keys and sections, and of files."""
     agents = config.swarm.agents
     listed = len(config.start.positions_ned_m)
@@ -278,7 +291,9 @@ def _whole(config: Config, only_agent: int | None) -> Iterator[str]:
         except ConfigError as error:
             yield from (f"sitl.{problem}" for problem in error.problems)
     yield from _vehicle_problems(config)
-    yield from key_problems(config.mavlink.signing_keys, agents, only_agent)
+    yield from host_problems(config.hosts, agents)
+    yield from _simulated_host_problems(config)
+    yield from key_problems(config.mavlink.signing_keys, agents, only_agents)
     if len(config.obstacles) > MAX_OBSTACLES:
         yield f"obstacles: {len(config.obstacles)} are listed, agents keep {MAX_OBSTACLES} at most"
     yield from parameter_problems(config.agent.autopilot_params)
@@ -396,6 +411,15 @@ def _vehicle_problems(config: Config) -> Iterator[str]:
                 "give every autopilot its own MAV_SYS_ID"
             )
         seen_sysids.setdefault(vehicle.sysid, i)
+
+
+def _simulated_host_problems(config: Config) -> Iterator[str]:
+    for i, host in enumerate(config.hosts if config.sitl.enabled else ()):
+        if list(host.agents) != list(range(host.agents[0], host.agents[0] + len(host.agents))):
+            yield (
+                f"hosts.{i}.agents = {list(host.agents)}: a host simulates vehicles that follow one another; "
+                "list numbers without gaps"
+            )
 
 
 def _same_place(a: Endpoint, b: Endpoint) -> bool:

@@ -5,7 +5,7 @@ The resolved configuration holds their absolute names, never a key.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -31,19 +31,27 @@ def locate_keys(tree: dict[str, Any], folder: Path) -> None:
         section["signing_keys"] = [str((folder / name).absolute()) if name else name for name in names]
 
 
-def key_problems(names: Sequence[str], agents: int, only: int | None = None) -> Iterator[str]:
+def locate_identities(tree: dict[str, Any], folder: Path) -> None:
+    """Make the name of the folder of identities absolute; arguments as of `locate_keys`."""
+    section = tree.get("bus")
+    name = section.get("identities") if isinstance(section, dict) else None
+    if isinstance(section, dict) and isinstance(name, str) and name:
+        section["identities"] = str((folder / name).absolute())
+
+
+def key_problems(names: Sequence[str], agents: int, only: Collection[int] | None = None) -> Iterator[str]:
     """Yield why the named files are not a key for each of so many vehicles; none for no names.
 
     Args:
         names: files in the order of the agents.
         agents: number of agents.
-        only: the one agent whose key is needed here; None: all.
+        only: the agents whose keys are needed here; None: all.
     """
     if names and len(names) < agents:
         yield f"{KEY}: {len(names)} files for swarm.agents = {agents}; list one for each vehicle (swarmctl keys new)"
     owners: dict[str, int] = {}
     for number, name in enumerate(names[:agents]):
-        if only not in (None, number):
+        if only is not None and number not in only:
             continue
         try:
             fingerprint = read_key(Path(name)).fingerprint
@@ -75,6 +83,6 @@ def read_own_key(names: Sequence[str], agent: int) -> SigningKey | None:
     Raises:
         ConfigError: its file can't be used.
     """
-    if problems := list(key_problems(names, agent + 1, only=agent)):
+    if problems := list(key_problems(names, agent + 1, only=(agent,))):
         raise ConfigError("signing keys", problems)
     return read_key(Path(names[agent])) if names else None

@@ -106,11 +106,12 @@ class FaultParams(Params):
         """Return the value, or the default of the kind."""
         return self.value if self.value is not None else FAULTS[self.kind].default or 0.0
 
-    def problems(self, vehicles: int) -> Iterator[str]:
-        """Yield what the kind or the number of vehicles does not allow."""
+    def problems(self, vehicles: int, first: int = 0) -> Iterator[str]:
+        """Yield what the kind or the numbers of the vehicles, which begin at `first`, do not allow."""
         rule = FAULTS[self.kind]
-        if self.vehicle >= vehicles:
-            yield f"vehicle = {self.vehicle}: allowed: 0 to {vehicles - 1}, or {EVERY_VEHICLE} for all"
+        if self.vehicle != EVERY_VEHICLE and not first <= self.vehicle < first + vehicles:
+            last = first + vehicles - 1
+            yield f"vehicle = {self.vehicle}: allowed: {first} to {last}, or {EVERY_VEHICLE} for all"
         if self.value is None and rule.default is None:
             yield f"value: missing; {self.kind} takes {rule.low:g} to {rule.high:g} ({rule.meaning})"
         elif self.value is not None and not rule.low <= self.value <= rule.high:
@@ -164,6 +165,7 @@ class SimulatorConfig(SimulatorParams, OriginParams):
     spawn_ned_m: tuple[_Spawn, ...] = Field((), strict=False)  # shared frame, one each; empty: along x, 1 m apart
     seed: int = Field(1, ge=0, le=2**31 - 1)
     sysid_base: int = Field(1, ge=1, le=255)  # MAVLink system id of the first vehicle
+    first_vehicle: int = Field(0, ge=0, lt=MAX_VEHICLES)  # number of the first vehicle in true states and faults
     signing_keys: tuple[str, ...] = Field((), strict=False)  # key files, one each; none: vehicles sign once set up
 
     @model_validator(mode="after")
@@ -181,7 +183,7 @@ class SimulatorConfig(SimulatorParams, OriginParams):
         if len(self.signing_keys) not in (0, self.vehicles):
             yield f"signing_keys: {len(self.signing_keys)} files; allowed: one for each of {self.vehicles} vehicles"
         for number, fault in enumerate(self.faults):
-            yield from (f"faults.{number}.{problem}" for problem in fault.problems(self.vehicles))
+            yield from (f"faults.{number}.{problem}" for problem in fault.problems(self.vehicles, self.first_vehicle))
 
     def spawns_ned_m(self) -> tuple[Vec3, ...]:
         """Return the position at which each vehicle begins, shared NED [m]."""

@@ -111,7 +111,7 @@ def run_agent(process: AgentProcess) -> int:
         ConfigError: the configuration is not valid.
     """
     agent = process.agent
-    config = load(process.config_path, only_agent=agent)
+    config = load(process.config_path, only_agents=(agent,))
     if not 0 <= agent < config.swarm.agents:
         raise StartError(f"--id {agent}: allowed: 0..{config.swarm.agents - 1} (swarm.agents)")
     stop = StopRequest(signal.SIGTERM, signal.SIGINT, signal.SIGHUP)

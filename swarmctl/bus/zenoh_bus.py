@@ -1,19 +1,14 @@
-"""The Zenoh bus: a client for agents and operators, and the router process that connects them.
+"""The Zenoh bus: a client of the router (`swarmctl.bus.network.router`) that connects agents and operators.
 
 It uses one Unix socket in a private directory, without port or discovery. Samples wait in one ring for each topic and
 sender until the tick drains them: no callback and no FIFO could block reception. `swarmctl.bus.peers` judges freshness
 from the payload; nothing here looks into a payload.
-
-`python -m swarmctl.bus.zenoh_bus --router unixsock-stream/DIR/bus.sock` is the router.
 """
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import json
-import signal
-import sys
 import threading
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -23,9 +18,7 @@ from typing import Any
 import zenoh
 
 from swarmctl.bus.topics import TOO_LONG, TOPICS, Topic
-from swarmctl.errors import StartError, SwarmError
-from swarmctl.process_lifetime import die_with_parent, remove_socket
-from swarmctl.process_priority import request_realtime
+from swarmctl.errors import StartError
 
 SCHEME = "unixsock-stream/"
 NO_BUS = "none"  # endpoint of an agent without a bus
@@ -36,7 +29,7 @@ _ALIVE_RING = 1024
 _OPEN_TIMEOUT_MS = 2000
 _MAX_SOCKET_PATH = 100  # sun_path is 108 bytes
 
-_COMMON: dict[str, Any] = {
+COMMON_SETTINGS: dict[str, Any] = {
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
     "transport/unicast/open_timeout": _OPEN_TIMEOUT_MS,
@@ -109,7 +102,7 @@ class ZenohBus:
 
     def close(self) -> None:
         """Leave the bus; give up after `CLOSE_DEADLINE_S`, since a link without its other end can block."""
-        _close_within(self._session, CLOSE_DEADLINE_S)
+        close_within(self._session, CLOSE_DEADLINE_S)
 
     def _watch_tokens(self) -> None:
         for sample in _drain(self._token_samples, _ALIVE_RING):
@@ -132,31 +125,6 @@ class ZenohBus:
         )
 
 
-def run_router(endpoint: str, realtime: bool = False) -> None:
-    """Run the router until SIGTERM, which the caller has blocked, then remove the socket and its directory.
-
-    Args:
-        endpoint: a Unix socket in a private directory.
-        realtime: ask to be scheduled before other programs.
-
-    Raises:
-        StartError: the endpoint is not a Unix socket in a private directory, or another router holds it.
-    """
-    socket_path = _private_socket(endpoint)
-    zenoh.init_log_from_env_or("error")
-    settings = _COMMON | {"mode": "router", "listen/endpoints": [endpoint], "scouting/delay": 0}
-    try:
-        session = _open(settings)
-    except zenoh.ZError as error:
-        raise StartError(f"bus endpoint {endpoint!r}: can't be opened: {error}. Is another router using it?") from error
-    if realtime:
-        request_realtime()
-    print(f"router ready {endpoint}", flush=True)
-    signal.sigwait({signal.SIGTERM})
-    _close_within(session, CLOSE_DEADLINE_S)
-    remove_socket(socket_path)
-
-
 def socket_file(endpoint: str) -> Path:
     """Return the path of a Unix socket endpoint.
 
@@ -173,19 +141,8 @@ def socket_file(endpoint: str) -> Path:
     return Path(path)
 
 
-def _private_socket(endpoint: str) -> Path:
-    path = socket_file(endpoint)
-    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    if path.parent.stat().st_mode & 0o077:
-        raise StartError(
-            f"bus endpoint {endpoint!r}: {path.parent} is open to other users, who could fly the swarm; "
-            "use a directory of mode 0700"
-        )
-    return path
-
-
 def _open_client(endpoint: str, lease_ms: int, timeout_ms: int) -> Any:
-    settings = _COMMON | {
+    settings = COMMON_SETTINGS | {
         "mode": "client",
         "connect/endpoints": [endpoint],
         "connect/timeout_ms": timeout_ms,
@@ -194,15 +151,20 @@ def _open_client(endpoint: str, lease_ms: int, timeout_ms: int) -> Any:
         "transport/link/tx/lease": lease_ms,
     }
     try:
-        return _open(settings)
+        return open_session(settings)
     except zenoh.ZError as error:
         raise StartError(
             f"bus endpoint {endpoint!r}: no router answers within {timeout_ms / 1000:.1f} s. "
-            f"Start one with: python -m swarmctl.bus.zenoh_bus --router {endpoint}"
+            f"Start one with: python -m swarmctl.bus.network.router {endpoint}"
         ) from error
 
 
-def _open(settings: Mapping[str, Any]) -> Any:
+def open_session(settings: Mapping[str, Any]) -> Any:
+    """Open a session of Zenoh with these settings.
+
+    Raises:
+        zenoh.ZError: it can't be opened.
+    """
     config = zenoh.Config()
     for key, value in settings.items():
         config.insert_json5(key, json.dumps(value))
@@ -218,7 +180,9 @@ def _drain(subscriber: Any, limit: int) -> list[Any]:
     return samples
 
 
-def _close_within(session: Any, deadline_s: float) -> None:
+def close_within(session: Any, deadline_s: float) -> None:
+    """Close a session; give up after the deadline, since a link without its other end can block."""
+
     def close() -> None:
         with contextlib.suppress(zenoh.ZError):
             session.close()
@@ -226,28 +190,3 @@ def _close_within(session: Any, deadline_s: float) -> None:
     closer = threading.Thread(target=close, name="bus-close", daemon=True)
     closer.start()
     closer.join(deadline_s)
-
-
-def main() -> int:
-    """Run the router process from the command line."""
-    parser = argparse.ArgumentParser(prog="python -m swarmctl.bus.zenoh_bus", description="Router of one swarm's bus.")
-    parser.add_argument("--router", required=True, metavar="ENDPOINT", help=f"{SCHEME}/DIR/bus.sock")
-    parser.add_argument("--die-with-parent", action="store_true", help="end when the parent process ends")
-    parser.add_argument(
-        "--realtime", action=argparse.BooleanOptionalAction, default=False, help="be scheduled before other programs"
-    )
-    arguments = parser.parse_args()
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})  # for sigwait; zenoh's threads inherit the mask
-    if arguments.die_with_parent:
-        die_with_parent(signal.SIGTERM)
-    try:
-        run_router(arguments.router, arguments.realtime)
-    except SwarmError as error:
-        print(error, file=sys.stderr)
-        return error.exit_code
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -20,6 +20,7 @@ from swarmctl.core.text import printable_lines
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, ConfigError, SwarmError
 from swarmctl.ops.verbs.configuration import config_app
 from swarmctl.ops.verbs.folders import add_folder_verbs
+from swarmctl.ops.verbs.hosts import add_host_verbs
 from swarmctl.ops.verbs.keys import keys_app
 from swarmctl.ops.verbs.obstacles import obstacle_app
 from swarmctl.ops.verbs.orders import Run, add_order_verbs
@@ -208,6 +209,9 @@ def agent(
             realtime=realtime,
         )
     )
+
+
+add_host_verbs(app)
 
 
 @app.command()

@@ -10,9 +10,12 @@ import shutil
 import signal
 import tempfile
 import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from swarmctl.bus.network.router_links import RouterLinks
 from swarmctl.bus.peers import agent_name
 from swarmctl.bus.topics import OBSTACLES, OPERATOR, STATUS
 from swarmctl.bus.zenoh_bus import NO_BUS, SCHEME, ZenohBus, socket_file
@@ -34,7 +37,7 @@ from swarmctl.ops.processes import (
     viewer_command,
     wants_realtime,
 )
-from swarmctl.ops.status_table import Display, open_display
+from swarmctl.ops.status_table import open_display
 from swarmctl.ops.summary import sum_up
 from swarmctl.ops.supervisor import FlightSupervisor, Services
 from swarmctl.process_lifetime import StopRequest
@@ -56,34 +59,68 @@ class LaunchOptions:
     view: bool = False  # open the viewer window
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SwarmPart:
+    """The part of a swarm that flies from one computer; all of it where no other one takes part.
+
+    Attributes:
+        run: name of the run on the bus, the same on every computer.
+        agents: numbers of the agents here.
+        links: links of the router to other computers, None without any.
+    """
+
+    run: str
+    agents: tuple[int, ...]
+    links: RouterLinks | None = None
+
+
 def launch(config: Config, options: LaunchOptions) -> int:
-    """Fly a configuration and return the exit code.
+    """Fly a configuration from this computer alone and return the exit code.
+
+    Raises:
+        ConfigError, StartError: it was refused, or did not come up; nothing is left running.
+    """
+    part = SwarmPart(run=run_name(config.name), agents=tuple(range(config.swarm.agents)))
+    return launch_part(config, options, part)
+
+
+def launch_part(config: Config, options: LaunchOptions, part: SwarmPart) -> int:
+    """Fly the agents of this computer and return the exit code.
 
     Raises:
         ConfigError, StartError: it was refused, or did not come up; nothing is left running.
     """
     with StopRequest(signal.SIGINT, signal.SIGTERM, signal.SIGHUP) as stop:
-        reserved = inspect(config)
-        try:
-            directory = _run_folder(config, options)
-        except BaseException:
-            reserved.release()
-            raise
-        run = run_name(config.name)
-        display = open_display(run=run)
-        services = Launcher(config, options, reserved, directory, run=run, display=display)
-        grace_s = _LAND_S  # after a failure from here on, agents still get time to land
-        try:
-            services.start()
-            result = FlightSupervisor(config, services, display).fly(lambda: stop.count)
-            grace_s = 0.0  # every agent has ended
-        finally:
-            services.stop(grace_s)
-            display.close()
+        with started(config, options, part) as services:
+            result = FlightSupervisor(config, services, services.display).fly(lambda: stop.count)
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a terminal that closes now must not lose the result
     # From here on Ctrl-C acts as usual: nothing is left to land.
-    violated = sum_up(config, directory, result, display.print_line)
+    violated = sum_up(config, services.context, result, services.display.print_line)
     return result.exit_code(violated)
+
+
+@contextmanager
+def started(config: Config, options: LaunchOptions, part: SwarmPart) -> Iterator[Launcher]:
+    """Start the processes of this computer, and stop them at the end.
+
+    Raises:
+        ConfigError, StartError: it was refused, or did not come up; nothing is left running.
+    """
+    reserved = inspect(config, part.agents)
+    try:
+        directory = _run_folder(config, options)
+    except BaseException:
+        reserved.release()
+        raise
+    services = Launcher(config, options, reserved, directory, part=part)
+    grace_s = _LAND_S  # after a failure from here on, agents still get time to land
+    try:
+        services.start()
+        yield services
+        grace_s = 0.0  # every agent has ended
+    finally:
+        services.stop(grace_s)
+        services.display.close()
 
 
 def _run_folder(config: Config, options: LaunchOptions) -> Path:
@@ -107,15 +144,15 @@ class Launcher(Services):
         reserved: ReservedPorts,
         directory: Path,
         *,
-        run: str,
-        display: Display,
+        part: SwarmPart,
     ) -> None:
         self._socket_dir = Path(tempfile.mkdtemp(prefix="swarm-"))  # mode 0700
         self._config = config
         self._options = options
         self._reserved = reserved
-        self._display = display
-        self.context = RunContext(run, f"{SCHEME}{self._socket_dir}/bus.sock", directory)
+        self.display = open_display(run=part.run)
+        self.context = RunContext(part.run, f"{SCHEME}{self._socket_dir}/bus.sock", directory, part.agents)
+        self._links = part.links
         self.log = EventLog(directory / "launch.events.jsonl", "launch")
         self.children: dict[str, Child] = {}
 
@@ -127,18 +164,18 @@ class Launcher(Services):
         """
         config, context, reserved = self._config, self.context, self._reserved
         socket_file(context.endpoint)
-        self._spawn(router_command(config, context.endpoint))
+        self._spawn(router_command(config, context, self._links))
         self.bus = self._join_bus()
         if reserved.view_port:
             self._spawn(viewer_command(config, context, reserved.view_port, self._options.view))
-        if config.sitl.enabled:
+        if config.sitl.enabled and context.agents:
             self._spawn(sitl_command(config, context, reserved.ports, reserved.vehicle_sockets))
         for command in agent_commands(config, context, reserved.sockets, reserved.vehicle_sockets):
             self._spawn(command)
         self.announce("")
         for line in _introduction(config, context, reserved):
-            self._display.print_line(line)
-        realtime = wants_realtime(config) and is_realtime_permitted()
+            self.display.print_line(line)
+        realtime = wants_realtime(config, context.agents) and is_realtime_permitted()
         self.log.write("started", run=context.run, ports=list(reserved.ports), realtime=realtime)
 
     def stop(self, agents_grace_s: float) -> None:
@@ -162,10 +199,12 @@ class Launcher(Services):
         endpoint = self.context.endpoint if router.poll() is None else NO_BUS
         directory = self.context.directory / "recovery"
         directory.mkdir(exist_ok=True)
-        context = RunContext(self.context.run, endpoint, directory)
-        ends = self._reserved.sockets, self._reserved.vehicle_sockets
+        context = RunContext(self.context.run, endpoint, directory, (agent,))
+        place = self.context.agents.index(agent)
+        own = slice(place, place + 1)
+        ends = self._reserved.sockets[own], self._reserved.vehicle_sockets[own]
         config_path = self.context.directory / "config.toml"
-        command = agent_commands(self._config, context, *ends, config_path=config_path)[agent]
+        (command,) = agent_commands(self._config, context, *ends, config_path=config_path)
         return Child(replace(command, argv=(*command.argv, "--only-land")), directory)
 
     def announce(self, view: str) -> None:
@@ -205,14 +244,15 @@ class Launcher(Services):
 
 def _introduction(config: Config, context: RunContext, reserved: ReservedPorts) -> tuple[str, ...]:
     """Return three lines that say what runs."""
-    agents = config.swarm.agents
+    agents = len(context.agents)
+    of = f" of {config.swarm.agents}" if agents < config.swarm.agents else ""
     if config.sitl.enabled:
         vehicles = f"built-in SITL ({config.sitl.preset}) on {LOOPBACK}"
     else:
-        vehicles = ", ".join(vehicle.url for vehicle in config.vehicles[:agents])
+        vehicles = ", ".join(config.vehicles[agent].url for agent in context.agents)
     view = f"view on port {reserved.view_port}" if reserved.view_port else "no view"
     return (
-        f"{context.run}: {agents} agent{'s' if agents > 1 else ''}, {vehicles}",
+        f"{context.run}: {agents}{of} agent{'s' if config.swarm.agents > 1 else ''}, {vehicles}",
         f"bus {context.endpoint}; {view}",
         f"run folder {context.directory}",
     )

@@ -10,7 +10,7 @@ import importlib.util
 import os
 import re
 import socket
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -47,15 +47,15 @@ class ReservedPorts:
             sock.close()
 
 
-def inspect(config: Config) -> ReservedPorts:
-    """Check everything, then bind the ports.
+def inspect(config: Config, agents: Sequence[int]) -> ReservedPorts:
+    """Check everything that these agents need on this computer, then bind the ports.
 
     Raises:
         StartError: with every problem, one line each: key, value, fix.
     """
     problems = list(_package_problems(config))
     sockets: tuple[socket.socket, ...] = ()
-    count = config.swarm.agents
+    count = len(agents)
     if config.sitl.enabled:
         if importlib.util.find_spec("sitl") is None:
             problems.append("sitl.enabled = true: package 'sitl' is not installed; install the whole distribution")
@@ -64,7 +64,7 @@ def inspect(config: Config) -> ReservedPorts:
         except StartError as error:
             problems.append(str(error))
     else:
-        problems += _vehicle_problems(config)
+        problems += _vehicle_problems(config, agents)
     view_port = next(free_view_ports(config.telemetry.port), 0) if config.telemetry.enabled else 0
     if config.telemetry.enabled and not view_port:
         problems.append(
@@ -105,10 +105,11 @@ def _package_problems(config: Config) -> Iterator[str]:
             yield f"package {name} = {found}: too old; pip install '{name}>={wanted}'"
 
 
-def _vehicle_problems(config: Config) -> Iterator[str]:
-    for i, vehicle in enumerate(config.vehicles[: config.swarm.agents]):
+def _vehicle_problems(config: Config, agents: Sequence[int]) -> Iterator[str]:
+    for agent in agents:
+        vehicle = config.vehicles[agent]
         endpoint = parse_url(vehicle.url)
-        key = f"vehicles.{i}.url = {vehicle.url!r}"
+        key = f"vehicles.{agent}.url = {vehicle.url!r}"
         if endpoint.scheme == "serial":
             device = Path(endpoint.where)
             if not device.exists():

@@ -20,6 +20,7 @@ from pathlib import Path
 
 import psutil
 
+from swarmctl.bus.network.router_links import RouterLinks
 from swarmctl.bus.peers import agent_name
 from swarmctl.bus.zenoh_bus import socket_file
 from swarmctl.config import Config
@@ -46,11 +47,12 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class RunContext:
-    """Values that all command lines of a launch share: run name, bus endpoint, run folder."""
+    """Values that all command lines of a launch share: run name, bus endpoint, run folder, agents of this computer."""
 
     run: str
     endpoint: str
     directory: Path
+    agents: tuple[int, ...]
 
 
 def run_name(name: str) -> str:
@@ -58,17 +60,18 @@ def run_name(name: str) -> str:
     return f"{name}-{secrets.token_hex(4)}"
 
 
-def wants_realtime(config: Config) -> bool:
-    """Return whether the flight is to have real-time priority and leaves the processors some time for others."""
+def wants_realtime(config: Config, agents: Sequence[int]) -> bool:
+    """Return whether these agents are to have real-time priority and leave the processors some time for others."""
     if sys.platform != "linux":
         return False
-    return config.agent.realtime and config.swarm.agents <= _AGENTS_PER_PROCESSOR * len(os.sched_getaffinity(0))
+    return config.agent.realtime and len(agents) <= _AGENTS_PER_PROCESSOR * len(os.sched_getaffinity(0))
 
 
-def router_command(config: Config, endpoint: str) -> Command:
-    """Return the command of the bus router."""
-    argv = _python("-m", "swarmctl.bus.zenoh_bus", "--router", endpoint, "--die-with-parent", _priority_flag(config))
-    return Command(ROUTER, argv)
+def router_command(config: Config, context: RunContext, links: RouterLinks | None) -> Command:
+    """Return the command of the bus router, with its links to other computers if there are any."""
+    argv = _python("-m", "swarmctl.bus.network.router", context.endpoint, "--die-with-parent")
+    argv += links.arguments() if links is not None else ()
+    return Command(ROUTER, (*argv, _priority_flag(config, context)))
 
 
 def agent_commands(
@@ -79,24 +82,24 @@ def agent_commands(
     *,
     config_path: Path | None = None,
 ) -> tuple[Command, ...]:
-    """Return one agent command per vehicle.
+    """Return one command for each agent of this computer.
 
     Args:
         config: the configuration of the launch.
         context: the run.
-        sockets: the agents' ends of the vehicle links, which they inherit; empty for real vehicles.
+        sockets: these agents' ends of the vehicle links, which they inherit; empty for real vehicles.
         vehicles: the simulator's ends of these links, whose ports the agents are given.
         config_path: resolved configuration, when it is not in the run folder.
     """
     commands = []
-    for agent in range(config.swarm.agents):
+    for place, agent in enumerate(context.agents):
         argv = _python("-m", "swarmctl", "agent", "--config", f"{config_path or context.directory / 'config.toml'}")
         argv += ("--id", f"{agent}")
         argv += ("--run", context.run, "--bus", context.endpoint, "--run-dir", f"{context.directory}")
-        fds = (sockets[agent].fileno(),) if sockets else ()
+        fds = (sockets[place].fileno(),) if sockets else ()
         argv += ("--fd", f"{fds[0]}") if fds else ()
-        argv += ("--vehicle-port", f"{vehicles[agent].getsockname()[1]}") if vehicles else ()
-        argv += (_priority_flag(config),)
+        argv += ("--vehicle-port", f"{vehicles[place].getsockname()[1]}") if vehicles else ()
+        argv += (_priority_flag(config, context),)
         commands.append(Command(agent_name(agent), argv, fds))
     return tuple(commands)
 
@@ -105,13 +108,15 @@ def sitl_command(
     config: Config, context: RunContext, ports: Sequence[int], sockets: Sequence[socket.socket] = ()
 ) -> Command:
     """Return the command of the built-in simulator, which sends from `sockets`, or own ports, to loopback `ports`."""
-    argv = _python("-m", "sitl", "--config-json", config.simulator().model_dump_json(exclude_defaults=True))
+    argv = _python(
+        "-m", "sitl", "--config-json", config.simulator(context.agents).model_dump_json(exclude_defaults=True)
+    )
     argv += ("--remote-ports", ",".join(str(port) for port in ports))
     fds = tuple(sock.fileno() for sock in sockets)
     argv += ("--local-fds", ",".join(map(str, fds))) if fds else ()
     argv += ("--control", f"{control_socket(context.endpoint)}")
     argv += ("--events", f"{context.directory / 'sitl.events.jsonl'}")
-    argv += ("--truth", f"{context.directory / 'truth.bin'}", "--die-with-parent", _priority_flag(config))
+    argv += ("--truth", f"{context.directory / 'truth.bin'}", "--die-with-parent", _priority_flag(config, context))
     return Command(SITL, argv, fds)
 
 
@@ -128,9 +133,9 @@ def viewer_command(config: Config, context: RunContext, port: int, view: bool) -
     return Command(VIEWER, argv + (("--view",) if view else ()))
 
 
-def _priority_flag(config: Config) -> str:
+def _priority_flag(config: Config, context: RunContext) -> str:
     """Return the flag of a process that delays setpoints, predicted paths or vehicle states when it has to wait."""
-    return "--realtime" if wants_realtime(config) else "--no-realtime"
+    return "--realtime" if wants_realtime(config, context.agents) else "--no-realtime"
 
 
 def _python(*arguments: str) -> tuple[str, ...]:

@@ -114,7 +114,7 @@ class FlightSupervisor:
         self._bus: Bus = services.bus
         self._display = display
         self._result = LaunchResult()
-        self._views = [AgentView(agent=agent) for agent in range(config.swarm.agents)]
+        self._views = [AgentView(agent=agent) for agent in services.context.agents]
         self._obstacles = first_list(config.obstacles, time.time_ns() // 1000)
         self._result.obstacles = _judged((), self._obstacles, 0)
         self._obstacles_said_s = 0.0
@@ -166,9 +166,9 @@ class FlightSupervisor:
     def _receive(self) -> None:
         for sender, payload in self._bus.receive(STATUS):
             status = decode_status(payload)
-            if status is None or not 0 <= status.agent < len(self._views) or sender != agent_name(status.agent):
+            view = next((view for view in self._views if status is not None and view.agent == status.agent), None)
+            if status is None or view is None or sender != agent_name(status.agent):
                 continue
-            view = self._views[status.agent]
             if view.status is None or view.status.phase != status.phase:
                 self._services.log.write("phase", agent=status.agent, phase=name_of(Phase, status.phase))
             view.status, view.received_s = status, time.monotonic()
@@ -229,13 +229,13 @@ class FlightSupervisor:
         """Tell the others that the process of an agent has ended, before another one is started in its place."""
         self._order(Order(EXCLUDE, {PEER: agent}), [view for view in self._running() if view.agent != agent])
 
-    def _order(self, order: Order, views: list[AgentView]) -> None:
-        """Give an order to all agents, stamped by the clocks of these. A repetition is another order, obeyed anew."""
+    def _order(self, order: Order, views: list[AgentView], agent: int = EVERYBODY) -> None:
+        """Give an order to an agent, or all, stamped by the clocks of these. A repetition is another, obeyed anew."""
         now_s = time.monotonic()
         clocks_us = [
             view.status.utc_us + round((now_s - view.received_s) * 1e6) for view in views if view.status is not None
         ]
-        for message in order_messages(numbered(order), EVERYBODY, time.time_ns() // 1000, clocks_us):
+        for message in order_messages(numbered(order), agent, time.time_ns() // 1000, clocks_us):
             self._bus.publish(COMMAND, message)
 
     def _recover(self, view: AgentView, code: int) -> None:
@@ -298,8 +298,11 @@ class FlightSupervisor:
         deaf = [
             view for view in running if view.status is None or view.status.phase < Phase.GOTO_LAND or view.status.held
         ]
-        if deaf:
+        if deaf and len(self._views) == self._config.swarm.agents:
             self._order(Order("land"), deaf)
+        elif deaf:  # agents of other computers fly on
+            for view in deaf:
+                self._order(Order("land"), [view], view.agent)
         for view in deaf:
             child = self._services.children[agent_name(view.agent)]
             if since_s > _LAND_OBEYED_S and self._is_first(f"{child.name} told by signal"):

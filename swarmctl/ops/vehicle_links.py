@@ -143,7 +143,8 @@ def _simulator(config: Config) -> Iterator[VehicleLinks]:
     ]
     directory = Path(tempfile.mkdtemp(prefix="swarm-check-"))
     children: list[Child] = []
-    context = RunContext(run_name(config.name), f"{SCHEME}{directory / 'bus.sock'}", directory)
+    agents = tuple(range(config.swarm.agents))
+    context = RunContext(run_name(config.name), f"{SCHEME}{directory / 'bus.sock'}", directory, agents)
     try:
         children.append(Child(sitl_command(config, context, ports), directory))
         yield VehicleLinks(links, _SIMULATOR_S, children[0])

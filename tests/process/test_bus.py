@@ -33,7 +33,7 @@ def until(condition: Callable[[], bool], timeout_s: float = WAIT_S) -> bool:
 
 
 def start_router(endpoint: str) -> subprocess.Popen[str]:
-    command = [sys.executable, "-m", "swarmctl.bus.zenoh_bus", "--router", endpoint, "--die-with-parent"]
+    command = [sys.executable, "-m", "swarmctl.bus.network.router", endpoint, "--die-with-parent"]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     assert process.stdout.readline().startswith("router ready")
@@ -257,7 +257,7 @@ def test_a_closed_bus_is_silent_and_never_raises(join: Callable[..., ZenohBus]) 
 
 
 def test_refusals_name_endpoint_and_fix(endpoint: str, tmp_path: Path) -> None:
-    with pytest.raises(StartError, match=r"absent.sock.*python -m swarmctl.bus.zenoh_bus --router"):
+    with pytest.raises(StartError, match=r"absent.sock.*python -m swarmctl.bus.network.router"):
         ZenohBus(f"{SCHEME}{tmp_path}/absent.sock", "run", "agent-0", {}, connect_timeout_ms=300)
     tmp_path.chmod(0o755)
     for bad, word in (
@@ -266,7 +266,7 @@ def test_refusals_name_endpoint_and_fix(endpoint: str, tmp_path: Path) -> None:
         (f"{SCHEME}/tmp/{'x' * 200}/bus.sock", "longer"),
         ("tcp/127.0.0.1:7447", SCHEME),
     ):
-        command = [sys.executable, "-m", "swarmctl.bus.zenoh_bus", "--router", bad]
+        command = [sys.executable, "-m", "swarmctl.bus.network.router", bad]
         answer = subprocess.run(command, capture_output=True, text=True, timeout=WAIT_S, check=False)
         assert answer.returncode == 3, answer
         assert word in answer.stderr
@@ -278,7 +278,7 @@ def test_router_ignores_ctrl_c_and_dies_with_a_killed_parent() -> None:
     endpoint = f"{SCHEME}{directory}/bus.sock"
     script = (
         "import subprocess, sys, time\n"
-        f"p = subprocess.Popen([sys.executable, '-m', 'swarmctl.bus.zenoh_bus', '--router', {endpoint!r}, "
+        f"p = subprocess.Popen([sys.executable, '-m', 'swarmctl.bus.network.router', {endpoint!r}, "
         "'--die-with-parent'], start_new_session=True)\nprint(p.pid, flush=True)\ntime.sleep(60)"
     )
     parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE, text=True)

@@ -150,10 +150,10 @@ def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Start) -> None:
     launched.until_phase("TRACK", 3)
     assert launched.verb("status").returncode == 0
     (started,) = launched.events("started")
-    realtime = is_realtime_permitted() and wants_realtime(load(None, ("swarm.agents=3",)))
+    realtime = is_realtime_permitted() and wants_realtime(load(None), range(3))
     assert started["realtime"] == realtime
     policy = os.SCHED_RR if realtime else os.SCHED_OTHER
-    for words in (["swarmctl.bus.zenoh_bus"], ["sitl"], *(["agent", "--id", str(i)] for i in range(3))):
+    for words in (["swarmctl.bus.network.router"], ["sitl"], *(["agent", "--id", str(i)] for i in range(3))):
         assert policies(launched.pid_of(*words)) == {policy}, words
     viewer = launched.pid_of("swarmctl.telemetry.view.viewer")
     assert policies(viewer) == {os.SCHED_OTHER}, "it waits for those that fly"
@@ -275,7 +275,7 @@ def a_killed_launcher_leaves_nothing(start: Start) -> None:
 
 
 def without_its_router_the_launch_lands_and_ends_as_failed(start: Start) -> None:
-    assert killed_part(start, "swarmctl.bus.zenoh_bus", *NEAR).landed() == {0: True, 1: True}
+    assert killed_part(start, "swarmctl.bus.network.router", *NEAR).landed() == {0: True, 1: True}
 
 
 def without_its_simulator_the_launch_ends_as_failed(start: Start) -> None:

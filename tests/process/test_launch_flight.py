@@ -55,7 +55,7 @@ class ScriptedServices(Services):
 
     def __init__(self, directory: Path, agents: Sequence[str], others: dict[str, str] | None = None) -> None:
         self.log = EventLog(directory / "launch.events.jsonl", "launch")
-        self.context = RunContext("run", "unixsock-stream//nowhere", directory)
+        self.context = RunContext("run", "unixsock-stream//nowhere", directory, tuple(range(len(agents))))
         scripts = {agent_name(i): script for i, script in enumerate(agents)} | (others or {ROUTER: FLIES_LONG})
         self.children = {
             name: Child(Command(name, (sys.executable, "-ESc", script)), directory) for name, script in scripts.items()

@@ -352,7 +352,7 @@ def test_key_files_are_checked_with_all_other_keys_and_only_their_names_are_kept
     assert len(refused.value.problems) == 3
     for word in ("mavlink.signing_keys.0", "has mode 0640", "mavlink.signing_keys.1", "No such file", "limits.min"):
         assert word in said
-    assert load(path, only_agent=2) == config, "the companion of one vehicle has its key alone"
+    assert load(path, only_agents=(2,)) == config, "the companion of one vehicle has its key alone"
     assert load(None, ["mavlink.signing_keys=[]"]).simulator().signing_keys == ()
 
 

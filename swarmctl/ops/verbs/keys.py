@@ -1,4 +1,4 @@
-"""The verbs of `swarmctl keys`, which make signing keys and give them to vehicles; heavy modules load inside them."""
+"""The verbs of `swarmctl keys`: signing keys of vehicles, identities of computers; heavy modules load inside them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import typer
 from swarmctl.errors import EXIT_OK, ConfigError
 
 keys_app = typer.Typer(
-    no_args_is_help=True, rich_markup_mode=None, help="Make MAVLink signing keys and give them to vehicles."
+    no_args_is_help=True, rich_markup_mode=None, help="Make signing keys of vehicles, and identities of computers."
 )
 
 
@@ -47,3 +47,18 @@ def keys_install(
     from swarmctl.ops.key_install import install
 
     return install(load(config, sets or ()), old or ())
+
+
+@keys_app.command("init")
+def keys_init(
+    config: Annotated[Path, typer.Argument(help="Configuration with [[hosts]] and bus.identities.")],
+    sets: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a configuration key; repeatable.")
+    ] = None,
+) -> int:
+    """Make an authority, and an identity for every host and the station; again, for those that were added."""
+    from swarmctl.ops.host import make_host_identities
+
+    folder, made = make_host_identities(config, sets or ())
+    print(f"{folder}: made {', '.join(made) or 'nothing: every host has an identity'}")
+    return EXIT_OK

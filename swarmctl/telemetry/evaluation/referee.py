@@ -62,6 +62,7 @@ class Rules:
     mode: Literal["realtime", "lockstep"] = "realtime"
     duration_s: float | None = None  # mission time that a completed run must have tracked
     volume: FlightVolume | None = None  # that nobody may leave
+    judged: tuple[int, ...] = ()  # agents that flew from the computer that recorded the run; (): all
     downwash: float = 1.0  # heights are divided by this in `scaled_min_m`, which is reported but not judged
 
 
@@ -157,7 +158,7 @@ def _evaluate_separation(tracks: Tracks, rules: Rules, clock: _MissionClock) -> 
     }
     scale = np.array([1.0, 1.0, 1.0 / rules.downwash])
     violations = []
-    for i, j in itertools.combinations(range(rules.agents), 2):
+    for i, j in itertools.combinations(rules.judged or range(rules.agents), 2):
         apart_m = tracks.pos_ned_m[:, i] - tracks.pos_ned_m[:, j]
         distance_m = np.linalg.norm(apart_m, axis=1)
         if not np.isfinite(distance_m).any():

@@ -392,7 +392,7 @@ def test_the_longest_good_message_of_every_topic_fits() -> None:
 
 def test_the_table_of_topics_is_all_that_the_router_loads_of_messages() -> None:
     """It passes payloads on unread: validation and numpy would be a third of its memory."""
-    code = "import sys, swarmctl.bus.zenoh_bus; print({'pydantic', 'numpy', 'msgspec'} & set(sys.modules))"
+    code = "import sys, swarmctl.bus.network.router; print({'pydantic', 'numpy', 'msgspec'} & set(sys.modules))"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "set()"
 

@@ -48,7 +48,7 @@ def test_vehicle_ports_are_held_and_are_not_those_every_simulator_sends_to() -> 
 
 
 def test_preflight_holds_the_ports_until_released() -> None:
-    ground = preflight.inspect(load(None, ["telemetry.enabled=false"]))
+    ground = preflight.inspect(load(None, ["telemetry.enabled=false"]), range(3))
     try:
         assert len(ground.ports) == 3
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as rival, pytest.raises(OSError):
@@ -64,7 +64,7 @@ def test_a_taken_view_port_is_stepped_over() -> None:
         taken.bind(("127.0.0.1", 0))
         taken.listen(1)
         port = taken.getsockname()[1]
-        ground = preflight.inspect(load(None, [f"telemetry.port={port}"]))
+        ground = preflight.inspect(load(None, [f"telemetry.port={port}"]), range(3))
         ground.release()
         assert port < ground.view_port < port + 50
 
@@ -81,7 +81,7 @@ def test_every_problem_at_once_and_nothing_kept(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(importlib.metadata, "version", version)
     monkeypatch.setattr(preflight, "free_view_ports", lambda _: iter(()))
     with pytest.raises(StartError) as caught:
-        preflight.inspect(load(None, ["telemetry.port=9876"]))
+        preflight.inspect(load(None, ["telemetry.port=9876"]), range(3))
     lines = str(caught.value).splitlines()
     assert len(lines) == 3
     assert "osqp = 0.6.7: too old; pip install 'osqp>=1.1'" in lines[0]
@@ -105,7 +105,7 @@ def vehicles(tmp_path: Path, url: str) -> Config:
 )
 def test_vehicle_links_are_tried(tmp_path: Path, url: str, word: str) -> None:
     with pytest.raises(StartError, match=word) as caught:
-        preflight.inspect(vehicles(tmp_path, url))
+        preflight.inspect(vehicles(tmp_path, url), (0,))
     assert "vehicles.0.url" in str(caught.value)
     assert url in str(caught.value)
 
@@ -114,7 +114,7 @@ def test_a_good_vehicle_port_is_left_free(tmp_path: Path) -> None:
     (held,) = preflight.claim_ports(1)
     port = held.getsockname()[1]
     held.close()
-    ground = preflight.inspect(vehicles(tmp_path, f"udpin://127.0.0.1:{port}"))
+    ground = preflight.inspect(vehicles(tmp_path, f"udpin://127.0.0.1:{port}"), (0,))
     assert ground.sockets == ()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as agent:
         agent.bind(("127.0.0.1", port))
@@ -122,7 +122,7 @@ def test_a_good_vehicle_port_is_left_free(tmp_path: Path) -> None:
 
 def test_command_lines_say_what_the_configuration_says(tmp_path: Path) -> None:
     config = load(None, ["swarm.agents=2", "start.spacing_m=1.5", "sitl.mass_scale=1.2", "seed=9"])
-    context = RunContext("run", "unixsock-stream//tmp/x/bus.sock", tmp_path)
+    context = RunContext("run", "unixsock-stream//tmp/x/bus.sock", tmp_path, (0, 1))
     sitl = sitl_command(config, context, (14540, 14541)).argv
     told = json.loads(sitl[sitl.index("--config-json") + 1])
     assert told == {"vehicles": 2, "spawn_ned_m": [[-0.75, 0, 2], [0.75, 0, 2]], "mass_scale": 1.2, "seed": 9}, (

@@ -129,7 +129,7 @@ def test_an_agent_needs_the_key_of_its_own_vehicle_alone(tmp_path: Path) -> None
     own = read_own_key(names, 1)
     assert own is not None
     assert own.secret == SECRET
-    assert not list(key_problems(names, 2, only=1))
+    assert not list(key_problems(names, 2, only=(1,)))
     with pytest.raises(ConfigError, match=r"elsewhere\.key"):
         read_own_key(names, 0)
     assert read_own_key((), 1) is None

@@ -25,7 +25,8 @@ def test_real_time_priority_is_wanted_where_processors_suffice(
     monkeypatch: pytest.MonkeyPatch, processors: int, sets: tuple[str, ...], wanted: bool
 ) -> None:
     monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(processors)))
-    assert wants_realtime(load(None, sets)) is wanted
+    config = load(None, sets)
+    assert wants_realtime(config, range(config.swarm.agents)) is wanted
 
 
 def test_the_last_words_of_a_process_control_no_terminal(tmp_path: Path) -> None:

@@ -48,7 +48,7 @@ def test_lockstep_flies_what_was_configured(config: Config) -> None:
 
 
 def test_a_launch_hands_everything_to_its_simulator(config: Config, tmp_path: Path) -> None:
-    context = RunContext("run", f"unixsock-stream/{tmp_path}/bus.sock", tmp_path)
+    context = RunContext("run", f"unixsock-stream/{tmp_path}/bus.sock", tmp_path, (0, 1, 2))
     argv = sitl_command(config, context, (1, 2, 3)).argv
     options = _parser().parse_args(list(argv[3:]))
     assert _config(options) == config.simulator() == Lockstep(config).world.params

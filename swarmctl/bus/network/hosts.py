@@ -1,0 +1,74 @@
+"""The computers of a swarm that flies from several: `[[hosts]]` of the configuration, and how their routers link up."""
+
+from __future__ import annotations
+
+import ipaddress
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import Field
+
+from swarmctl.bus.network.identity_files import AUTHORITY, STATION
+from swarmctl.bus.network.router_links import RouterLinks
+from swarmctl.core.params import Params
+
+_RESERVED = (AUTHORITY, STATION)
+
+
+class HostParams(Params):
+    """One computer of a swarm that flies from several, and its agents."""
+
+    name: str = Field(pattern=r"^[A-Za-z0-9_-]{1,40}$")  # of its identity, and in messages
+    address: str  # IP:PORT at which the routers of other computers reach its router, over UDP
+    agents: Annotated[tuple[int, ...], Field(strict=False, min_length=1)]  # numbers of those that run there
+
+
+def host_problems(hosts: Sequence[HostParams], agents: int) -> Iterator[str]:
+    """Yield why these hosts are not those of a swarm of so many agents; none for no hosts."""
+    for i, host in enumerate(hosts):
+        if host.name in _RESERVED:
+            yield f"hosts.{i}.name = {host.name!r}: reserved; choose another"
+        if problem := _address_problem(host.address):
+            yield f"hosts.{i}.address = {host.address!r}: {problem}; write IP:PORT, for example 192.168.1.20:7448"
+    for key, values in (("name", [h.name for h in hosts]), ("address", [h.address for h in hosts])):
+        yield from (f"hosts: {key} {value!r} is given {n} times" for value, n in Counter(values).items() if n > 1)
+    counts = Counter(agent for host in hosts for agent in host.agents)
+    if hosts and (missing := [agent for agent in range(agents) if not counts[agent]]):
+        yield f"hosts: agents {missing} run nowhere; list each of swarm.agents = {agents} at one host"
+    yield from (f"hosts: agent {agent} runs at {n} hosts; list it once" for agent, n in counts.items() if n > 1)
+    if unknown := sorted(agent for agent in counts if not 0 <= agent < agents):
+        yield f"hosts: there are no agents {unknown}; swarm.agents = {agents}"
+
+
+def links_of(hosts: Sequence[HostParams], name: str, identities: Path) -> RouterLinks:
+    """Return the links of a host's router, or of the station's.
+
+    Of two hosts the later in the list connects, so that there is one link for each pair; the station connects to all.
+    """
+    names = [host.name for host in hosts]
+    own = names.index(name) if name in names else len(hosts)
+    listen = hosts[own].address if own < len(hosts) else ""
+    connect = tuple(host.address for host in hosts[:own])
+    return RouterLinks(identities=identities, name=name, listen=listen, connect=connect)
+
+
+def ip_of(address: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:
+    """Return the IP of `IP:PORT`; IPv6 is in brackets.
+
+    Raises:
+        ValueError: it is not of this form.
+    """
+    ip, _, port = address.rpartition(":")
+    if not port.isascii() or not port.isdigit() or not 0 < int(port) < 65536:
+        raise ValueError(f"{port!r} is no port")
+    return ipaddress.ip_address(ip.removeprefix("[").removesuffix("]"))
+
+
+def _address_problem(address: str) -> str:
+    try:
+        ip_of(address)
+    except ValueError as error:
+        return str(error)
+    return ""

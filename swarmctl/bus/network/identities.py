@@ -1,0 +1,125 @@
+"""Makes the identities of a swarm's computers: an authority of its own, and what it signs for each of them.
+
+An identity is a certificate for the address of a computer, and its private key. Nobody else's authority counts, so who
+has no identity of the swarm is on none of its links.
+"""
+
+from __future__ import annotations
+
+import ipaddress
+from collections.abc import Mapping
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+from cryptography import x509
+from cryptography.hazmat.primitives import hashes, serialization
+from cryptography.hazmat.primitives.asymmetric import ec
+from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
+
+from swarmctl.bus.network.identity_files import AUTHORITY, certificate_file, key_file
+from swarmctl.errors import ConfigError
+from swarmctl.files import create_private, read_file
+
+_VALID = timedelta(days=3650)  # a swarm whose certificates expire in the field can't fly
+_BEFORE = timedelta(days=1)  # a clock may be behind
+_MOST_BYTES = 20_000
+_USAGES = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
+
+_Ip = ipaddress.IPv4Address | ipaddress.IPv6Address
+
+
+def make_identities(folder: Path, addresses: Mapping[str, _Ip | None]) -> list[str]:
+    """Make what is missing: the authority, and the identity of each computer; returns the names of those made.
+
+    Args:
+        folder: where the files are; it is made if need be.
+        addresses: IP of each computer by name; None for one that nobody connects to.
+
+    Raises:
+        ConfigError: a file can't be written or read, there are certificates but not the authority's key, or a
+            computer has an identity for another address.
+    """
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        signer = _authority(folder)
+        made = [name for name in addresses if not (folder / certificate_file(name)).exists()]
+        if moved := [name for name in addresses if name not in made and not _is_for(folder, name, addresses[name])]:
+            files = ", ".join(f"{certificate_file(name)} and {key_file(name)}" for name in moved)
+            raise ConfigError("keys init", [f"{', '.join(moved)}: another address now; remove {files} in {folder}"])
+        for name in made:
+            key = ec.generate_private_key(ec.SECP256R1())
+            certificate = _signed(name, key.public_key(), signer, addresses[name])
+            _write(folder, name, certificate, key)
+    except OSError as error:
+        raise ConfigError("keys init", [f"{error.filename}: {error.strerror}"]) from error
+    except ValueError as error:
+        raise ConfigError("keys init", [f"{folder}: holds a damaged certificate or key: {error}"]) from error
+    return made
+
+
+def _authority(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
+    """Return the authority of a folder, a new one in an empty folder."""
+    if not (folder / certificate_file(AUTHORITY)).exists():
+        new_key = ec.generate_private_key(ec.SECP256R1())
+        name = _common_name("swarm authority")
+        constraints = x509.BasicConstraints(ca=True, path_length=0)
+        certificate = _begun(name, name, new_key.public_key()).add_extension(constraints, critical=True)
+        signed = certificate.sign(new_key, hashes.SHA256())
+        _write(folder, AUTHORITY, signed, new_key)
+        return signed, new_key
+    if not (folder / key_file(AUTHORITY)).exists():
+        problem = f"{folder / key_file(AUTHORITY)} is not here; run this where the identities were made"
+        raise ConfigError("keys init", [problem])
+    secret = read_file(folder / key_file(AUTHORITY), _MOST_BYTES, private=True)
+    key = serialization.load_pem_private_key(secret, password=None)
+    if not isinstance(key, ec.EllipticCurvePrivateKey):
+        raise ValueError("the authority's key is of another kind")
+    return _read(folder, AUTHORITY), key
+
+
+def _signed(
+    name: str,
+    key: ec.EllipticCurvePublicKey,
+    signer: tuple[x509.Certificate, ec.EllipticCurvePrivateKey],
+    address: _Ip | None,
+) -> x509.Certificate:
+    authority, authority_key = signer
+    builder = _begun(_common_name(name), authority.subject, key)
+    builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
+    builder = builder.add_extension(x509.ExtendedKeyUsage(_USAGES), critical=False)
+    if address is not None:
+        builder = builder.add_extension(x509.SubjectAlternativeName([x509.IPAddress(address)]), critical=False)
+    return builder.sign(authority_key, hashes.SHA256())
+
+
+def _begun(subject: x509.Name, issuer: x509.Name, key: ec.EllipticCurvePublicKey) -> x509.CertificateBuilder:
+    now = datetime.now(UTC)
+    builder = x509.CertificateBuilder().subject_name(subject).issuer_name(issuer).public_key(key)
+    builder = builder.serial_number(x509.random_serial_number())
+    return builder.not_valid_before(now - _BEFORE).not_valid_after(now + _VALID)
+
+
+def _common_name(name: str) -> x509.Name:
+    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, name)])
+
+
+def _is_for(folder: Path, name: str, address: _Ip | None) -> bool:
+    """Return whether the certificate of a computer is for this address."""
+    try:
+        names = _read(folder, name).extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    except x509.ExtensionNotFound:
+        return address is None
+    return names.get_values_for_type(x509.IPAddress) == [address]
+
+
+def _read(folder: Path, name: str) -> x509.Certificate:
+    return x509.load_pem_x509_certificate(read_file(folder / certificate_file(name), _MOST_BYTES))
+
+
+def _write(folder: Path, name: str, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> None:
+    """Write the key before the certificate, whose presence says that both are there."""
+    secret = key.private_bytes(
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
+    )
+    create_private(folder / key_file(name), secret)
+    create_private(folder / certificate_file(name), certificate.public_bytes(serialization.Encoding.PEM))

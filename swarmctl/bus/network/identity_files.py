@@ -1,0 +1,39 @@
+"""The files of a swarm's identities: an authority, and a certificate and a private key for every computer.
+
+Only this module knows their names. The router reads them by Zenoh; `swarmctl.bus.network.identities` makes them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from swarmctl.files import read_file
+
+AUTHORITY = "authority"  # signs the others; its key is needed to add a host, on no host to fly
+STATION = "station"
+_MOST_BYTES = 20_000
+
+
+def certificate_file(name: str) -> str:
+    """Return the file name of a certificate."""
+    return f"{name}.pem"
+
+
+def key_file(name: str) -> str:
+    """Return the file name of a private key."""
+    return f"{name}.key"
+
+
+def identity_problems(folder: Path, name: str) -> Iterator[str]:
+    """Yield why a computer can't prove that it belongs to the swarm."""
+    for file, private in (
+        (certificate_file(AUTHORITY), False),
+        (certificate_file(name), False),
+        (key_file(name), True),
+    ):
+        try:
+            read_file(folder / file, _MOST_BYTES, private=private)
+        except OSError as error:
+            mode = ", a file of mode 0600" if private else ""
+            yield f"bus.identities: {folder / file}: {error.strerror}; copy it{mode} from where swarmctl keys init ran"

@@ -1,0 +1,113 @@
+"""The router process of the bus: connects the clients on one computer, and links to the routers of other computers.
+
+Clients reach it on a Unix socket in a private directory. Other routers reach it over QUIC, which is UDP, because a host
+that vanishes from a TCP link freezes the data of all the others for 10 s (zenoh #1101). Both ends of such a link prove
+by certificates of the swarm's own authority that they belong to it; there is no link without.
+
+`python -m swarmctl.bus.network.router unixsock-stream/DIR/bus.sock` is the router of a launch on one computer.
+"""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import sys
+from pathlib import Path
+
+import zenoh
+
+from swarmctl.bus.network.router_links import RouterLinks
+from swarmctl.bus.zenoh_bus import (
+    CLOSE_DEADLINE_S,
+    COMMON_SETTINGS,
+    SCHEME,
+    close_within,
+    open_session,
+    socket_file,
+)
+from swarmctl.errors import StartError, SwarmError
+from swarmctl.process_lifetime import die_with_parent, remove_socket
+from swarmctl.process_priority import request_realtime
+
+
+def run_router(endpoint: str, links: RouterLinks | None = None, *, realtime: bool = False) -> None:
+    """Run the router until SIGTERM, which the caller has blocked, then remove the socket and its directory.
+
+    Args:
+        endpoint: a Unix socket in a private directory.
+        links: links to other computers; None: there are none.
+        realtime: ask to be scheduled before other programs.
+
+    Raises:
+        StartError: the endpoint is not a Unix socket in a private directory, another router holds it, or an address or
+            identity can't be used.
+    """
+    socket_path = _private_socket(endpoint)
+    zenoh.init_log_from_env_or("error")
+    endpoints = [endpoint, *([f"quic/{links.listen}"] if links is not None and links.listen else [])]
+    settings = COMMON_SETTINGS | {"mode": "router", "listen/endpoints": endpoints, "scouting/delay": 0}
+    try:
+        session = open_session(settings | (links.settings() if links is not None else {}))
+    except zenoh.ZError as error:
+        where = " and ".join(repr(place) for place in endpoints)
+        raise StartError(f"bus endpoint {where}: can't be opened: {error}. Is another router using it?") from error
+    if realtime:
+        request_realtime()
+    print(f"router ready {endpoint}", flush=True)
+    signal.sigwait({signal.SIGTERM})
+    close_within(session, CLOSE_DEADLINE_S)
+    remove_socket(socket_path)
+
+
+def _private_socket(endpoint: str) -> Path:
+    path = socket_file(endpoint)
+    path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+    if path.parent.stat().st_mode & 0o077:
+        raise StartError(
+            f"bus endpoint {endpoint!r}: {path.parent} is open to other users, who could fly the swarm; "
+            "use a directory of mode 0700"
+        )
+    return path
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m swarmctl.bus.network.router", description="Router of one swarm's bus on one computer."
+    )
+    parser.add_argument("endpoint", metavar="ENDPOINT", help=f"{SCHEME}/DIR/bus.sock")
+    parser.add_argument("--identities", type=Path, metavar="FOLDER", help="written by swarmctl keys init")
+    parser.add_argument("--name", default="", help="name of this router's identity")
+    parser.add_argument("--listen", default="", metavar="ADDRESS:PORT", help="where other routers reach this one")
+    parser.add_argument("--connect", action="append", default=[], metavar="ADDRESS:PORT", help="another router")
+    parser.add_argument("--die-with-parent", action="store_true", help="end when the parent process ends")
+    parser.add_argument(
+        "--realtime", action=argparse.BooleanOptionalAction, default=False, help="be scheduled before other programs"
+    )
+    return parser
+
+
+def main() -> int:
+    """Run the router process from the command line."""
+    parser = _parser()
+    options = parser.parse_args()
+    links = None
+    if options.identities is not None:
+        links = RouterLinks(
+            identities=options.identities, name=options.name, listen=options.listen, connect=tuple(options.connect)
+        )
+    elif options.listen or options.connect:
+        parser.error("--listen and --connect need --identities and --name")
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})  # for sigwait; zenoh's threads inherit the mask
+    if options.die_with_parent:
+        die_with_parent(signal.SIGTERM)
+    try:
+        run_router(options.endpoint, links, realtime=options.realtime)
+    except SwarmError as error:
+        print(error, file=sys.stderr)
+        return error.exit_code
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,50 @@
+"""The links of one router to those of other computers, as its process is told of them and as it tells Zenoh."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from swarmctl.bus.network.identity_files import AUTHORITY, certificate_file, key_file
+
+LINK_LEASE_MS = 1500  # silence of another router after which its link counts as cut
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RouterLinks:
+    """The links of a router to those of other computers.
+
+    Attributes:
+        identities: folder with the certificate of the authority, and this router's certificate and key.
+        name: name of this router's identity.
+        listen: own `ADDRESS:PORT` for others; "" accepts none.
+        connect: addresses of others to connect to, again and again while they do not answer.
+    """
+
+    identities: Path
+    name: str
+    listen: str = ""
+    connect: tuple[str, ...] = ()
+
+    def settings(self) -> dict[str, Any]:
+        """Return what Zenoh is told of these links."""
+        own = {"certificate": certificate_file(self.name), "private_key": key_file(self.name)}
+        tls = {"root_ca_certificate": certificate_file(AUTHORITY)}
+        tls |= {f"{side}_{kind}": name for side in ("listen", "connect") for kind, name in own.items()}
+        return {
+            **{f"transport/link/tls/{key}": str(self.identities / name) for key, name in tls.items()},
+            "transport/link/tls/enable_mtls": True,
+            "transport/link/tls/verify_name_on_connect": True,
+            "transport/link/tx/lease": LINK_LEASE_MS,
+            "connect/endpoints": [f"quic/{address}" for address in self.connect],
+            "connect/timeout_ms": -1,
+            "connect/exit_on_failure": False,
+            "connect/retry": {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 2},
+        }
+
+    def arguments(self) -> tuple[str, ...]:
+        """Return the command-line options of a router with these links."""
+        listen = ("--listen", self.listen) if self.listen else ()
+        connect = (argument for address in self.connect for argument in ("--connect", address))
+        return ("--identities", str(self.identities), "--name", self.name, *listen, *connect)

@@ -1,0 +1,61 @@
+"""The verbs of a swarm that flies from several computers; heavy modules load inside them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from swarmctl.errors import EXIT_OK, ConfigError
+
+_ConfigOption = Annotated[Path, typer.Option("--config", help="Configuration of the whole swarm, with [[hosts]].")]
+_RunDir = Annotated[Path | None, typer.Option("--run-dir", help="Run folder to create; default runs/<UTC>-<name>.")]
+_Set = Annotated[
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Override a key, the same on every computer; repeatable."),
+]
+
+
+def add_host_verbs(to: typer.Typer) -> None:
+    """Add `host` and `station` to a command line."""
+    to.command()(host)
+    to.command()(station)
+
+
+def host(
+    config: _ConfigOption,
+    agents: Annotated[str, typer.Option("--agents", metavar="0,1,..", help="Agents of this computer.")],
+    run_dir: _RunDir = None,
+    sets: _Set = None,
+    print_unit: Annotated[bool, typer.Option("--print-unit", help="Print a systemd unit instead of flying.")] = False,
+) -> int:
+    """Fly the agents of this computer, together with those of other hosts. Ctrl-C lands them; the others fly on."""
+    from swarmctl.ops.host import fly_host, load_host, systemd_unit
+    from swarmctl.ops.launch import LaunchOptions
+
+    try:
+        numbers = [int(number) for number in agents.split(",")]
+    except ValueError as error:
+        raise ConfigError("--agents", [f"{agents!r}: write numbers with commas between them, as 0,1"]) from error
+    loaded, own = load_host(config, numbers, sets or ())
+    if print_unit:
+        print(systemd_unit(config, own), end="")
+        return EXIT_OK
+    return fly_host(loaded, own, LaunchOptions(run_dir))
+
+
+def station(
+    config: _ConfigOption,
+    run_dir: _RunDir = None,
+    sets: _Set = None,
+    view: Annotated[bool | None, typer.Option("--view/--no-view", help="Open the viewer window.")] = None,
+) -> int:
+    """Show, record and steer a swarm that flies from several hosts. Ctrl-C ends the station; the swarm flies on."""
+    from swarmctl.config import load
+    from swarmctl.ops.host import run_station
+    from swarmctl.ops.launch import LaunchOptions
+    from swarmctl.telemetry.view.recordings import has_display
+
+    options = LaunchOptions(run_dir, has_display() if view is None else view)
+    return run_station(load(config, sets or (), only_agents=()), options)
