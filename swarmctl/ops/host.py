@@ -1,4 +1,4 @@
-"""One computer of a swarm that flies from several: `swarmctl host` flies its agents, `swarmctl station` shows them all.
+"""One computer of a swarm that flies from several: what it is told, its identity, and the flight of its agents.
 
 Every computer has the same configuration, from which the name of the run follows. So swarms with other configurations
 are on other keys of the bus, even where their routers are linked, and computers need to agree on nothing else.
@@ -8,31 +8,20 @@ from __future__ import annotations
 
 import hashlib
 import shlex
-import signal
 import sys
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import tomli_w
 
-from swarmctl.bus.json_messages import decode_status
 from swarmctl.bus.network.hosts import HostParams, ip_of, links_of
 from swarmctl.bus.network.identity_files import STATION, identity_problems
-from swarmctl.bus.peers import Bus, agent_name
-from swarmctl.bus.topics import STATUS
 from swarmctl.config import Config, load
-from swarmctl.core.types import Phase
-from swarmctl.errors import EXIT_OK, ConfigError, StartError
-from swarmctl.ops.launch import LaunchOptions, SwarmPart, launch_part, started
-from swarmctl.ops.processes import ROUTER
-from swarmctl.ops.status_table import AgentView, Display
-from swarmctl.process_lifetime import StopRequest
+from swarmctl.errors import ConfigError
+from swarmctl.ops.launch import LaunchOptions, SwarmPart, launch_part
 
 _DIGEST_CHARACTERS = 8
 _OF_A_COMPUTER = (("own_folder",), ("mavlink", "signing_keys"), ("bus", "identities"))  # folders differ, flights do not
-_STEP_S = 0.05
-_GONE_S = 3.0  # an agent that was done and is silent for so long has ended
 
 
 def load_host(path: Path, agents: Sequence[int], overrides: Sequence[str] = ()) -> tuple[Config, HostParams]:
@@ -46,7 +35,7 @@ def load_host(path: Path, agents: Sequence[int], overrides: Sequence[str] = ()) 
     if host is None:
         known = "; ".join(f"{host.name}: {','.join(map(str, host.agents))}" for host in config.hosts) or "none"
         raise ConfigError("--agents", [f"no host has just agents {list(agents)}; hosts of {path}: {known}"])
-    _identified(config, host.name)
+    refuse_unidentified(config, host.name)
     return config, host
 
 
@@ -60,63 +49,6 @@ def fly_host(config: Config, host: HostParams, options: LaunchOptions) -> int:
     part = SwarmPart(run=shared_run_name(config), agents=tuple(sorted(host.agents)), links=links)
     telemetry = config.telemetry.model_copy(update={"enabled": False})  # the station has the view
     return launch_part(config.model_copy(update={"telemetry": telemetry}), options, part)
-
-
-def run_station(config: Config, options: LaunchOptions) -> int:
-    """Show and record the whole swarm, and let verbs act on it, until Ctrl-C or until every agent has ended.
-
-    It may start and end at any time: the swarm flies on without it.
-
-    Raises:
-        ConfigError, StartError: it was refused, or did not come up.
-    """
-    if not config.hosts:
-        raise ConfigError("hosts", ["the configuration lists none; a swarm on one computer flies by: swarmctl launch"])
-    _identified(config, STATION)
-    links = links_of(config.hosts, STATION, Path(config.bus.identities))
-    part = SwarmPart(run=shared_run_name(config), agents=(), links=links)
-    with (
-        StopRequest(signal.SIGINT, signal.SIGTERM, signal.SIGHUP) as stop,
-        started(config, options, part) as services,
-    ):
-        if services.bus is None:
-            raise StartError("the bus is not up")
-        router = services.children[ROUTER]
-        watch = SwarmWatch(services.bus, config.swarm.agents, services.display)
-        while not stop.count and not watch.step():
-            if router.poll() is not None:
-                raise StartError(f"router {router.how_it_ended()}; see {router.log}. The swarm flies on")
-            time.sleep(_STEP_S)
-    return EXIT_OK
-
-
-class SwarmWatch:
-    """Shows the statuses of agents that run elsewhere.
-
-    Args:
-        bus: receives the statuses.
-        agents: size of the swarm.
-        display: shows them.
-        clock_s: monotonic time [s].
-    """
-
-    def __init__(self, bus: Bus, agents: int, display: Display, clock_s: Callable[[], float] = time.monotonic) -> None:
-        self._bus, self._display, self._clock_s = bus, display, clock_s
-        self._views = [AgentView(agent=agent) for agent in range(agents)]
-
-    def step(self) -> bool:
-        """Show what has arrived; returns whether every agent was done and has ended."""
-        now_s = self._clock_s()
-        for sender, payload in self._bus.receive(STATUS):
-            status = decode_status(payload)
-            if status is not None and 0 <= status.agent < len(self._views) and sender == agent_name(status.agent):
-                view = self._views[status.agent]
-                view.status, view.received_s = status, now_s
-        self._display.show(self._views)
-        return all(
-            view.status is not None and view.status.phase == Phase.DONE and now_s - view.received_s > _GONE_S
-            for view in self._views
-        )
 
 
 def shared_run_name(config: Config) -> str:
@@ -168,8 +100,8 @@ LimitRTPRIO=20
 """
 
 
-def _identified(config: Config, name: str) -> None:
-    """Check that this computer can prove who it is.
+def refuse_unidentified(config: Config, name: str) -> None:
+    """Check that this computer can prove that it belongs to the swarm.
 
     Raises:
         ConfigError: it can't.

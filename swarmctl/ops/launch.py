@@ -16,8 +16,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from swarmctl.bus.network.router_links import RouterLinks
-from swarmctl.bus.peers import agent_name
-from swarmctl.bus.topics import OBSTACLES, OPERATOR, STATUS
+from swarmctl.bus.peers import Bus, agent_name
+from swarmctl.bus.topics import OBSTACLES, OPERATOR, STATUS, TICK, Topic
 from swarmctl.bus.zenoh_bus import NO_BUS, SCHEME, ZenohBus, socket_file
 from swarmctl.config import Config, dump
 from swarmctl.errors import StartError
@@ -178,6 +178,21 @@ class Launcher(Services):
         realtime = wants_realtime(config, context.agents) and is_realtime_permitted()
         self.log.write("started", run=context.run, ports=list(reserved.ports), realtime=realtime)
 
+    @property
+    def joined_bus(self) -> Bus:
+        """Return the bus that `start` has joined.
+
+        Raises:
+            StartError: it has not.
+        """
+        if self.bus is None:
+            raise StartError("the bus is not up")
+        return self.bus
+
+    def restart_router(self) -> None:
+        """Start the router again where the ended one was; everybody's session finds it by itself."""
+        self._spawn(router_command(self._config, self.context, self._links))
+
     def stop(self, agents_grace_s: float) -> None:
         """End every process, agents first and the router last, and remove all temporary files. Safe at any point."""
         router = [child for name, child in self.children.items() if name == ROUTER]
@@ -222,7 +237,9 @@ class Launcher(Services):
 
     def _join_bus(self) -> ZenohBus:
         senders = [agent_name(agent) for agent in range(self._config.swarm.agents)]
-        listen = {STATUS: senders, OBSTACLES: [OPERATOR]}
+        listen: dict[Topic, list[str]] = {STATUS: senders, OBSTACLES: [OPERATOR]}
+        if not self.context.agents:  # nobody records here, so the station does
+            listen[TICK] = senders
         router = self.children[ROUTER]
         deadline_s = time.monotonic() + _BUS_S
         while True:

@@ -38,6 +38,7 @@ _LAND_S = 60.0
 _LAND_REPEAT_S = 0.5
 _LAND_OBEYED_S = 10.0
 _OBSTACLES_REPEAT_S = 1.0
+_ROUTER_STARTS = 3  # in one flight
 _AFTER_DEATH_S = 3.0  # the simulator must outlive a dead agent until its vehicle has landed
 
 
@@ -51,6 +52,10 @@ class Services:
 
     def announce(self, view: str) -> None:
         """Publish the address of the live view to the operator's commands."""
+        raise NotImplementedError
+
+    def restart_router(self) -> None:
+        """Start the router again; the sessions of everybody find it."""
         raise NotImplementedError
 
     def recover(self, agent: int) -> Child:
@@ -120,6 +125,7 @@ class FlightSupervisor:
         self._obstacles_said_s = 0.0
         self._started_s = time.monotonic()
         self._reported: set[str] = set()
+        self._router_starts = 0  # how often it was started again
         self._essential_lost = False  # an essential process, router or simulator, has ended
         self._vehicles_lost = False  # the simulator has ended, and its vehicles with it
         self._recovery = Recovery(services.recover, config.sysids())
@@ -185,7 +191,12 @@ class FlightSupervisor:
         self._announce("obstacles", f"{len(message.obstacles)} obstacles, set by an operator", version=message.version)
 
     def _watch_essential_processes(self) -> None:
-        """Land all agents when the router or the simulator, without which the flight can't go on, has ended."""
+        """Start a router again; land all agents when it ends again and again, or the simulator has ended."""
+        router = self._services.children.get(ROUTER)
+        if router is not None and router.poll() is not None and self._router_starts < _ROUTER_STARTS:
+            self._router_starts += 1
+            self._announce("router_ended", f"router {router.how_it_ended()}; it is started again, the flight goes on")
+            self._services.restart_router()
         for name, land_s in ((ROUTER, _LAND_S), (SITL, _AFTER_DEATH_S)):
             child = self._services.children.get(name)
             if child is not None and child.poll() is not None and self._is_first(name):

@@ -69,6 +69,7 @@ class ScriptedServices(Services):
         self.agents = [self.hub.connect(agent_name(i)) for i in range(len(agents))]
         self.directory = directory
         self.lands = ends(130, 0.5)  # what recovers a vehicle
+        self.router = FLIES_LONG  # what is started in place of a router that has ended
         self.recovered: list[int] = []
         self.said: list[str] = []
         self.interrupts = 0
@@ -86,6 +87,9 @@ class ScriptedServices(Services):
 
     def announce(self, view: str) -> None:
         self.said.append(f"announced {view}")
+
+    def restart_router(self) -> None:
+        self.children[ROUTER] = Child(Command(ROUTER, (sys.executable, "-ESc", self.router)), self.directory)
 
     def recover(self, agent: int) -> Child:
         self.recovered.append(agent)
@@ -325,9 +329,19 @@ def test_second_interrupt_kills_at_once(tmp_path: Path) -> None:
     assert {child.poll() for child in scene.children.values()} == {137}
 
 
+def test_a_router_that_ends_is_started_again(tmp_path: Path) -> None:
+    scene = ScriptedServices(tmp_path, [ends(0, 2.0), ends(0, 2.0)])
+    scene.act = lambda: scene.kill(ROUTER)
+    result = scene.fly()
+    assert (result.exit_code(violated=False), result.problems) == (EXIT_OK, [])
+    assert scene.printed("router", "SIGKILL", "started again")
+    assert "land" not in scene.orders
+
+
 @pytest.mark.parametrize("name", [ROUTER, SITL])
 def test_without_router_or_simulator_all_agents_land(tmp_path: Path, name: str) -> None:
     scene = ScriptedServices(tmp_path, [FLIES_LONG, FLIES_LONG], {ROUTER: FLIES_LONG, SITL: FLIES_LONG})
+    scene.router = ends(3, 0.0)  # what is started instead can't run either
     scene.act = lambda: scene.kill(name)
     result = scene.fly()
     assert result.exit_code(violated=False) == EXIT_MISSION

@@ -51,10 +51,10 @@ def station(
     sets: _Set = None,
     view: Annotated[bool | None, typer.Option("--view/--no-view", help="Open the viewer window.")] = None,
 ) -> int:
-    """Show, record and steer a swarm that flies from several hosts. Ctrl-C ends the station; the swarm flies on."""
+    """Show, record, judge and steer a swarm of several hosts. Ctrl-C ends the station; the swarm flies on."""
     from swarmctl.config import load
-    from swarmctl.ops.host import run_station
     from swarmctl.ops.launch import LaunchOptions
+    from swarmctl.ops.station import run_station
     from swarmctl.telemetry.view.recordings import has_display
 
     options = LaunchOptions(run_dir, has_display() if view is None else view)

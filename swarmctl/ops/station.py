@@ -1,0 +1,121 @@
+"""`swarmctl station`: shows, records and judges a swarm that flies from several computers, and lets verbs act on it.
+
+No agent needs it: it may start late, end early, or never be there. What it records are the reports of the agents, so
+it judges by estimates, as a launch over real vehicles does.
+"""
+
+from __future__ import annotations
+
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from swarmctl.bus.json_messages import decode_status
+from swarmctl.bus.network.hosts import links_of
+from swarmctl.bus.network.identity_files import STATION
+from swarmctl.bus.peers import Bus, agent_name
+from swarmctl.bus.topics import STATUS, TICK
+from swarmctl.config import Config
+from swarmctl.core.records import unpack_tick
+from swarmctl.core.types import Phase
+from swarmctl.errors import ConfigError
+from swarmctl.ops.host import refuse_unidentified, shared_run_name
+from swarmctl.ops.launch import LaunchOptions, SwarmPart, started
+from swarmctl.ops.processes import ROUTER
+from swarmctl.ops.status_table import AgentView, Display
+from swarmctl.ops.summary import sum_up
+from swarmctl.ops.supervisor import LaunchResult
+from swarmctl.process_lifetime import StopRequest
+from swarmctl.telemetry.recording.recorder import Recorder
+
+_STEP_S = 0.05
+_GONE_S = 3.0  # an agent that was done and is silent for so long has ended
+
+
+def run_station(config: Config, options: LaunchOptions) -> int:
+    """Watch a whole swarm until every agent has ended, or until Ctrl-C, and return the exit code of its flight.
+
+    Raises:
+        ConfigError, StartError: it was refused, or did not come up.
+    """
+    if not config.hosts:
+        raise ConfigError("hosts", ["the configuration lists none; a swarm on one computer flies by: swarmctl launch"])
+    refuse_unidentified(config, STATION)
+    links = links_of(config.hosts, STATION, Path(config.bus.identities))
+    part = SwarmPart(run=shared_run_name(config), agents=(), links=links)
+    with StopRequest(signal.SIGINT, signal.SIGTERM, signal.SIGHUP) as stop:
+        with started(config, options, part) as services:
+            watch = SwarmWatch(services.joined_bus, config.swarm.agents, services.context.directory, services.display)
+            router = services.children[ROUTER]
+            while not (stop.count or watch.step()):
+                if router.poll() is not None:
+                    watch.problems.append(f"router {router.how_it_ended()}; see {router.log}. The swarm flies on")
+                    break
+                time.sleep(_STEP_S)
+            watch.close()
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a terminal that closes now must not lose the result
+    result = LaunchResult(problems=watch.problems, interrupted=bool(stop.count), has_armed=True)
+    violated = sum_up(config, services.context, result, services.display.print_line)
+    return result.exit_code(violated)
+
+
+class SwarmWatch:
+    """Shows and records agents that run elsewhere.
+
+    Args:
+        bus: receives their statuses and ticks.
+        agents: size of the swarm.
+        directory: run folder for what they report.
+        display: shows them.
+        clock_s: monotonic time [s].
+
+    Attributes:
+        problems: what went wrong, in words.
+    """
+
+    def __init__(
+        self,
+        bus: Bus,
+        agents: int,
+        directory: Path,
+        display: Display,
+        clock_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._bus, self._display, self._clock_s = bus, display, clock_s
+        self._views = [AgentView(agent=agent) for agent in range(agents)]
+        self._recorders = {agent_name(agent): Recorder(directory, agent) for agent in range(agents)}
+        self.problems: list[str] = []
+
+    def step(self) -> bool:
+        """Show and record what has arrived; returns whether every agent was done and has ended."""
+        now_s = self._clock_s()
+        for sender, payload in self._bus.receive(TICK):
+            tick = unpack_tick(payload)
+            if tick is not None:
+                self._recorders[sender].tick(tick[0], None)
+        for sender, payload in self._bus.receive(STATUS):
+            status = decode_status(payload)
+            if status is not None and 0 <= status.agent < len(self._views) and sender == agent_name(status.agent):
+                view = self._views[status.agent]
+                view.status, view.received_s = status, now_s
+        self._display.show(self._views)
+        over = all(self._has_ended(view, now_s) for view in self._views)
+        if over:
+            self.problems += list(filter(None, map(_failure, self._views)))
+        return over
+
+    def close(self) -> None:
+        """Write what is still to be recorded."""
+        for recorder in self._recorders.values():
+            recorder.close()
+
+    def _has_ended(self, view: AgentView, now_s: float) -> bool:
+        done = view.status is not None and view.status.phase == Phase.DONE
+        return done and now_s - view.received_s > _GONE_S
+
+
+def _failure(view: AgentView) -> str:
+    """Return why the mission of an agent that is done was not completed, or ""."""
+    outcome = view.status.outcome if view.status is not None else ""
+    return "" if outcome == "completed" else f"{agent_name(view.agent)} failed: {outcome or 'no reason given'}"
