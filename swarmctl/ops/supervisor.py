@@ -34,6 +34,7 @@ _FIRST_STATUS_S = 60.0  # timeout for every agent to appear on the bus
 _VEHICLE_S = 90.0  # timeout for every agent to receive its vehicle
 _BEYOND_MISSION_S = 300.0  # for take-off, waiting and landing; a longer flight is ended
 _SILENCE_S = 5.0
+_PAUSE_S = 0.5  # of the supervisor
 _LAND_S = 60.0
 _LAND_REPEAT_S = 0.5
 _LAND_OBEYED_S = 10.0
@@ -123,7 +124,7 @@ class FlightSupervisor:
         self._obstacles = first_list(config.obstacles, time.time_ns() // 1000)
         self._result.obstacles = _judged((), self._obstacles, 0)
         self._obstacles_said_s = 0.0
-        self._started_s = time.monotonic()
+        self._started_s = self._stepped_s = time.monotonic()
         self._reported: set[str] = set()
         self._router_starts = 0  # how often it was started again
         self._essential_lost = False  # an essential process, router or simulator, has ended
@@ -140,6 +141,7 @@ class FlightSupervisor:
             interrupts: number of stop requests; the first lands all agents, the second kills all processes.
         """
         while interrupts() < 2:
+            self._excuse_own_pause()
             self._receive()
             self._watch_essential_processes()
             self._watch_viewer()
@@ -168,6 +170,15 @@ class FlightSupervisor:
         for words in self._result.left:
             self._fail("vehicle_left", words)
         return self._result
+
+    def _excuse_own_pause(self) -> None:
+        """Count no time in which this process itself did not run: what arrived then is not yet passed on."""
+        now_s = time.monotonic()
+        paused_s = now_s - self._stepped_s
+        self._stepped_s = now_s
+        if paused_s > _PAUSE_S:
+            for view in self._views:
+                view.received_s += paused_s if view.status is not None else 0.0
 
     def _receive(self) -> None:
         for sender, payload in self._bus.receive(STATUS):

@@ -329,6 +329,23 @@ def test_second_interrupt_kills_at_once(tmp_path: Path) -> None:
     assert {child.poll() for child in scene.children.values()} == {137}
 
 
+def test_a_launcher_that_did_not_run_calls_nobody_silent(tmp_path: Path) -> None:
+    """On an overloaded machine agents have real-time priority, and the launcher waits; so does what it is sent."""
+    scene = ScriptedServices(tmp_path, [ends(0, 9.0), ends(0, 9.0)])
+
+    def hear_nothing() -> None:
+        scene.silent = {0, 1}
+        scene.act = sleep
+
+    def sleep() -> None:
+        time.sleep(6.0)
+        scene.act = scene.silent.clear
+
+    scene.act = hear_nothing
+    result = scene.fly()
+    assert (result.exit_code(violated=False), result.problems) == (EXIT_OK, [])
+
+
 def test_a_router_that_ends_is_started_again(tmp_path: Path) -> None:
     scene = ScriptedServices(tmp_path, [ends(0, 2.0), ends(0, 2.0)])
     scene.act = lambda: scene.kill(ROUTER)
