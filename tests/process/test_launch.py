@@ -51,6 +51,7 @@ class Launched:
     """One `swarmctl launch`; its temporary files are in a folder of their own, so that leftovers show."""
 
     prefix: tuple[str, ...] = ()  # of the command line
+    starts = "launch"
 
     def __init__(self, run_dir: Path, temp: Path, *arguments: str) -> None:
         self.run_dir = run_dir
@@ -58,7 +59,8 @@ class Launched:
         self.env = {**os.environ, "TMPDIR": str(temp), "XDG_RUNTIME_DIR": "", "XDG_STATE_HOME": str(temp / "state")}
         self.env.pop("DISPLAY", None)
         self.out = run_dir.with_suffix(".out")
-        command = [*self.prefix, sys.executable, "-m", "swarmctl", "launch", *arguments, "--run-dir", str(run_dir)]
+        command = [*self.prefix, sys.executable, "-m", "swarmctl", self.starts, *arguments]
+        command += ["--run-dir", str(run_dir)]
         with self.out.open("w") as out:
             self.process = subprocess.Popen(command, stdout=out, stderr=subprocess.STDOUT, env=self.env, cwd=ROOT)
 

@@ -1,0 +1,203 @@
+"""A swarm of several hosts, all on loopback: routers that link by identity, flights, and what ends one host only."""
+
+from __future__ import annotations
+
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from swarmctl.bus.network.router_links import RouterLinks
+from swarmctl.bus.topics import PATH
+from swarmctl.bus.zenoh_bus import SCHEME, ZenohBus
+from swarmctl.core.records import TRUTH_COLUMNS
+from swarmctl.ops.cli import main
+from swarmctl.telemetry.recording.run_files import PACKED_TRUTH, read_parquet
+from tests.benches.free_ports import free_ports
+from tests.process.test_bus import end, until
+from tests.process.test_launch import Launched
+from tests.process.test_readme import shown
+
+pytestmark = pytest.mark.process
+
+SWARM = """
+name = "hosts"
+[swarm]
+agents = 2
+[start]
+spacing_m = 2.5
+[mission]
+kind = "swap"
+duration_s = {duration_s}
+[mission.swap]
+travel_s = 6.0
+[separation]
+mode = "guaranteed"
+[agent]
+rate_hz = 25
+[sitl]
+physics_hz = 100
+ground_z_m = 0.5
+[telemetry]
+enabled = false
+[bus]
+identities = "identities"
+[[hosts]]
+name = "alpha"
+address = "127.0.0.1:{ports[0]}"
+agents = [0]
+[[hosts]]
+name = "bravo"
+address = "127.0.0.1:{ports[1]}"
+agents = [1]
+"""
+
+
+class StartedHost(Launched):
+    starts = "host"
+
+
+class StartedStation(Launched):
+    starts = "station"
+
+
+def write_swarm(folder: Path, duration_s: float = 12.0) -> Path:
+    path = folder / "swarm.toml"
+    path.write_text(SWARM.format(ports=free_ports(2), duration_s=duration_s))
+    return path
+
+
+def as_shown(command: str, path: Path, agents: str = "0,1") -> list[str]:
+    """Return the words of a command of docs/hosts.md for this configuration and these agents."""
+    (line,) = shown(rf"^swarmctl {command} ")
+    own = {"configs/three_hosts.toml": str(path), "0,1": agents}
+    return [own.get(word, word) for word in shlex.split(line)]
+
+
+def make_keys(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", as_shown("keys init", path))
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 0
+
+
+@contextmanager
+def three(path: Path) -> Iterator[tuple[StartedHost, StartedHost, StartedStation]]:
+    """Yield both hosts and the station; their folders are gone afterwards."""
+    temps = [Path(tempfile.mkdtemp(prefix="sw")) for _ in range(3)]
+    started = (
+        StartedHost(path.parent / "alpha", temps[0], *as_shown("host", path, "0")[2:]),
+        StartedHost(path.parent / "bravo", temps[1], *as_shown("host", path, "1")[2:]),
+        StartedStation(path.parent / "station", temps[2], *as_shown("station", path)[2:], "--no-view"),
+    )
+    try:
+        yield started
+    finally:
+        for launched, temp in zip(started, temps, strict=True):
+            for relative in launched.relatives():
+                relative.kill()
+            launched.process.kill()
+            launched.process.wait(20)
+            shutil.rmtree(temp, ignore_errors=True)
+
+
+def least_separation_m(*folders: Path) -> float:
+    """Return the least distance of two vehicles by true states, whose simulators share this machine's clock."""
+    a, b = (read_parquet(folder / PACKED_TRUTH, TRUTH_COLUMNS) for folder in folders)
+    assert (set(a["vehicle"]), set(b["vehicle"])) == ({0}, {1})
+    t_us = a["t_us"][(a["t_us"] >= b["t_us"][0]) & (a["t_us"] <= b["t_us"][-1])]
+    of_a, of_b = (
+        np.array([np.interp(t_us, rows["t_us"], rows["pos_ned_m"][:, k]) for k in range(3)]) for rows in (a, b)
+    )
+    return float(np.linalg.norm(of_a - of_b, axis=0).min())
+
+
+def test_two_hosts_fly_one_swarm_that_a_station_commands_and_judges(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = write_swarm(tmp_path)
+    make_keys(path, monkeypatch)
+    with three(path) as (alpha, bravo, station):
+        alpha.until_phase("TRACK", 1)
+        bravo.until_phase("TRACK", 1)
+        for verb in ("hold", "resume"):
+            answer = station.verb(verb)
+            assert answer.returncode == 0, answer.stderr
+            assert [f"agent-{i} accepts" in answer.stdout for i in range(2)] == [True, True]
+        assert alpha.end() == 0, alpha.text()
+        assert bravo.end() == 0, bravo.text()
+        assert station.end() == 0, station.text()
+        for launched, agents in ((alpha, {"agent-0"}), (bravo, {"agent-1"}), (station, {"agent-0", "agent-1"})):
+            assert {path.stem for path in launched.run_dir.glob("agent-?.parquet")} == agents
+        assert least_separation_m(alpha.run_dir, bravo.run_dir) >= 0.85
+        separation = station.summary()["separation"]
+        assert separation["min_m"] >= 0.85
+        assert separation["min_pair"] == [0, 1]
+        assert station.summary()["tracking"]["index_m"] is not None
+
+
+def test_a_stop_of_one_host_lands_its_agents_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = write_swarm(tmp_path, duration_s=20.0)
+    make_keys(path, monkeypatch)
+    with three(path) as (alpha, bravo, station):
+        alpha.until_phase("TRACK", 1)
+        bravo.until_phase("TRACK", 1)
+        station.process.send_signal(signal.SIGINT)
+        assert station.end() == 130, "the station is not needed"
+        bravo.process.send_signal(signal.SIGINT)
+        assert bravo.end() == 130, bravo.text()
+        assert bravo.landed() == {1: True}
+        assert alpha.process.poll() is None, alpha.text()
+        assert alpha.end() == 0, alpha.text()
+        assert least_separation_m(alpha.run_dir, bravo.run_dir) >= 0.85
+
+
+@contextmanager
+def router(folder: Path, links: RouterLinks) -> Iterator[ZenohBus]:
+    """Yield a client of a new router with these links."""
+    endpoint = f"{SCHEME}{folder}/bus.sock"
+    command = [sys.executable, "-m", "swarmctl.bus.network.router", endpoint, "--die-with-parent", *links.arguments()]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    assert process.stdout.readline().startswith("router ready")
+    names = ["alpha", "bravo", "mallory"]
+    bus = ZenohBus(endpoint, "run", links.name, {PATH: [name for name in names if name != links.name]})
+    yield bus
+    bus.close()
+    assert end(process) == 0
+
+
+def heard(bus: ZenohBus, say: ZenohBus, word: bytes) -> bool:
+    say.publish(PATH, word)
+    return any(payload == word for _, payload in bus.receive(PATH))
+
+
+def test_routers_link_with_those_of_their_own_authority_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    ours, theirs = tmp_path / "ours", tmp_path / "theirs"
+    for folder in (ours, theirs):
+        folder.mkdir(mode=0o700)
+        make_keys(write_swarm(folder), monkeypatch)
+    places = [Path(tempfile.mkdtemp(prefix="sw")) for _ in range(3)]
+    address = f"127.0.0.1:{free_ports(1)[0]}"
+    alpha = RouterLinks(identities=ours / "identities", name="alpha", listen=address)
+    bravo = RouterLinks(identities=ours / "identities", name="bravo", connect=(address,))
+    mallory = RouterLinks(identities=theirs / "identities", name="bravo", connect=(address,))
+    with router(places[0], alpha) as at_alpha:
+        with router(places[2], mallory) as at_mallory:
+            deadline_s = time.monotonic() + 2.0
+            while time.monotonic() < deadline_s:
+                assert not heard(at_alpha, at_mallory, b"forged"), "an identity of another authority is none"
+                assert not heard(at_mallory, at_alpha, b"secret")
+                time.sleep(0.02)
+        with router(places[1], bravo) as at_bravo:
+            assert until(lambda: heard(at_alpha, at_bravo, b"true")), "as it does with ours: this can fail"
+            assert until(lambda: heard(at_bravo, at_alpha, b"known"))
