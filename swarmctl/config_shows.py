@@ -60,7 +60,7 @@ class _Show:
             self.problems.append(f"no such file ({path}); names are relative to the configuration's folder")
         except OSError as error:
             self.problems.append(f"can't be read: {error.strerror}")
-        except zipfile.BadZipFile:
+        except (zipfile.BadZipFile, NotImplementedError, ValueError):  # what a damaged directory may raise
             self.problems.append("is no ZIP archive, as .skyc files are")
 
     def trajectories(self) -> list[dict[str, Any]]:

@@ -186,3 +186,14 @@ def test_a_file_that_is_no_archive_or_damaged_is_refused(tmp_path: Path) -> None
     (tmp_path / "show.skyc").unlink()
     with pytest.raises(ConfigError, match="no such file"):
         load(path)
+
+
+def test_an_archive_of_a_later_kind_is_refused(tmp_path: Path) -> None:
+    """Found by tools/fuzz.py: a byte of the directory names a version that the library does not read."""
+    path = config_with(tmp_path, {"show.json": show_of(drone(HOVERING), drone(FAR))})
+    archive = tmp_path / "show.skyc"
+    content = bytearray(archive.read_bytes())
+    content[content.rindex(b"PK\x01\x02") + 6] = 84  # version needed to extract, in the directory
+    archive.write_bytes(content)
+    with pytest.raises(ConfigError, match="is no ZIP archive"):
+        load(path)
