@@ -11,7 +11,7 @@ import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 import tomli_w
@@ -84,6 +84,8 @@ class MavlinkParams(Params):
     """Parameters of the MAVLink links to the vehicles."""
 
     signing_keys: tuple[str, ...] = Field((), strict=False)  # key file of each vehicle in turn; none: nothing is signed
+    forward: Annotated[tuple[str, ...], Field(strict=False, max_length=4)] = ()  # udpout:// of ground stations
+    forward_commands: bool = False  # whether these may command the vehicles; otherwise they may read only
 
 
 class SitlParams(SimulatorParams):
@@ -293,6 +295,7 @@ def _whole(config: Config, only_agents: Collection[int] | None) -> Iterator[str]
     yield from _vehicle_problems(config)
     yield from host_problems(config.hosts, agents)
     yield from _simulated_host_problems(config)
+    yield from _forward_problems(config)
     yield from key_problems(config.mavlink.signing_keys, agents, only_agents)
     if len(config.obstacles) > MAX_OBSTACLES:
         yield f"obstacles: {len(config.obstacles)} are listed, agents keep {MAX_OBSTACLES} at most"
@@ -411,6 +414,15 @@ def _vehicle_problems(config: Config) -> Iterator[str]:
                 "give every autopilot its own MAV_SYS_ID"
             )
         seen_sysids.setdefault(vehicle.sysid, i)
+
+
+def _forward_problems(config: Config) -> Iterator[str]:
+    for i, url in enumerate(config.mavlink.forward):
+        try:
+            if parse_url(url).scheme != "udpout":
+                raise ValueError(f"{url!r}: only udpout://HOST:PORT is forwarded to")
+        except ValueError as error:
+            yield f"mavlink.forward.{i} = {error}"
 
 
 def _simulated_host_problems(config: Config) -> Iterator[str]:

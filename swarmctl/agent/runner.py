@@ -27,11 +27,12 @@ from swarmctl.core.types import Mode
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, MissionError, StartError
 from swarmctl.mavlink.codec import heartbeat_of
 from swarmctl.mavlink.commands import OWN_COMPID
+from swarmctl.mavlink.forwarding import Forwarding
 from swarmctl.mavlink.signing.channel import AGENT_LINK, SigningChannel
 from swarmctl.mavlink.signing.recognition import SignedRecognition
 from swarmctl.mavlink.signing.refusals import in_words
 from swarmctl.mavlink.signing.stamp_file import kept_channel
-from swarmctl.mavlink.transport import Transport, open_transport
+from swarmctl.mavlink.transport import Transport, open_transport, parse_url, resolve
 from swarmctl.process_lifetime import StopRequest
 from swarmctl.process_priority import request_realtime
 from swarmctl.signing_keys import read_own_key
@@ -160,9 +161,21 @@ def _fly(
 
 
 def _open_link(process: AgentProcess, config: Config, clock: WallClock, signing: SigningChannel | None) -> Transport:
-    """Open the link to the vehicle, which belongs to the sender of its HEARTBEAT, a signed one where there is a key."""
+    """Open the link to the vehicle, and forward it to the ground stations that are to listen."""
     url = config.vehicles[process.agent].url if config.vehicles else f"udpin://{_LOOPBACK}:14540"
     sysid = config.sysids()[process.agent]
+    link = _open_vehicle(process, url, sysid, clock, signing)
+    if not config.mavlink.forward:
+        return link
+    stations = [(resolve(there.where), there.number) for there in map(parse_url, config.mavlink.forward)]
+    sign = bytes if signing is None else signing.sign
+    return Forwarding(link, stations, sysid, commands=config.mavlink.forward_commands, sign=sign)
+
+
+def _open_vehicle(
+    process: AgentProcess, url: str, sysid: int, clock: WallClock, signing: SigningChannel | None
+) -> Transport:
+    """Open the link to the vehicle, which belongs to the sender of its HEARTBEAT, a signed one where there is a key."""
     remote = None if process.vehicle_port is None else (_LOOPBACK, process.vehicle_port)
     if signing is None:
         return open_transport(url, process.fd, heartbeat_of(sysid), remote)

@@ -22,9 +22,12 @@ from typing import Any
 
 import psutil
 import pytest
+from pymavlink.dialects.v20 import development as mavlink
 
 from swarmctl.config import load
 from swarmctl.core.types import Phase
+from swarmctl.mavlink.codec import Codec
+from swarmctl.mavlink.framing import frames
 from swarmctl.mavlink.signing.key_file import write_new_key
 from swarmctl.mavlink.signing.refusals import OLD, REPLAYED
 from swarmctl.ops.cli import main
@@ -123,6 +126,36 @@ class Launched:
         return landed(self.run_dir)
 
 
+class GroundStation:
+    """A ground station, which hears vehicles through their agents."""
+
+    def __init__(self) -> None:
+        self._codec = Codec(255, 190)
+        self._sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._sock.bind(("127.0.0.1", 0))
+        self._sock.settimeout(READY_S)
+        self.port = self._sock.getsockname()[1]
+
+    def close(self) -> None:
+        self._sock.close()
+
+    def read_parameter(self, name: str) -> dict[int, float]:
+        """Ask every vehicle for a parameter until three have answered, and return the values by system id."""
+        values: dict[int, float] = {}
+        deadline_s = time.monotonic() + READY_S
+        while len(values) < 3 and time.monotonic() < deadline_s:
+            data, agent = self._sock.recvfrom(4096)
+            for message in map(self._codec.decode, frames(data)):
+                if message is None or message.get_srcSystem() in values:
+                    continue
+                if message.get_type() == "PARAM_VALUE" and message.param_id == name:
+                    values[message.get_srcSystem()] = message.param_value
+                elif message.get_type() == "HEARTBEAT":
+                    asked = mavlink.MAVLink_param_request_read_message(message.get_srcSystem(), 1, name.encode(), -1)
+                    self._sock.sendto(self._codec.encode(asked), agent)
+        return values
+
+
 Start = Callable[..., Launched]
 
 
@@ -149,7 +182,11 @@ def start(tmp_path: Path) -> Iterator[Start]:
 
 def test_a_whole_mission_is_flown_recorded_and_summed_up(start: Start) -> None:
     (line,) = shown(r"^swarmctl launch configs/thesis")
-    launched = start(*shlex.split(line)[2:], "--duration", "4", low(line), "--no-view")
+    station = GroundStation()
+    forward = f"mavlink.forward=['udpout://127.0.0.1:{station.port}']"
+    launched = start(*shlex.split(line)[2:], "--duration", "4", low(line), "--no-view", "--set", forward)
+    assert sorted(station.read_parameter("COM_OF_LOSS_T")) == [1, 2, 3], "every vehicle answers through its agent"
+    station.close()
     launched.until_phase("TRACK", 3)
     assert launched.verb("status").returncode == 0
     (started,) = launched.events("started")
