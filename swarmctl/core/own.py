@@ -14,6 +14,14 @@ from pydantic_core import CoreSchema, PydanticCustomError, core_schema
 _NAME = re.compile(r"[A-Za-z_]\w*(\.[A-Za-z_]\w*)*:[A-Za-z_]\w*")
 
 
+def in_words(error: BaseException) -> str:
+    """Return kind and text of what somebody else's code has raised, which may raise again when it is shown."""
+    try:
+        return f"{type(error).__name__}: {error}"
+    except (Exception, SystemExit):
+        return f"{type(error).__name__}, which can't be shown"
+
+
 class OwnError(Exception):
     """A class that a configuration names can't be had; the text says why."""
 
@@ -50,7 +58,7 @@ def own_class(name: str, group: str, base: type) -> Any:
     try:
         found = getattr(importlib.import_module(module), attribute, None)
     except (Exception, SystemExit) as error:  # whatever the module does when it is imported
-        raise OwnError(f"{module} can't be imported: {type(error).__name__}: {error}") from error
+        raise OwnError(f"{module} can't be imported: {in_words(error)}") from error
     if not isinstance(found, type) or not issubclass(found, base):
         raise OwnError(f"{module} has no class {attribute} derived from {base.__module__}.{base.__name__}")
     return found

@@ -20,7 +20,7 @@ from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.swarm_mpc import MpcParams
 from swarmctl.core.declared import declared
 from swarmctl.core.flight_volume import FlightVolume
-from swarmctl.core.own import BuiltInOrOwn, OwnError, own_class
+from swarmctl.core.own import BuiltInOrOwn, OwnError, in_words, own_class
 from swarmctl.core.params import Params, with_sections
 
 _KINDS: list[ControllerKind[Any]] = list(declared(controllers, ControllerKind))
@@ -94,7 +94,7 @@ def make_own(params: ControllerParams, setup: ControllerSetup, grid: Controller)
     try:
         return found(own_params, setup, grid.dt_us * 1e-6, grid.steps)
     except (Exception, SystemExit) as error:  # whatever it does when it is made
-        raise OwnError(f"{params.kind} can't be made: {type(error).__name__}: {error}") from error
+        raise OwnError(f"{params.kind} can't be made: {in_words(error)}") from error
 
 
 def _built_in(name: str, params: ControllerParams, setup: ControllerSetup) -> Controller:

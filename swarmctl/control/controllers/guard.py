@@ -20,6 +20,7 @@ from swarmctl.control.controllers.kind import Controller, ControllerSetup
 from swarmctl.control.controllers.own import OwnController
 from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.control.rollout import ModelledVehicle
+from swarmctl.core.own import in_words
 from swarmctl.core.text import printable
 from swarmctl.core.trajectory import braking_displacement
 from swarmctl.core.types import Array, Plan, PlanStatus, PlanTimes, Reference
@@ -91,7 +92,7 @@ class Guard:
         try:
             return np.asarray(call(), dtype=np.float64), ""
         except (Exception, SystemExit) as error:  # whatever it raises: the vehicle flies on
-            return np.empty(0), printable(f"raised {type(error).__name__}: {error}", _MAX_SHOWN)
+            return np.empty(0), printable(f"raised {in_words(error)}", _MAX_SHOWN)
 
     def _malformed(self, commands: Array) -> str:
         if commands.shape != (self.steps, 3):

@@ -16,7 +16,7 @@ from swarmctl.control.reference import kinds
 from swarmctl.control.reference.kind import MISSIONS, Heading, MissionKind, Place
 from swarmctl.control.reference.polynomial import through
 from swarmctl.core.declared import modules_of
-from swarmctl.core.own import BuiltInOrOwn, OwnError, own_class
+from swarmctl.core.own import BuiltInOrOwn, OwnError, in_words, own_class
 from swarmctl.core.params import Params, with_sections
 from swarmctl.core.types import Array, Sampled
 
@@ -82,7 +82,7 @@ def _tabulated(mission: MissionKind, place: Place, params: MissionParams) -> tup
         heading, offset = mission.heading(place), np.asarray(mission.offset_ned_m(place), dtype=np.float64)
         yaw = np.zeros(len(t_s)) if heading is None else np.asarray(heading(t_s.copy()), dtype=np.float64)
     except (Exception, SystemExit) as error:  # whatever it does
-        raise OwnError(f"{params.kind} raised {type(error).__name__}: {error}") from error
+        raise OwnError(f"{params.kind} raised {in_words(error)}") from error
     if pos.shape != (len(t_s), 3) or vel.shape != pos.shape or yaw.shape != t_s.shape or offset.shape != (3,):
         shapes = f"{pos.shape} and {vel.shape}"
         raise OwnError(f"{params.kind} returned positions and velocities of shape {shapes} for {len(t_s)} times")
