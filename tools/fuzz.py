@@ -59,7 +59,6 @@ SEEDS_KEPT = 400  # of each kind
 INTERESTING = (b"\x00", b"\xff", b"\x7f", b"\x80", b"nan", b"1e999", b"-1", b"null", b"[", b"{", b'"')
 CONFIGS = Path(__file__).parents[1] / "configs"
 MEMORY = Path("/dev/shm")
-ROUND_S = 1.0  # of one target
 HELD_US, RESUMED_US = 8_000_000, 9_000_000
 FLYING_US, RENEWED_US = 9_000_000, 300_000_000
 GIVEN_A_TICK = 20
@@ -334,6 +333,7 @@ def main() -> int:
     parser.add_argument("--executions", type=int, default=10_000_000, help="of all targets together, earlier ones too")
     parser.add_argument("--state", type=Path, required=True, help="file that counts executions")
     parser.add_argument("--only", help="targets, with commas between them")
+    parser.add_argument("--round", type=float, default=1.0, help="seconds of one target at a time")
     options = parser.parse_args()
     counts: dict[str, int] = json.loads(options.state.read_text()) if options.state.exists() else {}
     logging.disable()
@@ -342,7 +342,7 @@ def main() -> int:
         names = options.only.split(",") if options.only else list(found)
         while sum(counts.values()) < options.executions:
             for name in names:
-                end_s = time.monotonic() + ROUND_S
+                end_s = time.monotonic() + options.round
                 count, finding = fuzz(name, found[name], counts.get(name, 0), end_s)
                 counts[name] = counts.get(name, 0) + count
                 options.state.write_text(json.dumps(counts, indent=2))

@@ -86,7 +86,7 @@ def _own(controller: Controller) -> OwnController:
     return controller._own
 
 
-class Unshowable(Exception):
+class UnshowableError(Exception):
     def __str__(self) -> str:
         raise ValueError
 
@@ -101,7 +101,7 @@ class Unshowable(Exception):
         (lambda own, problem: 1 / 0, "raised ZeroDivisionError"),
         (lambda own, problem: (_ for _ in ()).throw(OSError("\x1b]0;owned")), r"raised OSError: \x1b]0;owned"),
         (lambda own, problem: exit(3), "raised SystemExit"),
-        (lambda own, problem: (_ for _ in ()).throw(Unshowable()), "raised Unshowable, which can't be shown"),
+        (lambda own, problem: (_ for _ in ()).throw(UnshowableError()), "raised UnshowableError, which can't be shown"),
     ],
 )
 def test_what_is_no_command_is_replaced_and_after_half_a_second_not_asked_for(answer: Any, why: str) -> None:
