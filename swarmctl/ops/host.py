@@ -35,6 +35,9 @@ def load_host(path: Path, agents: Sequence[int], overrides: Sequence[str] = ()) 
     if host is None:
         known = "; ".join(f"{host.name}: {','.join(map(str, host.agents))}" for host in config.hosts) or "none"
         raise ConfigError("--agents", [f"no host has just agents {list(agents)}; hosts of {path}: {known}"])
+    if any(obstacle.moves for obstacle in config.obstacles):
+        problem = "one moves, from a time at which every host starts it apart; add it in flight: swarmctl obstacle add"
+        raise ConfigError("obstacles", [problem])
     refuse_unidentified(config, host.name)
     return config, host
 

@@ -95,7 +95,7 @@ def launch_part(config: Config, options: LaunchOptions, part: SwarmPart) -> int:
             result = FlightSupervisor(config, services, services.display).fly(lambda: stop.count)
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a terminal that closes now must not lose the result
     # From here on Ctrl-C acts as usual: nothing is left to land.
-    violated = sum_up(config, services.context, result, services.display.print_line)
+    violated = sum_up(config, services.context.directory, result, services.display.print_line)
     return result.exit_code(violated)
 
 
@@ -176,7 +176,9 @@ class Launcher(Services):
         for line in _introduction(config, context, reserved):
             self.display.print_line(line)
         realtime = wants_realtime(config, context.agents) and is_realtime_permitted()
-        self.log.write("started", run=context.run, ports=list(reserved.ports), realtime=realtime)
+        self.log.write(
+            "started", run=context.run, agents=list(context.agents), ports=list(reserved.ports), realtime=realtime
+        )
 
     @property
     def joined_bus(self) -> Bus:

@@ -17,6 +17,7 @@ from swarmctl.bus.network.identity_files import STATION
 from swarmctl.bus.peers import Bus, agent_name
 from swarmctl.bus.topics import STATUS, TICK
 from swarmctl.config import Config
+from swarmctl.control.phases.state_machine import OPERATOR_STOP
 from swarmctl.core.records import unpack_tick
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError
@@ -55,8 +56,9 @@ def run_station(config: Config, options: LaunchOptions) -> int:
                 time.sleep(_STEP_S)
             watch.close()
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # a terminal that closes now must not lose the result
-    result = LaunchResult(problems=watch.problems, interrupted=bool(stop.count), has_armed=True)
-    violated = sum_up(config, services.context, result, services.display.print_line)
+    interrupted = bool(stop.count) or watch.was_stopped
+    result = LaunchResult(problems=watch.problems, interrupted=interrupted, has_armed=True)
+    violated = sum_up(config, services.context.directory, result, services.display.print_line)
     return result.exit_code(violated)
 
 
@@ -72,6 +74,7 @@ class SwarmWatch:
 
     Attributes:
         problems: what went wrong, in words.
+        was_stopped: whether an operator has ended the mission of an agent.
     """
 
     def __init__(
@@ -86,6 +89,7 @@ class SwarmWatch:
         self._views = [AgentView(agent=agent) for agent in range(agents)]
         self._recorders = {agent_name(agent): Recorder(directory, agent) for agent in range(agents)}
         self.problems: list[str] = []
+        self.was_stopped = False
 
     def step(self) -> bool:
         """Show and record what has arrived; returns whether every agent was done and has ended."""
@@ -102,7 +106,11 @@ class SwarmWatch:
         self._display.show(self._views)
         over = all(self._has_ended(view, now_s) for view in self._views)
         if over:
-            self.problems += list(filter(None, map(_failure, self._views)))
+            outcomes = {view.agent: view.status.outcome for view in self._views if view.status is not None}
+            self.was_stopped = OPERATOR_STOP in outcomes.values()
+            for agent, outcome in outcomes.items():
+                if outcome not in ("completed", OPERATOR_STOP):
+                    self.problems.append(f"{agent_name(agent)} failed: {outcome or 'no reason given'}")
         return over
 
     def close(self) -> None:
@@ -113,9 +121,3 @@ class SwarmWatch:
     def _has_ended(self, view: AgentView, now_s: float) -> bool:
         done = view.status is not None and view.status.phase == Phase.DONE
         return done and now_s - view.received_s > _GONE_S
-
-
-def _failure(view: AgentView) -> str:
-    """Return why the mission of an agent that is done was not completed, or ""."""
-    outcome = view.status.outcome if view.status is not None else ""
-    return "" if outcome == "completed" else f"{agent_name(view.agent)} failed: {outcome or 'no reason given'}"

@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 from swarmctl.config import Config, load_recorded
 from swarmctl.core.text import printable
 from swarmctl.mavlink.signing.refusals import HARMLESS
-from swarmctl.ops.processes import RunContext
 from swarmctl.ops.supervisor import LaunchResult
 from swarmctl.telemetry.evaluation.referee import SUMMED_ERROR
 
@@ -18,7 +17,7 @@ if TYPE_CHECKING:
     from swarmctl.telemetry.evaluation.referee import Rules
 
 
-def sum_up(config: Config, context: RunContext, result: LaunchResult, print_line: Callable[[str], None]) -> bool:
+def sum_up(config: Config, directory: Path, result: LaunchResult, print_line: Callable[[str], None]) -> bool:
     """Finish the run folder and print the result; return whether the referee found a violation.
 
     A folder that can't be read or written is a problem of the run, and never loses the result.
@@ -26,9 +25,8 @@ def sum_up(config: Config, context: RunContext, result: LaunchResult, print_line
     from swarmctl.telemetry.recording.run_folder import Outcome, finish_run
     from swarmctl.telemetry.view.recordings import optimize_recording  # heavy
 
-    directory = context.directory
     try:
-        rules = _rules(config, context.agents, result)
+        rules = _rules(config, result)
         summary, unwritten = finish_run(
             directory, rules, Outcome(outcome=result.outcome, problems=tuple(result.problems))
         )
@@ -91,9 +89,9 @@ def compare(directories: Sequence[Path], output: Path | None) -> Path:
     return compare_runs(output or directories[-1].resolve().parent / f"{names}.html", runs)
 
 
-def _rules(config: Config, agents: Sequence[int], result: LaunchResult) -> Rules:
-    """Return the limits for the agents of this computer, with obstacles as an operator left them."""
-    rules = replace(config.rules(), judged=tuple(agents))
+def _rules(config: Config, result: LaunchResult) -> Rules:
+    """Return the limits of the configuration, with obstacles as an operator left them."""
+    rules = config.rules()
     return rules if result.obstacles is None else replace(rules, obstacles=result.obstacles)
 
 

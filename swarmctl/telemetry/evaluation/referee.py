@@ -62,7 +62,6 @@ class Rules:
     mode: Literal["realtime", "lockstep"] = "realtime"
     duration_s: float | None = None  # mission time that a completed run must have tracked
     volume: FlightVolume | None = None  # that nobody may leave
-    judged: tuple[int, ...] = ()  # agents that flew from the computer that recorded the run; (): all
     downwash: float = 1.0  # heights are divided by this in `scaled_min_m`, which is reported but not judged
 
 
@@ -96,7 +95,7 @@ def evaluate(
     """
     tracks = merge_tracks(run.ticks, run.truth, rules.agents)
     clock = _MissionClock(run.ticks, tracks)
-    separation, apart = _evaluate_separation(tracks, rules, clock)
+    separation, apart = _evaluate_separation(tracks, rules, _agents_here(run, rules), clock)
     obstacles, clear = _evaluate_obstacles(tracks, rules, clock)
     volume, inside = _evaluate_volume(run, tracks, rules, clock)
     timing, punctual = _evaluate_timing(run.ticks, rules, speed_factor)
@@ -147,8 +146,18 @@ class _MissionClock:
         return (t_us - self.start_us) / 1e6
 
 
-def _evaluate_separation(tracks: Tracks, rules: Rules, clock: _MissionClock) -> tuple[dict[str, Any], list[str]]:
-    """Find the smallest distance over all pairs and common instants, also with heights scaled by the downwash."""
+def _agents_here(run: RunData, rules: Rules) -> Sequence[int]:
+    """Return the agents that flew from the computer that recorded the run: all, unless its launch says otherwise."""
+    started = next((event for event in run.events if event.get("event") == "started"), {})
+    listed = started.get("agents")
+    of_swarm = range(rules.agents)
+    return [agent for agent in of_swarm if agent in listed] if isinstance(listed, list) and listed else of_swarm
+
+
+def _evaluate_separation(
+    tracks: Tracks, rules: Rules, here: Sequence[int], clock: _MissionClock
+) -> tuple[dict[str, Any], list[str]]:
+    """Find the smallest distance over all pairs of `here` and common instants, also with heights scaled by downwash."""
     found: dict[str, Any] = {
         "min_m": None,
         "required_m": rules.required_separation_m,
@@ -158,7 +167,7 @@ def _evaluate_separation(tracks: Tracks, rules: Rules, clock: _MissionClock) -> 
     }
     scale = np.array([1.0, 1.0, 1.0 / rules.downwash])
     violations = []
-    for i, j in itertools.combinations(rules.judged or range(rules.agents), 2):
+    for i, j in itertools.combinations(here, 2):
         apart_m = tracks.pos_ned_m[:, i] - tracks.pos_ned_m[:, j]
         distance_m = np.linalg.norm(apart_m, axis=1)
         if not np.isfinite(distance_m).any():

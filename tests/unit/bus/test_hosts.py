@@ -97,6 +97,13 @@ def test_a_host_flies_only_with_an_identity(path: Path) -> None:
         load_host(path, [2, 3], ["bus.identities=''"])
 
 
+def test_an_obstacle_that_moves_has_no_common_start_on_several_hosts(path: Path) -> None:
+    make_host_identities(path)
+    with pytest.raises(ConfigError, match=r"obstacles: one moves"):
+        load_host(path, [2, 3], ["obstacles=[{center_ned_m=[9,0,0],radius_m=0.5,vel_ned_m_s=[1,0,0]}]"])
+    assert load_host(path, [2, 3], ["obstacles=[{center_ned_m=[9,0,0],radius_m=0.5}]"])[0].obstacles
+
+
 def test_a_host_simulates_its_own_vehicles_by_their_numbers() -> None:
     fault = "sitl.faults=[{kind='gps_loss',vehicle=3},{kind='gps_loss',vehicle=0},{kind='mass',value=1.1}]"
     config = load(CONFIG, [fault])

@@ -17,15 +17,13 @@ _SUM_UP = """
 import resource, sys
 from pathlib import Path
 from swarmctl.config import Config
-from swarmctl.ops.processes import RunContext
 from swarmctl.ops.supervisor import LaunchResult
 from swarmctl.ops.summary import sum_up
 directory, limit = Path(sys.argv[1]), int(sys.argv[2])
 if limit >= 0:
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 result = LaunchResult(problems=["agent-1 was killed by SIGKILL", "agent-2 has been silent for 5 s"])
-context = RunContext("run", "unixsock-stream//nowhere", directory, (0, 1, 2))
-violated = sum_up(Config(), context, result, print)
+violated = sum_up(Config(), directory, result, print)
 print("exit code", result.exit_code(violated))
 """
 

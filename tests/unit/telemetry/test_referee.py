@@ -50,6 +50,16 @@ def run(by_agent: dict[int, NDArray[np.void]], *true: NDArray[np.void], events: 
 APART = {0: ticks(20, (1.0, 0.0, 0.0)), 1: ticks(20, (0.0, 0.0, 2.0))}
 
 
+def test_a_host_judges_the_distances_of_its_own_agents() -> None:
+    rules, of_three = Rules(agents=3, required_separation_m=0.5), run(APART)
+    (problem,) = evaluate(of_three, rules, "failed")["violations"][:1]
+    assert "agents 0 and 2 can't be judged" in problem
+    started = {"event": "started", "agents": [0, 1]}
+    of_host = evaluate(run(APART, events=[started]), rules, "completed")
+    assert (of_host["violations"], of_host["separation"]["min_pair"]) == ([], [0, 1])
+    assert evaluate(run(APART, events=[{**started, "agents": []}]), rules, "failed")["violations"], "as the station's"
+
+
 def test_summed_mean_tracking_error_is_the_sum_of_mean_distances() -> None:
     tracking = evaluate(run(APART), Rules(agents=2, required_separation_m=0.5), "completed")["tracking"]
     assert tracking["index_m"] == pytest.approx(1.0 + 2.0)
