@@ -44,6 +44,9 @@ class InputBounds(ConstraintBlock):
 
     def __init__(self, prediction: Prediction) -> None:
         self._prediction = prediction
+        self._bounds = [  # by axis: its rows, bounds and unit
+            (prediction.columns(i), axis.u_min, axis.u_max, axis.u_scale) for i, axis in enumerate(prediction.axes)
+        ]
         super().__init__(np.kron(np.eye(len(prediction.axes)), np.tri(prediction.horizon.control)).astype(bool))
 
     def prepare(self, rows: Rows) -> None:
@@ -52,11 +55,8 @@ class InputBounds(ConstraintBlock):
             rows.moves[own, own] = np.tri(self._prediction.horizon.control) * axis.du_max / axis.u_scale
 
     def fill(self, rows: Rows, forecast: Forecast) -> None:
-        hc, first = self._prediction.horizon.control, 0
-        for axis, held in zip(self._prediction.axes, forecast.u_prev.tolist(), strict=True):
-            rows.lower[first : first + hc] = (axis.u_min - held) / axis.u_scale
-            rows.upper[first : first + hc] = (axis.u_max - held) / axis.u_scale
-            first += hc
+        for (own, u_min, u_max, u_scale), held in zip(self._bounds, forecast.u_prev.tolist(), strict=True):
+            rows.lower[own], rows.upper[own] = (u_min - held) / u_scale, (u_max - held) / u_scale
 
 
 class TerminalConditions(ConstraintBlock):

@@ -71,8 +71,8 @@ class Prediction:
         self._of_accel = np.stack([self.pos_of_accel, self.vel_of_accel])  # (2, Hp, Hp)
         self._of_vel = np.stack(horizon.of_velocity_s())[:, :, None]  # (2, Hp, 1)
         self.hold = horizon.held()  # (Hp, Hc) inputs of a unit increment
-        self._least, self._most = self.u_min[:, None], self.u_max[:, None]  # (axes, 1)
-        self._step = self.du_max[:, None]  # (axes, 1)
+        like = np.ones((len(axes), horizon.control + 1))  # operands of one shape are quicker than broadcast ones
+        self._least, self._most, self._step = (bound[:, None] * like for bound in (self.u_min, self.u_max, self.du_max))
         ramps = self._step * np.arange(horizon.control + 1)
         self._ramps = np.stack([ramps, -ramps])  # (2, axes, Hc+1) from the held input on
         self._has_lag = any(a.lag is not None for a in axes)
@@ -147,13 +147,13 @@ class Prediction:
         if x is None:
             return np.zeros(shape)
         moves = x[: shape[0] * shape[1]].reshape(shape)
-        wanted = np.minimum(np.maximum(moves, -1.0), 1.0) * self._step
+        wanted = np.minimum(np.maximum(moves, -1.0), 1.0) * self._step[:, 1:]
         inputs = u_prev[:, None] + wanted.cumsum(axis=1)
-        inputs = np.minimum(np.maximum(inputs, self._least), self._most)
+        inputs = np.minimum(np.maximum(inputs, self._least[:, 1:]), self._most[:, 1:])
         inputs[:, 1:] -= inputs[:, :-1]
         inputs[:, 0] -= u_prev
         return np.asarray(inputs)
 
     def scaled(self, increments: Array) -> Array:
         """Return increments (axes, Hc) as variables (moves,) of the program."""
-        return np.asarray(increments / self._step).ravel()
+        return np.asarray(increments / self._step[:, 1:]).ravel()

@@ -18,10 +18,13 @@ class TrackingCost:
         self._prediction, axes = prediction, prediction.axes
         self._regions = {i: self._region(a) for i, a in enumerate(axes) if a.terminal == "region"}
         self.scale = 1.0 / max(self._largest(), 1e-12)
-        self._weight = np.array([[a.q_pos for a in axes], [a.q_vel for a in axes]])[:, :, None]  # (2, axes, 1)
-        self._r = np.array([a.r for a in axes])[:, None]  # (axes, 1)
-        self._curvature_scale = np.array([2.0 * a.du_max**2 * self.scale for a in axes])[:, None, None]
-        self._slope_scale = np.array([2.0 * a.du_max * self.scale for a in axes])[:, None]
+        self._own, hc = [prediction.columns(i) for i in range(len(axes))], prediction.horizon.control
+        like, square = np.ones((len(axes), hc)), np.ones((len(axes), hc, hc))  # quicker than broadcast operands
+        weights = np.array([[a.q_pos for a in axes], [a.q_vel for a in axes]])  # (2, axes)
+        self._slope_weight, self._weight = weights[:, :, None] * like, weights[:, :, None, None] * square
+        self._r = np.array([a.r * np.eye(hc) for a in axes])  # (axes, Hc, Hc)
+        self._slope_factor = np.array([2.0 * a.du_max * self.scale for a in axes])[:, None] * like
+        self._factor = np.array([2.0 * a.du_max**2 * self.scale for a in axes])[:, None, None] * square
 
     def _region(self, axis: Axis) -> TerminalRegion:
         """Return the terminal region of an axis, in units of acceleration."""
@@ -55,23 +58,21 @@ class TrackingCost:
 
     def fill(self, hessian: Array, slope: Array, forecast: Forecast) -> None:
         """Write the Hessian (moves, moves) and the linear cost (moves,) of one step."""
-        axes, hc, response = len(self._weight[0]), self._prediction.horizon.control, forecast.response
-        gram = self._weight[..., None] * (response.swapaxes(2, 3) @ response)
+        response = forecast.response
+        gram = self._weight * (response.swapaxes(2, 3) @ response)
         curvature = gram[0] + gram[1]  # (axes, Hc, Hc)
         errors = forecast.error.swapaxes(1, 2)[:, :, None]  # (2, axes, 1, Hp)
-        pulls = self._weight * (errors @ response)[:, :, 0]
+        pulls = self._slope_weight * (errors @ response)[:, :, 0]
         pull = pulls[0] + pulls[1]  # (axes, Hc)
         for i, region in self._regions.items():
             end = self._end_response(i, forecast)
             weighted = end.T @ region.beyond
             curvature[i] += weighted @ end
             pull[i] += weighted @ np.array(self._end_error(i, forecast))
-        curvature.reshape(axes, -1)[:, :: hc + 1] += self._r  # the diagonals
-        curvature *= self._curvature_scale
-        for i in range(axes):
-            own = self._prediction.columns(i)
+        curvature = self._factor * (curvature + self._r)
+        for i, own in enumerate(self._own):
             hessian[own, own] = curvature[i]
-        slope[: axes * hc] = (self._slope_scale * pull).ravel()
+        slope[: pull.size] = (self._slope_factor * pull).ravel()
 
     def _end_response(self, i: int, forecast: Forecast) -> Array:
         """Return position, velocity and acceleration (3, Hc) at the end, due to unit increments of axis `i`."""
