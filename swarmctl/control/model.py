@@ -108,63 +108,68 @@ class Predictor:
         The remembered commands act one after the other, each from its own time. Before the first one the vehicle is
         assumed to compensate the disturbance.
         """
-        pos, vel, t_us = state.pos_ned_m, state.vel_ned_m_s, state.t_us
-        down = body_z_ned(state.q_nb)
-        tilt, rate = down[:2], tilt_rate(state)
-        current = None if not self._sent else self._sent[0][1]
-        for start_us, virtual_control in self._sent:
+        moved, t_us = _Motion(state, self._lag, self._drag_1_s, disturbance_ned_m_s2), state.t_us
+        acting = self._acting_from(t_us)
+        current = acting[0][1] if acting else None
+        for start_us, virtual_control in acting:
             if start_us > t_us:
                 if start_us >= until_us:
                     break
-                pos, vel, tilt, rate = self._advance(
-                    pos,
-                    vel,
-                    tilt,
-                    rate,
-                    command=current,
-                    disturbance_ned_m_s2=disturbance_ned_m_s2,
-                    for_us=start_us - t_us,
-                )
+                moved.advance(current, start_us - t_us)
                 t_us = start_us
             current = virtual_control
-        left_us = max(0, until_us - t_us)
-        pos, vel, tilt, rate = self._advance(
-            pos, vel, tilt, rate, command=current, disturbance_ned_m_s2=disturbance_ned_m_s2, for_us=left_us
-        )
-        if self._lag is None:
-            return Start(t_us=until_us, pos_ned_m=pos, vel_ned_m_s=vel, cos_tilt=float(down[2]), virtual_control=held)
-        cos_tilt = math.sqrt(max(0.0, 1.0 - float(tilt @ tilt)))
-        return Start(
-            t_us=until_us,
-            pos_ned_m=pos,
-            vel_ned_m_s=vel,
-            cos_tilt=cos_tilt,
-            virtual_control=held,
-            tilt=tilt,
-            tilt_rate_1_s=rate,
-        )
+        moved.advance(current, max(0, until_us - t_us))
+        return moved.start(until_us, held)
 
-    def _advance(
-        self,
-        pos: Array,
-        vel: Array,
-        tilt: Array,
-        rate: Array,
-        *,
-        command: Array | None,
-        disturbance_ned_m_s2: Array,
-        for_us: int,
-    ) -> tuple[Array, Array, Array, Array]:
+    def _acting_from(self, t_us: int) -> list[tuple[int, Array]]:
+        """Return the command that acts at `t_us`, or before all the oldest one, and those that act after it."""
+        found = []
+        for sent in reversed(self._sent):
+            found.append(sent)
+            if sent[0] <= t_us:
+                break
+        found.reverse()
+        return found
+
+
+class _Motion:
+    """The predicted motion of a vehicle, in plain numbers: there are too few for arrays to pay."""
+
+    def __init__(self, state: VehicleState, lag: Lag | None, drag_1_s: float, disturbance_ned_m_s2: Array) -> None:
+        self._pos, self._vel = state.pos_ned_m.tolist(), state.vel_ned_m_s.tolist()
+        *self._tilt, self._down = body_z_ned(state.q_nb).tolist()
+        self._rate = [0.0, 0.0] if lag is None else tilt_rate(state).tolist()
+        self._lag, self._drag_1_s, self._disturbance = lag, drag_1_s, disturbance_ned_m_s2.tolist()
+
+    def advance(self, command: Array | None, for_us: int) -> None:
+        """Move on under a command (3,); without one, at constant velocity."""
         dt_s = for_us * 1e-6
         if command is None:
-            return pos + vel * dt_s, vel, tilt, rate
-        flown = command
+            self._pos = [p + v * dt_s for p, v in zip(self._pos, self._vel, strict=True)]
+            return
+        ux, uy, thrust = command.tolist()
         if self._lag is not None and for_us > 0:
-            ends = [self._lag.advance(float(tilt[i]), float(rate[i]), float(command[i]), dt_s) for i in (0, 1)]
-            tilt, rate = np.array([end[0] for end in ends]), np.array([end[1] for end in ends])
-            flown = np.array([ends[0][2] / dt_s, ends[1][2] / dt_s, command[2]])
-        pos, vel = _moved(pos, vel, acceleration(flown) + disturbance_ned_m_s2, self._drag_1_s, dt_s=dt_s)
-        return pos, vel, tilt, rate
+            ends = [self._lag.advance(*now, dt_s) for now in zip(self._tilt, self._rate, (ux, uy), strict=True)]
+            self._tilt, self._rate = [end[0] for end in ends], [end[1] for end in ends]
+            ux, uy = ends[0][2] / dt_s, ends[1][2] / dt_s
+        accel = [a + d for a, d in zip(_acceleration(ux, uy, thrust), self._disturbance, strict=True)]
+        self._pos, self._vel = _moved(self._pos, self._vel, accel, self._drag_1_s, dt_s=dt_s)
+
+    def start(self, t_us: int, held: Array) -> Start:
+        """Return the start of a plan from here on, after `held` (3,) was commanded last."""
+        pos, vel = np.array(self._pos), np.array(self._vel)
+        if self._lag is None:
+            return Start(t_us=t_us, pos_ned_m=pos, vel_ned_m_s=vel, cos_tilt=self._down, virtual_control=held)
+        north, east = self._tilt
+        return Start(
+            t_us=t_us,
+            pos_ned_m=pos,
+            vel_ned_m_s=vel,
+            cos_tilt=math.sqrt(max(0.0, 1.0 - (north * north + east * east))),
+            virtual_control=held,
+            tilt=np.array(self._tilt),
+            tilt_rate_1_s=np.array(self._rate),
+        )
 
 
 def tilt_rate(state: VehicleState) -> Array:
@@ -175,14 +180,22 @@ def tilt_rate(state: VehicleState) -> Array:
 
 def acceleration(virtual_control: Array) -> Array:
     """Return the acceleration (3,) NED [m/s2] of virtual_control controls (3,), gravity included (thesis 3.2)."""
-    ux, uy, thrust = virtual_control.tolist()
+    return np.array(_acceleration(*virtual_control.tolist()))
+
+
+def _acceleration(ux: float, uy: float, thrust_m_s2: float) -> tuple[float, float, float]:
     down = max(0.0, 1.0 - ux * ux - uy * uy) ** 0.5
-    return np.array([-thrust * ux, -thrust * uy, GRAVITY_M_S2 - thrust * down])
+    return -thrust_m_s2 * ux, -thrust_m_s2 * uy, GRAVITY_M_S2 - thrust_m_s2 * down
 
 
-def _moved(pos: Array, vel: Array, accel: Array, drag_1_s: float, *, dt_s: float) -> tuple[Array, Array]:
-    if drag_1_s == 0.0:
-        return pos + vel * dt_s + (0.5 * dt_s * dt_s) * accel, vel + dt_s * accel
-    kept = math.exp(-drag_1_s * dt_s)
-    gained_s = (1.0 - kept) / drag_1_s
-    return pos + gained_s * vel + ((dt_s - gained_s) / drag_1_s) * accel, kept * vel + gained_s * accel
+def _moved(
+    pos: list[float], vel: list[float], accel: list[float], drag_1_s: float, *, dt_s: float
+) -> tuple[list[float], list[float]]:
+    """Return positions and velocities after `dt_s` of a held acceleration."""
+    kept, gained_s, fallen_s2 = 1.0, dt_s, 0.5 * dt_s * dt_s
+    if drag_1_s != 0.0:
+        kept = math.exp(-drag_1_s * dt_s)
+        gained_s = (1.0 - kept) / drag_1_s
+        fallen_s2 = (dt_s - gained_s) / drag_1_s
+    ends = [p + gained_s * v + fallen_s2 * a for p, v, a in zip(pos, vel, accel, strict=True)]
+    return ends, [kept * v + gained_s * a for v, a in zip(vel, accel, strict=True)]

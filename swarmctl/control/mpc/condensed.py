@@ -7,6 +7,7 @@ which.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from functools import partial
 
@@ -96,23 +97,22 @@ class CondensedMpc:
         """Return the motion under the increments of a solution, with what it violates."""
         x, ahead = solution.x, self.prediction
         increments = ahead.increments(x, forecast.u_prev)
-        pos_m = forecast.free_pos_m + np.einsum("akc,ca->ka", forecast.pos_response, increments)
-        vel_m_s = forecast.free_vel_m_s + np.einsum("akc,ca->ka", forecast.vel_response, increments)
-        residual_m = gap_m = np.inf
+        motion = forecast.free + np.einsum("qakc,ac->qka", forecast.response, increments)
+        residual_m = gap_m = math.inf
         if x is not None:
-            scaled = (increments / ahead.du_max).T.ravel()
-            flown = np.concatenate([scaled, x[len(scaled) :]])
+            flown = x.copy()
+            flown[: increments.size] = ahead.scaled(increments)
             residual_m = self._program.residual_m(flown)
             gap_m = self._ends.gap(self._program.rows[self._ends], forecast, flown)
         return AxesSolution(
             solved=x is not None,
             status=solution.status,
             iterations=solution.iterations,
-            u=forecast.u_prev + ahead.hold @ increments,
-            pos_m=pos_m,
-            vel_m_s=vel_m_s,
+            u=forecast.u_prev + ahead.hold @ increments.T,
+            pos_m=motion[0],
+            vel_m_s=motion[1],
             slack_m=slack_m(self._program.rows[self.half_spaces], solution),
             residual_m=residual_m,
-            terminal_gap_m=max(gap_m, self._cost.outside_m(forecast, pos_m, vel_m_s, increments)),
+            terminal_gap_m=max(gap_m, self._cost.outside_m(forecast, motion, increments)),
             solve_us=solve_us,
         )

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from swarmctl.control.mpc.axes import Faces, HalfSpaces, Penalties
+from swarmctl.control.mpc.axes import Faces, Penalties
 from swarmctl.control.mpc.prediction import Forecast, Prediction
 from swarmctl.control.mpc.program import ConstraintBlock, Rows
 from swarmctl.control.mpc.solvers.qp import INFINITY, QpSolution
@@ -44,6 +44,9 @@ class InputBounds(ConstraintBlock):
 
     def __init__(self, prediction: Prediction) -> None:
         self._prediction = prediction
+        self._bounds = [  # by axis: its rows, bounds and unit
+            (prediction.columns(i), axis.u_min, axis.u_max, axis.u_scale) for i, axis in enumerate(prediction.axes)
+        ]
         super().__init__(np.kron(np.eye(len(prediction.axes)), np.tri(prediction.horizon.control)).astype(bool))
 
     def prepare(self, rows: Rows) -> None:
@@ -52,10 +55,8 @@ class InputBounds(ConstraintBlock):
             rows.moves[own, own] = np.tri(self._prediction.horizon.control) * axis.du_max / axis.u_scale
 
     def fill(self, rows: Rows, forecast: Forecast) -> None:
-        for i, axis in enumerate(self._prediction.axes):
-            own, held = self._prediction.columns(i), forecast.u_prev[i]
-            rows.lower[own] = (axis.u_min - held) / axis.u_scale
-            rows.upper[own] = (axis.u_max - held) / axis.u_scale
+        for (own, u_min, u_max, u_scale), held in zip(self._bounds, forecast.u_prev.tolist(), strict=True):
+            rows.lower[own], rows.upper[own] = (u_min - held) / u_scale, (u_max - held) / u_scale
 
 
 class TerminalConditions(ConstraintBlock):
@@ -84,14 +85,13 @@ class TerminalConditions(ConstraintBlock):
 
     def fill(self, rows: Rows, forecast: Forecast) -> None:
         """Write equalities; an end that bounded increments can't reach is replaced by the farthest that they can."""
-        out_of_reach = set[int]()
+        out_of_reach, extremes = set[int](), self._prediction.extremes(forecast.u_prev)
         for j, (i, what) in enumerate(self._ends):
             response = (forecast.pos_response if what == "pos" else forecast.vel_response)[i, -1]
             both = slice(2 * j, 2 * j + 2)
             rows.moves[both, self._prediction.columns(i)] = self._prediction.axes[i].du_max * response
             asked = self._wanted(j, forecast)
-            extremes = self._prediction.extremes(i, forecast.u_prev)
-            least, most = sorted(float(response @ increments) for increments in extremes)
+            least, most = sorted(float(response @ increments) for increments in extremes[:, i])
             rows.lower[both], rows.upper[both] = -INFINITY, INFINITY
             if i in out_of_reach:
                 continue  # its end velocity then does not matter
@@ -104,7 +104,7 @@ class TerminalConditions(ConstraintBlock):
     def _wanted(self, j: int, forecast: Forecast) -> float:
         """Return by how much increments have to move the end of a condition."""
         i, what = self._ends[j]
-        return float(-(forecast.pos_error_m if what == "pos" else forecast.vel_error_m_s)[-1, i])
+        return float(-forecast.error[0 if what == "pos" else 1, -1, i])
 
     def soften(self, rows: Rows, which: NDArray[np.intp]) -> None:
         """Replace conditions `which` by `gap + slack >= 0` and `gap - slack <= 0` with free slacks.
@@ -148,7 +148,7 @@ class KeepOutHalfSpaces(ConstraintBlock):
     def __init__(
         self, prediction: Prediction, max_keep_outs: int, relax_01: float, penalties: Penalties, *, cost_scale: float
     ) -> None:
-        self._prediction, self._relax_01, self._max_keep_outs = prediction, relax_01, max_keep_outs
+        self._prediction, self._relax_01 = prediction, relax_01
         self._over, self._slope_floor = penalties.over, penalties.floor * _SLACK_SCALE_M * cost_scale
         axes, horizon, first = prediction.axes, prediction.horizon, prediction.first_row()
         stride = max(1, round(_ROW_SPACING_S / horizon.dt_s))
@@ -159,6 +159,7 @@ class KeepOutHalfSpaces(ConstraintBlock):
         response = np.append(response, response[-1])  # the stopping row
         self._row_scale = 1.0 / np.maximum(response, 0.01)  # rows of about unit size suit a first-order solver
         self._scale = np.tile(self._row_scale, max_keep_outs)  # of all rows
+        self._unit = (prediction.du_max[:, None] * self._row_scale)[:, None, :, None]  # (axes, 1, checks, 1)
         uses = np.ones((max_keep_outs * len(response), len(axes) * horizon.control), bool)
         slacks = np.kron(np.eye(max_keep_outs), (_SLACK_SCALE_M * self._row_scale)[:, None])
         curvature = 2 * penalties.slack_quadratic * _SLACK_SCALE_M**2 * cost_scale
@@ -166,47 +167,37 @@ class KeepOutHalfSpaces(ConstraintBlock):
 
     def fill(self, rows: Rows, forecast: Forecast) -> None:
         """Write the rows of half-spaces; without any they are disabled."""
-        if not self._max_keep_outs:
-            return
         rows.lower[:] = -INFINITY
-        steepest = float(np.abs(rows.slope).max()) * self._row_scale[-1]  # per metre of the last row
+        steepest = max(map(abs, rows.slope.tolist())) * self._row_scale[-1]  # per metre of the last row
         rows.slack_slope[:] = self._slope_floor + self._over * steepest * _SLACK_SCALE_M
         spaces = forecast.half_spaces
         if spaces is None or len(spaces.normal) == 0:
             return
-        normal = spaces.normal.take(self._steps, axis=1)
+        normal = spaces.normal.take(self._steps, axis=1)  # (used, checks, axes) of checked steps and the stopping row
         offset = spaces.offset_m.take(self._steps, axis=1)
         offset[:, -1] = spaces.stop_offset_m
-        reach = self._fill_coefficients(rows, forecast, spaces, normal)
-        free = np.empty((*offset.shape, len(self._prediction.axes)))
-        free[:] = forecast.free_pos_m.take(self._steps, axis=0)
-        free[:, -1] += spaces.stop_s[:, None] * forecast.free_vel_m_s[-1]
+        free = np.empty(normal.shape)
+        free[:] = forecast.free[0].take(self._steps, axis=0)
+        free[:, -1] += spaces.stop_s[:, None] * forecast.free[1, -1]
         wanted = offset - np.einsum("ska,ska->sk", normal, free)
+        reach = self._fill_coefficients(rows, forecast, spaces.stop_s, normal)
         lower = np.minimum(wanted, self._relax_01 * reach) * self._row_scale
-        rows.lower[: offset.size] = np.where(np.isfinite(offset), lower, -INFINITY).ravel()
+        rows.lower[: offset.size] = np.maximum(lower, -INFINITY).ravel()
 
-    def _fill_coefficients(self, rows: Rows, forecast: Forecast, spaces: HalfSpaces, normal: Array) -> Array:
-        """Write coefficients, and return the largest value [m] of each row that bounded increments allow.
-
-        Both `normal` (used, checks, axes) and the result (used, checks) are for checked steps and the stopping row.
-        """
-        used, checks = normal.shape[:2]
-        block = rows.moves[: used * checks].reshape(used, checks, -1)  # a view
-        reach = np.zeros((used, checks))
-        for i, axis in enumerate(self._prediction.axes):
-            pos, vel = forecast.pos_response[i], forecast.vel_response[i]
-            push = np.empty((used, checks, self._prediction.horizon.control))  # metres of each row per unit increment
-            push[:] = pos.take(self._steps, axis=0)
-            push[:, -1] += spaces.stop_s[:, None] * vel[-1]
-            push *= normal[:, :, i, None]
-            block[:, :, self._prediction.columns(i)] = (axis.du_max * self._row_scale)[None, :, None] * push
-            rise, fall = self._prediction.extremes(i, forecast.u_prev)
-            reach += np.maximum(push @ rise, push @ fall)
-        return reach
+    def _fill_coefficients(self, rows: Rows, forecast: Forecast, stop_s: Array, normal: Array) -> Array:
+        """Write coefficients, and return the largest value [m] (used, checks) that bounded increments allow."""
+        used, checks, axes = normal.shape
+        push = np.empty((axes, used, checks, self._prediction.horizon.control))  # metres of a row per unit increment
+        push[:] = forecast.response[0].take(self._steps, axis=1)[:, None]
+        push[:, :, -1] += stop_s[:, None] * forecast.response[1, :, None, -1]
+        push *= normal.transpose(2, 0, 1)[..., None]
+        block = rows.moves[: used * checks].reshape(used, checks, axes, -1)  # a view
+        np.multiply(self._unit, push, out=block.transpose(2, 0, 1, 3))
+        extremes = self._prediction.extremes(forecast.u_prev)
+        reached = (push @ extremes[:, :, None, :, None])[..., 0]  # (2, axes, used, checks)
+        return np.asarray(np.add.reduce(np.maximum(reached[0], reached[1])))
 
     def residual_m(self, rows: Rows, flown: Array) -> float:
-        if not self._max_keep_outs:
-            return 0.0
         shortfall = rows.lower - rows.coefficients @ flown
         return float((shortfall / self._scale).max(initial=0.0))
 
@@ -245,6 +236,8 @@ class VolumeFaces(ConstraintBlock):
         response = (prediction.pos_of_accel @ prediction.acted[0])[self._steps].max(axis=1)
         response += usual_s * (prediction.vel_of_accel @ prediction.acted[0])[self._steps].max(axis=1)
         self._scale = 1.0 / np.maximum(response * step_m_s2, 0.01)  # (rows of a face,) as in `KeepOutHalfSpaces`
+        self._unit = (prediction.du_max[:, None] * self._scale)[:, None, :, None]  # (axes, 1, checks, 1)
+        self._normals = faces.normals.T[:, :, None, None]  # (axes, faces, 1, 1)
         self._steepest = float(self._scale[len(positions) - 1])  # increments per metre of the last position
         uses = np.repeat(np.repeat(faces.normals != 0.0, len(self._steps), axis=0), prediction.horizon.control, axis=1)
         slacks = np.kron(np.eye(len(faces.normals)), (_SLACK_SCALE_M * self._scale)[:, None])
@@ -264,24 +257,20 @@ class VolumeFaces(ConstraintBlock):
         least, most = self._fill_coefficients(rows, forecast, ahead_s)
         lower = np.where(wanted > least, np.minimum(wanted, _ASKED_01 * most) * self._scale, -INFINITY)
         rows.lower[:] = lower.ravel()
-        steepest = float(np.abs(rows.slope).max()) * self._steepest
+        steepest = max(map(abs, rows.slope.tolist())) * self._steepest
         rows.slack_slope[:] = self._slope_floor + self._over * steepest * _SLACK_SCALE_M
 
     def _fill_coefficients(self, rows: Rows, forecast: Forecast, ahead_s: Array) -> tuple[Array, Array]:
         """Write coefficients, and return the least and the largest value [m] (faces, rows) that bounds allow."""
         faces, checks = ahead_s.shape
-        block = rows.moves.reshape(faces, checks, -1)  # a view
-        least, most = np.zeros((faces, checks)), np.zeros((faces, checks))
-        for i, axis in enumerate(self._prediction.axes):
-            pos, vel = forecast.pos_response[i][self._steps], forecast.vel_response[i][self._steps]
-            push = (pos + ahead_s[:, :, None] * vel) * self._faces.normals[
-                :, i, None, None
-            ]  # metres per unit increment
-            block[:, :, self._prediction.columns(i)] = axis.du_max * self._scale[None, :, None] * push
-            rise, fall = self._prediction.extremes(i, forecast.u_prev)
-            least += np.minimum(push @ rise, push @ fall)
-            most += np.maximum(push @ rise, push @ fall)
-        return least, most
+        pos, vel = forecast.response.take(self._steps, axis=2)[:, :, None]  # (axes, 1, checks, Hc) each
+        push = (pos + ahead_s[:, :, None] * vel) * self._normals  # (axes, faces, checks, Hc) metres per unit increment
+        block = rows.moves.reshape(faces, checks, len(push), -1)  # a view
+        np.multiply(self._unit, push, out=block.transpose(2, 0, 1, 3))
+        extremes = self._prediction.extremes(forecast.u_prev)
+        reached = (push @ extremes[:, :, None, :, None])[..., 0]  # (2, axes, faces, checks)
+        least, most = np.minimum(reached[0], reached[1]), np.maximum(reached[0], reached[1])
+        return np.asarray(np.add.reduce(least)), np.asarray(np.add.reduce(most))
 
     def residual_m(self, rows: Rows, flown: Array) -> float:
         shortfall = (rows.lower - rows.coefficients @ flown).reshape(-1, len(self._scale))
@@ -290,5 +279,6 @@ class VolumeFaces(ConstraintBlock):
 
 def slack_m(rows: Rows, solution: QpSolution) -> float:
     """Return the largest slack [m] of a block in a solution, 0 without one."""
-    x = solution.x
-    return 0.0 if x is None else float(x[rows.slack_columns].max(initial=0.0)) * _SLACK_SCALE_M
+    if solution.x is None or not len(rows.slack_slope):
+        return 0.0
+    return max(0.0, float(solution.x[rows.slack_columns].max())) * _SLACK_SCALE_M

@@ -95,12 +95,14 @@ class JointMpc:
         ahead = self._mpc.prediction
         acting = ahead.realised(found.u, tilt, rate)
         along = np.column_stack([acting[:, :2], np.full(steps, start.cos_tilt)])  # (steps, 3)
-        pos, vel = ahead.motion(start.pos_ned_m, start.vel_ned_m_s, self._drift(problem) - thrust * along)
+        motion = np.empty((2, steps + 1, 3))
+        motion[0, 0], motion[1, 0] = start.pos_ned_m, start.vel_ned_m_s
+        motion[:, 1:] = ahead.motion(start.pos_ned_m, start.vel_ned_m_s, self._drift(problem) - thrust * along)
         first_row, stopwatch_ns = ahead.first_row(), self._stopwatch_ns
         return judged(
             problem,
-            pos,
-            vel,
+            motion[0],
+            motion[1],
             found.u,
             solutions=(found,),
             from_step=first_row,

@@ -20,18 +20,38 @@ _DECIDED_S = 0.12  # motion within this time after the dead time can hardly be c
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Forecast:
-    """Holds what cost and constraints of one step need: the motion without increments, and responses to them."""
+    """Holds what cost and constraints of one step need: the motion without increments, and responses to them.
+
+    The first axis of motions and responses is 0 for positions [m] and 1 for velocities [m/s].
+    """
 
     asked: AxesProblem
     half_spaces: HalfSpaces | None
     u_prev: Array  # (axes,) held input, within its bounds
-    free_pos_m: Array  # (Hp, axes) at steps 1..Hp, without increments
-    free_vel_m_s: Array  # (Hp, axes)
-    pos_response: Array  # (axes, Hp, Hc) metres of a unit increment
-    vel_response: Array  # (axes, Hp, Hc)
-    pos_error_m: Array  # (Hp, axes) of the free motion to the reference
-    vel_error_m_s: Array  # (Hp, axes)
-    end_error: Array  # (3, axes) of position, velocity and acceleration, at the end of the free motion
+    accel_m_s2: Array  # (Hp, axes) over each step, without increments
+    free: Array  # (2, Hp, axes) motion at steps 1..Hp, without increments
+    error: Array  # (2, Hp, axes) of the free motion to the reference
+    response: Array  # (2, axes, Hp, Hc) to unit increments
+
+    @property
+    def free_pos_m(self) -> Array:
+        """Return positions (Hp, axes) without increments."""
+        return np.asarray(self.free[0])
+
+    @property
+    def free_vel_m_s(self) -> Array:
+        """Return velocities (Hp, axes) without increments."""
+        return np.asarray(self.free[1])
+
+    @property
+    def pos_response(self) -> Array:
+        """Return displacements (axes, Hp, Hc) [m] of unit increments."""
+        return np.asarray(self.response[0])
+
+    @property
+    def vel_response(self) -> Array:
+        """Return changes of velocity (axes, Hp, Hc) [m/s] by unit increments."""
+        return np.asarray(self.response[1])
 
 
 class Prediction:
@@ -48,9 +68,13 @@ class Prediction:
         self.u_max = np.array([a.u_max for a in axes])
         self.du_max = np.array([a.du_max for a in axes])
         self.pos_of_accel, self.vel_of_accel = horizon.of_acceleration()  # (Hp, Hp) each
-        self._pos_of_vel, self._vel_of_vel = horizon.of_velocity_s()
+        self._of_accel = np.stack([self.pos_of_accel, self.vel_of_accel])  # (2, Hp, Hp)
+        self._of_vel = np.stack(horizon.of_velocity_s())[:, :, None]  # (2, Hp, 1)
         self.hold = horizon.held()  # (Hp, Hc) inputs of a unit increment
-        self._ramps = [a.du_max * np.arange(horizon.control + 1) for a in axes]  # (Hc+1,) each, from the held input on
+        like = np.ones((len(axes), horizon.control + 1))  # operands of one shape are quicker than broadcast ones
+        self._least, self._most, self._step = (bound[:, None] * like for bound in (self.u_min, self.u_max, self.du_max))
+        ramps = self._step * np.arange(horizon.control + 1)
+        self._ramps = np.stack([ramps, -ramps])  # (2, axes, Hc+1) from the held input on
         self._has_lag = any(a.lag is not None for a in axes)
         self._lags = [lag_response(a.lag, horizon.dt_s, horizon.prediction) for a in axes]
         self.acted = np.stack([lag.of_command @ self.hold for lag in self._lags])  # (axes, Hp, Hc) realised inputs
@@ -82,53 +106,54 @@ class Prediction:
                 acts[:, i] += rate_1_s[i] * lag.of_rate_s
         return acts
 
-    def motion(self, pos_m: Array, vel_m_s: Array, accel_m_s2: Array) -> tuple[Array, Array]:
-        """Return positions and velocities (Hp, axes) under accelerations (Hp, axes) held over each step."""
-        pos = pos_m + self._pos_of_vel[:, None] * vel_m_s + self.pos_of_accel @ accel_m_s2
-        return pos, self._vel_of_vel[:, None] * vel_m_s + self.vel_of_accel @ accel_m_s2
+    def motion(self, pos_m: Array, vel_m_s: Array, accel_m_s2: Array) -> Array:
+        """Return positions and velocities (2, Hp, axes) under accelerations (Hp, axes) held over each step."""
+        coasting = self._of_vel * vel_m_s
+        coasting[0] += pos_m
+        return np.asarray(coasting + self._of_accel @ accel_m_s2)
 
     def forecast(self, asked: AxesProblem, half_spaces: HalfSpaces | None) -> Forecast:
         """Return the forecast of one receding-horizon step."""
-        gain_m_s2, ref_vel_m_s = asked.gain_m_s2, asked.ref_vel_m_s
+        gain_m_s2 = asked.gain_m_s2
         u_prev = np.minimum(np.maximum(asked.u_prev, self.u_min), self.u_max)
         acts = u_prev  # (axes,), or (Hp, axes) with a lag
         if self._has_lag:
             held = np.broadcast_to(u_prev, gain_m_s2.shape)
             acts = self.realised(held, asked.realised, asked.realised_1_s)
         accel = gain_m_s2 * acts + asked.drift_m_s2  # (Hp, axes)
-        free_pos, free_vel = self.motion(asked.pos_m, asked.vel_m_s, accel)
+        free = self.motion(asked.pos_m, asked.vel_m_s, accel)
+        error = np.empty(free.shape)
+        np.subtract(free[0], asked.ref_pos_m, out=error[0])
+        np.subtract(free[1], asked.ref_vel_m_s, out=error[1])
         driven = gain_m_s2.T[:, :, None] * self.acted  # (axes, Hp, Hc)
-        pos_error, vel_error = free_pos - asked.ref_pos_m, free_vel - ref_vel_m_s
-        ref_accel = (ref_vel_m_s[-1] - ref_vel_m_s[-2]) / self.horizon.dt_s if len(ref_vel_m_s) > 1 else 0.0 * u_prev
-        surplus = accel[-1] - self.horizon.drag_1_s * ref_vel_m_s[-1] - ref_accel
         return Forecast(
             asked=asked,
             half_spaces=half_spaces,
             u_prev=u_prev,
-            free_pos_m=free_pos,
-            free_vel_m_s=free_vel,
-            pos_response=self.pos_of_accel @ driven,
-            vel_response=self.vel_of_accel @ driven,
-            pos_error_m=pos_error,
-            vel_error_m_s=vel_error,
-            end_error=np.array([pos_error[-1], vel_error[-1], surplus]),
+            accel_m_s2=accel,
+            free=free,
+            error=error,
+            response=self._of_accel[:, None] @ driven,
         )
 
-    def extremes(self, axis: int, u_prev: Array) -> tuple[Array, Array]:
-        """Return increments (Hc,) of `axis` that raise, and that lower, its input as fast as the bounds allow."""
-        bounds, held, ramp = self.axes[axis], u_prev[axis], self._ramps[axis]
-        rise = np.minimum(held + ramp, bounds.u_max)
-        fall = np.maximum(held - ramp, bounds.u_min)
-        return rise[1:] - rise[:-1], fall[1:] - fall[:-1]
+    def extremes(self, u_prev: Array) -> Array:
+        """Return increments (2, axes, Hc) that raise inputs, and that lower them, as fast as the bounds allow."""
+        inputs = np.minimum(np.maximum(u_prev[:, None] + self._ramps, self._least), self._most)
+        return np.asarray(inputs[:, :, 1:] - inputs[:, :, :-1])
 
     def increments(self, x: Array | None, u_prev: Array) -> Array:
-        """Return increments (Hc, axes) of a solution, within both bounds exactly; zeros without a solution."""
-        hc, n = self.horizon.control, len(self.axes)
+        """Return increments (axes, Hc) of a solution, within both bounds exactly; zeros without a solution."""
+        shape = len(self.axes), self.horizon.control
         if x is None:
-            return np.zeros((hc, n))
-        wanted = x[: n * hc].reshape(n, hc).T * self.du_max
-        wanted = np.minimum(np.maximum(wanted, -self.du_max), self.du_max)
-        inputs = np.empty((n, hc + 1)).T  # the held one first; the layout decides how sums over increments are rounded
-        inputs[0] = u_prev
-        inputs[1:] = np.minimum(np.maximum(u_prev + wanted.cumsum(axis=0), self.u_min), self.u_max)
-        return np.asarray(inputs[1:] - inputs[:-1])
+            return np.zeros(shape)
+        moves = x[: shape[0] * shape[1]].reshape(shape)
+        wanted = np.minimum(np.maximum(moves, -1.0), 1.0) * self._step[:, 1:]
+        inputs = u_prev[:, None] + wanted.cumsum(axis=1)
+        inputs = np.minimum(np.maximum(inputs, self._least[:, 1:]), self._most[:, 1:])
+        inputs[:, 1:] -= inputs[:, :-1]
+        inputs[:, 0] -= u_prev
+        return np.asarray(inputs)
+
+    def scaled(self, increments: Array) -> Array:
+        """Return increments (axes, Hc) as variables (moves,) of the program."""
+        return np.asarray(increments / self._step[:, 1:]).ravel()

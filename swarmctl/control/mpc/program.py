@@ -77,6 +77,7 @@ class Program:
         self.hessian_pattern, self.pattern = np.eye(columns, dtype=bool), np.zeros((rows, columns), bool)
         self.hessian_pattern[:moves, :moves] = cost
         self.rows = dict(self._placed(sorted(blocks, key=lambda block: block.slacks.shape[1] > 0), moves, slacks))
+        self._filled = [(block, rows) for block, rows in self.rows.items() if len(block.uses)]
         self._hessian_index = np.ravel_multi_index(pattern_index(self.hessian_pattern, upper=True), (columns, columns))
         self._index = np.ravel_multi_index(pattern_index(self.pattern), (rows, columns))
 
@@ -113,7 +114,7 @@ class Program:
 
     def fill(self, forecast: Forecast) -> None:
         """Write the constraints of one step; the cost is written before."""
-        for block, rows in self.rows.items():
+        for block, rows in self._filled:
             block.fill(rows, forecast)
 
     def matrices(self) -> tuple[Array, Array]:
@@ -122,4 +123,4 @@ class Program:
 
     def residual_m(self, flown: Array) -> float:
         """Return the largest violation [m] of any constraint by the variables `flown` (columns,)."""
-        return max(block.residual_m(rows, flown) for block, rows in self.rows.items())
+        return max([block.residual_m(rows, flown) for block, rows in self._filled])

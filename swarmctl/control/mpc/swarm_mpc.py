@@ -160,6 +160,9 @@ class SwarmMpc:
             )
             for room in (max_keep_outs, 0)
         )
+        self._first_row = self._xy.prediction.first_row()
+        following = np.minimum(np.arange(self.steps), params.horizon_z - 1)
+        self._thrust_of = following if params.thrust_ahead == "planned" else 0 * following  # (steps,) of the z plan
 
     def plan(self, problem: Problem) -> Plan:
         """Solve one step of distributed MPC. Infeasibility is a status, never an exception."""
@@ -195,7 +198,7 @@ class SwarmMpc:
             pos_m=start.pos_ned_m[:2],
             vel_m_s=start.vel_ned_m_s[:2],
             u_prev=start.virtual_control[:2],
-            gain_m_s2=np.repeat(-self._thrust_ahead(up)[:, None], 2, axis=1),
+            gain_m_s2=self._gain_m_s2(up),
             drift_m_s2=problem.disturbance_ned_m_s2[:2],
             ref_pos_m=problem.reference.pos_ned_m[1 : steps + 1, :2],
             ref_vel_m_s=problem.reference.vel_ned_m_s[1 : steps + 1, :2],
@@ -203,27 +206,23 @@ class SwarmMpc:
             realised_1_s=start.tilt_rate_1_s,
         )
         across = (self._xy_alone if spaces is None else self._xy).solve(asked, spaces)
-        pos, vel = np.empty((steps, 3)), np.zeros((steps, 3))
-        virtual_control = np.empty((steps, 3))
-        pos[:, :2], vel[:, :2], virtual_control[:, :2] = across.pos_m, across.vel_m_s, across.u
-        pos[:count, 2:], vel[:count, 2:], virtual_control[:count, 2:] = (
-            up.pos_m[:count],
-            up.vel_m_s[:count],
-            up.u[:count],
-        )
-        pos[count:, 2], virtual_control[count:, 2] = up.pos_m[-1, 0], up.u[-1, 0]
-        first, stopwatch_ns = self._xy.prediction.first_row(), self._stopwatch_ns
+        pos, vel, virtual_control = np.empty((steps + 1, 3)), np.zeros((steps + 1, 3)), np.empty((steps, 3))
+        pos[0], vel[0] = start.pos_ned_m, start.vel_ned_m_s
+        pos[1:, :2], vel[1:, :2], virtual_control[:, :2] = across.pos_m, across.vel_m_s, across.u
+        pos[1 : count + 1, 2:], vel[1 : count + 1, 2:] = up.pos_m[:count], up.vel_m_s[:count]
+        virtual_control[:count, 2:] = up.u[:count]
+        pos[count + 1 :, 2], virtual_control[count:, 2] = up.pos_m[-1, 0], up.u[-1, 0]
         return judged(
             problem,
             pos,
             vel,
             virtual_control,
             solutions=(up, across),
-            from_step=first,
+            from_step=self._first_row,
             dt_us=self.dt_us,
             began_ns=began_ns,
             spaces_us=spaces_us,
-            stopwatch_ns=stopwatch_ns,
+            stopwatch_ns=self._stopwatch_ns,
             volume=self._volume,
         )
 
@@ -240,11 +239,9 @@ class SwarmMpc:
         )
         return self._z.solve(asked)
 
-    def _thrust_ahead(self, up: AxesSolution) -> Array:
-        """Return thrust over mass (steps,) [m/s2] for the prediction of x-y."""
-        if self._params.thrust_ahead == "held":
-            return np.full(self.steps, up.u[0, 0])
-        return np.asarray(up.u[np.minimum(np.arange(self.steps), len(up.u) - 1), 0])
+    def _gain_m_s2(self, up: AxesSolution) -> Array:
+        """Return accelerations (steps, 2) of unit inputs of x and y, which thrust over mass makes."""
+        return -up.u.take(self._thrust_of, axis=0).repeat(2, axis=1)
 
 
 def faces_along(volume: FlightVolume | None, axes: slice) -> Faces | None:
@@ -269,7 +266,7 @@ def closest_keep_outs(keep_outs: Sequence[KeepOut], guess_ned_m: Array, max_keep
         return list(keep_outs)
     apart = guess_ned_m - np.array([k.pos_ned_m for k in keep_outs])  # (keep-outs, steps+1, 3)
     apart[:, :, 2] *= np.array([k.vertical_01 for k in keep_outs])[:, None]
-    closest_m = np.sqrt(np.sum(apart**2, axis=2).min(axis=1)).tolist()
+    closest_m = np.sqrt(np.minimum.reduce(np.add.reduce(apart * apart, axis=2), axis=1)).tolist()
     gaps_m = [closest - k.radius_m for closest, k in zip(closest_m, keep_outs, strict=True)]
     order = sorted(range(len(keep_outs)), key=gaps_m.__getitem__)
     return [keep_outs[i] for i in order[:max_keep_outs]]
@@ -338,7 +335,7 @@ def judged(
 
     Args:
         problem: the problem it solves.
-        pos_ned_m, vel_ned_m_s: (steps, 3) at steps 1..Hp.
+        pos_ned_m, vel_ned_m_s: (steps+1, 3) from the start on.
         virtual_control: (steps, 3).
         solutions: solutions of all problems solved for it.
         from_step: first certified step; earlier ones cannot be changed any more.
@@ -348,26 +345,26 @@ def judged(
         stopwatch_ns: see `CondensedMpc`.
         volume: to stay in; None for none.
     """
-    start = problem.start
-    pos = np.concatenate([start.pos_ned_m[None], pos_ned_m])
-    vel = np.concatenate([start.vel_ned_m_s[None], vel_ned_m_s])
-    residual_m = max(s.residual_m for s in solutions)
+    residual_m = max([s.residual_m for s in solutions])
     solved_ns = stopwatch_ns()
     status = PlanStatus.OK
     if not all(s.solved for s in solutions):
         status = PlanStatus.SOLVER_FAILED
     elif residual_m > RESIDUAL_LIMIT_M:
         status = PlanStatus.RESIDUAL
-    elif min(certify(pos, problem.keep_outs, from_step), volume_margin_m(volume, pos, vel, from_step)) < 0.0:
+    elif (
+        certify(pos_ned_m, problem.keep_outs, from_step) < 0.0
+        or volume_margin_m(volume, pos_ned_m, vel_ned_m_s, from_step) < 0.0
+    ):
         status = PlanStatus.NOT_CERTIFIED
-    solve_us = sum(s.solve_us for s in solutions)
+    solve_us = sum([s.solve_us for s in solutions])
     certify_us = (stopwatch_ns() - solved_ns) * 1e-3
     return Plan(
         status=status,
-        t0_us=start.t_us,
+        t0_us=problem.start.t_us,
         dt_us=dt_us,
-        pos_ned_m=pos,
-        vel_ned_m_s=vel,
+        pos_ned_m=pos_ned_m,
+        vel_ned_m_s=vel_ned_m_s,
         virtual_control=virtual_control,
         times=PlanTimes(
             setup_us=(solved_ns - began_ns) * 1e-3 - solve_us - spaces_us,
@@ -375,8 +372,8 @@ def judged(
             certify_us=certify_us,
             spaces_us=spaces_us,
         ),
-        iterations=sum(s.iterations for s in solutions),
-        slack_m=max(s.slack_m for s in solutions),
+        iterations=sum([s.iterations for s in solutions]),
+        slack_m=max([s.slack_m for s in solutions]),
         residual_m=residual_m,
-        terminal_gap_m=max(s.terminal_gap_m for s in solutions),
+        terminal_gap_m=max([s.terminal_gap_m for s in solutions]),
     )

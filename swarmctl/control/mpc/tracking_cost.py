@@ -15,9 +15,16 @@ class TrackingCost:
     """Fills Hessian and slope of the scaled increments, which the scale of the cost brings to about 1."""
 
     def __init__(self, prediction: Prediction) -> None:
-        self._prediction = prediction
-        self._regions = {i: self._region(a) for i, a in enumerate(prediction.axes) if a.terminal == "region"}
+        self._prediction, axes = prediction, prediction.axes
+        self._regions = {i: self._region(a) for i, a in enumerate(axes) if a.terminal == "region"}
         self.scale = 1.0 / max(self._largest(), 1e-12)
+        self._own, hc = [prediction.columns(i) for i in range(len(axes))], prediction.horizon.control
+        like, square = np.ones((len(axes), hc)), np.ones((len(axes), hc, hc))  # quicker than broadcast operands
+        weights = np.array([[a.q_pos for a in axes], [a.q_vel for a in axes]])  # (2, axes)
+        self._slope_weight, self._weight = weights[:, :, None] * like, weights[:, :, None, None] * square
+        self._r = np.array([a.r * np.eye(hc) for a in axes])  # (axes, Hc, Hc)
+        self._slope_factor = np.array([2.0 * a.du_max * self.scale for a in axes])[:, None] * like
+        self._factor = np.array([2.0 * a.du_max**2 * self.scale for a in axes])[:, None, None] * square
 
     def _region(self, axis: Axis) -> TerminalRegion:
         """Return the terminal region of an axis, in units of acceleration."""
@@ -51,31 +58,43 @@ class TrackingCost:
 
     def fill(self, hessian: Array, slope: Array, forecast: Forecast) -> None:
         """Write the Hessian (moves, moves) and the linear cost (moves,) of one step."""
-        hc = self._prediction.horizon.control
-        for i, axis in enumerate(self._prediction.axes):
-            own, pos, vel = self._prediction.columns(i), forecast.pos_response[i], forecast.vel_response[i]
-            curvature = axis.q_pos * (pos.T @ pos) + axis.q_vel * (vel.T @ vel)
-            pull = axis.q_pos * (forecast.pos_error_m[:, i] @ pos) + axis.q_vel * (forecast.vel_error_m_s[:, i] @ vel)
-            if i in self._regions:
-                end = self._end_response(i, forecast)
-                weighted = end.T @ self._regions[i].beyond
-                curvature += weighted @ end
-                pull += weighted @ forecast.end_error[:, i]
-            curvature.reshape(-1)[:: hc + 1] += axis.r  # the diagonal
-            hessian[own, own] = (2.0 * axis.du_max**2 * self.scale) * curvature
-            slope[own] = (2.0 * axis.du_max * self.scale) * pull
+        response = forecast.response
+        gram = self._weight * (response.swapaxes(2, 3) @ response)
+        curvature = gram[0] + gram[1]  # (axes, Hc, Hc)
+        errors = forecast.error.swapaxes(1, 2)[:, :, None]  # (2, axes, 1, Hp)
+        pulls = self._slope_weight * (errors @ response)[:, :, 0]
+        pull = pulls[0] + pulls[1]  # (axes, Hc)
+        for i, region in self._regions.items():
+            end = self._end_response(i, forecast)
+            weighted = end.T @ region.beyond
+            curvature[i] += weighted @ end
+            pull[i] += weighted @ np.array(self._end_error(i, forecast))
+        curvature = self._factor * (curvature + self._r)
+        for i, own in enumerate(self._own):
+            hessian[own, own] = curvature[i]
+        slope[: pull.size] = (self._slope_factor * pull).ravel()
 
     def _end_response(self, i: int, forecast: Forecast) -> Array:
         """Return position, velocity and acceleration (3, Hc) at the end, due to unit increments of axis `i`."""
-        accel = forecast.asked.gain_m_s2[-1, i] * self._prediction.acted[i, -1]
-        return np.array([forecast.pos_response[i, -1], forecast.vel_response[i, -1], accel])
+        end = np.empty((3, self._prediction.horizon.control))
+        end[:2] = forecast.response[:, i, -1]
+        end[2] = forecast.asked.gain_m_s2[-1, i] * self._prediction.acted[i, -1]
+        return end
 
-    def outside_m(self, forecast: Forecast, pos_m: Array, vel_m_s: Array, increments: Array) -> float:
-        """Return how far [m] the end of a motion (Hp, axes) due to `increments` (Hc, axes) is outside its regions."""
+    def _end_error(self, i: int, forecast: Forecast) -> tuple[float, float, float]:
+        """Return errors of position, velocity and acceleration at the end of the free motion of axis `i`."""
+        pos_m, vel_m_s = forecast.error[:, -1, i].tolist()
+        ref_m_s, horizon = forecast.asked.ref_vel_m_s[-2:, i].tolist(), self._prediction.horizon
+        ref_m_s2 = (ref_m_s[-1] - ref_m_s[0]) / horizon.dt_s
+        return pos_m, vel_m_s, float(forecast.accel_m_s2[-1, i]) - horizon.drag_1_s * ref_m_s[-1] - ref_m_s2
+
+    def outside_m(self, forecast: Forecast, motion: Array, increments: Array) -> float:
+        """Return how far [m] a motion (2, Hp, axes), due to `increments` (axes, Hc), ends outside of its regions."""
         asked, farthest_m = forecast.asked, 0.0
         for i, region in self._regions.items():
-            accel = forecast.end_error[2, i]
-            accel += asked.gain_m_s2[-1, i] * float(self._prediction.acted[i, -1] @ increments[:, i])
-            error = (pos_m[-1, i] - asked.ref_pos_m[-1, i], vel_m_s[-1, i] - asked.ref_vel_m_s[-1, i], accel)
+            accel = self._end_error(i, forecast)[2]
+            accel += float(asked.gain_m_s2[-1, i]) * float(self._prediction.acted[i, -1] @ increments[i])
+            pos_m, vel_m_s = motion[:, -1, i].tolist()
+            error = (pos_m - float(asked.ref_pos_m[-1, i]), vel_m_s - float(asked.ref_vel_m_s[-1, i]), accel)
             farthest_m = max(farthest_m, region.outside_m(np.array(error)))
         return farthest_m
