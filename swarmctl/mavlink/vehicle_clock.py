@@ -13,6 +13,7 @@ another message agrees with them.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Hashable
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -78,7 +79,8 @@ class VehicleClock:
         self._arrived_us = 0  # arrival of that stamp
         self._taken = 0  # stamps since the clock began
         self._run: _Run | None = None
-        self._witnesses: dict[str, deque[tuple[int, int]]] = {}  # kind -> arrival, arrival - stamp of its newest frames
+        # kind of message -> arrival, arrival - stamp of its newest frames
+        self._witnesses: dict[Hashable, deque[tuple[int, int]]] = {}
         self._asked: deque[Point] = deque(maxlen=_QUESTIONS)  # stamp of an answer, request - stamp
 
     @property
@@ -107,9 +109,11 @@ class VehicleClock:
             self._fit()
         return vehicle_us + round(self._line(vehicle_us) - self._one_way_delay_us)
 
-    def witness(self, kind: str, vehicle_us: int, arrived_us: int) -> None:
+    def witness(self, kind: Hashable, vehicle_us: int, arrived_us: int) -> None:
         """Note the boot time that a message of another kind reports."""
-        told = self._witnesses.setdefault(kind, deque(maxlen=_WITNESSES))
+        told = self._witnesses.get(kind)
+        if told is None:
+            told = self._witnesses[kind] = deque(maxlen=_WITNESSES)
         told.append((arrived_us, arrived_us - vehicle_us))
 
     def round_trip(self, asked_us: int, vehicle_us: int, arrived_us: int) -> None:
