@@ -74,6 +74,7 @@ class VehicleClock:
         self.rate = 0.0
         self._offset_us = 0.0  # at stamp 0, along the line
         self._points: deque[Point] = deque(maxlen=_BUCKETS)
+        self._is_fitted = False  # since the points have changed
         self._floor: Point | None = None  # stamp of the newest answered TIMESYNC, and the lower bound of the line there
         self._newest_us: int | None = None
         self._arrived_us = 0  # arrival of that stamp
@@ -135,6 +136,7 @@ class VehicleClock:
             fresh = [(x, y) for x, y in self._points if y + self.rate * (vehicle_us - x) >= least_us]
             self._points.clear()  # the others are older than the stop of the vehicle's clock
             self._points.extend(fresh or [(float(vehicle_us), float(arrived_us - vehicle_us))])
+            self._is_fitted = False
             self._fit()
         self._asked.append((float(vehicle_us), float(asked_us - vehicle_us)))
         self._left_us = None
@@ -208,12 +210,17 @@ class VehicleClock:
         if self._points and x // _BUCKET_US <= self._points[-1][0] // _BUCKET_US:
             last_x, last_y = self._points[-1]
             if y - self.rate * x < last_y - self.rate * last_x:
-                self._points[-1] = (x, y)
+                self._points[-1], self._is_fitted = (x, y), False
             return False
         self._points.append((x, y))
+        self._is_fitted = False
         return True
 
     def _fit(self) -> None:
+        """Lay the line under the points, unless it is."""
+        if self._is_fitted:
+            return
+        self._is_fitted = True
         if self._spans():
             first, last = self._points[0][0], self._points[-1][0]
             rate = _slope_under(self._points, first + _KNEE_01 * (last - first))
