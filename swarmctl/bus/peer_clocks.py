@@ -36,7 +36,6 @@ class _PeerClock:
         ahead_us: how far it is taken to be ahead.
         reported_us: what was reported of that.
         interval_us: least and most that it can be ahead.
-        spread_us: error to leave room for; 0 while the clock is not measured and so taken for equal.
     """
 
     def __init__(self) -> None:
@@ -44,12 +43,13 @@ class _PeerClock:
         self._since_us = 0
         self.ahead_us = self.reported_us = 0
         self.interval_us = (-_UNKNOWN_US, _UNKNOWN_US)
-        self.spread_us = 0
 
     def narrow(self, low_us: int, high_us: int, utc_us: int) -> None:
         """Take in new bounds, and correct what is applied if it is impossible now."""
         if utc_us - self._since_us >= _WINDOW_US:
             self._now, self._before, self._since_us = _Bounds(), self._now, utc_us
+        elif low_us <= self._now.low_us and high_us >= self._now.high_us:
+            return  # as known, like most
         self._now.low_us = max(self._now.low_us, low_us)
         self._now.high_us = min(self._now.high_us, high_us)
         low, high = self._interval_us()
@@ -59,8 +59,6 @@ class _PeerClock:
         if not low <= self.ahead_us <= high and low > -_UNKNOWN_US and high < _UNKNOWN_US:
             self.ahead_us = (low + high) // 2
         self.interval_us = low, high
-        is_measured = max(abs(low), abs(high)) < _UNMEASURED_US
-        self.spread_us = self.error_us if is_measured else 0
 
     @property
     def error_us(self) -> int:
@@ -106,7 +104,9 @@ class PeerClocks:
     def spread_us(self, agent: int) -> int:
         """Return the error to leave room for; 0 while the clock is not measured and so taken for equal."""
         clock = self._clocks.get(agent)
-        return 0 if clock is None else clock.spread_us
+        if clock is None or clock.interval_us[0] <= -_UNMEASURED_US or clock.interval_us[1] >= _UNMEASURED_US:
+            return 0
+        return clock.error_us
 
     def _narrow(self, agent: int, low_us: int, high_us: int, utc_us: int) -> None:
         clock = self._clocks[agent]

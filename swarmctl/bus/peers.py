@@ -123,7 +123,7 @@ class PeerPaths:
         ahead_us, spread_us = self._clocks.ahead_us(path.agent), self._clocks.spread_us(path.agent)
         if not ahead_us and not spread_us:
             return path
-        steps_m = np.diff(path.pos_ned_m, axis=0)
+        steps_m = path.pos_ned_m[1:] - path.pos_ned_m[:-1]
         fastest_m_us = math.sqrt(float(np.einsum("kc,kc->k", steps_m, steps_m).max())) / path.dt_us
         margin_m = min(MAX_MARGIN_M, path.margin_m + spread_us * fastest_m_us)
         return replace(path, t0_utc_us=path.t0_utc_us - ahead_us, margin_m=margin_m)

@@ -60,7 +60,8 @@ def tick_row(record: TickRecord) -> NDArray[np.void]:
         return np.frombuffer(_TICK.pack(*numbers), TICK_DTYPE)
     except (struct.error, OverflowError):  # of another type, by a controller of somebody else, or too large for float32
         row = np.zeros(1, TICK_DTYPE)
-        row[0] = tuple(column.recorded(record) for column in COLUMNS)
+        with np.errstate(over="ignore"):
+            row[0] = tuple(column.recorded(record) for column in COLUMNS)
         return row
 
 

@@ -11,7 +11,7 @@ import math
 import struct
 from collections import Counter, deque
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from pymavlink.dialects.v20 import development as mavlink
@@ -27,7 +27,8 @@ from swarmctl.mavlink.fields import BOOT_READERS, READERS
 from swarmctl.mavlink.framing import frames, message_id
 from swarmctl.mavlink.local_frame import LocalFrame
 from swarmctl.mavlink.mode_watch import ModeWatch
-from swarmctl.mavlink.plausibility import Vector, state_problem
+from swarmctl.mavlink.plausibility import state_problem
+from swarmctl.mavlink.sample import Placed, Quaternion, Sample, Vector
 from swarmctl.mavlink.signing.refusals import FrameRefusals
 from swarmctl.mavlink.transport import Transport
 from swarmctl.mavlink.vehicle_clock import VehicleClock
@@ -45,29 +46,6 @@ _SYNC_EVERY_US = 200_000
 _OWN_FLIGHT_US = 1_000_000  # after this long without setpoints the autopilot flies by itself, whatever its mode
 _HOVER_M_S = 0.2
 _MOST_PARAMETERS = 5000  # an autopilot has some 1500
-
-Quaternion = tuple[float, float, float, float]
-
-
-class _Sample(NamedTuple):
-    """The newest state, in the clock and the local frame of the vehicle."""
-
-    vehicle_us: int
-    t_us: int  # monotonic time of this host
-    pos_ned_m: Vector
-    vel_ned_m_s: Vector
-    q_nb: Quaternion
-    rate_frd_rad_s: Vector
-
-
-class _Placed(NamedTuple):
-    """The newest state that has a place in the shared frame."""
-
-    sample: _Sample
-    pos_ned_m: Array  # (3,) in the shared frame
-    vel_ned_m_s: Array  # (3,)
-    q_nb: Array  # (4,)
-    rate_frd_rad_s: Array  # (3,)
 
 
 class Autopilot:
@@ -101,8 +79,8 @@ class Autopilot:
     whole_params: set[str]
     hover_thrust_01: float | None
     pos_accuracy_m: float | None
-    _sample: _Sample | None
-    _placed: _Placed | None
+    _sample: Sample | None
+    _placed: Placed | None
     _attitude: tuple[Quaternion, Vector] | None  # with its rates
     _reset_counter: int | None
     _was_reset: bool  # the estimator has reported a reset since the newest placed sample
@@ -332,10 +310,10 @@ class Autopilot:
         self.samples += 1
         if self._sample is not None and vehicle_us < self._sample.vehicle_us:
             return False
-        self._sample = _Sample(vehicle_us, t_us, pos, vel, (w / norm, x / norm, y / norm, z / norm), rate)
+        self._sample = Sample(vehicle_us, t_us, pos, vel, (w / norm, x / norm, y / norm, z / norm), rate)
         return True
 
-    def _state(self, sample: _Sample, now_us: int) -> VehicleState | None:
+    def _state(self, sample: Sample, now_us: int) -> VehicleState | None:
         if self._placed is None or self._placed.sample is not sample:
             self._placed = self._place(sample)
         if self._placed is None:
@@ -353,14 +331,14 @@ class Autopilot:
             failsafe=failsafe,
         )
 
-    def _place(self, sample: _Sample) -> _Placed | None:
+    def _place(self, sample: Sample) -> Placed | None:
         """Return the sample in the shared frame; None while its place can't be known."""
         vel, was_reset = np.array(sample.vel_ned_m_s), self._was_reset
         self._was_reset = False
         pos = self.frame.place(sample.vehicle_us, np.array(sample.pos_ned_m), vel, self.armed, reset=was_reset)
         if pos is None:
             return None
-        return _Placed(sample, pos, vel, np.array(sample.q_nb), np.array(sample.rate_frd_rad_s))
+        return Placed(sample, pos, vel, np.array(sample.q_nb), np.array(sample.rate_frd_rad_s))
 
     def _forget(self) -> None:
         """Discard everything the vehicle has reported: it has rebooted, or was never received."""
