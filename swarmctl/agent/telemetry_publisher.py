@@ -223,7 +223,7 @@ class TelemetryPublisher:
             outcome=state_machine.outcome,
             position_error_m=_finite(error_m),
             separation_m=_finite(record.nearest_peer_m),
-            tick_p99_ms=_percentile_99(self._recent_ms),
+            tick_p99_ms=percentile_99(self._recent_ms),
             ticks=record.seq,
             deadline_misses=record.deadline_misses,
             plan_staleness_ms=_finite(record.plan_staleness_ms),
@@ -235,7 +235,7 @@ class TelemetryPublisher:
         )
 
 
-def _percentile_99(values: Iterable[float]) -> float:
+def percentile_99(values: Iterable[float]) -> float:
     """Return the 99th percentile of some values, interpolated as by numpy."""
     ordered = sorted(values)
     place = 0.99 * (len(ordered) - 1)
