@@ -133,7 +133,7 @@ class Lockstep:
         self.logs = [FlightLog(directory=directory, agent=i, clock=own_clocks[i]) for i in range(agents)]
         self.fault_events: list[dict[str, Any]] = []
         self.world.faults.on_event = self._on_fault
-        self._operator = self.hub.connect(topics.OPERATOR)
+        self._operator = self.hub.connect(topics.OPERATOR, {})
         self._own = dict(own or {})
         self.agents: list[Agent | None] = [self._agent(i, self.links[i][0]) for i in range(agents)]
         self.frozen: set[int] = set()  # agents whose process is stopped: alive on the bus, but not ticking
@@ -150,7 +150,7 @@ class Lockstep:
 
     def _agent(self, index: int, transport: Any) -> Agent:
         log = self.logs[index]
-        bus = self.hub.connect(agent_name(index))
+        bus = self.hub.connect(agent_name(index), dict.fromkeys(topics.FOR_AGENTS))
         boot_id = self.config.seed * 1000 + index
         config = self._own.get(index, self.config)
         key = self._keys[index]

@@ -26,7 +26,7 @@ class WallClock:
         now_ns = time.monotonic_ns()
         most_ns = int((now_ns - self._read_ns) * _UTC_SLEW_01)
         off_ns = time.time_ns() - now_ns - self._offset_ns
-        self._offset_ns += min(most_ns, max(-most_ns, off_ns))
+        self._offset_ns += off_ns if -most_ns <= off_ns <= most_ns else most_ns if off_ns > 0 else -most_ns
         self._read_ns = now_ns
         return (now_ns + self._offset_ns) // 1000
 

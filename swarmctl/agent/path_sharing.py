@@ -41,7 +41,8 @@ class PathSharing:
         if not self._is_due(path):
             return None
         self._shared = path
-        return replace(path, margin_m=min(MAX_MARGIN_M, path.margin_m + self._params.error_m))
+        margin_m = min(MAX_MARGIN_M, path.margin_m + self._params.error_m)
+        return path if margin_m == path.margin_m else replace(path, margin_m=margin_m)
 
     def _is_due(self, path: PredictedPath) -> bool:
         shared = self._shared

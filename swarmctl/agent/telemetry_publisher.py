@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -185,9 +186,10 @@ class TelemetryPublisher:
         """
         if planning.start is None:
             return [], [], math.nan
-        here, act_utc_us = planning.start.pos_ned_m, utc_us + planning.start.t_us - self._clock.now_us()
-        peers = [math.dist(here, k.pos_ned_m[0]) for k in planning.keep_outs if k.priority_id >= 0]
-        obstacles = [k.distance_m(here) for k in planning.keep_outs if k.priority_id < 0]
+        start, act_utc_us = planning.start, utc_us + planning.start.t_us - self._clock.now_us()
+        here = start.pos_ned_m.tolist()
+        peers = [math.dist(here, k.pos_ned_m[0].tolist()) for k in planning.keep_outs if k.priority_id >= 0]
+        obstacles = [k.distance_m(start.pos_ned_m) for k in planning.keep_outs if k.priority_id < 0]
         ages_ms = [(act_utc_us - path.t0_utc_us) * 1e-3 for path in self._paths.latest()]
         return peers, obstacles, max(ages_ms, default=math.nan)
 
@@ -221,7 +223,7 @@ class TelemetryPublisher:
             outcome=state_machine.outcome,
             position_error_m=_finite(error_m),
             separation_m=_finite(record.nearest_peer_m),
-            tick_p99_ms=float(np.percentile(self._recent_ms, 99)),
+            tick_p99_ms=percentile_99(self._recent_ms),
             ticks=record.seq,
             deadline_misses=record.deadline_misses,
             plan_staleness_ms=_finite(record.plan_staleness_ms),
@@ -231,6 +233,14 @@ class TelemetryPublisher:
             uses_commitments=self._uses_commitments,
             utc_us=record.utc_us,
         )
+
+
+def percentile_99(values: Iterable[float]) -> float:
+    """Return the 99th percentile of some values, interpolated as by numpy."""
+    ordered = sorted(values)
+    place = 0.99 * (len(ordered) - 1)
+    below, above = ordered[math.floor(place)], ordered[math.ceil(place)]
+    return below + (above - below) * (place % 1.0)
 
 
 def _known(value: float | None) -> float:

@@ -129,6 +129,8 @@ class WorldModel:
             for path in self.paths.latest()
             if path.t0_utc_us < oldest_us and self._is_there(path.agent) and self._phase(path.agent) is not Phase.DONE
         }
+        if not unresponsive and not self._unresponsive_since_us:
+            return
         for agent in unresponsive.keys() - self._unresponsive_since_us.keys():
             self._unresponsive_since_us[agent] = unresponsive[agent]
             self._note("unresponsive", agent=agent, begins=True)

@@ -36,6 +36,9 @@ class Link:
         seed: seed of the bus.
         sender, receiver: their names.
         began_us: time from which bad periods are drawn, the same for all links.
+
+    Attributes:
+        draws: every message draws random numbers.
     """
 
     def __init__(self, impairments: Impairments, seed: int, sender: str, receiver: str, began_us: int) -> None:
@@ -47,10 +50,14 @@ class Link:
         )
         self._bad_periods = _BadPeriods(impairments, bursts, began_us)
         self._reliable_us = 0  # arrival of the newest reliable message
+        self.draws = impairments.loss_01 > 0.0 or impairments.jitter_us > 0
+        self._never_fails = not self.draws and impairments.burst_01 <= 0.0
 
     def arrival_us(self, now_us: int, *, reliable: bool) -> int | None:
         """Return when a message sent now arrives; None if it is lost. Reliable messages never overtake each other."""
         arrival_us = now_us + self._travel_us
+        if self._never_fails:
+            return arrival_us
         if self._impairments.jitter_us > 0:
             arrival_us += int(self._jitters.integers(self._impairments.jitter_us, endpoint=True))
         if reliable:

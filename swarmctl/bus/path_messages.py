@@ -18,11 +18,12 @@ _HEADER = struct.Struct(
     "<2sBBIIIqifBB2x"
 )  # magic, version, flags, agent, boot, seq, t0, dt, margin, points, own length
 _MAGIC = b"SP"
+_NUMBER = np.dtype("<f4")
 
 
 def encode_path(path: PredictedPath) -> bytes:
     """Encode a predicted path."""
-    points = np.ascontiguousarray(path.pos_ned_m, dtype="<f4")
+    points = path.pos_ned_m.astype(_NUMBER)
     header = _HEADER.pack(
         _MAGIC,
         PATH_VERSION,
@@ -48,9 +49,16 @@ def decode_path(payload: bytes) -> PredictedPath | None:
         return None
     if not 2 <= count <= MAX_POINTS or dt_us <= 0 or len(payload) != header_len + 12 * count:
         return None
-    points = np.frombuffer(payload, "<f4", 3 * count, header_len).reshape(count, 3).astype(np.float64)
-    if not (np.isfinite(points).all() and math.isfinite(margin_m) and 0.0 <= margin_m <= MAX_MARGIN_M):
+    numbers = np.frombuffer(payload, _NUMBER, 3 * count, header_len).astype(np.float64)
+    finite = math.isfinite(numbers @ numbers)  # squares of float32 can't overflow
+    if not (finite and math.isfinite(margin_m) and 0.0 <= margin_m <= MAX_MARGIN_M):
         return None
     return PredictedPath(
-        agent=agent, boot_id=boot_id, seq=seq, t0_utc_us=t0_utc_us, dt_us=dt_us, margin_m=margin_m, pos_ned_m=points
+        agent=agent,
+        boot_id=boot_id,
+        seq=seq,
+        t0_utc_us=t0_utc_us,
+        dt_us=dt_us,
+        margin_m=margin_m,
+        pos_ned_m=numbers.reshape(count, 3),
     )

@@ -30,28 +30,43 @@ class _Bounds:
 
 
 class _PeerClock:
-    """The clock of one peer."""
+    """The clock of one peer.
+
+    Attributes:
+        ahead_us: how far it is taken to be ahead.
+        reported_us: what was reported of that.
+        interval_us: least and most that it can be ahead.
+    """
 
     def __init__(self) -> None:
         self._now, self._before = _Bounds(), _Bounds()
         self._since_us = 0
         self.ahead_us = self.reported_us = 0
+        self.interval_us = (-_UNKNOWN_US, _UNKNOWN_US)
 
     def narrow(self, low_us: int, high_us: int, utc_us: int) -> None:
         """Take in new bounds, and correct what is applied if it is impossible now."""
         if utc_us - self._since_us >= _WINDOW_US:
             self._now, self._before, self._since_us = _Bounds(), self._now, utc_us
+        elif low_us <= self._now.low_us and high_us >= self._now.high_us:
+            return  # as known, like most
         self._now.low_us = max(self._now.low_us, low_us)
         self._now.high_us = min(self._now.high_us, high_us)
-        low, high = self.interval_us
+        low, high = self._interval_us()
         if low > high:  # a clock was set
             self._now, self._before = _Bounds(low_us, high_us), _Bounds()
             low, high = low_us, high_us
         if not low <= self.ahead_us <= high and low > -_UNKNOWN_US and high < _UNKNOWN_US:
             self.ahead_us = (low + high) // 2
+        self.interval_us = low, high
 
     @property
-    def interval_us(self) -> tuple[int, int]:
+    def error_us(self) -> int:
+        """Return the largest error that `ahead_us` may have."""
+        low, high = self.interval_us
+        return max(high - self.ahead_us, self.ahead_us - low)
+
+    def _interval_us(self) -> tuple[int, int]:
         """Return the bounds by all that is kept."""
         low = max(self._now.low_us, self._before.low_us - _DRIFT_US)
         return low, min(self._now.high_us, self._before.high_us + _DRIFT_US)
@@ -84,16 +99,14 @@ class PeerClocks:
 
     def error_us(self, agent: int) -> int:
         """Return the largest error that `ahead_us` may have; very large before both bounds are known."""
-        clock = self._clocks[agent]
-        low, high = clock.interval_us
-        return max(high - clock.ahead_us, clock.ahead_us - low)
+        return self._clocks[agent].error_us
 
     def spread_us(self, agent: int) -> int:
         """Return the error to leave room for; 0 while the clock is not measured and so taken for equal."""
         clock = self._clocks.get(agent)
-        if clock is None or max(map(abs, clock.interval_us)) >= _UNMEASURED_US:
+        if clock is None or clock.interval_us[0] <= -_UNMEASURED_US or clock.interval_us[1] >= _UNMEASURED_US:
             return 0
-        return self.error_us(agent)
+        return clock.error_us
 
     def _narrow(self, agent: int, low_us: int, high_us: int, utc_us: int) -> None:
         clock = self._clocks[agent]

@@ -12,6 +12,7 @@ from collections import deque
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
+from operator import itemgetter
 from typing import NamedTuple, Protocol
 
 import numpy as np
@@ -28,6 +29,9 @@ from swarmctl.core.types import MAX_MARGIN_M, PredictedPath
 MAX_AGE_US = 2_000_000
 MAX_LEAD_US = 500_000
 LEASE_US = 1_500_000  # time after which a `LocalHub` drops tokens that can't be reached, as bus.lease_ms
+
+
+Subscriptions = Mapping[Topic, Sequence[str] | None]  # senders to receive per topic; None: all but oneself
 
 
 def agent_name(agent: int) -> str:
@@ -91,6 +95,7 @@ class PeerPaths:
         self._max_lead_us = max_lead_us
         self._clocks = clocks
         self._newest: dict[int, PredictedPath] = {}
+        self._sorted: tuple[PredictedPath, ...] = ()  # these, by agent number
         self.refusals = refusals
 
     def offer(self, sender: str, payload: bytes, utc_us: int) -> None:
@@ -109,6 +114,7 @@ class PeerPaths:
             ReceivedMessage(path.boot_id, path.seq, path.t0_utc_us, payload), utc_us
         ):
             self._newest[path.agent] = path
+            self._sorted = tuple(self._newest[agent] for agent in sorted(self._newest))
 
     def _by_own_clock(self, path: PredictedPath | None) -> PredictedPath | None:
         """Return the path at times of the own clock, with room for the error that is left of the peer's."""
@@ -117,14 +123,14 @@ class PeerPaths:
         ahead_us, spread_us = self._clocks.ahead_us(path.agent), self._clocks.spread_us(path.agent)
         if not ahead_us and not spread_us:
             return path
-        steps_m = np.diff(path.pos_ned_m, axis=0)
+        steps_m = path.pos_ned_m[1:] - path.pos_ned_m[:-1]
         fastest_m_us = math.sqrt(float(np.einsum("kc,kc->k", steps_m, steps_m).max())) / path.dt_us
         margin_m = min(MAX_MARGIN_M, path.margin_m + spread_us * fastest_m_us)
         return replace(path, t0_utc_us=path.t0_utc_us - ahead_us, margin_m=margin_m)
 
     def latest(self) -> tuple[PredictedPath, ...]:
         """Return the newest path of every peer, whatever its age, sorted by agent number."""
-        return tuple(self._newest[agent] for agent in sorted(self._newest))
+        return self._sorted
 
     def _refusal(self, sender: str, path: PredictedPath, utc_us: int) -> str:
         if sender != agent_name(path.agent):
@@ -139,6 +145,14 @@ class PeerPaths:
 class _Message(NamedTuple):
     visible_us: int
     payload: bytes
+
+
+class _Receiver(NamedTuple):
+    """One that the messages of a sender on a topic go to."""
+
+    name: str
+    link: Link
+    inbox: deque[_Message] | None  # None: it does not subscribe, but its link draws as if it did
 
 
 class _Held(NamedTuple):
@@ -173,6 +187,7 @@ class LocalHub:
         self._began_us = now_us()
         self._impairments = impairments
         self._links: dict[tuple[str, str], Link] = {}
+        self._receivers: dict[tuple[str, Topic], list[_Receiver]] = {}  # of those attached now
         self._attached: dict[str, LocalBus] = {}
         self._views: dict[str, TokenView] = {}
         self._reachability = Reachability()
@@ -212,17 +227,18 @@ class LocalHub:
         self._reachability.mend(sender, receiver)
         self._reconnect()
 
-    def connect(self, name: str, subscriptions: Mapping[Topic, Sequence[str]] | None = None) -> LocalBus:
+    def connect(self, name: str, subscriptions: Subscriptions | None = None) -> LocalBus:
         """Join the hub as `name` and return the bus of that participant.
 
         Args:
             name: sender name, free at the moment.
-            subscriptions: senders to receive per topic; None receives all but the own messages.
+            subscriptions: senders to receive per topic, None for all but itself; None receives every topic so.
         """
         if name in self._attached:
             raise ValueError(f"{name!r} is connected already")
-        bus = LocalBus(self, name, subscriptions)
+        bus = LocalBus(self, name, dict.fromkeys(TOPICS) if subscriptions is None else subscriptions)
         self._attached[name] = bus
+        self._receivers.clear()
         self._views[name] = TokenView(LEASE_US)
         self._update_views()
         return bus
@@ -230,6 +246,7 @@ class LocalHub:
     def detach(self, name: str) -> None:
         """Detach a participant: it sends and receives nothing more; its messages under way still arrive."""
         self._attached.pop(name, None)
+        self._receivers.clear()
         self._views.pop(name, None)
         self._update_views()
 
@@ -259,17 +276,32 @@ class LocalHub:
                 self._held.append(_Held(sender, topic, payload, only))
             return
         now_us, missed = self._now_us(), []
-        for name, bus in self._attached.items():
-            if (only is not None and name not in only) or not bus.subscribes_to(topic, sender):
+        for name, link, inbox in self._receivers_of(sender, topic):
+            if only is not None and name not in only:
                 continue
             if not self._reachability.passes(sender, name):
-                missed.append(name)
+                missed += [name] if inbox is not None else []
                 continue
-            arrival_us = self._link(sender, name).arrival_us(now_us, reliable=topic.reliable)
-            if arrival_us is not None:
-                bus.accept(topic, sender, _Message(arrival_us, payload), now_us)
+            arrival_us = link.arrival_us(now_us, reliable=topic.reliable)
+            if arrival_us is not None and inbox is not None:
+                _enqueue(inbox, _Message(arrival_us, payload), topic.ring, now_us)
         if missed and topic.reliable:
             self._held.append(_Held(sender, topic, payload, frozenset(missed)))
+
+    def _receivers_of(self, sender: str, topic: Topic) -> list[_Receiver]:
+        """Return the subscribers, and where a link draws for each message, all others: what one hears changes no draw.
+
+        The list is made anew after somebody has joined or left.
+        """
+        found = self._receivers.get((sender, topic))
+        if found is None:
+            found = []
+            for name, bus in self._attached.items():
+                inbox, link = bus.inbox(topic, sender), self._link(sender, name)
+                if inbox is not None or (link.draws and name != sender):
+                    found.append(_Receiver(name, link, inbox))
+            self._receivers[sender, topic] = found
+        return found
 
     def _link(self, sender: str, receiver: str) -> Link:
         link = self._links.get((sender, receiver))
@@ -293,13 +325,11 @@ class LocalHub:
 class LocalBus:
     """A participant of a `LocalHub`."""
 
-    def __init__(self, hub: LocalHub, name: str, subscriptions: Mapping[Topic, Sequence[str]] | None) -> None:
+    def __init__(self, hub: LocalHub, name: str, subscriptions: Subscriptions) -> None:
         self._hub = hub
         self.name = name
-        self._subscriptions = (
-            None if subscriptions is None else {topic: frozenset(names) for topic, names in subscriptions.items()}
-        )
-        self._inboxes: dict[Topic, dict[str, deque[_Message]]] = {topic: {} for topic in TOPICS}
+        self._subscriptions = subscriptions
+        self._inboxes: dict[Topic, dict[str, deque[_Message]]] = {topic: {} for topic in subscriptions}
 
     def publish(self, topic: Topic, payload: bytes) -> None:
         if self._hub.is_attached(self):
@@ -316,7 +346,8 @@ class LocalBus:
                 message = inbox.popleft()
                 payload = message.payload if len(message.payload) <= topic.max_bytes else TOO_LONG
                 arrived.append((message.visible_us, sender, payload))
-        arrived.sort(key=lambda item: item[:2])  # stable: keeps the order of each sender
+        if len(arrived) > 1:
+            arrived.sort(key=itemgetter(0, 1))  # stable: keeps the order of each sender
         return [(sender, payload) for _, sender, payload in arrived]
 
     def alive(self) -> frozenset[str]:
@@ -329,23 +360,22 @@ class LocalBus:
         if self._hub.is_attached(self):
             self._hub.detach(self.name)
 
-    def subscribes_to(self, topic: Topic, sender: str) -> bool:
-        """Tell whether messages of a sender are received."""
-        if self._subscriptions is None:
-            return sender != self.name
-        return sender in self._subscriptions.get(topic, ())
+    def inbox(self, topic: Topic, sender: str) -> deque[_Message] | None:
+        """Return where messages of a sender wait to be received; None for those that are not subscribed to."""
+        if topic not in self._subscriptions:
+            return None
+        senders = self._subscriptions[topic]
+        hears = sender != self.name if senders is None else sender in senders
+        return self._inboxes[topic].setdefault(sender, deque()) if hears else None
 
-    def accept(self, topic: Topic, sender: str, message: _Message, now_us: int) -> None:
-        """Queue a message under way, in the order of arrival."""
-        inboxes = self._inboxes[topic]
-        inbox = inboxes.get(sender)
-        if inbox is None:
-            inbox = inboxes[sender] = deque()
-        place = len(inbox)
-        while place and inbox[place - 1].visible_us > message.visible_us:
-            place -= 1
-        inbox.insert(place, message)  # jitter reorders messages
-        _trim(inbox, topic.ring, now_us)
+
+def _enqueue(inbox: deque[_Message], message: _Message, ring: int, now_us: int) -> None:
+    """Queue a message under way, in the order of arrival."""
+    place = len(inbox)
+    while place and inbox[place - 1].visible_us > message.visible_us:
+        place -= 1
+    inbox.insert(place, message)  # jitter reorders messages
+    _trim(inbox, ring, now_us)
 
 
 def _trim(inbox: deque[_Message], ring: int, now_us: int) -> None:

@@ -65,6 +65,7 @@ class TokenView:
         self._seen: dict[str, object] = {}  # name -> session, as last told
         self._unreached_us: dict[str, int] = {}  # since when a seen token can't be reached
         self._arrivals: Counter[str] = Counter()
+        self._alive: frozenset[str] | None = None  # names seen; None: to be made anew
 
     def update(self, sessions: Mapping[str, object], shows: Callable[[str], bool], now_us: int) -> None:
         """Take in a change.
@@ -75,6 +76,7 @@ class TokenView:
             now_us: time.
         """
         self._expire(now_us)
+        self._alive = None
         for name in {**self._seen, **sessions}:
             if not shows(name):
                 if name in self._seen:
@@ -91,13 +93,18 @@ class TokenView:
     def alive(self, now_us: int) -> frozenset[str]:
         """Return the names whose tokens are seen."""
         self._expire(now_us)
-        return frozenset(self._seen)
+        if self._alive is None:
+            self._alive = frozenset(self._seen)
+        return self._alive
 
     def arrivals(self) -> Mapping[str, int]:
         """Return how often the token of each name has appeared."""
         return self._arrivals
 
     def _expire(self, now_us: int) -> None:
+        if not self._unreached_us:
+            return
         vanished = [name for name, since_us in self._unreached_us.items() if now_us - since_us >= self._lease_us]
         for name in vanished:
             del self._seen[name], self._unreached_us[name]
+            self._alive = None

@@ -56,18 +56,21 @@ class Presence:
 
     def __init__(self, bus: Arrivals) -> None:
         self._bus = bus
+        self._alive: frozenset[str] = frozenset()
         self._counts: dict[str, int] = {}
         self._since_us: dict[str, int] = {}
 
     def update(self, utc_us: int) -> None:
         """Take in which senders have joined and left."""
         alive, counts = self._bus.alive(), self._bus.arrivals()
+        if alive == self._alive and counts == self._counts:
+            return
         for sender in alive:
             if counts.get(sender) != self._counts.get(sender) or sender not in self._since_us:
                 self._since_us[sender] = utc_us
         for sender in self._since_us.keys() - alive:
             del self._since_us[sender]
-        self._counts = dict(counts)
+        self._alive, self._counts = alive, dict(counts)
 
     def since_us(self, sender: str) -> int | None:
         """Return the own UTC at which a sender joined; None while it is absent."""
@@ -141,7 +144,8 @@ class SenderVerifier:
             return ""
         if accepted.continues(received, utc_us, self._rate_hz):
             accepted.take(received, utc_us)
-            self._drop([claim for claim in self._claims if claim.began_utc_us < received.sent_utc_us], utc_us)
+            if self._claims:
+                self._drop([claim for claim in self._claims if claim.began_utc_us < received.sent_utc_us], utc_us)
             return ""
         same_boot = received.boot_id == accepted.boot_id
         if same_boot and received.seq in self._contents:

@@ -27,6 +27,7 @@ ANSWER = Topic(name="answer", ring=16, max_bytes=4096, reliable=True)
 OBSTACLES = Topic(name="obstacles", ring=4, max_bytes=65_536, reliable=True)
 TRAJECTORY = Topic(name="trajectory", ring=4, max_bytes=131_072, reliable=False)  # each one replaces all earlier ones
 TOPICS = (PATH, STATUS, TICK, COMMAND, ANSWER, OBSTACLES, TRAJECTORY)
+FOR_AGENTS = (PATH, STATUS, COMMAND, OBSTACLES, TRAJECTORY)
 
 TOO_LONG = b""  # replaces a message that is too long; every decoder refuses it
 

@@ -70,7 +70,7 @@ class ZenohBus:
             topic: [(sender, self._subscriber(f"{prefix}/{sender}/{topic.name}", topic)) for sender in senders]
             for topic, senders in subscriptions.items()
         }
-        self._alive: set[str] = set()
+        self._alive: frozenset[str] = frozenset()
         self._arrivals: Counter[str] = Counter()
         self._token_samples = self._session.liveliness().declare_subscriber(
             f"{prefix}/*/alive", zenoh.handlers.RingChannel(_ALIVE_RING), history=True
@@ -86,14 +86,15 @@ class ZenohBus:
         """Return (sender, payload) of a topic, oldest first for each sender, at most one ring of each."""
         arrived: list[tuple[str, bytes]] = []
         for sender, subscriber in self._subscribers.get(topic, ()):
-            payloads = (sample.payload for sample in _drain(subscriber, topic.ring))
-            arrived += [(sender, p.to_bytes() if len(p) <= topic.max_bytes else TOO_LONG) for p in payloads]
+            if samples := _drain(subscriber, topic.ring):  # there is nothing from most, in most ticks
+                payloads = (sample.payload for sample in samples)
+                arrived += [(sender, p.to_bytes() if len(p) <= topic.max_bytes else TOO_LONG) for p in payloads]
         return arrived
 
     def alive(self) -> frozenset[str]:
         """Return senders whose liveliness token is present; none, not even this one, while the router is lost."""
         self._watch_tokens()
-        return frozenset(self._alive)
+        return self._alive
 
     def arrivals(self) -> Mapping[str, int]:
         """Return how often each token has appeared; one that left and returned between two calls counts twice."""
@@ -108,9 +109,9 @@ class ZenohBus:
         for sample in _drain(self._token_samples, _ALIVE_RING):
             sender = str(sample.key_expr).split("/")[2]
             if sample.kind != zenoh.SampleKind.PUT:
-                self._alive.discard(sender)
+                self._alive -= {sender}
             elif sender not in self._alive:  # a second process of the same name is no new arrival
-                self._alive.add(sender)
+                self._alive |= {sender}
                 self._arrivals[sender] += 1
 
     def _publisher(self, key: str, topic: Topic) -> Any:
@@ -174,9 +175,11 @@ def open_session(settings: Mapping[str, Any]) -> Any:
 def _drain(subscriber: Any, limit: int) -> list[Any]:
     """Return at most `limit` samples, so that a flood cannot block the caller."""
     samples: list[Any] = []
-    with contextlib.suppress(zenoh.ZError):  # the session is closed
+    try:
         while len(samples) < limit and (sample := subscriber.try_recv()) is not None:
             samples.append(sample)
+    except zenoh.ZError:
+        return samples  # the session is closed
     return samples
 
 

@@ -6,6 +6,7 @@ All conversions of the project are here; MAVLink uses the same conventions, so i
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,9 +61,12 @@ def quat_from_body_z(down_ned: Array, yaw_rad: float) -> Array:
 
 def rotate_to_ned(q_nb: Array, vector_frd: Array) -> Array:
     """Rotate a body FRD vector (3,) into NED (3,)."""
-    w, x, y, z = q_nb.tolist()
-    vx, vy, vz = vector_frd.tolist()
+    return np.array(numbers_rotated_to_ned(q_nb.tolist(), vector_frd.tolist()))
+
+
+def numbers_rotated_to_ned(q_nb: Sequence[float], vector_frd: Sequence[float]) -> tuple[float, float, float]:
+    """Rotate as `rotate_to_ned`, four numbers and three into three."""
+    w, x, y, z = q_nb
+    vx, vy, vz = vector_frd
     tx, ty, tz = 2 * (y * vz - z * vy), 2 * (z * vx - x * vz), 2 * (x * vy - y * vx)
-    return np.array(
-        [vx + w * tx + y * tz - z * ty, vy + w * ty + z * tx - x * tz, vz + w * tz + x * ty - y * tx],
-    )
+    return vx + w * tx + y * tz - z * ty, vy + w * ty + z * tx - x * tz, vz + w * tz + x * ty - y * tx

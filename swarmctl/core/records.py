@@ -8,6 +8,7 @@ is an array.
 from __future__ import annotations
 
 import struct
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,11 @@ PLAN_COLUMNS = (
 PLAN_DTYPE = dtype_of(PLAN_COLUMNS)
 _PLAN_EVERY = 5  # ticks: ten plans a second
 
+# code in `struct` of each number of a tick
+_CODES = {_F4: "f", _F8: "d", _U1: "B", _U2: "H", "<u4": "I", _I8: "q"}
+_TICK = struct.Struct("<" + "".join(f"{max(1, column.size)}{_CODES[column.dtype]}" for column in COLUMNS))
+_VALUES = [(column.value, column.size, [column.none] * max(1, column.size)) for column in COLUMNS]
+
 _PLAN_HEADER = struct.Struct("<H")
 _NO_PLAN = np.empty((0, 3))
 NO_POINTS = np.zeros(0, PLAN_DTYPE)
@@ -46,9 +52,17 @@ NO_POINTS = np.zeros(0, PLAN_DTYPE)
 
 def tick_row(record: TickRecord) -> NDArray[np.void]:
     """Return one record as a (1,) structured array of `TICK_DTYPE`."""
-    row = np.zeros(1, TICK_DTYPE)
-    row[0] = tuple(column.recorded(record) for column in COLUMNS)
-    return row
+    numbers: list[Any] = []
+    for value_of, size, none in _VALUES:
+        value = value_of(record)
+        numbers += none if value is None else value.tolist() if size else (value,)
+    try:
+        return np.frombuffer(_TICK.pack(*numbers), TICK_DTYPE)
+    except (struct.error, OverflowError):  # of another type, by a controller of somebody else, or too large for float32
+        row = np.zeros(1, TICK_DTYPE)
+        with np.errstate(over="ignore"):
+            row[0] = tuple(column.recorded(record) for column in COLUMNS)
+        return row
 
 
 def plan_rows(row: NDArray[np.void], flown: Plan | None) -> NDArray[np.void]:
@@ -69,7 +83,7 @@ def plan_rows(row: NDArray[np.void], flown: Plan | None) -> NDArray[np.void]:
 
 def pack_tick(row: NDArray[np.void], flown: Plan | None) -> bytes:
     """Encode a tick for the bus: its row, the number of points of the flown plan (u16), the points as float32."""
-    plan = np.ascontiguousarray(_NO_PLAN if flown is None else flown.pos_ned_m, dtype="<f4")
+    plan = (_NO_PLAN if flown is None else flown.pos_ned_m).astype(_F4)
     return row.tobytes() + _PLAN_HEADER.pack(len(plan)) + plan.tobytes()
 
 

@@ -7,24 +7,28 @@ state, and therefore no setpoint is sent.
 
 from __future__ import annotations
 
+import math
+import struct
 from collections import Counter, deque
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from pymavlink.dialects.v20 import development as mavlink
 
-from swarmctl.core.frames import rotate_to_ned
+from swarmctl.core.frames import numbers_rotated_to_ned
 from swarmctl.core.text import printable
 from swarmctl.core.types import Array, AttitudeSetpoint, FlightMode, GeoOrigin, Landed, VehicleState
-from swarmctl.mavlink.codec import Codec
-from swarmctl.mavlink.commands import CommandPort
+from swarmctl.mavlink.codec import Codec, message_of
+from swarmctl.mavlink.commands import HEARD, CommandPort
 from swarmctl.mavlink.dialects.dialect import LAST_INTEGER_TYPE, Dialect
 from swarmctl.mavlink.dialects.discovery import DIALECTS
-from swarmctl.mavlink.framing import frames
+from swarmctl.mavlink.fields import BOOT_READERS, READERS
+from swarmctl.mavlink.framing import frames, message_id
 from swarmctl.mavlink.local_frame import LocalFrame
 from swarmctl.mavlink.mode_watch import ModeWatch
 from swarmctl.mavlink.plausibility import state_problem
+from swarmctl.mavlink.sample import Placed, Quaternion, Sample, Vector
 from swarmctl.mavlink.signing.refusals import FrameRefusals
 from swarmctl.mavlink.transport import Transport
 from swarmctl.mavlink.vehicle_clock import VehicleClock
@@ -36,23 +40,12 @@ _CRITICAL = 5
 _PREARM = 1 << 28
 _LOCAL_NED = mavlink.MAV_FRAME_LOCAL_NED
 _BODY_FRD = (mavlink.MAV_FRAME_BODY_NED, mavlink.MAV_FRAME_BODY_FRD)  # frames of the velocity in ODOMETRY
-_STATE = frozenset({"ODOMETRY", "LOCAL_POSITION_NED"})  # messages whose time stamps are those of the state
-_FAST = frozenset({mavlink.MAVLINK_MSG_ID_ODOMETRY})  # messages that the command port does not need
+_LOCAL_POSITION = mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED  # its time stamps are those of the state
+_SETPOINT = struct.Struct("<I4f3ff3B")  # SET_ATTITUDE_TARGET, without the thrust of other axes
 _SYNC_EVERY_US = 200_000
 _OWN_FLIGHT_US = 1_000_000  # after this long without setpoints the autopilot flies by itself, whatever its mode
 _HOVER_M_S = 0.2
 _MOST_PARAMETERS = 5000  # an autopilot has some 1500
-
-
-class _Sample(NamedTuple):
-    """The newest state, in the clock and the local frame of the vehicle."""
-
-    vehicle_us: int
-    t_us: int  # monotonic time of this host
-    pos_ned_m: Array  # (3,)
-    vel_ned_m_s: Array  # (3,)
-    q_nb: Array  # (4,)
-    rate_frd_rad_s: Array  # (3,)
 
 
 class Autopilot:
@@ -86,9 +79,9 @@ class Autopilot:
     whole_params: set[str]
     hover_thrust_01: float | None
     pos_accuracy_m: float | None
-    _sample: _Sample | None
-    _placed: tuple[_Sample, Array] | None  # the sample and its position (3,) in the shared frame
-    _attitude: tuple[int, Array, Array] | None  # arrival time, attitude (4,), rates (3,)
+    _sample: Sample | None
+    _placed: Placed | None
+    _attitude: tuple[Quaternion, Vector] | None  # with its rates
     _reset_counter: int | None
     _was_reset: bool  # the estimator has reported a reset since the newest placed sample
 
@@ -122,22 +115,22 @@ class Autopilot:
         self._syncs: deque[int] = deque(maxlen=16)  # host times of unanswered TIMESYNC requests [ns]
         self._boots = self._restarts = 0  # counters of the clock that have been handled
         self._forget()
-        self._handlers: dict[str, Callable[[Any, int], None]] = {
-            "HEARTBEAT": self._heartbeat,
-            "CURRENT_MODE": self._current_mode,
-            "ODOMETRY": self._odometry,
-            "ATTITUDE_QUATERNION": self._attitude_quaternion,
-            "LOCAL_POSITION_NED": self._local_position,
-            "GLOBAL_POSITION_INT": self._global_position,
-            "GPS_GLOBAL_ORIGIN": self._origin,
-            "SYS_STATUS": self._sys_status,
-            "EXTENDED_SYS_STATE": self._extended,
-            "ESTIMATOR_STATUS": self._estimator,
-            "GPS_RAW_INT": self._gps,
-            "ATTITUDE_TARGET": self._attitude_target,
-            "PARAM_VALUE": self._param_value,
-            "TIMESYNC": self._timesync,
-            "STATUSTEXT": self._statustext,
+        self._handlers: dict[int, Callable[[Any, int], None]] = {
+            mavlink.MAVLINK_MSG_ID_HEARTBEAT: self._heartbeat,
+            mavlink.MAVLINK_MSG_ID_CURRENT_MODE: self._current_mode,
+            mavlink.MAVLINK_MSG_ID_ODOMETRY: self._odometry,
+            mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: self._attitude_quaternion,
+            _LOCAL_POSITION: self._local_position,
+            mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: self._global_position,
+            mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: self._origin,
+            mavlink.MAVLINK_MSG_ID_SYS_STATUS: self._sys_status,
+            mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: self._extended,
+            mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: self._estimator,
+            mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: self._gps,
+            mavlink.MAVLINK_MSG_ID_ATTITUDE_TARGET: self._attitude_target,
+            mavlink.MAVLINK_MSG_ID_PARAM_VALUE: self._param_value,
+            mavlink.MAVLINK_MSG_ID_TIMESYNC: self._timesync,
+            mavlink.MAVLINK_MSG_ID_STATUSTEXT: self._statustext,
         }
 
     @property
@@ -156,7 +149,7 @@ class Autopilot:
         return self.frame.offset_ned_m
 
     def connect(self, slow: CommandPort) -> None:
-        """Pass every frame except the fast state messages to the command port `slow`."""
+        """Pass to the command port `slow` what it hears."""
         self._slow = slow
 
     def send_frame(self, frame: bytes) -> None:
@@ -189,12 +182,11 @@ class Autopilot:
         if refused:
             self.refused_setpoints += 1
             return refused
-        q = setpoint.q_nb.tolist()
-        message = mavlink.MAVLink_set_attitude_target_message(
-            (now_us // 1000) & 0xFFFFFFFF, self._sysid, 1, _ATTITUDE_ONLY, q, 0.0, 0.0, 0.0, setpoint.thrust_01
-        )
+        stamp_ms, q_nb = now_us // 1000 & 0xFFFFFFFF, setpoint.q_nb.tolist()
+        whom_and_what = self._sysid, 1, _ATTITUDE_ONLY
+        payload = _SETPOINT.pack(stamp_ms, *q_nb, 0.0, 0.0, 0.0, setpoint.thrust_01, *whom_and_what)
         self._measure_gap(now_us)
-        self.send_frame(self._codec.encode(message))
+        self.send_frame(self._codec.frame(mavlink.MAVLINK_MSG_ID_SET_ATTITUDE_TARGET, payload))
         return ""
 
     @property
@@ -219,22 +211,23 @@ class Autopilot:
     # -- frames -------------------------------------------------------------------------------------------------------
 
     def _frame(self, frame: bytes, arrived_us: int) -> None:
+        """Take a frame: each is checked and recorded, but only what is used of it is read."""
         if frame[5] != self._sysid or frame[6] != 1:
             return
-        message = self._codec.decode(frame)
-        if message is None:
+        payload = self._codec.payload(frame)
+        if payload is None:
             return
         self._on_frame(frame)
         self.watch.on_frame(arrived_us)
         self.received_us = arrived_us
-        kind = message.get_type()
-        if kind not in _STATE and (boot_ms := getattr(message, "time_boot_ms", None)) is not None:
-            self.clock.witness(kind, boot_ms * 1000, arrived_us)
-        handler = self._handlers.get(kind)
+        number = message_id(frame)
+        if number in BOOT_READERS and number != _LOCAL_POSITION:
+            self.clock.witness(number, BOOT_READERS[number](payload).time_boot_ms * 1000, arrived_us)
+        handler = self._handlers.get(number)
         if handler is not None:
-            handler(message, arrived_us)
-        if self._slow is not None and message.get_msgId() not in _FAST:
-            self._slow.frame(message)
+            handler(READERS[number](payload), arrived_us)
+        if number in HEARD and self._slow is not None:
+            self._slow.frame(message_of(number, payload))
 
     def _heartbeat(self, message: Any, arrived_us: int) -> None:
         dialect = DIALECTS.get(message.autopilot)
@@ -273,31 +266,34 @@ class Autopilot:
             self._codec.refused["odometry frame"] += 1
             return
         self._odometry_us = arrived_us
-        q_nb = np.array(message.q)
-        vel = np.array([message.vx, message.vy, message.vz])
+        q_nb = message.q_0, message.q_1, message.q_2, message.q_3
+        vel: Vector = message.vx, message.vy, message.vz
         if message.child_frame_id in _BODY_FRD:
-            vel = rotate_to_ned(q_nb, vel)
-        rate = np.array([message.rollspeed, message.pitchspeed, message.yawspeed])
-        pos = np.array([message.x, message.y, message.z])
+            vel = numbers_rotated_to_ned(q_nb, vel)
+        rate = message.rollspeed, message.pitchspeed, message.yawspeed
+        pos = message.x, message.y, message.z
         if self._take(message.time_usec, arrived_us, pos, vel, q_nb=q_nb, rate=rate):
             self._was_reset |= self._reset_counter not in (None, message.reset_counter)
             self._reset_counter = message.reset_counter
 
     def _attitude_quaternion(self, message: Any, arrived_us: int) -> None:
-        q_nb = np.array([message.q1, message.q2, message.q3, message.q4])
-        rate = np.array([message.rollspeed, message.pitchspeed, message.yawspeed])
-        self._attitude = (arrived_us, q_nb, rate)
+        q_nb = message.q1, message.q2, message.q3, message.q4
+        self._attitude = q_nb, (message.rollspeed, message.pitchspeed, message.yawspeed)
 
     def _local_position(self, message: Any, arrived_us: int) -> None:
         """Combine a local position with the newest attitude, for autopilots without ODOMETRY."""
         if self._attitude is None or (arrived_us - self._odometry_us < 500_000 and self._odometry_us):
             return
-        pos, vel = np.array([message.x, message.y, message.z]), np.array([message.vx, message.vy, message.vz])
-        self._take(message.time_boot_ms * 1000, arrived_us, pos, vel, q_nb=self._attitude[1], rate=self._attitude[2])
+        pos, vel = (message.x, message.y, message.z), (message.vx, message.vy, message.vz)
+        q_nb, rate = self._attitude
+        self._take(message.time_boot_ms * 1000, arrived_us, pos, vel, q_nb=q_nb, rate=rate)
 
-    def _take(self, vehicle_us: int, arrived_us: int, pos: Array, vel: Array, *, q_nb: Array, rate: Array) -> bool:
+    def _take(
+        self, vehicle_us: int, arrived_us: int, pos: Vector, vel: Vector, *, q_nb: Quaternion, rate: Vector
+    ) -> bool:
         """Keep a sample if it is valid and the newest; return whether it was kept."""
-        norm = float(np.sqrt(q_nb @ q_nb))
+        w, x, y, z = q_nb
+        norm = math.sqrt((w * w + y * y) + (x * x + z * z))  # in the order of a dot product, by which it rounds
         if problem := state_problem(pos, vel, rate, norm):
             self._codec.refused[problem] += 1
             return False
@@ -314,29 +310,35 @@ class Autopilot:
         self.samples += 1
         if self._sample is not None and vehicle_us < self._sample.vehicle_us:
             return False
-        self._sample = _Sample(vehicle_us, t_us, pos, vel, q_nb / norm, rate)
+        self._sample = Sample(vehicle_us, t_us, pos, vel, (w / norm, x / norm, y / norm, z / norm), rate)
         return True
 
-    def _state(self, sample: _Sample, now_us: int) -> VehicleState | None:
-        if self._placed is None or self._placed[0] is not sample:
-            told, self._was_reset = self._was_reset, False
-            placed = self.frame.place(sample.vehicle_us, sample.pos_ned_m, sample.vel_ned_m_s, self.armed, reset=told)
-            self._placed = None if placed is None else (sample, placed)
+    def _state(self, sample: Sample, now_us: int) -> VehicleState | None:
+        if self._placed is None or self._placed.sample is not sample:
+            self._placed = self._place(sample)
         if self._placed is None:
             return None
-        pos, vel, q_nb, rate = self._placed[1], sample.vel_ned_m_s, sample.q_nb, sample.rate_frd_rad_s
         mode, failsafe = self.watch.show(now_us)
         return VehicleState(
             t_us=sample.t_us,
-            pos_ned_m=pos,
-            vel_ned_m_s=vel,
-            q_nb=q_nb,
-            rate_frd_rad_s=rate,
+            pos_ned_m=self._placed.pos_ned_m,
+            vel_ned_m_s=self._placed.vel_ned_m_s,
+            q_nb=self._placed.q_nb,
+            rate_frd_rad_s=self._placed.rate_frd_rad_s,
             armed=self.armed,
             mode=mode,
             landed=self.landed,
             failsafe=failsafe,
         )
+
+    def _place(self, sample: Sample) -> Placed | None:
+        """Return the sample in the shared frame; None while its place can't be known."""
+        vel, was_reset = np.array(sample.vel_ned_m_s), self._was_reset
+        self._was_reset = False
+        pos = self.frame.place(sample.vehicle_us, np.array(sample.pos_ned_m), vel, self.armed, reset=was_reset)
+        if pos is None:
+            return None
+        return Placed(sample, pos, vel, np.array(sample.q_nb), np.array(sample.rate_frd_rad_s))
 
     def _forget(self) -> None:
         """Discard everything the vehicle has reported: it has rebooted, or was never received."""
@@ -357,7 +359,7 @@ class Autopilot:
         if self._sample is not None:
             place = _geodetic(message.lat, message.lon, message.alt)
             local_us, _, pos, vel = self._sample[:4]
-            self.frame.seen(place, message.time_boot_ms * 1000, local_us, pos, vel_ned_m_s=vel)
+            self.frame.seen(place, message.time_boot_ms * 1000, local_us, np.array(pos), vel_ned_m_s=np.array(vel))
 
     def _ask_the_time(self, now_us: int) -> None:
         if self.dialect is not None and now_us - self._sync_us >= _SYNC_EVERY_US:
@@ -380,7 +382,7 @@ class Autopilot:
     def _accuracy(self, source: str, sigma_m: float) -> None:
         """Return an accuracy [m], or None for 0, which both messages use for unknown."""
         if self.dialect is not None and self.dialect.horizontal_accuracy == source and 0.0 < sigma_m < np.inf:
-            self.pos_accuracy_m = float(sigma_m)
+            self.pos_accuracy_m = sigma_m
 
     def _param_value(self, message: Any, arrived_us: int) -> None:
         if self.dialect is None:
@@ -400,13 +402,13 @@ class Autopilot:
     def _attitude_target(self, message: Any, arrived_us: int) -> None:
         """Learn the hover thrust while the autopilot hovers by itself: in HOLD, or where take-off shares our mode."""
         if self.landed is Landed.IN_AIR and 0.05 < message.thrust < 1.0 and self._hovers_by_itself(arrived_us):
-            self.hover_thrust_01 = float(message.thrust)
+            self.hover_thrust_01 = message.thrust
 
     def _hovers_by_itself(self, now_us: int) -> bool:
         if self.mode is not FlightMode.EXTERNAL or self._sample is None:
             return self.mode is FlightMode.HOLD
         own = self._setpoint_us is None or now_us - self._setpoint_us > _OWN_FLIGHT_US
-        return own and abs(float(self._sample.vel_ned_m_s[2])) < _HOVER_M_S
+        return own and abs(self._sample.vel_ned_m_s[2]) < _HOVER_M_S
 
 
 def _geodetic(lat_e7: int, lon_e7: int, alt_mm: int) -> GeoOrigin:

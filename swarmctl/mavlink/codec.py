@@ -1,7 +1,8 @@
 """MAVLink 2 codec that converts bytes and dialect messages, one datagram at a time. It knows no socket and no vehicle.
 
 `parse_buffer` is never used: as a stream parser it loses most good frames after two bytes of junk. Plain frames
-(MAVLink 2, not signed, valid) are decoded here: to the same messages as by pymavlink's `decode`, in half of its time.
+(MAVLink 2, not signed) are judged and decoded here: to the same messages as by pymavlink's `decode`, in half of its
+time. Who needs a few fields only takes the payload, and reads them by `fields`.
 """
 
 from __future__ import annotations
@@ -20,7 +21,9 @@ from swarmctl.mavlink.framing import frames, message_id
 
 AUTOPILOT_COMPID = 1  # MAV_COMP_ID_AUTOPILOT1
 _VERSION_2, _PLAIN = 0xFD, 0  # first byte of a frame; incompatibility flags of one that is not signed
-_HEADER_BYTES, _CHECKSUM_BYTES = 10, 2
+_HEADER_BYTES, _HEADER_BYTES_1, _CHECKSUM_BYTES = 10, 6, 2  # the second of MAVLink 1
+_HEADER = struct.Struct("<BBBBBBBHB")
+_UNKNOWN = "unknown message"  # its checksum can't be verified
 
 
 class _Layout(NamedTuple):
@@ -52,6 +55,18 @@ def _layout(number: int) -> _Layout | None:
         arrays=tuple(i for i, count in enumerate(counts) if count > 1),
         texts=tuple(i for i, first in enumerate(firsts) if isinstance(zeros[first], bytes)),
     )
+
+
+def message_of(number: int, payload: bytes) -> Any:
+    """Return the message with a payload that `Codec.payload` has returned."""
+    layout = _layout(number)
+    assert layout is not None
+    arguments = list(layout.arguments(layout.payload.unpack_from(payload)))
+    for i in layout.arrays:
+        arguments[i] = list(arguments[i])
+    for i in layout.texts:
+        arguments[i] = arguments[i].rstrip(b"\0")
+    return layout.make(*arguments)
 
 
 def heartbeat_of(sysid: int) -> Callable[[bytes], bool]:
@@ -96,40 +111,66 @@ class Codec:
         self._mav.seq = (self._mav.seq + 1) % 256
         return frame
 
+    def frame(self, number: int, payload: bytes) -> bytes:
+        """Return the frame of a message whose payload is at hand; zeros at its end are not sent."""
+        layout = _layout(number)
+        if layout is None:
+            raise ValueError(f"message {number} is not of the dialect")
+        sent = payload.rstrip(b"\0") or b"\0"
+        ids = self._mav.seq, self.sysid, self.compid, number & 0xFFFF, number >> 16
+        inside = _HEADER.pack(_VERSION_2, len(sent), _PLAIN, 0, *ids) + sent
+        self._mav.seq = (self._mav.seq + 1) % 256
+        return inside + int(mcrf4xx(inside[1:] + layout.seed)).to_bytes(_CHECKSUM_BYTES, "little")
+
+    def payload(self, frame: bytes) -> bytes | None:
+        """Return the payload of one frame, with the zeros that are not sent; None for a refused one, which is counted.
+
+        Refused is exactly what `decode` refuses.
+        """
+        if not _is_plain(frame):
+            message = self._decoded(frame)
+            begin = _HEADER_BYTES if frame[:1] == bytes([_VERSION_2]) else _HEADER_BYTES_1
+            return None if message is None else frame[begin : begin + frame[1]].ljust(message.unpacker.size, b"\0")
+        layout = _layout(message_id(frame))
+        if layout is None:
+            self.refused[_UNKNOWN] += 1
+            return None
+        if mcrf4xx(frame[1:-_CHECKSUM_BYTES] + layout.seed) != int.from_bytes(frame[-_CHECKSUM_BYTES:], "little"):
+            self.refused[dialect.MAVError.__name__] += 1
+            return None
+        return frame[_HEADER_BYTES:-_CHECKSUM_BYTES].ljust(layout.payload.size, b"\0")
+
     def decode(self, frame: bytes) -> Any | None:
         """Return the message of one frame, or None for a refused one, which is counted."""
+        if not _is_plain(frame):
+            return self._decoded(frame)
+        payload = self.payload(frame)
+        return None if payload is None else _with_header(message_of(message_id(frame), payload), frame)
+
+    def _decoded(self, frame: bytes) -> Any | None:
+        """Return the message of a frame that pymavlink judges, or None for a refused one, which is counted."""
         try:
-            message = _decode_plain(frame) or self._mav.decode(bytearray(frame))
+            message = self._mav.decode(bytearray(frame))
         except (dialect.MAVError, IndexError, ValueError, KeyError) as error:
             self.refused[type(error).__name__] += 1
             return None
-        if isinstance(message, dialect.MAVLink_unknown):  # its checksum can't be verified
-            self.refused["unknown message"] += 1
+        if isinstance(message, dialect.MAVLink_unknown):
+            self.refused[_UNKNOWN] += 1
             return None
         return message
 
 
-def _decode_plain(frame: bytes) -> Any | None:
-    """Return the message of a valid frame of MAVLink 2 without signature; None for others, which pymavlink judges."""
+def _is_plain(frame: bytes) -> bool:
+    """Return whether a frame is a whole one of MAVLink 2 without signature."""
     whole = len(frame) >= _HEADER_BYTES + _CHECKSUM_BYTES and len(frame) == frame[1] + _HEADER_BYTES + _CHECKSUM_BYTES
-    if not whole or frame[0] != _VERSION_2 or frame[2] != _PLAIN:
-        return None
-    number = message_id(frame)
-    layout = _layout(number)
-    checksum = int.from_bytes(frame[-_CHECKSUM_BYTES:], "little")
-    if layout is None or mcrf4xx(frame[1:-_CHECKSUM_BYTES] + layout.seed) != checksum:
-        return None
-    size = layout.payload.size
-    payload = frame[_HEADER_BYTES:-_CHECKSUM_BYTES][:size].ljust(size, b"\0")
-    arguments = list(layout.arguments(layout.payload.unpack(payload)))
-    for i in layout.arrays:
-        arguments[i] = list(arguments[i])
-    for i in layout.texts:
-        arguments[i] = arguments[i].rstrip(b"\0")
-    message = layout.make(*arguments)
+    return whole and frame[0] == _VERSION_2 and frame[2] == _PLAIN
+
+
+def _with_header(message: Any, frame: bytes) -> Any:
+    """Return the message of a valid plain frame with what else pymavlink keeps of the frame."""
     header = message.get_header()
     header.mlen, header.seq, header.srcSystem, header.srcComponent = frame[1], frame[4], frame[5], frame[6]
     header.incompat_flags, header.compat_flags = frame[2], frame[3]
-    message._msgbuf, message._crc = bytearray(frame), checksum
+    message._msgbuf, message._crc = bytearray(frame), int.from_bytes(frame[-_CHECKSUM_BYTES:], "little")
     message._payload = message._msgbuf[6:-_CHECKSUM_BYTES]
     return message

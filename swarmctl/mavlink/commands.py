@@ -23,6 +23,9 @@ _RETRY_US = 500_000
 _TRIES = 4
 _IN_PROGRESS = 5  # MAV_RESULT
 _HEARTBEAT_US = 1_000_000
+HEARD = frozenset(  # ids of the messages that answer a command
+    (mavlink.MAVLINK_MSG_ID_COMMAND_ACK, mavlink.MAVLINK_MSG_ID_PARAM_VALUE, mavlink.MAVLINK_MSG_ID_PARAM_ERROR)
+)
 _GROUND_STATION, _NO_AUTOPILOT, _ACTIVE = 6, 8, 4  # MAV_TYPE_GCS: what PX4 counts for its data-link failsafe
 
 
@@ -80,7 +83,7 @@ class CommandPort:
         return done
 
     def frame(self, message: Any) -> None:
-        """Take a message of the vehicle; every one except the fast state messages is passed here."""
+        """Take a message of the vehicle that is one of `HEARD`."""
         if not self._steps or self._spoken is None:
             return
         current = self._steps[0]

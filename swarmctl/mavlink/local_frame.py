@@ -136,7 +136,7 @@ class LocalFrame:
         step_m = _RESET_M if reset else _JUMP_M
         leeway_m = step_m + 0.5 * _ACCEL_M_S2 * min(since_s, _LEEWAY_S) ** 2
         missing_ned_m = expected_ned_m - pos_ned_m - self.offset_ned_m
-        missed_m = math.dist(missing_ned_m, self.bridge_ned_m)
+        missed_m = math.dist(missing_ned_m.tolist(), self.bridge_ned_m.tolist())
         if self._moved_to is not None:
             moved_m = math.dist(pos_ned_m + self._moved_to, expected_ned_m)
             if moved_m < leeway_m and (self._unexplained or moved_m < missed_m):
@@ -151,7 +151,8 @@ class LocalFrame:
 
     def _draw_in(self, t_us: int, since_s: float) -> None:
         """Adapt the margin, and shorten a short bridge once positions have been steady."""
-        left_m = math.sqrt(float(self.bridge_ned_m @ self.bridge_ned_m))
+        bridge_ned_m = self.bridge_ned_m
+        left_m = 0.0 if bridge_ned_m is _NOTHING else math.sqrt(float(bridge_ned_m @ bridge_ned_m))
         if self._unexplained and t_us - self._jumped_us > _ASKED_US:  # no moved origin has been reported
             self._unexplained = False
             self.jumps += 1
@@ -159,7 +160,7 @@ class LocalFrame:
         widest_m, least_m = self.margin_m + _WIDEN_M_S * since_s, self.margin_m - _NARROW_M_S * since_s
         self.margin_m = max(min(wanted_m, widest_m), least_m)
         if left_m and self.jump_m <= _SHORT_M and t_us - self._jumped_us > _STEADY_US:
-            self.bridge_ned_m = self.bridge_ned_m * max(0.0, 1.0 - _DRAW_IN_M_S * since_s / left_m)
+            self.bridge_ned_m = bridge_ned_m * max(0.0, 1.0 - _DRAW_IN_M_S * since_s / left_m)
 
     def _take_origin(self) -> None:
         """Adopt a moved origin: positions have moved with it, and there was no jump."""

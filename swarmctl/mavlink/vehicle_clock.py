@@ -13,6 +13,7 @@ another message agrees with them.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Hashable
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -73,13 +74,16 @@ class VehicleClock:
         self.rate = 0.0
         self._offset_us = 0.0  # at stamp 0, along the line
         self._points: deque[Point] = deque(maxlen=_BUCKETS)
+        self._is_fitted = False  # since the points have changed
         self._floor: Point | None = None  # stamp of the newest answered TIMESYNC, and the lower bound of the line there
         self._newest_us: int | None = None
         self._arrived_us = 0  # arrival of that stamp
         self._taken = 0  # stamps since the clock began
         self._run: _Run | None = None
-        self._witnesses: dict[str, deque[tuple[int, int]]] = {}  # kind -> arrival, arrival - stamp of its newest frames
+        # kind of message -> arrival, arrival - stamp of its newest frames
+        self._witnesses: dict[Hashable, deque[tuple[int, int]]] = {}
         self._asked: deque[Point] = deque(maxlen=_QUESTIONS)  # stamp of an answer, request - stamp
+        self._left_us: float | None = None  # least distance of these from the line; None since one of both has changed
 
     @property
     def offset_us(self) -> float | None:
@@ -93,23 +97,28 @@ class VehicleClock:
         late_us = arrived_us - vehicle_us
         if self._newest_us is None:
             self._begin_again(vehicle_us, late_us)
-        elif self._fits(vehicle_us, arrived_us):
+        line_us = self._line(vehicle_us)
+        if self._fits(vehicle_us, arrived_us, line_us):
             self._run = None
-        elif not self._has_begun_again(vehicle_us, arrived_us):
+        elif self._has_begun_again(vehicle_us, arrived_us):
+            line_us = self._line(vehicle_us)
+        else:
             self.refused += 1
             return None
         assert self._newest_us is not None
-        residual_us = late_us - self._line(vehicle_us)
         rolled = self._keep(float(vehicle_us), float(late_us))
         self._newest_us, self._arrived_us = max(self._newest_us, vehicle_us), max(self._arrived_us, arrived_us)
         self._taken += 1
-        if rolled or residual_us < 0.0:
+        if rolled or late_us < line_us:
             self._fit()
-        return vehicle_us + round(self._line(vehicle_us) - self._one_way_delay_us)
+            line_us = self._line(vehicle_us)
+        return vehicle_us + round(line_us - self._one_way_delay_us)
 
-    def witness(self, kind: str, vehicle_us: int, arrived_us: int) -> None:
+    def witness(self, kind: Hashable, vehicle_us: int, arrived_us: int) -> None:
         """Note the boot time that a message of another kind reports."""
-        told = self._witnesses.setdefault(kind, deque(maxlen=_WITNESSES))
+        told = self._witnesses.get(kind)
+        if told is None:
+            told = self._witnesses[kind] = deque(maxlen=_WITNESSES)
         told.append((arrived_us, arrived_us - vehicle_us))
 
     def round_trip(self, asked_us: int, vehicle_us: int, arrived_us: int) -> None:
@@ -127,8 +136,10 @@ class VehicleClock:
             fresh = [(x, y) for x, y in self._points if y + self.rate * (vehicle_us - x) >= least_us]
             self._points.clear()  # the others are older than the stop of the vehicle's clock
             self._points.extend(fresh or [(float(vehicle_us), float(arrived_us - vehicle_us))])
+            self._is_fitted = False
             self._fit()
         self._asked.append((float(vehicle_us), float(asked_us - vehicle_us)))
+        self._left_us = None
 
     @property
     def _one_way_delay_us(self) -> float:
@@ -138,9 +149,10 @@ class VehicleClock:
         """
         if not self._asked or not self._spans():  # until the rate is known the line may be far too low
             return 0.0
-        offset_us, rate = self._offset_us, self.rate
-        left_us = min([offset_us + rate * x - y for x, y in self._asked])
-        return 0.5 * max(0.0, left_us - _LOOP_US)
+        if self._left_us is None:
+            offset_us, rate = self._offset_us, self.rate
+            self._left_us = min([offset_us + rate * x - y for x, y in self._asked])
+        return 0.5 * max(0.0, self._left_us - _LOOP_US)
 
     def _line(self, vehicle_us: float) -> float:
         """Host time minus vehicle time at a stamp, including the shortest delay."""
@@ -153,12 +165,12 @@ class VehicleClock:
     def _spans(self) -> bool:
         return len(self._points) > 1 and self._points[-1][0] - self._points[0][0] >= _RATE_AFTER_US
 
-    def _fits(self, vehicle_us: int, arrived_us: int) -> bool:
+    def _fits(self, vehicle_us: int, arrived_us: int, line_us: float) -> bool:
         """Return whether the clock can have read this: any delay is possible, an arrival before the line hardly."""
         assert self._newest_us is not None
         allowed_us = _EARLY_US if self._spans() else _UNKNOWN_RATE_US
         allowed_us += round(_EARLY_01 * max(0, arrived_us - self._arrived_us))
-        early_us = self._line(vehicle_us) - (arrived_us - vehicle_us)
+        early_us = line_us - (arrived_us - vehicle_us)
         return vehicle_us >= self._newest_us - _PAST_US and early_us <= allowed_us
 
     def _has_begun_again(self, vehicle_us: int, arrived_us: int) -> bool:
@@ -190,7 +202,7 @@ class VehicleClock:
         self._run, self._taken = None, 0
         self._points.clear()
         self._asked.clear()
-        self._floor = None
+        self._floor = self._left_us = None
         self._newest_us, self.rate, self._offset_us = vehicle_us, 0.0, float(late_us)
 
     def _keep(self, x: float, y: float) -> bool:
@@ -198,17 +210,23 @@ class VehicleClock:
         if self._points and x // _BUCKET_US <= self._points[-1][0] // _BUCKET_US:
             last_x, last_y = self._points[-1]
             if y - self.rate * x < last_y - self.rate * last_x:
-                self._points[-1] = (x, y)
+                self._points[-1], self._is_fitted = (x, y), False
             return False
         self._points.append((x, y))
+        self._is_fitted = False
         return True
 
     def _fit(self) -> None:
+        """Lay the line under the points, unless it is."""
+        if self._is_fitted:
+            return
+        self._is_fitted = True
         if self._spans():
             first, last = self._points[0][0], self._points[-1][0]
             rate = _slope_under(self._points, first + _KNEE_01 * (last - first))
             self.rate = max(-self._limit, min(self._limit, rate))
         self._offset_us = min(y - self.rate * x for x, y in self._points)
+        self._left_us = None
 
 
 def _slope_under(points: deque[Point], at: float) -> float:

@@ -123,3 +123,21 @@ def test_a_seed_gives_the_same_deliveries_in_whatever_order_agents_tick() -> Non
     flown = Traffic(2000, order=(0, 1, 2), **ALL)
     assert Traffic(2000, order=(2, 0, 1), **ALL).arrived == flown.arrived
     assert Traffic(2000, order=(0, 1, 2), seed=6, **ALL).arrived != flown.arrived
+
+
+def test_what_a_participant_listens_to_does_not_change_what_it_loses() -> None:
+    heard = []
+    for subscriptions in (None, {PATH: None}, {PATH: [agent_name(0)]}):
+        clock = SimClock()
+        hub = LocalHub(clock.now_us, 5, Impairments(loss_01=0.3, jitter_us=9_000))
+        sender, receiver = hub.connect(agent_name(0)), hub.connect(agent_name(1), subscriptions)
+        arrived = []
+        for step in range(300):
+            sender.publish(TICK, b"")
+            sender.publish(PATH, str(step).encode())
+            clock.advance(STEP_US)
+            arrived += receiver.receive(PATH)
+        assert 100 < len(arrived) < 250
+        assert bool(receiver.receive(TICK)) == (subscriptions is None)
+        heard.append(arrived)
+    assert heard[0] == heard[1] == heard[2]

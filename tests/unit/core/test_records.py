@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 import struct
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -84,6 +85,14 @@ def test_what_a_tick_does_not_know_is_not_recorded_as_zero() -> None:
     (row,) = tick_row(tick_record(state=None, reference=None, plan=None, flown=None, setpoint=None))
     for name, value in (RECORDED | UNKNOWN).items():
         np.testing.assert_allclose(row[name], value, rtol=1e-7, err_msg=name)
+
+
+def test_what_a_controller_of_somebody_else_calls_a_number_is_recorded_too() -> None:
+    odd = replace(PLAN, iterations=7.0, slack_m=np.float32(0.5), residual_m=1e300)  # type: ignore[arg-type]
+    (row,) = tick_row(tick_record(plan=odd, safety_filter_acted=np.bool_(True), nearest_peer_m=4e38))
+    assert (row["iterations"], row["slack_m"], row["residual_m"]) == (7, 0.5, math.inf)
+    assert (row["safety_filter_acted"], row["nearest_peer_m"]) == (1, math.inf)
+    np.testing.assert_array_equal(row["pos_ned_m"], RECORDED["pos_ned_m"])
 
 
 def test_every_column_is_described_and_named_once() -> None:

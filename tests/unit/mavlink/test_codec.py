@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import development as dialect
 
-from swarmctl.mavlink.codec import Codec
-from swarmctl.mavlink.framing import frames, message_id
+from swarmctl.mavlink.codec import Codec, message_of
+from swarmctl.mavlink.framing import cut_frames, frames, message_id
 
 CRC_EXTRA = {0: 50, 76: 152, 82: 49, 331: 91}  # of common.xml, by message id
 
@@ -33,6 +33,12 @@ def hand_frame(number: int, payload: bytes, sysid: int = 1, compid: int = 1, seq
     body = payload.rstrip(b"\x00") or b"\x00"
     inside = bytes([len(body), 0, 0, seq, sysid, compid]) + number.to_bytes(3, "little") + body
     return b"\xfd" + inside + struct.pack("<H", x25(inside + bytes([CRC_EXTRA[number]])))
+
+
+def frame_with(number: int, payload: bytes, flags: int = 0) -> bytes:
+    """A frame of any message of the dialect with any payload, and a right checksum."""
+    inside = bytes([len(payload), flags, 0, 200, 7, 9]) + number.to_bytes(3, "little") + payload
+    return b"\xfd" + inside + struct.pack("<H", x25(inside + bytes([dialect.mavlink_map[number].crc_extra])))
 
 
 def hand_parse(frame: bytes, size: int) -> tuple[int, int, int, int, bytes]:
@@ -173,19 +179,62 @@ def test_hostile_bytes_never_raise(data: bytes) -> None:
 
 @given(st.sampled_from(sorted(dialect.mavlink_map)), st.binary(max_size=255), st.integers(0, 255))
 def test_hostile_payloads_with_a_right_checksum_never_raise(number: int, payload: bytes, flags: int) -> None:
-    inside = bytes([len(payload), flags, 0, 0, 1, 1]) + number.to_bytes(3, "little") + payload
-    extra = dialect.mavlink_map[number].crc_extra
-    data = b"\xfd" + inside + struct.pack("<H", x25(inside + bytes([extra]))) + bytes(13)
-    for part in frames(data):
+    for part in frames(frame_with(number, payload, flags) + bytes(13)):
         Codec(1, 191).decode(part)
+
+
+def damaged(frame: bytes, bit: int) -> bytes:
+    """A frame with one bit changed."""
+    changed = bytearray(frame)
+    changed[bit // 8 % len(frame)] ^= 1 << bit % 8
+    return bytes(changed)
+
+
+KNOWN = st.sampled_from(sorted(dialect.mavlink_map))
+
+
+@given(
+    st.one_of(
+        st.binary(max_size=40),
+        st.binary(max_size=40).map(lambda rest: b"\xfd" + rest),
+        st.builds(frame_with, KNOWN, st.binary(max_size=255), st.integers(0, 255)),
+        st.builds(damaged, st.builds(frame_with, st.just(0), st.binary(min_size=9, max_size=9)), st.integers(0, 167)),
+    )
+)
+def test_a_payload_is_refused_as_its_message_is_and_counted_by_the_same_reason(frame: bytes) -> None:
+    one, other = Codec(1, 191), Codec(1, 191)
+    payload, message = one.payload(frame), other.decode(frame)
+    assert one.refused == other.refused
+    assert (payload is None) == (message is None)
+    if message is not None and payload is not None:
+        found = message_of(message.get_msgId(), payload)
+        assert all(repr(getattr(found, name)) == repr(getattr(message, name)) for name in message.get_fieldnames())
+
+
+@given(KNOWN, st.binary(max_size=255), st.integers(0, 3))
+def test_a_payload_is_packed_as_by_pymavlink(number: int, payload: bytes, before: int) -> None:
+    ours, theirs = Codec(7, 191), dialect.MAVLink(None, srcSystem=7, srcComponent=191)
+    kind = dialect.mavlink_map[number]
+    payload = payload[: kind.unpacker.size].ljust(kind.unpacker.size, b"\0")
+    for _ in range(before):
+        ours.encode(heartbeat())
+    theirs.seq = before
+    assert ours.frame(number, payload) == message_of(number, payload)._pack(theirs, kind.crc_extra, payload)
+    assert ours.frame(number, payload)[4] == before + 1
+
+
+@given(st.binary(max_size=60), st.integers(0, 255), st.integers(0, 1))
+def test_frames_of_a_datagram_are_those_of_a_stream(body: bytes, flags: int, more: int) -> None:
+    whole = b"\xfd" + bytes([len(body), flags]) + bytes(7) + body + bytes(2)
+    for datagram in (body, whole, whole + body, whole[: len(whole) - more]):
+        assert frames(datagram) == cut_frames(bytearray(datagram))
 
 
 @pytest.mark.parametrize("length", [1, 7, 40, 255])
 def test_every_message_is_decoded_as_by_pymavlink(length: int) -> None:
     rng = random.Random(length)
     for number, kind in sorted(dialect.mavlink_map.items()):
-        inside = bytes([length, 0, 0, 200, 7, 9]) + number.to_bytes(3, "little") + rng.randbytes(length)
-        frame = b"\xfd" + inside + struct.pack("<H", x25(inside + bytes([kind.crc_extra])))
+        frame = frame_with(number, rng.randbytes(length))
         ours, theirs = Codec(1, 191).decode(frame), dialect.MAVLink(None).decode(bytearray(frame))
         assert ours is not None
         assert type(ours) is type(theirs)
