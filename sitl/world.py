@@ -12,6 +12,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from sitl.arducopter.endpoint import Start, arducopter_links, arducopter_pilot
 from sitl.faults import Faults
 from sitl.net.lossy import LossyLink
 from sitl.net.signing import ARDUCOPTER_RULES, PX4_RULES, SigningLink, VehicleSigning
@@ -270,12 +271,6 @@ class SitlWorld:
         return pilot, endpoint
 
     def _arducopter(self, vehicle: int) -> tuple[Commander, MavlinkInterface]:
-        from sitl.arducopter.endpoint import (  # imports a second dialect module: 20 MB
-            Start,
-            arducopter_links,
-            arducopter_pilot,
-        )
-
         params = self.params
         start = Start(
             origin=self.origins[vehicle],

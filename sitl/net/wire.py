@@ -1,8 +1,8 @@
 """MAVLink frames of the simulator, packed directly from tuples.
 
-A dialect object takes 5-40 us to pack, a tuple about 2: one core has to carry 25,000 messages a second. PX4 sends eight
-messages that the dialect module lacks; they are defined here. `tests/unit/sitl/test_wire.py` compares all with
-pymavlink.
+A dialect object takes 5-40 us to pack, a tuple about 2: one core has to carry 25,000 messages a second. PX4 sends seven
+messages that the dialect module lacks, ArduCopter one; they are defined here. `tests/unit/sitl/test_wire.py` compares
+all with pymavlink.
 """
 
 from __future__ import annotations
@@ -44,6 +44,19 @@ LACKING: dict[int, tuple[str, str, int, tuple[str, ...]]] = {
             "uint16_t rx_overflows",
             "uint8_t tx_buf",
             "uint8_t rx_buf",
+        ),
+    ),
+    193: (
+        "EKF_STATUS_REPORT",
+        "<5fH",
+        71,
+        (
+            "float velocity_variance",
+            "float pos_horiz_variance",
+            "float pos_vert_variance",
+            "float compass_variance",
+            "float terrain_alt_variance",
+            "uint16_t flags",
         ),
     ),
     290: (
