@@ -30,6 +30,8 @@ class Mixer:
         self._even, self._odd = self._forces[::2], self._forces[1::2]  # (2, N), the two pairs of opposite rotors
         self._give = np.zeros((2, vehicles))  # force that each of a pair can lose
         self._take = np.zeros((2, vehicles))  # and gain
+        self._taken_by_other = self._take[::-1]
+        self._up, self._down = self._give  # (N,) limits of what yaw moves from even to odd rotors, and back
         self._yaw = np.zeros(vehicles)
 
     def allocate(self, wrench: Array) -> Array:
@@ -41,11 +43,11 @@ class Mixer:
         np.minimum(self._one_side, self._other_side, out=give)
         np.maximum(self._one_side, self._other_side, out=take)
         np.subtract(self._max_n, take, out=take)
-        np.minimum(give, take[::-1], out=give)  # what one pair loses, the other gains
+        np.minimum(give, self._taken_by_other, out=give)  # what one pair loses, the other gains
         np.multiply(wrench[3], self._yaw_scale, out=yaw)
-        np.minimum(yaw, give[0], out=yaw)
-        np.negative(give[1], out=give[1])
-        np.maximum(yaw, give[1], out=yaw)
+        np.minimum(yaw, self._up, out=yaw)
+        np.negative(self._down, out=self._down)
+        np.maximum(yaw, self._down, out=yaw)
         self._even -= yaw
         self._odd += yaw
         return forces

@@ -103,6 +103,7 @@ class Plant:
 
     Attributes:
         state: (13, N) quaternion body->NED, rates FRD [rad/s], velocity FRD [m/s], position NED [m].
+        q_nb, rate_frd_rad_s, pos_ned_m: parts of it.
         rotation: (9, N) row-major body->NED, of the current state.
         vel_ned_m_s: (3, N), of the current state.
         euler_rad: (3, N) roll, pitch, yaw, of the current state.
@@ -175,31 +176,30 @@ class Plant:
             _Stage(arguments[:12], arguments[2:12], polynomial, polynomial[:10], slope[:10])
             for arguments, polynomial, slope in zip(self._arguments, self._polynomials, self._slopes, strict=True)
         )
-        self._forcing = np.zeros((10, count))
-        self._sum = np.zeros(13 * count)
         self._levers = np.zeros((3, 3, 3, count))
+        self._lever = self._levers[0]
+        self._rotations = self._polynomials[:, 10:].reshape(3, 3, 3, count)
+        self._velocities = self._arguments[:, None, 9:12]
+        self._speeds = self._slopes[:, _POS]  # (3, 3, N): slopes of the position
+        self._all_slopes = self._slopes.reshape(3, 13 * count)
+        self._change = np.zeros((13, count))
+        self._flat_change = self._change.reshape(13 * count)
+        self.q_nb, self.rate_frd_rad_s = self.state[_QUAT], self.state[_RATE]
+        self.pos_ned_m, self._vel_frd_m_s = self.state[_POS], self.state[_VEL]
+        self._forcing = np.zeros((10, count))
         self._norm = np.zeros(count)
         self._square = np.zeros((4, count))
         self._quat_factors = np.zeros((32, count))
+        self._quat_left, self._quat_right = self._quat_factors[:16], self._quat_factors[16:]
         self._quat_products = np.zeros((16, count))
         self._attitude = np.zeros((13, count))
         self._spins = np.zeros((4, count))
         self.rotation = self._attitude[:9]
+        self._matrix = self.rotation.reshape(3, 3, count)
+        self._sines, self._cosines = self._attitude[9:11], self._attitude[11:]  # of roll and yaw, scaled
         self.vel_ned_m_s = np.zeros((3, count))
         self.euler_rad = np.zeros((3, count))
-        self._roll_yaw = self.euler_rad[::2]
-
-    @property
-    def q_nb(self) -> Array:
-        return self.state[_QUAT]
-
-    @property
-    def rate_frd_rad_s(self) -> Array:
-        return self.state[_RATE]
-
-    @property
-    def pos_ned_m(self) -> Array:
-        return self.state[_POS]
+        self._roll_yaw, self._pitch = self.euler_rad[::2], self.euler_rad[1]
 
     @property
     def hover_thrust_01(self) -> float:
@@ -282,7 +282,7 @@ class Plant:
         lighter = 1.0 / mass_ratio
         self._forcing[9] *= lighter
         if not self.preset.drag_scales_with_mass:
-            self._forcing[_VEL] += self._drag_1_s() * (1.0 - lighter) * self.state[_VEL]
+            self._forcing[_VEL] += self._drag_1_s() * (1.0 - lighter) * self._vel_frd_m_s
 
     def _drag_1_s(self) -> Array:
         """Return the drag rates (3, 1) [1/s] of the mass at the start."""
@@ -294,8 +294,8 @@ class Plant:
         drag = self._drag_1_s()
         if self.mass_ratio is not None and not self.preset.drag_scales_with_mass:
             drag = drag / self.mass_ratio
-        np.multiply(self.rotation.reshape(3, 3, -1), wind_ned_m_s[:, None], out=self._levers[0])
-        self._forcing[_VEL] += drag * self._levers[0].sum(axis=0)
+        np.multiply(self._matrix, wind_ned_m_s[:, None], out=self._lever)
+        self._forcing[_VEL] += drag * self._lever.sum(axis=0)
 
     def _integrate(self) -> None:
         first, second, third = self._stages
@@ -306,15 +306,13 @@ class Plant:
         np.multiply(second.slope, 0.75 * self.dt_s, out=third.moving)
         np.add(third.moving, first.moving, out=third.moving)
         self._slope(third)
-        rotations = self._polynomials[:, 10:].reshape(3, 3, 3, -1)
-        np.multiply(rotations, self._arguments[:, None, 9:12], out=self._levers)
-        np.add.reduce(self._levers, axis=2, out=self._slopes[:, _POS])
-        np.matmul(self._weights, self._slopes.reshape(3, -1), out=self._sum)
-        self.state += self._sum.reshape(13, -1)
-        rates = self.state[_RATE]
+        np.multiply(self._rotations, self._velocities, out=self._levers)
+        np.add.reduce(self._levers, axis=2, out=self._speeds)
+        np.matmul(self._weights, self._all_slopes, out=self._flat_change)
+        np.add(self.state, self._change, out=self.state)
+        rates, quat = self.rate_frd_rad_s, self.q_nb
         np.minimum(rates, RATE_LIMIT_RAD_S, out=rates)
         np.maximum(rates, -RATE_LIMIT_RAD_S, out=rates)
-        quat = self.state[_QUAT]
         np.multiply(quat, quat, out=self._square)
         np.add.reduce(self._square, axis=0, out=self._norm)
         np.sqrt(self._norm, out=self._norm)
@@ -329,14 +327,13 @@ class Plant:
 
     def refresh(self) -> None:
         """Update rotation, NED velocity and Euler angles from the current state."""
-        self.state.take(_QUAT_FACTORS, 0, self._quat_factors, "clip")
-        np.multiply(self._quat_factors[:16], self._quat_factors[16:], out=self._quat_products)
+        self.q_nb.take(_QUAT_FACTORS, 0, self._quat_factors, "clip")
+        np.multiply(self._quat_left, self._quat_right, out=self._quat_products)
         np.matmul(self._attitude_rows, self._quat_products, out=self._attitude)
-        lever = self._levers[0]
-        np.multiply(self.rotation.reshape(3, 3, -1), self.state[_VEL], out=lever)
-        np.add.reduce(lever, axis=1, out=self.vel_ned_m_s)
-        np.arctan2(self._attitude[9:11], self._attitude[11:13], out=self._roll_yaw)
-        pitch = self.euler_rad[1]
+        np.multiply(self._matrix, self._vel_frd_m_s, out=self._lever)
+        np.add.reduce(self._lever, axis=1, out=self.vel_ned_m_s)
+        np.arctan2(self._sines, self._cosines, out=self._roll_yaw)
+        pitch = self._pitch
         np.maximum(self._attitude[6], -1.0, out=pitch)
         np.minimum(pitch, 1.0, out=pitch)
         np.arcsin(pitch, out=pitch)
@@ -349,15 +346,14 @@ class Plant:
         if True not in self.contact.tolist():
             return
         self.refresh()
-        lift_n = self.rotor_force_n.sum(axis=0) * self.rotation[8]
-        for i in np.flatnonzero(self.contact):
-            self._rest_on_ground(int(i), float(lift_n[i]), float(self.ground_z_m[i]))
+        lift_n = (self.rotor_force_n.sum(axis=0) * self.rotation[8]).tolist()
+        for i in np.flatnonzero(self.contact).tolist():
+            self._rest_on_ground(i, lift_n[i], self.ground_z_m[i])
 
     def _rest_on_ground(self, i: int, lift_n: float, ground_z_m: float) -> None:
         """Enforce the ground: no penetration, upright on the skids, Coulomb friction; lift above weight takes off."""
-        state = self.state
         yaw = math.atan2(self.rotation[3, i], self.rotation[0, i])
-        north, east, down = (float(v) for v in self.vel_ned_m_s[:, i])
+        north, east, down = self.vel_ned_m_s[:, i].tolist()
         mass_kg = self.mass_kg * (float(self.mass_ratio[i]) if self.mass_ratio is not None else 1.0)
         load_n = max(0.0, mass_kg * GRAVITY_M_S2 - lift_n)
         speed = math.hypot(north, east)
@@ -365,7 +361,7 @@ class Plant:
         ratio = slowed / speed if speed > 0 else 0.0
         north, east, down = north * ratio, east * ratio, min(down, 0.0)
         c, s = math.cos(yaw), math.sin(yaw)
-        state[_QUAT, i] = math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)
-        state[_RATE, i] = 0.0
-        state[_VEL, i] = c * north + s * east, c * east - s * north, down
-        state[12, i] = ground_z_m
+        upright = math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)
+        at_rest = 0.0, 0.0, 0.0
+        self.state[:10, i] = *upright, *at_rest, c * north + s * east, c * east - s * north, down
+        self.state[12, i] = ground_z_m
