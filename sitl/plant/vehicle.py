@@ -168,7 +168,6 @@ class Plant:
         self._arguments[:, 0] = 1.0
         self.state = self._arguments[0, 2:]
         self._factors = np.zeros((288, count))
-        self._left, self._right = self._factors[:144], self._factors[144:]
         self._products = np.zeros((144, count))
         self._polynomials = np.zeros((3, 19, count))
         self._slopes = np.zeros((3, 13, count))
@@ -176,29 +175,33 @@ class Plant:
             _Stage(arguments[:12], arguments[2:12], polynomial, polynomial[:10], slope[:10])
             for arguments, polynomial, slope in zip(self._arguments, self._polynomials, self._slopes, strict=True)
         )
-        self._levers = np.zeros((3, 3, 3, count))
-        self._lever = self._levers[0]
-        self._rotations = self._polynomials[:, 10:].reshape(3, 3, 3, count)
-        self._velocities = self._arguments[:, None, 9:12]
-        self._speeds = self._slopes[:, _POS]  # (3, 3, N): slopes of the position
-        self._all_slopes = self._slopes.reshape(3, 13 * count)
         self._change = np.zeros((13, count))
-        self._flat_change = self._change.reshape(13 * count)
-        self.q_nb, self.rate_frd_rad_s = self.state[_QUAT], self.state[_RATE]
-        self.pos_ned_m, self._vel_frd_m_s = self.state[_POS], self.state[_VEL]
+        self._levers = np.zeros((3, 3, 3, count))
         self._forcing = np.zeros((10, count))
-        self._norm = np.zeros(count)
+        self._spins = np.zeros((4, count))
         self._square = np.zeros((4, count))
+        self._norm = np.zeros(count)
         self._quat_factors = np.zeros((32, count))
-        self._quat_left, self._quat_right = self._quat_factors[:16], self._quat_factors[16:]
         self._quat_products = np.zeros((16, count))
         self._attitude = np.zeros((13, count))
-        self._spins = np.zeros((4, count))
-        self.rotation = self._attitude[:9]
-        self._matrix = self.rotation.reshape(3, 3, count)
-        self._sines, self._cosines = self._attitude[9:11], self._attitude[11:]  # of roll and yaw, scaled
         self.vel_ned_m_s = np.zeros((3, count))
         self.euler_rad = np.zeros((3, count))
+        self._make_views(count)
+
+    def _make_views(self, count: int) -> None:
+        """Make the views of the buffers once: each costs as much as an operation on it."""
+        self.q_nb, self.rate_frd_rad_s = self.state[_QUAT], self.state[_RATE]
+        self.pos_ned_m, self._vel_frd_m_s = self.state[_POS], self.state[_VEL]
+        self.rotation = self._attitude[:9]
+        self._left, self._right = self._factors[:144], self._factors[144:]
+        self._rotations = self._polynomials[:, 10:].reshape(3, 3, 3, count)  # of the three stages
+        self._velocities = self._arguments[:, None, 9:12]
+        self._drifts = self._slopes[:, _POS]
+        self._flat_slopes = self._slopes.reshape(3, 13 * count)
+        self._flat_change = self._change.reshape(13 * count)
+        self._quat_left, self._quat_right = self._quat_factors[:16], self._quat_factors[16:]
+        self._matrix, self._lever = self.rotation.reshape(3, 3, count), self._levers[0]
+        self._sines, self._cosines = self._attitude[9:11], self._attitude[11:]  # of roll and yaw, scaled
         self._roll_yaw, self._pitch = self.euler_rad[::2], self.euler_rad[1]
 
     @property
@@ -307,8 +310,8 @@ class Plant:
         np.add(third.moving, first.moving, out=third.moving)
         self._slope(third)
         np.multiply(self._rotations, self._velocities, out=self._levers)
-        np.add.reduce(self._levers, axis=2, out=self._speeds)
-        np.matmul(self._weights, self._all_slopes, out=self._flat_change)
+        np.add.reduce(self._levers, axis=2, out=self._drifts)
+        np.matmul(self._weights, self._flat_slopes, out=self._flat_change)
         np.add(self.state, self._change, out=self.state)
         rates, quat = self.rate_frd_rad_s, self.q_nb
         np.minimum(rates, RATE_LIMIT_RAD_S, out=rates)
