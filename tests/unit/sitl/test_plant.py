@@ -213,7 +213,7 @@ def test_steps_that_would_change_nothing_are_left_out_and_nothing_else(monkeypat
             np.testing.assert_array_equal(plants[0].state, plants[1].state)
             np.testing.assert_array_equal(plants[0].vel_ned_m_s, plants[1].vel_ned_m_s)
     assert computed[1] == 1009
-    assert computed[0] < 915  # in the wind too, as long as it does not blow them over the ground
+    assert computed[0] < 970  # before take-off; wind would move them a little
 
 
 def test_each_vehicle_has_its_own_ground() -> None:
