@@ -120,9 +120,6 @@ class SitlWorld:
         self._kept = np.zeros(count, dtype=bool)  # on the ground or clamped
         self._clamped = set(range(count)) if airborne else set()
         self._flown = [IDLE] * count
-        self._truth = np.zeros(count, TRUTH_DTYPE)
-        self._truth_columns = {name: self._truth[name] for name in TRUTH_DTYPE.names or ()}
-        self._truth_columns["vehicle"][:] = np.arange(count)
         self._boot_us: int | None = None
         self._now_us = 0
         self._steps = 0
@@ -205,15 +202,16 @@ class SitlWorld:
 
     def truth_rows(self) -> NDArray[np.void]:
         """Return true states (N,) of `TRUTH_DTYPE`, shared frame."""
-        columns = self._truth_columns
-        columns["t_us"][:] = self._now_us
-        np.add(self.plant.pos_ned_m.T, self._offset_ned_m, out=columns["pos_ned_m"])
-        columns["vel_ned_m_s"][:] = self.plant.vel_ned_m_s.T
-        columns["q_nb"][:] = self.plant.q_nb.T
-        columns["armed"][:] = [pilot.armed for pilot in self.autopilots]
-        columns["landed"][:] = [pilot.landed for pilot in self.autopilots]
-        columns["flight_mode"][:] = [pilot.flight_mode() for pilot in self.autopilots]
-        return self._truth.copy()
+        rows = np.zeros(self.params.vehicles, TRUTH_DTYPE)
+        rows["t_us"] = self._now_us
+        rows["vehicle"] = np.arange(self.params.vehicles)
+        rows["pos_ned_m"] = self.plant.pos_ned_m.T + self._offset_ned_m
+        rows["vel_ned_m_s"] = self.plant.vel_ned_m_s.T
+        rows["q_nb"] = self.plant.q_nb.T
+        rows["armed"] = [pilot.armed for pilot in self.autopilots]
+        rows["landed"] = [pilot.landed for pilot in self.autopilots]
+        rows["flight_mode"] = [pilot.flight_mode() for pilot in self.autopilots]
+        return rows
 
     def set_wind(self, wind_ned_m_s: Sequence[float]) -> None:
         """Set a steady wind (3,) NED [m/s] on every vehicle."""
