@@ -24,9 +24,7 @@ _PURPOSE = 1  # purpose of the random stream, beside run seed and vehicle
 _LOST_M_S2 = 0.05  # acceleration that a tilt error of 0.3 deg causes in an uncorrected position
 EXACT_ACCURACY_M = (0.01, 0.01)
 # Rows of what is known of a vehicle: the plant's state, NED velocity, roll, pitch, yaw, and the body's down axis.
-_QUAT, _RATE, _MOTION, _SAMPLE, _EULER, _DOWN = (
-    slice(*ends) for ends in ((4,), (4, 7), (10, 16), (16,), (16, 19), (19, 22))
-)
+_QUAT, _MOTION, _SAMPLE, _EULER, _DOWN = slice(4), slice(10, 16), slice(16), slice(16, 19), slice(19, 22)
 _KNOWN_ROWS = 22
 
 # Small turns: which component of a quaternion times which half angle, or its negative, to add; first, second, third.
