@@ -12,6 +12,7 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from sitl.arducopter.endpoint import Start, arducopter_links, arducopter_pilot
 from sitl.faults import Faults
 from sitl.net.lossy import LossyLink
 from sitl.net.signing import ARDUCOPTER_RULES, PX4_RULES, SigningLink, VehicleSigning
@@ -21,7 +22,7 @@ from sitl.plant.estimator import ESTIMATORS, Estimator
 from sitl.plant.imu import Imu
 from sitl.plant.physics import Physics, outfitted
 from sitl.plant.sensors import FULL, local_origin
-from sitl.plant.vehicle import Plant
+from sitl.plant.vehicle import Array, Plant
 from sitl.px4.autopilot import Autopilot
 from sitl.px4.link.endpoint import Endpoint
 from sitl.px4.link.schedule import GCS_HZ
@@ -115,8 +116,9 @@ class SitlWorld:
             self.endpoints.append(endpoint)
         self._metered = [pilot if isinstance(pilot, Metered) else None for pilot in self.autopilots]
         self._wrench = np.zeros((4, count))
-        self._live = np.zeros(count)
         self._powered = np.zeros(count, dtype=bool)
+        self._kept = np.zeros(count, dtype=bool)  # on the ground or clamped
+        self._clamped = set(range(count)) if airborne else set()
         self._flown = [IDLE] * count
         self._boot_us: int | None = None
         self._now_us = 0
@@ -143,7 +145,7 @@ class SitlWorld:
                 pilot.tick(estimate, since_boot_us, self._autopilot_every * self.plant.dt_s)
         self._steps += 1
         self._take_outputs()
-        self.physics.step(since_boot_us * 1e-6, self._wrench, self._live)
+        self.physics.step(since_boot_us * 1e-6, self._wrench, self._live())
         self._now_us = now_us
         for endpoint in self.endpoints:
             endpoint.send_due(since_boot_us)
@@ -216,7 +218,7 @@ class SitlWorld:
         self.physics.air.mean_ned_m_s = np.array(wind_ned_m_s, dtype=np.float64).reshape(3, 1)
 
     def _take_outputs(self) -> None:
-        """Pass changed setpoints to the attitude loops, open clamps, and note which vehicles fly."""
+        """Pass changed setpoints to the attitude loops, and open clamps."""
         thrust_max_n = self.plant.preset.thrust_max_n
         for i, pilot in enumerate(self.autopilots):
             output = pilot.output
@@ -226,10 +228,15 @@ class SitlWorld:
                 self.attitude.rates.set(i, output.rate_frd_rad_s, output.feed_frd_rad_s)
                 self._wrench[0, i] = 0.0 if output.stopped else output.thrust_01 * thrust_max_n
                 self._powered[i] = not (output.stopped or output.loose)
-            if pilot.released and self.plant.held[i]:
-                self.plant.held[i] = False
-        np.logical_and(self._powered, ~self.plant.contact, out=self._live, casting="unsafe")
-        self._live *= ~self.plant.held
+        for i in [i for i in self._clamped if self.autopilots[i].released]:
+            self._clamped.remove(i)
+            self.plant.held[i] = False
+
+    def _live(self) -> Array | None:
+        """Return 1.0 for vehicles in free flight and 0.0 for the others (N,); None when all are in free flight."""
+        np.logical_or(self.plant.contact, self.plant.held, out=self._kept)
+        live = np.greater(self._powered, self._kept)
+        return live.astype(np.float64) if False in live.tolist() else None
 
     def _signed(self, vehicle: int, signing: VehicleSigning) -> list[SigningLink]:
         """Return the links of a vehicle with its signatures."""
@@ -264,12 +271,6 @@ class SitlWorld:
         return pilot, endpoint
 
     def _arducopter(self, vehicle: int) -> tuple[Commander, MavlinkInterface]:
-        from sitl.arducopter.endpoint import (  # imports a second dialect module: 20 MB
-            Start,
-            arducopter_links,
-            arducopter_pilot,
-        )
-
         params = self.params
         start = Start(
             origin=self.origins[vehicle],
@@ -291,18 +292,24 @@ class SitlWorld:
         rotor_scale = 1.0 / plant.preset.rotor_force_max_n
         cached: list[Report] = []  # of the newest step, for the other link
 
+        def rotor_01() -> Sequence[float]:
+            shares_01: list[float] = (plant.rotor_force_n[:, vehicle] * rotor_scale).tolist()
+            return shares_01
+
+        def force_frd_m_s2() -> Sequence[float]:
+            return self.imu.of(vehicle)
+
         def report() -> Report:
             now_us = self._now_us - (self._boot_us or 0)
             if cached and cached[0].simulation_us == now_us:
                 return cached[0]
             estimate = pilot.boot.local(self.estimator.of(vehicle, now_us))
-            rotors = tuple((plant.rotor_force_n[:, vehicle] * rotor_scale).tolist())
             made = Report(
                 estimate=estimate,
                 autopilot=pilot,
                 origin=pilot.boot.origin or origin,
-                rotor_01=rotors,
-                force_frd_m_s2=self.imu.of(vehicle),
+                rotor_01=rotor_01,
+                force_frd_m_s2=force_frd_m_s2,
                 simulation_us=now_us,
             )
             cached[:] = [made]

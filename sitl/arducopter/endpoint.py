@@ -12,12 +12,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pymavlink.dialects.v20 import ardupilotmega as mav
+from pymavlink.dialects.v20 import development as mav
 
 from sitl.arducopter.autopilot import FORCE_ARM, FORCE_DISARM, ArduCopter
 from sitl.arducopter.navigator import CopterNavigator
 from sitl.arducopter.parameters import CopterParameters
 from sitl.arducopter.streams import ALL_GROUPS, STREAMS, CopterReport, Intervals
+from sitl.net.wire import KINDS, FrameWriter, Kind
 from sitl.plant.sensors import Estimate, LocalOrigin
 from sitl.plant.vehicle import Plant
 from sitl.px4.modes import Result, Severity
@@ -33,6 +34,10 @@ TIMESYNC_US = 10_000_000
 PARAMS_PER_S = 1700
 REBOOT_AFTER_US = 200_000  # the ack is sent first
 TEXT_CHARS = 50
+_ACK = KINDS[mav.MAVLINK_MSG_ID_COMMAND_ACK]
+_TEXT = KINDS[mav.MAVLINK_MSG_ID_STATUSTEXT]
+_TIMESYNC = KINDS[mav.MAVLINK_MSG_ID_TIMESYNC]
+_VALUE = KINDS[mav.MAVLINK_MSG_ID_PARAM_VALUE]
 Params = tuple[float, float, float, float, float, float, float]
 
 
@@ -66,6 +71,7 @@ class ArduCopterEndpoint:
         self._pilot = pilot
         self._report = report
         self._codec = Codec(sysid, COMPONENT)
+        self._writer = FrameWriter(sysid, COMPONENT)
         self._step_us = step_us
         self._waited_us = 0  # since the arrival of the current datagram
         self._texts = pilot.outbox()
@@ -146,7 +152,7 @@ class ArduCopterEndpoint:
             self._send_streams([mav.MAVLINK_MSG_ID_HOME_POSITION, mav.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN])
         if now_us >= self._timesync_us:
             self._timesync_us = now_us + TIMESYNC_US
-            self._send(mav.MAVLink_timesync_message(0, now_us * 1000))
+            self._send(_TIMESYNC, 0, now_us * 1000)
         due = self._intervals.take_due(now_us)
         if due:
             self._send_streams(due)
@@ -190,7 +196,7 @@ class ArduCopterEndpoint:
 
     def _on_timesync(self, message: Any) -> None:
         if message.tc1 == 0:
-            self._send(mav.MAVLink_timesync_message((self._now_us - self._waited_us) * 1000, message.ts1))
+            self._send(_TIMESYNC, (self._now_us - self._waited_us) * 1000, message.ts1)
 
     def _on_data_stream(self, m: Any) -> None:
         rate_hz = m.req_message_rate if m.start_stop else 0
@@ -218,7 +224,7 @@ class ArduCopterEndpoint:
         return Result.UNSUPPORTED if action is None else action(params)
 
     def _acknowledge(self, command: int, result: Result) -> None:
-        self._send(mav.MAVLink_command_ack_message(command, result, 0, 0, *self._sender))
+        self._send(_ACK, command, result, 0, 0, *self._sender)
 
     def _arm_disarm(self, params: Params) -> Result:
         if params[0] == 1.0:
@@ -295,19 +301,19 @@ class ArduCopterEndpoint:
 
     def _send_param(self, p: WireValue) -> None:
         count = len(self._pilot.parameters)
-        self._send(mav.MAVLink_param_value_message(p.name.encode(), p.value, p.kind, count, p.index))
+        self._send(_VALUE, p.value, count, p.index, p.name.encode(), p.kind)
 
     # --- sending ---
 
-    def _send(self, message: Any) -> None:
-        self.transport.send(self._codec.encode(message))
+    def _send(self, kind: Kind, *fields: Any) -> None:
+        self.transport.send(self._writer.frame(kind, fields))
 
     def _send_streams(self, messages: list[int]) -> None:
         report = self._report()
         for message in messages:
             stream = STREAMS[message]
             if self._pilot.has_origin or not stream.needs_position:
-                self._send(stream.build(report))
+                self.transport.send(self._writer.frame(KINDS[message], stream.build(report)))
 
     def _send_text(self, severity: Severity, text: str) -> None:
         """Queue a text on every link."""
@@ -315,7 +321,7 @@ class ArduCopterEndpoint:
         raw = text.encode("ascii", "replace")
         chunks = [raw[i : i + TEXT_CHARS] for i in range(0, len(raw), TEXT_CHARS)]
         for number, chunk in enumerate(chunks):
-            self._send(mav.MAVLink_statustext_message(severity, chunk, self._text_id if len(chunks) > 1 else 0, number))
+            self._send(_TEXT, severity, chunk, self._text_id if len(chunks) > 1 else 0, number)
 
 
 def _whole(value: float) -> int | None:
@@ -336,13 +342,16 @@ def arducopter_links(
     """Return the MAVLink interface of an autopilot on each of its links."""
     rotor_scale = 1.0 / plant.preset.rotor_force_max_n
 
+    def rotor_01() -> Sequence[float]:
+        shares_01: list[float] = (plant.rotor_force_n[:, vehicle] * rotor_scale).tolist()
+        return shares_01
+
     def report() -> CopterReport:
-        rotors = tuple((plant.rotor_force_n[:, vehicle] * rotor_scale).tolist())
         return CopterReport(
             estimate=pilot.clock.local(start.estimate()),
             pilot=pilot,
             origin=pilot.clock.origin or start.origin,
-            rotor_01=rotors,
+            rotor_01=rotor_01,
         )
 
     step_us = round(plant.dt_s * 1e6)

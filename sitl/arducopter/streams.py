@@ -1,22 +1,23 @@
 """Reports of an ArduCopter: a builder per message, the groups of REQUEST_DATA_STREAM, and the send times.
 
-Every builder takes the same `CopterReport` and returns a dialect message. Only HEARTBEAT and TIMESYNC are sent without
-a request (SR0_* = 0).
+Every builder takes the same `CopterReport` and returns fields in wire order. Only HEARTBEAT and TIMESYNC are sent
+without a request (SR0_* = 0).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from pymavlink.dialects.v20 import ardupilotmega as mav  # EKF_STATUS_REPORT is in no other dialect
+from pymavlink.dialects.v20 import development as mav
 
 from sitl.arducopter.autopilot import ArduCopter
 from sitl.plant.sensors import FULL, Estimate, LocalOrigin, Power
 
-_NAN = math.nan
+Fields = tuple[Any, ...]
+EKF_STATUS_REPORT = 193
 _PRESENT = 0x0361FC2F  # gyro, accel, mag, baro, GPS, all controllers, motors, RC, AHRS, logging, battery; no fence
 _NOT_WHILE_DISARMED = 0x8000  # motor outputs are not enabled then
 _AHRS, _GPS = 0x200000, 0x20
@@ -28,7 +29,8 @@ _NO_FIX, _FIX_RTK = 1, 6
 _PWM_OFF, _PWM_SPAN, _SPIN_ARMED = 1000, 1000, 0.1
 _CAPABILITIES = 64495
 _VERSION = 0x040603FF
-_GIT_HASH = [*b"92b0cd78"]
+_LEVEL, _NO_OFFSET, _NO_SERVOS = (1.0, 0.0, 0.0, 0.0), (0.0,) * 4, (0,) * 8
+_GIT_HASH = (*b"92b0cd78",)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,53 +40,53 @@ class CopterReport:
     estimate: Estimate
     pilot: ArduCopter
     origin: LocalOrigin
-    rotor_01: tuple[float, float, float, float]
+    rotor_01: Callable[[], Sequence[float]]  # (4,) forces; called only for messages with them
 
 
-def heartbeat(r: CopterReport) -> Any:
+def heartbeat(r: CopterReport) -> Fields:
     pilot = r.pilot
-    return mav.MAVLink_heartbeat_message(2, 3, pilot.base_mode(), pilot.mode, pilot.system_status(), 3)
+    return pilot.mode, 2, 3, pilot.base_mode(), pilot.system_status(), 3
 
 
-def sys_status(r: CopterReport) -> Any:
+def sys_status(r: CopterReport) -> Fields:
     present = _PRESENT | _PREARM_CHECK
     enabled = present if r.pilot.armed else present & ~_NOT_WHILE_DISARMED
     passed = r.pilot.prearm_passed(r.estimate.t_us)
     health = _PRESENT & ~(0 if r.pilot.has_origin else _AHRS) & ~(0 if r.estimate.gps_ok else _GPS)
     health |= _PREARM_CHECK if passed else 0
     charge, volts, amperes = _power(r)
-    power = round(1e3 * volts), round(1e2 * amperes), round(1e2 * charge)
-    return mav.MAVLink_sys_status_message(present, enabled, health, 100, *power, 0, 0, 0, 0, 0, 0)
+    sensors = present, enabled, health
+    return *sensors, 100, round(1e3 * volts), round(1e2 * amperes), *(0,) * 6, round(1e2 * charge), 0, 0, 0
 
 
 def _power(r: CopterReport) -> Power:
     return _CHARGED if r.estimate.battery is FULL else r.estimate.battery
 
 
-def system_time(r: CopterReport) -> Any:
-    return mav.MAVLink_system_time_message(0, r.estimate.t_us // 1000)
+def system_time(r: CopterReport) -> Fields:
+    return 0, r.estimate.t_us // 1000
 
 
-def attitude(r: CopterReport) -> Any:
+def attitude(r: CopterReport) -> Fields:
     e = r.estimate
-    return mav.MAVLink_attitude_message(e.t_us // 1000, *e.euler_rad, *e.rate_frd_rad_s)
+    return e.t_us // 1000, *e.euler_rad, *e.rate_frd_rad_s
 
 
-def attitude_quaternion(r: CopterReport) -> Any:
+def attitude_quaternion(r: CopterReport) -> Fields:
     e = r.estimate
-    return mav.MAVLink_attitude_quaternion_message(e.t_us // 1000, *e.q_nb, *e.rate_frd_rad_s)
+    return e.t_us // 1000, *e.q_nb, *e.rate_frd_rad_s, *_NO_OFFSET
 
 
-def local_position(r: CopterReport) -> Any:
+def local_position(r: CopterReport) -> Fields:
     e = r.estimate
-    return mav.MAVLink_local_position_ned_message(e.t_us // 1000, *e.pos_ned_m, *e.vel_ned_m_s)
+    return e.t_us // 1000, *e.pos_ned_m, *e.vel_ned_m_s
 
 
-def global_position(r: CopterReport) -> Any:
+def global_position(r: CopterReport) -> Fields:
     e, origin = r.estimate, r.origin
     x_m, y_m, z_m = e.pos_ned_m
     home_z_m = r.pilot.home_ned_m[2] if r.pilot.home_ned_m else 0.0
-    return mav.MAVLink_global_position_int_message(
+    return (
         e.t_us // 1000,
         *origin.to_geo_e7(x_m, y_m),
         origin.alt_mm - round(z_m * 1e3),
@@ -94,84 +96,69 @@ def global_position(r: CopterReport) -> Any:
     )
 
 
-def gps_raw(r: CopterReport) -> Any:
+def gps_raw(r: CopterReport) -> Fields:
     e, origin = r.estimate, r.origin
     alt_mm = origin.alt_mm - round(e.pos_ned_m[2] * 1e3)
     speed_cm_s = min(65534, round(100 * math.hypot(*e.vel_ned_m_s[:2])))
     course_cdeg = round(math.degrees(math.atan2(e.vel_ned_m_s[1], e.vel_ned_m_s[0])) % 360.0 * 100) % 36000
     horizontal_mm, vertical_mm = (round(1e3 * m) for m in e.pos_accuracy_m)
-    return mav.MAVLink_gps_raw_int_message(
-        e.t_us,
-        _FIX_RTK if e.gps_ok else _NO_FIX,
-        *origin.to_geo_e7(e.pos_ned_m[0], e.pos_ned_m[1]),
-        alt_mm,
-        121,
-        200,
-        speed_cm_s,
-        course_cdeg,
-        10,
-        alt_mm,
-        horizontal_mm,
-        vertical_mm,
-        40,
-    )
+    fix = _FIX_RTK if e.gps_ok else _NO_FIX
+    place = *origin.to_geo_e7(e.pos_ned_m[0], e.pos_ned_m[1]), alt_mm
+    accuracy = horizontal_mm, vertical_mm, 40, 0
+    return e.t_us, *place, 121, 200, speed_cm_s, course_cdeg, fix, 10, alt_mm, *accuracy, 0
 
 
-def gps_global_origin(r: CopterReport) -> Any:
-    return mav.MAVLink_gps_global_origin_message(r.origin.lat_e7, r.origin.lon_e7, r.origin.alt_mm, r.estimate.t_us)
+def gps_global_origin(r: CopterReport) -> Fields:
+    return r.origin.lat_e7, r.origin.lon_e7, r.origin.alt_mm, r.estimate.t_us
 
 
-def home_position(r: CopterReport) -> Any:
+def home_position(r: CopterReport) -> Fields:
     x_m, y_m, z_m = r.pilot.home_ned_m or (0.0, 0.0, 0.0)
     alt_mm = r.origin.alt_mm - round(z_m * 1e3)
     lat_e7, lon_e7 = r.origin.to_geo_e7(x_m, y_m)
-    level = [1.0, 0.0, 0.0, 0.0]
-    return mav.MAVLink_home_position_message(lat_e7, lon_e7, alt_mm, x_m, y_m, z_m, level, 0, 0, 0, r.estimate.t_us)
+    return lat_e7, lon_e7, alt_mm, x_m, y_m, z_m, *_LEVEL, 0.0, 0.0, 0.0, r.estimate.t_us
 
 
-def vfr_hud(r: CopterReport) -> Any:
+def vfr_hud(r: CopterReport) -> Fields:
     e = r.estimate
     ground_m_s = math.hypot(*e.vel_ned_m_s[:2])
     heading_deg = int(math.degrees(e.yaw_rad) % 360.0)
     throttle = round(100 * r.pilot.output.thrust_01)
     amsl_m = r.origin.alt_mm / 1e3 - e.pos_ned_m[2]
-    return mav.MAVLink_vfr_hud_message(ground_m_s, ground_m_s, heading_deg, throttle, amsl_m, -e.vel_ned_m_s[2])
+    return ground_m_s, ground_m_s, amsl_m, -e.vel_ned_m_s[2], heading_deg, throttle
 
 
-def attitude_target(r: CopterReport) -> Any:
-    q_nb = [float(c) for c in r.pilot.target_q_nb]
-    t_ms = r.estimate.t_us // 1000
-    return mav.MAVLink_attitude_target_message(t_ms, 0, q_nb, 0.0, 0.0, 0.0, r.pilot.throttle_in_01)
+def attitude_target(r: CopterReport) -> Fields:
+    return r.estimate.t_us // 1000, *r.pilot.target_q_nb.tolist(), 0.0, 0.0, 0.0, r.pilot.throttle_in_01, 0
 
 
-def servo_output(r: CopterReport) -> Any:
+def servo_output(r: CopterReport) -> Fields:
     least = _SPIN_ARMED if r.pilot.armed else 0.0
-    pwm = [_PWM_OFF + round(_PWM_SPAN * max(least, f)) for f in r.rotor_01]
-    return mav.MAVLink_servo_output_raw_message(r.estimate.t_us & 0xFFFFFFFF, 0, *pwm, 0, 0, 0, 0)
+    pwm = [_PWM_OFF + round(_PWM_SPAN * max(least, f)) for f in r.rotor_01()]
+    return r.estimate.t_us & 0xFFFFFFFF, *pwm, 0, 0, 0, 0, 0, *_NO_SERVOS
 
 
-def extended_sys_state(r: CopterReport) -> Any:
-    return mav.MAVLink_extended_sys_state_message(0, r.pilot.landed)
+def extended_sys_state(r: CopterReport) -> Fields:
+    return 0, r.pilot.landed
 
 
-def battery_status(r: CopterReport) -> Any:
+def battery_status(r: CopterReport) -> Fields:
     charge, volts, amperes = _power(r)
-    cells = [round(1e3 * volts)] + [65535] * 9
-    return mav.MAVLink_battery_status_message(0, 0, 0, 32767, cells, round(1e2 * amperes), -1, -1, round(1e2 * charge))
+    cells = round(1e3 * volts), *(65535,) * 9
+    return -1, -1, 32767, *cells, round(1e2 * amperes), 0, 0, 0, round(1e2 * charge), 0, 0, *(0,) * 4, 0, 0
 
 
-def ekf_status(r: CopterReport) -> Any:
+def ekf_status(r: CopterReport) -> Fields:
     """Build EKF_STATUS_REPORT; its "variances" are test ratios of innovations, not metres."""
     if not r.pilot.has_origin:
-        return mav.MAVLink_ekf_status_report_message(_EKF_NO_POSITION, 0, 0, 0, 0, 0)
+        return 0.0, 0.0, 0.0, 0.0, 0.0, _EKF_NO_POSITION
     horizontal_m, vertical_m = r.estimate.pos_accuracy_m
     ratios = min(1.0, horizontal_m / _GATE_M), min(1.0, vertical_m / _GATE_M)
-    return mav.MAVLink_ekf_status_report_message(_EKF_HEALTHY, 0.02, *ratios, 0.02, 0)
+    return 0.02, *ratios, 0.02, 0.0, _EKF_HEALTHY
 
 
-def autopilot_version(r: CopterReport) -> Any:
-    none = [0] * 8
-    return mav.MAVLink_autopilot_version_message(_CAPABILITIES, _VERSION, 0, 0, 0, _GIT_HASH, none, none, 0, 0, 0)
+def autopilot_version(r: CopterReport) -> Fields:
+    return _CAPABILITIES, 0, _VERSION, 0, 0, 0, 0, 0, *_GIT_HASH, *(0,) * (8 + 8 + 18)
 
 
 EXTENDED_STATUS, RC_CHANNELS, POSITION, EXTRA1, EXTRA2, EXTRA3 = 2, 3, 6, 10, 11, 12  # MAV_DATA_STREAM
@@ -182,7 +169,7 @@ ALL_GROUPS = 0
 class CopterStream:
     """One message that this vehicle can send."""
 
-    build: Callable[[CopterReport], Any]
+    build: Callable[[CopterReport], Fields]
     group: int | None = None  # group of REQUEST_DATA_STREAM; None: by SET_MESSAGE_INTERVAL or REQUEST_MESSAGE only
     needs_position: bool = False  # only after the EKF has its origin
 
@@ -202,7 +189,7 @@ STREAMS: dict[int, CopterStream] = {
     mav.MAVLINK_MSG_ID_ATTITUDE_TARGET: CopterStream(attitude_target),
     mav.MAVLINK_MSG_ID_BATTERY_STATUS: CopterStream(battery_status, EXTRA3),
     mav.MAVLINK_MSG_ID_AUTOPILOT_VERSION: CopterStream(autopilot_version),
-    mav.MAVLINK_MSG_ID_EKF_STATUS_REPORT: CopterStream(ekf_status, EXTRA3),
+    EKF_STATUS_REPORT: CopterStream(ekf_status, EXTRA3),
     mav.MAVLINK_MSG_ID_HOME_POSITION: CopterStream(home_position, None, True),
     mav.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: CopterStream(extended_sys_state),
 }

@@ -170,10 +170,12 @@ class SigningLink:
         self._codec = Codec(sysid, _AUTOPILOT)
 
     def send(self, data: bytes) -> None:
-        self._inner.send(self._signing.signed(data, self._link_id))
+        self._inner.send(data if self._signing.key is None else self._signing.signed(data, self._link_id))
 
     def receive(self, now_us: int) -> list[Datagram]:
         arrived = self._inner.receive(now_us)
+        if not arrived:
+            return arrived
         return [
             Datagram(datagram.t_us, self._taken(datagram.data)) if self._concerns(datagram.data) else datagram
             for datagram in arrived

@@ -19,6 +19,7 @@ from sitl.px4.rates import RateLoop
 from swarmctl.core.frames import euler_from_quat
 
 _TURN_RAD = 2.0 * math.pi
+_LEFT, _RIGHT = np.repeat(np.arange(4), 4), np.tile(np.arange(4), 4)  # factors of all products of two quaternions
 
 
 class Sensed(Protocol):
@@ -45,8 +46,11 @@ class AttitudeLoop(Protocol):
     def set_reference(self, vehicle: int, q_nb: Array) -> None:
         """Set the setpoint (4,) wxyz of one vehicle; it acts from the next step."""
 
-    def torque(self, sensed: Sensed, live: Array, out: Array) -> None:
-        """Write torques (3, N) [N m] to `out`; `live` (N,) is 1.0 in free flight and 0.0 for idle vehicles."""
+    def torque(self, sensed: Sensed, live: Array | None, out: Array) -> None:
+        """Write torques (3, N) [N m] to `out`.
+
+        `live` (N,) is 1.0 in free flight and 0.0 for idle vehicles; None: all are in free flight.
+        """
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -100,16 +104,20 @@ class ThesisAttitude:
     def set_reference(self, vehicle: int, q_nb: Array) -> None:
         self._reference_rad[:, vehicle] = euler_from_quat(q_nb)
 
-    def torque(self, sensed: Sensed, live: Array, out: Array) -> None:
+    def torque(self, sensed: Sensed, live: Array | None, out: Array) -> None:
         error, term = self._error, self._term
         np.subtract(self._reference_rad, sensed.euler_rad, out=error)
         np.multiply(error, 1.0 / _TURN_RAD, out=term)
         np.rint(term, out=term)
         term *= _TURN_RAD
         error -= term  # wrapped to the nearest turn
-        error *= live
+        watched = np.remainder(-sensed.euler_rad, _TURN_RAD) if self._on_measurement else error
+        if live is not None:
+            error *= live
+            self._integral *= live
+            if self._on_measurement:
+                watched *= live
         past = self._past[self._head]
-        watched = np.remainder(-sensed.euler_rad, _TURN_RAD) * live if self._on_measurement else error
         np.subtract(watched, past, out=term)
         if self._on_measurement:
             term -= np.rint(term / _TURN_RAD) * _TURN_RAD  # wrapped to the nearest turn
@@ -118,13 +126,13 @@ class ThesisAttitude:
         np.multiply(term, self._kd, out=out)
         np.multiply(error, self._ki, out=term)
         self._integral += term
-        self._integral *= live
         out += self._integral
         np.multiply(error, self._kp, out=term)
         out += term
         if self.rates.feeding:
             out += self._rate_gain * self.rates.feed_rad_s
-        out *= live
+        if live is not None:
+            out *= live
         self.rates.overrule(sensed.rate_frd_rad_s, live, out)
 
 
@@ -176,6 +184,7 @@ class CascadeAttitude:
         inertia = np.array(preset.inertia_kg_m2).reshape(3, 1)
         self._attitude = 2.0 * np.array(gains.attitude_1_s).reshape(3, 1)
         self._limit = np.array(gains.rate_limit_rad_s).reshape(3, 1)
+        self._least = -self._limit
         self._kp = inertia * np.array(gains.rate_1_s).reshape(3, 1)
         self._ki = inertia * np.array(gains.rate_integral_1_s2).reshape(3, 1) * dt_s
         self.rates = RateLoop(self._kp, vehicles, dt_s)
@@ -196,7 +205,7 @@ class CascadeAttitude:
         ):
             for left, right, sign in terms:
                 self._error_rows[row, 4 * left + right] = sign
-        self._products = np.zeros((4, 4, vehicles))
+        self._measured, self._products = np.zeros((2, 16, vehicles))
         self._error = np.zeros((4, vehicles))
         self._integral = np.zeros((3, vehicles))
         self._last_rate = np.zeros((3, vehicles))
@@ -205,29 +214,33 @@ class CascadeAttitude:
     def set_reference(self, vehicle: int, q_nb: Array) -> None:
         self._reference[:, vehicle] = q_nb
 
-    def torque(self, sensed: Sensed, live: Array, out: Array) -> None:
+    def torque(self, sensed: Sensed, live: Array | None, out: Array) -> None:
         self._line[self._head] = self._reference
         self._head = (self._head + 1) % len(self._line)
-        np.multiply(sensed.q_nb[:, None], self._line[self._head][None], out=self._products)
-        np.matmul(self._error_rows, self._products.reshape(16, -1), out=self._error)
+        sensed.q_nb.take(_LEFT, 0, self._measured, "clip")
+        self._line[self._head].take(_RIGHT, 0, self._products, "clip")
+        np.multiply(self._measured, self._products, out=self._products)
+        np.matmul(self._error_rows, self._products, out=self._error)
         rate_error, term, rate = self._error[:3], self._term, sensed.rate_frd_rad_s
         rate_error *= np.sign(self._error[3])
         rate_error *= self._attitude
         np.minimum(rate_error, self._limit, out=rate_error)
-        np.maximum(rate_error, -self._limit, out=rate_error)
+        np.maximum(rate_error, self._least, out=rate_error)
         if self.rates.feeding:
             rate_error += self.rates.feed_rad_s
         rate_error -= rate
         np.multiply(rate_error, self._ki, out=term)
         self._integral += term
-        self._integral *= live
+        if live is not None:
+            self._integral *= live
         np.multiply(rate_error, self._kp, out=out)
         out += self._integral
         np.subtract(self._last_rate, rate, out=term)
         self._last_rate[...] = rate
         term *= self._kd
         out += term
-        out *= live
+        if live is not None:
+            out *= live
         self.rates.overrule(rate, live, out)
 
 

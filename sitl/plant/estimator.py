@@ -8,10 +8,11 @@ reported, as on a real autopilot.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sitl.plant.attitude import Sensed
 from sitl.plant.sensors import FULL, Estimate, Power
@@ -22,6 +23,28 @@ _DRAWS = 17  # per step and vehicle: wander of position 3, velocity 3, tilt 2; w
 _PURPOSE = 1  # purpose of the random stream, beside run seed and vehicle
 _LOST_M_S2 = 0.05  # acceleration that a tilt error of 0.3 deg causes in an uncorrected position
 EXACT_ACCURACY_M = (0.01, 0.01)
+# Rows of what is known of a vehicle: the plant's state, NED velocity, roll, pitch, yaw, and the body's down axis.
+_QUAT, _MOTION, _SAMPLE, _EULER, _DOWN = slice(4), slice(10, 16), slice(16), slice(16, 19), slice(19, 22)
+_KNOWN_ROWS = 22
+
+# Small turns: which component of a quaternion times which half angle, or its negative, to add; first, second, third.
+_TURNED = np.array([1, 0, 0, 0, 2, 2, 3, 1, 3, 3, 1, 2])
+_TURN = np.array([3, 0, 1, 2, 4, 2, 0, 1, 5, 4, 5, 3])
+# Rotation matrix: products ww, xx, yy, zz, xz, wy, yz, wx, xy, wz, and sums of them: the down axis, the sine of pitch,
+# and what the arctangents of roll and yaw take.
+_LEFT, _RIGHT = np.array([0, 1, 2, 3, 1, 0, 2, 0, 1, 0]), np.array([0, 1, 2, 3, 3, 2, 3, 1, 2, 3])
+_SUMS = np.array(
+    [
+        [0.0, 0, 0, 0, 2, 2, 0, 0, 0, 0],
+        [0, 0, 0, 0, 0, 0, 2, -2, 0, 0],
+        [1, -1, -1, 1, 0, 0, 0, 0, 0, 0],
+        [0, 0, 0, 0, -2, 2, 0, 0, 0, 0],
+        [0, 0, 0, 0, 0, 0, 2, 2, 0, 0],
+        [0, 0, 0, 0, 0, 0, 0, 0, 2, 2],
+        [1, -1, -1, 1, 0, 0, 0, 0, 0, 0],
+        [1, 1, -1, -1, 0, 0, 0, 0, 0, 0],
+    ]
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -113,9 +136,10 @@ class Estimator:
         self._jump_ned_m = np.zeros((3, count))
         self._lost_s = np.zeros(count)  # since GPS was lost; 0: GPS is available
         self._lost = np.zeros(count)
+        self._displaced = False  # by any fault, ever
         self._drift_axis = np.zeros((3, count))
         self._frozen: dict[int, Estimate] = {}
-        self._rows: list[Any] = []  # (19,) per vehicle: see `_believed`
+        self._rows: list[Any] = []  # (22,) per vehicle
         self._on_ground: list[bool] = []
         if model is not None:
             self._start(model, plant, seed)
@@ -126,6 +150,7 @@ class Estimator:
         taus_s = np.repeat([model.position_tau_s, model.velocity_tau_s, model.tilt_tau_s], (3, 3, 2))
         rms = np.array([*model.position_m, *model.velocity_m_s, model.tilt_rad, model.tilt_rad])
         self._keep = np.exp(-2.0 * dt_s / taus_s)[:, None]  # of each low-pass, with half the correlation time
+        self._follow = 1.0 - self._keep
         rough_rms = math.sqrt(2.0) * rms  # of the first stage: the second halves its variance
         self._drive = (rough_rms * np.sqrt(1.0 - np.exp(-4.0 * dt_s / taus_s)))[:, None]
         self._white_rms = np.repeat(
@@ -135,58 +160,76 @@ class Estimator:
         self._wander = first[0] * rms[:, None]
         self._rough = self._wander + first[1] * rms[:, None]  # stationary variance and correlation of the two
         low_s, high_s = model.latency_s
-        lags = [round(rng.uniform(low_s, high_s) / dt_s) for rng in self._rngs]
-        self._lag_steps = np.array(lags)
-        self._history = np.repeat(self._sample()[None], max(lags) + 1, axis=0)  # (steps, 13, N), ring
-        self._head = 0
-        self._columns = np.arange(count)
-        self._block = np.zeros((0, _DRAWS, count))
+        self._start_history(np.array([round(rng.uniform(low_s, high_s) / dt_s) for rng in self._rngs]))
+        self._driven = np.zeros((0, 8, count))  # of each step of a block: what drives the wander, white noise
+        self._noise = np.zeros((0, 9, count))
         self._drawn = 0
         self._white = np.zeros((9, count))
+        self._lead = np.zeros((8, count))  # of the first stage over the second
+        self._tilt_rad = np.zeros((3, count))
+        self._believed = np.zeros((_KNOWN_ROWS, count))
         self._tilt_quat()
+
+    def _start_history(self, lag_steps: NDArray[np.int64]) -> None:
+        """Fill the ring of the newest samples, (steps, 16, N); `_delayed` finds in it what each vehicle has by now."""
+        length, count = int(lag_steps.max()) + 1, len(lag_steps)
+        self._history = np.zeros((length, 16, count))
+        for self._head in range(length):
+            self._sample()
+        rows = (np.arange(length)[:, None] - lag_steps) % length  # (head, N)
+        places = np.arange(16 * count).reshape(16, count)
+        self._delayed = [row * 16 * count + places for row in rows]  # for each head (16, N), in the flat ring
 
     def advance(self) -> None:
         """Update the estimates after a physics step."""
         self._stale = True
         if self._model is None:
             return
-        if self._drawn == len(self._block):
-            self._block = np.stack([rng.standard_normal((_BLOCK, _DRAWS)) for rng in self._rngs], axis=2)
-            self._drawn = 0
-        draws = self._block[self._drawn]
-        self._drawn += 1
-        self._lost_s += self._lost * self._plant.dt_s
+        if self._drawn == len(self._noise):
+            self._draw()
+        self._white = self._noise[self._drawn]
         self._rough *= self._keep
-        self._rough += self._drive * draws[:8]
-        self._wander += (1.0 - self._keep) * (self._rough - self._wander)
-        np.multiply(draws[8:], self._white_rms, out=self._white)
+        self._rough += self._driven[self._drawn]
+        np.subtract(self._rough, self._wander, out=self._lead)
+        self._lead *= self._follow
+        self._wander += self._lead
+        self._drawn += 1
+        if self._displaced:
+            self._lost_s += self._lost * self._plant.dt_s
         self._head = (self._head + 1) % len(self._history)
-        self._history[self._head] = self._sample()
+        self._sample()
         self._tilt_quat()
+
+    def _draw(self) -> None:
+        """Draw the random numbers of a block of steps."""
+        draws = np.stack([rng.standard_normal((_BLOCK, _DRAWS)) for rng in self._rngs], axis=2)
+        self._driven, self._noise = self._drive * draws[:, :8], draws[:, 8:] * self._white_rms
+        self._drawn = 0
 
     def of(self, vehicle: int, t_us: int) -> Estimate:
         """Return the estimate of a vehicle; its stamp is `t_us` since boot."""
         frozen = self._frozen.get(vehicle)
         if frozen is not None:
-            return replace(frozen, t_us=t_us, on_ground=bool(self._plant.contact[vehicle]), battery=self.power[vehicle])
+            return frozen._replace(t_us=t_us, on_ground=bool(self._plant.contact[vehicle]), battery=self.power[vehicle])
         if self._stale:
             self._publish()
         row = self._rows[vehicle]
-        lost_s = float(self._lost_s[vehicle])
-        accuracy_m = self._accuracy_m
-        if lost_s:
+        accuracy_m, gps_ok = self._accuracy_m, True
+        if self._displaced:
+            lost_s = float(self._lost_s[vehicle])
             accuracy_m = math.hypot(accuracy_m[0], 0.5 * _LOST_M_S2 * lost_s * lost_s), accuracy_m[1]
+            gps_ok = not self._lost[vehicle]
         return Estimate(
             t_us=t_us,
-            pos_ned_m=row[0:3],
-            vel_ned_m_s=row[3:6],
-            q_nb=row[9:13],
-            euler_rad=row[13:16],
-            rate_frd_rad_s=row[6:9],
-            down_axis_ned=row[16:19],
+            pos_ned_m=row[10:13],
+            vel_ned_m_s=row[13:16],
+            q_nb=row[:4],
+            euler_rad=row[16:19],
+            rate_frd_rad_s=row[4:7],
+            down_axis_ned=row[19:],
             on_ground=self._on_ground[vehicle],
             pos_accuracy_m=accuracy_m,
-            gps_ok=not self._lost[vehicle],
+            gps_ok=gps_ok,
             battery=self.power[vehicle],
         )
 
@@ -223,61 +266,76 @@ class Estimator:
         self._lost[vehicle] = self._lost_s[vehicle] = 0.0
 
     def _wake(self) -> None:
+        self._displaced = True
         if self._model is None:
             self._model = _PERFECT
             self._start(_PERFECT, self._plant, self._seed)
 
-    def _sample(self) -> Array:
-        """Return position, NED velocity, rates and attitude of this instant, (13, N)."""
-        plant = self._plant
-        return np.concatenate([plant.pos_ned_m, plant.vel_ned_m_s, plant.rate_frd_rad_s, plant.q_nb])
+    # --- what the error models make of the truth ---
+
+    @property
+    def euler_rad(self) -> Array:
+        euler_rad: Array = _euler_and_down(self.q_nb)[0]
+        return euler_rad
+
+    @property
+    def rate_frd_rad_s(self) -> Array:
+        return self._plant.rate_frd_rad_s
+
+    def _sample(self) -> None:
+        """Note state and NED velocity of this instant."""
+        sample = self._history[self._head]
+        sample[:13], sample[13:] = self._plant.state, self._plant.vel_ned_m_s
 
     def _tilt_quat(self) -> None:
-        """Return the attitude that the attitude loop uses."""
-        self.q_nb = _turned(self._plant.q_nb, self._wander[6], self._wander[7], 0.0)
-        self.euler_rad, _ = _euler_and_down(self.q_nb)
-        self.rate_frd_rad_s = self._plant.rate_frd_rad_s
+        """Update the attitude that the attitude loop uses."""
+        self._tilt_rad[:2] = self._wander[6:]
+        self.q_nb = _turned(self._plant.q_nb, self._tilt_rad)
 
     def _publish(self) -> None:
         """Convert the numbers of all vehicles at once: one conversion per step instead of six per message."""
         self._stale = False
-        self._on_ground = self._plant.contact.tolist()
+        plant = self._plant
+        self._on_ground = plant.contact.tolist()
         if self._model is None:
-            plant = self._plant
-            believed = np.concatenate([self._sample(), plant.euler_rad, plant.rotation[2::3]])
+            known = plant.state, plant.vel_ned_m_s, plant.euler_rad, plant.rotation[2::3]
+            self._rows = list(zip(*(row for rows in known for row in rows.tolist()), strict=True))
         else:
-            believed = self._believed()
-        self._rows = list(zip(*believed.tolist(), strict=True))
+            self._believe()
+            self._rows = list(zip(*self._believed.tolist(), strict=True))
 
-    def _believed(self) -> Array:
-        """Return position, velocity, rates, attitude, Euler angles and down axis (19, N), delayed per vehicle."""
-        rows = (self._head - self._lag_steps) % len(self._history)
-        seen = self._history[rows, :, self._columns].T  # (13, N), each vehicle's own age
-        reported = seen[:9].copy()
-        reported[:6] += self._wander[:6] + self._white[:6]
-        reported[:3] += self._jump_ned_m + self._drift_axis * (0.5 * _LOST_M_S2 * self._lost_s**2)
-        reported[3:6] += self._drift_axis * (_LOST_M_S2 * self._lost_s)
-        noise = self._white[6:]
-        q_nb = _turned(seen[9:], self._wander[6] + noise[0], self._wander[7] + noise[1], noise[2])
-        return np.concatenate([reported, q_nb, *_euler_and_down(q_nb)])
+    def _believe(self) -> None:
+        """Fill `_believed` with what each vehicle knows, delayed and wrong."""
+        believed = self._believed
+        self._history.take(self._delayed[self._head], out=believed[_SAMPLE], mode="clip")
+        believed[_MOTION] += self._wander[:6] + self._white[:6]
+        if self._displaced:
+            believed[10:13] += self._jump_ned_m + self._drift_axis * (0.5 * _LOST_M_S2 * self._lost_s**2)
+            believed[13:16] += self._drift_axis * (_LOST_M_S2 * self._lost_s)
+        believed[_QUAT] = _turned(believed[_QUAT], self._tilt_rad + self._white[6:])
+        believed[_EULER], believed[_DOWN] = _euler_and_down(believed[_QUAT])
 
 
-def _turned(q_nb: Array, roll_rad: Array, pitch_rad: Array, yaw_rad: Array | float) -> Array:
-    """Return attitudes (4, N) with small errors about the body axes; unit length."""
-    w, x, y, z = q_nb
-    a, b, c = 0.5 * roll_rad, 0.5 * pitch_rad, 0.5 * yaw_rad
-    turned = np.stack(
-        [w - x * a - y * b - z * c, x + w * a + y * c - z * b, y + w * b + z * a - x * c, z + w * c + x * b - y * a]
-    )
-    unit: Array = turned / np.sqrt(np.sum(turned * turned, axis=0))
-    return unit
+def _turned(q_nb: Array, turn_rad: Array) -> Array:
+    """Return attitudes (4, N) with small errors (3, N) about the body axes; unit length."""
+    angles = np.empty((6, q_nb.shape[1]))
+    np.multiply(turn_rad, 0.5, out=angles[:3])
+    np.negative(angles[:3], out=angles[3:])
+    terms = q_nb.take(_TURNED, 0)
+    terms *= angles.take(_TURN, 0)
+    turned: Array = q_nb + terms[:4]
+    turned += terms[4:8]
+    turned += terms[8:]
+    turned /= np.sqrt(np.add.reduce(turned * turned))
+    return turned
 
 
 def _euler_and_down(q_nb: Array) -> tuple[Array, Array]:
     """Return roll, pitch, yaw (3, N) and the body's down axis in NED (3, N)."""
-    w, x, y, z = q_nb
-    down = np.stack([2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z])
-    roll = np.arctan2(2 * (y * z + w * x), down[2])
-    pitch = np.arcsin(np.clip(2 * (w * y - x * z), -1.0, 1.0))
-    yaw = np.arctan2(2 * (x * y + w * z), w * w + x * x - y * y - z * z)
-    return np.stack([roll, pitch, yaw]), down
+    products = q_nb.take(_LEFT, 0)
+    products *= q_nb.take(_RIGHT, 0)
+    sums = np.matmul(_SUMS, products)
+    euler_rad = np.empty_like(q_nb[:3])
+    np.arctan2(sums[4:6], sums[6:], out=euler_rad[::2])
+    np.arcsin(np.minimum(np.maximum(sums[3], -1.0), 1.0), out=euler_rad[1])
+    return euler_rad, sums[:3]

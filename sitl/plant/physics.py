@@ -45,10 +45,10 @@ class Physics:
         self._steps = 0
         self._windy = False
 
-    def step(self, t_s: float, wrench: Array, live: Array) -> None:
+    def step(self, t_s: float, wrench: Array, live: Array | None) -> None:
         """Advance to `t_s` since boot under collective thrusts `wrench[0]`; the rest of it (4, N) is filled in here.
 
-        `live` (N,) is 1.0 for vehicles in free flight.
+        `live` is that of `AttitudeLoop.torque`.
         """
         if self._steps % self._slow_every == 0:
             self._weather(t_s)

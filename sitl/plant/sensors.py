@@ -69,8 +69,7 @@ class Power(NamedTuple):
 FULL = Power(1.0, 16.2, -1.0)  # as PX4's SIH reports its simulated pack
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Estimate:
+class Estimate(NamedTuple):
     """State of one vehicle as its autopilot estimates it, local NED."""
 
     t_us: int  # since boot

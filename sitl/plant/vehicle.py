@@ -11,11 +11,13 @@ Arrays are (rows, N), one column a vehicle. This module knows no controller, no 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sitl.plant.airframes import Preset
+from sitl.plant.mixer import YAW_SIGN, Mixer
 from swarmctl.core.frames import GRAVITY_M_S2
 
 Array = NDArray[np.float64]
@@ -28,7 +30,10 @@ GROUND_FRICTION = 0.8  # share of the weight; a vehicle that touches down at 1 m
 # Rows of the polynomial's argument: constant, rotor speed sum, quaternion, body rates, body velocity.
 _ARGUMENTS = ("1", "wr", "qw", "qx", "qy", "qz", "p", "q", "r", "u", "v", "w")
 _QUAT, _RATE, _VEL, _POS = slice(0, 4), slice(4, 7), slice(7, 10), slice(10, 13)
-_YAW_SIGN = np.array([-1.0, 1.0, -1.0, 1.0])
+_SPIN_SIGN = -YAW_SIGN
+# Left factors of all products of two arguments, then right ones: (288,), and those of quaternions alone (32,).
+_FACTORS = np.concatenate([np.repeat(np.arange(12), 12), np.tile(np.arange(12), 12)])
+_QUAT_FACTORS = np.concatenate([np.repeat(np.arange(4), 4), np.tile(np.arange(4), 4)])
 
 # Body->NED rotation matrix, row-major, as quadratic forms of the quaternion.
 _ROTATION: tuple[tuple[tuple[str, str, float], ...], ...] = (
@@ -80,56 +85,25 @@ def _attitude_rows() -> Array:
     return table.reshape(13, 16)
 
 
-class Mixer:
-    """Maps wrench to rotor forces and back: the A matrix of thesis (1.13)-(1.16), plus configuration.
+class _Stage(NamedTuple):
+    """Buffers of one evaluation of the right-hand side."""
 
-    Every rotor stays within [0, rotor_force_max_n]. Roll, pitch and thrust are clipped rotor by rotor; yaw gets the
-    remaining range, because its lever is 12 times shorter and a yaw step would otherwise cost all attitude control.
-    """
-
-    def __init__(self, preset: Preset, vehicles: int) -> None:
-        arm_m, yaw_m, self._max_n = preset.arm_m, preset.yaw_per_force_m, preset.rotor_force_max_n
-        half = 0.5 / arm_m
-        self._from_wrench = np.array([[0.25, 0, -half], [0.25, -half, 0], [0.25, 0, half], [0.25, half, 0]])
-        self._yaw_scale = 0.25 / yaw_m
-        self.wrench_of_forces = np.array(  # (4, 4): f_t, tau_x, tau_y, tau_z of the four rotor forces
-            [[1, 1, 1, 1], [0, -arm_m, 0, arm_m], [-arm_m, 0, arm_m, 0], yaw_m * _YAW_SIGN]
-        )
-        eye = np.eye(4)
-        self._room_rows = np.vstack([eye[0], eye[2], -eye[1], -eye[3], eye[1], eye[3], -eye[0], -eye[2]])
-        self._room_offset = np.array([0, 0, 1, 1, 0, 0, 1, 1]).reshape(8, 1) * self._max_n
-        self._forces = np.zeros((4, vehicles))
-        self._room = np.zeros((8, vehicles))
-        self._yaw = np.zeros(vehicles)
-        self._least = np.zeros((2, vehicles))
-        self._share = np.zeros((4, vehicles))
-
-    def allocate(self, wrench: Array) -> Array:
-        """Return rotor forces (4, N) [N] for a wrench (4, N): f_t [N], tau_x, tau_y, tau_z [N m]; reuses its buffer."""
-        forces, room, yaw, least = self._forces, self._room, self._yaw, self._least
-        np.matmul(self._from_wrench, wrench[:3], out=forces)
-        np.maximum(forces, 0.0, out=forces)
-        np.minimum(forces, self._max_n, out=forces)
-        np.matmul(self._room_rows, forces, out=room)
-        room += self._room_offset
-        np.minimum.reduce(room.reshape(2, 4, -1), axis=1, out=least)
-        np.multiply(wrench[3], self._yaw_scale, out=yaw)
-        np.minimum(yaw, least[0], out=yaw)
-        np.negative(least[1], out=least[1])
-        np.maximum(yaw, least[1], out=yaw)
-        np.multiply(_YAW_SIGN[:, None], yaw, out=self._share)
-        forces += self._share
-        return forces
+    arguments: Array  # (12, N)
+    moving: Array  # (10, N) of these: quaternion, rates, velocity
+    polynomial: Array  # (19, N): `_quadratic_rows` of the arguments
+    quadratic: Array  # (10, N) of these: derivative of `moving` without forcing
+    slope: Array  # (10, N) with it
 
 
 class Plant:
     """State and one fixed step (Bogacki-Shampine third order, ode3) of all vehicles at once.
 
-    The right-hand side of (1.18) with a quaternion is quadratic in (quaternion, rates, velocity): one outer product and
-    one constant matrix evaluate it for all vehicles.
+    The right-hand side of (1.18) with a quaternion is quadratic in (quaternion, rates, velocity): all products of two
+    of its arguments and one constant matrix evaluate it for all vehicles.
 
     Attributes:
         state: (13, N) quaternion body->NED, rates FRD [rad/s], velocity FRD [m/s], position NED [m].
+        q_nb, rate_frd_rad_s, pos_ned_m: parts of it.
         rotation: (9, N) row-major body->NED, of the current state.
         vel_ned_m_s: (3, N), of the current state.
         euler_rad: (3, N) roll, pitch, yaw, of the current state.
@@ -165,7 +139,7 @@ class Plant:
         self.preset = preset
         self.dt_s = dt_s
         self.mass_kg = preset.mass_kg * mass_scale
-        self.state = np.zeros((13, count))
+        self._allocate_buffers(count)
         self.state[0] = 1.0
         self.state[_POS] = np.asarray(pos_ned_m, dtype=np.float64).T
         self.ground_z_m: Array | None = self.state[12].copy() if ground else None
@@ -178,6 +152,7 @@ class Plant:
         self._curve_01 = thrust_curve_01
         self._ground_effect = ground_effect and ground
         self._wind_ned_m_s: Array | None = None
+        self._at_rest: tuple[bytes, ...] | None = None  # the situation that the last step has left as it was
         self._lag = 1.0 - math.exp(-dt_s / preset.motor_tau_s) if preset.motor_tau_s > 0 else 1.0
         self._rows = _quadratic_rows(preset, self.mass_kg)
         self._attitude_rows = _attitude_rows()
@@ -186,40 +161,48 @@ class Plant:
         self._forcing_rows = np.zeros((10, 4))
         self._forcing_rows[_RATE], self._forcing_rows[9] = wrench_rows[1:], wrench_rows[0]
         self._weights = np.array([2.0, 3.0, 4.0]) * (dt_s / 9.0)
-        self._allocate_buffers(count)
         self.refresh()
 
     def _allocate_buffers(self, count: int) -> None:
-        self._args = np.zeros((12, count))
-        self._args[0] = 1.0
-        self._products = np.zeros((12, 12, count))
-        self._polynomial = np.zeros((19, count))
-        self._forcing = np.zeros((10, count))
+        self._arguments = np.zeros((3, 15, count))  # of each stage: `_ARGUMENTS`, position; the first is the state's
+        self._arguments[:, 0] = 1.0
+        self.state = self._arguments[0, 2:]
+        self._factors = np.zeros((288, count))
+        self._products = np.zeros((144, count))
+        self._polynomials = np.zeros((3, 19, count))
         self._slopes = np.zeros((3, 13, count))
-        self._stage = np.zeros((13, count))
-        self._sum = np.zeros(13 * count)
-        self._lever = np.zeros((3, 3, count))
-        self._norm = np.zeros(count)
-        self._square = np.zeros((4, count))
-        self._quat_products = np.zeros((4, 4, count))
-        self._attitude = np.zeros((13, count))
+        self._stages = tuple(
+            _Stage(arguments[:12], arguments[2:12], polynomial, polynomial[:10], slope[:10])
+            for arguments, polynomial, slope in zip(self._arguments, self._polynomials, self._slopes, strict=True)
+        )
+        self._change = np.zeros((13, count))
+        self._levers = np.zeros((3, 3, 3, count))
+        self._forcing = np.zeros((10, count))
         self._spins = np.zeros((4, count))
-        self.rotation = self._attitude[:9]
+        self._square = np.zeros((4, count))
+        self._norm = np.zeros(count)
+        self._quat_factors = np.zeros((32, count))
+        self._quat_products = np.zeros((16, count))
+        self._attitude = np.zeros((13, count))
         self.vel_ned_m_s = np.zeros((3, count))
         self.euler_rad = np.zeros((3, count))
-        self._roll_yaw = self.euler_rad[::2]
+        self._make_views(count)
 
-    @property
-    def q_nb(self) -> Array:
-        return self.state[_QUAT]
-
-    @property
-    def rate_frd_rad_s(self) -> Array:
-        return self.state[_RATE]
-
-    @property
-    def pos_ned_m(self) -> Array:
-        return self.state[_POS]
+    def _make_views(self, count: int) -> None:
+        """Make the views of the buffers once: each costs as much as an operation on it."""
+        self.q_nb, self.rate_frd_rad_s = self.state[_QUAT], self.state[_RATE]
+        self.pos_ned_m, self._vel_frd_m_s = self.state[_POS], self.state[_VEL]
+        self.rotation = self._attitude[:9]
+        self._left, self._right = self._factors[:144], self._factors[144:]
+        self._rotations = self._polynomials[:, 10:].reshape(3, 3, 3, count)  # of the three stages
+        self._velocities = self._arguments[:, None, 9:12]
+        self._drifts = self._slopes[:, _POS]
+        self._flat_slopes = self._slopes.reshape(3, 13 * count)
+        self._flat_change = self._change.reshape(13 * count)
+        self._quat_left, self._quat_right = self._quat_factors[:16], self._quat_factors[16:]
+        self._matrix, self._lever = self.rotation.reshape(3, 3, count), self._levers[0]
+        self._sines, self._cosines = self._attitude[9:11], self._attitude[11:]  # of roll and yaw, scaled
+        self._roll_yaw, self._pitch = self.euler_rad[::2], self.euler_rad[1]
 
     @property
     def hover_thrust_01(self) -> float:
@@ -253,19 +236,32 @@ class Plant:
         if self.preset.rotor_inertia_kg_m2:
             np.multiply(self.rotor_force_n, 1.0 / self.preset.thrust_coeff_n_s2, out=self._spins)
             np.sqrt(self._spins, out=self._spins)
-            np.matmul(-_YAW_SIGN, self._spins, out=self._args[1])  # w_r = W1 - W2 + W3 - W4
+            np.matmul(_SPIN_SIGN, self._spins, out=self._arguments[0, 1])  # w_r = W1 - W2 + W3 - W4
+            self._arguments[1:, 1] = self._arguments[0, 1]
         if self.mass_ratio is not None:
             self._reweigh(self.mass_ratio)
         if self._wind_ned_m_s is not None:
             self._add_wind(self._wind_ned_m_s)
-        if self.held.all():
+        holds = self.held.tolist()
+        if False not in holds:
             return  # nothing moves: of the state, only rotor forces change
-        held = self.state[:, self.held].copy() if self.held.any() else None
+        situation = self._situation()
+        if situation is not None and situation == self._at_rest:
+            return  # this step would change nothing, as the one before
+        held = self.state[:, self.held].copy() if True in holds else None
         self._integrate()
         if held is not None:
             self.state[:, self.held] = held
         self._touch_ground()
         self.refresh()
+        self._at_rest = situation if situation is not None and situation[0] == self.state.tobytes() else None
+
+    def _situation(self) -> tuple[bytes, ...] | None:
+        """Return all that a step depends on while every vehicle is on the ground, its state first; else None."""
+        if False in self.contact.tolist():
+            return None
+        mass_ratio = b"" if self.mass_ratio is None else self.mass_ratio.tobytes()
+        return self.state.tobytes(), self.rotor_force_n.tobytes(), self._forcing.tobytes(), mass_ratio
 
     def _achievable(self, rotor_cmd_n: Array) -> Array:
         """Return the real force of the commanded ones: thrust curve first, then battery and rotor health."""
@@ -289,7 +285,7 @@ class Plant:
         lighter = 1.0 / mass_ratio
         self._forcing[9] *= lighter
         if not self.preset.drag_scales_with_mass:
-            self._forcing[_VEL] += self._drag_1_s() * (1.0 - lighter) * self.state[_VEL]
+            self._forcing[_VEL] += self._drag_1_s() * (1.0 - lighter) * self._vel_frd_m_s
 
     def _drag_1_s(self) -> Array:
         """Return the drag rates (3, 1) [1/s] of the mass at the start."""
@@ -301,48 +297,46 @@ class Plant:
         drag = self._drag_1_s()
         if self.mass_ratio is not None and not self.preset.drag_scales_with_mass:
             drag = drag / self.mass_ratio
-        np.multiply(self.rotation.reshape(3, 3, -1), wind_ned_m_s[:, None], out=self._lever)
+        np.multiply(self._matrix, wind_ned_m_s[:, None], out=self._lever)
         self._forcing[_VEL] += drag * self._lever.sum(axis=0)
 
     def _integrate(self) -> None:
-        state, stage, slopes, h = self.state, self._stage, self._slopes, self.dt_s
-        self._slope(state, slopes[0])
-        np.multiply(slopes[0], 0.5 * h, out=stage)
-        stage += state
-        self._slope(stage, slopes[1])
-        np.multiply(slopes[1], 0.75 * h, out=stage)
-        stage += state
-        self._slope(stage, slopes[2])
-        np.matmul(self._weights, slopes.reshape(3, -1), out=self._sum)
-        state += self._sum.reshape(13, -1)
-        rates = state[_RATE]
+        first, second, third = self._stages
+        self._slope(first)
+        np.multiply(first.slope, 0.5 * self.dt_s, out=second.moving)
+        np.add(second.moving, first.moving, out=second.moving)
+        self._slope(second)
+        np.multiply(second.slope, 0.75 * self.dt_s, out=third.moving)
+        np.add(third.moving, first.moving, out=third.moving)
+        self._slope(third)
+        np.multiply(self._rotations, self._velocities, out=self._levers)
+        np.add.reduce(self._levers, axis=2, out=self._drifts)
+        np.matmul(self._weights, self._flat_slopes, out=self._flat_change)
+        np.add(self.state, self._change, out=self.state)
+        rates, quat = self.rate_frd_rad_s, self.q_nb
         np.minimum(rates, RATE_LIMIT_RAD_S, out=rates)
         np.maximum(rates, -RATE_LIMIT_RAD_S, out=rates)
-        quat = state[_QUAT]
         np.multiply(quat, quat, out=self._square)
         np.add.reduce(self._square, axis=0, out=self._norm)
         np.sqrt(self._norm, out=self._norm)
         quat /= self._norm
 
-    def _slope(self, state: Array, out: Array) -> None:
-        """Evaluate the right-hand side of (1.18) at `state` (13, N) into `out` (13, N)."""
-        args = self._args
-        args[2:] = state[:10]
-        np.multiply(args[:, None], args[None], out=self._products)
-        np.matmul(self._rows, self._products.reshape(144, -1), out=self._polynomial)
-        np.add(self._polynomial[:10], self._forcing, out=out[:10])
-        np.multiply(self._polynomial[10:].reshape(3, 3, -1), state[_VEL], out=self._lever)
-        np.add.reduce(self._lever, axis=1, out=out[_POS])
+    def _slope(self, stage: _Stage) -> None:
+        """Evaluate the right-hand side of (1.18), but for the position."""
+        stage.arguments.take(_FACTORS, 0, self._factors, "clip")  # "raise" would copy once more
+        np.multiply(self._left, self._right, out=self._products)
+        np.matmul(self._rows, self._products, out=stage.polynomial)
+        np.add(stage.quadratic, self._forcing, out=stage.slope)
 
     def refresh(self) -> None:
         """Update rotation, NED velocity and Euler angles from the current state."""
-        quat = self.state[_QUAT]
-        np.multiply(quat[:, None], quat[None], out=self._quat_products)
-        np.matmul(self._attitude_rows, self._quat_products.reshape(16, -1), out=self._attitude)
-        np.multiply(self.rotation.reshape(3, 3, -1), self.state[_VEL], out=self._lever)
+        self.q_nb.take(_QUAT_FACTORS, 0, self._quat_factors, "clip")
+        np.multiply(self._quat_left, self._quat_right, out=self._quat_products)
+        np.matmul(self._attitude_rows, self._quat_products, out=self._attitude)
+        np.multiply(self._matrix, self._vel_frd_m_s, out=self._lever)
         np.add.reduce(self._lever, axis=1, out=self.vel_ned_m_s)
-        np.arctan2(self._attitude[9:11], self._attitude[11:13], out=self._roll_yaw)
-        pitch = self.euler_rad[1]
+        np.arctan2(self._sines, self._cosines, out=self._roll_yaw)
+        pitch = self._pitch
         np.maximum(self._attitude[6], -1.0, out=pitch)
         np.minimum(pitch, 1.0, out=pitch)
         np.arcsin(pitch, out=pitch)
@@ -352,18 +346,17 @@ class Plant:
         if self.ground_z_m is None:
             return
         np.greater_equal(self.state[12], self.ground_z_m, out=self.contact)
-        if not self.contact.any():
+        if True not in self.contact.tolist():
             return
         self.refresh()
-        lift_n = self.rotor_force_n.sum(axis=0) * self.rotation[8]
-        for i in np.flatnonzero(self.contact):
-            self._rest_on_ground(int(i), float(lift_n[i]), float(self.ground_z_m[i]))
+        lift_n = (self.rotor_force_n.sum(axis=0) * self.rotation[8]).tolist()
+        for i in np.flatnonzero(self.contact).tolist():
+            self._rest_on_ground(i, lift_n[i], self.ground_z_m[i])
 
     def _rest_on_ground(self, i: int, lift_n: float, ground_z_m: float) -> None:
         """Enforce the ground: no penetration, upright on the skids, Coulomb friction; lift above weight takes off."""
-        state = self.state
         yaw = math.atan2(self.rotation[3, i], self.rotation[0, i])
-        north, east, down = (float(v) for v in self.vel_ned_m_s[:, i])
+        north, east, down = self.vel_ned_m_s[:, i].tolist()
         mass_kg = self.mass_kg * (float(self.mass_ratio[i]) if self.mass_ratio is not None else 1.0)
         load_n = max(0.0, mass_kg * GRAVITY_M_S2 - lift_n)
         speed = math.hypot(north, east)
@@ -371,7 +364,7 @@ class Plant:
         ratio = slowed / speed if speed > 0 else 0.0
         north, east, down = north * ratio, east * ratio, min(down, 0.0)
         c, s = math.cos(yaw), math.sin(yaw)
-        state[_QUAT, i] = math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)
-        state[_RATE, i] = 0.0
-        state[_VEL, i] = c * north + s * east, c * east - s * north, down
-        state[12, i] = ground_z_m
+        upright = math.cos(yaw / 2), 0.0, 0.0, math.sin(yaw / 2)
+        at_rest = 0.0, 0.0, 0.0
+        self.state[:10, i] = *upright, *at_rest, c * north + s * east, c * east - s * north, down
+        self.state[12, i] = ground_z_m

@@ -51,4 +51,4 @@ class Boot:
             return estimate
         (x_m, y_m, z_m), (dx_m, dy_m, dz_m) = estimate.pos_ned_m, self._shift_ned_m
         moved = x_m - dx_m, y_m - dy_m, z_m - dz_m
-        return replace(estimate, t_us=self.since_us(estimate.t_us), pos_ned_m=moved)
+        return estimate._replace(t_us=self.since_us(estimate.t_us), pos_ned_m=moved)

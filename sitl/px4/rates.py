@@ -43,13 +43,14 @@ class RateLoop:
         self.feed_rad_s[:, vehicle] = feed_frd_rad_s or 0.0
         self.feeding = bool(self.feed_rad_s.any())
 
-    def overrule(self, rate_frd_rad_s: Array, live: Array, out: Array) -> None:
-        """Replace the torques (3, N) in `out` of vehicles that fly rates."""
+    def overrule(self, rate_frd_rad_s: Array, live: Array | None, out: Array) -> None:
+        """Replace the torques (3, N) in `out` of vehicles that fly rates; `live` as of `AttitudeLoop.torque`."""
         if not self._active:
             return
         on = self._on
+        share = 1.0 if live is None else live[on]
         error = np.nan_to_num(self._wanted_rad_s[:, on] - rate_frd_rad_s[:, on])
         summed = self._integral_rad[:, on] + _INTEGRAL_1_S * self._dt_s * error
-        summed = np.clip(summed, -_WINDUP_RAD_S, _WINDUP_RAD_S) * live[on]
+        summed = np.clip(summed, -_WINDUP_RAD_S, _WINDUP_RAD_S) * share
         self._integral_rad[:, on] = summed
-        out[:, on] = self._gain_nm_s * (error + summed) * live[on]
+        out[:, on] = self._gain_nm_s * (error + summed) * share

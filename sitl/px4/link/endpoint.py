@@ -19,7 +19,7 @@ from sitl.px4.link.commands import Commands, Params
 from sitl.px4.link.missions import MissionLink
 from sitl.px4.link.parameters import ParameterLink
 from sitl.px4.link.schedule import OFFBOARD_HZ, Schedule
-from sitl.px4.link.streams import LinkCounts, Report
+from sitl.px4.link.streams import Fields, LinkCounts, Report
 from sitl.px4.link.streams_health import STREAMS
 from sitl.px4.modes import MODE_NAMES, STANDARD_MODES, Result, Severity
 from swarmctl.mavlink.codec import Codec
@@ -135,14 +135,15 @@ class Endpoint:
             self._greeted = True
             self.send(_ACK, BOOT_COMMAND, Result.ACCEPTED, 0, 0, 0, 1)
         due = self._schedule.take_due(self._now_us)
-        if pilot.ready(self._now_us) and self._origin_sent is not pilot.boot.origin:
+        if self._origin_sent is not pilot.boot.origin and pilot.ready(self._now_us):
             self._origin_sent = pilot.boot.origin
             due.append(_ORIGIN)
         if due:
             self._send_streams(due)
         self._parameters.send_due(self._now_us)
         self._missions.send_due(self._now_us)
-        self._send_reached()
+        if pilot.flight.reached:
+            self._send_reached()
         if self._texts or pilot.texts:
             self._send_texts()
 
@@ -267,6 +268,9 @@ class Endpoint:
 
     def send(self, kind: Kind, *fields: Any) -> None:
         """Send one message from its fields in wire order."""
+        self._send_fields(kind, fields)
+
+    def _send_fields(self, kind: Kind, fields: Fields) -> None:
         try:
             frame = self._writer.frame(kind, fields)
         except struct.error:
@@ -278,18 +282,19 @@ class Endpoint:
 
     def _send_streams(self, messages: list[int]) -> int:
         """Send the streams that are due; return how many had content."""
-        report = self._report()
-        report.counts = self._counts
         placed = self._autopilot.has_position and self._autopilot.ready(self._now_us)
-        told = 0
-        for message in messages:
-            if message == _CURRENT_MODE and not self._status_is_new():
-                continue
-            stream = STREAMS[message]
-            if placed or not stream.needs_position:
-                self.send(KINDS[message], *stream.build(report))
-                told += 1
-        return told
+        told = [message for message in messages if self._has_content(message, placed)]
+        if told:
+            report = self._report()
+            report.counts = self._counts
+            for message in told:
+                self._send_fields(KINDS[message], STREAMS[message].build(report))
+        return len(told)
+
+    def _has_content(self, message: int, placed: bool) -> bool:
+        if message == _CURRENT_MODE:
+            return self._status_is_new()
+        return placed or not STREAMS[message].needs_position
 
     def _status_is_new(self) -> bool:
         """Return whether PX4 has published its status anew: twice a second and on change, whatever the requests."""

@@ -99,12 +99,13 @@ class Schedule:
         due: list[int] = []
         queue, next_us = self._queue, self._next_us
         while queue and queue[0][0] <= now_us:
-            at_us, message = heapq.heappop(queue)
+            at_us, message = queue[0]
             if next_us.get(message) != at_us:
+                heapq.heappop(queue)
                 continue
             due.append(message)
             interval_us = self._interval_us[message]
             at_us += interval_us * (1 + (now_us - at_us) // interval_us)
             next_us[message] = at_us
-            heapq.heappush(queue, (at_us, message))
+            heapq.heapreplace(queue, (at_us, message))
         return due

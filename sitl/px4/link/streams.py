@@ -19,7 +19,6 @@ from sitl.px4.navigator import IDLE
 
 FRAME_LOCAL_NED = 1
 PROTOCOL_VERSION = 300
-REST_FORCE_M_S2 = (0.0, 0.0, -9.81)
 Fields = tuple[Any, ...]
 NAN = math.nan
 _NO_COVARIANCES = (NAN,) * 42
@@ -52,8 +51,8 @@ class Report:
     estimate: Estimate
     autopilot: Autopilot
     origin: LocalOrigin
-    rotor_01: tuple[float, ...]  # (4,) forces
-    force_frd_m_s2: tuple[float, float, float] = REST_FORCE_M_S2  # specific force, body axes
+    rotor_01: Callable[[], Sequence[float]]  # (4,) forces; called only for messages with them
+    force_frd_m_s2: Callable[[], Sequence[float]]  # (3,) specific force, body axes
     simulation_us: int = -1  # the instant, on the simulation's clock
     counts: LinkCounts | None = None
 
@@ -188,7 +187,7 @@ def position_target(r: Report) -> Fields:
 
 def servo_output(r: Report) -> Fields:
     running = r.autopilot.motors_on
-    pwm = [_PWM_IDLE + round(_PWM_SPAN * f) if running else _PWM_OFF for f in r.rotor_01]
+    pwm = [_PWM_IDLE + round(_PWM_SPAN * f) if running else _PWM_OFF for f in r.rotor_01()]
     return r.estimate.t_us & 0xFFFFFFFF, *pwm, 0, 0, 0, 0, 0, *_NO_SERVOS
 
 

@@ -83,7 +83,7 @@ def highres_imu(r: Report) -> Fields:
     pressure_hpa, celsius = _air(altitude_m)
     return (
         e.t_us,
-        *r.force_frd_m_s2,
+        *r.force_frd_m_s2(),
         *e.rate_frd_rad_s,
         *_in_body(e.q_nb, _EARTH_FIELD_NED_GAUSS),
         pressure_hpa,
@@ -115,13 +115,13 @@ def esc_info(r: Report) -> Fields:
 
 
 def esc_status(r: Report) -> Fields:
-    rpm = [round(_ROTOR_MAX_RPM * math.sqrt(max(0.0, f))) for f in r.rotor_01]
+    rpm = [round(_ROTOR_MAX_RPM * math.sqrt(max(0.0, f))) for f in r.rotor_01()]
     each_a = max(0.0, r.autopilot.battery_a) / 4.0
     return r.estimate.t_us, *rpm, *(r.autopilot.battery_v,) * 4, *(each_a,) * 4, 0
 
 
 def vibration(r: Report) -> Fields:
-    shake = 0.01 + 0.02 * sum(r.rotor_01)
+    shake = 0.01 + 0.02 * sum(r.rotor_01())
     return r.estimate.t_us, shake, shake, shake, 0, 0, 0
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -187,6 +188,32 @@ def test_touch_down_stops_without_penetration() -> None:
     assert np.abs(plant.vel_ned_m_s).max() < 1e-9
     np.testing.assert_allclose(plant.euler_rad[:2, 0], 0.0, atol=1e-9)
     assert plant.euler_rad[2, 0] == pytest.approx(0.7, abs=0.1)  # the heading it came down with
+
+
+def test_steps_that_would_change_nothing_are_left_out_and_nothing_else(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A plant that forgets before every step that it is at rest computes them all, to the same bits."""
+    plants = [Plant(PRESETS["x500"], np.zeros((2, 3)), 0.004) for _ in range(2)]
+    computed = [0, 0]
+    for number, plant in enumerate(plants):
+
+        def count(number: int = number, integrate: Callable[[], None] = plant._integrate) -> None:
+            computed[number] += 1
+            integrate()
+
+        monkeypatch.setattr(plant, "_integrate", count)
+    rng = np.random.default_rng(5)
+    for thrust_n, wind_m_s, steps in ((0.0, 0.0, 50), (0.0, 3.0, 50), (12.0, 3.0, 200), (0.0, 0.0, 700), (3.0, 0.0, 9)):
+        wrench = np.array([[thrust_n] * 2, *rng.normal(0.0, 1e-3 * (thrust_n > 9.0), (3, 2))])
+        for plant in plants:
+            plant.set_wind(np.full((3, 2), wind_m_s))
+        for _ in range(steps):
+            plants[1]._at_rest = None
+            for plant in plants:
+                plant.step(plant.mixer.allocate(wrench))
+            np.testing.assert_array_equal(plants[0].state, plants[1].state)
+            np.testing.assert_array_equal(plants[0].vel_ned_m_s, plants[1].vel_ned_m_s)
+    assert computed[1] == 1009
+    assert computed[0] < 970  # before take-off; wind would move them a little
 
 
 def test_each_vehicle_has_its_own_ground() -> None:
