@@ -34,7 +34,7 @@ from swarmctl.bus.path_messages import encode_path
 from swarmctl.bus.peers import Bus
 from swarmctl.bus.traffic import CountedBus
 from swarmctl.control.collision.encounters import Encounters
-from swarmctl.control.collision.separation import KeepOut, radius_problem
+from swarmctl.control.collision.separation import KeepOuts, radius_problem
 from swarmctl.control.estimation.accuracy import AccuracyMonitor
 from swarmctl.control.estimation.constant_velocity import predict_constant_velocity
 from swarmctl.control.fallback import brake_and_hold_plan
@@ -51,6 +51,7 @@ from swarmctl.core.clock import Clock
 from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned
 from swarmctl.core.operator_verbs import EXCLUDE, PEER, Order
 from swarmctl.core.tick_record import TickRecord, TickTiming
+from swarmctl.core.trajectory import grid
 from swarmctl.core.types import (
     MAX_MARGIN_M,
     NO_TIMES,
@@ -130,7 +131,10 @@ class Agent:
         self._safety_filter = make_safety_filter(setup, self._world_model, self._note, stopwatch_ns)
         self._state_machine = make_state_machine(setup)
         self._heading = Heading(setup.mission.yaw_rad)
-        self._reference_selector = ReferenceSelector(setup, self._state_machine, self._note)
+        ahead_us = np.arange(self._controller.longest + 1) * self._controller.dt_us  # (longest+1,)
+        self._horizon_us = self._predictor.delay_us + ahead_us
+        ahead_s = self._predictor.delay_us * 1e-6 + self._controller.dt_us * 1e-6 * grid(self._controller.longest)
+        self._reference_selector = ReferenceSelector(setup, self._state_machine, ahead_s, self._note)
         self._decision = FailsafeDecision(Mode.IDLE, "")
         self._virtual_control = np.array([0.0, 0.0, GRAVITY_M_S2])
         self._plan_buffer = PlanBuffer(
@@ -369,13 +373,12 @@ class Agent:
         flies = Phase.GOTO_START <= self._state_machine.phase <= Phase.GOTO_LAND
         if outside := self._volume_watch.update(now_us, state, flies and self._state_machine.had_control):
             self._alerts.put("volume", outside, now_us)
+        self._reference_selector.look_ahead(now_us, self._clock.utc_us())
         self._detect_deadlock(now_us, state, keep_outs, flies)
-        grid = np.arange(self._controller.longest + 1, dtype=np.float64)
-        ahead_s = self._predictor.delay_us * 1e-6 + dt_us * 1e-6 * grid
-        reference, now_ref = self._reference_selector.reference(now_us, self._clock.utc_us(), ahead_s)
+        reference, now_ref = self._reference_selector.reference()
         directive = self._directive = self._separate(now_us, state, keep_outs, flies)
         if not flies:
-            return PlanningResult(start=start, plan=None, reference=now_ref, keep_outs=keep_outs)
+            return PlanningResult(start=start, plan=None, reference=now_ref, keep_outs=list(keep_outs))
         if directive.alert:
             self._alerts.put("separation", directive.alert, now_us)
         if directive.reference is not None:
@@ -391,31 +394,30 @@ class Agent:
                 guess_ned_m=guess,
             )
         )
-        return PlanningResult(start=start, plan=plan, reference=now_ref, keep_outs=keep_outs)
+        return PlanningResult(start=start, plan=plan, reference=now_ref, keep_outs=list(keep_outs))
 
-    def _separate(self, now_us: int, state: VehicleState, keep_outs: list[KeepOut], flies: bool) -> SeparationDirective:
+    def _separate(self, now_us: int, state: VehicleState, keep_outs: KeepOuts, flies: bool) -> SeparationDirective:
         """Return this tick's directive; its reference begins where the setpoint acts."""
         utc_us = self._clock.utc_us()
         if not (flies and self._state_machine.had_control) or self._decision.mode in _DEVIATING_MODES:
             return self._separation.idle(utc_us, state, keep_outs)
-        act_us = utc_us + self._predictor.delay_us
         return self._separation.step(
             SeparationInputs(
                 utc_us=utc_us,
                 state=state,
                 phase=self._state_machine.phase,
                 desired=self._reference_selector.desired(now_us, utc_us),
-                horizon_utc_us=act_us + np.arange(self._controller.longest + 1) * self._controller.dt_us,
+                horizon_utc_us=utc_us + self._horizon_us,
                 keep_outs=keep_outs,
                 disturbance_ned_m_s2=self._observer.estimate.disturbance_ned_m_s2,
             )
         )
 
-    def _detect_deadlock(self, now_us: int, state: VehicleState, keep_outs: list[KeepOut], flies: bool) -> None:
+    def _detect_deadlock(self, now_us: int, state: VehicleState, keep_outs: KeepOuts, flies: bool) -> None:
         if not (flies and self._state_machine.had_control):
             self._reference_selector.reset(now_us)
             return
-        known = [*keep_outs, *self._directive.lost_peer_keep_outs]
+        known = (*keep_outs, *self._directive.lost_peer_keep_outs)
         landmarks = self._world_model.landmarks
         deadlock = self._reference_selector.update(
             now_us, self._clock.utc_us(), state.pos_ned_m, known, landmarks=landmarks
@@ -542,7 +544,7 @@ class Agent:
             mode=self._decision.mode,
             unresponsive_peer=self._directive.unresponsive_peer,
             cut_off=self._directive.cut_off or self._controller_watch.suspended,
-            peers=self._world_model.peers(),
+            peers=self._world_model.peers,
             others_ned_m=partial(self._world_model.others_ned_m, utc_us),
             arm_in=None if dialect is None else dialect.arm_in,
             boots=self._autopilot.clock.boots,
@@ -622,8 +624,7 @@ class Agent:
                 pos_ned_m=pos,
             )
         act_us, dt_us = self._clock.now_us() + self._predictor.delay_us, self._controller.dt_us
-        grid = np.arange(self._controller.steps + 1, dtype=np.float64)
-        ahead_s = grid * (dt_us * 1e-6) + (act_us - state.t_us) * 1e-6
+        ahead_s = grid(self._controller.steps) * (dt_us * 1e-6) + (act_us - state.t_us) * 1e-6
         pos = predict_constant_velocity(state, ahead_s, setup.separation.brake_m_s2)
         return PredictedPath(
             agent=setup.agent,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
+from collections.abc import Iterable
 
 import numpy as np
 from pydantic import Field
@@ -93,78 +94,67 @@ class Predictor:
         """Forget remembered commands, after a handover."""
         self._sent.clear()
 
-    def acting(self, t_us: int) -> Array | None:
-        """Return the virtual controls (3,) that act at `t_us`; None before the first."""
-        acting = None
-        for start_us, virtual_control in self._sent:
-            if start_us > t_us:
-                break
-            acting = virtual_control
-        return acting
-
     def start(self, state: VehicleState, until_us: int, disturbance_ned_m_s2: Array, held: Array) -> Start:
         """Return the start of a plan that acts from `until_us` on, after `held` (3,) was commanded last.
 
         The remembered commands act one after the other, each from its own time. Before the first one the vehicle is
         assumed to compensate the disturbance.
         """
-        pos, vel, t_us = state.pos_ned_m, state.vel_ned_m_s, state.t_us
-        down = body_z_ned(state.q_nb)
-        tilt, rate = down[:2], tilt_rate(state)
-        current = None if not self._sent else self._sent[0][1]
-        for start_us, virtual_control in self._sent:
+        t_us, sent = state.t_us, self._sent
+        while len(sent) > 1 and sent[1][0] <= t_us:
+            sent.popleft()  # time does not go back
+        motion = _Motion(state, disturbance_ned_m_s2, self._lag, self._drag_1_s)
+        current = sent[0][1].tolist() if sent else None
+        for start_us, virtual_control in sent:
+            if start_us >= until_us:
+                break
             if start_us > t_us:
-                if start_us >= until_us:
-                    break
-                pos, vel, tilt, rate = self._advance(
-                    pos,
-                    vel,
-                    tilt,
-                    rate,
-                    command=current,
-                    disturbance_ned_m_s2=disturbance_ned_m_s2,
-                    for_us=start_us - t_us,
-                )
+                motion.advance(current, start_us - t_us)
                 t_us = start_us
-            current = virtual_control
-        left_us = max(0, until_us - t_us)
-        pos, vel, tilt, rate = self._advance(
-            pos, vel, tilt, rate, command=current, disturbance_ned_m_s2=disturbance_ned_m_s2, for_us=left_us
-        )
-        if self._lag is None:
-            return Start(t_us=until_us, pos_ned_m=pos, vel_ned_m_s=vel, cos_tilt=float(down[2]), virtual_control=held)
-        cos_tilt = math.sqrt(max(0.0, 1.0 - float(tilt @ tilt)))
-        return Start(
-            t_us=until_us,
-            pos_ned_m=pos,
-            vel_ned_m_s=vel,
-            cos_tilt=cos_tilt,
-            virtual_control=held,
-            tilt=tilt,
-            tilt_rate_1_s=rate,
-        )
+            current = virtual_control.tolist()
+        motion.advance(current, max(0, until_us - t_us))
+        return motion.start(until_us, held)
 
-    def _advance(
-        self,
-        pos: Array,
-        vel: Array,
-        tilt: Array,
-        rate: Array,
-        *,
-        command: Array | None,
-        disturbance_ned_m_s2: Array,
-        for_us: int,
-    ) -> tuple[Array, Array, Array, Array]:
+
+class _Motion:
+    """Moves by the model from a measured state on, held command by held command; in plain numbers, which are few."""
+
+    def __init__(self, state: VehicleState, disturbance_ned_m_s2: Array, lag: Lag | None, drag_1_s: float) -> None:
+        self._pos, self._vel = state.pos_ned_m.tolist(), state.vel_ned_m_s.tolist()
+        self._disturbance, self._lag, self._drag_1_s = disturbance_ned_m_s2.tolist(), lag, drag_1_s
+        *self._tilt, self._down = body_z_ned(state.q_nb).tolist()
+        self._rate = [0.0, 0.0] if lag is None else tilt_rate(state).tolist()
+
+    def advance(self, command: list[float] | None, for_us: int) -> None:
+        """Move by a time in which a command acts; None: one that compensates the disturbance."""
         dt_s = for_us * 1e-6
         if command is None:
-            return pos + vel * dt_s, vel, tilt, rate
-        flown = command
+            self._pos = [p + v * dt_s for p, v in zip(self._pos, self._vel, strict=True)]
+            return
+        ux, uy, thrust = command
         if self._lag is not None and for_us > 0:
-            ends = [self._lag.advance(float(tilt[i]), float(rate[i]), float(command[i]), dt_s) for i in (0, 1)]
-            tilt, rate = np.array([end[0] for end in ends]), np.array([end[1] for end in ends])
-            flown = np.array([ends[0][2] / dt_s, ends[1][2] / dt_s, command[2]])
-        pos, vel = _moved(pos, vel, acceleration(flown) + disturbance_ned_m_s2, self._drag_1_s, dt_s=dt_s)
-        return pos, vel, tilt, rate
+            self._tilt[0], self._rate[0], x_s = self._lag.advance(self._tilt[0], self._rate[0], ux, dt_s)
+            self._tilt[1], self._rate[1], y_s = self._lag.advance(self._tilt[1], self._rate[1], uy, dt_s)
+            ux, uy = x_s / dt_s, y_s / dt_s
+        for i, (pushed, disturbed) in enumerate(zip(acceleration((ux, uy, thrust)), self._disturbance, strict=True)):
+            pos, vel, accel = self._pos[i], self._vel[i], pushed + disturbed
+            self._pos[i], self._vel[i] = _moved(pos, vel, accel, self._drag_1_s, dt_s=dt_s)
+
+    def start(self, t_us: int, held: Array) -> Start:
+        """Return where a plan begins that acts from now on, after `held` (3,) was commanded last."""
+        pos, vel = np.array(self._pos), np.array(self._vel)
+        if self._lag is None:
+            return Start(t_us=t_us, pos_ned_m=pos, vel_ned_m_s=vel, cos_tilt=self._down, virtual_control=held)
+        x, y = self._tilt
+        return Start(
+            t_us=t_us,
+            pos_ned_m=pos,
+            vel_ned_m_s=vel,
+            cos_tilt=math.sqrt(max(0.0, 1.0 - (x * x + y * y))),
+            virtual_control=held,
+            tilt=np.array(self._tilt),
+            tilt_rate_1_s=np.array(self._rate),
+        )
 
 
 def tilt_rate(state: VehicleState) -> Array:
@@ -173,14 +163,14 @@ def tilt_rate(state: VehicleState) -> Array:
     return rotate_to_ned(state.q_nb, np.array([q, -p, 0.0]))[:2]
 
 
-def acceleration(virtual_control: Array) -> Array:
-    """Return the acceleration (3,) NED [m/s2] of virtual_control controls (3,), gravity included (thesis 3.2)."""
-    ux, uy, thrust = virtual_control.tolist()
+def acceleration(virtual_control: Iterable[float]) -> tuple[float, float, float]:
+    """Return the acceleration NED [m/s2] of virtual controls (3,), gravity included (thesis 3.2)."""
+    ux, uy, thrust = virtual_control
     down = max(0.0, 1.0 - ux * ux - uy * uy) ** 0.5
-    return np.array([-thrust * ux, -thrust * uy, GRAVITY_M_S2 - thrust * down])
+    return -thrust * ux, -thrust * uy, GRAVITY_M_S2 - thrust * down
 
 
-def _moved(pos: Array, vel: Array, accel: Array, drag_1_s: float, *, dt_s: float) -> tuple[Array, Array]:
+def _moved(pos: float, vel: float, accel: float, drag_1_s: float, *, dt_s: float) -> tuple[float, float]:
     if drag_1_s == 0.0:
         return pos + vel * dt_s + (0.5 * dt_s * dt_s) * accel, vel + dt_s * accel
     kept = math.exp(-drag_1_s * dt_s)

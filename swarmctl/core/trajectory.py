@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import accumulate
 from typing import Any
 
@@ -16,7 +17,6 @@ from swarmctl.core.types import Array
 Times = NDArray[Any]  # UTC [us], integer or float
 _STOPPED_M_S = 1e-3  # a slower plan is not continued by braking
 _AT_REST_M_S = 1e-6  # a slower velocity has no direction
-_NOWHERE = np.zeros(3)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,21 +83,51 @@ def positions_at(trajectories: Sequence[Trajectory], t_utc_us: Times) -> Array:
     """Return positions (N, M, 3) NED of N trajectories at times (M,), by linear interpolation."""
     begins = np.array([t.t0_utc_us for t in trajectories], np.float64)[:, None]
     steps = np.array([t.dt_us for t in trajectories], np.float64)[:, None]
-    return interpolate([t.pos_ned_m for t in trajectories], np.maximum((t_utc_us - begins) / steps, 0.0))
+    return Polylines([t.pos_ned_m for t in trajectories]).at(np.maximum((t_utc_us - begins) / steps, 0.0))
 
 
-def interpolate(polylines: Sequence[Array], k: Array) -> Array:
-    """Return positions (N, M, 3) at fractional indices (N, M) into N polylines, by linear interpolation.
+@lru_cache(maxsize=64)
+def grid(steps: int) -> Array:
+    """Return 0, 1, ... `steps` as floats (steps+1,), read-only."""
+    found = np.arange(steps + 1, dtype=np.float64)
+    found.flags.writeable = False
+    return found
 
-    Before the first point the first segment is extrapolated; after the last point the last point is returned.
+
+class Polylines:
+    """N polylines, interpolated all at once.
+
+    Args:
+        corners: at least 2 of each, (K, 3).
+
+    Attributes:
+        lasts: (N, 1) indices of their last points.
     """
-    counts = [len(points) for points in polylines]
-    lasts = np.array(counts)[:, None] - 1
-    points = np.concatenate(polylines)
-    low = np.minimum(np.maximum(np.floor(k).astype(np.int64), 0), lasts - 1)
-    at = low + np.array([0, *accumulate(counts[:-1])])[:, None]  # in the concatenation
-    begins = points.take(at, axis=0)
-    return np.asarray(begins + (np.minimum(k, lasts) - low)[:, :, None] * (points.take(at + 1, axis=0) - begins))
+
+    def __init__(self, corners: Sequence[Array]) -> None:
+        counts = [len(points) for points in corners]
+        self._points = corners[0] if len(corners) == 1 else np.concatenate(corners)
+        self._firsts = np.array([0, *accumulate(counts[:-1])])[:, None]  # (N, 1) in all points
+        self.lasts = np.array(counts)[:, None] - 1
+
+    def at(self, k: Array) -> Array:
+        """Return positions (N, M, 3) at fractional indices (N, M), by linear interpolation.
+
+        Before the first point the first segment is extrapolated; after the last point the last point is returned.
+        """
+        low = np.minimum(np.maximum(k.astype(np.int64), 0), self.lasts - 1)
+        index = self._firsts + low
+        begins = self._points.take(index, axis=0)
+        found: Array = self._points[1:].take(index, axis=0)
+        found -= begins
+        found *= (np.minimum(k, self.lasts) - low)[:, :, None]
+        found += begins
+        return found
+
+    def last_legs(self) -> Array:
+        """Return the differences (N, 3) of the last two points."""
+        last = (self._firsts + self.lasts)[:, 0]
+        return np.asarray(self._points.take(last, axis=0) - self._points.take(last - 1, axis=0))
 
 
 def resting(pos_ned_m: Array, t_utc_us: int, dt_us: int) -> Trajectory:
@@ -152,22 +182,22 @@ def joined(first: Trajectory, then: Trajectory, from_utc_us: int) -> Trajectory:
 
 def braking_displacement(vel_ned_m_s: Array, t_s: Array, brake_m_s2: float) -> Array:
     """Return displacements (K, 3) NED [m] at times (K,) after the begin of braking to rest from a velocity (3,)."""
-    return np.asarray(braking_displacements([vel_ned_m_s], t_s[None], brake_m_s2)[0])
+    speed = math.sqrt(float(vel_ned_m_s @ vel_ned_m_s))
+    direction = vel_ned_m_s / speed if speed >= _AT_REST_M_S else np.zeros(3)
+    return _braked_m(speed, t_s, brake_m_s2)[:, None] * direction
 
 
-def braking_displacements(velocities_ned_m_s: Sequence[Array], t_s: Array, brake_m_s2: float) -> Array:
-    """Return displacements (N, K, 3) NED [m] at times (N, K) after N velocities, (3,) each, begin to brake to rest."""
-    speeds = [math.sqrt(float(vel @ vel)) for vel in velocities_ned_m_s]
-    directions = np.array(
-        [
-            vel / speed if speed >= _AT_REST_M_S else _NOWHERE
-            for vel, speed in zip(velocities_ned_m_s, speeds, strict=True)
-        ]
-    )
-    speed = np.array(speeds)[:, None]
+def braking_displacements(vel_ned_m_s: Array, t_s: Array, brake_m_s2: float) -> Array:
+    """Return displacements (N, K, 3) NED [m] at times (N, K) after N velocities (N, 3) begin to brake to rest."""
+    speed = np.sqrt(np.einsum("nc,nc->n", vel_ned_m_s, vel_ned_m_s))[:, None]
+    directions = np.where(speed >= _AT_REST_M_S, vel_ned_m_s / np.maximum(speed, _AT_REST_M_S), 0.0)
+    return np.asarray(_braked_m(speed, t_s, brake_m_s2)[:, :, None] * directions[:, None])
+
+
+def _braked_m(speed: Array | float, t_s: Array, brake_m_s2: float) -> Array:
+    """Return the distances [m] at times after the begin of braking to rest."""
     t_s = np.minimum(np.maximum(t_s, 0.0), speed / brake_m_s2)
-    travelled_m = speed * t_s - 0.5 * brake_m_s2 * t_s * t_s
-    return np.asarray(travelled_m[:, :, None] * directions[:, None])
+    return np.asarray(speed * t_s - 0.5 * brake_m_s2 * t_s * t_s)
 
 
 def _brake(pos_ned_m: Array, vel_ned_m_s: Array, dt_s: float, brake_m_s2: float) -> tuple[Array, Array]:

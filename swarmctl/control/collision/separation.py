@@ -9,7 +9,7 @@ prediction.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -20,7 +20,7 @@ from swarmctl.control.collision.budget import SeparationBudget
 from swarmctl.control.mpc.axes import HalfSpaces
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.params import Params
-from swarmctl.core.trajectory import braking_displacements, interpolate
+from swarmctl.core.trajectory import Polylines, braking_displacements, grid
 from swarmctl.core.types import Array, PredictedPath
 
 _TINY_M = 1e-6
@@ -95,6 +95,52 @@ class KeepOut:
         return math.dist(self.pos_ned_m[0, :axes], pos_ned_m[:axes])
 
 
+class KeepOuts(tuple[KeepOut, ...]):
+    """Several keep-outs, and what is computed of all of them at once, stacked.
+
+    Args:
+        keep_outs: with equal numbers of positions.
+        pos_ned_m: these positions, if they are stacked already.
+
+    Attributes:
+        pos_ned_m: (S, Hp+1, 3).
+        radius_m, hard_min_distance_m, vertical_01: (S, 1).
+        obstacles: indices of those that are no peers.
+    """
+
+    pos_ned_m: Array
+    radius_m: Array
+    hard_min_distance_m: Array
+    vertical_01: Array
+    obstacles: list[int]
+
+    def __new__(cls, keep_outs: Iterable[KeepOut] = (), pos_ned_m: Array | None = None) -> KeepOuts:
+        found = super().__new__(cls, keep_outs)
+        if not found:
+            return found
+        if pos_ned_m is None:
+            pos_ned_m = np.concatenate([k.pos_ned_m for k in found]).reshape(len(found), -1, 3)
+        found.pos_ned_m = pos_ned_m
+        numbers = np.array([(k.radius_m, k.hard_min_distance_m, k.vertical_01) for k in found])
+        found.radius_m, found.hard_min_distance_m, found.vertical_01 = numbers[:, :1], numbers[:, 1:2], numbers[:, 2:]
+        found.obstacles = [i for i, k in enumerate(found) if k.priority_id < 0]
+        return found
+
+    def apart(self, path_ned_m: Array) -> Array:
+        """Return the way (S, Hp+1, 3) from each of them to a path (Hp+1, 3), heights as they count."""
+        apart = path_ned_m - self.pos_ned_m
+        apart[:, :, 2] *= self.vertical_01
+        return apart
+
+
+NO_KEEP_OUTS = KeepOuts()
+
+
+def stacked(keep_outs: Iterable[KeepOut]) -> KeepOuts:
+    """Return keep-outs as such, stacked if they are not yet."""
+    return keep_outs if isinstance(keep_outs, KeepOuts) else KeepOuts(keep_outs)
+
+
 def radius_problem(params: SeparationParams, accuracy_m: float, drift_m: float) -> str:
     """Say why the radius is too small, and what to do; "" when it is large enough or allowed.
 
@@ -127,16 +173,14 @@ def aligned(paths: Sequence[PredictedPath], t0_utc_us: int, dt_us: int, steps: i
     """
     since = np.array([(t0_utc_us - path.t0_utc_us) / path.dt_us for path in paths])[:, None]
     pace = np.array([dt_us / path.dt_us for path in paths])[:, None]
-    k = since + np.arange(steps + 1) * pace  # (N, steps+1) in points
-    found = interpolate([path.pos_ned_m for path in paths], k)
-    beyond = k - np.array([len(path.pos_ned_m) - 1 for path in paths])[:, None]
-    ended = [i for i, last in enumerate(beyond[:, -1].tolist()) if last > 0.0]
-    if ended:
-        steps_s = [paths[i].dt_us * 1e-6 for i in ended]
-        last_vels = [
-            (paths[i].pos_ned_m[-1] - paths[i].pos_ned_m[-2]) / dt_s for i, dt_s in zip(ended, steps_s, strict=True)
-        ]
-        found[ended] += braking_displacements(last_vels, beyond[ended] * np.array(steps_s)[:, None], brake_m_s2)
+    k = since + grid(steps) * pace  # (N, steps+1) in points
+    known = Polylines([path.pos_ned_m for path in paths])
+    found = known.at(k)
+    if (k[:, -1:] > known.lasts).any():
+        tail = max(0, math.floor(((known.lasts - since) / pace).min()))  # first column in which a path has ended
+        steps_s = np.array([path.dt_us * 1e-6 for path in paths])[:, None]
+        beyond_s = (k[:, tail:] - known.lasts) * steps_s
+        found[:, tail:] += braking_displacements(known.last_legs() / steps_s, beyond_s, brake_m_s2)
     return found
 
 
@@ -149,7 +193,6 @@ def keep_out_of_peer(
     params: SeparationParams,
     parked: bool = False,
     landing: bool = False,
-    points: Array | None = None,
 ) -> KeepOut:
     """Return the keep-out of one peer.
 
@@ -159,12 +202,28 @@ def keep_out_of_peer(
         params: distance and margins.
         parked: whether the peer has landed, so that its margin does not grow with age.
         landing: whether either vehicle is about to descend, so that the keep-out holds at every height.
-        points: result of `align`, if it is known already.
+    """
+    points = align(path, t0_utc_us, dt_us, steps, brake_m_s2=params.brake_m_s2)
+    return keep_out_along(path, points, t0_utc_us, params, params.budget, parked=parked, landing=landing)
+
+
+def keep_out_along(
+    path: PredictedPath,
+    points_ned_m: Array,
+    t0_utc_us: int,
+    params: SeparationParams,
+    budget: SeparationBudget,
+    *,
+    parked: bool,
+    landing: bool,
+) -> KeepOut:
+    """Return the keep-out of one peer whose positions (steps+1, 3) from `t0_utc_us` on are known already.
+
+    Otherwise as `keep_out_of_peer`; `budget` is that of `params`.
     """
     age_s = max(0.0, (t0_utc_us - path.t0_utc_us) * 1e-6)
-    budget = params.budget
     return KeepOut(
-        pos_ned_m=align(path, t0_utc_us, dt_us, steps, brake_m_s2=params.brake_m_s2) if points is None else points,
+        pos_ned_m=points_ned_m,
         radius_m=budget.planned_peer_m(path.margin_m, budget.age_margin_m(age_s, parked)),
         hard_min_distance_m=budget.certified_peer_m(path.margin_m),
         any_height=landing or (age_s > params.lost_after_s and not parked),
@@ -227,50 +286,69 @@ def half_spaces(
     """
     if not keep_outs:
         return None
-    axes = len(goal_m)
-    others = np.stack([k.pos_ned_m for k in keep_outs])[:, 1:]  # (keep-outs, Hp, 3)
-    radius = np.array([k.radius_m for k in keep_outs])
-    apart = guess_ned_m[1:] - others  # (keep-outs, Hp, 3)
-    vertical_01 = np.array([k.vertical_01 for k in keep_outs])[:, None]
-    apart[:, :, 2] *= vertical_01
-    below_m = apart[:, :, 2] if axes == 2 else np.zeros(apart.shape[:2])
-    kept_m = radius[:, None] + (_approach_m(keep_outs, guess_ned_m[0], apart, params) if params.approach_01 else 0.0)
-    needed = np.sqrt(np.maximum(kept_m**2 - below_m**2, 0.0))  # (keep-outs, Hp)
-    apart, others = apart[:, :, :axes], others[:, :, :axes]
+    known, axes = stacked(keep_outs), len(goal_m)
+    scaled, others = known.apart(guess_ned_m)[:, 1:], known.pos_ned_m[:, 1:, :axes]  # (keep-outs, Hp, .)
+    kept_m = known.radius_m
+    if params.approach_01:
+        kept_m = kept_m + _approach_m(known, guess_ned_m[0], scaled, params)
+    apart, needed2 = scaled[:, :, :axes], kept_m**2
+    if axes == 2:
+        needed2 = np.maximum(needed2 - scaled[:, :, 2] ** 2, 0.0)
+    needed = np.sqrt(needed2)  # (keep-outs, Hp), in space perhaps (keep-outs, 1)
     distance = np.sqrt(np.einsum("skc,skc->sk", apart, apart))
-    side = np.zeros((len(keep_outs), 1, axes))
-    side[:, 0, 0] = [1.0 if own_priority_id > k.priority_id else -1.0 for k in keep_outs]
-    normal = np.where(distance[:, :, None] < _TINY_M, side, apart / np.maximum(distance, _TINY_M)[:, :, None])
+    normal = apart / np.maximum(distance, _TINY_M)[:, :, None]
+    if distance.min() < _TINY_M:
+        _part_coincident(normal, distance, [own_priority_id > k.priority_id for k in known])
     moved = math.dist(guess_ned_m[-1, :axes], guess_ned_m[0, :axes])
-    stuck = min(1.0, max(0.0, 2.0 - moved / params.stuck_m))
-    to_goal = goal_m - guess_ned_m[1:, :axes]  # (Hp, axes)
-    across = (
-        to_goal[:, 0] * normal[:, :, 1] - to_goal[:, 1] * normal[:, :, 0]
-    )  # (max_keep_outs, Hp), > 0: keep-out on the left
-    angle_rad = np.full(distance.shape, params.right_of_way_rad * stuck)
-    is_obstacle = np.array([k.priority_id < 0 for k in keep_outs])
-    angle_rad[is_obstacle] = params.right_of_way_obstacle_rad * np.where(across[is_obstacle] > 0.0, -1.0, 1.0)
-    normal = _with_right_of_way(normal, distance, needed, to_goal, angle_rad=angle_rad)
+    stuck_01 = min(1.0, max(0.0, 2.0 - moved / params.stuck_m))
+    if stuck_01 or known.obstacles:
+        to_goal = goal_m - guess_ned_m[1:, :axes]  # (Hp, axes)
+        angle_rad = _largest_turns(normal, to_goal, known.obstacles, stuck_01, params)
+        normal = _with_right_of_way(normal, distance, needed, to_goal, angle_rad=angle_rad)
     if axes == 3:
-        normal[:, :, 2] *= vertical_01  # back from scaled to true heights
+        normal[:, :, 2] *= known.vertical_01  # back from scaled to true heights
     offset = np.einsum("skc,skc->sk", normal, others) + needed
     idle = (needed <= 0.0) | (distance > needed + params.gate_m)
-    ends = (others[:, -1] - others[:, -2]) / dt_s  # (max_keep_outs, axes) velocity of each keep-out at the end
-    closing = -np.einsum("sc,sc->s", normal[:, -1], vel_m_s - ends)
+    last = normal[:, -1]  # (keep-outs, axes)
+    ends = (others[:, -1] - others[:, -2]) / dt_s  # (keep-outs, axes) velocity of each keep-out at the end
+    closing = -np.einsum("sc,sc->s", last, vel_m_s - ends)
     stop_s = np.maximum(closing, 0.0) / (2.0 * params.stop_m_s2)
-    squeezed = np.array([k.downwash > 1.0 and not k.any_height for k in keep_outs])
-    if squeezed.any():  # braking is scaled likewise
-        stop_s[squeezed] /= np.maximum(np.linalg.norm(normal[squeezed, -1], axis=1), _TINY_M)
-    stop_offset = offset[:, -1] + stop_s * np.einsum("sc,sc->s", normal[:, -1], ends)
-    return HalfSpaces(
-        normal=normal,
-        offset_m=np.where(idle, -np.inf, offset),
-        stop_s=stop_s,
-        stop_offset_m=np.where(idle[:, -1], -np.inf, stop_offset),
-    )
+    squeezed = [i for i, k in enumerate(known) if k.downwash > 1.0 and not k.any_height]
+    if squeezed:  # braking is scaled likewise
+        stop_s[squeezed] /= np.maximum(np.linalg.norm(last[squeezed], axis=1), _TINY_M)
+    stop_offset = offset[:, -1] + stop_s * np.einsum("sc,sc->s", last, ends)
+    offset[idle] = -np.inf
+    stop_offset[idle[:, -1]] = -np.inf
+    return HalfSpaces(normal=normal, offset_m=offset, stop_s=stop_s, stop_offset_m=stop_offset)
 
 
-def _approach_m(keep_outs: Sequence[KeepOut], here_ned_m: Array, apart: Array, params: SeparationParams) -> Array:
+def _part_coincident(normal: Array, distance: Array, has_priority: Sequence[bool]) -> None:
+    """Set normals (slots, Hp, axes) where distances (slots, Hp) have no direction: sideways, by priority."""
+    sides = np.zeros((len(normal), 1, normal.shape[2]))
+    sides[:, 0, 0] = np.where(has_priority, 1.0, -1.0)
+    np.copyto(normal, sides, where=(distance < _TINY_M)[:, :, None])
+
+
+def _largest_turns(
+    normal: Array, to_goal: Array, obstacles: Sequence[int], stuck_01: float, params: SeparationParams
+) -> Array:
+    """Return the largest turn (slots, Hp) of each normal (slots, Hp, axes): of obstacles away from the side it is on.
+
+    Args:
+        normal: unit vectors from keep-outs to the guess.
+        to_goal: (Hp, axes) from the guess to the goal.
+        obstacles: slots of obstacles.
+        stuck_01: how far the own plan is stuck.
+        params: angles.
+    """
+    angle_rad = np.full(normal.shape[:2], params.right_of_way_rad * stuck_01)
+    if obstacles:
+        across = to_goal[:, 0] * normal[obstacles, :, 1] - to_goal[:, 1] * normal[obstacles, :, 0]  # > 0: on the left
+        angle_rad[obstacles] = params.right_of_way_obstacle_rad * np.where(across > 0.0, -1.0, 1.0)
+    return angle_rad
+
+
+def _approach_m(keep_outs: KeepOuts, here_ned_m: Array, apart: Array, params: SeparationParams) -> Array:
     """Return the distance (keep-outs, Hp) kept beyond the constraint's from peers that come closer than they are now.
 
     Prediction errors grow with the relative motion still to be flown: tilt is answered with a few per cent less and
@@ -284,7 +362,7 @@ def _approach_m(keep_outs: Sequence[KeepOut], here_ned_m: Array, apart: Array, p
     """
     now_m = np.array([k.apart_m(here_ned_m) for k in keep_outs])[:, None]
     closing_m = np.maximum(now_m - np.sqrt(np.einsum("skc,skc->sk", apart, apart)), 0.0)
-    closing_m[[k.priority_id < 0 for k in keep_outs]] = 0.0
+    closing_m[keep_outs.obstacles] = 0.0
     return np.asarray(np.minimum(params.approach_01 * closing_m, params.approach_max_m))
 
 
@@ -330,18 +408,27 @@ def certify(
     """
     if not keep_outs:
         return math.inf
-    others = np.stack([k.pos_ned_m for k in keep_outs])  # (m, Hp+1, 3)
-    apart = path_ned_m - others
-    apart[:, :, 2] *= np.array([k.vertical_01 for k in keep_outs])[:, None]
-    step = apart[:, 1:] - apart[:, :-1]
+    known = stacked(keep_outs)
+    apart = known.apart(path_ned_m)
+    begins = apart[:, :-1]
+    step = apart[:, 1:] - begins
     length2 = np.maximum(np.einsum("mkc,mkc->mk", step, step), 1e-18)
-    nearest = np.minimum(np.maximum(-np.einsum("mkc,mkc->mk", apart[:, :-1], step) / length2, 0.0), 1.0)
-    closest = apart[:, :-1] + nearest[:, :, None] * step  # closest point of each relative segment to the origin
-    distance = np.sqrt(np.einsum("mkc,mkc->mk", closest, closest))  # (m, Hp)
-    now = np.sqrt(np.einsum("mc,mc->m", apart[:, 0], apart[:, 0]))
-    later = distance[:, min(from_step, distance.shape[1] - 1) :].min(axis=1)
-    allowed = np.array([k.hard_min_distance_m for k in keep_outs])
-    entered = [now_m if k.entered_m is None else k.entered_m for k, now_m in zip(keep_outs, now, strict=True)]
-    least = np.minimum(now, np.array(entered) - approach_m)
-    margin = np.where((now < allowed) & (later >= least - _TINY_M), 0.0, later - allowed)
-    return float(margin.min())
+    nearest = np.minimum(np.maximum(-np.einsum("mkc,mkc->mk", begins, step) / length2, 0.0), 1.0)
+    step *= nearest[:, :, None]
+    step += begins  # the point of each relative segment that is closest to the origin
+    distance2_m2 = np.einsum("mkc,mkc->mk", step, step)  # (m, Hp)
+    later2_m2 = distance2_m2[:, min(from_step, distance2_m2.shape[1] - 1) :].min(axis=1)
+    now2_m2 = np.einsum("mc,mc->m", apart[:, 0], apart[:, 0])
+    squares = zip(known, now2_m2.tolist(), later2_m2.tolist(), strict=True)
+    margins_m = [_margin_m(k, math.sqrt(now2), math.sqrt(later2), approach_m) for k, now2, later2 in squares]
+    return float(np.array(margins_m).min())  # NaN if any is
+
+
+def _margin_m(keep_out: KeepOut, now_m: float, later_m: float, approach_m: float) -> float:
+    """Return the margin of a path to one keep-out that is `now_m` away, and later at least `later_m`."""
+    allowed_m = keep_out.hard_min_distance_m
+    if now_m < allowed_m:
+        entered_m = now_m if keep_out.entered_m is None else keep_out.entered_m
+        if later_m >= min(now_m, entered_m - approach_m) - _TINY_M:
+            return 0.0
+    return later_m - allowed_m

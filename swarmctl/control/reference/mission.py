@@ -135,7 +135,8 @@ class MissionReference:
     def sample(self, t_s: Array) -> tuple[Array, Array]:
         """Return positions and velocities, (K, 3) NED each, at mission times `t_s` (K,); at rest before 0."""
         pos, vel = self._sampled(np.maximum(t_s, 0.0))
-        vel[t_s < 0.0] = 0.0
+        if t_s.min() < 0.0:
+            vel[t_s < 0.0] = 0.0
         return pos + self.offset_ned_m, vel
 
     def yaw_rad(self, t_s: Array) -> Array:
