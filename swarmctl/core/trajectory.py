@@ -40,14 +40,15 @@ class Trajectory:
         k = (np.asarray(t_utc_us, np.float64) - self.t0_utc_us) / self.dt_us
         k = np.minimum(np.maximum(k, 0.0), last)
         low = np.minimum(k.astype(int), last - 1)
-        high, s = low + 1, (k - low)[:, None]
-        p0, p1 = self.pos_ned_m.take(low, axis=0), self.pos_ned_m.take(high, axis=0)
-        v0, v1 = self.vel_ned_m_s.take(low, axis=0) * dt_s, self.vel_ned_m_s.take(high, axis=0) * dt_s
-        ends, rise = 2.0 * (p0 - p1) + v0 + v1, 3.0 * (p1 - p0) - 2.0 * v0 - v1
+        s = (k - low)[:, None]
+        p0, v0 = self.pos_ned_m.take(low, axis=0), self.vel_ned_m_s.take(low, axis=0) * dt_s
+        back, v1 = p0 - self.pos_ned_m[1:].take(low, axis=0), self.vel_ned_m_s[1:].take(low, axis=0) * dt_s
+        ends, rise = 2.0 * back + v0 + v1, -3.0 * back - 2.0 * v0 - v1
         pos = ((ends * s + rise) * s + v0) * s + p0
         vel = ((3.0 * ends * s + 2.0 * rise) * s + v0) / dt_s
-        inside = ((t_utc_us >= self.t0_utc_us) & (t_utc_us <= self.end_utc_us))[:, None]
-        return pos, np.where(inside, vel, 0.0)
+        outside = (t_utc_us < self.t0_utc_us) | (t_utc_us > self.end_utc_us)
+        vel[outside] = 0.0
+        return pos, vel
 
     def at(self, t_utc_us: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Return position and velocity, (3,) each, at one time; faster than `sample` for one."""
@@ -99,16 +100,11 @@ class Polylines:
 
     Args:
         corners: at least 2 of each, (K, 3).
-
-    Attributes:
-        lasts: (N, 1) indices of their last points.
     """
 
     def __init__(self, corners: Sequence[Array]) -> None:
-        counts = [len(points) for points in corners]
         self._points = corners[0] if len(corners) == 1 else np.concatenate(corners)
-        self._firsts = np.array([0, *accumulate(counts[:-1])])[:, None]  # (N, 1) in all points
-        self.lasts = np.array(counts)[:, None] - 1
+        self._firsts, self.lasts = _layout(tuple(map(len, corners)))
 
     def at(self, k: Array) -> Array:
         """Return positions (N, M, 3) at fractional indices (N, M), by linear interpolation.
@@ -126,8 +122,19 @@ class Polylines:
 
     def last_legs(self) -> Array:
         """Return the differences (N, 3) of the last two points."""
-        last = (self._firsts + self.lasts)[:, 0]
-        return np.asarray(self._points.take(last, axis=0) - self._points.take(last - 1, axis=0))
+        before = (self._firsts + self.lasts)[:, 0] - 1
+        return np.asarray(self._points[1:].take(before, axis=0) - self._points.take(before, axis=0))
+
+
+@lru_cache(maxsize=256)
+def _layout(counts: tuple[int, ...]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the indices of the first points of polylines in all points, and of their last points in their own.
+
+    Both are (N, 1) and read-only; `counts` are the numbers of points.
+    """
+    firsts, lasts = np.array([0, *accumulate(counts[:-1])])[:, None], np.array(counts)[:, None] - 1
+    firsts.flags.writeable = lasts.flags.writeable = False
+    return firsts, lasts
 
 
 def resting(pos_ned_m: Array, t_utc_us: int, dt_us: int) -> Trajectory:
@@ -190,7 +197,8 @@ def braking_displacement(vel_ned_m_s: Array, t_s: Array, brake_m_s2: float) -> A
 def braking_displacements(vel_ned_m_s: Array, t_s: Array, brake_m_s2: float) -> Array:
     """Return displacements (N, K, 3) NED [m] at times (N, K) after N velocities (N, 3) begin to brake to rest."""
     speed = np.sqrt(np.einsum("nc,nc->n", vel_ned_m_s, vel_ned_m_s))[:, None]
-    directions = np.where(speed >= _AT_REST_M_S, vel_ned_m_s / np.maximum(speed, _AT_REST_M_S), 0.0)
+    directions = vel_ned_m_s / np.maximum(speed, _AT_REST_M_S)
+    speed[speed < _AT_REST_M_S] = 0.0
     return np.asarray(_braked_m(speed, t_s, brake_m_s2)[:, :, None] * directions[:, None])
 
 

@@ -20,7 +20,7 @@ from swarmctl.control.collision.budget import SeparationBudget
 from swarmctl.control.mpc.axes import HalfSpaces
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.params import Params
-from swarmctl.core.trajectory import Polylines, braking_displacements, grid
+from swarmctl.core.trajectory import Polylines, braking_displacement, braking_displacements, grid
 from swarmctl.core.types import Array, PredictedPath
 
 _TINY_M = 1e-6
@@ -162,7 +162,19 @@ def radius_problem(params: SeparationParams, accuracy_m: float, drift_m: float) 
 
 def align(path: PredictedPath, t0_utc_us: int, dt_us: int, steps: int, *, brake_m_s2: float) -> Array:
     """Return positions (steps+1, 3) of one peer at `t0_utc_us + k dt_us`; see `aligned`."""
-    return np.asarray(aligned([path], t0_utc_us, dt_us, steps, brake_m_s2=brake_m_s2)[0])
+    points, dt_s, last = path.pos_ned_m, path.dt_us * 1e-6, len(path.pos_ned_m) - 1
+    since, pace = (t0_utc_us - path.t0_utc_us) / path.dt_us, dt_us / path.dt_us
+    k = since + grid(steps) * pace  # (steps+1,) in points
+    low = np.minimum(np.maximum(k.astype(np.int64), 0), last - 1)
+    begins = points.take(low, axis=0)
+    found: Array = points[1:].take(low, axis=0)
+    found -= begins
+    found *= (np.minimum(k, last) - low)[:, None]
+    found += begins
+    if since + steps * pace > last:
+        tail = max(0, math.floor((last - since) / pace))
+        found[tail:] += braking_displacement((points[-1] - points[-2]) / dt_s, (k[tail:] - last) * dt_s, brake_m_s2)
+    return found
 
 
 def aligned(paths: Sequence[PredictedPath], t0_utc_us: int, dt_us: int, steps: int, *, brake_m_s2: float) -> Array:
@@ -171,13 +183,14 @@ def aligned(paths: Sequence[PredictedPath], t0_utc_us: int, dt_us: int, steps: i
     Paths are interpolated, then continued by braking to a stop. Times before the first point are extrapolated
     backwards along the first segment.
     """
-    since = np.array([(t0_utc_us - path.t0_utc_us) / path.dt_us for path in paths])[:, None]
-    pace = np.array([dt_us / path.dt_us for path in paths])[:, None]
-    k = since + grid(steps) * pace  # (N, steps+1) in points
+    sinces = [(t0_utc_us - path.t0_utc_us) / path.dt_us for path in paths]  # in points, as all numbers of steps here
+    paces = [dt_us / path.dt_us for path in paths]
+    k = np.array(sinces)[:, None] + grid(steps) * np.array(paces)[:, None]  # (N, steps+1)
     known = Polylines([path.pos_ned_m for path in paths])
     found = known.at(k)
-    if (k[:, -1:] > known.lasts).any():
-        tail = max(0, math.floor(((known.lasts - since) / pace).min()))  # first column in which a path has ended
+    ends = min((len(p.pos_ned_m) - 1 - s) / pace for p, s, pace in zip(paths, sinces, paces, strict=True))
+    if ends <= steps:
+        tail = max(0, math.floor(ends))  # from where on some path is continued
         steps_s = np.array([path.dt_us * 1e-6 for path in paths])[:, None]
         beyond_s = (k[:, tail:] - known.lasts) * steps_s
         found[:, tail:] += braking_displacements(known.last_legs() / steps_s, beyond_s, brake_m_s2)
