@@ -41,6 +41,8 @@ class PathSharing:
         if not self._is_due(path):
             return None
         self._shared = path
+        if not self._params.error_m:
+            return path
         return replace(path, margin_m=min(MAX_MARGIN_M, path.margin_m + self._params.error_m))
 
     def _is_due(self, path: PredictedPath) -> bool:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Iterable
 
 import numpy as np
 from pydantic import Field
@@ -94,63 +93,79 @@ class Predictor:
         """Forget remembered commands, after a handover."""
         self._sent.clear()
 
+    def acting(self, t_us: int) -> Array | None:
+        """Return the virtual controls (3,) that act at `t_us`; None before the first."""
+        acting = None
+        for start_us, virtual_control in self._sent:
+            if start_us > t_us:
+                break
+            acting = virtual_control
+        return acting
+
     def start(self, state: VehicleState, until_us: int, disturbance_ned_m_s2: Array, held: Array) -> Start:
         """Return the start of a plan that acts from `until_us` on, after `held` (3,) was commanded last.
 
         The remembered commands act one after the other, each from its own time. Before the first one the vehicle is
         assumed to compensate the disturbance.
         """
-        t_us, sent = state.t_us, self._sent
-        while len(sent) > 1 and sent[1][0] <= t_us:
-            sent.popleft()  # time does not go back
-        motion = _Motion(state, disturbance_ned_m_s2, self._lag, self._drag_1_s)
-        current = sent[0][1].tolist() if sent else None
-        for start_us, virtual_control in sent:
-            if start_us >= until_us:
-                break
+        moved, t_us = _Motion(state, self._lag, self._drag_1_s, disturbance_ned_m_s2), state.t_us
+        acting = self._acting_from(t_us)
+        current = acting[0][1] if acting else None
+        for start_us, virtual_control in acting:
             if start_us > t_us:
-                motion.advance(current, start_us - t_us)
+                if start_us >= until_us:
+                    break
+                moved.advance(current, start_us - t_us)
                 t_us = start_us
-            current = virtual_control.tolist()
-        motion.advance(current, max(0, until_us - t_us))
-        return motion.start(until_us, held)
+            current = virtual_control
+        moved.advance(current, max(0, until_us - t_us))
+        return moved.start(until_us, held)
+
+    def _acting_from(self, t_us: int) -> list[tuple[int, Array]]:
+        """Return the command that acts at `t_us`, or before all the oldest one, and those that act after it."""
+        found = []
+        for sent in reversed(self._sent):
+            found.append(sent)
+            if sent[0] <= t_us:
+                break
+        found.reverse()
+        return found
 
 
 class _Motion:
-    """Moves by the model from a measured state on, held command by held command; in plain numbers, which are few."""
+    """The predicted motion of a vehicle, in plain numbers: there are too few for arrays to pay."""
 
-    def __init__(self, state: VehicleState, disturbance_ned_m_s2: Array, lag: Lag | None, drag_1_s: float) -> None:
+    def __init__(self, state: VehicleState, lag: Lag | None, drag_1_s: float, disturbance_ned_m_s2: Array) -> None:
         self._pos, self._vel = state.pos_ned_m.tolist(), state.vel_ned_m_s.tolist()
-        self._disturbance, self._lag, self._drag_1_s = disturbance_ned_m_s2.tolist(), lag, drag_1_s
         *self._tilt, self._down = body_z_ned(state.q_nb).tolist()
         self._rate = [0.0, 0.0] if lag is None else tilt_rate(state).tolist()
+        self._lag, self._drag_1_s, self._disturbance = lag, drag_1_s, disturbance_ned_m_s2.tolist()
 
-    def advance(self, command: list[float] | None, for_us: int) -> None:
-        """Move by a time in which a command acts; None: one that compensates the disturbance."""
+    def advance(self, command: Array | None, for_us: int) -> None:
+        """Move on under a command (3,); without one, at constant velocity."""
         dt_s = for_us * 1e-6
         if command is None:
             self._pos = [p + v * dt_s for p, v in zip(self._pos, self._vel, strict=True)]
             return
-        ux, uy, thrust = command
+        ux, uy, thrust = command.tolist()
         if self._lag is not None and for_us > 0:
-            self._tilt[0], self._rate[0], x_s = self._lag.advance(self._tilt[0], self._rate[0], ux, dt_s)
-            self._tilt[1], self._rate[1], y_s = self._lag.advance(self._tilt[1], self._rate[1], uy, dt_s)
-            ux, uy = x_s / dt_s, y_s / dt_s
-        for i, (pushed, disturbed) in enumerate(zip(acceleration((ux, uy, thrust)), self._disturbance, strict=True)):
-            pos, vel, accel = self._pos[i], self._vel[i], pushed + disturbed
-            self._pos[i], self._vel[i] = _moved(pos, vel, accel, self._drag_1_s, dt_s=dt_s)
+            ends = [self._lag.advance(*now, dt_s) for now in zip(self._tilt, self._rate, (ux, uy), strict=True)]
+            self._tilt, self._rate = [end[0] for end in ends], [end[1] for end in ends]
+            ux, uy = ends[0][2] / dt_s, ends[1][2] / dt_s
+        accel = [a + d for a, d in zip(_acceleration(ux, uy, thrust), self._disturbance, strict=True)]
+        self._pos, self._vel = _moved(self._pos, self._vel, accel, self._drag_1_s, dt_s=dt_s)
 
     def start(self, t_us: int, held: Array) -> Start:
-        """Return where a plan begins that acts from now on, after `held` (3,) was commanded last."""
+        """Return the start of a plan from here on, after `held` (3,) was commanded last."""
         pos, vel = np.array(self._pos), np.array(self._vel)
         if self._lag is None:
             return Start(t_us=t_us, pos_ned_m=pos, vel_ned_m_s=vel, cos_tilt=self._down, virtual_control=held)
-        x, y = self._tilt
+        north, east = self._tilt
         return Start(
             t_us=t_us,
             pos_ned_m=pos,
             vel_ned_m_s=vel,
-            cos_tilt=math.sqrt(max(0.0, 1.0 - (x * x + y * y))),
+            cos_tilt=math.sqrt(max(0.0, 1.0 - (north * north + east * east))),
             virtual_control=held,
             tilt=np.array(self._tilt),
             tilt_rate_1_s=np.array(self._rate),
@@ -163,16 +178,24 @@ def tilt_rate(state: VehicleState) -> Array:
     return rotate_to_ned(state.q_nb, np.array([q, -p, 0.0]))[:2]
 
 
-def acceleration(virtual_control: Iterable[float]) -> tuple[float, float, float]:
-    """Return the acceleration NED [m/s2] of virtual controls (3,), gravity included (thesis 3.2)."""
-    ux, uy, thrust = virtual_control
+def acceleration(virtual_control: Array) -> Array:
+    """Return the acceleration (3,) NED [m/s2] of virtual_control controls (3,), gravity included (thesis 3.2)."""
+    return np.array(_acceleration(*virtual_control.tolist()))
+
+
+def _acceleration(ux: float, uy: float, thrust_m_s2: float) -> tuple[float, float, float]:
     down = max(0.0, 1.0 - ux * ux - uy * uy) ** 0.5
-    return -thrust * ux, -thrust * uy, GRAVITY_M_S2 - thrust * down
+    return -thrust_m_s2 * ux, -thrust_m_s2 * uy, GRAVITY_M_S2 - thrust_m_s2 * down
 
 
-def _moved(pos: float, vel: float, accel: float, drag_1_s: float, *, dt_s: float) -> tuple[float, float]:
-    if drag_1_s == 0.0:
-        return pos + vel * dt_s + (0.5 * dt_s * dt_s) * accel, vel + dt_s * accel
-    kept = math.exp(-drag_1_s * dt_s)
-    gained_s = (1.0 - kept) / drag_1_s
-    return pos + gained_s * vel + ((dt_s - gained_s) / drag_1_s) * accel, kept * vel + gained_s * accel
+def _moved(
+    pos: list[float], vel: list[float], accel: list[float], drag_1_s: float, *, dt_s: float
+) -> tuple[list[float], list[float]]:
+    """Return positions and velocities after `dt_s` of a held acceleration."""
+    kept, gained_s, fallen_s2 = 1.0, dt_s, 0.5 * dt_s * dt_s
+    if drag_1_s != 0.0:
+        kept = math.exp(-drag_1_s * dt_s)
+        gained_s = (1.0 - kept) / drag_1_s
+        fallen_s2 = (dt_s - gained_s) / drag_1_s
+    ends = [p + gained_s * v + fallen_s2 * a for p, v, a in zip(pos, vel, accel, strict=True)]
+    return ends, [kept * v + gained_s * a for v, a in zip(vel, accel, strict=True)]

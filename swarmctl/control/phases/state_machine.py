@@ -191,7 +191,7 @@ class MissionStateMachine:
         """Return the yaw of the mission's reference now; None while that is not followed."""
         if not self._follows_mission or self.begin_utc_us is None:
             return None
-        return float(self._reference.yaw_rad(np.array([self.mission_t_s(utc_us)]))[0])
+        return self._reference.yaw_at_rad(self.mission_t_s(utc_us))
 
     @property
     def _follows_mission(self) -> bool:

@@ -145,6 +145,10 @@ class MissionReference:
             return np.full(len(t_s), self._yaw_rad)
         return self._heading(np.maximum(t_s, 0.0))
 
+    def yaw_at_rad(self, t_s: float) -> float:
+        """Return the yaw at one mission time."""
+        return self._yaw_rad if self._heading is None else float(self.yaw_rad(np.array([t_s]))[0])
+
     def motion(self, t_s: Array) -> Motion:
         """Return the whole reference at mission times `t_s` (K,) >= 0; acceleration is the difference of velocities."""
         pos, vel = self.sample(t_s)

@@ -183,7 +183,7 @@ def test_a_vehicle_gets_away_from_one_that_is_too_close_and_does_not_fly_past_as
     for _ in range(50):
         found = filtered(barrier, HOVER, start(pos, vel, held), [peer])
         held = HOVER if found is None else found
-        accel = np.array(acceleration(held))
+        accel = acceleration(held)
         pos, vel = pos + DT_S * vel + 0.5 * DT_S**2 * accel, vel + DT_S * accel
     assert math.dist(pos, peer.pos_ned_m) > APART_M
 

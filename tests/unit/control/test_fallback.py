@@ -47,7 +47,7 @@ def test_stops_within_braking_distance_and_the_distance_lost_to_tilting(speed_m_
 
 def test_braking_pushes_against_the_motion() -> None:
     plan = brake((2.0, -1.0, 0.5))
-    wanted = np.array(acceleration(plan.virtual_control[20]))
+    wanted = acceleration(plan.virtual_control[20])
     assert wanted[0] < 0.0 < wanted[1]
     assert wanted[2] < 0.0  # sinking is braked upwards
     assert plan.status is PlanStatus.NONE
@@ -75,7 +75,7 @@ def test_the_published_path_is_the_motion_the_commands_cause() -> None:
     pos, vel = plan.pos_ned_m[0].copy(), plan.vel_ned_m_s[0].copy()
     worst = 0.0
     for k in range(STEPS):
-        accel = np.array(acceleration(plan.virtual_control[k])) + wind
+        accel = acceleration(plan.virtual_control[k]) + wind
         pos, vel = pos + DT_S * vel + 0.5 * DT_S**2 * accel, vel + DT_S * accel
         worst = max(worst, float(np.abs(pos - plan.pos_ned_m[k + 1])[:2].max()))
     assert worst < 1e-9
@@ -128,7 +128,7 @@ def flown(
         virtual_control = brake_and_hold_plan(begin, at, NO_WIND, believed, dt_us=DT_US, steps=2).virtual_control[0]
         ends = [true.advance(float(tilt[i]), float(rate[i]), float(virtual_control[i]), DT_S) for i in (0, 1)]
         tilt, rate = np.array([e[0] for e in ends]), np.array([e[1] for e in ends])
-        accel = np.array(acceleration([ends[0][2] / DT_S, ends[1][2] / DT_S, virtual_control[2]]))
+        accel = acceleration(np.array([ends[0][2] / DT_S, ends[1][2] / DT_S, virtual_control[2]]))
         pos, v, commanded = pos + DT_S * v + 0.5 * DT_S**2 * accel, v + DT_S * accel, virtual_control[:2]
         path.append(pos)
         speeds.append(v)
@@ -164,6 +164,6 @@ def test_the_published_path_is_the_one_a_lagging_vehicle_flies() -> None:
     for k, virtual_control in enumerate(plan.virtual_control):
         ends = [LAG.advance(float(tilt[i]), float(rate[i]), float(virtual_control[i]), DT_S) for i in (0, 1)]
         tilt, rate = np.array([e[0] for e in ends]), np.array([e[1] for e in ends])
-        accel = np.array(acceleration([ends[0][2] / DT_S, ends[1][2] / DT_S, virtual_control[2]]))
+        accel = acceleration(np.array([ends[0][2] / DT_S, ends[1][2] / DT_S, virtual_control[2]]))
         pos, vel = pos + DT_S * vel + 0.5 * DT_S**2 * accel, vel + DT_S * accel
         np.testing.assert_allclose(plan.pos_ned_m[k + 1, :2], pos[:2], atol=0.02)
