@@ -198,11 +198,11 @@ class AttitudeSetpoint:
 
         A zero or non-finite quaternion corrupts PX4's attitude controller until reboot, a NaN thrust stops its motors.
         """
-        q = self.q_nb
-        if q.shape != (4,) or not np.isfinite(q).all():
-            return f"quaternion {q.tolist()} is not finite"
-        if abs(float(q @ q) - 1.0) > 2e-3:
-            return f"quaternion {q.tolist()} is not of unit length"
+        q = self.q_nb.tolist()
+        if len(q) != 4 or not all(map(math.isfinite, q)):
+            return f"quaternion {q} is not finite"
+        if abs(math.fsum(c * c for c in q) - 1.0) > 2e-3:
+            return f"quaternion {q} is not of unit length"
         if not (math.isfinite(self.thrust_01) and 0.0 <= self.thrust_01 <= 1.0):
             return f"thrust {self.thrust_01} is outside 0..1"
         if now_us > self.valid_until_us:
