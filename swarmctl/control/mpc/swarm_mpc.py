@@ -16,14 +16,8 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from swarmctl.control.collision.separation import (
-    KeepOut,
-    KeepOuts,
-    SeparationParams,
-    certify,
-    half_spaces,
-    stacked,
-)
+from swarmctl.control.collision.half_spaces import half_spaces
+from swarmctl.control.collision.separation import KeepOut, KeepOuts, SeparationParams, certify, stacked
 from swarmctl.control.collision.volume_certificate import volume_margin_m
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, Axis, Faces, HalfSpaces, Horizon, Penalties, Terminal
