@@ -553,24 +553,16 @@ class Agent:
         margins_m = self._autopilot.frame.margin_m, self._overload.margin_m, self._directive.margin_m
         margin_m = min(MAX_MARGIN_M, sum(margins_m))
         if flown is not None:
-            t0_us, dt_us, pos = self._utc(flown.t0_us), flown.dt_us, flown.pos_ned_m
-            return PredictedPath(
-                agent=setup.agent,
-                boot_id=setup.boot_id,
-                seq=seq,
-                t0_utc_us=t0_us,
-                dt_us=dt_us,
-                margin_m=margin_m,
-                pos_ned_m=pos,
-            )
-        act_us, dt_us = self._clock.now_us() + self._predictor.delay_us, self._controller.dt_us
-        ahead_s = grid(self._controller.steps) * (dt_us * 1e-6) + (act_us - state.t_us) * 1e-6
-        pos = predict_constant_velocity(state, ahead_s, setup.separation.brake_m_s2)
+            t0_us, dt_us, pos = flown.t0_us, flown.dt_us, flown.pos_ned_m
+        else:
+            t0_us, dt_us = self._clock.now_us() + self._predictor.delay_us, self._controller.dt_us
+            ahead_s = grid(self._controller.steps) * (dt_us * 1e-6) + (t0_us - state.t_us) * 1e-6
+            pos = predict_constant_velocity(state, ahead_s, setup.separation.brake_m_s2)
         return PredictedPath(
             agent=setup.agent,
             boot_id=setup.boot_id,
             seq=seq,
-            t0_utc_us=self._utc(act_us),
+            t0_utc_us=self._utc(t0_us),
             dt_us=dt_us,
             margin_m=margin_m,
             pos_ned_m=pos,
