@@ -95,6 +95,27 @@ def grid(steps: int) -> Array:
     return found
 
 
+def interpolated(points: Array, k: Array, last: int | NDArray[np.int64], first: int | NDArray[np.int64] = 0) -> Array:
+    """Return positions (..., 3) at fractional indices k (...) into polylines, by linear interpolation.
+
+    Before the first point the first segment is extrapolated; after the last point the last point is returned.
+
+    Args:
+        points: (K, 3) of one polyline, or of several one behind the other.
+        k: counted from the first point of each.
+        last: index of the last point of each, counted likewise.
+        first: index of that first point.
+    """
+    low = np.minimum(np.maximum(k.astype(np.int64), 0), last - 1)
+    index = first + low
+    begins = points.take(index, axis=0)
+    found: Array = points[1:].take(index, axis=0)
+    found -= begins
+    found *= (np.minimum(k, last) - low)[..., None]
+    found += begins
+    return found
+
+
 class Polylines:
     """N polylines, interpolated all at once.
 
@@ -107,18 +128,8 @@ class Polylines:
         self._firsts, self.lasts = _layout(tuple(map(len, corners)))
 
     def at(self, k: Array) -> Array:
-        """Return positions (N, M, 3) at fractional indices (N, M), by linear interpolation.
-
-        Before the first point the first segment is extrapolated; after the last point the last point is returned.
-        """
-        low = np.minimum(np.maximum(k.astype(np.int64), 0), self.lasts - 1)
-        index = self._firsts + low
-        begins = self._points.take(index, axis=0)
-        found: Array = self._points[1:].take(index, axis=0)
-        found -= begins
-        found *= (np.minimum(k, self.lasts) - low)[:, :, None]
-        found += begins
-        return found
+        """Return positions (N, M, 3) at fractional indices (N, M); see `interpolated`."""
+        return interpolated(self._points, k, self.lasts, self._firsts)
 
     def last_legs(self) -> Array:
         """Return the differences (N, 3) of the last two points."""

@@ -18,7 +18,7 @@ from pydantic import Field
 from swarmctl.control.collision.budget import SeparationBudget
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.params import Params
-from swarmctl.core.trajectory import Polylines, braking_displacement, braking_displacements, grid
+from swarmctl.core.trajectory import Polylines, braking_displacement, braking_displacements, grid, interpolated
 from swarmctl.core.types import Array, PredictedPath
 
 _TINY_M = 1e-6
@@ -100,15 +100,14 @@ class KeepOuts(tuple[KeepOut, ...]):
         keep_outs: with equal numbers of positions.
         pos_ned_m: these positions, if they are stacked already.
 
-    Attributes:
+    Attributes, if there are any keep-outs:
         pos_ned_m: (S, Hp+1, 3).
-        radius_m, hard_min_distance_m, vertical_01: (S, 1).
+        radius_m, vertical_01: (S, 1).
         obstacles: indices of those that are no peers.
     """
 
     pos_ned_m: Array
     radius_m: Array
-    hard_min_distance_m: Array
     vertical_01: Array
     obstacles: list[int]
 
@@ -119,8 +118,8 @@ class KeepOuts(tuple[KeepOut, ...]):
         if pos_ned_m is None:
             pos_ned_m = np.concatenate([k.pos_ned_m for k in found]).reshape(len(found), -1, 3)
         found.pos_ned_m = pos_ned_m
-        numbers = np.array([(k.radius_m, k.hard_min_distance_m, k.vertical_01) for k in found])
-        found.radius_m, found.hard_min_distance_m, found.vertical_01 = numbers[:, :1], numbers[:, 1:2], numbers[:, 2:]
+        numbers = np.array([(k.radius_m, k.vertical_01) for k in found])
+        found.radius_m, found.vertical_01 = numbers[:, :1], numbers[:, 1:]
         found.obstacles = [i for i, k in enumerate(found) if k.priority_id < 0]
         return found
 
@@ -163,12 +162,7 @@ def align(path: PredictedPath, t0_utc_us: int, dt_us: int, steps: int, *, brake_
     points, dt_s, last = path.pos_ned_m, path.dt_us * 1e-6, len(path.pos_ned_m) - 1
     since, pace = (t0_utc_us - path.t0_utc_us) / path.dt_us, dt_us / path.dt_us
     k = since + grid(steps) * pace  # (steps+1,) in points
-    low = np.minimum(np.maximum(k.astype(np.int64), 0), last - 1)
-    begins = points.take(low, axis=0)
-    found: Array = points[1:].take(low, axis=0)
-    found -= begins
-    found *= (np.minimum(k, last) - low)[:, None]
-    found += begins
+    found = interpolated(points, k, last)
     if since + steps * pace > last:
         tail = max(0, math.floor((last - since) / pace))
         found[tail:] += braking_displacement((points[-1] - points[-2]) / dt_s, (k[tail:] - last) * dt_s, brake_m_s2)
