@@ -6,7 +6,6 @@ recorder are passed in. Everything it does, it does inside the tick.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from functools import partial
 from typing import Any
@@ -22,6 +21,7 @@ from swarmctl.agent.components import (
     make_state_machine,
 )
 from swarmctl.agent.controller_watch import ControllerWatch
+from swarmctl.agent.mode_selector import ModeSelector
 from swarmctl.agent.path_sharing import PathSharing
 from swarmctl.agent.reference_selector import ReferenceSelector
 from swarmctl.agent.separation_policy import SeparationDirective, SeparationInputs
@@ -34,15 +34,11 @@ from swarmctl.bus.path_messages import encode_path
 from swarmctl.bus.peers import Bus
 from swarmctl.bus.traffic import CountedBus
 from swarmctl.control.collision.encounters import Encounters
-from swarmctl.control.collision.separation import KeepOut, radius_problem
+from swarmctl.control.collision.separation import KeepOuts, radius_problem
 from swarmctl.control.estimation.accuracy import AccuracyMonitor
 from swarmctl.control.estimation.constant_velocity import predict_constant_velocity
-from swarmctl.control.fallback import brake_and_hold_plan
 from swarmctl.control.model import Predictor
-from swarmctl.control.mpc.plan_buffer import PlanBuffer
 from swarmctl.control.mpc.problem import Problem, Start
-from swarmctl.control.phases.endurance import Endurance
-from swarmctl.control.phases.failsafe import NOTHING_WORN, Escalation, FailsafeDecision, Response, decide, escalate
 from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.control.phases.overload import Level, Overload, SetpointStops
 from swarmctl.control.reference.heading import Heading
@@ -51,14 +47,12 @@ from swarmctl.core.clock import Clock
 from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned
 from swarmctl.core.operator_verbs import EXCLUDE, PEER, Order
 from swarmctl.core.tick_record import TickRecord, TickTiming
+from swarmctl.core.trajectory import grid
 from swarmctl.core.types import (
     MAX_MARGIN_M,
     NO_TIMES,
-    Array,
     AttitudeSetpoint,
     FlightMode,
-    Health,
-    Landed,
     Mode,
     Phase,
     Plan,
@@ -130,15 +124,21 @@ class Agent:
         self._safety_filter = make_safety_filter(setup, self._world_model, self._note, stopwatch_ns)
         self._state_machine = make_state_machine(setup)
         self._heading = Heading(setup.mission.yaw_rad)
-        self._reference_selector = ReferenceSelector(setup, self._state_machine, self._note)
-        self._decision = FailsafeDecision(Mode.IDLE, "")
-        self._virtual_control = np.array([0.0, 0.0, GRAVITY_M_S2])
-        self._plan_buffer = PlanBuffer(
-            setup.agent, self._controller.dt_us, self._controller.steps, setup.separation.brake_m_s2
+        ahead_us = np.arange(self._controller.longest + 1) * self._controller.dt_us  # (longest+1,)
+        self._horizon_us = self._predictor.delay_us + ahead_us
+        ahead_s = self._predictor.delay_us * 1e-6 + self._controller.dt_us * 1e-6 * grid(self._controller.longest)
+        self._reference_selector = ReferenceSelector(setup, self._state_machine, ahead_s, self._note)
+        self._alerts = Alerts()
+        self._modes = ModeSelector(
+            setup,
+            self._controller,
+            self._predictor.delay_us,
+            self._state_machine,
+            alerts=self._alerts,
+            note=self._note,
         )
+        self._virtual_control = np.array([0.0, 0.0, GRAVITY_M_S2])
         self._encounters = Encounters()
-        self._certified_us: int | None = None
-        self._hold_at: Array | None = None
         self._publisher = TelemetryPublisher(
             setup.agent,
             setup.boot_id,
@@ -162,10 +162,8 @@ class Agent:
         )
         self._gaps = self._jumps = 0  # setpoint gaps and estimate jumps already reported
         self._announced: tuple[Phase, Mode, FlightMode] | None = None
-        self._alerts = Alerts()
         self._accuracy = AccuracyMonitor()
         self._standby_us = 0
-        self._endurance, self._escalation = Endurance(setup.params.failsafe.window_s), NOTHING_WORN
         self._overload = Overload(setup.params.overload, round(1e6 / setup.params.rate_hz))
         self._stops = SetpointStops(round(1e6 / setup.params.rate_hz))
         self._done_us: int | None = None
@@ -248,8 +246,7 @@ class Agent:
         sensed_ns = self._stopwatch_ns()
         planning = self._plan(now_us, state)
         planned_ns = self._stopwatch_ns()
-        self._decide(now_us, state, planning)
-        flown = self._flown(state, planning)
+        flown = self._decide(now_us, state, planning)
         setpoint = self._act(now_us, flown, planning.start)
         sent_ns = self._stopwatch_ns()
         times = NO_TIMES if planning.plan is None else planning.plan.times
@@ -276,7 +273,7 @@ class Agent:
             state,
             planning,
             ControlOutput(
-                mode=self._decision.mode, flown=flown, setpoint=setpoint, safety_filter_acted=self._safety_filter.acts
+                mode=self._modes.mode, flown=flown, setpoint=setpoint, safety_filter_acted=self._safety_filter.acts
             ),
             state_machine=self._state_machine,
             estimate=self._observer.estimate,
@@ -341,7 +338,7 @@ class Agent:
     # -- plan ---------------------------------------------------------------------------------------------------------
 
     def _plan(self, now_us: int, state: VehicleState | None) -> PlanningResult:
-        if state is None or not self._fresh(now_us, state):
+        if state is None or not self._modes.is_fresh(now_us, state):
             # the autopilot flies the vehicle, on stale setpoints or by its failsafe
             self._directive = self._separation.wait(self._clock.utc_us(), state)
             return PlanningResult(start=None, plan=None, reference=None, keep_outs=[])
@@ -369,18 +366,17 @@ class Agent:
         flies = Phase.GOTO_START <= self._state_machine.phase <= Phase.GOTO_LAND
         if outside := self._volume_watch.update(now_us, state, flies and self._state_machine.had_control):
             self._alerts.put("volume", outside, now_us)
+        self._reference_selector.look_ahead(now_us, self._clock.utc_us())
         self._detect_deadlock(now_us, state, keep_outs, flies)
-        grid = np.arange(self._controller.longest + 1, dtype=np.float64)
-        ahead_s = self._predictor.delay_us * 1e-6 + dt_us * 1e-6 * grid
-        reference, now_ref = self._reference_selector.reference(now_us, self._clock.utc_us(), ahead_s)
+        reference, now_ref = self._reference_selector.reference()
         directive = self._directive = self._separate(now_us, state, keep_outs, flies)
         if not flies:
-            return PlanningResult(start=start, plan=None, reference=now_ref, keep_outs=keep_outs)
+            return PlanningResult(start=start, plan=None, reference=now_ref, keep_outs=list(keep_outs))
         if directive.alert:
             self._alerts.put("separation", directive.alert, now_us)
         if directive.reference is not None:
             reference = directive.reference
-        guess = self._plan_buffer.guess_ned_m(act_us)
+        guess = self._modes.guess_ned_m(act_us)
         controller = self._controller if self._state_machine.phase is Phase.TRACK else self._transit
         plan = controller.plan(
             Problem(
@@ -391,31 +387,30 @@ class Agent:
                 guess_ned_m=guess,
             )
         )
-        return PlanningResult(start=start, plan=plan, reference=now_ref, keep_outs=keep_outs)
+        return PlanningResult(start=start, plan=plan, reference=now_ref, keep_outs=list(keep_outs))
 
-    def _separate(self, now_us: int, state: VehicleState, keep_outs: list[KeepOut], flies: bool) -> SeparationDirective:
+    def _separate(self, now_us: int, state: VehicleState, keep_outs: KeepOuts, flies: bool) -> SeparationDirective:
         """Return this tick's directive; its reference begins where the setpoint acts."""
         utc_us = self._clock.utc_us()
-        if not (flies and self._state_machine.had_control) or self._decision.mode in _DEVIATING_MODES:
+        if not (flies and self._state_machine.had_control) or self._modes.mode in _DEVIATING_MODES:
             return self._separation.idle(utc_us, state, keep_outs)
-        act_us = utc_us + self._predictor.delay_us
         return self._separation.step(
             SeparationInputs(
                 utc_us=utc_us,
                 state=state,
                 phase=self._state_machine.phase,
                 desired=self._reference_selector.desired(now_us, utc_us),
-                horizon_utc_us=act_us + np.arange(self._controller.longest + 1) * self._controller.dt_us,
+                horizon_utc_us=utc_us + self._horizon_us,
                 keep_outs=keep_outs,
                 disturbance_ned_m_s2=self._observer.estimate.disturbance_ned_m_s2,
             )
         )
 
-    def _detect_deadlock(self, now_us: int, state: VehicleState, keep_outs: list[KeepOut], flies: bool) -> None:
+    def _detect_deadlock(self, now_us: int, state: VehicleState, keep_outs: KeepOuts, flies: bool) -> None:
         if not (flies and self._state_machine.had_control):
             self._reference_selector.reset(now_us)
             return
-        known = [*keep_outs, *self._directive.lost_peer_keep_outs]
+        known = (*keep_outs, *self._directive.lost_peer_keep_outs)
         landmarks = self._world_model.landmarks
         deadlock = self._reference_selector.update(
             now_us, self._clock.utc_us(), state.pos_ned_m, known, landmarks=landmarks
@@ -425,75 +420,22 @@ class Agent:
 
     # -- decide the mode, send ----------------------------------------------------------------------------------------
 
-    def _decide(self, now_us: int, state: VehicleState | None, planning: PlanningResult) -> None:
-        plan = planning.plan
-        if plan is None:
-            self._certified_us = now_us  # no plan was needed in this tick, so its absence is no failure
-        if plan is not None:
-            assert planning.start is not None
-            self._plan_buffer.take(
-                plan, planning.start, planning.keep_outs, partial(self._brake_and_hold, planning.start)
-            )
-        if plan is not None and plan.status is PlanStatus.OK:
-            self._certified_us = now_us
-        elif plan is not None:
+    def _decide(self, now_us: int, state: VehicleState | None, planning: PlanningResult) -> Plan | None:
+        """Decide the mode of the tick; return the plan that is flown in it, None when the autopilot flies."""
+        plan, disturbance_ned_m_s2 = planning.plan, self._observer.estimate.disturbance_ned_m_s2
+        if plan is not None and plan.status is not PlanStatus.OK:
             self._publisher.failed_plans += 1
             self._alerts.put("plan", f"plan {plan.status.name.lower()}", now_us)
         if failure := self._controller_watch.update(plan):
             self._alerts.put("controller", failure, now_us)
-        good = self._plan_buffer.plan
-        delay_us = self._predictor.delay_us
-        is_stale = state is not None and not self._fresh(now_us, state)
-        self._endurance.update(now_us, self._autopilot.health.battery_01, is_stale)
-        health = Health(
-            state_age_us=_NO_TIME_US if state is None else max(0, now_us - state.t_us),
-            armed=state is not None and state.armed,
-            mode=FlightMode.UNKNOWN if state is None else state.mode,
-            landed=Landed.UNKNOWN if state is None else state.landed,
-            autopilot_failsafe=state is not None and state.failsafe,
-            plan_status=PlanStatus.NONE if plan is None else plan.status,
-            last_good_plan_age_us=_NO_TIME_US if good is None else now_us + delay_us - good.t0_us,
-            planless_us=0 if self._certified_us is None else now_us - self._certified_us,
-            speed_m_s=0.0 if state is None else math.sqrt(float(state.vel_ned_m_s @ state.vel_ned_m_s)),
-            phase=self._state_machine.phase,
-            had_control=self._state_machine.had_control,
-            battery_01=self._endurance.battery_01,
-            link_lost_01=self._endurance.link_lost_01,
-            pilot_override=self._state_machine.pilot_override,
+        self._modes.update(
+            now_us,
+            state,
+            planning,
+            disturbance_ned_m_s2=disturbance_ned_m_s2,
+            battery_01=self._autopilot.health.battery_01,
         )
-        self._decision = decide(health, self._setup.params.failsafe)
-        self._report_escalation(now_us, escalate(health, self._setup.params.failsafe))
-
-    def _report_escalation(self, now_us: int, now: Escalation) -> None:
-        before, self._escalation = self._escalation, now
-        if now.response is not before.response:
-            self._note("escalation", response=now.response.name, reason=now.reason)
-        if now.response is not Response.NONE and self._state_machine.phase < Phase.DONE:
-            self._alerts.put("escalation", now.reason, now_us)
-
-    def _brake_and_hold(self, start: Start) -> Plan:
-        disturbance = self._observer.estimate.disturbance_ned_m_s2
-        lag = self._setup.vehicle_model.lag()
-        return brake_and_hold_plan(
-            start, self._hold_at, disturbance, lag, dt_us=self._controller.dt_us, steps=self._controller.steps
-        )
-
-    def _flown(self, state: VehicleState | None, planning: PlanningResult) -> Plan | None:
-        """Return the plan whose input is sent and whose path is published; None when the autopilot flies."""
-        mode = self._decision.mode
-        if mode is not Mode.HOLD:
-            self._hold_at = None
-        if planning.start is None or state is None:
-            return None
-        if mode in (Mode.TRACKING, Mode.PRIMING):
-            return planning.plan
-        if mode is Mode.REPLAY:
-            return self._plan_buffer.plan
-        if mode in (Mode.BRAKE, Mode.HOLD):
-            if mode is Mode.HOLD and self._hold_at is None:
-                self._hold_at = state.pos_ned_m
-            return self._brake_and_hold(planning.start)
-        return None
+        return self._modes.flown(state, planning, disturbance_ned_m_s2)
 
     def _act(self, now_us: int, flown: Plan | None, start: Start | None) -> AttitudeSetpoint | None:
         if flown is None or start is None:
@@ -501,7 +443,7 @@ class Agent:
             return None
         act_us = now_us + self._predictor.delay_us
         step = min(max(0, (act_us - flown.t0_us) // flown.dt_us), len(flown.virtual_control) - 1)
-        estimate, flies = self._observer.estimate, self._decision.mode in FLOWN_BY_AGENT
+        estimate, flies = self._observer.estimate, self._modes.mode in FLOWN_BY_AGENT
         virtual_control = self._safety_filter.keep_apart(
             now_us,
             self._utc(act_us),
@@ -539,17 +481,17 @@ class Agent:
             prepared=self._vehicle_setup.ready,
             armable=self._autopilot.armable,
             busy=self._commands.busy,
-            mode=self._decision.mode,
+            mode=self._modes.mode,
             unresponsive_peer=self._directive.unresponsive_peer,
             cut_off=self._directive.cut_off or self._controller_watch.suspended,
-            peers=self._world_model.peers(),
+            peers=self._world_model.peers,
             others_ned_m=partial(self._world_model.others_ned_m, utc_us),
             arm_in=None if dialect is None else dialect.arm_in,
             boots=self._autopilot.clock.boots,
             refusal=self._vehicle_setup.refusal if self._state_machine.phase <= Phase.ARM else "",
             unsettled=self._unsettled(now_us),
             overload=self._overload.level,
-            escalation=self._escalation,
+            escalation=self._modes.escalation,
             setpoints_stopped=self._stops.text(now_us),
             armed_told_us=self._autopilot.armed_told_us,
         )
@@ -564,11 +506,11 @@ class Agent:
             self._predictor.clear()
             self._observer.reset()
             self._controller.reset()
-        now = (self._state_machine.phase, self._decision.mode, self._autopilot.mode)
+        now = (self._state_machine.phase, self._modes.mode, self._autopilot.mode)
         if now != self._announced:
             self._announced = now
             names = {"phase": now[0].name, "mode": now[1].name, "flight_mode": now[2].name}
-            self._note("state", **names, reason=self._decision.reason)
+            self._note("state", **names, reason=self._modes.decision.reason)
 
     def _report_start_blocker(self, now_us: int) -> None:
         waits_for = self._state_machine.waits_for
@@ -611,32 +553,20 @@ class Agent:
         margins_m = self._autopilot.frame.margin_m, self._overload.margin_m, self._directive.margin_m
         margin_m = min(MAX_MARGIN_M, sum(margins_m))
         if flown is not None:
-            t0_us, dt_us, pos = self._utc(flown.t0_us), flown.dt_us, flown.pos_ned_m
-            return PredictedPath(
-                agent=setup.agent,
-                boot_id=setup.boot_id,
-                seq=seq,
-                t0_utc_us=t0_us,
-                dt_us=dt_us,
-                margin_m=margin_m,
-                pos_ned_m=pos,
-            )
-        act_us, dt_us = self._clock.now_us() + self._predictor.delay_us, self._controller.dt_us
-        grid = np.arange(self._controller.steps + 1, dtype=np.float64)
-        ahead_s = grid * (dt_us * 1e-6) + (act_us - state.t_us) * 1e-6
-        pos = predict_constant_velocity(state, ahead_s, setup.separation.brake_m_s2)
+            t0_us, dt_us, pos = flown.t0_us, flown.dt_us, flown.pos_ned_m
+        else:
+            t0_us, dt_us = self._clock.now_us() + self._predictor.delay_us, self._controller.dt_us
+            ahead_s = grid(self._controller.steps) * (dt_us * 1e-6) + (t0_us - state.t_us) * 1e-6
+            pos = predict_constant_velocity(state, ahead_s, setup.separation.brake_m_s2)
         return PredictedPath(
             agent=setup.agent,
             boot_id=setup.boot_id,
             seq=seq,
-            t0_utc_us=self._utc(act_us),
+            t0_utc_us=self._utc(t0_us),
             dt_us=dt_us,
             margin_m=margin_m,
             pos_ned_m=pos,
         )
-
-    def _fresh(self, now_us: int, state: VehicleState) -> bool:
-        return now_us - state.t_us <= self._setup.params.failsafe.state_max_age_s * 1e6
 
     def _utc(self, t_us: int) -> int:
         """Convert monotonic time of this process to UTC [us]."""

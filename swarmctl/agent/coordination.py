@@ -13,7 +13,7 @@ from swarmctl.bus import topics
 from swarmctl.bus.commitment_messages import PeerTrajectories, encode_trajectory_message
 from swarmctl.bus.peers import Bus, agent_name
 from swarmctl.control.collision.encounters import Encounters
-from swarmctl.control.collision.separation import KeepOut, SeparationParams
+from swarmctl.control.collision.separation import KeepOut, KeepOuts, SeparationParams
 from swarmctl.control.commit.membership import Membership
 from swarmctl.control.commit.protocol import CommitCounts, Commitments, acknowledgements
 from swarmctl.control.commit.trajectory_planner import (
@@ -308,7 +308,7 @@ class Coordination:
 
     def _others(
         self, t0_utc_us: int, state: VehicleState, phase: Phase, taking_part: set[int], encounters: Encounters
-    ) -> list[KeepOut]:
+    ) -> KeepOuts:
         """Return keep-outs of obstacles and of peers that do not take part, on the planner's grid from `t0_utc_us` on.
 
         What a stale peer does is unknown, so its hard minimum distance includes all of the margin that grows with age.
@@ -318,8 +318,10 @@ class Coordination:
         steps, dt_us = self._commitments.steps, self._commitments.dt_us
         found = self._world_model.keep_outs(state.pos_ned_m, t0_utc_us, dt_us, steps, phase=phase, without=taking_part)
         spent_m = self._separation.budget.planned_beyond_hard_min_m
-        aged = [replace(k, hard_min_distance_m=max(k.hard_min_distance_m, k.radius_m - spent_m)) for k in found]
-        return encounters.noted(aged, np.array(self._commitments.flown.at(t0_utc_us)[0]))
+        aged = (replace(k, hard_min_distance_m=max(k.hard_min_distance_m, k.radius_m - spent_m)) for k in found)
+        return encounters.noted(
+            KeepOuts(aged, found.pos_ned_m) if found else found, np.array(self._commitments.flown.at(t0_utc_us)[0])
+        )
 
 
 def _names(agents: Iterable[int]) -> str:

@@ -22,14 +22,19 @@ class ReferenceSelector:
     Args:
         setup: parameters of the agent.
         state_machine: source of the mission's reference.
+        ahead_s: (N,) times from now of the references that are asked for.
         note: receives the event `deadlock` when one begins and when it ends.
     """
 
-    def __init__(self, setup: AgentSetup, state_machine: MissionStateMachine, note: Callable[..., None]) -> None:
+    def __init__(
+        self, setup: AgentSetup, state_machine: MissionStateMachine, ahead_s: Array, note: Callable[..., None]
+    ) -> None:
         self._state_machine, self._note, self._yaw_rad = state_machine, note, setup.mission.yaw_rad
         self._recovery = DeadlockRecovery(
             setup.params.deadlock, setup.agent, setup.separation.budget.radius_m, setup.volume
         )
+        self._ahead_s, self._now_and_ahead_s = ahead_s, np.concatenate([[0.0], ahead_s])
+        self._mission_ned = np.zeros((len(ahead_s) + 1, 3)), np.zeros((len(ahead_s) + 1, 3))  # positions, velocities
         self._reported: Deadlock | None = None
 
     def heading_rad(self, utc_us: int) -> float | None:
@@ -43,6 +48,10 @@ class ReferenceSelector:
             return self._yaw_rad
         return asked_rad
 
+    def look_ahead(self, now_us: int, utc_us: int) -> None:
+        """Take in what the mission asks for from this tick on."""
+        self._mission_ned = self._state_machine.reference(utc_us, now_us, self._now_and_ahead_s)
+
     def update(
         self,
         now_us: int,
@@ -55,12 +64,13 @@ class ReferenceSelector:
         """Check progress and plan a detour if there is none; returns the deadlock that the agent is in.
 
         Args:
-            now_us, utc_us: monotonic time and UTC.
+            now_us, utc_us: monotonic time and UTC, those of `look_ahead`.
             pos_ned_m: own position (3,).
             known: regions to keep out of.
             landmarks: returns the obstacles seen so far, which a detour leads around.
         """
-        self._recovery.step(now_us, pos_ned_m, self._mission(now_us, utc_us), known, obstacles=landmarks)
+        wanted_ned_m, mission = self._mission_ned[0][0], self._mission(now_us, utc_us)
+        self._recovery.step(now_us, pos_ned_m, wanted_ned_m, mission, known, obstacles=landmarks)
         return self._report(now_us)
 
     def reset(self, now_us: int) -> None:
@@ -68,15 +78,15 @@ class ReferenceSelector:
         self._recovery.reset()
         self._report(now_us)
 
-    def reference(self, now_us: int, utc_us: int, ahead_s: Array) -> tuple[Reference, Reference]:
-        """Return the reference at times `ahead_s` (N,) from now, (N, 3) each, and the mission's own one now, (1, 3).
+    def reference(self) -> tuple[Reference, Reference]:
+        """Return the reference at the times asked for, (N, 3) each, and the mission's own one now, (1, 3).
 
         The mission's own one is that which agents share, without the own place around it.
         """
-        pos, vel = self._state_machine.reference(utc_us, now_us, np.concatenate([[0.0], ahead_s]))
+        pos, vel = self._mission_ned
         now_ref = Reference(pos[:1] - self._state_machine.place_offset_ned_m, vel[:1], self._yaw_rad)
         if self._recovery.active:
-            return Reference(*self._recovery.sample(ahead_s), self._yaw_rad), now_ref
+            return Reference(*self._recovery.sample(self._ahead_s), self._yaw_rad), now_ref
         return Reference(pos[1:], vel[1:], self._yaw_rad), now_ref
 
     def desired(self, now_us: int, utc_us: int) -> DesiredReference:

@@ -12,7 +12,7 @@ from typing import Protocol
 
 from swarmctl.agent.coordination import Coordination
 from swarmctl.agent.world_model import WorldModel
-from swarmctl.control.collision.separation import KeepOut
+from swarmctl.control.collision.separation import NO_KEEP_OUTS, KeepOut, KeepOuts
 from swarmctl.control.commit.trajectory_planner import DesiredReference
 from swarmctl.core.trajectory import Times, Trajectory
 from swarmctl.core.types import Array, Phase, Reference, VehicleState
@@ -27,7 +27,7 @@ class SeparationInputs:
     phase: Phase
     desired: DesiredReference  # motion the agent would follow if it were alone
     horizon_utc_us: Times  # (longest+1,) times of the controller's reference
-    keep_outs: Sequence[KeepOut]  # of peers and obstacles, on the controller's grid
+    keep_outs: KeepOuts  # of peers and obstacles, on the controller's grid
     disturbance_ned_m_s2: Array  # (3,) estimated acceleration by wind
 
 
@@ -36,7 +36,7 @@ class SeparationDirective:
     """Says what keeps a vehicle apart from its peers in one tick; the default asks for nothing."""
 
     reference: Reference | None = None  # replaces the desired reference where there is one
-    keep_outs: tuple[KeepOut, ...] = ()  # that the controller's plan has to respect
+    keep_outs: KeepOuts = NO_KEEP_OUTS  # that the controller's plan has to respect
     committed_peers: Mapping[int, Sequence[Trajectory]] = field(default_factory=dict)  # for the safety filter
     lost_peer_keep_outs: tuple[KeepOut, ...] = ()  # may deadlock an agent, as those of the world model
     unresponsive_peer: bool = False  # the mission has to wait for a peer that may be flying on unseen
@@ -63,7 +63,7 @@ class SeparationPolicy(Protocol):
     def step(self, inputs: SeparationInputs) -> SeparationDirective:
         """Return the directive of a tick in which the agent flies its vehicle along its reference."""
 
-    def idle(self, utc_us: int, state: VehicleState | None, keep_outs: Sequence[KeepOut]) -> SeparationDirective:
+    def idle(self, utc_us: int, state: VehicleState | None, keep_outs: KeepOuts) -> SeparationDirective:
         """Return the directive of a tick in which it does not: a pilot or a failsafe flies."""
 
     def wait(self, utc_us: int, state: VehicleState | None) -> SeparationDirective:
@@ -93,15 +93,15 @@ class BestEffort:
         """Pass all keep-outs to the controller."""
         return self.idle(inputs.utc_us, inputs.state, inputs.keep_outs)
 
-    def idle(self, utc_us: int, state: VehicleState | None, keep_outs: Sequence[KeepOut]) -> SeparationDirective:
+    def idle(self, utc_us: int, state: VehicleState | None, keep_outs: KeepOuts) -> SeparationDirective:
         """Pass all keep-outs to the controller, which plans also while a failsafe brakes."""
         return SeparationDirective(
-            keep_outs=tuple(keep_outs), unresponsive_peer=self._world_model.has_unresponsive_peer(utc_us)
+            keep_outs=keep_outs, unresponsive_peer=self._world_model.has_unresponsive_peer(utc_us)
         )
 
     def wait(self, utc_us: int, state: VehicleState | None) -> SeparationDirective:
         """Ask for nothing: there is no plan."""
-        return self.idle(utc_us, state, ())
+        return self.idle(utc_us, state, NO_KEEP_OUTS)
 
     def publish(self, utc_us: int) -> None:
         """Do nothing: the agent publishes its path in every mode."""
@@ -159,10 +159,10 @@ class Guaranteed:
             duration_ns=duration_ns,
         )
 
-    def idle(self, utc_us: int, state: VehicleState | None, keep_outs: Sequence[KeepOut]) -> SeparationDirective:
+    def idle(self, utc_us: int, state: VehicleState | None, keep_outs: KeepOuts) -> SeparationDirective:
         """Commit nothing, and leave it to the controller to keep clear."""
         self._coordination.idle(utc_us, state)
-        return SeparationDirective(keep_outs=tuple(keep_outs))
+        return SeparationDirective(keep_outs=keep_outs)
 
     def wait(self, utc_us: int, state: VehicleState | None) -> SeparationDirective:
         """Keep what is committed for a moment: the vehicle still flies it when the gap is short."""

@@ -14,11 +14,11 @@ from swarmctl.bus.refusals import FUTURE, IDENTITY, MALFORMED, SEQUENCE, UNKNOWN
 from swarmctl.bus.senders import Presence, ReceivedMessage
 from swarmctl.control.collision.barrier import Body, body_of_obstacle, body_of_peer
 from swarmctl.control.collision.separation import (
-    KeepOut,
+    KeepOuts,
     SeparationParams,
     aligned,
+    keep_out_along,
     keep_out_of_obstacle,
-    keep_out_of_peer,
 )
 from swarmctl.control.phases.inputs import PeerInputs
 from swarmctl.core.obstacle import Obstacle
@@ -56,6 +56,7 @@ class WorldModel:
         note: Callable[..., None],
     ) -> None:
         self._agent, self._params, self._bus, self._note = agent, params, bus, note
+        self._budget = params.budget
         self.refusals, self.presence = Refusals(note), Presence(bus)
         self.clocks = PeerClocks(peers, note)
         self.paths = PeerPaths(peers, rate_hz, self.refusals, self.presence, clocks=self.clocks)
@@ -127,7 +128,7 @@ class WorldModel:
         unresponsive = {
             path.agent: path.t0_utc_us
             for path in self.paths.latest()
-            if path.t0_utc_us < oldest_us and self._is_there(path.agent) and self._phase(path.agent) is not Phase.DONE
+            if path.t0_utc_us < oldest_us and self._is_there(path.agent) and not self._is_in(path.agent, Phase.DONE)
         }
         if not unresponsive and not self._unresponsive_since_us:
             return
@@ -150,7 +151,7 @@ class WorldModel:
         *,
         phase: Phase,
         without: Set[int] = frozenset(),
-    ) -> list[KeepOut]:
+    ) -> KeepOuts:
         """Return the keep-outs of peers and visible obstacles over `steps` steps of `dt_us` from `t0_utc_us`.
 
         Args:
@@ -160,24 +161,26 @@ class WorldModel:
             phase: own phase; in GOTO_LAND peers are kept clear of at every height.
             without: peers to leave out, because their committed trajectories are known.
         """
+        params, budget, descends = self._params, self._budget, phase is Phase.GOTO_LAND
         paths = [path for path in self.paths.latest() if path.agent not in without]
-        places = aligned(paths, t0_utc_us, dt_us, steps, brake_m_s2=self._params.brake_m_s2) if paths else ()
+        places = aligned(paths, t0_utc_us, dt_us, steps, brake_m_s2=params.brake_m_s2) if paths else None
         found = [
-            keep_out_of_peer(
+            keep_out_along(
                 path,
+                points,
                 t0_utc_us,
-                dt_us,
-                steps,
-                params=self._params,
-                parked=self._phase(path.agent) is Phase.DONE,
-                landing=phase is Phase.GOTO_LAND or self._phase(path.agent) is Phase.LAND,
-                points=points,
+                params,
+                budget,
+                parked=self._is_in(path.agent, Phase.DONE),
+                landing=descends or self._is_in(path.agent, Phase.LAND),
             )
-            for path, points in zip(paths, places, strict=True)
+            for path, points in zip(paths, () if places is None else places, strict=True)
         ]
         seen = self._visible(pos_ned_m, t0_utc_us)
+        if not seen:
+            return KeepOuts(found, places)
         self._seen.update(seen)
-        return found + [keep_out_of_obstacle(o, dt_us, steps, self._params, number=n) for n, o in seen.items()]
+        return KeepOuts(found + [keep_out_of_obstacle(o, dt_us, steps, params, number=n) for n, o in seen.items()])
 
     def _visible(self, pos_ned_m: Array, utc_us: int) -> dict[int, Obstacle]:
         """Return the obstacles that are visible from a position (3,), as they are at a time, by number."""
@@ -220,7 +223,7 @@ class WorldModel:
             margin_m: distance added to the size of every body.
             committed_peers: trajectories that peers have committed to, by agent number.
         """
-        budget, fresh_us = self._params.budget, act_utc_us - round(self._params.lost_after_s * 1e6)
+        budget, fresh_us = self._budget, act_utc_us - round(self._params.lost_after_s * 1e6)
         found, committed_apart_m = list[Body](), budget.barrier_m(margin_m)
         for agent, trajectories in committed_peers.items():
             responsibility_01 = 0.5 if self._flies_itself(agent) else 1.0
@@ -233,7 +236,7 @@ class WorldModel:
                 continue
             filters = self._flies_itself(path.agent) and path.t0_utc_us >= fresh_us
             age_s = max(0.0, (act_utc_us - path.t0_utc_us) * 1e-6)
-            age_margin_m = budget.age_margin_m(age_s, parked=self._phase(path.agent) is Phase.DONE)
+            age_margin_m = budget.age_margin_m(age_s, parked=self._is_in(path.agent, Phase.DONE))
             apart_m = budget.barrier_peer_m(margin_m, path.margin_m, age_margin_m)
             found.append(
                 body_of_peer(path, act_utc_us, ahead_s, apart_m, filters=filters, brake_m_s2=self._params.brake_m_s2)
@@ -253,7 +256,7 @@ class WorldModel:
         token is none: the peer may be cut off.
         """
         vouched = agent in self._vouched and self._vouched[agent] == self._boot_id(agent)
-        return vouched or self._phase(agent) is Phase.DONE
+        return vouched or self._is_in(agent, Phase.DONE)
 
     def _boot_id(self, agent: int) -> int | None:
         status = self._status.get(agent)
@@ -287,20 +290,19 @@ class WorldModel:
         A peer whose liveliness token has gone while ours is present has died, as far as best effort can know; its path
         has become a keep-out.
         """
-        alive = self._bus.alive()
-        connected = agent_name(self._agent) in alive
         oldest_us = utc_us - round(self._params.lost_after_s * 1e6)
-        for path in self.paths.latest():
-            silent = path.t0_utc_us < oldest_us and not self.has_ended(path.agent)
-            if silent and (not connected or agent_name(path.agent) in alive):
-                return True
-        return False
+        silent = [p.agent for p in self.paths.latest() if p.t0_utc_us < oldest_us and not self.has_ended(p.agent)]
+        if not silent:
+            return False
+        alive = self._bus.alive()
+        return agent_name(self._agent) not in alive or any(agent_name(agent) in alive for agent in silent)
 
     def _flies_itself(self, agent: int) -> bool:
         """Return whether a peer's agent controls its vehicle, and so runs the same safety filter as ours."""
         status = self._status.get(agent)
         return status is not None and status.mode in FLOWN_BY_AGENT
 
-    def _phase(self, agent: int) -> Phase | None:
+    def _is_in(self, agent: int, phase: Phase) -> bool:
+        """Return whether a peer has said that it is in a phase."""
         status = self._status.get(agent)
-        return None if status is None else Phase(status.phase)
+        return status is not None and status.phase == phase

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import accumulate
 from typing import Any
 
@@ -16,7 +17,6 @@ from swarmctl.core.types import Array
 Times = NDArray[Any]  # UTC [us], integer or float
 _STOPPED_M_S = 1e-3  # a slower plan is not continued by braking
 _AT_REST_M_S = 1e-6  # a slower velocity has no direction
-_NOWHERE = np.zeros(3)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,14 +40,15 @@ class Trajectory:
         k = (np.asarray(t_utc_us, np.float64) - self.t0_utc_us) / self.dt_us
         k = np.minimum(np.maximum(k, 0.0), last)
         low = np.minimum(k.astype(int), last - 1)
-        high, s = low + 1, (k - low)[:, None]
-        p0, p1 = self.pos_ned_m.take(low, axis=0), self.pos_ned_m.take(high, axis=0)
-        v0, v1 = self.vel_ned_m_s.take(low, axis=0) * dt_s, self.vel_ned_m_s.take(high, axis=0) * dt_s
-        ends, rise = 2.0 * (p0 - p1) + v0 + v1, 3.0 * (p1 - p0) - 2.0 * v0 - v1
+        s = (k - low)[:, None]
+        p0, v0 = self.pos_ned_m.take(low, axis=0), self.vel_ned_m_s.take(low, axis=0) * dt_s
+        back, v1 = p0 - self.pos_ned_m[1:].take(low, axis=0), self.vel_ned_m_s[1:].take(low, axis=0) * dt_s
+        ends, rise = 2.0 * back + v0 + v1, -3.0 * back - 2.0 * v0 - v1
         pos = ((ends * s + rise) * s + v0) * s + p0
         vel = ((3.0 * ends * s + 2.0 * rise) * s + v0) / dt_s
-        inside = ((t_utc_us >= self.t0_utc_us) & (t_utc_us <= self.end_utc_us))[:, None]
-        return pos, np.where(inside, vel, 0.0)
+        outside = (t_utc_us < self.t0_utc_us) | (t_utc_us > self.end_utc_us)
+        vel[outside] = 0.0
+        return pos, vel
 
     def at(self, t_utc_us: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
         """Return position and velocity, (3,) each, at one time; faster than `sample` for one."""
@@ -83,21 +84,68 @@ def positions_at(trajectories: Sequence[Trajectory], t_utc_us: Times) -> Array:
     """Return positions (N, M, 3) NED of N trajectories at times (M,), by linear interpolation."""
     begins = np.array([t.t0_utc_us for t in trajectories], np.float64)[:, None]
     steps = np.array([t.dt_us for t in trajectories], np.float64)[:, None]
-    return interpolate([t.pos_ned_m for t in trajectories], np.maximum((t_utc_us - begins) / steps, 0.0))
+    return Polylines([t.pos_ned_m for t in trajectories]).at(np.maximum((t_utc_us - begins) / steps, 0.0))
 
 
-def interpolate(polylines: Sequence[Array], k: Array) -> Array:
-    """Return positions (N, M, 3) at fractional indices (N, M) into N polylines, by linear interpolation.
+@lru_cache(maxsize=64)
+def grid(steps: int) -> Array:
+    """Return 0, 1, ... `steps` as floats (steps+1,), read-only."""
+    found = np.arange(steps + 1, dtype=np.float64)
+    found.flags.writeable = False
+    return found
+
+
+def interpolated(points: Array, k: Array, last: int | NDArray[np.int64], first: int | NDArray[np.int64] = 0) -> Array:
+    """Return positions (..., 3) at fractional indices k (...) into polylines, by linear interpolation.
 
     Before the first point the first segment is extrapolated; after the last point the last point is returned.
+
+    Args:
+        points: (K, 3) of one polyline, or of several one behind the other.
+        k: counted from the first point of each.
+        last: index of the last point of each, counted likewise.
+        first: index of that first point.
     """
-    counts = [len(points) for points in polylines]
-    lasts = np.array(counts)[:, None] - 1
-    points = np.concatenate(polylines)
-    low = np.minimum(np.maximum(np.floor(k).astype(np.int64), 0), lasts - 1)
-    at = low + np.array([0, *accumulate(counts[:-1])])[:, None]  # in the concatenation
-    begins = points.take(at, axis=0)
-    return np.asarray(begins + (np.minimum(k, lasts) - low)[:, :, None] * (points.take(at + 1, axis=0) - begins))
+    low = np.minimum(np.maximum(k.astype(np.int64), 0), last - 1)
+    index = first + low
+    begins = points.take(index, axis=0)
+    found: Array = points[1:].take(index, axis=0)
+    found -= begins
+    found *= (np.minimum(k, last) - low)[..., None]
+    found += begins
+    return found
+
+
+class Polylines:
+    """N polylines, interpolated all at once.
+
+    Args:
+        corners: at least 2 of each, (K, 3).
+    """
+
+    def __init__(self, corners: Sequence[Array]) -> None:
+        self._points = corners[0] if len(corners) == 1 else np.concatenate(corners)
+        self._firsts, self.lasts = _layout(tuple(map(len, corners)))
+
+    def at(self, k: Array) -> Array:
+        """Return positions (N, M, 3) at fractional indices (N, M); see `interpolated`."""
+        return interpolated(self._points, k, self.lasts, self._firsts)
+
+    def last_legs(self) -> Array:
+        """Return the differences (N, 3) of the last two points."""
+        before = (self._firsts + self.lasts)[:, 0] - 1
+        return np.asarray(self._points[1:].take(before, axis=0) - self._points.take(before, axis=0))
+
+
+@lru_cache(maxsize=256)
+def _layout(counts: tuple[int, ...]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the indices of the first points of polylines in all points, and of their last points in their own.
+
+    Both are (N, 1) and read-only; `counts` are the numbers of points.
+    """
+    firsts, lasts = np.array([0, *accumulate(counts[:-1])])[:, None], np.array(counts)[:, None] - 1
+    firsts.flags.writeable = lasts.flags.writeable = False
+    return firsts, lasts
 
 
 def resting(pos_ned_m: Array, t_utc_us: int, dt_us: int) -> Trajectory:
@@ -152,22 +200,23 @@ def joined(first: Trajectory, then: Trajectory, from_utc_us: int) -> Trajectory:
 
 def braking_displacement(vel_ned_m_s: Array, t_s: Array, brake_m_s2: float) -> Array:
     """Return displacements (K, 3) NED [m] at times (K,) after the begin of braking to rest from a velocity (3,)."""
-    return np.asarray(braking_displacements([vel_ned_m_s], t_s[None], brake_m_s2)[0])
+    speed = math.sqrt(float(vel_ned_m_s @ vel_ned_m_s))
+    direction = vel_ned_m_s / speed if speed >= _AT_REST_M_S else np.zeros(3)
+    return _braked_m(speed, t_s, brake_m_s2)[:, None] * direction
 
 
-def braking_displacements(velocities_ned_m_s: Sequence[Array], t_s: Array, brake_m_s2: float) -> Array:
-    """Return displacements (N, K, 3) NED [m] at times (N, K) after N velocities, (3,) each, begin to brake to rest."""
-    speeds = [math.sqrt(float(vel @ vel)) for vel in velocities_ned_m_s]
-    directions = np.array(
-        [
-            vel / speed if speed >= _AT_REST_M_S else _NOWHERE
-            for vel, speed in zip(velocities_ned_m_s, speeds, strict=True)
-        ]
-    )
-    speed = np.array(speeds)[:, None]
+def braking_displacements(vel_ned_m_s: Array, t_s: Array, brake_m_s2: float) -> Array:
+    """Return displacements (N, K, 3) NED [m] at times (N, K) after N velocities (N, 3) begin to brake to rest."""
+    speed = np.sqrt(np.einsum("nc,nc->n", vel_ned_m_s, vel_ned_m_s))[:, None]
+    directions = vel_ned_m_s / np.maximum(speed, _AT_REST_M_S)
+    speed[speed < _AT_REST_M_S] = 0.0
+    return np.asarray(_braked_m(speed, t_s, brake_m_s2)[:, :, None] * directions[:, None])
+
+
+def _braked_m(speed: Array | float, t_s: Array, brake_m_s2: float) -> Array:
+    """Return the distances [m] at times after the begin of braking to rest."""
     t_s = np.minimum(np.maximum(t_s, 0.0), speed / brake_m_s2)
-    travelled_m = speed * t_s - 0.5 * brake_m_s2 * t_s * t_s
-    return np.asarray(travelled_m[:, :, None] * directions[:, None])
+    return np.asarray(speed * t_s - 0.5 * brake_m_s2 * t_s * t_s)
 
 
 def _brake(pos_ned_m: Array, vel_ned_m_s: Array, dt_s: float, brake_m_s2: float) -> tuple[Array, Array]:

@@ -89,7 +89,7 @@ class Flight:
             busy=self.busy,
             mode=self.failsafe_mode,
             unresponsive_peer=self.unresponsive_peer,
-            peers=self.peers,
+            peers=lambda: self.peers,
             others_ned_m=lambda: self.others,
             arm_in=self.arm_in,
             boots=self.boots,

@@ -95,17 +95,16 @@ def body_of_peer(
     points, dt_s = path.pos_ned_m, path.dt_us * 1e-6
     at = ((act_utc_us - path.t0_utc_us) * 1e-6 + ahead_s) / dt_s
     last = len(points) - 1
-    responsibility_01 = 0.5 if filters else 1.0
+    low = max(0, min(int(at), last - 1))
+    (ax, ay, az), (bx, by, bz) = points[low : low + 2].tolist()
+    rise = (bx - ax, by - ay, bz - az)
+    vel: Vector = (rise[0] / dt_s, rise[1] / dt_s, rise[2] / dt_s)
     if at >= last:
-        a, b = points[last - 1].tolist(), points[last].tolist()
-        pos, vel = _braked(b, tuple((q - p) / dt_s for p, q in zip(a, b, strict=True)), (at - last) * dt_s, brake_m_s2)
-        return Body(pos_ned_m=pos, vel_ned_m_s=vel, apart_m=apart_m, responsibility_01=responsibility_01)
-    low = max(0, int(at))
-    a, b = points[low].tolist(), points[low + 1].tolist()
-    part = at - low
-    pos = tuple(p + part * (q - p) for p, q in zip(a, b, strict=True))
-    vel = tuple((q - p) / dt_s for p, q in zip(a, b, strict=True))
-    return Body(pos_ned_m=pos, vel_ned_m_s=vel, apart_m=apart_m, responsibility_01=responsibility_01)
+        pos, vel = _braked((bx, by, bz), vel, (at - last) * dt_s, brake_m_s2)
+    else:
+        part = at - low
+        pos = (ax + part * rise[0], ay + part * rise[1], az + part * rise[2])
+    return Body(pos_ned_m=pos, vel_ned_m_s=vel, apart_m=apart_m, responsibility_01=0.5 if filters else 1.0)
 
 
 def _braked(pos: Vector, vel: Vector, t_s: float, brake_m_s2: float) -> tuple[Vector, Vector]:
@@ -164,10 +163,10 @@ class Barrier:
             hover_thrust_01: scales the bounds of thrust.
             bodies: predicted bodies when the command takes effect.
         """
-        if not bodies or not np.isfinite(virtual_control).all():
+        ux, uy, thrust = virtual_control.tolist()
+        if not bodies or not (math.isfinite(ux) and math.isfinite(uy) and math.isfinite(thrust)):
             return None
         pos, vel = self._predicted_state(start, disturbance_ned_m_s2)
-        ux, uy, thrust = virtual_control.tolist()
         cos_tilt = math.sqrt(max(0.0, 1.0 - ux * ux - uy * uy))
         wanted = (thrust * ux, thrust * uy, thrust * cos_tilt)  # thrust vector over mass, up positive
         dx, dy, dz = disturbance_ned_m_s2.tolist()
@@ -175,7 +174,7 @@ class Barrier:
         # acceleration without thrust
         rest = (dx - drag * vel[0], dy - drag * vel[1], GRAVITY_M_S2 + dz - drag * vel[2])
         rows = [row for body in bodies if (row := self._row(body, pos, vel, rest)) is not None]
-        if all(_dot(normal, wanted) >= offset for normal, offset in rows):
+        if not rows or all(_dot(normal, wanted) >= offset for normal, offset in rows):
             return None
         rows.sort(key=lambda row: _dot(row[0], wanted) - row[1])  # most violated rows first: fewer become active after
         slew_bounds = [

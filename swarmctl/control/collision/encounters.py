@@ -7,10 +7,11 @@ therefore measured against the distance at which the encounter began.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-from swarmctl.control.collision.separation import KeepOut
+from swarmctl.control.collision.separation import KeepOut, KeepOuts, stacked
 from swarmctl.core.types import Array
 
 
@@ -20,16 +21,17 @@ class Encounters:
     def __init__(self) -> None:
         self._entered_m: dict[int, float] = {}  # by `KeepOut.key`
 
-    def noted(self, keep_outs: Sequence[KeepOut], pos_ned_m: Array) -> list[KeepOut]:
+    def noted(self, keep_outs: Sequence[KeepOut], pos_ned_m: Array) -> KeepOuts:
         """Return the keep-outs of this tick; those that the position (3,) violates say where they were entered."""
-        entered_m: dict[int, float] = {}
-        found = []
-        for keep_out in keep_outs:
-            apart_m = keep_out.apart_m(pos_ned_m)
-            if keep_out.key is None or apart_m >= keep_out.hard_min_distance_m:
-                found.append(keep_out)
-                continue
-            entered_m[keep_out.key] = self._entered_m.get(keep_out.key, apart_m)
-            found.append(replace(keep_out, entered_m=entered_m[keep_out.key]))
+        known, entered_m = stacked(keep_outs), dict[int, float]()
+        if known:
+            ways_m = (pos_ned_m - known.pos_ned_m[:, 0]).tolist()
+            for keep_out, (north_m, east_m, down_m) in zip(known, ways_m, strict=True):
+                apart_m = math.hypot(north_m, east_m, down_m * keep_out.vertical_01)
+                if keep_out.key is not None and apart_m < keep_out.hard_min_distance_m:
+                    entered_m[keep_out.key] = self._entered_m.get(keep_out.key, apart_m)
         self._entered_m = entered_m
-        return found
+        if not entered_m:
+            return known
+        found = (replace(k, entered_m=entered_m[k.key]) if k.key in entered_m else k for k in known)
+        return KeepOuts(found, known.pos_ned_m)

@@ -1,15 +1,14 @@
-"""Separation: aligns peers' paths in time, linearises distances for the MPC, certifies plans independently of the QP.
+"""Separation: what plans keep clear of, with peers' paths aligned in time, and a certificate independent of the QP.
 
 Peers' predictions are time-stamped; each is interpolated at the own prediction times, continued beyond its end by
 braking to a stop, and given a margin that grows with age. A stale peer therefore turns into a keep-out where it was
-last expected to stop. Half-spaces are the thesis' distance constraints (4.1), (4.2) linearised at the own previous
-prediction.
+last expected to stop. `half_spaces` makes constraints of the MPC from keep-outs.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -17,10 +16,9 @@ import numpy as np
 from pydantic import Field
 
 from swarmctl.control.collision.budget import SeparationBudget
-from swarmctl.control.mpc.axes import HalfSpaces
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.params import Params
-from swarmctl.core.trajectory import braking_displacements, interpolate
+from swarmctl.core.trajectory import Polylines, braking_displacement, braking_displacements, grid, interpolated
 from swarmctl.core.types import Array, PredictedPath
 
 _TINY_M = 1e-6
@@ -95,6 +93,51 @@ class KeepOut:
         return math.dist(self.pos_ned_m[0, :axes], pos_ned_m[:axes])
 
 
+class KeepOuts(tuple[KeepOut, ...]):
+    """Several keep-outs, and what is computed of all of them at once, stacked.
+
+    Args:
+        keep_outs: with equal numbers of positions.
+        pos_ned_m: these positions, if they are stacked already.
+
+    Attributes, if there are any keep-outs:
+        pos_ned_m: (S, Hp+1, 3).
+        radius_m, vertical_01: (S, 1).
+        obstacles: indices of those that are no peers.
+    """
+
+    pos_ned_m: Array
+    radius_m: Array
+    vertical_01: Array
+    obstacles: list[int]
+
+    def __new__(cls, keep_outs: Iterable[KeepOut] = (), pos_ned_m: Array | None = None) -> KeepOuts:
+        found = super().__new__(cls, keep_outs)
+        if not found:
+            return found
+        if pos_ned_m is None:
+            pos_ned_m = np.concatenate([k.pos_ned_m for k in found]).reshape(len(found), -1, 3)
+        found.pos_ned_m = pos_ned_m
+        numbers = np.array([(k.radius_m, k.vertical_01) for k in found])
+        found.radius_m, found.vertical_01 = numbers[:, :1], numbers[:, 1:]
+        found.obstacles = [i for i, k in enumerate(found) if k.priority_id < 0]
+        return found
+
+    def apart(self, path_ned_m: Array) -> Array:
+        """Return the way (S, Hp+1, 3) from each of them to a path (Hp+1, 3), heights as they count."""
+        apart = path_ned_m - self.pos_ned_m
+        apart[:, :, 2] *= self.vertical_01
+        return apart
+
+
+NO_KEEP_OUTS = KeepOuts()
+
+
+def stacked(keep_outs: Iterable[KeepOut]) -> KeepOuts:
+    """Return keep-outs as such, stacked if they are not yet."""
+    return keep_outs if isinstance(keep_outs, KeepOuts) else KeepOuts(keep_outs)
+
+
 def radius_problem(params: SeparationParams, accuracy_m: float, drift_m: float) -> str:
     """Say why the radius is too small, and what to do; "" when it is large enough or allowed.
 
@@ -116,7 +159,14 @@ def radius_problem(params: SeparationParams, accuracy_m: float, drift_m: float) 
 
 def align(path: PredictedPath, t0_utc_us: int, dt_us: int, steps: int, *, brake_m_s2: float) -> Array:
     """Return positions (steps+1, 3) of one peer at `t0_utc_us + k dt_us`; see `aligned`."""
-    return np.asarray(aligned([path], t0_utc_us, dt_us, steps, brake_m_s2=brake_m_s2)[0])
+    points, dt_s, last = path.pos_ned_m, path.dt_us * 1e-6, len(path.pos_ned_m) - 1
+    since, pace = (t0_utc_us - path.t0_utc_us) / path.dt_us, dt_us / path.dt_us
+    k = since + grid(steps) * pace  # (steps+1,) in points
+    found = interpolated(points, k, last)
+    if since + steps * pace > last:
+        tail = max(0, math.floor((last - since) / pace))
+        found[tail:] += braking_displacement((points[-1] - points[-2]) / dt_s, (k[tail:] - last) * dt_s, brake_m_s2)
+    return found
 
 
 def aligned(paths: Sequence[PredictedPath], t0_utc_us: int, dt_us: int, steps: int, *, brake_m_s2: float) -> Array:
@@ -125,18 +175,17 @@ def aligned(paths: Sequence[PredictedPath], t0_utc_us: int, dt_us: int, steps: i
     Paths are interpolated, then continued by braking to a stop. Times before the first point are extrapolated
     backwards along the first segment.
     """
-    since = np.array([(t0_utc_us - path.t0_utc_us) / path.dt_us for path in paths])[:, None]
-    pace = np.array([dt_us / path.dt_us for path in paths])[:, None]
-    k = since + np.arange(steps + 1) * pace  # (N, steps+1) in points
-    found = interpolate([path.pos_ned_m for path in paths], k)
-    beyond = k - np.array([len(path.pos_ned_m) - 1 for path in paths])[:, None]
-    ended = [i for i, last in enumerate(beyond[:, -1].tolist()) if last > 0.0]
-    if ended:
-        steps_s = [paths[i].dt_us * 1e-6 for i in ended]
-        last_vels = [
-            (paths[i].pos_ned_m[-1] - paths[i].pos_ned_m[-2]) / dt_s for i, dt_s in zip(ended, steps_s, strict=True)
-        ]
-        found[ended] += braking_displacements(last_vels, beyond[ended] * np.array(steps_s)[:, None], brake_m_s2)
+    sinces = [(t0_utc_us - path.t0_utc_us) / path.dt_us for path in paths]  # in points, as all numbers of steps here
+    paces = [dt_us / path.dt_us for path in paths]
+    k = np.array(sinces)[:, None] + grid(steps) * np.array(paces)[:, None]  # (N, steps+1)
+    known = Polylines([path.pos_ned_m for path in paths])
+    found = known.at(k)
+    ends = min((len(p.pos_ned_m) - 1 - s) / pace for p, s, pace in zip(paths, sinces, paces, strict=True))
+    if ends <= steps:
+        tail = max(0, math.floor(ends))  # from where on some path is continued
+        steps_s = np.array([path.dt_us * 1e-6 for path in paths])[:, None]
+        beyond_s = (k[:, tail:] - known.lasts) * steps_s
+        found[:, tail:] += braking_displacements(known.last_legs() / steps_s, beyond_s, brake_m_s2)
     return found
 
 
@@ -149,7 +198,6 @@ def keep_out_of_peer(
     params: SeparationParams,
     parked: bool = False,
     landing: bool = False,
-    points: Array | None = None,
 ) -> KeepOut:
     """Return the keep-out of one peer.
 
@@ -159,12 +207,28 @@ def keep_out_of_peer(
         params: distance and margins.
         parked: whether the peer has landed, so that its margin does not grow with age.
         landing: whether either vehicle is about to descend, so that the keep-out holds at every height.
-        points: result of `align`, if it is known already.
+    """
+    points = align(path, t0_utc_us, dt_us, steps, brake_m_s2=params.brake_m_s2)
+    return keep_out_along(path, points, t0_utc_us, params, params.budget, parked=parked, landing=landing)
+
+
+def keep_out_along(
+    path: PredictedPath,
+    points_ned_m: Array,
+    t0_utc_us: int,
+    params: SeparationParams,
+    budget: SeparationBudget,
+    *,
+    parked: bool,
+    landing: bool,
+) -> KeepOut:
+    """Return the keep-out of one peer whose positions (steps+1, 3) from `t0_utc_us` on are known already.
+
+    Otherwise as `keep_out_of_peer`; `budget` is that of `params`.
     """
     age_s = max(0.0, (t0_utc_us - path.t0_utc_us) * 1e-6)
-    budget = params.budget
     return KeepOut(
-        pos_ned_m=align(path, t0_utc_us, dt_us, steps, brake_m_s2=params.brake_m_s2) if points is None else points,
+        pos_ned_m=points_ned_m,
         radius_m=budget.planned_peer_m(path.margin_m, budget.age_margin_m(age_s, parked)),
         hard_min_distance_m=budget.certified_peer_m(path.margin_m),
         any_height=landing or (age_s > params.lost_after_s and not parked),
@@ -201,114 +265,6 @@ def visible(obstacles: Sequence[Obstacle], pos_ned_m: Array) -> list[Obstacle]:
     return [o for o in obstacles if o.distance_m(pos_ned_m) < o.visibility_m]
 
 
-def half_spaces(
-    keep_outs: Sequence[KeepOut],
-    guess_ned_m: Array,
-    goal_m: Array,
-    vel_m_s: Array,
-    *,
-    dt_s: float,
-    own_priority_id: int,
-    params: SeparationParams,
-) -> HalfSpaces | None:
-    """Linearise distance constraints for steps 1..Hp, in the plane or in space; None without keep-outs.
-
-    Args:
-        keep_outs: at most as many as `max_keep_outs` of the problem.
-        guess_ned_m: (Hp+1, 3) own previous prediction at the same times.
-        goal_m: (2,) or (3,) end of the reference: defines head-on, and the number of axes.
-        vel_m_s: (2,) or (3,) own velocity at the first point.
-        dt_s: time between points.
-        own_priority_id: own agent id.
-        params: right of way, gate and braking.
-
-    In the plane, a height difference dz leaves `sqrt(R^2 - dz^2)` of a radius R to keep horizontally. A keep-out at any
-    height is a vertical cylinder. A keep-out with downwash is an ellipsoid: a sphere after heights are scaled.
-    """
-    if not keep_outs:
-        return None
-    axes = len(goal_m)
-    others = np.stack([k.pos_ned_m for k in keep_outs])[:, 1:]  # (keep-outs, Hp, 3)
-    radius = np.array([k.radius_m for k in keep_outs])
-    apart = guess_ned_m[1:] - others  # (keep-outs, Hp, 3)
-    vertical_01 = np.array([k.vertical_01 for k in keep_outs])[:, None]
-    apart[:, :, 2] *= vertical_01
-    below_m = apart[:, :, 2] if axes == 2 else np.zeros(apart.shape[:2])
-    kept_m = radius[:, None] + (_approach_m(keep_outs, guess_ned_m[0], apart, params) if params.approach_01 else 0.0)
-    needed = np.sqrt(np.maximum(kept_m**2 - below_m**2, 0.0))  # (keep-outs, Hp)
-    apart, others = apart[:, :, :axes], others[:, :, :axes]
-    distance = np.sqrt(np.einsum("skc,skc->sk", apart, apart))
-    side = np.zeros((len(keep_outs), 1, axes))
-    side[:, 0, 0] = [1.0 if own_priority_id > k.priority_id else -1.0 for k in keep_outs]
-    normal = np.where(distance[:, :, None] < _TINY_M, side, apart / np.maximum(distance, _TINY_M)[:, :, None])
-    moved = math.dist(guess_ned_m[-1, :axes], guess_ned_m[0, :axes])
-    stuck = min(1.0, max(0.0, 2.0 - moved / params.stuck_m))
-    to_goal = goal_m - guess_ned_m[1:, :axes]  # (Hp, axes)
-    across = (
-        to_goal[:, 0] * normal[:, :, 1] - to_goal[:, 1] * normal[:, :, 0]
-    )  # (max_keep_outs, Hp), > 0: keep-out on the left
-    angle_rad = np.full(distance.shape, params.right_of_way_rad * stuck)
-    is_obstacle = np.array([k.priority_id < 0 for k in keep_outs])
-    angle_rad[is_obstacle] = params.right_of_way_obstacle_rad * np.where(across[is_obstacle] > 0.0, -1.0, 1.0)
-    normal = _with_right_of_way(normal, distance, needed, to_goal, angle_rad=angle_rad)
-    if axes == 3:
-        normal[:, :, 2] *= vertical_01  # back from scaled to true heights
-    offset = np.einsum("skc,skc->sk", normal, others) + needed
-    idle = (needed <= 0.0) | (distance > needed + params.gate_m)
-    ends = (others[:, -1] - others[:, -2]) / dt_s  # (max_keep_outs, axes) velocity of each keep-out at the end
-    closing = -np.einsum("sc,sc->s", normal[:, -1], vel_m_s - ends)
-    stop_s = np.maximum(closing, 0.0) / (2.0 * params.stop_m_s2)
-    squeezed = np.array([k.downwash > 1.0 and not k.any_height for k in keep_outs])
-    if squeezed.any():  # braking is scaled likewise
-        stop_s[squeezed] /= np.maximum(np.linalg.norm(normal[squeezed, -1], axis=1), _TINY_M)
-    stop_offset = offset[:, -1] + stop_s * np.einsum("sc,sc->s", normal[:, -1], ends)
-    return HalfSpaces(
-        normal=normal,
-        offset_m=np.where(idle, -np.inf, offset),
-        stop_s=stop_s,
-        stop_offset_m=np.where(idle[:, -1], -np.inf, stop_offset),
-    )
-
-
-def _approach_m(keep_outs: Sequence[KeepOut], here_ned_m: Array, apart: Array, params: SeparationParams) -> Array:
-    """Return the distance (keep-outs, Hp) kept beyond the constraint's from peers that come closer than they are now.
-
-    Prediction errors grow with the relative motion still to be flown: tilt is answered with a few per cent less and
-    accelerations bend the estimate. The margin shrinks on the way and is zero in a formation.
-
-    Args:
-        keep_outs: peers and obstacles.
-        here_ned_m: (3,) own position at the first point.
-        apart: (keep-outs, Hp, 3) from them to the guess, heights as they count.
-        params: share and limit.
-    """
-    now_m = np.array([k.apart_m(here_ned_m) for k in keep_outs])[:, None]
-    closing_m = np.maximum(now_m - np.sqrt(np.einsum("skc,skc->sk", apart, apart)), 0.0)
-    closing_m[[k.priority_id < 0 for k in keep_outs]] = 0.0
-    return np.asarray(np.minimum(params.approach_01 * closing_m, params.approach_max_m))
-
-
-def _with_right_of_way(normal: Array, distance: Array, needed: Array, to_goal: Array, *, angle_rad: Array) -> Array:
-    """Return normals (slots, Hp, axes), turned where they point against the goal, so that head-on agents pass.
-
-    Peers follow one right-of-way rule: each turns normals clockwise seen from above (as NED yaw), so that two that meet
-    head-on both give way to the left. Obstacles are passed on the side the agent is on. `angle_rad` (max_keep_outs, Hp)
-    is the largest turn: full for obstacles, for peers only when the own plan is stuck, because turned normals would
-    also keep a swarm that shares one goal from closing in evenly.
-    """
-    if not angle_rad.any():
-        return normal
-    span = np.sqrt(np.einsum("kc,kc->k", to_goal, to_goal))  # (Hp,)
-    ahead = -np.einsum("skc,kc->sk", normal, to_goal) / np.maximum(span, _TINY_M)  # cosine: 1 is head-on
-    weight = np.clip((ahead - 0.7) / 0.3, 0.0, 1.0) * (span > 0.75 * needed) * (distance < 2.0 * needed + 0.5)
-    angle = angle_rad * weight
-    c, s = np.cos(angle), np.sin(angle)
-    turned = normal.copy()
-    turned[:, :, 0] = c * normal[:, :, 0] - s * normal[:, :, 1]
-    turned[:, :, 1] = s * normal[:, :, 0] + c * normal[:, :, 1]
-    return turned
-
-
 def certify(
     path_ned_m: Array,
     keep_outs: Sequence[KeepOut],
@@ -330,18 +286,27 @@ def certify(
     """
     if not keep_outs:
         return math.inf
-    others = np.stack([k.pos_ned_m for k in keep_outs])  # (m, Hp+1, 3)
-    apart = path_ned_m - others
-    apart[:, :, 2] *= np.array([k.vertical_01 for k in keep_outs])[:, None]
-    step = apart[:, 1:] - apart[:, :-1]
+    known = stacked(keep_outs)
+    apart = known.apart(path_ned_m)
+    begins = apart[:, :-1]
+    step = apart[:, 1:] - begins
     length2 = np.maximum(np.einsum("mkc,mkc->mk", step, step), 1e-18)
-    nearest = np.minimum(np.maximum(-np.einsum("mkc,mkc->mk", apart[:, :-1], step) / length2, 0.0), 1.0)
-    closest = apart[:, :-1] + nearest[:, :, None] * step  # closest point of each relative segment to the origin
-    distance = np.sqrt(np.einsum("mkc,mkc->mk", closest, closest))  # (m, Hp)
-    now = np.sqrt(np.einsum("mc,mc->m", apart[:, 0], apart[:, 0]))
-    later = distance[:, min(from_step, distance.shape[1] - 1) :].min(axis=1)
-    allowed = np.array([k.hard_min_distance_m for k in keep_outs])
-    entered = [now_m if k.entered_m is None else k.entered_m for k, now_m in zip(keep_outs, now, strict=True)]
-    least = np.minimum(now, np.array(entered) - approach_m)
-    margin = np.where((now < allowed) & (later >= least - _TINY_M), 0.0, later - allowed)
-    return float(margin.min())
+    nearest = np.minimum(np.maximum(-np.einsum("mkc,mkc->mk", begins, step) / length2, 0.0), 1.0)
+    step *= nearest[:, :, None]
+    step += begins  # the point of each relative segment that is closest to the origin
+    distance2_m2 = np.einsum("mkc,mkc->mk", step, step)  # (m, Hp)
+    later2_m2 = distance2_m2[:, min(from_step, distance2_m2.shape[1] - 1) :].min(axis=1)
+    now2_m2 = np.einsum("mc,mc->m", apart[:, 0], apart[:, 0])
+    squares = zip(known, now2_m2.tolist(), later2_m2.tolist(), strict=True)
+    margins_m = [_margin_m(k, math.sqrt(now2), math.sqrt(later2), approach_m) for k, now2, later2 in squares]
+    return float(np.array(margins_m).min())  # NaN if any is
+
+
+def _margin_m(keep_out: KeepOut, now_m: float, later_m: float, approach_m: float) -> float:
+    """Return the margin of a path to one keep-out that is `now_m` away, and later at least `later_m`."""
+    allowed_m = keep_out.hard_min_distance_m
+    if now_m < allowed_m:
+        entered_m = now_m if keep_out.entered_m is None else keep_out.entered_m
+        if later_m >= min(now_m, entered_m - approach_m) - _TINY_M:
+            return 0.0
+    return later_m - allowed_m

@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from pydantic import Field
 
-from swarmctl.control.collision.separation import KeepOut, SeparationParams, certify
+from swarmctl.control.collision.separation import NO_KEEP_OUTS, KeepOut, KeepOuts, SeparationParams, certify
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.control.mpc.swarm_mpc import AxisWeights, MpcParams, SwarmMpc
@@ -118,7 +118,7 @@ class TrajectoryPlanner:
         stopwatch_ns: Callable[[], int],
         volume: FlightVolume | None = None,
     ) -> None:
-        self._volume = volume
+        self._volume, self._budget = volume, separation.budget
         self._params, self._separation, self._drag_1_s = params, separation, vehicle.drag_1_s
         right_of_way = separation.model_copy(
             update={"right_of_way_rad": params.right_of_way_rad, "stuck_m": params.stuck_m}
@@ -221,7 +221,8 @@ class TrajectoryPlanner:
         guess = wanted.pos_ned_m + (pos[0] - wanted.pos_ned_m[0]) if now.desired.follows_path else pos
         agents = [message.agent for message in now.peers.values() for _ in message.followed]
         keep_outs = self._keep_outs(now.followed, agents, now.begin_us, steps)
-        kept = (*keep_outs, *(_first_steps(other, steps) for other in now.others))
+        others = [_first_steps(other, steps) for other in now.others]
+        kept = KeepOuts([*keep_outs, *others]) if others else keep_outs
         plan = self._mpc.plan(
             Problem(
                 start=start,
@@ -295,13 +296,13 @@ class TrajectoryPlanner:
         steps: int,
         *,
         spare_m: float = 0.0,
-    ) -> list[KeepOut]:
+    ) -> KeepOuts:
         if not trajectories:
-            return []
-        budget = self._separation.budget
+            return NO_KEEP_OUTS
+        budget = self._budget
         spreads_m = [trajectory.spread_m(t0_utc_us) for trajectory in trajectories]
         where = positions_at(trajectories, t0_utc_us + np.arange(steps + 1) * self.dt_us)
-        return [
+        found = [
             KeepOut(
                 pos_ned_m=points,
                 radius_m=budget.planned_m + spread_m,
@@ -312,6 +313,7 @@ class TrajectoryPlanner:
             )
             for points, agent, spread_m in zip(where, agents, spreads_m, strict=True)
         ]
+        return KeepOuts(found, where)
 
 
 def following(mpc: MpcParams, params: CommitParams) -> MpcParams:

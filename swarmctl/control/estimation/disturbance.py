@@ -16,6 +16,8 @@ from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned
 from swarmctl.core.params import Params
 from swarmctl.core.types import Array, VehicleState
 
+_GAP_US = 200_000  # a sample that is later does not continue the ones before
+
 
 class DisturbanceParams(Params):
     """Bandwidths and limits of the estimators."""
@@ -74,51 +76,58 @@ class DisturbanceObserver:
     """Second-order observer of the disturbance on each velocity axis, with an integrating hover-thrust estimate.
 
     v' = a_model + d + l1 (v - v_hat), d' = l2 (v - v_hat) with both poles at `bandwidth_rad_s`.
+
+    Attributes:
+        estimate: newest.
     """
 
     def __init__(self, params: DisturbanceParams, hover_thrust_01: float) -> None:
         self._params = params
         self._hover = HoverThrust(hover_thrust_01, params.hover_time_s)
-        self._disturbance = np.zeros(3)
-        self._velocity: Array | None = None
+        self._disturbance = [0.0, 0.0, 0.0]
+        self._velocity: list[float] | None = None
         self._t_us = 0
-
-    @property
-    def estimate(self) -> Estimate:
-        return Estimate(self._disturbance, self._hover.value_01)
+        self.estimate = self._estimated()
 
     def reset(self) -> None:
         """Forget velocity and disturbance, not the hover thrust, after the vehicle was flown by its autopilot."""
         self._velocity = None
-        self._disturbance = np.zeros(3)
+        self._disturbance = [0.0, 0.0, 0.0]
+        self.estimate = self._estimated()
 
     def update(self, state: VehicleState, thrust_01: float | None) -> Estimate:
         """Update with one new sample; `thrust_01` has acted since the last one, None if it is unknown."""
         if not self._params.enabled or thrust_01 is None:
             return self.estimate
-        if self._velocity is None or not 0 < state.t_us - self._t_us < 200_000:
-            self._velocity, self._t_us = state.vel_ned_m_s, state.t_us
+        before, since_us, self._t_us = self._velocity, state.t_us - self._t_us, state.t_us
+        if before is None or not 0 < since_us < _GAP_US:
+            self._velocity = state.vel_ned_m_s.tolist()
             return self.estimate
-        dt_s = (state.t_us - self._t_us) * 1e-6
-        self._t_us = state.t_us
+        dt_s = since_us * 1e-6
         specific_m_s2 = thrust_01 * GRAVITY_M_S2 / self._hover.value_01
-        model = -specific_m_s2 * body_z_ned(state.q_nb)
-        model[2] += GRAVITY_M_S2
-        predicted = self._velocity + dt_s * (model + self._disturbance)
-        innovation = state.vel_ned_m_s - predicted
-        pole = self._params.bandwidth_rad_s
-        self._velocity = predicted + min(1.0, 2.0 * pole * dt_s) * innovation
-        disturbance = self._disturbance + dt_s * pole * pole * innovation
-        limit = self._params.limit_m_s2
-        self._disturbance = np.minimum(np.maximum(disturbance, -limit), limit)
-        moved = self._hover.explain(float(self._disturbance[2]), thrust_01, dt_s)
-        self._disturbance = self._disturbance - np.array([0.0, 0.0, moved])
+        north, east, down = body_z_ned(state.q_nb).tolist()
+        model = (-specific_m_s2 * north, -specific_m_s2 * east, -specific_m_s2 * down + GRAVITY_M_S2)
+        pole, limit_m_s2 = self._params.bandwidth_rad_s, self._params.limit_m_s2
+        taken_01, learned_1_s = min(1.0, 2.0 * pole * dt_s), dt_s * pole * pole
+        velocity, disturbance = [0.0] * 3, [0.0] * 3
+        for i, (measured, accel) in enumerate(zip(state.vel_ned_m_s.tolist(), model, strict=True)):
+            predicted = before[i] + dt_s * (accel + self._disturbance[i])
+            innovation = measured - predicted
+            velocity[i] = predicted + taken_01 * innovation
+            disturbance[i] = min(max(self._disturbance[i] + learned_1_s * innovation, -limit_m_s2), limit_m_s2)
+        disturbance[2] -= self._hover.explain(disturbance[2], thrust_01, dt_s)
+        self._velocity, self._disturbance = velocity, disturbance
+        self.estimate = self._estimated()
         return self.estimate
+
+    def _estimated(self) -> Estimate:
+        return Estimate(np.array(self._disturbance), self._hover.value_01)
 
     def learn_hover(self, thrust_01: float) -> None:
         """Move the hover thrust towards the autopilot's own, see `HoverThrust.learn`."""
         if self._params.enabled:
             self._hover.learn(thrust_01)
+            self.estimate = self._estimated()
 
     def state(self, reported: VehicleState) -> VehicleState:
         """Return the state to plan from, here the reported one."""

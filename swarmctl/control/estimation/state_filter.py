@@ -50,6 +50,9 @@ class StateFilter:
         params: noise model.
         disturbance: limits and the hover thrust's time constant, shared with the observer.
         model: drag, dead time and first guess of the hover thrust.
+
+    Attributes:
+        estimate: newest.
     """
 
     def __init__(self, params: StateFilterParams, disturbance: DisturbanceParams, model: VehicleModelParams) -> None:
@@ -60,10 +63,7 @@ class StateFilter:
         self._mean = np.zeros((4, 3))
         self._covariance = np.zeros((4, 4))
         self._t_us: int | None = None
-
-    @property
-    def estimate(self) -> Estimate:
-        return Estimate(self._mean[_DIST].copy(), self._hover.value_01)
+        self.estimate = self._estimated()
 
     def reset(self) -> None:
         """Begin to estimate the disturbance: from now on the acting thrust is known."""
@@ -71,10 +71,12 @@ class StateFilter:
         self._covariance[_DIST] = self._covariance[:, _DIST] = 0.0
         self._covariance[_DIST, _DIST] = _FIRST_M_S2**2
         self._thrusts.clear()
+        self.estimate = self._estimated()
 
     def learn_hover(self, thrust_01: float) -> None:
         """Move the hover thrust towards the autopilot's own, see `HoverThrust.learn`."""
         self._hover.learn(thrust_01)
+        self.estimate = self._estimated()
 
     def update(self, state: VehicleState, thrust_01: float | None) -> Estimate:
         """Update with one new sample; `thrust_01` is the setpoint being sent, None while the autopilot flies."""
@@ -90,8 +92,13 @@ class StateFilter:
         self._correct(state)
         if acted_01 is not None:
             self._mean[_DIST, 2] -= self._hover.explain(float(self._mean[_DIST, 2]), acted_01, dt_s)
-            np.clip(self._mean[_DIST], -self._limit_m_s2, self._limit_m_s2, out=self._mean[_DIST])
+            limited = np.minimum(np.maximum(self._mean[_DIST], -self._limit_m_s2), self._limit_m_s2)
+            self._mean[_DIST] = limited
+        self.estimate = self._estimated()
         return self.estimate
+
+    def _estimated(self) -> Estimate:
+        return Estimate(self._mean[_DIST].copy(), self._hover.value_01)
 
     def state(self, reported: VehicleState) -> VehicleState:
         """Return the state to plan from: filtered position and velocity at the time of the sample."""
@@ -141,17 +148,18 @@ class StateFilter:
         mean[_POS] += 0.5 * dt_s * dt_s * accel
         mean[_VEL] += dt_s * model
         self._mean = mean
-        q = np.diag([0.0, noise_m_s2**2 * dt_s, (1.0 - kept * kept) * p.bias_m_s**2, walk**2 * dt_s])
-        q[_POS, _POS] = (0.5 * dt_s) ** 2 * q[_VEL, _VEL]
+        q, by_noise = np.zeros((4, 4)), noise_m_s2**2 * dt_s
+        q[_POS, _POS], q[_VEL, _VEL] = (0.5 * dt_s) ** 2 * by_noise, by_noise
+        q[_BIAS, _BIAS], q[_DIST, _DIST] = (1.0 - kept * kept) * p.bias_m_s**2, walk**2 * dt_s
         self._covariance = f @ self._covariance @ f.T + q
 
     def _correct(self, state: VehicleState) -> None:
         p = self._params
-        innovation = np.stack(
-            [state.pos_ned_m - self._mean[_POS], state.vel_ned_m_s - self._mean[_VEL] - self._mean[_BIAS]]
-        )
-        seen = np.stack([self._covariance[_POS], self._covariance[_VEL] + self._covariance[_BIAS]])  # (2, 4) H P
-        spread = np.stack([seen[:, _POS], seen[:, _VEL] + seen[:, _BIAS]], axis=1)
+        innovation, seen, spread = np.empty((2, 3)), np.empty((2, 4)), np.empty((2, 2))
+        innovation[0] = state.pos_ned_m - self._mean[_POS]
+        innovation[1] = state.vel_ned_m_s - self._mean[_VEL] - self._mean[_BIAS]
+        seen[0], seen[1] = self._covariance[_POS], self._covariance[_VEL] + self._covariance[_BIAS]  # H P
+        spread[:, 0], spread[:, 1] = seen[:, _POS], seen[:, _VEL] + seen[:, _BIAS]
         spread[0, 0] += p.pos_m**2
         spread[1, 1] += p.vel_m_s**2
         gain = np.linalg.solve(spread, seen).T  # (4, 2)

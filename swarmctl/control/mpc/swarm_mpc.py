@@ -16,7 +16,8 @@ from typing import Literal
 import numpy as np
 from pydantic import Field
 
-from swarmctl.control.collision.separation import KeepOut, SeparationParams, certify, half_spaces
+from swarmctl.control.collision.half_spaces import half_spaces
+from swarmctl.control.collision.separation import KeepOut, KeepOuts, SeparationParams, certify, stacked
 from swarmctl.control.collision.volume_certificate import volume_margin_m
 from swarmctl.control.model import VehicleModelParams
 from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, Axis, Faces, HalfSpaces, Horizon, Penalties, Terminal
@@ -260,16 +261,16 @@ def first_guess(problem: Problem, dt_s: float, steps: int) -> Array:
     return problem.start.at_constant_velocity(steps, dt_s)[0]
 
 
-def closest_keep_outs(keep_outs: Sequence[KeepOut], guess_ned_m: Array, max_keep_outs: int) -> list[KeepOut]:
+def closest_keep_outs(keep_outs: Sequence[KeepOut], guess_ned_m: Array, max_keep_outs: int) -> KeepOuts:
     """Return the `max_keep_outs` keep-outs that the guess (steps+1, 3) comes closest to."""
-    if len(keep_outs) < 2:
-        return list(keep_outs)
-    apart = guess_ned_m - np.array([k.pos_ned_m for k in keep_outs])  # (keep-outs, steps+1, 3)
-    apart[:, :, 2] *= np.array([k.vertical_01 for k in keep_outs])[:, None]
+    known = stacked(keep_outs)
+    if len(known) < 2:
+        return known
+    apart = known.apart(guess_ned_m)
     closest_m = np.sqrt(np.minimum.reduce(np.add.reduce(apart * apart, axis=2), axis=1)).tolist()
-    gaps_m = [closest - k.radius_m for closest, k in zip(closest_m, keep_outs, strict=True)]
-    order = sorted(range(len(keep_outs)), key=gaps_m.__getitem__)
-    return [keep_outs[i] for i in order[:max_keep_outs]]
+    gaps_m = [closest - k.radius_m for closest, k in zip(closest_m, known, strict=True)]
+    order = sorted(range(len(known)), key=gaps_m.__getitem__)[:max_keep_outs]
+    return KeepOuts([known[i] for i in order], known.pos_ned_m.take(order, axis=0))
 
 
 def near_half_spaces(

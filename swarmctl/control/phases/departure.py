@@ -18,7 +18,7 @@ def unmet_start_condition(inputs: PhaseInputs, state: VehicleState, peers: int) 
         return f"the autopilot to be ready to arm (it is in {state.mode.name})"
     if inputs.unsettled:
         return inputs.unsettled
-    absent = peers - sum(p.phase >= Phase.STANDBY and p.alive for p in inputs.peers.values())
+    absent = peers - sum(p.phase >= Phase.STANDBY and p.alive for p in inputs.peers().values())
     if absent:
         return f"{absent} of {peers} peers to stand by"
     return "the autopilot's answers" if inputs.busy else ""

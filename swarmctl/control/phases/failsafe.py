@@ -120,8 +120,10 @@ def escalate(health: Health, params: FailsafeParams) -> Escalation:
     found = NOTHING_WORN
     for watched in _WATCHED:
         value = watched.measure(health)
+        if value < 0.0:
+            continue
         for response, limit in zip(_ESCALATION, watched.limits(params), strict=True):
-            if value >= 0.0 and watched.sign * (value - limit) > 0.0 and response > found.response:
+            if watched.sign * (value - limit) > 0.0 and response > found.response:
                 found = Escalation(response, watched.said.format(round(100.0 * value)))
     return found
 

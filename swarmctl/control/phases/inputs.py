@@ -31,7 +31,7 @@ class PhaseInputs:
     busy: bool  # a command is being executed
     mode: Mode  # last decision of the failsafe
     unresponsive_peer: bool  # no message for too long from a peer that may be flying
-    peers: Mapping[int, PeerInputs]
+    peers: Callable[[], Mapping[int, PeerInputs]]  # returns what peers have told of themselves
     cut_off: str = ""  # why the mission must end here, because peers don't answer
     others_ned_m: Callable[[], Sequence[Array]] = tuple  # returns the present position (3,) of each peer
     arm_in: FlightMode | None = None  # flight mode required for arming; None: any

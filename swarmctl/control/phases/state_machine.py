@@ -191,7 +191,7 @@ class MissionStateMachine:
         """Return the yaw of the mission's reference now; None while that is not followed."""
         if not self._follows_mission or self.begin_utc_us is None:
             return None
-        return float(self._reference.yaw_rad(np.array([self.mission_t_s(utc_us)]))[0])
+        return self._reference.yaw_at_rad(self.mission_t_s(utc_us))
 
     @property
     def _follows_mission(self) -> bool:
@@ -369,7 +369,7 @@ class MissionStateMachine:
             return []
         if inputs.refusal:
             return self._refuse(inputs.refusal, inputs)
-        if any(p.phase is Phase.DONE and p.alive for p in inputs.peers.values()):
+        if any(p.phase is Phase.DONE and p.alive for p in inputs.peers().values()):
             return self._refuse("a peer gave up before take-off", inputs)
         self.waits_for = unmet_start_condition(inputs, state, self._expected)
         if not self.waits_for:
@@ -458,11 +458,11 @@ class MissionStateMachine:
         return [Command(verb=Verb.EXTERNAL)] if self._may_request(inputs) else []
 
     def _ready(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:
-        if any(not p.alive or p.phase >= Phase.GOTO_LAND for p in inputs.peers.values()) and not self.held:
+        if any(not p.alive or p.phase >= Phase.GOTO_LAND for p in inputs.peers().values()) and not self.held:
             self.outcome = "a peer gave up or was lost before the mission began"
             self._go_home(inputs.now_us, state)
             return []
-        ready = [p.ready_utc_us for p in inputs.peers.values() if p.ready_utc_us > 0]
+        ready = [p.ready_utc_us for p in inputs.peers().values() if p.ready_utc_us > 0]
         if len(ready) == self._expected:
             self.begin_utc_us = max([self.ready_utc_us, *ready]) + _BEGIN_DELAY_US
         return []
@@ -476,7 +476,7 @@ class MissionStateMachine:
             return []
         if inputs.utc_us - self.begin_utc_us >= self._duration_us and not self._interruptions.active:
             self.outcome = self.outcome or "completed"
-            if self._airborne and not inputs.peers:
+            if self._airborne and not inputs.peers():
                 self._enter(Phase.LAND, inputs.now_us)
             elif self._airborne:
                 self._stop_in_place(inputs.now_us, state)

@@ -134,6 +134,7 @@ class DeadlockRecovery:
         self,
         now_us: int,
         pos_ned_m: Array,
+        wanted_ned_m: Array,
         reference: Sampled,
         keep_outs: Sequence[KeepOut],
         *,
@@ -144,14 +145,14 @@ class DeadlockRecovery:
         Args:
             now_us: monotonic time.
             pos_ned_m: (3,) own position.
+            wanted_ned_m: (3,) the reference now.
             reference: reference to follow.
             keep_outs: keep-outs from now on.
             obstacles: returns the obstacles at rest that have been seen so far.
         """
         p, self._pos_ned_m = self._params, pos_ned_m
-        now_ref = reference(np.zeros(1))[0][0]
-        behind_m = math.dist(pos_ned_m, now_ref)
-        found = self._progress.step(now_us, pos_ned_m, now_ref, keep_outs)
+        behind_m = math.dist(pos_ned_m, wanted_ned_m)
+        found = self._progress.step(now_us, pos_ned_m, wanted_ned_m, keep_outs)
         if found is not None:
             since_us = found.since_us if self.deadlock is None else self.deadlock.since_us
             self.deadlock, self._stuck_ned_m = Deadlock(since_us, found.by), pos_ned_m.copy()

@@ -135,7 +135,8 @@ class MissionReference:
     def sample(self, t_s: Array) -> tuple[Array, Array]:
         """Return positions and velocities, (K, 3) NED each, at mission times `t_s` (K,); at rest before 0."""
         pos, vel = self._sampled(np.maximum(t_s, 0.0))
-        vel[t_s < 0.0] = 0.0
+        if t_s.min() < 0.0:
+            vel[t_s < 0.0] = 0.0
         return pos + self.offset_ned_m, vel
 
     def yaw_rad(self, t_s: Array) -> Array:
@@ -143,6 +144,10 @@ class MissionReference:
         if self._heading is None:
             return np.full(len(t_s), self._yaw_rad)
         return self._heading(np.maximum(t_s, 0.0))
+
+    def yaw_at_rad(self, t_s: float) -> float:
+        """Return the yaw at one mission time."""
+        return self._yaw_rad if self._heading is None else float(self.yaw_rad(np.array([t_s]))[0])
 
     def motion(self, t_s: Array) -> Motion:
         """Return the whole reference at mission times `t_s` (K,) >= 0; acceleration is the difference of velocities."""

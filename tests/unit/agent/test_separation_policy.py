@@ -10,7 +10,7 @@ import pytest
 from swarmctl.agent.components import SEPARATION_MODES
 from swarmctl.agent.separation_policy import BestEffort, Guaranteed, SeparationInputs, SeparationPolicy
 from swarmctl.bus.peers import LocalBus
-from swarmctl.control.collision.separation import SeparationParams
+from swarmctl.control.collision.separation import KeepOuts, SeparationParams
 from swarmctl.control.commit.trajectory_planner import DesiredReference
 from swarmctl.core.types import Phase
 from tests import builders
@@ -35,7 +35,7 @@ def inputs(bench: Bench) -> SeparationInputs:
         phase=Phase.TRACK,
         desired=DesiredReference(bench.wanted),
         horizon_utc_us=utc_us + np.arange(6) * 100_000,
-        keep_outs=[KEEP_OUT],
+        keep_outs=KeepOuts([KEEP_OUT]),
         disturbance_ned_m_s2=np.zeros(3),
     )
 
@@ -54,7 +54,7 @@ def test_best_effort_plans_along_the_desired_reference_around_all_keep_outs(benc
     bench.fly(0.5, each=bench.send)
     for directive in (
         policy.step(inputs(bench)),
-        policy.idle(bench.clock.utc_us(), bench.state, [KEEP_OUT]),
+        policy.idle(bench.clock.utc_us(), bench.state, KeepOuts([KEEP_OUT])),
     ):
         assert directive.reference is None
         assert directive.keep_outs == (KEEP_OUT,)
@@ -68,9 +68,9 @@ def test_best_effort_waits_for_a_silent_peer_also_without_a_state_and_guaranteed
     bench.fly(1.0)
     utc_us = bench.clock.utc_us()
     assert BestEffort(bench.world_model).step(inputs(bench)).unresponsive_peer
-    assert BestEffort(bench.world_model).idle(utc_us, None, ()).unresponsive_peer
+    assert BestEffort(bench.world_model).idle(utc_us, None, KeepOuts()).unresponsive_peer
     assert not guaranteed(bench).step(inputs(bench)).unresponsive_peer
-    assert not guaranteed(bench).idle(utc_us, None, ()).unresponsive_peer
+    assert not guaranteed(bench).idle(utc_us, None, KeepOuts()).unresponsive_peer
 
 
 def test_guaranteed_follows_the_committed_trajectory_and_names_committed_peers(bench: Bench) -> None:
@@ -104,7 +104,7 @@ def test_guaranteed_names_why_an_agent_is_cut_off(bench: Bench) -> None:
 
 def test_guaranteed_leaves_an_agent_that_does_not_fly_to_its_controller(bench: Bench) -> None:
     bench.fly(0.5, each=bench.send)
-    directive = guaranteed(bench).idle(bench.clock.utc_us(), bench.state, [KEEP_OUT])
+    directive = guaranteed(bench).idle(bench.clock.utc_us(), bench.state, KeepOuts([KEEP_OUT]))
     assert directive.reference is None
     assert directive.keep_outs == (KEEP_OUT,)
     assert directive.committed_peers == {} and directive.lost_peer_keep_outs == ()

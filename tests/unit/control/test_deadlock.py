@@ -64,7 +64,7 @@ def stood(
     recovery: DeadlockRecovery, seconds: float, keep_outs: list[KeepOut], obstacles: tuple[Obstacle, ...] = ()
 ) -> None:
     for k in range(round(seconds * 50) + 1):
-        recovery.step(k * 20_000, HERE, reference, keep_outs, obstacles=lambda: obstacles)
+        recovery.step(k * 20_000, HERE, WANTED, reference, keep_outs, obstacles=lambda: obstacles)
 
 
 def aside_m(recovery: DeadlockRecovery) -> float:
@@ -114,10 +114,10 @@ def test_a_wall_is_avoided_at_the_first_level_until_the_reference_is_reached() -
     pos, vel = recovery.sample(np.array([0.0, 0.5]))
     np.testing.assert_allclose(np.linalg.norm(pos[1] - pos[0]), 0.5)
     np.testing.assert_allclose(np.linalg.norm(vel, axis=1), 1.0)
-    recovery.step(1_700_000, HERE + np.array([0.0, 2.0, 0.0]), reference, [], obstacles=lambda: posts)
+    recovery.step(1_700_000, HERE + np.array([0.0, 2.0, 0.0]), WANTED, reference, [], obstacles=lambda: posts)
     assert recovery.active
     assert recovery.deadlock is None, "it has moved on"
-    recovery.step(9_000_000, WANTED - [0.1, 0.0, 0.0], reference, [], obstacles=lambda: posts)
+    recovery.step(9_000_000, WANTED - [0.1, 0.0, 0.0], WANTED, reference, [], obstacles=lambda: posts)
     assert not recovery.active
 
 

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 from swarmctl.control.collision.encounters import Encounters
+from swarmctl.control.collision.half_spaces import half_spaces
 from swarmctl.control.collision.separation import (
     KeepOut,
     SeparationParams,
     align,
     certify,
-    half_spaces,
     keep_out_of_obstacle,
     keep_out_of_peer,
     radius_problem,

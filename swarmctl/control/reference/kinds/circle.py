@@ -23,9 +23,10 @@ class CircleParams(SharedReference):
         return self._sample
 
     def _sample(self, t_s: Array) -> tuple[Array, Array]:
-        angle = self.omega_rad_s * t_s
+        angle, speed = self.omega_rad_s * t_s, self.radius_m * self.omega_rad_s
         cos, sin = np.cos(angle), np.sin(angle)
-        around = np.stack([self.radius_m * cos, self.radius_m * sin, self.climb_ned_m_s * t_s], axis=1)
-        speed = self.radius_m * self.omega_rad_s
-        vel = np.stack([-speed * sin, speed * cos, np.full(len(t_s), self.climb_ned_m_s)], axis=1)
-        return around + np.array(self.center_ned_m), vel
+        pos, vel = np.empty((len(t_s), 3)), np.empty((len(t_s), 3))
+        pos[:, 0], pos[:, 1], pos[:, 2] = self.radius_m * cos, self.radius_m * sin, self.climb_ned_m_s * t_s
+        vel[:, 0], vel[:, 1], vel[:, 2] = -speed * sin, speed * cos, self.climb_ned_m_s
+        pos += self.center_ned_m
+        return pos, vel
