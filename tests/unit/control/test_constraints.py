@@ -56,8 +56,8 @@ def filled(ahead: Prediction, block: ConstraintBlock, step: Forecast) -> Rows:
     return program.rows[block]
 
 
-def flown(ahead: Prediction, step: Forecast, moves: Array) -> tuple[Array, Array]:
-    """Positions and velocities (Hp, 2) under scaled increments (moves,)."""
+def flown(ahead: Prediction, step: Forecast, moves: Array) -> Array:
+    """Positions and velocities (2, Hp, 2) under scaled increments (moves,)."""
     increments = moves.reshape(2, HORIZON.control).T * ahead.du_max  # (Hc, 2)
     accel = -9.81 * (step.u_prev + ahead.hold @ increments) + step.asked.drift_m_s2
     return ahead.motion(step.asked.pos_m, step.asked.vel_m_s, accel)
