@@ -15,7 +15,7 @@ from pathlib import Path
 
 from swarmctl.core.types import GeoOrigin
 from swarmctl.process_lifetime import die_with_parent
-from tests.real.network import Network
+from tests.real.network import TMP, Network, with_tmp
 
 SPACING_M = 2.0  # apart along north, about the origin
 EARTH_RADIUS_M = 6_371_000.0
@@ -46,7 +46,7 @@ class Kind:
         spread: instance i has port + spread * i.
         command: binary and start to command line.
         environment: what it is told by environment variables.
-        lock_name: of a file in /tmp by which it runs once on a machine, whatever the network; {} is the instance.
+        lock_name: of a file in `TMP` by which it runs once on a machine, whatever the network; {} is the instance.
     """
 
     variable: str
@@ -63,8 +63,15 @@ class Kind:
         given = os.environ.get(self.variable, "")
         return Path(given).expanduser().absolute() if given else None
 
-    def locks(self, count: int) -> list[Path]:
-        return [Path("/tmp") / self.lock_name.format(i) for i in range(count)] if self.lock_name else []
+    def has_own_tmp(self, network: Network) -> bool:
+        """Return whether its locks are its own: where that is permitted, and its build is still seen then."""
+        return bool(self.lock_name) and network.is_own and self.binary is not None and TMP not in self.binary.parents
+
+    def locks(self, network: Network, count: int) -> list[Path]:
+        """Return the lock files that it shares with everybody on the machine."""
+        if not self.lock_name or self.has_own_tmp(network):
+            return []
+        return [TMP / self.lock_name.format(i) for i in range(count)]
 
     def place(self, index: int, count: int, folder: Path, parameters: Mapping[str, float] | None = None) -> Start:
         """Return the place of the vehicle of that index among so many."""
@@ -78,11 +85,14 @@ class Kind:
             parameters=parameters or {},
         )
 
-    def shell_line(self, start: Start) -> list[str]:
-        """Return the shell line that starts it, from any folder and any environment."""
+    def shell_line(self, start: Start, network: Network) -> list[str]:
+        """Return the shell line that starts it in that network, from any folder and any environment."""
         assert self.binary is not None
+        folder, prefix = start.folder, network.prefix
+        if self.has_own_tmp(network):
+            folder, prefix = TMP / folder.name, (*prefix, *with_tmp(folder.parent))
         told = [f"{name}={value}" for name, value in self.environment(start).items()]
-        return ["env", "-C", str(start.folder), *told, *self.command(self.binary, start)]
+        return [*prefix, "env", "-C", str(folder), *told, *self.command(self.binary, start)]
 
 
 def _px4_command(binary: Path, start: Start) -> list[str]:
@@ -167,7 +177,7 @@ class Fleet:
         start = self.kind.place(index, self.count, folder, self._parameters)
         with (folder / "out.log").open("ab") as out:
             self._running[index] = subprocess.Popen(
-                [*self.network.prefix, *self.kind.shell_line(start)],
+                self.kind.shell_line(start, self.network),
                 stdin=subprocess.DEVNULL,
                 stdout=out,
                 stderr=subprocess.STDOUT,

@@ -90,7 +90,7 @@ def require(kind: Kind, network: Network, count: int) -> None:
     taken = network.taken(port + kind.spread * i for port in kind.ports for i in range(count))
     if taken:
         pytest.skip(f"ports {taken} are taken; run as root for a network of its own")
-    running = [lock for lock in kind.locks(count) if held(lock)]
+    running = [lock for lock in kind.locks(network, count) if held(lock)]
     if running:
         pytest.skip(f"somebody else's autopilot runs and holds {', '.join(map(str, running))}")
 
