@@ -171,12 +171,13 @@ STATE_ROWS = (
         start=State.ARMABLE,
         steps=(
             go(6),
-            Wait(0.3),
+            Wait(2.2),
             Mark(),
             sees("SYS_STATUS", onboard_control_sensors_health=Bits(off=PREARM)),
             Stream(setpoint()),
             sees("SYS_STATUS", 0.7, onboard_control_sensors_health=Bits(PREARM)),
         ),
+        never_streamed=True,  # PX4 reports this at most every 2 s, and may forget that a stream of 1 s has ended
     ),
     Row(
         name="ESTIMATOR_STATUS flags",

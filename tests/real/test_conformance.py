@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 
+from tests.benches.scheduling import realtime_where_permitted
 from tests.conformance.dialogue import Dialogue
 from tests.conformance.partners import ByUrl
 from tests.conformance.player import Player
@@ -35,7 +36,7 @@ def px4(network: Network, folder: Path) -> str:
 @pytest.fixture(scope="module")
 def player(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Player]:
     """Return one that starts PX4 itself, again for rows that need a reboot; it is for all rows of a lane."""
-    with own_network() as network:
+    with own_network() as network, realtime_where_permitted():
         line = px4(network, tmp_path_factory.mktemp("vehicles"))
         with network.inside():
             partner = ByUrl(URL, GCS_URL, line)
