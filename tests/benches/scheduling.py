@@ -16,10 +16,10 @@ def policies(pid: int) -> set[int]:
 
 
 @contextmanager
-def realtime_where_permitted() -> Iterator[None]:
-    """This thread, and what it starts meanwhile, has the priority of a flight."""
+def realtime_where_permitted(priority: int) -> Iterator[None]:
+    """This thread, and what it starts meanwhile, has at least this real-time priority."""
     before, param = os.sched_getscheduler(0), os.sched_getparam(0)
-    request_realtime_for_this_thread()
+    request_realtime_for_this_thread(priority)
     try:
         yield
     finally:

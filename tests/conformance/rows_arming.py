@@ -124,7 +124,7 @@ ARMING_ROWS = (
             Command(number=LAND),
             Says(text="Landing at current position\t", severity=INFO),
             Says(text="Landing detected\t", severity=INFO, within_s=15.0),
-            Passes(name=EXTENDED, field="landed_state", values=(4, 1), within_s=10.0),
+            Passes(name=EXTENDED, field="landed_state", values=(4, 1), within_s=15.0),
             Mark(),
             Says(text="Disarmed by landing\t", severity=INFO, within_s=3.6),
             heartbeat(4.6, base_mode=29, custom_mode=M_LOITER),

@@ -23,6 +23,7 @@ from tests.real.network import Network, own_network
 pytestmark = [pytest.mark.process, pytest.mark.timeout(600)]
 
 URL, GCS_URL = "udpin://127.0.0.1:14540", "udpin://127.0.0.1:14550"
+_PRIORITY = 12  # above launched agents, at 10, that fly in other lanes
 
 
 def px4(network: Network, folder: Path) -> str:
@@ -36,7 +37,7 @@ def px4(network: Network, folder: Path) -> str:
 @pytest.fixture(scope="module")
 def player(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Player]:
     """Return one that starts PX4 itself, again for rows that need a reboot; it is for all rows of a lane."""
-    with own_network() as network, realtime_where_permitted():
+    with own_network() as network, realtime_where_permitted(_PRIORITY):
         line = px4(network, tmp_path_factory.mktemp("vehicles"))
         with network.inside():
             partner = ByUrl(URL, GCS_URL, line)
