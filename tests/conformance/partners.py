@@ -98,28 +98,33 @@ class InProcess:
 class VehicleClock:
     """The vehicle's own time, in which it keeps its promises: a loaded machine makes a simulated one slow.
 
-    Until the vehicle is heard, and between two of its messages, time passes as on the wall. It never runs backwards.
+    Between two of its messages time passes as on the wall, but not on and on: a simulation that stands still for up to
+    `STALL_S` has not used any time. Time never runs backwards.
     """
 
+    EVERY_S = 0.15  # between two messages, at the least rate that a row asks for
+    STALL_S = 1.0
+
     def __init__(self) -> None:
-        self._newest_s = 0.0
-        self._ahead_s = 0.0  # of the wall
-        self._start_s: float | None = None
+        self._newest_s = self._heard_s = self._heard_wall_s = time.monotonic()
+        self._start_s: float | None = None  # of the vehicle, once it has been heard
 
     def now_s(self) -> float:
-        self._newest_s = max(self._newest_s, time.monotonic() + self._ahead_s)
+        age_s = time.monotonic() - self._heard_wall_s
+        stalled_s = 0.0 if self._start_s is None else min(max(age_s - self.EVERY_S, 0.0), self.STALL_S)
+        self._newest_s = max(self._newest_s, self._heard_s + age_s - stalled_s)
         return self._newest_s
 
     def started(self) -> None:
         """Expect its messages to begin at zero again."""
-        self._start_s = None
+        self._heard_s, self._heard_wall_s, self._start_s = self.now_s(), time.monotonic(), None
 
     def heard(self, since_start_s: float, age_s: float) -> None:
         """Take over the time of a message that arrived so long ago."""
         wall_s = time.monotonic() - age_s
         if self._start_s is None:
-            self._start_s = wall_s + self._ahead_s - since_start_s
-        self._ahead_s = self._start_s + since_start_s - wall_s
+            self._start_s = self._heard_s + wall_s - self._heard_wall_s - since_start_s
+        self._heard_s, self._heard_wall_s = self._start_s + since_start_s, wall_s
 
 
 class ClockLink:
