@@ -105,23 +105,24 @@ class VehicleClock:
     EVERY_S = 0.15  # between two messages, at the least rate that a row asks for
     STALL_S = 1.0
 
-    def __init__(self) -> None:
-        self._newest_s = self._heard_s = self._heard_wall_s = time.monotonic()
+    def __init__(self, wall_s: Callable[[], float] = time.monotonic) -> None:
+        self._wall_s = wall_s
+        self._newest_s = self._heard_s = self._heard_wall_s = wall_s()
         self._start_s: float | None = None  # of the vehicle, once it has been heard
 
     def now_s(self) -> float:
-        age_s = time.monotonic() - self._heard_wall_s
+        age_s = self._wall_s() - self._heard_wall_s
         stalled_s = 0.0 if self._start_s is None else min(max(age_s - self.EVERY_S, 0.0), self.STALL_S)
         self._newest_s = max(self._newest_s, self._heard_s + age_s - stalled_s)
         return self._newest_s
 
     def started(self) -> None:
         """Expect its messages to begin at zero again."""
-        self._heard_s, self._heard_wall_s, self._start_s = self.now_s(), time.monotonic(), None
+        self._heard_s, self._heard_wall_s, self._start_s = self.now_s(), self._wall_s(), None
 
     def heard(self, since_start_s: float, age_s: float) -> None:
         """Take over the time of a message that arrived so long ago."""
-        wall_s = time.monotonic() - age_s
+        wall_s = self._wall_s() - age_s
         if self._start_s is None:
             self._start_s = self._heard_s + wall_s - self._heard_wall_s - since_start_s
         self._heard_s, self._heard_wall_s = self._start_s + since_start_s, wall_s
