@@ -154,6 +154,8 @@ RESPONSE_ROWS = (
             section=RESPONSE,
             start=State.LOITER,
             steps=(
+                Mark(),
+                sees("LOCAL_POSITION_NED", 10.0, vz=near(0.0, 0.1)),  # two thirds of a first speed would be added
                 Stream(setpoint(HOVER_01), 100.0),
                 go(6),
                 Wait(0.2),
