@@ -21,6 +21,7 @@ from tests.real.network import TMP, Network, with_tmp
 SPACING_M = 2.0  # apart along north, about the origin
 EARTH_RADIUS_M = 6_371_000.0
 STOP_S = 5.0
+BOOT_SPEED = 5.0  # of an ArduCopter's clock, whose filters take up to a minute to use GPS, until it is told otherwise
 _PRIORITY = 11  # above launched agents, at 10: the autopilot of a real vehicle has a processor of its own
 PARAMETER_FILES = ("copter.parm", "../../../Tools/autotest/default_params/copter.parm")  # beside it; of a source tree
 
@@ -117,7 +118,17 @@ def _arducopter_command(binary: Path, start: Start) -> list[str]:
     lines = {"SYSID_THISMAV": sysid, **start.parameters}
     own.write_text("".join(f"{name} {value:g}\n" for name, value in lines.items()))
     return [
-        *(str(binary), "-S", f"-I{start.index}", "--model", "quad", "--speedup", "1", "--sysid", str(sysid)),
+        *(
+            str(binary),
+            "-S",
+            f"-I{start.index}",
+            "--model",
+            "quad",
+            "--speedup",
+            f"{BOOT_SPEED:g}",
+            "--sysid",
+            str(sysid),
+        ),
         *("--home", f"{start.lat_deg:.9f},{start.lon_deg:.9f},{start.alt_m:g},0"),
         *("--defaults", f"{_parameter_file(binary)},{own}"),
         *("--serial0", f"udpclient:127.0.0.1:{14550 + 10 * start.index}"),
