@@ -102,17 +102,18 @@ class VehicleClock:
     `STALL_S` has not used any time. Time never runs backwards.
     """
 
-    EVERY_S = 0.15  # between two messages, at the least rate that a row asks for
     STALL_S = 1.0
+    LATE = 2.0  # times as long as between the two messages before
 
     def __init__(self, wall_s: Callable[[], float] = time.monotonic) -> None:
         self._wall_s = wall_s
         self._newest_s = self._heard_s = self._heard_wall_s = wall_s()
         self._start_s: float | None = None  # of the vehicle, once it has been heard
+        self._every_s = 0.0
 
     def now_s(self) -> float:
         age_s = self._wall_s() - self._heard_wall_s
-        stalled_s = 0.0 if self._start_s is None else min(max(age_s - self.EVERY_S, 0.0), self.STALL_S)
+        stalled_s = 0.0 if self._start_s is None else min(max(age_s - self.LATE * self._every_s, 0.0), self.STALL_S)
         self._newest_s = max(self._newest_s, self._heard_s + age_s - stalled_s)
         return self._newest_s
 
@@ -125,6 +126,7 @@ class VehicleClock:
         wall_s = self._wall_s() - age_s
         if self._start_s is None:
             self._start_s = self._heard_s + wall_s - self._heard_wall_s - since_start_s
+        self._every_s = self._start_s + since_start_s - self._heard_s
         self._heard_s, self._heard_wall_s = self._start_s + since_start_s, wall_s
 
 
