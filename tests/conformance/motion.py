@@ -60,11 +60,15 @@ def _height_m(samples: Samples) -> float:
     return -float(samples[-1][1].z)
 
 
+def _height_above_home_m(samples: Samples) -> float:
+    return float(samples[-1][1].relative_alt) * 1e-3
+
+
 def _acceleration_down_m_s2(samples: Samples) -> float:
-    """Slope of the reported velocity between 0.25 and 0.7 s."""
-    rows = [(t_s, m.vz) for t_s, m in samples if 0.25 <= t_s <= 0.7]
-    t_s, speed_m_s = np.array(rows).T
-    return float(np.polyfit(t_s, speed_m_s, 1)[0])
+    """Slope of the reported velocity over the vehicle's own time, between 0.25 and 0.7 s."""
+    rows = [(m.time_boot_ms * 1e-3, m.vz) for t_s, m in samples if 0.25 <= t_s <= 0.7]
+    boot_s, speed_m_s = np.array(rows).T
+    return float(np.polyfit(boot_s, speed_m_s, 1)[0])
 
 
 def _mean_thrust_01(samples: Samples) -> float:
@@ -75,6 +79,7 @@ MEASURES: dict[str, Measure] = {
     "climb_m": Measure("LOCAL_POSITION_NED", _climb_m),
     "height_change_m": Measure("LOCAL_POSITION_NED", _height_change_m),
     "height_m": Measure("LOCAL_POSITION_NED", _height_m),
+    "height_above_home_m": Measure("GLOBAL_POSITION_INT", _height_above_home_m),
     "acceleration_down_m_s2": Measure("LOCAL_POSITION_NED", _acceleration_down_m_s2),
     "mean_thrust_01": Measure("ATTITUDE_TARGET", _mean_thrust_01),
     "highest_tilt_deg": Measure("ATTITUDE", _highest_tilt_deg),

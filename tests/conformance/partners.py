@@ -12,11 +12,13 @@ from typing import Protocol
 
 from sitl.world import SitlWorld
 from swarmctl.core.clock import SimClock
+from swarmctl.mavlink.framing import frames, message_id
 from swarmctl.mavlink.transport import Datagram, Transport, open_transport, pipe_pair
 from swarmctl.simulator_config import SimulatorConfig
 from tests.conformance.vocabulary import GCS_LINK, OFFBOARD_LINK
 
 EKF_READY_S = 4.0  # as measured on PX4
+ATTITUDE = 30  # begins with the milliseconds since the vehicle's start
 STEP_US = 4000
 Tamper = Callable[[bytes], list[bytes]]
 
@@ -93,6 +95,63 @@ class InProcess:
             link.close()
 
 
+class VehicleClock:
+    """The vehicle's own time, in which it keeps its promises: a loaded machine makes a simulated one slow.
+
+    Between two of its messages time passes as on the wall, but not on and on: a simulation that stands still for up to
+    `STALL_S` has not used any time. Time never runs backwards.
+    """
+
+    STALL_S = 1.0
+    LATE = 2.0  # times as long as between the two messages before
+
+    def __init__(self, wall_s: Callable[[], float] = time.monotonic) -> None:
+        self._wall_s = wall_s
+        self._newest_s = self._heard_s = self._heard_wall_s = wall_s()
+        self._start_s: float | None = None  # of the vehicle, once it has been heard
+        self._every_s = 0.0
+
+    def now_s(self) -> float:
+        age_s = self._wall_s() - self._heard_wall_s
+        stalled_s = 0.0 if self._start_s is None else min(max(age_s - self.LATE * self._every_s, 0.0), self.STALL_S)
+        self._newest_s = max(self._newest_s, self._heard_s + age_s - stalled_s)
+        return self._newest_s
+
+    def started(self) -> None:
+        """Expect its messages to begin at zero again."""
+        self._heard_s, self._heard_wall_s, self._start_s = self.now_s(), self._wall_s(), None
+
+    def heard(self, since_start_s: float, age_s: float) -> None:
+        """Take over the time of a message that arrived so long ago."""
+        wall_s = self._wall_s() - age_s
+        if self._start_s is None:
+            self._start_s = self._heard_s + wall_s - self._heard_wall_s - since_start_s
+        self._every_s = self._start_s + since_start_s - self._heard_s
+        self._heard_s, self._heard_wall_s = self._start_s + since_start_s, wall_s
+
+
+class ClockLink:
+    """A link to a vehicle that sets its clock."""
+
+    def __init__(self, inner: Transport, clock: VehicleClock) -> None:
+        self._inner = inner
+        self._clock = clock
+
+    def send(self, data: bytes) -> None:
+        self._inner.send(data)
+
+    def receive(self, now_us: int) -> list[Datagram]:
+        came = self._inner.receive(now_us)
+        for datagram in came:
+            for frame in frames(datagram.data):
+                if message_id(frame) == ATTITUDE:
+                    self._clock.heard(int.from_bytes(frame[10:14], "little") * 1e-3, (now_us - datagram.t_us) * 1e-6)
+        return came
+
+    def close(self) -> None:
+        self._inner.close()
+
+
 class ByUrl:
     """Any autopilot on the URLs of its links; `restart_command` is a shell line that starts it afresh."""
 
@@ -103,6 +162,8 @@ class ByUrl:
     def __init__(self, url: str, gcs_url: str = "", restart_command: str = "") -> None:
         urls = {OFFBOARD_LINK: url} | ({GCS_LINK: gcs_url} if gcs_url else {})
         self.links: dict[str, Transport] = {name: open_transport(u) for name, u in urls.items()}
+        self._clock = VehicleClock()
+        self.links[OFFBOARD_LINK] = ClockLink(self.links[OFFBOARD_LINK], self._clock)
         self._restart_command = restart_command
         self._process: subprocess.Popen[bytes] | None = None
         if restart_command:
@@ -115,10 +176,11 @@ class ByUrl:
         self._stop()
         for link in self.links.values():
             link.receive(0)  # what the last one still said
+        self._clock.started()
         self._process = subprocess.Popen(["sh", "-c", f"exec {self._restart_command}"], stdout=subprocess.DEVNULL)
 
     def now_s(self) -> float:
-        return time.monotonic()
+        return self._clock.now_s()
 
     def advance(self) -> None:
         time.sleep(self.PAUSE_S)

@@ -35,7 +35,8 @@ class Player:
     def __init__(self, dialogue: Dialogue) -> None:
         self.dialogue = dialogue
         self._verifier = Verifier(dialogue)
-        self._original: dict[str, int | float] = {}
+        self._original: dict[str, int | float] = {}  # of every parameter that a row has ever changed
+        self._changed: set[str] = set()  # of these, since they were last restored
         self._spoilt = False
 
     def play(self, row: v.Row) -> None:
@@ -78,8 +79,9 @@ class Player:
         partner = self.dialogue.partner
         booting = row.start is v.State.BOOTING
         if partner.simulated or (partner.can_restart() and (row.needs_reboot or self._spoilt)):
-            partner.restart(booting)  # a real one keeps the parameters of the row before
+            partner.restart(booting)
             self.dialogue.begin()
+            self._changed = set(self._original)  # a real one stores a parameter seconds after it was set, or never
         self._wait(lambda: bool(self.dialogue.sysid), 10.0, "no HEARTBEAT of component 1")
         if booting:
             return
@@ -104,9 +106,9 @@ class Player:
         if self._armed() and not (stay_up and not self._spoilt and self._aloft()):
             self._land_and_disarm()
         self._say(v.go(4, 3))
-        for name, value in self._original.items():
-            self._verifier.verify(v.SetParam(name, value))
-        self._original.clear()
+        for name in sorted(self._changed):
+            self._verifier.verify(v.SetParam(name, self._original[name]))
+        self._changed.clear()
 
     def _land_and_disarm(self) -> None:
         if not self._say(v.disarm()):
@@ -137,7 +139,10 @@ class Player:
 
     def _remember(self, name: str, value: int | float) -> None:
         """What a parameter is before we change it; only a vehicle that outlives the row needs that."""
-        if self.dialogue.partner.simulated or name in self._original:
+        if self.dialogue.partner.simulated:
+            return
+        self._changed.add(name)
+        if name in self._original:
             return
         read = v.message("PARAM_REQUEST_READ", target_system=v.OWN, target_component=1, param_id=name, param_index=-1)
         self._verifier.verify(v.Send(what=read))

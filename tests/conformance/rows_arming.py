@@ -95,10 +95,10 @@ ARMING_ROWS = (
             Says(text="Using default takeoff altitude: 2.5 m\t", severity=INFO),
             Turns(value=3, low_s=1.3, high_s=2.7, name=EXTENDED, field="landed_state"),
             Says(text="Takeoff detected\t", severity=INFO, within_s=3.5),
-            Turns(value=M_LOITER, low_s=6.3, high_s=9.3),
+            Turns(value=M_LOITER, low_s=5.5, high_s=9.3),
             Passes(name=EXTENDED, field="landed_state", values=(1, 3, 2), within_s=10.0),
             Mark(),
-            Moves("height_m", near(2.5, 0.4), 1.0),
+            Moves("height_above_home_m", near(2.5, 0.4), 4.0),  # it goes on to climb in LOITER
         ),
     ),
     Row(
@@ -124,7 +124,7 @@ ARMING_ROWS = (
             Command(number=LAND),
             Says(text="Landing at current position\t", severity=INFO),
             Says(text="Landing detected\t", severity=INFO, within_s=15.0),
-            Passes(name=EXTENDED, field="landed_state", values=(4, 1), within_s=10.0),
+            Passes(name=EXTENDED, field="landed_state", values=(4, 1), within_s=15.0),
             Mark(),
             Says(text="Disarmed by landing\t", severity=INFO, within_s=3.6),
             heartbeat(4.6, base_mode=29, custom_mode=M_LOITER),

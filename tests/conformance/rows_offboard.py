@@ -83,10 +83,10 @@ ENTRY_ROWS = (
         steps=(Send(what=setpoint()), Wait(1.3), go(6, ack=TEMPORARILY_REJECTED), mode(M_LOITER)),
     ),
     Row(
-        name="1.0 Hz holds OFFBOARD",
+        name="1.1 Hz holds OFFBOARD",  # at 1.0 Hz milliseconds decide
         section=ENTRY,
         start=State.OFFBOARD,
-        steps=(Stream(setpoint(HOVER_01), 1.0), always("CURRENT_MODE", 5.0, 9, custom_mode=M_OFFBOARD)),
+        steps=(Stream(setpoint(HOVER_01), 1.1), always("CURRENT_MODE", 5.0, 9, custom_mode=M_OFFBOARD)),
     ),
     Row(
         name="2 Hz holds OFFBOARD",

@@ -43,7 +43,9 @@ STATE_ROWS = (
         section=STATE,
         start=State.BOOTING,
         steps=(
-            heartbeat(type=2, autopilot=12, mavlink_version=3, base_mode=29, custom_mode=M_LOITER, system_status=0),
+            heartbeat(
+                3.0, type=2, autopilot=12, mavlink_version=3, base_mode=29, custom_mode=M_LOITER, system_status=0
+            ),
         ),
     ),
     Row(
@@ -91,7 +93,7 @@ STATE_ROWS = (
         section=STATE,
         start=State.ARMABLE,
         steps=(go(6), heartbeat(base_mode=1, custom_mode=M_OFFBOARD, system_status=0)),
-        never_streamed=True,
+        untouched=True,
     ),
     Row(
         name="OFFBOARD disarmed with a stream, then without",
@@ -171,12 +173,13 @@ STATE_ROWS = (
         start=State.ARMABLE,
         steps=(
             go(6),
-            Wait(0.3),
+            Wait(2.2),
             Mark(),
             sees("SYS_STATUS", onboard_control_sensors_health=Bits(off=PREARM)),
             Stream(setpoint()),
             sees("SYS_STATUS", 0.7, onboard_control_sensors_health=Bits(PREARM)),
         ),
+        untouched=True,  # PX4 reports this at most every 2 s, and may forget that a stream of 1 s has ended
     ),
     Row(
         name="ESTIMATOR_STATUS flags",

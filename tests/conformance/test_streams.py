@@ -15,7 +15,7 @@ from tests.conformance.rows_streams import ALL_PER_S, SILENT, STREAMS, StreamRow
 from tests.conformance.test_dialogue import option
 from tests.conformance.vocabulary import GCS_LINK, OFFBOARD_LINK
 
-SETTLE_S = 5.0  # from its start
+SETTLE_S = 8.0  # from its start: PX4 says what has changed until 2 s after it can be armed
 WATCH_S = 20.0
 TOLERANCE, ONE_MORE = 0.03, 1.01  # of the rate; and of the count
 Counts = dict[str, Counter[int]]

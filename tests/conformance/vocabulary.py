@@ -349,7 +349,7 @@ class Row:
         steps: played in order; the first that is not met ends the row.
         params: set before the start state is entered, restored afterwards.
         spoils: leaves a vehicle only a reboot makes usable again.
-        never_streamed: needs a vehicle that has had no setpoint since its start.
+        untouched: needs a vehicle that has had no setpoint, and has not flown, since its start.
         needs_gcs: needs the second link.
         not_by_url: why it can't be played against a vehicle given by URL; empty when it can.
         real_px4: why a real one may answer otherwise, where that is no fault of the row; empty where it must not.
@@ -361,7 +361,7 @@ class Row:
     steps: tuple[Step, ...]
     params: Mapping[str, int | float] = field(default_factory=dict)
     spoils: bool = False
-    never_streamed: bool = False
+    untouched: bool = False
     needs_gcs: bool = False
     not_by_url: str = ""
     real_px4: str = ""
@@ -369,4 +369,4 @@ class Row:
     @property
     def needs_reboot(self) -> bool:
         """A vehicle given by URL must be restarted before it or after it."""
-        return self.spoils or self.never_streamed or self.start is State.BOOTING
+        return self.spoils or self.untouched or self.start is State.BOOTING

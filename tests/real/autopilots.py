@@ -15,11 +15,14 @@ from pathlib import Path
 
 from swarmctl.core.types import GeoOrigin
 from swarmctl.process_lifetime import die_with_parent
-from tests.real.network import Network
+from swarmctl.process_priority import request_realtime_for_this_thread
+from tests.real.network import TMP, Network, with_tmp
 
 SPACING_M = 2.0  # apart along north, about the origin
 EARTH_RADIUS_M = 6_371_000.0
 STOP_S = 5.0
+BOOT_SPEED = 5.0  # of an ArduCopter's clock, whose filters take up to a minute to use GPS, until it is told otherwise
+_PRIORITY = 11  # above launched agents, at 10: the autopilot of a real vehicle has a processor of its own
 PARAMETER_FILES = ("copter.parm", "../../../Tools/autotest/default_params/copter.parm")  # beside it; of a source tree
 
 
@@ -46,7 +49,7 @@ class Kind:
         spread: instance i has port + spread * i.
         command: binary and start to command line.
         environment: what it is told by environment variables.
-        lock_name: of a file in /tmp by which it runs once on a machine, whatever the network; {} is the instance.
+        lock_name: of a file in `TMP` by which it runs once on a machine, whatever the network; {} is the instance.
     """
 
     variable: str
@@ -63,8 +66,15 @@ class Kind:
         given = os.environ.get(self.variable, "")
         return Path(given).expanduser().absolute() if given else None
 
-    def locks(self, count: int) -> list[Path]:
-        return [Path("/tmp") / self.lock_name.format(i) for i in range(count)] if self.lock_name else []
+    def has_own_tmp(self, network: Network) -> bool:
+        """Return whether its locks are its own: where that is permitted, and its build is still seen then."""
+        return bool(self.lock_name) and network.is_own and self.binary is not None and TMP not in self.binary.parents
+
+    def locks(self, network: Network, count: int) -> list[Path]:
+        """Return the lock files that it shares with everybody on the machine."""
+        if not self.lock_name or self.has_own_tmp(network):
+            return []
+        return [TMP / self.lock_name.format(i) for i in range(count)]
 
     def place(self, index: int, count: int, folder: Path, parameters: Mapping[str, float] | None = None) -> Start:
         """Return the place of the vehicle of that index among so many."""
@@ -78,11 +88,14 @@ class Kind:
             parameters=parameters or {},
         )
 
-    def shell_line(self, start: Start) -> list[str]:
-        """Return the shell line that starts it, from any folder and any environment."""
+    def shell_line(self, start: Start, network: Network) -> list[str]:
+        """Return the shell line that starts it in that network, from any folder and any environment."""
         assert self.binary is not None
+        folder, prefix = start.folder, network.prefix
+        if self.has_own_tmp(network):
+            folder, prefix = TMP / folder.name, (*prefix, *with_tmp(folder.parent))
         told = [f"{name}={value}" for name, value in self.environment(start).items()]
-        return ["env", "-C", str(start.folder), *told, *self.command(self.binary, start)]
+        return [*prefix, "env", "-C", str(folder), *told, *self.command(self.binary, start)]
 
 
 def _px4_command(binary: Path, start: Start) -> list[str]:
@@ -105,7 +118,17 @@ def _arducopter_command(binary: Path, start: Start) -> list[str]:
     lines = {"SYSID_THISMAV": sysid, **start.parameters}
     own.write_text("".join(f"{name} {value:g}\n" for name, value in lines.items()))
     return [
-        *(str(binary), "-S", f"-I{start.index}", "--model", "quad", "--speedup", "1", "--sysid", str(sysid)),
+        *(
+            str(binary),
+            "-S",
+            f"-I{start.index}",
+            "--model",
+            "quad",
+            "--speedup",
+            f"{BOOT_SPEED:g}",
+            "--sysid",
+            str(sysid),
+        ),
         *("--home", f"{start.lat_deg:.9f},{start.lon_deg:.9f},{start.alt_m:g},0"),
         *("--defaults", f"{_parameter_file(binary)},{own}"),
         *("--serial0", f"udpclient:127.0.0.1:{14550 + 10 * start.index}"),
@@ -167,11 +190,11 @@ class Fleet:
         start = self.kind.place(index, self.count, folder, self._parameters)
         with (folder / "out.log").open("ab") as out:
             self._running[index] = subprocess.Popen(
-                [*self.network.prefix, *self.kind.shell_line(start)],
+                self.kind.shell_line(start, self.network),
                 stdin=subprocess.DEVNULL,
                 stdout=out,
                 stderr=subprocess.STDOUT,
-                preexec_fn=lambda: die_with_parent(signal.SIGKILL),
+                preexec_fn=_as_an_autopilot,
             )
 
     def stop(self, index: int) -> None:
@@ -187,3 +210,8 @@ class Fleet:
     def close(self) -> None:
         for index in list(self._running):
             self.stop(index)
+
+
+def _as_an_autopilot() -> None:
+    die_with_parent(signal.SIGKILL)
+    request_realtime_for_this_thread(_PRIORITY)

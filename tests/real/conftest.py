@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import fcntl
+import os
 import shutil
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import IO
 
 import psutil
 import pytest
@@ -53,6 +56,8 @@ class Field:
 
 
 Fielder = Callable[..., Field]
+FLEET = 2  # vehicles and more, which need most of a processor
+LOOK_S = 0.2
 
 
 @pytest.fixture
@@ -62,9 +67,10 @@ def network() -> Iterator[Network]:
 
 
 @pytest.fixture
-def field(network: Network, tmp_path: Path) -> Iterator[Fielder]:
+def field(network: Network, tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Fielder]:
     """Start N vehicles of a kind; skip where no build of it is named."""
     fields: list[Field] = []
+    turns = contextlib.ExitStack()
 
     def power_up(
         kind: Kind,
@@ -73,6 +79,8 @@ def field(network: Network, tmp_path: Path) -> Iterator[Fielder]:
         on_truth: Callable[[Witness, int, Truth], None] | None = None,
     ) -> Field:
         require(kind, network, count)
+        if count >= FLEET:
+            turns.enter_context(turn(tmp_path_factory.getbasetemp().parent))
         fleet = Fleet(kind, count, network, tmp_path / "vehicles", parameters)
         fields.append(Field(fleet, Witness(fleet, on_truth), tmp_path))
         return fields[-1]
@@ -80,6 +88,18 @@ def field(network: Network, tmp_path: Path) -> Iterator[Fielder]:
     yield power_up
     for each in fields:
         each.close()
+    turns.close()
+
+
+@contextlib.contextmanager
+def turn(shared: Path) -> Iterator[None]:
+    """Wait until fewer fleets are in the air than this machine has processors: lanes share that folder."""
+    with contextlib.ExitStack() as stack:
+        names = [shared / f"fleet-{i}.lock" for i in range(len(os.sched_getaffinity(0)))]
+        files = [stack.enter_context(name.open("w")) for name in names]
+        while not any(locked(file) for file in files):
+            time.sleep(LOOK_S)
+        yield
 
 
 def require(kind: Kind, network: Network, count: int) -> None:
@@ -90,7 +110,7 @@ def require(kind: Kind, network: Network, count: int) -> None:
     taken = network.taken(port + kind.spread * i for port in kind.ports for i in range(count))
     if taken:
         pytest.skip(f"ports {taken} are taken; run as root for a network of its own")
-    running = [lock for lock in kind.locks(count) if held(lock)]
+    running = [lock for lock in kind.locks(network, count) if held(lock)]
     if running:
         pytest.skip(f"somebody else's autopilot runs and holds {', '.join(map(str, running))}")
 
@@ -99,9 +119,14 @@ def held(lock: Path) -> bool:
     """Return whether a process has locked that file."""
     if not lock.exists():
         return False
-    with lock.open("r+b") as file:
-        try:
-            fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            return True
-    return False
+    with lock.open("r+") as file:
+        return not locked(file)
+
+
+def locked(file: IO[str]) -> bool:
+    """Lock a file, until it is closed; return False where another process has."""
+    try:
+        fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True

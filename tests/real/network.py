@@ -1,7 +1,7 @@
-"""A network of its own for each test, so that two autopilots, or two tests, never meet on one port.
+"""A network of its own for each test, so that two autopilots, or two tests, never meet on one port or one lock file.
 
-Needs root and iproute2. Without them tests run in the machine's own network, one at a time, and only if its ports are
-free.
+Needs root, iproute2 and util-linux. Without them tests run in the machine's own network, one at a time, and only if its
+ports are free.
 """
 
 from __future__ import annotations
@@ -15,8 +15,10 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+TMP = Path("/tmp")
 _NAMES = itertools.count()
 _NAMESPACES = Path("/var/run/netns")
+_OWN_TMP = f'mount --bind "$0" {TMP} && exec "$@"'
 
 
 class Network:
@@ -29,6 +31,11 @@ class Network:
     def __init__(self, name: str = "") -> None:
         self._name = name
         self.prefix: tuple[str, ...] = ("ip", "netns", "exec", name) if name else ()
+
+    @property
+    def is_own(self) -> bool:
+        """Return whether nobody else is in it."""
+        return bool(self._name)
 
     @contextmanager
     def inside(self) -> Iterator[None]:
@@ -54,6 +61,11 @@ class Network:
             except OSError:
                 return False
             return True
+
+
+def with_tmp(folder: Path) -> tuple[str, ...]:
+    """Return what goes before a command line for which that folder is `TMP`; everybody else keeps theirs."""
+    return ("unshare", "--mount", "sh", "-c", _OWN_TMP, str(folder))
 
 
 def _enter(namespace: int) -> None:

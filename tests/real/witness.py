@@ -165,6 +165,9 @@ class Witness:
         padded = [*params, *[0.0] * (7 - len(params))]
         self.say(index, mav.MAVLink_command_long_message(index + 1, 1, number, 0, *padded))
 
+    def set_parameter(self, index: int, name: str, value: float) -> None:
+        self.say(index, mav.MAVLink_param_set_message(index + 1, 1, name.encode(), value, mav.MAV_PARAM_TYPE_REAL32))
+
     # --- what has been seen ---
 
     def min_separation_m(self) -> float:
