@@ -7,7 +7,7 @@ A claim about a flight must also hold for starts shifted by a millimetre, or it 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -164,8 +164,8 @@ def nudged_starts(request: pytest.FixtureRequest) -> Iterator[None]:
     """Shift the vehicles of every flight by up to a millimetre, by the seed of `--nudged`."""
     seed, as_configured = int(request.config.getoption("--nudged")), Config.simulator
 
-    def elsewhere(config: Config) -> SimulatorConfig:
-        simulator = as_configured(config)
+    def elsewhere(config: Config, agents: Sequence[int] = ()) -> SimulatorConfig:
+        simulator = as_configured(config, agents)
         spawns_ned_m = nudged(np.array(simulator.spawn_ned_m), seed)
         return simulator.model_copy(update={"spawn_ned_m": tuple(map(tuple, spawns_ned_m.tolist()))})
 
