@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from functools import partial
 
-from swarmctl.control.mpc import swarm_mpc
-from swarmctl.control.phases import failsafe
-from swarmctl.core.types import Mode, Phase
+from swarmctl.control.mpc import condensed, swarm_mpc
+from swarmctl.core.types import Mode, Phase, PlanStatus
 from tests.benches.broken_solver import Spoil, break_solver, no_answer, not_numbers, wrong_answer
 from tests.faults.row import Off
-from tests.faults.simulated import ALONE, GUARANTEED, VICTIM, Holds, Scene, SimulatedRow
+from tests.faults.simulated import ALONE, GUARANTEED, VICTIM, Holds, Scene, SimulatedRow, tracking
 
 ON_A_CIRCLE = (*ALONE, "mission.kind=circle")
 
@@ -24,13 +23,6 @@ def _break(scene: Scene, agent: int, lasts_s: float, spoil: Spoil) -> None:
 
 def flies_in(mode: Mode, agent: int = 0) -> Holds:
     return lambda scene: mode in scene.modes.get(agent, set())
-
-
-def without(*rows: str) -> Off:
-    """Leave rows of the failsafe's table out."""
-    kept = tuple(row for row in failsafe._TABLE if row[0].__name__ not in rows)
-    assert len(kept) == len(failsafe._TABLE) - len(rows)
-    return Off(patches=((failsafe, "_TABLE", kept),))
 
 
 def _tracks_again(scene: Scene) -> bool:
@@ -68,12 +60,12 @@ ROWS = (
         name="solver-for-good",
         event="the solver gives no answer any more",
         reaction="replay, brake, hold, and a landing",
-        within_s=6.5,
+        within_s=12.0,
         protection="the longest hold without a plan (agent.failsafe.hold_s)",
         scene=ON_A_CIRCLE,
         happens=broken(600.0),
         reacts=lambda scene: scene.flight_mode(0).name == "LAND",
-        lasts_s=8.0,
+        lasts_s=12.5,
         off=Off(settings=("agent.failsafe.hold_s=600",)),
     ),
     SimulatedRow(
@@ -81,25 +73,24 @@ ROWS = (
         event="the solver's answer is no number for 0.3 s",
         reaction="it is not flown: the last certified plan is",
         within_s=0.1,
-        protection="rows of the failsafe's table for plans that must not be flown",
+        protection="answers are looked at before they are flown",
         scene=ON_A_CIRCLE,
         happens=broken(0.3, not_numbers),
         reacts=flies_in(Mode.REPLAY),
         lasts_s=1.5,
         finally_={"it does not track again": _tracks_again},
-        off=without("_plan_is_young"),
+        off=Off(patches=((condensed, "_usable", lambda solution: solution.x),)),
     ),
     SimulatedRow(
         name="solver-wrong",
-        event="the solver's answer is wrong for 0.3 s, and called a solution",
-        reaction="its residual gives it away: it is not flown",
-        within_s=0.1,
+        event="the solvers of four agents that meet answer wrongly for 1 s, and call it a solution",
+        reaction="the residual gives the answers away: they are not flown",
+        within_s=0.2,
         protection="limit of the residual",
-        scene=ON_A_CIRCLE,
-        happens=broken(0.3, wrong_answer),
-        reacts=flies_in(Mode.REPLAY),
-        lasts_s=1.5,
-        finally_={"it does not track again": _tracks_again},
+        due=tracking(2.0),
+        happens=lambda scene: [_break(scene, i, 1.0, wrong_answer) for i in range(4)],
+        reacts=lambda scene: any(scene.tick(i)["plan_status"] == PlanStatus.RESIDUAL for i in range(4)),
+        lasts_s=4.0,
         off=Off(patches=((swarm_mpc, "RESIDUAL_LIMIT_M", float("inf")),)),
     ),
     SimulatedRow(
