@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from swarmctl.agent import coordination
+from swarmctl.agent import coordination, world_model
 from swarmctl.agent.coordination import Coordination
 from swarmctl.agent.world_model import WorldModel
 from swarmctl.bus import peers
@@ -44,6 +44,10 @@ def refused(reason: str, count: int, by: Sequence[int] = OTHERS) -> Holds:
 
 def rests(agents: Sequence[int], slower_m_s: float = 0.25) -> Holds:
     return lambda scene: all(scene.speed_m_s(i) < slower_m_s for i in agents)
+
+
+def wait(agents: Sequence[int]) -> Holds:
+    return lambda scene: all(scene.waits(i) for i in agents)
 
 
 def arrived(scene: Scene) -> bool:
@@ -180,15 +184,15 @@ ROWS = (
     SimulatedRow(
         name="peer-silent",
         event="the paths of one of four agents reach nobody any more, who goes on flying",
-        reaction="all come to rest; it is named",
-        within_s=3.0,
+        reaction="all wait, keep clear of where it may be, and name it",
+        within_s=1.0,
         protection="rest while a peer is silent that may fly on",
         happens=cut([(VICTIM, i) for i in OTHERS], 60.0),
-        reacts=rests(OTHERS),
+        reacts=wait(OTHERS),
         lasts_s=5.0,
         finally_={
             "nobody names it": lambda scene: bool(scene.events(0, "unresponsive")),
-            "they fly on": rests(OTHERS),
+            "they don't wait": wait(OTHERS),
         },
         off=FLIES_ON,
     ),
@@ -280,15 +284,14 @@ ROWS = (
     SimulatedRow(
         name="bus-silent-10s",
         event="the bus carries nothing for 10 s",
-        reaction="all come to rest, and arrive once it does again; bodies stay apart (they may brake into 0.8 m)",
-        within_s=3.0,
+        reaction="all come to rest, and arrive once it does again",
+        within_s=2.5,
         protection="rest while a peer is silent that may fly on",
         happens=bus_fails(10.0),
         reacts=rests(range(4)),
         lasts_s=20.0,
         finally_={"they don't arrive": arrived},
-        apart_m=0.65,
-        off=FLIES_ON,
+        off=Off(patches=((world_model, "_BUS_LOST_US", 10**12),)),
     ),
     SimulatedRow(
         name="bus-silent-10s-guaranteed",
@@ -338,11 +341,11 @@ ROWS = (
     SimulatedRow(
         name="cut-one-way",
         event="one agent hears another no longer, which still hears it, for 4 s",
-        reaction="all come to rest or pass, and go on when it is mended",
-        within_s=3.0,
+        reaction="it waits; all arrive when it is mended",
+        within_s=1.0,
         protection="rest while a peer is silent that may fly on",
         happens=cut([(VICTIM, 0)], 4.0),
-        reacts=rests((0,)),
+        reacts=wait((0,)),
         lasts_s=14.0,
         finally_={"they don't arrive": arrived},
         off=FLIES_ON,

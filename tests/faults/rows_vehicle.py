@@ -15,6 +15,7 @@ from swarmctl.control.phases.state_machine import REBOOTED, MissionStateMachine
 from swarmctl.core.types import FlightMode, Mode, Phase
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.local_frame import LocalFrame
+from swarmctl.mavlink.vehicle_clock import VehicleClock
 from tests.faults.row import Off
 from tests.faults.rows_agents import lands
 from tests.faults.rows_bus import FORGETS, OTHERS, for_
@@ -193,8 +194,7 @@ ROWS = (
         reacts=lambda scene: scene.agent(0).outcome == REBOOTED,
         lasts_s=12.5,
         fastest_m_s=100.0,
-        told=("reboot",),
-        off=Off(patches=((state_machine, "REBOOTED", "nothing"),)),
+        off=Off(patches=((VehicleClock, "boots", property(lambda self: 0, lambda self, count: None)),)),
     ),
     SimulatedRow(
         name="pilot-takes-over",
@@ -239,7 +239,7 @@ ROWS = (
         name="pilot-kills",
         event="a pilot disarms a vehicle in the air, by force",
         reaction="it is not armed again; the others keep clear",
-        within_s=0.3,
+        within_s=0.5,
         protection="who flies is looked at before anything is sent",
         happens=pilot(ARM_DISARM, 0.0, BY_FORCE),
         reacts=lambda scene: not scene.true(VICTIM)["armed"] and nothing_is_sent(scene),
