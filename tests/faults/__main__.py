@@ -1,9 +1,9 @@
 """Plays the fault matrix, or shows that each of its rows can fail.
 
-    python -m tests.faults                    every row, with its protection
-    python -m tests.faults --off              every row without it: each must fail
-    python -m tests.faults --only NAME,NAME   some of them; words of shell patterns
-    python -m tests.faults --plays 10         again and again
+python -m tests.faults                    every row, with its protection
+python -m tests.faults --off              every row without it: each must fail
+python -m tests.faults --only NAME,NAME   some of them; words of shell patterns
+python -m tests.faults --plays 10         again and again
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ from pathlib import Path
 
 import swarmctl  # noqa: F401  (before anything loads numpy)
 from tests.faults.matrix import ROWS
-from tests.faults.row import Row, Unmet
+from tests.faults.row import Row, UnmetError
 
 
 def play(row: Row, folder: Path, *, off: bool) -> tuple[bool, str]:
     """Play a row; return whether that is as it should be, and what was seen."""
     try:
         played = row.play(folder, protected=not off)
-    except Unmet as unmet:
+    except UnmetError as unmet:
         return off, str(unmet)
     except Exception as error:  # without its protection anything may break; with it nothing
         return off, repr(error)

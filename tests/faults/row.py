@@ -15,14 +15,14 @@ from typing import Any
 from unittest.mock import patch
 
 
-class Unmet(AssertionError):
+class UnmetError(AssertionError):
     """The reaction of a row did not come, came too late, or something was violated on the way."""
 
 
 def require(holds: bool, what: str) -> None:
     """Fail the row unless something holds, named so that the failure reads as what happened."""
     if not holds:
-        raise Unmet(what)
+        raise UnmetError(what)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -44,7 +44,7 @@ class Off:
         """Keep the patches of this process in place."""
         with ExitStack() as stack:
             for owner, name, value in self.patches:
-                stack.enter_context(patch.object(owner, name, value))
+                stack.enter_context(patch.object(owner, name, value, create=True))
             yield
 
 
@@ -85,5 +85,5 @@ class Row(ABC):
         """Play the row in a new folder, with its protection or without.
 
         Raises:
-            Unmet: the row fails.
+            UnmetError: the row fails.
         """

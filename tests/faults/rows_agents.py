@@ -10,14 +10,12 @@ from swarmctl import wall_clock
 from swarmctl.agent import coordination
 from swarmctl.bus.peers import agent_name
 from swarmctl.core.types import FlightMode, Mode, Phase
-from swarmctl.mavlink import mode_watch
 from swarmctl.wall_clock import WallClock
 from tests.faults.row import Off
 from tests.faults.rows_bus import FORGETS, OTHERS, arrived, for_, rests
-from tests.faults.simulated import GUARANTEED, SWAP, VICTIM, Holds, Scene, SimulatedRow, entered, tracking
+from tests.faults.simulated import GUARANTEED, SWAP, VICTIM, Scene, SimulatedRow, entered, tracking
 
 NO_LANDING = Off(settings=("agent.autopilot_params={COM_OBL_RC_ACT=4,COM_OF_LOSS_T=60}",))
-RETAKES = Off(patches=((mode_watch, "_GAP_US", 10**12),))
 UNPROTECTED = Off(settings=("agent.overload.widen_01=1", "agent.overload.hold_01=1", "agent.overload.clear_01=1"))
 WHATEVER_PEERS = Off(patches=((coordination, "_SUSPECT_US", 10**12),))
 _BLIND_S = 0.8  # COM_OF_LOSS_T, which the agent sets, and what the autopilot takes to act
@@ -73,23 +71,25 @@ def _clock_follows(scene: Scene, seconds: float) -> None:
 def _goes_on(scene: Scene) -> bool:
     """Return whether everybody tracks and nothing was refused."""
     tracks = all(scene.phase(i) is Phase.TRACK for i in scene.agents)
-    return tracks and not any(scene.agent(i).rejected.get(reason) for i in scene.agents for reason in ("future", "late"))
+    return tracks and not any(
+        scene.agent(i).rejected.get(reason) for i in scene.agents for reason in ("future", "late")
+    )
 
 
-def stops_without_taking_back(name: str, seconds: float, scene: tuple[str, ...], words: str, off: Off) -> SimulatedRow:
+def stops_without_taking_back(name: str, seconds: float, scene: tuple[str, ...], words: str) -> SimulatedRow:
     return SimulatedRow(
         name=name,
         event=f"an agent is stopped for {seconds:g} s{words}",
         reaction="its autopilot lands the vehicle; the agent never takes it back; the others keep clear",
         within_s=_BLIND_S,
-        protection="offboard-loss action of the autopilot" if off is NO_LANDING else "doubt of the mode after a pause",
+        protection="offboard-loss action of the autopilot",
         scene=scene,
         happens=frozen(seconds),
         reacts=lands,
         lasts_s=max(4.0, seconds + 2.0),
         may_be_told=("deadline misses",),
         finally_={"why is not told": lambda scene: scene.agent(VICTIM).outcome.startswith("overload: setpoints stop")},
-        off=off,
+        off=NO_LANDING,
     )
 
 
@@ -135,20 +135,14 @@ def _due_with_clock(seconds: float, scene: Scene) -> bool:
     return scene.mission_s >= 1.0
 
 
-def overloaded(scene: Scene) -> list[str]:
-    return [event["level"] for event in scene.events(VICTIM, "overload")]
-
-
-def slow_rest(agents: Sequence[int]) -> Holds:
-    return lambda scene: "HOLD" in overloaded(scene) and rests(agents, 0.4)(scene)
+def overloaded(scene: Scene, agent: int = VICTIM) -> list[str]:
+    return [event["level"] for event in scene.events(agent, "overload")]
 
 
 ROWS = (
-    stops_without_taking_back("agent-stopped-2s", 2.0, SWAP, "", RETAKES),
-    stops_without_taking_back("agent-stopped-20s", 20.0, SWAP, "", NO_LANDING),
-    stops_without_taking_back(
-        "agent-stopped-2s-guaranteed", 2.0, GUARANTEED, ", with guaranteed separation", NO_LANDING
-    ),
+    stops_without_taking_back("agent-stopped-2s", 2.0, SWAP, ""),
+    stops_without_taking_back("agent-stopped-20s", 20.0, SWAP, ""),
+    stops_without_taking_back("agent-stopped-2s-guaranteed", 2.0, GUARANTEED, ", with guaranteed separation"),
     dies_in(Phase.READY, NO_LANDING),
     dies_in(Phase.TRACK, NO_LANDING),
     SimulatedRow(
@@ -232,7 +226,7 @@ ROWS = (
         protection="response to missed deadlines (agent.overload)",
         due=tracking(0.5),
         happens=starved((VICTIM,), 5),
-        reacts=slow_rest((VICTIM,)),
+        reacts=lambda scene: "HOLD" in overloaded(scene) and rests((VICTIM,), 0.4)(scene),
         lasts_s=16.0,
         finally_={
             "it does not land": lambda scene: "LAND" in overloaded(scene),
@@ -244,14 +238,14 @@ ROWS = (
     SimulatedRow(
         name="all-starved-guaranteed",
         event="the processors of all agents execute one tick of five, with guaranteed separation",
-        reaction="all come to rest",
-        within_s=6.0,
+        reaction="all say so, widen distances, hold, and land",
+        within_s=14.0,
         protection="response to missed deadlines (agent.overload)",
         scene=GUARANTEED,
         due=tracking(0.5),
         happens=starved(range(4), 5),
-        reacts=slow_rest(range(4)),
-        lasts_s=9.0,
+        reacts=lambda scene: all(overloaded(scene, i)[-1:] == ["LAND"] for i in range(4)),
+        lasts_s=14.5,
         may_be_told=("overload", "deadline misses"),
         off=UNPROTECTED,
     ),

@@ -10,13 +10,14 @@ import numpy as np
 
 from swarmctl.agent import coordination, world_model
 from swarmctl.agent.coordination import Coordination
+from swarmctl.agent.separation_policy import Guaranteed
 from swarmctl.agent.world_model import WorldModel
 from swarmctl.bus import peers
 from swarmctl.bus.path_messages import decode_path, encode_path
 from swarmctl.bus.peers import PeerPaths, agent_name
 from swarmctl.bus.senders import SenderVerifier
 from swarmctl.bus.topics import PATH, Topic
-from swarmctl.core.types import PredictedPath
+from swarmctl.core.types import Array, PredictedPath
 from tests.closed_loop.test_guaranteed import only_seen
 from tests.faults.row import Off
 from tests.faults.simulated import GUARANTEED, VICTIM, Holds, Scene, SimulatedRow, tracking
@@ -40,6 +41,19 @@ FLIES_ON = Off(patches=((WorldModel, "has_unresponsive_peer", lambda *_: False),
 def refused(reason: str, count: int, by: Sequence[int] = OTHERS) -> Holds:
     """Return whether each of these agents has refused so many messages for this reason."""
     return lambda scene: all(scene.agent(i).rejected.get(reason, 0) >= count for i in by)
+
+
+def commits_nothing(agents: Sequence[int], from_s: float, to_s: float) -> dict[str, Holds]:
+    """Return the claim that these agents, who miss an answer, commit to nothing new in a time after the event."""
+
+    def holds(scene: Scene) -> bool:
+        policies = [scene.agent(i)._separation for i in agents]
+        committed = sum(p.coordination.counts.committed for p in policies if isinstance(p, Guaranteed))
+        if scene.since_s <= from_s:
+            scene.notes["committed"] = committed
+        return not from_s < scene.since_s <= to_s or committed == scene.notes["committed"]
+
+    return {"agents commit without an answer": holds}
 
 
 def rests(agents: Sequence[int], slower_m_s: float = 0.25) -> Holds:
@@ -102,9 +116,23 @@ def overhears(change: Callable[[Scene, str, Topic, bytes], Sequence[tuple[str, b
                 for name, more in change(scene, sender, topic, payload):
                     carry(name, topic, more)
 
-        hub.carry = carried  # type: ignore[method-assign]
+        hub.carry = carried  # type: ignore[method-assign, assignment]
+        for i in scene.agents:
+            _count_offers(scene, i)
 
     return happens
+
+
+def _count_offers(scene: Scene, agent: int) -> None:
+    paths = scene.agent(agent)._world_model.paths
+    offer = paths.offer
+
+    def counted(*received: Any) -> None:
+        scene.notes["offers", agent] += 1
+        offer(*received)
+
+    scene.notes["offers", agent] = 0
+    paths.offer = counted  # type: ignore[method-assign, assignment]
 
 
 def _changed(payload: bytes, **fields: Any) -> bytes:
@@ -113,10 +141,10 @@ def _changed(payload: bytes, **fields: Any) -> bytes:
     return encode_path(replace(path, **fields))
 
 
-def _away(payload: bytes) -> np.ndarray[Any, Any]:
+def _away(payload: bytes) -> Array:
     path = decode_path(payload)
     assert path is not None
-    return path.pos_ned_m + np.array([40.0, 0.0, 0.0])
+    return np.asarray(path.pos_ned_m + np.array([40.0, 0.0, 0.0]))
 
 
 def _malformed(scene: Scene, sender: str, topic: Topic, payload: bytes) -> list[tuple[str, bytes]]:
@@ -170,12 +198,14 @@ def _counted_up(scene: Scene, sender: str, topic: Topic, payload: bytes) -> list
 
 def _least_work(scene: Scene) -> bool:
     """Return whether no agent looks at more than its ring of messages of a sender in a tick."""
-    for i in scene.agents:
-        before, now = scene.notes.get(("total", i), 0), scene.agent(i)._world_model.refusals.total
-        scene.notes["total", i] = now
-        if now - before > 2 * PATH.ring and scene.since_s > 0.1:
-            return False
-    return True
+    counts = [scene.notes["offers", i] for i in scene.agents]
+    scene.notes |= {("offers", i): 0 for i in scene.agents}
+    return bool(max(counts) <= PATH.ring * (len(counts) - 1))
+
+
+def _whoever(paths: PeerPaths, sender: str, path: PredictedPath, utc_us: int) -> str:
+    """Refuse only what is in the own name."""
+    return "" if path.agent in paths._verifiers else "unknown_peer"
 
 
 BUSY = {"an agent looks at a flood of messages": _least_work}
@@ -231,7 +261,7 @@ ROWS = (
         reacts=refused("identity", 10, (0, 3)),
         lasts_s=4.0,
         told=(r"agent-2 were refused \(path identity \d+\)",),
-        off=Off(patches=((PeerPaths, "_refusal", lambda *_: ""),)),
+        off=Off(patches=((PeerPaths, "_refusal", _whoever),)),
     ),
     SimulatedRow(
         name="peer-of-the-future",
@@ -275,7 +305,7 @@ ROWS = (
         within_s=2.0,
         protection="rings of a few messages for each sender",
         happens=overhears(_counted_up),
-        reacts=lambda scene: scene.agent(0)._world_model.refusals.total > 20,
+        reacts=refused("sequence", 10),
         lasts_s=4.0,
         told=(r"agent-1 were refused",),
         always=BUSY,
@@ -317,6 +347,7 @@ ROWS = (
         happens=bus_fails(1.0),
         reacts=arrived,
         lasts_s=12.5,
+        always=commits_nothing(range(4), 0.3, 1.0),
         off=Off(patches=((Coordination, "_required_peers", lambda *_: frozenset()),)),
     ),
     *(
@@ -330,6 +361,7 @@ ROWS = (
             happens=cut(between(one, other), 5.0),
             reacts=arrived,
             lasts_s=16.5,
+            always=commits_nothing((*one, *other), 1.0, 5.0),
             off=Off(patches=((Coordination, "_required_peers", lambda *_: frozenset()),)),
         )
         for a, b, one, other in (
@@ -360,17 +392,19 @@ ROWS = (
         happens=cut([(VICTIM, 0)], 4.0),
         reacts=arrived,
         lasts_s=16.5,
+        always=commits_nothing((0,), 1.0, 4.0),
         off=Off(patches=((Coordination, "_required_peers", lambda *_: frozenset()),)),
     ),
     SimulatedRow(
-        name="isolated-5s",
-        event="one host of four is cut off from all others for 5 s, with guaranteed separation",
+        name="isolated-2.5s",
+        event="one host of four is cut off from all others for 2.5 s, with guaranteed separation",
         reaction="it comes to rest; all arrive once it is heard again",
         within_s=4.0,
         protection="who is silent is waited for",
         scene=GUARANTEED,
         happens=cut(between((VICTIM,), OTHERS), 2.5),
         reacts=rests((VICTIM,)),
+        always=commits_nothing(range(4), 1.0, 2.5),
         lasts_s=18.0,
         finally_={"they don't arrive": arrived},
         off=Off(patches=((Coordination, "_required_peers", lambda *_: frozenset()),)),

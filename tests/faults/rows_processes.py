@@ -7,6 +7,8 @@ import resource
 import signal
 import socket
 import subprocess
+import sys
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -17,7 +19,7 @@ import psutil
 
 from tests.faults.launched import Bounded, LaunchedRow, Start
 from tests.faults.row import Off, require
-from tests.process.test_check import Pilot, Simulator
+from tests.process.test_check import ENV, ROOT, Pilot, Simulator
 from tests.process.test_launch import (
     AIR,
     NEAR,
@@ -186,12 +188,6 @@ def _of_another_simulator(port: int) -> tuple[str, ...]:
 
 
 def _simulator_on(port: int) -> subprocess.Popen[str]:
-    simulator = Simulator.__new__(Simulator)
-    simulator.ports = [port]
-    import sys
-
-    from tests.process.test_check import ENV, ROOT
-
     line = [sys.executable, "-m", "sitl", "--vehicles", "1", "--remote-ports", str(port), "--ekf-ready-s", "0.2"]
     return subprocess.Popen([*line, "--die-with-parent"], cwd=ROOT, env=ENV, stdout=subprocess.PIPE, text=True)
 
@@ -224,8 +220,8 @@ def launcher_stopped(start: Start) -> None:
 
 @contextmanager
 def small_disk(folder: Path, megabytes: float = 6.0) -> Iterator[Path]:
-    """Yield a folder on a disk of its own, which is soon full. As root."""
-    where = folder / "disk"
+    """Yield a run folder on a disk of its own, which is soon full. As root."""
+    where = folder / "run"  # beside it is what the launch prints
     where.mkdir()
     size = f"size={round(megabytes * 1024)}k"
     subprocess.run(["mount", "-t", "tmpfs", "-o", size, "none", str(where)], check=True)
@@ -248,11 +244,8 @@ def fill(disk: Path) -> None:
 
 def disk_full(phase: str) -> Callable[[Start], None]:
     def script(start: Start) -> None:
-        folder = Path(start().run_dir.parent) if False else None
-        del folder
-        with small_disk(Path(os.environ["SWARM_FAULTS_FOLDER"])) as disk:
-            launched = start(*TWO, *NEAR, "--duration", "4", run_dir=disk / "run")
-            launched.out.touch()
+        with tempfile.TemporaryDirectory(prefix="disk") as name, small_disk(Path(name)) as disk:
+            launched = start(*TWO, *NEAR, "--duration", "4", run_dir=disk)
             launched.until_phase(phase, 2)
             launched.event()
             fill(disk)
@@ -317,7 +310,7 @@ def descriptors_of_the_launcher_and_an_agent_dies(start: Start) -> None:
 class Piped(Bounded):
     """A launch whose output is read by another program, which may end."""
 
-    prefix = ("sh", "-c", 'exec 3>"$0"; "$@" | { head -n 4 >&3; }; exit 0')
+    prefix: tuple[str, ...] = ("sh", "-c", 'exec 3>"$0"; "$@" | { head -n 4 >&3; }; exit 0')
 
     def __init__(self, run_dir: Path, temp: Path, *arguments: str) -> None:
         self.prefix = (*type(self).prefix, str(run_dir.with_suffix(".head")))
@@ -385,11 +378,6 @@ def write(self, event, **fields):
         file.write(json.dumps({"utc_us": 0, "t_us": 0, "source": self._source, "event": event, **fields}) + "\\n")
 log.EventLog.write = write
 """
-PATIENT = Off(
-    preload="",
-    settings=(),
-)
-
 ROWS = (
     LaunchedRow(
         name="process-agent-stopped-0.3s",
@@ -488,8 +476,8 @@ ROWS = (
         script=simulator_started_again,
         off=in_program(
             "agent",
-            "import swarmctl.control.phases.state_machine as it\n"
-            "it.MissionStateMachine._watch_boots = lambda *_, **__: None",
+            "import swarmctl.mavlink.vehicle_clock as it\n"
+            "it.VehicleClock.boots = property(lambda self: 0, lambda self, count: None)",
         ),
     ),
     LaunchedRow(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import partial
 
 from swarmctl.control.mpc import condensed, swarm_mpc
-from swarmctl.core.types import Mode, Phase, PlanStatus
+from swarmctl.core.types import FlightMode, Mode, Phase, PlanStatus
 from tests.benches.broken_solver import Spoil, break_solver, no_answer, not_numbers, wrong_answer
 from tests.faults.row import Off
 from tests.faults.simulated import ALONE, GUARANTEED, VICTIM, Holds, Scene, SimulatedRow, tracking
@@ -19,6 +19,11 @@ def broken(lasts_s: float, spoil: Spoil = no_answer, agent: int = 0) -> partial[
 
 def _break(scene: Scene, agent: int, lasts_s: float, spoil: Spoil) -> None:
     break_solver(scene.lockstep, agent, lasts_s, spoil)
+
+
+def _all_wrong(scene: Scene) -> None:
+    for agent in range(4):
+        _break(scene, agent, 1.0, wrong_answer)
 
 
 def flies_in(mode: Mode, agent: int = 0) -> Holds:
@@ -59,13 +64,16 @@ ROWS = (
     SimulatedRow(
         name="solver-for-good",
         event="the solver gives no answer any more",
-        reaction="replay, brake, hold; then it is landed and disarmed",
-        within_s=12.0,
+        reaction="replay, brake, hold; then the autopilot gets the vehicle, at rest",
+        within_s=7.0,
         protection="the longest hold without a plan (agent.failsafe.hold_s)",
         scene=ON_A_CIRCLE,
         happens=broken(600.0),
-        reacts=lambda scene: not scene.true(0)["armed"],
-        lasts_s=12.5,
+        reacts=lambda scene: (
+            scene.phase(0) >= Phase.LAND and scene.flight_mode(0) in (FlightMode.HOLD, FlightMode.LAND)
+        ),
+        lasts_s=8.0,
+        told=("agent 0: no plan for too long",),
         off=Off(settings=("agent.failsafe.hold_s=600",)),
     ),
     SimulatedRow(
@@ -88,7 +96,7 @@ ROWS = (
         within_s=0.2,
         protection="limit of the residual",
         due=tracking(2.0),
-        happens=lambda scene: [_break(scene, i, 1.0, wrong_answer) for i in range(4)],
+        happens=_all_wrong,
         reacts=lambda scene: any(scene.tick(i)["plan_status"] == PlanStatus.RESIDUAL for i in range(4)),
         lasts_s=4.0,
         off=Off(patches=((swarm_mpc, "RESIDUAL_LIMIT_M", float("inf")),)),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -50,7 +50,7 @@ class Scene:
     began_us: int | None = None  # when the event happened
     modes: dict[int, set[Mode]] = field(default_factory=dict)
     apart_m: float = np.inf
-    notes: dict[str, Any] = field(default_factory=dict)  # what an event leaves for its claims
+    notes: dict[Any, Any] = field(default_factory=dict)  # what an event leaves for its claims
     each_tick: list[Callable[[Scene], None]] = field(default_factory=list)  # what an event goes on to do
 
     @property
@@ -133,12 +133,15 @@ def entered(phase: Phase, agent: int = VICTIM) -> Holds:
     return lambda scene: scene.phase(agent) >= phase
 
 
+_AMID_THE_WAY = tracking(1.5)
+
+
 @dataclass(frozen=True, kw_only=True)
 class SimulatedRow(Row):
     """A row flown in lockstep.
 
-    In every one, by true states: two vehicles never come closer than `apart_m`, none is faster than 8 m/s, none that was
-    disarmed is armed again, and none that has left the mode that follows setpoints returns to it by itself. The run
+    In every one, by true states: two vehicles never come closer than `apart_m`, none is faster than 8 m/s, none that
+    was disarmed is armed again, and none that has left the mode that follows setpoints returns to it by itself. The run
     folder can be read, and its summary tells the violations `told`, perhaps those that `may_be_told`, and no others.
 
     Attributes:
@@ -154,12 +157,12 @@ class SimulatedRow(Row):
 
     scene: tuple[str, ...] = SWAP
     clocks: tuple[int, ...] = ()
-    due: Holds = tracking(1.5)
+    due: Holds = _AMID_THE_WAY
     happens: Happens
     reacts: Holds
     lasts_s: float
-    always: dict[str, Holds] = field(default_factory=dict)
-    finally_: dict[str, Holds] = field(default_factory=dict)
+    always: Mapping[str, Holds] = field(default_factory=dict)
+    finally_: Mapping[str, Holds] = field(default_factory=dict)
     told: tuple[str, ...] = ()  # patterns
     may_be_told: tuple[str, ...] = ()
     apart_m: float = 0.8
@@ -208,7 +211,9 @@ class SimulatedRow(Row):
         (folder / "truth.bin").write_bytes(lockstep.truth.tobytes())
         write_events(folder / "sitl.events.jsonl", lockstep.fault_events)
         problems = tuple(problem for problem in lockstep.problems() if _UNFINISHED not in problem)
-        outcome = run_folder.Outcome(outcome="failed" if problems else "interrupted", problems=problems, speed_factor=1.0)
+        outcome = run_folder.Outcome(
+            outcome="failed" if problems else "interrupted", problems=problems, speed_factor=1.0
+        )
         with patch.object(run_folder, "write_report"):  # half of the time, and the matter of other tests
             rules = replace(config.rules("lockstep"), required_separation_m=self.apart_m)
             run_folder.finish_run(folder, rules, outcome, lockstep.recorded())
