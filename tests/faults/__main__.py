@@ -17,6 +17,7 @@ from pathlib import Path
 
 import swarmctl  # noqa: F401  (before anything loads numpy)
 from tests.faults.matrix import ROWS
+from tests.faults.page import page
 from tests.faults.row import Row, UnmetError
 
 
@@ -36,7 +37,11 @@ def main() -> int:
     parser.add_argument("--only", default="*", help="names of rows, or patterns of them")
     parser.add_argument("--off", action="store_true", help="without the protection of each row, which then must fail")
     parser.add_argument("--plays", type=int, default=1)
+    parser.add_argument("--page", action="store_true", help="print the page of all rows")
     options = parser.parse_args()
+    if options.page:
+        print(page(), end="")
+        return 0
     chosen = [row for row in ROWS.values() if any(fnmatch(row.name, word) for word in options.only.split(","))]
     failed = 0
     for number in range(options.plays):

@@ -10,14 +10,14 @@ from pymavlink.dialects.v20 import development as mavlink
 from swarmctl.control.phases import failsafe, state_machine
 from swarmctl.control.phases.state_machine import REBOOTED, MissionStateMachine
 from swarmctl.core.types import Mode, Phase
+from swarmctl.mavlink.autopilot import Autopilot
 from swarmctl.mavlink.codec import Codec
 from swarmctl.mavlink.local_frame import LocalFrame
 from swarmctl.mavlink.vehicle_clock import VehicleClock
 from tests.closed_loop.conftest import COARSE
 from tests.faults.row import Off
 from tests.faults.rows_agents import lands
-from tests.faults.rows_bus import FORGETS
-from tests.faults.simulated import ALONE, GUARANTEED, SWAP, VICTIM, Scene, SimulatedRow, tracking
+from tests.faults.simulated import ALONE, GUARANTEED, SWAP, VICTIM, Scene, SimulatedRow
 
 STALE_FLOWN = Off(settings=("agent.failsafe.state_max_age_s=5",))
 ALWAYS_OURS = Off(  # neither the failsafe's table nor the state machine looks at who flies
@@ -84,6 +84,12 @@ def _unchecked(codec: Codec, frame: bytes) -> bytes | None:
     return bytes(frame[10 : 10 + frame[1]]).ljust(size, b"\0")[:size]
 
 
+def _as_it_comes(self: Autopilot, vehicle_us: int, arrived_us: int, *values: Any, **more: Any) -> bool:
+    """Take a state for as new as its arrival."""
+    return _TAKE(self, arrived_us, arrived_us, *values, **more)
+
+
+_TAKE = Autopilot._take
 FROM_THE_GROUND = (*COARSE, "swarm.agents=2", "start.spacing_m=4", "mission.kind=line", "mission.duration_s=60")
 MOBILE = (*SWAP, "sitl.battery.capacity_mah=3000", "agent.failsafe.window_s=1")
 
@@ -149,7 +155,7 @@ ROWS = (
         ),
         reacts=lambda scene: scene.since_s > 7.5,
         lasts_s=8.0,
-        off=Off(patches=((VehicleClock, "to_local", lambda self, vehicle_us, arrived_us: arrived_us),)),
+        off=Off(patches=((Autopilot, "_take", _as_it_comes),)),
     ),
     SimulatedRow(
         name="link-corrupt",
@@ -276,20 +282,5 @@ ROWS = (
         reacts=lambda scene: any(e["response"] == "LAND" for e in scene.events(VICTIM, "escalation")),
         lasts_s=6.0,
         off=Off(settings=("agent.failsafe.battery_rtl_01=0", "agent.failsafe.battery_land_01=0")),
-    ),
-    SimulatedRow(
-        name="motor-fails",
-        event="a vehicle loses a rotor and falls, where four meet",
-        reaction="the others keep clear of where it can be",
-        within_s=4.0,
-        protection="a silent peer's last path grows with age",
-        due=tracking(2.2),
-        happens=several(link("motor", 0.0), lambda scene: scene.lockstep.kill(VICTIM)),
-        reacts=lambda scene: scene.since_s > 3.5,
-        lasts_s=4.0,
-        told=("agent 1 died",),
-        fastest_m_s=60.0,
-        apart_m=0.6,
-        off=FORGETS,
     ),
 )
