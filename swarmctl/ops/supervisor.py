@@ -21,7 +21,7 @@ from swarmctl.bus.topics import COMMAND, OBSTACLES, STATUS
 from swarmctl.config import Config
 from swarmctl.core.operator_verbs import EXCLUDE, PEER, Order
 from swarmctl.core.types import Phase
-from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START
+from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, StartError
 from swarmctl.ops.order_delivery import numbered
 from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, RunContext, kill_all
 from swarmctl.ops.recovery import RECOVERY_S, Recovery
@@ -207,7 +207,10 @@ class FlightSupervisor:
         if router is not None and router.poll() is not None and self._router_starts < _ROUTER_STARTS:
             self._router_starts += 1
             self._announce("router_ended", f"router {router.how_it_ended()}; it is started again, the flight goes on")
-            self._services.restart_router()
+            try:
+                self._services.restart_router()
+            except (StartError, OSError) as error:
+                self._announce("router_failed", f"the router can't be started again: {error}")
         for name, land_s in ((ROUTER, _LAND_S), (SITL, _AFTER_DEATH_S)):
             child = self._services.children.get(name)
             if child is not None and child.poll() is not None and self._is_first(name):
@@ -264,7 +267,11 @@ class FlightSupervisor:
         """Start another process that lands a vehicle which is not known to be down."""
         if self._recovery.is_on(view.agent) and code == EXIT_INTERRUPTED:
             self._announce("recovered", f"the vehicle of {agent_name(view.agent)} is on the ground and disarmed")
-        child = None if self._vehicles_lost else self._recovery.begin(view, code)
+        try:
+            child = None if self._vehicles_lost else self._recovery.begin(view, code)
+        except (StartError, OSError) as error:
+            self._fail("recovery_failed", f"the vehicle of {agent_name(view.agent)} can't be recovered: {error}")
+            return
         if child is None:
             return
         self._services.children[agent_name(view.agent)] = child

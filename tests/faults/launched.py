@@ -31,6 +31,7 @@ class Bounded(Launched):
     """A launch whose reaction is awaited for a bounded time."""
 
     within_s = math.inf  # of the row
+    keeps_note = False  # for operators' verbs, which recognise a stale one
 
     def __init__(self, *arguments: Any) -> None:
         super().__init__(*arguments)
@@ -51,10 +52,15 @@ class Bounded(Launched):
     def end(self, timeout_s: float = math.inf) -> int:
         """Return the exit code; the end is the reaction where none was awaited."""
         left_s = self.within_s if self.reacted_s is None else 150.0
-        code = super().end(min(timeout_s, max(1.0, self.since_s + left_s - time.monotonic())))
+        code = self.process.wait(min(timeout_s, max(1.0, self.since_s + left_s - time.monotonic())))
+        require(self.left() == [], f"left: {self.left()}")
         if self.reacted_s is None:
             self.reacted_s = time.monotonic() - self.since_s
         return code
+
+    def left(self) -> list[str]:
+        """Return the processes, sockets and notes that are left."""
+        return [path for path in self.leftovers() if not (self.keeps_note and path.endswith(".json"))]
 
     def said(self, words: str) -> bool:
         """Return whether it has printed these words."""
@@ -91,11 +97,12 @@ class LaunchedRow(Row):
     def play(self, folder: Path, *, protected: bool = True) -> Played:
         folder.mkdir(parents=True)
         launches: list[Bounded] = []
-        with self._preloaded(folder, protected), _starter(folder, launches, self.within_s) as start:
+        settings = () if protected else self.off.settings
+        with self._preloaded(folder, protected), _starter(folder, launches, self.within_s, settings) as start:
             self.script(start)
             for launched in launches:
                 launched.process.wait(30)
-                require(launched.leftovers() == [], f"left: {launched.leftovers()}")
+                require(launched.left() == [], f"left: {launched.left()}")
             apart_m = min((least_apart_m(launched.run_dir) for launched in launches), default=math.inf)
             require(apart_m >= self.apart_m, f"two vehicles came to {apart_m:.2f} m")
             if self.readable:
@@ -117,12 +124,13 @@ class LaunchedRow(Row):
 
 
 @contextmanager
-def _starter(folder: Path, launches: list[Bounded], within_s: float) -> Iterator[Start]:
+def _starter(folder: Path, launches: list[Bounded], within_s: float, settings: tuple[str, ...]) -> Iterator[Start]:
     number = itertools.count()
+    sets = [word for setting in settings for word in ("--set", setting)]
 
     def start(*arguments: str, kind: type[Bounded] = Bounded, run_dir: Path | None = None) -> Bounded:
         temp = Path(tempfile.mkdtemp(prefix="sw"))
-        launched = kind(run_dir or folder / f"run{next(number)}", temp, *arguments)
+        launched = kind(run_dir or folder / f"run{next(number)}", temp, *arguments, *sets)
         launched.within_s = within_s
         launches.append(launched)
         return launched

@@ -13,20 +13,18 @@ PAGE = "docs/faults.md"
 _KINDS = {ElsewhereRow: "test", LaunchedRow: "processes"}
 _HEAD = """# Fault matrix
 
-What may fail, what the swarm does then and how soon, and the protection without which that row fails. This page is
-written by `python -m tests.faults --page`; the rows are in `tests/faults/`, one entry of a table each. The reasons are in the
-[safety case](safety_case.md).
+What may fail, what the swarm does then and how soon, and the protection without which that row fails. The rows are in
+`tests/faults/`, and this page is written from them (`--page`). The hazards behind them are in the [safety
+case](safety_case.md).
 
-    python -m tests.faults                  # play every row; as root, as some fill a disk of their own
-    python -m tests.faults --off            # every row without its protection: each must fail
-    python -m tests.faults --only 'clock*'  # some of them
-    python -m tests.faults --plays 10
+`python -m tests.faults` plays every row, as root, because some fill a disk of their own; `--off` plays each without its
+protection, which must fail, `--only 'clock*'` some of them, and `--plays 10` all of them ten times.
 
-In every row two vehicles stay 0.8 m apart by true states (or what the row says), none that was disarmed is armed again, none
-that its autopilot or a pilot has taken follows setpoints again unasked, no process, socket or note is left, and the run folder can be
-read. Rows are flown in lockstep, or are launches of real *processes*, or are a *test* of `tests/closed_loop/`, whose negative
-control is the row without its protection. The tests play a sample. Networks of several hosts are flown by
-`tools/hosts_flight.py` ([hosts](hosts.md)), stops in every phase by `tools/stop_matrix.py`.
+In every row, by true states, two vehicles stay 0.8 m apart (or what the row says), none that was disarmed is armed
+again, and none that its autopilot or a pilot has taken follows setpoints again unasked; no process, socket or note is
+left, and the run folder can be read. Rows are flown in lockstep, are launches of real *processes*, or are a *test* of
+`tests/closed_loop/` whose negative control is the row without its protection. The tests play a sample. Networks of
+several hosts are flown by `tools/hosts_flight.py` ([hosts](hosts.md)), stops in every phase by `tools/stop_matrix.py`.
 """
 
 

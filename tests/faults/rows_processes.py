@@ -43,6 +43,11 @@ def in_program(word: str, code: str) -> Off:
     return Off(preload=f"if {word!r} in words:\n{indented}")
 
 
+def loss_after(seconds: float) -> Off:
+    """Have autopilots act on a loss of setpoints after so long."""
+    return Off(settings=(f"agent.autopilot_params={{COM_OBL_RC_ACT=4,COM_OF_LOSS_T={seconds}}}",))
+
+
 def tracking(start: Start, *arguments: str) -> Bounded:
     """Start a launch of two agents, and wait until they fly their mission."""
     launched = start(*arguments)
@@ -258,13 +263,15 @@ def disk_full(phase: str) -> Callable[[Start], None]:
     return script
 
 
+_NO_MORE = 3  # what is open stays so, and nothing else can be opened
+
+
 @contextmanager
 def fewest_descriptors(pid: int) -> Iterator[None]:
     """Leave a process not one more descriptor than it has."""
     process = psutil.Process(pid)
     before = process.rlimit(resource.RLIMIT_NOFILE)
-    highest = max(int(fd.name) for fd in Path(f"/proc/{pid}/fd").iterdir())
-    process.rlimit(resource.RLIMIT_NOFILE, (highest + 1, before[1]))
+    process.rlimit(resource.RLIMIT_NOFILE, (_NO_MORE, before[1]))
     try:
         yield
     finally:
@@ -288,17 +295,20 @@ def descriptors_of_the_router(start: Start) -> None:
 
 
 def descriptors_of_the_launcher(start: Start) -> None:
-    """Take them away for good: it watches the flight to its end, and prints the verdict."""
+    """Take them away for good: it watches the flight to its end, prints the verdict, and says what it can't write."""
     launched = tracking(start, *TWO, *NEAR, *SHORT)
+    launched.keeps_note = True
     with fewest_descriptors(launched.process.pid):
         code = launched.end()
     require(code == 4, f"exit code {code}: {launched.text()[-600:]}")
+    require(launched.said("Too many open files"), "why nothing is written is not said")
     launched.verdict()
 
 
 def descriptors_of_the_launcher_and_an_agent_dies(start: Start) -> None:
     """It can't start what lands the vehicle: the vehicle's autopilot does, and it is named."""
     launched = tracking(start, *TWO, *NEAR, *SHORT)
+    launched.keeps_note = True
     with fewest_descriptors(launched.process.pid):
         os.kill(agent_pid(launched), signal.SIGKILL)
         code = launched.end()
@@ -385,20 +395,18 @@ ROWS = (
         event="an agent's process is stopped for 0.3 s",
         reaction="it goes on before a failsafe acts; the mission is completed",
         within_s=60.0,
-        protection="the mode is asked for after a pause, and the vehicle kept until then",
+        protection="the time that the autopilot is told to wait for setpoints (COM_OF_LOSS_T)",
         script=agent_stopped_briefly,
-        off=in_program(
-            "agent", "import swarmctl.mavlink.autopilot as it\nit.Autopilot._ask_for = lambda *_, **__: None"
-        ),
+        off=loss_after(0.1),
     ),
     LaunchedRow(
         name="process-agent-stopped-2s",
         event="an agent's process is stopped for 2 s",
         reaction="its autopilot lands the vehicle, which the agent does not take back; the launch fails, and says why",
         within_s=90.0,
-        protection="doubt of the mode after a pause",
+        protection="offboard-loss action of the autopilot",
         script=agent_stopped_for_2_s,
-        off=in_program("agent", "import swarmctl.mavlink.mode_watch as it\nit._GAP_US = 10**12"),
+        off=loss_after(60.0),
     ),
     LaunchedRow(
         name="process-agent-stopped-20s",
