@@ -11,8 +11,8 @@ from swarmctl.agent import coordination
 from swarmctl.bus.peers import agent_name
 from swarmctl.core.types import FlightMode, Mode, Phase
 from swarmctl.wall_clock import WallClock
+from tests.faults.bus_events import FORGETS, OTHERS, arrived, for_, rests
 from tests.faults.row import Off
-from tests.faults.rows_bus import FORGETS, OTHERS, arrived, for_, rests
 from tests.faults.simulated import GUARANTEED, SWAP, VICTIM, Scene, SimulatedRow, entered, tracking
 
 NO_LANDING = Off(settings=("agent.autopilot_params={COM_OBL_RC_ACT=4,COM_OF_LOSS_T=60}",))
