@@ -112,7 +112,13 @@ class Agent:
             state_rate_hz=setup.params.state_machine.state_rate_hz,
         )
         self._world_model = WorldModel(
-            setup.agent, setup.peers, setup.separation, bus, rate_hz=setup.params.rate_hz, note=self._note
+            setup.agent,
+            setup.peers,
+            setup.separation,
+            bus,
+            rate_hz=setup.params.rate_hz,
+            note=self._note,
+            vouchers=setup.vouchers,
         )
         self._separation = make_separation_policy(setup, self._world_model, bus, self._note, stopwatch_ns=stopwatch_ns)
         self._directive = SeparationDirective()  # of the newest tick

@@ -5,10 +5,8 @@ from __future__ import annotations
 import shlex
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,14 +14,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from swarmctl.bus.network.router_links import RouterLinks
-from swarmctl.bus.topics import PATH
-from swarmctl.bus.zenoh_bus import SCHEME, ZenohBus
 from swarmctl.core.records import TRUTH_COLUMNS
 from swarmctl.ops.cli import main
 from swarmctl.telemetry.recording.run_files import PACKED_TRUTH, read_parquet
 from tests.benches.free_ports import free_ports
-from tests.process.test_bus import end, until
 from tests.process.test_launch import Launched
 from tests.process.test_readme import shown
 
@@ -158,45 +152,3 @@ def test_a_stop_of_one_host_lands_its_agents_alone(tmp_path: Path, monkeypatch: 
         assert alpha.end() == 0, alpha.text()
         assert alpha.summary()["violations"] == []
         assert least_separation_m(alpha.run_dir, bravo.run_dir) >= 0.85
-
-
-@contextmanager
-def router(folder: Path, links: RouterLinks) -> Iterator[ZenohBus]:
-    """Yield a client of a new router with these links."""
-    endpoint = f"{SCHEME}{folder}/bus.sock"
-    command = [sys.executable, "-m", "swarmctl.bus.network.router", endpoint, "--die-with-parent", *links.arguments()]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    assert process.stdout.readline().startswith("router ready")
-    names = ["alpha", "bravo", "mallory"]
-    bus = ZenohBus(endpoint, "run", links.name, {PATH: [name for name in names if name != links.name]})
-    yield bus
-    bus.close()
-    assert end(process) == 0
-
-
-def heard(bus: ZenohBus, say: ZenohBus, word: bytes) -> bool:
-    say.publish(PATH, word)
-    return any(payload == word for _, payload in bus.receive(PATH))
-
-
-def test_routers_link_with_those_of_their_own_authority_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    ours, theirs = tmp_path / "ours", tmp_path / "theirs"
-    for folder in (ours, theirs):
-        folder.mkdir(mode=0o700)
-        make_keys(write_swarm(folder), monkeypatch)
-    places = [Path(tempfile.mkdtemp(prefix="sw")) for _ in range(3)]
-    address = f"127.0.0.1:{free_ports(1)[0]}"
-    alpha = RouterLinks(identities=ours / "identities", name="alpha", listen=address)
-    bravo = RouterLinks(identities=ours / "identities", name="bravo", connect=(address,))
-    mallory = RouterLinks(identities=theirs / "identities", name="bravo", connect=(address,))
-    with router(places[0], alpha) as at_alpha:
-        with router(places[2], mallory) as at_mallory:
-            deadline_s = time.monotonic() + 2.0
-            while time.monotonic() < deadline_s:
-                assert not heard(at_alpha, at_mallory, b"forged"), "an identity of another authority is none"
-                assert not heard(at_mallory, at_alpha, b"secret")
-                time.sleep(0.02)
-        with router(places[1], bravo) as at_bravo:
-            assert until(lambda: heard(at_alpha, at_bravo, b"true")), "as it does with ours: this can fail"
-            assert until(lambda: heard(at_bravo, at_alpha, b"known"))

@@ -9,7 +9,7 @@ import pytest
 
 from swarmctl.bus.network.hosts import links_of
 from swarmctl.bus.network.identity_files import STATION
-from swarmctl.config import load
+from swarmctl.config import load, own_identity
 from swarmctl.errors import ConfigError
 from swarmctl.ops.host import load_host, make_host_identities, shared_run_name, systemd_unit
 
@@ -50,12 +50,13 @@ def test_what_is_no_list_of_hosts_is_refused(item: str, words: str) -> None:
 
 
 def test_there_is_one_link_for_each_pair_of_hosts_and_the_station_has_one_to_each() -> None:
-    hosts = load(CONFIG).hosts
+    config = load(CONFIG)
+    hosts = config.hosts
     addresses = [host.address for host in hosts]
     for i, host in enumerate(hosts):
-        links = links_of(hosts, host.name, Path("keys"))
+        links = links_of(hosts, own_identity(config, host.name))
         assert (links.listen, list(links.connect)) == (addresses[i], addresses[:i])
-    links = links_of(hosts, STATION, Path("keys"))
+    links = links_of(hosts, own_identity(config, STATION))
     assert (links.listen, list(links.connect)) == ("", addresses)
 
 
@@ -75,7 +76,7 @@ def test_identities_are_made_once_and_for_hosts_that_are_added(path: Path) -> No
     (folder / "charlie.key").unlink()
     assert make_host_identities(path)[1] == ["charlie"]
     assert (folder / "alpha.pem").read_bytes() == before
-    with pytest.raises(ConfigError, match=r"alpha: another address now; remove alpha\.pem and alpha\.key"):
+    with pytest.raises(ConfigError, match=r"alpha: another address now; swarmctl keys revoke it"):
         make_host_identities(path, [ALPHA + "address='10.20.0.9:7448'"])
     (folder / "authority.key").unlink()
     with pytest.raises(ConfigError, match=r"authority\.key is not here"):
