@@ -273,6 +273,11 @@ class WorldModel:
         vouched = agent in self._vouched and self._vouched[agent] == self._boot_id(agent)
         return vouched or self._is_in(agent, Phase.DONE)
 
+    @property
+    def excused(self) -> frozenset[int]:
+        """Return the peers that have never been heard, and that nobody has to wait for: somebody vouches for it."""
+        return frozenset(self._vouched.keys() - self._status.keys())
+
     def _boot_id(self, agent: int) -> int | None:
         status = self._status.get(agent)
         return None if status is None else status.boot_id

@@ -5,9 +5,10 @@ and the payload. The tag for an identity is a keyed BLAKE2s by the key that send
 BLAKE2b digest of run, sender, topic, header and payload. So what one computer is told can't be made, changed or moved
 to another run, sender or topic by any other one, also not by a router on the way or by another receiver.
 
-A signature would need one value instead of a tag for each, but Ed25519 takes 48 us to make and 129 us to verify
-against 6 and 4 us, at a few hundred messages a second in a tick of a few milliseconds. What a signature has beyond
-tags, that a third party can be shown who has said something, nothing here needs.
+A signature would need one value instead of a tag for each, but Ed25519 takes 48 us to make and 129 us to verify. A seal
+for four identities takes 3 us, each further identity 0.4 us more; opening one takes 2.4 us. That is done a few hundred
+times a second, in ticks of a few milliseconds. What a signature has beyond a tag, that a third party can be shown who
+has said something, nothing here needs.
 """
 
 from __future__ import annotations
@@ -103,8 +104,7 @@ class SealVerifier:
         """Return the payload, and "" or why the message is refused."""
         if len(sealed) < self._payload_at:
             return b"", UNSEALED
-        header = sealed[: _HEADER.size]
-        magic, version, tags, session, number, sent_utc_us = _HEADER.unpack(header)
+        magic, version, tags, session, number, sent_utc_us = _HEADER.unpack_from(sealed)
         if (magic, version, tags) != (_MAGIC, SEAL_VERSION, self._tags):
             return b"", UNSEALED
         known = self._senders.get(sender)
@@ -115,7 +115,7 @@ class SealVerifier:
             context = known.contexts[topic] = _context(self._run, sender, topic)
         payload = sealed[self._payload_at :]
         tag = sealed[self._tag_at : self._tag_at + TAG_BYTES]
-        if not hmac.compare_digest(tag, _tag(known.keyed, _digest(context, header, payload))):
+        if not hmac.compare_digest(tag, _tag(known.keyed, _digest(context, sealed[: _HEADER.size], payload))):
             return b"", FORGED
         return payload, self._refusal(known, topic, session, number, utc_us - sent_utc_us)
 
@@ -126,11 +126,13 @@ class SealVerifier:
         max_age_us = self._max_age_us.get(topic)
         if max_age_us is not None and not -max_age_us <= age_us <= max_age_us:
             return LATE if age_us > 0 else FUTURE
-        if len(known.sessions) > 1:
-            known.sessions.pop(session, None)  # to be the newest one
-        known.sessions[session] = (newest or {}) | {topic: number}
-        if len(known.sessions) > MOST_SESSIONS:
-            del known.sessions[next(iter(known.sessions))]
+        if newest is None:
+            newest = known.sessions[session] = {}
+            if len(known.sessions) > MOST_SESSIONS:
+                del known.sessions[next(iter(known.sessions))]
+        elif len(known.sessions) > 1:
+            known.sessions[session] = known.sessions.pop(session)  # the one not used for longest is forgotten first
+        newest[topic] = number
         return ""
 
 

@@ -292,3 +292,16 @@ def test_only_who_runs_an_agent_says_that_it_has_ended(sender: str, peer: int, b
     bench.hub.carry(sender, topics.ENDED, encode_message(CommandMessage("land", -1, bench.clock.utc_us() + 1)))
     assert bench.tick() == [EXCLUDE] * believed
     assert bench.world_model.refusals.by_reason == {"identity": 2 - believed}
+
+
+def test_who_has_never_been_heard_is_excused_until_it_is_heard() -> None:
+    bench = Bench()
+    order = CommandMessage(EXCLUDE, -1, bench.clock.utc_us(), {PEER: 1})
+    bench.hub.carry(topics.OPERATOR, topics.COMMAND, encode_message(order))
+    assert bench.tick() == [EXCLUDE]
+    bench.world_model.exclude(1)  # as the agent obeys
+    assert bench.world_model.excused == {1}
+    bench.peer.publish(topics.STATUS, encode_message(builders.status_message(agent=1)))
+    bench.tick()
+    assert bench.world_model.excused == set()
+    assert not bench.world_model.has_ended(1), "this is another process than the one that was vouched for"
