@@ -30,18 +30,18 @@ from swarmctl.bus.network.hosts import HostParams, links_of, roster_of
 from swarmctl.bus.network.identities import make_identities
 from swarmctl.bus.network.identity_files import STATION
 from swarmctl.bus.network.joining import join_bus
-from swarmctl.bus.network.keyring import load_keyring
-from swarmctl.bus.network.roster import OwnIdentity, Roster, Speaker, identity_of_json
-from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US, SealedBus
-from swarmctl.bus.network.seals import Sealer, SealVerifier
+from swarmctl.bus.network.roster import OwnIdentity, identity_of_json
+from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US
 from swarmctl.bus.peers import Bus, LocalHub, agent_name
-from swarmctl.bus.topics import OPERATOR, PATH, STATUS, TICK, TRAJECTORY
+from swarmctl.bus.topics import PATH, STATUS, TICK, TRAJECTORY
 from swarmctl.bus.zenoh_bus import SCHEME
 from swarmctl.config import Config, load
 from swarmctl.core.tick_record import TickRecord
 from swarmctl.core.types import Phase
 from swarmctl.mavlink.signing.key_file import write_new_key
 from swarmctl.wall_clock import WallClock
+from tests.benches.free_ports import free_ports
+from tests.benches.sealed_hub import SealedHub
 
 CONFIG = Path(__file__).parents[1] / "configs" / "three_hosts.toml"
 LOOPBACK = ip_address("127.0.0.1")
@@ -51,26 +51,6 @@ TICK_S, STATUS_TICKS = 0.02, 10
 OPEN = "import swarmctl.bus.network.router_links as links; links.access_settings = lambda *_: {}\n"
 LAWLESS = ("-c", OPEN + "from swarmctl.bus.network.router import main\nraise SystemExit(main())")
 LAWFUL = ("-m", "swarmctl.bus.network.router")
-
-
-def sealed_connect(config: Config, folder: Path) -> Callable[..., Bus]:
-    """Return a `LocalHub.connect` that seals what agents say, each as the host that it runs on."""
-    station = Speaker(name=OPERATOR, agents=(), senders=(OPERATOR,), operator=True)
-    hosts, connect = roster_of(config.hosts, relay=False).speakers[:-1], LocalHub.connect
-    roster = Roster(speakers=(*hosts, station), relay=False)
-    keys = {
-        speaker.name: load_keyring(OwnIdentity(folder=str(folder), name=speaker.name, roster=roster)).keys
-        for speaker in roster.speakers
-    }
-    host_of = {agent_name(agent): host.name for host in config.hosts for agent in host.agents}
-
-    def connected(hub: LocalHub, name: str, subscriptions: object = None) -> Bus:
-        me = host_of.get(name, OPERATOR)
-        verifier = SealVerifier(roster, keys[me], "run", me=me, max_age_us=FOR_AGENTS_US)
-        bus = connect(hub, name, subscriptions)  # type: ignore[arg-type]
-        return SealedBus(bus, Sealer(keys[me], "run", name, session=1), verifier, hub.now_us)
-
-    return connected
 
 
 def ticks_ms(config: Config, connect: Callable[..., Bus] | None) -> list[float]:
@@ -98,14 +78,12 @@ def compare_ticks(flights: int) -> None:
     """Print the median tick with and without seals and signatures."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        names = [host.name for host in load(CONFIG).hosts]
-        make_identities(folder / "identities", {**dict.fromkeys(names, LOOPBACK), OPERATOR: None})
         plain = load(CONFIG, ["sitl.start=air"])
         files = [str(folder / f"{agent}.key") for agent in range(plain.swarm.agents)]
         for file in files:
             write_new_key(Path(file))
         signed = load(CONFIG, ["sitl.start=air", f"mavlink.signing_keys={files}"])
-        connect = sealed_connect(plain, folder / "identities")
+        connect = SealedHub.of(plain.hosts, folder / "identities").connect
         cases = {"neither": (plain, None), "seals": (plain, connect), "seals, signatures": (signed, connect)}
         spent_ms: dict[str, list[list[float]]] = {case: [] for case in cases}
         for _ in range(flights):
@@ -179,8 +157,6 @@ def bus_s(folder: Path, hosts: Sequence[HostParams], module: Sequence[str], plai
 
 def compare_bus(seconds: float, runs: int) -> None:
     """Print the processor time of the bus with and without seals and access control."""
-    from tests.benches.free_ports import free_ports
-
     cases = {"neither": (LAWLESS, True), "access control": (LAWFUL, True), "and seals": (LAWFUL, False)}
     with tempfile.TemporaryDirectory() as name:
         hosts = [

@@ -128,7 +128,7 @@ def least_separation_m(*folders: Path) -> float:
 def test_two_hosts_fly_one_swarm_that_a_station_commands_and_judges(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """One host comes late: the other says for whom it waits, and tells it of the obstacle that an operator has added."""
+    """One host comes late: the other says for whom it waits, and tells it of an obstacle that an operator has added."""
     path = write_swarm(tmp_path, duration_s=600.0)
     make_keys(path, monkeypatch)
     with started(path) as start:
