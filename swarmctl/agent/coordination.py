@@ -53,7 +53,8 @@ class Coordination:
             and `commitments` with all counts when the autopilot or a pilot takes over.
 
     Attributes:
-        committed_peers: by agent number, the trajectories that each peer relied on may follow.
+        committed_peers: by agent number, the trajectories that each peer relied on may follow. A silent peer is relied
+            on as well: it rests where its last commitment ends, also when a majority has excluded it.
         lost_peer_keep_outs: keep-outs at the ends of lost peers' committed trajectories.
         cut_off: why the agent has to land where it is: it waits for peers in vain, or they have excluded it; or "".
         alert: what keeps it from committing to anything new, or nearly; or "".
@@ -159,38 +160,43 @@ class Coordination:
         known, required = self._peer_trajectories.newest, self._required_peers()
         self.cut_off = self._why_cut_off(utc_us, required)
         commitments.update(utc_us, known, required)
-        taking_part = self._taking_part(utc_us, known, required)
+        relied_on = self._relied_on(utc_us, known, required)
         begin_us = utc_us + commitments.lead_us
         now = Situation(
             utc_us=utc_us,
             begin_us=utc_us,
             desired=self._paced(desired, begin_us),
-            peers={agent: known[agent] for agent in taking_part},
-            others=self._others(utc_us, state, phase, taking_part, self._entered_now),
+            peers={agent: known[agent] for agent in relied_on},
+            others=self._others(utc_us, state, phase, relied_on, self._entered_now),
             disturbance_ned_m_s2=disturbance_ned_m_s2,
         )
         commitments.evade(now)
         unsure = {a for a in required if self._world_model.clocks.error_us(a) > self._clock_error_max_us}
         self.alert = self._why_slow(unsure)
         if commitments.is_due(utc_us) and self._grip < Grip.STOPPED and not unsure:
-            others = self._others(begin_us, state, phase, taking_part, self._entered_ahead)
+            heard = (relied_on & required) - self._absent()
+            others = self._others(begin_us, state, phase, heard, self._entered_ahead)
             commitments.propose(replace(now, begin_us=begin_us, peers=known, others=others))
 
-    def _taking_part(self, utc_us: int, known: Mapping[int, TrajectoryMessage], required: Set[int]) -> set[int]:
-        """Return the peers whose commitments are relied on, and remember where lost ones end."""
+    def _relied_on(self, utc_us: int, known: Mapping[int, TrajectoryMessage], required: Set[int]) -> Set[int]:
+        """Return the peers whose commitments are relied on, and remember where lost ones end.
+
+        Silence alone is no reason to doubt a commitment: to shrink from a peer that is merely cut off is to leave the
+        own commitment, before peers that rely on that. Only what is newly planned keeps clear of what a silent peer's
+        autopilot may do instead (see `step`).
+        """
         conflicting = self._commitments.conflicting_peers(utc_us, known)
         if conflicting != self._conflicting:
             self._conflicting = conflicting
             self._note("conflicting_commitment", by=sorted(conflicting))
         deviating = self._world_model.deviating_peers(known, utc_us, self._tube_m)
         deviating |= {agent for agent, message in known.items() if message.tube_m > self._tube_m + _SAME_M}
-        absent = self._absent()  # perhaps lost: no longer trusted, still required to acknowledge
         committed = {agent for agent, message in known.items() if message.is_committed}
         lost_peers = [agent for agent in known.keys() - required if agent in committed]
         self.lost_peer_keep_outs = [keep_out for agent in lost_peers for keep_out in self._ends(known[agent])]
-        taking_part = {a for a in required - absent - conflicting - deviating if a in committed}
-        self.committed_peers = {agent: known[agent].followed for agent in taking_part}
-        return taking_part
+        relied_on = (required | self._membership.excluded - self._ended) & committed - conflicting - deviating
+        self.committed_peers = {agent: known[agent].followed for agent in relied_on}
+        return relied_on
 
     def wait(self, utc_us: int, state: VehicleState | None) -> None:
         """Keep what is committed while the state is stale for a moment; longer is `idle`.
@@ -307,16 +313,16 @@ class Coordination:
         ]
 
     def _others(
-        self, t0_utc_us: int, state: VehicleState, phase: Phase, taking_part: set[int], encounters: Encounters
+        self, t0_utc_us: int, state: VehicleState, phase: Phase, without: Set[int], encounters: Encounters
     ) -> KeepOuts:
-        """Return keep-outs of obstacles and of peers that do not take part, on the planner's grid from `t0_utc_us` on.
+        """Return keep-outs of obstacles and of peers but those in `without`, on the planner's grid from `t0_utc_us` on.
 
         What a stale peer does is unknown, so its hard minimum distance includes all of the margin that grows with age.
         Those that are too close already say since which distance, so that plan by plan none comes closer.
         """
         assert self._commitments.flown is not None
         steps, dt_us = self._commitments.steps, self._commitments.dt_us
-        found = self._world_model.keep_outs(state.pos_ned_m, t0_utc_us, dt_us, steps, phase=phase, without=taking_part)
+        found = self._world_model.keep_outs(state.pos_ned_m, t0_utc_us, dt_us, steps, phase=phase, without=without)
         spent_m = self._separation.budget.planned_beyond_hard_min_m
         aged = (replace(k, hard_min_distance_m=max(k.hard_min_distance_m, k.radius_m - spent_m)) for k in found)
         return encounters.noted(

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence, Set
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -211,6 +212,46 @@ def test_halves_that_hear_each_other_again_in_time_go_on() -> None:
 def test_negative_control_halves_that_take_missing_tokens_for_deaths_collide(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Coordination, "_required_peers", only_seen)
     assert disturbed(halves()).monitor.collided
+
+
+def two_of_six_cut_off() -> TrialFlight:
+    """A host with two agents is cut off from two other hosts in the middle of a swap, for 5 s."""
+    cell = Cell(
+        scenario="swap", agents=6, delay_ms=20.0, loss=0.0, noise="exact", wind_m_s=0.0, protections="guaranteed"
+    )
+    event = Split([frozenset({0, 1, 2, 3}), frozenset({4, 5})], 2.5, 5.0)
+    layout = replace(layout_of("swap", 1, 6), events=(event,), limit_s=20.0, lost=frozenset({4, 5}))
+    flight = TrialFlight(Trial(cell, 1), layout)
+    flight.run()
+    return flight
+
+
+def evasions(flight: TrialFlight) -> int:
+    policies = [agent._separation for agent in flight._agents if agent is not None]
+    return sum(policy.coordination.counts.evasive for policy in policies if isinstance(policy, Guaranteed))
+
+
+def test_nobody_leaves_a_commitment_before_peers_that_are_merely_cut_off() -> None:
+    flight = two_of_six_cut_off()
+    assert flight.monitor.min_separation_m >= COMMITTED_M
+    assert evasions(flight) == 0
+    excluded = [e for e in events(flight, "membership") if e["excluded"]]
+    assert {str(e["source"]) for e in excluded} == {agent_name(i) for i in range(4)}
+    assert all(e["excluded"] == [4, 5] for e in excluded)
+
+
+def test_negative_control_agents_that_doubt_silent_peers_evade(monkeypatch: pytest.MonkeyPatch) -> None:
+    relied_on = Coordination._relied_on
+
+    def only_heard(self: Coordination, utc_us: int, *messages: Any) -> Set[int]:
+        heard = relied_on(self, utc_us, *messages) - self._absent() - self._membership.excluded
+        self.committed_peers = {agent: self.committed_peers[agent] for agent in heard}
+        return heard
+
+    monkeypatch.setattr(Coordination, "_relied_on", only_heard)
+    flight = two_of_six_cut_off()
+    assert evasions(flight) > 4
+    assert len(events(flight, "tracking_violation")) > 2, "pushed by safety filters, some leave their tubes"
 
 
 def test_the_others_go_on_without_a_frozen_agent_once_they_agree() -> None:

@@ -20,6 +20,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import psutil
 import pytest
 from pymavlink.dialects.v20 import development as mavlink
@@ -323,7 +324,8 @@ def without_its_router_the_flight_goes_on_with_another(start: Start) -> None:
     for agent in range(2):
         rows = read_parquet(launched.run_dir / f"agent-{agent}.parquet")
         tracked = rows[rows["phase"] == Phase.TRACK]
-        assert tracked["plan_staleness_ms"].max() > 300.0, "they heard nothing of each other for a while"
+        usual_ms = float(np.median(tracked["plan_staleness_ms"]))
+        assert tracked["plan_staleness_ms"].max() > 4.0 * usual_ms, "they heard nothing of each other for a while"
         assert tracked["plan_staleness_ms"][-1] < 100.0, "and do so again"
 
 
