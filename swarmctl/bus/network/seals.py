@@ -2,7 +2,7 @@
 
 A sealed message is a header (session of the sending process, number, time), one tag for each identity of the roster,
 and the payload. The tag for an identity is a keyed BLAKE2s by the key that sender and receiver alone share, over the
-BLAKE2b digest of run, sender, topic, header and payload. So what one computer is told can't be made, changed or moved
+SHA-256 digest of run, sender, topic, header and payload. So what one computer is told can't be made, changed or moved
 to another run, sender or topic by any other one, also not by a router on the way or by another receiver.
 
 A signature would need one value instead of a tag for each, but Ed25519 takes 48 us to make and 129 us to verify. A seal
@@ -17,7 +17,7 @@ import hmac
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from hashlib import blake2b, blake2s
+from hashlib import blake2s, sha256
 from typing import Any
 
 from swarmctl.bus.network.roster import Roster
@@ -138,13 +138,12 @@ class SealVerifier:
 
 def _context(run: str, sender: str, topic: str) -> Any:
     """Return the beginning of a digest; names hold no zero byte, so no two contexts are alike."""
-    return blake2b(f"{run}\0{sender}\0{topic}\0".encode(), digest_size=KEY_BYTES)
+    return sha256(f"{run}\0{sender}\0{topic}\0".encode())
 
 
 def _digest(context: Any, header: bytes, payload: bytes) -> bytes:
     digest = context.copy()
-    digest.update(header)
-    digest.update(payload)
+    digest.update(header + payload)
     return bytes(digest.digest())
 
 
