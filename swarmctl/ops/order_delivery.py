@@ -144,7 +144,7 @@ def addressed(launch: RunningLaunch, order: Order, agents: Sequence[int]) -> lis
         known = "agent 0 only" if launch.agents == 1 else f"agents 0 to {launch.agents - 1}"
         raise ConfigError(order.verb, [f"there is no agent {agent}; {launch.run} has {known}" for agent in unknown])
     obeying = obeying_agents(launch)
-    if deaf := [agent for agent in named if agent not in obeying and agent not in order.arguments.values()]:
+    if deaf := [agent for agent in dict.fromkeys(agents) if agent not in obeying]:
         raise ConfigError(order.verb, [f"agent {agent} does not obey: {no_operator(launch)}" for agent in deaf])
     asked = sorted(set(agents)) or [i for i in obeying if i != order.arguments.get(PEER)]
     if not asked:
