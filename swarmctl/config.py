@@ -19,7 +19,8 @@ from pydantic import Field
 
 from swarmctl.agent.setup import AgentParams
 from swarmctl.bus.json_messages import MAX_OBSTACLES
-from swarmctl.bus.network.hosts import HostParams, host_problems
+from swarmctl.bus.network.hosts import HostParams, host_problems, roster_of
+from swarmctl.bus.network.roster import OwnIdentity
 from swarmctl.config_problems import validated
 from swarmctl.config_shows import read_show
 from swarmctl.config_source import override, read_tree, set_value
@@ -100,6 +101,7 @@ class BusParams(Params):
     """Parameters of the Zenoh bus, and the seeded faults of the lockstep bus."""
 
     identities: str = ""  # folder written by swarmctl keys init; needed by swarmctl host and station only
+    relay: bool = False  # hosts pass on what others say; else each is heard on its own links alone
     lease_ms: int = Field(1500, ge=500, le=10000)  # silence after which Zenoh closes a link
     delay_ms: float = Field(0.0, ge=0, le=5000)  # lockstep only, on top of one tick
     loss_01: float = Field(0.0, ge=0, le=1)  # lockstep only
@@ -269,6 +271,12 @@ def load_recorded(folder: Path) -> Config:
     if not read_text(path):
         raise ConfigError(str(folder), [f"is no run folder: it holds no {CONFIG}"])
     return validated(Config, read_tree(path), str(path), _RENAMED)
+
+
+def own_identity(config: Config, name: str) -> OwnIdentity:
+    """Return the identity of one of the configuration's hosts, or the station's."""
+    roster = roster_of(config.hosts, relay=config.bus.relay)
+    return OwnIdentity(folder=config.bus.identities, name=name, roster=roster)
 
 
 def dump(config: Config) -> str:

@@ -38,6 +38,8 @@ from swarmctl.bus.json_messages import (
     decode_status,
     encode_message,
 )
+from swarmctl.bus.network.hosts import roster_of
+from swarmctl.bus.network.seals import KEY_BYTES, Sealer, SealVerifier
 from swarmctl.bus.path_messages import decode_path
 from swarmctl.bus.peers import agent_name
 from swarmctl.config import load
@@ -178,6 +180,11 @@ def targets(folder: Path) -> dict[str, Target]:
     channel = SigningChannel(key, AGENT_LINK, lambda: 1_800_000_000_000_000)
     signed = [channel.sign(frame) for frame in seeds["mavlink"]]
     receiver = SigningChannel(key, AGENT_LINK, lambda: 1_800_000_000_000_000)
+    roster = roster_of(load(CONFIGS / "three_hosts.toml").hosts, relay=False)
+    shared: list[bytes | None] = [bytes([number]) * KEY_BYTES for number in range(len(roster.speakers))]
+    sealer = Sealer(shared, "run", "agent-0", session=1)
+    sealed = [sealer.seal("path", payload, 1_800_000_000_000_000) for payload in seeds["path"]]
+    verifier = SealVerifier(roster, [shared[0]] * len(shared), "run", me="alpha", max_age_us={})
     flight = Lockstep(load(None, ("swarm.agents=1",)))
     fault = json.dumps({"fault": {"kind": "gust", "vehicle": 0, "value": 3.0, "for_s": 2.0}}).encode()
     found = {
@@ -187,6 +194,7 @@ def targets(folder: Path) -> dict[str, Target]:
         "command": Target(seeds["command"], decode_command),
         "answer": Target(seeds["answer"], decode_answer),
         "obstacles": Target(seeds["obstacles"], decode_obstacles),
+        "sealed": Target(sealed, lambda data: verifier.open("agent-0", "path", data, 1_800_000_000_000_000)),
         "tick row": Target(seeds["tick"], unpack_tick),
         "frames": Target(seeds["mavlink"], lambda data: [codec.decode(frame) for frame in frames(data, True)]),
         "frames, checksum right": Target(

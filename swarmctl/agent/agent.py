@@ -112,7 +112,13 @@ class Agent:
             state_rate_hz=setup.params.state_machine.state_rate_hz,
         )
         self._world_model = WorldModel(
-            setup.agent, setup.peers, setup.separation, bus, rate_hz=setup.params.rate_hz, note=self._note
+            setup.agent,
+            setup.peers,
+            setup.separation,
+            bus,
+            rate_hz=setup.params.rate_hz,
+            note=self._note,
+            vouchers=setup.vouchers,
         )
         self._separation = make_separation_policy(setup, self._world_model, bus, self._note, stopwatch_ns=stopwatch_ns)
         self._directive = SeparationDirective()  # of the newest tick
@@ -485,6 +491,7 @@ class Agent:
             unresponsive_peer=self._directive.unresponsive_peer,
             cut_off=self._directive.cut_off or self._controller_watch.suspended,
             peers=self._world_model.peers,
+            excused=self._world_model.excused,
             others_ned_m=partial(self._world_model.others_ned_m, utc_us),
             arm_in=None if dialect is None else dialect.arm_in,
             boots=self._autopilot.clock.boots,
@@ -514,7 +521,7 @@ class Agent:
 
     def _report_start_blocker(self, now_us: int) -> None:
         waits_for = self._state_machine.waits_for
-        if self._state_machine.phase is not Phase.STANDBY:
+        if self._state_machine.phase not in (Phase.STANDBY, Phase.READY):
             self._standby_us = now_us
         elif waits_for and now_us - self._standby_us > _START_ALERT_DELAY_US:
             self._alerts.put("start", f"waits for {waits_for}", now_us)

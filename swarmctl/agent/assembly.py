@@ -10,6 +10,7 @@ from swarmctl.agent.agent import Agent
 from swarmctl.agent.setup import AgentSetup
 from swarmctl.agent.telemetry_publisher import TickSink
 from swarmctl.bus.peers import Bus
+from swarmctl.bus.topics import OPERATOR
 from swarmctl.config import Config
 from swarmctl.core.clock import Clock
 from swarmctl.core.types import GeoOrigin
@@ -58,6 +59,7 @@ def make_agent(
         agent=agent,
         boot_id=boot_id,
         sysid=sysid,
+        vouchers={OPERATOR: frozenset(range(swarm.agents)), **{h.name: frozenset(h.agents) for h in config.hosts}},
         params=config.agent,
         mission=config.mission,
         starts_ned_m=np.array(config.starts_ned_m()),

@@ -18,9 +18,11 @@ from types import MappingProxyType
 from swarmctl.agent.agent import Agent
 from swarmctl.agent.assembly import make_agent
 from swarmctl.bus import topics
+from swarmctl.bus.network.joining import join_bus
+from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US
 from swarmctl.bus.peers import Bus, LocalHub, agent_name
-from swarmctl.bus.zenoh_bus import NO_BUS, ZenohBus
-from swarmctl.config import Config, load
+from swarmctl.bus.zenoh_bus import NO_BUS
+from swarmctl.config import Config, load, own_identity
 from swarmctl.control.phases.state_machine import OPERATOR_STOP
 from swarmctl.core.operator_verbs import Order
 from swarmctl.core.types import Mode
@@ -102,6 +104,7 @@ class AgentProcess:
     vehicle_port: int | None = None  # loopback port of the vehicle; None if unknown
     only_land: bool = False  # land and disarm the vehicle, whatever it is doing, then end
     realtime: bool = False  # ask to be scheduled before other programs
+    identity: str = ""  # name of the host it speaks for; "": messages are not sealed
 
 
 def run_agent(process: AgentProcess) -> int:
@@ -188,15 +191,27 @@ def _join(process: AgentProcess, config: Config, clock: WallClock) -> Bus:
     me = agent_name(process.agent)
     if process.bus == NO_BUS:
         return LocalHub(clock.now_us).connect(me)
+    identity = own_identity(config, process.identity) if process.identity else None
     peers = [agent_name(i) for i in range(config.swarm.agents) if i != process.agent]
+    launcher = (topics.OPERATOR,)
     listen = {
         topics.PATH: peers,
         topics.STATUS: peers,
         topics.TRAJECTORY: peers,
-        topics.COMMAND: [topics.OPERATOR],
-        topics.OBSTACLES: [topics.OPERATOR],
+        topics.COMMAND: launcher if identity is None else identity.roster.commanders(identity.name),
+        topics.ENDED: launcher if identity is None else identity.roster.hosts,
+        topics.OBSTACLES: launcher if identity is None else (identity.name,),  # which hears the others
     }
-    return ZenohBus(process.bus, process.run, me, listen, lease_ms=config.bus.lease_ms)
+    return join_bus(
+        process.bus,
+        process.run,
+        me,
+        listen,
+        identity=identity,
+        max_age_us=FOR_AGENTS_US,
+        utc_us=clock.utc_us,
+        lease_ms=config.bus.lease_ms,
+    )
 
 
 def _loop(agent: Agent, config: Config, clock: WallClock, stop: StopRequest, *, vehicle: str, only_land: bool) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 from pydantic import Field
@@ -51,6 +52,7 @@ class AgentSetup:
     agent: int
     boot_id: int
     sysid: int
+    vouchers: Mapping[str, frozenset[int]]  # agents of which each sender may say that they have ended
     params: AgentParams
     mission: MissionParams
     starts_ned_m: Array  # (agents, 3)

@@ -22,7 +22,7 @@ from swarmctl.control.collision.separation import (
 )
 from swarmctl.control.phases.inputs import PeerInputs
 from swarmctl.core.obstacle import Obstacle
-from swarmctl.core.operator_verbs import Answer, Order
+from swarmctl.core.operator_verbs import EXCLUDE, PEER, Answer, Order
 from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.trajectory_message import TrajectoryMessage
 from swarmctl.core.types import Array, Mode, Phase
@@ -42,6 +42,7 @@ class WorldModel:
         params: distances and ages.
         bus: source of messages, drained by `listen`.
         rate_hz: tick rate of every agent.
+        vouchers: agents of which each sender may say that they have ended.
         note: receives the events `refused` (see `Refusals`) and `unresponsive`: a peer on the bus has published no
             accepted path for `lost_after_s`; also when that ends, with its duration.
     """
@@ -55,6 +56,7 @@ class WorldModel:
         *,
         rate_hz: float,
         note: Callable[..., None],
+        vouchers: Mapping[str, Set[int]],
     ) -> None:
         self._agent, self._params, self._bus, self._note = agent, params, bus, note
         self._budget = params.budget
@@ -63,6 +65,7 @@ class WorldModel:
         self.paths = PeerPaths(peers, rate_hz, self.refusals, self.presence, clocks=self.clocks)
         self._verifiers = peer_verifiers(peers, topics.STATUS, rate_hz, self.refusals, presence=self.presence)
         self._orders = Orders(agent, self.refusals)
+        self._ends, self._vouchers = Orders(agent, self.refusals, topics.ENDED), vouchers
         self._unresponsive_since_us: dict[int, int] = {}
         self._status: dict[int, StatusMessage] = {}
         self._vouched: dict[int, int | None] = {}  # boot id of each agent that somebody says has ended
@@ -80,10 +83,22 @@ class WorldModel:
         for sender, payload in self._bus.receive(topics.OBSTACLES):
             self._take_obstacles(sender, payload, utc_us)
         orders = [self._orders.take(*received, utc_us) for received in self._bus.receive(topics.COMMAND)]
+        orders += [self._end_of_a_peer(*received, utc_us) for received in self._bus.receive(topics.ENDED)]
         self._orders.refuse_misdated(utc_us)
+        self._ends.refuse_misdated(utc_us)
+        for sender, topic, reason in self._bus.refused():
+            self.refusals.add(sender, topic, reason, utc_us)
         self.refusals.report(utc_us)
         self._watch_unresponsive(utc_us)
         return [order for order in orders if order is not None]
+
+    def _end_of_a_peer(self, sender: str, payload: bytes, utc_us: int) -> Order | None:
+        """Return the order to go on without a peer, from who runs its process and has seen it end; or None."""
+        order = self._ends.take(sender, payload, utc_us)
+        if order is None or (order.verb == EXCLUDE and order.arguments[PEER] in self._vouchers.get(sender, ())):
+            return order
+        self.refusals.add(sender, topics.ENDED.name, IDENTITY, utc_us)
+        return None
 
     def answer(self, order: Order, refusal: str) -> None:
         """Keep the agent's answer to an order: accepted, or why it is refused."""
@@ -258,6 +273,11 @@ class WorldModel:
         """
         vouched = agent in self._vouched and self._vouched[agent] == self._boot_id(agent)
         return vouched or self._is_in(agent, Phase.DONE)
+
+    @property
+    def excused(self) -> frozenset[int]:
+        """Return the peers that have never been heard, and that nobody has to wait for: somebody vouches for it."""
+        return frozenset(self._vouched.keys() - self._status.keys())
 
     def _boot_id(self, agent: int) -> int | None:
         status = self._status.get(agent)

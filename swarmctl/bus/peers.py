@@ -21,7 +21,7 @@ from swarmctl.bus.links import PERFECT, Impairments, Link
 from swarmctl.bus.path_messages import decode_path
 from swarmctl.bus.peer_clocks import PeerClocks
 from swarmctl.bus.reachability import Reachability, TokenView
-from swarmctl.bus.refusals import FUTURE, IDENTITY, LATE, MALFORMED, UNKNOWN_PEER, Refusals
+from swarmctl.bus.refusals import FUTURE, IDENTITY, LATE, MALFORMED, UNKNOWN_PEER, Refusals, RefusedMessage
 from swarmctl.bus.senders import Presence, ReceivedMessage, SenderVerifier
 from swarmctl.bus.topics import PATH, TOO_LONG, TOPICS, Topic
 from swarmctl.core.types import MAX_MARGIN_M, PredictedPath
@@ -57,6 +57,9 @@ class Bus(Protocol):
 
         There is at most one ring of each sender, and `TOO_LONG` replaces a message that is too long for its topic.
         """
+
+    def refused(self) -> list[RefusedMessage]:
+        """Return the messages that were not delivered since the last call; only sealed ones are refused by a bus."""
 
     def alive(self) -> frozenset[str]:
         """Return senders attached now, this one included. It shows that a process lives, not that its loop runs."""
@@ -353,6 +356,9 @@ class LocalBus:
         if len(arrived) > 1:
             arrived.sort(key=itemgetter(0, 1))  # stable: keeps the order of each sender
         return [(sender, payload) for _, sender, payload in arrived]
+
+    def refused(self) -> list[RefusedMessage]:
+        return []
 
     def alive(self) -> frozenset[str]:
         return self._hub.alive(self.name) if self._hub.is_attached(self) else frozenset()

@@ -11,6 +11,8 @@ LATE = "late"
 FUTURE = "future"
 MALFORMED = "malformed"
 IDENTITY = "identity"  # the name inside differs from that in the key
+UNSEALED = "unsealed"  # has no seal, where messages have one: `bus.network.seals`
+FORGED = "forged"  # its seal is not by who has this name
 UNKNOWN_PEER = "unknown_peer"
 UNCONFIRMED = "unconfirmed"  # perhaps a restart; becomes BOOT or SEQUENCE if the accepted stream continues
 BOOT = "boot"  # another boot id, while the accepted stream continues
@@ -28,6 +30,14 @@ class _Kind(NamedTuple):
     sender: str
     topic: str
     reason: str
+
+
+class RefusedMessage(NamedTuple):
+    """Names a message that a bus has not delivered, because who it is said to be from has not sent it so."""
+
+    sender: str
+    topic: str
+    reason: str  # one of those above
 
 
 class Refusals:
@@ -52,11 +62,13 @@ class Refusals:
             found[kind.reason] += count
         return +found
 
-    def add(self, sender: str, topic: str, reason: str, utc_us: int) -> None:
-        """Count one refused message."""
+    def add(self, sender: str, topic: str, reason: str, utc_us: int) -> int:
+        """Count one refused message; returns how many of its kind there have been."""
         self.total += 1
-        self._counts[_Kind(sender, topic, reason)] += 1
+        kind = _Kind(sender, topic, reason)
+        self._counts[kind] += 1
         self._raise_alert(sender, topic, reason, utc_us)
+        return self._counts[kind]
 
     def reclassify(self, sender: str, topic: str, reasons: Counter[str], utc_us: int) -> None:
         """Count unconfirmed messages by these reasons instead, after they have been contradicted."""

@@ -23,12 +23,13 @@ PATH = Topic(name="path", ring=4, max_bytes=4096, reliable=False)
 STATUS = Topic(name="status", ring=4, max_bytes=20_480, reliable=False)
 TICK = Topic(name="tick", ring=256, max_bytes=4096, reliable=False)
 COMMAND = Topic(name="command", ring=64, max_bytes=1024, reliable=True)
+ENDED = Topic(name="ended", ring=64, max_bytes=1024, reliable=True)  # a computer says that an agent of it has ended
 ANSWER = Topic(name="answer", ring=16, max_bytes=4096, reliable=True)
 OBSTACLES = Topic(name="obstacles", ring=4, max_bytes=65_536, reliable=True)
 TRAJECTORY = Topic(name="trajectory", ring=4, max_bytes=131_072, reliable=False)  # each one replaces all earlier ones
-TOPICS = (PATH, STATUS, TICK, COMMAND, ANSWER, OBSTACLES, TRAJECTORY)
-FOR_AGENTS = (PATH, STATUS, COMMAND, OBSTACLES, TRAJECTORY)
+TOPICS = (PATH, STATUS, TICK, COMMAND, ENDED, ANSWER, OBSTACLES, TRAJECTORY)
+FOR_AGENTS = (PATH, STATUS, COMMAND, ENDED, OBSTACLES, TRAJECTORY)
 
 TOO_LONG = b""  # replaces a message that is too long; every decoder refuses it
 
-OPERATOR = "operator"  # sender name of the launcher and of operator verbs
+OPERATOR = "operator"  # sender name of the launcher and of verbs; with [[hosts]] those of `bus.network.roster`

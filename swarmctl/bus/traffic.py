@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Mapping
 
 from swarmctl.bus.peers import Bus
+from swarmctl.bus.refusals import RefusedMessage
 from swarmctl.bus.topics import Topic
 
 
@@ -35,6 +36,10 @@ class CountedBus(Bus):
     def receive(self, topic: Topic) -> list[tuple[str, bytes]]:
         """Return what has come since the last call."""
         return self._bus.receive(topic)
+
+    def refused(self) -> list[RefusedMessage]:
+        """Return the messages that were not delivered."""
+        return self._bus.refused()
 
     def alive(self) -> frozenset[str]:
         """Return senders attached now."""

@@ -39,9 +39,10 @@ def cut_frames(buffer: bytearray, version_1: bool = False) -> list[bytes]:
 
 def frames(datagram: bytes, version_1: bool = False) -> list[bytes]:
     """Return the frames of a datagram as `cut_frames` does; a truncated frame ends it."""
-    payload_bytes = len(datagram) - _AROUND_2
-    if payload_bytes >= 0 and (datagram[0], datagram[1], datagram[2] & _SIGNED) == (_VERSION_2, payload_bytes, 0):
-        return [datagram]  # nearly every one is a single frame
+    if len(datagram) >= _AROUND_2 and datagram[0] == _VERSION_2:
+        around = _AROUND_2 + _SIGNATURE if datagram[2] & _SIGNED else _AROUND_2
+        if len(datagram) == around + datagram[1]:
+            return [datagram]  # nearly every one is a single frame
     return cut_frames(bytearray(datagram), version_1)
 
 

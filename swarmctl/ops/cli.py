@@ -189,6 +189,7 @@ def agent(
     realtime: Annotated[
         bool, typer.Option(help="Be scheduled before other programs once it is ready, where that is permitted.")
     ] = False,
+    identity: Annotated[str, typer.Option("--identity", help="Host it speaks for, one of [[hosts]].")] = "",
 ) -> int:
     """Run one agent for one autopilot. `launch` starts agents; on a companion computer start it yourself."""
     from swarmctl.agent.runner import AgentProcess, run_agent
@@ -207,6 +208,7 @@ def agent(
             vehicle_port=vehicle_port,
             only_land=only_land,
             realtime=realtime,
+            identity=identity,
         )
     )
 

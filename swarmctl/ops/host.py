@@ -10,13 +10,14 @@ import hashlib
 import shlex
 import sys
 from collections.abc import Sequence
+from ipaddress import IPv4Address, IPv6Address
 from pathlib import Path
 
 import tomli_w
 
 from swarmctl.bus.network.hosts import HostParams, ip_of, links_of
-from swarmctl.bus.network.identity_files import STATION, identity_problems
-from swarmctl.config import Config, load
+from swarmctl.bus.network.identity_files import STATION
+from swarmctl.config import Config, load, own_identity
 from swarmctl.errors import ConfigError
 from swarmctl.ops.launch import LaunchOptions, SwarmPart, launch_part
 
@@ -48,7 +49,7 @@ def fly_host(config: Config, host: HostParams, options: LaunchOptions) -> int:
     Raises:
         ConfigError, StartError: it was refused, or did not come up; nothing is left running.
     """
-    links = links_of(config.hosts, host.name, Path(config.bus.identities))
+    links = links_of(config.hosts, own_identity(config, host.name))
     part = SwarmPart(run=shared_run_name(config), agents=tuple(sorted(host.agents)), links=links)
     telemetry = config.telemetry.model_copy(update={"enabled": False})  # the station has the view
     return launch_part(config.model_copy(update={"telemetry": telemetry}), options, part)
@@ -71,14 +72,45 @@ def make_host_identities(path: Path, overrides: Sequence[str] = ()) -> tuple[Pat
     Raises:
         ConfigError: the configuration is invalid or names no hosts or no folder, or files can't be read or written.
     """
-    from swarmctl.bus.network.identities import make_identities  # loads cryptography, which flights do not need
+    from swarmctl.bus.network.identities import make_identities  # loads cryptography
 
     config = load(path, overrides, only_agents=())
     folder = _folder_of(config)
     if not config.hosts:
         raise ConfigError(str(path), ["hosts: none is listed; add one [[hosts]] for each computer"])
-    addresses = {host.name: ip_of(host.address) for host in config.hosts}
-    return folder, make_identities(folder, {**addresses, STATION: None})
+    return folder, make_identities(folder, _addresses(config))
+
+
+def add_host_identity(path: Path, name: str, overrides: Sequence[str] = ()) -> Path:
+    """Make the identity of one of a configuration's hosts, or of its station; returns its folder.
+
+    Raises:
+        ConfigError: the configuration is invalid or names no such host or no folder, the host has an identity that
+            counts, or files can't be read or written.
+    """
+    from swarmctl.bus.network.identities import add_identity  # loads cryptography
+
+    config = load(path, overrides, only_agents=())
+    folder, addresses = _folder_of(config), _addresses(config)
+    if name not in addresses:
+        raise ConfigError("keys add", [f"{name} is none of {', '.join(addresses)} ([[hosts]] of {path})"])
+    add_identity(folder, name, addresses[name])
+    return folder
+
+
+def revoke_host_identity(path: Path, name: str, overrides: Sequence[str] = ()) -> Path:
+    """Revoke an identity, also of a host that the configuration no longer names; returns the list of what is revoked.
+
+    Raises:
+        ConfigError: the configuration is invalid or names no folder, or there is no such identity.
+    """
+    from swarmctl.bus.network.identities import revoke_identity  # loads cryptography
+
+    return revoke_identity(_folder_of(load(path, overrides, only_agents=())), name)
+
+
+def _addresses(config: Config) -> dict[str, IPv4Address | IPv6Address | None]:
+    return {**{host.name: ip_of(host.address) for host in config.hosts}, STATION: None}
 
 
 def systemd_unit(path: Path, host: HostParams) -> str:
@@ -104,13 +136,15 @@ LimitRTPRIO=20
 
 
 def refuse_unidentified(config: Config, name: str) -> None:
-    """Check that this computer can prove that it belongs to the swarm.
+    """Check that this computer can prove that it belongs to the swarm, and has the certificates of the others.
 
     Raises:
-        ConfigError: it can't.
+        ConfigError: it can't, or has not.
     """
-    if problems := list(identity_problems(_folder_of(config), name)):
-        raise ConfigError(name, problems)
+    from swarmctl.bus.network.keyring import load_keyring  # loads cryptography, which one computer alone does not need
+
+    _folder_of(config)
+    load_keyring(own_identity(config, name))
 
 
 def _folder_of(config: Config) -> Path:

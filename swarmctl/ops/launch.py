@@ -10,19 +10,21 @@ import shutil
 import signal
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from swarmctl.bus.network.joining import join_bus
 from swarmctl.bus.network.router_links import RouterLinks
+from swarmctl.bus.network.sealed_bus import FOR_OPERATORS_US
 from swarmctl.bus.peers import Bus, agent_name
 from swarmctl.bus.topics import OBSTACLES, OPERATOR, STATUS, TICK, Topic
-from swarmctl.bus.zenoh_bus import NO_BUS, SCHEME, ZenohBus, socket_file
+from swarmctl.bus.zenoh_bus import NO_BUS, SCHEME, socket_file
 from swarmctl.config import Config, dump
 from swarmctl.errors import StartError
 from swarmctl.files import replace_text
-from swarmctl.ops.operator import RunningLaunch, announce, process_start_s, withdraw
+from swarmctl.ops.operator import RunningLaunch, announce, list_keepers, process_start_s, utc_us, withdraw
 from swarmctl.ops.preflight import LOOPBACK, ReservedPorts, inspect
 from swarmctl.ops.processes import (
     ROUTER,
@@ -151,7 +153,8 @@ class Launcher(Services):
         self._options = options
         self._reserved = reserved
         self.display = open_display(run=part.run)
-        self.context = RunContext(part.run, f"{SCHEME}{self._socket_dir}/bus.sock", directory, part.agents)
+        identity = None if part.links is None else part.links.identity
+        self.context = RunContext(part.run, f"{SCHEME}{self._socket_dir}/bus.sock", directory, part.agents, identity)
         self._links = part.links
         self.log = EventLog(directory / "launch.events.jsonl", "launch")
         self.children: dict[str, Child] = {}
@@ -216,7 +219,7 @@ class Launcher(Services):
         endpoint = self.context.endpoint if router.poll() is None else NO_BUS
         directory = self.context.directory / "recovery"
         directory.mkdir(exist_ok=True)
-        context = RunContext(self.context.run, endpoint, directory, (agent,))
+        context = replace(self.context, endpoint=endpoint, directory=directory, agents=(agent,))
         place = self.context.agents.index(agent)
         own = slice(place, place + 1)
         ends = self._reserved.sockets[own], self._reserved.vehicle_sockets[own]
@@ -230,27 +233,38 @@ class Launcher(Services):
         start_s, pid = process_start_s()
         announce(
             RunningLaunch(
-                context.run, context.endpoint, pid, start_s, self._config.swarm.agents, str(context.directory), view
+                context.run,
+                context.endpoint,
+                pid,
+                start_s,
+                self._config.swarm.agents,
+                str(context.directory),
+                view,
+                context.identity,
             )
         )
 
     def _spawn(self, command: Command) -> None:
         self.children[command.name] = Child(command, self.context.directory)
 
-    def _join_bus(self) -> ZenohBus:
+    def _join_bus(self) -> Bus:
+        context = self.context
         senders = [agent_name(agent) for agent in range(self._config.swarm.agents)]
-        listen: dict[Topic, list[str]] = {STATUS: senders, OBSTACLES: [OPERATOR]}
-        if not self.context.agents:  # nobody records here, so the station does
+        listen: dict[Topic, Sequence[str]] = {STATUS: senders, OBSTACLES: list_keepers(context.identity)}
+        if not context.agents:  # nobody records here, so the station does
             listen[TICK] = senders
         router = self.children[ROUTER]
         deadline_s = time.monotonic() + _BUS_S
         while True:
             try:
-                return ZenohBus(
-                    self.context.endpoint,
-                    self.context.run,
-                    OPERATOR,
+                return join_bus(
+                    context.endpoint,
+                    context.run,
+                    OPERATOR if context.identity is None else context.identity.name,
                     listen,
+                    identity=context.identity,
+                    max_age_us=FOR_OPERATORS_US,
+                    utc_us=utc_us,
                     lease_ms=self._config.bus.lease_ms,
                     connect_timeout_ms=_BUS_TRY_MS,
                 )

@@ -22,8 +22,8 @@ from swarmctl.bus.json_messages import (
     decode_obstacles,
     encode_message,
 )
+from swarmctl.bus.peers import Bus
 from swarmctl.bus.topics import OBSTACLES
-from swarmctl.bus.zenoh_bus import ZenohBus
 from swarmctl.config_problems import validated
 from swarmctl.config_source import read_tree
 from swarmctl.core.obstacle import Obstacle
@@ -31,6 +31,7 @@ from swarmctl.core.params import Params
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.ops.config_help import write_new
 from swarmctl.ops.operator import ANSWER_S, REPEAT_S, RunningLaunch, joined, vector
+from swarmctl.ops.order_delivery import no_operator
 
 _OPTIONS = {  # of the command line, by key
     "center_ned_m": "--center",
@@ -65,9 +66,11 @@ def change_obstacles(
     """Replace the obstacle list by what `change` makes of it, and wait until the launch repeats the new one.
 
     Raises:
-        ConfigError: `change` refuses, or there would be too many.
+        ConfigError: `change` refuses, there would be too many, or this computer may not change them.
         StartError: the launch does not answer, or others change the list all the time.
     """
+    if launch.identity is not None and not launch.identity.speaker.operator:
+        raise ConfigError(_SOURCE, [no_operator(launch)])
     with joined(launch) as bus:
         old = _received(bus, 0)
         for _ in range(_TRIES):
@@ -212,7 +215,7 @@ def _validated(values: dict[str, Any], problems: list[str]) -> Obstacle:
     return described
 
 
-def _received(bus: ZenohBus, least_version: int, say: bytes | None = None) -> ObstaclesMessage:
+def _received(bus: Bus, least_version: int, say: bytes | None = None) -> ObstaclesMessage:
     deadline_s = time.monotonic() + ANSWER_S
     while time.monotonic() < deadline_s:
         if say is not None:

@@ -22,9 +22,11 @@ import msgspec
 import psutil
 
 from swarmctl.bus.json_messages import StatusMessage, decode_status
-from swarmctl.bus.peers import agent_name
+from swarmctl.bus.network.joining import join_bus
+from swarmctl.bus.network.roster import OwnIdentity
+from swarmctl.bus.network.sealed_bus import FOR_OPERATORS_US
+from swarmctl.bus.peers import Bus, agent_name
 from swarmctl.bus.topics import ANSWER, OBSTACLES, OPERATOR, STATUS
-from swarmctl.bus.zenoh_bus import ZenohBus
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.files import read_file, replace_bytes
 
@@ -45,6 +47,7 @@ class RunningLaunch(msgspec.Struct, frozen=True):
     agents: int
     run_dir: str
     view: str = ""  # address of the live view; "" without one
+    identity: OwnIdentity | None = None  # as which operators speak here; None: a launch on one computer
 
 
 def announce(launch: RunningLaunch) -> None:
@@ -110,20 +113,38 @@ def running_launches() -> list[RunningLaunch]:
 
 
 @contextmanager
-def joined(launch: RunningLaunch) -> Iterator[ZenohBus]:
+def joined(launch: RunningLaunch) -> Iterator[Bus]:
     """Join the bus of a launch as its operator."""
     senders = [agent_name(agent) for agent in range(launch.agents)]
-    bus = ZenohBus(
+    bus = join_bus(
         launch.bus,
         launch.run,
-        OPERATOR,
-        {STATUS: senders, ANSWER: senders, OBSTACLES: [OPERATOR]},
+        OPERATOR if launch.identity is None else launch.identity.name,
+        {STATUS: senders, ANSWER: senders, OBSTACLES: list_keepers(launch.identity)},
+        identity=launch.identity,
+        max_age_us=FOR_OPERATORS_US,
+        utc_us=utc_us,
         connect_timeout_ms=3000,
     )
     try:
         yield bus
     finally:
         bus.close()
+
+
+def list_keepers(identity: OwnIdentity | None) -> tuple[str, ...]:
+    """Return the senders whose list of obstacles an operator, or a supervisor, takes for that of the swarm.
+
+    The station, which keeps none, takes that of any host.
+    """
+    if identity is None:
+        return (OPERATOR,)
+    return identity.roster.commanders(identity.name) if identity.speaker.agents else identity.roster.hosts
+
+
+def utc_us() -> int:
+    """Return the time of this computer, UTC [us]."""
+    return time.time_ns() // 1000
 
 
 def view_address(launch: RunningLaunch) -> str:
@@ -161,7 +182,7 @@ def vector(key: str, text: str, problems: list[str]) -> tuple[float, float, floa
     return (north, east, down)
 
 
-def _statuses(bus: ZenohBus, agents: range, timeout_s: float) -> dict[int, StatusMessage]:
+def _statuses(bus: Bus, agents: range, timeout_s: float) -> dict[int, StatusMessage]:
     """Return the newest status of each of `agents`, once all have published one or the time is up."""
     heard: dict[int, StatusMessage] = {}
     deadline_s = time.monotonic() + timeout_s

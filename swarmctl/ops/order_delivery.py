@@ -135,7 +135,7 @@ def addressed(launch: RunningLaunch, order: Order, agents: Sequence[int]) -> lis
     """Return the agents an order is for: those named, or all but one that it says has ended.
 
     Raises:
-        ConfigError: there is no such agent.
+        ConfigError: there is no such agent, or it does not obey this computer.
         StartError: there is nobody to be told.
     """
     named = [*agents, *(int(number) for name, number in order.arguments.items() if name == PEER)]
@@ -143,10 +143,25 @@ def addressed(launch: RunningLaunch, order: Order, agents: Sequence[int]) -> lis
     if unknown:
         known = "agent 0 only" if launch.agents == 1 else f"agents 0 to {launch.agents - 1}"
         raise ConfigError(order.verb, [f"there is no agent {agent}; {launch.run} has {known}" for agent in unknown])
-    asked = sorted(set(agents)) or [i for i in range(launch.agents) if i != order.arguments.get(PEER)]
+    obeying = obeying_agents(launch)
+    if deaf := [agent for agent in dict.fromkeys(agents) if agent not in obeying]:
+        raise ConfigError(order.verb, [f"agent {agent} does not obey: {no_operator(launch)}" for agent in deaf])
+    asked = sorted(set(agents)) or [i for i in obeying if i != order.arguments.get(PEER)]
     if not asked:
         raise StartError(f"{order.verb}: {launch.run} has no other agent that could be told")
     return asked
+
+
+def obeying_agents(launch: RunningLaunch) -> tuple[int, ...]:
+    """Return the agents that obey operators of a launch: all, or a host's own where it has no operator's identity."""
+    own = launch.identity
+    return tuple(range(launch.agents)) if own is None or own.speaker.operator else own.speaker.agents
+
+
+def no_operator(launch: RunningLaunch) -> str:
+    """Return why agents of other computers do not obey, in words."""
+    name = "" if launch.identity is None else launch.identity.name
+    return f"{name} has no operator's identity. Say it at the station, or set operator = true in [[hosts]] of {name}"
 
 
 def deliver(launch: RunningLaunch, order: Order, agents: Sequence[int]) -> list[Reply]:

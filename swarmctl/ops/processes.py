@@ -20,6 +20,7 @@ from pathlib import Path
 
 import psutil
 
+from swarmctl.bus.network.roster import OwnIdentity
 from swarmctl.bus.network.router_links import RouterLinks
 from swarmctl.bus.peers import agent_name
 from swarmctl.bus.zenoh_bus import socket_file
@@ -47,12 +48,16 @@ class Command:
 
 @dataclass(frozen=True, slots=True)
 class RunContext:
-    """Values that all command lines of a launch share: run name, bus endpoint, run folder, agents of this computer."""
+    """Values that all command lines of a launch share: run name, bus endpoint, run folder, agents of this computer.
+
+    On a bus of several computers also the identity as which all of them speak.
+    """
 
     run: str
     endpoint: str
     directory: Path
     agents: tuple[int, ...]
+    identity: OwnIdentity | None = None
 
 
 def run_name(name: str) -> str:
@@ -99,6 +104,7 @@ def agent_commands(
         fds = (sockets[place].fileno(),) if sockets else ()
         argv += ("--fd", f"{fds[0]}") if fds else ()
         argv += ("--vehicle-port", f"{vehicles[place].getsockname()[1]}") if vehicles else ()
+        argv += () if context.identity is None else ("--identity", context.identity.name)
         argv += (_priority_flag(config, context),)
         commands.append(Command(agent_name(agent), argv, fds))
     return tuple(commands)
@@ -130,6 +136,7 @@ def viewer_command(config: Config, context: RunContext, port: int, view: bool) -
     argv = _python("-m", "swarmctl.telemetry.view.viewer", "--run", context.run, "--bus", context.endpoint)
     argv += ("--flight", viewed_flight(config).model_dump_json(), "--run-dir", f"{context.directory}")
     argv += ("--port", f"{port}", "--rate-hz", f"{config.telemetry.rate_hz!r}", "--die-with-parent")
+    argv += () if context.identity is None else ("--identity", context.identity.as_json())
     return Command(VIEWER, argv + (("--view",) if view else ()))
 
 

@@ -15,8 +15,9 @@ from swarmctl.bus.json_messages import decode_status
 from swarmctl.bus.network.hosts import links_of
 from swarmctl.bus.network.identity_files import STATION
 from swarmctl.bus.peers import Bus, agent_name
+from swarmctl.bus.refusals import Refusals
 from swarmctl.bus.topics import STATUS, TICK
-from swarmctl.config import Config
+from swarmctl.config import Config, own_identity
 from swarmctl.control.phases.state_machine import OPERATOR_STOP
 from swarmctl.core.records import unpack_tick
 from swarmctl.core.types import Phase
@@ -26,7 +27,7 @@ from swarmctl.ops.launch import LaunchOptions, SwarmPart, started
 from swarmctl.ops.processes import ROUTER
 from swarmctl.ops.status_table import AgentView, Display
 from swarmctl.ops.summary import sum_up
-from swarmctl.ops.supervisor import LaunchResult
+from swarmctl.ops.supervisor import LaunchResult, report_refused
 from swarmctl.process_lifetime import StopRequest
 from swarmctl.telemetry.recording.recorder import Recorder
 
@@ -43,11 +44,17 @@ def run_station(config: Config, options: LaunchOptions) -> int:
     if not config.hosts:
         raise ConfigError("hosts", ["the configuration lists none; a swarm on one computer flies by: swarmctl launch"])
     refuse_unidentified(config, STATION)
-    links = links_of(config.hosts, STATION, Path(config.bus.identities))
+    links = links_of(config.hosts, own_identity(config, STATION))
     part = SwarmPart(run=shared_run_name(config), agents=(), links=links)
     with StopRequest(signal.SIGINT, signal.SIGTERM, signal.SIGHUP) as stop:
         with started(config, options, part) as services:
-            watch = SwarmWatch(services.joined_bus, config.swarm.agents, services.context.directory, services.display)
+            watch = SwarmWatch(
+                services.joined_bus,
+                config.swarm.agents,
+                services.context.directory,
+                services.display,
+                note=services.log.write,
+            )
             router = services.children[ROUTER]
             while not (stop.count or watch.step()):
                 if router.poll() is not None:
@@ -70,6 +77,7 @@ class SwarmWatch:
         agents: size of the swarm.
         directory: run folder for what they report.
         display: shows them.
+        note: is told of refused messages, see `Refusals`.
         clock_s: monotonic time [s].
 
     Attributes:
@@ -83,9 +91,11 @@ class SwarmWatch:
         agents: int,
         directory: Path,
         display: Display,
+        note: Callable[..., None],
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._bus, self._display, self._clock_s = bus, display, clock_s
+        self._refusals = Refusals(note)
         self._views = [AgentView(agent=agent) for agent in range(agents)]
         self._recorders = {agent_name(agent): Recorder(directory, agent) for agent in range(agents)}
         self.problems: list[str] = []
@@ -103,6 +113,7 @@ class SwarmWatch:
             if status is not None and 0 <= status.agent < len(self._views) and sender == agent_name(status.agent):
                 view = self._views[status.agent]
                 view.status, view.received_s = status, now_s
+        report_refused(self._bus, self._refusals, self._display)
         self._display.show(self._views)
         over = all(self._has_ended(view, now_s) for view in self._views)
         if over:

@@ -31,6 +31,7 @@ _LINE = 2000  # longest printed line
 _WIDE = 117  # columns of a terminal that has room for everything
 _SILENT_S = 2.0  # without a status for so long an agent is lost to the operator
 _OPERATORS_MATTER = ("HOLD", "GOTO", "WAIT", "PILOT", "FAILSAFE", "LOST")  # whose beginning and end are lines
+_WAITS = "waits for "  # begins an alert on the ground, or before the mission
 _FIX = {0: "no", 1: "no", 2: "2D", 3: "3D", 4: "DGPS", 5: "float", 6: "RTK"}  # GPS_FIX_TYPE
 
 
@@ -115,12 +116,13 @@ class LiveTable:
 
 
 class PlainLines:
-    """Prints a line when an agent's phase, a hold or loss of it, or the launcher's note on it changes, for logs."""
+    """Prints a line when an agent's phase, what it waits for, a hold or the launcher's note on it changes, for logs."""
 
     def __init__(self, stream: TextIO) -> None:
         self._stream = stream
         self._started_s = time.monotonic()
         self._last: dict[int, tuple[str, str, str]] = {}
+        self._waited: dict[int, str] = {}  # for what, by agent
 
     def print_line(self, text: str) -> None:
         with contextlib.suppress(OSError):  # the pipe is closed; the flight goes on
@@ -130,10 +132,12 @@ class PlainLines:
         for view in agents:
             phase = "" if view.status is None else name_of(Phase, view.status.phase)
             control = view.control if view.control in _OPERATORS_MATTER and not view.note else ""
-            if (phase, control, view.note) == self._last.get(view.agent, ("", "", "")):
+            alert = view.note or (view.status.active_alert if view.status else "")
+            waits = alert.startswith(_WAITS) and alert != self._waited.get(view.agent)
+            if not waits and (phase, control, view.note) == self._last.get(view.agent, ("", "", "")):
                 continue
             self._last[view.agent] = (phase, control, view.note)
-            alert = view.note or (view.status.active_alert if view.status else "")
+            self._waited |= {view.agent: alert} if waits else {}
             elapsed_s = time.monotonic() - self._started_s
             words = "  ".join(word for word in (agent_name(view.agent), phase, control, alert) if word)
             self.print_line(f"{elapsed_s:7.1f} s  {words}")

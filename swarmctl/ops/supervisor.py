@@ -17,7 +17,8 @@ import msgspec
 from swarmctl.bus.json_messages import ObstaclesMessage, decode_obstacles, decode_status, encode_message, first_list
 from swarmctl.bus.orders import EVERYBODY, order_messages
 from swarmctl.bus.peers import Bus, agent_name
-from swarmctl.bus.topics import COMMAND, OBSTACLES, STATUS
+from swarmctl.bus.refusals import HARMLESS, Refusals
+from swarmctl.bus.topics import COMMAND, ENDED, OBSTACLES, STATUS, Topic
 from swarmctl.config import Config
 from swarmctl.core.operator_verbs import EXCLUDE, PEER, Order
 from swarmctl.core.types import Phase
@@ -93,6 +94,15 @@ class LaunchResult:
         return EXIT_MISSION if self.problems or violated else EXIT_OK
 
 
+def report_refused(bus: Bus, refusals: Refusals, display: Display) -> None:
+    """Report what the bus did not deliver, because its seal was not by its sender; the first of each kind in words."""
+    utc_us = time.time_ns() // 1000
+    for sender, topic, reason in bus.refused():
+        if refusals.add(sender, topic, reason, utc_us) == 1 and reason not in HARMLESS:
+            display.print_line(f"{topic} in the name of {sender} refused: {reason}")
+    refusals.report(utc_us)
+
+
 def why_it_failed(outcome: str, last_line: str) -> str:
     """Return why an agent failed: the outcome of its mission, or its last line after a complete one."""
     return (outcome if outcome != "completed" else "") or last_line or "no reason given"
@@ -124,6 +134,7 @@ class FlightSupervisor:
         self._obstacles = first_list(config.obstacles, time.time_ns() // 1000)
         self._result.obstacles = _judged((), self._obstacles, 0)
         self._obstacles_said_s = 0.0
+        self._refusals = Refusals(services.log.write)
         self._started_s = self._stepped_s = time.monotonic()
         self._reported: set[str] = set()
         self._router_starts = 0  # how often it was started again
@@ -194,6 +205,7 @@ class FlightSupervisor:
             message = decode_obstacles(payload)
             if message is not None and message.replaces(self._obstacles.version):
                 self._adopt(message)
+        report_refused(self._bus, self._refusals, self._display)
 
     def _adopt(self, message: ObstaclesMessage) -> None:
         """Adopt an operator's obstacle list: repeat it, judge what is new from now on and what is gone until now."""
@@ -252,16 +264,17 @@ class FlightSupervisor:
 
     def _vouch_for_end(self, agent: int) -> None:
         """Tell the others that the process of an agent has ended, before another one is started in its place."""
-        self._order(Order(EXCLUDE, {PEER: agent}), [view for view in self._running() if view.agent != agent])
+        others = [view for view in self._running() if view.agent != agent]
+        self._order(Order(EXCLUDE, {PEER: agent}), others, topic=ENDED)
 
-    def _order(self, order: Order, views: list[AgentView], agent: int = EVERYBODY) -> None:
+    def _order(self, order: Order, views: list[AgentView], agent: int = EVERYBODY, *, topic: Topic = COMMAND) -> None:
         """Give an order to an agent, or all, stamped by the clocks of these. A repetition is another, obeyed anew."""
         now_s = time.monotonic()
         clocks_us = [
             view.status.utc_us + round((now_s - view.received_s) * 1e6) for view in views if view.status is not None
         ]
         for message in order_messages(numbered(order), agent, time.time_ns() // 1000, clocks_us):
-            self._bus.publish(COMMAND, message)
+            self._bus.publish(topic, message)
 
     def _recover(self, view: AgentView, code: int) -> None:
         """Start another process that lands a vehicle which is not known to be down."""

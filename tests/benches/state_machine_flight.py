@@ -47,6 +47,7 @@ class Flight:
         self.setpoints_stopped = ""
         self.seen = True
         self.escalation = NOTHING_WORN
+        self.excused: frozenset[int] = frozenset()
         self.peers = {k + 1: PeerInputs(Phase.STANDBY, 0, True) for k in range(peers)}
 
     @property
@@ -90,6 +91,7 @@ class Flight:
             mode=self.failsafe_mode,
             unresponsive_peer=self.unresponsive_peer,
             peers=lambda: self.peers,
+            excused=self.excused,
             others_ned_m=lambda: self.others,
             arm_in=self.arm_in,
             boots=self.boots,

@@ -5,25 +5,20 @@ from __future__ import annotations
 import shlex
 import shutil
 import signal
-import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from swarmctl.bus.network.router_links import RouterLinks
-from swarmctl.bus.topics import PATH
-from swarmctl.bus.zenoh_bus import SCHEME, ZenohBus
 from swarmctl.core.records import TRUTH_COLUMNS
 from swarmctl.ops.cli import main
 from swarmctl.telemetry.recording.run_files import PACKED_TRUTH, read_parquet
 from tests.benches.free_ports import free_ports
-from tests.process.test_bus import end, until
+from tests.process.test_bus import until
 from tests.process.test_launch import Launched
 from tests.process.test_readme import shown
 
@@ -55,11 +50,15 @@ identities = "identities"
 name = "alpha"
 address = "127.0.0.1:{ports[0]}"
 agents = [0]
+operator = true
 [[hosts]]
 name = "bravo"
 address = "127.0.0.1:{ports[1]}"
 agents = [1]
 """
+
+
+AGENTS = {"alpha": "0", "bravo": "1"}
 
 
 class StartedHost(Launched):
@@ -91,18 +90,23 @@ def make_keys(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @contextmanager
-def three(path: Path) -> Iterator[tuple[StartedHost, StartedHost, StartedStation]]:
-    """Yield both hosts and the station; their folders are gone afterwards."""
-    temps = [Path(tempfile.mkdtemp(prefix="sw")) for _ in range(3)]
-    started = (
-        StartedHost(path.parent / "alpha", temps[0], *as_shown("host", path, "0")[2:]),
-        StartedHost(path.parent / "bravo", temps[1], *as_shown("host", path, "1")[2:]),
-        StartedStation(path.parent / "station", temps[2], *as_shown("station", path)[2:], "--no-view"),
-    )
+def started(path: Path) -> Iterator[Callable[[str], Launched]]:
+    """Yield what starts alpha, bravo or the station; their folders are gone afterwards."""
+    running: list[tuple[Launched, Path]] = []
+
+    def start(name: str) -> Launched:
+        temp = Path(tempfile.mkdtemp(prefix="sw"))
+        words = as_shown("station", path) if name == "station" else as_shown("host", path, AGENTS[name])
+        kind = StartedStation if name == "station" else StartedHost
+        options = ("--no-view",) if name == "station" else ()
+        launched = kind(path.parent / name, temp, *words[2:], *options)
+        running.append((launched, temp))
+        return launched
+
     try:
-        yield started
+        yield start
     finally:
-        for launched, temp in zip(started, temps, strict=True):
+        for launched, temp in running:
             for relative in launched.relatives():
                 relative.kill()
             launched.process.kill()
@@ -124,9 +128,19 @@ def least_separation_m(*folders: Path) -> float:
 def test_two_hosts_fly_one_swarm_that_a_station_commands_and_judges(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """One host comes late: the other says for whom it waits, and tells it of an obstacle that an operator has added."""
     path = write_swarm(tmp_path, duration_s=600.0)
     make_keys(path, monkeypatch)
-    with three(path) as (alpha, bravo, station):
+    with started(path) as start:
+        alpha, station = start("alpha"), start("station")
+        alpha.until_phase("STANDBY", 1)
+        added = station.verb("obstacle", "add", "--center", "30,30,-3", "--radius", "0.5")
+        assert added.returncode == 0, added.stderr
+        assert until(lambda: "waits for agent-1 to stand by" in alpha.text()), alpha.text()
+        bravo = start("bravo")
+        assert until(lambda: bool(bravo.events("obstacles"))), bravo.text()
+        refused = bravo.verb("land", "0")
+        assert (refused.returncode, "bravo has no operator's identity" in refused.stderr) == (2, True)
         alpha.until_phase("TRACK", 1)
         bravo.until_phase("TRACK", 1)
         for verb in ("hold", "resume", "land"):
@@ -147,7 +161,8 @@ def test_two_hosts_fly_one_swarm_that_a_station_commands_and_judges(
 def test_a_stop_of_one_host_lands_its_agents_alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = write_swarm(tmp_path, duration_s=20.0)
     make_keys(path, monkeypatch)
-    with three(path) as (alpha, bravo, station):
+    with started(path) as start:
+        alpha, bravo, station = start("alpha"), start("bravo"), start("station")
         alpha.until_phase("TRACK", 1)
         bravo.until_phase("TRACK", 1)
         for stopped in (bravo, station):
@@ -158,45 +173,3 @@ def test_a_stop_of_one_host_lands_its_agents_alone(tmp_path: Path, monkeypatch: 
         assert alpha.end() == 0, alpha.text()
         assert alpha.summary()["violations"] == []
         assert least_separation_m(alpha.run_dir, bravo.run_dir) >= 0.85
-
-
-@contextmanager
-def router(folder: Path, links: RouterLinks) -> Iterator[ZenohBus]:
-    """Yield a client of a new router with these links."""
-    endpoint = f"{SCHEME}{folder}/bus.sock"
-    command = [sys.executable, "-m", "swarmctl.bus.network.router", endpoint, "--die-with-parent", *links.arguments()]
-    process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
-    assert process.stdout is not None
-    assert process.stdout.readline().startswith("router ready")
-    names = ["alpha", "bravo", "mallory"]
-    bus = ZenohBus(endpoint, "run", links.name, {PATH: [name for name in names if name != links.name]})
-    yield bus
-    bus.close()
-    assert end(process) == 0
-
-
-def heard(bus: ZenohBus, say: ZenohBus, word: bytes) -> bool:
-    say.publish(PATH, word)
-    return any(payload == word for _, payload in bus.receive(PATH))
-
-
-def test_routers_link_with_those_of_their_own_authority_only(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    ours, theirs = tmp_path / "ours", tmp_path / "theirs"
-    for folder in (ours, theirs):
-        folder.mkdir(mode=0o700)
-        make_keys(write_swarm(folder), monkeypatch)
-    places = [Path(tempfile.mkdtemp(prefix="sw")) for _ in range(3)]
-    address = f"127.0.0.1:{free_ports(1)[0]}"
-    alpha = RouterLinks(identities=ours / "identities", name="alpha", listen=address)
-    bravo = RouterLinks(identities=ours / "identities", name="bravo", connect=(address,))
-    mallory = RouterLinks(identities=theirs / "identities", name="bravo", connect=(address,))
-    with router(places[0], alpha) as at_alpha:
-        with router(places[2], mallory) as at_mallory:
-            deadline_s = time.monotonic() + 2.0
-            while time.monotonic() < deadline_s:
-                assert not heard(at_alpha, at_mallory, b"forged"), "an identity of another authority is none"
-                assert not heard(at_mallory, at_alpha, b"secret")
-                time.sleep(0.02)
-        with router(places[1], bravo) as at_bravo:
-            assert until(lambda: heard(at_alpha, at_bravo, b"true")), "as it does with ours: this can fail"
-            assert until(lambda: heard(at_bravo, at_alpha, b"known"))

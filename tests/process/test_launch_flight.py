@@ -17,7 +17,7 @@ from swarmctl.bus.json_messages import decode_command, decode_obstacles, encode_
 from swarmctl.bus.orders import Orders
 from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.bus.refusals import Refusals
-from swarmctl.bus.topics import COMMAND, OBSTACLES, OPERATOR, STATUS
+from swarmctl.bus.topics import COMMAND, ENDED, OBSTACLES, OPERATOR, STATUS
 from swarmctl.config import load
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import EXCLUDE, PEER
@@ -115,7 +115,8 @@ class ScriptedServices(Services):
             orders = [order for order in map(decode_command, received) if order]
             self.orders += [order.verb for order in orders]
             self.stamped_us += [(order.utc_us, now_us - order.utc_us) for order in orders]
-            self.vouched |= {int(order.arguments[PEER]) for order in orders if order.verb == EXCLUDE}
+            ended = [order for _, payload in bus.receive(ENDED) if (order := decode_command(payload))]
+            self.vouched |= {int(order.arguments[PEER]) for order in ended if order.verb == EXCLUDE}
             if any(order.verb == "land" for order in orders) and self.obeys and i not in self.silent:
                 self.children[agent_name(i)].signal(signal.SIGTERM)
             if i not in self.silent and self.children[agent_name(i)].poll() is None:

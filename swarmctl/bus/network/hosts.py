@@ -5,16 +5,18 @@ from __future__ import annotations
 import ipaddress
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from pathlib import Path
 from typing import Annotated
 
 from pydantic import Field
 
 from swarmctl.bus.network.identity_files import AUTHORITY, STATION
+from swarmctl.bus.network.roster import OwnIdentity, Roster, Speaker
 from swarmctl.bus.network.router_links import RouterLinks
+from swarmctl.bus.peers import agent_name
+from swarmctl.bus.topics import OPERATOR
 from swarmctl.core.params import Params
 
-_RESERVED = (AUTHORITY, STATION)
+_RESERVED = (AUTHORITY, STATION, "revoked", OPERATOR)
 
 
 class HostParams(Params):
@@ -23,12 +25,13 @@ class HostParams(Params):
     name: str = Field(pattern=r"^[A-Za-z0-9_-]{1,40}$")  # of its identity, and in messages
     address: str  # IP:PORT at which the routers of other computers reach its router, over UDP
     agents: Annotated[tuple[int, ...], Field(strict=False, min_length=1)]  # numbers of those that run there
+    operator: bool = False  # agents of other hosts obey what is ordered there; its own ones and the station's always do
 
 
 def host_problems(hosts: Sequence[HostParams], agents: int) -> Iterator[str]:
     """Yield why these hosts are not those of a swarm of so many agents; none for no hosts."""
     for i, host in enumerate(hosts):
-        if host.name in _RESERVED:
+        if host.name in _RESERVED or host.name.startswith("agent-"):
             yield f"hosts.{i}.name = {host.name!r}: reserved; choose another"
         if problem := _address_problem(host.address):
             yield f"hosts.{i}.address = {host.address!r}: {problem}; write IP:PORT, for example 192.168.1.20:7448"
@@ -42,16 +45,30 @@ def host_problems(hosts: Sequence[HostParams], agents: int) -> Iterator[str]:
         yield f"hosts: there are no agents {unknown}; swarm.agents = {agents}"
 
 
-def links_of(hosts: Sequence[HostParams], name: str, identities: Path) -> RouterLinks:
+def roster_of(hosts: Sequence[HostParams], *, relay: bool) -> Roster:
+    """Return the identities of these hosts, and the station's, which is always an operator's."""
+    speakers = [
+        Speaker(
+            name=host.name,
+            agents=host.agents,
+            senders=(host.name, *map(agent_name, host.agents)),
+            operator=host.operator,
+        )
+        for host in hosts
+    ]
+    station = Speaker(name=STATION, agents=(), senders=(STATION,), operator=True)
+    return Roster(speakers=(*speakers, station), relay=relay)
+
+
+def links_of(hosts: Sequence[HostParams], identity: OwnIdentity) -> RouterLinks:
     """Return the links of a host's router, or of the station's.
 
     Of two hosts the later in the list connects, so that there is one link for each pair; the station connects to all.
     """
     names = [host.name for host in hosts]
-    own = names.index(name) if name in names else len(hosts)
+    own = names.index(identity.name) if identity.name in names else len(hosts)
     listen = hosts[own].address if own < len(hosts) else ""
-    connect = tuple(host.address for host in hosts[:own])
-    return RouterLinks(identities=identities, name=name, listen=listen, connect=connect)
+    return RouterLinks(identity=identity, listen=listen, connect=tuple(host.address for host in hosts[:own]))
 
 
 def ip_of(address: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address:

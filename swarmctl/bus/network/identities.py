@@ -1,13 +1,16 @@
-"""Makes the identities of a swarm's computers: an authority of its own, and what it signs for each of them.
+"""Makes and revokes the identities of a swarm's computers: an authority of its own, and what it signs for each of them.
 
 An identity is a certificate for the address of a computer, and its private key. Nobody else's authority counts, so who
-has no identity of the swarm is on none of its links.
+has no identity of the swarm is on none of its links. What is revoked is a certificate, not a name: the common name has
+a random end, so that a computer's new identity is another one.
 """
 
 from __future__ import annotations
 
 import ipaddress
-from collections.abc import Mapping
+import secrets
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -16,13 +19,13 @@ from cryptography.hazmat.primitives import hashes, serialization
 from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from swarmctl.bus.network.identity_files import AUTHORITY, certificate_file, key_file
+from swarmctl.bus.network.identity_files import AUTHORITY, MOST_BYTES, REVOKED_FILE, certificate_file, key_file
+from swarmctl.bus.network.keyring import read_certificate, revoked_serials
 from swarmctl.errors import ConfigError
-from swarmctl.files import create_private, read_file
+from swarmctl.files import create_private, read_file, replace_bytes
 
 _VALID = timedelta(days=3650)  # a swarm whose certificates expire in the field can't fly
 _BEFORE = timedelta(days=1)  # a clock may be behind
-_MOST_BYTES = 20_000
 _USAGES = [ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]
 
 _Ip = ipaddress.IPv4Address | ipaddress.IPv6Address
@@ -39,27 +42,82 @@ def make_identities(folder: Path, addresses: Mapping[str, _Ip | None]) -> list[s
         ConfigError: a file can't be written or read, there are certificates but not the authority's key, or a
             computer has an identity for another address.
     """
-    try:
+    with _reported("keys init", folder):
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        signer = _authority(folder)
+        signer = _authority(folder, may_begin=True)
         made = [name for name in addresses if not (folder / certificate_file(name)).exists()]
         if moved := [name for name in addresses if name not in made and not _is_for(folder, name, addresses[name])]:
-            files = ", ".join(f"{certificate_file(name)} and {key_file(name)}" for name in moved)
-            raise ConfigError("keys init", [f"{', '.join(moved)}: another address now; remove {files} in {folder}"])
+            problem = "another address now; swarmctl keys revoke it, then swarmctl keys add it"
+            raise ConfigError("keys init", [f"{name}: {problem}" for name in moved])
         for name in made:
-            key = ec.generate_private_key(ec.SECP256R1())
-            certificate = _signed(name, key.public_key(), signer, addresses[name])
-            _write(folder, name, certificate, key)
-    except OSError as error:
-        raise ConfigError("keys init", [f"{error.filename}: {error.strerror}"]) from error
-    except ValueError as error:
-        raise ConfigError("keys init", [f"{folder}: holds a damaged certificate or key: {error}"]) from error
+            _make(folder, name, signer, addresses[name])
     return made
 
 
-def _authority(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
-    """Return the authority of a folder, a new one in an empty folder."""
-    if not (folder / certificate_file(AUTHORITY)).exists():
+def add_identity(folder: Path, name: str, address: _Ip | None) -> None:
+    """Make one identity; the files of one that is revoked may still be there.
+
+    Raises:
+        ConfigError: it has one that counts, the authority's key is not there, or a file can't be written or read.
+    """
+    with _reported("keys add", folder):
+        authority, key = _authority(folder)
+        if (folder / certificate_file(name)).exists():
+            if read_certificate(folder, name).serial_number not in revoked_serials(folder, authority):
+                raise ConfigError("keys add", [f"{name} has an identity; swarmctl keys revoke it first"])
+            _remove(folder, name)
+        _make(folder, name, (authority, key), address)
+
+
+def revoke_identity(folder: Path, name: str) -> Path:
+    """Put the certificate of a computer on the list of those that count no more; return the list's path.
+
+    Its files go from this folder, so that a new one can be made.
+
+    Raises:
+        ConfigError: there is no such identity, the authority's key is not there, or a file can't be written or read.
+    """
+    if name == AUTHORITY or Path(name).name != name:
+        raise ConfigError("keys revoke", [f"{name!r}: name one of [[hosts]], or station"])
+    with _reported("keys revoke", folder):
+        authority, key = _authority(folder)
+        revoked = revoked_serials(folder, authority) | {read_certificate(folder, name).serial_number}
+        now = datetime.now(UTC)
+        builder = x509.CertificateRevocationListBuilder().issuer_name(authority.subject)
+        builder = builder.last_update(now).next_update(now + _VALID)
+        for serial in sorted(revoked):
+            entry = x509.RevokedCertificateBuilder().serial_number(serial).revocation_date(now).build()
+            builder = builder.add_revoked_certificate(entry)
+        written = builder.sign(key, hashes.SHA256()).public_bytes(serialization.Encoding.PEM)
+        replace_bytes(folder / REVOKED_FILE, written)
+        _remove(folder, name)
+    return folder / REVOKED_FILE
+
+
+@contextmanager
+def _reported(verb: str, folder: Path) -> Iterator[None]:
+    """Raise a ConfigError in place of what goes wrong with files."""
+    try:
+        yield
+    except OSError as error:
+        raise ConfigError(verb, [f"{error.filename}: {error.strerror}"]) from error
+    except ValueError as error:
+        raise ConfigError(verb, [f"{folder}: holds a damaged certificate or key: {error}"]) from error
+
+
+def _make(folder: Path, name: str, signer: tuple[x509.Certificate, ec.EllipticCurvePrivateKey], ip: _Ip | None) -> None:
+    key = ec.generate_private_key(ec.SECP256R1())
+    _write(folder, name, _signed(name, key.public_key(), signer, ip), key)
+
+
+def _remove(folder: Path, name: str) -> None:
+    for file in (certificate_file(name), key_file(name)):  # the certificate says that both are there
+        (folder / file).unlink(missing_ok=True)
+
+
+def _authority(folder: Path, *, may_begin: bool = False) -> tuple[x509.Certificate, ec.EllipticCurvePrivateKey]:
+    """Return the authority of a folder; with `may_begin` a new one where there is none."""
+    if may_begin and not (folder / certificate_file(AUTHORITY)).exists():
         new_key = ec.generate_private_key(ec.SECP256R1())
         name = _common_name("swarm authority")
         constraints = x509.BasicConstraints(ca=True, path_length=0)
@@ -69,12 +127,12 @@ def _authority(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateK
         return signed, new_key
     if not (folder / key_file(AUTHORITY)).exists():
         problem = f"{folder / key_file(AUTHORITY)} is not here; run this where the identities were made"
-        raise ConfigError("keys init", [problem])
-    secret = read_file(folder / key_file(AUTHORITY), _MOST_BYTES, private=True)
+        raise ConfigError("keys", [problem])
+    secret = read_file(folder / key_file(AUTHORITY), MOST_BYTES, private=True)
     key = serialization.load_pem_private_key(secret, password=None)
     if not isinstance(key, ec.EllipticCurvePrivateKey):
         raise ValueError("the authority's key is of another kind")
-    return _read(folder, AUTHORITY), key
+    return read_certificate(folder, AUTHORITY), key
 
 
 def _signed(
@@ -84,7 +142,7 @@ def _signed(
     address: _Ip | None,
 ) -> x509.Certificate:
     authority, authority_key = signer
-    builder = _begun(_common_name(name), authority.subject, key)
+    builder = _begun(_common_name(f"{name}.{secrets.token_hex(4)}"), authority.subject, key)
     builder = builder.add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
     builder = builder.add_extension(x509.ExtendedKeyUsage(_USAGES), critical=False)
     if address is not None:
@@ -106,14 +164,10 @@ def _common_name(name: str) -> x509.Name:
 def _is_for(folder: Path, name: str, address: _Ip | None) -> bool:
     """Return whether the certificate of a computer is for this address."""
     try:
-        names = _read(folder, name).extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+        names = read_certificate(folder, name).extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except x509.ExtensionNotFound:
         return address is None
     return names.get_values_for_type(x509.IPAddress) == [address]
-
-
-def _read(folder: Path, name: str) -> x509.Certificate:
-    return x509.load_pem_x509_certificate(read_file(folder / certificate_file(name), _MOST_BYTES))
 
 
 def _write(folder: Path, name: str, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> None:

@@ -1,6 +1,7 @@
-"""The files of a swarm's identities: an authority, and a certificate and a private key for every computer.
+"""The files of a swarm's identities: an authority, what it has revoked, a certificate and a key for every computer.
 
-Only this module knows their names. The router reads them by Zenoh; `swarmctl.bus.network.identities` makes them.
+Only this module knows their names. Zenoh reads them for the router's links, `swarmctl.bus.network.keyring` for seals
+and rights; `swarmctl.bus.network.identities` makes them.
 """
 
 from __future__ import annotations
@@ -12,7 +13,8 @@ from swarmctl.files import read_file
 
 AUTHORITY = "authority"  # signs the others; its key is needed to add a host, on no host to fly
 STATION = "station"
-_MOST_BYTES = 20_000
+REVOKED_FILE = "revoked.pem"  # list of certificates that count no more, signed by the authority
+MOST_BYTES = 20_000
 
 
 def certificate_file(name: str) -> str:
@@ -33,7 +35,7 @@ def identity_problems(folder: Path, name: str) -> Iterator[str]:
         (key_file(name), True),
     ):
         try:
-            read_file(folder / file, _MOST_BYTES, private=private)
+            read_file(folder / file, MOST_BYTES, private=private)
         except OSError as error:
             mode = ", a file of mode 0600" if private else ""
             yield f"bus.identities: {folder / file}: {error.strerror}; copy it{mode} from where swarmctl keys init ran"

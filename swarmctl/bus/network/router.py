@@ -2,7 +2,8 @@
 
 Clients reach it on a Unix socket in a private directory. Other routers reach it over QUIC, which is UDP, because a host
 that vanishes from a TCP link freezes the data of all the others for 10 s (zenoh #1101). Both ends of such a link prove
-by certificates of the swarm's own authority that they belong to it; there is no link without.
+by certificates of the swarm's own authority that they belong to it; there is no link without, and each may bring only
+what the computer of this certificate may say (`swarmctl.bus.network.access`).
 
 `python -m swarmctl.bus.network.router unixsock-stream/DIR/bus.sock` is the router of a launch on one computer.
 """
@@ -13,9 +14,11 @@ import argparse
 import signal
 import sys
 from pathlib import Path
+from typing import Any
 
 import zenoh
 
+from swarmctl.bus.network.roster import identity_of_json
 from swarmctl.bus.network.router_links import RouterLinks
 from swarmctl.bus.zenoh_bus import (
     CLOSE_DEADLINE_S,
@@ -39,15 +42,16 @@ def run_router(endpoint: str, links: RouterLinks | None = None, *, realtime: boo
         realtime: ask to be scheduled before other programs.
 
     Raises:
-        StartError: the endpoint is not a Unix socket in a private directory, another router holds it, or an address or
-            identity can't be used.
+        StartError: the endpoint is not a Unix socket in a private directory, another router holds it, or an address
+            can't be used.
+        ConfigError: an identity can't be used.
     """
     socket_path = _private_socket(endpoint)
     zenoh.init_log_from_env_or("error")
     endpoints = [endpoint, *([f"quic/{links.listen}"] if links is not None and links.listen else [])]
     settings = COMMON_SETTINGS | {"mode": "router", "listen/endpoints": endpoints, "scouting/delay": 0}
     try:
-        session = open_session(settings | (links.settings() if links is not None else {}))
+        session = open_session(settings | _link_settings(links))
     except zenoh.ZError as error:
         where = " and ".join(repr(place) for place in endpoints)
         raise StartError(f"bus endpoint {where}: can't be opened: {error}. Is another router using it?") from error
@@ -57,6 +61,14 @@ def run_router(endpoint: str, links: RouterLinks | None = None, *, realtime: boo
     signal.sigwait({signal.SIGTERM})
     close_within(session, CLOSE_DEADLINE_S)
     remove_socket(socket_path)
+
+
+def _link_settings(links: RouterLinks | None) -> dict[str, Any]:
+    if links is None:
+        return {}
+    from swarmctl.bus.network.keyring import load_keyring  # loads cryptography, which one computer alone does not need
+
+    return links.settings(load_keyring(links.identity).common_names)
 
 
 def _private_socket(endpoint: str) -> Path:
@@ -75,8 +87,7 @@ def _parser() -> argparse.ArgumentParser:
         prog="python -m swarmctl.bus.network.router", description="Router of one swarm's bus on one computer."
     )
     parser.add_argument("endpoint", metavar="ENDPOINT", help=f"{SCHEME}/DIR/bus.sock")
-    parser.add_argument("--identities", type=Path, metavar="FOLDER", help="written by swarmctl keys init")
-    parser.add_argument("--name", default="", help="name of this router's identity")
+    parser.add_argument("--identity", metavar="JSON", help="own identity and those of others, an `OwnIdentity`")
     parser.add_argument("--listen", default="", metavar="ADDRESS:PORT", help="where other routers reach this one")
     parser.add_argument("--connect", action="append", default=[], metavar="ADDRESS:PORT", help="another router")
     parser.add_argument("--die-with-parent", action="store_true", help="end when the parent process ends")
@@ -91,12 +102,12 @@ def main() -> int:
     parser = _parser()
     options = parser.parse_args()
     links = None
-    if options.identities is not None:
+    if options.identity is not None:
         links = RouterLinks(
-            identities=options.identities, name=options.name, listen=options.listen, connect=tuple(options.connect)
+            identity=identity_of_json(options.identity), listen=options.listen, connect=tuple(options.connect)
         )
     elif options.listen or options.connect:
-        parser.error("--listen and --connect need --identities and --name")
+        parser.error("--listen and --connect need --identity")
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGTERM})  # for sigwait; zenoh's threads inherit the mask
     if options.die_with_parent:

@@ -2,26 +2,35 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Set
+
 import numpy as np
 
 from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.core.types import Array, FlightMode, Landed, Phase, VehicleState
 
+_MOST_NAMED = 4  # agents in one line
 _HOVER_LEARNING_US = 1_000_000  # hover flown by the autopilot itself, during which its hover thrust is learned
 
 
-def unmet_start_condition(inputs: PhaseInputs, state: VehicleState, peers: int) -> str:
-    """Return the first condition for arming that is not met, or ""; `peers` is the number of the other agents."""
+def unmet_start_condition(inputs: PhaseInputs, state: VehicleState, peers: Set[int]) -> str:
+    """Return the first condition for arming that is not met, or ""; `peers` are the agents to wait for."""
     if state.landed not in (Landed.ON_GROUND, Landed.IN_AIR):
         return "the autopilot to tell whether it has landed"
     if not inputs.armable:
         return f"the autopilot to be ready to arm (it is in {state.mode.name})"
     if inputs.unsettled:
         return inputs.unsettled
-    absent = peers - sum(p.phase >= Phase.STANDBY and p.alive for p in inputs.peers().values())
-    if absent:
-        return f"{absent} of {peers} peers to stand by"
+    there = {agent for agent, peer in inputs.peers().items() if peer.phase >= Phase.STANDBY and peer.alive}
+    if absent := peers - there:
+        return f"{names_of(absent)} to stand by"
     return "the autopilot's answers" if inputs.busy else ""
+
+
+def names_of(agents: Iterable[int]) -> str:
+    """Return agents in words, a few by name."""
+    named = [f"agent-{agent}" for agent in sorted(agents)]
+    return ", ".join(named[:_MOST_NAMED]) + (f" and {len(named) - _MOST_NAMED} more" if named[_MOST_NAMED:] else "")
 
 
 class Climb:

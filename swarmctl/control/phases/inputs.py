@@ -32,6 +32,7 @@ class PhaseInputs:
     mode: Mode  # last decision of the failsafe
     unresponsive_peer: bool  # no message for too long from a peer that may be flying
     peers: Callable[[], Mapping[int, PeerInputs]]  # returns what peers have told of themselves
+    excused: frozenset[int] = frozenset()  # peers that have never been heard, and whom an operator has excluded
     cut_off: str = ""  # why the mission must end here, because peers don't answer
     others_ned_m: Callable[[], Sequence[Array]] = tuple  # returns the present position (3,) of each peer
     arm_in: FlightMode | None = None  # flight mode required for arming; None: any

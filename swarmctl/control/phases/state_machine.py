@@ -17,7 +17,7 @@ import numpy as np
 
 from swarmctl.control.phases.arming import ArmingEvidence
 from swarmctl.control.phases.control_mode import control_mode
-from swarmctl.control.phases.departure import Climb, unmet_start_condition
+from swarmctl.control.phases.departure import Climb, names_of, unmet_start_condition
 from swarmctl.control.phases.failsafe import Response
 from swarmctl.control.phases.inputs import PhaseInputs
 from swarmctl.control.phases.interruptions import HoldPoint, Interruptions
@@ -62,7 +62,7 @@ class MissionStateMachine:
         ready_utc_us: UTC at which the start position was reached, 0 before.
         begin_utc_us: UTC of mission time 0, None until all are ready.
         outcome: "completed", or why the mission was not; "" while it is under way.
-        waits_for: unmet condition that keeps the vehicle on the ground, or "".
+        waits_for: unmet condition that keeps the vehicle on the ground, or from beginning the mission; or "".
         had_control: the autopilot follows our setpoints and control has not been given back.
         pilot_override: pilot or autopilot took over; lasts until an operator resumes.
     """
@@ -80,7 +80,8 @@ class MissionStateMachine:
         contains: Contains = lambda _: True,
         volume: FlightVolume | None = None,
     ) -> None:
-        self._params, self._expected, self._contains, self._volume = params, peers, contains, volume
+        self._params, self._contains, self._volume = params, contains, volume
+        self._peers = frozenset(range(peers + 1)) - {agent}
         self._start_ned_m, self._duration_us, self._reference = start_ned_m, round(duration_s * 1e6), reference
         self.phase = Phase.CONNECT
         self.ready_utc_us = 0
@@ -369,9 +370,12 @@ class MissionStateMachine:
             return []
         if inputs.refusal:
             return self._refuse(inputs.refusal, inputs)
-        if any(p.phase is Phase.DONE and p.alive for p in inputs.peers().values()):
+        phases = {peer.phase for peer in inputs.peers().values() if peer.alive}
+        if Phase.TRACK in phases:  # peers may fly where this vehicle would climb, and its autopilot avoids nobody
+            return self._refuse("the mission has begun without it", inputs)
+        if phases and max(phases) > Phase.TRACK:
             return self._refuse("a peer gave up before take-off", inputs)
-        self.waits_for = unmet_start_condition(inputs, state, self._expected)
+        self.waits_for = unmet_start_condition(inputs, state, self._peers - inputs.excused)
         if not self.waits_for:
             self._climb.begin(state)
             self._airborne = state.landed is Landed.IN_AIR
@@ -462,9 +466,11 @@ class MissionStateMachine:
             self.outcome = "a peer gave up or was lost before the mission began"
             self._go_home(inputs.now_us, state)
             return []
-        ready = [p.ready_utc_us for p in inputs.peers().values() if p.ready_utc_us > 0]
-        if len(ready) == self._expected:
-            self.begin_utc_us = max([self.ready_utc_us, *ready]) + _BEGIN_DELAY_US
+        ready_us = {agent: peer.ready_utc_us for agent, peer in inputs.peers().items() if peer.ready_utc_us > 0}
+        absent = self._peers - inputs.excused - ready_us.keys()
+        self.waits_for = f"{names_of(absent)} to reach the start" if absent else ""
+        if not absent:
+            self.begin_utc_us = max([self.ready_utc_us, *ready_us.values()]) + _BEGIN_DELAY_US
         return []
 
     def _track(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:

@@ -28,6 +28,7 @@ from swarmctl.mavlink.signing.signature import (
 )
 
 AGENT_LINK, CHECK_LINK = 1, 2  # link ids: vehicles remember time stamps by them, so programs have one each
+_NO_STREAM = Stream(0, 0, 0)
 _AHEAD = 60 * STAMPS_PER_S  # largest lead of a vehicle's time stamp over ours
 
 
@@ -78,25 +79,29 @@ class SigningChannel:
 
     def fault(self, frame: bytes) -> str:
         """Return why a frame would not be taken now, or "". Changes nothing."""
-        if not is_signed(frame):
-            return UNSIGNED
-        if not is_authentic(frame, self._key):
-            return DAMAGED if is_damaged(frame) else WRONG_SIGNATURE
-        stream, stamp = origin(frame)
-        if stamp <= self._began:
-            return OLD
-        if stamp <= self._newest.get(stream, 0):
-            return REPLAYED
-        return FUTURE if self._is_ahead(stamp) else ""
+        return self._examined(frame)[0]
 
     def take(self, frame: bytes) -> bytes | None:
         """Return a received frame without its signature, or None for a refused one, which is counted."""
-        if fault := self.fault(frame):
+        fault, stream, stamp = self._examined(frame)
+        if fault:
             self.refuse(fault)
             return None
-        stream, stamp = origin(frame)
         self._newest[stream] = stamp
         return strip(frame)
+
+    def _examined(self, frame: bytes) -> tuple[str, Stream, int]:
+        """Return why a frame would not be taken now, or "", and of one that is authentic its stream and time stamp."""
+        if not is_signed(frame):
+            return UNSIGNED, _NO_STREAM, 0
+        if not is_authentic(frame, self._key):
+            return (DAMAGED if is_damaged(frame) else WRONG_SIGNATURE), _NO_STREAM, 0
+        stream, stamp = origin(frame)
+        if stamp <= self._began:
+            return OLD, stream, stamp
+        if stamp <= self._newest.get(stream, 0):
+            return REPLAYED, stream, stamp
+        return (FUTURE if self._is_ahead(stamp) else ""), stream, stamp
 
     def refuse(self, fault: str) -> None:
         """Count a frame that was refused."""

@@ -9,6 +9,9 @@ import typer
 
 from swarmctl.errors import EXIT_OK, ConfigError
 
+_Set = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a configuration key; repeatable.")
+]
 keys_app = typer.Typer(
     no_args_is_help=True, rich_markup_mode=None, help="Make signing keys of vehicles, and identities of computers."
 )
@@ -38,9 +41,7 @@ def keys_install(
     old: Annotated[
         list[Path] | None, typer.Option("--old", metavar="FILE", help="Key that a vehicle has now; repeatable.")
     ] = None,
-    sets: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a configuration key; repeatable.")
-    ] = None,
+    sets: _Set = None,
 ) -> int:
     """Give every disarmed vehicle its key, in clear text: over a cable or a network that nobody else is on."""
     from swarmctl.config import load
@@ -52,13 +53,39 @@ def keys_install(
 @keys_app.command("init")
 def keys_init(
     config: Annotated[Path, typer.Argument(help="Configuration with [[hosts]] and bus.identities.")],
-    sets: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Override a configuration key; repeatable.")
-    ] = None,
+    sets: _Set = None,
 ) -> int:
     """Make an authority, and an identity for every host and the station; again, for those that were added."""
     from swarmctl.ops.host import make_host_identities
 
     folder, made = make_host_identities(config, sets or ())
     print(f"{folder}: made {', '.join(made) or 'nothing: every host has an identity'}")
+    return EXIT_OK
+
+
+@keys_app.command("add")
+def keys_add(
+    config: Annotated[Path, typer.Argument(help="Configuration with [[hosts]] and bus.identities.")],
+    name: Annotated[str, typer.Argument(help="One of [[hosts]], or station.")],
+    sets: _Set = None,
+) -> int:
+    """Make the identity of one computer: one that is new, or whose former one is revoked."""
+    from swarmctl.ops.host import add_host_identity
+
+    folder = add_host_identity(config, name, sets or ())
+    print(f"{folder}: made {name}. Copy {name}.pem to every computer, {name}.key to {name} alone")
+    return EXIT_OK
+
+
+@keys_app.command("revoke")
+def keys_revoke(
+    config: Annotated[Path, typer.Argument(help="Configuration with bus.identities.")],
+    name: Annotated[str, typer.Argument(help="Computer whose identity counts no more.")],
+    sets: _Set = None,
+) -> int:
+    """Revoke the identity of one computer. Others honour it from their next start on, once they have the list."""
+    from swarmctl.ops.host import revoke_host_identity
+
+    revoked = revoke_host_identity(config, name, sets or ())
+    print(f"{revoked}: {name} is revoked. Copy this file to every computer; it counts from the next start there on")
     return EXIT_OK

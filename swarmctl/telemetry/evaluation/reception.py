@@ -12,10 +12,13 @@ _ALLOWED = {  # refusals by one agent for each peer and topic; other reasons are
     "boot": 0,
     "sequence": 0,
     "identity": 0,
+    "unsealed": 0,
+    "forged": 0,
     "unknown_peer": 0,
     "malformed": 50,  # the paths of one second
     "future": 50,
 }
+_OF_ANYBODY = ("unsealed", "forged")  # also in the name of an operator; without seals anybody may use that name
 
 
 def refused_peers(events: Sequence[Mapping[str, Any]]) -> Iterator[str]:
@@ -28,7 +31,7 @@ def refused_peers(events: Sequence[Mapping[str, Any]]) -> Iterator[str]:
     found: dict[str, list[tuple[str, str, int, list[str]]]] = defaultdict(list)
     for (sender, topic, reason), by in sorted(counts.items()):
         told = {agent: count for agent, count in by.items() if count > _ALLOWED.get(reason, count)}
-        if sender.startswith("agent-") and told:
+        if told and (sender.startswith("agent-") or reason in _OF_ANYBODY):
             found[sender].append((topic, reason, sum(told.values()), sorted(told)))
     for sender, rows in found.items():
         kinds = ", ".join(f"{topic} {reason} {count}" for topic, reason, count, _ in rows)

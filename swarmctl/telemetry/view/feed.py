@@ -5,6 +5,7 @@ The bus drops the oldest samples when the viewer is slow, so neither the bus nor
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -85,9 +86,14 @@ class Feed:
         return [Batch(agent, t_us[kept], rows[kept], samples[-1][1])] if kept.any() else []
 
 
-def listens_to(agents: int) -> dict[topics.Topic, list[str]]:
-    """Return the topics and senders that a viewer of `agents` agents subscribes to."""
-    return {topics.TICK: [agent_name(agent) for agent in range(agents)], topics.OBSTACLES: [topics.OPERATOR]}
+def listens_to(agents: int, launchers: Sequence[str] = (topics.OPERATOR,)) -> dict[topics.Topic, Sequence[str]]:
+    """Return the topics and senders that a viewer of `agents` agents subscribes to.
+
+    Args:
+        agents: number of agents.
+        launchers: names of those who repeat the list of obstacles.
+    """
+    return {topics.TICK: [agent_name(agent) for agent in range(agents)], topics.OBSTACLES: launchers}
 
 
 class AgentClock:

@@ -65,17 +65,35 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--port", type=int, default=9876, help="loopback; the next free one when it is taken")
     parser.add_argument("--rate-hz", type=float, default=10.0, help="batches a second")
     parser.add_argument("--view", action="store_true", help="open the native viewer when there is a display")
+    parser.add_argument("--identity", metavar="JSON", help="as which it listens on a bus of several computers")
     parser.add_argument("--die-with-parent", action="store_true")
     return parser
 
 
 def _run(options: argparse.Namespace, flight: ViewedFlight, stop: StopRequest) -> int:
-    from swarmctl.bus.zenoh_bus import ZenohBus
+    from swarmctl.bus.network.joining import join_bus
+    from swarmctl.bus.network.roster import identity_of_json
+    from swarmctl.bus.network.sealed_bus import FOR_OPERATORS_US
+    from swarmctl.bus.topics import OPERATOR
     from swarmctl.telemetry.scene.scene import Scene
     from swarmctl.telemetry.view.feed import Feed, listens_to
 
     agents = len(flight.agents)
-    bus = _interruptible(lambda: ZenohBus(options.bus, options.run, "viewer", listens_to(agents)), stop)
+    identity = None if options.identity is None else identity_of_json(options.identity)
+    listen = listens_to(agents, (OPERATOR,) if identity is None else identity.roster.hosts)
+
+    def join() -> Any:
+        return join_bus(
+            options.bus,
+            options.run,
+            "viewer",
+            listen,
+            identity=identity,
+            max_age_us=FOR_OPERATORS_US,
+            utc_us=lambda: time.time_ns() // 1000,
+        )
+
+    bus = _interruptible(join, stop)
     if bus is None:
         return EXIT_OK
     rec, url = _serve(options.run, options.run_dir, options.port)

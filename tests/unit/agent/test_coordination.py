@@ -42,7 +42,9 @@ class Bench:
         self.peer: LocalBus = hub.connect(PEER)
         self.alive = {agent_name(0), PEER}
         separation = SeparationParams()
-        self.world_model = WorldModel(0, [1], separation, self.bus, rate_hz=RATE_HZ, note=lambda *_, **__: None)
+        self.world_model = WorldModel(
+            0, [1], separation, self.bus, rate_hz=RATE_HZ, note=lambda *_, **__: None, vouchers={}
+        )
         self.coordination = Coordination(
             agent=0,
             boot_id=1,

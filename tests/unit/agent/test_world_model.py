@@ -12,12 +12,13 @@ import pytest
 
 from swarmctl.agent.world_model import WorldModel
 from swarmctl.bus import topics
-from swarmctl.bus.json_messages import MAX_OBSTACLES, MAX_VERSION_STEP, encode_message, first_list
+from swarmctl.bus.json_messages import MAX_OBSTACLES, MAX_VERSION_STEP, CommandMessage, encode_message, first_list
 from swarmctl.bus.path_messages import encode_path
 from swarmctl.bus.peers import LocalHub, agent_name
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.core.clock import SimClock
 from swarmctl.core.obstacle import Obstacle
+from swarmctl.core.operator_verbs import EXCLUDE, PEER
 from swarmctl.core.types import Phase
 from tests import builders
 from tests.unit.bus.test_topics import STATUS
@@ -40,7 +41,10 @@ class Bench:
         self.bus = self.hub.connect(agent_name(0))
         self.peer, self.operator = self.hub.connect(agent_name(1)), self.hub.connect(topics.OPERATOR)
         note = lambda name, **fields: self.events.append({"event": name, **fields})  # noqa: E731
-        self.world_model = WorldModel(0, [1, 2], SeparationParams(), self.bus, rate_hz=50.0, note=note)
+        vouchers = {topics.OPERATOR: {0, 1, 2}, "bravo": {1}}
+        self.world_model = WorldModel(
+            0, [1, 2], SeparationParams(), self.bus, rate_hz=50.0, note=note, vouchers=vouchers
+        )
 
     def tick(self) -> list[str]:
         self.clock.advance(TICK_US)
@@ -293,3 +297,28 @@ def test_an_encounter_is_remembered_by_the_obstacles_number_apart_from_peers() -
     keys = [[keep_out.key for keep_out in keep_outs] for keep_outs in ticks]
     assert keys[0] == keys[1]
     assert len(set(keys[0])) == 3
+
+
+@pytest.mark.parametrize(
+    ("sender", "peer", "believed"), [("bravo", 1, True), ("bravo", 2, False), ("mallory", 1, False)]
+)
+def test_only_who_runs_an_agent_says_that_it_has_ended(sender: str, peer: int, believed: bool) -> None:
+    bench = Bench()
+    order = CommandMessage(EXCLUDE, -1, bench.clock.utc_us(), {PEER: peer})
+    bench.hub.carry(sender, topics.ENDED, encode_message(order))
+    bench.hub.carry(sender, topics.ENDED, encode_message(CommandMessage("land", -1, bench.clock.utc_us() + 1)))
+    assert bench.tick() == [EXCLUDE] * believed
+    assert bench.world_model.refusals.by_reason == {"identity": 2 - believed}
+
+
+def test_who_has_never_been_heard_is_excused_until_it_is_heard() -> None:
+    bench = Bench()
+    order = CommandMessage(EXCLUDE, -1, bench.clock.utc_us(), {PEER: 1})
+    bench.hub.carry(topics.OPERATOR, topics.COMMAND, encode_message(order))
+    assert bench.tick() == [EXCLUDE]
+    bench.world_model.exclude(1)  # as the agent obeys
+    assert bench.world_model.excused == {1}
+    bench.peer.publish(topics.STATUS, encode_message(builders.status_message(agent=1)))
+    bench.tick()
+    assert bench.world_model.excused == set()
+    assert not bench.world_model.has_ended(1), "this is another process than the one that was vouched for"

@@ -3,15 +3,26 @@
 from __future__ import annotations
 
 import stat
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from cryptography.x509 import load_pem_x509_crl
 
 from swarmctl.bus.network.hosts import links_of
 from swarmctl.bus.network.identity_files import STATION
-from swarmctl.config import load
+from swarmctl.bus.network.keyring import load_keyring
+from swarmctl.config import load, own_identity
 from swarmctl.errors import ConfigError
-from swarmctl.ops.host import load_host, make_host_identities, shared_run_name, systemd_unit
+from swarmctl.files import create_private
+from swarmctl.ops.host import (
+    add_host_identity,
+    load_host,
+    make_host_identities,
+    revoke_host_identity,
+    shared_run_name,
+    systemd_unit,
+)
 
 ROOT = Path(__file__).parents[3]
 CONFIG = ROOT / "configs" / "three_hosts.toml"
@@ -50,12 +61,13 @@ def test_what_is_no_list_of_hosts_is_refused(item: str, words: str) -> None:
 
 
 def test_there_is_one_link_for_each_pair_of_hosts_and_the_station_has_one_to_each() -> None:
-    hosts = load(CONFIG).hosts
+    config = load(CONFIG)
+    hosts = config.hosts
     addresses = [host.address for host in hosts]
     for i, host in enumerate(hosts):
-        links = links_of(hosts, host.name, Path("keys"))
+        links = links_of(hosts, own_identity(config, host.name))
         assert (links.listen, list(links.connect)) == (addresses[i], addresses[:i])
-    links = links_of(hosts, STATION, Path("keys"))
+    links = links_of(hosts, own_identity(config, STATION))
     assert (links.listen, list(links.connect)) == ("", addresses)
 
 
@@ -75,7 +87,7 @@ def test_identities_are_made_once_and_for_hosts_that_are_added(path: Path) -> No
     (folder / "charlie.key").unlink()
     assert make_host_identities(path)[1] == ["charlie"]
     assert (folder / "alpha.pem").read_bytes() == before
-    with pytest.raises(ConfigError, match=r"alpha: another address now; remove alpha\.pem and alpha\.key"):
+    with pytest.raises(ConfigError, match=r"alpha: another address now; swarmctl keys revoke it"):
         make_host_identities(path, [ALPHA + "address='10.20.0.9:7448'"])
     (folder / "authority.key").unlink()
     with pytest.raises(ConfigError, match=r"authority\.key is not here"):
@@ -119,3 +131,81 @@ def test_the_unit_lands_when_it_is_stopped_and_does_not_fly_at_boot(path: Path) 
     assert f"host --config {path} --agents 2,3" in unit
     assert {"KillSignal=SIGINT", "Restart=no"} <= set(unit.splitlines())
     assert "\n[Install]" not in unit
+
+
+def test_a_revoked_identity_is_refused_until_the_host_has_a_new_one(path: Path) -> None:
+    folder, _ = make_host_identities(path)
+    assert load_host(path, [2, 3])
+    with pytest.raises(ConfigError, match=r"charlie has an identity; swarmctl keys revoke it first"):
+        add_host_identity(path, "charlie")
+    stolen = {name: (folder / name).read_bytes() for name in ("charlie.pem", "charlie.key")}
+    assert revoke_host_identity(path, "charlie") == folder / "revoked.pem"
+    for name, content in stolen.items():  # as on every other host, which has the list and still its certificate
+        create_private(folder / name, content)
+    with pytest.raises(ConfigError, match=r"charlie\.pem: is revoked; give charlie a new identity"):
+        load_host(path, [2, 3])
+    add_host_identity(path, "charlie")
+    assert load_host(path, [4, 5])
+    revoke_host_identity(path, "charlie")
+    assert make_host_identities(path)[1] == ["charlie"]
+    create_private(folder / "old.pem", stolen["charlie.pem"])
+    with pytest.raises(ConfigError, match=r"old has|none of alpha"):
+        add_host_identity(path, "old")
+    revoked = load_pem_x509_crl((folder / "revoked.pem").read_bytes())
+    assert len(list(revoked)) == 2, "what was revoked stays so"
+    for name in ("authority", "../alpha"):
+        with pytest.raises(ConfigError, match="name one of"):
+            revoke_host_identity(path, name)
+
+
+def test_the_station_may_be_revoked_and_the_swarm_flies_without_it(path: Path) -> None:
+    make_host_identities(path)
+    revoke_host_identity(path, STATION)
+    config, host = load_host(path, [0, 1])
+    keyring = load_keyring(own_identity(config, host.name))
+    assert STATION not in keyring.common_names
+    assert [key is None for key in keyring.keys] == [False, False, False, True]
+
+
+def test_two_hosts_share_a_key_that_no_third_one_has(path: Path) -> None:
+    make_host_identities(path)
+    config = load(path)
+    alpha, bravo, charlie = (load_keyring(own_identity(config, name)).keys for name in ("alpha", "bravo", "charlie"))
+    assert alpha[1] == bravo[0]
+    assert len({*alpha, *bravo, *charlie}) == 3 + 3 + 3, "three pairs, three with itself, three with the station"
+
+
+@pytest.mark.parametrize(
+    ("broken", "words"),
+    [
+        (lambda folder, other: (folder / "charlie.pem").unlink(), r"charlie\.pem: missing; copy it"),
+        (lambda folder, other: replace(folder, other, "charlie.pem", "charlie.pem"), "is not by the authority"),
+        (lambda folder, other: replace(folder, folder, "charlie.pem", "alpha.pem"), r"is of alpha\..*, not of charlie"),
+        (lambda folder, other: replace(folder, other, "bravo.key", "bravo.key"), r"bravo\.key is not the key of bravo"),
+        (lambda folder, other: replace(folder, other, "revoked.pem", "revoked.pem"), "is not by the authority"),
+        (lambda folder, other: (folder / "alpha.pem").write_text("nonsense"), r"not by the authority|damaged"),
+    ],
+)
+def test_files_that_do_not_fit_are_refused(
+    path: Path, tmp_path: Path, broken: Callable[[Path, Path], None], words: str
+) -> None:
+    folder, _ = make_host_identities(path)
+    (tmp_path / "other").mkdir()
+    other_path = tmp_path / "other" / path.name
+    other_path.write_text(path.read_text())
+    other, _ = make_host_identities(other_path)
+    revoke_host_identity(other_path, STATION)
+    broken(folder, other)
+    with pytest.raises(ConfigError, match=words):
+        load_host(path, [2, 3])
+
+
+def replace(folder: Path, other: Path, name: str, by: str) -> None:
+    (folder / name).unlink(missing_ok=True)
+    create_private(folder / name, (other / by).read_bytes())
+
+
+@pytest.mark.parametrize("name", ["authority", "revoked", "operator", "agent-1"])
+def test_names_of_others_are_no_names_of_hosts(name: str) -> None:
+    with pytest.raises(ConfigError, match="reserved"):
+        load(CONFIG, [f"{ALPHA}name='{name}'"])

@@ -7,6 +7,7 @@ import math
 import numpy as np
 import pytest
 
+from swarmctl.control.phases.inputs import PeerInputs
 from swarmctl.core.types import Command, FlightMode, Phase, Verb
 from tests.benches.state_machine_flight import IN_AIR, SECOND, START, UTC0_US, Flight, ready
 
@@ -57,6 +58,39 @@ def test_when_a_peer_gives_up_on_the_ground_no_agent_takes_off() -> None:
     flight.peer(Phase.DONE)
     assert flight.run(5.0) == []
     assert (flight.at, flight.state_machine.outcome) == ("DONE", "a peer gave up before take-off")
+
+
+@pytest.mark.parametrize("phase", [Phase.TRACK, Phase.GOTO_LAND, Phase.LAND])
+def test_who_comes_after_the_mission_has_begun_stays_on_the_ground(phase: Phase) -> None:
+    flight = Flight()
+    flight.peer(phase)
+    assert flight.run(5.0) == []
+    assert flight.at == "DONE"
+    began = phase is Phase.TRACK
+    outcome = "the mission has begun without it" if began else "a peer gave up before take-off"
+    assert flight.state_machine.outcome == outcome
+
+
+def test_who_waits_says_for_whom() -> None:
+    flight = Flight(peers=6)
+    flight.peers = {1: PeerInputs(Phase.STANDBY, 0, True), 2: PeerInputs(Phase.CONNECT, 0, True)}
+    flight.run(1.0)
+    assert flight.at == "STANDBY"
+    assert flight.state_machine.waits_for == "agent-2, agent-3, agent-4, agent-5 and 1 more to stand by"
+
+
+def test_who_has_never_come_and_is_excluded_is_not_waited_for() -> None:
+    flight = Flight(peers=3)
+    del flight.peers[3]
+    flight.run(1.0)
+    assert (flight.at, flight.state_machine.waits_for) == ("STANDBY", "agent-3 to stand by")
+    flight.excused = frozenset({3})
+    flight.until(Phase.READY)
+    flight.run(1.0)
+    assert flight.state_machine.waits_for == "agent-1, agent-2 to reach the start"
+    flight.peers |= dict.fromkeys((1, 2), PeerInputs(Phase.READY, flight.utc_us, True))
+    flight.run(2.0)
+    assert flight.at == "TRACK"
 
 
 def test_arducopter_is_guided_before_it_is_armed_and_takes_off_in_that_mode() -> None:

@@ -18,6 +18,7 @@ from swarmctl.core.obstacle import Obstacle
 from swarmctl.errors import ConfigError, StartError
 from swarmctl.ops import obstacle_list
 from swarmctl.ops.operator import RunningLaunch
+from tests.benches.swarm_of_hosts import SwarmOfHosts
 
 UTC_US = 1_700_000_000_000_000
 LAUNCH = RunningLaunch("circle-1a", "unixsock-stream//x", 1, 0.0, 3, "runs/x")
@@ -163,3 +164,10 @@ def test_all_that_is_wrong_with_a_file_is_said_at_once(tmp_path: Path) -> None:
         "obstacles.1.size",
         "swarm",
     ]
+
+
+def test_a_host_without_an_operators_identity_changes_no_list() -> None:
+    identity = SwarmOfHosts.of(Path("nowhere")).identity("bravo")
+    launch = RunningLaunch("hosts-1a", "unixsock-stream//x", 1, 0.0, 3, "runs/x", "", identity)
+    with pytest.raises(ConfigError, match="bravo has no operator's identity"):
+        obstacle_list.change_obstacles(launch, lambda known: known.obstacles)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 
 import pytest
 
@@ -17,6 +18,7 @@ from swarmctl.errors import ConfigError, StartError
 from swarmctl.ops.operator import RunningLaunch
 from swarmctl.ops.order_delivery import OrderDelivery, Reply, addressed
 from tests import builders
+from tests.benches.swarm_of_hosts import SwarmOfHosts
 
 UTC_US = 1_700_000_000_000_000
 LAUNCH = RunningLaunch("circle-1a", "unixsock-stream//x", 1, 0.0, 3, "runs/x")
@@ -168,6 +170,19 @@ def test_who_is_asked() -> None:
     with pytest.raises(ConfigError) as caught:
         addressed(LAUNCH, Order("hold"), [7, 1, 9, 7])
     assert len(caught.value.problems) == 2, "each once"
+
+
+def test_a_host_without_an_operators_identity_asks_its_own_agents_only() -> None:
+    swarm = SwarmOfHosts.of(Path("nowhere"))
+    at = {
+        name: RunningLaunch("hosts-1a", "unixsock-stream//x", 1, 0.0, 3, "runs/x", "", swarm.identity(name))
+        for name in ("alpha", "bravo", "station")
+    }
+    assert addressed(at["bravo"], Order("land"), []) == addressed(at["bravo"], Order("land"), [1]) == [1]
+    assert addressed(at["alpha"], Order("land"), []) == addressed(at["station"], Order("land"), []) == [0, 1, 2]
+    with pytest.raises(ConfigError, match="agent 2 does not obey: bravo has no operator's identity"):
+        addressed(at["bravo"], Order("hold"), [1, 2])
+    assert addressed(at["bravo"], Order("exclude", {PEER: 2.0}), []) == [1]
 
 
 def test_a_repetition_to_many_fits_into_the_ring_of_each_agent() -> None:

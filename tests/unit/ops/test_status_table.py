@@ -157,6 +157,18 @@ def test_lines_say_when_an_agent_is_held_and_when_no_more() -> None:
     ]
 
 
+def test_lines_say_once_for_whom_an_agent_waits() -> None:
+    stream = io.StringIO()
+    lines, view = PlainLines(stream), AgentView(agent=2)
+    for alert in ("", "bad link", "waits for agent-1 to stand by", "bad link", "waits for agent-1 to stand by", ""):
+        view.status = status(2, phase=Phase.STANDBY, active_alert=alert)
+        lines.show([view])
+    assert [line.split("s  ")[1] for line in stream.getvalue().splitlines()] == [
+        "agent-2  STANDBY",
+        "agent-2  STANDBY  waits for agent-1 to stand by",
+    ]
+
+
 def test_the_live_table_fits_the_terminal_it_is_on() -> None:
     stream = io.StringIO()
     table = LiveTable(Console(file=stream, width=80, height=24, force_terminal=True, color_system=None))

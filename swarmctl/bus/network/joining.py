@@ -1,0 +1,56 @@
+"""Joins the bus of a run: sealed on several computers, plain where one launch has a private socket for itself."""
+
+from __future__ import annotations
+
+import secrets
+from collections.abc import Callable, Mapping, Sequence
+
+from swarmctl.bus.network.roster import OwnIdentity
+from swarmctl.bus.network.sealed_bus import SealedBus
+from swarmctl.bus.network.seals import Sealer, SealVerifier, overhead_bytes
+from swarmctl.bus.peers import Bus
+from swarmctl.bus.topics import Topic
+from swarmctl.bus.zenoh_bus import CONNECT_TIMEOUT_MS, ZenohBus
+
+
+def join_bus(
+    endpoint: str,
+    run: str,
+    me: str,
+    subscriptions: Mapping[Topic, Sequence[str]],
+    *,
+    identity: OwnIdentity | None,
+    max_age_us: Mapping[str, int],
+    utc_us: Callable[[], int],
+    lease_ms: int = 1500,
+    connect_timeout_ms: int = CONNECT_TIMEOUT_MS,
+) -> Bus:
+    """Join the bus of a run.
+
+    Args:
+        endpoint, run, me, subscriptions, lease_ms, connect_timeout_ms: see `ZenohBus`.
+        identity: as which messages are sealed; None: they are not.
+        max_age_us: see `SealVerifier`.
+        utc_us: own clock.
+
+    Raises:
+        StartError: the router does not answer in time.
+        ConfigError: the identity can't be used.
+    """
+    if identity is None:
+        return ZenohBus(endpoint, run, me, subscriptions, lease_ms=lease_ms, connect_timeout_ms=connect_timeout_ms)
+    from swarmctl.bus.network.keyring import load_keyring  # loads cryptography, which one computer alone does not need
+
+    keys, roster = load_keyring(identity).keys, identity.roster
+    bus = ZenohBus(
+        endpoint,
+        run,
+        me,
+        subscriptions,
+        lease_ms=lease_ms,
+        connect_timeout_ms=connect_timeout_ms,
+        seal_bytes=overhead_bytes(roster),
+    )
+    sealer = Sealer(keys, run, me, session=secrets.randbits(64))
+    verifier = SealVerifier(roster, keys, run, me=identity.name, max_age_us=max_age_us)
+    return SealedBus(bus, sealer, verifier, utc_us)

@@ -1,0 +1,94 @@
+"""Who speaks on the bus of a swarm of several computers, under which names, and what each may say. Pure.
+
+A computer speaks under the name of its identity, and each of its agents under the agent's. Orders and obstacles are
+taken from identities with an operator's rights; every computer commands its own agents, and may say of these alone that
+they have ended.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Speaker:
+    """Describes one identity.
+
+    Attributes:
+        name: also the sender name of its supervisor and of verbs.
+        agents: numbers of those that run there.
+        senders: every name under which it speaks, its own first.
+        operator: agents of other computers obey it.
+    """
+
+    name: str
+    agents: tuple[int, ...]
+    senders: tuple[str, ...]
+    operator: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Roster:
+    """Lists the identities of a swarm, in the same order on every computer.
+
+    Attributes:
+        speakers: those that there are.
+        relay: routers pass on what others say; seals alone tell who has said it.
+    """
+
+    speakers: tuple[Speaker, ...]
+    relay: bool
+
+    @property
+    def hosts(self) -> tuple[str, ...]:
+        """Return the names of the identities that have agents."""
+        return tuple(speaker.name for speaker in self.speakers if speaker.agents)
+
+    def speaker(self, name: str) -> Speaker:
+        """Return the identity of this name; there is one."""
+        return next(speaker for speaker in self.speakers if speaker.name == name)
+
+    def commanders(self, name: str) -> tuple[str, ...]:
+        """Return the names whose orders the agents of an identity obey."""
+        return tuple(speaker.name for speaker in self.speakers if speaker.operator or speaker.name == name)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OwnIdentity:
+    """Holds what a process needs to speak as one identity, and to know the others; it names files, and holds no key.
+
+    Attributes:
+        folder: of certificates and the own key.
+        name: the own one.
+        roster: everybody.
+    """
+
+    folder: str
+    name: str
+    roster: Roster
+
+    @property
+    def speaker(self) -> Speaker:
+        """Return the own entry of the roster."""
+        return self.roster.speaker(self.name)
+
+    def as_json(self) -> str:
+        """Return it as text for a command line."""
+        return json.dumps(asdict(self))
+
+
+def identity_of_json(text: str) -> OwnIdentity:
+    """Return the identity that `OwnIdentity.as_json` has written."""
+    tree = json.loads(text)
+    speakers = tuple(
+        Speaker(
+            name=item["name"],
+            agents=tuple(item["agents"]),
+            senders=tuple(item["senders"]),
+            operator=item["operator"],
+        )
+        for item in tree["roster"]["speakers"]
+    )
+    roster = Roster(speakers=speakers, relay=tree["roster"]["relay"])
+    return OwnIdentity(folder=tree["folder"], name=tree["name"], roster=roster)

@@ -1,0 +1,73 @@
+"""A bus whose messages are sealed: what others say arrives only if they have said it (`swarmctl.bus.network.seals`)."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
+
+from swarmctl.bus.network.seals import Sealer, SealVerifier
+from swarmctl.bus.peers import Bus
+from swarmctl.bus.refusals import RefusedMessage
+from swarmctl.bus.topics import OBSTACLES, PATH, STATUS, TOO_LONG, TRAJECTORY, Topic
+
+_FOR_FLIGHT_US = 10_000_000  # clocks that are farther apart are not corrected, see `commitment_messages`
+_FOR_LISTS_US = 60_000_000
+FOR_AGENTS_US: Mapping[str, int] = MappingProxyType(
+    {topic.name: _FOR_FLIGHT_US for topic in (PATH, STATUS, TRAJECTORY)} | {OBSTACLES.name: _FOR_LISTS_US}
+)
+# An operator has to understand agents whatever its clock: it stamps orders by what their statuses say.
+FOR_OPERATORS_US: Mapping[str, int] = MappingProxyType({OBSTACLES.name: _FOR_LISTS_US})
+_MOST_REFUSED = 4096  # kept until they are asked for
+
+
+class SealedBus(Bus):
+    """Seals what is published, and delivers what verifies.
+
+    Args:
+        bus: carries the sealed messages.
+        sealer: seals the own ones.
+        verifier: opens those of others.
+        utc_us: own clock.
+    """
+
+    def __init__(self, bus: Bus, sealer: Sealer, verifier: SealVerifier, utc_us: Callable[[], int]) -> None:
+        self._bus, self._sealer, self._verifier, self._utc_us = bus, sealer, verifier, utc_us
+        self._refused: list[RefusedMessage] = []
+
+    def publish(self, topic: Topic, payload: bytes) -> None:
+        """Seal and send to all subscribers."""
+        self._bus.publish(topic, self._sealer.seal(topic.name, payload, self._utc_us()))
+
+    def receive(self, topic: Topic) -> list[tuple[str, bytes]]:
+        """Return what others have said since the last call; one that is too long is delivered as such."""
+        arrived = self._bus.receive(topic)
+        if not arrived:
+            return arrived
+        utc_us, opened = self._utc_us(), list[tuple[str, bytes]]()
+        for sender, sealed in arrived:
+            if sealed == TOO_LONG:
+                opened.append((sender, sealed))
+                continue
+            payload, reason = self._verifier.open(sender, topic.name, sealed, utc_us)
+            if not reason:
+                opened.append((sender, payload))
+            elif len(self._refused) < _MOST_REFUSED:
+                self._refused.append(RefusedMessage(sender, topic.name, reason))
+        return opened
+
+    def refused(self) -> list[RefusedMessage]:
+        """Return the messages refused since the last call."""
+        refused, self._refused = self._refused, []
+        return refused
+
+    def alive(self) -> frozenset[str]:
+        """Return senders attached now. Tokens are not sealed: they prove nothing."""
+        return self._bus.alive()
+
+    def arrivals(self) -> Mapping[str, int]:
+        """Return how often each sender has joined."""
+        return self._bus.arrivals()
+
+    def close(self) -> None:
+        """Leave the bus."""
+        self._bus.close()

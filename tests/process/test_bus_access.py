@@ -1,0 +1,169 @@
+"""Routers of several hosts: what the holder of one identity can bring to the others, and that access control stops it.
+
+Charlie is the intruder: its router obeys no access control, and its clients say anything under any name.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+
+import pytest
+
+from swarmctl.bus.network.identities import add_identity, make_identities, revoke_identity
+from swarmctl.bus.network.identity_files import STATION
+from swarmctl.bus.network.joining import join_bus
+from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US
+from swarmctl.bus.peers import Bus
+from swarmctl.bus.topics import COMMAND, ENDED, OBSTACLES, PATH, STATUS, Topic
+from swarmctl.bus.zenoh_bus import ZenohBus
+from tests.benches.free_ports import free_ports
+from tests.benches.swarm_of_hosts import LOOPBACK, SwarmOfHosts
+
+pytestmark = pytest.mark.process
+
+AGENTS = ("agent-0", "agent-1", "agent-2")
+SAID = (
+    *((name, PATH) for name in AGENTS),
+    *((name, COMMAND) for name in ("alpha", "bravo", "charlie", STATION)),
+    *((name, ENDED) for name in ("bravo", "charlie")),
+    *((name, OBSTACLES) for name in ("alpha", "charlie")),
+)
+OPEN = "import swarmctl.bus.network.router_links as links; links.access_settings = lambda *_: {}\n"
+ROGUE = ("-c", OPEN + "from swarmctl.bus.network.router import main\nraise SystemExit(main())")
+LINK_S = 1.5
+WAIT_S = 20.0
+
+Heard = set[tuple[str, str, str]]  # where it was said, as whom, topic
+
+
+@pytest.fixture
+def swarm(tmp_path: Path) -> SwarmOfHosts:
+    return new_swarm(tmp_path)
+
+
+def new_swarm(folder: Path, *, relay: bool = False) -> SwarmOfHosts:
+    make_identities(folder, {"alpha": LOOPBACK, "bravo": LOOPBACK, "charlie": LOOPBACK, STATION: None})
+    return SwarmOfHosts.of(folder, free_ports(3), relay=relay)
+
+
+@contextmanager
+def routers(
+    swarm: SwarmOfHosts, *, lawless: tuple[str, ...] = ("charlie",), stolen: Path | None = None
+) -> Iterator[None]:
+    """Run the three routers; those of `lawless` obey no access control, charlie has the files of `stolen`."""
+    with ExitStack() as stack:
+        for host in swarm.hosts:
+            options = ROGUE if host.name in lawless else ()
+            folder = stolen if host.name == "charlie" else None
+            stack.enter_context(swarm.router(host.name, *options, folder=folder))
+        yield
+
+
+def what_is_heard(swarm: SwarmOfHosts, by: tuple[str, ...]) -> dict[str, Heard]:
+    """Return what listeners on alpha and bravo hear, of everything that clients on the hosts of `by` say."""
+    listen: dict[Topic, list[str]] = {}
+    for sender, topic in SAID:
+        listen.setdefault(topic, []).append(sender)
+    ears = {at: swarm.plain(at, "ear", listen) for at in ("alpha", "bravo")}
+    mouths = {(at, sender): swarm.plain(at, sender) for at in by for sender in {sender for sender, _ in SAID}}
+    heard: dict[str, Heard] = {at: set() for at in ears}
+    until_s = time.monotonic() + LINK_S
+    while time.monotonic() < until_s:
+        for (at, sender), mouth in mouths.items():
+            for topic in (topic for name, topic in SAID if name == sender):
+                mouth.publish(topic, at.encode())
+        time.sleep(0.1)
+        for at, ear in ears.items():
+            for topic in listen:
+                heard[at] |= {(said.decode(), sender, topic.name) for sender, said in ear.receive(topic)}
+    for bus in (*ears.values(), *mouths.values()):
+        bus.close()
+    return heard
+
+
+def test_an_identity_brings_what_is_its_own_only(swarm: SwarmOfHosts) -> None:
+    with routers(swarm):
+        heard = what_is_heard(swarm, ("alpha", "bravo", "charlie"))
+    own = {("charlie", "agent-2", "path"), ("charlie", "charlie", "ended")}
+    assert {said for said in heard["alpha"] if said[0] == "charlie"} == own
+    assert {said for said in heard["bravo"] if said[0] == "charlie"} == own
+    of_alpha = {("alpha", "agent-0", "path"), ("alpha", "alpha", "command"), ("alpha", "alpha", "obstacles")}
+    assert {said for said in heard["bravo"] if said[0] == "alpha"} == of_alpha, "it has an operator's identity"
+    of_bravo = {("bravo", "agent-1", "path"), ("bravo", "bravo", "ended")}
+    assert {said for said in heard["alpha"] if said[0] == "bravo"} == of_bravo, "it has none"
+    here = {("alpha", "agent-0", "path"), ("alpha", "alpha", "command"), ("alpha", "alpha", "obstacles")}
+    assert {said for said in heard["alpha"] if said[0] == "alpha"} == here, "nor does a client on the host itself"
+
+
+def test_negative_control_without_access_control_it_brings_anything(swarm: SwarmOfHosts) -> None:
+    with routers(swarm, lawless=("alpha", "bravo", "charlie")):
+        heard = what_is_heard(swarm, ("charlie",))
+    everything = {("charlie", sender, topic.name) for sender, topic in SAID}
+    assert heard == {"alpha": everything, "bravo": everything}
+
+
+def test_who_relays_passes_on_what_others_say(tmp_path: Path) -> None:
+    swarm = new_swarm(tmp_path, relay=True)
+    with routers(swarm):
+        heard = what_is_heard(swarm, ("charlie",))
+    assert ("charlie", "agent-1", "path") in heard["alpha"], "seals alone tell that bravo has not said it"
+
+
+def test_a_revoked_identity_has_a_link_and_no_rights(
+    swarm: SwarmOfHosts, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    stolen = tmp_path_factory.mktemp("stolen")
+    for file in swarm.folder.iterdir():
+        (stolen / file.name).write_bytes(file.read_bytes())
+        (stolen / file.name).chmod(0o600)
+    revoke_identity(swarm.folder, "charlie")
+    add_identity(swarm.folder, "charlie", LOOPBACK)
+    with routers(swarm, stolen=stolen):
+        heard = what_is_heard(swarm, ("bravo", "charlie"))
+    assert not {said for at in heard for said in heard[at] if said[0] == "charlie"}
+    assert ("bravo", "agent-1", "path") in heard["alpha"], "the others are heard: this can fail"
+
+
+def sealed(swarm: SwarmOfHosts, at: str, sender: str, folder: Path | None = None) -> Bus:
+    listen = {topic: [name for name in AGENTS if name != sender] for topic in (PATH, STATUS)}
+    return join_bus(
+        swarm.endpoint(at),
+        "run",
+        sender,
+        listen,
+        identity=swarm.identity(at, folder),
+        max_age_us=FOR_AGENTS_US,
+        utc_us=lambda: time.time_ns() // 1000,
+    )
+
+
+def test_sealed_messages_pass_between_hosts_and_plain_ones_are_counted(swarm: SwarmOfHosts) -> None:
+    with routers(swarm, lawless=("alpha", "bravo", "charlie")):
+        alpha, bravo = sealed(swarm, "alpha", "agent-0"), sealed(swarm, "bravo", "agent-1")
+        forger: ZenohBus = swarm.plain("charlie", "agent-1")
+        heard, refused = set[tuple[str, bytes]](), set[tuple[str, str, str]]()
+        deadline_s = time.monotonic() + WAIT_S
+        while not (heard and refused) and time.monotonic() < deadline_s:
+            bravo.publish(PATH, b"true")
+            forger.publish(PATH, b"false")
+            time.sleep(0.05)
+            heard |= set(alpha.receive(PATH))
+            refused |= set(alpha.refused())
+        assert heard == {("agent-1", b"true")}
+        assert refused == {("agent-1", "path", "unsealed")}
+        for bus in (alpha, bravo, forger):
+            bus.close()
+
+
+def test_routers_link_with_those_of_their_own_authority_only(
+    swarm: SwarmOfHosts, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    theirs = tmp_path_factory.mktemp("theirs")
+    new_swarm(theirs)
+    with routers(swarm, lawless=("alpha", "bravo", "charlie"), stolen=theirs):
+        heard = what_is_heard(swarm, ("bravo", "charlie"))
+    assert not {said for at in heard for said in heard[at] if said[0] == "charlie"}
+    assert ("bravo", "agent-1", "path") in heard["alpha"]
