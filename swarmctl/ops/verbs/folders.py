@@ -1,4 +1,4 @@
-"""The verbs that are given run folders: replay, report, bundle."""
+"""The verbs that are given run folders: replay, report, export, bundle."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Folder = Annotated[Path, typer.Argument(help="Run folder.")]
 
 def add_folder_verbs(app: typer.Typer) -> None:
     """Add the verbs to the command line."""
-    for verb in (replay, report, bundle):
+    for verb in (replay, report, export, bundle):
         app.command()(verb)
 
 
@@ -51,6 +51,22 @@ def report(
     print(rewrite_report(folders[0]))
     if figures:
         print(write_figures(folders[0]))
+    return EXIT_OK
+
+
+def export(
+    folder: Folder,
+    mcap: Annotated[bool, typer.Option("--mcap", help="As MCAP, which Foxglove opens.")] = False,
+    output: Annotated[
+        Path | None, typer.Option("--output", metavar="FILE", help="File to write; default: beside the folder.")
+    ] = None,
+) -> int:
+    """Write a run in the format of another program."""
+    from swarmctl.ops.export import export_mcap
+
+    if not mcap:
+        raise ConfigError("export", ["say as what: --mcap"])
+    print(export_mcap(folder, output))
     return EXIT_OK
 
 
