@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from swarmctl.errors import EXIT_OK, ConfigError
+from swarmctl.process_lifetime import StopRequest
 
+Web = Annotated[bool, typer.Option("--web", help="Serve a page to browsers of this computer, until Ctrl-C.")]
 Folder = Annotated[Path, typer.Argument(help="Run folder.")]
+_LOOK_S = 0.5  # time between two looks whether the page is still served
 
 
 def add_folder_verbs(app: typer.Typer) -> None:
@@ -18,10 +22,23 @@ def add_folder_verbs(app: typer.Typer) -> None:
         app.command()(verb)
 
 
-def replay(folder: Folder) -> int:
+def show_in_browser(target: str) -> int:
+    """Serve a recording or a live URL as a page until Ctrl-C, or until its server ends."""
+    from swarmctl.telemetry.view.web_page import web_page
+
+    with StopRequest(signal.SIGINT, signal.SIGTERM, signal.SIGHUP) as stop, web_page(target) as page:
+        print(f"open in a browser: {page.url}\nCtrl-C ends it", flush=True)
+        while page.process.poll() is None and not stop.is_set():
+            stop.wait(_LOOK_S)
+    return EXIT_OK
+
+
+def replay(folder: Folder, web: Web = False) -> int:
     """Open the recording of a run."""
     from swarmctl.telemetry.view.recordings import RECORDING, open_viewer
 
+    if web:
+        return show_in_browser(str(folder / RECORDING))
     open_viewer(str(folder / RECORDING))
     return EXIT_OK
 
