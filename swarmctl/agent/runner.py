@@ -195,6 +195,7 @@ def _join(process: AgentProcess, config: Config, clock: WallClock) -> Bus:
         topics.TRAJECTORY: peers,
         topics.COMMAND: [topics.OPERATOR],
         topics.OBSTACLES: [topics.OPERATOR],
+        topics.MISSION: [topics.OPERATOR],
     }
     return ZenohBus(process.bus, process.run, me, listen, lease_ms=config.bus.lease_ms)
 

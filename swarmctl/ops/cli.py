@@ -22,6 +22,7 @@ from swarmctl.ops.verbs.configuration import config_app
 from swarmctl.ops.verbs.folders import Web, add_folder_verbs, show_in_browser
 from swarmctl.ops.verbs.hosts import add_host_verbs
 from swarmctl.ops.verbs.keys import keys_app
+from swarmctl.ops.verbs.mission import mission_app
 from swarmctl.ops.verbs.obstacles import obstacle_app
 from swarmctl.ops.verbs.orders import Run, add_order_verbs
 
@@ -37,6 +38,7 @@ app = typer.Typer(
     help="Fly a swarm of quadrotors with one distributed-MPC agent beside every autopilot.",
 )
 app.add_typer(obstacle_app, name="obstacle")
+app.add_typer(mission_app, name="mission")
 app.add_typer(config_app, name="config")
 app.add_typer(keys_app, name="keys")
 
