@@ -136,6 +136,7 @@ class FlightSupervisor:
         self._obstacles_said_s = 0.0
         self._refusals = Refusals(services.log.write)
         self._started_s = self._stepped_s = time.monotonic()
+        self._mission_ends_s = self._started_s + config.mission.duration_s  # at the earliest
         self._reported: set[str] = set()
         self._router_starts = 0  # how often it was started again
         self._essential_lost = False  # an essential process, router or simulator, has ended
@@ -200,6 +201,8 @@ class FlightSupervisor:
             if view.status is None or view.status.phase != status.phase:
                 self._services.log.write("phase", agent=status.agent, phase=name_of(Phase, status.phase))
             view.status, view.received_s = status, time.monotonic()
+            if status.phase == Phase.TRACK:  # also of a mission that an operator has set
+                self._mission_ends_s = max(self._mission_ends_s, time.monotonic() + status.ends_in_s)
             self._result.has_armed |= Phase.ARM <= status.phase < Phase.DONE
         for _, payload in self._bus.receive(OBSTACLES):
             message = decode_obstacles(payload)
@@ -319,7 +322,7 @@ class FlightSupervisor:
             )
 
     def _watch_time(self) -> None:
-        limit_s = self._config.mission.duration_s + _BEYOND_MISSION_S
+        limit_s = self._mission_ends_s + _BEYOND_MISSION_S - self._started_s
         if time.monotonic() - self._started_s > limit_s and self._is_first("too long"):
             self._fail("too_long", f"the flight did not end within {limit_s:.0f} s; landing")
             self._land(_LAND_S)
