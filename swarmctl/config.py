@@ -211,6 +211,7 @@ class Config(Params):
             obstacles=tuple(JudgedObstacle(number=i, obstacle=o) for i, o in enumerate(self.obstacles)),
             obstacle_margin_m=self.limits.obstacle_margin_m,
             deadline_misses_01=self.limits.deadline_misses_01,
+            solver_name=self.controller.mpc.qp.solver,
             mode=mode,
             duration_s=self.mission.duration_s,
             downwash=self.separation.downwash,

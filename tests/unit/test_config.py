@@ -416,3 +416,8 @@ def test_what_does_not_go_with_a_volume_is_refused(overrides: tuple[str, ...], w
 
 def test_commitments_keep_a_volume_whatever_tracks_them() -> None:
     load(None, ["mission.kind=hover", *BOX, "controller.kind=pid", "separation.mode=guaranteed"])
+
+
+def test_a_run_is_said_to_be_flown_with_the_solver_that_flies_it() -> None:
+    named = load(None, ["controller.mpc.qp.solver='daqp'"]).rules().solver_name
+    assert (load(None).rules().solver_name, named) == ("osqp", "daqp")
