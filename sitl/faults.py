@@ -109,6 +109,7 @@ _BEGIN: dict[str, Callable[[FaultTarget, int, FaultParams, int], Undo]] = {
     "motor": _motor,
     "link_loss": _link("loss_01"),
     "link_delay": _link("delay_ms"),
+    "link_jitter": _link("jitter_ms"),
     "link_duplicate": _link("duplicate_01"),
     "link_reorder": _link("reorder_01"),
     "link_corrupt": _link("corrupt_01"),

@@ -256,6 +256,28 @@ def load(
     return config
 
 
+def load_mission(config: Config, path: Path) -> MissionParams:
+    """Read a file that holds `[mission]` alone, and check it for a swarm that flies already.
+
+    Raises:
+        ConfigError: it can't be flown; lists all problems.
+    """
+    source, tree = str(path), read_tree(path)
+    if set(tree) != {"mission"}:
+        others = ", ".join(sorted(set(tree) - {"mission"})) or "nothing"
+        raise ConfigError(source, [f"holds {others}; a mission for a running launch is a file of [mission] alone"])
+    if problems := read_tables(tree, path.parent) + read_show(tree, path.parent):
+        raise ConfigError(source, problems)
+    whole = config.model_dump(exclude_none=True) | tree
+    changed = validated(Config, whole, source, _RENAMED)
+    if changed.mission.is_own:
+        own = "is somebody else's code, which is flown only by a launch that was started with it"
+        raise ConfigError(source, [f"mission.kind = {changed.mission.kind!r}: {own}"])
+    if problems := list(changed.mission.problems(config.swarm.agents)) or list(_infeasible(changed)):
+        raise ConfigError(source, problems)
+    return changed.mission
+
+
 def load_recorded(folder: Path) -> Config:
     """Read the resolved configuration in a run folder, which may be somebody else's.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 
 _UTC_SLEW_01 = 0.01  # largest correction of UTC per elapsed time
 
@@ -13,19 +14,26 @@ def monotonic_us() -> int:
 
 
 class WallClock:
-    """Reads the host's clocks. UTC steps are slewed, so that in flight time neither jumps nor runs backwards."""
+    """Reads the host's clocks. UTC steps are slewed, so that in flight time neither jumps nor runs backwards.
 
-    def __init__(self) -> None:
-        self._read_ns = time.monotonic_ns()
-        self._offset_ns = time.time_ns() - self._read_ns
+    Args:
+        monotonic_ns, utc_ns: these clocks.
+    """
+
+    def __init__(
+        self, monotonic_ns: Callable[[], int] = time.monotonic_ns, utc_ns: Callable[[], int] = time.time_ns
+    ) -> None:
+        self._monotonic_ns, self._utc_ns = monotonic_ns, utc_ns
+        self._read_ns = monotonic_ns()
+        self._offset_ns = utc_ns() - self._read_ns
 
     def now_us(self) -> int:
-        return monotonic_us()
+        return self._monotonic_ns() // 1000
 
     def utc_us(self) -> int:
-        now_ns = time.monotonic_ns()
+        now_ns = self._monotonic_ns()
         most_ns = int((now_ns - self._read_ns) * _UTC_SLEW_01)
-        off_ns = time.time_ns() - now_ns - self._offset_ns
+        off_ns = self._utc_ns() - now_ns - self._offset_ns
         self._offset_ns += off_ns if -most_ns <= off_ns <= most_ns else most_ns if off_ns > 0 else -most_ns
         self._read_ns = now_ns
         return (now_ns + self._offset_ns) // 1000

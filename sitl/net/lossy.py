@@ -6,7 +6,7 @@ Without an impairment it passes everything unchanged. Late datagrams are release
 from __future__ import annotations
 
 import heapq
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from swarmctl.mavlink.transport import Datagram, Transport
 
 _OVERTAKEN_US = 100_000  # longest time that a datagram waits for another to overtake it
 _SET_ATTITUDE_TARGET = 82
-_NOTHING = (0.0,) * 5
+_NOTHING = (0.0,) * 6
 
 
 @dataclass(kw_only=True)
@@ -24,13 +24,14 @@ class Impairments:
 
     loss_01: float = 0.0
     delay_ms: float = 0.0
+    jitter_ms: float = 0.0  # largest extra delay, drawn uniformly for each datagram: some overtake others
     duplicate_01: float = 0.0
     reorder_01: float = 0.0
     corrupt_01: float = 0.0
 
     def any(self) -> bool:
         """Return whether any impairment is set."""
-        return (self.loss_01, self.delay_ms, self.duplicate_01, self.reorder_01, self.corrupt_01) != _NOTHING
+        return astuple(self) != _NOTHING
 
 
 class LinkDirection:
@@ -66,6 +67,8 @@ class LinkDirection:
             self._overtaken = now_us + _OVERTAKEN_US, data
             return
         due_us = now_us + round(impairments.delay_ms * 1e3)
+        if impairments.jitter_ms > 0.0:
+            due_us += int(rng.integers(round(impairments.jitter_ms * 1e3), endpoint=True))
         for _ in range(2 if self._happens(impairments.duplicate_01) else 1):
             self._push(due_us, data)
         if self._overtaken is not None:

@@ -21,6 +21,7 @@ from swarmctl.agent.components import (
     make_state_machine,
 )
 from swarmctl.agent.controller_watch import ControllerWatch
+from swarmctl.agent.mission_change import MissionChange
 from swarmctl.agent.mode_selector import ModeSelector
 from swarmctl.agent.path_sharing import PathSharing
 from swarmctl.agent.reference_selector import ReferenceSelector
@@ -45,7 +46,7 @@ from swarmctl.control.reference.heading import Heading
 from swarmctl.control.setpoint import setpoint_of
 from swarmctl.core.clock import Clock
 from swarmctl.core.frames import GRAVITY_M_S2, body_z_ned
-from swarmctl.core.operator_verbs import EXCLUDE, PEER, Order
+from swarmctl.core.operator_verbs import EXCLUDE, MISSION, PEER, Order
 from swarmctl.core.tick_record import TickRecord, TickTiming
 from swarmctl.core.trajectory import grid
 from swarmctl.core.types import (
@@ -120,6 +121,7 @@ class Agent:
             note=self._note,
             vouchers=setup.vouchers,
         )
+        self._missions = MissionChange(setup, bus, self._world_model.refusals)
         self._separation = make_separation_policy(setup, self._world_model, bus, self._note, stopwatch_ns=stopwatch_ns)
         self._directive = SeparationDirective()  # of the newest tick
         self._controller, self._transit = make_controllers(setup, stopwatch_ns)
@@ -224,15 +226,27 @@ class Agent:
             self._world_model.exclude(int(order.arguments[PEER]))
             refusal = ""
         else:
+            refusal = self._offer_mission(order) if order.verb == MISSION else ""
             state = self._autopilot.poll(now_us)
-            refusal = self._state_machine.operator(order, now_us, self._clock.utc_us(), state)
+            refusal = refusal or self._state_machine.operator(order, now_us, self._clock.utc_us(), state)
         self._world_model.answer(order, refusal)
         if refusal:
             self._alerts.put("order", f"{order.verb} refused: {refusal}", now_us)
             self._note("order_refused", verb=order.verb, reason=refusal, **order.arguments)
         else:
             self._note("operator", verb=order.verb, **order.arguments)
+            offered = self._state_machine.offered
+            if order.verb == MISSION and offered is not None:
+                self._note("mission_changed", duration_s=offered.duration_s, mission=offered.text)
         return refusal
+
+    def _offer_mission(self, order: Order) -> str:
+        """Have the state machine know the mission of an order; return why it is not flown, or ""."""
+        offered = self._missions.offer(order, self._clock.utc_us())
+        if isinstance(offered, str):
+            return offered
+        self._state_machine.offered = offered
+        return ""
 
     def tick(self, now_us: int, deadline_misses: int) -> TickRecord:
         """Run one control step at monotonic time `now_us`.
@@ -308,6 +322,7 @@ class Agent:
     # -- receive, sense -----------------------------------------------------------------------------------------------
 
     def _receive(self, now_us: int) -> None:
+        self._missions.receive(self._clock.utc_us())
         for order in self._world_model.receive(self._clock.utc_us()):
             self.ask(order, now_us)
         for answer in self._world_model.due_answers():

@@ -201,6 +201,7 @@ def _join(process: AgentProcess, config: Config, clock: WallClock) -> Bus:
         topics.COMMAND: launcher if identity is None else identity.roster.commanders(identity.name),
         topics.ENDED: launcher if identity is None else identity.roster.hosts,
         topics.OBSTACLES: launcher if identity is None else (identity.name,),  # which hears the others
+        topics.MISSION: launcher if identity is None else identity.roster.commanders(identity.name),
     }
     return join_bus(
         process.bus,

@@ -28,6 +28,7 @@ from swarmctl.core.trajectory_message import TrajectoryMessage
 from swarmctl.core.types import Array, Mode, Phase
 
 _RECENT_PATH_US = 300_000  # largest age of a path that is compared with commitments
+_BUS_LOST_US = 300_000  # without a path of anybody, of several: they share one at least every 0.25 s
 _STATUS_LEAD_US = 1_000_000  # largest lead of a peer's clock over ours
 FLOWN_BY_AGENT = frozenset((Mode.TRACKING, Mode.REPLAY, Mode.BRAKE, Mode.HOLD))
 
@@ -307,11 +308,14 @@ class WorldModel:
     def has_unresponsive_peer(self, utc_us: int) -> bool:
         """Return whether some peer is silent and not known to have died: it may be flying on, or our bus is lost.
 
+        One may be silent for a while because messages are lost; that several are at once is noticed sooner.
         A peer whose liveliness token has gone while ours is present has died, as far as best effort can know; its path
         has become a keep-out.
         """
         oldest_us = utc_us - round(self._params.lost_after_s * 1e6)
-        silent = [p.agent for p in self.paths.latest() if p.t0_utc_us < oldest_us and not self.has_ended(p.agent)]
+        flying = [path for path in self.paths.latest() if not self.has_ended(path.agent)]
+        everybody = len(flying) > 1 and utc_us - self.paths.heard_utc_us > _BUS_LOST_US
+        silent = [path.agent for path in flying if everybody or path.t0_utc_us < oldest_us]
         if not silent:
             return False
         alive = self._bus.alive()

@@ -98,6 +98,13 @@ class AnswerMessage(msgspec.Struct, frozen=True, kw_only=True):
         return Answer(self.verb, self.number, self.accepted, self.reason)
 
 
+class MissionMessage(msgspec.Struct, frozen=True, kw_only=True):
+    """Holds a mission, which an order names by its number."""
+
+    mission: Count
+    text: str  # parameters of the mission as JSON, `control.reference.mission`
+
+
 class ListedObstacle(msgspec.Struct, frozen=True, kw_only=True):
     """Holds one obstacle of the list under its number, which no other one has before or after it."""
 
@@ -153,6 +160,11 @@ def decode_answer(payload: bytes) -> AnswerMessage | None:
     return _printable(_decode(payload, _ANSWER_DECODER), "verb", "reason")
 
 
+def decode_mission(payload: bytes) -> MissionMessage | None:
+    """Decode a mission, whose text is not looked at; None if it is malformed."""
+    return _decode(payload, _MISSION_DECODER)
+
+
 def decode_obstacles(payload: bytes) -> ObstaclesMessage | None:
     """Decode a list of obstacles; None if it is malformed or out of bounds, or two have one number."""
     message = _decode(payload, _OBSTACLES_DECODER)
@@ -177,6 +189,7 @@ def _obstacle(kind: type, item: Any) -> Obstacle:
 _STATUS_DECODER = msgspec.json.Decoder(StatusMessage)
 _COMMAND_DECODER = msgspec.json.Decoder(CommandMessage)
 _ANSWER_DECODER = msgspec.json.Decoder(AnswerMessage)
+_MISSION_DECODER = msgspec.json.Decoder(MissionMessage)
 _OBSTACLES_DECODER = msgspec.json.Decoder(ObstaclesMessage, dec_hook=_obstacle)
 
 

@@ -80,6 +80,9 @@ class PeerPaths:
         max_age_us: a path whose first point is older than this when it arrives is refused.
         max_lead_us: a path whose first point is further in the future than this is refused.
         clocks: by which paths are converted to the own clock; None takes all clocks for equal.
+
+    Attributes:
+        heard_utc_us: when a path was accepted last, of whomever.
     """
 
     def __init__(
@@ -100,6 +103,7 @@ class PeerPaths:
         self._newest: dict[int, PredictedPath] = {}
         self._sorted: tuple[PredictedPath, ...] = ()  # these, by agent number
         self.refusals = refusals
+        self.heard_utc_us = 0
 
     def offer(self, sender: str, payload: bytes, utc_us: int) -> None:
         """Check one message of the PATH topic, and keep it if it is accepted.
@@ -116,7 +120,7 @@ class PeerPaths:
         if self._verifiers[path.agent].accepts(
             ReceivedMessage(path.boot_id, path.seq, path.t0_utc_us, payload), utc_us
         ):
-            self._newest[path.agent] = path
+            self._newest[path.agent], self.heard_utc_us = path, utc_us
             self._sorted = tuple(self._newest[agent] for agent in sorted(self._newest))
 
     def _by_own_clock(self, path: PredictedPath | None) -> PredictedPath | None:

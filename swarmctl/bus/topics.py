@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+MAX_MISSION_BYTES = 65_536  # a tick reads it
+
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)  # the table has one object a topic: keys by identity
 class Topic:
@@ -26,9 +28,10 @@ COMMAND = Topic(name="command", ring=64, max_bytes=1024, reliable=True)
 ENDED = Topic(name="ended", ring=64, max_bytes=1024, reliable=True)  # a computer says that an agent of it has ended
 ANSWER = Topic(name="answer", ring=16, max_bytes=4096, reliable=True)
 OBSTACLES = Topic(name="obstacles", ring=4, max_bytes=65_536, reliable=True)
+MISSION = Topic(name="mission", ring=4, max_bytes=MAX_MISSION_BYTES, reliable=True)
 TRAJECTORY = Topic(name="trajectory", ring=4, max_bytes=131_072, reliable=False)  # each one replaces all earlier ones
-TOPICS = (PATH, STATUS, TICK, COMMAND, ENDED, ANSWER, OBSTACLES, TRAJECTORY)
-FOR_AGENTS = (PATH, STATUS, COMMAND, ENDED, OBSTACLES, TRAJECTORY)
+TOPICS = (PATH, STATUS, TICK, COMMAND, ENDED, ANSWER, OBSTACLES, MISSION, TRAJECTORY)
+FOR_AGENTS = (PATH, STATUS, COMMAND, ENDED, OBSTACLES, MISSION, TRAJECTORY)
 
 TOO_LONG = b""  # replaces a message that is too long; every decoder refuses it
 

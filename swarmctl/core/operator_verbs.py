@@ -60,6 +60,7 @@ EXCLUDE, PEER = "exclude", "peer"
 GOTO = "goto"
 POINT = ("north_m", "east_m", "down_m")  # arguments of `goto`, shared NED
 YAW, SPEED = "yaw_deg", "speed_m_s"  # and its optional ones
+MISSION, BEGIN = "mission", "begin_utc_s"  # the verb, its argument of the same name: number of the mission; its begin
 _FAR_M = 100_000.0  # from the shared origin
 _AIRBORNE = frozenset({"TAKEOFF", "GOTO_START", "READY", "TRACK", "GOTO_LAND"})  # the agent decides where it flies
 _NOT_LANDING = _AIRBORNE | {"CONNECT", "STANDBY", "ARM", "DONE"}
@@ -104,6 +105,14 @@ OPERATOR_VERBS = {
                 most=20.0,
                 required=False,
             ),
+        ),
+    ),
+    MISSION: OperatorVerb(
+        help="Fly another mission.",
+        phases=frozenset({"STANDBY", "ARM", "TAKEOFF", "GOTO_START", "READY", "TRACK"}),  # likewise
+        arguments=(
+            VerbArgument(name=MISSION, option="--mission", help="Number.", least=0, most=2.0**53),
+            VerbArgument(name=BEGIN, option="--begin", help="Begin, UTC [s].", least=0, most=2.0**33),
         ),
     ),
     EXCLUDE: OperatorVerb(

@@ -19,9 +19,10 @@ from swarmctl import __version__
 from swarmctl.core.text import printable_lines
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_USAGE, ConfigError, SwarmError
 from swarmctl.ops.verbs.configuration import config_app
-from swarmctl.ops.verbs.folders import add_folder_verbs
+from swarmctl.ops.verbs.folders import Web, add_folder_verbs, show_in_browser
 from swarmctl.ops.verbs.hosts import add_host_verbs
 from swarmctl.ops.verbs.keys import keys_app
+from swarmctl.ops.verbs.mission import mission_app
 from swarmctl.ops.verbs.obstacles import obstacle_app
 from swarmctl.ops.verbs.orders import Run, add_order_verbs
 
@@ -37,6 +38,7 @@ app = typer.Typer(
     help="Fly a swarm of quadrotors with one distributed-MPC agent beside every autopilot.",
 )
 app.add_typer(obstacle_app, name="obstacle")
+app.add_typer(mission_app, name="mission")
 app.add_typer(config_app, name="config")
 app.add_typer(keys_app, name="keys")
 
@@ -286,12 +288,15 @@ def fault(
 
 
 @app.command()
-def view(run: Run = None) -> int:
+def view(run: Run = None, web: Web = False) -> int:
     """Open the live view of a running launch."""
     from swarmctl.ops import operator
     from swarmctl.telemetry.view.recordings import open_viewer
 
-    open_viewer(operator.view_address(operator.find_launch(run)))
+    address = operator.view_address(operator.find_launch(run))
+    if web:
+        return show_in_browser(address)
+    open_viewer(address)
     return EXIT_OK
 
 

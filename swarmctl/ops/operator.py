@@ -61,10 +61,11 @@ def announce(launch: RunningLaunch) -> None:
 
 
 def withdraw() -> None:
-    """Remove this process's notes from the registries."""
-    for registry in _registries():
-        with contextlib.suppress(OSError):
-            (registry / f"{os.getpid()}.json").unlink(missing_ok=True)
+    """Remove this process's notes from the registries; one that is left is known to be stale."""
+    with contextlib.suppress(OSError):  # without a descriptor left no folder can be listed
+        for registry in _registries():
+            with contextlib.suppress(OSError):
+                (registry / f"{os.getpid()}.json").unlink(missing_ok=True)
 
 
 def process_start_s() -> tuple[float, int]:

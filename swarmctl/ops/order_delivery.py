@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from swarmctl.bus.json_messages import StatusMessage, decode_answer, decode_status
 from swarmctl.bus.orders import EVERYBODY, order_messages
 from swarmctl.bus.peers import Bus, agent_name
-from swarmctl.bus.topics import ANSWER, COMMAND, STATUS
+from swarmctl.bus.topics import ANSWER, COMMAND, STATUS, Topic
 from swarmctl.core.operator_verbs import OPERATOR_VERBS, PEER, Answer, Order
 from swarmctl.core.text import printable
 from swarmctl.core.types import Phase
@@ -164,8 +164,16 @@ def no_operator(launch: RunningLaunch) -> str:
     return f"{name} has no operator's identity. Say it at the station, or set operator = true in [[hosts]] of {name}"
 
 
-def deliver(launch: RunningLaunch, order: Order, agents: Sequence[int]) -> list[Reply]:
+def deliver(
+    launch: RunningLaunch, order: Order, agents: Sequence[int], before: Sequence[tuple[Topic, bytes]] = ()
+) -> list[Reply]:
     """Give an order to agents of a launch, or to all; returns what each has answered, at the latest after `ANSWER_S`.
+
+    Args:
+        launch: whose agents are asked.
+        order: what is asked.
+        agents: numbers of the agents asked; none: all.
+        before: messages that have to be there before each repetition of the order.
 
     Raises:
         ConfigError: there is no such agent.
@@ -178,6 +186,8 @@ def deliver(launch: RunningLaunch, order: Order, agents: Sequence[int]) -> list[
         while delivery.open and time.monotonic() - began_s < ANSWER_S:
             if time.monotonic() >= repeated_s:
                 repeated_s = time.monotonic() + REPEAT_S
+                for topic, payload in before:
+                    bus.publish(topic, payload)
                 for message in delivery.messages(time.time_ns() // 1000):
                     bus.publish(COMMAND, message)
             time.sleep(_POLL_S)

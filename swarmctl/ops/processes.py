@@ -156,8 +156,8 @@ class Child:
         self.name = command.name
         self.log = directory / f"{command.name}.log"
         self.ended_s: float | None = None
-        with self.log.open("ab") as log:
-            try:
+        try:
+            with self.log.open("ab") as log:
                 self._process = subprocess.Popen(
                     command.argv,
                     stdin=subprocess.DEVNULL,
@@ -167,8 +167,8 @@ class Child:
                     pass_fds=command.fds,
                     start_new_session=True,
                 )
-            except OSError as error:
-                raise StartError(f"{command.name}: {command.argv[0]} can't be started: {error}") from error
+        except OSError as error:
+            raise StartError(f"{command.name}: {command.argv[0]} can't be started: {error}") from error
         self.pid = self._process.pid
 
     def poll(self) -> int | None:

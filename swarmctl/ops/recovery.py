@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Sequence
 
 from swarmctl.core.types import Phase
-from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_START
+from swarmctl.errors import EXIT_INTERRUPTED, EXIT_OK, EXIT_START, StartError
 from swarmctl.ops.processes import Child
 from swarmctl.ops.status_table import AgentView, name_of
 
@@ -41,7 +41,11 @@ class Recovery:
         return agent in self._begun_s and time.monotonic() - self._begun_s[agent] > RECOVERY_S
 
     def begin(self, view: AgentView, code: int) -> Child | None:
-        """Register an ended agent; return the process that recovers its vehicle, or None."""
+        """Register an ended agent; return the process that recovers its vehicle, or None.
+
+        Raises:
+            StartError, OSError: it can't be started; the vehicle counts as lost.
+        """
         if code in _DOWN or (code == EXIT_START and not self.is_on(view.agent)):
             self._lost.discard(view.agent)
             return None
@@ -51,7 +55,11 @@ class Recovery:
             self._lost |= {view.agent} if view.status is not None else set()
             return None
         self._begun_s[view.agent] = time.monotonic()
-        return self._start(view.agent)
+        try:
+            return self._start(view.agent)
+        except (StartError, OSError):
+            self._lost.add(view.agent)
+            raise
 
     def left(self, views: Sequence[AgentView]) -> list[str]:
         """Return one line for each vehicle that may still be armed or in the air."""

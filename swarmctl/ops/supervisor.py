@@ -22,7 +22,7 @@ from swarmctl.bus.topics import COMMAND, ENDED, OBSTACLES, STATUS, Topic
 from swarmctl.config import Config
 from swarmctl.core.operator_verbs import EXCLUDE, PEER, Order
 from swarmctl.core.types import Phase
-from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START
+from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, StartError
 from swarmctl.ops.order_delivery import numbered
 from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, RunContext, kill_all
 from swarmctl.ops.recovery import RECOVERY_S, Recovery
@@ -136,6 +136,7 @@ class FlightSupervisor:
         self._obstacles_said_s = 0.0
         self._refusals = Refusals(services.log.write)
         self._started_s = self._stepped_s = time.monotonic()
+        self._mission_ends_s = self._started_s + config.mission.duration_s  # at the earliest
         self._reported: set[str] = set()
         self._router_starts = 0  # how often it was started again
         self._essential_lost = False  # an essential process, router or simulator, has ended
@@ -200,6 +201,8 @@ class FlightSupervisor:
             if view.status is None or view.status.phase != status.phase:
                 self._services.log.write("phase", agent=status.agent, phase=name_of(Phase, status.phase))
             view.status, view.received_s = status, time.monotonic()
+            if status.phase == Phase.TRACK:  # also of a mission that an operator has set
+                self._mission_ends_s = max(self._mission_ends_s, time.monotonic() + status.ends_in_s)
             self._result.has_armed |= Phase.ARM <= status.phase < Phase.DONE
         for _, payload in self._bus.receive(OBSTACLES):
             message = decode_obstacles(payload)
@@ -219,7 +222,10 @@ class FlightSupervisor:
         if router is not None and router.poll() is not None and self._router_starts < _ROUTER_STARTS:
             self._router_starts += 1
             self._announce("router_ended", f"router {router.how_it_ended()}; it is started again, the flight goes on")
-            self._services.restart_router()
+            try:
+                self._services.restart_router()
+            except (StartError, OSError) as error:
+                self._announce("router_failed", f"the router can't be started again: {error}")
         for name, land_s in ((ROUTER, _LAND_S), (SITL, _AFTER_DEATH_S)):
             child = self._services.children.get(name)
             if child is not None and child.poll() is not None and self._is_first(name):
@@ -277,7 +283,11 @@ class FlightSupervisor:
         """Start another process that lands a vehicle which is not known to be down."""
         if self._recovery.is_on(view.agent) and code == EXIT_INTERRUPTED:
             self._announce("recovered", f"the vehicle of {agent_name(view.agent)} is on the ground and disarmed")
-        child = None if self._vehicles_lost else self._recovery.begin(view, code)
+        try:
+            child = None if self._vehicles_lost else self._recovery.begin(view, code)
+        except (StartError, OSError) as error:
+            self._fail("recovery_failed", f"the vehicle of {agent_name(view.agent)} can't be recovered: {error}")
+            return
         if child is None:
             return
         self._services.children[agent_name(view.agent)] = child
@@ -312,7 +322,7 @@ class FlightSupervisor:
             )
 
     def _watch_time(self) -> None:
-        limit_s = self._config.mission.duration_s + _BEYOND_MISSION_S
+        limit_s = self._mission_ends_s + _BEYOND_MISSION_S - self._started_s
         if time.monotonic() - self._started_s > limit_s and self._is_first("too long"):
             self._fail("too_long", f"the flight did not end within {limit_s:.0f} s; landing")
             self._land(_LAND_S)

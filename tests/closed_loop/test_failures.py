@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
 from functools import partial
 
 import numpy as np
@@ -13,10 +12,9 @@ from pymavlink.dialects.v20 import development as dialect
 from sitl.lockstep import Lockstep
 from swarmctl.bus.peers import PeerPaths
 from swarmctl.control.mpc import swarm_mpc as mpc
-from swarmctl.control.mpc.solvers.qp import QpSolution
-from swarmctl.control.mpc.swarm_mpc import SwarmMpc
 from swarmctl.core.types import FlightMode, Landed, Mode, Phase, PredictedPath
 from swarmctl.mavlink.codec import Codec
+from tests.benches.broken_solver import break_solver
 from tests.closed_loop.conftest import COARSE, Fly, closer_than, mission_is_over
 
 AIR = "sitl.start=air"
@@ -127,25 +125,6 @@ def test_no_state_no_setpoints(fly: Fly) -> None:
     assert len(blind) and np.isnan(blind["setpoint_thrust_01"]).all()
     assert blind["state_age_ms"].min() <= 221.0, "setpoints stop within 200 ms and a tick"
     assert landed_by_itself(flight.lockstep.truth, 0, 1)
-
-
-def break_solver(running: Lockstep, agent: int, lasts_s: float) -> None:
-    """Make OSQP of one agent return nothing for a while."""
-    until_s = running.clock.now_us() * 1e-6 + lasts_s
-    flown = running.agents[agent]
-    assert flown is not None
-    planner = flown._controller
-    assert isinstance(planner, SwarmMpc)
-    for solver in (planner._xy.session.solver, planner._xy_alone.session.solver):
-        solver.solve = partial(_solve_from, running, until_s, solver.solve)  # type: ignore[method-assign]
-
-
-def _solve_from(running: Lockstep, from_s: float, solve: Callable[..., QpSolution], *values: object) -> QpSolution:
-    return (
-        solve(*values)
-        if running.clock.now_us() * 1e-6 >= from_s
-        else QpSolution(x=None, exact=False, status="broken", iterations=0)
-    )
 
 
 @pytest.mark.parametrize(

@@ -22,7 +22,7 @@ from swarmctl.config import load
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import EXCLUDE, PEER
 from swarmctl.core.types import Phase
-from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START
+from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, StartError
 from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, Command, RunContext, kill_all
 from swarmctl.ops.status_table import AgentView
 from swarmctl.ops.supervisor import FlightSupervisor, LaunchResult, Services
@@ -189,6 +189,35 @@ def test_a_vehicle_that_can_not_be_recovered_is_named(tmp_path: Path) -> None:
     assert len(result.left) == 1
     assert scene.printed("vehicle 1", "may be armed", "TRACK", "by hand")
     assert result.exit_code(violated=False) == EXIT_MISSION
+
+
+def test_a_vehicle_whose_recovery_can_not_be_started_is_named_and_the_others_finish(tmp_path: Path) -> None:
+    """The launcher has no descriptor left, for instance."""
+    scene = ScriptedServices(tmp_path, [FLIES_LONG, ends(0, 2.0)])
+
+    def fails(agent: int) -> Child:
+        raise StartError("agent-0: too many open files")
+
+    scene.recover = fails  # type: ignore[method-assign]
+    scene.act = lambda: scene.kill("agent-0")
+    result = scene.fly()
+    assert scene.printed("agent-0", "can't be recovered", "too many open files")
+    assert len(result.left) == 1
+    assert result.exit_code(violated=False) == EXIT_MISSION
+    assert scene.children["agent-1"].poll() == 0
+
+
+def test_a_router_that_can_not_be_started_again_lands_all_agents(tmp_path: Path) -> None:
+    scene = ScriptedServices(tmp_path, [FLIES_LONG])
+
+    def fails() -> None:
+        raise StartError("router: too many open files")
+
+    scene.restart_router = fails  # type: ignore[method-assign]
+    scene.act = lambda: scene.kill(ROUTER)
+    assert scene.fly().exit_code(violated=False) == EXIT_MISSION
+    assert scene.printed("can't be started again")
+    assert scene.children["agent-0"].poll() == 130
 
 
 def test_an_interrupted_launch_that_leaves_a_vehicle_is_a_failed_one(tmp_path: Path) -> None:

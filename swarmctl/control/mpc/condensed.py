@@ -27,8 +27,15 @@ from swarmctl.control.mpc.program import ConstraintBlock, Program
 from swarmctl.control.mpc.session import Relaxation, SolverSession
 from swarmctl.control.mpc.solvers.qp import QpParams, QpSolution
 from swarmctl.control.mpc.tracking_cost import TrackingCost
+from swarmctl.core.types import Array
 
 _SLACK_USED_M = 1e-3
+
+
+def _usable(solution: QpSolution) -> Array | None:
+    """Return the solution's variables; None without one, and where a number is not finite: no bound refuses those."""
+    x = solution.x
+    return x if x is not None and math.isfinite(x @ x) else None
 
 
 class CondensedMpc:
@@ -95,7 +102,7 @@ class CondensedMpc:
 
     def _plan(self, forecast: Forecast, solution: QpSolution, solve_us: float) -> AxesSolution:
         """Return the motion under the increments of a solution, with what it violates."""
-        x, ahead = solution.x, self.prediction
+        x, ahead = _usable(solution), self.prediction
         increments = ahead.increments(x, forecast.u_prev)
         motion = forecast.free + np.einsum("qakc,ac->qka", forecast.response, increments)
         residual_m = gap_m = math.inf

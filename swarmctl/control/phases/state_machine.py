@@ -25,10 +25,10 @@ from swarmctl.control.phases.landing import Landing
 from swarmctl.control.phases.overload import Level
 from swarmctl.control.phases.refused_orders import Contains, OrderSituation, refusal_of
 from swarmctl.control.phases.state_machine_params import StateMachineParams
-from swarmctl.control.phases.trajectories import Trajectories, is_at
+from swarmctl.control.phases.trajectories import OfferedMission, Trajectories, is_at
 from swarmctl.control.reference.mission import MissionReference
 from swarmctl.core.flight_volume import FlightVolume
-from swarmctl.core.operator_verbs import GOTO, OPERATOR_VERBS, POINT, SPEED, YAW, Order
+from swarmctl.core.operator_verbs import BEGIN, GOTO, MISSION, OPERATOR_VERBS, POINT, SPEED, YAW, Order
 from swarmctl.core.types import Array, Command, FlightMode, Landed, Mode, Phase, VehicleState, Verb
 
 _REQUEST_PERIOD_US = 1_000_000  # time between repetitions of a request
@@ -65,6 +65,7 @@ class MissionStateMachine:
         waits_for: unmet condition that keeps the vehicle on the ground, or from beginning the mission; or "".
         had_control: the autopilot follows our setpoints and control has not been given back.
         pilot_override: pilot or autopilot took over; lasts until an operator resumes.
+        offered: the mission that the order `mission` has flown.
     """
 
     def __init__(
@@ -99,6 +100,7 @@ class MissionStateMachine:
         self._landing = Landing(
             params, agent, landing_m, start_ned_m=start_ned_m, trajectories=self._trajectories, volume=volume
         )
+        self.offered: OfferedMission | None = None
         self._entered_us = 0
         self._first_tick_us: int | None = None
         self._requested_us = -_REQUEST_PERIOD_US
@@ -123,6 +125,7 @@ class MissionStateMachine:
             "hold": self._hold,
             "resume": self._resume,
             GOTO: self._goto,
+            MISSION: self._change_mission,
         }  # stops are in `_apply_stop`
 
     @property
@@ -279,6 +282,16 @@ class MissionStateMachine:
             yaw_rad=math.radians(arguments[YAW]) if YAW in arguments else None,
         )
         self._interruptions.move_hold(point, now_us, state)
+
+    def _change_mission(self, order: Order, now_us: int, utc_us: int, state: VehicleState) -> None:
+        """Fly the mission that is offered: from its begin on where one is flown already, else when all are ready."""
+        assert self.offered is not None
+        self._reference, self._duration_us = self.offered.reference, round(self.offered.duration_s * 1e6)
+        self._trajectories.change_mission(self._reference)
+        if self.phase is Phase.TRACK:
+            self.begin_utc_us = round(order.arguments[BEGIN] * 1e6)
+            if not self._interruptions.active:
+                self._rejoin_mission(now_us, utc_us, state)
 
     @property
     def _lowest_m(self) -> float:

@@ -24,6 +24,15 @@ class BegunTrajectory:
         return self.trajectory.sample((now_us - self.began_us) * 1e-6 + offsets_s)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OfferedMission:
+    """A mission that an operator may have flown instead of the configured one."""
+
+    reference: MissionReference
+    duration_s: float
+    text: str  # its parameters as JSON
+
+
 class Trajectories:
     """Owns the transit or stop under way, its destination and the offset that decays to the mission's reference.
 
@@ -58,6 +67,10 @@ class Trajectories:
             offset, drift = self._rejoin_offset.sample(now_us, offsets_s)
             pos, vel = pos + offset, vel + drift
         return pos, vel
+
+    def change_mission(self, mission: MissionReference) -> None:
+        """Follow another mission from now on."""
+        self._mission, self._rejoin_offset = mission, None
 
     def stand(self, now_us: int, state: VehicleState) -> None:
         """Begin to stay at the vehicle's place, as if it were at rest."""

@@ -48,10 +48,13 @@ class _Rule:
 
 
 def infeasible(
-    references: Sequence[MissionReference], models: Sequence[VehicleModelParams], limits: FlightLimits
+    references: Sequence[MissionReference],
+    models: Sequence[VehicleModelParams],
+    limits: FlightLimits,
+    most_samples: int = _MAX_SAMPLES,
 ) -> Iterator[str]:
     """Yield why a mission can't be flown: for each agent and each pair of agents the first second that is wrong."""
-    samples = min(_MAX_SAMPLES // len(references), max(3, round(limits.duration_s / _STEP_S) + 1))
+    samples = min(most_samples // len(references), max(3, round(limits.duration_s / _STEP_S) + 1))
     t_s = np.linspace(0.0, limits.duration_s, samples)
     motions = [reference.motion(t_s) for reference in references]
     found = []

@@ -1,27 +1,44 @@
-"""The verbs that are given run folders: replay, report, bundle."""
+"""The verbs that are given run folders: replay, report, export, bundle."""
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from swarmctl.errors import EXIT_OK, ConfigError
+from swarmctl.process_lifetime import StopRequest
 
+Web = Annotated[bool, typer.Option("--web", help="Serve a page to browsers of this computer, until Ctrl-C.")]
 Folder = Annotated[Path, typer.Argument(help="Run folder.")]
+_LOOK_S = 0.5  # time between two looks whether the page is still served
 
 
 def add_folder_verbs(app: typer.Typer) -> None:
     """Add the verbs to the command line."""
-    for verb in (replay, report, bundle):
+    for verb in (replay, report, export, bundle):
         app.command()(verb)
 
 
-def replay(folder: Folder) -> int:
+def show_in_browser(target: str) -> int:
+    """Serve a recording or a live URL as a page until Ctrl-C, or until its server ends."""
+    from swarmctl.telemetry.view.web_page import web_page
+
+    with StopRequest(signal.SIGINT, signal.SIGTERM, signal.SIGHUP) as stop, web_page(target) as page:
+        print(f"open in a browser: {page.url}\nCtrl-C ends it", flush=True)
+        while page.process.poll() is None and not stop.is_set():
+            stop.wait(_LOOK_S)
+    return EXIT_OK
+
+
+def replay(folder: Folder, web: Web = False) -> int:
     """Open the recording of a run."""
     from swarmctl.telemetry.view.recordings import RECORDING, open_viewer
 
+    if web:
+        return show_in_browser(str(folder / RECORDING))
     open_viewer(str(folder / RECORDING))
     return EXIT_OK
 
@@ -51,6 +68,22 @@ def report(
     print(rewrite_report(folders[0]))
     if figures:
         print(write_figures(folders[0]))
+    return EXIT_OK
+
+
+def export(
+    folder: Folder,
+    mcap: Annotated[bool, typer.Option("--mcap", help="As MCAP, which Foxglove opens.")] = False,
+    output: Annotated[
+        Path | None, typer.Option("--output", metavar="FILE", help="File to write; default: beside the folder.")
+    ] = None,
+) -> int:
+    """Write a run in the format of another program."""
+    from swarmctl.ops.export import export_mcap
+
+    if not mcap:
+        raise ConfigError("export", ["say as what: --mcap"])
+    print(export_mcap(folder, output))
     return EXIT_OK
 
 

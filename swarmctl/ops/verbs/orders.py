@@ -6,13 +6,14 @@ Heavy modules are imported inside the verb that needs them, as in `swarmctl.ops.
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable
-from typing import Annotated, Any
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from swarmctl.core.operator_verbs import (
     GOTO,
+    MISSION,
     OPERATOR_VERBS,
     POINT,
     SPEED,
@@ -23,6 +24,9 @@ from swarmctl.core.operator_verbs import (
     order_problem,
 )
 from swarmctl.errors import EXIT_OK, ConfigError, MissionError
+
+if TYPE_CHECKING:
+    from swarmctl.ops.order_delivery import Reply
 
 Run = Annotated[
     str | None,
@@ -38,7 +42,7 @@ _ANSWERS = "Exit code 0: every agent asked has accepted; 4: one has refused, or 
 def add_order_verbs(to: typer.Typer) -> None:
     """Add every verb that is an order to agents to a command line."""
     for name, verb in OPERATOR_VERBS.items():
-        if name != GOTO:  # its point is an argument by itself
+        if name not in (GOTO, MISSION):  # a point is one argument, and a mission a file
             add_operator_verb(to, name, verb)
     minus = {"ignore_unknown_options": True}  # a point may begin with one
     to.command(GOTO, help=f"{OPERATOR_VERBS[GOTO].help} {_ANSWERS}", context_settings=minus)(_goto)
@@ -58,12 +62,21 @@ def _give(order: Order, run: str | None, agents: list[int]) -> int:
     from swarmctl.ops.order_delivery import deliver
 
     launch = operator.find_launch(run)
-    print(f"{order.verb}: {launch.run}")
-    replies = deliver(launch, order, agents)
+    return told(order.verb, launch.run, lambda: deliver(launch, order, agents))
+
+
+def told(verb: str, run: str, give: Callable[[], Sequence[Reply]]) -> int:
+    """Give an order to a launch, and print what each agent has answered; returns the exit code.
+
+    Raises:
+        MissionError: an agent refuses, or is silent.
+    """
+    print(f"{verb}: {run}")
+    replies = give()
     for reply in replies:
         print(reply.line)
     if problems := [reply.problem for reply in replies if reply.problem]:
-        raise MissionError(f"{order.verb}: {'; '.join(problems)}")
+        raise MissionError(f"{verb}: {'; '.join(problems)}")
     return EXIT_OK
 
 

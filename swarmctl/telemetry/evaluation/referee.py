@@ -104,7 +104,7 @@ def evaluate(
     refused = _shorten(list(refused_peers(run.events)))
     violations = [*problems, *apart, *clear, *inside, *unseen, *punctual, *refused, *_not_a_number(run.truth)]
     if outcome == "completed":
-        violations += _cut_short(tracked_s, rules)
+        violations += _cut_short(tracked_s, rules, run.events)
     summary = {
         "outcome": "failed" if outcome == "completed" and violations else outcome,
         "violations": violations,
@@ -404,12 +404,16 @@ def _not_a_number(truth: NDArray[np.void]) -> Iterator[str]:
         yield f"true position of agent {vehicle} is not a number: the simulation diverged"
 
 
-def _cut_short(tracked_s: Mapping[int, float], rules: Rules) -> Iterator[str]:
+def _cut_short(tracked_s: Mapping[int, float], rules: Rules, events: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """Yield whose mission was shorter than that of the configuration, or than the last one that was set in flight."""
     if rules.duration_s is None:
         return
+    changed = [event for event in events if event.get("event") == "mission_changed"]
+    asked_s = {event.get("source"): event.get("duration_s") for event in changed}
     for agent, seconds in tracked_s.items():
-        if seconds < rules.duration_s - _DURATION_SLACK_S:
-            yield f"mission time {seconds:.1f} s of agent {agent} below {rules.duration_s:g} s"
+        wanted_s = asked_s.get(f"agent-{agent}", rules.duration_s)
+        if isinstance(wanted_s, int | float) and seconds < wanted_s - _DURATION_SLACK_S:
+            yield f"mission time {seconds:.1f} s of agent {agent} below {wanted_s:g} s"
 
 
 def _percentiles(parts: Sequence[Array]) -> dict[str, float | None]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import signal
-import time
 from pathlib import Path
 
 import pytest
@@ -124,11 +123,13 @@ def test_an_agent_number_outside_the_swarm_is_refused_before_anything_is_opened(
         run_agent(AgentProcess(config_path=path, agent=2, run="run", bus="tcp/127.0.0.1:1", run_dir=tmp_path))
 
 
-def test_a_step_of_the_hosts_utc_is_followed_slowly(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_of_the_hosts_utc_is_followed_slowly() -> None:
     elapsed_ns, stepped_ns = 0, 0
-    monkeypatch.setattr(time, "monotonic_ns", lambda: 5_000_000_000 + elapsed_ns)
-    monkeypatch.setattr(time, "time_ns", lambda: 1_700_000_000_000_000_000 + elapsed_ns + stepped_ns)
-    clock = WallClock()
+
+    def utc_ns() -> int:
+        return 1_700_000_000_000_000_000 + elapsed_ns + stepped_ns
+
+    clock = WallClock(lambda: 5_000_000_000 + elapsed_ns, utc_ns)
     began_us = before_us = clock.utc_us()
     stepped_ns = -500_000_000
     for _ in range(100):
@@ -138,4 +139,4 @@ def test_a_step_of_the_hosts_utc_is_followed_slowly(monkeypatch: pytest.MonkeyPa
         before_us = now_us
     assert began_us + 2_000_000 - before_us == pytest.approx(20_000, abs=10), "1 % of the time that has passed"
     elapsed_ns += 100_000_000_000
-    assert clock.utc_us() == (time.time_ns()) // 1000
+    assert clock.utc_us() == utc_ns() // 1000

@@ -142,6 +142,23 @@ def test_a_peer_refused_for_long_counts_as_bus_loss_and_is_avoided_at_any_height
     assert bench.unresponsive[1]["lasted_s"] == pytest.approx(2.0, abs=0.1)
 
 
+@pytest.mark.parametrize(("peers", "silent_s"), [(1, 0.5), (2, 0.3)])
+def test_several_that_fall_silent_at_once_are_noticed_sooner_than_one(peers: int, silent_s: float) -> None:
+    """One may have lost a few messages; all of them have not."""
+    bench = Bench()
+    for agent in range(1, peers + 1):
+        path = builders.predicted_path(
+            agent=agent, t0_utc_us=bench.clock.utc_us(), dt_us=TICK_US, pos_ned_m=np.tile(HERE, (5, 1))
+        )
+        bench.hub.carry(agent_name(agent), topics.PATH, encode_path(path))
+    waited_us = 0
+    while not bench.world_model.has_unresponsive_peer(bench.clock.utc_us()):
+        bench.tick()
+        waited_us += TICK_US
+        assert waited_us < 2_000_000
+    assert waited_us * 1e-6 == pytest.approx(silent_s, abs=0.05)
+
+
 @pytest.mark.parametrize("why", ["gone", "done"])
 def test_a_peer_that_died_or_landed_is_not_reported_unresponsive(why: str) -> None:
     bench = Bench()

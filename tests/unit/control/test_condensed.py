@@ -160,6 +160,21 @@ def test_increments_are_within_their_bound_even_from_a_solver_that_stopped_early
         np.testing.assert_allclose(solution.pos_m[:, 0], pos, atol=1e-12)
 
 
+def test_an_answer_that_is_no_number_is_none() -> None:
+    problem = mpc(AXIS)
+    solve = problem.session.solver.solve
+
+    def spoilt(*values: Array) -> QpSolution:
+        solution = solve(*values)
+        assert solution.x is not None
+        return replace(solution, x=np.where(np.arange(len(solution.x)) == 1, np.nan, solution.x))
+
+    problem.session.solver.solve = spoilt  # type: ignore[method-assign, assignment]
+    solution = solve_one(problem, 0.0, 0.0, 0.0, 1.0)
+    assert not solution.solved
+    assert np.isfinite(solution.pos_m).all()
+
+
 def test_an_input_outside_its_bounds_comes_back_at_once() -> None:
     solution = solve_one(mpc(AXIS), 0.0, 0.0, 0.9, 0.0)
     assert np.abs(solution.u).max() <= 0.2 + 1e-6

@@ -9,8 +9,10 @@ import numpy as np
 import pytest
 
 from swarmctl.control.phases.state_machine import OPERATOR_STOP, TAKEN_OVER, MissionStateMachine
+from swarmctl.control.phases.trajectories import OfferedMission
+from swarmctl.control.reference.mission import MissionParams, MissionReference
 from swarmctl.core.flight_volume import FlightVolume, VolumeParams
-from swarmctl.core.operator_verbs import EXCLUDE, GOTO, OPERATOR_VERBS, order_problem
+from swarmctl.core.operator_verbs import BEGIN, EXCLUDE, GOTO, MISSION, OPERATOR_VERBS, order_problem
 from swarmctl.core.types import Array, FlightMode, Landed, Mode, Phase, Verb
 from tests.benches.state_machine_flight import IN_AIR, START, Flight, controlled, in_phase
 
@@ -53,15 +55,35 @@ def goes_there(flight: Flight) -> bool:
     return flight.state_machine.held and bool(np.allclose(place(flight), THERE))
 
 
+def flies_it(flight: Flight) -> bool:
+    """Whether it flies the mission that is offered, to its end, and no other."""
+    if flight.phase is Phase.TRACK:
+        pos, _ = flight.state_machine.reference(flight.utc_us, flight.now_us, np.array([OFFERED.duration_s - 0.1]))
+    else:
+        pos = flight.state_machine._reference.sample(np.array([OFFERED.duration_s]))[0]
+    return bool(np.allclose(pos.ravel(), ELSEWHERE)) and flight.state_machine._duration_us == OFFERED.duration_s * 1e6
+
+
+ELSEWHERE = (9.0, 9.0, -3.0)
+OFFERED = OfferedMission(
+    reference=MissionReference(
+        MissionParams.model_validate({"kind": "goto", "goto": {"goals_ned_m": [ELSEWHERE], "goal_assignment": False}}),
+        np.array([START]),
+        0,
+    ),
+    duration_s=77.0,
+    text="",
+)
 THERE = np.array([3.0, -2.0, -4.0])
 POINT = dict(zip(("north_m", "east_m", "down_m"), THERE.tolist(), strict=True))
-ARGUMENTS: dict[str, dict[str, float]] = {GOTO: POINT}
+ARGUMENTS: dict[str, dict[str, float]] = {GOTO: POINT, MISSION: {MISSION: 1.0, BEGIN: 0.0}}
 EFFECTS: dict[str, Callable[[Flight], bool]] = {
     "hold": is_held,
     "resume": goes_on,
     "land": ends,
     "rtl": ends,
     GOTO: goes_there,
+    MISSION: flies_it,
 }
 
 
@@ -70,8 +92,12 @@ EFFECTS: dict[str, Callable[[Flight], bool]] = {
 def test_each_verb_in_each_phase_has_its_effect_or_is_refused_with_a_reason(verb: str, phase: Phase) -> None:
     flight = in_phase(phase)
     machine = flight.state_machine
+    machine.offered = OFFERED
     before = machine.phase, machine.held, machine.outcome
-    refusal = flight.ask(verb, **ARGUMENTS.get(verb, {}))
+    arguments = dict(ARGUMENTS.get(verb, {}))
+    if BEGIN in arguments:
+        arguments[BEGIN] = flight.utc_us * 1e-6
+    refusal = flight.ask(verb, **arguments)
     if phase.name in OPERATOR_VERBS[verb].phases:
         assert refusal == ""
         assert EFFECTS[verb](flight)

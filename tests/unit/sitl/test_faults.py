@@ -77,6 +77,12 @@ def test_link_impairments(outwards: bool) -> None:
     delayed = through(outwards=outwards, delay_ms=100.0)
     assert [data for _, data in delayed] == [data for _, data in plain]
     assert {step - k for k, (step, _) in enumerate(delayed)} == {25}
+    jittered = through(outwards=outwards, jitter_ms=100.0)
+    assert {data for _, data in jittered} == {data for _, data in plain}
+    late = [step - int.from_bytes(data, "big") for step, data in jittered]
+    assert (min(late), max(late)) == (1, 25)
+    assert np.mean(late) == pytest.approx(13.0, abs=1.0)
+    assert any(b < a for a, b in itertools.pairwise(int.from_bytes(data, "big") for _, data in jittered))
     mixed = [int.from_bytes(data, "big") for _, data in through(outwards=outwards, reorder_01=0.2)]
     assert sorted(mixed) == list(range(1000))
     assert 100 < sum(b < a for a, b in itertools.pairwise(mixed)) < 200

@@ -471,6 +471,16 @@ def test_deadlocks_are_counted() -> None:
     assert evaluate(run(APART), Rules(agents=2, required_separation_m=0.5), "completed")["deadlocks"]["count"] == 0
 
 
+def test_a_mission_that_was_changed_in_flight_counts_with_its_own_duration() -> None:
+    rules = Rules(agents=2, required_separation_m=0.5, duration_s=38.0)
+    changed = [
+        {"event": "mission_changed", "source": f"agent-{agent}", "duration_s": duration_s}
+        for agent, duration_s in ((0, 5.0), (0, 20.5), (1, 30.0))
+    ]
+    summary = evaluate(run(APART, events=changed), rules, "completed")
+    assert summary["violations"] == ["mission time 20.0 s of agent 1 below 30 s"]
+
+
 def test_mission_cut_short_is_no_pass() -> None:
     assert (
         evaluate(run(APART), Rules(agents=2, required_separation_m=0.5, duration_s=20.5), "completed")["outcome"]

@@ -1,0 +1,37 @@
+"""Writes a recorded run in the format of another program."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from swarmctl.config import load_recorded
+from swarmctl.config_view import viewed_flight
+from swarmctl.errors import StartError
+from swarmctl.telemetry.export.mcap import RecordedFlight, write_mcap
+from swarmctl.telemetry.recording.run_files import read_plans
+from swarmctl.telemetry.recording.run_folder import read_judged
+
+
+def export_mcap(directory: Path, output: Path | None) -> Path:
+    """Write a finished run as MCAP, by default beside its folder, and return the file.
+
+    Raises:
+        ConfigError: it is no folder of a finished run.
+        StartError: the library for it is not installed, or the file can't be written.
+    """
+    config = load_recorded(directory)
+    judged = read_judged(directory, config.rules())
+    path = output or directory.resolve().with_name(f"{directory.resolve().name}.mcap")
+    recorded = RecordedFlight(
+        run=judged.run,
+        plans={agent: read_plans(directory, agent) for agent in judged.run.ticks},
+        flight=viewed_flight(config),
+        config_toml=judged.config_text,
+        summary_json=json.dumps(judged.summary, indent=2),
+    )
+    try:
+        write_mcap(path, recorded)
+    except OSError as error:
+        raise StartError(f"{path}: can't be written: {error.strerror or error}") from error
+    return path

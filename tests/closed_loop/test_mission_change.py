@@ -1,0 +1,134 @@
+"""Another mission for a swarm that flies: begun by all at one time, apart on the way, refused where it can't be."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from sitl.lockstep import Lockstep
+from swarmctl.bus import topics
+from swarmctl.bus.json_messages import encode_message
+from swarmctl.config import load, load_mission
+from swarmctl.core.operator_verbs import BEGIN, MISSION
+from swarmctl.core.types import Phase
+from swarmctl.errors import ConfigError
+from swarmctl.ops.mission_file import mission_message
+from tests.closed_loop.test_operator import fly_for, fly_until, outcome, phase
+
+HOVER = ("swarm.agents=2", "start.positions_ned_m=[[0,0,-3],[4,0,-3]]", "mission.kind=hover", "sitl.start=air")
+SWAP = """
+[mission]
+kind = "waypoints"
+duration_s = 9.0
+waypoints.speed_m_s = 1.5
+waypoints.lists = [
+  { points_ned_m = [[0.0, 0.0, -3.0], [2.0, 0.2, -3.0], [4.0, 1.0, -3.0]] },
+  { points_ned_m = [[4.0, 0.0, -3.0], [2.0, -0.2, -3.0], [0.0, -1.0, -3.0]] },
+]
+"""
+ENDS = np.array([[4.0, 1.0, -3.0], [0.0, -1.0, -3.0]])
+
+
+@pytest.fixture
+def swap(tmp_path: Path) -> Path:
+    path = tmp_path / "swap.toml"
+    path.write_text(SWAP)
+    return path
+
+
+def order(flight: Lockstep, path: Path, agent: int = -1, *, sent: bool = True) -> None:
+    """Do what `swarmctl mission set` does."""
+    message = mission_message(load_mission(flight.config, path))
+    if sent:
+        flight._operator.publish(topics.MISSION, encode_message(message))
+    arguments = {MISSION: float(message.mission), BEGIN: flight.clock.utc_us() * 1e-6 + 1.5}
+    flight.command(MISSION, agent, **arguments)
+
+
+def events(flight: Lockstep, agent: int, name: str) -> list[dict[str, object]]:
+    return [event for event in flight.logs[agent].events if event["event"] == name]
+
+
+@pytest.mark.parametrize("mode", ["best_effort", "guaranteed"])
+def test_a_hovering_swarm_flies_the_mission_of_a_file_at_one_time_and_apart(mode: str, swap: Path) -> None:
+    flight = Lockstep(load(None, (*HOVER, "mission.duration_s=60", f"separation.mode={mode}")))
+    fly_until(flight, lambda: phase(flight, 0) is phase(flight, 1) is Phase.TRACK)
+    fly_for(flight, 1.0)
+    order(flight, swap)
+    fly_for(flight, 3.0)
+    times_s = [float(log.rows[-1]["mission_t_s"][0]) for log in flight.logs]
+    assert times_s[0] == pytest.approx(1.5, abs=0.1)
+    assert times_s[1] == pytest.approx(times_s[0], abs=1e-3)
+    fly_until(flight, lambda: phase(flight, 0) > Phase.TRACK)
+    places = flight.world.truth_rows()["pos_ned_m"]
+    assert np.abs(places - ENDS).max() < 0.15, "where the file's lists end, when it does"
+    fly_until(flight, lambda: flight.finished)
+    assert [outcome(flight, agent) for agent in range(2)] == ["completed"] * 2
+    pos = flight.truth.reshape(-1, 2)["pos_ned_m"]
+    assert np.linalg.norm(pos[:, 0] - pos[:, 1], axis=1).min() >= 0.85
+
+
+def test_before_the_mission_it_is_what_all_begin_with(swap: Path) -> None:
+    flight = Lockstep(load(None, (*HOVER, "mission.duration_s=60")))
+    fly_until(flight, lambda: phase(flight, 0) is Phase.ARM)
+    order(flight, swap)
+    fly_until(flight, lambda: phase(flight, 0) > Phase.TRACK)
+    assert np.abs(flight.world.truth_rows()["pos_ned_m"] - ENDS).max() < 0.15
+
+
+def test_one_agent_flies_it_and_a_hold_stays_a_hold(swap: Path) -> None:
+    flight = Lockstep(load(None, (*HOVER, "mission.duration_s=60")))
+    fly_until(flight, lambda: phase(flight, 0) is phase(flight, 1) is Phase.TRACK)
+    flight.command("hold", 0)
+    fly_for(flight, 1.0)
+    order(flight, swap, agent=0)
+    fly_for(flight, 4.0)
+    places = flight.world.truth_rows()["pos_ned_m"]
+    assert np.abs(places - [[0.0, 0.0, -3.0], [4.0, 0.0, -3.0]]).max() < 0.2
+    assert not events(flight, 1, "operator")
+    flight.command("resume", 0)
+    fly_until(flight, lambda: phase(flight, 0) > Phase.TRACK)
+    moved = np.linalg.norm(flight.world.truth_rows()["pos_ned_m"] - places, axis=1)
+    assert moved[0] > 2.0 > moved[1], "agent 1 still hovers"
+
+
+def test_what_has_not_arrived_begins_another_day_or_can_not_be_flown_is_refused(tmp_path: Path, swap: Path) -> None:
+    flight = Lockstep(load(None, (*HOVER, "mission.duration_s=60")))
+    fly_until(flight, lambda: phase(flight, 0) is phase(flight, 1) is Phase.TRACK)
+    order(flight, swap, sent=False)
+    fly_for(flight, 0.1)
+    message = mission_message(load_mission(flight.config, swap))
+    flight._operator.publish(topics.MISSION, encode_message(message))
+    flight.command(MISSION, **{MISSION: float(message.mission), BEGIN: flight.clock.utc_us() * 1e-6 + 60.0})
+    fly_for(flight, 0.1)
+    for number, text in enumerate(
+        (
+            '{"kind": "goto", "goto": {"goals_ned_m": [[1, 2]]}}',
+            '{"kind": "os:PathLike"}',
+            '{"kind": "circle", "circle": {"radius_m": 5.0, "omega_rad_s": 3.0}}',
+        )
+    ):
+        flight._operator.publish(topics.MISSION, encode_message(type(message)(mission=number, text=text)))
+        flight.command(MISSION, **{MISSION: float(number), BEGIN: flight.clock.utc_us() * 1e-6})
+        fly_for(flight, 0.1)
+    reasons = [str(event["reason"]) for event in events(flight, 1, "order_refused")]
+    expected = ("has not arrived", "more than 10 s from now", "wrong value", "somebody else's code", "accelerates by")
+    assert len(reasons) == len(expected)
+    assert all(part in reason for part, reason in zip(expected, reasons, strict=True)), reasons
+    assert phase(flight, 1) is Phase.TRACK
+
+
+def test_a_file_that_this_swarm_can_not_fly_is_refused_before_it_is_sent(tmp_path: Path) -> None:
+    config = load(None, HOVER)
+    for text, said in (
+        ('name = "x"\n[mission]\nkind = "hover"', "is a file of \\[mission\\] alone"),
+        ('[mission]\nkind = "own_spiral:Spiral"', "only by a launch that was started with it"),
+        ('[mission]\nkind = "waypoints"\nwaypoints.lists = [{points_ned_m=[[0,0,-2]]}]', "a flight needs 2 or more"),
+        ('[mission]\nkind = "circle"\ncircle.omega_rad_s = 3.0', "accelerates by"),
+    ):
+        path = tmp_path / "mission.toml"
+        path.write_text(text)
+        with pytest.raises(ConfigError, match=said):
+            load_mission(config, path)

@@ -1,0 +1,144 @@
+"""Tests of runs exported as MCAP, read back by libraries that have not written them."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from mcap.reader import make_reader
+from scipy.spatial.transform import Rotation
+
+from swarmctl.api.run import load_run
+from swarmctl.config import Config, dump
+from swarmctl.core.obstacle import Obstacle
+from swarmctl.core.tick_record import COLUMNS
+from swarmctl.core.types import Phase
+from swarmctl.errors import ConfigError, StartError
+from swarmctl.ops.export import export_mcap
+from swarmctl.telemetry.recording.run_folder import Outcome, finish_run
+from swarmctl.telemetry.view.recordings import viewer_binary
+from tests.unit.telemetry.test_run_folder import write_run
+
+MOVING = Obstacle(center_ned_m=(1.0, 2.0, -3.0), vel_ned_m_s=(0.5, 0.0, 0.0))
+COLUMN = Obstacle(center_ned_m=(4.0, 0.0, 0.0), column=True)
+NED = np.array([1.0, 2.0, -3.0])  # 1 m north, 2 m east, 3 m up
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    directory = tmp_path_factory.mktemp("runs") / "flown"
+    directory.mkdir()
+    write_run(directory, 3, 3.0)
+    config = Config(obstacles=(MOVING, COLUMN))
+    (directory / "config.toml").write_text(dump(config))
+    finish_run(directory, config.rules(), Outcome(outcome="completed"))
+    return directory
+
+
+@pytest.fixture(scope="module")
+def path(folder: Path) -> Path:
+    return export_mcap(folder, None)
+
+
+def messages(path: Path, topic: str) -> list[tuple[int, Any]]:
+    """Return the messages of a topic with their times [ns], decoded by the schemas that are in the file."""
+    found = []
+    with path.open("rb") as file:
+        for schema, channel, message in make_reader(file, validate_crcs=True).iter_messages(topics=[topic]):
+            assert schema is not None
+            if channel.message_encoding == "json":
+                found.append((message.log_time, json.loads(message.data)))
+            else:
+                pool = descriptor_pool.DescriptorPool()
+                for described in descriptor_pb2.FileDescriptorSet.FromString(schema.data).file:
+                    pool.Add(described)
+                kind = message_factory.GetMessageClass(pool.FindMessageTypeByName(schema.name))
+                found.append((message.log_time, kind.FromString(message.data)))
+    return found
+
+
+def test_it_is_written_beside_the_run_and_holds_its_configuration_and_judgement(folder: Path, path: Path) -> None:
+    assert path == folder.parent / "flown.mcap"
+    with path.open("rb") as file:
+        attached = {attachment.name: attachment.data for attachment in make_reader(file).iter_attachments()}
+    assert attached["config.toml"].decode() == dump(load_run(folder).config)
+    assert json.loads(attached["summary.json"])["outcome"] == load_run(folder).outcome
+
+
+def test_every_recorded_value_is_there_with_unit_and_words(folder: Path, path: Path) -> None:
+    rows = load_run(folder).tick_rows(1)
+    ticks = messages(path, "/agent/1/tick")
+    assert [time_ns for time_ns, _ in ticks] == (rows["utc_us"] * 1000).tolist()
+    names = {column.name for column in COLUMNS}
+    assert set().union(*(tick for _, tick in ticks)) <= names
+    k = len(rows) // 2
+    assert ticks[k][1]["pos_ned_m"] == dict(zip("xyz", rows["pos_ned_m"][k].tolist(), strict=True))
+    assert ticks[k][1]["phase"] == Phase(int(rows["phase"][k])).name
+    with path.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    schema = next(s for s in summary.schemas.values() if s.name == "swarmctl.agent.1.tick")
+    described = json.loads(schema.data)["properties"]
+    assert described.keys() == names
+    assert described["solve_ms"]["description"].endswith("[ms]")
+    assert described["phase"]["type"] == "string"
+
+
+def test_up_is_up_and_a_vehicle_is_where_it_was(folder: Path, path: Path) -> None:
+    frames = messages(path, "/tf")
+    root = next(frame for _, frame in frames if frame.parent_frame_id == "world")
+    q = root.rotation
+    np.testing.assert_allclose(Rotation.from_quat([q.x, q.y, q.z, q.w]).apply(NED), [2.0, 1.0, 3.0], atol=1e-12)
+    rows = load_run(folder).tick_rows(2)
+    last = [frame for _, frame in frames if frame.child_frame_id == "agent-2"][-1]
+    assert last.parent_frame_id == "ned"
+    at = last.translation
+    np.testing.assert_allclose([at.x, at.y, at.z], rows["pos_ned_m"][-1])
+    turned = Rotation.from_quat([last.rotation.x, last.rotation.y, last.rotation.z, last.rotation.w])
+    expected = Rotation.from_quat(rows["q_nb"][-1], scalar_first=True)
+    assert (turned.inv() * expected).magnitude() < 1e-6
+
+
+def test_vehicles_references_and_obstacles_are_drawn(path: Path) -> None:
+    drawn = [(at_ns, entity) for at_ns, update in messages(path, "/scene") for entity in update.entities]
+    names = {entity.id for _, entity in drawn}
+    assert {f"{what}-{agent}" for what in ("agent", "reference") for agent in range(3)} <= names
+    begin_ns = min(at_ns for at_ns, _ in drawn)
+    moving = [(at_ns, entity) for at_ns, entity in drawn if entity.id == "obstacle-0"]
+    at_ns, entity = moving[-1]
+    moved_m = entity.spheres[0].pose.position.x - MOVING.center_ned_m[0]
+    assert moved_m == pytest.approx(0.5 * (at_ns - begin_ns) * 1e-9, abs=1e-3)
+    assert moved_m > 1.0
+    assert next(entity for _, entity in drawn if entity.id == "obstacle-1").cylinders
+
+
+def test_events_are_a_log_in_order_of_time(folder: Path, path: Path) -> None:
+    logs = messages(path, "/events")
+    assert len(logs) == len(load_run(folder).events)
+    assert [at_ns for at_ns, _ in logs] == sorted(at_ns for at_ns, _ in logs)
+
+
+def test_another_program_opens_it_and_finds_all_in_order(path: Path) -> None:
+    checked = subprocess.run([viewer_binary(), "mcap", "check", path], capture_output=True, text=True, check=False)
+    assert checked.returncode == 0
+    assert "PROBLEM" not in checked.stdout
+    assert checked.stdout.count("\nok") == 9  # of three agents: frames, scene, ticks, true states, events
+
+
+def test_without_the_library_it_is_said_how_to_install_it(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "foxglove", None)
+    with pytest.raises(StartError, match=r"pip install 'swarmctl\[mcap\]'"):
+        export_mcap(folder, None)
+
+
+def test_a_folder_without_a_run_and_a_file_that_can_not_be_written_are_named(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError):
+        export_mcap(tmp_path, None)
+    with pytest.raises(StartError, match="can't be written"):
+        export_mcap(folder, tmp_path / "nowhere" / "run.mcap")
