@@ -1,4 +1,4 @@
-"""Measures what protections cost: of a tick seals and MAVLink signatures, of the bus seals and access control.
+"""Measures what protections cost: of a tick seals and MAVLink signatures, of the bus TLS, access control and seals.
 
     python tools/protection_cost.py --flights 3 --seconds 10
 
@@ -48,8 +48,13 @@ LOOPBACK = ip_address("127.0.0.1")
 FLIGHT_S = 15.0
 SAID = {PATH: 632, TRAJECTORY: 1800, TICK: 1500, STATUS: 900}  # bytes, about as in flight
 TICK_S, STATUS_TICKS = 0.02, 10
-OPEN = "import swarmctl.bus.network.router_links as links; links.access_settings = lambda *_: {}\n"
-LAWLESS = ("-c", OPEN + "from swarmctl.bus.network.router import main\nraise SystemExit(main())")
+RUN_ROUTER = "from swarmctl.bus.network.router import main\nraise SystemExit(main())"
+OPEN = "import swarmctl.bus.network.router_links as links\nlinks.access_settings = lambda *_: {}\n"
+OVER_UDP = """import json
+import swarmctl.bus.network.router as router
+opened = router.open_session
+router.open_session = lambda settings: opened(json.loads(json.dumps(settings).replace("quic/", "udp/")))
+"""
 Connect = Callable[[LocalHub, str, Subscriptions | None], Bus]
 LAWFUL = ("-m", "swarmctl.bus.network.router")
 
@@ -157,8 +162,13 @@ def bus_s(folder: Path, hosts: Sequence[HostParams], module: Sequence[str], plai
 
 
 def compare_bus(seconds: float, runs: int) -> None:
-    """Print the processor time of the bus with and without seals and access control."""
-    cases = {"neither": (LAWLESS, True), "access control": (LAWFUL, True), "and seals": (LAWFUL, False)}
+    """Print the processor time of the bus with and without TLS, access control and seals."""
+    cases = {
+        "links over UDP": (("-c", OPEN + OVER_UDP + RUN_ROUTER), True),
+        "over QUIC with TLS": (("-c", OPEN + RUN_ROUTER), True),
+        "and access control": (LAWFUL, True),
+        "and seals": (LAWFUL, False),
+    }
     with tempfile.TemporaryDirectory() as name:
         hosts = [
             HostParams(name=f"host-{i}", address=f"127.0.0.1:{port}", agents=(2 * i, 2 * i + 1))
@@ -169,7 +179,7 @@ def compare_bus(seconds: float, runs: int) -> None:
         for _ in range(runs):
             for case, (module, plain) in cases.items():
                 spent[case].append(bus_s(Path(name), hosts, module, plain, seconds))
-    before_s = statistics.median(spent["neither"])
+    before_s = statistics.median(spent["links over UDP"])
     for case, found_s in spent.items():
         median_s = statistics.median(found_s)
         change = 100 * (median_s / before_s - 1)
