@@ -187,8 +187,8 @@ class Agent:
 
     @property
     def finished(self) -> bool:
-        """Whether this agent and every peer still on the bus are done."""
-        return self.done and all(p.phase is Phase.DONE or not p.alive for p in self._world_model.peers().values())
+        """Whether this agent and every peer that is still heard on the bus are done."""
+        return self.done and not self._world_model.has_company(self._clock.utc_us())
 
     @property
     def outcome(self) -> str:

@@ -27,6 +27,7 @@ from swarmctl.core.trajectory import Trajectory
 from swarmctl.core.trajectory_message import TrajectoryMessage
 from swarmctl.core.types import Array, Mode, Phase
 
+_COMPANY_US = 10_000_000  # a peer whose last status is older has left
 _RECENT_PATH_US = 300_000  # largest age of a path that is compared with commitments
 _BUS_LOST_US = 300_000  # without a path of anybody, of several: they share one at least every 0.25 s
 _STATUS_LEAD_US = 1_000_000  # largest lead of a peer's clock over ours
@@ -68,6 +69,7 @@ class WorldModel:
         self._ends, self._vouchers = Orders(agent, self.refusals, topics.ENDED), vouchers
         self._unresponsive_since_us: dict[int, int] = {}
         self._status: dict[int, StatusMessage] = {}
+        self._status_us: dict[int, int] = {}  # UTC of the newest one's arrival
         self._vouched: dict[int, int | None] = {}  # boot id of each agent that somebody says has ended
         self._obstacles: tuple[ListedObstacle, ...] = ()
         self._obstacles_version: int | None = None
@@ -124,7 +126,7 @@ class WorldModel:
         elif self._verifiers[status.agent].accepts(
             ReceivedMessage(status.boot_id, status.ticks, status.utc_us, payload), utc_us
         ):
-            self._status[status.agent] = status
+            self._status[status.agent], self._status_us[status.agent] = status, utc_us
 
     def _take_obstacles(self, sender: str, payload: bytes, utc_us: int) -> None:
         message, known = decode_obstacles(payload), self._obstacles_version
@@ -295,6 +297,19 @@ class WorldModel:
             agent: PeerInputs(Phase(status.phase), self._ready_utc_us(status), agent_name(agent) in alive)
             for agent, status in self._status.items()
         }
+
+    def has_company(self, utc_us: int) -> bool:
+        """Return whether some peer is on the bus and not done.
+
+        A liveliness token alone is no proof: one of a computer that was lost may stay for good on a router of another
+        one. So a peer that is silent for long is no company.
+        """
+        since_us = utc_us - _COMPANY_US
+        alive = self._bus.alive()
+        return any(
+            status.phase != Phase.DONE and agent_name(agent) in alive and self._status_us[agent] >= since_us
+            for agent, status in self._status.items()
+        )
 
     def _ready_utc_us(self, status: StatusMessage) -> int:
         """Return when a peer reached its start, by the own clock; 0 before."""

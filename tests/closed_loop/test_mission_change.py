@@ -101,7 +101,7 @@ def test_what_has_not_arrived_begins_another_day_or_can_not_be_flown_is_refused(
     fly_for(flight, 0.1)
     message = mission_message(load_mission(flight.config, swap))
     flight._operator.publish(topics.MISSION, encode_message(message))
-    flight.command(MISSION, **{MISSION: float(message.mission), BEGIN: flight.clock.utc_us() * 1e-6 + 60.0})
+    flight.command(MISSION, agent=-1, **{MISSION: float(message.mission), BEGIN: flight.clock.utc_us() * 1e-6 + 60.0})
     fly_for(flight, 0.1)
     for number, text in enumerate(
         (
@@ -111,7 +111,7 @@ def test_what_has_not_arrived_begins_another_day_or_can_not_be_flown_is_refused(
         )
     ):
         flight._operator.publish(topics.MISSION, encode_message(type(message)(mission=number, text=text)))
-        flight.command(MISSION, **{MISSION: float(number), BEGIN: flight.clock.utc_us() * 1e-6})
+        flight.command(MISSION, agent=-1, **{MISSION: float(number), BEGIN: flight.clock.utc_us() * 1e-6})
         fly_for(flight, 0.1)
     reasons = [str(event["reason"]) for event in events(flight, 1, "order_refused")]
     expected = ("has not arrived", "more than 10 s from now", "wrong value", "somebody else's code", "accelerates by")

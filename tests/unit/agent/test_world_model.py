@@ -322,3 +322,28 @@ def test_who_has_never_been_heard_is_excused_until_it_is_heard() -> None:
     bench.tick()
     assert bench.world_model.excused == set()
     assert not bench.world_model.has_ended(1), "this is another process than the one that was vouched for"
+
+
+def test_who_is_silent_for_long_is_no_company_though_its_token_stays() -> None:
+    """A router may keep the token of a computer that was lost for good: nobody would end."""
+    bench = Bench()
+    bench.say_status(phase=Phase.TRACK)
+    bench.tick()
+    assert bench.world_model.has_company(bench.clock.utc_us())
+    bench.clock.advance(9_000_000)
+    assert bench.world_model.has_company(bench.clock.utc_us())
+    bench.clock.advance(2_000_000)
+    assert agent_name(1) in bench.bus.alive()
+    assert not bench.world_model.has_company(bench.clock.utc_us())
+
+
+def test_who_is_done_or_has_left_is_no_company() -> None:
+    bench = Bench()
+    bench.say_status(phase=Phase.DONE)
+    bench.tick()
+    assert not bench.world_model.has_company(bench.clock.utc_us())
+    bench.say_status(phase=Phase.TRACK, ticks=2)
+    bench.tick()
+    assert bench.world_model.has_company(bench.clock.utc_us())
+    bench.peer.close()
+    assert not bench.world_model.has_company(bench.clock.utc_us())
