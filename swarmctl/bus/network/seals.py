@@ -6,9 +6,9 @@ SHA-256 digest of run, sender, topic, header and payload. So what one computer i
 to another run, sender or topic by any other one, also not by a router on the way or by another receiver.
 
 A signature would need one value instead of a tag for each, but Ed25519 takes 48 us to make and 129 us to verify. A seal
-for four identities takes 2.4 us, each further identity 0.3 us more; opening one takes 1.9 us. That is done a few hundred
-times a second, in ticks of a few milliseconds. What a signature has beyond a tag, that a third party can be shown who
-has said something, nothing here needs.
+for four identities takes 2.4 us, each further identity 0.3 us more; opening one takes 1.9 us. That is done a few
+hundred times a second, in ticks of a few milliseconds. What a signature has beyond a tag, that a third party can be
+shown who has said something, nothing here needs.
 """
 
 from __future__ import annotations
