@@ -131,7 +131,8 @@ def routers(folder: Path, hosts: Sequence[HostParams], module: Sequence[str]) ->
     for host in hosts:
         identity = OwnIdentity(folder=str(folder), name=host.name, roster=roster_of(hosts, relay=False))
         place = Path(tempfile.mkdtemp(prefix=f"sw-{host.name}"))
-        command = [sys.executable, *module, f"{SCHEME}{place}/bus.sock", *links_of(hosts, identity).arguments()]
+        command = [sys.executable, *module, f"{SCHEME}{place}/bus.sock", "--die-with-parent"]
+        command += links_of(hosts, identity).arguments()
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         assert process.stdout is not None
         process.stdout.readline()
