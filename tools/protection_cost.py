@@ -1,10 +1,10 @@
-"""Measures what protections cost: of a tick seals and MAVLink signatures, of the bus seals and access control.
+"""Measures what protections cost: of a tick seals and MAVLink signatures, of the bus TLS, access control and seals.
 
     python tools/protection_cost.py --flights 3 --seconds 10
 
-The tick is that of `configs/three_hosts.toml` in lockstep, with and without, in turn; the flights are the same bit for
-bit. The bus is three routers on loopback, with two clients each that say and hear as much as agents do. Times are
-processor times, which a busy machine hardly changes.
+The tick is that of `configs/three_hosts.toml` in lockstep, with and without, in turn tick by tick; the flights are the
+same bit for bit. The bus is three routers on loopback, with two clients each that say and hear as much as agents do.
+Times are processor times, which a busy machine changes less.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from ipaddress import ip_address
 from pathlib import Path
 from unittest import mock
@@ -32,7 +32,7 @@ from swarmctl.bus.network.identity_files import STATION
 from swarmctl.bus.network.joining import join_bus
 from swarmctl.bus.network.roster import OwnIdentity, identity_of_json
 from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US
-from swarmctl.bus.peers import Bus, LocalHub, agent_name
+from swarmctl.bus.peers import Bus, LocalHub, Subscriptions, agent_name
 from swarmctl.bus.topics import PATH, STATUS, TICK, TRAJECTORY
 from swarmctl.bus.zenoh_bus import SCHEME
 from swarmctl.config import Config, load
@@ -48,29 +48,37 @@ LOOPBACK = ip_address("127.0.0.1")
 FLIGHT_S = 15.0
 SAID = {PATH: 632, TRAJECTORY: 1800, TICK: 1500, STATUS: 900}  # bytes, about as in flight
 TICK_S, STATUS_TICKS = 0.02, 10
-OPEN = "import swarmctl.bus.network.router_links as links; links.access_settings = lambda *_: {}\n"
-LAWLESS = ("-c", OPEN + "from swarmctl.bus.network.router import main\nraise SystemExit(main())")
+RUN_ROUTER = "from swarmctl.bus.network.router import main\nraise SystemExit(main())"
+OPEN = "import swarmctl.bus.network.router_links as links\nlinks.access_settings = lambda *_: {}\n"
+OVER_UDP = """import json
+import swarmctl.bus.network.router as router
+opened = router.open_session
+router.open_session = lambda settings: opened(json.loads(json.dumps(settings).replace("quic/", "udp/")))
+"""
+Connect = Callable[[LocalHub, str, Subscriptions | None], Bus]
 LAWFUL = ("-m", "swarmctl.bus.network.router")
 
 
-def ticks_ms(config: Config, connect: Callable[..., Bus] | None) -> list[float]:
-    """Return the processor time of every tick of a mission."""
-    spent_ms, tick = list[float](), Agent.tick
+def ticks_ms(cases: Mapping[str, tuple[Config, Connect | None]]) -> dict[str, list[float]]:
+    """Return the processor time of every tick of the mission in each case, flown in turn, tick by tick."""
+    spent_ms: dict[str, list[float]] = {case: [] for case in cases}
+    tick, flying = Agent.tick, ""
 
     def timed(agent: Agent, now_us: int, deadline_misses: int) -> TickRecord:
         began_ns = time.thread_time_ns()
         record = tick(agent, now_us, deadline_misses)
         if record.phase is Phase.TRACK:
-            spent_ms.append((time.thread_time_ns() - began_ns) * 1e-6)
+            spent_ms[flying].append((time.thread_time_ns() - began_ns) * 1e-6)
         return record
 
-    with contextlib.ExitStack() as stack:
-        stack.enter_context(mock.patch.object(Agent, "tick", timed))
-        if connect is not None:
-            stack.enter_context(mock.patch.object(LocalHub, "connect", connect))
-        flight = Lockstep(config)
-        while flight.clock.now_us() < FLIGHT_S * 1e6:
-            flight.step()
+    flights = {}
+    for case, (config, connect) in cases.items():
+        with mock.patch.object(LocalHub, "connect", LocalHub.connect if connect is None else connect):
+            flights[case] = Lockstep(config)
+    with mock.patch.object(Agent, "tick", timed):
+        while any(flight.clock.now_us() < FLIGHT_S * 1e6 for flight in flights.values()):
+            for flying, flight in flights.items():  # noqa: B007  (`timed` reads it)
+                flight.step()
     return spent_ms
 
 
@@ -85,15 +93,13 @@ def compare_ticks(flights: int) -> None:
         signed = load(CONFIG, ["sitl.start=air", f"mavlink.signing_keys={files}"])
         connect = SealedHub.of(plain.hosts, folder / "identities").connect
         cases = {"neither": (plain, None), "seals": (plain, connect), "seals, signatures": (signed, connect)}
-        spent_ms: dict[str, list[list[float]]] = {case: [] for case in cases}
-        for _ in range(flights):
-            for case, (config, joined) in cases.items():
-                spent_ms[case].append(ticks_ms(config, joined))
-    least = {case: [min(same) for same in zip(*runs, strict=True)] for case, runs in spent_ms.items()}
+        runs = [ticks_ms(cases) for _ in range(flights)]
+    least = {case: [min(same) for same in zip(*(run[case] for run in runs), strict=True)] for case in cases}
     before_ms = statistics.median(least["neither"])
     for case, ticks in least.items():
+        more_ms = statistics.median(after - before for after, before in zip(ticks, least["neither"], strict=True))
         p50_ms = statistics.median(ticks)
-        print(f"tick, {case}: p50 {p50_ms:.3f} ms, {100 * (p50_ms / before_ms - 1):+.1f} %", flush=True)
+        print(f"tick, {case}: p50 {p50_ms:.3f} ms; each {1e3 * more_ms:+.0f} us, {100 * more_ms / before_ms:+.1f} %")
 
 
 def client(endpoint: str, me: str, identity: str, seconds: float) -> None:
@@ -125,7 +131,8 @@ def routers(folder: Path, hosts: Sequence[HostParams], module: Sequence[str]) ->
     for host in hosts:
         identity = OwnIdentity(folder=str(folder), name=host.name, roster=roster_of(hosts, relay=False))
         place = Path(tempfile.mkdtemp(prefix=f"sw-{host.name}"))
-        command = [sys.executable, *module, f"{SCHEME}{place}/bus.sock", *links_of(hosts, identity).arguments()]
+        command = [sys.executable, *module, f"{SCHEME}{place}/bus.sock", "--die-with-parent"]
+        command += links_of(hosts, identity).arguments()
         process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         assert process.stdout is not None
         process.stdout.readline()
@@ -156,8 +163,13 @@ def bus_s(folder: Path, hosts: Sequence[HostParams], module: Sequence[str], plai
 
 
 def compare_bus(seconds: float, runs: int) -> None:
-    """Print the processor time of the bus with and without seals and access control."""
-    cases = {"neither": (LAWLESS, True), "access control": (LAWFUL, True), "and seals": (LAWFUL, False)}
+    """Print the processor time of the bus with and without TLS, access control and seals."""
+    cases = {
+        "links over UDP": (("-c", OPEN + OVER_UDP + RUN_ROUTER), True),
+        "over QUIC with TLS": (("-c", OPEN + RUN_ROUTER), True),
+        "and access control": (LAWFUL, True),
+        "and seals": (LAWFUL, False),
+    }
     with tempfile.TemporaryDirectory() as name:
         hosts = [
             HostParams(name=f"host-{i}", address=f"127.0.0.1:{port}", agents=(2 * i, 2 * i + 1))
@@ -168,7 +180,7 @@ def compare_bus(seconds: float, runs: int) -> None:
         for _ in range(runs):
             for case, (module, plain) in cases.items():
                 spent[case].append(bus_s(Path(name), hosts, module, plain, seconds))
-    before_s = statistics.median(spent["neither"])
+    before_s = statistics.median(spent["links over UDP"])
     for case, found_s in spent.items():
         median_s = statistics.median(found_s)
         change = 100 * (median_s / before_s - 1)

@@ -141,10 +141,12 @@ def refuse_unidentified(config: Config, name: str) -> None:
     Raises:
         ConfigError: it can't, or has not.
     """
-    from swarmctl.bus.network.keyring import load_keyring  # loads cryptography, which one computer alone does not need
+    from swarmctl.bus.network.keyring import (
+        refuse_distrusted,  # loads cryptography, which one computer alone does not need
+    )
 
     _folder_of(config)
-    load_keyring(own_identity(config, name))
+    refuse_distrusted(own_identity(config, name))
 
 
 def _folder_of(config: Config) -> Path:

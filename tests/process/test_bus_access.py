@@ -17,7 +17,7 @@ from swarmctl.bus.network.identity_files import STATION
 from swarmctl.bus.network.joining import join_bus
 from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US
 from swarmctl.bus.peers import Bus
-from swarmctl.bus.topics import COMMAND, ENDED, OBSTACLES, PATH, STATUS, Topic
+from swarmctl.bus.topics import COMMAND, ENDED, MISSION, OBSTACLES, PATH, STATUS, Topic
 from swarmctl.bus.zenoh_bus import ZenohBus
 from tests.benches.free_ports import free_ports
 from tests.benches.swarm_of_hosts import LOOPBACK, SwarmOfHosts
@@ -29,7 +29,7 @@ SAID = (
     *((name, PATH) for name in AGENTS),
     *((name, COMMAND) for name in ("alpha", "bravo", "charlie", STATION)),
     *((name, ENDED) for name in ("bravo", "charlie")),
-    *((name, OBSTACLES) for name in ("alpha", "charlie")),
+    *((name, topic) for name in ("alpha", "charlie") for topic in (MISSION, OBSTACLES)),
 )
 OPEN = "import swarmctl.bus.network.router_links as links; links.access_settings = lambda *_: {}\n"
 ROGUE = ("-c", OPEN + "from swarmctl.bus.network.router import main\nraise SystemExit(main())")
@@ -90,12 +90,12 @@ def test_an_identity_brings_what_is_its_own_only(swarm: SwarmOfHosts) -> None:
     own = {("charlie", "agent-2", "path"), ("charlie", "charlie", "ended")}
     assert {said for said in heard["alpha"] if said[0] == "charlie"} == own
     assert {said for said in heard["bravo"] if said[0] == "charlie"} == own
-    of_alpha = {("alpha", "agent-0", "path"), ("alpha", "alpha", "command"), ("alpha", "alpha", "obstacles")}
+    operators = {("alpha", "alpha", topic) for topic in ("command", "mission", "obstacles")}
+    of_alpha = {("alpha", "agent-0", "path"), *operators}
     assert {said for said in heard["bravo"] if said[0] == "alpha"} == of_alpha, "it has an operator's identity"
+    assert {said for said in heard["alpha"] if said[0] == "alpha"} == of_alpha, "nor do clients on the host itself"
     of_bravo = {("bravo", "agent-1", "path"), ("bravo", "bravo", "ended")}
     assert {said for said in heard["alpha"] if said[0] == "bravo"} == of_bravo, "it has none"
-    here = {("alpha", "agent-0", "path"), ("alpha", "alpha", "command"), ("alpha", "alpha", "obstacles")}
-    assert {said for said in heard["alpha"] if said[0] == "alpha"} == here, "nor does a client on the host itself"
 
 
 def test_negative_control_without_access_control_it_brings_anything(swarm: SwarmOfHosts) -> None:

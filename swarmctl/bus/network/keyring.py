@@ -8,7 +8,8 @@ the links of routers check it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from hashlib import blake2b
 from pathlib import Path
@@ -52,14 +53,38 @@ def load_keyring(identity: OwnIdentity) -> Keyring:
     """Read the certificates that are trusted, and derive the keys that are shared with each.
 
     Raises:
-        ConfigError: the own identity can't be used, a host's is missing or does not count, or a file is damaged.
+        ConfigError: the own files can't be used, or a file is damaged.
     """
+    with _reported(identity):
+        folder = Path(identity.folder)
+        trusted, _ = _trusted(folder, identity)
+        return Keyring(keys=_shared_keys(folder, identity, trusted), common_names=_common_names(trusted))
+
+
+def refuse_distrusted(identity: OwnIdentity) -> None:
+    """Check before a flight that every host has a certificate that counts; only the station's may be missing.
+
+    In flight nobody asks: who is revoked meanwhile must not keep others from starting a router again.
+
+    Raises:
+        ConfigError: one has none, or the own files can't be used.
+    """
+    with _reported(identity):
+        _, problems = _trusted(Path(identity.folder), identity)
+        needed = [speaker.name for speaker in identity.roster.speakers if speaker.agents] + [identity.name]
+        if found := [problems[name] for name in dict.fromkeys(needed) if name in problems]:
+            raise ConfigError(identity.name, found)
+        load_keyring(identity)
+
+
+@contextmanager
+def _reported(identity: OwnIdentity) -> Iterator[None]:
+    """Raise a ConfigError in place of what goes wrong with the files of an identity."""
     folder = Path(identity.folder)
     if problems := list(identity_problems(folder, identity.name)):
         raise ConfigError(identity.name, problems)
     try:
-        trusted = _trusted(folder, identity)
-        return Keyring(keys=_shared_keys(folder, identity, trusted), common_names=_common_names(trusted))
+        yield
     except OSError as error:
         raise ConfigError(identity.name, [f"bus.identities: {error.filename}: {error.strerror}"]) from error
     except ValueError as error:
@@ -93,20 +118,18 @@ def read_certificate(folder: Path, name: str) -> x509.Certificate:
     return x509.load_pem_x509_certificate(read_file(folder / certificate_file(name), MOST_BYTES))
 
 
-def _trusted(folder: Path, identity: OwnIdentity) -> dict[str, x509.Certificate]:
-    """Return the certificates that count; a host's that doesn't is refused, the station may have none."""
+def _trusted(folder: Path, identity: OwnIdentity) -> tuple[dict[str, x509.Certificate], dict[str, str]]:
+    """Return the certificates that count, by identity, and why those of others do not."""
     authority = read_certificate(folder, AUTHORITY)
     revoked = revoked_serials(folder, authority)
-    found, problems = dict[str, x509.Certificate](), list[str]()
+    found, problems = dict[str, x509.Certificate](), dict[str, str]()
     for speaker in identity.roster.speakers:
         problem, certificate = _judged(folder, speaker.name, authority, revoked)
-        if certificate is not None:
+        if certificate is None:
+            problems[speaker.name] = problem
+        else:
             found[speaker.name] = certificate
-        elif speaker.agents or speaker.name == identity.name:
-            problems.append(problem)
-    if problems:
-        raise ConfigError(identity.name, problems)
-    return found
+    return found, problems
 
 
 def _judged(
@@ -137,7 +160,7 @@ def _shared_keys(
     if not isinstance(private, ec.EllipticCurvePrivateKey):
         raise ValueError(f"{key_file(identity.name)} is of another kind")
     own = _public(private.public_key())
-    if own != _public(trusted[identity.name].public_key()):
+    if own != _public(read_certificate(folder, identity.name).public_key()):
         raise ValueError(f"{key_file(identity.name)} is not the key of {certificate_file(identity.name)}")
     names = (speaker.name for speaker in identity.roster.speakers)
     return tuple(_shared(private, own, trusted[name]) if name in trusted else None for name in names)

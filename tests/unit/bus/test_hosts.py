@@ -209,3 +209,14 @@ def replace(folder: Path, other: Path, name: str, by: str) -> None:
 def test_names_of_others_are_no_names_of_hosts(name: str) -> None:
     with pytest.raises(ConfigError, match="reserved"):
         load(CONFIG, [f"{ALPHA}name='{name}'"])
+
+
+def test_who_is_revoked_in_flight_keeps_nobody_from_starting_a_router_again(path: Path) -> None:
+    make_host_identities(path)
+    identity = own_identity(load(path), "alpha")
+    revoke_host_identity(path, "bravo")
+    keyring = load_keyring(identity)
+    assert sorted(keyring.common_names) == ["alpha", "charlie", "station"]
+    assert [key is None for key in keyring.keys] == [False, True, False, False]
+    with pytest.raises(ConfigError, match=r"bravo\.pem: missing"):
+        load_host(path, [0, 1])
