@@ -11,7 +11,6 @@ from tests.faults.process_events import (
     agent_stopped_for_2_s,
     agent_stopped_for_20_s,
     in_program,
-    launcher_stopped,
     loss_after,
     router_killed_again_and_again,
     router_stopped,
@@ -166,15 +165,6 @@ ROWS = (
         protection="the viewer is watched",
         script=viewer_stopped,
         off=in_program("launch", SUPERVISOR + "supervisor.FlightSupervisor._watch_viewer = lambda *_: None"),
-    ),
-    LaunchedRow(
-        name="process-launcher-stopped",
-        event="the launcher is stopped for 8 s",
-        reaction="nobody is called silent; the mission is completed",
-        within_s=90.0,
-        protection="the launcher excuses its own pauses",
-        script=launcher_stopped,
-        off=in_program("launch", SUPERVISOR + "supervisor.FlightSupervisor._excuse_own_pause = lambda *_: None"),
     ),
     LaunchedRow(
         name="process-launcher-killed",
