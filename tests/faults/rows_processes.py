@@ -48,6 +48,15 @@ def write(self, event, **fields):
         file.write(json.dumps({"utc_us": 0, "t_us": 0, "source": self._source, "event": event, **fields}) + "\\n")
 log.EventLog.write = write
 """
+TRUTH_RAISES = """
+import sitl.realtime as it
+record = it.TruthFile.record
+def raising(self, world, now_us):
+    record(self, world, now_us)
+    if self._broken is not None:
+        raise self._broken
+it.TruthFile.record = raising
+"""
 ROWS = (
     LaunchedRow(
         name="process-agent-stopped-0.3s",
@@ -235,10 +244,10 @@ ROWS = (
             event=f"the disk is full from {phase} on",
             reaction="the mission is flown to its end, the verdict printed, what is missing named",
             within_s=90.0,
-            protection="a full disk loses events, never the flight",
+            protection="a full disk loses records, never the flight",
             script=disk_full(phase),
             readable=False,
-            off=in_program("launch", RAISES),
+            off=in_program("launch", RAISES) if phase == "TRACK" else in_program("sitl", TRUTH_RAISES),
         )
         for phase in ("STANDBY", "TRACK", "LAND")
     ),
