@@ -63,6 +63,7 @@ def disk_full(phase: str) -> Callable[[Start], None]:
             require(code == 4, f"exit code {code}: {launched.text()[-600:]}")
             wanted = "completed" if phase in ("TRACK", "LAND") else "failed"  # what is not recorded can't be judged
             require(launched.verdict().startswith(wanted), launched.verdict())
+            require(launched.said("agent-1  TRACK"), "the mission was not flown")
             require("No space left" in launched.text(), "it does not say that the disk is full")
 
     return script
