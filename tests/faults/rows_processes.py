@@ -247,7 +247,7 @@ ROWS = (
             protection="a full disk loses records, never the flight",
             script=disk_full(phase),
             readable=False,
-            off=in_program("launch", RAISES) if phase == "TRACK" else in_program("sitl", TRUTH_RAISES),
+            off=in_program("sitl", TRUTH_RAISES),
         )
         for phase in ("STANDBY", "TRACK", "LAND")
     ),
