@@ -35,7 +35,7 @@ LONGEST = [  # over a minute each
     "closed_loop/test_obstacle.py",
     "closed_loop/test_processors.py",
 ]
-FOLDERS = ["process", "closed_loop", "conformance", "unit"]
+FOLDERS = ["process", "closed_loop", "faults", "conformance", "unit"]
 
 
 @pytest.fixture(autouse=True)

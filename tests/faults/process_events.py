@@ -199,10 +199,3 @@ def viewer_hit(start: Start, signum: signal.Signals, words: str) -> None:
     launched.reacts(words, lambda: launched.said(words))
     code = launched.end()
     require(code == 0, f"exit code {code}: {launched.text()[-400:]}")
-
-
-def launcher_stopped(start: Start) -> None:
-    launched = tracking(start, *TWO, *NEAR, "--duration", "14")
-    stopped(launched.process.pid, 8.0)
-    code = launched.end()
-    require(code == 0, f"exit code {code}: {launched.text()[-400:]}")

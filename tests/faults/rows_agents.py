@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from functools import partial
 
@@ -11,7 +10,7 @@ from swarmctl.agent import coordination
 from swarmctl.bus.peers import agent_name
 from swarmctl.core.types import FlightMode, Mode, Phase
 from swarmctl.wall_clock import WallClock
-from tests.faults.bus_events import FORGETS, OTHERS, arrived, for_, rests
+from tests.faults.bus_events import FORGETS, arrived, for_, others_arrived, rests
 from tests.faults.row import Off
 from tests.faults.simulated import GUARANTEED, SWAP, VICTIM, Scene, SimulatedRow, entered, tracking
 
@@ -47,12 +46,6 @@ def starved(agents: Sequence[int], one_of: int) -> Callable[[Scene], None]:
 def lands(scene: Scene) -> bool:
     """Return whether the victim's autopilot lands it."""
     return scene.flight_mode(VICTIM) is FlightMode.LAND
-
-
-def others_arrived(scene: Scene) -> bool:
-    pos = scene.lockstep.world.truth_rows()["pos_ned_m"]
-    starts = scene.config.starts_ned_m()
-    return all(math.dist(pos[i][:2], [-starts[i][0], -starts[i][1]]) < 0.5 for i in OTHERS)
 
 
 def _clock_follows(scene: Scene, seconds: float) -> None:

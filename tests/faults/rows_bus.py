@@ -55,7 +55,7 @@ ROWS = (
     SimulatedRow(
         name="peer-malformed",
         event="an agent's paths arrive with broken copies: cut short, not finite, another version, 60 times as long",
-        reaction="the broken ones are counted, the flight is what it was",
+        reaction="the broken ones are counted and told, the flight goes on",
         within_s=1.0,
         protection="checks of what a path holds",
         happens=overhears(malformed),
@@ -142,7 +142,7 @@ ROWS = (
         event="the bus carries nothing for 10 s",
         reaction="all come to rest, and arrive once it does again",
         within_s=2.5,
-        protection="rest while a peer is silent that may fly on",
+        protection="the silence of several is noticed after 0.3 s",
         happens=bus_fails(10.0),
         reacts=rests(range(4)),
         lasts_s=20.0,

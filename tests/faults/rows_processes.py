@@ -11,7 +11,6 @@ from tests.faults.process_events import (
     agent_stopped_for_2_s,
     agent_stopped_for_20_s,
     in_program,
-    launcher_stopped,
     loss_after,
     router_killed_again_and_again,
     router_stopped,
@@ -48,6 +47,15 @@ def write(self, event, **fields):
     with self._path.open("a", encoding="utf-8") as file:
         file.write(json.dumps({"utc_us": 0, "t_us": 0, "source": self._source, "event": event, **fields}) + "\\n")
 log.EventLog.write = write
+"""
+TRUTH_RAISES = """
+import sitl.realtime as it
+record = it.TruthFile.record
+def raising(self, world, now_us):
+    record(self, world, now_us)
+    if self._broken is not None:
+        raise self._broken
+it.TruthFile.record = raising
 """
 ROWS = (
     LaunchedRow(
@@ -168,15 +176,6 @@ ROWS = (
         off=in_program("launch", SUPERVISOR + "supervisor.FlightSupervisor._watch_viewer = lambda *_: None"),
     ),
     LaunchedRow(
-        name="process-launcher-stopped",
-        event="the launcher is stopped for 8 s",
-        reaction="nobody is called silent; the mission is completed",
-        within_s=90.0,
-        protection="the launcher excuses its own pauses",
-        script=launcher_stopped,
-        off=in_program("launch", SUPERVISOR + "supervisor.FlightSupervisor._excuse_own_pause = lambda *_: None"),
-    ),
-    LaunchedRow(
         name="process-launcher-killed",
         event="the launcher is killed",
         reaction="every process ends, nothing is left",
@@ -245,10 +244,10 @@ ROWS = (
             event=f"the disk is full from {phase} on",
             reaction="the mission is flown to its end, the verdict printed, what is missing named",
             within_s=90.0,
-            protection="a full disk loses events, never the flight",
+            protection="a full disk loses records, never the flight",
             script=disk_full(phase),
             readable=False,
-            off=in_program("launch", RAISES),
+            off=in_program("sitl", TRUTH_RAISES),
         )
         for phase in ("STANDBY", "TRACK", "LAND")
     ),
