@@ -281,12 +281,12 @@ def _axes(column: StoredColumn) -> list[str]:
 
 
 def _paths(points: NDArray[np.void] | None) -> Iterator[tuple[int, NDArray[np.float64]]]:
-    """Yield when each predicted path was flown [us], and its points (M, 3)."""
+    """Yield when each predicted path that is drawn was flown [us], and its points (M, 3)."""
     if points is None or not len(points):
         return
     times_us, begins = np.unique(points["t_us"], return_index=True)
     split = np.split(points["pos_ned_m"].astype(np.float64), begins[1:])
-    yield from zip(times_us.tolist(), split, strict=True)
+    yield from zip(times_us[::_SCENE_TICKS].tolist(), split[::_SCENE_TICKS], strict=True)
 
 
 def _timestamp(messages: Any, utc_us: int) -> Any:
