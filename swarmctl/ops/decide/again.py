@@ -24,6 +24,7 @@ from swarmctl.ops.decide.inputs import (
     RecordedBus,
     RecordedLink,
     RecordedTime,
+    begins_utc_us,
     frames_of,
     operator_messages,
     peer_messages,
@@ -103,11 +104,10 @@ def decide_again(
     from_vehicle = _InTime(frames)
     from_peers = _InTime(peer_messages(config, agent, run.ticks, plans))
     from_operator = _InTime(operator_messages(config, agent, run.ticks, run.events))
-    ends_us = [*rows["utc_us"][1:].tolist(), int(rows["utc_us"][-1]) + 1_000_000]
-    for row, end_us in zip(rows, ends_us, strict=True):
-        clock.t_us, clock.utc = int(row["t_us"]), int(row["utc_us"])
+    for row, begin_us in zip(rows, begins_utc_us(rows).tolist(), strict=True):
+        clock.t_us, clock.utc, end_us = int(row["t_us"]), begin_us, int(row["utc_us"]) + 1
         link.offer([frame for _, frame in from_vehicle.before(end_us)], clock.t_us)  # stamped when the tick has read it
-        for _, topic, sender, payload in (*from_peers.before(clock.utc), *from_operator.before(end_us)):
+        for _, topic, sender, payload in (*from_peers.before(begin_us), *from_operator.before(end_us)):
             bus.offer(topic, sender, payload)
         flown.tick(clock.t_us, int(row["deadline_misses"]))
     return np.concatenate(sink.rows) if sink.rows else np.zeros(0, TICK_DTYPE)

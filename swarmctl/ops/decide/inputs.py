@@ -28,6 +28,7 @@ from swarmctl.bus.topics import OPERATOR, Topic
 from swarmctl.config import Config
 from swarmctl.control.estimation.constant_velocity import predict_constant_velocity
 from swarmctl.control.model import Predictor
+from swarmctl.control.phases.state_machine import BEGIN_DELAY_US
 from swarmctl.core.operator_verbs import MISSION, OPERATOR_VERBS
 from swarmctl.core.types import Array, FlightMode, Landed, Phase, PredictedPath, VehicleState
 from swarmctl.mavlink.commands import OWN_COMPID
@@ -38,6 +39,7 @@ _STAMP = struct.Struct(">Q")  # UTC [us] before each frame of a .tlog
 _V1, _V2 = 0xFE, 0xFD  # first byte of a frame
 _BOOT = 1  # of every peer
 _STATUS_EVERY = 10  # ticks
+_SECOND_TICKS = 50
 _COAST_S, _COAST_POINTS = 0.1, 21  # times of the path of a peer that has flown no plan at all
 
 
@@ -120,6 +122,15 @@ def frames_of(recorded: bytes) -> Iterator[tuple[int, bytes]]:
         at += size
 
 
+def begins_utc_us(rows: NDArray[np.void]) -> NDArray[np.int64]:
+    """Return the UTC (T,) [us] at which ticks have begun: rows hold that of their end, and both monotonic and UTC time
+    go on alike over a second.
+    """
+    late_us = np.pad(rows["utc_us"] - rows["t_us"], _SECOND_TICKS // 2, mode="edge")
+    least_us = np.lib.stride_tricks.sliding_window_view(late_us, _SECOND_TICKS + 1).min(axis=1)
+    return np.asarray(rows["t_us"] + least_us)
+
+
 def peer_messages(
     config: Config, agent: int, ticks: Mapping[int, NDArray[np.void]], plans: Mapping[int, NDArray[np.void]]
 ) -> list[Heard]:
@@ -144,12 +155,11 @@ def operator_messages(
 
 def _paths(config: Config, peer: int, rows: NDArray[np.void], points: NDArray[np.void]) -> Iterator[Heard]:
     """Yield the paths of a peer: its plans, or where it has flown none, straight on or to rest."""
-    to_utc_us = int(rows["utc_us"][0]) - int(rows["t_us"][0])
     times_us, begins = np.unique(points["t_us"], return_index=True)
     planned = dict(zip(times_us.tolist(), np.split(points, begins[1:]), strict=True)) if len(points) else {}
     like = planned[int(times_us[0])]["at_us"] if planned else np.arange(_COAST_POINTS) * round(_COAST_S * 1e6)
     delay_us = Predictor(config.model_of(peer)).delay_us
-    for row in rows:
+    for row, begin_us in zip(rows, begins_utc_us(rows).tolist(), strict=True):
         t_us, utc_us = int(row["t_us"]), int(row["utc_us"])
         if t_us in planned:
             at_us, pos = planned[t_us]["at_us"], planned[t_us]["pos_ned_m"].astype(np.float64)
@@ -162,7 +172,7 @@ def _paths(config: Config, peer: int, rows: NDArray[np.void], points: NDArray[np
             agent=peer,
             boot_id=_BOOT,
             seq=int(row["seq"]),
-            t0_utc_us=int(at_us[0]) + to_utc_us,
+            t0_utc_us=int(at_us[0]) + begin_us - t_us,
             dt_us=int(at_us[1] - at_us[0]),
             margin_m=0.0,
             pos_ned_m=pos,
@@ -190,8 +200,7 @@ def _straight_on(row: NDArray[np.void], at_us: NDArray[np.int64], brake_m_s2: fl
 
 def _statuses(peer: int, rows: NDArray[np.void]) -> Iterator[Heard]:
     """Yield what a peer has said of itself five times a second, as far as others use it."""
-    ready = rows["utc_us"][(rows["phase"] >= Phase.READY) & (rows["phase"] <= Phase.GOTO_LAND)]
-    ready_us = int(ready[0]) if len(ready) else 0
+    ready_us = _ready_utc_us(rows)
     said = np.diff(rows["phase"].astype(int), prepend=-1) != 0
     for row in rows[said | (rows["seq"] % _STATUS_EVERY == 0)]:
         utc_us = int(row["utc_us"])
@@ -230,6 +239,15 @@ def _statuses(peer: int, rows: NDArray[np.void]) -> Iterator[Heard]:
             utc_us=utc_us,
         )
         yield utc_us, topics.STATUS, agent_name(peer), encode_message(status)
+
+
+def _ready_utc_us(rows: NDArray[np.void]) -> int:
+    """Return when a peer was ready: a second before the mission's begin, which its mission time tells exactly."""
+    tracked = rows[np.isfinite(rows["mission_t_s"])][:_SECOND_TICKS]
+    if len(tracked):
+        return round(float(np.median(tracked["utc_us"] - tracked["mission_t_s"] * 1e6))) - BEGIN_DELAY_US
+    ready = begins_utc_us(rows)[rows["phase"] == Phase.READY]
+    return int(ready[0]) if len(ready) else 0
 
 
 def _orders(agent: int, events: Sequence[Mapping[str, Any]]) -> Iterator[Heard]:
