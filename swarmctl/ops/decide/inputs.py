@@ -24,6 +24,7 @@ from swarmctl.bus.json_messages import (
 )
 from swarmctl.bus.path_messages import encode_path
 from swarmctl.bus.peers import agent_name
+from swarmctl.bus.refusals import RefusedMessage
 from swarmctl.bus.topics import OPERATOR, Topic
 from swarmctl.config import Config
 from swarmctl.control.estimation.constant_velocity import predict_constant_velocity
@@ -93,6 +94,9 @@ class RecordedBus:
 
     def receive(self, topic: Topic) -> list[tuple[str, bytes]]:
         return self._waiting.pop(topic, [])
+
+    def refused(self) -> list[RefusedMessage]:
+        return []
 
     def alive(self) -> frozenset[str]:
         return self._senders
