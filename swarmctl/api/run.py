@@ -82,7 +82,7 @@ class Run:
         return self._data.ticks[agent]
 
     def plans(self, agent: int) -> pa.Table:
-        """Return the predicted paths of an agent, ten a second, one row for each point; no rows if none was recorded.
+        """Return the predicted paths of an agent, of each tick that flew one, a row a point; no rows without any.
 
         Raises:
             ConfigError: their file has not the expected content.

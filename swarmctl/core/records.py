@@ -38,7 +38,6 @@ PLAN_COLUMNS = (
     StoredColumn(name="pos_ned_m", dtype=_F4, size=3, unit="m", text="predicted position at that time"),
 )
 PLAN_DTYPE = dtype_of(PLAN_COLUMNS)
-_PLAN_EVERY = 5  # ticks: ten plans a second
 
 # code in `struct` of each number of a tick
 _CODES = {_F4: "f", _F8: "d", _U1: "B", _U2: "H", "<u4": "I", _I8: "q"}
@@ -66,15 +65,15 @@ def tick_row(record: TickRecord) -> NDArray[np.void]:
 
 
 def plan_rows(row: NDArray[np.void], flown: Plan | None) -> NDArray[np.void]:
-    """Return the points of the plan flown in a tick as rows (M,) of `PLAN_DTYPE`; none in most ticks.
+    """Return the points of the plan flown in a tick as rows (M,) of `PLAN_DTYPE`.
 
     Args:
         row: the tick, a (1,) array of `TICK_DTYPE`.
         flown: the plan, None without one.
     """
-    if flown is None or row["seq"][0] % _PLAN_EVERY:
+    if flown is None:
         return NO_POINTS
-    rows = np.zeros(len(flown.pos_ned_m), PLAN_DTYPE)
+    rows = np.empty(len(flown.pos_ned_m), PLAN_DTYPE)
     rows["t_us"] = row["t_us"]
     rows["at_us"] = flown.t0_us + flown.dt_us * np.arange(len(rows))
     rows["pos_ned_m"] = flown.pos_ned_m

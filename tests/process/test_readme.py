@@ -37,8 +37,8 @@ FENCED = re.compile(r"^```.*?^```$", re.DOTALL | re.MULTILINE)
 LINES = [line for page in PAGES for line in FENCED.sub("", page.read_text()).splitlines()]
 SHOWN = [line.strip() for line in LINES if re.match(r"    (swarmctl|python3?) ", line)]
 BIN = Path(sys.executable).parent
-WHILE_FLYING = (("status", "hold"), ("obstacle", "fault", "resume"), ("land",))  # beside each other, near the start
-AFTERWARDS = ("report", "replay")
+WHILE_FLYING = (("status", "hold"), ("obstacle", "fault", "resume"), ("mission",), ("land",))  # near the start
+AFTERWARDS = ("report", "replay", "export")
 CAMPAIGN = r"^python tools/campaign\.py "  # is run by tests/closed_loop/test_campaign.py
 
 
@@ -200,6 +200,9 @@ def test_a_launch_its_operator_and_what_is_left(tmp_path: Path) -> None:
     assert (directory / "report.html").exists()
     assert any((directory / "figures").glob("*.svg"))
     assert (directory.parent / "run-against-run.html").exists()
+    (export,) = shown(r"^swarmctl export ")
+    assert run(export.replace("runs/DIR", str(directory))).returncode == 0
+    assert directory.with_name("run.mcap").stat().st_size > 100_000
     (replay,) = shown(r"^swarmctl replay ")
     refused = run(replay.replace("runs/DIR", str(directory)))
     assert refused.returncode == 3

@@ -33,7 +33,7 @@ from swarmctl.core.types import Array, Command, FlightMode, Landed, Mode, Phase,
 
 _REQUEST_PERIOD_US = 1_000_000  # time between repetitions of a request
 _SPIN_UP_US = 6_000_000  # ArduCopter's rotors spin up for over 3 s, during which it refuses a second TAKEOFF
-_BEGIN_DELAY_US = 1_000_000  # from the last agent's readiness to mission time 0; several statuses are sent meanwhile
+BEGIN_DELAY_US = 1_000_000  # from the last agent's readiness to mission time 0; several statuses are sent meanwhile
 _LEAST_HEIGHT_M = 0.5  # above the ground, of a point to go to
 _PLAN_MODES = (Mode.TRACKING, Mode.REPLAY)
 _OWN_MODES = (FlightMode.HOLD, FlightMode.TAKEOFF, FlightMode.EXTERNAL)  # modes that follow from our own requests
@@ -483,7 +483,7 @@ class MissionStateMachine:
         absent = self._peers - inputs.excused - ready_us.keys()
         self.waits_for = f"{names_of(absent)} to reach the start" if absent else ""
         if not absent:
-            self.begin_utc_us = max([self.ready_utc_us, *ready_us.values()]) + _BEGIN_DELAY_US
+            self.begin_utc_us = max([self.ready_utc_us, *ready_us.values()]) + BEGIN_DELAY_US
         return []
 
     def _track(self, inputs: PhaseInputs, state: VehicleState) -> list[Command]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+import json
 import signal
 from pathlib import Path
 from typing import Annotated
@@ -33,13 +35,39 @@ def show_in_browser(target: str) -> int:
     return EXIT_OK
 
 
-def replay(folder: Folder, web: Web = False) -> int:
-    """Open the recording of a run."""
+def replay(
+    folder: Folder,
+    web: Web = False,
+    decide: Annotated[
+        bool, typer.Option("--decide", help="Run agents again over what they received, and show where they differ.")
+    ] = False,
+    sets: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="With --decide: override a key of the configuration flown."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="With --decide: print JSON.")] = False,
+) -> int:
+    """Open the recording of a run, or have its agents decide again."""
     from swarmctl.telemetry.view.recordings import RECORDING, open_viewer
 
+    if decide:
+        return _decide(folder, sets or [], as_json)
+    if sets or as_json:
+        raise ConfigError("replay", ["--set and --json are for --decide"])
     if web:
         return show_in_browser(str(folder / RECORDING))
     open_viewer(str(folder / RECORDING))
+    return EXIT_OK
+
+
+def _decide(folder: Path, sets: list[str], as_json: bool) -> int:
+    from swarmctl.ops.decide.verb import decisions_of_run, lines_of
+
+    decisions = decisions_of_run(folder, sets)
+    if as_json:
+        print(json.dumps([dataclasses.asdict(agent) for agent in decisions], indent=2))
+    else:
+        print("\n".join(line for agent in decisions for line in lines_of(agent)))
     return EXIT_OK
 
 

@@ -41,7 +41,7 @@ Messages = Iterator[tuple[int, Callable[..., None]]]  # UTC [us], and what logs 
 _WORLD, _NED = "world", "ned"
 _BODY_M, _REFERENCE_M, _GOAL_M = (0.4, 0.4, 0.08), 0.06, 0.2  # sizes drawn: a plate, radii of balls
 _SCENE_TICKS = 5  # of an agent, between two of its pictures: ten a second
-_OBSTACLE_STEP_US = 200_000
+_PLAN_PERIOD_US, _OBSTACLE_STEP_US = 100_000, 200_000
 _BLOCK = 4096  # rows turned into words at once
 _JSON_TYPES = {"f": "number", "i": "integer", "u": "integer"}  # by the kind of a numpy type
 _WARNINGS = ("outside_volume", "overload", "estimate_jumped", "order_refused", "refused", "unresponsive")
@@ -281,12 +281,13 @@ def _axes(column: StoredColumn) -> list[str]:
 
 
 def _paths(points: NDArray[np.void] | None) -> Iterator[tuple[int, NDArray[np.float64]]]:
-    """Yield when each predicted path was flown [us], and its points (M, 3)."""
+    """Yield when each predicted path that is drawn was flown [us], and its points (M, 3)."""
     if points is None or not len(points):
         return
     times_us, begins = np.unique(points["t_us"], return_index=True)
     split = np.split(points["pos_ned_m"].astype(np.float64), begins[1:])
-    yield from zip(times_us.tolist(), split, strict=True)
+    _, drawn = np.unique(times_us // _PLAN_PERIOD_US, return_index=True)
+    yield from ((int(times_us[k]), split[k]) for k in drawn)
 
 
 def _timestamp(messages: Any, utc_us: int) -> Any:

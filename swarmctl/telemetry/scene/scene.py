@@ -26,6 +26,7 @@ from swarmctl.telemetry.scene.stream import Stream, Times, pieces
 from swarmctl.telemetry.scene.surroundings import draw_compass, draw_obstacles
 from swarmctl.telemetry.scene.viewed_flight import ViewedFlight
 
+_PUSH_M_PER_M_S2, _LEAST_PUSH_M_S2 = 1.0, 0.1  # length of the arrow of a disturbance; smaller ones have none
 _NUMBER_ABOVE = 0.09  # height of a number above its vehicle, of the scene's extent
 _PLACE_TICKS = 2  # from one place of the camera that follows a vehicle to the next
 _PIECE_TICKS = 5  # of the trail
@@ -114,6 +115,8 @@ class Scene:
             t_us, rows = np.concatenate([t for t, _ in parts]), np.concatenate([rows for _, rows in parts])
             margin_m = self._obstacle_margin_m(t_us, rows["pos_ned_m"])
             send_curves(self._stream, agent, t_us, rows, self._flight, margin_m)
+        for agent in self._pending:
+            self._wind(agent, self._newest[agent])
         if self._pending:
             self._stream.now(TABLE, self._newest_us, status_table(self._newest))
         self._pending.clear()
@@ -139,6 +142,17 @@ class Scene:
             distance_m = np.linalg.norm(away_m[:, : obstacle.axes], axis=1)
             margin_m = np.minimum(margin_m, distance_m - obstacle.keep_out_m)
         return margin_m
+
+    def _wind(self, agent: int, row: Any) -> None:
+        """Draw what pushes a vehicle by its agent's estimate, wind above all, as an arrow from its place."""
+        push = row["disturbance_ned_m_s2"].astype(float)
+        is_felt = bool(np.isfinite(push).all()) and float(np.linalg.norm(push)) > _LEAST_PUSH_M_S2
+        arrow = rr.Arrows3D(
+            vectors=[push * _PUSH_M_PER_M_S2] if is_felt else [],
+            radii=[0.02] if is_felt else [],
+            colors=[NUMBER_RGB] if is_felt else [],
+        )
+        self._stream.now(f"world/place/{agent}/wind", self._newest_us, arrow)
 
     def _vehicle(self, agent: int, t_us: Times, rows: NDArray[np.void]) -> None:
         pos_ned_m = rows["pos_ned_m"]

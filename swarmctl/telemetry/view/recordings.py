@@ -23,6 +23,7 @@ from swarmctl.telemetry.scene.viewed_flight import ViewedFlight
 RECORDING = "telemetry.rrd"
 APPLICATION = "swarmctl"
 _MIN_RECORDING_BYTES = 4096  # a smaller packed recording contains no entity and is rejected
+_PLAN_PERIOD_US = 100_000  # of the predicted paths that are drawn
 _CHUNK_TICKS = 50  # ticks of an agent sent at once: one second
 _VIEWER_PORT_OPTIONS = ("--bind", "127.0.0.1", "--port", "auto")  # the default port would loop data back to our server
 NO_PLANS: Mapping[int, NDArray[np.void]] = MappingProxyType({})
@@ -139,9 +140,11 @@ def simulated_recording(
 
 
 def _paths(points: NDArray[np.void]) -> tuple[NDArray[np.int64], list[Array]]:
-    """Return the times (P,) at which predicted paths were flown, and the paths, (M, 3) each."""
+    """Return the times (P,) at which the predicted paths that are drawn were flown, and those paths, (M, 3) each."""
     t_us, begins = np.unique(points["t_us"], return_index=True)
-    return t_us, np.split(points["pos_ned_m"].astype(np.float64), begins[1:]) if len(t_us) else []
+    paths = np.split(points["pos_ned_m"].astype(np.float64), begins[1:]) if len(t_us) else []
+    _, drawn = np.unique(t_us // _PLAN_PERIOD_US, return_index=True)
+    return t_us[drawn], [paths[k] for k in drawn]
 
 
 def _fitted(flight: ViewedFlight, flown: Mapping[int, NDArray[np.void]]) -> ViewedFlight:

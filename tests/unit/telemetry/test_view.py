@@ -39,6 +39,7 @@ def flown(agent: int) -> NDArray[np.void]:
     rows["q_nb"][:, 0] = rows["setpoint_q_nb"][:, 0] = 1.0
     rows["nearest_peer_m"], rows["battery_01"], rows["tick_ms"] = 1.25, 0.625, 5.0
     rows["phase"][-25:] = Phase.GOTO_LAND
+    rows["disturbance_ned_m_s2"][:, 1] = 0.8 if agent == 1 else 0.05
     return rows
 
 
@@ -111,6 +112,13 @@ def test_margins_are_distances_beyond_those_that_are_kept(found: dict[str, list[
     for t_s, (peers_m, obstacles_m) in margins:
         assert peers_m == pytest.approx(1.25 - 0.9)
         assert obstacles_m == pytest.approx((10.0 - t_s) - t_s - 2.0, abs=1e-6), "a column that comes closer"
+
+
+def test_what_pushes_a_vehicle_is_an_arrow_from_its_place(found: dict[str, list[dict[str, Any]]]) -> None:
+    pushed = [vectors for _, vectors in moving(found, "/world/place/1/wind", "vectors")]
+    assert len(pushed) >= 3
+    assert all(np.allclose(vectors, [[0.0, 0.8, 0.0]]) for vectors in pushed)
+    assert not any(vectors for _, vectors in moving(found, "/world/place/0/wind", "vectors")), "next to nothing"
 
 
 def test_columns_do_not_run_to_infinity(found: dict[str, list[dict[str, Any]]]) -> None:

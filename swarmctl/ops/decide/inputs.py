@@ -1,0 +1,271 @@
+"""What one agent has received in a recorded run, given to an agent again, tick by tick.
+
+Frames of its vehicle are those of the `.tlog`, paths of peers those of their `.plans`; statuses of peers follow from
+their ticks, orders from the events, obstacles from the configuration. What the agent sends goes nowhere.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from swarmctl.bus import topics
+from swarmctl.bus.json_messages import (
+    CommandMessage,
+    MissionMessage,
+    StatusMessage,
+    encode_message,
+    first_list,
+)
+from swarmctl.bus.path_messages import encode_path
+from swarmctl.bus.peers import agent_name
+from swarmctl.bus.refusals import RefusedMessage
+from swarmctl.bus.topics import OPERATOR, Topic
+from swarmctl.config import Config
+from swarmctl.control.estimation.constant_velocity import predict_constant_velocity
+from swarmctl.control.model import Predictor
+from swarmctl.control.phases.state_machine import BEGIN_DELAY_US
+from swarmctl.core.operator_verbs import MISSION, OPERATOR_VERBS
+from swarmctl.core.types import Array, FlightMode, Landed, Phase, PredictedPath, VehicleState
+from swarmctl.mavlink.commands import OWN_COMPID
+from swarmctl.mavlink.transport import Datagram
+
+Heard = tuple[int, Topic, str, bytes]  # UTC [us] of a message, its topic, sender and payload
+_STAMP = struct.Struct(">Q")  # UTC [us] before each frame of a .tlog
+_V1, _V2 = 0xFE, 0xFD  # first byte of a frame
+_BOOT = 1  # of every peer
+_STATUS_EVERY = 10  # ticks
+_SECOND_TICKS = 50
+_COAST_S, _COAST_POINTS = 0.1, 21  # times of the path of a peer that has flown no plan at all
+
+
+class RecordedTime:
+    """The clock of a recorded tick."""
+
+    def __init__(self) -> None:
+        self.t_us = self.utc = 0
+
+    def now_us(self) -> int:
+        return self.t_us
+
+    def utc_us(self) -> int:
+        return self.utc
+
+
+class RecordedLink:
+    """A link whose vehicle says what it has said."""
+
+    def __init__(self) -> None:
+        self._arrived: list[Datagram] = []
+
+    def offer(self, frames: list[bytes], t_us: int) -> None:
+        """Have frames arrive."""
+        self._arrived += [Datagram(t_us, frame) for frame in frames]
+
+    def send(self, data: bytes) -> None:
+        """Send to nobody."""
+
+    def receive(self, now_us: int) -> list[Datagram]:
+        arrived, self._arrived = self._arrived, []
+        return arrived
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+class RecordedBus:
+    """A bus on which peers and operator say what they have said."""
+
+    def __init__(self, senders: frozenset[str]) -> None:
+        self._senders = senders
+        self._waiting: dict[Topic, list[tuple[str, bytes]]] = {}
+
+    def offer(self, topic: Topic, sender: str, payload: bytes) -> None:
+        """Have a message arrive."""
+        self._waiting.setdefault(topic, []).append((sender, payload))
+
+    def publish(self, topic: Topic, payload: bytes) -> None:
+        """Publish to nobody."""
+
+    def receive(self, topic: Topic) -> list[tuple[str, bytes]]:
+        return self._waiting.pop(topic, [])
+
+    def refused(self) -> list[RefusedMessage]:
+        return []
+
+    def alive(self) -> frozenset[str]:
+        return self._senders
+
+    def arrivals(self) -> Mapping[str, int]:
+        return dict.fromkeys(self._senders, 1)
+
+    def close(self) -> None:
+        """Nothing is open."""
+
+
+def frames_of(recorded: bytes) -> Iterator[tuple[int, bytes]]:
+    """Yield the frames of a `.tlog` that the vehicle has sent, each with its UTC [us], to where the file is cut off."""
+    at = 0
+    while at + _STAMP.size + 8 <= len(recorded):
+        (utc_us,) = _STAMP.unpack_from(recorded, at)
+        at += _STAMP.size
+        magic, payload = recorded[at], recorded[at + 1]
+        if magic == _V2:
+            size, component = 12 + payload + (13 if recorded[at + 2] & 1 else 0), recorded[at + 6]
+        elif magic == _V1:
+            size, component = 8 + payload, recorded[at + 4]
+        else:
+            return
+        if component != OWN_COMPID:
+            yield utc_us, recorded[at : at + size]
+        at += size
+
+
+def begins_utc_us(rows: NDArray[np.void]) -> NDArray[np.int64]:
+    """Return the UTC (T,) [us] at which ticks have begun: rows hold that of their end, and both monotonic and UTC time
+    go on alike over a second.
+    """
+    late_us = np.pad(rows["utc_us"] - rows["t_us"], _SECOND_TICKS // 2, mode="edge")
+    least_us = np.lib.stride_tricks.sliding_window_view(late_us, _SECOND_TICKS + 1).min(axis=1)
+    return np.asarray(rows["t_us"] + least_us)
+
+
+def peer_messages(
+    config: Config, agent: int, ticks: Mapping[int, NDArray[np.void]], plans: Mapping[int, NDArray[np.void]]
+) -> list[Heard]:
+    """Return what peers have said to an agent."""
+    heard: list[Heard] = []
+    for peer, rows in ticks.items():
+        if peer != agent:
+            heard += _paths(config, peer, rows, plans[peer])
+            heard += _statuses(peer, rows)
+    return sorted(heard, key=lambda message: message[0])
+
+
+def operator_messages(
+    config: Config, agent: int, ticks: Mapping[int, NDArray[np.void]], events: Sequence[Mapping[str, Any]]
+) -> list[Heard]:
+    """Return what the operator has said to an agent: the configured obstacles, and the orders that it has obeyed."""
+    begins_us = min(int(rows["utc_us"][0]) for rows in ticks.values())
+    listed = encode_message(first_list(config.obstacles, begins_us))
+    heard = [(begins_us, topics.OBSTACLES, OPERATOR, listed), *_orders(agent, events)]
+    return sorted(heard, key=lambda message: message[0])
+
+
+def _paths(config: Config, peer: int, rows: NDArray[np.void], points: NDArray[np.void]) -> Iterator[Heard]:
+    """Yield the paths of a peer: its plans, or where it has flown none, straight on or to rest."""
+    times_us, begins = np.unique(points["t_us"], return_index=True)
+    planned = dict(zip(times_us.tolist(), np.split(points, begins[1:]), strict=True)) if len(points) else {}
+    like = planned[int(times_us[0])]["at_us"] if planned else np.arange(_COAST_POINTS) * round(_COAST_S * 1e6)
+    delay_us = Predictor(config.model_of(peer)).delay_us
+    for row, begin_us in zip(rows, begins_utc_us(rows).tolist(), strict=True):
+        t_us, utc_us = int(row["t_us"]), int(row["utc_us"])
+        if t_us in planned:
+            at_us, pos = planned[t_us]["at_us"], planned[t_us]["pos_ned_m"].astype(np.float64)
+        elif np.isfinite(row["pos_ned_m"]).all() and np.isfinite(row["vel_ned_m_s"]).all():
+            at_us = t_us + delay_us + like - like[0]
+            pos = _straight_on(row, at_us, config.separation.brake_m_s2)
+        else:
+            continue
+        path = PredictedPath(
+            agent=peer,
+            boot_id=_BOOT,
+            seq=int(row["seq"]),
+            t0_utc_us=int(at_us[0]) + begin_us - t_us,
+            dt_us=int(at_us[1] - at_us[0]),
+            margin_m=0.0,
+            pos_ned_m=pos,
+        )
+        yield utc_us, topics.PATH, agent_name(peer), encode_path(path)
+
+
+def _straight_on(row: NDArray[np.void], at_us: NDArray[np.int64], brake_m_s2: float) -> Array:
+    """Return where a vehicle that its agent does not fly is taken to be, (N, 3) NED [m], at times (N,) [us]."""
+    age_us = float(row["state_age_ms"]) * 1e3
+    state = VehicleState(
+        t_us=int(row["t_us"] - age_us),
+        pos_ned_m=row["pos_ned_m"],
+        vel_ned_m_s=row["vel_ned_m_s"],
+        q_nb=row["q_nb"],
+        rate_frd_rad_s=np.zeros(3),
+        armed=bool(row["armed"]),
+        mode=FlightMode(int(row["flight_mode"])),
+        landed=Landed.UNKNOWN,
+        failsafe=False,
+    )
+    ahead_s: Array = (at_us - state.t_us).astype(np.float64) * 1e-6
+    return predict_constant_velocity(state, ahead_s, brake_m_s2)
+
+
+def _statuses(peer: int, rows: NDArray[np.void]) -> Iterator[Heard]:
+    """Yield what a peer has said of itself five times a second, as far as others use it."""
+    ready_us = _ready_utc_us(rows)
+    said = np.diff(rows["phase"].astype(int), prepend=-1) != 0
+    for row in rows[said | (rows["seq"] % _STATUS_EVERY == 0)]:
+        utc_us = int(row["utc_us"])
+        status = StatusMessage(
+            agent=peer,
+            boot_id=_BOOT,
+            sysid=peer + 1,
+            phase=int(row["phase"]),
+            mode=int(row["mode"]),
+            flight_mode=int(row["flight_mode"]),
+            armed=bool(row["armed"]),
+            landed=0,
+            held=False,
+            control="",
+            altitude_m=0.0,
+            ground_speed_m_s=-1.0,
+            battery_01=-1.0,
+            pos_accuracy_m=-1.0,
+            gps_fix=-1,
+            satellites=-1,
+            link_age_ms=0.0,
+            ready_utc_us=ready_us if utc_us >= ready_us else 0,
+            mission_t_s=-1.0,
+            ends_in_s=-1.0,
+            outcome="",
+            position_error_m=0.0,
+            separation_m=-1.0,
+            tick_p99_ms=0.0,
+            ticks=int(row["seq"]),
+            deadline_misses=int(row["deadline_misses"]),
+            plan_staleness_ms=-1.0,
+            solver_failed=0,
+            active_alert="",
+            alert_age_s=0.0,
+            uses_commitments=False,
+            utc_us=utc_us,
+        )
+        yield utc_us, topics.STATUS, agent_name(peer), encode_message(status)
+
+
+def _ready_utc_us(rows: NDArray[np.void]) -> int:
+    """Return when a peer was ready: a second before the mission's begin, which its mission time tells exactly."""
+    tracked = rows[np.isfinite(rows["mission_t_s"])][:_SECOND_TICKS]
+    if len(tracked):
+        return round(float(np.median(tracked["utc_us"] - tracked["mission_t_s"] * 1e6))) - BEGIN_DELAY_US
+    ready = begins_utc_us(rows)[rows["phase"] == Phase.READY]
+    return int(ready[0]) if len(ready) else 0
+
+
+def _orders(agent: int, events: Sequence[Mapping[str, Any]]) -> Iterator[Heard]:
+    """Yield the orders that an agent has obeyed, and the missions that it was told of."""
+    own = [event for event in events if event.get("source") == agent_name(agent)]
+    missions = [event for event in own if event.get("event") == "mission_changed"]
+    for event in own:
+        verb = event.get("verb")
+        if event.get("event") != "operator" or verb not in OPERATOR_VERBS:
+            continue
+        names = {argument.name for argument in OPERATOR_VERBS[verb].arguments}
+        arguments = {name: value for name, value in event.items() if name in names}
+        if verb == MISSION and missions:
+            told = MissionMessage(mission=int(arguments[MISSION]), text=str(missions.pop(0)["mission"]))
+            yield event["utc_us"], topics.MISSION, OPERATOR, encode_message(told)
+        order = CommandMessage(verb, agent, event["utc_us"], arguments)
+        yield event["utc_us"], topics.COMMAND, OPERATOR, msgspec.json.encode(order)

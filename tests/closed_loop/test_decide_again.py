@@ -1,0 +1,89 @@
+"""`swarmctl replay --decide`: an agent that receives what it has received decides what it has decided."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from sitl.lockstep import Lockstep
+from sitl.simulate import simulate
+from swarmctl.config import load
+from swarmctl.errors import ConfigError
+from swarmctl.ops.decide.verb import decisions_of_run, lines_of
+from tests.closed_loop.conftest import mission_t_s
+
+CROSSING = (
+    "swarm.agents=2",
+    "start.positions_ned_m=[[0,0,-3],[4,0.2,-3]]",
+    "mission.kind=goto",
+    "mission.goto.goals_ned_m=[[4,0,-3],[0,0.2,-3]]",
+    "mission.goto.goal_assignment=false",
+    "mission.duration_s=6",
+    "sitl.start=air",
+    "sitl.estimator=external",
+    "obstacles=[{center_ned_m=[2,1.5,-3],radius_m=0.5,keep_out_m=1.0,visibility_m=5.0}]",
+)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Fly two agents past each other and an obstacle; one is held on the way and goes on."""
+    directory, step = tmp_path_factory.mktemp("run"), Lockstep.step
+    due = {2.0: "hold", 3.0: "resume"}
+
+    def ordering(self: Lockstep) -> None:
+        for at_s in [at_s for at_s in due if mission_t_s(self) >= at_s]:
+            self.command(due.pop(at_s), 0)
+        step(self)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Lockstep, "step", ordering)
+        simulate(load(None, CROSSING), directory)
+    assert not due
+    return directory
+
+
+def test_the_same_agent_decides_the_same_in_every_phase(folder: Path) -> None:
+    for agent in decisions_of_run(folder, ()):
+        assert agent.compared > 500
+        assert agent.phases_differ == 0
+        assert agent.plans_differ == 0
+        assert agent.tilt_rad["max"] < 1e-3, "what is recorded is rounded"
+        assert agent.thrust_01["max"] < 1e-3
+        assert not agent.differences
+        assert lines_of(agent)[0].startswith(f"agent-{agent.agent}: {agent.compared} ticks")
+
+
+def test_another_parameter_is_seen_where_it_matters(folder: Path) -> None:
+    """Negative control: who may tilt less decides otherwise, from the moment on at which it is in control."""
+    for agent in decisions_of_run(folder, ["controller.mpc.u_max=0.05"]):
+        assert agent.tilt_rad["max"] > 0.05
+        assert agent.differences[0].was.split(",")[0] in ("GOTO_START", "READY")
+        assert sum(found.ticks for found in agent.differences) > 100
+        assert f"{agent.differences[0].ticks} ticks: {agent.differences[0].was}" in lines_of(agent)[1]
+
+
+def test_peers_are_heard(folder: Path, tmp_path: Path) -> None:
+    """Negative control: without the peer's plans the crossing is decided otherwise."""
+    deaf = shutil.copytree(folder, tmp_path / "deaf")
+    (deaf / "agent-1.plans.parquet").unlink()
+    first, _ = decisions_of_run(deaf, ())
+    assert sum(found.ticks for found in first.differences) > 10
+
+
+def test_what_can_not_be_decided_again_is_refused(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="committed to is not recorded"):
+        decisions_of_run(folder, ["separation.mode=guaranteed"])
+    with pytest.raises(ConfigError, match=r"swarm\.agents is that of the run, 2"):
+        decisions_of_run(folder, ["swarm.agents=1", "mission.kind=hover"])
+    with pytest.raises(ConfigError, match="is no run folder"):
+        decisions_of_run(tmp_path, ())
+    bare = shutil.copytree(folder, tmp_path / "bare")
+    (bare / "agent-0.tlog").unlink()
+    with pytest.raises(ConfigError, match=r"agent-0\.tlog: can't be read"):
+        decisions_of_run(bare, ())
+    (bare / "agent-0.tlog").write_bytes(b"\0" * 64)
+    with pytest.raises(ConfigError, match="holds no frames of a vehicle"):
+        decisions_of_run(bare, ())
