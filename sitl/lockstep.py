@@ -26,6 +26,7 @@ from swarmctl.bus import topics
 from swarmctl.bus.json_messages import CommandMessage, encode_message, first_list
 from swarmctl.bus.links import Impairments
 from swarmctl.bus.peers import LocalHub, agent_name
+from swarmctl.bus.relay import RelayingBus
 from swarmctl.config import Config
 from swarmctl.core.clock import Clock, ClockError, OffsetClock, SimClock
 from swarmctl.core.obstacle import Obstacle
@@ -150,7 +151,8 @@ class Lockstep:
 
     def _agent(self, index: int, transport: Any) -> Agent:
         log = self.logs[index]
-        bus = self.hub.connect(agent_name(index), dict.fromkeys(topics.FOR_AGENTS))
+        others = [i for i in range(self.config.swarm.agents) if i != index]
+        bus = RelayingBus(self.hub.connect(agent_name(index), dict.fromkeys(topics.FOR_AGENTS)), index, others)
         boot_id = self.config.seed * 1000 + index
         config = self._own.get(index, self.config)
         key = self._keys[index]

@@ -42,6 +42,7 @@ from swarmctl.bus.network.hosts import roster_of
 from swarmctl.bus.network.seals import KEY_BYTES, Sealer, SealVerifier
 from swarmctl.bus.path_messages import decode_path
 from swarmctl.bus.peers import agent_name
+from swarmctl.bus.relay import decode_relay, encode_relay
 from swarmctl.config import load
 from swarmctl.config_shows import read_show
 from swarmctl.config_tables import read_tables
@@ -190,6 +191,7 @@ def targets(folder: Path) -> dict[str, Target]:
     found = {
         "path": Target(seeds["path"], decode_path),
         "trajectory": Target(seeds["trajectory"], decode_trajectory_message),
+        "relay": Target([encode_relay([(0, seed)]) for seed in seeds["trajectory"][:4]], decode_relay),
         "status": Target(seeds["status"], decode_status),
         "command": Target(seeds["command"], decode_command),
         "answer": Target(seeds["answer"], decode_answer),

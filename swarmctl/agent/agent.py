@@ -38,6 +38,7 @@ from swarmctl.control.collision.encounters import Encounters
 from swarmctl.control.collision.separation import KeepOuts, radius_problem
 from swarmctl.control.estimation.accuracy import AccuracyMonitor
 from swarmctl.control.estimation.constant_velocity import predict_constant_velocity
+from swarmctl.control.estimation.gust import GustWatch
 from swarmctl.control.model import Predictor
 from swarmctl.control.mpc.problem import Problem, Start
 from swarmctl.control.phases.inputs import PhaseInputs
@@ -147,6 +148,7 @@ class Agent:
         )
         self._virtual_control = np.array([0.0, 0.0, GRAVITY_M_S2])
         self._encounters = Encounters()
+        self._gust = GustWatch()
         self._publisher = TelemetryPublisher(
             setup.agent,
             setup.boot_id,
@@ -565,6 +567,10 @@ class Agent:
     # -- publish, record ----------------------------------------------------------------------------------------------
 
     def _share(self, state: VehicleState | None, flown: Plan | None) -> None:
+        if flown is None or self._separation.uses_commitments:  # commitments have tubes
+            self._gust.forget()
+        else:
+            self._gust.update(self._clock.now_us(), self._observer.estimate.disturbance_ned_m_s2)
         path = None if state is None else self._path_sharing.choose(self._path(state, flown))
         if path is not None:
             self._bus.publish(topics.PATH, encode_path(path))
@@ -572,7 +578,12 @@ class Agent:
 
     def _path(self, state: VehicleState, flown: Plan | None) -> PredictedPath:
         setup, seq = self._setup, self._publisher.seq
-        margins_m = self._autopilot.frame.margin_m, self._overload.margin_m, self._directive.margin_m
+        margins_m = (
+            self._autopilot.frame.margin_m,
+            self._overload.margin_m,
+            self._directive.margin_m,
+            self._gust.margin_m,
+        )
         margin_m = min(MAX_MARGIN_M, sum(margins_m))
         if flown is not None:
             t0_us, dt_us, pos = flown.t0_us, flown.dt_us, flown.pos_ned_m

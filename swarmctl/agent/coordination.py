@@ -12,6 +12,7 @@ from swarmctl.agent.world_model import WorldModel
 from swarmctl.bus import topics
 from swarmctl.bus.commitment_messages import PeerTrajectories, encode_trajectory_message
 from swarmctl.bus.peers import Bus, agent_name
+from swarmctl.bus.relay import missed_by_peers
 from swarmctl.control.collision.encounters import Encounters
 from swarmctl.control.collision.separation import KeepOut, KeepOuts, SeparationParams
 from swarmctl.control.commit.membership import Membership
@@ -240,6 +241,8 @@ class Coordination:
             heard=self._peer_trajectories.heard(),
         )
         self._bus.publish(topics.TRAJECTORY, encode_trajectory_message(message))
+        peers = self._peer_trajectories
+        self._bus.relay(missed_by_peers(peers.newest, utc_us, peers.received_utc_us))
 
     @property
     def margin_m(self) -> float:

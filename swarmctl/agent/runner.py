@@ -21,6 +21,7 @@ from swarmctl.bus import topics
 from swarmctl.bus.network.joining import join_bus
 from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US
 from swarmctl.bus.peers import Bus, LocalHub, agent_name
+from swarmctl.bus.relay import RelayingBus
 from swarmctl.bus.zenoh_bus import NO_BUS
 from swarmctl.config import Config, load, own_identity
 from swarmctl.control.phases.state_machine import OPERATOR_STOP
@@ -192,12 +193,14 @@ def _join(process: AgentProcess, config: Config, clock: WallClock) -> Bus:
     if process.bus == NO_BUS:
         return LocalHub(clock.now_us).connect(me)
     identity = own_identity(config, process.identity) if process.identity else None
-    peers = [agent_name(i) for i in range(config.swarm.agents) if i != process.agent]
+    others = [i for i in range(config.swarm.agents) if i != process.agent]
+    peers = [agent_name(i) for i in others]
     launcher = (topics.OPERATOR,)
     listen = {
         topics.PATH: peers,
         topics.STATUS: peers,
         topics.TRAJECTORY: peers,
+        topics.RELAY: peers,
         topics.COMMAND: launcher if identity is None else identity.roster.commanders(identity.name),
         topics.ENDED: launcher if identity is None else identity.roster.hosts,
         topics.OBSTACLES: launcher if identity is None else (identity.name,),  # which hears the others
@@ -212,6 +215,7 @@ def _join(process: AgentProcess, config: Config, clock: WallClock) -> Bus:
         max_age_us=FOR_AGENTS_US,
         utc_us=clock.utc_us,
         lease_ms=config.bus.lease_ms,
+        carrier=lambda bus: RelayingBus(bus, process.agent, others),
     )
 
 

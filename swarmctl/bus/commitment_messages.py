@@ -201,7 +201,10 @@ class PeerTrajectories:
             self._refusals.add(sender, TRAJECTORY.name, MALFORMED if message is None else reason, utc_us)
             return
         sent = ReceivedMessage(message.boot_id, message.seq, min(message.sent_utc_us, utc_us + MAX_LEAD_US), payload)
-        if self._verifiers[message.agent].accepts(sent, utc_us):
+        verifier = self._verifiers[message.agent]
+        if verifier.is_past(sent):
+            return  # a relay, or the sender itself, was slower than another way
+        if verifier.accepts(sent, utc_us):
             if message.agent not in self.newest and not message.is_committed:
                 self.heard_before_flight.add(message.agent)
             self.newest[message.agent], self._memory[sender] = message, memory

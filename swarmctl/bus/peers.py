@@ -61,6 +61,9 @@ class Bus(Protocol):
     def refused(self) -> list[RefusedMessage]:
         """Return the messages that were not delivered since the last call; only sealed ones are refused by a bus."""
 
+    def relay(self, agents: Iterable[int]) -> int:
+        """Pass on the newest trajectory messages of other agents, by `RelayingBus` only; return the number of bytes."""
+
     def alive(self) -> frozenset[str]:
         """Return senders attached now, this one included. It shows that a process lives, not that its loop runs."""
 
@@ -359,6 +362,9 @@ class LocalBus:
 
     def refused(self) -> list[RefusedMessage]:
         return []
+
+    def relay(self, agents: Iterable[int]) -> int:
+        return 0
 
     def alive(self) -> frozenset[str]:
         return self._hub.alive(self.name) if self._hub.is_attached(self) else frozenset()

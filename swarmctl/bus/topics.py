@@ -1,7 +1,7 @@
 """The topics of the bus: one table. A bus delivers no message that is too long for its topic.
 
-Their messages are laid out in `path_messages.py`, `commitment_messages.py` and `json_messages.py`; ticks are rows of
-`core.records`.
+Their messages are laid out in `path_messages.py`, `commitment_messages.py`, `relay.py` and `json_messages.py`; ticks
+are rows of `core.records`.
 """
 
 from __future__ import annotations
@@ -30,8 +30,9 @@ ANSWER = Topic(name="answer", ring=16, max_bytes=4096, reliable=True)
 OBSTACLES = Topic(name="obstacles", ring=4, max_bytes=65_536, reliable=True)
 MISSION = Topic(name="mission", ring=4, max_bytes=MAX_MISSION_BYTES, reliable=True)
 TRAJECTORY = Topic(name="trajectory", ring=4, max_bytes=131_072, reliable=False)  # each one replaces all earlier ones
-TOPICS = (PATH, STATUS, TICK, COMMAND, ENDED, ANSWER, OBSTACLES, MISSION, TRAJECTORY)
-FOR_AGENTS = (PATH, STATUS, COMMAND, ENDED, OBSTACLES, MISSION, TRAJECTORY)
+RELAY = Topic(name="relay", ring=4, max_bytes=131_072, reliable=False)  # trajectory messages of others
+TOPICS = (PATH, STATUS, TICK, COMMAND, ENDED, ANSWER, OBSTACLES, MISSION, TRAJECTORY, RELAY)
+FOR_AGENTS = (PATH, STATUS, COMMAND, ENDED, OBSTACLES, MISSION, TRAJECTORY, RELAY)
 
 TOO_LONG = b""  # replaces a message that is too long; every decoder refuses it
 

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 
 from swarmctl.bus.peers import Bus
 from swarmctl.bus.refusals import RefusedMessage
-from swarmctl.bus.topics import Topic
+from swarmctl.bus.topics import RELAY, Topic
 
 
 class CountedBus(Bus):
@@ -40,6 +40,14 @@ class CountedBus(Bus):
     def refused(self) -> list[RefusedMessage]:
         """Return the messages that were not delivered."""
         return self._bus.refused()
+
+    def relay(self, agents: Iterable[int]) -> int:
+        """Pass on messages of other agents."""
+        sent = self._bus.relay(agents)
+        if sent:
+            self._messages[RELAY.name] += 1
+            self._bytes[RELAY.name] += sent
+        return sent
 
     def alive(self) -> frozenset[str]:
         """Return senders attached now."""

@@ -11,7 +11,7 @@ import contextlib
 import json
 import threading
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -98,6 +98,10 @@ class ZenohBus:
     def refused(self) -> list[RefusedMessage]:
         """Return nothing: whether a message is its sender's is not judged here."""
         return []
+
+    def relay(self, agents: Iterable[int]) -> int:
+        """Pass on nothing: a `RelayingBus` round this one does."""
+        return 0
 
     def alive(self) -> frozenset[str]:
         """Return senders whose liveliness token is present; none, not even this one, while the router is lost."""

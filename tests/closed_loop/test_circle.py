@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from swarmctl.control.mpc import swarm_mpc
 from swarmctl.core.types import Landed, Mode, Phase, PlanStatus
-from tests.closed_loop.conftest import Flight, Fly, closer_than, mission_is_over
+from tests.closed_loop.conftest import Flight, Fly, closer_than, mission_is_over, mission_t_s
 
 ALONE = ("sitl.start=air", "swarm.agents=1", "mission.duration_s=15")
 
@@ -99,3 +100,17 @@ def test_without_peers_the_reference_is_met(fly: Fly) -> None:
     lone = fly(*ALONE, until=mission_is_over)
     ticks, error = lone.tracked(0)
     assert np.linalg.norm(error[ticks["mission_t_s"] > 10], axis=1).max() < 0.01
+
+
+@pytest.mark.parametrize("rows", ["as they are", "control: one attempt"])
+def test_twelve_agents_that_close_in_on_one_point_keep_their_distance(
+    rows: str, fly: Fly, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With peers on both sides, room to stop beyond the horizon costs distance within it, and plans are refused.
+
+    Agents then coast on old plans and brake, each in another way.
+    """
+    if rows != "as they are":
+        monkeypatch.setattr(swarm_mpc, "_relaxed", lambda separation: iter(()))
+    flight = fly("swarm.agents=12", "sitl.start=air", until=lambda lockstep: mission_t_s(lockstep) >= 1.5)
+    assert (flight.separation_m() >= 0.85) is (rows == "as they are")

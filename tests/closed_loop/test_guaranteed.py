@@ -12,7 +12,7 @@ import pytest
 
 from sitl.lockstep import Lockstep
 from sitl.studies.campaign.events import Freeze, ScenarioEvent, Split
-from sitl.studies.campaign.flight import TrialFlight
+from sitl.studies.campaign.flight import TrialFlight, drawn
 from sitl.studies.campaign.scenarios import layout_of
 from sitl.studies.campaign.trials import Cell, Trial
 from swarmctl.agent import coordination
@@ -410,3 +410,24 @@ def test_the_safety_filter_places_peers_on_their_committed_trajectories(
     least_m = SeparationParams().body_m + BarrierParams().margin_m
     assert len(seen_m) > 5
     assert (seen_m == pytest.approx([least_m] * len(seen_m))) is (mode == "guaranteed")
+
+
+@pytest.mark.parametrize("relayed", [True, False], ids=["", "control: nobody relays"])
+def test_all_arrive_although_links_fail_for_seconds(relayed: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each direction between two agents delivers nothing for two fifths of the time, 2 s at once."""
+    if not relayed:
+        monkeypatch.setattr(coordination, "missed_by_peers", lambda *_: [])
+    cell = Cell(
+        scenario="swap",
+        agents=4,
+        delay_ms=0.0,
+        loss=0.0,
+        noise="exact",
+        wind_m_s=0.0,
+        protections="guaranteed",
+        disturbance="bursts:0.4",
+    )
+    flight = TrialFlight(Trial(cell, 2), replace(drawn(cell, 2), limit_s=12.0))
+    flight.run()
+    assert flight.monitor.min_separation_m >= 0.8
+    assert flight.row(None)["arrived"] is relayed

@@ -24,6 +24,7 @@ def join_bus(
     utc_us: Callable[[], int],
     lease_ms: int = 1500,
     connect_timeout_ms: int = CONNECT_TIMEOUT_MS,
+    carrier: Callable[[Bus], Bus] = lambda bus: bus,
 ) -> Bus:
     """Join the bus of a run.
 
@@ -32,13 +33,15 @@ def join_bus(
         identity: as which messages are sealed; None: they are not.
         max_age_us: see `SealVerifier`.
         utc_us: own clock.
+        carrier: carries messages as they are sent, sealed or not, by the bus that it is given.
 
     Raises:
         StartError: the router does not answer in time.
         ConfigError: the identity can't be used.
     """
     if identity is None:
-        return ZenohBus(endpoint, run, me, subscriptions, lease_ms=lease_ms, connect_timeout_ms=connect_timeout_ms)
+        plain = ZenohBus(endpoint, run, me, subscriptions, lease_ms=lease_ms, connect_timeout_ms=connect_timeout_ms)
+        return carrier(plain)
     from swarmctl.bus.network.keyring import load_keyring  # loads cryptography, which one computer alone does not need
 
     keys, roster = load_keyring(identity).keys, identity.roster
@@ -53,4 +56,4 @@ def join_bus(
     )
     sealer = Sealer(keys, run, me, session=secrets.randbits(64))
     verifier = SealVerifier(roster, keys, run, me=identity.name, max_age_us=max_age_us)
-    return SealedBus(bus, sealer, verifier, utc_us)
+    return SealedBus(carrier(bus), sealer, verifier, utc_us)

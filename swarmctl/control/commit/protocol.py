@@ -4,7 +4,8 @@ Every agent follows a *committed* trajectory, which ends at rest. To fly on, it 
 leaves the committed one a little later, keeps its distance to everything its peers are known to have committed to or
 to propose, and ends at rest again. It commits to the proposal only when every participant has acknowledged it. Each
 agent sends all of this in one message a tick (committed trajectory, proposal, acknowledgements), and only the newest
-message counts.
+message counts. Who has it passes it on to those that lack it (`swarmctl.bus.relay`): for what follows, such a message
+has only been under way for longer.
 
 Each tick applies these rules in this order:
 

@@ -9,7 +9,7 @@ a constant drift of each axis. Of a flight volume the z problem has floor and ce
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from typing import Literal
 
@@ -295,27 +295,42 @@ def planned(
     separation: SeparationParams,
     stopwatch_ns: Callable[[], int],
 ) -> Plan:
-    """Plan within the half-spaces near the guess and, if the plan is not certified, again within all half-spaces.
-
-    A plan may move far away from a guess that stands still, while half-spaces far from the guess are left out. It then
-    runs into peers that are there by the time it arrives, and so does every following plan from the same guess.
+    """Plan within the half-spaces near the guess and, as long as the plan is not certified, within others.
 
     Args:
         spaces_of: returns half-spaces for given parameters.
         plan: makes a plan within half-spaces, given the time [us] that they took.
-        separation: parameters of the first plan; the second plan has no gate.
+        separation: parameters of the first plan; those of the next ones are `_relaxed`.
         stopwatch_ns: see `CondensedMpc`.
     """
     began_ns = stopwatch_ns()
-    near = spaces_of(separation)
-    found = plan(near, (stopwatch_ns() - began_ns) * 1e-3)
-    if near is None or found.status is not PlanStatus.NOT_CERTIFIED:
-        return found
-    began_ns = stopwatch_ns()
-    every = spaces_of(separation.model_copy(update={"gate_m": math.inf}))
-    if every is None or np.array_equal(every.offset_m, near.offset_m):
-        return found
-    return plan(every, (stopwatch_ns() - began_ns) * 1e-3)
+    spaces = spaces_of(separation)
+    found = plan(spaces, (stopwatch_ns() - began_ns) * 1e-3)
+    for relaxed in _relaxed(separation):
+        if spaces is None or found.status is not PlanStatus.NOT_CERTIFIED:
+            return found
+        began_ns, before, spaces = stopwatch_ns(), spaces, spaces_of(relaxed)
+        if spaces is not None and not _are_equal(spaces, before):
+            found = plan(spaces, (stopwatch_ns() - began_ns) * 1e-3)
+    return found
+
+
+def _relaxed(separation: SeparationParams) -> Iterator[SeparationParams]:
+    """Yield parameters of half-spaces for a plan that is not certified within those of `separation`.
+
+    - Without the gate: a plan may move far away from a guess that stands still, while half-spaces far from the guess
+      are left out. It then runs into peers that are there by the time it arrives, as does the next from that guess.
+    - With harder braking beyond the horizon, then with none: the room that it takes has many metres of slack where
+      peers are on several sides, and pays for them by coming too close within the horizon.
+    """
+    every = separation.model_copy(update={"gate_m": math.inf})
+    yield every
+    for stop_m_s2 in (separation.brake_m_s2, math.inf):
+        yield every.model_copy(update={"stop_m_s2": stop_m_s2})
+
+
+def _are_equal(one: HalfSpaces, other: HalfSpaces) -> bool:
+    return np.array_equal(one.offset_m, other.offset_m) and np.array_equal(one.stop_s, other.stop_s)
 
 
 def judged(

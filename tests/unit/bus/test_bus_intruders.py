@@ -28,7 +28,8 @@ from swarmctl.bus.network.sealed_bus import FOR_AGENTS_US, SealedBus
 from swarmctl.bus.network.seals import TAG_BYTES, PairKeys, Sealer, SealVerifier, overhead_bytes
 from swarmctl.bus.path_messages import encode_path
 from swarmctl.bus.peers import LocalHub, agent_name
-from swarmctl.bus.topics import COMMAND, ENDED, OBSTACLES, PATH, STATUS, TRAJECTORY, Topic
+from swarmctl.bus.relay import RelayingBus, encode_relay
+from swarmctl.bus.topics import COMMAND, ENDED, OBSTACLES, PATH, RELAY, STATUS, TRAJECTORY, Topic
 from swarmctl.control.collision.separation import SeparationParams
 from swarmctl.core.clock import SimClock
 from swarmctl.core.obstacle import Obstacle
@@ -89,7 +90,7 @@ class Scene:
         self.hub = LocalHub(self.clock.now_us)
         keys = keyring(self.folders.ours, "alpha")
         listen = {
-            **{topic: [VICTIM, OTHER] for topic in (PATH, STATUS, TRAJECTORY)},
+            **{topic: [VICTIM, OTHER] for topic in (PATH, STATUS, TRAJECTORY, RELAY)},
             COMMAND: [*self.roster.commanders("alpha")],
             ENDED: [*self.roster.hosts],
             OBSTACLES: ["alpha"],
@@ -98,7 +99,7 @@ class Scene:
         verifier = SealVerifier(self.roster, keys, RUN, me="alpha", max_age_us=FOR_AGENTS_US)
         if not self.seals:
             verifier.open = self.believe  # type: ignore[method-assign]
-        self.bus = SealedBus(bus, Sealer(keys, RUN, ME, session=1), verifier, self.clock.utc_us)
+        self.bus = SealedBus(RelayingBus(bus, 0, [1, 2]), Sealer(keys, RUN, ME, session=1), verifier, self.clock.utc_us)
         vouchers = {host: frozenset((number,)) for number, host in enumerate(self.roster.hosts)}
         self.world = WorldModel(
             0,
@@ -414,3 +415,27 @@ def test_negative_control_without_seals_the_intruder_is_believed(name: str, fold
     ROWS[name].attack(scene)
     scene.listen()
     assert scene.knows() != before
+
+
+@pytest.mark.parametrize(
+    ("identity", "believed"), [("bravo", True), ("charlie", False)], ids=["its own seal", "control: the relay's"]
+)
+def test_what_is_relayed_is_opened_by_the_seal_of_who_has_said_it(
+    folders: Folders, identity: str, believed: bool
+) -> None:
+    scene = Scene(folders)
+    before = scene.trajectories.newest[1].seq
+    carried = scene.sealer(identity, VICTIM).seal(TRAJECTORY.name, scene.trajectory(), scene.now_us)
+    scene.carry(OTHER, RELAY, encode_relay([(1, carried)]))
+    scene.listen()
+    assert (scene.trajectories.newest[1].seq > before) is believed
+    assert bool(scene.world.refusals.by_reason) is not believed
+
+
+def test_what_a_slower_relay_delivers_is_no_replay(folders: Folders) -> None:
+    scene = Scene(folders)
+    late = scene.victim.seal(TRAJECTORY.name, scene.trajectory(), scene.now_us)
+    scene.live()
+    scene.carry(OTHER, RELAY, encode_relay([(1, late)]))
+    scene.listen()
+    assert not scene.world.refusals.by_reason

@@ -194,6 +194,38 @@ def test_commitments_keep_apart_by_clocks_that_differ_within_their_error(error_u
     assert crowd.committed >= 8, "they do move"
 
 
+class Relaying(Crowd):
+    """Agents 0 and 2 never hear each other; the others pass on what is missed, if they `relay`."""
+
+    def __init__(self, relay: bool) -> None:
+        super().__init__(4, Network(delay_us=(20_000, 60_000), loss_01=0.2))
+        self._relay = relay
+
+    def step(self) -> None:
+        super().step()
+        if not self._relay:
+            return
+        for by in (1, 3):
+            for of, to in ((0, 2), (2, 0)):
+                if of in self.known[by]:
+                    self.network.send(self.now_us, to, self.known[by][of])
+
+
+@pytest.mark.parametrize("relay", [True, False], ids=["", "control: nobody relays"])
+def test_two_that_never_hear_each_other_commit_by_relays(relay: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    crowd = Relaying(relay)
+    send = crowd.network.send
+
+    def cut(now_us: int, receiver: int, message: TrajectoryMessage) -> None:
+        is_direct = message.sent_utc_us == now_us and message.seq == crowd.seq
+        if not (is_direct and {receiver, message.agent} == {0, 2}):
+            send(now_us, receiver, message)
+
+    monkeypatch.setattr(crowd.network, "send", cut)
+    assert crowd.run(4.0) >= HARD_MIN_M - 1e-3
+    assert [crowd.agents[i].counts.committed > 0 for i in (0, 2)] == [relay, relay]
+
+
 class Careless(Crowd):
     """Agents that commit without waiting for acknowledgements."""
 
