@@ -133,7 +133,8 @@ def _asked(flight: Launch, launch: RunningLaunch, phase: Phase, verb: str, to_al
     if any(reply.answer is None for reply in replies):
         return {"result": "failed: silent"}
     first = next(reply for reply in replies if reply.agent == 0)
-    if first.phase is not phase:
+    obeyed_there = OPERATOR_VERBS[verb].is_stop and first.answer is not None and first.answer.accepted
+    if first.phase is not phase and not obeyed_there:  # a stop that is obeyed is another phase by now
         return {"result": "missed", "met": None if first.phase is None else first.phase.name}
     if phase.name not in OPERATOR_VERBS[verb].phases:
         refused = first.answer is not None and not first.answer.accepted and bool(first.answer.reason)

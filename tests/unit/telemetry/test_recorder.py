@@ -135,7 +135,11 @@ def test_disk_that_fills_up_mid_row_leaves_whole_rows(tmp_path: Path) -> None:
     rows = read_rows(tmp_path / "agent-0.ticks", TICK_DTYPE)
     assert (tmp_path / "agent-0.ticks").stat().st_size % TICK_DTYPE.itemsize == 0
     assert rows["seq"].tolist() == list(range(10))
-    assert int(output) == 50
+    (_, plan), points = told(0), read_plans(tmp_path, 0)
+    plans = len(np.unique(points["t_us"]))
+    assert plan is not None and len(points) == plans * len(plan.pos_ned_m), "whole paths, too"
+    assert 0 < plans < 60
+    assert int(output) == 50 + 60 - plans
 
 
 def test_killed_agent_loses_only_the_last_moments(tmp_path: Path) -> None:
