@@ -320,8 +320,8 @@ def _relaxed(separation: SeparationParams) -> Iterator[SeparationParams]:
 
     - Without the gate: a plan may move far away from a guess that stands still, while half-spaces far from the guess
       are left out. It then runs into peers that are there by the time it arrives, as does the next from that guess.
-    - With the harder braking that peers expect beyond the horizon: the room that it takes has many metres of slack where
-      peers are on several sides, and pays for them by coming too close within the horizon.
+    - With the harder braking that peers expect beyond the horizon: room to stop has much slack where peers are on
+      several sides, and one slack for each of them lets a plan come too close within the horizon as well.
     """
     every = separation.model_copy(update={"gate_m": math.inf})
     yield every
