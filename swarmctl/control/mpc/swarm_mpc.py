@@ -320,13 +320,12 @@ def _relaxed(separation: SeparationParams) -> Iterator[SeparationParams]:
 
     - Without the gate: a plan may move far away from a guess that stands still, while half-spaces far from the guess
       are left out. It then runs into peers that are there by the time it arrives, as does the next from that guess.
-    - With harder braking beyond the horizon, then with none: the room that it takes has many metres of slack where
-      peers are on several sides, and pays for them by coming too close within the horizon.
+    - With the harder braking that peers expect beyond the horizon: room to stop has much slack where peers are on
+      several sides, and one slack for each of them lets a plan come too close within the horizon as well.
     """
     every = separation.model_copy(update={"gate_m": math.inf})
     yield every
-    for stop_m_s2 in (separation.brake_m_s2, math.inf):
-        yield every.model_copy(update={"stop_m_s2": stop_m_s2})
+    yield every.model_copy(update={"stop_m_s2": separation.brake_m_s2})
 
 
 def _are_equal(one: HalfSpaces, other: HalfSpaces) -> bool:
