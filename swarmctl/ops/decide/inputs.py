@@ -7,7 +7,7 @@ their ticks, orders from the events, obstacles from the configuration. What the 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import msgspec
@@ -97,6 +97,9 @@ class RecordedBus:
 
     def refused(self) -> list[RefusedMessage]:
         return []
+
+    def relay(self, agents: Iterable[int]) -> int:
+        return 0
 
     def alive(self) -> frozenset[str]:
         return self._senders
