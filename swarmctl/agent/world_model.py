@@ -8,7 +8,6 @@ from collections.abc import Callable, Mapping, Sequence, Set
 from swarmctl.bus import topics
 from swarmctl.bus.json_messages import ListedObstacle, StatusMessage, decode_obstacles, decode_status
 from swarmctl.bus.orders import Orders
-from swarmctl.bus.path_messages import ROUNDING_M
 from swarmctl.bus.peer_clocks import PeerClocks
 from swarmctl.bus.peers import Bus, PeerPaths, agent_name, peer_verifiers
 from swarmctl.bus.refusals import FUTURE, IDENTITY, MALFORMED, SEQUENCE, UNKNOWN_PEER, Refusals
@@ -208,13 +207,13 @@ class WorldModel:
 
     def deviating_peers(self, messages: Mapping[int, TrajectoryMessage], utc_us: int, allowed_m: float) -> set[int]:
         """Return peers whose recent path deviates by more than `allowed_m` from all trajectories they committed to."""
-        found, seen_m = set(), allowed_m - ROUNDING_M
+        found = set()
         for path in self.paths.latest():
             message, at_us = messages.get(path.agent), path.t0_utc_us
             if message is None or not message.is_committed or at_us < utc_us - _RECENT_PATH_US:
                 continue
             here = path.pos_ned_m[0].tolist()
-            if all(math.dist(here, trajectory.at(at_us)[0]) > seen_m for trajectory in message.followed):
+            if all(math.dist(here, trajectory.at(at_us)[0]) > allowed_m for trajectory in message.followed):
                 found.add(path.agent)
         return found
 

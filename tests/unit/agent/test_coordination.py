@@ -13,7 +13,7 @@ from swarmctl.agent.world_model import WorldModel
 from swarmctl.bus import topics
 from swarmctl.bus.commitment_messages import decode_trajectory_message, encode_trajectory_message
 from swarmctl.bus.json_messages import encode_message
-from swarmctl.bus.path_messages import ROUNDING_M, encode_path
+from swarmctl.bus.path_messages import encode_path
 from swarmctl.bus.peers import LocalBus, LocalHub, agent_name
 from swarmctl.control.collision.encounters import Encounters
 from swarmctl.control.collision.separation import SeparationParams
@@ -272,8 +272,7 @@ def test_the_certificate_against_a_stale_peer_has_all_of_its_margin(bench: Bench
     utc_us, params = bench.clock.utc_us(), SeparationParams()
     (kept,) = bench.coordination._others(utc_us, bench.state, Phase.TRACK, set(), Encounters())
     (control,) = bench.world_model.keep_outs(HERE, utc_us, 100_000, 5, phase=Phase.TRACK)
-    received_m = params.budget.hard_min_distance_m + ROUNDING_M
-    assert control.hard_min_distance_m == received_m, "which would not grow with age"
+    assert control.hard_min_distance_m == params.budget.hard_min_distance_m, "which would not grow with age"
     assert kept.hard_min_distance_m > params.budget.planned_m + 0.5
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from swarmctl.bus.links import Impairments
-from swarmctl.bus.path_messages import ROUNDING_M, encode_path
+from swarmctl.bus.path_messages import encode_path
 from swarmctl.bus.peer_clocks import PeerClocks
 from swarmctl.bus.peers import LEASE_US, LocalBus, LocalHub, PeerPaths, agent_name
 from swarmctl.bus.refusals import Refusals
@@ -67,11 +67,11 @@ def test_a_path_gets_room_for_the_error_of_its_clock() -> None:
     moving = np.arange(5)[:, None] * [0.03, 0.04, 0.0]  # at 2.5 m/s
     path = builders.predicted_path(agent=1, seq=1, t0_utc_us=NOW_US, dt_us=20_000, pos_ned_m=moving)
     store.offer(encode_path(path))
-    assert store.paths.latest()[0].margin_m == path.margin_m + ROUNDING_M, "not measured"
+    assert store.paths.latest()[0].margin_m == path.margin_m, "not measured"
     clocks.received(1, NOW_US, NOW_US + 30_000)
     clocks.answered(1, NOW_US, NOW_US + 30_000, NOW_US + 40_000)
     store.offer(encode_path(replace(path, seq=2)))
-    assert store.paths.latest()[0].margin_m == pytest.approx(path.margin_m + ROUNDING_M + 0.03 * 2.5, rel=1e-3)
+    assert store.paths.latest()[0].margin_m == pytest.approx(path.margin_m + 0.03 * 2.5, rel=1e-3)
 
 
 def test_the_path_of_a_stale_peer_is_kept() -> None:
