@@ -180,15 +180,14 @@ ROWS = (
         SimulatedRow(
             name=f"link-cut-{a}-{b}",
             event=f"the link of hosts {a} and {b} is cut for 5 s (three hosts of 1, 2 and 1 agents), and healed",
-            reaction="agents that miss each other's answers wait; all arrive",
-            within_s=16.0,
-            protection="who is silent is waited for",
+            reaction="the third host relays what they miss of each other; all arrive as if there were no cut",
+            within_s=6.5,
+            protection="relays of trajectory messages",
             scene=GUARANTEED,
             happens=cut(between(one, other), 5.0),
             reacts=arrived,
             lasts_s=16.5,
-            always=commits_nothing((*one, *other), 1.0, 5.0),
-            off=Off(patches=((Coordination, "_required_peers", lambda *_: frozenset()),)),
+            off=Off(patches=((coordination, "missed_by_peers", lambda *_: []),)),
         )
         for a, b, one, other in (
             ("alpha", "bravo", (0,), (1, 2)),
