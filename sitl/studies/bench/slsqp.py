@@ -67,11 +67,10 @@ class NonlinearXy:
         du_max = np.repeat([a.du_max for a in axes], self._hc)
         self._u_prev = np.clip(asked.u_prev, u_min, u_max)
         (to_pos, to_vel), (glide_s, kept) = horizon.of_acceleration(), horizon.of_velocity_s()
-        gain_m_s2 = np.broadcast_to(asked.gain_m_s2, (hp, count))
-        accel = gain_m_s2 * self._u_prev + asked.drift_m_s2  # (Hp, 2)
+        accel = asked.gain_m_s2 * self._u_prev + asked.drift_m_s2  # (Hp, 2)
         self._free_m = (asked.pos_m + glide_s[:, None] * asked.vel_m_s + to_pos @ accel).T.ravel()  # (2 Hp,)
         free_vel = (kept[:, None] * asked.vel_m_s + to_vel @ accel).T.ravel()
-        driven = [gain_m_s2[:, i, None] * horizon.held() for i in range(count)]
+        driven = [asked.gain_m_s2[:, i, None] * horizon.held() for i in range(count)]
         self._push = _blocks([to_pos @ d for d in driven])  # (2 Hp, 2 Hc) metres of a unit increment
         push_vel = _blocks([to_vel @ d for d in driven])
         weight_pos, weight_vel, weight_moves = (

@@ -122,7 +122,7 @@ class AxesProblem:
     pos_m: Array  # (axes,)
     vel_m_s: Array  # (axes,)
     u_prev: Array  # (axes,) input held now
-    gain_m_s2: Array  # (Hp, axes) acceleration of a unit input over each step, or (1, axes) over all, sign included
+    gain_m_s2: Array  # (Hp, axes) acceleration of a unit input over each step, sign included
     drift_m_s2: Array  # (axes,) acceleration without input
     ref_pos_m: Array  # (Hp, axes) at steps 1..Hp
     ref_vel_m_s: Array  # (Hp, axes)

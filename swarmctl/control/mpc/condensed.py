@@ -11,6 +11,8 @@ import math
 from collections.abc import Callable, Iterator
 from functools import partial
 
+import numpy as np
+
 from swarmctl.control.mpc.axes import AxesProblem, AxesSolution, Axis, Faces, HalfSpaces, Horizon, Penalties
 from swarmctl.control.mpc.constraints import (
     IncrementBounds,
@@ -101,8 +103,8 @@ class CondensedMpc:
     def _plan(self, forecast: Forecast, solution: QpSolution, solve_us: float) -> AxesSolution:
         """Return the motion under the increments of a solution, with what it violates."""
         x, ahead = _usable(solution), self.prediction
-        u, increments = ahead.decided(x, forecast.u_prev)
-        motion = forecast.free + (forecast.response @ increments[:, :, None])[..., 0].swapaxes(1, 2)
+        increments = ahead.increments(x, forecast.u_prev)
+        motion = forecast.free + np.einsum("qakc,ac->qka", forecast.response, increments)
         residual_m = gap_m = math.inf
         if x is not None:
             flown = x.copy()
@@ -113,7 +115,7 @@ class CondensedMpc:
             solved=x is not None,
             status=solution.status,
             iterations=solution.iterations,
-            u=u,
+            u=forecast.u_prev + ahead.hold @ increments.T,
             pos_m=motion[0],
             vel_m_s=motion[1],
             slack_m=slack_m(self._program.rows[self.half_spaces], solution),

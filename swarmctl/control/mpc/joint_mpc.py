@@ -87,7 +87,7 @@ class JointMpc:
     def _plan(self, problem: Problem, began_ns: int, spaces: HalfSpaces | None, spaces_us: float) -> Plan:
         start, steps = problem.start, self.steps
         held = max(_MIN_THRUST_M_S2, float(start.virtual_control[2]))
-        first = self._solve(problem, np.array([held]), spaces)
+        first = self._solve(problem, np.full(steps, held), spaces)
         found = self._solve(problem, first.u[:, 2], spaces)
         found = replace(found, solve_us=first.solve_us + found.solve_us, iterations=first.iterations + found.iterations)
         thrust = found.u[:, 2:]
@@ -114,14 +114,13 @@ class JointMpc:
         )
 
     def _solve(self, problem: Problem, thrust_m_s2: Array, spaces: HalfSpaces | None) -> AxesSolution:
-        """Solve for given thrust over mass, (steps,) or (1,) for all steps."""
         steps, start, reference = self.steps, problem.start, problem.reference
         realised, realised_1_s = self._acting(problem)
         asked = AxesProblem(
             pos_m=start.pos_ned_m,
             vel_m_s=start.vel_ned_m_s,
             u_prev=start.virtual_control,
-            gain_m_s2=np.column_stack([-thrust_m_s2, -thrust_m_s2, np.full(len(thrust_m_s2), -start.cos_tilt)]),
+            gain_m_s2=np.column_stack([-thrust_m_s2, -thrust_m_s2, np.full(steps, -start.cos_tilt)]),
             drift_m_s2=self._drift(problem),
             ref_pos_m=reference.pos_ned_m[1 : steps + 1],
             ref_vel_m_s=reference.vel_ned_m_s[1 : steps + 1],

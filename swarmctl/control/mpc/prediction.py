@@ -28,7 +28,7 @@ class Forecast:
     asked: AxesProblem
     half_spaces: HalfSpaces | None
     u_prev: Array  # (axes,) held input, within its bounds
-    accel_m_s2: Array  # (Hp, axes) over each step, or (1, axes) over all, without increments
+    accel_m_s2: Array  # (Hp, axes) over each step, without increments
     free: Array  # (2, Hp, axes) motion at steps 1..Hp, without increments
     error: Array  # (2, Hp, axes) of the free motion to the reference
     response: Array  # (2, axes, Hp, Hc) to unit increments
@@ -78,11 +78,6 @@ class Prediction:
         self._has_lag = any(a.lag is not None for a in axes)
         self._lags = [lag_response(a.lag, horizon.dt_s, horizon.prediction) for a in axes]
         self.acted = np.stack([lag.of_command @ self.hold for lag in self._lags])  # (axes, Hp, Hc) realised inputs
-        self._of_held = np.stack([lag.of_command.sum(axis=1) for lag in self._lags], axis=1)  # (Hp, axes)
-        self._of_tilt = np.stack([lag.of_tilt for lag in self._lags], axis=1)  # (Hp, axes)
-        self._of_rate_s = np.stack([lag.of_rate_s for lag in self._lags], axis=1)  # (Hp, axes)
-        self._of_held_accel = self._of_accel.sum(axis=2)[:, :, None]  # (2, Hp, 1)
-        self.unit_response = self._of_accel[:, None] @ self.acted  # (2, axes, Hp, Hc) under a gain of 1
 
     def columns(self, axis: int) -> slice:
         """Return the variables that are the increments of an axis."""
@@ -112,24 +107,25 @@ class Prediction:
         return acts
 
     def motion(self, pos_m: Array, vel_m_s: Array, accel_m_s2: Array) -> Array:
-        """Return positions and velocities (2, Hp, axes) under accelerations over each step.
-
-        `accel_m_s2` is (Hp, axes), or (1, axes) for the same over all steps.
-        """
-        moved = self._of_vel * vel_m_s
-        moved[0] += pos_m
-        moved += self._of_held_accel * accel_m_s2 if len(accel_m_s2) == 1 else self._of_accel @ accel_m_s2
-        return np.asarray(moved)
+        """Return positions and velocities (2, Hp, axes) under accelerations (Hp, axes) held over each step."""
+        coasting = self._of_vel * vel_m_s
+        coasting[0] += pos_m
+        return np.asarray(coasting + self._of_accel @ accel_m_s2)
 
     def forecast(self, asked: AxesProblem, half_spaces: HalfSpaces | None) -> Forecast:
         """Return the forecast of one receding-horizon step."""
         gain_m_s2 = asked.gain_m_s2
         u_prev = np.minimum(np.maximum(asked.u_prev, self.u_min), self.u_max)
-        accel = gain_m_s2 * self._held(u_prev, asked) + asked.drift_m_s2  # (Hp, axes) or (1, axes)
+        acts = u_prev  # (axes,), or (Hp, axes) with a lag
+        if self._has_lag:
+            held = np.broadcast_to(u_prev, gain_m_s2.shape)
+            acts = self.realised(held, asked.realised, asked.realised_1_s)
+        accel = gain_m_s2 * acts + asked.drift_m_s2  # (Hp, axes)
         free = self.motion(asked.pos_m, asked.vel_m_s, accel)
         error = np.empty(free.shape)
         np.subtract(free[0], asked.ref_pos_m, out=error[0])
         np.subtract(free[1], asked.ref_vel_m_s, out=error[1])
+        driven = gain_m_s2.T[:, :, None] * self.acted  # (axes, Hp, Hc)
         return Forecast(
             asked=asked,
             half_spaces=half_spaces,
@@ -137,45 +133,26 @@ class Prediction:
             accel_m_s2=accel,
             free=free,
             error=error,
-            response=self._response(gain_m_s2),
+            response=self._of_accel[:, None] @ driven,
         )
-
-    def _held(self, u_prev: Array, asked: AxesProblem) -> Array:
-        """Return realised inputs, (axes,) or with a lag (Hp, axes), when the input is held."""
-        if not self._has_lag:
-            return u_prev
-        acts = self._of_held * u_prev + self._of_tilt * (u_prev if asked.realised is None else asked.realised)
-        return np.asarray(acts if asked.realised_1_s is None else acts + self._of_rate_s * asked.realised_1_s)
-
-    def _response(self, gain_m_s2: Array) -> Array:
-        """Return responses (2, axes, Hp, Hc) to unit increments under gains (Hp, axes) or (1, axes)."""
-        if len(gain_m_s2) == 1:
-            return gain_m_s2[0, :, None, None] * self.unit_response
-        return np.asarray(self._of_accel[:, None] @ (gain_m_s2.T[:, :, None] * self.acted))
 
     def extremes(self, u_prev: Array) -> Array:
         """Return increments (2, axes, Hc) that raise inputs, and that lower them, as fast as the bounds allow."""
         inputs = np.minimum(np.maximum(u_prev[:, None] + self._ramps, self._least), self._most)
         return np.asarray(inputs[:, :, 1:] - inputs[:, :, :-1])
 
-    def decided(self, x: Array | None, u_prev: Array) -> tuple[Array, Array]:
-        """Return inputs (Hp, axes) and increments (axes, Hc) of a solution, within both bounds exactly.
-
-        Without a solution the input is held.
-        """
-        shape, steps = (len(self.axes), self.horizon.control), self.horizon.prediction
+    def increments(self, x: Array | None, u_prev: Array) -> Array:
+        """Return increments (axes, Hc) of a solution, within both bounds exactly; zeros without a solution."""
+        shape = len(self.axes), self.horizon.control
         if x is None:
-            return np.tile(u_prev, (steps, 1)), np.zeros(shape)
+            return np.zeros(shape)
         moves = x[: shape[0] * shape[1]].reshape(shape)
         wanted = np.minimum(np.maximum(moves, -1.0), 1.0) * self._step[:, 1:]
         inputs = u_prev[:, None] + wanted.cumsum(axis=1)
         inputs = np.minimum(np.maximum(inputs, self._least[:, 1:]), self._most[:, 1:])
-        u = np.empty((steps, shape[0]))
-        u[:] = inputs[:, -1]
-        u[: shape[1]] = inputs.T[:steps]
         inputs[:, 1:] -= inputs[:, :-1]
         inputs[:, 0] -= u_prev
-        return u, inputs
+        return np.asarray(inputs)
 
     def scaled(self, increments: Array) -> Array:
         """Return increments (axes, Hc) as variables (moves,) of the program."""

@@ -162,8 +162,8 @@ class SwarmMpc:
             for room in (max_keep_outs, 0)
         )
         self._first_row = self._xy.prediction.first_row()
-        ahead = self.steps if params.thrust_ahead == "planned" else 1  # otherwise the thrust is that of now
-        self._thrust_of = np.minimum(np.arange(ahead), params.horizon_z - 1)  # steps of the z plan
+        following = np.minimum(np.arange(self.steps), params.horizon_z - 1)
+        self._thrust_of = following if params.thrust_ahead == "planned" else 0 * following  # (steps,) of the z plan
 
     def plan(self, problem: Problem) -> Plan:
         """Solve one step of distributed MPC. Infeasibility is a status, never an exception."""
@@ -233,7 +233,7 @@ class SwarmMpc:
             pos_m=start.pos_ned_m[2:],
             vel_m_s=start.vel_ned_m_s[2:],
             u_prev=start.virtual_control[2:],
-            gain_m_s2=np.array([[-start.cos_tilt]]),
+            gain_m_s2=np.full((steps, 1), -start.cos_tilt),
             drift_m_s2=GRAVITY_M_S2 + problem.disturbance_ned_m_s2[2:],
             ref_pos_m=reference.pos_ned_m[1 : steps + 1, 2:],
             ref_vel_m_s=reference.vel_ned_m_s[1 : steps + 1, 2:],
@@ -241,7 +241,7 @@ class SwarmMpc:
         return self._z.solve(asked)
 
     def _gain_m_s2(self, up: AxesSolution) -> Array:
-        """Return accelerations (steps, 2), or (1, 2) for all steps, of unit inputs of x and y: thrust over mass."""
+        """Return accelerations (steps, 2) of unit inputs of x and y, which thrust over mass makes."""
         return -up.u.take(self._thrust_of, axis=0).repeat(2, axis=1)
 
 

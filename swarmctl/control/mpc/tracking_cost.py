@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -13,15 +11,6 @@ from swarmctl.control.mpc.terminal import TerminalRegion, terminal_region
 from swarmctl.core.types import Array
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _Parts:
-    """Holds what the responses to increments alone decide of the cost, which is the same for all steps of one gain."""
-
-    curvature: Array  # (axes, Hc, Hc) of the errors, in scaled increments
-    pull: Array  # (2, axes, Hp, Hc) slope of unit errors of position and velocity
-    beyond: dict[int, Array]  # by axis with a terminal region: (3, Hc) slope of unit errors at the end
-
-
 class TrackingCost:
     """Fills Hessian and slope of the scaled increments, which the scale of the cost brings to about 1."""
 
@@ -29,14 +18,13 @@ class TrackingCost:
         self._prediction, axes = prediction, prediction.axes
         self._regions = {i: self._region(a) for i, a in enumerate(axes) if a.terminal == "region"}
         self.scale = 1.0 / max(self._largest(), 1e-12)
-        self._own = [prediction.columns(i) for i in range(len(axes))]
+        self._own, hc = [prediction.columns(i) for i in range(len(axes))], prediction.horizon.control
+        like, square = np.ones((len(axes), hc)), np.ones((len(axes), hc, hc))  # quicker than broadcast operands
         weights = np.array([[a.q_pos for a in axes], [a.q_vel for a in axes]])  # (2, axes)
-        du_max = prediction.du_max
-        self._weight = 2.0 * self.scale * (weights * du_max)[:, :, None, None]  # (2, axes, 1, 1)
-        self._du_max = du_max[:, None, None]  # (axes, 1, 1)
-        on_moves = 2.0 * self.scale * np.array([a.r for a in axes]) * du_max**2
-        self._on_moves = on_moves[:, None, None] * np.eye(prediction.horizon.control)  # (axes, Hc, Hc)
-        self._unit = self._parts(prediction.unit_response, prediction.acted[:, -1])
+        self._slope_weight, self._weight = weights[:, :, None] * like, weights[:, :, None, None] * square
+        self._r = np.array([a.r * np.eye(hc) for a in axes])  # (axes, Hc, Hc)
+        self._slope_factor = np.array([2.0 * a.du_max * self.scale for a in axes])[:, None] * like
+        self._factor = np.array([2.0 * a.du_max**2 * self.scale for a in axes])[:, None, None] * square
 
     def _region(self, axis: Axis) -> TerminalRegion:
         """Return the terminal region of an axis, in units of acceleration."""
@@ -68,34 +56,30 @@ class TrackingCost:
         hc = self._prediction.horizon.control
         return np.kron(np.eye(len(self._prediction.axes), dtype=bool), np.ones((hc, hc), bool))
 
-    def _parts(self, response: Array, end_accel: Array) -> _Parts:
-        """Return the cost's parts for responses (2, axes, Hp, Hc), and (axes, Hc) of the acceleration at the end."""
-        pull = self._weight * response
-        curvatures = self._du_max * (pull.swapaxes(2, 3) @ response)
-        curvature, beyond = curvatures[0] + curvatures[1], dict[int, Array]()
-        for i, region in self._regions.items():
-            end = np.stack([response[0, i, -1], response[1, i, -1], end_accel[i]])  # (3, Hc)
-            du_max = float(self._du_max[i, 0, 0])
-            beyond[i] = (2.0 * self.scale * du_max) * (region.beyond @ end)
-            curvature[i] += du_max * (beyond[i].T @ end)
-        return _Parts(curvature=curvature, pull=pull, beyond=beyond)
-
     def fill(self, hessian: Array, slope: Array, forecast: Forecast) -> None:
         """Write the Hessian (moves, moves) and the linear cost (moves,) of one step."""
-        gain = forecast.asked.gain_m_s2
-        if len(gain) == 1:  # the same over all steps
-            parts, factor = self._unit, gain[0, :, None]
-            curvature = (factor * factor)[:, :, None] * parts.curvature + self._on_moves
-        else:
-            parts = self._parts(forecast.response, gain[-1, :, None] * self._prediction.acted[:, -1])
-            factor, curvature = np.ones((len(self._own), 1)), parts.curvature + self._on_moves
-        pulls = (forecast.error.swapaxes(1, 2)[:, :, None] @ parts.pull)[:, :, 0]
+        response = forecast.response
+        gram = self._weight * (response.swapaxes(2, 3) @ response)
+        curvature = gram[0] + gram[1]  # (axes, Hc, Hc)
+        errors = forecast.error.swapaxes(1, 2)[:, :, None]  # (2, axes, 1, Hp)
+        pulls = self._slope_weight * (errors @ response)[:, :, 0]
         pull = pulls[0] + pulls[1]  # (axes, Hc)
-        for i, beyond in parts.beyond.items():
-            pull[i] += np.array(self._end_error(i, forecast)) @ beyond
+        for i, region in self._regions.items():
+            end = self._end_response(i, forecast)
+            weighted = end.T @ region.beyond
+            curvature[i] += weighted @ end
+            pull[i] += weighted @ np.array(self._end_error(i, forecast))
+        curvature = self._factor * (curvature + self._r)
         for i, own in enumerate(self._own):
             hessian[own, own] = curvature[i]
-        slope[: pull.size] = (factor * pull).ravel()
+        slope[: pull.size] = (self._slope_factor * pull).ravel()
+
+    def _end_response(self, i: int, forecast: Forecast) -> Array:
+        """Return position, velocity and acceleration (3, Hc) at the end, due to unit increments of axis `i`."""
+        end = np.empty((3, self._prediction.horizon.control))
+        end[:2] = forecast.response[:, i, -1]
+        end[2] = forecast.asked.gain_m_s2[-1, i] * self._prediction.acted[i, -1]
+        return end
 
     def _end_error(self, i: int, forecast: Forecast) -> tuple[float, float, float]:
         """Return errors of position, velocity and acceleration at the end of the free motion of axis `i`."""
