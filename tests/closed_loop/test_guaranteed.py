@@ -220,7 +220,7 @@ def two_of_six_cut_off() -> TrialFlight:
         scenario="swap", agents=6, delay_ms=20.0, loss=0.0, noise="exact", wind_m_s=0.0, protections="guaranteed"
     )
     event = Split([frozenset({0, 1, 2, 3}), frozenset({4, 5})], 2.5, 5.0)
-    layout = replace(layout_of("swap", 1, 6), events=(event,), limit_s=20.0, lost=frozenset({4, 5}))
+    layout = replace(layout_of("swap", 1, 6), events=(event,), limit_s=9.0, lost=frozenset({4, 5}))
     flight = TrialFlight(Trial(cell, 1), layout)
     flight.run()
     return flight

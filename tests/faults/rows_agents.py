@@ -199,6 +199,7 @@ ROWS = (
         reaction="its autopilot lands the vehicle; the others keep clear of where it can be, and arrive",
         within_s=14.0,
         protection="a silent peer's last path grows with age",
+        scene=(*SWAP, "start.positions_ned_m=[[3.001,0,0],[0,2.999,0],[-3,0.001,0],[0.0005,-3,0]]"),  # 7 s, exact 14
         due=tracking(2.2),
         happens=lost,
         reacts=others_arrived,
