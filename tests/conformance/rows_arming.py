@@ -16,6 +16,7 @@ from tests.conformance.vocabulary import (
     M_OFFBOARD,
     M_POSCTL,
     M_RTL,
+    M_TAKEOFF,
     NAN,
     NO_ACK,
     RTL,
@@ -107,6 +108,7 @@ ARMING_ROWS = (
         start=State.ARMABLE,
         steps=(
             Command(number=TAKEOFF, params=ALL_NAN),
+            sees("CURRENT_MODE", custom_mode=M_TAKEOFF),  # one of before is on its way while TAKEOFF is acknowledged
             arm(),
             Turns(value=M_LOITER, low_s=19.0, high_s=23.0),
             Moves("height_m", near(30.0, 1.5), 24.5),

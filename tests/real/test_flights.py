@@ -72,7 +72,7 @@ def test_three_px4_fly_the_built_in_mission(field: Fielder) -> None:
 
 def booted(field: Fielder, count: int) -> Field:
     """ArduCopters with a position, in real time."""
-    here = field(ARDUCOPTER, count)
+    here = field(ARDUCOPTER, count, is_accuracy_judged=True)
     here.witness.wait(here.witness.all_placed, PLACED_S, "a position")
     for index in range(count):
         here.witness.set_parameter(index, "SIM_SPEEDUP", 1.0)
