@@ -9,7 +9,7 @@ import compileall
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from pathlib import Path
 
 import pytest
@@ -17,25 +17,24 @@ import pytest
 import swarmctl  # noqa: F401  (before anything loads numpy)
 
 TESTS = Path(__file__).parent
-LONGEST = [  # over a minute each
-    "process/test_readme.py",
-    "closed_loop/test_guaranteed.py",
-    "closed_loop/test_failures.py",
+LONGEST = [  # half a minute and more each
     "process/test_launch.py",
+    "closed_loop/test_guaranteed.py",
+    "process/test_readme.py",
+    "closed_loop/test_failures.py",
+    "process/test_hosts.py",
     "closed_loop/test_deadlock.py",
     "closed_loop/test_real_autopilot.py",
+    "process/test_launch_flight.py",
     "closed_loop/test_circle.py",
-    "closed_loop/test_campaign.py",
-    "closed_loop/test_solvers.py",
-    "closed_loop/test_gusts.py",
     "closed_loop/test_swap.py",
-    "closed_loop/test_forgery.py",
-    "closed_loop/test_identify.py",
+    "closed_loop/test_reproduce.py",
     "process/test_viewer.py",
     "closed_loop/test_obstacle.py",
-    "closed_loop/test_processors.py",
+    "closed_loop/test_campaign.py",
 ]
-FOLDERS = ["process", "closed_loop", "faults", "conformance", "unit"]
+AT_ONCE = ["process", "closed_loop"]  # one flies in real time, waiting half of it, the other computes
+AFTERWARDS = ["faults", "conformance", "unit"]
 
 
 @pytest.fixture(autouse=True)
@@ -62,19 +61,22 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Order the files as workers take them, one at a time (`--dist loadfile --no-loadscope-reorder`).
-
-    The longest come first. A file that flies in real time leaves its processor half idle, while others compute.
-    """
-    items.sort(key=lambda item: place(item.path))
+    """Order the files as workers take them, one at a time (`--dist loadfile --no-loadscope-reorder`)."""
+    places = order({item.path.relative_to(TESTS).as_posix() for item in items})
+    items.sort(key=lambda item: places[item.path.relative_to(TESTS).as_posix()])
 
 
-def place(path: Path) -> tuple[int, int, str]:
-    """Return where a file comes in the order: the named ones as listed, then folder by folder."""
-    name = path.relative_to(TESTS).as_posix()
-    folder = name.partition("/")[0]
-    return (
-        LONGEST.index(name) if name in LONGEST else len(LONGEST),
-        FOLDERS.index(folder) if folder in FOLDERS else len(FOLDERS),
-        name,
-    )
+def order(names: Set[str]) -> dict[str, int]:
+    """Return where each file comes: the folders of `AT_ONCE` evenly mixed, the longest first, then the other ones."""
+
+    def folder(name: str) -> str:
+        return name.partition("/")[0]
+
+    def rank(name: str) -> tuple[int, str]:
+        return LONGEST.index(name) if name in LONGEST else len(LONGEST), name
+
+    mixed = [sorted((name for name in names if folder(name) == each), key=rank) for each in AT_ONCE]
+    shares = {name: i / len(files) for files in mixed for i, name in enumerate(files)}
+    last = {name: AFTERWARDS.index(folder(name)) if folder(name) in AFTERWARDS else len(AFTERWARDS) for name in names}
+    keys = {name: (shares[name], 0) if name in shares else (1.0, last[name]) for name in names}
+    return {name: i for i, name in enumerate(sorted(names, key=lambda name: (*keys[name], *rank(name))))}
