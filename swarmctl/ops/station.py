@@ -22,12 +22,13 @@ from swarmctl.control.phases.state_machine import OPERATOR_STOP
 from swarmctl.core.records import unpack_tick
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError
+from swarmctl.ops.bus_report import report_refused
 from swarmctl.ops.host import refuse_unidentified, shared_run_name
 from swarmctl.ops.launch import LaunchOptions, SwarmPart, started
+from swarmctl.ops.launch_result import LaunchResult
 from swarmctl.ops.processes import ROUTER
 from swarmctl.ops.status_table import AgentView, Display
 from swarmctl.ops.summary import sum_up
-from swarmctl.ops.supervisor import LaunchResult, report_refused
 from swarmctl.process_lifetime import StopRequest
 from swarmctl.telemetry.recording.recorder import Recorder
 

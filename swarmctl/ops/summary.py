@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from swarmctl.config import Config, load_recorded
 from swarmctl.core.text import printable
 from swarmctl.mavlink.signing.refusals import HARMLESS
-from swarmctl.ops.supervisor import LaunchResult
+from swarmctl.ops.launch_result import LaunchResult
 from swarmctl.telemetry.evaluation.referee import SUMMED_ERROR
 
 if TYPE_CHECKING:

@@ -9,25 +9,24 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
 from typing import Any
 
-import msgspec
-
-from swarmctl.bus.json_messages import ObstaclesMessage, decode_obstacles, decode_status, encode_message, first_list
+from swarmctl.bus.json_messages import decode_status
 from swarmctl.bus.orders import EVERYBODY, order_messages
 from swarmctl.bus.peers import Bus, agent_name
-from swarmctl.bus.refusals import HARMLESS, Refusals
-from swarmctl.bus.topics import COMMAND, ENDED, OBSTACLES, STATUS, Topic
+from swarmctl.bus.refusals import Refusals
+from swarmctl.bus.topics import COMMAND, ENDED, STATUS, Topic
 from swarmctl.config import Config
 from swarmctl.core.operator_verbs import EXCLUDE, PEER, Order
 from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, StartError
+from swarmctl.ops.bus_report import report_refused
+from swarmctl.ops.launch_result import LaunchResult, why_it_failed
+from swarmctl.ops.obstacle_keeper import ObstacleKeeper
 from swarmctl.ops.order_delivery import numbered
 from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, RunContext, kill_all
 from swarmctl.ops.recovery import RECOVERY_S, Recovery
 from swarmctl.ops.status_table import AgentView, Display, name_of
-from swarmctl.telemetry.evaluation.referee import JudgedObstacle
 from swarmctl.telemetry.recording.event_log import EventLog
 
 _STEP_S = 0.05
@@ -39,7 +38,6 @@ _PAUSE_S = 0.5  # of the supervisor
 _LAND_S = 60.0
 _LAND_REPEAT_S = 0.5
 _LAND_OBEYED_S = 10.0
-_OBSTACLES_REPEAT_S = 1.0
 _ROUTER_STARTS = 3  # in one flight
 _AFTER_DEATH_S = 3.0  # the simulator must outlive a dead agent until its vehicle has landed
 
@@ -65,60 +63,6 @@ class Services:
         raise NotImplementedError
 
 
-@dataclass(slots=True, kw_only=True)
-class LaunchResult:
-    """The result of a launch, collected during the flight."""
-
-    problems: list[str] = field(default_factory=list)
-    could_not_start: bool = False
-    has_armed: bool = False  # an agent has requested arming
-    left: tuple[str, ...] = ()  # vehicles that may still be armed or in the air, in words
-    interrupted: bool = False
-    obstacles: tuple[JudgedObstacle, ...] | None = None  # all there were; None: as configured
-
-    @property
-    def outcome(self) -> str:
-        """Outcome as in summary.json."""
-        if self.interrupted:
-            return "interrupted"
-        return "failed" if self.problems else "completed"
-
-    def exit_code(self, violated: bool) -> int:
-        """Return the exit code of the launch; `violated`: the referee found a violation."""
-        if self.left:
-            return EXIT_MISSION
-        if self.interrupted:
-            return EXIT_INTERRUPTED
-        if self.could_not_start and not self.has_armed:
-            return EXIT_START
-        return EXIT_MISSION if self.problems or violated else EXIT_OK
-
-
-def report_refused(bus: Bus, refusals: Refusals, display: Display) -> None:
-    """Report what the bus did not deliver, because its seal was not by its sender; the first of each kind in words."""
-    utc_us = time.time_ns() // 1000
-    for sender, topic, reason in bus.refused():
-        if refusals.add(sender, topic, reason, utc_us) == 1 and reason not in HARMLESS:
-            display.print_line(f"{topic} in the name of {sender} refused: {reason}")
-    refusals.report(utc_us)
-
-
-def why_it_failed(outcome: str, last_line: str) -> str:
-    """Return why an agent failed: the outcome of its mission, or its last line after a complete one."""
-    return (outcome if outcome != "completed" else "") or last_line or "no reason given"
-
-
-def _judged(known: tuple[JudgedObstacle, ...], message: ObstaclesMessage, utc_us: int) -> tuple[JudgedObstacle, ...]:
-    """Return all obstacles there were: those known that a list lacks are there until now, those it adds are new."""
-    listed = [
-        JudgedObstacle(number=item.number, obstacle=item.obstacle, since_utc_us=item.since_utc_us)
-        for item in message.obstacles
-    ]
-    there = set(listed)
-    kept = [j if j in there or j.until_utc_us is not None else replace(j, until_utc_us=utc_us) for j in known]
-    return (*kept, *(judged for judged in listed if judged not in kept))
-
-
 class FlightSupervisor:
     """Watches one launch until every agent has ended or has been given up."""
 
@@ -131,9 +75,7 @@ class FlightSupervisor:
         self._display = display
         self._result = LaunchResult()
         self._views = [AgentView(agent=agent) for agent in services.context.agents]
-        self._obstacles = first_list(config.obstacles, time.time_ns() // 1000)
-        self._result.obstacles = _judged((), self._obstacles, 0)
-        self._obstacles_said_s = 0.0
+        self._obstacles = ObstacleKeeper(self._bus, config.obstacles)
         self._refusals = Refusals(services.log.write)
         self._started_s = self._stepped_s = time.monotonic()
         self._mission_ends_s = self._started_s + config.mission.duration_s  # at the earliest
@@ -177,7 +119,8 @@ class FlightSupervisor:
         return self._report_left_vehicles()
 
     def _report_left_vehicles(self) -> LaunchResult:
-        """Report every vehicle that is not known to be on the ground."""
+        """Report every vehicle that is not known to be on the ground, and the obstacles that there were."""
+        self._result.obstacles = self._obstacles.judged
         self._result.left = () if self._vehicles_lost else tuple(self._recovery.left(self._views))
         for words in self._result.left:
             self._fail("vehicle_left", words)
@@ -204,17 +147,10 @@ class FlightSupervisor:
             if status.phase == Phase.TRACK:  # also of a mission that an operator has set
                 self._mission_ends_s = max(self._mission_ends_s, time.monotonic() + status.ends_in_s)
             self._result.has_armed |= Phase.ARM <= status.phase < Phase.DONE
-        for _, payload in self._bus.receive(OBSTACLES):
-            message = decode_obstacles(payload)
-            if message is not None and message.replaces(self._obstacles.version):
-                self._adopt(message)
+        for message in self._obstacles.receive():
+            text = f"{len(message.obstacles)} obstacles, set by an operator"
+            self._announce("obstacles", text, version=message.version)
         report_refused(self._bus, self._refusals, self._display)
-
-    def _adopt(self, message: ObstaclesMessage) -> None:
-        """Adopt an operator's obstacle list: repeat it, judge what is new from now on and what is gone until now."""
-        self._result.obstacles = _judged(self._result.obstacles or (), message, time.time_ns() // 1000)
-        self._obstacles, self._obstacles_said_s = message, 0.0
-        self._announce("obstacles", f"{len(message.obstacles)} obstacles, set by an operator", version=message.version)
 
     def _watch_essential_processes(self) -> None:
         """Start a router again; land all agents when it ends again and again, or the simulator has ended."""
@@ -329,10 +265,7 @@ class FlightSupervisor:
 
     def _speak(self) -> None:
         now_s = time.monotonic()
-        if now_s - self._obstacles_said_s >= _OBSTACLES_REPEAT_S:
-            self._obstacles_said_s = now_s
-            told = msgspec.structs.replace(self._obstacles, utc_us=time.time_ns() // 1000)
-            self._bus.publish(OBSTACLES, encode_message(told))
+        self._obstacles.repeat()
         if self._land_ordered_s is not None and now_s - self._land_said_s >= _LAND_REPEAT_S:
             self._land_said_s = now_s
             self._repeat_land_order(now_s - self._land_ordered_s)

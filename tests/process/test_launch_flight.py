@@ -23,9 +23,10 @@ from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import EXCLUDE, PEER
 from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, StartError
+from swarmctl.ops.launch_result import LaunchResult
 from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, Command, RunContext, kill_all
 from swarmctl.ops.status_table import AgentView
-from swarmctl.ops.supervisor import FlightSupervisor, LaunchResult, Services
+from swarmctl.ops.supervisor import FlightSupervisor, Services
 from swarmctl.telemetry.recording.event_log import EventLog
 from tests import builders
 

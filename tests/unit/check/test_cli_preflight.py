@@ -21,6 +21,7 @@ from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError, StartError, SwarmError
 from swarmctl.ops import operator, preflight
 from swarmctl.ops.fault import inject, parse_fault
+from swarmctl.ops.launch_result import why_it_failed
 from swarmctl.ops.processes import RunContext, agent_commands, sitl_command, viewer_command
 from swarmctl.ops.status_table import (
     AgentView,
@@ -32,7 +33,6 @@ from swarmctl.ops.status_table import (
     status_table,
 )
 from swarmctl.ops.summary import summary_lines, violation_lines
-from swarmctl.ops.supervisor import why_it_failed
 from swarmctl.process_lifetime import StopRequest
 from swarmctl.telemetry.scene.viewed_flight import ViewedFlight
 from tests import builders

@@ -1,0 +1,42 @@
+"""The result of a launch, as its supervisor collects it, and the exit code that follows from it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START
+from swarmctl.telemetry.evaluation.referee import JudgedObstacle
+
+
+@dataclass(slots=True, kw_only=True)
+class LaunchResult:
+    """The result of a launch, collected during the flight."""
+
+    problems: list[str] = field(default_factory=list)
+    could_not_start: bool = False
+    has_armed: bool = False  # an agent has requested arming
+    left: tuple[str, ...] = ()  # vehicles that may still be armed or in the air, in words
+    interrupted: bool = False
+    obstacles: tuple[JudgedObstacle, ...] | None = None  # all there were; None: as configured
+
+    @property
+    def outcome(self) -> str:
+        """Outcome as in summary.json."""
+        if self.interrupted:
+            return "interrupted"
+        return "failed" if self.problems else "completed"
+
+    def exit_code(self, violated: bool) -> int:
+        """Return the exit code of the launch; `violated`: the referee found a violation."""
+        if self.left:
+            return EXIT_MISSION
+        if self.interrupted:
+            return EXIT_INTERRUPTED
+        if self.could_not_start and not self.has_armed:
+            return EXIT_START
+        return EXIT_MISSION if self.problems or violated else EXIT_OK
+
+
+def why_it_failed(outcome: str, last_line: str) -> str:
+    """Return why an agent failed: the outcome of its mission, or its last line after a complete one."""
+    return (outcome if outcome != "completed" else "") or last_line or "no reason given"
