@@ -92,6 +92,25 @@ class StopOrder:
             self._due_us = now_us + _STOP_REPEAT_US if self._ask(Order("land"), now_us) else None
 
 
+class SessionWatch:
+    """Records when another session has taken the place of a deaf one.
+
+    Args:
+        bus: whose sessions.
+        note: takes the name and fields of an event.
+    """
+
+    def __init__(self, bus: Bus, note: Callable[..., None]) -> None:
+        self._bus, self._note = bus, note
+        self._reopened = 0
+
+    def step(self) -> None:
+        """Record what is new. Called once in every tick."""
+        if (reopened := self._bus.reopened()) > self._reopened:
+            self._reopened = reopened
+            self._note("bus_reopened", count=reopened)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AgentProcess:
     """Command-line arguments of one agent process."""
@@ -154,7 +173,8 @@ def _fly(
         recorder.event("realtime", clock.now_us(), clock.utc_us(), granted=granted, start_up_s=round(spent_s, 3))
     try:
         vehicle = url or f"inherited socket of sysid {config.sysids()[agent]}"
-        return _loop(flown, config, clock, stop, vehicle=vehicle, only_land=process.only_land)
+        sessions = SessionWatch(link, lambda name, **f: recorder.event(name, clock.now_us(), clock.utc_us(), **f))
+        return _loop(flown, config, clock, stop, sessions, vehicle=vehicle, only_land=process.only_land)
     finally:
         summary = {"sent": flown.sent, "rejected": flown.rejected, "lost": recorder.lost}
         recorder.event("bus_summary", clock.now_us(), clock.utc_us(), **summary)
@@ -219,7 +239,16 @@ def _join(process: AgentProcess, config: Config, clock: WallClock) -> Bus:
     )
 
 
-def _loop(agent: Agent, config: Config, clock: WallClock, stop: StopRequest, *, vehicle: str, only_land: bool) -> int:
+def _loop(
+    agent: Agent,
+    config: Config,
+    clock: WallClock,
+    stop: StopRequest,
+    sessions: SessionWatch,
+    *,
+    vehicle: str,
+    only_land: bool,
+) -> int:
     gc.collect()
     gc.freeze()  # keep objects of the start-up out of collections during flight
     landing = StopOrder(agent.ask)
@@ -232,6 +261,7 @@ def _loop(agent: Agent, config: Config, clock: WallClock, stop: StopRequest, *, 
         now_us = clock.now_us()
         landing.step(stop, now_us)
         record = agent.tick(now_us, pace.missed)
+        sessions.step()
         pace.done(now_us + round(record.timing.tick_ms * 1000), clock.now_us())
         if record.mode is not Mode.STATE_STALE:
             seen_us, ever_seen = now_us, True

@@ -60,15 +60,25 @@ class Bus(Protocol):
 
     def refused(self) -> list[RefusedMessage]:
         """Return the messages that were not delivered since the last call; only sealed ones are refused by a bus."""
+        return []
 
     def relay(self, agents: Iterable[int]) -> int:
         """Pass on the newest trajectory messages of other agents, by `RelayingBus` only; return the number of bytes."""
+        return 0
 
     def alive(self) -> frozenset[str]:
         """Return senders attached now, this one included. It shows that a process lives, not that its loop runs."""
 
     def arrivals(self) -> Mapping[str, int]:
         """Return how often each sender has joined, so that one that left and rejoined at once is noticed."""
+
+    def reopen(self) -> bool:
+        """Open another session in place of this one, which may be deaf; return whether one is being opened."""
+        return False
+
+    def reopened(self) -> int:
+        """Return how often another session has taken the place of a deaf one."""
+        return 0
 
     def close(self) -> None:
         """Leave the bus."""
@@ -332,7 +342,7 @@ class LocalHub:
             view.update(self._attached, partial(self._reachability.shows, observer=observer), now_us)
 
 
-class LocalBus:
+class LocalBus(Bus):
     """A participant of a `LocalHub`."""
 
     def __init__(self, hub: LocalHub, name: str, subscriptions: Subscriptions) -> None:
@@ -359,12 +369,6 @@ class LocalBus:
         if len(arrived) > 1:
             arrived.sort(key=itemgetter(0, 1))  # stable: keeps the order of each sender
         return [(sender, payload) for _, sender, payload in arrived]
-
-    def refused(self) -> list[RefusedMessage]:
-        return []
-
-    def relay(self, agents: Iterable[int]) -> int:
-        return 0
 
     def alive(self) -> frozenset[str]:
         return self._hub.alive(self.name) if self._hub.is_attached(self) else frozenset()

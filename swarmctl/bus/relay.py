@@ -113,6 +113,14 @@ class RelayingBus(Bus):
         """Return how often each sender has joined."""
         return self._bus.arrivals()
 
+    def reopen(self) -> bool:
+        """Open another session in place of this one; return whether one is being opened."""
+        return self._bus.reopen()
+
+    def reopened(self) -> int:
+        """Return how often another session has taken over."""
+        return self._bus.reopened()
+
     def close(self) -> None:
         """Leave the bus."""
         self._bus.close()

@@ -10,14 +10,18 @@ from __future__ import annotations
 import contextlib
 import json
 import threading
+import time
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import zenoh
 
-from swarmctl.bus.refusals import RefusedMessage
+from swarmctl.bus.peers import Bus
+from swarmctl.bus.silence import DEAF_S, SilenceWatch
 from swarmctl.bus.topics import TOO_LONG, TOPICS, Topic
 from swarmctl.errors import StartError
 
@@ -27,20 +31,40 @@ CONNECT_TIMEOUT_MS = 10_000
 CLOSE_DEADLINE_S = 2.0
 _MAX_MESSAGE_BYTES = 1 << 20
 _ALIVE_RING = 1024
-_OPEN_TIMEOUT_MS = 2000
+_SETTLE_S = 0.2  # until a new session knows who is there
+_LINK_OPEN_TIMEOUT_MS = 2000  # of links between routers: a cut one is tried again as often
+# A client waits for longer than the router does (accept_timeout, 10 s), because its own time limit may strike when
+# half of the opening is done: then it sends and is kept alive, but never reads (Zenoh 1.10.2). A client that got no
+# processor for 2 s, as in a launch on a machine under load, was deaf for good.
+_CLIENT_OPEN_TIMEOUT_MS = 60_000
 _MAX_SOCKET_PATH = 100  # sun_path is 108 bytes
 
 COMMON_SETTINGS: dict[str, Any] = {
     "scouting/multicast/enabled": False,
     "scouting/gossip/enabled": False,
-    "transport/unicast/open_timeout": _OPEN_TIMEOUT_MS,
+    "transport/unicast/open_timeout": _LINK_OPEN_TIMEOUT_MS,
     "transport/link/rx/max_message_size": _MAX_MESSAGE_BYTES,
     "transport/shared_memory/enabled": False,
 }
 
 
-class ZenohBus:
-    """Implements `swarmctl.bus.peers.Bus` by a client session.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Joined:
+    """One session, and what it has declared."""
+
+    session: Any
+    publishers: Mapping[Topic, Any]
+    subscribers: Mapping[Topic, Sequence[tuple[str, Any]]]  # by topic, with the sender of each
+    tokens: Any  # subscriber of liveliness tokens
+    own_token: Any
+
+
+class ZenohBus(Bus):
+    """Implements `swarmctl.bus.peers.Bus` by a client session, which is replaced when it is deaf.
+
+    Zenoh connects a session again whose link was lost. What it can't mend is a session that sends and is kept alive but
+    receives nothing. So where nobody at all is heard for a while, another session is opened in the background, and
+    takes over as soon as it is up; the one before goes on until then.
 
     Args:
         endpoint: the router's, for example `unixsock-stream//tmp/swarm-x/bus.sock`.
@@ -50,6 +74,7 @@ class ZenohBus:
         lease_ms: silence of the link after which the router drops this session.
         connect_timeout_ms: longest wait for the router.
         seal_bytes: by how much messages are longer than topics allow, because they are sealed.
+        deaf_s: see `SilenceWatch`.
 
     Raises:
         StartError: the router does not answer in time.
@@ -65,43 +90,40 @@ class ZenohBus:
         lease_ms: int = 1500,
         connect_timeout_ms: int = CONNECT_TIMEOUT_MS,
         seal_bytes: int = 0,
+        deaf_s: float = DEAF_S,
     ) -> None:
         self._seal_bytes = seal_bytes
-        self._session = _open_client(endpoint, lease_ms, connect_timeout_ms)
-        prefix = f"swarm/{run}"
-        self._publishers = {topic: self._publisher(f"{prefix}/{me}/{topic.name}", topic) for topic in TOPICS}
-        self._subscribers = {
-            topic: [(sender, self._subscriber(f"{prefix}/{sender}/{topic.name}", topic)) for sender in senders]
-            for topic, senders in subscriptions.items()
-        }
+        self._socket = socket_file(endpoint)
+        self._join: Callable[[], _Joined] = partial(
+            _join, endpoint, f"swarm/{run}", me, subscriptions, lease_ms, connect_timeout_ms
+        )
         self._alive: frozenset[str] = frozenset()
         self._arrivals: Counter[str] = Counter()
-        self._token_samples = self._session.liveliness().declare_subscriber(
-            f"{prefix}/*/alive", zenoh.handlers.RingChannel(_ALIVE_RING), history=True
-        )
-        self._token = self._session.liveliness().declare_token(f"{prefix}/{me}/alive")
+        self._silence = SilenceWatch(deaf_s)
+        self._opening: threading.Thread | None = None
+        self._next: _Joined | None = None  # up, and not yet in use
+        self._reopened = 0
+        self._is_closed = False
+        self._now = self._join()
 
     def publish(self, topic: Topic, payload: bytes) -> None:
         """Pass a message to the session; it is dropped when the queue is full or the bus is lost."""
         with contextlib.suppress(zenoh.ZError):
-            self._publishers[topic].put(payload)
+            self._now.publishers[topic].put(payload)
 
     def receive(self, topic: Topic) -> list[tuple[str, bytes]]:
         """Return (sender, payload) of a topic, oldest first for each sender, at most one ring of each."""
+        self._take_over()
         arrived: list[tuple[str, bytes]] = []
-        for sender, subscriber in self._subscribers.get(topic, ()):
+        for sender, subscriber in self._now.subscribers.get(topic, ()):
             if samples := _drain(subscriber, topic.ring):  # there is nothing from most, in most ticks
                 payloads, most_bytes = (sample.payload for sample in samples), topic.max_bytes + self._seal_bytes
                 arrived += [(sender, p.to_bytes() if len(p) <= most_bytes else TOO_LONG) for p in payloads]
+        if arrived:
+            self._silence.hear()
+        if self._silence.is_deaf(time.monotonic()):
+            self.reopen()
         return arrived
-
-    def refused(self) -> list[RefusedMessage]:
-        """Return nothing: whether a message is its sender's is not judged here."""
-        return []
-
-    def relay(self, agents: Iterable[int]) -> int:
-        """Pass on nothing: a `RelayingBus` round this one does."""
-        return 0
 
     def alive(self) -> frozenset[str]:
         """Return senders whose liveliness token is present; none, not even this one, while the router is lost."""
@@ -113,12 +135,51 @@ class ZenohBus:
         self._watch_tokens()
         return self._arrivals
 
+    def reopen(self) -> bool:
+        """Open another session in the background, unless there is no router; return whether one is being opened."""
+        if self._next is not None or (self._opening is not None and self._opening.is_alive()):
+            return True
+        if self._is_closed or not self._socket.exists():
+            return False
+        self._opening = threading.Thread(target=self._open_next, name="bus-reopen", daemon=True)
+        self._opening.start()
+        return True
+
+    def reopened(self) -> int:
+        """Return how often another session has taken over."""
+        return self._reopened
+
     def close(self) -> None:
         """Leave the bus; give up after `CLOSE_DEADLINE_S`, since a link without its other end can block."""
-        close_within(self._session, CLOSE_DEADLINE_S)
+        self._is_closed = True
+        close_within(self._now.session, CLOSE_DEADLINE_S)
+        if self._next is not None:
+            close_within(self._next.session, CLOSE_DEADLINE_S)
+
+    def _open_next(self) -> None:
+        with contextlib.suppress(StartError):
+            joined = self._join()
+            time.sleep(_SETTLE_S)
+            if self._is_closed:
+                close_within(joined.session, CLOSE_DEADLINE_S)
+            else:
+                self._next = joined
+
+    def _take_over(self) -> None:
+        """Go on with the session that was opened last."""
+        if self._next is None:
+            return
+        before, self._now, self._next = self._now, self._next, None
+        self._reopened += 1
+        known, self._alive = self._alive, frozenset()
+        arrivals = self._arrivals.copy()
+        self._watch_tokens()
+        arrivals.update(self._alive - known)  # who was known has not joined now
+        self._arrivals = arrivals
+        threading.Thread(target=close_session, args=(before.session,), name="bus-close", daemon=True).start()
 
     def _watch_tokens(self) -> None:
-        for sample in _drain(self._token_samples, _ALIVE_RING):
+        for sample in _drain(self._now.tokens, _ALIVE_RING):
             sender = str(sample.key_expr).split("/")[2]
             if sample.kind != zenoh.SampleKind.PUT:
                 self._alive -= {sender}
@@ -126,16 +187,39 @@ class ZenohBus:
                 self._alive |= {sender}
                 self._arrivals[sender] += 1
 
-    def _publisher(self, key: str, topic: Topic) -> Any:
-        reliability = zenoh.Reliability.RELIABLE if topic.reliable else zenoh.Reliability.BEST_EFFORT
-        return self._session.declare_publisher(
-            key, congestion_control=zenoh.CongestionControl.DROP, reliability=reliability
-        )
 
-    def _subscriber(self, key: str, topic: Topic) -> Any:
-        return self._session.declare_subscriber(
-            key, zenoh.handlers.RingChannel(topic.ring), allowed_origin=zenoh.Locality.REMOTE
-        )
+def _join(
+    endpoint: str,
+    prefix: str,
+    me: str,
+    subscriptions: Mapping[Topic, Sequence[str]],
+    lease_ms: int,
+    connect_timeout_ms: int,
+) -> _Joined:
+    """Open a session and declare everything."""
+    session = _open_client(endpoint, lease_ms, connect_timeout_ms)
+    publishers = {topic: _publisher(session, f"{prefix}/{me}/{topic.name}", topic) for topic in TOPICS}
+    subscribers = {
+        topic: [(sender, _subscriber(session, f"{prefix}/{sender}/{topic.name}", topic)) for sender in senders]
+        for topic, senders in subscriptions.items()
+    }
+    ring: Any = zenoh.handlers.RingChannel(_ALIVE_RING)
+    return _Joined(
+        session=session,
+        publishers=publishers,
+        subscribers=subscribers,
+        tokens=session.liveliness().declare_subscriber(f"{prefix}/*/alive", ring, history=True),
+        own_token=session.liveliness().declare_token(f"{prefix}/{me}/alive"),
+    )
+
+
+def _publisher(session: Any, key: str, topic: Topic) -> Any:
+    reliability = zenoh.Reliability.RELIABLE if topic.reliable else zenoh.Reliability.BEST_EFFORT
+    return session.declare_publisher(key, congestion_control=zenoh.CongestionControl.DROP, reliability=reliability)
+
+
+def _subscriber(session: Any, key: str, topic: Topic) -> Any:
+    return session.declare_subscriber(key, zenoh.handlers.RingChannel(topic.ring), allowed_origin=zenoh.Locality.REMOTE)
 
 
 def socket_file(endpoint: str) -> Path:
@@ -157,6 +241,7 @@ def socket_file(endpoint: str) -> Path:
 def _open_client(endpoint: str, lease_ms: int, timeout_ms: int) -> Any:
     settings = COMMON_SETTINGS | {
         "mode": "client",
+        "transport/unicast/open_timeout": _CLIENT_OPEN_TIMEOUT_MS,
         "connect/endpoints": [endpoint],
         "connect/timeout_ms": timeout_ms,
         "connect/exit_on_failure": True,
@@ -195,13 +280,14 @@ def _drain(subscriber: Any, limit: int) -> list[Any]:
     return samples
 
 
+def close_session(session: Any) -> None:
+    """Close a session, however long that takes."""
+    with contextlib.suppress(zenoh.ZError):
+        session.close()
+
+
 def close_within(session: Any, deadline_s: float) -> None:
     """Close a session; give up after the deadline, since a link without its other end can block."""
-
-    def close() -> None:
-        with contextlib.suppress(zenoh.ZError):
-            session.close()
-
-    closer = threading.Thread(target=close, name="bus-close", daemon=True)
+    closer = threading.Thread(target=close_session, args=(session,), name="bus-close", daemon=True)
     closer.start()
     closer.join(deadline_s)

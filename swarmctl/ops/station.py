@@ -15,14 +15,13 @@ from swarmctl.bus.json_messages import decode_status
 from swarmctl.bus.network.hosts import links_of
 from swarmctl.bus.network.identity_files import STATION
 from swarmctl.bus.peers import Bus, agent_name
-from swarmctl.bus.refusals import Refusals
 from swarmctl.bus.topics import STATUS, TICK
 from swarmctl.config import Config, own_identity
 from swarmctl.control.phases.state_machine import OPERATOR_STOP
 from swarmctl.core.records import unpack_tick
 from swarmctl.core.types import Phase
 from swarmctl.errors import ConfigError
-from swarmctl.ops.bus_report import report_refused
+from swarmctl.ops.bus_report import BusReport
 from swarmctl.ops.host import refuse_unidentified, shared_run_name
 from swarmctl.ops.launch import LaunchOptions, SwarmPart, started
 from swarmctl.ops.launch_result import LaunchResult
@@ -96,7 +95,7 @@ class SwarmWatch:
         clock_s: Callable[[], float] = time.monotonic,
     ) -> None:
         self._bus, self._display, self._clock_s = bus, display, clock_s
-        self._refusals = Refusals(note)
+        self._report = BusReport(bus, note, display)
         self._views = [AgentView(agent=agent) for agent in range(agents)]
         self._recorders = {agent_name(agent): Recorder(directory, agent) for agent in range(agents)}
         self.problems: list[str] = []
@@ -114,7 +113,7 @@ class SwarmWatch:
             if status is not None and 0 <= status.agent < len(self._views) and sender == agent_name(status.agent):
                 view = self._views[status.agent]
                 view.status, view.received_s = status, now_s
-        report_refused(self._bus, self._refusals, self._display)
+        self._report.step()
         self._display.show(self._views)
         over = all(self._has_ended(view, now_s) for view in self._views)
         if over:

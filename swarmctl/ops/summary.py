@@ -121,6 +121,7 @@ def summary_lines(summary: Mapping[str, Any], directory: Path) -> tuple[str, ...
         f"plan staleness p50/p99 {_ms(age, ('p50', 'p99'))} ms, {rejected} messages refused"
         + _refused_frames(comms)
         + _unresponsive(comms)
+        + _reopened(comms)
         + _deadlocks(summary),
         f"run folder {directory}",
     )
@@ -134,6 +135,12 @@ def _refused_frames(comms: Mapping[str, Any]) -> str:
 def _unresponsive(comms: Mapping[str, Any]) -> str:
     found = _section(comms, "unresponsive")
     return f"; agent-{found['agent']} unresponsive for {found['longest_s']:.1f} s" if found.get("count") else ""
+
+
+def _reopened(comms: Mapping[str, Any]) -> str:
+    """Return how often the session of a process was deaf, or seemed so, and was replaced."""
+    count = comms.get("reopened")
+    return f"; {count} bus sessions opened again" if count else ""
 
 
 def violation_lines(summary: Mapping[str, Any]) -> tuple[str, ...]:

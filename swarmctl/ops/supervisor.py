@@ -14,13 +14,13 @@ from typing import Any
 from swarmctl.bus.json_messages import decode_status
 from swarmctl.bus.orders import EVERYBODY, order_messages
 from swarmctl.bus.peers import Bus, agent_name
-from swarmctl.bus.refusals import Refusals
 from swarmctl.bus.topics import COMMAND, ENDED, STATUS, Topic
 from swarmctl.config import Config
 from swarmctl.core.operator_verbs import EXCLUDE, PEER, Order
 from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, StartError
-from swarmctl.ops.bus_report import report_refused
+from swarmctl.ops.bus_report import BusReport
+from swarmctl.ops.hearing import Hearing
 from swarmctl.ops.launch_result import LaunchResult, why_it_failed
 from swarmctl.ops.obstacle_keeper import ObstacleKeeper
 from swarmctl.ops.order_delivery import numbered
@@ -76,7 +76,8 @@ class FlightSupervisor:
         self._result = LaunchResult()
         self._views = [AgentView(agent=agent) for agent in services.context.agents]
         self._obstacles = ObstacleKeeper(self._bus, config.obstacles)
-        self._refusals = Refusals(services.log.write)
+        self._report = BusReport(self._bus, services.log.write, display)
+        self._hearing = Hearing(self._bus, self._announce)
         self._started_s = self._stepped_s = time.monotonic()
         self._mission_ends_s = self._started_s + config.mission.duration_s  # at the earliest
         self._reported: set[str] = set()
@@ -144,13 +145,14 @@ class FlightSupervisor:
             if view.status is None or view.status.phase != status.phase:
                 self._services.log.write("phase", agent=status.agent, phase=name_of(Phase, status.phase))
             view.status, view.received_s = status, time.monotonic()
+            self._hearing.hear(view.agent)
             if status.phase == Phase.TRACK:  # also of a mission that an operator has set
                 self._mission_ends_s = max(self._mission_ends_s, time.monotonic() + status.ends_in_s)
             self._result.has_armed |= Phase.ARM <= status.phase < Phase.DONE
         for message in self._obstacles.receive():
             text = f"{len(message.obstacles)} obstacles, set by an operator"
             self._announce("obstacles", text, version=message.version)
-        report_refused(self._bus, self._refusals, self._display)
+        self._report.step()
 
     def _watch_essential_processes(self) -> None:
         """Start a router again; land all agents when it ends again and again, or the simulator has ended."""
@@ -242,7 +244,7 @@ class FlightSupervisor:
         elif self._recovery.is_on(view.agent):
             if self._recovery.is_overdue(view.agent):
                 child.kill_all()
-        elif now_s - view.received_s > _SILENCE_S:
+        elif self._hearing.is_silent(view.agent, now_s - view.received_s, _SILENCE_S):
             view.note = "silent"
             if self._is_first(f"{child.name} silent"):
                 self._fail(

@@ -7,7 +7,7 @@ their ticks, orders from the events, obstacles from the configuration. What the 
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 import msgspec
@@ -23,8 +23,7 @@ from swarmctl.bus.json_messages import (
     first_list,
 )
 from swarmctl.bus.path_messages import encode_path
-from swarmctl.bus.peers import agent_name
-from swarmctl.bus.refusals import RefusedMessage
+from swarmctl.bus.peers import Bus, agent_name
 from swarmctl.bus.topics import OPERATOR, Topic
 from swarmctl.config import Config
 from swarmctl.control.estimation.constant_velocity import predict_constant_velocity
@@ -78,7 +77,7 @@ class RecordedLink:
         """Nothing is open."""
 
 
-class RecordedBus:
+class RecordedBus(Bus):
     """A bus on which peers and operator say what they have said."""
 
     def __init__(self, senders: frozenset[str]) -> None:
@@ -94,12 +93,6 @@ class RecordedBus:
 
     def receive(self, topic: Topic) -> list[tuple[str, bytes]]:
         return self._waiting.pop(topic, [])
-
-    def refused(self) -> list[RefusedMessage]:
-        return []
-
-    def relay(self, agents: Iterable[int]) -> int:
-        return 0
 
     def alive(self) -> frozenset[str]:
         return self._senders

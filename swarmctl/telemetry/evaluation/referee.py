@@ -340,7 +340,7 @@ def _solver(ticks: Mapping[int, NDArray[np.void]], name: str) -> dict[str, Any]:
 
 
 def _comms(run: RunData, time_field: str) -> dict[str, Any]:
-    """Summarise plan staleness, messages sent, messages and MAVLink frames refused, and unresponsive peers."""
+    """Summarise plan staleness, messages sent, messages and frames refused, unresponsive peers, sessions replaced."""
     ages = _percentiles([flight_rows(rows)["plan_staleness_ms"] for rows in run.ticks.values()])
     return {
         "path_age_ms": {"p50": ages["p50"], "p99": ages["p99"]},
@@ -348,6 +348,7 @@ def _comms(run: RunData, time_field: str) -> dict[str, Any]:
         "rejected": _refused(run.events, "bus_summary", "rejected"),
         "refused_frames": _refused(run.events, "link_summary", "refused"),
         "unresponsive": unresponsive(run.events, time_field),
+        "reopened": sum(event.get("event") == "bus_reopened" for event in run.events),
     }
 
 
