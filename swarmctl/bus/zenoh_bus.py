@@ -92,7 +92,7 @@ class ZenohBus(Bus):
         seal_bytes: int = 0,
         deaf_s: float = DEAF_S,
     ) -> None:
-        self._seal_bytes = seal_bytes
+        self._me, self._seal_bytes = me, seal_bytes
         self._socket = socket_file(endpoint)
         self._join: Callable[[], _Joined] = partial(
             _join, endpoint, f"swarm/{run}", me, subscriptions, lease_ms, connect_timeout_ms
@@ -128,7 +128,7 @@ class ZenohBus(Bus):
     def alive(self) -> frozenset[str]:
         """Return senders whose liveliness token is present; none, not even this one, while the router is lost."""
         self._watch_tokens()
-        return self._alive
+        return self._alive | {self._me} if self._is_linked() else self._alive - {self._me}
 
     def arrivals(self) -> Mapping[str, int]:
         """Return how often each token has appeared; one that left and returned between two calls counts twice."""
@@ -177,6 +177,13 @@ class ZenohBus(Bus):
         arrivals.update(self._alive - known)  # who was known has not joined now
         self._arrivals = arrivals
         threading.Thread(target=close_session, args=(before.session,), name="bus-close", daemon=True).start()
+
+    def _is_linked(self) -> bool:
+        """Return whether the session is linked to a router; the own token is not told of where it moves to another."""
+        try:
+            return bool(list(self._now.session.info.routers_zid()))
+        except zenoh.ZError:
+            return False  # the session is closed
 
     def _watch_tokens(self) -> None:
         for sample in _drain(self._now.tokens, _ALIVE_RING):

@@ -37,7 +37,7 @@ class Hearing:
     def hear(self, agent: int) -> None:
         """Note that an agent was heard."""
         doubt = self._doubts.pop(agent, None)
-        if doubt is not None and doubt.anew_s is not None:
+        if doubt is not None and self._bus.reopened() > doubt.reopened:
             text = f"{agent_name(agent)} is heard on another session of the bus: the one before was deaf"
             self._announce("bus_was_deaf", text)
 

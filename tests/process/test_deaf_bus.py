@@ -92,7 +92,7 @@ def scene(deaf_s: float) -> Iterator[Scene]:
 def test_sessions_that_went_deaf_are_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
     with scene(deaf_s=1.0) as flight:
         with monkeypatch.context() as short:
-            short.setattr(zenoh_bus, "_CLIENT_OPEN_TIMEOUT_MS", 2)
+            short.setattr(zenoh_bus, "_CLIENT_OPEN_TIMEOUT_MS", 1)
             flight.listen()
         assert flight.all_hear(10.0)
         for _ in range(MOST_RESTARTS):
@@ -101,13 +101,14 @@ def test_sessions_that_went_deaf_are_replaced(monkeypatch: pytest.MonkeyPatch) -
             if any(bus.reopened() for bus in flight.listeners):
                 break
         assert any(bus.reopened() for bus in flight.listeners)
-        assert all(len(bus.alive()) == LISTENERS + 1 for bus in flight.listeners)
+        for bus in flight.listeners:
+            assert flight.until(lambda bus=bus: bus.alive() == {"agent-0", *flight.names}, 5.0)  # type: ignore[misc]
 
 
 def test_control_they_stay_deaf_if_nobody_replaces_them(monkeypatch: pytest.MonkeyPatch) -> None:
     with scene(deaf_s=NEVER_S) as flight:
         with monkeypatch.context() as short:
-            short.setattr(zenoh_bus, "_CLIENT_OPEN_TIMEOUT_MS", 2)
+            short.setattr(zenoh_bus, "_CLIENT_OPEN_TIMEOUT_MS", 1)
             flight.listen()
         assert flight.all_hear(10.0)
         for _ in range(MOST_RESTARTS):

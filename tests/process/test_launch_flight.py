@@ -15,14 +15,16 @@ import swarmctl.ops.recovery
 import swarmctl.ops.supervisor
 from swarmctl.bus.json_messages import decode_command, decode_obstacles, encode_message, first_list
 from swarmctl.bus.orders import Orders
-from swarmctl.bus.peers import LocalHub, agent_name
+from swarmctl.bus.peers import Bus, LocalHub, agent_name
 from swarmctl.bus.refusals import Refusals
-from swarmctl.bus.topics import COMMAND, ENDED, OBSTACLES, OPERATOR, STATUS
+from swarmctl.bus.topics import COMMAND, ENDED, OBSTACLES, OPERATOR, STATUS, Topic
+from swarmctl.bus.traffic import CountedBus
 from swarmctl.config import load
 from swarmctl.core.obstacle import Obstacle
 from swarmctl.core.operator_verbs import EXCLUDE, PEER
 from swarmctl.core.types import Phase
 from swarmctl.errors import EXIT_INTERRUPTED, EXIT_MISSION, EXIT_OK, EXIT_START, StartError
+from swarmctl.ops.hearing import Hearing
 from swarmctl.ops.launch_result import LaunchResult
 from swarmctl.ops.processes import ROUTER, SITL, VIEWER, Child, Command, RunContext, kill_all
 from swarmctl.ops.status_table import AgentView
@@ -138,6 +140,26 @@ class ScriptedServices(Services):
 
     def printed(self, *words: str) -> bool:
         return any(all(word in line for word in words) for line in self.said)
+
+
+class DeafBus(CountedBus):
+    """A session that sends, and from a time on receives nothing, until another one is opened."""
+
+    def __init__(self, bus: Bus, deaf_from_s: float, opening_s: float) -> None:
+        super().__init__(bus)
+        self._deaf_s, self._opening_s = deaf_from_s, opening_s
+        self._anew_s: float | None = None
+
+    def receive(self, topic: Topic) -> list[tuple[str, bytes]]:
+        arrived = super().receive(topic)
+        return [] if time.monotonic() > self._deaf_s and not self.reopened() else arrived
+
+    def reopen(self) -> bool:
+        self._anew_s = self._anew_s or time.monotonic() + self._opening_s
+        return not self.reopened()
+
+    def reopened(self) -> int:
+        return int(self._anew_s is not None and time.monotonic() > self._anew_s)
 
 
 @pytest.fixture(autouse=True)
@@ -375,6 +397,33 @@ def test_a_launcher_that_did_not_run_calls_nobody_silent(tmp_path: Path) -> None
     scene.act = hear_nothing
     result = scene.fly()
     assert (result.exit_code(violated=False), result.problems) == (EXIT_OK, [])
+
+
+def deaf_flight(directory: Path, opening_s: float) -> ScriptedServices:
+    scene = ScriptedServices(directory, [ends(0, 4.0), ends(0, 4.0)])
+    assert scene.bus is not None
+    scene.bus = DeafBus(scene.bus, time.monotonic() + 0.5, opening_s)
+    return scene
+
+
+def test_a_supervisor_that_is_deaf_hears_its_agents_again_and_calls_none_silent(tmp_path: Path) -> None:
+    scene = deaf_flight(tmp_path, opening_s=1.0)  # the silence lasts longer than that of an agent may
+    result = scene.fly()
+    assert (result.exit_code(violated=False), result.problems) == (EXIT_OK, [])
+    assert scene.printed("agent-0", "its process runs", "another session")
+    assert scene.printed("agent-1", "is heard on another session", "the one before was deaf")
+    assert '"bus_reopened"' in (tmp_path / "launch.events.jsonl").read_text()
+    assert "land" not in scene.orders
+
+
+def test_control_a_supervisor_that_believes_its_deaf_session_lands_its_agents(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(Hearing, "is_silent", lambda self, agent, silent_s, limit_s: silent_s > limit_s)
+    scene = deaf_flight(tmp_path, opening_s=1.0)
+    assert scene.fly().exit_code(violated=False) == EXIT_MISSION
+    assert scene.printed("agent-0", "silent")
+    assert [scene.children[f"agent-{i}"].poll() for i in range(2)] == [130, 130]
 
 
 def test_a_router_that_ends_is_started_again(tmp_path: Path) -> None:

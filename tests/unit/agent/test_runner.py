@@ -5,10 +5,11 @@ from __future__ import annotations
 import os
 import signal
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
-from swarmctl.agent.runner import Pace, StopOrder, _check_vehicle_silence
+from swarmctl.agent.runner import Pace, SessionWatch, StopOrder, _check_vehicle_silence
 from swarmctl.config import load
 from swarmctl.core.operator_verbs import Order
 from swarmctl.errors import MissionError, StartError
@@ -112,6 +113,18 @@ def test_a_signal_is_a_stop_request_that_is_taken_once(signum: signal.Signals) -
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+def test_each_session_that_was_replaced_is_recorded_once() -> None:
+    counts = iter((0, 1, 1, 3))
+    noted: list[tuple[str, int]] = []
+    watch = SessionWatch(
+        SimpleNamespace(reopened=lambda: next(counts)),
+        lambda name, count: noted.append((name, count)),
+    )
+    for _ in range(4):
+        watch.step()
+    assert noted == [("bus_reopened", 1), ("bus_reopened", 3)]
 
 
 def test_an_agent_number_outside_the_swarm_is_refused_before_anything_is_opened(tmp_path: Path) -> None:

@@ -438,6 +438,12 @@ def test_the_peer_unresponsive_for_longest_is_named() -> None:
     assert comms["unresponsive"] == {"count": 2, "longest_s": 41.0, "agent": 0, "by": "agent-1"}
 
 
+def test_sessions_of_the_bus_that_were_replaced_are_counted() -> None:
+    events = [{"source": source, "event": "bus_reopened", "count": 1} for source in ("launch", "agent-1")]
+    comms = evaluate(run(APART, events=events), Rules(agents=2, required_separation_m=0.5), "completed")["comms"]
+    assert comms["reopened"] == 2
+
+
 def test_with_true_states_an_unresponsive_peer_is_timed_on_their_clock() -> None:
     row = {"source": "agent-0", "event": "unresponsive", "agent": 1, "utc_us": 90_000_000, "t_us": 11_000_000}
     events = [row | {"begins": True}, {"event": "state", "utc_us": 40_000_000, "t_us": 52_000_000}]
@@ -515,4 +521,4 @@ def test_summary_holds_no_nan_and_every_contract_key(data: RunData) -> None:
     assert set(again["obstacles"]) == {"min_clearance_m", "required_m"}
     assert set(again["timing"]) == {"ticks", "due_ticks", "late_ticks", "tick_ms", "solve_ms", "speed_factor"}
     assert set(again["solver"]) >= {"name", "failed", "max_residual_m"}
-    assert set(again["comms"]) == {"path_age_ms", "sent", "rejected", "refused_frames", "unresponsive"}
+    assert set(again["comms"]) == {"path_age_ms", "sent", "rejected", "refused_frames", "unresponsive", "reopened"}
